@@ -1,0 +1,164 @@
+"""Every setting of the method in one frozen, validated dataclass, and the presets."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any, Dict, Optional, Tuple
+
+from cflow_torch.types import CFlowError
+
+METHODS = ("dense", "keypoints")
+CLUSTERINGS = ("components", "hdbscan")
+LABELINGS = ("sparse", "kornia")
+CORRELATIONS = ("fft", "conv")
+DENSIFIERS = ("components", "nearest")
+
+
+@dataclass(frozen=True)
+class Config:
+    """Settings of CorrelationFlow. Checked when made; an invalid value raises `CFlowError`.
+
+    Args:
+        method: "dense" (Alg. general_correlation_flow) or "keypoints" (Sec. CorrelationFlow-Keypoints).
+        pixel_sizes: side s of a BEV pixel in metres, one per scale, coarse to fine (Eq. 3d_to_bev).
+        num_history: h, number of sweeps before t that are used (Sec. leverage_past_pcs).
+        point_cloud_range: (x0, y0, z0, x1, y1, z1) in metres, both ends included, in the frame of t+1.
+        connectivity: 4 or 8, which neighbours join two pixels (Sec. clustering).
+        max_extent: d^max in metres: longer side of a component's bounding box above which it is eroded
+            and labelled again (Alg. clustering).
+        max_speed: m/s; a displacement longer than max_speed * elapsed time + one pixel is not searched.
+            None = the paper's search range, half of the cluster's bounding box.
+        sweep_interval: seconds between consecutive sweeps where time stamps are missing.
+        use_timestamps: divide a history estimate by elapsed time (in sweep intervals t -> t+1) instead of steps.
+        sectional_view: also estimate f_z in the X-Z view along the heading (Alg. scene_flow_1obj).
+        clustering: "components" (Alg. clustering) or "hdbscan".
+        labeling: engine of morphology and labelling, "sparse" (occupied pixels only) or "kornia" (dense image).
+        correlation: engine of the correlation, "fft" or "conv". Engines give the same bits.
+        densify: key points: "components" or "nearest".
+        patch_size: key points: side L of a descriptor, odd number of pixels.
+        ratio_threshold: key points: rho > 1 of the ratio test.
+        gate_radius: key points: farthest match, metres.
+        max_memory: bytes of working memory that the method may plan with; None = no limit.
+    """
+
+    method: str = "dense"
+    pixel_sizes: Tuple[float, ...] = (0.1,)
+    num_history: int = 0
+    point_cloud_range: Tuple[float, ...] = (-35.0, -35.0, -math.inf, 35.0, 35.0, math.inf)
+    connectivity: int = 8
+    max_extent: float = 20.0
+    max_speed: Optional[float] = None
+    sweep_interval: float = 0.1
+    use_timestamps: bool = False
+    sectional_view: bool = False
+    clustering: str = "components"
+    labeling: str = "sparse"
+    correlation: str = "fft"
+    densify: str = "components"
+    patch_size: int = 11
+    ratio_threshold: float = 1.1
+    gate_radius: float = 3.0
+    max_memory: Optional[int] = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "pixel_sizes", _floats("pixel_sizes", self.pixel_sizes))
+        object.__setattr__(self, "point_cloud_range", _floats("point_cloud_range", self.point_cloud_range))
+        _one_of("method", self.method, METHODS)
+        _one_of("clustering", self.clustering, CLUSTERINGS)
+        _one_of("labeling", self.labeling, LABELINGS)
+        _one_of("correlation", self.correlation, CORRELATIONS)
+        _one_of("densify", self.densify, DENSIFIERS)
+        _one_of("connectivity", self.connectivity, (4, 8))
+        sizes = self.pixel_sizes
+        if not sizes or any(not 0 < s < math.inf for s in sizes) or any(a <= b for a, b in zip(sizes, sizes[1:])):
+            raise CFlowError(
+                f"pixel_sizes={sizes}: give at least one positive size in metres, strictly coarse to fine, "
+                "for example (0.4, 0.2, 0.1)"
+            )
+        box = self.point_cloud_range
+        if len(box) != 6 or any(math.isnan(v) for v in box) or any(a >= b for a, b in zip(box[:3], box[3:])):
+            raise CFlowError(
+                f"point_cloud_range={box}: give (x0, y0, z0, x1, y1, z1) in metres with x0 < x1, y0 < y1, z0 < z1"
+            )
+        if any(math.isinf(v) for v in (box[0], box[1], box[3], box[4])):
+            raise CFlowError(f"point_cloud_range={box}: x and y bounds must be finite; only z may be infinite")
+        for name in ("num_history", "patch_size"):
+            _whole_number(name, getattr(self, name))
+        if self.patch_size % 2 == 0:
+            raise CFlowError(f"patch_size={self.patch_size}: give an odd number of pixels, for example 11")
+        for name in ("max_extent", "sweep_interval", "gate_radius"):
+            _positive(name, getattr(self, name))
+        if self.max_speed is not None:
+            _positive("max_speed", self.max_speed)
+        if self.max_memory is not None:
+            _positive("max_memory", self.max_memory)
+        if not self.ratio_threshold >= 1:
+            raise CFlowError(f"ratio_threshold={self.ratio_threshold}: give a number of at least 1, for example 1.1")
+
+    def replace(self, **overrides: Any) -> Config:
+        """A copy with some fields changed; an unknown field raises `CFlowError` that lists the fields."""
+        return replace(self, **_known(overrides))
+
+    def as_dict(self) -> Dict[str, Any]:
+        """Plain dictionary, field by field, ready for YAML or JSON."""
+        return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self).items()}
+
+
+PRESETS: Dict[str, Config] = {
+    # The paper's base row: s = 0.1 m, BEV only, 70 m x 70 m, no history.
+    "paper": Config(),
+    "default": Config(),
+}
+
+
+def make_config(preset: str = "default", **overrides: Any) -> Config:
+    """The settings of a preset with some fields replaced.
+
+    Args:
+        preset: "default" or "paper".
+        **overrides: any field of `Config`; `pixel_size=0.1` is short for `pixel_sizes=(0.1,)`.
+
+    Returns:
+        A checked `Config`.
+
+    Raises:
+        CFlowError: unknown preset, unknown field (the message lists the fields), invalid value.
+    """
+    _one_of("preset", preset, tuple(PRESETS))
+    return PRESETS[preset].replace(**overrides)
+
+
+def _known(overrides: Dict[str, Any]) -> Dict[str, Any]:
+    overrides = dict(overrides)
+    if "pixel_size" in overrides:
+        if "pixel_sizes" in overrides:
+            raise CFlowError("pixel_size and pixel_sizes were both given: give one of them")
+        overrides["pixel_sizes"] = (overrides.pop("pixel_size"),)
+    names = [f.name for f in fields(Config)]
+    unknown = sorted(set(overrides) - set(names))
+    if unknown:
+        raise CFlowError(f"unknown setting {', '.join(unknown)}: the fields are {', '.join(['pixel_size', *names])}")
+    return overrides
+
+
+def _one_of(name: str, value: Any, allowed: Tuple[Any, ...]) -> None:
+    if isinstance(value, bool) or value not in allowed:
+        raise CFlowError(f"{name}={value!r}: give one of {', '.join(repr(a) for a in allowed)}")
+
+
+def _floats(name: str, values: Any) -> Tuple[float, ...]:
+    try:
+        return tuple(float(v) for v in values)
+    except (TypeError, ValueError):
+        raise CFlowError(f"{name}={values!r}: give a list of numbers") from None
+
+
+def _whole_number(name: str, value: Any) -> None:
+    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+        raise CFlowError(f"{name}={value!r}: give a whole number of at least 0")
+
+
+def _positive(name: str, value: Any) -> None:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not value > 0:
+        raise CFlowError(f"{name}={value!r}: give a positive number")

@@ -1,0 +1,60 @@
+"""The protocol every reader speaks: a log is an ordered, lazy set of sweeps; windows slide over it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Optional, Protocol, Sequence
+
+import numpy as np
+
+from cflow_torch.types import CFlowError, Sweep, Window
+
+
+@dataclass(frozen=True)
+class FlowLabels:
+    """Ground truth of one pair of sweeps, rows in the order of sweep t.
+
+    Args:
+        flow: (N, 3) float32, metres, TOTAL flow t -> t+1 (ego motion included), axes of ego1.
+        category: (N,) uint8, Argoverse 2 index 1 ... 30, 0 = background.
+        is_valid: (N,) bool, False where the truth is unknown.
+    """
+
+    flow: np.ndarray
+    category: np.ndarray
+    is_valid: np.ndarray
+
+
+class Log(Protocol):
+    """One drive.
+
+    Attributes:
+        log_id: name, safe as a folder name.
+        timestamps: sweep times in nanoseconds, ascending.
+    """
+
+    log_id: str
+    timestamps: Sequence[int]
+
+    def sweep(self, index: int) -> Sweep:
+        """Sweep number `index` with float32 points, float64 pose `T_world_ego`, ground mask, time."""
+
+    def labels(self, index: int) -> Optional[FlowLabels]:
+        """Truth of the pair (index, index + 1), None where the log has none."""
+
+
+def window(log: Log, index: int, num_history: int = 0) -> Window:
+    """The window whose flow is that of sweep `index` to sweep `index + 1`.
+
+    At the start of a log fewer than `num_history` sweeps exist; the window is then shorter.
+
+    Raises:
+        CFlowError: `index` has no successor, or a sweep cannot be read.
+    """
+    if not 0 <= index < len(log.timestamps) - 1:
+        raise CFlowError(
+            f"log {log.log_id} has {len(log.timestamps)} sweeps; a pair needs 0 <= index < "
+            f"{len(log.timestamps) - 1}, got {index}"
+        )
+    history = range(index - 1, max(index - 1 - num_history, -1), -1)
+    return Window(log.sweep(index), log.sweep(index + 1), tuple(log.sweep(i) for i in history))
