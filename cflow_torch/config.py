@@ -105,10 +105,10 @@ class Config:
         return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self).items()}
 
 
-PRESETS: Dict[str, Config] = {
-    # The paper's base row: s = 0.1 m, BEV only, 70 m x 70 m, no history.
-    "paper": Config(),
-    "default": Config(),
+# What each preset changes in `Config`'s defaults, which are the paper's base row: s = 0.1 m, BEV only, 70 m x 70 m, h = 0.
+PRESETS: Dict[str, Dict[str, Any]] = {
+    "paper": {},
+    "default": {},
 }
 
 
@@ -126,7 +126,7 @@ def make_config(preset: str = "default", **overrides: Any) -> Config:
         CFlowError: unknown preset, unknown field (the message lists the fields), invalid value.
     """
     _one_of("preset", preset, tuple(PRESETS))
-    return PRESETS[preset].replace(**overrides)
+    return Config(**PRESETS[preset]).replace(**overrides)
 
 
 def _known(overrides: Dict[str, Any]) -> Dict[str, Any]:

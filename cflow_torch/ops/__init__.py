@@ -1,0 +1,1 @@
+"""Batched tensor operations that know nothing of LiDAR."""

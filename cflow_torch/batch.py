@@ -1,0 +1,233 @@
+"""The door: windows of arrays or tensors -> one checked set of tensors in the frame of t+1."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, List, Sequence, Tuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from cflow_torch.config import Config
+from cflow_torch.ego import compensate, relative_transform
+from cflow_torch.grid import Grid
+from cflow_torch.types import CFlowError, FlowResult, Sweep, Window
+
+
+@dataclass(frozen=True)
+class Batch:
+    """All points that take part, of all sweeps of all windows.
+
+    Args:
+        positions: (3, P) float64, metres, frame of t+1 of the point's window.
+        image: (P,) int64, window * num_steps + step of each point; step 0 = sweep t+1, 1 = t, 2 = t-1, ...
+        num_windows: B.
+        num_steps: S, 1 + the longest list of source sweeps.
+        elapsed: (B, S) float64, sweep intervals from the sweep to t+1: the k that divides an estimate and
+            scales a warp (0 for step 0).
+        seconds: (B, S) float64, the same in seconds, for `max_speed`.
+        source: (Q,) int64, which of the P points belong to pc0.
+        row: (Q,) int64, their rows in the windows' pc0s put one after the other.
+        pose_flow: (R, 3) float32, of every row of every pc0.
+        num_rows: points of each window's pc0, adding up to R.
+    """
+
+    positions: Tensor
+    image: Tensor
+    num_windows: int
+    num_steps: int
+    elapsed: Tensor
+    seconds: Tensor
+    source: Tensor
+    row: Tensor
+    pose_flow: Tensor
+    num_rows: Tuple[int, ...]
+
+
+def make_batch(windows: Sequence[Window], config: Config, grid: Grid, device: Any = "auto") -> Batch:
+    """Check windows, bring every sweep into the frame of its t+1, drop what takes no part.
+
+    Args:
+        windows: B windows, at least one.
+        config: settings; `num_history` bounds the history that is accepted.
+        grid: the region; which of the scales it belongs to does not matter here.
+        device: "auto" = that of the tensors given, else a GPU if there is one, else the CPU.
+
+    Returns:
+        The batch, on one device.
+
+    Raises:
+        CFlowError: wrong shape or dtype, a transform that is not rigid, mixed devices, poses for some sweeps
+            only, more history than `num_history`.
+
+    Cost: linear in points; the only Python loop over sweeps, because they arrive as a list.
+    """
+    if isinstance(windows, (Window, Sweep)) or not all(isinstance(w, Window) for w in windows) or not windows:
+        raise CFlowError("give a non-empty list of cflow_torch.Window")
+    target_device = _device(windows, device)
+    kept = [_sources(window, config) for window in windows]
+    num_steps = 1 + max(len(sources) for sources in kept)
+    positions: List[Tensor] = []
+    image: List[Tensor] = []
+    source, row, pose_flow = [], [], []
+    num_points, num_rows = 0, []
+    elapsed = np.zeros((len(windows), num_steps))
+    seconds = np.zeros((len(windows), num_steps))
+    for index, (window, sources) in enumerate(zip(windows, kept)):
+        for step, (name, sweep, k) in enumerate([("pc1", window.pc1, 0), *sources]):
+            raw = _positions(sweep, name, target_device)
+            transform = None
+            if sweep.pose is not None and step > 0:
+                transform = relative_transform(window.pc1.pose, sweep.pose, f"pose of {name}")
+            moved = compensate(raw, transform)
+            takes_part = grid.contains(moved)
+            if sweep.is_ground is not None:
+                takes_part &= ~_ground(sweep, name, raw.shape[1], target_device)
+            chosen = takes_part.nonzero()[:, 0]
+            if step == 1:
+                source.append(num_points + torch.arange(chosen.numel(), device=target_device))
+                row.append(sum(num_rows) + chosen)
+                pose_flow.append(_pose_flow(raw, moved))
+                num_rows.append(raw.shape[1])
+            positions.append(moved[:, chosen])
+            image.append(torch.full_like(chosen, index * num_steps + step))
+            num_points += chosen.numel()
+            elapsed[index, step] = k
+            seconds[index, step] = k * config.sweep_interval
+    return Batch(
+        positions=torch.cat(positions, 1),
+        image=torch.cat(image),
+        num_windows=len(windows),
+        num_steps=num_steps,
+        elapsed=torch.as_tensor(elapsed, device=target_device),
+        seconds=torch.as_tensor(seconds, device=target_device),
+        source=torch.cat(source),
+        row=torch.cat(row),
+        pose_flow=torch.cat(pose_flow),
+        num_rows=tuple(num_rows),
+    )
+
+
+def split_results(batch: Batch, residual_flow: Tensor, cluster_id: Tensor, score: Tensor) -> List[FlowResult]:
+    """Values of the points of pc0 that took part -> one full-length result per window.
+
+    Args:
+        batch: as made by `make_batch`.
+        residual_flow: (3, Q) float64, metres, axes of ego1, rows of `batch.source`.
+        cluster_id: (Q,) int64, -1 = none.
+        score: (Q,) float32.
+
+    Returns:
+        B results; rows that took no part have flow 0, cluster -1, score 0, is_valid False.
+    """
+    num_rows = sum(batch.num_rows)
+    residual = batch.pose_flow.new_zeros((num_rows, 3))
+    residual[batch.row] = residual_flow.t().float()
+    cluster = torch.full((num_rows,), -1, dtype=torch.int64, device=residual.device)
+    cluster[batch.row] = cluster_id
+    scores = residual.new_zeros(num_rows)
+    scores[batch.row] = score
+    is_valid = torch.zeros(num_rows, dtype=torch.bool, device=residual.device)
+    is_valid[batch.row] = True
+    columns = (residual, batch.pose_flow, residual + batch.pose_flow, cluster, scores, is_valid)
+    return [FlowResult(*parts) for parts in zip(*(column.split(batch.num_rows) for column in columns))]
+
+
+def _sources(window: Window, config: Config) -> List[Tuple[str, Sweep, int]]:
+    """(name, sweep, steps to t+1) of pc0 and the history, repeated sweeps left out."""
+    if len(window.pch) > config.num_history:
+        raise CFlowError(
+            f"the window has {len(window.pch)} history sweeps but num_history={config.num_history}: "
+            "pass num_history, or fewer sweeps"
+        )
+    sweeps = [window.pc1, window.pc0, *window.pch]
+    with_pose = [sweep.pose is not None for sweep in sweeps]
+    if any(with_pose) and not all(with_pose):
+        raise CFlowError(
+            "some sweeps of the window have a pose and some have none: give the pose of every sweep, or of none "
+            "(then all points must already lie in the frame of t+1)"
+        )
+    names = ["pc0", *(f"pch{i + 1}" for i in range(len(window.pch)))]
+    sources: List[Tuple[str, Sweep, int]] = []
+    for step, (name, sweep) in enumerate(zip(names, sweeps[1:]), 1):
+        if not any(_same(sweep, other) for _, other, _ in sources):
+            sources.append((name, sweep, step))
+    return sources
+
+
+def _same(a: Sweep, b: Sweep) -> bool:
+    """Same points and same pose: harnesses repeat the first sweep of a scene where history is missing."""
+    if a is b:
+        return True
+    if tuple(a.points.shape) != tuple(b.points.shape) or (a.pose is None) != (b.pose is None):
+        return False
+    if a.pose is not None and not np.array_equal(_numpy(a.pose), _numpy(b.pose)):
+        return False
+    if isinstance(a.points, Tensor) and isinstance(b.points, Tensor):
+        return torch.equal(a.points, b.points)
+    return np.array_equal(_numpy(a.points), _numpy(b.points))
+
+
+def _numpy(array: Any) -> np.ndarray:
+    return array.detach().cpu().numpy() if isinstance(array, Tensor) else np.asarray(array)
+
+
+def _device(windows: Sequence[Window], device: Any) -> torch.device:
+    if not (isinstance(device, str) and device == "auto"):
+        try:
+            return torch.device(device)
+        except (RuntimeError, TypeError):
+            raise CFlowError(f"device={device!r}: give 'auto', 'cpu', 'cuda' or a torch.device") from None
+    found = {
+        array.device
+        for window in windows
+        for sweep in (window.pc0, window.pc1, *window.pch)
+        for array in (sweep.points, sweep.is_ground)
+        if isinstance(array, Tensor)
+    }
+    if len(found) > 1:
+        names = ", ".join(sorted(str(d) for d in found))
+        raise CFlowError(f"tensors lie on different devices ({names}): put them on one, or pass device=...")
+    if found:
+        return found.pop()
+    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+
+
+def _positions(sweep: Sweep, name: str, device: torch.device) -> Tensor:
+    """(3, N) float64 copy of the first three columns; the input is never modified."""
+    points = sweep.points
+    if not isinstance(points, (np.ndarray, Tensor)):
+        raise CFlowError(f"{name} is {type(points).__name__}: give a NumPy array or a torch tensor of shape (N, 3+)")
+    if points.ndim != 2 or points.shape[1] < 3:
+        raise CFlowError(f"{name} has shape {tuple(points.shape)}: give (N, 3+), columns x, y, z in metres")
+    if isinstance(points, Tensor):
+        if not points.is_floating_point():
+            raise CFlowError(f"{name} has dtype {points.dtype}: give floating-point metres")
+        return points.detach()[:, :3].to(device).t().to(torch.float64).contiguous()
+    if not np.issubdtype(points.dtype, np.floating):
+        raise CFlowError(f"{name} has dtype {points.dtype}: give floating-point metres")
+    return torch.from_numpy(np.array(points[:, :3].T, dtype=np.float64, order="C")).to(device)
+
+
+def _ground(sweep: Sweep, name: str, num_points: int, device: torch.device) -> Tensor:
+    mask = sweep.is_ground
+    if not isinstance(mask, (np.ndarray, Tensor)):
+        raise CFlowError(f"ground mask of {name} is {type(mask).__name__}: give a bool array or tensor of shape (N,)")
+    if tuple(mask.shape) != (num_points,):
+        raise CFlowError(f"ground mask of {name} has shape {tuple(mask.shape)}: give ({num_points},), one per point")
+    if mask.dtype not in (torch.bool, np.bool_):
+        raise CFlowError(f"ground mask of {name} has dtype {mask.dtype}: give bool, True = ground")
+    if isinstance(mask, np.ndarray):
+        mask = torch.from_numpy(np.array(mask))
+    return mask.to(device)
+
+
+def _pose_flow(raw: Tensor, moved: Tensor) -> Tensor:
+    """(N, 3) float32 T p - p; 0 for points that are not finite."""
+    if moved is raw:
+        return torch.zeros((raw.shape[1], 3), dtype=torch.float32, device=raw.device)
+    flow = (moved - raw).float()
+    flow[:, ~torch.isfinite(flow).all(0)] = 0
+    return flow.t().contiguous()
+

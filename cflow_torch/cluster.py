@@ -1,0 +1,161 @@
+"""Spatio-temporal clusters by connected components (Alg. clustering), all windows at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from cflow_torch.config import Config
+from cflow_torch.ops.labeling import connected_components, connected_components_kornia
+from cflow_torch.ops.morphology import dilate_3x3, dilate_3x3_kornia, erode_3x3, erode_3x3_kornia
+from cflow_torch.ops.segments import bounding_boxes
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """Occupied pixels of clusters.
+
+    Args:
+        cluster: (P,) int64, cluster of each pixel.
+        step: (P,) int64, sweep it was seen in: 0 = t+1, 1 = t, ...
+        row, col: (P,) int64, place in the image of its window.
+    """
+
+    cluster: Tensor
+    step: Tensor
+    row: Tensor
+    col: Tensor
+
+
+@dataclass(frozen=True)
+class Clusters:
+    """Clusters that have pixels at t+1 and before, numbered by window, then by first pixel in raster order.
+
+    Args:
+        window: (M,) int64, window of each cluster, ascending.
+        first: (M, 2) int64, top-left (row, col) of the bounding box over all sweeps.
+        size: (M, 2) int64, its height and width.
+        pixels: every occupied pixel of every sweep that belongs to a cluster.
+        of_pixel: (B * H * W,) int64, cluster of each pixel, -1 = none.
+    """
+
+    window: Tensor
+    first: Tensor
+    size: Tensor
+    pixels: Pixels
+    of_pixel: Tensor
+
+    def id_in_window(self, cluster: Tensor) -> Tensor:
+        """Number of a cluster counted from 0 in its own window; -1 stays -1.
+
+        Args:
+            cluster: (N,) int64, clusters of the batch, -1 = none.
+
+        Returns:
+            (N,) int64.
+        """
+        start = torch.searchsorted(self.window, self.window)  # first cluster of the same window
+        own = torch.arange(self.window.numel(), device=start.device) - start
+        return torch.cat((own, own.new_full((1,), -1)))[cluster]  # index -1 reads the -1 at the end
+
+
+def cluster(occupancy: Tensor, pixel_size: float, config: Config) -> Clusters:
+    """Alg. clustering, from the projection of the aggregated sweeps on: dilate, label, validate by size.
+
+    Args:
+        occupancy: (B, S, H, W) bool, image of every sweep; index 0 of S is sweep t+1.
+        pixel_size: s, metres.
+        config: `connectivity`, `max_extent` (d^max), `labeling`.
+
+    Returns:
+        The clusters of all B windows.
+
+    Convention:
+        Clusters never join across windows. Both engines give the same clusters.
+
+    Source: Alg. clustering.
+    """
+    num_windows, num_steps, height, width = occupancy.shape
+    aggregated = occupancy[:, 0].clone()
+    for step in range(1, num_steps):
+        aggregated |= occupancy[:, step]
+    pixels = aggregated.flatten().nonzero()[:, 0]
+    component = _label_dilated(aggregated, pixels, config)
+    component = _split_oversized(aggregated, pixels, component, pixel_size, config)
+
+    # What is seen where: every sweep's pixels find their component.
+    component_of_pixel = pixels.new_full((aggregated.numel(),), -1)
+    component_of_pixel[pixels] = component
+    seen = occupancy.flatten().nonzero()[:, 0]
+    image, raster = seen // (height * width), seen % (height * width)
+    window, step = image // num_steps, image % num_steps
+    seen_component = component_of_pixel[window * (height * width) + raster]
+
+    # A cluster needs pixels at t+1 and before. Components are named by their first pixel: raster order is theirs.
+    is_target = torch.zeros_like(pixels, dtype=torch.bool)
+    is_source = torch.zeros_like(is_target)
+    is_target[seen_component[step == 0]] = True
+    is_source[seen_component[step > 0]] = True
+    live = (is_target & is_source).nonzero()[:, 0]
+    number = torch.full_like(pixels, -1)
+    number[live] = torch.arange(live.numel(), device=live.device)
+
+    cluster_of_pixel = number[component]
+    inside = (cluster_of_pixel >= 0).nonzero()[:, 0]
+    place = pixels[inside] % (height * width)
+    first, size = bounding_boxes(place // width, place % width, cluster_of_pixel[inside], live.numel())
+    component_of_pixel[pixels] = cluster_of_pixel
+    seen_cluster = number[seen_component]
+    kept = (seen_cluster >= 0).nonzero()[:, 0]
+    return Clusters(
+        window=pixels[live] // (height * width),
+        first=first,
+        size=size,
+        pixels=Pixels(seen_cluster[kept], step[kept], raster[kept] // width, raster[kept] % width),
+        of_pixel=component_of_pixel,
+    )
+
+
+def _label_dilated(image: Tensor, pixels: Tensor, config: Config) -> Tensor:
+    """Component of each occupied pixel after a 3 x 3 dilation."""
+    if config.labeling == "kornia":
+        return connected_components_kornia(dilate_3x3_kornia(image), pixels, config.connectivity)
+    return connected_components(image, pixels, config.connectivity, reach=3)
+
+
+def _split_oversized(image: Tensor, pixels: Tensor, component: Tensor, pixel_size: float, config: Config) -> Tensor:
+    """Erode components whose bounding box is longer than d^max and label what is left of them.
+
+    All oversized components are eroded together: components of a dilated image do not share a 3 x 3 neighbourhood
+    that lies in their union, so none sees another.
+    """
+    _, height, width = image.shape
+    place = pixels % (height * width)
+    roots, segment = torch.unique(component, return_inverse=True)
+    first, size = bounding_boxes(place // width, place % width, segment, roots.numel())
+    border = torch.tensor([height - 1, width - 1], device=pixels.device)
+    last = torch.minimum(first + size, border)  # the dilation adds a pixel on every side, cut off at the border
+    extent = (last - (first - 1).clamp(min=0) + 1).amax(1) if roots.numel() else roots
+    oversized = (extent.double() * pixel_size > config.max_extent)[segment].nonzero()[:, 0]
+    if oversized.numel() == 0:
+        return component
+
+    alone = torch.zeros_like(image)
+    alone.view(-1)[pixels[oversized]] = True
+    if config.labeling == "kornia":
+        closed = erode_3x3_kornia(dilate_3x3_kornia(alone))
+        part = connected_components_kornia(closed, pixels[oversized], config.connectivity)
+    else:
+        closed = erode_3x3(dilate_3x3(alone))
+        closed_pixels = closed.flatten().nonzero()[:, 0]
+        part_of_pixel = torch.empty_like(closed, dtype=torch.int64).view(-1)
+        part_of_pixel[closed_pixels] = connected_components(closed, closed_pixels, config.connectivity, reach=1)
+        part = part_of_pixel[pixels[oversized]]
+        earliest = pixels.new_full((closed_pixels.numel(),), oversized.numel())
+        positions = torch.arange(oversized.numel(), device=pixels.device)
+        part = earliest.scatter_reduce_(0, part, positions, "amin")[part]
+    component = component.clone()
+    component[oversized] = oversized[part]
+    return component

@@ -1,0 +1,92 @@
+"""Ego motion: poses -> everything in the frame of t+1 (Eq. def_scene_flow). Float64 throughout."""
+
+from __future__ import annotations
+
+from typing import Any, Optional
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from cflow_torch.types import CFlowError
+
+# How far R R^T may be from the identity. Poses stored in float32 are within 1e-6.
+_ORTHOGONALITY = 1e-3
+
+
+def rigid_transform(matrix: Any, name: str) -> np.ndarray:
+    """A checked 4 x 4 rigid transform in float64.
+
+    Args:
+        matrix: (4, 4) array or tensor.
+        name: what to call it in an error, for example "T_ego1_ego0".
+
+    Returns:
+        (4, 4) float64.
+
+    Raises:
+        CFlowError: wrong shape, not finite, not a rotation with a translation.
+    """
+    if isinstance(matrix, Tensor):
+        matrix = matrix.detach().cpu().numpy()
+    try:
+        result = np.asarray(matrix, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise CFlowError(f"{name} is {type(matrix).__name__}: give a (4, 4) matrix of numbers") from None
+    if result.shape != (4, 4):
+        raise CFlowError(f"{name} has shape {result.shape}: give one (4, 4) matrix (no batch dimension)")
+    if not np.isfinite(result).all():
+        raise CFlowError(f"{name} holds NaN or infinite values: give a finite rigid transform")
+    rotation = result[:3, :3]
+    error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if error > _ORTHOGONALITY or np.linalg.det(rotation) < 0 or not np.allclose(result[3], (0, 0, 0, 1)):
+        raise CFlowError(
+            f"{name} is not rigid (|R R^T - I| up to {error:.3g}, det {np.linalg.det(rotation):.3g}, last row "
+            f"{result[3].tolist()}): give [R t; 0 0 0 1] with a rotation R, row-major"
+        )
+    return result
+
+
+def relative_transform(pose1: Any, pose: Any, name: str = "pose") -> np.ndarray:
+    """T_ego1_ego = inv(T_world_ego1) T_world_ego.
+
+    Args:
+        pose1: (4, 4) `T_world_ego1`, pose of sweep t+1.
+        pose: (4, 4) `T_world_ego`, pose of another sweep.
+        name: what to call `pose` in an error.
+
+    Returns:
+        (4, 4) float64.
+
+    Raises:
+        CFlowError: a pose is not a finite rigid transform.
+    """
+    return np.linalg.inv(rigid_transform(pose1, "pose1")) @ rigid_transform(pose, name)
+
+
+def compensate(positions: Tensor, T_ego1_ego: Optional[np.ndarray]) -> Tensor:
+    """Positions in the frame of t+1.
+
+    Args:
+        positions: (3, N) float64, metres, in the ego frame of their sweep; rows x, y, z.
+        T_ego1_ego: (4, 4) float64, None = already in the frame of t+1.
+
+    Returns:
+        (3, N) float64.
+
+    Convention:
+        ((R0 x + R1 y) + R2 z) + t with one rounding per operation, no matrix product: the same bits
+        on every device.
+
+    Source: Eq. def_scene_flow.
+    """
+    if T_ego1_ego is None:
+        return positions
+    rotation = torch.as_tensor(T_ego1_ego[:3, :3], dtype=torch.float64, device=positions.device)
+    translation = torch.as_tensor(T_ego1_ego[:3, 3], dtype=torch.float64, device=positions.device)
+    x, y, z = positions
+    result = rotation[:, 0:1] * x
+    result += rotation[:, 1:2] * y
+    result += rotation[:, 2:3] * z
+    result += translation[:, None]
+    return result

@@ -1,0 +1,99 @@
+"""Points <-> pixels: the bird's-eye-view grid and its occupancy images (Eq. 3d_to_bev, bev_dims)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Tuple
+
+import torch
+from torch import Tensor
+
+from cflow_torch.types import CFlowError
+
+# Pixel keys and labels of all images of a batch are int64, but nobody wants to wait for more pixels than this.
+_MOST_PIXELS = 2**31
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A BEV grid of square pixels; row from y, column from x.
+
+    Args:
+        pixel_size: s, metres.
+        lower: (x0, y0, z0), metres, lower end of the region, frame of t+1.
+        upper: (x1, y1, z1), upper end; both ends belong to the region.
+    """
+
+    pixel_size: float
+    lower: Tuple[float, float, float]
+    upper: Tuple[float, float, float]
+
+    def __post_init__(self) -> None:
+        if self.height * self.width > _MOST_PIXELS:
+            raise CFlowError(
+                f"a region of {self.width} x {self.height} pixels of {self.pixel_size} m is too large "
+                f"({self.width * self.height:.3g} pixels, at most {_MOST_PIXELS:.3g}): "
+                "give a smaller point_cloud_range or larger pixel_sizes"
+            )
+
+    @property
+    def height(self) -> int:
+        """H of Eq. bev_dims."""
+        return math.floor((self.upper[1] - self.lower[1]) / self.pixel_size) + 1
+
+    @property
+    def width(self) -> int:
+        """W of Eq. bev_dims."""
+        return math.floor((self.upper[0] - self.lower[0]) / self.pixel_size) + 1
+
+    def contains(self, positions: Tensor) -> Tensor:
+        """Which positions are finite and inside the region, both ends included.
+
+        Args:
+            positions: (3, N) float64, metres, frame of t+1.
+
+        Returns:
+            (N,) bool.
+        """
+        x, y, z = positions
+        inside = (x >= self.lower[0]) & (x <= self.upper[0]) & (y >= self.lower[1]) & (y <= self.upper[1])
+        inside &= torch.isfinite(z)  # NaN in x or y fails the comparisons
+        if math.isfinite(self.lower[2]):
+            inside &= z >= self.lower[2]
+        if math.isfinite(self.upper[2]):
+            inside &= z <= self.upper[2]
+        return inside
+
+    def pixel(self, positions: Tensor) -> Tensor:
+        """Raster index row * W + col of each position (Eq. 3d_to_bev).
+
+        Args:
+            positions: (3, N) float64, metres, frame of t+1, all inside the region.
+
+        Returns:
+            (N,) int64.
+
+        Convention:
+            floor((p - p_lower) / s) with a true division in float64: the divisor is a tensor because a GPU
+            multiplies by the reciprocal of a plain number, which rounds differently.
+        """
+        size = torch.full((), self.pixel_size, dtype=positions.dtype, device=positions.device)
+        col = torch.floor((positions[0] - self.lower[0]) / size).long()
+        row = torch.floor((positions[1] - self.lower[1]) / size).long()
+        return row * self.width + col
+
+    def occupancy(self, image: Tensor, pixel: Tensor, num_images: int) -> Tensor:
+        """Binary images that are set where a point falls.
+
+        Args:
+            image: (N,) int64, image of each point.
+            pixel: (N,) int64, raster index of each point.
+            num_images: B.
+
+        Returns:
+            (B, H, W) bool.
+        """
+        occupancy = torch.zeros(num_images * self.height * self.width, dtype=torch.bool, device=pixel.device)
+        occupancy[image * (self.height * self.width) + pixel] = True
+        return occupancy.view(num_images, self.height, self.width)

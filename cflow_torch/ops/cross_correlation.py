@@ -1,0 +1,87 @@
+"""Cross-correlation of many pairs of small binary images at once, as exact integer counts.
+
+The images hold zeros and ones, so every correlation value is a count. Whatever computes it, the result is rounded to
+the integer; engines, devices and batch sizes then agree to the last bit.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Tuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+# Rounding is safe while the error of a float32 FFT stays below 1/2. Its error is at most about
+# eps * log2(points) * |template| * |target|; the factor is a margin on top.
+_FFT_ERROR_MARGIN = 8.0
+_FFT_LARGEST_ERROR = 0.25
+
+
+def cross_correlate(template: Tensor, target: Tensor, target_of_job: Tensor, engine: str = "fft") -> Tensor:
+    """Number of coinciding pixels for every shift of a template over a target (numerator of Eq. norm_correlation).
+
+    Args:
+        template: (J, H, W) bool.
+        target: (N, H, W) bool.
+        target_of_job: (J,) int64, target of each template; a target's spectrum serves all its templates.
+        engine: "fft" or "conv" (conv2d).
+
+    Returns:
+        (J, 2 (H // 2) + 1, 2 (W // 2) + 1) int64; element [j, dy + H // 2, dx + W // 2] is
+        sum over p of template[j](p) * target(p + (dy, dx)), zero outside the images.
+
+    Cost: "fft" H W log(H W) per template and target; "conv" (H W)^2 per template.
+    """
+    return _by_fft(template, target, target_of_job) if engine == "fft" else _by_conv(template, target, target_of_job)
+
+
+def fft_length(size: int) -> int:
+    """Transform length for images of `size` pixels and shifts of up to size // 2, with factors 2, 3 and 5 only.
+
+    Shifts of up to size // 2 need size + size // 2 samples: what wraps around lands beyond them.
+    """
+    length = size + size // 2
+    while _odd_part(length) != 1:
+        length += 1
+    return length
+
+
+def _by_fft(template: Tensor, target: Tensor, target_of_job: Tensor) -> Tensor:
+    height, width = template.shape[1:]
+    shape = (fft_length(height), fft_length(width))
+    dtype = _fft_dtype(template, target, shape)
+    spectrum = torch.fft.rfft2(template.to(dtype), s=shape).conj()
+    product = spectrum * torch.fft.rfft2(target.to(dtype), s=shape)[target_of_job]
+    counts = torch.fft.irfft2(product, s=shape)
+    reach_y, reach_x = height // 2, width // 2
+    counts = torch.cat((counts[:, shape[0] - reach_y :], counts[:, : reach_y + 1]), 1)
+    counts = torch.cat((counts[:, :, shape[1] - reach_x :], counts[:, :, : reach_x + 1]), 2)
+    return counts.round_().long()
+
+
+def _fft_dtype(template: Tensor, target: Tensor, shape: Tuple[int, int]) -> torch.dtype:
+    # The number of pixels bounds the norms without looking at the images (no synchronisation).
+    pixels = template.shape[1] * template.shape[2]
+    error = _FFT_ERROR_MARGIN * torch.finfo(torch.float32).eps * math.log2(shape[0] * shape[1]) * pixels
+    if error <= _FFT_LARGEST_ERROR:
+        return torch.float32
+    largest = [float(images.sum((1, 2)).max()) if images.numel() else 0.0 for images in (template, target)]
+    return torch.float32 if error / pixels * math.sqrt(largest[0] * largest[1]) <= _FFT_LARGEST_ERROR else torch.float64
+
+
+def _by_conv(template: Tensor, target: Tensor, target_of_job: Tensor) -> Tensor:
+    num_jobs, height, width = template.shape
+    pad = (width // 2, width // 2, height // 2, height // 2)
+    padded = F.pad(target.float(), pad)[target_of_job]
+    # One group per template. Sums of products of zeros and ones: exact in float32 up to 2^24, also with TF32.
+    counts = F.conv2d(padded[None], template.float()[:, None], groups=num_jobs)[0]
+    return counts.round().long()
+
+
+def _odd_part(number: int) -> int:
+    for prime in (2, 3, 5):
+        while number % prime == 0:
+            number //= prime
+    return number

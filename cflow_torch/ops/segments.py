@@ -1,0 +1,71 @@
+"""Reductions over segments (groups of rows that share an index) and batched medians."""
+
+from __future__ import annotations
+
+from typing import Tuple
+
+import torch
+from torch import Tensor
+
+
+def segment_amin(values: Tensor, index: Tensor, num_segments: int, empty: int) -> Tensor:
+    """Smallest value of each segment.
+
+    Args:
+        values: (N,) integers.
+        index: (N,) int64, segment of each value, 0 ... num_segments - 1.
+        num_segments: S.
+        empty: result of a segment without values; must not be smaller than any value.
+
+    Returns:
+        (S,), dtype of `values`.
+    """
+    return values.new_full((num_segments,), empty).scatter_reduce_(0, index, values, "amin")
+
+
+def segment_amax(values: Tensor, index: Tensor, num_segments: int, empty: int) -> Tensor:
+    """Largest value of each segment; the counterpart of `segment_amin`."""
+    return values.new_full((num_segments,), empty).scatter_reduce_(0, index, values, "amax")
+
+
+def bounding_boxes(rows: Tensor, cols: Tensor, index: Tensor, num_segments: int) -> Tuple[Tensor, Tensor]:
+    """Bounding box of the pixels of each segment.
+
+    Args:
+        rows, cols: (N,) int64 pixel coordinates.
+        index: (N,) int64 segment of each pixel.
+        num_segments: S; every segment needs at least one pixel.
+
+    Returns:
+        first: (S, 2) int64, smallest (row, col).
+        size: (S, 2) int64, height and width.
+    """
+    if num_segments == 0:
+        return rows.new_zeros((0, 2)), rows.new_zeros((0, 2))
+    pixels = torch.stack((rows, cols), 1)
+    segment = index[:, None].expand(-1, 2)
+    limit = torch.iinfo(pixels.dtype)
+    first = pixels.new_full((num_segments, 2), limit.max).scatter_reduce_(0, segment, pixels, "amin")
+    last = pixels.new_full((num_segments, 2), limit.min).scatter_reduce_(0, segment, pixels, "amax")
+    return first, last - first + 1
+
+
+def masked_median(values: Tensor, mask: Tensor) -> Tensor:
+    """Median of the masked entries of each row.
+
+    Args:
+        values: (M, K) float.
+        mask: (M, K) bool, True = counts.
+
+    Returns:
+        (M,) float; 0 for a row without entries.
+
+    Convention:
+        Even count: mean of the middle two, (a + b) / 2.
+    """
+    ordered = values.masked_fill(~mask, float("inf")).sort(dim=1).values
+    count = mask.sum(dim=1)
+    low = ordered.gather(1, ((count - 1).clamp(min=0) // 2)[:, None])[:, 0]
+    high = ordered.gather(1, (count // 2).clamp(max=values.shape[1] - 1)[:, None])[:, 0]
+    median = torch.where(count % 2 == 1, low, (low + high) / 2)
+    return torch.where(count > 0, median, torch.zeros_like(median))

@@ -1,0 +1,68 @@
+"""Many estimates of a cluster's motion -> one (Sec. leverage_past_pcs)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from cflow_torch.ops.segments import masked_median
+
+
+def pool(estimates: Tensor, available: Tensor) -> Tensor:
+    """Median of the magnitudes and of the orientations of several estimates, separately.
+
+    Args:
+        estimates: (M, K, 3) float64, metres per sweep interval, nearest sweep first; z is pooled on its own.
+        available: (M, K) bool, False = the cluster is empty in that sweep; at least one per row is True.
+
+    Returns:
+        (M, 3) float64.
+
+    Convention:
+        A single estimate is returned as it is. Even counts: mean of the middle two (for orientations: the direction
+        half-way between them). Orientations are ordered by their angle from the circular mean; an estimate of
+        length zero has a magnitude but no orientation. No trigonometric function is used: additions, products,
+        divisions and square roots round the same way on every device.
+
+    Source: Sec. leverage_past_pcs; the paper leaves the even count and the angular median open.
+    """
+    num_estimates = estimates.shape[1]
+    first = available.int().argmax(1)
+    single = estimates[torch.arange(len(estimates), device=estimates.device), first]
+    if num_estimates == 1:
+        return single
+    x, y, z = estimates.masked_fill(~available[:, :, None], 0.0).unbind(2)
+    magnitude = (x * x + y * y).sqrt()
+    oriented = available & (magnitude > 0)
+    safe = torch.where(oriented, magnitude, torch.ones_like(magnitude))
+    unit = torch.stack((x / safe, y / safe), 2).masked_fill(~oriented[:, :, None], 0.0)
+    direction = _angular_median(unit, oriented)
+    length = masked_median(magnitude, available)
+    pooled = torch.cat((length[:, None] * direction, masked_median(z, available)[:, None]), 1)
+    return torch.where(available.sum(1, keepdim=True) == 1, single, pooled)
+
+
+def _angular_median(unit: Tensor, oriented: Tensor) -> Tensor:
+    """(M, 2) direction in the middle of (M, K, 2) unit vectors, of which only the `oriented` count; 0 if none does."""
+    rows = torch.arange(len(unit), device=unit.device)
+    mean = torch.zeros_like(unit[:, 0])
+    for step in range(unit.shape[1]):  # one after the other: the order of a float sum is part of the result
+        mean = mean + unit[:, step]
+    nearest = unit[rows, oriented.int().argmax(1)]
+    mean = torch.where((mean == 0).all(1, keepdim=True), nearest, mean)
+
+    along = mean[:, None, 0] * unit[..., 0] + mean[:, None, 1] * unit[..., 1]
+    across = mean[:, None, 0] * unit[..., 1] - mean[:, None, 1] * unit[..., 0]
+    total = along.abs() + across.abs()
+    slope = torch.where(total > 0, across / torch.where(total > 0, total, torch.ones_like(total)), total)
+    behind = torch.where(across >= 0, 2 - slope, -2 - slope)
+    angle = torch.where(along >= 0, slope, behind)  # grows with the angle from the mean, -2 ... 2
+    order = angle.masked_fill(~oriented, float("inf")).sort(dim=1, stable=True).indices
+    count = oriented.sum(1)
+    low = unit[rows, order[rows, (count - 1).clamp(min=0) // 2]]
+    high = unit[rows, order[rows, (count // 2).clamp(max=unit.shape[1] - 1)]]
+    both = low + high
+    norm = (both[:, 0] * both[:, 0] + both[:, 1] * both[:, 1]).sqrt()[:, None]
+    halfway = torch.where(norm > 0, both / torch.where(norm > 0, norm, torch.ones_like(norm)), low)
+    middle = torch.where((count % 2 == 1)[:, None], low, halfway)
+    return torch.where((count > 0)[:, None], middle, torch.zeros_like(middle))
