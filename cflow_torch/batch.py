@@ -17,36 +17,34 @@ from cflow_torch.types import CFlowError, FlowResult, Sweep, Window
 
 @dataclass(frozen=True)
 class Batch:
-    """All points that take part, of all sweeps of all windows.
+    """All points of all sweeps of all windows, one after the other: window by window, t+1, t, t-1, ... in each.
 
     Args:
         positions: (3, P) float64, metres, frame of t+1 of the point's window.
+        takes_part: (P,) bool, finite, not ground, inside the region.
         image: (P,) int64, window * num_steps + step of each point; step 0 = sweep t+1, 1 = t, 2 = t-1, ...
         num_windows: B.
         num_steps: S, 1 + the longest list of source sweeps.
         elapsed: (B, S) float64, sweep intervals from the sweep to t+1: the k that divides an estimate and
             scales a warp (0 for step 0).
         seconds: (B, S) float64, the same in seconds, for `max_speed`.
-        source: (Q,) int64, which of the P points belong to pc0.
-        row: (Q,) int64, their rows in the windows' pc0s put one after the other.
-        pose_flow: (R, 3) float32, of every row of every pc0.
-        num_rows: points of each window's pc0, adding up to R.
+        sources: where the points of each window's pc0 lie among the P points.
+        pose_flow: (N, 3) float32 of each window's pc0.
     """
 
     positions: Tensor
+    takes_part: Tensor
     image: Tensor
     num_windows: int
     num_steps: int
     elapsed: Tensor
     seconds: Tensor
-    source: Tensor
-    row: Tensor
-    pose_flow: Tensor
-    num_rows: Tuple[int, ...]
+    sources: Tuple[slice, ...]
+    pose_flow: Tuple[Tensor, ...]
 
 
 def make_batch(windows: Sequence[Window], config: Config, grid: Grid, device: Any = "auto") -> Batch:
-    """Check windows, bring every sweep into the frame of its t+1, drop what takes no part.
+    """Check windows, bring every sweep into the frame of its t+1, mark what takes part.
 
     Args:
         windows: B windows, at least one.
@@ -65,73 +63,64 @@ def make_batch(windows: Sequence[Window], config: Config, grid: Grid, device: An
     """
     if isinstance(windows, (Window, Sweep)) or not all(isinstance(w, Window) for w in windows) or not windows:
         raise CFlowError("give a non-empty list of cflow_torch.Window")
-    target_device = _device(windows, device)
+    chosen_device = _device(windows, device)
     kept = [_sources(window, config) for window in windows]
     num_steps = 1 + max(len(sources) for sources in kept)
-    positions: List[Tensor] = []
-    image: List[Tensor] = []
-    source, row, pose_flow = [], [], []
-    num_points, num_rows = 0, []
+    positions, takes_part, sources, pose_flow = [], [], [], []
+    image, count, num_points = [], [], 0
     elapsed = np.zeros((len(windows), num_steps))
-    seconds = np.zeros((len(windows), num_steps))
-    for index, (window, sources) in enumerate(zip(windows, kept)):
-        for step, (name, sweep, k) in enumerate([("pc1", window.pc1, 0), *sources]):
-            raw = _positions(sweep, name, target_device)
+    for index, (window, source_sweeps) in enumerate(zip(windows, kept)):
+        for step, (name, sweep, k) in enumerate([("pc1", window.pc1, 0), *source_sweeps]):
+            raw = _positions(sweep, name, chosen_device)
             transform = None
             if sweep.pose is not None and step > 0:
                 transform = relative_transform(window.pc1.pose, sweep.pose, f"pose of {name}")
             moved = compensate(raw, transform)
-            takes_part = grid.contains(moved)
+            inside = grid.contains(moved)
             if sweep.is_ground is not None:
-                takes_part &= ~_ground(sweep, name, raw.shape[1], target_device)
-            chosen = takes_part.nonzero()[:, 0]
+                inside &= ~_ground(sweep, name, raw.shape[1], chosen_device)
             if step == 1:
-                source.append(num_points + torch.arange(chosen.numel(), device=target_device))
-                row.append(sum(num_rows) + chosen)
+                sources.append(slice(num_points, num_points + raw.shape[1]))
                 pose_flow.append(_pose_flow(raw, moved))
-                num_rows.append(raw.shape[1])
-            positions.append(moved[:, chosen])
-            image.append(torch.full_like(chosen, index * num_steps + step))
-            num_points += chosen.numel()
+            positions.append(moved)
+            takes_part.append(inside)
+            image.append(index * num_steps + step)
+            count.append(raw.shape[1])
+            num_points += raw.shape[1]
             elapsed[index, step] = k
-            seconds[index, step] = k * config.sweep_interval
     return Batch(
         positions=torch.cat(positions, 1),
-        image=torch.cat(image),
+        takes_part=torch.cat(takes_part),
+        image=torch.repeat_interleave(
+            torch.tensor(image, device=chosen_device), torch.tensor(count, device=chosen_device), output_size=num_points
+        ),
         num_windows=len(windows),
         num_steps=num_steps,
-        elapsed=torch.as_tensor(elapsed, device=target_device),
-        seconds=torch.as_tensor(seconds, device=target_device),
-        source=torch.cat(source),
-        row=torch.cat(row),
-        pose_flow=torch.cat(pose_flow),
-        num_rows=tuple(num_rows),
+        elapsed=torch.as_tensor(elapsed, device=chosen_device),
+        seconds=torch.as_tensor(elapsed * config.sweep_interval, device=chosen_device),
+        sources=tuple(sources),
+        pose_flow=tuple(pose_flow),
     )
 
 
 def split_results(batch: Batch, residual_flow: Tensor, cluster_id: Tensor, score: Tensor) -> List[FlowResult]:
-    """Values of the points of pc0 that took part -> one full-length result per window.
+    """Values of all points -> one result per window, for the points of its pc0.
 
     Args:
         batch: as made by `make_batch`.
-        residual_flow: (3, Q) float64, metres, axes of ego1, rows of `batch.source`.
-        cluster_id: (Q,) int64, -1 = none.
-        score: (Q,) float32.
+        residual_flow: (P, 3) float64, metres, axes of ego1.
+        cluster_id: (P,) int64, -1 = none.
+        score: (P,) float32.
 
     Returns:
-        B results; rows that took no part have flow 0, cluster -1, score 0, is_valid False.
+        B results.
     """
-    num_rows = sum(batch.num_rows)
-    residual = batch.pose_flow.new_zeros((num_rows, 3))
-    residual[batch.row] = residual_flow.t().float()
-    cluster = torch.full((num_rows,), -1, dtype=torch.int64, device=residual.device)
-    cluster[batch.row] = cluster_id
-    scores = residual.new_zeros(num_rows)
-    scores[batch.row] = score
-    is_valid = torch.zeros(num_rows, dtype=torch.bool, device=residual.device)
-    is_valid[batch.row] = True
-    columns = (residual, batch.pose_flow, residual + batch.pose_flow, cluster, scores, is_valid)
-    return [FlowResult(*parts) for parts in zip(*(column.split(batch.num_rows) for column in columns))]
+    results = []
+    for rows, pose_flow in zip(batch.sources, batch.pose_flow):
+        residual = residual_flow[rows].float()
+        flow = residual + pose_flow
+        results.append(FlowResult(residual, pose_flow, flow, cluster_id[rows], score[rows], batch.takes_part[rows]))
+    return results
 
 
 def _sources(window: Window, config: Config) -> List[Tuple[str, Sweep, int]]:

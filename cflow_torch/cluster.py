@@ -38,7 +38,8 @@ class Clusters:
         first: (M, 2) int64, top-left (row, col) of the bounding box over all sweeps.
         size: (M, 2) int64, its height and width.
         pixels: every occupied pixel of every sweep that belongs to a cluster.
-        of_pixel: (B * H * W,) int64, cluster of each pixel, -1 = none.
+        of_pixel: (B * S * H * W + 1,) int64, cluster of each occupied pixel of each sweep, M = none; the last
+            entry, M, is for points that are nowhere. Undefined for empty pixels.
     """
 
     window: Tensor
@@ -47,18 +48,10 @@ class Clusters:
     pixels: Pixels
     of_pixel: Tensor
 
-    def id_in_window(self, cluster: Tensor) -> Tensor:
-        """Number of a cluster counted from 0 in its own window; -1 stays -1.
-
-        Args:
-            cluster: (N,) int64, clusters of the batch, -1 = none.
-
-        Returns:
-            (N,) int64.
-        """
+    def id_in_window(self) -> Tensor:
+        """(M,) int64, number of each cluster counted from 0 in its own window."""
         start = torch.searchsorted(self.window, self.window)  # first cluster of the same window
-        own = torch.arange(self.window.numel(), device=start.device) - start
-        return torch.cat((own, own.new_full((1,), -1)))[cluster]  # index -1 reads the -1 at the end
+        return torch.arange(self.window.numel(), device=start.device) - start
 
 
 def cluster(occupancy: Tensor, pixel_size: float, config: Config) -> Clusters:
@@ -86,36 +79,30 @@ def cluster(occupancy: Tensor, pixel_size: float, config: Config) -> Clusters:
     component = _split_oversized(aggregated, pixels, component, pixel_size, config)
 
     # What is seen where: every sweep's pixels find their component.
-    component_of_pixel = pixels.new_full((aggregated.numel(),), -1)
+    component_of_pixel = torch.empty(aggregated.numel(), dtype=torch.int64, device=pixels.device)
     component_of_pixel[pixels] = component
     seen = occupancy.flatten().nonzero()[:, 0]
     image, raster = seen // (height * width), seen % (height * width)
     window, step = image // num_steps, image % num_steps
-    seen_component = component_of_pixel[window * (height * width) + raster]
+    seen_component = component_of_pixel.index_select(0, window * (height * width) + raster)
 
     # A cluster needs pixels at t+1 and before. Components are named by their first pixel: raster order is theirs.
-    is_target = torch.zeros_like(pixels, dtype=torch.bool)
-    is_source = torch.zeros_like(is_target)
-    is_target[seen_component[step == 0]] = True
-    is_source[seen_component[step > 0]] = True
-    live = (is_target & is_source).nonzero()[:, 0]
-    number = torch.full_like(pixels, -1)
+    is_newest = step == 0
+    has_target, has_source = torch.zeros(2, pixels.numel(), dtype=torch.bool, device=pixels.device)
+    has_target[seen_component[is_newest]] = True
+    has_source[seen_component[~is_newest]] = True
+    live = (has_target & has_source).nonzero()[:, 0]
+    number = torch.full_like(pixels, live.numel())
     number[live] = torch.arange(live.numel(), device=live.device)
 
-    cluster_of_pixel = number[component]
-    inside = (cluster_of_pixel >= 0).nonzero()[:, 0]
-    place = pixels[inside] % (height * width)
-    first, size = bounding_boxes(place // width, place % width, cluster_of_pixel[inside], live.numel())
-    component_of_pixel[pixels] = cluster_of_pixel
-    seen_cluster = number[seen_component]
-    kept = (seen_cluster >= 0).nonzero()[:, 0]
-    return Clusters(
-        window=pixels[live] // (height * width),
-        first=first,
-        size=size,
-        pixels=Pixels(seen_cluster[kept], step[kept], raster[kept] // width, raster[kept] % width),
-        of_pixel=component_of_pixel,
-    )
+    seen_cluster = number.index_select(0, seen_component)
+    of_pixel = torch.empty(occupancy.numel() + 1, dtype=torch.int64, device=pixels.device)
+    of_pixel[seen] = seen_cluster
+    of_pixel[-1] = live.numel()
+    kept = (seen_cluster < live.numel()).nonzero()[:, 0]
+    members = Pixels(seen_cluster[kept], step[kept], raster[kept] // width, raster[kept] % width)
+    first, size = bounding_boxes(members.row, members.col, members.cluster, live.numel())
+    return Clusters(pixels[live] // (height * width), first, size, members, of_pixel)
 
 
 def _label_dilated(image: Tensor, pixels: Tensor, config: Config) -> Tensor:
@@ -133,11 +120,12 @@ def _split_oversized(image: Tensor, pixels: Tensor, component: Tensor, pixel_siz
     """
     _, height, width = image.shape
     place = pixels % (height * width)
-    roots, segment = torch.unique(component, return_inverse=True)
-    first, size = bounding_boxes(place // width, place % width, segment, roots.numel())
+    is_root = component == torch.arange(pixels.numel(), device=pixels.device)
+    segment = (is_root.cumsum(0) - 1).index_select(0, component)
+    first, size = bounding_boxes(place // width, place % width, segment, int(is_root.sum()))
     border = torch.tensor([height - 1, width - 1], device=pixels.device)
     last = torch.minimum(first + size, border)  # the dilation adds a pixel on every side, cut off at the border
-    extent = (last - (first - 1).clamp(min=0) + 1).amax(1) if roots.numel() else roots
+    extent = (last - (first - 1).clamp(min=0) + 1).amax(1)
     oversized = (extent.double() * pixel_size > config.max_extent)[segment].nonzero()[:, 0]
     if oversized.numel() == 0:
         return component

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Iterator, Optional, Tuple
+from typing import List, Optional, Tuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.ops.cross_correlation import cross_correlate
@@ -61,102 +62,118 @@ def best_shifts(
     Source: Eq. norm_correlation, displacement_in_bev, Alg. scene_flow_1view.
     """
     num_jobs = target_of_job.numel()
-    shift = torch.zeros((num_jobs, 2), dtype=torch.int64, device=size.device)
-    score = torch.zeros(num_jobs, dtype=torch.float32, device=size.device)
-    template_energy = torch.bincount(template.image, minlength=num_jobs)
-    for (height, width), targets, jobs in _size_classes(size, target_of_job):
-        target_images, number = _draw(target, targets, size.shape[0], height, width)
-        template_images, _ = _draw(template, jobs, num_jobs, height, width)
-        own_target = number[target_of_job[jobs]]
-        counts = cross_correlate(template_images, target_images, own_target, engine)
-        energy, searched = _window_energy(target_images, size[targets])
+    if num_jobs == 0:
+        return size.new_zeros((0, 2)), torch.zeros(0, device=size.device)
+    shape, class_of_target, class_shapes = _size_classes(size)
+    class_of_job = class_of_target[target_of_job]
+    targets, _, target_place = _draw(target, class_of_target, shape, class_shapes)
+    templates, jobs, _ = _draw(template, class_of_job, shape[target_of_job], class_shapes)
+    target_size = torch.empty_like(size).index_copy_(0, target_place, size)
+    target_of_job = target_place[target_of_job[jobs]]  # from here on targets and jobs are sorted by class
+
+    peaks = []
+    first_target = first_job = 0
+    for template_images, target_images in zip(templates, targets):
+        of_class = slice(first_job, first_job + len(template_images))
+        own = target_of_job[of_class] - first_target
+        sizes = target_size[first_target : first_target + len(target_images)]
+        counts = cross_correlate(template_images, target_images, own, engine)
+        energy, searched = _energy_under_window(target_images, sizes), _searched(target_images, sizes)[own]
         if radius is not None:
-            searched = searched[own_target] & _within(counts, radius[jobs])
-        else:
-            searched = searched[own_target]
-        energy = energy[own_target]
-        shift[jobs], peak_count, peak_energy = _argmax(counts, energy, searched)
-        energies = (template_energy[jobs] * peak_energy).double()
-        ncc = peak_count.double() / energies.clamp(min=1).sqrt()
-        score[jobs] = ncc.float()
-    return shift, score
+            searched = searched & (_squared_length(counts) <= (radius * radius)[jobs[of_class], None, None])
+        peaks.append(_argmax(counts, energy[own], searched))
+        first_target += len(target_images)
+        first_job += len(template_images)
+
+    shift, count, energy = (torch.empty_like(p).index_copy_(0, jobs, p) for p in map(torch.cat, zip(*peaks)))
+    energies = (torch.bincount(template.image, minlength=num_jobs) * energy).double()
+    return shift, (count.double() / energies.clamp(min=1).sqrt()).float()
 
 
-def _size_classes(size: Tensor, target_of_job: Tensor) -> Iterator[Tuple[Tuple[int, int], Tensor, Tensor]]:
-    """((height, width) of a class, its targets, its jobs), smallest class first."""
-    if size.shape[0] == 0:
-        return
+def _size_classes(size: Tensor) -> Tuple[Tensor, Tensor, List[Tuple[int, int]]]:
+    """(N, 2) shape of the images that each target is drawn in, (N,) its class, and the shape of every class."""
+    largest = int(size.max())
     square = torch.tensor(_SQUARE_CLASSES, device=size.device)
-    long = torch.tensor((*_LONG_CLASSES, int(size.max())), device=size.device)
+    long = torch.tensor([s for s in _LONG_CLASSES if s < largest] + [largest], device=size.device)
     longer = size.amax(1, keepdim=True)
     small = square[torch.searchsorted(square, longer).clamp(max=len(square) - 1)].expand(-1, 2)
-    large = long[torch.searchsorted(long[:-1].contiguous(), size)]
-    classes, class_of_target = torch.unique(
-        torch.where(longer <= _SQUARE_CLASSES[-1], small, large), dim=0, return_inverse=True
-    )
-    class_of_job = class_of_target[target_of_job]
-    for index, shape in enumerate(classes.tolist()):
-        yield (shape[0], shape[1]), (class_of_target == index).nonzero()[:, 0], (class_of_job == index).nonzero()[:, 0]
+    shape = torch.where(longer <= _SQUARE_CLASSES[-1], small, long[torch.searchsorted(long, size)])
+    base = 1 + max(largest, _SQUARE_CLASSES[-1])
+    keys, class_of_target = torch.unique(shape[:, 0] * base + shape[:, 1], return_inverse=True)
+    return shape, class_of_target, [divmod(key, base) for key in keys.tolist()]
 
 
-def _draw(images: Images, chosen: Tensor, num_images: int, height: int, width: int) -> Tuple[Tensor, Tensor]:
-    """Some of the images as (n, height, width) bool, and (num_images,) int64 where each of them went, -1 = not drawn."""
-    number = chosen.new_full((num_images,), -1)
-    number[chosen] = torch.arange(chosen.numel(), device=chosen.device)
-    place = number[images.image]
-    inside = (place >= 0).nonzero()[:, 0]
-    drawn = torch.zeros(chosen.numel() * height * width, dtype=torch.bool, device=chosen.device)
-    drawn[(place[inside] * height + images.row[inside]) * width + images.col[inside]] = True
-    return drawn.view(-1, height, width), number
-
-
-def _window_energy(target: Tensor, size: Tensor) -> Tuple[Tensor, Tensor]:
-    """Target pixels under the H x W window at every shift, and which shifts are searched.
-
-    Args:
-        target: (n, height, width) bool.
-        size: (n, 2) int64, H and W of each image, at most height and width.
+def _draw(
+    images: Images, class_of_image: Tensor, shape: Tensor, class_shapes: List[Tuple[int, int]]
+) -> Tuple[List[Tensor], Tensor, Tensor]:
+    """Draw every image, sorted by size class.
 
     Returns:
-        energy: (n, Dy, Dx) int64, second factor of the denominator of Eq. norm_correlation, squared.
-        searched: (n, Dy, Dx) bool.
+        images: per class (n, height, width) bool.
+        order: (N,) int64, images in the order in which they were drawn.
+        place: (N,) int64, where in that order each image is.
     """
-    energy = target.long()
-    searched = []
-    for axis in (1, 2):
-        side, extent = target.shape[axis], size[:, axis - 1 : axis]
-        shift = torch.arange(-(side // 2), side // 2 + 1, device=target.device)[None]
-        half = extent // 2
-        searched.append((shift >= -half) & (shift <= extent - 1 - half))
-        # Pixels in [shift, shift + extent), that is before the end minus before the start, along this axis.
-        before = torch.nn.functional.pad(energy.cumsum(axis), (1, 0) if axis == 2 else (0, 0, 1, 0))
-        stop, start = (shift + extent).clamp(0, side), shift.clamp(min=0).expand(len(size), -1)
-        expand = (lambda i: i[:, None, :].expand(-1, before.shape[1], -1)) if axis == 2 else (
-            lambda i: i[:, :, None].expand(-1, -1, before.shape[2])
-        )
-        energy = before.gather(axis, expand(stop)) - before.gather(axis, expand(start))
-    return energy, searched[0][:, :, None] & searched[1][:, None, :]
+    order = torch.sort(class_of_image, stable=True).indices
+    place = torch.empty_like(order).index_copy_(0, order, torch.arange(order.numel(), device=order.device))
+    area = (shape[:, 0] * shape[:, 1])[order]
+    start = (area.cumsum(0) - area)[place]
+    counts = torch.bincount(class_of_image, minlength=len(class_shapes)).tolist()
+    areas = [count * height * width for count, (height, width) in zip(counts, class_shapes)]
+    pixel = start[images.image] + images.row * shape[images.image, 1] + images.col
+    drawn = torch.zeros(sum(areas), dtype=torch.bool, device=pixel.device).index_fill_(0, pixel, True)
+    return [part.view(-1, *hw) for part, hw in zip(drawn.split(areas), class_shapes)], order, place
 
 
-def _within(counts: Tensor, radius: Tensor) -> Tensor:
-    """(J, Dy, Dx) bool, shifts of at most `radius` (J,) pixels."""
-    return _squared_length(counts)[None].double() <= (radius * radius)[:, None, None]
+def _shifts(side: int, device: torch.device) -> Tensor:
+    """(2 (side // 2) + 1,) int64, all shifts along an axis of `side` pixels."""
+    return torch.arange(-(side // 2), side // 2 + 1, device=device)
+
+
+def _searched(images: Tensor, size: Tensor) -> Tensor:
+    """(n, Dy, Dx) bool, the shifts of Alg. scene_flow_1view for images of (n, 2) `size` drawn as (n, height, width)."""
+    half = size // 2
+    low, high = -half, size - 1 - half
+    rows, cols = (
+        (shift >= low[:, axis, None]) & (shift <= high[:, axis, None])
+        for axis, shift in enumerate((_shifts(images.shape[1], size.device), _shifts(images.shape[2], size.device)))
+    )
+    return rows[:, :, None] & cols[:, None, :]
+
+
+def _energy_under_window(target: Tensor, size: Tensor) -> Tensor:
+    """(n, Dy, Dx) int32, target pixels under the H x W window at every shift (denominator of Eq. norm_correlation)."""
+    energy = target.int()
+    for axis in (0, 1):
+        energy = _sum_under_window(energy, size[:, axis, None]).transpose(1, 2)
+    return energy
+
+
+def _sum_under_window(values: Tensor, extent: Tensor) -> Tensor:
+    """Sums of (n, side, m) `values` over rows [shift, shift + extent), for every shift: (n, D, m)."""
+    side = values.shape[1]
+    before = F.pad(values.cumsum(1, dtype=torch.int32), (0, 0, 1, 0))
+    shift = _shifts(side, values.device)[None]
+    stop, start = (shift + extent).clamp(0, side), shift.clamp(min=0).expand(len(extent), -1)
+    rows = (index[:, :, None].expand(-1, -1, values.shape[2]) for index in (stop, start))
+    stop_sum, start_sum = (before.gather(1, row) for row in rows)
+    return stop_sum - start_sum
 
 
 def _squared_length(counts: Tensor) -> Tensor:
     """(Dy, Dx) int64, dy^2 + dx^2 of every shift of a count map."""
-    dy, dx = (torch.arange(n, device=counts.device) - n // 2 for n in counts.shape[1:])
+    dy, dx = (_shifts(n - 1, counts.device) for n in counts.shape[1:])
     return dy[:, None] ** 2 + dx[None] ** 2
 
 
 def _argmax(counts: Tensor, energy: Tensor, searched: Tensor) -> Tuple[Tensor, Tensor, Tensor]:
     """Shift (J, 2) of the largest count^2 / energy, with the count and the energy there; ties as in `best_shifts`."""
     height, width = counts.shape[1:]
-    value = (counts * counts).double() / energy.clamp(min=1).double()
+    value = counts.double()
+    value = value * value / energy.clamp(min=1)
     value = torch.where(searched, value, -1.0).flatten(1)
-    rank = (_squared_length(counts) * (height * width)).flatten() + torch.arange(height * width, device=counts.device)
+    order = (_squared_length(counts) * (height * width)).flatten() + torch.arange(height * width, device=counts.device)
     tied = value == value.amax(1, keepdim=True)
-    place = torch.where(tied, rank, torch.iinfo(torch.int64).max).amin(1) % (height * width)
+    place = torch.where(tied, order, torch.iinfo(torch.int64).max).amin(1) % (height * width)
     shift = torch.stack((place // width - height // 2, place % width - width // 2), 1)
     at = place[:, None]
     return shift, counts.flatten(1).gather(1, at)[:, 0], energy.flatten(1).gather(1, at)[:, 0]

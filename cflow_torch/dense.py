@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any, List, Sequence, Tuple
+from dataclasses import dataclass
+from typing import Any, List, Optional, Sequence, Tuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from cflow_torch.batch import Batch, make_batch, split_results
@@ -65,59 +67,68 @@ class CorrelationFlow(nn.Module):
         config = self.config
         grids = [Grid(size, config.point_cloud_range[:3], config.point_cloud_range[3:]) for size in config.pixel_sizes]
         batch = make_batch(windows, config, grids[0], self.device)  # compensate
-        flow = torch.zeros_like(batch.positions)
-        cluster_id, score = _nothing(batch)
+        flow = None
         for grid in grids:  # coarse to fine
-            motion, cluster_id, score = flow_at_scale(batch, flow, grid, config)
-            flow += motion
-        return split_results(batch, flow[:, batch.source], cluster_id[batch.source], score[batch.source])
+            motion = motion_at_scale(batch, flow, grid, config)
+            step = motion.flow.index_select(0, motion.cluster)
+            flow = step if flow is None else flow + step
+        cluster_id = motion.cluster_id.index_select(0, motion.cluster)
+        score = motion.score.index_select(0, motion.cluster)
+        return split_results(batch, flow, cluster_id, score)
 
 
-def flow_at_scale(batch: Batch, flow: Tensor, grid: Grid, config: Config) -> Tuple[Tensor, Tensor, Tensor]:
+@dataclass(frozen=True)
+class Motion:
+    """What one scale found. Entry M stands for "no cluster": motion 0, id -1, score 0.
+
+    Args:
+        cluster: (P,) int64, cluster of every point, M = none.
+        flow: (M + 1, 3) float64, metres per sweep interval, axes of ego1.
+        cluster_id: (M + 1,) int64, number of the cluster counted from 0 in its window.
+        score: (M + 1,) float32.
+    """
+
+    cluster: Tensor
+    flow: Tensor
+    cluster_id: Tensor
+    score: Tensor
+
+
+def motion_at_scale(batch: Batch, flow: Optional[Tensor], grid: Grid, config: Config) -> Motion:
     """One pass of Alg. general_correlation_flow, over points warped by the flow so far.
 
     Args:
         batch: points of all windows.
-        flow: (3, P) float64, metres per sweep interval, flow so far of every point of every sweep.
+        flow: (P, 3) float64, metres per sweep interval, flow so far of every point of every sweep; None = no flow yet.
         grid: the BEV at this scale.
         config: settings.
 
     Returns:
-        motion: (3, P) float64, what this scale adds.
-        cluster_id: (P,) int64, counted from 0 in each window, -1 = none.
-        score: (P,) float32.
+        What this scale adds.
     """
-    # Warp: sweep m by (t+1-m) times the flow so far, then project.
-    k = batch.elapsed.flatten()[batch.image]
-    warped = batch.positions + k * flow
-    inside = grid.contains(warped).nonzero()[:, 0]
-    positions, image = warped[:, inside], batch.image[inside]
-    pixel = grid.pixel(positions)
-    occupancy = grid.occupancy(image, pixel, batch.num_windows * batch.num_steps)
-    occupancy = occupancy.view(batch.num_windows, batch.num_steps, grid.height, grid.width)
+    positions, takes_part = batch.positions, batch.takes_part
+    if flow is not None:  # sweep m moves by (t+1-m) times the flow so far
+        k = batch.elapsed.flatten().index_select(0, batch.image)
+        positions = positions + k * flow.t()
+        takes_part = takes_part & grid.contains(positions)
+    occupancy, pixel = grid.project(positions, takes_part, batch.image, batch.num_windows * batch.num_steps)
 
-    clusters = cluster(occupancy, grid.pixel_size, config)
-    cluster_of_point = clusters.of_pixel[image // batch.num_steps * (grid.height * grid.width) + pixel]
+    clusters = cluster(occupancy.unflatten(0, (batch.num_windows, batch.num_steps)), grid.pixel_size, config)
+    cluster_of_point = clusters.of_pixel.index_select(0, pixel)
 
     estimates, scores, available = correlate(clusters, batch, grid, config)
     if config.sectional_view:
         estimates = add_sectional_view(
-            estimates, available, positions, cluster_of_point, image % batch.num_steps, grid.pixel_size, config
+            estimates, available, positions, cluster_of_point, batch.image % batch.num_steps, grid.pixel_size, config
         )
     per_interval = estimates / batch.elapsed[clusters.window, 1:].clamp(min=1)[:, :, None]
-    motion_of_cluster = pool(per_interval, available)
     newest = available.int().argmax(1, keepdim=True)
-    score_of_cluster = scores.gather(1, newest)[:, 0]
-
-    # Spread: every point takes the motion of its cluster.
-    motion = torch.zeros_like(flow)
-    cluster_id, score = _nothing(batch)
-    member = (cluster_of_point >= 0).nonzero()[:, 0]
-    cluster_of_member, point = cluster_of_point[member], inside[member]
-    motion[:, point] = motion_of_cluster.t()[:, cluster_of_member]
-    cluster_id[point] = clusters.id_in_window(cluster_of_member)
-    score[point] = score_of_cluster[cluster_of_member]
-    return motion, cluster_id, score
+    return Motion(
+        cluster=cluster_of_point,
+        flow=F.pad(pool(per_interval, available), (0, 0, 0, 1)),
+        cluster_id=F.pad(clusters.id_in_window(), (0, 1), value=-1),
+        score=F.pad(scores.gather(1, newest)[:, 0], (0, 1)),
+    )
 
 
 def correlate(clusters: Clusters, batch: Batch, grid: Grid, config: Config) -> Tuple[Tensor, Tensor, Tensor]:
@@ -167,9 +178,3 @@ def correlate(clusters: Clusters, batch: Batch, grid: Grid, config: Config) -> T
     scores[jobs] = job_score
     shape = (num_clusters, num_sources)
     return estimates.view(*shape, 3), scores.view(shape), available.view(shape)
-
-
-def _nothing(batch: Batch) -> Tuple[Tensor, Tensor]:
-    """Cluster -1 and score 0 for every point."""
-    points = batch.image
-    return torch.full_like(points, -1), torch.zeros(points.numel(), dtype=torch.float32, device=points.device)

@@ -69,31 +69,35 @@ class Grid:
         """Raster index row * W + col of each position (Eq. 3d_to_bev).
 
         Args:
-            positions: (3, N) float64, metres, frame of t+1, all inside the region.
+            positions: (3, N) float64, metres, frame of t+1.
 
         Returns:
-            (N,) int64.
+            (N,) int64; means nothing for positions outside the region.
 
         Convention:
             floor((p - p_lower) / s) with a true division in float64: the divisor is a tensor because a GPU
             multiplies by the reciprocal of a plain number, which rounds differently.
         """
         size = torch.full((), self.pixel_size, dtype=positions.dtype, device=positions.device)
-        col = torch.floor((positions[0] - self.lower[0]) / size).long()
-        row = torch.floor((positions[1] - self.lower[1]) / size).long()
-        return row * self.width + col
+        col = torch.floor((positions[0] - self.lower[0]) / size)
+        row = torch.floor((positions[1] - self.lower[1]) / size)
+        return (row * self.width + col).long()  # whole numbers far below 2^53: exact
 
-    def occupancy(self, image: Tensor, pixel: Tensor, num_images: int) -> Tensor:
-        """Binary images that are set where a point falls.
+    def project(self, positions: Tensor, takes_part: Tensor, image: Tensor, num_images: int) -> Tuple[Tensor, Tensor]:
+        """Binary images that are set where a point falls, and the pixel of every point.
 
         Args:
+            positions: (3, N) float64, metres, frame of t+1.
+            takes_part: (N,) bool, False = the point is left out; it must be False outside the region.
             image: (N,) int64, image of each point.
-            pixel: (N,) int64, raster index of each point.
             num_images: B.
 
         Returns:
-            (B, H, W) bool.
+            occupancy: (B, H, W) bool.
+            pixel: (N,) int64, flat index into `occupancy`; B * H * W for points that are left out.
         """
-        occupancy = torch.zeros(num_images * self.height * self.width, dtype=torch.bool, device=pixel.device)
-        occupancy[image * (self.height * self.width) + pixel] = True
-        return occupancy.view(num_images, self.height, self.width)
+        nowhere = num_images * self.height * self.width
+        pixel = image * (self.height * self.width) + self.pixel(positions)
+        pixel = torch.where(takes_part, pixel, nowhere)
+        occupancy = torch.zeros(nowhere + 1, dtype=torch.bool, device=pixel.device).index_fill_(0, pixel, True)
+        return occupancy[:-1].view(num_images, self.height, self.width), pixel

@@ -146,28 +146,27 @@ def general_correlation_flow(clouds: Sequence[Cloud], cloud1: Cloud, pixel_size:
         ids[keep] = clusters[pixel[:, 0], pixel[:, 1]]
         cluster_ids.append(ids)
 
-    level = Level(
-        [np.zeros(c.points.shape) for c in clouds], cluster_ids[1:], [np.zeros(len(c.points)) for c in clouds]
-    )
+    flows = [np.zeros(cloud.points.shape) for cloud in clouds]
+    scores = [np.zeros(len(cloud.points)) for cloud in clouds]
     for i in range(clusters.max(initial=-1) + 1):
         # The cluster's scene flow: one estimate per sweep that has points of it, nearest first.
         members = [ids == i for ids in cluster_ids]
         points = [cloud.points[member] for cloud, member in zip(sweeps, members)]
         box = bounding_box([project_bev(p, config, pixel_size) for p in points])
-        estimates, scores = [], []
+        estimates, peaks = [], []
         for cloud, points_m in zip(clouds, points[1:]):
             if len(points_m) == 0:
                 continue
             reach = search_radius(config, cloud.elapsed, pixel_size)
-            flow, score = scene_flow_1obj(points_m, points[0], box, reach, pixel_size, config)
+            flow, peak = scene_flow_1obj(points_m, points[0], box, reach, pixel_size, config)
             estimates.append(flow / cloud.steps)
-            scores.append(score)
+            peaks.append(peak)
         cluster_flow = pool(estimates)
         # Assign it to the cluster's points.
         for m, member in enumerate(members[1:]):
-            level.flow[m][member] = cluster_flow
-            level.score[m][member] = scores[0]
-    return level
+            flows[m][member] = cluster_flow
+            scores[m][member] = peaks[0]
+    return Level(flows, cluster_ids[1:], scores)
 
 
 # ------------------------------------------------------------------------------------------------------ input
@@ -203,11 +202,12 @@ def compensate(window: Window, config: Config) -> Tuple[List[Cloud], Cloud]:
 
 def _in_frame_of(sweep1: Sweep, sweep: Sweep) -> np.ndarray:
     points = _points(sweep)
-    if sweep.pose is None:
-        return points
-    matrix = np.linalg.inv(_matrix(sweep1.pose)) @ _matrix(sweep.pose)  # T_ego1_ego
-    moved = np.full(points.shape, np.nan)
     finite = np.isfinite(points).all(axis=1)
+    moved = np.full(points.shape, np.nan)
+    if sweep.pose is None:
+        moved[finite] = points[finite]
+        return moved
+    matrix = np.linalg.inv(_matrix(sweep1.pose)) @ _matrix(sweep.pose)  # T_ego1_ego
     x, y, z = points[finite].T
     for axis in range(3):
         rotation, translation = matrix[axis, :3], matrix[axis, 3]
@@ -246,7 +246,7 @@ def _matrix(values: Any) -> np.ndarray:
 def in_range(points: np.ndarray, config: Config) -> np.ndarray:
     """(N,) bool: which points (N, 3) lie in `point_cloud_range`, both ends included. NaN does not."""
     low, high = np.array(config.point_cloud_range[:3]), np.array(config.point_cloud_range[3:])
-    return ((points >= low) & (points <= high)).all(axis=1)
+    return np.all((points >= low) & (points <= high), axis=1)
 
 
 def project_bev(points: np.ndarray, config: Config, pixel_size: float) -> np.ndarray:
@@ -459,8 +459,8 @@ def scene_flow_in_1view(
         if reach is None or dx * dx + dy * dy <= reach * reach:
             candidates.append((-rank[u_y, u_x], dx * dx + dy * dy, dy, dx))
     _, _, dy, dx = min(candidates)
-    score = ncc_map(template, target)[dy + height // 2, dx + width // 2]
-    return (dx * pixel_size, dy * pixel_size), float(score)
+    scores = norm_correlation(overlap, np.count_nonzero(template), window_energy)
+    return (dx * pixel_size, dy * pixel_size), float(scores[dy + height // 2, dx + width // 2])
 
 
 def search_radius(config: Config, elapsed: float, pixel_size: float) -> Optional[float]:
@@ -473,8 +473,13 @@ def search_radius(config: Config, elapsed: float, pixel_size: float) -> Optional
 def ncc_map(template: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Eq. norm_correlation: R[u_y, u_x] for every pixel u, (H, W) float64 in [0, 1], 0 for an empty neighbourhood."""
     overlap, window_energy = overlap_and_energy(template, target)
-    energy = np.count_nonzero(template) * window_energy
-    scores = np.zeros(template.shape)
+    return norm_correlation(overlap, np.count_nonzero(template), window_energy)
+
+
+def norm_correlation(overlap: np.ndarray, template_energy: int, window_energy: np.ndarray) -> np.ndarray:
+    """Eq. norm_correlation from its three counts: c / sqrt(E_m E_w), 0 where a count is 0."""
+    energy = template_energy * window_energy
+    scores = np.zeros(energy.shape)
     np.divide(overlap, np.sqrt(energy), out=scores, where=energy > 0)
     return scores
 

@@ -27,7 +27,7 @@ def add_sectional_view(
         estimates: (M, K, 3) float64, metres m -> t+1 from the BEV, nearest sweep first.
         available: (M, K) bool, which estimates exist.
         positions: (3, P) float64, metres, frame of t+1, as they were projected to the BEV.
-        cluster: (P,) int64, cluster of each point, -1 = none.
+        cluster: (P,) int64, cluster of each point, M = none.
         step: (P,) int64, 0 = sweep t+1, 1 = t, ...
         pixel_size: s, metres.
         config: `correlation`.
@@ -52,7 +52,7 @@ def add_sectional_view(
     safe = torch.where(length > 0, length, torch.ones_like(length))
     heading = torch.stack((torch.where(length > 0, x / safe, torch.ones_like(x)), y / safe))
 
-    member = cluster >= 0
+    member = cluster < len(available)
     older = (member & (step > 0)).nonzero()[:, 0]
     template_job = job_of_slot[cluster[older] * num_sources + step[older] - 1]
     moved = positions[:, older].clone()

@@ -29,7 +29,7 @@ def cross_correlate(template: Tensor, target: Tensor, target_of_job: Tensor, eng
         engine: "fft" or "conv" (conv2d).
 
     Returns:
-        (J, 2 (H // 2) + 1, 2 (W // 2) + 1) int64; element [j, dy + H // 2, dx + W // 2] is
+        (J, 2 (H // 2) + 1, 2 (W // 2) + 1) int32; element [j, dy + H // 2, dx + W // 2] is
         sum over p of template[j](p) * target(p + (dy, dx)), zero outside the images.
 
     Cost: "fft" H W log(H W) per template and target; "conv" (H W)^2 per template.
@@ -58,7 +58,7 @@ def _by_fft(template: Tensor, target: Tensor, target_of_job: Tensor) -> Tensor:
     reach_y, reach_x = height // 2, width // 2
     counts = torch.cat((counts[:, shape[0] - reach_y :], counts[:, : reach_y + 1]), 1)
     counts = torch.cat((counts[:, :, shape[1] - reach_x :], counts[:, :, : reach_x + 1]), 2)
-    return counts.round_().long()
+    return counts.round_().int()
 
 
 def _fft_dtype(template: Tensor, target: Tensor, shape: Tuple[int, int]) -> torch.dtype:
@@ -77,7 +77,7 @@ def _by_conv(template: Tensor, target: Tensor, target_of_job: Tensor) -> Tensor:
     padded = F.pad(target.float(), pad)[target_of_job]
     # One group per template. Sums of products of zeros and ones: exact in float32 up to 2^24, also with TF32.
     counts = F.conv2d(padded[None], template.float()[:, None], groups=num_jobs)[0]
-    return counts.round().long()
+    return counts.round().int()
 
 
 def _odd_part(number: int) -> int:
