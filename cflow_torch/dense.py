@@ -8,6 +8,7 @@ from typing import Any, List, Optional, Sequence, Tuple
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.profiler import record_function
 
 from cflow_torch.batch import Batch, make_batch, split_results
 from cflow_torch.cluster import Clusters, cluster
@@ -26,17 +27,19 @@ class CorrelationFlow(nn.Module):
         config: settings, see `Config`; `CorrelationFlow.from_preset` makes them from a preset.
 
     Example:
-        >>> model = CorrelationFlow.from_preset("paper", pixel_size=0.2)
-        >>> pc = torch.tensor([[10.0, 0.0, 1.0], [10.0, 0.5, 1.0], [10.5, 0.5, 1.0]])
-        >>> result, = model([Window(pc0=Sweep(pc), pc1=Sweep(pc + torch.tensor([0.2, 0.0, 0.0])))])
+        >>> from cflow_torch import CorrelationFlow, Sweep, Window
+        >>> model = CorrelationFlow.from_preset("paper", pixel_size=0.1)
+        >>> car = 0.1 * torch.cartesian_prod(torch.arange(45.0), torch.arange(18.0), torch.arange(15.0)) + 5.05
+        >>> window = Window(pc0=Sweep(car), pc1=Sweep(car + torch.tensor([0.5, 0.0, 0.0])))
+        >>> (result,) = model([window])
         >>> result.residual_flow[0]
-        tensor([0.2000, 0.0000, 0.0000])
+        tensor([0.5000, 0.0000, 0.0000])
     """
 
     def __init__(self, config: Config, device: Any = "auto") -> None:
         super().__init__()
         if config.method != "dense":
-            raise CFlowError(f"CorrelationFlow is the dense method, got a config with method={config.method!r}")
+            raise CFlowError(f"method={config.method!r} is not built yet: use method='dense'")
         if config.clustering != "components":
             raise CFlowError("clustering='hdbscan' is not built yet: use clustering='components'")
         self.config = config
@@ -66,15 +69,17 @@ class CorrelationFlow(nn.Module):
         """
         config = self.config
         grids = [Grid(size, config.point_cloud_range[:3], config.point_cloud_range[3:]) for size in config.pixel_sizes]
-        batch = make_batch(windows, config, grids[0], self.device)  # compensate
+        with record_function("compensate"):
+            batch = make_batch(windows, config, grids[0], self.device)
         flow = None
         for grid in grids:  # coarse to fine
             motion = motion_at_scale(batch, flow, grid, config)
             step = motion.flow.index_select(0, motion.cluster)
             flow = step if flow is None else flow + step
-        cluster_id = motion.cluster_id.index_select(0, motion.cluster)
-        score = motion.score.index_select(0, motion.cluster)
-        return split_results(batch, flow, cluster_id, score)
+        with record_function("spread"):
+            cluster_id = motion.cluster_id.index_select(0, motion.cluster)
+            score = motion.score.index_select(0, motion.cluster)
+            return split_results(batch, flow, cluster_id, score)
 
 
 @dataclass(frozen=True)
@@ -106,29 +111,32 @@ def motion_at_scale(batch: Batch, flow: Optional[Tensor], grid: Grid, config: Co
     Returns:
         What this scale adds.
     """
-    positions, takes_part = batch.positions, batch.takes_part
-    if flow is not None:  # sweep m moves by (t+1-m) times the flow so far
-        k = batch.elapsed.flatten().index_select(0, batch.image)
-        positions = positions + k * flow.t()
-        takes_part = takes_part & grid.contains(positions)
-    occupancy, pixel = grid.project(positions, takes_part, batch.image, batch.num_windows * batch.num_steps)
-
-    clusters = cluster(occupancy.unflatten(0, (batch.num_windows, batch.num_steps)), grid.pixel_size, config)
-    cluster_of_point = clusters.of_pixel.index_select(0, pixel)
-
-    estimates, scores, available = correlate(clusters, batch, grid, config)
-    if config.sectional_view:
-        estimates = add_sectional_view(
-            estimates, available, positions, cluster_of_point, batch.image % batch.num_steps, grid.pixel_size, config
+    with record_function("project"):
+        positions, takes_part = batch.positions, batch.takes_part
+        if flow is not None:  # sweep m moves by (t+1-m) times the flow so far
+            k = batch.elapsed.flatten().index_select(0, batch.image)
+            positions = positions + k * flow.t()
+            takes_part = takes_part & grid.contains(positions)
+        occupancy, pixel = grid.project(positions, takes_part, batch.image, batch.num_windows * batch.num_steps)
+    with record_function("cluster"):
+        clusters = cluster(occupancy.unflatten(0, (batch.num_windows, batch.num_steps)), grid.pixel_size, config)
+        cluster_of_point = clusters.of_pixel.index_select(0, pixel)
+    with record_function("correlate"):
+        estimates, scores, available = correlate(clusters, batch, grid, config)
+        if config.sectional_view:
+            step = batch.image % batch.num_steps
+            estimates = add_sectional_view(
+                estimates, available, positions, cluster_of_point, step, grid.pixel_size, config
+            )
+    with record_function("pool"):
+        per_interval = estimates / batch.elapsed[clusters.window, 1:].clamp(min=1)[:, :, None]
+        newest = available.int().argmax(1, keepdim=True)
+        return Motion(
+            cluster=cluster_of_point,
+            flow=F.pad(pool(per_interval, available), (0, 0, 0, 1)),
+            cluster_id=F.pad(clusters.id_in_window(), (0, 1), value=-1),
+            score=F.pad(scores.gather(1, newest)[:, 0], (0, 1)),
         )
-    per_interval = estimates / batch.elapsed[clusters.window, 1:].clamp(min=1)[:, :, None]
-    newest = available.int().argmax(1, keepdim=True)
-    return Motion(
-        cluster=cluster_of_point,
-        flow=F.pad(pool(per_interval, available), (0, 0, 0, 1)),
-        cluster_id=F.pad(clusters.id_in_window(), (0, 1), value=-1),
-        score=F.pad(scores.gather(1, newest)[:, 0], (0, 1)),
-    )
 
 
 def correlate(clusters: Clusters, batch: Batch, grid: Grid, config: Config) -> Tuple[Tensor, Tensor, Tensor]:

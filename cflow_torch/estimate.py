@@ -1,0 +1,96 @@
+"""The one call: two point clouds in, flow out."""
+
+from __future__ import annotations
+
+from typing import Any, Optional, Sequence
+
+import numpy as np
+
+from cflow_torch.config import make_config
+from cflow_torch.dense import CorrelationFlow
+from cflow_torch.types import Array, CFlowError, FlowResult, Sweep, Window
+
+
+def estimate_flow(
+    pc0: Array,  # (N0, 3+), metres, ego frame of sweep t
+    pc1: Array,  # (N1, 3+), metres, ego frame of sweep t+1
+    *,
+    T_ego1_ego0: Optional[Array] = None,  # (4, 4)
+    gm0: Optional[Array] = None,  # (N0,) bool
+    gm1: Optional[Array] = None,  # (N1,) bool
+    pch: Sequence[Array] = (),  # (Nh, 3+) each, nearest first
+    T_ego1_egoh: Sequence[Optional[Array]] = (),
+    gmh: Sequence[Optional[Array]] = (),
+    method: str = "dense",
+    preset: str = "default",
+    ground: Optional[str] = None,
+    device: Any = "auto",
+    **overrides: Any,
+) -> FlowResult:
+    """Scene flow from sweep t to sweep t+1.
+
+    Args:
+        pc0: points of sweep t, (N0, 3+) float of any width, array or tensor; columns after z are ignored.
+        pc1: points of sweep t+1, (N1, 3+).
+        T_ego1_ego0: (4, 4), maps coordinates of the ego frame at t to the one at t+1 (pose1^-1 pose0);
+            None = pc0 already lies in the frame of t+1.
+        gm0, gm1: ground masks, True = ground; None = nothing is ground.
+        pch: older sweeps t-1, t-2, ..., at most `num_history`.
+        T_ego1_egoh: (4, 4) of each of `pch`; may be left out only if `T_ego1_ego0` is left out too.
+        gmh: ground mask of each of `pch`; empty = nothing is ground.
+        method: "dense" or "keypoints".
+        preset: "default" or "paper".
+        ground: None = as the masks say; "auto" = find the ground.
+        device: "auto" = that of the tensors given, else a GPU if there is one, else the CPU.
+        **overrides: any field of `Config`, for example `pixel_sizes=(0.4, 0.2, 0.1)`.
+
+    Returns:
+        Flow for every row of pc0, in the axes of the ego frame at t+1, on the device used.
+
+    Convention:
+        NaN and infinite points, ground and points outside `point_cloud_range` get residual flow 0, cluster -1,
+        `is_valid` False. Empty sweeps give an empty or all-zero result.
+
+    Raises:
+        CFlowError: wrong shape or dtype, a transform that is not rigid, mixed devices, an unknown setting.
+
+    Example:
+        >>> car = 0.1 * np.stack(np.meshgrid(range(45), range(18), range(15)), -1).reshape(-1, 3) + 5.05  # (12150, 3)
+        >>> result = estimate_flow(car, car + [0.5, 0.0, 0.0])
+        >>> result.residual_flow[0]  # metres until the next sweep
+        tensor([0.5000, 0.0000, 0.0000])
+
+    Source: Alg. general_correlation_flow.
+    """
+    if ground is not None:
+        raise CFlowError(f"ground={ground!r}: finding the ground is not built yet; pass gm0 and gm1")
+    config = make_config(preset, method=method, **overrides)
+    transforms = _per_sweep("T_ego1_egoh", T_ego1_egoh, pch)
+    masks = _per_sweep("gmh", gmh, pch)
+    moved = T_ego1_ego0 is not None or any(t is not None for t in transforms)
+    if moved and pch and len(T_ego1_egoh) == 0:
+        raise CFlowError(
+            "T_ego1_ego0 is given but T_ego1_egoh is not: give one transform per sweep of pch "
+            "(None for a sweep that already lies in the frame of t+1)"
+        )
+
+    def sweep(points: Array, is_ground: Optional[Array], transform: Optional[Array]) -> Sweep:
+        # The world is the ego frame at t+1, so T_ego1_ego is the pose.
+        pose = (np.eye(4) if transform is None else transform) if moved else None
+        return Sweep(points, is_ground, pose)
+
+    window = Window(
+        pc0=sweep(pc0, gm0, T_ego1_ego0),
+        pc1=sweep(pc1, gm1, None),
+        pch=tuple(sweep(*parts) for parts in zip(pch, masks, transforms)),
+    )
+    (result,) = CorrelationFlow(config, device)([window])
+    return result
+
+
+def _per_sweep(name: str, values: Sequence[Any], pch: Sequence[Array]) -> Sequence[Any]:
+    if len(values) == 0:
+        return [None] * len(pch)
+    if len(values) != len(pch):
+        raise CFlowError(f"{name} has {len(values)} entries for {len(pch)} sweeps of pch: give one per sweep")
+    return values
