@@ -459,7 +459,7 @@ def scene_flow_in_1view(
         if reach is None or dx * dx + dy * dy <= reach * reach:
             candidates.append((-rank[u_y, u_x], dx * dx + dy * dy, dy, dx))
     _, _, dy, dx = min(candidates)
-    scores = norm_correlation(overlap, np.count_nonzero(template), window_energy)
+    scores = norm_correlation(overlap, int(template.sum()), window_energy)
     return (dx * pixel_size, dy * pixel_size), float(scores[dy + height // 2, dx + width // 2])
 
 
@@ -473,7 +473,7 @@ def search_radius(config: Config, elapsed: float, pixel_size: float) -> Optional
 def ncc_map(template: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Eq. norm_correlation: R[u_y, u_x] for every pixel u, (H, W) float64 in [0, 1], 0 for an empty neighbourhood."""
     overlap, window_energy = overlap_and_energy(template, target)
-    return norm_correlation(overlap, np.count_nonzero(template), window_energy)
+    return norm_correlation(overlap, int(template.sum()), window_energy)
 
 
 def norm_correlation(overlap: np.ndarray, template_energy: int, window_energy: np.ndarray) -> np.ndarray:
