@@ -14,6 +14,11 @@ from cflow_torch.ego import compensate, relative_transform
 from cflow_torch.grid import Grid
 from cflow_torch.types import CFlowError, FlowResult, Sweep, Window
 
+# Sweeps further apart than this many times the step from t to t+1 are no steady history: counting steps would mislead.
+_LONGEST_GAP = 2.5
+# No sweep of a window is further away than this, metres: 2 s at 50 m/s.
+_FARTHEST_POSE = 100.0
+
 
 @dataclass(frozen=True)
 class Batch:
@@ -57,7 +62,7 @@ def make_batch(windows: Sequence[Window], config: Config, grid: Grid, device: An
 
     Raises:
         CFlowError: wrong shape or dtype, a transform that is not rigid, mixed devices, poses for some sweeps
-            only, more history than `num_history`.
+            only, more history than `num_history`, time stamps out of order or with gaps, poses too far apart.
 
     Cost: linear in points; the only Python loop over sweeps, because they arrive as a list.
     """
@@ -68,13 +73,16 @@ def make_batch(windows: Sequence[Window], config: Config, grid: Grid, device: An
     num_steps = 1 + max(len(sources) for sources in kept)
     positions, takes_part, sources, pose_flow = [], [], [], []
     image, count, num_points = [], [], 0
-    elapsed = np.zeros((len(windows), num_steps))
+    elapsed, seconds = np.zeros((2, len(windows), num_steps))
     for index, (window, source_sweeps) in enumerate(zip(windows, kept)):
-        for step, (name, sweep, k) in enumerate([("pc1", window.pc1, 0), *source_sweeps]):
+        times = _elapsed(window, source_sweeps, config)
+        elapsed[index, 1 : 1 + len(times)], seconds[index, 1 : 1 + len(times)] = zip(*times)
+        for step, (name, sweep, _) in enumerate([("pc1", window.pc1, 0), *source_sweeps]):
             raw = _positions(sweep, name, chosen_device)
             transform = None
             if sweep.pose is not None and step > 0:
                 transform = relative_transform(window.pc1.pose, sweep.pose, f"pose of {name}")
+                _check_distance(transform, name)
             moved = compensate(raw, transform)
             inside = grid.contains(moved)
             if sweep.is_ground is not None:
@@ -87,7 +95,6 @@ def make_batch(windows: Sequence[Window], config: Config, grid: Grid, device: An
             image.append(index * num_steps + step)
             count.append(raw.shape[1])
             num_points += raw.shape[1]
-            elapsed[index, step] = k
     return Batch(
         positions=torch.cat(positions, 1),
         takes_part=torch.cat(takes_part),
@@ -97,7 +104,7 @@ def make_batch(windows: Sequence[Window], config: Config, grid: Grid, device: An
         num_windows=len(windows),
         num_steps=num_steps,
         elapsed=torch.as_tensor(elapsed, device=chosen_device),
-        seconds=torch.as_tensor(elapsed * config.sweep_interval, device=chosen_device),
+        seconds=torch.as_tensor(seconds, device=chosen_device),
         sources=tuple(sources),
         pose_flow=tuple(pose_flow),
     )
@@ -149,13 +156,47 @@ def _same(a: Sweep, b: Sweep) -> bool:
     """Same points and same pose: harnesses repeat the first sweep of a scene where history is missing."""
     if a is b:
         return True
-    if tuple(a.points.shape) != tuple(b.points.shape) or (a.pose is None) != (b.pose is None):
+    if not all(isinstance(x.points, (np.ndarray, Tensor)) for x in (a, b)) or a.points.shape != b.points.shape:
         return False
-    if a.pose is not None and not np.array_equal(_numpy(a.pose), _numpy(b.pose)):
+    if (a.pose is None) != (b.pose is None):
         return False
-    if isinstance(a.points, Tensor) and isinstance(b.points, Tensor):
-        return torch.equal(a.points, b.points)
-    return np.array_equal(_numpy(a.points), _numpy(b.points))
+    same_pose = a.pose is None or np.array_equal(_numpy(a.pose), _numpy(b.pose))
+    return same_pose and np.array_equal(_numpy(a.points), _numpy(b.points), equal_nan=True)
+
+
+def _elapsed(
+    window: Window, sources: Sequence[Tuple[str, Sweep, int]], config: Config
+) -> Sequence[Tuple[float, float]]:
+    """(sweep intervals, seconds) from each source sweep to t+1, by time stamps where every sweep of the window has one."""
+    stamps = [sweep.timestamp_ns for sweep in (window.pc1, window.pc0, *window.pch)]
+    if any(stamp is None for stamp in stamps):
+        return [(float(step), step * config.sweep_interval) for _, _, step in sources]
+    gaps = [int(window.pc1.timestamp_ns) - int(sweep.timestamp_ns) for _, sweep, _ in sources]  # type: ignore[arg-type]
+    intervals = [later - earlier for earlier, later in zip([0, *gaps], gaps)]
+    if min(intervals) <= 0:
+        raise CFlowError(
+            f"time stamps of the window are out of order (nanoseconds before t+1: {gaps}): "
+            "give pc1, pc0, pch1, ... from newest to oldest"
+        )
+    if config.use_timestamps:
+        return [(gap / gaps[0], gap / 1e9) for gap in gaps]
+    steps = [after - before for before, after in zip([0, *(s for _, _, s in sources)], (s for _, _, s in sources))]
+    worst = max(interval / (step * gaps[0]) for interval, step in zip(intervals, steps))
+    if worst > _LONGEST_GAP:
+        raise CFlowError(
+            f"the sweeps are unevenly spaced (nanoseconds before t+1: {gaps}; one gap is {worst:.1f} times that from t to "
+            "t+1): pass use_timestamps=True, or leave out the sweeps before the gap"
+        )
+    return [(float(step), gap / 1e9) for (_, _, step), gap in zip(sources, gaps)]
+
+
+def _check_distance(T_ego1_ego: np.ndarray, name: str) -> None:
+    distance = float(np.linalg.norm(T_ego1_ego[:3, 3]))
+    if distance > _FARTHEST_POSE:
+        raise CFlowError(
+            f"the ego vehicle moves {distance:.0f} m between {name} and pc1 (at most {_FARTHEST_POSE:.0f} m): "
+            "are the poses of another log, or not in metres?"
+        )
 
 
 def _numpy(array: Any) -> np.ndarray:

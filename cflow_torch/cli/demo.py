@@ -1,0 +1,51 @@
+"""No data needed: a simulated drive goes through reader, method, evaluation and picture like a real log.
+
+Leaves in OUTPUT (outputs/demo): log/ the drive in Argoverse 2's format, <log id>/ one flow file per pair,
+flow.png the picture, results.json the scores, config.yaml the resolved settings and versions.
+
+  cflow demo
+  cflow demo data.seed=7 pair=2 output=outputs/another
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from omegaconf import DictConfig
+
+from cflow_torch.cli.eval import report
+from cflow_torch.cli.run import finish, for_each_pair, make_model, open_logs
+from cflow_torch.data.flow_file import write_flow
+from cflow_torch.data.log import Log
+from cflow_torch.evaluation.frame import EvalFrame
+from cflow_torch.evaluation.metrics import SceneFlowMetrics
+from cflow_torch.types import FlowResult, Window
+from cflow_torch.viz.bev import plot_flow, save_picture
+
+
+def task(cfg: DictConfig) -> None:
+    """Run `cflow demo`."""
+    output = Path(cfg.output)
+    metrics = SceneFlowMetrics(cfg.definition)
+    model = make_model(cfg)
+    logs, failures = open_logs(cfg, output)
+
+    def keep(log: Log, index: int, sweeps: Window, result: FlowResult) -> None:
+        write_flow(output / log.log_id / f"{log.timestamps[index]}.feather", result)
+        labels = log.labels(index)
+        if labels is not None:
+            metrics.update(EvalFrame.from_result(sweeps, result, labels))
+        if index == cfg.pair:
+            figure = plot_flow(
+                sweeps.pc0.points,
+                result,
+                is_ground=sweeps.pc0.is_ground,
+                point_cloud_range=model.config.point_cloud_range,
+                title=f"CorrelationFlow, {log.log_id}",
+            )
+            save_picture(figure, output / "flow.png")
+
+    failures += for_each_pair(logs, model, keep)
+    report(cfg, metrics, output)
+    print(f"picture: {output / 'flow.png'}\nflow files, log, scores, settings: {output}")
+    finish(failures)

@@ -1,0 +1,68 @@
+"""The `cflow` command: `cflow demo | flow | eval | bench | info`, settings as Hydra overrides."""
+
+from __future__ import annotations
+
+import sys
+from importlib import import_module
+from typing import List, Optional
+
+from cflow_torch.types import CFlowError
+
+COMMANDS = {
+    "demo": "simulate a drive, estimate its flow, score it and draw it",
+    "flow": "estimate the flow of every pair of sweeps of a data set",
+    "eval": "estimate and score every labelled pair of a data set",
+    "bench": "time every stage against the reference and a plain OpenCV loop",
+    "info": "versions and devices, to paste into a bug report",
+}
+
+HELP = f"""cflow: training-free LiDAR scene flow
+
+usage: cflow COMMAND [SETTING=VALUE ...]
+
+commands:
+{chr(10).join(f"  {name:6} {text}" for name, text in COMMANDS.items())}
+
+examples:
+  cflow demo                                          a picture in outputs/demo, no data needed
+  cflow flow data=av2 data.root=/data/av2/val         one flow file per pair of sweeps
+  cflow eval data=av2 data.root=/data/av2/val model=paper
+  cflow eval model.pixel_sizes=[0.4,0.2,0.1]          any field of the method, see `cflow eval --cfg job`
+  cflow eval -m model.connectivity=4,8                a sweep
+
+`cflow COMMAND --help` says more; `cflow COMMAND --cfg job` prints every setting and its value.
+"""
+
+
+def main(argv: Optional[List[str]] = None) -> None:
+    """Run one command. Ends the process with status 1 if anything failed, 2 if the call was wrong."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    if not arguments or arguments[0] in ("-h", "--help", "help"):
+        print(HELP)
+        return
+    command, *rest = arguments
+    if command not in COMMANDS:
+        print(f"error: unknown command {command!r}: give one of {', '.join(COMMANDS)}", file=sys.stderr)
+        raise SystemExit(2)
+    module = import_module(f"cflow_torch.cli.{command}")
+    if "-h" in rest or "--help" in rest:
+        print(f"cflow {command}: {COMMANDS[command]}\n\n{module.__doc__}")
+        return
+    if command == "info":
+        module.task()
+        return
+    import hydra
+
+    def task(cfg):  # type: ignore[no-untyped-def]
+        try:
+            return module.task(cfg)
+        except CFlowError as error:
+            print(f"error: {error}", file=sys.stderr)
+            raise SystemExit(2) from None
+
+    sys.argv = [f"cflow {command}", *rest]
+    hydra.main(version_base="1.3", config_path="pkg://cflow_torch.configs", config_name=command)(task)()
+
+
+if __name__ == "__main__":
+    main()
