@@ -8,6 +8,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any, Dict
 
@@ -44,8 +45,17 @@ def task(cfg: DictConfig) -> float:
 def report(cfg: DictConfig, metrics: SceneFlowMetrics, output: Path) -> Dict[str, Any]:
     """Print the scores and write results.json and config.yaml."""
     results = metrics.compute()
-    record = {"results": results, "config": OmegaConf.to_container(cfg, resolve=True), "versions": versions()}
+    record = {"results": _without_nan(results), "config": OmegaConf.to_container(cfg, resolve=True), "versions": versions()}
     write_text(output / "results.json", json.dumps(record, indent=2) + "\n")
     write_config(cfg, output)
     print(format_table(results))
     return results
+
+
+def _without_nan(value: Any) -> Any:
+    """NaN (no points) becomes null: JSON has no NaN."""
+    if isinstance(value, dict):
+        return {key: _without_nan(part) for key, part in value.items()}
+    if isinstance(value, list):
+        return [_without_nan(part) for part in value]
+    return None if isinstance(value, float) and math.isnan(value) else value

@@ -30,7 +30,7 @@ def versions() -> Dict[str, str]:
     """Versions that a result depends on."""
     return {
         "cflow_torch": __version__,
-        "torch": torch.__version__,
+        "torch": str(torch.__version__),
         "numpy": np.__version__,
         "python": platform.python_version(),
     }
