@@ -1,0 +1,129 @@
+"""Ground points from the ground height raster of an Argoverse 2 map."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Dict, Optional, Union
+
+import numpy as np
+
+from cflow_torch.types import CFlowError
+
+
+@dataclass(frozen=True)
+class GroundRule:
+    """How a raster tells ground from the rest.
+
+    Args:
+        threshold: metres; a point at most this far from the surface is ground.
+        rounding: "truncate" (towards zero) or "round" (half to even): raster coordinate to cell.
+    """
+
+    threshold: float
+    rounding: str
+
+
+GROUND_RULES: Dict[str, GroundRule] = {
+    "av2-api": GroundRule(threshold=0.3, rounding="truncate"),
+    "bsfe": GroundRule(threshold=0.4, rounding="round"),
+}
+
+
+@dataclass(frozen=True)
+class GroundRaster:
+    """Height of the ground on a grid of the city.
+
+    Args:
+        heights: (H, W) float64, metres, row from y, column from x; NaN = unknown.
+        rotation: (2, 2) float64, translation: (2,) float64, scale: cells per metre. The grid position of a city
+            point is scale * (rotation @ xy + translation).
+
+    Source: layout of the Argoverse 2 map folder, `*_ground_height_surface____*.npy` and `*___img_Sim2_city.json`.
+    """
+
+    heights: np.ndarray
+    rotation: np.ndarray
+    translation: np.ndarray
+    scale: float
+
+    def is_ground(self, points: np.ndarray, rule: Union[str, GroundRule] = "av2-api") -> np.ndarray:
+        """Tell which points lie on or under the ground.
+
+        Args:
+            points: (N, 3) float, metres, CITY frame.
+            rule: name in `GROUND_RULES`, or a rule.
+
+        Returns:
+            (N,) bool: within the threshold of the surface (limit included) or below it.
+
+        Convention: outside the raster and where its height is NaN a point is not ground.
+        """
+        rule = get_rule(rule)
+        xyz = np.asarray(points, dtype=np.float64)
+        height = self._height_at(xyz[:, :2], rule)
+        with np.errstate(invalid="ignore"):
+            above = xyz[:, 2] - height
+            return (np.abs(above) <= rule.threshold) | (above < 0)
+
+    def _height_at(self, xy: np.ndarray, rule: GroundRule) -> np.ndarray:
+        inside = np.isfinite(xy).all(axis=1)
+        position = (np.where(inside[:, None], xy, 0.0) @ self.rotation.T + self.translation) * self.scale
+        cell = (np.round(position) if rule.rounding == "round" else np.trunc(position)).astype(np.int64)
+        inside &= (cell >= 0).all(axis=1) & (cell < self.heights.shape[::-1]).all(axis=1)
+        height = np.full(len(xy), np.nan)
+        height[inside] = self.heights[cell[inside, 1], cell[inside, 0]]
+        return height
+
+
+def get_rule(rule: Union[str, GroundRule]) -> GroundRule:
+    """A rule by name, or the one given.
+
+    Raises:
+        CFlowError: no rule has this name.
+    """
+    if isinstance(rule, GroundRule):
+        return rule
+    if rule not in GROUND_RULES:
+        raise CFlowError(f"ground rules are {sorted(GROUND_RULES)}, got {rule!r}")
+    return GROUND_RULES[rule]
+
+
+def read_ground_raster(map_folder: Path) -> Optional[GroundRaster]:
+    """Read the raster of a log.
+
+    Args:
+        map_folder: the folder `map` of a log.
+
+    Returns:
+        The raster; None where the folder or its raster is missing.
+
+    Raises:
+        CFlowError: the raster is ambiguous, its Sim(2) file is missing, or either cannot be read.
+    """
+    rasters = sorted(map_folder.glob("*_ground_height_surface____*.npy"))
+    if not rasters:
+        return None
+    alignments = sorted(map_folder.glob("*___img_Sim2_city.json"))
+    if len(rasters) > 1 or len(alignments) != 1:
+        raise CFlowError(
+            f"{map_folder} must hold one *_ground_height_surface____*.npy and one *___img_Sim2_city.json, "
+            f"found {len(rasters)} and {len(alignments)}"
+        )
+    try:
+        heights = np.load(rasters[0], allow_pickle=False)
+        alignment = json.loads(alignments[0].read_text())
+        raster = GroundRaster(
+            heights=heights.astype(np.float64),
+            rotation=np.array(alignment["R"], dtype=np.float64).reshape(2, 2),
+            translation=np.array(alignment["t"], dtype=np.float64).reshape(2),
+            scale=float(alignment["s"]),
+        )
+    except (OSError, EOFError, ValueError, KeyError, TypeError) as error:
+        raise CFlowError(
+            f"cannot read the ground raster in {map_folder}: {error}; copy the map folder again"
+        ) from error
+    if raster.heights.ndim != 2:
+        raise CFlowError(f"{rasters[0]} must hold a (H, W) raster, got shape {raster.heights.shape}")
+    return raster

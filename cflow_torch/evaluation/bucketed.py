@@ -1,0 +1,108 @@
+"""Dynamic bucket-normalised end-point error: error divided by speed, averaged over speed buckets, per class."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any, Dict, Union
+
+import numpy as np
+
+from cflow_torch.evaluation.categories import META_NAMES, meta_class
+from cflow_torch.evaluation.definitions import Definition, get_definition
+from cflow_torch.evaluation.frame import EvalFrame
+from cflow_torch.evaluation.masks import ScoredPoints, score_points
+from cflow_torch.types import CFlowError
+
+
+def mean_of_present(values: np.ndarray) -> float:
+    """Mean of the values that are not NaN; NaN where there are none."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", category=RuntimeWarning)
+        return float(np.nanmean(values)) if values.size else float("nan")
+
+
+class BucketedEPE:
+    """Streaming dynamic bucket-normalised EPE.
+
+    With e and v the mean end-point error and mean true speed of all points of a class in a bucket, over all frames:
+    `static_epe` = e of the first bucket in metres; `dynamic_error` = mean of e / v over the other buckets that have
+    points, each bucket with the same weight. A prediction of "nothing moves" has a dynamic error of exactly 1.
+
+    Args:
+        definition: name or `Definition`.
+
+    Convention: frames in any order; a bucket holds its lower edge, not its upper one; classes without points are NaN
+    and do not enter the mean over classes.
+
+    Cost: a few arrays of the size of one frame per update; memory (classes x buckets).
+    """
+
+    def __init__(self, definition: Union[str, Definition] = "opensceneflow") -> None:
+        self.definition = get_definition(definition)
+        shape = (len(META_NAMES), len(self.definition.speed_edges) - 1)
+        self.count = np.zeros(shape, dtype=np.int64)
+        self.error_sum = np.zeros(shape, dtype=np.float64)
+        self.speed_sum = np.zeros(shape, dtype=np.float64)
+
+    def update(self, frame: EvalFrame) -> None:
+        """Add one frame."""
+        self.update_points(score_points(frame, self.definition))
+
+    def update_points(self, scored: ScoredPoints) -> None:
+        """Add the scored points of one frame."""
+        edges = np.asarray(self.definition.speed_edges)
+        meta = meta_class(scored.category)
+        bucket = np.searchsorted(edges, scored.speed, side="right") - 1
+        if self.definition.background == "static":
+            bucket = np.where(meta == META_NAMES.index("BACKGROUND"), 0, bucket)
+        keep = scored.in_region & (meta >= 0) & (bucket >= 0) & (bucket < len(edges) - 1)
+        cell = meta[keep] * (len(edges) - 1) + bucket[keep]
+        size, shape = self.count.size, self.count.shape
+        self.count += np.bincount(cell, minlength=size).reshape(shape)
+        self.error_sum += np.bincount(cell, scored.error[keep], minlength=size).reshape(shape)
+        self.speed_sum += np.bincount(cell, scored.speed[keep], minlength=size).reshape(shape)
+
+    def merge(self, other: BucketedEPE) -> None:
+        """Add what another accumulator of the same definition has seen.
+
+        Raises:
+            CFlowError: the definitions differ.
+        """
+        if other.definition != self.definition:
+            raise CFlowError(f"cannot merge scores of {other.definition.name} into {self.definition.name}")
+        self.count += other.count
+        self.error_sum += other.error_sum
+        self.speed_sum += other.speed_sum
+
+    def compute(self) -> Dict[str, Any]:
+        """Scores so far.
+
+        Returns:
+            "classes": per meta class `static_epe` (metres), `dynamic_error` (ratio), `num_static`, `num_dynamic`
+            (points) and "buckets" (`count`, `epe`, `speed`, `normalized` per bucket); "mean": `static_epe`,
+            `dynamic_error`; "speed_edges": metres per frame.
+        """
+        with np.errstate(divide="ignore", invalid="ignore"):
+            epe = self.error_sum / self.count
+            speed = self.speed_sum / self.count
+            normalized = np.concatenate([epe[:, :1], epe[:, 1:] / speed[:, 1:]], axis=1)
+        classes = {
+            name: {
+                "static_epe": float(normalized[row, 0]),
+                "dynamic_error": mean_of_present(normalized[row, 1:]),
+                "num_static": int(self.count[row, 0]),
+                "num_dynamic": int(self.count[row, 1:].sum()),
+                "buckets": {
+                    "count": self.count[row].tolist(),
+                    "epe": epe[row].tolist(),
+                    "speed": speed[row].tolist(),
+                    "normalized": normalized[row].tolist(),
+                },
+            }
+            for row, name in enumerate(META_NAMES)
+        }
+        mean = {
+            key: mean_of_present(np.array([scores[key] for scores in classes.values()], dtype=np.float64))
+            for key in ("static_epe", "dynamic_error")
+        }
+        return {"classes": classes, "mean": mean, "speed_edges": list(self.definition.speed_edges)}

@@ -1,0 +1,97 @@
+"""The object categories of Argoverse 2 and the five meta classes that scores are given for."""
+
+from __future__ import annotations
+
+from typing import Dict, Tuple
+
+import numpy as np
+
+from cflow_torch.types import CFlowError
+
+CATEGORIES: Tuple[str, ...] = (
+    "NONE",
+    "ANIMAL",
+    "ARTICULATED_BUS",
+    "BICYCLE",
+    "BICYCLIST",
+    "BOLLARD",
+    "BOX_TRUCK",
+    "BUS",
+    "CONSTRUCTION_BARREL",
+    "CONSTRUCTION_CONE",
+    "DOG",
+    "LARGE_VEHICLE",
+    "MESSAGE_BOARD_TRAILER",
+    "MOBILE_PEDESTRIAN_CROSSING_SIGN",
+    "MOTORCYCLE",
+    "MOTORCYCLIST",
+    "OFFICIAL_SIGNALER",
+    "PEDESTRIAN",
+    "RAILED_VEHICLE",
+    "REGULAR_VEHICLE",
+    "SCHOOL_BUS",
+    "SIGN",
+    "STOP_SIGN",
+    "STROLLER",
+    "TRAFFIC_LIGHT_TRAILER",
+    "TRUCK",
+    "TRUCK_CAB",
+    "VEHICULAR_TRAILER",
+    "WHEELCHAIR",
+    "WHEELED_DEVICE",
+    "WHEELED_RIDER",
+)
+"""Name of every category; the position is the index that labels store (0 = background)."""
+
+CATEGORY_INDEX: Dict[str, int] = {name: index for index, name in enumerate(CATEGORIES)}
+
+META_CLASSES: Dict[str, Tuple[str, ...]] = {
+    "BACKGROUND": ("NONE",),
+    "CAR": ("REGULAR_VEHICLE",),
+    "OTHER_VEHICLES": (
+        "ARTICULATED_BUS",
+        "BOX_TRUCK",
+        "BUS",
+        "LARGE_VEHICLE",
+        "RAILED_VEHICLE",
+        "SCHOOL_BUS",
+        "TRUCK",
+        "TRUCK_CAB",
+        "VEHICULAR_TRAILER",
+    ),
+    "PEDESTRIAN": ("OFFICIAL_SIGNALER", "PEDESTRIAN", "STROLLER", "WHEELCHAIR"),
+    "WHEELED_VRU": ("BICYCLE", "BICYCLIST", "MOTORCYCLE", "MOTORCYCLIST", "WHEELED_DEVICE", "WHEELED_RIDER"),
+}
+"""Meta class -> its categories. Signs, cones, trailers of signs and animals belong to none and are not scored."""
+
+META_NAMES: Tuple[str, ...] = tuple(META_CLASSES)
+
+
+def _meta_lookup() -> np.ndarray:
+    lookup = np.full(len(CATEGORIES), -1, dtype=np.int64)
+    for number, members in enumerate(META_CLASSES.values()):
+        lookup[[CATEGORY_INDEX[name] for name in members]] = number
+    return lookup
+
+
+_META_OF_CATEGORY = _meta_lookup()
+
+
+def meta_class(category: np.ndarray) -> np.ndarray:
+    """Meta class of each point.
+
+    Args:
+        category: (N,) integer, Argoverse 2 index 0 ... 30.
+
+    Returns:
+        (N,) int64, position in `META_NAMES`; -1 = category of no meta class.
+
+    Raises:
+        CFlowError: an index outside 0 ... 30.
+    """
+    if category.size and (category.min() < 0 or category.max() >= len(CATEGORIES)):
+        raise CFlowError(
+            f"category indices are 0 ... {len(CATEGORIES) - 1} (0 = background), got "
+            f"{category.min()} ... {category.max()}; map other data sets to Argoverse 2 indices first"
+        )
+    return _META_OF_CATEGORY[category]

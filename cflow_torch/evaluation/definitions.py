@@ -1,0 +1,150 @@
+"""What exactly is scored: the choices in which the public evaluators differ, as one frozen dataclass."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Dict, Optional, Tuple, Union
+
+import numpy as np
+
+from cflow_torch.types import CFlowError
+
+METRICS = ("bucketed", "three_way", "range_wise")
+
+_CHOICES: Dict[str, Tuple[Any, ...]] = {
+    "region": ("box", "disc", "all"),
+    "region_axes": ("t", "t+1"),
+    "residual_axes": ("t", "t+1"),
+    "three_way_flow": ("total", "residual"),
+    "foreground": ("all", "meta"),
+    "background": ("static", "bucketed"),
+    "average": ("points", "frames"),
+    "nan_rows": ("drop", "error"),
+    "norm_dtype": ("float32", "float64"),
+}
+
+SPEED_EDGES: Tuple[float, ...] = (*(float(edge) for edge in np.linspace(0.0, 2.0, 51)), math.inf)
+RANGE_EDGES: Tuple[float, ...] = (0.0, 35.0, 50.0, 75.0, 100.0, math.inf)
+
+
+@dataclass(frozen=True)
+class Definition:
+    """Choices of an evaluation. `dataclasses.replace(definition, ...)` changes single ones.
+
+    Args:
+        name: label that goes with every number.
+        metrics: which of `METRICS` are computed.
+        region: points scored by "bucketed" and "three_way": "box" max(|x|, |y|), "disc" sqrt(x^2 + y^2), "all".
+        max_range: metres, outer bound of the region.
+        min_range: metres, inner bound; the point that one region leaves out belongs to the next one.
+        closed: True: a point at exactly `max_range` counts (<=), False: it does not (<).
+        region_axes: ego frame in which the region is measured.
+        point_cloud_range: (x0, y0, z0, x1, y1, z1) metres, open interval, in `region_axes`; None = no crop.
+        mask_box: metres; where a frame has no evaluation mask, only points with |x|, |y| <= this (frame of t)
+            are scored; None = all.
+        exclude_ground: leave ground points out.
+        residual_axes: axes in which residuals are compared.
+        three_way_flow: flow that the three-way scores compare. Moves accuracy and angle, not the end-point error.
+        half_precision: three-way scores see truth and prediction rounded to float16 (the files of the 2023 challenge).
+        foreground: "all": every category but background; "meta": the four meta classes, others are left out.
+        background: "static": background points of any true speed go to bucket 0; "bucketed": by their speed.
+        average: three-way end-point errors and IoU: "points": over all points of all frames, NaN where there are
+            none; "frames": mean over frames of per-frame values, absent sets count as 0.
+        nan_rows: "drop": a point with NaN in position, truth or prediction is not scored (which flatters a method
+            that gives NaN; `num_nan` tells how many); "error": refuse it.
+        norm_dtype: precision in which lengths of residuals are taken.
+        dynamic_threshold: metres per frame; true or predicted residual at least this long = dynamic (three-way).
+        speed_edges: metres per frame, ascending bucket edges, lower one included; the first bucket is "static".
+        range_edges: metres, ascending edges of the range-wise metric, lower one included.
+        range_dynamic_speed: m/s, from which a point counts as dynamic in the range-wise metric.
+        sweep_interval: seconds between the sweeps of a pair (angle error, range-wise speed).
+
+    Raises:
+        CFlowError: an unknown choice or edges that do not ascend.
+    """
+
+    name: str
+    metrics: Tuple[str, ...] = METRICS
+    region: str = "disc"
+    max_range: float = 35.0
+    min_range: float = 0.0
+    closed: bool = True
+    region_axes: str = "t"
+    point_cloud_range: Optional[Tuple[float, ...]] = None
+    mask_box: Optional[float] = None
+    exclude_ground: bool = True
+    residual_axes: str = "t+1"
+    three_way_flow: str = "total"
+    half_precision: bool = False
+    foreground: str = "all"
+    background: str = "static"
+    average: str = "points"
+    nan_rows: str = "drop"
+    norm_dtype: str = "float64"
+    dynamic_threshold: float = 0.05
+    speed_edges: Tuple[float, ...] = SPEED_EDGES
+    range_edges: Tuple[float, ...] = RANGE_EDGES
+    range_dynamic_speed: float = 1.4
+    sweep_interval: float = 0.1
+
+    def __post_init__(self) -> None:
+        for field, allowed in _CHOICES.items():
+            if getattr(self, field) not in allowed:
+                raise CFlowError(f"definition {self.name}: {field} is one of {allowed}, got {getattr(self, field)!r}")
+        if not set(self.metrics) <= set(METRICS):
+            raise CFlowError(f"definition {self.name}: metrics are some of {METRICS}, got {self.metrics}")
+        if not 0 <= self.min_range < self.max_range:
+            raise CFlowError(
+                f"definition {self.name}: needs 0 <= min_range < max_range, got {self.min_range}, {self.max_range}"
+            )
+        for field in ("speed_edges", "range_edges"):
+            edges = getattr(self, field)
+            if len(edges) < 2 or not all(a < b for a, b in zip(edges, edges[1:])):
+                raise CFlowError(
+                    f"definition {self.name}: {field} must ascend and hold two values or more, got {edges}"
+                )
+
+
+DEFINITIONS: Dict[str, Definition] = {
+    # KTH-RPL/OpenSceneFlow: eval.py and its functions evaluate_leaderboard, _v2, evaluate_ssf.
+    "opensceneflow": Definition(name="opensceneflow", average="frames"),
+    # kylevedder/BucketedSceneFlowEval with_ground=False, evaluators bucketed_epe and threeway_epe. Its ground is the
+    # map raster rule "bsfe" (0.4 m), which the reader applies: see cflow_torch.data.ground.
+    "bucketed_scene_flow_eval": Definition(
+        name="bucketed_scene_flow_eval",
+        metrics=("bucketed", "three_way"),
+        region="box",
+        closed=False,
+        region_axes="t+1",
+        point_cloud_range=(-48.0, -48.0, -2.5, 48.0, 48.0, 2.5),
+        residual_axes="t",
+        three_way_flow="residual",
+        foreground="meta",
+        background="bucketed",
+        nan_rows="error",
+        norm_dtype="float32",
+    ),
+    # argoverse/av2-api: av2.evaluation.scene_flow.eval. No cut at 35 m except in the close / far breakdown.
+    "av2": Definition(
+        name="av2",
+        metrics=("three_way",),
+        region="all",
+        mask_box=50.0,
+        half_precision=True,
+        nan_rows="error",
+    ),
+}
+
+
+def get_definition(definition: Union[str, Definition]) -> Definition:
+    """A definition by name, or the one given.
+
+    Raises:
+        CFlowError: no definition has this name.
+    """
+    if isinstance(definition, Definition):
+        return definition
+    if definition not in DEFINITIONS:
+        raise CFlowError(f"evaluation definitions are {sorted(DEFINITIONS)}, got {definition!r}")
+    return DEFINITIONS[definition]

@@ -1,0 +1,143 @@
+"""One frame to score: points, prediction, truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Optional, Tuple
+
+import numpy as np
+
+from cflow_torch.data.log import FlowLabels
+from cflow_torch.types import Array, CFlowError, FlowResult, Window
+
+
+def as_numpy(value: Array, dtype: Optional[Any] = None) -> np.ndarray:
+    """NumPy array of an array or a tensor on any device."""
+    if hasattr(value, "detach"):
+        value = value.detach().cpu().numpy()  # type: ignore[union-attr]
+    return np.asarray(value, dtype=dtype)
+
+
+def ego_motion_flow(points: np.ndarray, T_ego1_ego0: np.ndarray) -> np.ndarray:
+    """Flow that ego motion alone causes, T p - p.
+
+    Args:
+        points: (N, 3) float, metres, ego frame of t.
+        T_ego1_ego0: (4, 4), ego coordinates of t to those of t+1.
+
+    Returns:
+        (N, 3) float32, metres, axes of ego1; computed in float64 and rounded once, because the difference of two
+        float32 positions at 100 m carries 1e-5 m of noise.
+    """
+    start, transform = np.asarray(points, dtype=np.float64), np.asarray(T_ego1_ego0, dtype=np.float64)
+    return (start @ transform[:3, :3].T + transform[:3, 3] - start).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class EvalFrame:
+    """What is needed to score one pair of sweeps. Arrays or tensors; rows in the order of sweep t, ground included.
+
+    Args:
+        points: (N, 3+) float, metres, ego frame of t.
+        labels: truth of the pair (total flow, categories, valid rows).
+        residual_flow: (N, 3) float, predicted residual, metres per frame. Give this or `flow`, not both.
+        flow: (N, 3) float, predicted total flow, axes of ego1.
+        pose_flow: (N, 3) float, T_ego1_ego0 p - p. Computed from `T_ego1_ego0` where missing; give at least one.
+        T_ego1_ego0: (4, 4) float, ego coordinates of t to those of t+1. Definitions that measure ranges or residuals
+            in another frame need it.
+        is_ground: (N,) bool, True = ground; None = no point is ground.
+        eval_mask: (N,) bool, True = scored; None = all.
+        is_dynamic: (N,) bool, predicted dynamic points (IoU); None = residual of at least the definition's threshold.
+        residual_axes: "t+1" or "t", axes that `residual_flow` is given in. This package predicts in "t+1".
+
+    Convention: everything is checked and turned to NumPy when the frame is made.
+
+    Raises:
+        CFlowError: missing or contradictory parts, shapes that do not agree.
+    """
+
+    points: Array
+    labels: FlowLabels
+    residual_flow: Optional[Array] = None
+    flow: Optional[Array] = None
+    pose_flow: Optional[Array] = None
+    T_ego1_ego0: Optional[Array] = None
+    is_ground: Optional[Array] = None
+    eval_mask: Optional[Array] = None
+    is_dynamic: Optional[Array] = None
+    residual_axes: str = "t+1"
+
+    def __post_init__(self) -> None:
+        if (self.residual_flow is None) == (self.flow is None):
+            raise CFlowError("an evaluation frame takes exactly one of residual_flow and flow (total)")
+        if self.pose_flow is None and self.T_ego1_ego0 is None:
+            raise CFlowError("an evaluation frame needs pose_flow or T_ego1_ego0 to tell ego motion from object motion")
+        if self.residual_axes not in ("t", "t+1"):
+            raise CFlowError(f"residual_axes is 't' or 't+1', got {self.residual_axes!r}")
+        points = as_numpy(self.points)
+        if points.ndim != 2 or points.shape[1] < 3:
+            raise CFlowError(f"points must be (N, 3) or wider, got shape {points.shape}")
+        self._set("points", points[:, :3].astype(np.float32))
+        rows = len(points)
+        for name in ("residual_flow", "flow", "pose_flow"):
+            self._keep(name, np.float32, (rows, 3))
+        for name in ("is_ground", "eval_mask", "is_dynamic"):
+            self._keep(name, np.bool_, (rows,))
+        self._keep("T_ego1_ego0", np.float64, (4, 4))
+        labels = FlowLabels(
+            flow=self._checked("labels.flow", self.labels.flow, np.float32, (rows, 3)),
+            category=self._checked("labels.category", self.labels.category, np.int64, (rows,)),
+            is_valid=self._checked("labels.is_valid", self.labels.is_valid, np.bool_, (rows,)),
+        )
+        self._set("labels", labels)
+        if self.pose_flow is None:
+            self._set("pose_flow", ego_motion_flow(self.points, self.T_ego1_ego0))  # type: ignore[arg-type]
+
+    @classmethod
+    def from_result(cls, window: Window, result: FlowResult, labels: FlowLabels, **parts: Any) -> EvalFrame:
+        """Frame of a window and the flow that was estimated for it.
+
+        Args:
+            window: needs the poses of pc0 and pc1, or neither.
+            result: flow of `window.pc0`.
+            labels: truth of the pair.
+            **parts: further fields, for example `eval_mask`; they win over what the window gives.
+        """
+        pose0, pose1 = window.pc0.pose, window.pc1.pose
+        if pose0 is not None and pose1 is not None:
+            parts.setdefault("T_ego1_ego0", np.linalg.inv(as_numpy(pose1, np.float64)) @ as_numpy(pose0, np.float64))
+        parts.setdefault("is_ground", window.pc0.is_ground)
+        parts.setdefault("pose_flow", result.pose_flow)
+        parts.setdefault("residual_flow", result.residual_flow)
+        return cls(points=window.pc0.points, labels=labels, **parts)
+
+    def transform(self) -> np.ndarray:
+        """(4, 4) float64 T_ego1_ego0.
+
+        Raises:
+            CFlowError: the frame has only `pose_flow`.
+        """
+        if self.T_ego1_ego0 is None:
+            raise CFlowError(
+                "this definition measures in the ego frame of another sweep, which pose_flow alone does not give; "
+                "pass T_ego1_ego0 to the evaluation frame"
+            )
+        return as_numpy(self.T_ego1_ego0)
+
+    def _set(self, name: str, value: Any) -> None:
+        object.__setattr__(self, name, value)
+
+    def _keep(self, name: str, dtype: Any, shape: Tuple[int, ...]) -> None:
+        if getattr(self, name) is not None:
+            self._set(name, self._checked(name, getattr(self, name), dtype, shape))
+
+    @staticmethod
+    def _checked(name: str, value: Array, dtype: Any, shape: Tuple[int, ...]) -> np.ndarray:
+        array = as_numpy(value)
+        if array.size == np.prod(shape) and array.ndim == len(shape) + 1 and array.shape[-1] == 1:
+            array = array[..., 0]  # evaluation masks are stored (N, 1) by some harnesses
+        if array.shape != shape:
+            raise CFlowError(f"{name} must have shape {shape} (one row per point of sweep t), got {array.shape}")
+        if dtype is np.bool_ and array.dtype != np.bool_:
+            raise CFlowError(f"{name} must be bool, got {array.dtype}")
+        return array.astype(dtype)

@@ -1,0 +1,158 @@
+"""Which points of a frame are scored, and the quantities every metric draws on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cflow_torch.evaluation.definitions import Definition
+from cflow_torch.evaluation.frame import EvalFrame, as_numpy
+from cflow_torch.types import CFlowError
+
+CLOSE_RANGE = 35.0  # metres, half side of the square that Argoverse 2 calls "close"
+
+
+@dataclass(frozen=True)
+class ScoredPoints:
+    """The M scored points of one frame.
+
+    Args:
+        error: (M,) float64, metres, length of predicted minus true residual.
+        speed: (M,) float64, metres per frame, length of the true residual.
+        category: (M,) int64, Argoverse 2 index.
+        in_region: (M,) bool, inside the definition's region.
+        is_close: (M,) bool, inside the 70 m x 70 m square around the ego at t.
+        distance: (M,) float64, metres, from the origin at t, height included.
+        true_flow, predicted_flow: (M, 3) float64, the flow that the three-way scores compare.
+        is_dynamic, predicted_dynamic: (M,) bool.
+        num_nan: points left out because of NaN.
+    """
+
+    error: np.ndarray
+    speed: np.ndarray
+    category: np.ndarray
+    in_region: np.ndarray
+    is_close: np.ndarray
+    distance: np.ndarray
+    true_flow: np.ndarray
+    predicted_flow: np.ndarray
+    is_dynamic: np.ndarray
+    predicted_dynamic: np.ndarray
+    num_nan: int
+
+
+def score_points(frame: EvalFrame, definition: Definition) -> ScoredPoints:
+    """Select the points of a frame that a definition scores and compare prediction and truth there.
+
+    Convention: rounding follows the evaluator that the definition is named after. Totals and residuals are float32; a
+    predicted residual goes the way of the harnesses (add pose flow, take it off again); lengths are taken in
+    `norm_dtype`. Rows whose label is not valid are never looked at.
+
+    Raises:
+        CFlowError: NaN where the definition refuses it; `T_ego1_ego0` is missing where it is needed.
+    """
+    keep = _candidates(frame, definition)
+    total = _predicted_total(frame)
+    pose_flow = as_numpy(frame.pose_flow)  # type: ignore[arg-type]
+    has_nan = np.isnan(np.concatenate([total, pose_flow, as_numpy(frame.points), frame.labels.flow], axis=1)).any(
+        axis=1
+    )
+    num_nan = int((keep & has_nan).sum())
+    if num_nan and definition.nan_rows == "error":
+        raise CFlowError(
+            f"{num_nan} scored points have NaN in position, truth or prediction; definition {definition.name} refuses "
+            f"them: predict 0 for points without an estimate, or use nan_rows='drop'"
+        )
+    keep &= ~has_nan
+    points, total, true_total = as_numpy(frame.points)[keep], total[keep], frame.labels.flow[keep]
+    residual, true_residual = total - pose_flow[keep], true_total - pose_flow[keep]
+    threshold = np.float32(definition.dynamic_threshold)
+    if frame.is_dynamic is None:
+        predicted_dynamic = np.linalg.norm(residual, axis=1) >= threshold
+    else:
+        predicted_dynamic = as_numpy(frame.is_dynamic)[keep]
+    if definition.residual_axes == "t":
+        true_residual = _residual_at_t(points, true_total, frame.transform())
+        residual = _predicted_residual_at_t(frame, keep, points, total)
+    predicted_flow, true_flow = (
+        (total, true_total) if definition.three_way_flow == "total" else (residual, true_residual)
+    )
+    if definition.half_precision:
+        predicted_flow, true_flow = predicted_flow.astype(np.float16), true_flow.astype(np.float16)
+    difference = residual.astype(definition.norm_dtype) - true_residual.astype(definition.norm_dtype)
+    return ScoredPoints(
+        error=np.linalg.norm(difference, axis=1).astype(np.float64),
+        speed=np.linalg.norm(true_residual.astype(definition.norm_dtype), axis=1).astype(np.float64),
+        category=frame.labels.category[keep],
+        in_region=_in_region(frame, definition)[keep],
+        is_close=(np.abs(points[:, :2]) <= CLOSE_RANGE).all(axis=1),
+        distance=np.linalg.norm(points, axis=1).astype(np.float64),
+        true_flow=true_flow.astype(np.float64),
+        predicted_flow=predicted_flow.astype(np.float64),
+        is_dynamic=np.linalg.norm(true_residual, axis=1) >= threshold,
+        predicted_dynamic=predicted_dynamic,
+        num_nan=num_nan,
+    )
+
+
+def _predicted_total(frame: EvalFrame) -> np.ndarray:
+    """(N, 3) float32 predicted total flow, axes of t+1."""
+    if frame.flow is not None:
+        return as_numpy(frame.flow)
+    residual = as_numpy(frame.residual_flow)  # type: ignore[arg-type]
+    if frame.residual_axes == "t":
+        residual = (residual @ frame.transform()[:3, :3].T).astype(np.float32)
+    return as_numpy(frame.pose_flow) + residual  # type: ignore[arg-type]
+
+
+def _residual_at_t(points: np.ndarray, total: np.ndarray, T_ego1_ego0: np.ndarray) -> np.ndarray:
+    """(M, 3) float32 residual in the axes of t: where the point ends, seen from t, minus where it started."""
+    start = points.astype(np.float64)
+    rotation, translation = T_ego1_ego0[:3, :3], T_ego1_ego0[:3, 3]
+    return ((start + total - translation) @ rotation - start).astype(np.float32)
+
+
+def _predicted_residual_at_t(frame: EvalFrame, keep: np.ndarray, points: np.ndarray, total: np.ndarray) -> np.ndarray:
+    """(M, 3) float32 predicted residual in the axes of t; one that was given as a residual is only turned."""
+    if frame.residual_flow is None:
+        return _residual_at_t(points, total, frame.transform())
+    residual = as_numpy(frame.residual_flow)[keep]
+    return residual if frame.residual_axes == "t" else (residual @ frame.transform()[:3, :3]).astype(np.float32)
+
+
+def _candidates(frame: EvalFrame, definition: Definition) -> np.ndarray:
+    """(N,) bool: valid truth, not ground, inside the evaluation mask and the crop."""
+    keep = frame.labels.is_valid.copy()
+    if definition.exclude_ground and frame.is_ground is not None:
+        keep &= ~as_numpy(frame.is_ground)
+    if frame.eval_mask is not None:
+        keep &= as_numpy(frame.eval_mask)
+    elif definition.mask_box is not None:
+        keep &= (np.abs(as_numpy(frame.points)[:, :2]) <= definition.mask_box).all(axis=1)
+    if definition.point_cloud_range is not None:
+        crop = np.asarray(definition.point_cloud_range, dtype=np.float64)
+        position = _position(frame, definition)
+        keep &= ((position > crop[:3]) & (position < crop[3:])).all(axis=1)
+    return keep
+
+
+def _in_region(frame: EvalFrame, definition: Definition) -> np.ndarray:
+    """(N,) bool: inside the box or disc that scores are given for."""
+    position = _position(frame, definition)[:, :2]
+    if definition.region == "all":
+        return np.ones(len(position), dtype=bool)
+    reach = np.abs(position).max(axis=1) if definition.region == "box" else np.linalg.norm(position, axis=1)
+    if definition.closed:
+        inner = reach > definition.min_range if definition.min_range > 0 else True
+        return inner & (reach <= definition.max_range)
+    return (reach >= definition.min_range) & (reach < definition.max_range)
+
+
+def _position(frame: EvalFrame, definition: Definition) -> np.ndarray:
+    """(N, 3) points in the frame that ranges are measured in: float32 at t, float64 at t+1."""
+    points = as_numpy(frame.points)
+    if definition.region_axes == "t":
+        return points
+    T = frame.transform()
+    return points @ T[:3, :3].T + T[:3, 3]

@@ -1,0 +1,408 @@
+"""The Argoverse 2 reader: the real log, small written logs, broken files, box truth, ground rules."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Dict, Optional, Sequence
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.feather as feather
+import pytest
+
+from cflow_torch.data.av2 import AV2Log, find_av2_logs
+from cflow_torch.data.boxes import Boxes, flow_from_boxes, points_in_box
+from cflow_torch.data.ground import GroundRaster, GroundRule, read_ground_raster
+from cflow_torch.data.log import window
+from cflow_torch.types import CFlowError
+
+TIMES = (100, 200, 300)
+POINTS = np.array([[1, 2, 3], [10, 0, 0.5], [-4, 0, 0]], dtype=np.float16)
+YAW = math.radians(90)
+
+
+def write(file: Path, columns: Dict[str, Any]) -> None:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    feather.write_feather(pa.table(columns), str(file))
+
+
+def write_sweep(folder: Path, time: int, points: np.ndarray = POINTS) -> None:
+    write(folder / "sensors" / "lidar" / f"{time}.feather", {name: points[:, i] for i, name in enumerate("xyz")})
+
+
+def pose_columns(times: Sequence[int] = TIMES) -> Dict[str, Any]:
+    """Sweep k stands at x = 1000 + k, turned left by 90 degrees."""
+    n = len(times)
+    columns: Dict[str, Any] = {name: np.zeros(n) for name in ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")}
+    columns.update(qw=np.full(n, math.cos(YAW / 2)), qz=np.full(n, math.sin(YAW / 2)), tx_m=1000.0 + np.arange(n))
+    return {"timestamp_ns": np.array(times, dtype=np.int64), **columns}
+
+
+def box_columns(
+    time: int, x: float, track: str = "a", category: str = "REGULAR_VEHICLE", inside: int = 1
+) -> Dict[str, Any]:
+    row: Dict[str, Any] = dict.fromkeys(("qx", "qy", "qz", "ty_m"), 0.0)
+    row.update(timestamp_ns=time, track_uuid=track, category=category, num_interior_pts=inside)
+    row.update(length_m=4.0, width_m=2.0, height_m=1.5, qw=1.0, tx_m=x, tz_m=0.5)
+    return row
+
+
+def annotate(folder: Path, *rows: Dict[str, Any]) -> None:
+    write(folder / "annotations.feather", {key: [row[key] for row in rows] for key in rows[0]})
+
+
+def label_columns(rows: int = 3, **changes: Any) -> Dict[str, Any]:
+    columns: Dict[str, Any] = {f"flow_t{axis}_m": np.arange(rows, dtype=np.float32) for axis in "xyz"}
+    columns.update(classes=np.full(rows, 19, dtype=np.uint8), dynamic=np.ones(rows, dtype=bool))
+    return {**columns, **changes}
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A log of three sweeps, without map and labels."""
+    log = tmp_path / "val" / "some-log"
+    for time in TIMES:
+        write_sweep(log, time)
+    write(log / "city_SE3_egovehicle.feather", pose_columns())
+    return log
+
+
+# ---------------------------------------------------------------------------------------------- the real log
+
+
+def test_real_log(av2_folder: Path, data_root: Path) -> None:
+    assert av2_folder in find_av2_logs(data_root)
+    log = AV2Log(av2_folder, require_ground=True)
+    assert log.log_id == av2_folder.name
+    assert list(log.timestamps) == [315966265259836000, 315966265360032000]
+    pair = window(log, 0)
+    assert pair.pc0.points.shape == (99_229, 3)
+    assert pair.pc1.points.shape == (99_466, 3)
+    assert pair.pc0.points.dtype == np.float32
+    assert pair.pc0.pose.dtype == np.float64
+    T = np.linalg.inv(pair.pc1.pose) @ pair.pc0.pose
+    npz = np.load(av2_folder / "ego_motion.npz")["ego_motion"][0]
+    np.testing.assert_allclose(T[:3, :3], npz[:3, :3], atol=1e-7)
+    np.testing.assert_allclose(T[:3, 3], npz[:3, 3], atol=1e-3)  # the npz was made in float32: 0.8 mm
+    assert log.labels(1) is None
+
+
+def test_real_ground_differs_in_one_point(av2_folder: Path) -> None:
+    # The stored mask was made with city coordinates in float32 (steps of 0.5 mm at 5 km). There one point, 0.4 mm from
+    # the border of a raster cell, falls into the next cell.
+    stored = feather.read_table(str(av2_folder / "flow_labels.feather"))["is_ground_0"].to_numpy()
+    is_ground = AV2Log(av2_folder).sweep(0).is_ground
+    assert stored.sum() == 17_374
+    assert is_ground.sum() == 17_373
+    assert (is_ground != stored).sum() == 1
+    assert AV2Log(av2_folder, ground="bsfe").sweep(0).is_ground.sum() == 18_754
+    assert AV2Log(av2_folder, ground=None).sweep(0).is_ground is None
+
+
+def test_real_box_truth_equals_the_stored_one(av2_folder: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "log"
+    copy.mkdir()
+    for entry in av2_folder.iterdir():
+        if entry.name != "flow_labels.feather":
+            (copy / entry.name).symlink_to(entry)
+    made, stored = AV2Log(copy).labels(0), AV2Log(av2_folder).labels(0)
+    assert made is not None and stored is not None
+    assert stored.is_valid.all()
+    np.testing.assert_array_equal(made.category, stored.category)
+    distance = np.linalg.norm(made.flow - stored.flow, axis=1)
+    assert distance.max() < 1e-3  # 0.8 mm: the stored flow has the float32 ego motion
+    ends = np.flatnonzero(~made.is_valid)
+    assert len(ends) == 9  # boxes that hold no point at t+1; stored as ego motion, without a mark
+    assert (stored.category[ends] > 0).all()
+
+
+# ---------------------------------------------------------------------------------------------- small logs
+
+
+def test_sweeps_and_poses(folder: Path) -> None:
+    log = AV2Log(folder)
+    assert (log.log_id, list(log.timestamps), len(log)) == ("some-log", [100, 200, 300], 3)
+    sweep = log.sweep(1)
+    np.testing.assert_array_equal(sweep.points, POINTS.astype(np.float32))
+    assert sweep.timestamp_ns == 200
+    assert sweep.is_ground is None
+    np.testing.assert_allclose(sweep.pose @ [1, 0, 0, 1], [1001, 1, 0, 1], atol=1e-12)  # forward is city y
+    assert log.labels(0) is None
+
+
+def test_sweeps_are_read_when_asked_for(folder: Path) -> None:
+    log = AV2Log(folder)
+    (folder / "sensors" / "lidar" / "200.feather").write_bytes(b"broken")
+    log.sweep(0)
+    with pytest.raises(CFlowError, match="cannot read"):
+        log.sweep(1)
+
+
+def test_find_logs(folder: Path, tmp_path: Path) -> None:
+    other = tmp_path / "train" / "deep" / "b-log"
+    for time in TIMES:
+        write_sweep(other, time)
+    assert find_av2_logs(folder) == [folder]
+    assert find_av2_logs(tmp_path / "val") == [folder]
+    assert find_av2_logs(tmp_path) == sorted([other, folder])
+    (tmp_path / "empty").mkdir()
+    assert find_av2_logs(tmp_path / "empty") == []
+    with pytest.raises(CFlowError, match="no folder"):
+        find_av2_logs(tmp_path / "nowhere")
+
+
+def test_label_folder_wins(folder: Path) -> None:
+    annotate(folder, box_columns(100, 10.0), box_columns(300, 11.0))
+    write(folder / "flow_labels.feather", label_columns(flow_tx_m=np.zeros(3, dtype=np.float32)))
+    valid = np.array([True, False, True])
+    write(folder / "flow_labels" / "100.feather", label_columns(is_valid=valid))
+    log = AV2Log(folder)
+    labels = log.labels(0)
+    assert labels is not None
+    np.testing.assert_array_equal(labels.flow[:, 0], [0, 1, 2])
+    np.testing.assert_array_equal(labels.is_valid, valid)
+    assert (labels.flow.dtype, labels.category.dtype, labels.is_valid.dtype) == (np.float32, np.uint8, np.bool_)
+    assert log.labels(1) is None  # the folder has no file for this pair
+    assert log.labels(2) is None  # no pair
+
+
+def test_single_label_file_is_of_the_first_pair(folder: Path) -> None:
+    write(folder / "flow_labels.feather", label_columns())
+    annotate(folder, box_columns(100, 10.0), box_columns(200, 10.0), box_columns(300, 13.0))
+    log = AV2Log(folder)
+    first, second = log.labels(0), log.labels(1)
+    assert first is not None and second is not None
+    np.testing.assert_array_equal(first.flow[:, 2], [0, 1, 2])
+    assert first.is_valid.all()
+    np.testing.assert_allclose(second.flow[1], [3, 0, 0], atol=1e-6)
+
+
+def test_labels_from_boxes(folder: Path) -> None:
+    annotate(folder, box_columns(100, 10.0), box_columns(200, 12.0), box_columns(200, -4.0, "b", "DOG"))
+    log = AV2Log(folder)
+    labels = log.labels(0)
+    assert labels is not None
+    np.testing.assert_array_equal(labels.category, [0, 19, 0])
+    # The ego moves 1 m along city x, which is its right: -y. So the world moves by +y; the box moves as annotated.
+    np.testing.assert_allclose(labels.flow, [[0, 1, 0], [2, 0, 0], [0, 1, 0]], atol=1e-6)
+    assert labels.is_valid.all()
+    assert log.labels(1) is None  # sweep 300 lies after the last annotation
+
+
+def test_track_that_ends_or_empties_is_not_valid(folder: Path) -> None:
+    annotate(folder, box_columns(100, 10.0), box_columns(200, 12.0, inside=0), box_columns(300, 12.0, "b"))
+    labels = AV2Log(folder).labels(0)
+    assert labels is not None
+    np.testing.assert_array_equal(labels.is_valid, [True, False, True])
+    assert labels.category[1] == 19
+
+
+# ---------------------------------------------------------------------------------------------- broken logs
+
+
+def test_bad_logs_are_refused(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(CFlowError, match="holds no folder sensors/lidar"):
+        AV2Log(tmp_path)
+    with pytest.raises(CFlowError, match="sweeps 0 ... 2, asked for 3"):
+        AV2Log(folder).sweep(3)
+    with pytest.raises(CFlowError, match="asked for -1"):
+        AV2Log(folder).labels(-1)
+    with pytest.raises(CFlowError, match="ground rules are"):
+        AV2Log(folder, ground="patchwork")
+    with pytest.raises(CFlowError, match="no ground raster"):
+        AV2Log(folder, require_ground=True)
+    for time in TIMES[1:]:
+        (folder / "sensors" / "lidar" / f"{time}.feather").unlink()
+    with pytest.raises(CFlowError, match="has 1 sweeps"):
+        AV2Log(folder)
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        (pose_columns((100, 300)), "no pose for sweep 200"),
+        ({**pose_columns(), "qw": np.full(3, 0.9)}, "the pose of 100 is no rigid motion"),
+        ({**pose_columns(), "tx_m": np.array([0, math.nan, 0])}, "the pose of 200 is no rigid motion"),
+        ({**pose_columns(), "qw": np.full(3, math.nan)}, "the pose of 100 is no rigid motion"),
+        ({**pose_columns(), "tx_m": ["a", "b", "c"]}, "must be floating point"),
+        ({**pose_columns(), "timestamp_ns": np.array(TIMES, dtype=np.float64)}, "timestamp_ns must be integer"),
+        ({key: value for key, value in pose_columns().items() if key != "qz"}, r"lacks the columns \['qz'\]"),
+        (None, "is missing"),
+    ],
+)
+def test_bad_poses_are_refused(folder: Path, columns: Optional[Dict[str, Any]], message: str) -> None:
+    file = folder / "city_SE3_egovehicle.feather"
+    file.unlink()
+    if columns is not None:
+        write(file, columns)
+    with pytest.raises(CFlowError, match=message):
+        AV2Log(folder)
+
+
+def test_truncated_files_are_refused(folder: Path) -> None:
+    for name in ("sensors/lidar/100.feather", "city_SE3_egovehicle.feather"):
+        file = folder / name
+        whole = file.read_bytes()
+        for keep in (0, 10, len(whole) // 2, len(whole) - 8):
+            file.write_bytes(whole[:keep])
+            with pytest.raises(CFlowError, match="cannot read"):
+                AV2Log(folder).sweep(0)
+        file.write_bytes(whole)
+    AV2Log(folder).sweep(0)
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        ({"x": POINTS[:, 0], "y": POINTS[:, 1]}, r"lacks the columns \['z'\]"),
+        ({"x": [1, 2], "y": [1.0, 2.0], "z": [1.0, 2.0]}, "must be floating point"),
+        ({"x": [1.0, None], "y": [1.0, 2.0], "z": [1.0, 2.0]}, r"empty entries in \['x'\]"),
+    ],
+)
+def test_bad_sweeps_are_refused(folder: Path, columns: Dict[str, Any], message: str) -> None:
+    write(folder / "sensors" / "lidar" / "100.feather", columns)
+    with pytest.raises(CFlowError, match=message):
+        AV2Log(folder).sweep(0)
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        (label_columns(rows=2), "2 rows but sweep 100 has 3 points"),
+        (label_columns(classes=np.array([0, 31, 0], dtype=np.uint8)), "classes are 0 ... 30"),
+        (label_columns(classes=np.zeros(3)), "classes must be integer"),
+        (label_columns(is_valid=np.ones(3)), "is_valid must be bool"),
+        (label_columns(flow_tx_m=np.zeros(3, dtype=np.int64)), "must be floating point"),
+    ],
+)
+def test_bad_labels_are_refused(folder: Path, columns: Dict[str, Any], message: str) -> None:
+    write(folder / "flow_labels" / "100.feather", columns)
+    with pytest.raises(CFlowError, match=message):
+        AV2Log(folder).labels(0)
+
+
+def test_bad_annotations_are_refused(folder: Path) -> None:
+    annotate(folder, box_columns(100, 10.0, category="SPACESHIP"), box_columns(200, 10.0))
+    with pytest.raises(CFlowError, match="SPACESHIP"):
+        AV2Log(folder).labels(0)
+    annotate(folder, box_columns(100, 10.0), box_columns(100, 20.0), box_columns(200, 10.0))
+    with pytest.raises(CFlowError, match=r"named twice: \['a'\]"):
+        AV2Log(folder).labels(0)
+    annotate(folder, {**box_columns(100, 10.0), "qw": 0.5}, box_columns(200, 10.0))
+    with pytest.raises(CFlowError, match="pose of a is no rigid motion"):
+        AV2Log(folder).labels(0)
+
+
+# ---------------------------------------------------------------------------------------------- boxes
+
+
+def turned(angle: float, x: float, y: float) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:2, :2] = [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
+    pose[:2, 3] = [x, y]
+    return pose
+
+
+def test_points_in_an_oriented_box() -> None:
+    size, pose = np.array([4.0, 2.0, 1.0]), turned(math.radians(30), 5, 1)
+    corner = pose[:3, :3] @ [2, 1, 0.5] + pose[:3, 3]
+    inward = pose[:3, :3] @ [-1, -1, -1] * 1e-9
+    points = np.stack([corner + inward, corner - inward, pose[:3, 3], [5, 3, 0]])
+    np.testing.assert_array_equal(points_in_box(points, size, pose), [True, False, True, False])
+    on_face = np.array([[2.0, 0, 0], [0, -1.0, 0], [0, 0, 0.5]])
+    assert points_in_box(on_face, size, np.eye(4)).all()
+
+
+def test_box_flow_is_the_rigid_motion_of_the_box() -> None:
+    rng = np.random.default_rng(0)
+    pose0, pose1, T = turned(0.3, 8, -2), turned(0.5, 9, -1), turned(-0.02, -1, 0)
+    local = rng.uniform(-1, 1, (40, 3)) * [2.0, 1.0, 0.7]
+    points = local @ pose0[:3, :3].T + pose0[:3, 3]
+    one = {"track_id": ["a"], "category": np.array([19], np.uint8), "size": np.array([[4.0, 2.0, 1.5]])}
+    labels = flow_from_boxes(
+        np.concatenate([points, [[30.0, 0, 0]]]), Boxes(pose=pose0[None], **one), Boxes(pose=pose1[None], **one), T
+    )
+    arrive = local @ pose1[:3, :3].T + pose1[:3, 3]
+    np.testing.assert_allclose(labels.flow[:40], arrive - points, atol=1e-6)
+    np.testing.assert_allclose(labels.flow[40], T[:3, :3] @ [30, 0, 0] + T[:3, 3] - [30, 0, 0], atol=1e-6)
+
+
+def test_margin_overlap_and_end_of_track() -> None:
+    points = np.array([[2.05, 0, 0], [0, 1.05, 0], [0, 0, 0.8], [1.9, 0, 0]])
+    boxes0 = Boxes(
+        track_id=["ends", "stays"],
+        category=np.array([4, 17], np.uint8),
+        size=np.array([[4.0, 2.0, 1.5], [0.4, 0.4, 1.5]]),
+        pose=np.stack([np.eye(4), turned(0, 1.9, 0)]),
+    )
+    boxes1 = Boxes(["stays"], np.array([17], np.uint8), boxes0.size[1:], turned(0, 2.4, 0)[None])
+    labels = flow_from_boxes(points, boxes0, boxes1, np.eye(4))
+    # 10 cm more per side in length and width, none in height; the last box wins, an ended one leaves its mark
+    np.testing.assert_array_equal(labels.category, [17, 4, 0, 17])
+    np.testing.assert_array_equal(labels.is_valid, [False, False, True, False])
+    np.testing.assert_allclose(labels.flow[[0, 3], 0], 0.5, atol=1e-6)
+    tight = flow_from_boxes(points, boxes0, boxes1, np.eye(4), margin=(0, 0, 0))
+    np.testing.assert_array_equal(tight.category, [17, 0, 0, 17])
+
+
+def test_no_points_and_no_boxes() -> None:
+    none = Boxes([], np.zeros(0, np.uint8), np.zeros((0, 3)), np.zeros((0, 4, 4)))
+    labels = flow_from_boxes(np.zeros((0, 3)), none, none, np.eye(4))
+    assert (labels.flow.shape, labels.category.shape, labels.is_valid.shape) == ((0, 3), (0,), (0,))
+    with pytest.raises(CFlowError, match="boxes need category"):
+        replace(none, track_id=["a"])
+
+
+# ---------------------------------------------------------------------------------------------- ground
+
+
+def raster(heights: Sequence[Sequence[float]]) -> GroundRaster:
+    return GroundRaster(np.array(heights, dtype=np.float64), np.eye(2), np.array([-100.0, -50.0]), 2.0)
+
+
+def test_ground_limits() -> None:
+    flat = raster([[1.0, 1.0], [1.0, 1.0]])
+    # half a metre per cell: cell (0, 0) holds x 100 ... 100.5, y 50 ... 50.5
+    z = np.array([1.3, 1.3 + 1e-9, 1.0, 0.7, -20.0, 1.35])
+    points = np.column_stack([np.full(6, 100.2), np.full(6, 50.2), z])
+    limit = GroundRule(threshold=z[0] - 1.0, rounding="truncate")  # 1.3 - 1 is not 0.3 in binary
+    np.testing.assert_array_equal(flat.is_ground(points, limit), [True, False, True, True, True, False])
+    np.testing.assert_array_equal(flat.is_ground(points, "bsfe"), [True, True, True, True, True, True])
+
+
+def test_rules_round_differently() -> None:
+    steps = raster([[0.0, 10.0], [20.0, 30.0]])
+    points = np.array([[100.3, 50.1, 10.0], [100.1, 50.3, 20.0], [99.7, 50.0, 0.0]])  # cells 0.6, 0.2; 0.2, 0.6; -0.6
+    np.testing.assert_array_equal(steps.is_ground(points, "av2-api"), [False, False, True])
+    np.testing.assert_array_equal(steps.is_ground(points, "bsfe"), [True, True, False])
+
+
+def test_unknown_height_is_not_ground() -> None:
+    hole = raster([[np.nan, 0.0]])
+    points = np.array([[100.1, 50.1, -5.0], [100.6, 50.1, -5.0], [500, 50, -5.0], [np.nan, 50, 0], [np.inf, 50, 0]])
+    np.testing.assert_array_equal(hole.is_ground(points), [False, True, False, False, False])
+
+
+def test_map_of_a_log(folder: Path) -> None:
+    maps = folder / "map"
+    maps.mkdir()
+    assert read_ground_raster(maps) is None
+    np.save(maps / "x_ground_height_surface____PIT.npy", np.zeros((40, 40), dtype=np.float16))
+    with pytest.raises(CFlowError, match="found 1 and 0"):
+        AV2Log(folder)
+    sim2 = maps / "x___img_Sim2_city.json"
+    sim2.write_text(json.dumps({"R": [1, 0, 0, 1], "t": [-990, 10], "s": 1.0}))
+    sweep = AV2Log(folder, require_ground=True).sweep(0)
+    np.testing.assert_array_equal(sweep.is_ground, [False, False, True])  # z = 3, 0.5, 0
+    np.testing.assert_array_equal(AV2Log(folder, ground="bsfe").sweep(0).is_ground, [False, False, True])
+    sim2.write_text("{}")
+    with pytest.raises(CFlowError, match="cannot read the ground raster"):
+        AV2Log(folder)
+    sim2.write_text(json.dumps({"R": [1, 0, 0, 1], "t": [-990, 10], "s": 1.0}))
+    whole = maps / "x_ground_height_surface____PIT.npy"
+    whole.write_bytes(whole.read_bytes()[:100])
+    with pytest.raises(CFlowError, match="cannot read the ground raster"):
+        AV2Log(folder)
