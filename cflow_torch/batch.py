@@ -14,6 +14,11 @@ from cflow_torch.ego import compensate, relative_transform
 from cflow_torch.grid import Grid
 from cflow_torch.types import CFlowError, FlowResult, Sweep, Window
 
+# Working memory that a window takes before its clusters are known: positions, pixels and temporaries of a point;
+# occupancy and cluster of a pixel of every sweep.
+_BYTES_PER_POINT = 160
+_BYTES_PER_PIXEL = 10
+
 # Sweeps further apart than this many times the step from t to t+1 are no steady history: counting steps would mislead.
 _LONGEST_GAP = 2.5
 # No sweep of a window is further away than this, metres: 2 s at 50 m/s.
@@ -48,6 +53,36 @@ class Batch:
     pose_flow: Tuple[Tensor, ...]
 
 
+def split_windows(windows: Sequence[Window], config: Config, grid: Grid) -> List[List[Window]]:
+    """Windows in groups that fit `max_memory`, in order. The result of a window does not depend on its group.
+
+    Args:
+        windows: B windows; an empty list gives no group.
+        config: `max_memory`; None = one group.
+        grid: the finest scale, whose images are the largest.
+
+    Returns:
+        Groups of at least one window.
+
+    Raises:
+        CFlowError: not a list of windows.
+    """
+    if isinstance(windows, (Window, Sweep)) or not all(isinstance(w, Window) for w in windows):
+        raise CFlowError("give a list of cflow_torch.Window (for one window, a list of length one)")
+    groups: List[List[Window]] = []
+    used = 0
+    for window in windows:
+        sweeps = (window.pc1, window.pc0, *window.pch)
+        points = sum(shape[0] for shape in (getattr(sweep.points, "shape", ()) for sweep in sweeps) if shape)
+        needed = _BYTES_PER_POINT * points + (_BYTES_PER_PIXEL * len(sweeps) + 30) * grid.height * grid.width
+        if not groups or (config.max_memory is not None and used + needed > config.max_memory):
+            groups.append([])
+            used = 0
+        groups[-1].append(window)
+        used += needed
+    return groups
+
+
 def make_batch(windows: Sequence[Window], config: Config, grid: Grid, device: Any = "auto") -> Batch:
     """Check windows, bring every sweep into the frame of its t+1, mark what takes part.
 
@@ -66,8 +101,6 @@ def make_batch(windows: Sequence[Window], config: Config, grid: Grid, device: An
 
     Cost: linear in points; the only Python loop over sweeps, because they arrive as a list.
     """
-    if isinstance(windows, (Window, Sweep)) or not all(isinstance(w, Window) for w in windows) or not windows:
-        raise CFlowError("give a non-empty list of cflow_torch.Window")
     chosen_device = _device(windows, device)
     kept = [_sources(window, config) for window in windows]
     num_steps = 1 + max(len(sources) for sources in kept)

@@ -15,6 +15,8 @@ from cflow_torch.ops.cross_correlation import cross_correlate
 # mean few kernel launches. Longer clusters are rare, thin and expensive: height and width get classes of their own.
 _SQUARE_CLASSES = (8, 16, 32, 64)
 _LONG_CLASSES = (8, 16, 32, 48, 64, 80, 96, 128, 160, 192, 256, 320, 384, 512, 640, 768, 1024)
+# Working memory of a job per pixel of its class: spectra of 1.5 x 1.5 the size, counts, energies, ranking values.
+_BYTES_PER_SAMPLE = 100
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,7 @@ def best_shifts(
     size: Tensor,
     radius: Optional[Tensor] = None,
     engine: str = "fft",
+    max_memory: Optional[int] = None,
 ) -> Tuple[Tensor, Tensor]:
     """The shift of each template that maximises the normalised cross-correlation with its target.
 
@@ -48,6 +51,8 @@ def best_shifts(
         size: (N, 2) int64, height and width H, W of each target and of its templates.
         radius: (J,) float64, longest shift that is searched, pixels; None = only bounded by the size.
         engine: "fft" or "conv"; the same bits.
+        max_memory: bytes of working memory to plan with; more jobs than fit are processed in turn, with the same
+            result. None = all jobs of a size class at once.
 
     Returns:
         shift: (J, 2) int64, (dy, dx), pixels.
@@ -74,20 +79,42 @@ def best_shifts(
     peaks = []
     first_target = first_job = 0
     for template_images, target_images in zip(templates, targets):
-        of_class = slice(first_job, first_job + len(template_images))
-        own = target_of_job[of_class] - first_target
+        own = target_of_job[first_job : first_job + len(template_images)] - first_target
         sizes = target_size[first_target : first_target + len(target_images)]
-        counts = cross_correlate(template_images, target_images, own, engine)
-        energy, searched = _energy_under_window(target_images, sizes), _searched(target_images, sizes)[own]
-        if radius is not None:
-            searched = searched & (_squared_length(counts) <= (radius * radius)[jobs[of_class], None, None])
-        peaks.append(_argmax(counts, energy[own], searched))
+        limits = None if radius is None else radius[jobs[first_job : first_job + len(template_images)]]
+        at_once = _jobs_at_once(template_images, max_memory)
+        for start in range(0, len(template_images), at_once):
+            part = slice(start, start + at_once)
+            used, of_used = own[part], slice(None)
+            if at_once < len(template_images):  # jobs are sorted by target: a run of jobs needs a run of targets
+                of_used = slice(int(used[0]), int(used[-1]) + 1)
+                used = used - used[0]
+            limit = None if limits is None else limits[part]
+            peaks.append(_peaks(template_images[part], target_images[of_used], used, sizes[of_used], limit, engine))
         first_target += len(target_images)
         first_job += len(template_images)
 
     shift, count, energy = (torch.empty_like(p).index_copy_(0, jobs, p) for p in map(torch.cat, zip(*peaks)))
     energies = (torch.bincount(template.image, minlength=num_jobs) * energy).double()
     return shift, (count.double() / energies.clamp(min=1).sqrt()).float()
+
+
+def _peaks(
+    template: Tensor, target: Tensor, target_of_job: Tensor, size: Tensor, radius: Optional[Tensor], engine: str
+) -> Tuple[Tensor, Tensor, Tensor]:
+    """Shift, count and energy at the best shift of (J, height, width) templates over (n, height, width) targets."""
+    counts = cross_correlate(template, target, target_of_job, engine)
+    searched = _searched(target, size)[target_of_job]
+    if radius is not None:
+        searched = searched & (_squared_length(counts) <= (radius * radius)[:, None, None])
+    return _argmax(counts, _energy_under_window(target, size)[target_of_job], searched)
+
+
+def _jobs_at_once(template: Tensor, max_memory: Optional[int]) -> int:
+    num_jobs, height, width = template.shape
+    if max_memory is None:
+        return num_jobs
+    return max(1, min(num_jobs, int(max_memory) // (_BYTES_PER_SAMPLE * height * width)))
 
 
 def _size_classes(size: Tensor) -> Tuple[Tensor, Tensor, List[Tuple[int, int]]]:

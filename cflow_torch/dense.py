@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.profiler import record_function
 
-from cflow_torch.batch import Batch, make_batch, split_results
+from cflow_torch.batch import Batch, make_batch, split_results, split_windows
 from cflow_torch.cluster import Clusters, cluster
 from cflow_torch.config import Config, make_config
 from cflow_torch.correlate import Images, best_shifts
@@ -69,11 +69,18 @@ class CorrelationFlow(nn.Module):
         """
         config = self.config
         grids = [Grid(size, config.point_cloud_range[:3], config.point_cloud_range[3:]) for size in config.pixel_sizes]
+        results: List[FlowResult] = []
+        for part in split_windows(windows, config, grids[-1]):
+            results += self._flow(part, grids)
+        return results
+
+    def _flow(self, windows: Sequence[Window], grids: Sequence[Grid]) -> List[FlowResult]:
+        """The page that reads like the paper: compensate, then at every scale project, cluster, correlate, pool, warp."""
         with record_function("compensate"):
-            batch = make_batch(windows, config, grids[0], self.device)
+            batch = make_batch(windows, self.config, grids[0], self.device)
         flow = None
         for grid in grids:  # coarse to fine
-            motion = motion_at_scale(batch, flow, grid, config)
+            motion = motion_at_scale(batch, flow, grid, self.config)
             step = motion.flow.index_select(0, motion.cluster)
             flow = step if flow is None else flow + step
         with record_function("spread"):
@@ -179,6 +186,7 @@ def correlate(clusters: Clusters, batch: Batch, grid: Grid, config: Config) -> T
         clusters.size,
         radius,
         config.correlation,
+        config.max_memory,
     )
     estimates = torch.zeros((num_clusters * num_sources, 3), dtype=torch.float64, device=row.device)
     estimates[jobs, :2] = shift.flip(1).double() * grid.pixel_size  # (dy, dx) -> (x, y)

@@ -73,6 +73,7 @@ def add_sectional_view(
         torch.arange(slots.numel(), device=slots.device),
         size,
         engine=config.correlation,
+        max_memory=config.max_memory,
     )
     along, up = shift[:, 1].double() * pixel_size, shift[:, 0].double() * pixel_size
     result = estimates.clone().view(-1, 3)
