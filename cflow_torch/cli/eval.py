@@ -15,6 +15,7 @@ from typing import Any, Dict
 from omegaconf import DictConfig, OmegaConf
 
 from cflow_torch.cli.run import finish, for_each_pair, make_model, open_logs, versions, write_config, write_text
+from cflow_torch.data.hdf5 import HDF5Log
 from cflow_torch.data.log import Log
 from cflow_torch.evaluation.frame import EvalFrame
 from cflow_torch.evaluation.metrics import SceneFlowMetrics
@@ -32,7 +33,8 @@ def task(cfg: DictConfig) -> float:
     def score(log: Log, index: int, sweeps: Window, result: FlowResult) -> None:
         labels = log.labels(index)
         if labels is not None:
-            metrics.update(EvalFrame.from_result(sweeps, result, labels))
+            eval_mask = log.eval_mask(index) if isinstance(log, HDF5Log) else None
+            metrics.update(EvalFrame.from_result(sweeps, result, labels, eval_mask=eval_mask))
 
     failures += for_each_pair(logs, model, score)
     if metrics.num_frames == 0:

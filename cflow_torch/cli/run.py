@@ -16,6 +16,7 @@ from cflow_torch import __version__
 from cflow_torch.config import Config
 from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.av2 import AV2Log, find_av2_logs
+from cflow_torch.data.hdf5 import HDF5Log, find_hdf5_scenes
 from cflow_torch.data.log import Log, window
 from cflow_torch.data.synthetic import make_drive
 from cflow_torch.data.writers import write_av2_log
@@ -23,6 +24,11 @@ from cflow_torch.dense import CorrelationFlow
 from cflow_torch.types import CFlowError, FlowResult, Window
 
 Failures = List[Tuple[str, str]]
+# data.name: how its logs are found, read, and called.
+_READERS: Dict[str, Tuple[Callable[[Any], List[Path]], Callable[[Any], Any], str]] = {
+    "av2": (find_av2_logs, AV2Log, "Argoverse 2 log (a folder with sensors/lidar)"),
+    "hdf5": (find_hdf5_scenes, HDF5Log, "scene (a file *.h5)"),
+}
 UseResult = Callable[[Log, int, Window, FlowResult], None]
 
 
@@ -59,21 +65,22 @@ def open_logs(cfg: DictConfig, folder: Path) -> Tuple[List[Log], Failures]:
     data = cfg.data
     if data.name == "synthetic":
         drive = make_drive(seed=data.seed, num_sweeps=data.num_sweeps)
-        folders = [write_av2_log(drive, folder / "log", overwrite=True)]
+        sources, reader = [write_av2_log(drive, folder / "log", overwrite=True)], AV2Log
+    elif OmegaConf.is_missing(data, "root"):
+        raise CFlowError("where is the data? give data.root=PATH, one log or a folder of logs")
     else:
-        if OmegaConf.is_missing(data, "root"):
-            raise CFlowError("where is the data? give data.root=FOLDER, a log or a folder of logs")
-        folders = find_av2_logs(data.root)
-    if not folders:
-        raise CFlowError(f"no Argoverse 2 log (a folder with sensors/lidar) below {data.root}")
+        find, reader, what = _READERS[data.name]
+        sources = find(data.root)
+        if not sources:
+            raise CFlowError(f"no {what} in {data.root}")
     logs: List[Log] = []
     failures: Failures = []
-    for log_folder in folders:
+    for source in sources:
         try:
-            logs.append(AV2Log(log_folder))
+            logs.append(reader(source))
         except (CFlowError, OSError) as error:
-            failures.append((log_folder.name, str(error)))
-            tqdm.write(f"failed: {log_folder.name}: {error}", file=sys.stderr)
+            failures.append((source.name, str(error)))
+            tqdm.write(f"failed: {source.name}: {error}", file=sys.stderr)
     return logs, failures
 
 
