@@ -12,7 +12,8 @@ import pytest
 import torch
 
 from cflow_torch import CFlowError, FlowResult
-from cflow_torch.viz import bev, flow_to_rgb, panel, plot_flow, save_picture, wheel_image
+from cflow_torch.data import atomic
+from cflow_torch.viz import flow_to_rgb, panel, plot_flow, save_picture, wheel_image
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 CAR_FLOW = np.array([-0.6, 0.0, 0.0])
@@ -278,7 +279,7 @@ def test_a_failed_save_leaves_the_old_file(scene, tmp_path, monkeypatch, stage):
     figure = plot_flow(points, flow)
 
     def half(target, **settings):
-        Path(target).write_bytes(b"half")
+        target.write(b"half")
         raise OSError("disk full")
 
     def refuse(*paths):
@@ -287,7 +288,7 @@ def test_a_failed_save_leaves_the_old_file(scene, tmp_path, monkeypatch, stage):
     if stage == "savefig":
         monkeypatch.setattr(figure, "savefig", half)
     else:
-        monkeypatch.setattr(bev.os, "replace", refuse)
+        monkeypatch.setattr(atomic.os, "replace", refuse)
     with pytest.raises(CFlowError, match="disk full"):
         save_picture(figure, path)
     assert path.read_bytes() == b"old"

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Optional, Sequence, Tuple, Union
 
 import numpy as np
 
 from cflow_torch.config import Config
+from cflow_torch.data.atomic import atomic_file
 from cflow_torch.types import Array, CFlowError, FlowResult
 from cflow_torch.viz.panel import MOVING, draw_error, draw_flow, draw_ground, draw_scale, draw_wheel, new_figure
 from cflow_torch.viz.wheel import to_numpy
@@ -107,11 +106,8 @@ def save_picture(figure: Figure, path: Union[str, Path]) -> Path:
     if not path.parent.is_dir():
         raise CFlowError(f"the folder {path.parent} does not exist: make it first")
     try:
-        # A folder beside the target: same file system, so that os.replace is atomic, and cleared on every way out.
-        with tempfile.TemporaryDirectory(prefix=f".{path.stem}-", dir=path.parent) as scratch:
-            temporary = Path(scratch) / path.name
-            figure.savefig(temporary, format="png", dpi=figure.dpi)
-            os.replace(temporary, path)
+        with atomic_file(path) as file:
+            figure.savefig(file, format="png", dpi=figure.dpi)
     except OSError as error:
         raise CFlowError(f"cannot write {path}: {error}") from error
     return path
