@@ -1,0 +1,116 @@
+"""The ground of the synthetic street: a gently curved road surface and kerbs up to raised pavements."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Tuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+_BISECTIONS = 12  # halvings of the way between pavement level and road level: a kerb face to the millimetre
+
+
+@dataclass(frozen=True)
+class Ground:
+    """Height field z(x, y) in the world: two streets that cross, kerbs, pavements.
+
+    The road is `z = slope . (x, y) + curvature / 2 * x**2`; the pavement lies `kerb` above it. One street runs along x
+    (centre y = 0), the other along y (centre x = crossing_x).
+
+    Args:
+        slope: rise per metre along x and y.
+        curvature: change of the slope per metre along x, 1/m (a crest or a dip).
+        kerb: height of the pavement above the road, metres.
+        half_widths: half the width between the kerbs of the street along x and of the one along y, metres.
+        crossing_x: centre of the street along y, metres.
+        corner_radius: of the kerbs at the crossing, metres.
+    """
+
+    slope: Tuple[float, float]
+    curvature: float
+    kerb: float = 0.13
+    half_widths: Tuple[float, float] = (8.5, 6.5)
+    crossing_x: float = 20.0
+    corner_radius: float = 4.0
+
+    def road_height(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Height of the road surface (continued below the pavements), metres."""
+        return self.slope[0] * x + self.slope[1] * y + 0.5 * self.curvature * x * x
+
+    def height(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Height of what a wheel or a foot stands on at world (x, y), float64 metres."""
+        on_pavement = self.pavement_depth(torch.from_numpy(x), torch.from_numpy(y)).numpy() > 0
+        return self.road_height(x, y) + self.kerb * on_pavement
+
+    def pavement_depth(self, x: Tensor, y: Tensor) -> Tensor:
+        """How far inside the pavement (x, y) lies: 0 at the kerb, negative on the road, metres."""
+        u = y.abs() - self.half_widths[0]
+        v = (x - self.crossing_x).abs() - self.half_widths[1]
+        radius = self.corner_radius
+        in_corner = (u < radius) & (v < radius) & (u > 0) & (v > 0)
+        return torch.where(in_corner, radius - torch.hypot(radius - u, radius - v), torch.minimum(u, v))
+
+    def pose(self, x: np.ndarray, y: np.ndarray, yaw: np.ndarray) -> np.ndarray:
+        """Frames that stand on the ground and tilt with it.
+
+        Args:
+            x, y: (...,) world position, metres.
+            yaw: (...,) heading, radians.
+
+        Returns:
+            (..., 4, 4) float64 `T_world_body`: x axis ahead, z axis normal to the ground, origin on the ground. Across
+            a kerb the height changes over half a metre, as legs and tyres do, not in one step.
+        """
+        slope_x, slope_y = self.slope[0] + self.curvature * x, np.broadcast_to(self.slope[1], x.shape)
+        depth = self.pavement_depth(torch.from_numpy(x), torch.from_numpy(y)).numpy()
+        z = self.road_height(x, y) + self.kerb * np.clip(0.5 + depth / 0.5, 0, 1)
+        up = np.stack([-slope_x, -slope_y, np.ones_like(x)], -1)
+        ahead = np.stack([np.cos(yaw), np.sin(yaw), slope_x * np.cos(yaw) + slope_y * np.sin(yaw)], -1)
+        up /= np.linalg.norm(up, axis=-1, keepdims=True)
+        ahead /= np.linalg.norm(ahead, axis=-1, keepdims=True)
+        pose = np.zeros((*x.shape, 4, 4))
+        pose[..., :3, :] = np.stack([ahead, np.cross(up, ahead), up, np.stack([x, y, z], -1)], -1)
+        pose[..., 3, 3] = 1
+        return pose
+
+    def cast(self, origin: Tensor, directions: Tensor) -> Tuple[Tensor, Tensor]:
+        """Where rays meet the ground.
+
+        Args:
+            origin: (3,) float64, world metres, above the ground.
+            directions: (3, R) float64 unit vectors, world axes.
+
+        Returns:
+            (R,) float64 range in metres, inf = never; (R,) float64 cosine of the angle of incidence.
+        """
+        raised, _ = self._cast_surface(origin, directions, self.kerb)
+        low, cosine = self._cast_surface(origin, directions, 0.0)
+        hits_pavement = self._depth_along(origin, directions, raised) > 0
+        # A ray that is above the road at pavement height and under the pavement at road height hit the kerb between.
+        hits_kerb = ~hits_pavement & (self._depth_along(origin, directions, low) > 0)
+        if bool(hits_kerb.any()):
+            rays = directions[:, hits_kerb]
+            near, far = raised[hits_kerb], low[hits_kerb]
+            for _ in range(_BISECTIONS):
+                middle = 0.5 * (near + far)
+                inside = self._depth_along(origin, rays, middle) > 0
+                near, far = torch.where(inside, near, middle), torch.where(inside, middle, far)
+            low[hits_kerb] = 0.5 * (near + far)
+            cosine[hits_kerb] = 0.5
+        return torch.where(hits_pavement, raised, low), cosine
+
+    def _cast_surface(self, origin: Tensor, directions: Tensor, lift: float) -> Tuple[Tensor, Tensor]:
+        """Range and cosine of incidence on the road surface lifted by `lift`; smallest root of a + b t + c t**2 = 0."""
+        x, y, z = origin.tolist()
+        slope_x = self.slope[0] + self.curvature * x
+        a = z - float(self.road_height(np.float64(x), np.float64(y))) - lift
+        b = directions[2] - slope_x * directions[0] - self.slope[1] * directions[1]
+        c = -0.5 * self.curvature * directions[0] ** 2
+        root = (b * b - 4 * a * c).sqrt()  # NaN: the ray passes over the crest
+        t = 2 * a / (root - b)  # the form without cancellation
+        return torch.where(t > 0, t, torch.inf), root.nan_to_num()
+
+    def _depth_along(self, origin: Tensor, directions: Tensor, t: Tensor) -> Tensor:
+        return self.pavement_depth(origin[0] + t * directions[0], origin[1] + t * directions[1])
