@@ -72,8 +72,8 @@ def cluster(occupancy: Tensor, pixel_size: float, config: Config) -> Clusters:
     """
     num_windows, num_steps, height, width = occupancy.shape
     aggregated = occupancy[:, 0].clone()
-    for step in range(1, num_steps):
-        aggregated |= occupancy[:, step]
+    for index in range(1, num_steps):
+        aggregated |= occupancy[:, index]
     pixels = aggregated.flatten().nonzero()[:, 0]
     component = _label_dilated(aggregated, pixels, config)
     component = _split_oversized(aggregated, pixels, component, pixel_size, config)

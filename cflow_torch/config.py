@@ -105,7 +105,7 @@ class Config:
         return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self).items()}
 
 
-# What each preset changes in `Config`'s defaults, which are the paper's base row: s = 0.1 m, BEV only, 70 m x 70 m, h = 0.
+# What each preset changes in `Config`'s defaults. Those are the paper's base row: s = 0.1 m, BEV, h = 0.
 PRESETS: Dict[str, Dict[str, Any]] = {
     "paper": {},
     "default": {},

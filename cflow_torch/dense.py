@@ -68,21 +68,22 @@ class CorrelationFlow(nn.Module):
             CFlowError: bad input, see `make_batch`.
         """
         config = self.config
-        grids = [Grid(size, config.point_cloud_range[:3], config.point_cloud_range[3:]) for size in config.pixel_sizes]
+        lower, upper = config.point_cloud_range[:3], config.point_cloud_range[3:]
+        grids = [Grid(size, lower, upper) for size in config.pixel_sizes]
         results: List[FlowResult] = []
         for part in split_windows(windows, config, grids[-1]):
             results += self._flow(part, grids)
         return results
 
     def _flow(self, windows: Sequence[Window], grids: Sequence[Grid]) -> List[FlowResult]:
-        """The page that reads like the paper: compensate, then at every scale project, cluster, correlate, pool, warp."""
+        """The paper on one page: compensate, then at every scale project, cluster, correlate, pool, spread."""
         with record_function("compensate"):
             batch = make_batch(windows, self.config, grids[0], self.device)
-        flow = None
-        for grid in grids:  # coarse to fine
+        motion = motion_at_scale(batch, None, grids[0], self.config)
+        flow = motion.flow.index_select(0, motion.cluster)
+        for grid in grids[1:]:  # coarse to fine
             motion = motion_at_scale(batch, flow, grid, self.config)
-            step = motion.flow.index_select(0, motion.cluster)
-            flow = step if flow is None else flow + step
+            flow = flow + motion.flow.index_select(0, motion.cluster)
         with record_function("spread"):
             cluster_id = motion.cluster_id.index_select(0, motion.cluster)
             score = motion.score.index_select(0, motion.cluster)

@@ -21,13 +21,13 @@ class Grid:
 
     Args:
         pixel_size: s, metres.
-        lower: (x0, y0, z0), metres, lower end of the region, frame of t+1.
-        upper: (x1, y1, z1), upper end; both ends belong to the region.
+        lower: (x0, y0, z0), p^-, metres, lower end of the region, frame of t+1.
+        upper: (x1, y1, z1), p^+, upper end; both ends belong to the region.
     """
 
     pixel_size: float
-    lower: Tuple[float, float, float]
-    upper: Tuple[float, float, float]
+    lower: Tuple[float, ...]
+    upper: Tuple[float, ...]
 
     def __post_init__(self) -> None:
         if self.height * self.width > _MOST_PIXELS:

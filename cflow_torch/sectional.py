@@ -37,7 +37,7 @@ def add_sectional_view(
 
     Convention:
         The heading is the direction of (f_x, f_y), the x axis if that is zero. The X-Z images lie on one grid through
-        the origin and are cut to the bounding box of the pair. Ties: smallest shift, then smallest dz, then smallest dx'.
+        the origin, cut to the bounding box of the pair. Ties: smallest shift, then smallest dz, then smallest dx'.
 
     Source: Alg. scene_flow_1obj.
     """

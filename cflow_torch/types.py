@@ -6,7 +6,6 @@ from dataclasses import dataclass, fields
 from typing import Any, Optional, Tuple, Union
 
 import numpy as np
-import torch
 from torch import Tensor
 
 Array = Union[np.ndarray, Tensor]

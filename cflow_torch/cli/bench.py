@@ -1,7 +1,7 @@
 """Times the method, stage by stage, against the reference and a plain OpenCV loop: a table and OUTPUT/bench.json.
 
-  cflow bench
-  cflow bench data=av2 data.root=/data/av2/val/LOG repeats=50
+cflow bench
+cflow bench data=av2 data.root=/data/av2/val/LOG repeats=50
 """
 
 from __future__ import annotations

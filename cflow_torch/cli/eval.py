@@ -1,8 +1,8 @@
 """Flow and scores of every labelled pair: a table on the screen, OUTPUT/results.json, OUTPUT/config.yaml.
 
-  cflow eval data=av2 data.root=/data/av2/val model=paper
-  cflow eval definition=av2                    scores as another public evaluator defines them
-  cflow eval -m model.connectivity=4,8         a sweep; give output=outputs/${model.connectivity} to keep both
+cflow eval data=av2 data.root=/data/av2/val model=paper
+cflow eval definition=av2                    scores as another public evaluator defines them
+cflow eval -m model.connectivity=4,8         a sweep; give output=outputs/${model.connectivity} to keep both
 """
 
 from __future__ import annotations
@@ -47,7 +47,11 @@ def task(cfg: DictConfig) -> float:
 def report(cfg: DictConfig, metrics: SceneFlowMetrics, output: Path) -> Dict[str, Any]:
     """Print the scores and write results.json and config.yaml."""
     results = metrics.compute()
-    record = {"results": _without_nan(results), "config": OmegaConf.to_container(cfg, resolve=True), "versions": versions()}
+    record = {
+        "results": _without_nan(results),
+        "config": OmegaConf.to_container(cfg, resolve=True),
+        "versions": versions(),
+    }
     write_text(output / "results.json", json.dumps(record, indent=2) + "\n")
     write_config(cfg, output)
     print(format_table(results))

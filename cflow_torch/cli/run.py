@@ -65,7 +65,8 @@ def open_logs(cfg: DictConfig, folder: Path) -> Tuple[List[Log], Failures]:
     data = cfg.data
     if data.name == "synthetic":
         drive = make_drive(seed=data.seed, num_sweeps=data.num_sweeps)
-        sources, reader = [write_av2_log(drive, folder / "log", overwrite=True)], AV2Log
+        reader: Callable[[Any], Any] = AV2Log
+        sources = [write_av2_log(drive, folder / "log", overwrite=True)]
     elif OmegaConf.is_missing(data, "root"):
         raise CFlowError("where is the data? give data.root=PATH, one log or a folder of logs")
     else:

@@ -10,6 +10,7 @@ import numpy as np
 
 from cflow_torch.data.log import FlowLabels
 from cflow_torch.types import CFlowError, Sweep
+
 # Time stamps count from 1970 or 1980: below this they are microseconds (16 digits), above it nanoseconds (18 or 19).
 _FIRST_NANOSECOND = 10**17
 

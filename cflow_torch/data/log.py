@@ -26,15 +26,15 @@ class FlowLabels:
 
 
 class Log(Protocol):
-    """One drive.
+    """One drive."""
 
-    Attributes:
-        log_id: name, safe as a folder name.
-        timestamps: sweep times in nanoseconds, ascending.
-    """
+    @property
+    def log_id(self) -> str:
+        """Name, safe as a folder name."""
 
-    log_id: str
-    timestamps: Sequence[int]
+    @property
+    def timestamps(self) -> Sequence[int]:
+        """Sweep times, ascending."""
 
     def sweep(self, index: int) -> Sweep:
         """Sweep number `index` with float32 points, float64 pose `T_world_ego`, ground mask, time."""

@@ -71,13 +71,11 @@ class GroundRaster:
 
 
 class AnnotatedLog(Log, Protocol):
-    """A log that knows all that Argoverse 2 stores.
+    """A log that knows all that Argoverse 2 stores."""
 
-    Attributes:
-        calibration: sensor name -> (4, 4) float64 `T_ego_sensor`.
-    """
-
-    calibration: Mapping[str, np.ndarray]
+    @property
+    def calibration(self) -> Mapping[str, np.ndarray]:
+        """Sensor name -> (4, 4) float64 `T_ego_sensor`."""
 
     def channels(self, index: int) -> Channels:
         """Of every point of sweep `index`."""

@@ -1,0 +1,1 @@
+"""Benchmark: the method against its reference and against a plain OpenCV loop."""

@@ -1,0 +1,140 @@
+"""Checks of what users give: shapes, dtypes, devices, repeated sweeps, time stamps."""
+
+from __future__ import annotations
+
+from typing import Any, List, Sequence, Tuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from cflow_torch.config import Config
+from cflow_torch.types import CFlowError, Sweep, Window
+
+# Sweeps further apart than this many times the step from t to t+1 are no steady history: counting steps would mislead.
+_LONGEST_GAP = 2.5
+# No sweep of a window is further away than this, metres: 2 s at 50 m/s.
+_FARTHEST_POSE = 100.0
+
+
+def source_sweeps(window: Window, config: Config) -> List[Tuple[str, Sweep, int]]:
+    """(name, sweep, steps to t+1) of pc0 and the history, repeated sweeps left out."""
+    if len(window.pch) > config.num_history:
+        raise CFlowError(
+            f"the window has {len(window.pch)} history sweeps but num_history={config.num_history}: "
+            "pass num_history, or fewer sweeps"
+        )
+    sweeps = [window.pc1, window.pc0, *window.pch]
+    with_pose = [sweep.pose is not None for sweep in sweeps]
+    if any(with_pose) and not all(with_pose):
+        raise CFlowError(
+            "some sweeps of the window have a pose and some have none: give the pose of every sweep, or of none "
+            "(then all points must already lie in the frame of t+1)"
+        )
+    names = ["pc0", *(f"pch{i + 1}" for i in range(len(window.pch)))]
+    sources: List[Tuple[str, Sweep, int]] = []
+    for step, (name, sweep) in enumerate(zip(names, sweeps[1:]), 1):
+        if not any(_same(sweep, other) for _, other, _ in sources):
+            sources.append((name, sweep, step))
+    return sources
+
+
+def _same(a: Sweep, b: Sweep) -> bool:
+    """Same points and same pose: harnesses repeat the first sweep of a scene where history is missing."""
+    if a is b:
+        return True
+    if not all(isinstance(x.points, (np.ndarray, Tensor)) for x in (a, b)) or a.points.shape != b.points.shape:
+        return False
+    if (a.pose is None) != (b.pose is None):
+        return False
+    same_pose = a.pose is None or np.array_equal(_numpy(a.pose), _numpy(b.pose))
+    return same_pose and np.array_equal(_numpy(a.points), _numpy(b.points), equal_nan=True)
+
+
+def elapsed_times(
+    window: Window, sources: Sequence[Tuple[str, Sweep, int]], config: Config
+) -> Sequence[Tuple[float, float]]:
+    """(sweep intervals, seconds) from each source sweep to t+1, by time stamps where every sweep has one."""
+    stamps = [sweep.timestamp_ns for sweep in (window.pc1, window.pc0, *window.pch)]
+    if any(stamp is None for stamp in stamps):
+        return [(float(step), step * config.sweep_interval) for _, _, step in sources]
+    gaps = [int(window.pc1.timestamp_ns) - int(sweep.timestamp_ns) for _, sweep, _ in sources]  # type: ignore[arg-type]
+    intervals = [later - earlier for earlier, later in zip([0, *gaps], gaps)]
+    if min(intervals) <= 0:
+        raise CFlowError(
+            f"time stamps of the window are out of order (nanoseconds before t+1: {gaps}): "
+            "give pc1, pc0, pch1, ... from newest to oldest"
+        )
+    if config.use_timestamps:
+        return [(gap / gaps[0], gap / 1e9) for gap in gaps]
+    steps = [after - before for before, after in zip([0, *(s for _, _, s in sources)], (s for _, _, s in sources))]
+    worst = max(interval / (step * gaps[0]) for interval, step in zip(intervals, steps))
+    if worst > _LONGEST_GAP:
+        raise CFlowError(
+            f"the sweeps are unevenly spaced (nanoseconds before t+1: {gaps}; one gap is {worst:.1f} times that from t "
+            "to t+1): pass use_timestamps=True, or leave out the sweeps before the gap"
+        )
+    return [(float(step), gap / 1e9) for (_, _, step), gap in zip(sources, gaps)]
+
+
+def check_distance(T_ego1_ego: np.ndarray, name: str) -> None:
+    distance = float(np.linalg.norm(T_ego1_ego[:3, 3]))
+    if distance > _FARTHEST_POSE:
+        raise CFlowError(
+            f"the ego vehicle moves {distance:.0f} m between {name} and pc1 (at most {_FARTHEST_POSE:.0f} m): "
+            "are the poses of another log, or not in metres?"
+        )
+
+
+def _numpy(array: Any) -> np.ndarray:
+    return array.detach().cpu().numpy() if isinstance(array, Tensor) else np.asarray(array)
+
+
+def choose_device(windows: Sequence[Window], device: Any) -> torch.device:
+    if not (isinstance(device, str) and device == "auto"):
+        try:
+            return torch.device(device)
+        except (RuntimeError, TypeError):
+            raise CFlowError(f"device={device!r}: give 'auto', 'cpu', 'cuda' or a torch.device") from None
+    found = {
+        array.device
+        for window in windows
+        for sweep in (window.pc0, window.pc1, *window.pch)
+        for array in (sweep.points, sweep.is_ground)
+        if isinstance(array, Tensor)
+    }
+    if len(found) > 1:
+        names = ", ".join(sorted(str(d) for d in found))
+        raise CFlowError(f"tensors lie on different devices ({names}): put them on one, or pass device=...")
+    if found:
+        return found.pop()
+    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+
+
+def read_positions(sweep: Sweep, name: str, device: torch.device) -> Tensor:
+    """(3, N) float64 copy of the first three columns; the input is never modified."""
+    points = sweep.points
+    if not isinstance(points, (np.ndarray, Tensor)):
+        raise CFlowError(f"{name} is {type(points).__name__}: give a NumPy array or a torch tensor of shape (N, 3+)")
+    if points.ndim != 2 or points.shape[1] < 3:
+        raise CFlowError(f"{name} has shape {tuple(points.shape)}: give (N, 3+), columns x, y, z in metres")
+    if isinstance(points, Tensor):
+        if not points.is_floating_point():
+            raise CFlowError(f"{name} has dtype {points.dtype}: give floating-point metres")
+        return points.detach()[:, :3].to(device).t().to(torch.float64).contiguous()
+    if not np.issubdtype(points.dtype, np.floating):
+        raise CFlowError(f"{name} has dtype {points.dtype}: give floating-point metres")
+    return torch.from_numpy(np.array(points[:, :3].T, dtype=np.float64, order="C")).to(device)
+
+
+def read_ground(sweep: Sweep, name: str, num_points: int, device: torch.device) -> Tensor:
+    mask = sweep.is_ground
+    if not isinstance(mask, (np.ndarray, Tensor)):
+        raise CFlowError(f"ground mask of {name} is {type(mask).__name__}: give a bool array or tensor of shape (N,)")
+    if tuple(mask.shape) != (num_points,):
+        raise CFlowError(f"ground mask of {name} has shape {tuple(mask.shape)}: give ({num_points},), one per point")
+    if mask.dtype not in (torch.bool, np.bool_):
+        raise CFlowError(f"ground mask of {name} has dtype {mask.dtype}: give bool, True = ground")
+    if isinstance(mask, np.ndarray):
+        mask = torch.from_numpy(np.array(mask))
+    return mask.to(device)
