@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Tuple
 
 import torch
 from torch import Tensor
@@ -38,15 +39,12 @@ class Clusters:
         first: (M, 2) int64, top-left (row, col) of the bounding box over all sweeps.
         size: (M, 2) int64, its height and width.
         pixels: every occupied pixel of every sweep that belongs to a cluster.
-        of_pixel: (B * S * H * W + 1,) int64, cluster of each occupied pixel of each sweep, M = none; the last
-            entry, M, is for points that are nowhere. Undefined for empty pixels.
     """
 
     window: Tensor
     first: Tensor
     size: Tensor
     pixels: Pixels
-    of_pixel: Tensor
 
     def id_in_window(self) -> Tensor:
         """(M,) int64, number of each cluster counted from 0 in its own window."""
@@ -54,7 +52,7 @@ class Clusters:
         return torch.arange(self.window.numel(), device=start.device) - start
 
 
-def cluster(occupancy: Tensor, pixel_size: float, config: Config) -> Clusters:
+def cluster(occupancy: Tensor, pixel_size: float, config: Config) -> Tuple[Clusters, Tensor]:
     """Alg. clustering, from the projection of the aggregated sweeps on: dilate, label, validate by size.
 
     Args:
@@ -63,7 +61,9 @@ def cluster(occupancy: Tensor, pixel_size: float, config: Config) -> Clusters:
         config: `connectivity`, `max_extent` (d^max), `labeling`.
 
     Returns:
-        The clusters of all B windows.
+        clusters: those of all B windows.
+        of_pixel: (B * S * H * W + 1,) int64, cluster of each occupied pixel of each sweep, M = none; the last entry, M,
+            is for points that are nowhere. Undefined for empty pixels.
 
     Convention:
         Clusters never join across windows. Both engines give the same clusters.
@@ -78,7 +78,7 @@ def cluster(occupancy: Tensor, pixel_size: float, config: Config) -> Clusters:
     component = _label_dilated(aggregated, pixels, config)
     component = _split_oversized(aggregated, pixels, component, pixel_size, config)
 
-    # What is seen where: every sweep's pixels find their component.
+    # What is seen where: every sweep's pixels find their component, which is named by its first pixel.
     component_of_pixel = torch.empty(aggregated.numel(), dtype=torch.int64, device=pixels.device)
     component_of_pixel[pixels] = component
     seen = occupancy.flatten().nonzero()[:, 0]
@@ -86,23 +86,46 @@ def cluster(occupancy: Tensor, pixel_size: float, config: Config) -> Clusters:
     window, step = image // num_steps, image % num_steps
     seen_component = component_of_pixel.index_select(0, window * (height * width) + raster)
 
-    # A cluster needs pixels at t+1 and before. Components are named by their first pixel: raster order is theirs.
-    is_newest = step == 0
-    has_target, has_source = torch.zeros(2, pixels.numel(), dtype=torch.bool, device=pixels.device)
-    has_target[seen_component[is_newest]] = True
-    has_source[seen_component[~is_newest]] = True
-    live = (has_target & has_source).nonzero()[:, 0]
-    number = torch.full_like(pixels, live.numel())
-    number[live] = torch.arange(live.numel(), device=live.device)
-
-    seen_cluster = number.index_select(0, seen_component)
+    row, col = raster // width, raster % width
+    clusters, number = keep_live(seen_component, pixels.numel(), window, step, row, col)
     of_pixel = torch.empty(occupancy.numel() + 1, dtype=torch.int64, device=pixels.device)
-    of_pixel[seen] = seen_cluster
-    of_pixel[-1] = live.numel()
-    kept = (seen_cluster < live.numel()).nonzero()[:, 0]
-    members = Pixels(seen_cluster[kept], step[kept], raster[kept] // width, raster[kept] % width)
-    first, size = bounding_boxes(members.row, members.col, members.cluster, live.numel())
-    return Clusters(pixels[live] // (height * width), first, size, members, of_pixel)
+    of_pixel[seen] = number.index_select(0, seen_component)
+    of_pixel[-1] = clusters.window.numel()
+    return clusters, of_pixel
+
+
+def keep_live(
+    component: Tensor, num_components: int, window: Tensor, step: Tensor, row: Tensor, col: Tensor
+) -> Tuple[Clusters, Tensor]:
+    """The components that can move: a pixel at t+1 and a pixel before.
+
+    Args:
+        component: (P,) int64, component of each occupied pixel of each sweep; numbered by window, then by first pixel
+            in raster order (gaps are allowed).
+        num_components: C, more than the largest component.
+        window, step, row, col: (P,) int64, where each pixel was seen.
+
+    Returns:
+        clusters: the M components that can move.
+        number: (C,) int64, cluster of each component, M = none.
+    """
+    has_target, has_source = torch.zeros(2, num_components, dtype=torch.bool, device=component.device)
+    is_newest = step == 0
+    has_target[component[is_newest]] = True
+    has_source[component[~is_newest]] = True
+    live = (has_target & has_source).nonzero()[:, 0]
+    num_clusters = live.numel()
+    number = torch.full((num_components,), num_clusters, dtype=torch.int64, device=component.device)
+    number[live] = torch.arange(num_clusters, device=component.device)
+
+    cluster = number.index_select(0, component)
+    kept = (cluster < num_clusters).nonzero()[:, 0]
+    pixels = Pixels(*(values.index_select(0, kept) for values in (cluster, step, row, col)))
+    window_of_cluster = torch.zeros(num_clusters, dtype=torch.int64, device=component.device)
+    window_of_cluster[pixels.cluster] = window.index_select(0, kept)
+    return Clusters(
+        window_of_cluster, *bounding_boxes(pixels.row, pixels.col, pixels.cluster, num_clusters), pixels
+    ), number
 
 
 def _label_dilated(image: Tensor, pixels: Tensor, config: Config) -> Tensor:

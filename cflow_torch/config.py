@@ -33,6 +33,7 @@ class Config:
         use_timestamps: divide a history estimate by elapsed time (in sweep intervals t -> t+1) instead of steps.
         sectional_view: also estimate f_z in the X-Z view along the heading (Alg. scene_flow_1obj).
         clustering: "components" (Alg. clustering) or "hdbscan".
+        min_cluster_size: hdbscan: smallest cluster, points of all sweeps together.
         labeling: engine of morphology and labelling, "sparse" (occupied pixels only) or "kornia" (dense image).
         correlation: engine of the correlation, "fft" or "conv". Engines give the same bits.
         densify: key points: "components" or "nearest".
@@ -53,6 +54,7 @@ class Config:
     use_timestamps: bool = False
     sectional_view: bool = False
     clustering: str = "components"
+    min_cluster_size: int = 20
     labeling: str = "sparse"
     correlation: str = "fft"
     densify: str = "components"
@@ -83,7 +85,7 @@ class Config:
             )
         if any(math.isinf(v) for v in (box[0], box[1], box[3], box[4])):
             raise CFlowError(f"point_cloud_range={box}: x and y bounds must be finite; only z may be infinite")
-        for name in ("num_history", "patch_size"):
+        for name in ("num_history", "patch_size", "min_cluster_size"):
             _whole_number(name, getattr(self, name))
         if self.patch_size % 2 == 0:
             raise CFlowError(f"patch_size={self.patch_size}: give an odd number of pixels, for example 11")
@@ -93,6 +95,8 @@ class Config:
             _positive("max_speed", self.max_speed)
         if self.max_memory is not None:
             _positive("max_memory", self.max_memory)
+        if isinstance(self.min_cluster_size, bool) or not self.min_cluster_size >= 2:
+            raise CFlowError(f"min_cluster_size={self.min_cluster_size}: give a whole number of at least 2")
         if not self.ratio_threshold >= 1:
             raise CFlowError(f"ratio_threshold={self.ratio_threshold}: give a number of at least 1, for example 1.1")
 

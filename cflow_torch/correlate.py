@@ -10,6 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.ops.cross_correlation import cross_correlate
+from cflow_torch.ops.exact import exact_sqrt
 
 # Clusters are correlated in size classes. Up to 64 px a few square classes: most clusters are small, and few classes
 # mean few kernel launches. Longer clusters are rare, thin and expensive: height and width get classes of their own.
@@ -96,7 +97,7 @@ def best_shifts(
 
     shift, count, energy = (torch.empty_like(p).index_copy_(0, jobs, p) for p in map(torch.cat, zip(*peaks)))
     energies = (torch.bincount(template.image, minlength=num_jobs) * energy).double()
-    return shift, (count.double() / energies.clamp(min=1).sqrt()).float()
+    return shift, (count.double() / exact_sqrt(energies.clamp(min=1))).float()
 
 
 def _peaks(

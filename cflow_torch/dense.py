@@ -14,6 +14,7 @@ from cflow_torch.batch import Batch, make_batch, split_results, split_windows
 from cflow_torch.cluster import Clusters, cluster
 from cflow_torch.config import Config, make_config
 from cflow_torch.correlate import Images, best_shifts
+from cflow_torch.density import cluster_by_density
 from cflow_torch.grid import Grid
 from cflow_torch.pool import pool
 from cflow_torch.sectional import add_sectional_view
@@ -40,8 +41,6 @@ class CorrelationFlow(nn.Module):
         super().__init__()
         if config.method != "dense":
             raise CFlowError(f"method={config.method!r} is not built yet: use method='dense'")
-        if config.clustering != "components":
-            raise CFlowError("clustering='hdbscan' is not built yet: use clustering='components'")
         self.config = config
         self.device = device
 
@@ -127,8 +126,12 @@ def motion_at_scale(batch: Batch, flow: Optional[Tensor], grid: Grid, config: Co
             takes_part = takes_part & grid.contains(positions)
         occupancy, pixel = grid.project(positions, takes_part, batch.image, batch.num_windows * batch.num_steps)
     with record_function("cluster"):
-        clusters = cluster(occupancy.unflatten(0, (batch.num_windows, batch.num_steps)), grid.pixel_size, config)
-        cluster_of_point = clusters.of_pixel.index_select(0, pixel)
+        if config.clustering == "hdbscan":
+            clusters, cluster_of_point = cluster_by_density(batch, positions, takes_part, pixel, grid, config)
+        else:
+            occupancy = occupancy.unflatten(0, (batch.num_windows, batch.num_steps))
+            clusters, of_pixel = cluster(occupancy, grid.pixel_size, config)
+            cluster_of_point = of_pixel.index_select(0, pixel)
     with record_function("correlate"):
         estimates, scores, available = correlate(clusters, batch, grid, config)
         if config.sectional_view:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from cflow_torch.config import Config
 from cflow_torch.correlate import Images, best_shifts
+from cflow_torch.ops.exact import exact_sqrt
 from cflow_torch.ops.segments import bounding_boxes
 
 
@@ -48,7 +49,7 @@ def add_sectional_view(
     job_of_slot[slots] = torch.arange(slots.numel(), device=slots.device)
 
     x, y = flow[:, 0], flow[:, 1]
-    length = (x * x + y * y).sqrt()
+    length = exact_sqrt(x * x + y * y)
     safe = torch.where(length > 0, length, torch.ones_like(length))
     heading = torch.stack((torch.where(length > 0, x / safe, torch.ones_like(x)), y / safe))
 
