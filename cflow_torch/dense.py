@@ -144,7 +144,7 @@ def motion_at_scale(batch: Batch, flow: Optional[Tensor], grid: Grid, config: Co
         newest = available.int().argmax(1, keepdim=True)
         return Motion(
             cluster=cluster_of_point,
-            flow=F.pad(pool(per_interval, available), (0, 0, 0, 1)),
+            flow=F.pad(pool(per_interval, available) + 0.0, (0, 0, 0, 1)),  # + 0.0 turns -0.0 into 0.0
             cluster_id=F.pad(clusters.id_in_window(), (0, 1), value=-1),
             score=F.pad(scores.gather(1, newest)[:, 0], (0, 1)),
         )

@@ -319,8 +319,14 @@ def _compensate(sweep: Sweep, sweep1: Sweep) -> Tuple[np.ndarray, np.ndarray]:
     if sweep.pose is None:
         return points, points
     matrix = np.linalg.inv(_numpy(sweep1.pose)) @ _numpy(sweep.pose)
+    rotation, translation = matrix[:3, :3, None], matrix[:3, 3:]
     with np.errstate(invalid="ignore"):  # points that are not finite
-        return points, matrix[:3, :3] @ points + matrix[:3, 3:]
+        # No product of large matrices: the threads of the BLAS behind it go on spinning for tens of milliseconds.
+        moved = rotation[:, 0] * points[0]
+        moved += rotation[:, 1] * points[1]
+        moved += rotation[:, 2] * points[2]
+        moved += translation
+    return points, moved
 
 
 def _columns(sweep: Sweep) -> np.ndarray:

@@ -1,0 +1,311 @@
+"""Tensor operations that know nothing of LiDAR, against SciPy, kornia and direct counting."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from kornia import contrib
+from scenes import LABELINGS, needs_gpu
+from scipy import ndimage
+from scipy.sparse import coo_matrix, csgraph
+
+from cflow_torch.ops import morphology
+from cflow_torch.ops.cross_correlation import cross_correlate, fft_length
+from cflow_torch.ops.labeling import connected_components, connected_components_kornia, union_find
+from cflow_torch.ops.segments import bounding_boxes, masked_median, segment_amax, segment_amin
+from cflow_torch.types import CFlowError
+
+SQUARE = np.ones((3, 3), dtype=bool)
+STRUCTURE = {4: ndimage.generate_binary_structure(2, 1), 8: SQUARE}
+
+
+# ------------------------------------------------------------------------------------------------- labelling
+
+
+def scipy_first(images: np.ndarray, connectivity: int, reach: int) -> np.ndarray:
+    """What `connected_components` must return, by SciPy, image by image."""
+    first = []
+    for image in images:
+        drawn = ndimage.binary_dilation(image, SQUARE) if reach == 3 else image
+        labels = ndimage.label(drawn, STRUCTURE[connectivity])[0][image]
+        _, position, inverse = np.unique(labels, return_index=True, return_inverse=True)
+        first.append(position[inverse.reshape(-1)] + sum(map(len, first)))
+    return np.concatenate(first)
+
+
+def label(images: np.ndarray, connectivity: int, reach: int, engine: str) -> np.ndarray:
+    occupancy = torch.from_numpy(images)
+    pixels = occupancy.flatten().nonzero()[:, 0]
+    if engine == "sparse":
+        return connected_components(occupancy, pixels, connectivity, reach).numpy()
+    dense = morphology.dilate_3x3(occupancy) if reach == 3 else occupancy
+    return connected_components_kornia(dense, pixels, connectivity).numpy()
+
+
+def spiral(size: int, step: int = 2) -> np.ndarray:
+    """One arm winding inwards, one pixel wide; neighbouring turns are `step` pixels apart."""
+    image = np.zeros((size, size), dtype=bool)
+    row, col, length = 0, 0, size - 1
+    image[0, 0] = True
+    directions = [(0, 1), (1, 0), (0, -1), (-1, 0)]
+    for turn in range(4 * size):
+        if length <= 0:
+            break
+        for _ in range(length):
+            row, col = row + directions[turn % 4][0], col + directions[turn % 4][1]
+            image[row, col] = True
+        if turn >= 2 and turn % 2 == 0:
+            length -= step
+    return image
+
+
+def comb(height: int, width: int, step: int) -> np.ndarray:
+    """Teeth that meet only in the last row, so raster order learns late that they are one."""
+    image = np.zeros((height, width), dtype=bool)
+    image[:, ::step] = True
+    image[-1] = True
+    return image
+
+
+def snake(height: int, width: int, step: int) -> np.ndarray:
+    """Rows joined alternately at the right and at the left end: one long component."""
+    image = np.zeros((height, width), dtype=bool)
+    image[::step] = True
+    for i, row in enumerate(range(0, height - step, step)):
+        image[row : row + step, -1 if i % 2 == 0 else 0] = True
+    return image
+
+
+@pytest.mark.parametrize("engine", LABELINGS)
+@pytest.mark.parametrize("reach", [1, 3])
+@pytest.mark.parametrize("connectivity", [4, 8])
+def test_labelling_equals_scipy_on_random_images(connectivity, reach, engine):
+    rng = np.random.default_rng(connectivity + reach)
+    for shape in [(1, 1), (1, 17), (19, 1), (2, 2), (7, 5), (23, 40), (64, 63)]:
+        densities = np.array([0.0, 0.02, 0.05, 0.1, 0.2, 0.41, 0.59, 0.8, 1.0])[:, None, None]
+        images = rng.random((9, *shape)) < densities
+        found = label(images, connectivity, reach, engine)
+        assert found.tolist() == scipy_first(images, connectivity, reach).tolist(), shape
+
+
+@pytest.mark.parametrize("engine", LABELINGS)
+@pytest.mark.parametrize("connectivity", [4, 8])
+@pytest.mark.parametrize("step", [2, 3, 4, 5])
+def test_labelling_of_spirals_and_combs(step, connectivity, engine):
+    images = np.stack([spiral(60, step), comb(60, 60, step), spiral(60, step).T, comb(60, 60, step)[::-1]])
+    for reach in (1, 3):
+        assert label(images, connectivity, reach, engine).tolist() == scipy_first(images, connectivity, reach).tolist()
+
+
+def test_spiral_and_snake_are_single_components():
+    # The shapes are what they claim to be, and a single label covers them.
+    for image in (spiral(61), snake(61, 40, 2), comb(30, 31, 2)):
+        assert ndimage.label(image)[1] == 1
+        assert not label(image[None], 4, 1, "sparse").any()
+
+
+@pytest.mark.parametrize("engine", LABELINGS)
+@pytest.mark.parametrize("reach, step, shape", [(1, 2, (449, 450)), (3, 4, (633, 640))])
+def test_labelling_of_a_snake_of_100000_pixels(reach, step, shape, engine):
+    image = snake(*shape, step)
+    assert image.sum() > 100_000
+    assert not label(image[None], 4, reach, engine).any()  # one component, named by its first pixel
+    image[shape[0] // 2 // step * step] = False  # cut it
+    assert label(image[None], 8, reach, engine).tolist() == scipy_first(image[None], 8, reach).tolist()
+
+
+@pytest.mark.parametrize("engine", LABELINGS)
+@pytest.mark.parametrize("reach", [1, 3])
+@pytest.mark.parametrize("connectivity", [4, 8])
+def test_two_pixels_link_exactly_within_reach(connectivity, reach, engine):
+    """Every offset up to 5, at every place relative to the blocks, the far pixel on the border of the image."""
+    for dy in range(6):
+        for dx in range(-5, 6):
+            if (dy, dx) <= (0, 0):
+                continue
+            images = np.zeros((16, dy + 4, abs(dx) + 4), dtype=bool)
+            for i in range(16):
+                row, col = i // 4, i % 4 + max(-dx, 0)
+                images[i, row, col] = images[i, row + dy, col + dx] = True
+            linked = label(images, connectivity, reach, engine)[1::2] == np.arange(0, 32, 2)
+            corner = connectivity == 4 and dy == abs(dx) == reach
+            assert linked.tolist() == [max(dy, abs(dx)) <= reach and not corner] * 16, (dy, dx)
+
+
+@pytest.mark.parametrize("engine", LABELINGS)
+@pytest.mark.parametrize("reach", [1, 3])
+def test_components_never_join_across_images(reach, engine):
+    images = np.ones((5, 6, 7), dtype=bool)
+    assert label(images, 8, reach, engine).tolist() == np.repeat(np.arange(5) * 42, 42).tolist()
+
+
+def test_labelling_without_kornia_union_find_says_what_to_do(monkeypatch):
+    monkeypatch.delattr(contrib, "connected_components_union_find", raising=False)
+    with pytest.raises(CFlowError, match="kornia >= 0.9.*sparse"):
+        label(np.ones((1, 3, 3), dtype=bool), 8, 1, "kornia")
+
+
+def test_union_find_equals_scipy():
+    rng = np.random.default_rng(0)
+    for num_nodes, num_edges in [(1, 0), (5, 0), (1, 3), (10, 6), (200, 150), (1000, 700), (3000, 9000)]:
+        edges = rng.integers(0, num_nodes, (2, num_edges))  # with loops and repeated edges
+        root = union_find(num_nodes, *torch.from_numpy(edges)).numpy()
+        graph = coo_matrix((np.ones(num_edges), tuple(edges)), shape=(num_nodes, num_nodes))
+        _, labels = csgraph.connected_components(graph, directed=False)
+        _, first = np.unique(labels, return_index=True)
+        assert root.tolist() == first[labels].tolist()
+
+
+@pytest.mark.parametrize("order", ["rising", "falling", "shuffled"])
+def test_union_find_on_a_long_path(order):
+    nodes = np.arange(100_000)
+    if order == "shuffled":
+        np.random.default_rng(1).shuffle(nodes)
+    nodes = torch.from_numpy(nodes[::-1].copy() if order == "falling" else nodes)
+    assert not union_find(100_000, nodes[:-1], nodes[1:]).any()
+
+
+# ------------------------------------------------------------------------------------------------ morphology
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 9), (8, 1), (2, 2), (13, 17), (3, 2, 11, 12), (0, 5, 5), (2, 0, 4)])
+def test_dilation_and_erosion_equal_scipy(shape):
+    rng = np.random.default_rng(len(shape))
+    for density in (0.0, 0.1, 0.7, 0.95, 1.0):
+        image = rng.random(shape) < density
+        before = image.copy()
+        given = torch.from_numpy(image)
+        dilated, eroded = morphology.dilate_3x3(given).numpy(), morphology.erode_3x3(given).numpy()
+        square = SQUARE.reshape((1,) * (len(shape) - 2) + (3, 3))
+        if image.size:
+            assert (dilated == ndimage.binary_dilation(image, square)).all()
+            assert (eroded == ndimage.binary_erosion(image, square, border_value=1)).all()
+        assert dilated.shape == eroded.shape == image.shape
+        assert (image == before).all()
+
+
+def test_kornia_morphology_is_the_same():
+    rng = np.random.default_rng(3)
+    for shape in [(1, 1, 1), (2, 1, 9), (3, 8, 1), (4, 21, 34)]:
+        for density in (0.05, 0.5, 0.9, 1.0):
+            image = torch.from_numpy(rng.random(shape) < density)
+            assert torch.equal(morphology.dilate_3x3_kornia(image), morphology.dilate_3x3(image))
+            assert torch.equal(morphology.erode_3x3_kornia(image), morphology.erode_3x3(image))
+
+
+def test_closing_never_loses_a_pixel_at_the_border_neither():
+    image = torch.from_numpy(np.random.default_rng(4).random((6, 9, 9)) < 0.3)
+    image[:, 0] = True
+    closed = morphology.erode_3x3(morphology.dilate_3x3(image))
+    assert (closed | ~image).all()
+
+
+# -------------------------------------------------------------------------------------------------- segments
+
+
+def test_segment_reductions():
+    index = torch.tensor([2, 0, 2, 4, 0])
+    values = torch.tensor([5, 3, -7, 1, 9])
+    assert segment_amin(values, index, 6, 99).tolist() == [3, 99, -7, 99, 1, 99]
+    assert segment_amax(values, index, 6, -99).tolist() == [9, -99, 5, -99, 1, -99]
+
+
+def test_bounding_boxes():
+    rng = np.random.default_rng(5)
+    index = rng.permutation(np.concatenate([np.arange(12), rng.integers(0, 12, 80)]))
+    rows, cols = rng.integers(-50, 50, (2, index.size))
+    first, size = bounding_boxes(*map(torch.from_numpy, (rows, cols, index)), 12)
+    for segment in range(12):
+        r, c = rows[index == segment], cols[index == segment]
+        assert first[segment].tolist() == [r.min(), c.min()]
+        assert size[segment].tolist() == [np.ptp(r) + 1, np.ptp(c) + 1]
+    none = torch.zeros(0, dtype=torch.int64)
+    assert [tuple(t.shape) for t in bounding_boxes(none, none, none, 0)] == [(0, 2), (0, 2)]
+
+
+def test_masked_median_equals_numpy():
+    rng = np.random.default_rng(6)
+    for width in (1, 2, 3, 6):
+        values, mask = rng.normal(size=(40, width)).round(1), rng.random((40, width)) < 0.6
+        found = masked_median(torch.from_numpy(values), torch.from_numpy(mask)).tolist()
+        assert found == [float(np.median(v[m])) if m.any() else 0.0 for v, m in zip(values, mask)]
+
+
+# --------------------------------------------------------------------------------------------- correlation
+
+
+def count_directly(template: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """sum over p of template(p) target(p + d), for all d within half the size: pairs of pixels, one by one."""
+    height, width = template.shape
+    counts = np.zeros((2 * (height // 2) + 1, 2 * (width // 2) + 1), dtype=np.int64)
+    for r, c in np.argwhere(template):
+        for i, j in np.argwhere(target):
+            dy, dx = i - r + height // 2, j - c + width // 2
+            if 0 <= dy < counts.shape[0] and 0 <= dx < counts.shape[1]:
+                counts[dy, dx] += 1
+    return counts
+
+
+@pytest.mark.parametrize("engine", ["fft", "conv"])
+@pytest.mark.parametrize("shape", [(1, 1), (1, 2), (2, 1), (1, 13), (9, 1), (2, 3), (8, 8), (15, 10), (3, 60), (70, 4)])
+def test_cross_correlation_counts(shape, engine):
+    rng = np.random.default_rng(sum(shape))
+    template, target = rng.random((5, *shape)) < 0.3, rng.random((3, *shape)) < 0.4
+    template[0], target[2] = True, True
+    own = np.array([2, 0, 2, 1, 0])
+    found = cross_correlate(*map(torch.from_numpy, (template, target, own)), engine=engine)
+    assert found.dtype == torch.int32
+    assert found.tolist() == [count_directly(template[j], target[n]).tolist() for j, n in enumerate(own)]
+
+
+@pytest.mark.parametrize("shape", [(64, 64), (16, 1024), (512, 8), (130, 200)])
+@pytest.mark.parametrize("density", [0.05, 0.5, 0.99])
+def test_cross_correlation_engines_agree_on_large_images(shape, density):
+    generator = torch.Generator().manual_seed(shape[0])
+    template, target = torch.rand((2, 2, *shape), generator=generator) < density
+    own = torch.tensor([1, 0])
+    assert torch.equal(cross_correlate(template, target, own, "fft"), cross_correlate(template, target, own, "conv"))
+
+
+@pytest.mark.parametrize("shape", [(100, 100), (317, 401), (640, 640), (4, 3000)])
+def test_fft_counts_stay_exact_on_full_images(shape):
+    # The largest counts there are: the overlap of two full images is (H - |dy|) (W - |dx|).
+    full = torch.ones((1, *shape), dtype=torch.bool)
+    rows, cols = (side - abs(np.arange(-(side // 2), side // 2 + 1)) for side in shape)
+    found = cross_correlate(full, full, torch.tensor([0]), "fft")[0].numpy()
+    assert (found == rows[:, None] * cols[None]).all()
+
+
+@pytest.mark.parametrize("engine", ["fft", "conv"])
+def test_cross_correlation_of_empty_images_is_zero(engine):
+    empty = torch.zeros((2, 6, 7), dtype=torch.bool)
+    assert not cross_correlate(empty, ~empty, torch.tensor([0, 1]), engine).any()
+    assert not cross_correlate(~empty, empty, torch.tensor([0, 1]), engine).any()
+
+
+def test_fft_length_is_the_shortest_smooth_one_that_does_not_wrap():
+    smooth = sorted(2**a * 3**b * 5**c for a in range(12) for b in range(8) for c in range(6))
+    for size in range(1, 1025):
+        assert fft_length(size) == next(n for n in smooth if n >= size + size // 2)
+
+
+@pytest.mark.cuda
+@needs_gpu
+@pytest.mark.parametrize("connectivity, reach", [(4, 1), (8, 1), (4, 3), (8, 3)])
+def test_labelling_on_cuda_equals_cpu(connectivity, reach):
+    images = torch.from_numpy(np.random.default_rng(9).random((4, 90, 80)) < 0.15)
+    pixels = images.flatten().nonzero()[:, 0]
+    on_cpu = connected_components(images, pixels, connectivity, reach)
+    assert torch.equal(connected_components(images.cuda(), pixels.cuda(), connectivity, reach).cpu(), on_cpu)
+
+
+@pytest.mark.cuda
+@needs_gpu
+@pytest.mark.parametrize("engine", ["fft", "conv"])
+@pytest.mark.parametrize("shape", [(8, 8), (64, 64), (16, 512)])
+def test_cross_correlation_on_cuda_equals_cpu(shape, engine):
+    template, target = torch.rand((2, 6, *shape), generator=torch.Generator().manual_seed(2)) < 0.3
+    own = torch.arange(6)
+    on_gpu = cross_correlate(template.cuda(), target.cuda(), own.cuda(), engine).cpu()
+    assert torch.equal(on_gpu, cross_correlate(template, target, own, "fft"))
