@@ -170,6 +170,5 @@ def _pose_flow(raw: Tensor, moved: Tensor) -> Tensor:
     """(N, 3) float32 T p - p; 0 for points that are not finite."""
     if moved is raw:
         return torch.zeros((raw.shape[1], 3), dtype=torch.float32, device=raw.device)
-    flow = (moved - raw).float()
-    flow[:, ~torch.isfinite(flow).all(0)] = 0
-    return flow.t().contiguous()
+    # A point that is not finite has no finite coordinate after the transform.
+    return (moved - raw).t().float().contiguous().nan_to_num_(0.0, 0.0, 0.0)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from cflow_torch.config import Config
+from cflow_torch.ops.indices import flat_nonzero
 from cflow_torch.ops.labeling import connected_components, connected_components_kornia
 from cflow_torch.ops.morphology import dilate_3x3, dilate_3x3_kornia, erode_3x3, erode_3x3_kornia
 from cflow_torch.ops.segments import bounding_boxes
@@ -74,22 +75,21 @@ def cluster(occupancy: Tensor, pixel_size: float, config: Config) -> Tuple[Clust
     aggregated = occupancy[:, 0].clone()
     for index in range(1, num_steps):
         aggregated |= occupancy[:, index]
-    pixels = aggregated.flatten().nonzero()[:, 0]
+    pixels = flat_nonzero(aggregated)
+    window, raster = pixels // (height * width), pixels % (height * width)
     component = _label_dilated(aggregated, pixels, config)
     component = _split_oversized(aggregated, pixels, component, pixel_size, config)
 
-    # What is seen where: every sweep's pixels find their component, which is named by its first pixel.
-    component_of_pixel = torch.empty(aggregated.numel(), dtype=torch.int64, device=pixels.device)
-    component_of_pixel[pixels] = component
-    seen = occupancy.flatten().nonzero()[:, 0]
-    image, raster = seen // (height * width), seen % (height * width)
-    window, step = image // num_steps, image % num_steps
-    seen_component = component_of_pixel.index_select(0, window * (height * width) + raster)
+    # Which sweeps saw each pixel. Components are named by their first pixel.
+    sweeps = torch.arange(num_steps, device=pixels.device)[:, None]
+    pixel_of_sweep = (window * num_steps + sweeps) * (height * width) + raster  # (S, P)
+    step, pixel = occupancy.flatten().take(pixel_of_sweep).nonzero().unbind(1)
+    place = (values.index_select(0, pixel) for values in (component, window, raster // width, raster % width))
+    of_component, of_window, row, col = place
+    clusters, number = keep_live(of_component, pixels.numel(), of_window, step, row, col)
 
-    row, col = raster // width, raster % width
-    clusters, number = keep_live(seen_component, pixels.numel(), window, step, row, col)
     of_pixel = torch.empty(occupancy.numel() + 1, dtype=torch.int64, device=pixels.device)
-    of_pixel[seen] = number.index_select(0, seen_component)
+    of_pixel.scatter_(0, pixel_of_sweep.flatten(), number.index_select(0, component).repeat(num_steps))
     of_pixel[-1] = clusters.window.numel()
     return clusters, of_pixel
 
@@ -149,7 +149,7 @@ def _split_oversized(image: Tensor, pixels: Tensor, component: Tensor, pixel_siz
     border = torch.tensor([height - 1, width - 1], device=pixels.device)
     last = torch.minimum(first + size, border)  # the dilation adds a pixel on every side, cut off at the border
     extent = (last - (first - 1).clamp(min=0) + 1).amax(1)
-    oversized = (extent.double() * pixel_size > config.max_extent)[segment].nonzero()[:, 0]
+    oversized = flat_nonzero((extent.double() * pixel_size > config.max_extent)[segment])
     if oversized.numel() == 0:
         return component
 
@@ -160,10 +160,10 @@ def _split_oversized(image: Tensor, pixels: Tensor, component: Tensor, pixel_siz
         part = connected_components_kornia(closed, pixels[oversized], config.connectivity)
     else:
         closed = erode_3x3(dilate_3x3(alone))
-        closed_pixels = closed.flatten().nonzero()[:, 0]
+        closed_pixels = flat_nonzero(closed)
         part_of_pixel = torch.empty_like(closed, dtype=torch.int64).view(-1)
-        part_of_pixel[closed_pixels] = connected_components(closed, closed_pixels, config.connectivity, reach=1)
-        part = part_of_pixel[pixels[oversized]]
+        part = connected_components(closed, closed_pixels, config.connectivity, reach=1)
+        part = part_of_pixel.scatter_(0, closed_pixels, part).index_select(0, pixels[oversized])
         earliest = pixels.new_full((closed_pixels.numel(),), oversized.numel())
         positions = torch.arange(oversized.numel(), device=pixels.device)
         part = earliest.scatter_reduce_(0, part, positions, "amin")[part]

@@ -6,16 +6,19 @@ from dataclasses import dataclass
 from typing import List, Optional, Tuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.ops.cross_correlation import cross_correlate
 from cflow_torch.ops.exact import exact_sqrt
+from cflow_torch.ops.indices import flat_nonzero
+from cflow_torch.ops.segments import segment_amin
 
 # Clusters are correlated in size classes. Up to 64 px a few square classes: most clusters are small, and few classes
-# mean few kernel launches. Longer clusters are rare, thin and expensive: height and width get classes of their own.
+# mean few kernel launches. Longer clusters are rare, thin and expensive: height and width get classes of their own, in
+# steps of at most an eighth.
 _SQUARE_CLASSES = (8, 16, 32, 64)
-_LONG_CLASSES = (8, 16, 32, 48, 64, 80, 96, 128, 160, 192, 256, 320, 384, 512, 640, 768, 1024)
+_LONG_CLASSES = tuple(n << k for k in range(8) for n in range(8, 16))
+
 # Working memory of a job per pixel of its class: spectra of 1.5 x 1.5 the size, counts, energies, ranking values.
 _BYTES_PER_SAMPLE = 100
 
@@ -32,6 +35,25 @@ class Images:
     image: Tensor
     row: Tensor
     col: Tensor
+
+
+@dataclass(frozen=True)
+class _Drawing:
+    """Images as pixels, sorted by size class.
+
+    Args:
+        images: per class (n, height, width) bool.
+        order: (N,) int64, images in the order in which they were drawn.
+        place: (N,) int64, where in that order each image is.
+        start: (N,) int64, in drawing order, first pixel of each image in all of `images` put one after the other.
+        stride: (N,) int64, in drawing order, width of each image.
+    """
+
+    images: List[Tensor]
+    order: Tensor
+    place: Tensor
+    start: Tensor
+    stride: Tensor
 
 
 def best_shifts(
@@ -71,50 +93,110 @@ def best_shifts(
     if num_jobs == 0:
         return size.new_zeros((0, 2)), torch.zeros(0, device=size.device)
     shape, class_of_target, class_shapes = _size_classes(size)
-    class_of_job = class_of_target[target_of_job]
-    targets, _, target_place = _draw(target, class_of_target, shape, class_shapes)
-    templates, jobs, _ = _draw(template, class_of_job, shape[target_of_job], class_shapes)
-    target_size = torch.empty_like(size).index_copy_(0, target_place, size)
-    target_of_job = target_place[target_of_job[jobs]]  # from here on targets and jobs are sorted by class
+    targets = _draw(target, class_of_target, shape, class_shapes, border=1)
+    templates = _draw(template, class_of_target[target_of_job], shape[target_of_job], class_shapes)
+    of_job = targets.place[target_of_job[templates.order]]  # from here on targets and jobs are sorted by class
+    energy_of_target = torch.bincount(target.image, minlength=len(size))[targets.order]
+    size = size[targets.order]
 
-    peaks = []
+    candidates = []
     first_target = first_job = 0
-    for template_images, target_images in zip(templates, targets):
-        own = target_of_job[first_job : first_job + len(template_images)] - first_target
-        sizes = target_size[first_target : first_target + len(target_images)]
-        limits = None if radius is None else radius[jobs[first_job : first_job + len(template_images)]]
+    for template_images, target_images in zip(templates.images, targets.images):
         at_once = _jobs_at_once(template_images, max_memory)
         for start in range(0, len(template_images), at_once):
-            part = slice(start, start + at_once)
-            used, of_used = own[part], slice(None)
+            part = slice(first_job + start, first_job + min(start + at_once, len(template_images)))
+            of_part = of_job[part]
+            used = slice(first_target, first_target + len(target_images))
             if at_once < len(template_images):  # jobs are sorted by target: a run of jobs needs a run of targets
-                of_used = slice(int(used[0]), int(used[-1]) + 1)
-                used = used - used[0]
-            limit = None if limits is None else limits[part]
-            peaks.append(_peaks(template_images[part], target_images[of_used], used, sizes[of_used], limit, engine))
+                used = slice(int(of_part[0]), int(of_part[-1]) + 1)
+            counts, dy, dx = cross_correlate(
+                template_images[start : start + at_once],
+                target_images[used.start - first_target : used.stop - first_target, 1:, 1:],
+                of_part - used.start,
+                engine,
+            )
+            limit = None if radius is None else radius[templates.order[part]]
+            job, *rest = _candidates(counts, dy, dx, size[of_part], energy_of_target[of_part], limit)
+            candidates.append((job + part.start, *rest))
         first_target += len(target_images)
         first_job += len(template_images)
 
-    shift, count, energy = (torch.empty_like(p).index_copy_(0, jobs, p) for p in map(torch.cat, zip(*peaks)))
-    energies = (torch.bincount(template.image, minlength=num_jobs) * energy).double()
-    return shift, (count.double() / exact_sqrt(energies.clamp(min=1))).float()
+    job, dy, dx, count = map(torch.cat, zip(*candidates))
+    energy = _energy_under_window(targets, of_job[job], size[of_job[job]], dy, dx)
+    best = _best_of_each_job(job, dy, dx, count, energy, num_jobs)
+    found = templates.order[job[best]]
+    shift = torch.zeros((num_jobs, 2), dtype=torch.int64, device=size.device)
+    shift[found] = torch.stack((dy[best], dx[best]), 1)
+    energies = torch.bincount(template.image, minlength=num_jobs)[found] * energy[best]
+    score = torch.zeros(num_jobs, dtype=torch.float32, device=size.device)
+    score[found] = (count[best].double() / exact_sqrt(energies.double())).float()
+    return shift, score
 
 
-def _peaks(
-    template: Tensor, target: Tensor, target_of_job: Tensor, size: Tensor, radius: Optional[Tensor], engine: str
-) -> Tuple[Tensor, Tensor, Tensor]:
-    """Shift, count and energy at the best shift of (J, height, width) templates over (n, height, width) targets."""
-    counts = cross_correlate(template, target, target_of_job, engine)
-    searched = _searched(target, size)[target_of_job]
+def _candidates(
+    counts: Tensor, dy: Tensor, dx: Tensor, size: Tensor, target_energy: Tensor, radius: Optional[Tensor]
+) -> Tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Shifts that may be the best of their job: (K,) job, dy, dx, count. Overwrites `counts`.
+
+    A window holds at least the pixels that coincide and at most all of the target's, so count^2 / energy lies between
+    count^2 / target energy and count. What is below the largest of the lower bounds need not be looked at.
+    """
+    half = size // 2
+    low, high = -half, size - 1 - half
+    in_rows = (dy >= low[:, :1]) & (dy <= high[:, :1])
+    in_cols = (dx >= low[:, 1:]) & (dx <= high[:, 1:])
+    counts.mul_(in_rows[:, :, None]).mul_(in_cols[:, None, :])
     if radius is not None:
-        searched = searched & (_squared_length(counts) <= (radius * radius)[:, None, None])
-    return _argmax(counts, _energy_under_window(target, size)[target_of_job], searched)
+        counts.mul_((dy[:, None] ** 2 + dx**2) <= (radius * radius)[:, None, None])
+    largest = counts.amax((1, 2)).round()
+    # 1 less, because counts are not rounded yet; counts of 0 are never better than no shift at all.
+    needed = (largest * largest / target_energy - 1).clamp(min=0.5)
+    place = flat_nonzero(counts > needed[:, None, None])
+    num_rows, num_cols = counts.shape[1:]
+    row = place // num_cols
+    count = counts.flatten()[place].round().long()
+    return row // num_rows, dy[row % num_rows], dx[place % num_cols], count
+
+
+def _energy_under_window(targets: _Drawing, target: Tensor, size: Tensor, dy: Tensor, dx: Tensor) -> Tensor:
+    """(K,) int64, target pixels under the H x W window at a shift (denominator of Eq. norm_correlation).
+
+    Args:
+        targets: drawn with a border of one empty row above and column to the left.
+        target: (K,) int64, which of the drawn targets.
+        size: (K, 2) int64, H, W.
+        dy, dx: (K,) int64.
+    """
+    tables = [images.cumsum(1, dtype=torch.int32).cumsum(2, dtype=torch.int32) for images in targets.images]
+    table = torch.cat([part.flatten() for part in tables])  # pixels above and to the left of each pixel
+    start, stride = targets.start[target], targets.stride[target]
+    stop_y, stop_x = torch.minimum(size[:, 0] + dy, size[:, 0]), torch.minimum(size[:, 1] + dx, size[:, 1])
+    begin_y, begin_x = dy.clamp(min=0), dx.clamp(min=0)
+    above, below = start + begin_y * stride, start + stop_y * stride
+    inside = table[below + stop_x] - table[above + stop_x] - table[below + begin_x] + table[above + begin_x]
+    return inside.long()
+
+
+def _best_of_each_job(
+    job: Tensor, dy: Tensor, dx: Tensor, count: Tensor, energy: Tensor, num_jobs: int
+) -> Tensor:
+    """(F,) int64, the best candidate of each job that has one; ties as in `best_shifts`."""
+    value = count.double()
+    value = value * value / energy
+    best_value = value.new_zeros(num_jobs).scatter_reduce_(0, job, value, "amax")
+    tied = flat_nonzero(value == best_value[job])
+    # One number that orders shifts: length, then dy, then dx. Shifts are shorter than 2^14 pixels.
+    span = 1 << 15
+    order = ((dy * dy + dx * dx) * span + dy + span // 2) * span + dx + span // 2
+    order = order[tied]
+    first = segment_amin(order, job[tied], num_jobs, torch.iinfo(torch.int64).max)
+    return tied[order == first[job[tied]]]
 
 
 def _jobs_at_once(template: Tensor, max_memory: Optional[int]) -> int:
     num_jobs, height, width = template.shape
     if max_memory is None:
-        return num_jobs
+        return max(1, num_jobs)
     return max(1, min(num_jobs, int(max_memory) // (_BYTES_PER_SAMPLE * height * width)))
 
 
@@ -132,76 +214,18 @@ def _size_classes(size: Tensor) -> Tuple[Tensor, Tensor, List[Tuple[int, int]]]:
 
 
 def _draw(
-    images: Images, class_of_image: Tensor, shape: Tensor, class_shapes: List[Tuple[int, int]]
-) -> Tuple[List[Tensor], Tensor, Tensor]:
-    """Draw every image, sorted by size class.
-
-    Returns:
-        images: per class (n, height, width) bool.
-        order: (N,) int64, images in the order in which they were drawn.
-        place: (N,) int64, where in that order each image is.
-    """
+    images: Images, class_of_image: Tensor, shape: Tensor, class_shapes: List[Tuple[int, int]], border: int = 0
+) -> _Drawing:
+    """Draw every image in the shape of its size class, with `border` empty rows above and columns to the left."""
     order = torch.sort(class_of_image, stable=True).indices
     place = torch.empty_like(order).index_copy_(0, order, torch.arange(order.numel(), device=order.device))
-    area = (shape[:, 0] * shape[:, 1])[order]
-    start = (area.cumsum(0) - area)[place]
+    stride = shape[:, 1] + border
+    area = ((shape[:, 0] + border) * stride)[order]
+    start = area.cumsum(0) - area
     counts = torch.bincount(class_of_image, minlength=len(class_shapes)).tolist()
-    areas = [count * height * width for count, (height, width) in zip(counts, class_shapes)]
-    pixel = start[images.image] + images.row * shape[images.image, 1] + images.col
+    shapes = [(count, height + border, width + border) for count, (height, width) in zip(counts, class_shapes)]
+    areas = [count * height * width for count, height, width in shapes]
+    pixel = (start[place] + border * (stride + 1))[images.image] + images.row * stride[images.image] + images.col
     drawn = torch.zeros(sum(areas), dtype=torch.bool, device=pixel.device).index_fill_(0, pixel, True)
-    return [part.view(-1, *hw) for part, hw in zip(drawn.split(areas), class_shapes)], order, place
-
-
-def _shifts(side: int, device: torch.device) -> Tensor:
-    """(2 (side // 2) + 1,) int64, all shifts along an axis of `side` pixels."""
-    return torch.arange(-(side // 2), side // 2 + 1, device=device)
-
-
-def _searched(images: Tensor, size: Tensor) -> Tensor:
-    """(n, Dy, Dx) bool, the shifts of Alg. scene_flow_1view for images of (n, 2) `size` drawn as (n, height, width)."""
-    half = size // 2
-    low, high = -half, size - 1 - half
-    rows, cols = (
-        (shift >= low[:, axis, None]) & (shift <= high[:, axis, None])
-        for axis, shift in enumerate((_shifts(images.shape[1], size.device), _shifts(images.shape[2], size.device)))
-    )
-    return rows[:, :, None] & cols[:, None, :]
-
-
-def _energy_under_window(target: Tensor, size: Tensor) -> Tensor:
-    """(n, Dy, Dx) int32, target pixels under the H x W window at every shift (denominator of Eq. norm_correlation)."""
-    energy = target.int()
-    for axis in (0, 1):
-        energy = _sum_under_window(energy, size[:, axis, None]).transpose(1, 2)
-    return energy
-
-
-def _sum_under_window(values: Tensor, extent: Tensor) -> Tensor:
-    """Sums of (n, side, m) `values` over rows [shift, shift + extent), for every shift: (n, D, m)."""
-    side = values.shape[1]
-    before = F.pad(values.cumsum(1, dtype=torch.int32), (0, 0, 1, 0))
-    shift = _shifts(side, values.device)[None]
-    stop, start = (shift + extent).clamp(0, side), shift.clamp(min=0).expand(len(extent), -1)
-    rows = (index[:, :, None].expand(-1, -1, values.shape[2]) for index in (stop, start))
-    stop_sum, start_sum = (before.gather(1, row) for row in rows)
-    return stop_sum - start_sum
-
-
-def _squared_length(counts: Tensor) -> Tensor:
-    """(Dy, Dx) int64, dy^2 + dx^2 of every shift of a count map."""
-    dy, dx = (_shifts(n - 1, counts.device) for n in counts.shape[1:])
-    return dy[:, None] ** 2 + dx[None] ** 2
-
-
-def _argmax(counts: Tensor, energy: Tensor, searched: Tensor) -> Tuple[Tensor, Tensor, Tensor]:
-    """Shift (J, 2) of the largest count^2 / energy, with the count and the energy there; ties as in `best_shifts`."""
-    height, width = counts.shape[1:]
-    value = counts.double()
-    value = value * value / energy.clamp(min=1)
-    value = torch.where(searched, value, -1.0).flatten(1)
-    order = (_squared_length(counts) * (height * width)).flatten() + torch.arange(height * width, device=counts.device)
-    tied = value == value.amax(1, keepdim=True)
-    place = torch.where(tied, order, torch.iinfo(torch.int64).max).amin(1) % (height * width)
-    shift = torch.stack((place // width - height // 2, place % width - width // 2), 1)
-    at = place[:, None]
-    return shift, counts.flatten(1).gather(1, at)[:, 0], energy.flatten(1).gather(1, at)[:, 0]
+    parts = [part.view(of_class) for part, of_class in zip(drawn.split(areas), shapes)]
+    return _Drawing(parts, order, place, start, stride[order])

@@ -39,7 +39,8 @@ def rigid_transform(matrix: Any, name: str) -> np.ndarray:
         raise CFlowError(f"{name} holds NaN or infinite values: give a finite rigid transform")
     rotation = result[:3, :3]
     error = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    if error > _ORTHOGONALITY or np.linalg.det(rotation) < 0 or not np.allclose(result[3], (0, 0, 0, 1)):
+    last_row = np.abs(result[3] - (0.0, 0.0, 0.0, 1.0)).max()
+    if error > _ORTHOGONALITY or last_row > _ORTHOGONALITY or np.linalg.det(rotation) < 0:
         raise CFlowError(
             f"{name} is not rigid (|R R^T - I| up to {error:.3g}, det {np.linalg.det(rotation):.3g}, last row "
             f"{result[3].tolist()}): give [R t; 0 0 0 1] with a rotation R, row-major"

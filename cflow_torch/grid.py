@@ -79,9 +79,9 @@ class Grid:
             multiplies by the reciprocal of a plain number, which rounds differently.
         """
         size = torch.full((), self.pixel_size, dtype=positions.dtype, device=positions.device)
-        col = torch.floor((positions[0] - self.lower[0]) / size)
-        row = torch.floor((positions[1] - self.lower[1]) / size)
-        return (row * self.width + col).long()  # whole numbers far below 2^53: exact
+        col = (positions[0] - self.lower[0]).div_(size).floor_()
+        row = (positions[1] - self.lower[1]).div_(size).floor_()
+        return row.mul_(self.width).add_(col).long()  # whole numbers far below 2^53: exact
 
     def project(self, positions: Tensor, takes_part: Tensor, image: Tensor, num_images: int) -> Tuple[Tensor, Tensor]:
         """Binary images that are set where a point falls, and the pixel of every point.
@@ -97,7 +97,7 @@ class Grid:
             pixel: (N,) int64, flat index into `occupancy`; B * H * W for points that are left out.
         """
         nowhere = num_images * self.height * self.width
-        pixel = image * (self.height * self.width) + self.pixel(positions)
-        pixel = torch.where(takes_part, pixel, nowhere)
+        pixel = (image * (self.height * self.width)).add_(self.pixel(positions))
+        pixel.masked_fill_(~takes_part, nowhere)
         occupancy = torch.zeros(nowhere + 1, dtype=torch.bool, device=pixel.device).index_fill_(0, pixel, True)
         return occupancy[:-1].view(num_images, self.height, self.width), pixel

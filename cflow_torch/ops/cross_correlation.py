@@ -1,7 +1,7 @@
 """Cross-correlation of many pairs of small binary images at once, as exact integer counts.
 
-The images hold zeros and ones, so every correlation value is a count. Whatever computes it, the result is rounded to
-the integer; engines, devices and batch sizes then agree to the last bit.
+The images hold zeros and ones, so every correlation value is a count. Whatever computes it, the nearest integer is the
+result; engines, devices and batch sizes then agree to the last bit.
 """
 
 from __future__ import annotations
@@ -19,7 +19,9 @@ _FFT_ERROR_MARGIN = 8.0
 _FFT_LARGEST_ERROR = 0.25
 
 
-def cross_correlate(template: Tensor, target: Tensor, target_of_job: Tensor, engine: str = "fft") -> Tensor:
+def cross_correlate(
+    template: Tensor, target: Tensor, target_of_job: Tensor, engine: str = "fft"
+) -> Tuple[Tensor, Tensor, Tensor]:
     """Number of coinciding pixels for every shift of a template over a target (numerator of Eq. norm_correlation).
 
     Args:
@@ -29,8 +31,10 @@ def cross_correlate(template: Tensor, target: Tensor, target_of_job: Tensor, eng
         engine: "fft" or "conv" (conv2d).
 
     Returns:
-        (J, 2 (H // 2) + 1, 2 (W // 2) + 1) int32; element [j, dy + H // 2, dx + W // 2] is
-        sum over p of template[j](p) * target(p + (dy, dx)), zero outside the images.
+        counts: (J, Y, X) float, less than 1/2 away from the sum over p of template[j](p) * target(p + (dy, dx)), zero
+            outside the images: round it. Only meaningful for |dy| <= H // 2, |dx| <= W // 2; all those shifts are there.
+        dy: (Y,) int64, vertical shift of each row of `counts`.
+        dx: (X,) int64, horizontal shift of each column.
 
     Cost: "fft" H W log(H W) per template and target; "conv" (H W)^2 per template.
     """
@@ -48,17 +52,14 @@ def fft_length(size: int) -> int:
     return length
 
 
-def _by_fft(template: Tensor, target: Tensor, target_of_job: Tensor) -> Tensor:
-    height, width = template.shape[1:]
-    shape = (fft_length(height), fft_length(width))
-    dtype = _fft_dtype(template, target, shape)
-    spectrum = torch.fft.rfft2(template.to(dtype), s=shape).conj()
-    product = spectrum * torch.fft.rfft2(target.to(dtype), s=shape)[target_of_job]
-    counts = torch.fft.irfft2(product, s=shape)
-    reach_y, reach_x = height // 2, width // 2
-    counts = torch.cat((counts[:, shape[0] - reach_y :], counts[:, : reach_y + 1]), 1)
-    counts = torch.cat((counts[:, :, shape[1] - reach_x :], counts[:, :, : reach_x + 1]), 2)
-    return counts.round_().int()
+def _by_fft(template: Tensor, target: Tensor, target_of_job: Tensor) -> Tuple[Tensor, Tensor, Tensor]:
+    shape = (fft_length(template.shape[1]), fft_length(template.shape[2]))
+    images = torch.cat((template, target)).to(_fft_dtype(template, target, shape))
+    of_template, of_target = torch.fft.rfft2(images, s=shape).split((len(template), len(target)))
+    counts = torch.fft.irfft2(of_target[target_of_job] * of_template.conj(), s=shape)
+    # Shifts below zero stand at the end of a transform.
+    dy, dx = (torch.arange(n, device=counts.device) for n in shape)
+    return counts, torch.where(dy > shape[0] // 2, dy - shape[0], dy), torch.where(dx > shape[1] // 2, dx - shape[1], dx)
 
 
 def _fft_dtype(template: Tensor, target: Tensor, shape: Tuple[int, int]) -> torch.dtype:
@@ -71,13 +72,14 @@ def _fft_dtype(template: Tensor, target: Tensor, shape: Tuple[int, int]) -> torc
     return torch.float32 if error / pixels * math.sqrt(largest[0] * largest[1]) <= _FFT_LARGEST_ERROR else torch.float64
 
 
-def _by_conv(template: Tensor, target: Tensor, target_of_job: Tensor) -> Tensor:
+def _by_conv(template: Tensor, target: Tensor, target_of_job: Tensor) -> Tuple[Tensor, Tensor, Tensor]:
     num_jobs, height, width = template.shape
     pad = (width // 2, width // 2, height // 2, height // 2)
     padded = F.pad(target.float(), pad)[target_of_job]
     # One group per template. Sums of products of zeros and ones: exact in float32 up to 2^24, also with TF32.
     counts = F.conv2d(padded[None], template.float()[:, None], groups=num_jobs)[0]
-    return counts.round().int()
+    dy, dx = (torch.arange(-(n // 2), n // 2 + 1, device=counts.device) for n in (height, width))
+    return counts, dy, dx
 
 
 def _odd_part(number: int) -> int:

@@ -18,6 +18,7 @@ from typing import Tuple
 import torch
 from torch import Tensor
 
+from cflow_torch.ops.indices import flat_nonzero
 from cflow_torch.types import CFlowError
 
 # Half of the eight neighbours of a block; the other half is the same links seen from the other side.
@@ -56,7 +57,7 @@ def connected_components(occupancy: Tensor, pixels: Tensor, connectivity: int = 
     # One more row of blocks than needed keeps the look-ups below the last row inside the tensor.
     masks = pixels.new_zeros(num_images * rows_of_blocks * cols_of_blocks + cols_of_blocks + 2)
     masks.scatter_add_(0, block, bit)  # distinct bits: adding is OR-ing
-    nodes = masks.nonzero()[:, 0]
+    nodes = flat_nonzero(masks > 0)
     node_of_block = torch.empty_like(masks)
     node_of_block[nodes] = torch.arange(nodes.numel(), device=pixels.device)
 
@@ -65,7 +66,7 @@ def connected_components(occupancy: Tensor, pixels: Tensor, connectivity: int = 
     sources, targets = [], []
     for direction, (down, right) in enumerate(_NEIGHBOURS):
         neighbour = nodes + down * cols_of_blocks + right
-        linked = ((reachable[direction][own] & masks[neighbour]) != 0).nonzero()[:, 0]
+        linked = flat_nonzero((reachable[direction][own] & masks[neighbour]) != 0)
         sources.append(linked)
         targets.append(node_of_block[neighbour[linked]])
     root = union_find(nodes.numel(), torch.cat(sources), torch.cat(targets))
@@ -98,7 +99,7 @@ def union_find(num_nodes: int, sources: Tensor, targets: Tensor) -> Tensor:
                 break
             parent = grandparent
         sources, targets = parent[sources], parent[targets]
-        open_edges = (sources != targets).nonzero()[:, 0]
+        open_edges = flat_nonzero(sources != targets)
         sources, targets = sources[open_edges], targets[open_edges]
     return parent
 
