@@ -14,13 +14,14 @@ from cflow_torch.ego import compensate, relative_transform
 from cflow_torch.grid import Grid
 from cflow_torch.inputs import (
     check_distance,
+    check_windows,
     choose_device,
     elapsed_times,
     read_ground,
     read_positions,
     source_sweeps,
 )
-from cflow_torch.types import CFlowError, FlowResult, Sweep, Window
+from cflow_torch.types import FlowResult, Window
 
 # Working memory that a window takes before its clusters are known: positions, pixels and temporaries of a point;
 # occupancy and cluster of a pixel of every sweep.
@@ -70,13 +71,12 @@ def split_windows(windows: Sequence[Window], config: Config, grid: Grid) -> List
     Raises:
         CFlowError: not a list of windows.
     """
-    if isinstance(windows, (Window, Sweep)) or not all(isinstance(w, Window) for w in windows):
-        raise CFlowError("give a list of cflow_torch.Window (for one window, a list of length one)")
+    check_windows(windows)
     groups: List[List[Window]] = []
     used = 0
     for window in windows:
         sweeps = (window.pc1, window.pc0, *window.pch)
-        points = sum(shape[0] for shape in (getattr(sweep.points, "shape", ()) for sweep in sweeps) if shape)
+        points = sum(sweep.points.shape[0] for sweep in sweeps)
         needed = _BYTES_PER_POINT * points + (_BYTES_PER_PIXEL * len(sweeps) + 30) * grid.height * grid.width
         if not groups or (config.max_memory is not None and used + needed > config.max_memory):
             groups.append([])
@@ -114,7 +114,7 @@ def make_batch(windows: Sequence[Window], config: Config, grid: Grid, device: An
         times = elapsed_times(window, older, config)
         elapsed[index, 1 : 1 + len(times)], seconds[index, 1 : 1 + len(times)] = zip(*times)
         for step, (name, sweep, _) in enumerate([("pc1", window.pc1, 0), *older]):
-            raw = read_positions(sweep, name, chosen_device)
+            raw = read_positions(sweep, chosen_device)
             transform = None
             if sweep.pose is not None and step > 0:
                 transform = relative_transform(window.pc1.pose, sweep.pose, f"pose of {name}")

@@ -76,7 +76,9 @@ def cluster(occupancy: Tensor, pixel_size: float, config: Config) -> Tuple[Clust
     for index in range(1, num_steps):
         aggregated |= occupancy[:, index]
     pixels = flat_nonzero(aggregated)
-    window, raster = pixels // (height * width), pixels % (height * width)
+    window = pixels // (height * width)
+    raster = pixels - window * (height * width)
+    row_of_pixel = raster // width
     component = _label_dilated(aggregated, pixels, config)
     component = _split_oversized(aggregated, pixels, component, pixel_size, config)
 
@@ -84,7 +86,8 @@ def cluster(occupancy: Tensor, pixel_size: float, config: Config) -> Tuple[Clust
     sweeps = torch.arange(num_steps, device=pixels.device)[:, None]
     pixel_of_sweep = (window * num_steps + sweeps) * (height * width) + raster  # (S, P)
     step, pixel = occupancy.flatten().take(pixel_of_sweep).nonzero().unbind(1)
-    place = (values.index_select(0, pixel) for values in (component, window, raster // width, raster % width))
+    col_of_pixel = raster - row_of_pixel * width
+    place = (values.index_select(0, pixel) for values in (component, window, row_of_pixel, col_of_pixel))
     of_component, of_window, row, col = place
     clusters, number = keep_live(of_component, pixels.numel(), of_window, step, row, col)
 

@@ -95,10 +95,13 @@ class Config:
             _positive("max_speed", self.max_speed)
         if self.max_memory is not None:
             _positive("max_memory", self.max_memory)
-        if isinstance(self.min_cluster_size, bool) or not self.min_cluster_size >= 2:
+        if self.min_cluster_size < 2:
             raise CFlowError(f"min_cluster_size={self.min_cluster_size}: give a whole number of at least 2")
-        if not self.ratio_threshold >= 1:
+        _positive("ratio_threshold", self.ratio_threshold)
+        if self.ratio_threshold < 1:
             raise CFlowError(f"ratio_threshold={self.ratio_threshold}: give a number of at least 1, for example 1.1")
+        for name in ("sectional_view", "use_timestamps"):
+            _one_of(name, getattr(self, name), (True, False))
 
     def replace(self, **overrides: Any) -> Config:
         """A copy with some fields changed; an unknown field raises `CFlowError` that lists the fields."""
@@ -147,7 +150,7 @@ def _known(overrides: Dict[str, Any]) -> Dict[str, Any]:
 
 
 def _one_of(name: str, value: Any, allowed: Tuple[Any, ...]) -> None:
-    if isinstance(value, bool) or value not in allowed:
+    if not any(type(value) is type(a) and value == a for a in allowed):
         raise CFlowError(f"{name}={value!r}: give one of {', '.join(repr(a) for a in allowed)}")
 
 

@@ -177,9 +177,7 @@ def _energy_under_window(targets: _Drawing, target: Tensor, size: Tensor, dy: Te
     return inside.long()
 
 
-def _best_of_each_job(
-    job: Tensor, dy: Tensor, dx: Tensor, count: Tensor, energy: Tensor, num_jobs: int
-) -> Tensor:
+def _best_of_each_job(job: Tensor, dy: Tensor, dx: Tensor, count: Tensor, energy: Tensor, num_jobs: int) -> Tensor:
     """(F,) int64, the best candidate of each job that has one; ties as in `best_shifts`."""
     value = count.double()
     value = value * value / energy

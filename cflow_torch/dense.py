@@ -39,6 +39,8 @@ class CorrelationFlow(nn.Module):
 
     def __init__(self, config: Config, device: Any = "auto") -> None:
         super().__init__()
+        if not isinstance(config, Config):
+            raise CFlowError(f"config is {type(config).__name__}: give a Config, or use CorrelationFlow.from_preset")
         if config.method != "dense":
             raise CFlowError(f"method={config.method!r} is not built yet: use method='dense'")
         self.config = config

@@ -68,7 +68,7 @@ def estimate_flow(
     transforms = _per_sweep("T_ego1_egoh", T_ego1_egoh, pch)
     masks = _per_sweep("gmh", gmh, pch)
     moved = T_ego1_ego0 is not None or any(t is not None for t in transforms)
-    if moved and pch and len(T_ego1_egoh) == 0:
+    if moved and len(pch) > 0 and len(T_ego1_egoh) == 0:
         raise CFlowError(
             "T_ego1_ego0 is given but T_ego1_egoh is not: give one transform per sweep of pch "
             "(None for a sweep that already lies in the frame of t+1)"

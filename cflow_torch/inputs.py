@@ -17,6 +17,25 @@ _LONGEST_GAP = 2.5
 _FARTHEST_POSE = 100.0
 
 
+def check_windows(windows: Any) -> None:
+    """Refuse what is not a list of windows of sweeps of arrays.
+
+    Raises:
+        CFlowError: what is wrong, by the name that users know it by.
+    """
+    if isinstance(windows, (Window, Sweep)) or not isinstance(windows, (list, tuple)):
+        raise CFlowError(f"got {type(windows).__name__}: give a list of cflow_torch.Window, also for one window")
+    for window in windows:
+        if not isinstance(window, Window):
+            raise CFlowError(f"the list holds {type(window).__name__}: give cflow_torch.Window(pc0=Sweep(...), ...)")
+        if not isinstance(window.pch, (list, tuple)):
+            raise CFlowError(f"pch is {type(window.pch).__name__}: give a tuple of cflow_torch.Sweep, () for none")
+        for name, sweep in _named_sweeps(window):
+            if not isinstance(sweep, Sweep):
+                raise CFlowError(f"{name} is {type(sweep).__name__}: give cflow_torch.Sweep(points, ...)")
+            _check_points(sweep.points, name)
+
+
 def source_sweeps(window: Window, config: Config) -> List[Tuple[str, Sweep, int]]:
     """(name, sweep, steps to t+1) of pc0 and the history, repeated sweeps left out."""
     if len(window.pch) > config.num_history:
@@ -31,21 +50,36 @@ def source_sweeps(window: Window, config: Config) -> List[Tuple[str, Sweep, int]
             "some sweeps of the window have a pose and some have none: give the pose of every sweep, or of none "
             "(then all points must already lie in the frame of t+1)"
         )
-    names = ["pc0", *(f"pch{i + 1}" for i in range(len(window.pch)))]
     sources: List[Tuple[str, Sweep, int]] = []
-    for step, (name, sweep) in enumerate(zip(names, sweeps[1:]), 1):
+    for step, (name, sweep) in enumerate(_named_sweeps(window)[1:], 1):
         if not any(_same(sweep, other) for _, other, _ in sources):
             sources.append((name, sweep, step))
     return sources
+
+
+def _named_sweeps(window: Window) -> List[Tuple[str, Sweep]]:
+    """Every sweep under its name, t+1 first, then from newest to oldest."""
+    older = [(f"pch{i}", sweep) for i, sweep in enumerate(window.pch, 1)]
+    return [("pc1", window.pc1), ("pc0", window.pc0), *older]
+
+
+def _check_points(points: Any, name: str) -> None:
+    if not isinstance(points, (np.ndarray, Tensor)):
+        raise CFlowError(f"{name} is {type(points).__name__}: give a NumPy array or a torch tensor of shape (N, 3+)")
+    if points.ndim != 2 or points.shape[1] < 3:
+        raise CFlowError(f"{name} has shape {tuple(points.shape)}: give (N, 3+), columns x, y, z in metres")
+    is_tensor = isinstance(points, Tensor)
+    if not (points.is_floating_point() if is_tensor else np.issubdtype(points.dtype, np.floating)):
+        raise CFlowError(f"{name} has dtype {points.dtype}: give floating-point metres")
+    if is_tensor and points.layout != torch.strided:
+        raise CFlowError(f"{name} has layout {points.layout}: give a dense tensor")
 
 
 def _same(a: Sweep, b: Sweep) -> bool:
     """Same points and same pose: harnesses repeat the first sweep of a scene where history is missing."""
     if a is b:
         return True
-    if not all(isinstance(x.points, (np.ndarray, Tensor)) for x in (a, b)) or a.points.shape != b.points.shape:
-        return False
-    if (a.pose is None) != (b.pose is None):
+    if a.points.shape != b.points.shape or (a.pose is None) != (b.pose is None):
         return False
     same_pose = a.pose is None or np.array_equal(_numpy(a.pose), _numpy(b.pose))
     return same_pose and np.array_equal(_numpy(a.points), _numpy(b.points), equal_nan=True)
@@ -87,19 +121,24 @@ def check_distance(T_ego1_ego: np.ndarray, name: str) -> None:
 
 
 def _numpy(array: Any) -> np.ndarray:
-    return array.detach().cpu().numpy() if isinstance(array, Tensor) else np.asarray(array)
+    if not isinstance(array, Tensor):
+        return np.asarray(array)
+    array = array.detach().cpu()
+    return (array.float() if array.dtype == torch.bfloat16 else array).numpy()  # NumPy has no bfloat16
 
 
 def choose_device(windows: Sequence[Window], device: Any) -> torch.device:
     if not (isinstance(device, str) and device == "auto"):
         try:
+            torch.empty(0, device=device)
             return torch.device(device)
-        except (RuntimeError, TypeError):
-            raise CFlowError(f"device={device!r}: give 'auto', 'cpu', 'cuda' or a torch.device") from None
+        except (RuntimeError, TypeError, AssertionError) as error:
+            reason = str(error).splitlines()[0]
+            raise CFlowError(f"device={device!r} cannot be used ({reason}): give 'auto', 'cpu' or 'cuda'") from None
     found = {
         array.device
         for window in windows
-        for sweep in (window.pc0, window.pc1, *window.pch)
+        for _, sweep in _named_sweeps(window)
         for array in (sweep.points, sweep.is_ground)
         if isinstance(array, Tensor)
     }
@@ -111,19 +150,11 @@ def choose_device(windows: Sequence[Window], device: Any) -> torch.device:
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
-def read_positions(sweep: Sweep, name: str, device: torch.device) -> Tensor:
+def read_positions(sweep: Sweep, device: torch.device) -> Tensor:
     """(3, N) float64 copy of the first three columns; the input is never modified."""
     points = sweep.points
-    if not isinstance(points, (np.ndarray, Tensor)):
-        raise CFlowError(f"{name} is {type(points).__name__}: give a NumPy array or a torch tensor of shape (N, 3+)")
-    if points.ndim != 2 or points.shape[1] < 3:
-        raise CFlowError(f"{name} has shape {tuple(points.shape)}: give (N, 3+), columns x, y, z in metres")
     if isinstance(points, Tensor):
-        if not points.is_floating_point():
-            raise CFlowError(f"{name} has dtype {points.dtype}: give floating-point metres")
         return points.detach()[:, :3].to(device).t().to(torch.float64).contiguous()
-    if not np.issubdtype(points.dtype, np.floating):
-        raise CFlowError(f"{name} has dtype {points.dtype}: give floating-point metres")
     return torch.from_numpy(np.array(points[:, :3].T, dtype=np.float64, order="C")).to(device)
 
 

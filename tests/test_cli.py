@@ -7,13 +7,13 @@ import shutil
 import sys
 from pathlib import Path
 
+import cflow_torch.configs
 import numpy as np
 import pytest
 import torch
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
-import cflow_torch.configs
 from cflow_torch import CFlowError, CorrelationFlow, FlowResult, make_config
 from cflow_torch.cli.main import COMMANDS, main
 from cflow_torch.config import PRESETS, Config
@@ -78,7 +78,7 @@ def test_demo_leaves_everything(tmp_path: Path, capsys: pytest.CaptureFixture) -
     assert (tmp_path / "flow.png").read_bytes().startswith(b"\x89PNG")
     printed = capsys.readouterr().out
     assert "flow.png" in printed and "CAR" in printed
-    assert not [p for p in tmp_path.rglob(".*")], "no temporary file is left"
+    assert not list(tmp_path.rglob(".*")), "no temporary file is left"
 
 
 def test_flow_files_hold_the_method_s_result(log_folder: Path, tmp_path: Path) -> None:

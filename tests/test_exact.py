@@ -20,7 +20,9 @@ def test_equals_the_correctly_rounded_root(scale: float) -> None:
 
 
 def test_squares_and_their_neighbours() -> None:
-    roots = np.concatenate((np.arange(0.0, 5000.0), 2.0 ** np.arange(-200, 200), np.array([1 - 2.0**-53, 1 + 2.0**-52])))
+    roots = np.concatenate(
+        (np.arange(0.0, 5000.0), 2.0 ** np.arange(-200, 200), np.array([1 - 2.0**-53, 1 + 2.0**-52]))
+    )
     for x in (roots * roots, np.nextafter(roots * roots, np.inf), np.nextafter(roots * roots, 0.0)):
         x = x[(x == 0) | (x > 1e-200)]
         assert np.array_equal(exact_sqrt(torch.from_numpy(x)).numpy(), np.sqrt(x))

@@ -7,6 +7,7 @@ result; engines, devices and batch sizes then agree to the last bit.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import Tuple
 
 import torch
@@ -32,7 +33,7 @@ def cross_correlate(
 
     Returns:
         counts: (J, Y, X) float, less than 1/2 away from the sum over p of template[j](p) * target(p + (dy, dx)), zero
-            outside the images: round it. Only meaningful for |dy| <= H // 2, |dx| <= W // 2; all those shifts are there.
+            outside the images: round it. All shifts |dy| <= H // 2, |dx| <= W // 2 are there; others mean nothing.
         dy: (Y,) int64, vertical shift of each row of `counts`.
         dx: (X,) int64, horizontal shift of each column.
 
@@ -41,6 +42,7 @@ def cross_correlate(
     return _by_fft(template, target, target_of_job) if engine == "fft" else _by_conv(template, target, target_of_job)
 
 
+@lru_cache(maxsize=None)
 def fft_length(size: int) -> int:
     """Transform length for images of `size` pixels and shifts of up to size // 2, with factors 2, 3 and 5 only.
 
@@ -57,9 +59,14 @@ def _by_fft(template: Tensor, target: Tensor, target_of_job: Tensor) -> Tuple[Te
     images = torch.cat((template, target)).to(_fft_dtype(template, target, shape))
     of_template, of_target = torch.fft.rfft2(images, s=shape).split((len(template), len(target)))
     counts = torch.fft.irfft2(of_target[target_of_job] * of_template.conj(), s=shape)
-    # Shifts below zero stand at the end of a transform.
-    dy, dx = (torch.arange(n, device=counts.device) for n in shape)
-    return counts, torch.where(dy > shape[0] // 2, dy - shape[0], dy), torch.where(dx > shape[1] // 2, dx - shape[1], dx)
+    return counts, _wrapped_shifts(shape[0], counts.device), _wrapped_shifts(shape[1], counts.device)
+
+
+@lru_cache(maxsize=None)
+def _wrapped_shifts(length: int, device: torch.device) -> Tensor:
+    """Shift of each sample of a correlation by FFT: those below zero stand at the end."""
+    shift = torch.arange(length, device=device)
+    return torch.where(shift > length // 2, shift - length, shift)
 
 
 def _fft_dtype(template: Tensor, target: Tensor, shape: Tuple[int, int]) -> torch.dtype:

@@ -13,7 +13,6 @@ masks. Union-find then works on a few thousand blocks instead of pixels.
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Tuple
 
 import torch
 from torch import Tensor
@@ -49,32 +48,32 @@ def connected_components(occupancy: Tensor, pixels: Tensor, connectivity: int = 
         return pixels.clone()
     side = reach + 1 if connectivity == 8 else reach
     rows_of_blocks, cols_of_blocks = -(-height // side) + 1, -(-width // side) + 2  # free border: no bounds checks
-    row, col = (pixels // width) % height, pixels % width
-    image = pixels // (height * width)
-    block = (image * rows_of_blocks + row // side) * cols_of_blocks + col // side + 1
-    bit = torch.ones_like(pixels) << ((row % side) * side + col % side)
+    image_row = pixels // width
+    image, col = image_row // height, pixels - image_row * width
+    row = image_row - image * height
+    block_row, block_col = row // side, col // side
+    block = (image * rows_of_blocks + block_row) * cols_of_blocks + block_col + 1
+    bit = torch.ones_like(pixels) << ((row - block_row * side) * side + col - block_col * side)
 
     # One more row of blocks than needed keeps the look-ups below the last row inside the tensor.
     masks = pixels.new_zeros(num_images * rows_of_blocks * cols_of_blocks + cols_of_blocks + 2)
     masks.scatter_add_(0, block, bit)  # distinct bits: adding is OR-ing
     nodes = flat_nonzero(masks > 0)
     node_of_block = torch.empty_like(masks)
-    node_of_block[nodes] = torch.arange(nodes.numel(), device=pixels.device)
+    node_of_block.scatter_(0, nodes, torch.arange(nodes.numel(), device=pixels.device))
 
-    reachable = _reachable(side, connectivity, reach, pixels.device)
-    own = masks[nodes]
-    sources, targets = [], []
-    for direction, (down, right) in enumerate(_NEIGHBOURS):
-        neighbour = nodes + down * cols_of_blocks + right
-        linked = flat_nonzero((reachable[direction][own] & masks[neighbour]) != 0)
-        sources.append(linked)
-        targets.append(node_of_block[neighbour[linked]])
-    root = union_find(nodes.numel(), torch.cat(sources), torch.cat(targets))
+    # Four look-ups per block: which of its neighbours hold a pixel that one of its own pixels reaches?
+    offsets = torch.tensor([down * cols_of_blocks + right for down, right in _NEIGHBOURS], device=pixels.device)
+    neighbours = nodes[:, None] + offsets
+    reached = _reachable(side, connectivity, reach, pixels.device).index_select(0, masks.index_select(0, nodes))
+    edges = flat_nonzero((reached & masks.take(neighbours)) != 0)
+    targets = node_of_block.index_select(0, neighbours.flatten().index_select(0, edges))
+    root = union_find(nodes.numel(), edges // len(_NEIGHBOURS), targets)
 
-    component = root[node_of_block[block]]
+    component = root.index_select(0, node_of_block.index_select(0, block))
     position = torch.arange(pixels.numel(), device=pixels.device)
     first = torch.full_like(root, pixels.numel()).scatter_reduce_(0, component, position, "amin")
-    return first[component]
+    return first.index_select(0, component)
 
 
 def union_find(num_nodes: int, sources: Tensor, targets: Tensor) -> Tensor:
@@ -144,8 +143,8 @@ def connected_components_kornia(occupancy: Tensor, pixels: Tensor, connectivity:
 
 
 @lru_cache(maxsize=None)
-def _reachable(side: int, connectivity: int, reach: int, device: torch.device) -> Tuple[Tensor, ...]:
-    """For each neighbour direction: (2^(side^2),) int64, mask of a block -> pixels of the neighbour linked to it."""
+def _reachable(side: int, connectivity: int, reach: int, device: torch.device) -> Tensor:
+    """(2^(side^2), 4) int64: mask of a block -> for each neighbour, the mask of its pixels that are linked to it."""
     masks = torch.arange(1 << side * side)
     tables = []
     for down, right in _NEIGHBOURS:
@@ -158,5 +157,5 @@ def _reachable(side: int, connectivity: int, reach: int, device: torch.device) -
                 near = max(dy, dx) <= reach and not (connectivity == 4 and dy == dx == reach)
                 linked |= near << other
             table |= torch.where((masks >> bit) & 1 == 1, linked, 0)
-        tables.append(table.to(device))
-    return tuple(tables)
+        tables.append(table)
+    return torch.stack(tables, 1).to(device)
