@@ -68,11 +68,14 @@ def _check_points(points: Any, name: str) -> None:
         raise CFlowError(f"{name} is {type(points).__name__}: give a NumPy array or a torch tensor of shape (N, 3+)")
     if points.ndim != 2 or points.shape[1] < 3:
         raise CFlowError(f"{name} has shape {tuple(points.shape)}: give (N, 3+), columns x, y, z in metres")
-    is_tensor = isinstance(points, Tensor)
-    if not (points.is_floating_point() if is_tensor else np.issubdtype(points.dtype, np.floating)):
+    if isinstance(points, Tensor):
+        is_floating = points.is_floating_point()
+        if points.layout != torch.strided:
+            raise CFlowError(f"{name} has layout {points.layout}: give a dense tensor")
+    else:
+        is_floating = np.issubdtype(points.dtype, np.floating)
+    if not is_floating:
         raise CFlowError(f"{name} has dtype {points.dtype}: give floating-point metres")
-    if is_tensor and points.layout != torch.strided:
-        raise CFlowError(f"{name} has layout {points.layout}: give a dense tensor")
 
 
 def _same(a: Sweep, b: Sweep) -> bool:
