@@ -161,8 +161,9 @@ def split_results(batch: Batch, residual_flow: Tensor, cluster_id: Tensor, score
     results = []
     for rows, pose_flow in zip(batch.sources, batch.pose_flow):
         residual = residual_flow[rows].float()
-        flow = residual + pose_flow
-        results.append(FlowResult(residual, pose_flow, flow, cluster_id[rows], score[rows], batch.takes_part[rows]))
+        pose = pose_flow.clone()
+        is_valid = batch.takes_part[rows].clone()
+        results.append(FlowResult(residual, pose, residual + pose, cluster_id[rows], score[rows], is_valid))
     return results
 
 
@@ -171,4 +172,5 @@ def _pose_flow(raw: Tensor, moved: Tensor) -> Tensor:
     if moved is raw:
         return torch.zeros((raw.shape[1], 3), dtype=torch.float32, device=raw.device)
     # A point that is not finite has no finite coordinate after the transform.
-    return (moved - raw).t().float().contiguous().nan_to_num_(0.0, 0.0, 0.0)
+    flow = torch.empty((raw.shape[1], 3), dtype=torch.float32, device=raw.device)
+    return flow.copy_((moved - raw).t()).nan_to_num_(0.0, 0.0, 0.0)

@@ -63,7 +63,7 @@ def cluster(occupancy: Tensor, pixel_size: float, config: Config) -> Tuple[Clust
 
     Returns:
         clusters: those of all B windows.
-        of_pixel: (B * S * H * W + 1,) int64, cluster of each occupied pixel of each sweep, M = none; the last entry, M,
+        of_pixel: (B * S * H * W + 1,) int32, cluster of each occupied pixel of each sweep, M = none; the last entry, M,
             is for points that are nowhere. Undefined for empty pixels.
 
     Convention:
@@ -85,14 +85,16 @@ def cluster(occupancy: Tensor, pixel_size: float, config: Config) -> Tuple[Clust
     # Which sweeps saw each pixel. Components are named by their first pixel.
     sweeps = torch.arange(num_steps, device=pixels.device)[:, None]
     pixel_of_sweep = (window * num_steps + sweeps) * (height * width) + raster  # (S, P)
-    step, pixel = occupancy.flatten().take(pixel_of_sweep).nonzero().unbind(1)
+    seen = flat_nonzero(occupancy.flatten().take(pixel_of_sweep))
+    step = seen // pixels.numel() if pixels.numel() else seen
+    pixel = seen - step * pixels.numel()
     col_of_pixel = raster - row_of_pixel * width
     place = (values.index_select(0, pixel) for values in (component, window, row_of_pixel, col_of_pixel))
     of_component, of_window, row, col = place
     clusters, number = keep_live(of_component, pixels.numel(), of_window, step, row, col)
 
-    of_pixel = torch.empty(occupancy.numel() + 1, dtype=torch.int64, device=pixels.device)
-    of_pixel.scatter_(0, pixel_of_sweep.flatten(), number.index_select(0, component).repeat(num_steps))
+    of_pixel = torch.empty(occupancy.numel() + 1, dtype=torch.int32, device=pixels.device)
+    of_pixel.scatter_(0, pixel_of_sweep.flatten(), number.index_select(0, component).int().repeat(num_steps))
     of_pixel[-1] = clusters.window.numel()
     return clusters, of_pixel
 
@@ -112,20 +114,18 @@ def keep_live(
         clusters: the M components that can move.
         number: (C,) int64, cluster of each component, M = none.
     """
-    has_target, has_source = torch.zeros(2, num_components, dtype=torch.bool, device=component.device)
-    is_newest = step == 0
-    has_target[component[is_newest]] = True
-    has_source[component[~is_newest]] = True
-    live = (has_target & has_source).nonzero()[:, 0]
+    seen = torch.zeros(2 * num_components, dtype=torch.bool, device=component.device)
+    seen.index_fill_(0, 2 * component + (step > 0), True)  # before, at t+1
+    live = flat_nonzero(seen.view(-1, 2).all(1))
     num_clusters = live.numel()
     number = torch.full((num_components,), num_clusters, dtype=torch.int64, device=component.device)
-    number[live] = torch.arange(num_clusters, device=component.device)
+    number.scatter_(0, live, torch.arange(num_clusters, device=component.device))
 
     cluster = number.index_select(0, component)
-    kept = (cluster < num_clusters).nonzero()[:, 0]
+    kept = flat_nonzero(cluster < num_clusters)
     pixels = Pixels(*(values.index_select(0, kept) for values in (cluster, step, row, col)))
     window_of_cluster = torch.zeros(num_clusters, dtype=torch.int64, device=component.device)
-    window_of_cluster[pixels.cluster] = window.index_select(0, kept)
+    window_of_cluster.scatter_(0, pixels.cluster, window.index_select(0, kept))
     return Clusters(
         window_of_cluster, *bounding_boxes(pixels.row, pixels.col, pixels.cluster, num_clusters), pixels
     ), number

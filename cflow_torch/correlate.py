@@ -154,8 +154,9 @@ def _candidates(
     place = flat_nonzero(counts > needed[:, None, None])
     num_rows, num_cols = counts.shape[1:]
     row = place // num_cols
-    count = counts.flatten()[place].round().long()
-    return row // num_rows, dy[row % num_rows], dx[place % num_cols], count
+    job = row // num_rows
+    count = counts.view(-1).index_select(0, place).round().long()
+    return job, dy.index_select(0, row - job * num_rows), dx.index_select(0, place - row * num_cols), count
 
 
 def _energy_under_window(targets: _Drawing, target: Tensor, size: Tensor, dy: Tensor, dx: Tensor) -> Tensor:

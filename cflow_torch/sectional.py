@@ -28,7 +28,7 @@ def add_sectional_view(
         estimates: (M, K, 3) float64, metres m -> t+1 from the BEV, nearest sweep first.
         available: (M, K) bool, which estimates exist.
         positions: (3, P) float64, metres, frame of t+1, as they were projected to the BEV.
-        cluster: (P,) int64, cluster of each point, M = none.
+        cluster: (P,) int32 or int64, cluster of each point, M = none.
         step: (P,) int64, 0 = sweep t+1, 1 = t, ...
         pixel_size: s, metres.
         config: `correlation`.
@@ -53,6 +53,7 @@ def add_sectional_view(
     safe = torch.where(length > 0, length, torch.ones_like(length))
     heading = torch.stack((torch.where(length > 0, x / safe, torch.ones_like(x)), y / safe))
 
+    cluster = cluster.long()
     member = cluster < len(available)
     older = (member & (step > 0)).nonzero()[:, 0]
     template_job = job_of_slot[cluster[older] * num_sources + step[older] - 1]

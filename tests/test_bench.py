@@ -189,17 +189,17 @@ def test_agreement_counts_points():
 
 
 def test_ratio_pairs_neighbouring_runs(monkeypatch):
-    # Every second pair of runs is ten times slower; OpenCV always takes three times as long.
+    # Every second round of runs is ten times slower; OpenCV always takes three times as long.
     clock, calls = [0.0], []
     monkeypatch.setattr(measure.time, "sleep", lambda _: None)
     monkeypatch.setattr(measure.time, "perf_counter", lambda: clock[0])
 
     def run(name, seconds):
         calls.append(name)
-        clock[0] += seconds * (10 if (len(calls) - 1) // 2 % 2 else 1)
+        clock[0] += seconds * (10 if (len(calls) - 1) // 4 % 2 else 1)
 
     fast, loop = measure._alternate([lambda: run("fast", 1.0), lambda: run("loop", 3.0)], 4)
-    assert calls == ["fast", "loop"] * 6
+    assert calls == ["fast", "fast", "loop", "loop"] * 6
     assert [b / a for a, b in zip(fast, loop)] == [3.0] * 4
 
 

@@ -302,3 +302,11 @@ def test_cuda_equals_cpu(num_history, pixel_sizes, correlation, labeling):
     for gpu, cpu in zip(CorrelationFlow(settings, device="cuda")(windows), on_cpu):
         assert gpu.flow.is_cuda
         assert_same(gpu.to("cpu"), cpu)
+
+
+def test_results_are_ordinary_tensors_that_a_training_loop_may_use():
+    (result,) = CorrelationFlow(config(num_history=0))([scene(0)])
+    weight = torch.ones(3, requires_grad=True)
+    for tensor in (result.residual_flow, result.pose_flow, result.flow):
+        (tensor * weight).sum().backward()  # saves the tensor for backward: refused for tensors of inference mode
+    assert not result.is_valid.is_inference() and not result.cluster_id.is_inference()

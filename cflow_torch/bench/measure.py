@@ -229,11 +229,16 @@ def _measure_clustering(window: Window, config: Config, repeats: int, why_no_ope
 
 
 def _alternate(runs: Sequence[Callable[[], Any]], repeats: int) -> List[List[float]]:
-    """Seconds of each of `repeats` runs, taken in turn (A B A B ...) after two rounds that do not count."""
+    """Seconds of each of `repeats` runs, taken in turn after two rounds that do not count.
+
+    Every timed run follows an untimed one of the same kind (a A b B a A b B ...): frames come one after the other, and
+    right after the rest threads are asleep and memory belongs to the other.
+    """
     times: List[List[float]] = [[] for _ in runs]
     for repeat in range(-2, repeats):
         for run, seconds in zip(runs, times):
             time.sleep(_REST_SECONDS)
+            run()
             start = time.perf_counter()
             run()
             if repeat >= 0:

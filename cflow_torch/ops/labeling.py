@@ -93,13 +93,14 @@ def union_find(num_nodes: int, sources: Tensor, targets: Tensor) -> Tensor:
         low, high = torch.minimum(sources, targets), torch.maximum(sources, targets)
         parent.scatter_reduce_(0, high, low, "amin")  # hook roots onto smaller roots: never a cycle
         while True:
-            grandparent = parent[parent]
-            if torch.equal(grandparent, parent):
+            ancestor = parent.index_select(0, parent)
+            ancestor = ancestor.index_select(0, ancestor)  # twice as far for one look whether anything moved
+            if torch.equal(ancestor, parent):
                 break
-            parent = grandparent
-        sources, targets = parent[sources], parent[targets]
+            parent = ancestor
+        sources, targets = parent.index_select(0, sources), parent.index_select(0, targets)
         open_edges = flat_nonzero(sources != targets)
-        sources, targets = sources[open_edges], targets[open_edges]
+        sources, targets = sources.index_select(0, open_edges), targets.index_select(0, open_edges)
     return parent
 
 
