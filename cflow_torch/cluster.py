@@ -164,9 +164,8 @@ def _split_oversized(image: Tensor, pixels: Tensor, component: Tensor, pixel_siz
     else:
         closed = erode_3x3(dilate_3x3(alone))
         closed_pixels = flat_nonzero(closed)
-        part_of_pixel = torch.empty_like(closed, dtype=torch.int64).view(-1)
         part = connected_components(closed, closed_pixels, config.connectivity, reach=1)
-        part = part_of_pixel.scatter_(0, closed_pixels, part).index_select(0, pixels[oversized])
+        part = part.index_select(0, torch.searchsorted(closed_pixels, pixels[oversized]))
         earliest = pixels.new_full((closed_pixels.numel(),), oversized.numel())
         positions = torch.arange(oversized.numel(), device=pixels.device)
         part = earliest.scatter_reduce_(0, part, positions, "amin")[part]
