@@ -193,7 +193,7 @@ class AV2Log:
         times = _integers(table, "timestamp_ns", file)
         if not times.size or timestamp0 < times.min() or timestamp1 > times.max():
             return None
-        used = np.ones(len(times), dtype=bool)
+        used: np.ndarray = np.ones(len(times), dtype=bool)
         if "num_interior_pts" in table.column_names:
             used = _integers(table, "num_interior_pts", file) >= MIN_INTERIOR_POINTS
         boxes0, boxes1 = (

@@ -105,7 +105,7 @@ class Ground:
         """Range and cosine of incidence on the road surface lifted by `lift`; smallest root of a + b t + c t**2 = 0."""
         x, y, z = origin.tolist()
         slope_x = self.slope[0] + self.curvature * x
-        a = z - float(self.road_height(np.float64(x), np.float64(y))) - lift
+        a = z - float(self.road_height(np.array(x), np.array(y))) - lift
         b = directions[2] - slope_x * directions[0] - self.slope[1] * directions[1]
         c = -0.5 * self.curvature * directions[0] ** 2
         root = (b * b - 4 * a * c).sqrt()  # NaN: the ray passes over the crest

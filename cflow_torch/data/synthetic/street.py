@@ -85,7 +85,7 @@ def _people(rng: np.random.Generator, crossing: float) -> Iterator[Body]:
 def _parked(rng: np.random.Generator, ground: Ground) -> Iterator[Body]:
     """Cars along the kerbs."""
     (main, cross), crossing = ground.half_widths, ground.crossing_x
-    for along in np.arange(-60, 85, 6.4):
+    for along in np.arange(-60, 85, 6.4).tolist():
         for side in (-1, 1):
             way = (along + rng.uniform(-0.4, 0.4), side * (main - 1.05), EAST + rng.uniform(-0.02, 0.02))
             behind_hoarding = side > 0 and -36 < along < -12
@@ -104,7 +104,7 @@ def _fixed(rng: np.random.Generator, ground: Ground) -> Iterator[Body]:
     yield objects.wall(-24.0, 5.95, 20.0, 0.1, 2.0, albedo=0.7)
     yield objects.wall(crossing + 36.0, -main - 0.1, 24.0, 0.15, 1.1)
     for side in (-1, 1):
-        for along in np.arange(-REACH, REACH, 12.0):
+        for along in np.arange(-REACH, REACH, 12.0).tolist():
             green = along + rng.uniform(4, 8)
             if abs(along - crossing) > cross + PAVEMENT:
                 yield objects.pole(along, side * (main + 0.6), 7.0, 0.09)
