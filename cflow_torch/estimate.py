@@ -39,7 +39,7 @@ def estimate_flow(
         T_ego1_egoh: (4, 4) of each of `pch`; may be left out only if `T_ego1_ego0` is left out too.
         gmh: ground mask of each of `pch`; empty = nothing is ground.
         method: "dense" or "keypoints".
-        preset: "default" or "paper".
+        preset: "default", "fast" or "paper".
         ground: None = as the masks say; "auto" = find the ground.
         device: "auto" = that of the tensors given, else a GPU if there is one, else the CPU.
         **overrides: any field of `Config`, for example `pixel_sizes=(0.4, 0.2, 0.1)`.

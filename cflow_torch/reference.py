@@ -70,7 +70,7 @@ def reference_flow(window: Window, config: Config) -> FlowResult:
         `FlowResult` of CPU tensors, rows in the order of pc0.
 
     Raises:
-        CFlowError: `method="keypoints"` or `clustering="hdbscan"`, which the reference does not have yet.
+        CFlowError: `method="keypoints"`, which the reference does not have yet.
 
     Cost: about one addition per (pixel of a cluster) x (pixel of its bounding box).
 
@@ -78,10 +78,6 @@ def reference_flow(window: Window, config: Config) -> FlowResult:
     """
     if config.method != "dense":
         raise CFlowError(f"method={config.method!r}: the reference does not have it yet, give method='dense'")
-    if config.clustering != "components":
-        raise CFlowError(
-            f"clustering={config.clustering!r}: the reference does not have it yet, give clustering='components'"
-        )
     clouds, cloud1 = compensate(window, config)
     residual_flow, cluster_id, score = coarse_to_fine(clouds, cloud1, config)
     # float32(p' - p); points that are not finite are NaN in p' and get 0
@@ -138,17 +134,21 @@ def general_correlation_flow(clouds: Sequence[Cloud], cloud1: Cloud, pixel_size:
     height, width = bev_dims(config, pixel_size)
     inside = [cloud.takes_part & in_range(cloud.points, config) for cloud in sweeps]
     pixels = [project_bev(cloud.points[keep], config, pixel_size) for cloud, keep in zip(sweeps, inside)]
-    images = [occupancy(pixel, (0, 0, height, width)) for pixel in pixels]
-    clusters = cluster(images, pixel_size, config.max_extent, config.connectivity)
+    if config.clustering == "hdbscan":
+        members = cluster_hdbscan([cloud.points[keep] for cloud, keep in zip(sweeps, inside)], pixels, config)
+    else:
+        images = [occupancy(pixel, (0, 0, height, width)) for pixel in pixels]
+        clusters = cluster(images, pixel_size, config.max_extent, config.connectivity)
+        members = [clusters[pixel[:, 0], pixel[:, 1]] for pixel in pixels]
     cluster_ids = []
-    for cloud, keep, pixel in zip(sweeps, inside, pixels):
+    for cloud, keep, member in zip(sweeps, inside, members):
         ids = np.full(len(cloud.points), -1, dtype=np.int64)
-        ids[keep] = clusters[pixel[:, 0], pixel[:, 1]]
+        ids[keep] = member
         cluster_ids.append(ids)
 
     flows = [np.zeros(cloud.points.shape) for cloud in clouds]
     scores = [np.zeros(len(cloud.points)) for cloud in clouds]
-    for i in range(clusters.max(initial=-1) + 1):
+    for i in range(max(int(ids.max(initial=-1)) for ids in cluster_ids) + 1):
         # The cluster's scene flow: one estimate per sweep that has points of it, nearest first.
         members = [ids == i for ids in cluster_ids]
         points = [cloud.points[member] for cloud, member in zip(sweeps, members)]
@@ -372,6 +372,31 @@ def cluster(images: Sequence[np.ndarray], pixel_size: float, max_extent: float, 
         if label in at_t1 and label in before:
             result[r, c] = numbers.setdefault(label, len(numbers))
     return result
+
+
+def cluster_hdbscan(points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], config: Config) -> List[np.ndarray]:
+    """HDBSCAN of the aggregated points in place of Alg. clustering (Table which_clustering_method).
+
+    Args:
+        points: (N, 3) float64 of sweep t+1, then of sweeps t, t-1, ...
+        pixels: (N, 2) their BEV pixels (row, column).
+        config: `min_cluster_size`.
+
+    Returns:
+        Per sweep (N,) int64, cluster of every point, -1 for noise and for clusters without a point at t+1 or without one
+        before it. Numbered in raster order of the first pixel; clusters that share it by label.
+    """
+    from hdbscan import HDBSCAN
+
+    aggregated = np.concatenate(points)
+    labels = np.full(len(aggregated), -1)
+    if len(aggregated) > config.min_cluster_size:
+        labels = HDBSCAN(min_cluster_size=config.min_cluster_size).fit_predict(aggregated)
+    of_sweep = np.split(labels, np.cumsum([len(p) for p in points])[:-1])
+    live = [i for i in range(labels.max(initial=-1) + 1) if i in of_sweep[0] and any(i in m for m in of_sweep[1:])]
+    first = {i: min(tuple(p) for m, pixel in zip(of_sweep, pixels) for p in pixel[m == i].tolist()) for i in live}
+    numbers = {label: number for number, label in enumerate(sorted(live, key=lambda i: (first[i], i)))}
+    return [np.array([numbers.get(label, -1) for label in m.tolist()], dtype=np.int64) for m in of_sweep]
 
 
 def _boxes(labels: np.ndarray) -> Dict[int, Box]:
