@@ -21,6 +21,7 @@ from cflow_torch.inputs import (
     read_positions,
     source_sweeps,
 )
+from cflow_torch.ops.indices import flat_nonzero
 from cflow_torch.types import FlowResult, Window
 
 # Working memory that a window takes before its clusters are known: positions, pixels and temporaries of a point;
@@ -31,30 +32,43 @@ _BYTES_PER_PIXEL = 10
 
 @dataclass(frozen=True)
 class Batch:
-    """All points of all sweeps of all windows, one after the other: window by window, t+1, t, t-1, ... in each.
+    """The points that take part, of all sweeps of all windows one after the other: t+1, t, t-1, ... of each window.
 
     Args:
-        positions: (3, P) float64, metres, frame of t+1 of the point's window.
-        takes_part: (P,) bool, finite, not ground, inside the region.
+        positions: (3, P) float64, metres, frame of t+1 of the point's window; finite, not ground, inside the region.
         image: (P,) int64, window * num_steps + step of each point; step 0 = sweep t+1, 1 = t, 2 = t-1, ...
         num_windows: B.
         num_steps: S, 1 + the longest list of source sweeps.
         elapsed: (B, S) float64, sweep intervals from the sweep to t+1: the k that divides an estimate and
             scales a warp (0 for step 0).
         seconds: (B, S) float64, the same in seconds, for `max_speed`.
-        sources: where the points of each window's pc0 lie among the P points.
-        pose_flow: (N, 3) float32 of each window's pc0.
+        sources: of each window, what its result is made of.
     """
 
     positions: Tensor
-    takes_part: Tensor
     image: Tensor
     num_windows: int
     num_steps: int
     elapsed: Tensor
     seconds: Tensor
-    sources: Tuple[slice, ...]
-    pose_flow: Tuple[Tensor, ...]
+    sources: Tuple[Source, ...]
+
+
+@dataclass(frozen=True)
+class Source:
+    """pc0 of one window: all N rows of it, and which of the batch's points they are.
+
+    Args:
+        points: its points among the P points of the batch, Q of them.
+        row: (Q,) int64, their rows in pc0.
+        takes_part: (N,) bool.
+        pose_flow: (N, 3) float32.
+    """
+
+    points: slice
+    row: Tensor
+    takes_part: Tensor
+    pose_flow: Tensor
 
 
 def split_windows(windows: Sequence[Window], config: Config, grid: Grid) -> List[List[Window]]:
@@ -87,7 +101,7 @@ def split_windows(windows: Sequence[Window], config: Config, grid: Grid) -> List
 
 
 def make_batch(windows: Sequence[Window], config: Config, grid: Grid, device: Any = "auto") -> Batch:
-    """Check windows, bring every sweep into the frame of its t+1, mark what takes part.
+    """Check windows, bring every sweep into the frame of its t+1, keep what takes part.
 
     Args:
         windows: B windows, at least one.
@@ -107,7 +121,7 @@ def make_batch(windows: Sequence[Window], config: Config, grid: Grid, device: An
     chosen_device = choose_device(windows, device)
     kept = [source_sweeps(window, config) for window in windows]
     num_steps = 1 + max(len(sources) for sources in kept)
-    positions, takes_part, sources, pose_flow = [], [], [], []
+    positions, sources = [], []
     image, count, num_points = [], [], 0
     elapsed, seconds = np.zeros((2, len(windows), num_steps))
     for index, (window, older) in enumerate(zip(windows, kept)):
@@ -120,20 +134,19 @@ def make_batch(windows: Sequence[Window], config: Config, grid: Grid, device: An
                 transform = relative_transform(window.pc1.pose, sweep.pose, f"pose of {name}")
                 check_distance(transform, name)
             moved = compensate(raw, transform)
-            inside = grid.contains(moved)
+            takes_part = grid.contains(moved)
             if sweep.is_ground is not None:
-                inside &= ~read_ground(sweep, name, raw.shape[1], chosen_device)
+                takes_part &= ~read_ground(sweep, name, raw.shape[1], chosen_device)
+            row = flat_nonzero(takes_part)
             if step == 1:
-                sources.append(slice(num_points, num_points + raw.shape[1]))
-                pose_flow.append(_pose_flow(raw, moved))
-            positions.append(moved)
-            takes_part.append(inside)
+                points = slice(num_points, num_points + row.numel())
+                sources.append(Source(points, row, takes_part, _pose_flow(raw, moved)))
+            positions.append(moved[:, row])
             image.append(index * num_steps + step)
-            count.append(raw.shape[1])
-            num_points += raw.shape[1]
+            count.append(row.numel())
+            num_points += row.numel()
     return Batch(
         positions=torch.cat(positions, 1),
-        takes_part=torch.cat(takes_part),
         image=torch.repeat_interleave(
             torch.tensor(image, device=chosen_device), torch.tensor(count, device=chosen_device), output_size=num_points
         ),
@@ -142,12 +155,11 @@ def make_batch(windows: Sequence[Window], config: Config, grid: Grid, device: An
         elapsed=torch.as_tensor(elapsed, device=chosen_device),
         seconds=torch.as_tensor(seconds, device=chosen_device),
         sources=tuple(sources),
-        pose_flow=tuple(pose_flow),
     )
 
 
 def split_results(batch: Batch, residual_flow: Tensor, cluster_id: Tensor, score: Tensor) -> List[FlowResult]:
-    """Values of all points -> one result per window, for the points of its pc0.
+    """Values of the points of the batch -> one full-length result per window, for all rows of its pc0.
 
     Args:
         batch: as made by `make_batch`.
@@ -156,14 +168,15 @@ def split_results(batch: Batch, residual_flow: Tensor, cluster_id: Tensor, score
         score: (P,) float32.
 
     Returns:
-        B results.
+        B results; rows that took no part have residual flow 0, cluster -1, score 0, is_valid False.
     """
     results = []
-    for rows, pose_flow in zip(batch.sources, batch.pose_flow):
-        residual = residual_flow[rows].float()
-        pose = pose_flow.clone()
-        is_valid = batch.takes_part[rows].clone()
-        results.append(FlowResult(residual, pose, residual + pose, cluster_id[rows], score[rows], is_valid))
+    for source in batch.sources:
+        pose_flow, is_valid = source.pose_flow.clone(), source.takes_part.clone()
+        residual = torch.zeros_like(pose_flow).index_copy_(0, source.row, residual_flow[source.points].float())
+        cluster = torch.full_like(is_valid, -1, dtype=torch.int64).index_copy_(0, source.row, cluster_id[source.points])
+        scores = torch.zeros_like(is_valid, dtype=torch.float32).index_copy_(0, source.row, score[source.points])
+        results.append(FlowResult(residual, pose_flow, residual + pose_flow, cluster, scores, is_valid))
     return results
 
 

@@ -124,15 +124,15 @@ def motion_at_scale(batch: Batch, flow: Optional[Tensor], grid: Grid, config: Co
         What this scale adds.
     """
     with record_function("project"):
-        positions, takes_part = batch.positions, batch.takes_part
+        positions, takes_part = batch.positions, None
         if flow is not None:  # sweep m moves by (t+1-m) times the flow so far
             k = batch.elapsed.flatten().index_select(0, batch.image)
             positions = positions + k * flow.t()
-            takes_part = takes_part & grid.contains(positions)
-        occupancy, pixel = grid.project(positions, takes_part, batch.image, batch.num_windows * batch.num_steps)
+            takes_part = grid.contains(positions)
+        occupancy, pixel = grid.project(positions, batch.image, batch.num_windows * batch.num_steps, takes_part)
     with record_function("cluster"):
         if config.clustering == "hdbscan":
-            clusters, cluster_of_point = cluster_by_density(batch, positions, takes_part, pixel, grid, config)
+            clusters, cluster_of_point = cluster_by_density(batch, positions, pixel, grid, config)
         else:
             occupancy = occupancy.unflatten(0, (batch.num_windows, batch.num_steps))
             clusters, of_pixel = cluster(occupancy, grid.pixel_size, config)

@@ -17,15 +17,14 @@ from cflow_torch.types import CFlowError
 
 
 def cluster_by_density(
-    batch: Batch, positions: Tensor, takes_part: Tensor, pixel: Tensor, grid: Grid, config: Config
+    batch: Batch, positions: Tensor, pixel: Tensor, grid: Grid, config: Config
 ) -> Tuple[Clusters, Tensor]:
     """Spatio-temporal clusters of the aggregated points (t+1, t, t-1, ...) by HDBSCAN on x, y, z.
 
     Args:
         batch: which window and sweep a point belongs to.
         positions: (3, P) float64, metres, frame of t+1, warped by the flow so far.
-        takes_part: (P,) bool.
-        pixel: (P,) int64, flat index of each point's pixel into images (B, S, H, W).
+        pixel: (P,) int64, flat index of each point's pixel into images (B, S, H, W); B * S * H * W = left out.
         grid: the BEV.
         config: `min_cluster_size`.
 
@@ -42,17 +41,17 @@ def cluster_by_density(
     Cost: N log N in points, on the CPU, window by window: a library's work, seconds for a full sweep pair.
     """
     window = batch.image // batch.num_steps
+    num_pixels = batch.num_windows * batch.num_steps * grid.height * grid.width
     label = torch.full_like(pixel, -1)
     num_labels = 0
     for index in range(batch.num_windows):
-        points = (takes_part & (window == index)).nonzero()[:, 0]
+        points = ((pixel < num_pixels) & (window == index)).nonzero()[:, 0]
         found = torch.from_numpy(hdbscan_labels(positions[:, points].t().cpu().numpy(), config.min_cluster_size))
         label[points] = torch.where(found >= 0, found + num_labels, found).to(label.device)
         num_labels += int(found.max()) + 1 if found.numel() else 0
 
     # Occupied pixels, once per cluster and sweep.
     member = (label >= 0).nonzero()[:, 0]
-    num_pixels = batch.num_windows * batch.num_steps * grid.height * grid.width
     key = torch.unique(label[member] * num_pixels + pixel[member])
     owner, place = key // num_pixels, key % num_pixels
     image, raster = place // (grid.height * grid.width), place % (grid.height * grid.width)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Tuple
+from typing import Optional, Tuple
 
 import torch
 from torch import Tensor
@@ -83,14 +83,17 @@ class Grid:
         row = (positions[1] - self.lower[1]).div_(size).floor_()
         return row.mul_(self.width).add_(col).long()  # whole numbers far below 2^53: exact
 
-    def project(self, positions: Tensor, takes_part: Tensor, image: Tensor, num_images: int) -> Tuple[Tensor, Tensor]:
+    def project(
+        self, positions: Tensor, image: Tensor, num_images: int, takes_part: Optional[Tensor] = None
+    ) -> Tuple[Tensor, Tensor]:
         """Binary images that are set where a point falls, and the pixel of every point.
 
         Args:
             positions: (3, N) float64, metres, frame of t+1.
-            takes_part: (N,) bool, False = the point is left out; it must be False outside the region.
             image: (N,) int64, image of each point.
             num_images: B.
+            takes_part: (N,) bool, False = the point is left out; it must be False outside the region. None = all points
+                are inside and take part.
 
         Returns:
             occupancy: (B, H, W) bool.
@@ -98,6 +101,7 @@ class Grid:
         """
         nowhere = num_images * self.height * self.width
         pixel = (image * (self.height * self.width)).add_(self.pixel(positions))
-        pixel.masked_fill_(~takes_part, nowhere)
+        if takes_part is not None:
+            pixel.masked_fill_(~takes_part, nowhere)
         occupancy = torch.zeros(nowhere + 1, dtype=torch.bool, device=pixel.device).index_fill_(0, pixel, True)
         return occupancy[:-1].view(num_images, self.height, self.width), pixel

@@ -383,8 +383,8 @@ def cluster_hdbscan(points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], 
         config: `min_cluster_size`.
 
     Returns:
-        Per sweep (N,) int64, cluster of every point, -1 for noise and for clusters without a point at t+1 or without one
-        before it. Numbered in raster order of the first pixel; clusters that share it by label.
+        Per sweep (N,) int64, cluster of every point, -1 for noise and for clusters without a point at t+1 or without
+        one before it. Numbered in raster order of the first pixel; clusters that share it by label.
     """
     from hdbscan import HDBSCAN
 

@@ -138,7 +138,7 @@ def test_projection_draws_every_point_that_takes_part():
     grid = Grid(1.0, (0.0, 0.0, -INF), (3.0, 2.0, INF))  # 3 rows, 4 columns
     positions = torch.tensor([[0.5, 3.0, 2.2, 0.5, np.nan], [0.5, 2.0, 1.9, 0.7, 0.0], [0.0] * 5], dtype=torch.float64)
     takes_part = torch.tensor([True, True, False, True, False])
-    occupancy, pixel = grid.project(positions, takes_part, torch.tensor([0, 1, 1, 0, 1]), 2)
+    occupancy, pixel = grid.project(positions, torch.tensor([0, 1, 1, 0, 1]), 2, takes_part)
     assert occupancy.shape == (2, 3, 4)
     assert occupancy.nonzero().tolist() == [[0, 0, 0], [1, 2, 3]]
     assert pixel.tolist() == [0, 12 + 11, 24, 0, 24]
