@@ -186,7 +186,7 @@ def test_ground_masks_of_the_wrong_kind(mask, complaint):
 @pytest.mark.parametrize(
     "arguments, complaint",
     [
-        ({"pch": [P1, P0]}, "2 history sweeps.*num_history=0"),
+        ({"pch": [P1, P0], "preset": "paper"}, "2 history sweeps.*num_history=0"),
         ({"pch": [P1, P0], "num_history": 1}, "2 history sweeps.*num_history=1"),
         ({"pch": [P1], "num_history": 1, "gmh": [None, None]}, "gmh has 2 entries for 1"),
         ({"pch": [P1], "num_history": 1, "T_ego1_egoh": [EYE, EYE]}, "T_ego1_egoh has 2 entries for 1"),

@@ -74,7 +74,7 @@ def test_demo_leaves_everything(tmp_path: Path, capsys: pytest.CaptureFixture) -
     scores = json.loads((tmp_path / "results.json").read_text())
     assert scores["results"]["num_frames"] == 2 and scores["versions"]["cflow_torch"]
     assert 0 < scores["results"]["three_way"]["epe_fd"] < 2
-    assert OmegaConf.load(tmp_path / "config.yaml").model.pixel_sizes == [0.1]
+    assert Config(**OmegaConf.load(tmp_path / "config.yaml").model) == make_config("default")
     assert (tmp_path / "flow.png").read_bytes().startswith(b"\x89PNG")
     printed = capsys.readouterr().out
     assert "flow.png" in printed and "CAR" in printed
