@@ -79,7 +79,8 @@ def main() -> None:
     print("| h | scales | " + " | ".join(columns) + " |")
     print("|---|---|" + "---|" * len(columns))
     for (h, scales), row in rows.items():
-        print(f"| {h} | {scales} | " + " | ".join("-" if np.isnan(row[name]) else f"{row[name]:.4f}" for name in columns) + " |")
+        cells = ["-" if np.isnan(row[name]) else f"{row[name]:.4f}" for name in columns]
+        print(f"| {h} | {scales} | " + " | ".join(cells) + " |")
 
 
 if __name__ == "__main__":

@@ -15,6 +15,10 @@ from cflow_torch.bench.measure import format_bench, run_bench
 from cflow_torch.cli.run import finish, make_model, open_logs, write_text
 from cflow_torch.data.log import window
 
+# The full configuration of the paper's figure benefit_multiscale.
+_FULL_HISTORY = 4
+_FULL_SCALES = (0.8, 0.4, 0.3, 0.2, 0.1)
+
 
 def task(cfg: DictConfig) -> None:
     """Run `cflow bench`."""
@@ -22,16 +26,27 @@ def task(cfg: DictConfig) -> None:
     model = make_model(cfg)
     logs, failures = open_logs(cfg, output)
     finish(failures)
-    config = model.config
-    index = min(config.num_history, len(logs[0].timestamps) - 2)
-    wide = config.replace(point_cloud_range=[2 * bound for bound in config.point_cloud_range])
+    config, log = model.config, logs[0]
+    longest = len(log.timestamps) - 2
+    index = min(max(_FULL_HISTORY, config.num_history), longest)
+    configs = {
+        "as configured": config,
+        "twice the region": config.replace(point_cloud_range=[2 * bound for bound in config.point_cloud_range]),
+    }
+    if longest >= _FULL_HISTORY:
+        configs[f"h = {_FULL_HISTORY}"] = config.replace(num_history=_FULL_HISTORY)
+        full = config.replace(num_history=_FULL_HISTORY, pixel_sizes=_FULL_SCALES)
+        configs[f"h = {_FULL_HISTORY}, {len(_FULL_SCALES)} scales"] = full
+    else:
+        print(f"log {log.log_id} has {longest + 2} sweeps: rows with h = {_FULL_HISTORY} need {_FULL_HISTORY + 2}")
     result = run_bench(
-        [window(logs[0], index, config.num_history)],
-        {"+-35 m": config, "+-70 m": wide},
+        [window(log, index, _FULL_HISTORY)],
+        configs,
         repeats=cfg.repeats,
         with_reference=cfg.reference,
         with_opencv=cfg.opencv,
         num_threads=cfg.num_threads,
+        device=cfg.device,
     )
     write_text(output / "bench.json", json.dumps(result, indent=2) + "\n")
     print(format_bench(result))
