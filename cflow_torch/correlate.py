@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import List, Optional, Tuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.ops.cross_correlation import cross_correlate
@@ -39,21 +40,19 @@ class Images:
 
 @dataclass(frozen=True)
 class _Drawing:
-    """Images as pixels, sorted by size class.
+    """Templates and targets as pixels, sorted by size class.
 
     Args:
-        images: per class (n, height, width) bool.
-        order: (N,) int64, images in the order in which they were drawn.
-        place: (N,) int64, where in that order each image is.
-        start: (N,) int64, in drawing order, first pixel of each image in all of `images` put one after the other.
-        stride: (N,) int64, in drawing order, width of each image.
+        blocks: per class (J_c + N_c, height, width) float32 zeros and ones: its templates, then its targets.
+        num_templates: per class J_c.
+        jobs: (J,) int64, templates in the order in which they were drawn.
+        targets: (N,) int64, targets in the order in which they were drawn.
     """
 
-    images: List[Tensor]
-    order: Tensor
-    place: Tensor
-    start: Tensor
-    stride: Tensor
+    blocks: List[Tensor]
+    num_templates: List[int]
+    jobs: Tensor
+    targets: Tensor
 
 
 def best_shifts(
@@ -92,39 +91,40 @@ def best_shifts(
     num_jobs = target_of_job.numel()
     if num_jobs == 0:
         return size.new_zeros((0, 2)), torch.zeros(0, device=size.device)
-    shape, class_of_target, class_shapes = _size_classes(size)
-    targets = _draw(target, class_of_target, shape, class_shapes, border=1)
-    templates = _draw(template, class_of_target[target_of_job], shape[target_of_job], class_shapes)
-    of_job = targets.place[target_of_job[templates.order]]  # from here on targets and jobs are sorted by class
-    energy_of_target = torch.bincount(target.image, minlength=len(size))[targets.order]
-    size = size[targets.order]
+    num_targets = len(size)
+    drawing = _draw(template, target, target_of_job, size)
+    # From here on jobs and targets are sorted by class.
+    jobs, targets = drawing.jobs, drawing.targets
+    place = torch.empty_like(targets).scatter_(0, targets, torch.arange(num_targets, device=size.device))
+    of_job = place.index_select(0, target_of_job.index_select(0, jobs))
+    target_energy = torch.bincount(target.image, minlength=num_targets).index_select(0, targets)
+    target_size = size.index_select(0, targets)
+    job_size, job_target_energy = target_size.index_select(0, of_job), target_energy.index_select(0, of_job)
+    job_radius = None if radius is None else radius.index_select(0, jobs)
 
     candidates = []
     first_target = first_job = 0
-    for template_images, target_images in zip(templates.images, targets.images):
-        at_once = _jobs_at_once(template_images, max_memory)
-        for start in range(0, len(template_images), at_once):
-            part = slice(first_job + start, first_job + min(start + at_once, len(template_images)))
-            of_part = of_job[part]
-            used = slice(first_target, first_target + len(target_images))
-            if at_once < len(template_images):  # jobs are sorted by target: a run of jobs needs a run of targets
-                used = slice(int(of_part[0]), int(of_part[-1]) + 1)
-            counts, dy, dx = cross_correlate(
-                template_images[start : start + at_once],
-                target_images[used.start - first_target : used.stop - first_target, 1:, 1:],
-                of_part - used.start,
-                engine,
-            )
-            limit = None if radius is None else radius[templates.order[part]]
-            job, *rest = _candidates(counts, dy, dx, size[of_part], energy_of_target[of_part], limit)
+    for block, num_templates in zip(drawing.blocks, drawing.num_templates):
+        at_once = _jobs_at_once(block, num_templates, max_memory)
+        for start in range(0, num_templates, at_once):
+            stop = min(start + at_once, num_templates)
+            part = slice(first_job + start, first_job + stop)
+            images, own = block, of_job[part] - first_target
+            if at_once < num_templates:  # jobs are sorted by target: a run of jobs needs a run of targets
+                first, last = int(own[0]), int(own[-1])
+                some_targets = block[num_templates + first : num_templates + last + 1]
+                images, own = torch.cat((block[start:stop], some_targets)), own - first
+            counts, dy, dx = cross_correlate(images, stop - start, own, engine)
+            limit = None if job_radius is None else job_radius[part]
+            job, *rest = _candidates(counts, dy, dx, job_size[part], job_target_energy[part], limit)
             candidates.append((job + part.start, *rest))
-        first_target += len(target_images)
-        first_job += len(template_images)
+        first_target += len(block) - num_templates
+        first_job += num_templates
 
     job, dy, dx, count = map(torch.cat, zip(*candidates))
-    energy = _energy_under_window(targets, of_job[job], size[of_job[job]], dy, dx)
+    energy = _energy_under_window(drawing, of_job.index_select(0, job), job_size.index_select(0, job), dy, dx)
     best = _best_of_each_job(job, dy, dx, count, energy, num_jobs)
-    found = templates.order[job[best]]
+    found = jobs[job[best]]
     shift = torch.zeros((num_jobs, 2), dtype=torch.int64, device=size.device)
     shift[found] = torch.stack((dy[best], dx[best]), 1)
     energies = torch.bincount(template.image, minlength=num_jobs)[found] * energy[best]
@@ -159,23 +159,31 @@ def _candidates(
     return job, dy.index_select(0, row - job * num_rows), dx.index_select(0, place - row * num_cols), count
 
 
-def _energy_under_window(targets: _Drawing, target: Tensor, size: Tensor, dy: Tensor, dx: Tensor) -> Tensor:
+def _energy_under_window(drawing: _Drawing, target: Tensor, size: Tensor, dy: Tensor, dx: Tensor) -> Tensor:
     """(K,) int64, target pixels under the H x W window at a shift (denominator of Eq. norm_correlation).
 
     Args:
-        targets: drawn with a border of one empty row above and column to the left.
-        target: (K,) int64, which of the drawn targets.
+        drawing: the images.
+        target: (K,) int64, which target, in drawing order.
         size: (K, 2) int64, H, W.
         dy, dx: (K,) int64.
     """
-    tables = [images.cumsum(1, dtype=torch.int32).cumsum(2, dtype=torch.int32) for images in targets.images]
-    table = torch.cat([part.flatten() for part in tables])  # pixels above and to the left of each pixel
-    start, stride = targets.start[target], targets.stride[target]
+    # Tables of the number of pixels above and to the left; counts below 2^24 are exact in float32.
+    tables = [
+        F.pad(block[first:].cumsum(1).cumsum(2), (1, 0, 1, 0))
+        for block, first in zip(drawing.blocks, drawing.num_templates)
+    ]
+    table = torch.cat([part.flatten() for part in tables])
+    shapes = torch.tensor([part.shape for part in tables], device=target.device)
+    of_class = torch.repeat_interleave(shapes[:, 0])
+    stride, area = shapes[of_class, 2], (shapes[:, 1] * shapes[:, 2])[of_class]
+    start, stride = (area.cumsum(0) - area).index_select(0, target), stride.index_select(0, target)
     stop_y, stop_x = torch.minimum(size[:, 0] + dy, size[:, 0]), torch.minimum(size[:, 1] + dx, size[:, 1])
     begin_y, begin_x = dy.clamp(min=0), dx.clamp(min=0)
     above, below = start + begin_y * stride, start + stop_y * stride
-    inside = table[below + stop_x] - table[above + stop_x] - table[below + begin_x] + table[above + begin_x]
-    return inside.long()
+    corners = torch.stack((below + stop_x, above + stop_x, below + begin_x, above + begin_x))
+    stop_stop, begin_stop, stop_begin, begin_begin = table.take(corners)
+    return (stop_stop - begin_stop - stop_begin + begin_begin).long()
 
 
 def _best_of_each_job(job: Tensor, dy: Tensor, dx: Tensor, count: Tensor, energy: Tensor, num_jobs: int) -> Tensor:
@@ -192,11 +200,32 @@ def _best_of_each_job(job: Tensor, dy: Tensor, dx: Tensor, count: Tensor, energy
     return tied[order == first[job[tied]]]
 
 
-def _jobs_at_once(template: Tensor, max_memory: Optional[int]) -> int:
-    num_jobs, height, width = template.shape
+def _jobs_at_once(block: Tensor, num_templates: int, max_memory: Optional[int]) -> int:
     if max_memory is None:
-        return max(1, num_jobs)
-    return max(1, min(num_jobs, int(max_memory) // (_BYTES_PER_SAMPLE * height * width)))
+        return max(1, num_templates)
+    return max(1, min(num_templates, int(max_memory) // (_BYTES_PER_SAMPLE * block.shape[1] * block.shape[2])))
+
+
+def _draw(template: Images, target: Images, target_of_job: Tensor, size: Tensor) -> _Drawing:
+    """Draw all templates and targets, each in the shape of its size class, in one go."""
+    num_jobs = target_of_job.numel()
+    shape, class_of_target, class_shapes = _size_classes(size)
+    shape = torch.cat((shape.index_select(0, target_of_job), shape))
+    kind = torch.cat((2 * class_of_target.index_select(0, target_of_job), 2 * class_of_target + 1))
+    order = torch.sort(kind, stable=True).indices
+    area = (shape[:, 0] * shape[:, 1]).index_select(0, order)
+    start = torch.empty_like(area).scatter_(0, order, area.cumsum(0) - area)
+    counts = torch.bincount(kind, minlength=2 * len(class_shapes)).tolist()
+
+    image = torch.cat((template.image, target.image + num_jobs))
+    row, col = torch.cat((template.row, target.row)), torch.cat((template.col, target.col))
+    pixel = start.index_select(0, image) + row * shape[:, 1].index_select(0, image) + col
+    shapes = [(a + b, *hw) for a, b, hw in zip(counts[::2], counts[1::2], class_shapes)]
+    areas = [number * height * width for number, height, width in shapes]
+    drawn = torch.zeros(sum(areas), dtype=torch.float32, device=pixel.device).index_fill_(0, pixel, 1.0)
+    blocks = [part.view(of_class) for part, of_class in zip(drawn.split(areas), shapes)]
+    is_job = order < num_jobs
+    return _Drawing(blocks, counts[::2], order[is_job], order[~is_job] - num_jobs)
 
 
 def _size_classes(size: Tensor) -> Tuple[Tensor, Tensor, List[Tuple[int, int]]]:
@@ -210,21 +239,3 @@ def _size_classes(size: Tensor) -> Tuple[Tensor, Tensor, List[Tuple[int, int]]]:
     base = 1 + max(largest, _SQUARE_CLASSES[-1])
     keys, class_of_target = torch.unique(shape[:, 0] * base + shape[:, 1], return_inverse=True)
     return shape, class_of_target, [divmod(key, base) for key in keys.tolist()]
-
-
-def _draw(
-    images: Images, class_of_image: Tensor, shape: Tensor, class_shapes: List[Tuple[int, int]], border: int = 0
-) -> _Drawing:
-    """Draw every image in the shape of its size class, with `border` empty rows above and columns to the left."""
-    order = torch.sort(class_of_image, stable=True).indices
-    place = torch.empty_like(order).index_copy_(0, order, torch.arange(order.numel(), device=order.device))
-    stride = shape[:, 1] + border
-    area = ((shape[:, 0] + border) * stride)[order]
-    start = area.cumsum(0) - area
-    counts = torch.bincount(class_of_image, minlength=len(class_shapes)).tolist()
-    shapes = [(count, height + border, width + border) for count, (height, width) in zip(counts, class_shapes)]
-    areas = [count * height * width for count, height, width in shapes]
-    pixel = (start[place] + border * (stride + 1))[images.image] + images.row * stride[images.image] + images.col
-    drawn = torch.zeros(sum(areas), dtype=torch.bool, device=pixel.device).index_fill_(0, pixel, True)
-    parts = [part.view(of_class) for part, of_class in zip(drawn.split(areas), shapes)]
-    return _Drawing(parts, order, place, start, stride[order])

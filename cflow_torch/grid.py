@@ -57,7 +57,8 @@ class Grid:
             (N,) bool.
         """
         x, y, z = positions
-        inside = (x >= self.lower[0]) & (x <= self.upper[0]) & (y >= self.lower[1]) & (y <= self.upper[1])
+        inside = (x >= self.lower[0]).logical_and_(x <= self.upper[0])
+        inside.logical_and_(y >= self.lower[1]).logical_and_(y <= self.upper[1])
         inside &= torch.isfinite(z)  # NaN in x or y fails the comparisons
         if math.isfinite(self.lower[2]):
             inside &= z >= self.lower[2]

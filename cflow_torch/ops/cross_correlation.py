@@ -22,13 +22,13 @@ _SHORT_FFT = 64
 
 
 def cross_correlate(
-    template: Tensor, target: Tensor, target_of_job: Tensor, engine: str = "fft"
+    images: Tensor, num_templates: int, target_of_job: Tensor, engine: str = "fft"
 ) -> Tuple[Tensor, Tensor, Tensor]:
     """Number of coinciding pixels for every shift of a template over a target (numerator of Eq. norm_correlation).
 
     Args:
-        template: (J, H, W) bool.
-        target: (N, H, W) bool.
+        images: (J + N, H, W) float32 zeros and ones: J templates, then N targets.
+        num_templates: J.
         target_of_job: (J,) int64, target of each template; a target's spectrum serves all its templates.
         engine: "fft" or "conv" (conv2d).
 
@@ -40,7 +40,11 @@ def cross_correlate(
 
     Cost: "fft" H W log(H W) per template and target; "conv" (H W)^2 per template.
     """
-    return _by_fft(template, target, target_of_job) if engine == "fft" else _by_conv(template, target, target_of_job)
+    return (
+        _by_fft(images, num_templates, target_of_job)
+        if engine == "fft"
+        else _by_conv(images, num_templates, target_of_job)
+    )
 
 
 @lru_cache(maxsize=None)
@@ -56,11 +60,11 @@ def fft_length(size: int) -> int:
     return length
 
 
-def _by_fft(template: Tensor, target: Tensor, target_of_job: Tensor) -> Tuple[Tensor, Tensor, Tensor]:
-    shape = (fft_length(template.shape[1]), fft_length(template.shape[2]))
-    images = torch.cat((template, target)).to(_fft_dtype(template, target, shape))
-    of_template, of_target = torch.fft.rfft2(images, s=shape).split((len(template), len(target)))
-    counts = torch.fft.irfft2(of_target[target_of_job] * of_template.conj(), s=shape)
+def _by_fft(images: Tensor, num_templates: int, target_of_job: Tensor) -> Tuple[Tensor, Tensor, Tensor]:
+    shape = (fft_length(images.shape[1]), fft_length(images.shape[2]))
+    spectrum = torch.fft.rfft2(images.to(_fft_dtype(images, shape)), s=shape)
+    of_template, of_target = spectrum[:num_templates], spectrum[num_templates:]
+    counts = torch.fft.irfft2(of_target.index_select(0, target_of_job) * of_template.conj(), s=shape)
     return counts, _wrapped_shifts(shape[0], counts.device), _wrapped_shifts(shape[1], counts.device)
 
 
@@ -71,22 +75,22 @@ def _wrapped_shifts(length: int, device: torch.device) -> Tensor:
     return torch.where(shift > length // 2, shift - length, shift)
 
 
-def _fft_dtype(template: Tensor, target: Tensor, shape: Tuple[int, int]) -> torch.dtype:
+def _fft_dtype(images: Tensor, shape: Tuple[int, int]) -> torch.dtype:
     # The number of pixels bounds the norms without looking at the images (no synchronisation).
-    pixels = template.shape[1] * template.shape[2]
-    error = _FFT_ERROR_MARGIN * torch.finfo(torch.float32).eps * math.log2(shape[0] * shape[1]) * pixels
-    if error <= _FFT_LARGEST_ERROR:
+    pixels = images.shape[1] * images.shape[2]
+    error = _FFT_ERROR_MARGIN * torch.finfo(torch.float32).eps * math.log2(shape[0] * shape[1])
+    if error * pixels <= _FFT_LARGEST_ERROR:
         return torch.float32
-    largest = [float(images.sum((1, 2)).max()) if images.numel() else 0.0 for images in (template, target)]
-    return torch.float32 if error / pixels * math.sqrt(largest[0] * largest[1]) <= _FFT_LARGEST_ERROR else torch.float64
+    largest = float(images.sum((1, 2)).max()) if len(images) else 0.0
+    return torch.float32 if error * largest <= _FFT_LARGEST_ERROR else torch.float64
 
 
-def _by_conv(template: Tensor, target: Tensor, target_of_job: Tensor) -> Tuple[Tensor, Tensor, Tensor]:
-    num_jobs, height, width = template.shape
+def _by_conv(images: Tensor, num_templates: int, target_of_job: Tensor) -> Tuple[Tensor, Tensor, Tensor]:
+    height, width = images.shape[1:]
     pad = (width // 2, width // 2, height // 2, height // 2)
-    padded = F.pad(target.float(), pad)[target_of_job]
+    padded = F.pad(images[num_templates:], pad)[target_of_job]
     # One group per template. Sums of products of zeros and ones: exact in float32 up to 2^24, also with TF32.
-    counts = F.conv2d(padded[None], template.float()[:, None], groups=num_jobs)[0]
+    counts = F.conv2d(padded[None], images[:num_templates, None], groups=num_templates)[0]
     dy, dx = (torch.arange(-(n // 2), n // 2 + 1, device=counts.device) for n in (height, width))
     return counts, dy, dx
 
