@@ -11,7 +11,8 @@ import torch
 from scenes import RANGE, config, pose, scene
 
 from cflow_torch.bench import measure
-from cflow_torch.bench.measure import STAGES, format_bench, run_bench
+from cflow_torch.bench.measure import STAGES, run_bench
+from cflow_torch.bench.table import format_bench
 from cflow_torch.config import Config
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.log import window

@@ -1,4 +1,4 @@
-"""Seconds of the fast path, of its stages, of the reference and of the OpenCV loop; a report and its table."""
+"""Seconds of the fast path, of its stages, of the reference and of the OpenCV loop."""
 
 from __future__ import annotations
 
@@ -95,65 +95,6 @@ def run_bench(
         "repeats": repeats,
         "results": results,
     }
-
-
-def format_bench(report: Report) -> str:
-    """The report as Markdown: the machine, a table of medians and ratios, a table of the stages.
-
-    Args:
-        report: as made by `run_bench`.
-
-    Returns:
-        Text without a line break at its end.
-
-    Convention: "OpenCV / fast" above 1 means that the fast path is faster.
-    """
-    machine, results = report["machine"], report["results"]
-    versions = ", ".join(f"{name} {version}" for name, version in machine["versions"].items())
-    lines = [
-        f"{machine['cpu']}, {machine['cores']} cores, {machine['threads']} threads, device {machine['device']}; "
-        f"{machine['platform']}, Python {machine['python']}; {versions}",
-        f"{report['num_windows']} window(s) of about {report['points']} points a sweep; "
-        f"medians of {report['repeats']} runs, per window",
-        "",
-    ]
-    lines += _table(
-        ["", "fast ms", "min-max", "OpenCV loop ms", "OpenCV / fast", "reference s", "bits = reference"]
-        + ["same flow as OpenCV", "within a pixel", "clustering ms", "OpenCV", "extra MB, at least"],
-        [[name, *_row(result)] for name, result in results.items()],
-    )
-    lines += ["", "Stages, ms (under the profiler):", ""]
-    lines += _table(
-        ["", *STAGES],
-        [[name, *(_ms(result["stages_s"][stage]) for stage in STAGES)] for name, result in results.items()],
-    )
-    return "\n".join(lines)
-
-
-def _row(result: Report) -> List[str]:
-    fast, agreement, clustering = result["fast"], result["agreement"], result["clustering"]
-    ratio, peak = result["opencv_over_fast"], result["peak_extra_mb"]
-    reference, agrees = result["reference"], agreement["opencv"]
-    cells: List[Any] = [_ms(fast), f"{_ms(fast['min_s'])}-{_ms(fast['max_s'])}", _ms(result["opencv"])]
-    cells.append(ratio if isinstance(ratio, str) else f"{ratio:.2f}")
-    cells.append(reference if isinstance(reference, str) else f"{reference['median_s']:.2f}")
-    same = agreement["reference"]
-    cells.append(same if isinstance(same, str) else "yes" if same["bit_equal"] else "no")
-    shares = ("same_flow", "within_one_pixel")
-    cells += [agrees if isinstance(agrees, str) else f"{100 * agrees[share]:.2f} %" for share in shares]
-    cells += [_ms(clustering["fast"]), _ms(clustering["opencv"])]
-    return [*cells, peak if isinstance(peak, str) else f"{peak:.0f}"]
-
-
-def _ms(seconds: Any) -> str:
-    """Milliseconds of a number of seconds or of a summary's median; a text stays as it is."""
-    if isinstance(seconds, str):
-        return seconds
-    return f"{1000 * (seconds['median_s'] if isinstance(seconds, dict) else seconds):.1f}"
-
-
-def _table(header: List[str], rows: List[List[str]]) -> List[str]:
-    return ["| " + " | ".join(cells) + " |" for cells in (header, ["---"] * len(header), *rows)]
 
 
 def _measure(

@@ -11,7 +11,8 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from cflow_torch.bench.measure import format_bench, run_bench
+from cflow_torch.bench.measure import run_bench
+from cflow_torch.bench.table import format_bench
 from cflow_torch.cli.run import finish, make_model, open_logs, write_text
 from cflow_torch.data.log import window
 
