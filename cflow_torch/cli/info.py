@@ -8,12 +8,13 @@ from importlib import metadata
 
 import torch
 
-PACKAGES = ("cflow_torch", "torch", "numpy", "pyarrow", "kornia", "hydra-core", "matplotlib", "opencv-python-headless")
+PACKAGES = ("cflow_torch", "numpy", "pyarrow", "kornia", "hydra-core", "matplotlib", "opencv-python-headless")
 
 
 def task() -> None:
     """Run `cflow info`."""
     print(f"python {platform.python_version()}, {platform.platform()}, {os.cpu_count()} cores")
+    print(f"torch {torch.__version__}")  # its metadata leaves out the build
     for package in PACKAGES:
         try:
             print(f"{package} {metadata.version(package)}")
