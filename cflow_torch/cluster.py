@@ -12,7 +12,7 @@ from cflow_torch.config import Config
 from cflow_torch.ops.indices import flat_nonzero
 from cflow_torch.ops.labeling import connected_components, connected_components_kornia
 from cflow_torch.ops.morphology import dilate_3x3, dilate_3x3_kornia, erode_3x3, erode_3x3_kornia
-from cflow_torch.ops.segments import bounding_boxes
+from cflow_torch.ops.segments import bounding_boxes, first_of_segment
 
 
 @dataclass(frozen=True)
@@ -166,9 +166,7 @@ def _split_oversized(image: Tensor, pixels: Tensor, component: Tensor, pixel_siz
         closed_pixels = flat_nonzero(closed)
         part = connected_components(closed, closed_pixels, config.connectivity, reach=1)
         part = part.index_select(0, torch.searchsorted(closed_pixels, pixels[oversized]))
-        earliest = pixels.new_full((closed_pixels.numel(),), oversized.numel())
-        positions = torch.arange(oversized.numel(), device=pixels.device)
-        part = earliest.scatter_reduce_(0, part, positions, "amin")[part]
+        part = first_of_segment(part, closed_pixels.numel())
     component = component.clone()
     component[oversized] = oversized[part]
     return component

@@ -192,8 +192,8 @@ def _best_of_each_job(job: Tensor, dy: Tensor, dx: Tensor, count: Tensor, energy
     value = value * value / energy
     best_value = value.new_zeros(num_jobs).scatter_reduce_(0, job, value, "amax")
     tied = flat_nonzero(value == best_value[job])
-    # One number that orders shifts: length, then dy, then dx. Shifts are shorter than 2^14 pixels.
-    span = 1 << 15
+    # One number that orders shifts: length, then dy, then dx. It fits: images have at most 2^15 pixels a side.
+    span = 1 << 16
     order = ((dy * dy + dx * dx) * span + dy + span // 2) * span + dx + span // 2
     order = order[tied]
     first = segment_amin(order, job[tied], num_jobs, torch.iinfo(torch.int64).max)

@@ -115,6 +115,11 @@ def elapsed_times(
 
 
 def check_distance(T_ego1_ego: np.ndarray, name: str) -> None:
+    """Refuse a sweep whose ego vehicle is implausibly far from that at t+1.
+
+    Raises:
+        CFlowError: further than `_FARTHEST_POSE`.
+    """
     distance = float(np.linalg.norm(T_ego1_ego[:3, 3]))
     if distance > _FARTHEST_POSE:
         raise CFlowError(
@@ -131,6 +136,11 @@ def _numpy(array: Any) -> np.ndarray:
 
 
 def choose_device(windows: Sequence[Window], device: Any) -> torch.device:
+    """The device asked for; for "auto" that of the tensors given, else a GPU if there is one, else the CPU.
+
+    Raises:
+        CFlowError: a device that cannot be used, or tensors on several devices.
+    """
     if not (isinstance(device, str) and device == "auto"):
         try:
             torch.empty(0, device=device)
@@ -162,6 +172,11 @@ def read_positions(sweep: Sweep, device: torch.device) -> Tensor:
 
 
 def read_ground(sweep: Sweep, name: str, num_points: int, device: torch.device) -> Tensor:
+    """(N,) bool ground mask, True = ground; the sweep must have one.
+
+    Raises:
+        CFlowError: no bool array or tensor of one entry per point.
+    """
     mask = sweep.is_ground
     if not isinstance(mask, (np.ndarray, Tensor)):
         raise CFlowError(f"ground mask of {name} is {type(mask).__name__}: give a bool array or tensor of shape (N,)")

@@ -147,3 +147,9 @@ def test_projection_draws_every_point_that_takes_part():
 def test_a_grid_that_nobody_can_hold_is_refused():
     with pytest.raises(CFlowError, match="point_cloud_range.*pixel_sizes"):
         Grid(1e-4, (-35.0, -35.0, -INF), (35.0, 35.0, INF))
+
+
+def test_an_image_side_is_bounded():
+    # 40,000 x 11 pixels are few, but shifts that long have no place in the order of ties.
+    with pytest.raises(CFlowError, match="32768 a side"):
+        Grid(0.1, (0.0, 0.0, -INF), (4000.0, 1.0, INF))

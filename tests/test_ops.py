@@ -13,7 +13,7 @@ from scipy.sparse import coo_matrix, csgraph
 from cflow_torch.ops import morphology
 from cflow_torch.ops.cross_correlation import cross_correlate, fft_length
 from cflow_torch.ops.labeling import connected_components, connected_components_kornia, union_find
-from cflow_torch.ops.segments import bounding_boxes, masked_median, segment_amax, segment_amin
+from cflow_torch.ops.segments import bounding_boxes, first_of_segment, masked_median, segment_amin
 from cflow_torch.types import CFlowError
 
 SQUARE = np.ones((3, 3), dtype=bool)
@@ -208,7 +208,8 @@ def test_segment_reductions():
     index = torch.tensor([2, 0, 2, 4, 0])
     values = torch.tensor([5, 3, -7, 1, 9])
     assert segment_amin(values, index, 6, 99).tolist() == [3, 99, -7, 99, 1, 99]
-    assert segment_amax(values, index, 6, -99).tolist() == [9, -99, 5, -99, 1, -99]
+    assert [index[i] for i in first_of_segment(index, 6)] == index.tolist()
+    assert first_of_segment(torch.tensor([3, 1, 3, 1, 0]), 4).tolist() == [0, 1, 0, 1, 4]
 
 
 def test_bounding_boxes():

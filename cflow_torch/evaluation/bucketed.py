@@ -7,11 +7,10 @@ from typing import Any, Dict, Union
 
 import numpy as np
 
+from cflow_torch.evaluation.accumulator import Accumulator
 from cflow_torch.evaluation.categories import META_NAMES, meta_class
-from cflow_torch.evaluation.definitions import Definition, get_definition
-from cflow_torch.evaluation.frame import EvalFrame
-from cflow_torch.evaluation.masks import ScoredPoints, score_points
-from cflow_torch.types import CFlowError
+from cflow_torch.evaluation.definitions import Definition
+from cflow_torch.evaluation.masks import ScoredPoints
 
 
 def mean_of_present(values: np.ndarray) -> float:
@@ -21,7 +20,7 @@ def mean_of_present(values: np.ndarray) -> float:
         return float(np.nanmean(values)) if values.size else float("nan")
 
 
-class BucketedEPE:
+class BucketedEPE(Accumulator):
     """Streaming dynamic bucket-normalised EPE.
 
     With e and v the mean end-point error and mean true speed of all points of a class in a bucket, over all frames:
@@ -37,16 +36,14 @@ class BucketedEPE:
     Cost: a few arrays of the size of one frame per update; memory (classes x buckets).
     """
 
+    totals = ("count", "error_sum", "speed_sum")
+
     def __init__(self, definition: Union[str, Definition] = "opensceneflow") -> None:
-        self.definition = get_definition(definition)
+        super().__init__(definition)
         shape = (len(META_NAMES), len(self.definition.speed_edges) - 1)
         self.count = np.zeros(shape, dtype=np.int64)
         self.error_sum = np.zeros(shape, dtype=np.float64)
         self.speed_sum = np.zeros(shape, dtype=np.float64)
-
-    def update(self, frame: EvalFrame) -> None:
-        """Add one frame."""
-        self.update_points(score_points(frame, self.definition))
 
     def update_points(self, scored: ScoredPoints) -> None:
         """Add the scored points of one frame."""
@@ -61,18 +58,6 @@ class BucketedEPE:
         self.count += np.bincount(cell, minlength=size).reshape(shape)
         self.error_sum += np.bincount(cell, scored.error[keep], minlength=size).reshape(shape)
         self.speed_sum += np.bincount(cell, scored.speed[keep], minlength=size).reshape(shape)
-
-    def merge(self, other: BucketedEPE) -> None:
-        """Add what another accumulator of the same definition has seen.
-
-        Raises:
-            CFlowError: the definitions differ.
-        """
-        if other.definition != self.definition:
-            raise CFlowError(f"cannot merge scores of {other.definition.name} into {self.definition.name}")
-        self.count += other.count
-        self.error_sum += other.error_sum
-        self.speed_sum += other.speed_sum
 
     def compute(self) -> Dict[str, Any]:
         """Scores so far.

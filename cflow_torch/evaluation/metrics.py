@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any, Dict, Union
+from typing import Any, Callable, Dict, Union
 
+from cflow_torch.evaluation.accumulator import Accumulator
 from cflow_torch.evaluation.bucketed import BucketedEPE
 from cflow_torch.evaluation.definitions import Definition, get_definition
 from cflow_torch.evaluation.frame import EvalFrame
@@ -12,7 +13,11 @@ from cflow_torch.evaluation.rangewise import RangeWiseEPE
 from cflow_torch.evaluation.threeway import ThreeWayEPE
 from cflow_torch.types import CFlowError
 
-_ACCUMULATORS = {"bucketed": BucketedEPE, "three_way": ThreeWayEPE, "range_wise": RangeWiseEPE}
+_ACCUMULATORS: Dict[str, Callable[..., Accumulator]] = {
+    "bucketed": BucketedEPE,
+    "three_way": ThreeWayEPE,
+    "range_wise": RangeWiseEPE,
+}
 
 
 class SceneFlowMetrics:

@@ -6,14 +6,13 @@ from typing import Any, Dict, Union
 
 import numpy as np
 
+from cflow_torch.evaluation.accumulator import Accumulator
 from cflow_torch.evaluation.bucketed import mean_of_present
-from cflow_torch.evaluation.definitions import Definition, get_definition
-from cflow_torch.evaluation.frame import EvalFrame
-from cflow_torch.evaluation.masks import ScoredPoints, score_points
-from cflow_torch.types import CFlowError
+from cflow_torch.evaluation.definitions import Definition
+from cflow_torch.evaluation.masks import ScoredPoints
 
 
-class RangeWiseEPE:
+class RangeWiseEPE(Accumulator):
     """Streaming range-wise EPE; the definition's region does not apply, every category counts.
 
     Args:
@@ -23,15 +22,13 @@ class RangeWiseEPE:
     of all frames; "mean" weighs every range that has points the same.
     """
 
+    totals = ("count", "error_sum")
+
     def __init__(self, definition: Union[str, Definition] = "opensceneflow") -> None:
-        self.definition = get_definition(definition)
+        super().__init__(definition)
         shape = (len(self.definition.range_edges) - 1, 2)  # range, static / dynamic
         self.count = np.zeros(shape, dtype=np.int64)
         self.error_sum = np.zeros(shape, dtype=np.float64)
-
-    def update(self, frame: EvalFrame) -> None:
-        """Add one frame."""
-        self.update_points(score_points(frame, self.definition))
 
     def update_points(self, scored: ScoredPoints) -> None:
         """Add the scored points of one frame."""
@@ -42,17 +39,6 @@ class RangeWiseEPE:
         cell = (2 * number + dynamic)[keep]
         self.count += np.bincount(cell, minlength=self.count.size).reshape(self.count.shape)
         self.error_sum += np.bincount(cell, scored.error[keep], minlength=self.count.size).reshape(self.count.shape)
-
-    def merge(self, other: RangeWiseEPE) -> None:
-        """Add what another accumulator of the same definition has seen.
-
-        Raises:
-            CFlowError: the definitions differ.
-        """
-        if other.definition != self.definition:
-            raise CFlowError(f"cannot merge scores of {other.definition.name} into {self.definition.name}")
-        self.count += other.count
-        self.error_sum += other.error_sum
 
     def compute(self) -> Dict[str, Any]:
         """Per range ("0-35", ...) `static_epe`, `dynamic_epe` in metres, `num_static`, `num_dynamic`; and "mean"."""

@@ -6,11 +6,10 @@ from typing import Any, Dict, List, Union
 
 import numpy as np
 
+from cflow_torch.evaluation.accumulator import Accumulator
 from cflow_torch.evaluation.categories import META_NAMES, meta_class
-from cflow_torch.evaluation.definitions import Definition, get_definition
-from cflow_torch.evaluation.frame import EvalFrame
-from cflow_torch.evaluation.masks import ScoredPoints, score_points
-from cflow_torch.types import CFlowError
+from cflow_torch.evaluation.definitions import Definition
+from cflow_torch.evaluation.masks import ScoredPoints
 
 CLASSES = ("background", "foreground")
 MOTIONS = ("static", "dynamic")
@@ -48,7 +47,7 @@ def point_quantities(predicted: np.ndarray, true: np.ndarray, sweep_interval: fl
     return np.stack([error, strict.astype(np.float64), relax.astype(np.float64), angle])
 
 
-class ThreeWayEPE:
+class ThreeWayEPE(Accumulator):
     """Streaming three-way EPE: foreground dynamic, foreground static, background static, and their mean.
 
     Args:
@@ -60,17 +59,15 @@ class ThreeWayEPE:
     breakdown is over points in both cases.
     """
 
+    totals = ("count", "sums", "segmentation", "num_frames", "frame_sums")
+
     def __init__(self, definition: Union[str, Definition] = "opensceneflow") -> None:
-        self.definition = get_definition(definition)
+        super().__init__(definition)
         self.count = np.zeros((2, 2, 2), dtype=np.int64)  # class, motion, distance
         self.sums = np.zeros((len(QUANTITIES), 2, 2, 2), dtype=np.float64)
         self.segmentation = np.zeros(3, dtype=np.int64)  # true positives, false positives, false negatives
         self.num_frames = 0
         self.frame_sums = np.zeros(len(_SETS) + 1, dtype=np.float64)  # per-frame values of the sets and the IoU
-
-    def update(self, frame: EvalFrame) -> None:
-        """Add one frame."""
-        self.update_points(score_points(frame, self.definition))
 
     def update_points(self, scored: ScoredPoints) -> None:
         """Add the scored points of one frame."""
@@ -94,20 +91,6 @@ class ThreeWayEPE:
         self.num_frames += 1
         means = [sums[0][place].sum() / (count[place].sum() + FRAME_COUNT_EPS) for place in _SETS.values()]
         self.frame_sums += np.array([*means, segmentation[0] / (segmentation.sum() + FRAME_IOU_EPS)])
-
-    def merge(self, other: ThreeWayEPE) -> None:
-        """Add what another accumulator of the same definition has seen.
-
-        Raises:
-            CFlowError: the definitions differ.
-        """
-        if other.definition != self.definition:
-            raise CFlowError(f"cannot merge scores of {other.definition.name} into {self.definition.name}")
-        self.count += other.count
-        self.sums += other.sums
-        self.segmentation += other.segmentation
-        self.num_frames += other.num_frames
-        self.frame_sums += other.frame_sums
 
     def compute(self) -> Dict[str, Any]:
         """Scores so far.

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from cflow_torch.ops.indices import flat_nonzero
+from cflow_torch.ops.segments import first_of_segment
 from cflow_torch.types import CFlowError
 
 # Half of the eight neighbours of a block; the other half is the same links seen from the other side.
@@ -71,9 +72,7 @@ def connected_components(occupancy: Tensor, pixels: Tensor, connectivity: int = 
     root = union_find(nodes.numel(), edges // len(_NEIGHBOURS), targets)
 
     component = root.index_select(0, node_of_block.index_select(0, block))
-    position = torch.arange(pixels.numel(), device=pixels.device)
-    first = torch.full_like(root, pixels.numel()).scatter_reduce_(0, component, position, "amin")
-    return first.index_select(0, component)
+    return first_of_segment(component, nodes.numel())
 
 
 def union_find(num_nodes: int, sources: Tensor, targets: Tensor) -> Tensor:
@@ -137,10 +136,7 @@ def connected_components_kornia(occupancy: Tensor, pixels: Tensor, connectivity:
     labels = connected_components_union_find(image[:, None])[:, 0]
     if connectivity == 4:
         labels = labels[:, ::2, ::2]
-    label = labels.reshape(-1)[pixels]
-    position = torch.arange(pixels.numel(), device=pixels.device)
-    first = label.new_full((image.numel() + 1,), pixels.numel()).scatter_reduce_(0, label, position, "amin")
-    return first[label]
+    return first_of_segment(labels.reshape(-1)[pixels], image.numel() + 1)
 
 
 @lru_cache(maxsize=None)

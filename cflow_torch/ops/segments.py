@@ -23,9 +23,18 @@ def segment_amin(values: Tensor, index: Tensor, num_segments: int, empty: int) -
     return values.new_full((num_segments,), empty).scatter_reduce_(0, index, values, "amin")
 
 
-def segment_amax(values: Tensor, index: Tensor, num_segments: int, empty: int) -> Tensor:
-    """Largest value of each segment; the counterpart of `segment_amin`."""
-    return values.new_full((num_segments,), empty).scatter_reduce_(0, index, values, "amax")
+def first_of_segment(index: Tensor, num_segments: int) -> Tensor:
+    """For each element the position of the first element of the same segment.
+
+    Args:
+        index: (N,) int64, segment of each element, 0 ... num_segments - 1.
+        num_segments: S.
+
+    Returns:
+        (N,) int64.
+    """
+    position = torch.arange(index.numel(), device=index.device)
+    return segment_amin(position, index, num_segments, index.numel()).index_select(0, index)
 
 
 def bounding_boxes(rows: Tensor, cols: Tensor, index: Tensor, num_segments: int) -> Tuple[Tensor, Tensor]:
