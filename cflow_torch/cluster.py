@@ -79,8 +79,7 @@ def cluster(occupancy: Tensor, pixel_size: float, config: Config) -> Tuple[Clust
     window = pixels // (height * width)
     raster = pixels - window * (height * width)
     row_of_pixel = raster // width
-    component = _label_dilated(aggregated, pixels, config)
-    component = _split_oversized(aggregated, pixels, component, pixel_size, config)
+    component = label_components(aggregated, pixels, pixel_size, config)
 
     # Which sweeps saw each pixel. Components are named by their first pixel.
     sweeps = torch.arange(num_steps, device=pixels.device)[:, None]
@@ -97,6 +96,22 @@ def cluster(occupancy: Tensor, pixel_size: float, config: Config) -> Tuple[Clust
     of_pixel.scatter_(0, pixel_of_sweep.flatten(), number.index_select(0, component).int().repeat(num_steps))
     of_pixel[-1] = clusters.window.numel()
     return clusters, of_pixel
+
+
+def label_components(image: Tensor, pixels: Tensor, pixel_size: float, config: Config) -> Tensor:
+    """Components of a dilated image, the oversized ones eroded and labelled again (Alg. clustering).
+
+    Args:
+        image: (B, H, W) bool.
+        pixels: (P,) int64, flat indices of its set pixels, ascending.
+        pixel_size: s, metres.
+        config: `connectivity`, `max_extent` (d^max), `labeling`.
+
+    Returns:
+        (P,) int64: the position in `pixels` of the first (in raster order) pixel of the same component.
+    """
+    component = _label_dilated(image, pixels, config)
+    return _split_oversized(image, pixels, component, pixel_size, config)
 
 
 def keep_live(

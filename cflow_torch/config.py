@@ -12,7 +12,10 @@ METHODS = ("dense", "keypoints")
 CLUSTERINGS = ("components", "hdbscan")
 LABELINGS = ("sparse", "kornia")
 CORRELATIONS = ("fft", "conv")
-DENSIFIERS = ("components", "nearest")
+DENSIFIERS = ("components", "clusters", "nearest")
+# The ratio test compares products of counts: 51^6 * (2 * 10^4)^2 still fits an int64.
+LARGEST_PATCH = 51
+LARGEST_RATIO = 2
 
 
 @dataclass(frozen=True)
@@ -36,10 +39,15 @@ class Config:
         min_cluster_size: hdbscan: smallest cluster, points of all sweeps together.
         labeling: engine of morphology and labelling, "sparse" (occupied pixels only) or "kornia" (dense image).
         correlation: engine of the correlation, "fft" or "conv". Engines give the same bits.
-        densify: key points: "components" or "nearest".
-        patch_size: key points: side L of a descriptor, odd number of pixels.
-        ratio_threshold: key points: rho > 1 of the ratio test.
-        gate_radius: key points: farthest match, metres.
+        densify: key points: where a point takes its flow from: "components" (median of the matches in its connected
+            component of I_t), "clusters" (the same, components of Alg. clustering: dilated, split at `max_extent`) or
+            "nearest" (nearest match).
+        patch_size: key points: side L of a descriptor, odd number of pixels, at most 51.
+        ratio_threshold: key points: rho of the ratio test, 1 ... 2, used to four decimals.
+        gate_radius: key points: farthest match, metres per 0.1 s between the sweeps (3 = 30 m/s).
+        mutual_check: key points: also ask that a match is the best one seen from t+1.
+        second_best_distance: key points: pixels; the second best of the ratio test lies at least this far from the
+            best. 0 = the paper's, any other key point.
         max_memory: bytes of working memory that the method may plan with; None = no limit.
     """
 
@@ -61,6 +69,8 @@ class Config:
     patch_size: int = 11
     ratio_threshold: float = 1.1
     gate_radius: float = 3.0
+    mutual_check: bool = False
+    second_best_distance: float = 0.0
     max_memory: Optional[int] = None
 
     def __post_init__(self) -> None:
@@ -87,8 +97,10 @@ class Config:
             raise CFlowError(f"point_cloud_range={box}: x and y bounds must be finite; only z may be infinite")
         for name in ("num_history", "patch_size", "min_cluster_size"):
             _whole_number(name, getattr(self, name))
-        if self.patch_size % 2 == 0:
-            raise CFlowError(f"patch_size={self.patch_size}: give an odd number of pixels, for example 11")
+        if self.patch_size % 2 == 0 or self.patch_size > LARGEST_PATCH:
+            raise CFlowError(
+                f"patch_size={self.patch_size}: give an odd number of pixels of at most {LARGEST_PATCH}, for example 11"
+            )
         for name in ("max_extent", "sweep_interval", "gate_radius"):
             _positive(name, getattr(self, name))
         if self.max_speed is not None:
@@ -98,10 +110,19 @@ class Config:
         if self.min_cluster_size < 2:
             raise CFlowError(f"min_cluster_size={self.min_cluster_size}: give a whole number of at least 2")
         _positive("ratio_threshold", self.ratio_threshold)
-        if self.ratio_threshold < 1:
-            raise CFlowError(f"ratio_threshold={self.ratio_threshold}: give a number of at least 1, for example 1.1")
-        for name in ("sectional_view", "use_timestamps"):
+        if not 1 <= self.ratio_threshold <= LARGEST_RATIO:
+            raise CFlowError(
+                f"ratio_threshold={self.ratio_threshold}: give a number from 1 to {LARGEST_RATIO}, for example 1.1"
+            )
+        if self.second_best_distance != 0:
+            _positive("second_best_distance", self.second_best_distance)
+        for name in ("sectional_view", "use_timestamps", "mutual_check"):
             _one_of(name, getattr(self, name), (True, False))
+        if self.method == "keypoints" and self.num_history > 0:
+            raise CFlowError(
+                f"method='keypoints' matches one pair of sweeps, num_history={self.num_history} was given: "
+                "give num_history=0, or method='dense'"
+            )
 
     def replace(self, **overrides: Any) -> Config:
         """A copy with some fields changed; an unknown field raises `CFlowError` that lists the fields."""
@@ -123,6 +144,15 @@ PRESETS: Dict[str, Dict[str, Any]] = {
     },
     # Two older sweeps and one scale: most of the gain of history at about a third of the time.
     "fast": {"num_history": 2, "point_cloud_range": (-51.2, -51.2, -math.inf, 51.2, 51.2, math.inf)},
+    # Best mean of scripts/keypoint_settings.py on its synthetic set; region of the main harness.
+    "keypoints": {
+        "method": "keypoints",
+        "densify": "clusters",
+        "patch_size": 31,
+        "ratio_threshold": 1.02,
+        "gate_radius": 2.0,
+        "point_cloud_range": (-51.2, -51.2, -math.inf, 51.2, 51.2, math.inf),
+    },
 }
 
 
@@ -130,7 +160,8 @@ def make_config(preset: str = "default", **overrides: Any) -> Config:
     """The settings of a preset with some fields replaced.
 
     Args:
-        preset: "default", "fast" or "paper".
+        preset: "default", "fast", "keypoints" or "paper". With `method="keypoints"` every preset but "paper" means
+            "keypoints".
         **overrides: any field of `Config`; `pixel_size=0.1` is short for `pixel_sizes=(0.1,)`.
 
     Returns:
@@ -140,6 +171,8 @@ def make_config(preset: str = "default", **overrides: Any) -> Config:
         CFlowError: unknown preset, unknown field (the message lists the fields), invalid value.
     """
     _one_of("preset", preset, tuple(PRESETS))
+    if overrides.get("method") == "keypoints" and preset != "paper":  # history and scales are for the dense method
+        preset = "keypoints"
     return Config(**PRESETS[preset]).replace(**overrides)
 
 

@@ -6,8 +6,10 @@ from typing import Any, Optional, Sequence
 
 import numpy as np
 
-from cflow_torch.config import make_config
+from cflow_torch.config import Config, make_config
 from cflow_torch.dense import CorrelationFlow
+from cflow_torch.keypoints import CorrelationFlowKeypoints
+from cflow_torch.pyramid import CoarseToFine
 from cflow_torch.types import Array, CFlowError, FlowResult, Sweep, Window
 
 
@@ -39,7 +41,7 @@ def estimate_flow(
         T_ego1_egoh: (4, 4) of each of `pch`; may be left out only if `T_ego1_ego0` is left out too.
         gmh: ground mask of each of `pch`; empty = nothing is ground.
         method: "dense" or "keypoints".
-        preset: "default", "fast" or "paper".
+        preset: "default", "fast", "keypoints" or "paper", see `make_config`.
         ground: None = as the masks say; "auto" = find the ground.
         device: "auto" = that of the tensors given, else a GPU if there is one, else the CPU.
         **overrides: any field of `Config`, for example `pixel_sizes=(0.4, 0.2, 0.1)`.
@@ -60,7 +62,7 @@ def estimate_flow(
         >>> result.residual_flow[0]  # metres until the next sweep
         tensor([0.5000, 0.0000, 0.0000])
 
-    Source: Alg. general_correlation_flow.
+    Source: Alg. general_correlation_flow; Sec. CorrelationFlow-Keypoints.
     """
     if ground is not None:
         raise CFlowError(f"ground={ground!r}: finding the ground is not built yet; pass gm0 and gm1")
@@ -84,8 +86,21 @@ def estimate_flow(
         pc1=sweep(pc1, gm1, None),
         pch=tuple(sweep(*parts) for parts in zip(pch, masks, transforms)),
     )
-    (result,) = CorrelationFlow(config, device)([window])
+    (result,) = make_model(config, device)([window])
     return result
+
+
+def make_model(config: Config, device: Any = "auto") -> CoarseToFine:
+    """The variant that `config.method` names.
+
+    Args:
+        config: settings.
+        device: as in `estimate_flow`.
+
+    Returns:
+        `CorrelationFlow` or `CorrelationFlowKeypoints`.
+    """
+    return (CorrelationFlowKeypoints if config.method == "keypoints" else CorrelationFlow)(config, device)
 
 
 def _per_sweep(name: str, values: Sequence[Any], pch: Sequence[Array]) -> Sequence[Any]:

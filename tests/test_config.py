@@ -8,7 +8,7 @@ from dataclasses import FrozenInstanceError, fields
 
 import pytest
 
-from cflow_torch import CFlowError, Config, CorrelationFlow, make_config
+from cflow_torch import CFlowError, Config, CorrelationFlow, CorrelationFlowKeypoints, make_config, make_model
 from cflow_torch.config import PRESETS
 
 INF = math.inf
@@ -111,8 +111,10 @@ def test_the_paper_s_base_row():
 
 def test_every_preset_is_valid():
     for name in PRESETS:
-        assert make_config(name, num_history=2).num_history == 2
-        assert CorrelationFlow.from_preset(name).config == make_config(name)
+        assert make_config(name, max_speed=2.0).max_speed == 2.0
+        assert make_model(make_config(name)).config == make_config(name)
+    assert CorrelationFlow.from_preset("fast").config == make_config("fast")
+    assert CorrelationFlowKeypoints.from_preset().config == make_config("keypoints")
 
 
 def test_config_cannot_be_changed_and_replace_makes_a_copy():
@@ -137,6 +139,9 @@ def test_whole_numbers_become_floats():
     assert config.point_cloud_range == (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
 
 
-def test_what_is_not_built_yet_says_so():
-    with pytest.raises(CFlowError, match="keypoints.*not built yet"):
+def test_a_class_refuses_the_other_method():
+    with pytest.raises(CFlowError, match="keypoints.*make_model"):
         CorrelationFlow.from_preset("paper", method="keypoints")
+    with pytest.raises(CFlowError, match="dense.*make_model"):
+        CorrelationFlowKeypoints(Config())
+    assert type(make_model(make_config("paper", method="keypoints"))) is CorrelationFlowKeypoints

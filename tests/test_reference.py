@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from fractions import Fraction
 
 import cv2
 import numpy as np
@@ -14,7 +15,7 @@ from scipy.sparse.csgraph import connected_components as graph_components
 
 from cflow_torch import reference as ref
 from cflow_torch.config import Config
-from cflow_torch.types import CFlowError, Sweep, Window
+from cflow_torch.types import Sweep, Window
 
 INF = math.inf
 # (row, column) pixels of an L, 6 high and 5 wide.
@@ -113,11 +114,6 @@ def test_empty_sweeps(empty):
     assert result.residual_flow.shape == result.flow.shape == result.pose_flow.shape == (n, 3)
     assert result.cluster_id.shape == result.score.shape == result.is_valid.shape == (n,)
     assert (result.cluster_id == -1).all() and (result.flow == 0).all() and (result.score == 0).all()
-
-
-def test_what_the_reference_does_not_have():
-    with pytest.raises(CFlowError, match="the reference does not have it yet"):
-        ref.reference_flow(Window(sweep(ELL), sweep(ELL)), config(method="keypoints"))
 
 
 # ----------------------------------------------------------------------------------------- points and pixels
@@ -508,6 +504,334 @@ def test_older_sweeps_are_warped_by_their_steps():
     result = ref.reference_flow(window, config(num_history=1, **TWO_SCALES))
     assert result.residual_flow.tolist() == [[7.0, 0.0, 0.0]] * 6
     assert result.score.tolist() == [1.0] * 6
+
+
+# ------------------------------------------------------------------------------------------------ key points
+
+
+def keypoint_config(**overrides) -> Config:
+    return config(method="keypoints", **overrides)
+
+
+def matches_of(pixels, pixels1, reach=100.0, shape=(12, 12), **overrides):
+    """((row, column), (dx, dy), score) of every accepted match."""
+    settings = keypoint_config(**overrides)
+    found = ref.match_keypoints(image_of(pixels, shape), image_of(pixels1, shape), reach, settings)
+    return [((m.row, m.column), (m.dx, m.dy), m.score) for m in found]
+
+
+def block(rows, columns):
+    return [(r, c) for r in rows for c in columns]
+
+
+@pytest.mark.parametrize(
+    "pixels, inner",
+    [
+        ([(4, 6)], []),
+        ([(2, c) for c in range(12)], []),  # a line
+        (block(range(3, 8), range(2, 7)), block(range(4, 7), range(3, 6))),  # a square: its ring
+        (block(range(3), range(3)), [(1, 1)]),  # in the corner: outside the image is background
+        (block(range(12), range(12)), block(range(1, 11), range(1, 11))),
+        ([(4, 5), (5, 4), (5, 5), (5, 6), (6, 5)], [(5, 5)]),  # a free diagonal neighbour does not matter
+        ([], []),
+    ],
+)
+def test_keypoints_are_the_boundary(pixels, inner):
+    found = ref.detect_keypoints(image_of(pixels, (12, 12)))
+    assert found.shape == (len(pixels) - len(inner), 2)
+    assert [tuple(p) for p in found.tolist()] == sorted(set(pixels) - set(inner))
+
+
+def test_keypoints_are_at_distance_1_of_the_distance_transform():
+    kept = 0
+    for image in random_images(20):
+        for filled in (image, ref.dilate(image)):
+            distance = ndimage.distance_transform_edt(np.pad(filled, 1))[1:-1, 1:-1]
+            np.testing.assert_array_equal(ref.detect_keypoints(filled), np.argwhere(distance == 1))
+            kept += np.count_nonzero(distance > 1)
+    assert kept > 1000  # there is something to leave out
+
+
+def test_descriptor_is_the_patch_with_zeros_outside():
+    image = image_of(block(range(3), range(3)) + [(3, 4)], (4, 5))
+    first, last = ref.describe(image, np.array([[0, 0], [3, 4]]), 3).reshape(2, 3, 3).astype(int).tolist()
+    assert first == [[0, 0, 0], [0, 1, 1], [0, 1, 1]]  # (1, 1) is no key point, but occupied
+    assert last == [[0, 0, 0], [0, 1, 0], [0, 0, 0]]
+    wide = ref.describe(image, np.array([[1, 0]]), 5).reshape(5, 5).astype(int).tolist()
+    assert wide == [[0, 0, 0, 0, 0], [0, 0, 1, 1, 1], [0, 0, 1, 1, 1], [0, 0, 1, 1, 1], [0, 0, 0, 0, 0]]
+
+
+PAIR, PAIR_MOVED = [(2, 2), (2, 3)], [(2, 4), (2, 5)]
+
+
+def test_a_match_by_hand():
+    # A descriptor of 3 x 3 sees its pixel and the other: right and left agree on c = 2 of E = 2; crosswise c = 1.
+    assert matches_of(PAIR, PAIR_MOVED, patch_size=3) == [((2, 2), (2, 0), 1.0), ((2, 3), (2, 0), 1.0)]
+    # R of the best is twice that of the second best: rho = 2 asks for more.
+    assert matches_of(PAIR, PAIR_MOVED, patch_size=3, ratio_threshold=2.0) == []
+    assert len(matches_of(PAIR, PAIR_MOVED, patch_size=3, ratio_threshold=1.9999)) == 2
+    # E = 4 and E = 2, c = 2: the upper row alone keeps two of the four.
+    square = block((2, 3), (2, 3))
+    found = matches_of(square[:2], [(r + 1, c) for r, c in square], patch_size=3)
+    assert found == []  # the upper and the lower row of the square correlate alike
+    found = matches_of(square[:2], [(r + 1, c) for r, c in square], patch_size=3, second_best_distance=1.5)
+    assert found == [((2, 2), (0, 1), 2 / math.sqrt(8)), ((2, 3), (0, 1), 2 / math.sqrt(8))]
+
+
+def test_a_match_lies_within_the_gate():
+    exact = matches_of(PAIR, PAIR_MOVED, patch_size=3, reach=2.0)
+    assert exact == [((2, 2), (2, 0), 1.0), ((2, 3), (2, 0), 1.0)]
+    # Just below 2: only (2, 3) sees one, and accepts it, as it has no second best.
+    assert matches_of(PAIR, PAIR_MOVED, patch_size=3, reach=1.999) == [((2, 3), (1, 0), 0.5)]
+    assert matches_of([(1, 1)], [(5, 4)], reach=5.0) == [((1, 1), (3, 4), 1.0)]
+    assert matches_of([(1, 1)], [(5, 5)], reach=5.0) == []
+    assert matches_of([(0, 11)], [(11, 0)], reach=INF) == [((0, 11), (-11, 11), 1.0)]
+
+
+def test_the_energy_of_the_candidate_counts():
+    # One pixel, two candidates with E = 2 near by and one with E = 1 farther off: c = 1 in all.
+    assert matches_of([(5, 5)], [(5, 6), (5, 7), (5, 1)], patch_size=3) == [((5, 5), (-4, 0), 1.0)]
+    assert matches_of([(5, 5)], [(5, 6), (5, 7)], patch_size=3) == []
+
+
+@pytest.mark.parametrize(
+    "targets, displacement",
+    [
+        ([(5, 4), (5, 6), (4, 5), (6, 5)], (0, -1)),  # equal norm: the smallest row displacement
+        ([(5, 4), (5, 6)], (-1, 0)),  # equal norm and row: the smallest column displacement
+        ([(3, 5), (5, 6)], (1, 0)),  # the smallest norm comes first
+        ([(9, 2), (9, 8), (8, 9), (8, 1)], (-4, 3)),
+        ([(5, 5), (5, 4)], (0, 0)),
+    ],
+)
+def test_ties_of_matches(targets, displacement):
+    # Descriptors of one pixel are all equal; far away there is no second best.
+    assert matches_of([(5, 5)], targets, patch_size=1, second_best_distance=50.0) == [((5, 5), displacement, 1.0)]
+    for ratio in (1.0, 1.1):
+        assert matches_of([(5, 5)], targets, patch_size=1, ratio_threshold=ratio) == []
+
+
+def test_the_second_best_is_away_from_the_best():
+    for distance, accepted in [(0.0, 0), (2.0, 0), (2.0001, 1)]:  # the two are 2 pixels apart
+        found = matches_of([(5, 5)], [(5, 4), (5, 6)], patch_size=1, second_best_distance=distance)
+        assert len(found) == accepted
+
+
+@pytest.mark.parametrize(
+    "counts, ratio, accepted",
+    [
+        ((11, 20, 10, 20), 1.1, False),  # 11 = 1.1 x 10 exactly
+        ((11, 20, 10, 20), 1.0999, True),
+        ((11, 25, 12, 36), 1.1, False),  # 11 / 5 = 1.1 x 12 / 6
+        ((11, 25, 12, 36), 1.10004, False),  # four decimals
+        ((11, 25, 12, 36), 1.09996, False),
+        ((11, 25, 12, 36), 1.09994, True),
+        ((5, 9, 4, 9), 1.25, False),
+        ((5, 9, 5, 9), 1.0, False),
+        ((2601, 2601, 2600, 2601), 1.0, True),
+        ((2601, 2601, 2600, 2600), 1.0, True),
+        ((2600, 2600, 2601, 2601), 1.0, False),
+        ((1, 1, 1, 4), 2.0, False),
+        ((1, 1, 1, 5), 2.0, True),
+    ],
+)
+def test_ratio_test_is_strict_and_exact(counts, ratio, accepted):
+    assert ref.passes_ratio_test(*counts, ratio) is accepted
+
+
+def test_mutual_check():
+    # Both of t take the only one of t+1; it takes the nearest.
+    assert len(matches_of([(5, 4), (5, 7)], [(5, 5)], patch_size=1)) == 2
+    assert matches_of([(5, 4), (5, 7)], [(5, 5)], patch_size=1, mutual_check=True) == [((5, 4), (1, 0), 1.0)]
+    # Equally near: the smallest dx of t -> t+1.
+    assert matches_of([(5, 4), (5, 6)], [(5, 5)], patch_size=1, mutual_check=True) == [((5, 6), (-1, 0), 1.0)]
+    assert matches_of([(4, 5), (6, 5)], [(5, 5)], patch_size=1, mutual_check=True) == [((6, 5), (0, -1), 1.0)]
+    # A better descriptor farther away, where E of t counts.
+    alone = matches_of([(5, 3), (5, 4), (5, 9)], [(5, 5)], patch_size=3, mutual_check=True)
+    assert alone == [((5, 9), (-4, 0), 1.0)]
+    # That one is outside the gate.
+    near = matches_of([(5, 3), (5, 4), (5, 9)], [(5, 5)], patch_size=3, mutual_check=True, reach=3.0)
+    assert near == [((5, 4), (1, 0), 1 / math.sqrt(2))]
+
+
+def test_quotients_of_counts_rank_as_fractions():
+    counts = [(c, e) for e in range(2561, 2602, 4) for c in range(2301, e + 1, 3)]
+    exact = sorted(counts, key=lambda n: Fraction(n[0] * n[0], n[1]))
+    for (c, e), (c1, e1) in zip(exact, exact[1:]):
+        assert (c * c / e < c1 * c1 / e1) == (c * c * e1 < c1 * c1 * e)
+
+
+@pytest.mark.parametrize("mutual_check", [False, True])
+@pytest.mark.parametrize("second_best_distance, ratio", [(0.0, 1.0), (0.0, 1.1), (2.0, 1.05), (3.5, 1.2)])
+def test_matches_are_those_of_all_pairs_in_fractions(second_best_distance, ratio, mutual_check):
+    settings = keypoint_config(
+        patch_size=5, ratio_threshold=ratio, second_best_distance=second_best_distance, mutual_check=mutual_check
+    )
+    rng = np.random.default_rng(11)
+    total = 0
+    for reach in (2.0, 3.3, 4.0, 60.0):
+        images = rng.random((2, 13, 16)) < 0.3
+        found = ref.match_keypoints(images[0], images[1], reach, settings)
+        sides = [[tuple(p) for p in ref.detect_keypoints(image).tolist()] for image in images]
+        patches = [
+            dict(zip(side, ref.describe(image, np.array(side), 5).astype(int))) for side, image in zip(sides, images)
+        ]
+
+        def order(p, q, energy, patches=patches):  # best first
+            c, (dy, dx) = int(patches[0][p] @ patches[1][q]), (q[0] - p[0], q[1] - p[1])
+            return -Fraction(c * c, int(energy.sum())), dx * dx + dy * dy, dy, dx
+
+        expected = []
+        for p in sides[0]:
+            ranked = sorted((*order(p, q, patches[1][q]), q) for q in sides[1] if math.dist(p, q) <= reach)
+            if not ranked:
+                continue
+            rank, _, dy, dx, best = ranked[0]
+            others = [other for other in ranked[1:] if math.dist(other[-1], best) >= second_best_distance]
+            if others and not -rank > Fraction(str(ratio)) ** 2 * -others[0][0]:
+                continue
+            viewers = [v for v in sides[0] if math.dist(v, best) <= reach]
+            if mutual_check and min(viewers, key=lambda v: order(v, best, patches[0][v])) != p:
+                continue
+            expected.append((*p, dx, dy))
+        assert [m[:4] for m in found] == expected
+        for m in found:
+            a, b = patches[0][m.row, m.column], patches[1][m.row + m.dy, m.column + m.dx]
+            assert m.score == pytest.approx(a @ b / (np.linalg.norm(a) * np.linalg.norm(b)), abs=1e-15)
+        total += len(found)
+    assert total > 0
+
+
+def test_gate_of_keypoints():
+    assert ref.gate(config(gate_radius=3.0), 0.1, 0.5) == 6.0
+    assert ref.gate(config(gate_radius=3.0), 0.05, 0.5) == 3.0  # metres per 0.1 s
+    assert ref.gate(config(gate_radius=3.0, max_speed=20.0), 0.1, 0.5) == 5.0  # 2 m and one pixel
+    assert ref.gate(config(gate_radius=3.0, max_speed=50.0), 0.1, 0.5) == 6.0
+    # 3 m in a step; the time stamps say 0.05 s.
+    for stamps, expected in [((0, 100_000_000), 3.0), ((0, 50_000_000), 0.0), ((None, 50_000_000), 3.0)]:
+        pc0, pc1 = sweep([(5, 5)], timestamp_ns=stamps[0]), sweep([(5, 8)], timestamp_ns=stamps[1])
+        flow = ref.reference_flow(Window(pc0, pc1), keypoint_config(gate_radius=3.0)).residual_flow
+        assert flow.tolist() == [[expected, 0.0, 0.0]]
+    slow = keypoint_config(gate_radius=3.0, max_speed=10.0)
+    assert ref.reference_flow(Window(sweep([(5, 5)]), sweep([(5, 8)])), slow).residual_flow.abs().max() == 0
+
+
+def test_median_of_components():
+    image = image_of([(0, 0), (0, 1), (1, 2), (4, 4), (6, 0), (6, 1)], (8, 8))
+    matches = [
+        ref.Match(0, 0, 1, -1, 0.5),
+        ref.Match(0, 1, 4, 1, 1.0),
+        ref.Match(6, 0, 7, 1, 0.25),
+        ref.Match(6, 1, 2, 6, 0.75),
+    ]
+    ids = ref.connected_components(image, 8)[0] - 1
+    motions = ref.median_of_components(ids, matches)
+    assert ids[image].tolist() == [0, 0, 0, 1, 2, 2] and (ids[~image] == -1).all()
+    assert motions == [(2.5, 0.0, 0.75), (0.0, 0.0, 0.0), (4.5, 3.5, 0.5)]  # (4, 4) without a match keeps its number
+    assert math.copysign(1, motions[0].dy) == 1
+    motions = ref.median_of_components(ids, [*matches, ref.Match(1, 2, 9, 9, 0.875)])
+    assert motions[0] == (4, 1, 0.875)  # odd: the middle of each
+    ids = ref.connected_components(image, 4)[0] - 1
+    motions = ref.median_of_components(ids, matches)
+    assert ids[image].tolist() == [0, 0, 1, 2, 3, 3]
+    assert motions[1] == (0.0, 0.0, 0.0)
+
+
+def test_nearest_match():
+    image = image_of([(2, 2), (2, 4), (2, 5), (2, 6), (4, 4)], (8, 8))
+    matches = [ref.Match(2, 2, 1, 0, 0.5), ref.Match(2, 6, 2, 0, 0.75)]
+    ids, motions = ref.nearest_match(image, matches)
+    assert ids[image].tolist() == [0, 0, 1, 1, 0]  # (2, 4) and (4, 4) are equally near: smallest column
+    assert motions == [(1, 0, 0.5), (2, 0, 0.75)]
+    ids, _ = ref.nearest_match(
+        image_of([(2, 4), (4, 2), (4, 4)], (8, 8)), [ref.Match(2, 4, 0, 0, 1.0), ref.Match(4, 2, 0, 0, 1.0)]
+    )
+    assert ids[4, 4] == 0  # equally near: smallest row
+    ids, motions = ref.nearest_match(image, [])
+    assert (ids == -1).all() and motions == []
+
+
+def test_keypoints_find_an_ell_and_keep_what_has_no_match():
+    strangers = [(2, 30), (30, 5)]
+    window = Window(sweep([*ELL, *strangers]), sweep(ELL, (2, 1, 0)))
+    result = ref.reference_flow(window, keypoint_config(gate_radius=4.0))
+    n = len(ELL)
+    assert result.residual_flow.tolist() == [[2.0, 1.0, 0.0]] * n + [[0.0, 0.0, 0.0]] * 2
+    assert result.cluster_id.tolist() == [1] * n + [0, 2]  # raster order of I_t, with or without a match
+    assert result.score.tolist() == [1.0] * n + [0.0, 0.0]
+    assert result.is_valid.all()
+    nearest = ref.reference_flow(window, keypoint_config(gate_radius=4.0, densify="nearest"))
+    assert nearest.residual_flow.tolist() == [[2.0, 1.0, 0.0]] * (n + 2)
+    assert sorted(set(nearest.cluster_id.tolist())) == list(range(nearest.cluster_id.max() + 1))
+    assert (nearest.score == 1).all()
+    small = Window(*(Sweep(s.points * 0.25) for s in (window.pc0, window.pc1)))
+    scaled = ref.reference_flow(small, keypoint_config(gate_radius=1.0, pixel_sizes=(0.25,)))
+    assert torch.equal(scaled.residual_flow, result.residual_flow * 0.25)
+
+
+def test_half_a_pixel_is_not_minus_zero():
+    # Two pixels of one component, matched one to the left and one to the right: the median is +0.
+    settings = keypoint_config(patch_size=1, gate_radius=1.0)
+    result = ref.reference_flow(Window(sweep([(5, 5), (5, 6)]), sweep([(5, 4), (5, 7)])), settings)
+    assert result.score.tolist() == [1.0, 1.0]
+    assert result.residual_flow.tolist() == [[0.0, 0.0, 0.0]] * 2
+    assert not torch.signbit(result.residual_flow).any()
+
+
+def test_clusters_are_those_of_the_dense_method_in_sweep_t():
+    # Two pixels apart: one cluster after the dilation, two components without.
+    pc0 = sweep([(5, 5), (5, 7), (5, 12)])  # row, column
+    window = Window(pc0, sweep([(6, 5), (6, 12)]))
+    together = keypoint_config(patch_size=1, gate_radius=1.0, densify="clusters")
+    result = ref.reference_flow(window, together)
+    assert result.cluster_id.tolist() == [0, 0, 1] and result.score.tolist() == [1.0] * 3
+    assert result.residual_flow.tolist() == [[0.0, 1.0, 0.0]] * 3
+    apart = ref.reference_flow(window, together.replace(densify="components"))
+    assert apart.cluster_id.tolist() == [0, 1, 2] and apart.score.tolist() == [1.0, 0.0, 1.0]
+
+
+@pytest.mark.parametrize("densify", ["components", "clusters", "nearest"])
+def test_rows_that_take_no_part_in_keypoints(densify):
+    pc0 = sweep([*ELL, (12, 11)], is_ground=np.array([False] * len(ELL) + [True]))
+    points = np.concatenate([pc0.points, [[np.nan, 1, 1], [1, INF, 1], [-1, 1, 1]]])
+    ground = np.concatenate([pc0.is_ground, [False] * 3])
+    window = Window(Sweep(points, ground), sweep(ELL, (2, 1, 0)))
+    result = ref.reference_flow(window, keypoint_config(gate_radius=4.0, densify=densify))
+    n = len(ELL)
+    assert result.is_valid.tolist() == [True] * n + [False] * 4
+    assert result.residual_flow.tolist() == [[2.0, 1.0, 0.0]] * n + [[0.0] * 3] * 4
+    assert result.cluster_id[n:].tolist() == [-1] * 4 and (result.cluster_id[:n] >= 0).all()
+    assert result.score.tolist() == [1.0] * n + [0.0] * 4
+    assert torch.isfinite(result.flow).all()
+
+
+@pytest.mark.parametrize("densify", ["components", "clusters", "nearest"])
+@pytest.mark.parametrize("empty", ["pc0", "pc1", "both"])
+def test_empty_sweeps_of_keypoints(empty, densify):
+    nothing = Sweep(np.zeros((0, 4), dtype=np.float32))
+    pc0 = nothing if empty in ("pc0", "both") else sweep(ELL)
+    pc1 = nothing if empty in ("pc1", "both") else sweep(ELL)
+    result = ref.reference_flow(Window(pc0, pc1), keypoint_config(densify=densify, mutual_check=True))
+    n = len(pc0.points)
+    assert result.residual_flow.shape == (n, 3) and (result.flow == 0).all() and (result.score == 0).all()
+    # A component keeps its number without any match; a match that is not there has none.
+    assert result.cluster_id.tolist() == [-1 if densify == "nearest" else 0] * n
+
+
+@pytest.mark.parametrize("densify", ["components", "nearest"])
+def test_keypoints_coarse_to_fine(densify):
+    # As for the dense method: 8 m with 4 m pixels, then -1 m. Dots 8 pixels apart all look alike with 1 m pixels.
+    settings = keypoint_config(**TWO_SCALES, densify=densify, gate_radius=9.0, second_best_distance=9.0)
+    window = Window(row_of_dots(3.5), row_of_dots(10.5))
+    result = ref.reference_flow(window, settings)
+    assert result.residual_flow.tolist() == [[7.0, 0.0, 0.0]] * 5
+    assert result.cluster_id.tolist() == [0, 1, 2, 3, 4] and result.score.tolist() == [1.0] * 5
+    # The last dot is warped to 43.5.
+    narrow = settings.replace(point_cloud_range=(0.0, 0.0, -INF, 43.0, 16.0, INF))
+    result = ref.reference_flow(window, narrow)
+    assert result.residual_flow[:, 0].tolist() == [7.0] * 4 + [8.0]
+    assert result.cluster_id.tolist() == [0, 1, 2, 3, -1]
+    assert result.score[4] == 0 and result.is_valid.all()
 
 
 # ------------------------------------------------------------------------------------------------ properties

@@ -78,3 +78,33 @@ def masked_median(values: Tensor, mask: Tensor) -> Tensor:
     high = ordered.gather(1, (count // 2).clamp(max=values.shape[1] - 1)[:, None])[:, 0]
     median = torch.where(count % 2 == 1, low, (low + high) / 2)
     return torch.where(count > 0, median, torch.zeros_like(median))
+
+
+def segment_median(values: Tensor, index: Tensor, num_segments: int) -> Tensor:
+    """Median of each segment.
+
+    Args:
+        values: (N,) float64.
+        index: (N,) int64, segment of each value, 0 ... num_segments - 1.
+        num_segments: S.
+
+    Returns:
+        (S,) float64; 0 for a segment without values.
+
+    Convention:
+        Even count: mean of the middle two, (a + b) / 2.
+
+    Cost: two sorts.
+    """
+    if values.numel() == 0:
+        return values.new_zeros(num_segments)
+    order = values.argsort(stable=True)
+    order = order.index_select(0, index.index_select(0, order).argsort(stable=True))  # by segment, then by value
+    ordered = values.index_select(0, order)
+    count = torch.bincount(index, minlength=num_segments)
+    start = count.cumsum(0) - count
+    last = values.numel() - 1  # only empty segments may point beyond it
+    low = ordered.index_select(0, (start + (count - 1).clamp(min=0) // 2).clamp(max=last))
+    high = ordered.index_select(0, (start + count // 2).clamp(max=last))
+    median = torch.where(count % 2 == 1, low, (low + high) / 2)
+    return torch.where(count > 0, median, torch.zeros_like(median))

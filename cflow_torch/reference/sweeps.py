@@ -1,0 +1,110 @@
+"""From a window to clouds in the frame of t+1: ego motion compensation, repeated sweeps, elapsed times."""
+
+from __future__ import annotations
+
+from typing import Any, List, NamedTuple, Tuple
+
+import numpy as np
+import torch
+
+from cflow_torch.config import Config
+from cflow_torch.types import Sweep, Window
+
+
+class Cloud(NamedTuple):
+    """One sweep after ego motion compensation.
+
+    Attributes:
+        points: (N, 3) float64, metres, frame of t+1; NaN for a point that was not finite.
+        takes_part: (N,) bool, finite and not ground.
+        steps: k, elapsed time to t+1 in sweep intervals: 1 for t, 2 for t-1 ...; 0 for t+1 itself.
+        elapsed: seconds to t+1.
+    """
+
+    points: np.ndarray
+    takes_part: np.ndarray
+    steps: float
+    elapsed: float
+
+
+class Level(NamedTuple):
+    """What one scale finds, one array per sweep m <= t, nearest first; rows in the order of the sweep's points.
+
+    Attributes:
+        flow: each (N, 3) float64, metres per sweep interval; 0 for points in no cluster.
+        cluster_id: each (N,) int64, -1 for points in no cluster.
+        score: each (N,) float64, NCC at the peak of the newest sweep; 0 for points in no cluster.
+    """
+
+    flow: List[np.ndarray]
+    cluster_id: List[np.ndarray]
+    score: List[np.ndarray]
+
+
+def compensate(window: Window, config: Config) -> Tuple[List[Cloud], Cloud]:
+    """Eq. def_scene_flow: every sweep in the frame of t+1, by inv(pose1) @ pose.
+
+    Returns:
+        Sweeps m = t, t-1, ..., nearest first, at most `config.num_history` before t; and sweep t+1.
+
+    Convention:
+        A sweep that repeats a newer one (same points, same pose) is dropped; k of the others still counts places
+        in the window. Without poses the points already lie in the frame of t+1. Elapsed times are those of the
+        time stamps if all sweeps have one, else steps times `sweep_interval`.
+    """
+    sweeps = [window.pc0, *window.pch[: config.num_history]]
+    has_stamps = all(sweep.timestamp_ns is not None for sweep in [window.pc1, *sweeps])
+    clouds: List[Cloud] = []
+    for m, sweep in enumerate(sweeps):
+        if any(_is_repeat(sweep, newer) for newer in sweeps[:m]):
+            continue
+        steps, elapsed = float(m + 1), (m + 1) * config.sweep_interval
+        if has_stamps:
+            elapsed_ns = int(window.pc1.timestamp_ns) - int(sweep.timestamp_ns)  # type: ignore[arg-type]
+            first_ns = int(window.pc1.timestamp_ns) - int(window.pc0.timestamp_ns)  # type: ignore[arg-type]
+            elapsed = elapsed_ns / 1e9
+            if config.use_timestamps:
+                steps = elapsed_ns / first_ns
+        clouds.append(Cloud(_in_frame_of(window.pc1, sweep), _takes_part(sweep), steps, elapsed))
+    return clouds, Cloud(xyz(window.pc1), _takes_part(window.pc1), 0.0, 0.0)
+
+
+def _in_frame_of(sweep1: Sweep, sweep: Sweep) -> np.ndarray:
+    points = xyz(sweep)
+    finite = np.isfinite(points).all(axis=1)
+    moved = np.full(points.shape, np.nan)
+    if sweep.pose is None:
+        moved[finite] = points[finite]
+        return moved
+    matrix = np.linalg.inv(_matrix(sweep1.pose)) @ _matrix(sweep.pose)  # T_ego1_ego
+    x, y, z = points[finite].T
+    for axis in range(3):
+        rotation, translation = matrix[axis, :3], matrix[axis, 3]
+        moved[finite, axis] = ((rotation[0] * x + rotation[1] * y) + rotation[2] * z) + translation
+    return moved
+
+
+def _is_repeat(sweep: Sweep, newer: Sweep) -> bool:
+    if (sweep.pose is None) != (newer.pose is None):
+        return False
+    same_pose = sweep.pose is None or np.array_equal(_matrix(sweep.pose), _matrix(newer.pose))
+    return same_pose and np.array_equal(_matrix(sweep.points), _matrix(newer.points), equal_nan=True)
+
+
+def _takes_part(sweep: Sweep) -> np.ndarray:
+    finite = np.isfinite(xyz(sweep)).all(axis=1)
+    if sweep.is_ground is None:
+        return finite
+    return finite & ~_matrix(sweep.is_ground).astype(bool)
+
+
+def xyz(sweep: Sweep) -> np.ndarray:
+    """(N, 3) float64, metres: the points of a sweep as they were given, without further columns."""
+    return _matrix(sweep.points)[:, :3]
+
+
+def _matrix(values: Any) -> np.ndarray:
+    """The door: a float64 array from an array or a tensor on any device."""
+    if isinstance(values, torch.Tensor):
+        values = values.detach().cpu().double().numpy()
+    return np.array(values, dtype=np.float64)
