@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from cflow_torch.data.log import FlowLabels
 from cflow_torch.evaluation import (
     DEFINITIONS,
+    BucketedByRange,
     BucketedEPE,
     Definition,
     EvalFrame,
@@ -30,7 +31,7 @@ from cflow_torch.types import CFlowError, FlowResult, Sweep, Window
 
 CAR, PEDESTRIAN, SIGN = CATEGORY_INDEX["REGULAR_VEHICLE"], CATEGORY_INDEX["PEDESTRIAN"], CATEGORY_INDEX["SIGN"]
 OSF, BSFE, AV2 = "opensceneflow", "bucketed_scene_flow_eval", "av2"
-NAMES = [OSF, BSFE, AV2]
+NAMES = [OSF, BSFE, AV2, "challenge_2026"]
 
 
 def frame(
@@ -216,6 +217,40 @@ def test_rings_share_no_point() -> None:
         assert counts == expected
 
 
+@pytest.mark.parametrize("region", ["disc", "box"])
+@pytest.mark.parametrize("closed", [True, False])
+@pytest.mark.parametrize("axes", ["t", "t+1"])
+def test_ranges_in_one_pass_equal_regions_one_by_one(region: str, closed: bool, axes: str) -> None:
+    edges = (0.0, 10.0, 35.0, 70.0)
+    rings = replace(DEFINITIONS["challenge_2026"], region=region, closed=closed, region_axes=axes, region_edges=edges)
+    frames = random_frames(3)
+    on_edges = [[10, 0, 0], [0, -35, 0], [70, 0, 0], [0, 0, 0], [35, 35, 0]]
+    frames.append(frame([[1, 0, 0]] * 5, points=on_edges))
+    ranges = scores(rings, *frames)["bucketed_by_range"]["ranges"]
+    for low, high in zip(edges, edges[1:]):
+        alone = scores(replace(rings, min_range=low, max_range=high, metrics=("bucketed",)), *frames)["bucketed"]
+        expected = flat({"classes": alone["classes"], "mean": alone["mean"]})
+        assert flat(ranges[f"{low:g}-{high:g}"]) == pytest.approx(expected, abs=0, rel=1e-15, nan_ok=True)
+        assert alone["classes"]["CAR"]["num_dynamic"] > 0
+
+
+def test_a_range_without_movers_makes_the_mean_over_ranges_nan() -> None:
+    results = scores("challenge_2026", frame([[1, 0, 0]]))["bucketed_by_range"]
+    assert results["ranges"]["0-35"]["mean"]["dynamic_error"] == 1.0
+    assert math.isnan(results["mean"]["dynamic_error"])  # never the mean of what is left
+
+
+def test_challenge_is_opensceneflow_with_ranges() -> None:
+    frames = random_frames(3)
+    ours, challenge = scores(OSF, *frames), scores("challenge_2026", *frames)
+    for name in ("bucketed", "three_way", "range_wise"):
+        assert flat(challenge[name]) == pytest.approx(flat(ours[name]), abs=0, nan_ok=True)
+    corner = frame([[1, 0, 0]], points=[[30, 30, 0]])  # in the box of 35 m, outside the disc
+    for definition, expected in (("challenge_2026", [0, 1]), ("challenge_2026_box", [1, 0])):
+        ranges = scores(definition, corner)["bucketed_by_range"]["ranges"]
+        assert [row["classes"]["CAR"]["num_dynamic"] for row in ranges.values()] == expected
+
+
 def test_crop_of_bucketed_scene_flow_eval_is_open() -> None:
     points = [[1, 1, 2.5], [1, 1, 2.4], [1, 1, -2.5]]
     assert car_counts(scores(BSFE, frame([[1, 0, 0]] * 3, points=points))) == {25: 1}
@@ -284,6 +319,20 @@ def test_three_way_by_hand() -> None:
     assert foreground["count"] == 2
     assert foreground["accuracy_strict"] == 0.5
     assert results["breakdown"]["background"]["dynamic"]["all"]["count"] == 1
+
+
+def test_breakdown_by_class_adds_up_to_the_foreground() -> None:
+    results = scores(replace(DEFINITIONS[OSF], foreground="meta", region="all"), *random_frames(3))["three_way"]
+    for motion in ("static", "dynamic"):
+        for distance in ("all", "close", "far"):
+            whole = results["breakdown"]["foreground"][motion][distance]
+            parts = [results["by_class"][name][motion][distance] for name in META_CLASSES if name != "BACKGROUND"]
+            for key in ("count", "num_predicted"):
+                assert sum(part[key] for part in parts) == whole[key]
+            for key in ("epe", "accuracy_strict", "accuracy_relax", "angle_error"):
+                total = sum(part[key] * part["count"] for part in parts if part["count"])
+                assert total / whole["count"] == pytest.approx(whole[key], rel=1e-12)
+    assert flat(results["by_class"]["BACKGROUND"]) == flat(results["breakdown"]["background"])
 
 
 def test_accuracy_is_absolute_or_relative() -> None:
@@ -449,6 +498,8 @@ def test_definitions_are_checked() -> None:
         {"min_range": 40.0},
         {"speed_edges": (0.0, 1.0, 1.0)},
         {"range_edges": (0.0,)},
+        {"region_edges": (35.0, 0.0)},
+        {"metrics": ("bucketed_by_range",), "region": "all"},
     ):
         with pytest.raises(CFlowError):
             Definition(**{"name": "mine", **change})  # type: ignore[arg-type]
@@ -498,9 +549,15 @@ def test_order_of_points_does_not_matter() -> None:
 
 def test_parts_alone_equal_the_bundle() -> None:
     frames = random_frames(3)
-    bundle = scores(OSF, *frames)
-    for name, kind in (("bucketed", BucketedEPE), ("three_way", ThreeWayEPE), ("range_wise", RangeWiseEPE)):
-        part, other = kind(OSF), kind(OSF)
+    bundle = scores("challenge_2026", *frames)
+    kinds = {
+        "bucketed": BucketedEPE,
+        "bucketed_by_range": BucketedByRange,
+        "three_way": ThreeWayEPE,
+        "range_wise": RangeWiseEPE,
+    }
+    for name, kind in kinds.items():
+        part, other = kind("challenge_2026"), kind("challenge_2026")
         part.update(frames[0])
         for item in frames[1:]:
             other.update(item)
@@ -510,7 +567,7 @@ def test_parts_alone_equal_the_bundle() -> None:
 
 def test_merging_other_definitions_is_refused() -> None:
     other = replace(DEFINITIONS[OSF], max_range=50.0)
-    for kind in (SceneFlowMetrics, BucketedEPE, ThreeWayEPE, RangeWiseEPE):
+    for kind in (SceneFlowMetrics, BucketedEPE, BucketedByRange, ThreeWayEPE, RangeWiseEPE):
         with pytest.raises(CFlowError, match="cannot merge"):
             kind(OSF).merge(kind(other))
 
@@ -532,6 +589,16 @@ def test_table_shows_every_class_and_no_nan() -> None:
     assert [cell.strip() for cell in row.strip("|").split("|")] == ["CAR", "-", "1.0000", "0", "1"]
     widths = {len(line) for line in text.splitlines()[2:9]}
     assert len(widths) == 1  # columns line up
+
+
+def test_table_of_ranges() -> None:
+    item = frame([[1, 0, 0]] * 2, [[0, 0, 0], [0.5, 0, 0]], points=[[10, 0, 0], [50, 0, 0]])
+    lines = format_table(scores("challenge_2026", item)).splitlines()
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    start = next(i for i, row in enumerate(rows) if row[0].startswith("dynamic error, range"))
+    assert rows[start + 2] == ["0-35", "1.0000", "-", "-", "-", "1.0000"]
+    assert rows[start + 3] == ["35-70", "0.5000", "-", "-", "-", "0.5000"]
+    assert rows[start + 4] == ["**mean**", "", "", "", "", "0.7500"]
 
 
 def test_table_leaves_out_what_a_definition_lacks() -> None:

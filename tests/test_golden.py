@@ -33,6 +33,7 @@ class Pair:
     is_ground: np.ndarray
     mask: np.ndarray
     bsfe_ground: np.ndarray
+    next_points: np.ndarray
 
     def score(self, definition: Any, **parts: Any) -> Dict[str, Any]:
         """Scores of the prediction "nothing but ego motion", unless `parts` say otherwise."""
@@ -63,6 +64,7 @@ def pair(av2_folder: Path) -> Pair:
         is_ground=is_ground,
         mask=~is_ground & (np.abs(sweep0.points[:, :2]) <= 50).all(axis=1),
         bsfe_ground=AV2Log(av2_folder, ground="bsfe").sweep(0).is_ground,
+        next_points=sweep1.points,
     )
 
 
@@ -104,6 +106,9 @@ def filled(results: Dict[str, Any], name: str, key: str) -> Dict[int, Any]:
 def test_points_of_the_pair(pair: Pair) -> None:
     assert len(pair.points) == 99_229
     assert pair.is_ground.sum() == 17_374
+    assert (~pair.is_ground).sum() == 81_855
+    assert len(pair.next_points) == 99_466
+    assert pair.mask.sum() == 78_506  # 78_507 with OpenSceneFlow's ground, which has one point less
     near = pair.points[~pair.is_ground, :2]
     assert (np.linalg.norm(near, axis=1) <= 35).sum() == 72_805
     assert (np.abs(near).max(axis=1) <= 35).sum() == 74_296
@@ -145,6 +150,20 @@ def test_opensceneflow_npz(pair: Pair) -> None:
     assert filled(results, "WHEELED_VRU", "count") == {0: 166}
     dynamic = results["three_way"]["breakdown"]["foreground"]["dynamic"]["all"]["count"]
     assert dynamic == 1_819
+
+
+def test_classes_within_35_metres(pair: Pair) -> None:
+    counts = {}
+    for region in ("disc", "box"):
+        classes = pair.score(replace(DEFINITIONS["opensceneflow"], region=region))["bucketed"]["classes"]
+        counts[region] = {name: row["num_static"] + row["num_dynamic"] for name, row in classes.items()}
+    assert [counts["disc"][name] for name in ("CAR", "PEDESTRIAN", "WHEELED_VRU", "OTHER_VEHICLES")] == [
+        7800,
+        250,
+        166,
+        0,
+    ]
+    assert counts["box"]["WHEELED_VRU"] == 166 + 39  # a parked motorcycle in a corner of the box
 
 
 def test_opensceneflow_range_wise(pair: Pair) -> None:

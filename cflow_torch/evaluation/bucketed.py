@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from typing import Any, Dict, Union
+from typing import Any, Dict, Tuple, Union
 
 import numpy as np
 
@@ -18,6 +18,48 @@ def mean_of_present(values: np.ndarray) -> float:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", category=RuntimeWarning)
         return float(np.nanmean(values)) if values.size else float("nan")
+
+
+def bucket_cells(scored: ScoredPoints, definition: Definition) -> Tuple[np.ndarray, np.ndarray]:
+    """Class and speed bucket of each point.
+
+    Returns:
+        (M,) int64, cell = class * number of buckets + bucket; (M,) bool, False where a point has no cell.
+    """
+    edges = np.asarray(definition.speed_edges)
+    meta = meta_class(scored.category)
+    bucket = np.searchsorted(edges, scored.speed, side="right") - 1
+    if definition.background == "static":
+        bucket = np.where(meta == META_NAMES.index("BACKGROUND"), 0, bucket)
+    return meta * (len(edges) - 1) + bucket, (meta >= 0) & (bucket >= 0) & (bucket < len(edges) - 1)
+
+
+def bucket_scores(count: np.ndarray, error_sum: np.ndarray, speed_sum: np.ndarray) -> Dict[str, Any]:
+    """Scores of (classes, buckets) sums: the "classes" and "mean" that `BucketedEPE.compute` returns."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        epe = error_sum / count
+        speed = speed_sum / count
+        normalized = np.concatenate([epe[:, :1], epe[:, 1:] / speed[:, 1:]], axis=1)
+    classes = {
+        name: {
+            "static_epe": float(normalized[row, 0]),
+            "dynamic_error": mean_of_present(normalized[row, 1:]),
+            "num_static": int(count[row, 0]),
+            "num_dynamic": int(count[row, 1:].sum()),
+            "buckets": {
+                "count": count[row].tolist(),
+                "epe": epe[row].tolist(),
+                "speed": speed[row].tolist(),
+                "normalized": normalized[row].tolist(),
+            },
+        }
+        for row, name in enumerate(META_NAMES)
+    }
+    mean = {
+        key: mean_of_present(np.array([scores[key] for scores in classes.values()], dtype=np.float64))
+        for key in ("static_epe", "dynamic_error")
+    }
+    return {"classes": classes, "mean": mean}
 
 
 class BucketedEPE(Accumulator):
@@ -47,17 +89,12 @@ class BucketedEPE(Accumulator):
 
     def update_points(self, scored: ScoredPoints) -> None:
         """Add the scored points of one frame."""
-        edges = np.asarray(self.definition.speed_edges)
-        meta = meta_class(scored.category)
-        bucket = np.searchsorted(edges, scored.speed, side="right") - 1
-        if self.definition.background == "static":
-            bucket = np.where(meta == META_NAMES.index("BACKGROUND"), 0, bucket)
-        keep = scored.in_region & (meta >= 0) & (bucket >= 0) & (bucket < len(edges) - 1)
-        cell = meta[keep] * (len(edges) - 1) + bucket[keep]
+        cell, keep = bucket_cells(scored, self.definition)
+        keep &= scored.in_region
         size, shape = self.count.size, self.count.shape
-        self.count += np.bincount(cell, minlength=size).reshape(shape)
-        self.error_sum += np.bincount(cell, scored.error[keep], minlength=size).reshape(shape)
-        self.speed_sum += np.bincount(cell, scored.speed[keep], minlength=size).reshape(shape)
+        self.count += np.bincount(cell[keep], minlength=size).reshape(shape)
+        self.error_sum += np.bincount(cell[keep], scored.error[keep], minlength=size).reshape(shape)
+        self.speed_sum += np.bincount(cell[keep], scored.speed[keep], minlength=size).reshape(shape)
 
     def compute(self) -> Dict[str, Any]:
         """Scores so far.
@@ -67,27 +104,5 @@ class BucketedEPE(Accumulator):
             (points) and "buckets" (`count`, `epe`, `speed`, `normalized` per bucket); "mean": `static_epe`,
             `dynamic_error`; "speed_edges": metres per frame.
         """
-        with np.errstate(divide="ignore", invalid="ignore"):
-            epe = self.error_sum / self.count
-            speed = self.speed_sum / self.count
-            normalized = np.concatenate([epe[:, :1], epe[:, 1:] / speed[:, 1:]], axis=1)
-        classes = {
-            name: {
-                "static_epe": float(normalized[row, 0]),
-                "dynamic_error": mean_of_present(normalized[row, 1:]),
-                "num_static": int(self.count[row, 0]),
-                "num_dynamic": int(self.count[row, 1:].sum()),
-                "buckets": {
-                    "count": self.count[row].tolist(),
-                    "epe": epe[row].tolist(),
-                    "speed": speed[row].tolist(),
-                    "normalized": normalized[row].tolist(),
-                },
-            }
-            for row, name in enumerate(META_NAMES)
-        }
-        mean = {
-            key: mean_of_present(np.array([scores[key] for scores in classes.values()], dtype=np.float64))
-            for key in ("static_epe", "dynamic_error")
-        }
-        return {"classes": classes, "mean": mean, "speed_edges": list(self.definition.speed_edges)}
+        scores = bucket_scores(self.count, self.error_sum, self.speed_sum)
+        return {**scores, "speed_edges": list(self.definition.speed_edges)}

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Dict, Optional, Tuple, Union
+from typing import Any, Dict, List, Optional, Sequence, Tuple, Union
 
 import numpy as np
 
 from cflow_torch.types import CFlowError
 
-METRICS = ("bucketed", "three_way", "range_wise")
+METRICS = ("bucketed", "bucketed_by_range", "three_way", "range_wise")
 
 _CHOICES: Dict[str, Tuple[Any, ...]] = {
     "region": ("box", "disc", "all"),
@@ -26,6 +26,7 @@ _CHOICES: Dict[str, Tuple[Any, ...]] = {
 
 SPEED_EDGES: Tuple[float, ...] = (*(float(edge) for edge in np.linspace(0.0, 2.0, 51)), math.inf)
 RANGE_EDGES: Tuple[float, ...] = (0.0, 35.0, 50.0, 75.0, 100.0, math.inf)
+REGION_EDGES: Tuple[float, ...] = (0.0, 35.0, 70.0)
 
 
 @dataclass(frozen=True)
@@ -35,10 +36,13 @@ class Definition:
     Args:
         name: label that goes with every number.
         metrics: which of `METRICS` are computed.
-        region: points scored by "bucketed" and "three_way": "box" max(|x|, |y|), "disc" sqrt(x^2 + y^2), "all".
+        region: points scored by "bucketed" and "three_way": "box" max(|x|, |y|), "disc" sqrt(x^2 + y^2), "all". Box
+            or disc is also how "bucketed_by_range" measures.
         max_range: metres, outer bound of the region.
         min_range: metres, inner bound; the point that one region leaves out belongs to the next one.
-        closed: True: a point at exactly `max_range` counts (<=), False: it does not (<).
+        closed: True: a point at exactly `max_range` counts (<=), False: it does not (<). The same for the upper edge of
+            each range of "bucketed_by_range"; the point that one range leaves out belongs to the next one.
+        region_edges: metres, ascending edges of the ranges that "bucketed_by_range" scores one by one.
         region_axes: ego frame in which the region is measured.
         point_cloud_range: (x0, y0, z0, x1, y1, z1) metres, open interval, in `region_axes`; None = no crop.
         mask_box: metres; where a frame has no evaluation mask, only points with |x|, |y| <= this (frame of t)
@@ -65,11 +69,12 @@ class Definition:
     """
 
     name: str
-    metrics: Tuple[str, ...] = METRICS
+    metrics: Tuple[str, ...] = ("bucketed", "three_way", "range_wise")
     region: str = "disc"
     max_range: float = 35.0
     min_range: float = 0.0
     closed: bool = True
+    region_edges: Tuple[float, ...] = REGION_EDGES
     region_axes: str = "t"
     point_cloud_range: Optional[Tuple[float, ...]] = None
     mask_box: Optional[float] = None
@@ -94,11 +99,15 @@ class Definition:
                 raise CFlowError(f"definition {self.name}: {field} is one of {allowed}, got {getattr(self, field)!r}")
         if not set(self.metrics) <= set(METRICS):
             raise CFlowError(f"definition {self.name}: metrics are some of {METRICS}, got {self.metrics}")
+        if "bucketed_by_range" in self.metrics and self.region == "all":
+            raise CFlowError(
+                f"definition {self.name}: bucketed_by_range measures ranges; give region 'box' or 'disc', not 'all'"
+            )
         if not 0 <= self.min_range < self.max_range:
             raise CFlowError(
                 f"definition {self.name}: needs 0 <= min_range < max_range, got {self.min_range}, {self.max_range}"
             )
-        for field in ("speed_edges", "range_edges"):
+        for field in ("speed_edges", "range_edges", "region_edges"):
             edges = getattr(self, field)
             if len(edges) < 2 or not all(a < b for a, b in zip(edges, edges[1:])):
                 raise CFlowError(
@@ -134,6 +143,10 @@ DEFINITIONS: Dict[str, Definition] = {
         half_precision=True,
         nan_rows="error",
     ),
+    # The two ranges of the 2026 multi-data-set challenge, scored in one pass with the rules of opensceneflow. The
+    # challenge's own code is not public: whether it measures a disc or a box is unknown, so there is one of each.
+    "challenge_2026": Definition(name="challenge_2026", metrics=METRICS, average="frames"),
+    "challenge_2026_box": Definition(name="challenge_2026_box", metrics=METRICS, average="frames", region="box"),
 }
 
 
@@ -148,3 +161,8 @@ def get_definition(definition: Union[str, Definition]) -> Definition:
     if definition not in DEFINITIONS:
         raise CFlowError(f"evaluation definitions are {sorted(DEFINITIONS)}, got {definition!r}")
     return DEFINITIONS[definition]
+
+
+def range_names(edges: Sequence[float]) -> List[str]:
+    """Names of the ranges between ascending edges: "0-35", "35-70"."""
+    return [f"{low:g}-{high:g}" for low, high in zip(edges, edges[1:])]

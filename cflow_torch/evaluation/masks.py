@@ -22,6 +22,7 @@ class ScoredPoints:
         speed: (M,) float64, metres per frame, length of the true residual.
         category: (M,) int64, Argoverse 2 index.
         in_region: (M,) bool, inside the definition's region.
+        reach: (M,) float64, metres, distance that regions are measured by: max(|x|, |y|) for a box, else the radius.
         is_close: (M,) bool, inside the 70 m x 70 m square around the ego at t.
         distance: (M,) float64, metres, from the origin at t, height included.
         true_flow, predicted_flow: (M, 3) float64, the flow that the three-way scores compare.
@@ -33,6 +34,7 @@ class ScoredPoints:
     speed: np.ndarray
     category: np.ndarray
     in_region: np.ndarray
+    reach: np.ndarray
     is_close: np.ndarray
     distance: np.ndarray
     true_flow: np.ndarray
@@ -80,12 +82,14 @@ def score_points(frame: EvalFrame, definition: Definition) -> ScoredPoints:
     )
     if definition.half_precision:
         predicted_flow, true_flow = predicted_flow.astype(np.float16), true_flow.astype(np.float16)
+    reach = _reach(frame, definition)
     difference = residual.astype(definition.norm_dtype) - true_residual.astype(definition.norm_dtype)
     return ScoredPoints(
         error=np.linalg.norm(difference, axis=1).astype(np.float64),
         speed=np.linalg.norm(true_residual.astype(definition.norm_dtype), axis=1).astype(np.float64),
         category=frame.labels.category[keep],
-        in_region=_in_region(frame, definition)[keep],
+        in_region=_in_region(reach, definition)[keep],
+        reach=reach[keep].astype(np.float64),
         is_close=(np.abs(points[:, :2]) <= CLOSE_RANGE).all(axis=1),
         distance=np.linalg.norm(points, axis=1).astype(np.float64),
         true_flow=true_flow.astype(np.float64),
@@ -137,12 +141,16 @@ def _candidates(frame: EvalFrame, definition: Definition) -> np.ndarray:
     return keep
 
 
-def _in_region(frame: EvalFrame, definition: Definition) -> np.ndarray:
-    """(N,) bool: inside the box or disc that scores are given for."""
+def _reach(frame: EvalFrame, definition: Definition) -> np.ndarray:
+    """(N,) distance that regions are measured by."""
     position = _position(frame, definition)[:, :2]
+    return np.abs(position).max(axis=1) if definition.region == "box" else np.linalg.norm(position, axis=1)
+
+
+def _in_region(reach: np.ndarray, definition: Definition) -> np.ndarray:
+    """(N,) bool: inside the box or disc that scores are given for."""
     if definition.region == "all":
-        return np.ones(len(position), dtype=bool)
-    reach = np.abs(position).max(axis=1) if definition.region == "box" else np.linalg.norm(position, axis=1)
+        return np.ones(len(reach), dtype=bool)
     if definition.closed:
         inner = reach > definition.min_range if definition.min_range > 0 else True
         return inner & (reach <= definition.max_range)

@@ -6,6 +6,7 @@ from typing import Any, Callable, Dict, Union
 
 from cflow_torch.evaluation.accumulator import Accumulator
 from cflow_torch.evaluation.bucketed import BucketedEPE
+from cflow_torch.evaluation.bucketed_by_range import BucketedByRange
 from cflow_torch.evaluation.definitions import Definition, get_definition
 from cflow_torch.evaluation.frame import EvalFrame
 from cflow_torch.evaluation.masks import score_points
@@ -15,6 +16,7 @@ from cflow_torch.types import CFlowError
 
 _ACCUMULATORS: Dict[str, Callable[..., Accumulator]] = {
     "bucketed": BucketedEPE,
+    "bucketed_by_range": BucketedByRange,
     "three_way": ThreeWayEPE,
     "range_wise": RangeWiseEPE,
 }
@@ -24,7 +26,8 @@ class SceneFlowMetrics:
     """Every metric that a definition names, as one accumulator.
 
     Args:
-        definition: "opensceneflow", "bucketed_scene_flow_eval", "av2", or a `Definition`.
+        definition: a name in `DEFINITIONS` ("opensceneflow", "bucketed_scene_flow_eval", "av2", ...) or a
+            `Definition`.
 
     Convention: frames in any order; `merge` joins parts that were scored apart.
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from cflow_torch.evaluation.accumulator import Accumulator
 from cflow_torch.evaluation.bucketed import mean_of_present
-from cflow_torch.evaluation.definitions import Definition
+from cflow_torch.evaluation.definitions import Definition, range_names
 from cflow_torch.evaluation.masks import ScoredPoints
 
 
@@ -44,15 +44,14 @@ class RangeWiseEPE(Accumulator):
         """Per range ("0-35", ...) `static_epe`, `dynamic_epe` in metres, `num_static`, `num_dynamic`; and "mean"."""
         with np.errstate(divide="ignore", invalid="ignore"):
             epe = self.error_sum / self.count
-        edges = self.definition.range_edges
         result: Dict[str, Any] = {
-            f"{low:g}-{high:g}": {
+            name: {
                 "static_epe": float(epe[row, 0]),
                 "dynamic_epe": float(epe[row, 1]),
                 "num_static": int(self.count[row, 0]),
                 "num_dynamic": int(self.count[row, 1]),
             }
-            for row, (low, high) in enumerate(zip(edges, edges[1:]))
+            for row, name in enumerate(range_names(self.definition.range_edges))
         }
         result["mean"] = {"static_epe": mean_of_present(epe[:, 0]), "dynamic_epe": mean_of_present(epe[:, 1])}
         return result

@@ -7,7 +7,7 @@ from typing import Any, Dict, List, Sequence
 
 
 def format_table(results: Dict[str, Any]) -> str:
-    """Tables of the bucketed, three-way and range-wise scores that `SceneFlowMetrics.compute` returned.
+    """Tables of the bucketed (also by range), three-way and range-wise scores that `SceneFlowMetrics.compute` returned.
 
     Args:
         results: what `compute` returned; metrics that the definition lacks are left out.
@@ -27,6 +27,20 @@ def format_table(results: Dict[str, Any]) -> str:
         ]
         rows.append(["**mean**", _number(mean["static_epe"]), _number(mean["dynamic_error"]), "", ""])
         lines += ["", *_table(["class", "static EPE [m]", "dynamic error", "static points", "dynamic points"], rows)]
+    if "bucketed_by_range" in results:
+        by_range = results["bucketed_by_range"]
+        names = list(next(iter(by_range["ranges"].values()))["classes"])
+        moving = [name for name in names if name != "BACKGROUND"]
+        rows = [
+            [
+                name,
+                *(_number(scores["classes"][column]["dynamic_error"]) for column in moving),
+                _number(scores["mean"]["dynamic_error"]),
+            ]
+            for name, scores in by_range["ranges"].items()
+        ]
+        rows.append(["**mean**", *("" for _ in moving), _number(by_range["mean"]["dynamic_error"])])
+        lines += ["", *_table(["dynamic error, range [m]", *moving, "mean"], rows)]
     if "three_way" in results:
         scores = results["three_way"]
         keys = ["epe_3way", "epe_fd", "epe_fs", "epe_bs", "dynamic_iou"]

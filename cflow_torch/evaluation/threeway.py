@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any, Dict, List, Union
+from typing import Any, Dict, List, Tuple, Union
 
 import numpy as np
 
 from cflow_torch.evaluation.accumulator import Accumulator
-from cflow_torch.evaluation.categories import META_NAMES, meta_class
+from cflow_torch.evaluation.categories import CATEGORIES, CATEGORY_INDEX, META_CLASSES, meta_class
 from cflow_torch.evaluation.definitions import Definition
 from cflow_torch.evaluation.masks import ScoredPoints
 
-CLASSES = ("background", "foreground")
 MOTIONS = ("static", "dynamic")
 DISTANCES = ("close", "far")
 QUANTITIES = ("epe", "accuracy_strict", "accuracy_relax", "angle_error")
@@ -19,8 +18,11 @@ ACCURACY_STRICT, ACCURACY_RELAX = 0.05, 0.1  # metres, and share of the true flo
 ACCURACY_EPS = 1e-10  # metres, keeps the share finite
 FRAME_COUNT_EPS, FRAME_IOU_EPS = 1e-8, 1e-6  # of OpenSceneFlow's per-frame values
 
-# The three sets of the score as (class, motion).
-_SETS = {"epe_fd": (1, 1), "epe_fs": (1, 0), "epe_bs": (0, 0)}
+# The three sets of the score as (categories, motion).
+_FOREGROUND = slice(1, None)
+_SETS: Dict[str, Tuple[Any, int]] = {"epe_fd": (_FOREGROUND, 1), "epe_fs": (_FOREGROUND, 0), "epe_bs": (0, 0)}
+_GROUPS: Dict[str, Any] = {"background": slice(0, 1), "foreground": _FOREGROUND}
+_META_GROUPS: Dict[str, Any] = {name: [CATEGORY_INDEX[c] for c in members] for name, members in META_CLASSES.items()}
 
 
 def point_quantities(predicted: np.ndarray, true: np.ndarray, sweep_interval: float) -> np.ndarray:
@@ -56,73 +58,85 @@ class ThreeWayEPE(Accumulator):
     Convention: a point is dynamic if its true residual is at least `dynamic_threshold`. With average "points" all
     means are over all points and a set without points is NaN; with "frames" the three errors and the IoU are means
     over frames, where an absent set counts as 0, so that frames without movers pull `epe_fd` and the IoU down. The
-    breakdown is over points in both cases.
+    breakdowns are over points in both cases.
     """
 
-    totals = ("count", "sums", "segmentation", "num_frames", "frame_sums")
+    totals = ("count", "num_predicted", "sums", "num_frames", "frame_sums")
 
     def __init__(self, definition: Union[str, Definition] = "opensceneflow") -> None:
         super().__init__(definition)
-        self.count = np.zeros((2, 2, 2), dtype=np.int64)  # class, motion, distance
-        self.sums = np.zeros((len(QUANTITIES), 2, 2, 2), dtype=np.float64)
-        self.segmentation = np.zeros(3, dtype=np.int64)  # true positives, false positives, false negatives
+        shape = (len(CATEGORIES), len(MOTIONS), len(DISTANCES))
+        self.count = np.zeros(shape, dtype=np.int64)
+        self.num_predicted = np.zeros(shape, dtype=np.int64)  # points predicted as dynamic
+        self.sums = np.zeros((len(QUANTITIES), *shape), dtype=np.float64)
         self.num_frames = 0
         self.frame_sums = np.zeros(len(_SETS) + 1, dtype=np.float64)  # per-frame values of the sets and the IoU
 
     def update_points(self, scored: ScoredPoints) -> None:
         """Add the scored points of one frame."""
         keep = scored.in_region
-        foreground = scored.category > 0
+        meta = meta_class(scored.category)
         if self.definition.foreground == "meta":
-            meta = meta_class(scored.category)
-            foreground = meta > META_NAMES.index("BACKGROUND")
             keep = keep & (meta >= 0)
         true, predicted = scored.is_dynamic[keep], scored.predicted_dynamic[keep]
-        cell = 4 * foreground[keep] + 2 * true + ~scored.is_close[keep]
+        cell = 4 * scored.category[keep] + 2 * true + ~scored.is_close[keep]
         quantities = point_quantities(
             scored.predicted_flow[keep], scored.true_flow[keep], self.definition.sweep_interval
         )
-        count = np.bincount(cell, minlength=8).reshape(2, 2, 2)
-        sums = np.stack([np.bincount(cell, row, minlength=8).reshape(2, 2, 2) for row in quantities])
-        segmentation = np.array([(true & predicted).sum(), (~true & predicted).sum(), (true & ~predicted).sum()])
+        size, shape = self.count.size, self.count.shape
+        count = np.bincount(cell, minlength=size).reshape(shape)
+        num_predicted = np.bincount(cell[predicted], minlength=size).reshape(shape)
+        sums = np.stack([np.bincount(cell, row, minlength=size).reshape(shape) for row in quantities])
         self.count += count
+        self.num_predicted += num_predicted
         self.sums += sums
-        self.segmentation += segmentation
         self.num_frames += 1
         means = [sums[0][place].sum() / (count[place].sum() + FRAME_COUNT_EPS) for place in _SETS.values()]
-        self.frame_sums += np.array([*means, segmentation[0] / (segmentation.sum() + FRAME_IOU_EPS)])
+        hits, union = _segmentation(count, num_predicted)
+        self.frame_sums += np.array([*means, hits / (union + FRAME_IOU_EPS)])
 
     def compute(self) -> Dict[str, Any]:
         """Scores so far.
 
         Returns:
             `epe_fd`, `epe_fs`, `epe_bs`, `epe_3way` in metres, `dynamic_iou`, `num_frames`, and "breakdown":
-            class -> motion -> "all" / "close" / "far" -> `count` and the values of `QUANTITIES`.
+            "background" / "foreground" -> "static" / "dynamic" -> "all" / "close" / "far" -> `count`, `num_predicted`
+            (points predicted as dynamic) and the values of `QUANTITIES`; "by_class": the same per meta class.
         """
         with np.errstate(divide="ignore", invalid="ignore"):
             if self.definition.average == "frames":
                 values = self.frame_sums / self.num_frames
             else:
                 means = [self.sums[0][place].sum() / self.count[place].sum() for place in _SETS.values()]
-                values = np.array([*means, self.segmentation[0] / self.segmentation.sum()])
+                hits, union = _segmentation(self.count, self.num_predicted)
+                values = np.array([*means, np.float64(hits) / union])
         result: Dict[str, Any] = {key: float(value) for key, value in zip(_SETS, values)}
         result["epe_3way"] = float(np.mean(values[: len(_SETS)]))
         result["dynamic_iou"] = float(values[-1])
         result["num_frames"] = self.num_frames
-        result["breakdown"] = {
-            name: {motion: self._cells(row, column) for column, motion in enumerate(MOTIONS)}
-            for row, name in enumerate(CLASSES)
-        }
+        result["breakdown"] = {name: self._group(place) for name, place in _GROUPS.items()}
+        result["by_class"] = {name: self._group(place) for name, place in _META_GROUPS.items()}
         return result
 
-    def _cells(self, row: int, column: int) -> Dict[str, Dict[str, float]]:
-        counts, sums = self.count[row, column], self.sums[:, row, column]
-        cells = {"all": (counts.sum(), sums.sum(axis=1))}
-        cells.update({name: (counts[place], sums[:, place]) for place, name in enumerate(DISTANCES)})
+    def _group(self, categories: Any) -> Dict[str, Dict[str, Dict[str, float]]]:
+        """Motion -> distance -> means over a group of categories."""
+        count, predicted = self.count[categories].sum(axis=0), self.num_predicted[categories].sum(axis=0)
+        sums = self.sums[:, categories].sum(axis=1)
+        places: Dict[str, Any] = {"all": slice(None), **{name: [place] for place, name in enumerate(DISTANCES)}}
         return {
-            name: {
-                "count": int(count),
-                **{key: float(total / count) if count else float("nan") for key, total in zip(QUANTITIES, totals)},
+            motion: {
+                name: _means(count[row, place].sum(), predicted[row, place].sum(), sums[:, row, place].sum(axis=1))
+                for name, place in places.items()
             }
-            for name, (count, totals) in cells.items()
+            for row, motion in enumerate(MOTIONS)
         }
+
+
+def _segmentation(count: np.ndarray, num_predicted: np.ndarray) -> Tuple[int, int]:
+    """Points that are dynamic in truth and prediction; in truth or prediction."""
+    return int(num_predicted[:, 1].sum()), int(count[:, 1].sum() + num_predicted[:, 0].sum())
+
+
+def _means(count: np.integer, num_predicted: np.integer, sums: np.ndarray) -> Dict[str, float]:
+    means = {key: float(total / count) if count else float("nan") for key, total in zip(QUANTITIES, sums)}
+    return {"count": int(count), "num_predicted": int(num_predicted), **means}

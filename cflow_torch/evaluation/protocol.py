@@ -1,0 +1,138 @@
+"""One number from several data sets: mean of a data set's ranges, then the unweighted mean over data sets."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Dict, List, Mapping, Optional, Sequence, Tuple
+
+from cflow_torch.types import CFlowError
+
+CHALLENGE_DATA_SETS: Tuple[str, ...] = ("AEVA", "AV2", "nuScenes", "TruckScenes", "Waymo")
+CHALLENGE_RANGES: Tuple[str, ...] = ("0-35", "35-70")
+
+
+@dataclass(frozen=True)
+class ProtocolScores:
+    """What `score_data_sets` returns.
+
+    Args:
+        overall: unweighted mean over data sets; NaN if anything is missing.
+        data_sets: data set -> mean of its ranges; NaN if one of them is missing.
+        ranges: range -> unweighted mean over data sets; NaN if one of them is missing.
+        missing: one sentence for each data set or range without a value; empty if all are there.
+    """
+
+    overall: float
+    data_sets: Dict[str, float]
+    ranges: Dict[str, float]
+    missing: Tuple[str, ...]
+
+    def to_dict(self) -> Dict[str, Any]:
+        """Plain dictionary, for JSON."""
+        return {
+            "overall": self.overall,
+            "data_sets": dict(self.data_sets),
+            "ranges": dict(self.ranges),
+            "missing": list(self.missing),
+        }
+
+
+def errors_by_range(results: Mapping[str, Any], class_name: Optional[str] = None) -> Dict[str, float]:
+    """Dynamic bucket-normalised error of each range, of what `SceneFlowMetrics.compute` returned.
+
+    Args:
+        results: scores of a definition with the metric "bucketed_by_range", also as read back from results.json.
+        class_name: a meta class; None = the mean over classes.
+
+    Returns:
+        Range ("0-35", ...) -> error; NaN where the range has no moving points.
+
+    Raises:
+        CFlowError: the metric or the class is not among the results.
+    """
+    if "bucketed_by_range" not in results:
+        raise CFlowError(
+            f"the results hold {sorted(results)}, not 'bucketed_by_range'; score with definition='challenge_2026' or "
+            f"another one whose metrics include it"
+        )
+    errors = {}
+    for name, scores in results["bucketed_by_range"]["ranges"].items():
+        if class_name is not None and class_name not in scores["classes"]:
+            raise CFlowError(f"classes are {sorted(scores['classes'])}, got {class_name!r}")
+        row = scores["mean"] if class_name is None else scores["classes"][class_name]
+        errors[name] = math.nan if row["dynamic_error"] is None else float(row["dynamic_error"])
+    return errors
+
+
+def score_data_sets(
+    results: Mapping[str, Mapping[str, Optional[float]]],
+    data_sets: Optional[Sequence[str]] = None,
+    ranges: Optional[Sequence[str]] = None,
+    missing: str = "error",
+) -> ProtocolScores:
+    """Combine the errors of several data sets.
+
+    Args:
+        results: data set -> range -> error, for example `{"AV2": errors_by_range(scores)}`; NaN or None = no value.
+        data_sets: those that must be there, for example `CHALLENGE_DATA_SETS`; None = those of `results`.
+        ranges: those that every data set must have; None = every range that any data set has.
+        missing: "error": refuse results with a hole; "nan": NaN for every mean that a hole enters, and the reasons
+            in `ProtocolScores.missing`. A mean over fewer sets or ranges than asked for is never given.
+
+    Returns:
+        Overall, per data set, per range.
+
+    Raises:
+        CFlowError: something is missing (unless `missing="nan"`); data sets or ranges that were not asked for; nothing
+            to combine.
+
+    Example:
+        >>> scores = score_data_sets({"A": {"0-35": 0.25, "35-70": 0.75}, "B": {"0-35": 0.25, "35-70": 0.25}})
+        >>> scores.data_sets, scores.overall
+        ({'A': 0.5, 'B': 0.25}, 0.375)
+    """
+    if missing not in ("error", "nan"):
+        raise CFlowError(f"missing is 'error' or 'nan', got {missing!r}")
+    set_names = list(results if data_sets is None else data_sets)
+    range_names = list(dict.fromkeys(name for row in results.values() for name in row) if ranges is None else ranges)
+    if not set_names or not range_names:
+        raise CFlowError(f"nothing to combine: data sets {set_names}, ranges {range_names}")
+    _refuse_unknown("data set", results, set_names)
+    reasons: List[str] = []
+    table: Dict[str, List[float]] = {}
+    for set_name in set_names:
+        row = results.get(set_name)
+        _refuse_unknown(f"range of {set_name}", row or {}, range_names)
+        table[set_name] = [_value(row, name) for name in range_names]
+        if row is None:
+            reasons.append(f"data set {set_name} has no results")
+        else:
+            reasons += [
+                f"data set {set_name}, range {name}: " + ("no moving points (NaN)" if name in row else "no result")
+                for name, value in zip(range_names, table[set_name])
+                if math.isnan(value)
+            ]
+    if reasons and missing == "error":
+        raise CFlowError(
+            "; ".join(reasons) + ": an overall score needs them all. Score the missing part, name the data sets and "
+            "ranges that you mean, or pass missing='nan' to get NaN and this list"
+        )
+    per_set = {name: _mean(row) for name, row in table.items()}
+    per_range = {name: _mean([row[i] for row in table.values()]) for i, name in enumerate(range_names)}
+    return ProtocolScores(_mean(list(per_set.values())), per_set, per_range, tuple(reasons))
+
+
+def _value(row: Optional[Mapping[str, Optional[float]]], name: str) -> float:
+    value = None if row is None else row.get(name)
+    return math.nan if value is None else float(value)
+
+
+def _mean(values: Sequence[float]) -> float:
+    return math.fsum(values) / len(values)  # NaN if any is NaN
+
+
+def _refuse_unknown(what: str, given: Mapping[str, Any], allowed: Sequence[str]) -> None:
+    unknown = [name for name in given if name not in allowed]
+    if unknown:
+        raise CFlowError(f"{what}: {unknown} given, but only {list(allowed)} asked for; leave out or ask for all")

@@ -1,0 +1,157 @@
+"""Several data sets and ranges to one number, on made-up results and on the figures that the paper prints."""
+
+from __future__ import annotations
+
+import json
+import math
+from decimal import ROUND_HALF_UP, Decimal
+from typing import Any, Dict, Tuple
+
+import numpy as np
+import pytest
+
+from cflow_torch.data.log import FlowLabels
+from cflow_torch.evaluation import EvalFrame, SceneFlowMetrics
+from cflow_torch.evaluation.protocol import (
+    CHALLENGE_DATA_SETS,
+    CHALLENGE_RANGES,
+    errors_by_range,
+    score_data_sets,
+)
+from cflow_torch.types import CFlowError
+
+# Figure "experiment_av2challenge_across_dataset": overall, then AEVA, AV2, nuScenes, TruckScenes, Waymo.
+BARS: Dict[str, Tuple[str, ...]] = {
+    "CorrelationFlow": ("0.444", "0.4216", "0.3587", "0.6449", "0.45395", "0.34085"),
+    "SSF": ("0.46905", "0.61795", "0.2032", "0.6519", "0.6205", "0.25175"),
+    "CorrelationFlow-Keypoint": ("0.527", "0.59645", "0.3758", "0.73635", "0.5783", "0.3482"),
+    "RVLoss": ("0.5778", "0.6098", "0.5148", "0.6355", "0.60355", "0.52545"),
+    "TeFlow": ("0.6125", "0.6422", "0.54225", "0.6835", "0.6496", "0.54495"),
+    "SeFlow++": ("0.70255", "0.8344", "0.46895", "0.83565", "0.8514", "0.52225"),
+    "VoteFlow": ("0.70375", "0.842", "0.478", "0.8471", "0.84125", "0.51045"),
+    "SeFlow": ("0.7367", "0.8669", "0.48755", "0.90285", "0.8697", "0.55665"),
+}
+# Figure "performance_evolution_2x2": (0-35, 35-70) of AEVA, AV2, TruckScenes, Waymo. It does not show nuScenes.
+BY_RANGE: Dict[str, Tuple[Tuple[float, float], ...]] = {
+    "CorrelationFlow": ((0.3603, 0.4829), (0.2106, 0.5068), (0.3043, 0.6036), (0.2141, 0.4676)),
+    "SSF": ((0.63, 0.6059), (0.1597, 0.2467), (0.6409, 0.6001), (0.202, 0.3015)),
+    "CorrelationFlow-Keypoint": ((0.4636, 0.7293), (0.2952, 0.4564), (0.6273, 0.5293), (0.2756, 0.4208)),
+    "RVLoss": ((0.3273, 0.8923), (0.1632, 0.8664), (0.3183, 0.8888), (0.1813, 0.8696)),
+    "TeFlow": ((0.3875, 0.8969), (0.2019, 0.8826), (0.3884, 0.9108), (0.1979, 0.892)),
+    "SeFlow++": ((0.8057, 0.8631), (0.2827, 0.6552), (0.8555, 0.8473), (0.3192, 0.7253)),
+    "VoteFlow": ((0.7961, 0.8879), (0.2904, 0.6656), (0.831, 0.8515), (0.3067, 0.7142)),
+    "SeFlow": ((0.8412, 0.8926), (0.3113, 0.6638), (0.8885, 0.8509), (0.3494, 0.7639)),
+}
+SHOWN_BY_RANGE = ("AEVA", "AV2", "TruckScenes", "Waymo")
+
+
+def rounded_like(value: float, printed: str) -> str:
+    """The value with as many decimals as the printed figure, halves away from zero."""
+    # 12 digits first: binary fractions put exact halves such as 0.468950 on either side
+    return str(Decimal(f"{value:.12f}").quantize(Decimal(printed), rounding=ROUND_HALF_UP))
+
+
+@pytest.mark.parametrize("method", sorted(BARS))
+def test_data_sets_of_the_paper_are_means_of_their_ranges(method: str) -> None:
+    results = {name: dict(zip(CHALLENGE_RANGES, pair)) for name, pair in zip(SHOWN_BY_RANGE, BY_RANGE[method])}
+    scores = score_data_sets(results, SHOWN_BY_RANGE, CHALLENGE_RANGES)
+    printed = dict(zip(CHALLENGE_DATA_SETS, BARS[method][1:]))
+    for name in SHOWN_BY_RANGE:
+        assert rounded_like(scores.data_sets[name], printed[name]) == printed[name]
+
+
+# Printed with five digits, not reproduced in the fifth. Every printed overall is a multiple of 0.00005, as the mean of
+# two four-digit numbers is: the leader board seems to average over data sets first, round each range to four digits,
+# and the figure shows their mean. That moves a figure by 0.00005 at most.
+FIFTH_DIGIT = {"SSF": "0.46906", "SeFlow++": "0.70253", "VoteFlow": "0.70376"}
+
+
+@pytest.mark.parametrize("method", sorted(BARS))
+def test_overall_of_the_paper_is_the_mean_over_data_sets(method: str) -> None:
+    overall, *per_set = BARS[method]
+    results = {name: {"0-70": float(value)} for name, value in zip(CHALLENGE_DATA_SETS, per_set)}
+    scores = score_data_sets(results, CHALLENGE_DATA_SETS)
+    assert rounded_like(scores.overall, overall) == FIFTH_DIGIT.get(method, overall)
+    assert scores.overall == pytest.approx(float(overall), abs=5e-5, rel=0)
+
+
+def test_the_paper_in_four_digits() -> None:
+    expected = {"CorrelationFlow": "0.4440", "SSF": "0.4691", "CorrelationFlow-Keypoint": "0.5270"}
+    for method, overall in expected.items():
+        results = {name: {"0-70": float(value)} for name, value in zip(CHALLENGE_DATA_SETS, BARS[method][1:])}
+        assert rounded_like(score_data_sets(results).overall, overall) == overall
+
+
+def test_ranges_then_data_sets() -> None:
+    scores = score_data_sets({"A": {"0-35": 0.25, "35-70": 0.75}, "B": {"0-35": 0.125, "35-70": 0.375}})
+    assert scores.data_sets == {"A": 0.5, "B": 0.25}
+    assert scores.ranges == {"0-35": 0.1875, "35-70": 0.5625}
+    assert (scores.overall, scores.missing) == (0.375, ())
+
+
+HOLES = [
+    ({"A": {"0-35": 0.25, "35-70": 0.5}}, "data set B has no results"),
+    ({"A": {"0-35": 0.25, "35-70": 0.5}, "B": {"0-35": 0.25}}, "data set B, range 35-70: no result"),
+    ({"A": {"0-35": 0.25, "35-70": 0.5}, "B": {"0-35": 0.25, "35-70": math.nan}}, "no moving points"),
+    ({"A": {"0-35": 0.25, "35-70": 0.5}, "B": {"0-35": 0.25, "35-70": None}}, "no moving points"),
+]
+
+
+@pytest.mark.parametrize("results, reason", HOLES)
+def test_holes_are_refused_or_listed(results: Dict[str, Dict[str, float]], reason: str) -> None:
+    with pytest.raises(CFlowError, match=reason):
+        score_data_sets(results, ("A", "B"), CHALLENGE_RANGES)
+    scores = score_data_sets(results, ("A", "B"), CHALLENGE_RANGES, missing="nan")
+    assert len(scores.missing) == 1 and reason in scores.missing[0]
+    assert scores.data_sets["A"] == 0.375
+    assert math.isnan(scores.data_sets["B"]) and math.isnan(scores.overall) and math.isnan(scores.ranges["35-70"])
+
+
+def test_a_range_that_one_set_has_is_asked_of_all() -> None:
+    with pytest.raises(CFlowError, match="data set B, range 35-70: no result"):
+        score_data_sets({"A": {"0-35": 0.25, "35-70": 0.5}, "B": {"0-35": 0.25}})
+
+
+def test_what_was_not_asked_for_is_refused() -> None:
+    results = {"A": {"0-35": 0.25, "35-70": 0.5}, "B": {"0-35": 0.25, "35-70": 0.5}}
+    with pytest.raises(CFlowError, match=r"\['B'\] given"):
+        score_data_sets(results, ("A",))
+    with pytest.raises(CFlowError, match=r"range of A: \['35-70'\] given"):
+        score_data_sets(results, ranges=("0-35",))
+    with pytest.raises(CFlowError, match="nothing to combine"):
+        score_data_sets({})
+    with pytest.raises(CFlowError, match="'error' or 'nan'"):
+        score_data_sets(results, missing="skip")
+
+
+def test_from_scores_of_frames(frame_scores: Dict[str, Any]) -> None:
+    errors = errors_by_range(frame_scores)
+    assert errors == {"0-35": 1.0, "35-70": 0.5}
+    assert errors_by_range(frame_scores, "CAR") == errors
+    assert math.isnan(errors_by_range(frame_scores, "PEDESTRIAN")["0-35"])
+    scores = score_data_sets({"A": errors})
+    assert scores.overall == frame_scores["bucketed_by_range"]["mean"]["dynamic_error"] == 0.75
+    assert json.loads(json.dumps(scores.to_dict()))["data_sets"] == {"A": 0.75}
+
+
+def test_from_scores_without_ranges(frame_scores: Dict[str, Any]) -> None:
+    with pytest.raises(CFlowError, match="challenge_2026"):
+        errors_by_range({"bucketed": {}})
+    with pytest.raises(CFlowError, match="classes are"):
+        errors_by_range(frame_scores, "TRAM")
+
+
+@pytest.fixture
+def frame_scores() -> Dict[str, Any]:
+    """One car point 10 m away, missed; one 50 m away, half of its motion found; one 90 m away, in no range."""
+    truth = np.array([[1, 0, 0]] * 3, dtype=np.float32)
+    metrics = SceneFlowMetrics("challenge_2026")
+    metrics.update(
+        EvalFrame(
+            points=np.array([[10, 0, 0], [0, 50, 0], [90, 0, 0]]),
+            labels=FlowLabels(truth, np.full(3, 19, dtype=np.uint8), np.ones(3, dtype=bool)),
+            residual_flow=np.array([[0, 0, 0], [0.5, 0, 0], [1, 0, 0]]),
+            T_ego1_ego0=np.eye(4),
+        )
+    )
+    return metrics.compute()
