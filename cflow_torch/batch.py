@@ -88,10 +88,13 @@ def split_windows(windows: Sequence[Window], config: Config, grid: Grid) -> List
     check_windows(windows)
     groups: List[List[Window]] = []
     used = 0
+    per_point = _BYTES_PER_POINT
+    if config.method == "keypoints":  # descriptors: two copies of L^2 bytes for at most half of the points
+        per_point += config.patch_size**2
     for window in windows:
         sweeps = (window.pc1, window.pc0, *window.pch)
         points = sum(sweep.points.shape[0] for sweep in sweeps)
-        needed = _BYTES_PER_POINT * points + (_BYTES_PER_PIXEL * len(sweeps) + 30) * grid.height * grid.width
+        needed = per_point * points + (_BYTES_PER_PIXEL * len(sweeps) + 30) * grid.height * grid.width
         if not groups or (config.max_memory is not None and used + needed > config.max_memory):
             groups.append([])
             used = 0

@@ -148,7 +148,7 @@ PRESETS: Dict[str, Dict[str, Any]] = {
     "keypoints": {
         "method": "keypoints",
         "densify": "clusters",
-        "patch_size": 31,
+        "patch_size": 41,
         "ratio_threshold": 1.02,
         "gate_radius": 2.0,
         "point_cloud_range": (-51.2, -51.2, -math.inf, 51.2, 51.2, math.inf),

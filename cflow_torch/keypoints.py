@@ -105,8 +105,7 @@ def describe(images: Tensor, is_key_point: Tensor, patch_size: int) -> Tuple[Ten
     line = place // width
     window, col = line // height, place - line * width
     row = line - window * height
-    patch = gather_patches(images, window, row, col, patch_size)
-    return place, KeyPoints(window, row, col, patch, patch.sum(1))
+    return place, KeyPoints(window, row, col, *gather_patches(images, window, row, col, patch_size))
 
 
 def gate(batch: Batch, grid: Grid, config: Config) -> Tensor:

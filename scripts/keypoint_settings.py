@@ -21,6 +21,7 @@ import yaml
 from tqdm import tqdm
 
 from cflow_torch import Window, make_config, make_model
+from cflow_torch.config import PRESETS
 from cflow_torch.data.log import FlowLabels, window
 from cflow_torch.data.synthetic import make_drive
 from cflow_torch.evaluation.frame import EvalFrame
@@ -29,6 +30,8 @@ from cflow_torch.evaluation.metrics import SceneFlowMetrics
 SEEDS = tuple(range(200, 210))
 WINDOWS_PER_DRIVE = 4
 CLASSES = ("CAR", "OTHER_VEHICLES", "PEDESTRIAN", "WHEELED_VRU")
+
+SWEPT = ("densify", "patch_size", "ratio_threshold", "gate_radius", "second_best_distance", "mutual_check")
 
 Item = Tuple[Window, FlowLabels]
 Row = Dict[str, Any]
@@ -64,16 +67,21 @@ def score(items: List[Item], settings: Dict[str, Any]) -> Dict[str, float]:
 
 
 def one_at_a_time(chosen: Row) -> List[Row]:
-    """The chosen settings, then each of them changed alone."""
+    """The dense method, the chosen settings, then each of them changed alone."""
+    chosen = {**{name: PRESETS["keypoints"][name] for name in PRESETS["keypoints"] if name in SWEPT}, **chosen}
     changes: Dict[str, Tuple[Any, ...]] = {
         "densify": ("components", "clusters", "nearest"),
-        "patch_size": (7, 9, 11, 13, 15, 21, 31),
+        "patch_size": (7, 11, 15, 21, 31, 41, 51),
         "ratio_threshold": (1.0, 1.02, 1.05, 1.1, 1.2, 1.3),
-        "gate_radius": (1.5, 2.0, 3.0, 4.0),
+        "gate_radius": (1.5, 2.0, 2.5, 3.0, 4.0),
         "second_best_distance": (0.0, 2.0, 3.0, 5.0),
         "mutual_check": (False, True),
     }
-    return [chosen, *({**chosen, name: value} for name, values in changes.items() for value in values)]
+    return [
+        {"method": "dense"},
+        chosen,
+        *({**chosen, name: value} for name, values in changes.items() for value in values),
+    ]
 
 
 def parse(settings: List[str]) -> Dict[str, List[Any]]:
@@ -86,7 +94,13 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--grid", nargs="+", metavar="NAME=V,V", help="all combinations of these values")
-    parser.add_argument("--base", nargs="*", default=[], metavar="NAME=V", help="what differs from the preset `paper`")
+    parser.add_argument(
+        "--base",
+        nargs="*",
+        default=[],
+        metavar="NAME=V",
+        help="what differs from the preset (with --grid: from `paper`)",
+    )
     arguments = parser.parse_args()
     base = {name: values[0] for name, values in parse(arguments.base).items()}
     rows = one_at_a_time(base)
@@ -95,7 +109,7 @@ def main() -> None:
         rows = [{**base, **dict(zip(grid, values))} for values in itertools.product(*grid.values())]
     items = load()
     names = sorted({name for row in rows for name in row})
-    print(f"{len(items)} windows; classes: dynamic bucket-normalised error; EPE in metres; base: {base or 'paper'}\n")
+    print(f"{len(items)} windows; classes: dynamic bucket-normalised error; EPE in metres; base: {base or 'preset'}\n")
     first = None
     for row in tqdm(rows, unit="setting"):
         figures = score(items, row)

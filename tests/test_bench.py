@@ -146,6 +146,7 @@ def test_clusters_are_numbered_in_raster_order():
 def report():
     threads = torch.get_num_threads()
     configs = {"one": config(), "history": config(num_history=1), "section": config(sectional_view=True)}
+    configs["keys"] = config(method="keypoints")
     result = run_bench([moving_boxes(2), moving_boxes(1)], configs, repeats=3, num_threads=1, device="cpu")
     assert torch.get_num_threads() == threads
     return result
@@ -158,16 +159,18 @@ def test_report_is_strict_json_with_the_promised_keys(report):
     assert report["machine"]["threads"] == 1
     assert report["machine"]["device"] == "cpu"
     assert report["machine"]["versions"]["torch"].split("+")[0] == torch.__version__.split("+")[0]
-    assert list(report["results"]) == ["one", "history", "section"]
+    assert list(report["results"]) == ["one", "history", "section", "keys"]
     keys = ["config", "fast", "stages_s", "opencv", "opencv_over_fast", "reference", "agreement", "clustering"]
     for result in report["results"].values():
         assert list(result) == [*keys, "peak_extra_mb"]
         assert 0 < result["fast"]["min_s"] <= result["fast"]["median_s"] <= result["fast"]["max_s"]
-        assert set(result["stages_s"]) == set(STAGES)
+        assert set(result["stages_s"]) == set(STAGES[result["config"]["method"]])
         assert all(seconds > 0 for seconds in result["stages_s"].values())
 
 
 def test_report_compares_flows(report):
+    assert report["results"]["keys"]["agreement"]["reference"]["bit_equal"] is True
+    assert report["results"]["keys"]["clustering"]["fast"] == "no clustering"
     for name in ("one", "history"):
         agreement = report["results"][name]["agreement"]
         assert agreement["reference"]["bit_equal"] is True
@@ -207,8 +210,8 @@ def test_ratio_pairs_neighbouring_runs(monkeypatch):
 def test_table_prints(report):
     text = format_bench(report)
     rows = [line for line in text.splitlines() if line.startswith("|")]
-    assert [row.split("|")[1].strip() for row in rows] == ["", "---", "one", "history", "section"] * 2
-    assert len({row.count("|") for row in rows[:5]}) == 1
+    assert [row.split("|")[1].strip() for row in rows] == ["", "---", "one", "history", "section", "keys"] * 2
+    assert len({row.count("|") for row in rows[:6]}) == 1
     median = report["results"]["one"]["fast"]["median_s"]
     assert f"| one | {1000 * median:.1f} |" in text
     assert "has no sectional view" in rows[4]

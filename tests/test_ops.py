@@ -13,7 +13,9 @@ from scipy.sparse import coo_matrix, csgraph
 from cflow_torch.ops import morphology
 from cflow_torch.ops.cross_correlation import cross_correlate, fft_length
 from cflow_torch.ops.labeling import connected_components, connected_components_kornia, union_find
-from cflow_torch.ops.segments import bounding_boxes, first_of_segment, masked_median, segment_amin
+from cflow_torch.ops.nearest import nearest_set_pixel
+from cflow_torch.ops.patches import gather_patches
+from cflow_torch.ops.segments import bounding_boxes, first_of_segment, masked_median, segment_amin, segment_median
 from cflow_torch.types import CFlowError
 
 SQUARE = np.ones((3, 3), dtype=bool)
@@ -320,3 +322,56 @@ def test_cross_correlation_on_cuda_equals_cpu(shape, engine):
     own = torch.arange(6)
     on_gpu = counts(template.cuda(), target.cuda(), own.cuda(), engine).cpu()
     assert torch.equal(on_gpu, counts(template, target, own, "fft"))
+
+
+# ------------------------------------------------------------------------------------------ of the key points
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 7), (7, 2), (9, 13)])
+def test_erode_cross_is_scipys_with_background_outside(shape):
+    for seed in range(20):
+        image = np.random.default_rng(seed).random((2, *shape)) < 0.8
+        expected = np.stack([ndimage.binary_erosion(part, border_value=0) for part in image])
+        np.testing.assert_array_equal(morphology.erode_cross(torch.from_numpy(image)).numpy(), expected)
+
+
+@pytest.mark.parametrize("size", [1, 3, 7, 13])
+def test_gather_patches(size):
+    images = np.random.default_rng(size).random((3, 6, 9)) < 0.4
+    place = [torch.from_numpy(index) for index in np.indices(images.shape).reshape(3, -1)]
+    patches, energy = gather_patches(torch.from_numpy(images), *place, size)
+    half = size // 2
+    padded = np.pad(images, [(0, 0), (half, half), (half, half)])
+    expected = [padded[b, r : r + size, c : c + size].flatten() for b, r, c in np.ndindex(images.shape)]
+    np.testing.assert_array_equal(patches.numpy(), np.array(expected))
+    assert energy.tolist() == [int(patch.sum()) for patch in expected]
+    assert patches.dtype == torch.uint8 and energy.dtype == torch.int64
+
+
+def test_nearest_set_pixel_is_the_first_of_the_nearest():
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        seeds = rng.random((3, 11, 8)) < (0.0, 0.02, 0.2)[seed % 3]
+        seeds[1] = False
+        pixels = np.sort(rng.choice(seeds.size, 60, replace=False))
+        expected = []
+        for image, row, col in zip(*np.unravel_index(pixels, seeds.shape)):
+            places = np.argwhere(seeds[image])  # in raster order: argmin takes the first of equals
+            distance = ((places - (row, col)) ** 2).sum(1)
+            best = places[distance.argmin()] if len(places) else None
+            expected.append(-1 if best is None else np.ravel_multi_index((image, *best), seeds.shape))
+        found = nearest_set_pixel(torch.from_numpy(seeds), torch.from_numpy(pixels))
+        assert found.tolist() == [int(place) for place in expected]
+    assert nearest_set_pixel(torch.ones((1, 2, 2), dtype=torch.bool), torch.zeros(0, dtype=torch.int64)).shape == (0,)
+
+
+def test_segment_median_is_numpys():
+    rng = np.random.default_rng(0)
+    for num_segments in (1, 5, 40):
+        values, index = rng.integers(-4, 5, 60).astype(np.float64), rng.integers(0, num_segments, 60)
+        median = segment_median(torch.from_numpy(values), torch.from_numpy(index), num_segments)
+        for segment in range(num_segments):
+            members = values[index == segment]
+            assert median[segment] == (np.median(members) if len(members) else 0)
+    nothing = torch.zeros(0, dtype=torch.float64)
+    assert segment_median(nothing, torch.zeros(0, dtype=torch.int64), 3).tolist() == [0, 0, 0]

@@ -20,13 +20,16 @@ from cflow_torch.batch import make_batch
 from cflow_torch.bench.opencv_loop import find_clusters, opencv, opencv_flow
 from cflow_torch.cluster import cluster
 from cflow_torch.config import Config
-from cflow_torch.dense import CorrelationFlow
+from cflow_torch.estimate import make_model
 from cflow_torch.grid import Grid
 from cflow_torch.reference import reference_flow
 from cflow_torch.types import CFlowError, FlowResult, Window
 
-# Names of the record_function blocks of the fast path.
-STAGES = ("compensate", "project", "cluster", "correlate", "pool", "spread")
+# Names of the record_function blocks of each method.
+STAGES = {
+    "dense": ("compensate", "project", "cluster", "correlate", "pool", "spread"),
+    "keypoints": ("compensate", "project", "describe", "match", "densify", "spread"),
+}
 _PROFILED_RUNS = 5
 # Rest between two timed runs: worker threads of the library that ran before spin for some milliseconds after their
 # last job, and would take the cores from the other one. (A product of large matrices in the OpenCV loop, whose BLAS
@@ -58,7 +61,7 @@ def run_bench(
         with_reference: also run the slow reference, once per window.
         with_opencv: also run the OpenCV loop, if OpenCV is installed.
         num_threads: threads of torch and OpenCV during the measurement; None = as many as torch has now.
-        device: as for `CorrelationFlow`; the OpenCV loop and the reference run on the CPU in any case.
+        device: as for `make_model`; the OpenCV loop and the reference run on the CPU in any case.
 
     Returns:
         A dictionary ready for strict JSON: "machine", "num_windows", "points" (mean number per sweep), "repeats",
@@ -86,7 +89,7 @@ def run_bench(
         for name, config in configs.items():
             trimmed = [replace(window, pch=tuple(window.pch)[: config.num_history]) for window in windows]
             results[name] = _measure(trimmed, config, repeats, with_reference, why_no_opencv, device)
-        machine = _machine(threads, CorrelationFlow(config, device)(trimmed[:1])[0].flow.device)
+        machine = _machine(threads, make_model(config, device)(trimmed[:1])[0].flow.device)
     sweeps = [sweep for window in windows for sweep in (window.pc0, window.pc1, *window.pch)]
     return {
         "machine": machine,
@@ -101,7 +104,7 @@ def _measure(
     windows: List[Window], config: Config, repeats: int, with_reference: bool, why_no_opencv: str, device: Any
 ) -> Report:
     """The entry of one config, see `run_bench`."""
-    model = CorrelationFlow(config, device)
+    model = make_model(config, device)
     plain = config.method == "dense" and config.clustering == "components"
     if not why_no_opencv and (config.sectional_view or not plain):
         why_no_opencv = "has no sectional view" if plain else "has no such method"
@@ -115,7 +118,7 @@ def _measure(
         return [opencv_flow(window, config) for window in windows]
 
     per_run = 1 / len(windows)
-    peak_extra_mb, flows = _peak_extra_mb(fast)
+    peak_extra_mb, flows = measure_peak(fast)
     opencv_seconds: Any = why_no_opencv
     ratio: Any = why_no_opencv
     agreement: Report = {"opencv": why_no_opencv, "reference": "not run"}
@@ -127,7 +130,7 @@ def _measure(
         opencv_seconds = _summary([t * per_run for t in loop_times])
         ratio = statistics.median(b / a for a, b in zip(fast_times, loop_times))
     reference_seconds: Any = "not run"
-    if with_reference and not plain:
+    if with_reference and config.clustering == "hdbscan":
         reference_seconds = agreement["reference"] = "not measured for this method"
     elif with_reference:
         start = time.perf_counter()
@@ -137,7 +140,7 @@ def _measure(
     return {
         "config": {key: _jsonable(value) for key, value in config.as_dict().items()},
         "fast": _summary([t * per_run for t in fast_times]),
-        "stages_s": {stage: t * per_run for stage, t in _stage_seconds(fast, flows[0]).items()},
+        "stages_s": {stage: t * per_run for stage, t in _stage_seconds(fast, flows[0], STAGES[config.method]).items()},
         "opencv": opencv_seconds,
         "opencv_over_fast": ratio,
         "reference": reference_seconds,
@@ -149,6 +152,8 @@ def _measure(
 
 def _measure_clustering(window: Window, config: Config, repeats: int, why_no_opencv: str, device: Any) -> Report:
     """Occupancy images -> clusters with boxes (dilate, label, erode, label again, number), finest scale, one window."""
+    if config.method != "dense":
+        return {"fast": "no clustering", "opencv": "no clustering"}
     x0, y0, z0, x1, y1, z1 = config.point_cloud_range
     grid = Grid(config.pixel_sizes[-1], (x0, y0, z0), (x1, y1, z1))
     batch = make_batch([window], config, grid, device)
@@ -187,7 +192,7 @@ def _alternate(runs: Sequence[Callable[[], Any]], repeats: int) -> List[List[flo
     return times
 
 
-def _stage_seconds(run: Callable[[], Any], result: FlowResult) -> Dict[str, float]:
+def _stage_seconds(run: Callable[[], Any], result: FlowResult, stages: Sequence[str]) -> Dict[str, float]:
     """Median seconds of each stage in a few profiled runs; kernels on a GPU, the host's clock otherwise."""
     on_gpu = result.flow.is_cuda
     activities = [ProfilerActivity.CPU] + ([ProfilerActivity.CUDA] if on_gpu else [])
@@ -197,7 +202,7 @@ def _stage_seconds(run: Callable[[], Any], result: FlowResult) -> Dict[str, floa
     events = [event for event in profiler.events() or [] if event.device_type == torch.autograd.DeviceType.CPU]
     events.sort(key=lambda event: event.time_range.start)
     medians = {}
-    for stage in STAGES:
+    for stage in stages:
         microseconds = [_kernel_microseconds(e) if on_gpu else e.cpu_time_total for e in events if e.name == stage]
         each = len(microseconds) // _PROFILED_RUNS  # blocks of this name in one run
         totals = [sum(microseconds[i * each : (i + 1) * each]) for i in range(_PROFILED_RUNS)]
@@ -227,7 +232,7 @@ def _same_bits(flows: Sequence[FlowResult], others: Sequence[FlowResult]) -> Dic
     return {"bit_equal": all(same.values()), **same}
 
 
-def _peak_extra_mb(run: Callable[[], List[FlowResult]]) -> Tuple[Union[float, str], List[FlowResult]]:
+def measure_peak(run: Callable[[], List[FlowResult]]) -> Tuple[Union[float, str], List[FlowResult]]:
     """Most memory held during a run above that before it, MB, and what the run returned.
 
     On a GPU torch's own count; on Linux the high-water mark of the resident set, which can be reset; else not measured.

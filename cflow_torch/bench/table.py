@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any, Dict, List
 
-from cflow_torch.bench.measure import STAGES
-
 Report = Dict[str, Any]
 
 
@@ -34,10 +32,11 @@ def format_bench(report: Report) -> str:
         + ["same flow as OpenCV", "within a pixel", "clustering ms", "OpenCV", "extra MB, at least"],
         [[name, *_row(result)] for name, result in results.items()],
     )
+    stages = list(dict.fromkeys(stage for result in results.values() for stage in result["stages_s"]))
     lines += ["", "Stages, ms (under the profiler):", ""]
     lines += _table(
-        ["", *STAGES],
-        [[name, *(_ms(result["stages_s"][stage]) for stage in STAGES)] for name, result in results.items()],
+        ["", *stages],
+        [[name, *(_ms(result["stages_s"].get(stage, "")) for stage in stages)] for name, result in results.items()],
     )
     return "\n".join(lines)
 

@@ -34,11 +34,11 @@ def task(cfg: DictConfig) -> None:
         "as configured": config,
         "twice the region": config.replace(point_cloud_range=[2 * bound for bound in config.point_cloud_range]),
     }
-    if longest >= _FULL_HISTORY:
+    if config.method == "dense" and longest >= _FULL_HISTORY:
         configs[f"h = {_FULL_HISTORY}"] = config.replace(num_history=_FULL_HISTORY)
         full = config.replace(num_history=_FULL_HISTORY, pixel_sizes=_FULL_SCALES)
         configs[f"h = {_FULL_HISTORY}, {len(_FULL_SCALES)} scales"] = full
-    else:
+    elif config.method == "dense":
         print(f"log {log.log_id} has {longest + 2} sweeps: rows with h = {_FULL_HISTORY} need {_FULL_HISTORY + 2}")
     result = run_bench(
         [window(log, index, _FULL_HISTORY)],
