@@ -14,7 +14,7 @@ import torch
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
-from cflow_torch import CFlowError, CorrelationFlow, FlowResult, make_config
+from cflow_torch import CFlowError, CorrelationFlow, FlowResult, make_config, make_model
 from cflow_torch.cli.main import COMMANDS, main
 from cflow_torch.config import PRESETS, Config
 from cflow_torch.data.av2 import AV2Log
@@ -51,7 +51,7 @@ def test_every_model_yaml_is_its_preset(file: Path) -> None:
     settings = OmegaConf.to_container(OmegaConf.load(file))
     assert list(settings) == list(Config().as_dict()), "every tunable is listed, in order"
     assert Config(**settings) == make_config(file.stem)
-    CorrelationFlow(Config(**settings))
+    make_model(Config(**settings))
 
 
 def test_every_preset_has_a_yaml() -> None:
@@ -64,7 +64,7 @@ def test_every_command_yaml_composes(file: Path) -> None:
         for data in (data.stem for data in CONFIGS.glob("data/*.yaml")):
             overrides = [] if file.stem == "hydra" else [f"data={data}"]
             cfg = compose(file.stem, overrides)
-            assert file.stem == "hydra" or (file.stem in COMMANDS and cfg.data.name == data)
+            assert file.stem == "hydra" or (file.stem in COMMANDS and cfg.data.label == data)
 
 
 def test_demo_leaves_everything(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
@@ -131,7 +131,7 @@ def test_a_bad_log_is_reported_and_the_rest_goes_on(
         (["flow", "data=av2"], "data.root"),
         (["flow", "data=av2", "data.root=/no/such/folder"], "/no/such/folder"),
         (["flow", "model.pixel_sizes=[0.1,0.2]"], "pixel_sizes"),
-        (["flow", "model.method=keypoints"], "keypoints"),
+        (["flow", "model.method=keypoints"], "one pair of sweeps"),
         (["eval", "definition=mine"], "mine"),
         (["fly"], "fly"),
     ],

@@ -9,12 +9,10 @@ flow.png the picture, results.json the scores, config.yaml the resolved settings
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from omegaconf import DictConfig
 
 from cflow_torch.cli.eval import report
-from cflow_torch.cli.run import finish, for_each_pair, make_model, open_logs
+from cflow_torch.cli.run import finish, for_each_pair, make_model, open_logs, output_folder
 from cflow_torch.data.flow_file import write_flow
 from cflow_torch.data.log import Log
 from cflow_torch.evaluation.frame import EvalFrame
@@ -25,7 +23,7 @@ from cflow_torch.viz.bev import plot_flow, save_picture
 
 def task(cfg: DictConfig) -> None:
     """Run `cflow demo`."""
-    output = Path(cfg.output)
+    output = output_folder(cfg)
     metrics = SceneFlowMetrics(cfg.definition)
     model = make_model(cfg)
     logs, failures = open_logs(cfg, output)

@@ -1,20 +1,26 @@
 """Flow and scores of every labelled pair: a table on the screen, OUTPUT/results.json, OUTPUT/config.yaml.
 
+A run whose results are there already is skipped; overwrite=true redoes it. The jobs of a sweep write to folders below
+OUTPUT that are named by what was overridden; the score that a sweeper sees is the mean dynamic error.
+
 cflow eval data=av2 data.root=/data/av2/val model=paper
 cflow eval definition=av2                    scores as another public evaluator defines them
-cflow eval -m model.connectivity=4,8         a sweep; give output=outputs/${model.connectivity} to keep both
+cflow eval -m model.connectivity=4,8         a sweep: outputs/eval/model.connectivity=4/results.json, ...
+cflow eval -m experiment=pixel_size          a table or figure of the paper, see docs/experiments.md
 """
 
 from __future__ import annotations
 
-import json
-import math
 from pathlib import Path
 from typing import Any, Dict
 
-from omegaconf import DictConfig, OmegaConf
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from omegaconf import DictConfig
 
-from cflow_torch.cli.run import finish, for_each_pair, make_model, open_logs, versions, write_config, write_text
+from cflow_torch.cli.record import DataIdentity, finished_results, write_results
+from cflow_torch.cli.run import finish, for_each_pair, make_model, open_logs, output_folder
+from cflow_torch.cli.stopwatch import StopWatch
 from cflow_torch.data.hdf5 import HDF5Log
 from cflow_torch.data.log import Log
 from cflow_torch.evaluation.frame import EvalFrame
@@ -24,44 +30,56 @@ from cflow_torch.types import CFlowError, FlowResult, Window
 
 
 def task(cfg: DictConfig) -> float:
-    """Run `cflow eval`; returns the mean dynamic error, the objective of a sweep."""
-    output = Path(cfg.output)
+    """Run `cflow eval`; returns the score of a sweep, see `objective`."""
+    output = output_folder(cfg)
+    record = finished_results(cfg, output)
+    if record is not None:
+        print(f"skipped, done before: {output}")
+        return objective(record["results"])
     metrics = SceneFlowMetrics(cfg.definition)
-    model = make_model(cfg)
+    model = StopWatch(make_model(cfg))
     logs, failures = open_logs(cfg, output)
+    identity = DataIdentity(cfg, logs)
 
     def score(log: Log, index: int, sweeps: Window, result: FlowResult) -> None:
         labels = log.labels(index)
         if labels is not None:
             eval_mask = log.eval_mask(index) if isinstance(log, HDF5Log) else None
             metrics.update(EvalFrame.from_result(sweeps, result, labels, eval_mask=eval_mask))
+            identity.add(sweeps, labels)
 
-    failures += for_each_pair(logs, model, score)
+    failures += for_each_pair(logs, model, score, cfg.data.first, cfg.data.step)
     if metrics.num_frames == 0:
         raise CFlowError("no pair has labels: nothing to score")
-    results = report(cfg, metrics, output)
-    finish(failures)
-    return float(results["bucketed"]["mean"]["dynamic_error"]) if "bucketed" in results else float("nan")
+    results = report(cfg, metrics, output, data=identity.report(), seconds=model.report(), failures=failures)
+    _finish(failures)
+    return objective(results)
 
 
-def report(cfg: DictConfig, metrics: SceneFlowMetrics, output: Path) -> Dict[str, Any]:
-    """Print the scores and write results.json and config.yaml."""
+def report(cfg: DictConfig, metrics: SceneFlowMetrics, output: Path, **about: Any) -> Dict[str, Any]:
+    """Print the scores and write results.json and config.yaml; `about` as for `write_results`."""
     results = metrics.compute()
-    record = {
-        "results": _without_nan(results),
-        "config": OmegaConf.to_container(cfg, resolve=True),
-        "versions": versions(),
-    }
-    write_text(output / "results.json", json.dumps(record, indent=2) + "\n")
-    write_config(cfg, output)
-    print(format_table(results))
+    write_results(cfg, results, output, **about)
+    print(f"{output}: {format_table(results)}")
     return results
 
 
-def _without_nan(value: Any) -> Any:
-    """NaN (no points) becomes null: JSON has no NaN."""
-    if isinstance(value, dict):
-        return {key: _without_nan(part) for key, part in value.items()}
-    if isinstance(value, list):
-        return [_without_nan(part) for part in value]
-    return None if isinstance(value, float) and math.isnan(value) else value
+def objective(results: Dict[str, Any]) -> float:
+    """The one number that a sweep minimises: the mean dynamic error, of the ranges if the definition has them; else the
+    three-way end-point error in metres. NaN where there is nothing to score."""
+    if "bucketed_by_range" in results:
+        value = results["bucketed_by_range"]["mean"]["dynamic_error"]
+    elif "bucketed" in results:
+        value = results["bucketed"]["mean"]["dynamic_error"]
+    else:
+        value = results["three_way"]["epe_3way"]
+    return float("nan") if value is None else float(value)
+
+
+def _finish(failures: Any) -> None:
+    """List what failed. A job of a sweep lets the others run; a run on its own ends with status 1."""
+    try:
+        finish(failures)
+    except SystemExit:
+        if not HydraConfig.initialized() or HydraConfig.get().mode != RunMode.MULTIRUN:
+            raise

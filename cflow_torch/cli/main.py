@@ -1,4 +1,4 @@
-"""The `cflow` command: `cflow demo | flow | eval | bench | info`, settings as Hydra overrides."""
+"""The `cflow` command: `cflow demo | flow | eval | submit | bench | info`, settings as Hydra overrides."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ COMMANDS = {
     "demo": "simulate a drive, estimate its flow, score it and draw it",
     "flow": "estimate the flow of every pair of sweeps of a data set",
     "eval": "estimate and score every labelled pair of a data set",
+    "submit": "write and check an archive for a public leaderboard",
     "bench": "time every stage against the reference and a plain OpenCV loop",
     "info": "versions and devices, to paste into a bug report",
 }
@@ -29,6 +30,7 @@ examples:
   cflow eval data=av2 data.root=/data/av2/val model=paper
   cflow eval model.pixel_sizes=[0.4,0.2,0.1]          any field of the method, see `cflow eval --cfg job`
   cflow eval -m model.connectivity=4,8                a sweep
+  cflow submit data=hdf5 data.root=/data/test version=3
 
 `cflow COMMAND --help` says more; `cflow COMMAND --cfg job` prints every setting and its value.
 """

@@ -2,25 +2,31 @@
 
 from __future__ import annotations
 
+import hashlib
 import platform
+import re
 import sys
+from functools import lru_cache
 from pathlib import Path
-from typing import Any, Callable, Dict, List, Sequence, Tuple
+from typing import Any, Callable, Dict, List, Protocol, Sequence, Tuple
 
 import numpy as np
 import torch
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
-from cflow_torch import __version__
+from cflow_torch import __version__, estimate
 from cflow_torch.config import Config
 from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.av2 import AV2Log, find_av2_logs
+from cflow_torch.data.benchmark import benchmark_logs
 from cflow_torch.data.hdf5 import HDF5Log, find_hdf5_scenes
 from cflow_torch.data.log import Log, window
 from cflow_torch.data.synthetic import make_drive
 from cflow_torch.data.writers import write_av2_log
-from cflow_torch.dense import CorrelationFlow
+from cflow_torch.pyramid import CoarseToFine
 from cflow_torch.types import CFlowError, FlowResult, Window
 
 Failures = List[Tuple[str, str]]
@@ -30,6 +36,16 @@ _READERS: Dict[str, Tuple[Callable[[Any], List[Path]], Callable[[Any], Any], str
     "hdf5": (find_hdf5_scenes, HDF5Log, "scene (a file *.h5)"),
 }
 UseResult = Callable[[Log, int, Window, FlowResult], None]
+_LONGEST_NAME = 150  # characters of a folder name; file systems end at 255 bytes
+
+
+class FlowModel(Protocol):
+    """What the loop over pairs needs of a method."""
+
+    config: Config
+
+    def __call__(self, windows: Sequence[Window]) -> List[FlowResult]:
+        """One result per window."""
 
 
 def versions() -> Dict[str, str]:
@@ -42,14 +58,41 @@ def versions() -> Dict[str, str]:
     }
 
 
-def make_model(cfg: DictConfig) -> CorrelationFlow:
+def make_model(cfg: DictConfig) -> CoarseToFine:
     """The method that `cfg.model` and `cfg.device` describe.
 
     Raises:
         CFlowError: an unknown or invalid setting.
     """
     settings: Dict[str, Any] = OmegaConf.to_container(cfg.model, resolve=True)  # type: ignore[assignment]
-    return CorrelationFlow(Config().replace(**settings), cfg.device)
+    return estimate.make_model(Config().replace(**settings), cfg.device)
+
+
+def output_folder(cfg: DictConfig) -> Path:
+    """Where a run writes: `cfg.output`; for a job of a sweep, a folder below it that no other job shares.
+
+    Its name is what was overridden for this job (`output` and `overwrite` aside), with the experiment, if one was
+    chosen, as a folder above: `outputs/eval/pixel_size/model.pixel_sizes=[0.2]`.
+    """
+    folder = Path(cfg.output)
+    if not HydraConfig.initialized() or HydraConfig.get().mode != RunMode.MULTIRUN:
+        return folder
+    parts = []
+    for override in HydraConfig.get().overrides.task:
+        key, _, value = override.partition("=")
+        if key == "experiment":
+            folder = folder / _folder_name(value)
+        elif key not in ("output", "overwrite"):
+            parts.append(override)
+    return folder / (_folder_name(",".join(sorted(parts))) or "base")
+
+
+def _folder_name(text: str) -> str:
+    """Text as one folder name; different texts keep different names."""
+    name = re.sub(r"[^\w.,=+@\[\]-]", "_", text.replace(" ", ""))[:_LONGEST_NAME]
+    if name != text or name in (".", ".."):
+        name += "-" + hashlib.sha256(text.encode()).hexdigest()[:8]
+    return name
 
 
 def open_logs(cfg: DictConfig, folder: Path) -> Tuple[List[Log], Failures]:
@@ -67,6 +110,10 @@ def open_logs(cfg: DictConfig, folder: Path) -> Tuple[List[Log], Failures]:
         drive = make_drive(seed=data.seed, num_sweeps=data.num_sweeps)
         reader: Callable[[Any], Any] = AV2Log
         sources = [write_av2_log(drive, folder / "log", overwrite=True)]
+    elif data.name == "benchmark":
+        reader = AV2Log
+        seeds = range(data.first_seed, data.first_seed + data.num_drives)
+        sources = benchmark_logs(data.cache, data.profiles, seeds, data.num_sweeps)
     elif OmegaConf.is_missing(data, "root"):
         raise CFlowError("where is the data? give data.root=PATH, one log or a folder of logs")
     else:
@@ -85,29 +132,50 @@ def open_logs(cfg: DictConfig, folder: Path) -> Tuple[List[Log], Failures]:
     return logs, failures
 
 
-def for_each_pair(logs: Sequence[Log], model: CorrelationFlow, use: UseResult) -> Failures:
+def for_each_pair(logs: Sequence[Log], model: FlowModel, use: UseResult, first: int = 0, step: int = 1) -> Failures:
     """Estimate the flow of every pair of every log and hand it on; a bad frame is reported and the rest goes on.
 
     Args:
         logs: logs of at least two sweeps.
         model: the method.
         use: what to do with a result.
+        first: first pair of each log.
+        step: take every `step`-th pair from there.
 
     Returns:
         (frame, message) of every pair that failed.
+
+    Raises:
+        CFlowError: `first` below 0 or `step` below 1.
     """
-    pairs = [(log, index) for log in logs for index in range(len(log.timestamps) - 1)]
+    if first < 0 or step < 1:
+        raise CFlowError(f"data.first={first}, data.step={step}: give a first pair of at least 0, a step of at least 1")
+    recent = [_RecentSweeps(log, model.config.num_history + 2) for log in logs]
+    pairs = [(log, index) for log in recent for index in range(first, len(log.timestamps) - 1, step)]
     failures: Failures = []
     for log, index in tqdm(pairs, unit="pair", disable=None):
         try:
             sweeps = window(log, index, model.config.num_history)
             (result,) = model([sweeps])
-            use(log, index, sweeps, result)
+            use(log.log, index, sweeps, result)
         except (CFlowError, OSError) as error:
             frame = f"{log.log_id}/{log.timestamps[index]}"
             failures.append((frame, str(error)))
             tqdm.write(f"failed: {frame}: {error}", file=sys.stderr)
     return failures
+
+
+class _RecentSweeps:
+    """A log that remembers its last sweeps: neighbouring windows share all but one.
+
+    Args:
+        log: any log.
+        count: sweeps to remember.
+    """
+
+    def __init__(self, log: Log, count: int) -> None:
+        self.log, self.log_id, self.timestamps, self.labels = log, log.log_id, log.timestamps, log.labels
+        self.sweep = lru_cache(count)(log.sweep)
 
 
 def finish(failures: Failures) -> None:

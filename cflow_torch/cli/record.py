@@ -1,0 +1,151 @@
+"""results.json: what is in it, how it is written, and whether a run is already done."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import platform
+import re
+from dataclasses import asdict
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any, Dict, List, Optional, Sequence, Tuple
+
+import numpy as np
+import torch
+from omegaconf import DictConfig, OmegaConf
+
+from cflow_torch.cli.run import versions, write_config, write_text
+from cflow_torch.data.benchmark import generator_key
+from cflow_torch.data.log import FlowLabels, Log
+from cflow_torch.evaluation.definitions import get_definition
+from cflow_torch.types import CFlowError, Window
+
+RESULTS = "results.json"
+# Settings that say where things lie, not what is computed.
+_PLACES = ("config.output", "config.overwrite", "config.data.cache")
+
+
+class DataIdentity:
+    """What exactly was scored: the logs, and a digest of all scored points and labels.
+
+    Args:
+        cfg: resolved settings.
+        logs: the logs that were opened.
+    """
+
+    def __init__(self, cfg: DictConfig, logs: Sequence[Log]) -> None:
+        self._about: Dict[str, Any] = {
+            "label": cfg.data.label,
+            "generator": _generator(cfg),
+            "logs": [{"log_id": log.log_id, "sweeps": len(log.timestamps)} for log in logs],
+        }
+        self._digest = hashlib.sha256()
+
+    def add(self, sweeps: Window, labels: FlowLabels) -> None:
+        """Count in one scored pair."""
+        for values in (sweeps.pc0.points, labels.flow, labels.category, labels.is_valid):
+            self._digest.update(np.ascontiguousarray(values).tobytes())
+
+    def report(self) -> Dict[str, Any]:
+        """ "label", "generator" (synthetic benchmark only), "logs", "digest"."""
+        return {**self._about, "digest": self._digest.hexdigest()[:16]}
+
+
+def finished_results(cfg: DictConfig, folder: Path) -> Optional[Dict[str, Any]]:
+    """The record of an earlier run with the same settings, versions and data settings; None where there is none.
+
+    Raises:
+        CFlowError: the folder holds the results of a run with other settings, and `overwrite` is not set.
+    """
+    file = folder / RESULTS
+    if cfg.overwrite or not file.exists():
+        return None
+    try:
+        record = json.loads(file.read_text(encoding="utf-8"))
+        before = {"versions": record["versions"], "generator": record["data"]["generator"], "config": record["config"]}
+    except (ValueError, KeyError, TypeError) as error:
+        raise CFlowError(
+            f"{file} is no results file of this version ({error!r}): give output=FOLDER, or overwrite=true"
+        ) from None
+    now = {"versions": versions(), "generator": _generator(cfg), "config": _plain(cfg)}
+    old, new = _flat(before), _flat(now)
+    changed = sorted(key for key in {*old, *new} if old.get(key) != new.get(key) and key not in _PLACES)
+    if changed:
+        shown = "; ".join(f"{key} was {old.get(key)}, is {new.get(key)}" for key in changed[:5])
+        more = f" and {len(changed) - 5} more" if len(changed) > 5 else ""
+        raise CFlowError(
+            f"{folder} holds results of another run ({shown}{more}): give output=FOLDER, or overwrite=true"
+        )
+    return record  # type: ignore[no-any-return]
+
+
+def write_results(
+    cfg: DictConfig,
+    results: Dict[str, Any],
+    folder: Path,
+    data: Optional[Dict[str, Any]] = None,
+    seconds: Optional[Dict[str, Any]] = None,
+    failures: Sequence[Tuple[str, str]] = (),
+) -> None:
+    """Write `folder/results.json` and `folder/config.yaml`, each whole or not at all.
+
+    Args:
+        cfg: resolved settings.
+        results: what `SceneFlowMetrics.compute` returned.
+        folder: made if absent.
+        data: what `DataIdentity.report` returned.
+        seconds: what `StopWatch.report` returned.
+        failures: pairs and logs that could not be used.
+    """
+    record = {
+        "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "versions": versions(),
+        "machine": {
+            "platform": platform.platform(),
+            "cores": os.cpu_count(),
+            "threads": torch.get_num_threads(),
+        },
+        "num_pairs": results["num_frames"],
+        "failures": [list(failure) for failure in failures],
+        "seconds_per_pair": seconds,
+        "data": data,
+        "config": _plain(cfg),
+        "definition": asdict(get_definition(cfg.definition)),
+        "results": results,
+    }
+    write_config(cfg, folder)
+    text = json.dumps(_strict(record), indent=1, allow_nan=False)
+    short = re.sub(
+        r"\[\n\s*([^][{}]*?)\n\s*\]", lambda found: f"[{' '.join(found[1].split())}]", text
+    )  # lists on one line
+    write_text(folder / RESULTS, short + "\n")
+
+
+def _generator(cfg: DictConfig) -> Optional[str]:
+    return generator_key() if cfg.data.name == "benchmark" else None
+
+
+def _plain(cfg: DictConfig) -> Any:
+    return _strict(OmegaConf.to_container(cfg, resolve=True))
+
+
+def _flat(value: Any, name: str = "") -> Dict[str, Any]:
+    """Nested dictionaries as one, keys joined by dots; lists are values."""
+    if not isinstance(value, dict):
+        return {name: value}
+    parts: List[Dict[str, Any]] = [_flat(part, f"{name}.{key}" if name else str(key)) for key, part in value.items()]
+    return {key: leaf for part in parts for key, leaf in part.items()}
+
+
+def _strict(value: Any) -> Any:
+    """JSON has neither NaN nor infinity: NaN (no points) becomes null, infinity a text."""
+    if isinstance(value, dict):
+        return {str(key): _strict(part) for key, part in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_strict(part) for part in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None if math.isnan(value) else str(value)
+    return value

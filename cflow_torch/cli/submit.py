@@ -1,0 +1,179 @@
+"""Archive for a public leaderboard: OUTPUT/v<version>.zip, made of the files in OUTPUT/v<version>/, checked before it
+is left there. A run that was interrupted goes on where it stopped. OUTPUT/config.yaml holds settings and versions.
+
+version=1: total flow of the points of the evaluation masks, 2023; version=2: residual flow of all points, 2024;
+version=3: the multi-dataset challenge of 2026, residual flow of all points.
+
+  cflow submit data=hdf5 data.root=/data/challenge_public/test version=3
+  cflow submit data=av2 data.root=/data/av2/test version=1 masks=/data/av2/test-masks.zip
+  cflow submit data=hdf5 data.root=/data/challenge_public/test version=3 archive=mine.zip    checks, changes nothing
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from pathlib import Path
+from typing import Any, Dict, List, Mapping, Optional, Sequence, Tuple
+
+from omegaconf import DictConfig, OmegaConf
+from tqdm import tqdm
+
+from cflow_torch.cli.run import (
+    Failures,
+    FlowModel,
+    finish,
+    make_model,
+    open_logs,
+    output_folder,
+    versions,
+    write_config,
+)
+from cflow_torch.data.log import Log, window
+from cflow_torch.submission.archive import pack
+from cflow_torch.submission.check import check_submission
+from cflow_torch.submission.encode import RESIDUAL_AXES, Rounding, encode
+from cflow_torch.submission.masks import MaskArchive, log_mask, point_mask
+from cflow_torch.submission.plan import Frame, PlannedFrame, plan_log, read_frame_list, require_logs
+from cflow_torch.submission.versions import SubmissionVersion, get_version
+from cflow_torch.submission.write import is_complete, write_frame, write_metadata
+from cflow_torch.types import CFlowError
+
+Plan = List[Tuple[PlannedFrame, Frame]]
+_SETTINGS = ("version", "model", "data", "frames", "masks", "residual_axes")  # a file depends on these, and no others
+
+
+def task(cfg: DictConfig) -> None:
+    """Run `cflow submit`."""
+    version, output = get_version(cfg.version), output_folder(cfg)
+    if cfg.residual_axes not in RESIDUAL_AXES:
+        raise CFlowError(f"residual_axes is one of {', '.join(RESIDUAL_AXES)}, got {cfg.residual_axes!r}")
+    if cfg.masks is not None and version.rows != "masked":
+        raise CFlowError(f"version {version.number} takes every point: masks= is for version 1 alone")
+    if cfg.masks is not None and cfg.frames is not None:
+        raise CFlowError("masks= says which frames are evaluated: leave frames= out")
+    masks = None if cfg.masks is None else MaskArchive(cfg.masks)
+    listed = read_frame_list(cfg.frames) if cfg.frames is not None else None if masks is None else masks.frames
+    model = make_model(cfg)
+    logs, failures = open_logs(cfg, output)
+    plan, unreadable = _plan(logs, version, listed, masks)
+    failures += unreadable
+    if cfg.archive is not None:
+        finish(failures)  # a log that cannot be read leaves open what the archive must hold
+        _check(cfg.archive, version, plan)
+        return
+    folder, file = output / f"v{version.number}", output / f"v{version.number}.zip"
+    _claim(cfg, output, folder, file)
+    failures += _write(plan, model, version, masks, cfg.residual_axes, folder)
+    finish(failures)
+    _pack(plan, version, folder, file)
+    print(f"version {version.number}, for {version.server}: {file}, {file.stat().st_size:,} bytes")
+
+
+def _pack(plan: Plan, version: SubmissionVersion, folder: Path, file: Path) -> None:
+    """Make the archive; it stays only if it passes."""
+    write_metadata(folder, version)
+    _check(folder, version, plan)
+    pack(folder, [frame.name for _, frame in plan], file, version)
+    try:
+        _check(file, version, plan)
+    except SystemExit:
+        file.unlink()
+        raise
+
+
+def _claim(cfg: DictConfig, output: Path, folder: Path, file: Path) -> None:
+    """Take the output folder for these settings; files of other settings are never mixed in.
+
+    Raises:
+        CFlowError: it holds files of other settings.
+    """
+    record, now = output / "config.yaml", {**_settings(cfg), "cflow_torch": versions()["cflow_torch"]}
+    if record.exists() and not cfg.overwrite:
+        stored = OmegaConf.load(record)
+        assert isinstance(stored, DictConfig)
+        before = {**_settings(stored), "cflow_torch": OmegaConf.select(stored, "versions.cflow_torch")}
+        changed = [name for name in now if now[name] != before[name]]
+        if changed:
+            raise CFlowError(
+                f"{output} holds files made with another {', '.join(changed)}: give output=FOLDER, or overwrite=true"
+            )
+    if cfg.overwrite:
+        shutil.rmtree(folder, ignore_errors=True)
+        file.unlink(missing_ok=True)
+    write_config(cfg, output)
+
+
+def _settings(cfg: DictConfig) -> Dict[str, Any]:
+    values: Dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
+    return {name: values.get(name) for name in _SETTINGS}
+
+
+def _plan(
+    logs: Sequence[Log],
+    version: SubmissionVersion,
+    listed: Optional[Mapping[str, Sequence[int]]],
+    masks: Optional[MaskArchive],
+) -> Tuple[Plan, Failures]:
+    """The frames that are needed, with their rows; those whose sweep cannot be read are reported."""
+    require_logs(logs, listed)
+    frames = [frame for log in logs for frame in plan_log(log, version, listed)]
+    if not frames:
+        raise CFlowError("no frame to submit: the logs are too short, or the list names none of their sweeps")
+    if version.rows == "masked" and masks is None and any(log_mask(f.log, f.index) is None for f in frames):
+        print(
+            "no masks given: points by the official rule, computed here, which can differ by a point from the server's"
+        )
+    plan: Plan = []
+    failures: Failures = []
+    for frame in tqdm(frames, desc="rows", unit="frame", disable=None):
+        try:
+            plan.append((frame, frame.expect(version, masks)))
+        except (CFlowError, OSError) as error:
+            failures.append((frame.name, str(error)))
+    return plan, failures
+
+
+def _write(
+    plan: Plan,
+    model: FlowModel,
+    version: SubmissionVersion,
+    masks: Optional[MaskArchive],
+    residual_axes: str,
+    folder: Path,
+) -> Failures:
+    """Estimate and write the frames that are not there yet."""
+    failures: Failures = []
+    rounding = Rounding()
+    kept = 0
+    for planned, frame in tqdm(plan, unit="frame", disable=None):
+        if is_complete(folder, frame, version):
+            kept += 1
+            continue
+        try:
+            sweeps = window(planned.log, planned.index, model.config.num_history)
+            mask = point_mask(planned.log, planned.index, sweeps.pc0, masks) if version.rows == "masked" else None
+            (result,) = model([sweeps])
+            columns, lost = encode(version, sweeps, result, mask, residual_axes)
+            write_frame(folder, frame.name, columns)
+            rounding.add(lost)
+        except (CFlowError, OSError) as error:
+            failures.append((frame.name, str(error)))
+            tqdm.write(f"failed: {frame.name}: {error}", file=sys.stderr)
+    print(f"frames written: {len(plan) - kept - len(failures)}, already there: {kept}")
+    if rounding.num_points:
+        print(f"float16 rounding of the new ones: {rounding}")
+    return failures
+
+
+def _check(path: Any, version: SubmissionVersion, plan: Plan) -> None:
+    """Print what was checked; list every problem and end the process with status 1 if there is one."""
+    problems = check_submission(path, version, [frame for _, frame in plan])
+    if problems:
+        print(f"{path} is no version {version.number} submission for this data:", file=sys.stderr)
+        for problem in problems:
+            print(f"  {problem}", file=sys.stderr)
+        print(f"problems: {len(problems)}", file=sys.stderr)
+        raise SystemExit(1)
+    rows = sum(frame.rows for _, frame in plan)
+    print(f"{path}: passes as version {version.number}, frames: {len(plan)}, rows: {rows:,}")

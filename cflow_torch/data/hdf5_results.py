@@ -1,0 +1,122 @@
+"""A method's flow as a key of OpenSceneFlow's HDF5 scenes, where the harness's viewers look for it."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any, Iterable, Tuple, Union
+
+import numpy as np
+
+from cflow_torch.evaluation.frame import as_numpy
+from cflow_torch.types import Array, CFlowError
+
+# Keys that scenes bring, and names that the viewers give a meaning of their own.
+RESERVED_KEYS = frozenset(
+    (
+        *("lidar", "lidar_id", "lidar_dt", "lidar_center", "ground_mask", "pose", "ego_motion", "eval_mask"),
+        *("flow", "flow_is_valid", "flow_category_indices", "flow_instance_id"),
+        *("dufo", "cluster", "dufocluster", "nnd", "label", "raw", "pc0_dynamic", "pc1_dynamic", "pch1_dynamic"),
+        *("pc0", "pc1", "gm0", "gm1", "pose0", "pose1"),
+    )
+)
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_.-]{0,63}")
+
+
+def check_result_name(name: str) -> None:
+    """Refuse names that are taken or that a viewer's command line cannot carry.
+
+    Raises:
+        CFlowError: as said.
+    """
+    if not isinstance(name, str) or _NAME.fullmatch(name) is None:
+        raise CFlowError(
+            f"{name!r} is no result name: begin with a letter, then letters, digits, '_', '-', '.', at most 64"
+        )
+    if name in RESERVED_KEYS:
+        raise CFlowError(f"{name} is a key of the scenes themselves, choose another name, for example cflow")
+
+
+def check_writable(file: Union[str, Path]) -> None:
+    """Refuse a scene that must not be changed.
+
+    Raises:
+        CFlowError: no such file, or it or its folder is read-only.
+    """
+    file = Path(file).resolve()
+    if not file.is_file():
+        raise CFlowError(f"{file} does not exist; give a scene (.h5)")
+    # The mode as well as the right: the superuser may write everything, but a file marked read-only is meant to be.
+    if not file.stat().st_mode & 0o222 or not os.access(file, os.W_OK) or not os.access(file.parent, os.W_OK):
+        raise CFlowError(f"{file} or its folder is read-only: copy the scene, or make it writable")
+
+
+def write_hdf5_results(file: Union[str, Path], name: str, results: Iterable[Tuple[int, Array]]) -> int:
+    """Write the total flow of sweeps into a scene under a result name.
+
+    Args:
+        file: `<scene>.h5`; every other key keeps its contents.
+        name: of the result; a result of that name is replaced.
+        results: (time stamp of sweep t, (N, 3) TOTAL flow) pairs, metres until the next sweep, axes of ego1, one row
+            per point of the sweep, ground included; taken one by one.
+
+    Returns:
+        Number of sweeps written.
+
+    Convention:
+        float32, neither chunked nor compressed, as the harness stores it. NaN rows are kept (viewers show them white).
+        All results go into a copy beside the file, which takes its place at the end: whatever happens on the way, the
+        scene is the old one or the new one. Readers that have it open go on with the old one. Two writers at once: the
+        later one wins, the results of the other are lost.
+
+    Raises:
+        CFlowError: h5py is missing; the name is taken; the file is read-only or no scene; a sweep is not in it; rows do
+            not agree. The scene is then unchanged.
+
+    Cost: one copy of the scene, in time and, until the end, in space.
+    """
+    try:
+        import h5py
+    except ImportError:
+        raise CFlowError("writing HDF5 scenes needs h5py: pip install 'cflow_torch[hdf5]'") from None
+    check_result_name(name)
+    check_writable(file)
+    file = Path(file).resolve()  # a link stays a link
+    descriptor, copy = tempfile.mkstemp(prefix=f".{file.name}.", dir=file.parent)
+    os.close(descriptor)
+    try:
+        shutil.copy(file, copy)
+        count = 0
+        try:
+            with h5py.File(copy, "r+") as scene:
+                for timestamp, flow in results:
+                    _write(scene, file, str(timestamp), name, as_numpy(flow))
+                    count += 1
+        except OSError as error:
+            raise CFlowError(f"{file} cannot be written as HDF5 ({error}): give a scene that is complete") from error
+        if count:
+            with open(copy, "rb") as written:
+                os.fsync(written.fileno())
+            os.replace(copy, file)
+        return count
+    finally:
+        if os.path.exists(copy):
+            os.unlink(copy)
+
+
+def _write(scene: Any, file: Path, timestamp: str, name: str, flow: np.ndarray) -> None:
+    group = scene.get(timestamp)
+    if group is None or "lidar" not in group:
+        raise CFlowError(f"{file} has no sweep {timestamp}")
+    rows = len(group["lidar"])
+    if flow.shape != (rows, 3):
+        raise CFlowError(f"{file}: the flow of sweep {timestamp} has shape {flow.shape}, expected ({rows}, 3)")
+    if name in group:
+        if group[name].shape != (rows, 3) or group[name].dtype != np.float32:
+            raise CFlowError(f"{file}: {name} of sweep {timestamp} is no flow result, it is not replaced")
+        group[name][...] = flow  # in its old place: deleting would leave a hole that HDF5 never gives back
+    else:
+        group.create_dataset(name, data=flow.astype(np.float32))

@@ -1,0 +1,99 @@
+"""Submission archives: packed the same bytes every time, read from a zip or a folder alike."""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Dict, Iterable, List, Union
+
+from cflow_torch.data.atomic import atomic_file
+from cflow_torch.submission.versions import METADATA_FILE, SubmissionVersion
+from cflow_torch.types import CFlowError
+
+MAX_FILE_BYTES = 1 << 28  # a frame takes about 1 MB; more than this is no frame
+# What zipfile raises for damaged entries, encrypted ones (RuntimeError) and unknown compression (NotImplementedError).
+_UNREADABLE = (OSError, KeyError, EOFError, RuntimeError, NotImplementedError, zipfile.BadZipFile, zlib.error)
+_EARLIEST = (1980, 1, 1, 0, 0, 0)  # the first time that a zip can hold
+
+
+def pack(folder: Union[str, Path], names: Iterable[str], file: Union[str, Path], version: SubmissionVersion) -> None:
+    """Zip the files of a submission folder, atomically.
+
+    Args:
+        folder: root of the submission.
+        names: frames to take.
+        file: the zip to write.
+        version: its metadata file is added if it has one.
+
+    Convention: entries sorted by name, dated 1980-01-01, mode 0644, deflated: the same files and the same zlib give
+        the same bytes.
+
+    Raises:
+        CFlowError: a file is missing.
+    """
+    folder = Path(folder)
+    entries = sorted({*names, *([METADATA_FILE] if version.metadata is not None else [])})
+    missing = [name for name in entries if not (folder / name).is_file()]
+    if missing:
+        raise CFlowError(f"{folder} lacks {len(missing)} files, first {missing[0]}")
+    with atomic_file(file) as raw, zipfile.ZipFile(raw, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name in entries:
+            entry = zipfile.ZipInfo(name, _EARLIEST)
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            entry.create_system, entry.external_attr = 3, 0o100644 << 16
+            archive.writestr(entry, (folder / name).read_bytes())
+
+
+class Contents:
+    """The files of a zip or folder, by name.
+
+    Args:
+        path: the zip or folder. Hidden files of a folder are passed over (an interrupted writer leaves some, and
+            `pack` takes none); those of a zip are not.
+
+    Attributes:
+        names: of all files, sorted; a name that a zip holds twice occurs twice.
+
+    Raises:
+        CFlowError: neither a zip nor a folder.
+    """
+
+    def __init__(self, path: Union[str, Path]) -> None:
+        self.path = Path(path)
+        self.names: List[str]
+        self._files: Dict[str, Path] = {}
+        self._zip = None
+        if self.path.is_dir():
+            for file in self.path.rglob("*"):
+                parts = file.relative_to(self.path).parts
+                if file.is_file() and not any(part.startswith(".") for part in parts):
+                    self._files["/".join(parts)] = file
+            self.names = sorted(self._files)
+            return
+        if not self.path.is_file():
+            raise CFlowError(f"{self.path} does not exist; give a zip, or the folder that it is made from")
+        try:
+            self._zip = zipfile.ZipFile(self.path)
+        except (OSError, zipfile.BadZipFile) as error:
+            raise CFlowError(f"{self.path} cannot be read as a zip ({error}): pack it again") from error
+        self.names = sorted(info.orig_filename for info in self._zip.infolist() if not info.is_dir())
+
+    def read(self, name: str) -> bytes:
+        """Contents of a file.
+
+        Raises:
+            CFlowError: it cannot be read, or is far too large.
+        """
+        try:
+            size = self._zip.getinfo(name).file_size if self._zip else self._files[name].stat().st_size
+            if size > MAX_FILE_BYTES:
+                raise CFlowError(f"{size} bytes, more than any frame has")
+            return self._zip.read(name) if self._zip else self._files[name].read_bytes()
+        except _UNREADABLE as error:
+            raise CFlowError(f"cannot be read ({error})") from error
+
+    def close(self) -> None:
+        """Close the zip."""
+        if self._zip is not None:
+            self._zip.close()

@@ -1,0 +1,99 @@
+"""Which points version 1 asks for: the official mask files, the mask a log brings, or the official rule."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+from typing import Dict, List, Optional, Union
+
+import numpy as np
+import pyarrow as pa
+from pyarrow import feather
+
+from cflow_torch.data.log import Log
+from cflow_torch.evaluation.frame import as_numpy
+from cflow_torch.types import CFlowError, Sweep
+
+_HALF_SIDE = 50.0  # metres; the official masks hold the points that are not ground with |x|, |y| <= 50
+
+
+class MaskArchive:
+    """The official evaluation masks: a zip of `<log>/<time stamp>.feather`, each one bool column.
+
+    Args:
+        file: the zip.
+
+    Attributes:
+        frames: log id -> time stamps that are evaluated, ascending.
+
+    Raises:
+        CFlowError: the file is no such zip.
+    """
+
+    def __init__(self, file: Union[str, Path]) -> None:
+        self.file = Path(file)
+        self.frames: Dict[str, List[int]] = {}
+        try:
+            self._zip = zipfile.ZipFile(self.file)
+        except (OSError, zipfile.BadZipFile) as error:
+            raise CFlowError(f"{self.file} cannot be read as a zip of masks ({error})") from error
+        for name in self._zip.namelist():
+            log_id, _, stem = name.rpartition("/")
+            if name.endswith(".feather") and stem[: -len(".feather")].isdigit():
+                self.frames.setdefault(log_id, []).append(int(stem[: -len(".feather")]))
+        if not self.frames:
+            raise CFlowError(f"{self.file} holds no masks; it must hold <log>/<time stamp>.feather")
+        for stamps in self.frames.values():
+            stamps.sort()
+
+    def mask(self, log_id: str, timestamp: int) -> np.ndarray:
+        """(N,) bool mask of a sweep.
+
+        Raises:
+            CFlowError: no mask for this sweep, or it cannot be read.
+        """
+        name = f"{log_id}/{timestamp}.feather"
+        try:
+            table = feather.read_table(pa.BufferReader(self._zip.read(name)))
+        except (KeyError, OSError, zipfile.BadZipFile, pa.ArrowException) as error:
+            raise CFlowError(f"{self.file}: cannot read {name} ({error})") from error
+        if table.num_columns != 1 or not pa.types.is_boolean(table.schema.types[0]):
+            raise CFlowError(f"{self.file}: {name} must hold one bool column, got {table.schema.names}")
+        return table.column(0).to_numpy().astype(bool)
+
+
+def point_mask(log: Log, index: int, sweep: Sweep, masks: Optional[MaskArchive] = None) -> np.ndarray:
+    """Points of a sweep that are evaluated.
+
+    Args:
+        log: may have a method `eval_mask(index)` that gives (N,) bool or None, as `HDF5Log` has.
+        index: number of the sweep.
+        sweep: the sweep.
+        masks: official masks; they win.
+
+    Returns:
+        (N,) bool: the official mask, else the log's own, else the official rule: not ground, |x| and |y| <= 50 m.
+
+    Raises:
+        CFlowError: the mask has another number of rows than the sweep; neither mask nor ground is known.
+    """
+    points = as_numpy(sweep.points)
+    mask = log_mask(log, index) if masks is None else masks.mask(log.log_id, log.timestamps[index])
+    if mask is None:
+        if sweep.is_ground is None:
+            raise CFlowError(
+                f"log {log.log_id} has neither evaluation masks nor ground, so the points of version 1 are unknown: "
+                f"give the official masks, or a log with its map"
+            )
+        return (np.abs(points[:, :2]) <= _HALF_SIDE).all(axis=1) & ~as_numpy(sweep.is_ground)
+    if mask.shape != (len(points),):
+        raise CFlowError(
+            f"evaluation mask of {log.log_id}/{log.timestamps[index]} has {len(mask)} rows, the sweep has {len(points)}"
+        )
+    return mask
+
+
+def log_mask(log: Log, index: int) -> Optional[np.ndarray]:
+    """(N,) bool evaluation mask that a log brings itself, None where it has none."""
+    read = getattr(log, "eval_mask", None)
+    return None if read is None else read(index)
