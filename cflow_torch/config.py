@@ -136,7 +136,7 @@ class Config:
 # What each preset changes in `Config`'s defaults. Those are the paper's base row: s = 0.1 m, BEV, h = 0.
 PRESETS: Dict[str, Dict[str, Any]] = {
     "paper": {},
-    # Best mean of scripts/history_by_scales.py on its synthetic set; region of the main harness.
+    # Chosen on simulated drives, docs/history_and_scales.md; region of the main harness.
     "default": {
         "num_history": 4,
         "pixel_sizes": (0.4, 0.2, 0.1),

@@ -1,4 +1,4 @@
-"""The dense method against reference.py, to the last bit of every field; and against truths known beforehand."""
+"""The dense method against the reference, to the last bit of every field; and against truths known beforehand."""
 
 from __future__ import annotations
 
