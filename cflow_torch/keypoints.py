@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Optional, Tuple
+from typing import Optional
 
 import torch
 import torch.nn.functional as F
@@ -10,17 +10,12 @@ from torch import Tensor
 from torch.profiler import record_function
 
 from cflow_torch.batch import Batch
-from cflow_torch.config import Config
 from cflow_torch.densify import densify
+from cflow_torch.descriptors import describe, detect
+from cflow_torch.gate import gate
 from cflow_torch.grid import Grid
-from cflow_torch.match import KeyPoints, match
-from cflow_torch.ops.indices import flat_nonzero
-from cflow_torch.ops.morphology import erode_cross
-from cflow_torch.ops.patches import gather_patches
+from cflow_torch.match import match
 from cflow_torch.pyramid import CoarseToFine, Motion, project
-
-# `gate_radius` is the distance that a match may cover in this time.
-_GATE_SECONDS = 0.1
 
 
 class CorrelationFlowKeypoints(CoarseToFine):
@@ -70,49 +65,3 @@ class CorrelationFlowKeypoints(CoarseToFine):
                 cluster_id=F.pad(dense.number, (0, 1), value=-1),
                 score=F.pad(dense.score.float(), (0, 1)),
             )
-
-
-def detect(occupancy: Tensor) -> Tensor:
-    """Key points: occupied pixels at distance 1 from the background (Sec. Keypoints).
-
-    Args:
-        occupancy: (..., H, W) bool.
-
-    Returns:
-        (..., H, W) bool.
-
-    Convention: the distance is Euclidean, so one of the four neighbours is free; outside the image all is free.
-    """
-    return occupancy & ~erode_cross(occupancy)
-
-
-def describe(images: Tensor, is_key_point: Tensor, patch_size: int) -> Tuple[Tensor, KeyPoints]:
-    """Key points of one sweep and their descriptors (Sec. Descriptor).
-
-    Args:
-        images: (B, H, W) bool, occupancy of the sweep of every window.
-        is_key_point: (B, H, W) bool.
-        patch_size: L, odd.
-
-    Returns:
-        place: (K,) int64, flat indices into `images`, ascending.
-        key_points: with their L x L patches, zero outside the image.
-
-    Cost: memory K L^2 bytes; the images are not unfolded.
-    """
-    _, height, width = images.shape
-    place = flat_nonzero(is_key_point)
-    line = place // width
-    window, col = line // height, place - line * width
-    row = line - window * height
-    return place, KeyPoints(window, row, col, *gather_patches(images, window, row, col, patch_size))
-
-
-def gate(batch: Batch, grid: Grid, config: Config) -> Tensor:
-    """(B,) float64, pixels: farthest match of each window, speed times the time from t to t+1."""
-    seconds = batch.seconds[:, 1]
-    size = torch.full_like(seconds, grid.pixel_size)  # a GPU would multiply by the reciprocal of a plain number
-    reach = config.gate_radius * (seconds / torch.full_like(seconds, _GATE_SECONDS)) / size
-    if config.max_speed is not None:
-        reach = torch.minimum(reach, config.max_speed * seconds / size + 1)
-    return reach

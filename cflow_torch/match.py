@@ -1,55 +1,30 @@
-"""Matching of key points: normalised correlation of descriptors, gated, all windows at once (Sec. Matching keypoints).
+"""Matching of key points by normalised correlation, all windows at once (Sec. Matching keypoints).
 
-Key points of t are grouped by small tiles of the image. A group meets only the key points of t+1 that can lie within
-the gate of its tile: they stand in a few runs of a list that is sorted by band of rows, then by column. The descriptors
-of a group times those of its candidates is one small matrix product of counts. Nothing is ever as large as all key
-points times all key points.
+The descriptors of a group of key points times those of its candidates within the gate is one small matrix product of
+counts.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Iterator, Tuple
+from typing import Tuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.config import Config
+from cflow_torch.descriptors import KeyPoints
+from cflow_torch.gate import chunks, pair
 from cflow_torch.ops.exact import exact_sqrt
 from cflow_torch.ops.indices import flat_nonzero
 from cflow_torch.ops.segments import segment_amin
 
-# Side of a tile and height of a band in pixels, key points in a group.
-_TILE = 24
-_GROUP = 32
-# Candidate lists are padded to the next of these lengths: steps of at most a quarter.
-_LENGTHS = tuple(n << k for k in range(28) for n in (8, 10, 12, 14))
-# Pairs (key point, candidate) that are looked at together: a CPU wants them in its cache, a GPU wants many.
-_PAIRS_AT_ONCE_CPU = 1 << 17
-_PAIRS_AT_ONCE_GPU = 1 << 26
 # Longest descriptor for which float32 tells any two values count^2 / energy apart: (L^2)^3 < 2^23.
 _FLOAT32_PATCH = 13
 # The ratio rho is used to four decimals, so that the test is one of integers.
 _RATIO_UNIT = 10_000
-
-
-@dataclass(frozen=True)
-class KeyPoints:
-    """Key points of one sweep of every window, in order of window, row and column.
-
-    Args:
-        window, row, col: (K,) int64.
-        patch: (K, L * L) uint8, zeros and ones.
-        energy: (K,) int64, number of ones, at least 1.
-    """
-
-    window: Tensor
-    row: Tensor
-    col: Tensor
-    patch: Tensor
-    energy: Tensor
 
 
 @dataclass(frozen=True)
@@ -130,11 +105,10 @@ def _best_candidates(
     square, second_square = torch.zeros_like(index), torch.zeros_like(index)
     second_energy = torch.ones_like(index)
     if num_source > 0 and num_target > 0:
-        tiles, members = _group(source)
-        pairing = _candidates(tiles, target, reach)
+        pairing = pair(source, target, reach)
         from_ends, to_ends = _with_padding(source), _with_padding(target)
-        for groups, length in _chunks(pairing, config):
-            member = members.index_select(0, groups)
+        for groups, length in chunks(pairing, config):
+            member = pairing.member.index_select(0, groups)
             slot = torch.arange(length, device=groups.device)
             place = pairing.first.index_select(0, groups)[:, None] + slot
             candidate = pairing.candidate.take(place.clamp(max=pairing.candidate.numel() - 1))
@@ -227,90 +201,3 @@ def _with_padding(points: KeyPoints) -> KeyPoints:
     window, row, col = (F.pad(values, (0, 1)) for values in (points.window, points.row, points.col))
     # An energy of 0 would make 0 / 0 of its scores.
     return KeyPoints(window, row, col, F.pad(points.patch, (0, 0, 0, 1)), F.pad(points.energy, (0, 1), value=1))
-
-
-@dataclass(frozen=True)
-class _Tiles:
-    """Where each group of key points stands: (G,) int64 each, row and column of the tile's first pixel."""
-
-    window: Tensor
-    row: Tensor
-    col: Tensor
-
-
-def _group(points: KeyPoints) -> Tuple[_Tiles, Tensor]:
-    """Groups of up to `_GROUP` key points of the same tile, (G, _GROUP) int64; padded with K."""
-    tile = (points.window << 24) + (points.row // _TILE << 12) + points.col // _TILE
-    tile, order = tile.sort(stable=True)
-    position = torch.arange(tile.numel(), device=tile.device)
-    rank = position - torch.searchsorted(tile, tile)
-    starts = rank % _GROUP == 0
-    group = starts.cumsum(0) - 1
-    first = flat_nonzero(starts)
-    members = torch.full((first.numel(), _GROUP), tile.numel(), dtype=torch.int64, device=tile.device)
-    members.view(-1).scatter_(0, group * _GROUP + rank % _GROUP, order)
-    tile = tile.index_select(0, first)
-    return _Tiles(tile >> 24, (tile >> 12 & 0xFFF) * _TILE, (tile & 0xFFF) * _TILE), members
-
-
-@dataclass(frozen=True)
-class _Pairing:
-    """Candidates of every group.
-
-    Args:
-        candidate: (C,) int64, those of all groups one after the other.
-        first, count: (G,) int64, which of them belong to a group.
-        limit: (G,) int32, largest squared distance, pixels.
-    """
-
-    candidate: Tensor
-    first: Tensor
-    count: Tensor
-    limit: Tensor
-
-
-def _candidates(tiles: _Tiles, points: KeyPoints, reach: Tensor) -> _Pairing:
-    """For every group the key points that may lie within reach of its tile (all that do, and a few more)."""
-    key, order = _band_key(points.window, points.row // _TILE, points.col).sort()
-    reach = reach.index_select(0, tiles.window)
-    num_bands = min(int(reach.max()) // _TILE + 1, 1 << 11)
-    band = torch.arange(-num_bands, num_bands + 1, device=key.device)
-    gap = ((band.abs() - 1) * _TILE + 1).clamp(min=0)  # rows between the tile and the band
-    square = (reach * reach)[:, None] - gap * gap
-    half_width = square.clamp(min=0).sqrt().ceil().clamp(max=1 << 15).long() + 1
-    bands = (tiles.row // _TILE)[:, None] + band
-    begin = (tiles.col[:, None] - half_width).clamp(min=0)
-    end = tiles.col[:, None] + _TILE + half_width
-    window = tiles.window[:, None]
-    start = torch.searchsorted(key, _band_key(window, bands, begin))
-    length = (torch.searchsorted(key, _band_key(window, bands, end)) - start) * (square >= 0)
-    count = length.sum(1)
-    stop = length.flatten().cumsum(0)
-    place = torch.repeat_interleave(start.flatten() - stop + length.flatten(), length.flatten())
-    candidate = order.take(place + torch.arange(place.numel(), device=place.device))
-    limit = (reach * reach).floor().clamp(max=torch.iinfo(torch.int32).max).int()
-    return _Pairing(candidate, count.cumsum(0) - count, count, limit)
-
-
-def _band_key(window: Tensor, band: Tensor, col: Tensor) -> Tensor:
-    """Sorts by window, band, column; bands may lie up to 2^12 below the image."""
-    return (((window << 14) + band + (1 << 12)) << 17) + col
-
-
-def _chunks(pairing: _Pairing, config: Config) -> Iterator[Tuple[Tensor, int]]:
-    """Groups that are looked at together, and the length that their lists of candidates are padded to."""
-    lengths = torch.tensor(_LENGTHS, device=pairing.count.device)
-    step = torch.searchsorted(lengths, pairing.count)
-    step, order = step.masked_fill_(pairing.count == 0, -1).sort(descending=True, stable=True)
-    num_pairs = _PAIRS_AT_ONCE_GPU if order.is_cuda else _PAIRS_AT_ONCE_CPU
-    if config.max_memory is not None:
-        bytes_per_pair = 24 + 5 * config.patch_size**2 // _GROUP
-        num_pairs = min(num_pairs, int(config.max_memory) // bytes_per_pair)
-    steps, counts = torch.unique_consecutive(step, return_counts=True)
-    first = 0
-    for index, number in zip(steps.tolist(), counts.tolist()):
-        if index >= 0:  # the others have no candidate
-            at_once = max(1, num_pairs // (_LENGTHS[index] * _GROUP))
-            for groups in order[first : first + number].split(at_once):
-                yield groups, _LENGTHS[index]
-        first += number

@@ -10,14 +10,15 @@ import torch
 from scenes import LABELINGS, assert_same, assert_zeros, box, config, needs_gpu, scene
 
 from cflow_torch import CFlowError, CorrelationFlowKeypoints, Sweep, Window, estimate_flow, make_model
+from cflow_torch import gate as gating
 from cflow_torch import match as matching
 from cflow_torch.config import make_config
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.hdf5 import HDF5Log
 from cflow_torch.data.log import window as window_of
 from cflow_torch.data.synthetic import make_drive
-from cflow_torch.keypoints import describe, detect
-from cflow_torch.match import KeyPoints, match
+from cflow_torch.descriptors import KeyPoints, describe, detect
+from cflow_torch.match import match
 from cflow_torch.reference import reference_flow
 from cflow_torch.types import FlowResult
 
@@ -128,7 +129,7 @@ def test_batch_equals_loop_whatever_the_chunks(monkeypatch):
         for whole, single in zip(small(windows), alone):
             assert_same(whole, single)
         with monkeypatch.context() as patch:
-            patch.setattr(matching, "_PAIRS_AT_ONCE_CPU", 1)  # every group on its own
+            patch.setattr(gating, "_PAIRS_AT_ONCE_CPU", 1)  # every group on its own
             patch.setattr("cflow_torch.ops.nearest._COMPARED_AT_ONCE", 1)
             assert_same(model([windows[0]])[0], alone[0])
 
@@ -137,8 +138,8 @@ def test_tiles_and_groups_do_not_show(monkeypatch):
     window, model = scene(63), CorrelationFlowKeypoints(settings_for(second_best_distance=2.0, mutual_check=True))
     (expected,) = model([window])
     for tile, group in ((1, 1), (3, 2), (64, 40)):
-        monkeypatch.setattr(matching, "_TILE", tile)
-        monkeypatch.setattr(matching, "_GROUP", group)
+        monkeypatch.setattr(gating, "_TILE", tile)
+        monkeypatch.setattr(gating, "_GROUP", group)
         assert_same(model([window])[0], expected)
 
 

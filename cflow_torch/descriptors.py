@@ -1,0 +1,65 @@
+"""Key points of the occupancy images and their binary descriptors (Sec. Keypoints, Sec. Descriptor)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Tuple
+
+from torch import Tensor
+
+from cflow_torch.ops.indices import flat_nonzero
+from cflow_torch.ops.morphology import erode_cross
+from cflow_torch.ops.patches import gather_patches
+
+
+@dataclass(frozen=True)
+class KeyPoints:
+    """Key points of one sweep of every window, in order of window, row and column.
+
+    Args:
+        window, row, col: (K,) int64.
+        patch: (K, L * L) uint8, zeros and ones.
+        energy: (K,) int64, number of ones, at least 1.
+    """
+
+    window: Tensor
+    row: Tensor
+    col: Tensor
+    patch: Tensor
+    energy: Tensor
+
+
+def detect(occupancy: Tensor) -> Tensor:
+    """Key points: occupied pixels at distance 1 from the background (Sec. Keypoints).
+
+    Args:
+        occupancy: (..., H, W) bool.
+
+    Returns:
+        (..., H, W) bool.
+
+    Convention: the distance is Euclidean, so one of the four neighbours is free; outside the image all is free.
+    """
+    return occupancy & ~erode_cross(occupancy)
+
+
+def describe(images: Tensor, is_key_point: Tensor, patch_size: int) -> Tuple[Tensor, KeyPoints]:
+    """Key points of one sweep and their descriptors (Sec. Descriptor).
+
+    Args:
+        images: (B, H, W) bool, occupancy of the sweep of every window.
+        is_key_point: (B, H, W) bool.
+        patch_size: L, odd.
+
+    Returns:
+        place: (K,) int64, flat indices into `images`, ascending.
+        key_points: with their L x L patches, zero outside the image.
+
+    Cost: memory K L^2 bytes; the images are not unfolded.
+    """
+    _, height, width = images.shape
+    place = flat_nonzero(is_key_point)
+    line = place // width
+    window, col = line // height, place - line * width
+    row = line - window * height
+    return place, KeyPoints(window, row, col, *gather_patches(images, window, row, col, patch_size))
