@@ -74,7 +74,7 @@ def flow_from_boxes(
     Convention: computed in float64. A point in several boxes takes flow and category of the last one, and is valid
     only if no box that holds it ends.
 
-    Cost: time O(N K).
+    Cost: time O(N K), for most points two comparisons per box.
 
     Source: the recipe of av2-api (torch/structures/flow.py), which rounds the ego motion to float32 first.
     """
@@ -84,7 +84,7 @@ def flow_from_boxes(
     is_valid = np.ones(len(start), dtype=bool)
     successor = {track: row for row, track in enumerate(boxes1.track_id)}
     for row, track in enumerate(boxes0.track_id):
-        inside = points_in_box(start, boxes0.size[row] + np.asarray(margin), boxes0.pose[row])
+        inside = _rows_in_box(start, boxes0.size[row] + np.asarray(margin), boxes0.pose[row])
         category[inside] = boxes0.category[row]
         if track not in successor:
             is_valid[inside] = False
@@ -92,3 +92,12 @@ def flow_from_boxes(
         motion = boxes1.pose[successor[track]] @ np.linalg.inv(boxes0.pose[row])
         flow[inside] = start[inside] @ motion[:3, :3].T + motion[:3, 3] - start[inside]
     return FlowLabels(flow=flow.astype(np.float32), category=category, is_valid=is_valid)
+
+
+def _rows_in_box(points: np.ndarray, size: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """(M,) int64 rows of the points inside a box; those outside of its bounding circle are not looked at closely."""
+    radius = np.linalg.norm(size) / 2 + 1e-6
+    near = np.abs(points[:, 0] - pose[0, 3]) <= radius
+    near &= np.abs(points[:, 1] - pose[1, 3]) <= radius
+    rows = np.flatnonzero(near)
+    return rows[points_in_box(points[rows], size, pose)]

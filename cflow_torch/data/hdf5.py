@@ -4,15 +4,26 @@ from __future__ import annotations
 
 from pathlib import Path
 from types import TracebackType
-from typing import Any, List, Optional, Sequence, Type, Union
+from typing import Any, List, Optional, Sequence, Tuple, Type, Union
 
 import numpy as np
 
+from cflow_torch.data.index_file import read_index
 from cflow_torch.data.log import FlowLabels
+from cflow_torch.ego import rigid_transform
 from cflow_torch.types import CFlowError, Sweep
 
 # Time stamps count from 1970 or 1980: below this they are microseconds (16 digits), above it nanoseconds (18 or 19).
 _FIRST_NANOSECOND = 10**17
+# Argoverse 2 counts nanoseconds from a moment of its own: all sweeps of the data set lie in here, no other set's do.
+_ARGOVERSE2_STAMPS = (315_900_000_000_000_000, 316_000_000_000_000_000)
+# Its up_lidar sits 2 m above the road, its ego frame 0.35 m: ground lower than this is seen from the sensor.
+_ARGOVERSE2_SENSOR_GROUND = -1.2
+# Extrinsics of up_lidar in one log of the set (7fab2350), yaw -0.58 degrees. Each log has its own, the scenes none.
+_ARGOVERSE2_EGO_T_UP_LIDAR = np.array(
+    [[0.9999483, 0.0101698, 0, 1.35018], [-0.0101698, 0.9999483, 0, 0], [0, 0, 1, 1.64042], [0, 0, 0, 1]]
+)
+EXTRINSIC = "ego_T_lidar"  # attribute of a scene that `write_hdf5_scene` leaves
 
 
 def find_hdf5_scenes(root: Union[str, Path]) -> List[Path]:
@@ -34,21 +45,32 @@ class HDF5Log:
 
     Args:
         file: `<scene>.h5`.
+        ego_T_lidar: (4, 4), coordinates of the stored points to the frame whose poses are stored; None = the same
+            frame; "auto" = as the scene says (see Convention).
 
     Attributes:
         log_id: file name without its ending.
         timestamps: names of the groups as integers, ascending, in nanoseconds or microseconds as the data set has
             them; the sweeps' `timestamp_ns` are nanoseconds.
+        ego_T_lidar: (4, 4) float64, the one in use.
 
     Convention:
-        The group's `lidar` lies in the frame that the file was written in (for Argoverse 2 files that is the up_lidar
-        sensor, while `pose` is the ego vehicle's). The index files beside a scene are pickles and are never read.
+        - Points, labels and results stay in the frame of the file, that of the LiDAR. A sweep's `pose` is the LiDAR's:
+          the stored pose times `ego_T_lidar`. So the static world stays put also where the file has points in the
+          sensor frame and poses of the ego vehicle.
+        - "auto": the file's attribute `ego_T_lidar` if it has one (our writer's do). Otherwise a scene with time stamps
+          of Argoverse 2 whose ground lies lower than 1.2 m below the origin has points in the frame of up_lidar, and
+          the extrinsics of one log of that set are used; those of the scene's own log are not in the file, pass them
+          from its `calibration/egovehicle_SE3_sensor.feather`. All other sets: the same frame (nuScenes and ZOD have
+          poses of the sensor, Waymo and TruckScenes points in the ego frame).
+        - Index files beside a scene are pickles; only `eval_frames` reads one, and runs nothing in it.
 
     Raises:
-        CFlowError: h5py is missing, the file is no HDF5 file, or it holds fewer than two sweeps.
+        CFlowError: h5py is missing, the file is no HDF5 file, it holds fewer than two sweeps, or `ego_T_lidar` is no
+            rigid motion.
     """
 
-    def __init__(self, file: Union[str, Path]) -> None:
+    def __init__(self, file: Union[str, Path], ego_T_lidar: Any = "auto") -> None:
         try:
             import h5py
         except ImportError:
@@ -59,10 +81,18 @@ class HDF5Log:
             self._scene = h5py.File(self.file, "r")
         except OSError as error:
             raise CFlowError(f"{self.file} cannot be read as HDF5 ({error}): give a scene that is complete") from error
-        self.timestamps: Sequence[int] = sorted(int(name) for name in self._scene if name.isdigit())
-        if len(self.timestamps) < 2:
+        try:
+            self.timestamps: Sequence[int] = sorted(int(name) for name in self._scene if name.isdigit())
+            if len(self.timestamps) < 2:
+                raise CFlowError(f"{self.file} has {len(self.timestamps)} sweeps; scene flow needs two or more")
+            if isinstance(ego_T_lidar, str) and ego_T_lidar == "auto":
+                ego_T_lidar = self._stated_extrinsics()
+            elif ego_T_lidar is None:
+                ego_T_lidar = np.eye(4)
+            self.ego_T_lidar = rigid_transform(ego_T_lidar, f"ego_T_lidar of {self.file}")
+        except BaseException:
             self._scene.close()
-            raise CFlowError(f"{self.file} has {len(self.timestamps)} sweeps; scene flow needs two or more")
+            raise
 
     def __enter__(self) -> HDF5Log:
         return self
@@ -73,7 +103,7 @@ class HDF5Log:
         self._scene.close()
 
     def sweep(self, index: int) -> Sweep:
-        """Sweep number `index`: float32 points, float64 pose, ground mask where the scene has one.
+        """Sweep number `index`: float32 points, float64 pose of their frame, ground mask where the scene has one.
 
         Raises:
             CFlowError: no such sweep, or `lidar` or `pose` is missing or cannot be read.
@@ -84,6 +114,8 @@ class HDF5Log:
             raise CFlowError(f"{self.file}: lidar of sweep {timestamp} has shape {points.shape}, expected (N, 3+)")
         is_ground = self._column(timestamp, "ground_mask", np.bool_, len(points))
         pose = self._read(timestamp, "pose").astype(np.float64)
+        if not np.array_equal(self.ego_T_lidar, np.eye(4)):
+            pose = rigid_transform(pose, f"pose of sweep {timestamp} in {self.file}") @ self.ego_T_lidar
         nanoseconds = timestamp if timestamp >= _FIRST_NANOSECOND else timestamp * 1000
         return Sweep(points[:, :3], is_ground, pose, nanoseconds)
 
@@ -97,16 +129,90 @@ class HDF5Log:
         if "flow" not in self._scene[str(timestamp)]:
             return None
         flow = self._read(timestamp, "flow").astype(np.float32, copy=False)
-        category = self._column(timestamp, "flow_category_indices", np.uint8, len(flow))
+        category = self._column(timestamp, "flow_category_indices", np.int64, len(flow))
         is_valid = self._column(timestamp, "flow_is_valid", np.bool_, len(flow))
         if category is None or is_valid is None:
             raise CFlowError(f"{self.file}: sweep {timestamp} has flow without flow_category_indices or flow_is_valid")
-        return FlowLabels(flow, category, is_valid)
+        # Waymo has int8 and -1 = no label.
+        return FlowLabels(flow, category.clip(0).astype(np.uint8), is_valid & (category >= 0))
 
     def eval_mask(self, index: int) -> Optional[np.ndarray]:
         """(N,) bool points to score, None where the sweep has no `eval_mask`."""
         timestamp = self._timestamp(index)
         return self._column(timestamp, "eval_mask", np.bool_, len(self._scene[str(timestamp)]["lidar"]))
+
+    def keys(self, index: int) -> Tuple[str, ...]:
+        """Names of everything that sweep `index` has, results included."""
+        return tuple(sorted(self._scene[str(self._timestamp(index))]))
+
+    def values(self, index: int, key: str) -> np.ndarray:
+        """What a sweep has under a key, as it is stored; (N, 1) columns become (N,).
+
+        Args:
+            index: number of the sweep.
+            key: for example `lidar` (N, 3+), `ego_motion` (4, 4) to the next sweep as stored (of the ego frame),
+                `flow_instance_id` (N,) 0 = background, `lidar_id` (N,), `lidar_dt` (N,) seconds, `lidar_center`
+                (L, 4, 4) ego_T_sensor, `dufo`, `cluster`, or the name of a result, (N, 3) total flow.
+
+        Raises:
+            CFlowError: no such sweep or key; the message lists the keys.
+        """
+        timestamp = self._timestamp(index)
+        if key not in self._scene[str(timestamp)]:
+            raise CFlowError(f"{self.file}: sweep {timestamp} has no {key}; it has {', '.join(self.keys(index))}")
+        values = self._read(timestamp, key)
+        return values[:, 0] if values.ndim == 2 and values.shape[1] == 1 else values
+
+    def eval_frames(self, index_file: Union[str, Path, None] = None) -> List[int]:
+        """Numbers of the sweeps to score, ascending.
+
+        Args:
+            index_file: OpenSceneFlow's index; None = `index_eval.pkl` beside the scene, if there is one.
+
+        Returns:
+            The scene's entries of the index file; without a file, the sweeps with `eval_mask`; without those, the
+            sweeps with `flow`. The last sweep of the scene has no successor and is left out.
+
+        Raises:
+            CFlowError: the file is no index, or it names a sweep that the scene does not have.
+        """
+        beside = self.file.parent / "index_eval.pkl"
+        if index_file is None and beside.is_file():
+            index_file = beside
+        if index_file is None:
+            for key in ("eval_mask", "flow"):
+                found = [k for k, stamp in enumerate(self.timestamps) if key in self._scene[str(stamp)]]
+                if found:
+                    break
+        else:
+            number = {stamp: k for k, stamp in enumerate(self.timestamps)}
+            stamps = [stamp for scene, stamp in read_index(index_file) if scene == self.log_id]
+            missing = [stamp for stamp in stamps if stamp not in number]
+            if missing:
+                raise CFlowError(f"{index_file} names sweep {missing[0]}, which {self.file} does not have: delete it")
+            found = sorted({number[stamp] for stamp in stamps})
+        return [k for k in found if k < len(self.timestamps) - 1]
+
+    @property
+    def poses(self) -> np.ndarray:
+        """(K, 4, 4) float64 `T_world_lidar` of every sweep, without reading any points."""
+        return np.stack([self._read(stamp, "pose").astype(np.float64) for stamp in self.timestamps]) @ self.ego_T_lidar
+
+    def _stated_extrinsics(self) -> np.ndarray:
+        """What the scene says about where its LiDAR sits."""
+        if EXTRINSIC in self._scene.attrs:
+            return np.asarray(self._scene.attrs[EXTRINSIC])
+        low, high = _ARGOVERSE2_STAMPS
+        if not low <= self.timestamps[0] < high:
+            return np.eye(4)
+        group = self._scene[str(self.timestamps[0])]
+        if "lidar" not in group or "ground_mask" not in group:
+            return np.eye(4)
+        points = self._read(self.timestamps[0], "lidar")
+        is_ground = self._column(self.timestamps[0], "ground_mask", np.bool_, len(points))
+        if is_ground is None or not is_ground.any() or np.median(points[is_ground, 2]) > _ARGOVERSE2_SENSOR_GROUND:
+            return np.eye(4)
+        return _ARGOVERSE2_EGO_T_UP_LIDAR
 
     def _timestamp(self, index: int) -> int:
         if not 0 <= index < len(self.timestamps):

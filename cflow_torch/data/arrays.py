@@ -1,0 +1,262 @@
+"""Any sensor: a folder with one point cloud per file, and text files with poses and times beside it."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any, Dict, List, Optional, Sequence, Tuple, Union
+
+import numpy as np
+
+from cflow_torch.data.cloud_file import KITTI_COLUMNS, SUFFIXES, read_cloud
+from cflow_torch.data.log import FlowLabels
+from cflow_torch.data.poses_text import Trajectory, poses_at, read_poses, read_times
+from cflow_torch.ego import rigid_transform
+from cflow_torch.types import CFlowError, Sweep
+
+POINT_FOLDERS = ("points", "lidar", "velodyne", "clouds")  # where the clouds may lie below the log's folder
+POSE_FILES = ("poses.txt", "poses.npy", "trajectory.txt")
+GROUND_FOLDER = "ground"
+SEARCH_DEPTH = 4
+_OTHER_STEMS = {"poses", "trajectory", "times", "timestamps", "calib"}
+_STAMP_DIGITS = 16  # a file name that long is a time: microseconds; nanoseconds have 18 or 19 digits
+_FIRST_NANOSECOND = 10**17
+
+
+def find_array_logs(root: Union[str, Path]) -> List[Path]:
+    """Folders of all logs under a folder, at most four levels down.
+
+    Args:
+        root: a log, or a folder of logs.
+
+    Returns:
+        Sorted folders with two or more clouds, in the folder itself or in its subfolder points, lidar, velodyne or
+        clouds.
+
+    Raises:
+        CFlowError: `root` is no folder.
+    """
+    root = Path(root)
+    if not root.is_dir():
+        raise CFlowError(f"{root} is no folder; give a folder with one point cloud per file, or a folder of such")
+    found: List[Path] = []
+    level = [root]
+    for _ in range(SEARCH_DEPTH + 1):
+        logs = {folder for folder in level if _clouds(folder)[1]}
+        found += logs
+        level = [
+            child
+            for folder in level
+            if folder not in logs
+            for child in folder.iterdir()
+            if child.is_dir() and child.name != GROUND_FOLDER
+        ]
+    return sorted(found)
+
+
+class ArraysLog:
+    """A folder of point clouds; implements the `Log` protocol.
+
+    Args:
+        folder: holds two or more clouds of one suffix (`cloud_file.SUFFIXES`), or has a subfolder points, lidar,
+            velodyne or clouds that does. They are taken in natural order: 2 before 10.
+        poses: "auto" = poses.txt, poses.npy or trajectory.txt in the folder, or KITTI's ../../poses/<name>.txt, if
+            there is one; None = no poses; or a file (see `read_poses`), or a (K, 4, 4) array.
+        poses_of: "ego" or "lidar": whose poses they are.
+        calibration: "auto" = `calib.txt` in the folder, if the poses are KITTI's 12 numbers; None = none; or a file. It
+            turns poses of KITTI's camera into poses of the LiDAR, so `poses_of` is "lidar" then.
+        times: "auto" = times.txt in the folder; None = none; or a file with one time in seconds per sweep.
+        ground: "auto" = the subfolder `ground`, if there is one; None = no masks; or a folder. It has one .npy of (N,)
+            bool or 0 and 1 per cloud, of the same name.
+        ego_T_lidar: (4, 4), coordinates of the stored points to the ego frame; None = they are the same.
+        suffix: which clouds, where a folder has several kinds.
+        bin_columns: numbers per point of `.bin` files: 4 in KITTI, 5 in nuScenes.
+
+    Attributes:
+        log_id: name of the folder.
+        files: the clouds, in order.
+        timestamps: nanoseconds, from `times`, else from the poses (TUM), else from file names of 16 digits or more
+            (microseconds, nanoseconds), else 0, 1, 2, ...; in that last case sweeps have no `timestamp_ns`.
+        poses: (K, 4, 4) float64 `T_world_ego` of every sweep; None = unknown.
+
+    Convention:
+        Sweeps are in the ego frame: points are moved by `ego_T_lidar` in float64, then rounded to float32. Poses with
+        times of their own (TUM) are interpolated at the sweeps' times where these are known; otherwise there must be
+        one pose per sweep. The frame should have z up: the method looks from above.
+
+    Raises:
+        CFlowError: fewer than two clouds, clouds of several suffixes, poses or times that do not fit, a setting that
+            names nothing.
+    """
+
+    def __init__(
+        self,
+        folder: Union[str, Path],
+        poses: Any = "auto",
+        poses_of: str = "ego",
+        calibration: Union[str, Path, None] = "auto",
+        times: Union[str, Path, None] = "auto",
+        ground: Union[str, Path, None] = "auto",
+        ego_T_lidar: Any = None,
+        suffix: Optional[str] = None,
+        bin_columns: int = KITTI_COLUMNS,
+    ) -> None:
+        self.folder = Path(folder)
+        if not self.folder.is_dir():
+            raise CFlowError(f"{self.folder} is no folder; give a folder with one point cloud per file")
+        if poses_of not in ("ego", "lidar"):
+            raise CFlowError(f"poses_of={poses_of!r}: give 'ego' or 'lidar'")
+        self.log_id = self.folder.resolve().name
+        self.files = _one_suffix(self.folder, suffix)
+        self._bin_columns = bin_columns
+        self._ground = _beside(self.folder, ground, (GROUND_FOLDER,), "ground")
+        self.ego_T_lidar = np.eye(4) if ego_T_lidar is None else rigid_transform(ego_T_lidar, "ego_T_lidar")
+        trajectory, source, in_lidar = self._trajectory(poses, calibration)
+        stamps = self._times(times, trajectory)
+        self._has_times = stamps is not None
+        self.timestamps: Sequence[int] = list(range(len(self.files))) if stamps is None else stamps
+        self.poses = None if trajectory is None else self._one_each(trajectory, source, stamps)
+        if self.poses is not None and (in_lidar or poses_of == "lidar"):
+            self.poses = self.poses @ np.linalg.inv(self.ego_T_lidar)
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+    def sweep(self, index: int) -> Sweep:
+        """Sweep number `index`: (N, 3) float32 in the ego frame, pose, ground mask and time where they are known.
+
+        Raises:
+            CFlowError: no such sweep, or its files cannot be read.
+        """
+        if not 0 <= index < len(self.files):
+            raise CFlowError(f"log {self.log_id} has sweeps 0 ... {len(self.files) - 1}, asked for {index}")
+        points = read_cloud(self.files[index], self._bin_columns)
+        if not np.array_equal(self.ego_T_lidar, np.eye(4)):
+            points = points.astype(np.float64) @ self.ego_T_lidar[:3, :3].T + self.ego_T_lidar[:3, 3]
+        is_ground = None if self._ground is None else _read_mask(self._ground, self.files[index].stem, len(points))
+        pose = None if self.poses is None else self.poses[index].copy()
+        time = self.timestamps[index] if self._has_times else None
+        return Sweep(points.astype(np.float32, copy=False), is_ground, pose, time)
+
+    def labels(self, index: int) -> Optional[FlowLabels]:
+        """None: bare clouds have no truth.
+
+        Raises:
+            CFlowError: no such sweep.
+        """
+        if not 0 <= index < len(self.files):
+            raise CFlowError(f"log {self.log_id} has sweeps 0 ... {len(self.files) - 1}, asked for {index}")
+        return None
+
+    def _trajectory(self, poses: Any, calibration: Any) -> Tuple[Optional[Trajectory], str, bool]:
+        """The poses given or found, what to call them, and whether a calibration made them the LiDAR's."""
+        if isinstance(poses, (str, Path)):
+            kitti = f"../../poses/{self.log_id}.txt"
+            file = _beside(self.folder.resolve(), poses, (*POSE_FILES, kitti), "poses")
+            if file is None:
+                return None, "", False
+            trajectory = read_poses(file)
+            chosen = _beside(self.folder, calibration, ("calib.txt",), "calibration")
+            if chosen is not None and (calibration != "auto" or trajectory.layout == "kitti"):
+                return read_poses(file, chosen), str(file), True
+            return trajectory, str(file), False
+        if poses is None:
+            return None, "", False
+        matrices = np.asarray(poses, np.float64)
+        if matrices.ndim != 3 or not len(matrices):
+            raise CFlowError(f"poses have shape {matrices.shape}; give (K, 4, 4), one per sweep")
+        checked = [rigid_transform(pose, f"poses[{row}]") for row, pose in enumerate(matrices)]
+        return Trajectory(np.stack(checked), None, "matrix"), "poses", False
+
+    def _times(self, times: Any, trajectory: Optional[Trajectory]) -> Optional[List[int]]:
+        """Nanoseconds of each sweep, None = unknown."""
+        count = len(self.files)
+        file = _beside(self.folder, times, ("times.txt",), "times")
+        if file is not None:
+            stamps = read_times(file).tolist()
+            if len(stamps) != count:
+                raise CFlowError(f"{file} has {len(stamps)} times for {count} sweeps; it needs one each")
+            return stamps
+        names = [path.stem for path in self.files]
+        if all(name.isdigit() and len(name) >= _STAMP_DIGITS for name in names):
+            return [int(name) * (1 if int(name) >= _FIRST_NANOSECOND else 1000) for name in names]
+        if trajectory is not None and trajectory.times_ns is not None and len(trajectory.times_ns) == count:
+            return trajectory.times_ns.tolist()
+        return None
+
+    def _one_each(self, trajectory: Trajectory, source: str, stamps: Optional[List[int]]) -> np.ndarray:
+        """(K, 4, 4) one pose per sweep."""
+        if trajectory.times_ns is not None and stamps is not None:
+            return poses_at(trajectory, stamps, source)
+        if len(trajectory.poses) != len(self.files):
+            raise CFlowError(
+                f"{source} has {len(trajectory.poses)} poses for {len(self.files)} sweeps: give one each, or poses "
+                "with times (TUM) and times.txt with those of the sweeps"
+            )
+        return trajectory.poses
+
+
+def natural_key(name: str) -> Tuple[Any, ...]:
+    """Sorts 2 before 10: the digits of a name count as numbers."""
+    return tuple((0, int(part), part) if part.isdigit() else (1, 0, part) for part in re.findall(r"\d+|\D+", name))
+
+
+def _clouds(folder: Path) -> Tuple[Path, Dict[str, List[Path]]]:
+    """Where the clouds of a log lie, and those of each suffix that has two or more."""
+    for place in (folder, *(folder / name for name in POINT_FOLDERS)):
+        kinds: Dict[str, List[Path]] = {}
+        if place.is_dir():
+            for path in place.iterdir():
+                if path.suffix.lower() in SUFFIXES and path.stem.lower() not in _OTHER_STEMS and path.name[0] != ".":
+                    kinds.setdefault(path.suffix.lower(), []).append(path)
+        kinds = {suffix: files for suffix, files in kinds.items() if len(files) > 1}
+        if kinds:
+            return place, kinds
+    return folder, {}
+
+
+def _one_suffix(folder: Path, suffix: Optional[str]) -> List[Path]:
+    place, kinds = _clouds(folder)
+    if suffix is not None:
+        kinds = {kind: files for kind, files in kinds.items() if kind == "." + suffix.lower().lstrip(".")}
+    if not kinds:
+        raise CFlowError(
+            f"{folder} has fewer than two point clouds ({suffix or ', '.join(SUFFIXES)}), in itself or in "
+            f"{', '.join(POINT_FOLDERS)}; scene flow needs two or more"
+        )
+    if len(kinds) > 1:
+        raise CFlowError(
+            f"{place} has clouds of several kinds ({', '.join(sorted(kinds))}): choose one with suffix=..."
+        )
+    return sorted(next(iter(kinds.values())), key=lambda path: natural_key(path.stem))
+
+
+def _beside(folder: Path, setting: Union[str, Path, None], names: Sequence[str], what: str) -> Optional[Path]:
+    """The file or folder that a setting means; None = none."""
+    if setting is None:
+        return None
+    if setting == "auto":
+        found = [folder / name for name in names if (folder / name).exists()]
+        if len(found) > 1:
+            raise CFlowError(f"{folder} has several: {', '.join(p.name for p in found)}; choose one with {what}=...")
+        return found[0] if found else None
+    path = Path(setting)
+    path = path if path.is_absolute() or path.exists() else folder / path
+    if not path.exists():
+        raise CFlowError(f"{what}={str(setting)!r} names nothing, neither here nor in {folder}")
+    return path
+
+
+def _read_mask(folder: Path, stem: str, rows: int) -> np.ndarray:
+    file = folder / f"{stem}.npy"
+    try:
+        mask = np.load(file, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise CFlowError(
+            f"{file} cannot be read ({error}); every sweep needs its ground mask, or pass ground=None"
+        ) from error
+    if mask.shape not in ((rows,), (rows, 1)) or mask.dtype.kind not in "biu" or not np.isin(mask, (0, 1)).all():
+        raise CFlowError(
+            f"{file} has shape {mask.shape} and dtype {mask.dtype} for {rows} points; give (N,) bool, True = ground"
+        )
+    return mask.reshape(rows).astype(bool)

@@ -1,0 +1,83 @@
+"""Writes any log as a folder of point clouds with poses, times and ground masks, as `ArraysLog` reads them."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Optional, Union
+
+import numpy as np
+
+from cflow_torch.data.arrays import GROUND_FOLDER
+from cflow_torch.data.cloud_file import SUFFIXES, write_cloud
+from cflow_torch.data.log import Log
+from cflow_torch.data.poses_text import write_kitti_poses, write_times, write_tum_poses
+from cflow_torch.types import CFlowError
+
+
+def write_array_log(log: Log, root: Union[str, Path], suffix: str = ".npy", poses: Optional[str] = "kitti") -> Path:
+    """Write a log to `root/<log_id>`: `points/000000.npy` ..., `ground/000000.npy` ..., `poses.txt`, `times.txt`.
+
+    Args:
+        log: any log.
+        root: folder above, made if absent.
+        suffix: of the clouds, one of `cloud_file.SUFFIXES`.
+        poses: "kitti" (12 numbers a line), "tum" (with times), "npy" ((K, 4, 4) float64), None = none.
+
+    Returns:
+        The folder.
+
+    Convention:
+        Everything appears at once or not at all. Points are in the log's ego frame, poses `T_world_ego`. Masks and
+        times are written where every sweep has them.
+
+    Raises:
+        CFlowError: an unknown suffix or format, poses asked for and not there, or the folder exists.
+    """
+    if suffix not in SUFFIXES or poses not in ("kitti", "tum", "npy", None):
+        raise CFlowError(
+            f"suffix={suffix!r}, poses={poses!r}: give one of {SUFFIXES} and 'kitti', 'tum', 'npy' or None"
+        )
+    folder = Path(root) / log.log_id
+    if folder.exists():
+        raise CFlowError(f"{folder} exists already: remove it, or choose another root")
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    scratch = Path(tempfile.mkdtemp(prefix=f".{log.log_id}-", dir=folder.parent))
+    try:
+        _write(log, scratch / "new", suffix, poses)
+        os.replace(scratch / "new", folder)
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+    return folder
+
+
+def _write(log: Log, folder: Path, suffix: str, poses: Optional[str]) -> None:
+    transforms, times, masks = [], [], []
+    for index in range(len(log.timestamps)):
+        sweep = log.sweep(index)
+        write_cloud(folder / "points" / f"{index:06d}{suffix}", np.asarray(sweep.points)[:, :3])
+        transforms.append(sweep.pose)
+        times.append(sweep.timestamp_ns)
+        masks.append(sweep.is_ground is not None)
+        if sweep.is_ground is not None:
+            file = folder / GROUND_FOLDER / f"{index:06d}.npy"
+            file.parent.mkdir(exist_ok=True)
+            np.save(file, np.asarray(sweep.is_ground))
+    if any(masks) and not all(masks):
+        shutil.rmtree(folder / GROUND_FOLDER)
+    known = [time for time in times if time is not None]
+    if len(known) == len(times):
+        write_times(folder / "times.txt", known)
+    if poses is None:
+        return
+    if any(pose is None for pose in transforms) or (poses == "tum" and len(known) < len(times)):
+        raise CFlowError(f"log {log.log_id} has sweeps without pose or time; write it with poses=None")
+    stacked = np.stack([np.asarray(pose, np.float64) for pose in transforms])
+    if poses == "kitti":
+        write_kitti_poses(folder / "poses.txt", stacked)
+    elif poses == "tum":
+        write_tum_poses(folder / "poses.txt", known, stacked)
+    else:
+        np.save(folder / "poses.npy", stacked)

@@ -1,0 +1,177 @@
+"""One point cloud per file, whatever the suffix: what is read are x, y, z in metres."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Callable, Dict, Mapping, Optional, Union
+
+import numpy as np
+import pyarrow as pa
+from pyarrow import feather, parquet
+
+from cflow_torch.data.atomic import atomic_file
+from cflow_torch.data.pcd import read_pcd, write_pcd
+from cflow_torch.data.ply import read_ply, write_ply
+from cflow_torch.types import CFlowError
+
+SUFFIXES = (".npy", ".npz", ".bin", ".pcd", ".ply", ".feather", ".parquet")
+KITTI_COLUMNS = 4  # x, y, z, reflectance
+_AXES = ("x", "y", "z")
+_CLOUD_KEYS = ("points", "lidar", "xyz", "pc")  # of an .npz file that holds more than one table
+
+
+def read_cloud(path: Union[str, Path], bin_columns: int = KITTI_COLUMNS) -> np.ndarray:
+    """Positions of a point cloud.
+
+    Args:
+        path: the file; its suffix says what it is (see Convention).
+        bin_columns: float32 numbers per point of a `.bin` file: 4 in KITTI, 5 in nuScenes.
+
+    Returns:
+        (N, 3) in the file's own precision: float32 or float64; float16 becomes float32.
+
+    Convention:
+        - `.npy`: (N, 3+) floats, columns x, y, z first; or a structured array with fields x, y, z.
+        - `.npz`: arrays x, y, z; or one (N, 3+) array, called points, lidar, xyz or pc if there are several.
+        - `.bin`: little-endian float32, `bin_columns` per point.
+        - `.pcd`, `.ply`: fields x, y, z.
+        - `.feather`, `.parquet`: columns x, y, z; where there are none of these names, the first three.
+        Anything else in the file is ignored. Nothing is unpickled.
+
+    Raises:
+        CFlowError: no such file, an unknown suffix, a file that is truncated or holds something else.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise CFlowError(f"{path} has suffix {suffix!r}; clouds are {', '.join(SUFFIXES)}")
+    if not path.is_file():
+        raise CFlowError(f"{path} does not exist")
+    if suffix == ".bin":
+        points = _read_bin(path, bin_columns)
+    elif suffix in (".pcd", ".ply"):
+        points = _from_fields(path, (read_pcd if suffix == ".pcd" else read_ply)(path))
+    elif suffix in (".feather", ".parquet"):
+        points = _read_table(path, feather.read_table if suffix == ".feather" else parquet.read_table)
+    else:
+        points = _read_numpy(path)
+    if points.dtype.kind != "f":
+        raise CFlowError(f"{path} holds {points.dtype} coordinates; give floating-point metres")
+    points = points[:, :3].astype(np.float32 if points.dtype.itemsize < 8 else np.float64, copy=False)
+    return points.astype(points.dtype.newbyteorder("="), copy=False)
+
+
+def write_cloud(path: Union[str, Path], points: np.ndarray, intensity: Optional[np.ndarray] = None) -> None:
+    """Write a cloud in the format of the suffix, atomically.
+
+    Args:
+        path: file name with one of `SUFFIXES`.
+        points: (N, 3) float32 or float64, metres. `.bin` files are float32 whatever is given.
+        intensity: (N,) float, 0 ... 1; a column more. `.bin` files have zeros where it is not given.
+
+    Raises:
+        CFlowError: an unknown suffix, or points of another shape.
+    """
+    path, points = Path(path), np.asarray(points)
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise CFlowError(f"{path} has suffix {suffix!r}; clouds are {', '.join(SUFFIXES)}")
+    if points.ndim != 2 or points.shape[1] != 3 or points.dtype not in (np.float32, np.float64):
+        raise CFlowError(f"points have shape {points.shape} and dtype {points.dtype}; give (N, 3) float32 or float64")
+    fields = {axis: np.ascontiguousarray(points[:, k]) for k, axis in enumerate(_AXES)}
+    if intensity is not None:
+        fields["intensity"] = np.asarray(intensity, points.dtype)
+    if suffix == ".pcd":
+        write_pcd(path, fields)
+    elif suffix == ".ply":
+        write_ply(path, fields)
+    elif suffix == ".bin":
+        reflectance = np.zeros(len(points)) if intensity is None else intensity
+        table = np.column_stack([points, reflectance]).astype("<f4")
+        _write(path, lambda file: file.write(table.tobytes()))
+    elif suffix == ".npy":
+        _write(path, lambda file: np.save(file, np.column_stack(list(fields.values()))))
+    elif suffix == ".npz":
+        _write(path, lambda file: np.savez(file, points=np.column_stack(list(fields.values()))))
+    else:
+        table = pa.table({name: pa.array(values) for name, values in fields.items()})
+        write = feather.write_feather if suffix == ".feather" else parquet.write_table
+        _write(path, lambda file: write(table, file))
+
+
+def _read_bin(path: Path, columns: int) -> np.ndarray:
+    if columns < 3:
+        raise CFlowError(f"bin_columns={columns}: a point has three coordinates at least")
+    data = path.read_bytes()
+    if len(data) % (4 * columns):
+        raise CFlowError(
+            f"{path} has {len(data)} bytes, no multiple of {4 * columns} ({columns} float32 a point): it is truncated, "
+            "or has another number of columns (bin_columns: 4 in KITTI, 5 in nuScenes)"
+        )
+    return np.frombuffer(data, "<f4").reshape(-1, columns)
+
+
+def _read_numpy(path: Path) -> np.ndarray:
+    try:
+        stored = np.load(path, allow_pickle=False)
+        if not isinstance(stored, np.ndarray):
+            with stored:
+                stored = _choose(path, {name: stored[name] for name in stored.files})
+    except CFlowError:
+        raise
+    except Exception as error:  # a damaged file makes NumPy and zipfile raise nearly anything
+        raise CFlowError(f"{path} cannot be read ({error}); it is truncated, or no file of plain arrays") from error
+    if stored.dtype.names is not None:
+        return _from_fields(path, {name: stored[name] for name in stored.dtype.names})
+    return _table(path, stored)
+
+
+def _choose(path: Path, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
+    """The cloud among the arrays of an .npz file."""
+    if all(axis in arrays for axis in _AXES):
+        return _from_fields(path, arrays)
+    tables = [name for name, array in arrays.items() if array.ndim == 2 and array.shape[1] >= 3]
+    named = [name for name in tables if name in _CLOUD_KEYS]
+    chosen = named or tables or [name for name, array in arrays.items() if array.dtype.names is not None]
+    if len(chosen) != 1:
+        raise CFlowError(
+            f"{path} holds {list(arrays)}; it must hold x, y, z, or one (N, 3+) array, or name it {_CLOUD_KEYS[0]}"
+        )
+    return arrays[chosen[0]]
+
+
+def _read_table(path: Path, read: Callable[..., Any]) -> np.ndarray:
+    try:
+        table = read(str(path), memory_map=False)
+    except (pa.ArrowException, OSError, ValueError) as error:
+        raise CFlowError(f"{path} cannot be read ({error}); it is truncated or of another format") from error
+    names = _AXES if all(axis in table.column_names for axis in _AXES) else tuple(table.column_names[:3])
+    if len(names) < 3:
+        raise CFlowError(f"{path} has the columns {table.column_names}; it needs x, y, z")
+    fields: Dict[str, np.ndarray] = {}
+    for name in names:
+        if not pa.types.is_floating(table.schema.field(name).type) or table.column(name).null_count:
+            raise CFlowError(f"{path}: column {name} must be floating-point metres without empty entries")
+        fields[name] = table.column(name).to_numpy()
+    return np.stack(list(fields.values()), axis=1)
+
+
+def _from_fields(path: Path, fields: Mapping[str, np.ndarray]) -> np.ndarray:
+    missing = [axis for axis in _AXES if axis not in fields]
+    if missing:
+        raise CFlowError(f"{path} has the fields {list(fields)}; it lacks {', '.join(missing)}")
+    columns = [fields[axis] for axis in _AXES]
+    if any(column.ndim != 1 or len(column) != len(columns[0]) for column in columns):
+        raise CFlowError(f"{path}: x, y, z have shapes {[column.shape for column in columns]}; give (N,) each")
+    return np.stack(columns, axis=1)
+
+
+def _table(path: Path, array: np.ndarray) -> np.ndarray:
+    if array.ndim != 2 or array.shape[1] < 3:
+        raise CFlowError(f"{path} holds an array of shape {array.shape}; give (N, 3+), columns x, y, z first")
+    return array
+
+
+def _write(path: Path, write: Callable[[Any], Any]) -> None:
+    with atomic_file(path) as file:
+        write(file)

@@ -1,0 +1,153 @@
+"""Writes any log as a scene in OpenSceneFlow's HDF5 layout, and the index files beside the scenes."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from pathlib import Path
+from typing import Any, Dict, List, Union
+
+import numpy as np
+
+from cflow_torch.data.boxes import points_in_box
+from cflow_torch.data.hdf5 import EXTRINSIC, HDF5Log, find_hdf5_scenes
+from cflow_torch.data.index_file import write_index
+from cflow_torch.data.log import Log
+from cflow_torch.ego import rigid_transform
+from cflow_torch.types import CFlowError
+
+
+def write_hdf5_scene(
+    log: Log,
+    file: Union[str, Path],
+    points_frame: str = "ego",
+    ego_T_lidar: Any = None,
+    store_extrinsics: bool = True,
+    pose_dtype: str = "float64",
+    eval_step: int = 5,
+) -> None:
+    """Write a log as one scene: one group per sweep, named by its time stamp.
+
+    Args:
+        log: any log with poses; a `Recording` gives lidar_id, lidar_dt, lidar_center and flow_instance_id as well.
+        file: `<scene>.h5`.
+        points_frame: "ego", or "sensor" = points and flow in the LiDAR's frame while poses and ego_motion stay those of
+            the ego frame, as OpenSceneFlow's Argoverse 2 scenes have it.
+        ego_T_lidar: (4, 4) for "sensor"; None = that of a recording's first unit.
+        store_extrinsics: leave `ego_T_lidar` as an attribute of the scene, where `HDF5Log` looks; the harness's own
+            files have none.
+        pose_dtype: "float64" (Waymo, nuScenes, TruckScenes) or "float32" (Argoverse 2, ZOD).
+        eval_step: every how many labelled sweeps get an `eval_mask`: valid and not ground. 0 = none.
+
+    Convention:
+        lidar, flow, ego_motion, lidar_dt, lidar_center are float32, masks bool, flow_category_indices and lidar_id
+        uint8, flow_instance_id int16. eval_mask is (N, 1). The last sweep has no flow and no ego_motion. Neither
+        chunked nor compressed. The file appears whole or not at all.
+
+    Raises:
+        CFlowError: h5py is missing, a sweep has no pose, there is no extrinsic for "sensor", a setting that does not
+            exist, or time stamps that are not different numbers.
+    """
+    try:
+        import h5py
+    except ImportError:
+        raise CFlowError("writing HDF5 scenes needs h5py: pip install 'cflow_torch[hdf5]'") from None
+    if points_frame not in ("ego", "sensor") or pose_dtype not in ("float32", "float64") or eval_step < 0:
+        raise CFlowError(
+            f"points_frame={points_frame!r}, pose_dtype={pose_dtype!r}, eval_step={eval_step}: give 'ego' or 'sensor', "
+            "'float32' or 'float64', and a step of 0 or more"
+        )
+    extrinsics = np.eye(4)
+    if points_frame == "sensor":
+        if ego_T_lidar is None and hasattr(log, "units"):
+            ego_T_lidar = log.units(0)[0].T_ego_sensor
+        if ego_T_lidar is None:
+            raise CFlowError(f"points_frame='sensor' needs ego_T_lidar: log {log.log_id} does not know its own")
+        extrinsics = rigid_transform(ego_T_lidar, "ego_T_lidar")
+    if len(set(log.timestamps)) < len(log.timestamps) or min(log.timestamps, default=0) < 0:
+        raise CFlowError(f"log {log.log_id}: time stamps must be different numbers from 0, they name the groups")
+    file = Path(file)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    identity: Dict[str, int] = {}
+    with tempfile.TemporaryDirectory(prefix=f".{file.name}.", dir=file.parent) as scratch:
+        new = Path(scratch) / file.name
+        with h5py.File(new, "w") as scene:
+            if store_extrinsics:
+                scene.attrs[EXTRINSIC] = extrinsics
+            for index, stamp in enumerate(log.timestamps):
+                group = scene.create_group(str(int(stamp)))
+                for key, value in _sweep(log, index, extrinsics, pose_dtype, eval_step, identity).items():
+                    group.create_dataset(key, data=value)
+        with open(new, "rb") as written:
+            os.fsync(written.fileno())
+        os.replace(new, file)
+
+
+def write_index_files(folder: Union[str, Path]) -> None:
+    """Write `index_total.pkl`, `index_flow.pkl` and `index_eval.pkl` for all scenes of a folder, taken from the groups.
+
+    Raises:
+        CFlowError: no such folder, or a scene that cannot be read.
+    """
+    folder = Path(folder)
+    total, flow, scored = [], [], []
+    for file in find_hdf5_scenes(folder):
+        with HDF5Log(file, ego_T_lidar=None) as log:
+            keys = [log.keys(k) for k in range(len(log.timestamps))]
+            for stamp, names in zip(log.timestamps, keys):
+                entry = (log.log_id, stamp)
+                total.append(entry)
+                flow += [entry] * ("flow" in names)
+                scored += [entry] * ("eval_mask" in names)
+    for name, entries in (("total", total), ("flow", flow), ("eval", scored)):
+        write_index(folder / f"index_{name}.pkl", entries)
+
+
+def _sweep(
+    log: Log, index: int, extrinsics: np.ndarray, pose_dtype: str, eval_step: int, identity: Dict[str, int]
+) -> Dict[str, np.ndarray]:
+    """Key -> value of one group."""
+    sweep, labels = log.sweep(index), log.labels(index)
+    if sweep.pose is None:
+        raise CFlowError(f"sweep {index} of log {log.log_id} has no pose, which the layout needs")
+    ego_points = np.asarray(sweep.points)[:, :3]
+    inverse = np.linalg.inv(extrinsics)
+    in_ego = np.array_equal(extrinsics, np.eye(4))
+    points = ego_points if in_ego else ego_points.astype(np.float64) @ inverse[:3, :3].T + inverse[:3, 3]
+    pose = np.asarray(sweep.pose, np.float64)
+    values: Dict[str, np.ndarray] = {"lidar": points.astype(np.float32), "pose": pose.astype(pose_dtype)}
+    if sweep.is_ground is not None:
+        values["ground_mask"] = np.asarray(sweep.is_ground, bool)
+    if index < len(log.timestamps) - 1:
+        following = np.asarray(log.sweep(index + 1).pose, np.float64)
+        values["ego_motion"] = (np.linalg.inv(following) @ pose).astype(np.float32)
+    if labels is not None:
+        flow = labels.flow if in_ego else labels.flow.astype(np.float64) @ inverse[:3, :3].T
+        values["flow"] = flow.astype(np.float32)
+        values["flow_is_valid"] = labels.is_valid
+        values["flow_category_indices"] = labels.category.astype(np.uint8)
+        if eval_step and index % eval_step == 0:
+            ground = values.get("ground_mask", np.zeros(len(points), bool))
+            values["eval_mask"] = (labels.is_valid & ~ground)[:, None]
+    if hasattr(log, "units"):
+        values.update(_units(log.units(index)))
+    if hasattr(log, "boxes"):
+        values["flow_instance_id"] = _instances(log.boxes(index), ego_points, identity)
+    return values
+
+
+def _units(units: List[Any]) -> Dict[str, np.ndarray]:
+    count = [len(unit.points) for unit in units]
+    return {
+        "lidar_id": np.repeat(np.arange(1, len(units) + 1, dtype=np.uint8), count),
+        "lidar_dt": np.concatenate([unit.offset_ns / 1e9 for unit in units]).astype(np.float32),
+        "lidar_center": np.stack([unit.T_ego_sensor for unit in units]).astype(np.float32),
+    }
+
+
+def _instances(boxes: Any, points: np.ndarray, identity: Dict[str, int]) -> np.ndarray:
+    """(N,) int16, the same number for a track in every sweep, 0 = in no box."""
+    instance = np.zeros(len(points), np.int16)
+    for track, size, pose in zip(boxes.track_id, boxes.size, boxes.pose):
+        instance[points_in_box(points, size, pose)] = identity.setdefault(track, len(identity) + 1)
+    return instance

@@ -1,0 +1,78 @@
+"""What nuScenes and TruckScenes call things, in the names of Argoverse 2, and back."""
+
+from __future__ import annotations
+
+from typing import Dict
+
+OWN_TRAILER = "vehicle.ego_trailer"  # what the recording truck of TruckScenes pulls
+
+NUSCENES_CATEGORIES: Dict[str, str] = {
+    "animal": "ANIMAL",
+    "human.pedestrian.adult": "PEDESTRIAN",
+    "human.pedestrian.child": "PEDESTRIAN",
+    "human.pedestrian.construction_worker": "PEDESTRIAN",
+    "human.pedestrian.personal_mobility": "PEDESTRIAN",
+    "human.pedestrian.police_officer": "PEDESTRIAN",
+    "human.pedestrian.stroller": "STROLLER",
+    "human.pedestrian.wheelchair": "WHEELCHAIR",
+    "movable_object.barrier": "NONE",
+    "movable_object.debris": "NONE",
+    "movable_object.pushable_pullable": "NONE",
+    "movable_object.trafficcone": "CONSTRUCTION_CONE",
+    "static_object.bicycle_rack": "NONE",
+    "vehicle.bicycle": "BICYCLE",
+    "vehicle.bus.bendy": "ARTICULATED_BUS",
+    "vehicle.bus.rigid": "BUS",
+    "vehicle.car": "REGULAR_VEHICLE",
+    "vehicle.construction": "LARGE_VEHICLE",
+    "vehicle.emergency.ambulance": "LARGE_VEHICLE",
+    "vehicle.emergency.police": "REGULAR_VEHICLE",
+    "vehicle.motorcycle": "MOTORCYCLE",
+    "vehicle.trailer": "VEHICULAR_TRAILER",
+    "vehicle.truck": "TRUCK",
+}
+"""Category of a box -> name in Argoverse 2; NONE = background, though its points move as the box does."""
+
+TRUCKSCENES_CATEGORIES: Dict[str, str] = {
+    **NUSCENES_CATEGORIES,
+    "animal": "NONE",
+    "static_object.traffic_sign": "SIGN",
+    "vehicle.other": "NONE",
+    "vehicle.train": "NONE",
+    OWN_TRAILER: "NONE",
+}
+"""Category of a box -> name in Argoverse 2, as for nuScenes."""
+
+NUSCENES_NAMES: Dict[str, str] = {
+    "ANIMAL": "animal",
+    "ARTICULATED_BUS": "vehicle.bus.bendy",
+    "BICYCLE": "vehicle.bicycle",
+    "BICYCLIST": "vehicle.bicycle",
+    "BOX_TRUCK": "vehicle.truck",
+    "BUS": "vehicle.bus.rigid",
+    "CONSTRUCTION_BARREL": "movable_object.trafficcone",
+    "CONSTRUCTION_CONE": "movable_object.trafficcone",
+    "DOG": "animal",
+    "LARGE_VEHICLE": "vehicle.construction",
+    "MOTORCYCLE": "vehicle.motorcycle",
+    "MOTORCYCLIST": "vehicle.motorcycle",
+    "OFFICIAL_SIGNALER": "human.pedestrian.police_officer",
+    "PEDESTRIAN": "human.pedestrian.adult",
+    "REGULAR_VEHICLE": "vehicle.car",
+    "SCHOOL_BUS": "vehicle.bus.rigid",
+    "STROLLER": "human.pedestrian.stroller",
+    "TRUCK": "vehicle.truck",
+    "TRUCK_CAB": "vehicle.truck",
+    "VEHICULAR_TRAILER": "vehicle.trailer",
+    "WHEELCHAIR": "human.pedestrian.wheelchair",
+    "WHEELED_DEVICE": "vehicle.bicycle",
+    "WHEELED_RIDER": "vehicle.bicycle",
+}
+"""Argoverse 2 name of a box -> the nearest category of nuScenes, of the same meta class."""
+
+TRUCKSCENES_NAMES: Dict[str, str] = {
+    **NUSCENES_NAMES,
+    "SIGN": "static_object.traffic_sign",
+    "STOP_SIGN": "static_object.traffic_sign",
+}
+"""Argoverse 2 name of a box -> the nearest category of TruckScenes."""

@@ -1,0 +1,83 @@
+"""Reader of raw MAN TruckScenes: nuScenes' tables, six LiDARs with sweeps as PCD, not compensated for ego motion."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import ClassVar, List, Mapping, Optional, Sequence, Tuple, Union
+
+import numpy as np
+
+from cflow_torch.data.nuscenes import Footprint, NuScenesLog
+from cflow_torch.data.nuscenes_categories import TRUCKSCENES_CATEGORIES
+from cflow_torch.data.nuscenes_tables import SceneSource, find_scenes
+from cflow_torch.data.pcd import read_pcd
+from cflow_torch.types import CFlowError
+
+
+def find_truckscenes_scenes(root: Union[str, Path]) -> List[SceneSource]:
+    """All scenes under a folder.
+
+    Args:
+        root: data root (it holds `v1.2-mini` or the like), the folder of one version, or a folder up to two levels
+            above data roots.
+
+    Returns:
+        Scenes, sorted by folder and name; empty if there are none. Scenes of one version share their tables.
+
+    Raises:
+        CFlowError: `root` is no folder, a scene.json cannot be read, or what is there is nuScenes.
+    """
+    return find_scenes(root, ("log", "map"), "TruckScenes")
+
+
+class TruckScenesLog(NuScenesLog):
+    """One TruckScenes scene; implements the `Log` protocol.
+
+    Args:
+        source: the scene, from `find_truckscenes_scenes`.
+        sweep_step: 1 = all sweeps (10 Hz); n = every n-th after each key frame, and every key frame.
+        lidars: channels to merge; None = every LiDAR of the scene (six).
+        own_vehicle: points above it are removed, as are those in a box of `vehicle.ego_trailer` (which is known where
+            there are annotations); None = keep both.
+        deskew: move each point with the pose that the vehicle had when it was measured; False: with the pose that its
+            LiDAR's sweep has.
+
+    Attributes:
+        log_id: name of the scene.
+        timestamps: times of the reference LiDAR's sweeps (LIDAR_LEFT, else the first), in microseconds.
+
+    Convention: points are float32 in the ego frame at the reference's time stamp (x ahead, y left, z up, origin on the
+        ground). Of every other LiDAR the sweep next in time is taken; none if that is more than 60 ms off. Poses are
+        float64 `T_world_ego`, world = UTM, numbers of 1e6 m. Between the reference's sweeps, poses are interpolated.
+        `is_ground` is None: TruckScenes has no ground mask.
+
+    Raises:
+        CFlowError: as `NuScenesLog`.
+    """
+
+    _categories: ClassVar[Mapping[str, str]] = TRUCKSCENES_CATEGORIES
+    _reference: ClassVar[str] = "LIDAR_LEFT"
+    # |x| < 7 m and |y| < 2 m, as OpenSceneFlow has it.
+    OWN_VEHICLE: ClassVar[Footprint] = Footprint(rear=-7.0, front=7.0, half_width=2.0)
+
+    def __init__(
+        self,
+        source: SceneSource,
+        sweep_step: int = 1,
+        lidars: Optional[Sequence[str]] = None,
+        own_vehicle: Optional[Footprint] = OWN_VEHICLE,
+        deskew: bool = True,
+    ) -> None:
+        super().__init__(source, sweep_step, lidars, own_vehicle)
+        self._deskew = deskew
+
+    def _read(self, file: Path) -> Tuple[np.ndarray, Optional[np.ndarray]]:
+        fields = read_pcd(file)
+        needed = ("x", "y", "z", "timestamp") if self._deskew else ("x", "y", "z")
+        missing = [name for name in needed if name not in fields or fields[name].ndim != 1]
+        if missing:
+            raise CFlowError(f"{file} lacks the fields {missing}; it has {list(fields)}. Is it a sweep of TruckScenes?")
+        points = np.stack([fields[axis].astype(np.float32) for axis in "xyz"], axis=1)
+        if not len(points):
+            raise CFlowError(f"{file} holds no points; copy it again")
+        return points, fields["timestamp"].astype(np.int64) if self._deskew else None

@@ -1,0 +1,127 @@
+"""Waymo's range images: which ray a pixel is, and where its return lies in the vehicle frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Optional, Tuple
+
+import numpy as np
+
+from cflow_torch.ego import rigid_transform
+from cflow_torch.types import CFlowError
+
+LASERS = {"TOP": 1, "FRONT": 2, "SIDE_LEFT": 3, "SIDE_RIGHT": 4, "REAR": 5}
+"""Laser name -> the number that files store; 0 is unknown."""
+
+TOP = LASERS["TOP"]
+RANGE, INTENSITY, ELONGATION, NO_LABEL_ZONE = range(4)
+"""Channels of a range image. Range is in metres, > 0 where there is a return; the zone is 1 inside, else not."""
+
+
+@dataclass(frozen=True)
+class LaserCalibration:
+    """Where one laser is mounted and which way its rows look.
+
+    Args:
+        T_ego_sensor: (4, 4) float64, laser coordinates to the vehicle's.
+        inclinations: (H,) float64 radians, ascending; None = evenly spaced between `low` and `high`.
+        low, high: radians, outer edges of the lowest and the highest row, used where `inclinations` is None.
+    """
+
+    T_ego_sensor: np.ndarray
+    inclinations: Optional[np.ndarray] = None
+    low: float = 0.0
+    high: float = 0.0
+
+    def row_inclinations(self, num_rows: int) -> np.ndarray:
+        """(H,) float64 radians above the laser's xy plane; row 0 is the highest.
+
+        Raises:
+            CFlowError: the table has another number of rows than the image, or an entry that is not finite.
+        """
+        ascending = self.inclinations
+        if ascending is None:
+            ascending = self.low + (np.arange(num_rows) + 0.5) / num_rows * (self.high - self.low)
+        if ascending.shape != (num_rows,) or not np.isfinite(ascending).all():
+            raise CFlowError(
+                f"a range image of {num_rows} rows needs {num_rows} finite beam inclinations, the calibration has "
+                f"{np.isfinite(ascending).sum()}; take both files from the same segment"
+            )
+        return ascending[::-1]
+
+    def column_azimuths(self, num_columns: int) -> np.ndarray:
+        """(W,) float64 radians about the laser's z axis, falling: column 0 looks to the rear of the vehicle."""
+        yaw = np.arctan2(self.T_ego_sensor[1, 0], self.T_ego_sensor[0, 0])
+        share = (num_columns - np.arange(num_columns) - 0.5) / num_columns
+        return (2 * share - 1) * np.pi - yaw
+
+
+def directions(azimuth: np.ndarray, inclination: np.ndarray) -> np.ndarray:
+    """(..., 3) float64 unit vectors, laser frame."""
+    flat = np.cos(inclination)
+    return np.stack([np.cos(azimuth) * flat, np.sin(azimuth) * flat, np.sin(inclination)], axis=-1)
+
+
+def rotations_from_angles(angles: np.ndarray) -> np.ndarray:
+    """Rotation matrices Rz(yaw) Ry(pitch) Rx(roll).
+
+    Args:
+        angles: (N, 3) roll, pitch, yaw, radians.
+
+    Returns:
+        (N, 3, 3) float64.
+    """
+    angles = np.asarray(angles, dtype=np.float64)
+    (sx, sy, sz), (cx, cy, cz) = np.sin(angles).T, np.cos(angles).T
+    rows = (
+        (cy * cz, sx * sy * cz - cx * sz, cx * sy * cz + sx * sz),
+        (cy * sz, sx * sy * sz + cx * cz, cx * sy * sz - sx * cz),
+        (-sy, sx * cy, cx * cy),
+    )
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def range_image_points(
+    image: np.ndarray,
+    calibration: LaserCalibration,
+    pixel_poses: Optional[np.ndarray] = None,
+    T_world_ego: Optional[np.ndarray] = None,
+) -> Tuple[np.ndarray, np.ndarray]:
+    """Points of all pixels that have a return.
+
+    Args:
+        image: (H, W, 4) float: range (metres), intensity, elongation, no-label-zone flag.
+        calibration: of the laser.
+        pixel_poses: (H, W, 6) roll, pitch, yaw, x, y, z of `T_world_ego` at the moment of each pixel. Only the TOP
+            laser has them; the images of the others are made for the vehicle pose of the frame.
+        T_world_ego: (4, 4) float64 vehicle pose of the frame; needed with `pixel_poses`.
+
+    Returns:
+        points: (N, 3) float64, metres, vehicle frame of the frame.
+        pixels: (N,) int64, row * W + column, ascending.
+
+    Convention: float64 throughout: world coordinates are about 10 km, where float32 has steps of 1 mm.
+
+    Raises:
+        CFlowError: shapes that do not fit, or a frame pose that is missing or not rigid.
+    """
+    if image.ndim != 3 or image.shape[2] <= NO_LABEL_ZONE:
+        raise CFlowError(f"a range image has shape (H, W, 4), got {image.shape}")
+    num_rows, num_columns = image.shape[:2]
+    pixels = np.flatnonzero(image[..., RANGE] > 0)
+    row, column = np.divmod(pixels, num_columns)
+    azimuth, inclination = calibration.column_azimuths(num_columns), calibration.row_inclinations(num_rows)
+    distance = image[..., RANGE].reshape(-1)[pixels].astype(np.float64)
+    in_laser = distance[:, None] * directions(azimuth[column], inclination[row])
+    points = in_laser @ calibration.T_ego_sensor[:3, :3].T + calibration.T_ego_sensor[:3, 3]
+    if pixel_poses is None:
+        return points, pixels
+    if pixel_poses.shape != (num_rows, num_columns, 6) or T_world_ego is None:
+        raise CFlowError(
+            f"pixel poses of a {num_rows} x {num_columns} image have shape ({num_rows}, {num_columns}, 6) and need the "
+            f"pose of the frame, got {pixel_poses.shape}"
+        )
+    poses = pixel_poses.reshape(-1, 6)[pixels].astype(np.float64)
+    world = np.einsum("nij,nj->ni", rotations_from_angles(poses[:, :3]), points) + poses[:, 3:]
+    T_ego_world = np.linalg.inv(rigid_transform(T_world_ego, "T_world_ego"))
+    return world @ T_ego_world[:3, :3].T + T_ego_world[:3, 3], pixels
