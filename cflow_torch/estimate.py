@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import warnings
+from dataclasses import replace
 from typing import Any, Optional, Sequence
 
 import numpy as np
 
 from cflow_torch.config import Config, make_config
 from cflow_torch.dense import CorrelationFlow
+from cflow_torch.ground import find_ground_batch, has_ground
+from cflow_torch.inputs import check_windows, choose_device
 from cflow_torch.keypoints import CorrelationFlowKeypoints
 from cflow_torch.pyramid import CoarseToFine
 from cflow_torch.types import Array, CFlowError, FlowResult, Sweep, Window
+
+GROUND = (None, "auto", "patchwork")
 
 
 def estimate_flow(
@@ -36,13 +42,14 @@ def estimate_flow(
         pc1: points of sweep t+1, (N1, 3+).
         T_ego1_ego0: (4, 4), maps coordinates of the ego frame at t to the one at t+1 (pose1^-1 pose0);
             None = pc0 already lies in the frame of t+1.
-        gm0, gm1: ground masks, True = ground; None = nothing is ground.
+        gm0, gm1: ground masks, True = ground; None = nothing is ground, unless `ground` says otherwise.
         pch: older sweeps t-1, t-2, ..., at most `num_history`.
         T_ego1_egoh: (4, 4) of each of `pch`; may be left out only if `T_ego1_ego0` is left out too.
         gmh: ground mask of each of `pch`; empty = nothing is ground.
         method: "dense" or "keypoints".
         preset: "default", "fast", "keypoints" or "paper", see `make_config`.
-        ground: None = as the masks say; "auto" = find the ground.
+        ground: None = as the masks say; "auto" = find the ground of every sweep without a mask (`find_ground`);
+            "patchwork" = the same by Patchwork++ (`pip install pypatchworkpp`).
         device: "auto" = that of the tensors given, else a GPU if there is one, else the CPU.
         **overrides: any field of `Config`, for example `pixel_sizes=(0.4, 0.2, 0.1)`.
 
@@ -52,6 +59,9 @@ def estimate_flow(
     Convention:
         NaN and infinite points, ground and points outside `point_cloud_range` get residual flow 0, cluster -1,
         `is_valid` False. Empty sweeps give an empty or all-zero result.
+
+    Warns:
+        UserWarning: there is ground in a sweep without a mask, and `ground` is None. The result is not changed by it.
 
     Raises:
         CFlowError: wrong shape or dtype, a transform that is not rigid, mixed devices, an unknown setting.
@@ -64,8 +74,8 @@ def estimate_flow(
 
     Source: Alg. general_correlation_flow; Sec. CorrelationFlow-Keypoints.
     """
-    if ground is not None:
-        raise CFlowError(f"ground={ground!r}: finding the ground is not built yet; pass gm0 and gm1")
+    if ground not in GROUND:
+        raise CFlowError(f"ground={ground!r}: give one of {', '.join(map(repr, GROUND))}")
     config = make_config(preset, method=method, **overrides)
     transforms = _per_sweep("T_ego1_egoh", T_ego1_egoh, pch)
     masks = _per_sweep("gmh", gmh, pch)
@@ -86,6 +96,7 @@ def estimate_flow(
         pc1=sweep(pc1, gm1, None),
         pch=tuple(sweep(*parts) for parts in zip(pch, masks, transforms)),
     )
+    window = _find_ground(window, ground, device)
     (result,) = make_model(config, device)([window])
     return result
 
@@ -101,6 +112,29 @@ def make_model(config: Config, device: Any = "auto") -> CoarseToFine:
         `CorrelationFlow` or `CorrelationFlowKeypoints`.
     """
     return (CorrelationFlowKeypoints if config.method == "keypoints" else CorrelationFlow)(config, device)
+
+
+def _find_ground(window: Window, ground: Optional[str], device: Any) -> Window:
+    """The window with the masks that it lacks; the same window, and maybe a warning, if none are asked for."""
+    check_windows([window])
+    chosen = choose_device([window], device)
+    sweeps = [window.pc0, window.pc1, *window.pch]
+    bare = [index for index, sweep in enumerate(sweeps) if sweep.is_ground is None]
+    clouds = [sweeps[index].points for index in bare]
+    if ground is None:
+        if any(has_ground(clouds, device=chosen)):
+            warnings.warn(
+                "there are ground points in a sweep without a ground mask: the ground joins what stands on it into one "
+                "cluster, so that moving objects are missed. Pass ground='auto', or masks gm0 and gm1 (gmh) "
+                "(all False if this is no ground)",
+                UserWarning,
+                stacklevel=3,
+            )
+        return window
+    method = "grid" if ground == "auto" else ground
+    for index, mask in zip(bare, find_ground_batch(clouds, method, device=chosen)):
+        sweeps[index] = replace(sweeps[index], is_ground=mask)
+    return Window(sweeps[0], sweeps[1], tuple(sweeps[2:]))
 
 
 def _per_sweep(name: str, values: Sequence[Any], pch: Sequence[Array]) -> Sequence[Any]:

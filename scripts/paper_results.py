@@ -110,7 +110,7 @@ def load_runs(folder: Path) -> Tuple[Runs, List[str]]:
         if experiment is None:
             continue
         data = config["data"]
-        name = data["label"] + (f" ({'+'.join(data['profiles'])})" if data["name"] == "benchmark" else "")
+        name = data["label"] + (f" ({data['profile']})" if data["name"] == "benchmark" else "")
         run = Run(experiment, name, row_of(experiment, config["model"]), record)
         rows = runs.setdefault(experiment, {}).setdefault(name, {})
         if run.row in rows:

@@ -21,7 +21,6 @@ from omegaconf import DictConfig
 from cflow_torch.cli.record import DataIdentity, finished_results, write_results
 from cflow_torch.cli.run import finish, for_each_pair, make_model, open_logs, output_folder
 from cflow_torch.cli.stopwatch import StopWatch
-from cflow_torch.data.hdf5 import HDF5Log
 from cflow_torch.data.log import Log
 from cflow_torch.evaluation.frame import EvalFrame
 from cflow_torch.evaluation.metrics import SceneFlowMetrics
@@ -44,7 +43,8 @@ def task(cfg: DictConfig) -> float:
     def score(log: Log, index: int, sweeps: Window, result: FlowResult) -> None:
         labels = log.labels(index)
         if labels is not None:
-            eval_mask = log.eval_mask(index) if isinstance(log, HDF5Log) else None
+            find_mask = getattr(log, "eval_mask", None)
+            eval_mask = None if find_mask is None else find_mask(index)
             metrics.update(EvalFrame.from_result(sweeps, result, labels, eval_mask=eval_mask))
             identity.add(sweeps, labels)
 

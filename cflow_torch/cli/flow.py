@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 from pathlib import Path
-from typing import List, Tuple
+from typing import Any, List, Tuple
 
 from omegaconf import DictConfig
 from tqdm import tqdm
@@ -41,10 +41,11 @@ def task(cfg: DictConfig) -> None:
     done: List[Tuple[Log, int, Path]] = []
     with ExitStack() as scenes:  # closed before anything is written into them
         for log in logs:
-            if isinstance(log, HDF5Log):
-                scenes.enter_context(log)
+            scene = _scene(log)
+            if isinstance(scene, HDF5Log):
+                scenes.enter_context(scene)
                 if cfg.result_name is not None:
-                    check_writable(log.file)
+                    check_writable(scene.file)
         write_config(cfg, output)
 
         def keep(log: Log, index: int, _: Window, result: FlowResult) -> None:
@@ -63,11 +64,16 @@ def _into_scenes(name: str, logs: List[Log], done: List[Tuple[Log, int, Path]]) 
     """Copy the flow files of this run into their scenes; a scene that refuses is reported and left as it was."""
     failures: Failures = []
     count = 0
-    for log in tqdm([log for log in logs if isinstance(log, HDF5Log)], desc=name, unit="scene", disable=None):
+    for log in tqdm(logs, desc=name, unit="scene", disable=None):
         results = ((timestamp, read_flow(file).flow) for owner, timestamp, file in done if owner is log)
         try:
-            count += write_hdf5_results(log.file, name, results)
+            count += write_hdf5_results(_scene(log).file, name, results)
         except (CFlowError, OSError) as error:
             failures.append((log.log_id, str(error)))
     print(f"sweeps that now have a key {name} in their scene: {count} (the last sweep of a scene has no flow)")
     return failures
+
+
+def _scene(log: Any) -> Any:
+    """The log itself, without what was put round it (ground, poses)."""
+    return _scene(log.log) if hasattr(log, "log") else log

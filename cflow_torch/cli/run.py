@@ -20,9 +20,8 @@ from tqdm import tqdm
 from cflow_torch import __version__, estimate
 from cflow_torch.config import Config
 from cflow_torch.data.atomic import atomic_file
-from cflow_torch.data.av2 import AV2Log, find_av2_logs
-from cflow_torch.data.benchmark import benchmark_logs
-from cflow_torch.data.hdf5 import HDF5Log, find_hdf5_scenes
+from cflow_torch.data.benchmark import benchmark_logs, format_of
+from cflow_torch.data.catalog import find_sources, open_log
 from cflow_torch.data.log import Log, window
 from cflow_torch.data.synthetic import make_drive
 from cflow_torch.data.writers import write_av2_log
@@ -30,12 +29,9 @@ from cflow_torch.pyramid import CoarseToFine
 from cflow_torch.types import CFlowError, FlowResult, Window
 
 Failures = List[Tuple[str, str]]
-# data.name: how its logs are found, read, and called.
-_READERS: Dict[str, Tuple[Callable[[Any], List[Path]], Callable[[Any], Any], str]] = {
-    "av2": (find_av2_logs, AV2Log, "Argoverse 2 log (a folder with sensors/lidar)"),
-    "hdf5": (find_hdf5_scenes, HDF5Log, "scene (a file *.h5)"),
-}
 UseResult = Callable[[Log, int, Window, FlowResult], None]
+# Settings of `data` that are not the reader's.
+_NOT_THE_READERS = ("name", "label", "root", "first", "step")
 _LONGEST_NAME = 150  # characters of a folder name; file systems end at 255 bytes
 
 
@@ -106,26 +102,26 @@ def open_logs(cfg: DictConfig, folder: Path) -> Tuple[List[Log], Failures]:
         CFlowError: no log at all.
     """
     data = cfg.data
+    reader, settings = "av2", {"check": False}  # of what the simulator writes
     if data.name == "synthetic":
         drive = make_drive(seed=data.seed, num_sweeps=data.num_sweeps)
-        reader: Callable[[Any], Any] = AV2Log
         sources = [write_av2_log(drive, folder / "log", overwrite=True)]
     elif data.name == "benchmark":
-        reader = AV2Log
         seeds = range(data.first_seed, data.first_seed + data.num_drives)
-        sources = benchmark_logs(data.cache, data.profiles, seeds, data.num_sweeps)
+        chosen = format_of(data.profile)
+        reader, settings = chosen.data_set, {"check": False, **chosen.settings}
+        sources = benchmark_logs(data.cache, data.profile, seeds, data.num_sweeps, data.scenes)
     elif OmegaConf.is_missing(data, "root"):
         raise CFlowError("where is the data? give data.root=PATH, one log or a folder of logs")
     else:
-        find, reader, what = _READERS[data.name]
-        sources = find(data.root)
-        if not sources:
-            raise CFlowError(f"no {what} in {data.root}")
+        reader, given = data.name, OmegaConf.to_container(data, resolve=True)
+        sources = list(find_sources(reader, data.root))
+        settings = {str(key): value for key, value in given.items() if key not in _NOT_THE_READERS}  # type: ignore[union-attr]
     logs: List[Log] = []
     failures: Failures = []
     for source in sources:
         try:
-            logs.append(reader(source))
+            logs.append(open_log(reader, source, **settings))
         except (CFlowError, OSError) as error:
             failures.append((source.name, str(error)))
             tqdm.write(f"failed: {source.name}: {error}", file=sys.stderr)
