@@ -23,7 +23,7 @@ import torch
 
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.ground import read_ground_raster
-from cflow_torch.data.hdf5 import HDF5Log
+from cflow_torch.data.hdf5.reader import HDF5Log
 from cflow_torch.data.synthetic import make_drive
 from cflow_torch.data.synthetic.profiles import PROFILES
 from cflow_torch.ground import find_ground, has_ground

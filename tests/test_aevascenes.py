@@ -15,13 +15,13 @@ from typing import Any, Dict
 import numpy as np
 import pytest
 
-from cflow_torch.data import aevascenes_writer
-from cflow_torch.data.aevascenes import CATEGORY_NAME, GROUND, AevaScenesLog, find_aevascenes_sequences
-from cflow_torch.data.aevascenes_writer import CLASS_OF, write_aevascenes_sequence
+from cflow_torch.data.aevascenes import writer as aevascenes_writer
+from cflow_torch.data.aevascenes.npz_strings import read_npz_member
+from cflow_torch.data.aevascenes.reader import CATEGORY_NAME, GROUND, AevaScenesLog, find_aevascenes_sequences
+from cflow_torch.data.aevascenes.writer import CLASS_OF, write_aevascenes_sequence
 from cflow_torch.data.boxes import Boxes as Tracks
 from cflow_torch.data.boxes import flow_from_boxes
 from cflow_torch.data.log import window
-from cflow_torch.data.npz_strings import read_npz_member
 from cflow_torch.data.recording import UnitReturns
 from cflow_torch.data.synthetic import make_drive
 from cflow_torch.evaluation.categories import CATEGORIES, CATEGORY_INDEX, meta_class

@@ -13,12 +13,9 @@ from hypothesis import strategies as st
 from pyarrow import feather, parquet
 
 from cflow_torch import CFlowError, Sweep, estimate_flow
-from cflow_torch.data.arrays import ArraysLog, find_array_logs, natural_key
-from cflow_torch.data.arrays_writer import write_array_log
-from cflow_torch.data.cloud_file import SUFFIXES, read_cloud, write_cloud
-from cflow_torch.data.log import window
-from cflow_torch.data.ply import read_ply, write_ply
-from cflow_torch.data.poses_text import (
+from cflow_torch.data.arrays.cloud_file import SUFFIXES, read_cloud, write_cloud
+from cflow_torch.data.arrays.ply import read_ply, write_ply
+from cflow_torch.data.arrays.poses_text import (
     Trajectory,
     poses_at,
     read_poses,
@@ -27,6 +24,9 @@ from cflow_torch.data.poses_text import (
     write_times,
     write_tum_poses,
 )
+from cflow_torch.data.arrays.reader import ArraysLog, find_array_logs, natural_key
+from cflow_torch.data.arrays.writer import write_array_log
+from cflow_torch.data.log import window
 from cflow_torch.data.synthetic import make_drive
 
 STAMP = 1_700_000_000_123_456_789

@@ -9,15 +9,15 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Dict
 
+import cflow_torch.configs
 import numpy as np
 import pytest
 import yaml
 
-import cflow_torch.configs
 from cflow_torch.cli.main import main
 from cflow_torch.cli.run import _NOT_THE_READERS
 from cflow_torch.data import catalog
-from cflow_torch.data.arrays_writer import write_array_log
+from cflow_torch.data.arrays.writer import write_array_log
 from cflow_torch.data.benchmark import FORMATS
 from cflow_torch.data.catalog import DATA_SETS, find_sources, open_log
 from cflow_torch.data.found_ground import GroundFoundLog

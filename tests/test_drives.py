@@ -8,7 +8,7 @@ import pytest
 from scenes import assert_same
 
 from cflow_torch import CorrelationFlow, Window, make_config
-from cflow_torch.data.hdf5 import HDF5Log
+from cflow_torch.data.hdf5.reader import HDF5Log
 from cflow_torch.data.log import window as window_of
 from cflow_torch.data.synthetic import make_drive
 from cflow_torch.reference import reference_flow

@@ -13,7 +13,7 @@ from scenes import assert_same, needs_gpu
 
 from cflow_torch import CFlowError, Sweep, Window, estimate_flow, make_config, make_model
 from cflow_torch.data.av2 import AV2Log
-from cflow_torch.data.hdf5 import HDF5Log
+from cflow_torch.data.hdf5.reader import HDF5Log
 from cflow_torch.data.synthetic import make_drive
 from cflow_torch.ground import find_ground, find_ground_batch, has_ground
 

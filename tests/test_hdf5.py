@@ -9,9 +9,9 @@ import pytest
 
 from cflow_torch import CFlowError
 from cflow_torch.cli.main import main
-from cflow_torch.data.hdf5 import HDF5Log, find_hdf5_scenes
-from cflow_torch.data.hdf5_writer import write_hdf5_scene, write_index_files
-from cflow_torch.data.index_file import read_index, write_index
+from cflow_torch.data.hdf5.index_file import read_index, write_index
+from cflow_torch.data.hdf5.reader import HDF5Log, find_hdf5_scenes
+from cflow_torch.data.hdf5.writer import write_hdf5_scene, write_index_files
 from cflow_torch.data.log import window
 from cflow_torch.data.synthetic import make_drive
 

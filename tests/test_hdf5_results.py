@@ -16,8 +16,8 @@ import torch
 from cflow_torch import CFlowError
 from cflow_torch.cli.main import main
 from cflow_torch.data.flow_file import read_flow
-from cflow_torch.data.hdf5 import HDF5Log, find_hdf5_scenes
-from cflow_torch.data.hdf5_results import RESERVED_KEYS, write_hdf5_results
+from cflow_torch.data.hdf5.reader import HDF5Log, find_hdf5_scenes
+from cflow_torch.data.hdf5.results import RESERVED_KEYS, write_hdf5_results
 
 h5py = pytest.importorskip("h5py")
 
@@ -126,7 +126,7 @@ def test_a_killed_process_changes_nothing(scene: Path) -> None:
     before = scene.read_bytes()
     code = (
         "import os, signal, sys, numpy as np\n"
-        "from cflow_torch.data.hdf5_results import write_hdf5_results\n"
+        "from cflow_torch.data.hdf5.results import write_hdf5_results\n"
         "def results():\n"
         f"    yield {STAMPS[0]}, np.ones((60, 3))\n"
         "    os.kill(os.getpid(), signal.SIGKILL)\n"

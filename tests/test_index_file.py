@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from cflow_torch import CFlowError
-from cflow_torch.data.index_file import _NoNames, read_index, write_index
+from cflow_torch.data.hdf5.index_file import _NoNames, read_index, write_index
 
 ENTRIES = [("scene-a", 315966265259836000), ("scene-a", 315966265360032000), ("b", 1)]
 

@@ -14,7 +14,7 @@ from cflow_torch import gate as gating
 from cflow_torch import match as matching
 from cflow_torch.config import make_config
 from cflow_torch.data.av2 import AV2Log
-from cflow_torch.data.hdf5 import HDF5Log
+from cflow_torch.data.hdf5.reader import HDF5Log
 from cflow_torch.data.log import window as window_of
 from cflow_torch.data.synthetic import make_drive
 from cflow_torch.descriptors import KeyPoints, describe, detect

@@ -12,13 +12,13 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 from tiny_recording import CAR_SIZE, TRACKS, TinyRecording
 
-from cflow_torch.data import nuscenes_writer
 from cflow_torch.data.boxes import Boxes, flow_from_boxes, points_in_box
 from cflow_torch.data.log import window
-from cflow_torch.data.nuscenes import Footprint, NuScenesLog, find_nuscenes_scenes, read_pcd_bin
-from cflow_torch.data.nuscenes_tables import Annotations, SceneSource
-from cflow_torch.data.nuscenes_tracks import Tracks
-from cflow_torch.data.nuscenes_writer import write_nuscenes
+from cflow_torch.data.nuscenes import writer as nuscenes_writer
+from cflow_torch.data.nuscenes.reader import Footprint, NuScenesLog, find_nuscenes_scenes, read_pcd_bin
+from cflow_torch.data.nuscenes.tables import Annotations, SceneSource
+from cflow_torch.data.nuscenes.tracks import Tracks
+from cflow_torch.data.nuscenes.writer import write_nuscenes
 from cflow_torch.data.synthetic import make_drive
 from cflow_torch.evaluation.categories import CATEGORY_INDEX, meta_class
 from cflow_torch.types import CFlowError

@@ -50,7 +50,7 @@ def test_a_simulated_drive(drive):
 def test_the_real_drive(kitti_file):
     pytest.importorskip("kiss_icp", reason="KISS-ICP is not installed (extra odometry)")
     pytest.importorskip("h5py")
-    from cflow_torch.data.hdf5 import HDF5Log
+    from cflow_torch.data.hdf5.reader import HDF5Log
 
     with HDF5Log(kitti_file) as log:
         poses = poses_from_odometry(NoPoses(log))

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from cflow_torch import CFlowError
-from cflow_torch.data.lzf import compress, decompress
-from cflow_torch.data.pcd import read_pcd, write_pcd
+from cflow_torch.data.arrays.lzf import compress, decompress
+from cflow_torch.data.arrays.pcd import read_pcd, write_pcd
 
 DATA = ("ascii", "binary", "binary_compressed")
 DTYPES = ("f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8")

@@ -9,7 +9,7 @@ import pytest
 
 from cflow_torch import CFlowError, Sweep
 from cflow_torch.data.av2 import AV2Log
-from cflow_torch.data.hdf5_writer import write_hdf5_scene
+from cflow_torch.data.hdf5.writer import write_hdf5_scene
 from cflow_torch.data.static_check import StaticWorldWarning, check_static_world, static_world_residual
 from cflow_torch.data.synthetic import make_drive
 
@@ -98,7 +98,7 @@ def test_the_shift_is_the_one_of_the_lever_arm(drive):
 
 def test_scenes_of_the_harness(tmp_path, drive):
     """OpenSceneFlow's Argoverse 2 layout: taken as it is the world slips, with the extrinsics it stays."""
-    hdf5 = pytest.importorskip("cflow_torch.data.hdf5")
+    hdf5 = pytest.importorskip("cflow_torch.data.hdf5.reader")
     pytest.importorskip("h5py")
     write_hdf5_scene(drive, tmp_path / "a.h5", "sensor", store_extrinsics=False)
     with hdf5.HDF5Log(tmp_path / "a.h5") as log:
@@ -108,7 +108,7 @@ def test_scenes_of_the_harness(tmp_path, drive):
 
 
 def test_real_drives(av2_folder, kitti_file):
-    hdf5 = pytest.importorskip("cflow_torch.data.hdf5")
+    hdf5 = pytest.importorskip("cflow_torch.data.hdf5.reader")
     pytest.importorskip("h5py")
     log = AV2Log(av2_folder)
     assert verdict(log) == "" and "inverted" in verdict(Changed(log, np.linalg.inv))

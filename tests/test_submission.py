@@ -18,7 +18,7 @@ from pyarrow import feather
 from cflow_torch import CFlowError, CorrelationFlow
 from cflow_torch.cli.main import main
 from cflow_torch.data.av2 import AV2Log
-from cflow_torch.data.hdf5 import HDF5Log
+from cflow_torch.data.hdf5.reader import HDF5Log
 from cflow_torch.data.log import window
 from cflow_torch.data.synthetic import make_drive
 from cflow_torch.data.writers import write_av2_log

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from tiny_recording import CAR_VELOCITY, TinyRecording
 
-from cflow_torch.data import truckscenes_writer
+from cflow_torch.data.arrays.pcd import read_pcd, write_pcd
 from cflow_torch.data.boxes import Boxes, flow_from_boxes
-from cflow_torch.data.nuscenes import find_nuscenes_scenes
-from cflow_torch.data.nuscenes_writer import write_nuscenes
-from cflow_torch.data.pcd import read_pcd, write_pcd
+from cflow_torch.data.nuscenes.reader import find_nuscenes_scenes
+from cflow_torch.data.nuscenes.writer import write_nuscenes
 from cflow_torch.data.synthetic import make_drive
-from cflow_torch.data.truckscenes import TruckScenesLog, find_truckscenes_scenes
-from cflow_torch.data.truckscenes_writer import write_truckscenes
+from cflow_torch.data.truckscenes import writer as truckscenes_writer
+from cflow_torch.data.truckscenes.reader import TruckScenesLog, find_truckscenes_scenes
+from cflow_torch.data.truckscenes.writer import write_truckscenes
 from cflow_torch.evaluation.categories import CATEGORY_INDEX, meta_class
 from cflow_torch.types import CFlowError
 

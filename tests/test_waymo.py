@@ -14,16 +14,16 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from cflow_torch.data import waymo_writer
 from cflow_torch.data.boxes import Boxes as Tracks
 from cflow_torch.data.boxes import flow_from_boxes
 from cflow_torch.data.log import FlowLabels, window
 from cflow_torch.data.recording import UnitReturns
 from cflow_torch.data.synthetic import make_drive
-from cflow_torch.data.waymo import BOX_CATEGORY, WaymoLog, find_waymo_segments
-from cflow_torch.data.waymo_range_image import LaserCalibration, range_image_points, rotations_from_angles
-from cflow_torch.data.waymo_tfrecord import WaymoRecordLog
-from cflow_torch.data.waymo_writer import BOX_TYPE, write_waymo_segment
+from cflow_torch.data.waymo import writer as waymo_writer
+from cflow_torch.data.waymo.range_image import LaserCalibration, range_image_points, rotations_from_angles
+from cflow_torch.data.waymo.reader import BOX_CATEGORY, WaymoLog, find_waymo_segments
+from cflow_torch.data.waymo.tfrecord import WaymoRecordLog
+from cflow_torch.data.waymo.writer import BOX_TYPE, write_waymo_segment
 from cflow_torch.data.writers import Boxes
 from cflow_torch.evaluation.categories import CATEGORY_INDEX
 from cflow_torch.types import CFlowError, Sweep

@@ -21,8 +21,8 @@ from tqdm import tqdm
 
 from cflow_torch.cli.run import Failures, finish, for_each_pair, make_model, open_logs, output_folder, write_config
 from cflow_torch.data.flow_file import read_flow, write_flow
-from cflow_torch.data.hdf5 import HDF5Log
-from cflow_torch.data.hdf5_results import check_result_name, check_writable, write_hdf5_results
+from cflow_torch.data.hdf5.reader import HDF5Log
+from cflow_torch.data.hdf5.results import check_result_name, check_writable, write_hdf5_results
 from cflow_torch.data.log import Log
 from cflow_torch.types import CFlowError, FlowResult, Window
 

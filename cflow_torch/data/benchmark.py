@@ -1,7 +1,7 @@
-"""The fixed synthetic benchmark: simulated drives from fixed seeds, made once and kept as logs in each sensor's own format.
+"""The fixed synthetic benchmark: simulated drives from fixed seeds, made once and kept in each sensor's own format.
 
-Seeds 300 and above are for scores. 100 ... 103, 200 ... 209 and 400 ... 409 were used to choose settings and must not be
-scored.
+Seeds 300 and above are for scores; 100 ... 103, 200 ... 209 and 400 ... 409 were used to choose settings and must not
+be scored.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ class Format:
 _NO_MASK = {"find_ground": "grid"}
 FORMATS: Dict[str, Format] = {
     "av2": Format("writers", "write_av2_log", "av2"),
-    "nuscenes": Format("nuscenes_writer", "write_nuscenes", "nuscenes", {**_NO_MASK, "sweep_step": 2}),
-    "truckscenes": Format("truckscenes_writer", "write_truckscenes", "truckscenes", _NO_MASK),
-    "waymo": Format("waymo_writer", "write_waymo_segment", "waymo", _NO_MASK),
-    "aevascenes": Format("aevascenes_writer", "write_aevascenes_sequence", "aevascenes"),
+    "nuscenes": Format("nuscenes.writer", "write_nuscenes", "nuscenes", {**_NO_MASK, "sweep_step": 2}),
+    "truckscenes": Format("truckscenes.writer", "write_truckscenes", "truckscenes", _NO_MASK),
+    "waymo": Format("waymo.writer", "write_waymo_segment", "waymo", _NO_MASK),
+    "aevascenes": Format("aevascenes.writer", "write_aevascenes_sequence", "aevascenes"),
 }
 
 
@@ -112,4 +112,4 @@ def benchmark_logs(
 
 
 def _module_file(name: str) -> Path:
-    return Path(__file__).with_name(f"{name}.py")
+    return Path(__file__).parent.joinpath(*name.split(".")).with_suffix(".py")

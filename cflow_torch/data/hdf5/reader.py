@@ -8,7 +8,7 @@ from typing import Any, List, Optional, Sequence, Tuple, Type, Union
 
 import numpy as np
 
-from cflow_torch.data.index_file import read_index
+from cflow_torch.data.hdf5.index_file import read_index
 from cflow_torch.data.log import FlowLabels
 from cflow_torch.ego import rigid_transform
 from cflow_torch.types import CFlowError, Sweep

@@ -9,9 +9,9 @@ import numpy as np
 
 from cflow_torch.data.boxes import Boxes, flow_from_boxes, points_in_box
 from cflow_torch.data.log import FlowLabels
-from cflow_torch.data.nuscenes_categories import NUSCENES_CATEGORIES, OWN_TRAILER
-from cflow_torch.data.nuscenes_tables import LidarChain, SceneSource, Tables, find_scenes
-from cflow_torch.data.nuscenes_tracks import TrackBoxes, Tracks, poses_at, transforms
+from cflow_torch.data.nuscenes.categories import NUSCENES_CATEGORIES, OWN_TRAILER
+from cflow_torch.data.nuscenes.tables import LidarChain, SceneSource, Tables, find_scenes
+from cflow_torch.data.nuscenes.tracks import TrackBoxes, Tracks, poses_at, transforms
 from cflow_torch.evaluation.categories import CATEGORY_INDEX
 from cflow_torch.types import CFlowError, Sweep
 

@@ -11,7 +11,7 @@ import pyarrow as pa
 
 from cflow_torch.data.boxes import Boxes, flow_from_boxes
 from cflow_torch.data.log import FlowLabels
-from cflow_torch.data.waymo_parquet import (
+from cflow_torch.data.waymo.parquet import (
     BOX,
     CALIBRATION,
     LASER,
@@ -26,7 +26,7 @@ from cflow_torch.data.waymo_parquet import (
     read_columns,
     read_images,
 )
-from cflow_torch.data.waymo_range_image import LASERS, NO_LABEL_ZONE, TOP, LaserCalibration, range_image_points
+from cflow_torch.data.waymo.range_image import LASERS, NO_LABEL_ZONE, TOP, LaserCalibration, range_image_points
 from cflow_torch.ego import relative_transform, rigid_transform
 from cflow_torch.evaluation.categories import CATEGORY_INDEX
 from cflow_torch.types import CFlowError, Sweep

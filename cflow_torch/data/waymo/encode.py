@@ -8,7 +8,7 @@ from typing import Dict, Optional
 import numpy as np
 
 from cflow_torch.data.recording import Recording, UnitReturns
-from cflow_torch.data.waymo_range_image import (
+from cflow_torch.data.waymo.range_image import (
     INTENSITY,
     RANGE,
     LaserCalibration,

@@ -7,9 +7,9 @@ from typing import Union
 
 import numpy as np
 
-from cflow_torch.data.nuscenes_categories import TRUCKSCENES_NAMES
-from cflow_torch.data.nuscenes_writer import SceneWriter, new_folder, write_tables
-from cflow_torch.data.pcd import write_pcd
+from cflow_torch.data.arrays.pcd import write_pcd
+from cflow_torch.data.nuscenes.categories import TRUCKSCENES_NAMES
+from cflow_torch.data.nuscenes.writer import SceneWriter, new_folder, write_tables
 from cflow_torch.data.recording import Recording, UnitReturns
 
 # Tables that the devkit wants besides those of nuScenes; a simulated truck has nothing to put there.

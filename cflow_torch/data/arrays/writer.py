@@ -10,10 +10,10 @@ from typing import Optional, Union
 
 import numpy as np
 
-from cflow_torch.data.arrays import GROUND_FOLDER
-from cflow_torch.data.cloud_file import SUFFIXES, write_cloud
+from cflow_torch.data.arrays.cloud_file import SUFFIXES, write_cloud
+from cflow_torch.data.arrays.poses_text import write_kitti_poses, write_times, write_tum_poses
+from cflow_torch.data.arrays.reader import GROUND_FOLDER
 from cflow_torch.data.log import Log
-from cflow_torch.data.poses_text import write_kitti_poses, write_times, write_tum_poses
 from cflow_torch.types import CFlowError
 
 

@@ -13,7 +13,7 @@ from typing import Any, Dict, List, Sequence, Union
 
 import numpy as np
 
-from cflow_torch.data.aevascenes import CATEGORY_NAME, GROUND
+from cflow_torch.data.aevascenes.reader import CATEGORY_NAME, GROUND
 from cflow_torch.data.boxes import points_in_box
 from cflow_torch.data.recording import Recording, UnitReturns
 from cflow_torch.data.writers import Boxes, quaternions

@@ -14,8 +14,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from cflow_torch.data.recording import Recording, UnitReturns
-from cflow_torch.data.waymo_encode import encode_images, poses_of_shots
-from cflow_torch.data.waymo_parquet import (
+from cflow_torch.data.waymo.encode import encode_images, poses_of_shots
+from cflow_torch.data.waymo.parquet import (
     BOX,
     LASER,
     LIDAR,
@@ -26,7 +26,7 @@ from cflow_torch.data.waymo_parquet import (
     TRACK,
     VEHICLE_POSE,
 )
-from cflow_torch.data.waymo_range_image import LASERS, TOP, LaserCalibration
+from cflow_torch.data.waymo.range_image import LASERS, TOP, LaserCalibration
 from cflow_torch.evaluation.categories import META_CLASSES
 from cflow_torch.types import CFlowError
 

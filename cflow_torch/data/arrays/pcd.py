@@ -10,8 +10,8 @@ from typing import Dict, List, Mapping, Tuple, Union
 
 import numpy as np
 
+from cflow_torch.data.arrays.lzf import compress, decompress
 from cflow_torch.data.atomic import atomic_file
-from cflow_torch.data.lzf import compress, decompress
 from cflow_torch.types import CFlowError
 
 _TYPES: Dict[Tuple[str, int], np.dtype] = {

@@ -9,7 +9,7 @@ from typing import Collection, Dict, List, Mapping, Optional, Sequence, Tuple, U
 
 import numpy as np
 
-from cflow_torch.data.nuscenes_json import Row, read_table
+from cflow_torch.data.nuscenes.json_tables import Row, read_table
 from cflow_torch.types import CFlowError
 
 QUATERNION_TOLERANCE = 1e-3  # a quaternion is a rotation only if its length is 1; stored values are within 1e-6

@@ -7,7 +7,7 @@ from typing import Dict, List, Optional, Tuple
 
 import numpy as np
 
-from cflow_torch.data.nuscenes_tables import Annotations
+from cflow_torch.data.nuscenes.tables import Annotations
 from cflow_torch.types import CFlowError
 
 _STRAIGHT = 1e-8  # radians below which sin(angle) / angle is 1 in float64: no turn to follow

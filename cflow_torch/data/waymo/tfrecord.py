@@ -12,8 +12,8 @@ import numpy as np
 
 from cflow_torch.data.boxes import flow_from_boxes
 from cflow_torch.data.log import FlowLabels
-from cflow_torch.data.waymo import BOX_CATEGORY, upright_boxes
-from cflow_torch.data.waymo_range_image import LASERS, NO_LABEL_ZONE, LaserCalibration, range_image_points
+from cflow_torch.data.waymo.range_image import LASERS, NO_LABEL_ZONE, LaserCalibration, range_image_points
+from cflow_torch.data.waymo.reader import BOX_CATEGORY, upright_boxes
 from cflow_torch.ego import relative_transform, rigid_transform
 from cflow_torch.types import CFlowError, Sweep
 

@@ -7,10 +7,10 @@ from typing import ClassVar, List, Mapping, Optional, Sequence, Tuple, Union
 
 import numpy as np
 
-from cflow_torch.data.nuscenes import Footprint, NuScenesLog
-from cflow_torch.data.nuscenes_categories import TRUCKSCENES_CATEGORIES
-from cflow_torch.data.nuscenes_tables import SceneSource, find_scenes
-from cflow_torch.data.pcd import read_pcd
+from cflow_torch.data.arrays.pcd import read_pcd
+from cflow_torch.data.nuscenes.categories import TRUCKSCENES_CATEGORIES
+from cflow_torch.data.nuscenes.reader import Footprint, NuScenesLog
+from cflow_torch.data.nuscenes.tables import SceneSource, find_scenes
 from cflow_torch.types import CFlowError
 
 

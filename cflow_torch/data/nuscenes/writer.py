@@ -17,7 +17,7 @@ from typing import Any, Dict, Iterator, List, Mapping, Sequence, Union
 import numpy as np
 
 from cflow_torch.data.atomic import atomic_file
-from cflow_torch.data.nuscenes_categories import NUSCENES_NAMES
+from cflow_torch.data.nuscenes.categories import NUSCENES_NAMES
 from cflow_torch.data.recording import Recording, UnitReturns
 from cflow_torch.data.writers import quaternions
 from cflow_torch.types import CFlowError

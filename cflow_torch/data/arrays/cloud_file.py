@@ -9,9 +9,9 @@ import numpy as np
 import pyarrow as pa
 from pyarrow import feather, parquet
 
+from cflow_torch.data.arrays.pcd import read_pcd, write_pcd
+from cflow_torch.data.arrays.ply import read_ply, write_ply
 from cflow_torch.data.atomic import atomic_file
-from cflow_torch.data.pcd import read_pcd, write_pcd
-from cflow_torch.data.ply import read_ply, write_ply
 from cflow_torch.types import CFlowError
 
 SUFFIXES = (".npy", ".npz", ".bin", ".pcd", ".ply", ".feather", ".parquet")

@@ -9,9 +9,9 @@ from typing import Any, Dict, List, Optional, Sequence, Tuple, Union
 
 import numpy as np
 
+from cflow_torch.data.aevascenes.npz_strings import read_npz_member
 from cflow_torch.data.boxes import Boxes, flow_from_boxes
 from cflow_torch.data.log import FlowLabels
-from cflow_torch.data.npz_strings import read_npz_member
 from cflow_torch.ego import relative_transform
 from cflow_torch.evaluation.categories import CATEGORY_INDEX
 from cflow_torch.types import CFlowError, Sweep

@@ -8,9 +8,9 @@ from typing import Any, Dict, List, Optional, Sequence, Tuple, Union
 
 import numpy as np
 
-from cflow_torch.data.cloud_file import KITTI_COLUMNS, SUFFIXES, read_cloud
+from cflow_torch.data.arrays.cloud_file import KITTI_COLUMNS, SUFFIXES, read_cloud
+from cflow_torch.data.arrays.poses_text import Trajectory, poses_at, read_poses, read_times
 from cflow_torch.data.log import FlowLabels
-from cflow_torch.data.poses_text import Trajectory, poses_at, read_poses, read_times
 from cflow_torch.ego import rigid_transform
 from cflow_torch.types import CFlowError, Sweep
 
