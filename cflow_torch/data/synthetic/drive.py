@@ -4,39 +4,44 @@ from __future__ import annotations
 
 import uuid
 from collections import OrderedDict
-from typing import Dict, Optional
+from typing import Dict, List, Optional
 
 import numpy as np
 import torch
 
 from cflow_torch.data.log import FlowLabels
-from cflow_torch.data.synthetic.lidar import Returns, scan
-from cflow_torch.data.synthetic.objects import CATEGORIES
-from cflow_torch.data.synthetic.profiles import LidarProfile, get_profile
+from cflow_torch.data.recording import UnitReturns
+from cflow_torch.data.synthetic.lidar import Returns, scan, scan_rolling
+from cflow_torch.data.synthetic.motion import Motion
+from cflow_torch.data.synthetic.objects import CATEGORIES, own_truck
+from cflow_torch.data.synthetic.profiles import get_profile, in_weather
 from cflow_torch.data.synthetic.scene import Scene
-from cflow_torch.data.synthetic.street import build_street
+from cflow_torch.data.synthetic.scenes import get_scene
+from cflow_torch.data.synthetic.sensors import LidarProfile
 from cflow_torch.data.writers import Boxes, Channels, GroundRaster
 from cflow_torch.types import CFlowError, Sweep
 
-SWEEP_INTERVAL_NS = 100_000_000
-AXLE_HEIGHT = 0.35  # of the ego frame's origin above the ground, metres
+AXLE_HEIGHT = 0.35  # of the ego frame's origin above the ground in profile av2, metres
 _FIRST_STAMP_NS = 315_970_000_000_000_000
 _CACHED_SWEEPS = 8  # a window of five and its neighbours; a sweep of 100,000 points takes 3 MB
 _BOX_SLACK = 0.1  # annotation boxes are that much larger than the body, so that range noise stays inside, metres
+_ROUNDING = 1e-4  # boxes hold their points also after those are rounded to float32, metres
 _RASTER_STEP = 0.3  # metres per cell of the ground raster, as in Argoverse 2
 
 
 class Drive:
-    """A drive through a synthetic street. Sweeps are simulated when asked for, each from its own random stream, so they
-    do not depend on the order of the calls.
+    """A drive through a synthetic scene. Sweeps are simulated when asked for, each from its own random stream, so they
+    do not depend on the order of the calls. It is a `data.recording.Recording`.
 
-    A sweep is instantaneous: nothing moves while the LiDAR turns.
+    In the profiles av2 and demo a sweep is instantaneous: nothing moves while the LiDAR turns. In the others every shot
+    has its own time; where the data set moves points to the time stamp by the motion of the ego car, so does the drive,
+    and what moves stays smeared. There boxes are as long as it takes to hold the smeared points.
 
     Args:
-        scene: street, traffic and the way of the ego car.
+        scene: place, traffic and the way of the ego car.
         profile: the LiDARs.
         seed: of the noise.
-        num_sweeps: at 10 Hz.
+        num_sweeps: at the rate of the profile.
         log_id: name of the log.
 
     Attributes:
@@ -48,19 +53,23 @@ class Drive:
 
     def __init__(self, scene: Scene, profile: LidarProfile, seed: int, num_sweeps: int, log_id: str) -> None:
         self.log_id = log_id
-        self.timestamps = tuple(_FIRST_STAMP_NS + i * SWEEP_INTERVAL_NS for i in range(num_sweeps))
+        self.timestamps = tuple(_FIRST_STAMP_NS + i * profile.sweep_interval_ns for i in range(num_sweeps))
         self.scene = scene
         self.calibration: Dict[str, np.ndarray] = {unit.name: unit.T_ego_sensor for unit in profile.units}
         self._profile, self._seed = profile, seed
-        self._seconds = np.arange(num_sweeps) * (SWEEP_INTERVAL_NS * 1e-9)
+        self._seconds = np.arange(num_sweeps) * (profile.sweep_interval_ns * 1e-9)
+        self._motion = Motion(scene, profile, self._seconds)
         self._body_poses = scene.body_poses(self._seconds)
-        self.poses = scene.ground.pose(*scene.ego(self._seconds).T)
-        self.poses[:, :3, 3] += AXLE_HEIGHT * self.poses[:, :3, 2]
+        self.poses = self._motion.ego_poses(self._seconds)
         self._is_annotated = self._annotated(scene)
         self._category = np.array([CATEGORIES.get(body.category or "", 0) for body in scene.bodies], np.uint8)
         identity = np.random.default_rng([seed, 1])
         self.track_ids = tuple(str(uuid.UUID(bytes=identity.bytes(16), version=4)) for _ in scene.bodies)
         self._cache: OrderedDict[int, Returns] = OrderedDict()
+
+    def poses_at(self, index: int, offset_ns: np.ndarray) -> np.ndarray:
+        """(M, 4, 4) float64 true `T_world_ego` at `offset_ns` (M,) after the time stamp of sweep `index`."""
+        return self._motion.ego_poses(self._seconds[index] + 1e-9 * np.asarray(offset_ns, np.float64))
 
     def sweep(self, index: int) -> Sweep:
         """Sweep `index`: (N, 3) float32 points in its ego frame, exact ground mask, float64 pose, time."""
@@ -72,7 +81,8 @@ class Drive:
     def labels(self, index: int) -> Optional[FlowLabels]:
         """Truth of the pair (index, index + 1), None for the last sweep.
 
-        A point belongs to the body its ray hit and moves with the body's track; legs do not swing in the truth. Points
+        A point belongs to the body its ray hit and moves with the body's track from the time stamp of the one sweep to
+        that of the other, also if it was measured before or after it; legs do not swing in the truth. Points
         of a body that is not annotated in both sweeps (its middle is beyond the LiDAR's range) are invalid, and of
         category 0 if it is not annotated at `index`.
 
@@ -103,6 +113,8 @@ class Drive:
         bodies = [self.scene.bodies[i] for i in chosen]
         size = np.array([body.size for body in bodies]).reshape(-1, 3) + _BOX_SLACK
         pose = np.linalg.inv(self.poses[index]) @ self._body_poses[index, chosen]
+        if self._profile.is_rolling:
+            size = np.maximum(size, self._extent(index, returns)[chosen])
         pose[:, :3, 3] += pose[:, :3, 2] * size[:, 2:] / 2
         return Boxes(
             track_id=tuple(self.track_ids[i] for i in chosen),
@@ -116,6 +128,45 @@ class Drive:
         """Intensity, laser and firing time of every point of sweep `index`."""
         returns = self.returns(index)
         return Channels(returns.intensity.numpy(), returns.laser_number.numpy(), returns.offset_ns.numpy())
+
+    def units(self, index: int) -> List[UnitReturns]:
+        """What each LiDAR received in sweep `index`; together, in this order, the rows of `sweep(index)`."""
+        returns = self.returns(index)
+        velocity = self._motion.radial_velocity(self._seconds[index], returns)
+        if self._profile.velocity_noise:
+            noise = np.random.default_rng([self._seed, 3, index]).normal(size=len(velocity))
+            velocity = (velocity + self._profile.velocity_noise * noise).astype(np.float32)
+        parts, begin = [], 0
+        counts = torch.bincount(returns.unit, minlength=len(self._profile.units)).tolist()
+        for unit, count in zip(self._profile.units, counts):
+            rows = slice(begin, begin + count)
+            parts.append(
+                UnitReturns(
+                    name=unit.name,
+                    T_ego_sensor=unit.T_ego_sensor,
+                    points=returns.local[rows].numpy().copy(),
+                    ring=returns.ring[rows].numpy().copy(),
+                    column=returns.column[rows].numpy().copy(),
+                    offset_ns=returns.offset_ns[rows].numpy().astype(np.int64),
+                    intensity=returns.intensity[rows].numpy().copy(),
+                    radial_velocity=velocity[rows],
+                    num_rings=len(unit.elevations),
+                    num_columns=unit.num_columns,
+                )
+            )
+            begin += count
+        return parts
+
+    def elevations(self, unit: str) -> np.ndarray:
+        """(num_rings,) float64 radians, elevation of each ring of a unit, lowest first.
+
+        Raises:
+            CFlowError: there is no such unit.
+        """
+        for candidate in self._profile.units:
+            if candidate.name == unit:
+                return np.radians(np.sort(np.array(candidate.elevations, np.float64)))
+        raise CFlowError(f"log {self.log_id} has no LiDAR {unit!r}; it has {', '.join(self.calibration)}")
 
     def ground_raster(self) -> GroundRaster:
         """Ground height of the area that the LiDAR can reach."""
@@ -135,18 +186,36 @@ class Drive:
         if not 0 <= index < len(self.timestamps):
             raise CFlowError(f"log {self.log_id} has sweeps 0 ... {len(self.timestamps) - 1}, got index {index}")
         if index not in self._cache:
-            stream = np.random.SeedSequence([self._seed, 2, index]).generate_state(1, np.uint32)[0]
-            self._cache[index] = scan(
-                self._profile,
-                self.scene.solids(float(self._seconds[index]), self._body_poses[index]),
-                self.scene.ground,
-                torch.from_numpy(self.poses[index]),
-                torch.Generator().manual_seed(int(stream)),
-                SWEEP_INTERVAL_NS,
-            )
+            self._cache[index] = self._scan(index)
             if len(self._cache) > _CACHED_SWEEPS:
                 self._cache.popitem(last=False)
         return self._cache[index]
+
+    def _scan(self, index: int) -> Returns:
+        stream = np.random.SeedSequence([self._seed, 2, index]).generate_state(1, np.uint32)[0]
+        generator = torch.Generator().manual_seed(int(stream))
+        seconds, ground = float(self._seconds[index]), self.scene.ground
+        if self._profile.is_rolling:
+            ego, solids = self._motion.ego_motion(seconds), self._motion.solids(index)
+            return scan_rolling(self._profile, solids, ground, ego, generator)
+        solids_now = self.scene.solids(seconds, self._body_poses[index])
+        pose = torch.from_numpy(self.poses[index])
+        return scan(self._profile, solids_now, ground, pose, generator, self._profile.sweep_interval_ns)
+
+    def _extent(self, index: int, returns: Returns) -> np.ndarray:
+        """(num_bodies, 3) float64 size of the smallest upright box about a body's axis that holds its points."""
+        points = returns.points.numpy().astype(np.float64)
+        if not self._profile.is_deskewed:
+            moved = np.linalg.inv(self.poses[index]) @ self.poses_at(index, returns.offset_ns.numpy())
+            points = np.einsum("nij,nj->ni", moved[:, :3, :3], points) + moved[:, :3, 3]
+        body = self._body_of(returns)
+        chosen = np.append(self._category > 0, False)[body]
+        points, body = points[chosen], body[chosen]
+        T_body_ego = (np.linalg.inv(self._body_poses[index]) @ self.poses[index])[body]
+        local = np.abs(np.einsum("nij,nj->ni", T_body_ego[:, :3, :3], points) + T_body_ego[:, :3, 3])
+        extent = np.zeros((len(self.scene.bodies), 3))
+        np.maximum.at(extent, body, local * (2, 2, 1))
+        return extent + _ROUNDING
 
     def _body_of(self, returns: Returns) -> np.ndarray:
         """(N,) int64 body of each point; number of bodies = the ground."""
@@ -159,19 +228,24 @@ class Drive:
         return is_background | (np.hypot(offset[..., 0], offset[..., 1]) < self._profile.max_range)
 
 
-def make_drive(seed: int = 0, num_sweeps: int = 20, profile: str = "av2") -> Drive:
-    """A simulated drive through a street with houses, trees, parked and moving traffic and people.
+def make_drive(
+    seed: int = 0, num_sweeps: int = 20, profile: str = "av2", scene: str = "street", weather: str = "clear"
+) -> Drive:
+    """A simulated drive past houses, trees, parked and moving traffic and people.
 
     Args:
         seed: >= 0; the same seed gives the same bytes on the same machine.
-        num_sweeps: >= 1, at 10 Hz. After the first seconds, vehicles may pass through each other.
-        profile: a name in `profiles.PROFILES`: `av2` (2 x 32 beams, 115,200 rays), `demo` (28,800 rays).
+        num_sweeps: >= 1, at the rate of the profile. After the first seconds, vehicles may pass through each other.
+        profile: a name in `profiles.PROFILES`: one of the five data sets `av2`, `nuscenes`, `truckscenes`, `waymo`,
+            `aevascenes`; `demo` (28,800 rays); `av2_rolling` (av2, with a time for every shot).
+        scene: a name in `scenes.SCENES`: `street`, `highway`, `crossing`, `narrow`, `car_park`.
+        weather: a name in `profiles.WEATHER`: `clear`, `rain`, `snow`, `fog`.
 
     Returns:
-        Drive, a `Log`.
+        Drive, a `Log` and a `Recording`.
 
     Raises:
-        CFlowError: an argument is out of range or there is no such profile.
+        CFlowError: an argument is out of range or there is no such profile, scene or weather.
 
     Example:
         >>> drive = make_drive(seed=1, num_sweeps=2, profile="demo")
@@ -180,5 +254,9 @@ def make_drive(seed: int = 0, num_sweeps: int = 20, profile: str = "av2") -> Dri
     """
     if seed < 0 or num_sweeps < 1:
         raise CFlowError(f"seed must be >= 0 and num_sweeps >= 1, got seed {seed} and num_sweeps {num_sweeps}")
-    scene = build_street(np.random.default_rng([seed, 0]))
-    return Drive(scene, get_profile(profile), seed, num_sweeps, f"synthetic-{profile}-{seed:04d}")
+    lidars = in_weather(get_profile(profile), weather)
+    place = get_scene(scene)(np.random.default_rng([seed, 0]))
+    if lidars.has_trailer:
+        place = place.with_own(own_truck(place.ego))
+    parts = [profile, *([scene] if scene != "street" else []), *([weather] if weather != "clear" else [])]
+    return Drive(place, lidars, seed, num_sweeps, f"synthetic-{'-'.join(parts)}-{seed:04d}")

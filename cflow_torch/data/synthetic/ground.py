@@ -41,7 +41,7 @@ class Ground:
 
     def height(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Height of what a wheel or a foot stands on at world (x, y), float64 metres."""
-        on_pavement = self.pavement_depth(torch.from_numpy(x), torch.from_numpy(y)).numpy() > 0
+        on_pavement = self.is_pavement(torch.from_numpy(x), torch.from_numpy(y)).numpy()
         return self.road_height(x, y) + self.kerb * on_pavement
 
     def pavement_depth(self, x: Tensor, y: Tensor) -> Tensor:
@@ -51,6 +51,17 @@ class Ground:
         radius = self.corner_radius
         in_corner = (u < radius) & (v < radius) & (u > 0) & (v > 0)
         return torch.where(in_corner, radius - torch.hypot(radius - u, radius - v), torch.minimum(u, v))
+
+    def is_pavement(self, x: Tensor, y: Tensor) -> Tensor:
+        """bool, `pavement_depth` > 0, in a third of the time."""
+        u = y.abs() - self.half_widths[0]
+        v = (x - self.crossing_x).abs() - self.half_widths[1]
+        raised = (u > 0) & (v > 0)
+        at_corner = (raised & (u < self.corner_radius) & (v < self.corner_radius)).nonzero(as_tuple=True)
+        if len(at_corner[0]):
+            u, v = self.corner_radius - u[at_corner], self.corner_radius - v[at_corner]
+            raised[at_corner] = torch.hypot(u, v) < self.corner_radius
+        return raised
 
     def pose(self, x: np.ndarray, y: np.ndarray, yaw: np.ndarray) -> np.ndarray:
         """Frames that stand on the ground and tilt with it.
@@ -79,38 +90,43 @@ class Ground:
         """Where rays meet the ground.
 
         Args:
-            origin: (3,) float64, world metres, above the ground.
-            directions: (3, R) float64 unit vectors, world axes.
+            origin: (3,) or (3, R) float64, world metres, above the ground.
+            directions: (3, R) unit vectors, world axes.
 
         Returns:
-            (R,) float64 range in metres, inf = never; (R,) float64 cosine of the angle of incidence.
+            (R,) range in metres, inf = never; (R,) cosine of the angle of incidence; both of the type of `directions`.
         """
-        raised, _ = self._cast_surface(origin, directions, self.kerb)
-        low, cosine = self._cast_surface(origin, directions, 0.0)
-        hits_pavement = self._depth_along(origin, directions, raised) > 0
+        x, y, z = (value.numpy() for value in origin)
+        slope_x = torch.from_numpy(np.asarray(self.slope[0] + self.curvature * x)).to(directions.dtype)
+        # On the road surface lifted by some amount, a + b t + c t**2 = 0.
+        b = directions[2] - slope_x * directions[0] - self.slope[1] * directions[1]
+        c = -0.5 * self.curvature * directions[0] ** 2
+
+        def meet(lift: float) -> Tuple[Tensor, Tensor]:
+            a = torch.from_numpy(np.asarray(z - self.road_height(x, y) - lift)).to(directions.dtype)
+            root = (b * b - 4 * a * c).sqrt()  # NaN: the ray passes over the crest
+            t = 2 * a / (root - b)  # the form without cancellation
+            return torch.where(t > 0, t, torch.inf), root
+
+        raised, _ = meet(self.kerb)
+        low, root = meet(0.0)
+        cosine = root.nan_to_num()
+        hits_pavement = self._is_pavement_along(origin, directions, raised)
         # A ray that is above the road at pavement height and under the pavement at road height hit the kerb between.
-        hits_kerb = ~hits_pavement & (self._depth_along(origin, directions, low) > 0)
+        hits_kerb = ~hits_pavement & self._is_pavement_along(origin, directions, low)
         if bool(hits_kerb.any()):
             rays = directions[:, hits_kerb]
+            if origin.dim() > 1:
+                origin = origin.expand_as(directions)[:, hits_kerb]
             near, far = raised[hits_kerb], low[hits_kerb]
             for _ in range(_BISECTIONS):
                 middle = 0.5 * (near + far)
-                inside = self._depth_along(origin, rays, middle) > 0
+                inside = self._is_pavement_along(origin, rays, middle)
                 near, far = torch.where(inside, near, middle), torch.where(inside, middle, far)
             low[hits_kerb] = 0.5 * (near + far)
             cosine[hits_kerb] = 0.5
         return torch.where(hits_pavement, raised, low), cosine
 
-    def _cast_surface(self, origin: Tensor, directions: Tensor, lift: float) -> Tuple[Tensor, Tensor]:
-        """Range and cosine of incidence on the road surface lifted by `lift`; smallest root of a + b t + c t**2 = 0."""
-        x, y, z = origin.tolist()
-        slope_x = self.slope[0] + self.curvature * x
-        a = z - float(self.road_height(np.array(x), np.array(y))) - lift
-        b = directions[2] - slope_x * directions[0] - self.slope[1] * directions[1]
-        c = -0.5 * self.curvature * directions[0] ** 2
-        root = (b * b - 4 * a * c).sqrt()  # NaN: the ray passes over the crest
-        t = 2 * a / (root - b)  # the form without cancellation
-        return torch.where(t > 0, t, torch.inf), root.nan_to_num()
-
-    def _depth_along(self, origin: Tensor, directions: Tensor, t: Tensor) -> Tensor:
-        return self.pavement_depth(origin[0] + t * directions[0], origin[1] + t * directions[1])
+    def _is_pavement_along(self, origin: Tensor, directions: Tensor, t: Tensor) -> Tensor:
+        x, y = origin[:2].to(directions.dtype)
+        return self.is_pavement(x + t * directions[0], y + t * directions[1])

@@ -55,15 +55,16 @@ class Solid(NamedTuple):
 
 @dataclass(frozen=True)
 class Route:
-    """A way made of a straight, an arc and a straight, driven at constant speed.
+    """A way made of a straight, an arc and a straight, driven at constant speed or with constant acceleration.
 
     Args:
         x, y: where the arc begins (anywhere, if angle is 0), world metres.
         yaw: heading there, radians.
         start: distance along the way at time 0, negative = before the arc, metres.
-        speed: m/s.
+        speed: m/s at time 0; negative = in reverse.
         radius: of the arc, metres.
         angle: of the arc, radians, positive = left.
+        acceleration: m/s^2; what brakes to a standstill stays there.
     """
 
     x: float
@@ -73,10 +74,25 @@ class Route:
     speed: float = 0.0
     radius: float = 1.0
     angle: float = 0.0
+    acceleration: float = 0.0
 
     def __call__(self, seconds: np.ndarray) -> np.ndarray:
         """(T, 3) float64 world x, y, yaw at `seconds` (T,)."""
-        return self.at(self.start + self.speed * seconds)
+        return self.at(self.distance(seconds))
+
+    def distance(self, seconds: np.ndarray) -> np.ndarray:
+        """(T,) metres from the beginning of the arc at `seconds` (T,)."""
+        if self.acceleration == 0:
+            return np.asarray(self.start + self.speed * seconds)
+        stop = -self.speed / self.acceleration
+        # One that brakes halts there; one that starts up at a time before 0 stood until then.
+        seconds = np.minimum(seconds, stop) if self.speed * self.acceleration < 0 else np.maximum(seconds, stop)
+        return np.asarray(self.start + self.speed * seconds + 0.5 * self.acceleration * seconds**2)
+
+    @property
+    def stands(self) -> bool:
+        """Never moves."""
+        return self.speed == 0 and self.acceleration == 0
 
     def at(self, distance: np.ndarray) -> np.ndarray:
         """(T, 3) float64 world x, y, yaw after `distance` (T,) metres from the beginning of the arc."""
@@ -109,7 +125,7 @@ class Towed:
 
     def __call__(self, seconds: np.ndarray) -> np.ndarray:
         """(T, 3) float64 world x, y, yaw of the trailer's middle at `seconds` (T,)."""
-        wanted = self.tractor.start + self.tractor.speed * seconds
+        wanted = self.tractor.distance(seconds)
         # Four wheelbases of straight run-in settle the angle; 5 cm steps follow the true curve to a millimetre.
         begin = min(float(wanted.min()), 0.0) - 4 * self.wheelbase
         distance = np.linspace(begin, float(wanted.max()), 2 + int((float(wanted.max()) - begin) / 0.05))
@@ -143,8 +159,14 @@ class Body:
     category: Optional[str] = None
     size: Vector = (0.0, 0.0, 0.0)
 
+    @property
+    def stands(self) -> bool:
+        """Never moves."""
+        return isinstance(self.way, Route) and self.way.stands
 
-def _box(x0: float, x1: float, y0: float, y1: float, z0: float, z1: float, albedo: float) -> Solid:
+
+def box(x0: float, x1: float, y0: float, y1: float, z0: float, z1: float, albedo: float) -> Solid:
+    """A box from its six faces, metres, body frame."""
     centre = ((x0 + x1) / 2, (y0 + y1) / 2, (z0 + z1) / 2)
     return Solid(BOX, centre, ((x1 - x0) / 2, (y1 - y0) / 2, (z1 - z0) / 2), albedo=albedo)
 
@@ -163,8 +185,8 @@ def car(rng: np.random.Generator, way: Route) -> Body:
     paint, half = rng.uniform(0.15, 0.9), length / 2
     rear = -half + rng.uniform(0.05, 0.7)  # estate ... saloon
     solids = [
-        _box(-half, half, -width / 2, width / 2, 0.25, 0.58 * height, paint),
-        _box(rear, half - rng.uniform(1.1, 1.5), -width / 2 + 0.12, width / 2 - 0.12, 0.58 * height, height, 0.3),
+        box(-half, half, -width / 2, width / 2, 0.25, 0.58 * height, paint),
+        box(rear, half - rng.uniform(1.1, 1.5), -width / 2 + 0.12, width / 2 - 0.12, 0.58 * height, height, 0.3),
         *_wheels((-0.3 * length, 0.3 * length), width / 2, 0.33),
     ]
     return Body(solids, way, "REGULAR_VEHICLE", (length, width, height))
@@ -172,23 +194,41 @@ def car(rng: np.random.Generator, way: Route) -> Body:
 
 def bus(way: Route) -> Body:
     """Twelve metres of bus."""
-    solids = [_box(-6, 6, -1.27, 1.27, 0.35, 3.1, 0.6), *_wheels((-3.2, 3.3), 1.27, 0.48)]
+    solids = [box(-6, 6, -1.27, 1.27, 0.35, 3.1, 0.6), *_wheels((-3.2, 3.3), 1.27, 0.48)]
     return Body(solids, way, "BUS", (12.0, 2.54, 3.1))
 
 
 def articulated_truck(way: Route) -> List[Body]:
     """A tractor with a driver's cab, and a trailer that swings in behind it: two tracks."""
     cab = [
-        _box(0.4, 2.8, -1.2, 1.2, 0.5, 3.3, 0.7),
-        _box(-2.8, 0.4, -0.6, 0.6, 0.6, 1.0, 0.3),
+        box(0.4, 2.8, -1.2, 1.2, 0.5, 3.3, 0.7),
+        box(-2.8, 0.4, -0.6, 0.6, 0.6, 1.0, 0.3),
         *_wheels((-1.6, 1.9), 1.2, 0.5),
     ]
-    trailer = [_box(-4.25, 4.25, -1.25, 1.25, 1.15, 3.7, 0.8), *_wheels((-2.9, -1.7), 1.25, 0.5)]
+    trailer = [box(-4.25, 4.25, -1.25, 1.25, 1.15, 3.7, 0.8), *_wheels((-2.9, -1.7), 1.25, 0.5)]
     tow = Towed(way, hitch=1.4, wheelbase=6.0, middle=3.4)
     return [
         Body(cab, way, "TRUCK_CAB", (5.6, 2.4, 3.3)),
         Body(trailer, tow, "VEHICULAR_TRAILER", (8.5, 2.5, 3.7)),
     ]
+
+
+def van(rng: np.random.Generator, way: Route) -> Body:
+    """A delivery van: one tall box behind a short bonnet."""
+    paint = rng.uniform(0.3, 0.9)
+    solids = [
+        box(-2.9, 1.9, -1.0, 1.0, 0.3, 2.5, paint),
+        box(1.9, 2.9, -0.95, 0.95, 0.3, 1.3, paint),
+        *_wheels((-1.8, 1.9), 1.0, 0.35),
+    ]
+    return Body(solids, way, "REGULAR_VEHICLE", (5.8, 2.0, 2.5))
+
+
+def own_truck(way: Route) -> List[Body]:
+    """The recording truck itself, a cab and a trailer that its LiDARs stand around. `way` is that of its rear axle."""
+    cab = [box(2.6, 5.0, -1.25, 1.25, 0.4, 3.1, 0.5), box(-1.0, 2.6, -0.6, 0.6, 0.3, 0.9, 0.3)]
+    trailer = [box(-6.3, 6.0, -1.25, 1.25, 1.1, 4.0, 0.7), *_wheels((-4.4, -3.1, -1.8), 1.25, 0.5)]
+    return [Body(cab, way), Body(trailer, Towed(way, hitch=-0.3, wheelbase=7.6, middle=4.7))]
 
 
 def pedestrian(rng: np.random.Generator, way: Route) -> Body:
@@ -219,8 +259,8 @@ def cyclist(rng: np.random.Generator, way: Route) -> Body:
     cloth, phase = rng.uniform(0.3, 0.8), rng.uniform(0, 2 * math.pi)
     solids = [
         *[Solid(CYLINDER, (x, 0.0, 0.34), (0.34, 0.34, 0.025), roll=math.pi / 2, albedo=0.2) for x in (-0.52, 0.52)],
-        _box(-0.5, 0.45, -0.03, 0.03, 0.35, 0.8, 0.4),
-        _box(0.4, 0.5, -0.28, 0.28, 0.95, 1.05, 0.4),
+        box(-0.5, 0.45, -0.03, 0.03, 0.35, 0.8, 0.4),
+        box(0.4, 0.5, -0.28, 0.28, 0.95, 1.05, 0.4),
         Solid(ELLIPSOID, (-0.05, 0.0, 1.22), (0.15, 0.22, 0.36), pitch=0.5, albedo=cloth),
         Solid(ELLIPSOID, (0.2, 0.0, 1.66), (0.11, 0.09, 0.13), albedo=0.5),
         *[
@@ -239,14 +279,14 @@ def cyclist(rng: np.random.Generator, way: Route) -> Body:
 
 def wall(x: float, y: float, length: float, depth: float, height: float, albedo: float = 0.45) -> Body:
     """A box along the world axes: building, garden wall or hoarding; it reaches a metre into the ground."""
-    return Body([_box(-length / 2, length / 2, -depth / 2, depth / 2, -1.0, height, albedo)], Route(x, y))
+    return Body([box(-length / 2, length / 2, -depth / 2, depth / 2, -1.0, height, albedo)], Route(x, y))
 
 
 def pole(x: float, y: float, height: float, radius: float, sign: float = 0.0) -> Body:
     """A lamp post, or with `sign` > 0 (metres) a sign post with its plate."""
     solids = [Solid(CYLINDER, (0, 0, height / 2), (radius, radius, height / 2), albedo=0.4)]
     if sign:
-        solids.append(_box(-0.03, 0.03, -sign / 2, sign / 2, height - sign, height, 0.9))
+        solids.append(box(-0.03, 0.03, -sign / 2, sign / 2, height - sign, height, 0.9))
     return Body(solids, Route(x, y))
 
 

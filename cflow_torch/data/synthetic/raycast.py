@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Tuple
+from typing import Callable, NamedTuple, Tuple
 
 import torch
 from torch import Tensor
@@ -37,6 +37,31 @@ class Solids:
     half_size: Tensor
     albedo: Tensor
     is_foliage: Tensor
+
+
+class Blocks(NamedTuple):
+    """E blocks of a range image, each holding all rays that can meet one solid (a solid may have several).
+
+    Args:
+        solid: (E,) int64.
+        first_column, num_columns: (E,) int64, columns [first, first + number), counted round the image.
+        first_beam, end_beam: (E,) int64, beams [first, end).
+    """
+
+    solid: Tensor
+    first_column: Tensor
+    num_columns: Tensor
+    first_beam: Tensor
+    end_beam: Tensor
+
+
+class UnitRays(NamedTuple):
+    """M columns of rays in unit coordinates of a solid: (3, M) float32 origins, and the two parts of the directions,
+    sideways * cos(elevation) + up * sin(elevation)."""
+
+    origin: Tensor
+    sideways: Tensor
+    up: Tensor
 
 
 def ray_directions(azimuth: Tensor, elevation: Tensor) -> Tensor:
@@ -74,38 +99,67 @@ def cast_solids(
 
     Cost: time and memory grow with the sum, over the solids, of the rays in the block that each one covers.
     """
-    num_beams = len(elevation)
-    best = torch.full((len(azimuth) * num_beams,), _NO_HIT, device=azimuth.device)
-    first_column, num_columns, first_beam, end_beam = _covered_block(
-        T_solid_sensor, half_size, azimuth, elevation, max_range
-    )
+    blocks = _covered_blocks(T_solid_sensor, half_size, azimuth, elevation, max_range)
     # Rays in unit coordinates of the solid: origin o, direction d = u(azimuth) cos(elevation) + w sin(elevation).
     to_unit = T_solid_sensor[:, :3] / half_size[:, :, None]
     origin, matrix = to_unit[..., 3].T.float(), to_unit[..., :3].permute(1, 2, 0).float()  # (3, P), (3, 3, P)
     cos_azimuth, sin_azimuth = azimuth.cos().float(), azimuth.sin().float()
-    cos_elevation, sin_elevation = elevation.cos().float(), elevation.sin().float()
 
-    size = num_columns * (end_beam - first_beam)
+    def rays_at(solid: Tensor, column: Tensor) -> UnitRays:
+        sideways = take(matrix[:, 0], solid) * take(cos_azimuth, column)
+        sideways += take(matrix[:, 1], solid) * take(sin_azimuth, column)
+        return UnitRays(take(origin, solid), sideways, take(matrix[:, 2], solid))
+
+    return nearest_hits(kind, blocks, rays_at, len(azimuth), elevation, max_candidates)  # block = solid
+
+
+def nearest_hits(
+    kind: Tensor,
+    blocks: Blocks,
+    rays_at: Callable[[Tensor, Tensor], UnitRays],
+    num_columns: int,
+    elevation: Tensor,
+    max_candidates: int = _MAX_CANDIDATES,
+) -> Tuple[Tensor, Tensor]:
+    """Nearest solid along every ray of a range image, from the blocks of rays that may meet each solid.
+
+    Args:
+        kind: (P,) int64.
+        blocks: E blocks.
+        rays_at: (M,) block number and (M,) column to the rays of that column as the solid of the block sees them.
+        num_columns: C, columns of the range image.
+        elevation: (B,) float64 radians, ascending.
+        max_candidates: (ray, solid) pairs that are tested at once; bounds the memory.
+
+    Returns:
+        (C * B,) float32 range in metres, inf = no hit; (C * B,) int64 block of the solid that was hit, -1 = no hit. Ray
+        number column * B + beam. Equal ranges: the lower block wins.
+    """
+    num_beams = len(elevation)
+    best = torch.full((num_columns * num_beams,), _NO_HIT, device=elevation.device)
+    cos_elevation, sin_elevation = elevation.cos().float(), elevation.sin().float()
+    height = blocks.end_beam - blocks.first_beam
+    size, kind_of = blocks.num_columns * height, kind[blocks.solid]
     for this_kind, intersect in ((BOX, _hit_cube), (CYLINDER, _hit_cylinder), (ELLIPSOID, _hit_ball)):
-        visible = ((kind == this_kind) & (size > 0)).nonzero()[:, 0]
+        visible = ((kind_of == this_kind) & (size > 0)).nonzero()[:, 0]
         chunk = (size[visible].cumsum(0) - 1) // max_candidates
-        for solids in visible.split(chunk.unique_consecutive(return_counts=True)[1].tolist()) if len(visible) else ():
-            # (solid, column) pairs, then (solid, column, beam) candidates.
-            pair, offset = _expand(_take(num_columns, solids))
-            owner = _take(solids, pair)
-            column = (_take(first_column, owner) + offset) % len(azimuth)
-            sideways = _take(matrix[:, 0], owner) * _take(cos_azimuth, column)
-            sideways += _take(matrix[:, 1], owner) * _take(sin_azimuth, column)
-            pair, offset = _expand(_take(end_beam - first_beam, owner))
-            owner, column = _take(owner, pair), _take(column, pair)
-            beam = _take(first_beam, owner) + offset
-            direction = _take(sideways, pair) * _take(cos_elevation, beam)
-            direction += _take(matrix[:, 2], owner) * _take(sin_elevation, beam)
-            t = intersect(_take(origin, owner), direction)
+        for chosen in visible.split(chunk.unique_consecutive(return_counts=True)[1].tolist()) if len(visible) else ():
+            # (block, column) pairs, then (block, column, beam) candidates.
+            pair, offset = _expand(take(blocks.num_columns, chosen))
+            block = take(chosen, pair)
+            column = (take(blocks.first_column, block) + offset) % num_columns
+            rays = rays_at(block, column)
+            ray = column * num_beams + take(blocks.first_beam, block)
+            pair, offset = _expand(take(height, block))
+            beam = take(blocks.first_beam, take(block, pair)) + offset
+            direction = take(rays.sideways, pair) * take(cos_elevation, beam)
+            direction += take(rays.up, pair) * take(sin_elevation, beam)
+            t = intersect(take(rays.origin, pair), direction)
             # Range (positive floats sort like their bits) and solid in one integer: one exact, order-free minimum.
-            key = (t.view(torch.int32).long() << 32) | owner
             hit = (t < torch.inf).nonzero()[:, 0]
-            best.scatter_reduce_(0, _take(column * num_beams + beam, hit), _take(key, hit), "amin")
+            pair, offset = take(pair, hit), take(offset, hit)
+            key = (take(t, hit).view(torch.int32).long() << 32) | take(block, pair)
+            best.scatter_reduce_(0, take(ray, pair) + offset, key, "amin")
     missed = best == _NO_HIT
     distance = (best >> 32).to(torch.int32).view(torch.float32).masked_fill(missed, torch.inf)
     return distance, (best & 0xFFFFFFFF).masked_fill(missed, -1)
@@ -114,18 +168,18 @@ def cast_solids(
 def _expand(counts: Tensor) -> Tuple[Tensor, Tensor]:
     """Row i repeated counts[i] times: the row numbers, and 0 ... counts[i] - 1 within each row."""
     row = torch.repeat_interleave(torch.arange(len(counts), device=counts.device), counts)
-    return row, torch.arange(len(row), device=counts.device) - _take(counts.cumsum(0) - counts, row)
+    return row, torch.arange(len(row), device=counts.device) - take(counts.cumsum(0) - counts, row)
 
 
-def _take(values: Tensor, index: Tensor) -> Tensor:
+def take(values: Tensor, index: Tensor) -> Tensor:
     """values[..., index]; `index_select` is several times faster than indexing on a CPU."""
     return values.index_select(-1, index)
 
 
-def _covered_block(
+def _covered_blocks(
     T_solid_sensor: Tensor, half_size: Tensor, azimuth: Tensor, elevation: Tensor, max_range: float
-) -> Tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Columns [first, first + number) and beams [first, end) outside which no ray can meet the solid's bounding box."""
+) -> Blocks:
+    """One block per solid, outside which no ray can meet its bounding box."""
     signs = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0], dtype=torch.float64, device=azimuth.device)] * 3)
     corners = signs * half_size[:, None] - T_solid_sensor[:, None, :3, 3]
     x, y, z = (corners @ T_solid_sensor[:, :3, :3]).unbind(-1)  # (P, 8) each, sensor frame
@@ -151,7 +205,8 @@ def _covered_block(
     highest = torch.atan2(top, torch.where(top > 0, nearest, farthest)) + 1e-6
     first_beam = torch.searchsorted(elevation, lowest)
     end_beam = torch.searchsorted(elevation, highest, right=True)
-    return first_column, num_columns, first_beam, torch.maximum(first_beam, end_beam)
+    solid = torch.arange(len(half_size), device=azimuth.device)
+    return Blocks(solid, first_column, num_columns, first_beam, torch.maximum(first_beam, end_beam))
 
 
 def _hit_cube(origin: Tensor, direction: Tensor) -> Tensor:
@@ -204,7 +259,21 @@ def incidence(solids: Solids, T_solid_sensor: Tensor, solid: Tensor, rays: Tenso
     inverse_half = columns[4]
     direction = columns[0] * rays[0] + columns[1] * rays[1] + columns[2] * rays[2]
     at = (direction * distance + columns[3]) * inverse_half  # on the unit solid
-    kind = solids.kind[solid]
+    return cosine_of_incidence(solids.kind[solid], at, direction, inverse_half)
+
+
+def cosine_of_incidence(kind: Tensor, at: Tensor, direction: Tensor, inverse_half: Tensor) -> Tensor:
+    """Cosine of the angle between rays and the normals of the solids that they hit.
+
+    Args:
+        kind: (N,) int64, of the solid.
+        at: (3, N) float32, where it was hit, unit coordinates of the solid.
+        direction: (3, N) float32 unit vectors, axes of the solid.
+        inverse_half: (3, N) float32, 1 / half size of the solid.
+
+    Returns:
+        (N,) float32 in [0, 1].
+    """
     magnitude = at.abs()
     face = (magnitude == magnitude.amax(0)) * at  # normal of the cube
     is_cap = magnitude[2] * magnitude[2] > at[0] * at[0] + at[1] * at[1]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Tuple
+from typing import Sequence, Tuple
 
 import numpy as np
 import torch
@@ -50,17 +50,31 @@ class Scene:
         ego: way of the recording car's rear axle.
         bodies: everything else.
         table: the solids of the bodies.
+        num_own: so many of the last bodies are the recording vehicle itself: they hide things but return no light.
     """
 
     ground: Ground
     ego: Route
     bodies: Tuple[Body, ...]
     table: SolidTable
+    num_own: int = 0
+
+    def with_own(self, own: Sequence[Body]) -> Scene:
+        """The scene with the recording vehicle in it."""
+        bodies = (*self.bodies, *own)
+        return Scene(self.ground, self.ego, bodies, SolidTable.of(bodies), len(own))
 
     def body_poses(self, seconds: np.ndarray) -> np.ndarray:
         """(T, num_bodies, 4, 4) float64 `T_world_body` at `seconds` (T,)."""
         ways = np.stack([body.way(seconds) for body in self.bodies], 1)
         return self.ground.pose(ways[..., 0], ways[..., 1], ways[..., 2])
+
+    def movers(self) -> Tuple[Scene, np.ndarray]:
+        """The scene with nothing but what moves, and (P',) int64 the number in this scene of each of its solids."""
+        bodies = np.array([not body.stands for body in self.bodies])
+        chosen = tuple(body for body, moves in zip(self.bodies, bodies) if moves)
+        scene = Scene(self.ground, self.ego, chosen, SolidTable.of(chosen))
+        return scene, np.flatnonzero(bodies[self.table.body])
 
     def solids(self, seconds: float, body_poses: np.ndarray) -> Solids:
         """All solids at one time.

@@ -32,7 +32,7 @@ def build_street(rng: np.random.Generator) -> Scene:
     return Scene(ground, ego, bodies, SolidTable.of(bodies))
 
 
-def _lane(rng: np.random.Generator, y: float, heading: float, speed: float, *xs: float) -> Iterator[Body]:
+def lane(rng: np.random.Generator, y: float, heading: float, speed: float, *xs: float) -> Iterator[Body]:
     """Cars in a lane along x, all at one speed."""
     for x in xs:
         way = Route(x + rng.uniform(-1.2, 1.2), y + rng.uniform(-0.12, 0.12), heading, speed=speed)
@@ -42,17 +42,17 @@ def _lane(rng: np.random.Generator, y: float, heading: float, speed: float, *xs:
 def _traffic(rng: np.random.Generator, crossing: float) -> Iterator[Body]:
     """Cars, a bus, an articulated truck and cyclists on the road."""
     # Eastbound: fast cars ahead and far, one behind the ego car, a bus and a car in the outer lane.
-    yield from _lane(rng, -1.6, EAST, rng.uniform(15, 20), crossing + 14, crossing + 29, crossing + 45)
-    yield from _lane(rng, -1.6, EAST, 4.5, -14)
-    yield from _lane(rng, -4.6, EAST, rng.uniform(9, 14), crossing + 35, crossing + 50)
+    yield from lane(rng, -1.6, EAST, rng.uniform(15, 20), crossing + 14, crossing + 29, crossing + 45)
+    yield from lane(rng, -1.6, EAST, 4.5, -14)
+    yield from lane(rng, -4.6, EAST, rng.uniform(9, 14), crossing + 35, crossing + 50)
     bus_speed = rng.uniform(3, 6)
     yield objects.bus(Route(-11.0, -4.6, EAST, speed=bus_speed))
-    yield from _lane(rng, -4.6, EAST, bus_speed, -26, -38)
+    yield from lane(rng, -4.6, EAST, bus_speed, -26, -38)
     # Westbound: beyond the crossing on their way out, before it waiting.
-    yield from _lane(rng, 1.6, WEST, rng.uniform(8, 13), 5, -14, -31, -52)
-    yield from _lane(rng, 4.6, WEST, rng.uniform(6, 10), -6, -24, -42)
-    yield from _lane(rng, 1.6, WEST, 0.0, crossing + 14, crossing + 21.5, crossing + 29)
-    yield from _lane(rng, 4.6, WEST, 0.0, crossing + 14, crossing + 21.5)
+    yield from lane(rng, 1.6, WEST, rng.uniform(8, 13), 5, -14, -31, -52)
+    yield from lane(rng, 4.6, WEST, rng.uniform(6, 10), -6, -24, -42)
+    yield from lane(rng, 1.6, WEST, 0.0, crossing + 14, crossing + 21.5, crossing + 29)
+    yield from lane(rng, 4.6, WEST, 0.0, crossing + 14, crossing + 21.5)
     # Out of the cross street: a car turns right (west), an articulated truck turns right (east).
     turn = {"radius": 9.0, "angle": -math.pi / 2}
     way = Route(crossing - 1.75, 4.6 + 9.0, SOUTH, start=rng.uniform(0, 4), speed=rng.uniform(4, 6), **turn)
@@ -98,11 +98,17 @@ def _parked(rng: np.random.Generator, ground: Ground) -> Iterator[Body]:
 
 def _fixed(rng: np.random.Generator, ground: Ground) -> Iterator[Body]:
     """Houses, walls, poles, trees, bushes."""
-    yield from _houses(rng, ground)
-    (main, cross), crossing = ground.half_widths, ground.crossing_x
+    yield from houses(rng, ground)
+    main, crossing = ground.half_widths[0], ground.crossing_x
     # A hoarding beside moving cars (gap 0.2-0.4 m), a garden wall that parked cars almost touch.
     yield objects.wall(-24.0, 5.95, 20.0, 0.1, 2.0, albedo=0.7)
     yield objects.wall(crossing + 36.0, -main - 0.1, 24.0, 0.15, 1.1)
+    yield from furniture(rng, ground)
+
+
+def furniture(rng: np.random.Generator, ground: Ground) -> Iterator[Body]:
+    """Lamps, signs, trees and bushes on the pavements."""
+    (main, cross), crossing = ground.half_widths, ground.crossing_x
     for side in (-1, 1):
         for along in np.arange(-REACH, REACH, 12.0).tolist():
             green = along + rng.uniform(4, 8)
@@ -121,7 +127,7 @@ def _fixed(rng: np.random.Generator, ground: Ground) -> Iterator[Body]:
             yield objects.pole(crossing + side * (cross + 2.2), corner * (main + 2.2), 3.2, 0.06, sign=0.7)
 
 
-def _houses(rng: np.random.Generator, ground: Ground) -> Iterator[Body]:
+def houses(rng: np.random.Generator, ground: Ground) -> Iterator[Body]:
     """Rows of fronts behind the pavements, with gaps and set-backs."""
     (main, cross), crossing = ground.half_widths, ground.crossing_x
     main_front, cross_front, depth = main + PAVEMENT, cross + PAVEMENT, 8.0

@@ -1,0 +1,93 @@
+"""What a sensor profile says: which beams a LiDAR has, where it sits, when it fires and how well it measures."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Optional, Tuple
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class SpinningLidar:
+    """One unit that sweeps a column of beams about its z axis, all round or over a fan.
+
+    Args:
+        name: sensor name, as a log's calibration table has it.
+        elevations: (B,) degrees above the sensor's xy plane, by laser number.
+        num_columns: firings per sweep, evenly spaced in azimuth and time.
+        position: (3,) metres in the ego frame.
+        yaw: degrees about z of the ego frame.
+        upside_down: turned by 180 degrees about its x axis before pitch and yaw.
+        pitch: degrees about y before the yaw, positive = looking down.
+        start: azimuth in the sensor frame at which a sweep begins, degrees: the outer edge of the first column.
+        span: degrees of azimuth per sweep, positive = counter-clockwise about the sensor's z axis.
+        seen: first column that fires and the one after the last; None = all. The image keeps its `num_columns`; columns
+            below 0 are those at its end, but fire before column 0.
+        has_jitter: each sweep begins up to a column early, as a free-running motor does; else on a fixed grid.
+        is_virtual: the shots are given as if the vehicle had stood still at the time stamp (Waymo's small LiDARs).
+        max_range, reach, dropout: as in `LidarProfile`, where the unit differs from it.
+    """
+
+    name: str
+    elevations: Tuple[float, ...]
+    num_columns: int
+    position: Tuple[float, float, float]
+    yaw: float = 0.0
+    upside_down: bool = False
+    pitch: float = 0.0
+    start: float = 180.0
+    span: float = -360.0
+    seen: Optional[Tuple[int, int]] = None
+    has_jitter: bool = True
+    is_virtual: bool = False
+    max_range: Optional[float] = None
+    reach: Optional[float] = None
+    dropout: Optional[float] = None
+
+    @property
+    def T_ego_sensor(self) -> np.ndarray:
+        """(4, 4) float64, sensor coordinates to ego."""
+        cos, sin = math.cos(math.radians(self.yaw)), math.sin(math.radians(self.yaw))
+        level, down = math.cos(math.radians(self.pitch)), math.sin(math.radians(self.pitch))
+        flip = -1.0 if self.upside_down else 1.0
+        ahead, left = (cos * level, sin * level, -down, 0), (-sin * flip, cos * flip, 0, 0)
+        up = (cos * down * flip, sin * down * flip, level * flip, 0)
+        return np.array([ahead, left, up, (*self.position, 1)], np.float64).T
+
+
+@dataclass(frozen=True)
+class LidarProfile:
+    """All LiDARs of a vehicle and their common quality.
+
+    Args:
+        units: the sensors; laser numbers run on from unit to unit.
+        min_range, max_range: metres; returns outside are lost.
+        range_noise: standard deviation along the ray, metres.
+        dropout: probability that a return is lost, whatever it hit.
+        reach: metres at which a white surface that faces the sensor is still seen half of the time.
+        sweep_interval_ns: time from sweep to sweep, and how long one takes.
+        is_rolling: every shot has its own time, and all moves meanwhile; else the world freezes at the time stamp.
+        reference: where in the sweep its time stamp lies: 0 = first shot, 1 = one column after the last.
+        is_deskewed: points are moved by the motion of the ego vehicle from the time of their shot to the time stamp.
+        ego_height: of the ego frame's origin above the ground, metres.
+        has_trailer: the vehicle is an articulated truck; what hits the truck itself is lost.
+        velocity_noise: standard deviation of the radial velocity, m/s.
+        extinction: share of the light that air takes per metre.
+    """
+
+    units: Tuple[SpinningLidar, ...]
+    min_range: float = 1.0
+    max_range: float = 200.0
+    range_noise: float = 0.015
+    dropout: float = 0.03
+    reach: float = 600.0
+    sweep_interval_ns: int = 100_000_000
+    is_rolling: bool = False
+    reference: float = 0.0
+    is_deskewed: bool = True
+    ego_height: float = 0.35
+    has_trailer: bool = False
+    velocity_noise: float = 0.0
+    extinction: float = 0.0
