@@ -15,10 +15,10 @@ from typing import Any, List, Sequence, Tuple
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.inputs import choose_device, read_positions
+from cflow_torch.ops.lower_surface import UNKNOWN, lower_surface
 from cflow_torch.types import Array, CFlowError, Sweep, Window
 
 METHODS = ("grid", "patchwork")
@@ -31,7 +31,6 @@ _NEAR_BITS, _NEAR_CELLS = 11, 32  # 2.048 m, |x|, |y| < 32.768 m
 _STEP, _STEP_BITS = 2, 12  # tilt is the median step of flat cells 4.096 m apart ...
 _MAX_STEP = 1024  # ... of at most 25 %
 
-_NOTHING = 1 << 29  # height of an empty cell; sums with it still fit an int32
 _HIGHEST = 1 << 28  # heights are cut off there, mm
 _FARTHEST_HEIGHT = 1e7  # metres; still fits the sort key
 _TRIM = 10  # the lowest tenth of the points of a cell does not count: multipath
@@ -40,10 +39,6 @@ _LAYER = 300  # flat cells of the ground differ by at most that (kerbs), mm
 # There is ground if there are so many pairs of flat cells that are level enough, and a sixth as many as near cells.
 # Simulated drives (seeds 400-409) have at least three times as many; with their ground removed at most a tenth.
 _FEWEST_PAIRS, _SMALLEST_SHARE = 20, 6
-_SUPPORT = 300  # neighbours at about the same height, mm; low points without such neighbours are multipath
-_STEEP, _GENTLE = 164, 51  # mm per cell: 16 % for hills, 5 % about the smoothed hills
-_ROUGH = 70  # mm above the surface at which a cell is still part of it
-_SMOOTH = 10  # cells on each side that the hills are smoothed over
 _PATCHWORK_HEIGHT = 1.723  # metres, sensor height that Patchwork++'s other settings are made for
 
 
@@ -210,72 +205,10 @@ def ground_points(positions: Tensor, sweep: Tensor, num_sweeps: int, threshold: 
     cell = (sweep * _CELLS).add_(row).mul_(_CELLS).add_(col)
     num_cells = num_sweeps * _CELLS * _CELLS
     low, _, count = _order_statistics(cell.masked_fill(~inside, num_cells), above, num_cells)
-    low = low.masked_fill_(count == 0, _NOTHING).int().view(num_sweeps, _CELLS, _CELLS)
+    low = low.masked_fill_(count == 0, UNKNOWN).int().view(num_sweeps, _CELLS, _CELLS)
 
-    surface = _surface(low).flatten().index_select(0, cell)
+    surface = lower_surface(low).flatten().index_select(0, cell)
     return (above <= surface + threshold).logical_and_(inside).logical_and_(plane.is_there.index_select(0, sweep))
-
-
-def _surface(low: Tensor) -> Tensor:
-    """(B, H, W) int32 height of the ground in mm from the lowest heights; only relative to each other they matter."""
-    is_supported = _is_supported(low)
-    hills = _box_mean(_gentlest(low.masked_fill(~is_supported, _NOTHING), _STEEP))
-    rest = low - hills
-    # A point without neighbours, as far rings have many, is believed unless it is a hole in the hills.
-    believed = (is_supported | (rest >= -_SUPPORT)).logical_and_(low < _NOTHING)
-    return _gentlest(rest.masked_fill_(~believed, _NOTHING), _GENTLE).add_(hills)
-
-
-def _is_supported(low: Tensor) -> Tensor:
-    """(B, H, W) bool: three of the eight neighbours, or half of the occupied ones, are at about the same height."""
-    height, width = low.shape[1:]
-    padded = F.pad(low, (1, 1, 1, 1), value=_NOTHING)
-    similar, occupied = torch.zeros_like(low, dtype=torch.uint8), torch.zeros_like(low, dtype=torch.uint8)
-    for down in range(3):
-        for right in range(3):
-            if (down, right) != (1, 1):
-                neighbour = padded[:, down : down + height, right : right + width]
-                similar += (neighbour - low).abs_() <= _SUPPORT
-                occupied += neighbour < _NOTHING
-    return (similar * 2 >= occupied.clamp(max=6)) & (occupied > 0) & (low < _NOTHING)
-
-
-def _gentlest(heights: Tensor, slope: int) -> Tensor:
-    """The surface of limited slope through the heights that no other height forbids, also where there is none.
-
-    Args:
-        heights: (B, H, W) int32, mm; `_NOTHING` = unknown.
-        slope: mm per cell, along rows and along columns.
-
-    Convention: between known cells the middle of the highest and the lowest possible surface.
-    """
-    is_ground = (heights - _cone(heights, slope) <= _ROUGH).logical_and_(heights < _NOTHING)
-    both = torch.cat([heights, -heights]).masked_fill_(~is_ground.repeat(2, 1, 1), _NOTHING)
-    highest, lowest = _cone(both, slope).split(len(heights))
-    return (highest - lowest) >> 1
-
-
-def _cone(heights: Tensor, slope: int) -> Tensor:
-    """(B, H, W) the highest surface of limited slope on or below all heights: min over q of h(q) + slope |p - q|."""
-    for _ in range(2):  # along rows, then, transposed, along columns
-        ramp = torch.arange(heights.shape[2], dtype=torch.int32, device=heights.device) * slope
-        upwards = (heights - ramp).cummin(2).values.add_(ramp)
-        downwards = (heights + ramp).flip(2).cummin(2).values.flip(2).sub_(ramp)
-        heights = torch.minimum(upwards, downwards).transpose(1, 2).contiguous()
-    return heights
-
-
-def _box_mean(heights: Tensor) -> Tensor:
-    """(B, H, W) int32 mean over the square around each cell, as far as it lies inside."""
-    span, height, width = _SMOOTH, heights.shape[1], heights.shape[2]
-    table = F.pad(heights.cumsum(1, dtype=torch.int64).cumsum(2), (1, 0, 1, 0))
-    place = torch.arange(max(height, width), device=heights.device)
-    top, bottom = (place[:height] - span).clamp_(min=0), (place[:height] + span + 1).clamp_(max=height)
-    left, right = (place[:width] - span).clamp_(min=0), (place[:width] + span + 1).clamp_(max=width)
-    rows = table.index_select(1, bottom) - table.index_select(1, top)
-    total = rows.index_select(2, right) - rows.index_select(2, left)
-    area = (bottom - top)[:, None] * (right - left)
-    return torch.div(total, area, rounding_mode="floor").int()
 
 
 def _order_statistics(cell: Tensor, height: Tensor, num_cells: int) -> Tuple[Tensor, Tensor, Tensor]:
@@ -307,7 +240,7 @@ def _median_step(here: Tensor, there: Tensor, is_pair: Tensor) -> Tuple[Tensor, 
     """(B,) int64: median of there - here over the pairs that are no steeper than allowed; number of such pairs."""
     step = there - here
     counts = is_pair & (step.abs() <= _MAX_STEP)
-    ordered = step.masked_fill(~counts, _NOTHING).flatten(1).sort(1).values
+    ordered = step.masked_fill(~counts, UNKNOWN).flatten(1).sort(1).values
     number = counts.flatten(1).sum(1)
     median = ordered.gather(1, (number // 2)[:, None].clamp_(max=ordered.shape[1] - 1))[:, 0]
     return torch.where(number > 0, median, 0), number

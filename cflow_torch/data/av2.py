@@ -10,6 +10,7 @@ import pyarrow as pa
 import pyarrow.feather as feather
 
 from cflow_torch.data.boxes import Boxes, flow_from_boxes
+from cflow_torch.data.folders import find_folders
 from cflow_torch.data.ground import GroundRaster, get_rule, read_ground_raster
 from cflow_torch.data.log import FlowLabels
 from cflow_torch.evaluation.categories import CATEGORIES, CATEGORY_INDEX
@@ -36,15 +37,7 @@ def find_av2_logs(root: Union[str, Path]) -> List[Path]:
     Raises:
         CFlowError: `root` is no folder.
     """
-    root = Path(root)
-    if not root.is_dir():
-        raise CFlowError(f"{root} is no folder; give a log, or a folder of logs")
-    found: List[Path] = []
-    level = [root]
-    for _ in range(SEARCH_DEPTH + 1):
-        found += [folder for folder in level if _is_log(folder)]
-        level = [child for folder in level if not _is_log(folder) for child in folder.iterdir() if child.is_dir()]
-    return sorted(found)
+    return find_folders(Path(root), _is_log, SEARCH_DEPTH, "a log, or a folder of logs")
 
 
 class AV2Log:

@@ -11,6 +11,7 @@ import numpy as np
 
 from cflow_torch.data.aevascenes.npz_strings import read_npz_member
 from cflow_torch.data.boxes import Boxes, flow_from_boxes
+from cflow_torch.data.folders import find_folders
 from cflow_torch.data.log import FlowLabels
 from cflow_torch.ego import relative_transform
 from cflow_torch.evaluation.categories import CATEGORY_INDEX
@@ -54,21 +55,8 @@ def find_aevascenes_sequences(root: Union[str, Path]) -> List[Path]:
     Raises:
         CFlowError: `root` is no folder.
     """
-    root = Path(root)
-    if not root.is_dir():
-        raise CFlowError(f"{root} is no folder; give a sequence (it holds sequence.json), or a folder of sequences")
-    found: List[Path] = []
-    level = [root]
-    for _ in range(SEARCH_DEPTH + 1):
-        found += [folder for folder in level if (folder / "sequence.json").is_file()]
-        level = [
-            child
-            for folder in level
-            if not (folder / "sequence.json").is_file()
-            for child in folder.iterdir()
-            if child.is_dir() and not child.name.startswith(".")
-        ]
-    return sorted(found)
+    what = "a sequence (it holds sequence.json), or a folder of sequences"
+    return find_folders(Path(root), lambda folder: (folder / "sequence.json").is_file(), SEARCH_DEPTH, what)
 
 
 class AevaScenesLog:

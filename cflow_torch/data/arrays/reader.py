@@ -10,6 +10,7 @@ import numpy as np
 
 from cflow_torch.data.arrays.cloud_file import KITTI_COLUMNS, SUFFIXES, read_cloud
 from cflow_torch.data.arrays.poses_text import Trajectory, poses_at, read_poses, read_times
+from cflow_torch.data.folders import find_folders
 from cflow_torch.data.log import FlowLabels
 from cflow_torch.ego import rigid_transform
 from cflow_torch.types import CFlowError, Sweep
@@ -36,22 +37,14 @@ def find_array_logs(root: Union[str, Path]) -> List[Path]:
     Raises:
         CFlowError: `root` is no folder.
     """
-    root = Path(root)
-    if not root.is_dir():
-        raise CFlowError(f"{root} is no folder; give a folder with one point cloud per file, or a folder of such")
-    found: List[Path] = []
-    level = [root]
-    for _ in range(SEARCH_DEPTH + 1):
-        logs = {folder for folder in level if _clouds(folder)[1]}
-        found += logs
-        level = [
-            child
-            for folder in level
-            if folder not in logs
-            for child in folder.iterdir()
-            if child.is_dir() and child.name != GROUND_FOLDER
-        ]
-    return sorted(found)
+    what = "a folder with one point cloud per file, or a folder of such"
+    return find_folders(
+        Path(root),
+        lambda folder: bool(_clouds(folder)[1]),
+        SEARCH_DEPTH,
+        what,
+        lambda child: child.name != GROUND_FOLDER,
+    )
 
 
 class ArraysLog:

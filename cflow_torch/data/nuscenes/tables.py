@@ -9,6 +9,7 @@ from typing import Collection, Dict, List, Mapping, Optional, Sequence, Tuple, U
 
 import numpy as np
 
+from cflow_torch.data.folders import find_folders
 from cflow_torch.data.nuscenes.json_tables import Row, read_table
 from cflow_torch.types import CFlowError
 
@@ -97,19 +98,11 @@ def find_scenes(root: Union[str, Path], foreign: Collection[str], data_set: str)
     Raises:
         CFlowError: `root` is no folder, a scene.json cannot be read, or all that is there is of the other data set.
     """
-    root = Path(root)
-    if not root.is_dir():
-        raise CFlowError(f"{root} is no folder; give the data root, which holds v1.0-mini or the like")
-    versions, level = [], [root]
-    for _ in range(SEARCH_DEPTH + 1):
-        versions += [folder for folder in level if (folder / "scene.json").is_file()]
-        level = [
-            child
-            for folder in level
-            if folder not in versions
-            for child in folder.iterdir()
-            if child.name not in _SENSOR_FOLDERS and child.is_dir()
-        ]
+    what = "the data root, which holds v1.0-mini or the like"
+    versions = find_folders(
+        *(Path(root), lambda folder: (folder / "scene.json").is_file(), SEARCH_DEPTH, what),
+        lambda child: child.name not in _SENSOR_FOLDERS,
+    )
     alien = [v for v in versions if any((v / f"{table}.json").exists() for table in foreign)]
     if alien and len(alien) == len(versions):
         raise CFlowError(f"{alien[0]} is not {data_set}: it has one of {sorted(foreign)}; choose the other reader")

@@ -102,7 +102,7 @@ def encode_images(
     if len(np.unique(pixel)) < len(pixel):
         raise CFlowError(f"{where}: {len(pixel) - len(np.unique(pixel))} returns share a pixel with another")
     image = np.full((height, width, 4), -1.0, np.float32)
-    images = {"second": image.copy()}
+    images: Dict[str, np.ndarray] = {"second": image.copy()}
     image[row, column] = (0.0, 0.0, 0.0, -1.0)
     image[row, column, RANGE], image[row, column, INTENSITY] = distance, unit.intensity
     images["first"] = image
