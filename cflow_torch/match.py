@@ -92,7 +92,8 @@ def match(pc0: KeyPoints, pc1: KeyPoints, reach: Tensor, config: Config) -> Matc
     dy = pc1.row.index_select(0, target) - pc0.row.index_select(0, source)
     dx = pc1.col.index_select(0, target) - pc0.col.index_select(0, source)
     energies = pc0.energy.index_select(0, source) * pc1.energy.index_select(0, target)
-    score = square.double().sqrt() / exact_sqrt(energies.double())  # the root of a square is exact
+    count = square.double().sqrt().round()  # a whole number, whatever the last bit of the root
+    score = count / exact_sqrt(energies.double())
     return Matches(source, torch.stack((dy, dx), 1), score)
 
 

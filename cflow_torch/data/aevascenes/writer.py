@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import shutil
-import tempfile
 import uuid
 from pathlib import Path
 from typing import Any, Dict, List, Sequence, Union
@@ -14,6 +12,7 @@ from typing import Any, Dict, List, Sequence, Union
 import numpy as np
 
 from cflow_torch.data.aevascenes.reader import CATEGORY_NAME, GROUND
+from cflow_torch.data.atomic import atomic_folder
 from cflow_torch.data.boxes import points_in_box
 from cflow_torch.data.recording import Recording, UnitReturns
 from cflow_torch.data.writers import Boxes, quaternions
@@ -74,22 +73,9 @@ def write_aevascenes_sequence(
     folder = Path(root) / log.log_id
     if folder.exists() and not overwrite:
         raise CFlowError(f"{folder} exists; give overwrite=True to replace the sequence")
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    scratch = Path(tempfile.mkdtemp(prefix=f".{log.log_id}-", dir=folder.parent))
-    try:
-        (scratch / "new" / _FOLDER).mkdir(parents=True)
-        _write_sequence(log, scratch / "new", _PATH_KEY[layout])
-        replaces = folder.exists()
-        if replaces:
-            os.replace(folder, scratch / "old")
-        try:
-            os.replace(scratch / "new", folder)
-        except BaseException:
-            if replaces:
-                os.replace(scratch / "old", folder)
-            raise
-    finally:
-        shutil.rmtree(scratch, ignore_errors=True)
+    with atomic_folder(folder) as new:
+        (new / _FOLDER).mkdir()
+        _write_sequence(log, new, _PATH_KEY[layout])
     return folder
 
 

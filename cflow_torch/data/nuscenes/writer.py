@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import shutil
 import struct
-import tempfile
 import zlib
 from contextlib import contextmanager
 from datetime import datetime, timezone
@@ -16,7 +13,7 @@ from typing import Any, Dict, Iterator, List, Mapping, Sequence, Union
 
 import numpy as np
 
-from cflow_torch.data.atomic import atomic_file
+from cflow_torch.data.atomic import atomic_file, atomic_folder
 from cflow_torch.data.nuscenes.categories import NUSCENES_NAMES
 from cflow_torch.data.recording import Recording, UnitReturns
 from cflow_torch.data.writers import quaternions
@@ -261,21 +258,8 @@ def new_folder(root: Union[str, Path], name: str, overwrite: bool) -> Iterator[P
     folder = Path(root) / name
     if folder.exists() and not overwrite:
         raise CFlowError(f"{folder} exists already; pass overwrite=True to replace it, or choose another root")
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    scratch = Path(tempfile.mkdtemp(prefix=f".{name}-", dir=folder.parent))
-    try:
-        (scratch / "new").mkdir()
-        yield scratch / "new"
-        if folder.exists():
-            os.replace(folder, scratch / "old")
-        try:
-            os.replace(scratch / "new", folder)
-        except OSError:
-            if (scratch / "old").exists():
-                os.replace(scratch / "old", folder)
-            raise
-    finally:
-        shutil.rmtree(scratch, ignore_errors=True)
+    with atomic_folder(folder) as new:
+        yield new
 
 
 def write_tables(folder: Path, tables: Mapping[str, Table]) -> None:
