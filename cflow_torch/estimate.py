@@ -29,7 +29,7 @@ def estimate_flow(
     pch: Sequence[Array] = (),  # (Nh, 3+) each, nearest first
     T_ego1_egoh: Sequence[Optional[Array]] = (),
     gmh: Sequence[Optional[Array]] = (),
-    method: str = "dense",
+    method: Optional[str] = None,
     preset: str = "default",
     ground: Optional[str] = None,
     device: Any = "auto",
@@ -46,7 +46,7 @@ def estimate_flow(
         pch: older sweeps t-1, t-2, ..., at most `num_history`.
         T_ego1_egoh: (4, 4) of each of `pch`; may be left out only if `T_ego1_ego0` is left out too.
         gmh: ground mask of each of `pch`; empty = nothing is ground.
-        method: "dense" or "keypoints".
+        method: "dense" or "keypoints"; None = the preset's, dense but for "keypoints".
         preset: "default", "fast", "keypoints" or "paper", see `make_config`.
         ground: None = as the masks say; "auto" = find the ground of every sweep without a mask (`find_ground`);
             "patchwork" = the same by Patchwork++ (`pip install pypatchworkpp`).
@@ -76,7 +76,9 @@ def estimate_flow(
     """
     if ground not in GROUND:
         raise CFlowError(f"ground={ground!r}: give one of {', '.join(map(repr, GROUND))}")
-    config = make_config(preset, method=method, **overrides)
+    if method is not None:
+        overrides["method"] = method
+    config = make_config(preset, **overrides)
     transforms = _per_sweep("T_ego1_egoh", T_ego1_egoh, pch)
     masks = _per_sweep("gmh", gmh, pch)
     moved = T_ego1_ego0 is not None or any(t is not None for t in transforms)

@@ -336,3 +336,12 @@ def test_presets():
     assert make_config("keypoints").num_history == 0 and len(make_config("keypoints").pixel_sizes) == 1
     assert make_config("paper", method="keypoints") == make_config("paper").replace(method="keypoints")
     assert make_config("default", method="keypoints", pixel_sizes=(0.2, 0.1)).pixel_sizes == (0.2, 0.1)
+
+
+def test_the_preset_chooses_the_method():
+    rng = np.random.default_rng(5)
+    pc0 = np.concatenate((box(rng, 2.0, 1.0, 1.0, 500), box(rng, 2.0, 1.0, 1.0, 500) + [8.0, 0, 0]))
+    pc1 = pc0[:500] + [0.5, 0, 0]  # the second box is gone: the dense method has no cluster of it
+    named, asked = estimate_flow(pc0, pc1, preset="keypoints"), estimate_flow(pc0, pc1, method="keypoints")
+    assert_same(named, asked)
+    assert (named.cluster_id[500:] == 1).all() and (estimate_flow(pc0, pc1).cluster_id[500:] == -1).all()
