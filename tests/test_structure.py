@@ -47,6 +47,7 @@ LAYERS = {
     "submission": 4,
     "viz": 4,
     "bench": 4,
+    "integrations": 5,
     "cli": 5,
 }
 HEAVY = ("kornia", "matplotlib", "cv2", "scipy", "hydra", "omegaconf", "pyarrow", "h5py", "pandas")

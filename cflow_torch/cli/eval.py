@@ -43,9 +43,10 @@ def task(cfg: DictConfig) -> float:
     def score(log: Log, index: int, sweeps: Window, result: FlowResult) -> None:
         labels = log.labels(index)
         if labels is not None:
-            find_mask = getattr(log, "eval_mask", None)
-            eval_mask = None if find_mask is None else find_mask(index)
-            metrics.update(EvalFrame.from_result(sweeps, result, labels, eval_mask=eval_mask))
+            parts = {"eval_mask": _of(log, "eval_mask", index)}
+            if metrics.definition.ego_motion == "stored":
+                parts["stored_motion"] = _of(log, "stored_motion", index)
+            metrics.update(EvalFrame.from_result(sweeps, result, labels, **parts))
             identity.add(sweeps, labels)
 
     failures += for_each_pair(logs, model, score, cfg.data.first, cfg.data.step)
@@ -54,6 +55,12 @@ def task(cfg: DictConfig) -> float:
     results = report(cfg, metrics, output, data=identity.report(), seconds=model.report(), failures=failures)
     _finish(failures)
     return objective(results)
+
+
+def _of(log: Log, name: str, index: int) -> Any:
+    """What a log knows about a pair beyond the protocol; None where it does not."""
+    find = getattr(log, name, None)
+    return None if find is None else find(index)
 
 
 def report(cfg: DictConfig, metrics: SceneFlowMetrics, output: Path, **about: Any) -> Dict[str, Any]:

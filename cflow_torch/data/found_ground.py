@@ -44,3 +44,8 @@ class GroundFoundLog:
         """The log's evaluation mask, None where it has none."""
         mask = getattr(self.log, "eval_mask", None)
         return None if mask is None else mask(index)
+
+    def stored_motion(self, index: int) -> Optional[np.ndarray]:
+        """As `HDF5Log.stored_motion`, None where the log does not have it."""
+        find = getattr(self.log, "stored_motion", None)
+        return None if find is None else find(index)

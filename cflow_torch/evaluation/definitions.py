@@ -13,6 +13,7 @@ from cflow_torch.types import CFlowError
 METRICS = ("bucketed", "bucketed_by_range", "three_way", "range_wise")
 
 _CHOICES: Dict[str, Tuple[Any, ...]] = {
+    "ego_motion": ("points", "stored"),
     "region": ("box", "disc", "all"),
     "region_axes": ("t", "t+1"),
     "residual_axes": ("t", "t+1"),
@@ -36,6 +37,8 @@ class Definition:
     Args:
         name: label that goes with every number.
         metrics: which of `METRICS` are computed.
+        ego_motion: whose motion is taken out of the flow: "points": that of the frame of the points; "stored": by the
+            poses as the data has them, also where those are of another frame (OpenSceneFlow's Argoverse 2 scenes).
         region: points scored by "bucketed" and "three_way": "box" max(|x|, |y|), "disc" sqrt(x^2 + y^2), "all". Box
             or disc is also how "bucketed_by_range" measures.
         max_range: metres, outer bound of the region.
@@ -70,6 +73,7 @@ class Definition:
 
     name: str
     metrics: Tuple[str, ...] = ("bucketed", "three_way", "range_wise")
+    ego_motion: str = "points"
     region: str = "disc"
     max_range: float = 35.0
     min_range: float = 0.0
@@ -117,7 +121,7 @@ class Definition:
 
 DEFINITIONS: Dict[str, Definition] = {
     # KTH-RPL/OpenSceneFlow: eval.py and its functions evaluate_leaderboard, _v2, evaluate_ssf.
-    "opensceneflow": Definition(name="opensceneflow", average="frames"),
+    "opensceneflow": Definition(name="opensceneflow", average="frames", ego_motion="stored"),
     # kylevedder/BucketedSceneFlowEval with_ground=False, evaluators bucketed_epe and threeway_epe. Its ground is the
     # map raster rule "bsfe" (0.4 m), which the reader applies: see cflow_torch.data.ground.
     "bucketed_scene_flow_eval": Definition(
@@ -145,8 +149,10 @@ DEFINITIONS: Dict[str, Definition] = {
     ),
     # The two ranges of the 2026 multi-data-set challenge, scored in one pass with the rules of opensceneflow. The
     # challenge's own code is not public: whether it measures a disc or a box is unknown, so there is one of each.
-    "challenge_2026": Definition(name="challenge_2026", metrics=METRICS, average="frames"),
-    "challenge_2026_box": Definition(name="challenge_2026_box", metrics=METRICS, average="frames", region="box"),
+    "challenge_2026": Definition(name="challenge_2026", metrics=METRICS, average="frames", ego_motion="stored"),
+    "challenge_2026_box": Definition(
+        name="challenge_2026_box", metrics=METRICS, average="frames", ego_motion="stored", region="box"
+    ),
 }
 
 

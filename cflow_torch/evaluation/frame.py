@@ -94,19 +94,33 @@ class EvalFrame:
             self._set("pose_flow", ego_motion_flow(self.points, self.T_ego1_ego0))  # type: ignore[arg-type]
 
     @classmethod
-    def from_result(cls, window: Window, result: FlowResult, labels: FlowLabels, **parts: Any) -> EvalFrame:
+    def from_result(
+        cls,
+        window: Window,
+        result: FlowResult,
+        labels: FlowLabels,
+        stored_motion: Optional[np.ndarray] = None,
+        **parts: Any,
+    ) -> EvalFrame:
         """Frame of a window and the flow that was estimated for it.
 
         Args:
             window: needs the poses of pc0 and pc1, or neither.
             result: flow of `window.pc0`.
             labels: truth of the pair.
+            stored_motion: (4, 4) T_ego1_ego0 by poses of another frame than that of the points, which the evaluation is
+                to take out of truth and prediction all the same (`HDF5Log.stored_motion`); None = that of the window.
             **parts: further fields, for example `eval_mask`; they win over what the window gives.
         """
         pose0, pose1 = window.pc0.pose, window.pc1.pose
         if pose0 is not None and pose1 is not None:
             parts.setdefault("T_ego1_ego0", np.linalg.inv(as_numpy(pose1, np.float64)) @ as_numpy(pose0, np.float64))
         parts.setdefault("is_ground", window.pc0.is_ground)
+        if stored_motion is not None:
+            pose_flow = ego_motion_flow(as_numpy(window.pc0.points)[:, :3], stored_motion)
+            parts.update(
+                T_ego1_ego0=stored_motion, pose_flow=pose_flow, residual_flow=as_numpy(result.flow) - pose_flow
+            )
         parts.setdefault("pose_flow", result.pose_flow)
         parts.setdefault("residual_flow", result.residual_flow)
         return cls(points=window.pc0.points, labels=labels, **parts)

@@ -8,21 +8,14 @@ from typing import Any, List, Optional, Sequence, Tuple, Type, Union
 
 import numpy as np
 
+from cflow_torch.data.hdf5.extrinsics import is_argoverse2, recognized_extrinsics
 from cflow_torch.data.hdf5.index_file import read_index
 from cflow_torch.data.log import FlowLabels
-from cflow_torch.ego import rigid_transform
+from cflow_torch.ego import relative_transform, rigid_transform
 from cflow_torch.types import CFlowError, Sweep
 
 # Time stamps count from 1970 or 1980: below this they are microseconds (16 digits), above it nanoseconds (18 or 19).
 _FIRST_NANOSECOND = 10**17
-# Argoverse 2 counts nanoseconds from a moment of its own: all sweeps of the data set lie in here, no other set's do.
-_ARGOVERSE2_STAMPS = (315_900_000_000_000_000, 316_000_000_000_000_000)
-# Its up_lidar sits 2 m above the road, its ego frame 0.35 m: ground lower than this is seen from the sensor.
-_ARGOVERSE2_SENSOR_GROUND = -1.2
-# Extrinsics of up_lidar in one log of the set (7fab2350), yaw -0.58 degrees. Each log has its own, the scenes none.
-_ARGOVERSE2_EGO_T_UP_LIDAR = np.array(
-    [[0.9999483, 0.0101698, 0, 1.35018], [-0.0101698, 0.9999483, 0, 0], [0, 0, 1, 1.64042], [0, 0, 0, 1]]
-)
 EXTRINSIC = "ego_T_lidar"  # attribute of a scene that `write_hdf5_scene` leaves
 
 
@@ -58,11 +51,8 @@ class HDF5Log:
         - Points, labels and results stay in the frame of the file, that of the LiDAR. A sweep's `pose` is the LiDAR's:
           the stored pose times `ego_T_lidar`. So the static world stays put also where the file has points in the
           sensor frame and poses of the ego vehicle.
-        - "auto": the file's attribute `ego_T_lidar` if it has one (our writer's do). Otherwise a scene with time stamps
-          of Argoverse 2 whose ground lies lower than 1.2 m below the origin has points in the frame of up_lidar, and
-          the extrinsics of one log of that set are used; those of the scene's own log are not in the file, pass them
-          from its `calibration/egovehicle_SE3_sensor.feather`. All other sets: the same frame (nuScenes and ZOD have
-          poses of the sensor, Waymo and TruckScenes points in the ego frame).
+        - "auto": the file's attribute `ego_T_lidar` if it has one (our writer's do), otherwise what the first sweep
+          looks like, see `recognized_extrinsics`.
         - Index files beside a scene are pickles; only `eval_frames` reads one, and runs nothing in it.
 
     Raises:
@@ -141,6 +131,18 @@ class HDF5Log:
         timestamp = self._timestamp(index)
         return self._column(timestamp, "eval_mask", np.bool_, len(self._scene[str(timestamp)]["lidar"]))
 
+    def stored_motion(self, index: int) -> Optional[np.ndarray]:
+        """T_ego1_ego0 (4, 4) float64 of the pair (index, index + 1) by the poses as they are in the file, which is what
+        the harness takes out of the flow; None where `ego_T_lidar` is the identity: that of the points is the same.
+
+        Raises:
+            CFlowError: no such pair, or a pose that cannot be read or is no rigid motion.
+        """
+        if np.array_equal(self.ego_T_lidar, np.eye(4)):
+            return None
+        pose0, pose1 = (self._read(self._timestamp(k), "pose") for k in (index, index + 1))
+        return relative_transform(pose1, pose0, f"pose of sweep {index} in {self.file}")
+
     def keys(self, index: int) -> Tuple[str, ...]:
         """Names of everything that sweep `index` has, results included."""
         return tuple(sorted(self._scene[str(self._timestamp(index))]))
@@ -202,17 +204,11 @@ class HDF5Log:
         """What the scene says about where its LiDAR sits."""
         if EXTRINSIC in self._scene.attrs:
             return np.asarray(self._scene.attrs[EXTRINSIC])
-        low, high = _ARGOVERSE2_STAMPS
-        if not low <= self.timestamps[0] < high:
+        first = self.timestamps[0]
+        if not is_argoverse2(first) or "lidar" not in self._scene[str(first)]:
             return np.eye(4)
-        group = self._scene[str(self.timestamps[0])]
-        if "lidar" not in group or "ground_mask" not in group:
-            return np.eye(4)
-        points = self._read(self.timestamps[0], "lidar")
-        is_ground = self._column(self.timestamps[0], "ground_mask", np.bool_, len(points))
-        if is_ground is None or not is_ground.any() or np.median(points[is_ground, 2]) > _ARGOVERSE2_SENSOR_GROUND:
-            return np.eye(4)
-        return _ARGOVERSE2_EGO_T_UP_LIDAR
+        points = self._read(first, "lidar")
+        return recognized_extrinsics(first, points, self._column(first, "ground_mask", np.bool_, len(points)))
 
     def _timestamp(self, index: int) -> int:
         if not 0 <= index < len(self.timestamps):

@@ -1,0 +1,1 @@
+"""CorrelationFlow inside other code bases: OpenSceneFlow, BucketedSceneFlowEval, SceneFlowZoo."""

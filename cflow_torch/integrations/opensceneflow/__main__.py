@@ -1,0 +1,27 @@
+"""python -m cflow_torch.integrations.opensceneflow FILE: write the checkpoint without weights."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from cflow_torch.integrations.opensceneflow.checkpoint import write_null_checkpoint
+from cflow_torch.types import CFlowError
+
+
+def main() -> int:
+    """Exit status: 0, or 1 with one line on stderr."""
+    parser = argparse.ArgumentParser(prog="python -m cflow_torch.integrations.opensceneflow", description=__doc__)
+    parser.add_argument("file", metavar="FILE", help="for example cflow.ckpt; its stem is the default name of results")
+    parser.add_argument("--overwrite", action="store_true", help="replace a file that is there")
+    arguments = parser.parse_args()
+    try:
+        print(f"wrote {write_null_checkpoint(arguments.file, overwrite=arguments.overwrite)}")
+    except CFlowError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,145 @@
+"""The harness's batches -> windows: every layout that its scripts produce, checked key by key."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, List, Mapping, Optional, Tuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from cflow_torch.data.hdf5.extrinsics import recognized_extrinsics
+from cflow_torch.ego import relative_transform, rigid_transform
+from cflow_torch.types import CFlowError, Sweep, Window
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One pair of sweeps of a batch, with its history.
+
+    Args:
+        window: points that are finite and not ground; poses are those of the frame of the points.
+        rows0: (K,) int64, rows of batch["pc0"] that are in `window.pc0`.
+        rows1: (K1,) int64, the same for pc1.
+        T_ego1_ego0: (4, 4) float64, from the poses as they are in the batch: what the harness adds itself.
+        T_lidar1_lidar0: (4, 4) float64, motion of the frame of the points; None = the same, `ego_T_lidar` is not used.
+    """
+
+    window: Window
+    rows0: Tensor
+    rows1: Tensor
+    T_ego1_ego0: np.ndarray
+    T_lidar1_lidar0: Optional[np.ndarray]
+
+
+def read_batch(batch: Mapping[str, Any], num_history: int, ego_T_lidar: Any = None) -> List[Sample]:
+    """Samples of a batch; the batch is not modified.
+
+    Args:
+        batch: as the harness collates it. For each sweep i of 0 and 1: "pc{i}" (B, N, 3) or a list of B (N, 3),
+            "pose{i}" (B, 4, 4) or a list of B (4, 4), optionally "gm{i}" (B, N), True = ground. For history, nearest
+            first: "pch1", "poseh1", "gmh1", "pch2", ... Of other keys, "auto" looks at "timestamp" and "origin_pc0".
+        num_history: most history sweeps to take; fewer in the batch are fine.
+        ego_T_lidar: (4, 4), None = identity, "auto" = `recognized_extrinsics` of the sweep.
+
+    Convention:
+        A ground mask of the length of its points is applied; one whose rows that are not ground are as many as the
+        points was applied before (the harness does so for pc0 and pc1, and for some or all of the history). Rows with
+        NaN are padding, or no return, and left out. "flow" and other truth is never read.
+
+    Raises:
+        CFlowError: a key is missing, or its value has a wrong shape, or a pose is no finite rigid motion; the message
+            names the key.
+    """
+    history = [f"h{i}" for i in range(1, num_history + 1)]
+    present = [name for name in history if f"pc{name}" in batch]
+    return [_sample(batch, b, present, ego_T_lidar) for b in range(len(_value(batch, "pose0")))]
+
+
+def _sample(batch: Mapping[str, Any], b: int, history: List[str], ego_T_lidar: Any) -> Sample:
+    extrinsics = _extrinsics(batch, b, ego_T_lidar)
+    clouds, poses, rows = [], [], []
+    for name in ("0", "1", *history):
+        points, kept = _points(batch, b, name)
+        clouds.append(points)
+        rows.append(kept)
+        poses.append(rigid_transform(_entry(batch, f"pose{name}", b), f"batch['pose{name}'][{b}]"))
+    lidar_poses = poses if extrinsics is None else [pose @ extrinsics for pose in poses]
+    T_ego1_ego0 = relative_transform(poses[1], poses[0])
+    sweeps = [Sweep(points, None, pose) for points, pose in zip(clouds, lidar_poses)]
+    return Sample(
+        window=Window(sweeps[0], sweeps[1], tuple(sweeps[2:])),
+        rows0=rows[0],
+        rows1=rows[1],
+        T_ego1_ego0=T_ego1_ego0,
+        T_lidar1_lidar0=None if extrinsics is None else relative_transform(lidar_poses[1], lidar_poses[0]),
+    )
+
+
+def _points(batch: Mapping[str, Any], b: int, name: str) -> Tuple[Tensor, Tensor]:
+    """Points of one sweep that are finite and not ground, and their rows."""
+    key = f"pc{name}"
+    points = _entry(batch, key, b)
+    if not isinstance(points, Tensor) or points.ndim != 2 or points.shape[1] < 3 or not points.is_floating_point():
+        raise CFlowError(f"batch['{key}'][{b}] is {_described(points)}: give a floating-point tensor of shape (N, 3)")
+    wanted = points[:, :3].isfinite().all(dim=1)
+    mask_key = f"gm{name}"
+    if mask_key in batch:
+        is_ground = _mask(batch, mask_key, b)
+        if is_ground.numel() == points.shape[0]:
+            wanted = wanted & ~is_ground.to(points.device)
+        elif int((~is_ground).sum()) != points.shape[0]:
+            raise CFlowError(
+                f"batch['{mask_key}'][{b}] has {is_ground.numel()} rows, {int((~is_ground).sum())} of them not ground, "
+                f"but batch['{key}'][{b}] has {points.shape[0]} points: give the mask of this sweep"
+            )
+    rows = wanted.nonzero()[:, 0]
+    return points[:, :3].index_select(0, rows), rows
+
+
+def _mask(batch: Mapping[str, Any], key: str, b: int) -> Tensor:
+    mask = _entry(batch, key, b)
+    if not isinstance(mask, Tensor) or mask.dtype != torch.bool or mask.ndim > 2 or mask.numel() != mask.shape[0]:
+        raise CFlowError(f"batch['{key}'][{b}] is {_described(mask)}: give a bool tensor of shape (N,), True = ground")
+    return mask.reshape(-1)
+
+
+def _extrinsics(batch: Mapping[str, Any], b: int, ego_T_lidar: Any) -> Optional[np.ndarray]:
+    """(4, 4) float64, None = identity."""
+    if not isinstance(ego_T_lidar, str):
+        return None if ego_T_lidar is None else rigid_transform(ego_T_lidar, "ego_T_lidar")
+    if "timestamp" not in batch or "gm0" not in batch:
+        return None  # training batches have neither ground nor its mask
+    is_ground = _mask(batch, "gm0", b)
+    points = _entry(batch, "origin_pc0" if "origin_pc0" in batch else "pc0", b)
+    stamp = str(_entry(batch, "timestamp", b))
+    if is_ground.numel() != len(points) or not stamp.isdigit():
+        return None
+    found = recognized_extrinsics(int(stamp), points.cpu().numpy(), is_ground.cpu().numpy())
+    return None if np.array_equal(found, np.eye(4)) else found
+
+
+def _value(batch: Mapping[str, Any], key: str) -> Any:
+    if key not in batch:
+        raise CFlowError(f"the batch has no '{key}', which the method needs; it has {', '.join(map(str, batch))}")
+    return batch[key]
+
+
+def _entry(batch: Mapping[str, Any], key: str, b: int) -> Any:
+    """Sample b of what a key holds, a tensor with a batch dimension or a list."""
+    value = _value(batch, key)
+    try:
+        return value[b]
+    except (IndexError, TypeError, KeyError):
+        raise CFlowError(
+            f"batch['{key}'] is {_described(value)}: give one entry per sample, as batch['pose0']"
+        ) from None
+
+
+def _described(value: Any) -> str:
+    if isinstance(value, Tensor):
+        return f"a tensor of shape {tuple(value.shape)} and dtype {value.dtype}"
+    return (
+        f"{type(value).__name__} of length {len(value)}" if isinstance(value, (list, tuple)) else type(value).__name__
+    )

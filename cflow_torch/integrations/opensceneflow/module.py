@@ -1,0 +1,169 @@
+"""The class that the harness's configuration names: batches in, residual flow out."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import fields
+from typing import Any, Dict, List, Mapping, Optional
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from cflow_torch.config import Config, make_config
+from cflow_torch.ego import compensate, rigid_transform
+from cflow_torch.estimate import make_model
+from cflow_torch.integrations.opensceneflow.batch import Sample, read_batch
+from cflow_torch.integrations.opensceneflow.timer import make_timer
+from cflow_torch.types import CFlowError, FlowResult
+
+OUTPUTS = ("full", "valid")
+_SETTINGS = tuple(f.name for f in fields(Config) if f.name != "num_history")
+
+
+class CFlow(nn.Module):
+    """CorrelationFlow, dense or key points, as OpenSceneFlow calls a model. No parameters, no buffers, no layers.
+
+    Args:
+        num_frames: sweeps per window as the harness counts them, t+1 and t included: h + 2. None = the preset's, 6 for
+            the dense method, 2 for key points. If the harness gives fewer, fewer are used.
+        ego_T_lidar: (4, 4) nested list or array, coordinates of the points to the frame whose poses the scenes store;
+            None = the same frame; "auto" = recognise scenes of Argoverse 2, whose points lie in the frame of up_lidar.
+        output: "full" = flow of all rows of pc0, 0 where the method says nothing (both paths of the harness);
+            "valid" = only of rows that took part, by "pc0_valid_point_idxes" (not with iter_only, which ignores those).
+        device: "auto" = that of the batch.
+        voxel_size, grid_feature_size: taken, because the harness wants and gives them; without effect.
+        **settings: any field of `Config` but `num_history`; those not given are the preset's, "keypoints" for
+            method="keypoints", else "default". Others are named in a warning and have no effect.
+
+    Raises:
+        CFlowError: invalid settings.
+
+    Source: Alg. general_correlation_flow; Sec. CorrelationFlow-Keypoints.
+    """
+
+    def __init__(
+        self,
+        num_frames: Optional[int] = None,
+        ego_T_lidar: Any = None,
+        output: str = "full",
+        device: Any = "auto",
+        voxel_size: Any = None,
+        grid_feature_size: Any = None,
+        **settings: Any,
+    ) -> None:
+        super().__init__()
+        unknown = sorted(set(settings) - set(_SETTINGS))
+        if unknown:
+            warnings.warn(
+                f"settings without effect: {', '.join(unknown)}; the method has {', '.join(_SETTINGS)} "
+                "(history is set by num_frames)",
+                UserWarning,
+                stacklevel=2,
+            )
+        config = make_config("default", **{name: settings[name] for name in settings if name in _SETTINGS})
+        self.estimator = make_model(_with_history(config, num_frames), device)
+        if output not in OUTPUTS:
+            raise CFlowError(f"output={output!r}: give one of {', '.join(map(repr, OUTPUTS))}")
+        self.output = output
+        self.ego_T_lidar = _extrinsics(ego_T_lidar)
+        self.timer = make_timer()
+        self._said_short = False
+
+    @property
+    def config(self) -> Config:
+        """The method's settings."""
+        return self.estimator.config
+
+    def forward(self, batch: Mapping[str, Any]) -> Dict[str, List[Tensor]]:
+        """Residual flow of every sample.
+
+        Args:
+            batch: any of the harness's layouts, see `read_batch`; B samples. Not modified.
+
+        Returns:
+            Lists of B tensors, on the device of the method:
+            flow: (M, 3) float32, metres from t to t+1, axes of the frame of t+1: what the harness adds to pose_flow.
+                With `ego_T_lidar` it holds, beside the motion of objects, what the harness's own pose_flow lacks.
+            pc0_valid_point_idxes: (M,) int64, the rows of batch["pc0"] that `flow` is for.
+            pose_flow: (N, 3) float32, T p - p of all rows of pc0, by the poses of the batch.
+            pc1_valid_point_idxes: (M1,) int64; pc0_points_lst: (M, 3), pc1_points_lst: (M1, 3), for losses.
+
+        Raises:
+            CFlowError: a bad batch; the message names the key.
+        """
+        num_history = self.config.num_history
+        samples = read_batch(batch, num_history, self.ego_T_lidar)
+        self._say_short(samples, num_history)
+        results = self.estimator([sample.window for sample in samples])
+        out: Dict[str, List[Tensor]] = {}
+        with torch.no_grad():
+            for b, (sample, result) in enumerate(zip(samples, results)):
+                for key, value in self._answer(batch, b, sample, result).items():
+                    out.setdefault(key, []).append(value)
+        return out
+
+    def _answer(self, batch: Mapping[str, Any], b: int, sample: Sample, result: FlowResult) -> Dict[str, Tensor]:
+        """The output of one sample."""
+        pc0, pc1 = batch["pc0"][b][:, :3], batch["pc1"][b][:, :3]
+        device = result.residual_flow.device
+        positions = pc0.detach().to(device).t().double()
+        pose_flow = (compensate(positions, sample.T_ego1_ego0) - positions).t()
+        flow = torch.zeros_like(pose_flow)
+        rows = sample.rows0.to(device)
+        flow[rows] = result.residual_flow.double()
+        if sample.T_lidar1_lidar0 is not None:
+            correct = (compensate(positions, sample.T_lidar1_lidar0) - positions).t()
+            flow[rows] += (correct - pose_flow)[rows]
+        if self.output == "valid":
+            rows = rows[result.is_valid]
+        elif "gm0" in batch:  # no padding: the harness's second path expects a row for every point
+            rows = torch.arange(len(pc0), device=device)
+        rows1 = sample.rows1.to(device)
+        return {
+            "flow": flow[rows].float(),
+            "pose_flow": pose_flow.float(),
+            "pc0_valid_point_idxes": rows,
+            "pc1_valid_point_idxes": rows1,
+            "pc0_points_lst": pc0.to(device)[rows],
+            "pc1_points_lst": pc1.to(device)[rows1],
+        }
+
+    def _say_short(self, samples: List[Sample], num_history: int) -> None:
+        """Once: the harness gives less history than asked for."""
+        given = min((len(sample.window.pch) for sample in samples), default=num_history)
+        if given < num_history and not self._said_short:
+            self._said_short = True
+            warnings.warn(
+                f"num_frames={num_history + 2} asks for {num_history} history sweeps, the batch has {given}: the flow "
+                f"is estimated from those; pass num_frames={num_history + 2} to the script as well (iter_only), or set "
+                f"model.target.num_frames={given + 2}",
+                UserWarning,
+                stacklevel=3,
+            )
+
+
+def _with_history(config: Config, num_frames: Any) -> Config:
+    if num_frames is None:
+        return config
+    if isinstance(num_frames, bool) or not isinstance(num_frames, int) or num_frames < 2:
+        raise CFlowError(f"num_frames={num_frames!r}: give a whole number of at least 2; history is num_frames - 2")
+    if config.method == "keypoints" and num_frames > 2:
+        raise CFlowError(
+            f"method='keypoints' matches one pair of sweeps, num_frames={num_frames} was given: give num_frames=2, "
+            "or take model=cflow_keypoints, which has all settings of the variant"
+        )
+    return config.replace(num_history=num_frames - 2)
+
+
+def _extrinsics(ego_T_lidar: Any) -> Any:
+    """None, "auto", or a checked (4, 4) float64."""
+    if ego_T_lidar is None or (isinstance(ego_T_lidar, str) and ego_T_lidar == "auto"):
+        return ego_T_lidar
+    if isinstance(ego_T_lidar, str):
+        raise CFlowError(f"ego_T_lidar={ego_T_lidar!r}: give 'auto', null, or a (4, 4) matrix")
+    try:  # Hydra gives lists of a type of its own
+        rows = np.array([[float(value) for value in row] for row in ego_T_lidar])
+    except (TypeError, ValueError):
+        raise CFlowError(f"ego_T_lidar={ego_T_lidar!r}: give 'auto', null, or a (4, 4) matrix") from None
+    return rigid_transform(rows, "ego_T_lidar")

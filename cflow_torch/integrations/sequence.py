@@ -1,0 +1,166 @@
+"""A sequence of sweeps as BucketedSceneFlowEval holds them -> residual flow of its pairs, in the axes of the points.
+
+Two harnesses share these data: BucketedSceneFlowEval, and SceneFlowZoo, which is built upon it.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from typing import Any, List, Optional, Sequence, Tuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from cflow_torch.config import make_config
+from cflow_torch.ego import compensate
+from cflow_torch.estimate import GROUND, make_model
+from cflow_torch.ground import find_ground_batch, has_ground
+from cflow_torch.inputs import read_positions
+from cflow_torch.types import Array, CFlowError, Sweep, Window
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One sweep of a sequence.
+
+    Args:
+        points: (N, 3) float, metres, in the frame of the sensor.
+        takes_part: (N,) bool, False = ground, or outside the range of the data set.
+        sensor_to_ego: (4, 4) float64, `T_ego_sensor` of this sweep.
+        ego_to_global: (4, 4) float64, `T_global_ego` of this sweep. "Global" is the ego frame at another sweep; which
+            one does not matter here, it must only be the same for all sweeps of a sequence.
+        timestamp_ns: nanoseconds, None = unknown.
+    """
+
+    points: Array
+    takes_part: Array
+    sensor_to_ego: np.ndarray
+    ego_to_global: np.ndarray
+    timestamp_ns: Optional[int] = None
+
+    def ego_points(self) -> Array:
+        """(N, 3) points in the ego frame of this sweep, float64 where the sensor has a frame of its own."""
+        if np.array_equal(self.sensor_to_ego, np.eye(4)):
+            return self.points
+        if isinstance(self.points, Tensor):
+            return compensate(read_positions(Sweep(self.points), self.points.device), self.sensor_to_ego).t()
+        return compensate(read_positions(Sweep(self.points), torch.device("cpu")), self.sensor_to_ego).t().numpy()
+
+
+class SequenceFlow(nn.Module):
+    """Frames in, residual flow out. No parameters, no buffers.
+
+    Args:
+        preset: as in `make_config`.
+        device: "auto" = that of the tensors given, else a GPU if there is one, else the CPU.
+        ground: None = ground is what the frames leave out; "auto" or "patchwork" = find it in every sweep as well, for
+            data sets that are loaded with their ground.
+        **settings: any field of `Config`.
+
+    Raises:
+        CFlowError: an unknown setting or an invalid value.
+    """
+
+    def __init__(self, preset: str = "default", device: Any = "auto", ground: Optional[str] = None, **settings: Any):
+        super().__init__()
+        if ground not in GROUND:
+            raise CFlowError(f"ground={ground!r}: give one of {', '.join(map(repr, GROUND))}")
+        self.model = make_model(make_config(preset, **settings), device)
+        self.ground = ground
+        self._looked_for_ground = False
+
+    @torch.no_grad()
+    def forward(self, sequences: Sequence[Sequence[Frame]], firsts: Sequence[int]) -> List[List[Tensor]]:
+        """Residual flow of the pairs (i, i + 1) of several sequences.
+
+        Args:
+            sequences: B sequences of at least two frames each, in order of time.
+            firsts: of each sequence, the first i that a flow is asked for. The frames before it are history only.
+
+        Returns:
+            Of each sequence, for i = firsts ... K - 2: (N, 3) float32, metres until frame i + 1, ego motion taken out,
+            in the axes of frame i's points. Rows that take no part are 0.
+
+        Convention:
+            Frame i has frames i - 1, i - 2, ... as history, as many as there are, at most `num_history`: every pair
+            gets a flow. The i-th windows of all sequences are computed together.
+
+        Raises:
+            CFlowError: bad input, see `cflow_torch.batch.make_batch`.
+        """
+        windows = [self._windows(frames, first) for frames, first in zip(sequences, firsts)]
+        flows: List[List[Tensor]] = [[] for _ in sequences]
+        for step in range(max((len(own) for own in windows), default=0)):
+            members = [index for index, own in enumerate(windows) if step < len(own)]
+            results = self.model([windows[index][step] for index in members])
+            for index, result in zip(members, results):
+                now, following = sequences[index][firsts[index] + step :][:2]
+                flows[index].append(in_axes_of_points(result.residual_flow, now, following))
+        return flows
+
+    @property
+    def num_history(self) -> int:
+        """How many sweeps before t are used."""
+        return self.model.config.num_history
+
+    def _windows(self, frames: Sequence[Frame], first: int) -> List[Window]:
+        oldest = max(first - self.num_history, 0)
+        sweeps = self._sweeps(frames[oldest:])
+        return [
+            Window(sweeps[i], sweeps[i + 1], tuple(sweeps[max(i - self.num_history, 0) : i][::-1]))
+            for i in range(first - oldest, len(sweeps) - 1)
+        ]
+
+    def _sweeps(self, frames: Sequence[Frame]) -> List[Sweep]:
+        points = [frame.ego_points() for frame in frames]
+        left_out = [~frame.takes_part for frame in frames]
+        if self.ground is not None:
+            method = "grid" if self.ground == "auto" else self.ground
+            found = [find_ground_batch([cloud], method)[0] for cloud in points]  # one by one: sequences may be long
+            left_out = [a | b for a, b in zip(left_out, found)]
+        elif not self._looked_for_ground:
+            self._looked_for_ground = True
+            if any(has_ground([points[-2][frames[-2].takes_part]])):
+                warnings.warn(
+                    "there are ground points among those that take part: the ground joins what stands on it into one "
+                    "cluster, so that moving objects are missed. Load the data set with with_ground=False, or pass "
+                    "ground='auto'",
+                    UserWarning,
+                    stacklevel=4,
+                )
+        return [
+            Sweep(cloud, mask, frame.ego_to_global, frame.timestamp_ns)
+            for cloud, mask, frame in zip(points, left_out, frames)
+        ]
+
+
+def in_axes_of_points(residual_flow: Tensor, now: Frame, following: Frame) -> Tensor:
+    """Residual flow turned from the axes of ego1 into those of the points of t.
+
+    Args:
+        residual_flow: (N, 3) float, metres, axes of ego1.
+        now: frame t.
+        following: frame t+1.
+
+    Returns:
+        (N, 3) float32; the rotation is done in float64.
+
+    Convention:
+        (R_global_ego0 R_ego_sensor)^T R_global_ego1, no translation: a flow is a difference of positions.
+    """
+    turn = np.eye(4)
+    to_global = now.ego_to_global[:3, :3] @ now.sensor_to_ego[:3, :3]
+    turn[:3, :3] = to_global.T @ following.ego_to_global[:3, :3]
+    return compensate(residual_flow.double().t(), turn).t().float().contiguous()
+
+
+def times_in_ns(stamps: Sequence[Any]) -> Tuple[Optional[int], ...]:
+    """Time stamps, or None for each if they are no nanoseconds: some data sets number their sweeps 0, 1, 2, ... there.
+
+    Args:
+        stamps: of the sweeps of a sequence, in order.
+    """
+    shortest = min((int(b) - int(a) for a, b in zip(stamps, stamps[1:])), default=0)
+    return tuple(int(stamp) if shortest >= 1_000_000 else None for stamp in stamps)

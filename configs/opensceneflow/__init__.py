@@ -1,0 +1,1 @@
+"""Model group for OpenSceneFlow: hydra.searchpath=[pkg://cflow_torch.configs.opensceneflow]."""
