@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from cflow_torch.config import Config
-from cflow_torch.types import CFlowError, Sweep, Window
+from cflow_torch.types import CFlowError, Sweep, Window, as_numpy
 
 # Sweeps further apart than this many times the step from t to t+1 are no steady history: counting steps would mislead.
 _LONGEST_GAP = 2.5
@@ -84,8 +84,8 @@ def _same(a: Sweep, b: Sweep) -> bool:
         return True
     if a.points.shape != b.points.shape or (a.pose is None) != (b.pose is None):
         return False
-    same_pose = a.pose is None or np.array_equal(_numpy(a.pose), _numpy(b.pose))
-    return same_pose and np.array_equal(_numpy(a.points), _numpy(b.points), equal_nan=True)
+    same_pose = a.pose is None or np.array_equal(as_numpy(a.pose), as_numpy(b.pose))  # type: ignore[arg-type]
+    return same_pose and np.array_equal(as_numpy(a.points), as_numpy(b.points), equal_nan=True)
 
 
 def elapsed_times(
@@ -126,13 +126,6 @@ def check_distance(T_ego1_ego: np.ndarray, name: str) -> None:
             f"the ego vehicle moves {distance:.0f} m between {name} and pc1 (at most {_FARTHEST_POSE:.0f} m): "
             "are the poses of another log, or not in metres?"
         )
-
-
-def _numpy(array: Any) -> np.ndarray:
-    if not isinstance(array, Tensor):
-        return np.asarray(array)
-    array = array.detach().cpu()
-    return (array.float() if array.dtype == torch.bfloat16 else array).numpy()  # NumPy has no bfloat16
 
 
 def choose_device(windows: Sequence[Window], device: Any) -> torch.device:

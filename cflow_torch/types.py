@@ -6,9 +6,18 @@ from dataclasses import dataclass, fields
 from typing import Any, Optional, Tuple, Union
 
 import numpy as np
+import torch
 from torch import Tensor
 
 Array = Union[np.ndarray, Tensor]
+
+
+def as_numpy(value: Array, dtype: Optional[Any] = None) -> np.ndarray:
+    """NumPy array of an array or of a tensor on any device; bfloat16, which NumPy lacks, becomes float32."""
+    if isinstance(value, Tensor):
+        value = value.detach().cpu()
+        value = (value.float() if value.dtype == torch.bfloat16 else value).numpy()
+    return np.asarray(value, dtype=dtype)
 
 
 class CFlowError(ValueError):

@@ -1,0 +1,1 @@
+"""The settings of the commands, found by Hydra as pkg://cflow_torch.configs."""

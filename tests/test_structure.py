@@ -21,6 +21,7 @@ PACKAGE = Path(cflow_torch.__file__).parent
 LAYERS = {
     "types": 0,
     "config": 0,
+    "configs": 0,  # YAML; part of an installed package only
     "ops": 1,
     "ego": 2,
     "grid": 2,

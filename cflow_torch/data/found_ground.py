@@ -6,6 +6,7 @@ from typing import Any, Optional, Sequence
 
 import numpy as np
 
+from cflow_torch.data.hdf5.frames import StoredMotion
 from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.ground import find_ground
 from cflow_torch.types import Sweep
@@ -45,7 +46,7 @@ class GroundFoundLog:
         mask = getattr(self.log, "eval_mask", None)
         return None if mask is None else mask(index)
 
-    def stored_motion(self, index: int) -> Optional[np.ndarray]:
+    def stored_motion(self, index: int) -> Optional[StoredMotion]:
         """As `HDF5Log.stored_motion`, None where the log does not have it."""
         find = getattr(self.log, "stored_motion", None)
         return None if find is None else find(index)

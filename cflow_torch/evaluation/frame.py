@@ -6,16 +6,11 @@ from dataclasses import dataclass
 from typing import Any, Optional, Tuple
 
 import numpy as np
+import torch
 
+from cflow_torch.data.hdf5.frames import StoredMotion, beside_harness, harness_pose_flow
 from cflow_torch.data.log import FlowLabels
-from cflow_torch.types import Array, CFlowError, FlowResult, Window
-
-
-def as_numpy(value: Array, dtype: Optional[Any] = None) -> np.ndarray:
-    """NumPy array of an array or a tensor on any device."""
-    if hasattr(value, "detach"):
-        value = value.detach().cpu().numpy()  # type: ignore[union-attr]
-    return np.asarray(value, dtype=dtype)
+from cflow_torch.types import Array, CFlowError, FlowResult, Window, as_numpy
 
 
 def ego_motion_flow(points: np.ndarray, T_ego1_ego0: np.ndarray) -> np.ndarray:
@@ -99,7 +94,7 @@ class EvalFrame:
         window: Window,
         result: FlowResult,
         labels: FlowLabels,
-        stored_motion: Optional[np.ndarray] = None,
+        stored_motion: Optional[StoredMotion] = None,
         **parts: Any,
     ) -> EvalFrame:
         """Frame of a window and the flow that was estimated for it.
@@ -108,8 +103,8 @@ class EvalFrame:
             window: needs the poses of pc0 and pc1, or neither.
             result: flow of `window.pc0`.
             labels: truth of the pair.
-            stored_motion: (4, 4) T_ego1_ego0 by poses of another frame than that of the points, which the evaluation is
-                to take out of truth and prediction all the same (`HDF5Log.stored_motion`); None = that of the window.
+            stored_motion: ego motion as OpenSceneFlow has it (`HDF5Log.stored_motion`): taken out of truth and
+                prediction as it does that, to the bit. None = motion of the window.
             **parts: further fields, for example `eval_mask`; they win over what the window gives.
         """
         pose0, pose1 = window.pc0.pose, window.pc1.pose
@@ -117,10 +112,12 @@ class EvalFrame:
             parts.setdefault("T_ego1_ego0", np.linalg.inv(as_numpy(pose1, np.float64)) @ as_numpy(pose0, np.float64))
         parts.setdefault("is_ground", window.pc0.is_ground)
         if stored_motion is not None:
-            pose_flow = ego_motion_flow(as_numpy(window.pc0.points)[:, :3], stored_motion)
-            parts.update(
-                T_ego1_ego0=stored_motion, pose_flow=pose_flow, residual_flow=as_numpy(result.flow) - pose_flow
-            )
+            points, residual = torch.as_tensor(as_numpy(window.pc0.points)[:, :3]), result.residual_flow.cpu()
+            if not stored_motion.of_points:
+                residual = beside_harness(residual, points, stored_motion.T_ego1_ego0, parts["T_ego1_ego0"])
+            pose_flow = harness_pose_flow(points, stored_motion.T_ego1_ego0)
+            parts.update(T_ego1_ego0=stored_motion.T_ego1_ego0, pose_flow=pose_flow, flow=pose_flow + residual)
+            return cls(points=points, labels=labels, **parts)
         parts.setdefault("pose_flow", result.pose_flow)
         parts.setdefault("residual_flow", result.residual_flow)
         return cls(points=window.pc0.points, labels=labels, **parts)

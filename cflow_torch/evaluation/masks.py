@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from cflow_torch.evaluation.definitions import Definition
-from cflow_torch.evaluation.frame import EvalFrame, as_numpy
-from cflow_torch.types import CFlowError
+from cflow_torch.evaluation.frame import EvalFrame
+from cflow_torch.types import CFlowError, as_numpy
 
 CLOSE_RANGE = 35.0  # metres, half side of the square that Argoverse 2 calls "close"
 

@@ -8,9 +8,8 @@ from typing import Dict, Optional, Tuple
 import numpy as np
 
 from cflow_torch.ego import relative_transform
-from cflow_torch.evaluation.frame import as_numpy
 from cflow_torch.submission.versions import SubmissionVersion
-from cflow_torch.types import CFlowError, FlowResult, Window
+from cflow_torch.types import CFlowError, FlowResult, Window, as_numpy
 
 DYNAMIC_THRESHOLD = 0.05  # metres per sweep; as the evaluation's dynamic points
 LARGEST = float(np.finfo(np.float16).max)  # 65504

@@ -11,8 +11,7 @@ import pyarrow as pa
 from pyarrow import feather
 
 from cflow_torch.data.log import Log
-from cflow_torch.evaluation.frame import as_numpy
-from cflow_torch.types import CFlowError, Sweep
+from cflow_torch.types import CFlowError, Sweep, as_numpy
 
 _HALF_SIDE = 50.0  # metres; the official masks hold the points that are not ground with |x|, |y| <= 50
 

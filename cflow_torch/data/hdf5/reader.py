@@ -8,10 +8,10 @@ from typing import Any, List, Optional, Sequence, Tuple, Type, Union
 
 import numpy as np
 
-from cflow_torch.data.hdf5.extrinsics import is_argoverse2, recognized_extrinsics
+from cflow_torch.data.hdf5.frames import StoredMotion, harness_motion, is_argoverse2, recognized_extrinsics
 from cflow_torch.data.hdf5.index_file import read_index
 from cflow_torch.data.log import FlowLabels
-from cflow_torch.ego import relative_transform, rigid_transform
+from cflow_torch.ego import rigid_transform
 from cflow_torch.types import CFlowError, Sweep
 
 # Time stamps count from 1970 or 1980: below this they are microseconds (16 digits), above it nanoseconds (18 or 19).
@@ -131,17 +131,16 @@ class HDF5Log:
         timestamp = self._timestamp(index)
         return self._column(timestamp, "eval_mask", np.bool_, len(self._scene[str(timestamp)]["lidar"]))
 
-    def stored_motion(self, index: int) -> Optional[np.ndarray]:
-        """T_ego1_ego0 (4, 4) float64 of the pair (index, index + 1) by the poses as they are in the file, which is what
-        the harness takes out of the flow; None where `ego_T_lidar` is the identity: that of the points is the same.
+    def stored_motion(self, index: int) -> StoredMotion:
+        """Ego motion of the pair (index, index + 1) as the harness has it, by the poses as they are in the file.
 
         Raises:
             CFlowError: no such pair, or a pose that cannot be read or is no rigid motion.
         """
-        if np.array_equal(self.ego_T_lidar, np.eye(4)):
-            return None
-        pose0, pose1 = (self._read(self._timestamp(k), "pose") for k in (index, index + 1))
-        return relative_transform(pose1, pose0, f"pose of sweep {index} in {self.file}")
+        poses = [self._read(self._timestamp(k), "pose") for k in (index, index + 1)]
+        for pose in poses:
+            rigid_transform(pose, f"pose of sweep {index} or {index + 1} of {self.file}")
+        return StoredMotion(harness_motion(*poses), np.array_equal(self.ego_T_lidar, np.eye(4)))
 
     def keys(self, index: int) -> Tuple[str, ...]:
         """Names of everything that sweep `index` has, results included."""

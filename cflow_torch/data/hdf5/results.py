@@ -11,8 +11,7 @@ from typing import Any, Iterable, Tuple, Union
 
 import numpy as np
 
-from cflow_torch.evaluation.frame import as_numpy
-from cflow_torch.types import Array, CFlowError
+from cflow_torch.types import Array, CFlowError, as_numpy
 
 # Keys that scenes bring, and names that the viewers give a meaning of their own.
 RESERVED_KEYS = frozenset(

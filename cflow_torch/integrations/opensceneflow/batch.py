@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cflow_torch.data.hdf5.extrinsics import recognized_extrinsics
+from cflow_torch.data.hdf5.frames import harness_motion, recognized_extrinsics
 from cflow_torch.ego import relative_transform, rigid_transform
 from cflow_torch.types import CFlowError, Sweep, Window
 
@@ -22,7 +22,7 @@ class Sample:
         window: points that are finite and not ground; poses are those of the frame of the points.
         rows0: (K,) int64, rows of batch["pc0"] that are in `window.pc0`.
         rows1: (K1,) int64, the same for pc1.
-        T_ego1_ego0: (4, 4) float64, from the poses as they are in the batch: what the harness adds itself.
+        T_ego1_ego0: (4, 4) float32, what the harness computes from the poses and adds itself.
         T_lidar1_lidar0: (4, 4) float64, motion of the frame of the points; None = the same, `ego_T_lidar` is not used.
     """
 
@@ -66,13 +66,12 @@ def _sample(batch: Mapping[str, Any], b: int, history: List[str], ego_T_lidar: A
         rows.append(kept)
         poses.append(rigid_transform(_entry(batch, f"pose{name}", b), f"batch['pose{name}'][{b}]"))
     lidar_poses = poses if extrinsics is None else [pose @ extrinsics for pose in poses]
-    T_ego1_ego0 = relative_transform(poses[1], poses[0])
     sweeps = [Sweep(points, None, pose) for points, pose in zip(clouds, lidar_poses)]
     return Sample(
         window=Window(sweeps[0], sweeps[1], tuple(sweeps[2:])),
         rows0=rows[0],
         rows1=rows[1],
-        T_ego1_ego0=T_ego1_ego0,
+        T_ego1_ego0=harness_motion(_entry(batch, "pose0", b), _entry(batch, "pose1", b)),
         T_lidar1_lidar0=None if extrinsics is None else relative_transform(lidar_poses[1], lidar_poses[0]),
     )
 
@@ -100,7 +99,8 @@ def _points(batch: Mapping[str, Any], b: int, name: str) -> Tuple[Tensor, Tensor
 
 def _mask(batch: Mapping[str, Any], key: str, b: int) -> Tensor:
     mask = _entry(batch, key, b)
-    if not isinstance(mask, Tensor) or mask.dtype != torch.bool or mask.ndim > 2 or mask.numel() != mask.shape[0]:
+    is_mask = isinstance(mask, Tensor) and mask.dtype == torch.bool and mask.ndim in (1, 2)
+    if not is_mask or mask.numel() != mask.shape[0]:
         raise CFlowError(f"batch['{key}'][{b}] is {_described(mask)}: give a bool tensor of shape (N,), True = ground")
     return mask.reshape(-1)
 

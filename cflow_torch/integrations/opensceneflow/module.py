@@ -11,7 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from cflow_torch.config import Config, make_config
-from cflow_torch.ego import compensate, rigid_transform
+from cflow_torch.data.hdf5.frames import beside_harness, harness_pose_flow
+from cflow_torch.ego import rigid_transform
 from cflow_torch.estimate import make_model
 from cflow_torch.integrations.opensceneflow.batch import Sample, read_batch
 from cflow_torch.integrations.opensceneflow.timer import make_timer
@@ -86,7 +87,7 @@ class CFlow(nn.Module):
             flow: (M, 3) float32, metres from t to t+1, axes of the frame of t+1: what the harness adds to pose_flow.
                 With `ego_T_lidar` it holds, beside the motion of objects, what the harness's own pose_flow lacks.
             pc0_valid_point_idxes: (M,) int64, the rows of batch["pc0"] that `flow` is for.
-            pose_flow: (N, 3) float32, T p - p of all rows of pc0, by the poses of the batch.
+            pose_flow: (N, 3) float32, T p - p of all rows of pc0, as the harness computes it.
             pc1_valid_point_idxes: (M1,) int64; pc0_points_lst: (M, 3), pc1_points_lst: (M1, 3), for losses.
 
         Raises:
@@ -106,23 +107,20 @@ class CFlow(nn.Module):
     def _answer(self, batch: Mapping[str, Any], b: int, sample: Sample, result: FlowResult) -> Dict[str, Tensor]:
         """The output of one sample."""
         pc0, pc1 = batch["pc0"][b][:, :3], batch["pc1"][b][:, :3]
-        device = result.residual_flow.device
-        positions = pc0.detach().to(device).t().double()
-        pose_flow = (compensate(positions, sample.T_ego1_ego0) - positions).t()
-        flow = torch.zeros_like(pose_flow)
-        rows = sample.rows0.to(device)
-        flow[rows] = result.residual_flow.double()
+        residual = result.residual_flow
+        device = residual.device
+        points, rows = pc0.detach().to(device).float(), sample.rows0.to(device)
         if sample.T_lidar1_lidar0 is not None:
-            correct = (compensate(positions, sample.T_lidar1_lidar0) - positions).t()
-            flow[rows] += (correct - pose_flow)[rows]
+            residual = beside_harness(residual, points[rows], sample.T_ego1_ego0, sample.T_lidar1_lidar0)
+        flow = torch.zeros_like(points).index_copy_(0, rows, residual)
         if self.output == "valid":
             rows = rows[result.is_valid]
         elif "gm0" in batch:  # no padding: the harness's second path expects a row for every point
             rows = torch.arange(len(pc0), device=device)
         rows1 = sample.rows1.to(device)
         return {
-            "flow": flow[rows].float(),
-            "pose_flow": pose_flow.float(),
+            "flow": flow[rows],
+            "pose_flow": harness_pose_flow(points, sample.T_ego1_ego0),
             "pc0_valid_point_idxes": rows,
             "pc1_valid_point_idxes": rows1,
             "pc0_points_lst": pc0.to(device)[rows],

@@ -1,0 +1,110 @@
+"""Frames in scenes of OpenSceneFlow's layout: where the LiDAR sits, and what the harness takes for the ego motion."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, Optional
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from cflow_torch.ego import compensate
+
+# Argoverse 2 counts nanoseconds from a moment of its own: all sweeps of the data set lie in here, no other set's do.
+_ARGOVERSE2_STAMPS = (315_900_000_000_000_000, 316_000_000_000_000_000)
+# Its up_lidar sits 2 m above the road, its ego frame 0.35 m: ground lower than this is seen from the sensor.
+_ARGOVERSE2_SENSOR_GROUND = -1.2
+# Extrinsics of up_lidar in one log of the set (7fab2350), yaw -0.58 degrees. Each log has its own, the scenes none.
+_ARGOVERSE2_EGO_T_UP_LIDAR = np.array(
+    [[0.9999483, 0.0101698, 0, 1.35018], [-0.0101698, 0.9999483, 0, 0], [0, 0, 1, 1.64042], [0, 0, 0, 1]]
+)
+
+
+class StoredMotion(NamedTuple):
+    """What the harness takes for the ego motion of a pair of sweeps.
+
+    Args:
+        T_ego1_ego0: (4, 4) float32, from `harness_motion`.
+        of_points: the poses are those of the frame of the points; False = `ego_T_lidar` lies between.
+    """
+
+    T_ego1_ego0: np.ndarray
+    of_points: bool
+
+
+def is_argoverse2(timestamp: int) -> bool:
+    """Whether a sweep's time stamp is one of Argoverse 2."""
+    low, high = _ARGOVERSE2_STAMPS
+    return low <= timestamp < high
+
+
+def recognized_extrinsics(timestamp: int, points: np.ndarray, is_ground: Optional[np.ndarray]) -> np.ndarray:
+    """Coordinates of a scene's points to the frame whose poses it stores, by what a sweep looks like.
+
+    Args:
+        timestamp: name of the sweep.
+        points: (N, 3+) float, metres, as stored.
+        is_ground: (N,) bool, True = ground; None = unknown.
+
+    Returns:
+        (4, 4) float64 ego_T_lidar.
+
+    Convention:
+        A sweep with a time stamp of Argoverse 2 whose ground lies lower than 1.2 m below the origin has points in the
+        frame of up_lidar and the pose of the ego frame: the extrinsics of one log of that set. Those of the scene's own
+        log are not in its file: take them from `calibration/egovehicle_SE3_sensor.feather`. All other sets: the
+        identity (nuScenes and ZOD have poses of the sensor, Waymo and TruckScenes points in the ego frame).
+    """
+    if not is_argoverse2(timestamp) or is_ground is None or not is_ground.any():
+        return np.eye(4)
+    if np.median(points[is_ground, 2]) > _ARGOVERSE2_SENSOR_GROUND:
+        return np.eye(4)
+    return _ARGOVERSE2_EGO_T_UP_LIDAR.copy()
+
+
+def harness_motion(pose0: Any, pose1: Any) -> np.ndarray:
+    """T_ego1_ego0 as the harness computes it from two stored poses.
+
+    Args:
+        pose0, pose1: (4, 4) T_world_ego of t and t+1, arrays or tensors, float32 or float64.
+
+    Returns:
+        (4, 4) float32.
+
+    Convention:
+        The inverse of a rotation is its transpose, and the translation of the inverse is summed in the precision of the
+        poses: with float32 and coordinates of kilometres that is off by up to half a millimetre. So are its scores.
+    """
+    start, end = (torch.as_tensor(pose).detach().cpu() for pose in (pose0, pose1))
+    inverse = torch.eye(4, dtype=torch.float64)
+    inverse[:3, :3] = end[:3, :3].t()
+    inverse[:3, 3] = -(end[:3, :3].t() * end[:3, 3]).sum(dim=1)
+    return (inverse @ start.double()).float().numpy()
+
+
+def harness_pose_flow(points: Tensor, T_ego1_ego0: np.ndarray) -> Tensor:
+    """The flow that the harness adds to a model's, and takes out of the truth: (N, 3) float32.
+
+    Args:
+        points: (N, 3) float32, metres.
+        T_ego1_ego0: (4, 4) float32, from `harness_motion`.
+    """
+    transform = torch.from_numpy(T_ego1_ego0).to(points.device)
+    return points @ transform[:3, :3].t() + transform[:3, 3] - points
+
+
+def beside_harness(residual: Tensor, points: Tensor, T_ego1_ego0: np.ndarray, T_lidar1_lidar0: np.ndarray) -> Tensor:
+    """What to hand to the harness so that its total is right although its poses are of another frame than the points.
+
+    Args:
+        residual: (N, 3) float32, metres, motion of objects.
+        points: (N, 3) float32, metres, frame of the LiDAR at t.
+        T_ego1_ego0: (4, 4) float32, from `harness_motion`.
+        T_lidar1_lidar0: (4, 4) float64, the motion of the frame of the points.
+
+    Returns:
+        (N, 3) float32: residual + (T_lidar1_lidar0 p - p) - (T_ego1_ego0 p - p).
+    """
+    positions = points.t().double()
+    correction = compensate(positions, T_lidar1_lidar0) - compensate(positions, T_ego1_ego0.astype(np.float64))
+    return (residual.double() + correction.t()).float()
