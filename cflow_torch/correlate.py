@@ -3,25 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import List, Optional, Tuple
+from typing import Iterator, List, Optional, Tuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
-from cflow_torch.ops.cross_correlation import cross_correlate
+from cflow_torch.ops.cross_correlation import FAST_LENGTHS, cross_correlate
 from cflow_torch.ops.exact import exact_sqrt
 from cflow_torch.ops.indices import flat_nonzero
 from cflow_torch.ops.segments import segment_amin
+from cflow_torch.ops.window_counts import WindowCounts
 
-# Clusters are correlated in size classes. Up to 64 px a few square classes: most clusters are small, and few classes
-# mean few kernel launches. Longer clusters are rare, thin and expensive: height and width get classes of their own, in
-# steps of at most an eighth.
-_SQUARE_CLASSES = (8, 16, 32, 64)
-_LONG_CLASSES = tuple(n << k for k in range(8) for n in range(8, 16))
-
-# Working memory of a job per pixel of its class: spectra of 1.5 x 1.5 the size, counts, energies, ranking values.
-_BYTES_PER_SAMPLE = 100
+# Images that fit are laid out as one line of this many samples, whatever their height and width: most clusters are
+# small, and few classes mean few kernel launches. Larger images are rare; they keep two dimensions, whose transforms
+# cost less than those of a line, and have classes of their own by height and width.
+_LINES = (144, 576, 2304, 9216)  # square clusters of 8, 16, 32, 64 pixels
+# Working memory of a job per sample of its class: spectra, counts, and what is looked up in them.
+_BYTES_PER_SAMPLE = 48
+# Classes are numbered by height and width of their images, both below this.
+_BASE = 1 << 17
 
 
 @dataclass(frozen=True)
@@ -39,18 +39,41 @@ class Images:
 
 
 @dataclass(frozen=True)
-class _Drawing:
-    """Templates and targets as pixels, sorted by size class.
+class _Search:
+    """Shifts that are searched for each of K images: dy in [-low_y, high_y], dx in [-low_x, high_x].
 
     Args:
-        blocks: per class (J_c + N_c, height, width) float32 zeros and ones: its templates, then its targets.
-        num_templates: per class J_c.
-        jobs: (J,) int64, templates in the order in which they were drawn.
-        targets: (N,) int64, targets in the order in which they were drawn.
+        low, high: (K, 2) int64, (y, x).
+        stride: (K,) int64, samples from one row of the image to the next, and from one dy to the next.
     """
 
-    blocks: List[Tensor]
-    num_templates: List[int]
+    low: Tensor
+    high: Tensor
+    stride: Tensor
+
+    def take(self, index: Tensor) -> _Search:
+        """Those of some images."""
+        return _Search(*(values.index_select(0, index) for values in (self.low, self.high, self.stride)))
+
+    def shift(self, sample: Tensor) -> Tuple[Tensor, Tensor]:
+        """dy and dx that stand at a sample of each image, (K,) int64; beyond `high` it means nothing."""
+        row = sample // self.stride
+        return row - self.low[:, 0], sample - row * self.stride - self.low[:, 1]
+
+
+@dataclass(frozen=True)
+class _Drawing:
+    """Templates and targets drawn in the shape of their class, class after class, templates before targets.
+
+    Args:
+        samples: (A,) float32 zeros and ones.
+        classes: of each class (templates, targets, Y, X, number of leading samples in which shifts are searched).
+        jobs: (J,) int64, templates in the order in which they are drawn.
+        targets: (N,) int64, targets in the order in which they are drawn.
+    """
+
+    samples: Tensor
+    classes: List[Tuple[int, ...]]
     jobs: Tensor
     targets: Tensor
 
@@ -74,7 +97,7 @@ def best_shifts(
         radius: (J,) float64, longest shift that is searched, pixels; None = only bounded by the size.
         engine: "fft" or "conv"; the same bits.
         max_memory: bytes of working memory to plan with; more jobs than fit are processed in turn, with the same
-            result. None = all jobs of a size class at once.
+            result. None = all jobs at once.
 
     Returns:
         shift: (J, 2) int64, (dy, dx), pixels.
@@ -85,157 +108,217 @@ def best_shifts(
         Ties: smallest |shift|, then smallest dy, then smallest dx. No overlap at all: shift 0, score 0.
         Counts are integers; they are compared as count^2 / energy in float64, so no device rounds differently.
 
-    Cost: about area log(area) per job; clusters are processed by size class, and the only Python loop is over classes.
+    Cost: about area log(area) per job, area as searched; the only Python loop is over size classes.
     Source: Eq. norm_correlation, displacement_in_bev, Alg. scene_flow_1view.
     """
     num_jobs = target_of_job.numel()
     if num_jobs == 0:
         return size.new_zeros((0, 2)), torch.zeros(0, device=size.device)
-    num_targets = len(size)
-    drawing = _draw(template, target, target_of_job, size)
-    # From here on jobs and targets are sorted by class.
-    jobs, targets = drawing.jobs, drawing.targets
-    place = torch.empty_like(targets).scatter_(0, targets, torch.arange(num_targets, device=size.device))
-    of_job = place.index_select(0, target_of_job.index_select(0, jobs))
-    target_energy = torch.bincount(target.image, minlength=num_targets).index_select(0, targets)
-    target_size = size.index_select(0, targets)
-    job_size, job_target_energy = target_size.index_select(0, of_job), target_energy.index_select(0, of_job)
+    low, high = _bounds(size, target_of_job, radius)
+    search, drawing = _draw(template, target, target_of_job, size, low, high)
+    jobs = drawing.jobs
+    target_energy = torch.bincount(target.image, minlength=len(size))
+    own = target_of_job.index_select(0, jobs)
+    search, energy_of_job = search.take(own), target_energy.index_select(0, own)
     job_radius = None if radius is None else radius.index_select(0, jobs)
 
-    candidates = []
-    first_target = first_job = 0
-    for block, num_templates in zip(drawing.blocks, drawing.num_templates):
-        at_once = _jobs_at_once(block, num_templates, max_memory)
-        for start in range(0, num_templates, at_once):
-            stop = min(start + at_once, num_templates)
-            part = slice(first_job + start, first_job + stop)
-            images, own = block, of_job[part] - first_target
-            if at_once < num_templates:  # jobs are sorted by target: a run of jobs needs a run of targets
-                first, last = int(own[0]), int(own[-1])
-                some_targets = block[num_templates + first : num_templates + last + 1]
-                images, own = torch.cat((block[start:stop], some_targets)), own - first
-            counts, dy, dx = cross_correlate(images, stop - start, own, engine)
-            limit = None if job_radius is None else job_radius[part]
-            job, *rest = _candidates(counts, dy, dx, job_size[part], job_target_energy[part], limit)
-            candidates.append((job + part.start, *rest))
-        first_target += len(block) - num_templates
-        first_job += num_templates
-
-    job, dy, dx, count = map(torch.cat, zip(*candidates))
-    energy = _energy_under_window(drawing, of_job.index_select(0, job), job_size.index_select(0, job), dy, dx)
-    best = _best_of_each_job(job, dy, dx, count, energy, num_jobs)
-    found = jobs[job[best]]
+    found = []
+    for part, counts in _correlated(drawing, own, engine, max_memory):
+        wanted = _Search(search.low[part], search.high[part], search.stride[part])
+        limit = None if job_radius is None else job_radius[part]
+        job, *rest = _candidates(counts, wanted, energy_of_job[part], limit)
+        found.append((job + part.start, *rest))
+    place, dy, dx, count = found[0] if len(found) == 1 else map(torch.cat, zip(*found))
+    job, job_target = jobs.index_select(0, place), own.index_select(0, place)
+    job, dy, dx, count, energy = _best_of_each_job(
+        WindowCounts(target.image, target.row, target.col, size), job, job_target, dy, dx, count, num_jobs
+    )
     shift = torch.zeros((num_jobs, 2), dtype=torch.int64, device=size.device)
-    shift[found] = torch.stack((dy[best], dx[best]), 1)
-    energies = torch.bincount(template.image, minlength=num_jobs)[found] * energy[best]
+    shift[job] = torch.stack((dy, dx), 1)
+    energies = torch.bincount(template.image, minlength=num_jobs).index_select(0, job) * energy
     score = torch.zeros(num_jobs, dtype=torch.float32, device=size.device)
-    score[found] = (count[best].double() / exact_sqrt(energies.double())).float()
+    score[job] = (count.double() / exact_sqrt(energies.double())).float()
     return shift, score
 
 
-def _candidates(
-    counts: Tensor, dy: Tensor, dx: Tensor, size: Tensor, target_energy: Tensor, radius: Optional[Tensor]
-) -> Tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Shifts that may be the best of their job: (K,) job, dy, dx, count. Overwrites `counts`.
-
-    A window holds at least the pixels that coincide and at most all of the target's, so count^2 / energy lies between
-    count^2 / target energy and count. What is below the largest of the lower bounds need not be looked at.
-    """
-    half = size // 2
-    low, high = -half, size - 1 - half
-    in_rows = (dy >= low[:, :1]) & (dy <= high[:, :1])
-    in_cols = (dx >= low[:, 1:]) & (dx <= high[:, 1:])
-    counts.mul_(in_rows[:, :, None]).mul_(in_cols[:, None, :])
+def _bounds(size: Tensor, target_of_job: Tensor, radius: Optional[Tensor]) -> Tuple[Tensor, Tensor]:
+    """(N, 2) farthest shifts down and up that any job of a target searches."""
+    low = size // 2
+    high = size - 1 - low
     if radius is not None:
-        counts.mul_((dy[:, None] ** 2 + dx**2) <= (radius * radius)[:, None, None])
-    largest = counts.amax((1, 2)).round()
-    # 1 less, because counts are not rounded yet; counts of 0 are never better than no shift at all.
-    needed = (largest * largest / target_energy - 1).clamp(min=0.5)
-    place = flat_nonzero(counts > needed[:, None, None])
-    num_rows, num_cols = counts.shape[1:]
-    row = place // num_cols
-    job = row // num_rows
-    count = counts.view(-1).index_select(0, place).round().long()
-    return job, dy.index_select(0, row - job * num_rows), dx.index_select(0, place - row * num_cols), count
+        reach = low.new_zeros(len(size)).scatter_reduce_(0, target_of_job, radius.floor().long(), "amax")[:, None]
+        low, high = torch.minimum(low, reach), torch.minimum(high, reach)
+    return low, high
 
 
-def _energy_under_window(drawing: _Drawing, target: Tensor, size: Tensor, dy: Tensor, dx: Tensor) -> Tensor:
-    """(K,) int64, target pixels under the H x W window at a shift (denominator of Eq. norm_correlation).
+def _draw(
+    template: Images, target: Images, target_of_job: Tensor, size: Tensor, low: Tensor, high: Tensor
+) -> Tuple[_Search, _Drawing]:
+    """Draw all templates and targets in one go; also what is searched for each target.
+
+    An image takes H + low_y rows of W + low_x samples, and a target is drawn low_y rows and low_x columns further down.
+    Then shift (dy, dx) of the correlation stands at sample (dy + low_y) * stride + dx + low_x, and no other pair of
+    pixels adds to the samples that are searched: neither across the end of a row nor across that of the image.
+    """
+    rows, width = (size + low).t().contiguous()
+    lines = torch.tensor(_LINES, device=size.device)
+    line = torch.searchsorted(lines, rows * width)
+    is_line = line < len(_LINES)
+    fast = torch.tensor(FAST_LENGTHS, device=size.device)
+    height = torch.where(is_line, 1, fast.take(torch.searchsorted(fast, rows)))
+    in_line = lines.take(line.clamp(max=len(_LINES) - 1))
+    length = torch.where(is_line, in_line, fast.take(torch.searchsorted(fast, width)))
+    stride = torch.where(is_line, width, length)
+
+    keys, class_of_target = torch.unique(height * _BASE + length, return_inverse=True)
+    num_jobs, num_classes = target_of_job.numel(), keys.numel()
+    kind = torch.cat((2 * class_of_target.index_select(0, target_of_job), 2 * class_of_target + 1))
+    last = (low + high)[:, 0] * stride + (low + high)[:, 1]
+    searched = torch.zeros_like(keys).scatter_reduce_(0, class_of_target, last + 1, "amax")
+    listed = torch.cat((keys, searched, torch.bincount(kind, minlength=2 * num_classes))).tolist()
+    numbers = listed[2 * num_classes :]
+    classes = [
+        (*numbers[2 * c : 2 * c + 2], *divmod(listed[c], _BASE), listed[num_classes + c]) for c in range(num_classes)
+    ]
+
+    order = torch.sort(kind, stable=True).indices
+    of_image = torch.cat((target_of_job, torch.arange(len(size), device=size.device)))
+    area = (height * length).index_select(0, of_image.index_select(0, order))
+    start = torch.empty_like(area).scatter_(0, order, area.cumsum(0) - area)
+    start[num_jobs:] += low[:, 0] * stride + low[:, 1]
+    image = torch.cat((template.image, target.image + num_jobs))
+    row, col = torch.cat((template.row, target.row)), torch.cat((template.col, target.col))
+    pixel = row.mul_(stride.index_select(0, of_image).index_select(0, image)).add_(col)
+    pixel += start.index_select(0, image)
+    total = sum((templates + targets) * y * x for templates, targets, y, x, _ in classes)
+    samples = torch.zeros(total, dtype=torch.float32, device=pixel.device).index_fill_(0, pixel, 1.0)
+    is_job = order < num_jobs
+    drawing = _Drawing(
+        samples,
+        classes,
+        order.index_select(0, flat_nonzero(is_job)),
+        order.index_select(0, flat_nonzero(~is_job)) - num_jobs,
+    )
+    return _Search(low, high, stride), drawing
+
+
+def _correlated(
+    drawing: _Drawing, own: Tensor, engine: str, max_memory: Optional[int]
+) -> Iterator[Tuple[slice, List[Tensor]]]:
+    """Runs of jobs, in drawing order, and the searched samples of their correlations, (n, samples) of n jobs a class.
 
     Args:
         drawing: the images.
-        target: (K,) int64, which target, in drawing order.
-        size: (K, 2) int64, H, W.
-        dy, dx: (K,) int64.
+        own: (J,) int64, target of each job, in drawing order.
+        engine, max_memory: as for `best_shifts`.
     """
-    # Tables of the number of pixels above and to the left; counts below 2^24 are exact in float32.
-    tables = [
-        F.pad(block[first:].cumsum(1).cumsum(2), (1, 0, 1, 0))
-        for block, first in zip(drawing.blocks, drawing.num_templates)
-    ]
-    table = torch.cat([part.flatten() for part in tables])
-    shapes = torch.tensor([part.shape for part in tables], device=target.device)
-    of_class = torch.repeat_interleave(shapes[:, 0])
-    stride, area = shapes[of_class, 2], (shapes[:, 1] * shapes[:, 2])[of_class]
-    start, stride = (area.cumsum(0) - area).index_select(0, target), stride.index_select(0, target)
-    stop_y, stop_x = torch.minimum(size[:, 0] + dy, size[:, 0]), torch.minimum(size[:, 1] + dx, size[:, 1])
-    begin_y, begin_x = dy.clamp(min=0), dx.clamp(min=0)
-    above, below = start + begin_y * stride, start + stop_y * stride
-    corners = torch.stack((below + stop_x, above + stop_x, below + begin_x, above + begin_x))
-    stop_stop, begin_stop, stop_begin, begin_begin = table.take(corners)
-    return (stop_stop - begin_stop - stop_begin + begin_begin).long()
+    place = torch.empty_like(drawing.targets)
+    place.scatter_(0, drawing.targets, torch.arange(place.numel(), device=place.device))
+    own = place.index_select(0, own)
+    blocks = drawing.samples.split([(j + n) * y * x for j, n, y, x, _ in drawing.classes])
+    pending: List[Tensor] = []
+    first_job = last_job = first_target = used = 0
+    for block, (num_templates, num_targets, height, width, searched) in zip(blocks, drawing.classes):
+        images = block.view(-1, height, width)
+        per_job = _BYTES_PER_SAMPLE * height * width
+        at_once = num_templates if max_memory is None else max(1, min(num_templates, int(max_memory) // per_job))
+        for begin in range(0, num_templates, at_once):
+            end = min(begin + at_once, num_templates)
+            needed = (end - begin) * per_job
+            if pending and max_memory is not None and used + needed > max_memory:
+                yield slice(first_job, last_job), pending
+                pending, first_job, used = [], last_job, 0
+            wanted = own[last_job : last_job + end - begin] - first_target
+            some = images
+            if end - begin < num_templates:  # jobs are sorted by target: a run of jobs needs a run of targets
+                low, high = int(wanted[0]), int(wanted[-1])
+                some = torch.cat((images[begin:end], images[num_templates + low : num_templates + high + 1]))
+                wanted = wanted - low
+            pending.append(cross_correlate(some, end - begin, wanted, engine).flatten(1)[:, :searched])
+            last_job += end - begin
+            used += needed
+        first_target += num_targets
+    yield slice(first_job, last_job), pending
 
 
-def _best_of_each_job(job: Tensor, dy: Tensor, dx: Tensor, count: Tensor, energy: Tensor, num_jobs: int) -> Tensor:
-    """(F,) int64, the best candidate of each job that has one; ties as in `best_shifts`."""
-    value = count.double()
-    value = value * value / energy
+def _candidates(
+    counts: List[Tensor], search: _Search, target_energy: Tensor, radius: Optional[Tensor]
+) -> Tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Shifts that may be the best of their job: (K,) job, dy, dx, count.
+
+    A window holds at least the pixels that coincide and at most all of the target's, so count^2 / energy lies between
+    count^2 / target energy and count. What is below the largest of the lower bounds need not be looked at.
+
+    Args:
+        counts: correlations of J jobs, (n, samples) float each; what stands at samples outside the search is ignored.
+        search: of each job.
+        target_energy: (J,) int64, pixels of each job's target.
+        radius: (J,) float64, pixels; None = no limit.
+    """
+    # Two samples for a lower bound: no shift, and the largest count, moved into the search if it stands outside.
+    largest = torch.cat([part.argmax(1) for part in counts])
+    middle = search.low[:, 0] * search.stride + search.low[:, 1]
+    dy, dx = search.shift(largest)
+    dy, dx = torch.minimum(dy, search.high[:, 0]), torch.minimum(dx, search.high[:, 1])
+    probe = middle + dy * search.stride + dx
+    if radius is not None:
+        square = (radius * radius).floor()
+        probe = torch.where(dy * dy + dx * dx <= square, probe, middle)
+    sizes = [len(part) for part in counts]
+    probes = torch.stack((middle, probe), 1).split(sizes)
+    bound = torch.cat([part.gather(1, places).amax(1) for part, places in zip(counts, probes)]).round_()
+    # 1 less, because counts are not rounded yet; counts of 0 are never better than no shift at all.
+    needed = (bound * bound / target_energy - 1).clamp_(min=0.5)[:, None].split(sizes)
+    place = flat_nonzero(torch.cat([(part > least).flatten() for part, least in zip(counts, needed)]))
+    value = torch.cat([part.flatten() for part in counts]).index_select(0, place)
+    # Which job and sample each place is: n jobs of a class have as many samples each.
+    table = torch.tensor([(len(part), part.shape[1], part.numel()) for part in counts], device=place.device)
+    ends = table[:, 2].cumsum(0)
+    kind = torch.searchsorted(ends, place, right=True)
+    first_job, length, first = torch.stack(
+        (table[:, 0].cumsum(0) - table[:, 0], table[:, 1], ends - table[:, 2])
+    ).index_select(1, kind)
+    within = place - first
+    in_class = within // length
+    job, sample = first_job + in_class, within - in_class * length
+    search = search.take(job)
+    dy, dx = search.shift(sample)
+    is_searched = (dy <= search.high[:, 0]) & (dx <= search.high[:, 1])
+    if radius is not None:
+        is_searched &= dy * dy + dx * dx <= square.index_select(0, job)
+    kept = flat_nonzero(is_searched)
+    job, dy, dx, count = (values.index_select(0, kept) for values in (job, dy, dx, value.round_().long()))
+    return job, dy, dx, count
+
+
+def _best_of_each_job(
+    windows: WindowCounts, job: Tensor, target: Tensor, dy: Tensor, dx: Tensor, count: Tensor, num_jobs: int
+) -> Tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """The best candidate of each job that has one: (F,) job, dy, dx, count, energy; ties as in `best_shifts`.
+
+    Args:
+        windows: the targets; the energy of a shift (denominator of Eq. norm_correlation) is their pixels under the
+            H x W window at that shift.
+        job, target, dy, dx, count: (K,) int64, candidates.
+        num_jobs: J.
+    """
+    # Bounds of the energy, cheap and close, leave few candidates. Division rounds monotonically: no winner is lost.
+    least, most = windows.bounds(target, dy, dx)
+    square = (count * count).double()
+    bound = (square / most).new_zeros(num_jobs).scatter_reduce_(0, job, square / most, "amax")
+    kept = flat_nonzero(square / torch.maximum(least, count) >= bound.index_select(0, job))
+    job, target, dy, dx, count, square = (
+        values.index_select(0, kept) for values in (job, target, dy, dx, count, square)
+    )
+    energy = windows.count(target, dy, dx)
+    value = square / energy
     best_value = value.new_zeros(num_jobs).scatter_reduce_(0, job, value, "amax")
-    tied = flat_nonzero(value == best_value[job])
+    tied = flat_nonzero(value == best_value.index_select(0, job))
+    job, dy, dx, count, energy = (values.index_select(0, tied) for values in (job, dy, dx, count, energy))
     # One number that orders shifts: length, then dy, then dx. It fits: images have at most 2^15 pixels a side.
     span = 1 << 16
     order = ((dy * dy + dx * dx) * span + dy + span // 2) * span + dx + span // 2
-    order = order[tied]
-    first = segment_amin(order, job[tied], num_jobs, torch.iinfo(torch.int64).max)
-    return tied[order == first[job[tied]]]
-
-
-def _jobs_at_once(block: Tensor, num_templates: int, max_memory: Optional[int]) -> int:
-    if max_memory is None:
-        return max(1, num_templates)
-    return max(1, min(num_templates, int(max_memory) // (_BYTES_PER_SAMPLE * block.shape[1] * block.shape[2])))
-
-
-def _draw(template: Images, target: Images, target_of_job: Tensor, size: Tensor) -> _Drawing:
-    """Draw all templates and targets, each in the shape of its size class, in one go."""
-    num_jobs = target_of_job.numel()
-    shape, class_of_target, class_shapes = _size_classes(size)
-    shape = torch.cat((shape.index_select(0, target_of_job), shape))
-    kind = torch.cat((2 * class_of_target.index_select(0, target_of_job), 2 * class_of_target + 1))
-    order = torch.sort(kind, stable=True).indices
-    area = (shape[:, 0] * shape[:, 1]).index_select(0, order)
-    start = torch.empty_like(area).scatter_(0, order, area.cumsum(0) - area)
-    counts = torch.bincount(kind, minlength=2 * len(class_shapes)).tolist()
-
-    image = torch.cat((template.image, target.image + num_jobs))
-    row, col = torch.cat((template.row, target.row)), torch.cat((template.col, target.col))
-    pixel = start.index_select(0, image) + row * shape[:, 1].index_select(0, image) + col
-    shapes = [(a + b, *hw) for a, b, hw in zip(counts[::2], counts[1::2], class_shapes)]
-    areas = [number * height * width for number, height, width in shapes]
-    drawn = torch.zeros(sum(areas), dtype=torch.float32, device=pixel.device).index_fill_(0, pixel, 1.0)
-    blocks = [part.view(of_class) for part, of_class in zip(drawn.split(areas), shapes)]
-    is_job = order < num_jobs
-    return _Drawing(blocks, counts[::2], order[is_job], order[~is_job] - num_jobs)
-
-
-def _size_classes(size: Tensor) -> Tuple[Tensor, Tensor, List[Tuple[int, int]]]:
-    """(N, 2) shape of the images that each target is drawn in, (N,) its class, and the shape of every class."""
-    largest = int(size.max())
-    square = torch.tensor(_SQUARE_CLASSES, device=size.device)
-    long = torch.tensor([s for s in _LONG_CLASSES if s < largest] + [largest], device=size.device)
-    longer = size.amax(1, keepdim=True)
-    small = square[torch.searchsorted(square, longer).clamp(max=len(square) - 1)].expand(-1, 2)
-    shape = torch.where(longer <= _SQUARE_CLASSES[-1], small, long[torch.searchsorted(long, size)])
-    base = 1 + max(largest, _SQUARE_CLASSES[-1])
-    keys, class_of_target = torch.unique(shape[:, 0] * base + shape[:, 1], return_inverse=True)
-    return shape, class_of_target, [divmod(key, base) for key in keys.tolist()]
+    first = segment_amin(order, job, num_jobs, torch.iinfo(torch.int64).max)
+    best = flat_nonzero(order == first.index_select(0, job))
+    job, dy, dx, count, energy = (values.index_select(0, best) for values in (job, dy, dx, count, energy))
+    return job, dy, dx, count, energy

@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+import torch.nn.functional as F
 from kornia import contrib
 from scenes import LABELINGS, needs_gpu
 from scipy import ndimage
 from scipy.sparse import coo_matrix, csgraph
 
 from cflow_torch.ops import morphology
-from cflow_torch.ops.cross_correlation import cross_correlate, fft_length
+from cflow_torch.ops.cross_correlation import FAST_LENGTHS, cross_correlate
 from cflow_torch.ops.labeling import connected_components, connected_components_kornia, union_find
 from cflow_torch.ops.nearest import nearest_set_pixel
 from cflow_torch.ops.patches import gather_patches
@@ -240,11 +241,12 @@ def test_masked_median_equals_numpy():
 
 def counts(template, target, own, engine):
     """(J, 2 (H // 2) + 1, 2 (W // 2) + 1) int64, counts of `cross_correlate`, shifts in ascending order."""
-    values, *shifts = cross_correlate(torch.cat((template, target)).float(), len(template), own, engine)
+    height, width = template.shape[1:]
+    templates = F.pad(template.float(), (0, width // 2, 0, height // 2))
+    targets = F.pad(target.float(), (width // 2, 0, height // 2, 0))  # moved by half the size: no shift is negative
+    values = cross_correlate(torch.cat((templates, targets)), len(template), own, engine)
+    values = values[:, : 2 * (height // 2) + 1, : 2 * (width // 2) + 1]
     assert ((values - values.round()).abs() < 0.5).all()
-    for axis, (shift, side) in enumerate(zip(shifts, template.shape[1:]), 1):
-        place = [shift.tolist().index(s) for s in range(-(side // 2), side // 2 + 1)]
-        values = values.index_select(axis, torch.tensor(place, device=values.device))
     return values.round().long()
 
 
@@ -296,11 +298,11 @@ def test_cross_correlation_of_empty_images_is_zero(engine):
     assert not counts(~empty, empty, torch.tensor([0, 1]), engine).any()
 
 
-def test_fft_length_is_the_shortest_good_one_that_does_not_wrap():
-    smooth = sorted(2**a * 3**b * 5**c for a in range(12) for b in range(8) for c in range(6))
-    for size in range(1, 1025):
-        needed = size + size // 2
-        assert fft_length(size) == next(n for n in smooth if n >= needed and (n <= 64 or n % 8 == 0))
+def test_fast_lengths():
+    longest = 3 * 2**15 // 2  # an image of 2^15 pixels a side and the margin for its shifts
+    used = [n for n in FAST_LENGTHS if n <= longest]
+    assert used[0] == 8 and FAST_LENGTHS[len(used)] > longest
+    assert all(a < b <= 1.25 * a for a, b in zip(used, FAST_LENGTHS[1:]))
 
 
 @pytest.mark.cuda
