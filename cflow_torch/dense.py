@@ -12,8 +12,9 @@ from torch.profiler import record_function
 from cflow_torch.batch import Batch
 from cflow_torch.cluster import Clusters, cluster
 from cflow_torch.config import Config
-from cflow_torch.correlate import Images, best_shifts
+from cflow_torch.correlate import best_shifts
 from cflow_torch.density import cluster_by_density
+from cflow_torch.drawing import Images
 from cflow_torch.grid import Grid
 from cflow_torch.ops.indices import flat_nonzero
 from cflow_torch.pool import pool

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from cflow_torch.config import Config
-from cflow_torch.correlate import Images, best_shifts
+from cflow_torch.correlate import best_shifts
+from cflow_torch.drawing import Images
 from cflow_torch.ops.exact import exact_sqrt
 from cflow_torch.ops.segments import bounding_boxes
 

@@ -12,7 +12,8 @@ import torch
 from scenes import needs_gpu, same_bits
 
 from cflow_torch import reference as ref
-from cflow_torch.correlate import Images, best_shifts
+from cflow_torch.correlate import best_shifts
+from cflow_torch.drawing import Images
 
 ENGINES = ("fft", "conv")
 Job = Tuple[np.ndarray, int, Optional[float]]  # template, its target, radius

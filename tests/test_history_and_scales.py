@@ -8,7 +8,8 @@ import torch
 from scenes import assert_same, config, scene
 
 from cflow_torch import CorrelationFlow, Sweep, Window, make_config
-from cflow_torch.correlate import Images, best_shifts
+from cflow_torch.correlate import best_shifts
+from cflow_torch.drawing import Images
 
 
 def car(rng: np.random.Generator, x: float, seen: float = 4.5) -> np.ndarray:

@@ -35,6 +35,7 @@ LAYERS = {
     "cluster": 2,
     "correlate": 2,
     "density": 2,
+    "drawing": 2,
     "pool": 2,
     "sectional": 2,
     "reference": 2,
