@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import Any, List, Sequence, Tuple
+from typing import Any, List, Optional, Sequence, Tuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from cflow_torch.config import Config
-from cflow_torch.ego import compensate, relative_transform
+from cflow_torch.ego import compensate, rigid_transform
 from cflow_torch.grid import Grid
 from cflow_torch.inputs import (
     check_distance,
@@ -22,7 +23,7 @@ from cflow_torch.inputs import (
     source_sweeps,
 )
 from cflow_torch.ops.indices import flat_nonzero
-from cflow_torch.types import FlowResult, Window
+from cflow_torch.types import Sweep, Window
 
 # Working memory that a window takes before its clusters are known: positions, pixels and temporaries of a point;
 # occupancy and cluster of a pixel of every sweep.
@@ -32,11 +33,17 @@ _BYTES_PER_PIXEL = 10
 
 @dataclass(frozen=True)
 class Batch:
-    """The points that take part, of all sweeps of all windows one after the other: t+1, t, t-1, ... of each window.
+    """Points of all sweeps of all windows, sweep by sweep: t+1 of every window, then t of every window, then t-1, ...
+
+    Points that do not take part (not finite, ground, outside the region) are left out, but for those of pc0: all its
+    rows are here, so that results are read off without being scattered.
 
     Args:
-        positions: (3, P) float64, metres, frame of t+1 of the point's window; finite, not ground, inside the region.
-        image: (P,) int64, window * num_steps + step of each point; step 0 = sweep t+1, 1 = t, 2 = t-1, ...
+        positions: (A, P) float64, metres, frame of t+1 of the point's window; A = 2, x and y, where nothing asks for z,
+            else 3.
+        takes_part: (P,) bool, False = a row of pc0 that does not take part; its position means nothing.
+        image: (P,) int32, window * num_steps + step of each point; step 0 = sweep t+1, 1 = t, 2 = t-1, ...
+        num_newest: number of points of t+1, the first ones; they are never warped.
         num_windows: B.
         num_steps: S, 1 + the longest list of source sweeps.
         elapsed: (B, S) float64, sweep intervals from the sweep to t+1: the k that divides an estimate and
@@ -46,7 +53,9 @@ class Batch:
     """
 
     positions: Tensor
+    takes_part: Tensor
     image: Tensor
+    num_newest: int
     num_windows: int
     num_steps: int
     elapsed: Tensor
@@ -56,18 +65,14 @@ class Batch:
 
 @dataclass(frozen=True)
 class Source:
-    """pc0 of one window: all N rows of it, and which of the batch's points they are.
+    """pc0 of one window: its N rows.
 
     Args:
-        points: its points among the P points of the batch, Q of them.
-        row: (Q,) int64, their rows in pc0.
-        takes_part: (N,) bool.
+        points: where they are among the P points of the batch.
         pose_flow: (N, 3) float32.
     """
 
     points: slice
-    row: Tensor
-    takes_part: Tensor
     pose_flow: Tensor
 
 
@@ -124,35 +129,57 @@ def make_batch(windows: Sequence[Window], config: Config, grid: Grid, device: An
     chosen_device = choose_device(windows, device)
     kept = [source_sweeps(window, config) for window in windows]
     num_steps = 1 + max(len(sources) for sources in kept)
-    positions, sources = [], []
-    image, count, num_points = [], [], 0
     elapsed, seconds = np.zeros((2, len(windows), num_steps))
+    sweeps: List[Tuple[int, int, str, Sweep]] = []
     for index, (window, older) in enumerate(zip(windows, kept)):
         times = elapsed_times(window, older, config)
         elapsed[index, 1 : 1 + len(times)], seconds[index, 1 : 1 + len(times)] = zip(*times)
-        for step, (name, sweep, _) in enumerate([("pc1", window.pc1, 0), *older]):
-            raw = read_positions(sweep, chosen_device)
-            transform = None
-            if sweep.pose is not None and step > 0:
-                transform = relative_transform(window.pc1.pose, sweep.pose, f"pose of {name}")
-                check_distance(transform, name)
-            moved = compensate(raw, transform)
-            takes_part = grid.contains(moved)
-            if sweep.is_ground is not None:
-                takes_part &= ~read_ground(sweep, name, raw.shape[1], chosen_device)
-            row = flat_nonzero(takes_part)
-            if step == 1:
-                points = slice(num_points, num_points + row.numel())
-                sources.append(Source(points, row, takes_part, _pose_flow(raw, moved)))
-            positions.append(moved[:, row])
-            image.append(index * num_steps + step)
-            count.append(row.numel())
-            num_points += row.numel()
+        named = [("pc1", window.pc1), *((name, sweep) for name, sweep, _ in older)]
+        sweeps += [(step, index, name, sweep) for step, (name, sweep) in enumerate(named)]
+    sweeps.sort(key=lambda entry: entry[0])  # stable: all t+1, then all t, then what is older
+
+    # z is read only where something depends on it. A transform carries what is not finite into x and y.
+    has_poses = [window.pc1.pose is not None for window in windows]
+    to_ego1 = [
+        np.linalg.inv(rigid_transform(window.pc1.pose, "pose1")) if posed else None
+        for window, posed in zip(windows, has_poses)
+    ]
+    num_axes = 3 if config.sectional_view or config.clustering == "hdbscan" else 2
+    is_flat = math.isinf(grid.lower[2]) and math.isinf(grid.upper[2])
+    most = sum(sweep.points.shape[0] for _, _, _, sweep in sweeps)
+    positions = torch.empty((num_axes, most), dtype=torch.float64, device=chosen_device)
+    takes_part = torch.ones(most, dtype=torch.bool, device=chosen_device)
+    image = torch.empty(most, dtype=torch.int32, device=chosen_device)
+    start, num_newest, sources = 0, 0, []
+    for step, index, name, sweep in sweeps:
+        raw = read_positions(sweep, chosen_device)
+        transform = None
+        if step > 0 and to_ego1[index] is not None:
+            transform = to_ego1[index] @ rigid_transform(sweep.pose, f"pose of {name}")
+            check_distance(transform, name)
+        checked_axes = 2 if is_flat and transform is not None else 3
+        moved = compensate(raw, transform, 3 if step == 1 else max(num_axes, checked_axes))
+        inside = grid.contains(moved[:checked_axes])
+        if sweep.is_ground is not None:
+            inside &= ~read_ground(sweep, name, raw.shape[1], chosen_device)
+        if step == 1:
+            points = slice(start, start + raw.shape[1])
+            positions[:, points] = moved[:num_axes]
+            takes_part[points] = inside
+            sources.append(Source(points, _pose_flow(raw, moved, transform)))
+        else:
+            row = flat_nonzero(inside)
+            points = slice(start, start + row.numel())
+            for kept_values, values in zip(positions[:, points], moved):
+                torch.index_select(values, 0, row, out=kept_values)
+        image[points] = index * num_steps + step
+        start = points.stop
+        num_newest = start if step == 0 else num_newest
     return Batch(
-        positions=torch.cat(positions, 1),
-        image=torch.repeat_interleave(
-            torch.tensor(image, device=chosen_device), torch.tensor(count, device=chosen_device), output_size=num_points
-        ),
+        positions=positions[:, :start],
+        takes_part=takes_part[:start],
+        image=image[:start],
+        num_newest=num_newest,
         num_windows=len(windows),
         num_steps=num_steps,
         elapsed=torch.as_tensor(elapsed, device=chosen_device),
@@ -161,32 +188,12 @@ def make_batch(windows: Sequence[Window], config: Config, grid: Grid, device: An
     )
 
 
-def split_results(batch: Batch, residual_flow: Tensor, cluster_id: Tensor, score: Tensor) -> List[FlowResult]:
-    """Values of the points of the batch -> one full-length result per window, for all rows of its pc0.
-
-    Args:
-        batch: as made by `make_batch`.
-        residual_flow: (P, 3) float64, metres, axes of ego1.
-        cluster_id: (P,) int64, -1 = none.
-        score: (P,) float32.
-
-    Returns:
-        B results; rows that took no part have residual flow 0, cluster -1, score 0, is_valid False.
-    """
-    results = []
-    for source in batch.sources:
-        pose_flow, is_valid = source.pose_flow.clone(), source.takes_part.clone()
-        residual = torch.zeros_like(pose_flow).index_copy_(0, source.row, residual_flow[source.points].float())
-        cluster = torch.full_like(is_valid, -1, dtype=torch.int64).index_copy_(0, source.row, cluster_id[source.points])
-        scores = torch.zeros_like(is_valid, dtype=torch.float32).index_copy_(0, source.row, score[source.points])
-        results.append(FlowResult(residual, pose_flow, residual + pose_flow, cluster, scores, is_valid))
-    return results
-
-
-def _pose_flow(raw: Tensor, moved: Tensor) -> Tensor:
+def _pose_flow(raw: Tensor, moved: Tensor, transform: Optional[np.ndarray]) -> Tensor:
     """(N, 3) float32 T p - p; 0 for points that are not finite."""
-    if moved is raw:
-        return torch.zeros((raw.shape[1], 3), dtype=torch.float32, device=raw.device)
+    flow = torch.zeros((raw.shape[1], 3), dtype=torch.float32, device=raw.device)
+    if transform is None:
+        return flow
+    for axis in range(3):
+        flow[:, axis] = moved[axis] - raw[axis]
     # A point that is not finite has no finite coordinate after the transform.
-    flow = torch.empty((raw.shape[1], 3), dtype=torch.float32, device=raw.device)
-    return flow.copy_((moved - raw).t()).nan_to_num_(0.0, 0.0, 0.0)
+    return flow.nan_to_num_(0.0, 0.0, 0.0)

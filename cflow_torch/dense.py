@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Optional, Tuple
+from typing import Tuple
 
 import torch
 import torch.nn.functional as F
@@ -40,28 +40,30 @@ class CorrelationFlow(CoarseToFine):
 
     method = "dense"
 
-    def motion_at_scale(self, batch: Batch, flow: Optional[Tensor], grid: Grid) -> Motion:
+    def motion_at_scale(self, batch: Batch, grid: Grid) -> Motion:
         """One pass of Alg. general_correlation_flow, over points warped by the flow so far."""
         config = self.config
-        positions, occupancy, pixel = project(batch, flow, grid)
+        occupancy, place = project(batch, grid)
         with record_function("cluster"):
             if config.clustering == "hdbscan":
-                clusters, cluster_of_point = cluster_by_density(batch, positions, pixel, grid, config)
+                clusters, of_place = cluster_by_density(batch, batch.positions, place, grid, config)
+                place = torch.arange(place.numel(), device=place.device)  # clusters may share pixels
             else:
-                clusters, of_pixel = cluster(occupancy, grid.pixel_size, config)
-                cluster_of_point = of_pixel.index_select(0, pixel)
+                clusters, of_place = cluster(occupancy, grid.pixel_size, config)
         with record_function("correlate"):
             estimates, scores, available = correlate(clusters, batch, grid, config)
             if config.sectional_view:
                 step = batch.image % batch.num_steps
+                of_point = of_place.index_select(0, place)
                 estimates = add_sectional_view(
-                    estimates, available, positions, cluster_of_point, step, grid.pixel_size, config
+                    estimates, available, batch.positions, of_point, step, grid.pixel_size, config
                 )
         with record_function("pool"):
             per_interval = estimates / batch.elapsed[clusters.window, 1:].clamp(min=1)[:, :, None]
             newest = available.int().argmax(1, keepdim=True)
             return Motion(
-                cluster=cluster_of_point,
+                of_place=of_place,
+                place=place,
                 flow=F.pad(pool(per_interval, available) + 0.0, (0, 0, 0, 1)),  # + 0.0 turns -0.0 into 0.0
                 cluster_id=F.pad(clusters.id_in_window(), (0, 1), value=-1),
                 score=F.pad(scores.gather(1, newest)[:, 0], (0, 1)),

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Optional
-
 import torch
 import torch.nn.functional as F
-from torch import Tensor
 from torch.profiler import record_function
 
 from cflow_torch.batch import Batch
@@ -40,10 +37,10 @@ class CorrelationFlowKeypoints(CoarseToFine):
 
     method = "keypoints"
 
-    def motion_at_scale(self, batch: Batch, flow: Optional[Tensor], grid: Grid) -> Motion:
+    def motion_at_scale(self, batch: Batch, grid: Grid) -> Motion:
         """Sec. CorrelationFlow-Keypoints at one pixel size, over points warped by the flow so far."""
         config = self.config
-        _, occupancy, pixel = project(batch, flow, grid)
+        occupancy, pixel = project(batch, grid)
         with record_function("describe"):
             is_key_point = detect(occupancy)
             _, pc1 = describe(occupancy[:, 0], is_key_point[:, 0], config.patch_size)
@@ -60,7 +57,8 @@ class CorrelationFlowKeypoints(CoarseToFine):
             in_occupancy = dense.pixel + (dense.pixel // image_size + 1) * image_size
             of_pixel.scatter_(0, in_occupancy, dense.group.int())
             return Motion(
-                cluster=of_pixel.index_select(0, pixel),
+                of_place=of_pixel,
+                place=pixel,
                 flow=F.pad(dense.shift.flip(1) * grid.pixel_size + 0.0, (0, 1, 0, 1)),  # (dy, dx) -> (x, y, 0); no -0.0
                 cluster_id=F.pad(dense.number, (0, 1), value=-1),
                 score=F.pad(dense.score.float(), (0, 1)),

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, List, Optional, Sequence, Tuple
 
 import torch
 from torch import Tensor, nn
 from torch.profiler import record_function
 
-from cflow_torch.batch import Batch, make_batch, split_results, split_windows
+from cflow_torch.batch import Batch, make_batch, split_windows
 from cflow_torch.config import Config, make_config
 from cflow_torch.grid import Grid
 from cflow_torch.types import CFlowError, FlowResult, Window
@@ -20,16 +20,29 @@ class Motion:
     """What one scale found: clusters of points that share a flow. Entry M stands for "none": motion 0, id -1, score 0.
 
     Args:
-        cluster: (P,) int32 or int64, cluster of every point, M = none.
+        of_place: (Q,) int32 or int64, cluster of each place where a point can be, M = none.
+        place: (P,) int64, place of every point: of a point that is left out, one that belongs to no cluster.
         flow: (M + 1, 3) float64, metres per sweep interval, axes of ego1.
         cluster_id: (M + 1,) int64, number of the cluster counted from 0 in its window.
         score: (M + 1,) float32.
     """
 
-    cluster: Tensor
+    of_place: Tensor
+    place: Tensor
     flow: Tensor
     cluster_id: Tensor
     score: Tensor
+
+    def cluster(self, points: slice) -> Tensor:
+        """Cluster of each of some points, M = none."""
+        return self.of_place.index_select(0, self.place[points])
+
+    def flow_of(self, cluster: Tensor, num_axes: int) -> Tensor:
+        """(A, K) float64, x, y (and z) of the flow of points of these K clusters."""
+        flow = torch.empty((num_axes, cluster.numel()), dtype=torch.float64, device=cluster.device)
+        for values, of_cluster in zip(flow, self.flow.t().contiguous()):
+            torch.index_select(of_cluster, 0, cluster, out=values)
+        return flow
 
 
 class CoarseToFine(nn.Module):
@@ -68,12 +81,11 @@ class CoarseToFine(nn.Module):
         """
         return cls(make_config(preset, **{"method": cls.method, **overrides}), device)
 
-    def motion_at_scale(self, batch: Batch, flow: Optional[Tensor], grid: Grid) -> Motion:
+    def motion_at_scale(self, batch: Batch, grid: Grid) -> Motion:
         """Motion that is found at one pixel size.
 
         Args:
-            batch: points of all windows.
-            flow: (P, 3) float64, metres per sweep interval, flow so far of every point of every sweep; None = none yet.
+            batch: points of all windows, warped by the flow so far.
             grid: the BEV at this scale.
 
         Returns:
@@ -103,39 +115,84 @@ class CoarseToFine(nn.Module):
         return results
 
     def _flow(self, windows: Sequence[Window], grids: Sequence[Grid]) -> List[FlowResult]:
+        with record_function("compensate"):
+            batch = make_batch(windows, self.config, grids[0], self.device)
         with torch.inference_mode():  # a tenth faster than no_grad: the work is many small operations
-            with record_function("compensate"):
-                batch = make_batch(windows, self.config, grids[0], self.device)
-            motion = self.motion_at_scale(batch, None, grids[0])
-            flow = motion.flow.index_select(0, motion.cluster)
+            motion, flow = self.motion_at_scale(batch, grids[0]), None
             for grid in grids[1:]:
-                motion = self.motion_at_scale(batch, flow, grid)
-                flow = flow + motion.flow.index_select(0, motion.cluster)
+                with record_function("spread"):
+                    flow = _flow_so_far(batch, flow, motion)
+                    warped = warp(batch, flow, grid)
+                motion = self.motion_at_scale(warped, grid)
         # Outside of inference mode: results are ordinary tensors, which a training loop may use.
         with record_function("spread"):
-            cluster_id = motion.cluster_id.index_select(0, motion.cluster)
-            score = motion.score.index_select(0, motion.cluster)
-            return split_results(batch, flow, cluster_id, score)
+            return _results(batch, flow, motion)
 
 
-def project(batch: Batch, flow: Optional[Tensor], grid: Grid) -> Tuple[Tensor, Tensor, Tensor]:
-    """Warp every sweep by the flow so far and project it (Eq. 3d_to_bev): sweep m moves by (t+1-m) times its flow.
+def warp(batch: Batch, flow: Tensor, grid: Grid) -> Batch:
+    """Every sweep moved by the flow so far: sweep m by (t+1-m) times its flow, t+1 not at all.
+
+    Args:
+        batch: points of all windows, as `make_batch` gives them.
+        flow: (A, P - num_newest) float64, metres per sweep interval, of every point before t+1.
+        grid: the region; a point that has left it does not take part.
+
+    Returns:
+        The same points at other positions.
+    """
+    older = slice(batch.num_newest, None)
+    intervals = batch.elapsed.flatten().index_select(0, batch.image[older])
+    positions, takes_part = torch.empty_like(batch.positions), batch.takes_part.clone()
+    positions[:, : batch.num_newest] = batch.positions[:, : batch.num_newest]
+    warped = torch.mul(flow, intervals, out=positions[:, older])
+    warped += batch.positions[:, older]
+    takes_part[older] &= grid.contains(warped)
+    return replace(batch, positions=positions, takes_part=takes_part)
+
+
+def project(batch: Batch, grid: Grid) -> Tuple[Tensor, Tensor]:
+    """Eq. 3d_to_bev for every sweep of every window.
 
     Args:
         batch: points of all windows.
-        flow: (P, 3) float64, metres per sweep interval; None = no flow yet.
         grid: the BEV.
 
     Returns:
-        positions: (3, P) float64, metres, frame of t+1.
         occupancy: (B, S, H, W) bool.
-        pixel: (P,) int64, flat index into `occupancy`; its size for points that the flow moved out of the region.
+        pixel: (P,) int64, flat index into `occupancy`; its size for points that do not take part.
     """
     with record_function("project"):
-        positions, takes_part = batch.positions, None
-        if flow is not None:
-            k = batch.elapsed.flatten().index_select(0, batch.image)
-            positions = positions + k * flow.t()
-            takes_part = grid.contains(positions)
-        occupancy, pixel = grid.project(positions, batch.image, batch.num_windows * batch.num_steps, takes_part)
-        return positions, occupancy.unflatten(0, (batch.num_windows, batch.num_steps)), pixel
+        num_images = batch.num_windows * batch.num_steps
+        occupancy, pixel = grid.project(batch.positions, batch.image, num_images, batch.takes_part)
+        return occupancy.unflatten(0, (batch.num_windows, batch.num_steps)), pixel
+
+
+def _flow_so_far(batch: Batch, flow: Optional[Tensor], motion: Motion) -> Tensor:
+    """(A, P - num_newest) float64, metres per sweep interval, of every point before t+1: the sum over the scales."""
+    found = motion.flow_of(motion.cluster(slice(batch.num_newest, None)), len(batch.positions))
+    return found if flow is None else flow.add_(found)
+
+
+def _results(batch: Batch, flow: Optional[Tensor], motion: Motion) -> List[FlowResult]:
+    """One full-length result per window, for all rows of its pc0.
+
+    Args:
+        batch: as `make_batch` gives it.
+        flow: of all scales but the last, as `_flow_so_far` gives it; None = there is only one.
+        motion: what the last scale found.
+
+    Returns:
+        B results; rows that took no part have residual flow 0, cluster -1, score 0, is_valid False.
+    """
+    results = []
+    for source in batch.sources:
+        cluster = motion.cluster(source.points)
+        residual = torch.zeros_like(source.pose_flow)
+        for axis, values in enumerate(motion.flow_of(cluster, len(batch.positions))):
+            if flow is not None:
+                values += flow[axis, source.points.start - batch.num_newest : source.points.stop - batch.num_newest]
+            residual[:, axis] = values
+        cluster_id, score = (of_cluster.index_select(0, cluster) for of_cluster in (motion.cluster_id, motion.score))
+        is_valid = batch.takes_part[source.points].clone()
+        results.append(FlowResult(residual, source.pose_flow, residual + source.pose_flow, cluster_id, score, is_valid))
+    return results

@@ -202,7 +202,7 @@ def test_key_points_are_at_distance_one(av2_folder):
     settings = make_config("paper")
     grid = Grid(0.1, settings.point_cloud_range[:3], settings.point_cloud_range[3:])
     batch = make_batch([window_of(AV2Log(av2_folder), 0)], settings, grid)
-    images += list(grid.project(batch.positions, batch.image, 2)[0].numpy())
+    images += list(grid.project(batch.positions, batch.image, 2, batch.takes_part)[0].numpy())
     for image in images:
         distance = distance_transform_edt(np.pad(image, 1))[1:-1, 1:-1]  # outside the image is background
         np.testing.assert_array_equal(detect(torch.from_numpy(image)).numpy(), distance == 1)

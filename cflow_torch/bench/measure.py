@@ -157,7 +157,7 @@ def _measure_clustering(window: Window, config: Config, repeats: int, why_no_ope
     x0, y0, z0, x1, y1, z1 = config.point_cloud_range
     grid = Grid(config.pixel_sizes[-1], (x0, y0, z0), (x1, y1, z1))
     batch = make_batch([window], config, grid, device)
-    occupancy, _ = grid.project(batch.positions, batch.image, batch.num_steps)
+    occupancy, _ = grid.project(batch.positions, batch.image, batch.num_steps, batch.takes_part)
     images = [image.byte().cpu().numpy() for image in occupancy]
 
     def fast() -> None:
