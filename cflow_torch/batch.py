@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, List, Optional, Sequence, Tuple
+from typing import Any, List, Sequence, Tuple
 
 import numpy as np
 import torch
@@ -22,6 +22,7 @@ from cflow_torch.inputs import (
     read_positions,
     source_sweeps,
 )
+from cflow_torch.ops.chunks import chunks
 from cflow_torch.ops.indices import flat_nonzero
 from cflow_torch.types import Sweep, Window
 
@@ -152,29 +153,39 @@ def make_batch(windows: Sequence[Window], config: Config, grid: Grid, device: An
     image = torch.empty(most, dtype=torch.int32, device=chosen_device)
     start, num_newest, sources = 0, 0, []
     for step, index, name, sweep in sweeps:
-        raw = read_positions(sweep, chosen_device)
-        transform = None
+        num_points, first = sweep.points.shape[0], start
+        transform = is_ground = None
         if step > 0 and to_ego1[index] is not None:
             transform = to_ego1[index] @ rigid_transform(sweep.pose, f"pose of {name}")
             check_distance(transform, name)
-        checked_axes = 2 if is_flat and transform is not None else 3
-        moved = compensate(raw, transform, 3 if step == 1 else max(num_axes, checked_axes))
-        inside = grid.contains(moved[:checked_axes])
         if sweep.is_ground is not None:
-            inside &= ~read_ground(sweep, name, raw.shape[1], chosen_device)
+            is_ground = read_ground(sweep, name, num_points, chosen_device)
+        pose_flow = torch.zeros((num_points if step == 1 else 0, 3), dtype=torch.float32, device=chosen_device)
+        checked_axes = 2 if is_flat and transform is not None else 3
+        moved_axes = 3 if step == 1 else max(num_axes, checked_axes)
+        for rows in chunks(0, num_points, chosen_device):
+            raw = read_positions(sweep, chosen_device, rows)
+            moved = compensate(raw, transform, moved_axes)
+            inside = grid.contains(moved[:checked_axes])
+            if is_ground is not None:
+                inside &= ~is_ground[rows]
+            if step == 1:
+                points = slice(start, start + raw.shape[1])
+                positions[:, points] = moved[:num_axes]
+                takes_part[points] = inside
+                if transform is not None:
+                    _write_pose_flow(pose_flow[rows], raw, moved)
+            else:
+                row = flat_nonzero(inside)
+                points = slice(start, start + row.numel())
+                for values, of_axis in zip(positions[:, points], moved):
+                    torch.index_select(of_axis, 0, row, out=values)
+            start = points.stop
+        image[first:start] = index * num_steps + step
+        if step == 0:
+            num_newest = start
         if step == 1:
-            points = slice(start, start + raw.shape[1])
-            positions[:, points] = moved[:num_axes]
-            takes_part[points] = inside
-            sources.append(Source(points, _pose_flow(raw, moved, transform)))
-        else:
-            row = flat_nonzero(inside)
-            points = slice(start, start + row.numel())
-            for kept_values, values in zip(positions[:, points], moved):
-                torch.index_select(values, 0, row, out=kept_values)
-        image[points] = index * num_steps + step
-        start = points.stop
-        num_newest = start if step == 0 else num_newest
+            sources.append(Source(slice(first, start), pose_flow))
     return Batch(
         positions=positions[:, :start],
         takes_part=takes_part[:start],
@@ -188,12 +199,9 @@ def make_batch(windows: Sequence[Window], config: Config, grid: Grid, device: An
     )
 
 
-def _pose_flow(raw: Tensor, moved: Tensor, transform: Optional[np.ndarray]) -> Tensor:
+def _write_pose_flow(pose_flow: Tensor, raw: Tensor, moved: Tensor) -> None:
     """(N, 3) float32 T p - p; 0 for points that are not finite."""
-    flow = torch.zeros((raw.shape[1], 3), dtype=torch.float32, device=raw.device)
-    if transform is None:
-        return flow
     for axis in range(3):
-        flow[:, axis] = moved[axis] - raw[axis]
+        pose_flow[:, axis] = moved[axis] - raw[axis]
     # A point that is not finite has no finite coordinate after the transform.
-    return flow.nan_to_num_(0.0, 0.0, 0.0)
+    pose_flow.nan_to_num_(0.0, 0.0, 0.0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Tuple
+from typing import Optional, Tuple
 
 import torch
 import torch.nn.functional as F
@@ -18,7 +18,7 @@ from cflow_torch.drawing import Images
 from cflow_torch.grid import Grid
 from cflow_torch.ops.indices import flat_nonzero
 from cflow_torch.pool import pool
-from cflow_torch.pyramid import CoarseToFine, Motion, project
+from cflow_torch.pyramid import CoarseToFine, Motion, project, warp
 from cflow_torch.sectional import add_sectional_view
 
 
@@ -40,13 +40,18 @@ class CorrelationFlow(CoarseToFine):
 
     method = "dense"
 
-    def motion_at_scale(self, batch: Batch, grid: Grid) -> Motion:
+    def motion_at_scale(self, batch: Batch, flow: Optional[Tensor], grid: Grid) -> Motion:
         """One pass of Alg. general_correlation_flow, over points warped by the flow so far."""
         config = self.config
-        occupancy, place = project(batch, grid)
+        occupancy, place = project(batch, flow, grid)
+        positions = batch.positions
+        if flow is not None and len(positions) == 3:  # something needs more than the pixels
+            positions = torch.cat(
+                (positions[:, : batch.num_newest], warp(batch, flow, slice(batch.num_newest, None))), 1
+            )
         with record_function("cluster"):
             if config.clustering == "hdbscan":
-                clusters, of_place = cluster_by_density(batch, batch.positions, place, grid, config)
+                clusters, of_place = cluster_by_density(batch, positions, place, grid, config)
                 place = torch.arange(place.numel(), device=place.device)  # clusters may share pixels
             else:
                 clusters, of_place = cluster(occupancy, grid.pixel_size, config)
@@ -55,9 +60,7 @@ class CorrelationFlow(CoarseToFine):
             if config.sectional_view:
                 step = batch.image % batch.num_steps
                 of_point = of_place.index_select(0, place)
-                estimates = add_sectional_view(
-                    estimates, available, batch.positions, of_point, step, grid.pixel_size, config
-                )
+                estimates = add_sectional_view(estimates, available, positions, of_point, step, grid.pixel_size, config)
         with record_function("pool"):
             per_interval = estimates / batch.elapsed[clusters.window, 1:].clamp(min=1)[:, :, None]
             newest = available.int().argmax(1, keepdim=True)

@@ -85,11 +85,10 @@ def compensate(positions: Tensor, T_ego1_ego: Optional[np.ndarray], num_axes: in
     if T_ego1_ego is None:
         return positions[:num_axes]
     x, y, z = positions
-    result, term = torch.empty_like(positions[:num_axes]), torch.empty_like(x)
-    # Row by row, by plain numbers: seven times faster on the CPU than a broadcast matrix, and nothing to upload.
-    for moved, (r0, r1, r2, t) in zip(result, np.asarray(T_ego1_ego, dtype=np.float64).tolist()):
-        torch.mul(x, r0, out=moved)
-        moved += torch.mul(y, r1, out=term)
-        moved += torch.mul(z, r2, out=term)
-        moved += t
+    r0, r1, r2, t = torch.as_tensor(T_ego1_ego[:num_axes], dtype=torch.float64, device=x.device)[:, :, None].unbind(1)
+    result = r0 * x
+    term = r1 * y
+    result += term
+    result += torch.mul(r2, z, out=term)
+    result += t
     return result

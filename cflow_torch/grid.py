@@ -104,6 +104,13 @@ class Grid:
             occupancy: (B, H, W) bool.
             pixel: (N,) int64, flat index into `occupancy`; B * H * W for points that are left out.
         """
+        pixel = self.pixel_of_image(positions, image, num_images, takes_part).long()
+        return self.draw(pixel, num_images), pixel
+
+    def pixel_of_image(
+        self, positions: Tensor, image: Tensor, num_images: int, takes_part: Optional[Tensor] = None
+    ) -> Tensor:
+        """(N,) int32, or int64 if it must be: the pixel of every point, as in `project`."""
         nowhere = num_images * self.height * self.width
         pixel = self.pixel(positions)
         if nowhere > torch.iinfo(torch.int32).max:
@@ -111,6 +118,10 @@ class Grid:
         pixel.add_(image, alpha=self.height * self.width)
         if takes_part is not None:  # a product: masked_fill_ would take four times as long
             pixel.sub_(nowhere).mul_(takes_part.to(pixel.dtype)).add_(nowhere)
-        pixel = pixel.long()
-        occupancy = torch.zeros(nowhere + 1, dtype=torch.bool, device=pixel.device).index_fill_(0, pixel, True)
-        return occupancy[:-1].view(num_images, self.height, self.width), pixel
+        return pixel
+
+    def draw(self, pixel: Tensor, num_images: int) -> Tensor:
+        """(B, H, W) bool: the images that are set at these (N,) int64 pixels, as `project` numbers them."""
+        num_pixels = num_images * self.height * self.width
+        occupancy = torch.zeros(num_pixels + 1, dtype=torch.bool, device=pixel.device).index_fill_(0, pixel, True)
+        return occupancy[:-1].view(num_images, self.height, self.width)

@@ -160,9 +160,9 @@ def choose_device(windows: Sequence[Window], device: Any) -> torch.device:
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
-def read_positions(sweep: Sweep, device: torch.device) -> Tensor:
-    """(3, N) float64 copy of the first three columns; the input is never modified."""
-    columns = sweep.points[:, :3]
+def read_positions(sweep: Sweep, device: torch.device, rows: slice = slice(None)) -> Tensor:
+    """(3, N) float64 copy of the first three columns of some rows; the input is never modified."""
+    columns = sweep.points[rows, :3]
     if not isinstance(columns, Tensor):
         if device.type == "cpu":
             return torch.from_numpy(np.array(columns.T, dtype=np.float64, order="C"))

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Optional
+
 import torch
 import torch.nn.functional as F
+from torch import Tensor
 from torch.profiler import record_function
 
 from cflow_torch.batch import Batch
@@ -37,10 +40,10 @@ class CorrelationFlowKeypoints(CoarseToFine):
 
     method = "keypoints"
 
-    def motion_at_scale(self, batch: Batch, grid: Grid) -> Motion:
+    def motion_at_scale(self, batch: Batch, flow: Optional[Tensor], grid: Grid) -> Motion:
         """Sec. CorrelationFlow-Keypoints at one pixel size, over points warped by the flow so far."""
         config = self.config
-        occupancy, pixel = project(batch, grid)
+        occupancy, pixel = project(batch, flow, grid)
         with record_function("describe"):
             is_key_point = detect(occupancy)
             _, pc1 = describe(occupancy[:, 0], is_key_point[:, 0], config.patch_size)

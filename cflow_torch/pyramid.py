@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, List, Optional, Sequence, Tuple
 
 import torch
@@ -12,6 +12,7 @@ from torch.profiler import record_function
 from cflow_torch.batch import Batch, make_batch, split_windows
 from cflow_torch.config import Config, make_config
 from cflow_torch.grid import Grid
+from cflow_torch.ops.chunks import chunks
 from cflow_torch.types import CFlowError, FlowResult, Window
 
 
@@ -81,11 +82,12 @@ class CoarseToFine(nn.Module):
         """
         return cls(make_config(preset, **{"method": cls.method, **overrides}), device)
 
-    def motion_at_scale(self, batch: Batch, grid: Grid) -> Motion:
+    def motion_at_scale(self, batch: Batch, flow: Optional[Tensor], grid: Grid) -> Motion:
         """Motion that is found at one pixel size.
 
         Args:
-            batch: points of all windows, warped by the flow so far.
+            batch: points of all windows.
+            flow: (A, P) float64, metres per sweep interval, flow so far of every point before t+1; None = none yet.
             grid: the BEV at this scale.
 
         Returns:
@@ -118,43 +120,22 @@ class CoarseToFine(nn.Module):
         with record_function("compensate"):
             batch = make_batch(windows, self.config, grids[0], self.device)
         with torch.inference_mode():  # a tenth faster than no_grad: the work is many small operations
-            motion, flow = self.motion_at_scale(batch, grids[0]), None
+            motion, flow = self.motion_at_scale(batch, None, grids[0]), None
             for grid in grids[1:]:
                 with record_function("spread"):
                     flow = _flow_so_far(batch, flow, motion)
-                    warped = warp(batch, flow, grid)
-                motion = self.motion_at_scale(warped, grid)
+                motion = self.motion_at_scale(batch, flow, grid)
         # Outside of inference mode: results are ordinary tensors, which a training loop may use.
         with record_function("spread"):
             return _results(batch, flow, motion)
 
 
-def warp(batch: Batch, flow: Tensor, grid: Grid) -> Batch:
-    """Every sweep moved by the flow so far: sweep m by (t+1-m) times its flow, t+1 not at all.
-
-    Args:
-        batch: points of all windows, as `make_batch` gives them.
-        flow: (A, P - num_newest) float64, metres per sweep interval, of every point before t+1.
-        grid: the region; a point that has left it does not take part.
-
-    Returns:
-        The same points at other positions.
-    """
-    older = slice(batch.num_newest, None)
-    intervals = batch.elapsed.flatten().index_select(0, batch.image[older])
-    positions, takes_part = torch.empty_like(batch.positions), batch.takes_part.clone()
-    positions[:, : batch.num_newest] = batch.positions[:, : batch.num_newest]
-    warped = torch.mul(flow, intervals, out=positions[:, older])
-    warped += batch.positions[:, older]
-    takes_part[older] &= grid.contains(warped)
-    return replace(batch, positions=positions, takes_part=takes_part)
-
-
-def project(batch: Batch, grid: Grid) -> Tuple[Tensor, Tensor]:
-    """Eq. 3d_to_bev for every sweep of every window.
+def project(batch: Batch, flow: Optional[Tensor], grid: Grid) -> Tuple[Tensor, Tensor]:
+    """Warp every sweep by the flow so far and project it (Eq. 3d_to_bev).
 
     Args:
         batch: points of all windows.
+        flow: (A, P) float64, metres per sweep interval, see `warp`; None = no flow yet.
         grid: the BEV.
 
     Returns:
@@ -162,15 +143,41 @@ def project(batch: Batch, grid: Grid) -> Tuple[Tensor, Tensor]:
         pixel: (P,) int64, flat index into `occupancy`; its size for points that do not take part.
     """
     with record_function("project"):
-        num_images = batch.num_windows * batch.num_steps
-        occupancy, pixel = grid.project(batch.positions, batch.image, num_images, batch.takes_part)
-        return occupancy.unflatten(0, (batch.num_windows, batch.num_steps)), pixel
+        num_images, num_points = batch.num_windows * batch.num_steps, len(batch.image)
+        pixel = torch.empty(num_points, dtype=torch.int64, device=batch.image.device)
+        for points in chunks(0, batch.num_newest, pixel.device):
+            pixel[points] = grid.pixel_of_image(batch.positions[:, points], batch.image[points], num_images)
+        for points in chunks(batch.num_newest, num_points, pixel.device):
+            positions, takes_part = batch.positions[:, points], batch.takes_part[points]
+            if flow is not None:
+                positions = warp(batch, flow, points)
+                takes_part = grid.contains(positions).logical_and_(takes_part)
+            pixel[points] = grid.pixel_of_image(positions, batch.image[points], num_images, takes_part)
+        return grid.draw(pixel, num_images).unflatten(0, (batch.num_windows, batch.num_steps)), pixel
+
+
+def warp(batch: Batch, flow: Tensor, points: slice) -> Tensor:
+    """Points before t+1 moved by the flow so far: sweep m by (t+1-m) times its flow.
+
+    Args:
+        batch: points of all windows.
+        flow: (A, P) float64, metres per sweep interval; means nothing for points of t+1.
+        points: which; none of t+1.
+
+    Returns:
+        (A, K) float64, metres, frame of t+1.
+    """
+    intervals = batch.elapsed.flatten().index_select(0, batch.image[points])
+    return (flow[:, points] * intervals).add_(batch.positions[:, points])
 
 
 def _flow_so_far(batch: Batch, flow: Optional[Tensor], motion: Motion) -> Tensor:
-    """(A, P - num_newest) float64, metres per sweep interval, of every point before t+1: the sum over the scales."""
-    found = motion.flow_of(motion.cluster(slice(batch.num_newest, None)), len(batch.positions))
-    return found if flow is None else flow.add_(found)
+    """(A, P) float64, metres per sweep interval: the sum over the scales, of every point before t+1."""
+    total = torch.empty_like(batch.positions) if flow is None else flow
+    for points in chunks(batch.num_newest, len(batch.image), batch.image.device):
+        found = motion.flow_of(motion.cluster(points), len(batch.positions))
+        total[:, points] = found if flow is None else found.add_(flow[:, points])
+    return total
 
 
 def _results(batch: Batch, flow: Optional[Tensor], motion: Motion) -> List[FlowResult]:
@@ -190,7 +197,7 @@ def _results(batch: Batch, flow: Optional[Tensor], motion: Motion) -> List[FlowR
         residual = torch.zeros_like(source.pose_flow)
         for axis, values in enumerate(motion.flow_of(cluster, len(batch.positions))):
             if flow is not None:
-                values += flow[axis, source.points.start - batch.num_newest : source.points.stop - batch.num_newest]
+                values += flow[axis, source.points]
             residual[:, axis] = values
         cluster_id, score = (of_cluster.index_select(0, cluster) for of_cluster in (motion.cluster_id, motion.score))
         is_valid = batch.takes_part[source.points].clone()
