@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, List, Sequence, Tuple
+from typing import Any, Iterator, List, Optional, Sequence, Tuple
 
 import numpy as np
 import torch
@@ -138,58 +138,47 @@ def make_batch(windows: Sequence[Window], config: Config, grid: Grid, device: An
         named = [("pc1", window.pc1), *((name, sweep) for name, sweep, _ in older)]
         sweeps += [(step, index, name, sweep) for step, (name, sweep) in enumerate(named)]
     sweeps.sort(key=lambda entry: entry[0])  # stable: all t+1, then all t, then what is older
-
-    # z is read only where something depends on it. A transform carries what is not finite into x and y.
-    has_poses = [window.pc1.pose is not None for window in windows]
     to_ego1 = [
-        np.linalg.inv(rigid_transform(window.pc1.pose, "pose1")) if posed else None
-        for window, posed in zip(windows, has_poses)
+        None if window.pc1.pose is None else np.linalg.inv(rigid_transform(window.pc1.pose, "pose1"))
+        for window in windows
     ]
+
     num_axes = 3 if config.sectional_view or config.clustering == "hdbscan" else 2
-    is_flat = math.isinf(grid.lower[2]) and math.isinf(grid.upper[2])
     most = sum(sweep.points.shape[0] for _, _, _, sweep in sweeps)
     positions = torch.empty((num_axes, most), dtype=torch.float64, device=chosen_device)
     takes_part = torch.ones(most, dtype=torch.bool, device=chosen_device)
     image = torch.empty(most, dtype=torch.int32, device=chosen_device)
-    start, num_newest, sources = 0, 0, []
+    stop, num_newest, sources = 0, 0, []
     for step, index, name, sweep in sweeps:
-        num_points, first = sweep.points.shape[0], start
-        transform = is_ground = None
+        start, transform = stop, None
         if step > 0 and to_ego1[index] is not None:
             transform = to_ego1[index] @ rigid_transform(sweep.pose, f"pose of {name}")
             check_distance(transform, name)
-        if sweep.is_ground is not None:
-            is_ground = read_ground(sweep, name, num_points, chosen_device)
-        pose_flow = torch.zeros((num_points if step == 1 else 0, 3), dtype=torch.float32, device=chosen_device)
-        checked_axes = 2 if is_flat and transform is not None else 3
-        moved_axes = 3 if step == 1 else max(num_axes, checked_axes)
-        for rows in chunks(0, num_points, chosen_device):
-            raw = read_positions(sweep, chosen_device, rows)
-            moved = compensate(raw, transform, moved_axes)
-            inside = grid.contains(moved[:checked_axes])
-            if is_ground is not None:
-                inside &= ~is_ground[rows]
-            if step == 1:
-                points = slice(start, start + raw.shape[1])
+        if step == 1:
+            with torch.inference_mode(False):  # becomes part of the result
+                pose_flow = torch.zeros((sweep.points.shape[0], 3), dtype=torch.float32, device=chosen_device)
+            sources.append(Source(slice(start, start + len(pose_flow)), pose_flow))
+        for rows, raw, moved, inside in _pieces(
+            sweep, name, transform, 3 if step == 1 else num_axes, grid, chosen_device
+        ):
+            if step == 1:  # all rows
+                points = slice(stop, stop + inside.numel())
                 positions[:, points] = moved[:num_axes]
                 takes_part[points] = inside
                 if transform is not None:
                     _write_pose_flow(pose_flow[rows], raw, moved)
             else:
                 row = flat_nonzero(inside)
-                points = slice(start, start + row.numel())
-                for values, of_axis in zip(positions[:, points], moved):
+                points = slice(stop, stop + row.numel())
+                for values, of_axis in zip(positions[:, points].unbind(0), moved.unbind(0)):
                     torch.index_select(of_axis, 0, row, out=values)
-            start = points.stop
-        image[first:start] = index * num_steps + step
-        if step == 0:
-            num_newest = start
-        if step == 1:
-            sources.append(Source(slice(first, start), pose_flow))
+            stop = points.stop
+        image[start:stop] = index * num_steps + step
+        num_newest = stop if step == 0 else num_newest
     return Batch(
-        positions=positions[:, :start],
-        takes_part=takes_part[:start],
-        image=image[:start],
+        positions=positions[:, :stop],
+        takes_part=takes_part[:stop],
+        image=image[:stop],
         num_newest=num_newest,
         num_windows=len(windows),
         num_steps=num_steps,
@@ -199,9 +188,28 @@ def make_batch(windows: Sequence[Window], config: Config, grid: Grid, device: An
     )
 
 
+def _pieces(
+    sweep: Sweep, name: str, transform: Optional[np.ndarray], num_axes: int, grid: Grid, device: torch.device
+) -> Iterator[Tuple[slice, Tensor, Tensor, Tensor]]:
+    """A sweep piece by piece: rows; (3, N) positions as given; (A or 3, N) in the frame of t+1; (N,) takes part."""
+    num_points = sweep.points.shape[0]
+    is_ground = None if sweep.is_ground is None else read_ground(sweep, name, num_points, device)
+    # z matters where the region bounds it. After a transform, a z that is not finite has spoiled x and y as well.
+    is_flat = transform is not None and math.isinf(grid.lower[2]) and math.isinf(grid.upper[2])
+    checked_axes = 2 if is_flat else 3
+    matrix = None if transform is None else torch.as_tensor(transform, device=device)
+    for rows in chunks(0, num_points, device):
+        raw = read_positions(sweep, device, rows)
+        moved = compensate(raw, matrix, max(num_axes, checked_axes))
+        inside = grid.contains(moved[:checked_axes])
+        if is_ground is not None:
+            inside &= ~is_ground[rows]
+        yield rows, raw, moved, inside
+
+
 def _write_pose_flow(pose_flow: Tensor, raw: Tensor, moved: Tensor) -> None:
-    """(N, 3) float32 T p - p; 0 for points that are not finite."""
-    for axis in range(3):
-        pose_flow[:, axis] = moved[axis] - raw[axis]
+    """(N, 3) float32 T p - p; 0 for points that are not finite. Overwrites `raw`."""
+    for of_axis, difference in zip(pose_flow.unbind(1), torch.sub(moved, raw, out=raw).unbind(0)):
+        of_axis.copy_(difference)
     # A point that is not finite has no finite coordinate after the transform.
     pose_flow.nan_to_num_(0.0, 0.0, 0.0)

@@ -63,7 +63,7 @@ class Grid:
         largest = torch.finfo(positions.dtype).max
         inside, *others = (
             values.clamp(max(lower, -largest), min(upper, largest)).eq_(values)
-            for values, lower, upper in zip(positions, self.lower, self.upper)
+            for values, lower, upper in zip(positions.unbind(0), self.lower, self.upper)
         )
         for other in others:
             inside.mul_(other)

@@ -38,12 +38,11 @@ class Motion:
         """Cluster of each of some points, M = none."""
         return self.of_place.index_select(0, self.place[points])
 
-    def flow_of(self, cluster: Tensor, num_axes: int) -> Tensor:
-        """(A, K) float64, x, y (and z) of the flow of points of these K clusters."""
-        flow = torch.empty((num_axes, cluster.numel()), dtype=torch.float64, device=cluster.device)
-        for values, of_cluster in zip(flow, self.flow.t().contiguous()):
+    def flow_of(self, cluster: Tensor, out: Tensor) -> Tensor:
+        """Into `out`, (A, K) float64: x, y (and z) of the flow of points of these K clusters."""
+        for values, of_cluster in zip(out.unbind(0), self.flow.unbind(1)):
             torch.index_select(of_cluster, 0, cluster, out=values)
-        return flow
+        return out
 
 
 class CoarseToFine(nn.Module):
@@ -117,9 +116,9 @@ class CoarseToFine(nn.Module):
         return results
 
     def _flow(self, windows: Sequence[Window], grids: Sequence[Grid]) -> List[FlowResult]:
-        with record_function("compensate"):
-            batch = make_batch(windows, self.config, grids[0], self.device)
         with torch.inference_mode():  # a tenth faster than no_grad: the work is many small operations
+            with record_function("compensate"):
+                batch = make_batch(windows, self.config, grids[0], self.device)
             motion, flow = self.motion_at_scale(batch, None, grids[0]), None
             for grid in grids[1:]:
                 with record_function("spread"):
@@ -175,8 +174,11 @@ def _flow_so_far(batch: Batch, flow: Optional[Tensor], motion: Motion) -> Tensor
     """(A, P) float64, metres per sweep interval: the sum over the scales, of every point before t+1."""
     total = torch.empty_like(batch.positions) if flow is None else flow
     for points in chunks(batch.num_newest, len(batch.image), batch.image.device):
-        found = motion.flow_of(motion.cluster(points), len(batch.positions))
-        total[:, points] = found if flow is None else found.add_(flow[:, points])
+        part, cluster = total[:, points], motion.cluster(points)
+        if flow is None:
+            motion.flow_of(cluster, out=part)
+        else:
+            part += motion.flow_of(cluster, out=torch.empty_like(part))
     return total
 
 
@@ -194,11 +196,14 @@ def _results(batch: Batch, flow: Optional[Tensor], motion: Motion) -> List[FlowR
     results = []
     for source in batch.sources:
         cluster = motion.cluster(source.points)
-        residual = torch.zeros_like(source.pose_flow)
-        for axis, values in enumerate(motion.flow_of(cluster, len(batch.positions))):
-            if flow is not None:
-                values += flow[axis, source.points]
-            residual[:, axis] = values
+        if flow is None:
+            residual = motion.flow.float().index_select(0, cluster)
+        else:
+            before = flow[:, source.points]
+            residual = torch.zeros_like(source.pose_flow)
+            total = motion.flow_of(cluster, out=torch.empty_like(before)).add_(before)
+            for of_axis, values in zip(residual.unbind(1), total.unbind(0)):
+                of_axis.copy_(values)
         cluster_id, score = (of_cluster.index_select(0, cluster) for of_cluster in (motion.cluster_id, motion.score))
         is_valid = batch.takes_part[source.points].clone()
         results.append(FlowResult(residual, source.pose_flow, residual + source.pose_flow, cluster_id, score, is_valid))

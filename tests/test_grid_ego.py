@@ -9,6 +9,7 @@ import pytest
 import torch
 from scenes import pose
 
+from cflow_torch import CorrelationFlow, Sweep, Window
 from cflow_torch import reference as ref
 from cflow_torch.config import Config
 from cflow_torch.ego import compensate, relative_transform, rigid_transform
@@ -142,6 +143,43 @@ def test_projection_draws_every_point_that_takes_part():
     assert occupancy.shape == (2, 3, 4)
     assert occupancy.nonzero().tolist() == [[0, 0, 0], [1, 2, 3]]
     assert pixel.tolist() == [0, 12 + 11, 24, 0, 24]
+
+
+def test_x_and_y_alone_are_those_of_the_whole_transform_and_region():
+    rng = np.random.default_rng(3)
+    given = torch.from_numpy(rng.normal(0, 30, (3, 400)))
+    given[rng.integers(0, 3, 40), rng.integers(0, 400, 40)] = torch.tensor([np.nan, INF, -INF, np.nan] * 10).double()
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = random_rotation(rng), rng.normal(0, 5, 3)
+    whole, flat = compensate(given, T), compensate(given, torch.from_numpy(T), num_axes=2)
+    assert torch.equal(whole[:2].nan_to_num(7.0), flat.nan_to_num(7.0))
+    grid = Grid(0.5, (-20.0, -10.0, -INF), (10.0, 30.0, INF))
+    inside = grid.contains(whole)
+    assert 0 < inside.sum() < 400
+    assert torch.equal(inside, grid.contains(flat))  # what is not finite in z is not finite in x and y either
+
+
+@pytest.mark.parametrize("sectional_view", [False, True])
+def test_the_length_of_a_piece_changes_nothing(monkeypatch, sectional_view):
+    rng = np.random.default_rng(5)
+    car = rng.uniform((0, 0, 0), (4, 2, 1.5), (600, 3))
+    sweeps = []
+    for step, seconds in enumerate((0.1, 0.0, -0.1)):
+        points = np.concatenate((car + (2 + 6 * seconds, 1, 0), rng.uniform(-20, 20, (300, 3))))
+        points[step] = np.nan
+        pose = np.eye(4)
+        pose[0, 3] = 5 * seconds
+        sweeps.append(Sweep((points - pose[:3, 3]).astype(np.float32), rng.random(900) < 0.1, pose))
+    window = Window(sweeps[1], sweeps[0], (sweeps[2],))
+    small_region = (-15.0, -15.0, -10.0, 4.5, 15.0, 10.0)  # the car drives out of it
+    overrides = {"num_history": 2, "pixel_sizes": (0.4, 0.2), "point_cloud_range": small_region}
+    model = CorrelationFlow.from_preset("paper", **overrides, sectional_view=sectional_view)
+    whole = model([window, window])
+    monkeypatch.setattr("cflow_torch.ops.chunks.CHUNK_ON_CPU", 37)
+    for expected, found in zip(whole, model([window, window])):
+        assert expected.residual_flow.any()
+        for name, values in expected.numpy().items():
+            assert values.tobytes() == found.numpy()[name].tobytes(), name
 
 
 def test_a_grid_that_nobody_can_hold_is_refused():
