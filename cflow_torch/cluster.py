@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import reduce
 from typing import Tuple
 
 import torch
 from torch import Tensor
 
 from cflow_torch.config import Config
-from cflow_torch.ops.indices import flat_nonzero
-from cflow_torch.ops.labeling import connected_components, connected_components_kornia
-from cflow_torch.ops.morphology import dilate_3x3, dilate_3x3_kornia, erode_3x3, erode_3x3_kornia
-from cflow_torch.ops.segments import bounding_boxes, first_of_segment
+from cflow_torch.ops.indices import divide, flat_nonzero, split_index
+from cflow_torch.ops.labeling import connected_components_kornia, label_blocks, pad
+from cflow_torch.ops.morphology import close_3x3, dilate_3x3_kornia, erode_3x3_kornia
+from cflow_torch.ops.segments import bounding_boxes, first_of_segment, segment_ends
 
 
 @dataclass(frozen=True)
@@ -71,30 +72,43 @@ def cluster(occupancy: Tensor, pixel_size: float, config: Config) -> Tuple[Clust
 
     Source: Alg. clustering.
     """
-    num_windows, num_steps, height, width = occupancy.shape
-    aggregated = occupancy[:, 0].clone()
-    for index in range(1, num_steps):
-        aggregated |= occupancy[:, index]
+    _, num_steps, height, width = occupancy.shape
+    area = height * width
+    aggregated = pad(occupancy.unbind(1))
     pixels = flat_nonzero(aggregated)
-    window = pixels // (height * width)
-    raster = pixels - window * (height * width)
-    row_of_pixel = raster // width
-    component = label_components(aggregated, pixels, pixel_size, config)
+    padded_row, col = split_index(pixels, aggregated.shape[2])
+    window, row = split_index(padded_row, aggregated.shape[1])
+    places = _Places(pixels, padded_row, row, col)
+    component, num_components = _label(aggregated, height, width, places, pixel_size, config)
 
-    # Which sweeps saw each pixel. Components are named by their first pixel.
-    sweeps = torch.arange(num_steps, device=pixels.device)[:, None]
-    pixel_of_sweep = (window * num_steps + sweeps) * (height * width) + raster  # (S, P)
-    seen = flat_nonzero(occupancy.flatten().take(pixel_of_sweep))
-    step = seen // pixels.numel() if pixels.numel() else seen
-    pixel = seen - step * pixels.numel()
-    col_of_pixel = raster - row_of_pixel * width
-    place = (values.index_select(0, pixel) for values in (component, window, row_of_pixel, col_of_pixel))
-    of_component, of_window, row, col = place
-    clusters, number = keep_live(of_component, pixels.numel(), of_window, step, row, col)
+    # Which sweeps saw each pixel. Sweep m lies m images behind t+1.
+    place = torch.add(col, row, alpha=width).add_(window, alpha=num_steps * area)
+    images = occupancy.flatten()
+    seen = torch.stack([images[index * area :].index_select(0, place) for index in range(num_steps)])
+    newest, *older = seen.unbind(0)
+    before = reduce(torch.bitwise_or, older, torch.zeros_like(newest))
+    live = flat_nonzero(_can_move(component, num_components, newest, before))
+    first, last = (values.index_select(0, live) for values in segment_ends(pixels, component, num_components))
+    first, order = first.sort()
+    live, last = live.index_select(0, order), last.index_select(0, order)
+    left, right = (values.index_select(0, live) for values in segment_ends(col, component, num_components))
+    top, bottom = divide(first, aggregated.shape[2]), divide(last, aggregated.shape[2])
+    window_of_cluster, top_in_window = split_index(top, aggregated.shape[1])
+    cluster = _numbers(live, num_components).index_select(0, component)
 
+    member = flat_nonzero((cluster < live.numel()) & seen)
+    step, pixel = split_index(member, max(pixels.numel(), 1))
+    clusters = Clusters(
+        window_of_cluster,
+        torch.stack((top_in_window, left), 1),
+        torch.stack((bottom - top, right - left), 1).add_(1),
+        Pixels(cluster.index_select(0, pixel), step, row.index_select(0, pixel), col.index_select(0, pixel)),
+    )
     of_pixel = torch.empty(occupancy.numel() + 1, dtype=torch.int32, device=pixels.device)
-    of_pixel.scatter_(0, pixel_of_sweep.flatten(), number.index_select(0, component).int().repeat(num_steps))
-    of_pixel[-1] = clusters.window.numel()
+    number_of_pixel = cluster.int()
+    for index in range(num_steps):
+        of_pixel[index * area :].scatter_(0, place, number_of_pixel)
+    of_pixel[-1:] = live.numel()
     return clusters, of_pixel
 
 
@@ -110,8 +124,13 @@ def label_components(image: Tensor, pixels: Tensor, pixel_size: float, config: C
     Returns:
         (P,) int64: the position in `pixels` of the first (in raster order) pixel of the same component.
     """
-    component = _label_dilated(image, pixels, config)
-    return _split_oversized(image, pixels, component, pixel_size, config)
+    _, height, width = image.shape
+    padded = pad([image])
+    image_row, col = split_index(pixels, width)
+    window, row = split_index(image_row, height)
+    padded_row = torch.add(row, window, alpha=padded.shape[1])
+    places = _Places(torch.add(col, padded_row, alpha=padded.shape[2]), padded_row, row, col)
+    return first_of_segment(*_label(padded, height, width, places, pixel_size, config))
 
 
 def keep_live(
@@ -129,59 +148,87 @@ def keep_live(
         clusters: the M components that can move.
         number: (C,) int64, cluster of each component, M = none.
     """
-    seen = torch.zeros(2 * num_components, dtype=torch.bool, device=component.device)
-    seen.index_fill_(0, 2 * component + (step > 0), True)  # before, at t+1
-    live = flat_nonzero(seen.view(-1, 2).all(1))
-    num_clusters = live.numel()
-    number = torch.full((num_components,), num_clusters, dtype=torch.int64, device=component.device)
-    number.scatter_(0, live, torch.arange(num_clusters, device=component.device))
-
+    live = flat_nonzero(_can_move(component, num_components, step == 0, step > 0))
+    number = _numbers(live, num_components)
     cluster = number.index_select(0, component)
-    kept = flat_nonzero(cluster < num_clusters)
+    kept = flat_nonzero(cluster < live.numel())
     pixels = Pixels(*(values.index_select(0, kept) for values in (cluster, step, row, col)))
-    window_of_cluster = torch.zeros(num_clusters, dtype=torch.int64, device=component.device)
-    window_of_cluster.scatter_(0, pixels.cluster, window.index_select(0, kept))
-    return Clusters(
-        window_of_cluster, *bounding_boxes(pixels.row, pixels.col, pixels.cluster, num_clusters), pixels
-    ), number
+    window_of_cluster = torch.zeros_like(live).scatter_(0, pixels.cluster, window.index_select(0, kept))
+    boxes = bounding_boxes(pixels.row, pixels.col, pixels.cluster, live.numel())
+    return Clusters(window_of_cluster, *boxes, pixels), number
 
 
-def _label_dilated(image: Tensor, pixels: Tensor, config: Config) -> Tensor:
-    """Component of each occupied pixel after a 3 x 3 dilation."""
-    if config.labeling == "kornia":
-        return connected_components_kornia(dilate_3x3_kornia(image), pixels, config.connectivity)
-    return connected_components(image, pixels, config.connectivity, reach=3)
+def _can_move(component: Tensor, num_components: int, newest: Tensor, before: Tensor) -> Tensor:
+    """(C,) bool, which components were seen at t+1 and before.
+
+    Args:
+        component: (P,) int64.
+        num_components: C, more than the largest component.
+        newest, before: (P,) bool, whether the pixel was seen at t+1, in an earlier sweep; at least one of them.
+    """
+    # Pixels of a component that were seen only before, only at t+1, in both.
+    kind = newest.view(torch.uint8) + (newest & before).view(torch.uint8)
+    kind = torch.add(component, kind, alpha=num_components)
+    kinds = torch.zeros(3 * num_components, dtype=torch.bool, device=kind.device).index_fill_(0, kind, True)
+    only_before, only_newest, both = kinds.view(3, -1)
+    return (only_before & only_newest).logical_or_(both)
 
 
-def _split_oversized(image: Tensor, pixels: Tensor, component: Tensor, pixel_size: float, config: Config) -> Tensor:
-    """Erode components whose bounding box is longer than d^max and label what is left of them.
+def _numbers(live: Tensor, num_components: int) -> Tensor:
+    """(C,) int64, place of each component in `live` (M,), M = it is not there."""
+    number = torch.full((num_components,), live.numel(), dtype=torch.int64, device=live.device)
+    return number.scatter_(0, live, torch.arange(live.numel(), device=live.device))
+
+
+@dataclass(frozen=True)
+class _Places:
+    """Where the set pixels of padded images are.
+
+    Args:
+        pixel: (P,) int64, flat index.
+        padded_row: (P,) int64, row, counted through all images.
+        row, col: (P,) int64, row and column in the image.
+    """
+
+    pixel: Tensor
+    padded_row: Tensor
+    row: Tensor
+    col: Tensor
+
+
+def _label(
+    padded: Tensor, height: int, width: int, places: _Places, pixel_size: float, config: Config
+) -> Tuple[Tensor, int]:
+    """Component, under any name, of the set pixels of padded images of height x width, and more than the largest.
 
     All oversized components are eroded together: components of a dilated image do not share a 3 x 3 neighbourhood
     that lies in their union, so none sees another.
     """
-    _, height, width = image.shape
-    place = pixels % (height * width)
-    is_root = component == torch.arange(pixels.numel(), device=pixels.device)
-    segment = (is_root.cumsum(0) - 1).index_select(0, component)
-    first, size = bounding_boxes(place // width, place % width, segment, int(is_root.sum()))
-    border = torch.tensor([height - 1, width - 1], device=pixels.device)
-    last = torch.minimum(first + size, border)  # the dilation adds a pixel on every side, cut off at the border
-    extent = (last - (first - 1).clamp(min=0) + 1).amax(1)
-    oversized = flat_nonzero((extent.double() * pixel_size > config.max_extent)[segment])
-    if oversized.numel() == 0:
-        return component
+    dilated = dilate_3x3_kornia(padded) if config.labeling == "kornia" else padded
+    component, count = _components(dilated, places, 3, config)
+    top, bottom = segment_ends(places.row, component, count)
+    left, right = segment_ends(places.col, component, count)
+    # The dilation adds a pixel on every side, cut off at the border.
+    num_rows = bottom.clamp_(max=height - 2).sub_(top.clamp_(min=1))
+    num_cols = right.clamp_(max=width - 2).sub_(left.clamp_(min=1))
+    extent = torch.maximum(num_rows, num_cols).add_(3)
+    is_oversized = extent.double() * pixel_size > config.max_extent
+    if not is_oversized.any():
+        return component, count
 
-    alone = torch.zeros_like(image)
-    alone.view(-1)[pixels[oversized]] = True
+    oversized = is_oversized.index_select(0, component)
+    alone = torch.zeros_like(padded).view(-1).scatter_(0, places.pixel, oversized).view_as(padded)
     if config.labeling == "kornia":
-        closed = erode_3x3_kornia(dilate_3x3_kornia(alone))
-        part = connected_components_kornia(closed, pixels[oversized], config.connectivity)
+        closed = pad([erode_3x3_kornia(dilate_3x3_kornia(alone[:, :height, :width]))])
     else:
-        closed = erode_3x3(dilate_3x3(alone))
-        closed_pixels = flat_nonzero(closed)
-        part = connected_components(closed, closed_pixels, config.connectivity, reach=1)
-        part = part.index_select(0, torch.searchsorted(closed_pixels, pixels[oversized]))
-        part = first_of_segment(part, closed_pixels.numel())
-    component = component.clone()
-    component[oversized] = oversized[part]
-    return component
+        closed = close_3x3(alone, height, width)
+    part, num_parts = _components(closed, places, 1, config)
+    return torch.where(oversized, part.add_(count), component), count + num_parts
+
+
+def _components(padded: Tensor, places: _Places, reach: int, config: Config) -> Tuple[Tensor, int]:
+    """Component of pixels of padded images (kornia: dilated ones if `reach` is 3), and more than the largest."""
+    if config.labeling == "kornia":
+        return connected_components_kornia(padded, places.pixel, config.connectivity), places.pixel.numel()
+    blocks = label_blocks(padded, config.connectivity, reach)
+    return blocks.of_pixel(places.padded_row, places.col), blocks.num_components

@@ -86,7 +86,7 @@ def _same(a: Sweep, b: Sweep) -> bool:
         return True
     if a.points.shape != b.points.shape or (a.pose is None) != (b.pose is None):
         return False
-    if a.pose is not None and not np.array_equal(as_numpy(a.pose), as_numpy(b.pose)):
+    if a.pose is not None and b.pose is not None and not np.array_equal(as_numpy(a.pose), as_numpy(b.pose)):
         return False
     parts = (slice(_FIRST_POINTS), slice(None))
     return all(np.array_equal(as_numpy(a.points[rows]), as_numpy(b.points[rows]), equal_nan=True) for rows in parts)

@@ -13,10 +13,18 @@ from scipy.sparse import coo_matrix, csgraph
 
 from cflow_torch.ops import morphology
 from cflow_torch.ops.cross_correlation import FAST_LENGTHS, cross_correlate
-from cflow_torch.ops.labeling import connected_components, connected_components_kornia, union_find
+from cflow_torch.ops.indices import divide, split_index
+from cflow_torch.ops.labeling import connected_components, connected_components_kornia, pad, union_find
 from cflow_torch.ops.nearest import nearest_set_pixel
 from cflow_torch.ops.patches import gather_patches
-from cflow_torch.ops.segments import bounding_boxes, first_of_segment, masked_median, segment_amin, segment_median
+from cflow_torch.ops.segments import (
+    bounding_boxes,
+    first_of_segment,
+    masked_median,
+    segment_amin,
+    segment_ends,
+    segment_median,
+)
 from cflow_torch.types import CFlowError
 
 SQUARE = np.ones((3, 3), dtype=bool)
@@ -42,7 +50,7 @@ def label(images: np.ndarray, connectivity: int, reach: int, engine: str) -> np.
     pixels = occupancy.flatten().nonzero()[:, 0]
     if engine == "sparse":
         return connected_components(occupancy, pixels, connectivity, reach).numpy()
-    dense = morphology.dilate_3x3(occupancy) if reach == 3 else occupancy
+    dense = morphology.dilate_3x3_kornia(occupancy) if reach == 3 else occupancy
     return connected_components_kornia(dense, pixels, connectivity).numpy()
 
 
@@ -143,6 +151,19 @@ def test_components_never_join_across_images(reach, engine):
     assert label(images, 8, reach, engine).tolist() == np.repeat(np.arange(5) * 42, 42).tolist()
 
 
+@pytest.mark.parametrize("reach", [1, 3])
+@pytest.mark.parametrize("connectivity", [4, 8])
+def test_labelling_at_every_size(connectivity, reach):
+    """Blocks and margins fit images of any size: the last row and column are full, so every neighbour is asked for."""
+    rng = np.random.default_rng(connectivity + reach)
+    for height, width in [(n, 1 + (5 * n) % 26) for n in range(1, 27)]:
+        images = rng.random((3, height, width)) < 0.08
+        images[:, -1, rng.random(width) < 0.5] = images[:, rng.random(height) < 0.5, -1] = True
+        assert (
+            label(images, connectivity, reach, "sparse").tolist() == scipy_first(images, connectivity, reach).tolist()
+        )
+
+
 def test_labelling_without_kornia_union_find_says_what_to_do(monkeypatch):
     monkeypatch.delattr(contrib, "connected_components_union_find", raising=False)
     with pytest.raises(CFlowError, match="kornia >= 0.9.*sparse"):
@@ -172,36 +193,26 @@ def test_union_find_on_a_long_path(order):
 # ------------------------------------------------------------------------------------------------ morphology
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (1, 9), (8, 1), (2, 2), (13, 17), (3, 2, 11, 12), (0, 5, 5), (2, 0, 4)])
-def test_dilation_and_erosion_equal_scipy(shape):
+@pytest.mark.parametrize("shape", [(1, 1, 1), (1, 1, 9), (1, 8, 1), (2, 2, 2), (3, 13, 17), (2, 11, 12), (0, 5, 5)])
+def test_closing_dilation_and_erosion_equal_scipy(shape):
     rng = np.random.default_rng(len(shape))
-    for density in (0.0, 0.1, 0.7, 0.95, 1.0):
+    square = SQUARE[None]
+    for density in (0.0, 0.05, 0.1, 0.3, 0.5, 0.7, 0.95, 1.0):
         image = rng.random(shape) < density
-        before = image.copy()
         given = torch.from_numpy(image)
-        dilated, eroded = morphology.dilate_3x3(given).numpy(), morphology.erode_3x3(given).numpy()
-        square = SQUARE.reshape((1,) * (len(shape) - 2) + (3, 3))
+        padded = pad([given])
+        before = padded.clone()
+        found = morphology.close_3x3(padded, *shape[1:])
+        closed = found[:, : shape[1], : shape[2]]
+        assert found.shape == padded.shape and found.sum() == closed.sum()  # nothing in the margin
+        assert torch.equal(padded, before)
+        assert (closed | ~given).all()  # no pixel is lost
         if image.size:
-            assert (dilated == ndimage.binary_dilation(image, square)).all()
-            assert (eroded == ndimage.binary_erosion(image, square, border_value=1)).all()
-        assert dilated.shape == eroded.shape == image.shape
-        assert (image == before).all()
-
-
-def test_kornia_morphology_is_the_same():
-    rng = np.random.default_rng(3)
-    for shape in [(1, 1, 1), (2, 1, 9), (3, 8, 1), (4, 21, 34)]:
-        for density in (0.05, 0.5, 0.9, 1.0):
-            image = torch.from_numpy(rng.random(shape) < density)
-            assert torch.equal(morphology.dilate_3x3_kornia(image), morphology.dilate_3x3(image))
-            assert torch.equal(morphology.erode_3x3_kornia(image), morphology.erode_3x3(image))
-
-
-def test_closing_never_loses_a_pixel_at_the_border_neither():
-    image = torch.from_numpy(np.random.default_rng(4).random((6, 9, 9)) < 0.3)
-    image[:, 0] = True
-    closed = morphology.erode_3x3(morphology.dilate_3x3(image))
-    assert (closed | ~image).all()
+            dilated = ndimage.binary_dilation(image, square)
+            assert (closed.numpy() == ndimage.binary_erosion(dilated, square, border_value=1)).all()
+            assert (morphology.dilate_3x3_kornia(given).numpy() == dilated).all()
+            eroded = ndimage.binary_erosion(image, square, border_value=1)
+            assert (morphology.erode_3x3_kornia(given).numpy() == eroded).all()
 
 
 # -------------------------------------------------------------------------------------------------- segments
@@ -213,6 +224,23 @@ def test_segment_reductions():
     assert segment_amin(values, index, 6, 99).tolist() == [3, 99, -7, 99, 1, 99]
     assert [index[i] for i in first_of_segment(index, 6)] == index.tolist()
     assert first_of_segment(torch.tensor([3, 1, 3, 1, 0]), 4).tolist() == [0, 1, 0, 1, 4]
+
+
+def test_segment_ends():
+    index, values = torch.tensor([2, 0, 2, 4, 0]), torch.tensor([5, 3, -7, 1, 9])
+    first, last = segment_ends(values, index, 5)
+    assert first[[0, 2, 4]].tolist() == [3, -7, 1] and last[[0, 2, 4]].tolist() == [9, 5, 1]
+    assert (last < first)[[1, 3]].all() and (last - first < 0)[[1, 3]].all()
+
+
+def test_split_index():
+    index = torch.tensor([0, 1, 6, 7, 8, 2**40, 2**62 + 5])
+    for width in (1, 2, 7, 701, 2**31 + 1):
+        row, col = split_index(index, width)
+        assert [tuple(pair) for pair in zip(row.tolist(), col.tolist())] == [divmod(i, width) for i in index.tolist()]
+        assert torch.equal(divide(index, width), row) and row.dtype == torch.int64
+    assert [part.shape for part in split_index(index[:0], 3)] == [(0,), (0,)]
+    assert divide(torch.tensor(7), 2) == 3 and divide(torch.tensor(7), 2).shape == ()
 
 
 def test_bounding_boxes():

@@ -7,6 +7,9 @@ from typing import Tuple
 import torch
 from torch import Tensor
 
+# Ends of a segment without values: beyond any index, near enough to subtract.
+_FAR = 1 << 61
+
 
 def segment_amin(values: Tensor, index: Tensor, num_segments: int, empty: int) -> Tensor:
     """Smallest value of each segment.
@@ -21,6 +24,20 @@ def segment_amin(values: Tensor, index: Tensor, num_segments: int, empty: int) -
         (S,), dtype of `values`.
     """
     return values.new_full((num_segments,), empty).scatter_reduce_(0, index, values, "amin")
+
+
+def segment_ends(values: Tensor, index: Tensor, num_segments: int) -> Tuple[Tensor, Tensor]:
+    """Smallest and largest value of each segment.
+
+    Args:
+        values: (N,) int64, at most 2^61.
+        index, num_segments: as for `segment_amin`.
+
+    Returns:
+        first, last: (S,) int64; of a segment without values the last is far below the first.
+    """
+    last = values.new_full((num_segments,), -_FAR).scatter_reduce_(0, index, values, "amax")
+    return segment_amin(values, index, num_segments, _FAR), last
 
 
 def first_of_segment(index: Tensor, num_segments: int) -> Tensor:
@@ -43,20 +60,16 @@ def bounding_boxes(rows: Tensor, cols: Tensor, index: Tensor, num_segments: int)
     Args:
         rows, cols: (N,) int64 pixel coordinates.
         index: (N,) int64 segment of each pixel.
-        num_segments: S; every segment needs at least one pixel.
+        num_segments: S.
 
     Returns:
         first: (S, 2) int64, smallest (row, col).
-        size: (S, 2) int64, height and width.
+        size: (S, 2) int64, height and width; negative for a segment without pixels.
     """
-    if num_segments == 0:
-        return rows.new_zeros((0, 2)), rows.new_zeros((0, 2))
-    pixels = torch.stack((rows, cols), 1)
-    segment = index[:, None].expand(-1, 2)
-    limit = torch.iinfo(pixels.dtype)
-    first = pixels.new_full((num_segments, 2), limit.max).scatter_reduce_(0, segment, pixels, "amin")
-    last = pixels.new_full((num_segments, 2), limit.min).scatter_reduce_(0, segment, pixels, "amax")
-    return first, last - first + 1
+    # One value at a time: reducing rows of several values takes longer than that.
+    top, bottom = segment_ends(rows, index, num_segments)
+    left, right = segment_ends(cols, index, num_segments)
+    return torch.stack((top, left), 1), torch.stack((bottom - top, right - left), 1).add_(1)
 
 
 def masked_median(values: Tensor, mask: Tensor) -> Tensor:
