@@ -16,6 +16,8 @@ from cflow_torch.ops.window_counts import WindowCounts
 
 # Working memory of a job per sample of its class: spectra, counts, and what is looked up in them.
 _BYTES_PER_SAMPLE = 48
+_AT_ONCE_CPU, _IN_PART_CPU = 1 << 18, 1 << 21
+_AT_ONCE_GPU, _IN_PART_GPU = 1 << 26, 1 << 26
 
 
 def best_shifts(
@@ -95,16 +97,15 @@ def _correlated(
     place.scatter_(0, drawing.targets, torch.arange(place.numel(), device=place.device))
     own = place.index_select(0, own)
     blocks = drawing.samples.split([(j + n) * y * x for j, n, y, x, _ in drawing.classes])
+    at_once, in_part = _samples_at_once(own.device, max_memory)
     pending: List[Tensor] = []
     first_job = last_job = first_target = used = 0
     for block, (num_templates, num_targets, height, width, searched) in zip(blocks, drawing.classes):
         images = block.view(-1, height, width)
-        per_job = _BYTES_PER_SAMPLE * height * width
-        at_once = num_templates if max_memory is None else max(1, min(num_templates, int(max_memory) // per_job))
-        for begin in range(0, num_templates, at_once):
-            end = min(begin + at_once, num_templates)
-            needed = (end - begin) * per_job
-            if pending and max_memory is not None and used + needed > max_memory:
+        step = max(1, at_once // (height * width))
+        for begin in range(0, num_templates, step):
+            end = min(begin + step, num_templates)
+            if pending and used + (end - begin) * searched > in_part:
                 yield slice(first_job, last_job), pending
                 pending, first_job, used = [], last_job, 0
             wanted = own[last_job : last_job + end - begin] - first_target
@@ -113,11 +114,19 @@ def _correlated(
                 low, high = int(wanted[0]), int(wanted[-1])
                 some = torch.cat((images[begin:end], images[num_templates + low : num_templates + high + 1]))
                 wanted = wanted - low
-            pending.append(cross_correlate(some, end - begin, wanted, engine).flatten(1)[:, :searched])
+            pending.append(cross_correlate(some.float(), end - begin, wanted, engine).flatten(1)[:, :searched])
             last_job += end - begin
-            used += needed
+            used += (end - begin) * searched
         first_target += num_targets
     yield slice(first_job, last_job), pending
+
+
+def _samples_at_once(device: torch.device, max_memory: Optional[int]) -> Tuple[int, int]:
+    """Samples of templates that are correlated together, and of correlations that are looked through together."""
+    at_once, in_part = (_AT_ONCE_CPU, _IN_PART_CPU) if device.type == "cpu" else (_AT_ONCE_GPU, _IN_PART_GPU)
+    if max_memory is None:
+        return at_once, in_part
+    return tuple(min(number, int(max_memory) // _BYTES_PER_SAMPLE) for number in (at_once, in_part))
 
 
 def _candidates(

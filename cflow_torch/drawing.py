@@ -61,7 +61,7 @@ class Drawing:
     """Templates and targets drawn in the shape of their class, class after class, templates before targets.
 
     Args:
-        samples: (A,) float32 zeros and ones.
+        samples: (A,) bool.
         classes: of each class (templates, targets, Y, X, number of leading samples in which shifts are searched).
         jobs: (J,) int64, templates in the order in which they are drawn.
         targets: (N,) int64, targets in the order in which they are drawn.
@@ -123,7 +123,7 @@ def draw(
     pixel = row.mul_(stride.index_select(0, of_image).index_select(0, image)).add_(col)
     pixel += start.index_select(0, image)
     total = sum((templates + targets) * y * x for templates, targets, y, x, _ in classes)
-    samples = torch.zeros(total, dtype=torch.float32, device=pixel.device).index_fill_(0, pixel, 1.0)
+    samples = torch.zeros(total, dtype=torch.bool, device=pixel.device).index_fill_(0, pixel, True)
     is_job = order < num_jobs
     drawing = Drawing(
         samples,
