@@ -137,33 +137,52 @@ def test_batch_equals_loop_whatever_the_chunks(monkeypatch):
 def test_tiles_and_groups_do_not_show(monkeypatch):
     window, model = scene(63), CorrelationFlowKeypoints(settings_for(second_best_distance=2.0, mutual_check=True))
     (expected,) = model([window])
-    for tile, group in ((1, 1), (3, 2), (64, 40)):
-        monkeypatch.setattr(gating, "_TILE", tile)
-        monkeypatch.setattr(gating, "_GROUP", group)
+    for rows, cols, band, group in ((1, 1, 1, 1), (3, 2, 5, 2), (64, 9, 2, 40), (5, 200, 64, 7)):
+        for name, value in (("_TILE_ROWS", rows), ("_TILE_COLS", cols), ("_BAND", band), ("_GROUP", group)):
+            monkeypatch.setattr(gating, name, value)
         assert_same(model([window])[0], expected)
 
 
-def test_float32_and_float64_give_the_same_bits(monkeypatch):
+@pytest.mark.parametrize("precision", ["highest", "high", "medium"])
+@pytest.mark.parametrize("patch_size", [1, 3, 11, 13, 41, 51])
+def test_the_products_count_exactly(patch_size, precision):
+    generator = torch.Generator().manual_seed(patch_size)
+    descriptors = []
+    for number, density in ((7, 0.1), (9, 0.7)):
+        patch = torch.rand((number, patch_size**2), generator=generator) < density
+        patch[0], patch[1] = True, False
+        descriptors.append(patch.byte())
+    expected = (descriptors[0][:, None] & descriptors[1]).sum(2)
+    strips0, strips1 = matching._pack(descriptors[0], False), matching._pack(descriptors[1], True)
+    before = torch.get_float32_matmul_precision()
+    try:
+        torch.set_float32_matmul_precision(precision)
+        found = matching._overlap(strips0, torch.arange(8).view(2, 4), strips1, torch.arange(10).repeat(2))
+    finally:
+        torch.set_float32_matmul_precision(before)
+    found = found.reshape(8, 10) >> 7
+    assert torch.equal(found[:7, :9], expected.int()) and not found[7].any() and not found[:, 9].any()  # padding
+
+
+def test_few_contenders_a_time_give_the_same_bits(monkeypatch):
     window = scene(64)
-    for patch_size in (11, 13):
-        model = CorrelationFlowKeypoints(settings_for(patch_size=patch_size))
+    for overrides in ({"patch_size": 15}, {"ratio_threshold": 1.0}, {"ratio_threshold": 2.0, "mutual_check": True}):
+        model = CorrelationFlowKeypoints(settings_for(**overrides))
         (expected,) = model([window])
+        assert_same(expected, reference_flow(window, model.config))
         with monkeypatch.context() as patch:
-            patch.setattr(matching, "_FLOAT32_PATCH", 0)
+            patch.setattr(gating, "_PAIRS_AT_ONCE_CPU", 3)
+            patch.setattr(matching, "_STRIP_NUMBERS", 5)
             assert_same(model([window])[0], expected)
 
 
-def test_float32_tells_all_values_apart():
-    # Every count^2 / energy that a patch of 13 x 13 can give: as many float32 numbers as fractions.
-    largest = matching._FLOAT32_PATCH**2
-    count, energy = torch.meshgrid(torch.arange(1, largest + 1), torch.arange(1, largest + 1), indexing="ij")
-    below = count <= energy  # no more coincide than there are
-    count, energy = count[below], energy[below]
-    divisor = torch.gcd(count * count, energy)
-    fractions = torch.unique(torch.stack((count * count // divisor, energy // divisor)), dim=1).shape[1]
-    value = count.float() * count.float() / energy.float()
-    assert torch.unique(value).numel() == fractions
-    assert torch.equal((value * energy).round().long(), count * count)  # and the count comes back
+def test_different_values_are_told_apart_or_both_looked_at():
+    # count^2 / energy of the largest descriptors, twice as close as any two can be: float32 takes them for equal.
+    share = 1 - matching._ROUNDING
+    for count, energy in ((2601, 2601), (2600, 2599), (51, 2601), (1, 2601)):
+        value = torch.tensor(float(count * count)) / energy
+        below = torch.nextafter(value, torch.tensor(0.0))
+        assert below >= value * share and value.double() * (1 - 2**-22) >= (value * share).double()
 
 
 def test_order_of_points_does_not_matter():
@@ -244,6 +263,7 @@ def test_the_ratio_test_is_exact():
     assert shifts(pc0, pc1, ratio_threshold=1.0999) == {0: (0, 1)}
     assert shifts(pc0, pc1, ratio_threshold=1.1) == {}  # R = rho R' does not pass; 1.1 * 1.1 is not 1.21 in floats
     assert shifts(pc0, pc1, ratio_threshold=1.10004) == {}  # four decimals count
+    assert shifts(pc0, pc1, ratio_threshold=1.09996) == {}  # and are what is looked for
     # Second best 1 / 1.2^2 = 25 / 36 of the energy: 36 against 25 ones.
     pc0, pc1 = hand_made([[5, 5]], [bits(36)]), hand_made([[5, 6], [5, 9]], [bits(36), bits(25)])
     assert shifts(pc0, pc1, ratio_threshold=1.2) == {} and shifts(pc0, pc1, ratio_threshold=1.1999) == {0: (0, 1)}
@@ -282,9 +302,13 @@ def test_mutual_check():
 
 
 def test_the_gate_is_closed():
-    pc0 = hand_made([[50, 50]], [bits(9)])
-    for place, reach, inside in (([53, 54], 5.0, True), ([53, 54], 4.999, False), ([50, 50], 0.5, True)):
-        assert bool(shifts(pc0, hand_made([place], [bits(9)]), reach)) == inside
+    for corner in (50, 32_700):  # there and far from the corner of the image
+        pc0 = hand_made([[corner, corner]], [bits(9)])
+        for (dy, dx), reach, inside in (((3, 4), 5.0, True), ((3, 4), 4.999, False), ((0, 0), 0.5, True)):
+            assert bool(shifts(pc0, hand_made([[corner + dy, corner + dx]], [bits(9)]), reach)) == inside
+    assert shifts(hand_made([[0, 0]], [bits(9)]), hand_made([[32_700, 32_700]], [bits(9)]), 1e9) == {
+        0: (32_700, 32_700)
+    }
 
 
 def test_no_key_points():

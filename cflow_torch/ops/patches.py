@@ -21,15 +21,16 @@ def gather_patches(images: Tensor, image: Tensor, row: Tensor, col: Tensor, size
         patches: (K, L * L) uint8 zeros and ones, rows of the patch one after the other.
         energy: (K,) int64, number of ones in each.
 
-    Cost: K L^2 bytes and a few passes over the padded images; the patches of all pixels are never made.
+    Cost: K L^2 bytes, written a row of a patch at a time; the patches of all pixels are never made.
     """
     half = size // 2
     padded = F.pad(images.byte(), (half, half, half, half))
-    patches = padded.unfold(1, size, 1).unfold(2, size, 1)[image, row, col].flatten(1)
-    # A sum over patches would write them again as int64; the table of sums above and to the left needs four look-ups.
-    table = F.pad(padded.cumsum(1, dtype=torch.int32).cumsum(2, dtype=torch.int32), (1, 0, 1, 0))
-    height, width = table.shape[1:]
-    above = (image * height + row) * width + col
-    below = above + size * width
-    corners = table.take(torch.stack((below + size, below, above + size, above)))
-    return patches, (corners[0] - corners[1] - corners[2] + corners[3]).long()
+    _, height, width = padded.shape
+    runs = padded.flatten().unfold(0, size, 1)  # the `size` pixels from each one on, nothing is copied
+    first = (image * height + row) * width + col
+    rows = (first[:, None] + torch.arange(size, device=images.device) * width).flatten()
+    patches = runs.index_select(0, rows).view(-1, size * size)
+    # A sum over the patches would write them again as integers; a run is the difference of two sums over the image.
+    sums = F.pad(padded.flatten().cumsum(0, dtype=torch.int32), (1, 0))
+    energy = (sums[size:] - sums[:-size]).index_select(0, rows).view(-1, size).sum(1)
+    return patches, energy
