@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Iterator, List, Optional, Tuple
+from typing import Iterator, List, NamedTuple, Optional, Tuple
 
 import torch
 from torch import Tensor
@@ -18,6 +18,18 @@ from cflow_torch.ops.window_counts import WindowCounts
 _BYTES_PER_SAMPLE = 48
 _AT_ONCE_CPU, _IN_PART_CPU = 1 << 18, 1 << 21
 _AT_ONCE_GPU, _IN_PART_GPU = 1 << 26, 1 << 26
+
+
+class Correlation(NamedTuple):
+    """Correlations of n jobs of a class.
+
+    Args:
+        counts: (n, Y * X) float, to be rounded.
+        searched: number of leading samples that a shift may stand at.
+    """
+
+    counts: Tensor
+    searched: int
 
 
 def best_shifts(
@@ -85,8 +97,8 @@ def best_shifts(
 
 def _correlated(
     drawing: Drawing, own: Tensor, engine: str, max_memory: Optional[int]
-) -> Iterator[Tuple[slice, List[Tensor]]]:
-    """Runs of jobs, in drawing order, and the searched samples of their correlations, (n, samples) of n jobs a class.
+) -> Iterator[Tuple[slice, List[Correlation]]]:
+    """Runs of jobs, in drawing order, and their correlations, class by class.
 
     Args:
         drawing: the images.
@@ -98,7 +110,7 @@ def _correlated(
     own = place.index_select(0, own)
     blocks = drawing.samples.split([(j + n) * y * x for j, n, y, x, _ in drawing.classes])
     at_once, in_part = _samples_at_once(own.device, max_memory)
-    pending: List[Tensor] = []
+    pending: List[Correlation] = []
     first_job = last_job = first_target = used = 0
     for block, (num_templates, num_targets, height, width, searched) in zip(blocks, drawing.classes):
         images = block.view(-1, height, width)
@@ -110,11 +122,11 @@ def _correlated(
                 pending, first_job, used = [], last_job, 0
             wanted = own[last_job : last_job + end - begin] - first_target
             some = images
-            if end - begin < num_templates:  # jobs are sorted by target: a run of jobs needs a run of targets
-                low, high = int(wanted[0]), int(wanted[-1])
+            if end - begin < num_templates:  # a run of jobs needs a run of targets: both are in the order of clusters
+                low, high = int(wanted.min()), int(wanted.max())
                 some = torch.cat((images[begin:end], images[num_templates + low : num_templates + high + 1]))
                 wanted = wanted - low
-            pending.append(cross_correlate(some.float(), end - begin, wanted, engine).flatten(1)[:, :searched])
+            pending.append(Correlation(cross_correlate(some.float(), end - begin, wanted, engine).flatten(1), searched))
             last_job += end - begin
             used += (end - begin) * searched
         first_target += num_targets
@@ -124,13 +136,14 @@ def _correlated(
 def _samples_at_once(device: torch.device, max_memory: Optional[int]) -> Tuple[int, int]:
     """Samples of templates that are correlated together, and of correlations that are looked through together."""
     at_once, in_part = (_AT_ONCE_CPU, _IN_PART_CPU) if device.type == "cpu" else (_AT_ONCE_GPU, _IN_PART_GPU)
-    if max_memory is None:
-        return at_once, in_part
-    return tuple(min(number, int(max_memory) // _BYTES_PER_SAMPLE) for number in (at_once, in_part))
+    if max_memory is not None:
+        most = int(max_memory) // _BYTES_PER_SAMPLE
+        at_once, in_part = min(at_once, most), min(in_part, most)
+    return at_once, in_part
 
 
 def _candidates(
-    counts: List[Tensor], search: Search, target_energy: Tensor, radius: Optional[Tensor]
+    parts: List[Correlation], search: Search, target_energy: Tensor, radius: Optional[Tensor]
 ) -> Tuple[Tensor, Tensor, Tensor, Tensor]:
     """Shifts that may be the best of their job: (K,) job, dy, dx, count.
 
@@ -138,12 +151,13 @@ def _candidates(
     count^2 / target energy and count. What is below the largest of the lower bounds need not be looked at.
 
     Args:
-        counts: correlations of J jobs, (n, samples) float each; what stands at samples outside the search is ignored.
+        parts: correlations of J jobs; what stands at samples outside the search is ignored.
         search: of each job.
         target_energy: (J,) int64, pixels of each job's target.
         radius: (J,) float64, pixels; None = no limit.
     """
     # Two samples for a lower bound: no shift, and the largest count, moved into the search if it stands outside.
+    counts = [part.counts[:, : part.searched] for part in parts]
     largest = torch.cat([part.argmax(1) for part in counts])
     middle = search.low[:, 0] * search.stride + search.low[:, 1]
     dy, dx = search.shift(largest)
@@ -158,25 +172,38 @@ def _candidates(
     # 1 less, because counts are not rounded yet; counts of 0 are never better than no shift at all.
     needed = (bound * bound / target_energy - 1).clamp_(min=0.5)[:, None].split(sizes)
     place = flat_nonzero(torch.cat([(part > least).flatten() for part, least in zip(counts, needed)]))
-    value = torch.cat([part.flatten() for part in counts]).index_select(0, place)
     # Which job and sample each place is: n jobs of a class have as many samples each.
-    table = torch.tensor([(len(part), part.shape[1], part.numel()) for part in counts], device=place.device)
+    shape = [(len(part), part.shape[1]) for part in counts]
+    table = torch.tensor([(n, width, n * width) for n, width in shape], device=place.device)
     ends = table[:, 2].cumsum(0)
     kind = torch.searchsorted(ends, place, right=True)
-    first_job, length, first = torch.stack(
+    first_job, width, first = torch.stack(
         (table[:, 0].cumsum(0) - table[:, 0], table[:, 1], ends - table[:, 2])
     ).index_select(1, kind)
     within = place - first
-    in_class = within // length
-    job, sample = first_job + in_class, within - in_class * length
+    in_class = within // width
+    job, sample = first_job + in_class, within - in_class * width
+    count = torch.cat(
+        [
+            part.counts.view(-1).index_select(0, rows * part.counts.shape[1] + samples)
+            for part, rows, samples in zip(parts, *_split(place, ends, in_class, sample))
+        ]
+    )
     search = search.take(job)
     dy, dx = search.shift(sample)
     is_searched = (dy <= search.high[:, 0]) & (dx <= search.high[:, 1])
     if radius is not None:
         is_searched &= dy * dy + dx * dx <= square.index_select(0, job)
     kept = flat_nonzero(is_searched)
-    job, dy, dx, count = (values.index_select(0, kept) for values in (job, dy, dx, value.round_().long()))
+    job, dy, dx, count = (values.index_select(0, kept) for values in (job, dy, dx, count.round_().long()))
     return job, dy, dx, count
+
+
+def _split(place: Tensor, ends: Tensor, *values: Tensor) -> List[Tuple[Tensor, ...]]:
+    """Each of `values` in one piece per class."""
+    stops = torch.searchsorted(place, ends).tolist()
+    sizes = [stop - start for start, stop in zip([0, *stops], stops)]
+    return [value.split(sizes) for value in values]
 
 
 def _best_of_each_job(
