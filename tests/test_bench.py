@@ -10,8 +10,10 @@ import pytest
 import torch
 from scenes import RANGE, config, pose, scene
 
-from cflow_torch.bench import measure
-from cflow_torch.bench.measure import STAGES, run_bench
+from cflow_torch.bench import measure, timing
+from cflow_torch.bench.agreement import same_bits, share_agreement
+from cflow_torch.bench.measure import run_bench
+from cflow_torch.bench.stages import STAGES
 from cflow_torch.bench.table import format_bench
 from cflow_torch.config import Config
 from cflow_torch.data.av2 import AV2Log
@@ -162,7 +164,7 @@ def test_report_is_strict_json_with_the_promised_keys(report):
     assert list(report["results"]) == ["one", "history", "section", "keys"]
     keys = ["config", "fast", "stages_s", "opencv", "opencv_over_fast", "reference", "agreement", "clustering"]
     for result in report["results"].values():
-        assert list(result) == [*keys, "peak_extra_mb"]
+        assert list(result) == [*keys, "peak_extra_mb", "work"]
         assert 0 < result["fast"]["min_s"] <= result["fast"]["median_s"] <= result["fast"]["max_s"]
         assert set(result["stages_s"]) == set(STAGES[result["config"]["method"]])
         assert all(seconds > 0 for seconds in result["stages_s"].values())
@@ -171,6 +173,10 @@ def test_report_is_strict_json_with_the_promised_keys(report):
 def test_report_compares_flows(report):
     assert report["results"]["keys"]["agreement"]["reference"]["bit_equal"] is True
     assert report["results"]["keys"]["clustering"]["fast"] == "no clustering"
+    for name in ("one", "history", "section"):
+        clustering = report["results"][name]["clustering"]
+        for key in ("opencv_over_fast", "dilate_and_label_over_fast"):
+            assert clustering[key] > 0
     for name in ("one", "history"):
         agreement = report["results"][name]["agreement"]
         assert agreement["reference"]["bit_equal"] is True
@@ -185,43 +191,46 @@ def test_agreement_counts_points():
     flow[0, 0] += S  # one pixel
     flow[1, 1] -= 2 * S
     wrong = type(right)(**{**right.__dict__, "residual_flow": flow})
-    agreement = measure._agreement([right], [wrong], config())
+    agreement = share_agreement([right], [wrong], config())
     assert agreement["same_flow"] == pytest.approx(1 - 2 / len(flow))
     assert agreement["within_one_pixel"] == pytest.approx(1 - 1 / len(flow))
-    same = measure._same_bits([right], [wrong])
+    same = same_bits([right], [wrong])
     assert (same["bit_equal"], same["residual_flow"], same["score"]) == (False, False, True)
 
 
 def test_ratio_pairs_neighbouring_runs(monkeypatch):
     # Every second round of runs is ten times slower; OpenCV always takes three times as long.
     clock, calls = [0.0], []
-    monkeypatch.setattr(measure.time, "sleep", lambda _: None)
-    monkeypatch.setattr(measure.time, "perf_counter", lambda: clock[0])
+    monkeypatch.setattr(timing.time, "sleep", lambda _: None)
+    monkeypatch.setattr(timing.time, "perf_counter", lambda: clock[0])
 
     def run(name, seconds):
         calls.append(name)
         clock[0] += seconds * (10 if (len(calls) - 1) // 4 % 2 else 1)
 
-    fast, loop = measure._alternate([lambda: run("fast", 1.0), lambda: run("loop", 3.0)], 4)
+    fast, loop = timing.alternate([lambda: run("fast", 1.0), lambda: run("loop", 3.0)], 4)
     assert calls == ["fast", "fast", "loop", "loop"] * 6
     assert [b / a for a, b in zip(fast, loop)] == [3.0] * 4
+    assert timing.median_ratio(fast, loop) == 3.0
 
 
 def test_table_prints(report):
     text = format_bench(report)
     rows = [line for line in text.splitlines() if line.startswith("|")]
-    assert [row.split("|")[1].strip() for row in rows] == ["", "---", "one", "history", "section", "keys"] * 2
+    assert [row.split("|")[1].strip() for row in rows] == ["", "---", "one", "history", "section", "keys"] * 3
     assert len({row.count("|") for row in rows[:6]}) == 1
     median = report["results"]["one"]["fast"]["median_s"]
     assert f"| one | {1000 * median:.1f} |" in text
     assert "has no sectional view" in rows[4]
+    work = report["results"]["history"]["work"]
+    assert f"| history | {work['operations']} | {work['waits']} | {work['uploads']} |" in text
 
 
 def test_bench_without_opencv_and_reference(monkeypatch):
-    monkeypatch.setattr(measure, "_has_opencv", lambda: False)
+    monkeypatch.setattr(measure, "has_opencv", lambda: False)
     result = run_bench([moving_boxes()], {"one": config()}, repeats=1, with_reference=False)["results"]["one"]
     assert result["opencv"] == result["opencv_over_fast"] == result["agreement"]["opencv"] == "not installed"
-    assert result["clustering"]["opencv"] == "not installed"
+    assert result["clustering"]["opencv"] == result["clustering"]["dilate_and_label"] == "not installed"
     assert result["reference"] == result["agreement"]["reference"] == "not run"
 
 

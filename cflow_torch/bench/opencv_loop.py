@@ -159,9 +159,8 @@ def find_clusters(images: Sequence[np.ndarray], pixel_size: float, config: Confi
     for image in images[1:]:
         aggregated |= image
     height, width = aggregated.shape
-    dilated = cv2.dilate(aggregated, _SQUARE)
     # Boxes come from the occupied pixels: connectedComponentsWithStats takes six times as long as labelling alone.
-    count, labels = cv2.connectedComponents(dilated, connectivity=config.connectivity)
+    dilated, count, labels = dilate_and_label(aggregated, config.connectivity)
     pixel = np.flatnonzero(aggregated.view(bool))
     label = labels.ravel()[pixel]
     group = _grouped(pixel, label, width)
@@ -195,6 +194,13 @@ def find_clusters(images: Sequence[np.ndarray], pixel_size: float, config: Confi
     number.ravel()[pixel] = number_of_label[label]
     sizes = group.last_row - group.top + 1, group.last_col - group.left + 1
     return Clusters(number, np.stack([group.top, group.left, *sizes], 1)[by_raster].tolist())
+
+
+def dilate_and_label(aggregated: np.ndarray, connectivity: int) -> Tuple[np.ndarray, int, np.ndarray]:
+    """The two bare calls: (H, W) uint8 dilated image, number of labels, (H, W) int32 labels."""
+    cv2 = opencv()
+    dilated = cv2.dilate(aggregated, _SQUARE)
+    return (dilated, *cv2.connectedComponents(dilated, connectivity=connectivity))
 
 
 class Groups(NamedTuple):

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any, Dict, List
+from typing import Any, Dict, List, Mapping, Sequence
+
+from cflow_torch.bench.target_row import Row
 
 Report = Dict[str, Any]
 
 
 def format_bench(report: Report) -> str:
-    """The report as Markdown: the machine, a table of medians and ratios, a table of the stages.
+    """The report as Markdown: the machine, a table of medians and ratios, one of the stages, one of counts.
 
     Args:
         report: as made by `run_bench`.
@@ -38,7 +40,55 @@ def format_bench(report: Report) -> str:
         ["", *stages],
         [[name, *(_ms(result["stages_s"].get(stage, "")) for stage in stages)] for name, result in results.items()],
     )
+    lines += ["", "Work, counted without a clock, first window:", ""]
+    lines += _work(results)
     return "\n".join(lines)
+
+
+def format_targets(rows: Sequence[Row]) -> str:
+    """The table of targets.
+
+    Args:
+        rows: as made by `measure_targets`.
+
+    Returns:
+        Markdown without a line break at its end; "?" = not measured.
+
+    Convention: a ratio is the competitor's figure over ours.
+    """
+    cells = [
+        [row.what, _figure(row.ours, row.unit), row.competitor]
+        + [_figure(row.theirs, row.unit) if row.competitor else "", "" if row.ratio is None else f"{row.ratio:.2f}"]
+        + [row.target, "" if not row.target else "?" if row.met is None else "yes" if row.met else "NO", row.why]
+        for row in rows
+    ]
+    header = ["targets", "ours", "competitor", "its", "ratio", "target", "met", "why not"]
+    return "\n".join(_table(header, cells))
+
+
+def _figure(value: Any, unit: str) -> str:
+    return "" if value is None else f"{value:.1f} {unit}"
+
+
+def _work(results: Mapping[str, Report]) -> List[str]:
+    """Counts of every config, see `Work`."""
+    header = [
+        "",
+        "operations",
+        "waits",
+        "uploads",
+        "FFT samples, 10^6",
+        "multiply-adds, 10^6",
+        "MB allocated",
+        "MB held",
+    ]
+    rows = []
+    for name, result in results.items():
+        work = result["work"]
+        millions = (work[key] / 1e6 for key in ("fft_samples", "multiply_adds", "allocated_bytes", "peak_bytes"))
+        counts = (str(work[key]) for key in ("operations", "waits", "uploads"))
+        rows.append([name, *counts, *(f"{value:.1f}" for value in millions)])
+    return _table(header, rows)
 
 
 def _row(result: Report) -> List[str]:

@@ -1,4 +1,4 @@
-"""Times the method, stage by stage, against the reference and a plain OpenCV loop: a table and OUTPUT/bench.json.
+"""Times the method against its targets, its reference and a plain OpenCV loop: tables and OUTPUT/bench.json.
 
 cflow bench
 cflow bench data=av2 data.root=/data/av2/val/LOG repeats=50
@@ -7,18 +7,17 @@ cflow bench data=av2 data.root=/data/av2/val/LOG repeats=50
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 
 from omegaconf import DictConfig
 
 from cflow_torch.bench.measure import run_bench
-from cflow_torch.bench.table import format_bench
+from cflow_torch.bench.table import format_bench, format_targets
+from cflow_torch.bench.target_row import FULL
+from cflow_torch.bench.targets import measure_targets
 from cflow_torch.cli.run import finish, make_model, open_logs, write_text
 from cflow_torch.data.log import window
-
-# The full configuration of the paper's figure benefit_multiscale.
-_FULL_HISTORY = 4
-_FULL_SCALES = (0.8, 0.4, 0.3, 0.2, 0.1)
 
 
 def task(cfg: DictConfig) -> None:
@@ -28,27 +27,26 @@ def task(cfg: DictConfig) -> None:
     logs, failures = open_logs(cfg, output)
     finish(failures)
     config, log = model.config, logs[0]
+    history, scales = FULL.num_history, FULL.pixel_sizes
     longest = len(log.timestamps) - 2
-    index = min(max(_FULL_HISTORY, config.num_history), longest)
+    index = min(max(history, config.num_history), longest)
     configs = {
         "as configured": config,
         "twice the region": config.replace(point_cloud_range=[2 * bound for bound in config.point_cloud_range]),
     }
-    if config.method == "dense" and longest >= _FULL_HISTORY:
-        configs[f"h = {_FULL_HISTORY}"] = config.replace(num_history=_FULL_HISTORY)
-        full = config.replace(num_history=_FULL_HISTORY, pixel_sizes=_FULL_SCALES)
-        configs[f"h = {_FULL_HISTORY}, {len(_FULL_SCALES)} scales"] = full
+    if config.method == "dense" and longest >= history:
+        configs[f"h = {history}"] = config.replace(num_history=history)
+        configs[f"h = {history}, {len(scales)} scales"] = config.replace(num_history=history, pixel_sizes=scales)
     elif config.method == "dense":
-        print(f"log {log.log_id} has {longest + 2} sweeps: rows with h = {_FULL_HISTORY} need {_FULL_HISTORY + 2}")
-    result = run_bench(
-        [window(log, index, _FULL_HISTORY)],
-        configs,
-        repeats=cfg.repeats,
-        with_reference=cfg.reference,
-        with_opencv=cfg.opencv,
-        num_threads=cfg.num_threads,
-        device=cfg.device,
-    )
-    write_text(output / "bench.json", json.dumps(result, indent=2) + "\n")
+        print(f"log {log.log_id} has {longest + 2} sweeps: rows with h = {history} need {history + 2}")
+    sweeps = window(log, index, max(history, config.num_history))
+    settings = {"repeats": cfg.repeats, "num_threads": cfg.num_threads, "device": cfg.device}
+    result = run_bench([sweeps], configs, with_reference=cfg.reference, with_opencv=cfg.opencv, **settings)
     print(format_bench(result))
+    targets = measure_targets(
+        sweeps, result, batches=cfg.batches, with_opencv=cfg.opencv, with_hdbscan=cfg.hdbscan, **settings
+    )
+    print("\n" + format_targets(targets))
+    result["targets"] = [asdict(row) for row in targets]
+    write_text(output / "bench.json", json.dumps(result, indent=2) + "\n")
     print(f"written to {output / 'bench.json'}")

@@ -1,0 +1,69 @@
+"""Timed runs that can be compared: in turn, rested, on the same number of threads."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from contextlib import contextmanager
+from typing import Any, Callable, Dict, Iterator, List, Optional, Sequence
+
+import torch
+
+from cflow_torch.bench.machine import has_opencv
+from cflow_torch.bench.opencv_loop import opencv
+
+# Rest between two timed runs: worker threads of the library that ran before spin for some milliseconds after their
+# last job, and would take the cores from the other one. (A product of large matrices in the OpenCV loop, whose BLAS
+# threads spin longer than this, doubled the time of the fast path.)
+_REST_SECONDS = 0.02
+
+
+def alternate(runs: Sequence[Callable[[], Any]], repeats: int) -> List[List[float]]:
+    """Seconds of each of `repeats` runs, taken in turn after two rounds that do not count.
+
+    Every timed run follows an untimed one of the same kind (a A b B a A b B ...): frames come one after the other, and
+    right after the rest threads are asleep and memory belongs to the other.
+    """
+    times: List[List[float]] = [[] for _ in runs]
+    for repeat in range(-2, repeats):
+        for run, seconds in zip(runs, times):
+            time.sleep(_REST_SECONDS)
+            run()
+            start = time.perf_counter()
+            run()
+            if repeat >= 0:
+                seconds.append(time.perf_counter() - start)
+    return times
+
+
+def median_ratio(ours: Sequence[float], theirs: Sequence[float]) -> float:
+    """Theirs over ours, the median over neighbouring runs: a slow spell of the machine hits both. Above 1: we win."""
+    return statistics.median(b / a for a, b in zip(ours, theirs))
+
+
+def summary(seconds: Sequence[float]) -> Dict[str, float]:
+    """Median, least and most: `median_s`, `min_s`, `max_s`."""
+    return {"median_s": statistics.median(seconds), "min_s": min(seconds), "max_s": max(seconds)}
+
+
+def synchronise(tensor: torch.Tensor) -> None:
+    """Wait until the tensor is computed."""
+    if tensor.is_cuda:
+        torch.cuda.synchronize(tensor.device)
+
+
+@contextmanager
+def threads(num_threads: Optional[int]) -> Iterator[int]:
+    """The same number of threads for torch and OpenCV, None = as many as torch has now; as before afterwards."""
+    before, with_opencv = torch.get_num_threads(), has_opencv()
+    number = num_threads or before
+    opencv_before = opencv().getNumThreads() if with_opencv else 0
+    try:
+        torch.set_num_threads(number)
+        if with_opencv:
+            opencv().setNumThreads(number)
+        yield number
+    finally:
+        torch.set_num_threads(before)
+        if with_opencv:
+            opencv().setNumThreads(opencv_before)
