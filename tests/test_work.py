@@ -107,7 +107,8 @@ def test_points_in_the_same_pixels_add_no_work(name):
 
 @pytest.mark.parametrize("name", CONFIGS)
 def test_work_is_linear_in_windows(name):
-    # Dense: all windows go through the same operations, only sweeps arrive one by one. Key points are matched in portions.
+    # Dense: all windows go through the same operations, only sweeps arrive one by one. Key points are matched in
+    # portions.
     times, most = (2, 2.0) if CONFIGS[name].method == "keypoints" else (4, 1.5)
     one, many = counted(name), counted(name, num_windows=times)
     assert many.fft_samples == pytest.approx(times * one.fft_samples, rel=0.01)
