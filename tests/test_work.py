@@ -25,31 +25,31 @@ from cflow_torch.data.synthetic import make_drive
 # the same commit.
 CEILINGS: Dict[str, Dict[str, int]] = {
     "h = 0": {
-        "operations": 1_220,  # 1_113
-        "fft_samples": 948_000,  # 862_020
+        "operations": 890,  # 809
+        "fft_samples": 780_000,  # 708_798
         "multiply_adds": 0,  # 0
-        "allocated_bytes": 85_700_000,  # 77_895_718
-        "peak_bytes": 24_900_000,  # 22_633_492
-        "waits": 70,  # 64
-        "uploads": 18,  # 16
+        "allocated_bytes": 59_400_000,  # 53_966_015
+        "peak_bytes": 24_100_000,  # 21_868_578
+        "waits": 67,  # 61
+        "uploads": 10,  # 9
     },
     "h = 2, 2 scales": {
-        "operations": 2_550,  # 2_316
-        "fft_samples": 2_730_000,  # 2_480_064
+        "operations": 2_160,  # 1_964
+        "fft_samples": 2_180_000,  # 1_979_099
         "multiply_adds": 0,  # 0
-        "allocated_bytes": 247_000_000,  # 224_188_833
-        "peak_bytes": 63_500_000,  # 57_686_141
-        "waits": 128,  # 116
-        "uploads": 33,  # 30
+        "allocated_bytes": 158_000_000,  # 143_385_299
+        "peak_bytes": 53_600_000,  # 48_714_797
+        "waits": 133,  # 121
+        "uploads": 20,  # 18
     },
     "key points": {
-        "operations": 4_040,  # 3_669
+        "operations": 1_120,  # 1_014
         "fft_samples": 0,  # 0
-        "multiply_adds": 337_000_000,  # 306_104_832
-        "allocated_bytes": 199_000_000,  # 181_021_881
-        "peak_bytes": 25_200_000,  # 22_953_154
-        "waits": 113,  # 103
-        "uploads": 13,  # 12
+        "multiply_adds": 87_200_000,  # 79_227_776
+        "allocated_bytes": 148_000_000,  # 134_249_814
+        "peak_bytes": 26_600_000,  # 24_167_767
+        "waits": 47,  # 43
+        "uploads": 7,  # 6
     },
 }
 CONFIGS: Dict[str, Config] = {
@@ -96,8 +96,9 @@ def test_counts_stay_below_their_ceilings(name):
 
 
 @pytest.mark.parametrize("name", CONFIGS)
-def test_points_in_the_same_pixels_add_no_work(name):
-    once, thrice = counted(name), counted(name, repeat_points=3)
+def test_points_in_the_same_pixels_add_no_work(name, monkeypatch):
+    monkeypatch.setattr("cflow_torch.ops.chunks.CHUNK_ON_CPU", 1 << 30)  # points come in pieces, with operations each
+    once, thrice = (counted.__wrapped__(name, repeat_points=times) for times in (1, 3))
     for key in ("operations", "fft_samples", "multiply_adds", "waits", "uploads"):
         assert getattr(thrice, key) == getattr(once, key), key
     # Memory is that of the pixels and clusters plus so much per point.
@@ -111,8 +112,9 @@ def test_work_is_linear_in_windows(name):
     # portions.
     times, most = (2, 2.0) if CONFIGS[name].method == "keypoints" else (4, 1.5)
     one, many = counted(name), counted(name, num_windows=times)
-    assert many.fft_samples == pytest.approx(times * one.fft_samples, rel=0.01)
-    assert many.multiply_adds == pytest.approx(times * one.multiply_adds, rel=0.01)
+    # Pieces that fit the cache are cut elsewhere: a target at a cut is transformed twice, products are padded otherwise.
+    assert many.fft_samples == pytest.approx(times * one.fft_samples, rel=0.03)
+    assert many.multiply_adds == pytest.approx(times * one.multiply_adds, rel=0.06)
     assert many.peak_bytes <= (times + 0.1) * one.peak_bytes
     assert many.operations <= most * one.operations
     assert many.waits <= most * one.waits

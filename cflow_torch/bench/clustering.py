@@ -66,8 +66,8 @@ def measure_clustering(window: Window, config: Config, repeats: int, why_no_open
 
 def measure_hdbscan(window: Window, config: Config) -> Any:
     """Seconds of HDBSCAN on the points of all sweeps that take part, once; a text where it is not installed."""
-    _, batch = _batch(window, config, "cpu")
-    points = np.ascontiguousarray(batch.positions.t().numpy())
+    _, batch = _batch(window, config.replace(clustering="hdbscan"), "cpu")  # which needs z
+    points = np.ascontiguousarray(batch.positions[:, batch.takes_part].t().numpy())
     try:
         hdbscan_labels(points[: 5 * config.min_cluster_size], config.min_cluster_size)  # compiled and imported
         start = time.perf_counter()
