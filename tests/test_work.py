@@ -112,7 +112,7 @@ def test_work_is_linear_in_windows(name):
     # portions.
     times, most = (2, 2.0) if CONFIGS[name].method == "keypoints" else (4, 1.5)
     one, many = counted(name), counted(name, num_windows=times)
-    # Pieces that fit the cache are cut elsewhere: a target at a cut is transformed twice, products are padded otherwise.
+    # Pieces that fit the cache are cut elsewhere: a target at a cut is transformed twice, products are padded anew.
     assert many.fft_samples == pytest.approx(times * one.fft_samples, rel=0.03)
     assert many.multiply_adds == pytest.approx(times * one.multiply_adds, rel=0.06)
     assert many.peak_bytes <= (times + 0.1) * one.peak_bytes
