@@ -30,6 +30,9 @@ from cflow_torch.types import Sweep, Window
 # occupancy and cluster of a pixel of every sweep.
 _BYTES_PER_POINT = 160
 _BYTES_PER_PIXEL = 10
+# What windows of a group may take on a CPU where `max_memory` says nothing: about 9 of a pair, 4 of six sweeps. Fresh
+# pages of larger arrays cost more than the operations that larger groups save (windows/s in docs/benchmarks).
+_BYTES_ON_CPU = 1 << 29
 
 
 @dataclass(frozen=True)
@@ -77,22 +80,26 @@ class Source:
     pose_flow: Tensor
 
 
-def split_windows(windows: Sequence[Window], config: Config, grid: Grid) -> List[List[Window]]:
+def split_windows(windows: Sequence[Window], config: Config, grid: Grid, device: Any = "auto") -> List[List[Window]]:
     """Windows in groups that fit `max_memory`, in order. The result of a window does not depend on its group.
 
     Args:
         windows: B windows; an empty list gives no group.
-        config: `max_memory`; None = one group.
+        config: `max_memory`; None = one group, or groups of `_BYTES_ON_CPU`.
         grid: the finest scale, whose images are the largest.
+        device: as for `make_batch`; on a CPU large groups only cost more.
 
     Returns:
         Groups of at least one window.
 
     Raises:
-        CFlowError: not a list of windows.
+        CFlowError: not a list of windows, a device that cannot be used.
     """
     check_windows(windows)
     groups: List[List[Window]] = []
+    limit = config.max_memory
+    if limit is None and choose_device(windows, device).type == "cpu":
+        limit = _BYTES_ON_CPU
     used = 0
     per_point = _BYTES_PER_POINT
     if config.method == "keypoints":  # descriptors: two copies of L^2 bytes for at most half of the points
@@ -101,7 +108,7 @@ def split_windows(windows: Sequence[Window], config: Config, grid: Grid) -> List
         sweeps = (window.pc1, window.pc0, *window.pch)
         points = sum(sweep.points.shape[0] for sweep in sweeps)
         needed = per_point * points + (_BYTES_PER_PIXEL * len(sweeps) + 30) * grid.height * grid.width
-        if not groups or (config.max_memory is not None and used + needed > config.max_memory):
+        if not groups or (limit is not None and used + needed > limit):
             groups.append([])
             used = 0
         groups[-1].append(window)

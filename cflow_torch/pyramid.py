@@ -111,7 +111,7 @@ class CoarseToFine(nn.Module):
         lower, upper = config.point_cloud_range[:3], config.point_cloud_range[3:]
         grids = [Grid(size, lower, upper) for size in config.pixel_sizes]
         results: List[FlowResult] = []
-        for part in split_windows(windows, config, grids[-1]):
+        for part in split_windows(windows, config, grids[-1], self.device):
             results += self._flow(part, grids)
         return results
 

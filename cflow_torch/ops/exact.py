@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -21,8 +22,15 @@ def exact_sqrt(x: Tensor) -> Tensor:
     Returns:
         (...) float64, the double nearest to the square root.
 
-    Cost: some twenty elementwise operations; meant for one number per cluster, not per pixel.
+    Cost: one pass on the CPU, by NumPy, whose root is the processor's; elsewhere some twenty elementwise operations.
     """
+    if x.device.type == "cpu":
+        return torch.from_numpy(np.asarray(np.sqrt(x.numpy())))  # asarray: of no dimension it would be a number
+    return corrected_sqrt(x)
+
+
+def corrected_sqrt(x: Tensor) -> Tensor:
+    """`exact_sqrt` from the root that the device has, off by a unit in the last place or not. Same arguments."""
     root = x.sqrt()
     # x - root^2 without rounding error (Dekker's product): which neighbour of `root` is nearest?
     high = root * _SPLIT
