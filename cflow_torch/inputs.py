@@ -17,6 +17,7 @@ _LONGEST_GAP = 2.5
 _FARTHEST_POSE = 100.0
 # Sweeps that differ at all differ in their first points: those are compared before the whole clouds are.
 _FIRST_POINTS = 64
+_ALL_ROWS = slice(None)
 
 
 def check_windows(windows: Any) -> None:
@@ -160,7 +161,7 @@ def choose_device(windows: Sequence[Window], device: Any) -> torch.device:
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
-def read_positions(sweep: Sweep, device: torch.device, rows: slice = slice(None)) -> Tensor:
+def read_positions(sweep: Sweep, device: torch.device, rows: slice = _ALL_ROWS) -> Tensor:
     """(3, N) float64 copy of the first three columns of some rows; the input is never modified."""
     columns = sweep.points[rows, :3]
     if not isinstance(columns, Tensor):
