@@ -114,6 +114,9 @@ class Config:
             raise CFlowError(
                 f"ratio_threshold={self.ratio_threshold}: give a number from 1 to {LARGEST_RATIO}, for example 1.1"
             )
+        for name in ("sweep_interval", "gate_radius"):
+            if math.isinf(getattr(self, name)):
+                raise CFlowError(f"{name}={getattr(self, name)}: give a finite number")
         if self.second_best_distance != 0:
             _positive("second_best_distance", self.second_best_distance)
         for name in ("sectional_view", "use_timestamps", "mutual_check"):

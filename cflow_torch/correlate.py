@@ -67,7 +67,7 @@ def best_shifts(
     """
     num_jobs = target_of_job.numel()
     if num_jobs == 0:
-        return size.new_zeros((0, 2)), torch.zeros(0, device=size.device)
+        return size.new_zeros((0, 2)), torch.zeros(0, dtype=torch.float32, device=size.device)
     low, high = search_bounds(size, target_of_job, radius)
     search, drawing = draw(template, target, target_of_job, size, low, high)
     jobs = drawing.jobs

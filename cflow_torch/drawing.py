@@ -10,11 +10,14 @@ from torch import Tensor
 
 from cflow_torch.ops.cross_correlation import FAST_LENGTHS
 from cflow_torch.ops.indices import flat_nonzero
+from cflow_torch.types import CFlowError
 
 # Images that fit are laid out as one line of this many samples, whatever their height and width: most clusters are
 # small, and few classes mean few kernel launches. Larger images are rare; they keep two dimensions, whose transforms
 # cost less than those of a line, and have classes of their own by height and width.
 _LINES = (144, 576, 2304, 9216)  # square clusters of 8, 16, 32, 64 pixels
+# Shifts of longer images would not fit the one number that orders them, see `best_shifts`.
+LONGEST_SIDE = 1 << 15
 # Classes are numbered by height and width of their images, both below this.
 _BASE = 1 << 17
 
@@ -78,7 +81,9 @@ def search_bounds(size: Tensor, target_of_job: Tensor, radius: Optional[Tensor])
     low = size // 2
     high = size - 1 - low
     if radius is not None:
-        reach = low.new_zeros(len(size)).scatter_reduce_(0, target_of_job, radius.floor().long(), "amax")[:, None]
+        reach = low.new_zeros(len(size)).scatter_reduce_(
+            0, target_of_job, radius.clamp(max=LONGEST_SIDE).floor().long(), "amax"
+        )[:, None]
         low, high = torch.minimum(low, reach), torch.minimum(high, reach)
     return low, high
 
@@ -96,10 +101,10 @@ def draw(
     lines = torch.tensor(_LINES, device=size.device)
     line = torch.searchsorted(lines, rows * width)
     is_line = line < len(_LINES)
-    fast = torch.tensor(FAST_LENGTHS, device=size.device)
-    height = torch.where(is_line, 1, fast.take(torch.searchsorted(fast, rows)))
+    fast, last_fast = torch.tensor(FAST_LENGTHS, device=size.device), len(FAST_LENGTHS) - 1
+    height = torch.where(is_line, 1, fast.take(torch.searchsorted(fast, rows).clamp(max=last_fast)))
     in_line = lines.take(line.clamp(max=len(_LINES) - 1))
-    length = torch.where(is_line, in_line, fast.take(torch.searchsorted(fast, width)))
+    length = torch.where(is_line, in_line, fast.take(torch.searchsorted(fast, width).clamp(max=last_fast)))
     stride = torch.where(is_line, width, length)
 
     keys, class_of_target = torch.unique(height * _BASE + length, return_inverse=True)
@@ -107,7 +112,9 @@ def draw(
     kind = torch.cat((2 * class_of_target.index_select(0, target_of_job), 2 * class_of_target + 1))
     last = (low + high)[:, 0] * stride + (low + high)[:, 1]
     searched = torch.zeros_like(keys).scatter_reduce_(0, class_of_target, last + 1, "amax")
-    listed = torch.cat((keys, searched, torch.bincount(kind, minlength=2 * num_classes))).tolist()
+    images = torch.bincount(kind, minlength=2 * num_classes)
+    *listed, longest = torch.cat((keys, searched, images, size.max()[None])).tolist()
+    _check_length(longest)
     numbers = listed[2 * num_classes :]
     classes = [
         (*numbers[2 * c : 2 * c + 2], *divmod(listed[c], _BASE), listed[num_classes + c]) for c in range(num_classes)
@@ -132,3 +139,11 @@ def draw(
         order.index_select(0, flat_nonzero(~is_job)) - num_jobs,
     )
     return Search(low, high, stride), drawing
+
+
+def _check_length(longest: int) -> None:
+    if longest > LONGEST_SIDE:
+        raise CFlowError(
+            f"a cluster is {longest} pixels long in one view (at most {LONGEST_SIDE}): is there a point far above or "
+            "below? Give finite z bounds in point_cloud_range, or larger pixel_sizes"
+        )

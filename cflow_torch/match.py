@@ -240,13 +240,14 @@ def _overlap(patch0: Sequence[Tensor], member: Tensor, patch1: Sequence[Tensor],
         (G, S, C) int32.
     """
     num_groups, size = member.shape
-    right = torch.empty((candidate.numel(), patch1[0].shape[1]), device=member.device)  # used again: new memory is slow
+    width = patch1[0].shape[1]
+    right = torch.empty((candidate.numel(), width), dtype=torch.float32, device=member.device)  # new memory is slow
     product = right.new_empty((num_groups, size, candidate.numel() // num_groups))
 
     def of_strip(strip0: Tensor, strip1: Tensor) -> Tensor:
         left = strip0.index_select(0, member.flatten()).float().view(num_groups, size, -1)
         right.copy_(strip1.index_select(0, candidate))
-        torch.bmm(left, right.view(num_groups, -1, right.shape[1]).transpose(1, 2), out=product)
+        torch.bmm(left, right.view(num_groups, -1, width).transpose(1, 2), out=product)
         return product.int().bitwise_and_(_COUNT_BITS)
 
     return reduce(Tensor.add_, map(of_strip, patch0, patch1))

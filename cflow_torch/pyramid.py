@@ -12,6 +12,7 @@ from torch.profiler import record_function
 from cflow_torch.batch import Batch, make_batch, split_windows
 from cflow_torch.config import Config, make_config
 from cflow_torch.grid import Grid
+from cflow_torch.inputs import check_windows, choose_device
 from cflow_torch.ops.chunks import chunks
 from cflow_torch.types import CFlowError, FlowResult, Window
 
@@ -111,8 +112,11 @@ class CoarseToFine(nn.Module):
         lower, upper = config.point_cloud_range[:3], config.point_cloud_range[3:]
         grids = [Grid(size, lower, upper) for size in config.pixel_sizes]
         results: List[FlowResult] = []
-        for part in split_windows(windows, config, grids[-1], self.device):
-            results += self._flow(part, grids)
+        check_windows(windows)
+        device = choose_device(windows, self.device)
+        with torch.autocast(device.type, enabled=False):  # counts would lose bits
+            for part in split_windows(windows, config, grids[-1], device):
+                results += self._flow(part, grids)
         return results
 
     def _flow(self, windows: Sequence[Window], grids: Sequence[Grid]) -> List[FlowResult]:

@@ -63,6 +63,8 @@ INF = math.inf
         ("ratio_threshold", "big"),
         ("ratio_threshold", None),
         ("gate_radius", 0),
+        ("gate_radius", float("inf")),
+        ("sweep_interval", float("inf")),
         ("max_memory", 0),
         ("max_memory", "1GB"),
         ("sectional_view", "no"),

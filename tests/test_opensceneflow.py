@@ -34,6 +34,7 @@ from cflow_torch.cli.main import main
 from cflow_torch.config import Config
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.hdf5 import HDF5Log, write_hdf5_scene
+from cflow_torch.data.hdf5.frames import recognized_extrinsics
 from cflow_torch.data.hdf5.writer import write_index_files
 from cflow_torch.data.log import FlowLabels, window
 from cflow_torch.evaluation import SceneFlowMetrics
@@ -797,8 +798,6 @@ def log_pose(folder: Path, index: int) -> np.ndarray:
     ids=["av2-sensor", "av2-ego", "another-set"],
 )
 def test_auto_recognizes_argoverse(height: float, first_stamp: int, recognized: bool, tmp_path: Path) -> None:
-    from cflow_torch.data.hdf5.frames import recognized_extrinsics
-
     store(tmp_path, SmallDrive(0, first_stamp, height))
     settings = {**VARIANTS["dense"], "point_cloud_range": [-8, -7, -10, 8, 7, 10]}
     raw = osf.load(tmp_path, 5, 6)
@@ -835,6 +834,36 @@ def plain_scores(results: Dict[str, Any]) -> Dict[str, float]:
 
     walk("", results)
     return found
+
+
+def test_auto_takes_a_time_stamp_as_a_tensor() -> None:
+    points = torch.tensor([[[5.0, 0.0, -2.0], [6.0, 0.0, -2.0], [6.0, 1.0, float("nan")], [7.0, 0.0, 0.5]]])
+    batch = {
+        "pc0": points,
+        "pc1": points,
+        "gm0": torch.tensor([[True, True, True, False]]),
+        "gm1": torch.tensor([[True, True, True, False]]),
+        "pose0": pose_matrix()[None],
+        "pose1": torch.eye(4)[None],
+    }
+    flows = [
+        CFlow(num_frames=2, ego_T_lidar="auto")({**batch, "timestamp": stamp})["flow"][0]
+        for stamp in (["315966070559696000"], torch.tensor([315966070559696000]), torch.tensor([1]))
+    ]
+    assert torch.equal(flows[0], flows[1]) and not torch.equal(flows[0], flows[2])
+
+
+def test_ground_without_height_recognizes_nothing() -> None:
+    points = np.full((4, 3), np.nan, np.float32)
+    found = recognized_extrinsics(315_966_070_559_696_000, points, np.ones(4, bool))
+    assert np.array_equal(found, np.eye(4))
+
+
+def pose_matrix() -> torch.Tensor:
+    """A turn, so that it matters where the LiDAR sits."""
+    pose = torch.eye(4)
+    pose[:2, :2] = torch.tensor([[0.995004165, -0.099833417], [0.099833417, 0.995004165]])
+    return pose
 
 
 @pytest.mark.parametrize("points_frame", ["ego", "sensor"])

@@ -60,8 +60,7 @@ def _fft_dtype(images: Tensor) -> torch.dtype:
     # The number of samples bounds the norms without looking at the images (no synchronisation).
     samples = images.shape[1] * images.shape[2]
     error = _FFT_ERROR_MARGIN * torch.finfo(torch.float32).eps * math.log2(samples)
-    # At least 4 of 9 samples are the margin that keeps shifts from wrapping.
-    if error * samples / 2 <= _FFT_LARGEST_ERROR:
+    if error * samples <= _FFT_LARGEST_ERROR:
         return torch.float32
     largest = float(images.sum((1, 2)).max()) if len(images) else 0.0
     return torch.float32 if error * largest <= _FFT_LARGEST_ERROR else torch.float64

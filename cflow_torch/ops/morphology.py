@@ -77,7 +77,7 @@ def dilate_3x3_kornia(image: Tensor) -> Tensor:
     """
     from kornia.morphology import dilation
 
-    return dilation(image[:, None].float(), torch.ones(3, 3, device=image.device))[:, 0] > 0.5
+    return dilation(image[:, None].float(), torch.ones(3, 3, dtype=torch.float32, device=image.device))[:, 0] > 0.5
 
 
 def erode_3x3_kornia(image: Tensor) -> Tensor:
@@ -91,4 +91,4 @@ def erode_3x3_kornia(image: Tensor) -> Tensor:
     """
     from kornia.morphology import erosion
 
-    return erosion(image[:, None].float(), torch.ones(3, 3, device=image.device))[:, 0] > 0.5
+    return erosion(image[:, None].float(), torch.ones(3, 3, dtype=torch.float32, device=image.device))[:, 0] > 0.5

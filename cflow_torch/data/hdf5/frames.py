@@ -55,9 +55,11 @@ def recognized_extrinsics(timestamp: int, points: np.ndarray, is_ground: Optiona
         log are not in its file: take them from `calibration/egovehicle_SE3_sensor.feather`. All other sets: the
         identity (nuScenes and ZOD have poses of the sensor, Waymo and TruckScenes points in the ego frame).
     """
-    if not is_argoverse2(timestamp) or is_ground is None or not is_ground.any():
+    if not is_argoverse2(timestamp) or is_ground is None:
         return np.eye(4)
-    if np.median(points[is_ground, 2]) > _ARGOVERSE2_SENSOR_GROUND:
+    height = points[is_ground, 2]
+    height = height[np.isfinite(height)]
+    if len(height) == 0 or np.median(height) > _ARGOVERSE2_SENSOR_GROUND:
         return np.eye(4)
     return _ARGOVERSE2_EGO_T_UP_LIDAR.copy()
 

@@ -113,7 +113,8 @@ def _extrinsics(batch: Mapping[str, Any], b: int, ego_T_lidar: Any) -> Optional[
         return None  # training batches have neither ground nor its mask
     is_ground = _mask(batch, "gm0", b)
     points = _entry(batch, "origin_pc0" if "origin_pc0" in batch else "pc0", b)
-    stamp = str(_entry(batch, "timestamp", b))
+    stamp = _entry(batch, "timestamp", b)
+    stamp = str(stamp.item() if isinstance(stamp, Tensor) and stamp.numel() == 1 else stamp)
     if is_ground.numel() != len(points) or not stamp.isdigit():
         return None
     found = recognized_extrinsics(int(stamp), points.cpu().numpy(), is_ground.cpu().numpy())

@@ -98,7 +98,8 @@ class CFlow(nn.Module):
         self._say_short(samples, num_history)
         results = self.estimator([sample.window for sample in samples])
         out: Dict[str, List[Tensor]] = {}
-        with torch.no_grad():
+        device = results[0].flow.device if results else torch.device("cpu")
+        with torch.no_grad(), torch.autocast(device.type, enabled=False):
             for b, (sample, result) in enumerate(zip(samples, results)):
                 for key, value in self._answer(batch, b, sample, result).items():
                     out.setdefault(key, []).append(value)
