@@ -114,7 +114,9 @@ class _Operations(TorchDispatchMode):
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Tuple[Any, ...] = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
-        if _is_composite(func):  # in inference mode these come undivided
+        # In inference mode composite operations come undivided. One with a number is one operation with a tensor, which
+        # torch 2.0 would hand the number all the same.
+        if _is_composite(func) and func._overloadname != "Scalar":
             with self:
                 return func.decompose(*args, **kwargs)
         result = func(*args, **kwargs)
