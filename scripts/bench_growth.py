@@ -2,7 +2,7 @@
 """How time grows: with points in the same pixels, with occupied area, with windows in a batch.
 
   OMP_NUM_THREADS=1 python scripts/bench_growth.py                 docs/benchmarks/growth.png and growth.json
-  OMP_NUM_THREADS=1 python scripts/bench_growth.py --repeats 3 --folder /tmp/growth
+  OMP_NUM_THREADS=1 python scripts/bench_growth.py --repeats 3 --folder outputs/growth
 
 One simulated street window, +-35 m, two settings. Points: every point given k times. Area: k copies of the street side
 by side, the region as long as they are. Windows: a batch of k. Medians; one thread, unless --threads says otherwise.
