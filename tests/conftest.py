@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
+import sys
 from pathlib import Path
+from types import ModuleType
+from typing import Iterator
+from unittest.mock import MagicMock
 
 import pytest
+
+WHY_SKIPPED = "the public evaluator is not installed: see docs/evaluation.md"
 
 
 @pytest.fixture(scope="session")
@@ -33,3 +40,16 @@ def kitti_file(data_root: Path) -> Path:
     if not file.is_file():
         pytest.skip(f"no KITTI file at {file}")
     return file
+
+
+@pytest.fixture(scope="module")
+def bsfe() -> Iterator[ModuleType]:
+    """bucketed_scene_flow_eval.datasets; open3d, which it imports for its viewer alone, is replaced by a mock."""
+    if importlib.util.find_spec("bucketed_scene_flow_eval") is None:
+        pytest.skip(WHY_SKIPPED)
+    mocked = importlib.util.find_spec("open3d") is None
+    if mocked:
+        sys.modules["open3d"] = MagicMock()
+    yield pytest.importorskip("bucketed_scene_flow_eval.datasets", reason=WHY_SKIPPED)
+    if mocked:
+        del sys.modules["open3d"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import math
 import subprocess
 import sys
@@ -10,8 +9,7 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
-from typing import Any, Dict, Iterator, List, Sequence, Tuple
-from unittest.mock import MagicMock
+from typing import Any, Dict, List, Sequence, Tuple
 
 import numpy as np
 import pytest
@@ -19,7 +17,6 @@ from scenes import pose
 from test_live_evaluators import (
     EDGES,
     LOG,
-    WHY_SKIPPED,
     MadeUp,
     compare_buckets,
     compare_three_way,
@@ -328,19 +325,6 @@ def test_the_package_is_asked_for_when_it_is_needed(monkeypatch: pytest.MonkeyPa
 
 
 # ------------------------------------------------------------------------------------------------------------ live
-
-
-@pytest.fixture(scope="module")
-def bsfe() -> Iterator[ModuleType]:
-    """bucketed_scene_flow_eval.datasets; open3d, which it imports for its viewer alone, is replaced by a mock."""
-    if importlib.util.find_spec("bucketed_scene_flow_eval") is None:
-        pytest.skip(WHY_SKIPPED)
-    mocked = importlib.util.find_spec("open3d") is None
-    if mocked:
-        sys.modules["open3d"] = MagicMock()
-    yield pytest.importorskip("bucketed_scene_flow_eval.datasets", reason=WHY_SKIPPED)
-    if mocked:
-        del sys.modules["open3d"]
 
 
 def make_data_set(bsfe: ModuleType, raw: Path, truth: Path, output: Path, kind: str, length: int = 2) -> Any:

@@ -7,22 +7,20 @@ the same: truth, evaluation mask or ground, ego motion T.
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import math
-import sys
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Dict, Iterator, List, Optional, Sequence, Tuple
-from unittest.mock import MagicMock
+from typing import Any, Dict, List, Optional, Sequence, Tuple
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.feather as feather
 import pytest
 import torch
+from conftest import WHY_SKIPPED
 
 from cflow_torch import CorrelationFlow
 from cflow_torch.data.av2 import AV2Log
@@ -37,26 +35,12 @@ TOLERANCE = 1e-6
 PREDICTIONS = ("zero", "half", "noise", "paper")
 LOG, TIME = "7fab2350-7eaf-3b7e-a39d-6937a4c1bede", 315966265259836000
 FLOW = ("flow_tx_m", "flow_ty_m", "flow_tz_m")
-WHY_SKIPPED = "the public evaluator is not installed: see docs/evaluation.md"
 
 
 @pytest.fixture(scope="module")
 def av2_eval() -> ModuleType:
     """av2.evaluation.scene_flow.eval."""
     return pytest.importorskip("av2.evaluation.scene_flow.eval", reason=WHY_SKIPPED)
-
-
-@pytest.fixture(scope="module")
-def bsfe() -> Iterator[ModuleType]:
-    """bucketed_scene_flow_eval.datasets; open3d, which it imports for its viewer alone, is replaced by a mock."""
-    if importlib.util.find_spec("bucketed_scene_flow_eval") is None:
-        pytest.skip(WHY_SKIPPED)
-    mocked = importlib.util.find_spec("open3d") is None
-    if mocked:
-        sys.modules["open3d"] = MagicMock()
-    yield pytest.importorskip("bucketed_scene_flow_eval.datasets", reason=WHY_SKIPPED)
-    if mocked:
-        del sys.modules["open3d"]
 
 
 class Comparison:
