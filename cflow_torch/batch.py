@@ -15,7 +15,6 @@ from cflow_torch.ego import compensate, rigid_transform
 from cflow_torch.grid import Grid
 from cflow_torch.inputs import (
     check_distance,
-    check_windows,
     choose_device,
     elapsed_times,
     read_ground,
@@ -80,25 +79,21 @@ class Source:
     pose_flow: Tensor
 
 
-def split_windows(windows: Sequence[Window], config: Config, grid: Grid, device: Any = "auto") -> List[List[Window]]:
+def split_windows(windows: Sequence[Window], config: Config, grid: Grid, device: torch.device) -> List[List[Window]]:
     """Windows in groups that fit `max_memory`, in order. The result of a window does not depend on its group.
 
     Args:
-        windows: B windows; an empty list gives no group.
+        windows: B windows, checked; an empty list gives no group.
         config: `max_memory`; None = one group, or groups of `_BYTES_ON_CPU`.
         grid: the finest scale, whose images are the largest.
-        device: as for `make_batch`; on a CPU large groups only cost more.
+        device: where the work is done; on a CPU large groups only cost more.
 
     Returns:
         Groups of at least one window.
-
-    Raises:
-        CFlowError: not a list of windows, a device that cannot be used.
     """
-    check_windows(windows)
     groups: List[List[Window]] = []
     limit = config.max_memory
-    if limit is None and choose_device(windows, device).type == "cpu":
+    if limit is None and device.type == "cpu":
         limit = _BYTES_ON_CPU
     used = 0
     per_point = _BYTES_PER_POINT

@@ -8,6 +8,7 @@ from typing import List, Optional, Tuple
 import torch
 from torch import Tensor
 
+from cflow_torch.grid import LONGEST_SIDE
 from cflow_torch.ops.cross_correlation import FAST_LENGTHS
 from cflow_torch.ops.indices import flat_nonzero
 from cflow_torch.types import CFlowError
@@ -16,8 +17,6 @@ from cflow_torch.types import CFlowError
 # small, and few classes mean few kernel launches. Larger images are rare; they keep two dimensions, whose transforms
 # cost less than those of a line, and have classes of their own by height and width.
 _LINES = (144, 576, 2304, 9216)  # square clusters of 8, 16, 32, 64 pixels
-# Shifts of longer images would not fit the one number that orders them, see `best_shifts`.
-LONGEST_SIDE = 1 << 15
 # Classes are numbered by height and width of their images, both below this.
 _BASE = 1 << 17
 

@@ -14,7 +14,7 @@ from cflow_torch.types import CFlowError
 # Pixel keys and labels of all images of a batch are int64, but nobody wants to wait for more pixels than this.
 _MOST_PIXELS = 2**30
 # Shifts of longer images would not fit the one number that orders them (ties of the correlation).
-_LONGEST_SIDE = 2**15
+LONGEST_SIDE = 2**15
 
 
 @dataclass(frozen=True)
@@ -32,10 +32,10 @@ class Grid:
     upper: Tuple[float, ...]
 
     def __post_init__(self) -> None:
-        if max(self.height, self.width) > _LONGEST_SIDE or self.height * self.width > _MOST_PIXELS:
+        if max(self.height, self.width) > LONGEST_SIDE or self.height * self.width > _MOST_PIXELS:
             raise CFlowError(
                 f"a region of {self.width} x {self.height} pixels of {self.pixel_size} m is too large "
-                f"(at most {_LONGEST_SIDE} a side and {_MOST_PIXELS} in all): "
+                f"(at most {LONGEST_SIDE} a side and {_MOST_PIXELS} in all): "
                 "give a smaller point_cloud_range or larger pixel_sizes"
             )
 

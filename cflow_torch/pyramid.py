@@ -116,13 +116,13 @@ class CoarseToFine(nn.Module):
         device = choose_device(windows, self.device)
         with torch.autocast(device.type, enabled=False):  # counts would lose bits
             for part in split_windows(windows, config, grids[-1], device):
-                results += self._flow(part, grids)
+                results += self._flow(part, grids, device)
         return results
 
-    def _flow(self, windows: Sequence[Window], grids: Sequence[Grid]) -> List[FlowResult]:
+    def _flow(self, windows: Sequence[Window], grids: Sequence[Grid], device: torch.device) -> List[FlowResult]:
         with torch.inference_mode():  # a tenth faster than no_grad: the work is many small operations
             with record_function("compensate"):
-                batch = make_batch(windows, self.config, grids[0], self.device)
+                batch = make_batch(windows, self.config, grids[0], device)
             motion, flow = self.motion_at_scale(batch, None, grids[0]), None
             for grid in grids[1:]:
                 with record_function("spread"):
