@@ -1,57 +1,131 @@
-"""Files and folders that appear whole or not at all."""
+"""Files and folders that appear whole or not at all, here and on whatever fsspec reaches."""
 
 from __future__ import annotations
 
 import os
+import re
+import secrets
 import shutil
+import socket
 import tempfile
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, Iterator, Union
+from typing import IO, Any, Collection, ContextManager, Iterator, List, Optional
+
+from cflow_torch.data.paths import Place, as_path, is_remote, remote_errors
+from cflow_torch.types import CFlowError
+
+_SPOOLED = 64 << 20  # bytes of a remote file that are collected in memory; more go to a temporary file here
+# Where a put takes the place of what was there at once, and is seen by nobody before it is complete.
+_WHOLE_PUTS = {"s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "oss", "memory"}
+_TEMPORARY = re.compile(r"\.(?P<target>.+)\.(?P<host>[A-Za-z0-9_-]+)-(?P<process>\d+)-[0-9a-f]{8}\.tmp")
 
 
-@contextmanager
-def atomic_file(path: Union[str, Path]) -> Iterator[Any]:
-    """Open a binary file for writing that takes its name only when everything is on disk.
+def atomic_file(path: Place) -> ContextManager[Any]:
+    """Open a binary file for writing that takes its name only when everything is written.
 
     Args:
         path: final name; its folder is made if absent.
 
-    Yields:
-        The open file, under a temporary name in the same folder. If the block raises, it is removed.
+    Returns:
+        A context manager of the open file. If its block raises, nothing is left of it, and an older file stays.
+
+    Convention:
+        - On this machine: a temporary name in the same folder, `.NAME.<host>-<process>-<random>.tmp`, then a rename;
+          contents and names are on disk when the block is done. Only a killed process leaves the temporary file behind,
+          see `remove_stale`.
+        - In an object store: the contents are collected here and put when the block ends. On other file systems of
+          fsspec they are put under a temporary name, then moved.
+
+    Raises:
+        OSError: as for any file; also if the far side cannot be reached.
     """
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    descriptor, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-    try:
-        with os.fdopen(descriptor, "wb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(name, 0o666 & ~_umask())  # mkstemp makes private files
-        os.replace(name, path)
-    except BaseException:
-        os.unlink(name)
-        raise
+    path = as_path(path)
+    return _put_file(path) if is_remote(path) else _renamed_file(path)
 
 
 @contextmanager
-def atomic_folder(folder: Union[str, Path]) -> Iterator[Path]:
+def _renamed_file(path: Path) -> Iterator[IO[bytes]]:
+    with atomic_name(path) as temporary, open(temporary, "xb") as file:
+        yield file
+        file.flush()
+        os.fsync(file.fileno())
+
+
+@contextmanager
+def atomic_name(path: Path) -> Iterator[Path]:
+    """As `atomic_file` on this machine, for libraries that open a file themselves.
+
+    Yields:
+        The temporary name, under which there is no file yet. What is made there must be on disk when the block ends.
+    """
+    make_folder(path.parent)
+    temporary = path.with_name(temporary_name(path.name))
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    except BaseException:
+        with suppress(FileNotFoundError):
+            os.unlink(temporary)
+        raise
+    sync_folder(path.parent)
+
+
+@contextmanager
+def _put_file(path: Any) -> Iterator[IO[bytes]]:
+    with tempfile.SpooledTemporaryFile(max_size=_SPOOLED) as file:
+        yield file  # type: ignore[misc]
+        with remote_errors(path):
+            if path.protocol in _WHOLE_PUTS:
+                _put(file, path)
+                return
+            path.parent.mkdir(parents=True, exist_ok=True)
+            temporary = path.parent / temporary_name(path.name)
+            try:
+                _put(file, temporary)
+                path.fs.mv(temporary.path, path.path)
+            except BaseException:
+                with suppress(Exception):
+                    temporary.unlink()
+                raise
+
+
+def _put(file: Any, path: Any) -> None:
+    size = file.seek(0, os.SEEK_END) or file.tell()  # seek says nothing before Python 3.11
+    file.seek(0)
+    if size <= _SPOOLED:
+        path.fs.pipe_file(path.path, file.read())
+        return
+    with tempfile.NamedTemporaryFile() as named:  # to send a large file by parts, fsspec wants its name
+        shutil.copyfileobj(file, named)
+        named.flush()
+        path.fs.put_file(named.name, path.path)
+
+
+@contextmanager
+def atomic_folder(folder: Place) -> Iterator[Path]:
     """A folder to fill that takes its name only when the block ends, in place of an older one of that name.
 
     Args:
-        folder: final name; the folder above is made if absent.
+        folder: final name, on this machine; the folder above is made if absent.
 
     Yields:
         An empty folder under a temporary name beside it. If the block raises, it is removed and the older one stays.
+
+    Raises:
+        CFlowError: the folder would be remote.
     """
-    folder = Path(folder)
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    scratch = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+    folder = as_path(folder)
+    if is_remote(folder):
+        raise CFlowError(f"{folder}: folders are written whole on this machine only; write one here and copy it there")
+    make_folder(folder.parent)
+    scratch = folder.with_name(temporary_name(folder.name))
     new, old = scratch / "new", scratch / "old"
     try:
-        new.mkdir()
+        new.mkdir(parents=True)
         yield new
+        for place in (new, *(path for path in new.rglob("*") if path.is_dir())):
+            sync_folder(place)
         if folder.exists():
             os.replace(folder, old)
         try:
@@ -60,11 +134,93 @@ def atomic_folder(folder: Union[str, Path]) -> Iterator[Path]:
             if old.exists():
                 os.replace(old, folder)
             raise
+        sync_folder(folder.parent)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
 
 
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+def remove_stale(folder: Place, targets: Optional[Collection[str]] = None) -> List[str]:
+    """Remove what writers that were killed have left in a folder.
+
+    Args:
+        folder: where the files are; what lies in folders below is not looked at.
+        targets: names of files or folders that only the caller writes from now on: their temporary ones are removed
+            whoever made them. None = those of any name that a process of this host made which lives no more.
+
+    Returns:
+        Sorted names of what was removed; empty if the folder does not exist.
+
+    Convention: a folder that was killed while it took the place of an older one gets the older one back. Hosts are told
+        apart by name, so two containers of one name must not share a folder without `targets`.
+
+    Raises:
+        OSError: the folder cannot be listed, or a file in it not be removed.
+    """
+    folder, removed = as_path(folder), []
+    with remote_errors(folder):
+        for path in list(folder.iterdir()) if folder.is_dir() else []:
+            match = _TEMPORARY.fullmatch(path.name)
+            if match is None:
+                continue
+            if targets is None:
+                is_stale = match["host"] == _host() and not _lives(int(match["process"]))
+            else:
+                is_stale = match["target"] in targets
+            if is_stale:
+                _remove(path, folder / match["target"])
+                removed.append(path.name)
+    return sorted(removed)
+
+
+def _remove(path: Path, target: Path) -> None:
+    if not path.is_dir():
+        with suppress(FileNotFoundError):
+            path.unlink()
+        return
+    if (path / "old").is_dir() and not target.exists():
+        os.replace(path / "old", target)
+    shutil.rmtree(path)
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder of this machine and those above it where they are absent, durably."""
+    if not folder.is_dir() and folder != folder.parent:
+        make_folder(folder.parent)
+        folder.mkdir(exist_ok=True)
+        sync_folder(folder.parent)
+
+
+def sync_folder(folder: Path) -> None:
+    """Makes the names in a folder durable, where the system allows to open a folder and to wait for it."""
+    try:
+        descriptor = os.open(folder, os.O_RDONLY)
+    except OSError:
+        return
+    try:
+        with suppress(OSError):  # some network file systems refuse
+            os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def temporary_name(name: str) -> str:
+    """A name beside `name` for what is not complete yet, which `remove_stale` knows."""
+    return f".{name}.{_host()}-{os.getpid()}-{secrets.token_hex(4)}.tmp"
+
+
+def _host() -> str:
+    """Name of this machine; without dots, so that it can be told from the file's name before it."""
+    return re.sub(r"[^A-Za-z0-9_-]", "_", socket.gethostname()) or "_"
+
+
+def _lives(process: int) -> bool:
+    """Whether a process of this host is there; where that cannot be asked, it may be."""
+    if os.name != "posix":
+        return True
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):
+        return True
+    return True

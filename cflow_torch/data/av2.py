@@ -13,6 +13,7 @@ from cflow_torch.data.boxes import Boxes, flow_from_boxes
 from cflow_torch.data.folders import find_folders
 from cflow_torch.data.ground import GroundRaster, get_rule, read_ground_raster
 from cflow_torch.data.log import FlowLabels
+from cflow_torch.data.paths import Place, as_path, remote_errors, whole
 from cflow_torch.evaluation.categories import CATEGORIES, CATEGORY_INDEX
 from cflow_torch.types import CFlowError, Sweep
 
@@ -25,7 +26,7 @@ _SIZE = ("length_m", "width_m", "height_m")
 _FLOW = ("flow_tx_m", "flow_ty_m", "flow_tz_m")
 
 
-def find_av2_logs(root: Union[str, Path]) -> List[Path]:
+def find_av2_logs(root: Place) -> List[Path]:
     """Folders of all logs under a folder.
 
     Args:
@@ -37,7 +38,7 @@ def find_av2_logs(root: Union[str, Path]) -> List[Path]:
     Raises:
         CFlowError: `root` is no folder.
     """
-    return find_folders(Path(root), _is_log, SEARCH_DEPTH, "a log, or a folder of logs")
+    return find_folders(as_path(root), _is_log, SEARCH_DEPTH, "a log, or a folder of logs")
 
 
 class AV2Log:
@@ -60,10 +61,8 @@ class AV2Log:
             the wrong type, poses that are no rigid motion or do not cover a sweep.
     """
 
-    def __init__(
-        self, folder: Union[str, Path], ground: Optional[str] = "av2-api", require_ground: bool = False
-    ) -> None:
-        self.folder = Path(folder)
+    def __init__(self, folder: Place, ground: Optional[str] = "av2-api", require_ground: bool = False) -> None:
+        self.folder = as_path(folder)
         if not _is_log(self.folder):
             raise CFlowError(f"{self.folder} is no Argoverse 2 log: it holds no folder sensors/lidar")
         self.log_id = self.folder.resolve().name
@@ -123,16 +122,16 @@ class AV2Log:
         timestamp = self._timestamp(index)
         if index == len(self.timestamps) - 1:
             return None
-        folder = self.folder / "flow_labels"
-        if folder.is_dir():
-            file = folder / f"{timestamp}.feather"
-            return self._stored_labels(file, timestamp) if file.exists() else None
-        first_pair = self.folder / "flow_labels.feather"
-        if index == 0 and first_pair.exists():
-            return self._stored_labels(first_pair, timestamp)
+        folder, first_pair = self.folder / "flow_labels", self.folder / "flow_labels.feather"
         annotations = self.folder / "annotations.feather"
-        if annotations.exists():
-            return self._labels_from_annotations(annotations, timestamp, self.timestamps[index + 1])
+        with remote_errors(self.folder):
+            if folder.is_dir():
+                file = folder / f"{timestamp}.feather"
+                return self._stored_labels(file, timestamp) if file.exists() else None
+            if index == 0 and first_pair.exists():
+                return self._stored_labels(first_pair, timestamp)
+            if annotations.exists():
+                return self._labels_from_annotations(annotations, timestamp, self.timestamps[index + 1])
         return None
 
     def _timestamp(self, index: int) -> int:
@@ -202,10 +201,10 @@ def _is_log(folder: Path) -> bool:
 
 def _read(file: Path, required: Sequence[str]) -> pa.Table:
     """Table of a feather file that has the required columns, without holes in them."""
-    if not file.is_file():
-        raise CFlowError(f"{file} is missing; copy it from the data set")
     try:
-        table = feather.read_table(str(file))
+        table = feather.read_table(whole(file))
+    except FileNotFoundError:
+        raise CFlowError(f"{file} is missing; copy it from the data set") from None
     except (pa.ArrowException, OSError, ValueError) as error:
         raise CFlowError(f"cannot read {file}: {error}; it may be truncated, copy it again") from error
     missing = [name for name in required if name not in table.column_names]

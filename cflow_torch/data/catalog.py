@@ -9,6 +9,7 @@ from importlib import import_module
 from typing import Any, Dict, Sequence
 
 from cflow_torch.data.log import Log
+from cflow_torch.data.paths import as_path, is_place, remote_errors
 from cflow_torch.data.static_check import check_static_world
 from cflow_torch.types import CFlowError
 
@@ -52,9 +53,13 @@ def find_sources(name: str, root: Any) -> Sequence[Any]:
 
     Raises:
         CFlowError: no such data set; nothing of its format there.
+        OSError: a remote place cannot be reached.
     """
     data_set = _data_set(name)
-    sources = getattr(import_module(f"cflow_torch.data.{data_set.module}"), data_set.find)(root)
+    find = getattr(import_module(f"cflow_torch.data.{data_set.module}"), data_set.find)
+    place = as_path(root)
+    with remote_errors(place):
+        sources = find(place)
     if not sources:
         raise CFlowError(f"no {data_set.what} in {root}")
     return list(sources)
@@ -87,7 +92,8 @@ def open_log(
         raise CFlowError(f"data set {name} has no setting {', '.join(unknown)}; it has {', '.join(known) or 'none'}")
     if find_ground is not None and find_ground not in GROUND_METHODS:
         raise CFlowError(f"find_ground={find_ground!r}: give null or one of {', '.join(GROUND_METHODS)}")
-    log: Log = reader(source, **settings)
+    with remote_errors(source if is_place(source) else source.root):
+        log: Log = reader(source, **settings)
     if odometry:
         from cflow_torch.data.odometry import with_poses
 

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Union
-
 import numpy as np
 import pyarrow as pa
 import torch
 from pyarrow import feather
 
 from cflow_torch.data.atomic import atomic_file
+from cflow_torch.data.paths import Place, as_path, whole
 from cflow_torch.types import CFlowError, FlowResult
 
 _VECTORS = {"flow": "flow", "residual_flow": "residual", "pose_flow": "pose"}
 _AXES = "xyz"
 
 
-def write_flow(path: Union[str, Path], result: FlowResult) -> None:
+def write_flow(path: Place, result: FlowResult) -> None:
     """Write a result to `path`, atomically.
 
     Args:
@@ -37,14 +35,14 @@ def write_flow(path: Union[str, Path], result: FlowResult) -> None:
         feather.write_feather(pa.table({name: pa.array(values) for name, values in columns.items()}), file)
 
 
-def read_flow(path: Union[str, Path]) -> FlowResult:
+def read_flow(path: Place) -> FlowResult:
     """Read what `write_flow` wrote.
 
     Raises:
-        CFlowError: the file is missing, truncated, or lacks a column.
+        CFlowError: the file is missing, cannot be reached, is truncated, or lacks a column.
     """
     try:
-        table = feather.read_table(str(path), memory_map=False)
+        table = feather.read_table(whole(as_path(path)), memory_map=False)
         vectors = {
             field: np.stack([table[f"{name}_t{axis}_m"].to_numpy() for axis in _AXES], 1)
             for field, name in _VECTORS.items()

@@ -34,5 +34,5 @@ def find_folders(root: Path, is_log: Test, depth: int, what: str, is_passed: Tes
         logs = {folder for folder in level if is_log(folder)}
         found += logs
         children = (child for folder in level if folder not in logs for child in folder.iterdir())
-        level = [c for c in children if c.is_dir() and not c.name.startswith(".") and is_passed(c)]
+        level = [c for c in children if not c.name.startswith(".") and is_passed(c) and c.is_dir()]
     return sorted(found)

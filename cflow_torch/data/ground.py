@@ -9,6 +9,7 @@ from typing import Dict, Optional, Union
 
 import numpy as np
 
+from cflow_torch.data.paths import read_bytes, whole
 from cflow_torch.types import CFlowError
 
 
@@ -112,8 +113,8 @@ def read_ground_raster(map_folder: Path) -> Optional[GroundRaster]:
             f"found {len(rasters)} and {len(alignments)}"
         )
     try:
-        heights = np.load(rasters[0], allow_pickle=False)
-        alignment = json.loads(alignments[0].read_text())
+        heights = np.load(whole(rasters[0]), allow_pickle=False)
+        alignment = json.loads(read_bytes(alignments[0]))
         raster = GroundRaster(
             heights=heights.astype(np.float64),
             rotation=np.array(alignment["R"], dtype=np.float64).reshape(2, 2),

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Callable, Mapping, Protocol, Sequence, Tuple, Union
@@ -14,6 +12,7 @@ import numpy as np
 import pyarrow as pa
 from pyarrow import feather
 
+from cflow_torch.data.atomic import atomic_folder
 from cflow_torch.data.log import Log
 from cflow_torch.types import CFlowError
 
@@ -121,29 +120,9 @@ def write_av2_log(log: AnnotatedLog, root: Union[str, Path], overwrite: bool = F
     folder = Path(root) / log.log_id
     if folder.exists() and not overwrite:
         raise CFlowError(f"{folder} exists already; pass overwrite=True to replace it, or choose another root")
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    scratch = Path(tempfile.mkdtemp(prefix=f".{log.log_id}-", dir=folder.parent))
-    try:
-        new = scratch / "new"
+    with atomic_folder(folder) as new:
         _write_log(log, new)
-        _put_in_place(new, folder, scratch / "old")
-    finally:
-        shutil.rmtree(scratch, ignore_errors=True)
     return folder
-
-
-def _put_in_place(new: Path, folder: Path, old: Path) -> None:
-    """Renames `new` to `folder`; what was there goes to `old`, and comes back if that fails."""
-    replaces = folder.exists()
-    if replaces:
-        os.replace(folder, old)
-    try:
-        os.replace(new, folder)
-    except OSError:
-        if replaces:
-            os.replace(old, folder)
-        raise
-    _sync_folder(folder.parent)
 
 
 def _write_log(log: AnnotatedLog, folder: Path) -> None:
@@ -183,8 +162,6 @@ def _write_log(log: AnnotatedLog, folder: Path) -> None:
     columns = {name: np.concatenate([part[name] for part in annotations]) for name in annotations[0]}
     _write_feather(folder / "annotations.feather", columns)
     _write_map(folder / "map", log.log_id, log.ground_raster())
-    for path in [folder, *(p for p in folder.rglob("*") if p.is_dir())]:
-        _sync_folder(path)
 
 
 def _annotations(stamp: int, boxes: Boxes) -> Mapping[str, np.ndarray]:
@@ -260,15 +237,3 @@ def _write(path: Path, write: Callable[[Any], Any]) -> None:
         write(file)
         file.flush()
         os.fsync(file.fileno())
-
-
-def _sync_folder(path: Path) -> None:
-    """Makes the names in a folder durable, where the system allows to open a folder."""
-    try:
-        descriptor = os.open(path, os.O_RDONLY)
-    except OSError:
-        return
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

@@ -11,7 +11,10 @@ from typing import Any, Optional, Tuple
 import numpy as np
 from numpy.lib import format as npy
 
+from cflow_torch.data.paths import whole
 from cflow_torch.types import CFlowError
+
+_MISSING = "{} is missing; copy it from the data set"
 
 
 class _Type:
@@ -60,13 +63,22 @@ class _StringUnpickler(pickle.Unpickler):
         raise pickle.UnpicklingError(f"it asks for {module}.{name}")
 
 
-def read_npz_member(file: Path, key: str, strings: bool = False) -> Optional[np.ndarray]:
+def npz_contents(file: Path) -> Any:
+    """`whole` of an archive of the data set."""
+    try:
+        return whole(file)
+    except FileNotFoundError:
+        raise CFlowError(_MISSING.format(file)) from None
+
+
+def read_npz_member(file: Path, key: str, strings: bool = False, contents: Any = None) -> Optional[np.ndarray]:
     """One array of an npz file.
 
     Args:
         file: the archive.
         key: name of the array.
         strings: the array holds text, maybe as pickled Python strings (dtype object).
+        contents: `npz_contents(file)`, where that was called already.
 
     Returns:
         The array; text as a NumPy string array of its stored shape. None where the archive has no such array.
@@ -74,10 +86,8 @@ def read_npz_member(file: Path, key: str, strings: bool = False) -> Optional[np.
     Raises:
         CFlowError: no such file, no npz, damaged, or an object array that holds anything but strings.
     """
-    if not file.is_file():
-        raise CFlowError(f"{file} is missing; copy it from the data set")
     try:
-        with zipfile.ZipFile(file) as archive:
+        with zipfile.ZipFile(npz_contents(file) if contents is None else contents) as archive:
             if f"{key}.npy" not in archive.namelist():
                 return None
             with archive.open(f"{key}.npy") as member:
@@ -88,6 +98,8 @@ def read_npz_member(file: Path, key: str, strings: bool = False) -> Optional[np.
                     return _strings(_StringUnpickler(member).load(), shape)
             with archive.open(f"{key}.npy") as member:
                 array = npy.read_array(member, allow_pickle=False)
+    except FileNotFoundError:
+        raise CFlowError(_MISSING.format(file)) from None
     except (
         *(OSError, EOFError, ValueError, TypeError, KeyError, IndexError, AttributeError, MemoryError, RecursionError),
         *(zipfile.BadZipFile, zlib.error, pickle.UnpicklingError, NotImplementedError),

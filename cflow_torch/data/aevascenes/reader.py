@@ -5,14 +5,15 @@ from __future__ import annotations
 import json
 import zipfile
 from pathlib import Path, PurePosixPath
-from typing import Any, Dict, List, Optional, Sequence, Tuple, Union
+from typing import Any, Dict, List, Optional, Sequence, Tuple
 
 import numpy as np
 
-from cflow_torch.data.aevascenes.npz_strings import read_npz_member
+from cflow_torch.data.aevascenes.npz_strings import npz_contents, read_npz_member
 from cflow_torch.data.boxes import Boxes, flow_from_boxes
 from cflow_torch.data.folders import find_folders
 from cflow_torch.data.log import FlowLabels
+from cflow_torch.data.paths import Place, as_path, read_bytes
 from cflow_torch.ego import relative_transform
 from cflow_torch.evaluation.categories import CATEGORY_INDEX
 from cflow_torch.types import CFlowError, Sweep
@@ -46,7 +47,7 @@ CATEGORY_NAME.update(dict.fromkeys(GROUND, "NONE"))
 _PATHS = {"compensated": ("point_cloud_compensated_path", "point_cloud_path"), "raw": ("point_cloud_raw_path",)}
 
 
-def find_aevascenes_sequences(root: Union[str, Path]) -> List[Path]:
+def find_aevascenes_sequences(root: Place) -> List[Path]:
     """Folders of all sequences under a folder, sorted.
 
     Args:
@@ -56,7 +57,7 @@ def find_aevascenes_sequences(root: Union[str, Path]) -> List[Path]:
         CFlowError: `root` is no folder.
     """
     what = "a sequence (it holds sequence.json), or a folder of sequences"
-    return find_folders(Path(root), lambda folder: (folder / "sequence.json").is_file(), SEARCH_DEPTH, what)
+    return find_folders(as_path(root), lambda folder: (folder / "sequence.json").is_file(), SEARCH_DEPTH, what)
 
 
 class AevaScenesLog:
@@ -88,16 +89,17 @@ class AevaScenesLog:
 
     def __init__(
         self,
-        folder: Union[str, Path],
+        folder: Place,
         clouds: str = "compensated",
         lidars: Optional[Sequence[str]] = None,
         ground: bool = True,
     ) -> None:
-        self.folder = Path(folder)
+        self.folder = as_path(folder)
         self.log_id = self.folder.resolve().name
         if clouds not in _PATHS:
             raise CFlowError(f"clouds is one of {', '.join(_PATHS)}; got {clouds!r}")
         self._clouds, self._ground = clouds, ground
+        self._last: Tuple[int, List[Tuple[Path, Any]]] = (-1, [])
         self._file = self.folder / "sequence.json"
         metadata, frames = self._read_sequence()
         extrinsics = self._get(metadata, "metadata", "vehicle_to_lidar_extrinsics")
@@ -136,15 +138,17 @@ class AevaScenesLog:
         Raises:
             CFlowError: no such sweep, or a cloud is missing or cannot be read.
         """
-        files = self._files(index)
+        clouds = self._clouds_of(index)
         is_ground = None
         if self._ground:
-            names = [read_npz_member(file, "semantic_labels", strings=True) for file in files]
+            names = [read_npz_member(file, "semantic_labels", True, contents) for file, contents in clouds]
             if all(name is not None for name in names):
                 is_ground = np.isin(np.concatenate([np.asarray(name).reshape(-1) for name in names]), GROUND)
         points = self._points(index)
         if is_ground is not None and is_ground.shape != (len(points),):
-            raise CFlowError(f"{files[0]} and its neighbours: {len(points)} points but {len(is_ground)} class names")
+            raise CFlowError(
+                f"{clouds[0][0]} and its neighbours: {len(points)} points but {len(is_ground)} class names"
+            )
         return Sweep(points, is_ground, self._poses[index].copy(), self.timestamps[index])
 
     def radial_velocity(self, index: int) -> np.ndarray:
@@ -156,7 +160,7 @@ class AevaScenesLog:
         Raises:
             CFlowError: no such sweep, or a cloud is missing or cannot be read.
         """
-        return np.concatenate([self._array(file, "velocity").reshape(-1) for file in self._files(index)])
+        return np.concatenate([self._array(*cloud, "velocity").reshape(-1) for cloud in self._clouds_of(index)])
 
     def labels(self, index: int) -> Optional[FlowLabels]:
         """Truth of the pair (index, index + 1) from box tracks; None for the last sweep and sequences without boxes.
@@ -173,21 +177,28 @@ class AevaScenesLog:
     def _points(self, index: int) -> np.ndarray:
         """(N, 3) float32, vehicle frame."""
         clouds = []
-        for name, file in zip(self.lidars, self._files(index)):
-            xyz = self._array(file, "xyz")
+        for name, (file, contents) in zip(self.lidars, self._clouds_of(index)):
+            xyz = self._array(file, contents, "xyz")
             if xyz.ndim != 2 or xyz.shape[1] != 3:
                 raise CFlowError(f"{file}: xyz must have shape (N, 3), got {xyz.shape}")
             T = self._T_ego_lidar[name]
             clouds.append(xyz.astype(np.float64) @ T[:3, :3].T + T[:3, 3])
         return np.concatenate(clouds).astype(np.float32)
 
-    def _array(self, file: Path, key: str) -> np.ndarray:
-        array = read_npz_member(file, key)
+    def _array(self, file: Path, contents: Any, key: str) -> np.ndarray:
+        array = read_npz_member(file, key, contents=contents)
         if array is None:
-            raise CFlowError(f"{file} has no array {key}; it has {zipfile.ZipFile(file).namelist()}")
+            raise CFlowError(f"{file} has no array {key}; it has {zipfile.ZipFile(contents).namelist()}")
         if not np.issubdtype(array.dtype, np.floating):
             raise CFlowError(f"{file}: {key} must be floating point, got {array.dtype}")
         return array.astype(np.float32, copy=False)
+
+    def _clouds_of(self, index: int) -> List[Tuple[Path, Any]]:
+        """The npz of each LiDAR and what to read it from; those of the last sweep are kept, as several arrays of each
+        are read one after the other."""
+        if index != self._last[0]:
+            self._last = index, [(file, npz_contents(file)) for file in self._files(index)]
+        return self._last[1]
 
     def _files(self, index: int) -> List[Path]:
         """The npz of each LiDAR."""
@@ -205,7 +216,7 @@ class AevaScenesLog:
             parts = PurePosixPath(path)
             if parts.is_absolute() or ".." in parts.parts:
                 raise CFlowError(f"{self._file}, {where}, {name}: path {path!r} leaves the sequence folder")
-            files.append(self.folder / parts)
+            files.append(self.folder / path)
         return files
 
     def _boxes(self, index: int) -> Boxes:
@@ -234,10 +245,10 @@ class AevaScenesLog:
             raise CFlowError(f"{self._file}, {where}: {error}") from error
 
     def _read_sequence(self) -> Tuple[Dict[str, Any], List[Dict[str, Any]]]:
-        if not self._file.is_file():
-            raise CFlowError(f"{self.folder} is no AevaScenes sequence: it holds no sequence.json")
         try:
-            content = json.loads(self._file.read_text(encoding="utf-8"))
+            content = json.loads(read_bytes(self._file))
+        except FileNotFoundError:
+            raise CFlowError(f"{self.folder} is no AevaScenes sequence: it holds no sequence.json") from None
         except (ValueError, OSError, RecursionError) as error:
             raise CFlowError(f"cannot read {self._file}: {error}; it may be truncated, copy it again") from error
         metadata, frames = (self._get(content, "the file", key) for key in ("metadata", "frames"))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Callable, Dict, Mapping, Optional, Union
+from typing import Any, Callable, Dict, Mapping, Optional
 
 import numpy as np
 import pyarrow as pa
@@ -12,6 +12,7 @@ from pyarrow import feather, parquet
 from cflow_torch.data.arrays.pcd import read_pcd, write_pcd
 from cflow_torch.data.arrays.ply import read_ply, write_ply
 from cflow_torch.data.atomic import atomic_file
+from cflow_torch.data.paths import Place, as_path, read_bytes, remote_errors, whole
 from cflow_torch.types import CFlowError
 
 SUFFIXES = (".npy", ".npz", ".bin", ".pcd", ".ply", ".feather", ".parquet")
@@ -20,7 +21,7 @@ _AXES = ("x", "y", "z")
 _CLOUD_KEYS = ("points", "lidar", "xyz", "pc")  # of an .npz file that holds more than one table
 
 
-def read_cloud(path: Union[str, Path], bin_columns: int = KITTI_COLUMNS) -> np.ndarray:
+def read_cloud(path: Place, bin_columns: int = KITTI_COLUMNS) -> np.ndarray:
     """Positions of a point cloud.
 
     Args:
@@ -41,12 +42,13 @@ def read_cloud(path: Union[str, Path], bin_columns: int = KITTI_COLUMNS) -> np.n
     Raises:
         CFlowError: no such file, an unknown suffix, a file that is truncated or holds something else.
     """
-    path = Path(path)
+    path = as_path(path)
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise CFlowError(f"{path} has suffix {suffix!r}; clouds are {', '.join(SUFFIXES)}")
-    if not path.is_file():
-        raise CFlowError(f"{path} does not exist")
+    with remote_errors(path):
+        if not path.is_file():
+            raise CFlowError(f"{path} does not exist")
     if suffix == ".bin":
         points = _read_bin(path, bin_columns)
     elif suffix in (".pcd", ".ply"):
@@ -61,7 +63,7 @@ def read_cloud(path: Union[str, Path], bin_columns: int = KITTI_COLUMNS) -> np.n
     return points.astype(points.dtype.newbyteorder("="), copy=False)
 
 
-def write_cloud(path: Union[str, Path], points: np.ndarray, intensity: Optional[np.ndarray] = None) -> None:
+def write_cloud(path: Place, points: np.ndarray, intensity: Optional[np.ndarray] = None) -> None:
     """Write a cloud in the format of the suffix, atomically.
 
     Args:
@@ -72,7 +74,7 @@ def write_cloud(path: Union[str, Path], points: np.ndarray, intensity: Optional[
     Raises:
         CFlowError: an unknown suffix, or points of another shape.
     """
-    path, points = Path(path), np.asarray(points)
+    path, points = as_path(path), np.asarray(points)
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise CFlowError(f"{path} has suffix {suffix!r}; clouds are {', '.join(SUFFIXES)}")
@@ -102,7 +104,7 @@ def write_cloud(path: Union[str, Path], points: np.ndarray, intensity: Optional[
 def _read_bin(path: Path, columns: int) -> np.ndarray:
     if columns < 3:
         raise CFlowError(f"bin_columns={columns}: a point has three coordinates at least")
-    data = path.read_bytes()
+    data = read_bytes(path)
     if len(data) % (4 * columns):
         raise CFlowError(
             f"{path} has {len(data)} bytes, no multiple of {4 * columns} ({columns} float32 a point): it is truncated, "
@@ -113,7 +115,7 @@ def _read_bin(path: Path, columns: int) -> np.ndarray:
 
 def _read_numpy(path: Path) -> np.ndarray:
     try:
-        stored = np.load(path, allow_pickle=False)
+        stored = np.load(whole(path), allow_pickle=False)
         if not isinstance(stored, np.ndarray):
             with stored:
                 stored = _choose(path, {name: stored[name] for name in stored.files})
@@ -142,7 +144,7 @@ def _choose(path: Path, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
 
 def _read_table(path: Path, read: Callable[..., Any]) -> np.ndarray:
     try:
-        table = read(str(path), memory_map=False)
+        table = read(whole(path), memory_map=False)
     except (pa.ArrowException, OSError, ValueError) as error:
         raise CFlowError(f"{path} cannot be read ({error}); it is truncated or of another format") from error
     names = _AXES if all(axis in table.column_names for axis in _AXES) else tuple(table.column_names[:3])

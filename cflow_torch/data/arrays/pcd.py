@@ -5,13 +5,13 @@ from __future__ import annotations
 import re
 import struct
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Dict, List, Mapping, Tuple, Union
+from typing import Dict, List, Mapping, Tuple
 
 import numpy as np
 
 from cflow_torch.data.arrays.lzf import compress, decompress
 from cflow_torch.data.atomic import atomic_file
+from cflow_torch.data.paths import Place, as_path, read_bytes
 from cflow_torch.types import CFlowError
 
 _TYPES: Dict[Tuple[str, int], np.dtype] = {
@@ -37,7 +37,7 @@ class _Header:
     start: int
 
 
-def read_pcd(path: Union[str, Path]) -> Dict[str, np.ndarray]:
+def read_pcd(path: Place) -> Dict[str, np.ndarray]:
     """All fields of a cloud.
 
     Args:
@@ -56,11 +56,15 @@ def read_pcd(path: Union[str, Path]) -> Dict[str, np.ndarray]:
 
     Source: "The PCD (Point Cloud Data) file format" of the Point Cloud Library, version 0.7.
     """
-    path = Path(path)
     try:
-        content = path.read_bytes()
+        content = read_bytes(as_path(path))
     except OSError as error:
         raise CFlowError(f"cannot read {path} ({error}); give a .pcd file") from error
+    return pcd_fields(content, path)
+
+
+def pcd_fields(content: bytes, path: Place) -> Dict[str, np.ndarray]:
+    """As `read_pcd`, of what is in the file."""
     try:
         header = _read_header(content)
         body = content[header.start :]
@@ -75,7 +79,7 @@ def read_pcd(path: Union[str, Path]) -> Dict[str, np.ndarray]:
     }
 
 
-def write_pcd(path: Union[str, Path], fields: Mapping[str, np.ndarray], data: str = "binary") -> None:
+def write_pcd(path: Place, fields: Mapping[str, np.ndarray], data: str = "binary") -> None:
     """Write a cloud, atomically.
 
     Args:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
-from typing import Dict, List, Mapping, Tuple, Union
+from typing import Dict, List, Mapping, Tuple
 
 import numpy as np
 
 from cflow_torch.data.atomic import atomic_file
+from cflow_torch.data.paths import Place, as_path, read_bytes
 from cflow_torch.types import CFlowError
 
 _CODES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
@@ -21,7 +21,7 @@ _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _LONGEST_HEADER = 65536
 
 
-def read_ply(path: Union[str, Path]) -> Dict[str, np.ndarray]:
+def read_ply(path: Place) -> Dict[str, np.ndarray]:
     """All properties of the vertices.
 
     Args:
@@ -35,9 +35,8 @@ def read_ply(path: Union[str, Path]) -> Dict[str, np.ndarray]:
 
     Source: G. Turk, "The PLY Polygon File Format".
     """
-    path = Path(path)
     try:
-        content = path.read_bytes()
+        content = read_bytes(as_path(path))
     except OSError as error:
         raise CFlowError(f"cannot read {path} ({error}); give a .ply file") from error
     try:
@@ -46,7 +45,7 @@ def read_ply(path: Union[str, Path]) -> Dict[str, np.ndarray]:
         raise CFlowError(f"{path} cannot be read as PLY: {error}") from error
 
 
-def write_ply(path: Union[str, Path], fields: Mapping[str, np.ndarray], data: str = "binary_little_endian") -> None:
+def write_ply(path: Place, fields: Mapping[str, np.ndarray], data: str = "binary_little_endian") -> None:
     """Write vertices, atomically.
 
     Args:

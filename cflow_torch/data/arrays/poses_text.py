@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
-from typing import List, Optional, Sequence, Tuple, Union
+from typing import List, Optional, Sequence, Tuple
 
 import numpy as np
 
 from cflow_torch.data.atomic import atomic_file
+from cflow_torch.data.paths import Place, as_path, read_bytes, whole
 from cflow_torch.data.writers import quaternions
 from cflow_torch.ego import rigid_transform
 from cflow_torch.types import CFlowError
@@ -34,7 +35,7 @@ class Trajectory:
     layout: str
 
 
-def read_poses(path: Union[str, Path], calibration: Union[str, Path, None] = None) -> Trajectory:
+def read_poses(path: Place, calibration: Optional[Place] = None) -> Trajectory:
     """Poses of a file; its number of columns tells the format.
 
     Args:
@@ -49,7 +50,7 @@ def read_poses(path: Union[str, Path], calibration: Union[str, Path, None] = Non
     Raises:
         CFlowError: no such file, another number of columns, no numbers, no rigid motions, times that do not ascend.
     """
-    path = Path(path)
+    path = as_path(path)
     times_ns, layout = None, "matrix"
     if path.suffix == ".npy":
         matrices = _load(path)
@@ -80,13 +81,13 @@ def read_poses(path: Union[str, Path], calibration: Union[str, Path, None] = Non
     return Trajectory(poses, times_ns, layout)
 
 
-def read_calibration(path: Union[str, Path]) -> np.ndarray:
+def read_calibration(path: Place) -> np.ndarray:
     """(4, 4) float64 `T_cam0_lidar` of KITTI's `calib.txt`: the line `Tr: ` and 12 numbers.
 
     Raises:
         CFlowError: no such file, no such line, no rigid motion.
     """
-    for row in _read_rows(Path(path), numbers=False):
+    for row in _read_rows(as_path(path), numbers=False):
         if row[0].rstrip(":") in CALIBRATION_KEYS:
             try:
                 matrix = np.array([float(word) for word in row[1:]]).reshape(3, 4)
@@ -96,24 +97,24 @@ def read_calibration(path: Union[str, Path]) -> np.ndarray:
     raise CFlowError(f"{path} has no line {', '.join(CALIBRATION_KEYS)} with the LiDAR's place in camera coordinates")
 
 
-def read_times(path: Union[str, Path]) -> np.ndarray:
+def read_times(path: Place) -> np.ndarray:
     """(K,) int64 nanoseconds of a file with one time in seconds a line (KITTI's `times.txt`).
 
     Raises:
         CFlowError: no such file, no numbers, or times that do not ascend.
     """
-    rows = _read_rows(Path(path))
+    rows = _read_rows(as_path(path))
     if any(len(row) != 1 for row in rows):
         raise CFlowError(f"{path} must have one time in seconds a line")
-    return _ascending(Path(path), [to_nanoseconds(row[0]) for row in rows])
+    return _ascending(path, [to_nanoseconds(row[0]) for row in rows])
 
 
-def write_kitti_poses(path: Union[str, Path], poses: np.ndarray) -> None:
+def write_kitti_poses(path: Place, poses: np.ndarray) -> None:
     """Write (K, 4, 4) poses as 12 numbers a line, with 17 digits."""
     _write_lines(path, [" ".join(f"{value:.17g}" for value in pose[:3].ravel()) for pose in np.asarray(poses)])
 
 
-def write_tum_poses(path: Union[str, Path], times_ns: Sequence[int], poses: np.ndarray) -> None:
+def write_tum_poses(path: Place, times_ns: Sequence[int], poses: np.ndarray) -> None:
     """Write (K, 4, 4) poses as `t x y z qx qy qz qw`, seconds with 9 decimals, the rest with 17 digits."""
     poses = np.asarray(poses, np.float64)
     rotation = quaternions(poses[:, :3, :3])[:, [1, 2, 3, 0]]
@@ -121,7 +122,7 @@ def write_tum_poses(path: Union[str, Path], times_ns: Sequence[int], poses: np.n
     _write_lines(path, [" ".join([_seconds(t), *(f"{value:.17g}" for value in row)]) for t, row in zip(times_ns, rows)])
 
 
-def write_times(path: Union[str, Path], times_ns: Sequence[int]) -> None:
+def write_times(path: Place, times_ns: Sequence[int]) -> None:
     """Write nanoseconds as one time in seconds a line, with 9 decimals."""
     _write_lines(path, [_seconds(time) for time in times_ns])
 
@@ -164,7 +165,7 @@ def poses_at(trajectory: Trajectory, times_ns: Sequence[int], source: str) -> np
     sine = np.where(near, 1.0, np.sin(angle))
     q = np.where(near, 1 - share, np.sin((1 - share) * angle) / sine) * q0
     q += np.where(near, share, np.sin(share * angle) / sine) * q1
-    middle = _from_quaternions(Path(source), (1 - share) * first[:, :3, 3] + share * last[:, :3, 3], q[:, [1, 2, 3, 0]])
+    middle = _from_quaternions(source, (1 - share) * first[:, :3, 3] + share * last[:, :3, 3], q[:, [1, 2, 3, 0]])
     return np.where((share == 0)[:, :, None], first, middle)
 
 
@@ -181,7 +182,7 @@ def _seconds(time_ns: int) -> str:
     return f"{sign}{time_ns // 10**9}.{time_ns % 10**9:09d}"
 
 
-def _from_quaternions(path: Path, translation: np.ndarray, xyzw: np.ndarray) -> np.ndarray:
+def _from_quaternions(path: Place, translation: np.ndarray, xyzw: np.ndarray) -> np.ndarray:
     """(K, 4, 4) float64 from (K, 3) metres and (K, 4) quaternions, scalar last."""
     norm = np.linalg.norm(xyzw, axis=1)
     bad = np.flatnonzero(~(np.abs(norm - 1) <= QUATERNION_TOLERANCE))
@@ -199,7 +200,7 @@ def _from_quaternions(path: Path, translation: np.ndarray, xyzw: np.ndarray) -> 
 
 def _load(path: Path) -> np.ndarray:
     try:
-        return np.asarray(np.load(path, allow_pickle=False))
+        return np.asarray(np.load(whole(path), allow_pickle=False))
     except (OSError, ValueError, EOFError) as error:
         raise CFlowError(f"{path} cannot be read ({error}); give a .npy file of (K, 4, 4) numbers") from error
 
@@ -207,7 +208,7 @@ def _load(path: Path) -> np.ndarray:
 def _read_rows(path: Path, numbers: bool = True) -> List[Tuple[str, ...]]:
     """Words of every line that says something, at least one line."""
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = read_bytes(path).decode("utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise CFlowError(f"{path} cannot be read ({error}); give a text file") from error
     rows = [tuple(line.replace(",", " ").split()) for line in lines if line.strip() and line.strip()[0] != "#"]
@@ -224,13 +225,13 @@ def _read_rows(path: Path, numbers: bool = True) -> List[Tuple[str, ...]]:
     return rows
 
 
-def _ascending(path: Path, times: List[int]) -> np.ndarray:
+def _ascending(path: Place, times: List[int]) -> np.ndarray:
     result = np.array(times, dtype=np.int64)
     if (np.diff(result) <= 0).any():
         raise CFlowError(f"{path}: times must ascend, line {int(np.argmax(np.diff(result) <= 0)) + 2} does not")
     return result
 
 
-def _write_lines(path: Union[str, Path], lines: Sequence[str]) -> None:
+def _write_lines(path: Place, lines: Sequence[str]) -> None:
     with atomic_file(path) as file:
         file.write("".join(line + "\n" for line in lines).encode("ascii"))

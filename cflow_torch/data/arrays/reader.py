@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any, Dict, List, Optional, Sequence, Tuple, Union
+from typing import Any, Dict, List, Optional, Sequence, Tuple
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from cflow_torch.data.arrays.cloud_file import KITTI_COLUMNS, SUFFIXES, read_clo
 from cflow_torch.data.arrays.poses_text import Trajectory, poses_at, read_poses, read_times
 from cflow_torch.data.folders import find_folders
 from cflow_torch.data.log import FlowLabels
+from cflow_torch.data.paths import Place, as_path, is_place, is_remote, whole
 from cflow_torch.ego import rigid_transform
 from cflow_torch.types import CFlowError, Sweep
 
@@ -24,7 +25,7 @@ _STAMP_DIGITS = 16  # a file name that long is a time: microseconds; nanoseconds
 _FIRST_NANOSECOND = 10**17
 
 
-def find_array_logs(root: Union[str, Path]) -> List[Path]:
+def find_array_logs(root: Place) -> List[Path]:
     """Folders of all logs under a folder, at most four levels down.
 
     Args:
@@ -39,7 +40,7 @@ def find_array_logs(root: Union[str, Path]) -> List[Path]:
     """
     what = "a folder with one point cloud per file, or a folder of such"
     return find_folders(
-        Path(root),
+        as_path(root),
         lambda folder: bool(_clouds(folder)[1]),
         SEARCH_DEPTH,
         what,
@@ -84,17 +85,17 @@ class ArraysLog:
 
     def __init__(
         self,
-        folder: Union[str, Path],
+        folder: Place,
         poses: Any = "auto",
         poses_of: str = "ego",
-        calibration: Union[str, Path, None] = "auto",
-        times: Union[str, Path, None] = "auto",
-        ground: Union[str, Path, None] = "auto",
+        calibration: Optional[Place] = "auto",
+        times: Optional[Place] = "auto",
+        ground: Optional[Place] = "auto",
         ego_T_lidar: Any = None,
         suffix: Optional[str] = None,
         bin_columns: int = KITTI_COLUMNS,
     ) -> None:
-        self.folder = Path(folder)
+        self.folder = as_path(folder)
         if not self.folder.is_dir():
             raise CFlowError(f"{self.folder} is no folder; give a folder with one point cloud per file")
         if poses_of not in ("ego", "lidar"):
@@ -143,9 +144,9 @@ class ArraysLog:
 
     def _trajectory(self, poses: Any, calibration: Any) -> Tuple[Optional[Trajectory], str, bool]:
         """The poses given or found, what to call them, and whether a calibration made them the LiDAR's."""
-        if isinstance(poses, (str, Path)):
-            kitti = f"../../poses/{self.log_id}.txt"
-            file = _beside(self.folder.resolve(), poses, (*POSE_FILES, kitti), "poses")
+        if is_place(poses):
+            kitti = self.folder.resolve().parent.parent / "poses" / f"{self.log_id}.txt"
+            file = _beside(self.folder, poses, POSE_FILES, "poses", kitti)
             if file is None:
                 return None, "", False
             trajectory = read_poses(file)
@@ -224,17 +225,19 @@ def _one_suffix(folder: Path, suffix: Optional[str]) -> List[Path]:
     return sorted(next(iter(kinds.values())), key=lambda path: natural_key(path.stem))
 
 
-def _beside(folder: Path, setting: Union[str, Path, None], names: Sequence[str], what: str) -> Optional[Path]:
+def _beside(
+    folder: Path, setting: Optional[Place], names: Sequence[str], what: str, *elsewhere: Path
+) -> Optional[Path]:
     """The file or folder that a setting means; None = none."""
     if setting is None:
         return None
     if setting == "auto":
-        found = [folder / name for name in names if (folder / name).exists()]
+        found = [place for place in (*(folder / name for name in names), *elsewhere) if place.exists()]
         if len(found) > 1:
             raise CFlowError(f"{folder} has several: {', '.join(p.name for p in found)}; choose one with {what}=...")
         return found[0] if found else None
-    path = Path(setting)
-    path = path if path.is_absolute() or path.exists() else folder / path
+    path = as_path(setting)
+    path = path if is_remote(path) or path.is_absolute() or path.exists() else folder / path
     if not path.exists():
         raise CFlowError(f"{what}={str(setting)!r} names nothing, neither here nor in {folder}")
     return path
@@ -243,7 +246,7 @@ def _beside(folder: Path, setting: Union[str, Path, None], names: Sequence[str],
 def _read_mask(folder: Path, stem: str, rows: int) -> np.ndarray:
     file = folder / f"{stem}.npy"
     try:
-        mask = np.load(file, allow_pickle=False)
+        mask = np.load(whole(file), allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
         raise CFlowError(
             f"{file} cannot be read ({error}); every sweep needs its ground mask, or pass ground=None"

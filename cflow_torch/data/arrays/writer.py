@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import shutil
-import tempfile
 from pathlib import Path
 from typing import Optional, Union
 
@@ -13,6 +11,7 @@ import numpy as np
 from cflow_torch.data.arrays.cloud_file import SUFFIXES, write_cloud
 from cflow_torch.data.arrays.poses_text import write_kitti_poses, write_times, write_tum_poses
 from cflow_torch.data.arrays.reader import GROUND_FOLDER
+from cflow_torch.data.atomic import atomic_folder
 from cflow_torch.data.log import Log
 from cflow_torch.types import CFlowError
 
@@ -43,13 +42,8 @@ def write_array_log(log: Log, root: Union[str, Path], suffix: str = ".npy", pose
     folder = Path(root) / log.log_id
     if folder.exists():
         raise CFlowError(f"{folder} exists already: remove it, or choose another root")
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    scratch = Path(tempfile.mkdtemp(prefix=f".{log.log_id}-", dir=folder.parent))
-    try:
-        _write(log, scratch / "new", suffix, poses)
-        os.replace(scratch / "new", folder)
-    finally:
-        shutil.rmtree(scratch, ignore_errors=True)
+    with atomic_folder(folder) as new:
+        _write(log, new, suffix, poses)
     return folder
 
 

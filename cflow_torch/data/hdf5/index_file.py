@@ -6,10 +6,10 @@ import io
 import pickle
 import pickletools
 from functools import lru_cache
-from pathlib import Path
-from typing import Any, List, Sequence, Tuple, Union
+from typing import Any, List, Sequence, Tuple
 
 from cflow_torch.data.atomic import atomic_file
+from cflow_torch.data.paths import Place, as_path, read_bytes
 from cflow_torch.types import CFlowError
 
 Entry = Tuple[str, int]
@@ -34,7 +34,7 @@ class _NoNames(pickle.Unpickler):
         raise pickle.UnpicklingError("it asks for a persistent object")
 
 
-def read_index(path: Union[str, Path]) -> List[Entry]:
+def read_index(path: Place) -> List[Entry]:
     """Entries (scene, time stamp) of an index file, in its order.
 
     Args:
@@ -50,24 +50,21 @@ def read_index(path: Union[str, Path]) -> List[Entry]:
     Raises:
         CFlowError: no such file, no pickle, a pickle with other contents.
     """
-    path = Path(path)
     try:
-        status = path.stat()
-        return list(_read(str(path), status.st_mtime_ns, status.st_size))
+        data = read_bytes(as_path(path))
     except OSError as error:
         raise CFlowError(f"cannot read {path} ({error}); give an index file (.pkl)") from error
+    return list(_entries(str(path), data))
 
 
-def write_index(path: Union[str, Path], entries: Sequence[Entry]) -> None:
+def write_index(path: Place, entries: Sequence[Entry]) -> None:
     """Write entries as OpenSceneFlow does: a pickled list of [scene, time stamp], both strings, atomically."""
     with atomic_file(path) as file:
         pickle.dump([[str(scene), str(stamp)] for scene, stamp in entries], file, protocol=4)
 
 
 @lru_cache(maxsize=8)  # every scene of a folder asks for the same file
-def _read(path: str, modified_ns: int, size: int) -> Tuple[Entry, ...]:
-    with open(path, "rb") as file:
-        data = file.read()
+def _entries(path: str, data: bytes) -> Tuple[Entry, ...]:
     mend = "delete it: the index is then taken from the scenes themselves"
     try:
         _refuse_code(data)

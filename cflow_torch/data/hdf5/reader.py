@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 from types import TracebackType
-from typing import Any, List, Optional, Sequence, Tuple, Type, Union
+from typing import Any, List, Optional, Sequence, Tuple, Type
 
 import numpy as np
 
 from cflow_torch.data.hdf5.frames import StoredMotion, harness_motion, is_argoverse2, recognized_extrinsics
 from cflow_torch.data.hdf5.index_file import read_index
 from cflow_torch.data.log import FlowLabels
+from cflow_torch.data.paths import Place, as_path, ranged
 from cflow_torch.ego import rigid_transform
 from cflow_torch.types import CFlowError, Sweep
 
@@ -19,13 +20,13 @@ _FIRST_NANOSECOND = 10**17
 EXTRINSIC = "ego_T_lidar"  # attribute of a scene that `write_hdf5_scene` leaves
 
 
-def find_hdf5_scenes(root: Union[str, Path]) -> List[Path]:
+def find_hdf5_scenes(root: Place) -> List[Path]:
     """The scene files of a folder, or the one file given, sorted.
 
     Raises:
         CFlowError: `root` does not exist.
     """
-    root = Path(root)
+    root = as_path(root)
     if root.is_file():
         return [root]
     if not root.is_dir():
@@ -60,15 +61,15 @@ class HDF5Log:
             rigid motion.
     """
 
-    def __init__(self, file: Union[str, Path], ego_T_lidar: Any = "auto") -> None:
+    def __init__(self, file: Place, ego_T_lidar: Any = "auto") -> None:
         try:
             import h5py
         except ImportError:
             raise CFlowError("reading HDF5 scenes needs h5py: pip install 'cflow_torch[hdf5]'") from None
-        self.file = Path(file)
+        self.file = as_path(file)
         self.log_id = self.file.stem
         try:
-            self._scene = h5py.File(self.file, "r")
+            self._scene = h5py.File(ranged(self.file), "r")
         except OSError as error:
             raise CFlowError(f"{self.file} cannot be read as HDF5 ({error}): give a scene that is complete") from error
         try:
@@ -164,7 +165,7 @@ class HDF5Log:
         values = self._read(timestamp, key)
         return values[:, 0] if values.ndim == 2 and values.shape[1] == 1 else values
 
-    def eval_frames(self, index_file: Union[str, Path, None] = None) -> List[int]:
+    def eval_frames(self, index_file: Optional[Place] = None) -> List[int]:
         """Numbers of the sweeps to score, ascending.
 
         Args:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 import re
 import shutil
-import tempfile
 from pathlib import Path
 from typing import Any, Iterable, Tuple, Union
 
 import numpy as np
 
+from cflow_torch.data.atomic import sync_folder, temporary_name
 from cflow_torch.types import Array, CFlowError, as_numpy
 
 # Keys that scenes bring, and names that the viewers give a meaning of their own.
@@ -84,8 +84,7 @@ def write_hdf5_results(file: Union[str, Path], name: str, results: Iterable[Tupl
     check_result_name(name)
     check_writable(file)
     file = Path(file).resolve()  # a link stays a link
-    descriptor, copy = tempfile.mkstemp(prefix=f".{file.name}.", dir=file.parent)
-    os.close(descriptor)
+    copy = file.with_name(temporary_name(file.name))
     try:
         shutil.copy(file, copy)
         count = 0
@@ -100,10 +99,11 @@ def write_hdf5_results(file: Union[str, Path], name: str, results: Iterable[Tupl
             with open(copy, "rb") as written:
                 os.fsync(written.fileno())
             os.replace(copy, file)
+            sync_folder(file.parent)
         return count
     finally:
-        if os.path.exists(copy):
-            os.unlink(copy)
+        if copy.exists():
+            copy.unlink()
 
 
 def _write(scene: Any, file: Path, timestamp: str, name: str, flow: np.ndarray) -> None:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-import tempfile
 from pathlib import Path
 from typing import Any, Dict, List, Union
 
 import numpy as np
 
+from cflow_torch.data.atomic import atomic_name
 from cflow_torch.data.boxes import points_in_box
 from cflow_torch.data.hdf5.index_file import write_index
 from cflow_torch.data.hdf5.reader import EXTRINSIC, HDF5Log, find_hdf5_scenes
@@ -67,10 +67,8 @@ def write_hdf5_scene(
     if len(set(log.timestamps)) < len(log.timestamps) or min(log.timestamps, default=0) < 0:
         raise CFlowError(f"log {log.log_id}: time stamps must be different numbers from 0, they name the groups")
     file = Path(file)
-    file.parent.mkdir(parents=True, exist_ok=True)
     identity: Dict[str, int] = {}
-    with tempfile.TemporaryDirectory(prefix=f".{file.name}.", dir=file.parent) as scratch:
-        new = Path(scratch) / file.name
+    with atomic_name(file) as new:
         with h5py.File(new, "w") as scene:
             if store_extrinsics:
                 scene.attrs[EXTRINSIC] = extrinsics
@@ -80,7 +78,6 @@ def write_hdf5_scene(
                     group.create_dataset(key, data=value)
         with open(new, "rb") as written:
             os.fsync(written.fileno())
-        os.replace(new, file)
 
 
 def write_index_files(folder: Union[str, Path]) -> None:

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any, Collection, Dict, List, Optional, Tuple
 
+from cflow_torch.data.paths import read_bytes
 from cflow_torch.types import CFlowError
 
 Row = Dict[str, Any]
@@ -58,13 +59,12 @@ def read_table(folder: Path, table: str, key: str = "", values: Collection[str] 
             )
         return {name: row[name] for name in names}
 
-    if not file.is_file():
-        raise CFlowError(f"{file} is missing; copy all tables of the version")
     try:
-        with open(file, encoding="utf-8") as stream:
-            rows = json.load(stream, object_hook=use)
+        rows = json.loads(read_bytes(file), object_hook=use)
     except CFlowError:
         raise
+    except FileNotFoundError:
+        raise CFlowError(f"{file} is missing; copy all tables of the version") from None
     except (OSError, ValueError, RecursionError) as error:
         raise CFlowError(f"cannot read {file} as JSON: {error}; it may be truncated, copy it again") from error
     if not isinstance(rows, list) or any(not isinstance(row, (dict, type(None))) for row in rows):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import ClassVar, List, Mapping, NamedTuple, Optional, Sequence, Tuple, Union
+from typing import ClassVar, List, Mapping, NamedTuple, Optional, Sequence, Tuple
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from cflow_torch.data.log import FlowLabels
 from cflow_torch.data.nuscenes.categories import NUSCENES_CATEGORIES, OWN_TRAILER
 from cflow_torch.data.nuscenes.tables import LidarChain, SceneSource, Tables, find_scenes
 from cflow_torch.data.nuscenes.tracks import TrackBoxes, Tracks, poses_at, transforms
+from cflow_torch.data.paths import Place, as_path, read_bytes
 from cflow_torch.evaluation.categories import CATEGORY_INDEX
 from cflow_torch.types import CFlowError, Sweep
 
@@ -32,7 +33,7 @@ class Footprint(NamedTuple):
     half_width: float
 
 
-def find_nuscenes_scenes(root: Union[str, Path]) -> List[SceneSource]:
+def find_nuscenes_scenes(root: Place) -> List[SceneSource]:
     """All scenes under a folder.
 
     Args:
@@ -85,7 +86,7 @@ class NuScenesLog:
     ) -> None:
         if sweep_step < 1:
             raise CFlowError(f"sweep_step={sweep_step}: it is 1 for all sweeps, 2 for every second one")
-        self.log_id, self._root, self._own_vehicle = source.scene, Path(source.root), own_vehicle
+        self.log_id, self._root, self._own_vehicle = source.scene, as_path(source.root), own_vehicle
         folder = self._root / source.version
         scene = (source.tables or Tables(folder)).scene(source.scene)
         unknown = sorted(set(scene.annotations.category) - set(self._categories))
@@ -188,9 +189,13 @@ class NuScenesLog:
     def _unit_points(self, chain: LidarChain, row: int, index: int) -> Tuple[np.ndarray, np.ndarray]:
         """`_cloud` of one sweep of one LiDAR."""
         file = self._root / chain.files[row]
-        if not file.is_file():
-            raise CFlowError(f"{file} is missing; copy the sensor data of scene {self.log_id} beside the tables")
-        local, times = self._read(file)
+        try:
+            content = read_bytes(file)
+        except FileNotFoundError:
+            raise CFlowError(
+                f"{file} is missing; copy the sensor data of scene {self.log_id} beside the tables"
+            ) from None
+        local, times = self._points_of(content, file)
         returned = np.isfinite(local).all(axis=1) & (local != 0).any(axis=1)
         mount = transforms(chain.mount[row : row + 1])[0]
         points = local.astype(np.float64) @ mount[:3, :3].T + mount[:3, 3]
@@ -216,9 +221,9 @@ class NuScenesLog:
             points[rows] = np.einsum("nij,nj->ni", at[:, :3, :3], points[rows]) + at[:, :3, 3]
         return points.astype(np.float32), since
 
-    def _read(self, file: Path) -> Tuple[np.ndarray, Optional[np.ndarray]]:
+    def _points_of(self, content: bytes, file: Path) -> Tuple[np.ndarray, Optional[np.ndarray]]:
         """(N, 3) points in the frame of the LiDAR; (N,) int64 microseconds, times of the shots, None = all at once."""
-        return read_pcd_bin(file), None
+        return pcd_bin_points(content, file), None
 
     def _is_own(self, points: np.ndarray, index: int) -> np.ndarray:
         """(N,) bool, above the recording vehicle or in the box of its trailer; points in the ego frame."""
@@ -235,7 +240,7 @@ class NuScenesLog:
         return own
 
 
-def read_pcd_bin(file: Union[str, Path]) -> np.ndarray:
+def read_pcd_bin(file: Place) -> np.ndarray:
     """Points of a nuScenes LiDAR sweep.
 
     Args:
@@ -247,7 +252,11 @@ def read_pcd_bin(file: Union[str, Path]) -> np.ndarray:
     Raises:
         CFlowError: the file is empty, has no whole number of rows, or its last column holds no ring numbers.
     """
-    content = Path(file).read_bytes()
+    return pcd_bin_points(read_bytes(as_path(file)), file)
+
+
+def pcd_bin_points(content: bytes, file: Place) -> np.ndarray:
+    """As `read_pcd_bin`, of what is in the file."""
     if not content or len(content) % (_COLUMNS * _ROW.itemsize):
         raise CFlowError(
             f"{file} has {len(content)} bytes, which is no whole number of rows of five float32 (x, y, z, intensity, "

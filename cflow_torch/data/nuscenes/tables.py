@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections import defaultdict
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Collection, Dict, List, Mapping, Optional, Sequence, Tuple, Union
+from typing import Collection, Dict, List, Mapping, Optional, Sequence, Tuple
 
 import numpy as np
 
 from cflow_torch.data.folders import find_folders
 from cflow_torch.data.nuscenes.json_tables import Row, read_table
+from cflow_torch.data.paths import Place, as_path
 from cflow_torch.types import CFlowError
 
 QUATERNION_TOLERANCE = 1e-3  # a quaternion is a rotation only if its length is 1; stored values are within 1e-6
@@ -87,7 +88,7 @@ class SceneTables:
     annotations: Annotations
 
 
-def find_scenes(root: Union[str, Path], foreign: Collection[str], data_set: str) -> List[SceneSource]:
+def find_scenes(root: Place, foreign: Collection[str], data_set: str) -> List[SceneSource]:
     """The scenes of all versions under a folder, by folder and name.
 
     Args:
@@ -100,7 +101,7 @@ def find_scenes(root: Union[str, Path], foreign: Collection[str], data_set: str)
     """
     what = "the data root, which holds v1.0-mini or the like"
     versions = find_folders(
-        *(Path(root), lambda folder: (folder / "scene.json").is_file(), SEARCH_DEPTH, what),
+        *(as_path(root), lambda folder: (folder / "scene.json").is_file(), SEARCH_DEPTH, what),
         lambda child: child.name not in _SENSOR_FOLDERS,
     )
     alien = [v for v in versions if any((v / f"{table}.json").exists() for table in foreign)]
@@ -124,8 +125,8 @@ class Tables:
     Cost: about 5 s per million rows (measured on one core); rows of cameras and radars are dropped while reading.
     """
 
-    def __init__(self, folder: Union[str, Path]) -> None:
-        self.folder = Path(folder)
+    def __init__(self, folder: Place) -> None:
+        self.folder = as_path(folder)
         self._rows: Dict[str, Dict[str, List[Row]]] = {}  # table -> token of the scene -> its rows
         self._by_token: Dict[str, Dict[str, Row]] = {}
         self._scenes: Optional[Dict[str, str]] = None  # name -> token

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import ClassVar, List, Mapping, Optional, Sequence, Tuple, Union
+from typing import ClassVar, List, Mapping, Optional, Sequence, Tuple
 
 import numpy as np
 
-from cflow_torch.data.arrays.pcd import read_pcd
+from cflow_torch.data.arrays.pcd import pcd_fields
 from cflow_torch.data.nuscenes.categories import TRUCKSCENES_CATEGORIES
 from cflow_torch.data.nuscenes.reader import Footprint, NuScenesLog
 from cflow_torch.data.nuscenes.tables import SceneSource, find_scenes
+from cflow_torch.data.paths import Place
 from cflow_torch.types import CFlowError
 
 
-def find_truckscenes_scenes(root: Union[str, Path]) -> List[SceneSource]:
+def find_truckscenes_scenes(root: Place) -> List[SceneSource]:
     """All scenes under a folder.
 
     Args:
@@ -71,8 +72,8 @@ class TruckScenesLog(NuScenesLog):
         super().__init__(source, sweep_step, lidars, own_vehicle)
         self._deskew = deskew
 
-    def _read(self, file: Path) -> Tuple[np.ndarray, Optional[np.ndarray]]:
-        fields = read_pcd(file)
+    def _points_of(self, content: bytes, file: Path) -> Tuple[np.ndarray, Optional[np.ndarray]]:
+        fields = pcd_fields(content, file)
         needed = ("x", "y", "z", "timestamp") if self._deskew else ("x", "y", "z")
         missing = [name for name in needed if name not in fields or fields[name].ndim != 1]
         if missing:

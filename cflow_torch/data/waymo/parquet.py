@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Dict, Iterator, List, Optional, Sequence, Tuple
+from typing import Any, Callable, Dict, Iterator, List, Optional, Sequence, Tuple
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from cflow_torch.data.paths import mapped, ranged
 from cflow_torch.types import CFlowError
 
 SEGMENT, TIME, LASER, TRACK = (
@@ -96,7 +97,7 @@ def read_images(file: Path, numbers: Sequence[int], column: str, channels: int) 
     """
     columns = [f"{column}.values", f"{column}.shape"]
     images: Dict[int, Optional[np.ndarray]] = {}
-    with _open(file, columns) as parquet:
+    with _open(file, columns, mapped) as parquet:
         end = 0
         for group in range(parquet.num_row_groups):
             number, end = end, end + parquet.metadata.row_group(group).num_rows
@@ -110,12 +111,12 @@ def read_images(file: Path, numbers: Sequence[int], column: str, channels: int) 
     return images
 
 
-def _open(file: Path, columns: Sequence[str]) -> pq.ParquetFile:
+def _open(file: Path, columns: Sequence[str], access: Callable[[Path], Any]) -> pq.ParquetFile:
     """An open parquet file that has these columns."""
-    if not file.is_file():
-        raise CFlowError(f"{file} is missing; download component {file.parent.name} of this segment")
     try:
-        parquet = pq.ParquetFile(str(file), memory_map=True)
+        parquet = pq.ParquetFile(access(file), memory_map=True)
+    except FileNotFoundError:
+        raise CFlowError(f"{file} is missing; download component {file.parent.name} of this segment") from None
     except (pa.ArrowException, OSError, ValueError) as error:
         raise CFlowError(f"cannot read {file} as parquet: {error}; it may be truncated, copy it again") from error
     names = parquet.schema_arrow.names
@@ -127,7 +128,7 @@ def _open(file: Path, columns: Sequence[str]) -> pq.ParquetFile:
 
 
 def read_columns(file: Path, columns: Sequence[str]) -> pa.Table:
-    with _open(file, columns) as parquet:
+    with _open(file, columns, ranged) as parquet:
         try:
             return parquet.read(columns=list(columns))
         except (pa.ArrowException, OSError, ValueError) as error:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Dict, List, Optional, Sequence, Tuple, Union
+from typing import Any, Dict, List, Optional, Sequence, Tuple
 
 import numpy as np
 import pyarrow as pa
 
 from cflow_torch.data.boxes import Boxes, flow_from_boxes
 from cflow_torch.data.log import FlowLabels
+from cflow_torch.data.paths import Place, as_path, remote_errors
 from cflow_torch.data.waymo.parquet import (
     BOX,
     CALIBRATION,
@@ -45,7 +46,7 @@ _KEPT_FRAMES = 2  # the labels of a pair are asked for after both of its sweeps
 Row = Tuple[int, int]  # frame time in microseconds, laser
 
 
-def find_waymo_segments(root: Union[str, Path]) -> List[Path]:
+def find_waymo_segments(root: Place) -> List[Path]:
     """The LiDAR files `<split>/lidar/<segment>.parquet` of all segments under a folder, sorted.
 
     Args:
@@ -54,7 +55,7 @@ def find_waymo_segments(root: Union[str, Path]) -> List[Path]:
     Raises:
         CFlowError: `root` does not exist.
     """
-    root = Path(root)
+    root = as_path(root)
     if root.is_file():
         return [root]
     if not root.is_dir():
@@ -108,10 +109,8 @@ class WaymoLog:
             frames; a frame without pose.
     """
 
-    def __init__(
-        self, file: Union[str, Path], lasers: Sequence[str] = tuple(LASERS), both_returns: bool = False
-    ) -> None:
-        self.file = Path(file)
+    def __init__(self, file: Place, lasers: Sequence[str] = tuple(LASERS), both_returns: bool = False) -> None:
+        self.file = as_path(file)
         unknown = sorted(set(lasers) - set(LASERS))
         if unknown or not lasers:
             raise CFlowError(f"lasers are some of {', '.join(LASERS)}; got {list(lasers)}")
@@ -279,8 +278,9 @@ class WaymoLog:
     def _read_boxes(self) -> Dict[int, Boxes]:
         """Frame time -> boxes; empty where the segment has no labels (the testing split)."""
         file = self._component("lidar_box")
-        if not file.exists():
-            return {}
+        with remote_errors(file):
+            if not file.exists():
+                return {}
         numbers = tuple(f"{BOX}box.{name}" for name in ("size.x", "size.y", "size.z", "heading"))
         centre = tuple(f"{BOX}box.center.{axis}" for axis in "xyz")
         table = self._keys("lidar_box", (TIME, TRACK, f"{BOX}type", *numbers, *centre))

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import mmap
+import os
 import struct
 import zlib
-from pathlib import Path
-from typing import Any, Dict, Iterator, List, Optional, Sequence, Tuple, Union
+from typing import Any, Dict, Iterator, List, Optional, Sequence, Tuple
 
 import numpy as np
 
 from cflow_torch.data.boxes import flow_from_boxes
 from cflow_torch.data.log import FlowLabels
+from cflow_torch.data.paths import Place, as_path, parts
 from cflow_torch.data.waymo.range_image import LASERS, NO_LABEL_ZONE, LaserCalibration, range_image_points
 from cflow_torch.data.waymo.reader import BOX_CATEGORY, upright_boxes
 from cflow_torch.ego import relative_transform, rigid_transform
 from cflow_torch.types import CFlowError, Sweep
 
+_HEAD = 1 << 16  # bytes of a record in which its time is looked for first
 _VARINT, _EIGHT, _BYTES, _FOUR = 0, 1, 2, 5  # wire types
 _BROKEN = (IndexError, ValueError, KeyError, struct.error, zlib.error, TypeError)  # what a foreign message leads to
 
@@ -37,18 +38,16 @@ class WaymoRecordLog:
         CFlowError: no such file, not a tfrecord of frames, truncated; fewer than two frames.
     """
 
-    def __init__(
-        self, file: Union[str, Path], lasers: Sequence[str] = tuple(LASERS), stored_flow: bool = False
-    ) -> None:
-        self.file = Path(file)
+    def __init__(self, file: Place, lasers: Sequence[str] = tuple(LASERS), stored_flow: bool = False) -> None:
+        self.file = as_path(file)
         if not lasers or set(lasers) - set(LASERS):
             raise CFlowError(f"lasers are some of {', '.join(LASERS)}; got {list(lasers)}")
-        if not self.file.is_file():
-            raise CFlowError(f"{self.file} is missing; give a segment-*.tfrecord")
         self.log_id = self.file.stem
         self._lasers, self._stored_flow = sorted(LASERS[name] for name in lasers), stored_flow
         try:
             self._span = dict(sorted(self._find_frames()))
+        except FileNotFoundError:
+            raise CFlowError(f"{self.file} is missing; give a segment-*.tfrecord") from None
         except _BROKEN as error:
             raise CFlowError(
                 f"{self.file} is no tfrecord of Waymo frames, or truncated: {error}; copy it again"
@@ -84,24 +83,28 @@ class WaymoRecordLog:
 
     def _find_frames(self) -> Iterator[Tuple[int, Tuple[int, int]]]:
         """(microseconds, (first byte, end)) of every frame; touches little of the file."""
-        with open(self.file, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-            begin = 0
-            while begin < len(data):
-                (length,) = struct.unpack_from("<Q", data, begin)
-                first = begin + 12  # after the length and its checksum
-                begin = first + length + 4
-                if begin > len(data):
-                    raise ValueError(f"a record of {length} bytes at byte {first} of {len(data)}")
-                yield (
-                    next(value for n, value in _fields(data, first, first + length) if n == 2),
-                    (first, first + length),
-                )
+        with parts(self.file) as file:
+            size, begin = file.seek(0, os.SEEK_END), 0
+            while begin < size:
+                file.seek(begin)
+                head = file.read(_HEAD)
+                (length,) = struct.unpack_from("<Q", head)
+                first, end = 12, 12 + length  # after the length and its checksum
+                if begin + end + 4 > size:
+                    raise ValueError(f"a record of {length} bytes at byte {begin + first} of {size}")
+                try:
+                    time = _time(head, first, end)
+                except IndexError:  # not near the beginning
+                    file.seek(begin)
+                    time = _time(file.read(end), first, end)
+                yield time, (begin + first, begin + end)
+                begin += end + 4
 
     def _frame(self, index: int) -> Dict[str, Any]:
         if not 0 <= index < len(self):
             raise CFlowError(f"segment {self.log_id} has sweeps 0 ... {len(self) - 1}, asked for {index}")
         first, end = self._span[self.timestamps[index] // 1000]
-        with open(self.file, "rb") as file:
+        with parts(self.file) as file:
             file.seek(first)
             data = file.read(end - first)
         try:
@@ -134,6 +137,14 @@ class WaymoRecordLog:
                 boxes.append((bytes(label[4][0]).decode(), BOX_CATEGORY[label[3][0]], values))
         arrays = {"points": np.concatenate(points).astype(np.float32), "velocity": np.concatenate(flow)}
         return {"pose": pose, "boxes": upright_boxes(boxes), "zone": np.concatenate(zone), **arrays}
+
+
+def _time(data: bytes, first: int, end: int) -> int:
+    """Microseconds of a frame."""
+    for number, value in _fields(data, first, end):
+        if number == 2:
+            return int(value)
+    raise ValueError("a frame without time")
 
 
 def _varint(data: Any, at: int) -> Tuple[int, int]:

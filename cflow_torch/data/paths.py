@@ -1,0 +1,210 @@
+"""Names of places, on this machine or wherever fsspec reaches, and how the readers open what is there.
+
+A place is text ("/data/av2", "s3://bucket/av2"), a `pathlib.Path` or a `upath.UPath`. The readers use nothing of it but
+pathlib's interface and the functions below.
+"""
+
+from __future__ import annotations
+
+import io
+import mmap
+import re
+import shutil
+import tempfile
+from contextlib import contextmanager
+from functools import lru_cache
+from pathlib import Path, PosixPath, WindowsPath
+from typing import Any, Dict, Iterator, Union
+
+import pyarrow as pa
+
+from cflow_torch.types import CFlowError
+
+Place = Union[str, Path]
+_SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)://")
+_BLOCK = 1 << 20  # bytes
+_KEPT_BLOCKS = 32  # of each open file
+_KEPT_COPIES = 4  # files of `mapped`: two of a Waymo segment that is read, two of the one before
+
+
+def as_path(place: Place) -> Path:
+    """The path that a text names.
+
+    Args:
+        place: "scheme://..." for what fsspec reaches, else a name on this machine; "file://..." is one too. Paths of
+            pathlib and of universal_pathlib (with storage options of their own, say) stay as they are.
+
+    Returns:
+        A `pathlib.Path`, or a `upath.UPath`, which has the same interface.
+
+    Raises:
+        CFlowError: the extra `remote` is missing, or the package of the scheme's file system, or fsspec does not know
+            the scheme.
+    """
+    if not isinstance(place, str):
+        return place
+    match = _SCHEME.match(place)
+    if match is None:
+        return Path(place)
+    scheme = match.group(1).lower()
+    if scheme == "file":
+        return Path(place[match.end() :])
+    try:
+        import fsspec
+        from upath import UPath
+    except ImportError:
+        raise CFlowError(f"{place} is not on this machine, which needs: pip install 'cflow_torch[remote]'") from None
+    try:
+        fsspec.get_filesystem_class(scheme)
+    except ImportError as error:  # it names the package
+        raise CFlowError(f"{place} needs one more package: {error}") from error
+    except ValueError as error:
+        raise CFlowError(f"fsspec has no file system {scheme}:// ({error}): {place}; is it written right?") from error
+    rest = place[match.end() :].rstrip("/")
+    path: Any = UPath(f"{scheme}://{rest}")
+    return path  # type: ignore[no-any-return]
+
+
+def is_remote(place: Any) -> bool:
+    """Whether a path is one of fsspec's, which `open` and memory mapping know nothing of."""
+    return hasattr(place, "storage_options") and not isinstance(place, (PosixPath, WindowsPath))
+
+
+def is_place(value: Any) -> bool:
+    """Whether a setting names a place."""
+    return isinstance(value, (str, Path)) or is_remote(value)
+
+
+@contextmanager
+def remote_errors(path: Path) -> Iterator[None]:
+    """Turns whatever the far side's own library raises (no credentials, no connection, a timeout) into an OSError."""
+    try:
+        yield
+    except (CFlowError, OSError):
+        raise
+    except Exception as error:
+        if not is_remote(path):
+            raise
+        raise OSError(f"cannot reach {path} ({type(error).__name__}: {error})") from error
+
+
+def read_bytes(path: Path) -> bytes:
+    """All of a file, in one request if it is remote.
+
+    Raises:
+        OSError: as for a local file, and if the far side cannot be reached.
+    """
+    with remote_errors(path):
+        return path.read_bytes()
+
+
+def whole(path: Path) -> Any:
+    """What to give a library that reads all of a file: its name, or what is in it if it is remote.
+
+    Raises:
+        OSError: a remote file cannot be read.
+    """
+    return io.BytesIO(read_bytes(path)) if is_remote(path) else str(path)
+
+
+def ranged(path: Path) -> Any:
+    """What to give a library that reads parts of a large file: its name, or an open binary file if it is remote.
+
+    Cost: one request for the blocks of 1 MiB in which the wanted bytes lie; the last 32 blocks of each file are kept.
+
+    Raises:
+        OSError: a remote file cannot be opened; later, that it cannot be read.
+    """
+    return io.BufferedReader(_RemoteFile(path, _BLOCK)) if is_remote(path) else str(path)
+
+
+def parts(path: Path) -> Any:
+    """An open binary file of which every `read` fetches just the bytes that it asks for, if it is remote.
+
+    Raises:
+        OSError: the file cannot be opened; later, that it cannot be read.
+    """
+    return _RemoteFile(path) if is_remote(path) else open(path, "rb")  # noqa: SIM115
+
+
+def mapped(path: Path) -> Any:
+    """What to give pyarrow to read a large file again and again: its name, or a copy on this machine if it is remote.
+
+    The last four copies stay in nameless files of the folder for temporary files (TMPDIR), which vanish with the
+    process however it ends.
+
+    Raises:
+        OSError: a remote file cannot be read, or there is no room for the copy.
+    """
+    return pa.BufferReader(_copy(path)) if is_remote(path) else str(path)
+
+
+@lru_cache(maxsize=_KEPT_COPIES)
+def _copy(path: Path) -> pa.Buffer:
+    with tempfile.TemporaryFile() as file, parts(path) as stream:
+        shutil.copyfileobj(stream, file, 8 * _BLOCK)
+        if not file.tell():
+            raise CFlowError(f"{path} is empty; copy it again")
+        file.flush()
+        return pa.py_buffer(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
+
+
+class _RemoteFile(io.RawIOBase):
+    """A remote file that is read by ranges.
+
+    Args:
+        path: of fsspec.
+        block: bytes; whole blocks are fetched and the last ones used are kept. 0 = what is asked for, nothing is kept.
+    """
+
+    def __init__(self, path: Any, block: int = 0) -> None:
+        super().__init__()
+        self._path, self._block, self._at = path, block, 0
+        self._blocks: Dict[int, bytes] = {}  # the one used last stands last
+        with remote_errors(path):
+            self._size = int(path.stat().st_size)
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def tell(self) -> int:
+        return self._at
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        self._at = offset + (0, self._at, self._size)[whence]
+        return self._at
+
+    def readinto(self, buffer: Any) -> int:
+        end = min(self._at + len(buffer), self._size)
+        if end <= self._at:
+            return 0
+        data = self._blockwise(self._at, end) if self._block else self._fetch(self._at, end)
+        buffer[: len(data)] = data
+        self._at += len(data)
+        return len(data)
+
+    def _fetch(self, start: int, end: int) -> bytes:
+        with remote_errors(self._path):
+            data: bytes = self._path.fs.cat_file(self._path.path, start=start, end=end)
+        if len(data) != end - start:
+            raise OSError(f"{self._path} gave {len(data)} bytes for {start} ... {end}; did it change meanwhile?")
+        return data
+
+    def _blockwise(self, start: int, end: int) -> bytes:
+        size = self._block
+        numbers = range(start // size, (end - 1) // size + 1)
+        missing = [number for number in numbers if number not in self._blocks]
+        if missing:
+            first, last = missing[0], missing[-1] + 1
+            data = self._fetch(first * size, min(last * size, self._size))
+            for number in range(first, last):
+                self._blocks[number] = data[(number - first) * size : (number - first + 1) * size]
+        for number in numbers:
+            self._blocks[number] = self._blocks.pop(number)
+        joined = b"".join(self._blocks[number] for number in numbers)
+        while len(self._blocks) > _KEPT_BLOCKS:
+            del self._blocks[next(iter(self._blocks))]
+        return joined[start - numbers[0] * size : end - numbers[0] * size]
