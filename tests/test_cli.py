@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import sys
 from pathlib import Path
@@ -68,8 +69,8 @@ def test_every_command_yaml_composes(file: Path) -> None:
 
 
 def test_demo_leaves_everything(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    assert run("demo", f"output={tmp_path}", "data.num_sweeps=3", "pair=1") == 0
-    (log,) = (AV2Log(folder) for folder in (tmp_path / "log").iterdir())
+    assert run("demo", f"output={tmp_path}", f"data.cache={tmp_path}/log", "data.num_sweeps=3", "pair=1") == 0
+    (log,) = (AV2Log(folder) for folder in (tmp_path / "log").glob("*/*/*"))
     assert sorted(int(f.stem) for f in (tmp_path / log.log_id).iterdir()) == list(log.timestamps[:-1])
     scores = json.loads((tmp_path / "results.json").read_text())
     assert scores["results"]["num_frames"] == 2 and scores["versions"]["cflow_torch"]
@@ -91,12 +92,16 @@ def test_flow_files_hold_the_method_s_result(log_folder: Path, tmp_path: Path) -
             np.testing.assert_array_equal(stored.numpy()[name], values, err_msg=name)
 
 
-def test_flow_refuses_another_run_s_folder(log_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_flow_goes_on_with_its_folder_and_refuses_another_run_s(
+    log_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
     call = ("flow", "data=av2", f"data.root={log_folder}", f"output={tmp_path}", "model=paper")
     assert run(*call) == 0
-    assert run(*call) == 2
+    assert run(*call) == 0
+    assert re.search(r"complete before +3\n", capsys.readouterr().out)
+    assert run(*call, "model.connectivity=4") == 2
     assert "overwrite=true" in capsys.readouterr().err
-    assert run(*call, "overwrite=true") == 0
+    assert run(*call, "model.connectivity=4", "overwrite=true") == 0
 
 
 def test_a_bad_frame_is_reported_and_the_rest_goes_on(
@@ -109,8 +114,8 @@ def test_a_bad_frame_is_reported_and_the_rest_goes_on(
     out = tmp_path / "out"
     assert run("flow", "data=av2", f"data.root={broken}", f"output={out}", "model=paper") == 1
     error = capsys.readouterr().err
-    assert "1 failed" in error and f"log/{sweeps[2].stem}" in error and sweeps[3].name in error
-    assert sorted(f.stem for f in (out / "log").iterdir()) == [s.stem for s in sweeps[:2]]
+    assert f"missing:\n  log/{sweeps[2].stem}" in error and sweeps[3].name in error
+    assert sorted(f.stem for f in (out / "log").glob("*.feather")) == [s.stem for s in sweeps[:2]]
 
 
 def test_a_bad_log_is_reported_and_the_rest_goes_on(

@@ -26,13 +26,13 @@ from cflow_torch import CFlowError, Config
 from cflow_torch.cli.eval import objective
 from cflow_torch.cli.main import main
 from cflow_torch.cli.run import _folder_name
-from cflow_torch.cli.stopwatch import StopWatch
 from cflow_torch.data import benchmark
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.benchmark import benchmark_logs
 from cflow_torch.data.log import window
 from cflow_torch.data.synthetic import make_drive
 from cflow_torch.data.writers import write_av2_log
+from cflow_torch.stopwatch import StopWatch
 
 CONFIGS = Path(cflow_torch.configs.__file__).parent
 EXPERIMENTS = sorted(file.stem for file in CONFIGS.glob("experiment/*.yaml"))

@@ -43,12 +43,14 @@ LAYERS = {
     "keypoints": 3,
     "pyramid": 3,
     "estimate": 3,
+    "stopwatch": 3,
     "": 4,  # cflow_torch/__init__.py
     "data": 4,
     "evaluation": 4,
     "submission": 4,
     "viz": 4,
     "bench": 4,
+    "fleet": 5,
     "integrations": 5,
     "cli": 5,
 }

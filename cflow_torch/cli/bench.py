@@ -16,15 +16,16 @@ from cflow_torch.bench.measure import run_bench
 from cflow_torch.bench.table import format_bench, format_targets
 from cflow_torch.bench.target_row import FULL
 from cflow_torch.bench.targets import measure_targets
-from cflow_torch.cli.run import finish, make_model, open_logs, write_text
+from cflow_torch.cli.run import finish, make_model, open_logs
 from cflow_torch.data.log import window
+from cflow_torch.data.records import write_text
 
 
 def task(cfg: DictConfig) -> None:
     """Run `cflow bench`."""
     output = Path(cfg.output)
     model = make_model(cfg)
-    logs, failures = open_logs(cfg, output)
+    logs, failures = open_logs(cfg)
     finish(failures)
     config, log = model.config, logs[0]
     history, scales = FULL.num_history, FULL.pixel_sizes

@@ -26,7 +26,7 @@ def task(cfg: DictConfig) -> None:
     output = output_folder(cfg)
     metrics = SceneFlowMetrics(cfg.definition)
     model = make_model(cfg)
-    logs, failures = open_logs(cfg, output)
+    logs, failures = open_logs(cfg)
 
     def keep(log: Log, index: int, sweeps: Window, result: FlowResult) -> None:
         write_flow(output / log.log_id / f"{log.timestamps[index]}.feather", result)

@@ -20,11 +20,11 @@ from omegaconf import DictConfig
 
 from cflow_torch.cli.record import DataIdentity, finished_results, write_results
 from cflow_torch.cli.run import finish, for_each_pair, make_model, open_logs, output_folder
-from cflow_torch.cli.stopwatch import StopWatch
 from cflow_torch.data.log import Log
 from cflow_torch.evaluation.frame import EvalFrame
 from cflow_torch.evaluation.metrics import SceneFlowMetrics
 from cflow_torch.evaluation.tables import format_table
+from cflow_torch.stopwatch import StopWatch
 from cflow_torch.types import CFlowError, FlowResult, Window
 
 
@@ -37,7 +37,7 @@ def task(cfg: DictConfig) -> float:
         return objective(record["results"])
     metrics = SceneFlowMetrics(cfg.definition)
     model = StopWatch(make_model(cfg))
-    logs, failures = open_logs(cfg, output)
+    logs, failures = open_logs(cfg)
     identity = DataIdentity(cfg, logs)
 
     def score(log: Log, index: int, sweeps: Window, result: FlowResult) -> None:

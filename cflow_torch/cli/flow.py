@@ -2,78 +2,114 @@
 
 Columns: flow_t{x,y,z}_m total flow, residual_t{x,y,z}_m motion of objects, pose_t{x,y,z}_m ego motion (float32,
 metres until the next sweep, axes of the ego frame at t+1), cluster_id, score, is_valid; one row per point of sweep t.
-OUTPUT/config.yaml holds the resolved settings and versions. result_name=NAME (HDF5 scenes) also writes the total flow
-into the scenes themselves, as key NAME of every sweep, where the viewers of OpenSceneFlow find it.
+OUTPUT/config.yaml holds the resolved settings and versions, OUTPUT/reports what was done. The same command again goes
+on where the last one ended. Ctrl-C and SIGTERM let the frames in hand be finished. The status is 0 if every frame is
+there, 1 if one is missing, 2 if the call was wrong, 130 or 143 after a signal.
+
+result_name=NAME (HDF5 scenes) also writes the total flow into the scenes themselves, as key NAME of every sweep, where
+the viewers of OpenSceneFlow find it.
 
   cflow flow data=av2 data.root=/data/av2/val output=outputs/val
-  cflow flow model=paper model.pixel_sizes=[0.2]
+  cflow flow data=av2 data.root=/data/av2/val dry_run=true        frames, outputs, time, memory, disk
+  cflow flow model=paper model.pixel_sizes=[0.2] engine.workers=8
+  cflow flow shard.index=2 shard.count=16 ...                     one of 16 processes, on any machine
+  cflow flow engine=ray engine.address=auto ...                   on a Ray cluster
+  cflow flow data=av2 data.root=s3://bucket/val output=s3://bucket/flow
   cflow flow data=hdf5 data.root=/data/scenes result_name=cflow
 """
 
 from __future__ import annotations
 
-from contextlib import ExitStack
+import os
+import sys
 from pathlib import Path
-from typing import Any, List, Tuple
+from typing import Any, Dict, Sequence
 
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
-from cflow_torch.cli.run import Failures, finish, for_each_pair, make_model, open_logs, output_folder, write_config
-from cflow_torch.data.flow_file import read_flow, write_flow
-from cflow_torch.data.hdf5.reader import HDF5Log
+from cflow_torch.cli.run import Failures, find_logs, make_model, output_folder, versions
+from cflow_torch.data.flow_file import read_flow
 from cflow_torch.data.hdf5.results import check_result_name, check_writable, write_hdf5_results
-from cflow_torch.data.log import Log
-from cflow_torch.types import CFlowError, FlowResult, Window
+from cflow_torch.data.records import write_text
+from cflow_torch.fleet.forecast import format_forecast, make_forecast
+from cflow_torch.fleet.job import Job
+from cflow_torch.fleet.machine import choose_layout
+from cflow_torch.fleet.manifest import claim_folder, complete_frames, find_conflict, frame_file, make_identity
+from cflow_torch.fleet.report import format_missing, format_report
+from cflow_torch.fleet.run import report_file, run_fleet
+from cflow_torch.fleet.shard import Shard, find_shard
+from cflow_torch.types import CFlowError
 
 
 def task(cfg: DictConfig) -> None:
     """Run `cflow flow`."""
     output = output_folder(cfg)
-    if (output / "config.yaml").exists() and not cfg.overwrite:
-        raise CFlowError(f"{output} holds results of another run: give output=FOLDER, or overwrite=true")
+    shard = find_shard(cfg.shard.index, cfg.shard.count, os.environ)
     if cfg.result_name is not None:
-        if cfg.data.name != "hdf5":
-            raise CFlowError(f"result_name writes into HDF5 scenes: it needs data=hdf5, not data={cfg.data.name}")
-        check_result_name(cfg.result_name)
-    model = make_model(cfg)
-    logs, failures = open_logs(cfg, output)
-    done: List[Tuple[Log, int, Path]] = []
-    with ExitStack() as scenes:  # closed before anything is written into them
-        for log in logs:
-            scene = _scene(log)
-            if isinstance(scene, HDF5Log):
-                scenes.enter_context(scene)
-                if cfg.result_name is not None:
-                    check_writable(scene.file)
-        write_config(cfg, output)
-
-        def keep(log: Log, index: int, _: Window, result: FlowResult) -> None:
-            file = output / log.log_id / f"{log.timestamps[index]}.feather"
-            write_flow(file, result)
-            done.append((log, log.timestamps[index], file))
-
-        failures += for_each_pair(logs, model, keep)
-    print(f"flow files in {output}")
+        _check_results(cfg, shard)
+    engine: Dict[str, Any] = OmegaConf.to_container(cfg.engine, resolve=True)  # type: ignore[assignment]
+    name, workers, threads, batch = (engine.pop(key) for key in ("name", "workers", "threads", "batch"))
+    layout = choose_layout(cfg.device, workers, threads, batch, os.environ)
+    config = make_model(cfg).config
+    sources = find_logs(cfg)
+    identity = make_identity(config, sources.reader, sources.settings)
+    job = Job(
+        config=config,
+        identity=identity["hash"],
+        reader=sources.reader,
+        settings={key: value for key, value in sources.settings.items() if key != "check"},
+        output=str(output),
+        batch=layout.batch,
+        redo=cfg.overwrite,
+        check=sources.settings.get("check", True),
+    )
+    if cfg.dry_run:
+        conflict = find_conflict(output, identity, cfg.resume or cfg.overwrite)
+        print(format_forecast(make_forecast(job, shard.units(sources.logs), layout), job))
+        if conflict is not None:
+            print(f"{output} holds results of another run{conflict}; overwrite=true would replace them")
+        return
     if cfg.result_name is not None:
-        failures += _into_scenes(cfg.result_name, logs, done)
-    finish(failures)
+        for scene in sources.logs:
+            check_writable(scene)
+    claim_folder(output, identity, cfg.resume, cfg.overwrite, shard.count == 1)
+    settings = OmegaConf.to_container(cfg, resolve=True)
+    kept = {key: settings[key] for key in ("model", "data", "result_name")}  # type: ignore[index,call-overload]
+    write_text(output / "config.yaml", OmegaConf.to_yaml(OmegaConf.create({**kept, "versions": versions()})))
+
+    about = {"config": settings, "versions": versions()}
+    report = run_fleet(job, sources.logs, layout, shard, name, about, **engine)
+    missing = format_missing(report)
+    status = report["exit_status"]
+    if cfg.result_name is not None:
+        failures = _into_scenes(cfg.result_name, sources.logs, output)
+        missing += "".join(f"\n  {scene}: {message}" for scene, message in failures)
+        status = status or int(bool(failures))
+    print(f"{format_report(report)}\nflow files in {output}, report in {report_file(job.output, shard)}")
+    if status:
+        print(f"missing:\n{missing}", file=sys.stderr)
+        raise SystemExit(status)
 
 
-def _into_scenes(name: str, logs: List[Log], done: List[Tuple[Log, int, Path]]) -> Failures:
-    """Copy the flow files of this run into their scenes; a scene that refuses is reported and left as it was."""
+def _check_results(cfg: DictConfig, shard: Shard) -> None:
+    if cfg.data.name != "hdf5":
+        raise CFlowError(f"result_name writes into HDF5 scenes: it needs data=hdf5, not data={cfg.data.name}")
+    if shard.count > 1:
+        raise CFlowError("result_name writes into whole scenes: give it to a last run without shards")
+    check_result_name(cfg.result_name)
+
+
+def _into_scenes(name: str, scenes: Sequence[Path], output: Path) -> Failures:
+    """Copy the flow files into their scenes; a scene that refuses is reported and left as it was."""
     failures: Failures = []
     count = 0
-    for log in tqdm(logs, desc=name, unit="scene", disable=None):
-        results = ((timestamp, read_flow(file).flow) for owner, timestamp, file in done if owner is log)
+    for scene in tqdm(scenes, desc=name, unit="scene", disable=None):
+        folder = output / scene.stem
+        stamps = sorted(complete_frames(folder))
         try:
-            count += write_hdf5_results(_scene(log).file, name, results)
+            count += write_hdf5_results(scene, name, ((t, read_flow(frame_file(folder, t)).flow) for t in stamps))
         except (CFlowError, OSError) as error:
-            failures.append((log.log_id, str(error)))
+            failures.append((scene.stem, str(error)))
     print(f"sweeps that now have a key {name} in their scene: {count} (the last sweep of a scene has no flow)")
     return failures
-
-
-def _scene(log: Any) -> Any:
-    """The log itself, without what was put round it (ground, poses)."""
-    return _scene(log.log) if hasattr(log, "log") else log

@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 import os
 import platform
 import re
 from dataclasses import asdict
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any, Dict, List, Optional, Sequence, Tuple
+from typing import Any, Dict, Optional, Sequence, Tuple
 
 import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from cflow_torch.cli.run import versions, write_config, write_text
+from cflow_torch.cli.run import versions, write_config
 from cflow_torch.data.benchmark import generator_key
 from cflow_torch.data.log import FlowLabels, Log
+from cflow_torch.data.records import changes, strict, write_text
 from cflow_torch.evaluation.definitions import get_definition
 from cflow_torch.types import CFlowError, Window
 
@@ -71,14 +71,9 @@ def finished_results(cfg: DictConfig, folder: Path) -> Optional[Dict[str, Any]]:
             f"{file} is no results file of this version ({error!r}): give output=FOLDER, or overwrite=true"
         ) from None
     now = {"versions": versions(), "generator": _generator(cfg), "config": _plain(cfg)}
-    old, new = _flat(before), _flat(now)
-    changed = sorted(key for key in {*old, *new} if old.get(key) != new.get(key) and key not in _PLACES)
+    changed = changes(before, now, _PLACES)
     if changed:
-        shown = "; ".join(f"{key} was {old.get(key)}, is {new.get(key)}" for key in changed[:5])
-        more = f" and {len(changed) - 5} more" if len(changed) > 5 else ""
-        raise CFlowError(
-            f"{folder} holds results of another run ({shown}{more}): give output=FOLDER, or overwrite=true"
-        )
+        raise CFlowError(f"{folder} holds results of another run ({changed}): give output=FOLDER, or overwrite=true")
     return record  # type: ignore[no-any-return]
 
 
@@ -117,7 +112,7 @@ def write_results(
         "results": results,
     }
     write_config(cfg, folder)
-    text = json.dumps(_strict(record), indent=1, allow_nan=False)
+    text = json.dumps(strict(record), indent=1, allow_nan=False)
     short = re.sub(
         r"\[\n\s*([^][{}]*?)\n\s*\]", lambda found: f"[{' '.join(found[1].split())}]", text
     )  # lists on one line
@@ -129,23 +124,4 @@ def _generator(cfg: DictConfig) -> Optional[str]:
 
 
 def _plain(cfg: DictConfig) -> Any:
-    return _strict(OmegaConf.to_container(cfg, resolve=True))
-
-
-def _flat(value: Any, name: str = "") -> Dict[str, Any]:
-    """Nested dictionaries as one, keys joined by dots; lists are values."""
-    if not isinstance(value, dict):
-        return {name: value}
-    parts: List[Dict[str, Any]] = [_flat(part, f"{name}.{key}" if name else str(key)) for key, part in value.items()]
-    return {key: leaf for part in parts for key, leaf in part.items()}
-
-
-def _strict(value: Any) -> Any:
-    """JSON has neither NaN nor infinity: NaN (no points) becomes null, infinity a text."""
-    if isinstance(value, dict):
-        return {str(key): _strict(part) for key, part in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_strict(part) for part in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None if math.isnan(value) else str(value)
-    return value
+    return strict(OmegaConf.to_container(cfg, resolve=True))

@@ -6,9 +6,9 @@ import hashlib
 import platform
 import re
 import sys
-from functools import lru_cache
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Callable, Dict, List, Protocol, Sequence, Tuple
+from typing import Any, Callable, Dict, List, Sequence, Tuple
 
 import numpy as np
 import torch
@@ -19,13 +19,13 @@ from tqdm import tqdm
 
 from cflow_torch import __version__, estimate
 from cflow_torch.config import Config
-from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.benchmark import benchmark_logs, format_of
 from cflow_torch.data.catalog import find_sources, open_log
-from cflow_torch.data.log import Log, window
-from cflow_torch.data.synthetic import make_drive
-from cflow_torch.data.writers import write_av2_log
+from cflow_torch.data.log import Log, RecentSweeps, window
+from cflow_torch.data.paths import as_path
+from cflow_torch.data.records import write_text
 from cflow_torch.pyramid import CoarseToFine
+from cflow_torch.stopwatch import FlowModel
 from cflow_torch.types import CFlowError, FlowResult, Window
 
 Failures = List[Tuple[str, str]]
@@ -33,15 +33,6 @@ UseResult = Callable[[Log, int, Window, FlowResult], None]
 # Settings of `data` that are not the reader's.
 _NOT_THE_READERS = ("name", "label", "root", "first", "step")
 _LONGEST_NAME = 150  # characters of a folder name; file systems end at 255 bytes
-
-
-class FlowModel(Protocol):
-    """What the loop over pairs needs of a method."""
-
-    config: Config
-
-    def __call__(self, windows: Sequence[Window]) -> List[FlowResult]:
-        """One result per window."""
 
 
 def versions() -> Dict[str, str]:
@@ -68,14 +59,17 @@ def output_folder(cfg: DictConfig) -> Path:
     """Where a run writes: `cfg.output`; for a job of a sweep, a folder below it that no other job shares.
 
     Its name is what was overridden for this job (`output` and `overwrite` aside), with the experiment, if one was
-    chosen, as a folder above: `outputs/eval/pixel_size/model.pixel_sizes=[0.2]`.
+    chosen, as a folder above: `outputs/eval/pixel_size/model.pixel_sizes=[0.2]`. A sweep over shards is one run in
+    pieces: its jobs share `cfg.output` itself.
     """
-    folder = Path(cfg.output)
+    folder = as_path(cfg.output)
     if not HydraConfig.initialized() or HydraConfig.get().mode != RunMode.MULTIRUN:
         return folder
     parts = []
     for override in HydraConfig.get().overrides.task:
         key, _, value = override.partition("=")
+        if key == "shard.index":
+            return folder
         if key == "experiment":
             folder = folder / _folder_name(value)
         elif key not in ("output", "overwrite"):
@@ -91,37 +85,54 @@ def _folder_name(text: str) -> str:
     return name
 
 
-def open_logs(cfg: DictConfig, folder: Path) -> Tuple[List[Log], Failures]:
-    """The logs of `cfg.data`; those that cannot be opened are reported, not fatal.
+@dataclass(frozen=True)
+class Sources:
+    """Logs that are not open yet.
 
     Args:
-        cfg: resolved settings.
-        folder: where a synthetic log is written before it is read back like any other.
+        reader: data set, a key of `catalog.DATA_SETS`.
+        settings: of its reader.
+        logs: what `catalog.open_log` takes, one each.
+    """
+
+    reader: str
+    settings: Dict[str, Any]
+    logs: List[Any]
+
+
+def find_logs(cfg: DictConfig) -> Sources:
+    """The logs of `cfg.data`; simulated ones are made first, if they are not in the cache.
 
     Raises:
         CFlowError: no log at all.
     """
     data = cfg.data
-    reader, settings = "av2", {"check": False}  # of what the simulator writes
     if data.name == "synthetic":
-        drive = make_drive(seed=data.seed, num_sweeps=data.num_sweeps)
-        sources = [write_av2_log(drive, folder / "log", overwrite=True)]
-    elif data.name == "benchmark":
+        return Sources("av2", {"check": False}, benchmark_logs(data.cache, "av2", [data.seed], data.num_sweeps))
+    if data.name == "benchmark":
         seeds = range(data.first_seed, data.first_seed + data.num_drives)
         chosen = format_of(data.profile)
-        reader, settings = chosen.data_set, {"check": False, **chosen.settings}
-        sources = benchmark_logs(data.cache, data.profile, seeds, data.num_sweeps, data.scenes)
-    elif OmegaConf.is_missing(data, "root"):
+        logs = benchmark_logs(data.cache, data.profile, seeds, data.num_sweeps, data.scenes)
+        return Sources(chosen.data_set, {"check": False, **chosen.settings}, logs)
+    if OmegaConf.is_missing(data, "root"):
         raise CFlowError("where is the data? give data.root=PATH, one log or a folder of logs")
-    else:
-        reader, given = data.name, OmegaConf.to_container(data, resolve=True)
-        sources = list(find_sources(reader, data.root))
-        settings = {str(key): value for key, value in given.items() if key not in _NOT_THE_READERS}  # type: ignore[union-attr]
+    given: Dict[str, Any] = OmegaConf.to_container(data, resolve=True)  # type: ignore[assignment]
+    settings = {str(key): value for key, value in given.items() if key not in _NOT_THE_READERS}
+    return Sources(data.name, settings, list(find_sources(data.name, data.root)))
+
+
+def open_logs(cfg: DictConfig) -> Tuple[List[Log], Failures]:
+    """The logs of `cfg.data`; those that cannot be opened are reported, not fatal.
+
+    Raises:
+        CFlowError: no log at all.
+    """
+    sources = find_logs(cfg)
     logs: List[Log] = []
     failures: Failures = []
-    for source in sources:
+    for source in sources.logs:
         try:
-            logs.append(open_log(reader, source, **settings))
+            logs.append(open_log(sources.reader, source, **sources.settings))
         except (CFlowError, OSError) as error:
             failures.append((source.name, str(error)))
             tqdm.write(f"failed: {source.name}: {error}", file=sys.stderr)
@@ -146,7 +157,7 @@ def for_each_pair(logs: Sequence[Log], model: FlowModel, use: UseResult, first: 
     """
     if first < 0 or step < 1:
         raise CFlowError(f"data.first={first}, data.step={step}: give a first pair of at least 0, a step of at least 1")
-    recent = [_RecentSweeps(log, model.config.num_history + 2) for log in logs]
+    recent = [RecentSweeps(log, model.config.num_history + 2) for log in logs]
     pairs = [(log, index) for log in recent for index in range(first, len(log.timestamps) - 1, step)]
     failures: Failures = []
     for log, index in tqdm(pairs, unit="pair", disable=None):
@@ -161,19 +172,6 @@ def for_each_pair(logs: Sequence[Log], model: FlowModel, use: UseResult, first: 
     return failures
 
 
-class _RecentSweeps:
-    """A log that remembers its last sweeps: neighbouring windows share all but one.
-
-    Args:
-        log: any log.
-        count: sweeps to remember.
-    """
-
-    def __init__(self, log: Log, count: int) -> None:
-        self.log, self.log_id, self.timestamps, self.labels = log, log.log_id, log.timestamps, log.labels
-        self.sweep = lru_cache(count)(log.sweep)
-
-
 def finish(failures: Failures) -> None:
     """List what failed, and end the process with status 1 if anything did."""
     if failures:
@@ -181,12 +179,6 @@ def finish(failures: Failures) -> None:
         for frame, message in failures:
             print(f"  {frame}: {message}", file=sys.stderr)
         raise SystemExit(1)
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a text file atomically."""
-    with atomic_file(path) as file:
-        file.write(text.encode())
 
 
 def write_config(cfg: DictConfig, folder: Path) -> None:

@@ -55,7 +55,7 @@ def task(cfg: DictConfig) -> None:
     masks = None if cfg.masks is None else MaskArchive(cfg.masks)
     listed = read_frame_list(cfg.frames) if cfg.frames is not None else None if masks is None else masks.frames
     model = make_model(cfg)
-    logs, failures = open_logs(cfg, output)
+    logs, failures = open_logs(cfg)
     plan, unreadable = _plan(logs, version, listed, masks)
     failures += unreadable
     if cfg.archive is not None:

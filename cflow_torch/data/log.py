@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Optional, Protocol, Sequence
 
 import numpy as np
@@ -58,3 +59,16 @@ def window(log: Log, index: int, num_history: int = 0) -> Window:
         )
     history = range(index - 1, max(index - 1 - num_history, -1), -1)
     return Window(log.sweep(index), log.sweep(index + 1), tuple(log.sweep(i) for i in history))
+
+
+class RecentSweeps:
+    """A log that remembers its last sweeps: neighbouring windows share all but one.
+
+    Args:
+        log: any log.
+        count: sweeps to remember.
+    """
+
+    def __init__(self, log: Log, count: int) -> None:
+        self.log, self.log_id, self.timestamps, self.labels = log, log.log_id, log.timestamps, log.labels
+        self.sweep = lru_cache(count)(log.sweep)

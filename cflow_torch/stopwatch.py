@@ -5,14 +5,23 @@ from __future__ import annotations
 import statistics
 import time
 from contextlib import contextmanager
-from typing import Any, Dict, Iterator, List, Sequence
+from typing import Any, Dict, Iterator, List, Protocol, Sequence
 from unittest.mock import patch
 
 import torch
 from torch.profiler import record_function
 
-from cflow_torch.cli.run import FlowModel
+from cflow_torch.config import Config
 from cflow_torch.types import FlowResult, Window
+
+
+class FlowModel(Protocol):
+    """What runs and clocks need of a method."""
+
+    config: Config
+
+    def __call__(self, windows: Sequence[Window]) -> List[FlowResult]:
+        """One result per window."""
 
 
 class StopWatch:

@@ -1,0 +1,1 @@
+"""Flow of whole fleets of logs: shards, workers, resuming, engines."""

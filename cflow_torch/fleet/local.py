@@ -1,0 +1,194 @@
+"""Engine `local`: worker processes of this machine, fed, watched and replaced by one parent."""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+from collections import deque
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from multiprocessing.connection import Connection, wait
+from typing import Any, Callable, Deque, Dict, Iterator, List, Optional, Sequence, Set
+
+import pyarrow
+import torch
+
+from cflow_torch.fleet.job import Begun, Event, Failed, Job, Opened, Unit
+from cflow_torch.fleet.machine import Layout
+from cflow_torch.fleet.work import Worker, source_name
+from cflow_torch.types import CFlowError
+
+# A frame that two workers died on is given up; so is a unit that two died on before its first frame.
+_MOST_DEATHS = 2
+_POLL_S = 0.2  # how soon a signal is noticed
+_END = "end"  # tells a worker that there is nothing more
+
+
+def run_local(job: Job, units: Sequence[Unit], layout: Layout, stop: Callable[[], bool]) -> Iterator[Event]:
+    """Do all units.
+
+    Args:
+        job: the run.
+        units: numbered as in `split`.
+        layout: one worker per device. A single worker is this very process.
+        stop: asked all the time; from True on, frames in hand are finished and no others begun.
+
+    Yields:
+        What happens, as it happens. A worker that is killed is replaced and its frames done again, one by one; a frame
+        that kills two workers is `Failed`.
+    """
+    if len(layout.devices) == 1:
+        worker = Worker(job, layout.devices[0])
+        for unit in units:
+            if stop():
+                break
+            yield from worker.run(unit, stop)
+        worker.close()
+    else:
+        yield from _Crew(job, units, layout, stop).run()
+
+
+@dataclass(frozen=True)
+class _Refusal:
+    """What a worker that cannot begin says."""
+
+    message: str
+
+
+@dataclass
+class _Hand:
+    """A worker as its parent sees it."""
+
+    device: str
+    process: Any
+    pipe: Connection
+    unit: Optional[Unit] = None
+    log_id: Optional[str] = None
+    in_hand: List[int] = field(default_factory=list)  # frames begun and not settled
+
+
+class _Crew:
+    """Hands out units, gathers events, replaces the dead."""
+
+    def __init__(self, job: Job, units: Sequence[Unit], layout: Layout, stop: Callable[[], bool]) -> None:
+        self._job, self._layout, self._stop = job, layout, stop
+        self._pending: Deque[Unit] = deque(units)
+        self._deaths: Dict[Any, int] = {}  # (unit number, time stamp or None) -> workers that died on it
+        self._hands: List[_Hand] = []
+
+    def run(self) -> Iterator[Event]:
+        """See `run_local`."""
+        try:
+            self._hands = [self._hire(device) for device in self._layout.devices[: max(1, len(self._pending))]]
+            told = False
+            while True:
+                if self._stop() and not told:
+                    told = True
+                    self._pending.clear()
+                    for hand in self._hands:
+                        self._send(hand, _END)
+                for hand in self._hands:
+                    if hand.unit is None and self._pending:
+                        hand.unit, hand.log_id, hand.in_hand = self._pending.popleft(), None, []
+                        self._send(hand, hand.unit)
+                if all(hand.unit is None for hand in self._hands):
+                    break
+                ready = set(wait([hand.pipe for hand in self._hands], timeout=_POLL_S))
+                for position, hand in enumerate(self._hands):
+                    if hand.pipe in ready:
+                        yield from self._hear(position, hand)
+        except BaseException:
+            for hand in self._hands:
+                hand.process.kill()
+            raise
+        finally:
+            for hand in self._hands:
+                self._send(hand, _END)
+                hand.process.join()
+                hand.pipe.close()
+
+    def _hire(self, device: str) -> _Hand:
+        context = multiprocessing.get_context("spawn")  # fork and threads, or CUDA, do not go together
+        here, there = context.Pipe()
+        process = context.Process(target=_serve, args=(self._job, device, self._layout.threads, there), daemon=True)
+        process.start()
+        there.close()  # the worker's end closes with the worker
+        return _Hand(device, process, here)
+
+    @staticmethod
+    def _send(hand: _Hand, message: Any) -> None:
+        with suppress(OSError):  # it died: `_hear` will find out
+            hand.pipe.send(message)
+
+    def _hear(self, position: int, hand: _Hand) -> Iterator[Event]:
+        """One message of a worker, or its end."""
+        try:
+            event = hand.pipe.recv()
+        except (EOFError, OSError):
+            yield from self._mourn(position, hand)
+            return
+        if event is None:  # the unit is at its end
+            hand.unit = None
+        elif isinstance(event, _Refusal):
+            raise CFlowError(event.message)
+        else:
+            if isinstance(event, Opened):
+                hand.log_id = event.log_id
+            elif isinstance(event, Begun):
+                hand.in_hand += event.timestamps
+            elif event.timestamp in hand.in_hand:
+                hand.in_hand.remove(event.timestamp)
+                self._deaths.pop((event.unit, None), None)
+            yield event
+
+    def _mourn(self, position: int, hand: _Hand) -> Iterator[Event]:
+        """A worker died: blame what it had in hand, and put another in its place."""
+        hand.process.join()
+        hand.pipe.close()
+        unit, how = hand.unit, _how(hand.process.exitcode)
+        self._hands[position] = self._hire(hand.device)
+        if unit is None:
+            return
+        given_up: Set[int] = set()
+        for stamp in hand.in_hand or [None]:  # type: ignore[list-item]
+            deaths = self._deaths[unit.number, stamp] = self._deaths.get((unit.number, stamp), 0) + 1
+            # While several frames were in hand, each is only a suspect.
+            if deaths >= _MOST_DEATHS and len(hand.in_hand) <= 1:
+                name = hand.log_id or source_name(unit.source)
+                message = f"{deaths} workers died on it, the last one {how}"
+                yield Failed(unit.number, name if stamp is None else f"{name}/{stamp}", message, stamp)
+                if stamp is None:
+                    return
+                given_up.add(stamp)
+        if not self._stop():
+            self._pending.appendleft(replace(unit, careful=unit.careful | set(hand.in_hand), skip=unit.skip | given_up))
+
+
+def _how(status: Optional[int]) -> str:
+    if status is not None and status < 0:
+        name = signal.Signals(-status).name
+        return f"by {name}" + (" (out of memory?)" if -status == signal.SIGKILL else "")
+    return f"with status {status}"
+
+
+def _serve(job: Job, device: str, threads: int, pipe: Connection) -> None:
+    """What a worker process runs. Signals are the parent's business: it says when to stop."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+    torch.set_num_threads(threads)
+    pyarrow.set_cpu_count(threads)
+    with suppress(BrokenPipeError, EOFError):  # the parent is gone: so are we
+        try:
+            worker = Worker(job, device)
+        except CFlowError as error:
+            pipe.send(_Refusal(str(error)))
+            return
+        while True:
+            unit = pipe.recv()
+            if unit == _END:
+                break
+            # While a unit is done, nothing but the end can come, or the parent's.
+            for event in worker.run(unit, pipe.poll):
+                pipe.send(event)
+            pipe.send(None)
+        worker.close()

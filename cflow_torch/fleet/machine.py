@@ -1,0 +1,117 @@
+"""How many workers, threads and devices this machine gives a run, and how large its batches are."""
+
+from __future__ import annotations
+
+import os
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, List, Mapping, Optional, Tuple
+
+import torch
+
+from cflow_torch.types import CFlowError
+
+AUTO = "auto"
+# Bytes that one worker may come to hold; measured, see docs/fleet.md.
+WORKER_MEMORY = 1_500_000_000
+# Windows that are computed together. A CPU gains up to 4 (fewer small operations), then loses (cold memory).
+CPU_BATCH = 4
+# Not measured: no GPU was at hand.
+GPU_BATCH = 32
+_CGROUP = Path("/sys/fs/cgroup")
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How a run uses its machine.
+
+    Args:
+        devices: one per worker.
+        threads: of one worker.
+        batch: windows that are computed together.
+    """
+
+    devices: Tuple[str, ...]
+    threads: int
+    batch: int
+
+
+def choose_layout(device: str, workers: Any, threads: Any, batch: Any, environ: Mapping[str, str]) -> Layout:
+    """Fill in what is "auto".
+
+    Args:
+        device: "auto", "cpu", "cuda" or "cuda:2".
+        workers: processes, or "auto": on a CPU one per core (as far as memory goes), on GPUs one per GPU.
+        threads: of each worker, or "auto": the cores shared out.
+        batch: windows, or "auto".
+        environ: LOCAL_RANK or SLURM_LOCALID choose the GPU where several processes share a machine;
+            LOCAL_WORLD_SIZE and SLURM_CPUS_PER_TASK bound the cores.
+
+    Raises:
+        CFlowError: not a whole number of at least 1; a GPU where there is none.
+    """
+    gpus = _gpus(device, environ)
+    cores = usable_cores(environ)
+    if workers != AUTO:
+        count = _at_least_1("workers", workers)
+    elif gpus:
+        count = len(gpus)
+    else:
+        memory = available_memory()
+        count = cores if memory is None else max(1, min(cores, memory // WORKER_MEMORY))
+    per_worker = max(1, cores // count) if threads == AUTO else _at_least_1("threads", threads)
+    size = (GPU_BATCH if gpus else CPU_BATCH) if batch == AUTO else _at_least_1("batch", batch)
+    devices = tuple(gpus[k % len(gpus)] for k in range(count)) if gpus else ("cpu",) * count
+    return Layout(devices, per_worker, size)
+
+
+def _gpus(device: str, environ: Mapping[str, str]) -> List[str]:
+    """The GPUs that this process may use; none for the CPU."""
+    name = str(device)
+    if name == "cpu" or (name == AUTO and not torch.cuda.is_available()):
+        return []
+    if name not in (AUTO, "cuda"):
+        return [name]
+    found = torch.cuda.device_count()
+    if found == 0:
+        raise CFlowError(f"device={name}: this machine has no GPU that torch can use; give device=cpu or device=auto")
+    rank = environ.get("LOCAL_RANK", environ.get("SLURM_LOCALID"))
+    return [f"cuda:{k}" for k in range(found)] if rank is None else [f"cuda:{int(rank) % found}"]
+
+
+def usable_cores(environ: Mapping[str, str]) -> int:
+    """Cores that this process may use: its affinity, its container's quota, its share of a SLURM or torchrun job."""
+    counts = [os.cpu_count() or 1]
+    with suppress(AttributeError):  # not on every system
+        counts.append(len(os.sched_getaffinity(0)))
+    with suppress(OSError, ValueError):
+        quota, period = (_CGROUP / "cpu.max").read_text().split()
+        counts.append(int(quota) // int(period))
+    if environ.get("SLURM_CPUS_PER_TASK", "").isdigit():
+        counts.append(int(environ["SLURM_CPUS_PER_TASK"]))
+    if environ.get("LOCAL_WORLD_SIZE", "").isdigit():
+        counts.append(min(counts) // max(1, int(environ["LOCAL_WORLD_SIZE"])))
+    return max(1, min(counts))
+
+
+def available_memory() -> Optional[int]:
+    """Bytes that this process may still take; None where the system does not tell."""
+    free = []
+    with suppress(OSError, StopIteration, ValueError):
+        lines = Path("/proc/meminfo").read_text().splitlines()
+        free.append(1024 * int(next(line for line in lines if line.startswith("MemAvailable")).split()[1]))
+    with suppress(OSError, ValueError):
+        limit, used = (int((_CGROUP / name).read_text()) for name in ("memory.max", "memory.current"))
+        free.append(limit - used)
+    return min(free) if free else None
+
+
+def _at_least_1(name: str, value: Any) -> int:
+    try:
+        number = int(str(value))
+    except ValueError:
+        number = 0
+    if number < 1:
+        raise CFlowError(f"{name}={value!r}: give a whole number of at least 1, or {AUTO}")
+    return number

@@ -1,0 +1,183 @@
+"""What the results in a folder were made from: method, data settings, versions, input. Nothing else may join them.
+
+OUTPUT/manifest.json              identity of the run and its hash
+OUTPUT/<log id>/manifest.json     the log: its time stamps, digests of its first, middle and last sweep
+OUTPUT/<log id>/<ns>.feather      a complete frame: files take their names when they are on disk
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from contextlib import suppress
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Dict, List, Mapping, Optional, Set
+
+import numpy as np
+import torch
+
+from cflow_torch import __version__
+from cflow_torch.config import Config
+from cflow_torch.data.atomic import remove_stale
+from cflow_torch.data.log import Log
+from cflow_torch.data.records import changes, strict, write_text
+from cflow_torch.types import CFlowError, as_numpy
+
+MANIFEST = "manifest.json"
+_FORMAT = 1
+_OURS = re.compile(r"\d+\.feather|manifest\.json|\..+\.tmp")
+_REMEDY = "give output=FOLDER, or overwrite=true"
+
+
+def make_identity(config: Config, reader: str, settings: Mapping[str, Any]) -> Dict[str, Any]:
+    """What decides the bytes of a result, besides the sweeps: method (not its `max_memory`), data settings, versions.
+
+    A CPU build and a CUDA build of one torch version count as the same.
+    """
+    versions = {
+        "cflow_torch": __version__,
+        "torch": str(torch.__version__).split("+")[0],
+        "numpy": np.__version__,
+    }
+    data = {"reader": reader, **{key: value for key, value in settings.items() if key != "check"}}
+    method = {key: value for key, value in asdict(config).items() if key != "max_memory"}
+    identity = strict({"format": _FORMAT, "method": method, "data": data, "versions": versions})
+    return {**identity, "hash": hashlib.sha256(_text(identity).encode()).hexdigest()}
+
+
+def claim_folder(output: Path, identity: Mapping[str, Any], resume: bool, overwrite: bool, alone: bool) -> None:
+    """Make sure that the folder holds results of this identity only, and say so in its manifest.
+
+    Args:
+        output: folder of the run.
+        identity: of `make_identity`.
+        resume: go on with what an earlier run of the same identity left.
+        overwrite: throw away the results of another run.
+        alone: no other shard works in this folder.
+
+    Raises:
+        CFlowError: it holds results that must not be mixed with these.
+    """
+    why = find_conflict(output, identity, resume or overwrite)
+    if why is not None:
+        if not overwrite:
+            raise CFlowError(f"{output} holds results of another run{why}: {_REMEDY}")
+        if not alone:
+            raise CFlowError(
+                f"{output} holds results of another run{why}: with several shards, remove the folder yourself (shards "
+                "that begin together cannot agree who does), or give output=FOLDER"
+            )
+        _clear(output)
+    remove_stale(output)
+    if not (output / MANIFEST).exists():
+        write_text(output / MANIFEST, _text(identity))
+
+
+def find_conflict(output: Path, identity: Mapping[str, Any], resume: bool) -> Optional[str]:
+    """Why results of this identity must not join those in the folder, to follow a noun; None if they may."""
+    before = _read(output / MANIFEST)
+    if before is None:
+        return "" if (output / "config.yaml").exists() else None
+    changed = changes(before, identity, ["hash"])
+    if changed:
+        return f" ({changed})"
+    return None if resume else " with the same settings (resume=true goes on with it)"
+
+
+def claim_log(folder: Path, log: Log, run: str) -> None:
+    """Make sure that the frames in a log's folder were made from this very log, and say so in its manifest.
+
+    Raises:
+        CFlowError: the log has changed since, or another log has its name.
+
+    Cost: reads three sweeps.
+    """
+    now = describe_log(log, run)
+    before = _read(folder / MANIFEST)
+    if before is None:
+        write_text(folder / MANIFEST, _text(now))
+    elif not _same_log(before, now):
+        raise CFlowError(
+            f"{folder} holds flow of other sweeps (the log has changed since, or two logs have one name): "
+            "remove that folder, or give output=FOLDER"
+        )
+
+
+def describe_log(log: Log, run: str) -> Dict[str, Any]:
+    """Manifest of a log. A sweep that cannot be read has no digest; its frames will say why."""
+    stamps = [int(stamp) for stamp in log.timestamps]
+    digests: Dict[str, Optional[str]] = {}
+    for index in sorted({0, len(stamps) // 2, len(stamps) - 1} & set(range(len(stamps)))):
+        digests[str(stamps[index])] = None
+        with suppress(CFlowError, OSError):
+            digests[str(stamps[index])] = _digest(log, index)
+    return {"run": run, "log_id": log.log_id, "timestamps": stamps, "sweeps": digests}
+
+
+def complete_frames(folder: Path) -> Set[int]:
+    """Time stamps whose flow is in a log's folder."""
+    try:
+        names = [file.name for file in folder.iterdir()]
+    except (FileNotFoundError, NotADirectoryError):
+        return set()
+    return {int(name[: -len(".feather")]) for name in names if re.fullmatch(r"\d+\.feather", name)}
+
+
+def frame_file(folder: Path, timestamp: int) -> Path:
+    """Where the flow of one frame lies."""
+    return folder / f"{timestamp}.feather"
+
+
+def _same_log(before: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
+    if any(before.get(key) != now[key] for key in ("run", "log_id", "timestamps")):
+        return False
+    old = before.get("sweeps")
+    return isinstance(old, dict) and all(
+        old.get(stamp) in (None, digest) for stamp, digest in now["sweeps"].items() if digest is not None
+    )
+
+
+def _digest(log: Log, index: int) -> str:
+    """Of all that a sweep gives to the method."""
+    sweep, digest = log.sweep(index), hashlib.sha256()
+    for values in (sweep.points, sweep.is_ground, sweep.pose):
+        if values is not None:
+            array = np.ascontiguousarray(as_numpy(values))
+            digest.update(f"{array.dtype}{array.shape}".encode())
+            digest.update(array.tobytes())
+        digest.update(b"|")
+    return digest.hexdigest()
+
+
+def _clear(output: Path) -> None:
+    """Remove the results of a run, and nothing else. Its manifest goes first: what is left half-way belongs to none."""
+    logs: List[Path] = [path for path in output.iterdir() if path.is_dir()]
+    for name in (MANIFEST, "config.yaml"):
+        with suppress(FileNotFoundError):
+            (output / name).unlink()
+    for folder in logs:
+        files = list(folder.iterdir())
+        for file in files:
+            if _OURS.fullmatch(file.name):
+                file.unlink()
+        if files and all(_OURS.fullmatch(file.name) for file in files):
+            with suppress(OSError):  # object stores have no folders
+                folder.rmdir()
+
+
+def _read(file: Path) -> Optional[Dict[str, Any]]:
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return None
+    except ValueError as error:
+        raise CFlowError(f"{file} is no manifest ({error}): remove it, or {_REMEDY}") from None
+    if not isinstance(content, dict):
+        raise CFlowError(f"{file} is no manifest: remove it, or {_REMEDY}")
+    return content
+
+
+def _text(content: Mapping[str, Any]) -> str:
+    return json.dumps(content, indent=1, sort_keys=True) + "\n"

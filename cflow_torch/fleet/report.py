@@ -1,0 +1,108 @@
+"""The last word of a run: what is there, what is not, how long it took; as a table and as JSON."""
+
+from __future__ import annotations
+
+import json
+import platform
+from typing import Any, Dict, List
+
+from cflow_torch.data.records import strict
+from cflow_torch.fleet.machine import Layout
+from cflow_torch.fleet.shard import Shard
+from cflow_torch.fleet.tally import Tally
+
+_SHOWN = 20  # failures that the table lists; JSON has them all
+
+
+def make_report(
+    tally: Tally, seconds: float, layout: Layout, shard: Shard, engine: str, signal_name: str, about: Dict[str, Any]
+) -> Dict[str, Any]:
+    """All figures of a run.
+
+    Args:
+        tally: what was done.
+        seconds: from the start of the engine to its end.
+        layout: what it ran on.
+        shard: which share of the work it was.
+        engine: "local" or "ray".
+        signal_name: what stopped it, "" if nothing did.
+        about: more to keep, e.g. settings and versions.
+
+    Returns:
+        "status": "complete", "incomplete" (something failed or is missing) or "interrupted"; "frames": "total",
+        "complete_before", "computed", "failed", "waiting" (begun logs) and "unopened_units"; "frames_per_s" of those
+        computed; "stages": seconds per computed frame, summed over the workers, that overlap in time; "failures",
+        "waiting".
+    """
+    status = "interrupted" if signal_name else "complete" if tally.is_complete else "incomplete"
+    waiting = tally.waiting
+    return {
+        "status": status,
+        "stopped_by": signal_name or None,
+        "engine": engine,
+        "shard": {"index": shard.index, "count": shard.count},
+        "devices": list(layout.devices),
+        "threads": layout.threads,
+        "batch": layout.batch,
+        "machine": platform.platform(),
+        "frames": {
+            "total": tally.total,
+            "complete_before": tally.complete_before,
+            "computed": tally.computed,
+            "failed": len(tally.failures),
+            "waiting": len(waiting),
+            "unopened_units": tally.num_unopened,
+        },
+        "seconds": seconds,
+        "frames_per_s": tally.computed / seconds if seconds > 0 else 0.0,
+        "stages": {name: total / max(1, tally.computed) for name, total in tally.seconds.items()},
+        "failures": [list(failure) for failure in tally.failures],
+        "waiting": waiting,
+        **about,
+    }
+
+
+def format_report(report: Dict[str, Any]) -> str:
+    """The table."""
+    frames, shard = report["frames"], report["shard"]
+    rows = [
+        ("status", report["status"] + (f" by {report['stopped_by']}" if report["stopped_by"] else "")),
+        ("engine", f"{report['engine']}, {_workers(report)}, shard {shard['index']} of {shard['count']}"),
+        ("frames", frames["total"]),
+        ("  complete before", frames["complete_before"]),
+        ("  computed", frames["computed"]),
+        ("  failed", frames["failed"]),
+        ("  not done", frames["waiting"]),
+    ]
+    if frames["unopened_units"]:
+        rows.append(("logs or parts of logs not begun", frames["unopened_units"]))
+    rows.append(("seconds", f"{report['seconds']:.1f}"))
+    rows.append(("frames/s", f"{report['frames_per_s']:.2f}"))
+    if report["stages"]:
+        rows.append(("ms per frame and worker (stages overlap)", ""))
+        rows += [(f"  {name}", f"{1e3 * seconds:.1f}") for name, seconds in report["stages"].items()]
+    width = max(len(name) for name, _ in rows)
+    lines = [f"{name:{width}}  {value}".rstrip() for name, value in rows]
+    return "\n".join(lines)
+
+
+def format_missing(report: Dict[str, Any]) -> str:
+    """What is not there, a line each; "" if nothing is missing."""
+    lines: List[str] = [f"  {name}: {message}" for name, message in report["failures"]]
+    lines += [f"  {name}: not done" for name in report["waiting"]]
+    if len(lines) > _SHOWN:
+        lines[_SHOWN:] = [f"  and {len(lines) - _SHOWN} more, all of them in the report"]
+    if report["frames"]["unopened_units"]:
+        lines.append(f"  {report['frames']['unopened_units']} logs or parts of logs: not begun")
+    return "\n".join(lines)
+
+
+def to_json(report: Dict[str, Any]) -> str:
+    """The report as text."""
+    return json.dumps(strict(report), indent=1, allow_nan=False) + "\n"
+
+
+def _workers(report: Dict[str, Any]) -> str:
+    devices = report["devices"]
+    names = ", ".join(sorted(set(devices)))
+    return f"{len(devices)} worker{'s' * (len(devices) > 1)} on {names} with {report['threads']} threads each"

@@ -1,0 +1,103 @@
+"""A whole run: claims the folder, starts the engine, counts, reports."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import time
+from typing import Any, Dict, Iterator, List, Sequence
+
+from tqdm import tqdm
+
+from cflow_torch.data.atomic import remove_stale
+from cflow_torch.data.paths import as_path
+from cflow_torch.data.records import write_text
+from cflow_torch.fleet.job import Event, Failed, Job, Opened, split
+from cflow_torch.fleet.local import run_local
+from cflow_torch.fleet.machine import Layout
+from cflow_torch.fleet.report import make_report, to_json
+from cflow_torch.fleet.shard import Shard
+from cflow_torch.fleet.stop import StopSignal
+from cflow_torch.fleet.tally import Tally
+from cflow_torch.types import CFlowError
+
+ENGINES = ("local", "ray")
+
+
+def run_fleet(
+    job: Job,
+    sources: Sequence[Any],
+    layout: Layout,
+    shard: Shard,
+    engine: str = "local",
+    about: Dict[str, Any] = {},  # noqa: B006 (read only)
+    **engine_settings: Any,
+) -> Dict[str, Any]:
+    """Compute what is not complete yet, and report.
+
+    Args:
+        job: the run; its folder is claimed already (`manifest.claim_folder`).
+        sources: all logs, of all shards.
+        layout: workers of this machine.
+        shard: which share of the logs to do.
+        engine: "local" or "ray".
+        about: more to keep in the report.
+        **engine_settings: of the engine.
+
+    Returns:
+        What `make_report` returns, which is also in OUTPUT/reports/<shard>.json. "exit_status" is 0 if every frame of
+        the shard is on disk, 1 if not, 130 or 143 if Ctrl-C or SIGTERM came first.
+    """
+    shares = shard.units(sources)
+    units = split(shares, len(layout.devices))
+    tally = Tally(units)
+    start = time.perf_counter()
+    with StopSignal() as stop:
+        events = _engine(engine)(job, units, layout, stop, **engine_settings)
+        try:
+            _follow(events, tally, len(units))
+        except KeyboardInterrupt:
+            stop.received = stop.received or signal.SIGINT
+        seconds = time.perf_counter() - start
+        name = signal.Signals(stop.received).name if stop.received and not tally.is_complete else ""
+        report = make_report(tally, seconds, layout, shard, engine, name, about)
+        report["exit_status"] = stop.exit_status if name else 0 if tally.is_complete else 1
+        try:
+            file = report_file(job.output, shard)
+            remove_stale(file.parent)
+            write_text(file, to_json(report))
+        except OSError as error:
+            print(f"the report could not be written: {error}", file=sys.stderr)
+            report["exit_status"] = report["exit_status"] or 1
+    return report
+
+
+def report_file(output: str, shard: Shard) -> Any:
+    """Where a shard's report lies."""
+    return as_path(output) / "reports" / f"shard-{shard.index}-of-{shard.count}.json"
+
+
+def _engine(name: str) -> Any:
+    if name == "local":
+        return run_local
+    if name == "ray":
+        from cflow_torch.fleet.ray_engine import run_ray
+
+        return run_ray
+    raise CFlowError(f"engine={name!r}: give one of {', '.join(ENGINES)}")
+
+
+def _follow(events: Iterator[Event], tally: Tally, num_units: int) -> None:
+    """Count events in, and show how far it is: the total grows as logs are opened."""
+    opened: List[int] = []
+    with tqdm(unit="frame", disable=None, smoothing=0.05) as bar:
+        for event in events:
+            settled = tally.add(event)
+            if isinstance(event, Opened):
+                opened.append(event.total)
+                bar.total = round(sum(opened) / len(opened) * max(num_units, len(opened)))
+            if isinstance(event, Failed):
+                tqdm.write(f"failed: {event.name}: {event.message}", file=sys.stderr)
+            bar.update(settled)
+        bar.total = bar.n
+        bar.refresh()

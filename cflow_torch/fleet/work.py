@@ -1,0 +1,211 @@
+"""One worker: reads, computes and writes the frames of a unit, the three at the same time."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Callable, Deque, Dict, Iterator, List, Sequence, Set, Tuple, Union
+
+import torch
+
+from cflow_torch.data.atomic import remove_stale
+from cflow_torch.data.catalog import open_log
+from cflow_torch.data.flow_file import write_flow
+from cflow_torch.data.log import Log, RecentSweeps, window
+from cflow_torch.data.paths import as_path
+from cflow_torch.data.static_check import check_static_world
+from cflow_torch.estimate import make_model
+from cflow_torch.fleet.job import Begun, Done, Event, Failed, Job, Opened, Unit
+from cflow_torch.fleet.manifest import claim_log, complete_frames, frame_file
+from cflow_torch.stopwatch import FlowModel, stage_clock
+from cflow_torch.types import CFlowError, FlowResult, Window
+
+# Batches that are read ahead, and that wait to be written: enough to even out, little enough for flat memory.
+_AHEAD = 2
+Trouble = Exception  # whatever one frame does must not stop the others
+
+
+@dataclass
+class _Frame:
+    """A frame on its way through a worker."""
+
+    index: int
+    timestamp: int
+    seconds: Dict[str, float]
+    content: Union[Window, FlowResult, Trouble, None] = None
+
+
+class Worker:
+    """Holds the method and the log in hand.
+
+    Args:
+        job: the run.
+        device: where to compute.
+        ahead: batches read ahead and waiting to be written; 0 = read, compute and write in turn.
+        model: stands in for the method (tests).
+
+    Raises:
+        CFlowError: there is no such device, or it cannot be used.
+    """
+
+    def __init__(self, job: Job, device: str, ahead: int = _AHEAD, model: Union[FlowModel, None] = None) -> None:
+        try:
+            torch.zeros(1, device=device)  # now, rather than frame by frame
+        except (RuntimeError, AssertionError) as error:
+            raise CFlowError(f"no worker can begin on {device}: {describe(error)}") from error
+        self._job, self._ahead = job, ahead
+        self._model: FlowModel = make_model(job.config, device) if model is None else model
+        self._log: Tuple[Any, Union[Log, None]] = (None, None)
+
+    def run(self, unit: Unit, stop: Callable[[], bool] = lambda: False) -> Iterator[Event]:
+        """Do a unit's frames that are not complete.
+
+        Args:
+            unit: what to do.
+            stop: asked before each batch; from True on, what is computed is written and nothing new is begun.
+
+        Yields:
+            What happens: `Opened` once, then `Begun`, `Done` and `Failed`, in the order of the log.
+        """
+        try:
+            log = self._open(unit.source)
+            folder = as_path(self._job.output) / log.log_id
+            complete = set() if self._job.redo else complete_frames(folder)
+            frames = unit.frames(len(log.timestamps) - 1)
+            todo = [i for i in frames if log.timestamps[i] not in complete | unit.skip]
+            if todo or complete:
+                claim_log(folder, log, self._job.identity)
+            remove_stale(folder)
+            remove_stale(folder, {frame_file(folder, log.timestamps[i]).name for i in todo})  # ours now
+        except Trouble as error:
+            yield Failed(unit.number, source_name(unit.source), describe(error))
+            return
+        yield Opened(unit.number, log.log_id, len(frames), tuple(int(log.timestamps[i]) for i in todo))
+        if todo and self._job.check and unit.first == 0:
+            # A sweep that cannot be read is reported when its turn comes.
+            with suppress(Trouble):
+                check_static_world(log)
+        careful = {i for i in todo if log.timestamps[i] in unit.careful}
+        yield from self._pass(unit, log, folder, todo, careful, stop)
+
+    def close(self) -> None:
+        """Let go of the log in hand."""
+        log, self._log = self._log[1], (None, None)
+        while log is not None:  # what is put round a log (recent sweeps, ground, poses) holds it as `log`
+            if hasattr(log, "close"):
+                log.close()
+            log = getattr(log, "log", None)
+
+    def _open(self, source: Any) -> Log:
+        if self._log[1] is None or self._log[0] != source:
+            self.close()
+            log = open_log(self._job.reader, source, **{**self._job.settings, "check": False})
+            self._log = (source, RecentSweeps(log, self._job.config.num_history + 2))
+        return self._log[1]  # type: ignore[return-value]
+
+    def _pass(
+        self, unit: Unit, log: Log, folder: Path, todo: Sequence[int], careful: Set[int], stop: Callable[[], bool]
+    ) -> Iterator[Event]:
+        """Frames through the reading thread, this thread and the writing thread."""
+        ahead = 0 if careful else self._ahead
+        batches = iter(_batches(todo, self._job.batch, careful))
+        reading: Deque[Future] = deque()
+        writing: Deque[Future] = deque()
+        with ThreadPoolExecutor(1) as reader, ThreadPoolExecutor(1) as writer:
+            while True:
+                while len(reading) <= ahead and not stop():
+                    batch = next(batches, None)
+                    if batch is None:
+                        break
+                    yield Begun(unit.number, tuple(int(log.timestamps[i]) for i in batch))
+                    reading.append(reader.submit(self._read, log, batch))
+                if reading and not stop():
+                    frames = reading.popleft().result()
+                    self._compute(frames)
+                    writing.extend(writer.submit(self._write, folder, frame) for frame in frames)
+                elif not writing:
+                    break
+                # Only so many results are held; at the end, or to stop, all are waited for.
+                most = ahead * self._job.batch if reading and not stop() else 0
+                while writing and (len(writing) > most or writing[0].done()):
+                    yield _event(unit, log, writing.popleft().result())
+
+    def _read(self, log: Log, batch: Sequence[int]) -> List[_Frame]:
+        return [self._read_one(log, index) for index in batch]
+
+    def _read_one(self, log: Log, index: int) -> _Frame:
+        frame = _Frame(index, int(log.timestamps[index]), {})
+        with _stage(frame, "read"):
+            frame.content = window(log, index, self._job.config.num_history)
+        return frame
+
+    def _compute(self, frames: List[_Frame]) -> None:
+        """Windows to results, together; if that fails, each by itself, so that one bad frame spoils no other."""
+        good = [frame for frame in frames if isinstance(frame.content, Window)]
+        if not good:
+            return
+        start = time.perf_counter()
+        try:
+            with stage_clock() as stages:
+                results = self._model([frame.content for frame in good])  # type: ignore[misc]
+        except Trouble as error:
+            if len(good) == 1:
+                good[0].content = error
+            else:
+                for frame in good:
+                    self._compute([frame])
+            return
+        seconds = {"compute": time.perf_counter() - start, **{f"compute/{name}": s for name, s in stages.items()}}
+        for frame, result in zip(good, results):
+            frame.content = result
+            frame.seconds.update({name: value / len(good) for name, value in seconds.items()})
+
+    @staticmethod
+    def _write(folder: Path, frame: _Frame) -> _Frame:
+        if isinstance(frame.content, FlowResult):
+            result, frame.content = frame.content, None
+            with _stage(frame, "write"):
+                write_flow(frame_file(folder, frame.timestamp), result)
+        return frame
+
+
+@contextmanager
+def _stage(frame: _Frame, name: str) -> Iterator[None]:
+    """Times a block as a stage of a frame; what it raises becomes the frame's content."""
+    start = time.perf_counter()
+    try:
+        yield
+    except Trouble as error:
+        frame.content = error
+    frame.seconds[name] = time.perf_counter() - start
+
+
+def describe(error: BaseException) -> str:
+    """An error in one line; those that are not the package's own or the system's, with their kind."""
+    text = " ".join(str(error).split()) or "no message"
+    return text if isinstance(error, (CFlowError, OSError)) else f"{type(error).__name__}: {text}"
+
+
+def source_name(source: Any) -> str:
+    """What messages call a log that could not be opened."""
+    return str(getattr(source, "scene", None) or getattr(source, "stem", None) or source)
+
+
+def _event(unit: Unit, log: Log, frame: _Frame) -> Event:
+    if isinstance(frame.content, Trouble):
+        return Failed(unit.number, f"{log.log_id}/{frame.timestamp}", describe(frame.content), frame.timestamp)
+    return Done(unit.number, frame.timestamp, frame.seconds)
+
+
+def _batches(todo: Sequence[int], size: int, careful: Set[int]) -> List[List[int]]:
+    """Consecutive frames in batches; careful ones alone."""
+    batches: List[List[int]] = []
+    for index in todo:
+        if index in careful or not batches or len(batches[-1]) == size or batches[-1][-1] in careful:
+            batches.append([])
+        batches[-1].append(index)
+    return batches
