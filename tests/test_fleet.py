@@ -432,6 +432,11 @@ def test_torchrun_s_variables_make_a_shard(
     assert tree(tmp_path) == tree(single) and report(tmp_path, "shard-1-of-2")["shard"] == {"index": 1, "count": 2}
 
 
+def test_a_sweep_over_shards_shares_one_folder(fleet: Path, single: Path, tmp_path: Path) -> None:
+    assert flow(fleet, tmp_path, "-m", "shard.count=3", "shard.index=0,1,2", "engine.workers=1") == 0
+    assert tree(tmp_path) == tree(single)
+
+
 # The machine
 
 

@@ -14,12 +14,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Dict
 
-from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from cflow_torch.cli.record import DataIdentity, finished_results, write_results
-from cflow_torch.cli.run import finish, for_each_pair, make_model, open_logs, output_folder
+from cflow_torch.cli.run import finish, for_each_pair, is_sweep, make_model, open_logs, output_folder
 from cflow_torch.data.log import Log
 from cflow_torch.evaluation.frame import EvalFrame
 from cflow_torch.evaluation.metrics import SceneFlowMetrics
@@ -88,5 +86,5 @@ def _finish(failures: Any) -> None:
     try:
         finish(failures)
     except SystemExit:
-        if not HydraConfig.initialized() or HydraConfig.get().mode != RunMode.MULTIRUN:
+        if not is_sweep():
             raise

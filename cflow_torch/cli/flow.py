@@ -28,7 +28,7 @@ from typing import Any, Dict, Sequence
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
-from cflow_torch.cli.run import Failures, find_logs, make_model, output_folder, versions
+from cflow_torch.cli.run import Failures, find_logs, is_sweep, make_model, output_folder, versions
 from cflow_torch.data.flow_file import read_flow
 from cflow_torch.data.hdf5.results import check_result_name, check_writable, write_hdf5_results
 from cflow_torch.data.records import write_text
@@ -89,6 +89,8 @@ def task(cfg: DictConfig) -> None:
     print(f"{format_report(report)}\nflow files in {output}, report in {report_file(job.output, shard)}")
     if status:
         print(f"missing:\n{missing}", file=sys.stderr)
+        if is_sweep():  # Hydra lets the other jobs run before it ends with status 1
+            raise RuntimeError(f"not every frame is there: see {report_file(job.output, shard)}")
         raise SystemExit(status)
 
 

@@ -55,6 +55,11 @@ def make_model(cfg: DictConfig) -> CoarseToFine:
     return estimate.make_model(Config().replace(**settings), cfg.device)
 
 
+def is_sweep() -> bool:
+    """Whether this is a job of a sweep (`-m`)."""
+    return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
+
+
 def output_folder(cfg: DictConfig) -> Path:
     """Where a run writes: `cfg.output`; for a job of a sweep, a folder below it that no other job shares.
 
@@ -63,7 +68,7 @@ def output_folder(cfg: DictConfig) -> Path:
     pieces: its jobs share `cfg.output` itself.
     """
     folder = as_path(cfg.output)
-    if not HydraConfig.initialized() or HydraConfig.get().mode != RunMode.MULTIRUN:
+    if not is_sweep():
         return folder
     parts = []
     for override in HydraConfig.get().overrides.task:
