@@ -198,6 +198,25 @@ def test_scenes_are_read_in_blocks_and_their_index_beside_them(written, place, m
     assert HDF5Log(source).eval_frames() == HDF5Log(local).eval_frames() != []
 
 
+def test_a_scene_may_be_open_when_python_ends(written):
+    (source,) = find_sources("hdf5", written("hdf5"))
+    code = """
+import sys
+from upath import UPath
+from cflow_torch.data import paths
+from cflow_torch.data.hdf5 import HDF5Log
+real = paths._RemoteFile._fetch
+paths._RemoteFile._fetch = lambda self, start, end: real(self, start, end)  # a name that Python clears in the end
+log = HDF5Log(UPath("file://" + sys.argv[1]))
+print(len(log.sweep(0).points))
+"""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    run = subprocess.run(
+        [sys.executable, "-c", code, str(source)], stdout=subprocess.PIPE, env=environment, check=False
+    )
+    assert run.returncode == 0 and int(run.stdout) > 0
+
+
 def test_a_remote_file_is_a_file(place):
     data = bytes(range(256)) * 50
     place.mkdir(parents=True, exist_ok=True)
@@ -305,6 +324,46 @@ def test_a_put_that_fails_leaves_the_old_file(place, method, monkeypatch):
 def test_folders_are_made_whole_here_only(place):
     with pytest.raises(CFlowError, match="write one here"), atomic_folder(place / "log"):
         pass
+
+
+@pytest.fixture
+def s3(monkeypatch: Any) -> Iterator[Any]:
+    """A bucket of a server on this machine that speaks S3."""
+    upath = pytest.importorskip("upath", reason=WHY_SKIPPED)
+    pytest.importorskip("s3fs", reason="s3fs is not installed")
+    moto = pytest.importorskip("moto.server", reason="moto[server] is not installed")
+    server = moto.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    server.start()
+    url = "http://{}:{}".format(*server.get_host_and_port())
+    monkeypatch.setenv("AWS_DEFAULT_REGION", "us-east-1")
+    bucket = upath.UPath("s3://bucket", endpoint_url=url, key="a", secret="b")
+    bucket.fs.mkdir("bucket")
+    yield bucket
+    server.stop()
+
+
+@pytest.mark.slow
+def test_a_real_object_store(s3, written, result, tmp_path, av2_folder, kitti_file):
+    for name, folder in (
+        *((name, written(name)) for name in DATA_SETS),
+        ("av2", av2_folder),
+        ("hdf5", kitti_file.parent),
+    ):
+        root = upload(folder, s3 / uuid.uuid4().hex / folder.name)
+        paths.forget_listings(root)
+        (source,) = pickle.loads(pickle.dumps(find_sources(name, root)))
+        (expected,) = find_sources(name, folder)
+        assert is_remote(folder_of(source))
+        assert_same_logs(open_log(name, source, check=False), open_log(name, expected, check=False))
+    write_flow(tmp_path / "1.feather", result)
+    write_flow(s3 / "out" / "1.feather", result)
+    assert (s3 / "out" / "1.feather").read_bytes() == (tmp_path / "1.feather").read_bytes()
+    with pytest.raises(KeyboardInterrupt), atomic_file(s3 / "out" / "2.feather") as file:
+        file.write(b"half")
+        raise KeyboardInterrupt
+    assert names(s3 / "out") == ("1.feather",)
+    with pytest.raises(CFlowError, match="no flow file"):
+        read_flow(s3 / "out" / "2.feather")
 
 
 # ---------------------------------------------------------------------------------------------- stale files

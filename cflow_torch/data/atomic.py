@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any, Collection, ContextManager, Iterator, List, Optional
 
-from cflow_torch.data.paths import Place, as_path, is_remote, remote_errors
+from cflow_torch.data.paths import Place, as_path, forget_listings, is_remote, remote_errors
 from cflow_torch.types import CFlowError
 
 _SPOOLED = 64 << 20  # bytes of a remote file that are collected in memory; more go to a temporary file here
@@ -157,6 +157,7 @@ def remove_stale(folder: Place, targets: Optional[Collection[str]] = None) -> Li
         OSError: the folder cannot be listed, or a file in it not be removed.
     """
     folder, removed = as_path(folder), []
+    forget_listings(folder)
     with remote_errors(folder):
         for path in list(folder.iterdir()) if folder.is_dir() else []:
             match = _TEMPORARY.fullmatch(path.name)

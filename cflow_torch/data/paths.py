@@ -22,8 +22,9 @@ from cflow_torch.types import CFlowError
 
 Place = Union[str, Path]
 _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)://")
-_BLOCK = 1 << 20  # bytes
-_KEPT_BLOCKS = 32  # of each open file
+_BLOCK = 1 << 18  # bytes; larger ones save few requests: HDF5's metadata is scattered, its data are long reads
+_KEPT_BLOCKS = 128  # of each open file: 32 MiB
+_COPIED = 8 << 20  # bytes per request while a file is copied
 _KEPT_COPIES = 4  # files of `mapped`: two of a Waymo segment that is read, two of the one before
 
 
@@ -88,14 +89,23 @@ def remote_errors(path: Path) -> Iterator[None]:
         raise OSError(f"cannot reach {path} ({type(error).__name__}: {error})") from error
 
 
+def forget_listings(path: Any) -> None:
+    """Look anew at what others may have written: fsspec remembers the listings of folders, for `is_file` too."""
+    if is_remote(path):
+        path.fs.invalidate_cache()
+
+
 def read_bytes(path: Path) -> bytes:
     """All of a file, in one request if it is remote.
 
     Raises:
         OSError: as for a local file, and if the far side cannot be reached.
     """
-    with remote_errors(path):
+    if not is_remote(path):
         return path.read_bytes()
+    remote: Any = path
+    with remote_errors(path):
+        return bytes(remote.fs.cat_file(remote.path))  # pathlib's own way asks for the size first
 
 
 def whole(path: Path) -> Any:
@@ -110,7 +120,7 @@ def whole(path: Path) -> Any:
 def ranged(path: Path) -> Any:
     """What to give a library that reads parts of a large file: its name, or an open binary file if it is remote.
 
-    Cost: one request for the blocks of 1 MiB in which the wanted bytes lie; the last 32 blocks of each file are kept.
+    Cost: one request for the blocks of 256 KiB in which the wanted bytes lie; the last 128 of each file are kept.
 
     Raises:
         OSError: a remote file cannot be opened; later, that it cannot be read.
@@ -142,7 +152,7 @@ def mapped(path: Path) -> Any:
 @lru_cache(maxsize=_KEPT_COPIES)
 def _copy(path: Path) -> pa.Buffer:
     with tempfile.TemporaryFile() as file, parts(path) as stream:
-        shutil.copyfileobj(stream, file, 8 * _BLOCK)
+        shutil.copyfileobj(stream, file, _COPIED)
         if not file.tell():
             raise CFlowError(f"{path} is empty; copy it again")
         file.flush()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from pathlib import Path
 from types import TracebackType
 from typing import Any, List, Optional, Sequence, Tuple, Type
@@ -72,6 +73,8 @@ class HDF5Log:
             self._scene = h5py.File(ranged(self.file), "r")
         except OSError as error:
             raise CFlowError(f"{self.file} cannot be read as HDF5 ({error}): give a scene that is complete") from error
+        # HDF5 itself closes after the interpreter has gone, which a file read through Python does not survive.
+        weakref.finalize(self, self._scene.close)
         try:
             self.timestamps: Sequence[int] = sorted(int(name) for name in self._scene if name.isdigit())
             if len(self.timestamps) < 2:
