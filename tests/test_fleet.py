@@ -188,6 +188,25 @@ def test_a_log_that_has_changed_is_refused_and_the_others_go_on(
     assert tree(out) == tree(single)
 
 
+def test_results_may_lie_where_fsspec_reaches(fleet: Path, single: Path, tmp_path: Path) -> None:
+    fsspec = pytest.importorskip("fsspec", reason="needs the extra remote")
+    pytest.importorskip("upath", reason="needs the extra remote")
+    memory = fsspec.filesystem("memory")
+    memory.put(str(fleet), "/fleet-data", recursive=True)
+    for computed in (10, 2):
+        assert run(
+            "flow", "data=av2", "data.root=memory://fleet-data", "output=memory://fleet-flow", "model=paper",
+            "data.check=false", "engine.workers=1",
+        ) == 0  # fmt: skip
+        memory.get("/fleet-flow", str(tmp_path), recursive=True)
+        (out,) = [folder.parent for folder in tmp_path.rglob("manifest.json") if (folder.parent / "reports").is_dir()]
+        assert tree(out) == tree(single) and report(out)["frames"]["computed"] == computed
+        for name in [name for name in memory.find("/fleet-flow") if name.endswith(".feather")][3:5]:
+            memory.rm(name)
+    memory.rm("/fleet-flow", recursive=True)
+    memory.rm("/fleet-data", recursive=True)
+
+
 # Trouble
 
 
@@ -433,7 +452,9 @@ def test_torchrun_s_variables_make_a_shard(
 
 
 def test_a_sweep_over_shards_shares_one_folder(fleet: Path, single: Path, tmp_path: Path) -> None:
-    assert flow(fleet, tmp_path, "-m", "shard.count=3", "shard.index=0,1,2", "engine.workers=1") == 0
+    arguments = [f"data.root={fleet}", f"output={tmp_path}", "shard.count=3", "shard.index=0,1,2", "engine.workers=1"]
+    assert run("flow", "-m", "data=av2", "model=paper", "data.check=false", *arguments) == 0
+    (tmp_path / "multirun.yaml").unlink()  # Hydra's
     assert tree(tmp_path) == tree(single)
 
 

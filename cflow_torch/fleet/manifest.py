@@ -22,6 +22,7 @@ from cflow_torch import __version__
 from cflow_torch.config import Config
 from cflow_torch.data.atomic import remove_stale
 from cflow_torch.data.log import Log
+from cflow_torch.data.paths import forget_listings, read_bytes, remote_errors
 from cflow_torch.data.records import changes, strict, write_text
 from cflow_torch.types import CFlowError, as_numpy
 
@@ -60,6 +61,7 @@ def claim_folder(output: Path, identity: Mapping[str, Any], resume: bool, overwr
     Raises:
         CFlowError: it holds results that must not be mixed with these.
     """
+    forget_listings(output)
     why = find_conflict(output, identity, resume or overwrite)
     if why is not None:
         if not overwrite:
@@ -117,11 +119,10 @@ def describe_log(log: Log, run: str) -> Dict[str, Any]:
 
 
 def complete_frames(folder: Path) -> Set[int]:
-    """Time stamps whose flow is in a log's folder."""
-    try:
-        names = [file.name for file in folder.iterdir()]
-    except (FileNotFoundError, NotADirectoryError):
-        return set()
+    """Time stamps whose flow is in a log's folder, whoever put it there."""
+    forget_listings(folder)
+    with remote_errors(folder):
+        names = [file.name for file in folder.iterdir()] if folder.is_dir() else []
     return {int(name[: -len(".feather")]) for name in names if re.fullmatch(r"\d+\.feather", name)}
 
 
@@ -169,7 +170,7 @@ def _clear(output: Path) -> None:
 
 def _read(file: Path) -> Optional[Dict[str, Any]]:
     try:
-        content = json.loads(file.read_text(encoding="utf-8"))
+        content = json.loads(read_bytes(file))
     except FileNotFoundError:
         return None
     except ValueError as error:
