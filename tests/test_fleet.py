@@ -17,6 +17,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from pyarrow import feather
 
 from cflow_torch import CFlowError, FlowResult, Window, make_config, make_model
 from cflow_torch.cli.main import main
@@ -116,6 +117,20 @@ def test_shards_together_are_the_single_run(fleet: Path, single: Path, tmp_path:
         assert flow(fleet, tmp_path, f"shard.index={index}", "shard.count=4", "engine.workers=1") == 0
         assert report(tmp_path, f"shard-{index}-of-4")["status"] == "complete"
     assert tree(tmp_path) == tree(single)
+
+
+def test_a_file_has_only_the_contents_asked_for(
+    fleet: Path, single: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    assert flow(fleet, tmp_path, "contents=[is_valid,residual]", "engine.workers=1") == 0
+    file = next(tmp_path.glob("*/*.feather"))
+    small, whole = feather.read_table(file), feather.read_table(single / file.relative_to(tmp_path))
+    assert small.column_names == ["residual_tx_m", "residual_ty_m", "residual_tz_m", "is_valid"]
+    assert small.equals(whole.select(small.column_names)) and file.stat().st_size * 5 < whole.nbytes
+    assert flow(fleet, tmp_path) == 2, "another content is another run"
+    assert "contents was" in capsys.readouterr().err
+    assert flow(fleet, tmp_path, "contents=[colour]") == 2
+    assert "residual" in capsys.readouterr().err
 
 
 # Going on
@@ -239,11 +254,11 @@ def test_a_full_disk_is_reported_per_frame(
 
     calls: List[Path] = []
 
-    def write(path: Path, result: FlowResult) -> None:
+    def write(path: Path, result: FlowResult, contents: Tuple[str, ...]) -> None:
         calls.append(path)
         if len(calls) in (3, 4):
             raise OSError(28, "No space left on device", str(path))
-        real(path, result)
+        real(path, result, contents)
 
     real = work.write_flow
     monkeypatch.setattr(work, "write_flow", write)

@@ -2,6 +2,7 @@
 
 Columns: flow_t{x,y,z}_m total flow, residual_t{x,y,z}_m motion of objects, pose_t{x,y,z}_m ego motion (float32,
 metres until the next sweep, axes of the ego frame at t+1), cluster_id, score, is_valid; one row per point of sweep t.
+contents=[residual,is_valid] writes these columns only: the others follow from the poses, and take most of the room.
 OUTPUT/config.yaml holds the resolved settings and versions, OUTPUT/reports what was done. The same command again goes
 on where the last one ended. Ctrl-C and SIGTERM let the frames in hand be finished. The status is 0 if every frame is
 there, 1 if one is missing, 2 if the call was wrong, 130 or 143 after a signal.
@@ -23,13 +24,13 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
-from typing import Any, Dict, Sequence
+from typing import Any, Dict, Sequence, Tuple
 
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from cflow_torch.cli.run import Failures, find_logs, is_sweep, make_model, output_folder, versions
-from cflow_torch.data.flow_file import read_flow
+from cflow_torch.data.flow_file import CONTENTS, read_flow
 from cflow_torch.data.hdf5.results import check_result_name, check_writable, write_hdf5_results
 from cflow_torch.data.records import write_text
 from cflow_torch.fleet.forecast import format_forecast, make_forecast
@@ -53,13 +54,15 @@ def task(cfg: DictConfig) -> None:
     layout = choose_layout(cfg.device, workers, threads, batch, os.environ)
     config = make_model(cfg).config
     sources = find_logs(cfg)
-    identity = make_identity(config, sources.reader, sources.settings)
+    contents = _contents(cfg)
+    identity = make_identity(config, sources.reader, sources.settings, contents)
     job = Job(
         config=config,
         identity=identity["hash"],
         reader=sources.reader,
         settings={key: value for key, value in sources.settings.items() if key != "check"},
         output=str(output),
+        contents=contents,
         batch=layout.batch,
         redo=cfg.overwrite,
         check=sources.settings.get("check", True),
@@ -100,6 +103,15 @@ def _check_results(cfg: DictConfig, shard: Shard) -> None:
     if shard.count > 1:
         raise CFlowError("result_name writes into whole scenes: give it to a last run without shards")
     check_result_name(cfg.result_name)
+
+
+def _contents(cfg: DictConfig) -> Tuple[str, ...]:
+    given = [cfg.contents] if isinstance(cfg.contents, str) else list(cfg.contents)
+    if not given or set(given) - set(CONTENTS):
+        raise CFlowError(f"contents={given}: give some of {', '.join(CONTENTS)}")
+    if cfg.result_name is not None and set(given) != set(CONTENTS):
+        raise CFlowError("result_name reads the flow files again: it needs all contents")
+    return tuple(name for name in CONTENTS if name in given)
 
 
 def _into_scenes(name: str, scenes: Sequence[Path], output: Path) -> Failures:

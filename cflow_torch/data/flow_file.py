@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Sequence
+
 import numpy as np
 import pyarrow as pa
 import torch
@@ -11,26 +13,32 @@ from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.paths import Place, as_path, whole
 from cflow_torch.types import CFlowError, FlowResult
 
-_VECTORS = {"flow": "flow", "residual_flow": "residual", "pose_flow": "pose"}
+_VECTORS = {"flow": "flow", "residual": "residual_flow", "pose": "pose_flow"}  # name in the file -> field
+_SCALARS = ("cluster_id", "score", "is_valid")
 _AXES = "xyz"
+CONTENTS = (*_VECTORS, *_SCALARS)
 
 
-def write_flow(path: Place, result: FlowResult) -> None:
+def write_flow(path: Place, result: FlowResult, contents: Sequence[str] = CONTENTS) -> None:
     """Write a result to `path`, atomically.
 
     Args:
         path: file name, by convention `<log id>/<time stamp of sweep t>.feather`.
         result: flow of one window.
+        contents: what of it, names of `CONTENTS`. The pose flow, and with it the total flow, follow from the poses;
+            without these two a file has about a seventeenth of the size.
 
     Convention:
         Columns flow_t{x,y,z}_m (total), residual_t{x,y,z}_m, pose_t{x,y,z}_m float32 in metres and in the axes of
         ego1, cluster_id int64, score float32, is_valid bool.
     """
-    arrays = result.numpy()
-    columns = {
-        f"{name}_t{axis}_m": arrays[field][:, i] for field, name in _VECTORS.items() for i, axis in enumerate(_AXES)
-    }
-    columns.update({name: arrays[name] for name in ("cluster_id", "score", "is_valid")})
+    columns = {}
+    for name in contents:
+        values = getattr(result, _VECTORS.get(name, name)).detach().cpu().numpy()
+        if name in _VECTORS:
+            columns.update({f"{name}_t{axis}_m": values[:, i] for i, axis in enumerate(_AXES)})
+        else:
+            columns[name] = values
     with atomic_file(path) as file:
         feather.write_feather(pa.table({name: pa.array(values) for name, values in columns.items()}), file)
 
@@ -39,15 +47,17 @@ def read_flow(path: Place) -> FlowResult:
     """Read what `write_flow` wrote.
 
     Raises:
-        CFlowError: the file is missing, cannot be reached, is truncated, or lacks a column.
+        CFlowError: the file is missing, cannot be reached, is truncated, or was not written with all contents.
     """
     try:
         table = feather.read_table(whole(as_path(path)), memory_map=False)
         vectors = {
             field: np.stack([table[f"{name}_t{axis}_m"].to_numpy() for axis in _AXES], 1)
-            for field, name in _VECTORS.items()
+            for name, field in _VECTORS.items()
         }
-        scalars = {name: table[name].to_numpy() for name in ("cluster_id", "score", "is_valid")}
+        scalars = {name: table[name].to_numpy() for name in _SCALARS}
     except (OSError, pa.ArrowException, KeyError) as error:
-        raise CFlowError(f"{path} is no flow file ({error}): give a file that `cflow flow` wrote") from error
+        raise CFlowError(
+            f"{path} is no flow file ({error}): give one that `cflow flow` wrote with all its contents"
+        ) from error
     return FlowResult(**{name: torch.from_numpy(np.array(values)) for name, values in {**vectors, **scalars}.items()})

@@ -123,7 +123,7 @@ def _try(job: Job, log: Log, indices: Sequence[int], layout: Layout, found: Fore
             file = Path(scratch) / "flow.feather"
             start = time.perf_counter()
             for result in results:
-                write_flow(file, result)
+                write_flow(file, result, job.contents)
             written = time.perf_counter() - start
             found.frame_bytes = file.stat().st_size
         # The first window also reads its history: later ones read one sweep each.

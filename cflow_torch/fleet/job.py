@@ -7,6 +7,7 @@ from fractions import Fraction
 from typing import Any, Dict, FrozenSet, List, Sequence, Tuple, Union
 
 from cflow_torch.config import Config
+from cflow_torch.data.flow_file import CONTENTS
 
 # Units per worker, so that the last one does not keep the others waiting long. A log is cut only if there are too few
 # logs: each piece reads h + 1 sweeps that its neighbour reads as well.
@@ -23,6 +24,7 @@ class Job:
         reader: data set, a key of `catalog.DATA_SETS`.
         settings: of its reader.
         output: folder of the results; a path, or the address of an object store.
+        contents: of a flow file, names of `flow_file.CONTENTS`.
         batch: windows that are computed together.
         redo: compute frames that are there already.
         check: warn of logs whose static world does not stay put.
@@ -33,6 +35,7 @@ class Job:
     reader: str
     settings: Dict[str, Any]
     output: str
+    contents: Tuple[str, ...] = CONTENTS
     batch: int = 1
     redo: bool = False
     check: bool = True

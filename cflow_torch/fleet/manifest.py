@@ -13,7 +13,7 @@ import re
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Dict, List, Mapping, Optional, Set
+from typing import Any, Dict, List, Mapping, Optional, Sequence, Set
 
 import numpy as np
 import torch
@@ -21,6 +21,7 @@ import torch
 from cflow_torch import __version__
 from cflow_torch.config import Config
 from cflow_torch.data.atomic import remove_stale
+from cflow_torch.data.flow_file import CONTENTS
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import forget_listings, read_bytes, remote_errors
 from cflow_torch.data.records import changes, strict, write_text
@@ -32,8 +33,11 @@ _OURS = re.compile(r"\d+\.feather|manifest\.json|\..+\.tmp")
 _REMEDY = "give output=FOLDER, or overwrite=true"
 
 
-def make_identity(config: Config, reader: str, settings: Mapping[str, Any]) -> Dict[str, Any]:
-    """What decides the bytes of a result, besides the sweeps: method (not its `max_memory`), data settings, versions.
+def make_identity(
+    config: Config, reader: str, settings: Mapping[str, Any], contents: Sequence[str] = CONTENTS
+) -> Dict[str, Any]:
+    """What decides the bytes of a result, besides the sweeps: method (not its `max_memory`), data settings, what is
+    written, versions.
 
     A CPU build and a CUDA build of one torch version count as the same.
     """
@@ -44,7 +48,7 @@ def make_identity(config: Config, reader: str, settings: Mapping[str, Any]) -> D
     }
     data = {"reader": reader, **{key: value for key, value in settings.items() if key != "check"}}
     method = {key: value for key, value in asdict(config).items() if key != "max_memory"}
-    identity = strict({"format": _FORMAT, "method": method, "data": data, "versions": versions})
+    identity = strict({"format": _FORMAT, "method": method, "data": data, "contents": contents, "versions": versions})
     return {**identity, "hash": hashlib.sha256(_text(identity).encode()).hexdigest()}
 
 

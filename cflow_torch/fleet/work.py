@@ -164,12 +164,11 @@ class Worker:
             frame.content = result
             frame.seconds.update({name: value / len(good) for name, value in seconds.items()})
 
-    @staticmethod
-    def _write(folder: Path, frame: _Frame) -> _Frame:
+    def _write(self, folder: Path, frame: _Frame) -> _Frame:
         if isinstance(frame.content, FlowResult):
             result, frame.content = frame.content, None
             with _stage(frame, "write"):
-                write_flow(frame_file(folder, frame.timestamp), result)
+                write_flow(frame_file(folder, frame.timestamp), result, self._job.contents)
         return frame
 
 
