@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
 # Make .venv in the checkout and install the package into it, from pinned versions. Does nothing if that was done.
-# Sourced by demo.sh and test.sh; leaves the interpreter's path in $PYTHON.
+# Sourced by demo.sh and test.sh, which say in $EXTRAS what they need; leaves the interpreter's path in $PYTHON.
 set -euo pipefail
 ROOT="$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)"
 PYTHON="$ROOT/.venv/bin/python"
-STAMP="$ROOT/.venv/installed"
+STAMP="$ROOT/.venv/installed-$EXTRAS"
 WANTED="$(cat "$ROOT/scripts/constraints.txt" "$ROOT/pyproject.toml" | cksum)"
 
 if [ ! -f "$STAMP" ] || [ "$(cat "$STAMP")" != "$WANTED" ]; then
@@ -25,6 +25,6 @@ if [ ! -f "$STAMP" ] || [ "$(cat "$STAMP")" != "$WANTED" ]; then
   fi
   echo "installing (once; a few minutes)"
   "$PYTHON" -m pip install --quiet --constraint "$ROOT/scripts/constraints.txt" setuptools wheel
-  "$PYTHON" -m pip install --quiet --constraint "$ROOT/scripts/constraints.txt" --no-build-isolation --editable "$ROOT[dev]"
+  "$PYTHON" -m pip install --quiet --constraint "$ROOT/scripts/constraints.txt" --no-build-isolation --editable "$ROOT[$EXTRAS]"
   echo "$WANTED" >"$STAMP"
 fi

@@ -87,6 +87,12 @@ def test_workers_together_are_the_single_run(fleet: Path, single: Path, tmp_path
     assert tree(tmp_path) == tree(single)
 
 
+def test_ray_s_workers_together_are_the_single_run(fleet: Path, single: Path, tmp_path: Path) -> None:
+    pytest.importorskip("ray", reason="needs the extra ray")
+    finish(start(fleet, tmp_path, "engine=ray", "engine.workers=2"))
+    assert tree(tmp_path) == tree(single)
+
+
 def test_kills_lose_nothing_and_leave_nothing(fleet: Path, single: Path, tmp_path: Path) -> None:
     chance = random.Random(9)
     seen: List[str] = []

@@ -15,7 +15,7 @@ import torch
 from cflow_torch.data.catalog import open_log
 from cflow_torch.data.flow_file import write_flow
 from cflow_torch.data.log import Log, RecentSweeps, window
-from cflow_torch.data.paths import as_path
+from cflow_torch.data.paths import as_path, is_remote
 from cflow_torch.estimate import make_model
 from cflow_torch.fleet.job import Job, Unit
 from cflow_torch.fleet.machine import Layout
@@ -78,8 +78,10 @@ def make_forecast(job: Job, units: Sequence[Unit], layout: Layout) -> Forecast:
                 _try(job, log, [i for i, stamp in enumerate(log.timestamps) if stamp in todo], layout, found)
         except Exception as error:
             found.failures.append((source_name(unit.source), describe(error)))
-    with suppress(OSError, ValueError, NotImplementedError):
-        found.free_bytes = shutil.disk_usage(_existing(as_path(job.output))).free
+    output = as_path(job.output)
+    if not is_remote(output):
+        with suppress(OSError):
+            found.free_bytes = shutil.disk_usage(_existing(output)).free
     return found
 
 
