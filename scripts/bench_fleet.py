@@ -27,13 +27,12 @@ from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.benchmark import benchmark_logs
 from cflow_torch.data.flow_file import write_flow
 from cflow_torch.data.log import RecentSweeps, window
-from cflow_torch.fleet.job import Done, Job, Opened, Unit, split
+from cflow_torch.fleet.job import Done, Failed, Job, Opened, Unit, split
 from cflow_torch.fleet.local import run_local
-from cflow_torch.fleet.machine import Layout, usable_cores
+from cflow_torch.fleet.machine import CPU_BATCH, Layout, usable_cores
 
 PAIRS, DRIVES = 40, 5
 _HELPER_MB = 50  # smaller processes are Python's own, which watch over the workers
-BATCH = 4
 
 
 def make_fleet(folder: Path, num_windows: int) -> List[Path]:
@@ -65,23 +64,25 @@ def in_sequence(logs: Sequence[Path], preset: str, output: Path, threads: int) -
 
 def by_engine(logs: Sequence[Path], preset: str, output: Path, layout: Layout) -> Tuple[int, float]:
     """The engine: frames and seconds from the first log's opening to the end, without the start of processes."""
-    job = Job(make_config(preset), "0" * 64, "av2", {}, str(output), layout.batch, check=False)
+    job = Job(make_config(preset), "0" * 64, "av2", {}, str(output), batch=layout.batch, check=False)
     units = split([Unit(0, folder) for folder in logs], len(layout.devices))
     count, start = 0, None
     for event in run_local(job, units, layout, lambda: False):
         if isinstance(event, Opened) and start is None:
             start = time.perf_counter()
+        if isinstance(event, Failed):
+            raise SystemExit(f"{event.name}: {event.message}")
         count += isinstance(event, Done)
     assert start is not None
     return count, time.perf_counter() - start
 
 
-def throughput(folder: Path, num_windows: int, preset: str, repeats: int) -> None:
+def throughput(folder: Path, num_windows: int, preset: str, repeats: int, batch: int) -> None:
     """Frames per second of every way in turn, and ratios of the same round."""
     logs, cores = make_fleet(folder, num_windows), usable_cores({})
     layouts = {
-        "1 worker, all threads": Layout(("cpu",), cores, BATCH),
-        "worker per core": Layout(("cpu",) * cores, 1, BATCH),
+        "1 worker, all threads": Layout(("cpu",), cores, batch),
+        "worker per core": Layout(("cpu",) * cores, 1, batch),
     }
     rates: Dict[str, List[float]] = {name: [] for name in ["in sequence", *layouts]}
     for _ in range(repeats):
@@ -96,7 +97,7 @@ def throughput(folder: Path, num_windows: int, preset: str, repeats: int) -> Non
             rates[name].append(count / seconds)
     for name, values in rates.items():
         ratios = [value / base for value, base in zip(values, rates["in sequence"])]
-        about: Dict[str, Any] = {"preset": preset, "way": name, "frames_per_s": round(statistics.median(values), 2)}
+        about: Dict[str, Any] = {"preset": preset, "batch": batch, "way": name, "frames_per_s": round(statistics.median(values), 2)}
         about["of in sequence"] = round(statistics.median(ratios), 3)
         print(json.dumps({**about, "rounds": [round(ratio, 3) for ratio in ratios]}), flush=True)
 
@@ -167,10 +168,11 @@ def main() -> None:
     parser.add_argument("--windows", type=int, help=f"multiple of {PAIRS}; default 200 and 2000")
     parser.add_argument("--preset", default="paper")
     parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--batch", type=int, default=CPU_BATCH)
     parser.add_argument("--plot", default="", help="PNG of the memory")
     given = parser.parse_args()
     if given.what == "throughput":
-        throughput(given.folder, given.windows or 5 * PAIRS, given.preset, given.repeats)
+        throughput(given.folder, given.windows or 5 * PAIRS, given.preset, given.repeats, given.batch)
     else:
         memory(given.folder, given.windows or 50 * PAIRS, given.preset, given.plot)
 

@@ -10,7 +10,7 @@ from cflow_torch.types import CFlowError
 
 COMMANDS = {
     "demo": "simulate a drive, estimate its flow, score it and draw it",
-    "flow": "estimate the flow of every pair of sweeps of a data set",
+    "flow": "estimate the flow of every pair of sweeps of one log or a fleet; shards, resumes, Ray",
     "eval": "estimate and score every labelled pair of a data set",
     "submit": "write and check an archive for a public leaderboard",
     "bench": "time every stage against the reference and a plain OpenCV loop",
