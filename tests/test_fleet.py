@@ -10,7 +10,7 @@ import signal
 import time
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, Callable, Dict, List, Tuple
+from typing import Any, Callable, Dict, List, Set, Tuple
 
 import numpy as np
 import pytest
@@ -347,6 +347,7 @@ def deadly_serve(*arguments: Any) -> None:
         if int(log.timestamps[index]) == int(stamp) and not (marker and Path(marker).exists()):
             if marker:
                 Path(marker).touch()
+            time.sleep(0.5)  # so that frames before it are done
             os.kill(os.getpid(), signal.SIGKILL)
         return read(self, log, index)
 
@@ -566,3 +567,146 @@ def test_the_first_signal_asks_and_the_second_insists() -> None:
 def test_engines_are_named(fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     assert flow(fleet, tmp_path, "engine.name=cloud") == 2
     assert "local, ray" in capsys.readouterr().err
+
+
+# Found in review
+
+
+def hard_serve(*arguments: Any) -> None:
+    """A worker process that cannot begin on the device "gone" (a GPU that has fallen off)."""
+    REAL_SERVE(*arguments[:1], {"gone": "nowhere"}.get(arguments[1], arguments[1]), *arguments[2:])
+
+
+def test_one_worker_uses_the_threads_it_is_given(fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before, seen = torch.get_num_threads(), []
+    run_worker = Worker.run
+    monkeypatch.setattr(Worker, "run", lambda *a: (seen.append(torch.get_num_threads()), run_worker(*a))[1])
+    list(run_local(job_for(tmp_path), [Unit(0, next(fleet.iterdir()))], Layout(("cpu",), before + 1, 2), lambda: False))
+    assert seen == [before + 1] and torch.get_num_threads() == before
+
+
+def test_a_killed_worker_of_an_overwriting_run_repeats_nothing(
+    fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = sorted(fleet.iterdir())[1]
+    stamps = AV2Log(source).timestamps
+    monkeypatch.setattr(local, "_serve", deadly_serve)
+    monkeypatch.setenv(DEADLY, f"{tmp_path / 'killed'}:{stamps[4]}")
+    units, done = split([Unit(0, source)], 1), []
+    tally = Tally(units)
+    for event in run_local(job_for(tmp_path / "out", batch=1, redo=True), units, LAYOUT, lambda: False):
+        tally.add(event)
+        done += [event.timestamp] if isinstance(event, Done) else []
+    assert done == list(stamps[:5]) and tally.is_complete and tally.computed == tally.total == 5
+
+
+def test_a_worker_that_cannot_begin_leaves_the_work_to_the_others(
+    fleet: Path, single: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.setattr(local, "_serve", hard_serve)
+    units = split([Unit(0, source) for source in sorted(fleet.iterdir())], 1)
+    tally = Tally(units)
+    for event in run_local(job_for(tmp_path), units, Layout(("gone", "cpu"), 1, 2), lambda: False):
+        tally.add(event)
+    assert tally.is_complete and tally.computed == 10
+    assert "nowhere" in capsys.readouterr().err
+
+
+def test_nobody_is_hired_to_stop(fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Workers that end because they were told to are not replaced, however long the others take."""
+    hired: List[str] = []
+    hire = local._Crew._hire
+    monkeypatch.setattr(local._Crew, "_hire", lambda self, device: (hired.append(device), hire(self, device))[1])
+    monkeypatch.setattr(local, "_serve", slow_serve)
+    units = split([Unit(0, sorted(fleet.iterdir())[1]), Unit(1, sorted(fleet.iterdir())[2])], 1)
+    done: Set[int] = set()
+    for event in run_local(job_for(tmp_path, batch=1), units, LAYOUT, lambda: len(done) == 2):
+        done.update([event.unit] if isinstance(event, Done) else [])
+    assert len(hired) == 2
+
+
+def slow_serve(*arguments: Any) -> None:
+    """A worker process that takes its time for the log of 6 sweeps."""
+    write = Worker._write
+
+    def slow_write(self: Worker, folder: Path, frame: Any) -> Any:
+        time.sleep(2 if folder.name.endswith("1") else 0)
+        return write(self, folder, frame)
+
+    Worker._write = slow_write  # type: ignore[method-assign]
+    REAL_SERVE(*arguments)
+
+
+def test_a_batch_that_failed_is_let_go_before_its_frames_are_tried_alone(fleet: Path, tmp_path: Path) -> None:
+    """A traceback holds what the failed batch had taken from the GPU."""
+    import weakref
+
+    class Big:
+        pass
+
+    alive: List[bool] = []
+
+    class Hungry(Stumbling):
+        taken: Any = None
+
+        def __call__(self, windows: List[Window]) -> List[FlowResult]:
+            if len(windows) > 1:
+                big = Big()
+                self.taken = weakref.ref(big)
+                raise RuntimeError("CUDA: out of memory")
+            alive.append(self.taken() is not None)
+            return self.model(windows)
+
+    source = sorted(fleet.iterdir())[2]
+    list(Worker(job_for(tmp_path), "cpu", model=Hungry([], MemoryError)).run(Unit(0, source)))
+    assert alive == [False, False]
+
+
+def test_an_overwrite_that_was_killed_half_way_can_be_given_again(
+    fleet: Path, single: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(single, out)
+    for name in ("manifest.json", "config.yaml"):
+        (out / name).unlink()
+    other = ("model.pixel_sizes=[0.2]", "engine.workers=1")
+    assert flow(fleet, out, *other) == 2, "the frames of the other run must not stay unnoticed"
+    assert "overwrite=true" in capsys.readouterr().err
+    assert flow(fleet, out, "overwrite=true", *other) == 0
+    fresh = tmp_path / "fresh"
+    assert flow(fleet, fresh, *other) == 0
+    assert tree(out) == tree(fresh)
+
+
+def test_shards_that_begin_together_are_no_conflict(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from cflow_torch.fleet import manifest
+
+    identity = make_identity(make_config("paper"), "av2", {})
+    read = manifest._read
+
+    def read_and_be_overtaken(file: Path) -> Any:
+        content = read(file)
+        manifest.write_text(tmp_path / "manifest.json", json.dumps(identity))
+        manifest.write_text(tmp_path / "config.yaml", "")
+        return content
+
+    monkeypatch.setattr(manifest, "_read", read_and_be_overtaken)
+    manifest.claim_folder(tmp_path, identity, resume=True, overwrite=False, alone=False)
+
+
+def test_an_output_that_cannot_be_written_is_told_in_a_line(
+    fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    (tmp_path / "file").write_text("")
+    assert flow(fleet, tmp_path / "file" / "out") == 2
+    assert "output=FOLDER" in capsys.readouterr().err
+
+
+def test_a_signal_is_heard_where_nobody_reads_the_words(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: Any) -> int:
+        raise BrokenPipeError
+
+    monkeypatch.setattr(os, "write", broken)
+    with StopSignal() as stop:
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert stop()

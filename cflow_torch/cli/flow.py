@@ -76,16 +76,19 @@ def task(cfg: DictConfig) -> None:
     if cfg.result_name is not None:
         for scene in sources.logs:
             check_writable(scene)
-    claim_folder(output, identity, cfg.resume, cfg.overwrite, shard.count == 1)
     settings = OmegaConf.to_container(cfg, resolve=True)
     kept = {key: settings[key] for key in ("model", "data", "result_name")}  # type: ignore[index,call-overload]
-    write_text(output / "config.yaml", OmegaConf.to_yaml(OmegaConf.create({**kept, "versions": versions()})))
+    try:
+        claim_folder(output, identity, cfg.resume, cfg.overwrite, shard.count == 1)
+        write_text(output / "config.yaml", OmegaConf.to_yaml(OmegaConf.create({**kept, "versions": versions()})))
+    except OSError as error:
+        raise CFlowError(f"cannot write into {output} ({error}): make room there, or give output=FOLDER") from error
 
     about = {"config": settings, "versions": versions()}
     report = run_fleet(job, sources.logs, layout, shard, name, about, **engine)
     missing = format_missing(report)
     status = report["exit_status"]
-    if cfg.result_name is not None:
+    if cfg.result_name is not None and report["stopped_by"] is None:  # a signal leaves no time for it
         failures = _into_scenes(cfg.result_name, sources.logs, output)
         missing += "".join(f"\n  {scene}: {message}" for scene, message in failures)
         status = status or int(bool(failures))

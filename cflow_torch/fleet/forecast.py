@@ -70,7 +70,7 @@ def make_forecast(job: Job, units: Sequence[Unit], layout: Layout) -> Forecast:
             log = open_log(job.reader, unit.source, **{**job.settings, "check": False})
             stamps = [int(log.timestamps[i]) for i in unit.frames(len(log.timestamps) - 1)]
             complete = set() if job.redo else complete_frames(as_path(job.output) / log.log_id)
-            todo = [stamp for stamp in stamps if stamp not in complete]
+            todo = {stamp for stamp in stamps if stamp not in complete}
             span = f"{stamps[0]} ... {stamps[-1]}" if stamps else ""
             found.logs.append((log.log_id, len(stamps), len(stamps) - len(todo), span))
             if todo and not tried:

@@ -51,7 +51,7 @@ class Unit:
         first: share of the log's pairs that lies before the span, 0 ... 1.
         last: share that lies before its end.
         careful: time stamps of frames that a worker died on. Each is read and computed by itself.
-        skip: time stamps of frames that are given up.
+        skip: time stamps of frames that are given up, or done already before a worker died.
     """
 
     number: int

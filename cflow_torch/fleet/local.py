@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import signal
+import sys
 from collections import deque
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -33,17 +34,25 @@ def run_local(job: Job, units: Sequence[Unit], layout: Layout, stop: Callable[[]
         layout: one worker per device. A single worker is this very process.
         stop: asked all the time; from True on, frames in hand are finished and no others begun.
 
+    Raises:
+        CFlowError: no worker can begin.
+
     Yields:
         What happens, as it happens. A worker that is killed is replaced and its frames done again, one by one; a frame
         that kills two workers is `Failed`.
     """
     if len(layout.devices) == 1:
+        threads, cpus = torch.get_num_threads(), pyarrow.cpu_count()
         worker = Worker(job, layout.devices[0])
-        for unit in units:
-            if stop():
-                break
-            yield from worker.run(unit, stop)
-        worker.close()
+        _use_threads(layout.threads, layout.threads)
+        try:
+            for unit in units:
+                if stop():
+                    break
+                yield from worker.run(unit, stop)
+        finally:
+            worker.close()
+            _use_threads(threads, cpus)
     else:
         yield from _Crew(job, units, layout, stop).run()
 
@@ -65,6 +74,7 @@ class _Hand:
     unit: Optional[Unit] = None
     log_id: Optional[str] = None
     in_hand: List[int] = field(default_factory=list)  # frames begun and not settled
+    settled: Set[int] = field(default_factory=set)  # frames of the unit that are on disk or failed
 
 
 class _Crew:
@@ -89,14 +99,14 @@ class _Crew:
                         self._send(hand, _END)
                 for hand in self._hands:
                     if hand.unit is None and self._pending:
-                        hand.unit, hand.log_id, hand.in_hand = self._pending.popleft(), None, []
+                        hand.unit, hand.log_id, hand.in_hand, hand.settled = self._pending.popleft(), None, [], set()
                         self._send(hand, hand.unit)
                 if all(hand.unit is None for hand in self._hands):
                     break
                 ready = set(wait([hand.pipe for hand in self._hands], timeout=_POLL_S))
-                for position, hand in enumerate(self._hands):
+                for hand in list(self._hands):
                     if hand.pipe in ready:
-                        yield from self._hear(position, hand)
+                        yield from self._hear(hand)
         except BaseException:
             for hand in self._hands:
                 hand.process.kill()
@@ -120,17 +130,17 @@ class _Crew:
         with suppress(OSError):  # it died: `_hear` will find out
             hand.pipe.send(message)
 
-    def _hear(self, position: int, hand: _Hand) -> Iterator[Event]:
+    def _hear(self, hand: _Hand) -> Iterator[Event]:
         """One message of a worker, or its end."""
         try:
             event = hand.pipe.recv()
         except (EOFError, OSError):
-            yield from self._mourn(position, hand)
+            yield from self._mourn(hand)
             return
         if event is None:  # the unit is at its end
             hand.unit = None
         elif isinstance(event, _Refusal):
-            raise CFlowError(event.message)
+            self._dismiss(hand, event.message)
         else:
             if isinstance(event, Opened):
                 hand.log_id = event.log_id
@@ -138,15 +148,34 @@ class _Crew:
                 hand.in_hand += event.timestamps
             elif event.timestamp in hand.in_hand:
                 hand.in_hand.remove(event.timestamp)
+                hand.settled.add(event.timestamp)
                 self._deaths.pop((event.unit, None), None)
             yield event
 
-    def _mourn(self, position: int, hand: _Hand) -> Iterator[Event]:
-        """A worker died: blame what it had in hand, and put another in its place."""
+    def _dismiss(self, hand: _Hand, message: str) -> None:
+        """A worker cannot begin (its GPU is gone): the others do its work. Raises if it was the last."""
+        self._let_go(hand)
+        if not self._hands:
+            raise CFlowError(message)
+        print(f"{message}; going on with {len(self._hands)} of {len(self._layout.devices)} workers", file=sys.stderr)
+        if hand.unit is not None and not self._stop():
+            self._pending.appendleft(hand.unit)
+
+    def _let_go(self, hand: _Hand) -> None:
         hand.process.join()
         hand.pipe.close()
+        self._hands.remove(hand)
+
+    def _mourn(self, hand: _Hand) -> Iterator[Event]:
+        """A worker died, or ended when it was told to: another takes its place if there is work for it."""
+        self._let_go(hand)
+        yield from self._blame(hand)
+        if self._pending and not self._stop():
+            self._hands.append(self._hire(hand.device))
+
+    def _blame(self, hand: _Hand) -> Iterator[Event]:
+        """Whatever a dead worker had in hand may be why; the rest of its unit is to be done again."""
         unit, how = hand.unit, _how(hand.process.exitcode)
-        self._hands[position] = self._hire(hand.device)
         if unit is None:
             return
         given_up: Set[int] = set()
@@ -161,23 +190,28 @@ class _Crew:
                     return
                 given_up.add(stamp)
         if not self._stop():
-            self._pending.appendleft(replace(unit, careful=unit.careful | set(hand.in_hand), skip=unit.skip | given_up))
+            skip = unit.skip | given_up | hand.settled  # with `redo`, files do not tell what is done
+            self._pending.appendleft(replace(unit, careful=unit.careful | set(hand.in_hand), skip=skip))
 
 
 def _how(status: Optional[int]) -> str:
     if status is not None and status < 0:
-        name = signal.Signals(-status).name
+        name = next((known.name for known in signal.Signals if known == -status), f"signal {-status}")
         return f"by {name}" + (" (out of memory?)" if -status == signal.SIGKILL else "")
     return f"with status {status}"
+
+
+def _use_threads(for_torch: int, for_pyarrow: int) -> None:
+    torch.set_num_threads(for_torch)
+    pyarrow.set_cpu_count(for_pyarrow)
 
 
 def _serve(job: Job, device: str, threads: int, pipe: Connection) -> None:
     """What a worker process runs. Signals are the parent's business: it says when to stop."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
-    torch.set_num_threads(threads)
-    pyarrow.set_cpu_count(threads)
-    with suppress(BrokenPipeError, EOFError):  # the parent is gone: so are we
+    _use_threads(threads, threads)
+    with suppress(ConnectionError, EOFError):  # the parent is gone: so are we
         try:
             worker = Worker(job, device)
         except CFlowError as error:

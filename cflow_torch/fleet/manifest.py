@@ -83,13 +83,21 @@ def claim_folder(output: Path, identity: Mapping[str, Any], resume: bool, overwr
 
 def find_conflict(output: Path, identity: Mapping[str, Any], resume: bool) -> Optional[str]:
     """Why results of this identity must not join those in the folder, to follow a noun; None if they may."""
-    before = _read(output / MANIFEST)
+    # In this order: a shard that begins beside this one writes the manifest first.
+    has_config, before = (output / "config.yaml").exists(), _read(output / MANIFEST)
     if before is None:
-        return "" if (output / "config.yaml").exists() else None
+        foreign = _foreign_log(output, identity["hash"])
+        return f" ({foreign} is of it)" if foreign else "" if has_config else None
     changed = changes(before, identity, ["hash"])
     if changed:
         return f" ({changed})"
     return None if resume else " with the same settings (resume=true goes on with it)"
+
+
+def _foreign_log(output: Path, run: str) -> Optional[str]:
+    """A log's folder that another run made: `overwrite` was killed when it had removed the run's own manifest."""
+    folders = [folder for folder in sorted(output.iterdir()) if folder.is_dir()] if output.is_dir() else []
+    return next((f.name for f in folders if (_read(f / MANIFEST) or {"run": run}).get("run", run) != run), None)
 
 
 def claim_log(folder: Path, log: Log, run: str) -> None:
@@ -157,14 +165,18 @@ def _digest(log: Log, index: int) -> str:
 
 
 def _clear(output: Path) -> None:
-    """Remove the results of a run, and nothing else. Its manifest goes first: what is left half-way belongs to none."""
+    """Remove the results of a run, and nothing else.
+
+    Its manifest goes first: what is left half-way belongs to none. That of a log goes last: it tells whose frames they
+    are.
+    """
     logs: List[Path] = [path for path in output.iterdir() if path.is_dir()]
     for name in (MANIFEST, "config.yaml"):
         with suppress(FileNotFoundError):
             (output / name).unlink()
     for folder in logs:
         files = list(folder.iterdir())
-        for file in files:
+        for file in sorted(files, key=lambda file: file.name == MANIFEST):
             if _OURS.fullmatch(file.name):
                 file.unlink()
         if files and all(_OURS.fullmatch(file.name) for file in files):

@@ -76,6 +76,7 @@ class _State:
     is_begun: bool = False
     log_id: Optional[str] = None
     in_hand: List[int] = field(default_factory=list)  # frames begun and not settled
+    settled: Set[int] = field(default_factory=set)  # frames on disk or failed
 
 
 class _Rounds:
@@ -142,6 +143,7 @@ class _Rounds:
                 state.in_hand += event.timestamps
             elif isinstance(event, (Done, Failed)) and event.timestamp in state.in_hand:
                 state.in_hand.remove(event.timestamp)
+                state.settled.add(event.timestamp)
                 self._deaths.pop((event.unit, None), None)
             yield event
         if news.ended:
@@ -167,7 +169,8 @@ class _Rounds:
                 if stamp is None:
                     return
                 given_up.add(stamp)
-        unit = replace(unit, careful=unit.careful | set(state.in_hand), skip=unit.skip | given_up)
+        skip = unit.skip | given_up | state.settled  # with `redo`, files do not tell what is done
+        unit = replace(unit, careful=unit.careful | set(state.in_hand), skip=skip)
         self._states[unit.number] = _State(unit)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import sys
 import time
-from typing import Any, Dict, Iterator, List, Sequence
+from typing import Any, Dict, Iterator, Sequence
 
 from tqdm import tqdm
 
@@ -58,6 +58,10 @@ def run_fleet(
             _follow(events, tally, len(units))
         except KeyboardInterrupt:
             stop.received = stop.received or signal.SIGINT
+        except CFlowError as error:  # no worker is left
+            if not tally.total:
+                raise
+            print(f"ended early: {error}", file=sys.stderr)
         seconds = time.perf_counter() - start
         name = signal.Signals(stop.received).name if stop.received and not tally.is_complete else ""
         report = make_report(tally, seconds, layout, shard, engine, name, about)
@@ -89,13 +93,13 @@ def _engine(name: str) -> Any:
 
 def _follow(events: Iterator[Event], tally: Tally, num_units: int) -> None:
     """Count events in, and show how far it is: the total grows as logs are opened."""
-    opened: List[int] = []
+    num_opened = num_frames = 0
     with tqdm(unit="frame", disable=None, smoothing=0.05) as bar:
         for event in events:
             settled = tally.add(event)
             if isinstance(event, Opened):
-                opened.append(event.total)
-                bar.total = round(sum(opened) / len(opened) * max(num_units, len(opened)))
+                num_opened, num_frames = num_opened + 1, num_frames + event.total
+                bar.total = round(num_frames / num_opened * max(num_units, num_opened))
             if isinstance(event, Failed):
                 tqdm.write(f"failed: {event.name}: {event.message}", file=sys.stderr)
             bar.update(settled)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import threading
+from contextlib import suppress
 from typing import Any, Dict, Optional
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -44,5 +45,6 @@ class StopSignal:
             raise KeyboardInterrupt
         self.received = number
         name = signal.Signals(number).name
-        # Not print: the signal may have come in the middle of one.
-        os.write(2, f"\n{name}: finishing the frames in hand; once more to end at once\n".encode())
+        # Not print: the signal may have come in the middle of one. Nobody may read it any more (`| head`).
+        with suppress(OSError):
+            os.write(2, f"\n{name}: finishing the frames in hand; once more to end at once\n".encode())

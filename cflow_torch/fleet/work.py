@@ -76,7 +76,8 @@ class Worker:
             folder = as_path(self._job.output) / log.log_id
             complete = set() if self._job.redo else complete_frames(folder)
             frames = unit.frames(len(log.timestamps) - 1)
-            todo = [i for i in frames if log.timestamps[i] not in complete | unit.skip]
+            needless = complete | unit.skip
+            todo = [i for i in frames if log.timestamps[i] not in needless]
             if todo or complete:
                 claim_log(folder, log, self._job.identity)
             remove_stale(folder)
@@ -148,16 +149,17 @@ class Worker:
         good = [frame for frame in frames if isinstance(frame.content, Window)]
         if not good:
             return
-        start = time.perf_counter()
+        start, results = time.perf_counter(), None
         try:
             with stage_clock() as stages:
                 results = self._model([frame.content for frame in good])  # type: ignore[misc]
         except Trouble as error:
             if len(good) == 1:
-                good[0].content = error
-            else:
-                for frame in good:
-                    self._compute([frame])
+                good[0].content = error.with_traceback(None)
+        if results is None:
+            # Only here, where the error is forgotten: its traceback holds all that the batch had in the GPU's memory.
+            for frame in good if len(good) > 1 else []:
+                self._compute([frame])
             return
         seconds = {"compute": time.perf_counter() - start, **{f"compute/{name}": s for name, s in stages.items()}}
         for frame, result in zip(good, results):
