@@ -97,7 +97,12 @@ def throughput(folder: Path, num_windows: int, preset: str, repeats: int, batch:
             rates[name].append(count / seconds)
     for name, values in rates.items():
         ratios = [value / base for value, base in zip(values, rates["in sequence"])]
-        about: Dict[str, Any] = {"preset": preset, "batch": batch, "way": name, "frames_per_s": round(statistics.median(values), 2)}
+        about: Dict[str, Any] = {
+            "preset": preset,
+            "batch": batch,
+            "way": name,
+            "frames_per_s": round(statistics.median(values), 2),
+        }
         about["of in sequence"] = round(statistics.median(ratios), 3)
         print(json.dumps({**about, "rounds": [round(ratio, 3) for ratio in ratios]}), flush=True)
 

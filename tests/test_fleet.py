@@ -340,7 +340,10 @@ def test_a_worker_that_is_to_stop_finishes_what_it_has_in_hand(fleet: Path, tmp_
 
 
 def deadly_serve(*arguments: Any) -> None:
-    """A worker process that kills itself when it reads a frame; $DEADLY is "<marker file, or nothing>:<time stamp>"."""
+    """A worker process that kills itself when it reads a frame; $DEADLY is "<marker file, or nothing>:<time stamp>".
+
+    If the marker file is called "hung", it stops instead, for ever.
+    """
     read, (marker, stamp) = Worker._read_one, os.environ[DEADLY].rsplit(":", 1)
 
     def deadly_read(self: Worker, log: Any, index: int) -> Any:
@@ -348,7 +351,7 @@ def deadly_serve(*arguments: Any) -> None:
             if marker:
                 Path(marker).touch()
             time.sleep(0.5)  # so that frames before it are done
-            os.kill(os.getpid(), signal.SIGKILL)
+            os.kill(os.getpid(), signal.SIGSTOP if marker.endswith("hung") else signal.SIGKILL)
         return read(self, log, index)
 
     Worker._read_one = deadly_read  # type: ignore[method-assign]
@@ -382,6 +385,42 @@ def test_a_killed_worker_is_replaced(
     written = tree(out)
     assert {name for name in written if name.endswith(".feather")} == frames
     assert all(written[name] == tree(single)[name] for name in frames)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stops", [False, True], ids=["timeout", "signal"])
+def test_a_worker_that_hangs_is_replaced(
+    fleet: Path, single: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stops: bool
+) -> None:
+    sources = sorted(fleet.iterdir())
+    deadly = AV2Log(sources[1]).timestamps[4]
+    monkeypatch.setattr(local, "_serve", deadly_serve)
+    monkeypatch.setattr(local, "_GRACE_S", 3.0)
+    monkeypatch.setenv(DEADLY, f"{tmp_path / 'hung'}:{deadly}")
+    units = split([Unit(0, source) for source in sources], 1)
+    tally, out, hung = Tally(units), tmp_path / "out", (tmp_path / "hung").exists
+    for event in run_local(job_for(out, batch=2), units, LAYOUT, lambda: stops and hung(), timeout=20):
+        tally.add(event)
+    if stops:
+        assert tally.waiting == [f"{sources[1].name}/{deadly}"] or tally.num_unopened
+    else:
+        assert tally.is_complete and tally.computed == tally.total == 10
+    written = {name: content for name, content in tree(out).items() if name.endswith(".feather")}
+    assert written.items() <= tree(single).items() and hung()
+
+
+def test_a_gpu_that_is_lost_ends_its_worker(fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = Stumbling(
+        [len(AV2Log(source).sweep(0).points) for source in fleet.iterdir()], lambda: RuntimeError("assert")
+    )
+    worker = Worker(job_for(tmp_path), "cpu", model=model)
+
+    def refuse(*_: Any, **__: Any) -> Any:
+        raise RuntimeError("device-side assert")
+
+    monkeypatch.setattr("cflow_torch.fleet.work.torch.zeros", refuse)
+    with pytest.raises(CFlowError, match="cannot be used any more: .*device-side assert"):
+        list(worker.run(Unit(0, sorted(fleet.iterdir())[0])))
 
 
 def test_workers_that_cannot_begin_end_the_run(fleet: Path, tmp_path: Path) -> None:
@@ -428,6 +467,12 @@ SLURM_ARRAY = {"SLURM_ARRAY_TASK_ID": "15", "SLURM_ARRAY_TASK_MIN": "11", "SLURM
         (("auto", "auto"), {**SLURM_ARRAY, "SLURM_ARRAY_TASK_COUNT": "3"}, Shard(2, 3)),
         (("auto", "auto"), {**SLURM_ARRAY, "SLURM_ARRAY_TASK_COUNT": "3", **SLURM_STEP}, Shard(11, 12)),
         (("auto", "auto"), {"RANK": "5", "WORLD_SIZE": "8", **SLURM_STEP}, Shard(5, 8)),
+        (
+            ("auto", "auto"),
+            {**SLURM_ARRAY, "SLURM_ARRAY_TASK_COUNT": "3", "RANK": "1", "WORLD_SIZE": "2", **SLURM_STEP},
+            Shard(5, 6),
+        ),
+        (("auto", "auto"), {"SLURM_ARRAY_TASK_ID": "0", "SLURM_ARRAY_TASK_COUNT": "1"}, Shard(0, 1)),
         (("auto", 4), SLURM_STEP, Shard(3, 4)),
         (("auto", 1), {}, Shard(0, 1)),
         # A batch script without srun is the only process of its job.
@@ -450,6 +495,7 @@ def test_the_shard_comes_from_settings_or_surroundings(given_: Any, environ: Dic
         (("one", 3), {}, "whole number"),
         (("auto", "auto"), {**SLURM_ARRAY, "SLURM_ARRAY_TASK_COUNT": "2"}, "gaps"),
         (("auto", "auto"), {"RANK": "x", "WORLD_SIZE": "2"}, "RANK"),
+        (("auto", "auto"), {**SLURM_ARRAY, "SLURM_ARRAY_TASK_COUNT": "1"}, "redo one shard"),
     ],
 )
 def test_a_shard_that_makes_no_sense_is_refused(given_: Any, environ: Dict[str, str], message: str) -> None:
@@ -479,11 +525,11 @@ def test_a_sweep_over_shards_shares_one_folder(fleet: Path, single: Path, tmp_pa
 
 def test_layout_is_chosen_from_the_machine(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(machine, "usable_cores", lambda environ: 16)
-    monkeypatch.setattr(machine, "available_memory", lambda: 10 * machine.WORKER_MEMORY + 1)
+    monkeypatch.setattr(machine, "available_memory", lambda environ: 10 * machine.WORKER_MEMORY + 1)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert choose_layout("auto", "auto", "auto", "auto", {}) == Layout(("cpu",) * 10, 1, machine.CPU_BATCH)
     assert choose_layout("cpu", 3, "auto", 7, {}) == Layout(("cpu",) * 3, 5, 7)
-    monkeypatch.setattr(machine, "available_memory", lambda: 1)
+    monkeypatch.setattr(machine, "available_memory", lambda environ: 1)
     assert choose_layout("cpu", "auto", "auto", "auto", {}).devices == ("cpu",)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
@@ -527,7 +573,7 @@ def test_the_report_tells_all(fleet: Path, tmp_path: Path, capsys: pytest.Captur
     assert flow(fleet, tmp_path, "engine.workers=1") == 0
     printed, told = capsys.readouterr().out, report(tmp_path)
     assert told["status"] == "complete" and told["exit_status"] == 0
-    assert list(told["frames"].values()) == [10, 0, 10, 0, 0, 0]
+    assert list(told["frames"].values()) == [10, 0, 10, 0, 0, 0, 0]
     assert told["frames_per_s"] == pytest.approx(10 / told["seconds"])
     assert {"read", "compute", "write", "compute/cluster", "compute/correlate"} <= set(told["stages"])
     assert told["config"]["model"]["pixel_sizes"] == [0.1] and told["versions"]["cflow_torch"]
@@ -545,7 +591,7 @@ def test_a_report_of_trouble_lists_what_is_missing() -> None:
     assert tally.add(Opened(0, "a", 40, tuple(range(13, 40)))) == 1, "frame 12 was written before its worker died"
     told = make_report(tally, 4.0, Layout(("cpu",), 2, 1), Shard(), "local", "SIGTERM", {})
     assert told["status"] == "interrupted" and told["stopped_by"] == "SIGTERM"
-    assert list(told["frames"].values()) == [40, 10, 2, 2, 27, 1]
+    assert list(told["frames"].values()) == [40, 10, 2, 1, 1, 27, 1]
     missing = format_missing(told).splitlines()
     assert missing[:3] == ["  a/11: odd", "  b: no log", "  a/13: not done"]
     assert missing[-2:] == ["  and 9 more, all of them in the report", "  1 logs or parts of logs: not begun"]

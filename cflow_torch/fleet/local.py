@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import signal
 import sys
+import time
 from collections import deque
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -22,10 +23,15 @@ from cflow_torch.types import CFlowError
 # A frame that two workers died on is given up; so is a unit that two died on before its first frame.
 _MOST_DEATHS = 2
 _POLL_S = 0.2  # how soon a signal is noticed
+_GRACE_S = 20.0  # that workers have for the frames in hand after a signal; schedulers kill after 30 s and more
 _END = "end"  # tells a worker that there is nothing more
 
+_LAST_BREATH_S = 10.0  # that a killed process may take to die
 
-def run_local(job: Job, units: Sequence[Unit], layout: Layout, stop: Callable[[], bool]) -> Iterator[Event]:
+
+def run_local(
+    job: Job, units: Sequence[Unit], layout: Layout, stop: Callable[[], bool], *, timeout: float = 600.0
+) -> Iterator[Event]:
     """Do all units.
 
     Args:
@@ -33,14 +39,17 @@ def run_local(job: Job, units: Sequence[Unit], layout: Layout, stop: Callable[[]
         units: numbered as in `split`.
         layout: one worker per device. A single worker is this very process.
         stop: asked all the time; from True on, frames in hand are finished and no others begun.
+        timeout: seconds after which a worker that has given no sign is killed. A single worker is not watched.
 
     Raises:
-        CFlowError: no worker can begin.
+        CFlowError: no worker can begin; a timeout that is not above 0.
 
     Yields:
         What happens, as it happens. A worker that is killed is replaced and its frames done again, one by one; a frame
         that kills two workers is `Failed`.
     """
+    if isinstance(timeout, bool) or not isinstance(timeout, (int, float)) or not timeout > 0:
+        raise CFlowError(f"engine.timeout={timeout!r}: give seconds above 0")
     if len(layout.devices) == 1:
         threads, cpus = torch.get_num_threads(), pyarrow.cpu_count()
         worker = Worker(job, layout.devices[0])
@@ -54,7 +63,7 @@ def run_local(job: Job, units: Sequence[Unit], layout: Layout, stop: Callable[[]
             worker.close()
             _use_threads(threads, cpus)
     else:
-        yield from _Crew(job, units, layout, stop).run()
+        yield from _Crew(job, units, layout, stop, timeout).run()
 
 
 @dataclass(frozen=True)
@@ -75,13 +84,17 @@ class _Hand:
     log_id: Optional[str] = None
     in_hand: List[int] = field(default_factory=list)  # frames begun and not settled
     settled: Set[int] = field(default_factory=set)  # frames of the unit that are on disk or failed
+    heard: float = field(default_factory=time.monotonic)  # when it gave its last sign, or was given its unit
+    killed: Optional[float] = None  # when it was killed because it gave no sign
 
 
 class _Crew:
     """Hands out units, gathers events, replaces the dead."""
 
-    def __init__(self, job: Job, units: Sequence[Unit], layout: Layout, stop: Callable[[], bool]) -> None:
-        self._job, self._layout, self._stop = job, layout, stop
+    def __init__(
+        self, job: Job, units: Sequence[Unit], layout: Layout, stop: Callable[[], bool], timeout: float
+    ) -> None:
+        self._job, self._layout, self._stop, self._timeout = job, layout, stop, timeout
         self._pending: Deque[Unit] = deque(units)
         self._deaths: Dict[Any, int] = {}  # (unit number, time stamp or None) -> workers that died on it
         self._hands: List[_Hand] = []
@@ -90,16 +103,17 @@ class _Crew:
         """See `run_local`."""
         try:
             self._hands = [self._hire(device) for device in self._layout.devices[: max(1, len(self._pending))]]
-            told = False
+            told = 0.0
             while True:
                 if self._stop() and not told:
-                    told = True
+                    told = time.monotonic()
                     self._pending.clear()
                     for hand in self._hands:
                         self._send(hand, _END)
                 for hand in self._hands:
                     if hand.unit is None and self._pending:
                         hand.unit, hand.log_id, hand.in_hand, hand.settled = self._pending.popleft(), None, [], set()
+                        hand.heard = time.monotonic()
                         self._send(hand, hand.unit)
                 if all(hand.unit is None for hand in self._hands):
                     break
@@ -107,6 +121,8 @@ class _Crew:
                 for hand in list(self._hands):
                     if hand.pipe in ready:
                         yield from self._hear(hand)
+                    elif hand.unit is not None and self._is_lost(hand, told):
+                        yield from self._mourn(hand)
         except BaseException:
             for hand in self._hands:
                 hand.process.kill()
@@ -114,7 +130,7 @@ class _Crew:
         finally:
             for hand in self._hands:
                 self._send(hand, _END)
-                hand.process.join()
+                hand.process.join(None if hand.killed is None else _LAST_BREATH_S)
                 hand.pipe.close()
 
     def _hire(self, device: str) -> _Hand:
@@ -130,8 +146,23 @@ class _Crew:
         with suppress(OSError):  # it died: `_hear` will find out
             hand.pipe.send(message)
 
+    def _is_lost(self, hand: _Hand, told: float) -> bool:
+        """Kill a worker that gives no sign (a file system or a GPU that hangs), or that does not end when it is told.
+
+        Returns:
+            Whether it does not even die: what it waits for never comes.
+        """
+        now = time.monotonic()
+        if hand.killed is not None:
+            return now - hand.killed > _LAST_BREATH_S
+        if now - hand.heard > self._timeout or (told and now - told > _GRACE_S):
+            hand.killed = now
+            hand.process.kill()
+        return False
+
     def _hear(self, hand: _Hand) -> Iterator[Event]:
         """One message of a worker, or its end."""
+        hand.heard = time.monotonic()
         try:
             event = hand.pipe.recv()
         except (EOFError, OSError):
@@ -162,7 +193,7 @@ class _Crew:
             self._pending.appendleft(hand.unit)
 
     def _let_go(self, hand: _Hand) -> None:
-        hand.process.join()
+        hand.process.join(_LAST_BREATH_S)
         hand.pipe.close()
         self._hands.remove(hand)
 
@@ -175,7 +206,8 @@ class _Crew:
 
     def _blame(self, hand: _Hand) -> Iterator[Event]:
         """Whatever a dead worker had in hand may be why; the rest of its unit is to be done again."""
-        unit, how = hand.unit, _how(hand.process.exitcode)
+        unit = hand.unit
+        how = f"after {self._timeout:g} s without a sign" if hand.killed is not None else _how(hand.process.exitcode)
         if unit is None:
             return
         given_up: Set[int] = set()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -58,7 +59,7 @@ def choose_layout(device: str, workers: Any, threads: Any, batch: Any, environ: 
     elif gpus:
         count = len(gpus)
     else:
-        memory = available_memory()
+        memory = available_memory(environ)
         count = cores if memory is None else max(1, min(cores, memory // WORKER_MEMORY))
     per_worker = max(1, cores // count) if threads == AUTO else _at_least_1("threads", threads)
     size = (GPU_BATCH if gpus else CPU_BATCH) if batch == AUTO else _at_least_1("batch", batch)
@@ -85,9 +86,10 @@ def usable_cores(environ: Mapping[str, str]) -> int:
     counts = [os.cpu_count() or 1]
     with suppress(AttributeError):  # not on every system
         counts.append(len(os.sched_getaffinity(0)))
-    with suppress(OSError, ValueError):
-        quota, period = (_CGROUP / "cpu.max").read_text().split()
-        counts.append(int(quota) // int(period))
+    for group in _cgroups():
+        with suppress(OSError, ValueError):  # "max" is no number
+            quota, period = (group / "cpu.max").read_text().split()
+            counts.append(int(quota) // int(period))
     if environ.get("SLURM_CPUS_PER_TASK", "").isdigit():
         counts.append(int(environ["SLURM_CPUS_PER_TASK"]))
     if environ.get("LOCAL_WORLD_SIZE", "").isdigit():
@@ -95,16 +97,34 @@ def usable_cores(environ: Mapping[str, str]) -> int:
     return max(1, min(counts))
 
 
-def available_memory() -> Optional[int]:
-    """Bytes that this process may still take; None where the system does not tell."""
+def available_memory(environ: Mapping[str, str]) -> Optional[int]:
+    """Bytes that this process may still take: what is free, its groups' limits, its share of a SLURM or torchrun job;
+    None where nobody tells."""
     free = []
     with suppress(OSError, StopIteration, ValueError):
         lines = Path("/proc/meminfo").read_text().splitlines()
         free.append(1024 * int(next(line for line in lines if line.startswith("MemAvailable")).split()[1]))
-    with suppress(OSError, ValueError):
-        limit, used = (int((_CGROUP / name).read_text()) for name in ("memory.max", "memory.current"))
-        free.append(limit - used)
-    return min(free) if free else None
+    for group in _cgroups():
+        with suppress(OSError, ValueError):
+            limit, used = (int((group / name).read_text()) for name in ("memory.max", "memory.current"))
+            free.append(limit - used)
+    if environ.get("SLURM_MEM_PER_NODE", "").isdigit():
+        free.append(int(environ["SLURM_MEM_PER_NODE"]) << 20)
+    neighbours = re.match(r"\d+", environ.get("LOCAL_WORLD_SIZE") or environ.get("SLURM_STEP_TASKS_PER_NODE") or "1")
+    share = min(free) // max(1, int(neighbours[0])) if free and neighbours else None
+    if environ.get("SLURM_MEM_PER_CPU", "").isdigit():
+        per_task = int(environ["SLURM_MEM_PER_CPU"]) * int(environ.get("SLURM_CPUS_PER_TASK", "1")) << 20
+        share = per_task if share is None else min(share, per_task)
+    return share
+
+
+def _cgroups() -> List[Path]:
+    """Control groups (version 2) that bound this process, the innermost first; none where there are no such."""
+    with suppress(OSError, StopIteration):
+        lines = Path("/proc/self/cgroup").read_text().splitlines()
+        group = _CGROUP / next(line[3:] for line in lines if line.startswith("0::")).lstrip("/")
+        return [folder for folder in (group, *group.parents) if _CGROUP in (folder, *folder.parents)]
+    return []
 
 
 def _at_least_1(name: str, value: Any) -> int:

@@ -109,10 +109,10 @@ def claim_log(folder: Path, log: Log, run: str) -> None:
     Cost: reads three sweeps.
     """
     now = describe_log(log, run)
-    before = _read(folder / MANIFEST)
-    if before is None:
+    if _read(folder / MANIFEST) is None:
         write_text(folder / MANIFEST, _text(now))
-    elif not _same_log(before, now):
+    before = _read(folder / MANIFEST)  # again: another log of that name may have been quicker
+    if before is None or not _same_log(before, now):
         raise CFlowError(
             f"{folder} holds flow of other sweeps (the log has changed since, or two logs have one name): "
             "remove that folder, or give output=FOLDER"

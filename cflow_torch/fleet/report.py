@@ -30,9 +30,9 @@ def make_report(
 
     Returns:
         "status": "complete", "incomplete" (something failed or is missing) or "interrupted"; "frames": "total",
-        "complete_before", "computed", "failed", "waiting" (begun logs) and "unopened_units"; "frames_per_s" of those
-        computed; "stages": seconds per computed frame, summed over the workers, that overlap in time; "failures",
-        "waiting".
+        "complete_before", "computed", "failed", "failed_logs" (or parts of logs), "waiting" (of begun logs) and
+        "unopened_units"; "frames_per_s" of those computed; "stages": seconds per computed frame, summed over the
+        workers, that overlap in time; "failures", "waiting".
     """
     status = "interrupted" if signal_name else "complete" if tally.is_complete else "incomplete"
     waiting = tally.waiting
@@ -49,7 +49,8 @@ def make_report(
             "total": tally.total,
             "complete_before": tally.complete_before,
             "computed": tally.computed,
-            "failed": len(tally.failures),
+            "failed": tally.num_failed_frames,
+            "failed_logs": len(tally.failures) - tally.num_failed_frames,
             "waiting": len(waiting),
             "unopened_units": tally.num_unopened,
         },
@@ -74,6 +75,8 @@ def format_report(report: Dict[str, Any]) -> str:
         ("  failed", frames["failed"]),
         ("  not done", frames["waiting"]),
     ]
+    if frames["failed_logs"]:
+        rows.append(("logs or parts of logs that failed", frames["failed_logs"]))
     if frames["unopened_units"]:
         rows.append(("logs or parts of logs not begun", frames["unopened_units"]))
     rows.append(("seconds", f"{report['seconds']:.1f}"))

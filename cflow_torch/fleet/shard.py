@@ -48,8 +48,8 @@ def find_shard(index: Any, count: Any, environ: Mapping[str, str]) -> Shard:
     Args:
         index: from 0, or "auto".
         count: number of shards, or "auto".
-        environ: environment variables. "auto" is, in this order: torchrun's RANK and WORLD_SIZE; the task of an `srun`
-            step times the task of a SLURM array, whichever there are; else the only shard.
+        environ: environment variables. "auto" is torchrun's RANK and WORLD_SIZE, else the task of an `srun` step, times
+            the task of a SLURM array, whichever there are; else the only shard.
 
     Raises:
         CFlowError: not numbers, out of range, an index without a count, a count that the environment contradicts.
@@ -76,20 +76,24 @@ def from_environment(environ: Mapping[str, str]) -> Optional[Tuple[int, int]]:
     A SLURM batch script is no task of its step: only `srun` sets SLURM_STEP_NUM_TASKS, so that `--ntasks=8` without
     `srun` does not silently compute one eighth.
     """
-    if "RANK" in environ and "WORLD_SIZE" in environ:
-        return _of(environ, "RANK"), _of(environ, "WORLD_SIZE")
     index, count, found = 0, 1, False
     if "SLURM_ARRAY_TASK_ID" in environ:
         lowest, step = _of(environ, "SLURM_ARRAY_TASK_MIN", 0), _of(environ, "SLURM_ARRAY_TASK_STEP", 1)
         index, found = (_of(environ, "SLURM_ARRAY_TASK_ID") - lowest) // step, True
         count = _of(environ, "SLURM_ARRAY_TASK_COUNT", index + 1)
+        if count == 1 and _of(environ, "SLURM_ARRAY_TASK_ID") > 0:
+            raise CFlowError(
+                "this SLURM array has one task whose number is not 0: to redo one shard give shard.index and "
+                "shard.count, to do everything shard.index=0 shard.count=1"
+            )
         if not index < count:
             raise CFlowError(
                 "the tasks of this SLURM array have numbers with gaps: give shard.index and shard.count, or a range"
             )
-    if "SLURM_STEP_NUM_TASKS" in environ and "SLURM_PROCID" in environ:
-        tasks = _of(environ, "SLURM_STEP_NUM_TASKS")
-        index, count, found = index * tasks + _of(environ, "SLURM_PROCID"), count * tasks, True
+    for rank, tasks in (("RANK", "WORLD_SIZE"), ("SLURM_PROCID", "SLURM_STEP_NUM_TASKS")):
+        if rank in environ and tasks in environ:
+            size = _of(environ, tasks)
+            return index * size + _of(environ, rank), count * size
     return (index, count) if found else None
 
 

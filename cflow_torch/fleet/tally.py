@@ -19,6 +19,7 @@ class Tally:
         self.complete_before = 0
         self.computed = 0
         self.failures: List[Tuple[str, str]] = []  # (frame or log, message)
+        self.num_failed_frames = 0
         self.seconds: Dict[str, float] = {}  # by stage, of all workers together
         self._open: Dict[int, Tuple[str, Set[int]]] = {}  # unit -> log id, time stamps neither on disk nor failed
         self._unopened = {unit.number for unit in units}
@@ -50,6 +51,7 @@ class Tally:
         if isinstance(event, Failed):
             self.failures.append((event.name, event.message))
             self._unopened.discard(event.unit)
+            self.num_failed_frames += event.timestamp is not None
             return 0 if event.timestamp is None else self._settle(event.unit, {event.timestamp})
         return 0
 

@@ -57,12 +57,15 @@ class Worker:
             torch.zeros(1, device=device)  # now, rather than frame by frame
         except (RuntimeError, AssertionError) as error:
             raise CFlowError(f"no worker can begin on {device}: {describe(error)}") from error
-        self._job, self._ahead = job, ahead
+        self._job, self._device, self._ahead = job, device, ahead
         self._model: FlowModel = make_model(job.config, device) if model is None else model
         self._log: Tuple[Any, Union[Log, None]] = (None, None)
 
     def run(self, unit: Unit, stop: Callable[[], bool] = lambda: False) -> Iterator[Event]:
         """Do a unit's frames that are not complete.
+
+        Raises:
+            CFlowError: the GPU cannot be used any more.
 
         Args:
             unit: what to do.
@@ -156,6 +159,7 @@ class Worker:
         except Trouble as error:
             if len(good) == 1:
                 good[0].content = error.with_traceback(None)
+                self._check_device()
         if results is None:
             # Only here, where the error is forgotten: its traceback holds all that the batch had in the GPU's memory.
             for frame in good if len(good) > 1 else []:
@@ -165,6 +169,13 @@ class Worker:
         for frame, result in zip(good, results):
             frame.content = result
             frame.seconds.update({name: value / len(good) for name, value in seconds.items()})
+
+    def _check_device(self) -> None:
+        """After an error of a kernel, CUDA refuses all that follows in the same process: only a new one can go on."""
+        try:
+            torch.zeros(1, device=self._device).item()
+        except RuntimeError as error:
+            raise CFlowError(f"{self._device} cannot be used any more: {describe(error)}") from error
 
     def _write(self, folder: Path, frame: _Frame) -> _Frame:
         if isinstance(frame.content, FlowResult):
