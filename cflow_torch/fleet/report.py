@@ -106,6 +106,10 @@ def to_json(report: Dict[str, Any]) -> str:
 
 
 def _workers(report: Dict[str, Any]) -> str:
-    devices = report["devices"]
+    devices, threads = report["devices"], report["threads"]
     names = ", ".join(sorted(set(devices)))
-    return f"{len(devices)} worker{'s' * (len(devices) > 1)} on {names} with {report['threads']} threads each"
+    return f"{_count(len(devices), 'worker')} on {names} with {_count(threads, 'thread')} each"
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"
