@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import subprocess
 import sys
 from pathlib import Path
 
@@ -176,3 +177,10 @@ def test_a_foreign_file_is_no_flow_file(tmp_path: Path) -> None:
     for name in ("b", "c", "missing"):
         with pytest.raises(CFlowError, match=f"{name}.feather"):
             read_flow(tmp_path / f"{name}.feather")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a POSIX shell")
+def test_output_that_nobody_reads_ends_quietly() -> None:
+    command = f"{sys.executable} -m cflow_torch.cli.main --help | true; echo status ${{PIPESTATUS[0]}}"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=120)
+    assert (done.stderr, done.stdout) == ("", "status 141\n")

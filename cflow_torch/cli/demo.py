@@ -1,7 +1,7 @@
 """No data needed: a simulated drive goes through reader, method, evaluation and picture like a real log.
 
-Leaves in OUTPUT (outputs/demo): log/ the drive in Argoverse 2's format, <log id>/ one flow file per pair,
-flow.png the picture, results.json the scores, config.yaml the resolved settings and versions.
+Leaves in OUTPUT (outputs/demo): <log id>/ one flow file per pair, flow.png the picture, results.json the scores,
+config.yaml the resolved settings and versions; in outputs/cache the drive in Argoverse 2's format.
 
   cflow demo
   cflow demo data.seed=7 pair=2 output=outputs/another
@@ -45,5 +45,5 @@ def task(cfg: DictConfig) -> None:
 
     failures += for_each_pair(logs, model, keep)
     report(cfg, metrics, output)
-    print(f"picture: {output / 'flow.png'}\nflow files, log, scores, settings: {output}")
+    print(f"picture: {output / 'flow.png'}\nflow files, scores, settings: {output}")
     finish(failures)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from importlib import import_module
 from typing import List, Optional
@@ -38,6 +39,14 @@ examples:
 
 def main(argv: Optional[List[str]] = None) -> None:
     """Run one command. Ends the process with status 1 if anything failed, 2 if the call was wrong."""
+    try:
+        _run(argv)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        _end_unread()
+
+
+def _run(argv: Optional[List[str]]) -> None:
     arguments = list(sys.argv[1:] if argv is None else argv)
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         print(HELP)
@@ -61,9 +70,17 @@ def main(argv: Optional[List[str]] = None) -> None:
         except CFlowError as error:
             print(f"error: {error}", file=sys.stderr)
             raise SystemExit(2) from None
+        except BrokenPipeError:
+            _end_unread()
 
     sys.argv = [f"cflow {command}", *rest]
     hydra.main(version_base="1.3", config_path="pkg://cflow_torch.configs", config_name=command)(task)()
+
+
+def _end_unread() -> None:
+    """Nobody reads what is printed any more (`cflow info | head`): end as other commands do, without a word."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left is flushed at the end
+    raise SystemExit(128 + 13)  # as if SIGPIPE had ended it
 
 
 if __name__ == "__main__":
