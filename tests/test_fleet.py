@@ -520,6 +520,14 @@ def test_a_sweep_over_shards_shares_one_folder(fleet: Path, single: Path, tmp_pa
     assert tree(tmp_path) == tree(single)
 
 
+def test_a_shard_without_frames_is_complete(fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    log = next(fleet.iterdir())
+    for index, count in ((0, 90), (45, 90)):
+        assert flow(log, tmp_path, f"shard.index={index}", f"shard.count={count}", "engine.workers=1") == 0
+        assert report(tmp_path, f"shard-{index}-of-{count}")["frames"]["total"] == 0
+    assert list(run_local(job_for(tmp_path), [], LAYOUT, lambda: False)) == []
+
+
 # The machine
 
 

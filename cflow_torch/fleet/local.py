@@ -50,6 +50,8 @@ def run_local(
     """
     if isinstance(timeout, bool) or not isinstance(timeout, (int, float)) or not timeout > 0:
         raise CFlowError(f"engine.timeout={timeout!r}: give seconds above 0")
+    if not units:
+        return
     if len(layout.devices) == 1:
         threads, cpus = torch.get_num_threads(), pyarrow.cpu_count()
         worker = Worker(job, layout.devices[0])
@@ -102,7 +104,7 @@ class _Crew:
     def run(self) -> Iterator[Event]:
         """See `run_local`."""
         try:
-            self._hands = [self._hire(device) for device in self._layout.devices[: max(1, len(self._pending))]]
+            self._hands = [self._hire(device) for device in self._layout.devices[: len(self._pending)]]
             told = 0.0
             while True:
                 if self._stop() and not told:
