@@ -402,7 +402,7 @@ def test_a_worker_that_hangs_is_replaced(
     for event in run_local(job_for(out, batch=2), units, LAYOUT, lambda: stops and hung(), timeout=20):
         tally.add(event)
     if stops:
-        assert tally.waiting == [f"{sources[1].name}/{deadly}"] or tally.num_unopened
+        assert f"{sources[1].name}/{deadly}" in tally.waiting  # and what was in hand with it
     else:
         assert tally.is_complete and tally.computed == tally.total == 10
     written = {name: content for name, content in tree(out).items() if name.endswith(".feather")}
