@@ -30,7 +30,16 @@ from cflow_torch.reference.dense import (
 from cflow_torch.reference.descriptors import describe, detect_keypoints
 from cflow_torch.reference.keypoints import correlation_flow_keypoints, gate, median_of_components, nearest_match
 from cflow_torch.reference.matching import Match, match_keypoints, passes_ratio_test
-from cflow_torch.reference.pixels import Box, bev_dims, bounding_box, in_range, occupancy, project_bev, search_radius
+from cflow_torch.reference.pixels import (
+    Box,
+    bev_dims,
+    bounding_box,
+    in_range,
+    longer_side,
+    occupancy,
+    project_bev,
+    search_radius,
+)
 from cflow_torch.reference.pooling import diamond_angle, median, median_direction, pool
 from cflow_torch.reference.sweeps import Cloud, Level, compensate, xyz
 from cflow_torch.types import FlowResult, Window
@@ -56,6 +65,7 @@ __all__ = [
     "gate",
     "general_correlation_flow",
     "in_range",
+    "longer_side",
     "match_keypoints",
     "median",
     "median_direction",
