@@ -7,7 +7,8 @@ operation is elementwise in the written order, so that another implementation ca
 
 Order of reading: reference_flow -> coarse_to_fine, here -> `dense` (Alg. general_correlation_flow) or `keypoints`
 (Sec. CorrelationFlow-Keypoints). What they use: `sweeps` (ego motion), `pixels` (Eq. 3d_to_bev), `clustering`
-(Alg. clustering), `pooling` (Sec. leverage_past_pcs), `descriptors` and `matching` (key points); `peak` is beyond the paper.
+(Alg. clustering), `pooling` (Sec. leverage_past_pcs), `descriptors` and `matching` (key points). Beyond
+the paper: `peak`.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from cflow_torch.reference.dense import (
 from cflow_torch.reference.descriptors import describe, detect_keypoints
 from cflow_torch.reference.keypoints import correlation_flow_keypoints, gate, median_of_components, nearest_match
 from cflow_torch.reference.matching import Match, match_keypoints, passes_ratio_test
-from cflow_torch.reference.peak import beats_zero, coinciding
+from cflow_torch.reference.peak import beats_zero, coinciding, parabola
 from cflow_torch.reference.pixels import (
     Box,
     bev_dims,
@@ -78,6 +79,7 @@ __all__ = [
     "norm_correlation",
     "occupancy",
     "overlap_and_energy",
+    "parabola",
     "passes_ratio_test",
     "pool",
     "project_bev",
