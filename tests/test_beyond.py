@@ -16,6 +16,7 @@ from cflow_torch import CFlowError, CorrelationFlow, Sweep, Window, make_config
 from cflow_torch import reference as ref
 from cflow_torch.bench.opencv_loop import opencv_flow
 from cflow_torch.config import DENSE_ONLY
+from cflow_torch.correlate import best_shifts
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.log import window as window_of
 from cflow_torch.displacement import beats_zero, parabola
@@ -25,7 +26,7 @@ from cflow_torch.reference import reference_flow
 
 CORRELATIONS = ("fft", "conv")
 # Every option on its own, and all of them, as the small scenes can use them.
-EACH: List[Dict[str, Any]] = [{"max_object": 2.0}, {"zero_test": 1.5}, {"subpixel": "parabola"}]
+EACH: List[Dict[str, Any]] = [{"max_object": 2.0}, {"zero_test": 1.5}, {"subpixel": "parabola"}, {"height_slices": 4}]
 ALL: Dict[str, Any] = {key: value for options in EACH for key, value in options.items()}
 OPTIONS = [*EACH, ALL]
 
@@ -125,6 +126,43 @@ def test_cuda_equals_cpu(options):
     on_cpu = CorrelationFlow(settings, device="cpu")(windows)
     for gpu, cpu in zip(CorrelationFlow(settings, device="cuda")(windows), on_cpu):
         assert_same(gpu.to("cpu"), cpu)
+
+
+@pytest.mark.parametrize("engine", CORRELATIONS)
+@pytest.mark.parametrize("num_slices", [2, 5, 8])
+def test_best_shifts_of_slices_equal_the_loop(num_slices, engine):
+    """All sizes in one call, two templates per target."""
+    rng = np.random.default_rng(num_slices)
+    sizes = [(1, 1), (1, 9), (8, 8), (3, 7), (17, 16), (2, 33), (70, 30), (130, 120)]
+    targets = [random_slices(rng, num_slices, size) for size in sizes]
+    own = [*range(len(sizes)), *range(len(sizes))]
+    templates = [random_slices(rng, num_slices, sizes[n]) for n in range(len(sizes))]
+    templates += [np.roll(target, (1, -1), (1, 2)) for target in targets]
+    shift, score = best_shifts(
+        sliced_images(templates),
+        sliced_images(targets),
+        torch.tensor(own),
+        torch.tensor(sizes),
+        engine=engine,
+        num_slices=num_slices,
+    )
+    for job, (template, n) in enumerate(zip(templates, own)):
+        (dx, dy), expected = ref.scene_flow_in_1view(template, targets[n], 1.0)
+        assert shift[job].tolist() == [dy, dx] and float(score[job]) == np.float32(expected)
+
+
+def random_slices(rng, num_slices, size) -> np.ndarray:
+    image = rng.random((num_slices, *size)) < rng.choice([0.05, 0.3])
+    image.flat[rng.integers(image.size)] = True
+    return image
+
+
+def sliced_images(images: List[np.ndarray]) -> Images:
+    """Set pixels of (n, H, W) images."""
+    rows = [np.column_stack([np.full(i.any(0).sum(), k), np.argwhere(i.any(0))]) for k, i in enumerate(images)]
+    bits = [(i[:, i.any(0)] << np.arange(len(i))[:, None]).sum(0) for i in images]
+    index = torch.from_numpy(np.concatenate(rows).astype(np.int64))
+    return Images(*index.t().contiguous(), slices=torch.from_numpy(np.concatenate(bits).astype(np.uint8)))
 
 
 # ------------------------------------------------------------------------------------------ truths by hand
@@ -251,3 +289,43 @@ def test_subpixel_is_nearer_to_the_truth():
             (result,) = CorrelationFlow(config(subpixel=name))([Window(Sweep(pc0), Sweep(pc1))])
             found.append(float((result.residual_flow[0] - torch.from_numpy(motion)).norm()))
     assert np.mean(errors["parabola"]) < 0.8 * np.mean(errors["none"])
+
+
+def test_pixels_coincide_only_in_the_same_slice():
+    # A low line of pixels; at t+1 a high one stands one pixel to the left of it and the low one two to the right.
+    line = [(r, 8) for r in range(6, 14)]
+    pc0 = sweep(line, 0.25)
+    high, low = sweep([*moved(line, 0, -1), (6, 4)], 0.75), sweep(moved(line, 0, 2), 0.25)
+    pc1 = Sweep(np.concatenate([high.points, low.points]))
+    assert flow_of(pc0, pc1)[:2] == [-1.0, 0.0]
+    assert flow_of(pc0, pc1, height_slices=2)[:2] == [2.0, 0.0]
+    assert flow_of(pc0, pc1, height_slices=2, slice_height=1.0) == flow_of(pc0, pc1)  # all in one slice
+    box = (6, 4, 8, 7)
+    template, target = (ref.slice_images(s.points, METRE.replace(height_slices=3), 1.0, box) for s in (pc0, pc1))
+    assert [int(image.sum()) for image in (*template, *target)] == [8, 0, 0, 8, 9, 0]
+    overlap, energy = ref.overlap_and_energy(template, target)
+    assert (overlap[4, 3 - 1], overlap[4, 3 + 2]) == (0, 8) and energy[4, 3] == 17
+
+
+def test_slices_below_zero_and_far_away():
+    z = np.array([-0.01, -0.5, -0.51, 0.0, 0.49, 0.5, 2.0, -1e11, 1e11, 1e15, -1e15, 123456.78])
+    numbers = [math.floor(min(max(v, -1e12), 1e12) / 0.5) % 4 for v in z.tolist()]
+    assert numbers[:7] == [3, 3, 2, 0, 0, 1, 0]
+    settings = METRE.replace(height_slices=4, point_cloud_range=(0.0, 0.0, -math.inf, 40.0, 40.0, math.inf))
+    cloud = np.column_stack([np.arange(len(z)) + 0.5, np.full(len(z), 3.5), z])
+    images = ref.slice_images(cloud, settings, 1.0, (3, 0, 1, len(z)))
+    assert images[:, 0].argmax(0).tolist() == numbers and (images.sum(0) == 1).all()
+    window = Window(Sweep(cloud), Sweep(cloud[::-1] * [1, 1, -1] + [0, 0, 0.3]))
+    (result,) = CorrelationFlow(settings)([window])
+    assert_same(result, reference_flow(window, settings))
+
+
+def test_one_point_a_pixel_in_the_same_slice_is_the_flat_result():
+    window = scene(5, num_history=2)
+    sweeps = (window.pc0, window.pc1)
+    finite = [np.where(np.isfinite(s.points), s.points, np.nan) for s in sweeps]
+    flat = [replace(s, points=p * np.float32([1, 1, 0]), pose=None) for s, p in zip(sweeps, finite)]
+    (plain,) = CorrelationFlow(config())([Window(*flat)])
+    (sliced,) = CorrelationFlow(config(height_slices=8, slice_height=100.0))([Window(*flat)])
+    assert_same(plain, sliced)
+    assert plain.residual_flow.any()

@@ -29,6 +29,7 @@ LAYERS = {
     "inputs": 2,
     "descriptors": 2,
     "gate": 2,
+    "height": 2,
     "match": 2,
     "densify": 2,
     "batch": 2,

@@ -41,6 +41,7 @@ from cflow_torch.reference.pixels import (
     occupancy,
     project_bev,
     search_radius,
+    slice_images,
 )
 from cflow_torch.reference.pooling import diamond_angle, median, median_direction, pool
 from cflow_torch.reference.sweeps import Cloud, Level, compensate, xyz
@@ -87,6 +88,7 @@ __all__ = [
     "scene_flow_1obj",
     "scene_flow_in_1view",
     "search_radius",
+    "slice_images",
 ]
 
 
