@@ -336,6 +336,15 @@ def test_a_worker_that_is_to_stop_finishes_what_it_has_in_hand(fleet: Path, tmp_
     assert sorted(int(file.stem) for file in written.glob("*.feather")) == done
 
 
+def test_a_worker_closes_the_file_it_read(kitti_file: Path, tmp_path: Path) -> None:
+    pytest.importorskip("h5py", reason="needs the extra hdf5")
+    worker = Worker(Job(make_config("paper"), "0" * 64, "hdf5", {}, str(tmp_path)), "cpu")
+    scene = worker._open(kitti_file).log
+    assert scene._scene, "it is open"
+    worker.close()
+    assert not scene._scene
+
+
 # Workers that die
 
 

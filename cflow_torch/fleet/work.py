@@ -64,15 +64,15 @@ class Worker:
     def run(self, unit: Unit, stop: Callable[[], bool] = lambda: False) -> Iterator[Event]:
         """Do a unit's frames that are not complete.
 
-        Raises:
-            CFlowError: the GPU cannot be used any more.
-
         Args:
             unit: what to do.
             stop: asked before each batch; from True on, what is computed is written and nothing new is begun.
 
         Yields:
             What happens: `Opened` once, then `Begun`, `Done` and `Failed`, in the order of the log.
+
+        Raises:
+            CFlowError: the GPU cannot be used any more.
         """
         try:
             log = self._open(unit.source)
@@ -100,8 +100,8 @@ class Worker:
         """Let go of the log in hand."""
         log, self._log = self._log[1], (None, None)
         while log is not None:  # what is put round a log (recent sweeps, ground, poses) holds it as `log`
-            if hasattr(log, "close"):
-                log.close()
+            if hasattr(log, "__exit__"):  # an open file
+                log.__exit__(None, None, None)
             log = getattr(log, "log", None)
 
     def _open(self, source: Any) -> Log:
