@@ -111,15 +111,16 @@ def make_cells(batch: Batch, grid: Grid, slice_height: float) -> Tuple[Cells, Te
         raise CFlowError("height slices need z: make the batch with three axes")
     num_images = batch.num_windows * batch.num_steps
     place = grid.pixel_of_image(batch.positions, batch.image, num_images, batch.takes_part).long()
-    part = slice_of(batch.positions[2].masked_fill(~batch.takes_part, 0.0), slice_height)
+    part = slice_of(batch.positions[2], slice_height)  # of rows that take no part anything: they are drawn nowhere
     image = draw_slices(place, part, num_images * grid.height * grid.width)
     return cells_of_image(image, grid, batch.num_windows, batch.num_steps), place
 
 
 def slice_of(z: Tensor, slice_height: float) -> Tensor:
-    """(N,) uint8, 0 ... 3: the slice of heights (N,) float64, metres, finite; as in `make_cells`."""
+    """(N,) uint8, 0 ... 3: the slice of heights (N,) float64, metres, as in `make_cells`; 0 for NaN."""
     layer = (z / torch.full((), slice_height, dtype=z.dtype, device=z.device)).floor_()
-    return (layer.clamp_(-_HIGHEST_SLICE, _HIGHEST_SLICE).long() & (NUM_SLICES - 1)).to(torch.uint8)
+    layer.clamp_(-_HIGHEST_SLICE, _HIGHEST_SLICE).nan_to_num_(0.0)
+    return (layer.long() & (NUM_SLICES - 1)).to(torch.uint8)
 
 
 def draw_slices(place: Tensor, part: Tensor, num_pixels: int) -> Tensor:

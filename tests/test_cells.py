@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -10,6 +12,9 @@ from scenes import RANGE, config, needs_gpu, same_bits, scene
 from cflow_torch import CFlowError, Sweep, Window
 from cflow_torch.batch import Batch, make_batch
 from cflow_torch.cells import Cells, count_slices, draw_slices, make_cells, slice_of
+from cflow_torch.config import Config
+from cflow_torch.data.av2 import AV2Log
+from cflow_torch.data.log import window as window_of_log
 from cflow_torch.grid import Grid
 from cflow_torch.reference.cells import slice_image
 from cflow_torch.reference.pixels import in_range
@@ -46,6 +51,17 @@ def test_cells_equal_the_loop_over_points(seed, slice_height):
     for found, image in zip(images(cells)[0], drawn):
         assert found.numpy().tobytes() == image.tobytes()
     assert cells.image[-1] == 0 and set(cells.image.tolist()) > {0, 1, 2, 4, 8}
+
+
+def test_cells_of_the_real_pair(av2_folder):
+    window, settings = window_of_log(AV2Log(av2_folder), 0), Config(sectional_view=True)
+    grid = Grid(0.1, settings.point_cloud_range[:3], settings.point_cloud_range[3:])
+    cells, _ = make_cells(make_batch([window], settings, grid, "cpu"), grid, SLICE)
+    clouds, cloud1 = compensate(window, settings)
+    for found, cloud in zip(images(cells)[0], (cloud1, *clouds)):
+        points = cloud.points[cloud.takes_part & in_range(cloud.points, settings)]
+        assert found.numpy().tobytes() == slice_image(points, settings, 0.1, SLICE).tobytes()
+    assert cells.pixel.numel() > 25_000
 
 
 def test_every_point_knows_its_pixel():
@@ -122,6 +138,8 @@ def test_slices_of_heights_by_hand():
         [0.0, 0.49, 0.5, 1.0, 1.99, 2.0, -0.01, -0.5, -0.51, -2.0, 1e300, -1e300, 2.0**53], dtype=torch.float64
     )
     assert slice_of(z, 0.5).tolist() == [0, 0, 1, 2, 3, 0, 3, 3, 2, 0, 0, 0, 0]
+    infinite = torch.tensor([math.inf, -math.inf, math.nan], dtype=torch.float64)
+    assert slice_of(infinite, 0.5).tolist() == [0, 0, 0]
     assert slice_of(torch.tensor([0.3 * 3], dtype=torch.float64), 0.3).tolist() == [int(0.3 * 3 / 0.3 // 1) % 4]
 
 

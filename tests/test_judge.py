@@ -10,7 +10,12 @@ from hypothesis import strategies as st
 from scenes import needs_gpu, same_bits
 
 from cflow_torch import judge as fast
-from cflow_torch.cells import Cells, cells_of_image
+from cflow_torch.batch import make_batch
+from cflow_torch.cells import Cells, cells_of_image, make_cells
+from cflow_torch.cluster import cluster
+from cflow_torch.config import Config
+from cflow_torch.data.av2 import AV2Log
+from cflow_torch.data.log import window as window_of_log
 from cflow_torch.grid import Grid
 from cflow_torch.reference import judge as ref
 
@@ -111,6 +116,30 @@ def test_a_column_by_hand():
     # 1 loses, 3 and 4 win one and nothing. By 1.49: 1 forwards, where only pixel 2 wins one and 1 loses one; -1 back.
     assert won.tolist() == [[5, 3, 2, 0, 0]]
     assert lost.tolist() == [[1, 1, 2, 0, 2]]
+
+
+def test_components_of_the_real_pair(av2_folder):
+    settings = Config(sectional_view=True)
+    grid = Grid(0.1, settings.point_cloud_range[:3], settings.point_cloud_range[3:])
+    batch = make_batch([window_of_log(AV2Log(av2_folder), 0)], settings, grid, "cpu")
+    cells, _ = make_cells(batch, grid, 0.5)
+    images = cells.image[:-1].view(1, 2, grid.height, grid.width)
+    clusters, of_place = cluster(images != 0, 0.1, settings)
+    node = of_place[cells.pixel].long()
+    num_nodes = clusters.window.numel()
+    rng = np.random.default_rng(0)
+    candidates = rng.normal(0, 6, (num_nodes, 3, 2))
+    judged = rng.random(num_nodes) < 0.1
+    won, lost = fast.judge(cells, node, torch.from_numpy(candidates), torch.from_numpy(judged), batch.elapsed)
+    assert judged.sum() > 15 and not won[~judged].any() and not lost[~judged].any()
+    for i in np.flatnonzero(judged).tolist():
+        members = torch.zeros_like(cells.image, dtype=torch.bool)
+        members[cells.pixel[node == i]] = True
+        members = members[:-1].view_as(images)[0].numpy()
+        for c, motion in enumerate(candidates[i].tolist()):
+            expected = ref.paired_counts(images[0].numpy(), members, motion, [0.0, 1.0])
+            assert (int(won[i, c]), int(lost[i, c])) == expected
+    assert (won + lost > 10).sum() > 15
 
 
 def test_what_is_not_judged_counts_nothing():
