@@ -29,6 +29,7 @@ from cflow_torch.reference.dense import (
 )
 from cflow_torch.reference.descriptors import describe, detect_keypoints
 from cflow_torch.reference.keypoints import correlation_flow_keypoints, gate, median_of_components, nearest_match
+from cflow_torch.reference.low_columns import ground_heights, in_low_column
 from cflow_torch.reference.matching import Match, match_keypoints, passes_ratio_test
 from cflow_torch.reference.pixels import Box, bev_dims, bounding_box, in_range, occupancy, project_bev, search_radius
 from cflow_torch.reference.pooling import diamond_angle, median, median_direction, pool
@@ -55,6 +56,8 @@ __all__ = [
     "erode",
     "gate",
     "general_correlation_flow",
+    "ground_heights",
+    "in_low_column",
     "in_range",
     "match_keypoints",
     "median",
