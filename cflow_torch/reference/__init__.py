@@ -18,6 +18,7 @@ import numpy as np
 import torch
 
 from cflow_torch.config import Config
+from cflow_torch.reference.aperture import principal_axis, slides_along_itself
 from cflow_torch.reference.clustering import cluster, cluster_hdbscan, connected_components, dilate, erode
 from cflow_torch.reference.dense import (
     general_correlation_flow,
@@ -70,11 +71,13 @@ __all__ = [
     "overlap_and_energy",
     "passes_ratio_test",
     "pool",
+    "principal_axis",
     "project_bev",
     "reference_flow",
     "scene_flow_1obj",
     "scene_flow_in_1view",
     "search_radius",
+    "slides_along_itself",
 ]
 
 
