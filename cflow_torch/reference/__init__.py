@@ -30,16 +30,19 @@ from cflow_torch.reference.dense import (
 )
 from cflow_torch.reference.descriptors import describe, detect_keypoints
 from cflow_torch.reference.keypoints import correlation_flow_keypoints, gate, median_of_components, nearest_match
+from cflow_torch.reference.levels import Components, components_at, equals_parent, parents
 from cflow_torch.reference.low_columns import ground_heights, in_low_column
 from cflow_torch.reference.matching import Match, match_keypoints, passes_ratio_test
 from cflow_torch.reference.pixels import Box, bev_dims, bounding_box, in_range, occupancy, project_bev, search_radius
 from cflow_torch.reference.pooling import diamond_angle, median, median_direction, pool
 from cflow_torch.reference.sweeps import Cloud, Level, compensate, xyz
+from cflow_torch.reference.tree import winners
 from cflow_torch.types import FlowResult, Window
 
 __all__ = [
     "Box",
     "Cloud",
+    "Components",
     "Level",
     "Match",
     "bev_dims",
@@ -48,12 +51,14 @@ __all__ = [
     "cluster_hdbscan",
     "coarse_to_fine",
     "compensate",
+    "components_at",
     "connected_components",
     "correlation_flow_keypoints",
     "describe",
     "detect_keypoints",
     "diamond_angle",
     "dilate",
+    "equals_parent",
     "erode",
     "gate",
     "general_correlation_flow",
@@ -69,6 +74,7 @@ __all__ = [
     "norm_correlation",
     "occupancy",
     "overlap_and_energy",
+    "parents",
     "passes_ratio_test",
     "pool",
     "principal_axis",
@@ -78,6 +84,7 @@ __all__ = [
     "scene_flow_in_1view",
     "search_radius",
     "slides_along_itself",
+    "winners",
 ]
 
 
