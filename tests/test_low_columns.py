@@ -95,6 +95,16 @@ def test_the_order_of_ground_points_means_nothing():
     assert torch.equal(heights_of(scenes), heights_of(scenes, order=rng.permutation))
 
 
+def test_the_order_of_points_means_nothing():
+    rng = np.random.default_rng(6)
+    ground, sweeps = random_scene(rng, 2, False)
+    before = kept([(ground, sweeps)], 2)[0]
+    order = [rng.permutation(len(points)) for points in sweeps]
+    after = kept([(ground, [points[rows] for points, rows in zip(sweeps, order)])], 2)[0]
+    assert [mine.tolist() for mine in after] == [mine[rows].tolist() for mine, rows in zip(before, order)]
+    assert not all(mine.all() for mine in before)
+
+
 def flat(height: float, count: int = 5) -> np.ndarray:
     """Ground points in one block around (1, 2)."""
     return np.column_stack([np.full(count, 1.0), np.full(count, 2.0), np.full(count, height)])
