@@ -94,7 +94,7 @@ class _Groups:
         at_t = flat_nonzero(voxels.step == 1)
         of_t = voxels.group.index_select(0, at_t)
         count = self._add(of_t, torch.ones_like(of_t))
-        x, y = (self._add(of_t, values.index_select(0, at_t)) for values in (voxels.x, voxels.y))
+        x, y = (self._add(of_t, values[:-1].index_select(0, at_t)) for values in (voxels.x, voxels.y))
         self.centre = torch.div(torch.stack((x, y)), count.clamp(min=1), rounding_mode="floor")  # (2, G) int64
 
         num_steps = voxels.num_steps
@@ -132,7 +132,7 @@ class _Groups:
         to_y = _whole(torch.where(self._is_back, back_y + c_y, on_y + c_y + k_y))
         other = voxels.nearest(self._window, self._sweep, self._part, to_x, to_y)
 
-        found = flat_nonzero(other < voxels.x.numel())
+        found = flat_nonzero(other < voxels.group.numel())
         found = found.index_select(0, flat_nonzero(self._same_group(other.index_select(0, found), found)))
         other, mine, is_back = (v.index_select(0, found) for v in (other, self._voxel, self._is_back))
         earlier, later = torch.where(is_back, other, mine), torch.where(is_back, mine, other)

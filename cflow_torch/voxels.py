@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.grid import Grid
@@ -12,8 +13,8 @@ from cflow_torch.moving import NUM_SLICES, MovingPoints
 
 # Centroids are whole numbers of 1 / UNITS metre from the lower corner of the region: their sums have no order.
 UNITS = 1024
-# Far beyond any squared distance; 16 of them fit in 62 bits.
-_FAR = 1 << 56
+# A place far beyond every other; 32 times its square fits in 62 bits.
+_FAR = 1 << 28
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,7 @@ class Voxels:
         grid: its pixels.
         num_steps: S, sweeps of a window.
         group, window, step, part: (V,) int64, as for `MovingPoints`.
-        x, y: (V,) int64, centroid, units from the lower corner.
+        x, y: (V + 1,) int64, centroid, units from the lower corner; the last entry, of no voxel, is far away.
         of_key: (4 P + 4,) int64, voxel of pixel * 4 + part, V = none.
         pixel_of_place: (Q,) int32 or int64, number of the occupied pixel at each place of the images, P = none.
     """
@@ -56,22 +57,20 @@ class Voxels:
         """
         device = x.device
         side = torch.full((), self.grid.pixel_size * UNITS, dtype=torch.float64, device=device)
-        offset = torch.arange(-1, 2, device=device)
-        row = (torch.floor(y.double() / side).long()[:, None] + offset).repeat_interleave(3, 1)
-        col = (torch.floor(x.double() / side).long()[:, None] + offset).repeat(1, 3)
+        offset = torch.arange(-1, 2, device=device)[:, None]
+        row = (torch.floor(y.double() / side).long() + offset).repeat_interleave(3, 0)  # (9, K)
+        col = (torch.floor(x.double() / side).long() + offset).repeat(3, 1)
         inside = (row >= 0) & (row < self.grid.height) & (col >= 0) & (col < self.grid.width)
-        image = (window * self.num_steps + step)[:, None]
-        place = (image * self.grid.height + row) * self.grid.width + col
+        place = ((window * self.num_steps + step) * self.grid.height + row) * self.grid.width + col
         place = torch.where(inside, place, self.pixel_of_place.numel() - 1)
-        pixel = self.pixel_of_place.index_select(0, place.view(-1)).long().view_as(place)
-        voxel = self.of_key.index_select(0, (pixel * NUM_SLICES + part[:, None]).view(-1))
-        dx = _take_or_zero(self.x, voxel).view_as(place) - x[:, None]
-        dy = _take_or_zero(self.y, voxel).view_as(place) - y[:, None]
-        voxel = voxel.view_as(place)
-        distance = (dx * dx + dy * dy).masked_fill_(voxel == self.x.numel(), _FAR)
-        # No two keys of a row are equal.
-        key = distance.mul_(16).add_(torch.arange(9, device=device)).amin(1, keepdim=True)
-        return voxel.gather(1, key & 15)[:, 0]
+        pixel = self.pixel_of_place.index_select(0, place.view(-1)).view_as(place)
+        voxel = self.of_key.index_select(0, (pixel * NUM_SLICES + part).view(-1))
+        dx = self.x.index_select(0, voxel).view_as(place).sub_(x)
+        dy = self.y.index_select(0, voxel).view_as(place).sub_(y)
+        distance = dx.mul_(dx).add_(dy.mul_(dy))
+        # No two keys of a column are equal.
+        key = distance.mul_(16).add_(torch.arange(9, device=device)[:, None]).amin(0, keepdim=True)
+        return voxel.view_as(place).gather(0, key & 15)[0]
 
 
 def make_voxels(points: MovingPoints, pixel_of_place: Tensor, num_pixels: int, grid: Grid, num_steps: int) -> Voxels:
@@ -103,13 +102,7 @@ def make_voxels(points: MovingPoints, pixel_of_place: Tensor, num_pixels: int, g
 
 
 def _centroid(values: Tensor, lower: float, voxel: Tensor, count: Tensor) -> Tensor:
-    """(V,) int64 mean, in units, of the (N,) coordinates in each voxel."""
+    """(V + 1,) int64 mean, in units, of the (N,) coordinates in each voxel; the last entry is far away."""
     units = torch.floor((values - lower) * UNITS + 0.5).long()
-    return torch.div(torch.zeros_like(count).index_add_(0, voxel, units), count, rounding_mode="floor")
-
-
-def _take_or_zero(values: Tensor, index: Tensor) -> Tensor:
-    """values[index]; some number where the index is beyond the end."""
-    if values.numel() == 0:
-        return torch.zeros_like(index)
-    return values.index_select(0, index.clamp(max=values.numel() - 1))
+    mean = torch.div(torch.zeros_like(count).index_add_(0, voxel, units), count, rounding_mode="floor")
+    return F.pad(mean, (0, 1), value=_FAR)

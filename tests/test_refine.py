@@ -159,9 +159,9 @@ def test_nearest_takes_the_first_of_equals(snap):
     voxels = make_voxels(scene.moving(), scene.pixel_of_place, len(scene.group), scene.grid, 2)
     listed = ref.centroids(scene.listed(), LOWER[:2], scene.grid.pixel_size)
     number = {(v.window, v.step, v.part, v.x, v.y): None for v in listed.values()}
-    assert len(number) == voxels.x.numel() == len(listed)
+    assert len(number) == voxels.group.numel() == len(listed)
     rng = np.random.default_rng(0)
-    at = torch.from_numpy(rng.integers(0, voxels.x.numel(), 400))
+    at = torch.from_numpy(rng.integers(0, voxels.group.numel(), 400))
     x, y = (
         values[at] + torch.from_numpy(rng.choice([-96, -51, -32, 0, 32, 51, 64, -4000], 400))
         for values in (voxels.x, voxels.y)
@@ -173,7 +173,7 @@ def test_nearest_takes_the_first_of_equals(snap):
         window, part = int(voxels.window[place]), int(voxels.part[place])
         wanted = ref.nearest(listed, window, int(step[i]), part, int(x[i]), int(y[i]), scene.grid.pixel_size)
         if wanted is None:
-            assert index == voxels.x.numel()
+            assert index == voxels.group.numel()
             continue
         same = [
             (int(values[index]))
