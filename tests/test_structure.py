@@ -46,6 +46,7 @@ LAYERS = {
     "moving": 2,
     "pool": 2,
     "refine": 2,
+    "relocate": 2,
     "rigid": 2,
     "sectional": 2,
     "voxels": 2,
