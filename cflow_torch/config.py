@@ -13,6 +13,8 @@ CLUSTERINGS = ("components", "hdbscan")
 LABELINGS = ("sparse", "kornia")
 CORRELATIONS = ("fft", "conv")
 DENSIFIERS = ("components", "clusters", "nearest")
+# Options of the dense method that are not in the paper (docs/beyond.md), and the value that turns each off.
+DENSE_ONLY: Dict[str, Any] = {"max_object": None}
 # The ratio test compares products of counts: 51^6 * (2 * 10^4)^2 still fits an int64.
 LARGEST_PATCH = 51
 LARGEST_RATIO = 2
@@ -32,6 +34,8 @@ class Config:
             and labelled again (Alg. clustering).
         max_speed: m/s; a displacement longer than max_speed * elapsed time + one pixel is not searched.
             None = the paper's search range, half of the cluster's bounding box.
+        max_object: m; a cluster whose pixels at t+1 have a bounding box with a longer side than this does not move, see
+            docs/beyond.md. None = any may.
         sweep_interval: seconds between consecutive sweeps where time stamps are missing.
         use_timestamps: divide a history estimate by elapsed time (in sweep intervals t -> t+1) instead of steps.
         sectional_view: also estimate f_z in the X-Z view along the heading (Alg. scene_flow_1obj).
@@ -58,6 +62,7 @@ class Config:
     connectivity: int = 8
     max_extent: float = 20.0
     max_speed: Optional[float] = None
+    max_object: Optional[float] = None
     sweep_interval: float = 0.1
     use_timestamps: bool = False
     sectional_view: bool = False
@@ -103,10 +108,9 @@ class Config:
             )
         for name in ("max_extent", "sweep_interval", "gate_radius"):
             _positive(name, getattr(self, name))
-        if self.max_speed is not None:
-            _positive("max_speed", self.max_speed)
-        if self.max_memory is not None:
-            _positive("max_memory", self.max_memory)
+        for name in ("max_speed", "max_object", "max_memory"):
+            if getattr(self, name) is not None:
+                _positive(name, getattr(self, name))
         if self.min_cluster_size < 2:
             raise CFlowError(f"min_cluster_size={self.min_cluster_size}: give a whole number of at least 2")
         _positive("ratio_threshold", self.ratio_threshold)
@@ -126,6 +130,12 @@ class Config:
                 f"method='keypoints' matches one pair of sweeps, num_history={self.num_history} was given: "
                 "give num_history=0, or method='dense'"
             )
+        for name, off in DENSE_ONLY.items():
+            if self.method == "keypoints" and getattr(self, name) != off:
+                raise CFlowError(
+                    f"{name}={getattr(self, name)!r} is an option of the dense method, method='keypoints' was given: "
+                    f"give {name}={off!r}, or method='dense'"
+                )
 
     def replace(self, **overrides: Any) -> Config:
         """A copy with some fields changed; an unknown field raises `CFlowError` that lists the fields."""

@@ -12,8 +12,8 @@ from torch.profiler import record_function
 from cflow_torch.batch import Batch
 from cflow_torch.cluster import Clusters, cluster
 from cflow_torch.config import Config
-from cflow_torch.correlate import best_shifts
 from cflow_torch.density import cluster_by_density
+from cflow_torch.displacement import displacements, is_longer
 from cflow_torch.drawing import Images
 from cflow_torch.grid import Grid
 from cflow_torch.ops.indices import flat_nonzero
@@ -61,6 +61,9 @@ class CorrelationFlow(CoarseToFine):
                 step = batch.image % batch.num_steps
                 of_point = of_place.index_select(0, place)
                 estimates = add_sectional_view(estimates, available, positions, of_point, step, grid.pixel_size, config)
+                if config.max_object is not None:  # nor along its heading, nor up
+                    is_still = is_longer(clusters, config.max_object, grid.pixel_size)
+                    estimates = estimates.masked_fill(is_still[:, None, None], 0.0)
         with record_function("pool"):
             per_interval = estimates / batch.elapsed[clusters.window, 1:].clamp(min=1)[:, :, None]
             newest = available.int().argmax(1, keepdim=True)
@@ -80,7 +83,7 @@ def correlate(clusters: Clusters, batch: Batch, grid: Grid, config: Config) -> T
         clusters: as made by `cluster`.
         batch: for the elapsed time of each sweep.
         grid: the BEV.
-        config: `max_speed`, `correlation`.
+        config: `max_speed`, `max_object`, `correlation`.
 
     Returns:
         estimates: (M, S - 1, 3) float64, metres m -> t+1, nearest sweep first; z is 0.
@@ -104,14 +107,17 @@ def correlate(clusters: Clusters, batch: Batch, grid: Grid, config: Config) -> T
         seconds = batch.seconds[clusters.window[cluster_of_job], source_of_job + 1]
         size = torch.full_like(seconds, grid.pixel_size)
         radius = config.max_speed * seconds / size + 1
-    shift, job_score = best_shifts(
+    is_still = None
+    if config.max_object is not None:
+        is_still = is_longer(clusters, config.max_object, grid.pixel_size)
+    shift, job_score = displacements(
         Images(job_of_slot[slot], row[older], col[older]),
         Images(pixels.cluster[newest], row[newest], col[newest]),
         cluster_of_job,
         clusters.size,
         radius,
-        config.correlation,
-        config.max_memory,
+        is_still,
+        config,
     )
     estimates = torch.zeros((num_clusters * num_sources, 3), dtype=torch.float64, device=row.device)
     estimates[jobs, :2] = shift.flip(1).double() * grid.pixel_size  # (dy, dx) -> (x, y)

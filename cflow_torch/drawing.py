@@ -34,6 +34,12 @@ class Images:
     row: Tensor
     col: Tensor
 
+    def take(self, wanted: Tensor) -> Images:
+        """Some of N images, numbered anew from 0. Args: wanted: (N,) bool."""
+        pixel = flat_nonzero(wanted.index_select(0, self.image))
+        image = (wanted.cumsum(0) - 1).index_select(0, self.image.index_select(0, pixel))
+        return Images(image, self.row.index_select(0, pixel), self.col.index_select(0, pixel))
+
 
 @dataclass(frozen=True)
 class Search:

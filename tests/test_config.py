@@ -9,7 +9,7 @@ from dataclasses import FrozenInstanceError, fields
 import pytest
 
 from cflow_torch import CFlowError, Config, CorrelationFlow, CorrelationFlowKeypoints, make_config, make_model
-from cflow_torch.config import PRESETS
+from cflow_torch.config import DENSE_ONLY, PRESETS
 
 INF = math.inf
 
@@ -54,6 +54,10 @@ INF = math.inf
         ("max_speed", 0.0),
         ("max_speed", math.nan),
         ("max_speed", "fast"),
+        ("max_object", 0),
+        ("max_object", math.nan),
+        ("max_object", "car"),
+        ("max_object", True),
         ("sweep_interval", 0),
         ("sweep_interval", None),
         ("patch_size", 10),
@@ -77,6 +81,18 @@ def test_invalid_values_name_the_field(field, value):
         Config(**{field: value})
     with pytest.raises(CFlowError, match=field):
         make_config(**{field: value})
+
+
+@pytest.mark.parametrize("field, value", [("max_object", 25.0)])
+def test_options_of_the_dense_method_are_refused_for_key_points(field, value):
+    assert getattr(make_config("paper", **{field: value}), field) == value
+    with pytest.raises(CFlowError, match=f"{field}.*dense"):
+        make_config("keypoints", **{field: value})
+
+
+def test_options_beyond_the_paper_are_off_in_every_preset():
+    for name in PRESETS:
+        assert {key: getattr(make_config(name), key) for key in DENSE_ONLY} == DENSE_ONLY
 
 
 def test_unknown_field_lists_the_fields():

@@ -12,7 +12,7 @@ from typing import Any, List, NamedTuple, Sequence, Tuple
 import numpy as np
 import torch
 
-from cflow_torch.config import Config
+from cflow_torch.config import DENSE_ONLY, Config
 from cflow_torch.types import CFlowError, FlowResult, Sweep, Window
 
 _SQUARE = np.ones((3, 3), np.uint8)
@@ -83,6 +83,8 @@ def opencv_flow(window: Window, config: Config) -> FlowResult:
     opencv()  # absent: say so before anything else
     if config.method != "dense" or config.clustering != "components" or config.sectional_view:
         raise CFlowError("the OpenCV loop has method='dense', clustering='components', sectional_view=False only")
+    if any(getattr(config, name) != off for name, off in DENSE_ONLY.items()):
+        raise CFlowError(f"the OpenCV loop is the paper's method: turn off {', '.join(DENSE_ONLY)}")
     points0, moved0 = _compensate(window.pc0, window.pc1)
     clouds = _clouds(window, moved0, config)
     cloud1 = _cloud(window.pc1, _columns(window.pc1), 0.0, 0.0, config)

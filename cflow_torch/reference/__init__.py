@@ -33,7 +33,16 @@ from cflow_torch.reference.keypoints import correlation_flow_keypoints, gate, me
 from cflow_torch.reference.levels import Components, components_at, equals_parent, parents
 from cflow_torch.reference.low_columns import ground_heights, in_low_column
 from cflow_torch.reference.matching import Match, match_keypoints, passes_ratio_test
-from cflow_torch.reference.pixels import Box, bev_dims, bounding_box, in_range, occupancy, project_bev, search_radius
+from cflow_torch.reference.pixels import (
+    Box,
+    bev_dims,
+    bounding_box,
+    in_range,
+    longer_side,
+    occupancy,
+    project_bev,
+    search_radius,
+)
 from cflow_torch.reference.pooling import diamond_angle, median, median_direction, pool
 from cflow_torch.reference.sweeps import Cloud, Level, compensate, xyz
 from cflow_torch.reference.tree import winners
@@ -65,6 +74,7 @@ __all__ = [
     "ground_heights",
     "in_low_column",
     "in_range",
+    "longer_side",
     "match_keypoints",
     "median",
     "median_direction",

@@ -18,6 +18,7 @@ from cflow_torch.reference.pixels import (
     bev_dims,
     bounding_box,
     in_range,
+    longer_side,
     occupancy,
     project_bev,
     search_radius,
@@ -37,6 +38,8 @@ def general_correlation_flow(clouds: Sequence[Cloud], cloud1: Cloud, pixel_size:
 
     Returns:
         Flow, cluster and score of every point of every sweep m <= t.
+
+    Convention: a cluster longer than `max_object` has flow 0 and the NCC score of no shift.
     """
     # Partition the aggregation of all sweeps into clusters.
     sweeps = [cloud1, *clouds]
@@ -62,12 +65,15 @@ def general_correlation_flow(clouds: Sequence[Cloud], cloud1: Cloud, pixel_size:
         members = [ids == i for ids in cluster_ids]
         points = [cloud.points[member] for cloud, member in zip(sweeps, members)]
         box = bounding_box([project_bev(p, config, pixel_size) for p in points])
+        is_long = config.max_object is not None and longer_side(points[0], config, pixel_size) > config.max_object
         estimates, peaks = [], []
         for cloud, points_m in zip(clouds, points[1:]):
             if len(points_m) == 0:
                 continue
-            reach = search_radius(config, cloud.elapsed, pixel_size)
+            reach = 0.0 if is_long else search_radius(config, cloud.elapsed, pixel_size)
             flow, peak = scene_flow_1obj(points_m, points[0], box, reach, pixel_size, config)
+            if is_long:
+                flow = np.zeros(3)  # nor does it move in the sectional view
             estimates.append(flow / cloud.steps)
             peaks.append(peak)
         cluster_flow = pool(estimates)

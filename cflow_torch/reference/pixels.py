@@ -40,6 +40,12 @@ def bounding_box(pixels: Sequence[np.ndarray]) -> Box:
     return int(row), int(column), int(last_row - row + 1), int(last_column - column + 1)
 
 
+def longer_side(points: np.ndarray, config: Config, pixel_size: float) -> float:
+    """Metres: longer side of the bounding box of the pixels of points (N, 3), counted in pixels times s."""
+    _, _, height, width = bounding_box([project_bev(points, config, pixel_size)])
+    return max(height, width) * pixel_size
+
+
 def occupancy(pixels: np.ndarray, box: Box) -> np.ndarray:
     """Binary image of the box: True where at least one of the pixels (N, 2) lies (text below Eq. bev_dims)."""
     row, column, height, width = box

@@ -1,0 +1,159 @@
+"""Options beyond the paper (docs/beyond.md): known answers, and the fast path against the reference to the last bit."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import replace
+from typing import Any, Dict, List
+
+import numpy as np
+import pytest
+import torch
+from scenes import LABELINGS, assert_same, config, needs_gpu, scene
+
+from cflow_torch import CFlowError, CorrelationFlow, Sweep, Window, make_config
+from cflow_torch.bench.opencv_loop import opencv_flow
+from cflow_torch.config import DENSE_ONLY
+from cflow_torch.data.av2 import AV2Log
+from cflow_torch.data.log import window as window_of
+from cflow_torch.reference import reference_flow
+
+CORRELATIONS = ("fft", "conv")
+# Every option on its own, and all of them, as the small scenes can use them.
+EACH: List[Dict[str, Any]] = [{"max_object": 2.0}]
+ALL: Dict[str, Any] = {key: value for options in EACH for key, value in options.items()}
+OPTIONS = [*EACH, ALL]
+
+
+def ids(options: Dict[str, Any]) -> str:
+    return "-".join(options)
+
+
+# ----------------------------------------------------------------------------------- equal to the reference
+
+
+@pytest.mark.parametrize("labeling", LABELINGS)
+@pytest.mark.parametrize("correlation", CORRELATIONS)
+@pytest.mark.parametrize("options", OPTIONS, ids=ids)
+def test_equals_the_reference(options, correlation, labeling):
+    for num_history, pixel_sizes, max_speed in itertools.product((0, 3), ((0.25,), (0.5, 0.25)), (None, 6.0)):
+        settings = config(
+            num_history=num_history,
+            pixel_sizes=pixel_sizes,
+            max_speed=max_speed,
+            correlation=correlation,
+            labeling=labeling,
+            **options,
+        )
+        window = scene(11 * num_history + len(pixel_sizes) + (max_speed is None), num_history=num_history)
+        (result,) = CorrelationFlow(settings)([window])
+        assert_same(result, reference_flow(window, settings))
+
+
+@pytest.mark.parametrize("options", OPTIONS, ids=ids)
+def test_equals_the_reference_on_many_scenes(options):
+    for seed in range(20):
+        settings = config(num_history=seed % 3, sectional_view=seed % 2 == 0, **options)
+        window = scene(200 + seed, num_history=seed % 3, poses=seed % 5 > 0)
+        (result,) = CorrelationFlow(settings)([window])
+        assert_same(result, reference_flow(window, settings))
+
+
+@pytest.mark.parametrize("options", OPTIONS, ids=ids)
+def test_batch_threads_and_order_of_points_do_not_matter(options):
+    settings = config(num_history=2, **options)
+    windows = [scene(seed, num_history=seed % 3, num_objects=3 + 4 * seed) for seed in range(5)]
+    model = CorrelationFlow(settings)
+    alone = [model([window])[0] for window in windows]
+    for together, one in zip(model(windows), alone):
+        assert_same(together, one)
+    for together, one in zip(CorrelationFlow(settings.replace(max_memory=2_000_000))(windows), alone):
+        assert_same(together, one)
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(3 - min(threads, 2))
+        assert_same(model(windows)[3], alone[3])
+    finally:
+        torch.set_num_threads(threads)
+    rng = np.random.default_rng(0)
+    shuffled = [
+        replace(sweep, points=sweep.points[order], is_ground=sweep.is_ground[order])
+        for sweep in (windows[2].pc1, *windows[2].pch)
+        for order in [rng.permutation(len(sweep.points))]
+    ]
+    assert_same(model([Window(windows[2].pc0, shuffled[0], tuple(shuffled[1:]))])[0], alone[2])
+
+
+@pytest.mark.parametrize("options", OPTIONS, ids=ids)
+def test_equals_the_reference_on_the_real_pair(av2_folder, options):
+    window = window_of(AV2Log(av2_folder), 0)
+    options = {key: 6.0 if key == "max_object" else value for key, value in options.items()}
+    settings = make_config("paper", **options)
+    (result,) = CorrelationFlow(settings)([window])
+    assert (result.residual_flow.norm(dim=1) >= 0.05).sum() > 1000  # there is something to find
+    assert_same(result, reference_flow(window, settings))
+    (paper,) = CorrelationFlow(make_config("paper"))([window])
+    assert not torch.equal(paper.residual_flow, result.residual_flow)  # and the options change it
+
+
+@pytest.mark.parametrize("options", OPTIONS, ids=ids)
+def test_nothing_to_find(options):
+    window = scene(0)
+    empty = replace(window.pc0, points=window.pc0.points[:0], is_ground=None)
+    for result in CorrelationFlow(config(**options))([Window(empty, window.pc1), Window(window.pc0, empty)]):
+        assert not result.residual_flow.any() and not result.score.any() and (result.cluster_id == -1).all()
+
+
+@pytest.mark.parametrize("name", DENSE_ONLY)
+def test_the_opencv_loop_has_none_of_them(name):
+    settings = make_config("paper", **{name: ALL[name]})
+    with pytest.raises(CFlowError, match=name):
+        opencv_flow(scene(0), settings)
+
+
+@pytest.mark.cuda
+@needs_gpu
+@pytest.mark.parametrize("options", OPTIONS, ids=ids)
+def test_cuda_equals_cpu(options):
+    windows = [scene(seed, num_history=2) for seed in range(6)]
+    settings = config(num_history=2, **options)
+    on_cpu = CorrelationFlow(settings, device="cpu")(windows)
+    for gpu, cpu in zip(CorrelationFlow(settings, device="cuda")(windows), on_cpu):
+        assert_same(gpu.to("cpu"), cpu)
+
+
+# ------------------------------------------------------------------------------------------ truths by hand
+
+METRE = config().replace(pixel_sizes=(1.0,), point_cloud_range=(0.0, 0.0, -9.0, 40.0, 40.0, 9.0), max_extent=1000.0)
+# (row, column) pixels of an L, 6 high and 5 wide.
+ELL = [(r, 10) for r in range(10, 16)] + [(15, c) for c in range(11, 15)]
+
+
+def sweep(pixels, z=0.5) -> Sweep:
+    """A point in the middle of each 1 m pixel."""
+    return Sweep(np.array([(c + 0.5, r + 0.5, z) for r, c in pixels]))
+
+
+def moved(pixels, rows, cols):
+    return [(r + rows, c + cols) for r, c in pixels]
+
+
+def flow_of(pc0: Sweep, pc1: Sweep, **options):
+    """Flow and score of the first point; both paths."""
+    window, settings = Window(pc0, pc1), METRE.replace(**options)
+    (result,) = CorrelationFlow(settings)([window])
+    assert_same(result, reference_flow(window, settings))
+    return [*result.residual_flow[0, :2].tolist(), float(result.score[0])]
+
+
+def test_longer_than_max_object_does_not_move():
+    ell, gone = sweep(ELL), sweep(moved(ELL, 1, 2))
+    assert flow_of(ell, gone) == flow_of(ell, gone, max_object=6.0) == [2.0, 1.0, 1.0]  # exactly 6 m is not longer
+    coinciding = len(set(ELL) & set(moved(ELL, 1, 2)))
+    score = float(np.float32(coinciding / math.sqrt(len(ELL) ** 2)))
+    assert flow_of(ell, gone, max_object=5.9) == [0.0, 0.0, score]
+    # What counts is the length at t+1, not at t.
+    short = ELL[1:]
+    assert flow_of(ell, sweep(moved(short, 1, 2)), max_object=5.9)[:2] == [2.0, 1.0]
+    assert flow_of(sweep(short), gone, max_object=5.9)[:2] == [0.0, 0.0]
