@@ -14,10 +14,12 @@ LABELINGS = ("sparse", "kornia")
 CORRELATIONS = ("fft", "conv")
 DENSIFIERS = ("components", "clusters", "nearest")
 # Options of the dense method that are not in the paper (docs/beyond.md), and the value that turns each off.
-DENSE_ONLY: Dict[str, Any] = {"max_object": None}
+DENSE_ONLY: Dict[str, Any] = {"max_object": None, "zero_test": None}
 # The ratio test compares products of counts: 51^6 * (2 * 10^4)^2 still fits an int64.
 LARGEST_PATCH = 51
 LARGEST_RATIO = 2
+# Nothing needs more, and (100 z)^2 times a count fits an int64.
+LARGEST_Z = 1000
 
 
 @dataclass(frozen=True)
@@ -36,6 +38,9 @@ class Config:
             None = the paper's search range, half of the cluster's bounding box.
         max_object: m; a cluster whose pixels at t+1 have a bounding box with a longer side than this does not move, see
             docs/beyond.md. None = any may.
+        zero_test: z; a shift is kept if the pixels that coincide by it only (b) are significantly more than those that
+            coincide without it only (c): b > c and (b - c)^2 >= z^2 (b + c). 0.01 ... 1000, used to two decimals.
+            None = every shift is kept.
         sweep_interval: seconds between consecutive sweeps where time stamps are missing.
         use_timestamps: divide a history estimate by elapsed time (in sweep intervals t -> t+1) instead of steps.
         sectional_view: also estimate f_z in the X-Z view along the heading (Alg. scene_flow_1obj).
@@ -63,6 +68,7 @@ class Config:
     max_extent: float = 20.0
     max_speed: Optional[float] = None
     max_object: Optional[float] = None
+    zero_test: Optional[float] = None
     sweep_interval: float = 0.1
     use_timestamps: bool = False
     sectional_view: bool = False
@@ -111,6 +117,10 @@ class Config:
         for name in ("max_speed", "max_object", "max_memory"):
             if getattr(self, name) is not None:
                 _positive(name, getattr(self, name))
+        if self.zero_test is not None:
+            _positive("zero_test", self.zero_test)
+            if not 0.01 <= self.zero_test <= LARGEST_Z:
+                raise CFlowError(f"zero_test={self.zero_test}: give a number from 0.01 to {LARGEST_Z}, for example 1.5")
         if self.min_cluster_size < 2:
             raise CFlowError(f"min_cluster_size={self.min_cluster_size}: give a whole number of at least 2")
         _positive("ratio_threshold", self.ratio_threshold)

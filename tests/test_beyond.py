@@ -13,15 +13,19 @@ import torch
 from scenes import LABELINGS, assert_same, config, needs_gpu, scene
 
 from cflow_torch import CFlowError, CorrelationFlow, Sweep, Window, make_config
+from cflow_torch import reference as ref
 from cflow_torch.bench.opencv_loop import opencv_flow
 from cflow_torch.config import DENSE_ONLY
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.log import window as window_of
+from cflow_torch.displacement import beats_zero
+from cflow_torch.drawing import Images
+from cflow_torch.lookup import Lookup
 from cflow_torch.reference import reference_flow
 
 CORRELATIONS = ("fft", "conv")
 # Every option on its own, and all of them, as the small scenes can use them.
-EACH: List[Dict[str, Any]] = [{"max_object": 2.0}]
+EACH: List[Dict[str, Any]] = [{"max_object": 2.0}, {"zero_test": 1.5}]
 ALL: Dict[str, Any] = {key: value for options in EACH for key, value in options.items()}
 OPTIONS = [*EACH, ALL]
 
@@ -157,3 +161,39 @@ def test_longer_than_max_object_does_not_move():
     short = ELL[1:]
     assert flow_of(ell, sweep(moved(short, 1, 2)), max_object=5.9)[:2] == [2.0, 1.0]
     assert flow_of(sweep(short), gone, max_object=5.9)[:2] == [0.0, 0.0]
+
+
+def test_the_zero_test_by_hand():
+    # Ten pixels in a row; c of them are there again at t+1, b others are one pixel further.
+    def kept(b: int, c: int, z: float) -> bool:
+        old = [(5 * i, 10) for i in range(b + c)]
+        new = [(r, 11 if i < b else 10) for i, (r, _) in enumerate(old)]
+        template, target = np.zeros((2, 100, 30), dtype=bool)
+        for r, col in old:
+            template[r, col] = True
+        for r, col in new:
+            target[r, col] = True
+        expected = b > c and (b - c) / math.sqrt(b + c) >= z
+        images = [
+            Images(torch.zeros(n, dtype=torch.int64), *torch.from_numpy(np.argwhere(image)).t())
+            for n, image in ((b + c, template), (b + c, target))
+        ]
+        lookup = Lookup(*images, torch.tensor([0]), torch.tensor([[100, 30]]))
+        (found,) = beats_zero(lookup, torch.tensor([[0, 1]]), z).tolist()
+        assert found == ref.beats_zero(template, target, 0, 1, z) == expected
+        assert not ref.beats_zero(template, target, 0, 0, z)
+        return found
+
+    assert kept(9, 1, 2.5) and kept(6, 4, 0.5) and not kept(5, 5, 0.01) and not kept(4, 6, 0.01)
+    assert kept(9, 0, 3.0) and not kept(9, 0, 3.01)  # 9 / sqrt(9): exactly z is enough
+    assert kept(16, 4, 2.68) and not kept(16, 4, 2.69)  # 2.683: between two decimals
+
+
+def test_a_shift_that_does_not_beat_zero_is_no_motion():
+    ell, gone = sweep(ELL), sweep(moved(ELL, 1, 2))
+    # 10 pixels, of which the shift brings all to coincide, no shift a few.
+    coinciding = len(set(ELL) & set(moved(ELL, 1, 2)))
+    b = len(ELL) - coinciding
+    score = float(np.float32(coinciding / len(ELL)))
+    assert flow_of(ell, gone, zero_test=math.floor(math.sqrt(b) * 100) / 100) == [2.0, 1.0, 1.0]
+    assert flow_of(ell, gone, zero_test=math.ceil(math.sqrt(b) * 100 + 1) / 100) == [0.0, 0.0, score]

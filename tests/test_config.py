@@ -58,6 +58,11 @@ INF = math.inf
         ("max_object", math.nan),
         ("max_object", "car"),
         ("max_object", True),
+        ("zero_test", 0),
+        ("zero_test", 0.001),
+        ("zero_test", 1001),
+        ("zero_test", math.nan),
+        ("zero_test", "2"),
         ("sweep_interval", 0),
         ("sweep_interval", None),
         ("patch_size", 10),
@@ -83,7 +88,7 @@ def test_invalid_values_name_the_field(field, value):
         make_config(**{field: value})
 
 
-@pytest.mark.parametrize("field, value", [("max_object", 25.0)])
+@pytest.mark.parametrize("field, value", [("max_object", 25.0), ("zero_test", 1.5)])
 def test_options_of_the_dense_method_are_refused_for_key_points(field, value):
     assert getattr(make_config("paper", **{field: value}), field) == value
     with pytest.raises(CFlowError, match=f"{field}.*dense"):

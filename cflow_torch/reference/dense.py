@@ -13,6 +13,7 @@ import numpy as np
 
 from cflow_torch.config import Config
 from cflow_torch.reference.clustering import cluster, cluster_hdbscan
+from cflow_torch.reference.peak import beats_zero
 from cflow_torch.reference.pixels import (
     Box,
     bev_dims,
@@ -100,7 +101,7 @@ def scene_flow_1obj(
         box: BEV pixels of the object in all sweeps.
         reach: longest displacement searched in the BEV, pixels; None = no limit.
         pixel_size: s in metres.
-        config: settings (`sectional_view`, `point_cloud_range`).
+        config: settings (`sectional_view`, `zero_test`, `point_cloud_range`).
 
     Returns:
         f_{m -> t+1} (3,) float64 in metres (z = 0 without the sectional view), and the NCC score of the BEV.
@@ -112,7 +113,7 @@ def scene_flow_1obj(
     """
     template = occupancy(project_bev(points_m, config, pixel_size), box)
     target = occupancy(project_bev(points_1, config, pixel_size), box)
-    (f_x, f_y), score = scene_flow_in_1view(template, target, pixel_size, reach)
+    (f_x, f_y), score = scene_flow_in_1view(template, target, pixel_size, reach, config.zero_test)
     if not config.sectional_view:
         return np.array([f_x, f_y, 0.0]), score
 
@@ -131,7 +132,11 @@ def scene_flow_1obj(
 
 
 def scene_flow_in_1view(
-    template: np.ndarray, target: np.ndarray, pixel_size: float, reach: Optional[float] = None
+    template: np.ndarray,
+    target: np.ndarray,
+    pixel_size: float,
+    reach: Optional[float] = None,
+    zero_test: Optional[float] = None,
 ) -> Tuple[Tuple[float, float], float]:
     """Alg. scene_flow_1view: the displacement with the highest NCC score, Eq. displacement_in_bev.
 
@@ -140,9 +145,11 @@ def scene_flow_in_1view(
         target: (H, W) bool, image of sweep t+1 of the same box.
         pixel_size: s in metres.
         reach: longest displacement searched, pixels; None = no limit.
+        zero_test: z of `beats_zero`; None = every displacement is kept.
 
     Returns:
-        (column displacement, row displacement) in metres, and the NCC score there.
+        (column displacement, row displacement) in metres, and the NCC score there; a displacement that does not pass
+        the test is 0.
 
     Convention:
         Scores are compared as c^2 / E_w, the square of Eq. norm_correlation without its constant factor. Ties:
@@ -158,6 +165,8 @@ def scene_flow_in_1view(
         if reach is None or dx * dx + dy * dy <= reach * reach:
             candidates.append((-rank[u_y, u_x], dx * dx + dy * dy, dy, dx))
     _, _, dy, dx = min(candidates)
+    if zero_test is not None and not beats_zero(template, target, dy, dx, zero_test):
+        dy, dx = 0, 0
     scores = norm_correlation(overlap, int(template.sum()), window_energy)
     return (dx * pixel_size, dy * pixel_size), float(scores[dy + height // 2, dx + width // 2])
 

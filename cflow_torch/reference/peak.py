@@ -1,0 +1,42 @@
+"""What is made of the peak of the correlation beyond the paper (docs/beyond.md): the test against no shift."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+
+
+def coinciding(template: np.ndarray, target: np.ndarray, dy: int, dx: int) -> np.ndarray:
+    """Template pixels that fall on a target pixel when the template is moved.
+
+    Args:
+        template: (H, W) bool.
+        target: (H, W) bool; pixels outside it are 0.
+        dy, dx: shift in pixels.
+
+    Returns:
+        (H, W) bool, in the place of the template's pixels.
+    """
+    height, width = template.shape
+    result = np.zeros(template.shape, dtype=bool)
+    for row, col in np.argwhere(template).tolist():
+        there = row + dy, col + dx
+        if 0 <= there[0] < height and 0 <= there[1] < width:
+            result[row, col] = target[there]
+    return result
+
+
+def beats_zero(template: np.ndarray, target: np.ndarray, dy: int, dx: int, z: float) -> bool:
+    """McNemar's test of a shift against no shift, over the template's pixels as pairs.
+
+    Args:
+        template, target, dy, dx: as for `coinciding`.
+        z: used to two decimals.
+
+    Returns:
+        Whether b > c and (b - c) / sqrt(b + c) >= z, where b pixels coincide by the shift only, c without it only.
+    """
+    moved, still = coinciding(template, target, dy, dx), coinciding(template, target, 0, 0)
+    b, c = int((moved & ~still).sum()), int((still & ~moved).sum())
+    return b > c and (b - c) ** 2 >= Fraction(round(z * 100), 100) ** 2 * (b + c)
