@@ -12,9 +12,10 @@ METHODS = ("dense", "keypoints")
 CLUSTERINGS = ("components", "hdbscan")
 LABELINGS = ("sparse", "kornia")
 CORRELATIONS = ("fft", "conv")
+SUBPIXELS = ("none", "parabola")
 DENSIFIERS = ("components", "clusters", "nearest")
 # Options of the dense method that are not in the paper (docs/beyond.md), and the value that turns each off.
-DENSE_ONLY: Dict[str, Any] = {"max_object": None, "zero_test": None}
+DENSE_ONLY: Dict[str, Any] = {"max_object": None, "zero_test": None, "subpixel": "none"}
 # The ratio test compares products of counts: 51^6 * (2 * 10^4)^2 still fits an int64.
 LARGEST_PATCH = 51
 LARGEST_RATIO = 2
@@ -41,6 +42,8 @@ class Config:
         zero_test: z; a shift is kept if the pixels that coincide by it only (b) are significantly more than those that
             coincide without it only (c): b > c and (b - c)^2 >= z^2 (b + c). 0.01 ... 1000, used to two decimals.
             None = every shift is kept.
+        subpixel: "none" or "parabola": the peak of the correlation to fractions of a pixel, at most half a pixel away, by
+            the parabola through the counts beside it; a peak at no shift stays there.
         sweep_interval: seconds between consecutive sweeps where time stamps are missing.
         use_timestamps: divide a history estimate by elapsed time (in sweep intervals t -> t+1) instead of steps.
         sectional_view: also estimate f_z in the X-Z view along the heading (Alg. scene_flow_1obj).
@@ -69,6 +72,7 @@ class Config:
     max_speed: Optional[float] = None
     max_object: Optional[float] = None
     zero_test: Optional[float] = None
+    subpixel: str = "none"
     sweep_interval: float = 0.1
     use_timestamps: bool = False
     sectional_view: bool = False
@@ -92,6 +96,7 @@ class Config:
         _one_of("labeling", self.labeling, LABELINGS)
         _one_of("correlation", self.correlation, CORRELATIONS)
         _one_of("densify", self.densify, DENSIFIERS)
+        _one_of("subpixel", self.subpixel, SUBPIXELS)
         _one_of("connectivity", self.connectivity, (4, 8))
         sizes = self.pixel_sizes
         if not sizes or any(not 0 < s < math.inf for s in sizes) or any(a <= b for a, b in zip(sizes, sizes[1:])):

@@ -83,7 +83,7 @@ def correlate(clusters: Clusters, batch: Batch, grid: Grid, config: Config) -> T
         clusters: as made by `cluster`.
         batch: for the elapsed time of each sweep.
         grid: the BEV.
-        config: `max_speed`, `max_object`, `zero_test`, `correlation`.
+        config: `max_speed`, `max_object`, `zero_test`, `subpixel`, `correlation`.
 
     Returns:
         estimates: (M, S - 1, 3) float64, metres m -> t+1, nearest sweep first; z is 0.

@@ -33,39 +33,59 @@ def displacements(
     Args:
         template, target, target_of_job, size, radius: as for `best_shifts`; J templates, N targets.
         is_still: (N,) bool, targets whose templates do not move; None = any may.
-        config: `zero_test`, `correlation`, `max_memory`.
+        config: `zero_test`, `subpixel`, `correlation`, `max_memory`.
 
     Returns:
-        shift: (J, 2) int64, (dy, dx), pixels; 0 where it does not move.
-        score: (J,) float32, NCC at that shift.
+        shift: (J, 2) int64, or float64 with `subpixel`, (dy, dx), pixels; 0 where it does not move.
+        score: (J,) float32, NCC at that shift, at the whole pixel.
 
     Cost: `best_shifts` of what may move; the options look template pixels up in the target, a few times each.
     """
-    engine, memory = config.correlation, config.max_memory
-    if is_still is None and config.zero_test is None:
-        return best_shifts(template, target, target_of_job, size, radius, engine, memory)
-    lookup = Lookup(template, target, target_of_job, size)
-    if is_still is None:
-        shift, score = best_shifts(template, target, target_of_job, size, radius, engine, memory)
-    else:
-        may_move = ~is_still
-        job_may_move = may_move.index_select(0, target_of_job)
-        jobs = flat_nonzero(job_may_move)
-        shift = torch.zeros((target_of_job.numel(), 2), dtype=torch.int64, device=size.device)
-        score = lookup.score_of_no_shift()
-        shift[jobs], score[jobs] = best_shifts(
-            template.take(job_may_move),
-            target.take(may_move),
-            (may_move.cumsum(0) - 1).index_select(0, target_of_job.index_select(0, jobs)),
-            size.index_select(0, flat_nonzero(may_move)),
-            None if radius is None else radius.index_select(0, jobs),
-            engine,
-            memory,
-        )
+    shift, score = _peaks(template, target, target_of_job, size, radius, is_still, config)
+    if config.zero_test is None and config.subpixel == "none":
+        return shift, score
+    moves = shift.any(1)  # the rest stays where it is
+    jobs = flat_nonzero(moves)
+    peak = shift.index_select(0, jobs)
+    lookup = Lookup(template.take(moves), target, target_of_job.index_select(0, jobs), size)
     if config.zero_test is not None:
-        is_kept = beats_zero(lookup, shift, config.zero_test)
-        shift = shift * is_kept[:, None]
-        score = torch.where(is_kept, score, lookup.score_of_no_shift())
+        is_kept = beats_zero(lookup, peak, config.zero_test)
+        peak = peak * is_kept[:, None]
+        score[jobs] = torch.where(is_kept, score.index_select(0, jobs), lookup.score_of_no_shift())
+    if config.subpixel == "parabola":
+        shift = shift.double()
+        peak = peak + parabola(lookup, peak) * peak.any(1)[:, None]
+    shift[jobs] = peak
+    return shift, score
+
+
+def _peaks(
+    template: Images,
+    target: Images,
+    target_of_job: Tensor,
+    size: Tensor,
+    radius: Optional[Tensor],
+    is_still: Optional[Tensor],
+    config: Config,
+) -> Tuple[Tensor, Tensor]:
+    """`best_shifts` of the templates that may move; of the others no shift and its score. Args as above."""
+    engine, memory = config.correlation, config.max_memory
+    if is_still is None:
+        return best_shifts(template, target, target_of_job, size, radius, engine, memory)
+    may_move = ~is_still
+    is_searched = may_move.index_select(0, target_of_job)
+    jobs = flat_nonzero(is_searched)
+    shift = torch.zeros((target_of_job.numel(), 2), dtype=torch.int64, device=size.device)
+    score = Lookup(template, target, target_of_job, size).score_of_no_shift()
+    shift[jobs], score[jobs] = best_shifts(
+        template.take(is_searched),
+        target.take(may_move),
+        (may_move.cumsum(0) - 1).index_select(0, target_of_job.index_select(0, jobs)),
+        size.index_select(0, flat_nonzero(may_move)),
+        None if radius is None else radius.index_select(0, jobs),
+        engine,
+        memory,
+    )
     return shift, score
 
 
@@ -87,6 +107,29 @@ def beats_zero(lookup: Lookup, shift: Tensor, z: float) -> Tensor:
     won, lost = lookup.count(moved & ~still), lookup.count(still & ~moved)
     lead, unit = won - lost, round(z * _Z_UNIT)
     return (lead > 0) & (lead * lead * _Z_UNIT**2 >= (won + lost) * unit**2)
+
+
+def parabola(lookup: Lookup, shift: Tensor) -> Tensor:
+    """Top of the parabola through the counts at each shift and one pixel beside it, per axis.
+
+    Args:
+        lookup: J templates and their targets.
+        shift: (J, 2) int64, (dy, dx), pixels.
+
+    Returns:
+        (J, 2) float64, (y, x), pixels to add, within half a pixel; 0 where the counts do not curve downwards. One
+        quotient of integers: the same everywhere.
+    """
+    top = lookup.count(lookup.at(shift))
+    offsets = []
+    for axis in (0, 1):
+        step = torch.zeros_like(shift)
+        step[:, axis] = 1
+        low, high = lookup.count(lookup.at(shift - step)), lookup.count(lookup.at(shift + step))
+        curve = 2 * top - low - high
+        offset = (high - low).double() / (2 * curve).clamp(min=1).double()
+        offsets.append(torch.where(curve > 0, offset, torch.zeros_like(offset)).clamp(-0.5, 0.5))
+    return torch.stack(offsets, 1)
 
 
 def is_longer(clusters: Clusters, length: float, pixel_size: float) -> Tensor:

@@ -18,14 +18,14 @@ from cflow_torch.bench.opencv_loop import opencv_flow
 from cflow_torch.config import DENSE_ONLY
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.log import window as window_of
-from cflow_torch.displacement import beats_zero
+from cflow_torch.displacement import beats_zero, parabola
 from cflow_torch.drawing import Images
 from cflow_torch.lookup import Lookup
 from cflow_torch.reference import reference_flow
 
 CORRELATIONS = ("fft", "conv")
 # Every option on its own, and all of them, as the small scenes can use them.
-EACH: List[Dict[str, Any]] = [{"max_object": 2.0}, {"zero_test": 1.5}]
+EACH: List[Dict[str, Any]] = [{"max_object": 2.0}, {"zero_test": 1.5}, {"subpixel": "parabola"}]
 ALL: Dict[str, Any] = {key: value for options in EACH for key, value in options.items()}
 OPTIONS = [*EACH, ALL]
 
@@ -197,3 +197,57 @@ def test_a_shift_that_does_not_beat_zero_is_no_motion():
     score = float(np.float32(coinciding / len(ELL)))
     assert flow_of(ell, gone, zero_test=math.floor(math.sqrt(b) * 100) / 100) == [2.0, 1.0, 1.0]
     assert flow_of(ell, gone, zero_test=math.ceil(math.sqrt(b) * 100 + 1) / 100) == [0.0, 0.0, score]
+
+
+@pytest.mark.parametrize(
+    "counts, offset",
+    [
+        ((3, 9, 3), 0.0),
+        ((2, 9, 6), 4 / 20),  # (high - low) / (2 (2 top - low - high))
+        ((6, 9, 2), -4 / 20),
+        ((9, 9, 0), -0.5),
+        ((12, 9, 5), -0.5),  # the NCC has its peak here, the counts do not: no farther than half a pixel
+        ((9, 9, 9), 0.0),
+        ((12, 9, 12), 0.0),  # curves upwards
+    ],
+)
+def test_the_parabola_by_hand(counts, offset):
+    # One template pixel per count and row, far enough apart that each meets its own target pixel at one shift only.
+    template, target = np.zeros((2, 9 * sum(counts), 40), dtype=bool)
+    row = 0
+    for shift, count in zip((-1, 0, 1), counts):
+        for _ in range(count):
+            row += 5
+            template[row, 10] = target[row, 12 + shift] = True
+    images = [
+        Images(torch.zeros(int(image.sum()), dtype=torch.int64), *torch.from_numpy(np.argwhere(image)).t())
+        for image in (template, target)
+    ]
+    lookup = Lookup(*images, torch.tensor([0]), torch.tensor([template.shape]))
+    for axis, swap in ((1, False), (0, True)):
+        if swap:
+            images = [Images(image.image, image.col, image.row) for image in images]
+            lookup = Lookup(*images, torch.tensor([0]), torch.tensor([template.T.shape]))
+            template, target = template.T, target.T
+        shift = [0, 2] if axis == 1 else [2, 0]
+        (found,) = parabola(lookup, torch.tensor([shift])).tolist()
+        assert found == list(ref.parabola(template, target, *shift))
+        assert found[axis] == offset and found[1 - axis] == 0.0
+
+
+def test_subpixel_is_nearer_to_the_truth():
+    rng = np.random.default_rng(3)
+    outline = np.concatenate(
+        [
+            np.column_stack([rng.uniform(0, 4, 900), np.zeros(900), rng.uniform(0, 1.5, 900)]),
+            np.column_stack([np.zeros(400), rng.uniform(0, 1.8, 400), rng.uniform(0, 1.5, 400)]),
+        ]
+    )
+    errors = {"none": [], "parabola": []}
+    for _ in range(20):
+        motion = np.array([*rng.uniform(-0.6, 0.6, 2), 0.0])
+        pc0, pc1 = (outline + rng.normal(0, 0.08, outline.shape) + move for move in (0.0, motion))
+        for name, found in errors.items():
+            (result,) = CorrelationFlow(config(subpixel=name))([Window(Sweep(pc0), Sweep(pc1))])
+            found.append(float((result.residual_flow[0] - torch.from_numpy(motion)).norm()))
+    assert np.mean(errors["parabola"]) < 0.8 * np.mean(errors["none"])

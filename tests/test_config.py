@@ -63,6 +63,8 @@ INF = math.inf
         ("zero_test", 1001),
         ("zero_test", math.nan),
         ("zero_test", "2"),
+        ("subpixel", "gauss"),
+        ("subpixel", None),
         ("sweep_interval", 0),
         ("sweep_interval", None),
         ("patch_size", 10),
@@ -88,7 +90,7 @@ def test_invalid_values_name_the_field(field, value):
         make_config(**{field: value})
 
 
-@pytest.mark.parametrize("field, value", [("max_object", 25.0), ("zero_test", 1.5)])
+@pytest.mark.parametrize("field, value", [("max_object", 25.0), ("zero_test", 1.5), ("subpixel", "parabola")])
 def test_options_of_the_dense_method_are_refused_for_key_points(field, value):
     assert getattr(make_config("paper", **{field: value}), field) == value
     with pytest.raises(CFlowError, match=f"{field}.*dense"):

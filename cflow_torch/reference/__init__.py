@@ -7,7 +7,8 @@ operation is elementwise in the written order, so that another implementation ca
 
 Order of reading: reference_flow -> coarse_to_fine, here -> `dense` (Alg. general_correlation_flow) or `keypoints`
 (Sec. CorrelationFlow-Keypoints). What they use: `sweeps` (ego motion), `pixels` (Eq. 3d_to_bev), `clustering`
-(Alg. clustering), `pooling` (Sec. leverage_past_pcs), `descriptors` and `matching` (key points); `peak` is beyond the paper.
+(Alg. clustering), `pooling` (Sec. leverage_past_pcs), `descriptors` and `matching` (key points). Beyond
+the paper: `peak`.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from cflow_torch.reference.keypoints import correlation_flow_keypoints, gate, me
 from cflow_torch.reference.levels import Components, components_at, equals_parent, parents
 from cflow_torch.reference.low_columns import ground_heights, in_low_column
 from cflow_torch.reference.matching import Match, match_keypoints, passes_ratio_test
-from cflow_torch.reference.peak import beats_zero, coinciding
+from cflow_torch.reference.peak import beats_zero, coinciding, parabola
 from cflow_torch.reference.pixels import (
     Box,
     bev_dims,
@@ -88,6 +89,7 @@ __all__ = [
     "occupancy",
     "overlap_and_energy",
     "parents",
+    "parabola",
     "passes_ratio_test",
     "pool",
     "principal_axis",

@@ -13,7 +13,7 @@ import numpy as np
 
 from cflow_torch.config import Config
 from cflow_torch.reference.clustering import cluster, cluster_hdbscan
-from cflow_torch.reference.peak import beats_zero
+from cflow_torch.reference.peak import beats_zero, parabola
 from cflow_torch.reference.pixels import (
     Box,
     bev_dims,
@@ -101,7 +101,7 @@ def scene_flow_1obj(
         box: BEV pixels of the object in all sweeps.
         reach: longest displacement searched in the BEV, pixels; None = no limit.
         pixel_size: s in metres.
-        config: settings (`sectional_view`, `zero_test`, `point_cloud_range`).
+        config: settings (`sectional_view`, `zero_test`, `subpixel`, `point_cloud_range`).
 
     Returns:
         f_{m -> t+1} (3,) float64 in metres (z = 0 without the sectional view), and the NCC score of the BEV.
@@ -113,7 +113,7 @@ def scene_flow_1obj(
     """
     template = occupancy(project_bev(points_m, config, pixel_size), box)
     target = occupancy(project_bev(points_1, config, pixel_size), box)
-    (f_x, f_y), score = scene_flow_in_1view(template, target, pixel_size, reach, config.zero_test)
+    (f_x, f_y), score = scene_flow_in_1view(template, target, pixel_size, reach, config.zero_test, config.subpixel)
     if not config.sectional_view:
         return np.array([f_x, f_y, 0.0]), score
 
@@ -137,6 +137,7 @@ def scene_flow_in_1view(
     pixel_size: float,
     reach: Optional[float] = None,
     zero_test: Optional[float] = None,
+    subpixel: str = "none",
 ) -> Tuple[Tuple[float, float], float]:
     """Alg. scene_flow_1view: the displacement with the highest NCC score, Eq. displacement_in_bev.
 
@@ -146,10 +147,11 @@ def scene_flow_in_1view(
         pixel_size: s in metres.
         reach: longest displacement searched, pixels; None = no limit.
         zero_test: z of `beats_zero`; None = every displacement is kept.
+        subpixel: "parabola" = to fractions of a pixel; a displacement of 0 stays 0.
 
     Returns:
-        (column displacement, row displacement) in metres, and the NCC score there; a displacement that does not pass
-        the test is 0.
+        (column displacement, row displacement) in metres, and the NCC score of the whole pixel; a displacement that
+        does not pass the test is 0.
 
     Convention:
         Scores are compared as c^2 / E_w, the square of Eq. norm_correlation without its constant factor. Ties:
@@ -168,7 +170,9 @@ def scene_flow_in_1view(
     if zero_test is not None and not beats_zero(template, target, dy, dx, zero_test):
         dy, dx = 0, 0
     scores = norm_correlation(overlap, int(template.sum()), window_energy)
-    return (dx * pixel_size, dy * pixel_size), float(scores[dy + height // 2, dx + width // 2])
+    moves = (dy, dx) != (0, 0)
+    y, x = parabola(template, target, dy, dx) if moves and subpixel == "parabola" else (0.0, 0.0)
+    return ((dx + x) * pixel_size, (dy + y) * pixel_size), float(scores[dy + height // 2, dx + width // 2])
 
 
 def ncc_map(template: np.ndarray, target: np.ndarray) -> np.ndarray:

@@ -1,8 +1,9 @@
-"""What is made of the peak of the correlation beyond the paper (docs/beyond.md): the test against no shift."""
+"""What is made of the peak of the correlation beyond the paper (docs/beyond.md): a test, fractions of a pixel."""
 
 from __future__ import annotations
 
 from fractions import Fraction
+from typing import Tuple
 
 import numpy as np
 
@@ -40,3 +41,24 @@ def beats_zero(template: np.ndarray, target: np.ndarray, dy: int, dx: int, z: fl
     moved, still = coinciding(template, target, dy, dx), coinciding(template, target, 0, 0)
     b, c = int((moved & ~still).sum()), int((still & ~moved).sum())
     return b > c and (b - c) ** 2 >= Fraction(round(z * 100), 100) ** 2 * (b + c)
+
+
+def parabola(template: np.ndarray, target: np.ndarray, dy: int, dx: int) -> Tuple[float, float]:
+    """Top of the parabola through the counts at a shift and one pixel beside it, per axis.
+
+    Args:
+        template, target, dy, dx: as for `coinciding`.
+
+    Returns:
+        (y, x): pixels to add to the shift, each within half a pixel; 0 where the counts do not curve downwards.
+    """
+
+    def count(y: int, x: int) -> int:
+        return int(coinciding(template, target, dy + y, dx + x).sum())
+
+    offsets = []
+    for y, x in ((1, 0), (0, 1)):
+        low, top, high = count(-y, -x), count(0, 0), count(y, x)
+        curve = 2 * top - low - high
+        offsets.append(min(max((high - low) / (2 * curve), -0.5), 0.5) if curve > 0 else 0.0)
+    return offsets[0], offsets[1]
