@@ -48,6 +48,16 @@ class Clusters:
     size: Tensor
     pixels: Pixels
 
+    def take(self, wanted: Tensor) -> Clusters:
+        """Some of M clusters, numbered anew from 0. Args: wanted: (M,) bool."""
+        index = flat_nonzero(wanted)
+        member = flat_nonzero(wanted.index_select(0, self.pixels.cluster))
+        number = (wanted.cumsum(0) - 1).index_select(0, self.pixels.cluster.index_select(0, member))
+        pixels = self.pixels
+        step, row, col = (values.index_select(0, member) for values in (pixels.step, pixels.row, pixels.col))
+        window, first, size = (values.index_select(0, index) for values in (self.window, self.first, self.size))
+        return Clusters(window, first, size, Pixels(number, step, row, col))
+
     def id_in_window(self) -> Tensor:
         """(M,) int64, number of each cluster counted from 0 in its own window."""
         start = torch.searchsorted(self.window, self.window)  # first cluster of the same window

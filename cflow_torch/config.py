@@ -42,8 +42,8 @@ class Config:
         zero_test: z; a shift is kept if the pixels that coincide by it only (b) are significantly more than those that
             coincide without it only (c): b > c and (b - c)^2 >= z^2 (b + c). 0.01 ... 1000, used to two decimals.
             None = every shift is kept.
-        subpixel: "none" or "parabola": the peak of the correlation to fractions of a pixel, at most half a pixel away, by
-            the parabola through the counts beside it; a peak at no shift stays there.
+        subpixel: "none" or "parabola": the peak of the correlation to fractions of a pixel, at most half a pixel away,
+            by the parabola through the counts beside it; a peak at no shift stays there.
         sweep_interval: seconds between consecutive sweeps where time stamps are missing.
         use_timestamps: divide a history estimate by elapsed time (in sweep intervals t -> t+1) instead of steps.
         sectional_view: also estimate f_z in the X-Z view along the heading (Alg. scene_flow_1obj).
