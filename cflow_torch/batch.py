@@ -96,13 +96,13 @@ def split_windows(windows: Sequence[Window], config: Config, grid: Grid, device:
     if limit is None and device.type == "cpu":
         limit = _BYTES_ON_CPU
     used = 0
-    per_point = _BYTES_PER_POINT
+    per_point, per_pixel = _BYTES_PER_POINT, _BYTES_PER_PIXEL + config.height_slices
     if config.method == "keypoints":  # descriptors: two copies of L^2 bytes for at most half of the points
         per_point += config.patch_size**2
     for window in windows:
         sweeps = (window.pc1, window.pc0, *window.pch)
         points = sum(sweep.points.shape[0] for sweep in sweeps)
-        needed = per_point * points + (_BYTES_PER_PIXEL * len(sweeps) + 30) * grid.height * grid.width
+        needed = per_point * points + (per_pixel * len(sweeps) + 30) * grid.height * grid.width
         if not groups or (limit is not None and used + needed > limit):
             groups.append([])
             used = 0
@@ -145,7 +145,8 @@ def make_batch(windows: Sequence[Window], config: Config, grid: Grid, device: An
         for window in windows
     ]
 
-    num_axes = 3 if config.sectional_view or config.clustering == "hdbscan" else 2
+    needs_z = config.sectional_view or config.clustering == "hdbscan" or config.height_slices > 0
+    num_axes = 3 if needs_z else 2
     most = sum(sweep.points.shape[0] for _, _, _, sweep in sweeps)
     positions = torch.empty((num_axes, most), dtype=torch.float64, device=chosen_device)
     takes_part = torch.ones(most, dtype=torch.bool, device=chosen_device)

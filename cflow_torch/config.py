@@ -15,12 +15,14 @@ CORRELATIONS = ("fft", "conv")
 SUBPIXELS = ("none", "parabola")
 DENSIFIERS = ("components", "clusters", "nearest")
 # Options of the dense method that are not in the paper (docs/beyond.md), and the value that turns each off.
-DENSE_ONLY: Dict[str, Any] = {"max_object": None, "zero_test": None, "subpixel": "none"}
+DENSE_ONLY: Dict[str, Any] = {"max_object": None, "zero_test": None, "subpixel": "none", "height_slices": 0}
 # The ratio test compares products of counts: 51^6 * (2 * 10^4)^2 still fits an int64.
 LARGEST_PATCH = 51
 LARGEST_RATIO = 2
 # Nothing needs more, and (100 z)^2 times a count fits an int64.
 LARGEST_Z = 1000
+# A byte holds the slices of a pixel.
+MOST_SLICES = 8
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,9 @@ class Config:
             None = every shift is kept.
         subpixel: "none" or "parabola": the peak of the correlation to fractions of a pixel, at most half a pixel away,
             by the parabola through the counts beside it; a peak at no shift stays there.
+        height_slices: number of height slices n, 2 ... 8: points coincide only if their slices floor(z / slice_height)
+            mod n do, z in the frame of t+1. Clusters stay those of the BEV. 0 = one slice for all heights.
+        slice_height: m.
         sweep_interval: seconds between consecutive sweeps where time stamps are missing.
         use_timestamps: divide a history estimate by elapsed time (in sweep intervals t -> t+1) instead of steps.
         sectional_view: also estimate f_z in the X-Z view along the heading (Alg. scene_flow_1obj).
@@ -73,6 +78,8 @@ class Config:
     max_object: Optional[float] = None
     zero_test: Optional[float] = None
     subpixel: str = "none"
+    height_slices: int = 0
+    slice_height: float = 0.5
     sweep_interval: float = 0.1
     use_timestamps: bool = False
     sectional_view: bool = False
@@ -111,13 +118,13 @@ class Config:
             )
         if any(math.isinf(v) for v in (box[0], box[1], box[3], box[4])):
             raise CFlowError(f"point_cloud_range={box}: x and y bounds must be finite; only z may be infinite")
-        for name in ("num_history", "patch_size", "min_cluster_size"):
+        for name in ("num_history", "patch_size", "min_cluster_size", "height_slices"):
             _whole_number(name, getattr(self, name))
         if self.patch_size % 2 == 0 or self.patch_size > LARGEST_PATCH:
             raise CFlowError(
                 f"patch_size={self.patch_size}: give an odd number of pixels of at most {LARGEST_PATCH}, for example 11"
             )
-        for name in ("max_extent", "sweep_interval", "gate_radius"):
+        for name in ("max_extent", "sweep_interval", "gate_radius", "slice_height"):
             _positive(name, getattr(self, name))
         for name in ("max_speed", "max_object", "max_memory"):
             if getattr(self, name) is not None:
@@ -126,6 +133,13 @@ class Config:
             _positive("zero_test", self.zero_test)
             if not 0.01 <= self.zero_test <= LARGEST_Z:
                 raise CFlowError(f"zero_test={self.zero_test}: give a number from 0.01 to {LARGEST_Z}, for example 1.5")
+        if self.height_slices == 1 or self.height_slices > MOST_SLICES:
+            raise CFlowError(f"height_slices={self.height_slices}: give 0 (off) or 2 to {MOST_SLICES}, for example 4")
+        if self.height_slices and self.clustering != "components":
+            raise CFlowError(
+                f"height_slices={self.height_slices} needs clustering='components', {self.clustering!r} was given: "
+                "give height_slices=0"
+            )
         if self.min_cluster_size < 2:
             raise CFlowError(f"min_cluster_size={self.min_cluster_size}: give a whole number of at least 2")
         _positive("ratio_threshold", self.ratio_threshold)
@@ -133,7 +147,7 @@ class Config:
             raise CFlowError(
                 f"ratio_threshold={self.ratio_threshold}: give a number from 1 to {LARGEST_RATIO}, for example 1.1"
             )
-        for name in ("sweep_interval", "gate_radius"):
+        for name in ("sweep_interval", "gate_radius", "slice_height"):
             if math.isinf(getattr(self, name)):
                 raise CFlowError(f"{name}={getattr(self, name)}: give a finite number")
         if self.second_best_distance != 0:

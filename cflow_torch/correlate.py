@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from cflow_torch.drawing import Drawing, Images, Search, draw, search_bounds
+from cflow_torch.ops.bits import popcount, unpack_bits
 from cflow_torch.ops.cross_correlation import cross_correlate
 from cflow_torch.ops.exact import exact_sqrt
 from cflow_torch.ops.indices import flat_nonzero
@@ -42,6 +43,7 @@ def best_shifts(
     radius: Optional[Tensor] = None,
     engine: str = "fft",
     max_memory: Optional[int] = None,
+    num_slices: int = 1,
 ) -> Tuple[Tensor, Tensor]:
     """The shift of each template that maximises the normalised cross-correlation with its target.
 
@@ -54,6 +56,7 @@ def best_shifts(
         engine: "fft" or "conv"; the same bits.
         max_memory: bytes of working memory to plan with; more jobs than fit are processed in turn, with the same
             result. None = all jobs at once.
+        num_slices: height slices of the images; all counts are sums over the slices.
 
     Returns:
         shift: (J, 2) int64, (dy, dx), pixels.
@@ -73,39 +76,40 @@ def best_shifts(
     low, high = search_bounds(size, target_of_job, radius)
     search, drawing = draw(template, target, target_of_job, size, low, high)
     jobs = drawing.jobs
-    target_energy = torch.bincount(target.image, minlength=len(size))
+    target_energy = target.energy(len(size))
     own = target_of_job.index_select(0, jobs)
     search, energy_of_job = search.take(own), target_energy.index_select(0, own)
     job_radius = None if radius is None else radius.index_select(0, jobs)
 
     found = []
-    for part, counts in _correlated(drawing, own, engine, max_memory):
+    for part, counts in _correlated(drawing, own, engine, max_memory, num_slices):
         wanted = Search(search.low[part], search.high[part], search.stride[part])
         limit = None if job_radius is None else job_radius[part]
         job, *rest = _candidates(counts, wanted, energy_of_job[part], limit)
         found.append((job + part.start, *rest))
     place, dy, dx, count = found[0] if len(found) == 1 else map(torch.cat, zip(*found))
     job, job_target = jobs.index_select(0, place), own.index_select(0, place)
+    weight = None if target.slices is None else popcount(target.slices)
     job, dy, dx, count, energy = _best_of_each_job(
-        WindowCounts(target.image, target.row, target.col, size), job, job_target, dy, dx, count, num_jobs
+        WindowCounts(target.image, target.row, target.col, size, weight), job, job_target, dy, dx, count, num_jobs
     )
     shift = torch.zeros((num_jobs, 2), dtype=torch.int64, device=size.device)
     shift[job] = torch.stack((dy, dx), 1)
-    energies = torch.bincount(template.image, minlength=num_jobs).index_select(0, job) * energy
+    energies = template.energy(num_jobs).index_select(0, job) * energy
     score = torch.zeros(num_jobs, dtype=torch.float32, device=size.device)
     score[job] = (count.double() / exact_sqrt(energies.double())).float()
     return shift, score
 
 
 def _correlated(
-    drawing: Drawing, own: Tensor, engine: str, max_memory: Optional[int]
+    drawing: Drawing, own: Tensor, engine: str, max_memory: Optional[int], num_slices: int
 ) -> Iterator[Tuple[slice, List[Correlation]]]:
     """Runs of jobs, in drawing order, and their correlations, class by class.
 
     Args:
         drawing: the images.
         own: (J,) int64, target of each job, in drawing order.
-        engine, max_memory: as for `best_shifts`.
+        engine, max_memory, num_slices: as for `best_shifts`.
     """
     place = torch.empty_like(drawing.targets)
     place.scatter_(0, drawing.targets, torch.arange(place.numel(), device=place.device))
@@ -116,7 +120,7 @@ def _correlated(
     first_job = last_job = first_target = used = 0
     for block, (num_templates, num_targets, height, width, searched) in zip(blocks, drawing.classes):
         images = block.view(-1, height, width)
-        step = max(1, at_once // (height * width))
+        step = max(1, at_once // (height * width * num_slices))
         for begin in range(0, num_templates, step):
             end = min(begin + step, num_templates)
             if pending and used + (end - begin) * searched > in_part:
@@ -128,17 +132,18 @@ def _correlated(
                 low, high = int(wanted.min()), int(wanted.max())
                 some = torch.cat((images[begin:end], images[num_templates + low : num_templates + high + 1]))
                 wanted = wanted - low
-            pending.append(
-                Correlation(cross_correlate(_as_float(some), end - begin, wanted, engine).flatten(1), searched)
-            )
+            counts = cross_correlate(_as_float(some, num_slices), end - begin, wanted, engine)
+            pending.append(Correlation(counts.flatten(1), searched))
             last_job += end - begin
             used += (end - begin) * searched
         first_target += num_targets
     yield slice(first_job, last_job), pending
 
 
-def _as_float(images: Tensor) -> Tensor:
-    """Zeros and ones; from bool itself torch takes eight times as long."""
+def _as_float(images: Tensor, num_slices: int) -> Tensor:
+    """Zeros and ones, (K, Y, X) or (K, n, Y, X); from bool itself torch takes eight times as long."""
+    if images.dtype == torch.uint8:
+        return unpack_bits(images, num_slices)
     return images.view(torch.uint8).float()
 
 

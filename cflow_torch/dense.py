@@ -15,6 +15,7 @@ from cflow_torch.config import Config
 from cflow_torch.density import cluster_by_density
 from cflow_torch.displacement import displacements, is_longer
 from cflow_torch.grid import Grid
+from cflow_torch.height import slices_of_pixels
 from cflow_torch.jobs import make_jobs
 from cflow_torch.pool import pool
 from cflow_torch.pyramid import CoarseToFine, Motion, project, warp
@@ -44,7 +45,8 @@ class CorrelationFlow(CoarseToFine):
         config = self.config
         occupancy, place = project(batch, flow, grid)
         positions = batch.positions
-        if flow is not None and len(positions) == 3:  # something needs more than the pixels
+        needs_xyz = config.sectional_view or config.clustering == "hdbscan"
+        if flow is not None and needs_xyz:  # more than the pixels
             positions = torch.cat(
                 (positions[:, : batch.num_newest], warp(batch, flow, slice(batch.num_newest, None))), 1
             )
@@ -55,7 +57,10 @@ class CorrelationFlow(CoarseToFine):
             else:
                 clusters, of_place = cluster(occupancy, grid.pixel_size, config)
         with record_function("correlate"):
-            estimates, scores, available = correlate(clusters, batch, grid, config)
+            slices = None
+            if config.height_slices > 0:  # warping changes z in the sectional view only
+                slices = slices_of_pixels(batch, positions[2], place, clusters, grid, config)
+            estimates, scores, available = correlate(clusters, batch, grid, config, slices)
             if config.sectional_view:
                 step = batch.image % batch.num_steps
                 of_point = of_place.index_select(0, place)
@@ -75,21 +80,24 @@ class CorrelationFlow(CoarseToFine):
             )
 
 
-def correlate(clusters: Clusters, batch: Batch, grid: Grid, config: Config) -> Tuple[Tensor, Tensor, Tensor]:
+def correlate(
+    clusters: Clusters, batch: Batch, grid: Grid, config: Config, slices: Optional[Tensor] = None
+) -> Tuple[Tensor, Tensor, Tensor]:
     """Displacement m -> t+1 of every cluster for every earlier sweep m (Alg. scene_flow_1view, view = BEV).
 
     Args:
         clusters: as made by `cluster`.
         batch: for the elapsed time of each sweep.
         grid: the BEV.
-        config: `max_speed`, `max_object`, `zero_test`, `subpixel`, `correlation`.
+        config: `max_speed`, `max_object`, `zero_test`, `subpixel`, `height_slices`, `correlation`.
+        slices: as `slices_of_pixels` gives them; None = one slice.
 
     Returns:
         estimates: (M, S - 1, 3) float64, metres m -> t+1, nearest sweep first; z is 0.
         scores: (M, S - 1) float32.
         available: (M, S - 1) bool, False = the cluster has no pixel in that sweep.
     """
-    jobs = make_jobs(clusters, batch, grid.pixel_size, config.max_speed)
+    jobs = make_jobs(clusters, batch, grid.pixel_size, config.max_speed, slices)
     is_still = None
     if config.max_object is not None:
         is_still = is_longer(clusters, config.max_object, grid.pixel_size)

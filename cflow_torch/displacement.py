@@ -33,7 +33,7 @@ def displacements(
     Args:
         template, target, target_of_job, size, radius: as for `best_shifts`; J templates, N targets.
         is_still: (N,) bool, targets whose templates do not move; None = any may.
-        config: `zero_test`, `subpixel`, `correlation`, `max_memory`.
+        config: `zero_test`, `subpixel`, `height_slices`, `correlation`, `max_memory`.
 
     Returns:
         shift: (J, 2) int64, or float64 with `subpixel`, (dy, dx), pixels; 0 where it does not move.
@@ -69,9 +69,9 @@ def _peaks(
     config: Config,
 ) -> Tuple[Tensor, Tensor]:
     """`best_shifts` of the templates that may move; of the others no shift and its score. Args as above."""
-    engine, memory = config.correlation, config.max_memory
+    engine, memory, num_slices = config.correlation, config.max_memory, max(config.height_slices, 1)
     if is_still is None:
-        return best_shifts(template, target, target_of_job, size, radius, engine, memory)
+        return best_shifts(template, target, target_of_job, size, radius, engine, memory, num_slices)
     may_move = ~is_still
     is_searched = may_move.index_select(0, target_of_job)
     jobs = flat_nonzero(is_searched)
@@ -85,6 +85,7 @@ def _peaks(
         None if radius is None else radius.index_select(0, jobs),
         engine,
         memory,
+        num_slices,
     )
     return shift, score
 

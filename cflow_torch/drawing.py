@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from cflow_torch.grid import LONGEST_SIDE
+from cflow_torch.ops.bits import popcount
 from cflow_torch.ops.cross_correlation import FAST_LENGTHS
 from cflow_torch.ops.indices import flat_nonzero
 from cflow_torch.types import CFlowError
@@ -28,17 +29,28 @@ class Images:
     Args:
         image: (P,) int64, image of each pixel.
         row, col: (P,) int64, place inside the image, from 0.
+        slices: (P,) uint8, bit by bit the height slices in which the pixel is set, at least one; None = there is one
+            slice, and it is.
     """
 
     image: Tensor
     row: Tensor
     col: Tensor
+    slices: Optional[Tensor] = None
 
     def take(self, wanted: Tensor) -> Images:
         """Some of N images, numbered anew from 0. Args: wanted: (N,) bool."""
         pixel = flat_nonzero(wanted.index_select(0, self.image))
         image = (wanted.cumsum(0) - 1).index_select(0, self.image.index_select(0, pixel))
-        return Images(image, self.row.index_select(0, pixel), self.col.index_select(0, pixel))
+        row, col = self.row.index_select(0, pixel), self.col.index_select(0, pixel)
+        return Images(image, row, col, None if self.slices is None else self.slices.index_select(0, pixel))
+
+    def energy(self, num_images: int) -> Tensor:
+        """(N,) int64, set pixels of each image, counted in every slice."""
+        if self.slices is None:
+            return torch.bincount(self.image, minlength=num_images)
+        energy = torch.zeros(num_images, dtype=torch.int64, device=self.image.device)
+        return energy.index_add_(0, self.image, popcount(self.slices))
 
 
 @dataclass(frozen=True)
@@ -69,7 +81,7 @@ class Drawing:
     """Templates and targets drawn in the shape of their class, class after class, templates before targets.
 
     Args:
-        samples: (A,) bool.
+        samples: (A,) bool, or uint8, bit by bit the slices.
         classes: of each class (templates, targets, Y, X, number of leading samples in which shifts are searched).
         jobs: (J,) int64, templates in the order in which they are drawn.
         targets: (N,) int64, targets in the order in which they are drawn.
@@ -135,7 +147,11 @@ def draw(
     pixel = row.mul_(stride.index_select(0, of_image).index_select(0, image)).add_(col)
     pixel += start.index_select(0, image)
     total = sum((templates + targets) * y * x for templates, targets, y, x, _ in classes)
-    samples = torch.zeros(total, dtype=torch.bool, device=pixel.device).index_fill_(0, pixel, True)
+    if template.slices is None or target.slices is None:
+        samples = torch.zeros(total, dtype=torch.bool, device=pixel.device).index_fill_(0, pixel, True)
+    else:
+        samples = torch.zeros(total, dtype=torch.uint8, device=pixel.device)
+        samples.scatter_(0, pixel, torch.cat((template.slices, target.slices)))
     is_job = order < num_jobs
     drawing = Drawing(
         samples,

@@ -61,8 +61,8 @@ def make_jobs(
         seconds = batch.seconds[clusters.window[cluster], source + 1]
         radius = max_speed * seconds / torch.full_like(seconds, pixel_size) + 1
     return Jobs(
-        Images(job_of_slot[slot], row[older], col[older], *(() if slices is None else (slices[older],))),
-        Images(pixels.cluster[newest], row[newest], col[newest], *(() if slices is None else (slices[newest],))),
+        Images(job_of_slot[slot], row[older], col[older], None if slices is None else slices[older]),
+        Images(pixels.cluster[newest], row[newest], col[newest], None if slices is None else slices[newest]),
         cluster,
         source,
         radius,

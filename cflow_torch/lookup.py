@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from cflow_torch.drawing import Images
+from cflow_torch.ops.bits import popcount
 from cflow_torch.ops.exact import exact_sqrt
 
 
@@ -21,22 +22,21 @@ class Lookup:
     def __init__(self, template: Images, target: Images, target_of_job: Tensor, size: Tensor) -> None:
         self._job = template.image
         self._num_jobs = target_of_job.numel()
-        self._energies = torch.bincount(template.image, minlength=self._num_jobs) * torch.bincount(
-            target.image, minlength=len(size)
-        ).index_select(0, target_of_job)
+        self._energies = template.energy(self._num_jobs) * target.energy(len(size)).index_select(0, target_of_job)
         area = size[:, 0] * size[:, 1]
         start = area.cumsum(0) - area
         # The last sample is what lies outside of a target.
-        self._table = torch.zeros(int(area.sum()) + 1, dtype=torch.bool, device=size.device)
+        drawn = torch.ones_like(target.row, dtype=torch.bool) if target.slices is None else target.slices
+        self._table = torch.zeros(int(area.sum()) + 1, dtype=drawn.dtype, device=size.device)
         width = size[:, 1].index_select(0, target.image)
-        self._table[start.index_select(0, target.image) + target.row * width + target.col] = True
+        self._table[start.index_select(0, target.image) + target.row * width + target.col] = drawn
         own = target_of_job.index_select(0, self._job)
-        self._row, self._col = template.row, template.col
+        self._row, self._col, self._slices = template.row, template.col, template.slices
         self._height, self._width = size.index_select(0, own).t().contiguous()
         self._start = start.index_select(0, own)
 
     def at(self, shift: Tensor) -> Tensor:
-        """(P,) bool: which template pixels fall on a pixel of their target.
+        """(P,) bool: which template pixels fall on a pixel of their target; with slices (P,) uint8: in which of them.
 
         Args:
             shift: (J, 2) int64, (dy, dx) of each template; any, also beyond what `best_shifts` searches.
@@ -45,13 +45,13 @@ class Lookup:
         row, col = self._row + dy, self._col + dx
         inside = (row >= 0) & (row < self._height) & (col >= 0) & (col < self._width)
         place = self._start + row * self._width + col
-        return self._table.index_select(0, torch.where(inside, place, self._table.numel() - 1))
+        found = self._table.index_select(0, torch.where(inside, place, self._table.numel() - 1))
+        return found if self._slices is None else found & self._slices
 
     def count(self, matches: Tensor) -> Tensor:
-        """(J,) int64, number of each template's pixels among some (P,) bool."""
-        return torch.zeros(self._num_jobs, dtype=torch.int64, device=matches.device).index_add_(
-            0, self._job, matches.long()
-        )
+        """(J,) int64, number of each template's pixels (in every slice) among some, given as by `at`."""
+        number = matches.long() if self._slices is None else popcount(matches)
+        return torch.zeros(self._num_jobs, dtype=torch.int64, device=matches.device).index_add_(0, self._job, number)
 
     def score_of_no_shift(self) -> Tensor:
         """(J,) float32, NCC at shift 0: c / sqrt(E_m E_1), where the window holds all of the target."""

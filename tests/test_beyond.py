@@ -25,7 +25,7 @@ from cflow_torch.reference import reference_flow
 
 CORRELATIONS = ("fft", "conv")
 # Every option on its own, and all of them, as the small scenes can use them.
-EACH: List[Dict[str, Any]] = [{"max_object": 2.0}, {"zero_test": 1.5}, {"subpixel": "parabola"}]
+EACH: List[Dict[str, Any]] = [{"max_object": 2.0}, {"zero_test": 1.5}, {"subpixel": "parabola"}, {"height_slices": 4}]
 ALL: Dict[str, Any] = {key: value for options in EACH for key, value in options.items()}
 OPTIONS = [*EACH, ALL]
 
@@ -251,3 +251,43 @@ def test_subpixel_is_nearer_to_the_truth():
             (result,) = CorrelationFlow(config(subpixel=name))([Window(Sweep(pc0), Sweep(pc1))])
             found.append(float((result.residual_flow[0] - torch.from_numpy(motion)).norm()))
     assert np.mean(errors["parabola"]) < 0.8 * np.mean(errors["none"])
+
+
+def test_pixels_coincide_only_in_the_same_slice():
+    # A low line of pixels; at t+1 a high one stands one pixel to the left of it and the low one two to the right.
+    line = [(r, 8) for r in range(6, 14)]
+    pc0 = sweep(line, 0.25)
+    high, low = sweep([*moved(line, 0, -1), (6, 4)], 0.75), sweep(moved(line, 0, 2), 0.25)
+    pc1 = Sweep(np.concatenate([high.points, low.points]))
+    assert flow_of(pc0, pc1)[:2] == [-1.0, 0.0]
+    assert flow_of(pc0, pc1, height_slices=2)[:2] == [2.0, 0.0]
+    assert flow_of(pc0, pc1, height_slices=2, slice_height=1.0) == flow_of(pc0, pc1)  # all in one slice
+    box = (6, 4, 8, 7)
+    template, target = (ref.slice_images(s.points, METRE.replace(height_slices=3), 1.0, box) for s in (pc0, pc1))
+    assert [int(image.sum()) for image in (*template, *target)] == [8, 0, 0, 8, 9, 0]
+    overlap, energy = ref.overlap_and_energy(template, target)
+    assert (overlap[4, 3 - 1], overlap[4, 3 + 2]) == (0, 8) and energy[4, 3] == 17
+
+
+def test_slices_below_zero_and_far_away():
+    z = np.array([-0.01, -0.5, -0.51, 0.0, 0.49, 0.5, 2.0, -1e11, 1e11, 1e15, -1e15, 123456.78])
+    numbers = [math.floor(min(max(v, -1e12), 1e12) / 0.5) % 4 for v in z.tolist()]
+    assert numbers[:7] == [3, 3, 2, 0, 0, 1, 0]
+    settings = METRE.replace(height_slices=4, point_cloud_range=(0.0, 0.0, -math.inf, 40.0, 40.0, math.inf))
+    cloud = np.column_stack([np.arange(len(z)) + 0.5, np.full(len(z), 3.5), z])
+    images = ref.slice_images(cloud, settings, 1.0, (3, 0, 1, len(z)))
+    assert images[:, 0].argmax(0).tolist() == numbers and (images.sum(0) == 1).all()
+    window = Window(Sweep(cloud), Sweep(cloud[::-1] * [1, 1, -1] + [0, 0, 0.3]))
+    (result,) = CorrelationFlow(settings)([window])
+    assert_same(result, reference_flow(window, settings))
+
+
+def test_one_point_a_pixel_in_the_same_slice_is_the_flat_result():
+    window = scene(5, num_history=2)
+    sweeps = (window.pc0, window.pc1)
+    finite = [np.where(np.isfinite(s.points), s.points, np.nan) for s in sweeps]
+    flat = [replace(s, points=p * np.float32([1, 1, 0]), pose=None) for s, p in zip(sweeps, finite)]
+    (plain,) = CorrelationFlow(config())([Window(*flat)])
+    (sliced,) = CorrelationFlow(config(height_slices=8, slice_height=100.0))([Window(*flat)])
+    assert_same(plain, sliced)
+    assert plain.residual_flow.any()

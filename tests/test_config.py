@@ -65,6 +65,12 @@ INF = math.inf
         ("zero_test", "2"),
         ("subpixel", "gauss"),
         ("subpixel", None),
+        ("height_slices", 1),
+        ("height_slices", 9),
+        ("height_slices", -2),
+        ("height_slices", 4.0),
+        ("slice_height", 0),
+        ("slice_height", INF),
         ("sweep_interval", 0),
         ("sweep_interval", None),
         ("patch_size", 10),
@@ -90,11 +96,18 @@ def test_invalid_values_name_the_field(field, value):
         make_config(**{field: value})
 
 
-@pytest.mark.parametrize("field, value", [("max_object", 25.0), ("zero_test", 1.5), ("subpixel", "parabola")])
+@pytest.mark.parametrize(
+    "field, value", [("max_object", 25.0), ("zero_test", 1.5), ("subpixel", "parabola"), ("height_slices", 4)]
+)
 def test_options_of_the_dense_method_are_refused_for_key_points(field, value):
     assert getattr(make_config("paper", **{field: value}), field) == value
     with pytest.raises(CFlowError, match=f"{field}.*dense"):
         make_config("keypoints", **{field: value})
+
+
+def test_height_slices_need_components():
+    with pytest.raises(CFlowError, match="height_slices.*components"):
+        make_config("paper", height_slices=4, clustering="hdbscan")
 
 
 def test_options_beyond_the_paper_are_off_in_every_preset():

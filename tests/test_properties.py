@@ -74,6 +74,8 @@ choices = st.fixed_dictionaries(
         "max_object": st.sampled_from([None, 2 * S, 1.0]),
         "zero_test": st.sampled_from([None, 0.5, 1.0]),
         "subpixel": st.sampled_from(["none", "parabola"]),
+        "height_slices": st.sampled_from([0, 2, 4]),
+        "slice_height": st.sampled_from([S, 0.3]),
         "sectional_view": st.booleans(),
         "pixel_sizes": st.sampled_from([(S,), (4 * S, S), (0.3, 0.1)]),
         "correlation": st.sampled_from(["fft", "conv"]),

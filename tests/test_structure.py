@@ -32,6 +32,7 @@ LAYERS = {
     "jobs": 2,
     "judge": 2,
     "peaks": 2,
+    "height": 2,
     "match": 2,
     "aperture": 2,
     "levels": 2,

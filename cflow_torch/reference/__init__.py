@@ -44,6 +44,7 @@ from cflow_torch.reference.pixels import (
     occupancy,
     project_bev,
     search_radius,
+    slice_images,
 )
 from cflow_torch.reference.pooling import diamond_angle, median, median_direction, pool
 from cflow_torch.reference.sweeps import Cloud, Level, compensate, xyz
@@ -100,6 +101,7 @@ __all__ = [
     "search_radius",
     "slides_along_itself",
     "winners",
+    "slice_images",
 ]
 
 

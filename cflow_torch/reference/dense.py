@@ -23,6 +23,7 @@ from cflow_torch.reference.pixels import (
     occupancy,
     project_bev,
     search_radius,
+    slice_images,
 )
 from cflow_torch.reference.pooling import pool
 from cflow_torch.reference.sweeps import Cloud, Level
@@ -101,7 +102,8 @@ def scene_flow_1obj(
         box: BEV pixels of the object in all sweeps.
         reach: longest displacement searched in the BEV, pixels; None = no limit.
         pixel_size: s in metres.
-        config: settings (`sectional_view`, `zero_test`, `subpixel`, `point_cloud_range`).
+        config: settings (`sectional_view`, `zero_test`, `subpixel`, `height_slices`,
+            `point_cloud_range`).
 
     Returns:
         f_{m -> t+1} (3,) float64 in metres (z = 0 without the sectional view), and the NCC score of the BEV.
@@ -111,8 +113,7 @@ def scene_flow_1obj(
         that stands still. The pixels of the sectional view start at the origin of the frame of t+1, its image is
         the box of both sweeps, its row comes from z.
     """
-    template = occupancy(project_bev(points_m, config, pixel_size), box)
-    target = occupancy(project_bev(points_1, config, pixel_size), box)
+    template, target = (slice_images(points, config, pixel_size, box) for points in (points_m, points_1))
     (f_x, f_y), score = scene_flow_in_1view(template, target, pixel_size, reach, config.zero_test, config.subpixel)
     if not config.sectional_view:
         return np.array([f_x, f_y, 0.0]), score
@@ -142,8 +143,8 @@ def scene_flow_in_1view(
     """Alg. scene_flow_1view: the displacement with the highest NCC score, Eq. displacement_in_bev.
 
     Args:
-        template: (H, W) bool, image of sweep m, at least one pixel.
-        target: (H, W) bool, image of sweep t+1 of the same box.
+        template: (H, W) bool, image of sweep m, at least one pixel; or (n, H, W), one image per height slice.
+        target: the same shape, image of sweep t+1 of the same box.
         pixel_size: s in metres.
         reach: longest displacement searched, pixels; None = no limit.
         zero_test: z of `beats_zero`; None = every displacement is kept.
@@ -158,7 +159,7 @@ def scene_flow_in_1view(
         smallest norm, then smallest row displacement, then smallest column displacement.
     """
     overlap, window_energy = overlap_and_energy(template, target)
-    height, width = template.shape
+    height, width = template.shape[-2:]
     rank = np.zeros((height, width))
     np.divide(overlap * overlap, window_energy, out=rank, where=window_energy > 0)
     candidates = []
@@ -193,13 +194,17 @@ def overlap_and_energy(template: np.ndarray, target: np.ndarray) -> Tuple[np.nda
     """Numerator and right-hand energy of Eq. norm_correlation; both are counts, the images being binary.
 
     Args:
-        template: (H, W) bool, I_m.
-        target: (H, W) bool, I_{t+1}; pixels outside it are 0.
+        template: (H, W) bool, I_m; or (n, H, W), one image per height slice.
+        target: the same shape, I_{t+1}; pixels outside it are 0.
 
     Returns:
         Two (H, W) int64 maps over u: the number of template pixels that fall on a target pixel when the template's
-        corner lies at u - floor(size / 2), and the number of target pixels in that H x W neighbourhood.
+        corner lies at u - floor(size / 2), and the number of target pixels in that H x W neighbourhood. Slices
+        are counted apart and added up.
     """
+    if template.ndim == 3:
+        overlaps, energies = zip(*(overlap_and_energy(*images) for images in zip(template, target)))
+        return np.sum(overlaps, axis=0), np.sum(energies, axis=0)
     height, width = template.shape
     half_h, half_w = height // 2, width // 2
     counts = target.astype(np.int32)

@@ -12,13 +12,15 @@ def coinciding(template: np.ndarray, target: np.ndarray, dy: int, dx: int) -> np
     """Template pixels that fall on a target pixel when the template is moved.
 
     Args:
-        template: (H, W) bool.
-        target: (H, W) bool; pixels outside it are 0.
+        template: (H, W) bool, or (n, H, W), one image per height slice.
+        target: the same shape; pixels outside it are 0.
         dy, dx: shift in pixels.
 
     Returns:
-        (H, W) bool, in the place of the template's pixels.
+        The same shape, bool, in the place of the template's pixels.
     """
+    if template.ndim == 3:
+        return np.stack([coinciding(*images, dy, dx) for images in zip(template, target)])
     height, width = template.shape
     result = np.zeros(template.shape, dtype=bool)
     for row, col in np.argwhere(template).tolist():

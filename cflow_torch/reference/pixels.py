@@ -55,6 +55,19 @@ def occupancy(pixels: np.ndarray, box: Box) -> np.ndarray:
     return image
 
 
+def slice_images(points: np.ndarray, config: Config, pixel_size: float, box: Box) -> np.ndarray:
+    """Binary images (n, H, W) of the box, one per height slice floor(z / slice_height) mod n of points (N, 3).
+
+    Convention: one image of all points without `height_slices`; heights beyond 1e12 m count as 1e12 m.
+    """
+    pixels = project_bev(points, config, pixel_size)
+    if config.height_slices == 0:
+        return occupancy(pixels, box)[None]
+    z = np.clip(points[:, 2], -1e12, 1e12)
+    numbers = np.array([math.floor(value) % config.height_slices for value in z / config.slice_height], dtype=np.int64)
+    return np.stack([occupancy(pixels[numbers == number], box) for number in range(config.height_slices)])
+
+
 def search_radius(config: Config, elapsed: float, pixel_size: float) -> Optional[float]:
     """Longest displacement in pixels: max_speed * elapsed / s + one pixel; None = the paper's, half of the box."""
     if config.max_speed is None:
