@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Tuple
+from typing import Optional, Tuple
 
 import torch
 from torch import Tensor
 
 from cflow_torch.batch import Batch
 from cflow_torch.grid import Grid
+from cflow_torch.low_columns import drop_low_columns, ground_heights
 from cflow_torch.ops.indices import flat_nonzero, split_index
 from cflow_torch.types import CFlowError
 
@@ -87,17 +88,22 @@ class Cells:
         return torch.where(self.look_up(place) != 0, place, self.image.numel() - 1)
 
 
-def make_cells(batch: Batch, grid: Grid, slice_height: float) -> Tuple[Cells, Tensor]:
+def make_cells(
+    batch: Batch, grid: Grid, slice_height: float, clearance: Optional[float] = None
+) -> Tuple[Cells, Tensor]:
     """Draw every sweep of a batch with its height slices.
 
     Args:
         batch: positions with three axes, frame of t+1.
         grid: the finest BEV.
         slice_height: metres.
+        clearance: metres; pixels that do not stand out of the ground of the batch by this much are left out, see
+            `drop_low_columns`. None = all are drawn.
 
     Returns:
         cells: of all windows.
-        place: (N,) int64, flat index into `cells.image` of every point; its last entry for those that take no part.
+        place: (N,) int64, flat index into `cells.image` of every point; its last entry for those that take no part or
+            lie on a pixel that is left out.
 
     Convention:
         The slice of a height z is floor(z / slice_height) mod 4 in float64, the division a true one (see `Grid.pixel`).
@@ -111,6 +117,9 @@ def make_cells(batch: Batch, grid: Grid, slice_height: float) -> Tuple[Cells, Te
         raise CFlowError("height slices need z: make the batch with three axes")
     num_images = batch.num_windows * batch.num_steps
     place = grid.pixel_of_image(batch.positions, batch.image, num_images, batch.takes_part).long()
+    if clearance is not None and batch.ground is not None:
+        heights = ground_heights(batch.ground)
+        place = drop_low_columns(place, batch.positions, heights, grid, batch.num_steps, clearance)
     part = slice_of(batch.positions[2], slice_height)  # of rows that take no part anything: they are drawn nowhere
     image = draw_slices(place, part, num_images * grid.height * grid.width)
     return cells_of_image(image, grid, batch.num_windows, batch.num_steps), place

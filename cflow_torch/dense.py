@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Optional, Tuple
+from typing import List, Optional, Sequence, Tuple
 
 import torch
 import torch.nn.functional as F
@@ -18,8 +18,10 @@ from cflow_torch.grid import Grid
 from cflow_torch.height import slices_of_pixels
 from cflow_torch.jobs import make_jobs
 from cflow_torch.pool import pool
+from cflow_torch.proof import prove_motion
 from cflow_torch.pyramid import CoarseToFine, Motion, project, warp
 from cflow_torch.sectional import add_sectional_view
+from cflow_torch.types import FlowResult, Window
 
 
 class CorrelationFlow(CoarseToFine):
@@ -40,9 +42,15 @@ class CorrelationFlow(CoarseToFine):
 
     method = "dense"
 
+    def _flow(self, windows: Sequence[Window], grids: Sequence[Grid], device: torch.device) -> List[FlowResult]:
+        # The proof has its scales within: one pass at the finest pixels.
+        return super()._flow(windows, grids[-1:] if self.config.proof else grids, device)
+
     def motion_at_scale(self, batch: Batch, flow: Optional[Tensor], grid: Grid) -> Motion:
         """One pass of Alg. general_correlation_flow, over points warped by the flow so far."""
         config = self.config
+        if config.proof:
+            return prove_motion(batch, grid, config)
         occupancy, place = project(batch, flow, grid)
         positions = batch.positions
         needs_xyz = config.sectional_view or config.clustering == "hdbscan"

@@ -57,7 +57,7 @@ LAYERS = {
     "voxels": 2,
     "reference": 2,
     "dense": 3,
-    "proof": 2,
+    "proof": 3,
     "keypoints": 3,
     "pyramid": 3,
     "estimate": 3,
