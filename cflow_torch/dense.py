@@ -114,8 +114,8 @@ def correlate(
     estimates = torch.zeros((*shape, 3), dtype=torch.float64, device=shift.device)
     scores = torch.zeros(shape, dtype=torch.float32, device=shift.device)
     available = torch.zeros(shape, dtype=torch.bool, device=shift.device)
-    where = (jobs.cluster, jobs.source)
-    estimates[(*where, slice(2))] = shift.flip(1).double() * grid.pixel_size  # (dy, dx) -> (x, y)
+    where = jobs.cluster, jobs.source
+    estimates[jobs.cluster, jobs.source, :2] = shift.flip(1).double() * grid.pixel_size  # (dy, dx) -> (x, y)
     scores[where] = score
     available[where] = True
     return estimates, scores, available

@@ -50,16 +50,16 @@ class Motion:
         return out
 
 
-def turned_flow(motion: Motion, cluster: Tensor, positions: Tensor) -> Tensor:
+def turned_flow(flow: Tensor, rigid: RigidMotion, cluster: Tensor, positions: Tensor) -> Tensor:
     """(N, 3) float64 flow of points of t, each where it lies in a motion that turns.
 
     Args:
-        motion: with `rigid`.
-        cluster: (N,) cluster of each point.
+        flow: (M + 1, 3) float64, where nothing turns.
+        rigid: of M + 1.
+        cluster: (N,) cluster of each point, M = none.
         positions: (A, N) float64, metres; means nothing where there is no cluster.
     """
-    rigid = motion.rigid
-    flow = motion.flow.index_select(0, cluster)
+    flow = flow.index_select(0, cluster)
     turns = flat_nonzero((rigid.turn != 0).index_select(0, cluster))
     cluster, places = cluster.index_select(0, turns), positions[:2].index_select(1, turns)
     x, y = rigid.flow_at(cluster, *places.unbind(0))
@@ -222,7 +222,7 @@ def _results(batch: Batch, flow: Optional[Tensor], motion: Motion) -> List[FlowR
     for source in batch.sources:
         cluster = motion.cluster(source.points)
         if flow is None and motion.rigid is not None:
-            residual = turned_flow(motion, cluster, batch.positions[:, source.points]).float()
+            residual = turned_flow(motion.flow, motion.rigid, cluster, batch.positions[:, source.points]).float()
         elif flow is None:
             residual = motion.flow.float().index_select(0, cluster)
         else:
