@@ -8,6 +8,7 @@ import torch
 
 from cflow_torch import CFlowError, Config, CorrelationFlow, Sweep, Window
 from cflow_torch.config import DENSE_ONLY, PRESETS, PROOF_ONLY, make_config
+from cflow_torch.reference import reference_flow
 
 ALL = {
     "proof": True,
@@ -71,6 +72,28 @@ def test_alone_or_in_a_batch(height_slices):
     flow = model(num_history=2, height_slices=height_slices)
     for window, result in zip(windows, flow(windows)):
         assert_same(flow([window])[0], result)
+
+
+def small(window: Window, rng) -> Window:
+    """A fifth of the points: the reference is slow."""
+
+    def thin(sweep):
+        keep = rng.random(len(sweep.points)) < 0.3
+        return Sweep(sweep.points[keep], is_ground=sweep.is_ground[keep])
+
+    return Window(thin(window.pc0), thin(window.pc1), tuple(thin(sweep) for sweep in window.pch))
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("num_history", [0, 2])
+def test_equals_the_reference(seed, num_history):
+    config = model(num_history=num_history, height_slices=seed % 2 * 4).config
+    window = small(scene(seed, num_history), np.random.default_rng(seed))
+    result, expected = CorrelationFlow(config)([window])[0], reference_flow(window, config)
+    assert result.residual_flow.any()
+    assert torch.equal(result.cluster_id, expected.cluster_id)
+    for name in ("residual_flow", "score", "is_valid", "flow"):
+        assert torch.equal(getattr(result, name), getattr(expected, name)), name
 
 
 def shuffled(sweep: Sweep, rng):

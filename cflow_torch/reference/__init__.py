@@ -47,7 +47,8 @@ from cflow_torch.reference.pixels import (
     slice_images,
 )
 from cflow_torch.reference.pooling import diamond_angle, median, median_direction, pool
-from cflow_torch.reference.sweeps import Cloud, Level, compensate, xyz
+from cflow_torch.reference.proof import prove_motion
+from cflow_torch.reference.sweeps import Cloud, Level, compensate, ground_points, xyz
 from cflow_torch.reference.tree import winners
 from cflow_torch.types import FlowResult, Window
 
@@ -122,7 +123,12 @@ def reference_flow(window: Window, config: Config) -> FlowResult:
         the multi-scale strategy.
     """
     clouds, cloud1 = compensate(window, config)
-    residual_flow, cluster_id, score = coarse_to_fine(clouds, cloud1, config)
+    if config.proof:
+        ground = [ground_points(window.pc0, clouds[0]), ground_points(window.pc1, cloud1)]
+        level = prove_motion(clouds, cloud1, ground, config)
+        residual_flow, cluster_id, score = level.flow[0], level.cluster_id[0], level.score[0]
+    else:
+        residual_flow, cluster_id, score = coarse_to_fine(clouds, cloud1, config)
     # float32(p' - p); points that are not finite are NaN in p' and get 0
     pose_flow = np.nan_to_num(clouds[0].points - xyz(window.pc0), nan=0.0).astype(np.float32)
     residual_flow = residual_flow.astype(np.float32)
