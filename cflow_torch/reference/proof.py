@@ -6,7 +6,7 @@ Order of reading: prove_motion -> judge_level -> find_peak; then settle.
 from __future__ import annotations
 
 import math
-from typing import Dict, List, NamedTuple, Optional, Sequence, Tuple
+from typing import Dict, List, NamedTuple, Optional, Sequence, Set, Tuple
 
 import numpy as np
 
@@ -129,8 +129,8 @@ def judge_level(
             peaks = [find_peak(coarse, members, m, clouds[m - 1], block, config) for m in range(1, len(images))]
             estimates = [None if peak is None else peak[0] for peak in peaks]
             score = [peak[1] for peak in peaks if peak is not None][0]
-            for values, member in zip(scores, members):
-                values[member] = score
+            for image, member in zip(scores, members):
+                image[member] = score
         inherited = None if above is None else inherit(members, above.node, above.motions)
         found = candidates(estimates, elapsed[1:], inherited)
         values = [0] * len(found)
@@ -164,14 +164,14 @@ def find_peak(
     """
     if not members[m].any():
         return None
-    own = [np.zeros_like(image) for image in coarse]
+    own: List[np.ndarray] = [np.zeros_like(image) for image in coarse]
     for member, image, drawn in zip(members, coarse, own):
         for r, c in np.argwhere(member).tolist():
             drawn[r // block, c // block] = image[r // block, c // block]
     row, col, height, width = bounding_box([np.argwhere(image) for image in own])
     template, target = (_slices(image[row : row + height, col : col + width]) for image in (own[m], own[0]))
     if config.height_slices == 0:
-        template, target = template.any(0), target.any(0)
+        template, target = (np.asarray(image.any(0)) for image in (template, target))
     radius = search_radius(config, cloud.elapsed, config.pixel_sizes[-1] * block)
     (dx, dy), score = scene_flow_in_1view(template, target, 1.0, radius)
     if dx == 0 and dy == 0:
@@ -196,7 +196,7 @@ def settle(
         inside: of each sweep, the points that count.
         config: settings. Only pairs of sweeps are relocated: with history one of many sweeps would decide.
     """
-    size, lower = config.pixel_sizes[-1], config.point_cloud_range[:2]
+    size, (x0, y0) = config.pixel_sizes[-1], config.point_cloud_range[:2]
     points = []
     for m, (cloud, keep) in enumerate(zip(sweeps, inside)):
         kept = cloud.points[keep]
@@ -205,11 +205,11 @@ def settle(
             if group >= 0 and any(motions[group]):
                 points.append(Point(0, m, math.floor(z / config.slice_height) % 4, group, x, y))
     if config.relocate and len(sweeps) == 2:
-        motions = relocate(points, motions, lower, size)
+        motions = relocate(points, motions, (x0, y0), size)
         points = [point for point in points if any(motions[point.group])]
     flows = [(x * size + 0.0, y * size + 0.0) for y, x in motions]
     if config.yaw:
-        return refine(points, flows, [[cloud.steps for cloud in sweeps]], lower, size)
+        return refine(points, flows, [[cloud.steps for cloud in sweeps]], (x0, y0), size)
     return [Rigid(flow, 0.0, (0.0, 0.0)) for flow in flows]
 
 
@@ -218,5 +218,5 @@ def _slices(image: np.ndarray) -> np.ndarray:
     return np.stack([(image >> bit) & 1 > 0 for bit in range(4)])
 
 
-def _pixels(mask: np.ndarray) -> set:
+def _pixels(mask: np.ndarray) -> Set[Tuple[int, int]]:
     return {(r, c) for r, c in np.argwhere(mask).tolist()}
