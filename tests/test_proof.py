@@ -12,9 +12,11 @@ from scenes import assert_same as assert_equal
 from scenes import scene as scene_of_boxes
 
 from cflow_torch import CFlowError, Config, CorrelationFlow, Sweep, Window
+from cflow_torch.batch import make_batch
 from cflow_torch.config import DENSE_ONLY, PRESETS, PROOF_ONLY, make_config
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.log import window as window_of
+from cflow_torch.grid import Grid
 from cflow_torch.reference import reference_flow
 
 ALL = {
@@ -224,3 +226,37 @@ def test_no_preset_proves_anything():
 def test_settings_that_make_no_sense(wrong):
     with pytest.raises(CFlowError, match=next(iter(wrong)) if wrong != {"proof": False} else "part of proof"):
         Config(**{**ALL, **wrong})
+
+
+def test_a_wall_that_seems_to_slide_stands_still():
+    # Its samples stand still in the frame of a sensor that drives 1.4 m.
+    rng = np.random.default_rng(0)
+    wall = np.stack((rng.uniform(-4, 4, 60), np.full(60, 3.05), rng.uniform(-1, 1, 60)), 1)
+    window = Window(Sweep(wall - (1.4, 0.0, 0.0)), Sweep(wall))
+    for aperture in (False, True):
+        flow = model(aperture=aperture)
+        (result,) = flow([window])
+        assert_equal(result, reference_flow(window, flow.config))
+        assert bool((result.residual_flow[:, 0] > 1.0).any()) != aperture
+
+
+def test_speed_is_bounded_at_every_pixel_size():
+    # Half of the box allows 2 m, the speed 0.6 m and a pixel.
+    car = box((0.0, 0.0), (4.0, 1.8), 0.0, np.random.default_rng(0))
+    window = Window(Sweep(car - (1.7, 0.0, 0.0)), Sweep(car))
+    moved = []
+    for max_speed in (None, 6.0):
+        flow = model(max_speed=max_speed, relocate=False, yaw=False)
+        (result,) = flow([window])
+        assert_equal(result, reference_flow(window, flow.config))
+        moved.append(result.residual_flow[:, 0].max())
+    assert moved[0] > 1.6 and moved[1] <= 0.6 + 0.4 + 0.2
+
+
+def test_ground_counts_of_the_newest_pair_only():
+    window, grid = scene(8, 2), Grid(0.1, ALL["point_cloud_range"][:3], ALL["point_cloud_range"][3:])
+    batch = make_batch([scene(9), window], model(num_history=2).config, grid)
+    for index, one in enumerate(batch.ground[1].sum((1, 2)).tolist()):
+        pair = (scene(9), window)[index]
+        assert one == pair.pc0.is_ground.sum() + pair.pc1.is_ground.sum()
+    assert make_batch([window], model(num_history=2, clearance=None).config, grid).ground is None
