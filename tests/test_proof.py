@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from scenes import LABELINGS, config
+from scenes import LABELINGS, config, needs_gpu
 from scenes import assert_same as assert_equal
 from scenes import scene as scene_of_boxes
 
@@ -169,11 +169,23 @@ def test_threads_do_not_matter():
         torch.set_num_threads(threads)
 
 
-def test_engines_do_not_matter():
+@pytest.mark.parametrize("labeling", LABELINGS)
+@pytest.mark.parametrize("height_slices", [0, 4])
+def test_engines_do_not_matter(height_slices, labeling):
     window = scene(6)
-    expected = model()([window])[0]
-    assert_same(expected, model(labeling="kornia")([window])[0])
-    assert_same(expected, model(correlation="conv")([window])[0])
+    expected = model(height_slices=height_slices)([window])[0]
+    assert_same(expected, model(height_slices=height_slices, labeling=labeling, correlation="conv")([window])[0])
+
+
+@pytest.mark.cuda
+@needs_gpu
+def test_cuda_equals_cpu():
+    windows = [scene(0, 2), scene(1), scene(2, 1), scene(3, 2)]
+    for height_slices in (0, 4):
+        settings = model(num_history=2, height_slices=height_slices).config
+        on_cpu = CorrelationFlow(settings, device="cpu")(windows)
+        for cpu, gpu in zip(on_cpu, CorrelationFlow(settings, device="cuda")(windows)):
+            assert_equal(cpu, gpu)
 
 
 def test_a_turning_car_moves_and_the_rest_stands_still():
