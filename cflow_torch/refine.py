@@ -43,7 +43,7 @@ def refine(
     that hold on to the given translation and to no turn; the motion that results is where the next step starts.
 
     Args:
-        points: of the groups, of all sweeps.
+        points: of the groups that move, of all sweeps; what stands still would take partners away.
         pixel_of_place, num_pixels, grid: as for `make_voxels`.
         elapsed: (B, S) float64, sweep intervals from each sweep to t+1.
         flow: (G, 2) float64, x and y, metres per sweep interval, to start from.

@@ -186,6 +186,42 @@ def test_nearest_takes_the_first_of_equals(snap):
     assert ties > 5
 
 
+def test_nearest_does_not_look_across_the_border():
+    """A voxel in the first column is no neighbour of the last column of the row above."""
+    cloud = np.array([[LOWER[0] + 0.02, 0.05, 0.2]])
+    scene = as_scene([cloud, cloud], [np.zeros(2)])
+    voxels = make_voxels(scene.moving(), scene.pixel_of_place, len(scene.group), scene.grid, 2)
+    zero = torch.zeros(6, dtype=torch.int64)
+    row = int((0.05 - LOWER[1]) / 0.1)
+    y = torch.tensor([int((row + move + 0.5) * 0.1 * UNITS) for move in (-2, -1, 0, 1, 2, 0)])
+    x = torch.full_like(y, int((scene.grid.width - 0.5) * 0.1 * UNITS))
+    x[-1] = 20
+    assert voxels.nearest(zero, zero, zero, x, y).tolist() == [2, 2, 2, 2, 2, 0]
+
+
+@pytest.mark.parametrize("errors, is_limited", [(20, False), (4000, True)])
+def test_step_is_that_of_the_reference_within_the_limits(errors, is_limited):
+    rng, num = np.random.default_rng(1), 500
+    groups = object.__new__(_Groups)
+    groups.num, groups.turns, groups._weight = 1, True, torch.full((2049,), 256)
+    groups.given = torch.tensor([[300.0], [-200.0]], dtype=torch.float64)
+    way, turn = torch.tensor([[350.5], [-160.25]], dtype=torch.float64), torch.tensor([0.03], dtype=torch.float64)
+    k, lever = rng.integers(1, 3, num), rng.integers(-3000, 3000, (num, 2))
+    error = rng.integers(0, errors, (num, 2)) + lever[:, ::-1] * (-1, 1) * errors // 6000  # goes on and turns
+    pairs = [ref.Pair(float(t), tuple(r), tuple(e), 256) for t, r, e in zip(k, lever.tolist(), error.tolist())]
+    dx, dy, angle = ref.gauss_newton(pairs, (300.0, -200.0), (350.5, -160.25), 0.03, True)
+    wanted = [ref.limit(350.5 + dx, 300.0), ref.limit(-160.25 + dy, -200.0)]
+    wanted_turn = min(max(0.03 + angle / 2, -ref.LARGEST_TURN), ref.LARGEST_TURN)
+    assert (
+        (wanted_turn in (-0.1, 0.1)) == is_limited == (wanted[0] == 300 + 0.15 * UNITS) == (wanted[1] != -160.25 + dy)
+    )
+
+    columns = (torch.from_numpy(np.ascontiguousarray(v)) for v in (16 * k, *lever.T, *error.T))
+    _, sums = groups._normal_equations(torch.zeros(num, dtype=torch.int64), *columns)
+    found, found_turn = groups.step(way, turn, sums)
+    assert found.flatten().tolist() == wanted and found_turn.tolist() == [wanted_turn]
+
+
 def test_long_levers_do_not_overflow():
     """A group that spans the whole of a wide region: the sums of squared levers exceed 62 bits, and stay exact."""
     num = 1 << 16
