@@ -152,6 +152,8 @@ def test_exactly_the_least_way_and_the_share():
     assert one({**still, 3: rail(10, 60)}, (0, way / 3), times=(0.0, 1.0, 2.0, 3.0), others={2: rail(10, 60)})
     # Of 80 looks 8, 10, 16 and 24 find nothing in their cell of four pixels or beside it; 12 may.
     assert [one({0: rail(0, 40), 1: rail(s, s + 40)}, (0, 13)) for s in (8, 10, 12, 16)] == [True, True, False, False]
+    for last, slides in ((52, True), (53, False)):  # 12 and 13 of 80
+        assert one({0: rail(0, 40), 1: rail(11, last) - rail(30, last - 21)}, (0, 13)) == slides
 
 
 def test_a_line_of_exactly_the_largest_width():
