@@ -8,6 +8,10 @@ import torch
 from scenes import RANGE, config, needs_gpu
 
 from cflow_torch import reference as ref
+from cflow_torch.batch import make_batch
+from cflow_torch.config import Config
+from cflow_torch.data.av2 import AV2Log
+from cflow_torch.data.log import window as window_of_log
 from cflow_torch.grid import Grid
 from cflow_torch.low_columns import add_ground, drop_low_columns, ground_heights, no_ground
 
@@ -150,6 +154,28 @@ def test_heights_far_away_do_not_overflow():
     assert drop_low_columns(place, point, ground_heights(sums), grid, 1, 0.4).tolist() == [AREA]
     unknown = ground_heights(no_ground(1, grid, torch.device("cpu")))
     assert drop_low_columns(place, point, unknown, grid, 1, 0.4).tolist() == place.tolist()
+
+
+def test_the_real_pair(av2_folder):
+    settings = Config(sectional_view=True)  # asks for heights
+    grid = Grid(0.1, settings.point_cloud_range[:3], settings.point_cloud_range[3:])
+    window = window_of_log(AV2Log(av2_folder), 0)
+    batch = make_batch([window], settings, grid, "cpu")
+    place = grid.pixel_of_image(batch.positions, batch.image, 2, batch.takes_part).long()
+    clouds, cloud1 = ref.compensate(window, settings)
+    ground = [
+        cloud.points[np.asarray(sweep.is_ground)] for cloud, sweep in ((cloud1, window.pc1), (clouds[0], window.pc0))
+    ]
+    sums = no_ground(1, grid, torch.device("cpu"))
+    for points in ground:
+        add_ground(sums, 0, torch.from_numpy(points.T.copy()), grid)
+    after = drop_low_columns(place, batch.positions, ground_heights(sums), grid, 2, 0.4)
+    means = ref.ground_heights(ground, settings)
+    for step in (0, 1):
+        points = (batch.image == step) & batch.takes_part
+        low = ref.in_low_column(batch.positions[:, points].T.numpy(), means, 0.4, 0.1, settings)
+        assert low.any() and torch.equal(after[points] != place[points], torch.from_numpy(low))
+    assert torch.equal(after[~batch.takes_part], place[~batch.takes_part])
 
 
 def test_nothing_in_nothing_out():
