@@ -7,8 +7,12 @@ operation is elementwise in the written order, so that another implementation ca
 
 Order of reading: reference_flow -> coarse_to_fine, here -> `dense` (Alg. general_correlation_flow) or `keypoints`
 (Sec. CorrelationFlow-Keypoints). What they use: `sweeps` (ego motion), `pixels` (Eq. 3d_to_bev), `clustering`
-(Alg. clustering), `pooling` (Sec. leverage_past_pcs), `descriptors` and `matching` (key points). Beyond
-the paper: `peak`.
+(Alg. clustering), `pooling` (Sec. leverage_past_pcs), `descriptors` and `matching` (key points).
+
+Beyond the paper: `peak` (test, fractions of a pixel), `proof` (motion by hypotheses and proof) and what it is made of:
+`cells` (height slices), `low_columns` (ground that a mask left over), `levels` (components at several pixel sizes),
+`candidates`, `judge`, `aperture` (lines that seem to slide along themselves), `tree` (which grouping wins),
+`relocation`, `refinement`.
 """
 
 from __future__ import annotations
