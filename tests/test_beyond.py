@@ -16,6 +16,7 @@ from cflow_torch import CFlowError, CorrelationFlow, Sweep, Window, make_config
 from cflow_torch import reference as ref
 from cflow_torch.bench.opencv_loop import opencv_flow
 from cflow_torch.config import DENSE_ONLY
+from cflow_torch.correlate import best_shifts
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.log import window as window_of
 from cflow_torch.displacement import beats_zero, parabola
@@ -125,6 +126,43 @@ def test_cuda_equals_cpu(options):
     on_cpu = CorrelationFlow(settings, device="cpu")(windows)
     for gpu, cpu in zip(CorrelationFlow(settings, device="cuda")(windows), on_cpu):
         assert_same(gpu.to("cpu"), cpu)
+
+
+@pytest.mark.parametrize("engine", CORRELATIONS)
+@pytest.mark.parametrize("num_slices", [2, 5, 8])
+def test_best_shifts_of_slices_equal_the_loop(num_slices, engine):
+    """All sizes in one call, two templates per target."""
+    rng = np.random.default_rng(num_slices)
+    sizes = [(1, 1), (1, 9), (8, 8), (3, 7), (17, 16), (2, 33), (70, 30), (130, 120)]
+    targets = [random_slices(rng, num_slices, size) for size in sizes]
+    own = [*range(len(sizes)), *range(len(sizes))]
+    templates = [random_slices(rng, num_slices, sizes[n]) for n in range(len(sizes))]
+    templates += [np.roll(target, (1, -1), (1, 2)) for target in targets]
+    shift, score = best_shifts(
+        sliced_images(templates),
+        sliced_images(targets),
+        torch.tensor(own),
+        torch.tensor(sizes),
+        engine=engine,
+        num_slices=num_slices,
+    )
+    for job, (template, n) in enumerate(zip(templates, own)):
+        (dx, dy), expected = ref.scene_flow_in_1view(template, targets[n], 1.0)
+        assert shift[job].tolist() == [dy, dx] and float(score[job]) == np.float32(expected)
+
+
+def random_slices(rng, num_slices, size) -> np.ndarray:
+    image = rng.random((num_slices, *size)) < rng.choice([0.05, 0.3])
+    image.flat[rng.integers(image.size)] = True
+    return image
+
+
+def sliced_images(images: List[np.ndarray]) -> Images:
+    """Set pixels of (n, H, W) images."""
+    rows = [np.column_stack([np.full(i.any(0).sum(), k), np.argwhere(i.any(0))]) for k, i in enumerate(images)]
+    bits = [(i[:, i.any(0)] << np.arange(len(i))[:, None]).sum(0) for i in images]
+    index = torch.from_numpy(np.concatenate(rows).astype(np.int64))
+    return Images(*index.t().contiguous(), slices=torch.from_numpy(np.concatenate(bits).astype(np.uint8)))
 
 
 # ------------------------------------------------------------------------------------------ truths by hand

@@ -12,6 +12,7 @@ METHODS = {
     "dense": {"num_history": 2},
     "conv": {"num_history": 2, "correlation": "conv"},
     "sectional": {"num_history": 2, "sectional_view": True},
+    "beyond": {"num_history": 2, "max_object": 2.0, "zero_test": 1.5, "subpixel": "parabola", "height_slices": 4},
     "key points": {"method": "keypoints"},
 }
 
