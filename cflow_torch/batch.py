@@ -21,6 +21,7 @@ from cflow_torch.inputs import (
     read_positions,
     source_sweeps,
 )
+from cflow_torch.low_columns import add_ground, no_ground
 from cflow_torch.ops.chunks import chunks
 from cflow_torch.ops.indices import flat_nonzero
 from cflow_torch.types import Sweep, Window
@@ -53,6 +54,7 @@ class Batch:
             scales a warp (0 for step 0).
         seconds: (B, S) float64, the same in seconds, for `max_speed`.
         sources: of each window, what its result is made of.
+        ground: (2, B, Y, X) int64, heights of the ground points of t and t+1, see `no_ground`; None = nothing asks.
     """
 
     positions: Tensor
@@ -64,6 +66,7 @@ class Batch:
     elapsed: Tensor
     seconds: Tensor
     sources: Tuple[Source, ...]
+    ground: Optional[Tensor] = None
 
 
 @dataclass(frozen=True)
@@ -145,8 +148,9 @@ def make_batch(windows: Sequence[Window], config: Config, grid: Grid, device: An
         for window in windows
     ]
 
-    needs_z = config.sectional_view or config.clustering == "hdbscan" or config.height_slices > 0
+    needs_z = config.sectional_view or config.clustering == "hdbscan" or config.height_slices > 0 or config.proof
     num_axes = 3 if needs_z else 2
+    ground = no_ground(len(windows), grid, chosen_device) if config.clearance is not None else None
     most = sum(sweep.points.shape[0] for _, _, _, sweep in sweeps)
     positions = torch.empty((num_axes, most), dtype=torch.float64, device=chosen_device)
     takes_part = torch.ones(most, dtype=torch.bool, device=chosen_device)
@@ -161,9 +165,11 @@ def make_batch(windows: Sequence[Window], config: Config, grid: Grid, device: An
             with torch.inference_mode(False):  # becomes part of the result
                 pose_flow = torch.zeros((sweep.points.shape[0], 3), dtype=torch.float32, device=chosen_device)
             sources.append(Source(slice(start, start + len(pose_flow)), pose_flow))
-        for rows, raw, moved, inside in _pieces(
+        for rows, raw, moved, inside, is_ground in _pieces(
             sweep, name, transform, 3 if step == 1 else num_axes, grid, chosen_device
         ):
+            if ground is not None and is_ground is not None and step <= 1:
+                add_ground(ground, index, moved.index_select(1, flat_nonzero(is_ground)), grid)
             if step == 1:  # all rows
                 points = slice(stop, stop + inside.numel())
                 positions[:, points] = moved[:num_axes]
@@ -188,13 +194,18 @@ def make_batch(windows: Sequence[Window], config: Config, grid: Grid, device: An
         elapsed=torch.as_tensor(elapsed, device=chosen_device),
         seconds=torch.as_tensor(seconds, device=chosen_device),
         sources=tuple(sources),
+        ground=ground,
     )
 
 
 def _pieces(
     sweep: Sweep, name: str, transform: Optional[np.ndarray], num_axes: int, grid: Grid, device: torch.device
-) -> Iterator[Tuple[slice, Tensor, Tensor, Tensor]]:
-    """A sweep piece by piece: rows; (3, N) positions as given; (A or 3, N) in the frame of t+1; (N,) takes part."""
+) -> Iterator[Tuple[slice, Tensor, Tensor, Tensor, Optional[Tensor]]]:
+    """A sweep piece by piece.
+
+    Yields:
+        Rows; (3, N) positions as given; (A or 3, N) in the frame of t+1; (N,) takes part; (N,) is ground, if known.
+    """
     num_points = sweep.points.shape[0]
     is_ground = None if sweep.is_ground is None else read_ground(sweep, name, num_points, device)
     # z matters where the region bounds it. After a transform, a z that is not finite has spoiled x and y as well.
@@ -207,7 +218,7 @@ def _pieces(
         inside = grid.contains(moved[:checked_axes])
         if is_ground is not None:
             inside &= ~is_ground[rows]
-        yield rows, raw, moved, inside
+        yield rows, raw, moved, inside, None if is_ground is None else is_ground[rows]
 
 
 def _write_pose_flow(pose_flow: Tensor, raw: Tensor, moved: Tensor) -> None:

@@ -48,19 +48,30 @@ class Clusters:
     size: Tensor
     pixels: Pixels
 
+    def take(self, wanted: Tensor) -> Clusters:
+        """Some of M clusters, numbered anew from 0. Args: wanted: (M,) bool."""
+        index = flat_nonzero(wanted)
+        member = flat_nonzero(wanted.index_select(0, self.pixels.cluster))
+        number = (wanted.cumsum(0) - 1).index_select(0, self.pixels.cluster.index_select(0, member))
+        pixels = self.pixels
+        step, row, col = (values.index_select(0, member) for values in (pixels.step, pixels.row, pixels.col))
+        window, first, size = (values.index_select(0, index) for values in (self.window, self.first, self.size))
+        return Clusters(window, first, size, Pixels(number, step, row, col))
+
     def id_in_window(self) -> Tensor:
         """(M,) int64, number of each cluster counted from 0 in its own window."""
         start = torch.searchsorted(self.window, self.window)  # first cluster of the same window
         return torch.arange(self.window.numel(), device=start.device) - start
 
 
-def cluster(occupancy: Tensor, pixel_size: float, config: Config) -> Tuple[Clusters, Tensor]:
+def cluster(occupancy: Tensor, pixel_size: float, config: Config, reach: int = 3) -> Tuple[Clusters, Tensor]:
     """Alg. clustering, from the projection of the aggregated sweeps on: dilate, label, validate by size.
 
     Args:
         occupancy: (B, S, H, W) bool, image of every sweep; index 0 of S is sweep t+1.
         pixel_size: s, metres.
         config: `connectivity`, `max_extent` (d^max), `labeling`.
+        reach: 3 = Alg. clustering; 1 = plain components: neither dilated nor validated by size.
 
     Returns:
         clusters: those of all B windows.
@@ -79,7 +90,10 @@ def cluster(occupancy: Tensor, pixel_size: float, config: Config) -> Tuple[Clust
     padded_row, col = split_index(pixels, aggregated.shape[2])
     window, row = split_index(padded_row, aggregated.shape[1])
     places = _Places(pixels, padded_row, row, col)
-    component, num_components = _label(aggregated, height, width, places, pixel_size, config)
+    if reach == 1:
+        component, num_components = _components(aggregated, places, 1, config)
+    else:
+        component, num_components = _label(aggregated, height, width, places, pixel_size, config)
 
     # Which sweeps saw each pixel. Sweep m lies m images behind t+1.
     place = torch.add(col, row, alpha=width).add_(window, alpha=num_steps * area)

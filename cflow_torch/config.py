@@ -15,7 +15,15 @@ CORRELATIONS = ("fft", "conv")
 SUBPIXELS = ("none", "parabola")
 DENSIFIERS = ("components", "clusters", "nearest")
 # Options of the dense method that are not in the paper (docs/beyond.md), and the value that turns each off.
-DENSE_ONLY: Dict[str, Any] = {"max_object": None, "zero_test": None, "subpixel": "none", "height_slices": 0}
+DENSE_ONLY: Dict[str, Any] = {
+    "max_object": None,
+    "zero_test": None,
+    "subpixel": "none",
+    "height_slices": 0,
+    "proof": False,
+}
+# Parts of the proof, which mean nothing without it, and the value that turns each off.
+PROOF_ONLY: Dict[str, Any] = {"clearance": None, "children": False, "aperture": False, "relocate": False, "yaw": False}
 # The ratio test compares products of counts: 51^6 * (2 * 10^4)^2 still fits an int64.
 LARGEST_PATCH = 51
 LARGEST_RATIO = 2
@@ -49,6 +57,16 @@ class Config:
         height_slices: number of height slices n, 2 ... 8: points coincide only if their slices floor(z / slice_height)
             mod n do, z in the frame of t+1. Clusters stay those of the BEV. 0 = one slice for all heights.
         slice_height: m.
+        proof: candidate motions of components at all `pixel_sizes` at once, judged against no motion at the finest one,
+            in four height slices, instead of coarse to fine, see docs/beyond.md. `pixel_sizes` must be whole multiples
+            of the finest. The options that follow are parts of it.
+        proof_z: standard deviations of luck that a motion must exceed to be proved.
+        clearance: m; pixels that stand out of the ground around them by less than this are left out, where ground is
+            known. None = none are.
+        children: also components that are not dilated, as parts of the finest ones.
+        aperture: lines that seem to slide along themselves do not move.
+        relocate: pairs of sweeps: place moving groups between the pixels, on four grids.
+        yaw: refine the motion of moving groups and let them turn.
         sweep_interval: seconds between consecutive sweeps where time stamps are missing.
         use_timestamps: divide a history estimate by elapsed time (in sweep intervals t -> t+1) instead of steps.
         sectional_view: also estimate f_z in the X-Z view along the heading (Alg. scene_flow_1obj).
@@ -80,6 +98,13 @@ class Config:
     subpixel: str = "none"
     height_slices: int = 0
     slice_height: float = 0.5
+    proof: bool = False
+    proof_z: float = 2.0
+    clearance: Optional[float] = None
+    children: bool = False
+    aperture: bool = False
+    relocate: bool = False
+    yaw: bool = False
     sweep_interval: float = 0.1
     use_timestamps: bool = False
     sectional_view: bool = False
@@ -126,7 +151,7 @@ class Config:
             )
         for name in ("max_extent", "sweep_interval", "gate_radius", "slice_height"):
             _positive(name, getattr(self, name))
-        for name in ("max_speed", "max_object", "max_memory"):
+        for name in ("max_speed", "max_object", "clearance", "max_memory"):
             if getattr(self, name) is not None:
                 _positive(name, getattr(self, name))
         if self.zero_test is not None:
@@ -152,6 +177,7 @@ class Config:
                 raise CFlowError(f"{name}={getattr(self, name)}: give a finite number")
         if self.second_best_distance != 0:
             _positive("second_best_distance", self.second_best_distance)
+        self._check_proof()
         for name in ("sectional_view", "use_timestamps", "mutual_check"):
             _one_of(name, getattr(self, name), (True, False))
         if self.method == "keypoints" and self.num_history > 0:
@@ -165,6 +191,29 @@ class Config:
                     f"{name}={getattr(self, name)!r} is an option of the dense method, method='keypoints' was given: "
                     f"give {name}={off!r}, or method='dense'"
                 )
+
+    def _check_proof(self) -> None:
+        for name in ("proof", "children", "aperture", "relocate", "yaw"):
+            _one_of(name, getattr(self, name), (True, False))
+        if isinstance(self.proof_z, bool) or not isinstance(self.proof_z, (int, float)) or not 0 <= self.proof_z < 1000:
+            raise CFlowError(f"proof_z={self.proof_z!r}: give a number from 0 to 1000, for example 2")
+        if not self.proof:
+            for name, off in PROOF_ONLY.items():
+                if getattr(self, name) != off:
+                    raise CFlowError(f"{name}={getattr(self, name)!r} is a part of proof=True: give {name}={off!r}")
+            return
+        blocks = [size / self.pixel_sizes[-1] for size in self.pixel_sizes]
+        if any(abs(block - round(block)) > 1e-6 for block in blocks):
+            raise CFlowError(
+                f"pixel_sizes={self.pixel_sizes}: with proof=True give whole multiples of the finest one, "
+                "for example (0.4, 0.2, 0.1)"
+            )
+        wanted = {"clustering": "components", "sectional_view": False, "zero_test": None}
+        for name, value in wanted.items():
+            if getattr(self, name) != value:
+                raise CFlowError(f"proof=True needs {name}={value!r}, {getattr(self, name)!r} was given")
+        if self.height_slices not in (0, 4):
+            raise CFlowError(f"height_slices={self.height_slices}: proof=True needs 0 or 4")
 
     def replace(self, **overrides: Any) -> Config:
         """A copy with some fields changed; an unknown field raises `CFlowError` that lists the fields."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Optional, Tuple
+from typing import List, Optional, Sequence, Tuple
 
 import torch
 import torch.nn.functional as F
@@ -14,13 +14,14 @@ from cflow_torch.cluster import Clusters, cluster
 from cflow_torch.config import Config
 from cflow_torch.density import cluster_by_density
 from cflow_torch.displacement import displacements, is_longer
-from cflow_torch.drawing import Images
 from cflow_torch.grid import Grid
 from cflow_torch.height import slices_of_pixels
-from cflow_torch.ops.indices import flat_nonzero
+from cflow_torch.jobs import make_jobs
 from cflow_torch.pool import pool
+from cflow_torch.proof import prove_motion
 from cflow_torch.pyramid import CoarseToFine, Motion, project, warp
 from cflow_torch.sectional import add_sectional_view
+from cflow_torch.types import FlowResult, Window
 
 
 class CorrelationFlow(CoarseToFine):
@@ -41,9 +42,15 @@ class CorrelationFlow(CoarseToFine):
 
     method = "dense"
 
+    def _flow(self, windows: Sequence[Window], grids: Sequence[Grid], device: torch.device) -> List[FlowResult]:
+        # The proof has its scales within: one pass at the finest pixels.
+        return super()._flow(windows, grids[-1:] if self.config.proof else grids, device)
+
     def motion_at_scale(self, batch: Batch, flow: Optional[Tensor], grid: Grid) -> Motion:
         """One pass of Alg. general_correlation_flow, over points warped by the flow so far."""
         config = self.config
+        if config.proof:
+            return prove_motion(batch, grid, config)
         occupancy, place = project(batch, flow, grid)
         positions = batch.positions
         needs_xyz = config.sectional_view or config.clustering == "hdbscan"
@@ -98,38 +105,17 @@ def correlate(
         scores: (M, S - 1) float32.
         available: (M, S - 1) bool, False = the cluster has no pixel in that sweep.
     """
-    num_clusters, num_sources = clusters.window.numel(), batch.num_steps - 1
-    pixels = clusters.pixels
-    row = pixels.row - clusters.first[:, 0].index_select(0, pixels.cluster)
-    col = pixels.col - clusters.first[:, 1].index_select(0, pixels.cluster)
-    older, newest = flat_nonzero(pixels.step > 0), flat_nonzero(pixels.step == 0)
-    slot = (pixels.cluster * num_sources + pixels.step - 1).index_select(0, older)
-    available = torch.zeros(num_clusters * num_sources, dtype=torch.bool, device=row.device).index_fill_(0, slot, True)
-    jobs = flat_nonzero(available)
-    job_of_slot = torch.empty_like(available, dtype=torch.int64)
-    job_of_slot.scatter_(0, jobs, torch.arange(jobs.numel(), device=row.device))
-    cluster_of_job, source_of_job = jobs // num_sources, jobs % num_sources
-
-    radius = None
-    if config.max_speed is not None:
-        seconds = batch.seconds[clusters.window[cluster_of_job], source_of_job + 1]
-        size = torch.full_like(seconds, grid.pixel_size)
-        radius = config.max_speed * seconds / size + 1
+    jobs = make_jobs(clusters, batch, grid.pixel_size, config.max_speed, slices)
     is_still = None
     if config.max_object is not None:
         is_still = is_longer(clusters, config.max_object, grid.pixel_size)
-    shift, job_score = displacements(
-        Images(job_of_slot[slot], row[older], col[older], None if slices is None else slices[older]),
-        Images(pixels.cluster[newest], row[newest], col[newest], None if slices is None else slices[newest]),
-        cluster_of_job,
-        clusters.size,
-        radius,
-        is_still,
-        config,
-    )
-    estimates = torch.zeros((num_clusters * num_sources, 3), dtype=torch.float64, device=row.device)
-    estimates[jobs, :2] = shift.flip(1).double() * grid.pixel_size  # (dy, dx) -> (x, y)
-    scores = torch.zeros(num_clusters * num_sources, dtype=torch.float32, device=row.device)
-    scores[jobs] = job_score
-    shape = (num_clusters, num_sources)
-    return estimates.view(*shape, 3), scores.view(shape), available.view(shape)
+    shift, score = displacements(jobs.template, jobs.target, jobs.cluster, clusters.size, jobs.radius, is_still, config)
+    shape = (clusters.window.numel(), batch.num_steps - 1)
+    estimates = torch.zeros((*shape, 3), dtype=torch.float64, device=shift.device)
+    scores = torch.zeros(shape, dtype=torch.float32, device=shift.device)
+    available = torch.zeros(shape, dtype=torch.bool, device=shift.device)
+    where = jobs.cluster, jobs.source
+    estimates[jobs.cluster, jobs.source, :2] = shift.flip(1).double() * grid.pixel_size  # (dy, dx) -> (x, y)
+    scores[where] = score
+    available[where] = True
+    return estimates, scores, available

@@ -11,7 +11,7 @@ from cflow_torch.cluster import Clusters
 from cflow_torch.config import Config
 from cflow_torch.correlate import best_shifts
 from cflow_torch.drawing import Images
-from cflow_torch.lookup import Lookup
+from cflow_torch.lookup import Coincidences, Lookup
 from cflow_torch.ops.indices import flat_nonzero
 from cflow_torch.ops.segments import bounding_boxes
 
@@ -110,7 +110,7 @@ def beats_zero(lookup: Lookup, shift: Tensor, z: float) -> Tensor:
     return (lead > 0) & (lead * lead * _Z_UNIT**2 >= (won + lost) * unit**2)
 
 
-def parabola(lookup: Lookup, shift: Tensor) -> Tensor:
+def parabola(lookup: Coincidences, shift: Tensor) -> Tensor:
     """Top of the parabola through the counts at each shift and one pixel beside it, per axis.
 
     Args:

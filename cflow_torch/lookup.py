@@ -2,12 +2,26 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import torch
 from torch import Tensor
 
 from cflow_torch.drawing import Images
 from cflow_torch.ops.bits import popcount
 from cflow_torch.ops.exact import exact_sqrt
+
+
+class Coincidences(Protocol):
+    """What J templates share with their targets at given shifts."""
+
+    def at(self, shift: Tensor) -> Tensor:
+        """(P,) bool or uint8, of each template pixel. Args: shift: (J, 2) int64, (dy, dx)."""
+        ...
+
+    def count(self, matches: Tensor) -> Tensor:
+        """(J,) int64, what each template has among some, given as by `at`."""
+        ...
 
 
 class Lookup:

@@ -14,6 +14,8 @@ from cflow_torch.config import Config, make_config
 from cflow_torch.grid import Grid
 from cflow_torch.inputs import check_windows, choose_device
 from cflow_torch.ops.chunks import chunks
+from cflow_torch.ops.indices import flat_nonzero
+from cflow_torch.rigid import RigidMotion
 from cflow_torch.types import CFlowError, FlowResult, Window
 
 
@@ -27,6 +29,7 @@ class Motion:
         flow: (M + 1, 3) float64, metres per sweep interval, axes of ego1.
         cluster_id: (M + 1,) int64, number of the cluster counted from 0 in its window.
         score: (M + 1,) float32.
+        rigid: of M + 1, what `flow` says and a turn: only where one is found, and at the last scale only.
     """
 
     of_place: Tensor
@@ -34,6 +37,7 @@ class Motion:
     flow: Tensor
     cluster_id: Tensor
     score: Tensor
+    rigid: Optional[RigidMotion] = None
 
     def cluster(self, points: slice) -> Tensor:
         """Cluster of each of some points, M = none."""
@@ -44,6 +48,23 @@ class Motion:
         for values, of_cluster in zip(out.unbind(0), self.flow.unbind(1)):
             torch.index_select(of_cluster, 0, cluster, out=values)
         return out
+
+
+def turned_flow(flow: Tensor, rigid: RigidMotion, cluster: Tensor, positions: Tensor) -> Tensor:
+    """(N, 3) float64 flow of points of t, each where it lies in a motion that turns.
+
+    Args:
+        flow: (M + 1, 3) float64, where nothing turns.
+        rigid: of M + 1.
+        cluster: (N,) cluster of each point, M = none.
+        positions: (A, N) float64, metres; means nothing where there is no cluster.
+    """
+    flow = flow.index_select(0, cluster)
+    turns = flat_nonzero((rigid.turn != 0).index_select(0, cluster))
+    cluster, places = cluster.index_select(0, turns), positions[:2].index_select(1, turns)
+    x, y = rigid.flow_at(cluster, *places.unbind(0))
+    flow[turns, 0], flow[turns, 1] = x + 0.0, y + 0.0
+    return flow
 
 
 class CoarseToFine(nn.Module):
@@ -200,7 +221,9 @@ def _results(batch: Batch, flow: Optional[Tensor], motion: Motion) -> List[FlowR
     results = []
     for source in batch.sources:
         cluster = motion.cluster(source.points)
-        if flow is None:
+        if flow is None and motion.rigid is not None:
+            residual = turned_flow(motion.flow, motion.rigid, cluster, batch.positions[:, source.points]).float()
+        elif flow is None:
             residual = motion.flow.float().index_select(0, cluster)
         else:
             before = flow[:, source.points]

@@ -112,7 +112,7 @@ def test_nothing_to_find(options):
 
 @pytest.mark.parametrize("name", DENSE_ONLY)
 def test_the_opencv_loop_has_none_of_them(name):
-    settings = make_config("paper", **{name: ALL[name]})
+    settings = make_config("paper", **{name: {**ALL, "proof": True}[name]})
     with pytest.raises(CFlowError, match=name):
         opencv_flow(scene(0), settings)
 

@@ -97,7 +97,8 @@ def test_invalid_values_name_the_field(field, value):
 
 
 @pytest.mark.parametrize(
-    "field, value", [("max_object", 25.0), ("zero_test", 1.5), ("subpixel", "parabola"), ("height_slices", 4)]
+    "field, value",
+    [("max_object", 25.0), ("zero_test", 1.5), ("subpixel", "parabola"), ("height_slices", 4), ("proof", True)],
 )
 def test_options_of_the_dense_method_are_refused_for_key_points(field, value):
     assert getattr(make_config("paper", **{field: value}), field) == value

@@ -7,8 +7,12 @@ operation is elementwise in the written order, so that another implementation ca
 
 Order of reading: reference_flow -> coarse_to_fine, here -> `dense` (Alg. general_correlation_flow) or `keypoints`
 (Sec. CorrelationFlow-Keypoints). What they use: `sweeps` (ego motion), `pixels` (Eq. 3d_to_bev), `clustering`
-(Alg. clustering), `pooling` (Sec. leverage_past_pcs), `descriptors` and `matching` (key points). Beyond
-the paper: `peak`.
+(Alg. clustering), `pooling` (Sec. leverage_past_pcs), `descriptors` and `matching` (key points).
+
+Beyond the paper: `peak` (test, fractions of a pixel), `proof` (motion by hypotheses and proof) and what it is made of:
+`cells` (height slices), `low_columns` (ground that a mask left over), `levels` (components at several pixel sizes),
+`candidates`, `judge`, `aperture` (lines that seem to slide along themselves), `tree` (which grouping wins),
+`relocation`, `refinement`.
 """
 
 from __future__ import annotations
@@ -19,6 +23,7 @@ import numpy as np
 import torch
 
 from cflow_torch.config import Config
+from cflow_torch.reference.aperture import principal_axis, slides_along_itself
 from cflow_torch.reference.clustering import cluster, cluster_hdbscan, connected_components, dilate, erode
 from cflow_torch.reference.dense import (
     general_correlation_flow,
@@ -30,6 +35,8 @@ from cflow_torch.reference.dense import (
 )
 from cflow_torch.reference.descriptors import describe, detect_keypoints
 from cflow_torch.reference.keypoints import correlation_flow_keypoints, gate, median_of_components, nearest_match
+from cflow_torch.reference.levels import Components, components_at, equals_parent, parents
+from cflow_torch.reference.low_columns import ground_heights, in_low_column
 from cflow_torch.reference.matching import Match, match_keypoints, passes_ratio_test
 from cflow_torch.reference.peak import beats_zero, coinciding, parabola
 from cflow_torch.reference.pixels import (
@@ -44,12 +51,15 @@ from cflow_torch.reference.pixels import (
     slice_images,
 )
 from cflow_torch.reference.pooling import diamond_angle, median, median_direction, pool
-from cflow_torch.reference.sweeps import Cloud, Level, compensate, xyz
+from cflow_torch.reference.proof import prove_motion
+from cflow_torch.reference.sweeps import Cloud, Level, compensate, ground_points, xyz
+from cflow_torch.reference.tree import winners
 from cflow_torch.types import FlowResult, Window
 
 __all__ = [
     "Box",
     "Cloud",
+    "Components",
     "Level",
     "Match",
     "beats_zero",
@@ -60,15 +70,19 @@ __all__ = [
     "coarse_to_fine",
     "coinciding",
     "compensate",
+    "components_at",
     "connected_components",
     "correlation_flow_keypoints",
     "describe",
     "detect_keypoints",
     "diamond_angle",
     "dilate",
+    "equals_parent",
     "erode",
     "gate",
     "general_correlation_flow",
+    "ground_heights",
+    "in_low_column",
     "in_range",
     "longer_side",
     "match_keypoints",
@@ -80,14 +94,18 @@ __all__ = [
     "norm_correlation",
     "occupancy",
     "overlap_and_energy",
+    "parents",
     "parabola",
     "passes_ratio_test",
     "pool",
+    "principal_axis",
     "project_bev",
     "reference_flow",
     "scene_flow_1obj",
     "scene_flow_in_1view",
     "search_radius",
+    "slides_along_itself",
+    "winners",
     "slice_images",
 ]
 
@@ -109,7 +127,12 @@ def reference_flow(window: Window, config: Config) -> FlowResult:
         the multi-scale strategy.
     """
     clouds, cloud1 = compensate(window, config)
-    residual_flow, cluster_id, score = coarse_to_fine(clouds, cloud1, config)
+    if config.proof:
+        ground = [ground_points(window.pc0, clouds[0]), ground_points(window.pc1, cloud1)]
+        level = prove_motion(clouds, cloud1, ground, config)
+        residual_flow, cluster_id, score = level.flow[0], level.cluster_id[0], level.score[0]
+    else:
+        residual_flow, cluster_id, score = coarse_to_fine(clouds, cloud1, config)
     # float32(p' - p); points that are not finite are NaN in p' and get 0
     pose_flow = np.nan_to_num(clouds[0].points - xyz(window.pc0), nan=0.0).astype(np.float32)
     residual_flow = residual_flow.astype(np.float32)

@@ -62,7 +62,9 @@ def connected_components(image: np.ndarray, connectivity: int) -> Tuple[np.ndarr
     return labels, count
 
 
-def cluster(images: Sequence[np.ndarray], pixel_size: float, max_extent: float, connectivity: int) -> np.ndarray:
+def cluster(
+    images: Sequence[np.ndarray], pixel_size: float, max_extent: float, connectivity: int, reach: int = 3
+) -> np.ndarray:
     """Alg. clustering: spatio-temporal clusters as connected components of the aggregated image.
 
     Args:
@@ -70,6 +72,7 @@ def cluster(images: Sequence[np.ndarray], pixel_size: float, max_extent: float, 
         pixel_size: s in metres.
         max_extent: d^max in metres.
         connectivity: 4 or 8.
+        reach: 3 = Alg. clustering; 1 = plain components: neither dilated nor validated by size.
 
     Returns:
         (H, W) int64: cluster of every pixel that some sweep occupies, -1 elsewhere and in clusters without a pixel
@@ -79,11 +82,12 @@ def cluster(images: Sequence[np.ndarray], pixel_size: float, max_extent: float, 
         not too large. An oversized component is eroded and labelled again once, whatever size results.
     """
     aggregated = np.logical_or.reduce(images)
-    labels, count = connected_components(dilate(aggregated), connectivity)
+    labels, count = connected_components(aggregated if reach == 1 else dilate(aggregated), connectivity)
 
     # Validation of the connected components.
     total = count
-    for component, box in _boxes(labels).items():
+    boxes = {} if reach == 1 else _boxes(labels)
+    for component, box in boxes.items():
         if max(box[2], box[3]) * pixel_size > max_extent:
             eroded = erode(labels == component)
             labels[labels == component] = 0

@@ -98,6 +98,13 @@ def _takes_part(sweep: Sweep) -> np.ndarray:
     return finite & ~_matrix(sweep.is_ground).astype(bool)
 
 
+def ground_points(sweep: Sweep, cloud: Cloud) -> np.ndarray:
+    """(N, 3) float64, metres, frame of t+1: the ground of a sweep; none where it is not known."""
+    if sweep.is_ground is None:
+        return np.zeros((0, 3))
+    return cloud.points[_matrix(sweep.is_ground).astype(bool)]
+
+
 def xyz(sweep: Sweep) -> np.ndarray:
     """(N, 3) float64, metres: the points of a sweep as they were given, without further columns."""
     return _matrix(sweep.points)[:, :3]

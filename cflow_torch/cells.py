@@ -1,0 +1,174 @@
+"""The finest images of all sweeps with four height slices a pixel, and the list of their occupied pixels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Optional, Tuple
+
+import torch
+from torch import Tensor
+
+from cflow_torch.batch import Batch
+from cflow_torch.grid import Grid
+from cflow_torch.low_columns import drop_low_columns, ground_heights
+from cflow_torch.ops.indices import flat_nonzero, split_index
+from cflow_torch.types import CFlowError
+
+NUM_SLICES = 4
+# Beyond this float64 only holds multiples of NUM_SLICES, so cutting heights off here changes no slice.
+_HIGHEST_SLICE = 2.0**55
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Four bits a pixel for every sweep of every window, and where any of them is set.
+
+    Args:
+        grid: the BEV of the images.
+        num_windows, num_steps: B, S; step 0 = sweep t+1, 1 = t, ...
+        image: (B * S * H * W + 1,) uint8, bit c = a point of height slice c lies there; the last entry, always 0, is
+            for whatever lies outside the images.
+        pixel: (P,) int64, flat indices of the occupied pixels, ascending.
+        window, step, row, col: (P,) int64, where each of them lies.
+        slices: (P,) uint8, what `image` holds there.
+    """
+
+    grid: Grid
+    num_windows: int
+    num_steps: int
+    image: Tensor
+    pixel: Tensor
+    window: Tensor
+    step: Tensor
+    row: Tensor
+    col: Tensor
+    slices: Tensor
+
+    def place(self, window: Tensor, step: Tensor, row: Tensor, col: Tensor) -> Tensor:
+        """Flat index into `image` of pixels that may lie outside it.
+
+        Args:
+            window, step: int64, of shapes that broadcast with each other and with those of row and col; valid.
+            row, col: int64, any value.
+
+        Returns:
+            int64 of the broadcast shape; that of the last entry of `image` for pixels outside.
+        """
+        height, width = self.grid.height, self.grid.width
+        inside = (row >= 0) & (row < height) & (col >= 0) & (col < width)
+        flat = ((window * self.num_steps + step) * height + row) * width + col
+        return torch.where(inside, flat, self.image.numel() - 1)
+
+    def look_up(self, place: Tensor) -> Tensor:
+        """uint8, shape of `place`: the slices at flat indices of any shape."""
+        return self.image.index_select(0, place.reshape(-1)).view(place.shape)
+
+    def number(self) -> Tensor:
+        """(B * S * H * W + 1,) int32: position of each pixel in the list, P where none is occupied.
+
+        Cost: one pass over the images; make it once.
+        """
+        number = torch.full_like(self.image, self.pixel.numel(), dtype=torch.int32)
+        return number.scatter_(0, self.pixel, torch.arange(self.pixel.numel(), device=number.device).int())
+
+    def without(self, dropped: Tensor) -> Cells:
+        """The cells that are left when some pixels are emptied.
+
+        Args:
+            dropped: (P,) bool.
+        """
+        image = self.image.index_fill(0, self.pixel.index_select(0, flat_nonzero(dropped)), 0)
+        kept = flat_nonzero(~dropped)
+        lists = (self.pixel, self.window, self.step, self.row, self.col, self.slices)
+        parts = (values.index_select(0, kept) for values in lists)
+        return Cells(self.grid, self.num_windows, self.num_steps, image, *parts)
+
+    def place_of_points(self, place: Tensor) -> Tensor:
+        """(N,) int64 places of points, those on an empty pixel moved to the last entry: they belong nowhere."""
+        return torch.where(self.look_up(place) != 0, place, self.image.numel() - 1)
+
+
+def make_cells(
+    batch: Batch, grid: Grid, slice_height: float, clearance: Optional[float] = None
+) -> Tuple[Cells, Tensor]:
+    """Draw every sweep of a batch with its height slices.
+
+    Args:
+        batch: positions with three axes, frame of t+1.
+        grid: the finest BEV.
+        slice_height: metres.
+        clearance: metres; pixels that do not stand out of the ground of the batch by this much are left out, see
+            `drop_low_columns`. None = all are drawn.
+
+    Returns:
+        cells: of all windows.
+        place: (N,) int64, flat index into `cells.image` of every point; its last entry for those that take no part or
+            lie on a pixel that is left out.
+
+    Convention:
+        The slice of a height z is floor(z / slice_height) mod 4 in float64, the division a true one (see `Grid.pixel`).
+
+    Raises:
+        CFlowError: the batch holds no heights.
+
+    Cost: linear in points and pixels.
+    """
+    if len(batch.positions) != 3:
+        raise CFlowError("height slices need z: make the batch with three axes")
+    num_images = batch.num_windows * batch.num_steps
+    place = grid.pixel_of_image(batch.positions, batch.image, num_images, batch.takes_part).long()
+    if clearance is not None and batch.ground is not None:
+        heights = ground_heights(batch.ground)
+        place = drop_low_columns(place, batch.positions, heights, grid, batch.num_steps, clearance)
+    part = slice_of(batch.positions[2], slice_height)  # of rows that take no part anything: they are drawn nowhere
+    image = draw_slices(place, part, num_images * grid.height * grid.width)
+    return cells_of_image(image, grid, batch.num_windows, batch.num_steps), place
+
+
+def slice_of(z: Tensor, slice_height: float) -> Tensor:
+    """(N,) uint8, 0 ... 3: the slice of heights (N,) float64, metres, as in `make_cells`; 0 for NaN."""
+    layer = (z / torch.full((), slice_height, dtype=z.dtype, device=z.device)).floor_()
+    layer.clamp_(-_HIGHEST_SLICE, _HIGHEST_SLICE).nan_to_num_(0.0)
+    return (layer.long() & (NUM_SLICES - 1)).to(torch.uint8)
+
+
+def draw_slices(place: Tensor, part: Tensor, num_pixels: int) -> Tensor:
+    """Images with a bit for every slice that a point lies in.
+
+    Args:
+        place: (N,) int64, pixel of each point, `num_pixels` for those that are nowhere.
+        part: (N,) uint8, slice of each point.
+        num_pixels: pixels of all images.
+
+    Returns:
+        (num_pixels + 1,) uint8, the last entry 0. A pass per slice: within a pass all points of a pixel write the same
+        value, so their order does not matter.
+    """
+    image = torch.zeros(num_pixels + 1, dtype=torch.uint8, device=place.device)
+    for index in range(NUM_SLICES):
+        at = place.index_select(0, flat_nonzero(part == index))
+        image.index_copy_(0, at, image.index_select(0, at).bitwise_or_(1 << index))
+    image[-1:] = 0
+    return image
+
+
+def cells_of_image(image: Tensor, grid: Grid, num_windows: int, num_steps: int) -> Cells:
+    """List the occupied pixels of an image.
+
+    Args:
+        image: (B * S * H * W + 1,) uint8, as in `Cells`.
+        grid: the BEV.
+        num_windows, num_steps: B, S.
+    """
+    pixel = flat_nonzero(image != 0)
+    of_image, within = split_index(pixel, grid.height * grid.width)
+    window, step = split_index(of_image, num_steps)
+    row, col = split_index(within, grid.width)
+    slices = image.index_select(0, pixel)
+    return Cells(grid, num_windows, num_steps, image, pixel, window, step, row, col, slices)
+
+
+def count_slices(slices: Tensor) -> Tensor:
+    """Set bits, 0 ... 4, of uint8 values below 16; uint8 of the same shape."""
+    pairs = (slices & 5) + ((slices >> 1) & 5)
+    return (pairs & 3) + (pairs >> 2)

@@ -1,0 +1,147 @@
+"""Low columns are ground: what a ground mask left over, found by its height above the ground around it.
+
+Remnants of the ground look different in every sweep, so they seem to move. A pixel belongs to an object only if
+something on it, or next to it, stands clearly above the ground points around; a curb or a bump does not.
+"""
+
+from __future__ import annotations
+
+from typing import Tuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from cflow_torch.grid import Grid
+from cflow_torch.ops.indices import divide, flat_nonzero, split_index
+
+# Side of the blocks in which the height of the ground is averaged, metres; with the eight blocks around, 6 m x 6 m.
+_BLOCK = 2.0
+# Fewer ground points than this in 6 m x 6 m say nothing.
+_LEAST_POINTS = 5
+# How far from a tall pixel a low one still belongs to its object, pixels.
+_REACH = 2
+# Heights are whole centimetres, bounded so that no sum overflows; unknown ground lies deeper than any point.
+_HIGHEST = 10**6
+_UNKNOWN = -(1 << 40)
+
+
+def no_ground(num_windows: int, grid: Grid, device: torch.device) -> Tensor:
+    """(2, B, Y, X) int64 zeros: sum of heights in centimetres and number of points, of blocks of 2 m x 2 m."""
+    return torch.zeros((2, num_windows, *_num_blocks(grid)), dtype=torch.int64, device=device)
+
+
+def add_ground(sums: Tensor, window: int, positions: Tensor, grid: Grid) -> None:
+    """Count ground points of a sweep, or of a piece of it, in `sums`.
+
+    Args:
+        sums: (2, B, Y, X) int64, as made by `no_ground`; changed in place.
+        window: index of the window.
+        positions: (3, N) float64, metres, frame of t+1; what lies outside the region, or is not finite, does not count.
+        grid: the region.
+
+    Convention: sums of integers, so neither the order of the points nor that of the pieces matters.
+    Cost: linear in N.
+    """
+    positions = positions.index_select(1, flat_nonzero(grid.contains(positions)))
+    block = _block(positions, grid)
+    heights, count = sums[:, window].view(2, -1).unbind(0)
+    heights.index_add_(0, block, _centimetres(positions[2]))
+    count.index_add_(0, block, torch.ones_like(block))
+
+
+def ground_heights(sums: Tensor) -> Tensor:
+    """Mean height of the ground around each block.
+
+    Args:
+        sums: (2, B, Y, X) int64, of all the ground points that are to count (those of t and t+1).
+
+    Returns:
+        (B, Y, X) int64, centimetres: mean over 3 x 3 blocks, rounded down; far below everything where they hold fewer
+        than five points.
+
+    Cost: a few operations on some thousand blocks.
+    """
+    _, _, rows, cols = sums.shape
+    wide = F.pad(sums, (1, 1, 1, 1))
+    around = torch.zeros_like(sums)
+    for down in range(3):
+        for right in range(3):
+            around += wide[:, :, down : down + rows, right : right + cols]
+    heights, count = around.unbind(0)
+    mean = torch.div(heights, count.clamp(min=1), rounding_mode="floor")
+    return torch.where(count >= _LEAST_POINTS, mean, torch.full_like(mean, _UNKNOWN))
+
+
+def drop_low_columns(
+    place: Tensor, positions: Tensor, ground: Tensor, grid: Grid, num_steps: int, clearance: float
+) -> Tensor:
+    """Pixel of every point, without the pixels that are ground.
+
+    A pixel stays if a point on it, or on a pixel of the same sweep at most two rows and two columns away, lies
+    `clearance` or more above the ground of the block that the point is in. Without ground points nothing is dropped.
+
+    Args:
+        place: (P,) int64, flat index into (B, S, H, W) images; B * S * H * W for points that are left out.
+        positions: (3, P) float64, metres, frame of t+1; of points that are left out it means nothing.
+        ground: (B, Y, X) int64, as `ground_heights` gives it.
+        grid: of the images.
+        num_steps: S.
+        clearance: metres; used to the centimetre.
+
+    Returns:
+        (P,) int64, as `place`; points on dropped pixels are left out.
+
+    Convention: heights are compared in whole centimetres, each rounded down.
+    Cost: some ten passes over the points and 25 look-ups for every pixel without a tall point.
+    """
+    area = grid.height * grid.width
+    nowhere = len(ground) * num_steps * area
+    present = flat_nonzero(place < nowhere)
+    pixel, inside = place.index_select(0, present), positions.index_select(1, present)
+    rows, cols = ground.shape[1:]
+    block = torch.add(_block(inside, grid), divide(pixel, num_steps * area), alpha=rows * cols)
+    is_high = _centimetres(inside[2]) - ground.reshape(-1).index_select(0, block) >= round(100 * clearance)
+
+    empty = torch.zeros(nowhere + 1, dtype=torch.bool, device=place.device)
+    tall = empty.index_fill(0, pixel.index_select(0, flat_nonzero(is_high)), True)
+    low = empty.index_fill_(0, pixel, True).logical_and_(~tall)
+    lone = flat_nonzero(low)
+    lone = lone.index_select(0, flat_nonzero(~_is_near(tall, lone, grid)))
+    dropped = low.fill_(False).index_fill_(0, lone, True)
+    return torch.where(dropped.index_select(0, place), nowhere, place)
+
+
+def _is_near(tall: Tensor, pixels: Tensor, grid: Grid) -> Tensor:
+    """(K,) bool: is a tall pixel at most `_REACH` rows and columns away from each of these flat indices?"""
+    image_row, col = split_index(pixels, grid.width)
+    image, row = split_index(image_row, grid.height)
+    first = image * (grid.height * grid.width)
+    reach = range(-_REACH, _REACH + 1)
+    # Beyond the border the border's pixel is looked up, which is as near.
+    cols = [(col + right).clamp_(0, grid.width - 1) for right in reach]
+    near = torch.zeros_like(pixels, dtype=torch.bool)
+    for down in reach:
+        start = torch.add(first, (row + down).clamp_(0, grid.height - 1), alpha=grid.width)
+        for other_col in cols:
+            near |= tall.index_select(0, start + other_col)
+    return near
+
+
+def _num_blocks(grid: Grid) -> Tuple[int, int]:
+    return (
+        int((grid.upper[1] - grid.lower[1]) / _BLOCK) + 1,
+        int((grid.upper[0] - grid.lower[0]) / _BLOCK) + 1,
+    )
+
+
+def _block(positions: Tensor, grid: Grid) -> Tensor:
+    """(N,) int64 block of (3, N) positions inside the region; nothing there is below the lower end."""
+    row = ((positions[1] - grid.lower[1]) / _BLOCK).long()
+    col = ((positions[0] - grid.lower[0]) / _BLOCK).long()
+    return torch.add(col, row, alpha=_num_blocks(grid)[1])
+
+
+def _centimetres(z: Tensor) -> Tensor:
+    """(N,) int64 height, rounded down."""
+    return torch.floor(z * 100).clamp_(-_HIGHEST, _HIGHEST).long()

@@ -1,0 +1,150 @@
+"""Motion by hypotheses and proof, in one pass at the finest pixels (docs/beyond.md): the page to read first.
+
+Components at several pixel sizes are hypotheses of what moves together. Each has candidate motions: the peak of its
+correlation with every sweep, their pool, the motion of the coarser component around it. Candidates are judged at the
+finest pixels, over all sweeps and both ways, against no motion. In the tree of components the grouping that explains
+most wins; what moves is then placed between the pixels, refined and turned.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import List, Optional, Tuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+from torch.profiler import record_function
+
+from cflow_torch.aperture import slides_along_itself
+from cflow_torch.batch import Batch
+from cflow_torch.candidates import inherit, make_candidates
+from cflow_torch.cells import Cells, make_cells
+from cflow_torch.config import Config
+from cflow_torch.grid import Grid
+from cflow_torch.judge import choose, judge, worth
+from cflow_torch.levels import Level, equals_parent, make_level, parents
+from cflow_torch.moving import moving_points
+from cflow_torch.ops.indices import flat_nonzero
+from cflow_torch.peaks import find_peaks
+from cflow_torch.pyramid import Motion
+from cflow_torch.refine import refine
+from cflow_torch.relocate import relocate
+from cflow_torch.rigid import RigidMotion
+from cflow_torch.tree import Groups, choose_groups
+
+
+def prove_motion(batch: Batch, grid: Grid, config: Config) -> Motion:
+    """Motion of everything in a batch.
+
+    Args:
+        batch: points of all windows, with three axes.
+        grid: the finest BEV.
+        config: all but what belongs to key points, `subpixel` and `zero_test`; `max_object` and `max_speed` count.
+
+    Returns:
+        The motion, by occupied pixel; ids number the groups that move together or stand still together.
+    """
+    with record_function("project"):
+        cells, place = make_cells(batch, grid, config.slice_height, config.clearance)
+    judged: List[_Judged] = []
+    for block, reach in _levels(config):
+        judged.append(_judge_level(cells, block, reach, judged[-1] if judged else None, batch, config))
+    with record_function("tree"):
+        groups = choose_groups([one.level.node for one in judged], [one.worth for one in judged])
+        motion = torch.cat([one.motion for one in judged]).index_select(0, groups.component)
+    with record_function("refine"):
+        rigid = _settle(motion, groups, cells, place, batch, config)
+    return _by_pixel(rigid, groups, judged[-1].score, cells, place)
+
+
+def _levels(config: Config) -> List[Tuple[int, int]]:
+    """Of each level, coarse to fine: finest pixels a side of its pixels, and the reach of its components."""
+    levels = [(round(size / config.pixel_sizes[-1]), 3) for size in config.pixel_sizes]
+    return [*levels, (1, 1)] if config.children else levels
+
+
+@dataclass(frozen=True)
+class _Judged:
+    """A level and the best motion of each of its M components.
+
+    Args:
+        level: the components.
+        motion: (M, 2) float64, (y, x), finest pixels per sweep interval; 0 = none is proved.
+        worth: (M,) int64.
+        score: (P,) float32 of each finest pixel: NCC of the finest component so far that was looked for.
+    """
+
+    level: Level
+    motion: Tensor
+    worth: Tensor
+    score: Tensor
+
+
+def _judge_level(
+    cells: Cells, block: int, reach: int, above: Optional[_Judged], batch: Batch, config: Config
+) -> _Judged:
+    """Candidates of the components at one pixel size, and which of them is proved best."""
+    with record_function("cluster"):
+        level = make_level(cells, block, reach, math.inf if config.max_object is None else config.max_object, config)
+        node, num_nodes = level.node, level.clusters.window.numel()
+        wanted, inherited = ~level.too_long, None
+        if above is not None:
+            inherited = inherit(node, num_nodes, above.level.node, above.motion)
+            if reach == 1:  # what has not fallen apart is known
+                others = (above.level.node, len(above.motion))
+                wanted &= ~equals_parent(node, num_nodes, *others, parents(node, num_nodes, *others))
+    with record_function("correlate"):
+        estimates, scores, available = find_peaks(level, wanted, batch, cells.grid.pixel_size, config)
+    with record_function("judge"):
+        intervals = batch.elapsed[level.clusters.window, 1:]
+        candidates = make_candidates(estimates, available, intervals, inherited)
+        is_judged = (candidates != 0).any(2).any(1) & ~level.too_long
+        worths = worth(*judge(cells, node, candidates, is_judged, batch.elapsed), config.proof_z)
+        if config.aperture:
+            owner = torch.where(F.pad(is_judged, (0, 1)).index_select(0, node), node, num_nodes)
+            worths = worths.masked_fill(slides_along_itself(cells, batch.elapsed, owner, candidates), 0)
+        motion, best = choose(worths, candidates)
+    newest = available.int().argmax(1, keepdim=True)
+    score = F.pad(scores.gather(1, newest)[:, 0], (0, 1)).index_select(0, node)
+    if above is not None:
+        score = torch.where(F.pad(wanted, (0, 1)).index_select(0, node), score, above.score)
+    return _Judged(level, motion, best, score)
+
+
+def _settle(motion: Tensor, groups: Groups, cells: Cells, place: Tensor, batch: Batch, config: Config) -> RigidMotion:
+    """Motion of G groups, metres, from (G, 2) float64 (y, x), finest pixels per sweep interval."""
+    grid, num_groups = cells.grid, len(motion)
+    still = torch.zeros_like(motion)
+    moves = F.pad(motion.any(1), (0, 1))
+    if (config.relocate or config.yaw) and bool(moves.any()):
+        number = cells.number()
+        of_pixel = torch.where(moves.index_select(0, groups.of_pixel), groups.of_pixel, num_groups)
+        points = moving_points(batch, place, number, of_pixel, num_groups, config.slice_height)
+        if config.relocate:  # with history one of many sweeps would decide
+            is_pair = (batch.elapsed > 0).sum(1) == 1
+            pairs = points.take(flat_nonzero(is_pair.index_select(0, points.window)))
+            motion = relocate(pairs, grid, batch.num_windows, motion)
+            points = points.take(flat_nonzero(motion.any(1).index_select(0, points.group)))
+        if config.yaw:
+            flow = motion.flip(1) * grid.pixel_size + 0.0
+            return refine(points, number, cells.pixel.numel(), grid, batch.elapsed, flow)
+    return RigidMotion(motion.flip(1) * grid.pixel_size, still[:, 0], still)
+
+
+def _by_pixel(rigid: RigidMotion, groups: Groups, score: Tensor, cells: Cells, place: Tensor) -> Motion:
+    """The motion of G groups, and (P,) scores, as `Motion` wants them: by occupied pixel; its cluster M is P."""
+    window = cells.window.index_select(0, groups.first)
+    ids = torch.arange(window.numel(), device=window.device) - torch.searchsorted(window, window)
+    group = F.pad(groups.of_pixel, (0, 1), value=window.numel())
+    flow = F.pad(rigid.flow, (0, 1, 0, 1)).index_select(0, group) + 0.0  # + 0.0 turns -0.0 into 0.0
+    turn, centre = F.pad(rigid.turn, (0, 1)), F.pad(rigid.centre, (0, 0, 0, 1))
+    return Motion(
+        of_place=cells.number(),
+        place=place,
+        flow=flow,
+        cluster_id=F.pad(ids, (0, 1), value=-1).index_select(0, group),
+        score=F.pad(score, (0, 1)),
+        rigid=RigidMotion(flow[:, :2], turn.index_select(0, group), centre.index_select(0, group)),
+    )
