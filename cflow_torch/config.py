@@ -227,14 +227,30 @@ class Config:
 # What each preset changes in `Config`'s defaults. Those are the paper's base row: s = 0.1 m, BEV, h = 0.
 PRESETS: Dict[str, Dict[str, Any]] = {
     "paper": {},
-    # Chosen on simulated drives, docs/history_and_scales.md; region of the main harness.
+    # Everything of docs/beyond.md; region of the main harness.
     "default": {
         "num_history": 4,
         "pixel_sizes": (0.4, 0.2, 0.1),
         "point_cloud_range": (-51.2, -51.2, -math.inf, 51.2, 51.2, math.inf),
+        "max_speed": 40.0,
+        "max_object": 25.0,
+        "height_slices": 4,
+        "proof": True,
+        "clearance": 0.4,
+        "children": True,
+        "aperture": True,
+        "relocate": True,
+        "yaw": True,
     },
-    # Two older sweeps and one scale: most of the gain of history at about a third of the time.
-    "fast": {"num_history": 2, "point_cloud_range": (-51.2, -51.2, -math.inf, 51.2, 51.2, math.inf)},
+    # Two older sweeps, one scale, and of docs/beyond.md what costs little.
+    "fast": {
+        "num_history": 2,
+        "point_cloud_range": (-51.2, -51.2, -math.inf, 51.2, 51.2, math.inf),
+        "max_speed": 40.0,
+        "max_object": 25.0,
+        "proof": True,
+        "clearance": 0.4,
+    },
     # Best mean of scripts/keypoint_settings.py on its synthetic set; region of the main harness.
     "keypoints": {
         "method": "keypoints",

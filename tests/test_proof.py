@@ -13,7 +13,7 @@ from scenes import scene as scene_of_boxes
 
 from cflow_torch import CFlowError, Config, CorrelationFlow, Sweep, Window
 from cflow_torch.batch import make_batch
-from cflow_torch.config import DENSE_ONLY, PRESETS, PROOF_ONLY, make_config
+from cflow_torch.config import DENSE_ONLY, PROOF_ONLY, make_config
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.log import window as window_of
 from cflow_torch.grid import Grid
@@ -213,11 +213,21 @@ def test_empty_and_hopeless_windows():
         assert not result.residual_flow.any()
 
 
-def test_no_preset_proves_anything():
-    for name in PRESETS:
+def test_the_paper_and_the_key_points_have_nothing_beyond_the_paper():
+    for name in ("paper", "keypoints"):
         config = make_config(name)
         for field, off in {**DENSE_ONLY, **PROOF_ONLY}.items():
             assert getattr(config, field) == off, (name, field)
+
+
+@pytest.mark.parametrize("name", ["default", "fast"])
+def test_presets_follow_the_reference(name):
+    flow = CorrelationFlow.from_preset(name, point_cloud_range=ALL["point_cloud_range"])
+    window = scene(5, flow.config.num_history)
+    assert flow.config.proof
+    (result,) = flow([window])
+    assert_equal(result, reference_flow(window, flow.config))
+    assert result.residual_flow.any()
 
 
 @pytest.mark.parametrize(
