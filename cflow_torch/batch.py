@@ -150,7 +150,8 @@ def make_batch(windows: Sequence[Window], config: Config, grid: Grid, device: An
 
     needs_z = config.sectional_view or config.clustering == "hdbscan" or config.height_slices > 0 or config.proof
     num_axes = 3 if needs_z else 2
-    ground = no_ground(len(windows), grid, chosen_device) if config.clearance is not None else None
+    needs_ground = config.proof and config.clearance is not None
+    ground = no_ground(len(windows), grid, chosen_device) if needs_ground else None
     most = sum(sweep.points.shape[0] for _, _, _, sweep in sweeps)
     positions = torch.empty((num_axes, most), dtype=torch.float64, device=chosen_device)
     takes_part = torch.ones(most, dtype=torch.bool, device=chosen_device)

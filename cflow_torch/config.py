@@ -6,31 +6,8 @@ import math
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, Dict, Optional, Tuple
 
+from cflow_torch.checks import check, floats, one_of
 from cflow_torch.types import CFlowError
-
-METHODS = ("dense", "keypoints")
-CLUSTERINGS = ("components", "hdbscan")
-LABELINGS = ("sparse", "kornia")
-CORRELATIONS = ("fft", "conv")
-SUBPIXELS = ("none", "parabola")
-DENSIFIERS = ("components", "clusters", "nearest")
-# Options of the dense method that are not in the paper (docs/beyond.md), and the value that turns each off.
-DENSE_ONLY: Dict[str, Any] = {
-    "max_object": None,
-    "zero_test": None,
-    "subpixel": "none",
-    "height_slices": 0,
-    "proof": False,
-}
-# Parts of the proof, which mean nothing without it, and the value that turns each off.
-PROOF_ONLY: Dict[str, Any] = {"clearance": None, "children": False, "aperture": False, "relocate": False, "yaw": False}
-# The ratio test compares products of counts: 51^6 * (2 * 10^4)^2 still fits an int64.
-LARGEST_PATCH = 51
-LARGEST_RATIO = 2
-# Nothing needs more, and (100 z)^2 times a count fits an int64.
-LARGEST_Z = 1000
-# A byte holds the slices of a pixel.
-MOST_SLICES = 8
 
 
 @dataclass(frozen=True)
@@ -59,7 +36,7 @@ class Config:
         slice_height: m.
         proof: candidate motions of components at all `pixel_sizes` at once, judged against no motion at the finest one,
             in four height slices, instead of coarse to fine, see docs/beyond.md. `pixel_sizes` must be whole multiples
-            of the finest. The options that follow are parts of it.
+            of the finest. The options from here to `yaw` are parts of it and mean nothing without it.
         proof_z: standard deviations of luck that a motion must exceed to be proved.
         clearance: m; pixels that stand out of the ground around them by less than this are left out, where ground is
             known. None = none are.
@@ -121,99 +98,9 @@ class Config:
     max_memory: Optional[int] = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "pixel_sizes", _floats("pixel_sizes", self.pixel_sizes))
-        object.__setattr__(self, "point_cloud_range", _floats("point_cloud_range", self.point_cloud_range))
-        _one_of("method", self.method, METHODS)
-        _one_of("clustering", self.clustering, CLUSTERINGS)
-        _one_of("labeling", self.labeling, LABELINGS)
-        _one_of("correlation", self.correlation, CORRELATIONS)
-        _one_of("densify", self.densify, DENSIFIERS)
-        _one_of("subpixel", self.subpixel, SUBPIXELS)
-        _one_of("connectivity", self.connectivity, (4, 8))
-        sizes = self.pixel_sizes
-        if not sizes or any(not 0 < s < math.inf for s in sizes) or any(a <= b for a, b in zip(sizes, sizes[1:])):
-            raise CFlowError(
-                f"pixel_sizes={sizes}: give at least one positive size in metres, strictly coarse to fine, "
-                "for example (0.4, 0.2, 0.1)"
-            )
-        box = self.point_cloud_range
-        if len(box) != 6 or any(math.isnan(v) for v in box) or any(a >= b for a, b in zip(box[:3], box[3:])):
-            raise CFlowError(
-                f"point_cloud_range={box}: give (x0, y0, z0, x1, y1, z1) in metres with x0 < x1, y0 < y1, z0 < z1"
-            )
-        if any(math.isinf(v) for v in (box[0], box[1], box[3], box[4])):
-            raise CFlowError(f"point_cloud_range={box}: x and y bounds must be finite; only z may be infinite")
-        for name in ("num_history", "patch_size", "min_cluster_size", "height_slices"):
-            _whole_number(name, getattr(self, name))
-        if self.patch_size % 2 == 0 or self.patch_size > LARGEST_PATCH:
-            raise CFlowError(
-                f"patch_size={self.patch_size}: give an odd number of pixels of at most {LARGEST_PATCH}, for example 11"
-            )
-        for name in ("max_extent", "sweep_interval", "gate_radius", "slice_height"):
-            _positive(name, getattr(self, name))
-        for name in ("max_speed", "max_object", "clearance", "max_memory"):
-            if getattr(self, name) is not None:
-                _positive(name, getattr(self, name))
-        if self.zero_test is not None:
-            _positive("zero_test", self.zero_test)
-            if not 0.01 <= self.zero_test <= LARGEST_Z:
-                raise CFlowError(f"zero_test={self.zero_test}: give a number from 0.01 to {LARGEST_Z}, for example 1.5")
-        if self.height_slices == 1 or self.height_slices > MOST_SLICES:
-            raise CFlowError(f"height_slices={self.height_slices}: give 0 (off) or 2 to {MOST_SLICES}, for example 4")
-        if self.height_slices and self.clustering != "components":
-            raise CFlowError(
-                f"height_slices={self.height_slices} needs clustering='components', {self.clustering!r} was given: "
-                "give height_slices=0"
-            )
-        if self.min_cluster_size < 2:
-            raise CFlowError(f"min_cluster_size={self.min_cluster_size}: give a whole number of at least 2")
-        _positive("ratio_threshold", self.ratio_threshold)
-        if not 1 <= self.ratio_threshold <= LARGEST_RATIO:
-            raise CFlowError(
-                f"ratio_threshold={self.ratio_threshold}: give a number from 1 to {LARGEST_RATIO}, for example 1.1"
-            )
-        for name in ("sweep_interval", "gate_radius", "slice_height"):
-            if math.isinf(getattr(self, name)):
-                raise CFlowError(f"{name}={getattr(self, name)}: give a finite number")
-        if self.second_best_distance != 0:
-            _positive("second_best_distance", self.second_best_distance)
-        self._check_proof()
-        for name in ("sectional_view", "use_timestamps", "mutual_check"):
-            _one_of(name, getattr(self, name), (True, False))
-        if self.method == "keypoints" and self.num_history > 0:
-            raise CFlowError(
-                f"method='keypoints' matches one pair of sweeps, num_history={self.num_history} was given: "
-                "give num_history=0, or method='dense'"
-            )
-        for name, off in DENSE_ONLY.items():
-            if self.method == "keypoints" and getattr(self, name) != off:
-                raise CFlowError(
-                    f"{name}={getattr(self, name)!r} is an option of the dense method, method='keypoints' was given: "
-                    f"give {name}={off!r}, or method='dense'"
-                )
-
-    def _check_proof(self) -> None:
-        for name in ("proof", "children", "aperture", "relocate", "yaw"):
-            _one_of(name, getattr(self, name), (True, False))
-        if isinstance(self.proof_z, bool) or not isinstance(self.proof_z, (int, float)) or not 0 <= self.proof_z < 1000:
-            raise CFlowError(f"proof_z={self.proof_z!r}: give a number from 0 to 1000, for example 2")
-        if not self.proof:
-            for name, off in PROOF_ONLY.items():
-                if getattr(self, name) != off:
-                    raise CFlowError(f"{name}={getattr(self, name)!r} is a part of proof=True: give {name}={off!r}")
-            return
-        blocks = [size / self.pixel_sizes[-1] for size in self.pixel_sizes]
-        if any(abs(block - round(block)) > 1e-6 for block in blocks):
-            raise CFlowError(
-                f"pixel_sizes={self.pixel_sizes}: with proof=True give whole multiples of the finest one, "
-                "for example (0.4, 0.2, 0.1)"
-            )
-        wanted = {"clustering": "components", "sectional_view": False, "zero_test": None}
-        for name, value in wanted.items():
-            if getattr(self, name) != value:
-                raise CFlowError(f"proof=True needs {name}={value!r}, {getattr(self, name)!r} was given")
-        if self.height_slices not in (0, 4):
-            raise CFlowError(f"height_slices={self.height_slices}: proof=True needs 0 or 4")
+        object.__setattr__(self, "pixel_sizes", floats("pixel_sizes", self.pixel_sizes))
+        object.__setattr__(self, "point_cloud_range", floats("point_cloud_range", self.point_cloud_range))
+        check(self)
 
     def replace(self, **overrides: Any) -> Config:
         """A copy with some fields changed; an unknown field raises `CFlowError` that lists the fields."""
@@ -277,7 +164,7 @@ def make_config(preset: str = "default", **overrides: Any) -> Config:
     Raises:
         CFlowError: unknown preset, unknown field (the message lists the fields), invalid value.
     """
-    _one_of("preset", preset, tuple(PRESETS))
+    one_of("preset", preset, tuple(PRESETS))
     if overrides.get("method") == "keypoints" and preset != "paper":  # history and scales are for the dense method
         preset = "keypoints"
     return Config(**PRESETS[preset]).replace(**overrides)
@@ -294,25 +181,3 @@ def _known(overrides: Dict[str, Any]) -> Dict[str, Any]:
     if unknown:
         raise CFlowError(f"unknown setting {', '.join(unknown)}: the fields are {', '.join(['pixel_size', *names])}")
     return overrides
-
-
-def _one_of(name: str, value: Any, allowed: Tuple[Any, ...]) -> None:
-    if not any(type(value) is type(a) and value == a for a in allowed):
-        raise CFlowError(f"{name}={value!r}: give one of {', '.join(repr(a) for a in allowed)}")
-
-
-def _floats(name: str, values: Any) -> Tuple[float, ...]:
-    try:
-        return tuple(float(v) for v in values)
-    except (TypeError, ValueError):
-        raise CFlowError(f"{name}={values!r}: give a list of numbers") from None
-
-
-def _whole_number(name: str, value: Any) -> None:
-    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-        raise CFlowError(f"{name}={value!r}: give a whole number of at least 0")
-
-
-def _positive(name: str, value: Any) -> None:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not value > 0:
-        raise CFlowError(f"{name}={value!r}: give a positive number")

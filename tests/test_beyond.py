@@ -15,7 +15,7 @@ from scenes import LABELINGS, assert_same, config, needs_gpu, scene
 from cflow_torch import CFlowError, CorrelationFlow, Sweep, Window, make_config
 from cflow_torch import reference as ref
 from cflow_torch.bench.opencv_loop import opencv_flow
-from cflow_torch.config import DENSE_ONLY
+from cflow_torch.checks import DENSE_ONLY
 from cflow_torch.correlate import best_shifts
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.log import window as window_of

@@ -9,7 +9,8 @@ from dataclasses import FrozenInstanceError, fields
 import pytest
 
 from cflow_torch import CFlowError, Config, CorrelationFlow, CorrelationFlowKeypoints, make_config, make_model
-from cflow_torch.config import DENSE_ONLY, PRESETS
+from cflow_torch.checks import DENSE_ONLY, NOT_WITH_PROOF
+from cflow_torch.config import PRESETS
 
 INF = math.inf
 
@@ -116,6 +117,34 @@ def test_options_beyond_the_paper_are_off_in_every_preset():
         assert {key: getattr(make_config(name), key) for key in DENSE_ONLY} == DENSE_ONLY
 
 
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"clustering": "hdbscan"},
+        {"sectional_view": True},
+        {"zero_test": 1.5},
+        {"subpixel": "parabola"},
+        {"height_slices": 3},
+        {"pixel_sizes": (0.25, 0.1)},
+    ],
+)
+def test_what_does_not_go_with_the_proof_says_how_to_mend_it(given):
+    (name,) = given
+    proof = make_config("paper", proof=True, pixel_sizes=(0.4, 0.2, 0.1))
+    with pytest.raises(CFlowError, match=f"{name}=.*proof=True.*give proof=False too, or start from preset='paper'"):
+        proof.replace(**given)
+    proof.replace(proof=False, **given)
+    make_config("paper", **given)
+
+
+def test_everything_that_does_not_go_with_the_proof_is_refused():
+    others = {"clustering": "hdbscan", "sectional_view": True, "zero_test": 1.5, "subpixel": "parabola"}
+    assert set(others) == set(NOT_WITH_PROOF)
+    for name, value in others.items():
+        with pytest.raises(CFlowError, match=name):
+            make_config("paper", proof=True, **{name: value})
+
+
 def test_unknown_field_lists_the_fields():
     for call in (make_config, Config().replace, lambda **kw: CorrelationFlow.from_preset("paper", **kw)):
         with pytest.raises(CFlowError, match="voxel_size") as caught:
@@ -152,6 +181,7 @@ def test_every_preset_is_valid():
     for name in PRESETS:
         assert make_config(name, max_speed=2.0).max_speed == 2.0
         assert make_model(make_config(name)).config == make_config(name)
+        assert not make_config(name, proof=False).proof  # which is all that must be said to do without
     assert CorrelationFlow.from_preset("fast").config == make_config("fast")
     assert CorrelationFlowKeypoints.from_preset().config == make_config("keypoints")
 

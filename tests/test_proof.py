@@ -13,7 +13,8 @@ from scenes import scene as scene_of_boxes
 
 from cflow_torch import CFlowError, Config, CorrelationFlow, Sweep, Window
 from cflow_torch.batch import make_batch
-from cflow_torch.config import DENSE_ONLY, PROOF_ONLY, make_config
+from cflow_torch.checks import DENSE_ONLY
+from cflow_torch.config import make_config
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.log import window as window_of
 from cflow_torch.grid import Grid
@@ -216,7 +217,7 @@ def test_empty_and_hopeless_windows():
 def test_the_paper_and_the_key_points_have_nothing_beyond_the_paper():
     for name in ("paper", "keypoints"):
         config = make_config(name)
-        for field, off in {**DENSE_ONLY, **PROOF_ONLY}.items():
+        for field, off in DENSE_ONLY.items():
             assert getattr(config, field) == off, (name, field)
 
 
@@ -238,16 +239,26 @@ def test_presets_follow_the_reference(name):
         {"proof_z": True},
         {"clearance": 0.0},
         {"pixel_sizes": (0.25, 0.1)},
-        {"clustering": "hdbscan"},
-        {"sectional_view": True},
-        {"zero_test": 1.5},
-        {"height_slices": 3},
-        {"proof": False},
+        {"proof_z": 1001},
+        {"children": 1},
+        {"pixel_sizes": (0.25, 0.1)},
     ],
 )
 def test_settings_that_make_no_sense(wrong):
-    with pytest.raises(CFlowError, match=next(iter(wrong)) if wrong != {"proof": False} else "part of proof"):
+    with pytest.raises(CFlowError, match=next(iter(wrong))):
         Config(**{**ALL, **wrong})
+
+
+def test_parts_of_the_proof_mean_nothing_without_it():
+    # So that `proof=False` is all that there is to say.
+    parts = {"proof_z": 5.0, "clearance": None, "children": False, "aperture": False, "relocate": False, "yaw": False}
+    with_parts, without = model(proof=False), model(proof=False, **parts)
+    assert all(getattr(with_parts.config, name) != value for name, value in parts.items())
+    (one,), (other,) = with_parts([scene(0)]), without([scene(0)])
+    assert one.residual_flow.any()
+    assert_same(one, other)
+    grid = Grid(0.1, ALL["point_cloud_range"][:3], ALL["point_cloud_range"][3:])
+    assert make_batch([scene(0)], with_parts.config, grid).ground is None
 
 
 def test_a_wall_that_seems_to_slide_stands_still():

@@ -20,6 +20,7 @@ PACKAGE = Path(cflow_torch.__file__).parent
 # Who may import whom: only modules of the same or a smaller number. A new module needs a place here.
 LAYERS = {
     "types": 0,
+    "checks": 0,
     "config": 0,
     "configs": 0,  # YAML; part of an installed package only
     "ops": 1,

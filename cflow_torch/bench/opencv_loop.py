@@ -12,7 +12,8 @@ from typing import Any, List, NamedTuple, Sequence, Tuple
 import numpy as np
 import torch
 
-from cflow_torch.config import DENSE_ONLY, Config
+from cflow_torch.checks import DENSE_ONLY
+from cflow_torch.config import Config
 from cflow_torch.types import CFlowError, FlowResult, Sweep, Window
 
 _SQUARE = np.ones((3, 3), np.uint8)
