@@ -166,11 +166,11 @@ def make_batch(windows: Sequence[Window], config: Config, grid: Grid, device: An
             with torch.inference_mode(False):  # becomes part of the result
                 pose_flow = torch.zeros((sweep.points.shape[0], 3), dtype=torch.float32, device=chosen_device)
             sources.append(Source(slice(start, start + len(pose_flow)), pose_flow))
-        for rows, raw, moved, inside, is_ground in _pieces(
+        for rows, raw, moved, inside, ground_inside in _pieces(
             sweep, name, transform, 3 if step == 1 else num_axes, grid, chosen_device
         ):
-            if ground is not None and is_ground is not None and step <= 1:
-                add_ground(ground, index, moved.index_select(1, flat_nonzero(is_ground)), grid)
+            if ground is not None and ground_inside is not None and step <= 1:
+                add_ground(ground, index, moved.index_select(1, flat_nonzero(ground_inside)), grid)
             if step == 1:  # all rows
                 points = slice(stop, stop + inside.numel())
                 positions[:, points] = moved[:num_axes]
@@ -205,7 +205,8 @@ def _pieces(
     """A sweep piece by piece.
 
     Yields:
-        Rows; (3, N) positions as given; (A or 3, N) in the frame of t+1; (N,) takes part; (N,) is ground, if known.
+        Rows; (3, N) positions as given; (A or 3, N) in the frame of t+1; (N,) takes part; (N,) is ground
+        inside the region, if known.
     """
     num_points = sweep.points.shape[0]
     is_ground = None if sweep.is_ground is None else read_ground(sweep, name, num_points, device)
@@ -217,9 +218,10 @@ def _pieces(
         raw = read_positions(sweep, device, rows)
         moved = compensate(raw, matrix, max(num_axes, checked_axes))
         inside = grid.contains(moved[:checked_axes])
-        if is_ground is not None:
-            inside &= ~is_ground[rows]
-        yield rows, raw, moved, inside, None if is_ground is None else is_ground[rows]
+        if is_ground is None:
+            yield rows, raw, moved, inside, None
+        else:
+            yield rows, raw, moved, inside & ~is_ground[rows], inside & is_ground[rows]
 
 
 def _write_pose_flow(pose_flow: Tensor, raw: Tensor, moved: Tensor) -> None:

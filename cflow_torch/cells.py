@@ -10,8 +10,9 @@ from torch import Tensor
 
 from cflow_torch.batch import Batch
 from cflow_torch.grid import Grid
-from cflow_torch.low_columns import drop_low_columns, ground_heights
-from cflow_torch.ops.indices import flat_nonzero, split_index
+from cflow_torch.low_columns import TALL, empty_low_columns, ground_heights, is_tall
+from cflow_torch.ops.chunks import chunks
+from cflow_torch.ops.indices import flat_nonzero, occupied, split_index
 from cflow_torch.types import CFlowError
 
 NUM_SLICES = 4
@@ -71,21 +72,15 @@ class Cells:
         number = torch.full_like(self.image, self.pixel.numel(), dtype=torch.int32)
         return number.scatter_(0, self.pixel, torch.arange(self.pixel.numel(), device=number.device).int())
 
-    def without(self, dropped: Tensor) -> Cells:
-        """The cells that are left when some pixels are emptied.
+    def number_at_t(self) -> Tensor:
+        """The same for points of sweep t: undefined for what is empty and for other sweeps, P at the last place.
 
-        Args:
-            dropped: (P,) bool.
+        Cost: that of the pixels of t; the rest is not touched.
         """
-        image = self.image.index_fill(0, self.pixel.index_select(0, flat_nonzero(dropped)), 0)
-        kept = flat_nonzero(~dropped)
-        lists = (self.pixel, self.window, self.step, self.row, self.col, self.slices)
-        parts = (values.index_select(0, kept) for values in lists)
-        return Cells(self.grid, self.num_windows, self.num_steps, image, *parts)
-
-    def place_of_points(self, place: Tensor) -> Tensor:
-        """(N,) int64 places of points, those on an empty pixel moved to the last entry: they belong nowhere."""
-        return torch.where(self.look_up(place) != 0, place, self.image.numel() - 1)
+        number = torch.empty_like(self.image, dtype=torch.int32)
+        at_t = flat_nonzero(self.step == 1)
+        number[-1:] = self.pixel.numel()
+        return number.scatter_(0, self.pixel.index_select(0, at_t), at_t.int())
 
 
 def make_cells(
@@ -98,7 +93,7 @@ def make_cells(
         grid: the finest BEV.
         slice_height: metres.
         clearance: metres; pixels that do not stand out of the ground of the batch by this much are left out, see
-            `drop_low_columns`. None = all are drawn.
+            `empty_low_columns`. None = all are drawn.
 
     Returns:
         cells: of all windows.
@@ -115,14 +110,23 @@ def make_cells(
     """
     if len(batch.positions) != 3:
         raise CFlowError("height slices need z: make the batch with three axes")
-    num_images = batch.num_windows * batch.num_steps
-    place = grid.pixel_of_image(batch.positions, batch.image, num_images, batch.takes_part).long()
-    if clearance is not None and batch.ground is not None:
-        heights = ground_heights(batch.ground)
-        place = drop_low_columns(place, batch.positions, heights, grid, batch.num_steps, clearance)
-    part = slice_of(batch.positions[2], slice_height)  # of rows that take no part anything: they are drawn nowhere
-    image = draw_slices(place, part, num_images * grid.height * grid.width)
-    return cells_of_image(image, grid, batch.num_windows, batch.num_steps), place
+    num_images, num_points, device = batch.num_windows * batch.num_steps, batch.image.numel(), batch.image.device
+    heights = None if clearance is None or batch.ground is None else ground_heights(batch.ground)
+    image = torch.zeros(num_images * grid.height * grid.width + 1, dtype=torch.uint8, device=device)
+    place = torch.empty(num_points, dtype=torch.int64, device=device)
+    for points in chunks(0, num_points, device):
+        positions, takes_part = batch.positions[:, points], batch.takes_part[points]
+        place[points] = at = grid.pixel_of_image(positions, batch.image[points], num_images, takes_part).long()
+        # Rows that take no part have any slice: what they draw is wiped off.
+        draw_slices(image, at, slice_of(positions[2], slice_height))
+        if heights is not None and clearance is not None:
+            draw_bit(image, is_tall(at, positions, heights, grid, batch.num_steps, clearance), TALL)
+    image[-1:] = 0
+    pixel = occupied(image)
+    if heights is not None:
+        pixel = empty_low_columns(image, pixel, grid)
+        place = torch.where(image.index_select(0, place) != 0, place, image.numel() - 1)
+    return _listed(image, pixel, grid, batch.num_windows, batch.num_steps), place
 
 
 def slice_of(z: Tensor, slice_height: float) -> Tensor:
@@ -132,24 +136,21 @@ def slice_of(z: Tensor, slice_height: float) -> Tensor:
     return (layer.long() & (NUM_SLICES - 1)).to(torch.uint8)
 
 
-def draw_slices(place: Tensor, part: Tensor, num_pixels: int) -> Tensor:
-    """Images with a bit for every slice that a point lies in.
+def draw_slices(image: Tensor, place: Tensor, part: Tensor) -> None:
+    """Set a bit for every slice that a point lies in.
 
     Args:
-        place: (N,) int64, pixel of each point, `num_pixels` for those that are nowhere.
+        image: (Q,) uint8, drawn into.
+        place: (N,) int64, where in it each point lies.
         part: (N,) uint8, slice of each point.
-        num_pixels: pixels of all images.
-
-    Returns:
-        (num_pixels + 1,) uint8, the last entry 0. A pass per slice: within a pass all points of a pixel write the same
-        value, so their order does not matter.
     """
-    image = torch.zeros(num_pixels + 1, dtype=torch.uint8, device=place.device)
     for index in range(NUM_SLICES):
-        at = place.index_select(0, flat_nonzero(part == index))
-        image.index_copy_(0, at, image.index_select(0, at).bitwise_or_(1 << index))
-    image[-1:] = 0
-    return image
+        draw_bit(image, place.index_select(0, flat_nonzero(part == index)), 1 << index)
+
+
+def draw_bit(image: Tensor, place: Tensor, bit: int) -> None:
+    """Set a bit of an image at some places. What is written at a place is the same for all, so order means nothing."""
+    image.index_copy_(0, place, image.index_select(0, place).bitwise_or_(bit))
 
 
 def cells_of_image(image: Tensor, grid: Grid, num_windows: int, num_steps: int) -> Cells:
@@ -160,7 +161,11 @@ def cells_of_image(image: Tensor, grid: Grid, num_windows: int, num_steps: int) 
         grid: the BEV.
         num_windows, num_steps: B, S.
     """
-    pixel = flat_nonzero(image != 0)
+    return _listed(image, occupied(image), grid, num_windows, num_steps)
+
+
+def _listed(image: Tensor, pixel: Tensor, grid: Grid, num_windows: int, num_steps: int) -> Cells:
+    """The same, where its occupied pixels are known."""
     of_image, within = split_index(pixel, grid.height * grid.width)
     window, step = split_index(of_image, num_steps)
     row, col = split_index(within, grid.width)

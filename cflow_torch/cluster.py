@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import reduce
-from typing import Tuple
+from typing import NamedTuple, Tuple
 
 import torch
 from torch import Tensor
 
+from cflow_torch.components import Places, components, components_by_size
 from cflow_torch.config import Config
 from cflow_torch.ops.indices import divide, flat_nonzero, split_index
-from cflow_torch.ops.labeling import connected_components_kornia, label_blocks, pad
-from cflow_torch.ops.morphology import close_3x3, dilate_3x3_kornia, erode_3x3_kornia
-from cflow_torch.ops.segments import bounding_boxes, first_of_segment, segment_ends
+from cflow_torch.ops.labeling import pad
+from cflow_torch.ops.segments import bounding_boxes, segment_ends
 
 
 @dataclass(frozen=True)
@@ -64,41 +64,74 @@ class Clusters:
         return torch.arange(self.window.numel(), device=start.device) - start
 
 
-def cluster(occupancy: Tensor, pixel_size: float, config: Config, reach: int = 3) -> Tuple[Clusters, Tensor]:
+class Columns(NamedTuple):
+    """Pixels that are occupied in any sweep, by window, in raster order.
+
+    Args:
+        window: (Q,) int64.
+        pixel: (Q,) int64, row * W + col.
+        cluster: (Q,) int64, M = none.
+    """
+
+    window: Tensor
+    pixel: Tensor
+    cluster: Tensor
+
+
+def cluster(occupancy: Tensor, pixel_size: float, config: Config) -> Tuple[Clusters, Tensor]:
     """Alg. clustering, from the projection of the aggregated sweeps on: dilate, label, validate by size.
 
     Args:
-        occupancy: (B, S, H, W) bool, image of every sweep; index 0 of S is sweep t+1.
-        pixel_size: s, metres.
-        config: `connectivity`, `max_extent` (d^max), `labeling`.
-        reach: 3 = Alg. clustering; 1 = plain components: neither dilated nor validated by size.
+        occupancy, pixel_size, config: as for `find_clusters`.
 
     Returns:
         clusters: those of all B windows.
         of_pixel: (B * S * H * W + 1,) int32, cluster of each occupied pixel of each sweep, M = none; the last entry, M,
             is for points that are nowhere. Undefined for empty pixels.
+    """
+    _, num_steps, height, width = occupancy.shape
+    area = height * width
+    clusters, columns = find_clusters(occupancy, pixel_size, config)
+    of_pixel = torch.empty(occupancy.numel() + 1, dtype=torch.int32, device=occupancy.device)
+    place = torch.add(columns.pixel, columns.window, alpha=num_steps * area)
+    number_of_pixel = columns.cluster.int()
+    for index in range(num_steps):
+        of_pixel[index * area :].scatter_(0, place, number_of_pixel)
+    of_pixel[-1:] = clusters.window.numel()
+    return clusters, of_pixel
+
+
+def find_clusters(images: Tensor, pixel_size: float, config: Config, reach: int = 3) -> Tuple[Clusters, Columns]:
+    """The clusters of images, and where they are.
+
+    Args:
+        images: (B, S, H, W) bool, or uint8 that is 0 where nothing is, of every sweep; index 0 of S is sweep t+1.
+        pixel_size: s, metres.
+        config: `connectivity`, `max_extent` (d^max), `labeling`.
+        reach: 3 = Alg. clustering; 1 = plain components: neither dilated nor validated by size.
 
     Convention:
         Clusters never join across windows. Both engines give the same clusters.
 
     Source: Alg. clustering.
     """
-    _, num_steps, height, width = occupancy.shape
+    _, num_steps, height, width = images.shape
     area = height * width
-    aggregated = pad(occupancy.unbind(1))
+    aggregated = pad(images.unbind(1))
     pixels = flat_nonzero(aggregated)
     padded_row, col = split_index(pixels, aggregated.shape[2])
     window, row = split_index(padded_row, aggregated.shape[1])
-    places = _Places(pixels, padded_row, row, col)
+    places = Places(pixels, padded_row, row, col)
     if reach == 1:
-        component, num_components = _components(aggregated, places, 1, config)
+        component, num_components = components(aggregated, places, 1, config)
     else:
-        component, num_components = _label(aggregated, height, width, places, pixel_size, config)
+        component, num_components = components_by_size(aggregated, height, width, places, pixel_size, config)
 
     # Which sweeps saw each pixel. Sweep m lies m images behind t+1.
-    place = torch.add(col, row, alpha=width).add_(window, alpha=num_steps * area)
-    images = occupancy.flatten()
-    seen = torch.stack([images[index * area :].index_select(0, place) for index in range(num_steps)])
+    pixel_in_window = torch.add(col, row, alpha=width)
+    place = torch.add(pixel_in_window, window, alpha=num_steps * area)
+    flat = images.flatten()
+    seen = torch.stack([flat[index * area :].index_select(0, place) for index in range(num_steps)]).bool()
     newest, *older = seen.unbind(0)
     before = reduce(torch.bitwise_or, older, torch.zeros_like(newest))
     live = flat_nonzero(_can_move(component, num_components, newest, before))
@@ -118,33 +151,7 @@ def cluster(occupancy: Tensor, pixel_size: float, config: Config, reach: int = 3
         torch.stack((bottom - top, right - left), 1).add_(1),
         Pixels(cluster.index_select(0, pixel), step, row.index_select(0, pixel), col.index_select(0, pixel)),
     )
-    of_pixel = torch.empty(occupancy.numel() + 1, dtype=torch.int32, device=pixels.device)
-    number_of_pixel = cluster.int()
-    for index in range(num_steps):
-        of_pixel[index * area :].scatter_(0, place, number_of_pixel)
-    of_pixel[-1:] = live.numel()
-    return clusters, of_pixel
-
-
-def label_components(image: Tensor, pixels: Tensor, pixel_size: float, config: Config) -> Tensor:
-    """Components of a dilated image, the oversized ones eroded and labelled again (Alg. clustering).
-
-    Args:
-        image: (B, H, W) bool.
-        pixels: (P,) int64, flat indices of its set pixels, ascending.
-        pixel_size: s, metres.
-        config: `connectivity`, `max_extent` (d^max), `labeling`.
-
-    Returns:
-        (P,) int64: the position in `pixels` of the first (in raster order) pixel of the same component.
-    """
-    _, height, width = image.shape
-    padded = pad([image])
-    image_row, col = split_index(pixels, width)
-    window, row = split_index(image_row, height)
-    padded_row = torch.add(row, window, alpha=padded.shape[1])
-    places = _Places(torch.add(col, padded_row, alpha=padded.shape[2]), padded_row, row, col)
-    return first_of_segment(*_label(padded, height, width, places, pixel_size, config))
+    return clusters, Columns(window, pixel_in_window, cluster)
 
 
 def keep_live(
@@ -192,57 +199,3 @@ def _numbers(live: Tensor, num_components: int) -> Tensor:
     """(C,) int64, place of each component in `live` (M,), M = it is not there."""
     number = torch.full((num_components,), live.numel(), dtype=torch.int64, device=live.device)
     return number.scatter_(0, live, torch.arange(live.numel(), device=live.device))
-
-
-@dataclass(frozen=True)
-class _Places:
-    """Where the set pixels of padded images are.
-
-    Args:
-        pixel: (P,) int64, flat index.
-        padded_row: (P,) int64, row, counted through all images.
-        row, col: (P,) int64, row and column in the image.
-    """
-
-    pixel: Tensor
-    padded_row: Tensor
-    row: Tensor
-    col: Tensor
-
-
-def _label(
-    padded: Tensor, height: int, width: int, places: _Places, pixel_size: float, config: Config
-) -> Tuple[Tensor, int]:
-    """Component, under any name, of the set pixels of padded images of height x width, and more than the largest.
-
-    All oversized components are eroded together: components of a dilated image do not share a 3 x 3 neighbourhood
-    that lies in their union, so none sees another.
-    """
-    dilated = dilate_3x3_kornia(padded) if config.labeling == "kornia" else padded
-    component, count = _components(dilated, places, 3, config)
-    top, bottom = segment_ends(places.row, component, count)
-    left, right = segment_ends(places.col, component, count)
-    # The dilation adds a pixel on every side, cut off at the border.
-    num_rows = bottom.clamp_(max=height - 2).sub_(top.clamp_(min=1))
-    num_cols = right.clamp_(max=width - 2).sub_(left.clamp_(min=1))
-    extent = torch.maximum(num_rows, num_cols).add_(3)
-    is_oversized = extent.double() * pixel_size > config.max_extent
-    if not is_oversized.any():
-        return component, count
-
-    oversized = is_oversized.index_select(0, component)
-    alone = torch.zeros_like(padded).view(-1).scatter_(0, places.pixel, oversized).view_as(padded)
-    if config.labeling == "kornia":
-        closed = pad([erode_3x3_kornia(dilate_3x3_kornia(alone[:, :height, :width]))])
-    else:
-        closed = close_3x3(alone, height, width)
-    part, num_parts = _components(closed, places, 1, config)
-    return torch.where(oversized, part.add_(count), component), count + num_parts
-
-
-def _components(padded: Tensor, places: _Places, reach: int, config: Config) -> Tuple[Tensor, int]:
-    """Component of pixels of padded images (kornia: dilated ones if `reach` is 3), and more than the largest."""
-    if config.labeling == "kornia":
-        return connected_components_kornia(padded, places.pixel, config.connectivity), places.pixel.numel()
-    blocks = label_blocks(padded, config.connectivity, reach)
-    return blocks.of_pixel(places.padded_row, places.col), blocks.num_components

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from cflow_torch.cluster import label_components
+from cflow_torch.components import label_components
 from cflow_torch.config import Config
 from cflow_torch.match import Matches
 from cflow_torch.ops.indices import flat_nonzero

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from cflow_torch.cells import NUM_SLICES, Cells
-from cflow_torch.cluster import Clusters, cluster
+from cflow_torch.cluster import Clusters, find_clusters
 from cflow_torch.config import Config
 from cflow_torch.ops.indices import divide, flat_nonzero
 from cflow_torch.ops.segments import bounding_boxes, segment_amin
@@ -54,12 +54,14 @@ def make_level(cells: Cells, block: int, reach: int, max_object: float, config: 
 
     Cost: as `cluster`, and some passes over the images of this level and the finest pixels.
     """
-    image, place = _coarsen(cells, block)
     height, width = -(-cells.grid.height // block), -(-cells.grid.width // block)
-    occupancy = image[:-1].bool().view(cells.num_windows, cells.num_steps, height, width)
-    clusters, of_place = cluster(occupancy, cells.grid.pixel_size * block, config, reach)
-    node = of_place.index_select(0, place).long()
-    num_components = clusters.window.numel()
+    image, column = _coarsen(cells, block, height, width)
+    images = image[:-1].view(cells.num_windows, cells.num_steps, height, width)
+    clusters, columns = find_clusters(images, cells.grid.pixel_size * block, config, reach)
+    num_components, area = clusters.window.numel(), height * width
+    of_column = torch.empty(cells.num_windows * area, dtype=torch.int64, device=column.device)
+    of_column.scatter_(0, torch.add(columns.pixel, columns.window, alpha=area), columns.cluster)
+    node = of_column.index_select(0, column)  # empty columns are never asked for
     newest = flat_nonzero((cells.step == 0) & (node < num_components))
     row, col, component = (values.index_select(0, newest) for values in (cells.row, cells.col, node))
     _, size = bounding_boxes(row, col, component, num_components)  # every component has pixels at t+1
@@ -106,18 +108,20 @@ def equals_parent(node: Tensor, num_nodes: int, above: Tensor, num_above: int, p
     return (common == size) & (common == size_above.index_select(0, parent)) & (parent < num_above)
 
 
-def _coarsen(cells: Cells, block: int) -> Tuple[Tensor, Tensor]:
-    """Image of coarse pixels, as in `Level`, and (P,) int64 the place in it of each occupied finest pixel."""
+def _coarsen(cells: Cells, block: int, height: int, width: int) -> Tuple[Tensor, Tensor]:
+    """Image of coarse pixels, as in `Level`, and (P,) int64 the column of each occupied finest pixel.
+
+    A column is a coarse pixel whatever the sweep: (window * height + row) * width + col.
+    """
+    row, col = (cells.row, cells.col) if block == 1 else (divide(cells.row, block), divide(cells.col, block))
+    column = torch.add(col, torch.add(row, cells.window, alpha=height), alpha=width)
     if block == 1:
-        return cells.image, cells.pixel
-    height, width = -(-cells.grid.height // block), -(-cells.grid.width // block)
-    place = torch.add(cells.step, cells.window, alpha=cells.num_steps)
-    place = torch.add(divide(cells.row, block), place, alpha=height)
-    place = torch.add(divide(cells.col, block), place, alpha=width)
-    num_pixels = cells.num_windows * cells.num_steps * height * width
-    image = torch.zeros(num_pixels + 1, dtype=torch.uint8, device=place.device)
+        return cells.image, column
+    area = height * width
+    place = torch.add(column, torch.add(cells.step, cells.window, alpha=cells.num_steps - 1), alpha=area)
+    image = torch.zeros(cells.num_windows * cells.num_steps * area + 1, dtype=torch.uint8, device=place.device)
     # A pass per slice: within a pass all pixels of a block write the same value, so their order does not matter.
     for index in range(NUM_SLICES):
         at = place.index_select(0, flat_nonzero((cells.slices & (1 << index)).bool()))
         image.index_copy_(0, at, image.index_select(0, at).bitwise_or_(1 << index))
-    return image, place
+    return image, column

@@ -21,6 +21,8 @@ _BLOCK = 2.0
 _LEAST_POINTS = 5
 # How far from a tall pixel a low one still belongs to its object, pixels.
 _REACH = 2
+# Bit of a pixel with a point that stands out of the ground, above those of its slices.
+TALL = 16
 # Heights are whole centimetres, bounded so that no sum overflows; unknown ground lies deeper than any point.
 _HIGHEST = 10**6
 _UNKNOWN = -(1 << 40)
@@ -37,13 +39,12 @@ def add_ground(sums: Tensor, window: int, positions: Tensor, grid: Grid) -> None
     Args:
         sums: (2, B, Y, X) int64, as made by `no_ground`; changed in place.
         window: index of the window.
-        positions: (3, N) float64, metres, frame of t+1; what lies outside the region, or is not finite, does not count.
+        positions: (3, N) float64, metres, frame of t+1, inside the region.
         grid: the region.
 
     Convention: sums of integers, so neither the order of the points nor that of the pieces matters.
     Cost: linear in N.
     """
-    positions = positions.index_select(1, flat_nonzero(grid.contains(positions)))
     block = _block(positions, grid)
     heights, count = sums[:, window].view(2, -1).unbind(0)
     heights.index_add_(0, block, _centimetres(positions[2]))
@@ -73,13 +74,8 @@ def ground_heights(sums: Tensor) -> Tensor:
     return torch.where(count >= _LEAST_POINTS, mean, torch.full_like(mean, _UNKNOWN))
 
 
-def drop_low_columns(
-    place: Tensor, positions: Tensor, ground: Tensor, grid: Grid, num_steps: int, clearance: float
-) -> Tensor:
-    """Pixel of every point, without the pixels that are ground.
-
-    A pixel stays if a point on it, or on a pixel of the same sweep at most two rows and two columns away, lies
-    `clearance` or more above the ground of the block that the point is in. Without ground points nothing is dropped.
+def is_tall(place: Tensor, positions: Tensor, ground: Tensor, grid: Grid, num_steps: int, clearance: float) -> Tensor:
+    """Where points lie that stand out of the ground.
 
     Args:
         place: (P,) int64, flat index into (B, S, H, W) images; B * S * H * W for points that are left out.
@@ -90,42 +86,59 @@ def drop_low_columns(
         clearance: metres; used to the centimetre.
 
     Returns:
-        (P,) int64, as `place`; points on dropped pixels are left out.
+        (K,) int64, places of the points that lie `clearance` or more above the ground of the block that they are in;
+        places come again if several do.
 
     Convention: heights are compared in whole centimetres, each rounded down.
-    Cost: some ten passes over the points and 25 look-ups for every pixel without a tall point.
+    Cost: some ten passes over the points.
     """
     area = grid.height * grid.width
-    nowhere = len(ground) * num_steps * area
-    present = flat_nonzero(place < nowhere)
-    pixel, inside = place.index_select(0, present), positions.index_select(1, present)
+    present = flat_nonzero(place < len(ground) * num_steps * area)
+    place, inside = place.index_select(0, present), positions.index_select(1, present)
     rows, cols = ground.shape[1:]
-    block = torch.add(_block(inside, grid), divide(pixel, num_steps * area), alpha=rows * cols)
-    is_high = _centimetres(inside[2]) - ground.reshape(-1).index_select(0, block) >= round(100 * clearance)
-
-    empty = torch.zeros(nowhere + 1, dtype=torch.bool, device=place.device)
-    tall = empty.index_fill(0, pixel.index_select(0, flat_nonzero(is_high)), True)
-    low = empty.index_fill_(0, pixel, True).logical_and_(~tall)
-    lone = flat_nonzero(low)
-    lone = lone.index_select(0, flat_nonzero(~_is_near(tall, lone, grid)))
-    dropped = low.fill_(False).index_fill_(0, lone, True)
-    return torch.where(dropped.index_select(0, place), nowhere, place)
+    block = torch.add(_block(inside, grid), divide(place, num_steps * area), alpha=rows * cols)
+    height = _centimetres(inside[2]) - ground.reshape(-1).index_select(0, block)
+    return place.index_select(0, flat_nonzero(height >= round(100 * clearance)))
 
 
-def _is_near(tall: Tensor, pixels: Tensor, grid: Grid) -> Tensor:
+def empty_low_columns(image: Tensor, pixel: Tensor, grid: Grid) -> Tensor:
+    """Empty the pixels that are ground, and take all marks of tall ones off.
+
+    A pixel stays if it is tall, or one of the same sweep at most two rows and two columns away is.
+
+    Args:
+        image: (B * S * H * W + 1,) uint8, bits of the slices of each pixel, and `TALL` where a point is tall; the last
+            entry, 0, is for whatever lies outside. Changed in place.
+        pixel: (P,) int64, flat indices of its occupied pixels, ascending.
+        grid: of the images.
+
+    Returns:
+        Those of them that stay.
+
+    Cost: 25 look-ups for every pixel without a tall point.
+    """
+    slices = image.index_select(0, pixel)
+    low = pixel.index_select(0, flat_nonzero(slices < TALL))
+    lone = low.index_select(0, flat_nonzero(~_is_near_tall(image, low, grid)))
+    image.index_copy_(0, pixel, slices.bitwise_and_(TALL - 1))
+    image.index_fill_(0, lone, 0)
+    return pixel.index_select(0, flat_nonzero(image.index_select(0, pixel)))
+
+
+def _is_near_tall(image: Tensor, pixels: Tensor, grid: Grid) -> Tensor:
     """(K,) bool: is a tall pixel at most `_REACH` rows and columns away from each of these flat indices?"""
     image_row, col = split_index(pixels, grid.width)
-    image, row = split_index(image_row, grid.height)
-    first = image * (grid.height * grid.width)
+    number, row = split_index(image_row, grid.height)
+    first = number * (grid.height * grid.width)
     reach = range(-_REACH, _REACH + 1)
     # Beyond the border the border's pixel is looked up, which is as near.
     cols = [(col + right).clamp_(0, grid.width - 1) for right in reach]
-    near = torch.zeros_like(pixels, dtype=torch.bool)
+    highest = torch.zeros(len(pixels), dtype=torch.uint8, device=pixels.device)
     for down in reach:
         start = torch.add(first, (row + down).clamp_(0, grid.height - 1), alpha=grid.width)
         for other_col in cols:
-            near |= tall.index_select(0, start + other_col)
-    return near
+            highest = torch.maximum(highest, image.index_select(0, start + other_col))
+    return highest >= TALL
 
 
 def _num_blocks(grid: Grid) -> Tuple[int, int]:

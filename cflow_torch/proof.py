@@ -55,8 +55,9 @@ def prove_motion(batch: Batch, grid: Grid, config: Config) -> Motion:
         groups = choose_groups([one.level.node for one in judged], [one.worth for one in judged])
         motion = torch.cat([one.motion for one in judged]).index_select(0, groups.component)
     with record_function("refine"):
-        rigid = _settle(motion, groups, cells, place, batch, config)
-    return _by_pixel(rigid, groups, judged[-1].score, cells, place)
+        number = cells.number() if config.relocate or config.yaw else cells.number_at_t()
+        rigid = _settle(motion, groups, cells, place, number, batch, config)
+    return _by_pixel(rigid, groups, judged[-1].score, cells, place, number)
 
 
 def _levels(config: Config) -> List[Tuple[int, int]]:
@@ -113,13 +114,19 @@ def _judge_level(
     return _Judged(level, motion, best, score)
 
 
-def _settle(motion: Tensor, groups: Groups, cells: Cells, place: Tensor, batch: Batch, config: Config) -> RigidMotion:
-    """Motion of G groups, metres, from (G, 2) float64 (y, x), finest pixels per sweep interval."""
+def _settle(
+    motion: Tensor, groups: Groups, cells: Cells, place: Tensor, number: Tensor, batch: Batch, config: Config
+) -> RigidMotion:
+    """Motion of G groups, metres, from (G, 2) float64 (y, x), finest pixels per sweep interval.
+
+    Args:
+        place: of every point.
+        number: of the pixel at every place, `Cells.number` if anything is to be done.
+    """
     grid, num_groups = cells.grid, len(motion)
     still = torch.zeros_like(motion)
     moves = F.pad(motion.any(1), (0, 1))
     if (config.relocate or config.yaw) and bool(moves.any()):
-        number = cells.number()
         of_pixel = torch.where(moves.index_select(0, groups.of_pixel), groups.of_pixel, num_groups)
         points = moving_points(batch, place, number, of_pixel, num_groups, config.slice_height)
         if config.relocate:  # with history one of many sweeps would decide
@@ -133,7 +140,7 @@ def _settle(motion: Tensor, groups: Groups, cells: Cells, place: Tensor, batch: 
     return RigidMotion(motion.flip(1) * grid.pixel_size, still[:, 0], still)
 
 
-def _by_pixel(rigid: RigidMotion, groups: Groups, score: Tensor, cells: Cells, place: Tensor) -> Motion:
+def _by_pixel(rigid: RigidMotion, groups: Groups, score: Tensor, cells: Cells, place: Tensor, number: Tensor) -> Motion:
     """The motion of G groups, and (P,) scores, as `Motion` wants them: by occupied pixel; its cluster M is P."""
     window = cells.window.index_select(0, groups.first)
     ids = torch.arange(window.numel(), device=window.device) - torch.searchsorted(window, window)
@@ -141,7 +148,7 @@ def _by_pixel(rigid: RigidMotion, groups: Groups, score: Tensor, cells: Cells, p
     flow = F.pad(rigid.flow, (0, 1, 0, 1)).index_select(0, group) + 0.0  # + 0.0 turns -0.0 into 0.0
     turn, centre = F.pad(rigid.turn, (0, 1)), F.pad(rigid.centre, (0, 0, 0, 1))
     return Motion(
-        of_place=cells.number(),
+        of_place=number,
         place=place,
         flow=flow,
         cluster_id=F.pad(ids, (0, 1), value=-1).index_select(0, group),

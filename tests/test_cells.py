@@ -83,6 +83,8 @@ def test_the_list_says_where_the_occupied_pixels_are():
     number = cells.number()
     assert number[cells.pixel].tolist() == list(range(cells.pixel.numel()))
     assert set(number[cells.image == 0].tolist()) == {cells.pixel.numel()}
+    at_t = torch.cat((cells.pixel[cells.step == 1], cells.pixel.new_tensor([cells.image.numel() - 1])))
+    assert same_bits(cells.number_at_t()[at_t], number[at_t])
 
 
 def test_what_lies_outside_the_image_is_empty():
@@ -118,21 +120,6 @@ def test_batch_equals_loop():
         assert not images(together)[index, alone.num_steps :].any()
 
 
-def test_without_some_pixels():
-    cells, place = make_cells(with_heights([scene(6, num_history=1)]), GRID, SLICE)
-    before = cells.image.clone()
-    dropped = torch.from_numpy(np.random.default_rng(1).random(cells.pixel.numel()) < 0.3)
-    fewer = cells.without(dropped)
-    assert same_bits(cells.image, before)  # the old cells are as they were
-    assert fewer.pixel.tolist() == [p for p, d in zip(cells.pixel.tolist(), dropped.tolist()) if not d]
-    assert same_bits(fewer.image[fewer.pixel], fewer.slices) and int((fewer.image != 0).sum()) == fewer.pixel.numel()
-    for name in LISTS:
-        assert same_bits(getattr(fewer, name), getattr(cells, name)[~dropped]), name
-    gone = set(cells.pixel[dropped].tolist())
-    nowhere = cells.image.numel() - 1
-    assert fewer.place_of_points(place).tolist() == [nowhere if p in gone else p for p in place.tolist()]
-
-
 def test_slices_of_heights_by_hand():
     z = torch.tensor(
         [0.0, 0.49, 0.5, 1.0, 1.99, 2.0, -0.01, -0.5, -0.51, -2.0, 1e300, -1e300, 2.0**53], dtype=torch.float64
@@ -145,7 +132,10 @@ def test_slices_of_heights_by_hand():
 
 def test_slices_of_a_pixel_are_or_ed():
     place, part = torch.tensor([2, 2, 0, 2, 3, 2]), torch.tensor([0, 3, 1, 0, 2, 0], dtype=torch.uint8)
-    assert draw_slices(place, part, 3).tolist() == [2, 0, 9, 0]
+    image = torch.zeros(4, dtype=torch.uint8)
+    draw_slices(image, place[:3], part[:3])
+    draw_slices(image, place[3:], part[3:])
+    assert image.tolist() == [2, 0, 9, 4]
 
 
 def test_set_slices_are_counted():
@@ -158,7 +148,6 @@ def test_nothing_to_draw():
     cells, place = make_cells(with_heights([Window(nothing, nothing)]), GRID, SLICE)
     assert not cells.image.any() and place.shape == (0,) and cells.num_steps >= 1
     assert all(getattr(cells, name).shape == (0,) for name in LISTS)
-    assert cells.without(torch.zeros(0, dtype=torch.bool)).pixel.shape == (0,)
     assert set(cells.number().tolist()) == {0}
 
 

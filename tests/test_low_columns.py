@@ -13,7 +13,7 @@ from cflow_torch.config import Config
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.log import window as window_of_log
 from cflow_torch.grid import Grid
-from cflow_torch.low_columns import add_ground, drop_low_columns, ground_heights, no_ground
+from cflow_torch.low_columns import TALL, add_ground, empty_low_columns, ground_heights, is_tall, no_ground
 
 SIZE = 0.25
 GRID = Grid(SIZE, RANGE[:3], RANGE[3:])
@@ -44,8 +44,22 @@ def heights_of(scenes, order=lambda points: points, device="cpu") -> torch.Tenso
     sums = no_ground(len(scenes), GRID, torch.device(device))
     for window, (ground, _) in enumerate(scenes):
         for points in ground:
-            add_ground(sums, window, torch.from_numpy(order(points).T.copy()).to(device), GRID)
+            positions = torch.from_numpy(order(points).T.copy()).to(device)
+            add_ground(sums, window, positions[:, GRID.contains(positions)], GRID)
     return ground_heights(sums)
+
+
+def drop_low_columns(place, positions, ground, grid, num_steps, clearance) -> torch.Tensor:
+    """(P,) int64, as `place`; points on pixels that are emptied are left out."""
+    image = torch.zeros(len(ground) * num_steps * grid.height * grid.width + 1, dtype=torch.uint8, device=place.device)
+    slices = torch.arange(len(place), device=place.device) % 15 + 1
+    image[place] = slices.to(torch.uint8)  # any
+    image[-1] = 0
+    before, tall = image.clone(), is_tall(place, positions, ground, grid, num_steps, clearance)
+    image[tall] = before[tall] | TALL
+    pixel = empty_low_columns(image, before.nonzero()[:, 0], grid)
+    assert pixel.tolist() == image.nonzero()[:, 0].tolist() and torch.equal(image[pixel], before[pixel])
+    return torch.where(image[place] != 0, place, len(image) - 1)
 
 
 def kept(scenes, num_steps: int, clearance: float = 0.4, device="cpu") -> list:
@@ -168,7 +182,8 @@ def test_the_real_pair(av2_folder):
     ]
     sums = no_ground(1, grid, torch.device("cpu"))
     for points in ground:
-        add_ground(sums, 0, torch.from_numpy(points.T.copy()), grid)
+        positions = torch.from_numpy(points.T.copy())
+        add_ground(sums, 0, positions[:, grid.contains(positions)], grid)
     after = drop_low_columns(place, batch.positions, ground_heights(sums), grid, 2, 0.4)
     means = ref.ground_heights(ground, settings)
     for step in (0, 1):

@@ -44,6 +44,7 @@ LAYERS = {
     "candidates": 2,
     "cells": 2,
     "cluster": 2,
+    "components": 2,
     "correlate": 2,
     "density": 2,
     "displacement": 2,

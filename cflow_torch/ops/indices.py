@@ -8,6 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from cflow_torch.ops.chunks import chunks
+
 
 def flat_nonzero(mask: Tensor) -> Tensor:
     """Flat indices of the set elements, ascending: `mask.flatten().nonzero()[:, 0]`.
@@ -24,6 +26,21 @@ def flat_nonzero(mask: Tensor) -> Tensor:
     if mask.device.type == "cpu":
         return torch.from_numpy(np.flatnonzero(mask.numpy()))
     return mask.flatten().nonzero()[:, 0]
+
+
+def occupied(image: Tensor) -> Tensor:
+    """Flat indices of the elements that are not 0, ascending.
+
+    Args:
+        image: (N,) uint8, mostly 0.
+
+    Returns:
+        (K,) int64.
+
+    Cost: one pass over the image, with no copy of it as a mask; on a GPU, one synchronisation.
+    """
+    parts = [flat_nonzero(image[part] != 0).add_(part.start) for part in chunks(0, image.numel(), image.device)]
+    return torch.cat(parts) if parts else flat_nonzero(image != 0)
 
 
 def divide(index: Tensor, divisor: int) -> Tensor:

@@ -63,7 +63,7 @@ def pad(images: Sequence[Tensor]) -> Tensor:
     """Where any of some sets of images is set, with the free margin, right and below, that `label_blocks` needs.
 
     Args:
-        images: (B, H, W) bool each.
+        images: (B, H, W) bool each, or uint8 that is 0 where nothing is set.
 
     Returns:
         (B, H', W') bool.
@@ -71,8 +71,8 @@ def pad(images: Sequence[Tensor]) -> Tensor:
     first = images[0]
     num_images, height, width = first.shape
     padded = first.new_empty((num_images, padded_size(height), padded_size(width)))
-    padded[:, height:] = False
-    padded[:, :height, width:] = False
+    padded[:, height:] = 0
+    padded[:, :height, width:] = 0
     inside = padded[:, :height, :width]
     if len(images) == 1:
         inside.copy_(first)
@@ -80,7 +80,7 @@ def pad(images: Sequence[Tensor]) -> Tensor:
         torch.bitwise_or(first, images[1], out=inside)
     for more in images[2:]:
         inside |= more
-    return padded
+    return padded.bool()
 
 
 def padded_size(size: int) -> int:
