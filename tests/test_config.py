@@ -112,8 +112,8 @@ def test_height_slices_need_components():
         make_config("paper", height_slices=4, clustering="hdbscan")
 
 
-def test_options_beyond_the_paper_are_off_in_every_preset():
-    for name in PRESETS:
+def test_options_beyond_the_paper_are_off_for_the_paper_and_for_key_points():
+    for name in ("paper", "keypoints"):
         assert {key: getattr(make_config(name), key) for key in DENSE_ONLY} == DENSE_ONLY
 
 

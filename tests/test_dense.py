@@ -190,7 +190,7 @@ def test_sectional_view_finds_vertical_motion():
     rng = np.random.default_rng(2)
     pc0 = np.column_stack([rng.uniform(0, 3, 500), np.full(500, 1.0), rng.uniform(0, 2, 500)])
     motion = np.array([0.5, 0.0, -0.25])
-    settings = {"pixel_size": 0.25, "point_cloud_range": (-8, -8, -3, 8, 8, 3)}
+    settings = {"preset": "paper", "pixel_size": 0.25, "point_cloud_range": (-8, -8, -3, 8, 8, 3)}
     flat = estimate_flow(pc0, pc0 + motion, **settings)
     full = estimate_flow(pc0, pc0 + motion, sectional_view=True, **settings)
     assert np.array_equal(flat.residual_flow.numpy(), np.tile([0.5, 0, 0], (500, 1)))
@@ -202,7 +202,7 @@ def test_history_outvotes_one_bad_estimate():
     shape = street(np.random.default_rng(3))[1]
     at = [shape + [0.5 * step, 0.0, 0.0] for step in (0, -1, -2, -3, -4)]
     wrong = at[1] + [0.25, 0.0, 0.0]
-    settings = {"pixel_size": 0.25, "point_cloud_range": (-8, -8, -1, 8, 8, 3), "num_history": 3}
+    settings = {"preset": "paper", "pixel_size": 0.25, "point_cloud_range": (-8, -8, -1, 8, 8, 3), "num_history": 3}
     assert (estimate_flow(wrong, at[0], **settings).residual_flow[:, 0] == 0.25).all()
     with_history = estimate_flow(wrong, at[0], pch=at[2:], **settings)
     assert (with_history.residual_flow == torch.tensor([0.5, 0.0, 0.0])).all()
@@ -212,7 +212,9 @@ def test_coarse_to_fine_adds_up():
     """A truth of 0.9 m: half-way between the pixels of the first two scales, reached by the last."""
     pc0 = street(np.random.default_rng(4))[1]
     found = [
-        estimate_flow(pc0, pc0 + [0.9, 0, 0], pixel_sizes=sizes, point_cloud_range=(-8, -8, -1, 8, 8, 3)).residual_flow
+        estimate_flow(
+            pc0, pc0 + [0.9, 0, 0], preset="paper", pixel_sizes=sizes, point_cloud_range=(-8, -8, -1, 8, 8, 3)
+        ).residual_flow
         for sizes in [(0.8,), (0.8, 0.2), (0.8, 0.2, 0.1)]
     ]
     assert torch.allclose(found[0], torch.tensor([0.8, 0, 0]), atol=1e-6)
@@ -222,7 +224,7 @@ def test_coarse_to_fine_adds_up():
 
 def test_max_speed_bounds_the_flow():
     pc0 = street(np.random.default_rng(5))[1]
-    settings = {"pixel_size": 0.25, "point_cloud_range": (-8, -8, -1, 8, 8, 3)}
+    settings = {"preset": "paper", "pixel_size": 0.25, "point_cloud_range": (-8, -8, -1, 8, 8, 3)}
     assert (estimate_flow(pc0, pc0 + [1.0, 0, 0], **settings).residual_flow[:, 0] == 1.0).all()
     # 5 m/s in 0.1 s are 2 pixels; one more is allowed, the fourth is not.
     slow = estimate_flow(pc0, pc0 + [1.0, 0, 0], max_speed=5.0, **settings).residual_flow

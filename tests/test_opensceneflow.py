@@ -44,7 +44,8 @@ from cflow_torch.types import Sweep
 
 SMALL = {"pixel_sizes": [0.25], "point_cloud_range": list(RANGE), "max_extent": 5.0}
 VARIANTS: Dict[str, Dict[str, Any]] = {
-    "dense": {"method": "dense", "num_frames": 6, **SMALL},
+    "dense": {"method": "dense", "num_frames": 6, "proof": False, "height_slices": 0, **SMALL},
+    "proof": {"method": "dense", "num_frames": 6, **SMALL},  # the preset's
     "keypoints": {"method": "keypoints", "patch_size": 11, "ratio_threshold": 1.0, **SMALL, "pixel_sizes": [0.1]},
 }
 EGO_T_LIDAR = np.array([[0.8, -0.6, 0, 1.35], [0.6, 0.8, 0, 0.2], [0, 0, 1, 1.6], [0, 0, 0, 1]])
@@ -298,7 +299,7 @@ def core(folder: Path, variant: str, index: int, num_frames: int, ego_T_lidar: A
     """(N', 3) residual of the points that are not ground, by the method itself on the scene as our reader reads it."""
     settings = {key: value for key, value in VARIANTS[variant].items() if key != "num_frames"}
     config = make_config("default", **settings)
-    if variant == "dense":
+    if variant != "keypoints":
         config = config.replace(num_history=num_frames - 2)
     with HDF5Log(folder / "drive-0.h5", ego_T_lidar=ego_T_lidar) as log:
         sweeps = window(log, index, config.num_history)
@@ -306,7 +307,7 @@ def core(folder: Path, variant: str, index: int, num_frames: int, ego_T_lidar: A
     return result.residual_flow[torch.from_numpy(~sweeps.pc0.is_ground)]
 
 
-CASES = [("dense", 2), ("dense", 4), ("dense", 6), ("keypoints", 2)]
+CASES = [("dense", 2), ("dense", 4), ("dense", 6), ("proof", 6), ("keypoints", 2)]
 
 
 @pytest.mark.parametrize(("variant", "num_frames"), CASES)

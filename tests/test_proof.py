@@ -13,8 +13,6 @@ from scenes import scene as scene_of_boxes
 
 from cflow_torch import CFlowError, Config, CorrelationFlow, Sweep, Window
 from cflow_torch.batch import make_batch
-from cflow_torch.checks import DENSE_ONLY
-from cflow_torch.config import make_config
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.log import window as window_of
 from cflow_torch.grid import Grid
@@ -212,13 +210,6 @@ def test_empty_and_hopeless_windows():
         (result,) = model()([Window(pc0, pc1)])
         assert result.residual_flow.shape == (len(pc0.points), 3)
         assert not result.residual_flow.any()
-
-
-def test_the_paper_and_the_key_points_have_nothing_beyond_the_paper():
-    for name in ("paper", "keypoints"):
-        config = make_config(name)
-        for field, off in DENSE_ONLY.items():
-            assert getattr(config, field) == off, (name, field)
 
 
 @pytest.mark.parametrize("name", ["default", "fast"])
