@@ -48,7 +48,7 @@ def add_ground(sums: Tensor, window: int, positions: Tensor, grid: Grid) -> None
     block = _block(positions, grid)
     heights, count = sums[:, window].view(2, -1).unbind(0)
     heights.index_add_(0, block, _centimetres(positions[2]))
-    count.index_add_(0, block, torch.ones_like(block))
+    count.index_add_(0, block, torch.ones_like(block, dtype=torch.int64))
 
 
 def ground_heights(sums: Tensor) -> Tensor:
@@ -92,13 +92,13 @@ def is_tall(place: Tensor, positions: Tensor, ground: Tensor, grid: Grid, num_st
     Convention: heights are compared in whole centimetres, each rounded down.
     Cost: some ten passes over the points.
     """
-    area = grid.height * grid.width
-    present = flat_nonzero(place < len(ground) * num_steps * area)
-    place, inside = place.index_select(0, present), positions.index_select(1, present)
-    rows, cols = ground.shape[1:]
-    block = torch.add(_block(inside, grid), divide(place, num_steps * area), alpha=rows * cols)
-    height = _centimetres(inside[2]) - ground.reshape(-1).index_select(0, block)
-    return place.index_select(0, flat_nonzero(height >= round(100 * clearance)))
+    area, (rows, cols) = grid.height * grid.width, ground.shape[1:]
+    block = torch.add(_block(positions, grid), divide(place, num_steps * area), alpha=rows * cols)
+    block.clamp_(0, ground.numel() - 1)  # that of points which are left out may be anything
+    least = (ground.reshape(-1) + round(100 * clearance)).double().index_select(0, block)
+    # A whole number is at most a number rounded down if it is at most the number.
+    is_high = (positions[2] * 100).clamp_(-_HIGHEST, _HIGHEST) >= least
+    return place.index_select(0, flat_nonzero(is_high & (place < len(ground) * num_steps * area)))
 
 
 def empty_low_columns(image: Tensor, pixel: Tensor, grid: Grid) -> Tensor:
@@ -149,10 +149,10 @@ def _num_blocks(grid: Grid) -> Tuple[int, int]:
 
 
 def _block(positions: Tensor, grid: Grid) -> Tensor:
-    """(N,) int64 block of (3, N) positions inside the region; nothing there is below the lower end."""
-    row = ((positions[1] - grid.lower[1]) / _BLOCK).long()
-    col = ((positions[0] - grid.lower[0]) / _BLOCK).long()
-    return torch.add(col, row, alpha=_num_blocks(grid)[1])
+    """(N,) int32 block of (3, N) positions inside the region; nothing there is below the lower end."""
+    row = (positions[1] - grid.lower[1]).div_(_BLOCK).int()
+    col = (positions[0] - grid.lower[0]).div_(_BLOCK).int()
+    return col.add_(row, alpha=_num_blocks(grid)[1])
 
 
 def _centimetres(z: Tensor) -> Tensor:

@@ -8,8 +8,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cflow_torch.ops.chunks import chunks
-
 
 def flat_nonzero(mask: Tensor) -> Tensor:
     """Flat indices of the set elements, ascending: `mask.flatten().nonzero()[:, 0]`.
@@ -37,10 +35,13 @@ def occupied(image: Tensor) -> Tensor:
     Returns:
         (K,) int64.
 
-    Cost: one pass over the image, with no copy of it as a mask; on a GPU, one synchronisation.
+    Cost: one pass over the image, eight elements at a time; on a GPU, two synchronisations.
     """
-    parts = [flat_nonzero(image[part] != 0).add_(part.start) for part in chunks(0, image.numel(), image.device)]
-    return torch.cat(parts) if parts else flat_nonzero(image != 0)
+    num_words, device = image.numel() // 8, image.device
+    word = flat_nonzero(image[: 8 * num_words].view(torch.int64).bool())
+    index = (8 * word[:, None] + torch.arange(8, device=device)).flatten()
+    index = torch.cat((index, torch.arange(8 * num_words, image.numel(), device=device)))
+    return index.index_select(0, flat_nonzero(image.index_select(0, index).bool()))
 
 
 def divide(index: Tensor, divisor: int) -> Tensor:
