@@ -30,6 +30,9 @@ from cflow_torch.types import Sweep, Window
 # occupancy and cluster of a pixel of every sweep.
 _BYTES_PER_POINT = 160
 _BYTES_PER_PIXEL = 10
+# What the proof takes on top, if every point has a pixel of its own: lists of pixels; of voxels, if they are refined.
+_BYTES_TO_PROVE = 40
+_BYTES_TO_REFINE = 280
 # What windows of a group may take on a CPU where `max_memory` says nothing: about 9 of a pair, 4 of six sweeps. Fresh
 # pages of larger arrays cost more than the operations that larger groups save (windows/s in docs/benchmarks).
 _BYTES_ON_CPU = 1 << 29
@@ -102,6 +105,9 @@ def split_windows(windows: Sequence[Window], config: Config, grid: Grid, device:
     per_point, per_pixel = _BYTES_PER_POINT, _BYTES_PER_PIXEL + config.height_slices
     if config.method == "keypoints":  # descriptors: two copies of L^2 bytes for at most half of the points
         per_point += config.patch_size**2
+    if config.proof:
+        per_point += _BYTES_TO_PROVE
+        per_point += _BYTES_TO_REFINE if config.relocate or config.yaw else 0
     for window in windows:
         sweeps = (window.pc1, window.pc0, *window.pch)
         points = sum(sweep.points.shape[0] for sweep in sweeps)

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from cflow_torch.grid import Grid
 from cflow_torch.moving import MovingPoints
+from cflow_torch.ops.chunks import chunks
 from cflow_torch.ops.indices import flat_nonzero
 from cflow_torch.rigid import RigidMotion, rotate
 from cflow_torch.voxels import UNITS, Voxels, make_voxels
@@ -121,20 +122,30 @@ class _Groups:
             way: (2, G) float64, units per interval.
             turn: (G,) float64.
         """
-        voxels, group, time = self.voxels, self._group, self._time
+        total = torch.zeros((9, self.num), dtype=torch.int64, device=way.device)
+        for some in chunks(0, self._voxel.numel(), way.device, 9):
+            total += self._look(some, way, turn)
+        score, *sums = total.unbind(0)
+        return score, _Sums(*sums)
+
+    def _look(self, some: slice, way: Tensor, turn: Tensor) -> Tensor:
+        """(9, G) int64, the same of some looks: weight, then `_Sums`."""
+        voxels, group, time, is_back = self.voxels, self._group[some], self._time[some], self._is_back[some]
+        voxel = self._voxel[some]
         c_x, c_y = self.centre.index_select(1, group).double().unbind(0)
         k_x, k_y = (time * values for values in way.index_select(1, group).unbind(0))
         turn = turn.index_select(0, group) * time
-        x, y = (v.index_select(0, self._voxel).double() for v in (voxels.x, voxels.y))
+        x, y = (v.index_select(0, voxel).double() for v in (voxels.x, voxels.y))
         on_x, on_y = rotate(turn, x - c_x, y - c_y)
         back_x, back_y = rotate(-turn, x - c_x - k_x, y - c_y - k_y)
-        to_x = _whole(torch.where(self._is_back, back_x + c_x, on_x + c_x + k_x))
-        to_y = _whole(torch.where(self._is_back, back_y + c_y, on_y + c_y + k_y))
-        other = voxels.nearest(self._window, self._sweep, self._part, to_x, to_y)
+        to_x = _whole(torch.where(is_back, back_x + c_x, on_x + c_x + k_x))
+        to_y = _whole(torch.where(is_back, back_y + c_y, on_y + c_y + k_y))
+        other = voxels.nearest(self._window[some], self._sweep[some], self._part[some], to_x, to_y)
 
         found = flat_nonzero(other < voxels.group.numel())
-        found = found.index_select(0, flat_nonzero(self._same_group(other.index_select(0, found), found)))
-        other, mine, is_back = (v.index_select(0, found) for v in (other, self._voxel, self._is_back))
+        is_own = voxels.group.index_select(0, other.index_select(0, found)) == group.index_select(0, found)
+        found = found.index_select(0, flat_nonzero(is_own))
+        other, mine, is_back = (v.index_select(0, found) for v in (other, voxel, is_back))
         earlier, later = torch.where(is_back, other, mine), torch.where(is_back, mine, other)
         group, time, turn, c_x, c_y, k_x, k_y = (
             v.index_select(0, found) for v in (group, time, turn, c_x, c_y, k_x, k_y)
@@ -145,20 +156,14 @@ class _Groups:
         e_y = voxels.y.index_select(0, later) - _whole(r_y + c_y + k_y)
         return self._normal_equations(group, _whole(time * 16), _whole(r_x), _whole(r_y), e_x, e_y)
 
-    def _same_group(self, other: Tensor, index: Tensor) -> Tensor:
-        return self.voxels.group.index_select(0, other) == self._group.index_select(0, index)
-
-    def _normal_equations(
-        self, group: Tensor, k: Tensor, r_x: Tensor, r_y: Tensor, e_x: Tensor, e_y: Tensor
-    ) -> Tuple[Tensor, _Sums]:
+    def _normal_equations(self, group: Tensor, k: Tensor, r_x: Tensor, r_y: Tensor, e_x: Tensor, e_y: Tensor) -> Tensor:
         w = self._weight.index_select(0, ((e_x * e_x + e_y * e_y) >> 6).clamp_(max=2048))
         wk = w * k
         wkk = wk * k
         s_xy = wkk * (r_x * r_x + r_y * r_y)
         e_a = wk * (r_x * e_y - r_y * e_x)
         terms = (w, wkk, wkk * r_x, wkk * r_y, s_xy >> 20, s_xy & ((1 << 20) - 1), wk * e_x, wk * e_y, e_a)
-        score, *sums = (self._add(group, term) for term in terms)
-        return score, _Sums(*sums)
+        return torch.stack([self._add(group, term) for term in terms])
 
     def step(self, way: Tensor, turn: Tensor, sums: _Sums) -> Tuple[Tensor, Tensor]:
         """The motion after a Gauss-Newton step: the equations are solved by elimination, in this order."""

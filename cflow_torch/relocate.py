@@ -11,6 +11,7 @@ from torch import Tensor
 
 from cflow_torch.grid import Grid
 from cflow_torch.moving import NUM_SLICES, MovingPoints
+from cflow_torch.ops.chunks import chunks
 from cflow_torch.ops.indices import flat_nonzero
 
 _GRIDS = 2  # by 2
@@ -77,20 +78,21 @@ def _coincidences(voxel: Tensor, group: Tensor, table: Tensor, start: Tensor, he
     key = torch.unique(voxel * num_groups + group) if num_groups else voxel
     voxel = torch.div(key, max(num_groups, 1), rounding_mode="floor")
     group = key - voxel * num_groups
-    pixel, part = voxel >> 2, voxel & (NUM_SLICES - 1)
-    line = torch.div(pixel, width, rounding_mode="floor")
-    window = torch.div(line, height, rounding_mode="floor")
-    offset = torch.arange(_SIDE, device=device)[:, None] - (_REACH + 1)
-    dy, dx = start.index_select(0, group).unbind(1)
-    row = (line - window * height + dy + offset).repeat_interleave(_SIDE, 0)  # (25, N)
-    col = (pixel - line * width + dx + offset).repeat(_SIDE, 1)
-    inside = (row >= 0) & (row < height) & (col >= 0) & (col < width)
-    place = ((window * height + row) * width + col) * NUM_SLICES + part
-    place = torch.where(inside, place, table.numel() - 1)
-    meets = table.index_select(0, place.view(-1)).view(place.shape)
-    slot = torch.arange(_SIDE * _SIDE, device=device)[:, None] + group * (_SIDE * _SIDE)
     counts = torch.zeros(num_groups * _SIDE * _SIDE, dtype=torch.int64, device=device)
-    return counts.index_add_(0, slot.view(-1), meets.view(-1).long()).view(num_groups, _SIDE * _SIDE)
+    offset = torch.arange(_SIDE, device=device)[:, None] - (_REACH + 1)
+    for some in chunks(0, voxel.numel(), device, _SIDE * _SIDE):
+        of_some, pixel, part = group[some], voxel[some] >> 2, voxel[some] & (NUM_SLICES - 1)
+        line = torch.div(pixel, width, rounding_mode="floor")
+        window = torch.div(line, height, rounding_mode="floor")
+        dy, dx = start.index_select(0, of_some).unbind(1)
+        row = (line - window * height + dy + offset).repeat_interleave(_SIDE, 0)  # (25, N)
+        col = (pixel - line * width + dx + offset).repeat(_SIDE, 1)
+        inside = (row >= 0) & (row < height) & (col >= 0) & (col < width)
+        place = ((window * height + row) * width + col) * NUM_SLICES + part
+        meets = table.index_select(0, torch.where(inside, place, table.numel() - 1).view(-1))
+        slot = torch.arange(_SIDE * _SIDE, device=device)[:, None] + of_some * (_SIDE * _SIDE)
+        counts.index_add_(0, slot.view(-1), meets.long())
+    return counts.view(num_groups, _SIDE * _SIDE)
 
 
 def _peak(counts: Tensor, start: Tensor, flow: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from moving_scenes import LOWER, Scene, as_scene, moving_scene, one_window
 from scenes import needs_gpu
 
 from cflow_torch.reference import refinement as ref
-from cflow_torch.refine import _Groups, refine
+from cflow_torch.refine import _Groups, _Sums, refine
 from cflow_torch.rigid import RigidMotion, rotate
 from cflow_torch.voxels import UNITS, make_voxels
 
@@ -217,7 +217,7 @@ def test_step_is_that_of_the_reference_within_the_limits(errors, is_limited):
     )
 
     columns = (torch.from_numpy(np.ascontiguousarray(v)) for v in (16 * k, *lever.T, *error.T))
-    _, sums = groups._normal_equations(torch.zeros(num, dtype=torch.int64), *columns)
+    sums = _Sums(*groups._normal_equations(torch.zeros(num, dtype=torch.int64), *columns)[1:])
     found, found_turn = groups.step(way, turn, sums)
     assert found.flatten().tolist() == wanted and found_turn.tolist() == [wanted_turn]
 
@@ -230,7 +230,7 @@ def test_long_levers_do_not_overflow():
     groups.num, groups._weight = 1, torch.full((2049,), 256)
     lever = torch.full((num,), 150 * UNITS)
     zero = torch.zeros_like(lever)
-    _, sums = groups._normal_equations(group, torch.full_like(lever, 32), lever, lever, zero, zero)
+    sums = _Sums(*groups._normal_equations(group, torch.full_like(lever, 32), lever, lever, zero, zero)[1:])
     exact = num * 256 * 32 * 32 * 2 * (150 * UNITS) ** 2
     assert exact > 2**62 and int(sums.high) * 2**20 + int(sums.low) == exact
 

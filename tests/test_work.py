@@ -16,10 +16,12 @@ import pytest
 import torch
 
 from cflow_torch import Config, Sweep, Window, make_config, make_model
+from cflow_torch.batch import split_windows
 from cflow_torch.bench.memory import count_allocations
 from cflow_torch.bench.work import Work, count_work
 from cflow_torch.data.log import window
 from cflow_torch.data.synthetic import make_drive
+from cflow_torch.grid import Grid
 
 # About a tenth above what was measured (behind each, by the command above). Lower them when a kernel gets cheaper, in
 # the same commit.
@@ -131,6 +133,60 @@ def test_max_memory_bounds_the_peak(name):
     of_results = sum(value.numel() * value.element_size() for result in results for value in vars(result).values())
     _, peak = count_allocations(lambda: limited(sweeps))
     assert of_results < peak <= limit + of_results
+
+
+PROOF: Dict[str, Any] = {
+    "pixel_sizes": (0.4, 0.2, 0.1),
+    "proof": True,
+    "max_object": 25.0,
+    "clearance": 0.4,
+}
+ALL_PARTS: Dict[str, Any] = {
+    **PROOF,
+    "height_slices": 4,
+    "children": True,
+    "aperture": True,
+    "relocate": True,
+    "yaw": True,
+}
+
+
+def cars(num_history: int, side: float = 35.0) -> Window:
+    """Cars 6 m apart that all drive, every point in a pixel of its own: the proof can have no more to do."""
+    y, x = np.mgrid[0:18, 0:40].reshape(2, 1, -1) * 0.1 + 0.05
+    corner = np.arange(3.0 - side, side - 9.0, 6.0)
+    at_y, at_x = np.meshgrid(corner, corner, indexing="ij")
+    sweeps = []
+    for k in range(1, -num_history - 1, -1):
+        flat = [at_x.reshape(-1, 1) + x + 0.37 * k, at_y.reshape(-1, 1) + y + 0.2 * k]
+        points = np.stack([flat[0].ravel(), flat[1].ravel(), np.linspace(-1, 1, flat[0].size)], 1)
+        sweeps.append(Sweep(points.astype(np.float32), is_ground=np.zeros(len(points), dtype=bool)))
+    return Window(sweeps[1], sweeps[0], tuple(sweeps[2:]))
+
+
+@pytest.mark.parametrize("num_history", [0, 1])
+@pytest.mark.parametrize("settings", [PROOF, ALL_PARTS], ids=["proof", "all parts"])
+def test_max_memory_bounds_the_proof_at_its_worst(settings, num_history):
+    config = make_config("paper", num_history=num_history, **settings)
+    sweeps, grid = cars(num_history), Grid(0.1, config.point_cloud_range[:3], config.point_cloud_range[3:])
+    # The least that lets two windows go together: what is planned with must be enough for them.
+    device, least, most = torch.device("cpu"), 10**6, 10**9
+    while most - least > 10**5:
+        limit = (least + most) // 2
+        fits = len(split_windows([sweeps] * 2, config.replace(max_memory=limit), grid, device)) == 1
+        least, most = (least, limit) if fits else (limit, most)
+    limited = make_model(config.replace(max_memory=most), "cpu")
+    results = limited([sweeps] * 3)
+    assert (results[0].residual_flow.norm(dim=1) > 0.3).float().mean() > 0.5
+    of_results = sum(value.numel() * value.element_size() for result in results for value in vars(result).values())
+    assert most / 2 < count_allocations(lambda: limited([sweeps] * 3))[1] <= most + of_results
+
+
+def test_a_window_that_needs_more_than_max_memory_goes_alone():
+    config = make_config("paper", **ALL_PARTS)
+    expected = make_model(config, "cpu")([street(0)] * 2)
+    for one, other in zip(make_model(config.replace(max_memory=1), "cpu")([street(0)] * 2), expected):
+        assert torch.equal(one.residual_flow, other.residual_flow) and torch.equal(one.score, other.score)
 
 
 @pytest.mark.parametrize("name", ["h = 0", "key points"])

@@ -13,7 +13,11 @@ CHUNK_ON_CPU = 1 << 17
 CHUNK_ON_GPU = 1 << 26
 
 
-def chunks(start: int, stop: int, device: torch.device) -> Iterator[slice]:
-    """start ... stop in pieces of the size that suits the device; the last one may be shorter."""
-    size = CHUNK_ON_CPU if device.type == "cpu" else CHUNK_ON_GPU
+def chunks(start: int, stop: int, device: torch.device, width: int = 1) -> Iterator[slice]:
+    """start ... stop in pieces of the size that suits the device; the last one may be shorter.
+
+    Args:
+        width: how many elements are computed from each.
+    """
+    size = max(1, (CHUNK_ON_CPU if device.type == "cpu" else CHUNK_ON_GPU) // width)
     return (slice(first, min(first + size, stop)) for first in range(start, stop, size))
