@@ -9,10 +9,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.batch import Batch
+from cflow_torch.cells import NUM_SLICES
 from cflow_torch.ops.indices import flat_nonzero, split_index
-
-# Height slices are told apart by this many numbers, then they repeat: 2 m of four slices of 0.5 m.
-NUM_SLICES = 4
 
 
 @dataclass(frozen=True)

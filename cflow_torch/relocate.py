@@ -9,8 +9,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from cflow_torch.cells import NUM_SLICES
 from cflow_torch.grid import Grid
-from cflow_torch.moving import NUM_SLICES, MovingPoints
+from cflow_torch.moving import MovingPoints
 from cflow_torch.ops.chunks import chunks
 from cflow_torch.ops.indices import flat_nonzero
 

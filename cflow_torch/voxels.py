@@ -8,8 +8,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from cflow_torch.cells import NUM_SLICES
 from cflow_torch.grid import Grid
-from cflow_torch.moving import NUM_SLICES, MovingPoints
+from cflow_torch.moving import MovingPoints
 
 # Centroids are whole numbers of 1 / UNITS metre from the lower corner of the region: their sums have no order.
 UNITS = 1024
