@@ -264,6 +264,12 @@ def test_a_wall_that_seems_to_slide_stands_still():
         assert bool((result.residual_flow[:, 0] > 1.0).any()) != aperture
 
 
+def test_what_relocation_puts_to_rest_is_not_refined(monkeypatch):
+    assert model()([scene(1)])[0].residual_flow.any()
+    monkeypatch.setattr("cflow_torch.proof.relocate", lambda points, grid, count, motion: torch.zeros_like(motion))
+    assert not model()([scene(1)])[0].residual_flow.any()
+
+
 def test_speed_is_bounded_at_every_pixel_size():
     # Half of the box allows 2 m, the speed 0.6 m and a pixel.
     car = box((0.0, 0.0), (4.0, 1.8), 0.0, np.random.default_rng(0))
