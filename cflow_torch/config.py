@@ -25,7 +25,7 @@ class Config:
         max_speed: m/s; a displacement longer than max_speed * elapsed time + one pixel is not searched.
             None = the paper's search range, half of the cluster's bounding box.
         max_object: m; a cluster whose pixels at t+1 have a bounding box with a longer side than this does not move, see
-            docs/beyond.md. None = any may.
+            docs/beyond.md. None = any may. With `proof` it has the score of the coarser component around it, or 0.
         zero_test: z; a shift is kept if the pixels that coincide by it only (b) are significantly more than those that
             coincide without it only (c): b > c and (b - c)^2 >= z^2 (b + c). 0.01 ... 1000, used to two decimals.
             None = every shift is kept.
