@@ -1,8 +1,8 @@
-"""Candidates for the motion of every component: of each sweep, of all of them pooled, of the coarser level."""
+"""Candidates for the motion of every component: of each sweep, of all of them pooled, of others."""
 
 from __future__ import annotations
 
-from typing import List, Optional
+from typing import List, Sequence
 
 import torch
 import torch.nn.functional as F
@@ -13,21 +13,19 @@ from cflow_torch.ops.segments import segment_amin
 from cflow_torch.pool import pool
 
 
-def make_candidates(
-    estimates: Tensor, available: Tensor, intervals: Tensor, inherited: Optional[Tensor] = None
-) -> Tensor:
+def make_candidates(estimates: Tensor, available: Tensor, intervals: Tensor, others: Sequence[Tensor] = ()) -> Tensor:
     """Motions that each component may have, in the order in which ties between them are decided.
 
     Args:
         estimates: (M, K, 2) float64, (y, x) finest pixels m -> t+1, nearest sweep first.
         available: (M, K) bool, False = there is no estimate; whatever stands there is not looked at.
         intervals: (M, K) float64, sweep intervals from m to t+1; at least 1 where an estimate is available.
-        inherited: (M, 2) float64, pixels per sweep interval, motion that the coarser level gave (`inherit`); None =
-            there is no coarser level.
+        others: (M, 2) float64 each, pixels per sweep interval, motions from elsewhere: what the coarser level gave
+            (`inherit`), what key points say.
 
     Returns:
         (M, C, 2) float64, finest pixels per sweep interval: the pool of the estimates (where K > 1), each estimate by
-        its interval, the inherited motion. 0 stands for what is not known; it proves nothing, so it never wins.
+        its interval, the others. 0 stands for what is not known; it proves nothing, so it never wins.
 
     Convention:
         Of one estimate the pool is the estimate itself, so sweeps that a window lacks change no choice. No -0.0.
@@ -41,9 +39,7 @@ def make_candidates(
     found: List[Tensor] = [per_interval]
     if estimates.shape[1] > 1:
         found.insert(0, pool(F.pad(per_interval, (0, 1)), available)[:, None, :2])  # without any estimate: 0
-    if inherited is not None:
-        found.append(inherited[:, None])
-    return torch.cat(found, 1) + 0.0  # turns -0.0 into 0.0
+    return torch.cat([*found, *(motion[:, None] for motion in others)], 1) + 0.0  # turns -0.0 into 0.0
 
 
 def inherit(node: Tensor, num_nodes: int, above: Tensor, motion: Tensor) -> Tensor:

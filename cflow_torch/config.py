@@ -44,6 +44,9 @@ class Config:
         aperture: lines that seem to slide along themselves do not move.
         relocate: pairs of sweeps: place moving groups between the pixels, on four grids.
         yaw: refine the motion of moving groups and let them turn.
+        keypoint_size: m; key points of t and t+1 are matched at this pixel size, a whole multiple of the finest, and
+            what they say of a component is one of its candidates; `patch_size` and the settings of key points that
+            follow it count. None = they are not asked.
         sweep_interval: seconds between consecutive sweeps where time stamps are missing.
         use_timestamps: divide a history estimate by elapsed time (in sweep intervals t -> t+1) instead of steps.
         sectional_view: also estimate f_z in the X-Z view along the heading (Alg. scene_flow_1obj).
@@ -82,6 +85,7 @@ class Config:
     aperture: bool = False
     relocate: bool = False
     yaw: bool = False
+    keypoint_size: Optional[float] = None
     sweep_interval: float = 0.1
     use_timestamps: bool = False
     sectional_view: bool = False

@@ -16,7 +16,6 @@ from torch import Tensor
 from cflow_torch.batch import Batch
 from cflow_torch.config import Config
 from cflow_torch.descriptors import KeyPoints
-from cflow_torch.grid import Grid
 
 # Rows and columns of a tile, rows of a band, key points in a group: of the settings that were counted for groups of 16
 # those with the fewest pairs (key point, candidate), on the AV2 pair 1.55 for one within the gate. Groups of 8 have
@@ -34,10 +33,10 @@ _LENGTH_STEP = 8
 _GATE_SECONDS = 0.1
 
 
-def gate(batch: Batch, grid: Grid, config: Config) -> Tensor:
+def gate(batch: Batch, pixel_size: float, config: Config) -> Tensor:
     """(B,) float64, pixels: farthest match of each window, speed times the time from t to t+1."""
     seconds = batch.seconds[:, 1]
-    size = torch.full_like(seconds, grid.pixel_size)  # a GPU would multiply by the reciprocal of a plain number
+    size = torch.full_like(seconds, pixel_size)  # a GPU would multiply by the reciprocal of a plain number
     reach = config.gate_radius * (seconds / torch.full_like(seconds, _GATE_SECONDS)) / size
     if config.max_speed is not None:
         reach = torch.minimum(reach, config.max_speed * seconds / size + 1)

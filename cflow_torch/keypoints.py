@@ -49,7 +49,7 @@ class CorrelationFlowKeypoints(CoarseToFine):
             _, pc1 = describe(occupancy[:, 0], is_key_point[:, 0], config.patch_size)
             place0, pc0 = describe(occupancy[:, 1], is_key_point[:, 1], config.patch_size)
         with record_function("match"):
-            matches = match(pc0, pc1, gate(batch, grid, config), config)
+            matches = match(pc0, pc1, gate(batch, grid.pixel_size, config), config)
         with record_function("densify"):
             place = place0.index_select(0, matches.source)
             dense = densify(occupancy[:, 1], place, matches, grid.pixel_size, config)

@@ -55,7 +55,7 @@ def make_level(cells: Cells, block: int, reach: int, max_object: float, config: 
     Cost: as `cluster`, and some passes over the images of this level and the finest pixels.
     """
     height, width = -(-cells.grid.height // block), -(-cells.grid.width // block)
-    image, column = _coarsen(cells, block, height, width)
+    image, column = coarsen(cells, block, height, width)
     images = image[:-1].view(cells.num_windows, cells.num_steps, height, width)
     clusters, columns = find_clusters(images, cells.grid.pixel_size * block, config, reach)
     num_components, area = clusters.window.numel(), height * width
@@ -108,7 +108,7 @@ def equals_parent(node: Tensor, num_nodes: int, above: Tensor, num_above: int, p
     return (common == size) & (common == size_above.index_select(0, parent)) & (parent < num_above)
 
 
-def _coarsen(cells: Cells, block: int, height: int, width: int) -> Tuple[Tensor, Tensor]:
+def coarsen(cells: Cells, block: int, height: int, width: int) -> Tuple[Tensor, Tensor]:
     """Image of coarse pixels, as in `Level`, and (P,) int64 the column of each occupied finest pixel.
 
     A column is a coarse pixel whatever the sweep: (window * height + row) * width + col.

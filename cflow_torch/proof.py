@@ -1,9 +1,9 @@
 """Motion by hypotheses and proof, in one pass at the finest pixels (docs/beyond.md): the page to read first.
 
 Components at several pixel sizes are hypotheses of what moves together. Each has candidate motions: the peak of its
-correlation with every sweep, their pool, the motion of the coarser component around it. Candidates are judged at the
-finest pixels, over all sweeps and both ways, against no motion. In the tree of components the grouping that explains
-most wins; what moves is then placed between the pixels, refined and turned.
+correlation with every sweep, their pool, the motion of the coarser component around it, what key points say.
+Candidates are judged at the finest pixels, over all sweeps and both ways, against no motion. In the tree of components
+the grouping that explains most wins; what moves is then placed between the pixels, refined and turned.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from cflow_torch.cells import Cells, make_cells
 from cflow_torch.config import Config
 from cflow_torch.grid import Grid
 from cflow_torch.judge import choose, judge, worth
+from cflow_torch.keypoint_motion import KeyPointMotion, match_key_points
 from cflow_torch.levels import Level, equals_parent, make_level, parents
 from cflow_torch.moving import moving_points
 from cflow_torch.ops.indices import flat_nonzero
@@ -41,16 +42,21 @@ def prove_motion(batch: Batch, grid: Grid, config: Config) -> Motion:
     Args:
         batch: points of all windows, with three axes.
         grid: the finest BEV.
-        config: all but what belongs to key points, `subpixel` and `zero_test`; `max_object` and `max_speed` count.
+        config: all but `subpixel` and `zero_test`; `max_object` and `max_speed` count, settings of key points where
+            `keypoint_size` is given.
 
     Returns:
         The motion, by occupied pixel; ids number the groups that move together or stand still together.
     """
     with record_function("project"):
         cells, place = make_cells(batch, grid, config.slice_height, config.clearance)
+    key_points = None
+    if config.keypoint_size is not None:
+        with record_function("match"):
+            key_points = match_key_points(cells, batch, round(config.keypoint_size / grid.pixel_size), config)
     judged: List[_Judged] = []
     for block, reach in _levels(config):
-        judged.append(_judge_level(cells, block, reach, judged[-1] if judged else None, batch, config))
+        judged.append(_judge_level(cells, block, reach, judged[-1] if judged else None, key_points, batch, config))
     with record_function("tree"):
         groups = choose_groups([one.level.node for one in judged], [one.worth for one in judged])
         motion = torch.cat([one.motion for one in judged]).index_select(0, groups.component)
@@ -84,23 +90,31 @@ class _Judged:
 
 
 def _judge_level(
-    cells: Cells, block: int, reach: int, above: Optional[_Judged], batch: Batch, config: Config
+    cells: Cells,
+    block: int,
+    reach: int,
+    above: Optional[_Judged],
+    key_points: Optional[KeyPointMotion],
+    batch: Batch,
+    config: Config,
 ) -> _Judged:
     """Candidates of the components at one pixel size, and which of them is proved best."""
     with record_function("cluster"):
         level = make_level(cells, block, reach, math.inf if config.max_object is None else config.max_object, config)
         node, num_nodes = level.node, level.clusters.window.numel()
-        wanted, inherited = ~level.too_long, None
+        wanted, others = ~level.too_long, []
         if above is not None:
-            inherited = inherit(node, num_nodes, above.level.node, above.motion)
+            others.append(inherit(node, num_nodes, above.level.node, above.motion))
             if reach == 1:  # what has not fallen apart is known
-                others = (above.level.node, len(above.motion))
-                wanted &= ~equals_parent(node, num_nodes, *others, parents(node, num_nodes, *others))
+                held_by = (above.level.node, len(above.motion))
+                wanted &= ~equals_parent(node, num_nodes, *held_by, parents(node, num_nodes, *held_by))
+        if key_points is not None:
+            others.append(key_points.of_components(node, num_nodes))
     with record_function("correlate"):
         estimates, scores, available = find_peaks(level, wanted, batch, cells.grid.pixel_size, config)
     with record_function("judge"):
         intervals = batch.elapsed[level.clusters.window, 1:]
-        candidates = make_candidates(estimates, available, intervals, inherited)
+        candidates = make_candidates(estimates, available, intervals, others)
         is_judged = (candidates != 0).any(2).any(1) & ~level.too_long
         worths = worth(*judge(cells, node, candidates, is_judged, batch.elapsed), config.proof_z)
         if config.aperture:

@@ -31,14 +31,18 @@ def estimates(seed: int, num_nodes: int = 300, num_sweeps: int = 5):
 def scalar(given, available, intervals, inherited):
     for f, known, k, parent in zip(given, available, intervals, inherited):
         row = [tuple(v) if is_known else None for v, is_known in zip(f.tolist(), known.tolist())]
-        yield ref.candidates(row, k.tolist(), tuple(parent.tolist()))
+        yield ref.candidates(row, k.tolist(), [tuple(parent.tolist())])
+
+
+def candidates_of(given, available, intervals, inherited):
+    return make_candidates(given, available, intervals, [inherited])
 
 
 @pytest.mark.parametrize("num_sweeps", [1, 2, 3, 5])
 def test_candidates_equal_the_scalar_rule(num_sweeps):
     for seed in range(3):
         given = estimates(seed, num_sweeps=num_sweeps)
-        found = make_candidates(*map(torch.from_numpy, given))
+        found = candidates_of(*map(torch.from_numpy, given))
         expected = np.array(list(scalar(*given))) + 0.0  # no -0.0
         assert found.shape == expected.shape == (300, num_sweeps + 1 + (num_sweeps > 1), 2)
         assert found.numpy().tobytes() == expected.tobytes()
@@ -47,25 +51,25 @@ def test_candidates_equal_the_scalar_rule(num_sweeps):
 def test_without_a_coarser_level():
     given, available, intervals, inherited = map(torch.from_numpy, estimates(1))
     found = make_candidates(given, available, intervals)
-    assert same_bits(found, make_candidates(given, available, intervals, inherited)[:, :-1].contiguous())
+    assert same_bits(found, candidates_of(given, available, intervals, inherited)[:, :-1].contiguous())
     assert found.shape == (300, 6, 2)
 
 
 def test_no_negative_zero():
     for seed in range(3):
-        found = make_candidates(*map(torch.from_numpy, estimates(seed)))
+        found = candidates_of(*map(torch.from_numpy, estimates(seed)))
         assert not (torch.signbit(found) & (found == 0)).any()
     minus = torch.tensor([[[-0.0, -0.0]]], dtype=torch.float64)
     one = torch.ones((1, 1), dtype=torch.float64)
-    assert not torch.signbit(make_candidates(minus, one.bool(), one, minus[0])).any()
+    assert not torch.signbit(candidates_of(minus, one.bool(), one, minus[0])).any()
 
 
 def test_sweeps_that_a_window_lacks_change_no_choice():
     # A window of two sweeps, alone and in a batch with windows of six. What a motion is worth depends on it alone.
     given, available, intervals, inherited = map(torch.from_numpy, estimates(4, num_sweeps=1))
-    alone = make_candidates(given, available, intervals, inherited)
+    alone = candidates_of(given, available, intervals, inherited)
     padded = [torch.cat((v, v.new_zeros((300, 4, *v.shape[2:]))), 1) for v in (given, available, intervals)]
-    together = make_candidates(*padded, inherited)
+    together = candidates_of(*padded, inherited)
 
     def worth(motions: torch.Tensor) -> torch.Tensor:
         y, x = (3 * motions).floor().long().unbind(2)
@@ -82,7 +86,7 @@ def test_candidates_by_hand():
     )
     available = torch.tensor([[True, True, True], [False, True, False]])
     intervals = torch.tensor([[1.0, 2.0, 3.0]] * 2, dtype=torch.float64)
-    found = make_candidates(given, available, intervals, torch.tensor([[0.5, -1.0], [0.0, 0.0]], dtype=torch.float64))
+    found = candidates_of(given, available, intervals, torch.tensor([[0.5, -1.0], [0.0, 0.0]], dtype=torch.float64))
     assert found[0].tolist() == [[3.0, 0.0], [2.0, 0.0], [4.0, 0.0], [3.0, 0.0], [0.5, -1.0]]
     assert found[1].tolist() == [[0.0, 1.5], [0.0, 0.0], [0.0, 1.5], [0.0, 0.0], [0.0, 0.0]]
 
@@ -119,7 +123,7 @@ def test_the_first_pixel_decides_where_components_are_not_nested():
 def test_nothing():
     none = torch.zeros((0, 3, 2), dtype=torch.float64)
     no_motion = none[:, 0]
-    found = make_candidates(none, none[:, :, 0].bool(), none[:, :, 0], no_motion)
+    found = candidates_of(none, none[:, :, 0].bool(), none[:, :, 0], no_motion)
     assert found.shape == (0, 5, 2)
     nobody = torch.zeros(0, dtype=torch.int64)
     assert inherit(nobody, 0, nobody, no_motion).shape == (0, 2)
@@ -130,4 +134,4 @@ def test_nothing():
 @needs_gpu
 def test_candidates_on_cuda_equal_cpu():
     given = list(map(torch.from_numpy, estimates(7)))
-    assert same_bits(make_candidates(*(v.cuda() for v in given)), make_candidates(*given))
+    assert same_bits(candidates_of(*(v.cuda() for v in given)), candidates_of(*given))

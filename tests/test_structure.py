@@ -32,6 +32,7 @@ LAYERS = {
     "gate": 2,
     "jobs": 2,
     "judge": 2,
+    "keypoint_motion": 2,
     "peaks": 2,
     "height": 2,
     "match": 2,

@@ -1,4 +1,4 @@
-"""Candidates for the motion of a component: of each sweep, of all sweeps together, of the coarser level."""
+"""Candidates for the motion of a component: of each sweep, of all sweeps together, of others."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ Vector = Tuple[float, float]
 
 
 def candidates(
-    estimates: Sequence[Optional[Vector]], intervals: Sequence[float], inherited: Optional[Vector] = None
+    estimates: Sequence[Optional[Vector]], intervals: Sequence[float], others: Sequence[Vector] = ()
 ) -> List[Vector]:
     """Motions per sweep interval that one component may have, in the order in which ties are decided.
 
     Args:
         estimates: (y, x) displacement m -> t+1 for every sweep m = t, t-1, ..., nearest first; None = not known.
         intervals: k, sweep intervals from m to t+1.
-        inherited: the motion that the coarser level gave to the component; None = there is no coarser level.
+        others: motions from elsewhere: what the coarser level gave to the component, what key points say.
 
     Returns:
         The pool of all estimates (Sec. leverage_past_pcs), if there is more than one sweep; each sweep's estimate by
-        its k; the inherited motion. (0, 0), which never wins, stands for what is not known.
+        its k; the others. (0, 0), which never wins, stands for what is not known.
     """
     per_interval = [None if f is None else (f[0] / k, f[1] / k) for f, k in zip(estimates, intervals)]
     found = [(0.0, 0.0) if f is None else f for f in per_interval]
@@ -31,9 +31,7 @@ def candidates(
         known = [np.array([*f, 0.0]) for f in per_interval if f is not None]
         y, x, _ = pool(known).tolist() if known else (0.0, 0.0, 0.0)
         found.insert(0, (y, x))
-    if inherited is not None:
-        found.append(inherited)
-    return found
+    return [*found, *others]
 
 
 def inherit(members: Sequence[np.ndarray], above: Sequence[np.ndarray], motions: Sequence[Vector]) -> Vector:

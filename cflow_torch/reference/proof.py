@@ -16,6 +16,7 @@ from cflow_torch.reference.candidates import Vector, candidates, inherit
 from cflow_torch.reference.cells import slice_image
 from cflow_torch.reference.dense import scene_flow_in_1view
 from cflow_torch.reference.judge import choose, paired_counts, worth
+from cflow_torch.reference.keypoint_motion import keypoint_motion, keypoint_shifts
 from cflow_torch.reference.levels import components_at, equals_parent
 from cflow_torch.reference.low_columns import ground_heights, in_low_column
 from cflow_torch.reference.peak import parabola
@@ -62,10 +63,13 @@ def prove_motion(clouds: Sequence[Cloud], cloud1: Cloud, ground: Sequence[np.nda
             keep[keep] = ~in_low_column(cloud.points[keep], means, config.clearance, size, config)
     images = [slice_image(cloud.points[keep], config, size, config.slice_height) for cloud, keep in zip(sweeps, inside)]
 
+    shifts = None
+    if config.keypoint_size is not None:
+        shifts = keypoint_shifts(images, clouds[0], round(config.keypoint_size / size), config)
     judged: List[Judged] = []
     levels = [(round(s / size), 3) for s in config.pixel_sizes] + ([(1, 1)] if config.children else [])
     for block, reach in levels:
-        judged.append(judge_level(images, clouds, block, reach, judged[-1] if judged else None, config))
+        judged.append(judge_level(images, clouds, block, reach, judged[-1] if judged else None, shifts, config))
 
     # Groups, numbered by their first pixel: sweep by sweep, t+1 first, in raster order.
     pixels = [(m, r, c) for m, image in enumerate(images) for r, c in np.argwhere(image).tolist()]
@@ -98,6 +102,7 @@ def judge_level(
     block: int,
     reach: int,
     above: Optional[Judged],
+    shifts: Optional[np.ndarray],
     config: Config,
 ) -> Judged:
     """The best motion of every component at one pixel size.
@@ -108,6 +113,7 @@ def judge_level(
         block: finest pixels a side of a pixel of this size.
         reach: 3 = Alg. clustering, 1 = plain components, which are not looked for if they are all of their parent.
         above: the next coarser level.
+        shifts: of key points (`keypoint_shifts`); None = they are not asked.
         config: settings.
     """
     size = config.pixel_sizes[-1]
@@ -131,8 +137,10 @@ def judge_level(
             score = [peak[1] for peak in peaks if peak is not None][0]
             for image, member in zip(scores, members):
                 image[member] = score
-        inherited = None if above is None else inherit(members, above.node, above.motions)
-        found = candidates(estimates, elapsed[1:], inherited)
+        others = [] if above is None else [inherit(members, above.node, above.motions)]
+        if shifts is not None:
+            others.append(keypoint_motion(members[1], shifts))
+        found = candidates(estimates, elapsed[1:], others)
         values = [0] * len(found)
         if not too_long[i]:
             values = [worth(*paired_counts(images, members, motion, elapsed), config.proof_z) for motion in found]
