@@ -18,7 +18,7 @@ from cflow_torch.voxels import UNITS, Voxels, make_voxels
 # Tried on five data sets and on simulated drives (docs/beyond.md). What holds the translation keeps pedestrians from
 # sliding along their few points; older sweeps than these pull where an object does not turn at a constant rate.
 _SIGMA = 0.15  # metres, of the weight of a pair of voxels
-_MOST_TIME = 2.0  # sweep intervals: older sweeps are not looked at
+_MOST_TIME = 2.5  # sweep intervals: t, t-1 and their jitter; older sweeps are not looked at
 _NUM_STEPS = 4
 _LONGEST_WAY = 0.15  # metres per interval, in x and in y, from the given flow
 _LARGEST_TURN = 0.1  # tangent of half the angle per interval

@@ -11,7 +11,7 @@ from typing import Dict, List, NamedTuple, Optional, Sequence, Tuple
 
 UNITS = 1024  # of a metre
 SIGMA = 0.15  # metres, of the weight of a pair of voxels
-MOST_TIME = 2.0  # sweep intervals: older sweeps are not looked at
+MOST_TIME = 2.5  # sweep intervals: older sweeps are not looked at
 NUM_STEPS = 4
 LONGEST_WAY = 0.15  # metres per interval, in x and in y, from the given flow
 LARGEST_TURN = 0.1  # tangent of half the angle per interval
