@@ -42,8 +42,8 @@ _BYTES_ON_CPU = 1 << 29
 class Batch:
     """Points of all sweeps of all windows, sweep by sweep: t+1 of every window, then t of every window, then t-1, ...
 
-    Points that do not take part (not finite, ground, outside the region) are left out, but for those of pc0: all its
-    rows are here, so that results are read off without being scattered.
+    Points that do not take part (not finite, ground, the vehicle's own, outside the region) are left out, but for those
+    of pc0: all its rows are here, so that results are read off without being scattered.
 
     Args:
         positions: (A, P) float64, metres, frame of t+1 of the point's window; A = 2, x and y, where nothing asks for z,
@@ -174,7 +174,7 @@ def make_batch(windows: Sequence[Window], config: Config, grid: Grid, device: An
                 pose_flow = torch.zeros((sweep.points.shape[0], 3), dtype=torch.float32, device=chosen_device)
             sources.append(Source(slice(start, start + len(pose_flow)), pose_flow))
         for rows, raw, moved, inside, ground_inside in _pieces(
-            sweep, name, transform, 3 if step == 1 else num_axes, grid, chosen_device
+            sweep, name, transform, 3 if step == 1 else num_axes, grid, config, chosen_device
         ):
             if ground is not None and ground_inside is not None and step <= 1:
                 add_ground(ground, index, moved.index_select(1, flat_nonzero(ground_inside)), grid)
@@ -207,7 +207,13 @@ def make_batch(windows: Sequence[Window], config: Config, grid: Grid, device: An
 
 
 def _pieces(
-    sweep: Sweep, name: str, transform: Optional[np.ndarray], num_axes: int, grid: Grid, device: torch.device
+    sweep: Sweep,
+    name: str,
+    transform: Optional[np.ndarray],
+    num_axes: int,
+    grid: Grid,
+    config: Config,
+    device: torch.device,
 ) -> Iterator[Tuple[slice, Tensor, Tensor, Tensor, Optional[Tensor]]]:
     """A sweep piece by piece.
 
@@ -225,10 +231,14 @@ def _pieces(
         raw = read_positions(sweep, device, rows)
         moved = compensate(raw, matrix, max(num_axes, checked_axes))
         inside = grid.contains(moved[:checked_axes])
-        if is_ground is None:
-            yield rows, raw, moved, inside, None
-        else:
-            yield rows, raw, moved, inside & ~is_ground[rows], inside & is_ground[rows]
+        ground_inside = None
+        if is_ground is not None:
+            ground_inside = inside & is_ground[rows]
+            inside &= ~is_ground[rows]
+        if config.ego_box is not None:
+            x0, y0, x1, y1 = config.ego_box
+            inside &= (raw[0] < x0) | (raw[0] > x1) | (raw[1] < y0) | (raw[1] > y1)
+        yield rows, raw, moved, inside, ground_inside
 
 
 def _write_pose_flow(pose_flow: Tensor, raw: Tensor, moved: Tensor) -> None:

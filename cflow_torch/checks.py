@@ -75,6 +75,9 @@ def _check_values(config: Any) -> None:
     for name in SWITCHES:
         one_of(name, getattr(config, name), (True, False))
     _check_space(config.pixel_sizes, config.point_cloud_range)
+    own = config.ego_box
+    if own is not None and (len(own) != 4 or not all(map(math.isfinite, own)) or own[0] >= own[2] or own[1] >= own[3]):
+        raise CFlowError(f"ego_box={own}: give (x0, y0, x1, y1) in metres, finite, with x0 < x1 and y0 < y1, or None")
     for name in ("num_history", "patch_size", "min_cluster_size", "height_slices"):
         _whole_number(name, getattr(config, name))
     if config.patch_size % 2 == 0 or config.patch_size > LARGEST_PATCH:

@@ -19,6 +19,9 @@ class Config:
         pixel_sizes: side s of a BEV pixel in metres, one per scale, coarse to fine (Eq. 3d_to_bev).
         num_history: h, number of sweeps before t that are used (Sec. leverage_past_pcs).
         point_cloud_range: (x0, y0, z0, x1, y1, z1) in metres, both ends included, in the frame of t+1.
+        ego_box: (x0, y0, x1, y1) in metres, both ends included, in every sweep's own frame: points in it are returns of
+            the vehicle itself and take no part, as ground. They stand still in that frame, so without it they move as
+            the vehicle does. None = there are none.
         connectivity: 4 or 8, which neighbours join two pixels (Sec. clustering).
         max_extent: d^max in metres: longer side of a component's bounding box above which it is eroded
             and labelled again (Alg. clustering).
@@ -70,6 +73,7 @@ class Config:
     pixel_sizes: Tuple[float, ...] = (0.1,)
     num_history: int = 0
     point_cloud_range: Tuple[float, ...] = (-35.0, -35.0, -math.inf, 35.0, 35.0, math.inf)
+    ego_box: Optional[Tuple[float, ...]] = None
     connectivity: int = 8
     max_extent: float = 20.0
     max_speed: Optional[float] = None
@@ -104,6 +108,8 @@ class Config:
     def __post_init__(self) -> None:
         object.__setattr__(self, "pixel_sizes", floats("pixel_sizes", self.pixel_sizes))
         object.__setattr__(self, "point_cloud_range", floats("point_cloud_range", self.point_cloud_range))
+        if self.ego_box is not None:
+            object.__setattr__(self, "ego_box", floats("ego_box", self.ego_box))
         check(self)
 
     def replace(self, **overrides: Any) -> Config:

@@ -71,7 +71,8 @@ class FlowResult:
         cluster_id: (N,) int64, 0 ... M-1 in raster order of each cluster's first pixel; -1 = in no cluster
             that has points both before and at t+1.
         score: (N,) float32 in [0, 1], NCC at the peak (t -> t+1, finest scale); 0 where cluster_id is -1.
-        is_valid: (N,) bool, True for the rows that took part: finite, not ground, inside the range.
+        is_valid: (N,) bool, True for the rows that took part: finite, neither ground nor of the
+            vehicle itself (`Config.ego_box`), inside the range.
     """
 
     residual_flow: Tensor

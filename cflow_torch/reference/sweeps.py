@@ -16,7 +16,7 @@ class Cloud(NamedTuple):
 
     Attributes:
         points: (N, 3) float64, metres, frame of t+1; NaN for a point that was not finite.
-        takes_part: (N,) bool, finite and not ground.
+        takes_part: (N,) bool, finite, neither ground nor of the vehicle itself.
         steps: k, elapsed time to t+1 in sweep intervals: 1 for t, 2 for t-1 ...; 0 for t+1 itself.
         elapsed: seconds to t+1.
     """
@@ -65,8 +65,8 @@ def compensate(window: Window, config: Config) -> Tuple[List[Cloud], Cloud]:
             elapsed = elapsed_ns / 1e9
             if config.use_timestamps:
                 steps = elapsed_ns / first_ns
-        clouds.append(Cloud(_in_frame_of(window.pc1, sweep), _takes_part(sweep), steps, elapsed))
-    return clouds, Cloud(xyz(window.pc1), _takes_part(window.pc1), 0.0, 0.0)
+        clouds.append(Cloud(_in_frame_of(window.pc1, sweep), _takes_part(sweep, config), steps, elapsed))
+    return clouds, Cloud(xyz(window.pc1), _takes_part(window.pc1, config), 0.0, 0.0)
 
 
 def _in_frame_of(sweep1: Sweep, sweep: Sweep) -> np.ndarray:
@@ -91,11 +91,15 @@ def _is_repeat(sweep: Sweep, newer: Sweep) -> bool:
     return same_pose and np.array_equal(_matrix(sweep.points), _matrix(newer.points), equal_nan=True)
 
 
-def _takes_part(sweep: Sweep) -> np.ndarray:
-    finite = np.isfinite(xyz(sweep)).all(axis=1)
+def _takes_part(sweep: Sweep, config: Config) -> np.ndarray:
+    keeps = np.isfinite(xyz(sweep)).all(axis=1)
+    if config.ego_box is not None:
+        x0, y0, x1, y1 = config.ego_box
+        x, y = xyz(sweep)[:, :2].T.astype(np.float64)
+        keeps &= ~((x0 <= x) & (x <= x1) & (y0 <= y) & (y <= y1))
     if sweep.is_ground is None:
-        return finite
-    return finite & ~_matrix(sweep.is_ground).astype(bool)
+        return keeps
+    return keeps & ~_matrix(sweep.is_ground).astype(bool)
 
 
 def ground_points(sweep: Sweep, cloud: Cloud) -> np.ndarray:
