@@ -138,6 +138,7 @@ PRESETS: Dict[str, Dict[str, Any]] = {
         "aperture": True,
         "relocate": True,
         "yaw": True,
+        "use_timestamps": True,
     },
     # Two older sweeps, one scale, and of docs/beyond.md what costs little.
     "fast": {
@@ -147,6 +148,7 @@ PRESETS: Dict[str, Dict[str, Any]] = {
         "max_object": 25.0,
         "proof": True,
         "clearance": 0.4,
+        "use_timestamps": True,
     },
     # Best mean of scripts/keypoint_settings.py on its synthetic set; region of the main harness.
     "keypoints": {

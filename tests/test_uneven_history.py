@@ -9,6 +9,7 @@ from moving_scenes import as_scene
 from scenes import assert_same
 
 from cflow_torch import CFlowError, Config, CorrelationFlow, Sweep, Window
+from cflow_torch.config import PRESETS, make_config
 from cflow_torch.reference import reference_flow
 from cflow_torch.refine import refine
 
@@ -81,3 +82,12 @@ def test_jitter_leaves_the_second_sweep_to_the_refinement():
     even, late, without = refined([0.0, 1.0, 2.0]), refined([0.0, 1.0, 2.003]), refined([0.0, 1.0, 0.0])
     assert abs(late - even) < 0.001
     assert abs(without - even) > 0.003
+
+
+def test_presets_with_history_go_by_time_stamps():
+    assert {name: make_config(name).use_timestamps for name in PRESETS} == {
+        "paper": False,
+        "default": True,
+        "fast": True,
+        "keypoints": False,
+    }
