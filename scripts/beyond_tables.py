@@ -10,6 +10,8 @@ import numpy as np
 from beyond_score import CLASSES, Figures, merge_classes
 from beyond_sets import PROFILES
 
+from cflow_torch.evaluation.bucketed import mean_of_present
+
 Cells = List[List[str]]
 Scores = Dict[str, Figures]  # by name of the set
 DEFAULT, FAST = "default", "fast"
@@ -77,7 +79,7 @@ def with_means(scores: Scores) -> Scores:
     for mean_name in simulated_names(scores):
         parts = [part for name, part in scores.items() if _is_of_sensor(name) and _mean_name(name) == mean_name]
         keys = ("near", "far", "static", "far_static", "dynamic")
-        mean: Figures = {key: float(np.nanmean([part[key] for part in parts])) for key in keys}
+        mean: Figures = {key: mean_of_present(np.array([part[key] for part in parts])) for key in keys}
         for name, classes in merge_classes(parts).items():
             mean.update({f"{name} {c}": value for c, value in classes.items()})
         result[mean_name] = mean
