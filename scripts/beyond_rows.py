@@ -56,11 +56,6 @@ PAPER = Setting("paper", "paper")
 PAPER_SCALES = Setting("paper, scales .4 .2 .1", "paper", {"pixel_sizes": SCALES})
 DEFAULT = Setting("default", "default")
 FAST = Setting("fast", "fast")
-if not DEFAULT.config().proof:
-    _LIMITS = {"proof": True, "clearance": 0.4, "max_object": 25.0, "max_speed": 40.0}
-    _PARTS = {"height_slices": 4, "children": True, "aperture": True, "relocate": True, "yaw": True}
-    DEFAULT = Setting("default", "paper", {**_LIMITS, **_PARTS, "pixel_sizes": SCALES})
-    FAST = Setting("fast", "paper", {**_LIMITS, "pixel_sizes": (0.1,)})
 PRESETS = (PAPER, PAPER_SCALES, DEFAULT, FAST)
 
 
