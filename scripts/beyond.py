@@ -31,7 +31,7 @@ import yaml
 from beyond_rows import DEFAULT, FAST, PRESETS, Setting, ablation
 from beyond_score import Store, changed, code_key
 from beyond_sets import ScoredSet, make_sets
-from beyond_tables import ablation_cells, markdown, sensor_cells, target_cells, with_means
+from beyond_tables import ablation_cells, flat_cells, markdown, sensor_cells, target_cells, with_means
 from beyond_times import measure, record, time_cells
 from paper_tables import comma_separated
 
@@ -88,7 +88,7 @@ def ablate(given: argparse.Namespace) -> int:
     for setting, figures in score_rows(rows, given):
         scores[setting.name] = figures
         cells = ablation_cells(scores)
-        write_text(given.output / "ablation.csv", comma_separated(cells))
+        write_text(given.output / "ablation.csv", comma_separated(flat_cells(scores)))
         finish(given, scores, rows, "ablation.md", f"{NOTE}{CELLS}\n{command(given)}\n{markdown(cells)}")
     return 0
 

@@ -144,8 +144,19 @@ def ablation_cells(scores: Mapping[str, Scores]) -> Cells:
     return cells
 
 
+def flat_cells(scores: Mapping[str, Scores]) -> Cells:
+    """Header and rows: a column per figure, for programs."""
+    columns = []
+    for set_name, part in next(iter(scores.values())).items():
+        columns += [(set_name, key) for key, value in part.items() if isinstance(value, (int, float))]
+    rows = [[name, *(number(f[set_name][key]) for set_name, key in columns)] for name, f in scores.items()]
+    return [["setting", *(": ".join(column) for column in columns)], *rows]
+
+
 def number(value: Any) -> str:
-    """Four decimals, "-" for NaN."""
+    """Four decimals, "-" for NaN; counts as they are."""
+    if isinstance(value, int):
+        return str(value)
     return "-" if math.isnan(value) else f"{value:.4f}"
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import importlib
 import json
 from dataclasses import fields, replace
@@ -350,7 +351,9 @@ def test_targets_are_written_and_an_interrupted_ablation_goes_on(
         beyond.main(command)
     monkeypatch.setattr(score, "estimate", lambda s, c: [i.frame(0 * i.pose_flow) for i in s.items()])
     assert beyond.main(command) == beyond.main(["targets", "--output", str(tmp_path)]) == 0
-    assert (tmp_path / "ablation.csv").read_text().count("\n") == 6
+    table = list(csv.DictReader((tmp_path / "ablation.csv").open(encoding="utf-8")))
+    assert [row["setting"] for row in table][:2] == ["paper", "paper, scales .4 .2 .1"] and len(table) == 5
+    assert table[0]["kitti h=0: dynamic"] == f"{np.linalg.norm(SPEED):.4f}"
     results = json.loads((tmp_path / "results.json").read_text())
     assert set(results) == {"ablation", "targets"}
     figures = results["targets"]["settings"]["default"]["figures"]["kitti h=0"]
