@@ -40,7 +40,7 @@ def block(rng: np.random.Generator, centre: Any, side: float, num_points: int) -
 
 def make_pair(seed: int = 0, with_mover: bool = True) -> Any:
     """A driving, turning sensor; a mover, two static blocks large enough to be pasted, one that is too small, one that
-    is too long, a parked labelled object, ground. Returns window, labels, instance."""
+    is too long, one that touches a parked object, ground. Returns window, labels, instance."""
     rng = np.random.default_rng(seed)
     T_world_ego = [pose(100.0, 50.0, 0.3), pose(101.0, 50.4, 0.32)]
     T_world_map = pose(100.0, 50.0, 0.3)  # the scene stands here
@@ -52,6 +52,7 @@ def make_pair(seed: int = 0, with_mover: bool = True) -> Any:
         (block(rng, [4, 14, 0.5], 0.3, 100), 0, 0, 0 * SPEED),
         (long_wall, 0, 0, 0 * SPEED),
         (block(rng, [12, -6, 0.5], 1.5, 200), 2, CAR, 0 * SPEED),
+        (block(rng, [12, -7, 0.5], 1.0, 120), 0, 0, 0 * SPEED),  # touches it
         (rng.uniform([-30, -30, -0.1], [30, 30, 0.0], (NUM_GROUND, 3)), 0, 0, 0 * SPEED),
     ]
     instance = np.concatenate([np.full(len(p), number) for p, number, _, _ in parts])
@@ -229,21 +230,24 @@ def test_means_are_those_of_the_errors_put_in(script: Any) -> None:
     truth = item.labels.flow - item.pose_flow
     walks = item.labels.category.copy()
     walks[:10] = PEDESTRIAN
+    walks[80:90] = 0  # moves, but is no object
     item = replace(item, labels=replace(item.labels, category=walks))
     speed = np.linalg.norm(SPEED)
     wrong = truth.copy()
-    wrong[:10] *= 0.4  # ten of the 90 points of the mover
+    wrong[:10] *= 0.4  # ten of the 80 points of the mover that count
     static = (walks == 0) & ~item.window.pc0.is_ground
+    static[80:90] = False
     wrong[static.nonzero()[0][0], 2] += 0.7
     figures = score.pooled_figures([item.frame(wrong)])
-    assert figures["num_dynamic"] == 90 and figures["num_pedestrian"] == 10
+    assert figures["num_dynamic"] == 80 and figures["num_pedestrian"] == 10
     assert figures["pedestrian"] == pytest.approx(0.6, abs=1e-5)
-    assert figures["relative"] == pytest.approx(0.6 / 9, abs=1e-5)
-    assert figures["dynamic"] == pytest.approx(0.6 * speed / 9, abs=1e-5)
+    assert figures["relative"] == pytest.approx(0.6 / 8, abs=1e-5)
+    assert figures["dynamic"] == pytest.approx(0.6 * speed / 8, abs=1e-5)
     assert figures["static"] == pytest.approx(0.7 / static.sum(), rel=1e-3)
     assert score.pooled_figures([item.frame(wrong)], step=11)["num_dynamic"] == 0  # slower than 0.55 m in 11 sweeps
-    far = replace(item, labels=replace(item.labels, is_valid=np.abs(item.window.pc0.points[:, 0]) > 35))
-    assert np.isnan(score.pooled_figures([far.frame(wrong)])["dynamic"])
+    far_points = replace(item.window.pc0, points=item.window.pc0.points + np.float32([50, 0, 0]))
+    far = score.pooled_figures([replace(item, window=replace(item.window, pc0=far_points)).frame(wrong)])
+    assert far["num_dynamic"] == 0 and np.isnan(far["dynamic"])
 
 
 def test_classes_of_several_sets_are_those_of_all_their_points(script: Any) -> None:
