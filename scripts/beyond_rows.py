@@ -8,7 +8,7 @@ from typing import Any, Dict, List, Optional
 
 from beyond_sets import ScoredSet
 
-from cflow_torch.config import PROOF_ONLY, Config, make_config
+from cflow_torch.config import Config, make_config
 
 SCALES = (0.4, 0.2, 0.1)
 # What each option of the dense method is set to alone on top of `paper`, where it can stand alone.
@@ -85,7 +85,7 @@ def ablation() -> List[Setting]:
         DEFAULT.but("default, scale .1", pixel_sizes=(0.1,)),
         DEFAULT.but("default, scales .2 .1", pixel_sizes=(0.2, 0.1)),
         DEFAULT.but("default, scales .4 .1", pixel_sizes=(0.4, 0.1)),
-        DEFAULT.but("default - proof", proof=False, **PROOF_ONLY),
+        DEFAULT.but("default - proof", proof=False),
         FAST.but("fast + children", children=True),
         FAST.but("fast + height_slices=4", height_slices=4),
     ]
