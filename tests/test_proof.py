@@ -13,6 +13,7 @@ from scenes import scene as scene_of_boxes
 
 from cflow_torch import CFlowError, Config, CorrelationFlow, Sweep, Window
 from cflow_torch.batch import make_batch
+from cflow_torch.config import make_config
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.log import window as window_of
 from cflow_torch.grid import Grid
