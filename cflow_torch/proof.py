@@ -21,6 +21,7 @@ from cflow_torch.aperture import slides_along_itself
 from cflow_torch.batch import Batch
 from cflow_torch.candidates import inherit, make_candidates
 from cflow_torch.cells import Cells, make_cells
+from cflow_torch.confidence import confidence
 from cflow_torch.config import Config
 from cflow_torch.grid import Grid
 from cflow_torch.judge import choose, judge, worth
@@ -63,7 +64,9 @@ def prove_motion(batch: Batch, grid: Grid, config: Config) -> Motion:
     with record_function("refine"):
         number = cells.number() if config.relocate or config.yaw else cells.number_at_t()
         rigid = _settle(motion, groups, cells, place, number, batch, config)
-    return _by_pixel(rigid, groups, judged[-1].score, cells, place, number)
+    with record_function("confidence"):
+        trust = confidence(cells, groups, rigid, batch.elapsed)
+    return _by_pixel(rigid, groups, judged[-1].score, trust, cells, place, number)
 
 
 def _levels(config: Config) -> List[Tuple[int, int]]:
@@ -154,8 +157,10 @@ def _settle(
     return RigidMotion(motion.flip(1) * grid.pixel_size, still[:, 0], still)
 
 
-def _by_pixel(rigid: RigidMotion, groups: Groups, score: Tensor, cells: Cells, place: Tensor, number: Tensor) -> Motion:
-    """The motion of G groups, and (P,) scores, as `Motion` wants them: by occupied pixel; its cluster M is P."""
+def _by_pixel(
+    rigid: RigidMotion, groups: Groups, score: Tensor, trust: Tensor, cells: Cells, place: Tensor, number: Tensor
+) -> Motion:
+    """The motion of G groups, (P,) scores, (P + 1,) trust, as `Motion` wants them: by pixel; its cluster M is P."""
     window = cells.window.index_select(0, groups.first)
     ids = torch.arange(window.numel(), device=window.device) - torch.searchsorted(window, window)
     group = F.pad(groups.of_pixel, (0, 1), value=window.numel())
@@ -168,4 +173,5 @@ def _by_pixel(rigid: RigidMotion, groups: Groups, score: Tensor, cells: Cells, p
         cluster_id=F.pad(ids, (0, 1), value=-1).index_select(0, group),
         score=F.pad(score, (0, 1)),
         rigid=RigidMotion(flow[:, :2], turn.index_select(0, group), centre.index_select(0, group)),
+        confidence=trust,
     )

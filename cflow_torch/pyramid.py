@@ -30,6 +30,7 @@ class Motion:
         cluster_id: (M + 1,) int64, number of the cluster counted from 0 in its window.
         score: (M + 1,) float32.
         rigid: of M + 1, what `flow` says and a turn: only where one is found, and at the last scale only.
+        confidence: (M + 1,) float32, see `FlowResult`; None = the method does not say.
     """
 
     of_place: Tensor
@@ -38,6 +39,7 @@ class Motion:
     cluster_id: Tensor
     score: Tensor
     rigid: Optional[RigidMotion] = None
+    confidence: Optional[Tensor] = None
 
     def cluster(self, points: slice) -> Tensor:
         """Cluster of each of some points, M = none."""
@@ -233,5 +235,9 @@ def _results(batch: Batch, flow: Optional[Tensor], motion: Motion) -> List[FlowR
                 of_axis.copy_(values)
         cluster_id, score = (of_cluster.index_select(0, cluster) for of_cluster in (motion.cluster_id, motion.score))
         is_valid = batch.takes_part[source.points].clone()
-        results.append(FlowResult(residual, source.pose_flow, residual + source.pose_flow, cluster_id, score, is_valid))
+        trust = motion.confidence
+        if trust is not None:
+            trust = trust.index_select(0, cluster).masked_fill_(~is_valid, 0.0)
+        total_flow = residual + source.pose_flow
+        results.append(FlowResult(residual, source.pose_flow, total_flow, cluster_id, score, is_valid, trust))
     return results

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any, Optional, Tuple, Union
+from typing import Any, Dict, Optional, Tuple, Union
 
 import numpy as np
 import torch
@@ -73,6 +73,9 @@ class FlowResult:
         score: (N,) float32 in [0, 1], NCC at the peak (t -> t+1, finest scale); 0 where cluster_id is -1.
         is_valid: (N,) bool, True for the rows that took part: finite, neither ground nor of the
             vehicle itself (`Config.ego_box`), inside the range.
+        confidence: (N,) float32 in [0, 1], with `Config.proof`, else None: estimated probability that the end-point
+            error of the residual flow (of a point that moves or stands still) is below 0.1 m per sweep interval; 0
+            where is_valid is False. From a table fitted on simulated drives, see docs/confidence.md.
     """
 
     residual_flow: Tensor
@@ -81,11 +84,16 @@ class FlowResult:
     cluster_id: Tensor
     score: Tensor
     is_valid: Tensor
+    confidence: Optional[Tensor] = None
 
     def to(self, device: Any) -> FlowResult:
         """The same result on another device."""
-        return FlowResult(*(getattr(self, f.name).to(device) for f in fields(self)))
+        return FlowResult(**{name: value.to(device) for name, value in self._given().items()})
 
     def numpy(self) -> dict:
-        """Every field as a NumPy array, by name."""
-        return {f.name: getattr(self, f.name).detach().cpu().numpy() for f in fields(self)}
+        """Every field that is not None as a NumPy array, by name."""
+        return {name: value.detach().cpu().numpy() for name, value in self._given().items()}
+
+    def _given(self) -> Dict[str, Tensor]:
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        return {name: value for name, value in values.items() if value is not None}

@@ -42,6 +42,8 @@ def test_points_that_are_not_finite_are_left_out(column, bad):
     keep = np.ones(len(clean.pc0.points), dtype=bool)
     keep[rows] = False
     for name, value in vars(result).items():  # the other rows do not notice
+        if value is None:
+            continue
         assert torch.equal(value[torch.from_numpy(keep)], getattr(expected, name)), name
         assert torch.isfinite(value.double()).all(), name
         fill = -1 if name == "cluster_id" else 0

@@ -63,7 +63,7 @@ def reordered(sweep: Sweep, seed: int) -> Sweep:
 
 
 def rows(result: FlowResult, order: np.ndarray) -> FlowResult:
-    return FlowResult(*(value[torch.from_numpy(order)] for value in vars(result).values()))
+    return FlowResult(*(value[torch.from_numpy(order)] for value in vars(result).values() if value is not None))
 
 
 choices = st.fixed_dictionaries(

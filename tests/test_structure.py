@@ -44,6 +44,7 @@ LAYERS = {
     "batch": 2,
     "candidates": 2,
     "cells": 2,
+    "confidence": 2,
     "cluster": 2,
     "components": 2,
     "correlate": 2,

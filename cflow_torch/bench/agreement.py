@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import fields
-from typing import Any, Dict, Sequence
+from typing import Any, Dict, Optional, Sequence
 
 import torch
+from torch import Tensor
 
 from cflow_torch.config import Config
 from cflow_torch.types import FlowResult
@@ -29,5 +30,9 @@ def same_bits(flows: Sequence[FlowResult], others: Sequence[FlowResult]) -> Dict
     """For each field of the result, whether it is equal everywhere, and whether all are."""
     names = [field.name for field in fields(FlowResult)]
     pairs = list(zip(flows, others))
-    same = {n: all(torch.equal(getattr(a, n).cpu(), getattr(b, n).cpu()) for a, b in pairs) for n in names}
+    same = {n: all(_is_same(getattr(a, n), getattr(b, n)) for a, b in pairs) for n in names}
     return {"bit_equal": all(same.values()), **same}
+
+
+def _is_same(one: Optional[Tensor], other: Optional[Tensor]) -> bool:
+    return one is other if one is None or other is None else torch.equal(one.cpu(), other.cpu())

@@ -131,4 +131,4 @@ def _memory(bench: Bench) -> Iterator[Row]:
 
 
 def _bytes_of(results: Sequence[FlowResult]) -> int:
-    return sum(value.numel() * value.element_size() for result in results for value in vars(result).values())
+    return sum(value.nbytes for result in results for value in result.numpy().values())

@@ -131,18 +131,23 @@ def reference_flow(window: Window, config: Config) -> FlowResult:
         ground = [ground_points(window.pc0, clouds[0]), ground_points(window.pc1, cloud1)]
         level = prove_motion(clouds, cloud1, ground, config)
         residual_flow, cluster_id, score = level.flow[0], level.cluster_id[0], level.score[0]
+        confidence = level.confidence
     else:
         residual_flow, cluster_id, score = coarse_to_fine(clouds, cloud1, config)
+        confidence = None
     # float32(p' - p); points that are not finite are NaN in p' and get 0
     pose_flow = np.nan_to_num(clouds[0].points - xyz(window.pc0), nan=0.0).astype(np.float32)
     residual_flow = residual_flow.astype(np.float32)
+    is_valid = clouds[0].takes_part & in_range(clouds[0].points, config)
+    trust = None if confidence is None else np.where(is_valid, confidence[0], 0).astype(np.float32)
     return FlowResult(
         residual_flow=torch.from_numpy(residual_flow),
         pose_flow=torch.from_numpy(pose_flow),
         flow=torch.from_numpy(pose_flow + residual_flow),
         cluster_id=torch.from_numpy(cluster_id),
         score=torch.from_numpy(score.astype(np.float32)),
-        is_valid=torch.from_numpy(clouds[0].takes_part & in_range(clouds[0].points, config)),
+        is_valid=torch.from_numpy(is_valid),
+        confidence=None if trust is None else torch.from_numpy(trust),
     )
 
 

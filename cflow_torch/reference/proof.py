@@ -14,6 +14,7 @@ from cflow_torch.config import Config
 from cflow_torch.reference.aperture import slides_along_itself
 from cflow_torch.reference.candidates import Vector, candidates, inherit
 from cflow_torch.reference.cells import slice_image
+from cflow_torch.reference.confidence import confidences
 from cflow_torch.reference.dense import scene_flow_in_1view
 from cflow_torch.reference.judge import choose, paired_counts, worth
 from cflow_torch.reference.keypoint_motion import keypoint_motion, keypoint_shifts
@@ -53,7 +54,7 @@ def prove_motion(clouds: Sequence[Cloud], cloud1: Cloud, ground: Sequence[np.nda
         config: settings.
 
     Returns:
-        Flow, number of the group and score, of sweep t only.
+        Flow, number of the group, score and confidence, of sweep t only.
     """
     sweeps, size = [cloud1, *clouds], config.pixel_sizes[-1]
     inside = [cloud.takes_part & in_range(cloud.points, config) for cloud in sweeps]
@@ -82,18 +83,23 @@ def prove_motion(clouds: Sequence[Cloud], cloud1: Cloud, ground: Sequence[np.nda
     motions = [judged[level].motions[component] for level, component in number]
     rigid = settle(motions, group_of, sweeps, inside, config)
 
+    elapsed = [cloud.steps for cloud in sweeps]
+    x0, y0 = config.point_cloud_range[:2]
+    trust, of_left_out = confidences(images, group_of, [group.flow for group in rigid], elapsed, (x0, y0), size)
+
     num_points = len(clouds[0].points)
+    confidence = np.full(num_points, of_left_out)
     flow, ids, scores = np.zeros((num_points, 3)), np.full(num_points, -1, dtype=np.int64), np.zeros(num_points)
     rows = np.flatnonzero(inside[1])
     for i, (r, c) in zip(rows.tolist(), project_bev(clouds[0].points[rows], config, size).tolist()):
-        scores[i] = judged[-1].scores[1][r, c]
+        scores[i], confidence[i] = judged[-1].scores[1][r, c], trust[r, c]
         if (1, r, c) in group_of:
             ids[i] = group_of[1, r, c]
             (v_x, v_y), turn, (c_x, c_y) = rigid[ids[i]]
             x, y = clouds[0].points[i, 0] - c_x, clouds[0].points[i, 1] - c_y
             turned_x, turned_y = rotate(turn, x, y)
             flow[i, :2] = (turned_x - x) + v_x, (turned_y - y) + v_y
-    return Level([flow], [ids], [scores])
+    return Level([flow], [ids], [scores], [confidence])
 
 
 def judge_level(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, List, NamedTuple, Tuple
+from typing import Any, List, NamedTuple, Optional, Tuple
 
 import numpy as np
 import torch
@@ -34,11 +34,13 @@ class Level(NamedTuple):
         flow: each (N, 3) float64, metres per sweep interval; 0 for points in no cluster.
         cluster_id: each (N,) int64, -1 for points in no cluster.
         score: each (N,) float64, NCC at the peak of the newest sweep; 0 for points in no cluster.
+        confidence: each (N,) float64, of points that take part; None = the method does not say.
     """
 
     flow: List[np.ndarray]
     cluster_id: List[np.ndarray]
     score: List[np.ndarray]
+    confidence: Optional[List[np.ndarray]] = None
 
 
 def compensate(window: Window, config: Config) -> Tuple[List[Cloud], Cloud]:
