@@ -3,6 +3,7 @@
 Columns: flow_t{x,y,z}_m total flow, residual_t{x,y,z}_m motion of objects, pose_t{x,y,z}_m ego motion (float32,
 metres until the next sweep, axes of the ego frame at t+1), cluster_id, score, is_valid; one row per point of sweep t.
 contents=[residual,is_valid] writes these columns only: the others follow from the poses, and take most of the room.
+With model.proof=true contents=[residual,is_valid,confidence] also tells how far each point can be trusted.
 OUTPUT/config.yaml holds the resolved settings and versions, OUTPUT/reports what was done. The same command again goes
 on where the last one ended. Ctrl-C and SIGTERM let the frames in hand be finished. The status is 0 if every frame is
 there, 1 if one is missing, 2 if the call was wrong, 130 or 143 after a signal.
@@ -30,7 +31,7 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from cflow_torch.cli.run import Failures, find_logs, is_sweep, make_model, output_folder, versions
-from cflow_torch.data.flow_file import CONTENTS, read_flow
+from cflow_torch.data.flow_file import CONTENTS, ON_REQUEST, read_flow
 from cflow_torch.data.hdf5.results import check_result_name, check_writable, write_hdf5_results
 from cflow_torch.data.records import write_text
 from cflow_torch.fleet.forecast import format_forecast, make_forecast
@@ -54,7 +55,7 @@ def task(cfg: DictConfig) -> None:
     layout = choose_layout(cfg.device, workers, threads, batch, os.environ)
     config = make_model(cfg).config
     sources = find_logs(cfg)
-    contents = _contents(cfg)
+    contents = _contents(cfg, config.proof)
     identity = make_identity(config, sources.reader, sources.settings, contents)
     job = Job(
         config=config,
@@ -108,13 +109,16 @@ def _check_results(cfg: DictConfig, shard: Shard) -> None:
     check_result_name(cfg.result_name)
 
 
-def _contents(cfg: DictConfig) -> Tuple[str, ...]:
+def _contents(cfg: DictConfig, has_confidence: bool) -> Tuple[str, ...]:
     given = [cfg.contents] if isinstance(cfg.contents, str) else list(cfg.contents)
-    if not given or set(given) - set(CONTENTS):
-        raise CFlowError(f"contents={given}: give some of {', '.join(CONTENTS)}")
-    if cfg.result_name is not None and set(given) != set(CONTENTS):
+    allowed = (*CONTENTS, *ON_REQUEST)
+    if not given or set(given) - set(allowed):
+        raise CFlowError(f"contents={given}: give some of {', '.join(allowed)}")
+    if "confidence" in given and not has_confidence:
+        raise CFlowError(f"contents={given}: confidence is there with model.proof=true only")
+    if cfg.result_name is not None and not set(given) >= set(CONTENTS):
         raise CFlowError("result_name reads the flow files again: it needs all contents")
-    return tuple(name for name in CONTENTS if name in given)
+    return tuple(name for name in allowed if name in given)
 
 
 def _into_scenes(name: str, scenes: Sequence[Path], output: Path) -> Failures:

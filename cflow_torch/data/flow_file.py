@@ -17,6 +17,7 @@ _VECTORS = {"flow": "flow", "residual": "residual_flow", "pose": "pose_flow"}  #
 _SCALARS = ("cluster_id", "score", "is_valid")
 _AXES = "xyz"
 CONTENTS = (*_VECTORS, *_SCALARS)
+ON_REQUEST = ("confidence",)  # what a file has only if it is named
 
 
 def write_flow(path: Place, result: FlowResult, contents: Sequence[str] = CONTENTS) -> None:
@@ -25,16 +26,22 @@ def write_flow(path: Place, result: FlowResult, contents: Sequence[str] = CONTEN
     Args:
         path: file name, by convention `<log id>/<time stamp of sweep t>.feather`.
         result: flow of one window.
-        contents: what of it, names of `CONTENTS`. The pose flow, and with it the total flow, follow from the poses;
-            without these two a file has about a seventeenth of the size.
+        contents: what of it, names of `CONTENTS` and `ON_REQUEST`. The pose flow, and with it the total flow, follow
+            from the poses; without these two a file has about a seventeenth of the size.
 
     Convention:
         Columns flow_t{x,y,z}_m (total), residual_t{x,y,z}_m, pose_t{x,y,z}_m float32 in metres and in the axes of
-        ego1, cluster_id int64, score float32, is_valid bool.
+        ego1, cluster_id int64, score and confidence float32, is_valid bool.
+
+    Raises:
+        CFlowError: the result has no confidence, and it was asked for.
     """
     columns = {}
     for name in contents:
-        values = getattr(result, _VECTORS.get(name, name)).detach().cpu().numpy()
+        given = getattr(result, _VECTORS.get(name, name))
+        if given is None:
+            raise CFlowError(f"{name} was asked for, but this result has none: estimate it with proof=True")
+        values = given.detach().cpu().numpy()
         if name in _VECTORS:
             columns.update({f"{name}_t{axis}_m": values[:, i] for i, axis in enumerate(_AXES)})
         else:
@@ -55,7 +62,8 @@ def read_flow(path: Place) -> FlowResult:
             field: np.stack([table[f"{name}_t{axis}_m"].to_numpy() for axis in _AXES], 1)
             for name, field in _VECTORS.items()
         }
-        scalars = {name: table[name].to_numpy() for name in _SCALARS}
+        more = [name for name in ON_REQUEST if name in table.column_names]
+        scalars = {name: table[name].to_numpy() for name in (*_SCALARS, *more)}
     except (OSError, pa.ArrowException, KeyError) as error:
         raise CFlowError(
             f"{path} is no flow file ({error}): give one that `cflow flow` wrote with all its contents"

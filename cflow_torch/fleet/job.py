@@ -24,7 +24,7 @@ class Job:
         reader: data set, a key of `catalog.DATA_SETS`.
         settings: of its reader.
         output: folder of the results; a path, or the address of an object store.
-        contents: of a flow file, names of `flow_file.CONTENTS`.
+        contents: of a flow file, names of `flow_file.CONTENTS` and `ON_REQUEST`.
         batch: windows that are computed together.
         redo: compute frames that are there already.
         check: warn of logs whose static world does not stay put.
