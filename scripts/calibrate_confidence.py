@@ -31,7 +31,8 @@ from cflow_torch.types import FlowResult, Window
 RIGHT = 0.1  # metres
 MOVES = 0.05  # metres; a true motion of at least this is dynamic
 SCENES = ("street", "highway", "crossing", "narrow")
-NUM_SWEEPS, MOST_HISTORY, EVERY = 15, 4, 5
+NUM_SWEEPS, MOST_HISTORY = 15, 4
+PICKS = (9, 12)  # sweeps of a drive, or the nearest that have labels
 DROPPED = (0.0, 0.05, 0.1, 0.2, 0.3, 0.5)
 NUM_BINS = 10  # of the reliability table
 MOST_POINTS = 3000  # of a window in a bin of the table when it is fitted, so that one lorry does not decide it
@@ -59,26 +60,28 @@ def simulated(cache: Path, seeds: Sequence[int]) -> Iterator[Truth]:
     """Windows of all sensors."""
     for profile, chosen in FORMATS.items():
         for source in benchmark_logs(cache, profile, seeds, NUM_SWEEPS, SCENES):
-            yield from _windows(open_log(chosen.data_set, source, check=False, **dict(chosen.settings)), EVERY)
+            log = open_log(chosen.data_set, source, check=False, **dict(chosen.settings))
+            late = range(MOST_HISTORY, len(log.timestamps) - 1)
+            for pick in PICKS:
+                nearest = sorted(late, key=lambda i: abs(i - pick))
+                yield _windowed(log, next(i for i in nearest if log.labels(i) is not None))
 
 
 def real(name: str, root: Path) -> Iterator[Truth]:
     """Windows of all logs of a data set below a folder."""
     for source in find_sources(name, root):
-        yield from _windows(open_log(name, source, check=False), 1)
+        log = open_log(name, source, check=False)
+        for i in range(min(MOST_HISTORY, len(log.timestamps) - 2), len(log.timestamps) - 1):
+            if log.labels(i) is not None:
+                yield _windowed(log, i)
 
 
-def _windows(log: Any, every: int) -> Iterator[Truth]:
-    known = [i for i in range(len(log.timestamps) - 1) if log.labels(i) is not None]
-    late = [i for i in known if i >= MOST_HISTORY] or known
-    for i in late[::every]:
-        truth = log.labels(i)
-        sweeps = window(log, i, MOST_HISTORY)
-        points = np.asarray(sweeps.pc0.points)[:, :3]
-        T_ego1_ego0 = np.linalg.inv(sweeps.pc1.pose) @ sweeps.pc0.pose
-        mask = log.eval_mask(i) if hasattr(log, "eval_mask") else None
-        counts = truth.is_valid if mask is None else truth.is_valid & mask
-        yield sweeps, truth.flow - ego_motion_flow(points, T_ego1_ego0), counts
+def _windowed(log: Any, i: int) -> Truth:
+    sweeps, truth = window(log, i, MOST_HISTORY), log.labels(i)
+    T_ego1_ego0 = np.linalg.inv(sweeps.pc1.pose) @ sweeps.pc0.pose
+    mask = log.eval_mask(i) if hasattr(log, "eval_mask") else None
+    counts = truth.is_valid if mask is None else truth.is_valid & mask
+    return sweeps, truth.flow - ego_motion_flow(np.asarray(sweeps.pc0.points)[:, :3], T_ego1_ego0), counts
 
 
 def statistics(windows: Iterator[Truth], histories: Sequence[int], most: float = math.inf) -> np.ndarray:
