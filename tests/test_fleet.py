@@ -131,6 +131,12 @@ def test_a_file_has_only_the_contents_asked_for(
     assert "contents was" in capsys.readouterr().err
     assert flow(fleet, tmp_path, "contents=[colour]") == 2
     assert "residual" in capsys.readouterr().err
+    assert flow(fleet, tmp_path, "contents=[confidence]") == 2
+    assert "model.proof=true" in capsys.readouterr().err
+    assert flow(fleet, tmp_path / "more", "contents=[confidence,residual]", "engine.workers=1", "model.proof=true") == 0
+    more = feather.read_table(next(tmp_path.glob("more/*/*.feather")))
+    assert more.column_names == ["residual_tx_m", "residual_ty_m", "residual_tz_m", "confidence"]
+    assert max(more["confidence"].to_pylist()) > 0.5
 
 
 # Going on
