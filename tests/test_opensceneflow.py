@@ -713,12 +713,14 @@ def test_every_setting_can_be_overridden_without_plus(name: str, conf: Path, tmp
         "max_memory": "100000000",
         "device": "cpu",
         "output": "valid",
+        "proof": "false",
+        "height_slices": "0",
         "ego_T_lidar": str(EGO_T_LIDAR.tolist()).replace(" ", ""),
     }
     cfg = composed(conf, f"model={name}", *(f"model.target.{key}={value}" for key, value in changes.items()))
     model = osf.build(cfg, write_null_checkpoint(tmp_path / "cflow.ckpt"))
     fields = {key: value for key, value in model.config.as_dict().items() if key in changes}
-    assert len(fields) == 17
+    assert len(fields) == 19
     for key, value in fields.items():
         assert value == yaml.safe_load(changes[key]), key
     assert model.output == "valid" and np.allclose(model.ego_T_lidar, EGO_T_LIDAR)
@@ -874,12 +876,13 @@ def test_real_pair_scores_as_cflow_eval(
     model: str, pose_dtype: str, points_frame: str, av2_folder: Path, tmp_path: Path
 ) -> None:
     """Batches do not tell the time of t+1, so that the gate of the key points is the one for 0.1 s; the pair's
-    0.100196 s make a gate of 2 m a little wider. A gate of 2.03 m and the wider one hold the same pixels."""
+    0.100196 s make a gate of 2 m a little wider. A gate of 2.03 m and the wider one hold the same pixels. Nor do they
+    hold ground, so `clearance` has nothing to go by."""
     extrinsics = up_lidar(av2_folder) if points_frame == "sensor" else None
     layout = {"points_frame": points_frame, "ego_T_lidar": extrinsics, "pose_dtype": pose_dtype}
     folder, out = store_real(tmp_path / "scenes", av2_folder, **layout), tmp_path / "out"
     call = ["eval", "data=hdf5", f"data.root={folder}", f"model={model}", "definition=opensceneflow", f"output={out}"]
-    main([*call, "model.gate_radius=2.03"])
+    main([*call, "model.gate_radius=2.03", "model.clearance=null"])
     expected = plain_scores(json.loads((out / "results.json").read_text())["results"])
     settings = make_config(model, gate_radius=2.03).as_dict()
     num_frames = settings.pop("num_history") + 2
