@@ -83,7 +83,7 @@ class Config:
     height_slices: int = 0
     slice_height: float = 0.5
     proof: bool = False
-    proof_z: float = 2.0
+    proof_z: float = 1.5
     clearance: Optional[float] = None
     children: bool = False
     aperture: bool = False
@@ -139,6 +139,10 @@ PRESETS: Dict[str, Dict[str, Any]] = {
         "relocate": True,
         "yaw": True,
         "use_timestamps": True,
+        # Cheap key points: they only propose.
+        "keypoint_size": 0.2,
+        "patch_size": 21,
+        "ratio_threshold": 1.02,
     },
     # Two older sweeps, one scale, and of docs/beyond.md what costs little.
     "fast": {
