@@ -28,7 +28,18 @@ NOT_WITH_PROOF: Dict[str, Any] = {
     "zero_test": None,
     "subpixel": "none",
 }
-SWITCHES = ("sectional_view", "use_timestamps", "mutual_check", "proof", "children", "aperture", "relocate", "yaw")
+SWITCHES = (
+    "sectional_view",
+    "use_timestamps",
+    "mutual_check",
+    "proof",
+    "children",
+    "aperture",
+    "relocate",
+    "nudge",
+    "yaw",
+    "slow",
+)
 # The ratio test compares products of counts: 51^6 * (2 * 10^4)^2 still fits an int64.
 LARGEST_PATCH = 51
 LARGEST_RATIO = 2

@@ -46,7 +46,9 @@ class Config:
         children: also components that are not dilated, as parts of the finest ones.
         aperture: lines that seem to slide along themselves do not move.
         relocate: pairs of sweeps: place moving groups between the pixels, on four grids.
+        nudge: pairs of sweeps: move large moving groups by 0.05 m at most where their centroids meet better.
         yaw: refine the motion of moving groups and let them turn.
+        slow: pairs of sweeps: look for motion of a pixel or less in groups that nothing moved, on small cubes.
         keypoint_size: m; key points of t and t+1 are matched at this pixel size, a whole multiple of the finest, and
             what they say of a component is one of its candidates; `patch_size` and the settings of key points that
             follow it count. None = they are not asked.
@@ -88,7 +90,9 @@ class Config:
     children: bool = False
     aperture: bool = False
     relocate: bool = False
+    nudge: bool = False
     yaw: bool = False
+    slow: bool = False
     keypoint_size: Optional[float] = None
     sweep_interval: float = 0.1
     use_timestamps: bool = False
@@ -131,13 +135,13 @@ PRESETS: Dict[str, Dict[str, Any]] = {
         "point_cloud_range": (-51.2, -51.2, -math.inf, 51.2, 51.2, math.inf),
         "max_speed": 40.0,
         "max_object": 25.0,
-        "height_slices": 4,
         "proof": True,
         "clearance": 0.4,
         "children": True,
         "aperture": True,
         "relocate": True,
         "yaw": True,
+        "slow": True,
         "use_timestamps": True,
         # Cheap key points: they only propose.
         "keypoint_size": 0.2,

@@ -21,7 +21,7 @@ class MovingPoints:
         group: (N,) int64.
         window, step: (N,) int64, which sweep: step 0 = t+1, 1 = t, ...
         pixel: (N,) int64, number of its occupied pixel, 0 ... P - 1.
-        part: (N,) int64, height slice, 0 ... 3.
+        part: (N,) int64, height slice, 0 ... 3 (or as many as `moving_points` was asked for).
         position: (2, N) float64, x and y, metres, frame of t+1; inside the region.
     """
 
@@ -41,7 +41,13 @@ class MovingPoints:
 
 
 def moving_points(
-    batch: Batch, place: Tensor, pixel_of_place: Tensor, group: Tensor, num_groups: int, slice_height: float
+    batch: Batch,
+    place: Tensor,
+    pixel_of_place: Tensor,
+    group: Tensor,
+    num_groups: int,
+    slice_height: float,
+    num_slices: int = NUM_SLICES,
 ) -> MovingPoints:
     """Points of all sweeps whose pixel has a group.
 
@@ -52,11 +58,12 @@ def moving_points(
         group: (P,) int64, group of each occupied pixel, `num_groups` = none.
         num_groups: G.
         slice_height: metres.
+        num_slices: a power of 2.
 
     Returns:
         In the order of the batch.
 
-    Convention: slice floor(z / slice_height) mod 4, a true division in float64.
+    Convention: slice floor(z / slice_height) mod num_slices, a true division in float64.
 
     Cost: two look-ups a point, the rest for those that are kept.
     """
@@ -67,5 +74,5 @@ def moving_points(
     x, y, z = batch.positions.index_select(1, rows).unbind(0)
     size = torch.full((), slice_height, dtype=torch.float64, device=z.device)
     window, step = split_index(batch.image.index_select(0, rows).long(), batch.num_steps)
-    part = torch.floor(z / size).long().bitwise_and_(NUM_SLICES - 1)
+    part = torch.floor(z / size).long().bitwise_and_(num_slices - 1)
     return MovingPoints(group.index_select(0, pixel), window, step, pixel, part, torch.stack((x, y)))

@@ -28,12 +28,14 @@ from cflow_torch.judge import choose, judge, worth
 from cflow_torch.keypoint_motion import KeyPointMotion, match_key_points
 from cflow_torch.levels import Level, equals_parent, make_level, parents
 from cflow_torch.moving import moving_points
+from cflow_torch.nudge import nudge
 from cflow_torch.ops.indices import flat_nonzero
 from cflow_torch.peaks import find_peaks
 from cflow_torch.pyramid import Motion
 from cflow_torch.refine import refine
 from cflow_torch.relocate import relocate
 from cflow_torch.rigid import RigidMotion
+from cflow_torch.slow import slow_motion
 from cflow_torch.tree import Groups, choose_groups
 
 
@@ -62,8 +64,13 @@ def prove_motion(batch: Batch, grid: Grid, config: Config) -> Motion:
         groups = choose_groups([one.level.node for one in judged], [one.worth for one in judged])
         motion = torch.cat([one.motion for one in judged]).index_select(0, groups.component)
     with record_function("refine"):
-        number = cells.number() if config.relocate or config.yaw else cells.number_at_t()
+        needs_all = config.relocate or config.nudge or config.yaw or config.slow
+        number = cells.number() if needs_all else cells.number_at_t()
         rigid = _settle(motion, groups, cells, place, number, batch, config)
+    if config.slow:
+        with record_function("slow"):
+            too_long = torch.cat([one.level.too_long for one in judged]).index_select(0, groups.component)
+            rigid = _creep(rigid, ~motion.any(1) & ~too_long, groups, cells, place, number, batch)
     with record_function("confidence"):
         trust = confidence(cells, groups, rigid, batch.elapsed)
     return _by_pixel(rigid, groups, judged[-1].score, trust, cells, place, number)
@@ -143,18 +150,33 @@ def _settle(
     grid, num_groups = cells.grid, len(motion)
     still = torch.zeros_like(motion)
     moves = F.pad(motion.any(1), (0, 1))
-    if (config.relocate or config.yaw) and bool(moves.any()):
+    if (config.relocate or config.nudge or config.yaw) and bool(moves.any()):
+        num_pixels = cells.pixel.numel()
         of_pixel = torch.where(moves.index_select(0, groups.of_pixel), groups.of_pixel, num_groups)
         points = moving_points(batch, place, number, of_pixel, num_groups, config.slice_height)
-        if config.relocate:  # with history one of many sweeps would decide
-            is_pair = (batch.elapsed > 0).sum(1) == 1
-            pairs = points.take(flat_nonzero(is_pair.index_select(0, points.window)))
+        is_pair = (batch.elapsed > 0).sum(1) == 1  # with history one of many sweeps would decide
+        pairs = points.take(flat_nonzero(is_pair.index_select(0, points.window)))
+        if config.relocate:
             motion = relocate(pairs, grid, batch.num_windows, motion)
-            points = points.take(flat_nonzero(motion.any(1).index_select(0, points.group)))
+            pairs, points = (of.take(flat_nonzero(motion.any(1).index_select(0, of.group))) for of in (pairs, points))
+        if config.nudge:
+            motion = nudge(pairs, number, num_pixels, grid, batch.elapsed, motion)
         if config.yaw:
             flow = motion.flip(1) * grid.pixel_size + 0.0
-            return refine(points, number, cells.pixel.numel(), grid, batch.elapsed, flow)
+            return refine(points, number, num_pixels, grid, batch.elapsed, flow)
     return RigidMotion(motion.flip(1) * grid.pixel_size, still[:, 0], still)
+
+
+def _creep(
+    rigid: RigidMotion, asked: Tensor, groups: Groups, cells: Cells, place: Tensor, number: Tensor, batch: Batch
+) -> RigidMotion:
+    """The motion with that of slow groups, which do not turn, among those asked, (G,) bool."""
+    window = cells.window.index_select(0, groups.first)
+    is_pair = (batch.elapsed > 0).sum(1) == 1  # with history slow groups leave their pixels
+    asked = asked & is_pair.index_select(0, window)
+    elapsed = batch.elapsed[:, 1].index_select(0, window)
+    slow = slow_motion(batch, place, cells, number, groups.of_pixel, asked, elapsed)
+    return RigidMotion(torch.where(slow.any(1, keepdim=True), slow, rigid.flow), rigid.turn, rigid.centre)
 
 
 def _by_pixel(

@@ -63,6 +63,8 @@ def moving_scene(
     pixel_size: float = 0.1,
     snap: float = 0.0,
     num_points: int = 40,
+    speed: float = 0.4,
+    size: Tuple[float, float] = (0.2, 1.5),
 ) -> Scene:
     """Objects that translate and turn, seen anew in every sweep, some at the border, some missing in some sweeps.
 
@@ -73,6 +75,8 @@ def moving_scene(
         pixel_size: metres.
         snap: metres, places are rounded to multiples of it: equal distances and shared voxels; 0 = they are not.
         num_points: of an object and sweep.
+        speed: metres per interval, standard deviation.
+        size: metres, shortest and longest side of an object.
     """
     grid = Grid(pixel_size, LOWER, UPPER)
     points, images, owners, flows, elapsed = [], [], [], [], []
@@ -82,8 +86,8 @@ def moving_scene(
         elapsed.append(times)
         for _ in range(int(rng.integers(1, 5))):
             centre = rng.uniform(LOWER, UPPER)[:2] * 0.9
-            size, angle, velocity = rng.uniform(0.2, 1.5, 2), rng.uniform(-0.1, 0.1), rng.normal(0, 0.4, 2)
-            shape = rng.uniform(-0.5, 0.5, (num_points, 2)) * size
+            sides, angle, velocity = rng.uniform(*size, 2), rng.uniform(-0.1, 0.1), rng.normal(0, speed, 2)
+            shape = rng.uniform(-0.5, 0.5, (num_points, 2)) * sides
             gone = rng.random(num_steps) < 0.15
             for step in range(num_steps):
                 turn, way = -angle * times[step], centre - velocity * times[step]

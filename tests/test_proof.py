@@ -29,7 +29,9 @@ ALL = {
     "children": True,
     "aperture": True,
     "relocate": True,
+    "nudge": True,
     "yaw": True,
+    "slow": True,
 }
 
 
@@ -120,7 +122,10 @@ def test_equals_the_reference_on_many_scenes(labeling):
             proof=True,
             proof_z=(0.0, 1.0, 2.0)[seed % 3],
             clearance=(None, 0.3)[seed % 7 > 0],
-            **{name: (seed + i) % 5 > 0 for i, name in enumerate(("children", "aperture", "relocate", "yaw"))},
+            **{
+                name: (seed + i) % 5 > 0
+                for i, name in enumerate(("children", "aperture", "relocate", "nudge", "yaw", "slow"))
+            },
         )
         window = scene_of_boxes(300 + seed, num_history=seed % 4, poses=seed % 5 > 0, stamps=seed % 2 > 0)
         (result,) = CorrelationFlow(settings)([window])

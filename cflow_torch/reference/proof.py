@@ -20,10 +20,12 @@ from cflow_torch.reference.judge import choose, paired_counts, worth
 from cflow_torch.reference.keypoint_motion import keypoint_motion, keypoint_shifts
 from cflow_torch.reference.levels import components_at, equals_parent
 from cflow_torch.reference.low_columns import ground_heights, in_low_column
+from cflow_torch.reference.nudge import nudge
 from cflow_torch.reference.peak import parabola
 from cflow_torch.reference.pixels import bounding_box, in_range, project_bev, search_radius
 from cflow_torch.reference.refinement import Point, Rigid, refine, rotate
 from cflow_torch.reference.relocation import relocate
+from cflow_torch.reference.slow import creep
 from cflow_torch.reference.sweeps import Cloud, Level
 from cflow_torch.reference.tree import winners
 
@@ -36,12 +38,14 @@ class Judged(NamedTuple):
         motions: of each component (y, x), finest pixels per sweep interval.
         worths: of each component.
         scores: per sweep (H, W) float64, NCC of the finest component so far that was looked for.
+        too_long: of each component, whether it is longer than `max_object`.
     """
 
     node: List[np.ndarray]
     motions: List[Vector]
     worths: List[int]
     scores: List[np.ndarray]
+    too_long: List[bool]
 
 
 def prove_motion(clouds: Sequence[Cloud], cloud1: Cloud, ground: Sequence[np.ndarray], config: Config) -> Level:
@@ -82,6 +86,11 @@ def prove_motion(clouds: Sequence[Cloud], cloud1: Cloud, ground: Sequence[np.nda
     group_of = {pixel: number[winner] for pixel, winner in zip(pixels, won) if winner is not None}
     motions = [judged[level].motions[component] for level, component in number]
     rigid = settle(motions, group_of, sweeps, inside, config)
+    if config.slow and len(sweeps) == 2:  # with history slow groups leave their pixels
+        asked = [not any(v) and not judged[level].too_long[i] for v, (level, i) in zip(motions, number)]
+        for group, slow in enumerate(creep(asked, group_of, images, sweeps, inside, config)):
+            if slow is not None:
+                rigid[group] = rigid[group]._replace(flow=slow)
 
     elapsed = [cloud.steps for cloud in sweeps]
     x0, y0 = config.point_cloud_range[:2]
@@ -158,7 +167,7 @@ def judge_level(
         motion, best = choose(values, found)
         motions.append(motion)
         worths.append(best)
-    return Judged(node, motions, worths, scores)
+    return Judged(node, motions, worths, scores, list(too_long))
 
 
 def find_peak(
@@ -208,7 +217,7 @@ def settle(
         group_of: (sweep, row, col) -> group.
         sweeps: t+1, t, t-1, ...
         inside: of each sweep, the points that count.
-        config: settings. Only pairs of sweeps are relocated: with history one of many sweeps would decide.
+        config: settings. Only pairs of sweeps are relocated and nudged: with history one of many sweeps would decide.
     """
     size, (x0, y0) = config.pixel_sizes[-1], config.point_cloud_range[:2]
     points = []
@@ -221,6 +230,8 @@ def settle(
     if config.relocate and len(sweeps) == 2:
         motions = relocate(points, motions, (x0, y0), size)
         points = [point for point in points if any(motions[point.group])]
+    if config.nudge and len(sweeps) == 2:
+        motions = nudge(points, motions, sweeps[1].steps, (x0, y0), size)
     flows = [(x * size + 0.0, y * size + 0.0) for y, x in motions]
     if config.yaw:
         return refine(points, flows, [[cloud.steps for cloud in sweeps]], (x0, y0), size)
