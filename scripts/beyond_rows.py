@@ -82,6 +82,10 @@ def ablation() -> List[Setting]:
     rows += [
         DEFAULT.but("default - relocate - yaw", relocate=False, yaw=False),
         DEFAULT.but("default, proof_z=0", proof_z=0.0),
+        DEFAULT.but("default, proof_z=1", proof_z=1.0),
+        DEFAULT.but("default, proof_z=2", proof_z=2.0),
+        DEFAULT.but("default + height_slices=4", height_slices=4),
+        DEFAULT.but("default + nudge", nudge=True),
         DEFAULT.but("default, scale .1", pixel_sizes=(0.1,)),
         DEFAULT.but("default, scales .2 .1", pixel_sizes=(0.2, 0.1)),
         DEFAULT.but("default, scales .4 .1", pixel_sizes=(0.4, 0.1)),

@@ -2,7 +2,7 @@
 """Confidence of the flow (docs/confidence.md): fit its table on simulated drives, see on others whether it is right.
 
   python scripts/calibrate_confidence.py fit CACHE           writes cflow_torch/confidence.json; seeds 100 ... 103
-  python scripts/calibrate_confidence.py evaluate CACHE --seeds 400 401 402 403 --figure docs/confidence.png
+  python scripts/calibrate_confidence.py evaluate CACHE --seeds 300 301 302 303 --figure docs/confidence.png
   python scripts/calibrate_confidence.py evaluate --real FOLDER      Argoverse 2 pair and KITTI 0000 below FOLDER
 
 CACHE is a folder for the simulated drives (`data/benchmark.py`). Five sensors, four kinds of scenes, pairs (h = 0) and
@@ -37,19 +37,6 @@ DROPPED = (0.0, 0.05, 0.1, 0.2, 0.3, 0.5)
 NUM_BINS = 10  # of the reliability table
 MOST_POINTS = 3000  # of a window in a bin of the table when it is fitted, so that one lorry does not decide it
 BOX = (-70.0, -70.0, -math.inf, 70.0, 70.0, math.inf)
-SETTINGS: Dict[str, Any] = {
-    "proof": True,
-    "pixel_sizes": (0.4, 0.2, 0.1),
-    "height_slices": 4,
-    "clearance": 0.4,
-    "children": True,
-    "aperture": True,
-    "relocate": True,
-    "yaw": True,
-    "max_object": 25.0,
-    "max_speed": 40.0,
-    "point_cloud_range": BOX,
-}
 TABLE_FILE = Path(confidence.__file__).with_name("confidence.json")
 # A row of the statistics: of the points of one bin of the table, all and dynamic ones.
 POINTS, RIGHT_ONES, DYNAMIC, RIGHT_DYNAMIC, ERROR, DYNAMIC_ERROR = range(6)
@@ -94,7 +81,7 @@ def statistics(windows: Iterator[Truth], histories: Sequence[int], most: float =
     """
     num_bins = len(confidence.TABLE["probabilities"])
     kept, sums = confidence.TABLE["probabilities"], np.zeros((num_bins, 6))
-    models = {h: make_model(make_config("default", **SETTINGS, num_history=h)) for h in histories}
+    models = {h: make_model(make_config("default", num_history=h, point_cloud_range=BOX)) for h in histories}
     confidence.TABLE["probabilities"] = [i / num_bins for i in range(num_bins)]  # says which bin it is
     try:
         for number, (sweeps, truth, counts) in enumerate(windows, 1):
