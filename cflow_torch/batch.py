@@ -103,7 +103,7 @@ def split_windows(windows: Sequence[Window], config: Config, grid: Grid, device:
         limit = _BYTES_ON_CPU
     used = 0
     per_point, per_pixel = _BYTES_PER_POINT, _BYTES_PER_PIXEL + config.height_slices
-    if config.method == "keypoints" or (config.proof and config.keypoint_size is not None):
+    if config.method == "keypoints" or (config.proof and config.keypoint_block > 0):
         # descriptors: two copies of L^2 bytes for at most half of the points
         per_point += config.patch_size**2
     if config.proof:

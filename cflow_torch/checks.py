@@ -89,7 +89,7 @@ def _check_values(config: Any) -> None:
     own = config.ego_box
     if own is not None and (len(own) != 4 or not all(map(math.isfinite, own)) or own[0] >= own[2] or own[1] >= own[3]):
         raise CFlowError(f"ego_box={own}: give (x0, y0, x1, y1) in metres, finite, with x0 < x1 and y0 < y1, or None")
-    for name in ("num_history", "patch_size", "min_cluster_size", "height_slices"):
+    for name in ("num_history", "patch_size", "min_cluster_size", "height_slices", "keypoint_block"):
         _whole_number(name, getattr(config, name))
     if config.patch_size % 2 == 0 or config.patch_size > LARGEST_PATCH:
         raise CFlowError(
@@ -97,7 +97,7 @@ def _check_values(config: Any) -> None:
         )
     for name in ("max_extent", "sweep_interval", "gate_radius", "slice_height"):
         _positive(name, getattr(config, name))
-    for name in ("max_speed", "max_object", "clearance", "keypoint_size", "max_memory"):
+    for name in ("max_speed", "max_object", "clearance", "max_memory"):
         if getattr(config, name) is not None:
             _positive(name, getattr(config, name))
     if config.zero_test is not None:
@@ -145,13 +145,6 @@ def _check_proof(config: Any) -> None:
             f"pixel_sizes={config.pixel_sizes}: with proof=True (as in preset='default') give whole multiples of the "
             f"finest one, for example (0.4, 0.2, 0.1); else {mend}"
         )
-    if config.keypoint_size is not None:
-        block = config.keypoint_size / config.pixel_sizes[-1]
-        if math.isinf(block) or abs(block - round(block)) > 1e-6:
-            raise CFlowError(
-                f"keypoint_size={config.keypoint_size}: give a whole multiple of the finest pixel size "
-                f"{config.pixel_sizes[-1]}, or None"
-            )
     for name, value in NOT_WITH_PROOF.items():
         if getattr(config, name) != value:
             raise CFlowError(f"{name}={getattr(config, name)!r} does not go with proof=True: {mend}")

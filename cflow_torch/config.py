@@ -49,9 +49,9 @@ class Config:
         nudge: pairs of sweeps: move large moving groups by 0.05 m at most where their centroids meet better.
         yaw: refine the motion of moving groups and let them turn.
         slow: pairs of sweeps: look for motion of a pixel or less in groups that nothing moved, on small cubes.
-        keypoint_size: m; key points of t and t+1 are matched at this pixel size, a whole multiple of the finest, and
-            what they say of a component is one of its candidates; `patch_size` and the settings of key points that
-            follow it count. None = they are not asked.
+        keypoint_block: k; key points of t and t+1 are matched at pixels of k x k finest ones, and what they say of a
+            component is one of its candidates; `patch_size` and the settings of key points that follow it count.
+            0 = they are not asked.
         sweep_interval: seconds between consecutive sweeps where time stamps are missing.
         use_timestamps: divide a history estimate by elapsed time (in sweep intervals t -> t+1) instead of steps.
         sectional_view: also estimate f_z in the X-Z view along the heading (Alg. scene_flow_1obj).
@@ -93,7 +93,7 @@ class Config:
     nudge: bool = False
     yaw: bool = False
     slow: bool = False
-    keypoint_size: Optional[float] = None
+    keypoint_block: int = 0
     sweep_interval: float = 0.1
     use_timestamps: bool = False
     sectional_view: bool = False
@@ -144,7 +144,7 @@ PRESETS: Dict[str, Dict[str, Any]] = {
         "slow": True,
         "use_timestamps": True,
         # Cheap key points: they only propose.
-        "keypoint_size": 0.2,
+        "keypoint_block": 2,
         "patch_size": 21,
         "ratio_threshold": 1.02,
     },

@@ -46,7 +46,7 @@ def prove_motion(batch: Batch, grid: Grid, config: Config) -> Motion:
         batch: points of all windows, with three axes.
         grid: the finest BEV.
         config: all but `subpixel` and `zero_test`; `max_object` and `max_speed` count, settings of key points where
-            `keypoint_size` is given.
+            `keypoint_block` is given.
 
     Returns:
         The motion, by occupied pixel; ids number the groups that move together or stand still together.
@@ -54,9 +54,9 @@ def prove_motion(batch: Batch, grid: Grid, config: Config) -> Motion:
     with record_function("project"):
         cells, place = make_cells(batch, grid, config.slice_height, config.clearance)
     key_points = None
-    if config.keypoint_size is not None:
+    if config.keypoint_block > 0:
         with record_function("match"):
-            key_points = match_key_points(cells, batch, round(config.keypoint_size / grid.pixel_size), config)
+            key_points = match_key_points(cells, batch, config.keypoint_block, config)
     judged: List[_Judged] = []
     for block, reach in _levels(config):
         judged.append(_judge_level(cells, block, reach, judged[-1] if judged else None, key_points, batch, config))

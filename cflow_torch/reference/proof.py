@@ -69,8 +69,8 @@ def prove_motion(clouds: Sequence[Cloud], cloud1: Cloud, ground: Sequence[np.nda
     images = [slice_image(cloud.points[keep], config, size, config.slice_height) for cloud, keep in zip(sweeps, inside)]
 
     shifts = None
-    if config.keypoint_size is not None:
-        shifts = keypoint_shifts(images, clouds[0], round(config.keypoint_size / size), config)
+    if config.keypoint_block > 0:
+        shifts = keypoint_shifts(images, clouds[0], config.keypoint_block, config)
     judged: List[Judged] = []
     levels = [(round(s / size), 3) for s in config.pixel_sizes] + ([(1, 1)] if config.children else [])
     for block, reach in levels:
