@@ -30,9 +30,12 @@ from cflow_torch.types import Sweep, Window
 # occupancy and cluster of a pixel of every sweep.
 _BYTES_PER_POINT = 160
 _BYTES_PER_PIXEL = 10
-# What the proof takes on top, if every point has a pixel of its own: lists of pixels; of voxels, if they are refined.
-_BYTES_TO_PROVE = 40
+# What the proof takes on top, if every point has a pixel of its own: lists of pixels and components; then one by one
+# descriptors of key points, voxels that are refined, cubes and the 25 around each.
+_BYTES_TO_PROVE = 170
 _BYTES_TO_REFINE = 280
+_BYTES_TO_CREEP = 560
+_BYTES_TO_NUDGE = 760
 # What windows of a group may take on a CPU where `max_memory` says nothing: about 9 of a pair, 4 of six sweeps. Fresh
 # pages of larger arrays cost more than the operations that larger groups save (windows/s in docs/benchmarks).
 _BYTES_ON_CPU = 1 << 29
@@ -101,24 +104,37 @@ def split_windows(windows: Sequence[Window], config: Config, grid: Grid, device:
     limit = config.max_memory
     if limit is None and device.type == "cpu":
         limit = _BYTES_ON_CPU
-    used = 0
-    per_point, per_pixel = _BYTES_PER_POINT, _BYTES_PER_PIXEL + config.height_slices
-    if config.method == "keypoints" or (config.proof and config.keypoint_block > 0):
-        # descriptors: two copies of L^2 bytes for at most half of the points
-        per_point += config.patch_size**2
-    if config.proof:
-        per_point += _BYTES_TO_PROVE
-        per_point += _BYTES_TO_REFINE if config.relocate or config.yaw else 0
+    used, per_pixel = 0, _BYTES_PER_PIXEL + config.height_slices
     for window in windows:
         sweeps = (window.pc1, window.pc0, *window.pch)
         points = sum(sweep.points.shape[0] for sweep in sweeps)
-        needed = per_point * points + (per_pixel * len(sweeps) + 30) * grid.height * grid.width
+        needed = _bytes_per_point(config, len(sweeps) == 2) * points
+        needed += (per_pixel * len(sweeps) + 30) * grid.height * grid.width
         if not groups or (limit is not None and used + needed > limit):
             groups.append([])
             used = 0
         groups[-1].append(window)
         used += needed
     return groups
+
+
+def _bytes_per_point(config: Config, is_pair: bool) -> int:
+    """What a point of a window takes. Stages of the proof follow one another: the largest counts."""
+    descriptors = config.patch_size**2  # two copies of L^2 bytes for at most half of the points
+    if config.method == "keypoints":
+        return _BYTES_PER_POINT + descriptors
+    if not config.proof:
+        return _BYTES_PER_POINT
+    return (
+        _BYTES_PER_POINT
+        + _BYTES_TO_PROVE
+        + max(
+            descriptors if config.keypoint_block > 0 else 0,
+            _BYTES_TO_REFINE if config.relocate or config.yaw else 0,
+            _BYTES_TO_CREEP if config.slow and is_pair else 0,
+            _BYTES_TO_NUDGE if config.nudge and is_pair else 0,
+        )
+    )
 
 
 def make_batch(windows: Sequence[Window], config: Config, grid: Grid, device: Any = "auto") -> Batch:

@@ -45,6 +45,10 @@ LARGEST_PATCH = 51
 LARGEST_RATIO = 2
 # Nothing needs more, and (100 z)^2 times a count fits an int64.
 LARGEST_Z = 1000
+# m; heights above the ground are bounded, too.
+HIGHEST_CLEARANCE = 1000
+# Pixels a side; no region is wider, and an index still fits an int64.
+LARGEST_BLOCK = 10**6
 # A byte holds the slices of a pixel.
 MOST_SLICES = 8
 
@@ -116,6 +120,10 @@ def _check_values(config: Any) -> None:
         raise CFlowError(
             f"ratio_threshold={config.ratio_threshold}: give a number from 1 to {LARGEST_RATIO}, for example 1.1"
         )
+    if config.clearance is not None and config.clearance > HIGHEST_CLEARANCE:
+        raise CFlowError(f"clearance={config.clearance}: give at most {HIGHEST_CLEARANCE} m, for example 0.4, or None")
+    if config.keypoint_block > LARGEST_BLOCK:
+        raise CFlowError(f"keypoint_block={config.keypoint_block}: give at most {LARGEST_BLOCK} pixels, for example 2")
     for name in ("sweep_interval", "gate_radius", "slice_height"):
         if math.isinf(getattr(config, name)):
             raise CFlowError(f"{name}={getattr(config, name)}: give a finite number")

@@ -26,7 +26,8 @@ class Config:
         max_extent: d^max in metres: longer side of a component's bounding box above which it is eroded
             and labelled again (Alg. clustering).
         max_speed: m/s; a displacement longer than max_speed * elapsed time + one pixel is not searched.
-            None = the paper's search range, half of the cluster's bounding box.
+            None = the paper's search range, half of the cluster's bounding box. With `proof` it bounds candidates, with
+            a pixel of their own pixel size; what places, refines or creeps may add some decimetres.
         max_object: m; a cluster whose pixels at t+1 have a bounding box with a longer side than this does not move, see
             docs/beyond.md. None = any may. With `proof` it has the score of the coarser component around it, or 0.
         zero_test: z; a shift is kept if the pixels that coincide by it only (b) are significantly more than those that
@@ -128,7 +129,7 @@ class Config:
 # What each preset changes in `Config`'s defaults. Those are the paper's base row: s = 0.1 m, BEV, h = 0.
 PRESETS: Dict[str, Dict[str, Any]] = {
     "paper": {},
-    # Everything of docs/beyond.md; region of the main harness.
+    # What pays of docs/beyond.md; region of the main harness.
     "default": {
         "num_history": 4,
         "pixel_sizes": (0.4, 0.2, 0.1),

@@ -193,7 +193,7 @@ def _by_pixel(
         place=place,
         flow=flow,
         cluster_id=F.pad(ids, (0, 1), value=-1).index_select(0, group),
-        score=F.pad(score, (0, 1)),
+        score=F.pad(score.masked_fill(groups.of_pixel == window.numel(), 0.0), (0, 1)),
         rigid=RigidMotion(flow[:, :2], turn.index_select(0, group), centre.index_select(0, group)),
         confidence=trust,
     )

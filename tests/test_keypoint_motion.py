@@ -122,7 +122,7 @@ def test_off_they_change_nothing_and_on_they_propose():
     assert any(moved) and not all(moved)
 
 
-@pytest.mark.parametrize("wrong", [-1, 0.3, None, True])
+@pytest.mark.parametrize("wrong", [-1, 0.3, None, True, 10**7])
 def test_sizes_that_make_no_sense(wrong):
     with pytest.raises(CFlowError, match="keypoint_block"):
         settings(0, keypoint_block=wrong)

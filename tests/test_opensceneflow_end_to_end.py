@@ -262,7 +262,7 @@ def test_eval_of_the_real_pair(model: str, harness: Harness, checkpoint: Path, r
     preset, num_frames = ("default", 6) if model == "cflow" else ("keypoints", 2)
     assert not disagreements(tables, replayed(real, module(preset, num_frames), num_frames))
     if model == "cflow":  # the gate of the key points is a little wider where the time of t+1 is known
-        assert not disagreements(tables, by_cflow_eval(real, tmp_path, "model.num_history=4"))
+        assert not disagreements(tables, by_cflow_eval(real, tmp_path, "model.num_history=4", "model.clearance=null"))
 
 
 @pytest.mark.slow
@@ -271,7 +271,7 @@ def test_eval_prints_what_cflow_eval_computes(
     model: str, harness: Harness, checkpoint: Path, data: Path, dense: Dict[str, str], tmp_path: Path
 ) -> None:
     if model == "cflow":
-        tables, settings = dense, ["model.num_history=4", MODEL_PIXELS]
+        tables, settings = dense, ["model.num_history=4", "model.clearance=null", MODEL_PIXELS]
     else:
         one_size = "pixel_sizes=[0.0937]"
         overrides = [*places(checkpoint, data), f"model.target.{one_size}"]

@@ -53,11 +53,21 @@ CEILINGS: Dict[str, Dict[str, int]] = {
         "waits": 48,  # 44
         "uploads": 7,  # 6
     },
+    "default, h = 0": {
+        "operations": 11_000,  # 9_996
+        "fft_samples": 1_850_000,  # 1_679_218
+        "multiply_adds": 141_000_000,  # 128_077_824
+        "allocated_bytes": 571_000_000,  # 519_306_746
+        "peak_bytes": 49_500_000,  # 45_040_442
+        "waits": 459,  # 417
+        "uploads": 26,  # 24
+    },
 }
 CONFIGS: Dict[str, Config] = {
     "h = 0": make_config("paper"),
     "h = 2, 2 scales": make_config("paper", num_history=2, pixel_sizes=(0.4, 0.1)),
     "key points": make_config("paper", method="keypoints"),
+    "default, h = 0": make_config("default", num_history=0, max_memory=1 << 32),  # not in small groups
 }
 COUNTS = [field.name for field in fields(Work) if field.type == "int"]
 
@@ -116,7 +126,9 @@ def test_work_is_linear_in_windows(name):
     one, many = counted(name), counted(name, num_windows=times)
     # Pieces that fit the cache are cut elsewhere: a target at a cut is transformed twice, products are padded anew.
     assert many.fft_samples == pytest.approx(times * one.fft_samples, rel=0.03)
-    assert many.multiply_adds == pytest.approx(times * one.multiply_adds, rel=0.06)
+    assert many.multiply_adds <= 1.06 * times * one.multiply_adds
+    least = 0.8 if CONFIGS[name].proof else 0.94  # few key points in one window are padded more than those of several
+    assert many.multiply_adds >= least * times * one.multiply_adds
     assert many.peak_bytes <= (times + 0.1) * one.peak_bytes
     assert many.operations <= most * one.operations
     assert many.waits <= most * one.waits
@@ -130,7 +142,7 @@ def test_max_memory_bounds_the_peak(name):
     assert count_allocations(lambda: free(sweeps))[1] > 2 * limit
     limited = make_model(CONFIGS[name].replace(max_memory=limit), "cpu")
     results = limited(sweeps)
-    of_results = sum(value.numel() * value.element_size() for result in results for value in vars(result).values())
+    of_results = sum(value.nbytes for result in results for value in result.numpy().values())
     _, peak = count_allocations(lambda: limited(sweeps))
     assert of_results < peak <= limit + of_results
 
@@ -147,7 +159,11 @@ ALL_PARTS: Dict[str, Any] = {
     "children": True,
     "aperture": True,
     "relocate": True,
+    "nudge": True,
     "yaw": True,
+    "slow": True,
+    "keypoint_block": 2,
+    "patch_size": 21,
 }
 
 
@@ -178,7 +194,7 @@ def test_max_memory_bounds_the_proof_at_its_worst(settings, num_history):
     limited = make_model(config.replace(max_memory=most), "cpu")
     results = limited([sweeps] * 3)
     assert (results[0].residual_flow.norm(dim=1) > 0.3).float().mean() > 0.5
-    of_results = sum(value.numel() * value.element_size() for result in results for value in vars(result).values())
+    of_results = sum(value.nbytes for result in results for value in result.numpy().values())
     assert most / 2 < count_allocations(lambda: limited([sweeps] * 3))[1] <= most + of_results
 
 

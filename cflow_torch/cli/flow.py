@@ -3,7 +3,7 @@
 Columns: flow_t{x,y,z}_m total flow, residual_t{x,y,z}_m motion of objects, pose_t{x,y,z}_m ego motion (float32,
 metres until the next sweep, axes of the ego frame at t+1), cluster_id, score, is_valid; one row per point of sweep t.
 contents=[residual,is_valid] writes these columns only: the others follow from the poses, and take most of the room.
-With model.proof=true contents=[residual,is_valid,confidence] also tells how far each point can be trusted.
+contents=[residual,is_valid,confidence] also tells how far each point can be trusted (not model=paper, keypoints).
 OUTPUT/config.yaml holds the resolved settings and versions, OUTPUT/reports what was done. The same command again goes
 on where the last one ended. Ctrl-C and SIGTERM let the frames in hand be finished. The status is 0 if every frame is
 there, 1 if one is missing, 2 if the call was wrong, 130 or 143 after a signal.

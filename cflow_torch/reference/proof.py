@@ -101,9 +101,9 @@ def prove_motion(clouds: Sequence[Cloud], cloud1: Cloud, ground: Sequence[np.nda
     flow, ids, scores = np.zeros((num_points, 3)), np.full(num_points, -1, dtype=np.int64), np.zeros(num_points)
     rows = np.flatnonzero(inside[1])
     for i, (r, c) in zip(rows.tolist(), project_bev(clouds[0].points[rows], config, size).tolist()):
-        scores[i], confidence[i] = judged[-1].scores[1][r, c], trust[r, c]
+        confidence[i] = trust[r, c]
         if (1, r, c) in group_of:
-            ids[i] = group_of[1, r, c]
+            ids[i], scores[i] = group_of[1, r, c], judged[-1].scores[1][r, c]
             (v_x, v_y), turn, (c_x, c_y) = rigid[ids[i]]
             x, y = clouds[0].points[i, 0] - c_x, clouds[0].points[i, 1] - c_y
             turned_x, turned_y = rotate(turn, x, y)

@@ -108,7 +108,7 @@ def ground_points(sweep: Sweep, cloud: Cloud) -> np.ndarray:
     """(N, 3) float64, metres, frame of t+1: the ground of a sweep; none where it is not known."""
     if sweep.is_ground is None:
         return np.zeros((0, 3))
-    return cloud.points[_matrix(sweep.is_ground).astype(bool)]
+    return cloud.points[_matrix(sweep.is_ground).astype(bool) & np.isfinite(cloud.points).all(axis=1)]
 
 
 def xyz(sweep: Sweep) -> np.ndarray:
