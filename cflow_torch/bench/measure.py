@@ -16,6 +16,7 @@ from cflow_torch.bench.opencv_loop import opencv_flow
 from cflow_torch.bench.stages import STAGES, stage_seconds
 from cflow_torch.bench.timing import alternate, median_ratio, summary, synchronise, threads
 from cflow_torch.bench.work import count_work
+from cflow_torch.checks import DENSE_ONLY
 from cflow_torch.config import Config
 from cflow_torch.estimate import make_model
 from cflow_torch.reference import reference_flow
@@ -96,7 +97,8 @@ def _measure(
 ) -> Report:
     """The entry of one config, see `run_bench`."""
     model = make_model(config, device)
-    plain = config.method == "dense" and config.clustering == "components"
+    is_paper = all(getattr(config, name) == off for name, off in DENSE_ONLY.items())
+    plain = config.method == "dense" and config.clustering == "components" and is_paper
     why_no_loop = why_no_opencv
     if not why_no_opencv and (config.sectional_view or not plain):
         why_no_loop = "has no sectional view" if plain else "has no such method"

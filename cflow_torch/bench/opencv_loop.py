@@ -85,7 +85,9 @@ def opencv_flow(window: Window, config: Config) -> FlowResult:
     if config.method != "dense" or config.clustering != "components" or config.sectional_view:
         raise CFlowError("the OpenCV loop has method='dense', clustering='components', sectional_view=False only")
     if any(getattr(config, name) != off for name, off in DENSE_ONLY.items()):
-        raise CFlowError(f"the OpenCV loop is the paper's method: turn off {', '.join(DENSE_ONLY)}")
+        raise CFlowError(
+            f"the OpenCV loop is the paper's method: give preset='paper', or turn off {', '.join(DENSE_ONLY)}"
+        )
     points0, moved0 = _compensate(window.pc0, window.pc1)
     clouds = _clouds(window, moved0, config)
     cloud1 = _cloud(window.pc1, _columns(window.pc1), 0.0, 0.0, config)
