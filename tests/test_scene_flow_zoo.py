@@ -16,7 +16,7 @@ from scenes import needs_gpu, pose
 from torch import Tensor, nn
 from turning_drive import SETTINGS, YAW_STEP, drive, expected, relative_to, speeds
 
-from cflow_torch import CFlowError, Sweep
+from cflow_torch import CFlowError, Sweep, Window
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.log import window
 from cflow_torch.integrations.scene_flow_zoo import CorrelationFlowModel, register
@@ -274,13 +274,15 @@ def test_a_sequence_is_no_batch(zoo: Any) -> None:
 def test_real_pair_as_it_is_loaded_there(
     zoo: Any, av2_folder: Path, monkeypatch: pytest.MonkeyPatch, preset: str
 ) -> None:
-    """120,000 rows a sweep, poses rounded to float32: the flow is the package's own, turned by R^T."""
+    """120,000 rows a sweep, poses rounded to float32: the flow is the package's own with these, turned by R^T."""
     monkeypatch.setattr(sys.modules[__name__], "PAD", 120_000)
     sweeps = window(AV2Log(av2_folder), 0)
     model = CorrelationFlowModel(preset)
     (output,) = model(ForwardMode.VAL, [make_sequence([sweeps.pc0, sweeps.pc1])], None)
-    (result,) = model.sequence_flow.model([sweeps])
-    T_ego1_ego0 = np.linalg.inv(np.asarray(sweeps.pc1.pose)) @ np.asarray(sweeps.pc0.pose)
+    poses = np.float32(relative_to([sweeps.pc0, sweeps.pc1], 1)).astype(np.float64)
+    rounded = [replace(sweep, pose=pose) for sweep, pose in zip((sweeps.pc0, sweeps.pc1), poses)]
+    (result,) = model.sequence_flow.model([Window(*rounded)])
+    T_ego1_ego0 = np.linalg.inv(poses[1]) @ poses[0]
     turned = result.residual_flow.double().numpy() @ T_ego1_ego0[:3, :3]
     assert output.ego_flows.shape == (1, 120_000, 3) and speeds(turned).max() > 0.5
     np.testing.assert_allclose(output.flow(0), turned, rtol=0, atol=1e-6)
