@@ -19,6 +19,8 @@ from cflow_torch.data.log import window as window_of_log
 from cflow_torch.grid import Grid
 from cflow_torch.reference import judge as ref
 
+EVERY = slice(None)
+
 
 class Scene:
     """Random images of B windows, S sweeps; random components; candidates on and between whole pixels."""
@@ -41,14 +43,14 @@ class Scene:
         if num_steps > 2:  # the first window lacks the oldest sweep
             self.images[0, -1], self.elapsed[0, -1] = 0, 0.0
 
-    def cells(self, windows: slice = slice(None)) -> Cells:
+    def cells(self, windows: slice = EVERY) -> Cells:
         images = self.images[windows]
         image = torch.from_numpy(np.append(images.ravel(), np.uint8(0)))
         grid = Grid(1.0, (0.0, 0.0, -1.0), (self.width - 0.5, self.height - 0.5, 1.0))
         assert (grid.height, grid.width) == images.shape[2:]
         return cells_of_image(image, grid, *images.shape[:2])
 
-    def judge(self, windows: slice = slice(None), device: str = "cpu"):
+    def judge(self, windows: slice = EVERY, device: str = "cpu"):
         cells = self.cells(windows)
         node = torch.from_numpy(self.nodes[windows].ravel())[cells.pixel]
         if device != "cpu":

@@ -19,6 +19,7 @@ from cflow_torch.data.log import window as window_of
 from cflow_torch.grid import Grid
 from cflow_torch.reference import reference_flow
 
+EVERY = slice(None)
 ALL = {
     "proof": True,
     "pixel_sizes": (0.4, 0.2, 0.1),
@@ -71,7 +72,7 @@ def model(**overrides) -> CorrelationFlow:
     return CorrelationFlow(Config(**{**ALL, **overrides}))
 
 
-def assert_same(one, other, rows=slice(None)):
+def assert_same(one, other, rows=EVERY):
     for name in ("residual_flow", "cluster_id", "score", "is_valid", "flow"):
         assert torch.equal(getattr(one, name)[rows], getattr(other, name)), name
 
