@@ -174,6 +174,8 @@ def _creep(
     window = cells.window.index_select(0, groups.first)
     is_pair = (batch.elapsed > 0).sum(1) == 1  # with history slow groups leave their pixels
     asked = asked & is_pair.index_select(0, window)
+    if not bool(asked.any()):
+        return rigid
     elapsed = batch.elapsed[:, 1].index_select(0, window)
     slow = slow_motion(batch, place, cells, number, groups.of_pixel, asked, elapsed)
     return RigidMotion(torch.where(slow.any(1, keepdim=True), slow, rigid.flow), rigid.turn, rigid.centre)
