@@ -23,7 +23,7 @@ from cflow_torch.reference.low_columns import ground_heights, in_low_column
 from cflow_torch.reference.nudge import nudge
 from cflow_torch.reference.peak import parabola
 from cflow_torch.reference.pixels import bounding_box, in_range, project_bev, search_radius
-from cflow_torch.reference.refinement import Point, Rigid, refine, rotate
+from cflow_torch.reference.refinement import Rigid, points_of_groups, refine, rotate
 from cflow_torch.reference.relocation import relocate
 from cflow_torch.reference.slow import creep
 from cflow_torch.reference.sweeps import Cloud, Level
@@ -220,13 +220,8 @@ def settle(
         config: settings. Only pairs of sweeps are relocated and nudged: with history one of many sweeps would decide.
     """
     size, (x0, y0) = config.pixel_sizes[-1], config.point_cloud_range[:2]
-    points = []
-    for m, (cloud, keep) in enumerate(zip(sweeps, inside)):
-        kept = cloud.points[keep]
-        for (r, c), (x, y, z) in zip(project_bev(kept, config, size).tolist(), kept.tolist()):
-            group = group_of.get((m, r, c), -1)
-            if group >= 0 and any(motions[group]):
-                points.append(Point(0, m, math.floor(z / config.slice_height) % 4, group, x, y))
+    moves = [any(motion) for motion in motions]
+    points = points_of_groups(moves, group_of, sweeps, inside, (config.slice_height, 4), config)
     if config.relocate and len(sweeps) == 2:
         motions = relocate(points, motions, (x0, y0), size)
         points = [point for point in points if any(motions[point.group])]

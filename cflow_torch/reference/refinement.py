@@ -9,6 +9,12 @@ from __future__ import annotations
 import math
 from typing import Dict, List, NamedTuple, Optional, Sequence, Tuple
 
+import numpy as np
+
+from cflow_torch.config import Config
+from cflow_torch.reference.pixels import project_bev
+from cflow_torch.reference.sweeps import Cloud
+
 UNITS = 1024  # of a metre
 SIGMA = 0.15  # metres, of the weight of a pair of voxels
 MOST_TIME = 2.5  # sweep intervals: older sweeps are not looked at
@@ -29,6 +35,35 @@ class Point(NamedTuple):
     group: int
     x: float
     y: float
+
+
+def points_of_groups(
+    wanted: Sequence[bool],
+    group_of: Dict[Tuple[int, int, int], int],
+    sweeps: Sequence[Cloud],
+    inside: Sequence[np.ndarray],
+    slices: Tuple[float, int],
+    config: Config,
+) -> List[Point]:
+    """Points of some groups.
+
+    Args:
+        wanted: of each group.
+        group_of: (sweep, row, col) -> group.
+        sweeps: t+1, t, t-1, ...
+        inside: of each sweep, the points that count.
+        slices: height of a slice in metres, and how many are told apart.
+        config: for the finest pixels.
+    """
+    height, num_slices = slices
+    points = []
+    for m, (cloud, keep) in enumerate(zip(sweeps, inside)):
+        kept = cloud.points[keep]
+        for (r, c), (x, y, z) in zip(project_bev(kept, config, config.pixel_sizes[-1]).tolist(), kept.tolist()):
+            group = group_of.get((m, r, c), -1)
+            if group >= 0 and wanted[group]:
+                points.append(Point(0, m, math.floor(z / height) % num_slices, group, x, y))
+    return points
 
 
 class Voxel(NamedTuple):

@@ -8,8 +8,7 @@ from typing import Dict, List, Optional, Sequence, Tuple
 import numpy as np
 
 from cflow_torch.config import Config
-from cflow_torch.reference.pixels import project_bev
-from cflow_torch.reference.refinement import UNITS, Place, Point, Voxel, centroids
+from cflow_torch.reference.refinement import UNITS, Place, Point, Voxel, centroids, points_of_groups
 from cflow_torch.reference.sweeps import Cloud
 
 SIDES = ((0, 1), (1, -1), (1, 0), (1, 1))  # (dy, dx), a pixel ahead; the opposite is behind
@@ -51,13 +50,7 @@ def creep(
         members[group].append(pixel)
     wanted = [is_asked and leans(images, pixels) for is_asked, pixels in zip(asked, members)]
     size, (x0, y0) = config.pixel_sizes[-1], config.point_cloud_range[:2]
-    points = []
-    for m, (cloud, keep) in enumerate(zip(sweeps, inside)):
-        kept = cloud.points[keep]
-        for (r, c), (x, y, z) in zip(project_bev(kept, config, size).tolist(), kept.tolist()):
-            group = group_of.get((m, r, c), -1)
-            if group >= 0 and wanted[group]:
-                points.append(Point(0, m, math.floor(z / size) % NUM_LAYERS, group, x, y))
+    points = points_of_groups(wanted, group_of, sweeps, inside, (size, NUM_LAYERS), config)
     return slow_motion(points, len(asked), sweeps[1].steps, (x0, y0), size)
 
 
