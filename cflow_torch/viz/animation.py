@@ -166,6 +166,7 @@ def _write_mp4(file: IO[bytes], pictures: Iterator[np.ndarray], frames_per_secon
             pix_fmt_out="yuv420p",
             quality=None,
             macro_block_size=2,
+            ffmpeg_log_level="error",
             output_params=settings,
         )
         try:
