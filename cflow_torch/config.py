@@ -15,35 +15,37 @@ class Config:
     """Settings of CorrelationFlow. Checked when made; an invalid value raises `CFlowError`.
 
     Args:
-        method: "dense" (Alg. general_correlation_flow) or "keypoints" (Sec. CorrelationFlow-Keypoints).
+        method: "dense": one motion for every cluster, by correlation (Alg. general_correlation_flow), or "keypoints":
+            matches of key points, spread over components (Sec. CorrelationFlow-Keypoints).
         pixel_sizes: side s of a BEV pixel in metres, one per scale, coarse to fine (Eq. 3d_to_bev).
         num_history: h, number of sweeps before t that are used (Sec. leverage_past_pcs).
         point_cloud_range: (x0, y0, z0, x1, y1, z1) in metres, both ends included, in the frame of t+1.
         ego_box: (x0, y0, x1, y1) in metres, both ends included, in every sweep's own frame: points in it are returns of
             the vehicle itself and take no part, as ground. They stand still in that frame, so without it they move as
             the vehicle does. None = there are none.
-        connectivity: 4 or 8, which neighbours join two pixels (Sec. clustering).
+        connectivity: 4: pixels join along their sides, 8: also across their corners (Sec. clustering).
         max_extent: d^max in metres: longer side of a component's bounding box above which it is eroded
             and labelled again (Alg. clustering).
-        max_speed: m/s; a displacement longer than max_speed * elapsed time + one pixel is not searched.
+        max_speed: a displacement longer than max_speed * elapsed time + one pixel is not searched.
             None = the paper's search range, half of the cluster's bounding box. With `proof` it bounds candidates, with
             a pixel of their own pixel size; what places, refines or creeps may add some decimetres.
-        max_object: m; a cluster whose pixels at t+1 have a bounding box with a longer side than this does not move, see
-            docs/beyond.md. None = any may. With `proof` it has the score of the coarser component around it, or 0.
-        zero_test: z; a shift is kept if the pixels that coincide by it only (b) are significantly more than those that
+        max_object: a cluster whose pixels at t+1 have a bounding box with a side of more metres than this does not
+            move, see docs/beyond.md. None = any may. With `proof` it has the score of the coarser component around it,
+            or 0.
+        zero_test: z: a shift is kept if the pixels that coincide by it only (b) are significantly more than those that
             coincide without it only (c): b > c and (b - c)^2 >= z^2 (b + c). 0.01 ... 1000, used to two decimals.
             None = every shift is kept.
         subpixel: "none" or "parabola": the peak of the correlation to fractions of a pixel, at most half a pixel away,
             by the parabola through the counts beside it; a peak at no shift stays there.
         height_slices: number of height slices n, 2 ... 8: points coincide only if their slices floor(z / slice_height)
             mod n do, z in the frame of t+1. Clusters stay those of the BEV. 0 = one slice for all heights.
-        slice_height: m.
+        slice_height: height of a slice, metres.
         proof: candidate motions of components at all `pixel_sizes` at once, judged against no motion at the finest one,
             in four height slices, instead of coarse to fine, see docs/beyond.md. `pixel_sizes` must be whole multiples
-            of the finest. The options from here to `yaw` are parts of it and mean nothing without it.
+            of the finest. The options from here to `keypoint_block` are parts of it and mean nothing without it.
         proof_z: standard deviations of luck that a motion must exceed to be proved.
-        clearance: m; pixels that stand out of the ground around them by less than this are left out, where ground is
-            known. None = none are.
+        clearance: pixels that stand out of the ground around them by less than this many metres are left out, where
+            ground is known. None = none are.
         children: also components that are not dilated, as parts of the finest ones.
         aperture: lines that seem to slide along themselves do not move.
         relocate: pairs of sweeps: place moving groups between the pixels, on four grids.
@@ -56,7 +58,8 @@ class Config:
         sweep_interval: seconds between consecutive sweeps where time stamps are missing.
         use_timestamps: divide a history estimate by elapsed time (in sweep intervals t -> t+1) instead of steps.
         sectional_view: also estimate f_z in the X-Z view along the heading (Alg. scene_flow_1obj).
-        clustering: "components" (Alg. clustering) or "hdbscan".
+        clustering: "components": connected components (Alg. clustering), or "hdbscan" in their place (Table
+            which_clustering_method; extra hdbscan, seconds per pair).
         min_cluster_size: hdbscan: smallest cluster, points of all sweeps together.
         labeling: engine of morphology and labelling, "sparse" (occupied pixels only) or "kornia" (dense image).
         correlation: engine of the correlation, "fft" or "conv". Engines give the same bits.
