@@ -1,7 +1,21 @@
-"""Pictures: bird's-eye view of a flow, in the field's colours. Needs `pip install 'cflow_torch[viz]'`."""
+"""Pictures of a flow and of every stage on the way to it. Needs `pip install 'cflow_torch[viz]'`."""
 
 from cflow_torch.viz.animation import save_animation
 from cflow_torch.viz.bev import plot_flow, save_picture
+from cflow_torch.viz.clusters import plot_clusters
+from cflow_torch.viz.correlation import plot_correlation
+from cflow_torch.viz.keypoints import plot_keypoints
+from cflow_torch.viz.scales import plot_scales
 from cflow_torch.viz.wheel import flow_to_rgb, wheel_image
 
-__all__ = ["flow_to_rgb", "plot_flow", "save_animation", "save_picture", "wheel_image"]
+__all__ = [
+    "flow_to_rgb",
+    "plot_clusters",
+    "plot_correlation",
+    "plot_flow",
+    "plot_keypoints",
+    "plot_scales",
+    "save_animation",
+    "save_picture",
+    "wheel_image",
+]

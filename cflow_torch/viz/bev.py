@@ -10,7 +10,8 @@ import numpy as np
 from cflow_torch.config import Config
 from cflow_torch.data.atomic import atomic_file
 from cflow_torch.types import Array, CFlowError, FlowResult
-from cflow_torch.viz.panel import MOVING, draw_error, draw_flow, draw_ground, draw_scale, draw_wheel, new_figure
+from cflow_torch.viz.legend import CORNERS, draw_scale, draw_wheel
+from cflow_torch.viz.panel import MOVING, draw_error, draw_flow, draw_ground, new_figure
 from cflow_torch.viz.wheel import to_numpy
 
 if TYPE_CHECKING:
@@ -26,6 +27,7 @@ def plot_flow(
     max_flow: Optional[float] = None,
     title: Optional[str] = None,
     truth: Optional[Array] = None,
+    legend: Optional[str] = None,
 ) -> Figure:
     """Bird's-eye view of sweep t with the motion of its objects until t+1.
 
@@ -39,6 +41,7 @@ def plot_flow(
         title: one line above the picture.
         truth: (N, 3) true RESIDUAL flow, metres per sweep, NaN where unknown (total flow minus `pose_flow`). Adds a
             panel with it and one with the error of every point whose truth is known.
+        legend: corner of the colour wheel, "upper right", "lower right" or "upper left"; None = where it hides least.
 
     Returns:
         Figure, 1000 pixels wide at its own dpi (1792 with truth), for `save_picture`. No pyplot state is touched.
@@ -53,16 +56,16 @@ def plot_flow(
 
     Cost: linear in the points; about a second for 100,000.
     """
-    position = _rows("points", points, None)
+    position = point_rows("points", points, None)
     given = result_or_residual.residual_flow if isinstance(result_or_residual, FlowResult) else result_or_residual
-    residual = _rows("residual flow", given, len(position))
-    true_flow = None if truth is None else _rows("truth", truth, len(position))
-    ground = np.zeros(len(position), bool) if is_ground is None else to_numpy(is_ground).astype(bool)
-    if ground.shape != (len(position),):
-        raise CFlowError(f"is_ground has shape {ground.shape}: give ({len(position)},), one entry per point")
+    residual = point_rows("residual flow", given, len(position))
+    true_flow = None if truth is None else point_rows("truth", truth, len(position))
+    ground = ground_rows(is_ground, len(position))
     if max_flow is not None and not 0 < max_flow < np.inf:
         raise CFlowError(f"max_flow={max_flow}: give a positive length in metres, or None for the longest flow drawn")
-    view, is_inside = _view(position, point_cloud_range)
+    if legend is not None and legend not in CORNERS:
+        raise CFlowError(f"legend={legend!r}: give None or one of {', '.join(CORNERS)}")
+    view, is_inside = view_of(position, point_cloud_range)
 
     floor, rest = position[is_inside & ground], is_inside & ~ground
     position, residual = position[rest], residual[rest]
@@ -72,7 +75,7 @@ def plot_flow(
     if true_flow is not None:
         true_flow = true_flow[rest]
     if max_flow is None:
-        max_flow = _longest(residual if true_flow is None else np.concatenate([residual, true_flow]))
+        max_flow = longest_flow(residual if true_flow is None else np.concatenate([residual, true_flow]))
 
     names = ("",) if true_flow is None else ("estimate", "ground truth", "error")
     figure, panels = new_figure(names, view, title)
@@ -80,7 +83,7 @@ def plot_flow(
         draw_ground(axes, floor)
     draw_flow(panels[0], position, residual, cluster, max_flow)
     draw_scale(panels[0])
-    draw_wheel(panels[0], position, np.linalg.norm(residual, axis=1) > MOVING, max_flow)
+    draw_wheel(panels[0], position, np.linalg.norm(residual, axis=1) > MOVING, max_flow, legend)
     if true_flow is not None:
         draw_flow(panels[1], position, true_flow, None, max_flow)
         draw_error(panels[2], position, residual, true_flow)
@@ -113,7 +116,7 @@ def save_picture(figure: Figure, path: Union[str, Path]) -> Path:
     return path
 
 
-def _rows(name: str, values: Array, count: Optional[int]) -> np.ndarray:
+def point_rows(name: str, values: Array, count: Optional[int]) -> np.ndarray:
     """(N, 3) float64."""
     array = to_numpy(values)
     if array.ndim != 2 or array.shape[1] < 3 or (count is not None and len(array) != count):
@@ -122,7 +125,15 @@ def _rows(name: str, values: Array, count: Optional[int]) -> np.ndarray:
     return array[:, :3].astype(np.float64)
 
 
-def _view(position: np.ndarray, point_cloud_range: Optional[Sequence[float]]) -> Tuple[np.ndarray, np.ndarray]:
+def ground_rows(is_ground: Optional[Array], count: int) -> np.ndarray:
+    """(N,) bool."""
+    ground = np.zeros(count, bool) if is_ground is None else to_numpy(is_ground).astype(bool)
+    if ground.shape != (count,):
+        raise CFlowError(f"is_ground has shape {ground.shape}: give ({count},), one entry per point")
+    return ground
+
+
+def view_of(position: np.ndarray, point_cloud_range: Optional[Sequence[float]]) -> Tuple[np.ndarray, np.ndarray]:
     """((2, 2) low and high corner of the view, (N,) bool is inside)."""
     default = Config().point_cloud_range
     bounds = np.asarray(default if point_cloud_range is None else point_cloud_range, np.float64)
@@ -140,7 +151,7 @@ def _view(position: np.ndarray, point_cloud_range: Optional[Sequence[float]]) ->
     return np.stack([low[:2], high[:2]]), is_inside
 
 
-def _longest(flow: np.ndarray) -> float:
+def longest_flow(flow: np.ndarray) -> float:
     """Longest flow in the plane, rounded up to 0.1 m, at least 0.1 m."""
     length = np.hypot(flow[:, 0], flow[:, 1])
     return max(float(np.ceil(length[np.isfinite(length)].max(initial=0) * 10 - 1e-3)) / 10, 0.1)

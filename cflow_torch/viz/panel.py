@@ -1,4 +1,4 @@
-"""Layers of a bird's-eye panel: ground, static points, movers, arrows, errors, and the legends."""
+"""Layers of a bird's-eye panel: ground, static points, movers, arrows, errors, the ego vehicle."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ import numpy as np
 import torch
 
 from cflow_torch.ops.labeling import connected_components
-from cflow_torch.types import CFlowError
-from cflow_torch.viz.wheel import flow_to_rgb, wheel_image
+from cflow_torch.viz.legend import SWEEP_RATE, legend_box
+from cflow_torch.viz.style import FAINT, FRAME, GROUND, INK, STATIC, blank_figure, inches_of
+from cflow_torch.viz.wheel import flow_to_rgb
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -17,35 +18,34 @@ if TYPE_CHECKING:
 
 MOVING = 0.08  # metres per sweep; the field's viewers leave slower points white
 MIN_ERROR, MAX_ERROR = 0.05, 0.35  # metres, ends of the viewers' error colours: below counts as none
-SWEEP_RATE = 10  # Hz
 ARROW_STEPS = 5  # an arrow is so many sweeps long
 MIN_ARROW_POINTS = 8  # smaller clusters get no arrow
 OBJECT_PIXEL = 0.5  # metres; movers in touching pixels are one object where no clusters are given
 _MAX_PIXELS = 2048  # a side; movers spread wider get larger pixels
+FLOW_CAPTION = (
+    f"grey: static   colour: moves more than {MOVING:g} m per sweep   "
+    f"arrow: motion over {ARROW_STEPS} sweeps ({ARROW_STEPS / SWEEP_RATE:g} s at {SWEEP_RATE} Hz)   "
+    f"rings: every 10 m"
+)
 
-_INK, _STATIC, _GROUND, _FRAME = "#20262e", "#b4bbc3", "#eff1f3", "#c9ced4"
 _SLOW_RIM, _FAST_RIM = np.array((0.62, 0.66, 0.70)), np.array((0.10, 0.12, 0.15))
 _SLATE = (80 / 255, 90 / 255, 110 / 255)  # behind errors: black (none) and white (large) both show on it
 
 
-def new_figure(names: Sequence[str], view: np.ndarray, title: Optional[str]) -> Tuple[Figure, List[Axes]]:
+def new_figure(
+    names: Sequence[str], view: np.ndarray, title: Optional[str], caption: str = FLOW_CAPTION
+) -> Tuple[Figure, List[Axes]]:
     """An empty figure with one framed panel per name, in a row, and range rings around the ego vehicle.
 
     Args:
         names: headings of the panels, "" = none.
         view: (2, 2) float64, metres, low and high corner (x, y).
         title: heading of the figure, None = none.
+        caption: one line below the panels: what the colours are.
 
     Raises:
         CFlowError: matplotlib is absent.
     """
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-        from matplotlib.patches import Circle
-    except ImportError as error:
-        raise CFlowError("pictures need matplotlib: pip install 'cflow_torch[viz]'") from error
-
     extent = view[1] - view[0]
     gap, foot = 0.2, 0.42
     full, dpi = (10.0, 100) if len(names) == 1 else (16.0, 112)
@@ -53,8 +53,8 @@ def new_figure(names: Sequence[str], view: np.ndarray, title: Optional[str]) -> 
     height = float(np.clip(width * extent[1] / extent[0], width / 4, width * 2))
     head = (0.5 if title else 0) + (0.42 if any(names) else 0) or gap
     total = (full, height + head + foot)
-    figure = Figure(figsize=total, dpi=dpi, facecolor="white")
-    FigureCanvasAgg(figure)
+    figure = blank_figure(total, dpi)
+    from matplotlib.patches import Circle
 
     panels = []
     for i, name in enumerate(names):
@@ -62,27 +62,22 @@ def new_figure(names: Sequence[str], view: np.ndarray, title: Optional[str]) -> 
         axes = figure.add_axes(place)
         axes.set(xlim=view[:, 0], ylim=view[:, 1], aspect="equal", xticks=[], yticks=[])
         for spine in axes.spines.values():
-            spine.set(color=_FRAME, linewidth=0.8)
+            spine.set(color=FRAME, linewidth=0.8)
         for radius in range(10, int(np.abs(view).max()) + 1, 10):
-            axes.add_patch(Circle((0, 0), radius, fill=False, color=_FRAME, alpha=0.45, linewidth=0.8, zorder=0.5))
+            axes.add_patch(Circle((0, 0), radius, fill=False, color=FRAME, alpha=0.45, linewidth=0.8, zorder=0.5))
         if name:
-            axes.set_title(name, fontsize=14, color=_INK, pad=7)
+            axes.set_title(name, fontsize=14, color=INK, pad=7)
         axes.apply_aspect()  # now, so that sizes in inches are right from here on
         panels.append(axes)
     if title:
-        figure.text(0.5, 1 - 0.3 / total[1], title, fontsize=17, color=_INK, ha="center", va="center")
-    caption = (
-        f"grey: static   colour: moves more than {MOVING:g} m per sweep   "
-        f"arrow: motion over {ARROW_STEPS} sweeps ({ARROW_STEPS / SWEEP_RATE:g} s at {SWEEP_RATE} Hz)   "
-        f"rings: every 10 m"
-    )
-    figure.text(0.5, 0.2 / total[1], caption, fontsize=11, color="#5b6570", ha="center", va="center")
+        figure.text(0.5, 1 - 0.3 / total[1], title, fontsize=17, color=INK, ha="center", va="center")
+    figure.text(0.5, 0.2 / total[1], caption, fontsize=11, color=FAINT, ha="center", va="center")
     return figure, panels
 
 
 def draw_ground(axes: Axes, position: np.ndarray) -> None:
     """Ground points, hardly there."""
-    axes.scatter(position[:, 0], position[:, 1], s=_dot(axes), color=_GROUND, linewidths=0, zorder=1)
+    axes.scatter(position[:, 0], position[:, 1], s=dot_area(axes), color=GROUND, linewidths=0, zorder=1)
 
 
 def draw_flow(
@@ -98,9 +93,9 @@ def draw_flow(
         max_flow: metres per sweep, full colour.
     """
     is_mover = np.linalg.norm(flow, axis=1) > MOVING  # False for NaN
-    dot = _dot(axes)
+    dot = dot_area(axes)
     still = position[~is_mover]
-    axes.scatter(still[:, 0], still[:, 1], s=dot, color=_STATIC, linewidths=0, zorder=2)
+    axes.scatter(still[:, 0], still[:, 1], s=dot, color=STATIC, linewidths=0, zorder=2)
     position, flow, cluster = position[is_mover], flow[is_mover], None if cluster is None else cluster[is_mover]
     # A dark rim keeps yellow visible on white; that of slow, pale movers is lighter, so that fast ones stand out.
     speed = np.minimum(np.hypot(flow[:, 0], flow[:, 1]) / max_flow, 1)
@@ -124,12 +119,12 @@ def draw_flow(
         headlength=4.5,
         headaxislength=4,
         minlength=0.5,
-        color=_INK,
+        color=INK,
         edgecolor="white",
         linewidth=0.7,
         zorder=6,
     )
-    _draw_ego(axes)
+    draw_ego(axes)
 
 
 def draw_error(axes: Axes, position: np.ndarray, flow: np.ndarray, truth: np.ndarray) -> None:
@@ -148,38 +143,15 @@ def draw_error(axes: Axes, position: np.ndarray, flow: np.ndarray, truth: np.nda
     order = np.argsort(error, kind="stable")  # the largest on top
     position, error = position[order], error[order]
     x, y = position[:, 0], position[:, 1]
-    size = _dot(axes) * np.where(error > 0, 4, 1)
+    size = dot_area(axes) * np.where(error > 0, 4, 1)
     axes.set_facecolor(_SLATE)
     dots = axes.scatter(x, y, s=size, c=error, cmap="hot", vmin=0, vmax=MAX_ERROR, linewidths=0, zorder=2)
-    box = _legend_box(axes, position, error > 0, (1.75, 0.74))
+    box = legend_box(axes, position, error > 0, (1.75, 0.74))
     bar = axes.figure.colorbar(dots, cax=box.inset_axes((0.1, 0.74, 0.8, 0.16)), orientation="horizontal")
     bar.set_ticks([0, 0.1, 0.2, 0.3], labels=["0", "0.1", "0.2", "0.3"])
-    bar.set_label(f"error, m (white ≥ {MAX_ERROR:g})", fontsize=10, color=_INK, labelpad=1)
-    bar.ax.tick_params(labelsize=10, labelcolor=_INK, color=_INK, length=2, pad=2)
-    _draw_ego(axes, "white", _SLATE)
-
-
-def draw_wheel(axes: Axes, position: np.ndarray, is_mover: np.ndarray, max_flow: float) -> None:
-    """The colour wheel, in a corner of the panel where it hides little."""
-    width = float(np.clip(0.2 * _inches(axes)[0], 1.6, 1.9))
-    box = _legend_box(axes, position, is_mover, (width, 1.14 * width))
-    box.imshow(wheel_image(256), extent=(-1, 1, -1, 1), interpolation="bilinear")
-    box.set(xlim=(-1.3, 1.3), ylim=(-1.77, 1.194))
-    rim = f"rim: {max_flow:.4g} m per sweep\n{max_flow * SWEEP_RATE:.4g} m/s at {SWEEP_RATE} Hz"
-    box.text(0, -1.1, rim, fontsize=6 * width, color=_INK, ha="center", va="top", linespacing=1.3)
-
-
-def draw_scale(axes: Axes) -> None:
-    """A bar of 10 m, bottom left."""
-    from matplotlib.patheffects import withStroke
-
-    inches, metres = _inches(axes), np.diff([axes.get_xlim(), axes.get_ylim()])[:, 0]
-    x, y = np.array([axes.get_xlim()[0], axes.get_ylim()[0]]) + 0.25 * metres / inches
-    for width, color in ((8, "white"), (4, _INK)):
-        axes.plot([x, x + 10], [y, y], linewidth=width, color=color, solid_capstyle="butt", zorder=8)
-    halo = [withStroke(linewidth=4, foreground="white")]
-    above = y + 0.08 * metres[1] / inches[1]
-    axes.text(x + 5, above, "10 m", fontsize=12, color=_INK, ha="center", va="bottom", zorder=8, path_effects=halo)
+    bar.set_label(f"error, m (white ≥ {MAX_ERROR:g})", fontsize=10, color=INK, labelpad=1)
+    bar.ax.tick_params(labelsize=10, labelcolor=INK, color=INK, length=2, pad=2)
+    draw_ego(axes, "white", _SLATE)
 
 
 def group_medians(group: np.ndarray, values: np.ndarray) -> Tuple[np.ndarray, np.ndarray]:
@@ -215,7 +187,7 @@ def _objects(position: np.ndarray) -> np.ndarray:
     return of_pixel.reshape(occupancy.shape)[0, row, column].numpy()
 
 
-def _draw_ego(axes: Axes, color: str = _INK, halo: Any = "white") -> None:
+def draw_ego(axes: Axes, color: str = INK, halo: Any = "white") -> None:
     """The ego vehicle: an arrow head of a car's length at the origin, pointing to +x."""
     from matplotlib.patheffects import withStroke
 
@@ -226,35 +198,11 @@ def _draw_ego(axes: Axes, color: str = _INK, halo: Any = "white") -> None:
     axes.fill([2.4, -1.9, -1.0, -1.9], [0, 1.15, 0, -1.15], color=color, linewidth=0, zorder=9, path_effects=effects)
     # The name stands behind the vehicle, where no lane is, unless the view ends there.
     x, side = (-2.3, "right") if left < -0.1 * (right - left) else (2.8, "left")
-    axes.text(x, 0, "ego", fontsize=12, color=color, ha=side, va="center_baseline", zorder=9, path_effects=effects)
+    size = 12 if inches_of(axes)[0] > 4 else 9
+    axes.text(x, 0, "ego", fontsize=size, color=color, ha=side, va="center_baseline", zorder=9, path_effects=effects)
 
 
-def _inches(axes: Axes) -> np.ndarray:
-    """(2,) width and height of a panel."""
-    return np.array([axes.bbox.width, axes.bbox.height]) / axes.figure.dpi
-
-
-def _dot(axes: Axes) -> float:
+def dot_area(axes: Axes) -> float:
     """Area of a static point in square points: about 0.2 m, never less than a fine dot."""
-    points_per_metre = 72 * _inches(axes)[0] / float(np.diff(axes.get_xlim())[0])
+    points_per_metre = 72 * inches_of(axes)[0] / float(np.diff(axes.get_xlim())[0])
     return max((0.2 * points_per_metre) ** 2, 0.5)
-
-
-def _legend_box(axes: Axes, position: np.ndarray, is_loud: np.ndarray, inches: Tuple[float, float]) -> Axes:
-    """An empty white box of that size in the corner where it hides the fewest points; loud ones count twenty-fold.
-
-    Convention: not in the lower left corner, which is the scale bar's.
-    """
-    panel = _inches(axes)
-    size, margin = np.minimum(np.array(inches) / panel, 0.5), 0.1 / panel
-    low, high = np.array([axes.get_xlim(), axes.get_ylim()]).T
-    fraction = (position[:, :2] - low) / (high - low)
-    far = 1 - margin - size
-    corners = np.array([(far[0], far[1]), (far[0], margin[1]), (margin[0], far[1])])
-    is_hidden = ((fraction >= corners[:, None]) & (fraction <= corners[:, None] + size)).all(axis=2)
-    x, y = corners[int(np.argmin(is_hidden @ np.where(is_loud, 20, 1)))]
-    box = axes.inset_axes((x, y, size[0], size[1]), zorder=7)
-    box.set(xticks=[], yticks=[], facecolor="white")
-    for spine in box.spines.values():
-        spine.set(color=_FRAME, linewidth=0.8)
-    return box

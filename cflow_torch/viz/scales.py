@@ -1,0 +1,158 @@
+"""Picture of coarse to fine: what every pixel size sees, and the flow so far."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, List, Optional, Tuple
+
+import numpy as np
+
+from cflow_torch.config import Config, make_config
+from cflow_torch.types import FlowResult, Window
+from cflow_torch.viz.bev import longest_flow, point_rows, view_of
+from cflow_torch.viz.legend import fill_wheel
+from cflow_torch.viz.occupancy import crop, draw_occupancy, frame, sweep_marks
+from cflow_torch.viz.panel import FLOW_CAPTION, draw_flow
+from cflow_torch.viz.stages import Scale, scales
+from cflow_torch.viz.style import FAINT, FRAME, INK, blank_figure
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_MARGIN = 2.0  # metres round the object that is shown
+_SMALLEST = 4.0  # metres, half a side
+_MIN_POINTS = 30  # of the object that is shown
+
+
+def plot_scales(window: Window, config: Optional[Config] = None, *, title: Optional[str] = None) -> Figure:
+    """Coarse to fine, one column per pixel size.
+
+    Args:
+        window: sweeps.
+        config: without `proof`; None = the preset "paper" with pixels of 0.4, 0.2 and 0.1 m.
+        title: one line above; None = the pixel sizes.
+
+    Returns:
+        Figure, 1600 pixels wide. Above, close up on the object where this changes most: sweep t moved by the flow of
+        the coarser scales, and t+1; last, t moved by the whole flow. Below: the flow so far, in the colours of the
+        wheel; last, what the finest pixels find on their own.
+
+    Convention: metres, frame of t+1.
+
+    Raises:
+        CFlowError: matplotlib is absent, the method has no scales one after the other (`proof`), or bad input.
+
+    Source: the paper's multi-scale strategy and its figure.
+    """
+    if config is None:
+        config = make_config("paper", pixel_sizes=(0.4, 0.2, 0.1))
+    found, result = scales(window, config)
+    _, alone = scales(window, config.replace(pixel_sizes=config.pixel_sizes[-1:]))
+    count = len(found) + 1
+    left, gap, side = 0.6, 0.22, 1.75  # inches; `side` is for the legends
+    width = (16.0 - left - gap * count - side) / count
+    total = np.array((16.0, 2 * width + 2.3))
+    figure = blank_figure((total[0], total[1]), 100)
+
+    def panels(bottom: float, inches: float, first: float, number: int) -> List[Axes]:
+        corners = [(first + i * (inches + gap), bottom) for i in range(number)]
+        return [figure.add_axes((*np.array(c) / total, *inches / total)) for c in corners]
+
+    if title is None:
+        title = "coarse to fine: " + " → ".join(f"{size:g} m" for size in config.pixel_sizes)
+    figure.text(0.5, 1 - 0.32 / total[1], title, fontsize=17, color=INK, ha="center", va="center")
+    position = point_rows("points", window.pc0.points, None) + result.pose_flow.numpy()
+    above, below = (panels(bottom, width, left, count) for bottom in (width + 1.2, 0.5))
+    _draw_near(above, position, found, result, alone)
+    max_flow = _draw_flows(below, config, position, found, result, alone)
+
+    marks = figure.add_axes((1 - side / total[0], (width + 1.2) / total[1], side / total[0], width / total[1]))
+    marks.legend(handles=sweep_marks(), loc="center left", frameon=False, fontsize=11, labelcolor=INK)
+    marks.axis("off")
+    wheel = side - 0.1
+    (box,) = panels(0.5 + (width - 1.14 * wheel) / 2, wheel, 16.0 - wheel, 1)
+    box.axis("off")
+    fill_wheel(box, wheel, max_flow)
+    figure.text(
+        0.5, 0.2 / total[1], FLOW_CAPTION.rpartition("   ")[0], fontsize=11, color=FAINT, ha="center", va="center"
+    )
+    return figure
+
+
+def _shown(result: FlowResult, alone: FlowResult) -> np.ndarray:
+    """(N,) bool, points of the cluster where coarse to fine changes most against the finest pixels alone.
+
+    Convention: mean change times the score of the match; of the larger clusters. If nothing changes, the fastest.
+    """
+    cluster, flow = result.cluster_id.numpy(), result.residual_flow.numpy()
+    has_one = cluster >= 0
+    if not has_one.any():
+        return has_one
+    change = np.linalg.norm(flow - alone.residual_flow.numpy(), axis=1)
+    weight = (change if change.any() else np.linalg.norm(flow, axis=1)) * result.score.numpy()
+    size = np.bincount(cluster[has_one])
+    mean = np.bincount(cluster[has_one], weights=weight[has_one]) / np.maximum(size, 1)
+    return cluster == int(np.argmax(np.where(size >= min(_MIN_POINTS, size.max()), mean, -1)))
+
+
+def _square(position: np.ndarray) -> Tuple[np.ndarray, np.ndarray]:
+    """Low and high corner of a square round some points and a margin."""
+    ends = position[:, :2] if len(position) else np.zeros((1, 2))
+    middle = (ends.min(axis=0) + ends.max(axis=0)) / 2
+    half = max(float(np.ptp(ends, axis=0).max()) / 2 + _MARGIN, _SMALLEST)
+    return middle - half, middle + half
+
+
+def _length(flow: np.ndarray, shown: np.ndarray) -> float:
+    """Length of the median flow of the points that are shown, metres."""
+    return float(np.linalg.norm(np.median(flow[shown], axis=0))) if shown.any() else 0.0
+
+
+def _draw_near(
+    panels: List[Axes], position: np.ndarray, found: List[Scale], result: FlowResult, alone: FlowResult
+) -> None:
+    """What each scale sees of one object, and in the last panel where it ends."""
+    shown = _shown(result, alone)
+    low, high = _square(np.concatenate([position[shown], (position + found[-1].flow_after)[shown]]))
+    seen = [(scale.before, scale.flow_before) for scale in found] + [(found[-1].after, found[-1].flow_after)]
+    for axes, (images, flow) in zip(panels, seen):
+        draw_occupancy(axes, crop(images, low, high))
+        frame(axes, low, high)
+        is_last, is_first = axes is panels[-1], axes is panels[0]
+        name = "result" if is_last else f"{images.pixel_size:g} m pixels"
+        words = "t as it is" if is_first else f"t moved by {_length(flow, shown):.2f} m"
+        axes.set_title(f"{name}: {words}", fontsize=12, color=INK, pad=6)
+        axes.set_xlabel("x, m", fontsize=9, color=INK, labelpad=1)
+        axes.tick_params(labelleft=is_first)
+    panels[0].set_ylabel("y, m", fontsize=9, color=INK, labelpad=1)
+
+
+def _draw_flows(
+    panels: List[Axes],
+    config: Config,
+    position: np.ndarray,
+    found: List[Scale],
+    result: FlowResult,
+    alone: FlowResult,
+) -> float:
+    """The flow so far after each scale, and in the last panel that of the finest one alone.
+
+    Returns:
+        Metres per sweep, full colour.
+    """
+    view, is_inside = view_of(position, config.point_cloud_range)
+    keep = is_inside & result.is_valid.numpy()
+    flows = [scale.flow_after[keep] for scale in found]
+    flows.append(alone.residual_flow.numpy()[keep].astype(np.float64))
+    max_flow = longest_flow(np.concatenate(flows))
+    names = [f"flow after {size:g} m" for size in config.pixel_sizes]
+    names[-1] += ": the result"
+    names.append(f"for comparison: {config.pixel_sizes[-1]:g} m alone")
+    for axes, name, flow in zip(panels, names, flows):
+        axes.set(xlim=view[:, 0], ylim=view[:, 1], aspect="equal", xticks=[], yticks=[])
+        for spine in axes.spines.values():
+            spine.set(color=FRAME, linewidth=0.8)
+        axes.apply_aspect()
+        draw_flow(axes, position[keep], flow, None, max_flow)
+        axes.set_title(name, fontsize=12, color=INK, pad=6)
+    return max_flow
