@@ -305,12 +305,12 @@ def test_engines_and_limits_of_memory_change_no_bit(engines):
 
 
 def test_names_of_a_flow_file(tmp_path):
-    result = flow_of(ell(), ell(2), T_ego1_ego0=transform(0, 1, 0))
+    result = flow_of(ell(), ell(3), T_ego1_ego0=transform(0, 1, 0))
     write_flow(tmp_path / "1.feather", result)
     table = feather.read_table(tmp_path / "1.feather")
     vectors = [f"{kind}_t{axis}_m" for kind in ("flow", "residual", "pose") for axis in "xyz"]
     assert table.column_names == [*vectors, "cluster_id", "score", "is_valid"]
-    assert [table[f"{kind}_tx_m"][0].as_py() for kind in ("flow", "residual", "pose")] == [2, 1, 1]
+    assert [table[f"{kind}_tx_m"][0].as_py() for kind in ("flow", "residual", "pose")] == [3, 2, 1]
 
 
 def test_labels_are_total_flow():
