@@ -1,0 +1,28 @@
+"""Entry points of `torch.hub`: `torch.hub.load("/path/to/cflow_torch", "cflow", source="local")`.
+
+Nothing is downloaded: the method has no weights. A checkout is enough, the package need not be installed.
+"""
+
+from __future__ import annotations
+
+from typing import Any as _Any  # underscores: not entry points
+
+from cflow_torch import CorrelationFlow as _CorrelationFlow
+from cflow_torch import make_config as _make_config
+from cflow_torch import make_model as _make_model
+
+dependencies = ["torch", "numpy"]
+
+
+def cflow(preset: str = "default", device: _Any = "auto", **overrides: _Any) -> _CorrelationFlow:
+    """CorrelationFlow, a module without parameters: a list of `cflow_torch.Window` in, a list of `FlowResult` out.
+
+    Args:
+        preset: "default", "fast", "keypoints" or "paper".
+        device: "auto" = that of the tensors given, else a GPU if there is one, else the CPU.
+        **overrides: any field of `cflow_torch.Config`, for example `num_history=2`.
+
+    Raises:
+        CFlowError: an unknown preset or setting, or an invalid value.
+    """
+    return _make_model(_make_config(preset, **overrides), device)
