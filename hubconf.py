@@ -7,14 +7,15 @@ from __future__ import annotations
 
 from typing import Any as _Any  # underscores: not entry points
 
-from cflow_torch import CorrelationFlow as _CorrelationFlow
+from torch.nn import Module as _Module
+
 from cflow_torch import make_config as _make_config
 from cflow_torch import make_model as _make_model
 
 dependencies = ["torch", "numpy"]
 
 
-def cflow(preset: str = "default", device: _Any = "auto", **overrides: _Any) -> _CorrelationFlow:
+def cflow(preset: str = "default", device: _Any = "auto", **overrides: _Any) -> _Module:
     """CorrelationFlow, a module without parameters: a list of `cflow_torch.Window` in, a list of `FlowResult` out.
 
     Args:
