@@ -159,7 +159,7 @@ SHRUNK: Tuple[Rule, ...] = (
     Rule(r"-m cflow_torch\.integrations", "imports torch anew", slow=True),
 )
 
-# Begin of commands -> why no test runs any of them. What is checked instead: the settings of cflow commands are composed,
+# Begin of commands -> why no test runs any. What is checked instead: the settings of cflow commands are composed,
 # scripts are asked for help, shell is parsed; files, extras and models that are named exist.
 KINDS_NOT_RUN: Dict[str, str] = {
     r"pip install ": "takes packages from the index",

@@ -92,7 +92,7 @@ def test_the_command_line_takes_a_readers_settings(arrays: Path, tmp_path: Path)
 def test_a_world_that_moves_is_warned_about(arrays: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (source,) = find_sources("arrays", arrays)
     calls = []
-    monkeypatch.setattr(catalog, "check_static_world", calls.append)
+    monkeypatch.setattr(catalog, "check_log", calls.append)
     open_log("arrays", source)
     open_log("arrays", source, check=False)
     assert len(calls) == 1

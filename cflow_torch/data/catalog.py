@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import inspect
-from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, Dict, Sequence
 
 from cflow_torch.data.log import Log
+from cflow_torch.data.log_check import check_log
 from cflow_torch.data.paths import as_path, is_place, remote_errors
-from cflow_torch.data.static_check import check_static_world
 from cflow_torch.types import CFlowError
 
 GROUND_METHODS = ("grid", "patchwork")
@@ -75,7 +74,7 @@ def open_log(
         source: from `find_sources`.
         find_ground: None, or a method of `cflow_torch.ground.find_ground` for sweeps without a ground mask.
         odometry: find poses with kiss-icp if the log has none.
-        check: warn if the static world does not stay put (0.3 s).
+        check: warn if ground is left in, or if the static world does not stay put, see `check_log`.
         **settings: keyword arguments of the reader.
 
     Returns:
@@ -103,9 +102,7 @@ def open_log(
 
         log = GroundFoundLog(log, find_ground)
     if check:
-        # A sweep that cannot be read is reported when its turn comes; the others are still of use.
-        with suppress(CFlowError, OSError):
-            check_static_world(log)
+        check_log(log)
     return log
 
 

@@ -16,8 +16,8 @@ from cflow_torch.data.atomic import remove_stale
 from cflow_torch.data.catalog import open_log
 from cflow_torch.data.flow_file import write_flow
 from cflow_torch.data.log import Log, RecentSweeps, window
+from cflow_torch.data.log_check import check_log
 from cflow_torch.data.paths import as_path
-from cflow_torch.data.static_check import check_static_world
 from cflow_torch.estimate import make_model
 from cflow_torch.fleet.job import Begun, Done, Event, Failed, Job, Opened, Unit
 from cflow_torch.fleet.manifest import claim_log, complete_frames, frame_file
@@ -90,9 +90,8 @@ class Worker:
             return
         yield Opened(unit.number, log.log_id, len(frames), tuple(int(log.timestamps[i]) for i in todo))
         if todo and self._job.check and unit.first == 0:
-            # A sweep that cannot be read is reported when its turn comes.
-            with suppress(Trouble):
-                check_static_world(log)
+            with suppress(Trouble):  # a sweep that cannot be read is reported when its turn comes
+                check_log(log)
         careful = {i for i in todo if log.timestamps[i] in unit.careful}
         yield from self._pass(unit, log, folder, todo, careful, stop)
 

@@ -1,0 +1,56 @@
+"""What is looked at when a log is opened: is its ground marked, does its static world stay put?"""
+
+from __future__ import annotations
+
+import warnings
+from contextlib import suppress
+
+from cflow_torch.data.log import Log
+from cflow_torch.data.static_check import check_static_world
+from cflow_torch.ground import has_ground
+from cflow_torch.types import CFlowError
+
+
+class GroundWarning(UserWarning):
+    """There are ground points in a log without ground masks."""
+
+
+def check_log(log: Log) -> None:
+    """Warn of mistakes that no sweep alone would show as an error.
+
+    Args:
+        log: any log. A sweep that cannot be read is passed over: it is reported when its turn comes.
+
+    Warns:
+        GroundWarning: see `check_ground`.
+        StaticWorldWarning: see `check_static_world`.
+
+    Cost: reads up to five sweeps; about 0.3 s.
+    """
+    for check in (check_ground, check_static_world):
+        with suppress(CFlowError, OSError):
+            check(log)
+
+
+def check_ground(log: Log) -> bool:
+    """Warn if the first sweep has ground points, but no mask that says so.
+
+    Returns:
+        Whether it has.
+
+    Warns:
+        GroundWarning: once.
+
+    Cost: reads one sweep; some milliseconds.
+    """
+    sweep = log.sweep(0)
+    is_left_in = sweep.is_ground is None and has_ground([sweep.points])[0]
+    if is_left_in:
+        warnings.warn(
+            f"log {log.log_id}: there are ground points, and no masks. The ground joins what stands on it into one "
+            "cluster, so that moving objects are missed. Give data.find_ground=grid (in Python find_ground='grid'), or "
+            "data.check=false if this is no ground",
+            GroundWarning,
+            stacklevel=2,
+        )
+    return is_left_in
