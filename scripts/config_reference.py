@@ -51,6 +51,7 @@ PLAIN: Dict[str, str] = {
     "first": "first pair that is scored",
     "step": "every how many pairs are scored",
     "first_seed": "of the first drive; the next ones count up",
+    "frames_per_second": "of the animation",
     "label": "what tables call it",
     "workers": "processes",
 }
@@ -141,7 +142,9 @@ def method_rows(names: Sequence[str]) -> List[List[str]]:
 
 def key_row(key: Key) -> List[str]:
     """A row of a table."""
-    return [f"`{key.name}`", f"`{key.value}`", key.comment or PLAIN.get(key.name.split(".")[-1], "")]
+    group, _, last = key.name.rpartition(".")
+    meaning = "changes this field of the method" if group == "model" else PLAIN.get(last, "")
+    return [f"`{key.name}`", f"`{key.value}`", key.comment or meaning]
 
 
 def in_order(files: Sequence[Path], order: Sequence[str]) -> List[Path]:
@@ -179,7 +182,7 @@ def sentence(text: str, file: Path) -> str:
 
 def is_name(key: Key, file: Path) -> bool:
     """Whether a key only says what the file is called."""
-    return key.name in ("name", "label") and key.value == file.stem
+    return key.name in ("name", "label", file.parent.name) and key.value == file.stem
 
 
 def shared_keys(files: Sequence[Path]) -> List[Key]:
