@@ -1,4 +1,4 @@
-"""The commands and Python blocks of the documents, as a reader would copy them."""
+"""The commands and Python blocks of the documents and of `cflow --help`, as a reader would copy them."""
 
 from __future__ import annotations
 
@@ -106,6 +106,15 @@ def commands_of_block(text: str) -> Iterator[Tuple[int, str]]:
                 yield started, joined
 
 
+def examples_of_help() -> Iterator[Snippet]:
+    """What `cflow --help` and `cflow COMMAND --help` show; two blanks end a command."""
+    for file in sorted((ROOT / "cflow_torch" / "cli").glob("*.py")):
+        for number, line in enumerate(file.read_text(encoding="utf-8").splitlines(), 1):
+            match = re.match(r"\s*(cflow [a-z]+( \S+)*)(  |$)", line)
+            if match:
+                yield Snippet(match[1], str(file.relative_to(ROOT)), number)
+
+
 def commands() -> List[Snippet]:
     """Every command of every document, each text once; where it is first, but in a block rather than in a sentence."""
     found: Dict[str, Snippet] = {}
@@ -121,6 +130,8 @@ def commands() -> List[Snippet]:
             if COMMAND.match(command) and " " in command or command.startswith(("./scripts/", ".ci/")):
                 snippet = Snippet(command, name, prose.count("\n", 0, match.start()) + 1, is_inline=True)
                 inline.setdefault(command, snippet)
+    for snippet in examples_of_help():
+        found.setdefault(snippet.text, snippet)
     return [*found.values(), *(snippet for text, snippet in inline.items() if text not in found)]
 
 

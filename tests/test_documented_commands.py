@@ -79,6 +79,7 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def home(tmp_path: Path, cache: Path, programs: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty folder to be in, as a reader begins; what is run here also finds the checkout."""
+    (tmp_path / "docs" / "benchmarks").mkdir(parents=True)  # where commands of the repository put pictures
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("CFLOW_CACHE", str(cache))
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), *os.environ.get("PYTHONPATH", "").split(os.pathsep)]))
@@ -129,7 +130,7 @@ def assert_promises(text: str, home: Path) -> None:
     if command not in LEFT or {"--cfg", "--help", "dry_run=true"} & set(words) or "archive=" in text:
         return
     given = [word.partition("=")[2] for word in words if word.startswith("output=")]
-    folder = Path(home, given[-1] if given else f"outputs/{command}")
+    folder = Path(home, given[-1].replace("file://", "") if given else f"outputs/{command}")
     for pattern in LEFT[command]:
         assert list(folder.glob(pattern)), f"{folder} lacks {pattern}: {sorted(folder.rglob('*'))[:20]}"
 
