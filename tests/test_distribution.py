@@ -18,7 +18,8 @@ pytest.importorskip("build", reason="the extra dev is not installed")
 metadata = pytest.importorskip("packaging.metadata", reason="needs packaging 23.1")
 
 ROOT = Path(__file__).resolve().parents[1]
-TOP_LEVEL = ("CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "LICENSE", "MANIFEST.in", "README.md", "pyproject.toml")
+TOP_LEVEL = ("CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "LICENSE", "MANIFEST.in", "README.md")
+TOP_LEVEL = (*TOP_LEVEL, "hubconf.py", "pyproject.toml")
 FOLDERS = ("cflow_torch", "configs", "docs", "notebooks", "scripts", "tests")
 MADE = ("__pycache__", "*.py[cod]", "*.egg-info", ".*", "outputs", "multirun")
 

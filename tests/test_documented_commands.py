@@ -22,8 +22,6 @@ from documented_commands import (
     Snippet,
     commands,
     commands_without_language,
-    documents,
-    markdown_of,
     python_blocks,
 )
 from documented_places import Places, namespace
@@ -240,36 +238,3 @@ def test_no_rule_is_stale() -> None:
 
 def test_every_block_of_commands_says_its_language() -> None:
     assert not commands_without_language(), "a block of commands begins with ```bash"
-
-
-@pytest.mark.parametrize("file", documents(), ids=lambda file: str(file.relative_to(ROOT)))
-def test_what_a_document_names_exists(file: Path) -> None:
-    """Links, files of the repository, modules of the package."""
-    text = re.sub(r"```.*?```", "", markdown_of(file), flags=re.S)
-    links = re.findall(r"\]\((?!https?:|#|mailto:)([^)#\s]+)", text)
-    assert not [link for link in links if not (file.parent / link).exists()], "links"
-    inline = re.findall(r"`([^`\n]+)`", text)
-    named = [
-        name
-        for name in inline
-        if re.fullmatch(r"(cflow_torch|configs|docs|scripts|tests|notebooks)/[\w./-]*\w/?", name)
-    ]
-    assert not [name for name in named if not (ROOT / name).exists()], "files"
-    dotted = [name for name in inline if re.fullmatch(r"cflow_torch(\.\w+)+", name)]
-    assert not [name for name in dotted if not is_importable(name)], "modules"
-
-
-def is_importable(name: str) -> bool:
-    """A module, or what a module holds."""
-    parts = name.split(".")
-    for length in range(len(parts), 0, -1):
-        try:
-            found: Any = importlib.import_module(".".join(parts[:length]))
-        except ImportError:
-            continue
-        for attribute in parts[length:]:
-            if not hasattr(found, attribute):
-                return attribute in getattr(found, "__annotations__", {})
-            found = getattr(found, attribute)
-        return True
-    return False
