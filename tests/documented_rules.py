@@ -51,7 +51,7 @@ SHRUNK: Tuple[Rule, ...] = (
         ),
         slow=True,
     ),
-    Rule(r"^cflow flow (?!.*engine=ray)", "processes of their own take seconds to start", add="engine.workers=1"),
+    Rule(r"^cflow flow (?!.*engine=ray)", "processes take seconds to start", add="engine.workers=1 engine.threads=1"),
     Rule(r"shard\.count=16", "three pairs in all", replace=(("shard.count=16", "shard.count=3"),)),
     Rule(r"^cflow demo", "the picture is of pair 3", add="data.num_sweeps=5"),
     Rule(
@@ -71,17 +71,12 @@ SHRUNK: Tuple[Rule, ...] = (
     Rule(r"^cflow bench .*repeats=", "one in a run of the quick tests is enough", slow=True),
     Rule(r"/data/scenes result_name=", "is written to", replace=(("/data/scenes", "DIR"),), slow=True),
     Rule(r"^(OMP\S+ )?cflow eval -m experiment=(?!.*data=)", "one small drive", add=SMALL_BENCHMARK, slow=True),
-    Rule(r"experiment=(history|scales)(?!.*data=)", "one h", add="model.num_history=0", slow=True),
+    Rule(r"experiment=(history|scales)(?!.*(data=|num_history))", "one h", add="model.num_history=0", slow=True),
+    Rule(r"experiment=scales .*num_history=0,2,4,8", "two of four h", replace=(("0,2,4,8", "0,2"),), slow=True),
     Rule(
-        r"experiment=scales .*num_history=0,2,4,8",
-        "one small drive, two of four h",
-        replace=(
-            ("0,2,4,8", "0,2"),
-            ("data.num_drives=4", "data.num_drives=1"),
-            ("data.num_sweeps=19", ""),
-            ("data.first=8", ""),
-        ),
-        slow=True,
+        r"experiment=scales .*data\.label=tuning",
+        "one small drive",
+        replace=(("data.num_drives=4", ""), ("data.num_sweeps=19", ""), ("data.first=8", "")),
     ),
     Rule(r"experiment=(datasets|range_split).*data=(av2|hdf5)", "five scales in a region of +-70 m", slow=True),
     Rule(
@@ -137,8 +132,8 @@ SHRUNK: Tuple[Rule, ...] = (
     Rule(r"config_reference\.py", "the page belongs to the checkout", add="--check"),
     Rule(r"bench_growth\.py", "one run of each", add="--repeats 1 --folder outputs/growth", slow=True),
     Rule(r"bench_keypoints\.py", "one run of each", add="--repeats 1", slow=True),
-    Rule(r"bench_fleet\.py throughput", "one round", add="--repeats 1 --windows 20", slow=True),
-    Rule(r"bench_fleet\.py memory", "few windows", add="--windows 40", slow=True),
+    Rule(r"bench_fleet\.py throughput", "one round", add="--repeats 1 --windows 40", slow=True),
+    Rule(r"bench_fleet\.py memory", "a tenth of the windows", add="--windows 200", slow=True),
     Rule(
         r"gpu_check\.py",
         "the rest repeats other tests",
@@ -163,6 +158,7 @@ KINDS_NOT_RUN: Dict[str, str] = {
 }
 # Exact command -> why no test runs it.
 NOT_RUN: Dict[str, str] = {
+    "OMP_NUM_THREADS=1 python scripts/bench_growth.py --repeats 5": "only repeats more than one that is run",
     "./scripts/demo.sh": "installs; .ci/run runs it on every commit",
     ".ci/run": "runs this test",
     "python /path/to/cflow_torch/tests/opensceneflow_stubs/launch.py eval.py ...": "needs files of OpenSceneFlow",
