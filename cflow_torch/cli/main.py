@@ -14,6 +14,7 @@ COMMANDS = {
     "flow": "estimate the flow of every pair of sweeps of one log or a fleet; shards, resumes, Ray",
     "eval": "estimate and score every labelled pair of a data set",
     "submit": "write and check an archive for a public leaderboard",
+    "plot": "pictures of the flow and of every stage, ground truth beside it, animations",
     "bench": "time every stage against the reference and a plain OpenCV loop",
     "info": "versions and devices, to paste into a bug report",
 }
@@ -31,6 +32,7 @@ examples:
   cflow eval data=av2 data.root=/data/av2/val model=paper
   cflow eval model.pixel_sizes=[0.4,0.2,0.1]          any field of the method, see `cflow eval --cfg job`
   cflow eval -m model.connectivity=4,8                a sweep
+  cflow plot picture=correlation pair=2               how one object was found, outputs/plot/correlation.png
   cflow submit data=hdf5 data.root=/data/test version=3
 
 `cflow COMMAND --help` says more; `cflow COMMAND --cfg job` prints every setting and its value.

@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 
 _COLORMAP = "viridis"
 _PEAK = "#e6194b"
-_MOST_LINES = 90  # of the surface, a side
+_MOST_LINES = 160  # of the surface, a side
+_THIN = 6.0  # a box that is so many times as long as wide
 
 
 def plot_correlation(
@@ -48,11 +49,11 @@ def plot_correlation(
     dy, dx = found.shift
     if title is None:
         title = (
-            f"cluster {found.cluster_id}: moves by ({dx:+.4g}, {dy:+.4g}) pixels of {size:g} m = "
-            f"({dx * size:+.3g}, {dy * size:+.3g}) m, score {found.score:.2f}"
+            f"cluster {found.cluster_id}: moves by {_pair(dx, dy)} pixels of {size:g} m = "
+            f"{_pair(dx * size, dy * size)} m, score {found.score:.2f}"
         )
         if np.abs(found.flow[:2] - found.shift[::-1] * size).max() > 1e-6:  # pooled with what older sweeps say
-            title += f"; with older sweeps ({found.flow[0]:+.3g}, {found.flow[1]:+.3g}) m"
+            title += f"; with older sweeps {_pair(*found.flow[:2])} m"
     figure.text(0.5, 1 - 0.35 / figure.get_figheight(), title, fontsize=17, color=INK, ha="center", va="center")
     nothing = np.zeros_like(found.images.t)
     moved = _moved(found.images.t, found.shift)
@@ -77,7 +78,7 @@ def _lay_out(shape: Tuple[int, int]) -> Tuple[Figure, List[Tuple[float, float, f
     lower, upper = np.array((lower, upper)) + (total[1] - (upper + height + 1.35)) / 2
     inches = [(left, upper, width, height), (right, upper, width, height), (left, lower, width, height)]
     inches += [(right, lower, width, height), (right + width + 0.75, lower, 0.13, height)]
-    inches.append((9.75, 0.2, 6.1, total[1] - 0.9))
+    inches.append((9.6, 0.2, 6.1, total[1] - 0.9))
     wide, high = total
     return blank_figure((wide, high), 100), [(x / wide, y / high, w / wide, h / high) for x, y, w, h in inches]
 
@@ -92,13 +93,19 @@ def _moved(template: np.ndarray, shift: np.ndarray) -> np.ndarray:
     return image
 
 
+def _aspect(found: ClusterCorrelation) -> Any:
+    """Of the images: square pixels, unless the box is so long and thin that nothing could be seen."""
+    height, width = found.images.t.shape
+    return "equal" if max(height, width) < _THIN * min(height, width) else "auto"
+
+
 def _draw_pixels(axes: Axes, name: str, found: ClusterCorrelation, image: np.ndarray) -> None:
     height, width = found.images.t.shape
-    axes.imshow(image, extent=(0, width, 0, height), origin="lower", interpolation="nearest", aspect="equal")
+    axes.imshow(image, extent=(0, width, 0, height), origin="lower", interpolation="nearest", aspect=_aspect(found))
     axes.set_title(name, fontsize=12, color=INK, pad=33)
     axes.set_xlabel("pixel", fontsize=9, color=INK, labelpad=2)
     axes.set_ylabel("pixel", fontsize=9, color=INK, labelpad=2)
-    thin(axes)
+    thin(axes, integer=True)
     add_metres(axes, tuple(found.images.lower), found.images.pixel_size, ("x, m", "y, m"))
 
 
@@ -114,7 +121,7 @@ def _draw_map(axes: Axes, beside: Axes, found: ClusterCorrelation) -> None:
         interpolation="nearest",
         cmap=_COLORMAP,
         vmin=0,
-        aspect="equal",
+        aspect=_aspect(found),
     )
     dy, dx = found.shift
     axes.plot(0, 0, "+", color="white", markersize=9, markeredgewidth=1.2)
@@ -122,7 +129,7 @@ def _draw_map(axes: Axes, beside: Axes, found: ClusterCorrelation) -> None:
     axes.set_title("score of every shift (+: no shift)", fontsize=12, color=INK, pad=33)
     axes.set_xlabel("shift in x, pixels", fontsize=9, color=INK, labelpad=2)
     axes.set_ylabel("shift in y, pixels", fontsize=9, color=INK, labelpad=2)
-    thin(axes)
+    thin(axes, integer=True)
     add_metres(axes, (0.0, 0.0), found.images.pixel_size, ("m", "m"))
     bar = axes.figure.colorbar(image, cax=beside)
     bar.ax.tick_params(labelsize=9, labelcolor=INK, color=INK, length=2)
@@ -136,17 +143,21 @@ def _draw_surface(axes: Any, found: ClusterCorrelation) -> None:
     height, width = found.ncc.shape
     y, x = np.arange(height) - height // 2, np.arange(width) - width // 2
     scores = np.where(np.isfinite(found.ncc), found.ncc, 0.0)
-    axes.plot_surface(
-        *np.meshgrid(x, y), scores, cmap=_COLORMAP, rcount=_MOST_LINES, ccount=_MOST_LINES, linewidth=0, vmin=0
-    )
+    down, right = (-(-n // _MOST_LINES) for n in scores.shape)  # of each block the highest: no peak is lost
+    scores = np.pad(scores, ((0, -height % down), (0, -width % right)))
+    scores = scores.reshape(len(scores) // down, down, -1, right).max(axis=(1, 3))
+    y, x = y[::down] + (down - 1) / 2, x[::right] + (right - 1) / 2
+    if min(scores.shape) == 1:  # a line is no surface: put what is beyond it round it
+        y, x, scores = _widened(y, down), _widened(x, right), np.pad(scores, 1)
+    axes.plot_surface(*np.meshgrid(x, y), scores, cmap=_COLORMAP, rstride=1, cstride=1, linewidth=0, vmin=0)
     dy, dx = found.shift
     top = max(float(scores.max()), found.score, 0.1)
     axes.plot([dx, dx], [dy, dy], [found.score, 1.12 * top], color=_PEAK, linewidth=1.6, zorder=10)
     axes.plot([dx], [dy], [1.12 * top], "o", color=_PEAK, markersize=7, zorder=10)
     size = found.images.pixel_size
-    axes.text(dx, dy, 1.18 * top, f"({dx * size:+.3g}, {dy * size:+.3g}) m", fontsize=12, color=_PEAK, ha="center")
+    axes.text(dx, dy, 1.18 * top, f"{_pair(dx * size, dy * size)} m", fontsize=12, color=_PEAK, ha="center")
     stretch = np.array([width, height]) / max(width, height)
-    axes.set_box_aspect((*np.maximum(stretch, 0.45), 0.6), zoom=0.94)
+    axes.set_box_aspect((*np.maximum(stretch, 0.45), 0.6), zoom=0.9)
     axes.set_zlim(0, 1.15 * top)
     axes.view_init(elev=32, azim=-62)
     axes.set_xlabel(f"shift in x, pixels of {size:g} m", fontsize=10, color=INK, labelpad=8)
@@ -155,3 +166,13 @@ def _draw_surface(axes: Any, found: ClusterCorrelation) -> None:
     axes.tick_params(labelsize=9, labelcolor=INK)
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(MaxNLocator(5, integer=True))
+
+
+def _widened(places: np.ndarray, step: int) -> np.ndarray:
+    """One more place at each end."""
+    return np.concatenate([places[:1] - step, places, places[-1:] + step])
+
+
+def _pair(x: float, y: float) -> str:
+    """Signed, to three digits."""
+    return "({}, {})".format(*(f"{value:+.3g}" if abs(value) > 1e-9 else "0" for value in (x, y)))

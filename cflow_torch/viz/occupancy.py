@@ -54,9 +54,9 @@ def frame(axes: Axes, low: np.ndarray, high: np.ndarray) -> None:
     thin(axes)
 
 
-def thin(axes: Axes) -> None:
+def thin(axes: Axes, integer: bool = False) -> None:
     """The house's look of axes with ticks."""
-    axes.locator_params(nbins=6, min_n_ticks=2)
+    axes.locator_params(nbins=6, min_n_ticks=2, integer=integer)
     axes.tick_params(labelsize=10, labelcolor=INK, color=FRAME, length=3)
     for spine in axes.spines.values():
         spine.set(color=FRAME, linewidth=0.8)

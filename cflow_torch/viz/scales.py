@@ -80,16 +80,18 @@ def plot_scales(window: Window, config: Optional[Config] = None, *, title: Optio
 
 
 def _shown(result: FlowResult, alone: FlowResult) -> np.ndarray:
-    """(N,) bool, points of the cluster where coarse to fine changes most against the finest pixels alone.
+    """(N,) bool, points of the mover whose flow coarse to fine changes most against the finest pixels alone.
 
-    Convention: mean change times the score of the match; of the larger clusters. If nothing changes, the fastest.
+    Convention: of the larger clusters, by mean change, at most the flow itself, times the score of the match. If
+        nothing changes, the fastest.
     """
     cluster, flow = result.cluster_id.numpy(), result.residual_flow.numpy()
     has_one = cluster >= 0
     if not has_one.any():
         return has_one
     change = np.linalg.norm(flow - alone.residual_flow.numpy(), axis=1)
-    weight = (change if change.any() else np.linalg.norm(flow, axis=1)) * result.score.numpy()
+    speed = np.linalg.norm(flow, axis=1)
+    weight = (np.minimum(change, speed) if change.any() else speed) * result.score.numpy()
     size = np.bincount(cluster[has_one])
     mean = np.bincount(cluster[has_one], weights=weight[has_one]) / np.maximum(size, 1)
     return cluster == int(np.argmax(np.where(size >= min(_MIN_POINTS, size.max()), mean, -1)))

@@ -129,7 +129,7 @@ def cluster_correlation(window: Window, config: Config, cluster_id: Optional[int
     if config.method != "dense" or config.clustering != "components":
         raise CFlowError(
             f"method={config.method}, clustering={config.clustering}: only the dense method with clusters by "
-            'components has a correlation map per cluster, for example make_config("paper")'
+            'components has a correlation map per cluster: give make_config("paper"), or model=paper'
         )
     (*_, last), _ = watch(window, config)
     batch, grid = last.batch, last.grid
@@ -184,7 +184,7 @@ def keypoint_matches(window: Window, config: Config) -> KeyPointMatches:
         CFlowError: another method, or bad input.
     """
     if config.method != "keypoints":
-        raise CFlowError(f'method={config.method}: key points are matched by make_config("keypoints")')
+        raise CFlowError(f'method={config.method}: key points are matched by make_config("keypoints"), model=keypoints')
     (*_, last), _ = watch(window, config)
     occupancy, _ = project(last.batch, last.flow, last.grid)
     is_key_point = detect(occupancy)

@@ -1,0 +1,202 @@
+"""A picture of one pair of sweeps, or an animation of a log: OUTPUT/<picture>.png (animation: .gif or .mp4).
+
+picture=flow         the flow from above; truth=true|false|auto puts the ground truth and the error beside it
+picture=clusters     the points by cluster
+picture=keypoints    key points of both sweeps and their matches (model=keypoints)
+picture=correlation  one cluster and the correlation of all its shifts (model=paper); cluster=ID chooses it
+picture=scales       coarse to fine, a column per pixel size (model=paper with three sizes)
+picture=animation    the flow of many pairs: first= step= count= format=gif|mp4 frames_per_second= width=
+
+  cflow plot                                             the simulated street, outputs/plot/flow.png
+  cflow plot picture=correlation pair=2
+  cflow plot picture=scales model.pixel_sizes=[0.8,0.4,0.2,0.1]
+  cflow plot data=av2 data.root=/data/av2/val log=LOG pair=10 truth=true
+  cflow plot picture=animation count=20 format=mp4 model=fast
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Callable, Dict, List, Optional
+
+import numpy as np
+from omegaconf import DictConfig
+from tqdm import tqdm
+
+from cflow_torch.cli.run import find_logs, make_model, output_folder
+from cflow_torch.data.catalog import open_log
+from cflow_torch.data.log import Log, RecentSweeps, window
+from cflow_torch.data.paths import is_remote
+from cflow_torch.pyramid import CoarseToFine
+from cflow_torch.types import CFlowError, FlowResult, Window
+from cflow_torch.viz.animation import save_animation
+from cflow_torch.viz.bev import plot_flow, save_picture
+from cflow_torch.viz.clusters import plot_clusters
+from cflow_torch.viz.correlation import plot_correlation
+from cflow_torch.viz.film import Frame, flow_figures
+from cflow_torch.viz.keypoints import plot_keypoints
+from cflow_torch.viz.scales import plot_scales
+from cflow_torch.viz.style import blank_figure
+
+FORMATS = ("gif", "mp4")
+
+
+def task(cfg: DictConfig) -> None:
+    """Run `cflow plot`."""
+    output = output_folder(cfg)
+    if is_remote(output):
+        raise CFlowError(f"output={cfg.output}: pictures are written to a folder of this machine")
+    blank_figure((1, 1), 100)  # without matplotlib: now, not after the work
+    model = make_model(cfg)
+    if cfg.picture == "animation":
+        path = _animate(cfg, model, output)
+    else:
+        log = find_log(cfg)
+        sweeps = _window(log, cfg.pair, model.config.num_history)
+        figure = PICTURES[cfg.picture](cfg, model, log, sweeps)
+        path = save_picture(figure, _folder(output) / f"{cfg.picture}.png")
+        print(f"log {log.log_id}, pair {cfg.pair}, sweep {log.timestamps[cfg.pair]}")
+    print(f"picture: {path}")
+
+
+def find_log(cfg: DictConfig) -> Log:
+    """The log of `cfg.data` that `cfg.log` names, or the first one.
+
+    Raises:
+        CFlowError: no log of that name, or it cannot be opened.
+    """
+    sources = find_logs(cfg)
+    if cfg.log is None:
+        return _open(sources.reader, sources.logs[0], sources.settings)
+    wanted, seen = str(cfg.log), []
+    # A log mostly has the name of its file or folder: then no other one is opened.
+    for source in sorted(sources.logs, key=lambda source: _name(source) != wanted):
+        try:
+            log = _open(sources.reader, source, {**sources.settings, "check": False})
+        except CFlowError as error:
+            if _name(source) == wanted:
+                raise
+            seen.append(f"{_name(source)} ({error})")
+            continue
+        if log.log_id == wanted:
+            return log
+        seen.append(log.log_id)
+    raise CFlowError(f"log={wanted}: there is no such log; there are {', '.join(sorted(seen))}")
+
+
+def _open(reader: str, source: Any, settings: Dict[str, Any]) -> Log:
+    try:
+        return open_log(reader, source, **settings)
+    except OSError as error:
+        raise CFlowError(f"cannot open {source}: {error}") from error
+
+
+def _name(source: Any) -> str:
+    return str(getattr(source, "stem", source))
+
+
+def _window(log: Log, pair: Any, num_history: int) -> Window:
+    if not isinstance(pair, int):
+        raise CFlowError(f"pair={pair}: give the number of one pair, from 0 to {len(log.timestamps) - 2}")
+    if not 0 <= pair < len(log.timestamps) - 1:
+        raise CFlowError(
+            f"pair={pair}: log {log.log_id} has {len(log.timestamps)} sweeps, so pairs 0 to {len(log.timestamps) - 2}"
+        )
+    try:
+        return window(log, pair, num_history)
+    except OSError as error:
+        raise CFlowError(f"cannot read pair {pair} of {log.log_id}: {error}") from error
+
+
+def _folder(output: Path) -> Path:
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise CFlowError(f"cannot make the folder {output} ({error}): give output=FOLDER") from error
+    return output
+
+
+def _title(log: Log, index: int) -> str:
+    return f"{log.log_id}, sweep {log.timestamps[index]}"
+
+
+def _flow(cfg: DictConfig, model: CoarseToFine, log: Log, sweeps: Window) -> Any:
+    if cfg.truth not in (True, False, "auto"):
+        raise CFlowError(f"truth={cfg.truth}: give true, false or auto")
+    (result,) = model([sweeps])
+    return plot_flow(
+        sweeps.pc0.points,
+        result,
+        is_ground=sweeps.pc0.is_ground,
+        point_cloud_range=model.config.point_cloud_range,
+        max_flow=cfg.max_flow,
+        title=_title(log, cfg.pair),
+        truth=_truth(cfg, log, result),
+    )
+
+
+def _truth(cfg: DictConfig, log: Log, result: FlowResult) -> Optional[np.ndarray]:
+    """(N, 3) true residual flow, NaN where unknown; None = it is not drawn."""
+    labels = None if cfg.truth is False else log.labels(cfg.pair)
+    if labels is None:
+        if cfg.truth is True:
+            raise CFlowError(f"truth=true: pair {cfg.pair} of {log.log_id} has no labels; give truth=false or auto")
+        return None
+    truth = labels.flow - result.pose_flow.cpu().numpy()
+    return np.where(labels.is_valid[:, None], truth, np.nan)
+
+
+def _clusters(cfg: DictConfig, model: CoarseToFine, log: Log, sweeps: Window) -> Any:
+    (result,) = model([sweeps])
+    return plot_clusters(
+        sweeps.pc0.points,
+        result,
+        is_ground=sweeps.pc0.is_ground,
+        point_cloud_range=model.config.point_cloud_range,
+        title=_title(log, cfg.pair),
+    )
+
+
+PICTURES: Dict[str, Callable[[DictConfig, CoarseToFine, Log, Window], Any]] = {
+    "flow": _flow,
+    "clusters": _clusters,
+    "keypoints": lambda cfg, model, log, sweeps: plot_keypoints(sweeps, model.config),
+    "correlation": lambda cfg, model, log, sweeps: plot_correlation(sweeps, model.config, cluster_id=cfg.cluster),
+    "scales": lambda cfg, model, log, sweeps: plot_scales(sweeps, model.config),
+}
+
+
+def _animate(cfg: DictConfig, model: CoarseToFine, output: Path) -> Path:
+    """Flow of several pairs, then their pictures; nothing is written if one of them fails."""
+    if cfg.format not in FORMATS:
+        raise CFlowError(f"format={cfg.format}: give one of {', '.join(FORMATS)}")
+    if cfg.first < 0 or cfg.step < 1 or (cfg.count is not None and cfg.count < 1):
+        raise CFlowError(
+            f"first={cfg.first}, step={cfg.step}, count={cfg.count}: give a first pair of at least 0, a step and a "
+            "count of at least 1"
+        )
+    log = find_log(cfg)
+    recent = RecentSweeps(log, model.config.num_history + 2)
+    pairs = range(cfg.first, len(log.timestamps) - 1, cfg.step)[: cfg.count]
+    if not pairs:
+        raise CFlowError(f"first={cfg.first}: log {log.log_id} has pairs 0 to {len(log.timestamps) - 2}")
+    frames: List[Frame] = []
+    for pair in tqdm(pairs, unit="pair", disable=None):
+        sweeps = _window(recent, pair, model.config.num_history)
+        (result,) = model([sweeps])
+        flow = result.residual_flow
+        result = replace(result, pose_flow=flow, flow=flow)  # many frames are kept: let go of what is not drawn
+        title = f"{log.log_id}, {(log.timestamps[pair] - log.timestamps[pairs[0]]) / 1e9:.1f} s"
+        frames.append(Frame(sweeps.pc0.points, result, sweeps.pc0.is_ground, title))
+    figures = flow_figures(
+        frames,
+        point_cloud_range=model.config.point_cloud_range,
+        max_flow=cfg.max_flow,
+        legend=cfg.legend,
+        width=cfg.width,
+    )
+    print(f"log {log.log_id}, {len(pairs)} pairs from {pairs[0]} to {pairs[-1]}")
+    path = _folder(output) / f"animation.{cfg.format}"
+    drawn = tqdm(figures, total=len(frames), unit="picture", disable=None)
+    return save_animation(drawn, path, frames_per_second=cfg.frames_per_second)
