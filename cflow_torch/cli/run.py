@@ -24,6 +24,7 @@ from cflow_torch.data.catalog import find_sources, open_log
 from cflow_torch.data.log import Log, RecentSweeps, window
 from cflow_torch.data.paths import as_path
 from cflow_torch.data.records import write_text
+from cflow_torch.fleet.progress import frames
 from cflow_torch.pyramid import CoarseToFine
 from cflow_torch.stopwatch import FlowModel
 from cflow_torch.types import CFlowError, FlowResult, Window
@@ -165,7 +166,7 @@ def for_each_pair(logs: Sequence[Log], model: FlowModel, use: UseResult, first: 
     recent = [RecentSweeps(log, model.config.num_history + 2) for log in logs]
     pairs = [(log, index) for log in recent for index in range(first, len(log.timestamps) - 1, step)]
     failures: Failures = []
-    for log, index in tqdm(pairs, unit="pair", disable=None):
+    for log, index in frames(pairs):
         try:
             sweeps = window(log, index, model.config.num_history)
             (result,) = model([sweeps])

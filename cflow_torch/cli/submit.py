@@ -30,6 +30,7 @@ from cflow_torch.cli.run import (
     write_config,
 )
 from cflow_torch.data.log import Log, window
+from cflow_torch.fleet.progress import frames as counted
 from cflow_torch.submission.archive import pack
 from cflow_torch.submission.check import check_submission
 from cflow_torch.submission.encode import RESIDUAL_AXES, Rounding, encode
@@ -126,7 +127,7 @@ def _plan(
         )
     plan: Plan = []
     failures: Failures = []
-    for frame in tqdm(frames, desc="rows", unit="frame", disable=None):
+    for frame in counted(frames, "rows"):
         try:
             plan.append((frame, frame.expect(version, masks)))
         except (CFlowError, OSError) as error:
@@ -146,7 +147,7 @@ def _write(
     failures: Failures = []
     rounding = Rounding()
     kept = 0
-    for planned, frame in tqdm(plan, unit="frame", disable=None):
+    for planned, frame in counted(plan):
         if is_complete(folder, frame, version):
             kept += 1
             continue

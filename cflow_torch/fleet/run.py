@@ -15,6 +15,7 @@ from cflow_torch.data.records import write_text
 from cflow_torch.fleet.job import Event, Failed, Job, Opened, split
 from cflow_torch.fleet.local import run_local
 from cflow_torch.fleet.machine import Layout
+from cflow_torch.fleet.progress import Progress
 from cflow_torch.fleet.report import make_report, to_json
 from cflow_torch.fleet.shard import Shard
 from cflow_torch.fleet.stop import StopSignal
@@ -94,14 +95,13 @@ def _engine(name: str) -> Any:
 def _follow(events: Iterator[Event], tally: Tally, num_units: int) -> None:
     """Count events in, and show how far it is: the total grows as logs are opened."""
     num_opened = num_frames = 0
-    with tqdm(unit="frame", disable=None, smoothing=0.05) as bar:
+    with Progress() as progress:
         for event in events:
             settled = tally.add(event)
             if isinstance(event, Opened):
                 num_opened, num_frames = num_opened + 1, num_frames + event.total
-                bar.total = round(num_frames / num_opened * max(num_units, num_opened))
+                progress.total = round(num_frames / num_opened * max(num_units, num_opened))
             if isinstance(event, Failed):
                 tqdm.write(f"failed: {event.name}: {event.message}", file=sys.stderr)
-            bar.update(settled)
-        bar.total = bar.n
-        bar.refresh()
+            progress.update(settled)
+        progress.total = progress.done
