@@ -15,6 +15,7 @@ COMMANDS = {
     "eval": "estimate and score every labelled pair of a data set",
     "submit": "write and check an archive for a public leaderboard",
     "plot": "pictures of the flow and of every stage, ground truth beside it, animations",
+    "view": "a recording of a drive for the viewer rerun: flow, clusters, truth, on a timeline",
     "bench": "time every stage against the reference and a plain OpenCV loop",
     "info": "versions and devices, to paste into a bug report",
 }

@@ -5,6 +5,7 @@ from cflow_torch.viz.bev import plot_flow, save_picture
 from cflow_torch.viz.clusters import plot_clusters
 from cflow_torch.viz.correlation import plot_correlation
 from cflow_torch.viz.keypoints import plot_keypoints
+from cflow_torch.viz.recording import record_log
 from cflow_torch.viz.scales import plot_scales
 from cflow_torch.viz.wheel import flow_to_rgb, wheel_image
 
@@ -15,6 +16,7 @@ __all__ = [
     "plot_flow",
     "plot_keypoints",
     "plot_scales",
+    "record_log",
     "save_animation",
     "save_picture",
     "wheel_image",

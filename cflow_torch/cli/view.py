@@ -1,0 +1,120 @@
+"""A recording for the viewer rerun, one per log: OUTPUT/<log id>.rrd. Needs the extra `rerun` (Python 3.9 or newer).
+
+Points of sweep t coloured by residual flow, an arrow per moving cluster, the clusters, sweep t+1, the true flow where
+the log has labels, and the ego vehicle's way, along a timeline of sweeps. The flow is estimated now; flow=FOLDER shows
+what `cflow flow` left there instead. `rerun FILE` opens a recording, on any machine; show=true does so at the end.
+OUTPUT/config.yaml holds the resolved settings and versions.
+
+examples:
+  cflow view                                                   a simulated street, no data needed
+  cflow view data=av2 data.root=/data/av2/val/LOG show=true    and open the viewer
+  cflow view data=hdf5 data.root=/data/scenes count=20         the first 20 pairs of each scene
+  cflow view data.first=2 data.step=2 max_flow=0.5             every second pair; the full colour at 0.5 m per sweep
+  cflow view flow=outputs/flow                                 what `cflow flow` left, with the same data= settings
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any, Callable, Iterator, List, Tuple
+
+from omegaconf import DictConfig
+from tqdm import tqdm
+
+from cflow_torch.cli.run import Failures, finish, make_model, open_logs, output_folder, write_config
+from cflow_torch.data.flow_file import read_flow
+from cflow_torch.data.log import Log, RecentSweeps, window
+from cflow_torch.data.paths import as_path, is_remote
+from cflow_torch.fleet.manifest import frame_file
+from cflow_torch.fleet.progress import Progress
+from cflow_torch.types import CFlowError, FlowResult
+from cflow_torch.viz.recording import load_rerun, record_log
+
+_PATIENCE = 3  # seconds in which a viewer that cannot run ends
+
+
+def task(cfg: DictConfig) -> None:
+    """Run `cflow view`."""
+    load_rerun()  # before hours of work
+    output = output_folder(cfg)
+    if is_remote(output):
+        raise CFlowError(f"{output}: recordings are written on this machine only; give output=FOLDER and copy them")
+    if cfg.data.first < 0 or cfg.data.step < 1 or (cfg.count is not None and cfg.count < 1):
+        raise CFlowError(
+            f"data.first={cfg.data.first}, data.step={cfg.data.step}, count={cfg.count}: "
+            "give a first pair of at least 0, a step and a count of at least 1"
+        )
+    flow, history = _flow(cfg)
+    logs, failures = open_logs(cfg)
+    write_config(cfg, output)
+    files: List[Path] = []
+    for log in logs:
+        pairs = range(cfg.data.first, len(log.timestamps) - 1, cfg.data.step)[: cfg.count]
+        recent: Any = RecentSweeps(log, history + 2)
+        file = output / f"{log.log_id}.rrd"
+        try:
+            count = record_log(recent, _results(recent, pairs, flow, failures), file, max_flow=cfg.max_flow)
+        except CFlowError as error:
+            failures.append((log.log_id, str(error)))
+            continue
+        files.append(file)
+        print(f"{file}: {count} pair{'' if count == 1 else 's'}, {file.stat().st_size / 1e6:,.1f} MB")
+    if files and not cfg.show:
+        print(f"look at it with: rerun {files[0]}")
+    if files and cfg.show:
+        _show(files)
+    finish(failures)
+
+
+def _flow(cfg: DictConfig) -> Tuple[Callable[[Log, int], FlowResult], int]:
+    """(What gives the flow of a pair, how many older sweeps it needs)."""
+    if cfg.flow is not None:
+        folder = as_path(cfg.flow)
+        if not folder.is_dir():
+            raise CFlowError(f"flow={cfg.flow} is no folder: give one that `cflow flow` left")
+        return lambda log, index: read_flow(frame_file(folder / log.log_id, log.timestamps[index])), 0
+    model = make_model(cfg)
+    history = model.config.num_history
+
+    def estimate(log: Log, index: int) -> FlowResult:
+        (result,) = model([window(log, index, history)])
+        return result
+
+    return estimate, history
+
+
+def _results(
+    log: Log, pairs: range, flow: Callable[[Log, int], FlowResult], failures: Failures
+) -> Iterator[Tuple[int, FlowResult]]:
+    """The flow of each pair; a bad frame is reported and the rest goes on."""
+    with Progress(len(pairs), log.log_id) as progress:
+        for index in pairs:
+            try:
+                window(log, index)  # both sweeps, which are kept for the recording
+                log.labels(index)
+                result = flow(log, index)
+            except (CFlowError, OSError) as error:
+                frame = f"{log.log_id}/{log.timestamps[index]}"
+                failures.append((frame, str(error)))
+                tqdm.write(f"failed: {frame}: {error}", file=sys.stderr)
+            else:
+                yield index, result
+            progress.update()
+
+
+def _show(files: List[Path]) -> None:
+    """Open the viewer, which stays when this command ends."""
+    # By default the viewer listens for data from anywhere.
+    command = [sys.executable, "-m", "rerun", "--bind", "127.0.0.1", *map(str, files)]
+    viewer = subprocess.Popen(command, start_new_session=True)
+    try:
+        status = viewer.wait(_PATIENCE)
+    except subprocess.TimeoutExpired:
+        return
+    if status:
+        raise CFlowError(
+            f"the viewer ended at once (status {status}). Without a screen: `rerun --web-viewer {files[0]}`, or copy "
+            "the file to a machine that has one"
+        )
