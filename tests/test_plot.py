@@ -252,6 +252,13 @@ def test_the_proof_has_no_such_picture(plot: object, preset: str) -> None:
         plot(scene(4), make_config(preset))  # type: ignore[operator]
 
 
+def test_presets_of_their_own_leave_older_sweeps_out() -> None:
+    for draw in (plot_correlation, plot_keypoints, plot_scales):
+        draw(scene(4, num_history=2))
+        with pytest.raises(CFlowError, match="num_history"):
+            draw(scene(4, num_history=2), keypoint_config() if draw is plot_keypoints else config())
+
+
 def test_the_wrong_method_is_named() -> None:
     with pytest.raises(CFlowError, match="keypoints"):
         plot_keypoints(scene(4), config())

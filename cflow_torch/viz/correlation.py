@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, List, Optional, Tuple
 
 import numpy as np
@@ -29,7 +30,7 @@ def plot_correlation(
 
     Args:
         window: sweeps.
-        config: of the dense method, without `proof`; None = the preset "paper".
+        config: of the dense method, without `proof`; None = the preset "paper", which leaves older sweeps out.
         cluster_id: as in `FlowResult`; None = the most conspicuous mover, see `stages.cluster_correlation`.
         title: one line above; None = which cluster and what was found.
 
@@ -43,7 +44,9 @@ def plot_correlation(
 
     Source: the paper's figures of one car and of its NCC map; Eq. norm_correlation, displacement_in_bev.
     """
-    found = cluster_correlation(window, make_config("paper") if config is None else config, cluster_id)
+    if config is None:
+        config, window = make_config("paper"), replace(window, pch=())
+    found = cluster_correlation(window, config, cluster_id)
     figure, places = _lay_out(found.images.t.shape)
     size = found.images.pixel_size
     dy, dx = found.shift

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Optional, Tuple
 
 import numpy as np
@@ -31,7 +32,7 @@ def plot_keypoints(window: Window, config: Optional[Config] = None, *, title: Op
 
     Args:
         window: sweeps.
-        config: of the key-point method; None = the preset "keypoints".
+        config: of the key-point method; None = the preset "keypoints", which leaves older sweeps out.
         title: one line above; None = how many key points and matches there are.
 
     Returns:
@@ -44,7 +45,9 @@ def plot_keypoints(window: Window, config: Optional[Config] = None, *, title: Op
         CFlowError: matplotlib is absent, another method, or bad input.
     """
     figure = blank_figure((16.0, 6.9), 100)
-    found = keypoint_matches(window, make_config("keypoints") if config is None else config)
+    if config is None:
+        config, window = make_config("keypoints"), replace(window, pch=())
+    found = keypoint_matches(window, config)
     start, end = match_lines(found)
     low, high = _busiest(start, end)
     if title is None:

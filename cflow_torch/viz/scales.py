@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, List, Optional, Tuple
 
 import numpy as np
@@ -29,7 +30,8 @@ def plot_scales(window: Window, config: Optional[Config] = None, *, title: Optio
 
     Args:
         window: sweeps.
-        config: without `proof`; None = the preset "paper" with pixels of 0.4, 0.2 and 0.1 m.
+        config: without `proof`; None = the preset "paper" with pixels of 0.4, 0.2 and 0.1 m, which leaves older
+            sweeps out.
         title: one line above; None = the pixel sizes.
 
     Returns:
@@ -45,7 +47,7 @@ def plot_scales(window: Window, config: Optional[Config] = None, *, title: Optio
     Source: the paper's multi-scale strategy and its figure.
     """
     if config is None:
-        config = make_config("paper", pixel_sizes=(0.4, 0.2, 0.1))
+        config, window = make_config("paper", pixel_sizes=(0.4, 0.2, 0.1)), replace(window, pch=())
     found, result = scales(window, config)
     _, alone = scales(window, config.replace(pixel_sizes=config.pixel_sizes[-1:]))
     count = len(found) + 1
