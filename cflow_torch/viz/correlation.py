@@ -143,6 +143,7 @@ def _draw_surface(axes: Any, found: ClusterCorrelation) -> None:
     """The same map as a surface. Args: axes: three-dimensional."""
     from matplotlib.ticker import MaxNLocator
 
+    axes.patch.set_visible(False)  # it would hide the numbers beside it
     height, width = found.ncc.shape
     y, x = np.arange(height) - height // 2, np.arange(width) - width // 2
     scores = np.where(np.isfinite(found.ncc), found.ncc, 0.0)

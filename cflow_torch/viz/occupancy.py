@@ -82,6 +82,8 @@ def add_metres(axes: Axes, origin: Tuple[float, float], pixel_size: float, names
     beside.set_ylabel(names[1], fontsize=9, color=FAINT, labelpad=3)
     for second, axis in ((above, above.xaxis), (beside, beside.yaxis)):
         axis.set_major_locator(MaxNLocator(5, steps=(1, 2, 5, 10), min_n_ticks=2))
+        for spine in second.spines.values():
+            spine.set(color=FRAME, linewidth=0.8)
         second.tick_params(labelsize=9, labelcolor=FAINT, color=FRAME, length=3)
 
 
