@@ -103,6 +103,17 @@ def slow_person(seed: int) -> Case:
     return _case(drive, attempts, "slow people in a hedge", "two people, 1.1 m/s", rows, (-6, -6, 20, 13))
 
 
+def crowd(seed: int) -> Case:
+    """Somebody who walks through a group that stands."""
+    rng = _rng(seed)
+    people = [objects.pedestrian(rng, Route(8, 4.5, EAST, start=-0.5, speed=1.2))]
+    for x, y in ((x, y) for x in (6.5, 7.2, 7.9, 8.6, 9.3) for y in (3.9, 5.1)):
+        people.append(objects.pedestrian(rng, Route(x + rng.uniform(-0.1, 0.1), y + rng.uniform(-0.1, 0.1))))
+    drive = _drive(people, Route(0, 0, speed=5), seed)
+    attempts = [_flow(drive, "default"), _flow(drive, "default", num_history=0)]
+    return _case(drive, attempts, "a person in a crowd", "who walks, 1.2 m/s", [0], (-6, -6, 20, 13))
+
+
 def touching(seed: int) -> Case:
     """A car that passes a parked one a hand's breadth away."""
     rng = _rng(seed)
@@ -214,7 +225,7 @@ def frozen_world(seed: int) -> Case:
 CASES: Dict[str, Callable[[int], Case]] = {
     case.__name__: case
     for case in (
-        *(long_side, rail, slow_person, touching, turning, vertical, fast, large, beyond_region),
+        *(long_side, rail, slow_person, crowd, touching, turning, vertical, fast, large, beyond_region),
         *(ground_left_in, wrong_frame, appearing, appeared, rolling_shutter, frozen_world),
     )
 }

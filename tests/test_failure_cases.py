@@ -59,6 +59,12 @@ def test_two_sweeps_find_slow_people_in_a_hedge_more_often_than_five(scenes):
     assert errors[:, 1].mean() < 0.7 * errors[:, 0].mean()
 
 
+def test_who_walks_through_a_crowd_is_lost_and_little_helps(scenes):
+    errors = np.array([scenes.crowd(seed).errors() for seed in range(5)])
+    assert (errors[:, 0] > 0.11).all()  # of 0.12 m
+    assert np.median(errors[:, 1]) > 0.11
+
+
 @pytest.mark.parametrize("seed", SEEDS)
 def test_what_appears_is_wrong_at_first_and_its_confidence_says_so(scenes, seed):
     first, later = scenes.appearing(seed), scenes.appeared(seed)
