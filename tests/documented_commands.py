@@ -59,7 +59,8 @@ class Snippet:
 def documents() -> List[Path]:
     """README, contributing, everything under docs/ and the notebooks."""
     found = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
-    return [*found, *sorted((ROOT / "notebooks").glob("*.ipynb"))]
+    notebooks = ROOT / "notebooks"
+    return [*found, *sorted(notebooks.glob("*.md")), *sorted(notebooks.glob("*.ipynb"))]
 
 
 def markdown_of(file: Path) -> str:

@@ -112,6 +112,7 @@ PLACES: Dict[str, Union[str, Callable[[Path], Path]]] = {
     "/data/truckscenes": _written(write_truckscenes),
     "/data/aevascenes": _written(write_aevascenes_sequence),
     "/data/my_drive": _arrays,
+    "my_drive": "/data/my_drive",
     "/scratch": lambda folder: folder,
     "CACHE": lambda folder: folder,
 }

@@ -78,6 +78,7 @@ SHRUNK: Tuple[Rule, ...] = (
     ),
     Rule(r"^cflow eval data=benchmark_small", "one small drive", add=SMALL_BENCHMARK),
     Rule(r"^(OMP\S+ )?cflow eval -m experiment=(?!.*data=)", "one small drive", add=SMALL_BENCHMARK, slow=True),
+    Rule(r"experiment=clustering", "each pair takes seconds", needs="hdbscan", slow=True),
     Rule(r"experiment=(history|scales)(?!.*(data=|num_history))", "one h", add="model.num_history=0", slow=True),
     Rule(r"experiment=scales .*num_history=0,2,4,8", "two of four h", replace=(("0,2,4,8", "0,2"),), slow=True),
     Rule(
@@ -166,6 +167,7 @@ KINDS_NOT_RUN: Dict[str, str] = {
 # Exact command -> why no test runs it.
 NOT_RUN: Dict[str, str] = {
     "OMP_NUM_THREADS=1 python scripts/bench_growth.py --repeats 5": "only repeats more than one that is run",
+    "jupyter lab notebooks": "opens a browser; tests/test_notebooks.py runs every cell",
     "./scripts/demo.sh": "installs; .ci/run runs it on every commit",
     ".ci/run": "runs this test",
     "python /path/to/cflow_torch/tests/opensceneflow_stubs/launch.py eval.py ...": "needs files of OpenSceneFlow",

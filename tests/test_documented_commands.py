@@ -162,7 +162,7 @@ def test_command_that_is_not_run(snippet: Snippet, home: Path, monkeypatch: pyte
     words = [word for word in snippet.words if word != "..."]
     for name in re.findall(r"(?:^|[ /])((?:scripts|tests|\.ci)/[\w./]+)", text):
         assert (ROOT / name).is_file(), name
-    for extra in re.findall(r"cflow_torch\[([\w,]+)\]", text):
+    for extra in re.findall(r"(?:cflow_torch|\.)\[([\w,]+)\]", text):
         listed = (ROOT / "pyproject.toml").read_text(encoding="utf-8").partition("[project.optional-dependencies]")[2]
         assert all(re.search(rf"^{name} = ", listed, re.M) for name in extra.split(","))
     if "cflow" in words and words.index("cflow") < len(words) - 1:
