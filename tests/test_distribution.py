@@ -14,7 +14,7 @@ from typing import Set, Tuple
 
 import pytest
 
-pytest.importorskip("build", reason="the extra dev is not installed")
+pytest.importorskip("build.__main__", reason="the extra dev is not installed")
 metadata = pytest.importorskip("packaging.metadata", reason="needs packaging 23.1")
 
 ROOT = Path(__file__).resolve().parents[1]

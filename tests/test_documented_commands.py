@@ -14,9 +14,10 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any, Dict, List
+from typing import Any, Dict, Iterator, List
 
 import pytest
+import torch
 from documented_commands import (
     ROOT,
     Snippet,
@@ -33,6 +34,8 @@ from cflow_torch import CFlowError
 from cflow_torch.cli.main import COMMANDS, main
 
 pytest.importorskip("h5py", reason="half of the commands read HDF5 scenes")
+if not (ROOT / "docs").is_dir():
+    pytest.skip("the documents are not beside the tests", allow_module_level=True)
 
 ALL = commands()
 RUN = [snippet for snippet in ALL if not (reason_not_run(snippet.text) or snippet.is_mention or snippet.is_script)]
@@ -75,7 +78,7 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def home(tmp_path: Path, cache: Path, programs: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def home(tmp_path: Path, cache: Path, programs: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """An empty folder to be in, as a reader begins; what is run here also finds the checkout."""
     (tmp_path / "docs" / "benchmarks").mkdir(parents=True)  # where commands of the repository put pictures
     monkeypatch.chdir(tmp_path)
@@ -84,7 +87,9 @@ def home(tmp_path: Path, cache: Path, programs: Path, monkeypatch: pytest.Monkey
     monkeypatch.setenv("PATH", f"{programs}{os.pathsep}{os.environ['PATH']}")
     monkeypatch.setenv("USER", os.environ.get("USER") or "reader")
     monkeypatch.setattr(sys, "argv", list(sys.argv))
-    return tmp_path
+    threads = torch.get_num_threads()
+    yield tmp_path
+    torch.set_num_threads(threads)
 
 
 def name_of(snippet: Snippet) -> str:
