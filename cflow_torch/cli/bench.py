@@ -1,7 +1,12 @@
 """Times the method against its targets, its reference and a plain OpenCV loop: tables and OUTPUT/bench.json.
 
-cflow bench
-cflow bench data=av2 data.root=/data/av2/val/LOG repeats=50
+One window of the first log, all on the same data in the same run, medians; times of one stage after the other,
+windows per second in batches, memory. Other work on the machine spoils the figures.
+
+examples:
+  cflow bench                                                    a simulated street
+  cflow bench data=av2 data.root=/data/av2/val/LOG repeats=50    real data, more runs
+  cflow bench num_threads=1 opencv=false                         one core; without the OpenCV loop
 """
 
 from __future__ import annotations

@@ -3,8 +3,10 @@
 Leaves in OUTPUT (outputs/demo): <log id>/ one flow file per pair, flow.png the picture, results.json the scores,
 config.yaml the resolved settings and versions; in outputs/cache the drive in Argoverse 2's format.
 
-  cflow demo
-  cflow demo data.seed=7 pair=2 output=outputs/another
+examples:
+  cflow demo                                              no data needed
+  cflow demo data.seed=7 pair=2 output=outputs/another    another street, drawn at another moment
+  cflow demo model=paper                                  with the method of the paper
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ from cflow_torch.data.flow_file import write_flow
 from cflow_torch.data.log import Log
 from cflow_torch.evaluation.frame import EvalFrame
 from cflow_torch.evaluation.metrics import SceneFlowMetrics
-from cflow_torch.types import FlowResult, Window
+from cflow_torch.types import CFlowError, FlowResult, Window
 from cflow_torch.viz.bev import plot_flow, save_picture
 
 
@@ -27,6 +29,9 @@ def task(cfg: DictConfig) -> None:
     metrics = SceneFlowMetrics(cfg.definition)
     model = make_model(cfg)
     logs, failures = open_logs(cfg)
+    num_pairs = max((len(log.timestamps) - 1 for log in logs), default=0)
+    if logs and not 0 <= cfg.pair < num_pairs:
+        raise CFlowError(f"pair={cfg.pair}: the drive has {num_pairs} pairs, give 0 ... {num_pairs - 1}")
 
     def keep(log: Log, index: int, sweeps: Window, result: FlowResult) -> None:
         write_flow(output / log.log_id / f"{log.timestamps[index]}.feather", result)

@@ -3,10 +3,12 @@
 A run whose results are there already is skipped; overwrite=true redoes it. The jobs of a sweep write to folders below
 OUTPUT that are named by what was overridden; the score that a sweeper sees is the mean dynamic error.
 
-cflow eval data=av2 data.root=/data/av2/val model=paper
-cflow eval definition=av2                    scores as another public evaluator defines them
-cflow eval -m model.connectivity=4,8         a sweep: outputs/eval/model.connectivity=4/results.json, ...
-cflow eval -m experiment=pixel_size          a table or figure of the paper, see docs/experiments.md
+examples:
+  cflow eval data=av2 data.root=/data/av2/val model=paper
+  cflow eval data=hdf5 data.root=/data/scenes model=fast     a cheaper method
+  cflow eval definition=av2                    scores as another public evaluator defines them
+  cflow eval -m model.connectivity=4,8         a sweep: outputs/eval/model.connectivity=4/results.json, ...
+  cflow eval -m experiment=pixel_size          a table or figure of the paper, see docs/experiments.md
 """
 
 from __future__ import annotations
@@ -49,7 +51,7 @@ def task(cfg: DictConfig) -> float:
 
     failures += for_each_pair(logs, model, score, cfg.data.first, cfg.data.step)
     if metrics.num_frames == 0:
-        raise CFlowError("no pair has labels: nothing to score")
+        raise CFlowError("no pair has labels: nothing to score; `cflow flow` estimates the flow without them")
     results = report(cfg, metrics, output, data=identity.report(), seconds=model.report(), failures=failures)
     _finish(failures)
     return objective(results)

@@ -11,6 +11,7 @@ there, 1 if one is missing, 2 if the call was wrong, 130 or 143 after a signal.
 result_name=NAME (HDF5 scenes) also writes the total flow into the scenes themselves, as key NAME of every sweep, where
 the viewers of OpenSceneFlow find it.
 
+examples:
   cflow flow data=av2 data.root=/data/av2/val output=outputs/val
   cflow flow data=av2 data.root=/data/av2/val dry_run=true        frames, outputs, time, memory, disk
   cflow flow model=paper model.pixel_sizes=[0.2] engine.workers=8
@@ -30,7 +31,7 @@ from typing import Any, Dict, Sequence, Tuple
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
-from cflow_torch.cli.run import Failures, find_logs, is_sweep, make_model, output_folder, versions
+from cflow_torch.cli.run import Failures, UnfinishedJob, find_logs, is_sweep, make_model, output_folder, versions
 from cflow_torch.data.flow_file import CONTENTS, ON_REQUEST, read_flow
 from cflow_torch.data.hdf5.results import check_result_name, check_writable, write_hdf5_results
 from cflow_torch.data.records import write_text
@@ -97,7 +98,7 @@ def task(cfg: DictConfig) -> None:
     if status:
         print(f"missing:\n{missing}", file=sys.stderr)
         if is_sweep():  # Hydra lets the other jobs run before it ends with status 1
-            raise RuntimeError(f"not every frame is there: see {report_file(job.output, shard)}")
+            raise UnfinishedJob(f"not every frame is there: see {report_file(job.output, shard)}")
         raise SystemExit(status)
 
 

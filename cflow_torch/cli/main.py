@@ -1,12 +1,17 @@
-"""The `cflow` command: `cflow demo | flow | eval | submit | bench | info`, settings as Hydra overrides."""
+"""The `cflow` command: `cflow demo | flow | eval | submit | view | bench | info | completion`.
+
+Settings are Hydra overrides.
+"""
 
 from __future__ import annotations
 
 import os
 import sys
+from difflib import get_close_matches
 from importlib import import_module
-from typing import List, Optional
+from typing import Any, List, Optional
 
+from cflow_torch import __version__
 from cflow_torch.types import CFlowError
 
 COMMANDS = {
@@ -17,15 +22,18 @@ COMMANDS = {
     "plot": "pictures of the flow and of every stage, ground truth beside it, animations",
     "view": "a recording of a drive for the viewer rerun: flow, clusters, truth, on a timeline",
     "bench": "time every stage against the reference and a plain OpenCV loop",
-    "info": "versions and devices, to paste into a bug report",
+    "info": "packages, machine, devices: to paste into a bug report",
+    "completion": "a script that makes a shell complete commands and settings",
 }
+
+_WITHOUT_SETTINGS = ("info", "completion")
 
 HELP = f"""cflow: training-free LiDAR scene flow
 
 usage: cflow COMMAND [SETTING=VALUE ...]
 
 commands:
-{chr(10).join(f"  {name:6} {text}" for name, text in COMMANDS.items())}
+{chr(10).join(f"  {name:10}  {text}" for name, text in COMMANDS.items())}
 
 examples:
   cflow demo                                          a picture in outputs/demo, no data needed
@@ -36,48 +44,100 @@ examples:
   cflow plot picture=correlation pair=2               how one object was found, outputs/plot/correlation.png
   cflow submit data=hdf5 data.root=/data/test version=3
 
-`cflow COMMAND --help` says more; `cflow COMMAND --cfg job` prints every setting and its value.
+`cflow COMMAND --help` says more; `cflow COMMAND --cfg job` prints every setting and its value; `cflow --version`.
 """
 
 
 def main(argv: Optional[List[str]] = None) -> None:
     """Run one command. Ends the process with status 1 if anything failed, 2 if the call was wrong."""
     try:
-        _run(argv)
-        sys.stdout.flush()
+        try:
+            _run(list(sys.argv[1:] if argv is None else argv))
+        finally:
+            sys.stdout.flush()
     except BrokenPipeError:
         _end_unread()
 
 
-def _run(argv: Optional[List[str]]) -> None:
-    arguments = list(sys.argv[1:] if argv is None else argv)
+def _run(arguments: List[str]) -> None:
     if not arguments or arguments[0] in ("-h", "--help", "help"):
+        if arguments[1:2] and arguments[1] in COMMANDS:  # cflow help eval
+            return _run([arguments[1], "--help"])
         print(HELP)
-        return
+        return None
+    if arguments[0] in ("-V", "--version"):
+        print(f"cflow_torch {__version__}")
+        return None
     command, *rest = arguments
     if command not in COMMANDS:
-        print(f"error: unknown command {command!r}: give one of {', '.join(COMMANDS)}", file=sys.stderr)
+        near = get_close_matches(command, COMMANDS, 1)
+        hint = f" (did you mean {near[0]}?)" if near else ""
+        print(f"error: unknown command {command!r}{hint}: give one of {', '.join(COMMANDS)}", file=sys.stderr)
         raise SystemExit(2)
     module = import_module(f"cflow_torch.cli.{command}")
     if "-h" in rest or "--help" in rest:
         print(f"cflow {command}: {COMMANDS[command]}\n\n{module.__doc__}")
-        return
-    if command == "info":
-        module.task()
-        return
+        return None
+    if command in _WITHOUT_SETTINGS:
+        try:
+            return module.task(rest)
+        except CFlowError as error:
+            print(f"error: {error}", file=sys.stderr)
+            raise SystemExit(2) from None
+    return _run_with_settings(command, module.task, rest)
+
+
+def _run_with_settings(command: str, run: Any, rest: List[str]) -> None:
     import hydra
 
-    def task(cfg):  # type: ignore[no-untyped-def]
+    from cflow_torch.cli import wrong_call
+
+    has_begun = False
+
+    def task(cfg: Any) -> Any:
+        nonlocal has_begun
+        has_begun = True
         try:
-            return module.task(cfg)
+            return run(cfg)
         except CFlowError as error:
             print(f"error: {error}", file=sys.stderr)
             raise SystemExit(2) from None
         except BrokenPipeError:
             _end_unread()
 
-    sys.argv = [f"cflow {command}", *rest]
-    hydra.main(version_base="1.3", config_path="pkg://cflow_torch.configs", config_name=command)(task)()
+    sys.argv = [f"cflow {command}", *wrong_call.overrides_first(rest)]
+    # Hydra prints errors itself, and a closed pipe as one, unless this is set.
+    given = os.environ.get("HYDRA_FULL_ERROR")
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    try:
+        hydra.main(version_base="1.3", config_path="pkg://cflow_torch.configs", config_name=command)(task)()
+    except SystemExit as stop:
+        if stop.code == 2 and not has_begun:  # an option that Hydra's parser does not know
+            print(f"`cflow {command} --help` has examples", file=sys.stderr)
+        raise
+    except BrokenPipeError:
+        raise
+    except Exception as error:
+        if given:
+            raise
+        _say(error, None if has_begun else wrong_call.explain(error, command))
+    finally:
+        if given is None:
+            del os.environ["HYDRA_FULL_ERROR"]
+        else:
+            os.environ["HYDRA_FULL_ERROR"] = given
+
+
+def _say(error: Exception, wrong_call_message: Optional[str]) -> None:
+    """Print what went wrong and end the process."""
+    from cflow_torch.cli.run import UnfinishedJob
+    from cflow_torch.cli.wrong_call import format_bug
+
+    if wrong_call_message is not None:
+        print(f"error: {wrong_call_message}", file=sys.stderr)
+        raise SystemExit(2) from None
+    print(f"error: {error}" if isinstance(error, UnfinishedJob) else format_bug(error), file=sys.stderr)
+    raise SystemExit(1) from None
 
 
 def _end_unread() -> None:

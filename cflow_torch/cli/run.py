@@ -36,6 +36,10 @@ _NOT_THE_READERS = ("name", "label", "root", "first", "step")
 _LONGEST_NAME = 150  # characters of a folder name; file systems end at 255 bytes
 
 
+class UnfinishedJob(RuntimeError):
+    """A job of a sweep that left something undone, and has said what; the other jobs run all the same."""
+
+
 def versions() -> Dict[str, str]:
     """Versions that a result depends on."""
     return {

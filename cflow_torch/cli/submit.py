@@ -4,6 +4,7 @@ is left there. A run that was interrupted goes on where it stopped. OUTPUT/confi
 version=1: total flow of the points of the evaluation masks, 2023; version=2: residual flow of all points, 2024;
 version=3: the multi-dataset challenge of 2026, residual flow of all points.
 
+examples:
   cflow submit data=hdf5 data.root=/data/challenge_public/test version=3
   cflow submit data=av2 data.root=/data/av2/test version=1 masks=/data/av2/test-masks.zip
   cflow submit data=hdf5 data.root=/data/challenge_public/test version=3 archive=mine.zip    checks, changes nothing

@@ -7,7 +7,7 @@ OUTPUT/config.yaml holds the resolved settings and versions.
 
 examples:
   cflow view                                                   a simulated street, no data needed
-  cflow view data=av2 data.root=/data/av2/val/LOG show=true    and open the viewer
+  cflow view data=av2 data.root=/data/av2/val/LOG              one log
   cflow view data=hdf5 data.root=/data/scenes count=20         the first 20 pairs of each scene
   cflow view data.first=2 data.step=2 max_flow=0.5             every second pair; the full colour at 0.5 m per sweep
   cflow view flow=outputs/flow                                 what `cflow flow` left, with the same data= settings

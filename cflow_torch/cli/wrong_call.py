@@ -1,0 +1,68 @@
+"""What Hydra refuses, said in one line with what to do next."""
+
+from __future__ import annotations
+
+import re
+import traceback
+from typing import List, Optional
+
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from omegaconf.errors import OmegaConfBaseException
+
+from cflow_torch.cli import settings
+
+
+def overrides_first(arguments: List[str]) -> List[str]:
+    """Settings before options: Hydra's parser does not take `-m` between two settings."""
+
+    def is_override(word: str) -> bool:
+        return not word.startswith("-") and ("=" in word or word[0:1] in "+~")
+
+    return [a for a in arguments if is_override(a)] + [a for a in arguments if not is_override(a)]
+
+
+def explain(error: Exception, command: str) -> Optional[str]:
+    """The message for a call that Hydra refuses; None if the error is none of the caller's."""
+    if isinstance(error, MissingConfigException):
+        return _unknown_choice(error, command)
+    if isinstance(error, OverrideParseException):
+        wrong = str(error.override)
+        if "=" not in wrong:
+            return f"{wrong!r} is no setting: give NAME=VALUE, `cflow {command} --help` has examples"
+        return f"cannot read {wrong!r}: settings are NAME=VALUE, in quotes where the shell would read them: '{wrong}'"
+    if not isinstance(error, (HydraException, OmegaConfBaseException)):
+        return None
+    message = str(error)
+    match = re.match(r"Could not override '([^']+)'", message)
+    if match:
+        known = [*settings.groups(command), *settings.settings(command)]
+        key = match[1].lstrip("+~")
+        return f"unknown setting {key!r}{settings.near(key, known)}: `cflow {command} --cfg job` prints every one"
+    match = re.match(r"Ambiguous value for argument '([^=']+)=([^']+)'", message)
+    if match:
+        key, values = match.groups()
+        return f"{key}={values} is more than one value: add -m to run each, or write '{key}=[{values}]' for a list"
+    first, *more = message.splitlines() or [type(error).__name__]
+    rest = f" ({'; '.join(line.strip() for line in more if line.strip())})" if more else ""
+    return f"{first}{rest}; `cflow {command} --cfg job` prints every setting"
+
+
+def _unknown_choice(error: MissingConfigException, command: str) -> str:
+    group, _, name = str(error.missing_cfg_file or "").rpartition("/")
+    if group.startswith("hydra/"):
+        kind = group.partition("/")[2]
+        return f"no {kind} {name!r} here: joblib, submitit and optuna come with pip install 'cflow_torch[sweep]'"
+    known = settings.choices(group)
+    if not known:
+        return f"{error}; `cflow {command} --help` has examples".replace("\n", " ")
+    return f"{group}={name}{settings.near(name, known)}: give one of {', '.join(known)}"
+
+
+def format_bug(error: BaseException) -> str:
+    """Traceback from the command on, without Hydra's own frames, and what to do with it."""
+    trace = error.__traceback__
+    inner = trace
+    while inner is not None and inner.tb_frame.f_code.co_name != "task":
+        inner = inner.tb_next
+    lines = traceback.format_exception(type(error), error, inner or trace)
+    return "".join(lines) + "this is a fault of cflow, not of the call: report it with the lines above and `cflow info`"
