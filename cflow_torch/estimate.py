@@ -14,7 +14,7 @@ from cflow_torch.ground import find_ground_batch, has_ground
 from cflow_torch.inputs import check_windows, choose_device
 from cflow_torch.keypoints import CorrelationFlowKeypoints
 from cflow_torch.pyramid import CoarseToFine
-from cflow_torch.types import Array, CFlowError, FlowResult, Sweep, Window
+from cflow_torch.types import Array, CFlowError, FlowResult, Sweep, Window, as_numpy
 
 GROUND = (None, "auto", "patchwork")
 
@@ -61,7 +61,8 @@ def estimate_flow(
         `is_valid` False. Empty sweeps give an empty or all-zero result.
 
     Warns:
-        UserWarning: there is ground in a sweep without a mask, and `ground` is None. The result is not changed by it.
+        UserWarning: there is ground in a sweep without a mask, and `ground` is None; or no point of pc0 takes part. The
+            result is not changed by it.
 
     Raises:
         CFlowError: wrong shape or dtype, a transform that is not rigid, mixed devices, an unknown setting.
@@ -100,6 +101,7 @@ def estimate_flow(
     )
     window = _find_ground(window, ground, device)
     (result,) = make_model(config, device)([window])
+    _warn_if_nothing_takes_part(result, window, config)
     return result
 
 
@@ -137,6 +139,26 @@ def _find_ground(window: Window, ground: Optional[str], device: Any) -> Window:
     for index, mask in zip(bare, find_ground_batch(clouds, method, device=chosen)):
         sweeps[index] = replace(sweeps[index], is_ground=mask)
     return Window(sweeps[0], sweeps[1], tuple(sweeps[2:]))
+
+
+def _warn_if_nothing_takes_part(result: FlowResult, window: Window, config: Config) -> None:
+    """Points in millimetres, of another place or all of them ground are legal, and rarely meant."""
+    count = len(result.is_valid)
+    if count == 0 or bool(result.is_valid.any()):
+        return
+    positions = as_numpy(window.pc0.points)[:, :3]
+    finite = positions[np.isfinite(positions).all(axis=1)]
+    seen = "all are NaN or infinite"
+    if len(finite):
+        low, high = finite.min(axis=0), finite.max(axis=0)
+        spans = ", ".join(f"{axis} {a:.6g} to {b:.6g}" for axis, a, b in zip("xyz", low, high))
+        seen = f"they span {spans} in their own frame"
+    warnings.warn(
+        f"none of the {count} points of pc0 takes part ({seen}): are they metres, near the ego vehicle, and not all of "
+        f"them ground? point_cloud_range={config.point_cloud_range}, in the ego frame at t+1",
+        UserWarning,
+        stacklevel=3,
+    )
 
 
 def _per_sweep(name: str, values: Sequence[Any], pch: Sequence[Array]) -> Sequence[Any]:

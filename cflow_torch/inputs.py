@@ -18,6 +18,8 @@ _FARTHEST_POSE = 100.0
 # Sweeps that differ at all differ in their first points: those are compared before the whole clouds are.
 _FIRST_POINTS = 64
 _ALL_ROWS = slice(None)
+# No sweep has so many columns; three or four rows of them are coordinates of that many points.
+_MOST_COLUMNS = 1000
 
 
 def check_windows(windows: Any) -> None:
@@ -71,6 +73,8 @@ def _check_points(points: Any, name: str) -> None:
         raise CFlowError(f"{name} is {type(points).__name__}: give a NumPy array or a torch tensor of shape (N, 3+)")
     if points.ndim != 2 or points.shape[1] < 3:
         raise CFlowError(f"{name} has shape {tuple(points.shape)}: give (N, 3+), columns x, y, z in metres")
+    if points.shape[1] > _MOST_COLUMNS:
+        raise CFlowError(f"{name} has shape {tuple(points.shape)}: a row is a point; give its transpose, (N, 3+)")
     if isinstance(points, Tensor):
         is_floating = points.is_floating_point()
         if points.layout != torch.strided:

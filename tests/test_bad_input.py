@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -239,6 +241,34 @@ def test_mixed_devices():
     ):
         with pytest.raises(CFlowError, match=r"different devices \(cpu, meta\)"):
             call()
+
+
+def test_coordinates_in_rows_instead_of_columns():
+    with pytest.raises(CFlowError, match="give its transpose"):
+        estimate_flow(np.zeros((3, 1001)), P1)
+    estimate_flow(np.zeros((3, 1000)), P1)
+
+
+@pytest.mark.parametrize(
+    ("points", "masks", "seen"),
+    [
+        (1000 * P0.astype(np.float64) + 1e6, {}, "they span x (99|100)"),
+        (np.full((4, 3), np.nan), {}, "all are NaN or infinite"),
+        (P0, {"gm0": np.ones(len(P0), bool)}, "not all of them ground"),
+    ],
+    ids=["millimetres", "nothing finite", "all ground"],
+)
+def test_a_warning_if_no_point_takes_part(points, masks, seen):
+    with pytest.warns(UserWarning, match="none of the .* points of pc0 takes part") as caught:
+        result = estimate_flow(points, P1, **masks)
+    assert not result.is_valid.any() and re.search(seen, str(caught[0].message))
+
+
+def test_no_such_warning_otherwise():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        estimate_flow(P0, P1)
+        estimate_flow(P0[:0], P1)
 
 
 # ------------------------------------------------------------------------------------------------- the module
