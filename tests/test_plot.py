@@ -22,7 +22,7 @@ from cflow_torch.reference.keypoints import gate
 from cflow_torch.viz import plot_clusters, plot_correlation, plot_keypoints, plot_scales, stages
 from cflow_torch.viz.coloring import color_numbers
 from cflow_torch.viz.film import Frame, flow_figures
-from cflow_torch.viz.keypoints import match_lines
+from cflow_torch.viz.keypoints import busiest, match_lines
 from cflow_torch.viz.occupancy import crop, occupancy_rgb
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -159,6 +159,17 @@ def test_the_lines_drawn_are_the_matches() -> None:
     shown = (start > (left, bottom)).all(axis=1) & (start < (right, top)).all(axis=1) & found.shift.any(axis=1)
     assert shown.any() and np.allclose(np.array(lines), np.stack([start, end], axis=1)[shown])
     assert np.allclose((start - found.images.lower) / 0.25 - 0.5, found.key_points[found.source][:, ::-1])
+
+
+def test_the_place_shown_is_where_matches_agree() -> None:
+    rng = np.random.default_rng(1)
+    agree, cross = np.full((40, 2), 10.0), np.full((60, 2), -20.0)
+    start = np.concatenate([agree, cross]) + rng.uniform(0, 1.5, (100, 2))
+    flow = np.concatenate([np.full((40, 2), 0.5), rng.uniform(-2, 2, (60, 2))])
+    low, high = busiest(start, start + flow)
+    assert (low < (10, 10)).all() and (high > (12, 12)).all()
+    low, high = busiest(start, start)
+    assert np.allclose(low + high, 0), "nothing moves: the ego vehicle"
 
 
 def test_the_images_drawn_are_the_stages() -> None:

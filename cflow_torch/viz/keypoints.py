@@ -49,7 +49,7 @@ def plot_keypoints(window: Window, config: Optional[Config] = None, *, title: Op
         config, window = make_config("keypoints"), replace(window, pch=())
     found = keypoint_matches(window, config)
     start, end = match_lines(found)
-    low, high = _busiest(start, end)
+    low, high = busiest(start, end)
     if title is None:
         title = f"{len(found.key_points)} key points at t, {len(found.source)} of them matched; shown is a part"
     figure.text(0.5, 0.955, title, fontsize=17, color=INK, ha="center", va="center")
@@ -81,15 +81,18 @@ def _middle(pixels: np.ndarray, found: KeyPointMatches) -> np.ndarray:
     return found.images.lower + (pixels[:, ::-1] + 0.5) * found.images.pixel_size
 
 
-def _busiest(start: np.ndarray, end: np.ndarray) -> Tuple[np.ndarray, np.ndarray]:
-    """Low and high corner of the view: round the cell whose matches are longest in sum, or the ego vehicle."""
-    length = np.linalg.norm(end - start, axis=1)
+def busiest(start: np.ndarray, end: np.ndarray) -> Tuple[np.ndarray, np.ndarray]:
+    """Low and high corner of the view: round the cell whose matches go farthest in sum, or the ego vehicle.
+
+    Convention: vectors are summed, so matches that agree count and those that cross do not.
+    """
+    flow = end - start
     middle = np.zeros(2)
-    moves = length > MOVING
+    moves = np.linalg.norm(flow, axis=1) > MOVING
     if moves.any():
         _, cell = np.unique(np.floor(start[moves] / _CELL).astype(np.int64), axis=0, return_inverse=True)
         cell = cell.reshape(-1)  # NumPy 2.0 gives it another shape
-        sums = np.bincount(cell, weights=length[moves])
+        sums = np.hypot(*(np.bincount(cell, weights=values) for values in flow[moves].T))
         middle = np.median((start + end)[moves][cell == sums.argmax()] / 2, axis=0)
     return middle - _HALF_VIEW, middle + _HALF_VIEW
 
