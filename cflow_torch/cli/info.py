@@ -132,7 +132,7 @@ def _memory() -> str:
 
 def _devices() -> Iterator[str]:
     if not torch.cuda.is_available():
-        yield "no GPU: everything runs on the CPU, with the same results"
+        yield "no GPU: everything runs on the CPU"
         return
     for index in range(torch.cuda.device_count()):
         about = torch.cuda.get_device_properties(index)

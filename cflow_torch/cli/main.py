@@ -1,7 +1,4 @@
-"""The `cflow` command: `cflow demo | flow | eval | submit | view | bench | info | completion`.
-
-Settings are Hydra overrides.
-"""
+"""The `cflow` command: one of `COMMANDS`, then settings as Hydra overrides."""
 
 from __future__ import annotations
 
