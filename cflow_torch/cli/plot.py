@@ -1,5 +1,7 @@
 """A picture of one pair of sweeps, or an animation of a log: OUTPUT/<picture>.png (animation: .gif or .mp4).
 
+log=ID pair=N choose the pair; without log= it is one of the first log.
+
 picture=flow         the flow from above; truth=true|false|auto puts the ground truth and the error beside it
 picture=clusters     the points by cluster
 picture=keypoints    key points of both sweeps and their matches (model=keypoints)
@@ -10,8 +12,8 @@ picture=animation    the flow of many pairs: first= step= count= format=gif|mp4 
   cflow plot                                             the simulated street, outputs/plot/flow.png
   cflow plot picture=correlation pair=2
   cflow plot picture=scales model.pixel_sizes=[0.8,0.4,0.2,0.1]
-  cflow plot data=av2 data.root=/data/av2/val log=LOG pair=10 truth=true
-  cflow plot picture=animation count=20 format=mp4 model=fast
+  cflow plot data=av2 data.root=/data/av2/val/LOG pair=2 truth=true
+  cflow plot picture=animation count=5 model=fast
 """
 
 from __future__ import annotations
