@@ -85,9 +85,9 @@ def _keys(file: Path, prefix: str) -> Dict[str, Any]:
         for key in node:
             value = node._get_node(key)
             if isinstance(value, DictConfig) and not value._is_none() and len(value):
-                yield from flat(value, f"{prefix}{key}.")
+                yield from flat(value, f"{prefix}{key!s}.")
             else:
-                yield f"{prefix}{key}", None if value is None else value._value()
+                yield f"{prefix}{key!s}", None if value is None else value._value()
 
     return {
         key: value
