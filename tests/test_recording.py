@@ -95,7 +95,7 @@ def read(path: Path, only: str = "") -> Tuple[Dict[str, Dict[int, Dict[str, Any]
         if not chunk.entity_path.endswith(only):
             continue
         for row in chunk.to_record_batch().to_pylist():
-            kept = {_short(name.partition(":")[2]): value for name, value in row.items() if ":" in name}
+            kept = {_short(name): value for name, value in row.items() if ":" in name}
             rows.setdefault(chunk.entity_path.lstrip("/"), {})[row.get("sweep", -1)] = kept
     return rows, timelines
 
@@ -104,6 +104,7 @@ def _short(component: str) -> str:
     """One name for what the versions of rerun call differently."""
     names = {"Position3D": "positions", "Color": "colors", "Vector3D": "vectors", "Translation3D": "translation"}
     names.update({"Text": "labels", "LineStrip3D": "strips", "origins": "positions"})
+    component = component.rpartition(":")[2]  # Points3D:colors
     return names.get(component, component)
 
 
