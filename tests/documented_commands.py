@@ -53,6 +53,8 @@ class Snippet:
     def is_mention(self) -> bool:
         """A name in a sentence, such as `cflow eval` or `cflow eval -m`: nothing is asked to be run."""
         given = [word for word in self.text.split() if not word.startswith("-")]
+        if "COMMAND" in given:
+            return True
         return self.is_inline and given[0] in ("cflow", "torchrun") and len(given) <= 2 and given[-1] != "info"
 
 
@@ -114,6 +116,14 @@ def examples_of_help() -> Iterator[Snippet]:
             match = re.match(r"\s*(cflow [a-z]+( \S+)*)(  |$)", line)
             if match:
                 yield Snippet(match[1], str(file.relative_to(ROOT)), number)
+
+
+def command_blocks() -> Iterator[Tuple[str, int, List[str]]]:
+    """Document, line and commands of each block of them."""
+    for file in documents():
+        for language, block, line in blocks(file):
+            if language in SHELLS and not block.startswith("#!"):
+                yield str(file.relative_to(ROOT)), line, [command for _, command in commands_of_block(block)]
 
 
 def commands() -> List[Snippet]:

@@ -53,6 +53,20 @@ SHRUNK: Tuple[Rule, ...] = (
     ),
     Rule(r"^cflow flow (?!.*engine=ray)", "processes take seconds to start", add="engine.workers=1 engine.threads=1"),
     Rule(r"shard\.count=16", "three pairs in all", replace=(("shard.count=16", "shard.count=3"),)),
+    Rule(r"^cflow eval data=benchmark", "one small drive", add=SMALL_BENCHMARK),
+    Rule(r"^cflow (plot|view)\b(?!.*data=)", "the street is shorter", add="data.num_sweeps=5"),
+    Rule(r"^cflow view\b(?!.*flow=)", "an extra; any preset will do", add="model=fast", needs="rerun"),
+    Rule(r"^cflow view .*show=true", "opens a window", replace=(("show=true", "show=false"),)),
+    Rule(
+        r"^cflow view flow=outputs/flow",
+        "of an earlier command",
+        before=("cflow flow data.num_sweeps=5 model=fast engine.workers=1",),
+        needs="rerun",
+    ),
+    Rule(r"^cflow plot .*format=mp4", "an extra", needs="imageio_ffmpeg", slow=True),
+    Rule(
+        r"log=LOG pair=10", "the log has three pairs", replace=(("log=LOG pair=10", "log=synthetic-demo-0003 pair=1"),)
+    ),
     Rule(r"^cflow demo", "the picture is of pair 3", add="data.num_sweeps=5"),
     Rule(
         r"^cflow (flow|eval|submit)\b(?!.*(model=|confidence|experiment=))",
@@ -68,6 +82,7 @@ SHRUNK: Tuple[Rule, ...] = (
         add="repeats=1 batches=[1] hdbscan=false reference=false",
     ),
     Rule(r"^cflow bench(?!.*data=)", "eight sweeps of 100,000 points are made first", slow=True),
+    Rule(r"^cflow bench data=benchmark_sensors", "no history", add="data.num_sweeps=3 data.first=0", slow=True),
     Rule(r"^cflow bench .*repeats=", "one in a run of the quick tests is enough", slow=True),
     Rule(r"/data/scenes result_name=", "is written to", replace=(("/data/scenes", "DIR"),), slow=True),
     Rule(
@@ -78,7 +93,6 @@ SHRUNK: Tuple[Rule, ...] = (
     ),
     Rule(r"^cflow eval data=benchmark_small", "one small drive", add=SMALL_BENCHMARK),
     Rule(r"^(OMP\S+ )?cflow eval -m experiment=(?!.*data=)", "one small drive", add=SMALL_BENCHMARK, slow=True),
-    Rule(r"experiment=clustering", "each pair takes seconds", needs="hdbscan", slow=True),
     Rule(r"experiment=(history|scales)(?!.*(data=|num_history))", "one h", add="model.num_history=0", slow=True),
     Rule(r"experiment=scales .*num_history=0,2,4,8", "two of four h", replace=(("0,2,4,8", "0,2"),), slow=True),
     Rule(
@@ -86,6 +100,7 @@ SHRUNK: Tuple[Rule, ...] = (
         "one small drive",
         replace=(("data.num_drives=4", ""), ("data.num_sweeps=19", ""), ("data.first=8", "")),
     ),
+    Rule(r"experiment=keypoints data=hdf5", "six settings", slow=True),
     Rule(r"experiment=(datasets|range_split).*data=(av2|hdf5)", "five scales in a region of +-70 m", slow=True),
     Rule(
         r"^cflow eval -m data=benchmark_sensors",

@@ -14,13 +14,14 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any, Dict, Iterator, List
+from typing import Any, Dict, Iterator, List, Set, Tuple
 
 import pytest
 import torch
 from documented_commands import (
     ROOT,
     Snippet,
+    command_blocks,
     commands,
     commands_without_language,
     python_blocks,
@@ -49,6 +50,8 @@ LEFT = {
     "eval": ("**/results.json", "**/config.yaml"),
     "submit": ("v*.zip",),
     "bench": ("bench.json",),
+    "plot": ("*.*",),
+    "view": ("*.rrd", "config.yaml"),
 }
 
 
@@ -185,6 +188,10 @@ def test_command_that_is_not_run(snippet: Snippet, home: Path, monkeypatch: pyte
 def check_cflow(words: List[str]) -> None:
     """The command is known, and its settings are (those of launchers that may not be installed are left out)."""
     command, *rest = words
+    if command == "COMMAND":  # any of them
+        for name in COMMANDS if rest == ["--help"] else set(COMMANDS) - {"info"}:
+            run_cflow([name, *rest])
+        return
     assert command in COMMANDS
     run_cflow([command, "--help"])
     settings = [word for word in rest if not word.startswith("-") and "hydra" not in word.partition("=")[0]]
@@ -239,6 +246,20 @@ def test_no_rule_is_stale() -> None:
     assert not [rule.pattern for rule in SHRUNK if not any(re.search(rule.pattern, text) for text in texts)]
     first = {block.text.splitlines()[0] for found in python_blocks().values() for block in found}
     assert not set(BLOCK_NEEDS) - first
+
+
+def test_commands_of_a_block_can_follow_each_other() -> None:
+    """None would be refused because one above it left other results in the same folder."""
+    for document, line, texts in command_blocks():
+        left: Dict[Tuple[str, str], Set[str]] = {}
+        for words in (shlex.split(text) for text in texts if text.startswith("cflow ")):
+            if "-m" in words or words[1] not in LEFT or any(word.startswith("archive=") for word in words):
+                continue  # the jobs of a sweep have folders of their own
+            output = next((word for word in words if word.startswith("output=")), "")
+            settings = set(words[2:]) - {"dry_run=true", "overwrite=true"}
+            before = left.setdefault((words[1], output), settings)
+            kept = words[1] in ("flow", "eval", "submit")
+            assert not kept or before == settings, f"{document}:{line}: give {' '.join(words)} an output= of its own"
 
 
 def test_every_block_of_commands_says_its_language() -> None:
