@@ -170,7 +170,7 @@ def namespace() -> Dict[str, Any]:
     from cflow_torch.evaluation.protocol import CHALLENGE_DATA_SETS
     from cflow_torch.ground import find_ground, find_ground_batch
 
-    drive = tiny_drive()
+    drive = tiny_drive(num_sweeps=6)
     pair, labels = window(drive, 1, 1), drive.labels(1)
     pc0, pc1 = pair.pc0, pair.pc1
     T = relative_transform(pc0.pose, pc1.pose)

@@ -189,8 +189,9 @@ def check_cflow(words: List[str]) -> None:
     """The command is known, and its settings are (those of launchers that may not be installed are left out)."""
     command, *rest = words
     if command == "COMMAND":  # any of them
-        for name in COMMANDS if rest == ["--help"] else set(COMMANDS) - {"info"}:
-            run_cflow([name, *rest])
+        for name in COMMANDS:
+            if rest == ["--help"] or (ROOT / "configs" / f"{name}.yaml").is_file():  # else it has no settings
+                run_cflow([name, *rest])
         return
     assert command in COMMANDS
     run_cflow([command, "--help"])
