@@ -9,6 +9,7 @@ picture=correlation  one cluster and the correlation of all its shifts (model=pa
 picture=scales       coarse to fine, a column per pixel size (model=paper with three sizes)
 picture=animation    the flow of many pairs: first= step= count= format=gif|mp4 frames_per_second= width=
 
+examples:
   cflow plot                                             the simulated street, outputs/plot/flow.png
   cflow plot picture=correlation pair=2
   cflow plot picture=scales model.pixel_sizes=[0.8,0.4,0.2,0.1]
