@@ -31,6 +31,7 @@ from cflow_torch.cli.run import find_logs, make_model, output_folder
 from cflow_torch.data.catalog import open_log
 from cflow_torch.data.log import Log, RecentSweeps, window
 from cflow_torch.data.paths import is_remote
+from cflow_torch.fleet.progress import frames as counted
 from cflow_torch.pyramid import CoarseToFine
 from cflow_torch.types import CFlowError, FlowResult, Window
 from cflow_torch.viz.animation import save_animation
@@ -185,7 +186,7 @@ def _animate(cfg: DictConfig, model: CoarseToFine, output: Path) -> Path:
     if not pairs:
         raise CFlowError(f"first={cfg.first}: log {log.log_id} has pairs 0 to {len(log.timestamps) - 2}")
     frames: List[Frame] = []
-    for pair in tqdm(pairs, unit="pair", disable=None):
+    for pair in counted(pairs):
         sweeps = _window(recent, pair, model.config.num_history)
         (result,) = model([sweeps])
         flow = result.residual_flow
