@@ -24,7 +24,7 @@ from cflow_torch.data.waymo import write_waymo_segment
 from cflow_torch.data.writers import write_av2_log
 from cflow_torch.submission import get_version, plan_log
 
-NUM_SWEEPS = 4
+NUM_SWEEPS = 5
 
 
 def tiny_drive(seed: int = 3, num_sweeps: int = NUM_SWEEPS) -> Drive:
