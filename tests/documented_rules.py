@@ -66,10 +66,7 @@ SHRUNK: Tuple[Rule, ...] = (
         "of an earlier command",
         before=("cflow flow data.num_sweeps=6 model=fast engine.workers=1",),
         needs="rerun",
-    ),
-    Rule(r"^cflow plot .*format=mp4", "an extra", needs="imageio_ffmpeg", slow=True),
-    Rule(
-        r"log=LOG pair=10", "the log has three pairs", replace=(("log=LOG pair=10", "log=synthetic-demo-0003 pair=1"),)
+        slow=True,
     ),
     Rule(r"^cflow demo", "the picture is of pair 3", add="data.num_sweeps=5"),
     Rule(
