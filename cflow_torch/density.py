@@ -92,5 +92,5 @@ def hdbscan_labels(points: np.ndarray, min_cluster_size: int) -> np.ndarray:
     try:
         from hdbscan import HDBSCAN
     except ImportError:
-        raise CFlowError("clustering='hdbscan' needs the hdbscan package: pip install 'cflow_torch[hdbscan]'") from None
+        raise CFlowError("clustering='hdbscan' needs the hdbscan package: pip install hdbscan") from None
     return HDBSCAN(min_cluster_size=min_cluster_size).fit_predict(points).astype(np.int64)

@@ -24,7 +24,7 @@ from cflow_torch.fleet.run import run_fleet
 from cflow_torch.fleet.shard import Shard
 from cflow_torch.fleet.work import Worker
 
-pytest.importorskip("ray.data", reason="Ray is not installed: pip install 'cflow_torch[ray]'")
+pytest.importorskip("ray.data", reason="Ray is not installed: pip install 'ray[data]>=2.10,<2.64'")
 
 CONFIG = make_config("paper", pixel_sizes=(0.4,), num_history=1)
 SETTINGS: Dict[str, Any] = {"find_ground": None, "odometry": False}

@@ -99,7 +99,7 @@ def test_the_version() -> None:
         (["flow", "num_history=2"], "(did you mean model.num_history?)"),
         (["eval", "model=papr"], "model=papr (did you mean paper?): give one of default, fast, keypoints, paper"),
         (["flow", "engine=slurm"], "engine=slurm: give one of local, ray"),
-        (["eval", "-m", "hydra/launcher=joblob", "data.seed=1,2"], "pip install 'cflow_torch[sweep]'"),
+        (["eval", "-m", "hydra/launcher=joblob", "data.seed=1,2"], "pip install hydra-joblib-launcher hydra-submitit-launcher hydra-optuna-sweeper"),
         (["eval", "data.root"], "'data.root' is no setting: give NAME=VALUE"),
         (["eval", "model.pixel_sizes=[0.2"], "cannot read 'model.pixel_sizes=[0.2'"),
         (["eval", "data.seed=1,2"], "add -m to run each, or write 'data.seed=[1,2]'"),

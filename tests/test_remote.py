@@ -38,7 +38,7 @@ from cflow_torch.data.writers import write_av2_log
 from cflow_torch.estimate import make_model
 from cflow_torch.types import CFlowError
 
-WHY_SKIPPED = "universal_pathlib is not installed: pip install 'cflow_torch[remote]'"
+WHY_SKIPPED = "universal_pathlib is not installed: pip install universal_pathlib fsspec"
 DATA_SETS = ("av2", "hdf5", "nuscenes", "truckscenes", "waymo", "aevascenes", "arrays")
 
 

@@ -33,7 +33,10 @@ def task(cfg: DictConfig) -> None:
     if logs and not 0 <= cfg.pair < num_pairs:
         raise CFlowError(f"pair={cfg.pair}: the drive has {num_pairs} pairs, give 0 ... {num_pairs - 1}")
 
+    is_drawn = False
+
     def keep(log: Log, index: int, sweeps: Window, result: FlowResult) -> None:
+        nonlocal is_drawn
         write_flow(output / log.log_id / f"{log.timestamps[index]}.feather", result)
         labels = log.labels(index)
         if labels is not None:
@@ -47,8 +50,11 @@ def task(cfg: DictConfig) -> None:
                 title=f"CorrelationFlow, {log.log_id}",
             )
             save_picture(figure, output / "flow.png")
+            is_drawn = True
 
     failures += for_each_pair(logs, model, keep)
     report(cfg, metrics, output)
-    print(f"picture: {output / 'flow.png'}\nflow files, scores, settings: {output}")
+    if is_drawn:
+        print(f"picture: {output / 'flow.png'}")
+    print(f"flow files, scores, settings: {output}")
     finish(failures)

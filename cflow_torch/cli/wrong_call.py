@@ -51,7 +51,8 @@ def _unknown_choice(error: MissingConfigException, command: str) -> str:
     group, _, name = str(error.missing_cfg_file or "").rpartition("/")
     if group.startswith("hydra/"):
         kind = group.partition("/")[2]
-        return f"no {kind} {name!r} here: joblib, submitit and optuna come with pip install 'cflow_torch[sweep]'"
+        packages = "hydra-joblib-launcher hydra-submitit-launcher hydra-optuna-sweeper"
+        return f"no {kind} {name!r} here: joblib, submitit and optuna come with pip install {packages}"
     known = settings.choices(group)
     if not known:
         return f"{error}; `cflow {command} --help` has examples".replace("\n", " ")

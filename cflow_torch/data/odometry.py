@@ -59,7 +59,7 @@ def _register(log: Log, order: Sequence[int], max_range: float) -> List[np.ndarr
         from kiss_icp.kiss_icp import KissICP
     except ImportError:
         raise CFlowError(
-            f"log {log.log_id} has no poses, and estimating them needs KISS-ICP: pip install 'cflow_torch[odometry]', "
+            f"log {log.log_id} has no poses, and estimating them needs KISS-ICP: pip install kiss-icp, "
             "or give poses (for bare arrays T_ego1_ego0, for a folder poses.txt)"
         ) from None
     config = load_config(None)

@@ -54,7 +54,7 @@ def as_path(place: Place) -> Path:
         import fsspec
         from upath import UPath
     except ImportError:
-        raise CFlowError(f"{place} is not on this machine, which needs: pip install 'cflow_torch[remote]'") from None
+        raise CFlowError(f"{place} is not on this machine, which needs: pip install universal_pathlib fsspec") from None
     try:
         fsspec.get_filesystem_class(scheme)
     except ImportError as error:  # it names the package

@@ -224,7 +224,7 @@ def import_ray() -> ModuleType:
         import ray
         import ray.data
     except ImportError as error:
-        raise CFlowError(f"engine=ray needs Ray ({error}): pip install 'cflow_torch[ray]'") from None
+        raise CFlowError(f"engine=ray needs Ray ({error}): pip install 'ray[data]>=2.10,<2.64'") from None
     return ray  # type: ignore[no-any-return]
 
 

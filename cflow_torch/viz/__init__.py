@@ -1,4 +1,4 @@
-"""Pictures of a flow and of every stage on the way to it. Needs `pip install 'cflow_torch[viz]'`."""
+"""Pictures of a flow and of every stage on the way to it. Needs `pip install matplotlib`."""
 
 from cflow_torch.viz.animation import save_animation
 from cflow_torch.viz.bev import plot_flow, save_picture

@@ -70,7 +70,7 @@ def _pictures(figures: Iterable[Figure]) -> Iterator[np.ndarray]:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure as FigureClass
     except ImportError as error:
-        raise CFlowError("pictures need matplotlib: pip install 'cflow_torch[viz]'") from error
+        raise CFlowError("pictures need matplotlib: pip install matplotlib") from error
 
     size = None
     for number, figure in enumerate(figures):
@@ -152,7 +152,7 @@ def _write_mp4(file: IO[bytes], pictures: Iterator[np.ndarray], frames_per_secon
     try:
         import imageio_ffmpeg
     except ImportError as error:
-        raise CFlowError(".mp4 needs imageio-ffmpeg: pip install 'cflow_torch[video]', or save a .gif") from error
+        raise CFlowError(".mp4 needs imageio-ffmpeg: pip install imageio-ffmpeg, or save a .gif") from error
 
     first = _even(next(pictures))
     with tempfile.TemporaryDirectory() as folder:  # ffmpeg wants a name, and goes back in the file at its end

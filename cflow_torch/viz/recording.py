@@ -97,9 +97,9 @@ def load_rerun() -> Any:
     try:
         import rerun as rr
     except ImportError as error:
-        raise CFlowError("recordings need rerun-sdk (Python 3.9 or newer): pip install 'cflow_torch[rerun]'") from error
+        raise CFlowError("recordings need rerun-sdk (Python 3.9 or newer): pip install 'rerun-sdk>=0.23'") from error
     if not hasattr(rr, "set_time"):
-        raise CFlowError(f"rerun-sdk {rr.__version__} is too old: pip install --upgrade 'cflow_torch[rerun]'")
+        raise CFlowError(f"rerun-sdk {rr.__version__} is too old: pip install --upgrade rerun-sdk")
     return rr
 
 

@@ -25,7 +25,7 @@ def blank_figure(inches: Tuple[float, float], dpi: int) -> Figure:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise CFlowError("pictures need matplotlib: pip install 'cflow_torch[viz]'") from error
+        raise CFlowError("pictures need matplotlib: pip install matplotlib") from error
     figure = Figure(figsize=inches, dpi=dpi, facecolor="white")
     FigureCanvasAgg(figure)
     return figure

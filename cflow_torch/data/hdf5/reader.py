@@ -36,7 +36,7 @@ def find_hdf5_scenes(root: Place) -> List[Path]:
 
 
 class HDF5Log:
-    """One scene; implements the `Log` protocol. Needs h5py (`pip install 'cflow_torch[hdf5]'`).
+    """One scene; implements the `Log` protocol. Needs h5py (`pip install h5py`).
 
     Args:
         file: `<scene>.h5`.
@@ -66,7 +66,7 @@ class HDF5Log:
         try:
             import h5py
         except ImportError:
-            raise CFlowError("reading HDF5 scenes needs h5py: pip install 'cflow_torch[hdf5]'") from None
+            raise CFlowError("reading HDF5 scenes needs h5py: pip install h5py") from None
         self.file = as_path(file)
         self.log_id = self.file.stem
         try:

@@ -80,7 +80,7 @@ def write_hdf5_results(file: Union[str, Path], name: str, results: Iterable[Tupl
     try:
         import h5py
     except ImportError:
-        raise CFlowError("writing HDF5 scenes needs h5py: pip install 'cflow_torch[hdf5]'") from None
+        raise CFlowError("writing HDF5 scenes needs h5py: pip install h5py") from None
     check_result_name(name)
     check_writable(file)
     file = Path(file).resolve()  # a link stays a link

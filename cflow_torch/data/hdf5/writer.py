@@ -51,7 +51,7 @@ def write_hdf5_scene(
     try:
         import h5py
     except ImportError:
-        raise CFlowError("writing HDF5 scenes needs h5py: pip install 'cflow_torch[hdf5]'") from None
+        raise CFlowError("writing HDF5 scenes needs h5py: pip install h5py") from None
     if points_frame not in ("ego", "sensor") or pose_dtype not in ("float32", "float64") or eval_step < 0:
         raise CFlowError(
             f"points_frame={points_frame!r}, pose_dtype={pose_dtype!r}, eval_step={eval_step}: give 'ego' or 'sensor', "
