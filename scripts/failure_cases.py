@@ -67,7 +67,7 @@ def draw(case: Case) -> Image.Image:
 
 
 def with_palette(pixels: np.ndarray) -> Image.Image:
-    """256 colours, a third of the bytes: the most frequent ones as they are, the rest for the wheel.
+    """256 colours, half of the bytes: the most frequent ones as they are, the rest dithered, which is mostly the wheel.
 
     Args:
         pixels: (H, W, 3) uint8 RGB.
@@ -77,7 +77,20 @@ def with_palette(pixels: np.ndarray) -> Image.Image:
     of_rest = Image.fromarray(rest[None]).quantize(256 - KEPT).getpalette() or []
     palette = Image.new("P", (1, 1))
     palette.putpalette([*kept.ravel().tolist(), *of_rest[: 3 * (256 - KEPT)]])
-    return Image.fromarray(pixels).quantize(palette=palette, dither=Image.Dither.NONE)
+    picture = Image.fromarray(pixels)
+    exact, smooth = (
+        np.asarray(picture.quantize(palette=palette, dither=dither))
+        for dither in (Image.Dither.NONE, Image.Dither.FLOYDSTEINBERG)
+    )
+    is_kept = np.isin(_codes(pixels), _codes(kept))
+    result = Image.fromarray(np.where(is_kept, exact, smooth), mode="P")
+    result.putpalette(palette.getpalette())
+    return result
+
+
+def _codes(colors: np.ndarray) -> np.ndarray:
+    """(...) int32, one number per colour, of (..., 3) uint8."""
+    return colors.astype(np.int32) @ np.array([1 << 16, 1 << 8, 1], np.int32)
 
 
 def table(names: Sequence[str], seeds: Sequence[int]) -> Iterator[str]:

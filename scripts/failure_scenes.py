@@ -147,7 +147,7 @@ def fast(seed: int) -> Case:
     bodies = [objects.car(rng, Route(-4, 4, EAST, speed=48)), objects.car(rng, Route(-10, -4, WEST, -20, 52))]
     drive = _drive([*bodies, objects.wall(25, 9, 30, 0.5, 4)], Route(0, 0, speed=20), seed)
     attempts = [_flow(drive, "default"), _flow(drive, "default", max_speed=60)]
-    return _case(drive, attempts, "faster than max_speed", "two cars, 48 and 52 m/s", [0, 1], (-32, -20, 24, 21))
+    return _case(drive, attempts, "faster than max_speed", "two cars, 48 and 52 m/s", [0, 1], (-54, -37, 40, 32))
 
 
 def large(seed: int) -> Case:

@@ -11,6 +11,7 @@ import numpy as np
 
 from cflow_torch.data.atomic import atomic_file
 from cflow_torch.types import CFlowError
+from cflow_torch.viz.source import Source
 from cflow_torch.viz.wheel import wheel_image
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ def save_animation(figures: Iterable[Figure], path: Union[str, Path], *, frames_
 
     Raises:
         CFlowError: no figure, figures of several sizes, another ending, no such folder, a rate that cannot be, a
-            folder that cannot be written to, or a missing package.
+            folder that cannot be written to, or a missing package. What a generator of figures raises stays as it is.
 
     Cost: a .gif keeps one byte per pixel and picture until the end, a .mp4 nothing.
     """
@@ -56,10 +57,13 @@ def save_animation(figures: Iterable[Figure], path: Union[str, Path], *, frames_
         limit = f" up to {fastest:g}" if ending == ".gif" else ""
         raise CFlowError(f"frames_per_second={frames_per_second}: give a positive number{limit}")
     write = _write_gif if ending == ".gif" else _write_mp4
+    pictures = Source(_pictures(figures))
     try:
         with atomic_file(path) as file:
-            write(file, _pictures(figures), frames_per_second)
+            write(file, pictures, frames_per_second)
     except OSError as error:
+        if error is pictures.error:
+            raise
         raise CFlowError(f"cannot write {path}: {error}") from error
     return path
 
@@ -170,11 +174,12 @@ def _write_mp4(file: IO[bytes], pictures: Iterator[np.ndarray], frames_per_secon
             output_params=settings,
         )
         try:
-            writer.send(None)
+            try:
+                writer.send(None)
+            except RuntimeError as error:  # no ffmpeg for this machine
+                raise CFlowError(f"no ffmpeg ({error}): name one in IMAGEIO_FFMPEG_EXE, or save a .gif") from error
             for picture in _then(first, map(_even, pictures)):
                 writer.send(np.ascontiguousarray(picture))
-        except RuntimeError as error:  # no ffmpeg for this machine
-            raise CFlowError(f"no ffmpeg ({error}): name one in IMAGEIO_FFMPEG_EXE, or save a .gif") from error
         finally:
             writer.close()
         if not video.is_file() or not video.stat().st_size:

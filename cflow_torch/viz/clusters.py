@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_CAPTION = "colour: a cluster, neighbours in different colours   grey: in no cluster   rings: every 10 m"
+_CAPTION = "colour: a cluster, neighbours in different colours   grey: in no cluster"
 
 
 def plot_clusters(

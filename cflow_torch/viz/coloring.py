@@ -27,7 +27,7 @@ def color_numbers(position: np.ndarray, group: np.ndarray, num_colors: int = len
     Convention: largest group first, each takes the colour whose nearest bearer is farthest away; ties: fewest bearers,
         then the first colour. So no two of any `num_colors` groups that all lie next to each other look alike.
 
-    Cost: square of the number of cells, which is bounded.
+    Cost: square of the number of cells, which is at most 6000, or the number of groups if there are more.
     """
     position, group = position[group >= 0, :2], group[group >= 0]
     num_groups = int(group.max(initial=-1)) + 1

@@ -11,7 +11,7 @@ from cflow_torch.config import Config, make_config
 from cflow_torch.types import Window
 from cflow_torch.viz.occupancy import add_metres, occupancy_rgb, thin
 from cflow_torch.viz.stages import ClusterCorrelation, cluster_correlation
-from cflow_torch.viz.style import INK, blank_figure
+from cflow_torch.viz.style import INK, blank_figure, write
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -50,19 +50,26 @@ def plot_correlation(
     figure, places = _lay_out(found.images.t.shape)
     size = found.images.pixel_size
     dy, dx = found.shift
+    has_coarser = len(config.pixel_sizes) > 1
     if title is None:
         title = (
             f"cluster {found.cluster_id}: moves by {_pair(dx, dy)} pixels of {size:g} m = "
-            f"{_pair(dx * size, dy * size)} m, score {found.score:.2f}"
+            f"{_pair(dx * size, dy * size)} m{' beyond the coarser scales' * has_coarser}, score {found.score:.2f}"
         )
         if np.abs(found.flow[:2] - found.shift[::-1] * size).max() > 1e-6:  # pooled with what older sweeps say
             title += f"; with older sweeps {_pair(*found.flow[:2])} m"
-    figure.text(0.5, 1 - 0.35 / figure.get_figheight(), title, fontsize=17, color=INK, ha="center", va="center")
+        if has_coarser:
+            title += f"; in all {_pair(*found.total[:2])} m"
+    write(figure, 1 - 0.35 / figure.get_figheight(), title)
     nothing = np.zeros_like(found.images.t)
     moved = _moved(found.images.t, found.shift)
     for place, name, t, t1 in zip(
         places,
-        ("template: sweep t", "target: sweep t+1", "t moved by the shift taken, and t+1"),
+        (
+            "template: t moved by the coarser scales" if has_coarser else "template: sweep t",
+            "target: sweep t+1",
+            "t moved by the shift taken, and t+1",
+        ),
         (found.images.t, nothing, moved),
         (nothing, found.images.t1, found.images.t1),
     ):

@@ -14,7 +14,7 @@ from cflow_torch.viz.legend import draw_wheel
 from cflow_torch.viz.occupancy import crop, draw_occupancy, frame, sweep_marks
 from cflow_torch.viz.panel import MOVING
 from cflow_torch.viz.stages import KeyPointMatches, keypoint_matches
-from cflow_torch.viz.style import FAINT, INK, blank_figure
+from cflow_torch.viz.style import FAINT, INK, blank_figure, write
 from cflow_torch.viz.wheel import flow_to_rgb
 
 if TYPE_CHECKING:
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 _HALF_VIEW = np.array((5.0, 3.6))  # metres, half width and height of what is shown
 _CELL = 4.0  # metres, in which matches are counted to find the place that is shown
 _POINT_COLOR = "#ffb000"
+_ALONG = 9  # places of a line that a legend may hide
 _FADE = 0.72  # of the pixels behind the matches
 
 
@@ -52,7 +53,7 @@ def plot_keypoints(window: Window, config: Optional[Config] = None, *, title: Op
     low, high = busiest(start, end)
     if title is None:
         title = f"{len(found.key_points)} key points at t, {len(found.source)} of them matched; shown is a part"
-    figure.text(0.5, 0.955, title, fontsize=17, color=INK, ha="center", va="center")
+    write(figure, 0.955, title)
     panels = [figure.add_axes((left, 0.13, 0.445, 0.74)) for left in (0.04, 0.535)]
     near = crop(found.images, low, high)
     points = _middle(found.key_points, found)
@@ -114,7 +115,8 @@ def _draw_matches(
     axes.add_collection(LineCollection(lines, colors=INK, linewidths=1.9, alpha=0.5, zorder=4))
     axes.add_collection(LineCollection(lines, colors=color[moves], linewidths=1.1, zorder=5))
     axes.scatter(end[moves, 0], end[moves, 1], s=14, c=color[moves], linewidths=0.6, edgecolors=INK, zorder=6)
-    draw_wheel(axes, np.column_stack([start, np.zeros(len(start))]), moves, max_flow)
+    along = np.concatenate([start + part * flow for part in np.linspace(0, 1, _ALONG)])
+    draw_wheel(axes, along, np.tile(moves, _ALONG), max_flow)
 
 
 def _draw_legend(figure: Figure) -> None:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Optional, Tuple
 
 import numpy as np
 
-from cflow_torch.viz.style import FRAME, INK, inches_of
+from cflow_torch.viz.style import FRAME, INK, inches_of, round_length
 from cflow_torch.viz.wheel import wheel_image
 
 if TYPE_CHECKING:
@@ -20,8 +20,14 @@ def draw_wheel(
     axes: Axes, position: np.ndarray, is_mover: np.ndarray, max_flow: float, corner: Optional[str] = None
 ) -> None:
     """The colour wheel, in a corner of the panel where it hides little, or in one of `CORNERS`."""
-    width = float(np.clip(0.2 * inches_of(axes)[0], 1.6, 1.9))
-    fill_wheel(legend_box(axes, position, is_mover, (width, 1.14 * width), corner), width, max_flow)
+    width, height = wheel_inches(inches_of(axes)[0])
+    fill_wheel(legend_box(axes, position, is_mover, (width, height), corner), width, max_flow)
+
+
+def wheel_inches(panel: float) -> Tuple[float, float]:
+    """Width and height of the legend, inches, in a panel of that width."""
+    width = float(np.clip(0.2 * panel, 1.6, 1.9))
+    return width, 1.14 * width
 
 
 def fill_wheel(box: Axes, width: float, max_flow: float) -> None:
@@ -39,16 +45,19 @@ def fill_wheel(box: Axes, width: float, max_flow: float) -> None:
 
 
 def draw_scale(axes: Axes) -> None:
-    """A bar of 10 m, bottom left."""
+    """A bar of a round length, at most a sixth of the panel (10 m in views of 60 to 120 m), bottom left."""
     from matplotlib.patheffects import withStroke
 
     inches, metres = inches_of(axes), np.diff([axes.get_xlim(), axes.get_ylim()])[:, 0]
     x, y = np.array([axes.get_xlim()[0], axes.get_ylim()[0]]) + 0.25 * metres / inches
+    length = round_length(metres[0] / 6)
     for width, color in ((8, "white"), (4, INK)):
-        axes.plot([x, x + 10], [y, y], linewidth=width, color=color, solid_capstyle="butt", zorder=8)
+        axes.plot([x, x + length], [y, y], linewidth=width, color=color, solid_capstyle="butt", zorder=8)
     halo = [withStroke(linewidth=4, foreground="white")]
     above = y + 0.08 * metres[1] / inches[1]
-    axes.text(x + 5, above, "10 m", fontsize=12, color=INK, ha="center", va="bottom", zorder=8, path_effects=halo)
+    name = f"{length:g} m"
+    style = {"fontsize": 12, "color": INK, "ha": "center", "va": "bottom", "zorder": 8}
+    axes.text(x + length / 2, above, name, path_effects=halo, **style)
 
 
 def legend_box(

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 
 from cflow_torch.ops.labeling import connected_components
-from cflow_torch.viz.legend import SWEEP_RATE, legend_box
-from cflow_torch.viz.style import FAINT, FRAME, GROUND, INK, STATIC, blank_figure, inches_of
+from cflow_torch.viz.legend import SWEEP_RATE, legend_box, wheel_inches
+from cflow_torch.viz.style import FAINT, FRAME, GROUND, INK, STATIC, blank_figure, inches_of, round_length, write
 from cflow_torch.viz.wheel import flow_to_rgb
 
 if TYPE_CHECKING:
@@ -24,9 +24,10 @@ OBJECT_PIXEL = 0.5  # metres; movers in touching pixels are one object where no 
 _MAX_PIXELS = 2048  # a side; movers spread wider get larger pixels
 FLOW_CAPTION = (
     f"grey: static   colour: moves more than {MOVING:g} m per sweep   "
-    f"arrow: motion over {ARROW_STEPS} sweeps ({ARROW_STEPS / SWEEP_RATE:g} s at {SWEEP_RATE} Hz)   "
-    f"rings: every 10 m"
+    f"arrow: motion over {ARROW_STEPS} sweeps ({ARROW_STEPS / SWEEP_RATE:g} s at {SWEEP_RATE} Hz)"
 )
+_RING, _MOST_RINGS = 10.0, 20  # metres between two rings; wider views get wider steps
+_HIGHEST = 2.0  # widths, height of a panel at most; at least it is that of two wheels
 
 _SLOW_RIM, _FAST_RIM = np.array((0.62, 0.66, 0.70)), np.array((0.10, 0.12, 0.15))
 _SLATE = (80 / 255, 90 / 255, 110 / 255)  # behind errors: black (none) and white (large) both show on it
@@ -39,23 +40,27 @@ def new_figure(
 
     Args:
         names: headings of the panels, "" = none.
-        view: (2, 2) float64, metres, low and high corner (x, y).
+        view: (2, 2) float64, metres, low and high corner (x, y). What is longer and thinner than a panel may be gets
+            empty space along its long sides.
         title: heading of the figure, None = none.
-        caption: one line below the panels: what the colours are.
+        caption: one line below the panels: what the colours are. How far apart the rings are is added.
 
     Raises:
         CFlowError: matplotlib is absent.
     """
-    extent = view[1] - view[0]
     gap, foot = 0.2, 0.42
     full, dpi = (10.0, 100) if len(names) == 1 else (16.0, 112)
     width = full / len(names) - gap * (1 + 1 / len(names))
-    height = float(np.clip(width * extent[1] / extent[0], width / 4, width * 2))
+    view = _widened(view, 2 * wheel_inches(width)[1] / width)
+    extent = view[1] - view[0]
+    height = float(width * extent[1] / extent[0])
     head = (0.5 if title else 0) + (0.42 if any(names) else 0) or gap
     total = (full, height + head + foot)
     figure = blank_figure(total, dpi)
     from matplotlib.patches import Circle
 
+    farthest = float(np.abs(view).max())
+    step = max(_RING, round_length(farthest / (0.4 * _MOST_RINGS)))  # rounding takes up to three fifths away
     panels = []
     for i, name in enumerate(names):
         place = ((gap + i * (width + gap)) / total[0], foot / total[1], width / total[0], height / total[1])
@@ -63,16 +68,24 @@ def new_figure(
         axes.set(xlim=view[:, 0], ylim=view[:, 1], aspect="equal", xticks=[], yticks=[])
         for spine in axes.spines.values():
             spine.set(color=FRAME, linewidth=0.8)
-        for radius in range(10, int(np.abs(view).max()) + 1, 10):
+        for radius in np.arange(step, farthest + 1e-9, step):
             axes.add_patch(Circle((0, 0), radius, fill=False, color=FRAME, alpha=0.45, linewidth=0.8, zorder=0.5))
         if name:
             axes.set_title(name, fontsize=14, color=INK, pad=7)
         axes.apply_aspect()  # now, so that sizes in inches are right from here on
         panels.append(axes)
     if title:
-        figure.text(0.5, 1 - 0.3 / total[1], title, fontsize=17, color=INK, ha="center", va="center")
+        write(figure, 1 - 0.3 / total[1], title)
+    caption = f"{caption}   rings: every {step:g} m"
     figure.text(0.5, 0.2 / total[1], caption, fontsize=11, color=FAINT, ha="center", va="center")
     return figure, panels
+
+
+def _widened(view: np.ndarray, lowest: float) -> np.ndarray:
+    """The view, or one round it whose height is at least `lowest` and at most `_HIGHEST` widths."""
+    extent = view[1] - view[0]
+    wanted = np.maximum(extent, (extent[1] / _HIGHEST, extent[0] * lowest))
+    return view + np.array([[-0.5], [0.5]]) * (wanted - extent)
 
 
 def draw_ground(axes: Axes, position: np.ndarray) -> None:

@@ -12,7 +12,9 @@ import numpy as np
 from cflow_torch.data.atomic import atomic_name
 from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.types import CFlowError, FlowResult, Sweep, as_numpy
+from cflow_torch.viz.coloring import color_numbers
 from cflow_torch.viz.panel import ARROW_STEPS, MIN_ARROW_POINTS, MOVING, group_medians
+from cflow_torch.viz.source import Source
 from cflow_torch.viz.wheel import flow_to_rgb
 
 if TYPE_CHECKING:
@@ -27,7 +29,7 @@ _DOT, _FINE_DOT = -1.5, -0.8  # negative: pixels of the screen
 _STATIC, _GROUND_COLOR, _NEXT_COLOR = (132, 138, 147), (70, 74, 81), (60, 110, 130)
 _NO_CLUSTER, _EGO_COLOR = (100, 105, 112), (255, 255, 255)
 _BACKGROUND = (22, 25, 30)
-_GOLDEN = 0.618033988749895  # of the hue circle: neighbouring numbers get colours far apart
+_NUM_HUES, _HUE_STEP = 10, 0.3  # of the hue circle: every tenth of it, those of neighbouring numbers far apart
 _CALENDAR = 10**17  # nanoseconds; later ones are a date (1973 and on), earlier ones a duration
 
 
@@ -61,6 +63,7 @@ def record_log(
     Raises:
         CFlowError: rerun-sdk is absent or too old, another ending, a `max_flow` that is not positive, no result at all,
             or a result with other rows than its sweep.
+        OSError: the log cannot be read. What `results` raises stays as it is, too.
 
     Cost: about 20 bytes per point and pair on disk for each entity that shows it.
     """
@@ -70,20 +73,23 @@ def record_log(
     if not 0 < max_flow < np.inf:
         raise CFlowError(f"max_flow={max_flow}: give a positive length in metres per sweep")
     rr = load_rerun()
+    pairs = Source((i, log.sweep(i), log.sweep(i + 1), result, log.labels(i)) for i, result in results)
     try:
         with atomic_name(path) as temporary:
             stream = rr.RecordingStream("cflow_torch", recording_id=f"{log.log_id}-{uuid.uuid4().hex}")
             stream.save(temporary)
             try:
                 drive = _Drive(rr, stream, max_flow)
-                for index, result in results:
-                    drive.add(index, log.sweep(index), log.sweep(index + 1), result, log.labels(index))
+                for pair in pairs:
+                    drive.add(*pair)
                 drive.end(log.log_id)
                 stream.flush()
             finally:
                 stream.disconnect()
             _sync(temporary)
     except OSError as error:
+        if error is pairs.error:
+            raise
         raise CFlowError(f"cannot write {path}: {error}") from error
     return drive.count
 
@@ -136,7 +142,7 @@ class _Drive:
         self._set_time(index, pc0.timestamp_ns)
         self._move(pc1.pose)
         self._points(ESTIMATE, position[shown], self._color(residual[shown]))
-        self._points(CLUSTERS, position[shown], cluster_to_rgb(cluster[shown]))
+        self._points(CLUSTERS, position[shown], cluster_to_rgb(position[shown], cluster[shown]))
         self._points(GROUND, position[is_known & ground], _GROUND_COLOR, _FINE_DOT)
         after = as_numpy(pc1.points)[:, :3]
         self._points(NEXT_SWEEP, after[np.isfinite(after).all(axis=1)], _NEXT_COLOR, _FINE_DOT)
@@ -227,20 +233,25 @@ class _Drive:
         return rrb.Blueprint(parts, collapse_panels=True)
 
 
-def cluster_to_rgb(cluster_id: np.ndarray) -> np.ndarray:
-    """A colour per cluster; grey where there is none.
+def cluster_to_rgb(position: np.ndarray, cluster_id: np.ndarray) -> np.ndarray:
+    """The colour of each point's cluster, bright, and another one for clusters near it; grey where there is none.
 
     Args:
+        position: (N, 3) float64, metres, finite.
         cluster_id: (N,) int64, -1 = none.
 
     Returns:
         (N, 3) uint8 RGB.
     """
-    hue = np.mod(cluster_id * _GOLDEN, 1.0)[:, None]
+    has_one = cluster_id >= 0
+    _, group = np.unique(cluster_id[has_one], return_inverse=True)
+    number = np.zeros(len(cluster_id), np.int64)
+    number[has_one] = color_numbers(position[has_one], group, _NUM_HUES)[group]
+    hue = np.mod(number * _HUE_STEP, 1.0)[:, None]
     # Three waves a third of the circle apart, cut to 0 ... 1: the hue circle.
     wave = np.clip(np.abs(np.mod(hue + np.array([0, 2 / 3, 1 / 3]), 1) * 6 - 3) - 1, 0, 1)
     bright = 90 + 165 * wave
-    return np.where(cluster_id[:, None] >= 0, bright, _NO_CLUSTER).astype(np.uint8)
+    return np.where(has_one[:, None], bright, _NO_CLUSTER).astype(np.uint8)
 
 
 def _sync(path: Path) -> None:

@@ -14,7 +14,7 @@ from cflow_torch.viz.legend import fill_wheel
 from cflow_torch.viz.occupancy import crop, draw_occupancy, frame, sweep_marks
 from cflow_torch.viz.panel import FLOW_CAPTION, draw_flow
 from cflow_torch.viz.stages import Scale, scales
-from cflow_torch.viz.style import FAINT, FRAME, INK, blank_figure
+from cflow_torch.viz.style import FAINT, FRAME, INK, blank_figure, write
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -53,7 +53,10 @@ def plot_scales(window: Window, config: Optional[Config] = None, *, title: Optio
     count = len(found) + 1
     left, gap, side = 0.6, 0.22, 1.75  # inches; `side` is for the legends
     width = (16.0 - left - gap * count - side) / count
-    total = np.array((16.0, 2 * width + 2.3))
+    lines = 1 if count <= 4 else 2  # of the panels' names
+    more = 0.2 * (lines - 1)  # inches
+    below_y, above_y = 0.5, width + 1.2 + more
+    total = np.array((16.0, 2 * width + 2.3 + 2 * more))
     figure = blank_figure((total[0], total[1]), 100)
 
     def panels(bottom: float, inches: float, first: float, number: int) -> List[Axes]:
@@ -62,22 +65,23 @@ def plot_scales(window: Window, config: Optional[Config] = None, *, title: Optio
 
     if title is None:
         title = "coarse to fine: " + " → ".join(f"{size:g} m" for size in config.pixel_sizes)
-    figure.text(0.5, 1 - 0.32 / total[1], title, fontsize=17, color=INK, ha="center", va="center")
+    write(figure, 1 - 0.32 / total[1], title)
     position = point_rows("points", window.pc0.points, None) + result.pose_flow.numpy()
-    above, below = (panels(bottom, width, left, count) for bottom in (width + 1.2, 0.5))
+    above, below = (panels(bottom, width, left, count) for bottom in (above_y, below_y))
     _draw_near(above, position, found, result, alone)
     max_flow = _draw_flows(below, config, position, found, result, alone)
 
-    marks = figure.add_axes((1 - side / total[0], (width + 1.2) / total[1], side / total[0], width / total[1]))
+    marks = figure.add_axes((1 - side / total[0], above_y / total[1], side / total[0], width / total[1]))
     marks.legend(handles=sweep_marks(), loc="center left", frameon=False, fontsize=11, labelcolor=INK)
     marks.axis("off")
     wheel = side - 0.1
-    (box,) = panels(0.5 + (width - 1.14 * wheel) / 2, wheel, 16.0 - wheel, 1)
+    (box,) = panels(below_y + (width - 1.14 * wheel) / 2, wheel, 16.0 - wheel, 1)
     box.axis("off")
     fill_wheel(box, wheel, max_flow)
-    figure.text(
-        0.5, 0.2 / total[1], FLOW_CAPTION.rpartition("   ")[0], fontsize=11, color=FAINT, ha="center", va="center"
-    )
+    figure.text(0.5, 0.2 / total[1], FLOW_CAPTION, fontsize=11, color=FAINT, ha="center", va="center")
+    for axes in (*above, *below):
+        name = axes.get_title().replace(": ", ":\n", lines - 1)
+        axes.set_title(name, fontsize=min(12, 8 * width), color=INK, pad=6)
     return figure
 
 
@@ -125,7 +129,7 @@ def _draw_near(
         is_last, is_first = axes is panels[-1], axes is panels[0]
         name = "result" if is_last else f"{images.pixel_size:g} m pixels"
         words = "t as it is" if is_first else f"t moved by {_length(flow, shown):.2f} m"
-        axes.set_title(f"{name}: {words}", fontsize=12, color=INK, pad=6)
+        axes.set_title(f"{name}: {words}")
         axes.set_xlabel("x, m", fontsize=9, color=INK, labelpad=1)
         axes.tick_params(labelleft=is_first)
     panels[0].set_ylabel("y, m", fontsize=9, color=INK, labelpad=1)
@@ -158,5 +162,5 @@ def _draw_flows(
             spine.set(color=FRAME, linewidth=0.8)
         axes.apply_aspect()
         draw_flow(axes, position[keep], flow, None, max_flow)
-        axes.set_title(name, fontsize=12, color=INK, pad=6)
+        axes.set_title(name)
     return max_flow

@@ -26,7 +26,8 @@ from cflow_torch.ops.cross_correlation import cross_correlate
 from cflow_torch.ops.indices import flat_nonzero
 from cflow_torch.pyramid import project
 from cflow_torch.types import CFlowError, FlowResult, Window
-from cflow_torch.viz.watch import Occupancy, watch
+from cflow_torch.viz.panel import group_medians
+from cflow_torch.viz.watch import Occupancy, Step, watch
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,7 @@ class ClusterCorrelation:
         score: NCC at that shift.
         flow: (3,) float64, flow of the cluster at this scale, metres per sweep interval: the shift times the pixel
             size where there is no history.
+        total: (3,) float64, the same with what the coarser scales found, in the median of its points.
     """
 
     cluster_id: int
@@ -67,6 +69,7 @@ class ClusterCorrelation:
     shift: np.ndarray
     score: float
     flow: np.ndarray
+    total: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -121,7 +124,7 @@ def cluster_correlation(window: Window, config: Config, cluster_id: Optional[int
         window: sweeps.
         config: `method="dense"`, without `proof`, clusters by components.
         cluster_id: as in `FlowResult`; None = the most conspicuous mover: of the clusters seen in t, the one with most
-            pixels times metres of motion.
+            pixels times metres of motion, all scales together.
 
     Raises:
         CFlowError: a method without such a map, no such cluster, or bad input.
@@ -145,8 +148,9 @@ def cluster_correlation(window: Window, config: Config, cluster_id: Optional[int
     available = jobs.cluster.index_select(0, of_pair)
     if available.numel() == 0:
         raise CFlowError("no cluster has points in both sweeps: there is no correlation to draw")
+    total = _total_flow(last, clusters.window.numel())
     if cluster_id is None:
-        length = last.motion.flow[available].norm(dim=1)
+        length = total[available].norm(dim=1)
         pixels = jobs.template.energy(jobs.cluster.numel()).index_select(0, of_pair)
         chosen = int((length * pixels).argmax())
     elif cluster_id in available:
@@ -174,6 +178,7 @@ def cluster_correlation(window: Window, config: Config, cluster_id: Optional[int
         shift=shift,
         score=float(scores[number, 0]),
         flow=last.motion.flow[number].numpy(),
+        total=total[number].numpy(),
     )
 
 
@@ -206,6 +211,17 @@ def _rows(flow: Tensor, points: slice) -> np.ndarray:
     rows = np.zeros((points.stop - points.start, 3))
     rows[:, : len(flow)] = flow[:, points].numpy().T
     return rows
+
+
+def _total_flow(step: Step, num_clusters: int) -> Tensor:
+    """(M, 3) float64, median flow of the points of t in each cluster, all scales so far together; 0 without points."""
+    points = step.batch.sources[0].points
+    cluster = step.motion.cluster(points).numpy().astype(np.int64)
+    cluster[cluster == num_clusters] = -1
+    median, _ = group_medians(cluster, _rows(step.flow_after(), points))
+    total = torch.zeros(num_clusters, 3, dtype=torch.float64)
+    total[np.unique(cluster[cluster >= 0])] = torch.from_numpy(median)
+    return total
 
 
 def _draw(images: Images, number: int, size: Tensor, config: Config) -> Tensor:

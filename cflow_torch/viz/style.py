@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Tuple
 
 import numpy as np
@@ -13,6 +14,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 INK, FAINT, STATIC, GROUND, FRAME = "#20262e", "#5b6570", "#b4bbc3", "#eff1f3", "#c9ced4"
+_TITLE = 7.2  # characters of a heading per inch
 
 
 def blank_figure(inches: Tuple[float, float], dpi: int) -> Figure:
@@ -29,6 +31,18 @@ def blank_figure(inches: Tuple[float, float], dpi: int) -> Figure:
     figure = Figure(figsize=inches, dpi=dpi, facecolor="white")
     FigureCanvasAgg(figure)
     return figure
+
+
+def write(figure: Figure, height: float, title: str) -> None:
+    """The heading. Args: height: of its middle, as a fraction of the figure. Names of logs are no formulas."""
+    size = 17 * min(1, _TITLE * figure.get_figwidth() / max(len(title), 1))
+    figure.text(0.5, height, title, fontsize=size, color=INK, ha="center", va="center", parse_math=False)
+
+
+def round_length(most: float) -> float:
+    """The longest of ... 1, 2, 5, 10, 20, 50 ... that is no longer than `most`, > 0."""
+    power = 10.0 ** math.floor(math.log10(most))
+    return max(power * digit for digit in (1, 2, 5) if power * digit <= most * (1 + 1e-9))
 
 
 def inches_of(axes: Axes) -> np.ndarray:
