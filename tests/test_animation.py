@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from cflow_torch import CFlowError
+from cflow_torch.data import atomic
 from cflow_torch.viz import flow_to_rgb, save_animation
 
 pytest.importorskip("matplotlib")
@@ -141,8 +142,34 @@ def test_no_picture_and_no_figure(tmp_path: Path) -> None:
 
 def test_a_video_without_its_extra_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    with pytest.raises(CFlowError, match=r"pip install 'cflow_torch\[video\]'"):
+    with pytest.raises(CFlowError, match="pip install imageio-ffmpeg"):
         save_animation([patch((255, 0, 0))], tmp_path / "a.mp4")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("error", [OSError("disk read"), RuntimeError("out of memory")])
+@pytest.mark.parametrize("name", ["a.gif", "a.mp4"])
+def test_what_a_generator_raises_keeps_its_name(name: str, error: Exception, tmp_path: Path) -> None:
+    if name == "a.mp4":
+        pytest.importorskip("imageio_ffmpeg")
+
+    def figures() -> Iterator[Figure]:
+        yield patch((255, 0, 0))
+        raise error
+
+    with pytest.raises(type(error)) as caught:
+        save_animation(figures(), tmp_path / name)
+    assert caught.value is error
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_disk_that_is_full_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*paths: object) -> None:
+        raise OSError("disk full")
+
+    monkeypatch.setattr(atomic.os, "replace", full)
+    with pytest.raises(CFlowError, match="cannot write .*a.gif: disk full"):
+        save_animation([patch((255, 0, 0))], tmp_path / "a.gif")
     assert not list(tmp_path.iterdir())
 
 

@@ -133,6 +133,27 @@ def test_the_default_cluster_moves_and_another_one_can_be_chosen() -> None:
     assert chosen.images.t[pixel[:, 1].clip(0), pixel[:, 0].clip(0)].mean() > 0.99
 
 
+def test_what_moves_most_is_counted_over_all_scales() -> None:
+    settings, sweeps = config(**SCALES), scene(8)
+    (result,) = make_model(settings)([sweeps])
+    chosen = stages.cluster_correlation(sweeps, settings)
+    in_all, last_scale = [], []
+    for number in range(int(result.cluster_id.max()) + 1):
+        rows = result.cluster_id == number
+        if rows.any():
+            one = stages.cluster_correlation(sweeps, settings, number)
+            flow = np.sort(result.residual_flow[rows].numpy().astype(float), axis=0)
+            assert np.allclose(one.total, flow[len(flow) // 2], atol=1e-6)
+            in_all.append((one.images.t.sum() * np.linalg.norm(one.total), number))
+            last_scale.append((one.images.t.sum() * np.linalg.norm(one.flow), number))
+    assert chosen.cluster_id == max(in_all)[1] != max(last_scale)[1]
+    assert np.linalg.norm(chosen.total - chosen.flow) > 0.3, "coarser scales have found most of it"
+    heading = plot_correlation(sweeps, settings).texts[0].get_text()
+    assert "= (+0.25, 0) m beyond the coarser scales" in heading and heading.endswith("in all (+0.75, 0) m")
+    alone = plot_correlation(sweeps, config()).texts[0].get_text()
+    assert "coarser" not in alone and "in all" not in alone
+
+
 @pytest.mark.parametrize("overrides", [{}, {"mutual_check": True}, {"densify": "nearest"}])
 def test_matches_are_the_matcher_s(overrides: dict) -> None:
     settings = keypoint_config(**overrides)
@@ -190,6 +211,38 @@ def test_the_images_drawn_are_the_stages() -> None:
     (image,) = pictures_of(figure.axes[3])
     assert np.array_equal(image, one.ncc)
     assert f"cluster {one.cluster_id}" in figure.texts[0].get_text()
+
+
+@pytest.mark.parametrize("sizes", [(0.4, 0.2), (0.8, 0.4, 0.2, 0.1), (1.6, 1.2, 0.8, 0.6, 0.4, 0.2, 0.15, 0.1)])
+def test_names_of_scales_do_not_overlap(sizes: tuple) -> None:
+    figure = plot_scales(scene(4), config(pixel_sizes=sizes))
+    figure.canvas.draw()
+    panels = [axes for axes in figure.axes if axes.get_title()]
+    assert len(panels) == 2 * (len(sizes) + 1)
+    boxes = [axes.title.get_window_extent() for axes in panels] + [figure.texts[0].get_window_extent()]
+    boxes += [axes.xaxis.label.get_window_extent() for axes in panels if axes.get_xlabel()]
+    for i, box in enumerate(boxes):
+        assert not any(box.overlaps(other) for other in boxes[:i])
+
+
+@pytest.mark.parametrize("plot", [plot_correlation, plot_keypoints, plot_scales])
+def test_a_heading_is_no_formula(plot: object) -> None:
+    settings = keypoint_config() if plot is plot_keypoints else config()
+    plot(scene(4), settings, title="log $_$ 1").canvas.draw()  # type: ignore[operator]
+
+
+def test_the_wheel_hides_no_end_of_a_match(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = []
+    monkeypatch.setattr(
+        "cflow_torch.viz.keypoints.draw_wheel", lambda axes, position, is_mover, most: seen.append((position, is_mover))
+    )
+    sweeps, settings = scene(5), keypoint_config()
+    figure = plot_keypoints(sweeps, settings)
+    lines = [item for item in figure.axes[1].collections if type(item).__name__ == "LineCollection"][-1].get_segments()
+    ((position, is_mover),) = seen
+    moving = position[is_mover]
+    for end in np.concatenate(lines):
+        assert np.hypot(*(moving - end).T).min() < 1e-9
 
 
 def test_every_text_is_inside_its_picture() -> None:
@@ -452,5 +505,5 @@ def test_missing_matplotlib_is_explained(drive: Path, tmp_path: Path, monkeypatc
         monkeypatch.setitem(sys.modules, name, None)
     assert plot("data=av2", f"data.root={drive}", f"output={tmp_path}") == 2
     assert "pip install matplotlib" in capsys.readouterr().err
-    with pytest.raises(CFlowError, match="viz"):
+    with pytest.raises(CFlowError, match="pip install matplotlib"):
         plot_scales(scene(4), config())

@@ -22,7 +22,8 @@ from cflow_torch.data.flow_file import write_flow
 from cflow_torch.data.log import FlowLabels
 from cflow_torch.types import Sweep
 from cflow_torch.viz import flow_to_rgb, recording
-from cflow_torch.viz.recording import cluster_to_rgb, record_log
+from cflow_torch.viz.coloring import cluster_to_rgb
+from cflow_torch.viz.recording import record_log
 
 CAR, WALL, FLOOR = slice(0, 20), slice(20, 40), slice(40, 50)
 CAR_FLOW = np.array([0.6, 0.3, 0.0], np.float32)
@@ -143,9 +144,12 @@ def test_clusters_have_a_colour_each(recorded: Any) -> None:
     colors = rgb(recorded[0][f"{LIDAR}/clusters"][0]["colors"])
     assert len(np.unique(colors[CAR], axis=0)) == len(np.unique(colors[WALL], axis=0)) == 1
     assert (colors[0] != colors[20]).any()
-    many = cluster_to_rgb(np.arange(-1, 8)).astype(int)
-    apart = np.abs(many[:, None] - many).max(axis=-1) + 255 * np.eye(9, dtype=int)
-    assert apart.min() > 40, "none looks like another or like no cluster"
+    for numbers in (np.arange(-1, 10), np.array([-1, *range(0, 1000, 100)]), 13 * np.arange(11) - 1):
+        position = np.column_stack([np.arange(11.0), np.zeros((11, 2))])  # one beside the other
+        many = cluster_to_rgb(position, numbers).astype(int)
+        apart = np.abs(many[:, None] - many).max(axis=-1) + 255 * np.eye(11, dtype=int)
+        assert apart.min() > 40, "none looks like another or like no cluster"
+    assert not len(cluster_to_rgb(np.zeros((0, 3)), np.zeros(0, int)))
 
 
 def test_an_arrow_per_moving_cluster_goes_when_it_stops(recorded: Any) -> None:
@@ -210,13 +214,30 @@ def test_a_recording_that_breaks_off_leaves_nothing(tmp_path: Path) -> None:
     assert [file.name for file in tmp_path.iterdir()] == ["a.rrd"] and path.read_bytes() == b"as it was"
 
 
+@pytest.mark.parametrize("where", ["results", "sweep", "labels"])
+def test_what_cannot_be_read_is_not_said_to_be_unwritable(where: str, tmp_path: Path) -> None:
+    pytest.importorskip("rerun")
+    error = OSError("disk read")
+
+    def fail(*arguments: Any) -> Any:
+        raise error
+
+    log = Street()
+    if where != "results":
+        setattr(log, where, fail)
+    results = map(fail, range(1)) if where == "results" else [(0, result_of())]
+    with pytest.raises(OSError, match="disk read") as caught:
+        record_log(log, results, tmp_path / "a.rrd")
+    assert caught.value is error and not list(tmp_path.iterdir())
+
+
 def test_a_wrong_call_says_how_to_mend_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(CFlowError, match="does not end in .rrd"):
         record_log(Street(), [], tmp_path / "a.bag")
     with pytest.raises(CFlowError, match="max_flow=0"):
         record_log(Street(), [], tmp_path / "a.rrd", max_flow=0)
     monkeypatch.setitem(sys.modules, "rerun", None)
-    with pytest.raises(CFlowError, match=r"pip install 'cflow_torch\[rerun\]'"):
+    with pytest.raises(CFlowError, match="pip install 'rerun-sdk>=0.23'"):
         record_log(Street(), [], tmp_path / "a.rrd")
     monkeypatch.setitem(sys.modules, "rerun", SimpleNamespace(__version__="0.12.0"))
     with pytest.raises(CFlowError, match="0.12.0 is too old"):

@@ -47,9 +47,10 @@ def plot_flow(
         Figure, 1000 pixels wide at its own dpi (1792 with truth), for `save_picture`. No pyplot state is touched.
 
     Convention:
-        x (forward) to the right, y (left) up, equal scales. Points whose residual flow is longer than
-        `panel.MOVING` are movers. An arrow starts at the median position of a cluster's movers and is
-        `panel.ARROW_STEPS` times their median flow long; where no clusters are given, movers near each other are one.
+        x (forward) to the right, y (left) up, equal scales; a long thin view gets empty space along its sides. Points
+        whose residual flow is longer than `panel.MOVING` are movers. An arrow starts at the median position of a
+        cluster's movers and is `panel.ARROW_STEPS` times their median flow long; where no clusters are given, movers
+        near each other are one.
 
     Raises:
         CFlowError: matplotlib is absent, or an argument has the wrong shape or value.

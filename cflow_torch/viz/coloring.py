@@ -9,6 +9,8 @@ import numpy as np
 PALETTE = (
     "#e6194b", "#3cb44b", "#4363d8", "#f58231", "#911eb4", "#00a0b0", "#b8860b", "#f032e6", "#7a4b1f", "#6b8e23"
 )  # fmt: skip
+_NUM_HUES, _HUE_STEP = 10, 0.3  # of the hue circle: every tenth of it, those of neighbouring numbers far apart
+_NO_CLUSTER = (100, 105, 112)
 _CELL = 1.0  # metres; distances between clusters are those of cells that they have points in
 _MOST_CELLS = 6000  # wider scenes get larger cells
 
@@ -49,6 +51,27 @@ def color_numbers(position: np.ndarray, group: np.ndarray, num_colors: int = len
         color[chosen] = best
         bearers[best] += 1
     return np.maximum(color, 0)
+
+
+def cluster_to_rgb(position: np.ndarray, cluster_id: np.ndarray) -> np.ndarray:
+    """The colour of each point's cluster, on black; clusters near each other differ. Grey where there is none.
+
+    Args:
+        position: (N, 3) float64, metres, finite.
+        cluster_id: (N,) int64, -1 = none.
+
+    Returns:
+        (N, 3) uint8 RGB.
+    """
+    has_one = cluster_id >= 0
+    _, group = np.unique(cluster_id[has_one], return_inverse=True)
+    number = np.zeros(len(cluster_id), np.int64)
+    number[has_one] = color_numbers(position[has_one], group, _NUM_HUES)[group]
+    hue = np.mod(number * _HUE_STEP, 1.0)[:, None]
+    # Three waves a third of the circle apart, cut to 0 ... 1: the hue circle.
+    wave = np.clip(np.abs(np.mod(hue + np.array([0, 2 / 3, 1 / 3]), 1) * 6 - 3) - 1, 0, 1)
+    bright = 90 + 165 * wave
+    return np.where(has_one[:, None], bright, _NO_CLUSTER).astype(np.uint8)
 
 
 def _cells(position: np.ndarray, group: np.ndarray) -> Tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -53,11 +53,9 @@ def draw_scale(axes: Axes) -> None:
     length = round_length(metres[0] / 6)
     for width, color in ((8, "white"), (4, INK)):
         axes.plot([x, x + length], [y, y], linewidth=width, color=color, solid_capstyle="butt", zorder=8)
-    halo = [withStroke(linewidth=4, foreground="white")]
     above = y + 0.08 * metres[1] / inches[1]
-    name = f"{length:g} m"
-    style = {"fontsize": 12, "color": INK, "ha": "center", "va": "bottom", "zorder": 8}
-    axes.text(x + length / 2, above, name, path_effects=halo, **style)
+    text = axes.text(x + length / 2, above, f"{length:g} m", fontsize=12, color=INK, ha="center", va="bottom", zorder=8)
+    text.set_path_effects([withStroke(linewidth=4, foreground="white")])
 
 
 def legend_box(

@@ -68,7 +68,7 @@ def new_figure(
         axes.set(xlim=view[:, 0], ylim=view[:, 1], aspect="equal", xticks=[], yticks=[])
         for spine in axes.spines.values():
             spine.set(color=FRAME, linewidth=0.8)
-        for radius in np.arange(step, farthest + 1e-9, step):
+        for radius in np.arange(step, farthest + 1e-9, step).tolist():
             axes.add_patch(Circle((0, 0), radius, fill=False, color=FRAME, alpha=0.45, linewidth=0.8, zorder=0.5))
         if name:
             axes.set_title(name, fontsize=14, color=INK, pad=7)

@@ -12,7 +12,7 @@ import numpy as np
 from cflow_torch.data.atomic import atomic_name
 from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.types import CFlowError, FlowResult, Sweep, as_numpy
-from cflow_torch.viz.coloring import color_numbers
+from cflow_torch.viz.coloring import cluster_to_rgb
 from cflow_torch.viz.panel import ARROW_STEPS, MIN_ARROW_POINTS, MOVING, group_medians
 from cflow_torch.viz.source import Source
 from cflow_torch.viz.wheel import flow_to_rgb
@@ -27,9 +27,8 @@ GROUND, NEXT_SWEEP = f"{EGO}/lidar/ground", f"{EGO}/lidar/next_sweep"
 MAX_FLOW = 1.5  # metres per sweep: 15 m/s at 10 Hz
 _DOT, _FINE_DOT = -1.5, -0.8  # negative: pixels of the screen
 _STATIC, _GROUND_COLOR, _NEXT_COLOR = (132, 138, 147), (70, 74, 81), (60, 110, 130)
-_NO_CLUSTER, _EGO_COLOR = (100, 105, 112), (255, 255, 255)
+_EGO_COLOR = (255, 255, 255)
 _BACKGROUND = (22, 25, 30)
-_NUM_HUES, _HUE_STEP = 10, 0.3  # of the hue circle: every tenth of it, those of neighbouring numbers far apart
 _CALENDAR = 10**17  # nanoseconds; later ones are a date (1973 and on), earlier ones a duration
 
 
@@ -231,27 +230,6 @@ class _Drive:
             beside.insert(0, view("ground truth", ESTIMATE, CLUSTERS, NEXT_SWEEP, ARROWS))
         parts = rrb.Horizontal(rrb.Tabs(estimate, over_next), rrb.Vertical(*beside), column_shares=[2, 1])
         return rrb.Blueprint(parts, collapse_panels=True)
-
-
-def cluster_to_rgb(position: np.ndarray, cluster_id: np.ndarray) -> np.ndarray:
-    """The colour of each point's cluster, bright, and another one for clusters near it; grey where there is none.
-
-    Args:
-        position: (N, 3) float64, metres, finite.
-        cluster_id: (N,) int64, -1 = none.
-
-    Returns:
-        (N, 3) uint8 RGB.
-    """
-    has_one = cluster_id >= 0
-    _, group = np.unique(cluster_id[has_one], return_inverse=True)
-    number = np.zeros(len(cluster_id), np.int64)
-    number[has_one] = color_numbers(position[has_one], group, _NUM_HUES)[group]
-    hue = np.mod(number * _HUE_STEP, 1.0)[:, None]
-    # Three waves a third of the circle apart, cut to 0 ... 1: the hue circle.
-    wave = np.clip(np.abs(np.mod(hue + np.array([0, 2 / 3, 1 / 3]), 1) * 6 - 3) - 1, 0, 1)
-    bright = 90 + 165 * wave
-    return np.where(has_one[:, None], bright, _NO_CLUSTER).astype(np.uint8)
 
 
 def _sync(path: Path) -> None:
