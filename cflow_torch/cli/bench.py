@@ -15,20 +15,24 @@ import json
 from dataclasses import asdict
 from pathlib import Path
 
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from cflow_torch.bench.measure import run_bench
 from cflow_torch.bench.table import format_bench, format_targets
 from cflow_torch.bench.target_row import FULL
 from cflow_torch.bench.targets import measure_targets
-from cflow_torch.cli.run import finish, make_model, open_logs
+from cflow_torch.cli.run import finish, make_model, number, open_logs
 from cflow_torch.data.log import window
 from cflow_torch.data.records import write_text
+from cflow_torch.types import CFlowError
 
 
 def task(cfg: DictConfig) -> None:
     """Run `cflow bench`."""
     output = Path(cfg.output)
+    repeats, num_threads = number(cfg, "repeats"), number(cfg, "num_threads", or_null=True)
+    if not OmegaConf.is_list(cfg.batches) or not all(type(batch) is int and batch > 0 for batch in cfg.batches):
+        raise CFlowError(f"batches={cfg.batches}: give a list of whole numbers of at least 1, as in 'batches=[1,8]'")
     model = make_model(cfg)
     logs, failures = open_logs(cfg)
     finish(failures)
@@ -46,7 +50,7 @@ def task(cfg: DictConfig) -> None:
     elif config.method == "dense":
         print(f"log {log.log_id} has {longest + 2} sweeps: rows with h = {history} need {history + 2}")
     sweeps = window(log, index, max(history, config.num_history))
-    settings = {"repeats": cfg.repeats, "num_threads": cfg.num_threads, "device": cfg.device}
+    settings = {"repeats": repeats, "num_threads": num_threads, "device": cfg.device}
     result = run_bench([sweeps], configs, with_reference=cfg.reference, with_opencv=cfg.opencv, **settings)
     print(format_bench(result))
     targets = measure_targets(

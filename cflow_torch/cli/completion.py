@@ -48,9 +48,12 @@ def candidates(command: str) -> List[str]:
     if not settings.has_settings(command):
         return ["--help"]
     found: Dict[str, None] = {}
-    for group, names in settings.groups(command).items():
+    groups = settings.groups(command)
+    for group, names in groups.items():
         found.update({f"{group}={name}": None for name in names})
     for key, value in settings.settings(command).items():
+        if key in groups:  # picture=flow also sets picture to its own name
+            continue
         whole = [f"{key}=true", f"{key}=false"] if isinstance(value, bool) else [f"{key}="]
         found.update(dict.fromkeys(whole))
     return [*found, *_OPTIONS]
@@ -74,7 +77,7 @@ _cflow() {
 CASES
   esac
   for word in $all; do
-    [[ $word == "$cur"* ]] || continue
+    [[ $word == "$cur"?* || ( $word == "$cur" && $cur != *= ) ]] || continue
     part="${word#"$cur"}"
     head="${part%%[.=]*}"
     part="${part:0:${#head}+1}"
@@ -109,7 +112,7 @@ _cflow() {
 CASES
   esac
   for word in $all; do
-    [[ $word == "$PREFIX"* ]] || continue
+    [[ $word == "$PREFIX"?* || ( $word == "$PREFIX" && $PREFIX != *= ) ]] || continue
     rest="${word#"$PREFIX"}"
     part="${rest%%[.=]*}"
     parts+=("$PREFIX$part${rest:$#part:1}")
@@ -136,12 +139,17 @@ function __cflow_words
 CASES
     end
 end
+function __cflow_offered  # data.root= is no answer to data.root=
+    set -l token (string escape --style=regex -- (commandline -ct))
+    __cflow_words | string match -rv -- "^$token(?<==)\$"
+end
 complete -c cflow -f
 complete -c cflow -n 'test (count (commandline -opc)) -eq 1' -a 'COMMANDS --help --version'
-complete -c cflow -n 'test (count (commandline -opc)) -gt 1' -a '(__cflow_words)'
+complete -c cflow -n 'test (count (commandline -opc)) -gt 1' -a '(__cflow_offered)'
 function __cflow_is_file
     set -l token (commandline -ct)
-    string match -q '*=*' -- $token; and not __cflow_words | string match -q -- "$token*"
+    string match -q '*=*' -- $token; or return
+    not __cflow_words | string match -rq -- '^'(string escape --style=regex -- $token)'.'
 end
 complete -c cflow -n __cflow_is_file -F
 """,

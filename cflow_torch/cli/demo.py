@@ -14,7 +14,7 @@ from __future__ import annotations
 from omegaconf import DictConfig
 
 from cflow_torch.cli.eval import report
-from cflow_torch.cli.run import finish, for_each_pair, make_model, open_logs, output_folder
+from cflow_torch.cli.run import finish, for_each_pair, make_model, number, open_logs, output_folder
 from cflow_torch.data.flow_file import write_flow
 from cflow_torch.data.log import Log
 from cflow_torch.evaluation.frame import EvalFrame
@@ -26,12 +26,13 @@ from cflow_torch.viz.bev import plot_flow, save_picture
 def task(cfg: DictConfig) -> None:
     """Run `cflow demo`."""
     output = output_folder(cfg)
+    pair = number(cfg, "pair")
     metrics = SceneFlowMetrics(cfg.definition)
     model = make_model(cfg)
     logs, failures = open_logs(cfg)
     num_pairs = max((len(log.timestamps) - 1 for log in logs), default=0)
-    if logs and not 0 <= cfg.pair < num_pairs:
-        raise CFlowError(f"pair={cfg.pair}: the drive has {num_pairs} pairs, give 0 ... {num_pairs - 1}")
+    if logs and not 0 <= pair < num_pairs:
+        raise CFlowError(f"pair={pair}: the drive has {num_pairs} pairs, give 0 ... {num_pairs - 1}")
 
     is_drawn = False
 
@@ -41,7 +42,7 @@ def task(cfg: DictConfig) -> None:
         labels = log.labels(index)
         if labels is not None:
             metrics.update(EvalFrame.from_result(sweeps, result, labels))
-        if index == cfg.pair:
+        if index == pair:
             figure = plot_flow(
                 sweeps.pc0.points,
                 result,

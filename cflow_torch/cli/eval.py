@@ -13,13 +13,22 @@ examples:
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Dict
 
 from omegaconf import DictConfig
 
 from cflow_torch.cli.record import DataIdentity, finished_results, write_results
-from cflow_torch.cli.run import finish, for_each_pair, is_sweep, make_model, open_logs, output_folder
+from cflow_torch.cli.run import (
+    UnfinishedJob,
+    finish,
+    for_each_pair,
+    make_model,
+    number,
+    open_logs,
+    output_folder,
+)
 from cflow_torch.data.log import Log
 from cflow_torch.evaluation.frame import EvalFrame
 from cflow_torch.evaluation.metrics import SceneFlowMetrics
@@ -31,6 +40,7 @@ from cflow_torch.types import CFlowError, FlowResult, Window
 def task(cfg: DictConfig) -> float:
     """Run `cflow eval`; returns the score of a sweep, see `objective`."""
     output = output_folder(cfg)
+    first, step = number(cfg, "data.first"), number(cfg, "data.step")
     record = finished_results(cfg, output)
     if record is not None:
         print(f"skipped, done before: {output}")
@@ -49,7 +59,7 @@ def task(cfg: DictConfig) -> float:
             metrics.update(EvalFrame.from_result(sweeps, result, labels, **parts))
             identity.add(sweeps, labels)
 
-    failures += for_each_pair(logs, model, score, cfg.data.first, cfg.data.step)
+    failures += for_each_pair(logs, model, score, first, step)
     if metrics.num_frames == 0:
         raise CFlowError("no pair has labels: nothing to score; `cflow flow` estimates the flow without them")
     results = report(cfg, metrics, output, data=identity.report(), seconds=model.report(), failures=failures)
@@ -84,9 +94,6 @@ def objective(results: Dict[str, Any]) -> float:
 
 
 def _finish(failures: Any) -> None:
-    """List what failed. A job of a sweep lets the others run; a run on its own ends with status 1."""
-    try:
+    """List what failed. A job of a sweep has a score all the same; a run on its own ends with status 1."""
+    with suppress(UnfinishedJob):
         finish(failures)
-    except SystemExit:
-        if not is_sweep():
-            raise

@@ -111,7 +111,7 @@ def _check_results(cfg: DictConfig, shard: Shard) -> None:
 
 
 def _contents(cfg: DictConfig, has_confidence: bool) -> Tuple[str, ...]:
-    given = [cfg.contents] if isinstance(cfg.contents, str) else list(cfg.contents)
+    given = list(cfg.contents) if OmegaConf.is_list(cfg.contents) else [cfg.contents]
     allowed = (*CONTENTS, *ON_REQUEST)
     if not given or set(given) - set(allowed):
         raise CFlowError(f"contents={given}: give some of {', '.join(allowed)}")

@@ -51,9 +51,13 @@ def main(argv: Optional[List[str]] = None) -> None:
         try:
             _run(list(sys.argv[1:] if argv is None else argv))
         finally:
-            sys.stdout.flush()
+            if sys.stdout is not None:  # closed: cflow ... >&-
+                sys.stdout.flush()
     except BrokenPipeError:
         _end_unread()
+    except KeyboardInterrupt:
+        print("stopped by Ctrl-C", file=sys.stderr)
+        raise SystemExit(128 + 2) from None  # as if SIGINT had ended it
 
 
 def _run(arguments: List[str]) -> None:
@@ -88,6 +92,7 @@ def _run_with_settings(command: str, run: Any, rest: List[str]) -> None:
     import hydra
 
     from cflow_torch.cli import wrong_call
+    from cflow_torch.cli.arguments import for_hydra
 
     has_begun = False
 
@@ -101,15 +106,20 @@ def _run_with_settings(command: str, run: Any, rest: List[str]) -> None:
             raise SystemExit(2) from None
         except BrokenPipeError:
             _end_unread()
+        except OSError as error:
+            if given or error.filename is None:
+                raise
+            print(f"error: {_place(error)}", file=sys.stderr)
+            raise SystemExit(2) from None
 
-    sys.argv = [f"cflow {command}", *wrong_call.overrides_first(rest)]
+    sys.argv = [f"cflow {command}", *for_hydra(rest)]
     # Hydra prints errors itself, and a closed pipe as one, unless this is set.
     given = os.environ.get("HYDRA_FULL_ERROR")
     os.environ["HYDRA_FULL_ERROR"] = "1"
     try:
         hydra.main(version_base="1.3", config_path="pkg://cflow_torch.configs", config_name=command)(task)()
     except SystemExit as stop:
-        if stop.code == 2 and not has_begun:  # an option that Hydra's parser does not know
+        if stop.code == 2 and _is_of_parser(stop):  # an option that it does not know
             print(f"`cflow {command} --help` has examples", file=sys.stderr)
         raise
     except BrokenPipeError:
@@ -135,6 +145,21 @@ def _say(error: Exception, wrong_call_message: Optional[str]) -> None:
         raise SystemExit(2) from None
     print(f"error: {error}" if isinstance(error, UnfinishedJob) else format_bug(error), file=sys.stderr)
     raise SystemExit(1) from None
+
+
+def _place(error: OSError) -> str:
+    """The message for a file or folder that cannot be read, made or written."""
+    return (
+        f"{error.filename}: {error.strerror or error}; give places that can be read (data.root=) and written (output=)"
+    )
+
+
+def _is_of_parser(stop: BaseException) -> bool:
+    """Whether the parser of options ended the process; what a task ends with can come from another process."""
+    trace = stop.__traceback__
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    return trace is not None and trace.tb_frame.f_globals.get("__name__") == "argparse"
 
 
 def _end_unread() -> None:

@@ -27,9 +27,10 @@ import numpy as np
 from omegaconf import DictConfig
 from tqdm import tqdm
 
-from cflow_torch.cli.run import find_logs, make_model, output_folder
+from cflow_torch.cli.run import find_logs, make_model, number, output_folder
 from cflow_torch.data.catalog import open_log
 from cflow_torch.data.log import Log, RecentSweeps, window
+from cflow_torch.data.log_check import check_log
 from cflow_torch.data.paths import is_remote
 from cflow_torch.fleet.progress import frames as counted
 from cflow_torch.pyramid import CoarseToFine
@@ -56,11 +57,12 @@ def task(cfg: DictConfig) -> None:
     if cfg.picture == "animation":
         path = _animate(cfg, model, output)
     else:
+        pair = number(cfg, "pair")
         log = find_log(cfg)
-        sweeps = _window(log, cfg.pair, model.config.num_history)
+        sweeps = _window(log, pair, model.config.num_history)
         figure = PICTURES[cfg.picture](cfg, model, log, sweeps)
         path = save_picture(figure, _folder(output) / f"{cfg.picture}.png")
-        print(f"log {log.log_id}, pair {cfg.pair}, sweep {log.timestamps[cfg.pair]}")
+        print(f"log {log.log_id}, pair {pair}, sweep {log.timestamps[pair]}")
     print(f"picture: {path}")
 
 
@@ -84,6 +86,8 @@ def find_log(cfg: DictConfig) -> Log:
             seen.append(f"{_name(source)} ({error})")
             continue
         if log.log_id == wanted:
+            if sources.settings.get("check", True):
+                check_log(log)
             return log
         seen.append(log.log_id)
     raise CFlowError(f"log={wanted}: there is no such log; there are {', '.join(sorted(seen))}")
@@ -100,9 +104,7 @@ def _name(source: Any) -> str:
     return str(getattr(source, "stem", source))
 
 
-def _window(log: Log, pair: Any, num_history: int) -> Window:
-    if not isinstance(pair, int):
-        raise CFlowError(f"pair={pair}: give the number of one pair, from 0 to {len(log.timestamps) - 2}")
+def _window(log: Log, pair: int, num_history: int) -> Window:
     if not 0 <= pair < len(log.timestamps) - 1:
         raise CFlowError(
             f"pair={pair}: log {log.log_id} has {len(log.timestamps)} sweeps, so pairs 0 to {len(log.timestamps) - 2}"
@@ -134,7 +136,7 @@ def _flow(cfg: DictConfig, model: CoarseToFine, log: Log, sweeps: Window) -> Any
         result,
         is_ground=sweeps.pc0.is_ground,
         point_cloud_range=model.config.point_cloud_range,
-        max_flow=cfg.max_flow,
+        max_flow=number(cfg, "max_flow", float, or_null=True),
         title=_title(log, cfg.pair),
         truth=_truth(cfg, log, result),
     )
@@ -166,7 +168,9 @@ PICTURES: Dict[str, Callable[[DictConfig, CoarseToFine, Log, Window], Any]] = {
     "flow": _flow,
     "clusters": _clusters,
     "keypoints": lambda cfg, model, log, sweeps: plot_keypoints(sweeps, model.config),
-    "correlation": lambda cfg, model, log, sweeps: plot_correlation(sweeps, model.config, cluster_id=cfg.cluster),
+    "correlation": lambda cfg, model, log, sweeps: plot_correlation(
+        sweeps, model.config, cluster_id=number(cfg, "cluster", or_null=True)
+    ),
     "scales": lambda cfg, model, log, sweeps: plot_scales(sweeps, model.config),
 }
 
@@ -175,16 +179,19 @@ def _animate(cfg: DictConfig, model: CoarseToFine, output: Path) -> Path:
     """Flow of several pairs, then their pictures; nothing is written if one of them fails."""
     if cfg.format not in FORMATS:
         raise CFlowError(f"format={cfg.format}: give one of {', '.join(FORMATS)}")
-    if cfg.first < 0 or cfg.step < 1 or (cfg.count is not None and cfg.count < 1):
+    first, step, count = number(cfg, "first"), number(cfg, "step"), number(cfg, "count", or_null=True)
+    if first < 0 or step < 1 or (count is not None and count < 1):
         raise CFlowError(
-            f"first={cfg.first}, step={cfg.step}, count={cfg.count}: give a first pair of at least 0, a step and a "
-            "count of at least 1"
+            f"first={first}, step={step}, count={count}: give a first pair of at least 0, a step and a count of at "
+            "least 1"
         )
+    max_flow, width = number(cfg, "max_flow", float, or_null=True), number(cfg, "width")
+    frames_per_second = number(cfg, "frames_per_second", float)
     log = find_log(cfg)
     recent = RecentSweeps(log, model.config.num_history + 2)
-    pairs = range(cfg.first, len(log.timestamps) - 1, cfg.step)[: cfg.count]
+    pairs = range(first, len(log.timestamps) - 1, step)[:count]
     if not pairs:
-        raise CFlowError(f"first={cfg.first}: log {log.log_id} has pairs 0 to {len(log.timestamps) - 2}")
+        raise CFlowError(f"first={first}: log {log.log_id} has pairs 0 to {len(log.timestamps) - 2}")
     frames: List[Frame] = []
     for pair in counted(pairs):
         sweeps = _window(recent, pair, model.config.num_history)
@@ -196,11 +203,11 @@ def _animate(cfg: DictConfig, model: CoarseToFine, output: Path) -> Path:
     figures = flow_figures(
         frames,
         point_cloud_range=model.config.point_cloud_range,
-        max_flow=cfg.max_flow,
+        max_flow=max_flow,
         legend=cfg.legend,
-        width=cfg.width,
+        width=width,
     )
     print(f"log {log.log_id}, {len(pairs)} pairs from {pairs[0]} to {pairs[-1]}")
     path = _folder(output) / f"animation.{cfg.format}"
     drawn = tqdm(figures, total=len(frames), unit="picture", disable=None)
-    return save_animation(drawn, path, frames_per_second=cfg.frames_per_second)
+    return save_animation(drawn, path, frames_per_second=frames_per_second)

@@ -8,7 +8,7 @@ import re
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Callable, Dict, List, Sequence, Tuple
+from typing import Any, Callable, Dict, List, Sequence, Tuple, Type
 
 import numpy as np
 import torch
@@ -58,6 +58,27 @@ def make_model(cfg: DictConfig) -> CoarseToFine:
     """
     settings: Dict[str, Any] = OmegaConf.to_container(cfg.model, resolve=True)  # type: ignore[assignment]
     return estimate.make_model(Config().replace(**settings), cfg.device)
+
+
+def number(cfg: DictConfig, key: str, kind: Type[float] = int, or_null: bool = False) -> Any:
+    """The value of a setting that is a number.
+
+    Args:
+        cfg: resolved settings.
+        key: in dotted form.
+        kind: int, or float, which takes whole numbers as well.
+        or_null: null is a value, too.
+
+    Raises:
+        CFlowError: it is none.
+    """
+    value = OmegaConf.select(cfg, key)
+    if value is None and or_null:
+        return None
+    if isinstance(value, bool) or not isinstance(value, (int, kind)):
+        what = "a whole number" if kind is int else "a number"
+        raise CFlowError(f"{key}={value}: give {what}{' or null' if or_null else ''}")
+    return value
 
 
 def is_sweep() -> bool:
@@ -118,11 +139,14 @@ def find_logs(cfg: DictConfig) -> Sources:
     """
     data = cfg.data
     if data.name == "synthetic":
-        return Sources("av2", {"check": False}, benchmark_logs(data.cache, "av2", [data.seed], data.num_sweeps))
+        seed, num_sweeps = number(cfg, "data.seed"), number(cfg, "data.num_sweeps")
+        return Sources("av2", {"check": False}, benchmark_logs(data.cache, "av2", [seed], num_sweeps))
     if data.name == "benchmark":
-        seeds = range(data.first_seed, data.first_seed + data.num_drives)
+        first, num_drives, num_sweeps = (
+            number(cfg, f"data.{key}") for key in ("first_seed", "num_drives", "num_sweeps")
+        )
         chosen = format_of(data.profile)
-        logs = benchmark_logs(data.cache, data.profile, seeds, data.num_sweeps, data.scenes)
+        logs = benchmark_logs(data.cache, data.profile, range(first, first + num_drives), num_sweeps, data.scenes)
         return Sources(chosen.data_set, {"check": False, **chosen.settings}, logs)
     if OmegaConf.is_missing(data, "root"):
         raise CFlowError("where is the data? give data.root=PATH, one log or a folder of logs")
@@ -183,11 +207,18 @@ def for_each_pair(logs: Sequence[Log], model: FlowModel, use: UseResult, first: 
 
 
 def finish(failures: Failures) -> None:
-    """List what failed, and end the process with status 1 if anything did."""
+    """List what failed, and end the process with status 1 if anything did.
+
+    Raises:
+        SystemExit: something failed.
+        UnfinishedJob: something failed in a job of a sweep; Hydra lets the others run before it ends with status 1.
+    """
     if failures:
         print(f"{len(failures)} failed:", file=sys.stderr)
         for frame, message in failures:
             print(f"  {frame}: {message}", file=sys.stderr)
+        if is_sweep():
+            raise UnfinishedJob(f"a job left {len(failures)} undone, listed above")
         raise SystemExit(1)
 
 

@@ -39,6 +39,17 @@ def settings(command: str) -> Dict[str, Any]:
     return found
 
 
+def owners(command: str, key: str) -> List[str]:
+    """The choices that bring a setting: ["picture=correlation"] for cluster; none if it stands in none."""
+    return [
+        f"{group}={name}"
+        for group, names in groups(command).items()
+        if group != "experiment"
+        for name in names
+        if key in _group_keys(group, name)
+    ]
+
+
 def near(word: str, known: Iterable[str]) -> str:
     """ " (did you mean X?)" for the most similar known word; "" if none is similar."""
     candidates = list(known)

@@ -23,7 +23,7 @@ from typing import Any, Callable, Iterator, List, Tuple
 from omegaconf import DictConfig
 from tqdm import tqdm
 
-from cflow_torch.cli.run import Failures, finish, make_model, open_logs, output_folder, write_config
+from cflow_torch.cli.run import Failures, finish, make_model, number, open_logs, output_folder, write_config
 from cflow_torch.data.flow_file import read_flow
 from cflow_torch.data.log import Log, RecentSweeps, window
 from cflow_torch.data.paths import as_path, is_remote
@@ -41,23 +41,30 @@ def task(cfg: DictConfig) -> None:
     output = output_folder(cfg)
     if is_remote(output):
         raise CFlowError(f"{output}: recordings are written on this machine only; give output=FOLDER and copy them")
-    if cfg.data.first < 0 or cfg.data.step < 1 or (cfg.count is not None and cfg.count < 1):
+    first, step, limit = number(cfg, "data.first"), number(cfg, "data.step"), number(cfg, "count", or_null=True)
+    if first < 0 or step < 1 or (limit is not None and limit < 1):
         raise CFlowError(
-            f"data.first={cfg.data.first}, data.step={cfg.data.step}, count={cfg.count}: "
+            f"data.first={first}, data.step={step}, count={limit}: "
             "give a first pair of at least 0, a step and a count of at least 1"
         )
+    max_flow = number(cfg, "max_flow", float)
+    if not 0 < max_flow < float("inf"):
+        raise CFlowError(f"max_flow={max_flow}: give a positive length in metres per sweep")
     flow, history = _flow(cfg)
     logs, failures = open_logs(cfg)
     write_config(cfg, output)
     files: List[Path] = []
     for log in logs:
-        pairs = range(cfg.data.first, len(log.timestamps) - 1, cfg.data.step)[: cfg.count]
+        pairs = range(first, len(log.timestamps) - 1, step)[:limit]
         recent: Any = RecentSweeps(log, history + 2)
         file = output / f"{log.log_id}.rrd"
+        if file in files:
+            failures.append((log.log_id, f"{file} is of another log of this name: give data.root=PATH more narrowly"))
+            continue
         try:
-            count = record_log(recent, _results(recent, pairs, flow, failures), file, max_flow=cfg.max_flow)
+            count = record_log(recent, _results(recent, pairs, flow, failures), file, max_flow=max_flow)
         except CFlowError as error:
-            failures.append((log.log_id, str(error)))
+            failures.append((log.log_id, _without(f"{log.log_id}: ", str(error))))
             continue
         files.append(file)
         print(f"{file}: {count} pair{'' if count == 1 else 's'}, {file.stat().st_size / 1e6:,.1f} MB")
@@ -66,6 +73,10 @@ def task(cfg: DictConfig) -> None:
     if files and cfg.show:
         _show(files)
     finish(failures)
+
+
+def _without(prefix: str, text: str) -> str:
+    return text[len(prefix) :] if text.startswith(prefix) else text
 
 
 def _flow(cfg: DictConfig) -> Tuple[Callable[[Log, int], FlowResult], int]:

@@ -3,22 +3,14 @@
 from __future__ import annotations
 
 import re
+import shlex
 import traceback
-from typing import List, Optional
+from typing import Optional
 
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf.errors import OmegaConfBaseException
 
 from cflow_torch.cli import settings
-
-
-def overrides_first(arguments: List[str]) -> List[str]:
-    """Settings before options: Hydra's parser does not take `-m` between two settings."""
-
-    def is_override(word: str) -> bool:
-        return not word.startswith("-") and ("=" in word or word[0:1] in "+~")
-
-    return [a for a in arguments if is_override(a)] + [a for a in arguments if not is_override(a)]
 
 
 def explain(error: Exception, command: str) -> Optional[str]:
@@ -29,7 +21,7 @@ def explain(error: Exception, command: str) -> Optional[str]:
         wrong = str(error.override)
         if "=" not in wrong:
             return f"{wrong!r} is no setting: give NAME=VALUE, `cflow {command} --help` has examples"
-        return f"cannot read {wrong!r}: settings are NAME=VALUE, in quotes where the shell would read them: '{wrong}'"
+        return f"cannot read {wrong!r}: {_readable(wrong)}"
     if not isinstance(error, (HydraException, OmegaConfBaseException)):
         return None
     message = str(error)
@@ -37,6 +29,9 @@ def explain(error: Exception, command: str) -> Optional[str]:
     if match:
         known = [*settings.groups(command), *settings.settings(command)]
         key = match[1].lstrip("+~")
+        owners = settings.owners(command, key)
+        if owners:
+            return f"setting {key!r} belongs to {' or '.join(owners)}: give that as well, or leave it out"
         return f"unknown setting {key!r}{settings.near(key, known)}: `cflow {command} --cfg job` prints every one"
     match = re.match(r"Ambiguous value for argument '([^=']+)=([^']+)'", message)
     if match:
@@ -45,6 +40,16 @@ def explain(error: Exception, command: str) -> Optional[str]:
     first, *more = message.splitlines() or [type(error).__name__]
     rest = f" ({'; '.join(line.strip() for line in more if line.strip())})" if more else ""
     return f"{first}{rest}; `cflow {command} --cfg job` prints every setting"
+
+
+def _readable(wrong: str) -> str:
+    """How an override that Hydra's parser refuses can be written."""
+    key, _, value = wrong.partition("=")
+    if value[:1] in ("[", "{", "(", "'", '"'):
+        return """write 'NAME=[A,B]' for a list, 'NAME=["A",B]' if A has special characters, in the shell's quotes"""
+    quoted = value.replace('"', r"\"")
+    both = shlex.quote(f'{key}="{quoted}"')
+    return f"text with special characters takes two pairs of quotes, the inner ones for Hydra: {both}"
 
 
 def _unknown_choice(error: MissingConfigException, command: str) -> str:

@@ -1,0 +1,33 @@
+"""What is typed behind a command, put in the form that Hydra's parser takes."""
+
+from __future__ import annotations
+
+import re
+from typing import List
+
+# Settings that name a file, a folder or a log: text, whatever they look like.
+_NAMES = ("output", "log", "flow", "archive", "frames", "masks", "result_name", "data.root", "data.cache")
+# What Hydra would read as a number or a truth value: 1e5, 2024_11_22, true.
+_NO_TEXT = re.compile(r"[+-]?[._]*\d[\d._]*(e[+-]?[\d_]+)?|true|false", re.IGNORECASE)
+
+
+def for_hydra(arguments: List[str]) -> List[str]:
+    """Settings before options, since Hydra's parser does not take `-m` between two settings; names in quotes.
+
+    Args:
+        arguments: behind the command. A Waymo segment, log=10203656353524179475_7625_000_7645_000, is a whole number to
+            Hydra, which leaves its underscores out.
+    """
+
+    def is_override(word: str) -> bool:
+        return not word.startswith("-") and ("=" in word or word[0:1] in "+~")
+
+    return [_quoted(a) for a in arguments if is_override(a)] + [a for a in arguments if not is_override(a)]
+
+
+def _quoted(override: str) -> str:
+    key, _, value = override.partition("=")
+    if key.lstrip("+") not in _NAMES:
+        return override
+    values = [f'"{one}"' if _NO_TEXT.fullmatch(one.strip()) else one for one in value.split(",")]  # of a sweep
+    return f"{key}={','.join(values)}"
