@@ -17,6 +17,7 @@ from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
 from cflow_torch import CFlowError, CorrelationFlow, FlowResult, make_config, make_model
+from cflow_torch.cli import run as command_run
 from cflow_torch.cli.main import COMMANDS, main
 from cflow_torch.config import PRESETS, Config
 from cflow_torch.data.av2 import AV2Log
@@ -129,6 +130,30 @@ def test_a_bad_log_is_reported_and_the_rest_goes_on(
     assert run("eval", "data=av2", f"data.root={root}", f"output={tmp_path / 'out'}", "model=paper") == 1
     assert "no-poses" in capsys.readouterr().err
     assert json.loads((tmp_path / "out" / "results.json").read_text())["results"]["num_frames"] == 3
+
+
+def test_a_failure_ends_a_run_and_leaves_a_sweep_going(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(SystemExit, match="1"):
+        command_run.finish([("a", "bad")])
+    monkeypatch.setattr(command_run, "is_sweep", lambda: True)
+    command_run.finish([])
+    with pytest.raises(command_run.UnfinishedJob, match="1"):
+        command_run.finish([("a", "bad")])
+
+
+@pytest.mark.parametrize("command", ["demo", "eval", "bench"])
+def test_an_output_that_cannot_be_made_is_named(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+    (tmp_path / "file").touch()
+    quick = ["reference=false", "opencv=false", "hdbscan=false", "repeats=1", "batches=[1]", "num_threads=1"]
+    call = [f"output={tmp_path}/file/below", f"data.cache={tmp_path}/cache", "data.num_sweeps=2", "model=paper"]
+    pair = {"demo": ["pair=0"], "eval": [], "bench": quick}[command]
+    assert run(command, *call, *pair) == 2
+    error = capsys.readouterr().err
+    assert f"error: {tmp_path}/file: File exists; give places" in error
+    assert "Traceback" not in error
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import shlex
+import shutil
 import struct
 import subprocess
 import sys
@@ -19,12 +20,14 @@ from hydra import compose, initialize_config_module
 
 import cflow_torch
 from cflow_torch.cli import completion, info, settings
+from cflow_torch.cli.arguments import for_hydra
 from cflow_torch.cli.main import COMMANDS, HELP, main
 from cflow_torch.fleet import progress
 from cflow_torch.types import CFlowError
 
 WITH_SETTINGS = [command for command in COMMANDS if settings.has_settings(command)]
 MAIN = [sys.executable, "-m", "cflow_torch.cli.main"]
+ANIMATION = ("first", "step", "count", "width", "frames_per_second", "max_flow")
 ROOT = Path(__file__).resolve().parents[1]
 
 
@@ -99,7 +102,10 @@ def test_the_version() -> None:
         (["flow", "num_history=2"], "(did you mean model.num_history?)"),
         (["eval", "model=papr"], "model=papr (did you mean paper?): give one of default, fast, keypoints, paper"),
         (["flow", "engine=slurm"], "engine=slurm: give one of local, ray"),
-        (["eval", "-m", "hydra/launcher=joblob", "data.seed=1,2"], "pip install hydra-joblib-launcher hydra-submitit-launcher hydra-optuna-sweeper"),
+        (
+            ["eval", "-m", "hydra/launcher=joblob", "data.seed=1,2"],
+            "pip install hydra-joblib-launcher hydra-submitit-launcher",
+        ),
         (["eval", "data.root"], "'data.root' is no setting: give NAME=VALUE"),
         (["eval", "model.pixel_sizes=[0.2"], "cannot read 'model.pixel_sizes=[0.2'"),
         (["eval", "data.seed=1,2"], "add -m to run each, or write 'data.seed=[1,2]'"),
@@ -108,6 +114,22 @@ def test_the_version() -> None:
         (["info", "all"], "info takes no settings, got all"),
         (["completion"], "one of bash, zsh, fish, got nothing"),
         (["completion", "tcsh"], "one of bash, zsh, fish, got tcsh"),
+        (["plot", "cluster=3"], "setting 'cluster' belongs to picture=correlation: give that as well"),
+        (["eval", "output=outputs/\u00fc"], "the inner ones for Hydra: 'output=\"outputs/\u00fc\"'"),
+        (["eval", "model.pixel_sizes=[\u00fc]"], "write 'NAME=[A,B]' for a list"),
+        (["eval", "data=av2", "data.root=7"], "7"),
+        (["plot", "log=1e5", "data.num_sweeps=2"], "log=1e5: there is no such log"),
+        (["plot", "pair=1.5"], "pair=1.5: give a whole number"),
+        (["plot", "pair=true"], "pair=True: give a whole number"),
+        (["plot", "max_flow=abc", "data.num_sweeps=2", "pair=0"], "max_flow=abc: give a number or null"),
+        (["plot", "picture=correlation", "cluster=abc", "pair=0"], "cluster=abc: give a whole number or null"),
+        *((["plot", "picture=animation", f"{key}=abc"], f"{key}=abc: give a") for key in ANIMATION),
+        (["demo", "pair=abc"], "pair=abc: give a whole number"),
+        (["demo", "data.seed=abc"], "data.seed=abc: give a whole number"),
+        (["eval", "data.first=abc"], "data.first=abc: give a whole number"),
+        (["bench", "repeats=abc"], "repeats=abc: give a whole number"),
+        (["bench", "batches=[0]"], "batches=[0]: give a list of whole numbers"),
+        (["flow", "contents=7"], "contents=[7]: give some of"),
     ],
 )
 def test_a_wrong_call_gets_one_line_that_says_what_to_do(
@@ -123,20 +145,41 @@ def test_a_wrong_call_gets_one_line_that_says_what_to_do(
     assert "HYDRA_FULL_ERROR" not in os.environ, "left as it was"
 
 
+@pytest.mark.parametrize("value", ["outputs/\u00fc", "a b\u00fc", 'it\'s "\u00fc"'])
+def test_the_quotes_that_are_advised_do_what_they_should(value: str, capsys: pytest.CaptureFixture) -> None:
+    assert run("eval", f"output={value}") == 2
+    advised = capsys.readouterr().err.partition("the inner ones for Hydra: ")[2]
+    with initialize_config_module("cflow_torch.configs", version_base="1.3"):
+        assert compose("eval", shlex.split(advised)).output == value
+
+
+@pytest.mark.parametrize("name", ["10203656353524179475_7625_000_7645_000", "1e5", "2024_11_22", "-1.5", "true", "a_1"])
+def test_names_are_text_whatever_they_look_like(name: str) -> None:
+    with initialize_config_module("cflow_torch.configs", version_base="1.3"):
+        cfg = compose("plot", for_hydra([f"log={name}", f"output={name}", "pair=1"]))
+        assert (cfg.log, cfg.output, cfg.pair) == (name, name, 1)
+        assert compose("plot", for_hydra(["log=null"])).log is None
+    assert for_hydra(["-m", "log=1_0,b,2_0", "pair=1,2"]) == ['log="1_0",b,"2_0"', "pair=1,2", "-m"]
+
+
 def test_settings_may_stand_before_and_behind_options(capsys: pytest.CaptureFixture) -> None:
     assert run("eval", "model=fast", "--cfg", "job", "data.seed=7") == 0
     text = capsys.readouterr().out
     assert "seed: 7" in text and "num_history: 2" in text
 
 
-def test_a_fault_of_ours_asks_for_a_report(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+def bench_that_raises(error: BaseException, monkeypatch: pytest.MonkeyPatch) -> None:
     module = ModuleType("cflow_torch.cli.bench")
 
     def task(cfg: Any) -> None:
-        raise KeyError("of ours")
+        raise error
 
     module.task = task  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "cflow_torch.cli.bench", module)
+
+
+def test_a_fault_of_ours_asks_for_a_report(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+    bench_that_raises(KeyError("of ours"), monkeypatch)
     assert run("bench") == 1
     error = capsys.readouterr().err
     assert "KeyError: 'of ours'" in error and "`cflow info`" in error
@@ -144,6 +187,44 @@ def test_a_fault_of_ours_asks_for_a_report(monkeypatch: pytest.MonkeyPatch, caps
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
     with pytest.raises(KeyError):
         main(["bench"])
+
+
+def test_ctrl_c_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+    bench_that_raises(KeyboardInterrupt(), monkeypatch)
+    assert run("bench") == 130
+    assert capsys.readouterr().err == "stopped by Ctrl-C\n"
+
+
+def test_a_place_that_cannot_be_used_is_no_fault_of_ours(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+    bench_that_raises(PermissionError(13, "Permission denied", "there"), monkeypatch)
+    assert run("bench") == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: there: Permission denied; give places") and error.count("\n") == 1
+    bench_that_raises(OSError("without a file"), monkeypatch)
+    assert run("bench") == 1
+    assert "this is a fault of cflow" in capsys.readouterr().err
+
+
+def test_a_task_that_ends_in_another_process_has_said_why(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    import hydra
+
+    # A launcher such as joblib's runs the tasks elsewhere, and raises here what they raised.
+    monkeypatch.setattr(hydra, "main", lambda **settings: lambda task: lambda: sys.exit(2))
+    assert run("bench") == 2
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a POSIX shell")
+@pytest.mark.parametrize("arguments", ["--help >&-", "eval --cfg job >&-", "--help 2>&-"])
+def test_output_may_be_closed(arguments: str) -> None:
+    command = f"{shlex.join(MAIN)} {arguments}"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=120)
+    assert (done.stderr, done.returncode) == ("", 0)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs a POSIX shell")
@@ -184,6 +265,10 @@ def test_every_setting_that_is_offered_exists(command: str) -> None:
         ("cflow eval --c", {"--cfg"}),
         ("cflow completion ", {*completion.SHELLS, "--help"}),
         ("cflow view data.root=here/a", {"here/alpha"}),
+        ("cflow view data.root=", {"here", "cflow.bash"}),
+        ("cflow plot output=", {"here", "cflow.bash"}),
+        ("cflow plot picture=", set(settings.choices("picture"))),
+        ("cflow eval model=fast", {"fast"}),
         ("cflow fly ", set()),
     ],
 )
@@ -197,6 +282,27 @@ def test_bash_completes(line: str, expected: set, tmp_path: Path) -> None:
     done = subprocess.run(["bash", "-c", shell], cwd=tmp_path, capture_output=True, text=True, timeout=60)
     assert done.stderr == "complete -F _cflow cflow\n" and not done.returncode
     assert set(done.stdout.split()) == expected
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("cflow ev", {"eval"}),
+        ("cflow view data.root=here/a", {"data.root=here/alpha"}),
+        ("cflow view data.root=", {"data.root=here/", "data.root=cflow.fish"}),
+        ("cflow plot picture=", {f"picture={name}" for name in settings.choices("picture")}),
+        ("cflow eval model=fast", {"model=fast"}),
+    ],
+)
+@pytest.mark.skipif(shutil.which("fish") is None, reason="no fish here")
+def test_fish_completes(line: str, expected: set, tmp_path: Path) -> None:
+    (tmp_path / "cflow.fish").write_text(completion.script("fish"))
+    (tmp_path / "here").mkdir()
+    (tmp_path / "here" / "alpha").touch()
+    shell = f"source ./cflow.fish; complete -C {shlex.quote(line)}"
+    done = subprocess.run(["fish", "-c", shell], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert (done.stderr, done.returncode) == ("", 0)
+    assert {word.partition("\t")[0] for word in done.stdout.splitlines()} == expected
 
 
 @pytest.mark.parametrize("shell", completion.SHELLS)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 from pathlib import Path
 from typing import List
@@ -498,6 +499,27 @@ def test_a_log_is_found_by_its_name(drive: Path, tmp_path: Path, capsys: pytest.
     call = ["data=av2", f"data.root={drive}", f"output={tmp_path}", "model=paper", "pair=0", "truth=false", SMALL]
     assert plot(*call, f"log={log}") == 0
     assert f"log {log}" in capsys.readouterr().out
+
+
+def test_a_log_whose_name_is_a_number_to_hydra(drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    name = "10203656353524179475_7625_000_7645_000"
+    shutil.copytree(next(drive.iterdir()), tmp_path / "root" / name)
+    call = ["data=av2", f"data.root={tmp_path / 'root'}", f"output={tmp_path}", "model=paper", "truth=false", SMALL]
+    assert plot(*call, f"log={name}", "pair=0") == 0
+    assert plot(*call, f"log={name}", "-m", "pair=0,1") == 0
+    printed = capsys.readouterr().out
+    assert printed.count(f"log {name}, pair 0") == 2 and f"log {name}, pair 1" in printed
+
+
+def test_a_log_that_is_named_is_checked_like_the_first_one(drive: Path, tmp_path: Path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    from cflow_torch.cli import plot as command
+
+    checked = []
+    monkeypatch.setattr(command, "check_log", lambda log: checked.append(log.log_id))
+    (log,) = (folder.name for folder in drive.iterdir())
+    call = ["data=av2", f"data.root={drive}", f"output={tmp_path}", "model=paper", "pair=0", f"log={log}", SMALL]
+    assert plot(*call, "data.check=false") == 0 and not checked
+    assert plot(*call) == 0 and checked == [log]
 
 
 def test_missing_matplotlib_is_explained(drive: Path, tmp_path: Path, monkeypatch, capsys) -> None:  # type: ignore[no-untyped-def]

@@ -20,6 +20,8 @@ from cflow_torch.cli.main import main
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.flow_file import write_flow
 from cflow_torch.data.log import FlowLabels
+from cflow_torch.data.synthetic import make_drive
+from cflow_torch.data.writers import write_av2_log
 from cflow_torch.types import Sweep
 from cflow_torch.viz import flow_to_rgb, recording
 from cflow_torch.viz.coloring import cluster_to_rgb
@@ -275,6 +277,58 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     with pytest.raises(SystemExit) as stop:
         main(["view", *data, "flow=nowhere", "output=shown"])
     assert stop.value.code == 2 and "flow=nowhere is no folder" in capsys.readouterr().err
+
+
+def view(*arguments: object) -> int:
+    """Exit status of `cflow view`."""
+    with pytest.raises(SystemExit) as stop:
+        main(["view", *map(str, arguments)])
+    return int(stop.value.code or 0)
+
+
+def test_a_wrong_call_of_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+    pytest.importorskip("rerun")
+    monkeypatch.setattr(sys, "argv", list(sys.argv))
+    monkeypatch.chdir(tmp_path)
+    wrong = ["count=abc", "data.first=abc", "data.step=abc", "max_flow=abc", "max_flow=-1", "max_flow=null", "flow=3"]
+    for given in wrong:
+        assert view(given) == 2, given
+        error = capsys.readouterr().err
+        assert error.startswith(f"error: {given.replace('null', 'None')}") and error.count("\n") == 1
+    (tmp_path / "file").touch()
+    assert view("output=file/below", "data.num_sweeps=2", "model=paper") == 2
+    assert "error: file: File exists; give places" in capsys.readouterr().err
+    assert not list(tmp_path.rglob("*.rrd"))
+
+
+def test_a_drive_that_is_too_short_fails_and_the_sweep_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    pytest.importorskip("rerun")
+    monkeypatch.setattr(sys, "argv", list(sys.argv))
+    monkeypatch.chdir(tmp_path)
+    call = ["data.num_sweeps=3", "model=paper", "count=1"]
+    assert view(*call, "data.first=99") == 1
+    assert "1 failed:\n  synthetic-av2-0000: no" in capsys.readouterr().err, "the drive is named once"
+    assert view(*call, "-m", "data.first=99,0") == 1
+    assert "data.first=0" in capsys.readouterr().out
+    assert len(list(Path("outputs/view").rglob("*.rrd"))) == 1
+
+
+def test_two_logs_of_one_name_do_not_overwrite_each_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    pytest.importorskip("rerun")
+    monkeypatch.setattr(sys, "argv", list(sys.argv))
+    for split, seed in (("train", 1), ("val", 2)):
+        write_av2_log(make_drive(seed=seed, num_sweeps=2), tmp_path / "split" / split).rename(
+            tmp_path / "split" / split / "same"
+        )
+    output = tmp_path / "out"
+    assert view("data=av2", f"data.root={tmp_path / 'split'}", f"output={output}", "model=paper") == 1
+    printed = capsys.readouterr()
+    assert printed.out.count(f"{output / 'same.rrd'}: 1 pair") == 1
+    assert "1 failed:\n  same: " in printed.err and "give data.root=PATH more narrowly" in printed.err
 
 
 def test_a_viewer_that_ends_at_once_is_told(monkeypatch: pytest.MonkeyPatch) -> None:

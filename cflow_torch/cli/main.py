@@ -46,13 +46,15 @@ examples:
 
 
 def main(argv: Optional[List[str]] = None) -> None:
-    """Run one command. Ends the process with status 1 if anything failed, 2 if the call was wrong."""
+    """Run one command. Ends the process with status 1 if anything failed, 2 if the call was wrong, 130 after Ctrl-C."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed: cflow ... >&-
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115
     try:
         try:
             _run(list(sys.argv[1:] if argv is None else argv))
         finally:
-            if sys.stdout is not None:  # closed: cflow ... >&-
-                sys.stdout.flush()
+            sys.stdout.flush()
     except BrokenPipeError:
         _end_unread()
     except KeyboardInterrupt:
