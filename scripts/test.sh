@@ -1,10 +1,12 @@
 #!/usr/bin/env bash
-# The tests. Arguments go to pytest; without any, the slow ones are left out.
+# The tests. Arguments go to pytest; without any, the slow ones are left out and several processes share the rest.
 set -euo pipefail
 EXTRAS="dev,ray,viz,rerun,video"
 . "$(dirname "${BASH_SOURCE[0]}")/install.sh"
 cd "$ROOT"
 if [ $# -eq 0 ]; then
-  set -- -m "not slow"
+  # One thread each: threads of several processes on the same cores wait for each other more than they work.
+  export OMP_NUM_THREADS="${OMP_NUM_THREADS:-1}"
+  set -- -m "not slow" --dist loadfile -n "$("$PYTHON" -c 'import os; print(min(4, os.cpu_count() or 1))')"
 fi
 exec "$PYTHON" -m pytest "$@"

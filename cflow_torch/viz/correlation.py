@@ -143,7 +143,8 @@ def _draw_map(axes: Axes, beside: Axes, found: ClusterCorrelation) -> None:
     add_metres(axes, (0.0, 0.0), found.images.pixel_size, ("m", "m"))
     bar = axes.figure.colorbar(image, cax=beside)
     bar.ax.tick_params(labelsize=9, labelcolor=INK, color=INK, length=2)
-    bar.outline.set_visible(False)
+    outline: Any = bar.outline  # whose type is known wrongly
+    outline.set_visible(False)
 
 
 def _draw_surface(axes: Any, found: ClusterCorrelation) -> None:
