@@ -111,6 +111,17 @@ def test_pictures_and_table(script, tmp_path, capsys):
         assert picture.width == 1792 and len(picture.getcolors()) > 64
 
 
+def test_the_wheel_stays_smooth_in_256_colours(script):
+    from cflow_torch.viz import wheel_image
+
+    picture = np.full((220, 220, 3), 252, np.uint8)
+    picture[60:, 60:] = np.where(wheel_image(160)[..., 3:] > 0, wheel_image(160)[..., :3], 252)
+    drawn = np.asarray(script.with_palette(picture).convert("RGB")).astype(float)
+    off = (drawn - picture).reshape(55, 4, 55, 4, 3).mean(axis=(1, 3))  # what the eye sees: 4 x 4 pixels together
+    assert np.abs(off).mean() < 1, "flat facets"
+    assert (drawn[:60] == 252).all(), "the ground is not dithered"
+
+
 @pytest.mark.filterwarnings("ignore:there are ground points")
 def test_every_case_and_picture_is_on_the_page(script):
     page = (ROOT / "docs" / "limits.md").read_text(encoding="utf-8")
