@@ -63,7 +63,7 @@ def task(cfg: DictConfig) -> None:
             continue
         try:
             count = record_log(recent, _results(recent, pairs, flow, failures), file, max_flow=max_flow)
-        except CFlowError as error:
+        except (CFlowError, OSError) as error:
             failures.append((log.log_id, _without(f"{log.log_id}: ", str(error))))
             continue
         files.append(file)
