@@ -62,7 +62,7 @@ def test_fewer_points_than_a_cluster_needs():
 
 def test_without_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "hdbscan", None)
-    with pytest.raises(CFlowError, match=r"cflow_torch\[hdbscan\]"):
+    with pytest.raises(CFlowError, match=r"pip install hdbscan"):
         CorrelationFlow(config(clustering="hdbscan"))([scene(0)])
 
 

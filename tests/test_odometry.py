@@ -64,7 +64,7 @@ def test_without_kiss_icp_the_message_says_what_to_do(drive, monkeypatch):
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "kiss_icp", None)
     for call in (poses_from_odometry, with_poses):
-        with pytest.raises(CFlowError, match=r"cflow_torch\[odometry\].*poses\.txt"):
+        with pytest.raises(CFlowError, match=r"pip install kiss-icp.*poses\.txt"):
             call(NoPoses(drive))
     assert with_poses(drive) is drive, "nothing is estimated where poses are known"
 

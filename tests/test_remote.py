@@ -142,7 +142,7 @@ def test_missing_packages_are_named(monkeypatch):
     with pytest.raises(CFlowError, match="adlfs"):
         as_path("abfs://bucket/val")
     monkeypatch.setitem(sys.modules, "upath", None)
-    with pytest.raises(CFlowError, match=r"cflow_torch\[remote\]"):
+    with pytest.raises(CFlowError, match=r"pip install universal_pathlib"):
         as_path("s3://bucket/val")
 
 
