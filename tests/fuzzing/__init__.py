@@ -1,0 +1,1 @@
+"""Fuzzing of the readers: what is fed to them (targets, mutation), what may come out (outcome), long runs (campaign)."""

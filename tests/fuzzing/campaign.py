@@ -1,0 +1,93 @@
+"""A long run over one reader: a watched process, restarted after whatever ends it."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Dict, List
+
+from fuzzing.ledger import Ledger
+from fuzzing.target import Target
+
+TESTS = Path(__file__).resolve().parents[1]
+HANGS = 20.0  # seconds for one small file
+MOST_ENDS = 200  # crashes and hangs after which a campaign is given up
+
+
+@dataclass(frozen=True)
+class Report:
+    """What came of a campaign: cases begun; those read, refused, ended by another exception; ends of the process."""
+
+    target: str
+    engine: str
+    cases: int
+    result: int
+    refused: int
+    wrong: int
+    crashes: int
+    hangs: int
+    most_bytes: int
+    seconds: float
+    findings: List[str]
+
+
+def run(target: Target, engine: str, cases: int, seed: int, folder: Path) -> Report:
+    """Feed `cases` hostile files to a reader in a process of its own.
+
+    Args:
+        target: the reader.
+        engine: "hypothesis" (damaged and crafted files) or "atheris" (guided by the branches that the reader takes).
+        cases: how many.
+        seed: of the choices.
+        folder: gets `counts`, `findings/` (one file of each fault, and where it was) and `report.json`; emptied first.
+    """
+    shutil.rmtree(folder, ignore_errors=True)
+    ledger = Ledger(folder)
+    ends: Dict[str, int] = {"crashes": 0, "hangs": 0}
+    began = time.monotonic()
+    while (done := ledger.counts()["cases"]) < cases and sum(ends.values()) < MOST_ENDS:
+        with tempfile.TemporaryDirectory(prefix="fuzz-", dir="/dev/shm" if os.path.isdir("/dev/shm") else None) as work:
+            now = seed + 1000 * sum(ends.values())
+            how = _watch(ledger, [target.name, engine, str(cases - done), str(now), str(folder), work])
+            if how:
+                ends["hangs" if how == "hang" else "crashes"] += 1
+                last = Path(work) / target.file
+                ledger.finding(
+                    how, last.read_bytes() if last.exists() else b"", (folder / "stderr").read_text()[-4000:]
+                )
+            elif ledger.counts()["cases"] == done:
+                raise RuntimeError(f"{target.name}: no case was run: {(folder / 'stderr').read_text()[-4000:]}")
+    findings = sorted(file.stem for file in (folder / "findings").glob("*.txt"))
+    counts = ledger.counts()
+    report = Report(target.name, engine, **counts, **ends, seconds=time.monotonic() - began, findings=findings)
+    (folder / "report.json").write_text(json.dumps(asdict(report), indent=2))
+    return report
+
+
+def _watch(ledger: Ledger, arguments: List[str]) -> str:
+    """Run the process; "" if it ended well, "hang" if one file took too long, else how it died."""
+    paths = os.pathsep.join([str(TESTS), str(TESTS.parent), *filter(None, [os.environ.get("PYTHONPATH")])])
+    environment = {**os.environ, "PYTHONPATH": paths, "OMP_NUM_THREADS": "1", "PYTHONFAULTHANDLER": "1"}
+    with open(ledger.folder / "stderr", "w") as stderr:
+        child = subprocess.Popen(
+            [sys.executable, "-m", "fuzzing.child", *arguments], env=environment, stderr=stderr, stdout=stderr
+        )
+        done, since = -1, time.monotonic()
+        while child.poll() is None:
+            time.sleep(0.2)
+            now = ledger.counts()["cases"]
+            if now != done:
+                done, since = now, time.monotonic()
+            elif time.monotonic() - since > HANGS + (60 if now == 0 else 0):
+                child.send_signal(signal.SIGABRT)  # faulthandler prints where it was
+                child.wait(10)
+                return "hang"
+    return "" if child.returncode == 0 else f"crash{child.returncode}"
