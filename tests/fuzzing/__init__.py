@@ -1,1 +1,1 @@
-"""Fuzzing of the readers: what is fed to them (targets, mutation), what may come out (outcome), long runs (campaign)."""
+"""Fuzzing of the readers: what they are fed (targets, mutation), what may come of it (outcome), long runs."""

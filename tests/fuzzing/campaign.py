@@ -53,6 +53,10 @@ def run(target: Target, engine: str, cases: int, seed: int, folder: Path) -> Rep
     ledger = Ledger(folder)
     ends: Dict[str, int] = {"crashes": 0, "hangs": 0}
     began = time.monotonic()
+
+    def said() -> str:
+        return (folder / "stderr").read_text(errors="replace")[-4000:]
+
     while (done := ledger.counts()["cases"]) < cases and sum(ends.values()) < MOST_ENDS:
         with tempfile.TemporaryDirectory(prefix="fuzz-", dir="/dev/shm" if os.path.isdir("/dev/shm") else None) as work:
             now = seed + 1000 * sum(ends.values())
@@ -60,11 +64,9 @@ def run(target: Target, engine: str, cases: int, seed: int, folder: Path) -> Rep
             if how:
                 ends["hangs" if how == "hang" else "crashes"] += 1
                 last = Path(work) / target.file
-                ledger.finding(
-                    how, last.read_bytes() if last.exists() else b"", (folder / "stderr").read_text()[-4000:]
-                )
+                ledger.finding(how, last.read_bytes() if last.exists() else b"", said())
             elif ledger.counts()["cases"] == done:
-                raise RuntimeError(f"{target.name}: no case was run: {(folder / 'stderr').read_text()[-4000:]}")
+                raise RuntimeError(f"{target.name}: no case was run: {said()}")
     findings = sorted(file.stem for file in (folder / "findings").glob("*.txt"))
     counts = ledger.counts()
     report = Report(target.name, engine, **counts, **ends, seconds=time.monotonic() - began, findings=findings)

@@ -1,4 +1,4 @@
-"""What a fuzzed process has done so far, where it survives the process: a small mapped file and a folder of findings."""
+"""What a fuzzed process has done so far, kept where it outlives the process: a mapped file, a folder of findings."""
 
 from __future__ import annotations
 
