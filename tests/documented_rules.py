@@ -180,6 +180,7 @@ NOT_RUN: Dict[str, str] = {
     "./scripts/demo.sh": "installs; .ci/run runs it on every commit",
     ".ci/run": "runs this test",
     "python /path/to/cflow_torch/tests/opensceneflow_stubs/launch.py eval.py ...": "needs files of OpenSceneFlow",
+    "python scripts/lock.py": "asks PyPI; tests/test_lock.py holds what it wrote",
     "scripts/check_environments.py old": "makes environments: 6 GB from the index",
     "python scripts/check_environments.py old new": "makes environments: 12 GB from the index",
     "python scripts/beyond.py ablation --sets real odd sim --seeds 100-103": "hours; 15 minutes on one seed",
