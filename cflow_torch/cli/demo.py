@@ -14,6 +14,7 @@ from __future__ import annotations
 from omegaconf import DictConfig
 
 from cflow_torch.cli.eval import report
+from cflow_torch.cli.pairs import Pairs
 from cflow_torch.cli.run import finish, for_each_pair, make_model, number, open_logs, output_folder
 from cflow_torch.data.flow_file import write_flow
 from cflow_torch.data.log import Log
@@ -53,7 +54,7 @@ def task(cfg: DictConfig) -> None:
             save_picture(figure, output / "flow.png")
             is_drawn = True
 
-    failures += for_each_pair(logs, model, keep)
+    failures += for_each_pair(logs, model, keep, Pairs().of)
     report(cfg, metrics, output)
     if is_drawn:
         print(f"picture: {output / 'flow.png'}")

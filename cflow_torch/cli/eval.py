@@ -19,13 +19,13 @@ from typing import Any, Dict
 
 from omegaconf import DictConfig
 
+from cflow_torch.cli.pairs import chosen_pairs
 from cflow_torch.cli.record import DataIdentity, finished_results, write_results
 from cflow_torch.cli.run import (
     UnfinishedJob,
     finish,
     for_each_pair,
     make_model,
-    number,
     open_logs,
     output_folder,
 )
@@ -40,7 +40,7 @@ from cflow_torch.types import CFlowError, FlowResult, Window
 def task(cfg: DictConfig) -> float:
     """Run `cflow eval`; returns the score of a sweep, see `objective`."""
     output = output_folder(cfg)
-    first, step = number(cfg, "data.first"), number(cfg, "data.step")
+    pairs = chosen_pairs(cfg, "data.first", "data.step")
     record = finished_results(cfg, output)
     if record is not None:
         print(f"skipped, done before: {output}")
@@ -59,7 +59,7 @@ def task(cfg: DictConfig) -> float:
             metrics.update(EvalFrame.from_result(sweeps, result, labels, **parts))
             identity.add(sweeps, labels)
 
-    failures += for_each_pair(logs, model, score, first, step)
+    failures += for_each_pair(logs, model, score, pairs.of)
     if metrics.num_frames == 0:
         raise CFlowError("no pair has labels: nothing to score; `cflow flow` estimates the flow without them")
     results = report(cfg, metrics, output, data=identity.report(), seconds=model.report(), failures=failures)

@@ -27,6 +27,7 @@ import numpy as np
 from omegaconf import DictConfig
 from tqdm import tqdm
 
+from cflow_torch.cli.pairs import chosen_pairs
 from cflow_torch.cli.run import find_logs, make_model, number, output_folder
 from cflow_torch.data.catalog import open_log
 from cflow_torch.data.log import Log, RecentSweeps, window
@@ -179,19 +180,14 @@ def _animate(cfg: DictConfig, model: CoarseToFine, output: Path) -> Path:
     """Flow of several pairs, then their pictures; nothing is written if one of them fails."""
     if cfg.format not in FORMATS:
         raise CFlowError(f"format={cfg.format}: give one of {', '.join(FORMATS)}")
-    first, step, count = number(cfg, "first"), number(cfg, "step"), number(cfg, "count", or_null=True)
-    if first < 0 or step < 1 or (count is not None and count < 1):
-        raise CFlowError(
-            f"first={first}, step={step}, count={count}: give a first pair of at least 0, a step and a count of at "
-            "least 1"
-        )
+    chosen = chosen_pairs(cfg, "first", "step", "count")
     max_flow, width = number(cfg, "max_flow", float, or_null=True), number(cfg, "width")
     frames_per_second = number(cfg, "frames_per_second", float)
     log = find_log(cfg)
     recent = RecentSweeps(log, model.config.num_history + 2)
-    pairs = range(first, len(log.timestamps) - 1, step)[:count]
+    pairs = chosen.of(log)
     if not pairs:
-        raise CFlowError(f"first={first}: log {log.log_id} has pairs 0 to {len(log.timestamps) - 2}")
+        raise CFlowError(f"first={chosen.first}: log {log.log_id} has pairs 0 to {len(log.timestamps) - 2}")
     frames: List[Frame] = []
     for pair in counted(pairs):
         sweeps = _window(recent, pair, model.config.num_history)

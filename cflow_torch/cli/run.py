@@ -173,28 +173,22 @@ def open_logs(cfg: DictConfig) -> Tuple[List[Log], Failures]:
     return logs, failures
 
 
-def for_each_pair(logs: Sequence[Log], model: FlowModel, use: UseResult, first: int = 0, step: int = 1) -> Failures:
-    """Estimate the flow of every pair of every log and hand it on; a bad frame is reported and the rest goes on.
+def for_each_pair(logs: Sequence[Log], model: FlowModel, use: UseResult, pairs: Callable[[Log], range]) -> Failures:
+    """Estimate the flow of the pairs of every log and hand it on; a bad frame is reported and the rest goes on.
 
     Args:
         logs: logs of at least two sweeps.
         model: the method.
         use: what to do with a result.
-        first: first pair of each log.
-        step: take every `step`-th pair from there.
+        pairs: which ones of a log, by index.
 
     Returns:
         (frame, message) of every pair that failed.
-
-    Raises:
-        CFlowError: `first` below 0 or `step` below 1.
     """
-    if first < 0 or step < 1:
-        raise CFlowError(f"data.first={first}, data.step={step}: give a first pair of at least 0, a step of at least 1")
     recent = [RecentSweeps(log, model.config.num_history + 2) for log in logs]
-    pairs = [(log, index) for log in recent for index in range(first, len(log.timestamps) - 1, step)]
+    indices = [(log, index) for log in recent for index in pairs(log)]
     failures: Failures = []
-    for log, index in frames(pairs):
+    for log, index in frames(indices):
         try:
             sweeps = window(log, index, model.config.num_history)
             (result,) = model([sweeps])

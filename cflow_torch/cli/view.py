@@ -23,6 +23,7 @@ from typing import Any, Callable, Iterator, List, Tuple
 from omegaconf import DictConfig
 from tqdm import tqdm
 
+from cflow_torch.cli.pairs import chosen_pairs
 from cflow_torch.cli.run import Failures, finish, make_model, number, open_logs, output_folder, write_config
 from cflow_torch.data.flow_file import read_flow
 from cflow_torch.data.log import Log, RecentSweeps, window
@@ -41,12 +42,7 @@ def task(cfg: DictConfig) -> None:
     output = output_folder(cfg)
     if is_remote(output):
         raise CFlowError(f"{output}: recordings are written on this machine only; give output=FOLDER and copy them")
-    first, step, limit = number(cfg, "data.first"), number(cfg, "data.step"), number(cfg, "count", or_null=True)
-    if first < 0 or step < 1 or (limit is not None and limit < 1):
-        raise CFlowError(
-            f"data.first={first}, data.step={step}, count={limit}: "
-            "give a first pair of at least 0, a step and a count of at least 1"
-        )
+    chosen = chosen_pairs(cfg, "data.first", "data.step", "count")
     max_flow = number(cfg, "max_flow", float)
     if not 0 < max_flow < float("inf"):
         raise CFlowError(f"max_flow={max_flow}: give a positive length in metres per sweep")
@@ -55,7 +51,7 @@ def task(cfg: DictConfig) -> None:
     write_config(cfg, output)
     files: List[Path] = []
     for log in logs:
-        pairs = range(first, len(log.timestamps) - 1, step)[:limit]
+        pairs = chosen.of(log)
         recent: Any = RecentSweeps(log, history + 2)
         file = output / f"{log.log_id}.rrd"
         if file in files:
