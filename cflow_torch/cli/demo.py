@@ -18,6 +18,7 @@ from cflow_torch.cli.pairs import Pairs
 from cflow_torch.cli.run import finish, for_each_pair, make_model, number, open_logs, output_folder
 from cflow_torch.data.flow_file import write_flow
 from cflow_torch.data.log import Log
+from cflow_torch.data.names import folder_in
 from cflow_torch.evaluation.frame import EvalFrame
 from cflow_torch.evaluation.metrics import SceneFlowMetrics
 from cflow_torch.types import CFlowError, FlowResult, Window
@@ -39,7 +40,7 @@ def task(cfg: DictConfig) -> None:
 
     def keep(log: Log, index: int, sweeps: Window, result: FlowResult) -> None:
         nonlocal is_drawn
-        write_flow(output / log.log_id / f"{log.timestamps[index]}.feather", result)
+        write_flow(folder_in(output, log.log_id, "the log") / f"{log.timestamps[index]}.feather", result)
         labels = log.labels(index)
         if labels is not None:
             metrics.update(EvalFrame.from_result(sweeps, result, labels))

@@ -9,6 +9,7 @@ from typing import Any, Dict, Sequence
 
 from cflow_torch.data.log import Log
 from cflow_torch.data.log_check import check_log
+from cflow_torch.data.names import safe_name
 from cflow_torch.data.paths import as_path, is_place, remote_errors
 from cflow_torch.types import CFlowError
 
@@ -81,7 +82,8 @@ def open_log(
         The log.
 
     Raises:
-        CFlowError: a log that cannot be read; a setting that the reader does not have (the message lists its own).
+        CFlowError: a log that cannot be read, or whose name cannot be a folder's; a setting that the reader does not
+            have (the message lists its own).
     """
     data_set = _data_set(name)
     reader = getattr(import_module(f"cflow_torch.data.{data_set.module}"), data_set.log)
@@ -93,6 +95,7 @@ def open_log(
         raise CFlowError(f"find_ground={find_ground!r}: give null or one of {', '.join(GROUND_METHODS)}")
     with remote_errors(source if is_place(source) else source.root):
         log: Log = reader(source, **settings)
+    safe_name(log.log_id, f"{source}: the log")  # results get that name
     if odometry:
         from cflow_torch.data.odometry import with_poses
 

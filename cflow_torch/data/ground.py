@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Dict, Optional, Union
 
 import numpy as np
 
-from cflow_torch.data.paths import read_bytes, whole
+from cflow_torch.data.json_file import read_json
+from cflow_torch.data.paths import whole
 from cflow_torch.types import CFlowError
 
 
@@ -114,14 +114,14 @@ def read_ground_raster(map_folder: Path) -> Optional[GroundRaster]:
         )
     try:
         heights = np.load(whole(rasters[0]), allow_pickle=False)
-        alignment = json.loads(read_bytes(alignments[0]))
+        alignment = read_json(alignments[0])
         raster = GroundRaster(
             heights=heights.astype(np.float64),
             rotation=np.array(alignment["R"], dtype=np.float64).reshape(2, 2),
             translation=np.array(alignment["t"], dtype=np.float64).reshape(2),
             scale=float(alignment["s"]),
         )
-    except (OSError, EOFError, ValueError, KeyError, TypeError) as error:
+    except (OSError, EOFError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise CFlowError(
             f"cannot read the ground raster in {map_folder}: {error}; copy the map folder again"
         ) from error

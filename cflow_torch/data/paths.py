@@ -6,15 +6,17 @@ pathlib's interface and the functions below.
 
 from __future__ import annotations
 
+import errno
 import io
 import mmap
 import re
 import shutil
+import stat
 import tempfile
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path, PosixPath, WindowsPath
-from typing import Any, Dict, Iterator, Union
+from typing import Any, Dict, Iterator, Optional, Union
 
 import pyarrow as pa
 
@@ -95,17 +97,33 @@ def forget_listings(path: Any) -> None:
         path.fs.invalidate_cache()
 
 
-def read_bytes(path: Path) -> bytes:
+def read_bytes(path: Path, most: Optional[int] = None) -> bytes:
     """All of a file, in one request if it is remote.
 
+    Args:
+        path: of a regular file. Reading a device or a pipe, which an unpacked archive can hold, would never end.
+        most: bytes that it may have.
+
     Raises:
+        CFlowError: it has more.
         OSError: as for a local file, and if the far side cannot be reached.
     """
     if not is_remote(path):
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode) and not stat.S_ISDIR(status.st_mode):
+            raise OSError(errno.EINVAL, "is a device or a pipe, no file", str(path))
+        _check_size(path, status.st_size, most)
         return path.read_bytes()
     remote: Any = path
     with remote_errors(path):
-        return bytes(remote.fs.cat_file(remote.path))  # pathlib's own way asks for the size first
+        data = bytes(remote.fs.cat_file(remote.path))  # pathlib's own way asks for the size first
+    _check_size(path, len(data), most)
+    return data
+
+
+def _check_size(path: Path, size: int, most: Optional[int]) -> None:
+    if most is not None and size > most:
+        raise CFlowError(f"{path} has {size} bytes, up to {most} are read; is it the right file?")
 
 
 def whole(path: Path) -> Any:

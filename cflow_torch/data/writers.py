@@ -14,6 +14,7 @@ from pyarrow import feather
 
 from cflow_torch.data.atomic import atomic_folder
 from cflow_torch.data.log import Log
+from cflow_torch.data.names import safe_name
 from cflow_torch.types import CFlowError
 
 CITY = "SYN"  # stands where Argoverse 2 has the code of the city
@@ -115,9 +116,7 @@ def write_av2_log(log: AnnotatedLog, root: Union[str, Path], overwrite: bool = F
             f"log {log.log_id} has no {', '.join(missing)}, which the Argoverse 2 layout needs; only logs with all "
             "members of AnnotatedLog can be written"
         )
-    if Path(log.log_id).name != log.log_id:
-        raise CFlowError(f"log_id {log.log_id!r} is no folder name; it must have no separators and not be empty")
-    folder = Path(root) / log.log_id
+    folder = Path(root) / safe_name(log.log_id, "log_id")
     if folder.exists() and not overwrite:
         raise CFlowError(f"{folder} exists already; pass overwrite=True to replace it, or choose another root")
     with atomic_folder(folder) as new:

@@ -22,14 +22,16 @@ from cflow_torch import __version__
 from cflow_torch.config import Config
 from cflow_torch.data.atomic import remove_stale
 from cflow_torch.data.flow_file import CONTENTS
+from cflow_torch.data.json_file import read_json
 from cflow_torch.data.log import Log
-from cflow_torch.data.paths import forget_listings, read_bytes, remote_errors
+from cflow_torch.data.names import leaves
+from cflow_torch.data.paths import forget_listings, remote_errors
 from cflow_torch.data.records import changes, strict, write_text
 from cflow_torch.types import CFlowError, as_numpy
 
 MANIFEST = "manifest.json"
 _FORMAT = 1
-_OURS = re.compile(r"\d+\.feather|manifest\.json|\..+\.tmp")
+_OURS = re.compile(r"[0-9]+\.feather|manifest\.json|\..+\.tmp")
 _REMEDY = "give output=FOLDER, or overwrite=true"
 
 
@@ -135,7 +137,7 @@ def complete_frames(folder: Path) -> Set[int]:
     forget_listings(folder)
     with remote_errors(folder):
         names = [file.name for file in folder.iterdir()] if folder.is_dir() else []
-    return {int(name[: -len(".feather")]) for name in names if re.fullmatch(r"\d+\.feather", name)}
+    return {int(name[: -len(".feather")]) for name in names if re.fullmatch(r"[0-9]{1,20}\.feather", name)}
 
 
 def frame_file(folder: Path, timestamp: int) -> Path:
@@ -170,7 +172,7 @@ def _clear(output: Path) -> None:
     Its manifest goes first: what is left half-way belongs to none. That of a log goes last: it tells whose frames they
     are.
     """
-    logs: List[Path] = [path for path in output.iterdir() if path.is_dir()]
+    logs: List[Path] = [path for path in output.iterdir() if path.is_dir() and not leaves(output, path)]
     for name in (MANIFEST, "config.yaml"):
         with suppress(FileNotFoundError):
             (output / name).unlink()
@@ -186,10 +188,10 @@ def _clear(output: Path) -> None:
 
 def _read(file: Path) -> Optional[Dict[str, Any]]:
     try:
-        content = json.loads(read_bytes(file))
+        content = read_json(file)
     except FileNotFoundError:
         return None
-    except ValueError as error:
+    except CFlowError as error:
         raise CFlowError(f"{file} is no manifest ({error}): remove it, or {_REMEDY}") from None
     if not isinstance(content, dict):
         raise CFlowError(f"{file} is no manifest: remove it, or {_REMEDY}")

@@ -10,6 +10,7 @@ from typing import Any, Dict, Iterator, Sequence
 from tqdm import tqdm
 
 from cflow_torch.data.atomic import remove_stale
+from cflow_torch.data.names import folder_in
 from cflow_torch.data.paths import as_path
 from cflow_torch.data.records import write_text
 from cflow_torch.fleet.job import Event, Failed, Job, Opened, split
@@ -79,7 +80,7 @@ def run_fleet(
 
 def report_file(output: str, shard: Shard) -> Any:
     """Where a shard's report lies."""
-    return as_path(output) / "reports" / f"shard-{shard.index}-of-{shard.count}.json"
+    return folder_in(as_path(output), "reports", "the folder") / f"shard-{shard.index}-of-{shard.count}.json"
 
 
 def _engine(name: str) -> Any:

@@ -17,6 +17,7 @@ from cflow_torch.data.catalog import open_log
 from cflow_torch.data.flow_file import write_flow
 from cflow_torch.data.log import Log, RecentSweeps, window
 from cflow_torch.data.log_check import check_log
+from cflow_torch.data.names import folder_in
 from cflow_torch.data.paths import as_path
 from cflow_torch.estimate import make_model
 from cflow_torch.fleet.job import Begun, Done, Event, Failed, Job, Opened, Unit
@@ -76,7 +77,7 @@ class Worker:
         """
         try:
             log = self._open(unit.source)
-            folder = as_path(self._job.output) / log.log_id
+            folder = folder_in(as_path(self._job.output), log.log_id, "the log")
             complete = set() if self._job.redo else complete_frames(folder)
             frames = unit.frames(len(log.timestamps) - 1)
             needless = complete | unit.skip

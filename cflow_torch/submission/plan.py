@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Dict, Iterable, List, Mapping, Optional, Sequence, Union
 
 from cflow_torch.data.log import Log
+from cflow_torch.data.names import safe_name, same_names
 from cflow_torch.submission.masks import MaskArchive, log_mask, point_mask
 from cflow_torch.submission.versions import SubmissionVersion
 from cflow_torch.types import CFlowError
 
 STRIDE = 5  # every fifth pair of a log is evaluated
-_LISTED = re.compile(r"(?P<log>[^\s,/]+)[\s,/]+(?P<timestamp>\d+)")
+_LISTED = re.compile(r"(?P<log>[^\s,/]+)[\s,/]+(?P<timestamp>[0-9]{1,19})")
 
 
 @dataclass(frozen=True)
@@ -67,8 +68,7 @@ def plan_log(
     Raises:
         CFlowError: a listed time stamp is not in the log, or is its last; the log's name is no folder name.
     """
-    if Path(log.log_id).name != log.log_id or "\\" in log.log_id:
-        raise CFlowError(f"log_id {log.log_id!r} is no folder name, which a submission needs")
+    safe_name(log.log_id, "the log")
     if listed is not None:
         indices = [_position(log, stamp) for stamp in sorted(listed.get(log.log_id, ()))]
     else:
@@ -114,15 +114,18 @@ def read_frame_list(file: Union[str, Path]) -> Dict[str, List[int]]:
 
 
 def require_logs(logs: Iterable[Log], listed: Optional[Mapping[str, Sequence[int]]]) -> None:
-    """Refuse two logs of one name, and a list that names logs which are not there.
+    """Refuse two logs of one name, upper and lower case taken as one, and a list that names logs which are not there.
 
     Raises:
         CFlowError: as said.
     """
     names = [log.log_id for log in logs]
-    twice = sorted({name for name in names if names.count(name) > 1})
+    twice = same_names(names)
     if twice:
-        raise CFlowError(f"several logs are called {', '.join(twice)}: their files would overwrite each other")
+        raise CFlowError(
+            f"several logs are called {', '.join(twice)}: their files would overwrite each other, where the archive is "
+            "unpacked if not here"
+        )
     missing = sorted(set(listed or ()) - set(names))
     if missing:
         raise CFlowError(

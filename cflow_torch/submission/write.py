@@ -11,6 +11,7 @@ import pyarrow as pa
 from pyarrow import feather
 
 from cflow_torch.data.atomic import atomic_file
+from cflow_torch.data.names import folder_in
 from cflow_torch.submission.check import check_file
 from cflow_torch.submission.plan import Frame
 from cflow_torch.submission.versions import METADATA_FILE, SubmissionVersion
@@ -23,10 +24,15 @@ def write_frame(folder: Union[str, Path], name: str, columns: Mapping[str, np.nd
         folder: root of the submission.
         name: inside the archive, `<log>/<stem>.feather`.
         columns: what `encode` returned.
+
+    Raises:
+        CFlowError: the log's name cannot be a folder's, or its folder is a link that leaves the submission's.
     """
+    log_id, _, stem = name.rpartition("/")
+    file = folder_in(Path(folder), log_id, "the log") / stem
     table = pa.table({key: pa.array(values) for key, values in columns.items()})
-    with atomic_file(Path(folder) / name) as file:
-        feather.write_feather(table, file)
+    with atomic_file(file) as stream:
+        feather.write_feather(table, stream)
 
 
 def write_metadata(folder: Union[str, Path], version: SubmissionVersion) -> None:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import zipfile
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any, Dict, List, Optional, Sequence, Tuple
 
 import numpy as np
@@ -12,8 +11,10 @@ import numpy as np
 from cflow_torch.data.aevascenes.npz_strings import npz_contents, read_npz_member
 from cflow_torch.data.boxes import Boxes, flow_from_boxes
 from cflow_torch.data.folders import find_folders
+from cflow_torch.data.json_file import is_number, is_whole, read_json, shown
 from cflow_torch.data.log import FlowLabels
-from cflow_torch.data.paths import Place, as_path, read_bytes
+from cflow_torch.data.names import inside
+from cflow_torch.data.paths import Place, as_path
 from cflow_torch.ego import relative_transform
 from cflow_torch.evaluation.categories import CATEGORY_INDEX
 from cflow_torch.types import CFlowError, Sweep
@@ -105,18 +106,19 @@ class AevaScenesLog:
         extrinsics = self._get(metadata, "metadata", "vehicle_to_lidar_extrinsics")
         known = self._get(metadata, "metadata", "sensors", "lidars")
         if not isinstance(known, list) or not all(isinstance(name, str) for name in known):
-            raise CFlowError(f"{self._file}: sensors.lidars must be a list of names, got {known}")
+            raise CFlowError(f"{self._file}: sensors.lidars must be a list of names, got {shown(known)}")
         self.lidars: Sequence[str] = tuple(known if lidars is None else lidars)
         strangers = sorted(set(self.lidars) - set(known))
         if strangers or not self.lidars:
-            raise CFlowError(f"{self._file} has the LiDARs {known}; got {list(self.lidars)}")
+            raise CFlowError(f"{self._file} has the LiDARs {shown(known)}; got {shown(list(self.lidars))}")
         self._T_ego_lidar = {
             name: self._pose(self._get(extrinsics, "vehicle_to_lidar_extrinsics", name), f"extrinsic of {name}")
             for name in self.lidars
         }
-        by_time = {self._get(frame, f"frame number {i}", "timestamp_ns"): frame for i, frame in enumerate(frames)}
-        if not all(isinstance(time, int) for time in by_time):
-            raise CFlowError(f"{self._file}: timestamp_ns must be integers, got {list(by_time)[:3]} ...")
+        times = [self._get(frame, f"frame number {i}", "timestamp_ns") for i, frame in enumerate(frames)]
+        if not all(map(is_whole, times)):
+            raise CFlowError(f"{self._file}: timestamp_ns must be integers of 64 bits, got {shown(times)}")
+        by_time = dict(zip(times, frames))
         if len(by_time) < 2 or len(by_time) < len(frames):
             raise CFlowError(
                 f"{self._file} has {len(frames)} frames with {len(by_time)} different times; two or more are needed"
@@ -207,30 +209,32 @@ class AevaScenesLog:
         where, files = f"frame {self.timestamps[index]}", []
         for name in self.lidars:
             entry = self._get(self._frames[index], where, "point_cloud", name)
-            path = next((entry[key] for key in _PATHS[self._clouds] if key in entry), None)
-            if not isinstance(path, str):
+            keys = [key for key in _PATHS[self._clouds] if isinstance(entry, dict) and key in entry]
+            if not keys:
                 raise CFlowError(
-                    f"{self._file}, {where}, {name}: no {self._clouds} cloud, only {sorted(entry)}; raw clouds come "
+                    f"{self._file}, {where}, {name}: no {self._clouds} cloud, only {shown(entry)}; raw clouds come "
                     f"with version 2 of the data set"
                 )
-            parts = PurePosixPath(path)
-            if parts.is_absolute() or ".." in parts.parts:
-                raise CFlowError(f"{self._file}, {where}, {name}: path {path!r} leaves the sequence folder")
-            files.append(self.folder / path)
+            files.append(inside(self.folder, entry[keys[0]], f"{self._file}, {where}, {name}: the path"))
         return files
 
     def _boxes(self, index: int) -> Boxes:
         where = f"frame {self.timestamps[index]}"
         tracks, categories, sizes, poses = [], [], [], []
-        for box in self._frames[index].get("boxes") or []:
+        listed = self._frames[index].get("boxes") or []
+        if not isinstance(listed, list):
+            raise CFlowError(f"{self._file}, {where}: boxes must be a list, got {shown(listed)}")
+        for box in listed:
             kind = self._get(box, where, "class")
-            if kind not in CATEGORY_NAME:
-                raise CFlowError(f"{self._file}, {where}: unknown class {kind!r}; known are {', '.join(CATEGORY_NAME)}")
+            if not isinstance(kind, str) or kind not in CATEGORY_NAME:
+                raise CFlowError(
+                    f"{self._file}, {where}: unknown class {shown(kind)}; known are {', '.join(CATEGORY_NAME)}"
+                )
             if CATEGORY_NAME[kind] == "NONE":
                 continue
             if box.get("reference_frame", "VEHICLE") != "VEHICLE":
-                raise CFlowError(f"{self._file}, {where}: boxes are in VEHICLE, got {box['reference_frame']!r}")
-            tracks.append(str(self._get(box, where, "id")))
+                raise CFlowError(f"{self._file}, {where}: boxes are in VEHICLE, got {shown(box['reference_frame'])}")
+            tracks.append(self._track(box, where))
             categories.append(CATEGORY_INDEX[CATEGORY_NAME[kind]])
             sizes.append(self._numbers(self._get(box, where, "dimensions"), "xyz", where))
             poses.append(self._pose(self._get(box, where, "pose"), f"{where}, box {tracks[-1]}"))
@@ -246,11 +250,11 @@ class AevaScenesLog:
 
     def _read_sequence(self) -> Tuple[Dict[str, Any], List[Dict[str, Any]]]:
         try:
-            content = json.loads(read_bytes(self._file))
+            content = read_json(self._file)
         except FileNotFoundError:
             raise CFlowError(f"{self.folder} is no AevaScenes sequence: it holds no sequence.json") from None
-        except (ValueError, OSError, RecursionError) as error:
-            raise CFlowError(f"cannot read {self._file}: {error}; it may be truncated, copy it again") from error
+        except OSError as error:
+            raise CFlowError(f"cannot read {self._file} ({error}); copy it again") from error
         metadata, frames = (self._get(content, "the file", key) for key in ("metadata", "frames"))
         if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
             raise CFlowError(f"{self._file}: frames must be a list of objects; is this a sequence of AevaScenes?")
@@ -260,15 +264,21 @@ class AevaScenesLog:
         """Value below an object of the file, key by key."""
         for key in keys:
             if not isinstance(node, dict) or key not in node:
-                has = sorted(node) if isinstance(node, dict) else type(node).__name__
+                has = shown(sorted(node)) if isinstance(node, dict) else type(node).__name__
                 raise CFlowError(f"{self._file}: {where} has no {key!r} (it has {has}); is this AevaScenes, complete?")
             node = node[key]
         return node
 
+    def _track(self, box: Any, where: str) -> str:
+        name = self._get(box, where, "id")
+        if type(name) not in (str, int):
+            raise CFlowError(f"{self._file}, {where}: the id of a box is text or a number, got {shown(name)}")
+        return str(name)
+
     def _numbers(self, node: Any, keys: str, where: str) -> List[float]:
         values = [self._get(node, where, key) for key in keys]
-        if not all(isinstance(value, (int, float)) and np.isfinite(value) for value in values):
-            raise CFlowError(f"{self._file}: {where}: {', '.join(keys)} must be finite numbers, got {values}")
+        if not all(map(is_number, values)):
+            raise CFlowError(f"{self._file}: {where}: {', '.join(keys)} must be finite numbers, got {shown(values)}")
         return values
 
     def _pose(self, node: Any, where: str) -> np.ndarray:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import uuid
 from pathlib import Path
 from typing import Any, Dict, List, Sequence, Union
@@ -14,6 +13,7 @@ import numpy as np
 from cflow_torch.data.aevascenes.reader import CATEGORY_NAME, GROUND
 from cflow_torch.data.atomic import atomic_folder
 from cflow_torch.data.boxes import points_in_box
+from cflow_torch.data.names import safe_name
 from cflow_torch.data.recording import Recording, UnitReturns
 from cflow_torch.data.writers import Boxes, quaternions
 from cflow_torch.types import CFlowError
@@ -68,9 +68,7 @@ def write_aevascenes_sequence(
     """
     if layout not in _PATH_KEY:
         raise CFlowError(f"layout is one of {', '.join(_PATH_KEY)}; got {layout!r}")
-    if not re.fullmatch(r"[\w.+=@-]+", log.log_id) or log.log_id.startswith("."):
-        raise CFlowError(f"log_id {log.log_id!r} cannot be a folder name; use letters, digits, _ and -")
-    folder = Path(root) / log.log_id
+    folder = Path(root) / safe_name(log.log_id, "log_id")
     if folder.exists() and not overwrite:
         raise CFlowError(f"{folder} exists; give overwrite=True to replace the sequence")
     with atomic_folder(folder) as new:
@@ -91,7 +89,7 @@ def _write_sequence(log: Recording, folder: Path, path_key: str) -> None:
         clouds, begin = {}, 0
         for unit in units:
             mounts[unit.name] = np.asarray(unit.T_ego_sensor, np.float64)
-            path = f"{_FOLDER}/{unit.name}_{stamp}.npz"
+            path = f"{_FOLDER}/{safe_name(unit.name, 'the LiDAR')}_{stamp}.npz"
             end = begin + len(unit.points)
             _write_cloud(folder / path, unit, classes[begin:end], f"sweep {index} of log {log.log_id}")
             clouds[unit.name] = {path_key: path}

@@ -13,6 +13,7 @@ from cflow_torch.data.arrays.poses_text import write_kitti_poses, write_times, w
 from cflow_torch.data.arrays.reader import GROUND_FOLDER
 from cflow_torch.data.atomic import atomic_folder
 from cflow_torch.data.log import Log
+from cflow_torch.data.names import safe_name
 from cflow_torch.types import CFlowError
 
 
@@ -39,7 +40,7 @@ def write_array_log(log: Log, root: Union[str, Path], suffix: str = ".npy", pose
         raise CFlowError(
             f"suffix={suffix!r}, poses={poses!r}: give one of {SUFFIXES} and 'kitti', 'tum', 'npy' or None"
         )
-    folder = Path(root) / log.log_id
+    folder = Path(root) / safe_name(log.log_id, "log_id")
     if folder.exists():
         raise CFlowError(f"{folder} exists already: remove it, or choose another root")
     with atomic_folder(folder) as new:

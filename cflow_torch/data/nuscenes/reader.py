@@ -8,7 +8,9 @@ from typing import ClassVar, List, Mapping, NamedTuple, Optional, Sequence, Tupl
 import numpy as np
 
 from cflow_torch.data.boxes import Boxes, flow_from_boxes, points_in_box
+from cflow_torch.data.json_file import shown
 from cflow_torch.data.log import FlowLabels
+from cflow_torch.data.names import inside
 from cflow_torch.data.nuscenes.categories import NUSCENES_CATEGORIES, OWN_TRAILER
 from cflow_torch.data.nuscenes.tables import LidarChain, SceneSource, Tables, find_scenes
 from cflow_torch.data.nuscenes.tracks import TrackBoxes, Tracks, poses_at, transforms
@@ -91,7 +93,9 @@ class NuScenesLog:
         scene = (source.tables or Tables(folder)).scene(source.scene)
         unknown = sorted(set(scene.annotations.category) - set(self._categories))
         if unknown:
-            raise CFlowError(f"{folder}: unknown categories {unknown}; the known ones are {sorted(self._categories)}")
+            raise CFlowError(
+                f"{folder}: unknown categories {shown(unknown)}; the known ones are {sorted(self._categories)}"
+            )
         missing = [] if lidars is None else [name for name in lidars if name not in scene.lidars]
         if missing or not scene.lidars:
             raise CFlowError(
@@ -188,7 +192,7 @@ class NuScenesLog:
 
     def _unit_points(self, chain: LidarChain, row: int, index: int) -> Tuple[np.ndarray, np.ndarray]:
         """`_cloud` of one sweep of one LiDAR."""
-        file = self._root / chain.files[row]
+        file = inside(self._root, chain.files[row], f"scene {self.log_id}: the filename in sample_data.json")
         try:
             content = read_bytes(file)
         except FileNotFoundError:

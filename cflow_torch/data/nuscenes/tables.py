@@ -10,6 +10,8 @@ from typing import Collection, Dict, List, Mapping, Optional, Sequence, Tuple
 import numpy as np
 
 from cflow_torch.data.folders import find_folders
+from cflow_torch.data.json_file import shown
+from cflow_torch.data.names import safe_name
 from cflow_torch.data.nuscenes.json_tables import Row, read_table
 from cflow_torch.data.paths import Place, as_path
 from cflow_torch.types import CFlowError
@@ -135,10 +137,14 @@ class Tables:
         """Sorted names.
 
         Raises:
-            CFlowError: scene.json cannot be read.
+            CFlowError: scene.json cannot be read, has two scenes of one name, or a name that no folder can have.
         """
         if self._scenes is None:
-            self._scenes = {row["name"]: row["token"] for row in read_table(self.folder, "scene")}
+            rows, file = read_table(self.folder, "scene"), self.folder / "scene.json"
+            scenes = {safe_name(row["name"], f"{file}: the scene"): row["token"] for row in rows}
+            if len(scenes) < len(rows):
+                raise CFlowError(f"{file} has {len(rows)} scenes, but {len(scenes)} names; {_COPY}")
+            self._scenes = scenes
         return sorted(self._scenes)
 
     def scene(self, name: str) -> SceneTables:
@@ -197,7 +203,9 @@ class Tables:
             token = start["token"]
             while token and len(chained) <= len(rows):
                 if token not in by_token:
-                    raise CFlowError(f"{file}: {name}: a sweep's next is {token}, which is no sweep of it; {_COPY}")
+                    raise CFlowError(
+                        f"{file}: {name}: a sweep's next is {token[:80]}, which is no sweep of it; {_COPY}"
+                    )
                 chained.append(by_token[token])
                 token = by_token[token]["next"]
         times = np.array([row["timestamp"] for row in chained], dtype=np.int64)
@@ -231,7 +239,8 @@ class Tables:
         linked = self._by_token[target].get(row[key])
         if linked is None:
             raise CFlowError(
-                f"{self.folder / table}.json names {target} {row[key]!r}, which {target}.json does not have; {_COPY}"
+                f"{self.folder / table}.json names {target} {shown(row[key])}, which {target}.json does not have; "
+                f"{_COPY}"
             )
         return linked
 

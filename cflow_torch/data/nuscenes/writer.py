@@ -14,6 +14,7 @@ from typing import Any, Dict, Iterator, List, Mapping, Sequence, Union
 import numpy as np
 
 from cflow_torch.data.atomic import atomic_file, atomic_folder
+from cflow_torch.data.names import safe_name
 from cflow_torch.data.nuscenes.categories import NUSCENES_NAMES
 from cflow_torch.data.recording import Recording, UnitReturns
 from cflow_torch.data.writers import quaternions
@@ -92,7 +93,7 @@ class SceneWriter:
     def __init__(self, recording: Recording, folder: Path, reference: str, names: Mapping[str, str]) -> None:
         self.recording, self.folder, self._names = recording, folder, names
         self._units = recording.units(0)
-        self._channels = [unit.name for unit in self._units]
+        self._channels = [safe_name(unit.name, "the LiDAR") for unit in self._units]
         if reference not in self._channels:
             self._channels[0] = reference
         self._stamps = [int(stamp) // 1000 for stamp in recording.timestamps]
@@ -253,9 +254,7 @@ def new_folder(root: Union[str, Path], name: str, overwrite: bool) -> Iterator[P
     Raises:
         CFlowError: `name` is no folder name, or the folder exists and `overwrite` is False.
     """
-    if Path(name).name != name:
-        raise CFlowError(f"log_id {name!r} is no folder name; it must have no separators and not be empty")
-    folder = Path(root) / name
+    folder = Path(root) / safe_name(name, "log_id")
     if folder.exists() and not overwrite:
         raise CFlowError(f"{folder} exists already; pass overwrite=True to replace it, or choose another root")
     with atomic_folder(folder) as new:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import shutil
 import tempfile
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from cflow_torch.data.names import safe_name
 from cflow_torch.data.recording import Recording, UnitReturns
 from cflow_torch.data.waymo.encode import encode_images, poses_of_shots
 from cflow_torch.data.waymo.parquet import (
@@ -80,9 +80,8 @@ def write_waymo_segment(
             in one pixel; time stamps that are not microseconds apart.
     """
     root = Path(root)
-    if not re.fullmatch(r"[\w.+=@-]+", log.log_id) or log.log_id.startswith("."):
-        raise CFlowError(f"log_id {log.log_id!r} cannot be a file name; use letters, digits, _ and -")
-    places = {tag: root / tag / f"{log.log_id}.parquet" for tag in SCHEMAS}
+    name = safe_name(f"{log.log_id}.parquet", "the file of log_id")
+    places = {tag: root / tag / name for tag in SCHEMAS}
     present = [str(place) for place in places.values() if place.exists()]
     if present and not overwrite:
         raise CFlowError(f"{present[0]} exists; give overwrite=True to replace the segment")
