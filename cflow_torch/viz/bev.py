@@ -9,10 +9,9 @@ import numpy as np
 
 from cflow_torch.config import Config
 from cflow_torch.data.atomic import atomic_file
-from cflow_torch.types import Array, CFlowError, FlowResult
+from cflow_torch.types import Array, CFlowError, FlowResult, as_numpy
 from cflow_torch.viz.legend import CORNERS, draw_scale, draw_wheel
 from cflow_torch.viz.panel import MOVING, draw_error, draw_flow, draw_ground, new_figure
-from cflow_torch.viz.wheel import to_numpy
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -72,7 +71,7 @@ def plot_flow(
     position, residual = position[rest], residual[rest]
     cluster = None
     if isinstance(result_or_residual, FlowResult):
-        cluster = to_numpy(result_or_residual.cluster_id)[rest]
+        cluster = as_numpy(result_or_residual.cluster_id)[rest]
     if true_flow is not None:
         true_flow = true_flow[rest]
     if max_flow is None:
@@ -119,16 +118,18 @@ def save_picture(figure: Figure, path: Union[str, Path]) -> Path:
 
 def point_rows(name: str, values: Array, count: Optional[int]) -> np.ndarray:
     """(N, 3) float64."""
-    array = to_numpy(values)
+    array = as_numpy(values)
     if array.ndim != 2 or array.shape[1] < 3 or (count is not None and len(array) != count):
         rows = "N" if count is None else str(count)
         raise CFlowError(f"{name} has shape {array.shape}: give ({rows}, 3), one row per point")
+    if array.dtype.kind not in "fiu":
+        raise CFlowError(f"{name} has type {array.dtype}: give numbers, metres")
     return array[:, :3].astype(np.float64)
 
 
 def ground_rows(is_ground: Optional[Array], count: int) -> np.ndarray:
     """(N,) bool."""
-    ground = np.zeros(count, bool) if is_ground is None else to_numpy(is_ground).astype(bool)
+    ground = np.zeros(count, bool) if is_ground is None else as_numpy(is_ground).astype(bool)
     if ground.shape != (count,):
         raise CFlowError(f"is_ground has shape {ground.shape}: give ({count},), one entry per point")
     return ground

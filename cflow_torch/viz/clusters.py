@@ -6,13 +6,12 @@ from typing import TYPE_CHECKING, Optional, Sequence, Union
 
 import numpy as np
 
-from cflow_torch.types import Array, CFlowError, FlowResult
+from cflow_torch.types import Array, CFlowError, FlowResult, as_numpy
 from cflow_torch.viz.bev import ground_rows, point_rows, view_of
 from cflow_torch.viz.coloring import PALETTE, color_numbers
 from cflow_torch.viz.legend import draw_scale, legend_box
 from cflow_torch.viz.panel import dot_area, draw_ego, draw_ground, new_figure
 from cflow_torch.viz.style import INK, STATIC
-from cflow_torch.viz.wheel import to_numpy
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -48,7 +47,7 @@ def plot_clusters(
     """
     position = point_rows("points", points, None)
     given = result_or_cluster_id
-    cluster = to_numpy(given.cluster_id if isinstance(given, FlowResult) else given)
+    cluster = as_numpy(given.cluster_id if isinstance(given, FlowResult) else given)
     if cluster.shape != (len(position),) or cluster.dtype.kind not in "iu":
         raise CFlowError(
             f"cluster_id has shape {cluster.shape} and type {cluster.dtype}: give ({len(position)},) integers, one "

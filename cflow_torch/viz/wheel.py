@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import Optional, Sequence
 
 import numpy as np
-from torch import Tensor
 
-from cflow_torch.types import Array, CFlowError
+from cflow_torch.types import Array, CFlowError, as_numpy
 
 # Steps from one primary hue to the next: the eye tells some hues apart more finely than others.
 TRANSITIONS = (15, 6, 4, 11, 13, 6)
@@ -41,7 +40,7 @@ def flow_to_rgb(
     Source: Baker et al., A Database and Evaluation Methodology for Optical Flow (2011); flowpy. The field's viewers cut
         the steps of their wheel to integers, so their colours differ by up to 2 levels.
     """
-    vectors = to_numpy(flow).astype(np.float64)
+    vectors = as_numpy(flow).astype(np.float64)
     ground = np.asarray(background, np.float64)
     if vectors.ndim == 0 or vectors.shape[-1] < 2:
         raise CFlowError(f"flow has shape {vectors.shape}: give (..., 2) or wider, x and y in metres")
@@ -82,8 +81,3 @@ def wheel_image(size: int, background: Sequence[float] = (255, 255, 255)) -> np.
     alpha = np.clip((1 - distance) * (size / 2), 0, 1) * 255
     rgb = flow_to_rgb(flow / np.maximum(distance, 1)[..., None], 1.0, background)
     return np.concatenate([rgb, alpha[..., None].astype(np.uint8)], axis=-1)
-
-
-def to_numpy(values: Array) -> np.ndarray:
-    """An array or tensor, on any device, as an array."""
-    return values.detach().cpu().numpy() if isinstance(values, Tensor) else np.asarray(values)
