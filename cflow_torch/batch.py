@@ -12,6 +12,7 @@ from torch import Tensor
 
 from cflow_torch.config import Config
 from cflow_torch.ego import compensate, rigid_transform
+from cflow_torch.free_memory import require_memory
 from cflow_torch.grid import Grid
 from cflow_torch.inputs import (
     check_distance,
@@ -99,6 +100,9 @@ def split_windows(windows: Sequence[Window], config: Config, grid: Grid, device:
 
     Returns:
         Groups of at least one window.
+
+    Raises:
+        CFlowError: a window alone needs more memory than there is.
     """
     groups: List[List[Window]] = []
     limit = config.max_memory
@@ -110,6 +114,13 @@ def split_windows(windows: Sequence[Window], config: Config, grid: Grid, device:
         points = sum(sweep.points.shape[0] for sweep in sweeps)
         needed = _bytes_per_point(config, len(sweeps) == 2) * points
         needed += (per_pixel * len(sweeps) + 30) * grid.height * grid.width
+        require_memory(
+            needed,
+            device,
+            f"a window of {points} points in {len(sweeps)} sweeps, on {grid.width} x {grid.height} pixels of "
+            f"{grid.pixel_size} m,",
+            "give a smaller point_cloud_range, larger pixel_sizes or fewer points",
+        )
         if not groups or (limit is not None and used + needed > limit):
             groups.append([])
             used = 0
@@ -166,8 +177,9 @@ def make_batch(windows: Sequence[Window], config: Config, grid: Grid, device: An
         named = [("pc1", window.pc1), *((name, sweep) for name, sweep, _ in older)]
         sweeps += [(step, index, name, sweep) for step, (name, sweep) in enumerate(named)]
     sweeps.sort(key=lambda entry: entry[0])  # stable: all t+1, then all t, then what is older
+    farthest = max(map(abs, (*grid.lower[:2], *grid.upper[:2])))
     to_ego1 = [
-        None if window.pc1.pose is None else np.linalg.inv(rigid_transform(window.pc1.pose, "pose1"))
+        None if window.pc1.pose is None else np.linalg.inv(rigid_transform(window.pc1.pose, "pose1", farthest))
         for window in windows
     ]
 
@@ -183,7 +195,7 @@ def make_batch(windows: Sequence[Window], config: Config, grid: Grid, device: An
     for step, index, name, sweep in sweeps:
         start, transform = stop, None
         if step > 0 and to_ego1[index] is not None:
-            transform = to_ego1[index] @ rigid_transform(sweep.pose, f"pose of {name}")
+            transform = to_ego1[index] @ rigid_transform(sweep.pose, f"pose of {name}", farthest)
             check_distance(transform, name)
         if step == 1:
             with torch.inference_mode(False):  # becomes part of the result

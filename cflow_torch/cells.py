@@ -17,8 +17,8 @@ from cflow_torch.types import CFlowError
 
 # Height slices are told apart by this many numbers, then they repeat: 2 m of four slices of 0.5 m.
 NUM_SLICES = 4
-# Beyond this float64 only holds multiples of NUM_SLICES, so cutting heights off here changes no slice.
-_HIGHEST_SLICE = 2.0**55
+# Beyond this float64 only holds multiples of 16, so cutting heights off here changes no slice.
+_HIGHEST_SLICE = 2.0**56
 
 
 @dataclass(frozen=True)
@@ -130,11 +130,11 @@ def make_cells(
     return _listed(image, pixel, grid, batch.num_windows, batch.num_steps), place
 
 
-def slice_of(z: Tensor, slice_height: float) -> Tensor:
-    """(N,) uint8, 0 ... 3: the slice of heights (N,) float64, metres, as in `make_cells`; 0 for NaN."""
+def slice_of(z: Tensor, slice_height: float, num_slices: int = NUM_SLICES) -> Tensor:
+    """(N,) uint8: slice of heights (N,) float64, metres, as in `make_cells`; 0 for NaN. At most 16, a power of 2."""
     layer = (z / torch.full((), slice_height, dtype=z.dtype, device=z.device)).floor_()
     layer.clamp_(-_HIGHEST_SLICE, _HIGHEST_SLICE).nan_to_num_(0.0)
-    return (layer.long() & (NUM_SLICES - 1)).to(torch.uint8)
+    return (layer.long() & (num_slices - 1)).to(torch.uint8)
 
 
 def draw_slices(image: Tensor, place: Tensor, part: Tensor) -> None:

@@ -49,8 +49,14 @@ LARGEST_Z = 1000
 HIGHEST_CLEARANCE = 1000
 # Pixels a side; no region is wider, and an index still fits an int64.
 LARGEST_BLOCK = 10**6
+# Whole numbers stay below this: they are compared with tensors of int64 and of float64.
+MOST = 2**53
 # A byte holds the slices of a pixel.
 MOST_SLICES = 8
+# Seconds, metres, pixels of settings that quotients are made of: nothing is shorter or longer.
+SHORTEST, LONGEST = 1e-6, 1e6
+# m a side: squares of longer ways in 1/1024 m, weighted and summed by the proof, would not fit an int64.
+WIDEST_PROOF = 3000
 
 
 def check(config: Any) -> None:
@@ -99,8 +105,7 @@ def _check_values(config: Any) -> None:
         raise CFlowError(
             f"patch_size={config.patch_size}: give an odd number of pixels of at most {LARGEST_PATCH}, for example 11"
         )
-    for name in ("max_extent", "sweep_interval", "gate_radius", "slice_height"):
-        _positive(name, getattr(config, name))
+    _positive("max_extent", config.max_extent)
     for name in ("max_speed", "max_object", "clearance", "max_memory"):
         if getattr(config, name) is not None:
             _positive(name, getattr(config, name))
@@ -124,11 +129,15 @@ def _check_values(config: Any) -> None:
         raise CFlowError(f"clearance={config.clearance}: give at most {HIGHEST_CLEARANCE} m, for example 0.4, or None")
     if config.keypoint_block > LARGEST_BLOCK:
         raise CFlowError(f"keypoint_block={config.keypoint_block}: give at most {LARGEST_BLOCK} pixels, for example 2")
-    for name in ("sweep_interval", "gate_radius", "slice_height"):
-        if math.isinf(getattr(config, name)):
-            raise CFlowError(f"{name}={getattr(config, name)}: give a finite number")
-    if config.second_best_distance != 0:
-        _positive("second_best_distance", config.second_best_distance)
+    if config.max_memory is not None and math.isinf(config.max_memory):
+        raise CFlowError(f"max_memory={config.max_memory}: give a finite number of bytes, or None for no limit")
+    for name in ("sweep_interval", "gate_radius", "slice_height", "second_best_distance"):
+        value = getattr(config, name)
+        if name == "second_best_distance" and value == 0:
+            continue
+        _positive(name, value)
+        if not SHORTEST <= value <= LONGEST:
+            raise CFlowError(f"{name}={value}: give a number from {SHORTEST:g} to {LONGEST:g}")
 
 
 def _check_space(sizes: Tuple[float, ...], box: Tuple[float, ...]) -> None:
@@ -142,11 +151,17 @@ def _check_space(sizes: Tuple[float, ...], box: Tuple[float, ...]) -> None:
             f"point_cloud_range={box}: give (x0, y0, z0, x1, y1, z1) in metres with x0 < x1, y0 < y1, z0 < z1"
         )
     if any(math.isinf(v) for v in (box[0], box[1], box[3], box[4])):
-        raise CFlowError(f"point_cloud_range={box}: x and y bounds must be finite; only z may be infinite")
+        raise CFlowError(f"point_cloud_range={box}: give finite x and y bounds; only z may be infinite")
 
 
 def _check_proof(config: Any) -> None:
     mend = "give proof=False too, or start from preset='paper'"
+    x0, y0, _, x1, y1, _ = config.point_cloud_range
+    if max(x1 - x0, y1 - y0) > WIDEST_PROOF:
+        raise CFlowError(
+            f"point_cloud_range={config.point_cloud_range}: with proof=True (as in preset='default') a side is at "
+            f"most {WIDEST_PROOF} m: give less; else {mend}"
+        )
     blocks = [size / config.pixel_sizes[-1] for size in config.pixel_sizes]
     if any(abs(block - round(block)) > 1e-6 for block in blocks):
         raise CFlowError(
@@ -170,15 +185,16 @@ def floats(name: str, values: Any) -> Tuple[float, ...]:
     """Any list of numbers as a tuple."""
     try:
         return tuple(float(v) for v in values)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise CFlowError(f"{name}={values!r}: give a list of numbers") from None
 
 
 def _whole_number(name: str, value: Any) -> None:
-    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-        raise CFlowError(f"{name}={value!r}: give a whole number of at least 0")
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < MOST:
+        raise CFlowError(f"{name}={value!r}: give a whole number of at least 0 and below 2^53")
 
 
 def _positive(name: str, value: Any) -> None:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not value > 0:
-        raise CFlowError(f"{name}={value!r}: give a positive number")
+    is_number = isinstance(value, float) or (isinstance(value, int) and not isinstance(value, bool) and value < MOST)
+    if not is_number or not value > 0:
+        raise CFlowError(f"{name}={value!r}: give a positive number, a whole one below 2^53")

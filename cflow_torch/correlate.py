@@ -74,7 +74,7 @@ def best_shifts(
     if num_jobs == 0:
         return size.new_zeros((0, 2)), torch.zeros(0, dtype=torch.float32, device=size.device)
     low, high = search_bounds(size, target_of_job, radius)
-    search, drawing = draw(template, target, target_of_job, size, low, high)
+    search, drawing = draw(template, target, target_of_job, size, low, high, num_slices)
     jobs = drawing.jobs
     target_energy = target.energy(len(size))
     own = target_of_job.index_select(0, jobs)

@@ -8,6 +8,7 @@ from typing import List, Optional, Tuple
 import torch
 from torch import Tensor
 
+from cflow_torch.free_memory import require_memory
 from cflow_torch.grid import LONGEST_SIDE
 from cflow_torch.ops.bits import popcount
 from cflow_torch.ops.cross_correlation import FAST_LENGTHS
@@ -18,6 +19,8 @@ from cflow_torch.types import CFlowError
 # small, and few classes mean few kernel launches. Larger images are rare; they keep two dimensions, whose transforms
 # cost less than those of a line, and have classes of their own by height and width.
 _LINES = (144, 576, 2304, 9216)  # square clusters of 8, 16, 32, 64 pixels
+# Spectra, counts and tables of an image that is correlated alone, the largest one.
+_BYTES_PER_SAMPLE = 80
 # Classes are numbered by height and width of their images, both below this.
 _BASE = 1 << 17
 
@@ -106,9 +109,22 @@ def search_bounds(size: Tensor, target_of_job: Tensor, radius: Optional[Tensor])
 
 
 def draw(
-    template: Images, target: Images, target_of_job: Tensor, size: Tensor, low: Tensor, high: Tensor
+    template: Images,
+    target: Images,
+    target_of_job: Tensor,
+    size: Tensor,
+    low: Tensor,
+    high: Tensor,
+    num_slices: int = 1,
 ) -> Tuple[Search, Drawing]:
     """Draw all templates and targets in one go; also what is searched for each target.
+
+    Args:
+        template, target, target_of_job, size, num_slices: as for `best_shifts`.
+        low, high: as `search_bounds` gives them.
+
+    Raises:
+        CFlowError: a cluster that is too long, or takes more memory than there is.
 
     An image takes H + low_y rows of W + low_x samples, and a target is drawn low_y rows and low_x columns further down.
     Then shift (dy, dx) of the correlation stands at sample (dy + low_y) * stride + dx + low_x, and no other pair of
@@ -147,6 +163,13 @@ def draw(
     pixel = row.mul_(stride.index_select(0, of_image).index_select(0, image)).add_(col)
     pixel += start.index_select(0, image)
     total = sum((templates + targets) * y * x for templates, targets, y, x, _ in classes)
+    largest = max(y * x for _, _, y, x, _ in classes)
+    require_memory(
+        total + _BYTES_PER_SAMPLE * num_slices * largest,
+        size.device,
+        f"a cluster that is {longest} pixels long",
+        "give a max_speed, so that it is searched less far, a smaller point_cloud_range or larger pixel_sizes",
+    )
     if template.slices is None or target.slices is None:
         samples = torch.zeros(total, dtype=torch.bool, device=pixel.device).index_fill_(0, pixel, True)
     else:

@@ -9,30 +9,32 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cflow_torch.types import Array, CFlowError
+from cflow_torch.resolution import COARSEST_POSE, resolution
+from cflow_torch.types import Array, CFlowError, as_numpy
 
 # How far R R^T may be from the identity. Poses stored in float32 are within 1e-6.
 _ORTHOGONALITY = 1e-3
 
 
-def rigid_transform(matrix: Any, name: str) -> np.ndarray:
+def rigid_transform(matrix: Any, name: str, reach: float = 0.0) -> np.ndarray:
     """A checked 4 x 4 rigid transform in float64.
 
     Args:
         matrix: (4, 4) array or tensor.
         name: what to call it in an error, for example "T_ego1_ego0".
+        reach: metres from the origin up to which points are transformed.
 
     Returns:
         (4, 4) float64.
 
     Raises:
-        CFlowError: wrong shape, not finite, not a rotation with a translation.
+        CFlowError: wrong shape, not finite, not a rotation with a translation, or of a type that holds it to more than
+            `COARSEST_POSE` only.
     """
-    if isinstance(matrix, Tensor):
-        matrix = matrix.detach().cpu().numpy()
+    dtype = getattr(matrix, "dtype", None)
     try:
-        result = np.asarray(matrix, dtype=np.float64)
-    except (TypeError, ValueError):
+        result = as_numpy(matrix, np.float64)
+    except (TypeError, ValueError, OverflowError):
         raise CFlowError(f"{name} is {type(matrix).__name__}: give a (4, 4) matrix of numbers") from None
     if result.shape != (4, 4):
         raise CFlowError(f"{name} has shape {result.shape}: give one (4, 4) matrix (no batch dimension)")
@@ -49,6 +51,13 @@ def rigid_transform(matrix: Any, name: str) -> np.ndarray:
         raise CFlowError(
             f"{name} is not rigid (|R R^T - I| up to {error:.3g}, det {determinant:.3g}, last row "
             f"{rows[3]}): give [R t; 0 0 0 1] with a rotation R, row-major"
+        )
+    farthest = max(reach, *(abs(row[3]) for row in rows[:3]))
+    step = max(resolution(kind, farthest) for kind in (np.dtype(np.float64), dtype) if kind is not None)
+    if step > COARSEST_POSE:
+        raise CFlowError(
+            f"{name} is {dtype or 'float64'}, which at {farthest:.9g} m only holds multiples of {step:g} m (at most "
+            f"{COARSEST_POSE} m): give it as float64, never rounded to less, or poses in a frame whose origin is nearer"
         )
     return result
 

@@ -32,9 +32,11 @@ class Grid:
     upper: Tuple[float, ...]
 
     def __post_init__(self) -> None:
-        if max(self.height, self.width) > LONGEST_SIDE or self.height * self.width > _MOST_PIXELS:
+        # Not `height` and `width`: a side may be too long for any whole number.
+        rows, cols = ((self.upper[axis] - self.lower[axis]) / self.pixel_size + 1 for axis in (1, 0))
+        if not (max(rows, cols) < LONGEST_SIDE + 1 and self.height * self.width <= _MOST_PIXELS):
             raise CFlowError(
-                f"a region of {self.width} x {self.height} pixels of {self.pixel_size} m is too large "
+                f"a region of {cols:.9g} x {rows:.9g} pixels of {self.pixel_size} m is too large "
                 f"(at most {LONGEST_SIDE} a side and {_MOST_PIXELS} in all): "
                 "give a smaller point_cloud_range or larger pixel_sizes"
             )

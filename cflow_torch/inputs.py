@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import Any, List, Sequence, Tuple
 
 import numpy as np
@@ -71,18 +72,22 @@ def _named_sweeps(window: Window) -> List[Tuple[str, Sweep]]:
 def _check_points(points: Any, name: str) -> None:
     if not isinstance(points, (np.ndarray, Tensor)):
         raise CFlowError(f"{name} is {type(points).__name__}: give a NumPy array or a torch tensor of shape (N, 3+)")
+    _check_plain(points, name)
     if points.ndim != 2 or points.shape[1] < 3:
         raise CFlowError(f"{name} has shape {tuple(points.shape)}: give (N, 3+), columns x, y, z in metres")
     if points.shape[1] > _MOST_COLUMNS:
         raise CFlowError(f"{name} has shape {tuple(points.shape)}: a row is a point; give its transpose, (N, 3+)")
-    if isinstance(points, Tensor):
-        is_floating = points.is_floating_point()
-        if points.layout != torch.strided:
-            raise CFlowError(f"{name} has layout {points.layout}: give a dense tensor")
-    else:
-        is_floating = np.issubdtype(points.dtype, np.floating)
+    is_floating = points.is_floating_point() if isinstance(points, Tensor) else np.issubdtype(points.dtype, np.floating)
     if not is_floating:
         raise CFlowError(f"{name} has dtype {points.dtype}: give floating-point metres")
+
+
+def _check_plain(array: Any, name: str) -> None:
+    """Refuse arrays that hold something else than they seem to."""
+    if isinstance(array, Tensor) and array.layout != torch.strided:
+        raise CFlowError(f"{name} has layout {array.layout}: give a dense tensor")
+    if isinstance(array, np.ma.MaskedArray):
+        raise CFlowError(f"{name} is a masked array, whose mask would be lost: give .filled(...), of points with NaN")
 
 
 def _same(a: Sweep, b: Sweep) -> bool:
@@ -101,10 +106,10 @@ def elapsed_times(
     window: Window, sources: Sequence[Tuple[str, Sweep, int]], config: Config
 ) -> Sequence[Tuple[float, float]]:
     """(sweep intervals, seconds) from each source sweep to t+1, by time stamps where every sweep has one."""
-    stamps = [sweep.timestamp_ns for sweep in (window.pc1, window.pc0, *window.pch)]
-    if any(stamp is None for stamp in stamps):
+    if any(sweep.timestamp_ns is None for sweep in (window.pc1, window.pc0, *window.pch)):
         return [(float(step), step * config.sweep_interval) for _, _, step in sources]
-    gaps = [int(window.pc1.timestamp_ns) - int(sweep.timestamp_ns) for _, sweep, _ in sources]  # type: ignore[arg-type]
+    newest = _nanoseconds(window.pc1, "pc1")
+    gaps = [newest - _nanoseconds(sweep, name) for name, sweep, _ in sources]
     intervals = [later - earlier for earlier, later in zip([0, *gaps], gaps)]
     if min(intervals) <= 0:
         raise CFlowError(
@@ -121,6 +126,18 @@ def elapsed_times(
             "to t+1): pass use_timestamps=True, or leave out the sweeps before the gap"
         )
     return [(float(step), gap / 1e9) for (_, _, step), gap in zip(sources, gaps)]
+
+
+def _nanoseconds(sweep: Sweep, name: str) -> int:
+    """The time stamp of a sweep that has one."""
+    with suppress(TypeError, ValueError, OverflowError, RuntimeError):
+        stamp = int(sweep.timestamp_ns)  # type: ignore[arg-type]
+        if abs(stamp) < 1 << 63:
+            return stamp
+    raise CFlowError(
+        f"timestamp_ns of {name} is {sweep.timestamp_ns!r}: give whole nanoseconds that fit an int64, or None for "
+        "every sweep of the window"
+    )
 
 
 def check_distance(T_ego1_ego: np.ndarray, name: str) -> None:
@@ -146,6 +163,8 @@ def choose_device(windows: Sequence[Window], device: Any) -> torch.device:
     if not (isinstance(device, str) and device == "auto"):
         try:
             torch.empty(0, device=device)
+            if torch.device(device).type == "meta":
+                raise RuntimeError("it holds no numbers")
             return torch.device(device)
         except (RuntimeError, TypeError, AssertionError) as error:
             reason = str(error).splitlines()[0]
@@ -157,6 +176,8 @@ def choose_device(windows: Sequence[Window], device: Any) -> torch.device:
         for array in (sweep.points, sweep.is_ground)
         if isinstance(array, Tensor)
     }
+    if {one.type for one in found} == {"meta"}:
+        raise CFlowError("tensors lie on the device 'meta', which holds no numbers: give tensors with values")
     if len(found) > 1:
         names = ", ".join(sorted(str(d) for d in found))
         raise CFlowError(f"tensors lie on different devices ({names}): put them on one, or pass device=...")
@@ -191,6 +212,7 @@ def read_ground(sweep: Sweep, name: str, num_points: int, device: torch.device) 
         raise CFlowError(f"ground mask of {name} has shape {tuple(mask.shape)}: give ({num_points},), one per point")
     if mask.dtype not in (torch.bool, np.bool_):
         raise CFlowError(f"ground mask of {name} has dtype {mask.dtype}: give bool, True = ground")
+    _check_plain(mask, f"ground mask of {name}")
     if isinstance(mask, np.ndarray):
         mask = torch.from_numpy(np.array(mask))
     return mask.to(device)

@@ -24,7 +24,7 @@ _REACH = 2
 # Bit of a pixel with a point that stands out of the ground, above those of its slices.
 TALL = 16
 # Heights are whole centimetres, bounded so that no sum overflows; unknown ground lies deeper than any point.
-_HIGHEST = 10**6
+_HIGHEST = 10**10
 _UNKNOWN = -(1 << 40)
 
 

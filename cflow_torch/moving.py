@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.batch import Batch
-from cflow_torch.cells import NUM_SLICES
+from cflow_torch.cells import NUM_SLICES, slice_of
 from cflow_torch.ops.indices import flat_nonzero, split_index
 
 
@@ -72,7 +72,6 @@ def moving_points(
     rows = flat_nonzero(has_group.index_select(0, pixel))
     pixel = pixel.index_select(0, rows).long()
     x, y, z = batch.positions.index_select(1, rows).unbind(0)
-    size = torch.full((), slice_height, dtype=torch.float64, device=z.device)
     window, step = split_index(batch.image.index_select(0, rows).long(), batch.num_steps)
-    part = torch.floor(z / size).long().bitwise_and_(num_slices - 1)
+    part = slice_of(z, slice_height, num_slices).long()
     return MovingPoints(group.index_select(0, pixel), window, step, pixel, part, torch.stack((x, y)))

@@ -15,6 +15,7 @@ from cflow_torch.grid import Grid
 from cflow_torch.inputs import check_windows, choose_device
 from cflow_torch.ops.chunks import chunks
 from cflow_torch.ops.indices import flat_nonzero
+from cflow_torch.resolution import check_resolution
 from cflow_torch.rigid import RigidMotion
 from cflow_torch.types import CFlowError, FlowResult, Window
 
@@ -136,6 +137,7 @@ class CoarseToFine(nn.Module):
         grids = [Grid(size, lower, upper) for size in config.pixel_sizes]
         results: List[FlowResult] = []
         check_windows(windows)
+        check_resolution(windows, config)
         device = choose_device(windows, self.device)
         with torch.autocast(device.type, enabled=False):  # counts would lose bits
             for part in split_windows(windows, config, grids[-1], device):

@@ -23,6 +23,8 @@ LAYERS = {
     "checks": 0,
     "config": 0,
     "configs": 0,  # YAML; part of an installed package only
+    "free_memory": 1,
+    "resolution": 1,
     "ops": 1,
     "ego": 2,
     "grid": 2,

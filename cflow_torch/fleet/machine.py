@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import os
-import re
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, List, Mapping, Optional, Tuple
+from typing import Any, List, Mapping, Tuple
 
 import torch
 
+from cflow_torch.free_memory import available_memory, control_groups
 from cflow_torch.types import CFlowError
 
 AUTO = "auto"
@@ -20,7 +19,6 @@ WORKER_MEMORY = 1_500_000_000
 CPU_BATCH = 4
 # Not measured: no GPU was at hand.
 GPU_BATCH = 32
-_CGROUP = Path("/sys/fs/cgroup")
 
 
 @dataclass(frozen=True)
@@ -86,7 +84,7 @@ def usable_cores(environ: Mapping[str, str]) -> int:
     counts = [os.cpu_count() or 1]
     with suppress(AttributeError):  # not on every system
         counts.append(len(os.sched_getaffinity(0)))
-    for group in _cgroups():
+    for group in control_groups():
         with suppress(OSError, ValueError):  # "max" is no number
             quota, period = (group / "cpu.max").read_text().split()
             counts.append(int(quota) // int(period))
@@ -95,36 +93,6 @@ def usable_cores(environ: Mapping[str, str]) -> int:
     if environ.get("LOCAL_WORLD_SIZE", "").isdigit():
         counts.append(min(counts) // max(1, int(environ["LOCAL_WORLD_SIZE"])))
     return max(1, min(counts))
-
-
-def available_memory(environ: Mapping[str, str]) -> Optional[int]:
-    """Bytes that this process may still take: what is free, its groups' limits, its share of a SLURM or torchrun job;
-    None where nobody tells."""
-    free = []
-    with suppress(OSError, StopIteration, ValueError):
-        lines = Path("/proc/meminfo").read_text().splitlines()
-        free.append(1024 * int(next(line for line in lines if line.startswith("MemAvailable")).split()[1]))
-    for group in _cgroups():
-        with suppress(OSError, ValueError):
-            limit, used = (int((group / name).read_text()) for name in ("memory.max", "memory.current"))
-            free.append(limit - used)
-    if environ.get("SLURM_MEM_PER_NODE", "").isdigit():
-        free.append(int(environ["SLURM_MEM_PER_NODE"]) << 20)
-    neighbours = re.match(r"\d+", environ.get("LOCAL_WORLD_SIZE") or environ.get("SLURM_STEP_TASKS_PER_NODE") or "1")
-    share = min(free) // max(1, int(neighbours[0])) if free and neighbours else None
-    if environ.get("SLURM_MEM_PER_CPU", "").isdigit():
-        per_task = int(environ["SLURM_MEM_PER_CPU"]) * int(environ.get("SLURM_CPUS_PER_TASK", "1")) << 20
-        share = per_task if share is None else min(share, per_task)
-    return share
-
-
-def _cgroups() -> List[Path]:
-    """Control groups (version 2) that bound this process, the innermost first; none where there are no such."""
-    with suppress(OSError, StopIteration):
-        lines = Path("/proc/self/cgroup").read_text().splitlines()
-        group = _CGROUP / next(line[3:] for line in lines if line.startswith("0::")).lstrip("/")
-        return [folder for folder in (group, *group.parents) if _CGROUP in (folder, *folder.parents)]
-    return []
 
 
 def _at_least_1(name: str, value: Any) -> int:

@@ -135,8 +135,10 @@ def reference_flow(window: Window, config: Config) -> FlowResult:
     else:
         residual_flow, cluster_id, score = coarse_to_fine(clouds, cloud1, config)
         confidence = None
-    # float32(p' - p); points that are not finite are NaN in p' and get 0
-    pose_flow = np.nan_to_num(clouds[0].points - xyz(window.pc0), nan=0.0).astype(np.float32)
+    # float32(p' - p); points that are not finite are NaN in p' and get 0, as do those that float32 does not hold
+    with np.errstate(over="ignore"):
+        pose_flow = (clouds[0].points - xyz(window.pc0)).astype(np.float32)
+    pose_flow = np.nan_to_num(pose_flow, nan=0.0, posinf=0.0, neginf=0.0)
     residual_flow = residual_flow.astype(np.float32)
     is_valid = clouds[0].takes_part & in_range(clouds[0].points, config)
     trust = None if confidence is None else np.where(is_valid, confidence[0], 0).astype(np.float32)

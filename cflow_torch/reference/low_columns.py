@@ -77,5 +77,5 @@ def _block(x: float, y: float, config: Config) -> Tuple[int, int]:
 
 
 def _centimetres(z: float) -> int:
-    """Height in whole centimetres, rounded down; beyond ten kilometres it stays there."""
-    return int(min(max(np.floor(z * 100), -1e6), 1e6))
+    """Height in whole centimetres, rounded down; beyond a hundred thousand kilometres it stays there."""
+    return int(min(max(np.floor(z * 100), -1e10), 1e10))

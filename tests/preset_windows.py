@@ -1,0 +1,44 @@
+"""Windows and settings small enough to run every preset many times, and to hold it to the reference."""
+
+from __future__ import annotations
+
+from typing import Any, Callable, List
+
+import numpy as np
+from scenes import RANGE, scene
+
+from cflow_torch import Config, FlowResult, Sweep, Window, make_config
+
+PRESETS = ("default", "fast", "paper", "keypoints")
+
+
+def small(preset: str, **overrides: Any) -> Config:
+    """A preset on 16 m x 14 m with pixels of 0.25 m, two older sweeps where it takes any."""
+    sizes = (0.5, 0.25) if preset == "default" else (0.25,)
+    history = 0 if preset == "keypoints" else 2
+    given = {"pixel_sizes": sizes, "num_history": history, "point_cloud_range": RANGE, "max_extent": 5.0}
+    return make_config(preset, **{**given, **overrides})
+
+
+def windows_for(config: Config, number: int = 1) -> List[Window]:
+    """Windows in which every preset finds motion; the last of several is a pair."""
+    seeds = (12, 11, 3, 8)[:number]
+    return [
+        scene(seed, num_history=0 if number > 1 and seed == seeds[-1] else config.num_history, num_points=120)
+        for seed in seeds
+    ]
+
+
+def changed(window: Window, change: Callable[[Sweep], Sweep]) -> Window:
+    """The same change of every sweep."""
+    return Window(change(window.pc0), change(window.pc1), tuple(map(change, window.pch)))
+
+
+def on_a_raster(sweep: Sweep) -> Sweep:
+    """Points, without pose, at whole multiples of 1/64 m: exact in float32 near the origin, in float64 anywhere."""
+    return Sweep(np.round(np.asarray(sweep.points, dtype=np.float64) * 64) / 64, sweep.is_ground)
+
+
+def num_moving(result: FlowResult) -> int:
+    """Points with a residual flow."""
+    return int(result.residual_flow.any(1).sum())
