@@ -96,9 +96,7 @@ def test_types_too_coarse_for_pixels_are_refused(points, far, refused):
         if not refused:
             assert cflow(window, config).is_valid.all()
             continue
-        with pytest.raises(
-            CFlowError, match=r"pc[01] is .*f.*only holds multiples of .* m.*pixels of 0.25 m"
-        ) as seen:
+        with pytest.raises(CFlowError, match=r"pc[01] is .*f.*only holds multiples of .* m.*pixels of 0.25 m") as seen:
             cflow(window, config)
         assert str(seen.value).startswith(name) or far == 1e16
 
