@@ -10,6 +10,7 @@ All of it is arithmetic on whole millimetres: the same bits in any batch, in any
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from typing import Any, List, Sequence, Tuple
 
@@ -17,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cflow_torch.inputs import choose_device, read_positions
+from cflow_torch.inputs import check_plain, choose_device, read_positions
 from cflow_torch.ops.lower_surface import UNKNOWN, lower_surface
 from cflow_torch.types import Array, CFlowError, Sweep, Window
 
@@ -60,6 +61,9 @@ def find_ground(points: Array, method: str = "grid", threshold: float = THRESHOL
         NaN and infinite points and points with |x| or |y| >= 131 m are not ground. Order of points, other sweeps of
         the batch and shifts by whole millimetres in z do not change the result.
 
+    Warns:
+        UserWarning: there are points, and all of them lie 131 m away or further.
+
     Raises:
         CFlowError: wrong shape, dtype, method or threshold; Patchwork++ is not installed.
 
@@ -98,9 +102,24 @@ def find_ground_batch(
     else:
         is_ground = _patchwork(positions, sweep, len(clouds))
     masks = is_ground.split([cloud.shape[0] for cloud in clouds])
+    for number, mask in enumerate(masks):
+        if not bool(mask.any()):
+            _warn_if_far(positions[:, sweep == number], number)
     return [
         mask.to(cloud.device) if isinstance(cloud, Tensor) else mask.cpu().numpy() for mask, cloud in zip(masks, clouds)
     ]
+
+
+def _warn_if_far(positions: Tensor, number: int) -> None:
+    """(3, N) positions of a sweep, all of them too far from the origin to be looked at."""
+    nearest = positions[:2].abs().amax(0).nan_to_num(torch.inf).amin() if positions.numel() else torch.zeros(())
+    if REACH <= nearest < torch.inf:
+        warnings.warn(
+            f"no point of sweep {number} lies within {REACH:.0f} m of the origin, so no ground was found: give points "
+            "in the frame of the vehicle or of the sensor",
+            UserWarning,
+            stacklevel=4,
+        )
 
 
 def has_ground(clouds: Sequence[Array], most_points: int = 30_000, device: Any = "auto") -> List[bool]:
@@ -268,6 +287,7 @@ def _stack(clouds: Sequence[Array], device: Any) -> Tuple[Tensor, Tensor]:
 
 
 def _check(cloud: Any, number: int) -> None:
+    check_plain(cloud, f"points of sweep {number}")
     if not isinstance(cloud, (np.ndarray, Tensor)) or cloud.ndim != 2 or cloud.shape[1] < 3:
         given = tuple(cloud.shape) if isinstance(cloud, (np.ndarray, Tensor)) else type(cloud).__name__
         raise CFlowError(f"points of sweep {number} are {given}: give an array or tensor of shape (N, 3+), metres")

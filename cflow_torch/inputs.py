@@ -72,7 +72,7 @@ def _named_sweeps(window: Window) -> List[Tuple[str, Sweep]]:
 def _check_points(points: Any, name: str) -> None:
     if not isinstance(points, (np.ndarray, Tensor)):
         raise CFlowError(f"{name} is {type(points).__name__}: give a NumPy array or a torch tensor of shape (N, 3+)")
-    _check_plain(points, name)
+    check_plain(points, name)
     if points.ndim != 2 or points.shape[1] < 3:
         raise CFlowError(f"{name} has shape {tuple(points.shape)}: give (N, 3+), columns x, y, z in metres")
     if points.shape[1] > _MOST_COLUMNS:
@@ -82,7 +82,7 @@ def _check_points(points: Any, name: str) -> None:
         raise CFlowError(f"{name} has dtype {points.dtype}: give floating-point metres")
 
 
-def _check_plain(array: Any, name: str) -> None:
+def check_plain(array: Any, name: str) -> None:
     """Refuse arrays that hold something else than they seem to."""
     if isinstance(array, Tensor) and array.layout != torch.strided:
         raise CFlowError(f"{name} has layout {array.layout}: give a dense tensor")
@@ -212,7 +212,7 @@ def read_ground(sweep: Sweep, name: str, num_points: int, device: torch.device) 
         raise CFlowError(f"ground mask of {name} has shape {tuple(mask.shape)}: give ({num_points},), one per point")
     if mask.dtype not in (torch.bool, np.bool_):
         raise CFlowError(f"ground mask of {name} has dtype {mask.dtype}: give bool, True = ground")
-    _check_plain(mask, f"ground mask of {name}")
+    check_plain(mask, f"ground mask of {name}")
     if isinstance(mask, np.ndarray):
         mask = torch.from_numpy(np.array(mask))
     return mask.to(device)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from scenes import RANGE, assert_same, pose
 
 from cflow_torch import CFlowError, Config, FlowResult, Sweep, Window, estimate_flow, free_memory, make_model
 from cflow_torch.grid import Grid
+from cflow_torch.ground import find_ground
 from cflow_torch.reference import reference_flow
 from cflow_torch.resolution import resolution
 
@@ -126,6 +128,17 @@ def test_poses_that_their_type_does_not_hold_are_refused(dtype, x, yaw, refused)
         return
     with pytest.raises(CFlowError, match=r"pose.*only holds multiples of .*float64"):
         cflow(window, small("paper"))
+
+
+def test_ground_far_from_the_origin_is_not_looked_for_in_silence():
+    street = np.random.default_rng(0).uniform(-30, 30, (5000, 3)) * [1, 1, 0]
+    assert find_ground(street).all()
+    with pytest.warns(UserWarning, match="no point of sweep 0 lies within 131 m of the origin"):
+        assert not find_ground(street + [FAR, 0, 0]).any()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for quiet in (street[:0], street * np.nan, street[:3], np.concatenate([street[:3], street + [FAR, 0, 0]])):
+            assert not find_ground(quiet).any()
 
 
 def test_a_turn_about_an_origin_far_away_is_refused():

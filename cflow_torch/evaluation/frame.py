@@ -12,6 +12,9 @@ from cflow_torch.data.hdf5.frames import StoredMotion, beside_harness, harness_p
 from cflow_torch.data.log import FlowLabels
 from cflow_torch.types import Array, CFlowError, FlowResult, Window, as_numpy
 
+# Kinds of numbers that are taken for each kind: NumPy would also make numbers of texts and drop imaginary parts.
+_KINDS = {"f": "fiu", "i": "iu", "b": "b"}
+
 
 def ego_motion_flow(points: np.ndarray, T_ego1_ego0: np.ndarray) -> np.ndarray:
     """Flow that ego motion alone causes, T p - p.
@@ -72,6 +75,8 @@ class EvalFrame:
         points = as_numpy(self.points)
         if points.ndim != 2 or points.shape[1] < 3:
             raise CFlowError(f"points must be (N, 3) or wider, got shape {points.shape}")
+        if points.dtype.kind not in _KINDS["f"]:
+            raise CFlowError(f"points must hold numbers, got {points.dtype}")
         self._set("points", points[:, :3].astype(np.float32))
         rows = len(points)
         for name in ("residual_flow", "flow", "pose_flow"):
@@ -151,4 +156,6 @@ class EvalFrame:
             raise CFlowError(f"{name} must have shape {shape} (one row per point of sweep t), got {array.shape}")
         if dtype is np.bool_ and array.dtype != np.bool_:
             raise CFlowError(f"{name} must be bool, got {array.dtype}")
+        if array.dtype.kind not in _KINDS[np.dtype(dtype).kind]:
+            raise CFlowError(f"{name} must hold {'whole ' if dtype is np.int64 else ''}numbers, got {array.dtype}")
         return array.astype(dtype)
