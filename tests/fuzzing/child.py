@@ -91,7 +91,7 @@ def _atheris(target: Target, one: Callable[[bytes], None], cases: int, seed: int
     lines = ("".join(f"\\x{byte:02x}" for byte in token) for token in target.tokens if token)
     tokens.write_text("".join(f'"{line}"\n' for line in lines))
     options = [f"-runs={cases}", f"-seed={seed + 1}", "-max_len=65536", "-len_control=0", "-verbosity=0"]
-    options += ["-rss_limit_mb=0", "-timeout=0", "-detect_leaks=0", *([f"-dict={tokens}"] if target.tokens else [])]
+    options += ["-rss_limit_mb=0", "-timeout=600", "-detect_leaks=0", *([f"-dict={tokens}"] if target.tokens else [])]
     atheris.Setup(["fuzz", *options, str(corpus)], one)
     atheris.Fuzz()
 
