@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 import re
 import struct
-from typing import Callable, Sequence, Tuple
+from typing import Callable, Sequence
 
 from hypothesis import strategies as st
 
@@ -20,7 +20,7 @@ _DIGITS = re.compile(rb"-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
 
 
 @st.composite
-def damaged(draw: Callable[..., object], seeds: Tuple[bytes, ...], tokens: Tuple[bytes, ...] = ()) -> bytes:
+def damaged(draw: Callable[..., object], seeds: Sequence[bytes], tokens: Sequence[bytes] = ()) -> bytes:
     """One of the seeds with one to eight wounds, all from one number: quick, and the same on every machine."""
     chance = random.Random(draw(st.integers(0, (1 << 64) - 1)))
     data = bytearray(chance.choice(seeds))

@@ -9,6 +9,7 @@ from typing import Any, List, Optional, Sequence, Tuple, Type
 
 import numpy as np
 
+from cflow_torch.data.hdf5.contained import array, check_numbers, hdf5_errors, member, names, read
 from cflow_torch.data.hdf5.frames import StoredMotion, harness_motion, is_argoverse2, recognized_extrinsics
 from cflow_torch.data.hdf5.index_file import read_index
 from cflow_torch.data.log import FlowLabels
@@ -18,6 +19,8 @@ from cflow_torch.types import CFlowError, Sweep
 
 # Time stamps count from 1970 or 1980: below this they are microseconds (16 digits), above it nanoseconds (18 or 19).
 _FIRST_NANOSECOND = 10**17
+_LAST = 2**63 - 1  # what 64 bits hold
+_LARGEST_CATEGORY = 255
 EXTRINSIC = "ego_T_lidar"  # attribute of a scene that `write_hdf5_scene` leaves
 
 
@@ -69,14 +72,17 @@ class HDF5Log:
             raise CFlowError("reading HDF5 scenes needs h5py: pip install h5py") from None
         self.file = as_path(file)
         self.log_id = self.file.stem
-        try:
+        with hdf5_errors(f"{self.file} cannot be read as HDF5"):
             self._scene = h5py.File(ranged(self.file), "r")
-        except OSError as error:
-            raise CFlowError(f"{self.file} cannot be read as HDF5 ({error}): give a scene that is complete") from error
+        self._last: Tuple[int, Any] = (-1, None)
         # HDF5 itself closes after the interpreter has gone, which a file read through Python does not survive.
         weakref.finalize(self, self._scene.close)
         try:
-            self.timestamps: Sequence[int] = sorted(int(name) for name in self._scene if name.isdigit())
+            self.timestamps: Sequence[int] = sorted(
+                _stamp(name, self.file)
+                for name in names(self._scene, str(self.file))
+                if name.isascii() and name.isdigit()
+            )
             if len(self.timestamps) < 2:
                 raise CFlowError(f"{self.file} has {len(self.timestamps)} sweeps; scene flow needs two or more")
             if isinstance(ego_T_lidar, str) and ego_T_lidar == "auto":
@@ -103,11 +109,9 @@ class HDF5Log:
             CFlowError: no such sweep, or `lidar` or `pose` is missing or cannot be read.
         """
         timestamp = self._timestamp(index)
-        points = self._read(timestamp, "lidar").astype(np.float32, copy=False)
-        if points.ndim != 2 or points.shape[1] < 3:
-            raise CFlowError(f"{self.file}: lidar of sweep {timestamp} has shape {points.shape}, expected (N, 3+)")
-        is_ground = self._column(timestamp, "ground_mask", np.bool_, len(points))
-        pose = self._read(timestamp, "pose").astype(np.float64)
+        points = self._values(timestamp, "lidar", self._lidar(timestamp), np.float32)
+        is_ground = self._column(timestamp, "ground_mask", len(points), np.bool_)
+        pose = self._pose(timestamp).astype(np.float64)
         if not np.array_equal(self.ego_T_lidar, np.eye(4)):
             pose = rigid_transform(pose, f"pose of sweep {timestamp} in {self.file}") @ self.ego_T_lidar
         nanoseconds = timestamp if timestamp >= _FIRST_NANOSECOND else timestamp * 1000
@@ -120,20 +124,29 @@ class HDF5Log:
             CFlowError: no such sweep, or its labels cannot be read.
         """
         timestamp = self._timestamp(index)
-        if "flow" not in self._scene[str(timestamp)]:
+        stored = self._array(timestamp, "flow")
+        if stored is None:
             return None
-        flow = self._read(timestamp, "flow").astype(np.float32, copy=False)
-        category = self._column(timestamp, "flow_category_indices", np.int64, len(flow))
-        is_valid = self._column(timestamp, "flow_is_valid", np.bool_, len(flow))
+        rows = len(self._lidar(timestamp))
+        if stored.shape != (rows, 3):
+            raise CFlowError(f"{self.file}: flow of sweep {timestamp} has shape {stored.shape}, expected ({rows}, 3)")
+        flow = self._values(timestamp, "flow", stored, np.float32)
+        category = self._column(timestamp, "flow_category_indices", rows)
+        is_valid = self._column(timestamp, "flow_is_valid", rows, np.bool_)
         if category is None or is_valid is None:
             raise CFlowError(f"{self.file}: sweep {timestamp} has flow without flow_category_indices or flow_is_valid")
+        if category.dtype.kind not in "iu" or category.max(initial=0) > _LARGEST_CATEGORY:
+            raise CFlowError(
+                f"{self.file}: flow_category_indices of sweep {timestamp} are {category.dtype} up to "
+                f"{category.max(initial=0)}, expected integers up to {_LARGEST_CATEGORY}"
+            )
         # Waymo has int8 and -1 = no label.
         return FlowLabels(flow, category.clip(0).astype(np.uint8), is_valid & (category >= 0))
 
     def eval_mask(self, index: int) -> Optional[np.ndarray]:
         """(N,) bool points to score, None where the sweep has no `eval_mask`."""
         timestamp = self._timestamp(index)
-        return self._column(timestamp, "eval_mask", np.bool_, len(self._scene[str(timestamp)]["lidar"]))
+        return self._column(timestamp, "eval_mask", len(self._lidar(timestamp)), np.bool_)
 
     def stored_motion(self, index: int) -> StoredMotion:
         """Ego motion of the pair (index, index + 1) as the harness has it, by the poses as they are in the file.
@@ -141,14 +154,15 @@ class HDF5Log:
         Raises:
             CFlowError: no such pair, or a pose that cannot be read or is no rigid motion.
         """
-        poses = [self._read(self._timestamp(k), "pose") for k in (index, index + 1)]
+        poses = [self._pose(self._timestamp(k)) for k in (index, index + 1)]
         for pose in poses:
             rigid_transform(pose, f"pose of sweep {index} or {index + 1} of {self.file}")
         return StoredMotion(harness_motion(*poses), np.array_equal(self.ego_T_lidar, np.eye(4)))
 
     def keys(self, index: int) -> Tuple[str, ...]:
         """Names of everything that sweep `index` has, results included."""
-        return tuple(sorted(self._scene[str(self._timestamp(index))]))
+        timestamp = self._timestamp(index)
+        return tuple(sorted(names(self._group(timestamp), f"{self.file}: sweep {timestamp}")))
 
     def values(self, index: int, key: str) -> np.ndarray:
         """What a sweep has under a key, as it is stored; (N, 1) columns become (N,).
@@ -163,9 +177,10 @@ class HDF5Log:
             CFlowError: no such sweep or key; the message lists the keys.
         """
         timestamp = self._timestamp(index)
-        if key not in self._scene[str(timestamp)]:
+        stored = self._array(timestamp, key)
+        if stored is None:
             raise CFlowError(f"{self.file}: sweep {timestamp} has no {key}; it has {', '.join(self.keys(index))}")
-        values = self._read(timestamp, key)
+        values = self._values(timestamp, key, stored)
         return values[:, 0] if values.ndim == 2 and values.shape[1] == 1 else values
 
     def eval_frames(self, index_file: Optional[Place] = None) -> List[int]:
@@ -186,7 +201,7 @@ class HDF5Log:
             index_file = beside
         if index_file is None:
             for key in ("eval_mask", "flow"):
-                found = [k for k, stamp in enumerate(self.timestamps) if key in self._scene[str(stamp)]]
+                found = [k for k, stamp in enumerate(self.timestamps) if self._array(stamp, key) is not None]
                 if found:
                     break
         else:
@@ -201,34 +216,75 @@ class HDF5Log:
     @property
     def poses(self) -> np.ndarray:
         """(K, 4, 4) float64 `T_world_lidar` of every sweep, without reading any points."""
-        return np.stack([self._read(stamp, "pose").astype(np.float64) for stamp in self.timestamps]) @ self.ego_T_lidar
+        return np.stack([self._pose(stamp).astype(np.float64) for stamp in self.timestamps]) @ self.ego_T_lidar
 
     def _stated_extrinsics(self) -> np.ndarray:
         """What the scene says about where its LiDAR sits."""
-        if EXTRINSIC in self._scene.attrs:
-            return np.asarray(self._scene.attrs[EXTRINSIC])
+        what = f"{self.file}: attribute {EXTRINSIC}"
+        with hdf5_errors(f"{what} cannot be read"):
+            if EXTRINSIC in self._scene.attrs:
+                attribute = self._scene.attrs.get_id(EXTRINSIC)
+                check_numbers(attribute, what)
+                if attribute.shape != (4, 4):
+                    raise CFlowError(f"{what} has shape {attribute.shape}, expected (4, 4)")
+                return np.asarray(self._scene.attrs[EXTRINSIC])
         first = self.timestamps[0]
-        if not is_argoverse2(first) or "lidar" not in self._scene[str(first)]:
+        if not is_argoverse2(first) or self._array(first, "lidar") is None:
             return np.eye(4)
-        points = self._read(first, "lidar")
-        return recognized_extrinsics(first, points, self._column(first, "ground_mask", np.bool_, len(points)))
+        points = self._values(first, "lidar", self._lidar(first))
+        return recognized_extrinsics(first, points, self._column(first, "ground_mask", len(points), np.bool_))
 
     def _timestamp(self, index: int) -> int:
         if not 0 <= index < len(self.timestamps):
             raise CFlowError(f"scene {self.log_id} has {len(self.timestamps)} sweeps, there is no sweep {index}")
         return self.timestamps[index]
 
-    def _read(self, timestamp: int, key: str) -> np.ndarray:
-        try:
-            return np.asarray(self._scene[str(timestamp)][key][()])
-        except (KeyError, OSError, TypeError, AttributeError) as error:
-            raise CFlowError(f"{self.file}: cannot read {key} of sweep {timestamp} ({error})") from error
+    def _group(self, timestamp: int) -> Any:
+        if self._last[0] != timestamp:  # a sweep is asked for one key after the other
+            group = member(self._scene, str(timestamp), str(self.file))
+            if not hasattr(group, "keys"):
+                raise CFlowError(f"{self.file}: {timestamp} is no group, expected one for each sweep")
+            self._last = timestamp, group
+        return self._last[1]
 
-    def _column(self, timestamp: int, key: str, dtype: Any, rows: int) -> Optional[np.ndarray]:
+    def _array(self, timestamp: int, key: str) -> Optional[Any]:
+        """What a sweep has under a key, not read yet; None where it is absent."""
+        return array(self._group(timestamp), key, f"{self.file}: sweep {timestamp}")
+
+    def _lidar(self, timestamp: int) -> Any:
+        """(N, 3+) points, not read yet."""
+        stored = self._array(timestamp, "lidar")
+        if stored is None or len(stored.shape) != 2 or stored.shape[1] < 3:
+            shape = "none" if stored is None else f"shape {stored.shape}"
+            raise CFlowError(f"{self.file}: lidar of sweep {timestamp} has {shape}, expected shape (N, 3+)")
+        return stored
+
+    def _pose(self, timestamp: int) -> np.ndarray:
+        """(4, 4) pose as stored."""
+        stored = self._array(timestamp, "pose")
+        if stored is None or stored.shape != (4, 4):
+            shape = "none" if stored is None else f"shape {stored.shape}"
+            raise CFlowError(f"{self.file}: pose of sweep {timestamp} has {shape}, expected shape (4, 4)")
+        return self._values(timestamp, "pose", stored)
+
+    def _values(self, timestamp: int, key: str, stored: Any, dtype: Any = None) -> np.ndarray:
+        values = read(stored, f"{self.file}: {key} of sweep {timestamp}", dtype)
+        with np.errstate(over="ignore"):  # float64 beyond float32 becomes infinite, which no step takes for a point
+            return values if dtype is None else values.astype(dtype, copy=False)
+
+    def _column(self, timestamp: int, key: str, rows: int, dtype: Any = None) -> Optional[np.ndarray]:
         """(N,) values of a key, also where it is stored as (N, 1); None where it is absent."""
-        if key not in self._scene[str(timestamp)]:
+        stored = self._array(timestamp, key)
+        if stored is None:
             return None
-        values = self._read(timestamp, key)
-        if values.shape not in ((rows,), (rows, 1)):
-            raise CFlowError(f"{self.file}: {key} of sweep {timestamp} has shape {values.shape}, expected ({rows},)")
-        return values.reshape(rows).astype(dtype, copy=False)
+        if stored.shape not in ((rows,), (rows, 1)):
+            raise CFlowError(f"{self.file}: {key} of sweep {timestamp} has shape {stored.shape}, expected ({rows},)")
+        return self._values(timestamp, key, stored, dtype).reshape(rows)
+
+
+def _stamp(name: str, file: Path) -> int:
+    if len(name) > len(str(_LAST)) or (name[0] == "0" and name != "0") or int(name) > _LAST:
+        raise CFlowError(
+            f"{file} has a sweep {name[:30]}, expected a time stamp up to {_LAST} that does not begin with 0"
+        )
+    return int(name)

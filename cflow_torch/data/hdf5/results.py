@@ -11,6 +11,7 @@ from typing import Any, Iterable, Tuple, Union
 import numpy as np
 
 from cflow_torch.data.atomic import sync_folder, temporary_name
+from cflow_torch.data.hdf5.contained import array, hdf5_errors, member
 from cflow_torch.types import Array, CFlowError, as_numpy
 
 # Keys that scenes bring, and names that the viewers give a meaning of their own.
@@ -22,6 +23,7 @@ RESERVED_KEYS = frozenset(
         *("pc0", "pc1", "gm0", "gm1", "pose0", "pose1"),
     )
 )
+_MEND = "give a scene that is complete, on a disk with room for two of it"
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_.-]{0,63}")
 
 
@@ -88,13 +90,15 @@ def write_hdf5_results(file: Union[str, Path], name: str, results: Iterable[Tupl
     try:
         shutil.copy(file, copy)
         count = 0
+        with hdf5_errors(f"{file} cannot be written as HDF5", _MEND):
+            scene = h5py.File(copy, "r+")
         try:
-            with h5py.File(copy, "r+") as scene:
-                for timestamp, flow in results:
-                    _write(scene, file, str(timestamp), name, as_numpy(flow))
-                    count += 1
-        except OSError as error:
-            raise CFlowError(f"{file} cannot be written as HDF5 ({error}): give a scene that is complete") from error
+            for timestamp, flow in results:
+                _write(scene, file, str(timestamp), name, as_numpy(flow))
+                count += 1
+        finally:
+            with hdf5_errors(f"{file} cannot be written as HDF5", _MEND):
+                scene.close()
         if count:
             with open(copy, "rb") as written:
                 os.fsync(written.fileno())
@@ -107,15 +111,22 @@ def write_hdf5_results(file: Union[str, Path], name: str, results: Iterable[Tupl
 
 
 def _write(scene: Any, file: Path, timestamp: str, name: str, flow: np.ndarray) -> None:
-    group = scene.get(timestamp)
-    if group is None or "lidar" not in group:
+    import h5py
+
+    where = f"{file}: sweep {timestamp}"
+    group: Any = member(scene, timestamp, str(file))
+    points = array(group, "lidar", where) if isinstance(group, h5py.Group) else None
+    if points is None:
         raise CFlowError(f"{file} has no sweep {timestamp}")
-    rows = len(group["lidar"])
+    rows = points.shape[0] if points.shape else 0
     if flow.shape != (rows, 3):
         raise CFlowError(f"{file}: the flow of sweep {timestamp} has shape {flow.shape}, expected ({rows}, 3)")
-    if name in group:
-        if group[name].shape != (rows, 3) or group[name].dtype != np.float32:
+    older = array(group, name, where)
+    with hdf5_errors(f"{where}: {name} cannot be written", _MEND):
+        if older is None:
+            group.create_dataset(name, data=flow.astype(np.float32))
+            return
+        # Two names of one dataset: another key would change as well.
+        if older.shape != (rows, 3) or older.dtype != np.float32 or h5py.h5o.get_info(older.id).rc > 1:
             raise CFlowError(f"{file}: {name} of sweep {timestamp} is no flow result, it is not replaced")
-        group[name][...] = flow  # in its old place: deleting would leave a hole that HDF5 never gives back
-    else:
-        group.create_dataset(name, data=flow.astype(np.float32))
+        older[...] = flow  # in its old place: deleting would leave a hole that HDF5 never gives back

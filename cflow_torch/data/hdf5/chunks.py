@@ -1,0 +1,92 @@
+"""Datasets in chunks, unpacked here: libhdf5 bounds no chunk and takes too short ones."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import zlib
+from typing import Any, List
+
+import numpy as np
+
+from cflow_torch.data.bounds import check_claim
+from cflow_torch.types import CFlowError
+
+_DEFLATE, _SHUFFLE = 1, 2  # numbers of the filters in the format
+_MEND = "write it anew, uncompressed or with gzip (compression='gzip' of h5py)"
+MAX_CHUNKS = 100_000  # of one dataset; h5py makes chunks of 8 KiB and more
+
+
+def filters_of(plan: Any, what: str) -> List[int]:
+    """The filters that a dataset went through: none, shuffle, gzip, or shuffle and then gzip.
+
+    Args:
+        plan: h5py's property list of the dataset.
+        what: for the message.
+
+    Raises:
+        CFlowError: there are others. They are refused because what they unpack to cannot be bounded, and because HDF5
+            would load a library for those that it does not know.
+    """
+    filters = [plan.get_filter(number)[0] for number in range(plan.get_nfilters())]
+    if filters not in ([], [_SHUFFLE], [_DEFLATE], [_SHUFFLE, _DEFLATE]):
+        raise CFlowError(
+            f"{what} is packed with the filters {filters[:8]}, gzip is read (with or without shuffle); {_MEND}"
+        )
+    return filters
+
+
+def read_chunks(dataset: Any, what: str) -> np.ndarray:
+    """All values of a dataset in chunks, of a type just as NumPy has it.
+
+    Raises:
+        CFlowError: it claims too much, a chunk is missing, or unpacks to another size than it has.
+    """
+    dtype, shape, chunk = dataset.dtype, dataset.shape, dataset.chunks
+    filters = filters_of(dataset.id.get_create_plist(), what)
+    size = math.prod(chunk) * dtype.itemsize
+    counts = [-(-whole // part) for whole, part in zip(shape, chunk)]
+    if math.prod(counts) > MAX_CHUNKS:
+        raise CFlowError(f"{what} has {math.prod(counts)} chunks, up to {MAX_CHUNKS} are read; {_MEND}")
+    check_claim(what, "its chunks", math.prod(counts) * size)
+    values = np.empty(shape, dtype)
+    for numbers in itertools.product(*map(range, counts)):
+        corner = tuple(number * part for number, part in zip(numbers, chunk))
+        part = np.frombuffer(_unpacked(dataset, corner, filters, size, what), dtype).reshape(chunk)
+        place = tuple(slice(start, start + length) for start, length in zip(corner, chunk))
+        there = values[place]
+        there[...] = part[tuple(slice(0, length) for length in there.shape)]
+    return values
+
+
+def _unpacked(dataset: Any, corner: Any, filters: List[int], size: int, what: str) -> Any:
+    """The bytes of one chunk."""
+    info = dataset.id.get_chunk_info_by_coord(corner)
+    # Packing makes nothing larger, but for a few bytes in a thousand.
+    if info.byte_offset is None or info.size > size + size // 100 + 1024:
+        raise CFlowError(
+            f"{what}: the chunk at {corner} is missing or claims {info.size} bytes of {size}; copy it again"
+        )
+    skipped, data = dataset.id.read_direct_chunk(corner)
+    for number, kind in reversed(list(enumerate(filters))):
+        if skipped >> number & 1:
+            continue
+        if kind == _DEFLATE:
+            unpacker = zlib.decompressobj()
+            data = unpacker.decompress(data, size + 1)
+            if not unpacker.eof:
+                raise CFlowError(f"{what}: the chunk at {corner} does not end after {size} bytes; copy it again")
+        elif len(data) == size:
+            data = _unshuffled(data, dataset.dtype.itemsize)
+    if len(data) != size:
+        raise CFlowError(f"{what}: the chunk at {corner} unpacks to {len(data)} bytes, expected {size}; copy it again")
+    return data
+
+
+def _unshuffled(data: Any, itemsize: int) -> Any:
+    """Shuffle puts the first bytes of all numbers first, then the second ones, ..."""
+    planes = np.frombuffer(data, np.uint8).reshape(itemsize, -1)
+    numbers = np.empty((planes.shape[1], itemsize), np.uint8)
+    for place, plane in enumerate(planes):  # four times as fast as to copy the transpose
+        numbers[:, place] = plane
+    return numbers.data.cast("B")
