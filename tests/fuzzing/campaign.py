@@ -19,6 +19,7 @@ from fuzzing.target import Target
 
 TESTS = Path(__file__).resolve().parents[1]
 HANGS = 20.0  # seconds for one small file
+START = 600.0  # until the first one, after the imports, on a busy machine
 MOST_ENDS = 200  # crashes and hangs after which a campaign is given up
 
 
@@ -82,13 +83,14 @@ def _watch(ledger: Ledger, arguments: List[str]) -> str:
         child = subprocess.Popen(
             [sys.executable, "-m", "fuzzing.child", *arguments], env=environment, stderr=stderr, stdout=stderr
         )
-        done, since = -1, time.monotonic()
+        begun, since = ledger.counts()["cases"], time.monotonic()
+        done = begun
         while child.poll() is None:
             time.sleep(0.2)
             now = ledger.counts()["cases"]
             if now != done:
                 done, since = now, time.monotonic()
-            elif time.monotonic() - since > HANGS + (60 if now == 0 else 0):
+            elif time.monotonic() - since > (START if now == begun else HANGS):
                 child.send_signal(signal.SIGABRT)  # faulthandler prints where it was
                 child.wait(10)
                 return "hang"
