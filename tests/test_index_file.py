@@ -7,12 +7,13 @@ import io
 import os
 import pickle
 import struct
+import tracemalloc
 from pathlib import Path
 
 import pytest
 
 from cflow_torch import CFlowError
-from cflow_torch.data.hdf5.index_file import _NoNames, read_index, write_index
+from cflow_torch.data.hdf5.index_file import MAX_BYTES, MAX_INSTRUCTIONS, _NoNames, read_index, write_index
 
 ENTRIES = [("scene-a", 315966265259836000), ("scene-a", 315966265360032000), ("b", 1)]
 
@@ -119,3 +120,33 @@ def test_broken_files(tmp_path):
             read_index(file)
     with pytest.raises(CFlowError, match="missing"):
         read_index(tmp_path / "missing.pkl")
+
+
+def test_bombs_of_size_and_reference(tmp_path):
+    """Doubled references, deep nesting, claims of sizes: nothing is made of them that is larger than the file."""
+    text, claim = b"\x8c\x01a", (1 << 31) - 1
+    doubled = b"".join(b"h%ch%c\x86q%c" % (k, k, k + 1) for k in range(200))
+    streams = {
+        "doubled tuples": b"\x80\x02](" + text + b"q\0" + doubled + b"e.",
+        "list of itself": b"]q\0(h\0h\0e.",
+        "deep": b"]" * 300_000 + b"a" * 299_999 + b".",
+        "text": b"](X" + struct.pack("<I", claim) + b"ae.",
+        "long text": b"](\x8d" + struct.pack("<Q", 1 << 62) + b"ae.",
+        "integer": b"](\x8b" + struct.pack("<i", claim) + b"\x01e.",
+        "frame": b"\x80\x04\x95" + struct.pack("<Q", (1 << 63) - 1) + b"].",
+        "many instructions": b"](" + b"]0" * (MAX_INSTRUCTIONS // 2) + b"e.",
+        "large": b"](" + b"0" * MAX_BYTES,
+    }
+    for what, stream in streams.items():
+        (tmp_path / "a.pkl").write_bytes(stream)
+        tracemalloc.start()
+        with pytest.raises(CFlowError, match=r"a\.pkl"):
+            read_index(tmp_path / "a.pkl")
+        most = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert most < 2 * len(stream) + (60 << 20), what
+
+
+def test_entries_that_share_their_parts_are_read(tmp_path):
+    (tmp_path / "a.pkl").write_bytes(b"\x80\x02](\x8c\x01a\x8c\x017\x86q\0" + b"h\0" * 1000 + b"e.")
+    assert read_index(tmp_path / "a.pkl") == [("a", 7)] * 1001

@@ -21,6 +21,8 @@ _HARMLESS = {
     *("UNICODE", "BINUNICODE", "SHORT_BINUNICODE", "BINUNICODE8", "STRING", "BINSTRING", "SHORT_BINSTRING"),
     *("MEMOIZE", "PUT", "BINPUT", "LONG_BINPUT", "GET", "BINGET", "LONG_BINGET"),
 }
+MAX_BYTES = 1 << 25  # the largest public one has 93,547 entries, 6 MB
+MAX_INSTRUCTIONS = 4_000_000  # of a pickle; an entry takes five to nine
 _PUTS = {"PUT", "BINPUT", "LONG_BINPUT"}
 
 
@@ -51,7 +53,7 @@ def read_index(path: Place) -> List[Entry]:
         CFlowError: no such file, no pickle, a pickle with other contents.
     """
     try:
-        data = read_bytes(as_path(path))
+        data = read_bytes(as_path(path), MAX_BYTES)
     except OSError as error:
         raise CFlowError(f"cannot read {path} ({error}); give an index file (.pkl)") from error
     return list(_entries(str(path), data))
@@ -87,7 +89,9 @@ def _entries(path: str, data: bytes) -> Tuple[Entry, ...]:
 
 
 def _refuse_code(data: bytes) -> None:
-    for opcode, argument, _ in pickletools.genops(data):
+    for number, (opcode, argument, _) in enumerate(pickletools.genops(data)):
+        if number >= MAX_INSTRUCTIONS:
+            raise CFlowError(f"it has more than {MAX_INSTRUCTIONS} instructions")
         if opcode.name not in _HARMLESS:
             raise CFlowError(f"it has the instruction {opcode.name}; an index is made of lists, tuples and text only")
         # The unpickler makes room for the number it is told: a tiny file could ask for all memory.
