@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import zipfile
-import zlib
 from pathlib import Path
 from typing import Dict, Iterable, List, Union
 
 from cflow_torch.data.atomic import atomic_file
+from cflow_torch.data.zips import member_names, open_zip, read_member
 from cflow_torch.submission.versions import METADATA_FILE, SubmissionVersion
 from cflow_torch.types import CFlowError
 
-MAX_FILE_BYTES = 1 << 28  # a frame takes about 1 MB; more than this is no frame
-# What zipfile raises for damaged entries, encrypted ones (RuntimeError) and unknown compression (NotImplementedError).
-_UNREADABLE = (OSError, KeyError, EOFError, RuntimeError, NotImplementedError, zipfile.BadZipFile, zlib.error)
+_ROW_BYTES, _OTHER_BYTES = 64, 1 << 20  # a row has four columns of at most 8 bytes; metadata take some kilobytes
 _EARLIEST = (1980, 1, 1, 0, 0, 0)  # the first time that a zip can hold
 
 
@@ -73,24 +71,28 @@ class Contents:
             return
         if not self.path.is_file():
             raise CFlowError(f"{self.path} does not exist; give a zip, or the folder that it is made from")
-        try:
-            self._zip = zipfile.ZipFile(self.path)
-        except (OSError, zipfile.BadZipFile) as error:
-            raise CFlowError(f"{self.path} cannot be read as a zip ({error}): pack it again") from error
-        self.names = sorted(info.orig_filename for info in self._zip.infolist() if not info.is_dir())
+        self._zip = open_zip(self.path)
+        self.names = member_names(self._zip)
 
-    def read(self, name: str) -> bytes:
+    def read(self, name: str, rows: int = 0) -> bytes:
         """Contents of a file.
+
+        Args:
+            name: of the file.
+            rows: that it should have; one that is far too large for them is not read.
 
         Raises:
             CFlowError: it cannot be read, or is far too large.
         """
+        limit = _OTHER_BYTES + _ROW_BYTES * rows
+        if self._zip is not None:
+            return read_member(self._zip, name, limit)
         try:
-            size = self._zip.getinfo(name).file_size if self._zip else self._files[name].stat().st_size
-            if size > MAX_FILE_BYTES:
-                raise CFlowError(f"{size} bytes, more than any frame has")
-            return self._zip.read(name) if self._zip else self._files[name].read_bytes()
-        except _UNREADABLE as error:
+            size = self._files[name].stat().st_size
+            if size > limit:
+                raise CFlowError(f"it has {size} bytes, up to {limit} are right here")
+            return self._files[name].read_bytes()
+        except (OSError, KeyError) as error:
             raise CFlowError(f"cannot be read ({error})") from error
 
     def close(self) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 from pyarrow import feather
 
+from cflow_torch.data.json_file import parse_json
 from cflow_torch.submission.archive import Contents
 from cflow_torch.submission.plan import Frame
 from cflow_torch.submission.versions import METADATA_FILE, SubmissionVersion
@@ -102,7 +103,7 @@ def _check(contents: Contents, version: SubmissionVersion, expected: Dict[str, i
             problems.append(f"{name}: missing frame")
             continue
         try:
-            problems += check_file(name, contents.read(prefix + name), expected[name], version)
+            problems += check_file(name, contents.read(prefix + name, expected[name]), expected[name], version)
         except CFlowError as error:
             problems.append(f"{name}: {_one_line(error)}")
     if version.metadata is not None:
@@ -138,8 +139,8 @@ def _check_metadata(contents: Contents, name: str, required: Mapping[str, Any]) 
     if name not in contents.names:
         return [f"{METADATA_FILE}: missing, it must hold {json.dumps(dict(required))}"]
     try:
-        values = json.loads(contents.read(name).decode("utf-8"))
-    except ValueError as error:  # a file that cannot be read as well
+        values = parse_json(contents.read(name), METADATA_FILE)
+    except CFlowError as error:  # a file that cannot be read as well
         return [f"{METADATA_FILE}: no JSON ({_one_line(error)})"]
     return [
         f"{METADATA_FILE}: must hold {json.dumps(key)} as true or false"

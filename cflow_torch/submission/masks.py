@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import zipfile
+import re
 from pathlib import Path
 from typing import Dict, List, Optional, Union
 
@@ -11,8 +11,11 @@ import pyarrow as pa
 from pyarrow import feather
 
 from cflow_torch.data.log import Log
+from cflow_torch.data.zips import member_names, open_zip, read_member
 from cflow_torch.types import CFlowError, Sweep, as_numpy
 
+MAX_MASK_BYTES = 1 << 26  # of one mask's file; one of 100,000 points takes some kilobytes
+_MASK = re.compile(r"(?P<log>.+)/(?P<stamp>0|[1-9][0-9]{0,18})\.feather", re.ASCII)
 _HALF_SIDE = 50.0  # metres; the official masks hold the points that are not ground with |x|, |y| <= 50
 
 
@@ -32,14 +35,14 @@ class MaskArchive:
     def __init__(self, file: Union[str, Path]) -> None:
         self.file = Path(file)
         self.frames: Dict[str, List[int]] = {}
-        try:
-            self._zip = zipfile.ZipFile(self.file)
-        except (OSError, zipfile.BadZipFile) as error:
-            raise CFlowError(f"{self.file} cannot be read as a zip of masks ({error})") from error
-        for name in self._zip.namelist():
-            log_id, _, stem = name.rpartition("/")
-            if name.endswith(".feather") and stem[: -len(".feather")].isdigit():
-                self.frames.setdefault(log_id, []).append(int(stem[: -len(".feather")]))
+        self._zip = open_zip(self.file)
+        stored = member_names(self._zip)
+        for name, following in zip(stored, [*stored[1:], None]):
+            if name == following:
+                raise CFlowError(f"{self.file} holds {name!r} twice: which one is meant?")
+            match = _MASK.fullmatch(name)
+            if match is not None:
+                self.frames.setdefault(match["log"], []).append(int(match["stamp"]))
         if not self.frames:
             raise CFlowError(f"{self.file} holds no masks; it must hold <log>/<time stamp>.feather")
         for stamps in self.frames.values():
@@ -53,12 +56,17 @@ class MaskArchive:
         """
         name = f"{log_id}/{timestamp}.feather"
         try:
-            table = feather.read_table(pa.BufferReader(self._zip.read(name)))
-        except (KeyError, OSError, zipfile.BadZipFile, pa.ArrowException) as error:
+            data = read_member(self._zip, name, MAX_MASK_BYTES)
+            table = feather.read_table(pa.BufferReader(data))
+        except (CFlowError, OSError, ValueError, pa.ArrowException) as error:
             raise CFlowError(f"{self.file}: cannot read {name} ({error})") from error
         if table.num_columns != 1 or not pa.types.is_boolean(table.schema.types[0]):
             raise CFlowError(f"{self.file}: {name} must hold one bool column, got {table.schema.names}")
         return table.column(0).to_numpy().astype(bool)
+
+    def close(self) -> None:
+        """Close the zip."""
+        self._zip.close()
 
 
 def point_mask(log: Log, index: int, sweep: Sweep, masks: Optional[MaskArchive] = None) -> np.ndarray:

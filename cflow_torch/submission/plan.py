@@ -9,12 +9,14 @@ from typing import Dict, Iterable, List, Mapping, Optional, Sequence, Union
 
 from cflow_torch.data.log import Log
 from cflow_torch.data.names import safe_name, same_names
+from cflow_torch.data.paths import read_bytes
 from cflow_torch.submission.masks import MaskArchive, log_mask, point_mask
 from cflow_torch.submission.versions import SubmissionVersion
 from cflow_torch.types import CFlowError
 
 STRIDE = 5  # every fifth pair of a log is evaluated
 _LISTED = re.compile(r"(?P<log>[^\s,/]+)[\s,/]+(?P<timestamp>[0-9]{1,19})")
+MAX_LIST_BYTES = 1 << 24  # of a list of frames; one of 10,000 has less than a megabyte
 
 
 @dataclass(frozen=True)
@@ -93,10 +95,10 @@ def read_frame_list(file: Union[str, Path]) -> Dict[str, List[int]]:
             f"one <log>/<time stamp> a line, or leave the list out where the scenes carry eval_mask"
         )
     try:
-        lines = file.read_text(encoding="utf-8").splitlines()
+        lines = read_bytes(file, MAX_LIST_BYTES).decode("utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise CFlowError(f"{file} cannot be read as a list of frames ({error})") from error
-    result: Dict[str, List[int]] = {}
+    result: Dict[str, Dict[int, None]] = {}
     for number, line in enumerate(lines, 1):
         entry = line.partition("#")[0].strip()
         if not entry:
@@ -104,13 +106,13 @@ def read_frame_list(file: Union[str, Path]) -> Dict[str, List[int]]:
         match = _LISTED.fullmatch(entry)
         if match is None:
             raise CFlowError(f"{file}, line {number}: {entry!r} is no frame; write <log>/<time stamp>")
-        stamps = result.setdefault(match["log"], [])
+        stamps = result.setdefault(match["log"], {})  # a set that keeps the order
         if int(match["timestamp"]) in stamps:
             raise CFlowError(f"{file}, line {number}: {entry!r} is listed twice")
-        stamps.append(int(match["timestamp"]))
+        stamps[int(match["timestamp"])] = None
     if not result:
         raise CFlowError(f"{file} lists no frame")
-    return result
+    return {log: list(stamps) for log, stamps in result.items()}
 
 
 def require_logs(logs: Iterable[Log], listed: Optional[Mapping[str, Sequence[int]]]) -> None:
