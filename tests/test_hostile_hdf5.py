@@ -104,6 +104,12 @@ def test_a_second_name_of_another_key_is_not_written_over(scene: Path) -> None:
     assert scene.read_bytes() == before
 
 
+def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "scene.h5")
+    with pytest.raises(CFlowError, match=r"scene\.h5.*pipe"):
+        HDF5Log(tmp_path / "scene.h5")
+
+
 TYPES = (
     *("c8", "S4", "V7", np.longdouble, ("f4", (3,)), [("a", "f4")], h5py.string_dtype(), h5py.ref_dtype),
     *(h5py.vlen_dtype(np.float32), h5py.enum_dtype({"a": 1}), h5py.opaque_dtype(np.dtype("M8[s]"))),

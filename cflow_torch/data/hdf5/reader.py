@@ -13,7 +13,7 @@ from cflow_torch.data.hdf5.contained import array, check_numbers, hdf5_errors, m
 from cflow_torch.data.hdf5.frames import StoredMotion, harness_motion, is_argoverse2, recognized_extrinsics
 from cflow_torch.data.hdf5.index_file import read_index
 from cflow_torch.data.log import FlowLabels
-from cflow_torch.data.paths import Place, as_path, ranged
+from cflow_torch.data.paths import Place, as_path, is_remote, ranged
 from cflow_torch.ego import rigid_transform
 from cflow_torch.types import CFlowError, Sweep
 
@@ -73,6 +73,8 @@ class HDF5Log:
         self.file = as_path(file)
         self.log_id = self.file.stem
         with hdf5_errors(f"{self.file} cannot be read as HDF5"):
+            if not is_remote(self.file) and not self.file.is_file():
+                raise FileNotFoundError("no such file, or a folder, pipe or device")  # HDF5 would wait for a pipe
             self._scene = h5py.File(ranged(self.file), "r")
         self._last: Tuple[int, Any] = (-1, None)
         # HDF5 itself closes after the interpreter has gone, which a file read through Python does not survive.
@@ -216,7 +218,9 @@ class HDF5Log:
     @property
     def poses(self) -> np.ndarray:
         """(K, 4, 4) float64 `T_world_lidar` of every sweep, without reading any points."""
-        return np.stack([self._pose(stamp).astype(np.float64) for stamp in self.timestamps]) @ self.ego_T_lidar
+        stored = np.stack([self._pose(stamp).astype(np.float64) for stamp in self.timestamps])
+        with np.errstate(all="ignore"):  # NaN stays NaN
+            return stored @ self.ego_T_lidar
 
     def _stated_extrinsics(self) -> np.ndarray:
         """What the scene says about where its LiDAR sits."""
