@@ -139,6 +139,15 @@ def packed(group: Any, stored: bytes, mask: int = 0, **how: Any) -> None:
     made.id.write_direct_chunk((0, 0), stored, filter_mask=mask)
 
 
+def filtered_by_nobody(group: Any) -> None:
+    """HDF5 would look for a library that knows filter 32123, and run it."""
+    plan = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    plan.set_chunk((POINTS, 4))
+    plan.set_filter(32123, h5py.h5z.FLAG_OPTIONAL, ())
+    space = h5py.h5s.create_simple((POINTS, 4))
+    h5py.h5d.create(group.id, b"lidar", h5py.h5t.IEEE_F32LE, space, plan).write_direct_chunk((0, 0), WHOLE)
+
+
 WHOLE = sweep_values(0)["lidar"].tobytes()
 PACKED: Dict[str, Callable[[Any], object]] = {
     "too short": lambda group: packed(group, zlib.compress(WHOLE[:-1])),
@@ -151,6 +160,7 @@ PACKED: Dict[str, Callable[[Any], object]] = {
     "partly missing": lambda group: group.create_dataset("lidar", (POINTS, 4), "f4", chunks=(2, 2)).__setitem__(
         (0, 0), 1
     ),
+    "a filter of nobody": lambda group: filtered_by_nobody(group),
     "lzf": lambda group: group.create_dataset("lidar", data=np.ones((POINTS, 4)), compression="lzf"),
     "scale-offset": lambda group: group.create_dataset("lidar", data=np.ones((POINTS, 4), int), scaleoffset=2),
     "not stored": lambda group: group.create_dataset("lidar", (POINTS, 4), "f4"),
@@ -271,7 +281,7 @@ def test_a_sweep_or_key_that_is_another_thing(scene: Path) -> None:
         opened[str(STAMPS[1])] = np.zeros(3)
         opened["5"] = np.dtype("f4")
     with HDF5Log(scene) as log:
-        for index, complaint in ((0, "5 is no group"), (1, "lidar is a Group"), (2, f"{STAMPS[1]} is no group")):
+        for index, complaint in ((0, "5 is no group"), (1, "lidar is no array"), (2, f"{STAMPS[1]} is no group")):
             with pytest.raises(CFlowError, match=complaint):
                 log.sweep(index)
             with (

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import zlib
-from typing import Any, List
+from typing import Any, List, NamedTuple, Optional, Tuple
 
 import numpy as np
 
@@ -15,6 +15,24 @@ from cflow_torch.types import CFlowError
 _DEFLATE, _SHUFFLE = 1, 2  # numbers of the filters in the format
 _MEND = "write it anew, uncompressed or with gzip (compression='gzip' of h5py)"
 MAX_CHUNKS = 100_000  # of one dataset; h5py makes chunks of 8 KiB and more
+
+
+class Stored(NamedTuple):
+    """An array in a file, checked but not read.
+
+    Args:
+        opened: h5py's low-level dataset.
+        shape: of the array.
+        dtype: one that NumPy has just like this.
+        chunk: shape of its chunks, None = it is not in chunks.
+        filters: that each chunk went through.
+    """
+
+    opened: Any
+    shape: Tuple[int, ...]
+    dtype: np.dtype
+    chunk: Optional[Tuple[int, ...]]
+    filters: List[int]
 
 
 def filters_of(plan: Any, what: str) -> List[int]:
@@ -36,14 +54,13 @@ def filters_of(plan: Any, what: str) -> List[int]:
     return filters
 
 
-def read_chunks(dataset: Any, what: str) -> np.ndarray:
-    """All values of a dataset in chunks, of a type just as NumPy has it.
+def read_chunks(stored: Stored, what: str) -> np.ndarray:
+    """All values of an array in chunks, which has some.
 
     Raises:
         CFlowError: it claims too much, a chunk is missing, or unpacks to another size than it has.
     """
-    dtype, shape, chunk = dataset.dtype, dataset.shape, dataset.chunks
-    filters = filters_of(dataset.id.get_create_plist(), what)
+    dtype, shape, chunk = stored.dtype, stored.shape, stored.chunk or stored.shape
     size = math.prod(chunk) * dtype.itemsize
     counts = [-(-whole // part) for whole, part in zip(shape, chunk)]
     if math.prod(counts) > MAX_CHUNKS:
@@ -52,23 +69,23 @@ def read_chunks(dataset: Any, what: str) -> np.ndarray:
     values = np.empty(shape, dtype)
     for numbers in itertools.product(*map(range, counts)):
         corner = tuple(number * part for number, part in zip(numbers, chunk))
-        part = np.frombuffer(_unpacked(dataset, corner, filters, size, what), dtype).reshape(chunk)
+        part = np.frombuffer(_unpacked(stored, corner, size, what), dtype).reshape(chunk)
         place = tuple(slice(start, start + length) for start, length in zip(corner, chunk))
         there = values[place]
         there[...] = part[tuple(slice(0, length) for length in there.shape)]
     return values
 
 
-def _unpacked(dataset: Any, corner: Any, filters: List[int], size: int, what: str) -> Any:
+def _unpacked(stored: Stored, corner: Any, size: int, what: str) -> Any:
     """The bytes of one chunk."""
-    info = dataset.id.get_chunk_info_by_coord(corner)
+    info = stored.opened.get_chunk_info_by_coord(corner)
     # Packing makes nothing larger, but for a few bytes in a thousand.
     if info.byte_offset is None or info.size > size + size // 100 + 1024:
         raise CFlowError(
             f"{what}: the chunk at {corner} is missing or claims {info.size} bytes of {size}; copy it again"
         )
-    skipped, data = dataset.id.read_direct_chunk(corner)
-    for number, kind in reversed(list(enumerate(filters))):
+    skipped, data = stored.opened.read_direct_chunk(corner)
+    for number, kind in reversed(list(enumerate(stored.filters))):
         if skipped >> number & 1:
             continue
         if kind == _DEFLATE:
@@ -77,7 +94,7 @@ def _unpacked(dataset: Any, corner: Any, filters: List[int], size: int, what: st
             if not unpacker.eof:
                 raise CFlowError(f"{what}: the chunk at {corner} does not end after {size} bytes; copy it again")
         elif len(data) == size:
-            data = _unshuffled(data, dataset.dtype.itemsize)
+            data = _unshuffled(data, stored.dtype.itemsize)
     if len(data) != size:
         raise CFlowError(f"{what}: the chunk at {corner} unpacks to {len(data)} bytes, expected {size}; copy it again")
     return data

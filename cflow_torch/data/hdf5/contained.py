@@ -6,13 +6,14 @@ run through conversions of their own. A scene of OpenSceneFlow has none of that,
 
 from __future__ import annotations
 
+import math
 from contextlib import contextmanager
-from typing import Any, Iterator, List, Optional, Tuple
+from typing import Any, Iterator, List, Optional
 
 import numpy as np
 
 from cflow_torch.data.bounds import check_claim
-from cflow_torch.data.hdf5.chunks import filters_of, read_chunks
+from cflow_torch.data.hdf5.chunks import Stored, filters_of, read_chunks
 from cflow_torch.types import CFlowError
 
 _MEND = "write the scene anew: groups with arrays of plain numbers in the file itself"
@@ -30,66 +31,76 @@ def hdf5_errors(what: str, mend: str = "copy the scene again") -> Iterator[None]
         raise CFlowError(f"{what} ({type(error).__name__}: {error}); {mend}") from error
 
 
-def names(group: Any, where: str) -> List[str]:
+def names(parent: Any, where: str) -> List[str]:
     """Names in a group, as stored.
 
     Raises:
         CFlowError: they cannot be read, or one is no text.
     """
     with hdf5_errors(f"{where} cannot be listed"):
-        found = list(group)
+        found = list(parent)
     strange = [name for name in found if not isinstance(name, str)]
     if strange:
         raise CFlowError(f"{where} has the name {strange[0]!r}, which is no UTF-8 text: rename it")
     return found
 
 
-def member(group: Any, name: str, where: str) -> Optional[Any]:
-    """The group or dataset of a name; None where there is none. No link is ever followed.
+def group(parent: Any, name: str, where: str) -> Optional[Any]:
+    """The group of a name; None where there is none. No link is ever followed.
 
     Raises:
-        CFlowError: the name stands for something elsewhere, or cannot be opened.
+        CFlowError: the name stands for something else, or cannot be opened.
     """
+    import h5py
+
+    opened = _opened(parent, name, where)
+    if opened is None:
+        return None
+    if not isinstance(opened, h5py.h5g.GroupID):
+        raise CFlowError(f"{where}: {name} is no group; {_MEND}")
+    return h5py.Group(opened)
+
+
+def array(parent: Any, name: str, where: str) -> Optional[Stored]:
+    """An array of plain numbers in the file itself; None where there is none. Nothing of it is read.
+
+    Raises:
+        CFlowError: the name stands for something else, or cannot be opened.
+    """
+    import h5py
+
+    opened = _opened(parent, name, where)
+    if opened is None:
+        return None
+    what = f"{where}: {name}"
+    if not isinstance(opened, h5py.h5d.DatasetID):
+        raise CFlowError(f"{what} is no array; {_MEND}")
+    with hdf5_errors(f"{what} cannot be opened"):
+        plan = opened.get_create_plist()
+        layout = plan.get_layout()
+        if layout == h5py.h5d.VIRTUAL or plan.get_external_count():
+            raise CFlowError(f"{what} lies in other files, which are not read; {_MEND}")
+        check_numbers(opened, what)
+        filters = filters_of(plan, what)
+        shape = opened.shape
+        if shape is None:
+            raise CFlowError(f"{what} holds nothing at all; {_MEND}")
+        return Stored(opened, shape, opened.dtype, plan.get_chunk() if layout == h5py.h5d.CHUNKED else None, filters)
+
+
+def _opened(parent: Any, name: str, where: str) -> Optional[Any]:
     import h5py
 
     if not name or "/" in name or name == ".":
         return None
     with hdf5_errors(f"{where}: cannot open {name}"):
         stored = name.encode()
-        links = group.id.links  # `in` and `get` of h5py open what a link names, be it a file elsewhere
+        links = parent.id.links  # `in` and `get` of h5py open what a link names, be it a file elsewhere
         if not links.exists(stored):
             return None
         if links.get_info(stored).type != h5py.h5l.TYPE_HARD:
             raise CFlowError(f"{where}: {name} is a link, which is not followed; {_MEND}")
-        opened = h5py.h5o.open(group.id, stored)
-        if isinstance(opened, h5py.h5g.GroupID):
-            return h5py.Group(opened)
-        return h5py.Dataset(opened) if isinstance(opened, h5py.h5d.DatasetID) else opened
-
-
-def array(group: Any, name: str, where: str) -> Optional[Any]:
-    """A dataset of plain numbers in the file itself; None where there is none. Nothing of it is read.
-
-    Raises:
-        CFlowError: it is something else.
-    """
-    import h5py
-
-    found = member(group, name, where)
-    if found is None:
-        return None
-    what = f"{where}: {name}"
-    if not isinstance(found, h5py.Dataset):
-        raise CFlowError(f"{what} is a {type(found).__name__}, expected an array; {_MEND}")
-    with hdf5_errors(f"{what} cannot be opened"):
-        plan = found.id.get_create_plist()
-        if plan.get_layout() == h5py.h5d.VIRTUAL or plan.get_external_count():
-            raise CFlowError(f"{what} lies in other files, which are not read; {_MEND}")
-        check_numbers(found.id, what)
-        filters_of(plan, what)
-        if found.shape is None:
-            raise CFlowError(f"{what} holds nothing at all; {_MEND}")
-    return found
+        return h5py.h5o.open(parent.id, stored)
 
 
 def check_numbers(opened: Any, what: str) -> None:
@@ -112,11 +123,11 @@ def check_numbers(opened: Any, what: str) -> None:
     raise CFlowError(f"{what} is no array of bool, integers or floats; {_MEND}")
 
 
-def read(dataset: Any, what: str, becomes: Any = None) -> np.ndarray:
-    """All values of what `array` gave.
+def read(stored: Stored, what: str, becomes: Any = None) -> np.ndarray:
+    """All values of an array.
 
     Args:
-        dataset: from `array`.
+        stored: from `array`.
         what: for the message.
         becomes: dtype that the caller turns it into, None = the stored one.
 
@@ -126,18 +137,14 @@ def read(dataset: Any, what: str, becomes: Any = None) -> np.ndarray:
     import h5py
 
     with hdf5_errors(f"{what} cannot be read"):
-        shape: Tuple[int, ...] = dataset.shape
-        count = 1
-        for size in shape:
-            count *= size
-        here = dataset.dtype.itemsize
-        check_claim(what, "its shape", count * max(here, np.dtype(becomes or dataset.dtype).itemsize))
-        if count == 0:
-            return np.empty(shape, dataset.dtype)
-        if dataset.id.get_create_plist().get_layout() == h5py.h5d.CHUNKED:
-            return read_chunks(dataset, what)
-        if dataset.id.get_storage_size() < count * here:
-            raise CFlowError(
-                f"{what} claims {count * here} bytes, {dataset.id.get_storage_size()} are stored; copy the scene again"
-            )
-        return np.asarray(dataset[()])
+        count, here = math.prod(stored.shape), stored.dtype.itemsize
+        check_claim(what, "its shape", count * max(here, np.dtype(becomes or stored.dtype).itemsize))
+        if count and stored.chunk is not None:
+            return read_chunks(stored, what)
+        there = stored.opened.get_storage_size() if count else 0
+        if there < count * here:
+            raise CFlowError(f"{what} claims {count * here} bytes, {there} are stored; copy the scene again")
+        values = np.empty(stored.shape, stored.dtype)
+        if count:
+            stored.opened.read(h5py.h5s.ALL, h5py.h5s.ALL, values)
+        return values

@@ -9,7 +9,8 @@ from typing import Any, List, Optional, Sequence, Tuple, Type
 
 import numpy as np
 
-from cflow_torch.data.hdf5.contained import array, check_numbers, hdf5_errors, member, names, read
+from cflow_torch.data.hdf5.chunks import Stored
+from cflow_torch.data.hdf5.contained import array, check_numbers, group, hdf5_errors, names, read
 from cflow_torch.data.hdf5.frames import StoredMotion, harness_motion, is_argoverse2, recognized_extrinsics
 from cflow_torch.data.hdf5.index_file import read_index
 from cflow_torch.data.log import FlowLabels
@@ -129,7 +130,7 @@ class HDF5Log:
         stored = self._array(timestamp, "flow")
         if stored is None:
             return None
-        rows = len(self._lidar(timestamp))
+        rows = self._lidar(timestamp).shape[0]
         if stored.shape != (rows, 3):
             raise CFlowError(f"{self.file}: flow of sweep {timestamp} has shape {stored.shape}, expected ({rows}, 3)")
         flow = self._values(timestamp, "flow", stored, np.float32)
@@ -148,7 +149,7 @@ class HDF5Log:
     def eval_mask(self, index: int) -> Optional[np.ndarray]:
         """(N,) bool points to score, None where the sweep has no `eval_mask`."""
         timestamp = self._timestamp(index)
-        return self._column(timestamp, "eval_mask", len(self._lidar(timestamp)), np.bool_)
+        return self._column(timestamp, "eval_mask", self._lidar(timestamp).shape[0], np.bool_)
 
     def stored_motion(self, index: int) -> StoredMotion:
         """Ego motion of the pair (index, index + 1) as the harness has it, by the poses as they are in the file.
@@ -245,17 +246,14 @@ class HDF5Log:
 
     def _group(self, timestamp: int) -> Any:
         if self._last[0] != timestamp:  # a sweep is asked for one key after the other
-            group = member(self._scene, str(timestamp), str(self.file))
-            if not hasattr(group, "keys"):
-                raise CFlowError(f"{self.file}: {timestamp} is no group, expected one for each sweep")
-            self._last = timestamp, group
+            self._last = timestamp, group(self._scene, str(timestamp), str(self.file))
         return self._last[1]
 
-    def _array(self, timestamp: int, key: str) -> Optional[Any]:
+    def _array(self, timestamp: int, key: str) -> Optional[Stored]:
         """What a sweep has under a key, not read yet; None where it is absent."""
         return array(self._group(timestamp), key, f"{self.file}: sweep {timestamp}")
 
-    def _lidar(self, timestamp: int) -> Any:
+    def _lidar(self, timestamp: int) -> Stored:
         """(N, 3+) points, not read yet."""
         stored = self._array(timestamp, "lidar")
         if stored is None or len(stored.shape) != 2 or stored.shape[1] < 3:
@@ -271,7 +269,7 @@ class HDF5Log:
             raise CFlowError(f"{self.file}: pose of sweep {timestamp} has {shape}, expected shape (4, 4)")
         return self._values(timestamp, "pose", stored)
 
-    def _values(self, timestamp: int, key: str, stored: Any, dtype: Any = None) -> np.ndarray:
+    def _values(self, timestamp: int, key: str, stored: Stored, dtype: Any = None) -> np.ndarray:
         values = read(stored, f"{self.file}: {key} of sweep {timestamp}", dtype)
         with np.errstate(over="ignore"):  # float64 beyond float32 becomes infinite, which no step takes for a point
             return values if dtype is None else values.astype(dtype, copy=False)

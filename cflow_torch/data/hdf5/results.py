@@ -11,7 +11,7 @@ from typing import Any, Iterable, Tuple, Union
 import numpy as np
 
 from cflow_torch.data.atomic import sync_folder, temporary_name
-from cflow_torch.data.hdf5.contained import array, hdf5_errors, member
+from cflow_torch.data.hdf5.contained import array, group, hdf5_errors
 from cflow_torch.types import Array, CFlowError, as_numpy
 
 # Keys that scenes bring, and names that the viewers give a meaning of their own.
@@ -114,19 +114,22 @@ def _write(scene: Any, file: Path, timestamp: str, name: str, flow: np.ndarray) 
     import h5py
 
     where = f"{file}: sweep {timestamp}"
-    group: Any = member(scene, timestamp, str(file))
-    points = array(group, "lidar", where) if isinstance(group, h5py.Group) else None
-    if points is None:
+    sweep = group(scene, timestamp, str(file))
+    points = None if sweep is None else array(sweep, "lidar", where)
+    if sweep is None or points is None:
         raise CFlowError(f"{file} has no sweep {timestamp}")
     rows = points.shape[0] if points.shape else 0
     if flow.shape != (rows, 3):
         raise CFlowError(f"{file}: the flow of sweep {timestamp} has shape {flow.shape}, expected ({rows}, 3)")
-    older = array(group, name, where)
+    older = array(sweep, name, where)
     with hdf5_errors(f"{where}: {name} cannot be written", _MEND):
         if older is None:
-            group.create_dataset(name, data=flow.astype(np.float32))
+            sweep.create_dataset(name, data=flow.astype(np.float32))
             return
         # Two names of one dataset: another key would change as well.
-        if older.shape != (rows, 3) or older.dtype != np.float32 or h5py.h5o.get_info(older.id).rc > 1:
+        if older.shape != (rows, 3) or older.dtype != np.float32 or h5py.h5o.get_info(older.opened).rc > 1:
             raise CFlowError(f"{file}: {name} of sweep {timestamp} is no flow result, it is not replaced")
-        older[...] = flow  # in its old place: deleting would leave a hole that HDF5 never gives back
+        values = np.ascontiguousarray(flow, np.float32)
+        older.opened.write(
+            h5py.h5s.ALL, h5py.h5s.ALL, values
+        )  # in its old place: deleting would leave a hole that HDF5 never gives back
