@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from typing import Sequence, Tuple
 
@@ -32,9 +33,11 @@ class Boxes:
         shapes = (self.category.shape, self.size.shape, self.pose.shape)
         if shapes != ((count,), (count, 3), (count, 4, 4)):
             raise CFlowError(f"{count} boxes need category (K,), size (K, 3), pose (K, 4, 4); got {shapes}")
+        if not (np.isfinite(self.size).all() and np.isfinite(self.pose).all()):
+            raise CFlowError("a box holds numbers that are not finite; copy the annotations again")
         if len(set(self.track_id)) != count:
-            twice = sorted({name for name in self.track_id if list(self.track_id).count(name) > 1})
-            raise CFlowError(f"a track may have one box per sweep; named twice: {twice}")
+            twice = sorted(name for name, times in Counter(self.track_id).items() if times > 1)
+            raise CFlowError(f"a track may have one box per sweep; named twice: {twice[:10]}")
 
 
 def points_in_box(points: np.ndarray, size: np.ndarray, pose: np.ndarray) -> np.ndarray:

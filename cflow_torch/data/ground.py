@@ -9,7 +9,7 @@ from typing import Dict, Optional, Union
 import numpy as np
 
 from cflow_torch.data.json_file import read_json
-from cflow_torch.data.paths import whole
+from cflow_torch.data.npy_file import read_npy
 from cflow_torch.types import CFlowError
 
 
@@ -112,8 +112,12 @@ def read_ground_raster(map_folder: Path) -> Optional[GroundRaster]:
             f"{map_folder} must hold one *_ground_height_surface____*.npy and one *___img_Sim2_city.json, "
             f"found {len(rasters)} and {len(alignments)}"
         )
+    heights = read_npy(rasters[0], "copy the map folder again")
+    if heights.ndim != 2 or heights.dtype.kind not in "fiu":
+        raise CFlowError(
+            f"{rasters[0]} must hold a (H, W) raster of numbers, got shape {heights.shape} and dtype {heights.dtype}"
+        )
     try:
-        heights = np.load(whole(rasters[0]), allow_pickle=False)
         alignment = read_json(alignments[0])
         raster = GroundRaster(
             heights=heights.astype(np.float64),
@@ -121,10 +125,10 @@ def read_ground_raster(map_folder: Path) -> Optional[GroundRaster]:
             translation=np.array(alignment["t"], dtype=np.float64).reshape(2),
             scale=float(alignment["s"]),
         )
-    except (OSError, EOFError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise CFlowError(
             f"cannot read the ground raster in {map_folder}: {error}; copy the map folder again"
         ) from error
-    if raster.heights.ndim != 2:
-        raise CFlowError(f"{rasters[0]} must hold a (H, W) raster, got shape {raster.heights.shape}")
+    if not all(np.isfinite(value).all() for value in (raster.rotation, raster.translation, raster.scale)):
+        raise CFlowError(f"{alignments[0]} holds numbers that are not finite; copy the map folder again")
     return raster

@@ -190,7 +190,7 @@ class AevaScenesLog:
     def _array(self, file: Path, contents: Any, key: str) -> np.ndarray:
         array = read_npz_member(file, key, contents=contents)
         if array is None:
-            raise CFlowError(f"{file} has no array {key}; it has {zipfile.ZipFile(contents).namelist()}")
+            raise CFlowError(f"{file} has no array {key}; it has {zipfile.ZipFile(contents).namelist()[:20]}")
         if not np.issubdtype(array.dtype, np.floating):
             raise CFlowError(f"{file}: {key} must be floating point, got {array.dtype}")
         return array.astype(np.float32, copy=False)

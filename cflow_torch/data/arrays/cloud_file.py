@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Callable, Dict, Mapping, Optional
+from typing import Any, Callable, Dict, Mapping, Optional, Sequence
 
 import numpy as np
 import pyarrow as pa
@@ -12,6 +12,7 @@ from pyarrow import feather, parquet
 from cflow_torch.data.arrays.pcd import read_pcd, write_pcd
 from cflow_torch.data.arrays.ply import read_ply, write_ply
 from cflow_torch.data.atomic import atomic_file
+from cflow_torch.data.npy_file import Header, read_npy, read_npz
 from cflow_torch.data.paths import Place, as_path, read_bytes, remote_errors, whole
 from cflow_torch.types import CFlowError
 
@@ -114,32 +115,31 @@ def _read_bin(path: Path, columns: int) -> np.ndarray:
 
 
 def _read_numpy(path: Path) -> np.ndarray:
-    try:
-        stored = np.load(whole(path), allow_pickle=False)
-        if not isinstance(stored, np.ndarray):
-            with stored:
-                stored = _choose(path, {name: stored[name] for name in stored.files})
-    except CFlowError:
-        raise
-    except Exception as error:  # a damaged file makes NumPy and zipfile raise nearly anything
-        raise CFlowError(f"{path} cannot be read ({error}); it is truncated, or no file of plain arrays") from error
+    mend = "it is truncated, or no file of plain arrays"
+    if path.suffix.lower() == ".npz":
+        arrays = read_npz(path, mend, lambda headers: _choose(path, headers))
+        if len(arrays) > 1:
+            return _from_fields(path, arrays)
+        (stored,) = arrays.values()
+    else:
+        stored = read_npy(path, mend)
     if stored.dtype.names is not None:
         return _from_fields(path, {name: stored[name] for name in stored.dtype.names})
     return _table(path, stored)
 
 
-def _choose(path: Path, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
-    """The cloud among the arrays of an .npz file."""
+def _choose(path: Path, arrays: Mapping[str, Header]) -> Sequence[str]:
+    """Names of the cloud's arrays among those of an .npz file: x, y, z, or one."""
     if all(axis in arrays for axis in _AXES):
-        return _from_fields(path, arrays)
-    tables = [name for name, array in arrays.items() if array.ndim == 2 and array.shape[1] >= 3]
+        return _AXES
+    tables = [name for name, array in arrays.items() if len(array.shape) == 2 and array.shape[1] >= 3]
     named = [name for name in tables if name in _CLOUD_KEYS]
     chosen = named or tables or [name for name, array in arrays.items() if array.dtype.names is not None]
     if len(chosen) != 1:
         raise CFlowError(
             f"{path} holds {list(arrays)}; it must hold x, y, z, or one (N, 3+) array, or name it {_CLOUD_KEYS[0]}"
         )
-    return arrays[chosen[0]]
+    return chosen
 
 
 def _read_table(path: Path, read: Callable[..., Any]) -> np.ndarray:
@@ -165,6 +165,8 @@ def _from_fields(path: Path, fields: Mapping[str, np.ndarray]) -> np.ndarray:
     columns = [fields[axis] for axis in _AXES]
     if any(column.ndim != 1 or len(column) != len(columns[0]) for column in columns):
         raise CFlowError(f"{path}: x, y, z have shapes {[column.shape for column in columns]}; give (N,) each")
+    if any(column.dtype.kind not in "fiu" for column in columns):
+        raise CFlowError(f"{path}: x, y, z have dtypes {[str(column.dtype) for column in columns]}; give numbers")
     return np.stack(columns, axis=1)
 
 

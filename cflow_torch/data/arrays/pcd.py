@@ -10,7 +10,9 @@ from typing import Dict, List, Mapping, Tuple
 import numpy as np
 
 from cflow_torch.data.arrays.lzf import compress, decompress
+from cflow_torch.data.arrays.text_numbers import text_column
 from cflow_torch.data.atomic import atomic_file
+from cflow_torch.data.bounds import check_claim
 from cflow_torch.data.paths import Place, as_path, read_bytes
 from cflow_torch.types import CFlowError
 
@@ -35,6 +37,11 @@ class _Header:
     num_points: int
     data: str
     start: int
+
+    @property
+    def point_bytes(self) -> int:
+        """Bytes of one point in binary data."""
+        return sum(kind.itemsize * count for _, kind, count in self.fields)
 
 
 def read_pcd(path: Place) -> Dict[str, np.ndarray]:
@@ -67,6 +74,8 @@ def pcd_fields(content: bytes, path: Place) -> Dict[str, np.ndarray]:
     """As `read_pcd`, of what is in the file."""
     try:
         header = _read_header(content)
+        check_claim("its header", "a point", header.point_bytes)
+        check_claim("its header", "the cloud", header.num_points * header.point_bytes)
         body = content[header.start :]
         read = {"ascii": _read_ascii, "binary": _read_binary, "binary_compressed": _read_compressed}[header.data]
         arrays = read(header, body)
@@ -175,28 +184,20 @@ def _read_ascii(header: _Header, body: bytes) -> List[np.ndarray]:
             f"{header.num_points} points of {per_point} values need {header.num_points * per_point} values, "
             f"found {len(words)}; it is truncated or damaged"
         )
-    table = np.array(words, dtype=bytes).reshape(header.num_points, per_point)
     arrays, first = [], 0
     for name, kind, count in header.fields:
-        part = table[:, first : first + count]
-        first += count
         try:
-            if kind.kind == "f":
-                arrays.append(part.astype(np.float64).astype(kind.newbyteorder("=")))
-            else:
-                values = [int(word) for word in part.ravel().tolist()]
-                limits = np.iinfo(kind)
-                if not all(limits.min <= value <= limits.max for value in values):
-                    raise ValueError(f"a number lies outside {limits.min} ... {limits.max}")
-                arrays.append(np.array(values, dtype=kind.newbyteorder("=")).reshape(part.shape))
+            columns = [text_column(words[k::per_point], kind) for k in range(first, first + count) if words]
         except ValueError as error:
-            raise CFlowError(f"field {name}: {error}") from error
+            raise CFlowError(f"field {name}: {str(error)[:80]}") from error
+        arrays.append(np.stack(columns, axis=1) if words else np.zeros((0, count), kind.newbyteorder("=")))
+        first += count
     return arrays
 
 
 def _read_binary(header: _Header, body: bytes) -> List[np.ndarray]:
+    body = _exactly(body, header.num_points * header.point_bytes)
     packed = np.dtype([(f"f{i}", kind, (count,)) for i, (_, kind, count) in enumerate(header.fields)])
-    body = _exactly(body, header.num_points * packed.itemsize)
     table = np.frombuffer(body, packed)
     return [table[f"f{i}"].astype(kind.newbyteorder("=")) for i, (_, kind, _) in enumerate(header.fields)]
 
@@ -206,7 +207,7 @@ def _read_compressed(header: _Header, body: bytes) -> List[np.ndarray]:
     if len(body) < 8:
         raise CFlowError("it ends before the sizes of the compressed data; it is truncated")
     compressed, plain = struct.unpack("<II", body[:8])
-    needed = header.num_points * sum(kind.itemsize * count for _, kind, count in header.fields)
+    needed = header.num_points * header.point_bytes
     if plain != needed:
         raise CFlowError(f"its {header.num_points} points need {needed} bytes, the compressed data hold {plain}")
     data = decompress(_exactly(body[8:], compressed), plain)

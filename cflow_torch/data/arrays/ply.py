@@ -7,7 +7,9 @@ from typing import Dict, List, Mapping, Tuple
 
 import numpy as np
 
+from cflow_torch.data.arrays.text_numbers import text_column
 from cflow_torch.data.atomic import atomic_file
+from cflow_torch.data.bounds import check_claim
 from cflow_torch.data.paths import Place, as_path, read_bytes
 from cflow_torch.types import CFlowError
 
@@ -104,6 +106,7 @@ def _read(content: bytes) -> Dict[str, np.ndarray]:
         return _read_ascii(body, num_points, properties)
     table_type = np.dtype([(name, _ORDERS[kind] + code) for name, code in properties])
     needed = num_points * table_type.itemsize
+    check_claim("its header", "the cloud", needed)
     if len(body) < needed:
         raise CFlowError(f"{num_points} vertices need {needed} bytes, found {len(body)}; it is truncated")
     table = np.frombuffer(body, table_type, num_points)
@@ -112,8 +115,9 @@ def _read(content: bytes) -> Dict[str, np.ndarray]:
 
 def _vertices(lines: List[List[str]]) -> Tuple[int, List[Tuple[str, str]]]:
     """Number of vertices and (name, type code) of their properties."""
-    if not lines or lines[0][:2] != ["element", "vertex"] or len(lines[0]) != 3 or not lines[0][2].isdigit():
-        raise CFlowError(f"its first element must be 'vertex', got {' '.join(lines[0] if lines else [])!r}")
+    first = " ".join(lines[0]) if lines else ""
+    if re.fullmatch(r"element vertex [0-9]{1,12}", first) is None:
+        raise CFlowError(f"its first element must be 'vertex' with the number of points, got {first[:80]!r}")
     properties = []
     for words in lines[1:]:
         if words[0] == "element":
@@ -130,22 +134,14 @@ def _vertices(lines: List[List[str]]) -> Tuple[int, List[Tuple[str, str]]]:
 
 
 def _read_ascii(body: bytes, num_points: int, properties: List[Tuple[str, str]]) -> Dict[str, np.ndarray]:
-    words = body.split(None, num_points * len(properties))[: num_points * len(properties)]
-    if len(words) < num_points * len(properties):
-        raise CFlowError(
-            f"{num_points} vertices need {num_points * len(properties)} numbers, found {len(words)}; it is truncated"
-        )
-    table = np.array(words, dtype=bytes).reshape(num_points, len(properties))
+    needed = num_points * len(properties)
+    words = body.split(None, needed)[:needed] if needed <= len(body) else []
+    if len(words) < needed:
+        raise CFlowError(f"{num_points} vertices need {needed} numbers, there are fewer; it is truncated")
     fields = {}
     for column, (name, code) in enumerate(properties):
         try:
-            if code[0] == "f":
-                fields[name] = table[:, column].astype(np.float64).astype(code)
-            else:
-                values, limits = [int(word) for word in table[:, column].tolist()], np.iinfo(code)
-                if not all(limits.min <= value <= limits.max for value in values):
-                    raise ValueError(f"a number lies outside {limits.min} ... {limits.max}")
-                fields[name] = np.array(values, dtype=code)
+            fields[name] = text_column(words[column :: len(properties)], np.dtype(code))
         except ValueError as error:
-            raise CFlowError(f"property {name}: {error}") from error
+            raise CFlowError(f"property {name}: {str(error)[:80]}") from error
     return fields

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from pathlib import Path
 from typing import List, Optional, Sequence, Tuple
 
 import numpy as np
 
 from cflow_torch.data.atomic import atomic_file
-from cflow_torch.data.paths import Place, as_path, read_bytes, whole
+from cflow_torch.data.npy_file import read_npy
+from cflow_torch.data.paths import Place, as_path, read_bytes
 from cflow_torch.data.writers import quaternions
 from cflow_torch.ego import rigid_transform
 from cflow_torch.types import CFlowError
 
 QUATERNION_TOLERANCE = 1e-3  # TUM files have 4 to 17 digits
 CALIBRATION_KEYS = ("Tr", "Tr_velo_to_cam", "Tr_velo_cam")  # KITTI's odometry, raw and tracking sets
+_LONGEST_WORD = 400  # characters of a number; "1e308" has 309 when it is written out
 _LONGEST_GAP_NS = 500_000_000  # between two poses, over which an interpolation is still a guess worth making
 
 
@@ -53,7 +56,7 @@ def read_poses(path: Place, calibration: Optional[Place] = None) -> Trajectory:
     path = as_path(path)
     times_ns, layout = None, "matrix"
     if path.suffix == ".npy":
-        matrices = _load(path)
+        matrices = read_npy(path, "give a .npy file of (K, 4, 4) numbers")
     else:
         rows = _read_rows(path)
         columns = len(rows[0])
@@ -170,11 +173,18 @@ def poses_at(trajectory: Trajectory, times_ns: Sequence[int], source: str) -> np
 
 
 def to_nanoseconds(seconds: str) -> int:
-    """Decimal seconds to whole nanoseconds, without the rounding of a float (unix times need 19 digits)."""
+    """Decimal seconds to whole nanoseconds, without the rounding of a float (unix times need 19 digits).
+
+    Raises:
+        CFlowError: no number, or or above 4.6e9 seconds either way (the year 2116): 64 bits hold differences of those.
+    """
     try:
-        return int((Decimal(seconds) * 10**9).to_integral_value())
-    except (InvalidOperation, ValueError, OverflowError) as error:
-        raise CFlowError(f"{seconds!r} is no time in seconds") from error
+        time = (Decimal(seconds) * 10**9).to_integral_value()
+        if abs(time) < 2**62:
+            return int(time)
+    except (ArithmeticError, ValueError) as error:
+        raise CFlowError(f"{seconds[:80]!r} is no time in seconds") from error
+    raise CFlowError(f"{seconds[:80]!r} is no time in seconds: up to 4.6e9 fit, the year 2116; are they nanoseconds?")
 
 
 def _seconds(time_ns: int) -> str:
@@ -198,37 +208,32 @@ def _from_quaternions(path: Place, translation: np.ndarray, xyzw: np.ndarray) ->
     return poses
 
 
-def _load(path: Path) -> np.ndarray:
-    try:
-        return np.asarray(np.load(whole(path), allow_pickle=False))
-    except (OSError, ValueError, EOFError) as error:
-        raise CFlowError(f"{path} cannot be read ({error}); give a .npy file of (K, 4, 4) numbers") from error
-
-
 def _read_rows(path: Path, numbers: bool = True) -> List[Tuple[str, ...]]:
     """Words of every line that says something, at least one line."""
     try:
         lines = read_bytes(path).decode("utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise CFlowError(f"{path} cannot be read ({error}); give a text file") from error
-    rows = [tuple(line.replace(",", " ").split()) for line in lines if line.strip() and line.strip()[0] != "#"]
+    words = (line.replace(",", " ").split() for line in lines)
+    rows = [tuple(row) for row in words if row and not row[0].startswith("#")]
     if not rows:
         raise CFlowError(f"{path} is empty")
     if numbers:
         for row in rows:
             try:
-                finite = all(np.isfinite(float(word)) for word in row)
+                finite = all(math.isfinite(float(word)) for word in row)
             except ValueError:
                 finite = False
-            if not finite:
+            if not finite or max(map(len, row)) > _LONGEST_WORD:
                 raise CFlowError(f"{path} has a line that is no row of finite numbers: {' '.join(row)[:80]!r}")
     return rows
 
 
 def _ascending(path: Place, times: List[int]) -> np.ndarray:
     result = np.array(times, dtype=np.int64)
-    if (np.diff(result) <= 0).any():
-        raise CFlowError(f"{path}: times must ascend, line {int(np.argmax(np.diff(result) <= 0)) + 2} does not")
+    falls = result[1:] <= result[:-1]
+    if falls.any():
+        raise CFlowError(f"{path}: times must ascend, line {int(np.argmax(falls)) + 2} does not")
     return result
 
 

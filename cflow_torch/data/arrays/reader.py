@@ -12,7 +12,8 @@ from cflow_torch.data.arrays.cloud_file import KITTI_COLUMNS, SUFFIXES, read_clo
 from cflow_torch.data.arrays.poses_text import Trajectory, poses_at, read_poses, read_times
 from cflow_torch.data.folders import find_folders
 from cflow_torch.data.log import FlowLabels
-from cflow_torch.data.paths import Place, as_path, is_place, is_remote, whole
+from cflow_torch.data.npy_file import read_npy
+from cflow_torch.data.paths import Place, as_path, is_place, is_remote
 from cflow_torch.ego import rigid_transform
 from cflow_torch.types import CFlowError, Sweep
 
@@ -21,7 +22,7 @@ POSE_FILES = ("poses.txt", "poses.npy", "trajectory.txt")
 GROUND_FOLDER = "ground"
 SEARCH_DEPTH = 4
 _OTHER_STEMS = {"poses", "trajectory", "times", "timestamps", "calib"}
-_STAMP_DIGITS = 16  # a file name that long is a time: microseconds; nanoseconds have 18 or 19 digits
+_STAMP = re.compile("[0-9]{16,18}|[0-8][0-9]{18}")  # such a name is a time: microseconds, or 18 or 19 of nanoseconds
 _FIRST_NANOSECOND = 10**17
 
 
@@ -172,7 +173,7 @@ class ArraysLog:
                 raise CFlowError(f"{file} has {len(stamps)} times for {count} sweeps; it needs one each")
             return stamps
         names = [path.stem for path in self.files]
-        if all(name.isdigit() and len(name) >= _STAMP_DIGITS for name in names):
+        if all(_STAMP.fullmatch(name) for name in names):
             return [int(name) * (1 if int(name) >= _FIRST_NANOSECOND else 1000) for name in names]
         if trajectory is not None and trajectory.times_ns is not None and len(trajectory.times_ns) == count:
             return trajectory.times_ns.tolist()
@@ -192,7 +193,7 @@ class ArraysLog:
 
 def natural_key(name: str) -> Tuple[Any, ...]:
     """Sorts 2 before 10: the digits of a name count as numbers."""
-    return tuple((0, int(part), part) if part.isdigit() else (1, 0, part) for part in re.findall(r"\d+|\D+", name))
+    return tuple((0, int(part), part) if part.isdecimal() else (1, 0, part) for part in re.findall(r"\d+|\D+", name))
 
 
 def _clouds(folder: Path) -> Tuple[Path, Dict[str, List[Path]]]:
@@ -245,12 +246,7 @@ def _beside(
 
 def _read_mask(folder: Path, stem: str, rows: int) -> np.ndarray:
     file = folder / f"{stem}.npy"
-    try:
-        mask = np.load(whole(file), allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise CFlowError(
-            f"{file} cannot be read ({error}); every sweep needs its ground mask, or pass ground=None"
-        ) from error
+    mask = read_npy(file, "every sweep needs its ground mask, or pass ground=None")
     if mask.shape not in ((rows,), (rows, 1)) or mask.dtype.kind not in "biu" or not np.isin(mask, (0, 1)).all():
         raise CFlowError(
             f"{file} has shape {mask.shape} and dtype {mask.dtype} for {rows} points; give (N,) bool, True = ground"

@@ -210,11 +210,12 @@ class NuScenesLog:
             motion, group = T_ego_world @ transforms(chain.ego[row : row + 1]), np.zeros(len(points), dtype=np.int64)
             since = np.zeros(len(points), dtype=np.int64)
         else:
-            lag = times[kept] - chain.times[row]
-            if lag.size and np.abs(lag).max() > MAX_SHOT_LAG:
+            first, last = int(times[kept].min(initial=chain.times[row])), int(times[kept].max(initial=chain.times[row]))
+            lag = max(int(chain.times[row]) - first, last - int(chain.times[row]))
+            if lag > MAX_SHOT_LAG:
                 raise CFlowError(
-                    f"{file}: timestamps of points lie up to {np.abs(lag).max()} microseconds off the sweep's; they "
-                    "must be microseconds since 1970. Open the log with deskew=False to do without"
+                    f"{file}: timestamps of points lie up to {lag} microseconds off the sweep's; they must be "
+                    "microseconds since 1970. Open the log with deskew=False to do without"
                 )
             distinct, group = np.unique(times[kept], return_inverse=True)
             motion = T_ego_world @ transforms(poses_at(distinct, *self._odometry))

@@ -18,8 +18,13 @@ from cflow_torch.ego import relative_transform, rigid_transform
 from cflow_torch.types import CFlowError, Sweep
 
 _HEAD = 1 << 16  # bytes of a record in which its time is looked for first
+_LATEST = 1 << 53  # microseconds, the year 2255: in nanoseconds, too, they are 64-bit numbers
+_MOST_FIELDS = 1 << 16  # of one message; a frame has some hundred
+_MOST_IMAGE = 1 << 26  # bytes of an unpacked range image
+_OTHER = max(BOX_CATEGORY) + 1  # a class that is none of those with a category
 _VARINT, _EIGHT, _BYTES, _FOUR = 0, 1, 2, 5  # wire types
-_BROKEN = (IndexError, ValueError, KeyError, struct.error, zlib.error, TypeError)  # what a foreign message leads to
+# What a foreign message leads to.
+_BROKEN = (IndexError, ValueError, KeyError, struct.error, zlib.error, TypeError, OverflowError, MemoryError)
 
 
 class WaymoRecordLog:
@@ -74,10 +79,10 @@ class WaymoRecordLog:
         if not self._stored_flow:
             labels = flow_from_boxes(frame["points"], frame["boxes"], after["boxes"], T)
             return FlowLabels(labels.flow, labels.category, labels.is_valid & ~frame["zone"])
-        velocity, kind = frame["velocity"][:, :3], frame["velocity"][:, 3].astype(np.int64)
+        velocity, kind = frame["velocity"][:, :3], _classes(frame["velocity"])
         seconds = (self.timestamps[index + 1] - self.timestamps[index]) * 1e-9
         moved = (points + np.where(kind[:, None] < 0, 0, velocity) * seconds) @ T[:3, :3].T + T[:3, 3]
-        category = np.array([BOX_CATEGORY.get(k, 0) for k in range(kind.max(initial=0) + 1)], np.uint8)
+        category = np.array([BOX_CATEGORY.get(k, 0) for k in range(_OTHER + 1)], np.uint8)
         is_valid = (kind >= 0) & ~frame["zone"]
         return FlowLabels((moved - points).astype(np.float32), category[np.maximum(kind, 0)], is_valid)
 
@@ -85,20 +90,22 @@ class WaymoRecordLog:
         """(microseconds, (first byte, end)) of every frame; touches little of the file."""
         with parts(self.file) as file:
             size, begin = file.seek(0, os.SEEK_END), 0
+            head, start = b"", 0  # what was read last, and where it lies: small records share it
             while begin < size:
-                file.seek(begin)
-                head = file.read(_HEAD)
-                (length,) = struct.unpack_from("<Q", head)
-                first, end = 12, 12 + length  # after the length and its checksum
-                if begin + end + 4 > size:
-                    raise ValueError(f"a record of {length} bytes at byte {begin + first} of {size}")
+                if _end(head, begin - start) > len(head):
+                    file.seek(begin)
+                    head, start = file.read(_HEAD), begin
+                first = begin - start + 12  # after the length and its checksum
+                end = _end(head, begin - start)
+                if start + end + 4 > size:
+                    raise ValueError(f"a record of {end - first} bytes at byte {begin + 12} of {size}")
                 try:
                     time = _time(head, first, end)
                 except IndexError:  # not near the beginning
                     file.seek(begin)
-                    time = _time(file.read(end), first, end)
-                yield time, (begin + first, begin + end)
-                begin += end + 4
+                    time = _time(file.read(12 + end - first), 12, 12 + end - first)
+                yield time, (start + first, start + end)
+                begin = start + end + 4
 
     def _frame(self, index: int) -> Dict[str, Any]:
         if not 0 <= index < len(self):
@@ -117,7 +124,8 @@ class WaymoRecordLog:
         pose = rigid_transform(_doubles(_message(frame[3][0])[1]).reshape(4, 4), "pose")
         calibration = {c[1][0]: c for c in map(_message, _message(frame[1][0])[3])}
         images = {laser[1][0]: _message(laser[2][0]) for laser in map(_message, frame.get(5, [])) if 2 in laser}
-        points, zone, flow = [np.zeros((0, 3))], [np.zeros(0, bool)], [np.zeros((0, 4))]
+        points, zone = [np.zeros((0, 3))], [np.zeros(0, bool)]
+        flow: List[np.ndarray] = [np.zeros((0, 4))]
         for laser in (number for number in self._lasers if number in images):
             image, mount = images[laser], calibration[laser]
             low, high = (_doubles(mount[n])[0] if n in mount else 0.0 for n in (3, 4))
@@ -127,23 +135,35 @@ class WaymoRecordLog:
             poses = _matrix(image[4][0]) if 4 in image else None
             there, pixels = range_image_points(returns, LaserCalibration(T_ego_sensor, table, low, high), poses, pose)
             points.append(there)
-            zone.append(returns.reshape(-1, 4)[pixels, NO_LABEL_ZONE] == 1)
-            flow.append(_matrix(image[5][0]).reshape(-1, 4)[pixels] if 5 in image else np.full((len(pixels), 4), -1.0))
+            zone.append(_per_pixel(returns, returns)[pixels, NO_LABEL_ZONE] == 1)
+            stored = _per_pixel(_matrix(image[5][0]), returns) if 5 in image else None
+            flow.append(np.full((len(pixels), 4), -1.0) if stored is None else stored[pixels, :4].astype(np.float64))
         boxes = []
         for label in map(_message, frame.get(6, [])):
             if BOX_CATEGORY[label[3][0]]:
                 box = {n: _doubles(value)[0] for n, value in _message(label[1][0]).items()}
                 values = [box.get(n, 0.0) for n in (5, 4, 6, 7, 1, 2, 3)]  # a message has the width before the length
-                boxes.append((bytes(label[4][0]).decode(), BOX_CATEGORY[label[3][0]], values))
+                boxes.append((str(label[4][0], "utf-8"), BOX_CATEGORY[label[3][0]], values))
         arrays = {"points": np.concatenate(points).astype(np.float32), "velocity": np.concatenate(flow)}
         return {"pose": pose, "boxes": upright_boxes(boxes), "zone": np.concatenate(zone), **arrays}
+
+
+def _classes(velocity: np.ndarray) -> np.ndarray:
+    """(N,) int64 class of stored velocities: -1 = none, which a velocity that is not finite has too."""
+    known = np.isfinite(velocity).all(axis=1)
+    return np.where(known, np.clip(np.where(known, velocity[:, 3], -1), -1, _OTHER), -1).astype(np.int64)
+
+
+def _end(data: bytes, at: int) -> int:
+    """Where the record ends that begins at a place in some bytes; at least where its length ends."""
+    return at + 12 + (struct.unpack_from("<Q", data, at)[0] if at + 8 <= len(data) else 0)
 
 
 def _time(data: bytes, first: int, end: int) -> int:
     """Microseconds of a frame."""
     for number, value in _fields(data, first, end):
-        if number == 2:
-            return int(value)
+        if number == 2 and isinstance(value, int) and value < _LATEST:
+            return value
     raise ValueError("a frame without time")
 
 
@@ -154,6 +174,8 @@ def _varint(data: Any, at: int) -> Tuple[int, int]:
         at, shift = at + 1, shift + 7
         if data[at - 1] < 0x80:
             return value, at
+        if shift > 63:
+            raise ValueError("a number of more than 64 bits")
 
 
 def _fields(data: Any, at: int, end: int) -> Iterator[Tuple[int, Any]]:
@@ -181,7 +203,9 @@ def _message(data: bytes) -> Dict[int, List[Any]]:
     """Field number -> values, in order."""
     fields: Dict[int, List[Any]] = {}
     view = memoryview(data)
-    for number, value in _fields(view, 0, len(view)):
+    for count, (number, value) in enumerate(_fields(view, 0, len(view))):
+        if count >= _MOST_FIELDS:
+            raise ValueError(f"a message of more than {_MOST_FIELDS} fields")
         fields.setdefault(number, []).append(view[value] if isinstance(value, slice) else value)
     return fields
 
@@ -193,6 +217,17 @@ def _doubles(values: Sequence[Any]) -> np.ndarray:
 
 def _matrix(compressed: Any) -> np.ndarray:
     """MatrixFloat: values and shape."""
-    matrix = _message(zlib.decompress(compressed))
+    unpacking = zlib.decompressobj()
+    content = unpacking.decompress(compressed, _MOST_IMAGE)
+    if not unpacking.eof:
+        raise ValueError(f"an image that is truncated or unpacks to more than {_MOST_IMAGE} bytes")
+    matrix = _message(content)
     shape = [size for size in _message(matrix[2][0])[1] if isinstance(size, int)]
     return np.frombuffer(b"".join(matrix[1]), dtype="<f4").reshape(shape)
+
+
+def _per_pixel(matrix: np.ndarray, returns: np.ndarray) -> np.ndarray:
+    """(H * W, channels) of a matrix that lies over the image of the returns."""
+    if matrix.shape[:2] != returns.shape[:2] or matrix.ndim != 3 or matrix.shape[2] < 4:
+        raise ValueError(f"an image of shape {matrix.shape} over one of {returns.shape}")
+    return matrix.reshape(-1, matrix.shape[2])
