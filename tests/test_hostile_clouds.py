@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import os
 import struct
 import time
 import tracemalloc
@@ -15,6 +16,7 @@ import numpy as np
 import pytest
 
 from cflow_torch import CFlowError
+from cflow_torch.data.aevascenes.npz_strings import read_npz_member
 from cflow_torch.data.arrays.cloud_file import read_cloud, write_cloud
 from cflow_torch.data.arrays.pcd import pcd_fields, read_pcd
 from cflow_torch.data.arrays.ply import read_ply
@@ -22,6 +24,8 @@ from cflow_torch.data.arrays.poses_text import read_calibration, read_poses, rea
 from cflow_torch.data.arrays.reader import ArraysLog
 from cflow_torch.data.boxes import Boxes
 from cflow_torch.data.ground import read_ground_raster
+from cflow_torch.data.nuscenes.reader import read_pcd_bin
+from cflow_torch.data.waymo.tfrecord import WaymoRecordLog
 
 MIB = 1 << 20
 
@@ -100,6 +104,30 @@ def test_axes_of_other_types(tmp_path: Path, kind: str) -> None:
     np.savez(tmp_path / "a.npz", x=np.zeros(3), y=np.zeros(3).astype(kind), z=np.zeros(3))
     with pytest.raises(CFlowError, match=r"a\.npz.*(numbers|text are read)"):
         read_cloud(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".npz", ".bin", ".pcd", ".ply", ".txt", ".pcd.bin", ".tfrecord"])
+@pytest.mark.parametrize("kind", ["pipe", "folder"])
+def test_what_is_no_file(tmp_path: Path, suffix: str, kind: str) -> None:
+    """Opening a pipe would wait for ever."""
+    file = tmp_path / f"a{suffix}"
+    if kind == "folder":
+        file.mkdir()
+    else:
+        os.mkfifo(file)
+    readers = {
+        ".txt": [read_poses, read_times],
+        ".npy": [read_cloud, read_poses],
+        ".pcd.bin": [read_pcd_bin],
+        ".tfrecord": [WaymoRecordLog],
+        ".pcd": [read_cloud, read_pcd],
+        ".ply": [read_cloud, read_ply],
+    }
+    for read in readers.get(suffix, [read_cloud]):
+        with pytest.raises(CFlowError, match=f"a{suffix}"):
+            read(file)
+    with pytest.raises(CFlowError, match=f"a{suffix}"):
+        read_npz_member(file, "xyz")
 
 
 # ---------------------------------------------------------------------------------------------- bombs

@@ -109,16 +109,21 @@ def read_bytes(path: Path, most: Optional[int] = None) -> bytes:
         OSError: as for a local file, and if the far side cannot be reached.
     """
     if not is_remote(path):
-        status = path.stat()
-        if not stat.S_ISREG(status.st_mode) and not stat.S_ISDIR(status.st_mode):
-            raise OSError(errno.EINVAL, "is a device or a pipe, no file", str(path))
-        _check_size(path, status.st_size, most)
+        _check_size(path, _size(path), most)
         return path.read_bytes()
     remote: Any = path
     with remote_errors(path):
         data = bytes(remote.fs.cat_file(remote.path))  # pathlib's own way asks for the size first
     _check_size(path, len(data), most)
     return data
+
+
+def _size(path: Path) -> int:
+    """Bytes of a file on this machine, which must be one."""
+    status = path.stat()
+    if not stat.S_ISREG(status.st_mode) and not stat.S_ISDIR(status.st_mode):
+        raise OSError(errno.EINVAL, "is a device or a pipe, no file", str(path))
+    return status.st_size
 
 
 def _check_size(path: Path, size: int, most: Optional[int]) -> None:
@@ -130,9 +135,12 @@ def whole(path: Path) -> Any:
     """What to give a library that reads all of a file: its name, or what is in it if it is remote.
 
     Raises:
-        OSError: a remote file cannot be read.
+        OSError: a remote file cannot be read, there is none on this machine, or it is a device or a pipe.
     """
-    return io.BytesIO(read_bytes(path)) if is_remote(path) else str(path)
+    if is_remote(path):
+        return io.BytesIO(read_bytes(path))
+    _size(path)
+    return str(path)
 
 
 def ranged(path: Path) -> Any:
@@ -150,9 +158,12 @@ def parts(path: Path) -> Any:
     """An open binary file of which every `read` fetches just the bytes that it asks for, if it is remote.
 
     Raises:
-        OSError: the file cannot be opened; later, that it cannot be read.
+        OSError: the file cannot be opened, or is a device or a pipe; later, that it cannot be read.
     """
-    return _RemoteFile(path) if is_remote(path) else open(path, "rb")  # noqa: SIM115
+    if is_remote(path):
+        return _RemoteFile(path)
+    _size(path)
+    return open(path, "rb")  # noqa: SIM115
 
 
 def mapped(path: Path) -> Any:

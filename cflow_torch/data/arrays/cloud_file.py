@@ -105,7 +105,10 @@ def write_cloud(path: Place, points: np.ndarray, intensity: Optional[np.ndarray]
 def _read_bin(path: Path, columns: int) -> np.ndarray:
     if columns < 3:
         raise CFlowError(f"bin_columns={columns}: a point has three coordinates at least")
-    data = read_bytes(path)
+    try:
+        data = read_bytes(path)
+    except OSError as error:
+        raise CFlowError(f"cannot read {path} ({error}); copy it again") from error
     if len(data) % (4 * columns):
         raise CFlowError(
             f"{path} has {len(data)} bytes, no multiple of {4 * columns} ({columns} float32 a point): it is truncated, "

@@ -199,6 +199,8 @@ class NuScenesLog:
             raise CFlowError(
                 f"{file} is missing; copy the sensor data of scene {self.log_id} beside the tables"
             ) from None
+        except OSError as error:
+            raise CFlowError(f"cannot read {file} ({error}); copy it again") from error
         local, times = self._points_of(content, file)
         returned = np.isfinite(local).all(axis=1) & (local != 0).any(axis=1)
         mount = transforms(chain.mount[row : row + 1])[0]
@@ -257,7 +259,11 @@ def read_pcd_bin(file: Place) -> np.ndarray:
     Raises:
         CFlowError: the file is empty, has no whole number of rows, or its last column holds no ring numbers.
     """
-    return pcd_bin_points(read_bytes(as_path(file)), file)
+    try:
+        content = read_bytes(as_path(file))
+    except OSError as error:
+        raise CFlowError(f"cannot read {file} ({error}); give a .pcd.bin file") from error
+    return pcd_bin_points(content, file)
 
 
 def pcd_bin_points(content: bytes, file: Place) -> np.ndarray:

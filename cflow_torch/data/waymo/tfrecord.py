@@ -53,7 +53,7 @@ class WaymoRecordLog:
             self._span = dict(sorted(self._find_frames()))
         except FileNotFoundError:
             raise CFlowError(f"{self.file} is missing; give a segment-*.tfrecord") from None
-        except _BROKEN as error:
+        except (OSError, *_BROKEN) as error:
             raise CFlowError(
                 f"{self.file} is no tfrecord of Waymo frames, or truncated: {error}; copy it again"
             ) from error
@@ -111,12 +111,12 @@ class WaymoRecordLog:
         if not 0 <= index < len(self):
             raise CFlowError(f"segment {self.log_id} has sweeps 0 ... {len(self) - 1}, asked for {index}")
         first, end = self._span[self.timestamps[index] // 1000]
-        with parts(self.file) as file:
-            file.seek(first)
-            data = file.read(end - first)
         try:
+            with parts(self.file) as file:
+                file.seek(first)
+                data = file.read(end - first)
             return self._decode(data)
-        except _BROKEN as error:
+        except (OSError, *_BROKEN) as error:
             raise CFlowError(f"{self.file}: frame {index} cannot be read: {error}; copy the file again") from error
 
     def _decode(self, data: bytes) -> Dict[str, Any]:
