@@ -154,6 +154,14 @@ def test_an_archive_that_unpacks_to_more_than_is_read(tmp_path: Path, monkeypatc
     cheaply(lambda: read_cloud(file), MIB)
 
 
+def test_a_header_that_unpacks_to_much(tmp_path: Path) -> None:
+    """NumPy reads a header whole, of up to 4 GiB, before it finds that it is too long."""
+    with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("points.npy", b"\x93NUMPY\2\0" + struct.pack("<I", 2**32 - 1) + b" " * (32 * MIB))
+    cheaply(lambda: read_cloud(tmp_path / "a.npz"), MIB)
+    cheaply(lambda: read_npz_member(tmp_path / "a.npz", "points"), MIB)
+
+
 def test_only_the_cloud_of_an_archive_is_unpacked(tmp_path: Path) -> None:
     """Members may share the same packed bytes, so that an archive unpacks to any multiple of its size."""
     file = bomb(tmp_path / "a.npz", 64 * MIB, f"({64 * MIB},)")

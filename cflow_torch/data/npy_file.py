@@ -17,6 +17,7 @@ from cflow_torch.data.paths import whole
 from cflow_torch.types import CFlowError
 
 _PLAIN = "biufUS"  # kinds of numbers and of text; neither objects (pickles) nor dates, complex numbers, raw bytes
+_LONGEST_HEADER = 10000  # bytes; NumPy's own limit
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # what NumPy writes
 
 
@@ -110,8 +111,13 @@ def read_header(stream: IO[bytes]) -> Header:
     Raises:
         Exception: whatever NumPy raises for a damaged one.
     """
-    read = npy.read_array_header_1_0 if npy.read_magic(stream) == (1, 0) else npy.read_array_header_2_0
-    shape, _, dtype = read(stream)
+    is_short = npy.read_magic(stream) == (1, 0)
+    start, digits = stream.tell(), 2 if is_short else 4
+    length = int.from_bytes(stream.read(digits), "little")
+    if length > _LONGEST_HEADER:  # NumPy would read, and unpack, all of it before it says so
+        raise ValueError(f"a header of {length} bytes")
+    stream.seek(start)
+    shape, _, dtype = (npy.read_array_header_1_0 if is_short else npy.read_array_header_2_0)(stream)
     return Header(shape, dtype)
 
 

@@ -140,7 +140,7 @@ def _choose(path: Path, arrays: Mapping[str, Header]) -> Sequence[str]:
     chosen = named or tables or [name for name, array in arrays.items() if array.dtype.names is not None]
     if len(chosen) != 1:
         raise CFlowError(
-            f"{path} holds {list(arrays)}; it must hold x, y, z, or one (N, 3+) array, or name it {_CLOUD_KEYS[0]}"
+            f"{path} holds {list(arrays)[:20]}; it must hold x, y, z, or one (N, 3+) array, or name it {_CLOUD_KEYS[0]}"
         )
     return chosen
 

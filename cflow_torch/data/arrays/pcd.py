@@ -139,13 +139,15 @@ def _read_header(content: bytes) -> _Header:
     names = entries.get("FIELDS", entries.get("COLUMNS", []))
     data = match.group(1).decode("ascii", "replace")
     if not names or data not in _DATA:
-        raise CFlowError(f"the header needs FIELDS and DATA {', '.join(_DATA)}; got FIELDS {names}, DATA {data}")
+        raise CFlowError(
+            f"the header needs FIELDS and DATA {', '.join(_DATA)}; got {len(names)} fields, DATA {data[:80]}"
+        )
     entries.setdefault("COUNT", ["1"] * len(names))
     for key in ("SIZE", "TYPE", "COUNT"):
         if len(entries.get(key, [])) != len(names):
             raise CFlowError(f"FIELDS names {len(names)} fields, {key} has {len(entries.get(key, []))} entries")
     if len(set(names) - {_PADDING}) != len([name for name in names if name != _PADDING]):
-        raise CFlowError(f"FIELDS names a field twice: {names}")
+        raise CFlowError(f"FIELDS names a field twice: {' '.join(names)[:200]}")
     fields = []
     for name, letter, size, count in zip(names, entries["TYPE"], entries["SIZE"], entries["COUNT"]):
         kind = _TYPES.get((letter, _whole("SIZE", size)))
@@ -172,7 +174,7 @@ def _number_of_points(entries: Mapping[str, List[str]]) -> int:
 
 def _whole(key: str, *words: str) -> int:
     if len(words) != 1 or not words[0].isdigit() or len(words[0]) > 12:
-        raise CFlowError(f"{key} must be a whole number, got {' '.join(words)!r}")
+        raise CFlowError(f"{key} must be a whole number, got {' '.join(words)[:80]!r}")
     return int(words[0])
 
 

@@ -98,7 +98,9 @@ def _read(content: bytes) -> Dict[str, np.ndarray]:
     lines = [line.split() for line in content[: end.start()].decode("ascii", "replace").splitlines()[1:]]
     lines = [words for words in lines if words and words[0] not in ("comment", "obj_info")]
     if not lines or lines[0][0] != "format" or len(lines[0]) != 3 or lines[0][1] not in _ORDERS:
-        raise CFlowError(f"its format must be one of {', '.join(_ORDERS)}, got {' '.join(lines[0] if lines else [])!r}")
+        raise CFlowError(
+            f"its format must be one of {', '.join(_ORDERS)}, got {' '.join(lines[0] if lines else [])[:80]!r}"
+        )
     kind = lines[0][1]
     num_points, properties = _vertices(lines[1:])
     body = content[end.end() :]
@@ -124,12 +126,12 @@ def _vertices(lines: List[List[str]]) -> Tuple[int, List[Tuple[str, str]]]:
             break
         if words[0] != "property" or len(words) != 3 or words[1] not in _TYPES:
             raise CFlowError(
-                f"vertices may have scalar properties of types {', '.join(_TYPES)}; got {' '.join(words)!r}"
+                f"vertices may have scalar properties of types {', '.join(_TYPES)}; got {' '.join(words)[:80]!r}"
             )
         properties.append((words[2], _TYPES[words[1]]))
     names = [name for name, _ in properties]
     if not names or len(set(names)) < len(names):
-        raise CFlowError(f"vertices need properties of different names, got {names}")
+        raise CFlowError(f"vertices need properties of different names, got {' '.join(names)[:200]!r}")
     return int(lines[0][2]), properties
 
 
