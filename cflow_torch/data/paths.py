@@ -20,7 +20,10 @@ from typing import Any, Dict, Iterator, Optional, Union
 
 import pyarrow as pa
 
+from cflow_torch.data.arrow_types import refuse_pickled_types
 from cflow_torch.types import CFlowError
+
+refuse_pickled_types()  # here, since every reader comes by
 
 Place = Union[str, Path]
 _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)://")
@@ -41,11 +44,15 @@ def as_path(place: Place) -> Path:
         A `pathlib.Path`, or a `upath.UPath`, which has the same interface.
 
     Raises:
-        CFlowError: the extra `remote` is missing, or the package of the scheme's file system, or fsspec does not know
-            the scheme.
+        CFlowError: it is no name; the extra `remote` is missing, or the package of the scheme's file system, or fsspec
+            does not know the scheme.
     """
     if not isinstance(place, str):
+        if not is_place(place):
+            raise CFlowError(f'{str(place)[:80]!r} is no place: give a name, "scheme://..." or a path')
         return place
+    if not place or "\0" in place:
+        raise CFlowError(f"{place[:80]!r} is no place: give the name of a file or folder")
     match = _SCHEME.match(place)
     if match is None:
         return Path(place)
