@@ -44,7 +44,7 @@ def task(cfg: DictConfig) -> float:
     record = finished_results(cfg, output)
     if record is not None:
         print(f"skipped, done before: {output}")
-        return objective(record["results"])
+        return objective_of(record, output)
     metrics = SceneFlowMetrics(cfg.definition)
     model = StopWatch(make_model(cfg))
     logs, failures = open_logs(cfg)
@@ -91,6 +91,20 @@ def objective(results: Dict[str, Any]) -> float:
     else:
         value = results["three_way"]["epe_3way"]
     return float("nan") if value is None else float(value)
+
+
+def objective_of(record: Dict[str, Any], folder: Path) -> float:
+    """`objective` of a record that was read.
+
+    Raises:
+        CFlowError: it lacks the score.
+    """
+    try:
+        return objective(record["results"])
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise CFlowError(
+            f"{folder} holds a results file without its score ({error!r:.80}): give output=FOLDER, or overwrite=true"
+        ) from None
 
 
 def _finish(failures: Any) -> None:

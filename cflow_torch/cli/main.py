@@ -92,19 +92,24 @@ def _run(arguments: List[str]) -> None:
 
 def _run_with_settings(command: str, run: Any, rest: List[str]) -> None:
     import hydra
+    from omegaconf.errors import OmegaConfBaseException
 
-    from cflow_torch.cli import wrong_call
+    from cflow_torch.cli import settings, wrong_call
     from cflow_torch.cli.arguments import for_hydra
 
     has_begun = False
 
     def task(cfg: Any) -> Any:
         nonlocal has_begun
-        has_begun = True
         try:
+            settings.check_shape(cfg, command)
+            has_begun = True
             return run(cfg)
         except CFlowError as error:
             print(f"error: {error}", file=sys.stderr)
+            raise SystemExit(2) from None
+        except OmegaConfBaseException as error:  # a setting that refers to none, or was taken out
+            print(f"error: {wrong_call.explain(error, command)}", file=sys.stderr)
             raise SystemExit(2) from None
         except BrokenPipeError:
             _end_unread()

@@ -18,6 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from cflow_torch.cli.run import versions, write_config
 from cflow_torch.data.benchmark import generator_key
+from cflow_torch.data.json_file import read_json
 from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.data.records import changes, strict, write_text
 from cflow_torch.evaluation.definitions import get_definition
@@ -64,7 +65,7 @@ def finished_results(cfg: DictConfig, folder: Path) -> Optional[Dict[str, Any]]:
     if cfg.overwrite or not file.exists():
         return None
     try:
-        record = json.loads(file.read_text(encoding="utf-8"))
+        record = read_json(file)
         before = {"versions": record["versions"], "generator": record["data"]["generator"], "config": record["config"]}
     except (ValueError, KeyError, TypeError) as error:
         raise CFlowError(

@@ -22,6 +22,7 @@ from cflow_torch.config import Config
 from cflow_torch.data.benchmark import benchmark_logs, format_of
 from cflow_torch.data.catalog import find_sources, open_log
 from cflow_torch.data.log import Log, RecentSweeps, window
+from cflow_torch.data.names import is_safe_name
 from cflow_torch.data.paths import as_path
 from cflow_torch.data.records import write_text
 from cflow_torch.fleet.progress import frames
@@ -33,7 +34,7 @@ Failures = List[Tuple[str, str]]
 UseResult = Callable[[Log, int, Window, FlowResult], None]
 # Settings of `data` that are not the reader's.
 _NOT_THE_READERS = ("name", "label", "root", "first", "step")
-_LONGEST_NAME = 150  # characters of a folder name; file systems end at 255 bytes
+_LONGEST_NAME = 150  # bytes of a folder name; file systems end at 255
 
 
 class UnfinishedJob(RuntimeError):
@@ -110,9 +111,10 @@ def output_folder(cfg: DictConfig) -> Path:
 
 def _folder_name(text: str) -> str:
     """Text as one folder name; different texts keep different names."""
-    name = re.sub(r"[^\w.,=+@\[\]-]", "_", text.replace(" ", ""))[:_LONGEST_NAME]
-    if name != text or name in (".", ".."):
-        name += "-" + hashlib.sha256(text.encode()).hexdigest()[:8]
+    name = re.sub(r"[^\w.,=+@\[\]-]", "_", text.replace(" ", ""))
+    name = name.encode()[:_LONGEST_NAME].decode(errors="ignore")
+    if text and (name != text or not is_safe_name(name)):
+        name = name.lstrip(".") + "-" + hashlib.sha256(text.encode(errors="surrogatepass")).hexdigest()[:8]
     return name
 
 

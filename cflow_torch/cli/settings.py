@@ -10,6 +10,7 @@ from typing import Any, Dict, Iterable, List, Tuple
 from omegaconf import DictConfig, OmegaConf
 
 import cflow_torch.configs
+from cflow_torch.types import CFlowError
 
 CONFIGS = Path(cflow_torch.configs.__path__[0])
 
@@ -48,6 +49,33 @@ def owners(command: str, key: str) -> List[str]:
         for name in names
         if key in _group_keys(group, name)
     ]
+
+
+def check_shape(cfg: DictConfig, command: str) -> None:
+    """Put values where settings refer to others (`${...}`), and refuse what has lost the shape that commands rely on.
+
+    Raises:
+        CFlowError: references in a circle; a group or a mapping that is none any more; a setting taken out.
+        OmegaConfBaseException: a reference to what is not there.
+    """
+    try:
+        OmegaConf.resolve(cfg)
+    except RecursionError:
+        raise CFlowError("settings refer to each other (${...}) in a circle, or are nested too deep") from None
+    _check_shape(cfg, _load(CONFIGS / f"{command}.yaml")[0], [g for g in groups(command) if g != "experiment"], "")
+
+
+def _check_shape(given: DictConfig, known: DictConfig, mappings: Iterable[str], prefix: str) -> None:
+    inner = {str(key): known._get_node(key) for key in known if key not in ("defaults", "hydra")}
+    for key in {**inner, **dict.fromkeys(mappings)}:
+        if key not in given and not OmegaConf.is_missing(given, key):
+            raise CFlowError(f"setting {prefix}{key} was taken out: leave out ~{prefix}{key}")
+        own, now = inner.get(key), given._get_node(key)
+        if key in mappings or (isinstance(own, DictConfig) and not own._is_none()):
+            if not isinstance(now, DictConfig) or now._is_none() or now._is_missing():
+                raise CFlowError(f"{prefix}{key}={now} is no mapping: give its settings, {prefix}{key}.NAME=VALUE")
+            if isinstance(own, DictConfig):
+                _check_shape(now, own, (), f"{prefix}{key}.")
 
 
 def near(word: str, known: Iterable[str]) -> str:

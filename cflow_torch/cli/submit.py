@@ -30,7 +30,10 @@ from cflow_torch.cli.run import (
     versions,
     write_config,
 )
+from cflow_torch.cli.settings_file import plain_yaml, read_settings
 from cflow_torch.data.log import Log, window
+from cflow_torch.data.names import folder_in
+from cflow_torch.data.records import flat
 from cflow_torch.fleet.progress import frames as counted
 from cflow_torch.submission.archive import pack
 from cflow_torch.submission.check import check_submission
@@ -90,12 +93,13 @@ def _claim(cfg: DictConfig, output: Path, folder: Path, file: Path) -> None:
     Raises:
         CFlowError: it holds files of other settings.
     """
-    record, now = output / "config.yaml", {**_settings(cfg), "cflow_torch": versions()["cflow_torch"]}
+    record = output / "config.yaml"
+    folder_in(output, folder.name, "the folder")
     if record.exists() and not cfg.overwrite:
-        stored = OmegaConf.load(record)
-        assert isinstance(stored, DictConfig)
-        before = {**_settings(stored), "cflow_torch": OmegaConf.select(stored, "versions.cflow_torch")}
-        changed = [name for name in now if now[name] != before[name]]
+        now, before = plain_yaml(OmegaConf.to_yaml(_settings(cfg))), read_settings(record)
+        now["cflow_torch"] = versions()["cflow_torch"]
+        before["cflow_torch"] = flat(before).get("versions.cflow_torch")
+        changed = [name for name in now if now[name] != before.get(name)]
         if changed:
             raise CFlowError(
                 f"{output} holds files made with another {', '.join(changed)}: give output=FOLDER, or overwrite=true"
@@ -106,9 +110,9 @@ def _claim(cfg: DictConfig, output: Path, folder: Path, file: Path) -> None:
     write_config(cfg, output)
 
 
-def _settings(cfg: DictConfig) -> Dict[str, Any]:
+def _settings(cfg: DictConfig) -> DictConfig:
     values: Dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
-    return {name: values.get(name) for name in _SETTINGS}
+    return OmegaConf.create({name: values.get(name) for name in _SETTINGS})
 
 
 def _plan(

@@ -12,6 +12,9 @@ from omegaconf.errors import OmegaConfBaseException
 
 from cflow_torch.cli import settings
 
+# How messages begin of what Hydra's parser lets through: a number of thousands of digits; model=null.
+_OF_HYDRA = ("Exceeds the limit", "Config group override must be")
+
 
 def explain(error: Exception, command: str) -> Optional[str]:
     """The message for a call that Hydra refuses; None if the error is none of the caller's."""
@@ -22,9 +25,11 @@ def explain(error: Exception, command: str) -> Optional[str]:
         if "=" not in wrong:
             return f"{wrong!r} is no setting: give NAME=VALUE, `cflow {command} --help` has examples"
         return f"cannot read {wrong!r}: {_readable(wrong)}"
+    message = str(error)
+    if type(error) is ValueError and message.startswith(_OF_HYDRA):
+        return f"{message}; `cflow {command} --help` has examples"
     if not isinstance(error, (HydraException, OmegaConfBaseException)):
         return None
-    message = str(error)
     match = re.match(r"Could not override '([^']+)'", message)
     if match:
         known = [*settings.groups(command), *settings.settings(command)]

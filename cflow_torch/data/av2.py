@@ -13,6 +13,7 @@ from cflow_torch.data.boxes import Boxes, flow_from_boxes
 from cflow_torch.data.folders import find_folders
 from cflow_torch.data.ground import GroundRaster, get_rule, read_ground_raster
 from cflow_torch.data.log import FlowLabels
+from cflow_torch.data.names import is_stamp
 from cflow_torch.data.paths import Place, as_path, remote_errors, whole
 from cflow_torch.evaluation.categories import CATEGORIES, CATEGORY_INDEX
 from cflow_torch.types import CFlowError, Sweep
@@ -69,7 +70,7 @@ class AV2Log:
         self._files: Dict[int, Path] = {
             int(file.stem): file
             for file in (self.folder / "sensors" / "lidar").glob("*.feather")
-            if file.stem.isdigit()
+            if is_stamp(file.stem)
         }
         self.timestamps: Sequence[int] = sorted(self._files)
         if len(self.timestamps) < 2:

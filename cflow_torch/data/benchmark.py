@@ -21,6 +21,9 @@ from tqdm import tqdm
 from cflow_torch.data import synthetic
 from cflow_torch.data.catalog import find_sources
 from cflow_torch.data.synthetic import Drive, make_drive
+from cflow_torch.types import CFlowError
+
+_MOST = 100_000  # sweeps of a drive (three hours), and drives: more is a slip
 
 
 @dataclass(frozen=True)
@@ -87,6 +90,8 @@ def benchmark_logs(
 
     Cost: about 2 s and 40 MB per drive of 20 sweeps of 100,000 points, once.
     """
+    if len(seeds) > _MOST or num_sweeps > _MOST:
+        raise CFlowError(f"{len(seeds)} drives of {num_sweeps} sweeps: give at most {_MOST} of each")
     folder = Path(cache) / f"{generator_key()}-{num_sweeps}"
     chosen = format_of(profile)
     num_simulated = num_sweeps * int(chosen.settings.get("sweep_step", 1))

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import collections.abc
 import inspect
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Any, Dict, Sequence
+from pathlib import Path
+from typing import Any, Dict, Sequence, Union, get_type_hints
+
+import numpy as np
 
 from cflow_torch.data.log import Log
 from cflow_torch.data.log_check import check_log
@@ -93,6 +97,7 @@ def open_log(
         raise CFlowError(f"data set {name} has no setting {', '.join(unknown)}; it has {', '.join(known) or 'none'}")
     if find_ground is not None and find_ground not in GROUND_METHODS:
         raise CFlowError(f"find_ground={find_ground!r}: give null or one of {', '.join(GROUND_METHODS)}")
+    _check_kinds(name, reader, settings)
     with remote_errors(source if is_place(source) else source.root):
         log: Log = reader(source, **settings)
     safe_name(log.log_id, f"{source}: the log")  # results get that name
@@ -107,6 +112,31 @@ def open_log(
     if check:
         check_log(log)
     return log
+
+
+def _check_kinds(name: str, reader: Any, settings: Dict[str, Any]) -> None:
+    """Refuse a value of another kind than the reader says; lists of numbers are the reader's own business."""
+    hints = get_type_hints(reader.__init__)
+    for key, value in settings.items():
+        if not _is_kind(value, hints.get(key, Any)):
+            kind = str(inspect.signature(reader).parameters[key].annotation).replace("Optional", "null or ")
+            raise CFlowError(f"data set {name}: {key}={value!r:.80}: give {kind}")
+
+
+def _is_kind(value: Any, hint: Any) -> bool:
+    parts: Any = getattr(hint, "__args__", ())
+    if getattr(hint, "__origin__", None) is Union:
+        return any(_is_kind(value, part) for part in parts)
+    if getattr(hint, "__origin__", None) is collections.abc.Sequence:
+        return isinstance(value, (list, tuple)) and all(_is_kind(part, parts[0]) for part in value)
+    if hint is bool:
+        return isinstance(value, (bool, int, np.bool_)) and value in (0, 1)
+    if hint in (int, float):
+        allowed = (int, np.integer) if hint is int else (int, float, np.integer, np.floating)
+        return isinstance(value, allowed) and not isinstance(value, bool)
+    if hint in (str, type(None)):
+        return isinstance(value, hint)
+    return is_place(value) if hint is Path else True
 
 
 def _data_set(name: str) -> DataSet:

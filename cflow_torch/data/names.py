@@ -45,6 +45,11 @@ def safe_name(name: Any, what: str) -> str:
     return str(name)
 
 
+def is_safe_name(name: Any) -> bool:
+    """Whether `safe_name` takes it."""
+    return not _fault(name)
+
+
 def inside(folder: Path, relative: Any, what: str) -> Path:
     """Where a name from a table lies: below a folder.
 
@@ -100,6 +105,11 @@ def leaves(output: Path, path: Path) -> bool:
         return False
     root, real = os.path.realpath(output), os.path.realpath(path)
     return real != root and not real.startswith(root.rstrip(os.sep) + os.sep)
+
+
+def is_stamp(name: str) -> bool:
+    """Whether a name is a time stamp: digits 0 to 9 that an int64 can hold."""
+    return name.isascii() and name.isdigit() and len(name) < 20 and int(name) < 1 << 63
 
 
 def same_names(names: Iterable[str]) -> List[str]:

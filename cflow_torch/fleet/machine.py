@@ -13,6 +13,7 @@ from cflow_torch.free_memory import available_memory, control_groups
 from cflow_torch.types import CFlowError
 
 AUTO = "auto"
+_MOST = 100_000  # workers, threads or windows; more is a slip
 # Bytes that one worker may come to hold: three times the most that `paper` was seen to take, see docs/fleet.md.
 WORKER_MEMORY = 1_500_000_000
 # Windows that are computed together. A CPU gains up to 4 (fewer small operations), then loses (cold memory).
@@ -100,6 +101,6 @@ def _at_least_1(name: str, value: Any) -> int:
         number = int(str(value))
     except ValueError:
         number = 0
-    if number < 1:
-        raise CFlowError(f"{name}={value!r}: give a whole number of at least 1, or {AUTO}")
+    if not 1 <= number <= _MOST:
+        raise CFlowError(f"{name}={value!r}: give a whole number of at least 1, at most {_MOST}, or {AUTO}")
     return number

@@ -157,7 +157,10 @@ class ArraysLog:
             return trajectory, str(file), False
         if poses is None:
             return None, "", False
-        matrices = np.asarray(poses, np.float64)
+        try:
+            matrices = np.asarray(poses, np.float64)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise CFlowError(f"poses={poses!r:.80} are no numbers ({error}); give (K, 4, 4), one per sweep") from None
         if matrices.ndim != 3 or not len(matrices):
             raise CFlowError(f"poses have shape {matrices.shape}; give (K, 4, 4), one per sweep")
         checked = [rigid_transform(pose, f"poses[{row}]") for row, pose in enumerate(matrices)]
