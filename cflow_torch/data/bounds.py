@@ -9,7 +9,7 @@ from cflow_torch.types import CFlowError
 MAX_ARRAY_BYTES = 1 << 30  # of one array or column: 89 million points; a sweep of the densest sensor has 2 million
 
 
-def check_claim(file: Any, what: str, num_bytes: int) -> None:
+def check_claim(file: Any, what: str, num_bytes: int, limit: int = MAX_ARRAY_BYTES) -> None:
     """Refuse what a file claims to hold before memory is asked for.
 
     A few damaged or hostile bytes can claim 10^12 points, or unpack to a thousand times their size. Every reader asks
@@ -19,12 +19,13 @@ def check_claim(file: Any, what: str, num_bytes: int) -> None:
         file: name of the file, for the message.
         what: name of the array, column or member.
         num_bytes: what it would take in memory.
+        limit: what it may take.
 
     Raises:
-        CFlowError: it is negative or above MAX_ARRAY_BYTES.
+        CFlowError: it is negative or above the limit.
     """
-    if not 0 <= num_bytes <= MAX_ARRAY_BYTES:
+    if not 0 <= num_bytes <= limit:
         raise CFlowError(
-            f"{file}: {what} claims {num_bytes} bytes; up to {MAX_ARRAY_BYTES} are read at once. "
+            f"{file}: {what} claims {num_bytes} bytes; up to {limit} are read at once. "
             "Is the file damaged? Copy or write it anew; one with that much data is split into sweeps"
         )
