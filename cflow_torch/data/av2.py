@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Dict, List, Optional, Sequence, Tuple, Union
+from typing import Dict, List, Optional, Sequence, Union
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.feather as feather
 
+from cflow_torch.data.arrow_file import check_rows, shortened, texts
 from cflow_torch.data.boxes import Boxes, flow_from_boxes
+from cflow_torch.data.feather_file import FeatherFile
 from cflow_torch.data.folders import find_folders
 from cflow_torch.data.ground import GroundRaster, get_rule, read_ground_raster
 from cflow_torch.data.log import FlowLabels
 from cflow_torch.data.names import is_stamp
-from cflow_torch.data.paths import Place, as_path, remote_errors, whole
+from cflow_torch.data.paths import Place, as_path, remote_errors
 from cflow_torch.evaluation.categories import CATEGORIES, CATEGORY_INDEX
 from cflow_torch.types import CFlowError, Sweep
 
 QUATERNION_TOLERANCE = 1e-3  # a quaternion is a rotation only if its length is 1; stored values are within 1e-15
 MIN_INTERIOR_POINTS = 1  # av2-api's data loader drops boxes that hold no point, so a track that empties ends
+_INT64_MAX = (1 << 63) - 1
 SEARCH_DEPTH = 4  # <root>/<data set>/sensor/<split>/<log>, the deepest layout in use
 
 _POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
@@ -148,6 +150,7 @@ class AV2Log:
         """Sweep time -> (4, 4) float64 T_world_ego."""
         file = self.folder / "city_SE3_egovehicle.feather"
         table = _read(file, ("timestamp_ns", *_POSE))
+        check_rows(file, table.num_rows)
         times = _integers(table, "timestamp_ns", file)
         row_of = {int(time): row for row, time in enumerate(times)}
         missing = [time for time in self.timestamps if time not in row_of]
@@ -162,7 +165,7 @@ class AV2Log:
         return dict(zip(self.timestamps, _transforms(values, file, self.timestamps)))
 
     def _stored_labels(self, file: Path, timestamp: int) -> FlowLabels:
-        table = _read(file, (*_FLOW, "classes"))
+        table = _read(file, (*_FLOW, "classes"), ("is_valid",))
         rows = len(self._points(timestamp))
         if table.num_rows != rows:
             raise CFlowError(
@@ -182,7 +185,8 @@ class AV2Log:
 
     def _labels_from_annotations(self, file: Path, timestamp0: int, timestamp1: int) -> Optional[FlowLabels]:
         columns = ("timestamp_ns", "track_uuid", "category", *_SIZE, *_POSE)
-        table = _read(file, columns)
+        table = _read(file, columns, ("num_interior_pts",))
+        check_rows(file, table.num_rows)
         times = _integers(table, "timestamp_ns", file)
         if not times.size or timestamp0 < times.min() or timestamp1 > times.max():
             return None
@@ -200,18 +204,17 @@ def _is_log(folder: Path) -> bool:
     return (folder / "sensors" / "lidar").is_dir()
 
 
-def _read(file: Path, required: Sequence[str]) -> pa.Table:
-    """Table of a feather file that has the required columns, without holes in them."""
+def _read(file: Path, required: Sequence[str], optional: Sequence[str] = ()) -> pa.Table:
+    """The required columns of a feather file, without holes in them, and the optional ones that it has."""
     try:
-        table = feather.read_table(whole(file))
+        feather = FeatherFile(file)
     except FileNotFoundError:
         raise CFlowError(f"{file} is missing; copy it from the data set") from None
-    except (pa.ArrowException, OSError, ValueError) as error:
+    except OSError as error:
         raise CFlowError(f"cannot read {file}: {error}; it may be truncated, copy it again") from error
-    missing = [name for name in required if name not in table.column_names]
-    if missing:
-        raise CFlowError(f"{file} lacks the columns {missing}; it has {table.column_names}")
-    holes = [name for name in required if table.column(name).null_count]
+    columns = (*required, *(name for name in optional if name in feather.names))
+    table = feather.read(columns)
+    holes = [name for name in columns if table.column(name).null_count]
     if holes:
         raise CFlowError(f"{file} has empty entries in {holes}")
     return table
@@ -234,7 +237,10 @@ def _integers(table: pa.Table, column: str, file: Path) -> np.ndarray:
     kind = table.schema.field(column).type
     if not pa.types.is_integer(kind):
         raise CFlowError(f"{file}: {column} must be integer, got {kind}")
-    return table.column(column).to_numpy().astype(np.int64)
+    values = table.column(column).to_numpy()
+    if values.size and values.max() > _INT64_MAX:
+        raise CFlowError(f"{file}: {column} holds {values.max()}, more than {_INT64_MAX}")
+    return values.astype(np.int64)
 
 
 def _transforms(values: np.ndarray, file: Path, names: Sequence[Union[int, str]]) -> np.ndarray:
@@ -257,12 +263,12 @@ def _transforms(values: np.ndarray, file: Path, names: Sequence[Union[int, str]]
 
 def _boxes(table: pa.Table, file: Path) -> Boxes:
     """Boxes of one sweep, in the order of the file."""
-    names: Tuple[List[str], List[str]] = (table.column("track_uuid").to_pylist(), table.column("category").to_pylist())
+    names = tuple(texts(table.column(name), file) for name in ("track_uuid", "category"))
     unknown = sorted(set(names[1]) - set(CATEGORIES[1:]))
     if unknown:
-        raise CFlowError(f"{file}: unknown categories {unknown}; the known ones are {CATEGORIES[1:]}")
+        raise CFlowError(f"{file}: unknown categories {shortened(unknown)}; the known ones are {CATEGORIES[1:]}")
     return Boxes(
-        track_id=[str(name) for name in names[0]],
+        track_id=names[0],
         category=np.array([CATEGORY_INDEX[name] for name in names[1]], dtype=np.uint8),
         size=_floats(table, _SIZE, np.float64),
         pose=_transforms(_floats(table, _POSE, np.float64), file, names[0]),

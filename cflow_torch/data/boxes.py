@@ -11,6 +11,9 @@ import numpy as np
 from cflow_torch.data.log import FlowLabels
 from cflow_torch.types import CFlowError
 
+MAX_BOXES = 10_000  # of a sweep; every point is compared with every box, and a busy crossing has some hundred
+_LISTED = 20  # names in a message
+
 
 @dataclass(frozen=True)
 class Boxes:
@@ -37,7 +40,9 @@ class Boxes:
             raise CFlowError("a box holds numbers that are not finite; copy the annotations again")
         if len(set(self.track_id)) != count:
             twice = sorted(name for name, times in Counter(self.track_id).items() if times > 1)
-            raise CFlowError(f"a track may have one box per sweep; named twice: {twice[:10]}")
+            raise CFlowError(f"a track may have one box per sweep; named twice: {twice[:_LISTED]}")
+        if count > MAX_BOXES:
+            raise CFlowError(f"a sweep has up to {MAX_BOXES} boxes, got {count}: is the file damaged?")
 
 
 def points_in_box(points: np.ndarray, size: np.ndarray, pose: np.ndarray) -> np.ndarray:

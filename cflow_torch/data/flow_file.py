@@ -10,7 +10,8 @@ import torch
 from pyarrow import feather
 
 from cflow_torch.data.atomic import atomic_file
-from cflow_torch.data.paths import Place, as_path, whole
+from cflow_torch.data.feather_file import FeatherFile
+from cflow_torch.data.paths import Place, as_path
 from cflow_torch.types import CFlowError, FlowResult
 
 _VECTORS = {"flow": "flow", "residual": "residual_flow", "pose": "pose_flow"}  # name in the file -> field
@@ -56,16 +57,24 @@ def read_flow(path: Place) -> FlowResult:
     Raises:
         CFlowError: the file is missing, cannot be reached, is truncated, or was not written with all contents.
     """
+    names = [f"{name}_t{axis}_m" for name in _VECTORS for axis in _AXES] + list(_SCALARS)
+    path = as_path(path)
     try:
-        table = feather.read_table(whole(as_path(path)), memory_map=False)
-        vectors = {
-            field: np.stack([table[f"{name}_t{axis}_m"].to_numpy() for axis in _AXES], 1)
-            for name, field in _VECTORS.items()
-        }
-        more = [name for name in ON_REQUEST if name in table.column_names]
-        scalars = {name: table[name].to_numpy() for name in (*_SCALARS, *more)}
-    except (OSError, pa.ArrowException, KeyError) as error:
+        file = FeatherFile(path)
+        table = file.read([*names, *(name for name in ON_REQUEST if name in file.names)])
+    except (OSError, CFlowError) as error:
         raise CFlowError(
             f"{path} is no flow file ({error}): give one that `cflow flow` wrote with all its contents"
         ) from error
-    return FlowResult(**{name: torch.from_numpy(np.array(values)) for name, values in {**vectors, **scalars}.items()})
+    columns = {}
+    for name in table.column_names:
+        kind = table.column(name).type
+        wanted = {"cluster_id": "int64", "is_valid": "bool"}.get(name, "floating point")
+        right = pa.types.is_floating(kind) if wanted == "floating point" else str(kind) == wanted
+        if not right or table.column(name).null_count:
+            raise CFlowError(f"{path} is no flow file: {name} must be {wanted} in every row, got {kind}")
+        columns[name] = table.column(name).to_numpy()
+    vectors = {
+        field: np.stack([columns.pop(f"{name}_t{axis}_m") for axis in _AXES], 1) for name, field in _VECTORS.items()
+    }
+    return FlowResult(**{name: torch.from_numpy(np.array(values)) for name, values in {**vectors, **columns}.items()})

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any, Dict, List, Mapping, Sequence, Set, Union
 
 import numpy as np
-import pyarrow as pa
-from pyarrow import feather
 
+from cflow_torch.data.arrow_file import shortened
+from cflow_torch.data.feather_file import FeatherFile
 from cflow_torch.data.json_file import parse_json
 from cflow_torch.submission.archive import Contents
 from cflow_torch.submission.plan import Frame
@@ -55,26 +55,30 @@ def check_file(name: str, data: bytes, rows: int, version: SubmissionVersion) ->
         version: the format.
     """
     try:
-        table = feather.read_table(pa.BufferReader(data))
-    except (OSError, ValueError, pa.ArrowException) as error:
+        file = FeatherFile(name, data)
+    except CFlowError as error:
         return [f"{name}: no feather file ({_one_line(error)})"]
     problems = []
-    missing = [column for column in version.columns if column not in table.column_names]
-    foreign = [column for column in table.column_names if column not in version.columns]
-    twice = [column for column, count in Counter(table.column_names).items() if count > 1]
+    present = [column for column in version.columns if column in file.names]
+    missing = [column for column in version.columns if column not in file.names]
+    foreign = [column for column in file.names if column not in version.columns]
+    twice = [column for column, count in Counter(file.names).items() if count > 1]
     if missing:
-        problems.append(f"{name}: column {', '.join(missing)} is missing, it has {', '.join(table.column_names)}")
+        problems.append(f"{name}: column {', '.join(missing)} is missing, it has {shortened(', '.join(file.names))}")
     if foreign:
-        problems.append(f"{name}: column {', '.join(foreign)} does not belong, allowed: {', '.join(version.columns)}")
+        foreign_names, allowed = shortened(", ".join(foreign)), ", ".join(version.columns)
+        problems.append(f"{name}: column {foreign_names} does not belong, allowed: {allowed}")
     if twice:
-        return [*problems, f"{name}: column {', '.join(twice)} occurs more than once"]
-    if table.num_rows != rows:
+        return [*problems, f"{name}: column {shortened(', '.join(twice))} occurs more than once"]
+    if file.num_rows != rows:
         of = "points of the evaluation mask" if version.rows == "masked" else "points of the sweep"
-        problems.append(f"{name}: {table.num_rows} rows, expected {rows} ({of})")
-    for column, dtypes in version.columns.items():
-        if column in missing:
-            continue
-        values = table.column(column)
+        problems.append(f"{name}: {file.num_rows} rows, expected {rows} ({of})")
+    try:
+        columns = {column: file.read([column]).column(0) for column in present}
+    except CFlowError as error:
+        return [*problems, f"{name}: no feather file ({_one_line(error)})"]
+    for column, values in columns.items():
+        dtypes = version.columns[column]
         dtype = _DTYPES.get(str(values.type), str(values.type))
         if dtype not in dtypes:
             problems.append(f"{name}: column {column} is {dtype}, expected {' or '.join(dtypes)}")

@@ -8,8 +8,9 @@ from typing import Dict, List, Optional, Union
 
 import numpy as np
 import pyarrow as pa
-from pyarrow import feather
 
+from cflow_torch.data.arrow_file import shortened
+from cflow_torch.data.feather_file import FeatherFile
 from cflow_torch.data.log import Log
 from cflow_torch.data.zips import member_names, open_zip, read_member
 from cflow_torch.types import CFlowError, Sweep, as_numpy
@@ -57,12 +58,15 @@ class MaskArchive:
         name = f"{log_id}/{timestamp}.feather"
         try:
             data = read_member(self._zip, name, MAX_MASK_BYTES)
-            table = feather.read_table(pa.BufferReader(data))
-        except (CFlowError, OSError, ValueError, pa.ArrowException) as error:
+        except (CFlowError, OSError, ValueError) as error:
             raise CFlowError(f"{self.file}: cannot read {name} ({error})") from error
-        if table.num_columns != 1 or not pa.types.is_boolean(table.schema.types[0]):
-            raise CFlowError(f"{self.file}: {name} must hold one bool column, got {table.schema.names}")
-        return table.column(0).to_numpy().astype(bool)
+        file = FeatherFile(f"{self.file}: {name}", data)
+        if len(file.names) != 1 or not pa.types.is_boolean(file.schema.types[0]):
+            raise CFlowError(f"{self.file}: {name} must hold one bool column, got {shortened(file.names)}")
+        values = file.read(file.names).column(0)
+        if values.null_count:
+            raise CFlowError(f"{self.file}: {name} has {values.null_count} empty values")
+        return values.to_numpy().astype(bool)
 
     def close(self) -> None:
         """Close the zip."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Callable, Dict, Mapping, Optional, Sequence
+from typing import Any, Callable, Dict, Mapping, Optional, Sequence, Union
 
 import numpy as np
 import pyarrow as pa
@@ -12,7 +12,9 @@ from pyarrow import feather, parquet
 from cflow_torch.data.arrays.pcd import read_pcd, write_pcd
 from cflow_torch.data.arrays.ply import read_ply, write_ply
 from cflow_torch.data.atomic import atomic_file
+from cflow_torch.data.feather_file import FeatherFile
 from cflow_torch.data.npy_file import Header, read_npy, read_npz
+from cflow_torch.data.parquet_file import ParquetFile
 from cflow_torch.data.paths import Place, as_path, read_bytes, remote_errors, whole
 from cflow_torch.types import CFlowError
 
@@ -55,7 +57,7 @@ def read_cloud(path: Place, bin_columns: int = KITTI_COLUMNS) -> np.ndarray:
     elif suffix in (".pcd", ".ply"):
         points = _from_fields(path, (read_pcd if suffix == ".pcd" else read_ply)(path))
     elif suffix in (".feather", ".parquet"):
-        points = _read_table(path, feather.read_table if suffix == ".feather" else parquet.read_table)
+        points = _read_table(path)
     else:
         points = _read_numpy(path)
     if points.dtype.kind != "f":
@@ -145,20 +147,29 @@ def _choose(path: Path, arrays: Mapping[str, Header]) -> Sequence[str]:
     return chosen
 
 
-def _read_table(path: Path, read: Callable[..., Any]) -> np.ndarray:
+def _read_table(path: Path) -> np.ndarray:
     try:
-        table = read(whole(path), memory_map=False)
-    except (pa.ArrowException, OSError, ValueError) as error:
-        raise CFlowError(f"{path} cannot be read ({error}); it is truncated or of another format") from error
-    names = _AXES if all(axis in table.column_names for axis in _AXES) else tuple(table.column_names[:3])
-    if len(names) < 3:
-        raise CFlowError(f"{path} has the columns {table.column_names}; it needs x, y, z")
+        if path.suffix.lower() == ".feather":
+            table = _positions(path, FeatherFile(path))
+        else:
+            with ParquetFile(path, whole(path)) as file:
+                table = _positions(path, file)
+    except OSError as error:
+        raise CFlowError(f"cannot read {path}: {error}") from error
     fields: Dict[str, np.ndarray] = {}
-    for name in names:
+    for name in table.column_names:
         if not pa.types.is_floating(table.schema.field(name).type) or table.column(name).null_count:
             raise CFlowError(f"{path}: column {name} must be floating-point metres without empty entries")
         fields[name] = table.column(name).to_numpy()
     return np.stack(list(fields.values()), axis=1)
+
+
+def _positions(path: Path, file: Union[FeatherFile, ParquetFile]) -> pa.Table:
+    """The three columns of the positions."""
+    names = _AXES if all(axis in file.names for axis in _AXES) else tuple(file.names[:3])
+    if len(names) < 3:
+        raise CFlowError(f"{path} has the columns {file.names}; it needs x, y, z")
+    return file.read(names).select(names)
 
 
 def _from_fields(path: Path, fields: Mapping[str, np.ndarray]) -> np.ndarray:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
-from typing import Any, Callable, Dict, Iterator, List, Optional, Sequence, Tuple
+from typing import Any, Callable, Dict, List, Optional, Sequence, Tuple
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
+from cflow_torch.data.arrow_file import check_columns, check_rows, shortened
+from cflow_torch.data.parquet_file import ParquetFile
 from cflow_torch.data.paths import mapped, ranged
 from cflow_torch.types import CFlowError
 
@@ -75,6 +77,7 @@ SCHEMAS: Dict[str, pa.Schema] = {
 }
 """Component -> its columns, as the official classes print them."""
 
+_MAX_KEY = 1 << 53
 _BATCH = 8  # rows of range images held at once while looking for one
 
 
@@ -98,12 +101,16 @@ def read_images(file: Path, numbers: Sequence[int], column: str, channels: int) 
     columns = [f"{column}.values", f"{column}.shape"]
     images: Dict[int, Optional[np.ndarray]] = {}
     with _open(file, columns, mapped) as parquet:
+        check_columns(file, parquet.schema, columns)
+        kinds = [parquet.schema.field(name).type for name in columns]
+        if not (_is_list_of(kinds[0], pa.types.is_floating) and _is_list_of(kinds[1], pa.types.is_integer)):
+            raise CFlowError(f"{file}: {columns} must be lists of floats and of integers, got {kinds[0]}, {kinds[1]}")
         end = 0
-        for group in range(parquet.num_row_groups):
-            number, end = end, end + parquet.metadata.row_group(group).num_rows
+        for group, num_rows in enumerate(parquet.group_rows):
+            number, end = end, end + num_rows
             if not any(number <= wanted < end for wanted in numbers):
                 continue
-            for batch in _batches(file, parquet, group, columns):
+            for batch in parquet.batches(group, columns, _BATCH):
                 for values, shape in zip(*(batch.column(name) for name in columns)):
                     if number in numbers:
                         images[number] = _image(values, shape, channels, file)
@@ -111,35 +118,27 @@ def read_images(file: Path, numbers: Sequence[int], column: str, channels: int) 
     return images
 
 
-def _open(file: Path, columns: Sequence[str], access: Callable[[Path], Any]) -> pq.ParquetFile:
+def _open(file: Path, columns: Sequence[str], access: Callable[[Path], Any]) -> ParquetFile:
     """An open parquet file that has these columns."""
     try:
-        parquet = pq.ParquetFile(access(file), memory_map=True)
+        parquet = ParquetFile(file, access(file))
     except FileNotFoundError:
         raise CFlowError(f"{file} is missing; download component {file.parent.name} of this segment") from None
-    except (pa.ArrowException, OSError, ValueError) as error:
-        raise CFlowError(f"cannot read {file} as parquet: {error}; it may be truncated, copy it again") from error
-    names = parquet.schema_arrow.names
+    except OSError as error:
+        raise CFlowError(f"cannot read {file}: {error}; it may be truncated, copy it again") from error
+    names = parquet.names
     missing = [name for name in columns if name not in names]
     if missing:
-        parquet.close()
-        raise CFlowError(f"{file} lacks the columns {missing}; it has {names}: is it component {file.parent.name}?")
+        raise CFlowError(
+            f"{file} lacks the columns {missing}; it has {shortened(names)}: is it component {file.parent.name}?"
+        )
     return parquet
 
 
 def read_columns(file: Path, columns: Sequence[str]) -> pa.Table:
     with _open(file, columns, ranged) as parquet:
-        try:
-            return parquet.read(columns=list(columns))
-        except (pa.ArrowException, OSError, ValueError) as error:
-            raise CFlowError(f"cannot read {file}: {error}; it may be damaged, copy it again") from error
-
-
-def _batches(file: Path, parquet: pq.ParquetFile, group: int, columns: Sequence[str]) -> Iterator[pa.RecordBatch]:
-    try:
-        yield from parquet.iter_batches(batch_size=_BATCH, row_groups=[group], columns=list(columns))
-    except (pa.ArrowException, OSError, ValueError) as error:
-        raise CFlowError(f"cannot read {file}: {error}; it may be damaged, copy it again") from error
+        check_rows(file, sum(parquet.group_rows))
+        return parquet.read(columns)
 
 
 def numbers_of(table: pa.Table, column: str, file: Path) -> np.ndarray:
@@ -154,19 +153,50 @@ def numbers_of(table: pa.Table, column: str, file: Path) -> np.ndarray:
     return array
 
 
-def matrix_of(values: Optional[Sequence[float]], where: str) -> np.ndarray:
+def keys_of(table: pa.Table, column: str, file: Path) -> List[int]:
+    """Whole numbers of a column; times in microseconds are within +-2^53."""
+    array = numbers_of(table, column, file)
+    if array.dtype.kind not in "iu" or (
+        array.size and not -_MAX_KEY <= int(array.min()) <= int(array.max()) <= _MAX_KEY
+    ):
+        raise CFlowError(f"{file}: {column} must hold whole numbers up to 2^53, got {array.dtype}")
+    keys: List[int] = array.tolist()
+    return keys
+
+
+def cell_of(table: pa.Table, column: str, row: int, file: Path) -> Optional[np.ndarray]:
+    """(K,) float64 of a cell that is a number (K = 1) or a list of numbers; holes in it are NaN; None for no cell."""
+    values = table.column(column)
+    is_number = pa.types.is_integer(values.type) or pa.types.is_floating(values.type)
+    if not is_number and not _is_list_of(values.type, pa.types.is_integer, pa.types.is_floating):
+        raise CFlowError(f"{file}: {column} must be numbers or lists of numbers, got {values.type}")
+    cell = values[row]
+    if not cell.is_valid:
+        return None
+    return np.array([cell.as_py()] if is_number else cell.values.to_numpy(zero_copy_only=False), dtype=np.float64)
+
+
+def matrix_of(values: Optional[np.ndarray], where: str) -> np.ndarray:
     """(4, 4) from 16 numbers, row by row."""
-    if values is None or len(values) != 16 or None in values:
-        raise CFlowError(f"{where} must be 16 numbers, row by row, got {values}")
-    return np.array(values, dtype=np.float64).reshape(4, 4)
+    if values is None or len(values) != 16:
+        raise CFlowError(
+            f"{where} must be 16 numbers, row by row, got {'nothing' if values is None else f'{len(values)}'}"
+        )
+    return values.reshape(4, 4)
+
+
+def _is_list_of(kind: pa.DataType, *checks: Callable[[pa.DataType], bool]) -> bool:
+    is_list = pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)
+    return bool(is_list and any(check(kind.value_type) for check in checks))
 
 
 def _image(values: Any, shape: Any, channels: int, file: Path) -> Optional[np.ndarray]:
     """(H, W, channels) image of a list cell; None where the cell is null or empty."""
-    size = shape.as_py()
-    if not values.is_valid or not size or len(values.values) == 0:
+    if not values.is_valid or not shape.is_valid or not len(values.values) or not len(shape.values):
         return None
-    flat = values.values.to_numpy(zero_copy_only=False)
-    if len(size) != 3 or size[2] != channels or flat.size != np.prod(size):
+    flat, size = values.values.to_numpy(zero_copy_only=False), shape.values[:4].to_pylist()
+    if len(size) != 3 or None in size or min(size) < 1 or size[2] != channels or flat.size != math.prod(size):
         raise CFlowError(f"{file}: a range image of shape (H, W, {channels}) was expected, got {size} for {flat.size}")
+    if values.values.null_count:
+        raise CFlowError(f"{file}: a range image has {values.values.null_count} empty pixels; copy it again")
     return flat.reshape(size)

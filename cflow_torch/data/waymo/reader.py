@@ -9,6 +9,7 @@ from typing import Any, Dict, List, Optional, Sequence, Tuple
 import numpy as np
 import pyarrow as pa
 
+from cflow_torch.data.arrow_file import shortened, texts
 from cflow_torch.data.boxes import Boxes, flow_from_boxes
 from cflow_torch.data.log import FlowLabels
 from cflow_torch.data.paths import Place, as_path, remote_errors
@@ -22,6 +23,8 @@ from cflow_torch.data.waymo.parquet import (
     TIME,
     TRACK,
     VEHICLE_POSE,
+    cell_of,
+    keys_of,
     matrix_of,
     numbers_of,
     read_columns,
@@ -220,7 +223,7 @@ class WaymoLog:
     def _row_numbers(self, tag: str) -> Dict[Row, int]:
         """(time, laser) -> number of the row in the file."""
         table = self._keys(tag, (TIME, LASER))
-        keys = list(zip(*(numbers_of(table, name, self._component(tag)).tolist() for name in (TIME, LASER))))
+        keys = list(zip(*(keys_of(table, name, self._component(tag)) for name in (TIME, LASER))))
         rows = {key: number for number, key in enumerate(keys)}
         if len(rows) < len(keys):
             raise CFlowError(f"{self._component(tag)} has two rows of the same frame and laser; copy it again")
@@ -230,10 +233,11 @@ class WaymoLog:
         """Columns of a component, after checking that the file is of this segment."""
         file = self._component(tag)
         table = read_columns(file, (SEGMENT, *columns))
-        strangers = sorted({str(name) for name in table.column(SEGMENT).unique().to_pylist()} - {self.log_id})
+        strangers = sorted(set(texts(table.column(SEGMENT), file)) - {self.log_id})
         if strangers:
             raise CFlowError(
-                f"{file} holds segment {strangers[0]}; a file is named after its segment: rename it, or copy it again"
+                f"{file} holds segment {shortened(strangers[0])}; a file is named after its segment: rename it, or "
+                f"copy it again"
             )
         return table
 
@@ -241,23 +245,24 @@ class WaymoLog:
         file = self._component("lidar_calibration")
         names = ("extrinsic.transform", *(f"beam_inclination.{name}" for name in ("values", "min", "max")))
         table = self._keys("lidar_calibration", (LASER, *(CALIBRATION + name for name in names)))
-        lasers = numbers_of(table, LASER, file).tolist()
+        lasers = keys_of(table, LASER, file)
         missing = [laser for laser in self._lasers if laser not in lasers]
         if missing:
             raise CFlowError(f"{file} has lasers {lasers}; lasers {missing} are missing, copy it again")
         calibration = {}
         for laser in self._lasers:
-            transform, values, low, high = (
-                table.column(CALIBRATION + name)[lasers.index(laser)].as_py() for name in names
-            )
+            row = lasers.index(laser)
+            transform, values, low, high = (cell_of(table, CALIBRATION + name, row, file) for name in names)
             where = f"{file}: extrinsic of laser {laser}"
-            if not values and (low is None or high is None):
+            if values is not None and not len(values):
+                values = None
+            if values is None and (low is None or high is None):
                 raise CFlowError(f"{file}: laser {laser} has neither beam inclinations nor their limits; copy it again")
             calibration[laser] = LaserCalibration(
                 rigid_transform(matrix_of(transform, where), where),
-                np.array(values, dtype=np.float64) if values else None,
-                0.0 if low is None else float(low),
-                0.0 if high is None else float(high),
+                values,
+                0.0 if low is None else float(low[0]),
+                0.0 if high is None else float(high[0]),
             )
         return calibration
 
@@ -265,14 +270,14 @@ class WaymoLog:
         """Frame time -> (4, 4) float64 `T_world_ego`."""
         file = self._component("vehicle_pose")
         table = self._keys("vehicle_pose", (TIME, VEHICLE_POSE))
-        row_of = {time: row for row, time in enumerate(numbers_of(table, TIME, file).tolist())}
+        row_of = {time: row for row, time in enumerate(keys_of(table, TIME, file))}
         missing = [time for time in times if time not in row_of]
         if missing:
             raise CFlowError(f"{file} has no pose for frame {missing[0]} ({len(missing)} missing); copy it again")
         poses = {}
         for time in times:
             where = f"{file}: the pose of frame {time}"
-            poses[time] = rigid_transform(matrix_of(table.column(VEHICLE_POSE)[row_of[time]].as_py(), where), where)
+            poses[time] = rigid_transform(matrix_of(cell_of(table, VEHICLE_POSE, row_of[time], file), where), where)
         return poses
 
     def _read_boxes(self) -> Dict[int, Boxes]:
@@ -284,15 +289,15 @@ class WaymoLog:
         numbers = tuple(f"{BOX}box.{name}" for name in ("size.x", "size.y", "size.z", "heading"))
         centre = tuple(f"{BOX}box.center.{axis}" for axis in "xyz")
         table = self._keys("lidar_box", (TIME, TRACK, f"{BOX}type", *numbers, *centre))
-        times, kinds = (numbers_of(table, name, file).tolist() for name in (TIME, f"{BOX}type"))
+        times, kinds = (keys_of(table, name, file) for name in (TIME, f"{BOX}type"))
         unknown = sorted(set(kinds) - set(BOX_CATEGORY))
         if unknown:
-            raise CFlowError(f"{file}: box types are {sorted(BOX_CATEGORY)}, got {unknown}")
+            raise CFlowError(f"{file}: box types are {sorted(BOX_CATEGORY)}, got {shortened(unknown)}")
         values = np.stack([numbers_of(table, name, file) for name in (*numbers, *centre)], axis=1).astype(np.float64)
         rows: Dict[int, List[Any]] = {time: [] for time in times}
-        for time, track, kind, value in zip(times, table.column(TRACK).to_pylist(), kinds, values):
+        for time, track, kind, value in zip(times, texts(table.column(TRACK), file), kinds, values):
             if BOX_CATEGORY[kind]:
-                rows[time].append((str(track), BOX_CATEGORY[kind], value))
+                rows[time].append((track, BOX_CATEGORY[kind], value))
         try:
             return {time: upright_boxes(of_frame) for time, of_frame in rows.items()}
         except CFlowError as error:
