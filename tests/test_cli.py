@@ -152,7 +152,7 @@ def test_an_output_that_cannot_be_made_is_named(
     pair = {"demo": ["pair=0"], "eval": [], "bench": quick}[command]
     assert run(command, *call, *pair) == 2
     error = capsys.readouterr().err
-    assert f"error: {tmp_path}/file: File exists; give places" in error
+    assert f"error: cannot write into {tmp_path}/file/below" in error and "give output=FOLDER" in error
     assert "Traceback" not in error
 
 

@@ -96,7 +96,9 @@ def test_many_batches_of_the_same_bytes(tmp_path: Path) -> None:
         data[block : block + 24] = whole[blocks[0] : blocks[0] + 24]
     (tmp_path / "a.feather").write_bytes(data)
     assert read_cloud(tmp_path / "a.feather").shape == (1000, 3)  # no more than there is room for
-    large = bytearray(feather_bytes({axis: np.zeros(1000) for axis in "xyz"}, compression="uncompressed", chunksize=500))
+    large = bytearray(
+        feather_bytes({axis: np.zeros(1000) for axis in "xyz"}, compression="uncompressed", chunksize=500)
+    )
     start = len(large) - 10 - struct.unpack_from("<i", large, len(large) - 10)[0]
     footer = feather_claims._Table(bytes(large), start + struct.unpack_from("<I", large, start)[0])
     extra = bytes(large[next(footer.entries(3, 24)) :][:24]) * 2

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
-from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -22,20 +21,23 @@ from cflow_torch.bench.table import format_bench, format_targets
 from cflow_torch.bench.target_row import FULL
 from cflow_torch.bench.targets import measure_targets
 from cflow_torch.cli.run import finish, make_model, number, open_logs
+from cflow_torch.data.atomic import ready_folder
 from cflow_torch.data.log import window
+from cflow_torch.data.paths import as_path
 from cflow_torch.data.records import write_text
 from cflow_torch.types import CFlowError
 
 
 def task(cfg: DictConfig) -> None:
     """Run `cflow bench`."""
-    output = Path(cfg.output)
+    output = as_path(cfg.output)
     repeats, num_threads = number(cfg, "repeats"), number(cfg, "num_threads", or_null=True)
     if not OmegaConf.is_list(cfg.batches) or not all(type(batch) is int and batch > 0 for batch in cfg.batches):
         raise CFlowError(f"batches={cfg.batches}: give a list of whole numbers of at least 1, as in 'batches=[1,8]'")
     model = make_model(cfg)
     logs, failures = open_logs(cfg)
     finish(failures)
+    ready_folder(output)
     config, log = model.config, logs[0]
     history, scales = FULL.num_history, FULL.pixel_sizes
     longest = len(log.timestamps) - 2

@@ -16,6 +16,7 @@ from omegaconf import DictConfig
 from cflow_torch.cli.eval import report
 from cflow_torch.cli.pairs import Pairs
 from cflow_torch.cli.run import finish, for_each_pair, make_model, number, open_logs, output_folder
+from cflow_torch.data.atomic import ready_folder, remove_stale
 from cflow_torch.data.flow_file import write_flow
 from cflow_torch.data.log import Log
 from cflow_torch.data.names import folder_in
@@ -36,6 +37,7 @@ def task(cfg: DictConfig) -> None:
     if logs and not 0 <= pair < num_pairs:
         raise CFlowError(f"pair={pair}: the drive has {num_pairs} pairs, give 0 ... {num_pairs - 1}")
 
+    ready_folder(output)
     is_drawn = False
 
     def keep(log: Log, index: int, sweeps: Window, result: FlowResult) -> None:
@@ -55,6 +57,8 @@ def task(cfg: DictConfig) -> None:
             save_picture(figure, output / "flow.png")
             is_drawn = True
 
+    for log in logs:
+        remove_stale(output / log.log_id)
     failures += for_each_pair(logs, model, keep, Pairs().of)
     report(cfg, metrics, output)
     if is_drawn:

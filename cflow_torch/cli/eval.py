@@ -29,6 +29,7 @@ from cflow_torch.cli.run import (
     open_logs,
     output_folder,
 )
+from cflow_torch.data.atomic import ready_folder
 from cflow_torch.data.log import Log
 from cflow_torch.evaluation.frame import EvalFrame
 from cflow_torch.evaluation.metrics import SceneFlowMetrics
@@ -49,6 +50,7 @@ def task(cfg: DictConfig) -> float:
     model = StopWatch(make_model(cfg))
     logs, failures = open_logs(cfg)
     identity = DataIdentity(cfg, logs)
+    ready_folder(output)
 
     def score(log: Log, index: int, sweeps: Window, result: FlowResult) -> None:
         labels = log.labels(index)

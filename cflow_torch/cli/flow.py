@@ -94,7 +94,8 @@ def task(cfg: DictConfig) -> None:
         failures = _into_scenes(cfg.result_name, sources.logs, output)
         missing += "".join(f"\n  {scene}: {message}" for scene, message in failures)
         status = status or int(bool(failures))
-    print(f"{format_report(report)}\nflow files in {output}, report in {report_file(job.output, shard)}")
+    where = f"report in {report_file(job.output, shard)}" if report["is_written"] else "no report"
+    print(f"{format_report(report)}\nflow files in {output}, {where}")
     if status:
         print(f"missing:\n{missing}", file=sys.stderr)
         if is_sweep():  # Hydra lets the other jobs run before it ends with status 1

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import select
 import sys
+from contextlib import suppress
 from difflib import get_close_matches
 from importlib import import_module
 from typing import Any, List, Optional
@@ -55,8 +57,10 @@ def main(argv: Optional[List[str]] = None) -> None:
             _run(list(sys.argv[1:] if argv is None else argv))
         finally:
             sys.stdout.flush()
-    except BrokenPipeError:
-        _end_unread()
+    except OSError as error:
+        if error.filename is not None or error.errno is None:
+            raise
+        _end_refused(error)
     except KeyboardInterrupt:
         print("stopped by Ctrl-C", file=sys.stderr)
         raise SystemExit(128 + 2) from None  # as if SIGINT had ended it
@@ -111,11 +115,11 @@ def _run_with_settings(command: str, run: Any, rest: List[str]) -> None:
         except OmegaConfBaseException as error:  # a setting that refers to none, or was taken out
             print(f"error: {wrong_call.explain(error, command)}", file=sys.stderr)
             raise SystemExit(2) from None
-        except BrokenPipeError:
-            _end_unread()
         except OSError as error:
-            if given or error.filename is None:
+            if given or error.errno is None:
                 raise
+            if error.filename is None:
+                _end_refused(error)
             print(f"error: {_place(error)}", file=sys.stderr)
             raise SystemExit(2) from None
 
@@ -128,8 +132,6 @@ def _run_with_settings(command: str, run: Any, rest: List[str]) -> None:
     except SystemExit as stop:
         if stop.code == 2 and _is_of_parser(stop):  # an option that it does not know
             print(f"`cflow {command} --help` has examples", file=sys.stderr)
-        raise
-    except BrokenPipeError:
         raise
     except Exception as error:
         if given:
@@ -169,10 +171,33 @@ def _is_of_parser(stop: BaseException) -> bool:
     return trace is not None and trace.tb_frame.f_globals.get("__name__") == "argparse"
 
 
-def _end_unread() -> None:
-    """Nobody reads what is printed any more (`cflow info | head`): end as other commands do, without a word."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left is flushed at the end
-    raise SystemExit(128 + 13)  # as if SIGPIPE had ended it
+def _end_refused(error: OSError) -> None:
+    """End after the system refused something that has no name: mostly to print, on a full disk, to a reader who left.
+
+    What cannot be printed is given up: else it would be tried once more.
+    """
+    status = 1
+    if isinstance(error, BrokenPipeError) and _is_unread():
+        status = 128 + 13  # as if SIGPIPE had ended it
+    else:
+        with suppress(OSError):
+            print(f"error: {error}: no file is named, so it is mostly what this command prints to", file=sys.stderr)
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    raise SystemExit(status) from None
+
+
+def _is_unread() -> bool:
+    """Whether nobody reads what is printed any more (`cflow info | head`): then commands end without a word."""
+    try:
+        poll = select.poll()
+        for stream in (sys.stdout, sys.stderr):
+            poll.register(stream.fileno(), 0)
+        return any(event & (select.POLLERR | select.POLLHUP) for _, event in poll.poll(0))
+    except (AttributeError, OSError, ValueError):  # no such call on this system, no such file
+        return True
 
 
 if __name__ == "__main__":

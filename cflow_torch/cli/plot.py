@@ -29,6 +29,7 @@ from tqdm import tqdm
 
 from cflow_torch.cli.pairs import chosen_pairs
 from cflow_torch.cli.run import find_logs, make_model, number, output_folder
+from cflow_torch.data.atomic import ready_folder
 from cflow_torch.data.catalog import open_log
 from cflow_torch.data.log import Log, RecentSweeps, window
 from cflow_torch.data.log_check import check_log
@@ -61,8 +62,9 @@ def task(cfg: DictConfig) -> None:
         pair = number(cfg, "pair")
         log = find_log(cfg)
         sweeps = _window(log, pair, model.config.num_history)
+        ready_folder(output)
         figure = PICTURES[cfg.picture](cfg, model, log, sweeps)
-        path = save_picture(figure, _folder(output) / f"{cfg.picture}.png")
+        path = save_picture(figure, output / f"{cfg.picture}.png")
         print(f"log {log.log_id}, pair {pair}, sweep {log.timestamps[pair]}")
     print(f"picture: {path}")
 
@@ -114,14 +116,6 @@ def _window(log: Log, pair: int, num_history: int) -> Window:
         return window(log, pair, num_history)
     except OSError as error:
         raise CFlowError(f"cannot read pair {pair} of {log.log_id}: {error}") from error
-
-
-def _folder(output: Path) -> Path:
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise CFlowError(f"cannot make the folder {output} ({error}): give output=FOLDER") from error
-    return output
 
 
 def _title(log: Log, index: int) -> str:
@@ -188,6 +182,7 @@ def _animate(cfg: DictConfig, model: CoarseToFine, output: Path) -> Path:
     pairs = chosen.of(log)
     if not pairs:
         raise CFlowError(f"first={chosen.first}: log {log.log_id} has pairs 0 to {len(log.timestamps) - 2}")
+    ready_folder(output)
     frames: List[Frame] = []
     for pair in counted(pairs):
         sweeps = _window(recent, pair, model.config.num_history)
@@ -204,6 +199,6 @@ def _animate(cfg: DictConfig, model: CoarseToFine, output: Path) -> Path:
         width=width,
     )
     print(f"log {log.log_id}, {len(pairs)} pairs from {pairs[0]} to {pairs[-1]}")
-    path = _folder(output) / f"animation.{cfg.format}"
+    path = output / f"animation.{cfg.format}"
     drawn = tqdm(figures, total=len(frames), unit="picture", disable=None)
     return save_animation(drawn, path, frames_per_second=frames_per_second)

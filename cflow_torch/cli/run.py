@@ -15,7 +15,6 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
-from tqdm import tqdm
 
 from cflow_torch import __version__, estimate
 from cflow_torch.config import Config
@@ -25,7 +24,7 @@ from cflow_torch.data.log import Log, RecentSweeps, window
 from cflow_torch.data.names import is_safe_name
 from cflow_torch.data.paths import as_path
 from cflow_torch.data.records import write_text
-from cflow_torch.fleet.progress import frames
+from cflow_torch.fleet.progress import frames, say
 from cflow_torch.pyramid import CoarseToFine
 from cflow_torch.stopwatch import FlowModel
 from cflow_torch.types import CFlowError, FlowResult, Window
@@ -171,7 +170,7 @@ def open_logs(cfg: DictConfig) -> Tuple[List[Log], Failures]:
             logs.append(open_log(sources.reader, source, **sources.settings))
         except (CFlowError, OSError) as error:
             failures.append((source.name, str(error)))
-            tqdm.write(f"failed: {source.name}: {error}", file=sys.stderr)
+            say(f"failed: {source.name}: {error}")
     return logs, failures
 
 
@@ -198,7 +197,7 @@ def for_each_pair(logs: Sequence[Log], model: FlowModel, use: UseResult, pairs: 
         except (CFlowError, OSError) as error:
             frame = f"{log.log_id}/{log.timestamps[index]}"
             failures.append((frame, str(error)))
-            tqdm.write(f"failed: {frame}: {error}", file=sys.stderr)
+            say(f"failed: {frame}: {error}")
     return failures
 
 

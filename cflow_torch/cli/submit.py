@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any, Dict, List, Mapping, Optional, Sequence, Tuple
 
 from omegaconf import DictConfig, OmegaConf
-from tqdm import tqdm
 
 from cflow_torch.cli.run import (
     Failures,
@@ -31,10 +30,12 @@ from cflow_torch.cli.run import (
     write_config,
 )
 from cflow_torch.cli.settings_file import plain_yaml, read_settings
+from cflow_torch.data.atomic import ready_folder
 from cflow_torch.data.log import Log, window
 from cflow_torch.data.names import folder_in
 from cflow_torch.data.records import flat
 from cflow_torch.fleet.progress import frames as counted
+from cflow_torch.fleet.progress import say
 from cflow_torch.submission.archive import pack
 from cflow_torch.submission.check import check_submission
 from cflow_torch.submission.encode import RESIDUAL_AXES, Rounding, encode
@@ -94,6 +95,7 @@ def _claim(cfg: DictConfig, output: Path, folder: Path, file: Path) -> None:
         CFlowError: it holds files of other settings.
     """
     record = output / "config.yaml"
+    ready_folder(output)
     folder_in(output, folder.name, "the folder")
     if record.exists() and not cfg.overwrite:
         now, before = plain_yaml(OmegaConf.to_yaml(_settings(cfg))), read_settings(record)
@@ -165,7 +167,7 @@ def _write(
             rounding.add(lost)
         except (CFlowError, OSError) as error:
             failures.append((frame.name, str(error)))
-            tqdm.write(f"failed: {frame.name}: {error}", file=sys.stderr)
+            say(f"failed: {frame.name}: {error}")
     print(f"frames written: {len(plan) - kept - len(failures)}, already there: {kept}")
     if rounding.num_points:
         print(f"float16 rounding of the new ones: {rounding}")

@@ -21,15 +21,15 @@ from pathlib import Path
 from typing import Any, Callable, Iterator, List, Tuple
 
 from omegaconf import DictConfig
-from tqdm import tqdm
 
 from cflow_torch.cli.pairs import chosen_pairs
 from cflow_torch.cli.run import Failures, finish, make_model, number, open_logs, output_folder, write_config
+from cflow_torch.data.atomic import ready_folder
 from cflow_torch.data.flow_file import read_flow
 from cflow_torch.data.log import Log, RecentSweeps, window
 from cflow_torch.data.paths import as_path, is_remote
 from cflow_torch.fleet.manifest import frame_file
-from cflow_torch.fleet.progress import Progress
+from cflow_torch.fleet.progress import Progress, say
 from cflow_torch.types import CFlowError, FlowResult
 from cflow_torch.viz.recording import load_rerun, record_log
 
@@ -48,7 +48,7 @@ def task(cfg: DictConfig) -> None:
         raise CFlowError(f"max_flow={max_flow}: give a positive length in metres per sweep")
     flow, history = _flow(cfg)
     logs, failures = open_logs(cfg)
-    write_config(cfg, output)
+    write_config(cfg, ready_folder(output))
     files: List[Path] = []
     for log in logs:
         pairs = chosen.of(log)
@@ -105,7 +105,7 @@ def _results(
             except (CFlowError, OSError) as error:
                 frame = f"{log.log_id}/{log.timestamps[index]}"
                 failures.append((frame, str(error)))
-                tqdm.write(f"failed: {frame}: {error}", file=sys.stderr)
+                say(f"failed: {frame}: {error}")
             else:
                 yield index, result
             progress.update()

@@ -64,9 +64,11 @@ def atomic_name(path: Path) -> Iterator[Path]:
     try:
         yield temporary
         os.replace(temporary, path)
-    except BaseException:
+    except BaseException as error:
         with suppress(FileNotFoundError):
             os.unlink(temporary)
+        if isinstance(error, OSError) and error.errno is not None and error.filename is None:
+            error.filename = str(path)  # "no space left" of what?
         raise
     sync_folder(path.parent)
 
@@ -181,6 +183,31 @@ def _remove(path: Path, target: Path) -> None:
     if (path / "old").is_dir() and not target.exists():
         os.replace(path / "old", target)
     shutil.rmtree(path)
+
+
+def ready_folder(folder: Place) -> Path:
+    """A folder to write into after long work: tried now, and rid of what killed writers have left there.
+
+    Args:
+        folder: made if absent.
+
+    Returns:
+        Its path.
+
+    Raises:
+        CFlowError: it cannot be made, or not be written to.
+    """
+    folder = as_path(folder)
+    try:
+        remove_stale(folder)
+        trial = folder / temporary_name("trial")
+        with atomic_file(trial) as file:
+            file.write(b"\0")
+        with suppress(OSError), remote_errors(folder):  # some stores let nobody delete
+            trial.unlink()
+    except OSError as error:
+        raise CFlowError(f"cannot write into {folder} ({error}): make room there, or give output=FOLDER") from error
+    return folder
 
 
 def make_folder(folder: Path) -> None:

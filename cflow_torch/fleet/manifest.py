@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import re
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Dict, List, Mapping, Optional, Sequence, Set
+from typing import Any, Dict, Iterable, List, Mapping, Optional, Sequence, Set
 
 import numpy as np
 import torch
@@ -25,12 +26,13 @@ from cflow_torch.data.flow_file import CONTENTS
 from cflow_torch.data.json_file import read_json
 from cflow_torch.data.log import Log
 from cflow_torch.data.names import leaves
-from cflow_torch.data.paths import forget_listings, remote_errors
+from cflow_torch.data.paths import forget_listings, is_remote, remote_errors
 from cflow_torch.data.records import changes, strict, write_text
 from cflow_torch.types import CFlowError, as_numpy
 
 MANIFEST = "manifest.json"
 _FORMAT = 1
+_ENDING = b"ARROW1"  # of every feather file
 _OURS = re.compile(r"[0-9]+\.feather|manifest\.json|\..+\.tmp")
 _REMEDY = "give output=FOLDER, or overwrite=true"
 
@@ -88,18 +90,22 @@ def find_conflict(output: Path, identity: Mapping[str, Any], resume: bool) -> Op
     # In this order: a shard that begins beside this one writes the manifest first.
     has_config, before = (output / "config.yaml").exists(), _read(output / MANIFEST)
     if before is None:
-        foreign = _foreign_log(output, identity["hash"])
-        return f" ({foreign} is of it)" if foreign else "" if has_config else None
+        runs = _runs(output)  # an overwriting run was killed when it had removed the manifest, or the manifest is lost
+        foreign = next((log_id for log_id, run in runs.items() if run != identity["hash"]), None)
+        if foreign is not None:
+            return f" ({foreign} is of it)"
+        return f" (its {MANIFEST} is gone)" if has_config and not runs else None
     changed = changes(before, identity, ["hash"])
     if changed:
         return f" ({changed})"
     return None if resume else " with the same settings (resume=true goes on with it)"
 
 
-def _foreign_log(output: Path, run: str) -> Optional[str]:
-    """A log's folder that another run made: `overwrite` was killed when it had removed the run's own manifest."""
+def _runs(output: Path) -> Dict[str, Any]:
+    """Folder of a log -> hash of the run that made it."""
     folders = [folder for folder in sorted(output.iterdir()) if folder.is_dir()] if output.is_dir() else []
-    return next((f.name for f in folders if (_read(f / MANIFEST) or {"run": run}).get("run", run) != run), None)
+    manifests = {folder.name: _read(folder / MANIFEST) for folder in folders}
+    return {name: manifest["run"] for name, manifest in manifests.items() if manifest and "run" in manifest}
 
 
 def claim_log(folder: Path, log: Log, run: str) -> None:
@@ -133,16 +139,57 @@ def describe_log(log: Log, run: str) -> Dict[str, Any]:
 
 
 def complete_frames(folder: Path) -> Set[int]:
-    """Time stamps whose flow is in a log's folder, whoever put it there."""
+    """Time stamps whose flow is in a log's folder, whichever worker put it there.
+
+    None where the log's manifest is gone, for nobody knows then what they were made from; and none whose file does not
+    end as it was written (a power cut, a copy that broke off).
+
+    Cost: on this machine, the last bytes of every file are read.
+    """
     forget_listings(folder)
     with remote_errors(folder):
         names = [file.name for file in folder.iterdir()] if folder.is_dir() else []
-    return {int(name[: -len(".feather")]) for name in names if re.fullmatch(r"[0-9]{1,20}\.feather", name)}
+    if MANIFEST not in names:
+        return set()
+    frames = [name for name in names if re.fullmatch(r"[0-9]{1,20}\.feather", name)]
+    return {int(name[: -len(".feather")]) for name in frames if is_remote(folder) or _is_whole(folder / name)}
+
+
+def check_claimed(folder: Path) -> None:
+    """Notice that a log's folder was removed in the middle of a run: a new one would hold frames of unknown origin.
+
+    Raises:
+        CFlowError: its manifest is gone. In an object store nobody looks.
+    """
+    if not is_remote(folder) and not (folder / MANIFEST).is_file():
+        raise CFlowError(f"{folder} was removed, or its {MANIFEST}, while a run wrote into it: run it again")
+
+
+def removed_logs(output: Path, log_ids: Iterable[str]) -> List[str]:
+    """Those of the logs whose folders are gone; all of them if the run's own manifest is gone.
+
+    Raises:
+        OSError: the output cannot be listed.
+
+    Cost: one listing.
+    """
+    forget_listings(output)
+    with remote_errors(output):
+        names = {path.name for path in output.iterdir()} if output.is_dir() else set()
+    return [log_id for log_id in log_ids if log_id not in names or MANIFEST not in names]
 
 
 def frame_file(folder: Path, timestamp: int) -> Path:
     """Where the flow of one frame lies."""
     return folder / f"{timestamp}.feather"
+
+
+def _is_whole(file: Path) -> bool:
+    """Whether a feather file ends as such files do."""
+    with suppress(OSError), open(file, "rb") as opened:
+        opened.seek(-len(_ENDING), os.SEEK_END)
+        return opened.read() == _ENDING
+    return False
 
 
 def _same_log(before: Mapping[str, Any], now: Mapping[str, Any]) -> bool:

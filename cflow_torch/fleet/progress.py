@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
+from contextlib import contextmanager, suppress
 from typing import Any, Callable, Iterable, Iterator, Optional, Sized
 
 from tqdm import tqdm
@@ -38,14 +40,16 @@ class Progress:
         if self.total is None:
             self.total = self.done
         self._bar.total = self.total
-        self._bar.refresh()
-        self._bar.close()
+        with _unheard():
+            self._bar.refresh()
+            self._bar.close()
 
     def update(self, frames: int = 1) -> None:
         """So many frames more are done."""
         self.done += frames
         self._bar.total = self.total
-        self._bar.update(frames)
+        with _unheard():
+            self._bar.update(frames)
         if self._bar.disable and self._clock() - self._said_at >= EVERY:
             self._say()
 
@@ -59,7 +63,24 @@ class Progress:
             if rate > 0:
                 left = f", {tqdm.format_interval(max(0, self.total - self.done) / rate)} left"
         prefix = f"{self._name}: " if self._name else ""
-        print(f"{prefix}{self.done:,}{of} frames, {rate:.2f} frames/s{left}", file=sys.stderr, flush=True)
+        say(f"{prefix}{self.done:,}{of} frames, {rate:.2f} frames/s{left}")
+
+
+def say(text: str) -> None:
+    """A line on stderr, above the bar; the work goes on even if nobody hears it."""
+    with _unheard():
+        tqdm.write(text, file=sys.stderr)
+        sys.stderr.flush()
+
+
+@contextmanager
+def _unheard() -> Iterator[None]:
+    """What is said on the way may be lost: a terminal that was closed, a full disk, a `tee` that Ctrl-C ended."""
+    try:
+        yield
+    except OSError:
+        with suppress(OSError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())  # else the rest is tried again at the end
 
 
 def frames(items: Iterable[Any], name: str = "") -> Iterator[Any]:

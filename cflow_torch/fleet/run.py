@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import signal
-import sys
 import time
-from typing import Any, Dict, Iterator, Sequence
-
-from tqdm import tqdm
+from typing import Any, Dict, Iterator, List, Sequence, Tuple
 
 from cflow_torch.data.atomic import remove_stale
 from cflow_torch.data.names import folder_in
@@ -16,7 +13,8 @@ from cflow_torch.data.records import write_text
 from cflow_torch.fleet.job import Event, Failed, Job, Opened, split
 from cflow_torch.fleet.local import run_local
 from cflow_torch.fleet.machine import Layout
-from cflow_torch.fleet.progress import Progress
+from cflow_torch.fleet.manifest import removed_logs
+from cflow_torch.fleet.progress import Progress, say
 from cflow_torch.fleet.report import make_report, to_json
 from cflow_torch.fleet.shard import Shard
 from cflow_torch.fleet.stop import StopSignal
@@ -47,8 +45,8 @@ def run_fleet(
         **engine_settings: of the engine.
 
     Returns:
-        What `make_report` returns, which is also in OUTPUT/reports/<shard>.json. "exit_status" is 0 if every frame of
-        the shard is on disk, 1 if not, 130 or 143 if Ctrl-C or SIGTERM came first.
+        What `make_report` returns, which is also in OUTPUT/reports/<shard>.json if "is_written". "exit_status" is 0 if
+        every frame of the shard is on disk, 1 if not, 130, 143 or 129 if Ctrl-C, SIGTERM or SIGHUP came first.
     """
     shares = shard.units(sources)
     units = split(shares, len(layout.devices))
@@ -63,18 +61,20 @@ def run_fleet(
         except CFlowError as error:  # no worker is left
             if not tally.total:
                 raise
-            print(f"ended early: {error}", file=sys.stderr)
+            say(f"ended early: {error}")
+        tally.failures += _removed(job.output, tally)
         seconds = time.perf_counter() - start
         name = signal.Signals(stop.received).name if stop.received and not tally.is_complete else ""
         report = make_report(tally, seconds, layout, shard, engine, name, about)
+        report["is_written"] = True
         report["exit_status"] = stop.exit_status if name else 0 if tally.is_complete else 1
         try:
             file = report_file(job.output, shard)
             remove_stale(file.parent)
             write_text(file, to_json(report))
         except OSError as error:
-            print(f"the report could not be written: {error}", file=sys.stderr)
-            report["exit_status"] = report["exit_status"] or 1
+            say(f"the report could not be written: {error}")
+            report["exit_status"], report["is_written"] = report["exit_status"] or 1, False
     return report
 
 
@@ -93,6 +93,17 @@ def _engine(name: str) -> Any:
     raise CFlowError(f"engine={name!r}: give one of {', '.join(ENGINES)}")
 
 
+def _removed(output: str, tally: Tally) -> List[Tuple[str, str]]:
+    """(log, message) of what somebody removed while the run was at work."""
+    try:
+        gone = removed_logs(as_path(output), sorted(tally.log_ids))
+    except OSError as error:
+        return [(output, f"cannot be looked at any more ({error})")]
+    return [
+        (log_id, f"its folder in {output} was removed while the run wrote into it: run it again") for log_id in gone
+    ]
+
+
 def _follow(events: Iterator[Event], tally: Tally, num_units: int) -> None:
     """Count events in, and show how far it is: the total grows as logs are opened."""
     num_opened = num_frames = 0
@@ -103,6 +114,6 @@ def _follow(events: Iterator[Event], tally: Tally, num_units: int) -> None:
                 num_opened, num_frames = num_opened + 1, num_frames + event.total
                 progress.total = round(num_frames / num_opened * max(num_units, num_opened))
             if isinstance(event, Failed):
-                tqdm.write(f"failed: {event.name}: {event.message}", file=sys.stderr)
+                say(f"failed: {event.name}: {event.message}")
             progress.update(settled)
         progress.total = progress.done

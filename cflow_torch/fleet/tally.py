@@ -22,6 +22,7 @@ class Tally:
         self.num_failed_frames = 0
         self.seconds: Dict[str, float] = {}  # by stage, of all workers together
         self._open: Dict[int, Tuple[str, Set[int]]] = {}  # unit -> log id, time stamps neither on disk nor failed
+        self.log_ids: Set[str] = set()  # of which frames are on disk
         self._unopened = {unit.number for unit in units}
 
     @property
@@ -47,6 +48,7 @@ class Tally:
             for stage, seconds in event.seconds.items():
                 self.seconds[stage] = self.seconds.get(stage, 0.0) + seconds
             self.computed += 1
+            self.log_ids.add(self._open[event.unit][0])
             return self._settle(event.unit, {event.timestamp})
         if isinstance(event, Failed):
             self.failures.append((event.name, event.message))
@@ -63,6 +65,8 @@ class Tally:
             return self._settle(event.unit, found)
         self._unopened.discard(event.unit)
         self._open[event.unit] = (event.log_id, todo)
+        if len(todo) < event.total:
+            self.log_ids.add(event.log_id)
         self.total += event.total
         self.complete_before += event.total - len(todo)
         return event.total - len(todo)

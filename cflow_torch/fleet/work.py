@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +20,8 @@ from cflow_torch.data.names import folder_in
 from cflow_torch.data.paths import as_path
 from cflow_torch.estimate import make_model
 from cflow_torch.fleet.job import Begun, Done, Event, Failed, Job, Opened, Unit
-from cflow_torch.fleet.manifest import claim_log, complete_frames, frame_file
+from cflow_torch.fleet.line import Line, Outcome
+from cflow_torch.fleet.manifest import check_claimed, claim_log, complete_frames, frame_file
 from cflow_torch.stopwatch import FlowModel, stage_clock
 from cflow_torch.types import CFlowError, FlowResult, Window
 
@@ -117,9 +117,9 @@ class Worker:
         """Frames through the reading thread, this thread and the writing thread."""
         ahead = 0 if careful else self._ahead
         batches = iter(_batches(todo, self._job.batch, careful))
-        reading: Deque[Future] = deque()
-        writing: Deque[Future] = deque()
-        with ThreadPoolExecutor(1) as reader, ThreadPoolExecutor(1) as writer:
+        reading: Deque[Outcome] = deque()
+        writing: Deque[Outcome] = deque()
+        with Line() as reader, Line() as writer:
             while True:
                 while len(reading) <= ahead and not stop():
                     batch = next(batches, None)
@@ -180,8 +180,13 @@ class Worker:
     def _write(self, folder: Path, frame: _Frame) -> _Frame:
         if isinstance(frame.content, FlowResult):
             result, frame.content = frame.content, None
+            file = frame_file(folder, frame.timestamp)
             with _stage(frame, "write"):
-                write_flow(frame_file(folder, frame.timestamp), result, self._job.contents)
+                check_claimed(folder)
+                try:
+                    write_flow(file, result, self._job.contents)
+                except FileNotFoundError:  # a run that begins beside this one takes our file for a dead one's
+                    write_flow(file, result, self._job.contents)
         return frame
 
 
