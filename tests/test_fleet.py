@@ -373,7 +373,7 @@ def deadly_serve(*arguments: Any) -> None:
     REAL_SERVE(*arguments)
 
 
-REAL_SERVE = local._serve
+REAL_SERVE = local.serve
 LAYOUT = Layout(("cpu", "cpu"), 1, 2)
 
 
@@ -383,7 +383,7 @@ def test_a_killed_worker_is_replaced(
 ) -> None:
     sources = sorted(fleet.iterdir())
     deadly = AV2Log(sources[1]).timestamps[4]  # the other logs end before
-    monkeypatch.setattr(local, "_serve", deadly_serve)
+    monkeypatch.setattr(local, "serve", deadly_serve)
     monkeypatch.setenv(DEADLY, f"{tmp_path / 'killed' if once else ''}:{deadly}")
     units = split([Unit(0, source) for source in sources], 1)
     tally = Tally(units)
@@ -409,7 +409,7 @@ def test_a_worker_that_hangs_is_replaced(
 ) -> None:
     sources = sorted(fleet.iterdir())
     deadly = AV2Log(sources[1]).timestamps[4]
-    monkeypatch.setattr(local, "_serve", deadly_serve)
+    monkeypatch.setattr(local, "serve", deadly_serve)
     monkeypatch.setattr(local, "_GRACE_S", 3.0)
     monkeypatch.setenv(DEADLY, f"{tmp_path / 'hung'}:{deadly}")
     units = split([Unit(0, source) for source in sources], 1)
@@ -659,7 +659,7 @@ def test_a_killed_worker_of_an_overwriting_run_repeats_nothing(
 ) -> None:
     source = sorted(fleet.iterdir())[1]
     stamps = AV2Log(source).timestamps
-    monkeypatch.setattr(local, "_serve", deadly_serve)
+    monkeypatch.setattr(local, "serve", deadly_serve)
     monkeypatch.setenv(DEADLY, f"{tmp_path / 'killed'}:{stamps[4]}")
     units, done = split([Unit(0, source)], 1), []
     tally = Tally(units)
@@ -672,7 +672,7 @@ def test_a_killed_worker_of_an_overwriting_run_repeats_nothing(
 def test_a_worker_that_cannot_begin_leaves_the_work_to_the_others(
     fleet: Path, single: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
-    monkeypatch.setattr(local, "_serve", hard_serve)
+    monkeypatch.setattr(local, "serve", hard_serve)
     units = split([Unit(0, source) for source in sorted(fleet.iterdir())], 1)
     tally = Tally(units)
     for event in run_local(job_for(tmp_path), units, Layout(("gone", "cpu"), 1, 2), lambda: False):
@@ -686,7 +686,7 @@ def test_nobody_is_hired_to_stop(fleet: Path, tmp_path: Path, monkeypatch: pytes
     hired: List[str] = []
     hire = local._Crew._hire
     monkeypatch.setattr(local._Crew, "_hire", lambda self, device: (hired.append(device), hire(self, device))[1])
-    monkeypatch.setattr(local, "_serve", slow_serve)
+    monkeypatch.setattr(local, "serve", slow_serve)
     units = split([Unit(0, sorted(fleet.iterdir())[1]), Unit(1, sorted(fleet.iterdir())[2])], 1)
     done: Set[int] = set()
     for event in run_local(job_for(tmp_path, batch=1), units, LAYOUT, lambda: len(done) == 2):

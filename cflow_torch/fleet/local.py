@@ -4,28 +4,33 @@ from __future__ import annotations
 
 import multiprocessing
 import signal
-import sys
 import time
 from collections import deque
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
-from typing import Any, Callable, Deque, Dict, Iterator, List, Optional, Sequence, Set
+from typing import Any, Callable, Deque, Iterator, List, Optional, Sequence, Set
 
 import pyarrow
 import torch
 
+from cflow_torch.fleet.deaths import Deaths
 from cflow_torch.fleet.job import Begun, Event, Failed, Job, Opened, Unit
+from cflow_torch.fleet.local_worker import END, Ready, Refusal, serve, use_threads
 from cflow_torch.fleet.machine import Layout
-from cflow_torch.fleet.work import Worker, source_name
+from cflow_torch.fleet.progress import say
+from cflow_torch.fleet.work import Worker, describe, source_name
 from cflow_torch.types import CFlowError
 
 # A frame that two workers died on is given up; so is a unit that two died on before its first frame.
 _MOST_DEATHS = 2
+_MOST_STILLBORN = 3  # workers that died one after the other before they could begin: so would all others
 _POLL_S = 0.2  # how soon a signal is noticed
 _GRACE_S = 20.0  # that workers have for the frames in hand after a signal; schedulers kill after 30 s and more
-_END = "end"  # tells a worker that there is nothing more
 
+# Silence is counted look by look, each for so many seconds at most: this process may itself have been stopped for an
+# hour (Ctrl-Z, a lid that was shut).
+_LONGEST_LOOK_S = 5 * _POLL_S
 _LAST_BREATH_S = 10.0  # that a killed process may take to die
 
 
@@ -55,24 +60,22 @@ def run_local(
     if len(layout.devices) == 1:
         threads, cpus = torch.get_num_threads(), pyarrow.cpu_count()
         worker = Worker(job, layout.devices[0])
-        _use_threads(layout.threads, layout.threads)
+        use_threads(layout.threads, layout.threads)
         try:
             for unit in units:
                 if stop():
                     break
-                yield from worker.run(unit, stop)
+                try:
+                    yield from worker.run(unit, stop)
+                except CFlowError:  # no frame can be computed any more
+                    raise
+                except Exception as error:  # no memory for a thread, say
+                    yield Failed(unit.number, source_name(unit.source), describe(error))
         finally:
             worker.close()
-            _use_threads(threads, cpus)
+            use_threads(threads, cpus)
     else:
         yield from _Crew(job, units, layout, stop, timeout).run()
-
-
-@dataclass(frozen=True)
-class _Refusal:
-    """What a worker that cannot begin says."""
-
-    message: str
 
 
 @dataclass
@@ -82,11 +85,12 @@ class _Hand:
     device: str
     process: Any
     pipe: Connection
+    is_ready: bool = False
     unit: Optional[Unit] = None
     log_id: Optional[str] = None
     in_hand: List[int] = field(default_factory=list)  # frames begun and not settled
     settled: Set[int] = field(default_factory=set)  # frames of the unit that are on disk or failed
-    heard: float = field(default_factory=time.monotonic)  # when it gave its last sign, or was given its unit
+    silent: float = 0.0  # seconds since it gave its last sign, or was given its unit
     killed: Optional[float] = None  # when it was killed because it gave no sign
 
 
@@ -98,29 +102,33 @@ class _Crew:
     ) -> None:
         self._job, self._layout, self._stop, self._timeout = job, layout, stop, timeout
         self._pending: Deque[Unit] = deque(units)
-        self._deaths: Dict[Any, int] = {}  # (unit number, time stamp or None) -> workers that died on it
+        self._deaths = Deaths(_MOST_DEATHS)
+        self._stillborn = 0  # in a row
         self._hands: List[_Hand] = []
 
     def run(self) -> Iterator[Event]:
         """See `run_local`."""
         try:
             self._hands = [self._hire(device) for device in self._layout.devices[: len(self._pending)]]
-            told = 0.0
+            told, looked = 0.0, time.monotonic()
             while True:
+                passed = min(time.monotonic() - looked, _LONGEST_LOOK_S)
+                looked = time.monotonic()
                 if self._stop() and not told:
                     told = time.monotonic()
                     self._pending.clear()
                     for hand in self._hands:
-                        self._send(hand, _END)
+                        self._send(hand, END)
                 for hand in self._hands:
                     if hand.unit is None and self._pending:
                         hand.unit, hand.log_id, hand.in_hand, hand.settled = self._pending.popleft(), None, [], set()
-                        hand.heard = time.monotonic()
+                        hand.silent = 0.0
                         self._send(hand, hand.unit)
                 if all(hand.unit is None for hand in self._hands):
                     break
                 ready = set(wait([hand.pipe for hand in self._hands], timeout=_POLL_S))
                 for hand in list(self._hands):
+                    hand.silent += passed
                     if hand.pipe in ready:
                         yield from self._hear(hand)
                     elif hand.unit is not None and self._is_lost(hand, told):
@@ -131,15 +139,18 @@ class _Crew:
             raise
         finally:
             for hand in self._hands:
-                self._send(hand, _END)
+                self._send(hand, END)
                 hand.process.join(None if hand.killed is None else _LAST_BREATH_S)
                 hand.pipe.close()
 
     def _hire(self, device: str) -> _Hand:
         context = multiprocessing.get_context("spawn")  # fork and threads, or CUDA, do not go together
         here, there = context.Pipe()
-        process = context.Process(target=_serve, args=(self._job, device, self._layout.threads, there), daemon=True)
-        process.start()
+        process = context.Process(target=serve, args=(self._job, device, self._layout.threads, there), daemon=True)
+        try:
+            process.start()
+        except OSError as error:
+            raise CFlowError(f"no worker process can be started ({error}): give fewer engine.workers") from error
         there.close()  # the worker's end closes with the worker
         return _Hand(device, process, here)
 
@@ -157,14 +168,14 @@ class _Crew:
         now = time.monotonic()
         if hand.killed is not None:
             return now - hand.killed > _LAST_BREATH_S
-        if now - hand.heard > self._timeout or (told and now - told > _GRACE_S):
+        if hand.silent > self._timeout or (told and now - told > _GRACE_S):
             hand.killed = now
             hand.process.kill()
         return False
 
     def _hear(self, hand: _Hand) -> Iterator[Event]:
         """One message of a worker, or its end."""
-        hand.heard = time.monotonic()
+        hand.silent = 0.0
         try:
             event = hand.pipe.recv()
         except (EOFError, OSError):
@@ -172,7 +183,9 @@ class _Crew:
             return
         if event is None:  # the unit is at its end
             hand.unit = None
-        elif isinstance(event, _Refusal):
+        elif isinstance(event, Ready):
+            hand.is_ready, self._stillborn = True, 0
+        elif isinstance(event, Refusal):
             self._dismiss(hand, event.message)
         else:
             if isinstance(event, Opened):
@@ -182,17 +195,20 @@ class _Crew:
             elif event.timestamp in hand.in_hand:
                 hand.in_hand.remove(event.timestamp)
                 hand.settled.add(event.timestamp)
-                self._deaths.pop((event.unit, None), None)
+                self._deaths.settle(event.unit)
             yield event
 
     def _dismiss(self, hand: _Hand, message: str) -> None:
         """A worker cannot begin (its GPU is gone): the others do its work. Raises if it was the last."""
         self._let_go(hand)
-        if not self._hands:
-            raise CFlowError(message)
-        print(f"{message}; going on with {len(self._hands)} of {len(self._layout.devices)} workers", file=sys.stderr)
+        self._go_on_without(message)
         if hand.unit is not None and not self._stop():
             self._pending.appendleft(hand.unit)
+
+    def _go_on_without(self, message: str) -> None:
+        if not self._hands:
+            raise CFlowError(message)
+        say(f"{message}; going on with {len(self._hands)} of {len(self._layout.devices)} workers")
 
     def _let_go(self, hand: _Hand) -> None:
         hand.process.join(_LAST_BREATH_S)
@@ -203,60 +219,39 @@ class _Crew:
         """A worker died, or ended when it was told to: another takes its place if there is work for it."""
         self._let_go(hand)
         yield from self._blame(hand)
-        if self._pending and not self._stop():
-            self._hands.append(self._hire(hand.device))
+        if not hand.is_ready:
+            self._stillborn += 1
+        if self._stillborn >= _MOST_STILLBORN and not self._stop():
+            self._go_on_without(
+                f"{self._stillborn} workers one after the other died before they could begin, the last one "
+                f"{self._how(hand)} (give fewer engine.workers if it is the memory, else see above)"
+            )
+        elif self._pending and not self._stop():
+            try:
+                self._hands.append(self._hire(hand.device))
+            except CFlowError as error:
+                self._go_on_without(str(error))
 
     def _blame(self, hand: _Hand) -> Iterator[Event]:
         """Whatever a dead worker had in hand may be why; the rest of its unit is to be done again."""
         unit = hand.unit
-        how = f"after {self._timeout:g} s without a sign" if hand.killed is not None else _how(hand.process.exitcode)
         if unit is None:
             return
-        given_up: Set[int] = set()
-        for stamp in hand.in_hand or [None]:  # type: ignore[list-item]
-            deaths = self._deaths[unit.number, stamp] = self._deaths.get((unit.number, stamp), 0) + 1
-            # While several frames were in hand, each is only a suspect.
-            if deaths >= _MOST_DEATHS and len(hand.in_hand) <= 1:
-                name = hand.log_id or source_name(unit.source)
-                message = f"{deaths} workers died on it, the last one {how}"
-                yield Failed(unit.number, name if stamp is None else f"{name}/{stamp}", message, stamp)
-                if stamp is None:
-                    return
-                given_up.add(stamp)
-        if not self._stop():
-            skip = unit.skip | given_up | hand.settled  # with `redo`, files do not tell what is done
-            self._pending.appendleft(replace(unit, careful=unit.careful | set(hand.in_hand), skip=skip))
+        again: Optional[Unit] = unit
+        if hand.is_ready:
+            how = f"the last one {self._how(hand)}"
+            name = hand.log_id or source_name(unit.source)
+            failed, again = self._deaths.blame(unit, name, hand.in_hand, hand.settled, how)
+            yield from failed
+        if again is not None and not self._stop():
+            self._pending.appendleft(again)
 
-
-def _how(status: Optional[int]) -> str:
-    if status is not None and status < 0:
-        name = next((known.name for known in signal.Signals if known == -status), f"signal {-status}")
-        return f"by {name}" + (" (out of memory?)" if -status == signal.SIGKILL else "")
-    return f"with status {status}"
-
-
-def _use_threads(for_torch: int, for_pyarrow: int) -> None:
-    torch.set_num_threads(for_torch)
-    pyarrow.set_cpu_count(for_pyarrow)
-
-
-def _serve(job: Job, device: str, threads: int, pipe: Connection) -> None:
-    """What a worker process runs. Signals are the parent's business: it says when to stop."""
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)
-    _use_threads(threads, threads)
-    with suppress(ConnectionError, EOFError):  # the parent is gone: so are we
-        try:
-            worker = Worker(job, device)
-        except CFlowError as error:
-            pipe.send(_Refusal(str(error)))
-            return
-        while True:
-            unit = pipe.recv()
-            if unit == _END:
-                break
-            # While a unit is done, nothing but the end can come, or the parent's.
-            for event in worker.run(unit, pipe.poll):
-                pipe.send(event)
-            pipe.send(None)
-        worker.close()
+    def _how(self, hand: _Hand) -> str:
+        """A worker died."""
+        if hand.killed is not None:
+            return f"after {self._timeout:g} s without a sign"
+        status = hand.process.exitcode
+        if status is not None and status < 0:
+            name = next((known.name for known in signal.Signals if known == -status), f"signal {-status}")
+            return f"by {name}" + (" (out of memory?)" if -status == signal.SIGKILL else "")
+        return f"with status {status}"

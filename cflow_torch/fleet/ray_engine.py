@@ -7,11 +7,12 @@ import queue
 import threading
 import time
 from dataclasses import dataclass, field, replace
-from typing import Any, Callable, Dict, Iterator, List, Optional, Sequence, Set
+from typing import Any, Callable, Iterator, List, Optional, Sequence, Set
 
 import pyarrow as pa
 
 from cflow_torch.data.paths import as_path, is_remote
+from cflow_torch.fleet.deaths import Deaths
 from cflow_torch.fleet.job import Begun, Done, Event, Failed, Job, Opened, Unit
 from cflow_torch.fleet.machine import AUTO, Layout
 from cflow_torch.fleet.ray_cluster import Cluster
@@ -87,7 +88,7 @@ class _Rounds:
     ) -> None:
         self._job, self._threads, self._stop, self._cluster = job, layout.threads, stop, cluster
         self._most_deaths = retries + 1
-        self._deaths: Dict[Any, int] = {}  # (unit number, time stamp or None) -> workers that died on it
+        self._deaths = Deaths(self._most_deaths)
         self._states = {unit.number: _State(unit) for unit in units}
         self._idle_rounds = 0  # in a row, in which no unit was begun
 
@@ -144,7 +145,7 @@ class _Rounds:
             elif isinstance(event, (Done, Failed)) and event.timestamp in state.in_hand:
                 state.in_hand.remove(event.timestamp)
                 state.settled.add(event.timestamp)
-                self._deaths.pop((event.unit, None), None)
+                self._deaths.settle(event.unit)
             yield event
         if news.ended:
             self._ended += 1
@@ -159,19 +160,10 @@ class _Rounds:
             else:
                 self._states[unit.number] = _State(unit)
             return
-        given_up: Set[int] = set()
-        for stamp in state.in_hand or [None]:  # type: ignore[list-item]
-            deaths = self._deaths[unit.number, stamp] = self._deaths.get((unit.number, stamp), 0) + 1
-            # While several frames were in hand, each is only a suspect.
-            if deaths >= self._most_deaths and len(state.in_hand) <= 1:
-                message = f"{deaths} worker{'s' * (deaths > 1)} died on it (out of memory?)"
-                yield Failed(unit.number, name if stamp is None else f"{name}/{stamp}", message, stamp)
-                if stamp is None:
-                    return
-                given_up.add(stamp)
-        skip = unit.skip | given_up | state.settled  # with `redo`, files do not tell what is done
-        unit = replace(unit, careful=unit.careful | set(state.in_hand), skip=skip)
-        self._states[unit.number] = _State(unit)
+        failed, again = self._deaths.blame(unit, name, state.in_hand, state.settled, "out of memory?")
+        yield from failed
+        if again is not None:
+            self._states[unit.number] = _State(again)
 
 
 class _Rows:

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: finish what is in hand, then end; at the second signal, end at once."""
+"""Ctrl-C, SIGTERM and SIGHUP: finish what is in hand, then end; at the second signal, end at once."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ import threading
 from contextlib import suppress
 from typing import Any, Dict, Optional
 
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+SIGNALS = [signal.SIGINT, signal.SIGTERM]
+if hasattr(signal, "SIGHUP"):  # the terminal is gone
+    SIGNALS.append(signal.SIGHUP)
 
 
 class StopSignal:
@@ -24,7 +26,9 @@ class StopSignal:
 
     def __enter__(self) -> StopSignal:
         if threading.current_thread() is threading.main_thread():
-            self._before = {number: signal.signal(number, self._receive) for number in _SIGNALS}
+            for number in SIGNALS:
+                if number == signal.SIGINT or signal.getsignal(number) is not signal.SIG_IGN:  # nohup stays nohup
+                    self._before[number] = signal.signal(number, self._receive)
         return self
 
     def __exit__(self, *_: Any) -> None:
