@@ -36,7 +36,7 @@ def run(*arguments: Any) -> int:
 
 def flow(root: Path, output: Path, *more: str) -> int:
     """`cflow flow` of a folder of logs by one process, if not told otherwise."""
-    settings = ["data=av2", f"data.root={root}", f"output={output}", "model=paper", "model.pixel_sizes=[0.4]"]
+    settings = ["data=av2", f'data.root="{root}"', f'output="{output}"', "model=paper", "model.pixel_sizes=[0.4]"]
     return run("flow", *settings, "data.check=false", "engine.workers=1", "engine.threads=1", *more)
 
 

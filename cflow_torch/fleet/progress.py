@@ -31,7 +31,10 @@ class Progress:
         self.total, self.done, self._name, self._clock = total, 0, name, clock
         self._said_at, self._said_done = clock(), 0
         bar_format = _BAR.replace("{desc}", f"{name}: " if name else "")
-        self._bar: Any = tqdm(total=total, unit=" frames", disable=None, smoothing=0.05, bar_format=bar_format)
+        try:
+            self._bar: Any = tqdm(total=total, unit=" frames", disable=None, smoothing=0.05, bar_format=bar_format)
+        except OSError:  # it is drawn at once, and the terminal may be gone
+            self._bar = tqdm(total=total, disable=True)
 
     def __enter__(self) -> Progress:
         return self

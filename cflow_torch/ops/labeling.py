@@ -217,13 +217,13 @@ def connected_components_kornia(occupancy: Tensor, pixels: Tensor, connectivity:
     return first_of_segment(labels.reshape(-1)[pixels], image.numel() + 1)
 
 
-@lru_cache(maxsize=None)
+@lru_cache(maxsize=256)
 def _offsets(cols: int, device: torch.device) -> Tensor:
     """(4,) int64, how far away the neighbours of a block are."""
     return torch.tensor([down * cols + right for down, right in _NEIGHBOURS], device=device)
 
 
-@lru_cache(maxsize=None)
+@lru_cache(maxsize=32)
 def _reachable(side: int, connectivity: int, reach: int, device: torch.device) -> Tensor:
     """(512, 4) int32: which pixels of each neighbour are linked to a block, by the first two columns of its mask.
 
