@@ -260,7 +260,7 @@ def test_arrays_of_objects(marker: Path, tmp_path: Path) -> None:
             ArraysLog(folder, suffix=suffix, ground=None).sweep(0)
     np.save(tmp_path / "log_ground_height_surface____SYN.npy", objects(marker, (4, 3)))
     (tmp_path / "log___img_Sim2_city.json").write_text('{"R": [1, 0, 0, 1], "t": [0, 0], "s": 1}')
-    with pytest.raises(CFlowError, match="object"):
+    with pytest.raises(CFlowError, match="ground_height_surface|ground raster"):
         read_ground_raster(tmp_path)
 
 
