@@ -329,7 +329,7 @@ def with_column(name: str, values: Any) -> Callable[[pa.Table], pa.Table]:
         ("track_uuid", ["a", None], "no name|empty entries"),
         ("track_uuid", [1, 2], "must be text"),
         ("category", ["x" * 10**6] * 2, "unknown categories .{1,500} ...; the known"),
-        ("length_m", [np.nan] * 2, "finite size"),
+        ("length_m", [np.nan] * 2, "not finite"),
         ("num_interior_pts", pa.array([None, 3], pa.int64()), "empty entries"),
     ],
 )
