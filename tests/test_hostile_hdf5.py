@@ -104,6 +104,22 @@ def test_a_second_name_of_another_key_is_not_written_over(scene: Path) -> None:
     assert scene.read_bytes() == before
 
 
+@pytest.mark.parametrize("source", [b"pipe", b"pipe%b"])
+def test_virtual_data_without_a_limit_open_nothing(source: bytes, scene: Path) -> None:
+    """To ask HDF5 for their shape would open the source: here a pipe, which is waited for without an end."""
+    for name in ("pipe", "pipe0"):
+        os.mkfifo(scene.parent / name)
+    shape, most = (POINTS, 4), (h5py.h5s.UNLIMITED, 4)
+    blocks = h5py.h5s.create_simple(shape, most)
+    blocks.select_hyperslab((0, 0), (h5py.h5s.UNLIMITED, 1), shape, shape)
+    plan = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    plan.set_virtual(blocks, source, b"a", h5py.h5s.create_simple(shape) if b"%" in source else blocks)
+    space = h5py.h5s.create_simple(shape, most)
+    replace(scene, "lidar", lambda group: h5py.h5d.create(group.id, b"lidar", h5py.h5t.IEEE_F32LE, space, plan))
+    with HDF5Log(scene) as log, pytest.raises(CFlowError, match="lidar lies in other files"):
+        log.sweep(0)
+
+
 def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "scene.h5")
     with pytest.raises(CFlowError, match=r"scene\.h5.*pipe"):
