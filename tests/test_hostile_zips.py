@@ -24,7 +24,7 @@ from cflow_torch.submission.versions import get_version
 
 NAME = "log/315966265259836000.feather"
 FRAMES = [Frame(NAME, 5)]
-BOMB = 1 << 28
+BOMB = 1 << 27
 
 
 def mask_file() -> bytes:

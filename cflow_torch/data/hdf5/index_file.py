@@ -65,7 +65,7 @@ def write_index(path: Place, entries: Sequence[Entry]) -> None:
         pickle.dump([[str(scene), str(stamp)] for scene, stamp in entries], file, protocol=4)
 
 
-@lru_cache(maxsize=8)  # every scene of a folder asks for the same file
+@lru_cache(maxsize=2)  # every scene of a folder asks for the same file
 def _entries(path: str, data: bytes) -> Tuple[Entry, ...]:
     mend = "delete it: the index is then taken from the scenes themselves"
     try:
