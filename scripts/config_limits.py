@@ -19,8 +19,10 @@ from cflow_torch.checks import (
     LARGEST_PATCH,
     LARGEST_RATIO,
     LARGEST_Z,
+    LONGEST,
     METHODS,
     MOST_SLICES,
+    SHORTEST,
     SUBPIXELS,
 )
 
@@ -53,6 +55,12 @@ def _positive(unit: str, may_be_none: bool = False, may_be_infinite: bool = True
     )
 
 
+def _bounded(unit: str, or_zero: bool = False) -> Limits:
+    good = (SHORTEST, 1, 1.5, LONGEST, *([0, 0.0] if or_zero else []))
+    bad = (-1.0, 0.9 * SHORTEST, 2 * LONGEST, INF, NAN, "1", None, *([] if or_zero else [0]))
+    return Limits(f"{'0, or ' * or_zero}{SHORTEST:g} to {LONGEST:g}, {unit}", good, bad)
+
+
 _SWITCH = Limits("`true`, `false`", (True, False), (None, 0, 1, "true"))
 _NEGATIVE = (-1, 1.5, True, None)
 
@@ -63,7 +71,7 @@ LIMITS: Dict[str, Limits] = {
     ),
     "num_history": Limits("whole number >= 0", (0, 1, 9), _NEGATIVE),
     "point_cloud_range": Limits(
-        "six numbers, m; z may be infinite",
+        "six numbers, m; z may be infinite; with `proof` at most 3000 m a side",
         ((-1, -1, -INF, 1, 1, INF), (-1, -1, -1, 1, 1, 1)),
         ((-1, -1, 1, 1), (1, -1, -1, -1, 1, 1), (-INF, -1, -1, 1, 1, 1), (-1, -1, -1, 1, 1, NAN)),
     ),
@@ -77,7 +85,7 @@ LIMITS: Dict[str, Limits] = {
     "zero_test": Limits(f"0.01 to {LARGEST_Z}, or null", (None, 0.01, LARGEST_Z), (0, 0.009, LARGEST_Z + 1, NAN)),
     "subpixel": _one_of(SUBPIXELS),
     "height_slices": Limits(f"0, or 2 to {MOST_SLICES}", (0, 2, MOST_SLICES), (1, MOST_SLICES + 1, *_NEGATIVE)),
-    "slice_height": _positive("m", may_be_infinite=False),
+    "slice_height": _bounded("m"),
     "proof": _SWITCH,
     "proof_z": Limits(f"0 to {LARGEST_Z}", (0, 1.5, LARGEST_Z), (-0.1, LARGEST_Z + 1, NAN, None, True)),
     "clearance": Limits(
@@ -94,7 +102,7 @@ LIMITS: Dict[str, Limits] = {
     "keypoint_block": Limits(
         f"whole number, 0 to {LARGEST_BLOCK}", (0, 2, LARGEST_BLOCK), (LARGEST_BLOCK + 1, *_NEGATIVE)
     ),
-    "sweep_interval": _positive("s", may_be_infinite=False),
+    "sweep_interval": _bounded("s"),
     "use_timestamps": _SWITCH,
     "sectional_view": _SWITCH,
     "clustering": _one_of(CLUSTERINGS),
@@ -104,10 +112,10 @@ LIMITS: Dict[str, Limits] = {
     "densify": _one_of(DENSIFIERS),
     "patch_size": Limits(f"odd, 1 to {LARGEST_PATCH}", (1, 11, LARGEST_PATCH), (10, LARGEST_PATCH + 2, *_NEGATIVE)),
     "ratio_threshold": Limits(f"1 to {LARGEST_RATIO}", (1, 1.02, LARGEST_RATIO), (0.99, LARGEST_RATIO + 0.01, NAN)),
-    "gate_radius": _positive("m per 0.1 s", may_be_infinite=False),
+    "gate_radius": _bounded("m per 0.1 s"),
     "mutual_check": _SWITCH,
-    "second_best_distance": Limits("number >= 0, pixels", (0, 0.0, 3, 1.5), (-1, NAN, None)),
-    "max_memory": _positive("bytes", may_be_none=True),
+    "second_best_distance": _bounded("pixels", or_zero=True),
+    "max_memory": _positive("bytes", may_be_none=True, may_be_infinite=False),
 }
 
 GROUPS: Dict[str, Tuple[str, ...]] = {

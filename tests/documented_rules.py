@@ -159,7 +159,7 @@ SHRUNK: Tuple[Rule, ...] = (
     ),
     Rule(r"keypoint_settings\.py", "two settings instead of the table", add="--grid patch_size=7,11", slow=True),
     Rule(r"ground_figures\.py", "all of it", slow=True),
-    Rule(r"tests/test_work\.py|-m timeit", "all of it", slow=True),
+    Rule(r"tests/test_(work|exactness_matrix|union_find_shapes)\.py|-m timeit", "all of it", slow=True),
     Rule(r"-m cflow_torch\.integrations", "imports torch anew", slow=True),
 )
 

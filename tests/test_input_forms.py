@@ -158,6 +158,13 @@ def test_scores_and_pictures_take_numbers_only(wrong: np.ndarray) -> None:
             plot_flow(*arguments)
 
 
+def test_pictures_take_bfloat16() -> None:
+    from cflow_torch.viz import flow_to_rgb
+
+    flow = np.array([[1.0, 0.0, 0.0], [0.0, -0.5, 0.0]], np.float32)
+    assert np.array_equal(flow_to_rgb(torch.from_numpy(flow).bfloat16()), flow_to_rgb(flow))
+
+
 # ------------------------------------------------------------------------------------------- doors that only look
 
 

@@ -11,10 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from moving_scenes import SLICE, moving_scene
 from preset_windows import PRESETS, changed, num_moving, on_a_raster, small, windows_for
 from scenes import RANGE, assert_same, pose
 
 from cflow_torch import CFlowError, Config, FlowResult, Sweep, Window, estimate_flow, free_memory, make_model
+from cflow_torch.cells import slice_of
 from cflow_torch.grid import Grid
 from cflow_torch.ground import find_ground
 from cflow_torch.reference import reference_flow
@@ -167,6 +169,19 @@ def test_finite_points_beyond_all_bounds_change_nothing(preset, value):
     result = cflow(wild, config)
     assert_same(result, reference_flow(wild, config))
     assert all(torch.isfinite(values.double()).all() for values in vars(result).values() if values is not None)
+
+
+def test_moving_points_have_the_slices_of_cells():
+    """Of heights without end, too: a quotient that no int64 holds is cut off, not left to the processor."""
+    heights = [0.3, -0.3, 7.9, 1e17, 1e18, -1e18, 1e30, -1e30]
+    flat = moving_scene(0, num_points=8)
+    z = torch.tensor(heights, dtype=torch.float64).repeat(flat.batch.positions.shape[1] // len(heights) + 1)
+    positions = torch.cat((flat.batch.positions[:2], z[None, : flat.batch.positions.shape[1]]))
+    points = flat._replace(batch=replace(flat.batch, positions=positions)).moving()
+    assert len(points.part) > 20
+    kept = positions[2][[int((positions[:2].t() == xy).all(1).nonzero()[0]) for xy in points.position.t()]]
+    assert points.part.tolist() == [int(z // SLICE) % 4 for z in kept.tolist()]
+    assert slice_of(torch.tensor([1e30, -1e30, 2.0**63], dtype=torch.float64), 1.0, 16).tolist() == [0, 0, 0]
 
 
 # ------------------------------------------------------------------------------------------------- tiny and many
