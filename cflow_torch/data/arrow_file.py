@@ -5,18 +5,16 @@ Only columns that are asked for are unpacked, after their types and what they cl
 
 from __future__ import annotations
 
-import stat
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any, Iterator, List, Sequence
 
 import pyarrow as pa
 
 from cflow_torch.data.bounds import check_claim
-from cflow_torch.data.paths import is_remote
 from cflow_torch.types import CFlowError
 
 MAX_ROWS = 1 << 20  # of a table that is gone through row by row; a log has some ten thousand boxes
+MAX_TEXT_BYTES = 1 << 26  # of the names in a column; ten thousand boxes have some hundred kilobytes
 _MAX_TEXT = 400  # characters of what a library says; a damaged name can be a million long
 
 
@@ -37,20 +35,6 @@ def shortened(text: Any) -> str:
     """One line, not too long."""
     line = " ".join(str(text).split())
     return line if len(line) <= _MAX_TEXT else line[:_MAX_TEXT] + " ..."
-
-
-def check_regular(path: Path) -> None:
-    """Refuse what never ends or is too large to be read whole.
-
-    Raises:
-        OSError: there is no such file, it is no file (a pipe, a device), or it cannot be reached.
-        CFlowError: it is larger than `bounds.MAX_ARRAY_BYTES`.
-    """
-    if not is_remote(path):
-        status = path.stat()
-        if not stat.S_ISREG(status.st_mode):
-            raise OSError(f"{path} is no regular file")
-        check_claim(path, "the file", status.st_size)
 
 
 def check_columns(file: Any, schema: pa.Schema, columns: Sequence[str]) -> None:
@@ -96,11 +80,12 @@ def texts(column: pa.ChunkedArray, file: Any) -> List[str]:
     """Text of every row; rows of equal text share it where the file does.
 
     Raises:
-        CFlowError: something else than text, or a row without.
+        CFlowError: something else than text, a row without, or more than MAX_TEXT_BYTES.
     """
     kind = column.type.value_type if pa.types.is_dictionary(column.type) else column.type
     if not (pa.types.is_string(kind) or pa.types.is_large_string(kind)):
         raise CFlowError(f"{file}: a column of names must be text, got {column.type}")
+    check_claim(file, "a column of names", column.nbytes, MAX_TEXT_BYTES)
     found: List[Any] = []
     with arrow_errors(file):
         for chunk in column.chunks:

@@ -229,7 +229,10 @@ def _floats(table: pa.Table, columns: Sequence[str], dtype: type) -> np.ndarray:
     }
     if wrong:
         raise CFlowError(f"columns {list(columns)} must be floating point, got {wrong}")
-    return np.stack([table.column(name).to_numpy().astype(dtype) for name in columns], axis=1)
+    values = np.empty((table.num_rows, len(columns)), dtype)
+    for number, name in enumerate(columns):
+        values[:, number] = table.column(name).to_numpy()
+    return values
 
 
 def _integers(table: pa.Table, column: str, file: Path) -> np.ndarray:

@@ -16,7 +16,8 @@ from cflow_torch.types import CFlowError
 _MAGIC = b"ARROW1"
 _OLD_COMPRESSION = b"ARROW:experimental_compression"  # Arrow 0.17 said so in the metadata of a batch
 _DICTIONARY, _BATCH = 2, 3  # kinds of message
-_WIDEST = 8  # bytes of a number; empty columns and runs have none in the file, but each row has one in memory
+_ROW = 12  # bytes of a point; columns of runs or of nothing have none in the file, but each row has some in memory
+_MAX_METADATA = 1 << 22  # bytes of all batches' lists of buffers; 500 for 65,536 rows are usual
 
 
 def check_feather_claims(file: Any, data: bytes) -> int:
@@ -43,7 +44,7 @@ def check_feather_claims(file: Any, data: bytes) -> int:
         raise CFlowError(
             f"cannot read {file}: no feather file ({error}); it may be truncated, copy it again"
         ) from error
-    check_claim(file, f"its {rows} rows", rows * _WIDEST if rows >= 0 else -1)
+    check_claim(file, f"its {rows} rows", rows * _ROW if rows >= 0 else -1)
     check_claim(file, "the sum of its columns", num_bytes)
     return rows
 
@@ -57,7 +58,7 @@ def _claims(data: bytes) -> Tuple[int, int]:
     if not 0 < size <= start:
         raise IndexError("its footer is longer than the file")
     footer = _Table(data, start + _number(data, "<I", start))
-    rows = num_bytes = covered = 0
+    rows = num_bytes = covered = metadata = 0
     for field in (2, 3):  # dictionaries, batches
         for block in footer.entries(field, 24):
             offset, length = _number(data, "<q", block), _number(data, "<i", block + 8)
@@ -65,9 +66,11 @@ def _claims(data: bytes) -> Tuple[int, int]:
             if kind not in (_DICTIONARY, _BATCH):
                 raise IndexError("its footer lists a message that is no batch")
             body = message.scalar(3, "<q")
-            covered += length + body
-            if body < 0 or covered > len(data):  # so that all of this takes time in proportion to the file
+            covered, metadata = covered + length + body, metadata + length
+            if body < 0 or covered > len(data):
                 raise IndexError("its batches are longer than the file")
+            if metadata > _MAX_METADATA:  # which takes about a second
+                raise IndexError(f"its lists of buffers have more than {_MAX_METADATA} bytes")
             batch = message.table(2)
             if kind == _DICTIONARY:
                 batch = batch.table(1)

@@ -6,7 +6,8 @@ from typing import Any, List, Optional, Sequence
 
 import pyarrow as pa
 
-from cflow_torch.data.arrow_file import arrow_errors, check_columns, check_regular
+from cflow_torch.data.arrow_file import arrow_errors, check_columns
+from cflow_torch.data.bounds import MAX_ARRAY_BYTES
 from cflow_torch.data.feather_claims import check_feather_claims
 from cflow_torch.data.paths import read_bytes
 from cflow_torch.types import CFlowError
@@ -24,14 +25,13 @@ class FeatherFile:
         num_rows: rows.
 
     Raises:
-        OSError: there is no such file, or it cannot be reached.
+        OSError: there is no such file, it is a pipe or a device, or it cannot be reached.
         CFlowError: it is damaged, or claims more than `bounds.MAX_ARRAY_BYTES`.
     """
 
     def __init__(self, file: Any, data: Optional[bytes] = None) -> None:
         if data is None:
-            check_regular(file)
-            data = read_bytes(file)
+            data = read_bytes(file, MAX_ARRAY_BYTES)
         self.file, self._data = file, data
         self.num_rows = check_feather_claims(file, data)
         with arrow_errors(file):

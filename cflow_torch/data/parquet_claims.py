@@ -17,12 +17,12 @@ from cflow_torch.types import CFlowError
 
 MAX_PAGES = 1 << 16  # of the columns that are read; a page holds about 1 MiB
 MAX_LIST = 1024  # row groups, and entries of the schema, whose nesting Arrow follows by recursion
-_MAX_FOOTER = 1 << 24  # bytes; a thousand row groups of twenty columns take 3 million
-_FIRST_LOOK, _MAX_HEADER = 256, 1 << 20  # bytes of a page's header: 20 to 100, and two values of its statistics
+_MAX_FOOTER = 1 << 23  # bytes; a thousand row groups of twenty columns take 3 million
+_FIRST_LOOK, _MAX_HEADER = 256, 1 << 16  # bytes of a page's header: 20 to 100, and two values of its statistics
 _PREFIXED = 7  # DELTA_BYTE_ARRAY: texts that repeat the beginning of the one before, so that they cost nothing
 _BYTE_ARRAY = 6
 _WIDTH = {0: 1, 1: 4, 2: 8, 3: 12, 4: 4, 5: 8, _BYTE_ARRAY: 4}  # bytes of a physical type; texts: of their number
-_LEVELS, _WORD = 4, 16  # bytes in memory: two levels of a value, the entry of a dictionary
+_LEVELS, _WORD, _ROW = 4, 16, 12  # bytes in memory: two levels of a value, the entry of a dictionary, a point
 _META = {1: I32, 5: I64, 7: I64, 9: I64, 11: I64}
 _FOOTER = {2: [{1: I32, 2: I32, 4: TEXT, 5: I32}], 4: [{1: [{3: _META}], 3: I64}]}
 _DATA, _DICTIONARY, _DATA2 = 5, 7, 8
@@ -139,7 +139,7 @@ def check_parquet_claims(
         CFlowError: a column claims more, or its pages are damaged.
     """
     rows = sum(footer.group_rows[group] for group in groups)
-    check_claim(file, f"its {rows} rows", 8 * rows, limit)
+    check_claim(file, f"its {rows} rows", _ROW * rows)
     num_pages = 0
     for number, leaf in enumerate(footer.leaves):
         if not any(leaf.path == name or leaf.path.startswith(name + ".") for name in columns):

@@ -7,9 +7,10 @@ from typing import Any, Iterator, List, Optional, Sequence
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from cflow_torch.data.arrow_file import arrow_errors, check_columns, check_regular
+from cflow_torch.data.arrow_file import arrow_errors, check_columns
 from cflow_torch.data.bounds import MAX_ARRAY_BYTES
 from cflow_torch.data.parquet_claims import MAX_LIST, check_parquet_claims, read_footer
+from cflow_torch.data.paths import is_remote
 from cflow_torch.types import CFlowError
 
 MAX_STREAMED_BYTES = 3 * MAX_ARRAY_BYTES  # of a column of one row group that is gone through a few rows at a time
@@ -37,7 +38,8 @@ class ParquetFile:
 
     def __init__(self, file: Any, source: Any) -> None:
         self.file = file
-        check_regular(file)
+        if not is_remote(file) and file.exists() and not file.is_file():
+            raise OSError(f"{file} is no file")
         if isinstance(source, str):
             source = pa.OSFile(source)
         elif not isinstance(source, pa.NativeFile):
