@@ -18,6 +18,7 @@ from cflow_torch.types import CFlowError
 
 _PLAIN = "biufUS"  # kinds of numbers and of text; neither objects (pickles) nor dates, complex numbers, raw bytes
 _LONGEST_HEADER = 10000  # bytes; NumPy's own limit
+_CHUNK = 1 << 18  # bytes read at once: zipfile makes copies of what it gives
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # what NumPy writes
 
 
@@ -27,6 +28,7 @@ class Header:
 
     shape: Tuple[int, ...]
     dtype: np.dtype
+    is_fortran: bool
 
 
 def read_npy(path: Path, mend: str) -> np.ndarray:
@@ -117,16 +119,16 @@ def read_header(stream: IO[bytes]) -> Header:
     if length > _LONGEST_HEADER:  # NumPy would read, and unpack, all of it before it says so
         raise ValueError(f"a header of {length} bytes")
     stream.seek(start)
-    shape, _, dtype = (npy.read_array_header_1_0 if is_short else npy.read_array_header_2_0)(stream)
-    return Header(shape, dtype)
+    shape, is_fortran, dtype = (npy.read_array_header_1_0 if is_short else npy.read_array_header_2_0)(stream)
+    return Header(shape, dtype, is_fortran)
 
 
 def read_array(stream: IO[bytes], size: int, file: Any, what: str) -> np.ndarray:
-    """The array in a stream that stands at its beginning.
+    """The array in a stream.
 
     Args:
-        stream: can seek.
-        size: number of bytes that are in it.
+        stream: stands at its beginning and can seek.
+        size: number of bytes that are in it, at most.
         file, what: for the messages.
 
     Raises:
@@ -144,17 +146,20 @@ def read_array(stream: IO[bytes], size: int, file: Any, what: str) -> np.ndarray
     there = size - stream.tell()
     if claim > there:
         raise CFlowError(f"{file}: {what} claims {claim} bytes, {there} are there; it is truncated, copy it again")
-    stream.seek(0)
-    return npy.read_array(stream, allow_pickle=False)
+    data = np.empty(claim, np.uint8)
+    view = memoryview(data)  # type: ignore[arg-type]
+    got = sum(stream.readinto(view[at : at + _CHUNK]) for at in range(0, claim, _CHUNK))  # type: ignore[attr-defined]
+    if got != claim:
+        raise CFlowError(f"{file}: {what} has {got} of {claim} bytes; it is truncated, copy it again")
+    stream.read(1)  # a member of an archive is compared with its checksum at its end
+    return data.view(dtype).reshape(header.shape, order="F" if header.is_fortran else "C")
 
 
 def _is_plain(dtype: np.dtype) -> bool:
-    """Numbers or text, also in fields and subarrays; what takes no room could be claimed any number of times."""
-    if dtype.subdtype is not None:
-        return _is_plain(dtype.subdtype[0])
+    """Numbers or text, also in fields; what takes no room could be claimed any number of times."""
     if dtype.names is not None:
-        return bool(dtype.names) and all(_is_plain(dtype[name]) for name in dtype.names)
-    return dtype.kind in _PLAIN and dtype.itemsize > 0
+        return bool(dtype.names) and all(_is_plain(dtype[name].base) for name in dtype.names)
+    return dtype.kind in _PLAIN and dtype.itemsize > 0 and dtype.subdtype is None
 
 
 def _said(error: Exception) -> str:

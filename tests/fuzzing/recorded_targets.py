@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Callable, List, Sequence, Tuple
 
@@ -51,19 +51,20 @@ def _truckscenes(folder: Path) -> Sequence[Any]:
     return [TruckScenesLog(source), TruckScenesLog(source, deskew=False)]
 
 
+def _read_truck(folder: Path) -> List[Any]:
+    each, at_once = _truckscenes(folder)
+    return any_of(lambda: each.labels(1), lambda: at_once.sweep(1))
+
+
 @lru_cache(maxsize=4)
 def _aevascenes(folder: Path) -> Sequence[Any]:
     return [AevaScenesLog(folder)]
 
 
-def _middle(log: Any) -> List[Any]:
-    return [log.sweep(1), log.labels(1)]
-
-
 def _read_frames(folder: Path) -> List[Any]:
     log = WaymoRecordLog(folder / "a.tfrecord")
     flow = WaymoRecordLog(folder / "a.tfrecord", stored_flow=True)
-    return any_of(lambda: log.sweep(1), lambda: log.labels(0), lambda: flow.labels(0))
+    return any_of(lambda: log.labels(0), lambda: flow.labels(0))  # of the points of both frames
 
 
 def _nuscenes_seeds() -> List[bytes]:
@@ -106,13 +107,13 @@ def _read_cloud(folder: Path) -> List[Any]:
 TARGETS: Tuple[Target, ...] = (
     Target(
         *("nuscenes_sweep", "tiny/sweep", _nuscenes_seeds),
-        lambda folder: [_middle(log) for log in _nuscenes(folder)],
+        lambda folder: [log.labels(1) for log in _nuscenes(folder)],  # of the sweep's points
         prepare=_scene(write_nuscenes, "LIDAR_TOP"),
         crafted=BODY,
     ),
     Target(
         *("truckscenes_sweep", "tiny/sweep", _truckscenes_seeds),
-        lambda folder: any_of(*(partial(_middle, log) for log in _truckscenes(folder))),
+        _read_truck,
         prepare=_scene(write_truckscenes, "LIDAR_LEFT"),
         crafted=crafted_pcd((*"xyz", "timestamp")),
         tokens=PCD_TOKENS,

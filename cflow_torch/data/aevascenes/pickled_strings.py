@@ -22,10 +22,12 @@ _COUNTED = dict(zip(b"XB\x8cC", (4, 4, 1, 1)))  # strings and bytes: as many byt
 _STOP, _GLOBAL, _CALL = b".cR"
 # Nearly all of a pickle: strings of up to 48 bytes, that they are remembered, and that they come again. A number to
 # remember by is below 2^22: the unpickler makes room for as many at once.
+_TEXTS = [(re.escape(bytes([size])), size) for size in range(1, 49)]
 _RUN = re.compile(
-    rb"(?:[hq].|j.{4}|\x94|r..[\0-\x3f]\0|[e(]|\x95.{8}|"
-    + b"|".join(b"(?:X%s\0\0\0|\x8c%s).{%d}" % (re.escape(bytes([n])), re.escape(bytes([n])), n) for n in range(1, 49))
-    + rb"){1,1000}",
+    rb"(?:h.|q.|r..[\0-\x3f]\0|\x94|"  # alternatives that begin with one byte each: quick to leave
+    + b"X(?:%s)|" % b"|".join(b"%s\0\0\0.{%d}" % text for text in _TEXTS)
+    + b"\x8c(?:%s)|" % b"|".join(b"%s.{%d}" % text for text in _TEXTS)
+    + rb"j.{4}|e|\(|\x95.{8}){1,1000}",
     re.DOTALL,
 )
 _LONGEST_SCALAR = 256  # bytes, 64 characters; the same bytes can be asked for again and again
