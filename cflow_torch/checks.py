@@ -163,7 +163,7 @@ def _check_proof(config: Any) -> None:
             f"most {WIDEST_PROOF} m: give less; else {mend}"
         )
     blocks = [size / config.pixel_sizes[-1] for size in config.pixel_sizes]
-    if any(abs(block - round(block)) > 1e-6 for block in blocks):
+    if any(math.isinf(block) or abs(block - round(block)) > 1e-6 for block in blocks):
         raise CFlowError(
             f"pixel_sizes={config.pixel_sizes}: with proof=True (as in preset='default') give whole multiples of the "
             f"finest one, for example (0.4, 0.2, 0.1); else {mend}"

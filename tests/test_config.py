@@ -214,3 +214,8 @@ def test_a_class_refuses_the_other_method():
     with pytest.raises(CFlowError, match="dense.*make_model"):
         CorrelationFlowKeypoints(Config())
     assert type(make_model(make_config("paper", method="keypoints"))) is CorrelationFlowKeypoints
+
+
+def test_pixel_sizes_whose_quotient_no_float_holds_are_refused():
+    with pytest.raises(CFlowError, match="whole multiples"):
+        make_config(pixel_sizes=(1e308, 0.2, 0.1))
