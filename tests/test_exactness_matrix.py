@@ -13,6 +13,8 @@ import hashlib
 import os
 import subprocess
 import sys
+import warnings
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import fields, replace
 from functools import lru_cache
@@ -134,6 +136,26 @@ def again(config: Config, windows: List[Window]) -> Results:
     return model(windows)
 
 
+def in_python_threads(config: Config, windows: List[Window]) -> Results:
+    """One model, four callers at once."""
+    model = make_model(config, "cpu")
+    with ThreadPoolExecutor(4) as pool:
+        return list(pool.map(lambda window: model([window])[0], windows * 4))[-len(windows) :]
+
+
+def with_other_kernels(config: Config, windows: List[Window]) -> Results:
+    """Without oneDNN, matrix products in bfloat16 where torch may."""
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("medium")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # torch says which GPUs this machine has not
+            with torch.backends.mkldnn.flags(enabled=False):
+                return together(config, windows)
+    finally:
+        torch.set_float32_matmul_precision(before)
+
+
 def while_training(config: Config, windows: List[Window]) -> Results:
     """Gradients on, another default dtype, autocast, deterministic algorithms only."""
     torch.set_default_dtype(torch.float64)
@@ -167,6 +189,8 @@ VARIANTS: Dict[str, Way] = {
     "columns first": with_points(np.asfortranarray),
     "more columns": with_points(lambda p: np.pad(p, [(0, 0), (0, 3)], constant_values=np.nan)),
     "the third run": again,
+    "four Python threads at once": in_python_threads,
+    "without oneDNN, matmul precision medium": with_other_kernels,
     "while training": while_training,
 }
 NEED_KORNIA = ("labeling=kornia", "conv and kornia")

@@ -325,6 +325,16 @@ def test_regions_larger_than_the_memory_are_refused_before_they_are_made(preset,
     assert highest_resident_kb() - before < 50_000
 
 
+@pytest.mark.parametrize("preset", PRESETS)
+def test_more_points_than_the_memory_holds_are_refused_before_they_are_copied(preset, monkeypatch):
+    monkeypatch.setattr(free_memory, "available_memory", lambda environ: 4_000_000_000)
+    points = np.broadcast_to(np.float32([1.0, 2.0, 0.5]), (10**8, 3))  # takes no memory itself
+    before = highest_resident_kb()
+    with pytest.raises(CFlowError, match=r"200000000 points in 2 sweeps.*bytes\).*fewer points"):
+        make_model(small(preset), "cpu")([Window(Sweep(points), Sweep(points))])
+    assert highest_resident_kb() - before < 50_000
+
+
 def test_regions_of_more_pixels_than_any_are_refused():
     for size, region in ((0.1, 1e5), (1e-300, 1.0), (5e-324, 1.0), (0.1, 1e308), (1e-310, 1e308)):
         with pytest.raises(CFlowError, match="pixels of .* too large.*smaller point_cloud_range or larger pixel_sizes"):
