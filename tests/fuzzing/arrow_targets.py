@@ -180,9 +180,8 @@ def _single(name: str, table: pa.Table, read: Callable[[Path], Any]) -> Target:
 
 
 def _read_frame(folder: Path) -> None:
-    data, problems = (folder / "a.feather").read_bytes(), []
-    for version in VERSIONS.values():
-        problems.append(check_file("a", data, _ROWS, version))
+    data = (folder / "a.feather").read_bytes()
+    problems = [check_file("a", data, _ROWS, version) for version in VERSIONS.values()]
     if all(problems):
         raise CFlowError("\n".join(problems[0]))
 
