@@ -9,6 +9,7 @@ import subprocess
 from pathlib import Path
 from typing import Any, Callable, Dict, List
 
+import numpy as np
 import pytest
 from full_disk import STEPS, SmallDisk, fill
 from small_fleet import PAIRS, flow, report, run, tree, write_fleet
@@ -358,3 +359,28 @@ def test_a_folder_without_manifest_has_no_complete_frames(tmp_path: Path) -> Non
     assert complete_frames(tmp_path) == {1}
     with pytest.raises(CFlowError, match="no flow file"):
         read_flow(tmp_path / "1.feather")
+
+
+def test_results_in_scenes_find_no_room(fleet: Path, tmp_path: Path) -> None:
+    """The scene stays as it was; copies that a killed writer left are removed."""
+    pytest.importorskip("h5py", reason="needs the extra hdf5")
+    from cflow_torch.data.hdf5 import write_hdf5_scene
+    from cflow_torch.data.hdf5.results import write_hdf5_results
+    from cflow_torch.data.synthetic import make_drive
+
+    drive = make_drive(seed=0, num_sweeps=2, profile="demo")
+    with SmallDisk(tmp_path / "disk", "size=50m") as disk:
+        scene = disk.folder / "scene.h5"
+        write_hdf5_scene(drive, scene)
+        ended = subprocess.Popen(["true"])
+        ended.wait()
+        stale = disk.folder / atomic.temporary_name(scene.name).replace(f"-{os.getpid()}-", f"-{ended.pid}-")
+        stale.write_bytes(b"half")
+        before = scene.read_bytes()
+        disk.change(f"size={2 * len(before) // 1024 + 60}k")
+        results = [(drive.timestamps[0], np.ones((len(drive.sweep(0).points), 3), np.float32))]
+        with pytest.raises(CFlowError, match="No space left on device.*make room"):
+            write_hdf5_results(scene, "mine", results)
+        assert [path.name for path in disk.folder.iterdir()] == ["scene.h5"] and scene.read_bytes() == before
+        disk.change("size=50m")
+        assert write_hdf5_results(scene, "mine", results) == 1

@@ -10,7 +10,7 @@ from typing import Any, Iterable, Tuple, Union
 
 import numpy as np
 
-from cflow_torch.data.atomic import sync_folder, temporary_name
+from cflow_torch.data.atomic import remove_stale, sync_folder, temporary_name
 from cflow_torch.data.hdf5.contained import array, group, hdf5_errors
 from cflow_torch.types import Array, CFlowError, as_numpy
 
@@ -23,7 +23,7 @@ RESERVED_KEYS = frozenset(
         *("pc0", "pc1", "gm0", "gm1", "pose0", "pose1"),
     )
 )
-_MEND = "give a scene that is complete, on a disk with room for two of it"
+_MEND = "give a complete scene, and make room beside it for a copy"
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_.-]{0,63}")
 
 
@@ -86,6 +86,7 @@ def write_hdf5_results(file: Union[str, Path], name: str, results: Iterable[Tupl
     check_result_name(name)
     check_writable(file)
     file = Path(file).resolve()  # a link stays a link
+    remove_stale(file.parent)  # copies of writers that were killed
     copy = file.with_name(temporary_name(file.name))
     try:
         shutil.copy(file, copy)
