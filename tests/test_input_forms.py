@@ -139,7 +139,11 @@ def test_ground_masks_that_hold_something_else_are_refused(mask: Any) -> None:
         estimate_flow(np.ones((4, 3)), np.ones((4, 3)), gm0=mask)
 
 
-@pytest.mark.parametrize("wrong", [np.ones((4, 3), complex), np.full((4, 3), "1"), np.full((4, 3), object())], ids=str)
+@pytest.mark.parametrize(
+    "wrong",
+    [np.ones((4, 3), complex), np.full((4, 3), "1"), np.full((4, 3), object())],
+    ids=["complex", "text", "objects"],
+)
 def test_scores_and_pictures_take_numbers_only(wrong: np.ndarray) -> None:
     pytest.importorskip("matplotlib")
     from cflow_torch.viz import plot_flow

@@ -18,8 +18,8 @@ from fuzzing.ledger import Ledger
 from fuzzing.target import Target
 
 TESTS = Path(__file__).resolve().parents[1]
-HANGS = 20.0  # seconds for one small file
-START = 600.0  # until the first one, after the imports, on a busy machine
+HANGS = 20.0  # seconds of the processor for one small file; a machine may be busy with something else
+STANDS_STILL = 300.0  # seconds of the clock
 MOST_ENDS = 200  # crashes and hangs after which a campaign is given up
 
 
@@ -83,15 +83,21 @@ def _watch(ledger: Ledger, arguments: List[str]) -> str:
         child = subprocess.Popen(
             [sys.executable, "-m", "fuzzing.child", *arguments], env=environment, stderr=stderr, stdout=stderr
         )
-        begun, since = ledger.counts()["cases"], time.monotonic()
-        done = begun
+        begun = done = ledger.counts()["cases"]
+        since, used = time.monotonic(), 0.0
         while child.poll() is None:
             time.sleep(0.2)
             now = ledger.counts()["cases"]
             if now != done:
-                done, since = now, time.monotonic()
-            elif time.monotonic() - since > (START if now == begun else HANGS):
+                done, since, used = now, time.monotonic(), _seconds_of(child.pid)
+            elif now != begun and _seconds_of(child.pid) - used > HANGS or time.monotonic() - since > STANDS_STILL:
                 child.send_signal(signal.SIGABRT)  # faulthandler prints where it was
                 child.wait(10)
                 return "hang"
     return "" if child.returncode == 0 else f"crash{child.returncode}"
+
+
+def _seconds_of(process: int) -> float:
+    """Time that a process has used of the processor, in seconds."""
+    fields = Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
