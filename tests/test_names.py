@@ -21,7 +21,7 @@ from cflow_torch.data.nuscenes import write_nuscenes
 from cflow_torch.data.truckscenes import write_truckscenes
 from cflow_torch.data.waymo import write_waymo_segment
 from cflow_torch.fleet.job import Failed, Job, Unit
-from cflow_torch.fleet.manifest import claim_folder, make_identity
+from cflow_torch.fleet.manifest import claim_folder, claim_log, make_identity
 from cflow_torch.fleet.run import report_file
 from cflow_torch.fleet.shard import Shard
 from cflow_torch.fleet.work import Worker
@@ -256,6 +256,13 @@ def test_logs_of_names_that_differ_by_case_alone_are_not_packed_together() -> No
     require_logs([Named("log-1"), Named("log-2")], None)
     with pytest.raises(CFlowError, match="several logs are called Log, log"):
         require_logs([Named("log"), Named("Log")], None)
+
+
+def test_two_logs_never_share_a_folder(tmp_path: Path) -> None:
+    """As on a file system that takes log and Log for one name."""
+    claim_log(tmp_path, Named("log"), "0" * 64)
+    with pytest.raises(CFlowError, match="two logs have one name"):
+        claim_log(tmp_path, Named("Log"), "0" * 64)
 
 
 def test_time_stamps_of_a_list_of_frames(tmp_path: Path) -> None:

@@ -54,7 +54,7 @@ def task(cfg: DictConfig) -> None:
         pairs = chosen.of(log)
         recent: Any = RecentSweeps(log, history + 2)
         file = output / f"{log.log_id}.rrd"
-        if file in files:
+        if file.name.casefold() in {other.name.casefold() for other in files}:
             failures.append((log.log_id, f"{file} is of another log of this name: give data.root=PATH more narrowly"))
             continue
         try:

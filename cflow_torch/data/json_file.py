@@ -30,7 +30,7 @@ def read_json(file: Path) -> Any:
     Convention: UTF-8, with or without a byte order mark. NaN and Infinity are numbers, as Python writes them: whoever
         needs finite ones checks, since 1e999 is infinite too. An object must not have a key twice.
 
-    Cost: memory of at most 30 times the file, which has at most `MAX_JSON_BYTES`.
+    Cost: memory of at most 40 times the file, which has at most `MAX_JSON_BYTES`.
 
     Raises:
         CFlowError: too large, not UTF-8, no JSON, deeper than `MAX_DEPTH`, a doubled key, half of a surrogate pair, a
