@@ -24,7 +24,7 @@ def windows_for(config: Config, number: int = 1) -> List[Window]:
     """Windows in which every preset finds motion; the last of several is a pair."""
     seeds = (12, 11, 3, 8)[:number]
     return [
-        scene(seed, num_history=0 if number > 1 and seed == seeds[-1] else config.num_history, num_points=120)
+        scene(seed, num_history=0 if number > 1 and seed == seeds[-1] else config.num_history, num_points=90)
         for seed in seeds
     ]
 

@@ -210,8 +210,8 @@ def test_hard_shapes_equal_scipy_in_few_rounds(shape, connectivity, reach, monke
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_rounds_hardly_grow_with_the_size(shape, monkeypatch):
-    """From 63 to 1023 pixels a side, 256 times as many: no more than four more rounds."""
-    few, many = (label(SHAPES[shape](size)[None], 4, 1, monkeypatch)[1].rounds for size in (63, 1023))
+    """From 63 to 511 pixels a side, 66 times as many: no more than four more rounds."""
+    few, many = (label(SHAPES[shape](size)[None], 4, 1, monkeypatch)[1].rounds for size in (63, 511))
     assert many <= few + 4
 
 
