@@ -26,7 +26,8 @@ from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.boxes import MAX_BOXES, Boxes
 from cflow_torch.data.feather_file import FeatherFile
 from cflow_torch.data.flow_file import read_flow
-from cflow_torch.data.parquet_file import ParquetFile
+from cflow_torch.data.parquet_claims import Chunk, Footer, Leaf, check_parquet_claims
+from cflow_torch.data.parquet_file import MAX_STREAMED_BYTES, ParquetFile
 from cflow_torch.data.waymo.reader import WaymoLog
 from cflow_torch.submission.check import check_file
 from cflow_torch.submission.versions import VERSIONS
@@ -208,6 +209,20 @@ def test_names_of_folders_are_no_columns(tmp_path: Path) -> None:
     folder.mkdir()
     parquet.write_table(pa.table(XYZ), str(folder / "a.parquet"))
     assert read_cloud(folder / "a.parquet").shape == (4, 3)
+
+
+def test_a_long_segment_in_one_row_group_is_read() -> None:
+    # 199 frames of Waymo's five lasers, as large as the real ones; once counted as pages, values and levels together.
+    values = 199 * 4 * (64 * 2650 + 4 * 200 * 600)
+    pages = b"".join(page(b"", values // 4, claim=values) for _ in range(4))
+
+    def check(num_values: int) -> None:
+        footer = Footer([Leaf("a", 4, 4)], [995], [[Chunk(0, len(pages), num_values)]])
+        check_parquet_claims("a", pa.BufferReader(pages), footer, ["a"], [0], MAX_STREAMED_BYTES)
+
+    check(values)
+    with pytest.raises(CFlowError, match="column a claims"):
+        check(2 * values)
 
 
 def test_texts_that_share_their_beginnings(tmp_path: Path) -> None:

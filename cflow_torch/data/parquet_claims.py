@@ -22,7 +22,7 @@ _FIRST_LOOK, _MAX_HEADER = 256, 1 << 16  # bytes of a page's header: 20 to 100, 
 _PREFIXED = 7  # DELTA_BYTE_ARRAY: texts that repeat the beginning of the one before, so that they cost nothing
 _BYTE_ARRAY = 6
 _WIDTH = {0: 1, 1: 4, 2: 8, 3: 12, 4: 4, 5: 8, _BYTE_ARRAY: 4}  # bytes of a physical type; texts: of their number
-_LEVELS, _WORD, _ROW = 4, 16, 12  # bytes in memory: two levels of a value, the entry of a dictionary, a point
+_WORD, _ROW = 16, 12  # bytes in memory: the entry of a dictionary, a point
 _META = {1: I32, 5: I64, 7: I64, 9: I64, 11: I64}
 _FOOTER = {2: [{1: I32, 2: I32, 4: TEXT, 5: I32}], 4: [{1: [{3: _META}], 3: I64}]}
 _DATA, _DICTIONARY, _DATA2 = 5, 7, 8
@@ -175,7 +175,8 @@ def _pages(source: Any, chunk: Chunk, leaf: Leaf, max_pages: int) -> Tuple[int, 
         if count > max_pages:
             raise ValueError(f"more than {MAX_PAGES} pages")
         num_values, size, at = num_values + values, size + head[2], at + length + head[3]
-    return size + max(num_values, chunk.num_values) * (leaf.width + _LEVELS), count
+    values = max(num_values, chunk.num_values) * leaf.width
+    return size + values if leaf.is_text else max(size, values), count  # pages of numbers become the values
 
 
 def _header(source: Any, at: int) -> Tuple[Any, int]:
