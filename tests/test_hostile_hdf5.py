@@ -104,6 +104,35 @@ def test_a_second_name_of_another_key_is_not_written_over(scene: Path) -> None:
     assert scene.read_bytes() == before
 
 
+@pytest.mark.parametrize("libver", ["earliest", "latest"])
+@pytest.mark.parametrize("start", [0, 512])
+def test_virtual_data_are_told_before_they_are_opened(
+    libver: str, start: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """libhdf5 2.0.0 loops for ever over a damaged list of their sources, which it reads when it opens them."""
+    with h5py.File(tmp_path / "scene.h5", "w", libver=libver, userblock_size=start) as opened:
+        for stamp in STAMPS:
+            for key, value in sweep_values(0).items():
+                opened[f"{stamp}/{key}"] = value
+        del opened[FIRST]["lidar"], opened[FIRST]["flow"]
+        virtual(opened[FIRST], "lidar", "outside.h5")
+        virtual(opened[FIRST], "flow", ".")
+        for number in range(30):  # the header goes on elsewhere
+            opened[FIRST]["lidar"].attrs[f"attribute {number}"] = np.zeros(9)
+    opens = h5py.h5o.open
+
+    def opened_once(parent: Any, name: bytes) -> Any:
+        assert name not in (b"lidar", b"flow"), "it is opened"
+        return opens(parent, name)
+
+    with HDF5Log(tmp_path / "scene.h5", None) as log:
+        assert len(log.sweep(1).points) == POINTS and log.labels(1) is not None
+        monkeypatch.setattr(h5py.h5o, "open", opened_once)
+        for key in ("lidar", "flow"):
+            with pytest.raises(CFlowError, match=f"{key} lies in other files"):
+                log.values(0, key)
+
+
 @pytest.mark.parametrize("source", [b"pipe", b"pipe%b"])
 def test_virtual_data_without_a_limit_open_nothing(source: bytes, scene: Path) -> None:
     """To ask HDF5 for their shape would open the source: here a pipe, which is waited for without an end."""

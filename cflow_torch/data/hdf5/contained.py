@@ -14,6 +14,7 @@ import numpy as np
 
 from cflow_torch.data.bounds import check_claim
 from cflow_torch.data.hdf5.chunks import Stored, filters_of, read_chunks
+from cflow_torch.data.hdf5.layout_message import is_virtual
 from cflow_torch.types import CFlowError
 
 _MEND = "write the scene anew: groups with arrays of plain numbers in the file itself"
@@ -98,8 +99,11 @@ def _opened(parent: Any, name: str, where: str) -> Optional[Any]:
         links = parent.id.links  # `in` and `get` of h5py open what a link names, be it a file elsewhere
         if not links.exists(stored):
             return None
-        if links.get_info(stored).type != h5py.h5l.TYPE_HARD:
+        link = links.get_info(stored)
+        if link.type != h5py.h5l.TYPE_HARD:
             raise CFlowError(f"{where}: {name} is a link, which is not followed; {_MEND}")
+        if is_virtual(parent.id, link.u):
+            raise CFlowError(f"{where}: {name} lies in other files, which are not read; {_MEND}")
         return h5py.h5o.open(parent.id, stored)
 
 
