@@ -110,6 +110,7 @@ class Gone:
         raise OSError(5, "Input/output error")
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # tqdm's, of a bar that never was
 def test_work_goes_on_if_nobody_hears(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(progress, "EVERY", -1.0)
     with pytest.MonkeyPatch.context() as patch:

@@ -325,10 +325,10 @@ def test_a_closed_terminal_loses_nothing(fleet: Path, single: Dict[str, bytes], 
     )
     os.close(theirs)
     deadline = time.monotonic() + 120
-    while not (tmp_path / "manifest.json").exists() and time.monotonic() < deadline:
+    while not list(tmp_path.glob("*/*.feather")) and time.monotonic() < deadline:
         time.sleep(0.01)
     os.close(ours)
-    assert process.wait(60) in (0, 1, 129)
+    assert process.wait(60) in (0, 1, 129, -signal.SIGHUP), "the last one, if the work was over"
     assert {n: c for n, c in tree(tmp_path).items() if "/." not in n}.items() <= single.items()
     assert (tmp_path / "reports" / "shard-0-of-1.json").exists()
     assert flow(fleet, tmp_path) == 0

@@ -5,8 +5,8 @@ metres until the next sweep, axes of the ego frame at t+1), cluster_id, score, i
 contents=[residual,is_valid] writes these columns only: the others follow from the poses, and take most of the room.
 contents=[residual,is_valid,confidence] also tells how far each point can be trusted (not model=paper, keypoints).
 OUTPUT/config.yaml holds the resolved settings and versions, OUTPUT/reports what was done. The same command again goes
-on where the last one ended. Ctrl-C and SIGTERM let the frames in hand be finished. The status is 0 if every frame is
-there, 1 if one is missing, 2 if the call was wrong, 130 or 143 after a signal.
+on where the last one ended. Ctrl-C, SIGTERM and SIGHUP let the frames in hand be finished. The status is 0 if every
+frame is there, 1 if one is missing, 2 if the call was wrong, 128 and its number after a signal.
 
 result_name=NAME (HDF5 scenes) also writes the total flow into the scenes themselves, as key NAME of every sweep, where
 the viewers of OpenSceneFlow find it.

@@ -14,7 +14,7 @@ from cflow_torch.types import CFlowError
 
 AUTO = "auto"
 _MOST = 100_000  # workers, threads or windows; more is a slip
-# Bytes that one worker may come to hold: three times the most that `paper` was seen to take, see docs/fleet.md.
+# Bytes that one worker may come to hold: nearly twice the most that `default` was seen to take, see docs/fleet.md.
 WORKER_MEMORY = 1_500_000_000
 # Windows that are computed together. A CPU gains up to 4 (fewer small operations), then loses (cold memory).
 CPU_BATCH = 4
