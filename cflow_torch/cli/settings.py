@@ -62,7 +62,9 @@ def check_shape(cfg: DictConfig, command: str) -> None:
         OmegaConf.resolve(cfg)
     except RecursionError:
         raise CFlowError("settings refer to each other (${...}) in a circle, or are nested too deep") from None
-    _check_shape(cfg, _load(CONFIGS / f"{command}.yaml")[0], [g for g in groups(command) if g != "experiment"], "")
+    # A group whose files write at the top (picture, experiment) leaves no mapping of its own name.
+    mappings = [group for group in groups(command) if not _load(CONFIGS / group / f"{choices(group)[0]}.yaml")[1]]
+    _check_shape(cfg, _load(CONFIGS / f"{command}.yaml")[0], mappings, "")
 
 
 def _check_shape(given: DictConfig, known: DictConfig, mappings: Iterable[str], prefix: str) -> None:
