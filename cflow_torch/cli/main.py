@@ -133,6 +133,8 @@ def _run_with_settings(command: str, run: Any, rest: List[str]) -> None:
         if stop.code == 2 and _is_of_parser(stop):  # an option that it does not know
             print(f"`cflow {command} --help` has examples", file=sys.stderr)
         raise
+    except BrokenPipeError:  # of Hydra's own printing
+        raise
     except Exception as error:
         if given:
             raise

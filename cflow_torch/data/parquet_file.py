@@ -43,7 +43,7 @@ class ParquetFile:
         if isinstance(source, str):
             source = pa.OSFile(source)
         elif not isinstance(source, pa.NativeFile):
-            source = pa.PythonFile(source)
+            source = pa.PythonFile(source, mode="r")
         self._source = source
         with arrow_errors(file):
             self._footer = read_footer(file, source)
