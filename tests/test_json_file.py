@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import time
 import tracemalloc
 from pathlib import Path
 from typing import Any
@@ -179,3 +180,12 @@ def test_settings_are_read_back(tmp_path: Path) -> None:
     file.write_text(OmegaConf.to_yaml(OmegaConf.create(values)))
     assert read_settings(file) == values
     assert plain_yaml("a: ${oc.env:HOME}") == {"a": "${oc.env:HOME}"}, "nothing is looked up"
+
+
+def test_a_key_that_stands_twice_is_found_in_linear_time(tmp_path: Path) -> None:
+    names = [*range(30_000), 29_999]
+    (tmp_path / "a.json").write_text("{" + ", ".join(f'"{name}": 0' for name in names) + "}")
+    begin = time.process_time()
+    with pytest.raises(CFlowError, match="'29999' stands twice"):
+        read_json(tmp_path / "a.json")
+    assert time.process_time() - begin < 2  # one by one it took 8 s
