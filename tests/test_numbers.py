@@ -231,7 +231,7 @@ def test_a_million_points_in_one_pixel_are_one_point(preset):
     point = window.pc0.points[np.argmax(cflow(window, config).residual_flow.any(1).numpy())][None]
 
     def elsewhere(sweep: Sweep) -> Sweep:
-        keep = (np.floor(sweep.points[:, :2] / 0.25) != np.floor(point[:, :2] / 0.25)).any(1)
+        keep = (np.abs(sweep.points[:, :2] - point[:, :2]) > 0.5).any(1)
         return Sweep(sweep.points[keep], sweep.is_ground[keep])
 
     window = changed(window, elsewhere)
