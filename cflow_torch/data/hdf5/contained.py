@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import math
 from contextlib import contextmanager
-from typing import Any, Iterator, List, Optional
+from typing import Any, Iterator, List, NamedTuple, Optional
 
 import numpy as np
 
 from cflow_torch.data.bounds import check_claim
 from cflow_torch.data.hdf5.chunks import Stored, filters_of, read_chunks
-from cflow_torch.data.hdf5.layout_message import is_virtual
+from cflow_torch.data.hdf5.layout_message import RawFile, is_virtual, raw_file
 from cflow_torch.types import CFlowError
 
 _MEND = "write the scene anew: groups with arrays of plain numbers in the file itself"
@@ -46,7 +46,19 @@ def names(parent: Any, where: str) -> List[str]:
     return found
 
 
-def group(parent: Any, name: str, where: str) -> Optional[Any]:
+class Group(NamedTuple):
+    """A group of a scene.
+
+    Args:
+        opened: h5py's group.
+        raw: bytes of the file, None = not at hand.
+    """
+
+    opened: Any
+    raw: Optional[RawFile]
+
+
+def group(scene: Any, name: str, where: str) -> Optional[Group]:
     """The group of a name; None where there is none. No link is ever followed.
 
     Raises:
@@ -54,15 +66,17 @@ def group(parent: Any, name: str, where: str) -> Optional[Any]:
     """
     import h5py
 
-    opened = _opened(parent, name, where)
+    with hdf5_errors(f"{where} cannot be read as HDF5"):
+        raw = raw_file(scene.id)
+    opened = _opened(Group(scene, raw), name, where)
     if opened is None:
         return None
     if not isinstance(opened, h5py.h5g.GroupID):
         raise CFlowError(f"{where}: {name} is no group; {_MEND}")
-    return h5py.Group(opened)
+    return Group(h5py.Group(opened), raw)
 
 
-def array(parent: Any, name: str, where: str) -> Optional[Stored]:
+def array(parent: Group, name: str, where: str) -> Optional[Stored]:
     """An array of plain numbers in the file itself; None where there is none. Nothing of it is read.
 
     Raises:
@@ -89,22 +103,22 @@ def array(parent: Any, name: str, where: str) -> Optional[Stored]:
         return Stored(opened, shape, opened.dtype, plan.get_chunk() if layout == h5py.h5d.CHUNKED else None, filters)
 
 
-def _opened(parent: Any, name: str, where: str) -> Optional[Any]:
+def _opened(parent: Group, name: str, where: str) -> Optional[Any]:
     import h5py
 
     if not name or "/" in name or name == ".":
         return None
     with hdf5_errors(f"{where}: cannot open {name}"):
         stored = name.encode()
-        links = parent.id.links  # `in` and `get` of h5py open what a link names, be it a file elsewhere
+        links = parent.opened.id.links  # `in` and `get` of h5py open what a link names, be it a file elsewhere
         if not links.exists(stored):
             return None
         link = links.get_info(stored)
         if link.type != h5py.h5l.TYPE_HARD:
             raise CFlowError(f"{where}: {name} is a link, which is not followed; {_MEND}")
-        if is_virtual(parent.id, link.u):
+        if parent.raw is not None and is_virtual(parent.raw, link.u):
             raise CFlowError(f"{where}: {name} lies in other files, which are not read; {_MEND}")
-        return h5py.h5o.open(parent.id, stored)
+        return h5py.h5o.open(parent.opened.id, stored)
 
 
 def check_numbers(opened: Any, what: str) -> None:

@@ -7,29 +7,45 @@ ever (seen with 2.0.0). So it must be known before. What cannot be made out here
 from __future__ import annotations
 
 import os
-from typing import Any, Iterator, Tuple
+from typing import Any, Iterator, NamedTuple, Optional, Tuple
 
 _LAYOUT, _CONTINUATION = 0x08, 0x10  # types of messages
 _VIRTUAL = 3
 _HEAD, _MOST_BYTES, _MOST_BLOCKS = 64, 1 << 16, 64
 
 
-def is_virtual(scene: Any, address: int) -> bool:
-    """Whether the header at an address says so.
+class RawFile(NamedTuple):
+    """A file's bytes beside libhdf5.
 
     Args:
-        scene: h5py's low-level file or group.
-        address: of the object's header.
+        handle: of the operating system.
+        start: bytes before the part that is HDF5.
+    """
 
-    Convention: sizes of 8 bytes for addresses and lengths, as every scene has them. False for files that are not on
-        this machine, and on Windows, which cannot read beside libhdf5 without moving its place in the file.
+    handle: int
+    start: int
+
+
+def raw_file(file: Any) -> Optional[RawFile]:
+    """The bytes of h5py's low-level file.
+
+    Returns:
+        None for files that are not on this machine, and on Windows, which cannot read beside libhdf5 without moving its
+        place in the file: there virtual data are told only after they are opened.
     """
     import h5py
 
-    file = h5py.h5i.get_file_id(scene)
     if not hasattr(os, "pread") or file.get_access_plist().get_driver() != h5py.h5fd.SEC2:
-        return False
-    handle, start = file.get_vfd_handle(), file.get_create_plist().get_userblock()
+        return None
+    return RawFile(file.get_vfd_handle(), file.get_create_plist().get_userblock())
+
+
+def is_virtual(raw: RawFile, address: int) -> bool:
+    """Whether the header at an address says so.
+
+    Convention: sizes of 8 bytes for addresses and lengths, as every scene has them.
+    """
+    handle, start = raw
     head = os.pread(handle, _HEAD, start + address)
     if len(head) < _HEAD // 4:
         return False

@@ -10,7 +10,7 @@ from typing import Any, List, Optional, Sequence, Tuple, Type
 import numpy as np
 
 from cflow_torch.data.hdf5.chunks import Stored
-from cflow_torch.data.hdf5.contained import array, check_numbers, group, hdf5_errors, names, read
+from cflow_torch.data.hdf5.contained import Group, array, check_numbers, group, hdf5_errors, names, read
 from cflow_torch.data.hdf5.frames import StoredMotion, harness_motion, is_argoverse2, recognized_extrinsics
 from cflow_torch.data.hdf5.index_file import read_index
 from cflow_torch.data.log import FlowLabels
@@ -165,7 +165,7 @@ class HDF5Log:
     def keys(self, index: int) -> Tuple[str, ...]:
         """Names of everything that sweep `index` has, results included."""
         timestamp = self._timestamp(index)
-        return tuple(sorted(names(self._group(timestamp), f"{self.file}: sweep {timestamp}")))
+        return tuple(sorted(names(self._group(timestamp).opened, f"{self.file}: sweep {timestamp}")))
 
     def values(self, index: int, key: str) -> np.ndarray:
         """What a sweep has under a key, as it is stored; (N, 1) columns become (N,).
@@ -244,9 +244,12 @@ class HDF5Log:
             raise CFlowError(f"scene {self.log_id} has {len(self.timestamps)} sweeps, there is no sweep {index}")
         return self.timestamps[index]
 
-    def _group(self, timestamp: int) -> Any:
+    def _group(self, timestamp: int) -> Group:
         if self._last[0] != timestamp:  # a sweep is asked for one key after the other
-            self._last = timestamp, group(self._scene, str(timestamp), str(self.file))
+            found = group(self._scene, str(timestamp), str(self.file))
+            if found is None:
+                raise CFlowError(f"{self.file} lists a sweep {timestamp} that it does not have; copy it again")
+            self._last = timestamp, found
         return self._last[1]
 
     def _array(self, timestamp: int, key: str) -> Optional[Stored]:

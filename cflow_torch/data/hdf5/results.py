@@ -125,7 +125,7 @@ def _write(scene: Any, file: Path, timestamp: str, name: str, flow: np.ndarray) 
     older = array(sweep, name, where)
     with hdf5_errors(f"{where}: {name} cannot be written", _MEND):
         if older is None:
-            sweep.create_dataset(name, data=flow.astype(np.float32))
+            sweep.opened.create_dataset(name, data=flow.astype(np.float32))
             return
         # Two names of one dataset: another key would change as well.
         if older.shape != (rows, 3) or older.dtype != np.float32 or h5py.h5o.get_info(older.opened).rc > 1:
