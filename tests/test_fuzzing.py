@@ -33,6 +33,11 @@ def test_whole_files_are_read(name: str, folder: Path) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_hostile_files(name: str, folder: Path) -> None:
+    if TARGETS[name].needs == "h5py":
+        h5py = pytest.importorskip("h5py")
+        if h5py.version.hdf5_version_tuple < (2, 0, 0):
+            pytest.skip(f"HDF5 {h5py.version.hdf5_version} itself crashes on damaged files: see docs/trust.md")
+
     @settings(
         max_examples=NUM_CASES,
         derandomize=True,

@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 import sys
+import sysconfig
 import zipfile
 from pathlib import Path
 from typing import Dict, List
@@ -53,7 +54,10 @@ def test_every_package_of_this_environment_is_listed() -> None:
     from importlib.metadata import distributions
 
     listed = {entry.split("==")[0] for file in LISTS for entry in _entries(file)}
-    there = {re.sub(r"[-_.]+", "-", each.metadata["Name"]).lower() for each in distributions()}
+    there = {
+        re.sub(r"[-_.]+", "-", each.metadata["Name"]).lower()
+        for each in distributions(path=[sysconfig.get_path("purelib")])
+    }
     assert there - listed == {"cflow-torch", "pip"}
 
 

@@ -9,10 +9,11 @@ from typing import Any, List, NamedTuple, Optional, Tuple
 
 import numpy as np
 
+from cflow_torch.data.arrays.lzf import decompress
 from cflow_torch.data.bounds import check_claim
 from cflow_torch.types import CFlowError
 
-_DEFLATE, _SHUFFLE = 1, 2  # numbers of the filters in the format
+_DEFLATE, _SHUFFLE, _LZF = 1, 2, 32000  # numbers of the filters in the format
 _MEND = "write it anew, uncompressed or with gzip (compression='gzip' of h5py)"
 MAX_CHUNKS = 100_000  # of one dataset; h5py makes chunks of 8 KiB and more
 
@@ -36,7 +37,7 @@ class Stored(NamedTuple):
 
 
 def filters_of(plan: Any, what: str) -> List[int]:
-    """The filters that a dataset went through: none, shuffle, gzip, or shuffle and then gzip.
+    """The filters that a dataset went through: shuffle or none, then gzip, LZF or none.
 
     Args:
         plan: h5py's property list of the dataset.
@@ -47,9 +48,9 @@ def filters_of(plan: Any, what: str) -> List[int]:
             would load a library for those that it does not know.
     """
     filters = [plan.get_filter(number)[0] for number in range(plan.get_nfilters())]
-    if filters not in ([], [_SHUFFLE], [_DEFLATE], [_SHUFFLE, _DEFLATE]):
+    if filters not in [first + last for first in ([], [_SHUFFLE]) for last in ([], [_DEFLATE], [_LZF])]:
         raise CFlowError(
-            f"{what} is packed with the filters {filters[:8]}, gzip is read (with or without shuffle); {_MEND}"
+            f"{what} is packed with the filters {filters[:8]}, gzip and lzf are read (with or without shuffle); {_MEND}"
         )
     return filters
 
@@ -93,11 +94,20 @@ def _unpacked(stored: Stored, corner: Any, size: int, what: str) -> Any:
             data = unpacker.decompress(data, size + 1)
             if not unpacker.eof:
                 raise CFlowError(f"{what}: the chunk at {corner} does not end after {size} bytes; copy it again")
+        elif kind == _LZF:
+            data = _unpacked_lzf(data, size, f"{what}: the chunk at {corner}")
         elif len(data) == size:
             data = _unshuffled(data, stored.dtype.itemsize)
     if len(data) != size:
         raise CFlowError(f"{what}: the chunk at {corner} unpacks to {len(data)} bytes, expected {size}; copy it again")
     return data
+
+
+def _unpacked_lzf(data: bytes, size: int, what: str) -> bytes:
+    try:
+        return decompress(data, size)
+    except ValueError as error:  # a CFlowError too
+        raise CFlowError(f"{what} cannot be unpacked ({error}); copy it again") from error
 
 
 def _unshuffled(data: Any, itemsize: int) -> Any:
