@@ -17,7 +17,7 @@ from pyarrow import feather
 from cflow_torch import CFlowError
 from cflow_torch.submission.check import check_submission
 from cflow_torch.submission.masks import MaskArchive
-from cflow_torch.submission.plan import Frame, read_frame_list
+from cflow_torch.submission.plan import Frame
 from cflow_torch.submission.versions import get_version
 from fuzzing.target import Target
 
@@ -165,13 +165,4 @@ TARGETS = (
         tokens=_MARKS,
     ),
     Target("zip-masks", "masks.zip", lambda: _seeds(_masks), _read_masks, crafted=_crafted(_masks), tokens=_MARKS),
-    Target(
-        *(
-            "frame-list",
-            "frames.txt",
-            lambda: [_LIST, _LIST[9:]],
-            lambda folder: read_frame_list(folder / "frames.txt"),
-        ),
-        tokens=(b"\n", b"#", b"/", b",", b"..", b"\0", b"\xff", "²".encode(), b"9" * 5000, b"log-a", b"7"),
-    ),
 )
