@@ -71,13 +71,15 @@ def test_large_files_pipes_and_devices_are_not_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("piece", ["[]", "{}", '{"":{}}', "[0]", '{"":0}', "999", '"\u00e9x"', '{"":[]}'])
-def test_a_document_takes_at_most_40_times_its_size(piece: str, tmp_path: Path) -> None:
+def test_a_document_takes_at_most_50_times_its_size(piece: str, tmp_path: Path) -> None:
     file = tmp_path / "a.json"
     file.write_text(f'[{",".join([piece] * 20_000)},"\U0001f600"]', encoding="utf-8")
     tracemalloc.start()
-    read_json(file)
-    assert tracemalloc.get_traced_memory()[1] < 40 * file.stat().st_size
-    tracemalloc.stop()
+    try:
+        read_json(file)
+        assert tracemalloc.get_traced_memory()[1] < 50 * file.stat().st_size
+    finally:
+        tracemalloc.stop()
 
 
 def test_numbers_that_float64_and_int64_hold() -> None:
