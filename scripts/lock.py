@@ -7,6 +7,7 @@ which PyPI does not have for Linux) and cuda (what torch from PyPI needs besides
 
 from __future__ import annotations
 
+import argparse
 import hashlib
 import io
 import json
@@ -202,6 +203,7 @@ def lists() -> Dict[str, Dict[Tuple[str, str], Set[str]]]:
 
 
 def main() -> None:
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     abouts = {
         "build": "What builds the package and what has no wheel.",
         "demo": "What ./scripts/demo.sh installs.",

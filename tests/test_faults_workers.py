@@ -100,11 +100,12 @@ def test_a_line_waits_for_its_calls_but_not_after_ctrl_c() -> None:
 
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="no SIGHUP on this system")
 def test_a_terminal_that_is_closed_stops_a_run_but_not_under_nohup() -> None:
-    with StopSignal() as stop:
-        os.kill(os.getpid(), signal.SIGHUP)
-        assert stop() and stop.exit_status == 129
-    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)  # the tests themselves may run under nohup
     try:
+        with StopSignal() as stop:
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert stop() and stop.exit_status == 129
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
         with StopSignal() as stop:
             os.kill(os.getpid(), signal.SIGHUP)
             assert not stop()

@@ -297,7 +297,7 @@ def test_a_wrong_call_of_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyP
         assert error.startswith(f"error: {given.replace('null', 'None')}") and error.count("\n") == 1
     (tmp_path / "file").touch()
     assert view("output=file/below", "data.num_sweeps=2", "model=paper") == 2
-    assert "error: file: File exists; give places" in capsys.readouterr().err
+    assert "error: cannot write into file/below ([Errno 17] File exists: 'file')" in capsys.readouterr().err
     assert not list(tmp_path.rglob("*.rrd"))
 
 
