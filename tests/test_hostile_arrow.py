@@ -397,6 +397,15 @@ def test_hostile_components(tmp_path: Path, tag: str, column: int, values: Any, 
         log.sweep(1)
 
 
+@pytest.mark.parametrize("column", [4, 5])
+def test_limits_of_beams_that_are_empty_lists(tmp_path: Path, column: int) -> None:
+    TARGETS["waymo"].prepare(tmp_path)
+    place, empty = tmp_path / "lidar_calibration" / "seg.parquet", pa.array([[]] * 2, pa.list_(pa.float64()))
+    changed(place, lambda table: table.set_column(column, table.column_names[column], empty))
+    with pytest.raises(CFlowError, match="neither beam inclinations nor their limits"):
+        WaymoLog(tmp_path / "lidar" / "seg.parquet").sweep(0)
+
+
 @pytest.mark.parametrize("name", ["cluster_id", "is_valid", "flow_tx_m", "score"])
 @pytest.mark.parametrize("values", [["a"] * 4, np.zeros(4, np.uint64), [None] * 4, np.zeros(4, np.float64)])
 def test_hostile_flow_files(tmp_path: Path, name: str, values: Any) -> None:

@@ -254,8 +254,7 @@ class WaymoLog:
             row = lasers.index(laser)
             transform, values, low, high = (cell_of(table, CALIBRATION + name, row, file) for name in names)
             where = f"{file}: extrinsic of laser {laser}"
-            if values is not None and not len(values):
-                values = None
+            values, low, high = (None if cell is None or not len(cell) else cell for cell in (values, low, high))
             if values is None and (low is None or high is None):
                 raise CFlowError(f"{file}: laser {laser} has neither beam inclinations nor their limits; copy it again")
             calibration[laser] = LaserCalibration(
