@@ -406,6 +406,14 @@ def test_limits_of_beams_that_are_empty_lists(tmp_path: Path, column: int) -> No
         WaymoLog(tmp_path / "lidar" / "seg.parquet").sweep(0)
 
 
+def test_a_row_group_of_fewer_rows_than_it_claims(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    TARGETS["waymo"].prepare(tmp_path)
+    log = WaymoLog(tmp_path / "lidar" / "seg.parquet")
+    monkeypatch.setattr(ParquetFile, "batches", lambda *_: iter(()))  # what Arrow made of a damaged file
+    with pytest.raises(CFlowError, match="fewer rows than it claims: row 0 is missing"):
+        log.sweep(0)
+
+
 @pytest.mark.parametrize("name", ["cluster_id", "is_valid", "flow_tx_m", "score"])
 @pytest.mark.parametrize("values", [["a"] * 4, np.zeros(4, np.uint64), [None] * 4, np.zeros(4, np.float64)])
 def test_hostile_flow_files(tmp_path: Path, name: str, values: Any) -> None:

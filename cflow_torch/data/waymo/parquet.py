@@ -115,6 +115,9 @@ def read_images(file: Path, numbers: Sequence[int], column: str, channels: int) 
                     if number in numbers:
                         images[number] = _image(values, shape, channels, file)
                     number += 1
+    missing = [number for number in numbers if number not in images]
+    if missing:  # what the footer says of its row groups is not true
+        raise CFlowError(f"{file} has fewer rows than it claims: row {missing[0]} is missing, copy it again")
     return images
 
 
