@@ -316,6 +316,7 @@ def test_settings_that_a_run_left(text: str, marker: Path, tmp_path: Path) -> No
 @pytest.mark.parametrize(
     "override",
     [
+        "~engine.threads",
         "+model._target_=os.mkdir +model.path={marker}",
         "+data._target_=os.mkdir +data.path={marker}",
         "model.method={{_target_:os.mkdir,path:{marker}}}",

@@ -65,6 +65,12 @@ def check_shape(cfg: DictConfig, command: str) -> None:
     # A group whose files write at the top (picture, experiment) leaves no mapping of its own name.
     mappings = [group for group in groups(command) if not _load(CONFIGS / group / f"{choices(group)[0]}.yaml")[1]]
     _check_shape(cfg, _load(CONFIGS / f"{command}.yaml")[0], mappings, "")
+    for group in mappings:
+        if group != "model":  # what is not said of the method has a default
+            files = [_load(CONFIGS / group / f"{choice}.yaml")[0] for choice in choices(group)]
+            for key in sorted(set.intersection(*({str(key) for key in file} for file in files)) - {"defaults"}):
+                if key not in cfg[group] and not OmegaConf.is_missing(cfg[group], key):
+                    raise CFlowError(f"setting {group}.{key} was taken out: leave out ~{group}.{key}")
 
 
 def _check_shape(given: DictConfig, known: DictConfig, mappings: Iterable[str], prefix: str) -> None:
