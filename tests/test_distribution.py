@@ -19,7 +19,7 @@ metadata = pytest.importorskip("packaging.metadata", reason="needs packaging 23.
 
 ROOT = Path(__file__).resolve().parents[1]
 TOP_LEVEL = ("CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "LICENSE", "MANIFEST.in", "README.md")
-TOP_LEVEL = (*TOP_LEVEL, "hubconf.py", "pyproject.toml")
+TOP_LEVEL = (*TOP_LEVEL, "SECURITY.md", "hubconf.py", "pyproject.toml")
 FOLDERS = ("cflow_torch", "configs", "docs", "notebooks", "scripts", "tests")
 MADE = ("__pycache__", "*.py[cod]", "*.egg-info", ".*", "outputs", "multirun")
 

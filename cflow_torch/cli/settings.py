@@ -67,10 +67,15 @@ def check_shape(cfg: DictConfig, command: str) -> None:
     _check_shape(cfg, _load(CONFIGS / f"{command}.yaml")[0], mappings, "")
     for group in mappings:
         if group != "model":  # what is not said of the method has a default
-            files = [_load(CONFIGS / group / f"{choice}.yaml")[0] for choice in choices(group)]
-            for key in sorted(set.intersection(*({str(key) for key in file} for file in files)) - {"defaults"}):
-                if key not in cfg[group] and not OmegaConf.is_missing(cfg[group], key):
-                    raise CFlowError(f"setting {group}.{key} was taken out: leave out ~{group}.{key}")
+            _check_group(cfg[group], group)
+
+
+def _check_group(given: DictConfig, group: str) -> None:
+    """Refuse a group that lacks what each of its choices has."""
+    files = [_load(CONFIGS / group / f"{choice}.yaml")[0] for choice in choices(group)]
+    for key in sorted(set.intersection(*({str(key) for key in file} for file in files)) - {"defaults"}):
+        if key not in given and not OmegaConf.is_missing(given, key):
+            raise CFlowError(f"setting {group}.{key} was taken out: leave out ~{group}.{key}")
 
 
 def _check_shape(given: DictConfig, known: DictConfig, mappings: Iterable[str], prefix: str) -> None:

@@ -1,4 +1,4 @@
-"""LZF, the byte compression inside `.pcd` files: runs of plain bytes and references to earlier output."""
+"""LZF, the byte compression inside `.pcd` files and chunks of HDF5: runs of plain bytes and references to earlier output."""
 
 from __future__ import annotations
 
