@@ -1,4 +1,4 @@
-"""LZF, the byte compression inside `.pcd` files and chunks of HDF5: runs of plain bytes and references to earlier output."""
+"""LZF, the byte compression in `.pcd` files and HDF5 chunks: runs of plain bytes and references to earlier output."""
 
 from __future__ import annotations
 
