@@ -151,7 +151,10 @@ SHRUNK: Tuple[Rule, ...] = (
     Rule(r"bench_keypoints\.py", "one run of each", add="--repeats 1", slow=True),
     Rule(r"bench_fleet\.py throughput", "one round", add="--repeats 1 --windows 40", slow=True),
     Rule(
-        r"scripts/fuzz\.py.* --engine atheris", "atheris is no part of the tests", replace=((" --engine atheris", ""),)
+        r"scripts/fuzz\.py.* --engine atheris",
+        "atheris is no part of the tests",
+        replace=((" --engine atheris", ""),),
+        slow=True,
     ),
     Rule(r"scripts/fuzz\.py", "100 files", add="--engine hypothesis --cases 100"),
     Rule(r"leaks\.py", "60 windows", add="--windows 60", slow=True),

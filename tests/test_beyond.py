@@ -129,7 +129,7 @@ def test_cuda_equals_cpu(options):
 
 
 @pytest.mark.parametrize("engine", CORRELATIONS)
-@pytest.mark.parametrize("num_slices", [2, 5, 8])
+@pytest.mark.parametrize("num_slices", [pytest.param(2, marks=pytest.mark.slow), 5, 8])
 def test_best_shifts_of_slices_equal_the_loop(num_slices, engine):
     """All sizes in one call, two templates per target."""
     rng = np.random.default_rng(num_slices)

@@ -97,7 +97,7 @@ def test_flow_files_hold_the_method_s_result(log_folder: Path, tmp_path: Path) -
 def test_flow_goes_on_with_its_folder_and_refuses_another_run_s(
     log_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
-    call = ("flow", "data=av2", f"data.root={log_folder}", f"output={tmp_path}", "model=paper")
+    call = ("flow", "data=av2", f"data.root={log_folder}", f"output={tmp_path}", "model=paper", "engine.workers=1")
     assert run(*call) == 0
     assert run(*call) == 0
     assert re.search(r"complete before +3\n", capsys.readouterr().out)

@@ -458,6 +458,7 @@ def test_figures_hold_the_numbers(tmp_path: Path, script: Any) -> None:
     assert [axes.get_title() for axes in plots.draw("range_split", paper["range_split"], runs["range_split"]).axes][:2]
 
 
+@pytest.mark.slow
 def test_paper_script_passes_settings_on(log_folder: Path, tmp_path: Path) -> None:
     command = [sys.executable, str(SCRIPTS / "paper.py"), "data=av2", f"data.root={log_folder}", f"output={tmp_path}"]
     environment = {**os.environ, "PYTHONPATH": str(SCRIPTS.parent)}

@@ -377,7 +377,7 @@ REAL_SERVE = local.serve
 LAYOUT = Layout(("cpu", "cpu"), 1, 2)
 
 
-@pytest.mark.parametrize("once", [True, False], ids=["once", "always"])
+@pytest.mark.parametrize("once", [True, pytest.param(False, marks=pytest.mark.slow)], ids=["once", "always"])
 def test_a_killed_worker_is_replaced(
     fleet: Path, single: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, once: bool
 ) -> None:
@@ -654,6 +654,7 @@ def test_one_worker_uses_the_threads_it_is_given(fleet: Path, tmp_path: Path, mo
     assert seen == [before + 1] and torch.get_num_threads() == before
 
 
+@pytest.mark.slow
 def test_a_killed_worker_of_an_overwriting_run_repeats_nothing(
     fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -699,7 +700,7 @@ def slow_serve(*arguments: Any) -> None:
     write = Worker._write
 
     def slow_write(self: Worker, folder: Path, frame: Any) -> Any:
-        time.sleep(2 if folder.name.endswith("1") else 0)
+        time.sleep(1 if folder.name.endswith("1") else 0)
         return write(self, folder, frame)
 
     Worker._write = slow_write  # type: ignore[method-assign]

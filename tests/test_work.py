@@ -181,7 +181,9 @@ def cars(num_history: int, side: float = 35.0) -> Window:
 
 
 @pytest.mark.parametrize("num_history", [0, 1])
-@pytest.mark.parametrize("settings", [PROOF, ALL_PARTS], ids=["proof", "all parts"])
+@pytest.mark.parametrize(
+    "settings", [pytest.param(PROOF, id="proof"), pytest.param(ALL_PARTS, id="all parts", marks=pytest.mark.slow)]
+)
 def test_max_memory_bounds_the_proof_at_its_worst(settings, num_history):
     config = make_config("paper", num_history=num_history, **settings)
     sweeps, grid = cars(num_history), Grid(0.1, config.point_cloud_range[:3], config.point_cloud_range[3:])
