@@ -130,6 +130,9 @@ def test_the_version() -> None:
         (["bench", "repeats=abc"], "repeats=abc: give a whole number"),
         (["bench", "batches=[0]"], "batches=[0]: give a list of whole numbers"),
         (["flow", "contents=7"], "contents=[7]: give some of"),
+        (["flow", "model.pixel_sizes.x=1"], "'x' is no place in a list: give all of it, 'NAME=[A,B]'"),
+        (["eval", "++model.point_cloud_range.y.x=1"], "'y' is no place in a list"),
+        (["eval", "~model.point_cloud_range.0"], "`cflow eval --help` has examples"),
     ],
 )
 def test_a_wrong_call_gets_one_line_that_says_what_to_do(

@@ -12,8 +12,8 @@ from omegaconf.errors import OmegaConfBaseException
 
 from cflow_torch.cli import settings
 
-# How messages begin of what Hydra's parser lets through: a number of thousands of digits; model=null.
-_OF_HYDRA = ("Exceeds the limit", "Config group override must be")
+# What Hydra raises itself for some calls: a number of thousands of digits, model=null, ~model.pixel_sizes.0.
+_OF_PYTHON = (ValueError, TypeError, LookupError, AttributeError, AssertionError)
 
 
 def explain(error: Exception, command: str) -> Optional[str]:
@@ -26,10 +26,13 @@ def explain(error: Exception, command: str) -> Optional[str]:
             return f"{wrong!r} is no setting: give NAME=VALUE, `cflow {command} --help` has examples"
         return f"cannot read {wrong!r}: {_readable(wrong)}"
     message = str(error)
-    if type(error) is ValueError and message.startswith(_OF_HYDRA):
-        return f"{message}; `cflow {command} --help` has examples"
     if not isinstance(error, (HydraException, OmegaConfBaseException)):
-        return None
+        if not isinstance(error, _OF_PYTHON) or not _is_of_hydra(error):
+            return None
+        match = re.match(r"invalid literal for int\(\) with base 10: (.*)|Index (.*) \(str\) is not an int", message)
+        if match:  # model.pixel_sizes.x=1
+            message = f"{match[1] or match[2]} is no place in a list: give all of it, 'NAME=[A,B]'"
+        return f"{' '.join(message.split())}; `cflow {command} --help` has examples"
     match = re.match(r"Could not override '([^']+)'", message)
     if match:
         known = [*settings.groups(command), *settings.settings(command)]
@@ -45,6 +48,12 @@ def explain(error: Exception, command: str) -> Optional[str]:
     first, *more = message.splitlines() or [type(error).__name__]
     rest = f" ({'; '.join(line.strip() for line in more if line.strip())})" if more else ""
     return f"{first}{rest}; `cflow {command} --cfg job` prints every setting"
+
+
+def _is_of_hydra(error: Exception) -> bool:
+    """Whether it was raised in Hydra's own code, or its parser's."""
+    *_, (frame, _) = traceback.walk_tb(error.__traceback__)
+    return str(frame.f_globals.get("__name__")).partition(".")[0] in ("hydra", "omegaconf", "antlr4")
 
 
 def _readable(wrong: str) -> str:
