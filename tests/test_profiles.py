@@ -164,7 +164,10 @@ def test_nuscenes_looks_right_and_forward_and_waymo_s_grid_is_the_vehicle_s(driv
     assert math.degrees(math.asin(-down[2])) == pytest.approx(56.0)
 
 
-@pytest.mark.parametrize("name", ROLLING)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[pytest.mark.slow] * (name not in ("av2_rolling", "nuscenes"))) for name in ROLLING],
+)
 def test_rolling_shots_equal_brute_force(name, drives):
     """Every ray at its own time, from where its LiDAR then is, against every solid where that then is."""
     drive, rng = drives[name], np.random.default_rng(0)
