@@ -29,6 +29,7 @@ from cflow_torch.data.flow_file import read_flow
 from cflow_torch.data.parquet_claims import Chunk, Footer, Leaf, check_parquet_claims
 from cflow_torch.data.parquet_file import MAX_STREAMED_BYTES, ParquetFile
 from cflow_torch.data.waymo.reader import WaymoLog
+from cflow_torch.free_memory import available_memory
 from cflow_torch.submission.check import check_file
 from cflow_torch.submission.versions import VERSIONS
 
@@ -288,6 +289,37 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
     *errors, grown = done.stdout.splitlines()
     assert len(errors) == 3
     assert int(grown) < 100 * 1024  # KiB
+
+
+@pytest.mark.slow
+def test_one_range_image_of_a_whole_row_group(tmp_path: Path) -> None:
+    """The dearest file there is: 250 kB, one list of all the values that a row group may have."""
+    if (available_memory({}) or 0) < 12 << 30:
+        pytest.skip("needs 12 GiB")
+    count = 700_000_000  # of 4 bytes: a little less than MAX_STREAMED_BYTES
+    making = """
+import sys
+import numpy as np, pyarrow as pa
+from pyarrow import parquet
+name, count = sys.argv[1], int(sys.argv[2])
+values = pa.ListArray.from_arrays(pa.array([0, count], pa.int32()), pa.array(np.zeros(count, np.float32)))
+table = pa.table({"image.values": values, "image.shape": pa.array([[1, count // 4, 4]], pa.list_(pa.int32(), 3))})
+parquet.write_table(table, name, compression="zstd", use_dictionary=False, write_statistics=False)
+"""
+    reading = """
+import resource, sys
+from pathlib import Path
+from cflow_torch.data.waymo.parquet import read_images
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+assert read_images(Path(sys.argv[1]), [0], "image", 4)[0].size == int(sys.argv[2])
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
+"""
+    place, grown = tmp_path / "a.parquet", ""
+    for program in (making, reading):
+        command = [sys.executable, "-c", program, str(place), str(count)]
+        grown = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert place.stat().st_size < MIB
+    assert 2 << 20 < int(grown) < 7.5 * (1 << 20)  # KiB
 
 
 # ---------------------------------------------------------------------------------------------- readers
