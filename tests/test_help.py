@@ -132,6 +132,7 @@ def test_the_version() -> None:
         (["flow", "contents=7"], "contents=[7]: give some of"),
         (["flow", "model.pixel_sizes.x=1"], "'x' is no place in a list: give all of it, 'NAME=[A,B]'"),
         (["eval", "++model.point_cloud_range.y.x=1"], "'y' is no place in a list"),
+        (["flow", "contents.7=x"], "Error merging override contents.7=x (list index out of range)"),
         (["eval", "~model.point_cloud_range.0"], "`cflow eval --help` has examples"),
     ],
 )

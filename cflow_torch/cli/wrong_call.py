@@ -46,6 +46,7 @@ def explain(error: Exception, command: str) -> Optional[str]:
         key, values = match.groups()
         return f"{key}={values} is more than one value: add -m to run each, or write '{key}=[{values}]' for a list"
     first, *more = message.splitlines() or [type(error).__name__]
+    more = more or str(error.__cause__ or "").splitlines()[:1]  # "Error merging override" does not say why
     rest = f" ({'; '.join(line.strip() for line in more if line.strip())})" if more else ""
     return f"{first}{rest}; `cflow {command} --cfg job` prints every setting"
 
