@@ -40,6 +40,7 @@ HARNESS = "test_opensceneflow*.py"
 NEED_CHECKOUT: Dict[str, str] = {
     "tests/test_docs_links.py": "reads the documents",
     "tests/test_docs_names.py": "reads the documents",
+    "tests/test_docs_trust.py": "reads the documents",
     "tests/test_faq.py": "reads the documents",
     "tests/test_failure_cases.py::test_every_case_and_picture_is_on_the_page": "reads the documents",
     "tests/test_config_reference.py": "reads the documents and the folder configs",
