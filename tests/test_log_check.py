@@ -66,7 +66,9 @@ def test_both_checks_are_made(drive):
     assert {warning.category for warning in caught} == {GroundWarning, StaticWorldWarning}
 
 
-@pytest.mark.parametrize("remedy", ["", "data.find_ground=grid", "data.check=false"])
+@pytest.mark.parametrize(
+    "remedy", ["", "data.find_ground=grid", pytest.param("data.check=false", marks=pytest.mark.slow)]
+)
 def test_cflow_flow_says_so_and_the_remedies_help(drive, tmp_path: Path, remedy: str):
     root = write_array_log(WithoutMasks(drive), tmp_path / "mine")
     settings = ["data=arrays", f"data.root={root}", f"output={tmp_path / 'out'}", "model=paper", "engine.workers=1"]
