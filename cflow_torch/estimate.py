@@ -9,12 +9,12 @@ from typing import Any, Optional, Sequence
 import numpy as np
 
 from cflow_torch.config import Config, make_config
-from cflow_torch.dense import CorrelationFlow
-from cflow_torch.ground import find_ground_batch, has_ground
-from cflow_torch.inputs import check_windows, choose_device
-from cflow_torch.keypoints import CorrelationFlowKeypoints
-from cflow_torch.pyramid import CoarseToFine
+from cflow_torch.dense.method import CorrelationFlow
+from cflow_torch.keypoints.method import CorrelationFlowKeypoints
+from cflow_torch.model import CoarseToFine
 from cflow_torch.types import Array, CFlowError, FlowResult, Sweep, Window, as_numpy
+from cflow_torch.windows.ground import find_ground_batch, has_ground
+from cflow_torch.windows.validation import check_windows, choose_device
 
 GROUND = (None, "auto", "patchwork")
 

@@ -24,12 +24,12 @@ import torch
 
 from cflow_torch import make_config, make_model
 from cflow_torch.data.av2 import AV2Log
-from cflow_torch.data.benchmark import benchmark_logs
 from cflow_torch.data.flow_file import write_flow
 from cflow_torch.data.log import RecentSweeps, window
 from cflow_torch.fleet.job import Done, Failed, Job, Opened, Unit, split
 from cflow_torch.fleet.local import run_local
 from cflow_torch.fleet.machine import CPU_BATCH, Layout, usable_cores
+from cflow_torch.simulator.benchmark import benchmark_logs
 
 PAIRS, DRIVES = 40, 5
 _HELPER_MB = 50  # smaller processes are Python's own, which watch over the workers

@@ -24,7 +24,7 @@ from cflow_torch import Config, Sweep, Window, make_config, make_model
 from cflow_torch.bench.machine import describe_machine
 from cflow_torch.bench.stages import STAGES, stage_seconds
 from cflow_torch.data.log import window
-from cflow_torch.data.synthetic import make_drive
+from cflow_torch.simulator import make_drive
 
 SETTINGS: Dict[str, Config] = {
     "h = 0, 1 scale": make_config("paper"),

@@ -16,11 +16,11 @@ import numpy as np
 from beyond_made import chain_flow, paste_static
 
 from cflow_torch.data.av2 import AV2Log
-from cflow_torch.data.benchmark import benchmark_logs, format_of
 from cflow_torch.data.catalog import open_log
 from cflow_torch.data.hdf5 import HDF5Log
 from cflow_torch.data.log import FlowLabels, RecentSweeps, window
 from cflow_torch.evaluation.frame import EvalFrame, ego_motion_flow
+from cflow_torch.simulator.benchmark import benchmark_logs, format_of
 from cflow_torch.types import CFlowError, Sweep, Window, as_numpy
 
 HISTORY = 4

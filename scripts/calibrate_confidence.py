@@ -21,12 +21,13 @@ from typing import Any, Dict, Iterator, List, Optional, Sequence, Tuple
 import numpy as np
 import torch
 
-from cflow_torch import confidence, make_config, make_model
-from cflow_torch.data.benchmark import FORMATS, benchmark_logs
+from cflow_torch import make_config, make_model
 from cflow_torch.data.catalog import find_sources, open_log
 from cflow_torch.data.log import window
 from cflow_torch.evaluation.frame import ego_motion_flow
+from cflow_torch.simulator.benchmark import FORMATS, benchmark_logs
 from cflow_torch.types import FlowResult, Window
+from cflow_torch.verified import confidence
 
 RIGHT = 0.1  # metres
 MOVES = 0.05  # metres; a true motion of at least this is dynamic

@@ -10,12 +10,12 @@ import numpy as np
 
 from cflow_torch import FlowResult, Sweep, Window, estimate_flow, make_config, make_model
 from cflow_torch.data.log import Log, window
-from cflow_torch.data.synthetic import objects
-from cflow_torch.data.synthetic.drive import Drive
-from cflow_torch.data.synthetic.ground import Ground
-from cflow_torch.data.synthetic.objects import Body, Route, box
-from cflow_torch.data.synthetic.profiles import get_profile
-from cflow_torch.data.synthetic.scene import Scene, SolidTable
+from cflow_torch.simulator import objects
+from cflow_torch.simulator.drive import Drive
+from cflow_torch.simulator.ground import Ground
+from cflow_torch.simulator.objects import Body, Route, box
+from cflow_torch.simulator.profiles import get_profile
+from cflow_torch.simulator.scene import Scene, SolidTable
 
 PAIR, NUM_SWEEPS = 5, 7  # sweep t, so that four older ones exist
 FLAT = Ground((0.0, 0.0), 0.0, kerb=0.0, half_widths=(1e4, 1.0), crossing_x=1e5)

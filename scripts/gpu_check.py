@@ -28,7 +28,6 @@ import torch
 from torch.profiler import ProfilerActivity, profile
 
 from cflow_torch import Config, FlowResult, Sweep, Window, make_config, make_model
-from cflow_torch.batch import make_batch
 from cflow_torch.bench.machine import describe_machine
 from cflow_torch.bench.measure import trim_history
 from cflow_torch.bench.memory import count_allocations
@@ -36,7 +35,8 @@ from cflow_torch.bench.stages import STAGES
 from cflow_torch.bench.target_row import FULL, NAMES, PAIR
 from cflow_torch.bench.throughput import measure_throughput
 from cflow_torch.bench.work import count_work
-from cflow_torch.grid import Grid
+from cflow_torch.windows.bev_grid import Grid
+from cflow_torch.windows.collation import make_batch
 
 ROOT = Path(__file__).resolve().parents[1]
 BUDGET_SECONDS = 440.0
@@ -93,7 +93,7 @@ STREETS: List[Window] = []  # filled by `main`
 def make_streets() -> Dict[str, np.ndarray]:
     """Simulated windows as arrays: points, ground, pose and time of every sweep, t+1 first."""
     from cflow_torch.data.log import window
-    from cflow_torch.data.synthetic import make_drive
+    from cflow_torch.simulator import make_drive
 
     arrays = {}
     for number, seed in enumerate(SEEDS):

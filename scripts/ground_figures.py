@@ -24,10 +24,10 @@ import torch
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.ground import read_ground_raster
 from cflow_torch.data.hdf5.reader import HDF5Log
-from cflow_torch.data.synthetic import make_drive
-from cflow_torch.data.synthetic.profiles import PROFILES
-from cflow_torch.ground import find_ground, has_ground
+from cflow_torch.simulator import make_drive
+from cflow_torch.simulator.profiles import PROFILES
 from cflow_torch.types import CFlowError
+from cflow_torch.windows.ground import find_ground, has_ground
 
 SEEDS = (410, 411, 412)  # the settings were tuned on 400 ... 409
 AV2 = Path("av2-7fab2350", "val", "7fab2350-7eaf-3b7e-a39d-6937a4c1bede")

@@ -23,9 +23,9 @@ from tqdm import tqdm
 from cflow_torch import Window, make_config, make_model
 from cflow_torch.config import PRESETS
 from cflow_torch.data.log import FlowLabels, window
-from cflow_torch.data.synthetic import make_drive
 from cflow_torch.evaluation.frame import EvalFrame
 from cflow_torch.evaluation.metrics import SceneFlowMetrics
+from cflow_torch.simulator import make_drive
 
 SEEDS = tuple(range(200, 210))
 WINDOWS_PER_DRIVE = 4

@@ -6,11 +6,11 @@ from typing import List, NamedTuple, Tuple
 
 import numpy as np
 import torch
+from oracle.refinement import Point
 
-from cflow_torch.batch import Batch
-from cflow_torch.grid import Grid
-from cflow_torch.moving import MovingPoints, moving_points
-from cflow_torch.reference.refinement import Point
+from cflow_torch.verified.moving import MovingPoints, moving_points
+from cflow_torch.windows.bev_grid import Grid
+from cflow_torch.windows.collation import Batch
 
 SLICE = 0.5
 LOWER, UPPER = (-3.0, -2.5, -2.0), (3.0, 2.5, 3.0)

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, Dict
 
 from cflow_torch.cli.main import main
-from cflow_torch.data.synthetic import make_drive
-from cflow_torch.data.writers import write_av2_log
+from cflow_torch.simulator import make_drive
+from cflow_torch.simulator.writers.av2 import write_av2_log
 
 SWEEPS = (3, 4)  # of the logs; 5 pairs
 PAIRS = sum(SWEEPS) - len(SWEEPS)

@@ -30,7 +30,7 @@ from scenes import assert_same, has_kornia_labelling, needs_gpu, needs_kornia_la
 from cflow_torch import Config, FlowResult, Sweep, Window, make_config, make_model
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.log import window as window_of
-from cflow_torch.data.synthetic import make_drive
+from cflow_torch.simulator import make_drive
 
 Results = List[FlowResult]
 Way = Callable[[Config, List[Window]], Results]

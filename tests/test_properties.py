@@ -10,11 +10,11 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from oracle import reference_flow
 from scenes import LABELINGS, assert_same, config, pose, scene
 
 from cflow_torch import CorrelationFlow, FlowResult, Sweep, Window
 from cflow_torch.config import Config
-from cflow_torch.reference import reference_flow
 
 S = 0.125  # exact in every float format, so whole pixels are exact shifts
 RANGE = (-6.0, -6.0, -2.0, 6.0, 6.0, 2.0)

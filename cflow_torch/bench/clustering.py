@@ -7,14 +7,14 @@ from typing import Any, Dict, Tuple
 
 import numpy as np
 
-from cflow_torch.batch import Batch, make_batch
 from cflow_torch.bench.opencv_loop import dilate_and_label, find_clusters
 from cflow_torch.bench.timing import alternate, median_ratio, summary, synchronise
-from cflow_torch.cluster import cluster
 from cflow_torch.config import Config
-from cflow_torch.density import hdbscan_labels
-from cflow_torch.grid import Grid
+from cflow_torch.dense.clustering import cluster
+from cflow_torch.dense.hdbscan import hdbscan_labels
 from cflow_torch.types import CFlowError, Window
+from cflow_torch.windows.bev_grid import Grid
+from cflow_torch.windows.collation import Batch, make_batch
 
 
 def measure_clustering(window: Window, config: Config, repeats: int, why_no_opencv: str, device: Any) -> Dict[str, Any]:

@@ -8,6 +8,8 @@ import time
 from dataclasses import replace
 from typing import Any, Dict, List, Mapping, Optional, Sequence
 
+from oracle import reference_flow
+
 from cflow_torch.bench.agreement import same_bits, share_agreement
 from cflow_torch.bench.clustering import measure_clustering
 from cflow_torch.bench.machine import describe_machine, has_opencv
@@ -19,7 +21,6 @@ from cflow_torch.bench.work import count_work
 from cflow_torch.checks import DENSE_ONLY
 from cflow_torch.config import Config
 from cflow_torch.estimate import make_model
-from cflow_torch.reference import reference_flow
 from cflow_torch.types import CFlowError, FlowResult, Window
 
 Report = Dict[str, Any]

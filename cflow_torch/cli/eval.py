@@ -34,7 +34,7 @@ from cflow_torch.data.log import Log
 from cflow_torch.evaluation.frame import EvalFrame
 from cflow_torch.evaluation.metrics import SceneFlowMetrics
 from cflow_torch.evaluation.tables import format_table
-from cflow_torch.stopwatch import StopWatch
+from cflow_torch.stages import StopWatch
 from cflow_torch.types import CFlowError, FlowResult, Window
 
 

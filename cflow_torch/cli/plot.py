@@ -35,7 +35,7 @@ from cflow_torch.data.log import Log, RecentSweeps, window
 from cflow_torch.data.log_check import check_log
 from cflow_torch.data.paths import is_remote
 from cflow_torch.fleet.progress import frames as counted
-from cflow_torch.pyramid import CoarseToFine
+from cflow_torch.model import CoarseToFine
 from cflow_torch.types import CFlowError, FlowResult, Window
 from cflow_torch.viz.animation import save_animation
 from cflow_torch.viz.bev import plot_flow, save_picture

@@ -17,11 +17,11 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from cflow_torch.cli.run import versions, write_config
-from cflow_torch.data.benchmark import generator_key
 from cflow_torch.data.json_file import read_json
 from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.data.records import changes, strict, write_text
 from cflow_torch.evaluation.definitions import get_definition
+from cflow_torch.simulator.benchmark import generator_key
 from cflow_torch.types import CFlowError, Window
 
 RESULTS = "results.json"

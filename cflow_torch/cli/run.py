@@ -18,15 +18,15 @@ from omegaconf import DictConfig, OmegaConf
 
 from cflow_torch import __version__, estimate
 from cflow_torch.config import Config
-from cflow_torch.data.benchmark import benchmark_logs, format_of
 from cflow_torch.data.catalog import find_sources, open_log
 from cflow_torch.data.log import Log, RecentSweeps, window
 from cflow_torch.data.names import is_safe_name
 from cflow_torch.data.paths import as_path
 from cflow_torch.data.records import write_text
 from cflow_torch.fleet.progress import frames, say
-from cflow_torch.pyramid import CoarseToFine
-from cflow_torch.stopwatch import FlowModel
+from cflow_torch.model import CoarseToFine
+from cflow_torch.simulator.benchmark import benchmark_logs, format_of
+from cflow_torch.stages import FlowModel
 from cflow_torch.types import CFlowError, FlowResult, Window
 
 Failures = List[Tuple[str, str]]

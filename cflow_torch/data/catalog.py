@@ -77,7 +77,7 @@ def open_log(
     Args:
         name: a key of `DATA_SETS`.
         source: from `find_sources`.
-        find_ground: None, or a method of `cflow_torch.ground.find_ground` for sweeps without a ground mask.
+        find_ground: None, or a method of `cflow_torch.windows.ground.find_ground` for sweeps without a ground mask.
         odometry: find poses with kiss-icp if the log has none.
         check: warn if ground is left in, or if the static world does not stay put, see `check_log`.
         **settings: keyword arguments of the reader.

@@ -8,8 +8,8 @@ import numpy as np
 
 from cflow_torch.data.hdf5.frames import StoredMotion
 from cflow_torch.data.log import FlowLabels, Log
-from cflow_torch.ground import find_ground
 from cflow_torch.types import Sweep
+from cflow_torch.windows.ground import find_ground
 
 
 class GroundFoundLog:
@@ -17,7 +17,7 @@ class GroundFoundLog:
 
     Args:
         log: any log.
-        method: as for `cflow_torch.ground.find_ground`.
+        method: as for `cflow_torch.windows.ground.find_ground`.
 
     Convention: a mask that the log has is kept. Everything else is the log's, `eval_mask` included.
 

@@ -7,8 +7,8 @@ from contextlib import suppress
 
 from cflow_torch.data.log import Log
 from cflow_torch.data.static_check import check_static_world
-from cflow_torch.ground import has_ground
 from cflow_torch.types import CFlowError
+from cflow_torch.windows.ground import has_ground
 
 
 class GroundWarning(UserWarning):

@@ -8,8 +8,8 @@ import numpy as np
 from tqdm import tqdm
 
 from cflow_torch.data.log import FlowLabels, Log
-from cflow_torch.ego import rigid_transform
 from cflow_torch.types import CFlowError, Sweep
+from cflow_torch.windows.ego_motion import rigid_transform
 
 # KISS-ICP starts as if the vehicle stood still: its first steps miss by up to 14 cm at 6 m/s, later ones by 1 to 3 cm.
 _RUN_IN = 5  # sweeps

@@ -9,8 +9,8 @@ from typing import Any, List, Optional, Tuple
 import numpy as np
 
 from cflow_torch.data.log import Log
-from cflow_torch.ego import rigid_transform
 from cflow_torch.types import CFlowError, Sweep
+from cflow_torch.windows.ego_motion import rigid_transform
 
 BASELINE = 5  # sweeps between the two that are compared: a wrong frame shows by how far the vehicle turned
 _NEAREST, _FARTHEST = 2.5, 50.0  # metres from the origin: without the own car, and near enough for dense structure

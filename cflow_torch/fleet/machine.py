@@ -9,8 +9,8 @@ from typing import Any, List, Mapping, Tuple
 
 import torch
 
-from cflow_torch.free_memory import available_memory, control_groups
 from cflow_torch.types import CFlowError
+from cflow_torch.windows.memory import available_memory, control_groups
 
 AUTO = "auto"
 _MOST = 100_000  # workers, threads or windows; more is a slip

@@ -22,7 +22,7 @@ from cflow_torch.estimate import make_model
 from cflow_torch.fleet.job import Begun, Done, Event, Failed, Job, Opened, Unit
 from cflow_torch.fleet.line import Line, Outcome
 from cflow_torch.fleet.manifest import check_claimed, claim_log, complete_frames, frame_file
-from cflow_torch.stopwatch import FlowModel, stage_clock
+from cflow_torch.stages import FlowModel, stage_clock
 from cflow_torch.types import CFlowError, FlowResult, Window
 
 # Batches that are read ahead, and that wait to be written: enough to even out, little enough for flat memory.

@@ -8,9 +8,9 @@ from typing import Any, List, Optional, Sequence
 
 import numpy as np
 
-from cflow_torch.ego import rigid_transform
 from cflow_torch.integrations.sequence import Frame, SequenceFlow, times_in_ns
 from cflow_torch.types import CFlowError
+from cflow_torch.windows.ego_motion import rigid_transform
 
 
 class CorrelationFlowEstimator:

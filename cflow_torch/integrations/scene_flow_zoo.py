@@ -8,9 +8,9 @@ from typing import Any, List, Optional, Tuple
 import torch
 from torch import Tensor, nn
 
-from cflow_torch.ego import rigid_transform
 from cflow_torch.integrations.sequence import Frame, SequenceFlow
 from cflow_torch.types import CFlowError
+from cflow_torch.windows.ego_motion import rigid_transform
 
 
 class CorrelationFlowModel(nn.Module):

@@ -14,11 +14,11 @@ import torch
 from torch import Tensor, nn
 
 from cflow_torch.config import make_config
-from cflow_torch.ego import compensate
 from cflow_torch.estimate import GROUND, make_model
-from cflow_torch.ground import find_ground_batch, has_ground
-from cflow_torch.inputs import read_positions
 from cflow_torch.types import Array, CFlowError, Sweep, Window
+from cflow_torch.windows.ego_motion import compensate
+from cflow_torch.windows.ground import find_ground_batch, has_ground
+from cflow_torch.windows.validation import read_positions
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class SequenceFlow(nn.Module):
             gets a flow. The i-th windows of all sequences are computed together.
 
         Raises:
-            CFlowError: bad input, see `cflow_torch.batch.make_batch`.
+            CFlowError: bad input, see `cflow_torch.windows.collation.make_batch`.
         """
         windows = [self._windows(frames, first) for frames, first in zip(sequences, firsts)]
         flows: List[List[Tensor]] = [[] for _ in sequences]

@@ -12,19 +12,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cflow_torch.cluster import cluster
 from cflow_torch.config import Config
-from cflow_torch.dense import correlate
-from cflow_torch.descriptors import describe, detect
-from cflow_torch.drawing import Images
-from cflow_torch.gate import gate
-from cflow_torch.height import slices_of_pixels
-from cflow_torch.jobs import make_jobs
-from cflow_torch.match import match
+from cflow_torch.dense.clustering import cluster
+from cflow_torch.dense.height import slices_of_pixels
+from cflow_torch.dense.method import correlate
+from cflow_torch.dense.packing import Images
+from cflow_torch.dense.templates import make_jobs
+from cflow_torch.keypoints.descriptors import describe, detect
+from cflow_torch.keypoints.match_candidates import gate
+from cflow_torch.keypoints.matching import match
+from cflow_torch.model import project
 from cflow_torch.ops.bits import unpack_bits
 from cflow_torch.ops.cross_correlation import cross_correlate
 from cflow_torch.ops.indices import flat_nonzero
-from cflow_torch.pyramid import project
 from cflow_torch.types import CFlowError, FlowResult, Window
 from cflow_torch.viz.panel import group_medians
 from cflow_torch.viz.watch import Occupancy, Step, watch

@@ -9,13 +9,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cflow_torch.batch import Batch
 from cflow_torch.config import Config
-from cflow_torch.dense import CorrelationFlow
-from cflow_torch.grid import Grid
-from cflow_torch.keypoints import CorrelationFlowKeypoints
-from cflow_torch.pyramid import CoarseToFine, Motion, project
+from cflow_torch.dense.method import CorrelationFlow
+from cflow_torch.keypoints.method import CorrelationFlowKeypoints
+from cflow_torch.model import CoarseToFine, Motion, project
 from cflow_torch.types import CFlowError, FlowResult, Window
+from cflow_torch.windows.bev_grid import Grid
+from cflow_torch.windows.collation import Batch
 
 
 @dataclass(frozen=True)

@@ -20,9 +20,9 @@ from cflow_torch.data.flow_file import read_flow
 from cflow_torch.data.log import Log
 from cflow_torch.data.waymo.parquet import SCHEMAS
 from cflow_torch.data.waymo.reader import WaymoLog
-from cflow_torch.submission.check import check_file
-from cflow_torch.submission.masks import MaskArchive
-from cflow_torch.submission.versions import VERSIONS
+from cflow_torch.evaluation.submission.check import check_file
+from cflow_torch.evaluation.submission.masks import MaskArchive
+from cflow_torch.evaluation.submission.versions import VERSIONS
 from fuzzing.crafted_arrow import crafted, feather_bytes, hostile_table, one_of_several, parquet_bytes
 from fuzzing.crafted_parquet import deep, lying
 from fuzzing.target import Target

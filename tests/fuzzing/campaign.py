@@ -17,7 +17,7 @@ from typing import Dict, List
 from fuzzing.ledger import Ledger
 from fuzzing.target import Target
 
-TESTS = Path(__file__).resolve().parents[1]
+TESTS = Path(__file__).resolve().parents[2]
 HANGS = 20.0  # seconds of the processor for one small file; a machine may be busy with something else
 STANDS_STILL = 300.0  # seconds of the clock
 MOST_ENDS = 200  # crashes and hangs after which a campaign is given up

@@ -16,19 +16,19 @@ from cflow_torch.cli.eval import objective_of
 from cflow_torch.cli.record import finished_results
 from cflow_torch.config import Config, make_config
 from cflow_torch.data.aevascenes.reader import AevaScenesLog, find_aevascenes_sequences
-from cflow_torch.data.aevascenes.writer import write_aevascenes_sequence
 from cflow_torch.data.ground import read_ground_raster
 from cflow_torch.data.log import Log
 from cflow_torch.data.nuscenes.json_tables import FIELDS
 from cflow_torch.data.nuscenes.reader import NuScenesLog, find_nuscenes_scenes
-from cflow_torch.data.nuscenes.writer import write_nuscenes
 from cflow_torch.data.truckscenes.reader import TruckScenesLog, find_truckscenes_scenes
-from cflow_torch.data.truckscenes.writer import write_truckscenes
+from cflow_torch.evaluation.submission.check import check_submission
+from cflow_torch.evaluation.submission.plan import read_frame_list
+from cflow_torch.evaluation.submission.versions import get_version
+from cflow_torch.evaluation.submission.write import write_metadata
 from cflow_torch.fleet.manifest import claim_log, describe_log, find_conflict, make_identity
-from cflow_torch.submission.check import check_submission
-from cflow_torch.submission.plan import read_frame_list
-from cflow_torch.submission.versions import get_version
-from cflow_torch.submission.write import write_metadata
+from cflow_torch.simulator.writers.aevascenes import write_aevascenes_sequence
+from cflow_torch.simulator.writers.nuscenes import write_nuscenes
+from cflow_torch.simulator.writers.truckscenes import write_truckscenes
 from cflow_torch.types import CFlowError
 from fuzzing.json_damage import hostile_json
 from fuzzing.target import Target

@@ -14,10 +14,10 @@ from tiny_recording import START_NS, TinyRecording
 from cflow_torch.data.aevascenes.reader import AevaScenesLog
 from cflow_torch.data.arrays.pcd import write_pcd
 from cflow_torch.data.nuscenes.reader import NuScenesLog, find_nuscenes_scenes
-from cflow_torch.data.nuscenes.writer import write_nuscenes
 from cflow_torch.data.truckscenes.reader import TruckScenesLog, find_truckscenes_scenes
-from cflow_torch.data.truckscenes.writer import write_truckscenes
 from cflow_torch.data.waymo.tfrecord import WaymoRecordLog
+from cflow_torch.simulator.writers.nuscenes import write_nuscenes
+from cflow_torch.simulator.writers.truckscenes import write_truckscenes
 from fuzzing.clouds_targets import PCD_TOKENS, any_of, written
 from fuzzing.crafted_clouds import BODY, crafted_pcd, npy_of
 from fuzzing.crafted_recordings import NAMES, Frames, crafted_frames, crafted_names, names_npz, object_npy, varint

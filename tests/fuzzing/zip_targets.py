@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 from pyarrow import feather
 
 from cflow_torch import CFlowError
-from cflow_torch.submission.check import check_submission
-from cflow_torch.submission.masks import MaskArchive
-from cflow_torch.submission.plan import Frame
-from cflow_torch.submission.versions import get_version
+from cflow_torch.evaluation.submission.check import check_submission
+from cflow_torch.evaluation.submission.masks import MaskArchive
+from cflow_torch.evaluation.submission.plan import Frame
+from cflow_torch.evaluation.submission.versions import get_version
 from fuzzing.target import Target
 
 _ROWS = 5

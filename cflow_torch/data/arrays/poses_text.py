@@ -13,9 +13,9 @@ import numpy as np
 from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.npy_file import read_npy
 from cflow_torch.data.paths import Place, as_path, read_bytes
-from cflow_torch.data.writers import quaternions
-from cflow_torch.ego import rigid_transform
+from cflow_torch.simulator.writers.av2 import quaternions
 from cflow_torch.types import CFlowError
+from cflow_torch.windows.ego_motion import rigid_transform
 
 QUATERNION_TOLERANCE = 1e-3  # TUM files have 4 to 17 digits
 CALIBRATION_KEYS = ("Tr", "Tr_velo_to_cam", "Tr_velo_cam")  # KITTI's odometry, raw and tracking sets

@@ -14,8 +14,8 @@ from cflow_torch.data.folders import find_folders
 from cflow_torch.data.log import FlowLabels
 from cflow_torch.data.npy_file import read_npy
 from cflow_torch.data.paths import Place, as_path, is_place, is_remote
-from cflow_torch.ego import rigid_transform
 from cflow_torch.types import CFlowError, Sweep
+from cflow_torch.windows.ego_motion import rigid_transform
 
 POINT_FOLDERS = ("points", "lidar", "velodyne", "clouds")  # where the clouds may lie below the log's folder
 POSE_FILES = ("poses.txt", "poses.npy", "trajectory.txt")

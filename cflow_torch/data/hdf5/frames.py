@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cflow_torch.ego import compensate
+from cflow_torch.windows.ego_motion import compensate
 
 # Argoverse 2 counts nanoseconds from a moment of its own: all sweeps of the data set lie in here, no other set's do.
 _ARGOVERSE2_STAMPS = (315_900_000_000_000_000, 316_000_000_000_000_000)

@@ -15,8 +15,8 @@ from cflow_torch.data.hdf5.frames import StoredMotion, harness_motion, is_argove
 from cflow_torch.data.hdf5.index_file import read_index
 from cflow_torch.data.log import FlowLabels
 from cflow_torch.data.paths import Place, as_path, is_remote, ranged
-from cflow_torch.ego import rigid_transform
 from cflow_torch.types import CFlowError, Sweep
+from cflow_torch.windows.ego_motion import rigid_transform
 
 # Time stamps count from 1970 or 1980: below this they are microseconds (16 digits), above it nanoseconds (18 or 19).
 _FIRST_NANOSECOND = 10**17

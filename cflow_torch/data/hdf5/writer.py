@@ -13,8 +13,8 @@ from cflow_torch.data.boxes import points_in_box
 from cflow_torch.data.hdf5.index_file import write_index
 from cflow_torch.data.hdf5.reader import EXTRINSIC, HDF5Log, find_hdf5_scenes
 from cflow_torch.data.log import Log
-from cflow_torch.ego import rigid_transform
 from cflow_torch.types import CFlowError
+from cflow_torch.windows.ego_motion import rigid_transform
 
 
 def write_hdf5_scene(

@@ -1,8 +1,7 @@
-"""Raw nuScenes: reader and writer."""
+"""Raw nuScenes: reader."""
 
 from __future__ import annotations
 
 from cflow_torch.data.nuscenes.reader import NuScenesLog, find_nuscenes_scenes
-from cflow_torch.data.nuscenes.writer import write_nuscenes
 
-__all__ = ["NuScenesLog", "find_nuscenes_scenes", "write_nuscenes"]
+__all__ = ["NuScenesLog", "find_nuscenes_scenes"]

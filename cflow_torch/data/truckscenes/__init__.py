@@ -1,8 +1,7 @@
-"""Raw MAN TruckScenes: reader and writer."""
+"""Raw MAN TruckScenes: reader."""
 
 from __future__ import annotations
 
 from cflow_torch.data.truckscenes.reader import TruckScenesLog, find_truckscenes_scenes
-from cflow_torch.data.truckscenes.writer import write_truckscenes
 
-__all__ = ["TruckScenesLog", "find_truckscenes_scenes", "write_truckscenes"]
+__all__ = ["TruckScenesLog", "find_truckscenes_scenes"]

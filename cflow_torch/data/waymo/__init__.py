@@ -1,8 +1,7 @@
-"""Waymo Open: reader and writer of version 2, reader of version 1."""
+"""Waymo Open: readers of versions 1 and 2."""
 
 from __future__ import annotations
 
 from cflow_torch.data.waymo.reader import WaymoLog, find_waymo_segments
-from cflow_torch.data.waymo.writer import write_waymo_segment
 
-__all__ = ["WaymoLog", "find_waymo_segments", "write_waymo_segment"]
+__all__ = ["WaymoLog", "find_waymo_segments"]

@@ -7,8 +7,8 @@ from typing import Optional, Tuple
 
 import numpy as np
 
-from cflow_torch.ego import rigid_transform
 from cflow_torch.types import CFlowError
+from cflow_torch.windows.ego_motion import rigid_transform
 
 LASERS = {"TOP": 1, "FRONT": 2, "SIDE_LEFT": 3, "SIDE_RIGHT": 4, "REAR": 5}
 """Laser name -> the number that files store; 0 is unknown."""

@@ -14,8 +14,8 @@ from cflow_torch.data.log import FlowLabels
 from cflow_torch.data.paths import Place, as_path, parts
 from cflow_torch.data.waymo.range_image import LASERS, NO_LABEL_ZONE, LaserCalibration, range_image_points
 from cflow_torch.data.waymo.reader import BOX_CATEGORY, upright_boxes
-from cflow_torch.ego import relative_transform, rigid_transform
 from cflow_torch.types import CFlowError, Sweep
+from cflow_torch.windows.ego_motion import relative_transform, rigid_transform
 
 _HEAD = 1 << 16  # bytes of a record in which its time is looked for first
 _LATEST = 1 << 53  # microseconds, the year 2255: in nanoseconds, too, they are 64-bit numbers

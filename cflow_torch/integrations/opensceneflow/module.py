@@ -12,11 +12,11 @@ from torch import Tensor, nn
 
 from cflow_torch.config import Config, make_config
 from cflow_torch.data.hdf5.frames import beside_harness, harness_pose_flow
-from cflow_torch.ego import rigid_transform
 from cflow_torch.estimate import make_model
 from cflow_torch.integrations.opensceneflow.batch import Sample, read_batch
 from cflow_torch.integrations.opensceneflow.timer import make_timer
 from cflow_torch.types import CFlowError, FlowResult
+from cflow_torch.windows.ego_motion import rigid_transform
 
 OUTPUTS = ("full", "valid")
 _SETTINGS = tuple(f.name for f in fields(Config) if f.name != "num_history")

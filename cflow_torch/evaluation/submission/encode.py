@@ -1,0 +1,133 @@
+"""One flow result -> the columns of a submission file, and what float16 costs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Dict, Optional, Tuple
+
+import numpy as np
+
+from cflow_torch.evaluation.submission.versions import SubmissionVersion
+from cflow_torch.types import CFlowError, FlowResult, Window, as_numpy
+from cflow_torch.windows.ego_motion import relative_transform
+
+DYNAMIC_THRESHOLD = 0.05  # metres per sweep; as the evaluation's dynamic points
+LARGEST = float(np.finfo(np.float16).max)  # 65504
+RESIDUAL_AXES = ("t+1", "t")
+
+
+@dataclass
+class Rounding:
+    """What was lost to float16: lengths of the differences, metres.
+
+    Args:
+        largest: of one point.
+        total: of all points together.
+        num_points: points counted.
+    """
+
+    largest: float = 0.0
+    total: float = 0.0
+    num_points: int = 0
+
+    def add(self, other: Rounding) -> None:
+        """Count another file's points as well."""
+        self.largest = max(self.largest, other.largest)
+        self.total += other.total
+        self.num_points += other.num_points
+
+    @property
+    def mean(self) -> float:
+        """Of one point, metres; 0 without points."""
+        return self.total / self.num_points if self.num_points else 0.0
+
+    def __str__(self) -> str:
+        return f"largest {self.largest:.6f} m, mean {self.mean:.8f} m over {self.num_points:,} points"
+
+
+def encode(
+    version: SubmissionVersion,
+    sweeps: Window,
+    result: FlowResult,
+    mask: Optional[np.ndarray] = None,
+    residual_axes: str = "t+1",
+) -> Tuple[Dict[str, np.ndarray], Rounding]:
+    """Columns of one frame's file.
+
+    Args:
+        version: the format.
+        sweeps: the window; its pc0 gives the ground, its poses turn the residual if `residual_axes` is "t".
+        result: flow of `sweeps.pc0`.
+        mask: (N,) bool, points to write; needed where the format asks for masked rows, refused elsewhere.
+        residual_axes: axes of the residual in the file. "t+1", as OpenSceneFlow writes it; "t" as
+            bucketed-scene-flow-eval measures it.
+
+    Returns:
+        Columns by name, in the format's order (flow float16, metres until the next sweep; `is_dynamic`, `is_valid`
+        bool), and the rounding.
+
+    Convention:
+        Residuals of ground points are 0. `is_dynamic`: unrounded residual of 0.05 m or more. `is_valid`: every row,
+        because bucketed-scene-flow-eval refuses predictions that leave out a point it scores.
+
+    Raises:
+        CFlowError: rows do not agree; a value is NaN, infinite or beyond float16; unknown axes, or "t" for total flow.
+    """
+    rows = len(sweeps.pc0.points)
+    if len(result.flow) != rows:
+        raise CFlowError(f"the result has {len(result.flow)} rows, the sweep has {rows} points")
+    if (mask is not None) != (version.rows == "masked"):
+        asks = "only the points of a mask: give one" if mask is None else "every point: give no mask"
+        raise CFlowError(f"version {version.number} holds {asks}")
+    residual = as_numpy(result.residual_flow).astype(np.float32)
+    keep = np.ones(rows, dtype=bool) if mask is None else np.asarray(mask, dtype=bool)
+    if keep.shape != (rows,):
+        raise CFlowError(f"the mask has shape {keep.shape}, the sweep has {rows} points")
+    if version.flow == "total":
+        if residual_axes != "t+1":
+            raise CFlowError(f"version {version.number} holds total flow: residual_axes has no meaning, leave it out")
+        flow = as_numpy(result.flow).astype(np.float32)
+    else:
+        flow = _turned(residual, sweeps, residual_axes)
+        if sweeps.pc0.is_ground is not None:
+            flow[as_numpy(sweeps.pc0.is_ground)] = 0.0
+    half, rounding = to_half(flow[keep])
+    is_dynamic = np.linalg.norm(residual[keep], axis=1) >= np.float32(DYNAMIC_THRESHOLD)
+    columns = {
+        "is_valid": np.ones(len(half), dtype=bool),
+        "is_dynamic": is_dynamic,
+        **{f"flow_t{axis}_m": half[:, i] for i, axis in enumerate("xyz")},
+    }
+    return {name: columns[name] for name in version.columns}, rounding
+
+
+def to_half(flow: np.ndarray) -> Tuple[np.ndarray, Rounding]:
+    """Round to float16.
+
+    Args:
+        flow: (M, 3) float.
+
+    Returns:
+        (M, 3) float16, and what was lost.
+
+    Raises:
+        CFlowError: a value is NaN, infinite, or larger than float16 can hold.
+    """
+    bad = ~np.isfinite(flow).all(axis=1)
+    if bad.any():
+        raise CFlowError(f"the flow of {bad.sum()} points is NaN or infinite, first row {int(np.argmax(bad))}")
+    if flow.size and np.abs(flow).max() > LARGEST:
+        raise CFlowError(f"a flow of {np.abs(flow).max():g} m is beyond float16 (at most {LARGEST:g} m)")
+    half = flow.astype(np.float16)
+    lost = np.linalg.norm(half.astype(np.float64) - flow.astype(np.float64), axis=1)
+    return half, Rounding(float(lost.max(initial=0.0)), float(lost.sum()), len(lost))
+
+
+def _turned(residual: np.ndarray, sweeps: Window, axes: str) -> np.ndarray:
+    """(N, 3) float32 residual in the axes asked for; a copy."""
+    if axes not in RESIDUAL_AXES:
+        raise CFlowError(f"residual_axes is one of {', '.join(RESIDUAL_AXES)}, got {axes!r}")
+    pose0, pose1 = sweeps.pc0.pose, sweeps.pc1.pose
+    if axes == "t+1" or pose0 is None or pose1 is None:  # without poses both sweeps lie in one frame
+        return residual.copy()
+    return (residual.astype(np.float64) @ relative_transform(pose1, pose0)[:3, :3]).astype(np.float32)

@@ -1,0 +1,150 @@
+"""Which files an archive must hold, and how many rows each."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Dict, Iterable, List, Mapping, Optional, Sequence, Union
+
+from cflow_torch.data.log import Log
+from cflow_torch.data.names import safe_name, same_names
+from cflow_torch.data.paths import read_bytes
+from cflow_torch.evaluation.submission.masks import MaskArchive, log_mask, point_mask
+from cflow_torch.evaluation.submission.versions import SubmissionVersion
+from cflow_torch.types import CFlowError
+
+STRIDE = 5  # every fifth pair of a log is evaluated
+_LISTED = re.compile(r"(?P<log>[^\s,/]+)[\s,/]+(?P<timestamp>[0-9]{1,19})")
+MAX_LIST_BYTES = 1 << 24  # of a list of frames; one of 10,000 has less than a megabyte
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One file that an archive must hold.
+
+    Args:
+        name: inside the archive, `<log>/<stem>.feather`.
+        rows: number of its rows.
+    """
+
+    name: str
+    rows: int
+
+
+@dataclass(frozen=True)
+class PlannedFrame:
+    """A frame and where its flow comes from: the pair (index, index + 1) of a log."""
+
+    log: Log
+    index: int
+    name: str
+
+    def expect(self, version: SubmissionVersion, masks: Optional[MaskArchive] = None) -> Frame:
+        """The file this frame becomes; reads the sweep.
+
+        Raises:
+            CFlowError: the sweep or its mask cannot be read.
+        """
+        sweep = self.log.sweep(self.index)
+        if version.rows == "masked":
+            return Frame(self.name, int(point_mask(self.log, self.index, sweep, masks).sum()))
+        return Frame(self.name, len(sweep.points))
+
+
+def plan_log(
+    log: Log, version: SubmissionVersion, listed: Optional[Mapping[str, Sequence[int]]] = None
+) -> List[PlannedFrame]:
+    """Frames of one log that a submission needs, in the order of time.
+
+    Args:
+        log: one drive.
+        version: the format.
+        listed: log id -> time stamps of exactly the frames to submit (a frame list, or a mask archive's `frames`).
+
+    Convention:
+        Without a list: the sweeps that carry an evaluation mask where the format goes by masks and the log has any
+        (the last sweep left out: it has no successor, and OpenSceneFlow writes no file for it either), else the pairs
+        0, 5, 10 ... Names by position count sweeps of the log from 0.
+
+    Raises:
+        CFlowError: a listed time stamp is not in the log, or is its last; the log's name is no folder name.
+    """
+    safe_name(log.log_id, "the log")
+    if listed is not None:
+        indices = [_position(log, stamp) for stamp in sorted(listed.get(log.log_id, ()))]
+    else:
+        indices = _evaluated(log) if version.frames == "evaluated" else []
+        indices = indices or list(range(0, len(log.timestamps) - 1, STRIDE))
+    return [PlannedFrame(log, i, version.file_name(log.log_id, i, log.timestamps[i])) for i in indices]
+
+
+def read_frame_list(file: Union[str, Path]) -> Dict[str, List[int]]:
+    """A list of frames: plain text, one `<log>/<time stamp>` a line (a blank or comma does as well), # for comments.
+
+    Returns:
+        Log id -> time stamps.
+
+    Raises:
+        CFlowError: the file cannot be read, is a pickle, names a frame twice, or a line is no frame.
+    """
+    file = Path(file)
+    if file.suffix in (".pkl", ".pickle"):
+        raise CFlowError(
+            f"{file} is a pickle, which can run any code when it is opened, so it is not read: give a text file with "
+            f"one <log>/<time stamp> a line, or leave the list out where the scenes carry eval_mask"
+        )
+    try:
+        lines = read_bytes(file, MAX_LIST_BYTES).decode("utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise CFlowError(f"{file} cannot be read as a list of frames ({error})") from error
+    result: Dict[str, Dict[int, None]] = {}
+    for number, line in enumerate(lines, 1):
+        entry = line.partition("#")[0].strip()
+        if not entry:
+            continue
+        match = _LISTED.fullmatch(entry)
+        if match is None:
+            raise CFlowError(f"{file}, line {number}: {entry!r} is no frame; write <log>/<time stamp>")
+        stamps = result.setdefault(match["log"], {})  # a set that keeps the order
+        if int(match["timestamp"]) in stamps:
+            raise CFlowError(f"{file}, line {number}: {entry!r} is listed twice")
+        stamps[int(match["timestamp"])] = None
+    if not result:
+        raise CFlowError(f"{file} lists no frame")
+    return {log: list(stamps) for log, stamps in result.items()}
+
+
+def require_logs(logs: Iterable[Log], listed: Optional[Mapping[str, Sequence[int]]]) -> None:
+    """Refuse two logs of one name, upper and lower case taken as one, and a list that names logs which are not there.
+
+    Raises:
+        CFlowError: as said.
+    """
+    names = [log.log_id for log in logs]
+    twice = same_names(names)
+    if twice:
+        raise CFlowError(
+            f"several logs are called {', '.join(twice)}: their files would overwrite each other, where the archive is "
+            "unpacked if not here"
+        )
+    missing = sorted(set(listed or ()) - set(names))
+    if missing:
+        raise CFlowError(
+            f"{len(missing)} listed logs are not in the data: {', '.join(missing[:5])}"
+            + (" ..." if len(missing) > 5 else "")
+        )
+
+
+def _evaluated(log: Log) -> List[int]:
+    return [index for index in range(len(log.timestamps) - 1) if log_mask(log, index) is not None]
+
+
+def _position(log: Log, timestamp: int) -> int:
+    try:
+        index = list(log.timestamps).index(timestamp)
+    except ValueError:
+        raise CFlowError(f"log {log.log_id} has no sweep {timestamp}, which is listed") from None
+    if index == len(log.timestamps) - 1:
+        raise CFlowError(f"{log.log_id}/{timestamp} is listed but is the last sweep of its log: it has no flow")
+    return index

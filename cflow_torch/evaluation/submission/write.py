@@ -1,0 +1,48 @@
+"""Files of a submission folder, each whole or absent."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Mapping, Union
+
+import numpy as np
+import pyarrow as pa
+from pyarrow import feather
+
+from cflow_torch.data.atomic import atomic_file
+from cflow_torch.data.names import folder_in
+from cflow_torch.evaluation.submission.check import check_file
+from cflow_torch.evaluation.submission.plan import Frame
+from cflow_torch.evaluation.submission.versions import METADATA_FILE, SubmissionVersion
+
+
+def write_frame(folder: Union[str, Path], name: str, columns: Mapping[str, np.ndarray]) -> None:
+    """Write one frame's file atomically.
+
+    Args:
+        folder: root of the submission.
+        name: inside the archive, `<log>/<stem>.feather`.
+        columns: what `encode` returned.
+
+    Raises:
+        CFlowError: the log's name cannot be a folder's, or its folder is a link that leaves the submission's.
+    """
+    log_id, _, stem = name.rpartition("/")
+    file = folder_in(Path(folder), log_id, "the log") / stem
+    table = pa.table({key: pa.array(values) for key, values in columns.items()})
+    with atomic_file(file) as stream:
+        feather.write_feather(table, stream)
+
+
+def write_metadata(folder: Union[str, Path], version: SubmissionVersion) -> None:
+    """Write `metadata.json`, for versions that have one."""
+    if version.metadata is not None:
+        with atomic_file(Path(folder) / METADATA_FILE) as file:
+            file.write((json.dumps(dict(version.metadata), indent=4) + "\n").encode())
+
+
+def is_complete(folder: Union[str, Path], frame: Frame, version: SubmissionVersion) -> bool:
+    """Whether a frame's file is there already and passes every check."""
+    file = Path(folder) / frame.name
+    return file.is_file() and not check_file(frame.name, file.read_bytes(), frame.rows, version)

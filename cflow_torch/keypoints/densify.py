@@ -1,0 +1,82 @@
+"""Sparse matches -> one shift for every occupied pixel (Sec. From sparse scene flow to dense scene flow)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from cflow_torch.config import Config
+from cflow_torch.dense.components import label_components
+from cflow_torch.keypoints.matching import Matches
+from cflow_torch.ops.indices import flat_nonzero
+from cflow_torch.ops.labeling import connected_components, connected_components_kornia
+from cflow_torch.ops.nearest import nearest_set_pixel
+from cflow_torch.ops.segments import segment_median
+
+
+@dataclass(frozen=True)
+class DenseShift:
+    """Groups of pixels that share a shift, numbered by window, then by first pixel (or key point) in raster order.
+
+    Args:
+        pixel: (P,) int64, flat indices of the occupied pixels, ascending.
+        group: (P,) int64, group of each, G = none.
+        shift: (G, 2) float64, (dy, dx) pixels; 0 for a group without a match.
+        number: (G,) int64, number of the group counted from 0 in its window.
+        score: (G,) float64, NCC; 0 for a group without a match.
+    """
+
+    pixel: Tensor
+    group: Tensor
+    shift: Tensor
+    number: Tensor
+    score: Tensor
+
+
+def densify(images: Tensor, place: Tensor, matches: Matches, pixel_size: float, config: Config) -> DenseShift:
+    """Shift of every occupied pixel of sweep t.
+
+    Args:
+        images: (B, H, W) bool, occupancy of sweep t.
+        place: (M,) int64, flat indices into `images` of the matched key points, ascending.
+        matches: their shifts and scores.
+        pixel_size: s, metres.
+        config: `densify`, `connectivity`, `labeling`, `max_extent`.
+
+    Returns:
+        "components": a group is a connected component of the image as it is; its shift is the median of dy and that of
+        dx over its matched key points, its score the median of theirs. "clusters": the same for the components that
+        Alg. clustering finds in sweep t alone. "nearest": a group is a matched key point and the pixels nearest to it.
+
+    Convention:
+        Medians of an even number are the mean of the middle two. Ties of the nearest key point: first in raster order.
+
+    Source: Sec. From sparse scene flow to dense scene flow; Table keypoint_sparse2dense.
+    """
+    pixel = flat_nonzero(images)
+    image_size = images.shape[1] * images.shape[2]
+    shift, score = matches.shift.double(), matches.score
+    if config.densify == "nearest":
+        seeds = torch.zeros_like(images).view(-1).index_fill_(0, place, True).view_as(images)
+        nearest = nearest_set_pixel(seeds, pixel)
+        group = torch.where(nearest < 0, place.numel(), torch.searchsorted(place, nearest))
+        return DenseShift(pixel, group, shift, _count_from_zero(place // image_size), score)
+    if config.densify == "clusters":
+        component = label_components(images, pixel, pixel_size, config)
+    else:
+        label = connected_components_kornia if config.labeling == "kornia" else connected_components
+        component = label(images, pixel, config.connectivity)
+    is_first = component == torch.arange(pixel.numel(), device=pixel.device)
+    group = (is_first.cumsum(0) - 1).index_select(0, component)
+    first = flat_nonzero(is_first)
+    of_match = group.index_select(0, torch.searchsorted(pixel, place))
+    dy, dx, ncc = (segment_median(values, of_match, first.numel()) for values in (*shift.unbind(1), score))
+    number = _count_from_zero(pixel.index_select(0, first) // image_size)
+    return DenseShift(pixel, group, torch.stack((dy, dx), 1), number, ncc)
+
+
+def _count_from_zero(window: Tensor) -> Tensor:
+    """(G,) ascending windows -> number of each group counted from 0 in its window."""
+    return torch.arange(window.numel(), device=window.device) - torch.searchsorted(window, window)

@@ -1,0 +1,139 @@
+"""Which key points of t and t+1 may match: those within the gate of each other.
+
+Key points of t are grouped by small tiles of the image. The key points of t+1 that can lie within the gate of a group
+stand in a few runs of a list that is sorted by band of rows, then by column. Nothing is ever as large as all key points
+times all key points.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Iterator, Optional, Tuple
+
+import torch
+from torch import Tensor
+
+from cflow_torch.config import Config
+from cflow_torch.keypoints.descriptors import KeyPoints
+from cflow_torch.windows.collation import Batch
+
+# Rows and columns of a tile, rows of a band, key points in a group: of the settings that were counted for groups of 16
+# those with the fewest pairs (key point, candidate), on the AV2 pair 1.55 for one within the gate. Groups of 8 have
+# fewer pairs but fetch twice as many descriptors for each.
+_TILE_ROWS, _TILE_COLS = 12, 64
+_BAND = 4
+_GROUP = 16
+# Pairs that are looked at together: a CPU wants them in its cache, a GPU wants many.
+_PAIRS_AT_ONCE_CPU = 1 << 17
+_PAIRS_AT_ONCE_GPU = 1 << 26
+_BYTES_PER_PAIR = 64
+# Lists of candidates are padded to a multiple of this, and to the longest of those that are looked at together.
+_LENGTH_STEP = 8
+# `gate_radius` is the distance that a match may cover in this time.
+_GATE_SECONDS = 0.1
+
+
+def gate(batch: Batch, pixel_size: float, config: Config) -> Tensor:
+    """(B,) float64, pixels: farthest match of each window, speed times the time from t to t+1."""
+    seconds = batch.seconds[:, 1]
+    size = torch.full_like(seconds, pixel_size)  # a GPU would multiply by the reciprocal of a plain number
+    reach = config.gate_radius * (seconds / torch.full_like(seconds, _GATE_SECONDS)) / size
+    if config.max_speed is not None:
+        reach = torch.minimum(reach, config.max_speed * seconds / size + 1)
+    return reach
+
+
+@dataclass(frozen=True)
+class Pairing:
+    """Groups of key points and what they may match, the longest lists of candidates first.
+
+    Args:
+        member: (G, S) int64, key points of each group; padded with their number.
+        candidate: (C,) int64, candidates of all groups one after the other.
+        first, count: (G,) int64, which of them belong to a group.
+        limit: (G,) int32, largest squared distance of a match, pixels.
+    """
+
+    member: Tensor
+    candidate: Tensor
+    first: Tensor
+    count: Tensor
+    limit: Tensor
+
+
+def pair(source: KeyPoints, target: KeyPoints, reach: Tensor) -> Pairing:
+    """Candidates among `target` of groups of `source`: all within reach of a group, and a few more.
+
+    Args:
+        source, target: key points of the same windows, at least one each.
+        reach: (B,) float64, pixels.
+
+    Cost: linear in key points plus candidates.
+    """
+    member = _group(source)
+    candidate, count, limit = _candidates(source, member, target, reach)
+    first = count.cumsum(0) - count
+    count, order = count.sort(descending=True)
+    member, first, limit = (values.index_select(0, order) for values in (member, first, limit))
+    return Pairing(member, candidate, first, count, limit)
+
+
+def pairs_at_once(device: torch.device, max_memory: Optional[int]) -> int:
+    """Number of pairs (key point, candidate) that are looked at together."""
+    number = _PAIRS_AT_ONCE_CPU if device.type == "cpu" else _PAIRS_AT_ONCE_GPU
+    return number if max_memory is None else min(number, int(max_memory) // _BYTES_PER_PAIR)
+
+
+def chunks(pairing: Pairing, num_pairs: int) -> Iterator[Tuple[slice, int]]:
+    """Groups that are looked at together, and the length that their lists of candidates are padded to."""
+    counts = pairing.count.tolist()
+    begin = 0
+    while begin < len(counts) and counts[begin] > 0:  # the others have no candidate
+        length = -(-counts[begin] // _LENGTH_STEP) * _LENGTH_STEP
+        end = begin + max(1, num_pairs // (length * _GROUP))
+        yield slice(begin, end), length
+        begin = end
+
+
+def _group(points: KeyPoints) -> Tensor:
+    """Groups of up to `_GROUP` key points of the same tile, side by side, (G, _GROUP) int64; padded with K."""
+    tile = (points.window << 24) + (points.row // _TILE_ROWS << 12) + points.col // _TILE_COLS
+    tile, order = ((tile << 16) + points.col).sort(stable=True)
+    tile >>= 16
+    rank = torch.arange(tile.numel(), device=tile.device) - torch.searchsorted(tile, tile)
+    slot = rank % _GROUP
+    group = (slot == 0).cumsum(0) - 1
+    member = torch.full((int(group[-1]) + 1, _GROUP), tile.numel(), dtype=torch.int64, device=tile.device)
+    member.view(-1).scatter_(0, group * _GROUP + slot, order)
+    return member
+
+
+def _candidates(source: KeyPoints, member: Tensor, target: KeyPoints, reach: Tensor) -> Tuple[Tensor, Tensor, Tensor]:
+    """For every group the key points that may lie within reach of its members (all that do, and a few more)."""
+    key, order = _band_key(target.window, target.row // _BAND, target.col).sort()
+    some = member[:, :1]
+    window = source.window.take(some)
+    member = torch.where(member == source.row.numel(), some, member)
+    (top, bottom), (left, right) = (
+        values.take(member).aminmax(dim=1, keepdim=True) for values in (source.row, source.col)
+    )
+    reach = reach.take(window)
+    num_bands = min((2 * int(reach.max()) + _TILE_ROWS) // _BAND + 2, 1 << 13)
+    band = (top - reach.long()).clamp_(min=0) // _BAND + torch.arange(num_bands, device=key.device)
+    gap = torch.maximum(top - (band * _BAND + _BAND - 1), band * _BAND - bottom).clamp_(min=0)
+    square = reach * reach - gap * gap
+    half_width = square.clamp(min=0).sqrt().ceil().clamp(max=1 << 15).long()
+    start = torch.searchsorted(key, _band_key(window, band, (left - half_width).clamp(min=0)))
+    end = torch.searchsorted(key, _band_key(window, band, right + half_width + 1))
+    length = (end - start).mul_(square >= 0)
+    count = length.sum(1)
+    start, length = start.flatten(), length.flatten()
+    place = torch.repeat_interleave(start - (length.cumsum(0) - length), length)
+    candidate = order.index_select(0, place.add_(torch.arange(place.numel(), device=place.device)))
+    limit = (reach * reach).floor().clamp(max=torch.iinfo(torch.int32).max - 1).int()
+    return candidate, count, limit[:, 0]
+
+
+def _band_key(window: Tensor, band: Tensor, col: Tensor) -> Tensor:
+    """Sorts by window, band, column; bands may lie up to 2^13 below the image."""
+    return (((window << 16) + band) << 17) + col

@@ -1,0 +1,262 @@
+"""A simulated drive that speaks the `Log` protocol, with exact poses, ground mask and flow."""
+
+from __future__ import annotations
+
+import uuid
+from collections import OrderedDict
+from typing import Dict, List, Optional
+
+import numpy as np
+import torch
+
+from cflow_torch.data.log import FlowLabels
+from cflow_torch.simulator.lidar import Returns, scan, scan_rolling
+from cflow_torch.simulator.motion import Motion
+from cflow_torch.simulator.objects import CATEGORIES, own_truck
+from cflow_torch.simulator.profiles import get_profile, in_weather
+from cflow_torch.simulator.recording import UnitReturns
+from cflow_torch.simulator.scene import Scene
+from cflow_torch.simulator.scenes import get_scene
+from cflow_torch.simulator.sensors import LidarProfile
+from cflow_torch.simulator.writers.av2 import Boxes, Channels, GroundRaster
+from cflow_torch.types import CFlowError, Sweep
+
+AXLE_HEIGHT = 0.35  # of the ego frame's origin above the ground in profile av2, metres
+_FIRST_STAMP_NS = 315_970_000_000_000_000
+_CACHED_SWEEPS = 8  # a window of five and its neighbours; a sweep of 100,000 points takes 3 MB
+_BOX_SLACK = 0.1  # annotation boxes are that much larger than the body, so that range noise stays inside, metres
+_ROUNDING = 1e-4  # boxes hold their points also after those are rounded to float32, metres
+_RASTER_STEP = 0.3  # metres per cell of the ground raster, as in Argoverse 2
+
+
+class Drive:
+    """A drive through a synthetic scene. Sweeps are simulated when asked for, each from its own random stream, so they
+    do not depend on the order of the calls. It is a `data.recording.Recording`.
+
+    In the profiles av2 and demo a sweep is instantaneous: nothing moves while the LiDAR turns. In the others every shot
+    has its own time; where the data set moves points to the time stamp by the motion of the ego car, so does the drive,
+    and what moves stays smeared. There boxes are as long as it takes to hold the smeared points.
+
+    Args:
+        scene: place, traffic and the way of the ego car.
+        profile: the LiDARs.
+        seed: of the noise.
+        num_sweeps: at the rate of the profile.
+        log_id: name of the log.
+
+    Attributes:
+        log_id, timestamps: see `cflow_torch.data.log.Log`.
+        poses: (num_sweeps, 4, 4) float64 `T_world_ego`.
+        calibration: sensor name -> (4, 4) float64 `T_ego_sensor`.
+        track_ids: one UUID per body of the scene; only bodies with a category are annotated.
+    """
+
+    def __init__(self, scene: Scene, profile: LidarProfile, seed: int, num_sweeps: int, log_id: str) -> None:
+        self.log_id = log_id
+        self.timestamps = tuple(_FIRST_STAMP_NS + i * profile.sweep_interval_ns for i in range(num_sweeps))
+        self.scene = scene
+        self.calibration: Dict[str, np.ndarray] = {unit.name: unit.T_ego_sensor for unit in profile.units}
+        self._profile, self._seed = profile, seed
+        self._seconds = np.arange(num_sweeps) * (profile.sweep_interval_ns * 1e-9)
+        self._motion = Motion(scene, profile, self._seconds)
+        self._body_poses = scene.body_poses(self._seconds)
+        self.poses = self._motion.ego_poses(self._seconds)
+        self._is_annotated = self._annotated(scene)
+        self._category = np.array([CATEGORIES.get(body.category or "", 0) for body in scene.bodies], np.uint8)
+        identity = np.random.default_rng([seed, 1])
+        self.track_ids = tuple(str(uuid.UUID(bytes=identity.bytes(16), version=4)) for _ in scene.bodies)
+        self._cache: OrderedDict[int, Returns] = OrderedDict()
+
+    def poses_at(self, index: int, offset_ns: np.ndarray) -> np.ndarray:
+        """(M, 4, 4) float64 true `T_world_ego` at `offset_ns` (M,) after the time stamp of sweep `index`."""
+        return self._motion.ego_poses(self._seconds[index] + 1e-9 * np.asarray(offset_ns, np.float64))
+
+    def sweep(self, index: int) -> Sweep:
+        """Sweep `index`: (N, 3) float32 points in its ego frame, exact ground mask, float64 pose, time."""
+        returns = self.returns(index)
+        return Sweep(
+            returns.points.numpy().copy(), (returns.solid < 0).numpy(), self.poses[index].copy(), self.timestamps[index]
+        )
+
+    def labels(self, index: int) -> Optional[FlowLabels]:
+        """Truth of the pair (index, index + 1), None for the last sweep.
+
+        A point belongs to the body its ray hit and moves with the body's track from the time stamp of the one sweep to
+        that of the other, also if it was measured before or after it; legs do not swing in the truth. Points
+        of a body that is not annotated in both sweeps (its middle is beyond the LiDAR's range) are invalid, and of
+        category 0 if it is not annotated at `index`.
+
+        Source: p' = inv(pose1) B1 inv(B0) pose0 p with the body's poses B0, B1 in the world, in float64.
+        """
+        returns = self.returns(index)
+        if index == len(self.timestamps) - 1:
+            return None
+        world_ego = np.linalg.inv(self.poses[index + 1])
+        static = world_ego @ self.poses[index]
+        moved = world_ego @ self._body_poses[index + 1] @ np.linalg.inv(self._body_poses[index]) @ self.poses[index]
+        is_background = self._category == 0
+        moved[is_background] = static
+        motions = np.concatenate([moved, static[None]])  # the last row is the ground's
+
+        body = self._body_of(returns)
+        points = returns.points.numpy().astype(np.float64)
+        motion = motions[body]
+        flow = np.einsum("nij,nj->ni", motion[:, :3, :3], points) + motion[:, :3, 3] - points
+        now, then = np.append(self._is_annotated[index], True), np.append(self._is_annotated[index + 1], True)
+        category = np.where(now, np.append(self._category, 0), 0).astype(np.uint8)
+        return FlowLabels(flow.astype(np.float32), category[body], (now & then)[body])
+
+    def boxes(self, index: int) -> Boxes:
+        """Annotation boxes of sweep `index`, in its ego frame."""
+        returns = self.returns(index)
+        chosen = np.flatnonzero(self._is_annotated[index] & (self._category > 0))
+        bodies = [self.scene.bodies[i] for i in chosen]
+        size = np.array([body.size for body in bodies]).reshape(-1, 3) + _BOX_SLACK
+        pose = np.linalg.inv(self.poses[index]) @ self._body_poses[index, chosen]
+        if self._profile.is_rolling:
+            size = np.maximum(size, self._extent(index, returns)[chosen])
+        pose[:, :3, 3] += pose[:, :3, 2] * size[:, 2:] / 2
+        return Boxes(
+            track_id=tuple(self.track_ids[i] for i in chosen),
+            category=tuple(str(body.category) for body in bodies),
+            size=size,
+            pose=pose,
+            num_points=np.bincount(self._body_of(returns), minlength=len(self.scene.bodies) + 1)[chosen],
+        )
+
+    def channels(self, index: int) -> Channels:
+        """Intensity, laser and firing time of every point of sweep `index`."""
+        returns = self.returns(index)
+        return Channels(returns.intensity.numpy(), returns.laser_number.numpy(), returns.offset_ns.numpy())
+
+    def units(self, index: int) -> List[UnitReturns]:
+        """What each LiDAR received in sweep `index`; together, in this order, the rows of `sweep(index)`."""
+        returns = self.returns(index)
+        velocity = self._motion.radial_velocity(self._seconds[index], returns)
+        if self._profile.velocity_noise:
+            noise = np.random.default_rng([self._seed, 3, index]).normal(size=len(velocity))
+            velocity = (velocity + self._profile.velocity_noise * noise).astype(np.float32)
+        parts, begin = [], 0
+        counts = torch.bincount(returns.unit, minlength=len(self._profile.units)).tolist()
+        for unit, count in zip(self._profile.units, counts):
+            rows = slice(begin, begin + count)
+            parts.append(
+                UnitReturns(
+                    name=unit.name,
+                    T_ego_sensor=unit.T_ego_sensor,
+                    points=returns.local[rows].numpy().copy(),
+                    ring=returns.ring[rows].numpy().copy(),
+                    column=returns.column[rows].numpy().copy(),
+                    offset_ns=returns.offset_ns[rows].numpy().astype(np.int64),
+                    intensity=returns.intensity[rows].numpy().copy(),
+                    radial_velocity=velocity[rows],
+                    num_rings=len(unit.elevations),
+                    num_columns=unit.num_columns,
+                )
+            )
+            begin += count
+        return parts
+
+    def elevations(self, unit: str) -> np.ndarray:
+        """(num_rings,) float64 radians, elevation of each ring of a unit, lowest first.
+
+        Raises:
+            CFlowError: there is no such unit.
+        """
+        for candidate in self._profile.units:
+            if candidate.name == unit:
+                return np.radians(np.sort(np.array(candidate.elevations, np.float64)))
+        raise CFlowError(f"log {self.log_id} has no LiDAR {unit!r}; it has {', '.join(self.calibration)}")
+
+    def ground_raster(self) -> GroundRaster:
+        """Ground height of the area that the LiDAR can reach."""
+        reach = self._profile.max_range + 1
+        low = np.floor(self.poses[:, :2, 3].min(0) - reach)
+        count = np.ceil((self.poses[:, :2, 3].max(0) + reach - low) / _RASTER_STEP).astype(int)
+        x, y = (low[k] + _RASTER_STEP * (np.arange(count[k]) + 0.5) for k in (0, 1))
+        height = self.scene.ground.height(*np.meshgrid(x, y))
+        return GroundRaster(height, (float(low[0]), float(low[1])), _RASTER_STEP)
+
+    def returns(self, index: int) -> Returns:
+        """Everything the LiDARs received in sweep `index`.
+
+        Raises:
+            CFlowError: there is no such sweep.
+        """
+        if not 0 <= index < len(self.timestamps):
+            raise CFlowError(f"log {self.log_id} has sweeps 0 ... {len(self.timestamps) - 1}, got index {index}")
+        if index not in self._cache:
+            self._cache[index] = self._scan(index)
+            if len(self._cache) > _CACHED_SWEEPS:
+                self._cache.popitem(last=False)
+        return self._cache[index]
+
+    def _scan(self, index: int) -> Returns:
+        stream = np.random.SeedSequence([self._seed, 2, index]).generate_state(1, np.uint32)[0]
+        generator = torch.Generator().manual_seed(int(stream))
+        seconds, ground = float(self._seconds[index]), self.scene.ground
+        if self._profile.is_rolling:
+            ego, solids = self._motion.ego_motion(seconds), self._motion.solids(index)
+            return scan_rolling(self._profile, solids, ground, ego, generator)
+        solids_now = self.scene.solids(seconds, self._body_poses[index])
+        pose = torch.from_numpy(self.poses[index])
+        return scan(self._profile, solids_now, ground, pose, generator, self._profile.sweep_interval_ns)
+
+    def _extent(self, index: int, returns: Returns) -> np.ndarray:
+        """(num_bodies, 3) float64 size of the smallest upright box about a body's axis that holds its points."""
+        points = returns.points.numpy().astype(np.float64)
+        if not self._profile.is_deskewed:
+            moved = np.linalg.inv(self.poses[index]) @ self.poses_at(index, returns.offset_ns.numpy())
+            points = np.einsum("nij,nj->ni", moved[:, :3, :3], points) + moved[:, :3, 3]
+        body = self._body_of(returns)
+        chosen = np.append(self._category > 0, False)[body]
+        points, body = points[chosen], body[chosen]
+        T_body_ego = (np.linalg.inv(self._body_poses[index]) @ self.poses[index])[body]
+        local = np.abs(np.einsum("nij,nj->ni", T_body_ego[:, :3, :3], points) + T_body_ego[:, :3, 3])
+        extent = np.zeros((len(self.scene.bodies), 3))
+        np.maximum.at(extent, body, local * (2, 2, 1))
+        return extent + _ROUNDING
+
+    def _body_of(self, returns: Returns) -> np.ndarray:
+        """(N,) int64 body of each point; number of bodies = the ground."""
+        return np.append(self.scene.table.body, len(self.scene.bodies))[returns.solid.numpy()]
+
+    def _annotated(self, scene: Scene) -> np.ndarray:
+        """(num_sweeps, num_bodies) bool: near enough for an annotator to see; background always."""
+        offset = self._body_poses[:, :, :2, 3] - self.poses[:, None, :2, 3]
+        is_background = np.array([body.category is None for body in scene.bodies])
+        return is_background | (np.hypot(offset[..., 0], offset[..., 1]) < self._profile.max_range)
+
+
+def make_drive(
+    seed: int = 0, num_sweeps: int = 20, profile: str = "av2", scene: str = "street", weather: str = "clear"
+) -> Drive:
+    """A simulated drive past houses, trees, parked and moving traffic and people.
+
+    Args:
+        seed: >= 0; the same seed gives the same bytes on the same machine.
+        num_sweeps: >= 1, at the rate of the profile. After the first seconds, vehicles may pass through each other.
+        profile: a name in `profiles.PROFILES`: one of the five data sets `av2`, `nuscenes`, `truckscenes`, `waymo`,
+            `aevascenes`; `demo` (28,800 rays); `av2_rolling` (av2, with a time for every shot).
+        scene: a name in `scenes.SCENES`: `street`, `highway`, `crossing`, `narrow`, `car_park`.
+        weather: a name in `profiles.WEATHER`: `clear`, `rain`, `snow`, `fog`.
+
+    Returns:
+        Drive, a `Log` and a `Recording`.
+
+    Raises:
+        CFlowError: an argument is out of range or there is no such profile, scene or weather.
+
+    Example:
+        >>> drive = make_drive(seed=1, num_sweeps=2, profile="demo")
+        >>> drive.sweep(0).points.shape == drive.labels(0).flow.shape
+        True
+    """
+    if seed < 0 or num_sweeps < 1:
+        raise CFlowError(f"seed must be >= 0 and num_sweeps >= 1, got seed {seed} and num_sweeps {num_sweeps}")
+    lidars = in_weather(get_profile(profile), weather)
+    place = get_scene(scene)(np.random.default_rng([seed, 0]))
+    if lidars.has_trailer:
+        place = place.with_own(own_truck(place.ego))
+    parts = [profile, *([scene] if scene != "street" else []), *([weather] if weather != "clear" else [])]
+    return Drive(place, lidars, seed, num_sweeps, f"synthetic-{'-'.join(parts)}-{seed:04d}")

@@ -1,0 +1,240 @@
+"""Multi-beam LiDARs that measure a scene: geometry from ray casting, then noise and lost returns."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from typing import Callable, List, Tuple, Union
+
+import torch
+from torch import Tensor
+
+from cflow_torch.simulator.ground import Ground
+from cflow_torch.simulator.moving_solids import MovingSolids
+from cflow_torch.simulator.range_image import RangeImage, cast_shots, cast_unit
+from cflow_torch.simulator.raycast import Solids, incidence
+from cflow_torch.simulator.rolling import Shots
+from cflow_torch.simulator.sensors import LidarProfile, SpinningLidar
+
+GROUND_ALBEDO = 0.25
+FOLIAGE_RETURN = 0.75  # share of the shots at a leaf that come back: leaves flutter
+
+
+@dataclass(frozen=True)
+class Returns:
+    """What a vehicle's LiDARs received in one sweep, N returns, unit by unit.
+
+    Args:
+        points: (N, 3) float32, metres, ego frame, after the motion compensation of the data set.
+        solid: (N,) int64, the solid that was hit; -1 = the ground.
+        intensity: (N,) uint8.
+        laser_number: (N,) uint8, running on from unit to unit (modulo 256).
+        offset_ns: (N,) int32, time of the shot after the time stamp.
+        unit: (N,) int64, number of the unit that received it; ascending.
+        local: (N, 3) float32, metres, the points in the frame of their unit.
+        ring: (N,) int32, number of the beam, lowest first.
+        column: (N,) int32, number of the azimuth step in the order of time.
+
+    Convention: in a profile that rolls, the rows of a unit are in the order of time, in one that does not, in the order
+    of azimuth; those of one column from the lowest beam up.
+    """
+
+    points: Tensor
+    solid: Tensor
+    intensity: Tensor
+    laser_number: Tensor
+    offset_ns: Tensor
+    unit: Tensor
+    local: Tensor
+    ring: Tensor
+    column: Tensor
+
+
+@dataclass(frozen=True)
+class EgoMotion:
+    """How the vehicle moves while it measures.
+
+    Args:
+        T_world_ego: (4, 4) float64 at the time stamp.
+        T_world_unit: one per unit: (C, 4, 4) float64, where the unit is when it fires the columns it has.
+        seconds: one per unit: (C,) float64, when that is.
+        speed: (2,) m/s and rad/s that it does not exceed.
+    """
+
+    T_world_ego: Tensor
+    T_world_unit: List[Tensor]
+    seconds: List[Tensor]
+    speed: Tuple[float, float]
+
+
+def scan(
+    profile: LidarProfile,
+    solids: Solids,
+    ground: Ground,
+    T_world_ego: Tensor,
+    generator: torch.Generator,
+    sweep_interval_ns: int,
+) -> Returns:
+    """One sweep of all units of a vehicle in a world that stands still meanwhile.
+
+    Args:
+        profile: the units and their quality.
+        solids: everything but the ground, in the world.
+        ground: the ground, in the world.
+        T_world_ego: (4, 4) float64.
+        generator: noise, drop-out and the azimuth at which the turn starts are drawn from it.
+        sweep_interval_ns: duration of one turn.
+    """
+    parts, first_laser = [], 0
+    T_solid_ego = torch.linalg.inv(solids.pose) @ T_world_ego
+    for number, unit in enumerate(profile.units):
+        step = 2 * math.pi / unit.num_columns
+        phase = step * torch.rand((), generator=generator, dtype=torch.float64).item()
+        image = cast_unit(unit, phase, solids, T_solid_ego, ground, T_world_ego, profile.max_range)
+        T_solid_sensor = T_solid_ego @ torch.from_numpy(unit.T_ego_sensor)
+
+        def cosine_at(ray: Tensor, image: RangeImage = image, T_solid_sensor: Tensor = T_solid_sensor) -> Tensor:
+            rays, distance, solid = image.rays.index_select(1, ray), image.distance[ray], image.solid[ray]
+            return incidence(solids, T_solid_sensor, solid, rays, distance)
+
+        hit, distance, reflected = _measure(image, unit, profile, solids, cosine_at, generator)
+        local = image.rays.index_select(1, hit) * distance
+        T_ego_sensor = torch.from_numpy(unit.T_ego_sensor).float()
+        points = T_ego_sensor[:3, :3] @ local + T_ego_sensor[:3, 3:]
+        column = hit // len(unit.elevations)
+        turned = column if unit.span > 0 else unit.num_columns - 1 - column
+        offset_ns = turned * (sweep_interval_ns / unit.num_columns)
+        parts.append(_returns(points, local, image, hit, reflected, unit, (number, first_laser), turned, offset_ns))
+        first_laser += len(unit.elevations)
+    return _together(parts)
+
+
+def scan_rolling(
+    profile: LidarProfile, solids: MovingSolids, ground: Ground, ego: EgoMotion, generator: torch.Generator
+) -> Returns:
+    """One sweep of all units of a vehicle; everything moves while they turn.
+
+    Args:
+        profile: the units and their quality.
+        solids: everything but the ground.
+        ground: the ground, in the world.
+        ego: motion of the vehicle.
+        generator: noise, drop-out and the azimuth at which the sweep starts are drawn from it.
+    """
+    parts, first_laser = [], 0
+    for number, unit in enumerate(profile.units):
+        first, end = unit.seen or (0, unit.num_columns)
+        step = math.radians(unit.span) / unit.num_columns
+        early = torch.rand((), generator=generator, dtype=torch.float64).item() if unit.has_jitter else 0.5
+        columns = torch.arange(first, end)
+        T_world_unit = ego.T_world_unit[number].clone()
+        T_world_unit[:, :3, 3] -= solids.origin
+        shots = Shots(
+            azimuth=math.radians(unit.start) + step * (columns.double() + early),
+            seconds=ego.seconds[number],
+            T_world_sensor=T_world_unit,
+            elevation=torch.tensor(unit.elevations, dtype=torch.float64).deg2rad().sort().values,
+            speed=(0.0, 0.0) if unit.is_virtual else ego.speed,
+        )
+        max_range = min(unit.max_range or profile.max_range, profile.max_range)
+        image, cosine_at = cast_shots(shots, solids, ground, max_range)
+        hit, distance, reflected = _measure(image, unit, profile, solids, cosine_at, generator)
+
+        column = hit // len(unit.elevations)
+        T_ego_sensor = torch.from_numpy(unit.T_ego_sensor).float()
+        R, t = T_ego_sensor[:3, :3], T_ego_sensor[:3, 3:]
+        if profile.is_deskewed and not unit.is_virtual:
+            # To where the ray ended in the world, and from there to the frames at the time stamp.
+            T_ego_world = torch.linalg.inv(ego.T_world_ego)
+            T_ego_world[:3, 3] += T_ego_world[:3, :3] @ solids.origin
+            origins = T_world_unit[:, :3, 3].T.float().contiguous()
+            ended = origins.index_select(1, column) + image.rays.index_select(1, hit) * distance
+            points = T_ego_world[:3, :3].float() @ ended + T_ego_world[:3, 3:].float()
+            local = R.T @ (points - t)
+        else:
+            azimuth, elevation = shots.azimuth.float()[column], shots.elevation.float()[hit % len(unit.elevations)]
+            level = elevation.cos() * distance
+            local = torch.stack([azimuth.cos() * level, azimuth.sin() * level, elevation.sin() * distance])
+            points = R @ local + t
+        interval_ns = profile.sweep_interval_ns / unit.num_columns
+        offset_ns = ((column + first).double() * interval_ns - profile.reference * profile.sweep_interval_ns).round()
+        image_column = (column + first) % unit.num_columns
+        parts.append(
+            _returns(points, local, image, hit, reflected, unit, (number, first_laser), image_column, offset_ns)
+        )
+        first_laser += len(unit.elevations)
+    return _together(parts)
+
+
+def _measure(
+    image: RangeImage,
+    unit: SpinningLidar,
+    profile: LidarProfile,
+    solids: Union[Solids, MovingSolids],
+    cosine_at: Callable[[Tensor], Tensor],
+    generator: torch.Generator,
+) -> Tuple[Tensor, Tensor, Tensor]:
+    """Noise along the ray; returns that are too near, too far, too weak or unlucky are lost.
+
+    Args:
+        cosine_at: rays (n,) that met solids to the cosines of the angles of incidence.
+
+    Returns:
+        (N,) int64 rays that came back; (N,) float32 measured range; (N,) float32 share of the light reflected.
+    """
+    max_range = min(unit.max_range or profile.max_range, profile.max_range)
+    hit = ((image.distance > profile.min_range) & (image.distance < max_range)).nonzero()[:, 0]
+    noise = profile.range_noise * torch.randn(len(hit), generator=generator)
+    luck = torch.rand(len(hit), generator=generator)
+    dropout = profile.dropout if unit.dropout is None else unit.dropout
+    lucky = (luck < 1 - dropout).nonzero()[:, 0]
+    hit, noise, luck = hit.index_select(0, lucky), noise.index_select(0, lucky), luck.index_select(0, lucky)
+
+    distance, solid, cosine = (values.index_select(0, hit) for values in (image.distance, image.solid, image.cosine))
+    on_solid = (solid >= 0).nonzero()[:, 0]
+    cosine[on_solid] = cosine_at(hit.index_select(0, on_solid))
+    # Solid number -1, the ground, reads the last row.
+    albedo = torch.cat([solids.albedo, torch.tensor([GROUND_ALBEDO])]).take(solid)
+    is_foliage = torch.cat([solids.is_foliage, torch.tensor([False])]).take(solid)
+    reflected = cosine * albedo
+    # Light comes back as 1 / range^2; the threshold is soft.
+    margin = reflected * ((unit.reach or profile.reach) / distance) ** 2
+    if profile.extinction:
+        margin = margin * torch.exp(-2 * profile.extinction * distance)
+    chance = (1 - dropout) * torch.sigmoid(4 * margin.clamp(min=1e-12).log())
+    chance = torch.where(is_foliage, FOLIAGE_RETURN * chance, chance)
+    if isinstance(solids, MovingSolids):
+        chance = chance.masked_fill(torch.cat([solids.is_hidden, torch.tensor([False])]).take(solid), 0.0)
+    kept = (luck < chance).nonzero()[:, 0]
+    return hit[kept], (distance + noise)[kept], reflected[kept]
+
+
+def _returns(
+    points: Tensor,
+    local: Tensor,
+    image: RangeImage,
+    hit: Tensor,
+    reflected: Tensor,
+    unit: SpinningLidar,
+    numbers: Tuple[int, int],
+    column: Tensor,
+    offset_ns: Tensor,
+) -> Returns:
+    """Returns of one unit; `numbers` are its own and that of its first laser."""
+    laser = torch.tensor(unit.elevations, dtype=torch.float64).sort().indices
+    beam = hit % len(unit.elevations)
+    return Returns(
+        points=points.T.contiguous(),
+        solid=image.solid.index_select(0, hit),
+        intensity=(255 * reflected).clamp(0, 255).to(torch.uint8),
+        laser_number=((numbers[1] + laser[beam]) % 256).to(torch.uint8),
+        offset_ns=offset_ns.to(torch.int32),
+        unit=torch.full((len(hit),), numbers[0]),
+        local=local.T.contiguous(),
+        ring=beam.to(torch.int32),
+        column=column.to(torch.int32),
+    )
+
+
+def _together(parts: List[Returns]) -> Returns:
+    return Returns(*(torch.cat([getattr(part, column.name) for part in parts]) for column in fields(Returns)))

@@ -1,0 +1,318 @@
+"""What stands and moves in the street: shapes made of a few solids, and the ways they travel.
+
+A body frame stands on the ground: x ahead, y left, z up, origin below the middle of the body.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import List, NamedTuple, Optional, Sequence, Tuple, Union
+
+import numpy as np
+
+from cflow_torch.simulator.raycast import BOX, CYLINDER, ELLIPSOID
+
+Vector = Tuple[float, float, float]
+HIP = 0.9  # height about which legs swing, metres
+
+# Argoverse 2 category index (1-based, alphabetical) of the categories that occur.
+CATEGORIES = {
+    "BICYCLIST": 4,
+    "BUS": 7,
+    "PEDESTRIAN": 17,
+    "REGULAR_VEHICLE": 19,
+    "TRUCK_CAB": 26,
+    "VEHICULAR_TRAILER": 27,
+}
+
+
+class Solid(NamedTuple):
+    """One solid of a body.
+
+    Args:
+        kind: BOX, CYLINDER or ELLIPSOID.
+        centre: metres, body frame.
+        half: half size along its own axes, metres.
+        pitch, roll: radians about y, then x: how the solid is turned in the body.
+        albedo: share of the light that comes back.
+        is_foliage: flickers from sweep to sweep.
+        swing: amplitude of a leg's swing about the hip's y axis, radians.
+        stride: steps per second; phase: radians at time 0.
+    """
+
+    kind: int
+    centre: Vector
+    half: Vector
+    pitch: float = 0.0
+    roll: float = 0.0
+    albedo: float = 0.5
+    is_foliage: bool = False
+    swing: float = 0.0
+    stride: float = 0.0
+    phase: float = 0.0
+
+
+@dataclass(frozen=True)
+class Route:
+    """A way made of a straight, an arc and a straight, driven at constant speed or with constant acceleration.
+
+    Args:
+        x, y: where the arc begins (anywhere, if angle is 0), world metres.
+        yaw: heading there, radians.
+        start: distance along the way at time 0, negative = before the arc, metres.
+        speed: m/s at time 0; negative = in reverse.
+        radius: of the arc, metres.
+        angle: of the arc, radians, positive = left.
+        acceleration: m/s^2; what brakes to a standstill stays there.
+    """
+
+    x: float
+    y: float
+    yaw: float = 0.0
+    start: float = 0.0
+    speed: float = 0.0
+    radius: float = 1.0
+    angle: float = 0.0
+    acceleration: float = 0.0
+
+    def __call__(self, seconds: np.ndarray) -> np.ndarray:
+        """(T, 3) float64 world x, y, yaw at `seconds` (T,)."""
+        return self.at(self.distance(seconds))
+
+    def distance(self, seconds: np.ndarray) -> np.ndarray:
+        """(T,) metres from the beginning of the arc at `seconds` (T,)."""
+        if self.acceleration == 0:
+            return np.asarray(self.start + self.speed * seconds)
+        stop = -self.speed / self.acceleration
+        # One that brakes halts there; one that starts up at a time before 0 stood until then.
+        seconds = np.minimum(seconds, stop) if self.speed * self.acceleration < 0 else np.maximum(seconds, stop)
+        return np.asarray(self.start + self.speed * seconds + 0.5 * self.acceleration * seconds**2)
+
+    @property
+    def stands(self) -> bool:
+        """Never moves."""
+        return self.speed == 0 and self.acceleration == 0
+
+    def at(self, distance: np.ndarray) -> np.ndarray:
+        """(T, 3) float64 world x, y, yaw after `distance` (T,) metres from the beginning of the arc."""
+        side = math.copysign(1.0, self.angle)
+        turned = np.clip(distance / self.radius, 0, abs(self.angle))
+        beyond = np.maximum(distance - self.radius * abs(self.angle), 0)
+        ahead = np.minimum(distance, 0) + self.radius * np.sin(turned) + beyond * math.cos(self.angle)
+        left = side * self.radius * (1 - np.cos(turned)) + beyond * math.sin(self.angle)
+        cos, sin = math.cos(self.yaw), math.sin(self.yaw)
+        return np.stack(
+            [self.x + cos * ahead - sin * left, self.y + sin * ahead + cos * left, self.yaw + side * turned], -1
+        )
+
+
+@dataclass(frozen=True)
+class Towed:
+    """The way of a trailer: its axle follows the hitch like a tractrix.
+
+    Args:
+        tractor: way of the tractor's middle.
+        hitch: how far behind that middle the hitch is, metres.
+        wheelbase: hitch to axle, metres.
+        middle: hitch to the trailer's middle, metres.
+    """
+
+    tractor: Route
+    hitch: float
+    wheelbase: float
+    middle: float
+
+    def __call__(self, seconds: np.ndarray) -> np.ndarray:
+        """(T, 3) float64 world x, y, yaw of the trailer's middle at `seconds` (T,)."""
+        wanted = self.tractor.distance(seconds)
+        # Four wheelbases of straight run-in settle the angle; 5 cm steps follow the true curve to a millimetre.
+        begin = min(float(wanted.min()), 0.0) - 4 * self.wheelbase
+        distance = np.linspace(begin, float(wanted.max()), 2 + int((float(wanted.max()) - begin) / 0.05))
+        ways = self.tractor.at(distance)
+        heading = np.stack([np.cos(ways[:, 2]), np.sin(ways[:, 2])], -1)
+        hitches = ways[:, :2] - self.hitch * heading
+        axles = np.empty_like(hitches)
+        axles[0] = hitches[0] - self.wheelbase * heading[0]
+        for i in range(1, len(hitches)):
+            pull = hitches[i] - axles[i - 1]
+            axles[i] = hitches[i] - pull * (self.wheelbase / math.hypot(pull[0], pull[1]))
+        pull = hitches - axles
+        yaw = np.unwrap(np.arctan2(pull[:, 1], pull[:, 0]))
+        middles = hitches - pull * (self.middle / self.wheelbase)
+        return np.stack([np.interp(wanted, distance, values) for values in (*middles.T, yaw)], -1)
+
+
+@dataclass(frozen=True)
+class Body:
+    """A thing of the scene.
+
+    Args:
+        solids: its shape.
+        way: (T,) seconds to (T, 3) world x, y, yaw.
+        category: Argoverse 2 category name, None = background (never labelled, never moves).
+        size: length, width, height, from the ground up, metres.
+    """
+
+    solids: Sequence[Solid]
+    way: Union[Route, Towed]
+    category: Optional[str] = None
+    size: Vector = (0.0, 0.0, 0.0)
+
+    @property
+    def stands(self) -> bool:
+        """Never moves."""
+        return isinstance(self.way, Route) and self.way.stands
+
+
+def box(x0: float, x1: float, y0: float, y1: float, z0: float, z1: float, albedo: float) -> Solid:
+    """A box from its six faces, metres, body frame."""
+    centre = ((x0 + x1) / 2, (y0 + y1) / 2, (z0 + z1) / 2)
+    return Solid(BOX, centre, ((x1 - x0) / 2, (y1 - y0) / 2, (z1 - z0) / 2), albedo=albedo)
+
+
+def _wheels(xs: Sequence[float], y: float, radius: float) -> List[Solid]:
+    return [
+        Solid(CYLINDER, (x, side * (y - 0.12), radius), (radius, radius, 0.12), roll=math.pi / 2, albedo=0.15)
+        for x in xs
+        for side in (-1, 1)
+    ]
+
+
+def car(rng: np.random.Generator, way: Route) -> Body:
+    """A hull with clearance, a cabin on it, four wheels."""
+    length, width, height = rng.uniform(3.8, 5.0), rng.uniform(1.7, 2.0), rng.uniform(1.4, 1.85)
+    paint, half = rng.uniform(0.15, 0.9), length / 2
+    rear = -half + rng.uniform(0.05, 0.7)  # estate ... saloon
+    solids = [
+        box(-half, half, -width / 2, width / 2, 0.25, 0.58 * height, paint),
+        box(rear, half - rng.uniform(1.1, 1.5), -width / 2 + 0.12, width / 2 - 0.12, 0.58 * height, height, 0.3),
+        *_wheels((-0.3 * length, 0.3 * length), width / 2, 0.33),
+    ]
+    return Body(solids, way, "REGULAR_VEHICLE", (length, width, height))
+
+
+def bus(way: Route) -> Body:
+    """Twelve metres of bus."""
+    solids = [box(-6, 6, -1.27, 1.27, 0.35, 3.1, 0.6), *_wheels((-3.2, 3.3), 1.27, 0.48)]
+    return Body(solids, way, "BUS", (12.0, 2.54, 3.1))
+
+
+def articulated_truck(way: Route) -> List[Body]:
+    """A tractor with a driver's cab, and a trailer that swings in behind it: two tracks."""
+    cab = [
+        box(0.4, 2.8, -1.2, 1.2, 0.5, 3.3, 0.7),
+        box(-2.8, 0.4, -0.6, 0.6, 0.6, 1.0, 0.3),
+        *_wheels((-1.6, 1.9), 1.2, 0.5),
+    ]
+    trailer = [box(-4.25, 4.25, -1.25, 1.25, 1.15, 3.7, 0.8), *_wheels((-2.9, -1.7), 1.25, 0.5)]
+    tow = Towed(way, hitch=1.4, wheelbase=6.0, middle=3.4)
+    return [
+        Body(cab, way, "TRUCK_CAB", (5.6, 2.4, 3.3)),
+        Body(trailer, tow, "VEHICULAR_TRAILER", (8.5, 2.5, 3.7)),
+    ]
+
+
+def van(rng: np.random.Generator, way: Route) -> Body:
+    """A delivery van: one tall box behind a short bonnet."""
+    paint = rng.uniform(0.3, 0.9)
+    solids = [
+        box(-2.9, 1.9, -1.0, 1.0, 0.3, 2.5, paint),
+        box(1.9, 2.9, -0.95, 0.95, 0.3, 1.3, paint),
+        *_wheels((-1.8, 1.9), 1.0, 0.35),
+    ]
+    return Body(solids, way, "REGULAR_VEHICLE", (5.8, 2.0, 2.5))
+
+
+def own_truck(way: Route) -> List[Body]:
+    """The recording truck itself, a cab and a trailer that its LiDARs stand around. `way` is that of its rear axle."""
+    cab = [box(2.6, 5.0, -1.25, 1.25, 0.4, 3.1, 0.5), box(-1.0, 2.6, -0.6, 0.6, 0.3, 0.9, 0.3)]
+    trailer = [box(-6.3, 6.0, -1.25, 1.25, 1.1, 4.0, 0.7), *_wheels((-4.4, -3.1, -1.8), 1.25, 0.5)]
+    return [Body(cab, way), Body(trailer, Towed(way, hitch=-0.3, wheelbase=7.6, middle=4.7))]
+
+
+def pedestrian(rng: np.random.Generator, way: Route) -> Body:
+    """A trunk, a head, two legs that swing if the person walks."""
+    scale, cloth = rng.uniform(0.9, 1.1), rng.uniform(0.2, 0.8)
+    swing = 0.0 if way.speed == 0 else 0.45
+    phase = rng.uniform(0, 2 * math.pi)
+    legs = [
+        Solid(
+            *(CYLINDER, (0.0, 0.1 * side, 0.46 * scale), (0.08, 0.08, 0.44 * scale)),
+            albedo=cloth,
+            swing=swing,
+            stride=0.75 * way.speed,
+            phase=phase + side * math.pi / 2,
+        )
+        for side in (-1, 1)
+    ]
+    solids = [
+        Solid(ELLIPSOID, (0.0, 0.0, 1.17 * scale), (0.16, 0.25, 0.38 * scale), albedo=cloth),
+        Solid(ELLIPSOID, (0.0, 0.0, 1.63 * scale), (0.11, 0.09, 0.13), albedo=0.5),
+        *legs,
+    ]
+    return Body(solids, way, "PEDESTRIAN", (0.95, 0.55, 1.76 * scale))
+
+
+def cyclist(rng: np.random.Generator, way: Route) -> Body:
+    """Two wheels, a frame, and a rider who leans forward and pedals."""
+    cloth, phase = rng.uniform(0.3, 0.8), rng.uniform(0, 2 * math.pi)
+    solids = [
+        *[Solid(CYLINDER, (x, 0.0, 0.34), (0.34, 0.34, 0.025), roll=math.pi / 2, albedo=0.2) for x in (-0.52, 0.52)],
+        box(-0.5, 0.45, -0.03, 0.03, 0.35, 0.8, 0.4),
+        box(0.4, 0.5, -0.28, 0.28, 0.95, 1.05, 0.4),
+        Solid(ELLIPSOID, (-0.05, 0.0, 1.22), (0.15, 0.22, 0.36), pitch=0.5, albedo=cloth),
+        Solid(ELLIPSOID, (0.2, 0.0, 1.66), (0.11, 0.09, 0.13), albedo=0.5),
+        *[
+            Solid(
+                *(CYLINDER, (0.05, 0.12 * side, 0.6), (0.07, 0.07, 0.3)),
+                albedo=cloth,
+                swing=0.35,
+                stride=1.2,
+                phase=phase + side * math.pi / 2,
+            )
+            for side in (-1, 1)
+        ],
+    ]
+    return Body(solids, way, "BICYCLIST", (1.75, 0.6, 1.8))
+
+
+def wall(x: float, y: float, length: float, depth: float, height: float, albedo: float = 0.45) -> Body:
+    """A box along the world axes: building, garden wall or hoarding; it reaches a metre into the ground."""
+    return Body([box(-length / 2, length / 2, -depth / 2, depth / 2, -1.0, height, albedo)], Route(x, y))
+
+
+def pole(x: float, y: float, height: float, radius: float, sign: float = 0.0) -> Body:
+    """A lamp post, or with `sign` > 0 (metres) a sign post with its plate."""
+    solids = [Solid(CYLINDER, (0, 0, height / 2), (radius, radius, height / 2), albedo=0.4)]
+    if sign:
+        solids.append(box(-0.03, 0.03, -sign / 2, sign / 2, height - sign, height, 0.9))
+    return Body(solids, Route(x, y))
+
+
+def tree(rng: np.random.Generator, x: float, y: float, num_leaves: int = 110) -> Body:
+    """A trunk and a crown of balls of leaves."""
+    spread, bottom = rng.uniform(1.3, 2.1), rng.uniform(2.0, 2.8)
+    trunk = Solid(CYLINDER, (0, 0, bottom / 2 + 0.5), (0.14, 0.14, bottom / 2 + 0.5), albedo=0.3)
+    crown = _foliage(rng, (spread, spread, 1.3 * spread), bottom + 1.2 * spread, num_leaves, (0.12, 0.35))
+    return Body([trunk, *crown], Route(x, y))
+
+
+def bush(rng: np.random.Generator, x: float, y: float, num_leaves: int = 40) -> Body:
+    """Leaves from the ground up."""
+    size = (rng.uniform(0.5, 1.4), rng.uniform(0.4, 0.7), rng.uniform(0.4, 0.8))
+    return Body(_foliage(rng, size, size[2], num_leaves, (0.08, 0.2)), Route(x, y))
+
+
+def _foliage(
+    rng: np.random.Generator, radii: Vector, height: float, number: int, leaf: Tuple[float, float]
+) -> List[Solid]:
+    """Balls spread evenly through an ellipsoid."""
+    towards = rng.normal(size=(number, 3))
+    towards *= rng.uniform(size=(number, 1)) ** (1 / 3) / np.linalg.norm(towards, axis=1, keepdims=True)
+    centres = towards * radii + (0, 0, height)
+    sizes = rng.uniform(*leaf, size=number)
+    return [
+        Solid(ELLIPSOID, (cx, cy, cz), (r, r, 0.7 * r), albedo=0.35, is_foliage=True)
+        for (cx, cy, cz), r in zip(centres.tolist(), sizes.tolist())
+    ]

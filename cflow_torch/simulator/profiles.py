@@ -1,0 +1,183 @@
+"""Sensor profiles of five data sets, and the weather they may meet.
+
+What no source tells is this project's own choice and is marked "chosen".
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Dict, Tuple
+
+import numpy as np
+
+from cflow_torch.simulator.beams import PANDAR_64, VLP_32C, WAYMO_TOP
+from cflow_torch.simulator.sensors import LidarProfile, SpinningLidar
+from cflow_torch.types import CFlowError
+
+
+def _uniform(lowest: float, highest: float, number: int) -> Tuple[float, ...]:
+    return tuple(float(e) for e in np.linspace(lowest, highest, number))
+
+
+_UP = SpinningLidar("up_lidar", VLP_32C, 1800, (1.350, 0.0, 1.640), yaw=-0.58)
+# It turns clockwise seen from above too, half a turn apart from the upper one.
+_DOWN = SpinningLidar(
+    *("down_lidar", VLP_32C, 1800, (1.347, 0.005, 1.525)), yaw=-11.56, upside_down=True, start=0.0, span=360.0
+)
+_AV2 = LidarProfile((_UP, _DOWN))
+
+# A quarter of the rays, for examples and tests.
+_DEMO = LidarProfile(
+    (SpinningLidar("up_lidar", _uniform(-25, 7, 32), 900, (1.35, 0.0, 1.64)),),
+    max_range=120.0,
+)
+
+# Chosen: a sweep begins behind the car, and the reach.
+_NUSCENES = LidarProfile(
+    (SpinningLidar("LIDAR_TOP", _uniform(-30.67, 10.67, 32), 1084, (0.943713, 0.0, 1.84023), yaw=-90.0, start=-90.0),),
+    max_range=100.0,
+    reach=350.0,
+    sweep_interval_ns=50_000_000,
+    is_rolling=True,
+    reference=1.0,
+    ego_height=0.0,
+)
+
+
+def _truckscenes() -> LidarProfile:
+    """Chosen: all mountings but that of TOP_FRONT, the fans, the reaches, a time stamp at the beginning of the turn.
+
+    The azimuth offsets between the beams of the 64-beam units are left out.
+    """
+
+    def corner(name: str, side: int) -> SpinningLidar:
+        place = ((4.9, side * 1.5, 2.2), side * 45.0)
+        return SpinningLidar(name, PANDAR_64, 1800, *place, seen=(225, 1575), reach=500.0)
+
+    def wide(name: str, position: Tuple[float, float, float], yaw: float, pitch: float) -> SpinningLidar:
+        return SpinningLidar(
+            *(name, _uniform(-45, 45, 32), 1024, position, yaw),
+            pitch=pitch,
+            seen=(256, 768),
+            max_range=60.0,
+            reach=110.0,
+        )
+
+    units = (
+        corner("LIDAR_LEFT", 1),
+        corner("LIDAR_RIGHT", -1),
+        wide("LIDAR_TOP_FRONT", (5.008, -0.014, 3.234), 0.0, 56.0),
+        wide("LIDAR_TOP_LEFT", (4.3, 1.3, 3.2), 90.0, 50.0),
+        wide("LIDAR_TOP_RIGHT", (4.3, -1.3, 3.2), -90.0, 50.0),
+        wide("LIDAR_REAR", (-1.1, 0.0, 0.95), 180.0, 0.0),
+    )
+    return LidarProfile(units, is_rolling=True, is_deskewed=False, ego_height=0.0, has_trailer=True)
+
+
+def _waymo() -> LidarProfile:
+    """One LiDAR on the roof, four that look at what is close; azimuths on the grid of the range images.
+
+    Chosen: the small ones see 90 degrees and fill three pixels in ten, so that a few per cent of their image are valid.
+    """
+    rows = _uniform(-89.7, 29.7, 200)  # middles of 200 rows from -90 to 30 degrees
+
+    def small(name: str, position: Tuple[float, float, float], yaw: float) -> SpinningLidar:
+        ahead = round(300 - yaw / 0.6)  # column 0 lies behind the vehicle
+        return SpinningLidar(
+            *(name, rows, 600, position, yaw),
+            start=180.0 - yaw,
+            seen=(ahead - 75, ahead + 75),
+            has_jitter=False,
+            is_virtual=True,
+            max_range=20.0,
+            reach=150.0,
+            dropout=0.7,
+        )
+
+    units = (
+        SpinningLidar("TOP", WAYMO_TOP, 2650, (1.43, 0.0, 2.184), yaw=148.0, start=32.0, has_jitter=False),
+        small("FRONT", (4.07, 0.0, 0.69), 0.0),
+        small("SIDE_LEFT", (3.25, 1.02, 0.98), 90.0),
+        small("SIDE_RIGHT", (3.25, -1.02, 0.98), -90.0),
+        small("REAR", (-1.15, 0.0, 0.46), 180.0),
+    )
+    return LidarProfile(units, min_range=0.4, max_range=75.0, is_rolling=True, reference=0.5, ego_height=0.0)
+
+
+def _aevascenes() -> LidarProfile:
+    """Chosen: numbers of lines and columns, one pass from left to right per sweep, and the reaches."""
+
+    def fan(
+        name: str,
+        position: Tuple[float, float, float],
+        yaw: float,
+        azimuth: Tuple[float, float],
+        elevation: Tuple[float, float],
+        max_range: float,
+    ) -> SpinningLidar:
+        width = azimuth[1] - azimuth[0]
+        lines, columns, reach = (80, 700, 1500.0) if width < 60 else (100, 800, 600.0)
+        return SpinningLidar(
+            *(name, _uniform(*elevation, lines), columns, position, yaw),
+            start=azimuth[1],
+            span=-width,
+            max_range=max_range,
+            reach=reach,
+        )
+
+    units = (
+        fan("front_wide_lidar", (1.481, 0.151, 1.961), 0.6, (-62.6, 61.2), (-13.2, 7.6), 193.0),
+        fan("front_narrow_lidar", (1.484, -0.158, 2.007), 1.0, (-19.9, 20.0), (-8.1, 7.4), 396.0),
+        fan("right_lidar", (0.654, -0.679, 1.956), -88.6, (-59.4, 59.2), (-10.7, 9.4), 107.0),
+        fan("rear_wide_lidar", (-0.819, 0.066, 2.006), -179.2, (-60.4, 66.5), (-10.4, 9.2), 198.0),
+        fan("rear_narrow_lidar", (-0.918, -0.297, 1.971), -179.5, (-19.6, 19.1), (-5.7, 9.8), 512.0),
+        fan("left_lidar", (0.697, 0.495, 1.935), 89.5, (-57.6, 59.5), (-11.2, 9.1), 107.0),
+    )
+    return LidarProfile(units, max_range=512.0, is_rolling=True, velocity_noise=0.1)
+
+
+PROFILES: Dict[str, LidarProfile] = {
+    "av2": _AV2,
+    "av2_rolling": replace(_AV2, is_rolling=True),
+    "demo": _DEMO,
+    "nuscenes": _NUSCENES,
+    "truckscenes": _truckscenes(),
+    "waymo": _waymo(),
+    "aevascenes": _aevascenes(),
+}
+
+# How much light weather takes per metre, and how many returns it costs whatever they hit.
+WEATHER: Dict[str, Tuple[float, float]] = {
+    "clear": (0.0, 0.0),
+    "rain": (0.004, 0.06),
+    "snow": (0.008, 0.15),
+    "fog": (0.02, 0.02),
+}
+
+
+def get_profile(name: str) -> LidarProfile:
+    """The profile called `name`.
+
+    Raises:
+        CFlowError: there is none of that name.
+    """
+    if name not in PROFILES:
+        raise CFlowError(f"sensor profile {name!r} does not exist; choose one of {', '.join(sorted(PROFILES))}")
+    return PROFILES[name]
+
+
+def in_weather(profile: LidarProfile, weather: str) -> LidarProfile:
+    """The same LiDARs in rain, snow or fog: far and dark things are lost first, and some returns at random.
+
+    Raises:
+        CFlowError: there is no such weather.
+    """
+    if weather not in WEATHER:
+        raise CFlowError(f"weather {weather!r} does not exist; choose one of {', '.join(sorted(WEATHER))}")
+    extinction, lost = WEATHER[weather]
+
+    def dropout(clear: float) -> float:
+        return 1 - (1 - clear) * (1 - lost)
+
+    units = tuple(u if u.dropout is None else replace(u, dropout=dropout(u.dropout)) for u in profile.units)
+    return replace(profile, units=units, extinction=extinction, dropout=dropout(profile.dropout))

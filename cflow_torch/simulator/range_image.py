@@ -1,0 +1,89 @@
+"""What the rays of a LiDAR meet first, the ground or a solid."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Callable, Tuple
+
+import torch
+from torch import Tensor
+
+from cflow_torch.simulator.ground import Ground
+from cflow_torch.simulator.moving_solids import MovingSolids
+from cflow_torch.simulator.raycast import Solids, cast_solids, nearest_hits, ray_directions, take
+from cflow_torch.simulator.rolling import RollingRays, Shots, covered_blocks
+from cflow_torch.simulator.sensors import SpinningLidar
+
+
+@dataclass(frozen=True)
+class RangeImage:
+    """What the C * B rays of a unit meet, before the sensor measures it. Ray number = column * B + beam.
+
+    Args:
+        rays: (3, C * B) float32 unit vectors, sensor frame; of shots, axes of the world.
+        distance: (C * B,) float32 true range, metres, inf = nothing.
+        solid: (C * B,) int64 the solid that is met, -1 = the ground or nothing.
+        cosine: (C * B,) float32 cosine of the angle of incidence, where the ground is met.
+    """
+
+    rays: Tensor
+    distance: Tensor
+    solid: Tensor
+    cosine: Tensor
+
+
+def cast_unit(
+    unit: SpinningLidar,
+    phase: float,
+    solids: Solids,
+    T_solid_ego: Tensor,
+    ground: Ground,
+    T_world_ego: Tensor,
+    max_range: float,
+) -> RangeImage:
+    """The true range image of one unit.
+
+    Args:
+        phase: azimuth of the first column, radians.
+        T_solid_ego: (P, 4, 4) float64, ego coordinates to the solids'.
+    """
+    T_ego_sensor = torch.from_numpy(unit.T_ego_sensor)
+    T_world_sensor, T_solid_sensor = T_world_ego @ T_ego_sensor, T_solid_ego @ T_ego_sensor
+    elevation = torch.tensor(unit.elevations, dtype=torch.float64).deg2rad().sort().values
+    azimuth = phase + 2 * math.pi / unit.num_columns * torch.arange(unit.num_columns, dtype=torch.float64)
+
+    rays = ray_directions(azimuth, elevation)
+    distance, solid = cast_solids(solids.kind, T_solid_sensor, solids.half_size, azimuth, elevation, max_range)
+    ground_distance, cosine = ground.cast(T_world_sensor[:3, 3], T_world_sensor[:3, :3] @ rays)
+    rays, ground_distance, cosine = rays.float(), ground_distance.float(), cosine.float()
+    solid = solid.masked_fill(ground_distance < distance, -1)
+    return RangeImage(rays, torch.minimum(distance, ground_distance), solid, cosine)
+
+
+def cast_shots(
+    shots: Shots, solids: MovingSolids, ground: Ground, max_range: float
+) -> Tuple[RangeImage, Callable[[Tensor], Tensor]]:
+    """The true range image of one unit, column after column.
+
+    Returns:
+        The image, its rays in world axes; what gives the cosines of the angles of incidence of rays (n,) that met
+        solids.
+    """
+    num_beams = len(shots.elevation)
+    blocks = covered_blocks(solids, shots, max_range)
+    rays_at = RollingRays(solids, shots, blocks)
+    distance, block = nearest_hits(solids.kind, blocks, rays_at, len(shots.azimuth), shots.elevation)
+    sideways, up = shots.directions
+    directions = sideways * shots.elevation.cos().float() + up * shots.elevation.sin().float()  # (3, C, B)
+    origin = (shots.T_world_sensor[:, :3, 3] + solids.origin).T[..., None]
+    ground_distance, cosine = (values.flatten() for values in ground.cast(origin, directions))
+    solid = torch.cat([blocks.solid, torch.tensor([-1])]).take(block)  # block -1 reads the last row
+    solid = solid.masked_fill(ground_distance < distance, -1)
+    distance = torch.minimum(distance, ground_distance)
+
+    def cosine_at(ray: Tensor) -> Tensor:
+        column = torch.div(ray, num_beams, rounding_mode="floor")
+        return rays_at.incidence(take(block, ray), column, ray - column * num_beams, take(distance, ray))
+
+    return RangeImage(directions.flatten(1), distance, solid, cosine), cosine_at

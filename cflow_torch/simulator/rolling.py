@@ -1,0 +1,185 @@
+"""Rays of a LiDAR that turns while its vehicle and all the others move: every column has its own time."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Tuple
+
+import torch
+from torch import Tensor
+
+from cflow_torch.simulator.moving_solids import MovingSolids, rotate
+from cflow_torch.simulator.raycast import ELLIPSOID, Blocks, UnitRays, cosine_of_incidence, take
+
+_ROUNDS = 2  # of "when is the solid swept?", "where is it then?": each divides the error by 6 or more
+
+
+@dataclass(frozen=True)
+class Shots:
+    """The columns that a unit fires in one sweep.
+
+    Args:
+        azimuth: (C,) float64 radians, evenly spaced in the order of time, sensor frame.
+        seconds: (C,) float64, evenly spaced.
+        T_world_sensor: (C, 4, 4) float64, relative to the `origin` of the solids.
+        elevation: (B,) float64 radians, ascending.
+        speed: (2,) m/s and rad/s that the unit does not exceed.
+    """
+
+    azimuth: Tensor
+    seconds: Tensor
+    T_world_sensor: Tensor
+    elevation: Tensor
+    speed: Tuple[float, float]
+
+    @property
+    def directions(self) -> Tuple[Tensor, Tensor]:
+        """(3, C, 1) float32 world parts of the directions: sideways * cos(elevation) + up * sin(elevation)."""
+        R = self.T_world_sensor[:, :3, :3]
+        sideways = R[:, :, 0] * self.azimuth.cos()[:, None] + R[:, :, 1] * self.azimuth.sin()[:, None]
+        return sideways.T.float()[..., None], R[:, :, 2].T.float()[..., None]
+
+
+def covered_blocks(solids: MovingSolids, shots: Shots, max_range: float) -> Blocks:
+    """Blocks of the range image outside which no ray can meet a solid's bounding box (a ball's bounding sphere).
+
+    Convention: a solid near the azimuth at which the sweep begins has a block at the beginning and one at the end.
+    """
+    num_columns = len(shots.azimuth)
+    step = float(shots.azimuth[1] - shots.azimuth[0])
+    interval = float(shots.seconds[1] - shots.seconds[0])
+    whole_turn = 2 * math.pi / abs(step)
+    # Where the solid's bounding sphere is in mid-sweep, and how far that may be wrong at the time of a shot.
+    middle = num_columns // 2
+    centre, speed = solids.centres
+    late = abs(float(shots.seconds[middle] - solids.middle)) + 0.5 * interval * num_columns
+    travel = solids.radius + late * (speed + shots.speed[0])
+    offset = centre - shots.T_world_sensor[middle, :3, 3]
+    distance = offset.norm(dim=1)
+    near = (distance - travel < max_range).nonzero()[:, 0]
+    distance, travel = distance[near].clamp(min=1e-6), travel[near]
+    x, y, z = (offset[near] @ shots.T_world_sensor[middle, :3, :3]).T
+    rho = torch.hypot(x, y)
+    slack = (travel / distance).clamp(max=1).asin() + late * shots.speed[1]
+    height = torch.atan2(z, rho)
+    is_seen = (height + slack > shots.elevation[0]) & (height - slack < shots.elevation[-1])
+    column = ((torch.atan2(y, x) - shots.azimuth[0]) / step) % whole_turn
+    # Near the sensor's axis the azimuth means little.
+    slack = torch.where(rho < 2 * travel, math.pi, 2 * slack).clamp(max=math.pi) / abs(step)
+    solid, guess = [], []
+    for turn in (-1, 0, 1):
+        shifted = column + turn * whole_turn
+        chosen = (is_seen & (shifted + slack >= 0) & (shifted - slack < num_columns)).nonzero()[:, 0]
+        solid.append(near[chosen])
+        guess.append(shifted[chosen])
+    return _blocks_near(solids, shots, torch.cat(solid), torch.cat(guess), speed, max_range)
+
+
+def _blocks_near(
+    solids: MovingSolids, shots: Shots, solid: Tensor, guess: Tensor, speed: Tensor, max_range: float
+) -> Blocks:
+    """Blocks of `solid` (E,) that are swept about column `guess` (E,)."""
+    num_columns = len(shots.azimuth)
+    step = float(shots.azimuth[1] - shots.azimuth[0])
+    interval = float(shots.seconds[1] - shots.seconds[0])
+    num_around = 2 * math.pi / abs(step)
+    half = solids.half_size[solid]
+    for _ in range(_ROUNDS):
+        at = guess.round().long().clamp(0, num_columns - 1)
+        T_world_sensor = shots.T_world_sensor.index_select(0, at)
+        place, _ = solids.at(solid, take(shots.seconds, at))
+        rotation = place[:, :, :3] @ T_world_sensor[:, :3, :3]  # sensor axes to the solid's
+        centre = rotate(rotation.transpose(1, 2), -(rotate(place[:, :, :3], T_world_sensor[:, :3, 3]) + place[..., 3]))
+        azimuth = torch.atan2(centre[:, 1], centre[:, 0])
+        expected = shots.azimuth[0] + step * guess
+        guess = guess + torch.remainder((azimuth - expected) / step + 0.5 * num_around, num_around) - 0.5 * num_around
+
+    rho = torch.hypot(centre[:, 0], centre[:, 1])
+    spread = half.amax(1)  # of a ball about its middle, horizontally; corners of the others below
+    low, high, side = centre[:, 2] - spread, centre[:, 2] + spread, (spread / rho.clamp(min=1e-6)).clamp(max=1).asin()
+    side = torch.stack([-side, side])
+    cornered = (solids.kind[solid] != ELLIPSOID).nonzero()[:, 0]
+    if len(cornered):
+        signs = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0], dtype=torch.float64)] * 3)
+        reach = (signs * half[cornered, None]) @ rotation[cornered]
+        x, y, z = (reach + centre[cornered, None]).unbind(-1)  # (E', 8) each, sensor frame
+        spread[cornered] = torch.hypot(reach[..., 0], reach[..., 1]).amax(1)
+        low[cornered], high[cornered] = z.amin(1), z.amax(1)
+        cos, sin = (centre[cornered, k, None] / rho[cornered, None].clamp(min=1e-6) for k in (0, 1))
+        corner_side = torch.atan2(y * cos - x * sin, x * cos + y * sin)
+        side[:, cornered] = torch.stack([corner_side.amin(1), corner_side.amax(1)])
+
+    # The solid moves while it is swept, by no more than `drift` from where it was in the middle of that time.
+    width = (side[1] - side[0]).clamp(max=2 * math.pi)
+    relative = speed[solid] + shots.speed[0] + shots.speed[1] * centre.norm(dim=1)
+    drift = relative * interval * (0.6 * width / abs(step) + 2)
+    nearest, farthest = (rho - spread - drift).clamp(min=1e-6), rho + spread + drift
+    margin = (drift / (rho - spread).clamp(min=1e-6)).clamp(max=1).asin() + 1e-6
+    around = (rho - spread <= 2 * drift) | (width + 2 * margin > math.pi)
+    # Columns count along `step`, which may be negative.
+    side = side if step > 0 else -side.flip(0)
+    first = (guess + (side[0] - margin) / abs(step)).ceil().long()
+    end = (guess + (side[1] + margin) / abs(step)).floor().long() + 1
+    first = torch.where(around, 0, first).clamp(0, num_columns)
+    end = torch.where(around, num_columns, end).clamp(0, num_columns)
+    count = (end - first).clamp(min=0).masked_fill(nearest > max_range, 0)
+
+    # A solid that is seen all around can come nearer by all that it moves in a sweep.
+    whole = torch.where(around, relative * interval * num_columns, drift)
+    nearest = torch.where(around, 1e-6, nearest)
+    bottom, top = low - whole, high + whole
+    lowest = torch.atan2(bottom, torch.where(bottom < 0, nearest, farthest)) - 1e-6
+    highest = torch.atan2(top, torch.where(top > 0, nearest, farthest)) + 1e-6
+    first_beam = torch.searchsorted(shots.elevation, lowest)
+    end_beam = torch.searchsorted(shots.elevation, highest, right=True)
+    return Blocks(solid, first, count, first_beam, torch.maximum(first_beam, end_beam))
+
+
+class RollingRays:
+    """The rays of a sweep as the solids of its blocks see them: `rays_at` of `raycast.nearest_hits`."""
+
+    def __init__(self, solids: MovingSolids, shots: Shots, blocks: Blocks) -> None:
+        middle = blocks.first_column + blocks.num_columns // 2
+        seconds = shots.seconds[middle.clamp(0, len(shots.seconds) - 1)]
+        place, change = solids.at(blocks.solid, seconds)
+        half = solids.half_size[blocks.solid][..., None]
+        # A block is swept in milliseconds: what moves, moves evenly.
+        self._to_unit = (place / half).flatten(1).T.float().contiguous()  # (12, E)
+        self._change = (change / half).flatten(1).T.float().contiguous()
+        self._moves = solids.row[blocks.solid] >= 0
+        self._kind = solids.kind[blocks.solid]
+        self._inverse_half = solids.half_size[blocks.solid].reciprocal().T.float().contiguous()
+        self._cos_elevation, self._sin_elevation = shots.elevation.cos().float(), shots.elevation.sin().float()
+        self._seconds, self._block_seconds = shots.seconds, seconds
+        sideways, up = shots.directions
+        self._columns = torch.cat([shots.T_world_sensor[:, :3, 3].T.float(), sideways[..., 0], up[..., 0]])  # (9, C)
+
+    def __call__(self, block: Tensor, column: Tensor) -> UnitRays:
+        matrix = take(self._to_unit, block)
+        moving = take(self._moves, block).nonzero()[:, 0]
+        if len(moving):
+            swept = take(block, moving)
+            lag = (take(self._seconds, take(column, moving)) - take(self._block_seconds, swept)).float()
+            matrix.index_add_(1, moving, take(self._change, swept) * lag)
+        matrix = matrix.view(3, 4, -1)
+        columns = take(self._columns, column).view(3, 3, -1)  # origin, sideways, up
+        origin, sideways, up = (
+            matrix[:, 0] * column[0] + matrix[:, 1] * column[1] + matrix[:, 2] * column[2] for column in columns
+        )
+        return UnitRays(origin + matrix[:, 3], sideways, up)
+
+    def incidence(self, block: Tensor, column: Tensor, beam: Tensor, distance: Tensor) -> Tensor:
+        """Cosine of the angle between rays and the normals of what they hit.
+
+        Args:
+            block, column, beam: (N,) int64, the block of what was hit, and the ray that did.
+            distance: (N,) float32 range of the hit, metres.
+
+        Returns:
+            (N,) float32 in [0, 1].
+        """
+        rays, inverse_half = self(block, column), take(self._inverse_half, block)
+        direction = rays.sideways * take(self._cos_elevation, beam) + rays.up * take(self._sin_elevation, beam)
+        at = rays.origin + direction * distance
+        return cosine_of_incidence(take(self._kind, block), at, direction / inverse_half, inverse_half)

@@ -1,0 +1,115 @@
+"""A scene: ground, ego way and bodies; and where every solid is at any time."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Sequence, Tuple
+
+import numpy as np
+import torch
+
+from cflow_torch.simulator.ground import Ground
+from cflow_torch.simulator.objects import HIP, Body, Route
+from cflow_torch.simulator.raycast import Solids
+
+
+@dataclass(frozen=True)
+class SolidTable:
+    """The solids of all bodies, one row each; columns as in `objects.Solid`.
+
+    Args:
+        body: (P,) int64, the body a solid belongs to.
+    """
+
+    body: np.ndarray
+    kind: np.ndarray
+    centre: np.ndarray
+    half: np.ndarray
+    pitch: np.ndarray
+    roll: np.ndarray
+    albedo: np.ndarray
+    is_foliage: np.ndarray
+    swing: np.ndarray
+    stride: np.ndarray
+    phase: np.ndarray
+
+    @classmethod
+    def of(cls, bodies: Tuple[Body, ...]) -> SolidTable:
+        """Solids in the order of the bodies."""
+        body = np.repeat(np.arange(len(bodies)), [len(b.solids) for b in bodies])
+        return cls(body, *(np.array(column) for column in zip(*(solid for b in bodies for solid in b.solids))))
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A street with traffic.
+
+    Args:
+        ground: what everything stands on.
+        ego: way of the recording car's rear axle.
+        bodies: everything else.
+        table: the solids of the bodies.
+        num_own: so many of the last bodies are the recording vehicle itself: they hide things but return no light.
+    """
+
+    ground: Ground
+    ego: Route
+    bodies: Tuple[Body, ...]
+    table: SolidTable
+    num_own: int = 0
+
+    def with_own(self, own: Sequence[Body]) -> Scene:
+        """The scene with the recording vehicle in it."""
+        bodies = (*self.bodies, *own)
+        return Scene(self.ground, self.ego, bodies, SolidTable.of(bodies), len(own))
+
+    def body_poses(self, seconds: np.ndarray) -> np.ndarray:
+        """(T, num_bodies, 4, 4) float64 `T_world_body` at `seconds` (T,)."""
+        ways = np.stack([body.way(seconds) for body in self.bodies], 1)
+        return self.ground.pose(ways[..., 0], ways[..., 1], ways[..., 2])
+
+    def movers(self) -> Tuple[Scene, np.ndarray]:
+        """The scene with nothing but what moves, and (P',) int64 the number in this scene of each of its solids."""
+        bodies = np.array([not body.stands for body in self.bodies])
+        chosen = tuple(body for body, moves in zip(self.bodies, bodies) if moves)
+        scene = Scene(self.ground, self.ego, chosen, SolidTable.of(chosen))
+        return scene, np.flatnonzero(bodies[self.table.body])
+
+    def solids(self, seconds: float, body_poses: np.ndarray) -> Solids:
+        """All solids at one time.
+
+        Args:
+            seconds: time, moves the legs.
+            body_poses: (num_bodies, 4, 4) float64 `T_world_body` at that time.
+        """
+        table = self.table
+        # In the body: turn about x, about y, move to the place; a leg then swings about the y axis through the hip.
+        angle = table.swing * np.sin(2 * math.pi * table.stride * seconds + table.phase)
+        place = _turn_y(table.pitch) @ _turn_x(table.roll)
+        place[:, :3, 3] = table.centre - np.where(angle[:, None] == 0, 0, (0, 0, HIP))
+        place = _turn_y(angle) @ place
+        place[:, :3, 3] += np.where(angle[:, None] == 0, 0, (0, 0, HIP))
+        return Solids(
+            torch.from_numpy(table.kind),
+            torch.from_numpy(body_poses[table.body] @ place),
+            torch.from_numpy(table.half),
+            torch.from_numpy(table.albedo).float(),
+            torch.from_numpy(table.is_foliage),
+        )
+
+
+def _turn_x(angle: np.ndarray) -> np.ndarray:
+    turn = np.tile(np.eye(4), (len(angle), 1, 1))
+    turn[:, 1, 1] = turn[:, 2, 2] = np.cos(angle)
+    turn[:, 2, 1] = np.sin(angle)
+    turn[:, 1, 2] = -turn[:, 2, 1]
+    return turn
+
+
+def _turn_y(angle: np.ndarray) -> np.ndarray:
+    turn = np.tile(np.eye(4), (len(angle), 1, 1))
+    turn[:, 0, 0] = turn[:, 2, 2] = np.cos(angle)
+    turn[:, 0, 2] = np.sin(angle)
+    turn[:, 2, 0] = -turn[:, 0, 2]
+    return turn

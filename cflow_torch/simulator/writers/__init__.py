@@ -1,0 +1,1 @@
+"""Simulated drives on disk, in the layouts of the data sets, so that readers have something to read."""

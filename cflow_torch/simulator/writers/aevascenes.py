@@ -1,0 +1,205 @@
+"""Writes a recording in the layout of AevaScenes: `sequence.json` and one npz per LiDAR and frame."""
+
+from __future__ import annotations
+
+import json
+import os
+import uuid
+from pathlib import Path
+from typing import Any, Dict, List, Sequence, Union
+
+import numpy as np
+
+from cflow_torch.data.aevascenes.reader import CATEGORY_NAME, GROUND
+from cflow_torch.data.atomic import atomic_folder
+from cflow_torch.data.boxes import points_in_box
+from cflow_torch.data.names import safe_name
+from cflow_torch.simulator.recording import Recording, UnitReturns
+from cflow_torch.simulator.writers.av2 import Boxes, quaternions
+from cflow_torch.types import CFlowError
+
+CLASS_OF: Dict[str, str] = {
+    **{name: kind for kind, name in CATEGORY_NAME.items() if name != "NONE"},
+    **dict.fromkeys(("ARTICULATED_BUS", "SCHOOL_BUS"), "bus"),
+    **dict.fromkeys(("BOX_TRUCK", "TRUCK_CAB"), "truck"),
+    **dict.fromkeys(("MESSAGE_BOARD_TRAILER", "TRAFFIC_LIGHT_TRAILER"), "traffic_item"),
+    **dict.fromkeys(("OFFICIAL_SIGNALER", "STROLLER", "WHEELCHAIR"), "pedestrian"),
+    **dict.fromkeys(("WHEELED_DEVICE", "WHEELED_RIDER"), "bicyclist"),
+    **dict.fromkeys(("BOLLARD", "CONSTRUCTION_BARREL"), "traffic_item"),
+    **dict.fromkeys(("MOBILE_PEDESTRIAN_CROSSING_SIGN", "STOP_SIGN"), "traffic_sign"),
+    "DOG": "animal",
+}
+"""Argoverse 2 name -> class of AevaScenes."""
+
+_BACKGROUND, _ON_GROUND = "other_structure", GROUND[0]
+_CLASSES = tuple(CATEGORY_NAME)  # the position is the index written; the real data's table is not published
+_FOLDER = "pointcloud_compensated"
+_PATH_KEY = {"v2": "point_cloud_compensated_path", "v0.1": "point_cloud_path"}
+_XYZ = ("x", "y", "z")
+
+
+def write_aevascenes_sequence(
+    log: Recording, root: Union[str, Path], overwrite: bool = False, layout: str = "v2"
+) -> Path:
+    """Writes `log` to `root/<log_id>`.
+
+    Everything is written to a temporary folder beside it that takes its name when it is complete.
+
+    Args:
+        log: what to write.
+        root: folder of the split, made if absent.
+        overwrite: replace a sequence of that name.
+        layout: "v2", or "v0.1" with its older key for the paths of the clouds.
+
+    Returns:
+        The sequence folder, which `AevaScenesLog` takes.
+
+    Convention:
+        - Points stay the float32 of the unit; poses and boxes are JSON numbers, exact float64. Poses are written as
+          quaternions, in the frame of the first one.
+        - Only the compensated clouds exist: a recording knows no others.
+        - Every point has a class name: "road" on the ground, that of the box it lies in, else "other_structure".
+          `semantic_labels_idx` is the position of the name in `CATEGORY_NAME`, which is not Aeva's table.
+        - Box velocities are over ground in axes of the vehicle, from the track's poses in the two nearest frames.
+
+    Raises:
+        CFlowError: the sequence exists; no such folder name or layout; a shot before its sweep's time stamp or more
+            than 4 s after it; a category without a class.
+    """
+    if layout not in _PATH_KEY:
+        raise CFlowError(f"layout is one of {', '.join(_PATH_KEY)}; got {layout!r}")
+    folder = Path(root) / safe_name(log.log_id, "log_id")
+    if folder.exists() and not overwrite:
+        raise CFlowError(f"{folder} exists; give overwrite=True to replace the sequence")
+    with atomic_folder(folder) as new:
+        (new / _FOLDER).mkdir()
+        _write_sequence(log, new, _PATH_KEY[layout])
+    return folder
+
+
+def _write_sequence(log: Recording, folder: Path, path_key: str) -> None:
+    poses = np.asarray(log.poses, np.float64)
+    from_first = np.linalg.inv(poses[0]) @ poses
+    from_first[0] = np.eye(4)  # but for rounding it is
+    frames: List[Dict[str, Any]] = []
+    mounts: Dict[str, np.ndarray] = {}
+    for index, stamp in enumerate(log.timestamps):
+        units, boxes = log.units(index), log.boxes(index)
+        classes = _classes(log, index, boxes)
+        clouds, begin = {}, 0
+        for unit in units:
+            mounts[unit.name] = np.asarray(unit.T_ego_sensor, np.float64)
+            path = f"{_FOLDER}/{safe_name(unit.name, 'the LiDAR')}_{stamp}.npz"
+            end = begin + len(unit.points)
+            _write_cloud(folder / path, unit, classes[begin:end], f"sweep {index} of log {log.log_id}")
+            clouds[unit.name] = {path_key: path}
+            begin = end
+        frames.append(
+            {
+                "timestamp_ns": int(stamp),
+                "frame_idx": index,
+                "frame_uuid": str(uuid.uuid5(uuid.NAMESPACE_OID, f"{log.log_id}/{stamp}")),
+                "ego_pose": _pose(from_first[index]),
+                "point_cloud": clouds,
+                "image": {},
+                "boxes": _boxes(boxes),
+            }
+        )
+    _add_velocities(frames, poses)
+    metadata = {
+        "sequence_uuid": log.log_id,
+        "sensors": {"lidars": list(mounts), "cameras": []},
+        "camera_lidar_mapping": {},
+        "vehicle_to_lidar_extrinsics": {name: _pose(T_ego_sensor) for name, T_ego_sensor in mounts.items()},
+        "vehicle_to_camera_extrinsics": {},
+        "camera_intrinsics": {},
+    }
+    with open(folder / "sequence.json", "w", encoding="utf-8") as file:
+        json.dump({"metadata": metadata, "frames": frames}, file, default=float)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _write_cloud(path: Path, unit: UnitReturns, classes: np.ndarray, where: str) -> None:
+    offset = np.asarray(unit.offset_ns)
+    if offset.size and not 0 <= offset.min() <= offset.max() < 2**32:
+        raise CFlowError(
+            f"{where}, unit {unit.name}: shots {offset.min()} ... {offset.max()} ns after the time stamp; AevaScenes "
+            f"stores 0 ... {2**32 - 1}: stamp a sweep with the time of its first shot"
+        )
+    with open(path, "wb") as file:
+        np.savez(
+            file,
+            xyz=np.asarray(unit.points, np.float32),
+            velocity=np.asarray(unit.radial_velocity, np.float32)[:, None],
+            reflectivity=np.asarray(unit.intensity, np.float32)[:, None],
+            line_index=np.asarray(unit.ring, np.uint32)[:, None],
+            time_offset_ns=offset.astype(np.uint32)[:, None],
+            semantic_labels=np.array(_CLASSES, dtype=object)[classes][:, None],
+            semantic_labels_idx=classes[:, None],
+        )
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _classes(log: Recording, index: int, boxes: Boxes) -> np.ndarray:
+    """(N,) int64, position in `_CLASSES` of the class of every point of a sweep."""
+    sweep = log.sweep(index)
+    points = np.asarray(sweep.points)[:, :3]
+    classes = np.full(len(points), _CLASSES.index(_BACKGROUND), np.int64)
+    for category, size, pose in zip(boxes.category, boxes.size, boxes.pose):
+        near = np.flatnonzero(np.abs(points[:, 0] - np.float32(pose[0, 3])) <= np.linalg.norm(size))
+        near = near[points_in_box(points[near], size, pose)]
+        classes[near] = _CLASSES.index(_class_of(category))
+    if sweep.is_ground is not None:
+        classes[np.asarray(sweep.is_ground)] = _CLASSES.index(_ON_GROUND)
+    return classes
+
+
+def _class_of(category: str) -> str:
+    if category not in CLASS_OF:
+        raise CFlowError(f"category {category!r} has no class in AevaScenes; give one of {', '.join(CLASS_OF)}")
+    return CLASS_OF[category]
+
+
+def _boxes(boxes: Boxes) -> List[Dict[str, Any]]:
+    """Without velocities."""
+    return [
+        {
+            "id": track,
+            "class": _class_of(category),
+            "class_idx": _CLASSES.index(_class_of(category)),
+            "reference_frame": "VEHICLE",
+            "dimensions": dict(zip(_XYZ, size.tolist())),
+            "pose": _pose(pose),
+            "linear_velocity": dict.fromkeys(_XYZ, 0.0),
+            "angular_velocity": dict.fromkeys(_XYZ, 0.0),
+        }
+        for track, category, size, pose in zip(boxes.track_id, boxes.category, boxes.size, boxes.pose)
+    ]
+
+
+def _add_velocities(frames: Sequence[Dict[str, Any]], poses: np.ndarray) -> None:
+    """Linear velocity, and the turning about z, from the neighbours of each box in its track."""
+    tracks: Dict[str, List[Any]] = {}
+    for frame, pose in zip(frames, poses):
+        for box in frame["boxes"]:
+            tracks.setdefault(box["id"], []).append((frame["timestamp_ns"], pose, box))
+    for track in tracks.values():
+        if len(track) < 2:
+            continue
+        seconds = np.array([(stamp - track[0][0]) * 1e-9 for stamp, _, _ in track])
+        centres = np.stack(
+            [pose[:3, :3] @ list(box["pose"]["translation"].values()) + pose[:3, 3] for _, pose, box in track]
+        )
+        q = np.array([list(box["pose"]["rotation"].values()) for _, _, box in track])
+        yaw = 2 * np.arctan2(q[:, 3], q[:, 0]) + [np.arctan2(pose[1, 0], pose[0, 0]) for _, pose, _ in track]
+        speeds, turning = np.gradient(centres, seconds, axis=0), np.gradient(np.unwrap(yaw), seconds)
+        for (_, pose, box), speed, rate in zip(track, speeds, turning):
+            box["linear_velocity"] = dict(zip(_XYZ, (pose[:3, :3].T @ speed).tolist()))
+            box["angular_velocity"]["z"] = float(rate)
+
+
+def _pose(T: np.ndarray) -> Dict[str, Any]:
+    rotation = quaternions(T[None, :3, :3])[0]
+    return {"translation": dict(zip(_XYZ, T[:3, 3].tolist())), "rotation": dict(zip("wxyz", rotation.tolist()))}

@@ -1,0 +1,284 @@
+"""Writes a recording in the on-disk layout of nuScenes: JSON tables and `.pcd.bin` sweeps."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import struct
+import zlib
+from contextlib import contextmanager
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any, Dict, Iterator, List, Mapping, Sequence, Union
+
+import numpy as np
+
+from cflow_torch.data.atomic import atomic_file, atomic_folder
+from cflow_torch.data.names import safe_name
+from cflow_torch.data.nuscenes.categories import NUSCENES_NAMES
+from cflow_torch.simulator.recording import Recording, UnitReturns
+from cflow_torch.simulator.writers.av2 import quaternions
+from cflow_torch.types import CFlowError
+
+_VISIBILITY = ("v0-40", "v40-60", "v60-80", "v80-100")
+Table = List[Dict[str, Any]]
+
+
+def write_nuscenes(
+    recording: Recording,
+    root: Union[str, Path],
+    version: str = "v1.0-mini",
+    key_frame_interval: float = 0.5,
+    overwrite: bool = False,
+) -> Path:
+    """Writes `recording` to `root/<log_id>`, a data root of nuScenes with one scene of that name.
+
+    All files are written to a temporary folder beside it, and appear under their name at once.
+
+    Args:
+        recording: what to write. If none of its LiDARs is called LIDAR_TOP, the first one is in the file.
+        root: folder, made if absent.
+        version: name of the folder of the tables.
+        key_frame_interval: seconds between samples, which alone have boxes. First and last sweep are samples too, so
+            that there is truth for every pair.
+        overwrite: replace a scene of that name.
+
+    Returns:
+        The data root.
+
+    Convention:
+        - All 13 tables, complete enough for the official devkit; `attribute` is empty, visibility always the highest.
+        - Points are float32 in the frame of their LiDAR, with intensity and ring, in the order of the recording.
+        - Time stamps are cut to microseconds. Poses keep the height that they have (the real data set has z = 0).
+        - Ground mask and flow have no place in the format.
+
+    Raises:
+        CFlowError: the scene exists, the log_id is no folder name, a category has no counterpart, the LiDARs change
+            from sweep to sweep, or time stamps do not ascend by a microsecond or more.
+    """
+
+    def write_points(file: Path, unit: UnitReturns, stamp_ns: int) -> None:
+        rows = np.column_stack([unit.points, unit.intensity, unit.ring]).astype("<f4")
+        with atomic_file(file) as stream:
+            stream.write(rows.tobytes())
+
+    with new_folder(root, recording.log_id, overwrite) as folder:
+        scene = SceneWriter(recording, folder, "LIDAR_TOP", NUSCENES_NAMES)
+        tables = scene.write("{name}__{channel}__{stamp}.pcd.bin", write_points, key_frame_interval)
+        log, image = scene.token("log"), f"maps/{recording.log_id}.png"
+        day = datetime.fromtimestamp(recording.timestamps[0] * 1e-9, timezone.utc).strftime("%Y-%m-%d")
+        tables["log"] = [
+            {"token": log, "logfile": recording.log_id, "vehicle": "", "date_captured": day, "location": ""}
+        ]
+        tables["map"] = [
+            {"token": scene.token("map"), "log_tokens": [log], "category": "semantic_prior", "filename": image}
+        ]
+        tables["scene"][0]["log_token"] = log
+        with atomic_file(folder / image) as stream:
+            stream.write(_black_pixel())
+        write_tables(folder / version, tables)
+    return Path(root) / recording.log_id
+
+
+class SceneWriter:
+    """Sweeps and tables that nuScenes and TruckScenes have in common.
+
+    Args:
+        recording: what to write.
+        folder: data root.
+        reference: channel that the first LiDAR gets, unless another one has that name.
+        names: Argoverse 2 name of a box -> category of the format.
+    """
+
+    def __init__(self, recording: Recording, folder: Path, reference: str, names: Mapping[str, str]) -> None:
+        self.recording, self.folder, self._names = recording, folder, names
+        self._units = recording.units(0)
+        self._channels = [safe_name(unit.name, "the LiDAR") for unit in self._units]
+        if reference not in self._channels:
+            self._channels[0] = reference
+        self._stamps = [int(stamp) // 1000 for stamp in recording.timestamps]
+        if any(later <= earlier for earlier, later in zip(self._stamps, self._stamps[1:])):
+            raise CFlowError(f"log {recording.log_id}: time stamps must ascend by a microsecond or more")
+
+    def token(self, *what: object) -> str:
+        """32 hex characters, the same for the same thing."""
+        return hashlib.md5(repr((self.recording.log_id, *what)).encode()).hexdigest()
+
+    def write(self, file_name: str, write_points: Any, key_frame_interval: float) -> Dict[str, Table]:
+        """Writes all sweeps.
+
+        Args:
+            file_name: pattern with {name} of the log, {channel}, {stamp} in microseconds.
+            write_points: called with file, unit and its sweep's time stamp in nanoseconds.
+            key_frame_interval: seconds.
+
+        Returns:
+            Table -> rows.
+        """
+        keys = self._key_frames(key_frame_interval)
+        tables = self._fixed_tables(keys)
+        last = len(self._stamps) - 1
+        for index, stamp in enumerate(self._stamps):
+            units = self.recording.units(index)
+            if [unit.name for unit in units] != [unit.name for unit in self._units]:
+                raise CFlowError(f"log {self.recording.log_id}: sweep {index} has other LiDARs than the first sweep")
+            sample = next(key for key in keys if key >= index)  # a sweep belongs to the sample that follows it
+            for channel, unit in zip(self._channels, units):
+                kind = "samples" if index == sample else "sweeps"
+                name = file_name.format(name=self.recording.log_id, channel=channel, stamp=stamp)
+                write_points(self.folder / kind / channel / name, unit, self.recording.timestamps[index])
+                token = self.token("sweep", channel, index)
+                tables["ego_pose"].append(
+                    {"token": token, "timestamp": stamp, **_pose(np.asarray(self.recording.poses[index]))}
+                )
+                tables["sample_data"].append(
+                    {
+                        "token": token,
+                        "sample_token": self.token("sample", sample),
+                        "ego_pose_token": token,
+                        "calibrated_sensor_token": self.token("mount", channel),
+                        "timestamp": stamp,
+                        "fileformat": "pcd",
+                        "is_key_frame": index == sample,
+                        "height": 0,
+                        "width": 0,
+                        "filename": f"{kind}/{channel}/{name}",
+                        "prev": self.token("sweep", channel, index - 1) if index > 0 else "",
+                        "next": self.token("sweep", channel, index + 1) if index < last else "",
+                    }
+                )
+        self._annotate(keys, tables)
+        return tables
+
+    def _key_frames(self, interval: float) -> List[int]:
+        step = int(np.median(np.diff(self._stamps))) if len(self._stamps) > 1 else 0
+        keys = [0]
+        for index, stamp in enumerate(self._stamps):
+            if stamp - self._stamps[keys[-1]] >= interval * 1e6 - step / 2 and index > 0:
+                keys.append(index)
+        last = len(self._stamps) - 1
+        return keys if keys[-1] == last else [*keys, last]
+
+    def _fixed_tables(self, keys: Sequence[int]) -> Dict[str, Table]:
+        """Everything but sweeps and boxes."""
+        token, scene = self.token, self.token("scene")
+        samples = [token("sample", key) for key in keys]
+        links = zip(samples, keys, ["", *samples[:-1]], [*samples[1:], ""])
+        mounts = list(zip(self._channels, self._units))
+        return {
+            "scene": [
+                {
+                    "token": scene,
+                    "log_token": "",
+                    "nbr_samples": len(samples),
+                    "first_sample_token": samples[0],
+                    "last_sample_token": samples[-1],
+                    "name": self.recording.log_id,
+                    "description": "",
+                }
+            ],
+            "sample": [
+                {"token": this, "timestamp": self._stamps[key], "prev": before, "next": after, "scene_token": scene}
+                for this, key, before, after in links
+            ],
+            "sensor": [{"token": token("sensor", c), "channel": c, "modality": "lidar"} for c in self._channels],
+            "calibrated_sensor": [
+                {
+                    "token": token("mount", channel),
+                    "sensor_token": token("sensor", channel),
+                    **_pose(unit.T_ego_sensor),
+                    "camera_intrinsic": [],
+                }
+                for channel, unit in mounts
+            ],
+            "visibility": [
+                {"token": str(i + 1), "level": name, "description": name} for i, name in enumerate(_VISIBILITY)
+            ],
+            **{name: [] for name in ("attribute", "sample_data", "ego_pose")},
+        }
+
+    def _annotate(self, keys: Sequence[int], tables: Dict[str, Table]) -> None:
+        """Adds categories, instances and the boxes of the samples."""
+        tracks: Dict[str, Table] = {}  # track -> its boxes
+        category_of: Dict[str, str] = {}
+        for key in keys:
+            boxes = self.recording.boxes(key)
+            poses = np.asarray(self.recording.poses[key]) @ boxes.pose
+            for row, (track, name) in enumerate(zip(boxes.track_id, boxes.category)):
+                if name not in self._names:
+                    raise CFlowError(
+                        f"log {self.recording.log_id} has a box of category {name!r}, for which the format has no "
+                        f"name; it can hold {sorted(self._names)}"
+                    )
+                category_of[track] = self._names[name]
+                length, width, height = (float(side) for side in boxes.size[row])
+                tracks.setdefault(track, []).append(
+                    {
+                        "token": self.token("box", track, key),
+                        "sample_token": self.token("sample", key),
+                        "instance_token": self.token("instance", track),
+                        "visibility_token": str(len(_VISIBILITY)),
+                        "attribute_tokens": [],
+                        **_pose(poses[row]),
+                        "size": [width, length, height],
+                        "prev": "",
+                        "next": "",
+                        "num_lidar_pts": int(boxes.num_points[row]),
+                        "num_radar_pts": 0,
+                    }
+                )
+        for rows in tracks.values():
+            for before, after in zip(rows, rows[1:]):
+                before["next"], after["prev"] = after["token"], before["token"]
+        tables["category"] = [
+            {"token": self.token("category", name), "name": name, "description": "", "index": number}
+            for number, name in enumerate(sorted(set(self._names.values())))
+        ]
+        tables["instance"] = [
+            {
+                "token": rows[0]["instance_token"],
+                "category_token": self.token("category", category_of[track]),
+                "nbr_annotations": len(rows),
+                "first_annotation_token": rows[0]["token"],
+                "last_annotation_token": rows[-1]["token"],
+            }
+            for track, rows in tracks.items()
+        ]
+        tables["sample_annotation"] = [row for rows in tracks.values() for row in rows]
+
+
+@contextmanager
+def new_folder(root: Union[str, Path], name: str, overwrite: bool) -> Iterator[Path]:
+    """A folder to fill, which becomes `root/<name>` when the block ends and vanishes if the block raises.
+
+    Raises:
+        CFlowError: `name` is no folder name, or the folder exists and `overwrite` is False.
+    """
+    folder = Path(root) / safe_name(name, "log_id")
+    if folder.exists() and not overwrite:
+        raise CFlowError(f"{folder} exists already; pass overwrite=True to replace it, or choose another root")
+    with atomic_folder(folder) as new:
+        yield new
+
+
+def write_tables(folder: Path, tables: Mapping[str, Table]) -> None:
+    """One JSON file per table."""
+    for table, rows in tables.items():
+        with atomic_file(folder / f"{table}.json") as stream:
+            stream.write(json.dumps(rows, indent=0, allow_nan=False).encode())
+
+
+def _pose(pose: np.ndarray) -> Dict[str, List[float]]:
+    rotation = quaternions(np.asarray(pose, dtype=np.float64)[None, :3, :3])[0]
+    return {"translation": [float(v) for v in pose[:3, 3]], "rotation": rotation.tolist()}
+
+
+def _black_pixel() -> bytes:
+    """A PNG of one grey pixel: the devkit wants a map file, which it opens only to draw it."""
+
+    def chunk(kind: bytes, content: bytes) -> bytes:
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+    header = struct.pack(">IIBBBBB", 1, 1, 8, 0, 0, 0, 0)
+    parts = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"\0\0")) + chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + parts

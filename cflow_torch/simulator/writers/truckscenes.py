@@ -1,0 +1,64 @@
+"""Writes a recording in the on-disk layout of MAN TruckScenes: JSON tables and PCD sweeps with a time per point."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Union
+
+import numpy as np
+
+from cflow_torch.data.arrays.pcd import write_pcd
+from cflow_torch.data.nuscenes.categories import TRUCKSCENES_NAMES
+from cflow_torch.simulator.recording import Recording, UnitReturns
+from cflow_torch.simulator.writers.nuscenes import SceneWriter, new_folder, write_tables
+
+# Tables that the devkit wants besides those of nuScenes; a simulated truck has nothing to put there.
+_EMPTY = ("ego_motion_cabin", "ego_motion_chassis", "weather_annotation")
+
+
+def write_truckscenes(
+    recording: Recording,
+    root: Union[str, Path],
+    version: str = "v1.2-mini",
+    key_frame_interval: float = 0.5,
+    overwrite: bool = False,
+    data: str = "binary",
+) -> Path:
+    """Writes `recording` to `root/<log_id>`, a data root of TruckScenes with one scene of that name.
+
+    All files are written to a temporary folder beside it, and appear under their name at once.
+
+    Args:
+        recording: what to write. If none of its LiDARs is called LIDAR_LEFT, the first one is in the file.
+        root: folder, made if absent.
+        version: name of the folder of the tables.
+        key_frame_interval: seconds between samples, which alone have boxes. First and last sweep are samples too, so
+            that there is truth for every pair.
+        overwrite: replace a scene of that name.
+        data: kind of PCD: "binary", "binary_compressed" (as in the release; a second per 100,000 points), "ascii".
+
+    Returns:
+        The data root.
+
+    Convention:
+        - All 14 tables, complete enough for the official devkit; cabin and chassis motion and weather are empty.
+        - Fields of a sweep: x, y, z, intensity float32, timestamp uint64, microseconds since 1970 of each shot (cut).
+        - Points stay in the frame of their LiDAR, in the order of the recording; nothing is compensated here.
+        - Ground mask and flow have no place in the format.
+
+    Raises:
+        CFlowError: as `write_nuscenes`, and an unknown kind of PCD.
+    """
+
+    def write_points(file: Path, unit: UnitReturns, stamp_ns: int) -> None:
+        x, y, z = np.asarray(unit.points, dtype=np.float32).T
+        times = ((int(stamp_ns) + np.asarray(unit.offset_ns, dtype=np.int64)) // 1000).astype(np.uint64)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        fields = {"x": x, "y": y, "z": z, "intensity": unit.intensity.astype(np.float32), "timestamp": times}
+        write_pcd(file, fields, data)
+
+    with new_folder(root, recording.log_id, overwrite) as folder:
+        scene = SceneWriter(recording, folder, "LIDAR_LEFT", TRUCKSCENES_NAMES)
+        tables = scene.write("{channel}_{stamp}.pcd", write_points, key_frame_interval)
+        write_tables(folder / version, {**tables, **{name: [] for name in _EMPTY}})
+    return Path(root) / recording.log_id

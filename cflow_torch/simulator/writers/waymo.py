@@ -1,0 +1,233 @@
+"""Writes a recording in the layout of the Waymo Open Dataset, version 2: six parquet files per segment."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any, Dict, List, Sequence, Tuple, Union
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from cflow_torch.data.names import safe_name
+from cflow_torch.data.waymo.parquet import (
+    BOX,
+    LASER,
+    LIDAR,
+    PIXEL_POSE,
+    SCHEMAS,
+    SEGMENT,
+    TIME,
+    TRACK,
+    VEHICLE_POSE,
+)
+from cflow_torch.data.waymo.range_image import LASERS, TOP, LaserCalibration
+from cflow_torch.evaluation.categories import META_CLASSES
+from cflow_torch.simulator.recording import Recording, UnitReturns
+from cflow_torch.simulator.writers.waymo_encoding import encode_images, poses_of_shots
+from cflow_torch.types import CFlowError
+
+BOX_TYPE: Dict[str, int] = {
+    **dict.fromkeys(META_CLASSES["CAR"] + META_CLASSES["OTHER_VEHICLES"] + ("MOTORCYCLE", "MOTORCYCLIST"), 1),
+    **dict.fromkeys(META_CLASSES["PEDESTRIAN"], 2),
+    **dict.fromkeys(("SIGN", "STOP_SIGN"), 3),
+    **dict.fromkeys(("BICYCLE", "BICYCLIST", "WHEELED_DEVICE", "WHEELED_RIDER"), 4),
+}
+"""Argoverse 2 name -> Waymo's box type. Motorcycles are vehicles; what has no type, and trains, are not labelled."""
+del BOX_TYPE["RAILED_VEHICLE"]
+
+_XYZ = ("x", "y", "z")
+
+
+def write_waymo_segment(
+    log: Recording,
+    root: Union[str, Path],
+    overwrite: bool = False,
+    max_shift: float = 0.005,
+    is_rolling: bool = True,
+) -> Path:
+    """Writes `log` to `root/<component>/<log_id>.parquet`, one row group per frame.
+
+    All files are written to a temporary folder below `root` and moved to their names when all are complete; if a move
+    fails, what was there before comes back.
+
+    Args:
+        log: what to write. Units called as in `waymo_range_image.LASERS` become these; if none is, they become TOP,
+            FRONT, ... in their order.
+        root: folder of the split, made if absent.
+        overwrite: replace a segment of that name.
+        max_shift: metres. A return is stored as a range in the direction of its pixel; one that this moves further is
+            refused. TOP's pixels have poses that make up for it.
+        is_rolling: the vehicle moves while TOP turns (its points are compensated for that); False = it stands still.
+
+    Returns:
+        The file of the component `lidar`, which `WaymoLog` takes.
+
+    Convention:
+        - TOP: each pixel has the vehicle's pose at the time of its shot, interpolated between the poses of the sweeps,
+          and moved so that its point lies exactly where the recording has it. What is left is the rounding of those
+          poses and of ranges to float32: 5e-5 m up to 1 km from the world's origin.
+        - The others: range images of the vehicle at the pose of the frame, without poses of pixels. Returns whose rays
+          are those of the pixels come back to float32, 5e-6 m at 75 m; others are moved onto the ray.
+        - Times are rounded to microseconds. Boxes keep heading only: roll and pitch of a box are lost.
+        - No second returns, no elongation, no no-label zones, no accelerations: the files say so.
+
+    Raises:
+        CFlowError: the segment exists; no such folder name; more than five units; a return off its pixel's ray, or two
+            in one pixel; time stamps that are not microseconds apart.
+    """
+    root = Path(root)
+    name = safe_name(f"{log.log_id}.parquet", "the file of log_id")
+    places = {tag: root / tag / name for tag in SCHEMAS}
+    present = [str(place) for place in places.values() if place.exists()]
+    if present and not overwrite:
+        raise CFlowError(f"{present[0]} exists; give overwrite=True to replace the segment")
+    root.mkdir(parents=True, exist_ok=True)
+    scratch = Path(tempfile.mkdtemp(prefix=f".{log.log_id}-", dir=root))
+    try:
+        (scratch / "new").mkdir()
+        (scratch / "old").mkdir()
+        _write_components(log, scratch / "new", max_shift, is_rolling)
+        _put_in_place(scratch, places)
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+    return places["lidar"]
+
+
+def _put_in_place(scratch: Path, places: Dict[str, Path]) -> None:
+    """Moves new/<tag> to its place; on failure everything is as before."""
+    tags = sorted(places, key=lambda tag: tag == "lidar")  # the file that readers look for comes last
+    moved_away, moved_in = [], []
+    try:
+        for tag in reversed(tags):
+            if places[tag].exists():
+                os.replace(places[tag], scratch / "old" / tag)
+                moved_away.append(tag)
+        for tag in tags:
+            places[tag].parent.mkdir(exist_ok=True)
+            os.replace(scratch / "new" / tag, places[tag])
+            moved_in.append(tag)
+    except BaseException:
+        for tag in reversed(moved_in):
+            places[tag].unlink()
+        for tag in reversed(moved_away):
+            os.replace(scratch / "old" / tag, places[tag])
+        raise
+
+
+def _write_components(log: Recording, folder: Path, max_shift: float, is_rolling: bool) -> None:
+    times = [(stamp + 500) // 1000 for stamp in log.timestamps]
+    if len(set(times)) < len(times):
+        raise CFlowError(f"log {log.log_id} has sweeps less than a microsecond apart; Waymo cannot tell them apart")
+    tables: Dict[str, List[Dict[str, Any]]] = {tag: [] for tag in SCHEMAS}
+    writers = {tag: pq.ParquetWriter(folder / tag, SCHEMAS[tag], compression="zstd") for tag in ("lidar", "lidar_pose")}
+    try:
+        for index, time in enumerate(times):
+            key = {SEGMENT: log.log_id, TIME: time}
+            pose, units = np.asarray(log.poses[index], np.float64), log.units(index)
+            numbers = _laser_numbers([unit.name for unit in units])
+            rows: List[Dict[str, Any]] = []
+            for unit, number in sorted(zip(units, numbers), key=lambda pair: pair[1]):
+                calibration = _calibration(unit, log.elevations(unit.name))
+                shots = poses_of_shots(log, index, unit.offset_ns, is_rolling) if number == TOP else None
+                where = f"sweep {index} of log {log.log_id}, unit {unit.name}"
+                images = encode_images(unit, calibration, max_shift, where, shots)
+                cells = {**_cells(f"{LIDAR}1", images["first"]), **_cells(f"{LIDAR}2", images["second"])}
+                rows.append({**key, LASER: number, **cells})
+                if number == TOP:
+                    cells = _cells(PIXEL_POSE, images["poses"])
+                    _write_rows(writers["lidar_pose"], [{**key, LASER: TOP, **cells}])
+                if index == 0:
+                    tables["lidar_calibration"].append(_calibration_row(log.log_id, number, calibration))
+            _write_rows(writers["lidar"], rows)
+            boxes = _box_rows(log, index, key)
+            tables["lidar_box"] += boxes
+            tables["vehicle_pose"].append({**key, VEHICLE_POSE: pose.reshape(-1)})
+            tables["stats"].append({**key, **_stats(boxes)})
+    finally:
+        for writer in writers.values():
+            writer.close()
+    _add_speeds(tables["lidar_box"], dict(zip(times, np.asarray(log.poses, np.float64))))
+    for tag, rows in tables.items():
+        if tag not in writers:
+            with pq.ParquetWriter(folder / tag, SCHEMAS[tag], compression="zstd") as writer:
+                _write_rows(writer, rows)
+    for tag in SCHEMAS:
+        with open(folder / tag, "rb+") as file:
+            os.fsync(file.fileno())
+
+
+def _laser_numbers(names: Sequence[str]) -> List[int]:
+    if len(names) > len(LASERS):
+        raise CFlowError(f"Waymo's vehicles carry up to {len(LASERS)} LiDARs, the recording has {list(names)}")
+    if not set(names) & set(LASERS):
+        return list(LASERS.values())[: len(names)]
+    unknown = sorted(set(names) - set(LASERS))
+    if unknown:
+        raise CFlowError(f"units {unknown} are none of Waymo's ({', '.join(LASERS)}) although others are; rename them")
+    return [LASERS[name] for name in names]
+
+
+def _calibration(unit: UnitReturns, elevations: np.ndarray) -> LaserCalibration:
+    """Evenly spaced beams are stored by their outer edges, as Waymo does for its side lasers."""
+    T_ego_sensor, elevations = np.asarray(unit.T_ego_sensor, np.float64), np.asarray(elevations, np.float64)
+    steps = np.diff(elevations)
+    if len(steps) and np.ptp(steps) < 1e-12 and unit.name != "TOP":
+        half = (elevations[-1] - elevations[0]) / len(steps) / 2
+        return LaserCalibration(T_ego_sensor, None, float(elevations[0] - half), float(elevations[-1] + half))
+    return LaserCalibration(T_ego_sensor, elevations, float(elevations[0]), float(elevations[-1]))
+
+
+def _cells(column: str, image: np.ndarray) -> Dict[str, Any]:
+    return {f"{column}.values": image.astype(np.float32).reshape(-1), f"{column}.shape": list(image.shape)}
+
+
+def _calibration_row(log_id: str, number: int, calibration: LaserCalibration) -> Dict[str, Any]:
+    values = (calibration.T_ego_sensor.reshape(-1), calibration.low, calibration.high, calibration.inclinations)
+    return dict(zip(SCHEMAS["lidar_calibration"].names, (log_id, number, *values)))
+
+
+def _box_rows(log: Recording, index: int, key: Dict[str, Any]) -> List[Dict[str, Any]]:
+    """Rows of one frame, without speeds."""
+    boxes, rows = log.boxes(index), []
+    for track, category, size, pose, count in zip(
+        boxes.track_id, boxes.category, boxes.size, boxes.pose, boxes.num_points
+    ):
+        if category in BOX_TYPE:
+            numbers = {f"{BOX}box.center.{axis}": pose[k, 3] for k, axis in enumerate(_XYZ)}
+            numbers.update({f"{BOX}box.size.{axis}": size[k] for k, axis in enumerate(_XYZ)})
+            numbers[f"{BOX}box.heading"] = np.arctan2(pose[1, 0], pose[0, 0])
+            kind = {f"{BOX}type": BOX_TYPE[category], f"{BOX}num_lidar_points_in_box": int(count)}
+            rows.append({**key, TRACK: track, **numbers, **kind})
+    return rows
+
+
+def _add_speeds(rows: Sequence[Dict[str, Any]], poses: Dict[int, np.ndarray]) -> None:
+    """Velocities over ground in world axes, from the track's centres in the two nearest frames."""
+    tracks: Dict[str, List[Dict[str, Any]]] = {}
+    for row in rows:
+        tracks.setdefault(row[TRACK], []).append(row)
+    for track in tracks.values():
+        if len(track) < 2:
+            continue
+        seconds = np.array([row[TIME] - track[0][TIME] for row in track]) * 1e-6
+        local = np.array([[row[f"{BOX}box.center.{axis}"] for axis in _XYZ] for row in track])
+        pose = np.stack([poses[row[TIME]] for row in track])
+        centres = np.einsum("nij,nj->ni", pose[:, :3, :3], local) + pose[:, :3, 3]
+        for row, speed in zip(track, np.gradient(centres, seconds, axis=0)):
+            row.update({f"{BOX}speed.{axis}": speed[k] for k, axis in enumerate(_XYZ)})
+
+
+def _stats(boxes: Sequence[Dict[str, Any]]) -> Dict[str, Any]:
+    types, counts = np.unique([row[f"{BOX}type"] for row in boxes], return_counts=True)
+    values: Tuple[Any, ...] = ("Day", "synthetic", "sunny", types.astype(np.int8), counts, [], [])
+    return dict(zip(SCHEMAS["stats"].names[2:], values))
+
+
+def _write_rows(writer: pq.ParquetWriter, rows: Sequence[Dict[str, Any]]) -> None:
+    """Adds one row group; a column that a row does not have becomes null."""
+    arrays = [pa.array([row.get(field.name) for row in rows], field.type) for field in writer.schema]
+    writer.write_table(pa.Table.from_arrays(arrays, schema=writer.schema), row_group_size=max(len(rows), 1))

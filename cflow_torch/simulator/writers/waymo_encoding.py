@@ -1,0 +1,118 @@
+"""From returns to Waymo's range images: pixels, ranges and, for the laser on the roof, poses of the pixels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Dict, Optional
+
+import numpy as np
+
+from cflow_torch.data.waymo.range_image import (
+    INTENSITY,
+    RANGE,
+    LaserCalibration,
+    directions,
+    rotations_from_angles,
+)
+from cflow_torch.simulator.recording import Recording, UnitReturns
+from cflow_torch.types import CFlowError
+
+_NODES = 4  # sweeps whose poses are interpolated: a cubic is exact for constant jerk
+# Of a pixel's pose from the interpolated one, metres: a car that begins to turn within a sweep is off by 0.3 at 75 m.
+_MAX_POSE_SHIFT = 1.0
+
+
+@dataclass(frozen=True)
+class ShotPoses:
+    """Where the vehicle was at each of N shots.
+
+    Args:
+        of_shot: (N, 6) roll, pitch, yaw, x, y, z of `T_world_ego`; the angles are float32 numbers already.
+        of_frame: (6,) that of the frame.
+        T_world_ego: (4, 4) float64 pose of the frame.
+    """
+
+    of_shot: np.ndarray
+    of_frame: np.ndarray
+    T_world_ego: np.ndarray
+
+    def to_shot(self, points: np.ndarray, T_ego_sensor: np.ndarray) -> np.ndarray:
+        """Points (N, 3) of the laser's frame at the pose of the frame, seen from it at the moment of the shot."""
+        world = self._world(points, T_ego_sensor)
+        ego = np.einsum("nji,nj->ni", rotations_from_angles(self.of_shot[:, :3]), world - self.of_shot[:, 3:])
+        return (ego - T_ego_sensor[:3, 3]) @ T_ego_sensor[:3, :3]
+
+    def that_give(self, points: np.ndarray, on_rays: np.ndarray, T_ego_sensor: np.ndarray) -> np.ndarray:
+        """The poses, moved so that (N, 3) points on the rays of their pixels come to lie where the true ones are."""
+        ego = on_rays @ T_ego_sensor[:3, :3].T + T_ego_sensor[:3, 3]
+        turned = np.einsum("nij,nj->ni", rotations_from_angles(self.of_shot[:, :3]), ego)
+        return np.concatenate([self.of_shot[:, :3], self._world(points, T_ego_sensor) - turned], axis=1)
+
+    def _world(self, points: np.ndarray, T_ego_sensor: np.ndarray) -> np.ndarray:
+        T = self.T_world_ego @ T_ego_sensor
+        return points @ T[:3, :3].T + T[:3, 3]
+
+
+def poses_of_shots(log: Recording, index: int, offset_ns: np.ndarray, is_rolling: bool) -> ShotPoses:
+    """Poses at the times of shots: the polynomial through the angles and positions of the four nearest sweeps."""
+    first = min(max(index - 1, 0), max(len(log.timestamps) - _NODES, 0))
+    nodes = range(first, min(first + _NODES, len(log.timestamps)))
+    values = np.stack([pose_angles(np.asarray(log.poses[node], np.float64)) for node in nodes])
+    values[:, :3] = np.unwrap(values[:, :3], axis=0)
+    seconds = np.array([(log.timestamps[node] - log.timestamps[index]) * 1e-9 for node in nodes])
+    at = np.asarray(offset_ns, np.float64) * 1e-9 * is_rolling
+    weights = np.ones((len(at), len(nodes)))
+    for k, own in enumerate(seconds):
+        for other in np.delete(seconds, k):
+            weights[:, k] *= (at - other) / (own - other)
+    of_shot = weights @ values
+    of_shot[:, :3] = of_shot[:, :3].astype(np.float32)
+    T_world_ego = np.asarray(log.poses[index], np.float64)
+    return ShotPoses(of_shot, pose_angles(T_world_ego), T_world_ego)
+
+
+def encode_images(
+    unit: UnitReturns, calibration: LaserCalibration, max_shift: float, where: str, shot_poses: Optional[ShotPoses]
+) -> Dict[str, np.ndarray]:
+    """Range images of both returns (the second is empty) and, given poses of the shots, the image of pixel poses."""
+    height, width = unit.num_rings, unit.num_columns
+    points = np.asarray(unit.points, np.float64)  # laser frame, at the pose of the frame
+    seen = points if shot_poses is None else shot_poses.to_shot(points, calibration.T_ego_sensor)
+    distance = np.linalg.norm(seen, axis=1).astype(np.float32)
+    row = height - 1 - np.asarray(unit.ring, np.int64)
+    # Column j looks to azimuth a_0 - 2 pi j / W.
+    azimuths = calibration.column_azimuths(width)
+    turned = (azimuths[0] - np.arctan2(seen[:, 1], seen[:, 0])) / (2 * np.pi) * width
+    column = np.rint(turned).astype(np.int64) % width
+    if shot_poses is not None and len(column):
+        # Interpolated poses may err by a pixel. The recording counts columns as the image does, from another first one.
+        start = np.bincount((column - unit.column) % width).argmax()
+        column = (np.asarray(unit.column, np.int64) + start) % width
+        max_shift = _MAX_POSE_SHIFT
+    rays = directions(azimuths[column], calibration.row_inclinations(height)[row])
+    on_rays = distance[:, None].astype(np.float64) * rays
+    shift = np.linalg.norm(seen - on_rays, axis=1)
+    if len(shift) and shift.max() > max_shift:
+        raise CFlowError(
+            f"{where}: {np.count_nonzero(shift > max_shift)} of {len(shift)} returns are off the rays of a {height} x "
+            f"{width} range image, by up to {shift.max():.3g} m; record with a profile made for Waymo, say with "
+            f"is_rolling whether the vehicle moves during a sweep, or (not for TOP) allow max_shift"
+        )
+    pixel = row * width + column
+    if len(np.unique(pixel)) < len(pixel):
+        raise CFlowError(f"{where}: {len(pixel) - len(np.unique(pixel))} returns share a pixel with another")
+    image = np.full((height, width, 4), -1.0, np.float32)
+    images: Dict[str, np.ndarray] = {"second": image.copy()}
+    image[row, column] = (0.0, 0.0, 0.0, -1.0)
+    image[row, column, RANGE], image[row, column, INTENSITY] = distance, unit.intensity
+    images["first"] = image
+    if shot_poses is not None:
+        images["poses"] = np.tile(shot_poses.of_frame, (height, width, 1)).astype(np.float32)
+        images["poses"][row, column] = shot_poses.that_give(points, on_rays, calibration.T_ego_sensor)
+    return images
+
+
+def pose_angles(pose: np.ndarray) -> np.ndarray:
+    """(6,) roll, pitch, yaw, x, y, z of a transform."""
+    roll, yaw = np.arctan2(pose[2, 1], pose[2, 2]), np.arctan2(pose[1, 0], pose[0, 0])
+    return np.array([roll, -np.arcsin(np.clip(pose[2, 0], -1, 1)), yaw, *pose[:3, 3]])

@@ -1,0 +1,1 @@
+"""What comes in: sweeps of windows, checked, in the frame of t+1, on one BEV grid."""

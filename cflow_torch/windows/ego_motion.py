@@ -1,0 +1,112 @@
+"""Ego motion: poses -> everything in the frame of t+1 (Eq. def_scene_flow). Float64 throughout."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Optional, Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from cflow_torch.types import Array, CFlowError, as_numpy
+from cflow_torch.windows.resolution import COARSEST_POSE, resolution
+
+# How far R R^T may be from the identity. Poses stored in float32 are within 1e-6.
+_ORTHOGONALITY = 1e-3
+
+
+def rigid_transform(matrix: Any, name: str, reach: float = 0.0) -> np.ndarray:
+    """A checked 4 x 4 rigid transform in float64.
+
+    Args:
+        matrix: (4, 4) array or tensor.
+        name: what to call it in an error, for example "T_ego1_ego0".
+        reach: metres from the origin up to which points are transformed.
+
+    Returns:
+        (4, 4) float64.
+
+    Raises:
+        CFlowError: wrong shape, not finite, not a rotation with a translation, or of a type that holds it to more than
+            `COARSEST_POSE` only.
+    """
+    dtype = getattr(matrix, "dtype", None)
+    try:
+        result = as_numpy(matrix, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise CFlowError(f"{name} is {type(matrix).__name__}: give a (4, 4) matrix of numbers") from None
+    if result.shape != (4, 4):
+        raise CFlowError(f"{name} has shape {result.shape}: give one (4, 4) matrix (no batch dimension)")
+    # Plain numbers: NumPy's way to ask the same of sixteen takes ten times as long, once per sweep.
+    rows = result.tolist()
+    if not all(math.isfinite(value) for row in rows for value in row):
+        raise CFlowError(f"{name} holds NaN or infinite values: give a finite rigid transform")
+    x, y, z = (row[:3] for row in rows[:3])
+    lengths = max(abs(_dot(axis, axis) - 1) for axis in (x, y, z))
+    error = max(lengths, abs(_dot(x, y)), abs(_dot(x, z)), abs(_dot(y, z)))
+    last_row = max(abs(value - expected) for value, expected in zip(rows[3], (0.0, 0.0, 0.0, 1.0)))
+    determinant = _dot(x, (y[1] * z[2] - y[2] * z[1], y[2] * z[0] - y[0] * z[2], y[0] * z[1] - y[1] * z[0]))
+    if error > _ORTHOGONALITY or last_row > _ORTHOGONALITY or determinant < 0:
+        raise CFlowError(
+            f"{name} is not rigid (|R R^T - I| up to {error:.3g}, det {determinant:.3g}, last row "
+            f"{rows[3]}): give [R t; 0 0 0 1] with a rotation R, row-major"
+        )
+    farthest = max(reach, *(abs(row[3]) for row in rows[:3]))
+    step = max(resolution(kind, farthest) for kind in (np.dtype(np.float64), dtype) if kind is not None)
+    if step > COARSEST_POSE:
+        raise CFlowError(
+            f"{name} is {dtype or 'float64'}, which at {farthest:.9g} m only holds multiples of {step:g} m (at most "
+            f"{COARSEST_POSE} m): give it as float64, never rounded to less, or poses in a frame whose origin is nearer"
+        )
+    return result
+
+
+def _dot(a: Sequence[float], b: Sequence[float]) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def relative_transform(pose1: Any, pose: Any, name: str = "pose") -> np.ndarray:
+    """T_ego1_ego = inv(T_world_ego1) T_world_ego.
+
+    Args:
+        pose1: (4, 4) `T_world_ego1`, pose of sweep t+1.
+        pose: (4, 4) `T_world_ego`, pose of another sweep.
+        name: what to call `pose` in an error.
+
+    Returns:
+        (4, 4) float64.
+
+    Raises:
+        CFlowError: a pose is not a finite rigid transform.
+    """
+    return np.linalg.inv(rigid_transform(pose1, "pose1")) @ rigid_transform(pose, name)
+
+
+def compensate(positions: Tensor, T_ego1_ego: Optional[Array], num_axes: int = 3) -> Tensor:
+    """Positions in the frame of t+1.
+
+    Args:
+        positions: (3, N) float64, metres, in the ego frame of their sweep; rows x, y, z.
+        T_ego1_ego: (4, 4) float64, array or tensor, None = already in the frame of t+1.
+        num_axes: A, how many coordinates are asked for: 2 = x and y only.
+
+    Returns:
+        (A, N) float64. A point that is not finite has no finite coordinate after a transform.
+
+    Convention:
+        ((R0 x + R1 y) + R2 z) + t with one rounding per operation, no matrix product: the same bits
+        on every device.
+
+    Source: Eq. def_scene_flow.
+    """
+    if T_ego1_ego is None:
+        return positions[:num_axes]
+    x, y, z = positions.unbind(0)
+    r0, r1, r2, t = torch.as_tensor(T_ego1_ego[:num_axes], dtype=torch.float64, device=x.device)[:, :, None].unbind(1)
+    result = r0 * x
+    term = r1 * y
+    result += term
+    result += torch.mul(r2, z, out=term)
+    result += t
+    return result

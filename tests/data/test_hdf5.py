@@ -1,0 +1,256 @@
+"""The reader of OpenSceneFlow's HDF5 scenes, on a scene made here and on the real one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cflow_torch import CFlowError
+from cflow_torch.cli.main import main
+from cflow_torch.data.hdf5.index_file import read_index, write_index
+from cflow_torch.data.hdf5.reader import HDF5Log, find_hdf5_scenes
+from cflow_torch.data.hdf5.writer import write_hdf5_scene, write_index_files
+from cflow_torch.data.log import window
+from cflow_torch.simulator import make_drive
+
+h5py = pytest.importorskip("h5py")
+
+STAMPS = (1_533_279_682_150_532, 1_533_279_682_250_532, 1_533_279_682_350_532)  # microseconds
+
+
+def write_scene(file: Path, stamps=STAMPS, **replaced) -> Path:
+    """Sweeps of 50 points, columns x, y, z, intensity; the last one has no flow. `replaced` values go into sweep 0."""
+    rng = np.random.default_rng(0)
+    with h5py.File(file, "w") as scene:
+        for index, stamp in enumerate(stamps):
+            group = scene.create_group(str(stamp))
+            pose = np.eye(4)
+            pose[0, 3] = index
+            values = {
+                "lidar": rng.uniform(-5, 5, (50, 4)).astype(np.float32),
+                "ground_mask": rng.random(50) < 0.3,
+                "pose": pose,
+            }
+            if index < len(stamps) - 1:
+                values["flow"] = rng.normal(size=(50, 3)).astype(np.float32)
+                values["flow_is_valid"] = rng.random(50) < 0.9
+                values["flow_category_indices"] = rng.integers(0, 30, 50).astype(np.int8)
+                values["eval_mask"] = rng.random((50, 1)) < 0.5
+            if index == 0:
+                values.update(replaced)
+            for key, value in values.items():
+                if value is not None:
+                    group[key] = value
+    return file
+
+
+def test_what_is_stored_is_read(tmp_path):
+    file = write_scene(tmp_path / "scene.h5")
+    with h5py.File(file) as scene, HDF5Log(file) as log:
+        assert log.log_id == "scene" and list(log.timestamps) == list(STAMPS)
+        group = scene[str(STAMPS[1])]
+        sweep, labels = log.sweep(1), log.labels(1)
+        assert np.array_equal(sweep.points, group["lidar"][:, :3]) and sweep.points.dtype == np.float32
+        assert np.array_equal(sweep.is_ground, group["ground_mask"][:])
+        assert np.array_equal(sweep.pose, group["pose"][:]) and sweep.pose.dtype == np.float64
+        assert sweep.timestamp_ns == STAMPS[1] * 1000, "microseconds become nanoseconds"
+        assert np.array_equal(labels.flow, group["flow"][:]) and labels.category.dtype == np.uint8
+        assert np.array_equal(log.eval_mask(1), group["eval_mask"][:, 0])
+        assert log.labels(2) is None
+        assert len(window(log, 1, 4).pch) == 1
+    assert find_hdf5_scenes(tmp_path) == find_hdf5_scenes(file) == [file]
+
+
+def test_nanoseconds_stay(tmp_path):
+    stamps = (315_966_265_259_836_000, 315_966_265_360_032_000)
+    with HDF5Log(write_scene(tmp_path / "a.h5", stamps)) as log:
+        assert log.sweep(0).timestamp_ns == stamps[0]
+
+
+@pytest.mark.parametrize(
+    ("replaced", "complaint"),
+    [
+        ({"lidar": None}, "lidar"),
+        ({"pose": None}, "pose"),
+        ({"lidar": np.zeros((50, 2), np.float32)}, "lidar.*shape"),
+        ({"ground_mask": np.zeros(49, bool)}, "ground_mask.*shape"),
+    ],
+)
+def test_a_bad_sweep_is_named(tmp_path, replaced, complaint):
+    with HDF5Log(write_scene(tmp_path / "a.h5", **replaced)) as log:
+        with pytest.raises(CFlowError, match=complaint):
+            log.sweep(0)
+        assert len(log.sweep(1).points) == 50
+
+
+@pytest.mark.parametrize("replaced", [{"flow_is_valid": None}, {"flow_category_indices": np.zeros(3, np.uint8)}])
+def test_bad_labels_are_named(tmp_path, replaced):
+    with HDF5Log(write_scene(tmp_path / "a.h5", **replaced)) as log, pytest.raises(
+        CFlowError, match=next(iter(replaced))
+    ):
+        log.labels(0)
+
+
+def test_files_that_are_no_scene(tmp_path):
+    whole = write_scene(tmp_path / "whole.h5").read_bytes()
+    (tmp_path / "half.h5").write_bytes(whole[: len(whole) // 2])
+    (tmp_path / "empty.h5").write_bytes(b"")
+    write_scene(tmp_path / "one.h5", STAMPS[:1])
+    for name in ("half", "empty", "one", "missing"):
+        with pytest.raises(CFlowError, match=f"{name}.h5"):
+            HDF5Log(tmp_path / f"{name}.h5")
+    with pytest.raises(CFlowError, match="nowhere"):
+        find_hdf5_scenes(tmp_path / "nowhere")
+
+
+def test_every_key_is_read_as_stored(tmp_path):
+    rng = np.random.default_rng(1)
+    extra = {
+        "ego_motion": np.eye(4, dtype=np.float32),
+        "flow_instance_id": rng.integers(0, 9, 50).astype(np.int16),
+        "lidar_id": rng.integers(1, 3, 50).astype(np.uint8),
+        "lidar_dt": rng.random(50).astype(np.float32),
+        "lidar_center": rng.random((2, 4, 4)).astype(np.float32),
+        "dufo": rng.integers(0, 2, 50).astype(np.uint8),
+        "cluster": rng.integers(0, 5, (50, 1)).astype(np.int16),
+        "my_result": rng.random((50, 3)).astype(np.float32),
+    }
+    with HDF5Log(write_scene(tmp_path / "scene.h5", **extra)) as log:
+        assert set(log.keys(0)) > set(extra) and "dufo" not in log.keys(1)
+        for key, value in extra.items():
+            read = log.values(0, key)
+            assert read.dtype == value.dtype and np.array_equal(read, value[:, 0] if key == "cluster" else value), key
+        with pytest.raises(CFlowError, match=r"no nnd; it has cluster, .*dufo"):
+            log.values(0, "nnd")
+
+
+def test_variants_of_types_and_shapes(tmp_path):
+    """float32 poses, (N, 3) points, int8 categories with -1 = no label, eval_mask (N,)."""
+    category = np.array([-1, 19] * 25, np.int8)
+    pose = np.eye(4, dtype=np.float32)
+    file = write_scene(
+        tmp_path / "scene.h5",
+        lidar=np.ones((50, 3), np.float32),
+        pose=pose,
+        flow_category_indices=category,
+        flow_is_valid=np.ones(50, bool),
+        eval_mask=np.arange(50) < 7,
+    )
+    with HDF5Log(file) as log:
+        assert log.sweep(0).pose.dtype == np.float64 and log.eval_mask(0).sum() == 7
+        labels = log.labels(0)
+        assert labels.category.tolist() == [0, 19] * 25 and labels.is_valid.tolist() == [False, True] * 25
+
+
+@pytest.mark.parametrize("points_frame", ["ego", "sensor"])
+def test_round_trip_of_a_simulated_drive(tmp_path, points_frame):
+    drive = make_drive(seed=1, num_sweeps=3, profile="demo")
+    file = tmp_path / "scene.h5"
+    write_hdf5_scene(drive, file, points_frame, eval_step=2)
+    extrinsics = drive.units(0)[0].T_ego_sensor if points_frame == "sensor" else np.eye(4)
+    with HDF5Log(file) as log, h5py.File(file) as scene:
+        assert list(log.timestamps) == list(drive.timestamps) and np.array_equal(log.ego_T_lidar, extrinsics)
+        assert np.array_equal(log.poses, drive.poses @ extrinsics)
+        for index in range(3):
+            stored, read, units = drive.sweep(index), log.sweep(index), drive.units(index)
+            there = read.points.astype(np.float64) @ extrinsics[:3, :3].T + extrinsics[:3, 3]
+            step = 0.0 if points_frame == "ego" else 1e-5  # float32 at 100 m
+            assert np.abs(there - stored.points).max() <= step
+            assert np.array_equal(read.is_ground, stored.is_ground) and read.timestamp_ns == stored.timestamp_ns
+            assert np.array_equal(read.pose, drive.poses[index] @ extrinsics)
+            assert np.array_equal(scene[str(drive.timestamps[index])]["pose"][:], drive.poses[index]), (
+                "of the ego frame"
+            )
+            assert log.values(index, "lidar_id").max() == len(units)
+            assert np.array_equal(log.values(index, "lidar_center")[0], units[0].T_ego_sensor.astype(np.float32))
+            assert np.allclose(log.values(index, "lidar_dt") * 1e9, units[0].offset_ns, atol=10)
+            truth, labels = drive.labels(index), log.labels(index)
+            if index == 2:
+                assert truth is labels is None and "ego_motion" not in log.keys(2)
+                continue
+            assert np.abs(labels.flow @ extrinsics[:3, :3].T - truth.flow).max() <= step
+            assert np.array_equal(labels.category, truth.category) and np.array_equal(labels.is_valid, truth.is_valid)
+            motion = np.linalg.inv(drive.poses[index + 1]) @ drive.poses[index]
+            assert np.array_equal(log.values(index, "ego_motion"), motion.astype(np.float32))
+            assert ((log.values(index, "flow_instance_id") > 0) == (truth.category > 0))[
+                truth.category > 0
+            ].mean() > 0.99
+            # In the frame of the points, what stands still moves as the poses say.
+            T_1_0 = np.linalg.inv(log.sweep(index + 1).pose) @ read.pose
+            rigid = read.points @ T_1_0[:3, :3].T + T_1_0[:3, 3] - read.points
+            assert np.abs(labels.flow - rigid)[truth.category == 0].max() < 1e-4
+        assert log.eval_mask(1) is None
+        assert np.array_equal(log.eval_mask(0), log.labels(0).is_valid & ~log.sweep(0).is_ground)
+        assert log.eval_frames() == [0]
+
+
+def test_argoverse_scenes_without_extrinsics_are_recognised(tmp_path):
+    """Time stamps of that set and ground 2 m below the origin: up_lidar; ground 0.35 m below: the ego frame."""
+    drive = make_drive(seed=1, num_sweeps=2, profile="demo")
+    mount = drive.units(0)[0].T_ego_sensor
+    for frame in ("sensor", "ego"):
+        file = tmp_path / f"{frame}.h5"
+        write_hdf5_scene(drive, file, frame, store_extrinsics=False, pose_dtype="float32")
+        with HDF5Log(file) as log, HDF5Log(file, ego_T_lidar=mount) as told, HDF5Log(file, ego_T_lidar=None) as plain:
+            if frame == "ego":
+                assert np.array_equal(log.ego_T_lidar, np.eye(4))
+            else:
+                assert np.abs(log.ego_T_lidar[:3, 3] - mount[:3, 3]).max() < 1e-2
+                assert abs(np.degrees(np.arctan2(log.ego_T_lidar[1, 0], log.ego_T_lidar[0, 0])) + 0.58) < 0.01
+            assert np.array_equal(told.ego_T_lidar, mount)
+            assert np.array_equal(plain.sweep(0).pose, drive.poses[0].astype(np.float32))
+    with pytest.raises(CFlowError, match="ego_T_lidar of"):
+        HDF5Log(file, ego_T_lidar=np.ones((4, 4)))
+
+
+def test_eval_frames(tmp_path):
+    file = write_scene(tmp_path / "scene.h5")
+    with HDF5Log(file) as log:
+        assert log.eval_frames() == [0, 1], "no index: the sweeps with a mask"
+        write_index(tmp_path / "index_eval.pkl", [("other", 5), ("scene", STAMPS[2]), ("scene", STAMPS[1])])
+        assert log.eval_frames() == [1], "the last sweep has no successor"
+        write_index(tmp_path / "index_eval.pkl", [("scene", 5)])
+        with pytest.raises(CFlowError, match="names sweep 5"):
+            log.eval_frames()
+    write_index_files(tmp_path)
+    names = {name: read_index(tmp_path / f"index_{name}.pkl") for name in ("total", "flow", "eval")}
+    assert names["total"] == [("scene", stamp) for stamp in STAMPS]
+    assert names["flow"] == names["eval"] == names["total"][:2]
+
+
+def test_what_cannot_be_written(tmp_path):
+    drive = make_drive(seed=1, num_sweeps=2, profile="demo")
+
+    class NoPose:
+        log_id, timestamps, labels = "bare", drive.timestamps, drive.labels
+
+        def sweep(self, index):
+            return type(drive.sweep(0))(drive.sweep(index).points)
+
+    for log, settings, complaint in (
+        (NoPose(), {}, "no pose"),
+        (NoPose(), {"points_frame": "sensor"}, "does not know its own"),
+        (drive, {"points_frame": "camera"}, "points_frame"),
+        (drive, {"pose_dtype": "float16"}, "pose_dtype"),
+    ):
+        with pytest.raises(CFlowError, match=complaint):
+            write_hdf5_scene(log, tmp_path / "a.h5", **settings)
+        assert not list(tmp_path.iterdir()), "nothing half-written"
+
+
+def test_command_scores_the_eval_mask(tmp_path, capsys):
+    write_scene(tmp_path / "scene.h5")
+    (tmp_path / "broken.h5").write_bytes(b"no")
+    with pytest.raises(SystemExit) as stop:
+        main(["eval", "data=hdf5", f"data.root={tmp_path}", f"output={tmp_path / 'out'}", "model=paper"])
+    assert stop.value.code == 1 and "broken.h5" in capsys.readouterr().err
+
+
+def test_the_real_scene(kitti_file):
+    with HDF5Log(kitti_file) as log:
+        assert len(log.timestamps) == 16 and log.labels(15) is None
+        sweep, labels = log.sweep(0), log.labels(0)
+        assert len(labels.flow) == len(sweep.points) == len(log.eval_mask(0))
+        assert 0.05 < (log.sweep(1).timestamp_ns - sweep.timestamp_ns) / 1e9 < 0.15

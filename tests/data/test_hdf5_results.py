@@ -1,0 +1,217 @@
+"""A method's flow inside HDF5 scenes: what is written, what is refused, and that a scene is never left half written."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any, Dict, Iterator, Tuple
+
+import numpy as np
+import pytest
+import torch
+
+from cflow_torch import CFlowError
+from cflow_torch.cli.main import main
+from cflow_torch.data.flow_file import read_flow
+from cflow_torch.data.hdf5.reader import HDF5Log, find_hdf5_scenes
+from cflow_torch.data.hdf5.results import RESERVED_KEYS, write_hdf5_results
+
+h5py = pytest.importorskip("h5py")
+
+STAMPS = tuple(10**18 + index * 10**8 for index in range(3))
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    """Three sweeps of 60, 61 and 62 points: a box that moves, and ground."""
+    rng = np.random.default_rng(0)
+    file = tmp_path / "scene.h5"
+    with h5py.File(file, "w") as new:
+        for index, stamp in enumerate(STAMPS):
+            group = new.create_group(str(stamp))
+            box = rng.uniform(0, 2, (50, 3)) + [5 + index, 0, 0]
+            ground = rng.uniform(-9, 9, (10 + index, 3)) * [1, 1, 0]
+            group["lidar"] = np.concatenate([box, ground]).astype(np.float32)
+            group["ground_mask"] = np.arange(60 + index) >= 50
+            group["pose"] = np.eye(4)
+    return file
+
+
+def flow_of(index: int, value: float = 1.0) -> np.ndarray:
+    return np.full((60 + index, 3), value, np.float32)
+
+
+def contents(file: Path) -> Dict[str, Any]:
+    """Every value of a scene."""
+    with h5py.File(file, "r") as scene:
+        return {f"{stamp}/{key}": scene[stamp][key][()] for stamp in scene for key in scene[stamp]}
+
+
+def assert_unchanged(file: Path, before: bytes) -> None:
+    assert file.read_bytes() == before
+    assert os.listdir(file.parent) == [file.name], "no temporary file is left"
+
+
+def test_a_result_is_written_and_the_rest_stays(scene: Path) -> None:
+    before = contents(scene)
+    results = [(STAMPS[0], flow_of(0, 0.25)), (STAMPS[1], torch.full((61, 3), 0.1, dtype=torch.float64))]
+    assert write_hdf5_results(scene, "cflow", results) == 2
+    after = contents(scene)
+    assert set(after) - set(before) == {f"{STAMPS[0]}/cflow", f"{STAMPS[1]}/cflow"}
+    for key, value in before.items():
+        np.testing.assert_array_equal(after[key], value)
+    stored = after[f"{STAMPS[1]}/cflow"]
+    assert stored.dtype == np.float32 and stored.shape == (61, 3) and (stored == np.float32(0.1)).all()
+    assert find_hdf5_scenes(scene.parent) == [scene] and os.listdir(scene.parent) == [scene.name]
+
+
+def test_an_older_result_is_replaced_without_growth(scene: Path) -> None:
+    write_hdf5_results(scene, "cflow", [(STAMPS[0], flow_of(0, 1))])
+    size = scene.stat().st_size
+    for value in (2, 3, 4):
+        write_hdf5_results(scene, "cflow", [(STAMPS[0], flow_of(0, value))])
+    assert (contents(scene)[f"{STAMPS[0]}/cflow"] == 4).all() and scene.stat().st_size == size
+    write_hdf5_results(scene, "other", [(STAMPS[0], flow_of(0, 9))])
+    assert (contents(scene)[f"{STAMPS[0]}/cflow"] == 4).all()
+
+
+@pytest.mark.parametrize("name", [*sorted(RESERVED_KEYS), "a/b", "..", "", "[flow]", "1st", "x" * 65, "a b", None])
+def test_names_that_are_taken_or_none(name: Any, scene: Path) -> None:
+    before = scene.read_bytes()
+    with pytest.raises(CFlowError, match="name"):
+        write_hdf5_results(scene, name, [(STAMPS[0], flow_of(0))])
+    assert_unchanged(scene, before)
+
+
+@pytest.mark.parametrize(
+    ("stamp", "flow", "complaint"),
+    [
+        (STAMPS[0], flow_of(1), r"\(61, 3\), expected \(60, 3\)"),
+        (STAMPS[0], flow_of(0)[:, :2], r"\(60, 2\)"),
+        (17, flow_of(0), "no sweep 17"),
+    ],
+)
+def test_a_wrong_result_changes_nothing(stamp: int, flow: np.ndarray, complaint: str, scene: Path) -> None:
+    before = scene.read_bytes()
+    with pytest.raises(CFlowError, match=complaint):
+        write_hdf5_results(scene, "cflow", [(STAMPS[1], flow_of(1)), (stamp, flow)])
+    assert_unchanged(scene, before)
+
+
+def test_a_key_that_is_no_flow_is_not_replaced(scene: Path) -> None:
+    with h5py.File(scene, "r+") as file:
+        file[str(STAMPS[0])]["mine"] = np.arange(60)
+    before = scene.read_bytes()
+    with pytest.raises(CFlowError, match="mine.*no flow result"):
+        write_hdf5_results(scene, "mine", [(STAMPS[0], flow_of(0))])
+    assert_unchanged(scene, before)
+
+
+def test_an_error_on_the_way_changes_nothing(scene: Path) -> None:
+    before = scene.read_bytes()
+
+    def results() -> Iterator[Tuple[int, np.ndarray]]:
+        yield STAMPS[0], flow_of(0)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_hdf5_results(scene, "cflow", results())
+    assert_unchanged(scene, before)
+
+
+def test_a_killed_process_changes_nothing(scene: Path) -> None:
+    before = scene.read_bytes()
+    code = (
+        "import os, signal, sys, numpy as np\n"
+        "from cflow_torch.data.hdf5.results import write_hdf5_results\n"
+        "def results():\n"
+        f"    yield {STAMPS[0]}, np.ones((60, 3))\n"
+        "    os.kill(os.getpid(), signal.SIGKILL)\n"
+        "write_hdf5_results(sys.argv[1], 'cflow', results())\n"
+    )
+    root = Path(__file__).resolve().parents[2]
+    done = subprocess.run([sys.executable, "-c", code, str(scene)], cwd=str(root), capture_output=True, text=True)
+    assert done.returncode == -9, done.stderr
+    assert scene.read_bytes() == before
+    assert find_hdf5_scenes(scene.parent) == [scene], "what it left is not taken for a scene"
+    assert write_hdf5_results(scene, "cflow", [(STAMPS[0], flow_of(0))]) == 1
+
+
+def test_read_only_and_foreign_files(scene: Path, tmp_path: Path) -> None:
+    before = scene.read_bytes()
+    scene.chmod(0o444)
+    with pytest.raises(CFlowError, match="read-only"):
+        write_hdf5_results(scene, "cflow", [(STAMPS[0], flow_of(0))])
+    assert_unchanged(scene, before)
+    scene.chmod(0o640)
+    half = tmp_path / "half.h5"
+    half.write_bytes(before[: len(before) // 2])
+    with pytest.raises(CFlowError, match="half.h5 cannot be written"):
+        write_hdf5_results(half, "cflow", [(STAMPS[0], flow_of(0))])
+    with pytest.raises(CFlowError, match="missing.h5 does not exist"):
+        write_hdf5_results(tmp_path / "missing.h5", "cflow", [])
+    assert sorted(os.listdir(tmp_path)) == ["half.h5", "scene.h5"]
+
+
+def test_mode_links_and_open_readers_survive(scene: Path, tmp_path: Path) -> None:
+    scene.chmod(0o640)
+    link = tmp_path / "link.h5"
+    link.symlink_to(scene)
+    with HDF5Log(scene) as log:
+        points = log.sweep(0).points
+        assert write_hdf5_results(link, "cflow", [(STAMPS[0], flow_of(0))]) == 1
+        np.testing.assert_array_equal(log.sweep(0).points, points)
+    assert link.is_symlink() and scene.stat().st_mode & 0o777 == 0o640
+    assert f"{STAMPS[0]}/cflow" in contents(scene)
+    assert write_hdf5_results(scene, "cflow", []) == 0
+
+
+def run(*arguments: object) -> int:
+    """Exit status of a command."""
+    argv = list(sys.argv)
+    try:
+        main([str(argument) for argument in arguments])
+    except SystemExit as stop:
+        return int(stop.code or 0)
+    finally:
+        sys.argv = argv
+    return 0
+
+
+def test_command_writes_what_its_flow_files_hold(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    out = tmp_path / "out"
+    call = ["flow", "data=hdf5", f"data.root={scene}", f"output={out}", "model=paper"]
+    assert run(*call, "result_name=cflow") == 0
+    assert "cflow" in capsys.readouterr().out
+    after = contents(scene)
+    for index in (0, 1):
+        flow = read_flow(out / "scene" / f"{STAMPS[index]}.feather").flow.numpy()
+        np.testing.assert_array_equal(after[f"{STAMPS[index]}/cflow"], flow)
+        assert flow[:50].any()
+    assert f"{STAMPS[2]}/cflow" not in after
+
+    before = scene.read_bytes()
+    for wrong, message in (("flow", "scenes themselves"), ("a/b", "no result name")):
+        assert run(*call, "overwrite=true", f"result_name={wrong}") == 2
+        assert message in capsys.readouterr().err
+    scene.chmod(0o444)
+    shutil.rmtree(out)
+    assert run(*call, "result_name=cflow") == 2
+    assert "read-only" in capsys.readouterr().err and not out.exists(), "known before anything is estimated"
+    assert run("flow", f"output={out}", "result_name=cflow") == 2
+    assert "data=hdf5" in capsys.readouterr().err
+    assert scene.read_bytes() == before
+
+
+def test_the_real_scene_as_a_viewer_reads_it(kitti_file: Path, tmp_path: Path) -> None:
+    copy = tmp_path / kitti_file.name
+    copy.write_bytes(kitti_file.read_bytes())
+    with HDF5Log(copy) as log:
+        stamp, flow = log.timestamps[3], log.labels(3).flow
+    assert write_hdf5_results(copy, "truth", [(stamp, flow)]) == 1
+    with h5py.File(copy, "r") as scene:
+        group = scene[str(stamp)]
+        np.testing.assert_array_equal(group["truth"][:], group["flow"][:])

@@ -1,0 +1,92 @@
+"""Poses for logs without any: KISS-ICP where it is installed, one clear message where it is not."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+import scenes
+
+from cflow_torch import CFlowError, Sweep
+from cflow_torch.data.odometry import PosedLog, poses_from_odometry, with_poses
+from cflow_torch.data.static_check import check_static_world
+from cflow_torch.simulator import make_drive
+
+
+class NoPoses:
+    """A log whose poses are lost."""
+
+    def __init__(self, log) -> None:
+        self.log, self.log_id, self.timestamps, self.labels = log, log.log_id, log.timestamps, log.labels
+
+    def sweep(self, index):
+        sweep = self.log.sweep(index)
+        return Sweep(sweep.points, sweep.is_ground, None, sweep.timestamp_ns)
+
+
+@pytest.fixture(scope="module")
+def drive():
+    return make_drive(seed=2, num_sweeps=8, profile="demo")
+
+
+def drift(poses: np.ndarray, truth: np.ndarray):
+    """(metres, degrees) by which the last sweep is off, seen from the first."""
+    difference = np.linalg.inv(np.linalg.inv(truth[0]) @ truth[-1]) @ np.linalg.inv(poses[0]) @ poses[-1]
+    angle = np.degrees(np.arccos(np.clip((np.trace(difference[:3, :3]) - 1) / 2, -1, 1)))
+    return np.linalg.norm(difference[:3, 3]), angle
+
+
+def test_a_simulated_drive(drive):
+    pytest.importorskip("kiss_icp", reason="KISS-ICP is not installed (extra odometry)")
+    poses = poses_from_odometry(NoPoses(drive))
+    assert np.array_equal(poses[0], np.eye(4))
+    for index in range(7):  # the first steps too, where KISS-ICP alone misses by 14 cm
+        metres, degrees = drift(poses[index : index + 2], drive.poses[index : index + 2])
+        assert metres < 0.05 and degrees < 0.2, index
+    assert np.array_equal(poses, poses_from_odometry(NoPoses(drive))), "the same again"
+
+
+def test_the_real_drive(kitti_file):
+    pytest.importorskip("kiss_icp", reason="KISS-ICP is not installed (extra odometry)")
+    pytest.importorskip("h5py")
+    from cflow_torch.data.hdf5.reader import HDF5Log
+
+    with HDF5Log(kitti_file) as log:
+        poses = poses_from_odometry(NoPoses(log))
+        metres, degrees = drift(poses, log.poses)
+        assert metres < 0.1 and degrees < 0.5, "after 5 m and 11 degrees"
+        assert not any(residual.verdict for residual in check_static_world(PosedLog(log, poses)))
+
+
+def test_without_kiss_icp_the_message_says_what_to_do(drive, monkeypatch):
+    for name in [name for name in sys.modules if name.split(".")[0] == "kiss_icp"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "kiss_icp", None)
+    for call in (poses_from_odometry, with_poses):
+        with pytest.raises(CFlowError, match=r"pip install kiss-icp.*poses\.txt"):
+            call(NoPoses(drive))
+    assert with_poses(drive) is drive, "nothing is estimated where poses are known"
+
+
+def test_sweeps_that_cannot_be_registered(drive):
+    pytest.importorskip("kiss_icp", reason="KISS-ICP is not installed (extra odometry)")
+
+    class Empty(NoPoses):
+        def sweep(self, index):
+            return Sweep(np.full((200, 3), np.nan, np.float32))
+
+    with pytest.raises(CFlowError, match="fewer than 100 points"):
+        poses_from_odometry(Empty(drive))
+    with pytest.raises(CFlowError, match="max_range"):
+        poses_from_odometry(NoPoses(drive), max_range=0)
+
+
+def test_poses_are_put_on(drive):
+    poses = np.stack([scenes.pose(k, 0, 0) for k in range(8)])
+    log = PosedLog(NoPoses(drive), poses)
+    assert np.array_equal(log.sweep(3).pose, poses[3]) and np.array_equal(log.sweep(3).points, drive.sweep(3).points)
+    assert np.array_equal(log.labels(3).flow, drive.labels(3).flow) and list(log.timestamps) == list(drive.timestamps)
+    for wrong, complaint in ((poses[:7], "7 poses for 8"), (2 * poses, "rigid")):
+        with pytest.raises(CFlowError, match=complaint):
+            PosedLog(drive, wrong)

@@ -1,0 +1,359 @@
+"""docs/conventions.md: what stands there is so, and every line of it names the test that would notice a change."""
+
+from __future__ import annotations
+
+import ast
+import math
+import re
+from pathlib import Path
+from typing import Any, List, Tuple
+
+import numpy as np
+import pytest
+import torch
+from pyarrow import feather
+
+from cflow_torch import CFlowError, CorrelationFlow, FlowResult, Sweep, Window, estimate_flow
+from cflow_torch.data.flow_file import write_flow
+from cflow_torch.simulator import make_drive
+from cflow_torch.windows.bev_grid import Grid
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = ROOT / "docs" / "conventions.md"
+INF = math.inf
+# Pixels of 1 m and points in their middles: displacements are exact. The paper's method, one pair, one scale.
+SETTINGS = {"preset": "paper", "pixel_size": 1.0, "point_cloud_range": (-20.0, -20.0, -INF, 20.0, 20.0, INF)}
+# (row, column) pixels of an L, 6 m along y and 5 m along x.
+ELL = [(r, 0) for r in range(6)] + [(5, c) for c in range(1, 5)]
+
+
+def points_of(pixels: List[Tuple[int, int]]) -> np.ndarray:
+    """(N, 3) a point in the middle of each (row, column); pixel (0, 0) begins at x = y = 0."""
+    return np.array([(c + 0.5, r + 0.5, 0.5) for r, c in pixels]).reshape(-1, 3)
+
+
+def ell(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> np.ndarray:
+    """(10, 3) an L of pixels, moved."""
+    return points_of(ELL) + [x, y, z]
+
+
+def transform(yaw: float, x: float, y: float) -> np.ndarray:
+    """(4, 4) a turn by `yaw` degrees, counter-clockwise, then a shift."""
+    cos, sin = round(math.cos(math.radians(yaw)), 12), round(math.sin(math.radians(yaw)), 12)
+    return np.array([[cos, -sin, 0, x], [sin, cos, 0, y], [0, 0, 1, 0], [0, 0, 0, 1.0]])
+
+
+def through(T: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """(N, 3) T p."""
+    return points @ T[:3, :3].T + T[:3, 3]
+
+
+def flow_of(pc0: Any, pc1: Any, **arguments: Any) -> FlowResult:
+    return estimate_flow(pc0, pc1, **{**SETTINGS, **arguments})
+
+
+def flow_of_window(window: Window, **overrides: Any) -> FlowResult:
+    settings = {**SETTINGS, **overrides}
+    (result,) = CorrelationFlow.from_preset(**settings)([window])
+    return result
+
+
+# --------------------------------------------------------------------------------------------- frames and units
+
+
+def test_x_is_forward_y_is_left_z_is_up():
+    drive = make_drive(seed=0, num_sweeps=2)
+    sweep, labels = drive.sweep(0), drive.labels(0)
+    ground = labels.flow[np.asarray(sweep.is_ground)]
+    assert ground[:, 0].mean() < -0.3 and abs(ground[:, 1].mean()) < 0.1  # it drives forward: the world comes nearer
+    z = np.asarray(sweep.points)[:, 2]
+    assert np.median(z[sweep.is_ground]) < np.median(z[~np.asarray(sweep.is_ground)])
+    with pytest.raises(CFlowError, match="not rigid"):  # a mirrored frame, y to the right, is none
+        flow_of(ell(), ell(), T_ego1_ego0=np.diag([1.0, -1.0, 1.0, 1.0]))
+
+
+def test_the_transform_maps_the_frame_of_t_to_that_of_t1():
+    T_ego1_ego0 = transform(90, 3, 1)
+    pc1 = ell(2, 4)
+    pc0 = through(np.linalg.inv(T_ego1_ego0), pc1)
+    right = flow_of(pc0, pc1, T_ego1_ego0=T_ego1_ego0)
+    assert not right.residual_flow.any() and right.score.tolist() == [1.0] * 10
+    wrong = flow_of(pc0, pc1, T_ego1_ego0=np.linalg.inv(T_ego1_ego0))
+    assert wrong.score.max() < 1
+
+
+def test_poses_map_the_ego_frame_to_the_world():
+    pose0, pose1, world = transform(90, 3, 1), transform(0, 5, 2), ell(6, 3)
+    sweeps = [Sweep(through(np.linalg.inv(pose), world), pose=pose) for pose in (pose0, pose1)]
+    result = flow_of_window(Window(*sweeps))
+    assert not result.residual_flow.any() and result.score.tolist() == [1.0] * 10
+    np.testing.assert_allclose(result.pose_flow, sweeps[1].points - sweeps[0].points, atol=1e-6)
+
+
+def test_without_transforms_all_points_lie_in_the_frame_of_t1():
+    result = flow_of(ell(), ell(2, 1))
+    assert not result.pose_flow.any()
+    assert torch.equal(result.flow, result.residual_flow) and result.flow[0].tolist() == [2, 1, 0]
+
+
+def test_pc0_plus_flow_lies_on_t1():
+    T_ego1_ego0 = transform(90, 3, 1)
+    pc1 = ell(2, 4) + [1, -2, 0]  # moves by (1, -2) in the axes of t+1
+    pc0 = through(np.linalg.inv(T_ego1_ego0), ell(2, 4))
+    result = flow_of(pc0, pc1, T_ego1_ego0=T_ego1_ego0)
+    np.testing.assert_allclose(pc0 + result.flow.numpy(), pc1, atol=1e-6)
+    np.testing.assert_allclose(result.pose_flow, through(T_ego1_ego0, pc0) - pc0, atol=1e-6)
+    assert torch.equal(result.flow, result.residual_flow + result.pose_flow)
+
+
+def test_a_still_world_has_no_residual_flow():
+    T_ego1_ego0 = transform(0, -4, 0)  # the vehicle drives 4 m forward
+    result = flow_of(ell(6), through(T_ego1_ego0, ell(6)), T_ego1_ego0=T_ego1_ego0)
+    assert result.residual_flow.tolist() == [[0, 0, 0]] * 10
+    assert result.flow.tolist() == result.pose_flow.tolist() == [[-4, 0, 0]] * 10
+
+
+def test_flow_has_the_axes_of_t1():
+    T_ego1_ego0 = transform(-90, 0, 0)  # the vehicle turns left by 90 degrees; its world turns right
+    pc0, ahead = ell(4), np.array([2.0, 0, 0])  # what was ahead at t is on the right at t+1
+    result = flow_of(pc0, through(T_ego1_ego0, pc0 + ahead), T_ego1_ego0=T_ego1_ego0)
+    assert result.residual_flow.tolist() == [[0, -2, 0]] * 10
+
+
+def test_flow_is_metres_until_the_next_sweep():
+    for interval in (100_000_000, 500_000_000):
+        window = Window(Sweep(ell(), timestamp_ns=0), Sweep(ell(2), timestamp_ns=interval))
+        assert flow_of_window(window).residual_flow[0].tolist() == [2, 0, 0]
+
+
+def test_time_stamps_are_nanoseconds_and_speeds_metres_per_second():
+    found = {}
+    for milliseconds in (100, 300):
+        window = Window(Sweep(ell(), timestamp_ns=0), Sweep(ell(2), timestamp_ns=milliseconds * 1_000_000))
+        # 5 m/s: 0.5 m + one pixel in 0.1 s, 1.5 m + one pixel in 0.3 s
+        found[milliseconds] = flow_of_window(window, max_speed=5.0).residual_flow[0, 0].item()
+    assert found[100] < 2 and found[300] == 2
+
+
+def test_history_is_nearest_first():
+    sweeps = [Sweep(ell(2.0 * k), timestamp_ns=k * 100_000_000) for k in range(4)]  # t-2, t-1, t, t+1
+    t2, t1, now, newest = sweeps
+    assert flow_of_window(Window(now, newest, (t1, t2)), num_history=2).residual_flow[0].tolist() == [2, 0, 0]
+    with pytest.raises(CFlowError, match="out of order"):
+        flow_of_window(Window(now, newest, (t2, t1)), num_history=2)
+
+
+def test_the_place_in_the_history_is_the_number_of_steps():
+    # 4 m in what is said to be two steps, beside 1 m in one: the mean of the middle two estimates.
+    result = flow_of(ell(), ell(1), pch=[ell(-3)], num_history=1)
+    assert result.residual_flow[0].tolist() == [1.5, 0, 0]
+
+
+# --------------------------------------------------------------------------------------------------------- rows
+
+
+def test_rows_are_those_of_pc0():
+    pc0 = np.concatenate([ell(), [[500.0, 0, 0], [np.nan, 0, 0]], ell(0, 12)])
+    pc1 = np.concatenate([ell(2), ell(0, 12)])
+    order = np.random.default_rng(0).permutation(len(pc0))
+    one, other = flow_of(pc0, pc1), flow_of(pc0[order], pc1)
+    assert one.residual_flow[:, 0].tolist() == [2] * 10 + [0] * 12
+    for name, values in one.numpy().items():
+        assert len(values) == len(pc0)
+        np.testing.assert_array_equal(other.numpy()[name], values[order])
+
+
+def test_columns_after_z_are_ignored():
+    wide = np.concatenate([ell(), np.full((10, 2), np.nan)], 1)
+    assert flow_of(wide, ell(2)).residual_flow[0].tolist() == [2, 0, 0]
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
+def test_dtypes_of_the_result(dtype):
+    result = flow_of(ell().astype(dtype), torch.from_numpy(ell(2).astype(dtype)))
+    assert result.residual_flow[0].tolist() == [2, 0, 0]
+    assert {name: str(value.dtype) for name, value in result.numpy().items()} == {
+        "residual_flow": "float32",
+        "pose_flow": "float32",
+        "flow": "float32",
+        "cluster_id": "int64",
+        "score": "float32",
+        "is_valid": "bool",
+    }
+
+
+def test_true_in_a_mask_is_ground():
+    pc0, pc1 = np.concatenate([ell(), ell(0, 10)]), np.concatenate([ell(2), ell(2, 10)])
+    mask = np.arange(20) < 10
+    result = flow_of(pc0, pc1, gm0=mask, gm1=mask, T_ego1_ego0=transform(0, 1, 0))
+    assert result.is_valid.tolist() == (~mask).tolist()
+    assert result.cluster_id.tolist() == [-1] * 10 + [0] * 10
+    assert result.residual_flow[:, 0].tolist() == [0] * 10 + [1] * 10
+    assert result.pose_flow.tolist() == [[1, 0, 0]] * 20  # ground has the flow of the ego motion
+
+
+@pytest.mark.parametrize("bad", [np.nan, INF, -INF])
+def test_points_that_are_not_finite_have_no_flow_at_all(bad):
+    pc0 = np.concatenate([ell(), [[1.5, bad, 0.5]]])
+    result = flow_of(pc0, ell(2), T_ego1_ego0=transform(0, 1, 0))
+    assert result.residual_flow[0].tolist() == [1, 0, 0] and bool(result.is_valid[0])
+    assert not result.flow[-1].any() and not result.pose_flow[-1].any()
+    assert int(result.cluster_id[-1]) == -1 and not result.is_valid[-1]
+
+
+def test_both_ends_of_the_region_belong_to_it():
+    on, off = 20.0, float(np.nextafter(20.0, INF))
+    pc0 = np.array([[on, on, 0], [-on, -on, 0], [off, 0, 0], [0, -off, 0]])
+    assert flow_of(pc0, pc0).is_valid.tolist() == [True, True, False, False]
+
+
+def test_the_region_is_that_of_the_frame_of_t1():
+    T_ego1_ego0 = transform(0, -30, 0)
+    pc0 = np.array([[35.0, 0, 0], [5, 0, 0]])
+    result = flow_of(pc0, through(T_ego1_ego0, pc0), T_ego1_ego0=T_ego1_ego0)
+    assert result.is_valid.tolist() == [True, False]
+    assert result.flow.tolist() == [[-30, 0, 0]] * 2  # outside: the flow of the ego motion
+
+
+def test_the_ego_box_is_that_of_each_sweep():
+    pc0, T_ego1_ego0 = np.array([[1.0, 0, 0], [4.0, 0, 0]]), transform(0, -3, 0)
+    result = flow_of(pc0, pc0, T_ego1_ego0=T_ego1_ego0, ego_box=(-2, -2, 2, 2))
+    assert result.is_valid.tolist() == [False, True]  # 4 m ahead at t, 1 m ahead at t+1
+
+
+def test_empty_sweeps_are_no_error():
+    nothing = np.zeros((0, 3))
+    assert flow_of(nothing, ell()).flow.shape == (0, 3)
+    result = flow_of(ell(), nothing)
+    assert not result.flow.any() and result.cluster_id.tolist() == [-1] * 10 and result.score.tolist() == [0] * 10
+    assert result.is_valid.all()  # they took part; nothing was found
+
+
+# ------------------------------------------------------------------------------------------------------- pixels
+
+
+def test_a_pixel_is_the_floor_of_the_distance_from_the_lower_end():
+    grid = Grid(0.5, (-10.0, -10.0, -1.0), (10.0, 10.0, 1.0))
+    x = torch.tensor([-10.0, -9.51, -9.5, -0.01, 0.0], dtype=torch.float64)
+    assert grid.pixel(torch.stack((x, torch.full_like(x, -10.0)))).tolist() == [0, 0, 1, 19, 20]
+
+
+def test_rows_from_y_columns_from_x_and_one_more_than_fits():
+    grid = Grid(1.0, (0.0, 0.0, -1.0), (3.0, 5.0, 1.0))
+    assert (grid.height, grid.width) == (6, 4)
+    image, _ = grid.project(torch.tensor([[2.5], [0.5]], dtype=torch.float64), torch.zeros(1, dtype=torch.int32), 1)
+    assert image.nonzero().tolist() == [[0, 0, 2]]  # image, row (y), column (x)
+
+
+# ----------------------------------------------------------------------------------------------------- clusters
+
+
+@pytest.mark.parametrize(
+    "other, connectivity, clusters",
+    [((3, 0), 8, 1), ((4, 0), 8, 2), ((3, 3), 8, 1), ((3, 3), 4, 2), ((3, 2), 4, 1)],
+)
+def test_gaps_of_two_free_pixels_are_bridged(other, connectivity, clusters):
+    points = points_of([(0, 0), other])
+    ids = flow_of(points, points, connectivity=connectivity).cluster_id
+    assert len(set(ids.tolist())) == clusters
+    if connectivity == 8:
+        assert torch.equal(flow_of(points, points).cluster_id, ids)  # the default
+
+
+def test_cluster_ids_count_in_raster_order():
+    points = points_of([(10, 0), (2, 15), (2, 5)])  # (row, column)
+    assert flow_of(points, points).cluster_id.tolist() == [2, 1, 0]
+
+
+def test_a_cluster_is_seen_before_and_at_t1():
+    pc0, pc1 = points_of([(0, 0), (10, 10)]), points_of([(0, 0), (0, 10)])
+    result = flow_of(pc0, pc1)
+    assert result.cluster_id.tolist() == [0, -1] and result.is_valid.tolist() == [True, True]
+
+
+# -------------------------------------------------------------------------------------------------- correlation
+
+
+def test_the_score_is_the_normalised_correlation():
+    assert flow_of(ell(), ell(2)).score.tolist() == [1.0] * 10
+    half = flow_of(ell(), ell()[:5])  # 5 of 10 pixels are there: 5 / sqrt(10 * 5)
+    np.testing.assert_allclose(half.score, math.sqrt(0.5), rtol=1e-6)
+
+
+def test_heights_do_not_move_without_the_sectional_view():
+    tall = np.concatenate([ell(0, 0, z) for z in range(4)])
+    assert flow_of(tall, tall + [2, 0, 1]).residual_flow[0].tolist() == [2, 0, 0]
+    assert flow_of(tall, tall + [2, 0, 1], sectional_view=True).residual_flow[0].tolist() == [2, 0, 1]
+
+
+def test_displacements_are_whole_pixels():
+    assert flow_of(ell(), ell(1.6)).residual_flow[0].tolist() == [2, 0, 0]
+    assert flow_of(ell(), ell(1.4)).residual_flow[0].tolist() == [1, 0, 0]
+
+
+@pytest.mark.parametrize("engines", [{"correlation": "conv"}, {"max_memory": 1}])
+def test_engines_and_limits_of_memory_change_no_bit(engines):
+    rng = np.random.default_rng(1)
+    pc0 = rng.uniform(-15, 15, (40, 3))
+    pc1 = pc0 + rng.normal(0, 1.0, (40, 3))
+    one, other = flow_of(pc0, pc1).numpy(), flow_of(pc0, pc1, **engines).numpy()
+    assert len(set(one["cluster_id"].tolist())) > 3
+    assert all(one[name].tobytes() == other[name].tobytes() for name in one)
+
+
+# -------------------------------------------------------------------------------------------------------- files
+
+
+def test_names_of_a_flow_file(tmp_path):
+    result = flow_of(ell(), ell(3), T_ego1_ego0=transform(0, 1, 0))
+    write_flow(tmp_path / "1.feather", result)
+    table = feather.read_table(tmp_path / "1.feather")
+    vectors = [f"{kind}_t{axis}_m" for kind in ("flow", "residual", "pose") for axis in "xyz"]
+    assert table.column_names == [*vectors, "cluster_id", "score", "is_valid"]
+    assert [table[f"{kind}_tx_m"][0].as_py() for kind in ("flow", "residual", "pose")] == [3, 2, 1]
+
+
+def test_labels_are_total_flow():
+    drive = make_drive(seed=0, num_sweeps=2)
+    sweep, labels = drive.sweep(0), drive.labels(0)
+    static = labels.is_valid & (labels.category == 0)
+    T_ego1_ego0 = np.linalg.inv(drive.poses[1]) @ drive.poses[0]
+    points = np.asarray(sweep.points)[static].astype(np.float64)
+    np.testing.assert_allclose(labels.flow[static], through(T_ego1_ego0, points) - points, atol=1e-5)
+
+
+# ----------------------------------------------------------------------------------------------------- the page
+
+
+def lines_of_the_page() -> List[str]:
+    """The numbered lines."""
+    return [line for line in PAGE.read_text(encoding="utf-8").split("\n") if re.match(r"\d+\. ", line)]
+
+
+def named_tests(line: str) -> List[Tuple[str, str]]:
+    """(file, function) of every test that a line names."""
+    return re.findall(r"`tests/(test_\w+\.py)::(test_\w+)`", line)
+
+
+def functions(file: str) -> List[str]:
+    """Names of the tests of a file."""
+    tree = ast.parse((ROOT / "tests" / file).read_text(encoding="utf-8"))
+    return [node.name for node in tree.body if isinstance(node, ast.FunctionDef) and node.name.startswith("test_")]
+
+
+def test_every_line_names_tests_that_exist():
+    lines = lines_of_the_page()
+    assert len(lines) > 40
+    assert [int(line.split(".")[0]) for line in lines] == list(range(1, len(lines) + 1))
+    for line in lines:
+        named = named_tests(line)
+        assert named, line
+        assert line.count("::") == len(named), f"a test that is not written as `tests/FILE.py::NAME`: {line}"
+        for file, name in named:
+            assert name in functions(file), f"{file}::{name}"
+
+
+def test_every_test_here_is_named_by_a_line():
+    about_the_page = {"test_every_line_names_tests_that_exist", "test_every_test_here_is_named_by_a_line"}
+    named = {name for line in lines_of_the_page() for file, name in named_tests(line) if file == Path(__file__).name}
+    assert named == set(functions(Path(__file__).name)) - about_the_page

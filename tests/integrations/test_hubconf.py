@@ -1,0 +1,68 @@
+"""`torch.hub.load` from a checkout."""
+
+from __future__ import annotations
+
+import importlib.util
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+import torch
+from scenes import assert_same, scene
+
+from cflow_torch import CFlowError, CorrelationFlowKeypoints, make_config, make_model
+
+ROOT = str(Path(__file__).resolve().parents[2])
+
+
+@pytest.fixture()
+def hubconf() -> ModuleType:
+    """The module itself."""
+    spec = importlib.util.spec_from_file_location("hubconf", Path(ROOT, "hubconf.py"))
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_it_is_the_model_of_the_preset():
+    window = scene(0, num_history=1)
+    model = torch.hub.load(ROOT, "cflow", source="local", preset="fast", device="cpu", num_history=1)
+    assert model.config == make_config("fast", num_history=1)
+    assert_same(model([window])[0], make_model(make_config("fast", num_history=1))([window])[0])
+
+
+def test_other_presets_and_the_default():
+    keypoints = torch.hub.load(ROOT, "cflow", source="local", preset="keypoints")
+    assert isinstance(keypoints, CorrelationFlowKeypoints)
+    assert torch.hub.load(ROOT, "cflow", source="local").config == make_config()
+
+
+def test_one_entry_point_with_help(hubconf):
+    # What torch.hub.list takes for an entry point.
+    assert [name for name, value in vars(hubconf).items() if callable(value) and not name.startswith("_")] == ["cflow"]
+    assert "preset" in (hubconf.cflow.__doc__ or "")
+
+
+def test_bad_settings_say_what_is_allowed():
+    with pytest.raises(CFlowError, match="paper.*default.*fast.*keypoints"):
+        torch.hub.load(ROOT, "cflow", source="local", preset="best")
+    with pytest.raises(CFlowError, match="num_histori"):
+        torch.hub.load(ROOT, "cflow", source="local", num_histori=1)
+
+
+def test_dependencies_are_what_loading_needs(hubconf, tmp_path):
+    # In a process of its own, which finds nothing but the checkout and the dependencies that are named.
+    others = {"kornia", "pyarrow", "hydra", "omegaconf", "tqdm", "matplotlib", "h5py", "scipy", "cv2", "pandas"}
+    code = (
+        "import sys\n"
+        f"for name in {sorted(others - set(hubconf.dependencies))}: sys.modules[name] = None\n"
+        "import torch\n"
+        f"model = torch.hub.load({ROOT!r}, 'cflow', source='local', preset='paper')\n"
+        "print(type(model).__name__, len(list(model.parameters())))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=str(tmp_path), capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == ["CorrelationFlow", "0"]

@@ -1,0 +1,140 @@
+"""Sec. clustering: morphology, labelling, Alg. clustering, and HDBSCAN in its place."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Dict, List, Sequence, Tuple
+
+import numpy as np
+
+from cflow_torch.config import Config
+from oracle.pixels import Box, bounding_box
+
+
+def dilate(image: np.ndarray) -> np.ndarray:
+    """Dilation with a 3 x 3 square of ones, clipped at the border: every foreground pixel paints its square."""
+    result = np.zeros_like(image)
+    for r, c in np.argwhere(image).tolist():
+        result[max(r - 1, 0) : r + 2, max(c - 1, 0) : c + 2] = True
+    return result
+
+
+def erode(image: np.ndarray) -> np.ndarray:
+    """Erosion with a 3 x 3 square of ones: a pixel stays if its whole square is foreground.
+
+    Convention: pixels outside the image are ignored; the border itself does not erode.
+    """
+    result = np.zeros_like(image)
+    for r, c in np.argwhere(image).tolist():
+        result[r, c] = image[max(r - 1, 0) : r + 2, max(c - 1, 0) : c + 2].all()
+    return result
+
+
+def connected_components(image: np.ndarray, connectivity: int) -> Tuple[np.ndarray, int]:
+    """Breadth-first labelling of a binary image.
+
+    Args:
+        image: (H, W) bool.
+        connectivity: 4 (orthogonal neighbours) or 8 (diagonal ones too).
+
+    Returns:
+        (H, W) int64 labels, 0 = background, 1 ... n in raster order of each component's first pixel; and n.
+    """
+    steps = [(-1, 0), (0, -1), (0, 1), (1, 0)]
+    if connectivity == 8:
+        steps += [(-1, -1), (-1, 1), (1, -1), (1, 1)]
+    height, width = image.shape
+    labels = np.zeros(image.shape, dtype=np.int64)
+    count = 0
+    for seed in np.argwhere(image).tolist():
+        if labels[seed[0], seed[1]]:
+            continue
+        count += 1
+        labels[seed[0], seed[1]] = count
+        queue = deque([seed])
+        while queue:
+            r, c = queue.popleft()
+            for dr, dc in steps:
+                i, j = r + dr, c + dc
+                if 0 <= i < height and 0 <= j < width and image[i, j] and not labels[i, j]:
+                    labels[i, j] = count
+                    queue.append([i, j])
+    return labels, count
+
+
+def cluster(
+    images: Sequence[np.ndarray], pixel_size: float, max_extent: float, connectivity: int, reach: int = 3
+) -> np.ndarray:
+    """Alg. clustering: spatio-temporal clusters as connected components of the aggregated image.
+
+    Args:
+        images: occupancy (H, W) bool of sweep t+1, then of sweeps t, t-1, ...
+        pixel_size: s in metres.
+        max_extent: d^max in metres.
+        connectivity: 4 or 8.
+        reach: 3 = Alg. clustering; 1 = plain components: neither dilated nor validated by size.
+
+    Returns:
+        (H, W) int64: cluster of every pixel that some sweep occupies, -1 elsewhere and in clusters without a pixel
+        at t+1 or without a pixel before it. Numbered 0 ... M-1 in raster order of the first occupied pixel.
+
+    Convention: a component is measured dilated, as the longer side of its box in pixels times s; exactly d^max is
+        not too large. An oversized component is eroded and labelled again once, whatever size results.
+    """
+    aggregated = np.logical_or.reduce(images)
+    labels, count = connected_components(aggregated if reach == 1 else dilate(aggregated), connectivity)
+
+    # Validation of the connected components.
+    total = count
+    boxes = {} if reach == 1 else _boxes(labels)
+    for component, box in boxes.items():
+        if max(box[2], box[3]) * pixel_size > max_extent:
+            eroded = erode(labels == component)
+            labels[labels == component] = 0
+            parts, count = connected_components(eroded, connectivity)
+            labels[eroded] = parts[eroded] + total
+            total += count
+
+    # Number the components that can move: a pixel at t+1 and a pixel before.
+    at_t1 = set(labels[images[0]].tolist())
+    before = {label for image in images[1:] for label in labels[image].tolist()}
+    numbers: Dict[int, int] = {}
+    result = np.full(labels.shape, -1, dtype=np.int64)
+    for r, c in np.argwhere(aggregated).tolist():
+        label = int(labels[r, c])
+        if label in at_t1 and label in before:
+            result[r, c] = numbers.setdefault(label, len(numbers))
+    return result
+
+
+def cluster_hdbscan(points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], config: Config) -> List[np.ndarray]:
+    """HDBSCAN of the aggregated points in place of Alg. clustering (Table which_clustering_method).
+
+    Args:
+        points: (N, 3) float64 of sweep t+1, then of sweeps t, t-1, ...
+        pixels: (N, 2) their BEV pixels (row, column).
+        config: `min_cluster_size`.
+
+    Returns:
+        Per sweep (N,) int64, cluster of every point, -1 for noise and for clusters without a point at t+1 or without
+        one before it. Numbered in raster order of the first pixel; clusters that share it by label.
+    """
+    from hdbscan import HDBSCAN
+
+    aggregated = np.concatenate(points)
+    labels = np.full(len(aggregated), -1)
+    if len(aggregated) > config.min_cluster_size:
+        labels = HDBSCAN(min_cluster_size=config.min_cluster_size).fit_predict(aggregated)
+    of_sweep = np.split(labels, np.cumsum([len(p) for p in points])[:-1])
+    live = [i for i in range(labels.max(initial=-1) + 1) if i in of_sweep[0] and any(i in m for m in of_sweep[1:])]
+    first = {i: min(tuple(p) for m, pixel in zip(of_sweep, pixels) for p in pixel[m == i].tolist()) for i in live}
+    numbers = {label: number for number, label in enumerate(sorted(live, key=lambda i: (first[i], i)))}
+    return [np.array([numbers.get(label, -1) for label in m.tolist()], dtype=np.int64) for m in of_sweep]
+
+
+def _boxes(labels: np.ndarray) -> Dict[int, Box]:
+    """Bounding box of every component of a label image."""
+    pixels: Dict[int, List[List[int]]] = {}
+    for r, c in np.argwhere(labels).tolist():
+        pixels.setdefault(int(labels[r, c]), []).append([r, c])
+    return {label: bounding_box([np.array(members)]) for label, members in pixels.items()}

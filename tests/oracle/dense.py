@@ -1,0 +1,223 @@
+"""CorrelationFlow at one scale: the motion of every cluster (Alg. general_correlation_flow).
+
+Order of reading: general_correlation_flow -> scene_flow_1obj (Alg. scene_flow_1obj) -> scene_flow_in_1view
+(Alg. scene_flow_1view) -> overlap_and_energy (Eq. norm_correlation).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Optional, Sequence, Tuple
+
+import numpy as np
+
+from cflow_torch.config import Config
+from oracle.clustering import cluster, cluster_hdbscan
+from oracle.peak import beats_zero, parabola
+from oracle.pixels import (
+    Box,
+    bev_dims,
+    bounding_box,
+    in_range,
+    longer_side,
+    occupancy,
+    project_bev,
+    search_radius,
+    slice_images,
+)
+from oracle.pooling import pool
+from oracle.sweeps import Cloud, Level
+
+
+def general_correlation_flow(clouds: Sequence[Cloud], cloud1: Cloud, pixel_size: float, config: Config) -> Level:
+    """Alg. general_correlation_flow: cluster, find the motion of each cluster, assign it to the cluster's points.
+
+    Args:
+        clouds: sweeps m = t, t-1, ... nearest first.
+        cloud1: sweep t+1.
+        pixel_size: s in metres.
+        config: settings.
+
+    Returns:
+        Flow, cluster and score of every point of every sweep m <= t.
+
+    Convention: a cluster longer than `max_object` has flow 0 and the NCC score of no shift.
+    """
+    # Partition the aggregation of all sweeps into clusters.
+    sweeps = [cloud1, *clouds]
+    height, width = bev_dims(config, pixel_size)
+    inside = [cloud.takes_part & in_range(cloud.points, config) for cloud in sweeps]
+    pixels = [project_bev(cloud.points[keep], config, pixel_size) for cloud, keep in zip(sweeps, inside)]
+    if config.clustering == "hdbscan":
+        members = cluster_hdbscan([cloud.points[keep] for cloud, keep in zip(sweeps, inside)], pixels, config)
+    else:
+        images = [occupancy(pixel, (0, 0, height, width)) for pixel in pixels]
+        clusters = cluster(images, pixel_size, config.max_extent, config.connectivity)
+        members = [clusters[pixel[:, 0], pixel[:, 1]] for pixel in pixels]
+    cluster_ids = []
+    for cloud, keep, member in zip(sweeps, inside, members):
+        ids = np.full(len(cloud.points), -1, dtype=np.int64)
+        ids[keep] = member
+        cluster_ids.append(ids)
+
+    flows = [np.zeros(cloud.points.shape) for cloud in clouds]
+    scores = [np.zeros(len(cloud.points)) for cloud in clouds]
+    for i in range(max(int(ids.max(initial=-1)) for ids in cluster_ids) + 1):
+        # The cluster's scene flow: one estimate per sweep that has points of it, nearest first.
+        members = [ids == i for ids in cluster_ids]
+        points = [cloud.points[member] for cloud, member in zip(sweeps, members)]
+        box = bounding_box([project_bev(p, config, pixel_size) for p in points])
+        is_long = config.max_object is not None and longer_side(points[0], config, pixel_size) > config.max_object
+        estimates, peaks = [], []
+        for cloud, points_m in zip(clouds, points[1:]):
+            if len(points_m) == 0:
+                continue
+            reach = 0.0 if is_long else search_radius(config, cloud.elapsed, pixel_size)
+            flow, peak = scene_flow_1obj(points_m, points[0], box, reach, pixel_size, config)
+            if is_long:
+                flow = np.zeros(3)  # nor does it move in the sectional view
+            estimates.append(flow / cloud.steps)
+            peaks.append(peak)
+        cluster_flow = pool(estimates)
+        # Assign it to the cluster's points.
+        for m, member in enumerate(members[1:]):
+            flows[m][member] = cluster_flow
+            scores[m][member] = peaks[0]
+    return Level(flows, cluster_ids[1:], scores)
+
+
+def scene_flow_1obj(
+    points_m: np.ndarray,
+    points_1: np.ndarray,
+    box: Box,
+    reach: Optional[float],
+    pixel_size: float,
+    config: Config,
+) -> Tuple[np.ndarray, float]:
+    """Alg. scene_flow_1obj: motion of one object from sweep m to sweep t+1.
+
+    Args:
+        points_m: (N, 3) float64, the object at m, frame of t+1.
+        points_1: (K, 3) float64, the object at t+1.
+        box: BEV pixels of the object in all sweeps.
+        reach: longest displacement searched in the BEV, pixels; None = no limit.
+        pixel_size: s in metres.
+        config: settings (`sectional_view`, `zero_test`, `subpixel`, `height_slices`,
+            `point_cloud_range`).
+
+    Returns:
+        f_{m -> t+1} (3,) float64 in metres (z = 0 without the sectional view), and the NCC score of the BEV.
+
+    Convention:
+        The heading is (f_x, f_y) / norm, which are cos and sin of theta without trigonometry; (1, 0) for an object
+        that stands still. The pixels of the sectional view start at the origin of the frame of t+1, its image is
+        the box of both sweeps, its row comes from z.
+    """
+    template, target = (slice_images(points, config, pixel_size, box) for points in (points_m, points_1))
+    (f_x, f_y), score = scene_flow_in_1view(template, target, pixel_size, reach, config.zero_test, config.subpixel)
+    if not config.sectional_view:
+        return np.array([f_x, f_y, 0.0]), score
+
+    norm = math.sqrt(f_x * f_x + f_y * f_y)
+    cos, sin = (f_x / norm, f_y / norm) if norm > 0 else (1.0, 0.0)
+    translated = points_m + np.array([f_x, f_y, 0.0])
+    sections = []
+    for points in (translated, points_1):
+        x_along = cos * points[:, 0] + sin * points[:, 1]
+        row, column = np.floor(points[:, 2] / pixel_size), np.floor(x_along / pixel_size)
+        sections.append(np.stack([row, column], axis=1).astype(np.int64))
+    section_box = bounding_box(sections)
+    template, target = (occupancy(section, section_box) for section in sections)
+    (f_along, f_z), _ = scene_flow_in_1view(template, target, pixel_size)
+    return np.array([f_x + f_along * cos, f_y + f_along * sin, f_z]), score
+
+
+def scene_flow_in_1view(
+    template: np.ndarray,
+    target: np.ndarray,
+    pixel_size: float,
+    reach: Optional[float] = None,
+    zero_test: Optional[float] = None,
+    subpixel: str = "none",
+) -> Tuple[Tuple[float, float], float]:
+    """Alg. scene_flow_1view: the displacement with the highest NCC score, Eq. displacement_in_bev.
+
+    Args:
+        template: (H, W) bool, image of sweep m, at least one pixel; or (n, H, W), one image per height slice.
+        target: the same shape, image of sweep t+1 of the same box.
+        pixel_size: s in metres.
+        reach: longest displacement searched, pixels; None = no limit.
+        zero_test: z of `beats_zero`; None = every displacement is kept.
+        subpixel: "parabola" = to fractions of a pixel; a displacement of 0 stays 0.
+
+    Returns:
+        (column displacement, row displacement) in metres, and the NCC score of the whole pixel; a displacement that
+        does not pass the test is 0.
+
+    Convention:
+        Scores are compared as c^2 / E_w, the square of Eq. norm_correlation without its constant factor. Ties:
+        smallest norm, then smallest row displacement, then smallest column displacement.
+    """
+    overlap, window_energy = overlap_and_energy(template, target)
+    height, width = template.shape[-2:]
+    rank = np.zeros((height, width))
+    np.divide(overlap * overlap, window_energy, out=rank, where=window_energy > 0)
+    candidates = []
+    for u_y, u_x in np.ndindex(height, width):
+        dy, dx = u_y - height // 2, u_x - width // 2
+        if reach is None or dx * dx + dy * dy <= reach * reach:
+            candidates.append((-rank[u_y, u_x], dx * dx + dy * dy, dy, dx))
+    _, _, dy, dx = min(candidates)
+    if zero_test is not None and not beats_zero(template, target, dy, dx, zero_test):
+        dy, dx = 0, 0
+    scores = norm_correlation(overlap, int(template.sum()), window_energy)
+    moves = (dy, dx) != (0, 0)
+    y, x = parabola(template, target, dy, dx) if moves and subpixel == "parabola" else (0.0, 0.0)
+    return ((dx + x) * pixel_size, (dy + y) * pixel_size), float(scores[dy + height // 2, dx + width // 2])
+
+
+def ncc_map(template: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Eq. norm_correlation: R[u_y, u_x] for every pixel u, (H, W) float64 in [0, 1], 0 for an empty neighbourhood."""
+    overlap, window_energy = overlap_and_energy(template, target)
+    return norm_correlation(overlap, int(template.sum()), window_energy)
+
+
+def norm_correlation(overlap: np.ndarray, template_energy: int, window_energy: np.ndarray) -> np.ndarray:
+    """Eq. norm_correlation from its three counts: c / sqrt(E_m E_w), 0 where a count is 0."""
+    energy = template_energy * window_energy
+    scores = np.zeros(energy.shape)
+    np.divide(overlap, np.sqrt(energy), out=scores, where=energy > 0)
+    return scores
+
+
+def overlap_and_energy(template: np.ndarray, target: np.ndarray) -> Tuple[np.ndarray, np.ndarray]:
+    """Numerator and right-hand energy of Eq. norm_correlation; both are counts, the images being binary.
+
+    Args:
+        template: (H, W) bool, I_m; or (n, H, W), one image per height slice.
+        target: the same shape, I_{t+1}; pixels outside it are 0.
+
+    Returns:
+        Two (H, W) int64 maps over u: the number of template pixels that fall on a target pixel when the template's
+        corner lies at u - floor(size / 2), and the number of target pixels in that H x W neighbourhood. Slices
+        are counted apart and added up.
+    """
+    if template.ndim == 3:
+        overlaps, energies = zip(*(overlap_and_energy(*images) for images in zip(template, target)))
+        return np.sum(overlaps, axis=0), np.sum(energies, axis=0)
+    height, width = template.shape
+    half_h, half_w = height // 2, width // 2
+    counts = target.astype(np.int32)
+    overlap = np.zeros((height, width), dtype=np.int32)
+    for r, c in np.argwhere(template).tolist():
+        # Template pixel (r, c) lies at (u_y - half_h + r, u_x - half_w + c): the target moved by (half - pixel).
+        down, right = half_h - r, half_w - c
+        overlap[max(down, 0) : height + down, max(right, 0) : width + right] += counts[
+            max(-down, 0) : height - down, max(-right, 0) : width - right
+        ]
+    energy = np.zeros((height, width), dtype=np.int32)
+    for i, j in np.argwhere(target).tolist():
+        # Target pixel (i, j) is in the neighbourhood of u if u - half <= pixel < u - half + size.
+        bottom, right = i + half_h, j + half_w
+        energy[max(bottom - height + 1, 0) : bottom + 1, max(right - width + 1, 0) : right + 1] += 1
+    return overlap.astype(np.int64), energy.astype(np.int64)
