@@ -16,7 +16,7 @@ import cflow_torch
 from cflow_torch import make_model
 from cflow_torch.config import Config
 from cflow_torch.data.records import strict, write_text
-from cflow_torch.evaluation.categories import CATEGORY_INDEX
+from cflow_torch.data.categories import CATEGORY_INDEX
 from cflow_torch.evaluation.definitions import Definition
 from cflow_torch.evaluation.frame import EvalFrame
 from cflow_torch.evaluation.masks import score_points

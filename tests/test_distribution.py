@@ -59,7 +59,7 @@ def test_the_wheel_holds_the_package_and_nothing_else(built: Tuple[Path, Path]) 
     expected = {str(file.relative_to(ROOT)) for file in (ROOT / "cflow_torch").rglob("*.py")}
     expected |= {f"cflow_torch/{file.relative_to(ROOT)}" for file in (ROOT / "configs").rglob("*.py")}
     expected |= {f"cflow_torch/{file.relative_to(ROOT)}" for file in (ROOT / "configs").rglob("*.yaml")}
-    expected |= {"cflow_torch/py.typed", "cflow_torch/confidence.json"}
+    expected |= {"cflow_torch/py.typed", "cflow_torch/verified/confidence.json"}
     assert names_in(wheel) == expected
     assert wheel.name.endswith("-py3-none-any.whl")
     assert wheel.stat().st_size < 2**20, "under 1 MiB: no picture, no data"

@@ -87,7 +87,7 @@ def constants(**values: int) -> Iterator[None]:
     patch = pytest.MonkeyPatch()
     try:
         for name, value in values.items():
-            patch.setattr("cflow_torch." + name.replace("__", ".", 1).replace("ops_", "ops."), value)
+            patch.setattr("cflow_torch." + name.replace("__", "."), value)
         yield
     finally:
         patch.undo()

@@ -16,7 +16,7 @@ from cflow_torch.data.ground import GroundRaster, get_rule, read_ground_raster
 from cflow_torch.data.log import FlowLabels
 from cflow_torch.data.names import is_stamp
 from cflow_torch.data.paths import Place, as_path, remote_errors
-from cflow_torch.evaluation.categories import CATEGORIES, CATEGORY_INDEX
+from cflow_torch.data.categories import CATEGORIES, CATEGORY_INDEX
 from cflow_torch.types import CFlowError, Sweep
 
 QUATERNION_TOLERANCE = 1e-3  # a quaternion is a rotation only if its length is 1; stored values are within 1e-15

@@ -20,7 +20,7 @@ from cflow_torch.data.aevascenes.reader import CATEGORY_NAME, GROUND, AevaScenes
 from cflow_torch.data.boxes import Boxes as Tracks
 from cflow_torch.data.boxes import flow_from_boxes
 from cflow_torch.data.log import window
-from cflow_torch.evaluation.categories import CATEGORIES, CATEGORY_INDEX, meta_class
+from cflow_torch.data.categories import CATEGORIES, CATEGORY_INDEX, meta_class
 from cflow_torch.simulator import make_drive
 from cflow_torch.simulator.recording import UnitReturns
 from cflow_torch.simulator.writers import aevascenes as aevascenes_writer

@@ -17,7 +17,7 @@ from cflow_torch.data.log import window
 from cflow_torch.data.nuscenes.reader import Footprint, NuScenesLog, find_nuscenes_scenes, read_pcd_bin
 from cflow_torch.data.nuscenes.tables import Annotations, SceneSource
 from cflow_torch.data.nuscenes.tracks import Tracks
-from cflow_torch.evaluation.categories import CATEGORY_INDEX, meta_class
+from cflow_torch.data.categories import CATEGORY_INDEX, meta_class
 from cflow_torch.simulator import make_drive
 from cflow_torch.simulator.writers import nuscenes as nuscenes_writer
 from cflow_torch.simulator.writers.nuscenes import write_nuscenes

@@ -15,7 +15,7 @@ from cflow_torch.data.arrays.pcd import read_pcd, write_pcd
 from cflow_torch.data.boxes import Boxes, flow_from_boxes
 from cflow_torch.data.nuscenes.reader import find_nuscenes_scenes
 from cflow_torch.data.truckscenes.reader import TruckScenesLog, find_truckscenes_scenes
-from cflow_torch.evaluation.categories import CATEGORY_INDEX, meta_class
+from cflow_torch.data.categories import CATEGORY_INDEX, meta_class
 from cflow_torch.simulator import make_drive
 from cflow_torch.simulator.writers import truckscenes as truckscenes_writer
 from cflow_torch.simulator.writers.nuscenes import write_nuscenes

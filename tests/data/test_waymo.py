@@ -20,7 +20,7 @@ from cflow_torch.data.log import FlowLabels, window
 from cflow_torch.data.waymo.range_image import LaserCalibration, range_image_points, rotations_from_angles
 from cflow_torch.data.waymo.reader import BOX_CATEGORY, WaymoLog, find_waymo_segments
 from cflow_torch.data.waymo.tfrecord import WaymoRecordLog
-from cflow_torch.evaluation.categories import CATEGORY_INDEX
+from cflow_torch.data.categories import CATEGORY_INDEX
 from cflow_torch.simulator import make_drive
 from cflow_torch.simulator.recording import UnitReturns
 from cflow_torch.simulator.writers import waymo as waymo_writer

@@ -25,7 +25,7 @@ from cflow_torch.evaluation import (
     ThreeWayEPE,
     format_table,
 )
-from cflow_torch.evaluation.categories import CATEGORIES, CATEGORY_INDEX, META_CLASSES, meta_class
+from cflow_torch.data.categories import CATEGORIES, CATEGORY_INDEX, META_CLASSES, meta_class
 from cflow_torch.evaluation.frame import ego_motion_flow
 from cflow_torch.types import CFlowError, FlowResult, Sweep, Window
 

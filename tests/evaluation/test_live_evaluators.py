@@ -27,7 +27,7 @@ from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.ground import read_ground_raster
 from cflow_torch.data.log import FlowLabels, window
 from cflow_torch.evaluation import DEFINITIONS, EvalFrame, SceneFlowMetrics
-from cflow_torch.evaluation.categories import CATEGORIES, META_CLASSES
+from cflow_torch.data.categories import CATEGORIES, META_CLASSES
 from cflow_torch.evaluation.frame import ego_motion_flow
 from cflow_torch.types import CFlowError
 

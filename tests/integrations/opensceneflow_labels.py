@@ -14,7 +14,7 @@ import pyarrow.feather as feather
 
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.boxes import points_in_box
-from cflow_torch.evaluation.categories import CATEGORY_INDEX
+from cflow_torch.data.categories import CATEGORY_INDEX
 
 # Metres (see `growth`): a box whose points move by more than this is made larger.
 GROWS_FROM = 0.04

@@ -31,7 +31,7 @@ from cflow_torch.data.waymo.parquet import (
     read_images,
 )
 from cflow_torch.data.waymo.range_image import LASERS, NO_LABEL_ZONE, TOP, LaserCalibration, range_image_points
-from cflow_torch.evaluation.categories import CATEGORY_INDEX
+from cflow_torch.data.categories import CATEGORY_INDEX
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.ego_motion import relative_transform, rigid_transform
 

@@ -25,7 +25,7 @@ from cflow_torch.data.waymo.parquet import (
     VEHICLE_POSE,
 )
 from cflow_torch.data.waymo.range_image import LASERS, TOP, LaserCalibration
-from cflow_torch.evaluation.categories import META_CLASSES
+from cflow_torch.data.categories import META_CLASSES
 from cflow_torch.simulator.recording import Recording, UnitReturns
 from cflow_torch.simulator.writers.waymo_encoding import encode_images, poses_of_shots
 from cflow_torch.types import CFlowError

@@ -1,11 +1,8 @@
-"""docs/conventions.md: what stands there is so, and every line of it names the test that would notice a change."""
+"""The conventions that users rely on: frames, units, rows, dtypes, ties; one test each."""
 
 from __future__ import annotations
 
-import ast
 import math
-import re
-from pathlib import Path
 from typing import Any, List, Tuple
 
 import numpy as np
@@ -18,8 +15,6 @@ from cflow_torch.data.flow_file import write_flow
 from cflow_torch.simulator import make_drive
 from cflow_torch.windows.bev_grid import Grid
 
-ROOT = Path(__file__).resolve().parents[2]
-PAGE = ROOT / "docs" / "conventions.md"
 INF = math.inf
 # Pixels of 1 m and points in their middles: displacements are exact. The paper's method, one pair, one scale.
 SETTINGS = {"preset": "paper", "pixel_size": 1.0, "point_cloud_range": (-20.0, -20.0, -INF, 20.0, 20.0, INF)}
@@ -320,40 +315,3 @@ def test_labels_are_total_flow():
     T_ego1_ego0 = np.linalg.inv(drive.poses[1]) @ drive.poses[0]
     points = np.asarray(sweep.points)[static].astype(np.float64)
     np.testing.assert_allclose(labels.flow[static], through(T_ego1_ego0, points) - points, atol=1e-5)
-
-
-# ----------------------------------------------------------------------------------------------------- the page
-
-
-def lines_of_the_page() -> List[str]:
-    """The numbered lines."""
-    return [line for line in PAGE.read_text(encoding="utf-8").split("\n") if re.match(r"\d+\. ", line)]
-
-
-def named_tests(line: str) -> List[Tuple[str, str]]:
-    """(file, function) of every test that a line names."""
-    return re.findall(r"`tests/(test_\w+\.py)::(test_\w+)`", line)
-
-
-def functions(file: str) -> List[str]:
-    """Names of the tests of a file."""
-    tree = ast.parse((ROOT / "tests" / file).read_text(encoding="utf-8"))
-    return [node.name for node in tree.body if isinstance(node, ast.FunctionDef) and node.name.startswith("test_")]
-
-
-def test_every_line_names_tests_that_exist():
-    lines = lines_of_the_page()
-    assert len(lines) > 40
-    assert [int(line.split(".")[0]) for line in lines] == list(range(1, len(lines) + 1))
-    for line in lines:
-        named = named_tests(line)
-        assert named, line
-        assert line.count("::") == len(named), f"a test that is not written as `tests/FILE.py::NAME`: {line}"
-        for file, name in named:
-            assert name in functions(file), f"{file}::{name}"
-
-
-def test_every_test_here_is_named_by_a_line():
-    about_the_page = {"test_every_line_names_tests_that_exist", "test_every_test_here_is_named_by_a_line"}
-    named = {name for line in lines_of_the_page() for file, name in named_tests(line) if file == Path(__file__).name}
-    assert named == set(functions(Path(__file__).name)) - about_the_page

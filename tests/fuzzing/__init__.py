@@ -1,1 +1,0 @@
-"""Fuzzing of the readers: what they are fed (targets, mutation), what may come of it (outcome), long runs."""
