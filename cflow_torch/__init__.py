@@ -5,8 +5,9 @@ from cflow_torch.dense.method import CorrelationFlow
 from cflow_torch.estimate import estimate_flow, make_model
 from cflow_torch.keypoints.method import CorrelationFlowKeypoints
 from cflow_torch.types import CFlowError, FlowResult, Sweep, Window
+from cflow_torch.verified.method import VerifiedFlow
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = [
     "CFlowError",
@@ -15,6 +16,7 @@ __all__ = [
     "CorrelationFlowKeypoints",
     "FlowResult",
     "Sweep",
+    "VerifiedFlow",
     "Window",
     "estimate_flow",
     "make_config",

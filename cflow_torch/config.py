@@ -1,207 +1,360 @@
-"""Every setting of the method in one frozen, validated dataclass, and the presets."""
+"""Settings: each stands here once, with its default, its bounds and its help. Presets hold only what they change."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, fields, replace
-from typing import Any, Dict, Optional, Tuple
+from dataclasses import asdict, dataclass, field, fields, replace
+from numbers import Integral, Real
+from typing import Any, Dict, Optional, Tuple, Type
 
-from cflow_torch.checks import check, floats, one_of
 from cflow_torch.types import CFlowError
+
+# Whole numbers stay below this: they are compared with tensors of int64 and of float64.
+_MOST = 2**53
+
+
+def setting(
+    default: Any,
+    help: str,
+    *,
+    low: float = -math.inf,
+    above: float = -math.inf,
+    high: float = math.inf,
+    choices: Tuple[Any, ...] = (),
+) -> Any:
+    """A field of a `Config`.
+
+    Args:
+        default: what it is where nothing is said.
+        help: what it does, with its unit.
+        low, high: smallest and largest value, both allowed.
+        above: largest value that is not allowed.
+        choices: all values, if they can be listed.
+    """
+    return field(default=default, metadata={"help": help, "low": low, "above": above, "high": high, "choices": choices})
+
+
+def _method(name: str) -> Any:
+    return setting(name, "dense | keypoints | verified; a preset chooses it", choices=(name,))
 
 
 @dataclass(frozen=True)
 class Config:
-    """Settings of CorrelationFlow. Checked when made; an invalid value raises `CFlowError`.
+    """Settings that all methods have; each method adds its own, see `CONFIGS`. Made by `make_config`.
 
-    Args:
-        method: "dense": one motion for every cluster, by correlation (Alg. general_correlation_flow), or "keypoints":
-            matches of key points, spread over components (Sec. CorrelationFlow-Keypoints).
-        pixel_sizes: side s of a BEV pixel in metres, one per scale, coarse to fine (Eq. 3d_to_bev).
-        num_history: h, number of sweeps before t that are used (Sec. leverage_past_pcs).
-        point_cloud_range: (x0, y0, z0, x1, y1, z1) in metres, both ends included, in the frame of t+1.
-        ego_box: (x0, y0, x1, y1) in metres, both ends included, in every sweep's own frame: points in it are returns of
-            the vehicle itself and take no part, as ground. They stand still in that frame, so without it they move as
-            the vehicle does. None = there are none.
-        connectivity: 4: pixels join along their sides, 8: also across their corners (Sec. clustering).
-        max_extent: d^max in metres: longer side of a component's bounding box above which it is eroded
-            and labelled again (Alg. clustering).
-        max_speed: a displacement longer than max_speed * elapsed time + one pixel is not searched.
-            None = the paper's search range, half of the cluster's bounding box. With `proof` it bounds candidates, with
-            a pixel of their own pixel size; what places, refines or creeps may add some decimetres.
-        max_object: a cluster whose pixels at t+1 have a bounding box with a side of more metres than this does not
-            move, see docs/beyond.md. None = any may. With `proof` it has the score of the coarser component around it,
-            or 0.
-        zero_test: z: a shift is kept if the pixels that coincide by it only (b) are significantly more than those that
-            coincide without it only (c): b > c and (b - c)^2 >= z^2 (b + c). 0.01 ... 1000, used to two decimals.
-            None = every shift is kept.
-        subpixel: "none" or "parabola": the peak of the correlation to fractions of a pixel, at most half a pixel away,
-            by the parabola through the counts beside it; a peak at no shift stays there.
-        height_slices: number of height slices n, 2 ... 8: points coincide only if their slices floor(z / slice_height)
-            mod n do, z in the frame of t+1. Clusters stay those of the BEV. 0 = one slice for all heights.
-        slice_height: height of a slice, metres.
-        proof: candidate motions of components at all `pixel_sizes` at once, judged against no motion at the finest one,
-            in four height slices, instead of coarse to fine, see docs/beyond.md. `pixel_sizes` must be whole multiples
-            of the finest. The options from here to `keypoint_block` are parts of it and mean nothing without it.
-        proof_z: standard deviations of luck that a motion must exceed to be proved.
-        clearance: pixels that stand out of the ground around them by less than this many metres are left out, where
-            ground is known. None = none are.
-        children: also components that are not dilated, as parts of the finest ones.
-        aperture: lines that seem to slide along themselves do not move.
-        relocate: pairs of sweeps: place moving groups between the pixels, on four grids.
-        nudge: pairs of sweeps: move large moving groups by 0.05 m at most where their centroids meet better.
-        yaw: refine the motion of moving groups and let them turn.
-        slow: pairs of sweeps: look for motion of a pixel or less in groups that nothing moved, on small cubes.
-        keypoint_block: k; key points of t and t+1 are matched at pixels of k x k finest ones, and what they say of a
-            component is one of its candidates; `patch_size` and the settings of key points that follow it count.
-            0 = they are not asked.
-        sweep_interval: seconds between consecutive sweeps where time stamps are missing.
-        use_timestamps: divide a history estimate by elapsed time (in sweep intervals t -> t+1) instead of steps.
-        sectional_view: also estimate f_z in the X-Z view along the heading (Alg. scene_flow_1obj).
-        clustering: "components": connected components (Alg. clustering), or "hdbscan" in their place (Table
-            which_clustering_method; extra hdbscan, seconds per pair).
-        min_cluster_size: hdbscan: smallest cluster, points of all sweeps together.
-        labeling: engine of morphology and labelling, "sparse" (occupied pixels only) or "kornia" (dense image).
-        correlation: engine of the correlation, "fft" or "conv". Engines give the same bits.
-        densify: key points: where a point takes its flow from: "components" (median of the matches in its connected
-            component of I_t), "clusters" (the same, components of Alg. clustering: dilated, split at `max_extent`) or
-            "nearest" (nearest match).
-        patch_size: key points: side L of a descriptor, odd number of pixels, at most 51.
-        ratio_threshold: key points: rho of the ratio test, 1 ... 2, used to four decimals.
-        gate_radius: key points: farthest match, metres per 0.1 s between the sweeps (3 = 30 m/s).
-        mutual_check: key points: also ask that a match is the best one seen from t+1.
-        second_best_distance: key points: pixels; the second best of the ratio test lies at least this far from the
-            best. 0 = the paper's, any other key point.
-        max_memory: bytes of working memory that the method may plan with; None = no limit.
+    Checked when made: an invalid value raises `CFlowError`. `describe` lists what each field means and may be.
     """
 
-    method: str = "dense"
-    pixel_sizes: Tuple[float, ...] = (0.1,)
-    num_history: int = 0
-    point_cloud_range: Tuple[float, ...] = (-35.0, -35.0, -math.inf, 35.0, 35.0, math.inf)
-    ego_box: Optional[Tuple[float, ...]] = None
-    connectivity: int = 8
-    max_extent: float = 20.0
-    max_speed: Optional[float] = None
-    max_object: Optional[float] = None
-    zero_test: Optional[float] = None
-    subpixel: str = "none"
-    height_slices: int = 0
-    slice_height: float = 0.5
-    proof: bool = False
-    proof_z: float = 1.5
-    clearance: Optional[float] = None
-    children: bool = False
-    aperture: bool = False
-    relocate: bool = False
-    nudge: bool = False
-    yaw: bool = False
-    slow: bool = False
-    keypoint_block: int = 0
-    sweep_interval: float = 0.1
-    use_timestamps: bool = False
-    sectional_view: bool = False
-    clustering: str = "components"
-    min_cluster_size: int = 20
-    labeling: str = "sparse"
-    correlation: str = "fft"
-    densify: str = "components"
-    patch_size: int = 11
-    ratio_threshold: float = 1.1
-    gate_radius: float = 3.0
-    mutual_check: bool = False
-    second_best_distance: float = 0.0
-    max_memory: Optional[int] = None
+    method: str = _method("")
+    pixel_sizes: Tuple[float, ...] = setting(
+        (0.1,), "side s of a BEV pixel, metres, one per scale, coarse to fine (Eq. 3d_to_bev)"
+    )
+    point_cloud_range: Tuple[float, ...] = setting(
+        (-35.0, -35.0, -math.inf, 35.0, 35.0, math.inf),
+        "(x0, y0, z0, x1, y1, z1), metres, both ends included, frame of t+1; only z may be infinite",
+    )
+    ego_box: Optional[Tuple[float, ...]] = setting(
+        None,
+        "(x0, y0, x1, y1), metres, both ends included, frame of each sweep: points in it are returns of the vehicle "
+        "itself and take no part. None = there are none",
+    )
+    connectivity: int = setting(
+        8, "4: pixels join along their sides, 8: also across their corners (Sec. clustering)", choices=(4, 8)
+    )
+    max_extent: float = setting(
+        20.0,
+        "d^max, metres: longer side of a component's bounding box above which it is eroded and labelled again "
+        "(Alg. clustering)",
+        above=0,
+    )
+    max_speed: Optional[float] = setting(
+        None,
+        "m/s: a displacement longer than max_speed * elapsed time + one pixel is not searched. None = the paper's "
+        "search range, half of the cluster's bounding box",
+        above=0,
+    )
+    sweep_interval: float = setting(
+        0.1, "seconds between consecutive sweeps where time stamps are missing", low=1e-6, high=1e6
+    )
+    labeling: str = setting(
+        "sparse",
+        "engine of morphology and labelling: sparse (occupied pixels only) or kornia (dense images); the same result",
+        choices=("sparse", "kornia"),
+    )
+    max_memory: Optional[float] = setting(
+        None, "bytes of working memory that the method may plan with. None = no limit", above=0, high=float(_MOST)
+    )
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "pixel_sizes", floats("pixel_sizes", self.pixel_sizes))
-        object.__setattr__(self, "point_cloud_range", floats("point_cloud_range", self.point_cloud_range))
-        if self.ego_box is not None:
-            object.__setattr__(self, "ego_box", floats("ego_box", self.ego_box))
-        check(self)
+        for f in fields(self):
+            object.__setattr__(self, f.name, _checked(f.name, getattr(self, f.name), str(f.type), f.metadata))
+        _check_space(self.pixel_sizes, self.point_cloud_range, self.ego_box)
 
     def replace(self, **overrides: Any) -> Config:
         """A copy with some fields changed; an unknown field raises `CFlowError` that lists the fields."""
-        return replace(self, **_known(overrides))
+        return replace(self, **_known(type(self), overrides))
 
     def as_dict(self) -> Dict[str, Any]:
-        """Plain dictionary, field by field, ready for YAML or JSON."""
+        """Plain dictionary, field by field, ready for YAML or JSON; `config_from` reads it."""
         return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self).items()}
 
 
-# What each preset changes in `Config`'s defaults. Those are the paper's base row: s = 0.1 m, BEV, h = 0.
-PRESETS: Dict[str, Dict[str, Any]] = {
-    "paper": {},
-    # What pays of docs/beyond.md; region of the main harness.
-    "default": {
-        "num_history": 4,
-        "pixel_sizes": (0.4, 0.2, 0.1),
-        "point_cloud_range": (-51.2, -51.2, -math.inf, 51.2, 51.2, math.inf),
-        "max_speed": 40.0,
-        "max_object": 25.0,
-        "proof": True,
-        "clearance": 0.4,
-        "children": True,
-        "aperture": True,
-        "relocate": True,
-        "yaw": True,
-        "slow": True,
-        "use_timestamps": True,
-        # Cheap key points: they only propose.
-        "keypoint_block": 2,
-        "patch_size": 21,
-        "ratio_threshold": 1.02,
-    },
-    # Two older sweeps, one scale, and of docs/beyond.md what costs little.
-    "fast": {
-        "num_history": 2,
-        "point_cloud_range": (-51.2, -51.2, -math.inf, 51.2, 51.2, math.inf),
-        "max_speed": 40.0,
-        "max_object": 25.0,
-        "proof": True,
-        "clearance": 0.4,
-        "use_timestamps": True,
-    },
-    # Best mean of scripts/keypoint_settings.py on its synthetic set; region of the main harness.
-    "keypoints": {
-        "method": "keypoints",
-        "densify": "clusters",
-        "patch_size": 41,
-        "ratio_threshold": 1.02,
-        "gate_radius": 2.0,
-        "point_cloud_range": (-51.2, -51.2, -math.inf, 51.2, 51.2, math.inf),
-    },
+@dataclass(frozen=True)
+class _WithHistory(Config):
+    num_history: int = setting(0, "h, sweeps before t that are used (Sec. leverage_past_pcs)", low=0)
+    correlation: str = setting(
+        "fft", "engine of the correlation: fft or conv (conv2d); the same result", choices=("fft", "conv")
+    )
+
+
+@dataclass(frozen=True)
+class DenseConfig(_WithHistory):
+    """Settings of `CorrelationFlow`, the paper's dense method. The defaults are the paper's base row."""
+
+    method: str = _method("dense")
+    sectional_view: bool = setting(False, "also estimate f_z in the X-Z view along the heading (Alg. scene_flow_1obj)")
+    clustering: str = setting(
+        "components",
+        "components (Alg. clustering) or hdbscan in their place (Table which_clustering_method; seconds per pair)",
+        choices=("components", "hdbscan"),
+    )
+    min_cluster_size: int = setting(20, "hdbscan: smallest cluster, points of all sweeps together", low=2)
+
+
+@dataclass(frozen=True)
+class KeypointsConfig(Config):
+    """Settings of `CorrelationFlowKeypoints`, the paper's key-point variant, which matches one pair of sweeps."""
+
+    method: str = _method("keypoints")
+    densify: str = setting(
+        "components",
+        "where a point takes its flow from: components (median of the matches in its connected component of I_t), "
+        "clusters (the same, components of Alg. clustering) or nearest (nearest match)",
+        choices=("components", "clusters", "nearest"),
+    )
+    # The ratio test compares products of counts: 51^6 * (2 * 10^4)^2 still fits an int64.
+    patch_size: int = setting(11, "side L of a descriptor, odd number of pixels", low=1, high=51)
+    ratio_threshold: float = setting(1.1, "rho of the ratio test, used to four decimals", low=1, high=2)
+    gate_radius: float = setting(
+        3.0, "farthest match, metres per 0.1 s between the sweeps (3 = 30 m/s)", low=1e-6, high=1e6
+    )
+
+    @property
+    def num_history(self) -> int:
+        """0: key points are matched between t and t+1."""
+        return 0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.patch_size % 2 == 0:
+            raise CFlowError(f"patch_size={self.patch_size}: give an odd number of pixels, for example 11")
+
+
+@dataclass(frozen=True)
+class VerifiedConfig(_WithHistory):
+    """Settings of `VerifiedFlow`: motion candidates of all scales at once, verified at the finest pixels."""
+
+    method: str = _method("verified")
+    max_object: Optional[float] = setting(
+        25.0,
+        "metres: what is longer than this at t+1 does not move, and has the score of the coarser component around it, "
+        "or 0. None = anything may move",
+        above=0,
+    )
+    significance: float = setting(
+        1.5, "z: standard deviations of noise by which a motion must explain more than standing still", low=0, high=1000
+    )
+    min_height: Optional[float] = setting(
+        0.4,
+        "metres: pixels that stand out of the ground around them by less are left out, where ground is known. "
+        "None = none are",
+        above=0,
+        high=1000,
+    )
+    thorough: bool = setting(
+        True,
+        "also: parts that are not dilated, candidates of key points, the aperture test, motion between the pixels, "
+        "turns. False = none of these, several times faster",
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        blocks = [size / self.pixel_sizes[-1] for size in self.pixel_sizes]
+        if any(math.isinf(block) or abs(block - round(block)) > 1e-6 for block in blocks):
+            raise CFlowError(
+                f"pixel_sizes={self.pixel_sizes}: the verified method (presets default and fast) takes whole multiples "
+                "of the finest one, for example (0.4, 0.2, 0.1)"
+            )
+
+
+CONFIGS: Dict[str, Type[Config]] = {"dense": DenseConfig, "keypoints": KeypointsConfig, "verified": VerifiedConfig}
+
+_HARNESS_REGION = (-51.2, -51.2, -math.inf, 51.2, 51.2, math.inf)
+# The method of each preset, and what it changes in the method's defaults.
+PRESETS: Dict[str, Tuple[str, Dict[str, Any]]] = {
+    "default": (
+        "verified",
+        {
+            "num_history": 4,
+            "pixel_sizes": (0.4, 0.2, 0.1),
+            "point_cloud_range": _HARNESS_REGION,
+            "max_speed": 40.0,
+        },
+    ),
+    "fast": (
+        "verified",
+        {"num_history": 2, "point_cloud_range": _HARNESS_REGION, "max_speed": 40.0, "thorough": False},
+    ),
+    "paper": ("dense", {}),
+    # Best mean of scripts/ablation/keypoint_settings.py on its simulated set.
+    "keypoints": (
+        "keypoints",
+        {
+            "densify": "clusters",
+            "patch_size": 41,
+            "ratio_threshold": 1.02,
+            "gate_radius": 2.0,
+            "point_cloud_range": _HARNESS_REGION,
+        },
+    ),
+}
+_PRESET_OF_METHOD = {"dense": "paper", "keypoints": "keypoints", "verified": "default"}
+
+# Settings of version 0.1, and what to do without them.
+REMOVED = {
+    "proof": "the method says so now: preset default or fast (method='verified'), or paper (method='dense')",
+    "proof_z": "its name is significance",
+    "clearance": "its name is min_height",
+    "use_timestamps": "time stamps count wherever every sweep of a window has one",
+    **dict.fromkeys(("children", "aperture", "relocate", "yaw", "keypoint_block"), "a part of thorough=True"),
+    **dict.fromkeys(
+        ("slow", "nudge", "zero_test", "subpixel", "height_slices", "slice_height", "mutual_check"), "leave it out"
+    ),
+    "second_best_distance": "leave it out",
 }
 
 
-def make_config(preset: str = "default", **overrides: Any) -> Config:
+def make_config(preset: Optional[str] = None, method: Optional[str] = None, **overrides: Any) -> Config:
     """The settings of a preset with some fields replaced.
 
     Args:
-        preset: "default", "fast", "keypoints" or "paper". With `method="keypoints"` every preset but "paper" means
-            "keypoints".
-        **overrides: any field of `Config`; `pixel_size=0.1` is short for `pixel_sizes=(0.1,)`.
+        preset: "default", "fast", "paper" or "keypoints"; None = the preset of the method, "default" if none is given.
+        method: "dense" (preset "paper"), "keypoints" or "verified" (presets "default", "fast"); None = the preset's.
+            "keypoints" with preset "paper" are the paper's key points.
+        **overrides: any field of the method's settings; `pixel_size=0.1` is short for `pixel_sizes=(0.1,)`.
 
     Returns:
-        A checked `Config`.
+        A checked `DenseConfig`, `KeypointsConfig` or `VerifiedConfig`.
 
     Raises:
-        CFlowError: unknown preset, unknown field (the message lists the fields), invalid value.
+        CFlowError: unknown preset, unknown field (the message lists the fields), invalid value, or a preset that is of
+            another method.
     """
-    one_of("preset", preset, tuple(PRESETS))
-    if overrides.get("method") == "keypoints" and preset != "paper":  # history and scales are for the dense method
-        preset = "keypoints"
-    return Config(**PRESETS[preset]).replace(**overrides)
+    if method is not None and method not in CONFIGS:
+        raise CFlowError(f"method={method!r}: give one of {', '.join(map(repr, CONFIGS))}")
+    if preset is None:
+        preset = _PRESET_OF_METHOD[method] if method is not None else "default"
+    if preset not in PRESETS:
+        raise CFlowError(f"preset={preset!r}: give one of {', '.join(map(repr, PRESETS))}")
+    own, changes = PRESETS[preset]
+    if method == "keypoints" and preset == "paper":
+        own, changes = method, {}
+    if method not in (None, own):
+        raise CFlowError(f"preset={preset!r} is of method={own!r}, method={method!r} was given: leave one of them out")
+    return CONFIGS[own](**changes).replace(**overrides)
 
 
-def _known(overrides: Dict[str, Any]) -> Dict[str, Any]:
+def config_from(settings: Dict[str, Any]) -> Config:
+    """The settings that a dictionary holds, such as `Config.as_dict` gives it; those not given are the method's defaults.
+
+    Raises:
+        CFlowError: no or an unknown method, an unknown field, an invalid value.
+    """
+    method = settings.get("method")
+    if method not in CONFIGS:
+        raise CFlowError(f"method={method!r}: give one of {', '.join(map(repr, CONFIGS))}")
+    return CONFIGS[method]().replace(**settings)
+
+
+def describe(f: Any) -> str:
+    """What a field of a `Config` may be, in words: "a number from 1 to 2, or None"."""
+    low, above, high, choices = (f.metadata[key] for key in ("low", "above", "high", "choices"))
+    return _allowed(str(f.type), low, above, high, choices)
+
+
+def _known(kind: Type[Config], overrides: Dict[str, Any]) -> Dict[str, Any]:
     overrides = dict(overrides)
     if "pixel_size" in overrides:
         if "pixel_sizes" in overrides:
             raise CFlowError("pixel_size and pixel_sizes were both given: give one of them")
         overrides["pixel_sizes"] = (overrides.pop("pixel_size"),)
-    names = [f.name for f in fields(Config)]
+    names = [f.name for f in fields(kind)]
     unknown = sorted(set(overrides) - set(names))
+    for name in unknown:
+        if name in REMOVED:
+            raise CFlowError(f"setting {name} went with version 0.2: {REMOVED[name]}")
+        owners = [method for method, other in CONFIGS.items() if name in (f.name for f in fields(other))]
+        if owners:
+            raise CFlowError(
+                f"{name} is a setting of method {' and '.join(owners)}, not of {fields(kind)[0].default}: "
+                "leave it out, or choose another preset"
+            )
     if unknown:
         raise CFlowError(f"unknown setting {', '.join(unknown)}: the fields are {', '.join(['pixel_size', *names])}")
     return overrides
+
+
+def _checked(name: str, value: Any, kind: str, bounds: Any) -> Any:
+    """The value in its plain type.
+
+    Raises:
+        CFlowError: it is of another type, or out of its bounds.
+    """
+    low, above, high, choices = (bounds[key] for key in ("low", "above", "high", "choices"))
+    if value is None and kind.startswith("Optional"):
+        return None
+    if "Tuple" in kind:
+        try:
+            return tuple(float(v) for v in value)
+        except (TypeError, ValueError, OverflowError):
+            raise CFlowError(f"{name}={value!r}: give a list of numbers") from None
+    wanted = {"bool": bool, "str": str, "int": Integral}.get(kind, Real)
+    is_kind = isinstance(value, wanted) and (wanted is bool or not isinstance(value, bool))
+    if is_kind and choices:
+        is_kind = value in choices
+    elif is_kind and kind not in ("bool", "str"):
+        is_kind = low <= value <= high and value > above and (isinstance(value, float) or abs(value) < _MOST)
+    if not is_kind:
+        raise CFlowError(f"{name}={value!r}: give {_allowed(kind, low, above, high, choices)}")
+    return int(value) if wanted is Integral else float(value) if wanted is Real else value
+
+
+def _allowed(kind: str, low: float, above: float, high: float, choices: Tuple[Any, ...]) -> str:
+    if choices:
+        return f"one of {', '.join(map(repr, choices))}"
+    if "Tuple" in kind:
+        what = "a list of numbers"
+    elif kind == "bool":
+        what = "True or False"
+    else:
+        what = "a whole number" if kind == "int" else "a number"
+        what += f" of at least {low:g}" if low > -math.inf else ""
+        what += f" above {above:g}" if above > -math.inf else ""
+        what += f"{' and' if max(low, above) > -math.inf else ''} of at most {high:g}" if high < math.inf else ""
+    return what + (", or None" if kind.startswith("Optional") else "")
+
+
+def _check_space(sizes: Tuple[float, ...], box: Tuple[float, ...], own: Optional[Tuple[float, ...]]) -> None:
+    if not sizes or any(not 0 < s < math.inf for s in sizes) or any(a <= b for a, b in zip(sizes, sizes[1:])):
+        raise CFlowError(
+            f"pixel_sizes={sizes}: give at least one positive size in metres, strictly coarse to fine, "
+            "for example (0.4, 0.2, 0.1)"
+        )
+    if len(box) != 6 or any(math.isnan(v) for v in box) or any(a >= b for a, b in zip(box[:3], box[3:])):
+        raise CFlowError(
+            f"point_cloud_range={box}: give (x0, y0, z0, x1, y1, z1) in metres with x0 < x1, y0 < y1, z0 < z1"
+        )
+    if any(math.isinf(v) for v in (box[0], box[1], box[3], box[4])):
+        raise CFlowError(f"point_cloud_range={box}: give finite x and y bounds; only z may be infinite")
+    if own is not None and (len(own) != 4 or not all(map(math.isfinite, own)) or own[0] >= own[2] or own[1] >= own[3]):
+        raise CFlowError(f"ego_box={own}: give (x0, y0, x1, y1) in metres, finite, with x0 < x1 and y0 < y1, or None")

@@ -11,8 +11,9 @@ import numpy as np
 from cflow_torch.config import Config, make_config
 from cflow_torch.dense.method import CorrelationFlow
 from cflow_torch.keypoints.method import CorrelationFlowKeypoints
-from cflow_torch.model import CoarseToFine
+from cflow_torch.model import SceneFlowModel
 from cflow_torch.types import Array, CFlowError, FlowResult, Sweep, Window, as_numpy
+from cflow_torch.verified.method import VerifiedFlow
 from cflow_torch.windows.ground import find_ground_batch, has_ground
 from cflow_torch.windows.validation import check_windows, choose_device
 
@@ -30,7 +31,7 @@ def estimate_flow(
     T_ego1_egoh: Sequence[Optional[Array]] = (),
     gmh: Sequence[Optional[Array]] = (),
     method: Optional[str] = None,
-    preset: str = "default",
+    preset: Optional[str] = None,
     ground: Optional[str] = None,
     device: Any = "auto",
     **overrides: Any,
@@ -46,8 +47,8 @@ def estimate_flow(
         pch: older sweeps t-1, t-2, ..., at most `num_history`.
         T_ego1_egoh: (4, 4) of each of `pch`; may be left out only if `T_ego1_ego0` is left out too.
         gmh: ground mask of each of `pch`; empty = nothing is ground.
-        method: "dense" or "keypoints"; None = the preset's, dense but for "keypoints".
-        preset: "default", "fast", "keypoints" or "paper", see `make_config`.
+        method: "dense", "keypoints" or "verified"; None = the preset's.
+        preset: "default", "fast", "keypoints" or "paper"; None = "default", or that of the method, see `make_config`.
         ground: None = as the masks say; "auto" = find the ground of every sweep without a mask (`find_ground`);
             "patchwork" = the same by Patchwork++ (`pip install pypatchworkpp`).
         device: "auto" = that of the tensors given, else a GPU if there is one, else the CPU.
@@ -77,9 +78,7 @@ def estimate_flow(
     """
     if ground not in GROUND:
         raise CFlowError(f"ground={ground!r}: give one of {', '.join(map(repr, GROUND))}")
-    if method is not None:
-        overrides["method"] = method
-    config = make_config(preset, **overrides)
+    config = make_config(preset, method, **overrides)
     transforms = _per_sweep("T_ego1_egoh", T_ego1_egoh, pch)
     masks = _per_sweep("gmh", gmh, pch)
     moved = T_ego1_ego0 is not None or any(t is not None for t in transforms)
@@ -105,17 +104,20 @@ def estimate_flow(
     return result
 
 
-def make_model(config: Config, device: Any = "auto") -> CoarseToFine:
-    """The variant that `config.method` names.
+def make_model(config: Config, device: Any = "auto") -> SceneFlowModel:
+    """The method that some settings are for.
 
     Args:
-        config: settings.
+        config: settings, see `make_config`.
         device: as in `estimate_flow`.
 
     Returns:
-        `CorrelationFlow` or `CorrelationFlowKeypoints`.
+        `CorrelationFlow`, `CorrelationFlowKeypoints` or `VerifiedFlow`.
     """
-    return (CorrelationFlowKeypoints if config.method == "keypoints" else CorrelationFlow)(config, device)
+    methods = {method.method: method for method in (CorrelationFlow, CorrelationFlowKeypoints, VerifiedFlow)}
+    if not isinstance(config, Config):
+        raise CFlowError(f"config is {type(config).__name__}: give the result of make_config")
+    return methods[config.method](config, device)
 
 
 def _find_ground(window: Window, ground: Optional[str], device: Any) -> Window:

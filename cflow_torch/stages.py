@@ -1,18 +1,41 @@
-"""Times a method while it works: seconds per pair, and of each stage."""
+"""Named stages of a method: blocks that torch's profiler shows and that a stop watch times."""
 
 from __future__ import annotations
 
 import statistics
+import threading
 import time
 from contextlib import contextmanager
 from typing import Any, Dict, Iterator, List, Protocol, Sequence
-from unittest.mock import patch
 
 import torch
 from torch.profiler import record_function
 
 from cflow_torch.config import Config
 from cflow_torch.types import FlowResult, Window
+
+_watched = threading.local()
+
+
+@contextmanager
+def stage(name: str) -> Iterator[None]:
+    """A block of work; its seconds are added to those of `stage_seconds`, if that is open in this thread."""
+    with record_function(name):
+        start = time.perf_counter()
+        yield
+        seconds = getattr(_watched, "seconds", None)
+        if seconds is not None:
+            seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - start
+
+
+@contextmanager
+def stage_seconds() -> Iterator[Dict[str, float]]:
+    """Collects the seconds of each stage by the host's clock (on a GPU: the time to queue its work) while it is open."""
+    before, _watched.seconds = getattr(_watched, "seconds", None), {}
+    try:
+        yield _watched.seconds
+    finally:
+        _watched.seconds = before
 
 
 class FlowModel(Protocol):
@@ -31,8 +54,7 @@ class StopWatch:
         model: the method.
 
     Convention: a pair's time starts with the window in memory and ends with the result on the device. The first pair
-    warms up and does not count, if there are more. A stage is a `record_function` block of the method, timed by the
-    host's clock (on a GPU: the time to queue its work).
+    warms up and does not count, if there are more.
     """
 
     def __init__(self, model: FlowModel) -> None:
@@ -42,7 +64,7 @@ class StopWatch:
 
     def __call__(self, windows: Sequence[Window]) -> List[FlowResult]:
         """What the method gives."""
-        with stage_clock() as stages:
+        with stage_seconds() as stages:
             start = time.perf_counter()
             results = self.model(windows)
             if results and results[0].flow.is_cuda:
@@ -64,23 +86,3 @@ class StopWatch:
             "pairs": len(counted),
             "stages": {name: statistics.median(pair.get(name, 0.0) for pair in stages) for name in names},
         }
-
-
-@contextmanager
-def stage_clock() -> Iterator[Dict[str, float]]:
-    """Collects the seconds spent in `record_function` blocks, by name, while it is open.
-
-    The profiler would do the same, but its bookkeeping doubles the time of so many small operations.
-    """
-    seconds: Dict[str, float] = {}
-    started: List[float] = []
-
-    def enter(block: Any) -> Any:
-        started.append(time.perf_counter())
-        return block
-
-    def leave(block: Any, *_: Any) -> None:
-        seconds[block.name] = seconds.get(block.name, 0.0) + time.perf_counter() - started.pop()
-
-    with patch.object(record_function, "__enter__", enter), patch.object(record_function, "__exit__", leave):
-        yield seconds

@@ -10,13 +10,13 @@ import pyarrow as pa
 
 from cflow_torch.data.arrow_file import check_rows, shortened, texts
 from cflow_torch.data.boxes import Boxes, flow_from_boxes
+from cflow_torch.data.categories import CATEGORIES, CATEGORY_INDEX
 from cflow_torch.data.feather_file import FeatherFile
 from cflow_torch.data.folders import find_folders
 from cflow_torch.data.ground import GroundRaster, get_rule, read_ground_raster
 from cflow_torch.data.log import FlowLabels
 from cflow_torch.data.names import is_stamp
 from cflow_torch.data.paths import Place, as_path, remote_errors
-from cflow_torch.data.categories import CATEGORIES, CATEGORY_INDEX
 from cflow_torch.types import CFlowError, Sweep
 
 QUATERNION_TOLERANCE = 1e-3  # a quaternion is a rotation only if its length is 1; stored values are within 1e-15

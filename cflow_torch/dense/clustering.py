@@ -11,6 +11,7 @@ from torch import Tensor
 
 from cflow_torch.config import Config
 from cflow_torch.dense.components import Places, components, components_by_size
+from cflow_torch.dense.projection import ProjectedSweeps
 from cflow_torch.ops.indices import divide, flat_nonzero, split_index
 from cflow_torch.ops.labeling import pad
 from cflow_torch.ops.segments import bounding_boxes, segment_ends
@@ -78,30 +79,33 @@ class Columns(NamedTuple):
     cluster: Tensor
 
 
-def cluster(occupancy: Tensor, pixel_size: float, config: Config) -> Tuple[Clusters, Tensor]:
+def find_clusters(sweeps: ProjectedSweeps, config: Config) -> Tuple[Clusters, Tensor, Tensor]:
     """Alg. clustering, from the projection of the aggregated sweeps on: dilate, label, validate by size.
 
     Args:
-        occupancy, pixel_size, config: as for `find_clusters`.
+        sweeps: of all B windows.
+        config: `connectivity`, `max_extent` (d^max), `labeling`.
 
     Returns:
-        clusters: those of all B windows.
-        of_pixel: (B * S * H * W + 1,) int32, cluster of each occupied pixel of each sweep, M = none; the last entry, M,
+        clusters: those of all windows.
+        of_place: (B * S * H * W + 1,) int32, cluster of each occupied pixel of each sweep, M = none; the last entry, M,
             is for points that are nowhere. Undefined for empty pixels.
+        place: (P,) int64, where each point is looked up in it.
     """
+    occupancy = sweeps.occupancy
     _, num_steps, height, width = occupancy.shape
     area = height * width
-    clusters, columns = find_clusters(occupancy, pixel_size, config)
-    of_pixel = torch.empty(occupancy.numel() + 1, dtype=torch.int32, device=occupancy.device)
+    clusters, columns = cluster_images(occupancy, sweeps.grid.pixel_size, config)
+    of_place = torch.empty(occupancy.numel() + 1, dtype=torch.int32, device=occupancy.device)
     place = torch.add(columns.pixel, columns.window, alpha=num_steps * area)
-    number_of_pixel = columns.cluster.int()
+    number_of_place = columns.cluster.int()
     for index in range(num_steps):
-        of_pixel[index * area :].scatter_(0, place, number_of_pixel)
-    of_pixel[-1:] = clusters.window.numel()
-    return clusters, of_pixel
+        of_place[index * area :].scatter_(0, place, number_of_place)
+    of_place[-1:] = clusters.window.numel()
+    return clusters, of_place, sweeps.pixel
 
 
-def find_clusters(images: Tensor, pixel_size: float, config: Config, reach: int = 3) -> Tuple[Clusters, Columns]:
+def cluster_images(images: Tensor, pixel_size: float, config: Config, reach: int = 3) -> Tuple[Clusters, Columns]:
     """The clusters of images, and where they are.
 
     Args:

@@ -8,29 +8,24 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cflow_torch.config import Config
+from cflow_torch.config import DenseConfig
 from cflow_torch.dense.clustering import Clusters, keep_live
+from cflow_torch.dense.projection import ProjectedSweeps
 from cflow_torch.ops.segments import segment_amin
 from cflow_torch.types import CFlowError
-from cflow_torch.windows.bev_grid import Grid
-from cflow_torch.windows.collation import Batch
 
 
-def cluster_by_density(
-    batch: Batch, positions: Tensor, pixel: Tensor, grid: Grid, config: Config
-) -> Tuple[Clusters, Tensor]:
+def find_dense_clusters(sweeps: ProjectedSweeps, config: DenseConfig) -> Tuple[Clusters, Tensor, Tensor]:
     """Spatio-temporal clusters of the aggregated points (t+1, t, t-1, ...) by HDBSCAN on x, y, z.
 
     Args:
-        batch: which window and sweep a point belongs to.
-        positions: (3, P) float64, metres, frame of t+1, warped by the flow so far.
-        pixel: (P,) int64, flat index of each point's pixel into images (B, S, H, W); B * S * H * W = left out.
-        grid: the BEV.
+        sweeps: whose points have three axes.
         config: `min_cluster_size`.
 
     Returns:
         clusters: those with pixels at t+1 and before. Unlike components, clusters may share pixels.
-        of_point: (P,) int64, cluster of each point, M = none (HDBSCAN's noise included).
+        of_place: (P,) int64, cluster of each point, M = none (HDBSCAN's noise included).
+        place: (P,) int64, 0 ... P - 1: every point has a place of its own.
 
     Raises:
         CFlowError: the extra is not installed.
@@ -40,6 +35,7 @@ def cluster_by_density(
 
     Cost: N log N in points, on the CPU, window by window: a library's work, seconds for a full sweep pair.
     """
+    batch, grid, pixel, positions = sweeps.batch, sweeps.grid, sweeps.pixel, sweeps.positions()
     window = batch.image // batch.num_steps
     num_pixels = batch.num_windows * batch.num_steps * grid.height * grid.width
     label = torch.full_like(pixel, -1)
@@ -71,7 +67,7 @@ def cluster_by_density(
     )
     of_point = torch.full_like(label, clusters.window.numel())
     of_point[member] = number[component[label[member]]]
-    return clusters, of_point
+    return clusters, of_point, torch.arange(of_point.numel(), device=of_point.device)
 
 
 def hdbscan_labels(points: np.ndarray, min_cluster_size: int) -> np.ndarray:

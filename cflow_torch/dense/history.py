@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from cflow_torch.ops.exact import exact_sqrt
 from cflow_torch.ops.segments import masked_median
 
 
@@ -33,7 +32,7 @@ def pool(estimates: Tensor, available: Tensor) -> Tensor:
     if num_estimates == 1:
         return single
     x, y, z = estimates.masked_fill(~available[:, :, None], 0.0).unbind(2)
-    magnitude = exact_sqrt(x * x + y * y)
+    magnitude = torch.sqrt(x * x + y * y)
     oriented = available & (magnitude > 0)
     safe = torch.where(oriented, magnitude, torch.ones_like(magnitude))
     unit = torch.stack((x / safe, y / safe), 2).masked_fill(~oriented[:, :, None], 0.0)
@@ -63,7 +62,7 @@ def _angular_median(unit: Tensor, oriented: Tensor) -> Tensor:
     low = unit[rows, order[rows, (count - 1).clamp(min=0) // 2]]
     high = unit[rows, order[rows, (count // 2).clamp(max=unit.shape[1] - 1)]]
     both = low + high
-    norm = exact_sqrt(both[:, 0] * both[:, 0] + both[:, 1] * both[:, 1])[:, None]
+    norm = torch.sqrt(both[:, 0] * both[:, 0] + both[:, 1] * both[:, 1])[:, None]
     halfway = torch.where(norm > 0, both / torch.where(norm > 0, norm, torch.ones_like(norm)), low)
     middle = torch.where((count % 2 == 1)[:, None], low, halfway)
     return torch.where((count > 0)[:, None], middle, torch.zeros_like(middle))

@@ -1,14 +1,14 @@
-"""Clusters as small binary images in one buffer, laid out so that one correlation per size class finds all shifts."""
+"""Templates and targets packed into one buffer, laid out so that one correlation per size class finds all shifts."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import List, Optional, Tuple
+from typing import List, Tuple
 
 import torch
 from torch import Tensor
 
-from cflow_torch.ops.bits import popcount
+from cflow_torch.dense.templates import TemplatePairs
 from cflow_torch.ops.cross_correlation import FAST_LENGTHS
 from cflow_torch.ops.indices import flat_nonzero
 from cflow_torch.types import CFlowError
@@ -23,37 +23,6 @@ _LINES = (144, 576, 2304, 9216)  # square clusters of 8, 16, 32, 64 pixels
 _BYTES_PER_SAMPLE = 80
 # Classes are numbered by height and width of their images, both below this.
 _BASE = 1 << 17
-
-
-@dataclass(frozen=True)
-class Images:
-    """A set of small binary images, given by their set pixels.
-
-    Args:
-        image: (P,) int64, image of each pixel.
-        row, col: (P,) int64, place inside the image, from 0.
-        slices: (P,) uint8, bit by bit the height slices in which the pixel is set, at least one; None = there is one
-            slice, and it is.
-    """
-
-    image: Tensor
-    row: Tensor
-    col: Tensor
-    slices: Optional[Tensor] = None
-
-    def take(self, wanted: Tensor) -> Images:
-        """Some of N images, numbered anew from 0. Args: wanted: (N,) bool."""
-        pixel = flat_nonzero(wanted.index_select(0, self.image))
-        image = (wanted.cumsum(0) - 1).index_select(0, self.image.index_select(0, pixel))
-        row, col = self.row.index_select(0, pixel), self.col.index_select(0, pixel)
-        return Images(image, row, col, None if self.slices is None else self.slices.index_select(0, pixel))
-
-    def energy(self, num_images: int) -> Tensor:
-        """(N,) int64, set pixels of each image, counted in every slice."""
-        if self.slices is None:
-            return torch.bincount(self.image, minlength=num_images)
-        energy = torch.zeros(num_images, dtype=torch.int64, device=self.image.device)
-        return energy.index_add_(0, self.image, popcount(self.slices))
 
 
 @dataclass(frozen=True)
@@ -80,69 +49,50 @@ class Search:
 
 
 @dataclass(frozen=True)
-class Drawing:
-    """Templates and targets drawn in the shape of their class, class after class, templates before targets.
+class Packing:
+    """Templates and targets in the shape of their class, class after class, templates before targets.
 
     Args:
-        samples: (A,) bool, or uint8, bit by bit the slices.
+        samples: (A,) bool.
         classes: of each class (templates, targets, Y, X, number of leading samples in which shifts are searched).
-        jobs: (J,) int64, templates in the order in which they are drawn.
-        targets: (N,) int64, targets in the order in which they are drawn.
+        pairs: (J,) int64, pairs in the order in which their templates are packed.
+        targets: (N,) int64, targets in the order in which they are packed.
     """
 
     samples: Tensor
     classes: List[Tuple[int, ...]]
-    jobs: Tensor
+    pairs: Tensor
     targets: Tensor
 
 
-def search_bounds(size: Tensor, target_of_job: Tensor, radius: Optional[Tensor]) -> Tuple[Tensor, Tensor]:
-    """(N, 2) farthest shifts down and up that any job of a target searches."""
-    low = size // 2
-    high = size - 1 - low
-    if radius is not None:
-        reach = low.new_zeros(len(size)).scatter_reduce_(
-            0, target_of_job, radius.clamp(max=LONGEST_SIDE).floor().long(), "amax"
-        )[:, None]
-        low, high = torch.minimum(low, reach), torch.minimum(high, reach)
-    return low, high
-
-
-def draw(
-    template: Images,
-    target: Images,
-    target_of_job: Tensor,
-    size: Tensor,
-    low: Tensor,
-    high: Tensor,
-    num_slices: int = 1,
-) -> Tuple[Search, Drawing]:
-    """Draw all templates and targets in one go; also what is searched for each target.
+def pack(pairs: TemplatePairs) -> Tuple[Search, Packing]:
+    """Pack all templates and targets in one go; also what is searched for each of N targets.
 
     Args:
-        template, target, target_of_job, size, num_slices: as for `best_shifts`.
-        low, high: as `search_bounds` gives them.
+        pairs: at least one.
 
     Raises:
         CFlowError: a cluster that is too long, or takes more memory than there is.
 
-    An image takes H + low_y rows of W + low_x samples, and a target is drawn low_y rows and low_x columns further down.
+    An image takes H + low_y rows of W + low_x samples, and a target is packed low_y rows and low_x columns further down.
     Then shift (dy, dx) of the correlation stands at sample (dy + low_y) * stride + dx + low_x, and no other pair of
     pixels adds to the samples that are searched: neither across the end of a row nor across that of the image.
     """
+    size, of_pair, device = pairs.size, pairs.cluster, pairs.size.device
+    low, high = _search_bounds(pairs)
     rows, width = (size + low).t().contiguous()
-    lines = torch.tensor(_LINES, device=size.device)
+    lines = torch.tensor(_LINES, device=device)
     line = torch.searchsorted(lines, rows * width)
     is_line = line < len(_LINES)
-    fast, last_fast = torch.tensor(FAST_LENGTHS, device=size.device), len(FAST_LENGTHS) - 1
+    fast, last_fast = torch.tensor(FAST_LENGTHS, device=device), len(FAST_LENGTHS) - 1
     height = torch.where(is_line, 1, fast.take(torch.searchsorted(fast, rows).clamp(max=last_fast)))
     in_line = lines.take(line.clamp(max=len(_LINES) - 1))
     length = torch.where(is_line, in_line, fast.take(torch.searchsorted(fast, width).clamp(max=last_fast)))
     stride = torch.where(is_line, width, length)
 
     keys, class_of_target = torch.unique(height * _BASE + length, return_inverse=True)
-    num_jobs, num_classes = target_of_job.numel(), keys.numel()
-    kind = torch.cat((2 * class_of_target.index_select(0, target_of_job), 2 * class_of_target + 1))
+    num_pairs, num_classes = of_pair.numel(), keys.numel()
+    kind = torch.cat((2 * class_of_target.index_select(0, of_pair), 2 * class_of_target + 1))
     last = (low + high)[:, 0] * stride + (low + high)[:, 1]
     searched = torch.zeros_like(keys).scatter_reduce_(0, class_of_target, last + 1, "amax")
     images = torch.bincount(kind, minlength=2 * num_classes)
@@ -152,37 +102,39 @@ def draw(
     classes = [
         (*numbers[2 * c : 2 * c + 2], *divmod(listed[c], _BASE), listed[num_classes + c]) for c in range(num_classes)
     ]
-
-    order = torch.sort(kind, stable=True).indices
-    of_image = torch.cat((target_of_job, torch.arange(len(size), device=size.device)))
-    area = (height * length).index_select(0, of_image.index_select(0, order))
-    start = torch.empty_like(area).scatter_(0, order, area.cumsum(0) - area)
-    start[num_jobs:] += low[:, 0] * stride + low[:, 1]
-    image = torch.cat((template.image, target.image + num_jobs))
-    row, col = torch.cat((template.row, target.row)), torch.cat((template.col, target.col))
-    pixel = row.mul_(stride.index_select(0, of_image).index_select(0, image)).add_(col)
-    pixel += start.index_select(0, image)
     total = sum((templates + targets) * y * x for templates, targets, y, x, _ in classes)
-    largest = max(y * x for _, _, y, x, _ in classes)
     require_memory(
-        total + _BYTES_PER_SAMPLE * num_slices * largest,
-        size.device,
+        total + _BYTES_PER_SAMPLE * max(y * x for _, _, y, x, _ in classes),
+        device,
         f"a cluster that is {longest} pixels long",
         "give a max_speed, so that it is searched less far, a smaller point_cloud_range or larger pixel_sizes",
     )
-    if template.slices is None or target.slices is None:
-        samples = torch.zeros(total, dtype=torch.bool, device=pixel.device).index_fill_(0, pixel, True)
-    else:
-        samples = torch.zeros(total, dtype=torch.uint8, device=pixel.device)
-        samples.scatter_(0, pixel, torch.cat((template.slices, target.slices)))
-    is_job = order < num_jobs
-    drawing = Drawing(
-        samples,
-        classes,
-        order.index_select(0, flat_nonzero(is_job)),
-        order.index_select(0, flat_nonzero(~is_job)) - num_jobs,
-    )
-    return Search(low, high, stride), drawing
+
+    order = torch.sort(kind, stable=True).indices
+    of_image = torch.cat((of_pair, torch.arange(len(size), device=device)))
+    area = (height * length).index_select(0, of_image.index_select(0, order))
+    start = torch.empty_like(area).scatter_(0, order, area.cumsum(0) - area)
+    start[num_pairs:] += low[:, 0] * stride + low[:, 1]
+    template, target = pairs.template, pairs.target
+    image = torch.cat((template.image, target.image + num_pairs))
+    row, col = torch.cat((template.row, target.row)), torch.cat((template.col, target.col))
+    sample = row.mul_(stride.index_select(0, of_image).index_select(0, image)).add_(col)
+    sample += start.index_select(0, image)
+    samples = torch.zeros(total, dtype=torch.bool, device=device).index_fill_(0, sample, True)
+    is_pair = order < num_pairs
+    first, last = order.index_select(0, flat_nonzero(is_pair)), order.index_select(0, flat_nonzero(~is_pair))
+    return Search(low, high, stride), Packing(samples, classes, first, last - num_pairs)
+
+
+def _search_bounds(pairs: TemplatePairs) -> Tuple[Tensor, Tensor]:
+    """(N, 2) farthest shifts down and up that any pair of a target searches."""
+    low = pairs.size // 2
+    high = pairs.size - 1 - low
+    if pairs.radius is not None:
+        reach = pairs.radius.clamp(max=LONGEST_SIDE).floor().long()
+        reach = low.new_zeros(len(low)).scatter_reduce_(0, pairs.cluster, reach, "amax")[:, None]
+        low, high = torch.minimum(low, reach), torch.minimum(high, reach)
+    return low, high
 
 
 def _check_length(longest: int) -> None:

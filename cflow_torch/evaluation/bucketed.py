@@ -7,8 +7,8 @@ from typing import Any, Dict, Tuple, Union
 
 import numpy as np
 
-from cflow_torch.evaluation.accumulator import Accumulator
 from cflow_torch.data.categories import META_NAMES, meta_class
+from cflow_torch.evaluation.accumulator import Accumulator
 from cflow_torch.evaluation.definitions import Definition
 from cflow_torch.evaluation.masks import ScoredPoints
 

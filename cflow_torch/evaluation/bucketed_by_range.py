@@ -6,9 +6,9 @@ from typing import Any, Dict, Union
 
 import numpy as np
 
+from cflow_torch.data.categories import META_NAMES
 from cflow_torch.evaluation.accumulator import Accumulator
 from cflow_torch.evaluation.bucketed import bucket_cells, bucket_scores
-from cflow_torch.data.categories import META_NAMES
 from cflow_torch.evaluation.definitions import Definition, range_names
 from cflow_torch.evaluation.masks import ScoredPoints
 

@@ -6,8 +6,8 @@ from typing import Any, Dict, List, Tuple, Union
 
 import numpy as np
 
-from cflow_torch.evaluation.accumulator import Accumulator
 from cflow_torch.data.categories import CATEGORIES, CATEGORY_INDEX, META_CLASSES, meta_class
+from cflow_torch.evaluation.accumulator import Accumulator
 from cflow_torch.evaluation.definitions import Definition
 from cflow_torch.evaluation.masks import ScoredPoints
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from cflow_torch.config import Config
+from cflow_torch.config import KeypointsConfig
 from cflow_torch.dense.components import label_components
 from cflow_torch.keypoints.matching import Matches
 from cflow_torch.ops.indices import flat_nonzero
@@ -35,7 +35,7 @@ class DenseShift:
     score: Tensor
 
 
-def densify(images: Tensor, place: Tensor, matches: Matches, pixel_size: float, config: Config) -> DenseShift:
+def densify(images: Tensor, place: Tensor, matches: Matches, pixel_size: float, config: KeypointsConfig) -> DenseShift:
     """Shift of every occupied pixel of sweep t.
 
     Args:

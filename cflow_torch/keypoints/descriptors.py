@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Tuple
 
 from torch import Tensor
 
-from cflow_torch.ops.indices import flat_nonzero
+from cflow_torch.ops.indices import flat_nonzero, split_index
 from cflow_torch.ops.morphology import erode_cross
 from cflow_torch.ops.patches import gather_patches
 
@@ -17,11 +16,13 @@ class KeyPoints:
     """Key points of one sweep of every window, in order of window, row and column.
 
     Args:
-        window, row, col: (K,) int64.
+        place: (K,) int64, flat indices into the images, ascending.
+        window, row, col: (K,) int64, the same apart.
         patch: (K, L * L) uint8, zeros and ones.
         energy: (K,) int64, number of ones, at least 1.
     """
 
+    place: Tensor
     window: Tensor
     row: Tensor
     col: Tensor
@@ -43,23 +44,19 @@ def detect(occupancy: Tensor) -> Tensor:
     return occupancy & ~erode_cross(occupancy)
 
 
-def describe(images: Tensor, is_key_point: Tensor, patch_size: int) -> Tuple[Tensor, KeyPoints]:
+def describe(images: Tensor, patch_size: int) -> KeyPoints:
     """Key points of one sweep and their descriptors (Sec. Descriptor).
 
     Args:
         images: (B, H, W) bool, occupancy of the sweep of every window.
-        is_key_point: (B, H, W) bool.
         patch_size: L, odd.
 
     Returns:
-        place: (K,) int64, flat indices into `images`, ascending.
-        key_points: with their L x L patches, zero outside the image.
+        The key points with their L x L patches, zero outside the image.
 
     Cost: memory K L^2 bytes; the images are not unfolded.
     """
-    _, height, width = images.shape
-    place = flat_nonzero(is_key_point)
-    line = place // width
-    window, col = line // height, place - line * width
-    row = line - window * height
-    return place, KeyPoints(window, row, col, *gather_patches(images, window, row, col, patch_size))
+    place = flat_nonzero(detect(images))
+    line, col = split_index(place, images.shape[2])
+    window, row = split_index(line, images.shape[1])
+    return KeyPoints(place, window, row, col, *gather_patches(images, window, row, col, patch_size))

@@ -1,6 +1,6 @@
-"""Which key points of t and t+1 may match: those within the gate of each other.
+"""Match candidates: which key points of t and t+1 may match, those within a radius of each other.
 
-Key points of t are grouped by small tiles of the image. The key points of t+1 that can lie within the gate of a group
+Key points of t are grouped by small tiles of the image. The key points of t+1 that can lie within the radius of a group
 stand in a few runs of a list that is sorted by band of rows, then by column. Nothing is ever as large as all key points
 times all key points.
 """
@@ -13,12 +13,12 @@ from typing import Iterator, Optional, Tuple
 import torch
 from torch import Tensor
 
-from cflow_torch.config import Config
+from cflow_torch.config import KeypointsConfig
 from cflow_torch.keypoints.descriptors import KeyPoints
 from cflow_torch.windows.collation import Batch
 
 # Rows and columns of a tile, rows of a band, key points in a group: of the settings that were counted for groups of 16
-# those with the fewest pairs (key point, candidate), on the AV2 pair 1.55 for one within the gate. Groups of 8 have
+# those with the fewest pairs (key point, candidate), on the AV2 pair 1.55 for one within the radius. Groups of 8 have
 # fewer pairs but fetch twice as many descriptors for each.
 _TILE_ROWS, _TILE_COLS = 12, 64
 _BAND = 4
@@ -33,7 +33,7 @@ _LENGTH_STEP = 8
 _GATE_SECONDS = 0.1
 
 
-def gate(batch: Batch, pixel_size: float, config: Config) -> Tensor:
+def match_radius(batch: Batch, pixel_size: float, config: KeypointsConfig) -> Tensor:
     """(B,) float64, pixels: farthest match of each window, speed times the time from t to t+1."""
     seconds = batch.seconds[:, 1]
     size = torch.full_like(seconds, pixel_size)  # a GPU would multiply by the reciprocal of a plain number
@@ -78,7 +78,7 @@ def pair(source: KeyPoints, target: KeyPoints, reach: Tensor) -> Pairing:
     return Pairing(member, candidate, first, count, limit)
 
 
-def pairs_at_once(device: torch.device, max_memory: Optional[int]) -> int:
+def pairs_at_once(device: torch.device, max_memory: Optional[float]) -> int:
     """Number of pairs (key point, candidate) that are looked at together."""
     number = _PAIRS_AT_ONCE_CPU if device.type == "cpu" else _PAIRS_AT_ONCE_GPU
     return number if max_memory is None else min(number, int(max_memory) // _BYTES_PER_PAIR)

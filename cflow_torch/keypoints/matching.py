@@ -6,7 +6,6 @@ counts. Few candidates come near the best of their key point; only those are loo
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import reduce
 from typing import Iterable, Iterator, List, Sequence, Tuple
@@ -15,10 +14,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from cflow_torch.config import Config
+from cflow_torch.config import KeypointsConfig
 from cflow_torch.keypoints.descriptors import KeyPoints
 from cflow_torch.keypoints.match_candidates import chunks, pair, pairs_at_once
-from cflow_torch.ops.exact import exact_sqrt
 from cflow_torch.ops.indices import flat_nonzero
 from cflow_torch.ops.segments import segment_amin
 
@@ -67,13 +65,13 @@ class _Best:
     is_clear: Tensor
 
 
-def match(pc0: KeyPoints, pc1: KeyPoints, reach: Tensor, config: Config) -> Matches:
+def match(pc0: KeyPoints, pc1: KeyPoints, reach: Tensor, config: KeypointsConfig) -> Matches:
     """Best match of every key point of t that passes the ratio test (Eq. descriptor_ncc, best_match).
 
     Args:
         pc0, pc1: key points of t and t+1.
         reach: (B,) float64, pixels, farthest match of each window.
-        config: `ratio_threshold`, `second_best_distance`, `mutual_check`, `max_memory`.
+        config: `ratio_threshold`, `max_memory`.
 
     Returns:
         The accepted matches.
@@ -81,35 +79,28 @@ def match(pc0: KeyPoints, pc1: KeyPoints, reach: Tensor, config: Config) -> Matc
     Convention:
         Scores are compared as count^2 / energy of the candidate, exactly. Ties: smallest distance, then smallest dy,
         then smallest dx. A match is accepted if R > rho R' holds for the second best R', on integers; equality does
-        not hold, so a tie for the best is not accepted (unless `second_best_distance` leaves its rival out). Without a
-        second candidate there is nothing to test.
+        not hold, so a tie for the best is not accepted. Without a second candidate there is nothing to test.
 
     Cost: time (key points x candidates within the gate) x L^2; memory a fixed number of pairs, plus L^2 bytes a point.
     """
     best = _best_candidates(pc0, pc1, reach, config)
     source = flat_nonzero(best.is_clear)
-    if config.mutual_check:
-        back = _best_candidates(pc1, pc0, reach, config, backward=True)
-        returns = back.index.index_select(0, best.index.index_select(0, source)) == source
-        source = source.index_select(0, flat_nonzero(returns))
     target, count = best.index.index_select(0, source), best.count.index_select(0, source)
     dy = pc1.row.index_select(0, target) - pc0.row.index_select(0, source)
     dx = pc1.col.index_select(0, target) - pc0.col.index_select(0, source)
     energies = pc0.energy.index_select(0, source) * pc1.energy.index_select(0, target)
-    return Matches(source, torch.stack((dy, dx), 1), count.double() / exact_sqrt(energies.double()))
+    return Matches(source, torch.stack((dy, dx), 1), count.double() / torch.sqrt(energies.double()))
 
 
-def _best_candidates(
-    source: KeyPoints, target: KeyPoints, reach: Tensor, config: Config, backward: bool = False
-) -> _Best:
-    """Best candidate of every key point of `source`; `backward`: ties look at shifts from target to source."""
+def _best_candidates(source: KeyPoints, target: KeyPoints, reach: Tensor, config: KeypointsConfig) -> _Best:
+    """Best candidate of every key point of `source`."""
     num_source = source.row.numel()
     index = torch.full((num_source,), -1, dtype=torch.int64, device=source.row.device)
     best = _Best(index, torch.zeros_like(index), torch.zeros_like(index, dtype=torch.bool))
     if num_source == 0 or target.row.numel() == 0:
         return best
     rho = round(config.ratio_threshold * _RATIO_UNIT)
-    share = 1.0 if backward else (_RATIO_UNIT / rho) ** 2
+    share = (_RATIO_UNIT / rho) ** 2
     num_pairs = pairs_at_once(reach.device, config.max_memory)
     parts = _contenders(source, target, reach, share, num_pairs)
     for of_source, of_target, count in _together(parts, min(num_pairs, _CONTENDERS_AT_ONCE)):
@@ -121,8 +112,6 @@ def _best_candidates(
         p, q = of_source.index_select(0, tied), of_target.index_select(0, tied)
         dy = target.row.index_select(0, q) - source.row.index_select(0, p)
         dx = target.col.index_select(0, q) - source.col.index_select(0, p)
-        if backward:
-            dy, dx = -dy, -dx
         order = ((dy * dy + dx * dx) * (1 << 17) + dy + (1 << 16)) * 2 + (dx > 0)  # only the sign is left open
         first = segment_amin(order, p, num_source, torch.iinfo(torch.int64).max)
         is_best = flat_nonzero(order == first.index_select(0, p))
@@ -131,17 +120,10 @@ def _best_candidates(
         best.index.index_copy_(0, p, q)
         best.count.index_copy_(0, p, count.index_select(0, winner))
         best.is_clear.index_fill_(0, p, True)
-        if backward:
-            continue
         # The ratio test, of every rival: c1^2 E2 > rho^2 c2^2 E1.
         own = torch.zeros_like(index).index_copy_(0, p, winner).index_select(0, of_source)  # contender that is the best
         left = square.index_select(0, own) * energy * _RATIO_UNIT**2
         is_rival = (left <= square * energy.index_select(0, own) * rho**2).index_fill_(0, winner, False)
-        if config.second_best_distance > 0:
-            other = of_target.index_select(0, own)
-            dy = target.row.index_select(0, other) - target.row.index_select(0, of_target)
-            dx = target.col.index_select(0, other) - target.col.index_select(0, of_target)
-            is_rival &= dy * dy + dx * dx >= math.ceil(config.second_best_distance**2)
         best.is_clear.index_fill_(0, of_source.index_select(0, flat_nonzero(is_rival)), False)
     return best
 

@@ -21,14 +21,13 @@ _FFT_LARGEST_ERROR = 0.25
 FAST_LENGTHS = tuple(sorted(n << k for k in range(14) for n in (8, 9, 10, 12, 15, 21, 22, 25, 27, 28)))
 
 
-def cross_correlate(images: Tensor, num_templates: int, target_of_job: Tensor, engine: str = "fft") -> Tensor:
+def cross_correlate(images: Tensor, num_templates: int, own: Tensor, engine: str = "fft") -> Tensor:
     """Number of coinciding pixels for shifts of templates over targets (numerator of Eq. norm_correlation).
 
     Args:
-        images: (J + N, Y, X) float32 zeros and ones: J templates, then N targets; or (J + N, n, Y, X), whose n slices
-            are correlated apart and added up.
+        images: (J + N, Y, X) float32 zeros and ones: J templates, then N targets.
         num_templates: J.
-        target_of_job: (J,) int64, target of each template; a target's spectrum serves all its templates.
+        own: (J,) int64, target of each template; a target's spectrum serves all its templates.
         engine: "fft" or "conv" (conv2d).
 
     Returns:
@@ -38,22 +37,16 @@ def cross_correlate(images: Tensor, num_templates: int, target_of_job: Tensor, e
         "fft" wraps around: p + (y, x) is taken modulo (Y, X). "conv" does not. Callers read only shifts where nothing
         wraps.
 
-    Cost: "fft" Y X log(Y X) per template and target, slices each (but for the way back); "conv" (Y X)^2 per template.
+    Cost: "fft" Y X log(Y X) per template and target; "conv" (Y X)^2 per template.
     """
-    return (
-        _by_fft(images, num_templates, target_of_job)
-        if engine == "fft"
-        else _by_conv(images, num_templates, target_of_job)
-    )
+    return _by_fft(images, num_templates, own) if engine == "fft" else _by_conv(images, num_templates, own)
 
 
-def _by_fft(images: Tensor, num_templates: int, target_of_job: Tensor) -> Tensor:
+def _by_fft(images: Tensor, num_templates: int, own: Tensor) -> Tensor:
     height, width = images.shape[-2:]
     images = images.to(_fft_dtype(images))
     spectrum = torch.fft.rfft(images[..., 0, :]) if height == 1 else torch.fft.rfft2(images)
-    product = spectrum[num_templates:].index_select(0, target_of_job).mul_(spectrum[:num_templates].conj())
-    if images.dim() == 4:
-        product = product.sum(1)
+    product = spectrum[num_templates:].index_select(0, own).mul_(spectrum[:num_templates].conj())
     if height == 1:
         return torch.fft.irfft(product, n=width)[:, None]
     return torch.fft.irfft2(product, s=(height, width))
@@ -69,21 +62,19 @@ def _fft_dtype(images: Tensor) -> torch.dtype:
     return torch.float32 if error * largest <= _FFT_LARGEST_ERROR else torch.float64
 
 
-def _by_conv(images: Tensor, num_templates: int, target_of_job: Tensor) -> Tensor:
-    if images.dim() == 3:
-        images = images[:, None]
+def _by_conv(images: Tensor, num_templates: int, own: Tensor) -> Tensor:
     templates, targets = images[:num_templates], images[num_templates:]
     height, width = _extent(templates)
     rows, cols = _extent(targets)
-    padded = F.pad(targets[:, :, :rows, :cols], (0, width - 1, 0, height - 1))[target_of_job]
+    padded = F.pad(targets[:, :rows, :cols], (0, width - 1, 0, height - 1))[own]
     # One group per template. Sums of products of zeros and ones: exact in float32 up to 2^24, also with TF32.
-    counts = F.conv2d(padded.flatten(0, 1)[None], templates[:, :, :height, :width], groups=num_templates)[0]
-    return F.pad(counts, (0, images.shape[3] - cols, 0, images.shape[2] - rows))
+    counts = F.conv2d(padded[None], templates[:, None, :height, :width], groups=num_templates)[0]
+    return F.pad(counts, (0, images.shape[2] - cols, 0, images.shape[1] - rows))
 
 
 def _extent(images: Tensor) -> Tuple[int, int]:
     """Rows and columns up to the last one in which any image has a pixel, at least 1."""
-    used = images.amax((0, 1))
+    used = images.amax(0)
     places = (used.amax(1 - dim).nonzero() for dim in (0, 1))
     height, width = (int(place.max()) + 1 if place.numel() else 1 for place in places)
     return height, width

@@ -12,10 +12,9 @@ from typing import Tuple
 import torch
 from torch import Tensor
 
-from cflow_torch.ops.exact import exact_sqrt
 from cflow_torch.ops.indices import divide, flat_nonzero, split_index
 from cflow_torch.ops.segments import bounding_boxes
-from cflow_torch.verified.height_slices import Cells
+from cflow_torch.verified.height_slices import HeightSlicedSweeps
 
 # A line: largest standard deviation across and smallest along, metres.
 _THIN, _LONG = 0.3, 1.0
@@ -27,12 +26,11 @@ _LEAST_WAY = 1.2
 _CELL, _COVERED = 0.4, 85
 
 
-def slides_along_itself(cells: Cells, elapsed: Tensor, owner: Tensor, candidates: Tensor) -> Tensor:
+def slides_along_itself(sweeps: HeightSlicedSweeps, owner: Tensor, candidates: Tensor) -> Tensor:
     """Which motions are explained by a line that stays where it is.
 
     Args:
-        cells: finest images of all windows and their P occupied pixels.
-        elapsed: (B, S) float64, sweep intervals from each sweep to t+1; 0 for t+1 and for sweeps that a window has not.
+        sweeps: finest images of all windows and their P occupied pixels.
         owner: (P,) int64, component of each occupied pixel, A = none of these.
         candidates: (A, C, 2) float64 (y, x), fine pixels per sweep interval.
 
@@ -50,23 +48,23 @@ def slides_along_itself(cells: Cells, elapsed: Tensor, owner: Tensor, candidates
     Source: the aperture problem; not in the paper.
     """
     num_components = len(candidates)
-    newest = flat_nonzero((owner < num_components) & (cells.step == 0))
-    component, row, col = (values.index_select(0, newest) for values in (owner, cells.row, cells.col))
-    is_line, axis_y, axis_x = _principal_axes(component, row, col, num_components, cells.grid.pixel_size)
+    newest = flat_nonzero((owner < num_components) & (sweeps.step == 0))
+    component, row, col = (values.index_select(0, newest) for values in (owner, sweeps.row, sweeps.col))
+    is_line, axis_y, axis_x = _principal_axes(component, row, col, num_components, sweeps.grid.pixel_size)
 
     # Its window, of each component; those without pixels at t+1 are no lines.
-    window = torch.zeros_like(is_line, dtype=torch.int64).scatter_(0, component, cells.window.index_select(0, newest))
-    intervals = elapsed.amax(1).index_select(0, window)[:, None]
+    window = torch.zeros_like(is_line, dtype=torch.int64).scatter_(0, component, sweeps.window.index_select(0, newest))
+    intervals = sweeps.elapsed.amax(1).index_select(0, window)[:, None]
     y, x = candidates.unbind(2)
     across = axis_y[:, None] * x - axis_x[:, None] * y
     square = y * y + x * x
     length = (axis_y * axis_y + axis_x * axis_x)[:, None]
     suspect = is_line[:, None] & (across * across <= _ALONG * square * length)
-    suspect &= square * (intervals * intervals) >= (_LEAST_WAY / cells.grid.pixel_size) ** 2
+    suspect &= square * (intervals * intervals) >= (_LEAST_WAY / sweeps.grid.pixel_size) ** 2
     looked_at = suspect.any(1)
     if not bool(looked_at.any()):
         return suspect
-    return suspect & _is_covered(cells, elapsed, owner, looked_at)[:, None]
+    return suspect & _is_covered(sweeps, owner, looked_at)[:, None]
 
 
 def _principal_axes(
@@ -91,29 +89,29 @@ def _principal_axes(
     cov = (n * sum_yx - sum_y * sum_x) / (n * n)
     # Eigenvalues of the 2 x 2 matrix; of the two ways to write the eigenvector, the one that does not vanish.
     mean, half = (var_y + var_x) / 2, (var_y - var_x) / 2
-    root = exact_sqrt(half * half + cov * cov)
+    root = torch.sqrt(half * half + cov * cov)
     small, large = mean - root, mean + root
     is_line = (small <= (_THIN / pixel_size) ** 2) & (large >= (_LONG / pixel_size) ** 2)
     is_wide = var_y < var_x
     return is_line, torch.where(is_wide, cov, large - var_x), torch.where(is_wide, large - var_y, cov)
 
 
-def _is_covered(cells: Cells, elapsed: Tensor, owner: Tensor, looked_at: Tensor) -> Tensor:
+def _is_covered(sweeps: HeightSlicedSweeps, owner: Tensor, looked_at: Tensor) -> Tensor:
     """(A,) bool: enough looks of a component find something; of those not `looked_at` (A,) it means nothing."""
-    num_components, num_steps = looked_at.numel(), cells.num_steps
-    side = max(1, round(_CELL / cells.grid.pixel_size))
+    num_components, num_steps = looked_at.numel(), sweeps.num_steps
+    side = max(1, round(_CELL / sweeps.grid.pixel_size))
     # A free margin all around: neighbours need no bounds check.
-    height, width = -(-cells.grid.height // side) + 2, -(-cells.grid.width // side) + 2
-    row, col = divide(cells.row, side) + 1, divide(cells.col, side) + 1
+    height, width = -(-sweeps.grid.height // side) + 2, -(-sweeps.grid.width // side) + 2
+    row, col = divide(sweeps.row, side) + 1, divide(sweeps.col, side) + 1
     in_image = torch.add(col, row, alpha=width)
-    image = torch.add(cells.step, cells.window, alpha=num_steps)
-    is_occupied = torch.zeros(cells.num_windows * num_steps * height * width, dtype=torch.bool, device=row.device)
+    image = torch.add(sweeps.step, sweeps.window, alpha=num_steps)
+    is_occupied = torch.zeros(sweeps.num_windows * num_steps * height * width, dtype=torch.bool, device=row.device)
     is_occupied.index_fill_(0, torch.add(in_image, image, alpha=height * width), True)
 
     members = flat_nonzero(torch.cat((looked_at, looked_at.new_zeros(1))).index_select(0, owner))
-    window, step = cells.window.index_select(0, members), cells.step.index_select(0, members)
+    window, step = sweeps.window.index_select(0, members), sweeps.step.index_select(0, members)
     # From t+1 into all older sweeps of the window, from those into t+1.
-    older = (elapsed > 0).index_select(0, window)
+    older = (sweeps.elapsed > 0).index_select(0, window)
     others = torch.where((step == 0)[:, None], older, torch.arange(num_steps, device=row.device) == 0)
     looking, other = split_index(flat_nonzero(others), num_steps)
     where = in_image.index_select(0, members.index_select(0, looking))

@@ -16,12 +16,12 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.ops.indices import divide, flat_nonzero
-from cflow_torch.verified.component_tree import Groups
-from cflow_torch.verified.height_slices import Cells, count_slices
-from cflow_torch.verified.paired_test import judge
-from cflow_torch.verified.rigid import RigidMotion
+from cflow_torch.verified.component_tree import Objects
+from cflow_torch.verified.height_slices import HeightSlicedSweeps, count_slices
+from cflow_torch.verified.paired_test import count_wins
+from cflow_torch.verified.rigid_motion import RigidMotion
 
-# Bounds of the bins and the probabilities, written by scripts/calibrate_confidence.py. Bins, in order: left out;
+# Bounds of the bins and the probabilities, written by scripts/benchmarks/calibrate_confidence.py. Bins, in order: left out;
 # unlinked, by `crowd`; still, by `share`; moving, by `margin`: pairs near, pairs far, with history near and far.
 TABLE = json.loads(Path(__file__).with_name("confidence.json").read_text(encoding="utf-8"))
 DISPLACEMENT = 0.4  # metres per interval, along x and along y
@@ -29,78 +29,76 @@ BLOCK = 1.6  # metres, sides of a neighbourhood
 _NOWHERE = 1e7  # pixels, outside every image
 
 
-def confidence(cells: Cells, groups: Groups, rigid: RigidMotion, elapsed: Tensor) -> Tensor:
+def confidence_of(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMotion) -> Tensor:
     """Probability that the motion of a pixel of t is right to 0.1 m per sweep interval.
 
     Args:
-        cells: finest images, P occupied pixels.
-        groups: G groups of pixels.
-        rigid: motion of the groups. Turns are not looked at: a group counts as it moves at its centre.
-        elapsed: (B, S) float64, sweep intervals to t+1.
+        sweeps: finest images, P occupied pixels.
+        objects: G of them.
+        rigid: their motion. Turns are not looked at: an object counts as it moves at its centre.
 
     Returns:
         (P + 1,) float32; entry P is for points whose pixel was left out. Means nothing for pixels of other sweeps.
 
     Cost: one look-up for each pixel of t; six for each pixel of what moves and each sweep.
     """
-    probabilities = torch.tensor(TABLE["probabilities"], dtype=torch.float32, device=elapsed.device)
-    return probabilities.index_select(0, F.pad(_bins(cells, groups, rigid, elapsed), (0, 1)))
+    probabilities = torch.tensor(TABLE["probabilities"], dtype=torch.float32, device=sweeps.elapsed.device)
+    return probabilities.index_select(0, F.pad(_bins(sweeps, objects, rigid), (0, 1)))
 
 
-def _bins(cells: Cells, groups: Groups, rigid: RigidMotion, elapsed: Tensor) -> Tensor:
+def _bins(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMotion) -> Tensor:
     """(P,) int64, place of each pixel in the table."""
-    num_groups, size = groups.component.numel(), cells.grid.pixel_size
+    size = sweeps.grid.pixel_size
     motion = rigid.flow.flip(1) / torch.full_like(rigid.flow, size)
     moves = motion.any(1)
-    number, found = _neighbourhood(cells, F.pad(motion, (0, 0, 0, 1)).index_select(0, groups.of_pixel), elapsed)
+    number, found = _neighbourhood(sweeps, F.pad(motion, (0, 0, 0, 1)).index_select(0, objects.of_pixel))
     crowd, share = TABLE["crowd"], TABLE["share"]
     unlinked = 1 + _count([number >= bound for bound in crowd])
     still = 2 + len(crowd) + _count([10 * found >= bound * number for bound in share])
 
-    margin = _margin(cells, groups, motion, moves, elapsed)
-    y, x = ((at.double() + 0.5) * size for at in (cells.row, cells.col))
-    x, y = x + cells.grid.lower[0], y + cells.grid.lower[1]
+    margin = _margin(sweeps, objects, motion, moves)
+    y, x = ((at.double() + 0.5) * size for at in (sweeps.row, sweeps.col))
+    x, y = x + sweeps.grid.lower[0], y + sweeps.grid.lower[1]
     is_far = x * x + y * y >= float(TABLE["far"]) ** 2
-    has_history = ((elapsed > 0).sum(1) > 1).index_select(0, cells.window)
+    has_history = ((sweeps.elapsed > 0).sum(1) > 1).index_select(0, sweeps.window)
     kind = 2 * has_history.long() + is_far.long()
-    moving = 3 + len(crowd) + len(share) + kind * (1 + len(TABLE["margin"])) + F.pad(margin, (0, 1))[groups.of_pixel]
+    moving = 3 + len(crowd) + len(share) + kind * (1 + len(TABLE["margin"])) + F.pad(margin, (0, 1))[objects.of_pixel]
 
-    still = torch.where(groups.of_pixel == num_groups, unlinked, still)
-    return torch.where(F.pad(moves, (0, 1)).index_select(0, groups.of_pixel), moving, still)
+    still = torch.where(objects.of_pixel == objects.count, unlinked, still)
+    return torch.where(F.pad(moves, (0, 1)).index_select(0, objects.of_pixel), moving, still)
 
 
-def _neighbourhood(cells: Cells, motion: Tensor, elapsed: Tensor) -> Tuple[Tensor, Tensor]:
+def _neighbourhood(sweeps: HeightSlicedSweeps, motion: Tensor) -> Tuple[Tensor, Tensor]:
     """Slices of t in the block around each pixel, and how many of them t+1 has where they move to.
 
     Args:
-        cells: P pixels.
+        sweeps: P pixels.
         motion: (P, 2) float64, (y, x) finest pixels per interval.
-        elapsed: (B, S) float64.
 
     Returns:
         (P,) int64 each.
     """
-    side = max(1, round(BLOCK / cells.grid.pixel_size))
-    height, width = -(-cells.grid.height // side), -(-cells.grid.width // side)
-    block = (cells.window * height + divide(cells.row, side)) * width + divide(cells.col, side)
-    source = flat_nonzero(cells.step == 1)
+    side = max(1, round(BLOCK / sweeps.grid.pixel_size))
+    height, width = -(-sweeps.grid.height // side), -(-sweeps.grid.width // side)
+    block = (sweeps.window * height + divide(sweeps.row, side)) * width + divide(sweeps.col, side)
+    source = flat_nonzero(sweeps.step == 1)
     window, row, col, own, at = (
-        values.index_select(0, source) for values in (cells.window, cells.row, cells.col, cells.slices, block)
+        values.index_select(0, source) for values in (sweeps.window, sweeps.row, sweeps.col, sweeps.slices, block)
     )
-    move = (motion.index_select(0, source) * elapsed[window, 1][:, None] + 0.5).floor_().long()
-    there = own & cells.look_up(cells.place(window, torch.zeros_like(window), row + move[:, 0], col + move[:, 1]))
-    sums = torch.zeros((2, cells.num_windows * height * width), dtype=torch.int64, device=block.device)
+    move = (motion.index_select(0, source) * sweeps.elapsed[window, 1][:, None] + 0.5).floor_().long()
+    there = own & sweeps.slices_at(window, torch.zeros_like(window), row + move[:, 0], col + move[:, 1])
+    sums = torch.zeros((2, sweeps.num_windows * height * width), dtype=torch.int64, device=block.device)
     for out, slices in zip(sums, (own, there)):
         out.index_add_(0, at, count_slices(slices).long())
     return sums[0].index_select(0, block), sums[1].index_select(0, block)
 
 
-def _margin(cells: Cells, groups: Groups, motion: Tensor, moves: Tensor, elapsed: Tensor) -> Tensor:
+def _margin(sweeps: HeightSlicedSweeps, objects: Objects, motion: Tensor, moves: Tensor) -> Tensor:
     """(G,) int64, bin of what a motion loses by being displaced, in standard deviations of what it finds."""
-    off = DISPLACEMENT / cells.grid.pixel_size
+    off = DISPLACEMENT / sweeps.grid.pixel_size
     ways = [[0.0, 0.0], [off, 0.0], [-off, 0.0], [0.0, off], [0.0, -off], [_NOWHERE, _NOWHERE]]
     candidates = motion[:, None] + torch.tensor(ways, dtype=torch.float64, device=motion.device)
-    won, lost = judge(cells, groups.of_pixel, candidates, moves, elapsed)
+    won, lost = count_wins(sweeps, objects.of_pixel, candidates, moves)
     surplus = won - lost  # found under the motion less found where it stands
     found = surplus[:, 0] + lost[:, 5]  # who moves out of the image loses all that is found where it stands
     gain = (surplus[:, 0] - surplus[:, 1:5].amax(1)).clamp(min=0)

@@ -1,44 +1,47 @@
-"""The finest images of all sweeps with four height slices a pixel, and the list of their occupied pixels."""
+"""Height-sliced occupancy: the finest images of all sweeps with four height slices a pixel, and their occupied pixels."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Optional, Tuple
 
 import torch
 from torch import Tensor
 
 from cflow_torch.ops.chunks import chunks
-from cflow_torch.ops.indices import flat_nonzero, occupied, split_index
-from cflow_torch.types import CFlowError
-from cflow_torch.verified.ground_residue import TALL, empty_low_columns, ground_heights, is_tall
+from cflow_torch.ops.indices import divide, flat_nonzero, occupied, split_index
+from cflow_torch.verified.ground_residue import TALL, clear_ground_residue, is_tall
 from cflow_torch.windows.bev_grid import Grid
 from cflow_torch.windows.collation import Batch
 
 # Height slices are told apart by this many numbers, then they repeat: 2 m of four slices of 0.5 m.
 NUM_SLICES = 4
+SLICE_HEIGHT = 0.5  # metres
 # Beyond this float64 only holds multiples of 16, so cutting heights off here changes no slice.
 _HIGHEST_SLICE = 2.0**56
 
 
 @dataclass(frozen=True)
-class Cells:
-    """Four bits a pixel for every sweep of every window, and where any of them is set.
+class HeightSlicedSweeps:
+    """All sweeps of all windows as the verified method sees them: bits of height slices by pixel. P pixels are occupied.
 
     Args:
-        grid: the BEV of the images.
-        num_windows, num_steps: B, S; step 0 = sweep t+1, 1 = t, ...
+        batch: the points.
+        grid: the finest BEV.
         image: (B * S * H * W + 1,) uint8, bit c = a point of height slice c lies there; the last entry, always 0, is
-            for whatever lies outside the images.
+            for whatever lies outside the images. Step 0 of S is sweep t+1, 1 = t, ...
+        place: (N,) int64, flat index into `image` of every point; its last entry for those that take no part or lie on
+            a pixel that is left out.
         pixel: (P,) int64, flat indices of the occupied pixels, ascending.
         window, step, row, col: (P,) int64, where each of them lies.
         slices: (P,) uint8, what `image` holds there.
     """
 
+    batch: Batch
     grid: Grid
-    num_windows: int
-    num_steps: int
     image: Tensor
+    place: Tensor
     pixel: Tensor
     window: Tensor
     step: Tensor
@@ -46,7 +49,64 @@ class Cells:
     col: Tensor
     slices: Tensor
 
-    def place(self, window: Tensor, step: Tensor, row: Tensor, col: Tensor) -> Tensor:
+    @classmethod
+    def of(cls, batch: Batch, grid: Grid, min_height: Optional[float] = None) -> HeightSlicedSweeps:
+        """Draw every sweep of a batch with its height slices.
+
+        Args:
+            batch: positions with three axes.
+            grid: the finest BEV.
+            min_height: metres; pixels that do not stand out of the ground of the batch by this much are left out, see
+                `clear_ground_residue`. None = all are drawn.
+
+        Convention:
+            The slice of a height z is floor(z / 0.5 m) mod 4 in float64.
+
+        Cost: linear in points and pixels.
+        """
+        num_images, num_points = batch.num_windows * batch.num_steps, batch.image.numel()
+        image = torch.zeros(num_images * grid.height * grid.width + 1, dtype=torch.uint8, device=batch.image.device)
+        place = torch.empty(num_points, dtype=torch.int64, device=image.device)
+        ground = None if min_height is None or batch.ground is None else batch.ground.mean()
+        for points in chunks(0, num_points, image.device):
+            positions, takes_part = batch.positions[:, points], batch.takes_part[points]
+            at = grid.pixel_of_image(positions, batch.image[points], num_images, takes_part).long()
+            # Rows that take no part have any slice: what they draw is wiped off.
+            part = slice_of(positions[2], SLICE_HEIGHT)
+            for index in range(NUM_SLICES):
+                set_bit(image, at.index_select(0, flat_nonzero(part == index)), 1 << index)
+            if ground is not None and min_height is not None and batch.ground is not None:
+                window = divide(batch.image[points].long(), batch.num_steps)
+                height = batch.ground.below(positions, window, ground)
+                high = flat_nonzero(is_tall(positions[2], height, min_height) & (at < image.numel() - 1))
+                set_bit(image, at.index_select(0, high), TALL)
+            place[points] = at
+        image[-1:] = 0
+        pixel = occupied(image)
+        if ground is not None:
+            pixel = clear_ground_residue(image, pixel, grid)
+            place = torch.where(image.index_select(0, place) != 0, place, image.numel() - 1)
+        of_image, within = split_index(pixel, grid.height * grid.width)
+        window, step = split_index(of_image, batch.num_steps)
+        row, col = split_index(within, grid.width)
+        return cls(batch, grid, image, place, pixel, window, step, row, col, image.index_select(0, pixel))
+
+    @property
+    def num_windows(self) -> int:
+        """B."""
+        return self.batch.num_windows
+
+    @property
+    def num_steps(self) -> int:
+        """S."""
+        return self.batch.num_steps
+
+    @property
+    def elapsed(self) -> Tensor:
+        """(B, S) float64, sweep intervals from each sweep to t+1."""
+        return self.batch.elapsed
+
+    def index(self, window: Tensor, step: Tensor, row: Tensor, col: Tensor) -> Tensor:
         """Flat index into `image` of pixels that may lie outside it.
 
         Args:
@@ -61,14 +121,16 @@ class Cells:
         flat = ((window * self.num_steps + step) * height + row) * width + col
         return torch.where(inside, flat, self.image.numel() - 1)
 
-    def look_up(self, place: Tensor) -> Tensor:
-        """uint8, shape of `place`: the slices at flat indices of any shape."""
-        return self.image.index_select(0, place.reshape(-1)).view(place.shape)
+    def slices_at(self, window: Tensor, step: Tensor, row: Tensor, col: Tensor) -> Tensor:
+        """uint8, shape of `index`: the slices at pixels that may lie outside; 0 there."""
+        index = self.index(window, step, row, col)
+        return self.image.index_select(0, index.reshape(-1)).view(index.shape)
 
+    @cached_property
     def number(self) -> Tensor:
         """(B * S * H * W + 1,) int32: position of each pixel in the list, P where none is occupied.
 
-        Cost: one pass over the images; make it once.
+        Cost: one pass over the images, once.
         """
         number = torch.full_like(self.image, self.pixel.numel(), dtype=torch.int32)
         return number.scatter_(0, self.pixel, torch.arange(self.pixel.numel(), device=number.device).int())
@@ -83,95 +145,39 @@ class Cells:
         number[-1:] = self.pixel.numel()
         return number.scatter_(0, self.pixel.index_select(0, at_t), at_t.int())
 
+    def coarsen(self, block: int) -> Tuple[Tensor, Tensor]:
+        """The same images at pixels of `block` x `block` finest ones.
 
-def make_cells(
-    batch: Batch, grid: Grid, slice_height: float, clearance: Optional[float] = None
-) -> Tuple[Cells, Tensor]:
-    """Draw every sweep of a batch with its height slices.
-
-    Args:
-        batch: positions with three axes, frame of t+1.
-        grid: the finest BEV.
-        slice_height: metres.
-        clearance: metres; pixels that do not stand out of the ground of the batch by this much are left out, see
-            `empty_low_columns`. None = all are drawn.
-
-    Returns:
-        cells: of all windows.
-        place: (N,) int64, flat index into `cells.image` of every point; its last entry for those that take no part or
-            lie on a pixel that is left out.
-
-    Convention:
-        The slice of a height z is floor(z / slice_height) mod 4 in float64, the division a true one (see `Grid.pixel`).
-
-    Raises:
-        CFlowError: the batch holds no heights.
-
-    Cost: linear in points and pixels.
-    """
-    if len(batch.positions) != 3:
-        raise CFlowError("height slices need z: make the batch with three axes")
-    num_images, num_points, device = batch.num_windows * batch.num_steps, batch.image.numel(), batch.image.device
-    heights = None if clearance is None or batch.ground is None else ground_heights(batch.ground)
-    image = torch.zeros(num_images * grid.height * grid.width + 1, dtype=torch.uint8, device=device)
-    place = torch.empty(num_points, dtype=torch.int64, device=device)
-    for points in chunks(0, num_points, device):
-        positions, takes_part = batch.positions[:, points], batch.takes_part[points]
-        place[points] = at = grid.pixel_of_image(positions, batch.image[points], num_images, takes_part).long()
-        # Rows that take no part have any slice: what they draw is wiped off.
-        draw_slices(image, at, slice_of(positions[2], slice_height))
-        if heights is not None and clearance is not None:
-            draw_bit(image, is_tall(at, positions, heights, grid, batch.num_steps, clearance), TALL)
-    image[-1:] = 0
-    pixel = occupied(image)
-    if heights is not None:
-        pixel = empty_low_columns(image, pixel, grid)
-        place = torch.where(image.index_select(0, place) != 0, place, image.numel() - 1)
-    return _listed(image, pixel, grid, batch.num_windows, batch.num_steps), place
+        Returns:
+            images: (B, S, height, width) uint8; a coarse pixel has the slices of all its finest pixels.
+            column: (P,) int64 the column of each occupied finest pixel. A column is a coarse pixel whatever the sweep:
+                (window * height + row) * width + col.
+        """
+        height, width = -(-self.grid.height // block), -(-self.grid.width // block)
+        shape = (self.num_windows, self.num_steps, height, width)
+        row, col = (self.row, self.col) if block == 1 else (divide(self.row, block), divide(self.col, block))
+        column = torch.add(col, torch.add(row, self.window, alpha=height), alpha=width)
+        if block == 1:
+            return self.image[:-1].view(shape), column
+        step = torch.add(self.step, self.window, alpha=self.num_steps - 1)
+        index = torch.add(column, step, alpha=height * width)
+        image = torch.zeros(shape, dtype=torch.uint8, device=column.device)
+        for bit in range(NUM_SLICES):
+            set_bit(image.view(-1), index.index_select(0, flat_nonzero((self.slices & (1 << bit)).bool())), 1 << bit)
+        return image, column
 
 
 def slice_of(z: Tensor, slice_height: float, num_slices: int = NUM_SLICES) -> Tensor:
-    """(N,) uint8: slice of heights (N,) float64, metres, as in `make_cells`; 0 for NaN. At most 16, a power of 2."""
+    """(N,) uint8: slice of heights (N,) float64, metres, floor(z / slice_height) mod n; 0 for NaN. n: a power of 2, at
+    most 16."""
     layer = (z / torch.full((), slice_height, dtype=z.dtype, device=z.device)).floor_()
     layer.clamp_(-_HIGHEST_SLICE, _HIGHEST_SLICE).nan_to_num_(0.0)
     return (layer.long() & (num_slices - 1)).to(torch.uint8)
 
 
-def draw_slices(image: Tensor, place: Tensor, part: Tensor) -> None:
-    """Set a bit for every slice that a point lies in.
-
-    Args:
-        image: (Q,) uint8, drawn into.
-        place: (N,) int64, where in it each point lies.
-        part: (N,) uint8, slice of each point.
-    """
-    for index in range(NUM_SLICES):
-        draw_bit(image, place.index_select(0, flat_nonzero(part == index)), 1 << index)
-
-
-def draw_bit(image: Tensor, place: Tensor, bit: int) -> None:
-    """Set a bit of an image at some places. What is written at a place is the same for all, so order means nothing."""
-    image.index_copy_(0, place, image.index_select(0, place).bitwise_or_(bit))
-
-
-def cells_of_image(image: Tensor, grid: Grid, num_windows: int, num_steps: int) -> Cells:
-    """List the occupied pixels of an image.
-
-    Args:
-        image: (B * S * H * W + 1,) uint8, as in `Cells`.
-        grid: the BEV.
-        num_windows, num_steps: B, S.
-    """
-    return _listed(image, occupied(image), grid, num_windows, num_steps)
-
-
-def _listed(image: Tensor, pixel: Tensor, grid: Grid, num_windows: int, num_steps: int) -> Cells:
-    """The same, where its occupied pixels are known."""
-    of_image, within = split_index(pixel, grid.height * grid.width)
-    window, step = split_index(of_image, num_steps)
-    row, col = split_index(within, grid.width)
-    slices = image.index_select(0, pixel)
-    return Cells(grid, num_windows, num_steps, image, pixel, window, step, row, col, slices)
+def set_bit(image: Tensor, index: Tensor, bit: int) -> None:
+    """Set a bit of an image at some flat indices. What is written at one is the same for all, so order means nothing."""
+    image.index_copy_(0, index, image.index_select(0, index).bitwise_or_(bit))
 
 
 def count_slices(slices: Tensor) -> Tensor:

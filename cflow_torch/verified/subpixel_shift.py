@@ -1,4 +1,4 @@
-"""Relocation of groups: the best of the whole-pixel shifts near their motion, and a parabola, all groups at once.
+"""Sub-pixel shift of objects: the best of the whole-pixel shifts near their motion, and a parabola, all at once.
 
 One grid of pixels cuts a small object badly by chance. Counts are therefore summed over grids that are moved by half a
 pixel, in x, in y, and in both.
@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from cflow_torch.ops.chunks import chunks
-from cflow_torch.ops.indices import flat_nonzero
-from cflow_torch.verified.height_slices import NUM_SLICES
-from cflow_torch.verified.moving import MovingPoints
+from cflow_torch.ops.parabola import vertex
+from cflow_torch.verified.height_slices import NUM_SLICES, HeightSlicedSweeps
+from cflow_torch.verified.voxel_centroids import ObjectPoints
 from cflow_torch.windows.bev_grid import Grid
 
 _GRIDS = 2  # by 2
@@ -20,41 +20,40 @@ _REACH = 1  # pixels, farthest shift from the given motion; counts are needed on
 _SIDE = 2 * _REACH + 3  # shifts in y and in x that are counted
 
 
-def relocate(points: MovingPoints, grid: Grid, num_windows: int, flow: Tensor) -> Tensor:
-    """The motion t -> t+1 of every group where most of its voxels at t meet one at t+1.
+def shift_between_pixels(points: ObjectPoints, sweeps: HeightSlicedSweeps, flow: Tensor) -> Tensor:
+    """The motion t -> t+1 of every object where most of its voxels at t meet one at t+1.
 
     Args:
-        points: of the groups; those of t and t+1 matter.
-        grid: the pixels.
-        num_windows: B.
+        points: of the objects; those of t and t+1 matter.
+        sweeps: finest images.
         flow: (G, 2) float64, (y, x), pixels per sweep interval.
 
     Returns:
-        (G, 2) float64, the same. A group that meets nothing keeps its flow.
+        (G, 2) float64, the same. A object that meets nothing keeps its flow.
 
     Convention:
         The given motion is rounded to whole pixels, halves up. Of equal counts the shift nearest to it, of those the
-        first in raster order. A voxel of t+1 counts whatever its group is. The parabola through the peak and its
+        first in raster order. A voxel of t+1 counts whatever its object is. The parabola through the peak and its
         neighbours, in y and in x, adds half a pixel at most.
 
     Cost: for each of the four grids a sort of the points of t and 25 look-ups for each of their voxels; one table of a
         byte for each voxel of a sweep.
     """
-    older, newest = (points.take(flat_nonzero(points.step == step)) for step in (1, 0))
+    older, newest = (points.take(points.step == step) for step in (1, 0))
     start = torch.floor(flow + 0.5).long()
-    # Grids that are moved need a pixel more.
+    grid = sweeps.grid  # grids that are moved need a pixel more
     height, width = grid.height + 1, grid.width + 1
-    table = torch.zeros(num_windows * height * width * NUM_SLICES + 1, dtype=torch.bool, device=flow.device)
+    table = torch.zeros(sweeps.num_windows * height * width * NUM_SLICES + 1, dtype=torch.bool, device=flow.device)
     counts = torch.zeros((len(flow), _SIDE * _SIDE), dtype=torch.int64, device=flow.device)
     for phase in range(_GRIDS * _GRIDS):
         target = _voxel(newest, grid, phase)
         table.index_fill_(0, target, True)
-        counts += _coincidences(_voxel(older, grid, phase), older.group, table, start, height, width)
+        counts += _coincidences(_voxel(older, grid, phase), older.owner, table, start, height, width)
         table.index_fill_(0, target, False)
     return _peak(counts, start, flow)
 
 
-def _voxel(points: MovingPoints, grid: Grid, phase: int) -> Tensor:
+def _voxel(points: ObjectPoints, grid: Grid, phase: int) -> Tensor:
     """(N,) int64, where in the table the voxel of each point is: window, row, col, slice in this order."""
     size = torch.full((), grid.pixel_size, dtype=torch.float64, device=points.position.device)
     (x, y), (x_0, y_0, _) = points.position.unbind(0), grid.lower
@@ -64,25 +63,25 @@ def _voxel(points: MovingPoints, grid: Grid, phase: int) -> Tensor:
     return pixel * NUM_SLICES + points.part
 
 
-def _coincidences(voxel: Tensor, group: Tensor, table: Tensor, start: Tensor, height: int, width: int) -> Tensor:
-    """Voxels of each group that meet one of the table, at all shifts around the group's motion.
+def _coincidences(voxel: Tensor, owner: Tensor, table: Tensor, start: Tensor, height: int, width: int) -> Tensor:
+    """Voxels of each object that meet one of the table, at all shifts around the object's motion.
 
     Args:
-        voxel, group: (N,) int64, of points; a voxel counts once however many points it holds.
+        voxel, owner: (N,) int64, of points; a voxel counts once however many points it holds.
         table: (B * H * W * 4 + 1,) bool; the last entry is for what lies outside.
         start: (G, 2) int64, (dy, dx).
 
     Returns:
         (G, 25) int64.
     """
-    num_groups, device = len(start), voxel.device
-    key = torch.unique(voxel * num_groups + group) if num_groups else voxel
-    voxel = torch.div(key, max(num_groups, 1), rounding_mode="floor")
-    group = key - voxel * num_groups
-    counts = torch.zeros(num_groups * _SIDE * _SIDE, dtype=torch.int64, device=device)
+    num_objects, device = len(start), voxel.device
+    key = torch.unique(voxel * num_objects + owner) if num_objects else voxel
+    voxel = torch.div(key, max(num_objects, 1), rounding_mode="floor")
+    owner = key - voxel * num_objects
+    counts = torch.zeros(num_objects * _SIDE * _SIDE, dtype=torch.int64, device=device)
     offset = torch.arange(_SIDE, device=device)[:, None] - (_REACH + 1)
     for some in chunks(0, voxel.numel(), device, _SIDE * _SIDE):
-        of_some, pixel, part = group[some], voxel[some] >> 2, voxel[some] & (NUM_SLICES - 1)
+        of_some, pixel, part = owner[some], voxel[some] >> 2, voxel[some] & (NUM_SLICES - 1)
         line = torch.div(pixel, width, rounding_mode="floor")
         window = torch.div(line, height, rounding_mode="floor")
         dy, dx = start.index_select(0, of_some).unbind(1)
@@ -93,7 +92,7 @@ def _coincidences(voxel: Tensor, group: Tensor, table: Tensor, start: Tensor, he
         meets = table.index_select(0, torch.where(inside, place, table.numel() - 1).view(-1))
         slot = torch.arange(_SIDE * _SIDE, device=device)[:, None] + of_some * (_SIDE * _SIDE)
         counts.index_add_(0, slot.view(-1), meets.long())
-    return counts.view(num_groups, _SIDE * _SIDE)
+    return counts.view(num_objects, _SIDE * _SIDE)
 
 
 def _peak(counts: Tensor, start: Tensor, flow: Tensor) -> Tensor:
@@ -111,14 +110,9 @@ def _peak(counts: Tensor, start: Tensor, flow: Tensor) -> Tensor:
     key = ((counts << 10) + ((31 - dy * dy - dx * dx) << 5) + (31 - offset)).masked_fill(~is_inner, -1)
     best = 31 - (key.amax(1) & 31)
     middle = counts.gather(1, best[:, None])[:, 0]
-    moves = [_vertex(counts, best, middle, step) for step in (_SIDE, 1)]
+    moves = [
+        vertex(counts.gather(1, (best - step)[:, None])[:, 0], middle, counts.gather(1, (best + step)[:, None])[:, 0])
+        for step in (_SIDE, 1)
+    ]
     shift = torch.stack((dy.index_select(0, best) + moves[0], dx.index_select(0, best) + moves[1]), 1)
     return torch.where((middle > 0)[:, None], start + shift, flow)
-
-
-def _vertex(counts: Tensor, best: Tensor, middle: Tensor, step: int) -> Tensor:
-    """(G,) float64, where the parabola through the counts at `best` and a step before and after it is largest."""
-    low, high = (counts.gather(1, (best + move)[:, None])[:, 0] for move in (-step, step))
-    curve = 2 * middle - low - high
-    vertex = (high - low).double() / (2 * curve).clamp(min=1).double()
-    return torch.where(curve > 0, vertex, torch.zeros_like(vertex)).clamp(-0.5, 0.5)

@@ -1,4 +1,4 @@
-"""Voxels: pixels by height slices of every sweep, the centroids of their points, and the nearest one to a place."""
+"""Voxels (pixels by height slices of every sweep), the centroids of their points, and the nearest one to a place."""
 
 from __future__ import annotations
 
@@ -8,63 +8,128 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from cflow_torch.verified.height_slices import NUM_SLICES
-from cflow_torch.verified.moving import MovingPoints
-from cflow_torch.windows.bev_grid import Grid
+from cflow_torch.ops.indices import flat_nonzero, split_index
+from cflow_torch.verified.component_tree import Objects
+from cflow_torch.verified.height_slices import NUM_SLICES, SLICE_HEIGHT, HeightSlicedSweeps, slice_of
 
-# Centroids are whole numbers of 1 / UNITS metre from the lower corner of the region: their sums have no order.
+
+# Centroids are whole numbers of 1 / UNITS metre: their sums are exact, in any order of the points and on any device.
 UNITS = 1024
-# A place far beyond every other; 32 times its square fits in 62 bits.
-_FAR = 1 << 28
+_BEYOND = 2.0**28  # units: a place far beyond every other
 
 
 @dataclass(frozen=True)
-class Voxels:
-    """V voxels, by pixel, then by slice.
+class ObjectPoints:
+    """N points of G objects, of all sweeps; the points of a pixel have one object.
 
     Args:
-        grid: its pixels.
-        num_steps: S, sweeps of a window.
-        group, window, step, part: (V,) int64, as for `MovingPoints`.
-        x, y: (V + 1,) int64, centroid, units from the lower corner; the last entry, of no voxel, is far away.
-        num_slices: n, a power of 2.
-        of_key: (n P + n,) int64, voxel of pixel * n + part, V = none.
-        pixel_of_place: (Q,) int32 or int64, number of the occupied pixel at each place of the images, P = none.
+        owner: (N,) int64, object of each.
+        window, step: (N,) int64, which sweep: step 0 = t+1, 1 = t, ...
+        pixel: (N,) int64, number of its occupied pixel, 0 ... P - 1.
+        part: (N,) int64, height slice, 0 ... 3 (or as many as `points_of_objects` was asked for).
+        position: (2, N) float64, x and y, metres, frame of t+1; inside the region.
     """
 
-    grid: Grid
-    num_steps: int
-    group: Tensor
+    owner: Tensor
     window: Tensor
     step: Tensor
+    pixel: Tensor
     part: Tensor
-    x: Tensor
-    y: Tensor
-    num_slices: int
-    of_key: Tensor
-    pixel_of_place: Tensor
+    position: Tensor
+
+    def take(self, wanted: Tensor) -> ObjectPoints:
+        """Some of them, (N,) bool."""
+        index = flat_nonzero(wanted)
+        parts = (self.owner, self.window, self.step, self.pixel, self.part)
+        return ObjectPoints(*(values.index_select(0, index) for values in parts), self.position.index_select(1, index))
+
+
+def points_of_objects(
+    sweeps: HeightSlicedSweeps,
+    objects: Objects,
+    wanted: Tensor,
+    slice_height: float = SLICE_HEIGHT,
+    num_slices: int = NUM_SLICES,
+) -> ObjectPoints:
+    """The points of some objects in all sweeps, in the order of the batch.
+
+    Args:
+        sweeps: finest images.
+        objects: G of them.
+        wanted: (G,) bool.
+        slice_height: metres.
+        num_slices: a power of 2.
+
+    Cost: two look-ups a point, the rest for those that are kept.
+    """
+    of_pixel = F.pad(objects.pixels_of(wanted), (0, 1), value=objects.count)
+    pixel = sweeps.number.index_select(0, sweeps.place)
+    rows = flat_nonzero((of_pixel < objects.count).index_select(0, pixel))
+    pixel = pixel.index_select(0, rows).long()
+    x, y, z = sweeps.batch.positions.index_select(1, rows).unbind(0)
+    window, step = split_index(sweeps.batch.image.index_select(0, rows).long(), sweeps.num_steps)
+    part = slice_of(z, slice_height, num_slices).long()
+    return ObjectPoints(of_pixel.index_select(0, pixel), window, step, pixel, part, torch.stack((x, y)))
+
+
+class Voxels:
+    """V voxels that hold points of objects, by pixel, then by slice.
+
+    Args:
+        points: of all sweeps.
+        sweeps: finest images.
+        num_slices: of the points.
+
+    Attributes:
+        owner, window, step, part: (V,) int64, as for `ObjectPoints`.
+        x, y: (V + 1,) float64, centroid, whole units of 1/1024 m from the lower corner of the region; the last entry,
+            of no voxel, is far away.
+
+    Convention: a coordinate is rounded to the nearest unit, their mean down to a whole one.
+
+    Cost: a sort of the points.
+    """
+
+    def __init__(self, points: ObjectPoints, sweeps: HeightSlicedSweeps, num_slices: int = NUM_SLICES) -> None:
+        self._sweeps, self._num_slices = sweeps, num_slices
+        key, voxel, count = torch.unique(
+            points.pixel * num_slices + points.part, return_inverse=True, return_counts=True
+        )
+        self.x, self.y = (
+            self._centroids(values - lower, voxel, count)
+            for values, lower in zip(points.position.unbind(0), sweeps.grid.lower)
+        )
+        num_keys = num_slices * (sweeps.pixel.numel() + 1)
+        self._of_key = torch.full((num_keys,), key.numel(), dtype=torch.int64, device=key.device)
+        self._of_key.scatter_(0, key, torch.arange(key.numel(), device=key.device))
+        # Of all points of a voxel these are the same, so it does not matter which of them is written last.
+        self.owner, self.window, self.step = (
+            torch.zeros_like(key).scatter_(0, voxel, values) for values in (points.owner, points.window, points.step)
+        )
+        self.part = key & (num_slices - 1)
+
+    @staticmethod
+    def _centroids(values: Tensor, voxel: Tensor, count: Tensor) -> Tensor:
+        """(V + 1,) mean, in units, of the (N,) coordinates in each voxel."""
+        sums = torch.zeros_like(count, dtype=values.dtype).index_add_(0, voxel, whole(values * UNITS))
+        return F.pad(torch.floor(sums / count), (0, 1), value=_BEYOND)
 
     def nearest(self, window: Tensor, step: Tensor, part: Tensor, x: Tensor, y: Tensor) -> Tensor:
         """Nearest voxel of a sweep, in the 3 x 3 pixels around a place and in the slice given.
 
         Args:
             window, step, part: (K,) int64.
-            x, y: (K,) int64, units from the lower corner, anywhere.
+            x, y: (K,) float64, units from the lower corner, anywhere.
 
         Returns:
             (K,) int64, V = there is none.
-
-        Convention: of equally near ones the first in raster order.
 
         Cost: nine look-ups each.
         """
         voxel = self.around(window, step, part, x, y, 1)
         dx = self.x.index_select(0, voxel.view(-1)).view_as(voxel).sub_(x)
         dy = self.y.index_select(0, voxel.view(-1)).view_as(voxel).sub_(y)
-        distance = dx.mul_(dx).add_(dy.mul_(dy))
-        # No two keys of a column are equal.
-        key = distance.mul_(16).add_(torch.arange(9, device=x.device)[:, None]).amin(0, keepdim=True)
-        return voxel.gather(0, key & 15)[0]
+        return voxel.gather(0, dx.mul_(dx).add_(dy.mul_(dy)).argmin(0, keepdim=True))[0]
 
     def around(self, window: Tensor, step: Tensor, part: Tensor, x: Tensor, y: Tensor, reach: int) -> Tensor:
         """Voxels of a sweep in the pixels around a place, `reach` pixels each way, and in the slice given.
@@ -76,56 +141,33 @@ class Voxels:
         Returns:
             ((2 r + 1)^2, K) int64, in raster order, V = there is none.
         """
-        side = torch.full((), self.grid.pixel_size * UNITS, dtype=torch.float64, device=x.device)
+        grid = self._sweeps.grid
+        size = torch.full((), grid.pixel_size * UNITS, dtype=torch.float64, device=x.device)
         offset = torch.arange(-reach, reach + 1, device=x.device)[:, None]
-        row, col = torch.floor(y.double() / side).long() + offset, torch.floor(x.double() / side).long() + offset
-        line = ((window * self.num_steps + step) * self.grid.height + row) * self.grid.width
-        is_row, is_col = (row >= 0) & (row < self.grid.height), (col >= 0) & (col < self.grid.width)
+        row = torch.floor(y / size).long() + offset
+        col = torch.floor(x / size).long() + offset
+        line = ((window * self._sweeps.num_steps + step) * grid.height + row) * grid.width
+        is_row, is_col = (row >= 0) & (row < grid.height), (col >= 0) & (col < grid.width)
         place = (line[:, None] + col).flatten(0, 1)
         inside = (is_row[:, None] & is_col).view_as(place)
-        place.masked_fill_(~inside, self.pixel_of_place.numel() - 1)
-        pixel = self.pixel_of_place.index_select(0, place.view(-1)).view_as(place).long()
-        return self.of_key.index_select(0, pixel.mul_(self.num_slices).add_(part).view(-1)).view_as(place)
+        place.masked_fill_(~inside, self._sweeps.image.numel() - 1)
+        pixel = self._sweeps.number.index_select(0, place.view(-1)).view_as(place).long()
+        return self._of_key.index_select(0, pixel.mul_(self._num_slices).add_(part).view(-1)).view_as(place)
 
 
-def make_voxels(
-    points: MovingPoints,
-    pixel_of_place: Tensor,
-    num_pixels: int,
-    grid: Grid,
-    num_steps: int,
-    num_slices: int = NUM_SLICES,
-) -> Voxels:
-    """Voxels that hold points, and the centroids of what they hold.
+def whole(x: Tensor) -> Tensor:
+    """Nearest whole number, halves up."""
+    return torch.floor(x + 0.5)
+
+
+def meeting_weights(sigma: float, device: torch.device) -> Tensor:
+    """(2049,) float64 whole numbers: weight exp(-d^2 / 2 sigma^2) of two centroids that miss each other by d, in 256ths.
 
     Args:
-        points: of all sweeps.
-        pixel_of_place: (Q,) int32 or int64, number of the occupied pixel at each place, P = none; the last entry, P,
-            is for what lies outside of the images.
-        num_pixels: P.
-        grid: whose pixels these are.
-        num_steps: S.
-        num_slices: of the points, a power of 2.
+        sigma: metres.
+        device: where it is to lie.
 
-    Convention: a coordinate is rounded to the nearest unit, their mean down to a whole one.
-
-    Cost: a sort of the points.
+    Convention: entry i stands for d^2 from 64 i to 64 (i + 1) square units; the last one, 0, for all that is farther.
     """
-    device = points.part.device
-    key, voxel, count = torch.unique(points.pixel * num_slices + points.part, return_inverse=True, return_counts=True)
-    x, y = (_centroid(values, lower, voxel, count) for values, lower in zip(points.position.unbind(0), grid.lower))
-    of_key = torch.full((num_slices * (num_pixels + 1),), key.numel(), dtype=torch.int64, device=device)
-    of_key.scatter_(0, key, torch.arange(key.numel(), device=device))
-    # Of all points of a voxel these are the same, so it does not matter which of them is written last.
-    group, window, step = (
-        torch.zeros_like(key).scatter_(0, voxel, of_point) for of_point in (points.group, points.window, points.step)
-    )
-    part = key & (num_slices - 1)
-    return Voxels(grid, num_steps, group, window, step, part, x, y, num_slices, of_key, pixel_of_place)
-
-
-def _centroid(values: Tensor, lower: float, voxel: Tensor, count: Tensor) -> Tensor:
-    """(V + 1,) int64 mean, in units, of the (N,) coordinates in each voxel; the last entry is far away."""
-    units = torch.floor((values - lower) * UNITS + 0.5).long()
-    mean = torch.div(torch.zeros_like(count).index_add_(0, voxel, units), count, rounding_mode="floor")
-    return F.pad(mean, (0, 1), value=_FAR)
+    square = 64 * torch.arange(2048, dtype=torch.float64) + 32
+    return F.pad(whole(256 * torch.exp(square / (-2 * (sigma * UNITS) ** 2))), (0, 1)).to(device)

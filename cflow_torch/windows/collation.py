@@ -1,10 +1,10 @@
-"""The door: windows of arrays or tensors -> one checked set of tensors in the frame of t+1."""
+"""Collation: windows of arrays or tensors -> one checked batch of tensors in the frame of t+1."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Iterator, List, Optional, Sequence, Tuple
+from typing import Iterator, List, Optional, Sequence, Tuple
 
 import numpy as np
 import torch
@@ -14,29 +14,20 @@ from cflow_torch.config import Config
 from cflow_torch.ops.chunks import chunks
 from cflow_torch.ops.indices import flat_nonzero
 from cflow_torch.types import Sweep, Window
-from cflow_torch.verified.ground_residue import add_ground, no_ground
 from cflow_torch.windows.bev_grid import Grid
 from cflow_torch.windows.ego_motion import compensate, rigid_transform
+from cflow_torch.windows.ground_heights import GroundHeights
 from cflow_torch.windows.memory import require_memory
 from cflow_torch.windows.validation import (
     check_distance,
-    choose_device,
     elapsed_times,
     read_ground,
     read_positions,
     source_sweeps,
 )
 
-# Working memory that a window takes before its clusters are known: positions, pixels and temporaries of a point;
-# occupancy and cluster of a pixel of every sweep.
-_BYTES_PER_POINT = 160
+# Working memory of a pixel of every sweep (occupancy and cluster) before the clusters of a window are known.
 _BYTES_PER_PIXEL = 10
-# What the proof takes on top, if every point has a pixel of its own: lists of pixels and components; then one by one
-# descriptors of key points, voxels that are refined, cubes and the 25 around each.
-_BYTES_TO_PROVE = 170
-_BYTES_TO_REFINE = 280
-_BYTES_TO_CREEP = 560
-_BYTES_TO_NUDGE = 760
 # What windows of a group may take on a CPU where `max_memory` says nothing: about 9 of a pair, 4 of six sweeps. Fresh
 # pages of larger arrays cost more than the operations that larger groups save (windows/s in docs/benchmarks).
 _BYTES_ON_CPU = 1 << 29
@@ -61,7 +52,7 @@ class Batch:
             scales a warp (0 for step 0).
         seconds: (B, S) float64, the same in seconds, for `max_speed`.
         sources: of each window, what its result is made of.
-        ground: (2, B, Y, X) int64, heights of the ground points of t and t+1, see `no_ground`; None = nothing asks.
+        ground: of the ground points of t and t+1; None = nothing asks.
     """
 
     positions: Tensor
@@ -73,7 +64,7 @@ class Batch:
     elapsed: Tensor
     seconds: Tensor
     sources: Tuple[Source, ...]
-    ground: Optional[Tensor] = None
+    ground: Optional[GroundHeights] = None
 
 
 @dataclass(frozen=True)
@@ -89,14 +80,17 @@ class Source:
     pose_flow: Tensor
 
 
-def split_windows(windows: Sequence[Window], config: Config, grid: Grid, device: torch.device) -> List[List[Window]]:
-    """Windows in groups that fit `max_memory`, in order. The result of a window does not depend on its group.
+def split_windows(
+    windows: Sequence[Window], grid: Grid, device: torch.device, bytes_per_point: int, max_memory: Optional[float]
+) -> List[List[Window]]:
+    """Windows in groups that fit the memory, in order. The result of a window does not depend on its group.
 
     Args:
         windows: B windows, checked; an empty list gives no group.
-        config: `max_memory`; None = one group, or groups of `_BYTES_ON_CPU`.
         grid: the finest scale, whose images are the largest.
         device: where the work is done; on a CPU large groups only cost more.
+        bytes_per_point: what a method plans with for each point.
+        max_memory: bytes; None = one group, or groups of `_BYTES_ON_CPU`.
 
     Returns:
         Groups of at least one window.
@@ -105,15 +99,13 @@ def split_windows(windows: Sequence[Window], config: Config, grid: Grid, device:
         CFlowError: a window alone needs more memory than there is.
     """
     groups: List[List[Window]] = []
-    limit = config.max_memory
-    if limit is None and device.type == "cpu":
-        limit = _BYTES_ON_CPU
-    used, per_pixel = 0, _BYTES_PER_PIXEL + config.height_slices
+    if max_memory is None and device.type == "cpu":
+        max_memory = _BYTES_ON_CPU
+    used = 0
     for window in windows:
         sweeps = (window.pc1, window.pc0, *window.pch)
         points = sum(sweep.points.shape[0] for sweep in sweeps)
-        needed = _bytes_per_point(config, len(sweeps) == 2) * points
-        needed += (per_pixel * len(sweeps) + 30) * grid.height * grid.width
+        needed = bytes_per_point * points + (_BYTES_PER_PIXEL * len(sweeps) + 30) * grid.height * grid.width
         require_memory(
             needed,
             device,
@@ -121,7 +113,7 @@ def split_windows(windows: Sequence[Window], config: Config, grid: Grid, device:
             f"{grid.pixel_size} m,",
             "give a smaller point_cloud_range, larger pixel_sizes or fewer points",
         )
-        if not groups or (limit is not None and used + needed > limit):
+        if not groups or (max_memory is not None and used + needed > max_memory):
             groups.append([])
             used = 0
         groups[-1].append(window)
@@ -129,33 +121,23 @@ def split_windows(windows: Sequence[Window], config: Config, grid: Grid, device:
     return groups
 
 
-def _bytes_per_point(config: Config, is_pair: bool) -> int:
-    """What a point of a window takes. Stages of the proof follow one another: the largest counts."""
-    descriptors = config.patch_size**2  # two copies of L^2 bytes for at most half of the points
-    if config.method == "keypoints":
-        return _BYTES_PER_POINT + descriptors
-    if not config.proof:
-        return _BYTES_PER_POINT
-    return (
-        _BYTES_PER_POINT
-        + _BYTES_TO_PROVE
-        + max(
-            descriptors if config.keypoint_block > 0 else 0,
-            _BYTES_TO_REFINE if config.relocate or config.yaw else 0,
-            _BYTES_TO_CREEP if config.slow and is_pair else 0,
-            _BYTES_TO_NUDGE if config.nudge and is_pair else 0,
-        )
-    )
-
-
-def make_batch(windows: Sequence[Window], config: Config, grid: Grid, device: Any = "auto") -> Batch:
+def make_batch(
+    windows: Sequence[Window],
+    config: Config,
+    grid: Grid,
+    device: torch.device,
+    num_axes: int = 2,
+    needs_ground: bool = False,
+) -> Batch:
     """Check windows, bring every sweep into the frame of its t+1, keep what takes part.
 
     Args:
         windows: B windows, at least one.
-        config: settings; `num_history` bounds the history that is accepted.
+        config: `ego_box`, `sweep_interval`; `num_history` bounds the history that is accepted.
         grid: the region; which of the scales it belongs to does not matter here.
-        device: "auto" = that of the tensors given, else a GPU if there is one, else the CPU.
+        device: where the batch is to lie.
+        num_axes: coordinates that are kept, 2 or 3.
+        needs_ground: whether heights of the ground are kept as well.
 
     Returns:
         The batch, on one device.
@@ -166,7 +148,6 @@ def make_batch(windows: Sequence[Window], config: Config, grid: Grid, device: An
 
     Cost: linear in points; the only Python loop over sweeps, because they arrive as a list.
     """
-    chosen_device = choose_device(windows, device)
     kept = [source_sweeps(window, config) for window in windows]
     num_steps = 1 + max(len(sources) for sources in kept)
     elapsed, seconds = np.zeros((2, len(windows), num_steps))
@@ -183,14 +164,11 @@ def make_batch(windows: Sequence[Window], config: Config, grid: Grid, device: An
         for window in windows
     ]
 
-    needs_z = config.sectional_view or config.clustering == "hdbscan" or config.height_slices > 0 or config.proof
-    num_axes = 3 if needs_z else 2
-    needs_ground = config.proof and config.clearance is not None
-    ground = no_ground(len(windows), grid, chosen_device) if needs_ground else None
+    ground = GroundHeights(len(windows), grid, device) if needs_ground else None
     most = sum(sweep.points.shape[0] for _, _, _, sweep in sweeps)
-    positions = torch.empty((num_axes, most), dtype=torch.float64, device=chosen_device)
-    takes_part = torch.ones(most, dtype=torch.bool, device=chosen_device)
-    image = torch.empty(most, dtype=torch.int32, device=chosen_device)
+    positions = torch.empty((num_axes, most), dtype=torch.float64, device=device)
+    takes_part = torch.ones(most, dtype=torch.bool, device=device)
+    image = torch.empty(most, dtype=torch.int32, device=device)
     stop, num_newest, sources = 0, 0, []
     for step, index, name, sweep in sweeps:
         start, transform = stop, None
@@ -199,13 +177,13 @@ def make_batch(windows: Sequence[Window], config: Config, grid: Grid, device: An
             check_distance(transform, name)
         if step == 1:
             with torch.inference_mode(False):  # becomes part of the result
-                pose_flow = torch.zeros((sweep.points.shape[0], 3), dtype=torch.float32, device=chosen_device)
+                pose_flow = torch.zeros((sweep.points.shape[0], 3), dtype=torch.float32, device=device)
             sources.append(Source(slice(start, start + len(pose_flow)), pose_flow))
         for rows, raw, moved, inside, ground_inside in _pieces(
-            sweep, name, transform, 3 if step == 1 else num_axes, grid, config, chosen_device
+            sweep, name, transform, 3 if step == 1 else num_axes, grid, config, device
         ):
             if ground is not None and ground_inside is not None and step <= 1:
-                add_ground(ground, index, moved.index_select(1, flat_nonzero(ground_inside)), grid)
+                ground.add(index, moved.index_select(1, flat_nonzero(ground_inside)))
             if step == 1:  # all rows
                 points = slice(stop, stop + inside.numel())
                 positions[:, points] = moved[:num_axes]
@@ -227,8 +205,8 @@ def make_batch(windows: Sequence[Window], config: Config, grid: Grid, device: An
         num_newest=num_newest,
         num_windows=len(windows),
         num_steps=num_steps,
-        elapsed=torch.as_tensor(elapsed, device=chosen_device),
-        seconds=torch.as_tensor(seconds, device=chosen_device),
+        elapsed=torch.as_tensor(elapsed, device=device),
+        seconds=torch.as_tensor(seconds, device=device),
         sources=tuple(sources),
         ground=ground,
     )

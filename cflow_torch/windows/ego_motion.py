@@ -10,8 +10,10 @@ import torch
 from torch import Tensor
 
 from cflow_torch.types import Array, CFlowError, as_numpy
-from cflow_torch.windows.resolution import COARSEST_POSE, resolution
+from cflow_torch.windows.validation import resolution
 
+# A pose moves all points: its type must hold it to so many metres.
+_COARSEST_POSE = 0.01
 # How far R R^T may be from the identity. Poses stored in float32 are within 1e-6.
 _ORTHOGONALITY = 1e-3
 
@@ -28,8 +30,8 @@ def rigid_transform(matrix: Any, name: str, reach: float = 0.0) -> np.ndarray:
         (4, 4) float64.
 
     Raises:
-        CFlowError: wrong shape, not finite, not a rotation with a translation, or of a type that holds it to more than
-            `COARSEST_POSE` only.
+        CFlowError: wrong shape, not finite, not a rotation with a translation, or of a type that does not hold it to a
+            centimetre.
     """
     dtype = getattr(matrix, "dtype", None)
     try:
@@ -54,10 +56,10 @@ def rigid_transform(matrix: Any, name: str, reach: float = 0.0) -> np.ndarray:
         )
     farthest = max(reach, *(abs(row[3]) for row in rows[:3]))
     step = max(resolution(kind, farthest) for kind in (np.dtype(np.float64), dtype) if kind is not None)
-    if step > COARSEST_POSE:
+    if step > _COARSEST_POSE:
         raise CFlowError(
             f"{name} is {dtype or 'float64'}, which at {farthest:.9g} m only holds multiples of {step:g} m (at most "
-            f"{COARSEST_POSE} m): give it as float64, never rounded to less, or poses in a frame whose origin is nearer"
+            f"{_COARSEST_POSE} m): give it as float64, never rounded to less, or poses in a frame whose origin is nearer"
         )
     return result
 

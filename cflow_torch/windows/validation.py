@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import suppress
-from typing import Any, List, Sequence, Tuple
+from typing import Any, List, Optional, Sequence, Tuple
 
 import numpy as np
 import torch
@@ -12,8 +13,6 @@ from torch import Tensor
 from cflow_torch.config import Config
 from cflow_torch.types import CFlowError, Sweep, Window, as_numpy
 
-# Sweeps further apart than this many times the step from t to t+1 are no steady history: counting steps would mislead.
-_LONGEST_GAP = 2.5
 # No sweep of a window is further away than this, metres: 2 s at 50 m/s.
 _FARTHEST_POSE = 100.0
 # Sweeps that differ at all differ in their first points: those are compared before the whole clouds are.
@@ -23,8 +22,12 @@ _ALL_ROWS = slice(None)
 _MOST_COLUMNS = 1000
 
 
-def check_windows(windows: Any) -> None:
+def check_windows(windows: Any, config: Optional[Config] = None) -> None:
     """Refuse what is not a list of windows of sweeps of arrays.
+
+    Args:
+        windows: anything.
+        config: settings whose region and finest pixels the points must be fine enough for; None = not looked at.
 
     Raises:
         CFlowError: what is wrong, by the name that users know it by.
@@ -40,6 +43,8 @@ def check_windows(windows: Any) -> None:
             if not isinstance(sweep, Sweep):
                 raise CFlowError(f"{name} is {type(sweep).__name__}: give cflow_torch.Sweep(points, ...)")
             _check_points(sweep.points, name)
+            if config is not None:
+                _check_resolution(sweep.points.dtype, name, config)
 
 
 def source_sweeps(window: Window, config: Config) -> List[Tuple[str, Sweep, int]]:
@@ -82,6 +87,28 @@ def _check_points(points: Any, name: str) -> None:
         raise CFlowError(f"{name} has dtype {points.dtype}: give floating-point metres")
 
 
+def resolution(dtype: Any, distance: float) -> float:
+    """Difference between neighbouring numbers of a type at a distance from 0, in its unit; 0 for whole numbers."""
+    if isinstance(dtype, torch.dtype):
+        epsilon = torch.finfo(dtype).eps if dtype.is_floating_point else 0.0
+    else:
+        epsilon = float(np.finfo(dtype).eps) if np.issubdtype(dtype, np.floating) else 0.0
+    return math.ldexp(epsilon, math.frexp(distance)[1] - 1) if distance else 0.0
+
+
+def _check_resolution(dtype: Any, name: str, config: Config) -> None:
+    """Refuse points of a type that is coarser than half of the finest pixels at the far end of the region."""
+    bounds, pixel_size = config.point_cloud_range, config.pixel_sizes[-1]
+    farthest = max(abs(bound) for bound in (*bounds[:2], *bounds[3:5]))
+    step = resolution(dtype, farthest)
+    if step > 0.5 * pixel_size:
+        raise CFlowError(
+            f"{name} is {dtype}, which at {farthest:g} m (the far end of point_cloud_range) only holds multiples of "
+            f"{step:g} m, too coarse for pixels of {pixel_size:g} m: give points of a wider type, or a frame whose "
+            "origin is nearer (point_cloud_range and poses with it), or larger pixel_sizes"
+        )
+
+
 def check_plain(array: Any, name: str) -> None:
     """Refuse arrays that hold something else than they seem to."""
     if isinstance(array, Tensor) and array.layout != torch.strided:
@@ -116,16 +143,7 @@ def elapsed_times(
             f"time stamps of the window are out of order (nanoseconds before t+1: {gaps}): "
             "give pc1, pc0, pch1, ... from newest to oldest"
         )
-    if config.use_timestamps:
-        return [(gap / gaps[0], gap / 1e9) for gap in gaps]
-    steps = [after - before for before, after in zip([0, *(s for _, _, s in sources)], (s for _, _, s in sources))]
-    worst = max(interval / (step * gaps[0]) for interval, step in zip(intervals, steps))
-    if worst > _LONGEST_GAP:
-        raise CFlowError(
-            f"the sweeps are unevenly spaced (nanoseconds before t+1: {gaps}; one gap is {worst:.1f} times that from t "
-            "to t+1): pass use_timestamps=True, or leave out the sweeps before the gap"
-        )
-    return [(float(step), gap / 1e9) for (_, _, step), gap in zip(sources, gaps)]
+    return [(gap / gaps[0], gap / 1e9) for gap in gaps]
 
 
 def _nanoseconds(sweep: Sweep, name: str) -> int:

@@ -10,12 +10,12 @@ import numpy as np
 
 from cflow_torch.data.aevascenes.npz_strings import npz_contents, read_npz_member
 from cflow_torch.data.boxes import Boxes, flow_from_boxes
+from cflow_torch.data.categories import CATEGORY_INDEX
 from cflow_torch.data.folders import find_folders
 from cflow_torch.data.json_file import is_number, is_whole, read_json, shown
 from cflow_torch.data.log import FlowLabels
 from cflow_torch.data.names import inside
 from cflow_torch.data.paths import Place, as_path
-from cflow_torch.data.categories import CATEGORY_INDEX
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.ego_motion import relative_transform
 

@@ -8,6 +8,7 @@ from typing import ClassVar, List, Mapping, NamedTuple, Optional, Sequence, Tupl
 import numpy as np
 
 from cflow_torch.data.boxes import Boxes, flow_from_boxes, points_in_box
+from cflow_torch.data.categories import CATEGORY_INDEX
 from cflow_torch.data.json_file import shown
 from cflow_torch.data.log import FlowLabels
 from cflow_torch.data.names import inside
@@ -15,7 +16,6 @@ from cflow_torch.data.nuscenes.categories import NUSCENES_CATEGORIES, OWN_TRAILE
 from cflow_torch.data.nuscenes.tables import LidarChain, SceneSource, Tables, find_scenes
 from cflow_torch.data.nuscenes.tracks import TrackBoxes, Tracks, poses_at, transforms
 from cflow_torch.data.paths import Place, as_path, read_bytes
-from cflow_torch.data.categories import CATEGORY_INDEX
 from cflow_torch.types import CFlowError, Sweep
 
 MAX_UNIT_LAG = 60_000  # microseconds from the sweep of another LiDAR to that of the reference; half a turn and a bit

@@ -11,6 +11,7 @@ import pyarrow as pa
 
 from cflow_torch.data.arrow_file import shortened, texts
 from cflow_torch.data.boxes import Boxes, flow_from_boxes
+from cflow_torch.data.categories import CATEGORY_INDEX
 from cflow_torch.data.log import FlowLabels
 from cflow_torch.data.paths import Place, as_path, remote_errors
 from cflow_torch.data.waymo.parquet import (
@@ -31,7 +32,6 @@ from cflow_torch.data.waymo.parquet import (
     read_images,
 )
 from cflow_torch.data.waymo.range_image import LASERS, NO_LABEL_ZONE, TOP, LaserCalibration, range_image_points
-from cflow_torch.data.categories import CATEGORY_INDEX
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.ego_motion import relative_transform, rigid_transform
 

@@ -12,6 +12,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from cflow_torch.data.categories import META_CLASSES
 from cflow_torch.data.names import safe_name
 from cflow_torch.data.waymo.parquet import (
     BOX,
@@ -25,7 +26,6 @@ from cflow_torch.data.waymo.parquet import (
     VEHICLE_POSE,
 )
 from cflow_torch.data.waymo.range_image import LASERS, TOP, LaserCalibration
-from cflow_torch.data.categories import META_CLASSES
 from cflow_torch.simulator.recording import Recording, UnitReturns
 from cflow_torch.simulator.writers.waymo_encoding import encode_images, poses_of_shots
 from cflow_torch.types import CFlowError

@@ -1,0 +1,71 @@
+"""Sweeps as images: every sweep warped by the flow so far and projected to the bird's-eye view (Eq. 3d_to_bev)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Optional
+
+import torch
+from torch import Tensor
+
+from cflow_torch.ops.chunks import chunks
+from cflow_torch.windows.bev_grid import Grid
+from cflow_torch.windows.collation import Batch
+
+
+@dataclass(frozen=True)
+class ProjectedSweeps:
+    """Occupancy images of all sweeps of all windows.
+
+    Args:
+        batch: points of all windows.
+        grid: the BEV.
+        flow: (A, P) float64, metres per sweep interval, flow so far of every point before t+1; None = none yet.
+        occupancy: (B, S, H, W) bool; index 0 of S is sweep t+1.
+        pixel: (P,) int64, flat index into `occupancy`; its size for points that do not take part.
+    """
+
+    batch: Batch
+    grid: Grid
+    flow: Optional[Tensor]
+    occupancy: Tensor
+    pixel: Tensor
+
+    def positions(self) -> Tensor:
+        """(A, P) float64, metres, frame of t+1: the points where they were projected."""
+        if self.flow is None:
+            return self.batch.positions
+        before = slice(self.batch.num_newest, None)
+        return torch.cat((self.batch.positions[:, : before.start], _warp(self.batch, self.flow, before)), 1)
+
+
+def project(batch: Batch, flow: Optional[Tensor], grid: Grid) -> ProjectedSweeps:
+    """Warp every sweep m by (t+1-m) times its flow so far and draw it.
+
+    Args:
+        batch: points of all windows.
+        flow: as in `ProjectedSweeps`.
+        grid: the BEV.
+
+    Convention: points that are warped out of the region do not take part at this scale.
+
+    Cost: linear in points.
+    """
+    num_images, num_points = batch.num_windows * batch.num_steps, len(batch.image)
+    pixel = torch.empty(num_points, dtype=torch.int64, device=batch.image.device)
+    for points in chunks(0, batch.num_newest, pixel.device):
+        pixel[points] = grid.pixel_of_image(batch.positions[:, points], batch.image[points], num_images)
+    for points in chunks(batch.num_newest, num_points, pixel.device):
+        positions, takes_part = batch.positions[:, points], batch.takes_part[points]
+        if flow is not None:
+            positions = _warp(batch, flow, points)
+            takes_part = grid.contains(positions).logical_and_(takes_part)
+        pixel[points] = grid.pixel_of_image(positions, batch.image[points], num_images, takes_part)
+    occupancy = grid.draw(pixel, num_images).unflatten(0, (batch.num_windows, batch.num_steps))
+    return ProjectedSweeps(batch, grid, flow, occupancy, pixel)
+
+
+def _warp(batch: Batch, flow: Tensor, points: slice) -> Tensor:
+    """(A, K) float64, metres: some points before t+1, moved by the flow so far."""
+    intervals = batch.elapsed.flatten().index_select(0, batch.image[points])
+    return (flow[:, points] * intervals).add_(batch.positions[:, points])

@@ -1,0 +1,70 @@
+"""Rigid motion in the plane: a translation and a turn about a centre; the flow of points of objects that turn."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Tuple
+
+import torch
+from torch import Tensor
+
+from cflow_torch.model import Motion
+from cflow_torch.ops.indices import flat_nonzero
+
+
+@dataclass(frozen=True)
+class RigidMotion:
+    """Motion of G objects per sweep interval.
+
+    Args:
+        flow: (G, 2) float64, x and y at the centre, metres, axes of ego1.
+        turn: (G,) float64, tangent of half the angle, counter-clockwise.
+        centre: (G, 2) float64, x and y, metres, frame of t+1.
+    """
+
+    flow: Tensor
+    turn: Tensor
+    centre: Tensor
+
+    @classmethod
+    def translation(cls, flow: Tensor) -> RigidMotion:
+        """Objects that do not turn."""
+        still = torch.zeros_like(flow)
+        return cls(flow, still[:, 0], still)
+
+    def flow_at(self, which: Tensor, x: Tensor, y: Tensor) -> Tuple[Tensor, Tensor]:
+        """x and y of the flow, metres per interval, of points of t (K,), by their object and their place in metres."""
+        (c_x, c_y), (v_x, v_y) = (values.index_select(0, which).unbind(1) for values in (self.centre, self.flow))
+        x, y = x - c_x, y - c_y
+        turned_x, turned_y = rotate(self.turn.index_select(0, which), x, y)
+        return (turned_x - x) + v_x, (turned_y - y) + v_y
+
+
+def rotate(turn: Tensor, x: Tensor, y: Tensor) -> Tuple[Tensor, Tensor]:
+    """Places turned about the origin by the angle whose half has the tangent `turn`."""
+    n = 1 + turn * turn
+    cos, sin = (1 - turn * turn) / n, 2 * turn / n
+    return cos * x - sin * y, sin * x + cos * y
+
+
+@dataclass(frozen=True)
+class TurningMotion(Motion):
+    """Motion of clusters that may turn.
+
+    Args:
+        turn: (M + 1,) float64, as in `RigidMotion`.
+        centre: (M + 1, 2) float64, likewise.
+    """
+
+    turn: Tensor = torch.empty(0)
+    centre: Tensor = torch.empty(0)
+
+    def residual_flow(self, points: slice, positions: Tensor) -> Tensor:
+        """(K, 3) float32 flow of some points, each where it lies in a motion that turns."""
+        cluster = self.cluster(points)
+        flow = self.flow.index_select(0, cluster)
+        turns = flat_nonzero((self.turn != 0).index_select(0, cluster))
+        rigid = RigidMotion(self.flow[:, :2], self.turn, self.centre)
+        x, y = rigid.flow_at(cluster.index_select(0, turns), *positions[:2].index_select(1, turns).unbind(0))
+        flow[turns, 0], flow[turns, 1] = x + 0.0, y + 0.0  # no -0.0
+        return flow.float()

@@ -1,0 +1,67 @@
+"""Height of the ground around each place, from the ground points of a window."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from cflow_torch.windows.bev_grid import Grid
+
+# Side of the blocks in which heights are averaged, metres; with the eight blocks around, 6 m x 6 m.
+_BLOCK = 2.0
+# Fewer ground points than this in 6 m x 6 m say nothing.
+_LEAST_POINTS = 5
+# Heights are whole centimetres, bounded so that no sum overflows; unknown ground lies deeper than any point.
+_HIGHEST = 10**10
+_UNKNOWN = -(1 << 40)
+
+
+class GroundHeights:
+    """Sums over blocks of 2 m x 2 m. Sums of integers: neither the order of the points nor that of the pieces matters.
+
+    Args:
+        num_windows: B.
+        grid: the region.
+        device: where the sums lie.
+    """
+
+    def __init__(self, num_windows: int, grid: Grid, device: torch.device) -> None:
+        self._lower = grid.lower
+        shape = tuple(int((grid.upper[axis] - grid.lower[axis]) / _BLOCK) + 1 for axis in (1, 0))
+        self._heights = torch.zeros((num_windows, *shape), dtype=torch.int64, device=device)
+        self._counts = torch.zeros_like(self._heights)
+
+    def add(self, window: int, positions: Tensor) -> None:
+        """Count ground points, (3, N) float64, metres, frame of t+1, inside the region."""
+        block = self._block(positions)
+        height = torch.floor(positions[2] * 100).clamp_(-_HIGHEST, _HIGHEST).long()
+        self._heights[window].view(-1).index_add_(0, block, height)
+        self._counts[window].view(-1).index_add_(0, block, torch.ones_like(height))
+
+    def mean(self) -> Tensor:
+        """(B, Y, X) int64, centimetres: mean over 3 x 3 blocks, rounded down; far below everything where they hold fewer
+        than five points."""
+        _, rows, cols = self._heights.shape
+        heights, counts = F.pad(self._heights, (1, 1, 1, 1)), F.pad(self._counts, (1, 1, 1, 1))
+        around = [(slice(down, down + rows), slice(right, right + cols)) for down in range(3) for right in range(3)]
+        height, count = (sum(values[:, y, x] for y, x in around) for values in (heights, counts))
+        mean = torch.div(height, count.clamp(min=1), rounding_mode="floor")
+        return torch.where(count >= _LEAST_POINTS, mean, torch.full_like(mean, _UNKNOWN))
+
+    def below(self, positions: Tensor, window: Tensor, mean: Tensor) -> Tensor:
+        """(N,) float64, centimetres: height of the ground around points.
+
+        Args:
+            positions: (3, N) float64, metres; of points outside the region the answer means nothing.
+            window: (N,) int64.
+            mean: as `mean` gives it.
+        """
+        block = torch.add(self._block(positions), window, alpha=mean.shape[1] * mean.shape[2])
+        return mean.view(-1).double().index_select(0, block.clamp_(0, mean.numel() - 1))
+
+    def _block(self, positions: Tensor) -> Tensor:
+        """(N,) int32 block of positions inside the region; nothing there is below the lower end."""
+        row = (positions[1] - self._lower[1]).div_(_BLOCK).int()
+        col = (positions[0] - self._lower[0]).div_(_BLOCK).int()
+        return col.add_(row, alpha=self._heights.shape[2])
