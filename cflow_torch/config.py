@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import asdict, dataclass, field, fields, replace
 from numbers import Integral, Real
-from typing import Any, Dict, Optional, Tuple, Type
+from typing import Any, Dict, Optional, Tuple, Type, TypeVar
 
 from cflow_torch.types import CFlowError
 
+Kind = TypeVar("Kind", bound="Config")
 # Whole numbers stay below this: they are compared with tensors of int64 and of float64.
 _MOST = 2**53
 
@@ -90,7 +91,12 @@ class Config:
             object.__setattr__(self, f.name, _checked(f.name, getattr(self, f.name), str(f.type), f.metadata))
         _check_space(self.pixel_sizes, self.point_cloud_range, self.ego_box)
 
-    def replace(self, **overrides: Any) -> Config:
+    @property
+    def num_history(self) -> int:
+        """h, sweeps before t that are used."""
+        return 0
+
+    def replace(self: Kind, **overrides: Any) -> Kind:
         """A copy with some fields changed; an unknown field raises `CFlowError` that lists the fields."""
         return replace(self, **_known(type(self), overrides))
 
@@ -101,7 +107,9 @@ class Config:
 
 @dataclass(frozen=True)
 class _WithHistory(Config):
-    num_history: int = setting(0, "h, sweeps before t that are used (Sec. leverage_past_pcs)", low=0)
+    num_history: int = setting(  # type: ignore[assignment]
+        0, "h, sweeps before t that are used (Sec. leverage_past_pcs)", low=0
+    )
     correlation: str = setting(
         "fft", "engine of the correlation: fft or conv (conv2d); the same result", choices=("fft", "conv")
     )
@@ -138,11 +146,6 @@ class KeypointsConfig(Config):
     gate_radius: float = setting(
         3.0, "farthest match, metres per 0.1 s between the sweeps (3 = 30 m/s)", low=1e-6, high=1e6
     )
-
-    @property
-    def num_history(self) -> int:
-        """0: key points are matched between t and t+1."""
-        return 0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -265,7 +268,7 @@ def make_config(preset: Optional[str] = None, method: Optional[str] = None, **ov
 
 
 def config_from(settings: Dict[str, Any]) -> Config:
-    """The settings that a dictionary holds, such as `Config.as_dict` gives it; those not given are the method's defaults.
+    """The settings of a dictionary such as `Config.as_dict` gives it; those not given are the method's defaults.
 
     Raises:
         CFlowError: no or an unknown method, an unknown field, an invalid value.

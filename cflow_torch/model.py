@@ -27,7 +27,7 @@ class Motion:
         cluster_id: (M + 1,) int64, number of the cluster counted from 0 in its window.
         score: (M + 1,) float32.
         confidence: (M + 1,) float32, see `FlowResult`; None = the method does not say.
-        before: (A, P) float64, metres per sweep interval, flow that coarser scales gave each point; None = no scale did.
+        before: (A, P) float64, metres per sweep interval, flow of each point by coarser scales; None = there are none.
     """
 
     of_place: Tensor

@@ -30,7 +30,7 @@ def stage(name: str) -> Iterator[None]:
 
 @contextmanager
 def stage_seconds() -> Iterator[Dict[str, float]]:
-    """Collects the seconds of each stage by the host's clock (on a GPU: the time to queue its work) while it is open."""
+    """Collects seconds of each stage by the host's clock (on a GPU: the time to queue its work) while it is open."""
     before, _watched.seconds = getattr(_watched, "seconds", None), {}
     try:
         yield _watched.seconds

@@ -56,7 +56,7 @@ def task(cfg: DictConfig) -> None:
     layout = choose_layout(cfg.device, workers, threads, batch, os.environ)
     config = make_model(cfg).config
     sources = find_logs(cfg)
-    contents = _contents(cfg, config.proof)
+    contents = _contents(cfg, config.method == "verified")
     identity = make_identity(config, sources.reader, sources.settings, contents)
     job = Job(
         config=config,

@@ -35,7 +35,7 @@ from cflow_torch.data.log import Log, RecentSweeps, window
 from cflow_torch.data.log_check import check_log
 from cflow_torch.data.paths import is_remote
 from cflow_torch.fleet.progress import frames as counted
-from cflow_torch.model import CoarseToFine
+from cflow_torch.model import SceneFlowModel
 from cflow_torch.types import CFlowError, FlowResult, Window
 from cflow_torch.viz.animation import save_animation
 from cflow_torch.viz.bev import plot_flow, save_picture
@@ -122,7 +122,7 @@ def _title(log: Log, index: int) -> str:
     return f"{log.log_id}, sweep {log.timestamps[index]}"
 
 
-def _flow(cfg: DictConfig, model: CoarseToFine, log: Log, sweeps: Window) -> Any:
+def _flow(cfg: DictConfig, model: SceneFlowModel, log: Log, sweeps: Window) -> Any:
     if cfg.truth not in (True, False, "auto"):
         raise CFlowError(f"truth={cfg.truth}: give true, false or auto")
     (result,) = model([sweeps])
@@ -148,7 +148,7 @@ def _truth(cfg: DictConfig, log: Log, result: FlowResult) -> Optional[np.ndarray
     return np.where(labels.is_valid[:, None], truth, np.nan)
 
 
-def _clusters(cfg: DictConfig, model: CoarseToFine, log: Log, sweeps: Window) -> Any:
+def _clusters(cfg: DictConfig, model: SceneFlowModel, log: Log, sweeps: Window) -> Any:
     (result,) = model([sweeps])
     return plot_clusters(
         sweeps.pc0.points,
@@ -159,7 +159,7 @@ def _clusters(cfg: DictConfig, model: CoarseToFine, log: Log, sweeps: Window) ->
     )
 
 
-PICTURES: Dict[str, Callable[[DictConfig, CoarseToFine, Log, Window], Any]] = {
+PICTURES: Dict[str, Callable[[DictConfig, SceneFlowModel, Log, Window], Any]] = {
     "flow": _flow,
     "clusters": _clusters,
     "keypoints": lambda cfg, model, log, sweeps: plot_keypoints(sweeps, model.config),
@@ -170,7 +170,7 @@ PICTURES: Dict[str, Callable[[DictConfig, CoarseToFine, Log, Window], Any]] = {
 }
 
 
-def _animate(cfg: DictConfig, model: CoarseToFine, output: Path) -> Path:
+def _animate(cfg: DictConfig, model: SceneFlowModel, output: Path) -> Path:
     """Flow of several pairs, then their pictures; nothing is written if one of them fails."""
     if cfg.format not in FORMATS:
         raise CFlowError(f"format={cfg.format}: give one of {', '.join(FORMATS)}")

@@ -17,14 +17,14 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from cflow_torch import __version__, estimate
-from cflow_torch.config import Config
+from cflow_torch.config import config_from
 from cflow_torch.data.catalog import find_sources, open_log
 from cflow_torch.data.log import Log, RecentSweeps, window
 from cflow_torch.data.names import is_safe_name
 from cflow_torch.data.paths import as_path
 from cflow_torch.data.records import write_text
 from cflow_torch.fleet.progress import frames, say
-from cflow_torch.model import CoarseToFine
+from cflow_torch.model import SceneFlowModel
 from cflow_torch.simulator.benchmark import benchmark_logs, format_of
 from cflow_torch.stages import FlowModel
 from cflow_torch.types import CFlowError, FlowResult, Window
@@ -50,14 +50,14 @@ def versions() -> Dict[str, str]:
     }
 
 
-def make_model(cfg: DictConfig) -> CoarseToFine:
+def make_model(cfg: DictConfig) -> SceneFlowModel:
     """The method that `cfg.model` and `cfg.device` describe.
 
     Raises:
         CFlowError: an unknown or invalid setting.
     """
     settings: Dict[str, Any] = OmegaConf.to_container(cfg.model, resolve=True)  # type: ignore[assignment]
-    return estimate.make_model(Config().replace(**settings), cfg.device)
+    return estimate.make_model(config_from(settings), cfg.device)
 
 
 def number(cfg: DictConfig, key: str, kind: Type[float] = int, or_null: bool = False) -> Any:

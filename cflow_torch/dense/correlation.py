@@ -8,7 +8,7 @@ from typing import Iterator, List, NamedTuple, Optional, Tuple
 import torch
 from torch import Tensor
 
-from cflow_torch.config import Config
+from cflow_torch.config import DenseConfig
 from cflow_torch.dense.clustering import Clusters
 from cflow_torch.dense.packing import Packing, Search, pack
 from cflow_torch.dense.projection import ProjectedSweeps
@@ -64,7 +64,7 @@ class Correlation(NamedTuple):
     searched: int
 
 
-def correlate(clusters: Clusters, sweeps: ProjectedSweeps, config: Config) -> Estimates:
+def correlate(clusters: Clusters, sweeps: ProjectedSweeps, config: DenseConfig) -> Estimates:
     """Displacement m -> t+1 of every cluster for every earlier sweep m (Alg. scene_flow_1view, view = BEV).
 
     Args:

@@ -74,7 +74,7 @@ def pack(pairs: TemplatePairs) -> Tuple[Search, Packing]:
     Raises:
         CFlowError: a cluster that is too long, or takes more memory than there is.
 
-    An image takes H + low_y rows of W + low_x samples, and a target is packed low_y rows and low_x columns further down.
+    An image takes H + low_y rows of W + low_x samples, and a target stands low_y rows and low_x columns further down.
     Then shift (dy, dx) of the correlation stands at sample (dy + low_y) * stride + dx + low_x, and no other pair of
     pixels adds to the samples that are searched: neither across the end of a row nor across that of the image.
     """

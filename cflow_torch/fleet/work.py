@@ -22,7 +22,7 @@ from cflow_torch.estimate import make_model
 from cflow_torch.fleet.job import Begun, Done, Event, Failed, Job, Opened, Unit
 from cflow_torch.fleet.line import Line, Outcome
 from cflow_torch.fleet.manifest import check_claimed, claim_log, complete_frames, frame_file
-from cflow_torch.stages import FlowModel, stage_clock
+from cflow_torch.stages import FlowModel, stage_seconds
 from cflow_torch.types import CFlowError, FlowResult, Window
 
 # Batches that are read ahead, and that wait to be written: enough to even out, little enough for flat memory.
@@ -154,7 +154,7 @@ class Worker:
             return
         start, results = time.perf_counter(), None
         try:
-            with stage_clock() as stages:
+            with stage_seconds() as stages:
                 results = self._model([frame.content for frame in good])  # type: ignore[misc]
         except Trouble as error:
             if len(good) == 1:

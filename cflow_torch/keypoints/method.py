@@ -51,9 +51,8 @@ class CorrelationFlowKeypoints(CoarseToFine):
             matches = match(pc0, pc1, match_radius(sweeps.batch, pixel_size, config), config)
         with stage("densify"):
             dense = densify(occupancy[:, 1], pc0.place.index_select(0, matches.source), matches, pixel_size, config)
-            of_pixel = torch.full(
-                (occupancy.numel() + 1,), len(dense.shift), dtype=torch.int32, device=pc0.place.device
-            )
+            size = occupancy.numel() + 1
+            of_pixel = torch.full((size,), len(dense.shift), dtype=torch.int32, device=occupancy.device)
             # Image b of sweep t is image 2 b + 1 of the occupancy.
             image_size = occupancy[0, 0].numel()
             in_occupancy = dense.pixel + (dense.pixel // image_size + 1) * image_size

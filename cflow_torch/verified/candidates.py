@@ -1,4 +1,4 @@
-"""Motion candidates of every component: peaks of the correlation with each sweep, their pool, motions from elsewhere."""
+"""Motion candidates of components: peaks of the correlation with each sweep, their pool, motions from elsewhere."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Height-sliced occupancy: the finest images of all sweeps with four height slices a pixel, and their occupied pixels."""
+"""Height-sliced occupancy: the finest images of all sweeps with four height slices a pixel, and what is occupied."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _HIGHEST_SLICE = 2.0**56
 
 @dataclass(frozen=True)
 class HeightSlicedSweeps:
-    """All sweeps of all windows as the verified method sees them: bits of height slices by pixel. P pixels are occupied.
+    """All sweeps of all windows as the verified method sees them: bits of height slices of P occupied pixels.
 
     Args:
         batch: the points.
@@ -176,7 +176,7 @@ def slice_of(z: Tensor, slice_height: float, num_slices: int = NUM_SLICES) -> Te
 
 
 def set_bit(image: Tensor, index: Tensor, bit: int) -> None:
-    """Set a bit of an image at some flat indices. What is written at one is the same for all, so order means nothing."""
+    """Set a bit of an image at some flat indices. All that write at one write the same: order means nothing."""
     image.index_copy_(0, index, image.index_select(0, index).bitwise_or_(bit))
 
 

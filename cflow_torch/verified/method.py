@@ -62,7 +62,8 @@ class VerifiedFlow(SceneFlowModel):
 
     def motion(self, batch: Batch) -> TurningMotion:
         """Motion of everything in a batch, by occupied pixel; ids number what moves together or stands together."""
-        config, levels, key_points = self.config, [], None
+        config, key_points = self.config, None
+        levels: List[VerifiedLevel] = []
         with stage("project"):
             sweeps = HeightSlicedSweeps.of(batch, self.grid(config.pixel_sizes[-1]), config.min_height)
         if config.thorough:
@@ -85,7 +86,7 @@ class VerifiedFlow(SceneFlowModel):
             return _by_pixel(objects, rigid, levels[-1].score, confidence, sweeps, config.thorough)
 
     def scales(self) -> List[Tuple[int, bool]]:
-        """Of each level, coarse to fine: finest pixels a side of its pixels, and whether its components are undilated."""
+        """Of each level, coarse to fine: finest pixels a side of its pixels; are its components undilated?"""
         sizes = self.config.pixel_sizes
         levels = [(round(size / sizes[-1]), False) for size in sizes]
         return [*levels, (1, True)] if self.config.thorough else levels

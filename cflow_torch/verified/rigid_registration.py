@@ -59,7 +59,7 @@ def register(points: ObjectPoints, sweeps: HeightSlicedSweeps, flow: Tensor) -> 
 
 
 class _Sums(NamedTuple):
-    """Normal equations, (G,) float64 each: sums over pairs of weight w, time k, arm r, distance e that is left, units."""
+    """Normal equations, (G,) float64 each: sums over pairs of weight w, time k, arm r, error e; lengths in units."""
 
     s: Tensor  # w k^2
     s_x: Tensor  # w k^2 r_x

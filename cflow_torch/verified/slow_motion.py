@@ -143,7 +143,7 @@ class _Cubes:
         return shifts.index_select(0, best).masked_fill(~is_significant[:, None], 0), is_significant
 
     def gains(self, shifts: Tensor) -> Tuple[Tensor, Tensor]:
-        """Weight that every cube gains by a shift, and its square, summed over the cubes of each object: (G, C) float64.
+        """(G, C) float64 each: weight that cubes gain by a shift, and its square, summed over each object.
 
         Args:
             shifts: (C, G or 1, 2) float64, (x, y), units, from t to t+1.

@@ -12,7 +12,6 @@ from cflow_torch.ops.indices import flat_nonzero, split_index
 from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import NUM_SLICES, SLICE_HEIGHT, HeightSlicedSweeps, slice_of
 
-
 # Centroids are whole numbers of 1 / UNITS metre: their sums are exact, in any order of the points and on any device.
 UNITS = 1024
 _BEYOND = 2.0**28  # units: a place far beyond every other
@@ -40,8 +39,10 @@ class ObjectPoints:
     def take(self, wanted: Tensor) -> ObjectPoints:
         """Some of them, (N,) bool."""
         index = flat_nonzero(wanted)
-        parts = (self.owner, self.window, self.step, self.pixel, self.part)
-        return ObjectPoints(*(values.index_select(0, index) for values in parts), self.position.index_select(1, index))
+        owner, window, step, pixel, part = (
+            values.index_select(0, index) for values in (self.owner, self.window, self.step, self.pixel, self.part)
+        )
+        return ObjectPoints(owner, window, step, pixel, part, self.position.index_select(1, index))
 
 
 def points_of_objects(
@@ -161,7 +162,7 @@ def whole(x: Tensor) -> Tensor:
 
 
 def meeting_weights(sigma: float, device: torch.device) -> Tensor:
-    """(2049,) float64 whole numbers: weight exp(-d^2 / 2 sigma^2) of two centroids that miss each other by d, in 256ths.
+    """(2049,) float64 whole numbers: weights exp(-d^2 / 2 sigma^2) of centroids that miss each other by d, in 256ths.
 
     Args:
         sigma: metres.

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Optional, Sequence, Tuple, Union
 
 import numpy as np
 
-from cflow_torch.config import Config
+from cflow_torch.config import DenseConfig
 from cflow_torch.data.atomic import atomic_file
 from cflow_torch.types import Array, CFlowError, FlowResult, as_numpy
 from cflow_torch.viz.legend import CORNERS, draw_scale, draw_wheel
@@ -137,7 +137,7 @@ def ground_rows(is_ground: Optional[Array], count: int) -> np.ndarray:
 
 def view_of(position: np.ndarray, point_cloud_range: Optional[Sequence[float]]) -> Tuple[np.ndarray, np.ndarray]:
     """((2, 2) low and high corner of the view, (N,) bool is inside)."""
-    default = Config().point_cloud_range
+    default = DenseConfig().point_cloud_range
     bounds = np.asarray(default if point_cloud_range is None else point_cloud_range, np.float64)
     if bounds.shape != (6,) or not (bounds[:3] < bounds[3:]).all():
         raise CFlowError(

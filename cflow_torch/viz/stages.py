@@ -12,17 +12,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cflow_torch.config import Config
-from cflow_torch.dense.clustering import cluster
-from cflow_torch.dense.height import slices_of_pixels
-from cflow_torch.dense.method import correlate
-from cflow_torch.dense.packing import Images
-from cflow_torch.dense.templates import make_jobs
-from cflow_torch.keypoints.descriptors import describe, detect
-from cflow_torch.keypoints.match_candidates import gate
+from cflow_torch.config import Config, DenseConfig, KeypointsConfig
+from cflow_torch.dense.clustering import find_clusters
+from cflow_torch.dense.correlation import correlate
+from cflow_torch.dense.projection import project
+from cflow_torch.dense.templates import Images, make_pairs
+from cflow_torch.keypoints.descriptors import describe
+from cflow_torch.keypoints.match_candidates import match_radius
 from cflow_torch.keypoints.matching import match
-from cflow_torch.model import project
-from cflow_torch.ops.bits import unpack_bits
 from cflow_torch.ops.cross_correlation import cross_correlate
 from cflow_torch.ops.indices import flat_nonzero
 from cflow_torch.types import CFlowError, FlowResult, Window
@@ -96,12 +93,12 @@ def scales(window: Window, config: Config) -> Tuple[List[Scale], FlowResult]:
     """Every scale of a run, coarse to fine, and the run's result.
 
     Raises:
-        CFlowError: the method has no scales one after the other (`proof`), or bad input.
+        CFlowError: the method has no scales one after the other, or bad input.
     """
     steps, result = watch(window, config)
     found = []
     for step in steps:
-        points = step.batch.sources[0].points
+        points = step.sweeps.batch.sources[0].points
         after = step.flow_after()
         before = torch.zeros_like(after) if step.flow is None else step.flow
         of_point = step.motion.cluster_id.index_select(0, step.motion.cluster(points))
@@ -122,36 +119,32 @@ def cluster_correlation(window: Window, config: Config, cluster_id: Optional[int
 
     Args:
         window: sweeps.
-        config: `method="dense"`, without `proof`, clusters by components.
+        config: `method="dense"`, clusters by components.
         cluster_id: as in `FlowResult`; None = the most conspicuous mover: of the clusters seen in t, the one with most
             pixels times metres of motion, all scales together.
 
     Raises:
         CFlowError: a method without such a map, no such cluster, or bad input.
     """
-    if config.method != "dense" or config.clustering != "components":
+    if not isinstance(config, DenseConfig) or config.clustering != "components":
         raise CFlowError(
-            f"method={config.method}, clustering={config.clustering}: only the dense method with clusters by "
+            f"method={config.method}: only the dense method with clusters by "
             'components has a correlation map per cluster: give make_config("paper"), or model=paper'
         )
     (*_, last), _ = watch(window, config)
-    batch, grid = last.batch, last.grid
-    images, place = project(batch, last.flow, grid)
-    clusters, _ = cluster(images, grid.pixel_size, config)
-    slices = None
-    if config.height_slices > 0:
-        slices = slices_of_pixels(batch, batch.positions[2], place, clusters, grid, config)
-    jobs = make_jobs(clusters, batch, grid.pixel_size, config.max_speed, slices)
-    estimates, scores, _ = correlate(clusters, batch, grid, config, slices)
+    sweeps, grid = project(last.sweeps.batch, last.flow, last.sweeps.grid), last.sweeps.grid
+    clusters, _, _ = find_clusters(sweeps, config)
+    pairs = make_pairs(clusters, sweeps.batch, grid.pixel_size, config.max_speed)
+    estimates = correlate(clusters, sweeps, config)
 
-    of_pair = flat_nonzero(jobs.source == 0)
-    available = jobs.cluster.index_select(0, of_pair)
+    of_pair = flat_nonzero(pairs.source == 0)
+    available = pairs.cluster.index_select(0, of_pair)
     if available.numel() == 0:
         raise CFlowError("no cluster has points in both sweeps: there is no correlation to draw")
     total = _total_flow(last, clusters.window.numel())
     if cluster_id is None:
         length = total[available].norm(dim=1)
-        pixels = jobs.template.energy(jobs.cluster.numel()).index_select(0, of_pair)
+        pixels = pairs.template.energy(pairs.cluster.numel()).index_select(0, of_pair)
         chosen = int((length * pixels).argmax())
     elif cluster_id in available:
         chosen = int((available == cluster_id).nonzero())
@@ -162,21 +155,21 @@ def cluster_correlation(window: Window, config: Config, cluster_id: Optional[int
         )
     number = int(available[chosen])
     size, first = clusters.size[number], clusters.first[number]
-    template = _draw(jobs.template, int(of_pair[chosen]), size, config)
-    target = _draw(jobs.target, number, size, config)
+    template = _draw(pairs.template, int(of_pair[chosen]), size)
+    target = _draw(pairs.target, number, size)
     ncc = _ncc_map(template, target, config.correlation)
-    if jobs.radius is not None:
+    if pairs.radius is not None:
         dy, dx = (torch.arange(n) - n // 2 for n in ncc.shape)
-        reach = jobs.radius[of_pair[chosen]]
+        reach = pairs.radius[of_pair[chosen]]
         ncc[dy[:, None] ** 2 + dx**2 > reach * reach] = torch.nan
     lower = np.array(grid.lower[:2]) + grid.pixel_size * first.flip(0).numpy()
-    shift = (estimates[number, 0, :2] / grid.pixel_size).flip(0).numpy()
+    shift = (estimates.displacement[number, 0, :2] / grid.pixel_size).flip(0).numpy()
     return ClusterCorrelation(
         cluster_id=number,
-        images=Occupancy(template.amax(0).numpy() > 0, target.amax(0).numpy() > 0, lower, grid.pixel_size),
+        images=Occupancy(template.numpy() > 0, target.numpy() > 0, lower, grid.pixel_size),
         ncc=ncc.numpy(),
         shift=shift,
-        score=float(scores[number, 0]),
+        score=float(estimates.score[number, 0]),
         flow=last.motion.flow[number].numpy(),
         total=total[number].numpy(),
     )
@@ -188,14 +181,12 @@ def keypoint_matches(window: Window, config: Config) -> KeyPointMatches:
     Raises:
         CFlowError: another method, or bad input.
     """
-    if config.method != "keypoints":
+    if not isinstance(config, KeypointsConfig):
         raise CFlowError(f'method={config.method}: key points are matched by make_config("keypoints"), model=keypoints')
     (*_, last), _ = watch(window, config)
-    occupancy, _ = project(last.batch, last.flow, last.grid)
-    is_key_point = detect(occupancy)
-    _, pc1 = describe(occupancy[:, 0], is_key_point[:, 0], config.patch_size)
-    _, pc0 = describe(occupancy[:, 1], is_key_point[:, 1], config.patch_size)
-    matches = match(pc0, pc1, gate(last.batch, last.grid.pixel_size, config), config)
+    sweeps = project(last.sweeps.batch, last.flow, last.sweeps.grid)
+    pc1, pc0 = (describe(sweeps.occupancy[:, step], config.patch_size) for step in (0, 1))
+    matches = match(pc0, pc1, match_radius(sweeps.batch, sweeps.grid.pixel_size, config), config)
     return KeyPointMatches(
         images=last.occupancy(last.flow),
         key_points=torch.stack((pc0.row, pc0.col), 1).numpy(),
@@ -215,7 +206,7 @@ def _rows(flow: Tensor, points: slice) -> np.ndarray:
 
 def _total_flow(step: Step, num_clusters: int) -> Tensor:
     """(M, 3) float64, median flow of the points of t in each cluster, all scales so far together; 0 without points."""
-    points = step.batch.sources[0].points
+    points = step.sweeps.batch.sources[0].points
     cluster = step.motion.cluster(points).numpy().astype(np.int64)
     cluster[cluster == num_clusters] = -1
     median, _ = group_medians(cluster, _rows(step.flow_after(), points))
@@ -224,20 +215,19 @@ def _total_flow(step: Step, num_clusters: int) -> Tensor:
     return total
 
 
-def _draw(images: Images, number: int, size: Tensor, config: Config) -> Tensor:
-    """(n, H, W) float32, one of a set of images, slice by slice."""
+def _draw(images: Images, number: int, size: Tensor) -> Tensor:
+    """(H, W) float32, one of a set of images."""
     pixel = flat_nonzero(images.image == number)
-    image = torch.zeros(size.tolist(), dtype=torch.uint8)
-    slices = 1 if images.slices is None else images.slices[pixel]
-    image[images.row[pixel], images.col[pixel]] = torch.as_tensor(slices, dtype=torch.uint8)
-    return unpack_bits(image[None], max(config.height_slices, 1))[0]
+    image = torch.zeros(size.tolist())
+    image[images.row[pixel], images.col[pixel]] = 1
+    return image
 
 
 def _ncc_map(template: Tensor, target: Tensor, engine: str) -> Tensor:
     """(H, W) float64, as `ClusterCorrelation.ncc`. A window of ones over the target counts its pixels."""
-    height, width = template.shape[1:]
-    images = torch.zeros(3, len(template), 2 * height, 2 * width)
-    images[:, :, :height, :width] = torch.stack((template, torch.ones_like(template), target))
+    height, width = template.shape
+    images = torch.zeros(3, 2 * height, 2 * width)
+    images[:, :height, :width] = torch.stack((template, torch.ones_like(template), target))
     counts = cross_correlate(images, 2, torch.zeros(2, dtype=torch.int64), engine).round().double()
     # Half of the images is free: negative shifts stand at the far end.
     dy, dx = ((torch.arange(n) - n // 2) % (2 * n) for n in (height, width))

@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from cflow_torch.config import Config
+from cflow_torch.dense.coarse_to_fine import CoarseToFine
 from cflow_torch.dense.method import CorrelationFlow
+from cflow_torch.dense.projection import ProjectedSweeps, project
 from cflow_torch.keypoints.method import CorrelationFlowKeypoints
-from cflow_torch.model import CoarseToFine, Motion, project
+from cflow_torch.model import Motion
 from cflow_torch.types import CFlowError, FlowResult, Window
-from cflow_torch.windows.bev_grid import Grid
-from cflow_torch.windows.collation import Batch
 
 
 @dataclass(frozen=True)
@@ -39,21 +39,20 @@ class Step:
     """What one scale was given, and what it found.
 
     Args:
-        batch: points of the one window.
+        sweeps: the one window, warped by the flow so far.
         flow: (A, P) float64, metres per sweep interval, flow so far; None = this is the first scale.
-        grid: the BEV at this scale.
         motion: what it adds.
     """
 
-    batch: Batch
+    sweeps: ProjectedSweeps
     flow: Optional[Tensor]
-    grid: Grid
     motion: Motion
 
     def flow_after(self) -> Tensor:
         """(A, P) float64, metres per sweep interval: flow so far with this scale's; 0 for points of t+1."""
-        points = slice(self.batch.num_newest, None)
-        total = torch.zeros_like(self.batch.positions)
+        batch = self.sweeps.batch
+        points = slice(batch.num_newest, None)
+        total = torch.zeros_like(batch.positions)
         self.motion.flow_of(self.motion.cluster(points), out=total[:, points])
         if self.flow is not None:
             total[:, points] += self.flow[:, points]
@@ -61,25 +60,26 @@ class Step:
 
     def occupancy(self, flow: Optional[Tensor]) -> Occupancy:
         """The pair at this scale, points warped by a flow as `project` takes it."""
-        (images,), _ = project(self.batch, flow, self.grid)
+        grid = self.sweeps.grid
+        (images,) = project(self.sweeps.batch, flow, grid).occupancy
         t1, t = images[:2].numpy()
-        return Occupancy(t, t1, np.array(self.grid.lower[:2]), self.grid.pixel_size)
+        return Occupancy(t, t1, np.array(grid.lower[:2]), grid.pixel_size)
 
 
 def watch(window: Window, config: Config) -> Tuple[List[Step], FlowResult]:
     """Run the method on one window, on the CPU, and keep what passes from scale to scale."""
-    if config.proof:
+    if config.method == "verified":
         raise CFlowError(
-            "with proof=True (presets default and fast) motions are hypotheses of all scales at once: there is no "
-            'single correlation map and no coarse to fine to draw. Give make_config("paper"), or model=paper'
+            "presets default and fast weigh motions of all scales at once: there is no single correlation map and no "
+            'coarse to fine to draw. Give make_config("paper"), or model=paper'
         )
     steps: List[Step] = []
     variant: Type[CoarseToFine] = CorrelationFlowKeypoints if config.method == "keypoints" else CorrelationFlow
 
     class Watched(variant):  # type: ignore[valid-type,misc]
-        def motion_at_scale(self, batch: Batch, flow: Optional[Tensor], grid: Grid) -> Motion:
-            motion = super().motion_at_scale(batch, flow, grid)
-            steps.append(Step(batch, None if flow is None else flow.clone(), grid, motion))
+        def motion_at_scale(self, sweeps: ProjectedSweeps) -> Motion:
+            motion = super().motion_at_scale(sweeps)
+            steps.append(Step(sweeps, None if sweeps.flow is None else sweeps.flow.clone(), motion))
             return motion
 
     (result,) = Watched(config, "cpu")([window])

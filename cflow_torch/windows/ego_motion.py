@@ -59,7 +59,7 @@ def rigid_transform(matrix: Any, name: str, reach: float = 0.0) -> np.ndarray:
     if step > _COARSEST_POSE:
         raise CFlowError(
             f"{name} is {dtype or 'float64'}, which at {farthest:.9g} m only holds multiples of {step:g} m (at most "
-            f"{_COARSEST_POSE} m): give it as float64, never rounded to less, or poses in a frame whose origin is nearer"
+            f"{_COARSEST_POSE} m): give it as float64, never rounded to less, or poses in a nearer frame"
         )
     return result
 

@@ -40,12 +40,12 @@ class GroundHeights:
         self._counts[window].view(-1).index_add_(0, block, torch.ones_like(height))
 
     def mean(self) -> Tensor:
-        """(B, Y, X) int64, centimetres: mean over 3 x 3 blocks, rounded down; far below everything where they hold fewer
-        than five points."""
+        """(B, Y, X) int64, centimetres: mean over 3 x 3 blocks, rounded down; far below everything where they hold
+        fewer than five points."""
         _, rows, cols = self._heights.shape
-        heights, counts = F.pad(self._heights, (1, 1, 1, 1)), F.pad(self._counts, (1, 1, 1, 1))
-        around = [(slice(down, down + rows), slice(right, right + cols)) for down in range(3) for right in range(3)]
-        height, count = (sum(values[:, y, x] for y, x in around) for values in (heights, counts))
+        sums = F.pad(torch.stack((self._heights, self._counts)), (1, 1, 1, 1))
+        around = [sums[:, :, down : down + rows, right : right + cols] for down in range(3) for right in range(3)]
+        height, count = torch.stack(around).sum(0)
         mean = torch.div(height, count.clamp(min=1), rounding_mode="floor")
         return torch.where(count >= _LEAST_POINTS, mean, torch.full_like(mean, _UNKNOWN))
 

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from cflow_torch.config import Config, make_config
+from cflow_torch.config import CONFIGS, Config, make_config
 from cflow_torch.data.hdf5.frames import beside_harness, harness_pose_flow
 from cflow_torch.estimate import make_model
 from cflow_torch.integrations.opensceneflow.batch import Sample, read_batch
@@ -19,7 +19,7 @@ from cflow_torch.types import CFlowError, FlowResult
 from cflow_torch.windows.ego_motion import rigid_transform
 
 OUTPUTS = ("full", "valid")
-_SETTINGS = tuple(f.name for f in fields(Config) if f.name != "num_history")
+_SETTINGS = tuple(dict.fromkeys(f.name for kind in CONFIGS.values() for f in fields(kind) if f.name != "num_history"))
 
 
 class CFlow(nn.Module):
@@ -62,7 +62,7 @@ class CFlow(nn.Module):
                 UserWarning,
                 stacklevel=2,
             )
-        config = make_config("default", **{name: settings[name] for name in settings if name in _SETTINGS})
+        config = make_config(None, **{name: settings[name] for name in settings if name in _SETTINGS})
         self.estimator = make_model(_with_history(config, num_frames), device)
         if output not in OUTPUTS:
             raise CFlowError(f"output={output!r}: give one of {', '.join(map(repr, OUTPUTS))}")
