@@ -23,7 +23,7 @@ def as_numpy(value: Array, dtype: Optional[Any] = None) -> np.ndarray:
 class CFlowError(ValueError):
     """The only error this package raises for bad input, bad files and bad settings.
 
-    The message says what was given, what is allowed, and how to mend it.
+    The message says what was given, what is allowed, and how to put it right.
     """
 
 
@@ -73,9 +73,9 @@ class FlowResult:
         score: (N,) float32 in [0, 1], NCC at the peak (t -> t+1, finest scale); 0 where cluster_id is -1.
         is_valid: (N,) bool, True for the rows that took part: finite, neither ground nor of the
             vehicle itself (`Config.ego_box`), inside the range.
-        confidence: (N,) float32 in [0, 1], with `Config.proof`, else None: estimated probability that the end-point
+        confidence: (N,) float32 in [0, 1] by the verified method, else None: estimated probability that the end-point
             error of the residual flow (of a point that moves or stands still) is below 0.1 m per sweep interval; 0
-            where is_valid is False. From a table fitted on simulated drives, see docs/confidence.md.
+            where is_valid is False. From a table fitted on simulated drives, see docs/verified.md.
     """
 
     residual_flow: Tensor

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Optional, Tuple
+from typing import Tuple
 
 import torch
 from torch import Tensor
@@ -16,20 +16,19 @@ class WindowCounts:
     Args:
         image, row, col: (P,) int64, which image and where in it; each pixel once.
         size: (N, 2) int64, height and width H, W of each image.
-        weight: (P,) int64, what each pixel counts; None = 1.
 
     Cost: linear in the area of the images.
     """
 
-    def __init__(self, image: Tensor, row: Tensor, col: Tensor, size: Tensor, weight: Optional[Tensor] = None) -> None:
+    def __init__(self, image: Tensor, row: Tensor, col: Tensor, size: Tensor) -> None:
         self._size = size
-        self._energy = _weighted_counts(image, len(size), weight)
+        self._energy = torch.bincount(image, minlength=len(size))
         # Pixels in the rows above, and in the columns to the left, of every row and column.
         self._edges = size + 1
         self._first_edge = self._edges.cumsum(0) - self._edges
         above, left = (
-            _weighted_counts(
-                self._first_edge[:, axis].index_select(0, image) + place + 1, int(self._edges[:, axis].sum()), weight
+            torch.bincount(
+                self._first_edge[:, axis].index_select(0, image) + place + 1, minlength=int(self._edges[:, axis].sum())
             ).cumsum(0)
             for axis, place in enumerate((row, col))
         )
@@ -39,9 +38,8 @@ class WindowCounts:
         area = size[:, 0] * self._stride
         self._start = area.cumsum(0) - area
         pixel = self._start.index_select(0, image) + row * self._stride.index_select(0, image) + col + 1
-        drawn = torch.zeros(int(area.sum()), dtype=torch.int32, device=size.device)
-        drawn = drawn.index_fill_(0, pixel, 1) if weight is None else drawn.scatter_(0, pixel, weight.int())
-        self._table = drawn.cumsum(0)
+        table = torch.zeros(int(area.sum()), dtype=torch.int32, device=size.device)
+        self._table = table.index_fill_(0, pixel, 1).cumsum(0)
 
     def bounds(self, image: Tensor, dy: Tensor, dx: Tensor) -> Tuple[Tensor, Tensor]:
         """(K,) int64 each, `count` is at least the first and at most the second. Args as for `count`."""
@@ -77,9 +75,3 @@ class WindowCounts:
         begin, end = shift.clamp(min=0), torch.minimum(length, length + shift)
         return before.index_select(0, first + end) - before.index_select(0, first + begin)
 
-
-def _weighted_counts(index: Tensor, num_segments: int, weight: Optional[Tensor]) -> Tensor:
-    """(num_segments,) int64: sum of the weights of each segment, of ones without any."""
-    if weight is None:
-        return torch.bincount(index, minlength=num_segments)
-    return torch.zeros(num_segments, dtype=torch.int64, device=index.device).index_add_(0, index, weight)
