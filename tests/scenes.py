@@ -1,23 +1,23 @@
-"""Small seeded windows and exact comparisons shared by the tests."""
+"""Small seeded windows and comparisons of results, shared by the tests."""
 
 from __future__ import annotations
 
 from dataclasses import fields
-from typing import List, Tuple
+from typing import Iterator, List, Tuple
 
 import numpy as np
 import pytest
 import torch
 
-from cflow_torch.config import Config
+from cflow_torch.config import CONFIGS, Config
 from cflow_torch.types import FlowResult, Sweep, Window
 
 RANGE = (-8.0, -7.0, -2.0, 8.0, 7.0, 3.0)
 
 
-def config(**overrides) -> Config:
+def config(method: str = "dense", **overrides) -> Config:
     """Settings for the small scenes: 0.25 m pixels, 16 m x 14 m, components longer than 5 m are split."""
-    return Config(pixel_sizes=(0.25,), point_cloud_range=RANGE, max_extent=5.0).replace(**overrides)
+    return CONFIGS[method](pixel_sizes=(0.25,), point_cloud_range=RANGE, max_extent=5.0).replace(**overrides)
 
 
 def pose(x: float, y: float, yaw: float, z: float = 0.0) -> np.ndarray:
@@ -94,16 +94,27 @@ def same_bits(a: torch.Tensor, b: torch.Tensor) -> bool:
     return a.shape == b.shape and a.dtype == b.dtype and a.cpu().numpy().tobytes() == b.cpu().numpy().tobytes()
 
 
-def assert_same(a: FlowResult, b: FlowResult) -> None:
-    """Two results agree to the last bit in every field."""
+def assert_same(a: FlowResult, b: FlowResult, atol: float = 1e-6) -> None:
+    """Two results are equal: clusters and validity exactly, flow, score and confidence to `atol` (metres)."""
+    for name, left, right in _pairs(a, b):
+        differ = (left != right) if not left.is_floating_point() else ~((left - right).abs() <= atol)
+        assert not differ.any(), f"{name} differs in {int(differ.sum())} places, first {differ.nonzero()[:3].tolist()}"
+
+
+def assert_same_bits(a: FlowResult, b: FlowResult) -> None:
+    """Two results are equal to the last bit: the same window, computed in another batch on the same device."""
+    for name, left, right in _pairs(a, b):
+        assert same_bits(left, right), f"{name} differs in {int((left != right).sum())} places"
+
+
+def _pairs(a: FlowResult, b: FlowResult) -> Iterator[Tuple[str, torch.Tensor, torch.Tensor]]:
+    """Name and both values of every field, on the CPU, of the same type and shape."""
     for field in fields(FlowResult):
         left, right = getattr(a, field.name), getattr(b, field.name)
-        if left is None or right is None:
-            assert left is right, field.name
-            continue
-        assert left.dtype == right.dtype and left.shape == right.shape, field.name
-        differ = (left.cpu() != right.cpu()).nonzero()
-        assert same_bits(left, right), f"{field.name} differs in {len(differ)} places, first {differ[:3].tolist()}"
+        assert (left is None) == (right is None), field.name
+        if left is not None:
+            assert left.dtype == right.dtype and left.shape == right.shape, field.name
+            yield field.name, left.cpu(), right.cpu()
 
 
 def assert_zeros(result: FlowResult, num_points: int) -> None:

@@ -14,13 +14,18 @@ class Keypoints(NamedTuple):
         pixels: (K, 2) int64, row and column.
         descriptors: (K, L * L) bool.
         energies: (K,) int64, E = number of ones of each descriptor, its squared norm; at least 1, the centre.
-        number_at: (H, W) int64, number of the key point at each pixel, -1 elsewhere.
     """
 
     pixels: np.ndarray
     descriptors: np.ndarray
     energies: np.ndarray
-    number_at: np.ndarray
+
+
+def described_keypoints(image: np.ndarray, patch_size: int) -> Keypoints:
+    """Key points of an image (H, W) bool and their descriptors of side L = `patch_size`."""
+    pixels = detect_keypoints(image)
+    descriptors = describe(image, pixels, patch_size)
+    return Keypoints(pixels, descriptors, descriptors.sum(axis=1))
 
 
 def detect_keypoints(image: np.ndarray) -> np.ndarray:
@@ -63,13 +68,3 @@ def describe(image: np.ndarray, keypoints: np.ndarray, patch_size: int) -> np.nd
     for k, (r, c) in enumerate(keypoints.tolist()):
         descriptors[k] = padded[r : r + patch_size, c : c + patch_size].ravel()
     return descriptors
-
-
-def described_keypoints(image: np.ndarray, patch_size: int) -> Keypoints:
-    """Key points of an image (H, W) bool, their descriptors of side L = `patch_size`, and where to find them."""
-    pixels = detect_keypoints(image)
-    descriptors = describe(image, pixels, patch_size)
-    number_at = np.full(image.shape, -1, dtype=np.int64)
-    for number, (r, c) in enumerate(pixels.tolist()):
-        number_at[r, c] = number
-    return Keypoints(pixels, descriptors, descriptors.sum(axis=1), number_at)

@@ -54,7 +54,12 @@ def median_direction(directions: Sequence[Tuple[float, float]]) -> Tuple[float, 
         mean_x, mean_y = mean_x + u_x, mean_y + u_y
     if mean_x == 0 and mean_y == 0:
         mean_x, mean_y = directions[0]
-    ordered = sorted(directions, key=lambda u: diamond_angle(mean_x, mean_y, u[0], u[1]))
+
+    def angle(u: Tuple[float, float]) -> float:
+        """From the mean to u, counter-clockwise."""
+        return math.atan2(mean_x * u[1] - mean_y * u[0] + 0.0, mean_x * u[0] + mean_y * u[1])
+
+    ordered = sorted(directions, key=angle)
     middle = len(ordered) // 2
     if len(ordered) % 2 == 1:
         return ordered[middle]
@@ -62,15 +67,3 @@ def median_direction(directions: Sequence[Tuple[float, float]]) -> Tuple[float, 
     w_x, w_y = first[0] + second[0], first[1] + second[1]
     norm = math.sqrt(w_x * w_x + w_y * w_y)
     return (w_x / norm, w_y / norm) if norm > 0 else first
-
-
-def diamond_angle(mean_x: float, mean_y: float, u_x: float, u_y: float) -> float:
-    """Angle of u from the mean, counter-clockwise, in (-2, 2] instead of (-pi, pi]: monotone, no trigonometry."""
-    along = mean_x * u_x + mean_y * u_y
-    across = mean_x * u_y - mean_y * u_x
-    size = abs(along) + abs(across)
-    if size == 0:  # only if the mean underflows
-        return 0.0
-    if along >= 0:
-        return across / size
-    return 2 - across / size if across >= 0 else -2 - across / size
