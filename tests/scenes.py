@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Iterator, List, Tuple
 
 import numpy as np
 import pytest
 import torch
 
-from cflow_torch.config import CONFIGS, Config
+from cflow_torch.config import CONFIGS, Config, VerifiedConfig
 from cflow_torch.types import FlowResult, Sweep, Window
+from cflow_torch.verified.height_slices import HeightSlicedSweeps
+from cflow_torch.windows.bev_grid import Grid
+from cflow_torch.windows.collation import make_batch
 
 RANGE = (-8.0, -7.0, -2.0, 8.0, 7.0, 3.0)
 
@@ -87,6 +90,32 @@ def scene(
         stamp = 1_700_000_000_000_000_000 - 100_000_000 * k - int(k > 0) * int(rng.integers(0, 20_000_000))
         sweeps.append(Sweep(points[order], is_ground[order], T_world_ego if poses else None, stamp if stamps else None))
     return Window(pc0=sweeps[1], pc1=sweeps[0], pch=tuple(sweeps[2:]))
+
+
+def sweeps_of(windows: List[Window], settings: VerifiedConfig) -> HeightSlicedSweeps:
+    """Windows as the verified method sees them."""
+    box = settings.point_cloud_range
+    grid = Grid(settings.pixel_sizes[-1], box[:3], box[3:])
+    batch = make_batch(windows, settings, grid, torch.device("cpu"), 3, settings.min_height is not None)
+    return HeightSlicedSweeps.of(batch, grid, settings.min_height)
+
+
+def reordered(window: Window, seed: int = 0) -> Tuple[Window, np.ndarray]:
+    """Points of every sweep in another order, and the order of those of pc0."""
+    rng = np.random.default_rng(seed)
+    sweeps = [window.pc0, window.pc1, *window.pch]
+    orders = [rng.permutation(len(sweep.points)) for sweep in sweeps]
+    mixed = [
+        replace(s, points=s.points[order], is_ground=None if s.is_ground is None else s.is_ground[order])
+        for s, order in zip(sweeps, orders)
+    ]
+    return Window(mixed[0], mixed[1], tuple(mixed[2:])), orders[0]
+
+
+def rows_of(result: FlowResult, rows: np.ndarray) -> FlowResult:
+    """Some rows of a result."""
+    values = {f.name: getattr(result, f.name) for f in fields(FlowResult)}
+    return FlowResult(**{name: None if v is None else v[torch.from_numpy(rows)] for name, v in values.items()})
 
 
 def same_bits(a: torch.Tensor, b: torch.Tensor) -> bool:
