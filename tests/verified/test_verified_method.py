@@ -8,7 +8,16 @@ import numpy as np
 import pytest
 import torch
 from oracle import reference_flow
-from scenes import LABELINGS, assert_same, assert_same_bits, config, needs_gpu, reordered, rows_of, scene
+from scenes import (
+    assert_same,
+    assert_same_bits,
+    config,
+    needs_gpu,
+    needs_kornia_labelling,
+    reordered,
+    rows_of,
+    scene,
+)
 from turning_car import MODEL, car_of, turning_car, upright_box
 
 from cflow_torch import Sweep, VerifiedFlow, Window, make_config
@@ -92,11 +101,11 @@ def test_alone_or_in_a_batch_in_any_order_of_points():
         assert_same_bits(model([mixed])[0], rows_of(result, order))
 
 
-@pytest.mark.parametrize("engines", [{"correlation": "conv"}, *({"labeling": label} for label in LABELINGS[1].values)])
+@pytest.mark.parametrize(
+    "engines", [{"correlation": "conv"}, pytest.param({"labeling": "kornia"}, marks=needs_kornia_labelling)]
+)
 def test_engines_do_not_matter(engines):
-    window = scene(6, num_history=1)
-    settings = config("verified", num_history=1)
-    pytest.importorskip("kornia", minversion="0.9")
+    window, settings = scene(6, num_history=1), config("verified", num_history=1)
     assert_same(VerifiedFlow(settings.replace(**engines))([window])[0], VerifiedFlow(settings)([window])[0])
 
 
