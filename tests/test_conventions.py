@@ -286,16 +286,6 @@ def test_displacements_are_whole_pixels():
     assert flow_of(ell(), ell(1.4)).residual_flow[0].tolist() == [1, 0, 0]
 
 
-@pytest.mark.parametrize("engines", [{"correlation": "conv"}, {"max_memory": 1}])
-def test_engines_and_limits_of_memory_change_no_bit(engines):
-    rng = np.random.default_rng(1)
-    pc0 = rng.uniform(-15, 15, (40, 3))
-    pc1 = pc0 + rng.normal(0, 1.0, (40, 3))
-    one, other = flow_of(pc0, pc1).numpy(), flow_of(pc0, pc1, **engines).numpy()
-    assert len(set(one["cluster_id"].tolist())) > 3
-    assert all(one[name].tobytes() == other[name].tobytes() for name in one)
-
-
 # -------------------------------------------------------------------------------------------------------- files
 
 
