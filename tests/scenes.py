@@ -8,8 +8,10 @@ from typing import Iterator, List, Tuple
 import numpy as np
 import pytest
 import torch
+from oracle import reference_flow
 
 from cflow_torch.config import CONFIGS, Config, VerifiedConfig
+from cflow_torch.estimate import make_model
 from cflow_torch.types import FlowResult, Sweep, Window
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 from cflow_torch.windows.bev_grid import Grid
@@ -128,6 +130,13 @@ def assert_same(a: FlowResult, b: FlowResult, atol: float = 1e-6) -> None:
     for name, left, right in _pairs(a, b):
         differ = (left != right) if not left.is_floating_point() else ~((left - right).abs() <= atol)
         assert not differ.any(), f"{name} differs in {int(differ.sum())} places, first {differ.nonzero()[:3].tolist()}"
+
+
+def flow_as_oracle(window: Window, settings: Config) -> FlowResult:
+    """The result of the method of the settings, which is the oracle's."""
+    (result,) = make_model(settings)([window])
+    assert_same(result, reference_flow(window, settings))
+    return result
 
 
 def assert_same_bits(a: FlowResult, b: FlowResult) -> None:

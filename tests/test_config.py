@@ -63,32 +63,21 @@ def test_invalid_values_are_refused_and_the_allowed_ones_named(method, field, va
         make_config(method=method, **{field: value})
 
 
-@pytest.mark.parametrize("sizes", [(), 0.1, "fine", (0.0,), (-0.1,), (math.nan,), (INF,), (0.1, 0.2), (0.2, 0.2), None])
-def test_pixel_sizes_that_are_none(sizes):
-    with pytest.raises(CFlowError, match="pixel_sizes.*give"):
-        DenseConfig(pixel_sizes=sizes)
-
-
-@pytest.mark.parametrize(
-    "region",
-    [
-        35,
-        None,
-        (-35, -35, 35, 35),
-        (35, -35, -3, -35, 35, 3),
-        (-35, math.nan, -3, 35, 35, 3),
-        (-INF, -35, -3, 35, 35, 3),
+SPACE = {
+    "pixel_sizes": [(), 0.1, "fine", (0.0,), (-0.1,), (math.nan,), (INF,), (0.1, 0.2), (0.2, 0.2), None],
+    "point_cloud_range": [
+        *(35, None, (-35, -35, 35, 35), (35, -35, -3, -35, 35, 3)),
+        *((-35, math.nan, -3, 35, 35, 3), (-INF, -35, -3, 35, 35, 3)),
     ],
-)
-def test_regions_that_are_none(region):
-    with pytest.raises(CFlowError, match="point_cloud_range.*give"):
-        DenseConfig(point_cloud_range=region)
+    "ego_box": [(1, 2, 3), (1.0, 0.0, 0.0, 1.0), (-INF, -1, 1, 1), (math.nan, -1, 1, 1), 3],
+}
 
 
-@pytest.mark.parametrize("box", [(1, 2, 3), (1.0, 0.0, 0.0, 1.0), (-INF, -1, 1, 1), (math.nan, -1, 1, 1), 3])
-def test_boxes_that_are_none(box):
-    with pytest.raises(CFlowError, match="ego_box.*give"):
-        DenseConfig(ego_box=box)
+@pytest.mark.parametrize("field", SPACE)
+def test_pixels_regions_and_boxes_that_are_none(field):
+    for value in SPACE[field]:
+        with pytest.raises(CFlowError, match=f"{field}.*give"):
+            DenseConfig(**{field: value})
 
 
 def test_an_unknown_setting_lists_the_fields():

@@ -48,12 +48,6 @@ def test_arguments_that_make_no_sense(arguments, complaint):
     assert isinstance(caught.value, ValueError)
 
 
-def test_a_stack_of_sweeps_is_a_sequence_of_sweeps():
-    given = {"pch": P1[None], "num_history": 1, "preset": "paper"}
-    one = estimate_flow(P0, P1, T_ego1_ego0=EYE, T_ego1_egoh=EYE[None], **given)
-    assert_same_bits(one, estimate_flow(P0, P1, **given))
-
-
 @pytest.mark.parametrize("method", ["dense", "verified"])
 def test_the_call_is_the_module(method):
     window, settings = scene(6, num_history=2), config(method, num_history=2)

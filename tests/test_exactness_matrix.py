@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import warnings
-from contextlib import contextmanager
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any, Callable, Dict, Iterator, List, Tuple
+from typing import Any, Callable, Dict, List, Tuple
 
 import numpy as np
 import pytest
@@ -61,17 +60,6 @@ def with_little_memory(config: Config, windows: List[Window]) -> Results:
     return together(config.replace(max_memory=500_000), windows)
 
 
-@contextmanager
-def constants(values: Dict[str, int]) -> Iterator[None]:
-    patch = pytest.MonkeyPatch()
-    try:
-        for name, value in values.items():
-            patch.setattr(f"cflow_torch.{name}", value)
-        yield
-    finally:
-        patch.undo()
-
-
 def in_pieces(config: Config, windows: List[Window]) -> Results:
     """Points, images, look-ups and key points in pieces of other sizes."""
     pieces = {
@@ -83,7 +71,9 @@ def in_pieces(config: Config, windows: List[Window]) -> Results:
         "keypoints.match_candidates._TILE_COLS": 5,
         "keypoints.matching._STRIP_NUMBERS": 11,
     }
-    with constants(pieces):
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in pieces.items():
+            patch.setattr(f"cflow_torch.{name}", value)
         return together(config, windows)
 
 

@@ -15,26 +15,20 @@ from scenes import (
     assert_zeros,
     box,
     config,
+    flow_as_oracle,
     needs_gpu,
     needs_kornia_labelling,
     pose,
     scene,
 )
 
-from cflow_torch import CorrelationFlow, FlowResult, Sweep, Window, estimate_flow, make_config
+from cflow_torch import CorrelationFlow, Sweep, Window, estimate_flow, make_config
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.hdf5.reader import HDF5Log
 from cflow_torch.data.log import window as window_of
 from cflow_torch.simulator import make_drive
 
 ENGINES = [{"correlation": "conv"}, pytest.param({"labeling": "kornia"}, marks=needs_kornia_labelling)]
-
-
-def flow_as_oracle(window: Window, settings) -> FlowResult:
-    """The result, which is the oracle's."""
-    (result,) = CorrelationFlow(settings)([window])
-    assert_same(result, reference_flow(window, settings))
-    return result
 
 
 # ------------------------------------------------------------------------------------------- equal to the oracle

@@ -9,9 +9,7 @@ import pytest
 from oracle import reference_flow
 from scenes import assert_same, assert_same_bits, config, scene
 
-from cflow_torch import CFlowError, CorrelationFlow, Sweep, Window, make_config
-from cflow_torch.data.av2 import AV2Log
-from cflow_torch.data.log import window as window_of
+from cflow_torch import CFlowError, CorrelationFlow, Sweep, Window
 
 SETTINGS = [
     {"num_history": 2, "pixel_sizes": (0.5, 0.25)},
@@ -52,11 +50,3 @@ def test_without_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "hdbscan", None)
     with pytest.raises(CFlowError, match=r"pip install hdbscan"):
         CorrelationFlow(config(clustering="hdbscan"))([scene(0)])
-
-
-@pytest.mark.slow
-def test_equals_the_oracle_on_the_real_pair(av2_folder):
-    pytest.importorskip("hdbscan")
-    window = window_of(AV2Log(av2_folder), 0)
-    settings = make_config("paper", clustering="hdbscan")
-    assert_same(CorrelationFlow(settings)([window])[0], reference_flow(window, settings))

@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 import pytest
+import scenes
 import torch
-from oracle import reference_flow
-from scenes import assert_same, config
+from scenes import config
 
 from cflow_torch import CFlowError, CorrelationFlow, FlowResult, Sweep, Window
 
@@ -17,10 +17,7 @@ SECTIONAL = METRE.replace(sectional_view=True)
 
 
 def flow_as_oracle(pc0: np.ndarray, pc1: np.ndarray, settings=SECTIONAL) -> FlowResult:
-    window = Window(Sweep(pc0), Sweep(pc1))
-    (result,) = CorrelationFlow(settings)([window])
-    assert_same(result, reference_flow(window, settings))
-    return result
+    return scenes.flow_as_oracle(Window(Sweep(pc0), Sweep(pc1)), settings)
 
 
 @pytest.mark.parametrize("move", [(3, 4, 1), (-4, 3, -2), (0, 2, 1), (0, 0, 2), (3, 0, 0)])

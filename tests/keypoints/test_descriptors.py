@@ -7,7 +7,7 @@ from typing import List, Tuple
 import numpy as np
 import pytest
 import torch
-from oracle.descriptors import described_keypoints, detect_keypoints
+from oracle.matching import described_keypoints, detect_keypoints
 from scipy import ndimage
 
 from cflow_torch.keypoints.descriptors import describe, detect

@@ -7,7 +7,6 @@ import math
 import numpy as np
 import pytest
 import torch
-from oracle import reference_flow
 from oracle.keypoints import match_radius
 from scenes import (
     assert_same,
@@ -15,6 +14,7 @@ from scenes import (
     assert_zeros,
     box,
     config,
+    flow_as_oracle,
     needs_gpu,
     needs_kornia_labelling,
     reordered,
@@ -22,19 +22,12 @@ from scenes import (
     scene,
 )
 
-from cflow_torch import CFlowError, CorrelationFlowKeypoints, FlowResult, Sweep, Window, estimate_flow, make_config
+from cflow_torch import CFlowError, CorrelationFlowKeypoints, Sweep, Window, estimate_flow, make_config
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.hdf5.reader import HDF5Log
 from cflow_torch.data.log import window as window_of
 
 DENSIFIERS = ("components", "clusters", "nearest")
-
-
-def flow_as_oracle(window: Window, settings) -> FlowResult:
-    """The result, which is the oracle's."""
-    (result,) = CorrelationFlowKeypoints(settings)([window])
-    assert_same(result, reference_flow(window, settings))
-    return result
 
 
 @pytest.mark.parametrize("seed", range(18))
@@ -153,18 +146,6 @@ def test_the_radius_of_matches():
     for stamps, expected in [((0, 100_000_000), 3.0), ((0, 50_000_000), 0.0), ((None, 50_000_000), 3.0)]:
         window = Window(sweep([(5, 5)], timestamp_ns=stamps[0]), sweep([(5, 8)], timestamp_ns=stamps[1]))
         assert flow_as_oracle(window, METRE.replace(gate_radius=3.0)).residual_flow[0, 0] == expected
-
-
-@pytest.mark.parametrize("densify", DENSIFIERS)
-def test_rows_that_take_no_part(densify):
-    n, pc0 = len(ELL), sweep([*ELL, (12, 11)])
-    points = np.concatenate([pc0.points, [[np.nan, 1, 1], [1, math.inf, 1], [-1, 1, 1]]])
-    ground = np.array([False] * n + [True] + [False] * 3)
-    window = Window(Sweep(points, ground), sweep(ELL, (2, 1, 0)))
-    result = flow_as_oracle(window, METRE.replace(gate_radius=4.0, densify=densify))
-    assert result.is_valid.tolist() == [True] * n + [False] * 4
-    assert result.residual_flow.tolist() == [[2.0, 1.0, 0.0]] * n + [[0.0] * 3] * 4
-    assert result.cluster_id[n:].tolist() == [-1] * 4 and result.score.tolist() == [1.0] * n + [0.0] * 4
 
 
 @pytest.mark.parametrize("densify", DENSIFIERS)

@@ -9,9 +9,8 @@ from typing import Dict, List, Tuple
 import numpy as np
 import pytest
 import torch
-from oracle.descriptors import describe as oracle_describe
-from oracle.descriptors import detect_keypoints
-from oracle.matching import match_keypoints, passes_ratio_test
+from oracle.matching import describe as oracle_describe
+from oracle.matching import detect_keypoints, match_keypoints, passes_ratio_test
 from scenes import config
 
 from cflow_torch.keypoints import match_candidates, matching

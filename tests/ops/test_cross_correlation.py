@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from scenes import needs_gpu
 
-from cflow_torch.ops.cross_correlation import FAST_LENGTHS, cross_correlate
+from cflow_torch.ops.cross_correlation import cross_correlate
 from cflow_torch.ops.window_counts import WindowCounts
 
 ENGINES = ("fft", "conv")
@@ -61,16 +61,6 @@ def test_engines_agree_on_large_images():
     template, target = torch.rand((2, 2, 130, 200), generator=torch.Generator().manual_seed(0)) < 0.5
     own = torch.tensor([1, 0])
     assert torch.equal(counts(template, target, own, "fft"), counts(template, target, own, "conv"))
-
-
-def test_fast_lengths_are_products_of_small_primes_in_small_steps():
-    for length in FAST_LENGTHS:
-        for prime in (2, 3, 5, 7, 11):
-            while length % prime == 0:
-                length //= prime
-        assert length == 1
-    used = [length for length in FAST_LENGTHS if length <= 3 << 15]  # of a side and the shifts along it
-    assert all(low < high <= 1.25 * low for low, high in zip(used, used[1:]))
 
 
 def test_pixels_under_a_window_and_their_bounds():

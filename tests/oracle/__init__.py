@@ -6,7 +6,7 @@ docstring says what is done.
 
 Order of reading: reference_flow, here -> `dense` (Alg. general_correlation_flow), `keypoints` (Sec.
 CorrelationFlow-Keypoints) or `verified` (ours). What they use: `sweeps` (ego motion), `pixels` (Eq. 3d_to_bev),
-`clustering` (Alg. clustering), `history` (Sec. leverage_past_pcs), `descriptors` and `matching` (key points).
+`clustering` (Alg. clustering), `history` (Sec. leverage_past_pcs), `matching` (key points).
 
 Parts of the verified method, in its order: `height_slices`, `ground_residue`, `component_tree`, `candidates`,
 `paired_test`, `aperture`, `slow_motion`, `subpixel_shift`, `rigid_registration`, `confidence`.

@@ -1,8 +1,8 @@
 """CorrelationFlow-Keypoints at one scale: match boundary pixels of I_t and I_{t+1}, then spread their flow.
 
-Order of reading: correlation_flow_keypoints -> `descriptors` (Sec. Keypoints, Sec. Descriptor) -> `matching`
-(Sec. Matching keypoints) -> median_of_components or nearest_match (Sec. From sparse to dense). Displacements are
-pixels until the last step of correlation_flow_keypoints multiplies them by s.
+Order of reading: correlation_flow_keypoints -> `matching` (Sec. Keypoints, Descriptor, Matching keypoints) ->
+median_of_components or nearest_match (Sec. From sparse to dense). Displacements are pixels until the last step of
+correlation_flow_keypoints multiplies them by s.
 """
 
 from __future__ import annotations

@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 import torch
-from oracle import reference_flow
 from scenes import (
     assert_same,
     assert_same_bits,
     config,
+    flow_as_oracle,
     needs_gpu,
     needs_kornia_labelling,
     reordered,
@@ -26,13 +26,6 @@ from cflow_torch.data.hdf5.reader import HDF5Log
 from cflow_torch.data.log import window as window_of
 
 NEAR = (-20.0, -10.0, -math.inf, 0.0, 5.0, math.inf)  # the whole takes the oracle minutes
-
-
-def flow_as_oracle(window: Window, settings):
-    """The result, which is the oracle's."""
-    (result,) = VerifiedFlow(settings)([window])
-    assert_same(result, reference_flow(window, settings))
-    return result
 
 
 # ------------------------------------------------------------------------------------------- equal to the oracle

@@ -8,7 +8,6 @@ import torch
 from scenes import pose
 
 from cflow_torch import CFlowError, CorrelationFlow, Sweep, Window, estimate_flow
-from cflow_torch.windows.validation import resolution
 
 RNG = np.random.default_rng(0)
 P0, P1 = RNG.uniform(-5, 5, (50, 3)).astype(np.float32), RNG.uniform(-5, 5, (40, 3)).astype(np.float32)
@@ -125,15 +124,6 @@ def test_types_too_coarse_for_pixels_are_refused(points, far, is_refused):
         return
     with pytest.raises(CFlowError, match=r"pc0 is .*only holds multiples of .* m.*pixels of 0.25 m"):
         model([window])
-
-
-def test_the_resolution_of_types_is_that_of_numpy():
-    for dtype in (np.float16, np.float32, np.float64, np.dtype(">f4")):
-        for distance in (1e-3, 0.75, 1.0, 35.0, 64.0, 5e4):
-            spacing = np.spacing(np.dtype(dtype).newbyteorder("=").type(distance))
-            assert resolution(dtype, distance) == spacing, (dtype, distance)
-    assert resolution(torch.bfloat16, 51.2) == 0.25 and resolution(torch.float32, 1e7) == 1.0
-    assert resolution(np.int64, 1e7) == resolution(torch.float64, 0.0) == 0.0
 
 
 def test_devices():
