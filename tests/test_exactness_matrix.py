@@ -85,18 +85,16 @@ def shuffled(config: Config, windows: List[Window]) -> Results:
 
 
 def while_training(config: Config, windows: List[Window]) -> Results:
-    """Gradients on, another default dtype, autocast, matrix products in bfloat16 where torch may, no oneDNN."""
+    """Another default dtype, autocast, matrix products in bfloat16 where torch may, no oneDNN."""
     precision = torch.get_float32_matmul_precision()
     torch.set_default_dtype(torch.float64)
     torch.set_float32_matmul_precision("medium")
-    torch.use_deterministic_algorithms(True)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # torch says which GPUs this machine has not
             with torch.backends.mkldnn.flags(enabled=False), torch.autocast("cpu", dtype=torch.bfloat16):
                 return together(config, windows)
     finally:
-        torch.use_deterministic_algorithms(False)
         torch.set_float32_matmul_precision(precision)
         torch.set_default_dtype(torch.float32)
 

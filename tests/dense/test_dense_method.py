@@ -34,7 +34,7 @@ ENGINES = [{"correlation": "conv"}, pytest.param({"labeling": "kornia"}, marks=n
 # ------------------------------------------------------------------------------------------- equal to the oracle
 
 
-@pytest.mark.parametrize("seed", range(24))
+@pytest.mark.parametrize("seed", range(20))
 def test_equals_the_oracle_on_random_scenes(seed):
     settings = config(
         num_history=seed % 5,
@@ -55,9 +55,8 @@ def test_engines_equal_the_oracle(engines):
         flow_as_oracle(scene(seed, num_history=2), settings)
 
 
-@pytest.mark.parametrize("settings", [{}, {"pixel_sizes": (0.4, 0.2), "sectional_view": True}], ids=["paper", "scales"])
-def test_the_real_pair_equals_the_oracle(av2_folder, settings):
-    result = flow_as_oracle(window_of(AV2Log(av2_folder), 0), make_config("paper", **settings))
+def test_the_real_pair_equals_the_oracle(av2_folder):
+    result = flow_as_oracle(window_of(AV2Log(av2_folder), 0), make_config("paper"))
     assert (result.residual_flow.norm(dim=1) >= 0.05).sum() > 1000  # there is something to find
 
 
