@@ -1,64 +1,118 @@
-"""Small batches of groups that move, as tensors and as the lists that the reference takes."""
+"""Sweeps of the verified method, from images or from objects that move, and the same as the oracle takes it."""
 
 from __future__ import annotations
 
-from typing import List, NamedTuple, Tuple
+from typing import Dict, List, NamedTuple, Optional, Sequence, Tuple
 
 import numpy as np
 import torch
-from oracle.refinement import Point
+from oracle.height_slices import NUM_SLICES, SLICE_HEIGHT, Pixel, SlicedSweeps, Vector
+from oracle.voxel_centroids import Point
+from oracle.voxel_centroids import points_of_objects as listed_points
 
-from cflow_torch.verified.moving import MovingPoints, moving_points
+from cflow_torch.config import VerifiedConfig
+from cflow_torch.verified.component_tree import Objects
+from cflow_torch.verified.height_slices import HeightSlicedSweeps
+from cflow_torch.verified.voxel_centroids import ObjectPoints, points_of_objects
 from cflow_torch.windows.bev_grid import Grid
 from cflow_torch.windows.collation import Batch
 
-SLICE = 0.5
 LOWER, UPPER = (-3.0, -2.5, -2.0), (3.0, 2.5, 3.0)
 
 
 class Scene(NamedTuple):
-    """A batch and the groups of its occupied pixels.
+    """Sweeps of B windows and the objects of their occupied pixels.
 
     Args:
-        batch: windows of sweeps.
-        place: (points,) int64, flat place of each point, the last one = nowhere.
-        pixel_of_place: (Q,) int64, number of the occupied pixel at each place, P = none.
-        group: (P,) int64, G = none.
-        flow: (G, 2) float64, metres per interval, near the truth.
-        grid: the pixels.
+        sweeps: drawn.
+        objects: G of them, of all windows.
+        flow: (G, 2) float64, x and y, metres per interval, near the truth.
     """
 
-    batch: Batch
-    place: torch.Tensor
-    pixel_of_place: torch.Tensor
-    group: torch.Tensor
+    sweeps: HeightSlicedSweeps
+    objects: Objects
     flow: torch.Tensor
-    grid: Grid
 
-    def moving(self) -> MovingPoints:
-        return moving_points(
-            self.batch, self.place, self.pixel_of_place, self.group, num_groups=len(self.flow), slice_height=SLICE
-        )
+    def points(self) -> ObjectPoints:
+        """Of all objects."""
+        return points_of_objects(self.sweeps, self.objects, torch.ones(len(self.flow), dtype=torch.bool))
 
-    def listed(self) -> List[Point]:
-        """The same points for the reference, point by point."""
-        points, num_steps = [], self.batch.num_steps
-        for i, place in enumerate(self.place.tolist()):
-            pixel = int(self.pixel_of_place[place])
-            group = len(self.flow) if pixel == len(self.group) else int(self.group[pixel])
-            if group < len(self.flow):
-                x, y, z = self.batch.positions[:, i].tolist()
-                window, step = divmod(int(self.batch.image[i]), num_steps)
-                points.append(Point(window, step, int(np.floor(z / SLICE)) % 4, group, x, y))
-        return points
+    def in_pixels(self) -> torch.Tensor:
+        """(G, 2) float64, the flow, (y, x) pixels per interval."""
+        return self.flow.flip(1) / self.sweeps.grid.pixel_size
 
-    def listed_flow(self) -> List[Tuple[float, float]]:
-        return [(x, y) for x, y in self.flow.tolist()]
+    def windows(self) -> List[OracleWindow]:
+        """The same for the oracle, window by window."""
+        return [OracleWindow(self, window) for window in range(self.sweeps.num_windows)]
+
+
+class OracleWindow:
+    """One window of a scene as the oracle takes it; its objects are numbered from 0."""
+
+    def __init__(self, scene: Scene, window: int) -> None:
+        sweeps, objects = scene.sweeps, scene.objects
+        mine = sweeps.window[objects.first] == window
+        size, grid = sweeps.grid.pixel_size, sweeps.grid
+        self.sweeps = for_oracle(sweeps, window)
+        pixels = self.sweeps.pixels()
+        owners = objects.of_pixel[sweeps.window == window] - int((~mine).cumprod(0).sum())
+        self.num_objects = int(mine.sum())
+        self.object_of: Dict[Pixel, int] = {
+            pixel: owner for pixel, owner in zip(pixels, owners.tolist()) if 0 <= owner < self.num_objects
+        }
+        self.flow: List[Vector] = [(x, y) for x, y in scene.flow[mine].tolist()]
+        self.flow_in_pixels: List[Vector] = [(y / size, x / size) for x, y in self.flow]
+        self._config = VerifiedConfig(pixel_sizes=(size,), point_cloud_range=(*grid.lower, *grid.upper))
+        self._clouds = [
+            sweeps.batch.positions[:, sweeps.batch.image == window * sweeps.num_steps + step].T.numpy()
+            for step in range(sweeps.num_steps)
+        ]
+
+    def points(
+        self, wanted: Optional[Sequence[bool]] = None, height: float = SLICE_HEIGHT, num_slices: int = NUM_SLICES
+    ) -> List[Point]:
+        """Of the objects wanted, of all of them if nothing is said."""
+        wanted = [True] * self.num_objects if wanted is None else wanted
+        return listed_points(wanted, self.object_of, self._clouds, self._config, height, num_slices)
+
+
+def for_oracle(sweeps: HeightSlicedSweeps, window: int) -> SlicedSweeps:
+    """One window of some sweeps; sweeps that it lacks are left out."""
+    images = sweeps.image[:-1].view(sweeps.num_windows, sweeps.num_steps, sweeps.grid.height, sweeps.grid.width)
+    elapsed = sweeps.elapsed[window].tolist()
+    steps = [step for step, k in enumerate(elapsed) if step == 0 or k > 0]
+    return SlicedSweeps(
+        [images[window, step].numpy() for step in steps],
+        [elapsed[step] for step in steps],
+        [float(sweeps.batch.seconds[window, step]) for step in steps],
+        sweeps.grid.pixel_size,
+        sweeps.grid.lower[:2],
+    )
+
+
+def from_images(
+    images: np.ndarray, pixel_size: float = 0.25, elapsed: Optional[np.ndarray] = None
+) -> HeightSlicedSweeps:
+    """Sweeps without points.
+
+    Args:
+        images: (B, S, H, W) uint8, bits of slices.
+        pixel_size: metres.
+        elapsed: (B, S) float64, intervals to t+1; None = 0, 1, 2, ...
+    """
+    num_windows, num_steps, height, width = images.shape
+    grid = Grid(pixel_size, (0.0, 0.0, -1.0), ((width - 0.5) * pixel_size, (height - 0.5) * pixel_size, 1.0))
+    assert (grid.height, grid.width) == (height, width)
+    times = np.tile(np.arange(num_steps, dtype=np.float64), (num_windows, 1)) if elapsed is None else elapsed
+    batch = _batch(torch.zeros((3, 0), dtype=torch.float64), torch.zeros(0), torch.from_numpy(times))
+    pixel = torch.from_numpy(np.flatnonzero(images))
+    window, step, row, col = map(torch.from_numpy, np.nonzero(images))
+    image = torch.from_numpy(np.append(images.ravel(), np.uint8(0)))
+    return HeightSlicedSweeps(batch, grid, image, pixel[:0], pixel, window, step, row, col, image[pixel])
 
 
 def moving_scene(
-    seed: int,
-    num_windows: int = 1,
+    seeds: Sequence[int],
     num_steps: int = 2,
     pixel_size: float = 0.1,
     snap: float = 0.0,
@@ -69,8 +123,7 @@ def moving_scene(
     """Objects that translate and turn, seen anew in every sweep, some at the border, some missing in some sweeps.
 
     Args:
-        seed: of everything random; the seeds of windows follow it, so that scenes can be put together.
-        num_windows: B.
+        seeds: one per window, which depends on nothing else.
         num_steps: S.
         pixel_size: metres.
         snap: metres, places are rounded to multiples of it: equal distances and shared voxels; 0 = they are not.
@@ -78,12 +131,16 @@ def moving_scene(
         speed: metres per interval, standard deviation.
         size: metres, shortest and longest side of an object.
     """
-    grid = Grid(pixel_size, LOWER, UPPER)
-    points, images, owners, flows, elapsed = [], [], [], [], []
-    for window in range(num_windows):
-        rng = np.random.default_rng((seed, window))
+    clouds: List[List[np.ndarray]] = []
+    owners: List[List[np.ndarray]] = []
+    flows: List[np.ndarray] = []
+    elapsed = []
+    for seed in seeds:
+        rng = np.random.default_rng(seed)
         times = np.arange(num_steps) * (1.0 if rng.random() < 0.5 else rng.uniform(0.8, 1.2))
         elapsed.append(times)
+        parts: List[List[np.ndarray]] = [[] for _ in range(num_steps)]
+        of_parts: List[List[np.ndarray]] = [[] for _ in range(num_steps)]
         for _ in range(int(rng.integers(1, 5))):
             centre = rng.uniform(LOWER, UPPER)[:2] * 0.9
             sides, angle, velocity = rng.uniform(*size, 2), rng.uniform(-0.1, 0.1), rng.normal(0, speed, 2)
@@ -95,74 +152,68 @@ def moving_scene(
                 kept = shape[rng.random(num_points) < (0.0 if gone[step] else 0.8)]
                 xy = kept @ rotation.T + way + rng.normal(0, 0.01, kept.shape)
                 xy = np.round(xy / snap) * snap if snap else xy
-                points.append(np.concatenate([xy, rng.uniform(-1.5, 2.0, (len(xy), 1))], 1))
-                images.append(np.full(len(xy), window * num_steps + step))
-                owners.append(np.full(len(xy), len(flows) if rng.random() < 0.95 else -1))
+                parts[step].append(np.concatenate([xy, rng.uniform(-1.5, 2.0, (len(xy), 1))], 1))
+                of_parts[step].append(np.full(len(xy), len(flows) if rng.random() < 0.95 else -1))
             flows.append(velocity + rng.normal(0, 0.04, 2))
-    return _as_scene(points, images, owners, flows, elapsed, grid, num_windows, num_steps, seed)
+        clouds.append([np.concatenate(of_step) for of_step in parts])
+        owners.append([np.concatenate(of_step) for of_step in of_parts])
+    return _draw(clouds, owners, flows, elapsed, pixel_size)
 
 
-def as_scene(clouds: List[np.ndarray], flow: List[np.ndarray]) -> Scene:
-    """One object, (N, 3) points in every sweep, t+1 first, and the motion to start from; one interval apart."""
+def one_object(clouds: Sequence[np.ndarray], flow: Sequence[float], interval: float = 1.0) -> Scene:
+    """One object, (N, 3) points in every sweep, t+1 first, and the motion to start from."""
     owners = [np.zeros(len(cloud), dtype=np.int64) for cloud in clouds]
-    images = [np.full(len(cloud), step) for step, cloud in enumerate(clouds)]
-    times, grid = [np.arange(len(clouds), dtype=np.float64)], Grid(0.1, LOWER, UPPER)
-    return _as_scene(clouds, images, owners, flow, times, grid, 1, len(clouds), 0)
+    return _draw([list(clouds)], [owners], [np.array(flow)], [interval * np.arange(len(clouds))], 0.1)
 
 
-def _as_scene(points, images, owners, flows, elapsed, grid, num_windows, num_steps, seed) -> Scene:
-    positions = torch.from_numpy(np.concatenate(points).T.copy())
-    image, owner = (torch.from_numpy(np.concatenate(values)) for values in (images, owners))
+def reordered(scene: Scene, seed: int = 0) -> Scene:
+    """The same with its points in another order."""
+    batch = scene.sweeps.batch
+    order = torch.randperm(batch.image.numel(), generator=torch.Generator().manual_seed(seed))
+    other = _batch(batch.positions[:, order], batch.image[order], batch.elapsed)
+    return scene._replace(sweeps=HeightSlicedSweeps.of(other, scene.sweeps.grid))
+
+
+def _draw(
+    clouds: List[List[np.ndarray]],
+    owners: List[List[np.ndarray]],
+    flows: List[np.ndarray],
+    elapsed: List[np.ndarray],
+    pixel_size: float,
+) -> Scene:
+    grid, num_steps = Grid(pixel_size, LOWER, UPPER), len(elapsed[0])
+    positions = torch.from_numpy(np.concatenate([cloud for window in clouds for cloud in window]).T.copy())
+    owner = np.concatenate([of_sweep for window in owners for of_sweep in window])
+    sizes = [len(cloud) for window in clouds for cloud in window]
+    image = torch.arange(len(sizes)).repeat_interleave(torch.tensor(sizes))
     inside = grid.contains(positions)
-    place = grid.pixel_of_image(positions, image.int(), num_windows * num_steps, inside).long()
-    nowhere = num_windows * num_steps * grid.height * grid.width
-    pixels, index = torch.unique(place[place < nowhere], return_inverse=True)
-    # The first point of a pixel says whose it is.
-    group = torch.full_like(pixels, len(flows))
-    group[index.flip(0)] = owner[place < nowhere].flip(0)
-    group[group < 0] = len(flows)
-    of_place = torch.full((nowhere + 1,), len(pixels))
-    of_place[pixels] = torch.arange(len(pixels))
-    order = torch.from_numpy(np.random.default_rng(seed).permutation(len(place)))
-    batch = Batch(
-        positions=positions[:, order],
-        takes_part=inside[order],
-        image=image[order].int(),
-        num_newest=0,
-        num_windows=num_windows,
-        num_steps=num_steps,
-        elapsed=torch.from_numpy(np.stack(elapsed)),
-        seconds=torch.from_numpy(np.stack(elapsed) * 0.1),
-        sources=(),
+    batch = _batch(positions[:, inside], image[inside], torch.from_numpy(np.stack(elapsed)))
+    assert batch.num_steps == num_steps
+    sweeps = HeightSlicedSweeps.of(batch, grid)
+    # The first point of a pixel says whose it is. Objects are numbered by their first pixel, so by window.
+    _, first_point = np.unique(sweeps.number[sweeps.place].numpy(), return_index=True)
+    of_pixel = owner[inside.numpy()][first_point]
+    present, first = np.unique(of_pixel[of_pixel >= 0], return_index=True)
+    first = np.flatnonzero(of_pixel >= 0)[first]
+    order = first.argsort()
+    number = np.full(len(flows) + 1, len(present))
+    number[present[order]] = np.arange(len(present))
+    objects = Objects(
+        torch.from_numpy(number[of_pixel]), torch.arange(len(present)), torch.from_numpy(first[order].astype(np.int64))
     )
-    flow = torch.from_numpy(np.array(flows).reshape(-1, 2))
-    return Scene(batch, place[order], of_place, group, flow, grid)
+    flow = np.array(flows, dtype=np.float64).reshape(-1, 2)[present[order]]
+    return Scene(sweeps, objects, torch.from_numpy(flow))
 
 
-def one_window(scene: Scene, window: int) -> Tuple[Scene, torch.Tensor]:
-    """A window of a scene on its own, and which groups of the scene (K,) it holds; points in the same order."""
-    batch, grid = scene.batch, scene.grid
-    rows = torch.div(batch.image, batch.num_steps, rounding_mode="floor") == window
-    area = batch.num_steps * grid.height * grid.width
-    nowhere = scene.pixel_of_place.numel() - 1
-    place = torch.where(scene.place < nowhere, scene.place - window * area, area)[rows]
-    old = scene.pixel_of_place[window * area : (window + 1) * area]
-    here = old < len(scene.group)
-    of_place = torch.full((area + 1,), int(here.sum()))
-    of_place[:-1][here] = torch.arange(int(here.sum()))
-    old_group = scene.group[old[here]]
-    groups = torch.unique(old_group[old_group < len(scene.flow)])
-    number = torch.full((len(scene.flow) + 1,), len(groups))
-    number[groups] = torch.arange(len(groups))
-    alone = Batch(
-        positions=batch.positions[:, rows],
-        takes_part=batch.takes_part[rows],
-        image=batch.image[rows] - window * batch.num_steps,
+def _batch(positions: torch.Tensor, image: torch.Tensor, elapsed: torch.Tensor) -> Batch:
+    return Batch(
+        positions=positions,
+        takes_part=torch.ones(image.numel(), dtype=torch.bool),
+        image=image.int(),
         num_newest=0,
-        num_windows=1,
-        num_steps=batch.num_steps,
-        elapsed=batch.elapsed[window : window + 1],
-        seconds=batch.seconds[window : window + 1],
+        num_windows=elapsed.shape[0],
+        num_steps=elapsed.shape[1],
+        elapsed=elapsed,
+        seconds=elapsed * 0.1,
         sources=(),
     )
-    return Scene(alone, place, of_place, number[old_group], scene.flow[groups], grid), groups

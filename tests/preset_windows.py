@@ -1,4 +1,4 @@
-"""Windows and settings small enough to run every preset many times, and to hold it to the reference."""
+"""Windows and settings small enough to run every preset many times, and to hold it to the oracle."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ PRESETS = ("default", "fast", "paper", "keypoints")
 
 def small(preset: str, **overrides: Any) -> Config:
     """A preset on 16 m x 14 m with pixels of 0.25 m, two older sweeps where it takes any."""
-    sizes = (0.5, 0.25) if preset == "default" else (0.25,)
-    history = 0 if preset == "keypoints" else 2
-    given = {"pixel_sizes": sizes, "num_history": history, "point_cloud_range": RANGE, "max_extent": 5.0}
-    return make_config(preset, **{**given, **overrides})
+    given = {"pixel_sizes": (0.5, 0.25) if preset == "default" else (0.25,), "max_extent": 5.0}
+    if preset != "keypoints":
+        given["num_history"] = 2
+    return make_config(preset, **{"point_cloud_range": RANGE, **given, **overrides})
 
 
 def windows_for(config: Config, number: int = 1) -> List[Window]:

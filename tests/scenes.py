@@ -1,23 +1,28 @@
-"""Small seeded windows and exact comparisons shared by the tests."""
+"""Small seeded windows and comparisons of results, shared by the tests."""
 
 from __future__ import annotations
 
-from dataclasses import fields
-from typing import List, Tuple
+from dataclasses import fields, replace
+from typing import Iterator, List, Tuple
 
 import numpy as np
 import pytest
 import torch
+from oracle import reference_flow
 
-from cflow_torch.config import Config
+from cflow_torch.config import CONFIGS, Config, VerifiedConfig
+from cflow_torch.estimate import make_model
 from cflow_torch.types import FlowResult, Sweep, Window
+from cflow_torch.verified.height_slices import HeightSlicedSweeps
+from cflow_torch.windows.bev_grid import Grid
+from cflow_torch.windows.collation import make_batch
 
 RANGE = (-8.0, -7.0, -2.0, 8.0, 7.0, 3.0)
 
 
-def config(**overrides) -> Config:
+def config(method: str = "dense", **overrides) -> Config:
     """Settings for the small scenes: 0.25 m pixels, 16 m x 14 m, components longer than 5 m are split."""
-    return Config(pixel_sizes=(0.25,), point_cloud_range=RANGE, max_extent=5.0).replace(**overrides)
+    return CONFIGS[method](pixel_sizes=(0.25,), point_cloud_range=RANGE, max_extent=5.0).replace(**overrides)
 
 
 def pose(x: float, y: float, yaw: float, z: float = 0.0) -> np.ndarray:
@@ -89,21 +94,65 @@ def scene(
     return Window(pc0=sweeps[1], pc1=sweeps[0], pch=tuple(sweeps[2:]))
 
 
+def sweeps_of(windows: List[Window], settings: VerifiedConfig) -> HeightSlicedSweeps:
+    """Windows as the verified method sees them."""
+    box = settings.point_cloud_range
+    grid = Grid(settings.pixel_sizes[-1], box[:3], box[3:])
+    batch = make_batch(windows, settings, grid, torch.device("cpu"), 3, settings.min_height is not None)
+    return HeightSlicedSweeps.of(batch, grid, settings.min_height)
+
+
+def reordered(window: Window, seed: int = 0) -> Tuple[Window, np.ndarray]:
+    """Points of every sweep in another order, and the order of those of pc0."""
+    rng = np.random.default_rng(seed)
+    sweeps = [window.pc0, window.pc1, *window.pch]
+    orders = [rng.permutation(len(sweep.points)) for sweep in sweeps]
+    mixed = [
+        replace(s, points=s.points[order], is_ground=None if s.is_ground is None else s.is_ground[order])
+        for s, order in zip(sweeps, orders)
+    ]
+    return Window(mixed[0], mixed[1], tuple(mixed[2:])), orders[0]
+
+
+def rows_of(result: FlowResult, rows: np.ndarray) -> FlowResult:
+    """Some rows of a result."""
+    values = {f.name: getattr(result, f.name) for f in fields(FlowResult)}
+    return FlowResult(**{name: None if v is None else v[torch.from_numpy(rows)] for name, v in values.items()})
+
+
 def same_bits(a: torch.Tensor, b: torch.Tensor) -> bool:
     """Same shape, dtype and bytes (so -0.0 differs from 0.0)."""
     return a.shape == b.shape and a.dtype == b.dtype and a.cpu().numpy().tobytes() == b.cpu().numpy().tobytes()
 
 
-def assert_same(a: FlowResult, b: FlowResult) -> None:
-    """Two results agree to the last bit in every field."""
+def assert_same(a: FlowResult, b: FlowResult, atol: float = 1e-6) -> None:
+    """Two results are equal: clusters and validity exactly, flow, score and confidence to `atol` (metres)."""
+    for name, left, right in _pairs(a, b):
+        differ = (left != right) if not left.is_floating_point() else ~((left - right).abs() <= atol)
+        assert not differ.any(), f"{name} differs in {int(differ.sum())} places, first {differ.nonzero()[:3].tolist()}"
+
+
+def flow_as_oracle(window: Window, settings: Config) -> FlowResult:
+    """The result of the method of the settings, which is the oracle's."""
+    (result,) = make_model(settings)([window])
+    assert_same(result, reference_flow(window, settings))
+    return result
+
+
+def assert_same_bits(a: FlowResult, b: FlowResult) -> None:
+    """Two results are equal to the last bit: the same window, computed in another batch on the same device."""
+    for name, left, right in _pairs(a, b):
+        assert same_bits(left, right), f"{name} differs in {int((left != right).sum())} places"
+
+
+def _pairs(a: FlowResult, b: FlowResult) -> Iterator[Tuple[str, torch.Tensor, torch.Tensor]]:
+    """Name and both values of every field, on the CPU, of the same type and shape."""
     for field in fields(FlowResult):
         left, right = getattr(a, field.name), getattr(b, field.name)
-        if left is None or right is None:
-            assert left is right, field.name
-            continue
-        assert left.dtype == right.dtype and left.shape == right.shape, field.name
-        differ = (left.cpu() != right.cpu()).nonzero()
-        assert same_bits(left, right), f"{field.name} differs in {len(differ)} places, first {differ[:3].tolist()}"
+        assert (left is None) == (right is None), field.name
+        if left is not None:
+            assert left.dtype == right.dtype and left.shape == right.shape, field.name
+            yield field.name, left.cpu(), right.cpu()
 
 
 def assert_zeros(result: FlowResult, num_points: int) -> None:

@@ -1,4 +1,4 @@
-"""Settings: checked when made, unknown names refused, presets as documented."""
+"""Settings: checked when made, unknown and removed names refused, presets, methods, dictionaries."""
 
 from __future__ import annotations
 
@@ -8,214 +8,171 @@ from dataclasses import FrozenInstanceError, fields
 
 import pytest
 
-from cflow_torch import CFlowError, Config, CorrelationFlow, CorrelationFlowKeypoints, make_config, make_model
-from cflow_torch.checks import DENSE_ONLY, NOT_WITH_PROOF
-from cflow_torch.config import PRESETS
+from cflow_torch import CFlowError, make_config, make_model
+from cflow_torch.config import (
+    CONFIGS,
+    PRESETS,
+    REMOVED,
+    DenseConfig,
+    KeypointsConfig,
+    VerifiedConfig,
+    config_from,
+    describe,
+)
 
 INF = math.inf
 
 
 @pytest.mark.parametrize(
-    "field, value",
+    "method, field, value, allowed",
     [
-        ("method", "sparse"),
-        ("clustering", "kmeans"),
-        ("labeling", "opencv"),
-        ("labeling", None),
-        ("correlation", "FFT"),
-        ("densify", ""),
-        ("connectivity", 6),
-        ("connectivity", True),
-        ("connectivity", "8"),
-        ("pixel_sizes", ()),
-        ("pixel_sizes", 0.1),
-        ("pixel_sizes", "fine"),
-        ("pixel_sizes", (0.0,)),
-        ("pixel_sizes", (-0.1,)),
-        ("pixel_sizes", (math.nan,)),
-        ("pixel_sizes", (INF,)),
-        ("pixel_sizes", (0.1, 0.2)),
-        ("pixel_sizes", (0.2, 0.2)),
-        ("point_cloud_range", 35),
-        ("point_cloud_range", None),
-        ("point_cloud_range", (-35, -35, 35, 35)),
-        ("point_cloud_range", (35, -35, -3, -35, 35, 3)),
-        ("point_cloud_range", (-35, -35, 3, 35, 35, 3)),
-        ("point_cloud_range", (-35, math.nan, -3, 35, 35, 3)),
-        ("point_cloud_range", (-INF, -35, -3, 35, 35, 3)),
-        ("point_cloud_range", (-35, -35, -3, 35, INF, 3)),
-        ("num_history", -1),
-        ("num_history", 1.5),
-        ("num_history", True),
-        ("num_history", None),
-        ("max_extent", 0),
-        ("max_extent", -1.0),
-        ("max_extent", math.nan),
-        ("max_extent", "20"),
-        ("max_speed", 0.0),
-        ("max_speed", math.nan),
-        ("max_speed", "fast"),
-        ("max_object", 0),
-        ("max_object", math.nan),
-        ("max_object", "car"),
-        ("max_object", True),
-        ("zero_test", 0),
-        ("zero_test", 0.001),
-        ("zero_test", 1001),
-        ("zero_test", math.nan),
-        ("zero_test", "2"),
-        ("subpixel", "gauss"),
-        ("subpixel", None),
-        ("height_slices", 1),
-        ("height_slices", 9),
-        ("height_slices", -2),
-        ("height_slices", 4.0),
-        ("slice_height", 0),
-        ("slice_height", INF),
-        ("sweep_interval", 0),
-        ("sweep_interval", None),
-        ("patch_size", 10),
-        ("patch_size", 11.0),
-        ("ratio_threshold", 0.9),
-        ("ratio_threshold", math.nan),
-        ("ratio_threshold", "big"),
-        ("ratio_threshold", None),
-        ("gate_radius", 0),
-        ("gate_radius", float("inf")),
-        ("sweep_interval", float("inf")),
-        ("max_memory", 0),
-        ("max_memory", "1GB"),
-        ("sectional_view", "no"),
-        ("sectional_view", None),
-        ("use_timestamps", "false"),
+        ("dense", "clustering", "kmeans", "one of 'components', 'hdbscan'"),
+        ("dense", "labeling", None, "one of 'sparse', 'kornia'"),
+        ("dense", "connectivity", 6, "one of 4, 8"),
+        ("dense", "connectivity", True, "one of 4, 8"),
+        ("dense", "num_history", -1, "a whole number of at least 0"),
+        ("dense", "num_history", 1.5, "a whole number"),
+        ("dense", "num_history", True, "a whole number"),
+        ("dense", "max_extent", 0, "a number above 0"),
+        ("dense", "max_extent", math.nan, "a number above 0"),
+        ("dense", "max_extent", "20", "a number above 0"),
+        ("dense", "max_speed", 0.0, "a number above 0, or None"),
+        ("dense", "max_speed", 10**400, "a number above 0, or None"),
+        ("dense", "sweep_interval", INF, "a number of at least 1e-06 and of at most 1e"),
+        ("dense", "max_memory", "1GB", "a number above 0"),
+        ("dense", "sectional_view", "no", "True or False"),
+        ("dense", "min_cluster_size", 1, "a whole number of at least 2"),
+        ("keypoints", "densify", "", "one of 'components', 'clusters', 'nearest'"),
+        ("keypoints", "patch_size", 53, "a whole number of at least 1 and of at most 51"),
+        ("keypoints", "patch_size", 10, "an odd number"),
+        ("keypoints", "ratio_threshold", 0.9, "a number of at least 1 and of at most 2"),
+        ("keypoints", "gate_radius", 0, "a number of at least 1e-06"),
+        ("verified", "max_object", 0, "a number above 0, or None"),
+        ("verified", "significance", 1001, "a number of at least 0 and of at most 1000"),
+        ("verified", "min_height", 0.0, "a number above 0 and of at most 1000, or None"),
+        ("verified", "thorough", 1, "True or False"),
+        ("verified", "pixel_sizes", (0.25, 0.1), "whole multiples"),
+        ("verified", "pixel_sizes", (1e308, 1e-5), "whole multiples"),
     ],
 )
-def test_invalid_values_name_the_field(field, value):
+def test_invalid_values_are_refused_and_the_allowed_ones_named(method, field, value, allowed):
+    with pytest.raises(CFlowError) as caught:
+        CONFIGS[method](**{field: value})
+    assert str(caught.value).startswith(f"{field}={value!r}"[:12]) and allowed in str(caught.value)
     with pytest.raises(CFlowError, match=field):
-        Config(**{field: value})
-    with pytest.raises(CFlowError, match=field):
-        make_config(**{field: value})
+        make_config(method=method, **{field: value})
 
 
-@pytest.mark.parametrize(
-    "field, value",
-    [("max_object", 25.0), ("zero_test", 1.5), ("subpixel", "parabola"), ("height_slices", 4), ("proof", True)],
-)
-def test_options_of_the_dense_method_are_refused_for_key_points(field, value):
-    assert getattr(make_config("paper", **{field: value}), field) == value
-    with pytest.raises(CFlowError, match=f"{field}.*dense"):
-        make_config("keypoints", **{field: value})
-
-
-def test_height_slices_need_components():
-    with pytest.raises(CFlowError, match="height_slices.*components"):
-        make_config("paper", height_slices=4, clustering="hdbscan")
-
-
-def test_options_beyond_the_paper_are_off_for_the_paper_and_for_key_points():
-    for name in ("paper", "keypoints"):
-        assert {key: getattr(make_config(name), key) for key in DENSE_ONLY} == DENSE_ONLY
-
-
-@pytest.mark.parametrize(
-    "given",
-    [
-        {"clustering": "hdbscan"},
-        {"sectional_view": True},
-        {"zero_test": 1.5},
-        {"subpixel": "parabola"},
-        {"height_slices": 3},
-        {"pixel_sizes": (0.25, 0.1)},
+SPACE = {
+    "pixel_sizes": [(), 0.1, "fine", (0.0,), (-0.1,), (math.nan,), (INF,), (0.1, 0.2), (0.2, 0.2), None],
+    "point_cloud_range": [
+        *(35, None, (-35, -35, 35, 35), (35, -35, -3, -35, 35, 3)),
+        *((-35, math.nan, -3, 35, 35, 3), (-INF, -35, -3, 35, 35, 3)),
     ],
-)
-def test_what_does_not_go_with_the_proof_says_how_to_mend_it(given):
-    (name,) = given
-    proof = make_config("paper", proof=True, pixel_sizes=(0.4, 0.2, 0.1))
-    with pytest.raises(CFlowError, match=f"{name}=.*proof=True.*give proof=False too, or start from preset='paper'"):
-        proof.replace(**given)
-    proof.replace(proof=False, **given)
-    make_config("paper", **given)
+    "ego_box": [(1, 2, 3), (1.0, 0.0, 0.0, 1.0), (-INF, -1, 1, 1), (math.nan, -1, 1, 1), 3],
+}
 
 
-def test_everything_that_does_not_go_with_the_proof_is_refused():
-    others = {"clustering": "hdbscan", "sectional_view": True, "zero_test": 1.5, "subpixel": "parabola"}
-    assert set(others) == set(NOT_WITH_PROOF)
-    for name, value in others.items():
-        with pytest.raises(CFlowError, match=name):
-            make_config("paper", proof=True, **{name: value})
+@pytest.mark.parametrize("field", SPACE)
+def test_pixels_regions_and_boxes_that_are_none(field):
+    for value in SPACE[field]:
+        with pytest.raises(CFlowError, match=f"{field}.*give"):
+            DenseConfig(**{field: value})
 
 
-def test_unknown_field_lists_the_fields():
-    for call in (make_config, Config().replace, lambda **kw: CorrelationFlow.from_preset("paper", **kw)):
-        with pytest.raises(CFlowError, match="voxel_size") as caught:
+def test_an_unknown_setting_lists_the_fields():
+    for call in (make_config, VerifiedConfig().replace):
+        with pytest.raises(
+            CFlowError, match="unknown setting voxel_size: the fields are pixel_size, method,"
+        ) as caught:
             call(voxel_size=0.1)
-        for field in fields(Config):
-            assert field.name in str(caught.value)
-        assert "pixel_size," in str(caught.value)
+        assert all(f.name in str(caught.value) for f in fields(VerifiedConfig))
 
 
-def test_unknown_preset_lists_the_presets():
-    with pytest.raises(CFlowError, match="preset='best'") as caught:
+@pytest.mark.parametrize("name", REMOVED)
+def test_a_setting_of_version_0_1_says_what_to_do_without(name):
+    assert all(name not in (f.name for f in fields(kind)) for kind in CONFIGS.values())
+    with pytest.raises(CFlowError, match=f"setting {name} went with version 0.2: ..."):
+        make_config(**{name: 1})
+
+
+def test_a_setting_of_another_method_names_that_method():
+    for preset, name, owners in (
+        ("keypoints", "num_history", "dense and verified"),
+        ("paper", "max_object", "verified"),
+        ("default", "patch_size", "keypoints"),
+        ("default", "clustering", "dense"),
+    ):
+        with pytest.raises(CFlowError, match=f"{name} is a setting of method {owners}, not of"):
+            make_config(preset, **{name: 1})
+
+
+def test_presets_and_methods():
+    methods = {"default": VerifiedConfig, "fast": VerifiedConfig, "paper": DenseConfig, "keypoints": KeypointsConfig}
+    assert {name: type(make_config(name)) for name in PRESETS} == methods
+    assert make_config() == make_config("default") == make_config(method="verified")
+    assert make_config(method="dense") == make_config("paper") == DenseConfig()
+    assert make_config(method="keypoints") == make_config("keypoints") != make_config("paper", "keypoints")
+    assert make_config("paper", "keypoints") == KeypointsConfig()  # the paper's key points
+    for name in PRESETS:
+        config = make_config(name, max_speed=2.0)
+        assert config.max_speed == 2.0 and make_model(config).config == config
+        assert config.method == make_model(config).method
+    for preset, method in (("fast", "dense"), ("default", "keypoints"), ("keypoints", "verified")):
+        with pytest.raises(CFlowError, match=f"preset='{preset}' is of method=.*leave one of them out"):
+            make_config(preset, method)
+    with pytest.raises(CFlowError, match="preset='best': give one of 'default', 'fast', 'paper', 'keypoints'"):
         make_config("best")
-    assert all(name in str(caught.value) for name in PRESETS)
+    with pytest.raises(CFlowError, match="method='sparse': give one of 'dense', 'keypoints', 'verified'"):
+        make_config(method="sparse")
+
+
+def test_the_paper_s_base_row_and_what_presets_change():
+    paper, default, fast = (make_config(name) for name in ("paper", "default", "fast"))
+    assert (paper.pixel_sizes, paper.num_history, paper.sectional_view) == ((0.1,), 0, False)
+    assert paper.point_cloud_range == (-35.0, -35.0, -INF, 35.0, 35.0, INF) and paper.max_speed is None
+    assert (default.pixel_sizes, default.num_history, default.thorough) == ((0.4, 0.2, 0.1), 4, True)
+    assert (fast.pixel_sizes, fast.num_history, fast.thorough) == ((0.1,), 2, False)
+    assert make_config("keypoints").num_history == 0 and make_config("keypoints").ego_box is None
 
 
 def test_pixel_size_is_short_for_one_scale():
     assert make_config(pixel_size=0.2).pixel_sizes == (0.2,)
     assert make_config(pixel_sizes=[0.4, 0.2]).pixel_sizes == (0.4, 0.2)
-    with pytest.raises(CFlowError, match="one of them"):
+    with pytest.raises(CFlowError, match="give one of them"):
         make_config(pixel_size=0.2, pixel_sizes=(0.4,))
-    with pytest.raises(CFlowError, match="pixel_size"):
-        make_config(pixel_size=-1)
 
 
-def test_the_paper_s_base_row():
-    config = make_config("paper")
-    assert config.method == "dense" and config.clustering == "components"
-    assert config.pixel_sizes == (0.1,) and config.num_history == 0
-    assert config.point_cloud_range == (-35.0, -35.0, -INF, 35.0, 35.0, INF)
-    assert config.max_speed is None and not config.sectional_view
+def test_values_get_their_plain_types():
+    config = DenseConfig(pixel_sizes=[1], point_cloud_range=range(6), max_extent=3, ego_box=[-1, -1, 1, 1])
+    assert config.pixel_sizes == (1.0,) and config.point_cloud_range == (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
+    assert [type(v) for v in (config.max_extent, *config.ego_box, config.num_history)] == [float] * 5 + [int]
 
 
-def test_every_preset_is_valid():
-    for name in PRESETS:
-        assert make_config(name, max_speed=2.0).max_speed == 2.0
-        assert make_model(make_config(name)).config == make_config(name)
-        assert not make_config(name, proof=False).proof  # which is all that must be said to do without
-    assert CorrelationFlow.from_preset("fast").config == make_config("fast")
-    assert CorrelationFlowKeypoints.from_preset().config == make_config("keypoints")
-
-
-def test_config_cannot_be_changed_and_replace_makes_a_copy():
-    config = Config()
+def test_a_config_cannot_be_changed_and_replace_makes_a_copy():
+    config = DenseConfig()
     with pytest.raises(FrozenInstanceError):
         config.num_history = 3
-    other = config.replace(num_history=3)
-    assert (config.num_history, other.num_history) == (0, 3)
-    assert hash(config) == hash(Config()) and config == Config() and config != other
+    assert (config.replace(num_history=3).num_history, config.num_history) == (3, 0)
+    assert hash(config) == hash(DenseConfig()) and config != config.replace(num_history=3)
 
 
-def test_as_dict_goes_round():
-    config = make_config("paper", pixel_sizes=(0.4, 0.1), point_cloud_range=(-1, -2, -3, 1, 2, 3), max_speed=20.0)
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_dictionary_goes_round(preset):
+    config = make_config(preset, point_cloud_range=(-1, -2, -3, 1, 2, 3), ego_box=(-1, -1, 1, 1), max_speed=None)
     plain = json.loads(json.dumps(config.as_dict()))
-    assert list(plain) == [f.name for f in fields(Config)]
-    assert make_config("paper", **plain) == config
+    assert list(plain) == [f.name for f in fields(config)] and plain["method"] == config.method
+    assert config_from(plain) == make_config(preset, **plain) == config
+    assert config_from({"method": config.method}) == CONFIGS[config.method]()
+    for wrong in ({}, {"method": "sparse"}, {**plain, "voxel_size": 1}, {**plain, "max_extent": -1}):
+        with pytest.raises(CFlowError, match="give|the fields are"):
+            config_from(wrong)
 
 
-def test_whole_numbers_become_floats():
-    config = Config(pixel_sizes=[1], point_cloud_range=range(6))
-    assert config.pixel_sizes == (1.0,) and isinstance(config.pixel_sizes[0], float)
-    assert config.point_cloud_range == (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
-
-
-def test_a_class_refuses_the_other_method():
-    with pytest.raises(CFlowError, match="keypoints.*make_model"):
-        CorrelationFlow.from_preset("paper", method="keypoints")
-    with pytest.raises(CFlowError, match="dense.*make_model"):
-        CorrelationFlowKeypoints(Config())
-    assert type(make_model(make_config("paper", method="keypoints"))) is CorrelationFlowKeypoints
-
-
-def test_pixel_sizes_whose_quotient_no_float_holds_are_refused():
-    with pytest.raises(CFlowError, match="whole multiples"):
-        make_config(pixel_sizes=(1e308, 0.2, 0.1))
+def test_every_field_says_what_it_means_and_may_be():
+    for kind in CONFIGS.values():
+        for f in fields(kind):
+            assert f.metadata["help"] and describe(f).split()[0] in ("one", "a", "True")
+    by_name = {f.name: describe(f) for f in fields(KeypointsConfig)}
+    assert by_name["ratio_threshold"] == "a number of at least 1 and of at most 2"
+    assert by_name["ego_box"] == "a list of numbers, or None"

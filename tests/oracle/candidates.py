@@ -1,17 +1,25 @@
-"""Candidates for the motion of a component: of each sweep, of all sweeps together, of others."""
+"""Motion candidates of a component: of each sweep, of all sweeps together, of the coarser level, of key points."""
 
 from __future__ import annotations
 
-from typing import List, Optional, Sequence, Tuple
+from typing import Dict, List, Optional, Sequence, Tuple
 
 import numpy as np
 
-from oracle.pooling import pool
+from cflow_torch.config import KeypointsConfig, VerifiedConfig
+from oracle.component_tree import Level
+from oracle.dense import scene_flow_in_1view
+from oracle.height_slices import Pixel, SlicedSweeps, Vector, coarsen, shared, vertex
+from oracle.history import median, pool
+from oracle.keypoints import match_radius
+from oracle.matching import match_keypoints
+from oracle.pixels import bounding_box, occupancy, search_radius
 
-Vector = Tuple[float, float]
+KEYPOINTS = KeypointsConfig(patch_size=21, ratio_threshold=1.02, gate_radius=3.0)
+KEYPOINT_BLOCK = 2  # finest pixels a side of a pixel that can be a key point
 
 
-def candidates(
+def list_motions(
     estimates: Sequence[Optional[Vector]], intervals: Sequence[float], others: Sequence[Vector] = ()
 ) -> List[Vector]:
     """Motions per sweep interval that one component may have, in the order in which ties are decided.
@@ -34,20 +42,47 @@ def candidates(
     return [*found, *others]
 
 
-def inherit(members: Sequence[np.ndarray], above: Sequence[np.ndarray], motions: Sequence[Vector]) -> Vector:
-    """Motion of the coarser component that a component lies in.
+def find_peak(
+    sweeps: SlicedSweeps, level: Level, members: Sequence[Pixel], m: int, config: VerifiedConfig
+) -> Optional[Tuple[Vector, float]]:
+    """Displacement (y, x) of a component from sweep m to t+1, finest pixels, and its NCC; None without pixels at m.
 
-    Args:
-        members: (H, W) bool of sweep t+1, then of t, t-1, ..., the pixels of the component.
-        above: (H, W) int of each sweep, coarser component of each pixel, -1 = none.
-        motions: motion of each coarser component.
-
-    Returns:
-        That of the first member with a coarser component, in the order of the sweeps, then of the raster; (0, 0) if
-        none has one. Components are nested but for erosion, so that other members seldom have another one.
+    Convention: a parabola through the counts of slices that the template shares with t+1, whatever component they are
+        of there, gives the part of a pixel; a peak at no shift stays there.
     """
-    for member, coarser in zip(members, above):
-        for r, c in np.argwhere(member).tolist():
-            if coarser[r, c] >= 0:
-                return motions[int(coarser[r, c])]
-    return 0.0, 0.0
+    block = level.block
+    own = [sorted({(r // block, c // block) for n, r, c in members if n == i}) for i in range(len(sweeps.images))]
+    if not own[m]:
+        return None
+    box = bounding_box([np.array(pixels) for pixels in own if pixels])
+    template, target = (occupancy(np.array(own[i]), box) for i in (m, 0))
+    radius = search_radius(config, sweeps.seconds[m], sweeps.pixel_size * block)
+    (dx, dy), score = scene_flow_in_1view(template, target, 1.0, radius)
+    if dx == 0 and dy == 0:
+        return (0.0, 0.0), score
+    coarse = sweeps._replace(images=level.images)
+    beside = [(0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)]
+    middle, above, below, left, right = (
+        shared(coarse, [(m, r, c) for r, c in own[m]], 0, int(dy) + down, int(dx) + aside) for down, aside in beside
+    )
+    return ((dy + vertex(above, middle, below)) * block, (dx + vertex(left, middle, right)) * block), score
+
+
+def keypoint_shifts(sweeps: SlicedSweeps, config: VerifiedConfig) -> Dict[Pixel, Vector]:
+    """Displacement t -> t+1, (y, x) finest pixels, of the occupied pixels of t that lie in a matched key point."""
+    settings = KEYPOINTS.replace(max_speed=config.max_speed)
+    newest, at_t = (coarsen(image, KEYPOINT_BLOCK) > 0 for image in sweeps.images[:2])
+    reach = match_radius(settings, sweeps.seconds[1], sweeps.pixel_size * KEYPOINT_BLOCK)
+    matches = {(found.row, found.column): found for found in match_keypoints(at_t, newest, reach, settings)}
+    shifts = {}
+    for r, c in np.argwhere(sweeps.images[1]).tolist():
+        found = matches.get((r // KEYPOINT_BLOCK, c // KEYPOINT_BLOCK))
+        if found is not None:
+            shifts[1, r, c] = (float(found.dy * KEYPOINT_BLOCK), float(found.dx * KEYPOINT_BLOCK))
+    return shifts
+
+
+def keypoint_motion(members: Sequence[Pixel], shifts: Dict[Pixel, Vector]) -> Vector:
+    """The median of each axis over the pixels of a component that were matched; (0, 0) if none was."""
+    matched = [shifts[pixel] for pixel in members if pixel in shifts]
+    return (median([y for y, _ in matched]), median([x for _, x in matched])) if matched else (0.0, 0.0)

@@ -7,8 +7,8 @@ from typing import Dict, List, Sequence, Tuple
 
 import numpy as np
 
-from cflow_torch.config import Config
-from oracle.pixels import Box, bounding_box
+from cflow_torch.config import DenseConfig
+from oracle.pixels import bounding_box
 
 
 def dilate(image: np.ndarray) -> np.ndarray:
@@ -86,9 +86,9 @@ def cluster(
 
     # Validation of the connected components.
     total = count
-    boxes = {} if reach == 1 else _boxes(labels)
-    for component, box in boxes.items():
-        if max(box[2], box[3]) * pixel_size > max_extent:
+    for component in range(1, 1 + total) if reach == 3 else ():
+        _, _, height, width = bounding_box([np.argwhere(labels == component)])
+        if max(height, width) * pixel_size > max_extent:
             eroded = erode(labels == component)
             labels[labels == component] = 0
             parts, count = connected_components(eroded, connectivity)
@@ -107,7 +107,9 @@ def cluster(
     return result
 
 
-def cluster_hdbscan(points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], config: Config) -> List[np.ndarray]:
+def cluster_hdbscan(
+    points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], config: DenseConfig
+) -> List[np.ndarray]:
     """HDBSCAN of the aggregated points in place of Alg. clustering (Table which_clustering_method).
 
     Args:
@@ -130,11 +132,3 @@ def cluster_hdbscan(points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], 
     first = {i: min(tuple(p) for m, pixel in zip(of_sweep, pixels) for p in pixel[m == i].tolist()) for i in live}
     numbers = {label: number for number, label in enumerate(sorted(live, key=lambda i: (first[i], i)))}
     return [np.array([numbers.get(label, -1) for label in m.tolist()], dtype=np.int64) for m in of_sweep]
-
-
-def _boxes(labels: np.ndarray) -> Dict[int, Box]:
-    """Bounding box of every component of a label image."""
-    pixels: Dict[int, List[List[int]]] = {}
-    for r, c in np.argwhere(labels).tolist():
-        pixels.setdefault(int(labels[r, c]), []).append([r, c])
-    return {label: bounding_box([np.array(members)]) for label, members in pixels.items()}

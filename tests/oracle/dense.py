@@ -11,37 +11,22 @@ from typing import Optional, Sequence, Tuple
 
 import numpy as np
 
-from cflow_torch.config import Config
+from cflow_torch.config import DenseConfig
 from oracle.clustering import cluster, cluster_hdbscan
-from oracle.peak import beats_zero, parabola
-from oracle.pixels import (
-    Box,
-    bev_dims,
-    bounding_box,
-    in_range,
-    longer_side,
-    occupancy,
-    project_bev,
-    search_radius,
-    slice_images,
-)
-from oracle.pooling import pool
-from oracle.sweeps import Cloud, Level
+from oracle.history import pool
+from oracle.pixels import Box, bev_dims, bounding_box, in_range, occupancy, project_bev, search_radius
+from oracle.sweeps import Cloud, PointMotion
 
 
-def general_correlation_flow(clouds: Sequence[Cloud], cloud1: Cloud, pixel_size: float, config: Config) -> Level:
+def general_correlation_flow(
+    clouds: Sequence[Cloud], cloud1: Cloud, pixel_size: float, config: DenseConfig
+) -> PointMotion:
     """Alg. general_correlation_flow: cluster, find the motion of each cluster, assign it to the cluster's points.
 
     Args:
         clouds: sweeps m = t, t-1, ... nearest first.
         cloud1: sweep t+1.
         pixel_size: s in metres.
-        config: settings.
-
-    Returns:
-        Flow, cluster and score of every point of every sweep m <= t.
-
-    Convention: a cluster longer than `max_object` has flow 0 and the NCC score of no shift.
     """
     # Partition the aggregation of all sweeps into clusters.
     sweeps = [cloud1, *clouds]
@@ -60,30 +45,24 @@ def general_correlation_flow(clouds: Sequence[Cloud], cloud1: Cloud, pixel_size:
         ids[keep] = member
         cluster_ids.append(ids)
 
-    flows = [np.zeros(cloud.points.shape) for cloud in clouds]
-    scores = [np.zeros(len(cloud.points)) for cloud in clouds]
+    flows, score = [np.zeros(cloud.points.shape) for cloud in clouds], np.zeros(len(clouds[0].points))
     for i in range(max(int(ids.max(initial=-1)) for ids in cluster_ids) + 1):
         # The cluster's scene flow: one estimate per sweep that has points of it, nearest first.
         members = [ids == i for ids in cluster_ids]
         points = [cloud.points[member] for cloud, member in zip(sweeps, members)]
         box = bounding_box([project_bev(p, config, pixel_size) for p in points])
-        is_long = config.max_object is not None and longer_side(points[0], config, pixel_size) > config.max_object
         estimates, peaks = [], []
         for cloud, points_m in zip(clouds, points[1:]):
-            if len(points_m) == 0:
-                continue
-            reach = 0.0 if is_long else search_radius(config, cloud.elapsed, pixel_size)
-            flow, peak = scene_flow_1obj(points_m, points[0], box, reach, pixel_size, config)
-            if is_long:
-                flow = np.zeros(3)  # nor does it move in the sectional view
-            estimates.append(flow / cloud.steps)
-            peaks.append(peak)
-        cluster_flow = pool(estimates)
+            if len(points_m) > 0:
+                reach = search_radius(config, cloud.seconds, pixel_size)
+                flow, peak = scene_flow_1obj(points_m, points[0], box, reach, pixel_size, config)
+                estimates.append(flow / cloud.intervals)
+                peaks.append(peak)
         # Assign it to the cluster's points.
-        for m, member in enumerate(members[1:]):
-            flows[m][member] = cluster_flow
-            scores[m][member] = peaks[0]
-    return Level(flows, cluster_ids[1:], scores)
+        for flow, member in zip(flows, members[1:]):
+            flow[member] = pool(estimates)
+        score[members[1]] = peaks[0]
+    return PointMotion(flows, cluster_ids[1], score)
 
 
 def scene_flow_1obj(
@@ -92,7 +71,7 @@ def scene_flow_1obj(
     box: Box,
     reach: Optional[float],
     pixel_size: float,
-    config: Config,
+    config: DenseConfig,
 ) -> Tuple[np.ndarray, float]:
     """Alg. scene_flow_1obj: motion of one object from sweep m to sweep t+1.
 
@@ -102,19 +81,18 @@ def scene_flow_1obj(
         box: BEV pixels of the object in all sweeps.
         reach: longest displacement searched in the BEV, pixels; None = no limit.
         pixel_size: s in metres.
-        config: settings (`sectional_view`, `zero_test`, `subpixel`, `height_slices`,
-            `point_cloud_range`).
+        config: settings (`sectional_view`, `point_cloud_range`).
 
     Returns:
         f_{m -> t+1} (3,) float64 in metres (z = 0 without the sectional view), and the NCC score of the BEV.
 
     Convention:
-        The heading is (f_x, f_y) / norm, which are cos and sin of theta without trigonometry; (1, 0) for an object
-        that stands still. The pixels of the sectional view start at the origin of the frame of t+1, its image is
-        the box of both sweeps, its row comes from z.
+        The heading is (f_x, f_y) / norm, which are cos and sin of theta; (1, 0) for an object that stands still. The
+        pixels of the sectional view start at the origin of the frame of t+1, its image is the box of both sweeps, its
+        row comes from z.
     """
-    template, target = (slice_images(points, config, pixel_size, box) for points in (points_m, points_1))
-    (f_x, f_y), score = scene_flow_in_1view(template, target, pixel_size, reach, config.zero_test, config.subpixel)
+    template, target = (occupancy(project_bev(points, config, pixel_size), box) for points in (points_m, points_1))
+    (f_x, f_y), score = scene_flow_in_1view(template, target, pixel_size, reach)
     if not config.sectional_view:
         return np.array([f_x, f_y, 0.0]), score
 
@@ -133,33 +111,25 @@ def scene_flow_1obj(
 
 
 def scene_flow_in_1view(
-    template: np.ndarray,
-    target: np.ndarray,
-    pixel_size: float,
-    reach: Optional[float] = None,
-    zero_test: Optional[float] = None,
-    subpixel: str = "none",
+    template: np.ndarray, target: np.ndarray, pixel_size: float, reach: Optional[float] = None
 ) -> Tuple[Tuple[float, float], float]:
     """Alg. scene_flow_1view: the displacement with the highest NCC score, Eq. displacement_in_bev.
 
     Args:
-        template: (H, W) bool, image of sweep m, at least one pixel; or (n, H, W), one image per height slice.
-        target: the same shape, image of sweep t+1 of the same box.
+        template: (H, W) bool, image of sweep m, at least one pixel.
+        target: (H, W) bool, image of sweep t+1 of the same box.
         pixel_size: s in metres.
         reach: longest displacement searched, pixels; None = no limit.
-        zero_test: z of `beats_zero`; None = every displacement is kept.
-        subpixel: "parabola" = to fractions of a pixel; a displacement of 0 stays 0.
 
     Returns:
-        (column displacement, row displacement) in metres, and the NCC score of the whole pixel; a displacement that
-        does not pass the test is 0.
+        (column displacement, row displacement) in metres, and the NCC score.
 
     Convention:
         Scores are compared as c^2 / E_w, the square of Eq. norm_correlation without its constant factor. Ties:
         smallest norm, then smallest row displacement, then smallest column displacement.
     """
     overlap, window_energy = overlap_and_energy(template, target)
-    height, width = template.shape[-2:]
+    height, width = template.shape
     rank = np.zeros((height, width))
     np.divide(overlap * overlap, window_energy, out=rank, where=window_energy > 0)
     candidates = []
@@ -168,23 +138,15 @@ def scene_flow_in_1view(
         if reach is None or dx * dx + dy * dy <= reach * reach:
             candidates.append((-rank[u_y, u_x], dx * dx + dy * dy, dy, dx))
     _, _, dy, dx = min(candidates)
-    if zero_test is not None and not beats_zero(template, target, dy, dx, zero_test):
-        dy, dx = 0, 0
-    scores = norm_correlation(overlap, int(template.sum()), window_energy)
-    moves = (dy, dx) != (0, 0)
-    y, x = parabola(template, target, dy, dx) if moves and subpixel == "parabola" else (0.0, 0.0)
-    return ((dx + x) * pixel_size, (dy + y) * pixel_size), float(scores[dy + height // 2, dx + width // 2])
+    u = dy + height // 2, dx + width // 2
+    score = overlap[u] / math.sqrt(template.sum() * window_energy[u]) if overlap[u] > 0 else 0.0
+    return (dx * pixel_size, dy * pixel_size), float(score)
 
 
 def ncc_map(template: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Eq. norm_correlation: R[u_y, u_x] for every pixel u, (H, W) float64 in [0, 1], 0 for an empty neighbourhood."""
     overlap, window_energy = overlap_and_energy(template, target)
-    return norm_correlation(overlap, int(template.sum()), window_energy)
-
-
-def norm_correlation(overlap: np.ndarray, template_energy: int, window_energy: np.ndarray) -> np.ndarray:
-    """Eq. norm_correlation from its three counts: c / sqrt(E_m E_w), 0 where a count is 0."""
-    energy = template_energy * window_energy
+    energy = template.sum() * window_energy
     scores = np.zeros(energy.shape)
     np.divide(overlap, np.sqrt(energy), out=scores, where=energy > 0)
     return scores
@@ -193,18 +155,11 @@ def norm_correlation(overlap: np.ndarray, template_energy: int, window_energy: n
 def overlap_and_energy(template: np.ndarray, target: np.ndarray) -> Tuple[np.ndarray, np.ndarray]:
     """Numerator and right-hand energy of Eq. norm_correlation; both are counts, the images being binary.
 
-    Args:
-        template: (H, W) bool, I_m; or (n, H, W), one image per height slice.
-        target: the same shape, I_{t+1}; pixels outside it are 0.
-
     Returns:
         Two (H, W) int64 maps over u: the number of template pixels that fall on a target pixel when the template's
-        corner lies at u - floor(size / 2), and the number of target pixels in that H x W neighbourhood. Slices
-        are counted apart and added up.
+        corner lies at u - floor(size / 2), and the number of target pixels in that H x W neighbourhood. What lies
+        outside the target is 0.
     """
-    if template.ndim == 3:
-        overlaps, energies = zip(*(overlap_and_energy(*images) for images in zip(template, target)))
-        return np.sum(overlaps, axis=0), np.sum(energies, axis=0)
     height, width = template.shape
     half_h, half_w = height // 2, width // 2
     counts = target.astype(np.int32)

@@ -1,4 +1,4 @@
-"""Matches between the key points of two images (Sec. CorrelationFlow-Keypoints: Matching keypoints).
+"""Key points of two images, their descriptors and their matches (Sec. CorrelationFlow-Keypoints).
 
 Pixels are (row, column), displacements are pixels, t -> t+1.
 """
@@ -6,30 +6,73 @@ Pixels are (row, column), displacements are pixels, t -> t+1.
 from __future__ import annotations
 
 import math
-from typing import List, NamedTuple
+from typing import List, NamedTuple, Tuple
 
 import numpy as np
 
-from cflow_torch.config import Config
-from oracle.descriptors import Keypoints, described_keypoints
+from cflow_torch.config import KeypointsConfig
 
 
-class Candidate(NamedTuple):
-    """A key point of t+1 as a match of one of t, or the reverse; the smaller tuple is the better match.
+class Keypoints(NamedTuple):
+    """Key points of one image with their descriptors, in raster order."""
 
-    Attributes:
-        minus_rank: -c^2 / E of the other one's descriptor.
-        squared_length, dy, dx: displacement t -> t+1 in pixels, whichever of the two looks for the other.
-        number: the other one's number.
-        overlap: c, number of positions at which both descriptors are one.
+    pixels: np.ndarray  # (K, 2) int64, row and column
+    descriptors: np.ndarray  # (K, L * L) bool
+    energies: np.ndarray  # (K,) int64, E = number of ones of each descriptor, its squared norm; at least 1, the centre
+
+
+def described_keypoints(image: np.ndarray, patch_size: int) -> Keypoints:
+    """Key points of an image (H, W) bool and their descriptors of side L = `patch_size`."""
+    pixels = detect_keypoints(image)
+    descriptors = describe(image, pixels, patch_size)
+    return Keypoints(pixels, descriptors, descriptors.sum(axis=1))
+
+
+def detect_keypoints(image: np.ndarray) -> np.ndarray:
+    """Sec. Keypoints: the foreground pixels whose distance to the background is 1.
+
+    Args:
+        image: (H, W) bool.
+
+    Returns:
+        (K, 2) int64, row and column, in raster order.
+
+    Convention:
+        Distance 1 means that one of the 4 orthogonal neighbours is background. What lies outside the image is
+        background, as in the zero padding of the descriptors.
     """
+    padded = np.pad(image, 1)
+    keypoints = []
+    for r, c in np.argwhere(image).tolist():
+        # (r, c) of the image is (r + 1, c + 1) of the padded one.
+        above, below = padded[r, c + 1], padded[r + 2, c + 1]
+        left, right = padded[r + 1, c], padded[r + 1, c + 2]
+        if not (above and below and left and right):
+            keypoints.append((r, c))
+    return np.array(keypoints, dtype=np.int64).reshape(-1, 2)
 
-    minus_rank: float
-    squared_length: int
-    dy: int
-    dx: int
-    number: int
-    overlap: int
+
+def describe(image: np.ndarray, keypoints: np.ndarray, patch_size: int) -> np.ndarray:
+    """Sec. Descriptor: the L x L patch of the occupancy image around each key point, flattened; 0 outside the image.
+
+    Args:
+        image: (H, W) bool.
+        keypoints: (K, 2) int64, row and column.
+        patch_size: L, odd.
+
+    Returns:
+        (K, L * L) bool.
+    """
+    padded = np.pad(image, patch_size // 2)
+    descriptors = np.zeros((len(keypoints), patch_size * patch_size), dtype=bool)
+    for k, (r, c) in enumerate(keypoints.tolist()):
+        descriptors[k] = padded[r : r + patch_size, c : c + patch_size].ravel()
+    return descriptors
+
+
+# A key point of t+1 as a match of one of t; the smaller tuple is the better match: -c^2 / E of its descriptor, squared
+# length and dy, dx of the displacement in pixels, its number, c (positions at which both descriptors are one).
+Candidate = Tuple[float, int, int, int, int, int]
 
 
 class Match(NamedTuple):
@@ -42,52 +85,47 @@ class Match(NamedTuple):
     score: float
 
 
-def match_keypoints(image: np.ndarray, image1: np.ndarray, reach: float, config: Config) -> List[Match]:
+def match_keypoints(image: np.ndarray, image1: np.ndarray, reach: float, config: KeypointsConfig) -> List[Match]:
     """Sec. Matching keypoints: Eq. best_match of every key point of t, then the ratio test.
 
     Args:
         image: (H, W) bool, I_t.
         image1: (H, W) bool, I_{t+1}.
         reach: longest displacement in pixels, itself allowed.
-        config: `patch_size`, `ratio_threshold`, `second_best_distance`, `mutual_check`.
+        config: `patch_size`, `ratio_threshold`.
 
     Returns:
         The accepted matches, in raster order of their key points of t.
 
     Convention:
-        The second best lies at least `second_best_distance` pixels from the best; where there is none the match is
-        accepted. `mutual_check` (not in the paper) asks besides that the key point of t is the best one of its
-        match. Ties in either direction: smallest displacement t -> t+1, then smallest dy, then smallest dx.
+        Without a second candidate the match is accepted. Ties: smallest displacement, then smallest dy, then
+        smallest dx.
     """
     at_t, at_t1 = (described_keypoints(i, config.patch_size) for i in (image, image1))
     matches = []
     for i, (row, column) in enumerate(at_t.pixels.tolist()):
-        candidates = rank_candidates(at_t, i, at_t1, reach, forward=True)
+        candidates = rank_candidates(at_t, i, at_t1, reach)
         if not candidates:
             continue
-        best = candidates[0]
-        energy, energy1 = int(at_t.energies[i]), int(at_t1.energies[best.number])
-        second = next((c for c in candidates[1:] if lies_apart(c, best, config.second_best_distance)), None)
-        if second is not None:
-            second_energy = int(at_t1.energies[second.number])
-            if not passes_ratio_test(best.overlap, energy1, second.overlap, second_energy, config.ratio_threshold):
+        _, _, dy, dx, best, overlap = candidates[0]
+        if len(candidates) > 1:
+            second, overlap2 = candidates[1][4:]
+            counts = overlap, int(at_t1.energies[best]), overlap2, int(at_t1.energies[second])
+            if not passes_ratio_test(*counts, config.ratio_threshold):
                 continue
-        if config.mutual_check and rank_candidates(at_t1, best.number, at_t, reach, forward=False)[0].number != i:
-            continue
-        score = best.overlap / math.sqrt(energy * energy1)
-        matches.append(Match(row, column, best.dx, best.dy, score))
+        score = overlap / math.sqrt(int(at_t.energies[i]) * int(at_t1.energies[best]))
+        matches.append(Match(row, column, dx, dy, score))
     return matches
 
 
-def rank_candidates(viewers: Keypoints, viewer: int, others: Keypoints, reach: float, forward: bool) -> List[Candidate]:
-    """Key points of the other image within the gate of one key point, the best match first (Eq. best_match).
+def rank_candidates(at_t: Keypoints, number: int, at_t1: Keypoints, reach: float) -> List[Candidate]:
+    """Key points of t+1 within reach of one key point of t, the best match first (Eq. best_match).
 
     Args:
-        viewers: key points of the image that looks for matches.
-        viewer: number of the one that looks.
-        others: key points of the other image.
+        at_t: key points of t.
+        number: which of them.
+        at_t1: key points of t+1.
         reach: longest displacement in pixels, itself allowed.
-        forward: True where the viewer belongs to t, False where it belongs to t+1.
 
     Convention:
         Eq. descriptor_ncc is c / sqrt(E E_other); E is the viewer's own, so c^2 / E_other ranks its candidates. The
@@ -95,37 +133,21 @@ def rank_candidates(viewers: Keypoints, viewer: int, others: Keypoints, reach: f
         rounded alike, and different ones differ by at least 1 / 2601^2 > 1e-7, at values of at most 2601, where
         rounding changes less than 1e-12.
     """
-    r, c = viewers.pixels[viewer].tolist()
-    # A square that holds the gate for certain; the comparison below decides.
-    half = int(min(reach, max(others.number_at.shape))) + 1
-    square = others.number_at[max(r - half, 0) : r + half + 1, max(c - half, 0) : c + half + 1]
-    numbers = square[square >= 0]
-    dy, dx = (others.pixels[numbers] - viewers.pixels[viewer]).T
-    near = dx * dx + dy * dy <= reach * reach
-    numbers, dy, dx = numbers[near], dy[near], dx[near]
-    if not forward:
-        dy, dx = -dy, -dx
-
-    overlap = np.count_nonzero(others.descriptors[numbers] & viewers.descriptors[viewer], axis=1)
-    rank = overlap * overlap / others.energies[numbers]
+    dy, dx = (at_t1.pixels - at_t.pixels[number]).T
+    numbers = np.flatnonzero(dx * dx + dy * dy <= reach * reach)
+    dy, dx = dy[numbers], dx[numbers]
+    overlap = np.count_nonzero(at_t1.descriptors[numbers] & at_t.descriptors[number], axis=1)
+    rank = overlap * overlap / at_t1.energies[numbers]
     columns = (-rank, dx * dx + dy * dy, dy, dx, numbers, overlap)
-    return sorted(map(Candidate._make, zip(*(column.tolist() for column in columns))))
-
-
-def lies_apart(candidate: Candidate, best: Candidate, distance: float) -> bool:
-    """Whether two key points, seen from the same one, are at least `distance` pixels apart."""
-    dy, dx = candidate.dy - best.dy, candidate.dx - best.dx
-    return dx * dx + dy * dy >= distance * distance
+    return sorted(zip(*(column.tolist() for column in columns)))
 
 
 def passes_ratio_test(overlap: int, energy: int, second_overlap: int, second_energy: int, ratio: float) -> bool:
     """R_best > rho R_second (Sec. Matching keypoints), in whole numbers.
 
     Args:
-        overlap: c of the best match.
-        energy: E of the best match's descriptor.
-        second_overlap: c of the second best.
-        second_energy: E of the second best's descriptor.
+        overlap, energy: c and E of the best match.
+        second_overlap, second_energy: c and E of the second best.
         ratio: rho, at least 1, used to four decimals.
 
     Convention:

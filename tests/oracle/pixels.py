@@ -40,12 +40,6 @@ def bounding_box(pixels: Sequence[np.ndarray]) -> Box:
     return int(row), int(column), int(last_row - row + 1), int(last_column - column + 1)
 
 
-def longer_side(points: np.ndarray, config: Config, pixel_size: float) -> float:
-    """Metres: longer side of the bounding box of the pixels of points (N, 3), counted in pixels times s."""
-    _, _, height, width = bounding_box([project_bev(points, config, pixel_size)])
-    return max(height, width) * pixel_size
-
-
 def occupancy(pixels: np.ndarray, box: Box) -> np.ndarray:
     """Binary image of the box: True where at least one of the pixels (N, 2) lies (text below Eq. bev_dims)."""
     row, column, height, width = box
@@ -55,21 +49,8 @@ def occupancy(pixels: np.ndarray, box: Box) -> np.ndarray:
     return image
 
 
-def slice_images(points: np.ndarray, config: Config, pixel_size: float, box: Box) -> np.ndarray:
-    """Binary images (n, H, W) of the box, one per height slice floor(z / slice_height) mod n of points (N, 3).
-
-    Convention: one image of all points without `height_slices`; heights beyond 1e12 m count as 1e12 m.
-    """
-    pixels = project_bev(points, config, pixel_size)
-    if config.height_slices == 0:
-        return occupancy(pixels, box)[None]
-    z = np.clip(points[:, 2], -1e12, 1e12)
-    numbers = np.array([math.floor(value) % config.height_slices for value in z / config.slice_height], dtype=np.int64)
-    return np.stack([occupancy(pixels[numbers == number], box) for number in range(config.height_slices)])
-
-
-def search_radius(config: Config, elapsed: float, pixel_size: float) -> Optional[float]:
-    """Longest displacement in pixels: max_speed * elapsed / s + one pixel; None = the paper's, half of the box."""
+def search_radius(config: Config, seconds: float, pixel_size: float) -> Optional[float]:
+    """Longest displacement in pixels: max_speed * time / s + one pixel; None = the paper's, half of the box."""
     if config.max_speed is None:
         return None
-    return config.max_speed * elapsed / pixel_size + 1
+    return config.max_speed * seconds / pixel_size + 1

@@ -1,137 +1,104 @@
-"""Candidates: equal to the scalar rule to the bit; sweeps that are missing change no choice; nested components."""
+"""Motion candidates: the oracle's peaks and list of motions; sweeps that a window lacks change no choice."""
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 import pytest
 import torch
-from oracle import candidates as ref
-from scenes import needs_gpu, same_bits
+from moving_scenes import for_oracle
+from oracle import candidates as oracle
+from oracle.component_tree import find_components as oracle_components
+from scenes import config, same_bits, scene, sweeps_of
 
-from cflow_torch.verified.candidates import inherit, make_candidates
-from cflow_torch.verified.paired_test import choose
+from cflow_torch.verified.candidates import _find_peaks, list_motions, propose
+from cflow_torch.verified.component_tree import find_components
+from cflow_torch.verified.paired_test import VerifiedLevel, best_candidate
 
 
-def estimates(seed: int, num_nodes: int = 300, num_sweeps: int = 5):
+@pytest.mark.parametrize("block", [1, 2])
+def test_peaks_equal_the_oracle(block):
+    settings, moved = config("verified", num_history=2, max_speed=8.0, pixel_size=0.12), 0
+    windows = [scene(seed, num_history=seed % 3) for seed in range(4)]
+    sweeps = sweeps_of(windows, settings)
+    level = find_components(sweeps, block, False, settings)
+    wanted = torch.arange(level.num_components) % 5 > 0
+    estimates, scores, available = _find_peaks(level, wanted, sweeps, settings)
+    assert not available[~wanted].any() and not estimates[~available].any()
+    start = 0
+    for window in range(4):
+        of_window = for_oracle(sweeps, window)
+        expected = oracle_components(of_window, block, False, settings)
+        for i, members in enumerate(expected.members, start):
+            for m in range(1, len(of_window.images) if wanted[i] else 1):
+                peak = oracle.find_peak(of_window, expected, members, m, settings)
+                assert available[i, m - 1] == (peak is not None)
+                if peak is not None:
+                    assert estimates[i, m - 1].tolist() == pytest.approx(peak[0], abs=1e-9)
+                    assert float(scores[i, m - 1]) == pytest.approx(peak[1], abs=1e-6)
+                    moved += int(any(peak[0]))
+        start += len(expected.members)
+    assert moved > 10
+
+
+def random_estimates(seed: int, num_sweeps: int):
     """Whole and parabola's pixels by whole and uneven steps: zeros, ties and opposites abound."""
-    rng = np.random.default_rng(seed)
-    whole = rng.integers(-3, 4, (num_nodes, num_sweeps, 2)) * (rng.random((num_nodes, num_sweeps, 1)) < 0.8)
+    rng, count = np.random.default_rng(seed), 300
+    whole = rng.integers(-3, 4, (count, num_sweeps, 2)) * (rng.random((count, num_sweeps, 1)) < 0.8)
     free = whole + rng.uniform(-0.5, 0.5, whole.shape)
-    given = np.where(rng.random((num_nodes, 1, 1)) < 0.6, whole, free).astype(np.float64)
-    available = rng.random((num_nodes, num_sweeps)) < 0.7
-    intervals = np.where(rng.random((num_nodes, 1)) < 0.7, 1.0, 1.0625) * np.arange(1, num_sweeps + 1)
-    inherited = np.round(rng.normal(0, 2, (num_nodes, 2))) / 2 + 0.0
-    given[~available] = math.nan  # must not be looked at
-    intervals[~available] = 0.0
-    return given, available, intervals, inherited
-
-
-def scalar(given, available, intervals, inherited):
-    for f, known, k, parent in zip(given, available, intervals, inherited):
-        row = [tuple(v) if is_known else None for v, is_known in zip(f.tolist(), known.tolist())]
-        yield ref.candidates(row, k.tolist(), [tuple(parent.tolist())])
-
-
-def candidates_of(given, available, intervals, inherited):
-    return make_candidates(given, available, intervals, [inherited])
+    given = np.where(rng.random((count, 1, 1)) < 0.6, whole, free).astype(np.float64)
+    available = rng.random((count, num_sweeps)) < 0.7
+    intervals = np.where(rng.random((count, 1)) < 0.7, 1.0, 1.0625) * np.arange(1, num_sweeps + 1)
+    given[~available], intervals[~available] = np.nan, 0.0  # must not be looked at
+    return tuple(map(torch.from_numpy, (given, available, intervals, rng.normal(0, 2, (count, 2)))))
 
 
 @pytest.mark.parametrize("num_sweeps", [1, 2, 3, 5])
-def test_candidates_equal_the_scalar_rule(num_sweeps):
-    for seed in range(3):
-        given = estimates(seed, num_sweeps=num_sweeps)
-        found = candidates_of(*map(torch.from_numpy, given))
-        expected = np.array(list(scalar(*given))) + 0.0  # no -0.0
-        assert found.shape == expected.shape == (300, num_sweeps + 1 + (num_sweeps > 1), 2)
-        assert found.numpy().tobytes() == expected.tobytes()
+def test_motions_equal_the_oracle(num_sweeps):
+    given, available, intervals, other = random_estimates(num_sweeps, num_sweeps)
+    found = list_motions(given, available, intervals, [other])
+    assert found.shape == (300, num_sweeps + 1 + (num_sweeps > 1), 2)
+    assert not (torch.signbit(found) & (found == 0)).any()
+    for mine, f, known, k, parent in zip(*(v.tolist() for v in (found, given, available, intervals, other))):
+        estimates = [tuple(v) if is_known else None for v, is_known in zip(f, known)]
+        np.testing.assert_allclose(mine, oracle.list_motions(estimates, k, [tuple(parent)]), atol=1e-9)
 
 
-def test_without_a_coarser_level():
-    given, available, intervals, inherited = map(torch.from_numpy, estimates(1))
-    found = make_candidates(given, available, intervals)
-    assert same_bits(found, candidates_of(given, available, intervals, inherited)[:, :-1].contiguous())
-    assert found.shape == (300, 6, 2)
-
-
-def test_no_negative_zero():
-    for seed in range(3):
-        found = candidates_of(*map(torch.from_numpy, estimates(seed)))
-        assert not (torch.signbit(found) & (found == 0)).any()
-    minus = torch.tensor([[[-0.0, -0.0]]], dtype=torch.float64)
-    one = torch.ones((1, 1), dtype=torch.float64)
-    assert not torch.signbit(candidates_of(minus, one.bool(), one, minus[0])).any()
-
-
-def test_sweeps_that_a_window_lacks_change_no_choice():
-    # A window of two sweeps, alone and in a batch with windows of six. What a motion is worth depends on it alone.
-    given, available, intervals, inherited = map(torch.from_numpy, estimates(4, num_sweeps=1))
-    alone = candidates_of(given, available, intervals, inherited)
-    padded = [torch.cat((v, v.new_zeros((300, 4, *v.shape[2:]))), 1) for v in (given, available, intervals)]
-    together = candidates_of(*padded, inherited)
-
-    def worth(motions: torch.Tensor) -> torch.Tensor:
-        y, x = (3 * motions).floor().long().unbind(2)
-        return ((7 * y - 5 * x) % 11) * (motions != 0).any(2)
-
-    assert (worth(together) > 0).any(1).sum() > 100
-    for a, b in zip(choose(worth(alone), alone), choose(worth(together), together)):
-        assert same_bits(a, b)
-
-
-def test_candidates_by_hand():
-    given = torch.tensor(
-        [[[2.0, 0.0], [8.0, 0.0], [9.0, 0.0]], [[5.0, 5.0], [0.0, 3.0], [1.0, 1.0]]], dtype=torch.float64
-    )
+def test_motions_by_hand():
+    given = torch.tensor([[[2.0, 0.0], [8.0, 0.0], [9.0, 0.0]], [[5.0, 5.0], [0.0, 3.0], [1.0, 1.0]]]).double()
     available = torch.tensor([[True, True, True], [False, True, False]])
-    intervals = torch.tensor([[1.0, 2.0, 3.0]] * 2, dtype=torch.float64)
-    found = candidates_of(given, available, intervals, torch.tensor([[0.5, -1.0], [0.0, 0.0]], dtype=torch.float64))
+    other = torch.tensor([[0.5, -1.0], [0.0, 0.0]]).double()
+    found = list_motions(given, available, torch.tensor([[1.0, 2.0, 3.0]] * 2).double(), [other])
     assert found[0].tolist() == [[3.0, 0.0], [2.0, 0.0], [4.0, 0.0], [3.0, 0.0], [0.5, -1.0]]
     assert found[1].tolist() == [[0.0, 1.5], [0.0, 0.0], [0.0, 1.5], [0.0, 0.0], [0.0, 0.0]]
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_inherited_motion_equals_the_loop(seed):
-    rng = np.random.default_rng(seed)
-    shape, num_nodes, num_above = (3, 9, 11), 12, 4
-    node = rng.integers(0, num_nodes + 1, shape)
-    node[node == 3] = num_nodes  # a component without pixels
-    above = np.where(rng.random(shape) < 0.3, -1, node % num_above)
-    above[node == 5] = -1  # one without a coarser component
-    occupied = rng.random(shape) < 0.5
-    motions = rng.normal(size=(num_above, 2))
-    listed = np.flatnonzero(occupied)
-    found = inherit(
-        torch.from_numpy(node.ravel()[listed]),
-        num_nodes,
-        torch.from_numpy(np.where(above < 0, num_above, above).ravel()[listed]),
-        torch.from_numpy(motions),
-    )
-    rows = [tuple(f) for f in motions.tolist()]
-    expected = [ref.inherit((node == i) & occupied, above, rows) for i in range(num_nodes)]
-    assert found.tolist() == [list(f) for f in expected]
-    assert found[3].tolist() == found[5].tolist() == [0.0, 0.0]
+def test_sweeps_that_a_window_lacks_change_no_choice():
+    # A window of two sweeps, alone and in a batch with windows of six. Evidence depends on the motion alone.
+    given, available, intervals, other = random_estimates(4, 1)
+    alone = list_motions(given, available, intervals, [other])
+    padded = [torch.cat((v, v.new_zeros((300, 4, *v.shape[2:]))), 1) for v in (given, available, intervals)]
+    together = list_motions(*padded, [other])
+
+    def evidence(motions: torch.Tensor) -> torch.Tensor:
+        y, x = (3 * motions).floor().long().unbind(2)
+        return ((7 * y - 5 * x) % 11) * (motions != 0).any(2)
+
+    assert (evidence(together) > 0).any(1).sum() > 100
+    for a, b in zip(best_candidate(evidence(alone), alone), best_candidate(evidence(together), together)):
+        assert same_bits(a, b)
 
 
-def test_the_first_pixel_decides_where_components_are_not_nested():
-    node, above = torch.tensor([1, 0, 0, 1, 0, 2]), torch.tensor([2, 3, 1, 0, 0, 0])  # 3 = none
-    motion = torch.tensor([[1.0, 0.0], [0.0, 2.0], [3.0, 3.0]], dtype=torch.float64)
-    assert inherit(node, 2, above, motion).tolist() == [[0.0, 2.0], [3.0, 3.0]]
-
-
-def test_nothing():
-    none = torch.zeros((0, 3, 2), dtype=torch.float64)
-    no_motion = none[:, 0]
-    found = candidates_of(none, none[:, :, 0].bool(), none[:, :, 0], no_motion)
-    assert found.shape == (0, 5, 2)
-    nobody = torch.zeros(0, dtype=torch.int64)
-    assert inherit(nobody, 0, nobody, no_motion).shape == (0, 2)
-    assert inherit(nobody, 2, nobody, no_motion).tolist() == [[0.0, 0.0]] * 2
-
-
-@pytest.mark.cuda
-@needs_gpu
-def test_candidates_on_cuda_equal_cpu():
-    given = list(map(torch.from_numpy, estimates(7)))
-    assert same_bits(candidates_of(*(v.cuda() for v in given)), candidates_of(*given))
+def test_parts_are_asked_for_the_motion_of_the_whole_and_looked_for_if_they_differ():
+    settings = config("verified", num_history=1, pixel_size=0.1)
+    sweeps = sweeps_of([scene(3, num_history=1)], settings)
+    whole, part = (find_components(sweeps, 1, undilated, settings) for undilated in (False, True))
+    motion = torch.arange(2.0 * whole.num_components, dtype=torch.float64).view(-1, 2) + 1
+    score = torch.full((sweeps.pixel.numel(),), 0.25)
+    above = VerifiedLevel(whole, motion, motion[:, 0].long(), score)
+    found = propose(part, sweeps, above, None, settings)
+    parent = part.parents(whole)
+    assert same_bits(found.motion[:, -1], motion[parent])
+    same = part.equals_parent(whole, parent)
+    assert same.any() and (~same).any()
+    assert not found.motion[same, :-1].any()  # what has not fallen apart is known
+    assert (found.score[same[part.component.clamp(max=len(same) - 1)]] == 0.25).all()

@@ -1,0 +1,220 @@
+"""The best shift of each template, against a plain loop over all shifts, the oracle and OpenCV."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import List, Optional, Tuple
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from oracle.dense import scene_flow_in_1view
+from scenes import needs_gpu, same_bits
+
+from cflow_torch import CFlowError
+from cflow_torch.dense import correlation
+from cflow_torch.dense.correlation import best_shifts
+from cflow_torch.dense.templates import Images, TemplatePairs
+from cflow_torch.windows import memory
+
+ENGINES = ("fft", "conv")
+Pair = Tuple[np.ndarray, int, Optional[float]]  # template, its target, radius
+
+
+def loop(template: np.ndarray, target: np.ndarray, radius: Optional[float]) -> Tuple[int, int, float]:
+    """(dy, dx, score) by looking at every shift on its own."""
+    height, width = template.shape
+    best = None
+    for dy in range(-(height // 2), height - height // 2):
+        for dx in range(-(width // 2), width - width // 2):
+            if radius is not None and dx * dx + dy * dy > radius * radius:
+                continue
+            window = np.zeros((height, width), dtype=bool)  # target pixels under the shifted template's box
+            rows, cols = slice(max(dy, 0), min(height, height + dy)), slice(max(dx, 0), min(width, width + dx))
+            window[rows.start - dy : rows.stop - dy, cols.start - dx : cols.stop - dx] = target[rows, cols]
+            count, energy = int((template & window).sum()), int(window.sum())
+            value = count * count / energy if energy else 0.0
+            score = count / math.sqrt(int(template.sum()) * energy) if energy else 0.0
+            rank = (-value, dx * dx + dy * dy, dy, dx)
+            if best is None or rank < best[0]:
+                best = (rank, dy, dx, score)
+    return best[1], best[2], best[3]
+
+
+def as_images(images: List[np.ndarray]) -> Images:
+    """Set pixels of all images, in random order."""
+    parts = [np.column_stack([np.full(image.sum(), i), np.argwhere(image)]) for i, image in enumerate(images)]
+    pixels = np.random.default_rng(0).permutation(np.concatenate(parts).astype(np.int64))
+    return Images(*torch.from_numpy(pixels).t().contiguous())
+
+
+def as_pairs(targets: List[np.ndarray], pairs: List[Pair]) -> TemplatePairs:
+    """Pairs in the order of their targets."""
+    radius = None if pairs[0][2] is None else torch.tensor([pair[2] for pair in pairs], dtype=torch.float64)
+    return TemplatePairs(
+        as_images([pair[0] for pair in pairs]),
+        as_images(targets),
+        torch.tensor([pair[1] for pair in pairs]),
+        torch.zeros(len(pairs), dtype=torch.int64),
+        torch.tensor([target.shape for target in targets]),
+        radius,
+    )
+
+
+def assert_equals_loop(targets: List[np.ndarray], pairs: List[Pair], engine: str = "fft") -> None:
+    shift, score = best_shifts(as_pairs(targets, pairs), engine)
+    assert shift.dtype == torch.int64 and score.dtype == torch.float32
+    expected = [loop(template, targets[own], radius) for template, own, radius in pairs]
+    assert shift.tolist() == [[dy, dx] for dy, dx, _ in expected]
+    assert score.tolist() == pytest.approx([value for _, _, value in expected], abs=1e-6)
+
+
+def random_image(rng, shape, density=None) -> np.ndarray:
+    image = rng.random(shape) < (rng.choice([0.05, 0.2, 0.5, 0.9]) if density is None else density)
+    image.flat[rng.integers(image.size)] = True
+    return image
+
+
+def random_pairs(rng, sizes, num_pairs, with_radius) -> Tuple[List[np.ndarray], List[Pair]]:
+    targets = [random_image(rng, size) for size in sizes]
+    pairs: List[Pair] = []
+    for own in sorted([*range(len(sizes)), *rng.integers(0, len(sizes), num_pairs).tolist()]):
+        moved = np.roll(targets[own], rng.integers(-2, 3, 2), (0, 1)) & (rng.random(sizes[own]) < 0.8)
+        template = moved if moved.any() and rng.random() < 0.6 else random_image(rng, sizes[own])
+        pairs.append((template, own, float(rng.choice([0, 1, 2**0.5, 2, 2.9, 5, 40])) if with_radius else None))
+    return targets, pairs
+
+
+SIZES = [(1, 1), (1, 2), (2, 1), (2, 2), (1, 9), (12, 1), (8, 8), (9, 8), (3, 7), (16, 5), (17, 16), (2, 33), (40, 3)]
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("with_radius", [False, True])
+def test_best_shifts_equal_the_loop(with_radius, engine):
+    """All sizes in one call, several templates per target."""
+    for seed in range(2):
+        assert_equals_loop(*random_pairs(np.random.default_rng(seed), SIZES, 30, with_radius), engine)
+
+
+@pytest.mark.parametrize("shape", [(1, 700), (3, 260), (97, 8), (66, 130)])
+def test_long_thin_images_equal_the_oracle(shape):
+    rng = np.random.default_rng(sum(shape))
+    target = random_image(rng, shape, 0.1)
+    dy, dx = shape[0] // 3, -(shape[1] // 3)
+    template = np.zeros(shape, dtype=bool)
+    for row, col in np.argwhere(target):  # the target moved by -shift, as far as it stays inside
+        if 0 <= row - dy < shape[0] and 0 <= col - dx < shape[1]:
+            template[row - dy, col - dx] = True
+    template |= random_image(rng, shape, 0.01)
+    found, score = best_shifts(as_pairs([target], [(template, 0, None)]))
+    (x, y), expected_score = scene_flow_in_1view(template, target, 1.0)
+    assert found.tolist() == [[y, x]] and score.tolist() == pytest.approx([expected_score], abs=1e-6)
+
+
+def test_every_small_image_equals_the_loop():
+    # All pairs of 2 x 3 images: plenty of ties of every kind.
+    images = [np.array([(i >> b) & 1 for b in range(6)], dtype=bool).reshape(2, 3) for i in range(1, 64)]
+    assert_equals_loop(images, [(template, own, None) for own in range(len(images)) for template in images[::3]])
+
+
+@pytest.mark.parametrize(
+    "target, best",
+    [
+        ([(3, 1), (3, 5)], (0, -2)),  # equal distance left and right: the smaller dx
+        ([(1, 3), (5, 3)], (-2, 0)),  # above and below: the smaller dy
+        ([(3, 5), (4, 3)], (1, 0)),  # the nearer one
+        ([(2, 4), (4, 2)], (-1, 1)),  # same distance: dy before dx
+        ([(3, 3), (3, 4)], (0, 0)),  # where it is
+    ],
+)
+def test_ties(target, best):
+    image, template = np.zeros((2, 7, 7), dtype=bool)
+    template[3, 3] = True
+    for pixel in target:
+        image[pixel] = True
+    for engine in ENGINES:
+        assert best_shifts(as_pairs([image], [(template, 0, None)]), engine)[0].tolist() == [list(best)]
+    assert scene_flow_in_1view(template, image, 1.0)[0] == best[::-1]
+
+
+def shift_of(template: List[Tuple[int, int]], target: List[Tuple[int, int]], shape, radius=None) -> Tuple[list, float]:
+    image, other = np.zeros((2, *shape), dtype=bool)
+    for pixels, drawn in ((template, image), (target, other)):
+        for pixel in pixels:
+            drawn[pixel] = True
+    shift, score = best_shifts(as_pairs([other], [(image, 0, radius)]))
+    return shift[0].tolist(), float(score)
+
+
+def test_what_is_searched():
+    assert shift_of([(0, 0)], [(8, 8)], (9, 9)) == ([0, 0], 0.0)  # a shift of 8 is out of reach: no overlap at all
+    assert shift_of([(0, 0)], [(8, 8), (4, 4)], (9, 9))[0] == [4, 4]
+    assert shift_of([(0, 0)], [(8, 8), (4, 4)], (9, 9), 3.0) == ([0, 0], 0.0)
+    assert shift_of([(3, 3)], [(6, 7)], (11, 11), 5.0)[0] == [3, 4]  # the radius itself
+    assert shift_of([(3, 3)], [(6, 7)], (11, 11), float(np.nextafter(5, 0)))[0] == [0, 0]
+    # Of even sizes one shift less on the far side.
+    assert shift_of([(0, 0)], [(0, 4)], (1, 8))[0] == [0, 0] and shift_of([(0, 4)], [(0, 0)], (1, 8))[0] == [0, -4]
+
+
+def test_no_pairs():
+    none = torch.zeros(0, dtype=torch.int64)
+    nothing = Images(none, none, none)
+    shift, score = best_shifts(TemplatePairs(nothing, nothing, none, none, torch.zeros(0, 2).long()))
+    assert shift.shape == (0, 2) and score.shape == (0,)
+
+
+def test_company_chunks_and_memory_do_not_matter(monkeypatch):
+    rng = np.random.default_rng(12)
+    targets, pairs = random_pairs(rng, [(5, 6), (20, 20), (9, 33), (70, 3)], 10, False)
+    shift, score = best_shifts(as_pairs(targets, pairs))
+    for i, (template, own, _) in enumerate(pairs):
+        alone = best_shifts(as_pairs([targets[own]], [(template, 0, None)]))
+        assert torch.equal(alone[0][0], shift[i]) and same_bits(alone[1][0], score[i])
+    for engine in ENGINES:
+        for found in (best_shifts(as_pairs(targets, pairs), engine, limit) for limit in (1, 100_000)):
+            assert torch.equal(found[0], shift) and same_bits(found[1], score)
+    monkeypatch.setattr(correlation, "_AT_ONCE_CPU", 600)
+    monkeypatch.setattr(correlation, "_IN_PART_CPU", 900)
+    found = best_shifts(as_pairs(targets, pairs))
+    assert torch.equal(found[0], shift) and same_bits(found[1], score)
+
+
+def test_score_is_that_of_opencv():
+    """cv2.TM_CCORR_NORMED is Eq. norm_correlation; OpenCV works in float32."""
+    targets, pairs = random_pairs(np.random.default_rng(5), [(9, 9), (12, 20), (31, 17), (5, 40)], 20, False)
+    shift, score = best_shifts(as_pairs(targets, pairs))
+    for (template, own, _), (dy, dx), value in zip(pairs, shift.tolist(), score.tolist()):
+        height, width = template.shape
+        half = (height // 2, width // 2)
+        padded = np.pad(targets[own], [(half[0], height - 1 - half[0]), (half[1], width - 1 - half[1])])
+        scores = cv2.matchTemplate(padded.astype(np.float32), template.astype(np.float32), cv2.TM_CCORR_NORMED)
+        assert value == pytest.approx(scores[dy + half[0], dx + half[1]], abs=2e-6)
+        seen = cv2.boxFilter(padded.astype(np.float64), -1, (width, height), anchor=(0, 0), normalize=False)
+        scores[seen[:height, :width] < 0.5] = 0  # OpenCV divides by nearly zero where nothing is below the window
+        assert value >= scores.max() - 2e-6
+
+
+def test_clusters_too_large_are_refused(monkeypatch):
+    ends = [np.zeros((1, 40_000), dtype=bool)]
+    ends[0][0, [0, -1]] = True
+    with pytest.raises(CFlowError, match="40000 pixels long.*finite z bounds"):
+        best_shifts(as_pairs(ends, [(ends[0], 0, None)]))
+    pairs = as_pairs([np.eye(300, dtype=bool)], [(np.eye(300, dtype=bool), 0, None)])
+    monkeypatch.setattr(memory, "_MUCH", 0)
+    monkeypatch.setattr(memory, "available_memory", lambda environ: 10**7)
+    with pytest.raises(CFlowError, match=r"a cluster that is 300 pixels long needs about .* bytes\).*max_speed"):
+        best_shifts(pairs)
+    best_shifts(replace(pairs, radius=torch.tensor([3.0])))  # as the message says
+
+
+@pytest.mark.cuda
+@needs_gpu
+@pytest.mark.parametrize("engine", ENGINES)
+def test_best_shifts_on_cuda_equal_cpu(engine):
+    given = as_pairs(*random_pairs(np.random.default_rng(6), [(5, 6), (20, 20), (9, 33), (64, 64)], 60, True))
+    template, target = (Images(*(t.cuda() for t in (i.image, i.row, i.col))) for i in (given.template, given.target))
+    rest = (values.cuda() for values in (given.cluster, given.source, given.size, given.radius))
+    on_gpu, on_cpu = best_shifts(TemplatePairs(template, target, *rest), engine), best_shifts(given, engine)
+    assert torch.equal(on_gpu[0].cpu(), on_cpu[0]) and torch.allclose(on_gpu[1].cpu(), on_cpu[1], atol=1e-6)

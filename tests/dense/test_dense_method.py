@@ -1,0 +1,306 @@
+"""The dense method: equal to the oracle on random scenes and real drives; truths known beforehand."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from oracle import reference_flow
+from scenes import (
+    assert_same,
+    assert_same_bits,
+    assert_zeros,
+    box,
+    config,
+    flow_as_oracle,
+    needs_gpu,
+    needs_kornia_labelling,
+    pose,
+    scene,
+)
+
+from cflow_torch import CorrelationFlow, Sweep, Window, estimate_flow, make_config
+from cflow_torch.data.av2 import AV2Log
+from cflow_torch.data.hdf5.reader import HDF5Log
+from cflow_torch.data.log import window as window_of
+from cflow_torch.simulator import make_drive
+
+ENGINES = [{"correlation": "conv"}, pytest.param({"labeling": "kornia"}, marks=needs_kornia_labelling)]
+
+
+# ------------------------------------------------------------------------------------------- equal to the oracle
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_equals_the_oracle_on_random_scenes(seed):
+    settings = config(
+        num_history=seed % 5,
+        pixel_sizes=((0.25,), (0.5, 0.25), (0.8, 0.4, 0.2), (0.11,))[seed % 4],
+        sectional_view=seed % 2 == 0,
+        connectivity=(4, 8)[seed % 3 > 0],
+        max_speed=(None, 6.0)[seed % 5 > 2],
+        max_extent=(5.0, 0.3, 1000.0)[seed % 7 % 3],
+        ego_box=(None, (-3.0, -2.0, 2.5, 3.0))[seed % 6 == 5],
+    )
+    flow_as_oracle(scene(seed, num_history=seed % 5, poses=seed % 3 > 0, stamps=seed % 4 > 1), settings)
+
+
+@pytest.mark.parametrize("engines", ENGINES)
+def test_engines_equal_the_oracle(engines):
+    for seed, sectional_view in ((1, True), (2, False)):
+        settings = config(num_history=2, pixel_sizes=(0.5, 0.25), sectional_view=sectional_view, **engines)
+        flow_as_oracle(scene(seed, num_history=2), settings)
+
+
+def test_the_real_pair_equals_the_oracle(av2_folder):
+    result = flow_as_oracle(window_of(AV2Log(av2_folder), 0), make_config("paper"))
+    assert (result.residual_flow.norm(dim=1) >= 0.05).sum() > 1000  # there is something to find
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"num_history": 8, "pixel_sizes": (0.8, 0.4, 0.3, 0.2, 0.1)},
+        {"num_history": 2, "pixel_sizes": (0.4, 0.1), "sectional_view": True},
+        {"num_history": 8, "connectivity": 4, "max_speed": 30.0, "max_extent": 8.0},
+    ],
+    ids=["h8-5scales", "h2-sectional", "h8-connectivity4"],
+)
+def test_drives_equal_the_oracle(kitti_file, data_root, settings):
+    with HDF5Log(kitti_file) as kitti, HDF5Log(data_root / "av2-crown" / "av2-crown.h5") as crown:
+        history = settings["num_history"]
+        logs = [(kitti, 9), (crown, len(crown) - 2), (make_drive(seed=11, num_sweeps=11), 9)]
+        for window in [window_of(log, index, min(history, index)) for log, index in logs]:
+            result = flow_as_oracle(window, make_config("paper", **settings))
+            assert (result.residual_flow.norm(dim=1) >= 0.05).sum() > 500
+
+
+def test_a_mixed_batch_equals_the_loop():
+    """Windows of different sizes, numbers of sweeps, with and without poses; two of them empty."""
+    first, nothing = scene(1), Sweep(np.zeros((0, 3), dtype=np.float32))
+    batch = [
+        scene(0, num_history=3),
+        first,
+        Window(nothing, nothing),
+        scene(2, num_history=1, poses=False, num_objects=2, num_points=15),
+        replace(first, pc1=Sweep(first.pc1.points[:0], pose=first.pc1.pose)),
+        scene(3, num_history=2, num_objects=16),
+    ]
+    model = CorrelationFlow(config(num_history=3, sectional_view=True, pixel_sizes=(0.5, 0.25), max_speed=8.0))
+    for window, result, backwards in zip(batch, model(batch), model(batch[::-1])[::-1]):
+        (alone,) = model([window])
+        assert_same_bits(result, alone)
+        assert_same_bits(backwards, alone)
+        assert_same(alone, reference_flow(window, model.config))
+    assert_zeros(model([batch[4]])[0], len(first.pc0.points))
+
+
+@pytest.mark.cuda
+@needs_gpu
+@pytest.mark.parametrize("num_history, pixel_sizes", [(0, (0.25,)), (2, (0.5, 0.25))])
+def test_cuda_equals_cpu(num_history, pixel_sizes):
+    windows = [scene(seed, num_history=num_history) for seed in range(12)]
+    for engines in ({}, {"correlation": "conv"}, {"labeling": "kornia"}):
+        settings = config(num_history=num_history, pixel_sizes=pixel_sizes, sectional_view=True, **engines)
+        on_cpu = CorrelationFlow(settings, device="cpu")(windows)
+        for gpu, cpu in zip(CorrelationFlow(settings, device="cuda")(windows), on_cpu):
+            assert gpu.flow.is_cuda
+            assert_same(gpu, cpu, atol=1e-4)
+
+
+# --------------------------------------------------------------------------------------- truths known beforehand
+
+WIDE = (-8, -8, -1, 8, 8, 3)
+PAPER = {"preset": "paper", "pixel_size": 0.25, "point_cloud_range": WIDE}
+
+
+def street(seed: int) -> list:
+    """Three boxes, at places where they do not touch."""
+    rng, places = np.random.default_rng(seed), [(-5.0, -4.0, 0.0), (0.5, 2.5, 0.0), (4.0, -3.0, 0.0)]
+    return [box(rng, 2.5, 1.5, 1.5, 400) + place for place in places]
+
+
+def test_every_object_gets_its_own_motion():
+    pc0 = np.concatenate(street(0))
+    truth = np.repeat(np.array([[0.5, -0.25, 0], [0, 0, 0], [-0.5, 0.75, 0]]), 400, axis=0)
+    result = estimate_flow(pc0, pc0 + truth, **PAPER)
+    assert np.array_equal(result.residual_flow.numpy(), truth)
+    assert result.score.tolist() == [1.0] * 1200
+    assert result.cluster_id.tolist() == [0] * 400 + [2] * 400 + [1] * 400  # raster order: rows of y first
+
+
+def test_a_still_world_seen_from_a_moving_sensor():
+    pc_world = np.concatenate(street(1))
+    T_ego1_ego0 = np.linalg.inv(pose(0.9, 0.1, 0.05))
+    pc1 = pc_world @ T_ego1_ego0[:3, :3].T + T_ego1_ego0[:3, 3]
+    result = estimate_flow(pc_world, pc1, T_ego1_ego0=T_ego1_ego0, **PAPER)
+    assert np.abs(result.pose_flow.numpy() - (pc1 - pc_world)).max() < 1e-6
+    assert not result.residual_flow.any() and torch.equal(result.flow, result.pose_flow)
+    without = estimate_flow(pc_world, pc1, **PAPER)
+    assert not without.pose_flow.any() and without.residual_flow.any()  # else the test would see nothing
+
+
+def test_history_outvotes_one_bad_estimate():
+    """One object, 0.5 m per sweep along x; at t it is seen one step too far, so t -> t+1 alone gives the wrong flow."""
+    at = [street(3)[1] + [0.5 * step, 0.0, 0.0] for step in (0, -1, -2, -3, -4)]
+    wrong = at[1] + [0.25, 0.0, 0.0]
+    assert (estimate_flow(wrong, at[0], **PAPER).residual_flow[:, 0] == 0.25).all()
+    with_history = estimate_flow(wrong, at[0], pch=at[2:], num_history=3, **PAPER)
+    assert (with_history.residual_flow == torch.tensor([0.5, 0.0, 0.0])).all()
+
+
+def test_coarse_to_fine_adds_up():
+    """A truth of 0.9 m: half-way between the pixels of the first two scales, reached by the last."""
+    pc0 = street(4)[1]
+    found = [
+        estimate_flow(pc0, pc0 + [0.9, 0, 0], preset="paper", pixel_sizes=sizes, point_cloud_range=WIDE).residual_flow
+        for sizes in [(0.8,), (0.8, 0.2), (0.8, 0.2, 0.1)]
+    ]
+    assert torch.allclose(found[0], torch.tensor([0.8, 0, 0]), atol=1e-6)
+    assert torch.allclose((found[1][:, 0] - 0.9).abs(), torch.tensor(0.1), atol=1e-6)  # off by half a pixel
+    assert torch.allclose(found[2], torch.tensor([0.9, 0, 0]), atol=1e-6)
+
+
+def test_max_speed_bounds_the_flow():
+    pc0 = street(5)[1]
+    assert (estimate_flow(pc0, pc0 + [1.0, 0, 0], **PAPER).residual_flow[:, 0] == 1.0).all()
+    # 5 m/s in 0.1 s are 2 pixels; one more is allowed, the fourth is not.
+    slow = estimate_flow(pc0, pc0 + [1.0, 0, 0], max_speed=5.0, **PAPER).residual_flow
+    assert 0 < slow.norm(dim=1).max() <= 0.75
+    assert (estimate_flow(pc0, pc0 + [0.75, 0, 0], max_speed=5.0, **PAPER).residual_flow[:, 0] == 0.75).all()
+
+
+def test_ground_never_moves_and_joins_nothing():
+    car = street(6)[1]
+    floor = np.stack(np.meshgrid(np.arange(-7, 7, 0.2), np.arange(-7, 7, 0.2), [0.0]), -1).reshape(-1, 3)
+    pc0, pc1 = np.concatenate([car, floor]), np.concatenate([car + [0.5, 0, 0], floor])
+    ground = np.repeat([False, True], [400, len(floor)])
+    result = estimate_flow(pc0, pc1, gm0=ground, gm1=ground, **PAPER)
+    assert (result.residual_flow[:400, 0] == 0.5).all()
+    assert not result.residual_flow[400:].any() and not result.is_valid[400:].any()
+    assert (result.cluster_id[400:] == -1).all() and not result.score[400:].any()
+    with pytest.warns(UserWarning, match="ground"):
+        joined = estimate_flow(pc0, pc1, **PAPER)
+    assert joined.is_valid.all() and (joined.residual_flow[:400, 0] != 0.5).all()  # the mask did it
+
+
+# ---------------------------------------------------------------------------------- history and scales, by hand
+
+METRE = config(pixel_size=1.0, point_cloud_range=(0.0, 0.0, -math.inf, 40.0, 40.0, math.inf), max_extent=1000.0)
+# (row, column) pixels of a long L: half of its bounding box holds the whole way since t-2.
+LONG_ELL = [(r, 10) for r in range(10, 16)] + [(15, c) for c in range(11, 30)]
+
+
+def ell_at(x: float, **fields) -> Sweep:
+    """A point in the middle of each 1 m pixel, displaced along x."""
+    return Sweep(np.array([(c + 0.5, r + 0.5, 0.5) for r, c in LONG_ELL]) + [x, 0, 0], **fields)
+
+
+def flow_x(pc1: Sweep, pc0: Sweep, *pch: Sweep, **overrides) -> float:
+    (flow,) = {*flow_as_oracle(Window(pc0, pc1, pch), METRE.replace(**overrides)).residual_flow[:, 0].tolist()}
+    return flow
+
+
+def test_history_divides_by_the_steps():
+    older = [ell_at(-4), ell_at(-7)]
+    found = [flow_x(ell_at(2), ell_at(0), *older[:h], num_history=h) for h in (0, 1, 2)]
+    assert found == [2.0, 2.5, 3.0]  # 2, 6 / 2, 9 / 3
+
+
+def test_history_skips_a_sweep_without_the_cluster():
+    gap = Sweep(np.array([[35.5, 35.5, 0.5]]))
+    assert flow_x(ell_at(2), ell_at(0), gap, ell_at(-6), num_history=2) == pytest.approx((2 + 8 / 3) / 2)
+
+
+def test_a_repeated_sweep_is_dropped_and_places_still_count():
+    pc1, pc0, older = ell_at(2), ell_at(0), ell_at(-4)  # the repeat would vote 2 / 2; the older one has k = 3
+    for history, expected in [((pc0,), 2.0), ((pc0, older), 2.0), ((older,), 2.5), ((ell_at(0), pc0, older), 1.75)]:
+        assert flow_x(pc1, pc0, *history, num_history=3) == pytest.approx(expected)
+
+
+def test_time_stamps_replace_steps_where_every_sweep_has_one():
+    stamps = (300_000_000, 200_000_000, 0)
+    sweeps = [ell_at(x, timestamp_ns=t) for x, t in zip((2, 0, -4), stamps)]
+    assert flow_x(*sweeps, num_history=1) == 2.0  # 2, 6 / 3
+    assert flow_x(*sweeps[:2], ell_at(-4), num_history=1) == 2.5  # 2, 6 / 2
+    # 3 m in a step: 20 m/s need 0.1 s for a reach of 2 + 1 pixels; in 0.05 s the reach is 2 pixels.
+    assert flow_x(ell_at(3), ell_at(0), max_speed=20.0) == 3.0
+    assert flow_x(ell_at(3), ell_at(0), max_speed=20.0, sweep_interval=0.05) <= 2.0
+    assert flow_x(ell_at(3, timestamp_ns=50_000_000), ell_at(0, timestamp_ns=0), max_speed=20.0) <= 2.0
+
+
+def test_score_is_that_of_the_newest_sweep():
+    older = Sweep(ell_at(-1).points[:6])
+    result = flow_as_oracle(Window(ell_at(0), ell_at(1), (older,)), METRE.replace(num_history=1))
+    assert result.score.tolist() == [1.0] * len(LONG_ELL)
+
+
+def row_of_dots(start: float, count: int = 5) -> Sweep:
+    """Points 8 m apart along x: one object with 4 m pixels, strangers with 1 m pixels."""
+    return Sweep(np.array([[start + 8.0 * i, 4.5, 0.5] for i in range(count)]))
+
+
+TWO_SCALES = METRE.replace(pixel_sizes=(4.0, 1.0), point_cloud_range=(0.0, 0.0, -math.inf, 80.0, 16.0, math.inf))
+
+
+def test_scales_are_added():
+    # 3.5 -> 10.5: columns 0 -> 2 with 4 m pixels, that is 8 m; then -1 m with 1 m pixels.
+    window = Window(row_of_dots(3.5), row_of_dots(10.5))
+    result = flow_as_oracle(window, TWO_SCALES)
+    assert result.residual_flow[:, 0].tolist() == [7.0] * 5
+    assert result.cluster_id.tolist() == [0, 1, 2, 3, 4]  # of the finest scale
+    coarse = flow_as_oracle(window, TWO_SCALES.replace(pixel_sizes=(4.0,)))
+    assert coarse.residual_flow[:, 0].tolist() == [8.0] * 5 and coarse.cluster_id.tolist() == [0] * 5
+
+
+def test_a_point_warped_out_of_range_gets_no_more():
+    settings = TWO_SCALES.replace(point_cloud_range=(0.0, 0.0, -math.inf, 43.0, 16.0, math.inf))
+    result = flow_as_oracle(Window(row_of_dots(3.5), row_of_dots(10.5)), settings)
+    assert result.residual_flow[:, 0].tolist() == [7.0] * 4 + [8.0]  # the last point went to 43.5
+    assert result.cluster_id.tolist() == [0, 1, 2, 3, -1] and result.score[4] == 0 and result.is_valid.all()
+
+
+def test_older_sweeps_are_warped_by_their_steps():
+    # With 4 m pixels: 8 m from t, 12 / 2 m from t-1, pooled 7 m; warped by 7 and 14 m both then lie on t+1.
+    window = Window(row_of_dots(11.5, 6), row_of_dots(18.5, 6), (row_of_dots(4.5, 6),))
+    result = flow_as_oracle(window, TWO_SCALES.replace(num_history=1))
+    assert result.residual_flow[:, 0].tolist() == [7.0] * 6 and result.score.tolist() == [1.0] * 6
+
+
+# --------------------------------------------------------------------------------- what history and scales are for
+
+
+def car(rng: np.random.Generator, x: float, seen: float = 4.5) -> np.ndarray:
+    """(N, 3) rear and the first metres `seen` of the right side of a car, as a LiDAR behind it sees them."""
+    rear = np.stack([np.zeros(400), rng.uniform(0, 1.8, 400), rng.uniform(0, 1.4, 400)], 1)
+    side = np.stack([rng.uniform(0, seen, 700), np.zeros(700), rng.uniform(0, 1.4, 700)], 1)
+    return np.concatenate((rear, side)) + rng.normal(0, 0.01, (1100, 3)) + (x, 8.0, 0.0)
+
+
+def error(sweeps: list, truth: tuple, **overrides) -> float:
+    """Mean end-point error of the points of sweep t; `sweeps` from t+1 back."""
+    window = Window(Sweep(sweeps[1]), Sweep(sweeps[0]), tuple(Sweep(sweep) for sweep in sweeps[2:]))
+    (result,) = CorrelationFlow(make_config("paper", **overrides))([window])
+    return float((result.residual_flow - torch.tensor(truth)).norm(dim=1).mean())
+
+
+@pytest.mark.parametrize("num_history", [0, 4])
+def test_coarse_levels_help_a_car_whose_footprints_do_not_overlap(num_history):
+    # 30 m/s are 3 m a sweep. Two metres of the car are seen, so a metre lies between its footprints.
+    rng = np.random.default_rng(0)
+    sweeps = [car(rng, 20.0 - 3.0 * k, seen=2.0) for k in range(num_history + 2)]
+    truth = (3.0, 0.0, 0.0)
+    assert error(sweeps, truth, num_history=num_history) == pytest.approx(3.0)  # 0.1 m pixels do not connect them
+    assert error(sweeps, truth, num_history=num_history, pixel_sizes=(0.4, 0.2, 0.1)) < 0.1
+
+
+def test_history_measures_motion_below_a_pixel():
+    # 0.4 m/s are 0.04 m a sweep: a pair of sweeps can only say 0 or 0.1 m, five sweeps see it move two pixels.
+    rng = np.random.default_rng(1)
+    sweeps = [car(rng, 10.0 - 0.04 * k) for k in range(6)]
+    assert error(sweeps[:2], (0.04, 0.0, 0.0)) > 0.035
+    assert error(sweeps, (0.04, 0.0, 0.0), num_history=4) < 0.02

@@ -1,0 +1,208 @@
+"""Matching of key points: the oracle's matches, fractions, the ratio test and ties by hand, exact products."""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+from typing import Dict, List, Tuple
+
+import numpy as np
+import pytest
+import torch
+from oracle.matching import describe as oracle_describe
+from oracle.matching import detect_keypoints, match_keypoints, passes_ratio_test
+from scenes import config
+
+from cflow_torch.keypoints import match_candidates, matching
+from cflow_torch.keypoints.descriptors import KeyPoints, describe
+from cflow_torch.keypoints.matching import Matches, match
+
+
+def matched(images: np.ndarray, images1: np.ndarray, reach: float, **overrides) -> Matches:
+    settings = config("keypoints", **overrides)
+    pc0, pc1 = (describe(torch.from_numpy(i), settings.patch_size) for i in (images, images1))
+    return match(pc0, pc1, torch.full((len(images),), reach, dtype=torch.float64), settings)
+
+
+def assert_equals_oracle(images: np.ndarray, images1: np.ndarray, reach: float, **overrides) -> int:
+    settings = config("keypoints", **overrides)
+    found, start, total = matched(images, images1, reach, **overrides), 0, 0
+    for image, image1 in zip(images, images1):
+        pixels = [tuple(p) for p in detect_keypoints(image).tolist()]
+        expected = match_keypoints(image, image1, reach, settings)
+        mine = slice(total, total + len(expected))
+        assert found.source[mine].tolist() == [start + pixels.index((m.row, m.column)) for m in expected]
+        assert found.shift[mine].tolist() == [[m.dy, m.dx] for m in expected]
+        assert found.score[mine].tolist() == pytest.approx([m.score for m in expected], abs=1e-12)
+        start, total = start + len(pixels), mine.stop
+    assert len(found.source) == total
+    return total
+
+
+@pytest.mark.parametrize("patch_size, ratio", [(1, 1.0), (5, 1.0), (5, 1.1), (11, 1.02), (13, 1.3)])
+def test_matches_equal_the_oracle(patch_size, ratio):
+    rng, total = np.random.default_rng(patch_size), 0
+    for reach in (2.0, 3.3, 60.0):
+        images = rng.random((2, 2, 25, 31)) < 0.1
+        images[1] = np.roll(images[0], (1, 2), (1, 2)) ^ (rng.random((2, 25, 31)) < 0.02)
+        total += assert_equals_oracle(images[0], images[1], reach, patch_size=patch_size, ratio_threshold=ratio)
+    assert total > 0
+
+
+def test_matches_are_those_of_all_pairs_in_fractions():
+    rng, total = np.random.default_rng(11), 0
+    for reach, ratio in ((2.0, 1.0), (4.0, 1.1), (60.0, 1.1)):
+        images = rng.random((2, 13, 16)) < 0.3
+        sides = [[tuple(p) for p in detect_keypoints(image).tolist()] for image in images]
+        patches = [
+            dict(zip(side, oracle_describe(image, np.array(side), 5).astype(int))) for side, image in zip(sides, images)
+        ]
+        expected = []
+        for p in sides[0]:
+            ranked = []
+            for q in (q for q in sides[1] if math.dist(p, q) <= reach):
+                c, (dy, dx) = int(patches[0][p] @ patches[1][q]), (q[0] - p[0], q[1] - p[1])
+                ranked.append((-Fraction(c * c, int(patches[1][q].sum())), dx * dx + dy * dy, dy, dx))
+            ranked.sort()
+            if ranked and (len(ranked) == 1 or -ranked[0][0] > Fraction(str(ratio)) ** 2 * -ranked[1][0]):
+                expected.append((*p, ranked[0][3], ranked[0][2]))
+        settings = config("keypoints", patch_size=5, ratio_threshold=ratio)
+        assert [m[:4] for m in match_keypoints(images[0], images[1], reach, settings)] == expected
+        total += assert_equals_oracle(images[:1], images[1:], reach, patch_size=5, ratio_threshold=ratio)
+    assert total > 0
+
+
+# ---------------------------------------------------------------------------------------------------------- by hand
+
+
+def hand_made(places: List[List[int]], ones: List[int]) -> KeyPoints:
+    """Key points whose 11 x 11 descriptors have their first pixels set."""
+    row, col = torch.tensor(places, dtype=torch.int64).reshape(-1, 2).unbind(1)
+    patch = torch.tensor([[1] * n + [0] * (121 - n) for n in ones], dtype=torch.uint8).reshape(-1, 121)
+    return KeyPoints(row * 40_000 + col, torch.zeros_like(row), row, col, patch, patch.sum(1))
+
+
+def shifts(pc0: KeyPoints, pc1: KeyPoints, reach: float = 10.0, ratio: float = 1.1) -> Dict[int, Tuple[int, int]]:
+    settings = config("keypoints", patch_size=11, ratio_threshold=ratio)
+    found = match(pc0, pc1, torch.tensor([reach], dtype=torch.float64), settings)
+    return dict(zip(found.source.tolist(), map(tuple, found.shift.tolist())))
+
+
+def test_the_ratio_test_is_strict_and_exact():
+    # R^2 = c^2 / (E E'): the best coincides fully with the 121 ones, the second in 100: R = 1, R' = 10 / 11.
+    pc0, pc1 = hand_made([[5, 5]], [121]), hand_made([[5, 6], [5, 9]], [121, 100])
+    assert shifts(pc0, pc1, ratio=1.0999) == {0: (0, 1)}
+    assert shifts(pc0, pc1, ratio=1.1) == {}  # R = rho R' does not pass; 1.1 * 1.1 is not 1.21 in floats
+    assert shifts(pc0, pc1, ratio=1.10004) == shifts(pc0, pc1, ratio=1.09996) == {}  # rho is used to four decimals
+    # Second best 1 / 1.2^2 = 25 / 36 of the energy: 36 against 25 ones.
+    pc0, pc1 = hand_made([[5, 5]], [36]), hand_made([[5, 6], [5, 9]], [36, 25])
+    assert shifts(pc0, pc1, ratio=1.2) == {} and shifts(pc0, pc1, ratio=1.1999) == {0: (0, 1)}
+
+
+@pytest.mark.parametrize(
+    "counts, ratio, accepted",
+    [
+        ((11, 20, 10, 20), 1.1, False),  # 11 = 1.1 x 10 exactly
+        ((11, 20, 10, 20), 1.0999, True),
+        ((11, 25, 12, 36), 1.1, False),  # 11 / 5 = 1.1 x 12 / 6
+        ((5, 9, 5, 9), 1.0, False),
+        ((2601, 2601, 2600, 2601), 1.0, True),
+        ((2600, 2600, 2601, 2601), 1.0, False),
+        ((1, 1, 1, 4), 2.0, False),
+        ((1, 1, 1, 5), 2.0, True),
+    ],
+)
+def test_the_oracle_s_ratio_test(counts, ratio, accepted):
+    assert passes_ratio_test(*counts, ratio) is accepted
+
+
+def test_a_single_candidate_has_no_rival_and_equal_ones_are_none():
+    assert shifts(hand_made([[5, 5]], [9]), hand_made([[4, 3]], [1]), ratio=2.0) == {0: (-1, -2)}
+    assert shifts(hand_made([[5, 5]], [9]), hand_made([[4, 3], [9, 9]], [9, 9]), ratio=1.0) == {}
+
+
+def test_the_energy_of_the_candidate_counts():
+    # One pixel, two candidates with E = 2 near by and one with E = 1 farther off: c = 1 in all.
+    image, image1 = np.zeros((2, 1, 12, 12), dtype=bool)
+    image[0, 5, 5] = image1[0, 5, 6] = image1[0, 5, 7] = image1[0, 5, 1] = True
+    assert assert_equals_oracle(image, image1, 10.0, patch_size=3) == 1
+    assert matched(image, image1, 10.0, patch_size=3).shift.tolist() == [[0, -4]]
+
+
+def test_the_radius_is_closed():
+    for corner in (50, 32_700):  # near the corner of the image and far from it
+        pc0 = hand_made([[corner, corner]], [9])
+        for (dy, dx), reach, inside in (((3, 4), 5.0, True), ((3, 4), 4.999, False), ((0, 0), 0.5, True)):
+            assert bool(shifts(pc0, hand_made([[corner + dy, corner + dx]], [9]), reach)) == inside
+    assert shifts(hand_made([[0, 0]], [9]), hand_made([[32_700, 32_700]], [9]), 1e9) == {0: (32_700, 32_700)}
+
+
+def test_no_key_points():
+    none, one = hand_made([], []), hand_made([[5, 5]], [9])
+    assert all(shifts(*pair) == {} for pair in ((none, one), (one, none), (none, none)))
+
+
+# ------------------------------------------------------------------------------------------ what must not matter
+
+
+def test_tiles_groups_and_pieces_do_not_show(monkeypatch):
+    rng = np.random.default_rng(3)
+    images = rng.random((2, 2, 24, 40)) < 0.08
+    expected = matched(*images, 8.0, patch_size=15, ratio_threshold=1.0)
+    assert len(expected.source) > 20
+    for rows, cols, band, group, pairs, strip in (
+        (1, 1, 1, 1, 1, 5),
+        (3, 2, 5, 2, 50, 11),
+        (64, 9, 2, 40, 1 << 17, 63),
+    ):
+        names = ("_TILE_ROWS", "_TILE_COLS", "_BAND", "_GROUP", "_PAIRS_AT_ONCE_CPU")
+        for name, value in zip(names, (rows, cols, band, group, pairs)):
+            monkeypatch.setattr(match_candidates, name, value)
+        monkeypatch.setattr(matching, "_STRIP_NUMBERS", strip)
+        found = matched(*images, 8.0, patch_size=15, ratio_threshold=1.0)
+        assert all(torch.equal(getattr(found, n), getattr(expected, n)) for n in ("source", "shift", "score"))
+
+
+def test_all_within_the_radius_are_candidates():
+    rng = np.random.default_rng(4)
+    images = torch.from_numpy(rng.random((2, 50, 90)) < 0.05)
+    pc0, pc1 = describe(images, 3), describe(images.flip(2), 3)
+    reach = torch.tensor([4.5, 30.0], dtype=torch.float64)
+    pairing = match_candidates.pair(pc0, pc1, reach)
+    found = set()
+    for member, first, count in zip(pairing.member.tolist(), pairing.first.tolist(), pairing.count.tolist()):
+        found |= {(p, q) for p in member for q in pairing.candidate[first : first + count].tolist()}
+    for p in range(len(pc0.row)):
+        square = (pc1.row - pc0.row[p]) ** 2 + (pc1.col - pc0.col[p]) ** 2
+        near = (pc1.window == pc0.window[p]) & (square <= reach[pc0.window[p]] ** 2)
+        assert {(p, q) for q in near.nonzero()[:, 0].tolist()} <= found
+    assert len(found) < 0.8 * len(pc0.row) * len(pc1.row)
+
+
+@pytest.mark.parametrize("precision", ["highest", "medium"])
+@pytest.mark.parametrize("patch_size", [1, 11, 51])
+def test_the_products_count_exactly(patch_size, precision):
+    generator, descriptors = torch.Generator().manual_seed(patch_size), []
+    for number, density in ((7, 0.1), (9, 0.7)):
+        patch = torch.rand((number, patch_size**2), generator=generator) < density
+        patch[0], patch[1] = True, False
+        descriptors.append(patch.byte())
+    expected = (descriptors[0][:, None] & descriptors[1]).sum(2)
+    strips0, strips1 = matching._pack(descriptors[0], False), matching._pack(descriptors[1], True)
+    before = torch.get_float32_matmul_precision()
+    try:
+        torch.set_float32_matmul_precision(precision)
+        found = matching._overlap(strips0, torch.arange(8).view(2, 4), strips1, torch.arange(10).repeat(2))
+    finally:
+        torch.set_float32_matmul_precision(before)
+    found = found.reshape(8, 10) >> 7
+    assert torch.equal(found[:7, :9], expected.int()) and not found[7].any() and not found[:, 9].any()  # padding
+
+
+def test_different_values_are_told_apart_or_both_looked_at():
+    # count^2 / energy of the largest descriptors, twice as close as any two can be: float32 takes them for equal.
+    share = 1 - matching._ROUNDING
+    for count, energy in ((2601, 2601), (2600, 2599), (51, 2601), (1, 2601)):
+        value = torch.tensor(float(count * count)) / energy
+        below = torch.nextafter(value, torch.tensor(0.0))
+        assert below >= value * share and value.double() * (1 - 2**-22) >= (value * share).double()

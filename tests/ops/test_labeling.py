@@ -1,0 +1,176 @@
+"""Connected components of sparse images against SciPy: random images, hard shapes, every size, rounds of union-find."""
+
+from __future__ import annotations
+
+import math
+from typing import Callable, Dict
+
+import numpy as np
+import pytest
+import torch
+from kornia import contrib
+from scenes import LABELINGS
+from scipy import ndimage
+from scipy.sparse import coo_matrix, csgraph
+
+from cflow_torch.ops import morphology
+from cflow_torch.ops.labeling import connected_components, connected_components_kornia, union_find
+from cflow_torch.types import CFlowError
+
+STRUCTURE = {4: ndimage.generate_binary_structure(2, 1), 8: np.ones((3, 3), dtype=bool)}
+
+
+def by_scipy(images: np.ndarray, connectivity: int, reach: int) -> np.ndarray:
+    """What `connected_components` must return, image by image."""
+    first = []
+    for image in images:
+        drawn = ndimage.binary_dilation(image, STRUCTURE[8]) if reach == 3 else image
+        labels = ndimage.label(drawn, STRUCTURE[connectivity])[0][image]
+        _, position, inverse = np.unique(labels, return_index=True, return_inverse=True)
+        first.append(position[inverse.reshape(-1)] + sum(map(len, first)))
+    return np.concatenate(first)
+
+
+def label(images: np.ndarray, connectivity: int, reach: int, engine: str = "sparse") -> np.ndarray:
+    occupancy = torch.from_numpy(images)
+    pixels = occupancy.flatten().nonzero()[:, 0]
+    if engine == "sparse":
+        return connected_components(occupancy, pixels, connectivity, reach).numpy()
+    dense = morphology.dilate_3x3_kornia(occupancy) if reach == 3 else occupancy
+    return connected_components_kornia(dense, pixels, connectivity).numpy()
+
+
+@pytest.mark.parametrize("engine", LABELINGS)
+@pytest.mark.parametrize("reach", [1, 3])
+@pytest.mark.parametrize("connectivity", [4, 8])
+def test_random_images_equal_scipy(connectivity, reach, engine):
+    rng = np.random.default_rng(connectivity + reach)
+    for shape in [(1, 1), (1, 17), (19, 1), (2, 2), (23, 40)]:
+        images = rng.random((7, *shape)) < np.array([0.0, 0.02, 0.1, 0.2, 0.41, 0.59, 1.0])[:, None, None]
+        assert label(images, connectivity, reach, engine).tolist() == by_scipy(images, connectivity, reach).tolist()
+
+
+@pytest.mark.parametrize("reach", [1, 3])
+@pytest.mark.parametrize("connectivity", [4, 8])
+def test_images_of_every_size_equal_scipy(connectivity, reach):
+    """Blocks and margins fit images of any size: the last row and column are full, so every neighbour is asked for."""
+    rng = np.random.default_rng(connectivity + reach)
+    for height, width in [(n, 1 + (5 * n) % 26) for n in range(1, 27)]:
+        images = rng.random((3, height, width)) < 0.08
+        images[:, -1, rng.random(width) < 0.5] = images[:, rng.random(height) < 0.5, -1] = True
+        assert label(images, connectivity, reach).tolist() == by_scipy(images, connectivity, reach).tolist()
+
+
+@pytest.mark.parametrize("reach", [1, 3])
+@pytest.mark.parametrize("connectivity", [4, 8])
+def test_two_pixels_link_exactly_within_reach(connectivity, reach):
+    """Every offset up to 5, at every place relative to the blocks, the far pixel on the border of the image."""
+    for dy, dx in [(dy, dx) for dy in range(6) for dx in range(-5, 6) if (dy, dx) > (0, 0)]:
+        images = np.zeros((16, dy + 4, abs(dx) + 4), dtype=bool)
+        for i in range(16):
+            row, col = i // 4, i % 4 + max(-dx, 0)
+            images[i, row, col] = images[i, row + dy, col + dx] = True
+        linked = label(images, connectivity, reach)[1::2] == np.arange(0, 32, 2)
+        corner = connectivity == 4 and dy == abs(dx) == reach
+        assert linked.tolist() == [max(dy, abs(dx)) <= reach and not corner] * 16, (dy, dx)
+
+
+@pytest.mark.parametrize("engine", LABELINGS)
+def test_components_never_join_across_images(engine):
+    assert label(np.ones((5, 6, 7), dtype=bool), 8, 3, engine).tolist() == np.repeat(np.arange(5) * 42, 42).tolist()
+
+
+def test_without_union_find_kornia_says_what_to_do(monkeypatch):
+    monkeypatch.delattr(contrib, "connected_components_union_find", raising=False)
+    with pytest.raises(CFlowError, match="kornia >= 0.9.*sparse"):
+        label(np.ones((1, 3, 3), dtype=bool), 8, 1, "kornia")
+
+
+# ------------------------------------------------------------------------------------------------------ hard shapes
+# In every round each root with a smaller neighbour hooks onto the smallest one. A root that stays has no smaller
+# neighbour: after the next round it has hooked as well or swallowed all of its neighbours. So two rounds at least halve
+# the roots of every open component: at most 2 log2(V) + 1 rounds for V nodes.
+
+
+def spiral(size: int) -> np.ndarray:
+    """One arm, one pixel wide, that winds inwards; a free pixel between its turns."""
+    image, low, high = np.zeros((size, size), dtype=bool), 0, size - 1
+    image[0, 0] = True
+    while low <= high:
+        image[low, max(low - 1, 0) : high + 1] = image[low : high + 1, high] = image[high, low : high + 1] = True
+        image[low + 2 : high + 1, low] = True
+        low, high = low + 2, high - 2
+    return image
+
+
+def comb(size: int) -> np.ndarray:
+    """Teeth that meet in the last row only."""
+    image = np.zeros((size, size), dtype=bool)
+    image[:, ::2] = image[-1] = True
+    return image
+
+
+def serpentine(size: int) -> np.ndarray:
+    """Rows joined alternately at the right and at the left."""
+    image = np.zeros((size, size), dtype=bool)
+    image[::2] = True
+    image[1::4, -1] = image[3::4, 0] = True
+    return image
+
+
+def checkerboard(size: int) -> np.ndarray:
+    """Corner to corner everywhere."""
+    return np.indices((size, size)).sum(0) % 2 == 0
+
+
+def percolation(size: int) -> np.ndarray:
+    """At 0.593 4-connected clusters have every size."""
+    return np.random.default_rng(0).random((size, size)) < 0.593
+
+
+SHAPES: Dict[str, Callable[[int], np.ndarray]] = {
+    shape.__name__: shape for shape in (spiral, comb, serpentine, checkerboard, percolation)
+}
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_hard_shapes_equal_scipy(shape):
+    """Turned and mirrored, as one batch."""
+    image = SHAPES[shape](63)
+    images = np.stack([image, image[::-1], image[:, ::-1].T, np.zeros_like(image)])
+    for connectivity, reach in ((4, 1), (8, 1), (8, 3)):
+        assert label(images, connectivity, reach).tolist() == by_scipy(images, connectivity, reach).tolist()
+
+
+def test_union_find_equals_scipy():
+    rng = np.random.default_rng(0)
+    for num_nodes, num_edges in [(1, 0), (5, 0), (1, 3), (10, 6), (200, 150), (3000, 9000)]:
+        edges = rng.integers(0, num_nodes, (2, num_edges))  # with loops and repeated edges
+        root = union_find(num_nodes, *torch.from_numpy(edges)).numpy()
+        graph = coo_matrix((np.ones(num_edges), tuple(edges)), shape=(num_nodes, num_nodes))
+        _, labels = csgraph.connected_components(graph, directed=False)
+        _, first = np.unique(labels, return_index=True)
+        assert root.tolist() == first[labels].tolist()
+
+
+@pytest.mark.parametrize("num_nodes", [17, 65_536])
+def test_paths_stars_and_trees_take_few_rounds_whatever_their_numbering(num_nodes, monkeypatch):
+    rng, line, hook, rounds = np.random.default_rng(0), np.arange(num_nodes), torch.Tensor.scatter_reduce_, []
+    monkeypatch.setattr(torch.Tensor, "scatter_reduce_", lambda *given: rounds.append(1) or hook(*given))
+    bit_reversed = np.array([int(f"{i:032b}"[::-1], 2) for i in line]).argsort().argsort()
+    for sources, targets in (
+        (line[:-1], line[1:]),
+        (line[:-1], line[1:] * 0 + num_nodes - 1),
+        ((line[1:] - 1) // 2, line[1:]),
+    ):
+        for numbering in (line, line[::-1].copy(), rng.permutation(num_nodes), bit_reversed):
+            rounds.clear()
+            root = union_find(num_nodes, *map(torch.from_numpy, (numbering[sources], numbering[targets])))
+            assert not root.any() and 1 <= len(rounds) <= 2 * math.ceil(math.log2(num_nodes)) + 1
+
+
+def test_snakes_of_a_hundred_thousand_pixels_are_one_component():
+    for shape in (serpentine, spiral):
+        image = shape(451)
+        assert image.sum() > 100_000 and ndimage.label(image)[1] == 1
+        assert not label(image[None], 4, 1).any()

@@ -1,0 +1,55 @@
+"""Patches around pixels, nearest set pixels, and the lower surface of height maps, against loops."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from cflow_torch.ops.lower_surface import UNKNOWN, _cone, lower_surface
+from cflow_torch.ops.nearest import nearest_set_pixel
+from cflow_torch.ops.patches import gather_patches
+
+
+@pytest.mark.parametrize("size", [1, 3, 13])
+def test_patches_have_zeros_outside_the_image(size):
+    images, half = np.random.default_rng(size).random((3, 6, 9)) < 0.4, size // 2
+    place = [torch.from_numpy(index) for index in np.indices(images.shape).reshape(3, -1)]
+    patches, energy = gather_patches(torch.from_numpy(images), *place, size)
+    padded = np.pad(images, [(0, 0), (half, half), (half, half)])
+    expected = [padded[b, r : r + size, c : c + size].flatten() for b, r, c in np.ndindex(images.shape)]
+    assert np.array_equal(patches.numpy(), expected) and patches.dtype == torch.uint8
+    assert energy.tolist() == [int(patch.sum()) for patch in expected] and energy.dtype == torch.int64
+
+
+def test_the_nearest_set_pixel_is_the_first_of_the_nearest():
+    for seed in range(9):
+        rng = np.random.default_rng(seed)
+        seeds = rng.random((3, 11, 8)) < (0.0, 0.02, 0.2)[seed % 3]
+        seeds[1] = False
+        pixels = np.sort(rng.choice(seeds.size, 60, replace=False))
+        expected = []
+        for image, row, col in zip(*np.unravel_index(pixels, seeds.shape)):
+            places = np.argwhere(seeds[image])  # in raster order: argmin takes the first of equals
+            best = places[((places - (row, col)) ** 2).sum(1).argmin()] if len(places) else None
+            expected.append(-1 if best is None else int(np.ravel_multi_index((image, *best), seeds.shape)))
+        assert nearest_set_pixel(torch.from_numpy(seeds), torch.from_numpy(pixels)).tolist() == expected
+    assert nearest_set_pixel(torch.ones((1, 2, 2), dtype=torch.bool), torch.zeros(0, dtype=torch.int64)).shape == (0,)
+
+
+def test_cones_are_the_highest_surfaces_of_limited_slope():
+    heights = torch.from_numpy(np.random.default_rng(0).integers(-900, 900, (2, 7, 9)).astype(np.int32))
+    found = _cone(heights, 51)
+    for b, r, c in np.ndindex(*heights.shape):
+        steps = np.abs(np.arange(7) - r)[:, None] + np.abs(np.arange(9) - c)
+        assert found[b, r, c] == (heights[b].numpy() + 51 * steps).min()
+
+
+def test_the_lower_surface_passes_below_what_stands_on_it():
+    slope = 40 * np.arange(40)[:, None] + np.zeros((40, 40))
+    low = torch.from_numpy(slope.astype(np.int32))[None]
+    ground = low.clone()
+    low[0, 10:14, 10:14] += 1500  # a box
+    low[0, 25:30, 5:20] = UNKNOWN
+    found = lower_surface(low)[0]
+    assert (found - ground[0]).abs().max() <= 70

@@ -1,0 +1,156 @@
+"""Rigid registration: a few Gauss-Newton steps on the voxel centroids of objects.
+
+An object turns about a centre and moves on, both in proportion to the time that passes. Lengths are units of 1/1024 m
+from the lower corner of the region; the turn is the tangent of half the angle.
+"""
+
+from __future__ import annotations
+
+from typing import List, NamedTuple, Sequence, Tuple
+
+from oracle.height_slices import SlicedSweeps, Vector
+from oracle.voxel_centroids import UNITS, Point, Voxel, Voxels, centroids, meeting_weight, nearest, whole
+
+SIGMA = 0.15  # metres, of the weight of a pair of voxels
+MOST_TIME = 2.5  # sweep intervals: older sweeps are not looked at
+NUM_STEPS = 4
+LONGEST_WAY = 0.15  # metres per interval, in x and in y, from the given flow
+LARGEST_TURN = 0.1  # tangent of half the angle per interval
+HELD = 150.0  # perfect pairs of voxels that the given translation is worth
+HELD_SHARE = 0.2  # and, besides, this share of the pairs that were found
+HELD_TURN = 20.0  # perfect pairs at a distance of 1 m that no turn is worth
+
+
+class RigidMotion(NamedTuple):
+    """Motion per sweep interval: (x, y) of the flow at the centre, turn, centre; metres."""
+
+    flow: Vector
+    turn: float
+    centre: Vector
+
+    def flow_at(self, x: float, y: float) -> Vector:
+        """Flow of a point of t, by its place; all in metres."""
+        x, y = x - self.centre[0], y - self.centre[1]
+        turned_x, turned_y = rotate(self.turn, x, y)
+        return (turned_x - x) + self.flow[0], (turned_y - y) + self.flow[1]
+
+
+class Pair(NamedTuple):
+    """A voxel of an earlier sweep and one of t+1: time between, turned arm of the first, what is missing, weight."""
+
+    time: float
+    arm: Tuple[int, int]
+    error: Tuple[int, int]
+    weight: float
+
+
+def register(points: Sequence[Point], flow: Sequence[Vector], sweeps: SlicedSweeps) -> List[RigidMotion]:
+    """Refine the motion of every object.
+
+    Args:
+        points: of all objects, all sweeps; the points of a pixel have one object.
+        flow: of each object, (x, y) metres per sweep interval, to start from.
+        sweeps: the window.
+
+    Returns:
+        Of each object. One without points at t keeps its flow; its centre is the lower corner.
+
+    Convention: of the start and the steps that follow, the one whose pairs weigh most counts, of equals the first.
+    """
+    voxels, lower = centroids(points, sweeps), sweeps.lower
+    result = []
+    for owner, start in enumerate(flow):
+        members = [voxel for voxel in voxels.values() if voxel.owner == owner]
+        at_t = [voxel for voxel in members if voxel.step == 1]
+        if not at_t:
+            result.append(RigidMotion(start, 0.0, lower))
+            continue
+        centre = (sum(v.x for v in at_t) // len(at_t), sum(v.y for v in at_t) // len(at_t))
+        given = (start[0] * UNITS, start[1] * UNITS)
+        way, turn, most = given, 0.0, -1.0
+        best_way, best_turn = way, turn
+        for _ in range(NUM_STEPS + 1):
+            found = find_pairs(members, voxels, sweeps, centre, way, turn)
+            weight = sum(pair.weight for pair in found)
+            if weight > most:
+                best_way, best_turn, most = way, turn, weight
+            dx, dy, angle = gauss_newton(found, given, way, turn)
+            way = (limit(way[0] + dx, given[0]), limit(way[1] + dy, given[1]))
+            turn = min(max(turn + angle / 2, -LARGEST_TURN), LARGEST_TURN)
+        corner = (centre[0] / UNITS + lower[0], centre[1] / UNITS + lower[1])
+        result.append(RigidMotion((best_way[0] / UNITS, best_way[1] / UNITS), best_turn, corner))
+    return result
+
+
+def find_pairs(
+    members: Sequence[Voxel], voxels: Voxels, sweeps: SlicedSweeps, centre: Tuple[int, int], way: Vector, turn: float
+) -> List[Pair]:
+    """Voxels of an object that find each other under its motion, looked for from both ends.
+
+    Every voxel before t+1 looks for the nearest one at t+1, every voxel of t+1 for the nearest one in each earlier
+    sweep. If what is nearest belongs to another object there is no pair; two that choose each other count twice.
+    """
+    found = []
+    for voxel in members:
+        for step, time in enumerate(sweeps.elapsed):
+            if not 0 < time <= MOST_TIME or voxel.step not in (0, step):
+                continue
+            if voxel.step == 0:  # back to sweep `step`
+                x, y = voxel.x - centre[0] - time * way[0], voxel.y - centre[1] - time * way[1]
+                x, y = rotate(-turn * time, x, y)
+                x, y = whole(x + centre[0]), whole(y + centre[1])
+            else:  # on to t+1
+                x, y = moved(voxel, centre, way, turn, time)
+            partner = nearest(voxels, step if voxel.step == 0 else 0, voxel.part, x, y, sweeps.pixel_size)
+            if partner is None or partner.owner != voxel.owner:
+                continue
+            earlier, later = (partner, voxel) if voxel.step == 0 else (voxel, partner)
+            x, y = moved(earlier, centre, way, turn, time)
+            error = (later.x - x, later.y - y)
+            r_x, r_y = rotate(turn * time, earlier.x - centre[0], earlier.y - centre[1])
+            weight = meeting_weight(error[0] ** 2 + error[1] ** 2, SIGMA)
+            found.append(Pair(time, (whole(r_x), whole(r_y)), error, weight))
+    return found
+
+
+def moved(voxel: Voxel, centre: Tuple[int, int], way: Vector, turn: float, time: float) -> Tuple[int, int]:
+    """Where a voxel is `time` intervals later, in whole units."""
+    x, y = rotate(turn * time, voxel.x - centre[0], voxel.y - centre[1])
+    return whole(x + centre[0] + time * way[0]), whole(y + centre[1] + time * way[1])
+
+
+def rotate(turn: float, x: float, y: float) -> Vector:
+    """Rotate by the angle whose half has the tangent `turn`."""
+    n = 1 + turn * turn
+    cos, sin = (1 - turn * turn) / n, 2 * turn / n
+    return cos * x - sin * y, sin * x + cos * y
+
+
+def gauss_newton(found: Sequence[Pair], given: Vector, way: Vector, turn: float) -> Tuple[float, float, float]:
+    """Least squares: change of the translation (units) and of the angle (radians, small), per interval.
+
+    Minimises, over the pairs with times k (in whole 1/16), arms r and errors e,
+    sum w (k (dx - r_y a) - e_x)^2 + w (k (dy + r_x a) - e_y)^2, and the squares that hold on to the given translation
+    and to no turn.
+    """
+    s = s_x = s_y = s_xy = e_x = e_y = e_a = 0.0
+    for time, (r_x, r_y), (x, y), w in found:
+        k = whole(time * 16) / 16
+        s += w * k * k
+        s_x += w * k * k * r_x
+        s_y += w * k * k * r_y
+        s_xy += w * k * k * (r_x * r_x + r_y * r_y)
+        e_x += w * k * x
+        e_y += w * k * y
+        e_a += w * k * (r_x * y - r_y * x)
+    held, held_turn = HELD + HELD_SHARE * s, HELD_TURN * UNITS**2
+    a, a_x, a_y, a_xy = s + held, s_x, -s_y, s_xy + held_turn
+    b_x, b_y = e_x + held * (given[0] - way[0]), e_y + held * (given[1] - way[1])
+    b_a = e_a - held_turn * (2 * turn)
+    angle = (b_a - (a_y * b_x + a_x * b_y) / a) / (a_xy - (a_y * a_y + a_x * a_x) / a)
+    return (b_x - a_y * angle) / a, (b_y - a_x * angle) / a, angle
+
+
+def limit(value: float, given: float) -> float:
+    """At most `LONGEST_WAY` from the given one."""
+    return min(max(value, given - LONGEST_WAY * UNITS), given + LONGEST_WAY * UNITS)

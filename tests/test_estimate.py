@@ -1,0 +1,139 @@
+"""The one call: its arguments, its warnings, and that it is the module. The module: its class, its results."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from scenes import assert_same_bits, assert_zeros, box, config, scene
+
+from cflow_torch import (
+    CFlowError,
+    CorrelationFlow,
+    CorrelationFlowKeypoints,
+    VerifiedFlow,
+    estimate_flow,
+    make_config,
+    make_model,
+)
+from cflow_torch.stages import StopWatch
+
+RNG = np.random.default_rng(0)
+P0, P1 = RNG.uniform(-5, 5, (50, 3)).astype(np.float32), RNG.uniform(-5, 5, (40, 3)).astype(np.float32)
+EYE = np.eye(4)
+
+
+@pytest.mark.parametrize(
+    "arguments, complaint",
+    [
+        ({"pch": [P1, P0], "preset": "paper"}, "2 history sweeps.*num_history=0"),
+        ({"pch": [P1], "gmh": [None, None]}, "gmh has 2 entries for 1"),
+        ({"pch": [P1], "T_ego1_egoh": [EYE, EYE]}, "T_ego1_egoh has 2 entries for 1"),
+        ({"gmh": [None]}, "gmh has 1 entries for 0"),
+        ({"pch": [P1], "T_ego1_ego0": EYE}, "T_ego1_ego0 is given but T_ego1_egoh is not"),
+        ({"T_ego1_ego0": EYE[None]}, r"pc0 has shape \(1, 4, 4\)"),
+        ({"T_ego1_ego0": EYE, "pch": [P1], "T_ego1_egoh": [np.diag([1, 1, -1, 1.0])]}, "pch1 is not rigid"),
+        ({"max_hight": 3}, "unknown setting max_hight: the fields are pixel_size"),
+        ({"preset": "paperr"}, "preset='paperr'.*'default'"),
+        ({"method": "fast"}, "method='fast'.*'dense'"),
+        ({"ground": "yes"}, "ground='yes'.*'auto'"),
+        ({"pixel_size": 1e-5}, "point_cloud_range"),
+    ],
+)
+def test_arguments_that_make_no_sense(arguments, complaint):
+    with pytest.raises(CFlowError, match=complaint) as caught:
+        estimate_flow(P0, P1, **arguments)
+    assert isinstance(caught.value, ValueError)
+
+
+@pytest.mark.parametrize("method", ["dense", "verified"])
+def test_the_call_is_the_module(method):
+    window, settings = scene(6, num_history=2), config(method, num_history=2)
+    to_ego1 = [np.linalg.inv(window.pc1.pose) @ sweep.pose for sweep in (window.pc0, *window.pch)]
+    called = estimate_flow(
+        window.pc0.points,
+        window.pc1.points,
+        T_ego1_ego0=to_ego1[0],
+        gm0=window.pc0.is_ground,
+        gm1=window.pc1.is_ground,
+        pch=[sweep.points for sweep in window.pch],
+        T_ego1_egoh=to_ego1[1:],
+        gmh=[sweep.is_ground for sweep in window.pch],
+        **settings.as_dict(),
+    )
+    assert_same_bits(called, make_model(settings)([window])[0])
+
+
+def test_the_preset_chooses_the_method():
+    pc0 = np.concatenate((box(RNG, 2.0, 1.0, 1.0, 500), box(RNG, 2.0, 1.0, 1.0, 500) + [8.0, 0, 0]))
+    pc1 = pc0[:500] + [0.5, 0, 0]  # the second box is gone: the dense method has no cluster of it
+    named, asked = estimate_flow(pc0, pc1, preset="keypoints"), estimate_flow(pc0, pc1, method="keypoints")
+    assert_same_bits(named, asked)
+    assert (named.cluster_id[500:] >= 0).all()
+    assert (estimate_flow(pc0, pc1, method="dense").cluster_id[500:] == -1).all()
+
+
+def test_everything_ground_and_single_points():
+    ground = np.ones(50, dtype=bool)
+    with pytest.warns(UserWarning, match="not all of them ground"):
+        result = estimate_flow(P0, P0 + np.float32(0.5), gm0=ground, gm1=ground)
+    assert_zeros(result, 50)
+    assert not result.is_valid.any()
+    alone = estimate_flow(P0[:1], P0[:1], preset="paper")
+    assert alone.cluster_id.tolist() == [0] and alone.score.tolist() == [1.0] and not alone.flow.any()
+
+
+@pytest.mark.parametrize(
+    ("points", "seen"),
+    [
+        (1000 * P0.astype(np.float64) + 1e6, "they span x (99|100)"),
+        (np.full((4, 3), np.nan), "all are NaN or infinite"),
+    ],
+    ids=["millimetres", "nothing finite"],
+)
+def test_a_warning_if_no_point_takes_part(points, seen):
+    with pytest.warns(UserWarning, match=f"none of the .* points of pc0 takes part.*{seen}"):
+        assert not estimate_flow(points, P1).is_valid.any()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        estimate_flow(P0, P1)
+        estimate_flow(P0[:0], P1)
+
+
+# ------------------------------------------------------------------------------------------------------- the module
+
+
+def test_a_class_refuses_the_settings_of_another_method():
+    classes = {"dense": CorrelationFlow, "keypoints": CorrelationFlowKeypoints, "verified": VerifiedFlow}
+    for method, kind in classes.items():
+        assert type(make_model(config(method))) is kind and kind.from_preset().config == make_config(method=method)
+        for other in set(classes) - {method}:
+            with pytest.raises(CFlowError, match=f"{kind.__name__} does method='{method}', the config says '{other}'"):
+                kind(config(other))
+    for wrong in (None, {"pixel_sizes": (0.1,)}, "paper"):
+        with pytest.raises(CFlowError, match="give the result of make_config"):
+            CorrelationFlow(wrong)
+        with pytest.raises(CFlowError, match="give the result of make_config"):
+            make_model(wrong)
+    assert "pixel_sizes=(0.25,)" in repr(make_model(config())) and make_model(config())([]) == []
+
+
+def test_results_are_ordinary_tensors_that_a_training_loop_may_use():
+    (result,) = make_model(config("verified"))([scene(0)])
+    weight = torch.ones(3, requires_grad=True)
+    for tensor in (result.residual_flow, result.pose_flow, result.flow):
+        (tensor * weight).sum().backward()  # saves the tensor for backward: refused for tensors of inference mode
+    assert not any(value.is_inference() for value in vars(result).values())
+
+
+def test_a_stop_watch_stands_in_for_the_method_and_knows_its_stages():
+    watch, window = StopWatch(make_model(config("verified"))), scene(0)
+    assert watch.report() == {"pairs": 0}
+    results = [watch([window])[0] for _ in range(3)]
+    assert_same_bits(results[0], make_model(watch.config)([window])[0])
+    report = watch.report()
+    assert report["pairs"] == 2 and 0 < report["min"] <= report["median"] <= report["max"]
+    names = {"compensate", "project", "match", "cluster", "correlate", "verify", "select", "register", "spread"}
+    assert set(report["stages"]) == names | {"confidence"} and sum(report["stages"].values()) <= 3 * report["max"]

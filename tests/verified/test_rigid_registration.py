@@ -1,0 +1,124 @@
+"""Rigid registration: the oracle's motion, whatever the order and the company; known motions are found."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import fields
+
+import numpy as np
+import pytest
+import torch
+from moving_scenes import Scene, moving_scene, one_object, reordered
+from oracle import rigid_registration as oracle
+from scenes import same_bits
+
+from cflow_torch.verified.rigid_motion import RigidMotion, rotate
+from cflow_torch.verified.rigid_registration import register
+from cflow_torch.verified.voxel_centroids import UNITS
+
+
+def registered(scene: Scene) -> RigidMotion:
+    return register(scene.points(), scene.sweeps, scene.flow)
+
+
+def assert_equals_oracle(scene: Scene) -> RigidMotion:
+    found = registered(scene)
+    expected = [motion for w in scene.windows() for motion in oracle.register(w.points(), w.flow, w.sweeps)]
+    for name in ("flow", "turn", "centre"):
+        values = np.array([getattr(motion, name) for motion in expected])
+        np.testing.assert_allclose(getattr(found, name), values.reshape(getattr(found, name).shape), atol=1e-6)
+    return found
+
+
+@pytest.mark.parametrize("num_steps", [2, 4])
+@pytest.mark.parametrize("snap", [0.0, 1 / 16])
+def test_equals_the_oracle(snap, num_steps):
+    moved = 0
+    for pixel_size in (0.1, 0.2):
+        scene = moving_scene(range(8), num_steps, pixel_size, snap)
+        found = assert_equals_oracle(scene)
+        moved += int(((found.flow != scene.flow).any(1) & (found.turn != 0)).sum())
+    assert moved > 5
+
+
+def test_order_of_points_and_company_do_not_matter():
+    seeds = (2, 3, 4, 5)
+    scene = moving_scene(seeds, 3, snap=1 / 16)
+    together, mixed = registered(scene), registered(reordered(scene))
+    alone = [registered(moving_scene([seed], 3, snap=1 / 16)) for seed in seeds]
+    for name in (f.name for f in fields(RigidMotion)):
+        assert same_bits(getattr(mixed, name), getattr(together, name))
+        assert same_bits(torch.cat([getattr(one, name) for one in alone]), getattr(together, name))
+
+
+def test_an_object_without_points_at_t_keeps_its_flow():
+    cloud = np.array([[0.5, 0.5, 0.2]])
+    scene = one_object([cloud, cloud[:0], cloud], (0.3, 0.1))
+    found = assert_equals_oracle(scene)
+    assert torch.equal(found.flow, scene.flow) and not found.turn.any()
+
+
+def scatter(angle: float, x: float, y: float) -> np.ndarray:
+    """(N, 3) points 0.25 m apart in four slices of 2.5 m x 1.5 m, turned about the origin and moved."""
+    xy = np.stack(np.meshgrid(np.arange(-1.25, 1.3, 0.25), np.arange(-0.75, 0.8, 0.25)), 2).reshape(-1, 2)
+    cos, sin = math.cos(angle), math.sin(angle)
+    turned = xy @ np.array([[cos, sin], [-sin, cos]]) + (x, y)
+    return np.concatenate([np.concatenate([turned, np.full((len(turned), 1), z)], 1) for z in (0.2, 0.7, 1.2, 1.7)])
+
+
+def test_a_known_motion_is_found():
+    """A turning object whose points are told apart: what holds on to no turn leaves a tenth of it at most."""
+    angle, clouds = 0.06, [scatter(0.06, 0.43, 0.13), scatter(0.0, 0.03, 0.03)]
+    truth = torch.from_numpy(clouds[0] - clouds[1])[:, :2]
+    scene = one_object(clouds, truth.mean(0).tolist())
+    found = assert_equals_oracle(scene)
+    assert abs(2 * math.atan(float(found.turn[0])) - angle) < 0.1 * angle
+    old = torch.from_numpy(clouds[1])
+    flow = torch.stack(found.flow_at(torch.zeros(len(old), dtype=torch.int64), old[:, 0], old[:, 1]), 1)
+    assert (flow - truth).norm(dim=1).mean() < 0.1 * (scene.flow - truth).norm(dim=1).mean()
+
+
+def test_jitter_leaves_the_second_sweep_to_the_registration():
+    # The object starts 0.08 m off. A clock that is 0.3 ms late must not cost half of the pairs.
+    rng = np.random.default_rng(1)
+    shape = rng.uniform(-0.8, 0.8, (300, 3))
+    clouds = [shape - (0.5 * k, 0.0, 0.0) + rng.normal(0, 0.01, shape.shape) for k in range(3)]
+
+    def flow_x(elapsed: list) -> float:
+        scene = one_object(clouds, (0.42, 0.0))
+        scene.sweeps.batch.elapsed[:] = torch.tensor([elapsed])
+        return float(registered(scene).flow[0, 0])
+
+    even, late, without = flow_x([0.0, 1.0, 2.0]), flow_x([0.0, 1.0, 2.003]), flow_x([0.0, 1.0, 0.0])
+    assert abs(late - even) < 0.001 < abs(without - even)
+
+
+def test_a_step_is_the_least_squares_of_its_pairs():
+    """The oracle's normal equations against NumPy's least squares on the rows themselves."""
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        columns = (
+            rng.integers(1, 3, 60).astype(float).tolist(),
+            map(tuple, rng.integers(-4000, 4000, (60, 2)).tolist()),
+            map(tuple, rng.integers(-80, 80, (60, 2)).tolist()),
+            (rng.integers(1, 257, 60) / 256).tolist(),
+        )
+        pairs = [oracle.Pair(*values) for values in zip(*columns)]
+        given, way, turn = tuple(rng.normal(0, 300, 2)), tuple(rng.normal(0, 300, 2)), rng.normal(0, 0.02)
+        rows, rhs = [], []
+        for k, (r_x, r_y), (e_x, e_y), w in pairs:
+            rows += [math.sqrt(w) * np.array([k, 0, -k * r_y]), math.sqrt(w) * np.array([0, k, k * r_x])]
+            rhs += [math.sqrt(w) * e_x, math.sqrt(w) * e_y]
+        held = 150 + 0.2 * sum(w * k * k for k, _, _, w in pairs)
+        rows += [math.sqrt(held) * np.array(row) for row in ([1, 0, 0], [0, 1, 0])]
+        rhs += [math.sqrt(held) * (given[0] - way[0]), math.sqrt(held) * (given[1] - way[1])]
+        rows.append(np.array([0, 0, math.sqrt(20) * UNITS]))
+        rhs.append(-math.sqrt(20) * UNITS * 2 * turn)
+        wanted = np.linalg.lstsq(np.array(rows), np.array(rhs), rcond=None)[0]
+        np.testing.assert_allclose(oracle.gauss_newton(pairs, given, way, turn), wanted, rtol=1e-8, atol=1e-9)
+
+
+def test_rotate_is_the_rotation():
+    x, y = rotate(torch.tensor([math.tan(0.15)]), torch.tensor([2.0]), torch.tensor([1.0]))
+    assert abs(float(x) - (2 * math.cos(0.3) - math.sin(0.3))) < 1e-6
+    assert abs(float(y) - (2 * math.sin(0.3) + math.cos(0.3))) < 1e-6

@@ -1,0 +1,220 @@
+"""The verified method as a whole: equal to the oracle, however windows come; what each part is for."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scenes import (
+    assert_same,
+    assert_same_bits,
+    config,
+    flow_as_oracle,
+    needs_gpu,
+    needs_kornia_labelling,
+    reordered,
+    rows_of,
+    scene,
+)
+from turning_car import MODEL, car_of, turning_car, upright_box
+
+from cflow_torch import Sweep, VerifiedFlow, Window, make_config
+from cflow_torch.data.av2 import AV2Log
+from cflow_torch.data.hdf5.reader import HDF5Log
+from cflow_torch.data.log import window as window_of
+
+NEAR = (-15.0, -10.0, -math.inf, 0.0, 4.0, math.inf)  # the whole takes the oracle minutes
+
+
+# ------------------------------------------------------------------------------------------- equal to the oracle
+
+
+@pytest.mark.parametrize("seed", range(18))
+def test_equals_the_oracle_on_random_scenes(seed):
+    settings = config(
+        "verified",
+        num_history=seed % 4,
+        pixel_sizes=((0.25,), (0.5, 0.25), (0.45, 0.15))[seed % 3],
+        max_speed=(None, 6.0)[seed % 5 == 0],
+        max_object=(None, 4.0)[seed % 3 > 0],
+        significance=(0.0, 1.0, 2.0)[seed % 3],
+        min_height=(None, 0.3)[seed % 7 > 0],
+        thorough=seed % 4 > 0,
+        connectivity=(4, 8)[seed % 6 > 0],
+    )
+    flow_as_oracle(scene(300 + seed, num_history=seed % 4, poses=seed % 5 > 0, stamps=seed % 2 > 0), settings)
+
+
+@pytest.mark.parametrize("preset", ["default", "fast"])
+def test_presets_equal_the_oracle(preset):
+    settings = make_config(preset, point_cloud_range=MODEL.point_cloud_range)
+    assert flow_as_oracle(turning_car(5, settings.num_history, 0.5), settings).residual_flow.any()
+
+
+def test_a_turning_car_equals_the_oracle():
+    for seed in range(3):
+        assert flow_as_oracle(turning_car(seed, share=0.4), MODEL).residual_flow.any()
+
+
+@pytest.mark.parametrize("preset", ["default", "fast"])
+def test_a_part_of_the_real_pair_equals_the_oracle(av2_folder, preset):
+    settings = make_config(preset, point_cloud_range=NEAR, max_object=6.0)
+    result = flow_as_oracle(window_of(AV2Log(av2_folder), 0), settings)
+    assert (result.residual_flow.norm(dim=1) >= 0.05).sum() > 500  # there is something to find
+
+
+@pytest.mark.parametrize("num_history", [4, pytest.param(1, marks=pytest.mark.slow)])
+def test_a_part_of_kitti_equals_the_oracle(kitti_file, num_history):
+    with HDF5Log(kitti_file) as log:
+        window = window_of(log, 9, num_history)
+    assert flow_as_oracle(window, make_config("default", point_cloud_range=NEAR)).residual_flow.any()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("preset", ["default", "fast"])
+def test_real_drives_equal_the_oracle(av2_folder, data_root, preset):
+    flow_as_oracle(window_of(AV2Log(av2_folder), 0), make_config(preset))
+    with HDF5Log(data_root / "av2-crown" / "av2-crown.h5") as log:
+        settings = make_config(preset)
+        flow_as_oracle(window_of(log, len(log) - 2, settings.num_history), settings)
+
+
+# --------------------------------------------------------------------------------------------- what must not matter
+
+
+def test_alone_or_in_a_batch_in_any_order_of_points():
+    # Mixed lengths of history: only the windows that are pairs are shifted, whatever lies beside them.
+    windows = [turning_car(seed, history, 0.4) for seed, history in ((0, 2), (1, 0), (2, 1), (3, 2))]
+    model = VerifiedFlow(MODEL.replace(num_history=2))
+    for window, result in zip(windows, model(windows)):
+        assert_same_bits(model([window])[0], result)
+        mixed, order = reordered(window)
+        assert_same_bits(model([mixed])[0], rows_of(result, order))
+
+
+@pytest.mark.parametrize(
+    "engines", [{"correlation": "conv"}, pytest.param({"labeling": "kornia"}, marks=needs_kornia_labelling)]
+)
+def test_engines_do_not_matter(engines):
+    window, settings = scene(6, num_history=1), config("verified", num_history=1)
+    assert_same(VerifiedFlow(settings.replace(**engines))([window])[0], VerifiedFlow(settings)([window])[0])
+
+
+@pytest.mark.cuda
+@needs_gpu
+def test_cuda_equals_cpu():
+    windows = [turning_car(0, 2), turning_car(1), turning_car(2, 1), turning_car(3, 2)]
+    settings = MODEL.replace(num_history=2)
+    for on_cpu, on_gpu in zip(VerifiedFlow(settings, "cpu")(windows), VerifiedFlow(settings, "cuda")(windows)):
+        assert_same(on_gpu, on_cpu, atol=1e-4)
+
+
+def test_empty_and_hopeless_windows():
+    empty, lost = Sweep(np.zeros((0, 3), np.float32)), Sweep(np.full((5, 3), np.nan, np.float32))
+    one = Sweep(np.zeros((1, 3), np.float32))
+    for pc0, pc1 in ((empty, empty), (lost, one), (one, lost), (one, one)):
+        result = flow_as_oracle(Window(pc0, pc1), MODEL)
+        assert result.residual_flow.shape == (len(pc0.points), 3) and not result.residual_flow.any()
+
+
+# ---------------------------------------------------------------------------------------------- what parts are for
+
+
+def test_a_turning_car_moves_and_the_rest_stands_still():
+    window, (start, velocity, turn) = turning_car(7, 2), car_of(7)
+    (result,) = VerifiedFlow(MODEL.replace(num_history=2))([window])
+    points = window.pc0.points[:, :2].astype(np.float64)
+    arm = points - start
+    truth = velocity + turn * np.stack((-arm[:, 1], arm[:, 0]), 1)
+    is_car = (np.abs(arm) < 2.4).all(1) & (window.pc0.points[:, 2] > -1.4) & ~window.pc0.is_ground
+    error = np.linalg.norm(result.residual_flow.numpy()[is_car, :2] - truth[is_car], axis=1)
+    is_static = ~is_car & (points[:, 1] > -5.0)  # neither the person nor the wall beside
+    assert error.mean() < 0.03
+    assert result.residual_flow[is_static].any(1).sum() < 0.02 * is_static.sum()
+
+
+def test_a_wall_that_seems_to_slide_stands_still():
+    # Its samples stand still in the frame of a sensor that drives 1.4 m.
+    rng = np.random.default_rng(0)
+    wall = np.stack((rng.uniform(-4, 4, 250), np.full(250, 3.05), rng.uniform(-1, 1, 250)), 1)
+    window = Window(Sweep(wall - (1.4, 0.0, 0.0)), Sweep(wall))
+    for thorough in (False, True):
+        result = flow_as_oracle(window, MODEL.replace(thorough=thorough))
+        assert bool((result.residual_flow[:, 0] > 1.0).any()) != thorough
+
+
+def test_what_the_sub_pixel_shift_puts_to_rest_is_not_registered(monkeypatch):
+    model, window = VerifiedFlow(MODEL), turning_car(1)
+    moved = model([window])[0].residual_flow.any(1)
+    monkeypatch.setattr(
+        "cflow_torch.verified.method.shift_between_pixels", lambda points, sweeps, motion: torch.zeros_like(motion)
+    )
+    assert moved.sum() > 5 * model([window])[0].residual_flow.any(1).sum()  # what is left is slow motion
+
+
+def test_longer_than_max_object_does_not_move():
+    # An L of 6 m x 5 m that moves by (0.5, 0.25) m; exactly 6 m is not longer.
+    rng = np.random.default_rng(2)
+    long_side = np.stack((np.full(900, 0.05), rng.uniform(0.0, 5.999, 900), rng.uniform(-1, 1, 900)), 1)
+    ell = np.concatenate((long_side, long_side[:, [1, 0, 2]] * (5 / 6, 1, 1)))
+    window = Window(Sweep(ell - (0.5, 0.25, 0.0)), Sweep(ell))
+    settings = MODEL.replace(pixel_sizes=(0.25,), max_object=6.0)
+    assert (flow_as_oracle(window, settings).residual_flow - torch.tensor([0.5, 0.25, 0])).norm(dim=1).max() < 0.05
+    assert not flow_as_oracle(window, settings.replace(max_object=5.9)).residual_flow.any()
+
+
+def test_more_significance_moves_less():
+    window = turning_car(0, share=0.3)
+    moved = [
+        int(flow_as_oracle(window, MODEL.replace(significance=z)).residual_flow.any(1).sum())
+        for z in (0.0, 2.0, 1000.0)
+    ]
+    assert moved[0] >= moved[1] > moved[2] == 0
+
+
+def test_speed_is_bounded_at_every_pixel_size():
+    # Half of the box allows 2 m, the speed 0.6 m and a pixel.
+    car = upright_box((0.0, 0.0), (4.0, 1.8), 0.0, np.random.default_rng(0))
+    window = Window(Sweep(car - (1.7, 0.0, 0.0)), Sweep(car))
+    free, bounded = (
+        flow_as_oracle(window, MODEL.replace(max_speed=speed, thorough=False)).residual_flow[:, 0].max()
+        for speed in (None, 6.0)
+    )
+    assert free > 1.6 and bounded <= 0.6 + 0.4 + 0.2
+
+
+# ----------------------------------------------------------------------------------------------- uneven history
+
+VELOCITY = (5.0, 1.5)  # m/s
+
+
+def uneven_drive(times, stamped: bool = True) -> Window:
+    """A car at some times before t+1, milliseconds, sampled anew; the flow t -> t+1 is VELOCITY times the first."""
+    rng, sweeps = np.random.default_rng(0), []
+    for time in [0, *times]:
+        car = upright_box(-np.array(VELOCITY) * time / 1000, (3.6, 1.7), 0.0, rng, 220).astype(np.float32)
+        sweeps.append(Sweep(car, timestamp_ns=10**12 - time * 10**6 if stamped else None))
+    return Window(sweeps[1], sweeps[0], tuple(sweeps[2:]))
+
+
+def mean_error(window: Window, first: int) -> float:
+    region = (-10.0, -4.0, -3.0, 6.0, 4.0, 3.0)
+    result = flow_as_oracle(window, MODEL.replace(num_history=4, pixel_sizes=(0.2,), point_cloud_range=region))
+    truth = torch.tensor([*VELOCITY, 0.0]) * first / 1000
+    return float((result.residual_flow - truth).norm(dim=1).mean())
+
+
+@pytest.mark.parametrize("times", [(100, 300, 400), (50, 150, 250, 350), (120, 200, 310, 395, 510)])
+def test_time_stamps_are_heeded(times):
+    assert mean_error(uneven_drive(times), times[0]) < 0.03
+    assert mean_error(uneven_drive(times, stamped=False), times[0]) > 0.06  # places say t-1, t-2, ...
+
+
+def test_even_or_missing_time_stamps_are_the_same():
+    with_stamps, without = (
+        VerifiedFlow(MODEL.replace(num_history=2))([uneven_drive((100, 200, 300), stamped)])[0]
+        for stamped in (True, False)
+    )
+    assert_same(with_stamps, without)

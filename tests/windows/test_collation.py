@@ -1,0 +1,250 @@
+"""Windows -> batch: what takes part, repeated sweeps, the vehicle's own returns, pieces, groups, forms of arrays."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import replace
+from typing import Any, Callable, Dict
+
+import numpy as np
+import pytest
+import torch
+from preset_windows import PRESETS, changed, num_moving, on_a_raster, small, windows_for
+from scenes import RANGE, assert_same_bits, assert_zeros, config, flow_as_oracle, pose, rows_of, scene
+
+from cflow_torch import CorrelationFlow, FlowResult, Sweep, Window, make_model
+from cflow_torch.config import Config
+from cflow_torch.windows import collation
+from cflow_torch.windows.bev_grid import Grid
+from cflow_torch.windows.collation import make_batch, split_windows
+
+CPU = torch.device("cpu")
+EMPTY, FAR = np.zeros((0, 3), dtype=np.float32), np.full((3, 3), 1000.0)
+P0, P1 = np.random.default_rng(0).uniform(-5, 5, (2, 50, 3)).astype(np.float32)
+
+
+def cflow(window: Window, settings: Config) -> FlowResult:
+    (result,) = make_model(settings, "cpu")([window])
+    return result
+
+
+# ------------------------------------------------------------------------------------------------- what takes part
+
+
+@pytest.mark.parametrize("column, bad", [(0, np.nan), (1, np.inf), (2, -np.inf), (2, np.nan)])
+def test_points_that_are_not_finite_are_left_out(column, bad):
+    clean, rows = scene(11, num_history=1), np.array([3, 100, 101, 400])
+
+    def broken(sweep: Sweep) -> Sweep:
+        points = sweep.points.copy()
+        points[rows, column] = bad
+        return replace(sweep, points=points)
+
+    def without(sweep: Sweep) -> Sweep:
+        return replace(sweep, points=np.delete(sweep.points, rows, 0), is_ground=np.delete(sweep.is_ground, rows))
+
+    result = cflow(changed(clean, broken), config(num_history=1))
+    kept = np.delete(np.arange(len(clean.pc0.points)), rows)
+    assert_same_bits(rows_of(result, kept), cflow(changed(clean, without), config(num_history=1)))
+    assert_zeros(rows_of(result, rows), len(rows))
+    assert not result.flow[rows].any() and not result.is_valid[rows].any()
+
+
+@pytest.mark.parametrize("with_pose", [False, True])
+@pytest.mark.parametrize(
+    "pc0, pc1, pch",
+    [
+        (EMPTY, P1, (P0,)),
+        (P0, EMPTY, (P1,)),
+        (EMPTY, EMPTY, (EMPTY, EMPTY)),
+        (P0[:1], P0[:1] + 3, ()),
+        (FAR, P1, ()),
+        (P0, FAR, (P1,)),
+        (P0 * np.nan, P1, ()),
+    ],
+)
+def test_nothing_to_find_gives_zeros_of_the_right_shape(pc0, pc1, pch, with_pose):
+    sweeps = [Sweep(p, pose=pose(1, 2, 0.3) if with_pose else None) for p in (pc0, pc1, *pch)]
+    window = Window(sweeps[0], sweeps[1], tuple(sweeps[2:]))
+    settings = config(num_history=2, sectional_view=True, pixel_sizes=(0.4, 0.2), max_speed=5.0)
+    result = flow_as_oracle(window, settings)
+    assert_zeros(result, len(pc0))
+    low, high = np.array(RANGE[:3]), np.array(RANGE[3:])
+    assert result.is_valid.tolist() == [bool(((p >= low) & (p <= high)).all()) for p in pc0]
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_finite_points_beyond_all_bounds_change_nothing(preset):
+    """Squares of them are infinite, their slices and pixels no integers."""
+    settings = small(preset, point_cloud_range=(*RANGE[:2], -math.inf, *RANGE[3:5], math.inf))
+    (window,) = windows_for(settings)
+    wild = np.array([[1e300, 0, 0], [0, -1e20, 0], [1.0, 2.0, 1e300], [1e300, 1e300, 1e300]])
+
+    def with_wild(sweep: Sweep) -> Sweep:
+        points = np.concatenate([sweep.points.astype(np.float64), wild])
+        return replace(sweep, points=points, is_ground=np.concatenate([sweep.is_ground, [False] * 4]))
+
+    result = flow_as_oracle(changed(window, with_wild), settings)
+    assert all(torch.isfinite(values.double()).all() for values in vars(result).values() if values is not None)
+
+
+def test_repeated_sweeps_are_dropped_and_the_others_keep_their_place():
+    window = scene(3, num_history=3)
+    assert np.isnan(window.pc0.points).any()  # NaN points do not hide that two sweeps are the same
+    copy = replace(window.pc0, points=window.pc0.points.copy(), pose=window.pc0.pose.copy())
+    other_pose = replace(window.pc0, pose=window.pch[0].pose)  # same points, other pose: not a repetition
+    for pch in [(window.pc0, *window.pch), (window.pch[0], copy, window.pch[1]), (other_pose,), (window.pc1,)]:
+        flow_as_oracle(replace(window, pch=pch), config(num_history=4))
+    once, thrice = (cflow(replace(window, pch=(window.pc0,) * n), config(num_history=3)) for n in (0, 3))
+    assert_same_bits(once, thrice)
+
+
+def test_a_shorter_history_is_fewer_estimates():
+    window = scene(5, num_history=4)
+    for length in range(5):
+        shorter = Window(window.pc0, window.pc1, window.pch[:length])
+        assert_same_bits(cflow(shorter, config(num_history=4)), cflow(shorter, config(num_history=length)))
+
+
+# --------------------------------------------------------------------------------------------- the vehicle itself
+
+BOX = (-1.5, -1.0, 2.5, 1.0)
+
+
+def drive(num_history: int) -> Window:
+    """The vehicle drives 0.8 m a sweep past a wall; hood and mirrors are seen from the sensor."""
+    rng, sweeps = np.random.default_rng(0), []
+    wall = rng.uniform((-6, 3.0, -1.0), (6, 3.2, 1.0), (600, 3))
+    for k in range(num_history + 2):
+        T_world_ego = pose(-0.8 * k, 0.0, 0.0)
+        own = rng.uniform((1.2, -0.8, -1.0), (2.4, 0.8, -0.8), (200, 3))
+        points = np.concatenate((wall - T_world_ego[:3, 3], own)).astype(np.float32)
+        sweeps.append(Sweep(points, pose=T_world_ego))
+    return Window(sweeps[1], sweeps[0], tuple(sweeps[2:]))
+
+
+@pytest.mark.parametrize("method, num_history", [("dense", 2), ("keypoints", 0), ("verified", 2)])
+def test_own_returns_move_with_the_sensor_and_a_box_leaves_them_out(method, num_history):
+    window, overrides = drive(num_history), {} if method == "keypoints" else {"num_history": num_history}
+    without, result = (cflow(window, config(method, ego_box=box, **overrides)) for box in (None, BOX))
+    assert without.residual_flow[600:, 0].mean() > 0.6
+    assert not result.residual_flow[600:].any() and not result.is_valid[600:].any()
+    bare = changed(window, lambda sweep: replace(sweep, points=sweep.points[:600]))
+    assert_same_bits(rows_of(result, np.arange(600)), cflow(bare, config(method, **overrides)))
+
+
+def test_the_box_is_that_of_the_sweep_and_holds_its_ends():
+    # At t the post lies in the box of t, not in that of t+1, 5 m ahead; NaN lies nowhere.
+    points = np.array([[2.5, 1.0, 0], [np.nextafter(2.5, 3), 0, 0], [math.nan, 0, 0], [0, 0, 0], [7.5, 0, 0]])
+    window = Window(Sweep(points, pose=np.eye(4)), Sweep(points, pose=pose(5.0, 0.0, 0.0)))
+    settings = config(ego_box=BOX, point_cloud_range=(-10, -10, -5, 10, 10, 5))
+    assert cflow(window, settings).is_valid.tolist() == [False, True, False, False, True]
+
+
+# ----------------------------------------------------------------------------------------------- batch and groups
+
+
+def test_a_batch_by_hand():
+    grid = Grid(1.0, RANGE[:3], RANGE[3:])
+    pc0 = np.array([[1.0, 2.0, 0.0], [99.0, 0.0, 0.0], [-3.0, 1.0, 1.0]])
+    one = Window(Sweep(pc0, np.array([False, False, True])), Sweep(pc0[:1] + 1), (Sweep(pc0[2:]),))
+    two = Window(Sweep(pc0[:1], timestamp_ns=0), Sweep(pc0, timestamp_ns=200_000_000))
+    batch = make_batch([one, two], config(num_history=1), grid, CPU)
+    assert (batch.num_windows, batch.num_steps, batch.num_newest) == (2, 3, 3)
+    # t+1 of both, then t of both (all rows), then t-1: window * 3 + step.
+    assert batch.image.tolist() == [0, 3, 3, 1, 1, 1, 4, 2]
+    assert batch.takes_part.tolist() == [True] * 4 + [False, False, True, True]
+    assert batch.positions[:, [0, 7]].t().tolist() == [[2.0, 3.0], [-3.0, 1.0]]
+    assert batch.elapsed.tolist() == [[0, 1, 2], [0, 1, 0]]
+    assert batch.seconds.tolist() == [[0, 0.1, 0.2], [0, 0.2, 0]]
+    assert [source.points for source in batch.sources] == [slice(3, 6), slice(6, 7)]
+
+
+def test_the_length_of_a_piece_changes_nothing(monkeypatch):
+    windows, settings = [scene(1, num_history=2), scene(2)], config(num_history=2, sectional_view=True)
+    whole = CorrelationFlow(settings)(windows)
+    monkeypatch.setattr("cflow_torch.ops.chunks.CHUNK_ON_CPU", 37)
+    for expected, found in zip(whole, CorrelationFlow(settings)(windows)):
+        assert_same_bits(found, expected)
+
+
+def test_windows_are_grouped_by_memory(monkeypatch):
+    grid, windows = Grid(1.0, RANGE[:3], RANGE[3:]), [scene(seed) for seed in range(5)]
+
+    def sizes(max_memory=None) -> list:
+        return [len(group) for group in split_windows(windows, grid, CPU, 160, max_memory)]
+
+    assert sizes() == [5] and sizes(1) == [1] * 5
+    assert sum(sizes(1_000_000)) == 5 and 1 < len(sizes(1_000_000)) < 5
+    monkeypatch.setattr(collation, "_BYTES_ON_CPU", 1)
+    assert sizes() == [1] * 5 and split_windows([], grid, CPU, 160, None) == []
+
+
+# ---------------------------------------------------------------------------------------------- forms of arrays
+
+
+def locked(array: np.ndarray) -> np.ndarray:
+    array = array.copy()
+    array.flags.writeable = False
+    return array
+
+
+FORMS: Dict[str, Callable[[np.ndarray], Any]] = {
+    "float16": lambda p: p.astype(np.float16),
+    "float64": lambda p: p.astype(np.float64),
+    "longdouble": lambda p: p.astype(np.longdouble),
+    "big-endian": lambda p: p.astype(">f8"),
+    "columns first": np.asfortranarray,
+    "both backwards": lambda p: p[::-1, ::-1].copy()[::-1, ::-1],
+    "every third row": lambda p: np.repeat(p, 3, 0)[::3],
+    "not aligned": lambda p: np.frombuffer(b"x" + p.tobytes(), np.uint8)[1:].view(p.dtype).reshape(p.shape),
+    "read-only": locked,
+    "more columns": lambda p: np.pad(p, [(0, 0), (0, 2)], constant_values=np.nan),
+    "tensor of float64": lambda p: torch.from_numpy(p).double(),
+    "tensor of bfloat16": lambda p: torch.from_numpy(p).bfloat16(),
+    "tensor, transposed": lambda p: torch.from_numpy(np.ascontiguousarray(p.T)).t(),
+    "tensor with gradient": lambda p: torch.from_numpy(p.copy()).requires_grad_(),
+}
+
+
+def as_bytes(value: Any) -> bytes:
+    value = value.detach().double().numpy() if isinstance(value, torch.Tensor) else value
+    return np.ascontiguousarray(value).tobytes()
+
+
+def coarse(sweep: Sweep) -> Sweep:
+    """Points at multiples of 1/16 m within 8 m, where bfloat16 holds multiples of 1/32 m."""
+    points = np.nan_to_num(np.asarray(sweep.points), nan=0.0, posinf=0.0, neginf=0.0).clip(-7.9, 7.9)
+    return Sweep((np.round(points * 16) / 16).astype(np.float32), sweep.is_ground)
+
+
+def test_forms_of_arrays_do_not_matter_and_are_left_alone():
+    settings = small("paper", num_history=1, sectional_view=True)
+    plain = changed(windows_for(settings)[0], coarse)
+    expected = cflow(plain, settings)
+    assert num_moving(expected) > 100
+    for form in FORMS.values():
+        given = changed(plain, lambda sweep, form=form: replace(sweep, points=form(sweep.points)))
+        before = [as_bytes(sweep.points) for sweep in (given.pc0, given.pc1, *given.pch)]
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            result = cflow(given, settings)
+        assert_same_bits(result, expected)
+        assert not result.flow.requires_grad
+        assert [as_bytes(sweep.points) for sweep in (given.pc0, given.pc1, *given.pch)] == before
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_results_do_not_change_with_the_input(preset):
+    """Nothing of a result lies in the memory of what was given."""
+    settings = small(preset)
+    given = changed(
+        changed(windows_for(settings)[0], on_a_raster),
+        lambda sweep: replace(sweep, points=torch.from_numpy(np.asarray(sweep.points).copy())),
+    )
+    result = cflow(given, settings)
+    kept = {name: value.clone() for name, value in vars(result).items() if value is not None}
+    for sweep in (given.pc0, given.pc1, *given.pch):
+        sweep.points.fill_(7.0)
+    assert all(torch.equal(getattr(result, name).nan_to_num(), value.nan_to_num()) for name, value in kept.items())

@@ -1,0 +1,240 @@
+"""Ground without a map: exact properties, scenes by hand, accuracy on simulated and real sweeps, `ground="auto"`."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from typing import List, Tuple
+
+import numpy as np
+import pytest
+import torch
+from scenes import assert_same, needs_gpu
+
+from cflow_torch import CFlowError, Sweep, estimate_flow
+from cflow_torch.data.av2 import AV2Log
+from cflow_torch.data.hdf5.reader import HDF5Log
+from cflow_torch.simulator import make_drive
+from cflow_torch.windows.ground import find_ground, find_ground_batch, has_ground
+
+SEED = 410  # the method was tuned on 400 ... 409
+Point = Tuple[float, float, float]
+
+
+def overlap(a: np.ndarray, b: np.ndarray) -> float:
+    """Intersection over union."""
+    return float((a & b).sum() / (a | b).sum())
+
+
+def rings(height: float, beams: int = 16, columns: int = 900) -> np.ndarray:
+    """(N, 3) where the beams of a level LiDAR meet a level floor `height` metres below it."""
+    down = np.radians(np.linspace(-25.0, -1.0, beams))
+    r = np.repeat(height / np.tan(-down), columns)
+    angle = np.tile(np.linspace(-np.pi, np.pi, columns, endpoint=False), beams)
+    points = np.stack([r * np.cos(angle), r * np.sin(angle), np.full_like(r, -height)], 1)
+    return points[r < 100]
+
+
+def block(low: Point, high: Point, num_points: int, seed: int) -> np.ndarray:
+    """(N, 3) points in a box."""
+    return np.random.default_rng(seed).uniform(low, high, (num_points, 3))
+
+
+@pytest.fixture(scope="module")
+def sweeps() -> List[Sweep]:
+    drive = make_drive(seed=SEED, num_sweeps=2, profile="demo")
+    return [drive.sweep(i) for i in range(2)]
+
+
+# ------------------------------------------------------------------------------------------------- exact properties
+
+
+def test_order_of_points_and_other_sweeps_do_not_matter(sweeps):
+    points = sweeps[0].points
+    order = np.random.default_rng(1).permutation(len(points))
+    assert np.array_equal(find_ground(points)[order], find_ground(points[order]))
+    clouds = [s.points for s in sweeps] + [np.zeros((0, 3)), block((4, 4, 0), (8, 6, 1.5), 900, 0)]
+    assert all(np.array_equal(mask, find_ground(cloud)) for mask, cloud in zip(find_ground_batch(clouds), clouds))
+    assert find_ground_batch([]) == []
+
+
+def test_the_mounting_height_does_not_matter(sweeps):
+    points = np.round(sweeps[0].points.astype(np.float64) * 1000)
+    assert np.array_equal(find_ground(points / 1000), find_ground((points + [0, 0, -1723]) / 1000))
+
+
+def test_points_that_are_not_finite_or_far_away_are_not_ground(sweeps):
+    points = sweeps[0].points + np.array([0, 0, 0.5], np.float32)  # the origin lies below the ground
+    bad = np.full((8, 3), -0.5, np.float32)
+    bad[:5, 0] = (np.nan, np.inf, -np.inf, 131.08, 1e30)
+    bad[5:, 2] = (np.nan, np.inf, -np.inf)
+    mask = find_ground(np.concatenate([points, bad]))
+    assert not mask[-8:].any() and np.array_equal(mask[:-8], find_ground(points))
+    assert find_ground(np.concatenate([points, np.full((1, 3), -0.5, np.float32)]))[-1]
+    with pytest.warns(UserWarning, match="no point of sweep 0 lies within 131 m of the origin"):
+        assert not find_ground(points[:5000] + np.float32([1e4, 0, 0])).any()
+
+
+def test_few_points_have_no_ground():
+    for mask, number in zip(find_ground_batch([np.ones((n, 4)) for n in (0, 1, 30)]), (0, 1, 30)):
+        assert mask.dtype == np.bool_ and mask.shape == (number,) and not mask.any()
+
+
+def test_arrays_give_arrays_and_tensors_tensors(sweeps):
+    points = sweeps[0].points.copy()
+    mask = find_ground(torch.from_numpy(points))
+    assert isinstance(mask, torch.Tensor) and np.array_equal(mask.numpy(), find_ground(points))
+    assert np.array_equal(points, sweeps[0].points)
+
+
+@pytest.mark.cuda
+@needs_gpu
+def test_a_gpu_finds_the_same(sweeps):
+    clouds = [s.points for s in sweeps]
+    for a, b in zip(find_ground_batch(clouds, device="cuda"), find_ground_batch(clouds, device="cpu")):
+        assert np.array_equal(a, b)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        ({"points": [1, 2, 3]}, "list"),
+        ({"points": np.zeros((4, 2))}, r"\(4, 2\)"),
+        ({"points": np.zeros((4, 3), int)}, "int"),
+        ({"points": np.zeros((4, 3)), "method": "ransac"}, "'ransac'.*'grid'.*'patchwork'"),
+        ({"points": np.zeros((4, 3)), "threshold": -0.1}, "threshold=-0.1"),
+    ],
+)
+def test_bad_arguments(arguments, complaint):
+    with pytest.raises(CFlowError, match=complaint):
+        find_ground(**arguments)
+
+
+# --------------------------------------------------------------------------------------------------- scenes by hand
+
+
+@pytest.mark.parametrize("height", [0.5, 1.73, 3.0])
+def test_a_level_floor_seen_by_sixteen_beams_and_what_stands_on_it(height):
+    floor, box = rings(height), block((6, -1, 0.31 - height), (10, 1, 1.5 - height), 2000, 1)
+    mask = find_ground(np.concatenate([floor, box]))
+    assert mask[: len(floor)].all() and not mask[len(floor) :].any()
+
+
+@pytest.mark.parametrize("slope", [-0.22, 0.22])
+def test_a_tilted_floor(slope):
+    floor, box = rings(1.7), block((6, -1, 0.45 - 1.7), (10, 1, 1.5 - 1.7), 2000, 1)
+    for points in (floor, box):
+        points[:, 2] += slope * (0.8 * points[:, 0] + 0.6 * points[:, 1])
+    mask = find_ground(np.concatenate([floor, box]))
+    assert mask[: len(floor)].mean() > 0.99 and not mask[len(floor) :].any()
+
+
+def test_kerbs_are_ground_and_walls_bridges_and_roofs_are_not():
+    floor, wall = rings(1.7), block((-20, 9, -1.2), (20, 9.1, 3), 5000, 2)
+    kerbs = floor + 0.15 * (floor[:, 1:2] > 4) * [0, 0, 1]
+    bridge, roof = block((12, -15, 3.2), (20, 15, 3.3), 6000, 3), block((-40, 20, 2.5), (-20, 40, 2.6), 4000, 4)
+    open_road = floor[(floor[:, 0] < 12) | (floor[:, 0] > 20)]  # the bridge hides the road under it
+    for ground, others in ((kerbs, wall), (open_road, np.concatenate([bridge, roof]))):
+        mask = find_ground(np.concatenate([ground, others]))
+        assert mask[: len(ground)].mean() > 0.995 and not mask[len(ground) :].any()
+
+
+def test_multipath_points_below_the_ground_do_not_pull_it_down(sweeps):
+    rain, rng = sweeps[0].points.copy(), np.random.default_rng(5)
+    rows = rng.choice(len(rain), len(rain) // 100, replace=False)
+    rain[rows, 2] -= rng.uniform(0.5, 4, len(rows)).astype(np.float32) + np.maximum(rain[rows, 2], 0)
+    keep = np.ones(len(rain), bool)
+    keep[rows] = False
+    assert overlap(find_ground(rain)[keep], find_ground(sweeps[0].points)[keep]) > 0.98
+
+
+# --------------------------------------------------------------------------------------------------------- accuracy
+
+
+def test_a_simulated_drive_and_the_same_bent_into_hills():
+    drive = make_drive(seed=SEED, num_sweeps=1, profile="av2")
+    sweep = drive.sweep(0)
+    points = sweep.points.astype(np.float64)
+    world = points @ sweep.pose[:3, :3].T + sweep.pose[:3, 3]
+    truth = world[:, 2] - drive.scene.ground.height(world[:, 0], world[:, 1]) <= 0.3  # the rule of the raster
+    mask = find_ground(sweep.points)
+    assert overlap(mask, truth) > 0.93 and mask[sweep.is_ground].mean() > 0.99  # what rays truly hit the ground
+    points[:, 2] += 1.5 * np.sin(2 * np.pi * points[:, 0] / 80) + 0.1 * points[:, 1]  # 12 % up and down on 10 %
+    assert overlap(find_ground(points), truth) > 0.9
+    clouds = [sweep.points[~sweep.is_ground], sweep.points[~mask], sweep.points]
+    assert has_ground(clouds) == [False, False, True]
+
+
+def test_real_sweeps_against_the_map_and_the_stored_mask(av2_folder, kitti_file):
+    sweep = AV2Log(av2_folder).sweep(0)
+    mine = find_ground(sweep.points)
+    assert overlap(mine, sweep.is_ground) > 0.93  # also where the map knows nothing
+    sensor = sweep.points - np.array([1.35, 0, 1.64], np.float32)
+    assert overlap(find_ground(sensor), sweep.is_ground) > 0.93
+    assert has_ground([sweep.points, sweep.points[~sweep.is_ground], sweep.points[~mine]]) == [True, False, False]
+    with HDF5Log(kitti_file) as log:
+        sweep = log.sweep(7)
+        assert overlap(find_ground(sweep.points), sweep.is_ground) > 0.93
+
+
+def test_patchwork_is_optional(monkeypatch, sweeps):
+    monkeypatch.setitem(sys.modules, "pypatchworkpp", None)
+    with pytest.raises(CFlowError, match="pip install pypatchworkpp"):
+        find_ground(sweeps[0].points, method="patchwork")
+
+
+def test_patchwork():
+    pytest.importorskip("pypatchworkpp")
+    sweep = make_drive(seed=SEED, num_sweeps=1, profile="av2").sweep(0)
+    for shift in (0.0, 1.7):
+        mask = find_ground(sweep.points + np.array([0, 0, shift], np.float32), method="patchwork")
+        assert overlap(mask, sweep.is_ground) > 0.8
+
+
+# ---------------------------------------------------------------------------------------------------- estimate_flow
+
+
+@pytest.fixture(scope="module")
+def street() -> Tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Two bare clouds with ground, a car that moves 0.8 m, parked cars; what each row of pc0 is: 0 = the car, 1, 2."""
+    floor, car = rings(1.7, beams=32), block((8, -1, -1.5), (12, 0.8, 0.0), 3000, 6)
+    parked = [block((x, y, -1.65), (x + 4, y + 1.8, 0.0), 2000, 7) for x, y in ((-9, 4), (5, 5), (16, 4))]
+    pc0, pc1 = (np.concatenate([car + [0.8 * step, 0, 0], *parked, floor]) for step in (0, 1))
+    return pc0, pc1, np.repeat([0, 1, 2], [len(car), 6000, len(floor)])
+
+
+def test_auto_finds_the_moving_car_and_leaves_the_rest_still(street):
+    pc0, pc1, part = street
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        result = estimate_flow(pc0, pc1, ground="auto", preset="paper")
+    flow, is_valid = result.residual_flow.numpy(), result.is_valid.numpy()
+    # The lowest 0.3 m of everything count as ground, and between rings the surface is up to 0.15 m too high.
+    above = pc0[:, 2] > -1.25
+    assert np.allclose(flow[(part == 0) & above], [0.8, 0, 0], atol=1e-6) and not flow[part > 0].any()
+    assert is_valid[(part < 2) & above].all() and not is_valid[part == 2].any()
+
+
+def test_without_masks_there_is_a_warning(street):
+    pc0, pc1, part = street
+    with pytest.warns(UserWarning, match="ground='auto'") as record:
+        result = estimate_flow(pc0, pc1, preset="paper")
+    assert len(record) == 1 and record[0].filename == __file__
+    assert np.abs(result.residual_flow.numpy()[part == 0] - [0.8, 0, 0]).max() > 0.5  # what the warning is about
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        nothing = np.zeros(len(pc0), dtype=bool)
+        estimate_flow(pc0, pc1, gm0=nothing, gm1=nothing, preset="paper")
+        estimate_flow(pc0[part < 2], pc1[part < 2], preset="paper")
+
+
+def test_auto_keeps_masks_that_are_given_and_masks_the_history_too(street):
+    pc0, pc1, part = street
+    mine = part == 0  # not ground at all, but it is the user's word
+    result = estimate_flow(pc0, pc1, gm0=mine, ground="auto", preset="paper")
+    assert not result.is_valid[mine].any() and result.is_valid[part == 1].all()
+    older = pc0 - np.where(mine[:, None], [0.8, 0, 0], 0)
+    settings = {"pch": [older], "num_history": 1, "preset": "paper"}
+    gm0, gm1, gmh = find_ground_batch([pc0, pc1, older])
+    masked = estimate_flow(pc0, pc1, gm0=gm0, gm1=gm1, gmh=[gmh], **settings)
+    assert_same(estimate_flow(pc0, pc1, ground="auto", **settings), masked)

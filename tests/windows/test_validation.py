@@ -1,0 +1,138 @@
+"""Input that is refused: one error that names the thing and says what to give."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scenes import pose
+
+from cflow_torch import CFlowError, CorrelationFlow, Sweep, Window, estimate_flow
+
+RNG = np.random.default_rng(0)
+P0, P1 = RNG.uniform(-5, 5, (50, 3)).astype(np.float32), RNG.uniform(-5, 5, (40, 3)).astype(np.float32)
+EYE, MIRROR = np.eye(4), np.diag([1.0, 1.0, -1.0, 1.0])
+MODEL = CorrelationFlow.from_preset("paper", num_history=1, pixel_size=0.25)
+
+
+def refused(*sweeps: Sweep, match: str) -> None:
+    """pc0, pc1 and maybe one of history."""
+    with pytest.raises(CFlowError, match=match):
+        MODEL([Window(sweeps[0], sweeps[1], tuple(sweeps[2:]))])
+
+
+@pytest.mark.parametrize(
+    "points, complaint",
+    [
+        (P0[:, :2], r"shape \(50, 2\).*\(N, 3\+\)"),
+        (P0[None], r"shape \(1, 50, 3\)"),
+        (np.zeros((3, 1001)), "give its transpose"),
+        (P0.astype(np.int64), "dtype int64.*float"),
+        (P0.astype(object), "dtype object"),
+        (P0.astype(complex), "dtype complex128"),
+        (torch.from_numpy(P0).int(), "dtype torch.int32"),
+        (np.zeros((4, 3), dtype=[("x", "f4")]), "dtype"),
+        (np.ma.masked_greater(P0, 0.5), "masked array"),
+        (torch.from_numpy(P0).to_sparse(), "layout"),
+        (P0.tolist(), "is list"),
+        ("points.npy", "is str"),
+    ],
+)
+def test_points_of_the_wrong_kind(points, complaint):
+    good = Sweep(P1)
+    refused(Sweep(points), good, match="pc0.*" + complaint)
+    refused(good, Sweep(points), match="pc1.*" + complaint)
+    refused(good, good, Sweep(points), match="pch1.*" + complaint)
+
+
+@pytest.mark.parametrize(
+    "mask, complaint",
+    [
+        (np.zeros(3, dtype=bool), r"shape \(3,\)"),
+        (np.zeros((50, 1), dtype=bool), r"shape \(50, 1\)"),
+        (np.zeros(50, dtype=np.uint8), "dtype uint8.*bool"),
+        (torch.zeros(50), "dtype torch.float32.*bool"),
+        (np.ma.masked_array(np.zeros(50, bool), [True] * 50), "masked array"),
+        ([False] * 50, "is list"),
+    ],
+)
+def test_ground_masks_of_the_wrong_kind(mask, complaint):
+    refused(Sweep(P0, mask), Sweep(P1), match="ground mask of pc0.*" + complaint)
+    refused(Sweep(P1), Sweep(P0), Sweep(P0 + 1, mask), match="ground mask of pch1.*" + complaint)
+
+
+@pytest.mark.parametrize(
+    "windows",
+    [None, Window(Sweep(P0), Sweep(P1)), [Sweep(P0)], [P0, P1], [Window(P0, P1)], [Window(Sweep(P0), Sweep(P1), None)]],
+    ids=["None", "Window", "Sweep", "arrays", "Window of arrays", "no history"],
+)
+def test_what_is_no_list_of_windows(windows):
+    with pytest.raises(CFlowError, match="Window|Sweep"):
+        MODEL(windows)
+
+
+@pytest.mark.parametrize("given", [(0,), (1,), (0, 1), (1, 2)])
+def test_poses_of_some_sweeps_only(given):
+    refused(*(Sweep(p, pose=EYE if i in given else None) for i, p in enumerate((P0, P1, P0 + 1))), match="pose")
+
+
+@pytest.mark.parametrize("which, name", [(0, "pc0"), (1, "pose1"), (2, "pch1")])
+def test_bad_poses_are_named(which, name):
+    for bad in (EYE * np.nan, MIRROR, np.eye(3), "pose"):
+        refused(*(Sweep(p, pose=bad if i == which else EYE) for i, p in enumerate((P0, P1, P0 + 1))), match=name)
+
+
+def test_poses_of_another_log():
+    refused(Sweep(P0, pose=pose(5000.0, 100.0, 0.0)), Sweep(P1, pose=EYE), match="moves 5001 m between pc0 and pc1")
+
+
+@pytest.mark.parametrize("stamps", [(0, 0, -1), (0, 1, -1), (0, -1, 1), (0, -1, -1)])
+def test_time_stamps_out_of_order(stamps):
+    pc1, pc0, older = (Sweep(p, timestamp_ns=10**9 + 10**8 * s) for p, s in zip((P1, P0, P0 + 1), stamps))
+    refused(pc0, pc1, older, match="time stamps.*out of order.*newest to oldest")
+
+
+@pytest.mark.parametrize("stamp", [float("nan"), "now", 2**63, [1, 2]], ids=str)
+def test_time_stamps_that_are_none_are_named(stamp):
+    for stamps, name in (((10**9, stamp), "pc1"), ((stamp, 10**9), "pc0")):
+        pc0, pc1 = (Sweep(p, timestamp_ns=s) for p, s in zip((P0, P1), stamps))
+        refused(pc0, pc1, match=f"timestamp_ns of {name} is .*whole nanoseconds")
+
+
+def test_more_history_than_is_asked_for():
+    refused(*map(Sweep, (P0, P1, P0 + 1, P0 + 2)), match="2 history sweeps but num_history=1")
+
+
+@pytest.mark.parametrize(
+    "points, far, is_refused",
+    [
+        (lambda p: p, 1e7, False),
+        (lambda p: p.astype(np.float32), 1e7, True),  # whole metres
+        (lambda p: p.astype(np.float32), 1e6, False),  # 1/16 m: a quarter of a pixel
+        (lambda p: p.astype(">f4"), 1e7, True),
+        (lambda p: torch.from_numpy(p).half(), 0.0, False),
+        (lambda p: torch.from_numpy(p).bfloat16(), 60.0, True),
+    ],
+)
+def test_types_too_coarse_for_pixels_are_refused(points, far, is_refused):
+    model = CorrelationFlow.from_preset(
+        "paper", pixel_size=0.25, point_cloud_range=(far - 8, far - 8, -8, far + 8, far + 8, 8)
+    )
+    window = Window(Sweep(points(RNG.uniform(-1, 1, (50, 3)) + [far, far, 0.0])), Sweep(np.zeros((4, 3)) + far))
+    if not is_refused:
+        assert model([window])[0].is_valid.all()
+        return
+    with pytest.raises(CFlowError, match=r"pc0 is .*only holds multiples of .* m.*pixels of 0.25 m"):
+        model([window])
+
+
+def test_devices():
+    cpu, other = torch.from_numpy(P0), torch.from_numpy(P1).to("meta")
+    for pc0, pc1 in ((cpu, other), (other, cpu)):
+        with pytest.raises(CFlowError, match=r"different devices \(cpu, meta\)"):
+            estimate_flow(pc0, pc1)
+    with pytest.raises(CFlowError, match="holds no numbers"):
+        estimate_flow(other, other)
+    for device in ("abacus", None, *(() if torch.cuda.is_available() else ("cuda",))):
+        with pytest.raises(CFlowError, match=f"device={device!r} cannot be used"):
+            estimate_flow(P0, P1, device=device)
