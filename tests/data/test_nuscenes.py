@@ -58,10 +58,9 @@ def tiny(tmp_path):
     return write_nuscenes(TinyRecording(("LIDAR_TOP",)), tmp_path / "data", key_frame_interval=0.1)
 
 
-@pytest.mark.parametrize("profile", ["nuscenes", "av2"])
-def test_a_simulated_drive_comes_back(profile, tmp_path):
-    """One LiDAR that was de-skewed, and two. Points differ by the float32 rounding of one rotation: 2e-5 m at 200 m."""
-    recording = make_drive(seed=1, num_sweeps=2, profile=profile)
+def test_a_simulated_drive_comes_back(tmp_path):
+    """Points differ by the float32 rounding of one rotation: 2e-5 m at 200 m."""
+    recording = make_drive(seed=1, num_sweeps=2, profile="nuscenes")
     log = open_log(write_nuscenes(recording, tmp_path, key_frame_interval=0.05), own_vehicle=None)
     assert log.log_id == recording.log_id and len(log) == 2
     assert list(log.timestamps) == [stamp // 1000 for stamp in recording.timestamps]
@@ -76,6 +75,9 @@ def test_a_simulated_drive_comes_back(profile, tmp_path):
     assert np.abs(labels.flow - exact.flow).max() < 1e-5 and len(np.unique(labels.category)) > 3
     assert np.array_equal(labels.category, exact.category) and np.array_equal(labels.is_valid, exact.is_valid)
     assert log.labels(1) is None and len(window(log, 0, 4).pch) == 0
+    several = TinyRecording(("LIDAR_TOP", "SECOND"))
+    points = open_log(write_nuscenes(several, tmp_path / "tiny"), own_vehicle=None).sweep(1).points
+    assert np.abs(points - several.sweep(1).points).max() < 2e-5
 
 
 def test_labels_between_samples(drive, tmp_path):
@@ -183,21 +185,19 @@ def test_own_vehicle_and_shots_without_return_are_removed(tiny):
 def test_finding_scenes_and_reading_their_tables_once(tiny, tmp_path):
     second = write_nuscenes(TinyRecording(("LIDAR_TOP",), num_sweeps=4, log_id="second"), tmp_path / "data")
     assert [source.name for source in find_nuscenes_scenes(tmp_path)] == ["second", "tiny"]
-    for root in (tiny, tiny / VERSION):
-        (source,) = find_nuscenes_scenes(root)
-        assert (source.root, source.version, source.scene) == (tiny, VERSION, "tiny")
     for file in (second / VERSION).iterdir():  # two scenes of one version, as in the real data set
         if file.stem not in ("visibility", "attribute"):
             edit(tiny, file.stem, lambda rows, file=file: rows + json.loads(file.read_text()))
-    for file in (second / "samples" / "LIDAR_TOP").iterdir():
-        file.rename(tiny / "samples" / "LIDAR_TOP" / file.name)
-    sources = find_nuscenes_scenes(tiny)
+    for root in (tiny, tiny / VERSION):
+        sources = find_nuscenes_scenes(root)
+        assert [(source.root, source.version, source.scene) for source in sources] == [
+            (tiny, VERSION, name) for name in ("second", "tiny")
+        ]
     first = NuScenesLog(sources[1])
     for file in (tiny / VERSION).iterdir():
         file.unlink()
     log = NuScenesLog(sources[0])
     assert (first.log_id, len(first), log.log_id, len(log)) == ("tiny", 6, "second", 4)
-    assert len(log.sweep(0).points) == 40
     with pytest.raises(CFlowError, match="nowhere is no folder"):
         find_nuscenes_scenes(tmp_path / "nowhere")
 
