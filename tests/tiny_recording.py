@@ -6,8 +6,7 @@ from typing import List, Sequence, Tuple
 
 import numpy as np
 
-from cflow_torch.simulator.recording import UnitReturns
-from cflow_torch.simulator.writers.av2 import Boxes
+from cflow_torch.simulator.recording import Boxes, UnitReturns
 from cflow_torch.types import Sweep
 
 START_NS = 1_533_279_682_000_000_000

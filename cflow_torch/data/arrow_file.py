@@ -1,99 +1,112 @@
-"""What holds for every table of Arrow, in a feather or a parquet file: nothing is believed, and nothing is run.
-
-Only columns that are asked for are unpacked, after their types and what they claim to hold have been looked at.
-"""
+"""Columns of Arrow tables, of a feather or a parquet file, as NumPy arrays and texts."""
 
 from __future__ import annotations
 
-from contextlib import contextmanager
-from typing import Any, Iterator, List, Sequence
+from typing import Any, List, Sequence
 
+import numpy as np
 import pyarrow as pa
 
-from cflow_torch.data.bounds import check_claim
+from cflow_torch.data.file_errors import shortened as shortened
 from cflow_torch.types import CFlowError
 
-MAX_ROWS = 1 << 20  # of a table that is gone through row by row; a log has some ten thousand boxes
-MAX_TEXT_BYTES = 1 << 26  # of the names in a column; ten thousand boxes have some hundred kilobytes
-_MAX_TEXT = 400  # characters of what a library says; a damaged name can be a million long
+_INT64_MAX = (1 << 63) - 1
 
 
-@contextmanager
-def arrow_errors(file: Any) -> Iterator[None]:
-    """Turns whatever a damaged file makes Arrow raise into a CFlowError."""
-    try:
-        yield
-    except CFlowError:
-        raise
-    except Exception as error:  # Arrow's own, OSError, ValueError, KeyError, UnicodeDecodeError, MemoryError, ...
-        raise CFlowError(
-            f"cannot read {file}: {shortened(error)}; it may be truncated or damaged, copy it again"
-        ) from error
+class TableFile:
+    """A file that holds one table, read into memory.
+
+    Args:
+        file: where it is, for messages.
+        table: what it holds.
+
+    Attributes:
+        schema, names, num_rows: of the table, its columns, its rows.
+    """
+
+    def __init__(self, file: Any, table: pa.Table) -> None:
+        table.validate(full=True)
+        self.file, self._table = file, table
+        self.schema: pa.Schema = table.schema
+        self.names: List[str] = table.column_names
+        self.num_rows: int = table.num_rows
+
+    def read(self, columns: Sequence[str]) -> pa.Table:
+        """Some columns, in the order that is asked for.
+
+        Raises:
+            CFlowError: a column is missing or occurs twice.
+        """
+        check_columns(self.file, self.names, columns)
+        return self._table.select(list(columns))
 
 
-def shortened(text: Any) -> str:
-    """One line, not too long."""
-    line = " ".join(str(text).split())
-    return line if len(line) <= _MAX_TEXT else line[:_MAX_TEXT] + " ..."
-
-
-def check_columns(file: Any, schema: pa.Schema, columns: Sequence[str]) -> None:
-    """Refuse columns that are missing, doubled or of a type that no reader has use for.
+def check_columns(file: Any, names: Sequence[str], columns: Sequence[str], mend: str = "copy it again") -> None:
+    """Refuse columns that are asked for and missing, or there several times.
 
     Raises:
-        CFlowError: such a column.
+        CFlowError: such a column; `mend` says what to do.
     """
-    names = schema.names
     missing = [name for name in columns if name not in names]
     if missing:
-        raise CFlowError(f"{file} lacks the columns {missing}; it has {shortened(names)}")
-    for name in columns:
-        if names.count(name) > 1:
-            raise CFlowError(f"{file} has {names.count(name)} columns {name}; keep one")
-        kind = schema.field(name).type
-        if not _is_plain(kind):
-            raise CFlowError(
-                f"{file}: column {name} is {shortened(kind)}; columns of numbers, bools or text are read, and lists"
-            )
+        raise CFlowError(f"{file} lacks the columns {missing}; it has {shortened(names)}; {mend}")
+    doubled = [name for name in columns if names.count(name) > 1]
+    if doubled:
+        raise CFlowError(f"{file} has several columns {doubled}; keep one")
 
 
-def _is_plain(kind: pa.DataType) -> bool:
-    """Numbers, times, text, also by dictionary; lists of numbers."""
-    if pa.types.is_dictionary(kind):
-        kind = kind.value_type
-    elif pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind):
-        return bool(pa.types.is_primitive(kind.value_type))
-    return bool(pa.types.is_primitive(kind) or pa.types.is_string(kind) or pa.types.is_large_string(kind))
-
-
-def check_rows(file: Any, num_rows: int) -> None:
-    """Refuse a table that takes too long to go through row by row.
+def floats(table: pa.Table, columns: Sequence[str], file: Any, dtype: type = np.float64) -> np.ndarray:
+    """(rows, K) numbers of K floating-point columns.
 
     Raises:
-        CFlowError: more than `MAX_ROWS` rows.
+        CFlowError: a column of another type, or with empty entries.
     """
-    if num_rows > MAX_ROWS:
-        raise CFlowError(f"{file} has {num_rows} rows; such a table has up to {MAX_ROWS}. Is the file damaged?")
+    values = np.empty((table.num_rows, len(columns)), dtype)
+    for number, name in enumerate(columns):
+        values[:, number] = _column(table, name, file, "floating point", pa.types.is_floating).to_numpy()
+    return values
 
 
-def texts(column: pa.ChunkedArray, file: Any) -> List[str]:
-    """Text of every row; rows of equal text share it where the file does.
+def integers(table: pa.Table, column: str, file: Any) -> np.ndarray:
+    """(rows,) int64 numbers of an integer column.
 
     Raises:
-        CFlowError: something else than text, a row without, or more than MAX_TEXT_BYTES.
+        CFlowError: another type, empty entries, or numbers beyond int64.
     """
-    kind = column.type.value_type if pa.types.is_dictionary(column.type) else column.type
-    if not (pa.types.is_string(kind) or pa.types.is_large_string(kind)):
-        raise CFlowError(f"{file}: a column of names must be text, got {column.type}")
-    check_claim(file, "a column of names", column.nbytes, MAX_TEXT_BYTES)
-    found: List[Any] = []
-    with arrow_errors(file):
-        for chunk in column.chunks:
-            if pa.types.is_dictionary(column.type):
-                words = chunk.dictionary.to_pylist()
-                found += [None if at is None else words[at] for at in chunk.indices.to_pylist()]
-            else:
-                found += chunk.to_pylist()
-    if None in found:
-        raise CFlowError(f"{file}: {found.count(None)} rows have no name")
+    values = _column(table, column, file, "integer", pa.types.is_integer).to_numpy()
+    if values.size and int(values.max()) > _INT64_MAX:
+        raise CFlowError(f"{file}: {column} holds {values.max()}, more than {_INT64_MAX}")
+    return values.astype(np.int64)
+
+
+def bools(table: pa.Table, column: str, file: Any) -> np.ndarray:
+    """(rows,) bool.
+
+    Raises:
+        CFlowError: another type, or empty entries.
+    """
+    return _column(table, column, file, "bool", pa.types.is_boolean).to_numpy().astype(bool)
+
+
+def texts(table: pa.Table, column: str, file: Any) -> List[str]:
+    """Text of every row, also of a dictionary.
+
+    Raises:
+        CFlowError: another type, or empty entries.
+    """
+    found: List[str] = _column(table, column, file, "text", _is_text).to_pylist()
     return found
+
+
+def _column(table: pa.Table, column: str, file: Any, kind: str, is_kind: Any) -> pa.ChunkedArray:
+    values = table.column(column)
+    if not is_kind(values.type):
+        raise CFlowError(f"{file}: column {column} must be {kind}, got {values.type}")
+    if values.null_count:
+        raise CFlowError(f"{file} has {values.null_count} empty entries in {column}; copy it again")
+    return values
+
+
+def _is_text(kind: pa.DataType) -> bool:
+    kind = kind.value_type if pa.types.is_dictionary(kind) else kind
+    return bool(pa.types.is_string(kind) or pa.types.is_large_string(kind))

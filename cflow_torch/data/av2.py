@@ -8,20 +8,20 @@ from typing import Dict, List, Optional, Sequence, Union
 import numpy as np
 import pyarrow as pa
 
-from cflow_torch.data.arrow_file import check_rows, shortened, texts
-from cflow_torch.data.boxes import Boxes, flow_from_boxes
-from cflow_torch.data.categories import CATEGORIES, CATEGORY_INDEX
+from cflow_torch.data.arrow_file import bools, floats, integers, texts
+from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes, make_boxes
+from cflow_torch.data.categories import CATEGORIES
 from cflow_torch.data.feather_file import FeatherFile
+from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.folders import find_folders
-from cflow_torch.data.ground import GroundRaster, get_rule, read_ground_raster
-from cflow_torch.data.log import FlowLabels
+from cflow_torch.data.ground import get_rule, read_ground_raster
+from cflow_torch.data.log import FlowLabels, NumberedSweeps
 from cflow_torch.data.names import is_stamp
 from cflow_torch.data.paths import Place, as_path, remote_errors
+from cflow_torch.data.rigid_motion import moved, poses_from_quaternions
 from cflow_torch.types import CFlowError, Sweep
 
-QUATERNION_TOLERANCE = 1e-3  # a quaternion is a rotation only if its length is 1; stored values are within 1e-15
 MIN_INTERIOR_POINTS = 1  # av2-api's data loader drops boxes that hold no point, so a track that empties ends
-_INT64_MAX = (1 << 63) - 1
 SEARCH_DEPTH = 4  # <root>/<data set>/sensor/<split>/<log>, the deepest layout in use
 
 _POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
@@ -30,13 +30,10 @@ _FLOW = ("flow_tx_m", "flow_ty_m", "flow_tz_m")
 
 
 def find_av2_logs(root: Place) -> List[Path]:
-    """Folders of all logs under a folder.
+    """Sorted folders of all logs: those that hold `sensors/lidar`.
 
     Args:
         root: a log, a split (holds logs), or a folder of splits, at most four levels above the logs.
-
-    Returns:
-        Sorted folders that hold `sensors/lidar`; empty if there are none.
 
     Raises:
         CFlowError: `root` is no folder.
@@ -44,7 +41,7 @@ def find_av2_logs(root: Place) -> List[Path]:
     return find_folders(as_path(root), _is_log, SEARCH_DEPTH, "a log, or a folder of logs")
 
 
-class AV2Log:
+class AV2Log(NumberedSweeps):
     """One Argoverse 2 sensor log; implements the `Log` protocol.
 
     Args:
@@ -74,16 +71,12 @@ class AV2Log:
             for file in (self.folder / "sensors" / "lidar").glob("*.feather")
             if is_stamp(file.stem)
         }
-        self.timestamps: Sequence[int] = sorted(self._files)
-        if len(self.timestamps) < 2:
-            raise CFlowError(
-                f"log {self.log_id} has {len(self.timestamps)} sweeps in sensors/lidar (<nanoseconds>.feather); "
-                f"scene flow needs two or more"
-            )
+        self.timestamps = sorted(self._files)
+        self._check_count(f"{self.folder}: sensors/lidar/<nanoseconds>.feather")
         self._poses = self._read_poses()
-        self._rule = None if ground is None else get_rule(ground)
-        self._raster: Optional[GroundRaster] = None
-        if self._rule is not None:
+        self._rule, self._raster = ground, None
+        if ground is not None:
+            get_rule(ground)
             self._raster = read_ground_raster(self.folder / "map")
         if require_ground and self._raster is None:
             raise CFlowError(
@@ -91,22 +84,13 @@ class AV2Log:
                 f"given; fetch the map, or open the log with require_ground=False and segment the ground yourself"
             )
 
-    def __len__(self) -> int:
-        return len(self.timestamps)
-
     def sweep(self, index: int) -> Sweep:
-        """Sweep number `index`.
-
-        Raises:
-            CFlowError: no such sweep, or its file cannot be read.
-        """
+        """Sweep number `index`, with ground where the log has a raster."""
         timestamp = self._timestamp(index)
-        points = self._points(timestamp)
-        pose = self._poses[timestamp]
+        points, pose = self._points(timestamp), self._poses[timestamp]
         is_ground = None
         if self._raster is not None and self._rule is not None:
-            city = points.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
-            is_ground = self._raster.is_ground(city, self._rule)
+            is_ground = self._raster.is_ground(moved(points, pose), self._rule)
         return Sweep(points=points, is_ground=is_ground, pose=pose.copy(), timestamp_ns=timestamp)
 
     def labels(self, index: int) -> Optional[FlowLabels]:
@@ -114,16 +98,11 @@ class AV2Log:
 
         Taken from the first of these that the log has: `flow_labels/<ns of sweep t>.feather` (if that folder exists,
         a pair without a file has no truth); `flow_labels.feather` for the first pair; `annotations.feather` by the
-        recipe of av2-api (boxes that hold no point count as absent), for pairs inside the annotated time.
-
-        Returns:
-            The labels; None where the log has none, as for its last sweep.
-
-        Raises:
-            CFlowError: no such sweep; a label file that cannot be read or has another number of rows than the sweep.
+        recipe of av2-api (boxes that hold no point count as absent), for pairs inside the annotated time. None where
+        the log has none, as for its last sweep.
         """
         timestamp = self._timestamp(index)
-        if index == len(self.timestamps) - 1:
+        if index == len(self) - 1:
             return None
         folder, first_pair = self.folder / "flow_labels", self.folder / "flow_labels.feather"
         annotations = self.folder / "annotations.feather"
@@ -137,22 +116,16 @@ class AV2Log:
                 return self._labels_from_annotations(annotations, timestamp, self.timestamps[index + 1])
         return None
 
-    def _timestamp(self, index: int) -> int:
-        if not 0 <= index < len(self.timestamps):
-            raise CFlowError(f"log {self.log_id} has sweeps 0 ... {len(self.timestamps) - 1}, asked for {index}")
-        return self.timestamps[index]
-
     def _points(self, timestamp: int) -> np.ndarray:
         """(N, 3) float32."""
-        return _floats(_read(self._files[timestamp], ("x", "y", "z")), ("x", "y", "z"), np.float32)
+        file = self._files[timestamp]
+        return floats(FeatherFile(file).read("xyz"), "xyz", file, np.float32)
 
     def _read_poses(self) -> Dict[int, np.ndarray]:
         """Sweep time -> (4, 4) float64 T_world_ego."""
         file = self.folder / "city_SE3_egovehicle.feather"
-        table = _read(file, ("timestamp_ns", *_POSE))
-        check_rows(file, table.num_rows)
-        times = _integers(table, "timestamp_ns", file)
-        row_of = {int(time): row for row, time in enumerate(times)}
+        table = FeatherFile(file).read(("timestamp_ns", *_POSE))
+        row_of = {time: row for row, time in enumerate(integers(table, "timestamp_ns", file).tolist())}
         missing = [time for time in self.timestamps if time not in row_of]
         if missing:
             raise CFlowError(
@@ -161,38 +134,36 @@ class AV2Log:
                 + "; every sweep needs a pose at exactly its time stamp"
             )
         rows = [row_of[time] for time in self.timestamps]
-        values = _floats(table, _POSE, np.float64)[rows]
-        return dict(zip(self.timestamps, _transforms(values, file, self.timestamps)))
+        return dict(zip(self.timestamps, _poses(table.take(rows), file, self.timestamps)))
 
     def _stored_labels(self, file: Path, timestamp: int) -> FlowLabels:
-        table = _read(file, (*_FLOW, "classes"), ("is_valid",))
+        stored = FeatherFile(file)
+        table = stored.read((*_FLOW, "classes"))
         rows = len(self._points(timestamp))
         if table.num_rows != rows:
             raise CFlowError(
                 f"{file} has {table.num_rows} rows but sweep {timestamp} has {rows} points; labels need one each"
             )
-        category = _integers(table, "classes", file)
+        category = integers(table, "classes", file)
         if category.size and not 0 <= category.min() <= category.max() < len(CATEGORIES):
             raise CFlowError(
                 f"{file}: classes are 0 ... {len(CATEGORIES) - 1}, got {category.min()} ... {category.max()}"
             )
         is_valid = np.ones(rows, dtype=bool)
-        if "is_valid" in table.column_names:
-            if not pa.types.is_boolean(table.schema.field("is_valid").type):
-                raise CFlowError(f"{file}: is_valid must be bool, got {table.schema.field('is_valid').type}")
-            is_valid = table.column("is_valid").to_numpy().astype(bool)
-        return FlowLabels(flow=_floats(table, _FLOW, np.float32), category=category.astype(np.uint8), is_valid=is_valid)
+        if "is_valid" in stored.names:
+            is_valid = bools(stored.read(["is_valid"]), "is_valid", file)
+        return FlowLabels(floats(table, _FLOW, file, np.float32), category.astype(np.uint8), is_valid)
 
     def _labels_from_annotations(self, file: Path, timestamp0: int, timestamp1: int) -> Optional[FlowLabels]:
-        columns = ("timestamp_ns", "track_uuid", "category", *_SIZE, *_POSE)
-        table = _read(file, columns, ("num_interior_pts",))
-        check_rows(file, table.num_rows)
-        times = _integers(table, "timestamp_ns", file)
+        stored = FeatherFile(file)
+        table = stored.read(("timestamp_ns", "track_uuid", "category", *_SIZE, *_POSE))
+        times = integers(table, "timestamp_ns", file)
         if not times.size or timestamp0 < times.min() or timestamp1 > times.max():
             return None
         used: np.ndarray = np.ones(len(times), dtype=bool)
-        if "num_interior_pts" in table.column_names:
-            used = _integers(table, "num_interior_pts", file) >= MIN_INTERIOR_POINTS
+        if "num_interior_pts" in stored.names:
+            points_inside = integers(stored.read(["num_interior_pts"]), "num_interior_pts", file)
+            used = points_inside >= MIN_INTERIOR_POINTS
         boxes0, boxes1 = (
             _boxes(table.filter(pa.array(used & (times == time))), file) for time in (timestamp0, timestamp1)
         )
@@ -204,75 +175,15 @@ def _is_log(folder: Path) -> bool:
     return (folder / "sensors" / "lidar").is_dir()
 
 
-def _read(file: Path, required: Sequence[str], optional: Sequence[str] = ()) -> pa.Table:
-    """The required columns of a feather file, without holes in them, and the optional ones that it has."""
-    try:
-        feather = FeatherFile(file)
-    except FileNotFoundError:
-        raise CFlowError(f"{file} is missing; copy it from the data set") from None
-    except OSError as error:
-        raise CFlowError(f"cannot read {file}: {error}; it may be truncated, copy it again") from error
-    columns = (*required, *(name for name in optional if name in feather.names))
-    table = feather.read(columns)
-    holes = [name for name in columns if table.column(name).null_count]
-    if holes:
-        raise CFlowError(f"{file} has empty entries in {holes}")
-    return table
-
-
-def _floats(table: pa.Table, columns: Sequence[str], dtype: type) -> np.ndarray:
-    """(rows, columns) array of floating-point columns."""
-    wrong = {
-        name: str(table.schema.field(name).type)
-        for name in columns
-        if not pa.types.is_floating(table.schema.field(name).type)
-    }
-    if wrong:
-        raise CFlowError(f"columns {list(columns)} must be floating point, got {wrong}")
-    values = np.empty((table.num_rows, len(columns)), dtype)
-    for number, name in enumerate(columns):
-        values[:, number] = table.column(name).to_numpy()
-    return values
-
-
-def _integers(table: pa.Table, column: str, file: Path) -> np.ndarray:
-    """(rows,) int64."""
-    kind = table.schema.field(column).type
-    if not pa.types.is_integer(kind):
-        raise CFlowError(f"{file}: {column} must be integer, got {kind}")
-    values = table.column(column).to_numpy()
-    if values.size and values.max() > _INT64_MAX:
-        raise CFlowError(f"{file}: {column} holds {values.max()}, more than {_INT64_MAX}")
-    return values.astype(np.int64)
-
-
-def _transforms(values: np.ndarray, file: Path, names: Sequence[Union[int, str]]) -> np.ndarray:
-    """(K, 4, 4) float64 from rows of qw qx qy qz tx ty tz."""
-    norm = np.linalg.norm(values[:, :4], axis=1)
-    for row in np.flatnonzero(~np.isfinite(values).all(axis=1) | ~(np.abs(norm - 1) <= QUATERNION_TOLERANCE)):
-        raise CFlowError(
-            f"{file}: the pose of {names[int(row)]} is no rigid motion: quaternion and translation must be finite, "
-            f"the quaternion of length 1, got {values[row].tolist()}"
-        )
-    w, x, y, z = (values[:, :4] / norm[:, None]).T
-    transforms = np.zeros((len(values), 4, 4))
-    transforms[:, 0, :3] = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], axis=1)
-    transforms[:, 1, :3] = np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], axis=1)
-    transforms[:, 2, :3] = np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=1)
-    transforms[:, :3, 3] = values[:, 4:]
-    transforms[:, 3, 3] = 1
-    return transforms
+def _poses(table: pa.Table, file: Path, names: Sequence[Union[int, str]]) -> np.ndarray:
+    """(K, 4, 4) float64."""
+    values = floats(table, _POSE, file)
+    return poses_from_quaternions(values[:, 4:], values[:, :4], lambda row: f"{file}: the pose of {names[row]}")
 
 
 def _boxes(table: pa.Table, file: Path) -> Boxes:
     """Boxes of one sweep, in the order of the file."""
-    names = tuple(texts(table.column(name), file) for name in ("track_uuid", "category"))
-    unknown = sorted(set(names[1]) - set(CATEGORIES[1:]))
-    if unknown:
-        raise CFlowError(f"{file}: unknown categories {shortened(unknown)}; the known ones are {CATEGORIES[1:]}")
-    return Boxes(
-        track_id=names[0],
-        category=np.array([CATEGORY_INDEX[name] for name in names[1]], dtype=np.uint8),
-        size=_floats(table, _SIZE, np.float64),
-        pose=_transforms(_floats(table, _POSE, np.float64), file, names[0]),
-    )
+    tracks, names = (texts(table, column, file) for column in ("track_uuid", "category"))
+    with file_errors(file):
+        category = category_indices(names, {name: name for name in CATEGORIES[1:]})
+        return make_boxes(tracks, category, floats(table, _SIZE, file), _poses(table, file, tracks))

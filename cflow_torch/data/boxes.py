@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
-from typing import Sequence, Tuple
+from typing import Any, List, Mapping, Sequence, Tuple
 
 import numpy as np
 
+from cflow_torch.data.categories import CATEGORY_INDEX
+from cflow_torch.data.file_errors import shortened
 from cflow_torch.data.log import FlowLabels
+from cflow_torch.data.rigid_motion import moved
 from cflow_torch.types import CFlowError
 
-MAX_BOXES = 10_000  # of a sweep; every point is compared with every box, and a busy crossing has some hundred
 _LISTED = 20  # names in a message
 
 
@@ -41,8 +43,28 @@ class Boxes:
         if len(set(self.track_id)) != count:
             twice = sorted(name for name, times in Counter(self.track_id).items() if times > 1)
             raise CFlowError(f"a track may have one box per sweep; named twice: {twice[:_LISTED]}")
-        if count > MAX_BOXES:
-            raise CFlowError(f"a sweep has up to {MAX_BOXES} boxes, got {count}: is the file damaged?")
+
+
+def make_boxes(track_id: Sequence[str], category: Sequence[int], size: Any, pose: Any) -> Boxes:
+    """`Boxes` from lists of K values each, also of none."""
+    sizes, poses = np.array(size, dtype=np.float64), np.array(pose, dtype=np.float64)
+    return Boxes(track_id, np.array(category, dtype=np.uint8), sizes.reshape(-1, 3), poses.reshape(-1, 4, 4))
+
+
+def category_indices(names: Sequence[Any], known: Mapping[Any, str]) -> List[int]:
+    """Argoverse 2 indices of K boxes.
+
+    Args:
+        names: of their categories, as the data set has them.
+        known: such a name -> that of Argoverse 2.
+
+    Raises:
+        CFlowError: a name is not known; the message lists those that are.
+    """
+    unknown = sorted(set(names) - set(known))
+    if unknown:
+        raise CFlowError(f"unknown categories {shortened(unknown[:_LISTED])}; the known ones are {list(known)}")
+    return [CATEGORY_INDEX[known[name]] for name in names]
 
 
 def points_in_box(points: np.ndarray, size: np.ndarray, pose: np.ndarray) -> np.ndarray:
@@ -87,7 +109,7 @@ def flow_from_boxes(
     Source: the recipe of av2-api (torch/structures/flow.py), which rounds the ego motion to float32 first.
     """
     start = np.asarray(points, dtype=np.float64)[:, :3]
-    flow = start @ T_ego1_ego0[:3, :3].T + T_ego1_ego0[:3, 3] - start
+    flow = moved(start, T_ego1_ego0) - start
     category = np.zeros(len(start), dtype=np.uint8)
     is_valid = np.ones(len(start), dtype=bool)
     successor = {track: row for row, track in enumerate(boxes1.track_id)}
@@ -98,7 +120,7 @@ def flow_from_boxes(
             is_valid[inside] = False
             continue
         motion = boxes1.pose[successor[track]] @ np.linalg.inv(boxes0.pose[row])
-        flow[inside] = start[inside] @ motion[:3, :3].T + motion[:3, 3] - start[inside]
+        flow[inside] = moved(start[inside], motion) - start[inside]
     return FlowLabels(flow=flow.astype(np.float32), category=category, is_valid=is_valid)
 
 

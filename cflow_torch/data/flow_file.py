@@ -9,6 +9,7 @@ import pyarrow as pa
 import torch
 from pyarrow import feather
 
+from cflow_torch.data.arrow_file import bools, floats, integers
 from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.feather_file import FeatherFile
 from cflow_torch.data.paths import Place, as_path
@@ -41,7 +42,7 @@ def write_flow(path: Place, result: FlowResult, contents: Sequence[str] = CONTEN
     for name in contents:
         given = getattr(result, _VECTORS.get(name, name))
         if given is None:
-            raise CFlowError(f"{name} was asked for, but this result has none: estimate it with proof=True")
+            raise CFlowError(f"{name} was asked for, but this result has none: estimate it with preset default or fast")
         values = given.detach().cpu().numpy()
         if name in _VECTORS:
             columns.update({f"{name}_t{axis}_m": values[:, i] for i, axis in enumerate(_AXES)})
@@ -57,24 +58,18 @@ def read_flow(path: Place) -> FlowResult:
     Raises:
         CFlowError: the file is missing, cannot be reached, is truncated, or was not written with all contents.
     """
-    names = [f"{name}_t{axis}_m" for name in _VECTORS for axis in _AXES] + list(_SCALARS)
     path = as_path(path)
     try:
         file = FeatherFile(path)
-        table = file.read([*names, *(name for name in ON_REQUEST if name in file.names)])
-    except (OSError, CFlowError) as error:
+        names = [*_SCALARS, *(name for name in ON_REQUEST if name in file.names)]
+        axes = {name: [f"{name}_t{axis}_m" for axis in _AXES] for name in _VECTORS}
+        table = file.read([*(column for columns in axes.values() for column in columns), *names])
+        read = {"cluster_id": integers, "is_valid": bools}
+        values = {name: read[name](table, name, path) for name in names if name in read}
+        values.update({name: floats(table, [name], path, np.float32)[:, 0] for name in names if name not in read})
+        values.update({_VECTORS[name]: floats(table, columns, path, np.float32) for name, columns in axes.items()})
+    except CFlowError as error:
         raise CFlowError(
             f"{path} is no flow file ({error}): give one that `cflow flow` wrote with all its contents"
         ) from error
-    columns = {}
-    for name in table.column_names:
-        kind = table.column(name).type
-        wanted = {"cluster_id": "int64", "is_valid": "bool"}.get(name, "floating point")
-        right = pa.types.is_floating(kind) if wanted == "floating point" else str(kind) == wanted
-        if not right or table.column(name).null_count:
-            raise CFlowError(f"{path} is no flow file: {name} must be {wanted} in every row, got {kind}")
-        columns[name] = table.column(name).to_numpy()
-    vectors = {
-        field: np.stack([columns.pop(f"{name}_t{axis}_m") for axis in _AXES], 1) for name, field in _VECTORS.items()
-    }
-    return FlowResult(**{name: torch.from_numpy(np.array(values)) for name, values in {**vectors, **columns}.items()})
+    return FlowResult(**{name: torch.from_numpy(np.array(array)) for name, array in values.items()})

@@ -4,31 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Dict, Optional, Union
+from typing import Any, Callable, Dict, Optional, Tuple
 
 import numpy as np
 
+from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.json_file import read_json
 from cflow_torch.data.npy_file import read_npy
 from cflow_torch.types import CFlowError
 
-
-@dataclass(frozen=True)
-class GroundRule:
-    """How a raster tells ground from the rest.
-
-    Args:
-        threshold: metres; a point at most this far from the surface is ground.
-        rounding: "truncate" (towards zero) or "round" (half to even): raster coordinate to cell.
-    """
-
-    threshold: float
-    rounding: str
-
-
-GROUND_RULES: Dict[str, GroundRule] = {
-    "av2-api": GroundRule(threshold=0.3, rounding="truncate"),
-    "bsfe": GroundRule(threshold=0.4, rounding="round"),
+# Rule -> metres that a point of the ground is away from the surface at most, and raster coordinate to cell: towards
+# zero, or half to even.
+GROUND_RULES: Dict[str, Tuple[float, Callable[[np.ndarray], Any]]] = {
+    "av2-api": (0.3, np.trunc),
+    "bsfe": (0.4, np.round),
 }
 
 
@@ -49,43 +38,40 @@ class GroundRaster:
     translation: np.ndarray
     scale: float
 
-    def is_ground(self, points: np.ndarray, rule: Union[str, GroundRule] = "av2-api") -> np.ndarray:
+    def is_ground(self, points: np.ndarray, rule: str = "av2-api") -> np.ndarray:
         """Tell which points lie on or under the ground.
 
         Args:
             points: (N, 3) float, metres, CITY frame.
-            rule: name in `GROUND_RULES`, or a rule.
+            rule: name in `GROUND_RULES`.
 
         Returns:
             (N,) bool: within the threshold of the surface (limit included) or below it.
 
         Convention: outside the raster and where its height is NaN a point is not ground.
+
+        Raises:
+            CFlowError: no rule has this name.
         """
-        rule = get_rule(rule)
-        xyz = np.asarray(points, dtype=np.float64)
-        height = self._height_at(xyz[:, :2], rule)
+        threshold, rounded = get_rule(rule)
+        xyz: np.ndarray = np.asarray(points, dtype=np.float64)
+        inside = np.isfinite(xyz[:, :2]).all(axis=1)
+        position = (np.where(inside[:, None], xyz[:, :2], 0.0) @ self.rotation.T + self.translation) * self.scale
+        cell = rounded(position).astype(np.int64)
+        inside &= (cell >= 0).all(axis=1) & (cell < self.heights.shape[::-1]).all(axis=1)
+        height = np.full(len(xyz), np.nan)
+        height[inside] = self.heights[cell[inside, 1], cell[inside, 0]]
         with np.errstate(invalid="ignore"):
             above = xyz[:, 2] - height
-            return (np.abs(above) <= rule.threshold) | (above < 0)
-
-    def _height_at(self, xy: np.ndarray, rule: GroundRule) -> np.ndarray:
-        inside = np.isfinite(xy).all(axis=1)
-        position = (np.where(inside[:, None], xy, 0.0) @ self.rotation.T + self.translation) * self.scale
-        cell = (np.round(position) if rule.rounding == "round" else np.trunc(position)).astype(np.int64)
-        inside &= (cell >= 0).all(axis=1) & (cell < self.heights.shape[::-1]).all(axis=1)
-        height = np.full(len(xy), np.nan)
-        height[inside] = self.heights[cell[inside, 1], cell[inside, 0]]
-        return height
+            return (np.abs(above) <= threshold) | (above < 0)
 
 
-def get_rule(rule: Union[str, GroundRule]) -> GroundRule:
-    """A rule by name, or the one given.
+def get_rule(rule: str) -> Tuple[float, Callable[[np.ndarray], Any]]:
+    """A rule by name.
 
     Raises:
         CFlowError: no rule has this name.
     """
-    if isinstance(rule, GroundRule):
-        return rule
     if rule not in GROUND_RULES:
         raise CFlowError(f"ground rules are {sorted(GROUND_RULES)}, got {rule!r}")
     return GROUND_RULES[rule]
@@ -117,7 +103,7 @@ def read_ground_raster(map_folder: Path) -> Optional[GroundRaster]:
         raise CFlowError(
             f"{rasters[0]} must hold a (H, W) raster of numbers, got shape {heights.shape} and dtype {heights.dtype}"
         )
-    try:
+    with file_errors(alignments[0], "copy the map folder again"):
         alignment = read_json(alignments[0])
         raster = GroundRaster(
             heights=heights.astype(np.float64),
@@ -125,10 +111,6 @@ def read_ground_raster(map_folder: Path) -> Optional[GroundRaster]:
             translation=np.array(alignment["t"], dtype=np.float64).reshape(2),
             scale=float(alignment["s"]),
         )
-    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
-        raise CFlowError(
-            f"cannot read the ground raster in {map_folder}: {error}; copy the map folder again"
-        ) from error
     if not all(np.isfinite(value).all() for value in (raster.rotation, raster.translation, raster.scale)):
         raise CFlowError(f"{alignments[0]} holds numbers that are not finite; copy the map folder again")
     return raster

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Optional, Protocol, Sequence
+from typing import Any, Optional, Protocol, Sequence
 
 import numpy as np
 
@@ -27,7 +27,12 @@ class FlowLabels:
 
 
 class Log(Protocol):
-    """One drive."""
+    """One drive.
+
+    Raises:
+        CFlowError: from `sweep` and `labels`: there is no sweep of this number, or a file of it is missing, damaged, or
+            of another size than what belongs to it. Other sweeps can be read then.
+    """
 
     @property
     def log_id(self) -> str:
@@ -59,6 +64,27 @@ def window(log: Log, index: int, num_history: int = 0) -> Window:
         )
     history = range(index - 1, max(index - 1 - num_history, -1), -1)
     return Window(log.sweep(index), log.sweep(index + 1), tuple(log.sweep(i) for i in history))
+
+
+class NumberedSweeps:
+    """What readers share: sweeps are asked for by number."""
+
+    log_id: str
+    timestamps: Sequence[int]
+
+    def __len__(self) -> int:
+        return len(self.timestamps)
+
+    def _timestamp(self, index: int) -> int:
+        """Time stamp of sweep `index`; refuses a number that no sweep has."""
+        if not 0 <= index < len(self.timestamps):
+            raise CFlowError(f"log {self.log_id} has sweeps 0 ... {len(self) - 1}, asked for {index}")
+        return self.timestamps[index]
+
+    def _check_count(self, where: Any) -> None:
+        """Refuse a log without a pair of sweeps; `where` begins the message."""
+        if len(self.timestamps) < 2:
+            raise CFlowError(f"{where} has {len(self.timestamps)} sweeps; scene flow needs two or more")
 
 
 class RecentSweeps:

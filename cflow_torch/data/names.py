@@ -1,7 +1,4 @@
-"""Names that come from data: what may become a file's or a folder's name, and where it may lie.
-
-Log ids, scene names, tokens and file names in tables are text that somebody else wrote. One rule for all of them.
-"""
+"""Names that come from data (log ids, scene names, file names in tables): one rule for all of them."""
 
 from __future__ import annotations
 
@@ -16,7 +13,6 @@ from cflow_torch.data.paths import is_remote
 from cflow_torch.types import CFlowError
 
 MAX_NAME_BYTES = 255  # of one folder or file, in UTF-8: what file systems take
-_MAX_DEPTH = 64  # folders in one name of a table
 _SEPARATOR = re.compile(r"[/\\]|^[A-Za-z]:")  # also those of other systems: outputs are copied there
 # Windows opens a device instead of a file for these, whatever follows the first dot.
 _RESERVED = re.compile(r"(CON|PRN|AUX|NUL|CONIN\$|CONOUT\$|(COM|LPT)[0-9\u00b9\u00b2\u00b3]) *(\..*)?", re.I | re.S)
@@ -34,9 +30,8 @@ def safe_name(name: Any, what: str) -> str:
         The same name.
 
     Raises:
-        CFlowError: no text, empty, begins with a dot (`..`, hidden ones), has a separator (/, \\, C:), a control
-            character (NUL, line ends) or a lone surrogate, ends in a dot or blank, is reserved on Windows (CON,
-            aux.txt), or has over 255 bytes.
+        CFlowError: no text, empty, begins with a dot, has a separator (/, \\, C:), a control character or a lone
+            surrogate, ends in a dot or blank, is reserved on Windows (CON, aux.txt), or has over 255 bytes.
     """
     why = _fault(name)
     if why:
@@ -51,9 +46,7 @@ def is_safe_name(name: Any) -> bool:
 
 
 def inside(folder: Path, relative: Any, what: str) -> Path:
-    """Where a name from a table lies: below a folder.
-
-    Links below the folder are followed: they are how the user laid out the data.
+    """Where a name from a table lies: below a folder. Links below it are followed: the user laid out the data so.
 
     Args:
         folder: of the data set.
@@ -61,21 +54,16 @@ def inside(folder: Path, relative: Any, what: str) -> Path:
         what: what it is the name of, for the message.
 
     Raises:
-        CFlowError: no text, absolute, or a part that `safe_name` refuses, `..` among them.
+        CFlowError: no text, empty, absolute, or a part that `safe_name` refuses, `..` among them.
     """
-    if not isinstance(relative, str):
-        raise CFlowError(f"{what} is a {type(relative).__name__}, expected the name of a file")
-    parts = [part for part in relative.split("/") if part not in ("", ".")]
-    if relative.startswith(("/", "\\")) or ".." in parts:
-        raise CFlowError(f"{what} {ascii(relative)[:_SHOWN]} leaves {folder}: it must be a name below that folder")
-    if not 0 < len(parts) <= _MAX_DEPTH:
-        raise CFlowError(f"{what} {ascii(relative)[:_SHOWN]} has {len(parts)} parts, expected 1 to {_MAX_DEPTH}")
-    for part in parts:
-        if _fault(part):
-            raise CFlowError(
-                f"{what} {ascii(relative)[:_SHOWN]} is not read: of {ascii(part)[:_SHOWN]}, {_fault(part)}"
-            )
-    return folder.joinpath(*parts)
+    parts = relative.split("/") if isinstance(relative, str) else []
+    named = [part for part in parts if part not in ("", ".")]
+    fault = next(filter(None, map(_fault, named)), "" if named else "it names no file")
+    if parts and (not parts[0] or ".." in parts):
+        fault = f"it leaves {folder}"
+    if fault:
+        raise CFlowError(f"{what} {ascii(relative)[:_SHOWN]} is not read: {fault}; give a name below {folder}")
+    return folder.joinpath(*named)
 
 
 def folder_in(output: Path, name: Any, what: str) -> Path:
@@ -87,15 +75,12 @@ def folder_in(output: Path, name: Any, what: str) -> Path:
         what: what it is the name of, for the message.
 
     Raises:
-        CFlowError: `safe_name` refuses the name; or it is a link that leaves `output`, so that others' files would be
-            written or removed.
+        CFlowError: `safe_name` refuses the name, or it is a link that leaves `output`.
     """
     folder = output / safe_name(name, what)
     if leaves(output, folder):
-        raise CFlowError(
-            f"{folder} is a link to {os.path.realpath(folder)}, outside of {output}: nothing is written there; "
-            "remove the link, or give output=FOLDER"
-        )
+        where = f"{folder} is a link to {os.path.realpath(folder)}, outside of {output}"
+        raise CFlowError(f"{where}: nothing is written there; remove the link, or give output=FOLDER")
     return folder
 
 

@@ -20,10 +20,7 @@ from typing import Any, Dict, Iterator, Optional, Union
 
 import pyarrow as pa
 
-from cflow_torch.data.arrow_types import refuse_pickled_types
 from cflow_torch.types import CFlowError
-
-refuse_pickled_types()  # here, since every reader comes by
 
 Place = Union[str, Path]
 _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)://")

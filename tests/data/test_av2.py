@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import replace
 from pathlib import Path
-from typing import Any, Dict, Optional, Sequence
+from typing import Any, Dict, Sequence
 
 import numpy as np
 import pyarrow as pa
@@ -14,9 +13,10 @@ import pyarrow.feather as feather
 import pytest
 
 from cflow_torch.data.av2 import AV2Log, find_av2_logs
-from cflow_torch.data.boxes import Boxes, flow_from_boxes, points_in_box
-from cflow_torch.data.ground import GroundRaster, GroundRule, read_ground_raster
+from cflow_torch.data.boxes import Boxes, flow_from_boxes
+from cflow_torch.data.ground import GroundRaster, read_ground_raster
 from cflow_torch.data.log import window
+from cflow_torch.data.rigid_motion import moved
 from cflow_torch.types import CFlowError
 
 TIMES = (100, 200, 300)
@@ -70,9 +70,6 @@ def folder(tmp_path: Path) -> Path:
     return log
 
 
-# ---------------------------------------------------------------------------------------------- the real log
-
-
 def test_real_log(av2_folder: Path, data_root: Path) -> None:
     assert av2_folder in find_av2_logs(data_root)
     log = AV2Log(av2_folder, require_ground=True)
@@ -119,9 +116,6 @@ def test_real_box_truth_equals_the_stored_one(av2_folder: Path, tmp_path: Path) 
     assert (stored.category[ends] > 0).all()
 
 
-# ---------------------------------------------------------------------------------------------- small logs
-
-
 def test_sweeps_and_poses(folder: Path) -> None:
     log = AV2Log(folder)
     assert (log.log_id, list(log.timestamps), len(log)) == ("some-log", [100, 200, 300], 3)
@@ -133,14 +127,6 @@ def test_sweeps_and_poses(folder: Path) -> None:
     assert log.labels(0) is None
 
 
-def test_sweeps_are_read_when_asked_for(folder: Path) -> None:
-    log = AV2Log(folder)
-    (folder / "sensors" / "lidar" / "200.feather").write_bytes(b"broken")
-    log.sweep(0)
-    with pytest.raises(CFlowError, match="cannot read"):
-        log.sweep(1)
-
-
 def test_find_logs(folder: Path, tmp_path: Path) -> None:
     other = tmp_path / "train" / "deep" / "b-log"
     for time in TIMES:
@@ -148,36 +134,24 @@ def test_find_logs(folder: Path, tmp_path: Path) -> None:
     assert find_av2_logs(folder) == [folder]
     assert find_av2_logs(tmp_path / "val") == [folder]
     assert find_av2_logs(tmp_path) == sorted([other, folder])
-    (tmp_path / "empty").mkdir()
-    assert find_av2_logs(tmp_path / "empty") == []
     with pytest.raises(CFlowError, match="no folder"):
         find_av2_logs(tmp_path / "nowhere")
 
 
-def test_label_folder_wins(folder: Path) -> None:
-    annotate(folder, box_columns(100, 10.0), box_columns(300, 11.0))
+def test_stored_labels_come_before_boxes(folder: Path) -> None:
+    annotate(folder, box_columns(100, 10.0), box_columns(200, 10.0), box_columns(300, 13.0))
     write(folder / "flow_labels.feather", label_columns(flow_tx_m=np.zeros(3, dtype=np.float32)))
+    first, second = (AV2Log(folder).labels(index) for index in (0, 1))
+    assert not first.flow[:, 0].any() and first.flow[2, 2] == 2 and first.is_valid.all()
+    np.testing.assert_allclose(second.flow[1], [3, 0, 0], atol=1e-6)  # the one file is of the first pair
     valid = np.array([True, False, True])
     write(folder / "flow_labels" / "100.feather", label_columns(is_valid=valid))
     log = AV2Log(folder)
     labels = log.labels(0)
-    assert labels is not None
     np.testing.assert_array_equal(labels.flow[:, 0], [0, 1, 2])
     np.testing.assert_array_equal(labels.is_valid, valid)
     assert (labels.flow.dtype, labels.category.dtype, labels.is_valid.dtype) == (np.float32, np.uint8, np.bool_)
-    assert log.labels(1) is None  # the folder has no file for this pair
-    assert log.labels(2) is None  # no pair
-
-
-def test_single_label_file_is_of_the_first_pair(folder: Path) -> None:
-    write(folder / "flow_labels.feather", label_columns())
-    annotate(folder, box_columns(100, 10.0), box_columns(200, 10.0), box_columns(300, 13.0))
-    log = AV2Log(folder)
-    first, second = log.labels(0), log.labels(1)
-    assert first is not None and second is not None
-    np.testing.assert_array_equal(first.flow[:, 2], [0, 1, 2])
-    assert first.is_valid.all()
-    np.testing.assert_allclose(second.flow[1], [3, 0, 0], atol=1e-6)
+    assert log.labels(1) is None and log.labels(2) is None  # the folder has no file for this pair; no pair
 
 
 def test_labels_from_boxes(folder: Path) -> None:
@@ -190,26 +164,18 @@ def test_labels_from_boxes(folder: Path) -> None:
     np.testing.assert_allclose(labels.flow, [[0, 1, 0], [2, 0, 0], [0, 1, 0]], atol=1e-6)
     assert labels.is_valid.all()
     assert log.labels(1) is None  # sweep 300 lies after the last annotation
-
-
-def test_track_that_ends_or_empties_is_not_valid(folder: Path) -> None:
     annotate(folder, box_columns(100, 10.0), box_columns(200, 12.0, inside=0), box_columns(300, 12.0, "b"))
-    labels = AV2Log(folder).labels(0)
-    assert labels is not None
-    np.testing.assert_array_equal(labels.is_valid, [True, False, True])
-    assert labels.category[1] == 19
-
-
-# ---------------------------------------------------------------------------------------------- broken logs
+    labels = AV2Log(folder).labels(0)  # a track that empties
+    assert labels.is_valid.tolist() == [True, False, True] and labels.category[1] == 19
 
 
 def test_bad_logs_are_refused(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(CFlowError, match="holds no folder sensors/lidar"):
         AV2Log(tmp_path)
-    with pytest.raises(CFlowError, match="sweeps 0 ... 2, asked for 3"):
-        AV2Log(folder).sweep(3)
-    with pytest.raises(CFlowError, match="asked for -1"):
-        AV2Log(folder).labels(-1)
+    for ask in (AV2Log(folder).sweep, AV2Log(folder).labels):
+        for index in (3, -1):
+            with pytest.raises(CFlowError, match=f"sweeps 0 ... 2, asked for {index}"):
+                ask(index)
     with pytest.raises(CFlowError, match="ground rules are"):
         AV2Log(folder, ground="patchwork")
     with pytest.raises(CFlowError, match="no ground raster"):
@@ -220,83 +186,58 @@ def test_bad_logs_are_refused(folder: Path, tmp_path: Path) -> None:
         AV2Log(folder)
 
 
+SWEEP, POSES, LABELS = "sensors/lidar/100.feather", "city_SE3_egovehicle.feather", "flow_labels/100.feather"
+
+
 @pytest.mark.parametrize(
-    ("columns", "message"),
+    ("file", "columns", "message"),
     [
-        (pose_columns((100, 300)), "no pose for sweep 200"),
-        ({**pose_columns(), "qw": np.full(3, 0.9)}, "the pose of 100 is no rigid motion"),
-        ({**pose_columns(), "tx_m": np.array([0, math.nan, 0])}, "the pose of 200 is no rigid motion"),
-        ({**pose_columns(), "qw": np.full(3, math.nan)}, "the pose of 100 is no rigid motion"),
-        ({**pose_columns(), "tx_m": ["a", "b", "c"]}, "must be floating point"),
-        ({**pose_columns(), "timestamp_ns": np.array(TIMES, dtype=np.float64)}, "timestamp_ns must be integer"),
-        ({key: value for key, value in pose_columns().items() if key != "qz"}, r"lacks the columns \['qz'\]"),
-        (None, "is missing"),
+        (POSES, pose_columns((100, 300)), "no pose for sweep 200"),
+        (POSES, {**pose_columns(), "qw": np.full(3, 0.9)}, "the pose of 100 is no rigid motion"),
+        (POSES, {**pose_columns(), "tx_m": ["a", "b", "c"]}, "must be floating point"),
+        (POSES, {**pose_columns(), "timestamp_ns": np.array(TIMES, dtype=np.float64)}, "timestamp_ns must be integer"),
+        (POSES, {key: value for key, value in pose_columns().items() if key != "qz"}, r"lacks the columns \['qz'\]"),
+        (SWEEP, {"x": [1, 2], "y": [1.0, 2.0], "z": [1.0, 2.0]}, "must be floating point"),
+        (SWEEP, {"x": [1.0, None], "y": [1.0, 2.0], "z": [1.0, 2.0]}, "1 empty entries in x"),
+        (LABELS, label_columns(rows=2), "2 rows but sweep 100 has 3 points"),
+        (LABELS, label_columns(classes=np.array([0, 31, 0], dtype=np.uint8)), "classes are 0 ... 30"),
+        (LABELS, label_columns(is_valid=np.ones(3)), "is_valid must be bool"),
     ],
 )
-def test_bad_poses_are_refused(folder: Path, columns: Optional[Dict[str, Any]], message: str) -> None:
-    file = folder / "city_SE3_egovehicle.feather"
-    file.unlink()
-    if columns is not None:
-        write(file, columns)
-    with pytest.raises(CFlowError, match=message):
-        AV2Log(folder)
+def test_bad_columns_are_refused(folder: Path, file: str, columns: Dict[str, Any], message: str) -> None:
+    write(folder / file, columns)
+    with pytest.raises(CFlowError, match=message) as error:
+        log = AV2Log(folder)
+        log.sweep(0), log.labels(0)
+    assert file in str(error.value)
 
 
-def test_truncated_files_are_refused(folder: Path) -> None:
-    for name in ("sensors/lidar/100.feather", "city_SE3_egovehicle.feather"):
+def test_truncated_and_missing_files_are_refused_when_they_are_read(folder: Path) -> None:
+    opened = AV2Log(folder)
+    for name in (SWEEP, POSES):
         file = folder / name
         whole = file.read_bytes()
         for keep in (0, 10, len(whole) // 2, len(whole) - 8):
             file.write_bytes(whole[:keep])
-            with pytest.raises(CFlowError, match="cannot read"):
+            with pytest.raises(CFlowError, match=f"cannot read .*{name}"):
                 AV2Log(folder).sweep(0)
+        file.unlink()
+        with pytest.raises(CFlowError, match=f"{name} is missing; copy it"):
+            (opened if name == SWEEP else AV2Log(folder)).sweep(0)
+        assert len(opened.sweep(1).points) == 3
         file.write_bytes(whole)
     AV2Log(folder).sweep(0)
 
 
-@pytest.mark.parametrize(
-    ("columns", "message"),
-    [
-        ({"x": POINTS[:, 0], "y": POINTS[:, 1]}, r"lacks the columns \['z'\]"),
-        ({"x": [1, 2], "y": [1.0, 2.0], "z": [1.0, 2.0]}, "must be floating point"),
-        ({"x": [1.0, None], "y": [1.0, 2.0], "z": [1.0, 2.0]}, r"empty entries in \['x'\]"),
-    ],
-)
-def test_bad_sweeps_are_refused(folder: Path, columns: Dict[str, Any], message: str) -> None:
-    write(folder / "sensors" / "lidar" / "100.feather", columns)
-    with pytest.raises(CFlowError, match=message):
-        AV2Log(folder).sweep(0)
-
-
-@pytest.mark.parametrize(
-    ("columns", "message"),
-    [
-        (label_columns(rows=2), "2 rows but sweep 100 has 3 points"),
-        (label_columns(classes=np.array([0, 31, 0], dtype=np.uint8)), "classes are 0 ... 30"),
-        (label_columns(classes=np.zeros(3)), "classes must be integer"),
-        (label_columns(is_valid=np.ones(3)), "is_valid must be bool"),
-        (label_columns(flow_tx_m=np.zeros(3, dtype=np.int64)), "must be floating point"),
-    ],
-)
-def test_bad_labels_are_refused(folder: Path, columns: Dict[str, Any], message: str) -> None:
-    write(folder / "flow_labels" / "100.feather", columns)
-    with pytest.raises(CFlowError, match=message):
-        AV2Log(folder).labels(0)
-
-
 def test_bad_annotations_are_refused(folder: Path) -> None:
-    annotate(folder, box_columns(100, 10.0, category="SPACESHIP"), box_columns(200, 10.0))
-    with pytest.raises(CFlowError, match="SPACESHIP"):
-        AV2Log(folder).labels(0)
-    annotate(folder, box_columns(100, 10.0), box_columns(100, 20.0), box_columns(200, 10.0))
-    with pytest.raises(CFlowError, match=r"named twice: \['a'\]"):
-        AV2Log(folder).labels(0)
-    annotate(folder, {**box_columns(100, 10.0), "qw": 0.5}, box_columns(200, 10.0))
-    with pytest.raises(CFlowError, match="pose of a is no rigid motion"):
-        AV2Log(folder).labels(0)
-
-
-# ---------------------------------------------------------------------------------------------- boxes
+    for rows, message in (
+        ((box_columns(100, 10.0, category="SPACESHIP"), box_columns(200, 10.0)), "SPACESHIP"),
+        ((box_columns(100, 10.0), box_columns(100, 20.0), box_columns(200, 10.0)), r"named twice: \['a'\]"),
+        (({**box_columns(100, 10.0), "qw": 0.5}, box_columns(200, 10.0)), "pose of a is no rigid motion"),
+    ):
+        annotate(folder, *rows)
+        with pytest.raises(CFlowError, match=f"annotations.feather.*{message}"):
+            AV2Log(folder).labels(0)
 
 
 def turned(angle: float, x: float, y: float) -> np.ndarray:
@@ -306,27 +247,16 @@ def turned(angle: float, x: float, y: float) -> np.ndarray:
     return pose
 
 
-def test_points_in_an_oriented_box() -> None:
-    size, pose = np.array([4.0, 2.0, 1.0]), turned(math.radians(30), 5, 1)
-    corner = pose[:3, :3] @ [2, 1, 0.5] + pose[:3, 3]
-    inward = pose[:3, :3] @ [-1, -1, -1] * 1e-9
-    points = np.stack([corner + inward, corner - inward, pose[:3, 3], [5, 3, 0]])
-    np.testing.assert_array_equal(points_in_box(points, size, pose), [True, False, True, False])
-    on_face = np.array([[2.0, 0, 0], [0, -1.0, 0], [0, 0, 0.5]])
-    assert points_in_box(on_face, size, np.eye(4)).all()
-
-
 def test_box_flow_is_the_rigid_motion_of_the_box() -> None:
     rng = np.random.default_rng(0)
     pose0, pose1, T = turned(0.3, 8, -2), turned(0.5, 9, -1), turned(-0.02, -1, 0)
     local = rng.uniform(-1, 1, (40, 3)) * [2.0, 1.0, 0.7]
-    points = local @ pose0[:3, :3].T + pose0[:3, 3]
+    points = moved(local, pose0)
     one = {"track_id": ["a"], "category": np.array([19], np.uint8), "size": np.array([[4.0, 2.0, 1.5]])}
     labels = flow_from_boxes(
         np.concatenate([points, [[30.0, 0, 0]]]), Boxes(pose=pose0[None], **one), Boxes(pose=pose1[None], **one), T
     )
-    arrive = local @ pose1[:3, :3].T + pose1[:3, 3]
-    np.testing.assert_allclose(labels.flow[:40], arrive - points, atol=1e-6)
+    np.testing.assert_allclose(labels.flow[:40], moved(local, pose1) - points, atol=1e-6)
     np.testing.assert_allclose(labels.flow[40], T[:3, :3] @ [30, 0, 0] + T[:3, 3] - [30, 0, 0], atol=1e-6)
 
 
@@ -348,42 +278,21 @@ def test_margin_overlap_and_end_of_track() -> None:
     np.testing.assert_array_equal(tight.category, [17, 0, 0, 17])
 
 
-def test_no_points_and_no_boxes() -> None:
-    none = Boxes([], np.zeros(0, np.uint8), np.zeros((0, 3)), np.zeros((0, 4, 4)))
-    labels = flow_from_boxes(np.zeros((0, 3)), none, none, np.eye(4))
-    assert (labels.flow.shape, labels.category.shape, labels.is_valid.shape) == ((0, 3), (0,), (0,))
-    with pytest.raises(CFlowError, match="boxes need category"):
-        replace(none, track_id=["a"])
-
-
-# ---------------------------------------------------------------------------------------------- ground
-
-
 def raster(heights: Sequence[Sequence[float]]) -> GroundRaster:
     return GroundRaster(np.array(heights, dtype=np.float64), np.eye(2), np.array([-100.0, -50.0]), 2.0)
 
 
 def test_ground_limits() -> None:
-    flat = raster([[1.0, 1.0], [1.0, 1.0]])
+    flat = raster([[0.0, np.nan], [0.0, 30.0]])
     # half a metre per cell: cell (0, 0) holds x 100 ... 100.5, y 50 ... 50.5
-    z = np.array([1.3, 1.3 + 1e-9, 1.0, 0.7, -20.0, 1.35])
+    z = np.array([0.3, 0.3 + 1e-9, 0.0, -0.3, -20.0, 0.4])
     points = np.column_stack([np.full(6, 100.2), np.full(6, 50.2), z])
-    limit = GroundRule(threshold=z[0] - 1.0, rounding="truncate")  # 1.3 - 1 is not 0.3 in binary
-    np.testing.assert_array_equal(flat.is_ground(points, limit), [True, False, True, True, True, False])
-    np.testing.assert_array_equal(flat.is_ground(points, "bsfe"), [True, True, True, True, True, True])
-
-
-def test_rules_round_differently() -> None:
-    steps = raster([[0.0, 10.0], [20.0, 30.0]])
-    points = np.array([[100.3, 50.1, 10.0], [100.1, 50.3, 20.0], [99.7, 50.0, 0.0]])  # cells 0.6, 0.2; 0.2, 0.6; -0.6
-    np.testing.assert_array_equal(steps.is_ground(points, "av2-api"), [False, False, True])
-    np.testing.assert_array_equal(steps.is_ground(points, "bsfe"), [True, True, False])
-
-
-def test_unknown_height_is_not_ground() -> None:
-    hole = raster([[np.nan, 0.0]])
-    points = np.array([[100.1, 50.1, -5.0], [100.6, 50.1, -5.0], [500, 50, -5.0], [np.nan, 50, 0], [np.inf, 50, 0]])
-    np.testing.assert_array_equal(hole.is_ground(points), [False, True, False, False, False])
+    np.testing.assert_array_equal(flat.is_ground(points), [True, False, True, True, True, False])
+    np.testing.assert_array_equal(flat.is_ground(points, "bsfe"), [True] * 6)
+    # Unknown height; outside; no number; cell 0.6, 0.6, which one rule truncates and the other rounds.
+    others = np.array([[100.6, 50.1, -5.0], [500, 50, -5.0], [np.nan, 50, 0], [100.3, 50.3, 9.0]])
+    np.testing.assert_array_equal(flat.is_ground(others), [False, False, False, False])
+    np.testing.assert_array_equal(flat.is_ground(others, "bsfe"), [False, False, False, True])
 
 
 def test_map_of_a_log(folder: Path) -> None:
@@ -399,10 +308,14 @@ def test_map_of_a_log(folder: Path) -> None:
     np.testing.assert_array_equal(sweep.is_ground, [False, False, True])  # z = 3, 0.5, 0
     np.testing.assert_array_equal(AV2Log(folder, ground="bsfe").sweep(0).is_ground, [False, False, True])
     sim2.write_text("{}")
-    with pytest.raises(CFlowError, match="cannot read the ground raster"):
+    with pytest.raises(CFlowError, match="cannot read .*img_Sim2_city.json.*copy the map folder again"):
         AV2Log(folder)
     sim2.write_text(json.dumps({"R": [1, 0, 0, 1], "t": [-990, 10], "s": 1.0}))
+    for content in (np.zeros(40), np.zeros((2, 2), dtype=object)):
+        np.save(maps / "x_ground_height_surface____PIT.npy", content)
+        with pytest.raises(CFlowError, match="ground_height_surface"):
+            AV2Log(folder)
     whole = maps / "x_ground_height_surface____PIT.npy"
     whole.write_bytes(whole.read_bytes()[:100])
-    with pytest.raises(CFlowError, match="ground_height_surface.* cannot be read"):
+    with pytest.raises(CFlowError, match="cannot read .*ground_height_surface"):
         AV2Log(folder)

@@ -1,9 +1,8 @@
-"""TruckScenes: simulator -> files -> reader, several LiDARs, motion compensation, broken files, the official devkit."""
+"""TruckScenes: several LiDARs with times of their own, motion compensation, the truck itself, broken files."""
 
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +11,9 @@ import pytest
 from tiny_recording import CAR_VELOCITY, TinyRecording
 
 from cflow_torch.data.arrays.pcd import read_pcd, write_pcd
-from cflow_torch.data.boxes import Boxes, flow_from_boxes
 from cflow_torch.data.nuscenes.reader import find_nuscenes_scenes
+from cflow_torch.data.rigid_motion import moved
 from cflow_torch.data.truckscenes.reader import TruckScenesLog, find_truckscenes_scenes
-from cflow_torch.data.categories import CATEGORY_INDEX, meta_class
-from cflow_torch.simulator import make_drive
-from cflow_torch.simulator.writers import truckscenes as truckscenes_writer
 from cflow_torch.simulator.writers.nuscenes import write_nuscenes
 from cflow_torch.simulator.writers.truckscenes import write_truckscenes
 from cflow_torch.types import CFlowError
@@ -39,10 +35,6 @@ def save(folder: Path, table: str, rows: list) -> None:
     (folder / VERSION / f"{table}.json").write_text(json.dumps(rows))
 
 
-def moved(points: np.ndarray, T: np.ndarray) -> np.ndarray:
-    return points @ T[:3, :3].T + T[:3, 3]
-
-
 @pytest.fixture(scope="module")
 def recording():
     return TinyRecording(("LIDAR_RIGHT", "LIDAR_LEFT", "LIDAR_REAR"), origin=UTM)
@@ -51,59 +43,6 @@ def recording():
 @pytest.fixture
 def tiny(recording, tmp_path):
     return write_truckscenes(recording, tmp_path / "data")
-
-
-# ---------------------------------------------------------------------------------------------- round trip
-
-
-def test_a_simulated_truck_comes_back(tmp_path):
-    """Six LiDARs. Points differ by the float32 rounding of one rotation: 2e-5 m at 200 m."""
-    drive = make_drive(seed=1, num_sweeps=2, profile="truckscenes")
-    folder = write_truckscenes(drive, tmp_path)
-    log = open_log(folder, own_vehicle=None, deskew=False)
-    assert log.log_id == drive.log_id
-    assert list(log.timestamps) == [stamp // 1000 for stamp in drive.timestamps]
-    for index, stamp in enumerate(drive.timestamps):
-        sweep, true = log.sweep(index), drive.sweep(index)
-        assert sweep.points.dtype == np.float32 and sweep.is_ground is None and sweep.timestamp_ns == stamp
-        assert sweep.points.shape == true.points.shape
-        assert np.abs(sweep.points - true.points).max() < 5e-5
-        assert np.abs(sweep.pose - drive.poses[index]).max() < 1e-12
-    labels, points = log.labels(0), log.sweep(0).points
-    ends = []
-    for index in (0, 1):
-        boxes = drive.boxes(index)
-        names = [{"BICYCLIST": "BICYCLE", "TRUCK_CAB": "TRUCK"}.get(name, name) for name in boxes.category]
-        category = np.array([CATEGORY_INDEX[name] for name in names], np.uint8)
-        ends.append(Boxes(boxes.track_id, category, boxes.size, boxes.pose))
-    exact = flow_from_boxes(points, *ends, np.linalg.inv(drive.poses[1]) @ drive.poses[0])
-    assert np.abs(labels.flow - exact.flow).max() < 1e-5 and len(np.unique(exact.category)) > 3
-    assert np.array_equal(labels.category, exact.category) and np.array_equal(labels.is_valid, exact.is_valid)
-    assert log.labels(1) is None
-    # With the times of the shots, a box holds what was hit of its object while both moved; without, a third is missed.
-    true = drive.labels(0)
-    on_object = (true.category > 0) & true.is_valid
-    deskewed = open_log(folder, own_vehicle=None).labels(0)
-    same = meta_class(deskewed.category[on_object]) == meta_class(true.category[on_object])
-    assert on_object.sum() > 5000 and same.mean() > 0.999
-
-
-@pytest.mark.parametrize("data", ["binary", "binary_compressed", "ascii"])
-def test_what_is_stored(recording, tmp_path, data):
-    folder = write_truckscenes(recording, tmp_path, data=data)
-    assert sorted(os.listdir(folder)) == ["samples", "sweeps", VERSION]
-    file = folder / "sweeps" / "LIDAR_LEFT" / f"LIDAR_LEFT_{recording.timestamps[1] // 1000}.pcd"
-    fields, unit = read_pcd(file), recording.units(1)[1]
-    assert list(fields) == ["x", "y", "z", "intensity", "timestamp"]
-    assert np.array_equal(np.stack([fields[axis] for axis in "xyz"], 1), unit.points)
-    assert np.array_equal(fields["intensity"], unit.intensity)
-    assert fields["timestamp"].dtype == np.uint64
-    assert np.array_equal(fields["timestamp"], (recording.timestamps[1] + unit.offset_ns) // 1000)
-    poses = np.array([row["translation"] for row in read(folder, "ego_pose")])
-    assert np.array_equal(poses[0], recording.poses[0, :3, 3])
-
-
-# ---------------------------------------------------------------------------------------------- merging in time
 
 
 @pytest.mark.parametrize("index", [0, 2, 5])
@@ -146,7 +85,7 @@ def test_lidars_with_their_own_times_and_poses(recording, tiny):
     points, here = log.sweep(1).points, recording.sweep(1).points
     late = np.linalg.inv(recording.poses[1]) @ recording.pose_at(recording.timestamps[1] + 20_000_000)
     assert np.abs(points[40:] - here[40:]).max() < 2e-5
-    assert np.abs(points[:40] - moved(here[:40].astype(float), late)).max() < 3e-5
+    assert np.abs(points[:40] - moved(here[:40], late)).max() < 3e-5
     assert np.abs(points[:40] - here[:40]).max() > 0.2
     skewless = open_log(tiny, own_vehicle=None).sweep(1).points  # the shots have their own times: nothing changes
     assert np.abs(skewless - moved(recording.world(1), np.linalg.inv(recording.poses[1]))).max() < 2e-5
@@ -163,9 +102,6 @@ def test_a_lidar_that_missed_a_turn_is_left_out(recording, tiny):
     assert [len(log.sweep(index).points) for index in range(4)] == [120, 120, 80, 120]
     only = open_log(tiny, own_vehicle=None, lidars=["LIDAR_REAR"])
     assert len(only) == 5 and len(only.sweep(0).points) == 40
-
-
-# ---------------------------------------------------------------------------------------------- the truck itself
 
 
 def test_truck_and_trailer_are_removed(recording, tiny):
@@ -191,115 +127,33 @@ def test_truck_and_trailer_are_removed(recording, tiny):
     assert len(open_log(tiny, lidars=["LIDAR_LEFT"], own_vehicle=None).sweep(0).points) == 6
 
 
-# ---------------------------------------------------------------------------------------------- broken files
-
-
 def test_bad_sweeps(recording, tiny):
     log = open_log(tiny)
     file = next((tiny / "samples" / "LIDAR_LEFT").glob(f"*_{log.timestamps[0]}.pcd"))
     whole, fields = file.read_bytes(), read_pcd(file)
-    binary = np.zeros((10, 5), "<f4").tobytes()
-    for content in (whole[: len(whole) // 2], whole[:30], b"", binary):
+    for content in (whole[: len(whole) // 2], b""):
         file.write_bytes(content)
-        with pytest.raises(CFlowError, match=f"{file.name} cannot be read as PCD"):
+        with pytest.raises(CFlowError, match=f"{file.name}"):
             log.sweep(0)
     for change, complaint in [
         ({"timestamp": None}, r"lacks the fields \['timestamp'\]"),
-        ({"z": None}, r"lacks the fields \['z'\]"),
+        ({name: values[:0] for name, values in fields.items()}, "holds no points"),
         ({"timestamp": fields["timestamp"] - fields["timestamp"].min()}, "microseconds since 1970.* deskew=False"),
         ({"timestamp": fields["timestamp"] * np.uint64(1000)}, "microseconds since 1970.* deskew=False"),
     ]:
         write_pcd(file, {name: values for name, values in {**fields, **change}.items() if values is not None})
-        with pytest.raises(CFlowError, match=complaint) as error:
+        with pytest.raises(CFlowError, match=f"{file.name}.*{complaint}"):
             log.sweep(0)
-        assert file.name in str(error.value)
     assert len(log.sweep(1).points) > 0
     file.unlink()
     with pytest.raises(CFlowError, match=f"{file.name} is missing; copy"):
         log.sweep(0)
 
 
-def test_no_points_and_no_times(tiny):
-    log = open_log(tiny, deskew=False)
-    file = next((tiny / "samples" / "LIDAR_LEFT").glob(f"*_{log.timestamps[0]}.pcd"))
-    fields = read_pcd(file)
-    write_pcd(file, {axis: fields[axis] for axis in "xyz"})
-    assert len(log.sweep(0).points) > 0  # without deskew nobody asks for times
-    write_pcd(file, {axis: fields[axis][:0] for axis in "xyz"})
-    with pytest.raises(CFlowError, match="holds no points"):
-        log.sweep(0)
-
-
-def test_tables(tiny, tmp_path):
-    file = tiny / VERSION / "ego_pose.json"
-    whole = file.read_text()
-    file.write_text(whole[: len(whole) // 2])
-    with pytest.raises(CFlowError, match=r"cannot read .*ego_pose.json as JSON"):
-        open_log(tiny)
-    file.unlink()
-    with pytest.raises(CFlowError, match=r"ego_pose.json is missing; copy"):
-        open_log(tiny)
+def test_the_other_data_set_is_refused_or_passed_over(tiny, tmp_path):
     with pytest.raises(CFlowError, match="is not nuScenes: .* choose the other reader"):
         find_nuscenes_scenes(tiny)
     other = write_nuscenes(TinyRecording(), tmp_path / "other")
     with pytest.raises(CFlowError, match="is not TruckScenes: .* choose the other reader"):
         find_truckscenes_scenes(other)
-    both = find_truckscenes_scenes(tmp_path)
-    assert [source.root for source in both] == [tiny], "the other data set beside it is passed over"
-    file.write_text(whole)
-    assert len(open_log(tiny)) == 6
-
-
-# ---------------------------------------------------------------------------------------------- the writer
-
-
-def test_a_failed_write_leaves_the_old_scene_and_no_rubbish(recording, tiny, monkeypatch):
-    with pytest.raises(CFlowError, match="overwrite=True"):
-        write_truckscenes(recording, tiny.parent)
-    with pytest.raises(CFlowError, match="PCD data are"):
-        write_truckscenes(recording, tiny.parent, overwrite=True, data="zip")
-
-    def full(*_):
-        raise OSError("disk full")
-
-    monkeypatch.setattr(truckscenes_writer, "write_tables", full)
-    with pytest.raises(OSError, match="disk full"):
-        write_truckscenes(recording, tiny.parent, overwrite=True)
-    assert os.listdir(tiny.parent) == ["tiny"] and len(open_log(tiny)) == 6
-
-
-def test_the_first_lidar_stands_in_for_the_reference(tmp_path):
-    folder = write_truckscenes(TinyRecording(("up", "down")), tmp_path)
-    assert sorted(os.listdir(folder / "samples")) == ["LIDAR_LEFT", "down"]
-    assert len(open_log(folder, own_vehicle=None).sweep(0).points) == 80
-
-
-# ---------------------------------------------------------------------------------------------- the official devkit
-
-
-@pytest.mark.parametrize("data", ["binary", "binary_compressed"])
-def test_the_official_devkit_opens_it(recording, tmp_path, data):
-    truckscenes = pytest.importorskip("truckscenes", reason="truckscenes-devkit is not installed")
-    from truckscenes.utils.data_classes import LidarPointCloud
-
-    folder = write_truckscenes(recording, tmp_path, data=data)
-    devkit = truckscenes.TruckScenes(VERSION, str(folder), verbose=False)
-    assert [scene["name"] for scene in devkit.scene] == ["tiny"] and len(devkit.sample) == 2
-    sample = devkit.sample[0]
-    assert set(sample["data"]) == set(recording.mounts)
-    path, boxes, _ = devkit.get_sample_data(sample["data"]["LIDAR_LEFT"])
-    unit = recording.units(0)[1]
-    cloud = LidarPointCloud.from_file(str(path))
-    np.testing.assert_array_equal(cloud.points[:3].T, unit.points)
-    np.testing.assert_array_equal(cloud.timestamps[0], (recording.timestamps[0] + unit.offset_ns) // 1000)
-    car = next(box for box in boxes if box.name == "vehicle.car")
-    T_sensor_world = np.linalg.inv(recording.poses[0] @ unit.T_ego_sensor)
-    np.testing.assert_allclose(
-        car.center, (T_sensor_world @ recording.car_at(recording.timestamps[0]))[:3, 3], atol=1e-6
-    )
-    velocity = devkit.box_velocity(sample["anns"][0])
-    np.testing.assert_allclose(velocity, CAR_VELOCITY, atol=1e-6)
-    merged, lag = LidarPointCloud.from_file_multisweep(
-        devkit, devkit.sample[1], "LIDAR_LEFT", "LIDAR_LEFT", nsweeps=3, min_distance=0
-    )
-    assert merged.points.shape == (4, 120) and -0.1 < lag.min() < 0 < lag.max() < 0.21
+    assert [source.root for source in find_truckscenes_scenes(tmp_path)] == [tiny]

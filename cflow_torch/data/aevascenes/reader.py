@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-import zipfile
 from pathlib import Path
 from typing import Any, Dict, List, Optional, Sequence, Tuple
 
 import numpy as np
 
-from cflow_torch.data.aevascenes.npz_strings import npz_contents, read_npz_member
-from cflow_torch.data.boxes import Boxes, flow_from_boxes
-from cflow_torch.data.categories import CATEGORY_INDEX
+from cflow_torch.data.aevascenes.clouds import Cloud
+from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes, make_boxes
+from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.folders import find_folders
-from cflow_torch.data.json_file import is_number, is_whole, read_json, shown
-from cflow_torch.data.log import FlowLabels
+from cflow_torch.data.json_file import is_whole, read_json, shown
+from cflow_torch.data.log import FlowLabels, NumberedSweeps
 from cflow_torch.data.names import inside
 from cflow_torch.data.paths import Place, as_path
+from cflow_torch.data.rigid_motion import moved, poses_from_quaternions
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.ego_motion import relative_transform
 
 SEARCH_DEPTH = 3  # <root>/<data set>/<split>/<sequence>
-QUATERNION_TOLERANCE = 1e-3  # a quaternion is a rotation only if its length is 1
+_MEND = "give a whole sequence of AevaScenes"
 
 CATEGORY_NAME: Dict[str, str] = {
     **dict.fromkeys(("unknown", "pole_trunk", "building", "other_structure", "vegetation"), "NONE"),
@@ -61,7 +61,7 @@ def find_aevascenes_sequences(root: Place) -> List[Path]:
     return find_folders(as_path(root), lambda folder: (folder / "sequence.json").is_file(), SEARCH_DEPTH, what)
 
 
-class AevaScenesLog:
+class AevaScenesLog(NumberedSweeps):
     """One sequence, of the layout of version 0.1, 0.2 or 2; implements the `Log` protocol.
 
     Args:
@@ -100,57 +100,35 @@ class AevaScenesLog:
         if clouds not in _PATHS:
             raise CFlowError(f"clouds is one of {', '.join(_PATHS)}; got {clouds!r}")
         self._clouds, self._ground = clouds, ground
-        self._last: Tuple[int, List[Tuple[Path, Any]]] = (-1, [])
+        self._last: Tuple[int, List[Cloud]] = (-1, [])
         self._file = self.folder / "sequence.json"
-        metadata, frames = self._read_sequence()
-        extrinsics = self._get(metadata, "metadata", "vehicle_to_lidar_extrinsics")
-        known = self._get(metadata, "metadata", "sensors", "lidars")
-        if not isinstance(known, list) or not all(isinstance(name, str) for name in known):
-            raise CFlowError(f"{self._file}: sensors.lidars must be a list of names, got {shown(known)}")
-        self.lidars: Sequence[str] = tuple(known if lidars is None else lidars)
-        strangers = sorted(set(self.lidars) - set(known))
-        if strangers or not self.lidars:
-            raise CFlowError(f"{self._file} has the LiDARs {shown(known)}; got {shown(list(self.lidars))}")
-        self._T_ego_lidar = {
-            name: self._pose(self._get(extrinsics, "vehicle_to_lidar_extrinsics", name), f"extrinsic of {name}")
-            for name in self.lidars
-        }
-        times = [self._get(frame, f"frame number {i}", "timestamp_ns") for i, frame in enumerate(frames)]
-        if not all(map(is_whole, times)):
-            raise CFlowError(f"{self._file}: timestamp_ns must be integers of 64 bits, got {shown(times)}")
-        by_time = dict(zip(times, frames))
-        if len(by_time) < 2 or len(by_time) < len(frames):
-            raise CFlowError(
-                f"{self._file} has {len(frames)} frames with {len(by_time)} different times; two or more are needed"
-            )
-        self.timestamps: Sequence[int] = sorted(by_time)
-        self._frames = [by_time[time] for time in self.timestamps]
-        self._poses = [
-            self._pose(self._get(frame, f"frame {time}", "ego_pose"), f"ego_pose of frame {time}")
-            for time, frame in zip(self.timestamps, self._frames)
-        ]
-        self._has_boxes = any(frame.get("boxes") for frame in self._frames)
-
-    def __len__(self) -> int:
-        return len(self.timestamps)
+        with file_errors(self._file, _MEND):
+            content = read_json(self._file)
+            mounts, known = content["metadata"]["vehicle_to_lidar_extrinsics"], content["metadata"]["sensors"]["lidars"]
+            self.lidars: Sequence[str] = tuple(known if lidars is None else lidars)
+            if not self.lidars or not set(self.lidars) <= set(known):
+                raise CFlowError(f"{self._file} has the LiDARs {shown(known)}; got {shown(list(self.lidars))}")
+            by_time: Dict[int, Dict[str, Any]] = {frame["timestamp_ns"]: frame for frame in content["frames"]}
+            if len(by_time) < len(content["frames"]) or not all(map(is_whole, by_time)):
+                raise CFlowError(
+                    f"{self._file}: timestamp_ns must be different 64-bit integers, got {shown(list(by_time))}"
+                )
+            self.timestamps = sorted(by_time)
+            self._check_count(self._file)
+            self._frames = [by_time[time] for time in self.timestamps]
+            self._mounts = self._poses_of([mounts[name] for name in self.lidars], "extrinsics")
+            self._poses = self._poses_of([frame["ego_pose"] for frame in self._frames], "ego poses")
+            self._has_boxes = any(frame.get("boxes") for frame in self._frames)
 
     def sweep(self, index: int) -> Sweep:
-        """Sweep number `index`; `is_ground` is None where a cloud of it has no class names.
-
-        Raises:
-            CFlowError: no such sweep, or a cloud is missing or cannot be read.
-        """
-        clouds = self._clouds_of(index)
-        is_ground = None
-        if self._ground:
-            names = [read_npz_member(file, "semantic_labels", True, contents) for file, contents in clouds]
-            if all(name is not None for name in names):
-                is_ground = np.isin(np.concatenate([np.asarray(name).reshape(-1) for name in names]), GROUND)
-        points = self._points(index)
-        if is_ground is not None and is_ground.shape != (len(points),):
-            raise CFlowError(
-                f"{clouds[0][0]} and its neighbours: {len(points)} points but {len(is_ground)} class names"
-            )
+        """Sweep number `index`; `is_ground` is None where a cloud of it has no class names."""
+        points, is_ground = self._points(index), None
+        names = [cloud.names("semantic_labels") for cloud in self._clouds_of(index)] if self._ground else [None]
+        if None not in names:
+            is_ground = np.array([name in GROUND for of_cloud in names for name in of_cloud or ()], dtype=bool)
+            if len(is_ground) != len(points):
+                file = self._clouds_of(index)[0].file
+                raise CFlowError(f"{file} and its neighbours: {len(points)} points but {len(is_ground)} class names")
         return Sweep(points, is_ground, self._poses[index].copy(), self.timestamps[index])
 
     def radial_velocity(self, index: int) -> np.ndarray:
@@ -162,136 +140,54 @@ class AevaScenesLog:
         Raises:
             CFlowError: no such sweep, or a cloud is missing or cannot be read.
         """
-        return np.concatenate([self._array(*cloud, "velocity").reshape(-1) for cloud in self._clouds_of(index)])
+        return np.concatenate([cloud.numbers("velocity", 1)[:, 0] for cloud in self._clouds_of(index)])
 
     def labels(self, index: int) -> Optional[FlowLabels]:
-        """Truth of the pair (index, index + 1) from box tracks; None for the last sweep and sequences without boxes.
-
-        Raises:
-            CFlowError: no such sweep, or a cloud or box that cannot be read.
-        """
-        points = self._points(index)
+        """Truth of the pair (index, index + 1) from box tracks; None for the last sweep and sequences without boxes."""
+        self._timestamp(index)
         if index == len(self) - 1 or not self._has_boxes:
             return None
         T_ego1_ego0 = relative_transform(self._poses[index + 1], self._poses[index])
-        return flow_from_boxes(points, self._boxes(index), self._boxes(index + 1), T_ego1_ego0)
+        return flow_from_boxes(self._points(index), self._boxes(index), self._boxes(index + 1), T_ego1_ego0)
 
     def _points(self, index: int) -> np.ndarray:
         """(N, 3) float32, vehicle frame."""
-        clouds = []
-        for name, (file, contents) in zip(self.lidars, self._clouds_of(index)):
-            xyz = self._array(file, contents, "xyz")
-            if xyz.ndim != 2 or xyz.shape[1] != 3:
-                raise CFlowError(f"{file}: xyz must have shape (N, 3), got {xyz.shape}")
-            T = self._T_ego_lidar[name]
-            clouds.append(xyz.astype(np.float64) @ T[:3, :3].T + T[:3, 3])
-        return np.concatenate(clouds).astype(np.float32)
+        clouds = zip(self._clouds_of(index), self._mounts)
+        return np.concatenate([moved(cloud.numbers("xyz", 3), mount) for cloud, mount in clouds]).astype(np.float32)
 
-    def _array(self, file: Path, contents: Any, key: str) -> np.ndarray:
-        array = read_npz_member(file, key, contents=contents)
-        if array is None:
-            raise CFlowError(f"{file} has no array {key}; it has {zipfile.ZipFile(contents).namelist()[:20]}")
-        if not np.issubdtype(array.dtype, np.floating):
-            raise CFlowError(f"{file}: {key} must be floating point, got {array.dtype}")
-        return array.astype(np.float32, copy=False)
-
-    def _clouds_of(self, index: int) -> List[Tuple[Path, Any]]:
-        """The npz of each LiDAR and what to read it from; those of the last sweep are kept, as several arrays of each
-        are read one after the other."""
+    def _clouds_of(self, index: int) -> List[Cloud]:
+        """Those of the last sweep are kept, as several arrays of each are read one after the other."""
+        where = f"{self._file}, frame {self._timestamp(index)}"
         if index != self._last[0]:
-            self._last = index, [(file, npz_contents(file)) for file in self._files(index)]
+            clouds = []
+            for name in self.lidars:
+                with file_errors(where, _MEND):
+                    entry = self._frames[index]["point_cloud"][name]
+                    paths = [entry[key] for key in _PATHS[self._clouds] if key in entry]
+                if not paths:
+                    has = f"no {self._clouds} cloud, only {shown(entry)}"
+                    raise CFlowError(f"{where}, {name}: {has}; raw clouds come with version 2 of the data set")
+                clouds.append(Cloud(inside(self.folder, paths[0], f"{where}, {name}: the path")))
+            self._last = index, clouds
         return self._last[1]
 
-    def _files(self, index: int) -> List[Path]:
-        """The npz of each LiDAR."""
-        if not 0 <= index < len(self):
-            raise CFlowError(f"sequence {self.log_id} has sweeps 0 ... {len(self) - 1}, asked for {index}")
-        where, files = f"frame {self.timestamps[index]}", []
-        for name in self.lidars:
-            entry = self._get(self._frames[index], where, "point_cloud", name)
-            keys = [key for key in _PATHS[self._clouds] if isinstance(entry, dict) and key in entry]
-            if not keys:
-                raise CFlowError(
-                    f"{self._file}, {where}, {name}: no {self._clouds} cloud, only {shown(entry)}; raw clouds come "
-                    f"with version 2 of the data set"
-                )
-            files.append(inside(self.folder, entry[keys[0]], f"{self._file}, {where}, {name}: the path"))
-        return files
-
     def _boxes(self, index: int) -> Boxes:
-        where = f"frame {self.timestamps[index]}"
-        tracks, categories, sizes, poses = [], [], [], []
-        listed = self._frames[index].get("boxes") or []
-        if not isinstance(listed, list):
-            raise CFlowError(f"{self._file}, {where}: boxes must be a list, got {shown(listed)}")
-        for box in listed:
-            kind = self._get(box, where, "class")
-            if not isinstance(kind, str) or kind not in CATEGORY_NAME:
-                raise CFlowError(
-                    f"{self._file}, {where}: unknown class {shown(kind)}; known are {', '.join(CATEGORY_NAME)}"
-                )
-            if CATEGORY_NAME[kind] == "NONE":
-                continue
-            if box.get("reference_frame", "VEHICLE") != "VEHICLE":
-                raise CFlowError(f"{self._file}, {where}: boxes are in VEHICLE, got {shown(box['reference_frame'])}")
-            tracks.append(self._track(box, where))
-            categories.append(CATEGORY_INDEX[CATEGORY_NAME[kind]])
-            sizes.append(self._numbers(self._get(box, where, "dimensions"), "xyz", where))
-            poses.append(self._pose(self._get(box, where, "pose"), f"{where}, box {tracks[-1]}"))
-        try:
-            return Boxes(
-                tracks,
-                np.array(categories, dtype=np.uint8),
-                np.array(sizes, dtype=np.float64).reshape(-1, 3),
-                np.array(poses, dtype=np.float64).reshape(-1, 4, 4),
+        where = f"{self._file}, frame {self.timestamps[index]}"
+        with file_errors(where, _MEND):
+            boxes = self._frames[index].get("boxes") or []
+            boxes = [box for box in boxes if CATEGORY_NAME.get(box["class"]) != "NONE"]
+            strange = [box for box in boxes if box.get("reference_frame", "VEHICLE") != "VEHICLE"]
+            if strange:
+                raise CFlowError(f"boxes are in VEHICLE, got {shown(strange[0]['reference_frame'])}")
+            return make_boxes(
+                [str(box["id"]) for box in boxes],
+                category_indices([box["class"] for box in boxes], CATEGORY_NAME),
+                [[box["dimensions"][axis] for axis in "xyz"] for box in boxes],
+                self._poses_of([box["pose"] for box in boxes], f"frame {self.timestamps[index]}, boxes"),
             )
-        except CFlowError as error:
-            raise CFlowError(f"{self._file}, {where}: {error}") from error
 
-    def _read_sequence(self) -> Tuple[Dict[str, Any], List[Dict[str, Any]]]:
-        try:
-            content = read_json(self._file)
-        except FileNotFoundError:
-            raise CFlowError(f"{self.folder} is no AevaScenes sequence: it holds no sequence.json") from None
-        except OSError as error:
-            raise CFlowError(f"cannot read {self._file} ({error}); copy it again") from error
-        metadata, frames = (self._get(content, "the file", key) for key in ("metadata", "frames"))
-        if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
-            raise CFlowError(f"{self._file}: frames must be a list of objects; is this a sequence of AevaScenes?")
-        return metadata, frames
-
-    def _get(self, node: Any, where: str, *keys: str) -> Any:
-        """Value below an object of the file, key by key."""
-        for key in keys:
-            if not isinstance(node, dict) or key not in node:
-                has = shown(sorted(node)) if isinstance(node, dict) else type(node).__name__
-                raise CFlowError(f"{self._file}: {where} has no {key!r} (it has {has}); is this AevaScenes, complete?")
-            node = node[key]
-        return node
-
-    def _track(self, box: Any, where: str) -> str:
-        name = self._get(box, where, "id")
-        if type(name) not in (str, int):
-            raise CFlowError(f"{self._file}, {where}: the id of a box is text or a number, got {shown(name)}")
-        return str(name)
-
-    def _numbers(self, node: Any, keys: str, where: str) -> List[float]:
-        values = [self._get(node, where, key) for key in keys]
-        if not all(map(is_number, values)):
-            raise CFlowError(f"{self._file}: {where}: {', '.join(keys)} must be finite numbers, got {shown(values)}")
-        return values
-
-    def _pose(self, node: Any, where: str) -> np.ndarray:
-        """(4, 4) float64 from translation {x, y, z} and rotation {w, x, y, z}."""
-        w, x, y, z = q = np.array(self._numbers(self._get(node, where, "rotation"), "wxyz", where), dtype=np.float64)
-        if not abs(np.linalg.norm(q) - 1) <= QUATERNION_TOLERANCE:
-            raise CFlowError(f"{self._file}: {where}: a rotation is a quaternion of length 1, got {q.tolist()}")
-        w, x, y, z = q / np.linalg.norm(q)
-        pose = np.eye(4)
-        pose[:3, :3] = (
-            (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-            (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-            (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-        )
-        pose[:3, 3] = self._numbers(self._get(node, where, "translation"), "xyz", where)
-        return pose
+    def _poses_of(self, nodes: Sequence[Any], what: str) -> np.ndarray:
+        """(K, 4, 4) float64 from objects with translation {x, y, z} and rotation {w, x, y, z}."""
+        translation = [[node["translation"][key] for key in "xyz"] for node in nodes]
+        rotation = [[node["rotation"][key] for key in "wxyz"] for node in nodes]
+        return poses_from_quaternions(translation, rotation, lambda row: f"{self._file}: {what}: number {row}")

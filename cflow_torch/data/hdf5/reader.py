@@ -4,23 +4,21 @@ from __future__ import annotations
 
 import weakref
 from pathlib import Path
-from types import TracebackType
-from typing import Any, List, Optional, Sequence, Tuple, Type
+from typing import Any, List, Optional, Sequence, Tuple
 
 import numpy as np
 
-from cflow_torch.data.hdf5.chunks import Stored
-from cflow_torch.data.hdf5.contained import Group, array, check_numbers, group, hdf5_errors, names, read
 from cflow_torch.data.hdf5.frames import StoredMotion, harness_motion, is_argoverse2, recognized_extrinsics
 from cflow_torch.data.hdf5.index_file import read_index
-from cflow_torch.data.log import FlowLabels
-from cflow_torch.data.paths import Place, as_path, is_remote, ranged
+from cflow_torch.data.hdf5.stored import member, open_scene, scene_errors
+from cflow_torch.data.log import FlowLabels, NumberedSweeps
+from cflow_torch.data.names import is_stamp
+from cflow_torch.data.paths import Place, as_path
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.ego_motion import rigid_transform
 
 # Time stamps count from 1970 or 1980: below this they are microseconds (16 digits), above it nanoseconds (18 or 19).
 _FIRST_NANOSECOND = 10**17
-_LAST = 2**63 - 1  # what 64 bits hold
 _LARGEST_CATEGORY = 255
 EXTRINSIC = "ego_T_lidar"  # attribute of a scene that `write_hdf5_scene` leaves
 
@@ -39,7 +37,7 @@ def find_hdf5_scenes(root: Place) -> List[Path]:
     return sorted(root.glob("*.h5"))
 
 
-class HDF5Log:
+class HDF5Log(NumberedSweeps):
     """One scene; implements the `Log` protocol. Needs h5py (`pip install h5py`).
 
     Args:
@@ -67,27 +65,15 @@ class HDF5Log:
     """
 
     def __init__(self, file: Place, ego_T_lidar: Any = "auto") -> None:
-        try:
-            import h5py
-        except ImportError:
-            raise CFlowError("reading HDF5 scenes needs h5py: pip install h5py") from None
         self.file = as_path(file)
         self.log_id = self.file.stem
-        with hdf5_errors(f"{self.file} cannot be read as HDF5"):
-            if not is_remote(self.file) and not self.file.is_file():
-                raise FileNotFoundError("no such file, or a folder, pipe or device")  # HDF5 would wait for a pipe
-            self._scene = h5py.File(ranged(self.file), "r")
-        self._last: Tuple[int, Any] = (-1, None)
+        self._scene = open_scene(self.file)
         # HDF5 itself closes after the interpreter has gone, which a file read through Python does not survive.
         weakref.finalize(self, self._scene.close)
         try:
-            self.timestamps: Sequence[int] = sorted(
-                _stamp(name, self.file)
-                for name in names(self._scene, str(self.file))
-                if name.isascii() and name.isdigit()
-            )
-            if len(self.timestamps) < 2:
-                raise CFlowError(f"{self.file} has {len(self.timestamps)} sweeps; scene flow needs two or more")
+            with scene_errors(self.file):
+                self.timestamps = sorted(int(name) for name in self._scene if is_stamp(name))
+            self._check_count(self.file)
             if isinstance(ego_T_lidar, str) and ego_T_lidar == "auto":
                 ego_T_lidar = self._stated_extrinsics()
             elif ego_T_lidar is None:
@@ -100,56 +86,39 @@ class HDF5Log:
     def __enter__(self) -> HDF5Log:
         return self
 
-    def __exit__(
-        self, kind: Optional[Type[BaseException]], error: Optional[BaseException], trace: Optional[TracebackType]
-    ) -> None:
+    def __exit__(self, *_: Any) -> None:
         self._scene.close()
 
     def sweep(self, index: int) -> Sweep:
-        """Sweep number `index`: float32 points, float64 pose of their frame, ground mask where the scene has one.
-
-        Raises:
-            CFlowError: no such sweep, or `lidar` or `pose` is missing or cannot be read.
-        """
-        timestamp = self._timestamp(index)
-        points = self._values(timestamp, "lidar", self._lidar(timestamp), np.float32)
-        is_ground = self._column(timestamp, "ground_mask", len(points), np.bool_)
-        pose = self._pose(timestamp).astype(np.float64)
+        """Sweep number `index`: float32 points, float64 pose of their frame, ground mask where the scene has one."""
+        rows, timestamp = self._rows(index), self.timestamps[index]
+        points = self._needed(index, "lidar", dtype=np.float32)
+        is_ground = self._column(index, "ground_mask", rows, np.bool_)
+        pose = self._needed(index, "pose", (4, 4), np.float64)
         if not np.array_equal(self.ego_T_lidar, np.eye(4)):
             pose = rigid_transform(pose, f"pose of sweep {timestamp} in {self.file}") @ self.ego_T_lidar
         nanoseconds = timestamp if timestamp >= _FIRST_NANOSECOND else timestamp * 1000
         return Sweep(points[:, :3], is_ground, pose, nanoseconds)
 
     def labels(self, index: int) -> Optional[FlowLabels]:
-        """Truth of the pair (index, index + 1); None where the sweep has no `flow`.
-
-        Raises:
-            CFlowError: no such sweep, or its labels cannot be read.
-        """
-        timestamp = self._timestamp(index)
-        stored = self._array(timestamp, "flow")
-        if stored is None:
+        """Truth of the pair (index, index + 1); None where the sweep has no `flow`."""
+        rows = self._rows(index)
+        flow = self._values(index, "flow", [(rows, 3)], np.float32)
+        if flow is None:
             return None
-        rows = self._lidar(timestamp).shape[0]
-        if stored.shape != (rows, 3):
-            raise CFlowError(f"{self.file}: flow of sweep {timestamp} has shape {stored.shape}, expected ({rows}, 3)")
-        flow = self._values(timestamp, "flow", stored, np.float32)
-        category = self._column(timestamp, "flow_category_indices", rows)
-        is_valid = self._column(timestamp, "flow_is_valid", rows, np.bool_)
+        category = self._column(index, "flow_category_indices", rows)
+        is_valid = self._column(index, "flow_is_valid", rows, np.bool_)
+        where = f"{self.file}: sweep {self.timestamps[index]}"
         if category is None or is_valid is None:
-            raise CFlowError(f"{self.file}: sweep {timestamp} has flow without flow_category_indices or flow_is_valid")
+            raise CFlowError(f"{where} has flow without flow_category_indices or flow_is_valid")
         if category.dtype.kind not in "iu" or category.max(initial=0) > _LARGEST_CATEGORY:
-            raise CFlowError(
-                f"{self.file}: flow_category_indices of sweep {timestamp} are {category.dtype} up to "
-                f"{category.max(initial=0)}, expected integers up to {_LARGEST_CATEGORY}"
-            )
+            raise CFlowError(f"{where}: flow_category_indices must be integers up to {_LARGEST_CATEGORY}")
         # Waymo has int8 and -1 = no label.
         return FlowLabels(flow, category.clip(0).astype(np.uint8), is_valid & (category >= 0))
 
     def eval_mask(self, index: int) -> Optional[np.ndarray]:
         """(N,) bool points to score, None where the sweep has no `eval_mask`."""
-        timestamp = self._timestamp(index)
-        return self._column(timestamp, "eval_mask", self._lidar(timestamp).shape[0], np.bool_)
+        return self._column(index, "eval_mask", self._rows(index), np.bool_)
 
     def stored_motion(self, index: int) -> StoredMotion:
         """Ego motion of the pair (index, index + 1) as the harness has it, by the poses as they are in the file.
@@ -157,15 +126,15 @@ class HDF5Log:
         Raises:
             CFlowError: no such pair, or a pose that cannot be read or is no rigid motion.
         """
-        poses = [self._pose(self._timestamp(k)) for k in (index, index + 1)]
+        poses = [self._needed(k, "pose", (4, 4)) for k in (index, index + 1)]
         for pose in poses:
             rigid_transform(pose, f"pose of sweep {index} or {index + 1} of {self.file}")
         return StoredMotion(harness_motion(*poses), np.array_equal(self.ego_T_lidar, np.eye(4)))
 
     def keys(self, index: int) -> Tuple[str, ...]:
         """Names of everything that sweep `index` has, results included."""
-        timestamp = self._timestamp(index)
-        return tuple(sorted(names(self._group(timestamp).opened, f"{self.file}: sweep {timestamp}")))
+        with scene_errors(self.file):
+            return tuple(sorted(self._group(index)))
 
     def values(self, index: int, key: str) -> np.ndarray:
         """What a sweep has under a key, as it is stored; (N, 1) columns become (N,).
@@ -179,11 +148,7 @@ class HDF5Log:
         Raises:
             CFlowError: no such sweep or key; the message lists the keys.
         """
-        timestamp = self._timestamp(index)
-        stored = self._array(timestamp, key)
-        if stored is None:
-            raise CFlowError(f"{self.file}: sweep {timestamp} has no {key}; it has {', '.join(self.keys(index))}")
-        values = self._values(timestamp, key, stored)
+        values = self._needed(index, key)
         return values[:, 0] if values.ndim == 2 and values.shape[1] == 1 else values
 
     def eval_frames(self, index_file: Optional[Place] = None) -> List[int]:
@@ -204,92 +169,80 @@ class HDF5Log:
             index_file = beside
         if index_file is None:
             for key in ("eval_mask", "flow"):
-                found = [k for k, stamp in enumerate(self.timestamps) if self._array(stamp, key) is not None]
+                found = [index for index in range(len(self)) if self._array(index, key) is not None]
                 if found:
                     break
         else:
-            number = {stamp: k for k, stamp in enumerate(self.timestamps)}
-            stamps = [stamp for scene, stamp in read_index(index_file) if scene == self.log_id]
-            missing = [stamp for stamp in stamps if stamp not in number]
+            number = {stamp: index for index, stamp in enumerate(self.timestamps)}
+            stamps = {stamp for scene, stamp in read_index(index_file) if scene == self.log_id}
+            missing = sorted(stamps - set(number))
             if missing:
                 raise CFlowError(f"{index_file} names sweep {missing[0]}, which {self.file} does not have: delete it")
-            found = sorted({number[stamp] for stamp in stamps})
-        return [k for k in found if k < len(self.timestamps) - 1]
+            found = sorted(number[stamp] for stamp in stamps)
+        return [index for index in found if index < len(self) - 1]
 
     @property
     def poses(self) -> np.ndarray:
         """(K, 4, 4) float64 `T_world_lidar` of every sweep, without reading any points."""
-        stored = np.stack([self._pose(stamp).astype(np.float64) for stamp in self.timestamps])
+        stored = np.stack([self._needed(index, "pose", (4, 4), np.float64) for index in range(len(self))])
         with np.errstate(all="ignore"):  # NaN stays NaN
             return stored @ self.ego_T_lidar
 
     def _stated_extrinsics(self) -> np.ndarray:
         """What the scene says about where its LiDAR sits."""
-        what = f"{self.file}: attribute {EXTRINSIC}"
-        with hdf5_errors(f"{what} cannot be read"):
+        with scene_errors(f"{self.file}: attribute {EXTRINSIC}"):
             if EXTRINSIC in self._scene.attrs:
-                attribute = self._scene.attrs.get_id(EXTRINSIC)
-                check_numbers(attribute, what)
-                if attribute.shape != (4, 4):
-                    raise CFlowError(f"{what} has shape {attribute.shape}, expected (4, 4)")
-                return np.asarray(self._scene.attrs[EXTRINSIC])
-        first = self.timestamps[0]
-        if not is_argoverse2(first) or self._array(first, "lidar") is None:
+                return np.asarray(self._scene.attrs[EXTRINSIC], np.float64)
+        points = self._values(0, "lidar") if is_argoverse2(self.timestamps[0]) else None
+        if points is None:
             return np.eye(4)
-        points = self._values(first, "lidar", self._lidar(first))
-        return recognized_extrinsics(first, points, self._column(first, "ground_mask", len(points), np.bool_))
+        is_ground = self._column(0, "ground_mask", len(points), np.bool_)
+        return recognized_extrinsics(self.timestamps[0], points, is_ground)
 
-    def _timestamp(self, index: int) -> int:
-        if not 0 <= index < len(self.timestamps):
-            raise CFlowError(f"scene {self.log_id} has {len(self.timestamps)} sweeps, there is no sweep {index}")
-        return self.timestamps[index]
+    def _group(self, index: int) -> Any:
+        """The group of a sweep."""
+        found = member(self._scene, str(self._timestamp(index)), self.file)
+        if found is None:
+            raise CFlowError(f"{self.file} lists a sweep {self.timestamps[index]} that it does not have; copy it again")
+        return found
 
-    def _group(self, timestamp: int) -> Group:
-        if self._last[0] != timestamp:  # a sweep is asked for one key after the other
-            found = group(self._scene, str(timestamp), str(self.file))
-            if found is None:
-                raise CFlowError(f"{self.file} lists a sweep {timestamp} that it does not have; copy it again")
-            self._last = timestamp, found
-        return self._last[1]
-
-    def _array(self, timestamp: int, key: str) -> Optional[Stored]:
+    def _array(self, index: int, key: str) -> Optional[Any]:
         """What a sweep has under a key, not read yet; None where it is absent."""
-        return array(self._group(timestamp), key, f"{self.file}: sweep {timestamp}")
+        return member(self._group(index), key, f"{self.file}: sweep {self.timestamps[index]}")
 
-    def _lidar(self, timestamp: int) -> Stored:
-        """(N, 3+) points, not read yet."""
-        stored = self._array(timestamp, "lidar")
-        if stored is None or len(stored.shape) != 2 or stored.shape[1] < 3:
-            shape = "none" if stored is None else f"shape {stored.shape}"
-            raise CFlowError(f"{self.file}: lidar of sweep {timestamp} has {shape}, expected shape (N, 3+)")
-        return stored
+    def _rows(self, index: int) -> int:
+        """Points of a sweep, none of which is read."""
+        stored = self._array(index, "lidar")
+        shape: Tuple[int, ...] = () if stored is None else stored.shape
+        if len(shape) != 2 or shape[1] < 3:
+            raise CFlowError(
+                f"{self.file}: lidar of sweep {self.timestamps[index]} has shape {shape}, expected (N, 3+)"
+            )
+        return int(shape[0])
 
-    def _pose(self, timestamp: int) -> np.ndarray:
-        """(4, 4) pose as stored."""
-        stored = self._array(timestamp, "pose")
-        if stored is None or stored.shape != (4, 4):
-            shape = "none" if stored is None else f"shape {stored.shape}"
-            raise CFlowError(f"{self.file}: pose of sweep {timestamp} has {shape}, expected shape (4, 4)")
-        return self._values(timestamp, "pose", stored)
-
-    def _values(self, timestamp: int, key: str, stored: Stored, dtype: Any = None) -> np.ndarray:
-        values = read(stored, f"{self.file}: {key} of sweep {timestamp}", dtype)
-        with np.errstate(over="ignore"):  # float64 beyond float32 becomes infinite, which no step takes for a point
-            return values if dtype is None else values.astype(dtype, copy=False)
-
-    def _column(self, timestamp: int, key: str, rows: int, dtype: Any = None) -> Optional[np.ndarray]:
-        """(N,) values of a key, also where it is stored as (N, 1); None where it is absent."""
-        stored = self._array(timestamp, key)
+    def _values(
+        self, index: int, key: str, shapes: Sequence[Tuple[int, ...]] = (), dtype: Any = None
+    ) -> Optional[np.ndarray]:
+        """Values of a key in one of the given shapes; None where it is absent."""
+        stored = self._array(index, key)
         if stored is None:
             return None
-        if stored.shape not in ((rows,), (rows, 1)):
-            raise CFlowError(f"{self.file}: {key} of sweep {timestamp} has shape {stored.shape}, expected ({rows},)")
-        return self._values(timestamp, key, stored, dtype).reshape(rows)
+        what = f"{self.file}: {key} of sweep {self.timestamps[index]}"
+        with scene_errors(what), np.errstate(over="ignore"):  # float64 beyond float32 becomes infinite: no point
+            if shapes and stored.shape not in shapes:
+                raise CFlowError(f"{what} has shape {stored.shape}, expected {shapes[0]}")
+            values: np.ndarray = stored[()]
+            return values if dtype is None else values.astype(dtype, copy=False)
 
+    def _needed(self, index: int, key: str, shape: Optional[Tuple[int, ...]] = None, dtype: Any = None) -> np.ndarray:
+        """`_values` of a key that must be there."""
+        values = self._values(index, key, [shape] if shape else [], dtype)
+        if values is None:
+            has = ", ".join(self.keys(index))
+            raise CFlowError(f"{self.file}: sweep {self.timestamps[index]} has no {key}; it has {has}")
+        return values
 
-def _stamp(name: str, file: Path) -> int:
-    if len(name) > len(str(_LAST)) or (name[0] == "0" and name != "0") or int(name) > _LAST:
-        raise CFlowError(
-            f"{file} has a sweep {name[:30]}, expected a time stamp up to {_LAST} that does not begin with 0"
-        )
-    return int(name)
+    def _column(self, index: int, key: str, rows: int, dtype: Any = None) -> Optional[np.ndarray]:
+        """(N,) values of a key, also where it is stored as (N, 1); None where it is absent."""
+        values = self._values(index, key, [(rows,), (rows, 1)], dtype)
+        return None if values is None else values.reshape(rows)

@@ -5,13 +5,15 @@ from __future__ import annotations
 import os
 import re
 import shutil
+from functools import partial
 from pathlib import Path
 from typing import Any, Iterable, Tuple, Union
 
 import numpy as np
 
 from cflow_torch.data.atomic import remove_stale, sync_folder, temporary_name
-from cflow_torch.data.hdf5.contained import array, group, hdf5_errors
+from cflow_torch.data.file_errors import file_errors
+from cflow_torch.data.hdf5.stored import import_h5py, member
 from cflow_torch.types import Array, CFlowError, as_numpy
 
 # Keys that scenes bring, and names that the viewers give a meaning of their own.
@@ -23,7 +25,7 @@ RESERVED_KEYS = frozenset(
         *("pc0", "pc1", "gm0", "gm1", "pose0", "pose1"),
     )
 )
-_MEND = "give a complete scene, and make room beside it for a copy"
+_writing = partial(file_errors, mend="give a complete scene, and make room beside it for a copy", doing="write")
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_.-]{0,63}")
 
 
@@ -79,10 +81,7 @@ def write_hdf5_results(file: Union[str, Path], name: str, results: Iterable[Tupl
 
     Cost: one copy of the scene, in time and, until the end, in space.
     """
-    try:
-        import h5py
-    except ImportError:
-        raise CFlowError("writing HDF5 scenes needs h5py: pip install h5py") from None
+    h5py = import_h5py()
     check_result_name(name)
     check_writable(file)
     file = Path(file).resolve()  # a link stays a link
@@ -91,14 +90,14 @@ def write_hdf5_results(file: Union[str, Path], name: str, results: Iterable[Tupl
     try:
         shutil.copy(file, copy)
         count = 0
-        with hdf5_errors(f"{file} cannot be written as HDF5", _MEND):
+        with _writing(file):
             scene = h5py.File(copy, "r+")
         try:
             for timestamp, flow in results:
                 _write(scene, file, str(timestamp), name, as_numpy(flow))
                 count += 1
         finally:
-            with hdf5_errors(f"{file} cannot be written as HDF5", _MEND):
+            with _writing(file):
                 scene.close()
         if count:
             with open(copy, "rb") as written:
@@ -112,25 +111,20 @@ def write_hdf5_results(file: Union[str, Path], name: str, results: Iterable[Tupl
 
 
 def _write(scene: Any, file: Path, timestamp: str, name: str, flow: np.ndarray) -> None:
-    import h5py
-
     where = f"{file}: sweep {timestamp}"
-    sweep = group(scene, timestamp, str(file))
-    points = None if sweep is None else array(sweep, "lidar", where)
+    sweep = member(scene, timestamp, file)
+    points = None if sweep is None else member(sweep, "lidar", where)
     if sweep is None or points is None:
         raise CFlowError(f"{file} has no sweep {timestamp}")
-    rows = points.shape[0] if points.shape else 0
-    if flow.shape != (rows, 3):
-        raise CFlowError(f"{file}: the flow of sweep {timestamp} has shape {flow.shape}, expected ({rows}, 3)")
-    older = array(sweep, name, where)
-    with hdf5_errors(f"{where}: {name} cannot be written", _MEND):
+    with _writing(where):
+        rows = len(points)
+        if flow.shape != (rows, 3):
+            raise CFlowError(f"{file}: the flow of sweep {timestamp} has shape {flow.shape}, expected ({rows}, 3)")
+        older = member(sweep, name, where)
         if older is None:
-            sweep.opened.create_dataset(name, data=flow.astype(np.float32))
+            sweep.create_dataset(name, data=flow.astype(np.float32))
             return
         # Two names of one dataset: another key would change as well.
-        if older.shape != (rows, 3) or older.dtype != np.float32 or h5py.h5o.get_info(older.opened).rc > 1:
+        if older.shape != (rows, 3) or older.dtype != np.float32 or import_h5py().h5o.get_info(older.id).rc > 1:
             raise CFlowError(f"{file}: {name} of sweep {timestamp} is no flow result, it is not replaced")
-        values = np.ascontiguousarray(flow, np.float32)
-        older.opened.write(
-            h5py.h5s.ALL, h5py.h5s.ALL, values
-        )  # in its old place: deleting would leave a hole that HDF5 never gives back
+        older[...] = flow  # in its old place: deleting would leave a hole that HDF5 never gives back

@@ -12,6 +12,7 @@ from cflow_torch.data.atomic import atomic_name
 from cflow_torch.data.boxes import points_in_box
 from cflow_torch.data.hdf5.index_file import write_index
 from cflow_torch.data.hdf5.reader import EXTRINSIC, HDF5Log, find_hdf5_scenes
+from cflow_torch.data.hdf5.stored import import_h5py
 from cflow_torch.data.log import Log
 from cflow_torch.types import CFlowError
 from cflow_torch.windows.ego_motion import rigid_transform
@@ -48,10 +49,7 @@ def write_hdf5_scene(
         CFlowError: h5py is missing, a sweep has no pose, there is no extrinsic for "sensor", a setting that does not
             exist, or time stamps that are not different numbers.
     """
-    try:
-        import h5py
-    except ImportError:
-        raise CFlowError("writing HDF5 scenes needs h5py: pip install h5py") from None
+    h5py = import_h5py()
     if points_frame not in ("ego", "sensor") or pose_dtype not in ("float32", "float64") or eval_step < 0:
         raise CFlowError(
             f"points_frame={points_frame!r}, pose_dtype={pose_dtype!r}, eval_step={eval_step}: give 'ego' or 'sensor', "

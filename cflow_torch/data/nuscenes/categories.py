@@ -44,29 +44,14 @@ TRUCKSCENES_CATEGORIES: Dict[str, str] = {
 """Category of a box -> name in Argoverse 2, as for nuScenes."""
 
 NUSCENES_NAMES: Dict[str, str] = {
-    "ANIMAL": "animal",
-    "ARTICULATED_BUS": "vehicle.bus.bendy",
-    "BICYCLE": "vehicle.bicycle",
-    "BICYCLIST": "vehicle.bicycle",
-    "BOX_TRUCK": "vehicle.truck",
-    "BUS": "vehicle.bus.rigid",
+    **{name: own for own, name in reversed(NUSCENES_CATEGORIES.items()) if name != "NONE"},
+    **dict.fromkeys(("BICYCLIST", "WHEELED_DEVICE", "WHEELED_RIDER"), "vehicle.bicycle"),
+    **dict.fromkeys(("BOX_TRUCK", "TRUCK_CAB"), "vehicle.truck"),
     "CONSTRUCTION_BARREL": "movable_object.trafficcone",
-    "CONSTRUCTION_CONE": "movable_object.trafficcone",
     "DOG": "animal",
-    "LARGE_VEHICLE": "vehicle.construction",
-    "MOTORCYCLE": "vehicle.motorcycle",
     "MOTORCYCLIST": "vehicle.motorcycle",
     "OFFICIAL_SIGNALER": "human.pedestrian.police_officer",
-    "PEDESTRIAN": "human.pedestrian.adult",
-    "REGULAR_VEHICLE": "vehicle.car",
     "SCHOOL_BUS": "vehicle.bus.rigid",
-    "STROLLER": "human.pedestrian.stroller",
-    "TRUCK": "vehicle.truck",
-    "TRUCK_CAB": "vehicle.truck",
-    "VEHICULAR_TRAILER": "vehicle.trailer",
-    "WHEELCHAIR": "human.pedestrian.wheelchair",
-    "WHEELED_DEVICE": "vehicle.bicycle",
-    "WHEELED_RIDER": "vehicle.bicycle",
 }
 """Argoverse 2 name of a box -> the nearest category of nuScenes, of the same meta class."""
 

@@ -9,14 +9,15 @@ from typing import Collection, Dict, List, Mapping, Optional, Sequence, Tuple
 
 import numpy as np
 
+from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.folders import find_folders
 from cflow_torch.data.json_file import shown
 from cflow_torch.data.names import safe_name
 from cflow_torch.data.nuscenes.json_tables import Row, read_table
 from cflow_torch.data.paths import Place, as_path
+from cflow_torch.data.rigid_motion import poses_from_quaternions
 from cflow_torch.types import CFlowError
 
-QUATERNION_TOLERANCE = 1e-3  # a quaternion is a rotation only if its length is 1; stored values are within 1e-6
 SEARCH_DEPTH = 3  # levels of folders below the one that is searched, to one that holds a scene.json
 _SENSOR_FOLDERS = ("samples", "sweeps", "maps")  # lie beside the tables and hold very many files
 _COPY = "copy the tables again"
@@ -52,8 +53,8 @@ class LidarChain:
         times: (M,) int64, microseconds.
         is_key_frame: (M,) bool.
         files: relative to the data root.
-        ego: (M, 7) float64 `T_world_ego` at each sweep's own time: translation, quaternion (scalar first).
-        mount: (M, 7) float64 `T_ego_sensor`, the same way.
+        ego: (M, 4, 4) float64 `T_world_ego` at each sweep's own time.
+        mount: (M, 4, 4) float64 `T_ego_sensor`.
     """
 
     times: np.ndarray
@@ -71,7 +72,7 @@ class Annotations:
         time: (A,) int64, microseconds.
         track, category: A instance tokens, A names of the data set.
         size: (A, 3) float64, metres: length, width, height.
-        pose: (A, 7) float64 `T_world_box`: translation, quaternion (scalar first).
+        pose: (A, 4, 4) float64 `T_world_box`.
     """
 
     time: np.ndarray
@@ -91,10 +92,11 @@ class SceneTables:
 
 
 def find_scenes(root: Place, foreign: Collection[str], data_set: str) -> List[SceneSource]:
-    """The scenes of all versions under a folder, by folder and name.
+    """The scenes of all versions under a folder, by folder and name. Those of one version share their tables.
 
     Args:
-        root: folder of the tables, data root, or up to two levels above data roots.
+        root: data root (it holds `v1.0-mini` or the like), the folder of one version, or a folder up to two levels
+            above data roots.
         foreign: tables of the related data set; a version that has one of them is not this data set.
         data_set: its name.
 
@@ -116,6 +118,25 @@ def find_scenes(root: Place, foreign: Collection[str], data_set: str) -> List[Sc
     return found
 
 
+class _ByToken(Dict[str, Row]):
+    """Rows of a table by their token.
+
+    Args:
+        folder: of the version.
+        table: name in `FIELDS`.
+
+    Raises:
+        CFlowError: the table cannot be read; later, a token is looked up that it does not have.
+    """
+
+    def __init__(self, folder: Path, table: str, key: str = "", values: Collection[str] = ()) -> None:
+        super().__init__((row["token"], row) for row in read_table(folder, table, key, values))
+        self._file = folder / f"{table}.json"
+
+    def __missing__(self, token: str) -> Row:
+        raise CFlowError(f"{self._file} has no row {shown(token)}, which another table names; {_COPY}")
+
+
 class Tables:
     """The tables of one version.
 
@@ -130,7 +151,7 @@ class Tables:
     def __init__(self, folder: Place) -> None:
         self.folder = as_path(folder)
         self._rows: Dict[str, Dict[str, List[Row]]] = {}  # table -> token of the scene -> its rows
-        self._by_token: Dict[str, Dict[str, Row]] = {}
+        self._by_token: Dict[str, _ByToken] = {}
         self._scenes: Optional[Dict[str, str]] = None  # name -> token
 
     def scene_names(self) -> List[str]:
@@ -152,106 +173,73 @@ class Tables:
 
         Raises:
             CFlowError: no such scene; a table that is missing, truncated, or no table of this format; a row that names
-                another one which does not exist; sweeps that are no chain.
+                another one which does not exist; two sweeps of a LiDAR, or two samples, at one time.
         """
         names = self.scene_names()
         if name not in names or self._scenes is None:
             raise CFlowError(f"{self.folder / 'scene.json'} has no scene {name!r}; it has {names[:5]} ...")
-        if not self._rows:
-            self._load()
-        token = self._scenes[name]
-        samples = sorted(row["timestamp"] for row in self._rows["sample"].get(token, []))
-        if len(set(samples)) < len(samples):
-            raise CFlowError(f"{self.folder / 'sample.json'} has two samples of {name} at one time; {_COPY}")
-        sweeps: Dict[str, List[Row]] = defaultdict(list)
-        for row in self._rows["sample_data"].get(token, []):
-            mount = self._by_token["calibrated_sensor"][row["calibrated_sensor_token"]]
-            sweeps[self._by_token["sensor"][mount["sensor_token"]]["channel"]].append(row)
-        channels = [row["channel"] for row in self._by_token["sensor"].values() if row["channel"] in sweeps]
-        return SceneTables(
-            sample_times=np.array(samples, dtype=np.int64),
-            lidars={channel: self._chain(f"{name}, {channel}", sweeps[channel]) for channel in channels},
-            annotations=self._annotations(self._rows["sample_annotation"].get(token, [])),
-        )
+        with file_errors(f"{self.folder}, {name}", _COPY):
+            if not self._rows:
+                self._load()
+            rows = {table: by_scene[self._scenes[name]] for table, by_scene in self._rows.items()}
+            samples = self._ordered("sample", rows["sample"])
+            channels: Dict[str, List[Row]] = {row["channel"]: [] for row in self._by_token["sensor"].values()}
+            for row in self._ordered("sample_data", rows["sample_data"], "calibrated_sensor_token"):
+                mount = self._by_token["calibrated_sensor"][row["calibrated_sensor_token"]]
+                channels[self._by_token["sensor"][mount["sensor_token"]]["channel"]].append(row)
+            lidars = {channel: self._chain(sweeps) for channel, sweeps in channels.items() if sweeps}
+            return SceneTables(_times(samples), lidars, self._annotations(rows["sample_annotation"]))
 
     def _load(self) -> None:
         by_token = self._by_token
-        for table in ("sensor", "calibrated_sensor", "category", "instance", "sample"):
-            by_token[table] = {row["token"]: row for row in read_table(self.folder, table)}
-        lidars = {token for token, row in by_token["sensor"].items() if row["modality"] == "lidar"}
+        for table in ("sensor", "category", "instance", "sample"):
+            by_token[table] = _ByToken(self.folder, table)
+        lidars = [token for token, row in by_token["sensor"].items() if row["modality"] == "lidar"]
+        by_token["calibrated_sensor"] = _ByToken(self.folder, "calibrated_sensor", "sensor_token", lidars)
         mounts = by_token["calibrated_sensor"]
-        mounts = {token: row for token, row in mounts.items() if row["sensor_token"] in lidars}
-        by_token["calibrated_sensor"] = mounts
         sweeps = read_table(self.folder, "sample_data", "calibrated_sensor_token", mounts)
-        poses = read_table(self.folder, "ego_pose", "token", {row["ego_pose_token"] for row in sweeps})
-        by_token["ego_pose"] = {row["token"]: row for row in poses}
-        rows = {"sample": list(by_token["sample"].values()), "sample_data": sweeps}
-        rows["sample_annotation"] = read_table(self.folder, "sample_annotation")
-        for table, content in rows.items():
+        by_token["ego_pose"] = _ByToken(self.folder, "ego_pose", "token", {row["ego_pose_token"] for row in sweeps})
+        rows = {"sample_data": sweeps, "sample_annotation": read_table(self.folder, "sample_annotation")}
+        for table, content in (*rows.items(), ("sample", list(by_token["sample"].values()))):
             grouped: Dict[str, List[Row]] = defaultdict(list)
             for row in content:
-                sample = row if table == "sample" else self._linked(table, row, "sample_token", "sample")
+                sample = row if table == "sample" else by_token["sample"][row["sample_token"]]
                 grouped[sample["scene_token"]].append(row)
             self._rows[table] = grouped
 
-    def _chain(self, name: str, rows: Sequence[Row]) -> LidarChain:
-        """Sweeps from the row without `prev` along `next`. There may be several such chains, one after the other."""
-        file = self.folder / "sample_data.json"
-        by_token = {row["token"]: row for row in rows}
-        chained: List[Row] = []
-        for start in sorted((row for row in rows if not row["prev"]), key=lambda row: row["timestamp"]):
-            token = start["token"]
-            while token and len(chained) <= len(rows):
-                if token not in by_token:
-                    raise CFlowError(
-                        f"{file}: {name}: a sweep's next is {token[:80]}, which is no sweep of it; {_COPY}"
-                    )
-                chained.append(by_token[token])
-                token = by_token[token]["next"]
-        times = np.array([row["timestamp"] for row in chained], dtype=np.int64)
-        if len(chained) != len(rows) or (np.diff(times) <= 0).any():
-            raise CFlowError(f"{file}: {name}: prev and next do not chain its sweeps in the order of time; {_COPY}")
-        link, mounts = self._linked, self._by_token["calibrated_sensor"]
+    def _ordered(self, table: str, rows: Sequence[Row], key: str = "scene_token") -> List[Row]:
+        """Rows in the order of time, no two of which have one time and one `key`."""
+        if len({(row["timestamp"], row[key]) for row in rows}) < len(rows):
+            raise CFlowError(f"{self.folder / table}.json has two rows of one {key} and one time; {_COPY}")
+        return sorted(rows, key=lambda row: row["timestamp"])
+
+    def _chain(self, rows: Sequence[Row]) -> LidarChain:
+        mounts = [self._by_token["calibrated_sensor"][row["calibrated_sensor_token"]] for row in rows]
         return LidarChain(
-            times=times,
-            is_key_frame=np.array([row["is_key_frame"] for row in chained], dtype=bool),
-            files=tuple(row["filename"] for row in chained),
-            ego=self._poses("ego_pose", [link("sample_data", row, "ego_pose_token", "ego_pose") for row in chained]),
-            mount=self._poses("calibrated_sensor", [mounts[row["calibrated_sensor_token"]] for row in chained]),
+            times=_times(rows),
+            is_key_frame=np.array([row["is_key_frame"] for row in rows], dtype=bool),
+            files=tuple(row["filename"] for row in rows),
+            ego=self._poses("ego_pose", [self._by_token["ego_pose"][row["ego_pose_token"]] for row in rows]),
+            mount=self._poses("calibrated_sensor", mounts),
         )
 
     def _annotations(self, rows: Sequence[Row]) -> Annotations:
-        names, times = [], []
-        for row in rows:
-            instance = self._linked("sample_annotation", row, "instance_token", "instance")
-            names.append(self._linked("instance", instance, "category_token", "category")["name"])
-            times.append(self._by_token["sample"][row["sample_token"]]["timestamp"])
+        instances = [self._by_token["instance"][row["instance_token"]] for row in rows]
         width_length_height = np.array([row["size"] for row in rows], dtype=np.float64).reshape(-1, 3)
         return Annotations(
-            time=np.array(times, dtype=np.int64),
+            time=_times([self._by_token["sample"][row["sample_token"]] for row in rows]),
             track=[row["instance_token"] for row in rows],
-            category=names,
+            category=[self._by_token["category"][row["category_token"]]["name"] for row in instances],
             size=width_length_height[:, [1, 0, 2]],
             pose=self._poses("sample_annotation", rows),
         )
 
-    def _linked(self, table: str, row: Row, key: str, target: str) -> Row:
-        linked = self._by_token[target].get(row[key])
-        if linked is None:
-            raise CFlowError(
-                f"{self.folder / table}.json names {target} {shown(row[key])}, which {target}.json does not have; "
-                f"{_COPY}"
-            )
-        return linked
-
     def _poses(self, table: str, rows: Sequence[Row]) -> np.ndarray:
-        """(K, 7) float64, quaternions of length 1."""
-        poses = np.array([[*row["translation"], *row["rotation"]] for row in rows], dtype=np.float64).reshape(-1, 7)
-        length = np.linalg.norm(poses[:, 3:], axis=1)
-        for bad in np.flatnonzero(~np.isfinite(poses).all(1) | ~(np.abs(length - 1) <= QUATERNION_TOLERANCE)):
-            raise CFlowError(
-                f"{self.folder / table}.json: {poses[bad].tolist()} is no rigid motion: translation and rotation must "
-                f"be finite, the rotation a quaternion w, x, y, z of length 1; {_COPY}"
-            )
-        poses[:, 3:] /= length[:, None]
-        return poses
+        """(K, 4, 4) float64."""
+        translation, rotation = ([row[key] for row in rows] for key in ("translation", "rotation"))
+        return poses_from_quaternions(translation, rotation, lambda _: f"{self.folder / table}.json: a pose")
+
+
+def _times(rows: Sequence[Row]) -> np.ndarray:
+    """(K,) int64, microseconds."""
+    return np.array([row["timestamp"] for row in rows], dtype=np.int64)

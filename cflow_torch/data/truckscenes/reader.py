@@ -16,18 +16,7 @@ from cflow_torch.types import CFlowError
 
 
 def find_truckscenes_scenes(root: Place) -> List[SceneSource]:
-    """All scenes under a folder.
-
-    Args:
-        root: data root (it holds `v1.2-mini` or the like), the folder of one version, or a folder up to two levels
-            above data roots.
-
-    Returns:
-        Scenes, sorted by folder and name; empty if there are none. Scenes of one version share their tables.
-
-    Raises:
-        CFlowError: `root` is no folder, a scene.json cannot be read, or what is there is nuScenes.
-    """
+    """All scenes under a folder, see `nuscenes.tables.find_scenes`."""
     return find_scenes(root, ("log", "map"), "TruckScenes")
 
 

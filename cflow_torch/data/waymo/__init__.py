@@ -1,4 +1,4 @@
-"""Waymo Open: readers of versions 1 and 2."""
+"""Waymo Open, version 2: reader."""
 
 from __future__ import annotations
 

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
-from typing import Any, Callable, Dict, List, Optional, Sequence, Tuple
+from typing import Any, Collection, Dict, List, Optional, Sequence, Tuple
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 
-from cflow_torch.data.arrow_file import check_columns, check_rows, shortened
-from cflow_torch.data.parquet_file import ParquetFile
+from cflow_torch.data.arrow_file import check_columns
+from cflow_torch.data.file_errors import file_errors, shortened
+from cflow_torch.data.json_file import is_whole
 from cflow_torch.data.paths import mapped, ranged
 from cflow_torch.types import CFlowError
+from cflow_torch.windows.ego_motion import rigid_transform
 
 SEGMENT, TIME, LASER, TRACK = (
     f"key.{name}" for name in ("segment_context_name", "frame_timestamp_micros", "laser_name", "laser_object_id")
@@ -77,129 +79,112 @@ SCHEMAS: Dict[str, pa.Schema] = {
 }
 """Component -> its columns, as the official classes print them."""
 
-_MAX_KEY = 1 << 53
+_MOST = 1 << 53  # of a time in microseconds, which becomes nanoseconds in an int64
 _BATCH = 8  # rows of range images held at once while looking for one
+Key = Tuple[int, int]  # frame time in microseconds, laser
 
 
-def read_images(file: Path, numbers: Sequence[int], column: str, channels: int) -> Dict[int, Optional[np.ndarray]]:
-    """Range images of some rows.
+class Component:
+    """One of the parquet files of a segment; opened when something of it is asked for.
 
     Args:
-        file: the component.
-        numbers: rows wanted, 0 = first of the file.
-        column: name without its `.values` and `.shape`.
-        channels: of each image.
+        segment: `<split>/lidar/<segment>.parquet`.
+        tag: name of the component, of its folder.
 
-    Returns:
-        Row -> (H, W, channels) image, None where the file has a null.
-
-    Cost: decodes every row group that holds a wanted row, a few rows at a time.
-
-    Raises:
-        CFlowError: the file cannot be read, or a cell is no image.
+    Attributes:
+        file: `<split>/<tag>/<segment>.parquet`.
     """
-    columns = [f"{column}.values", f"{column}.shape"]
-    images: Dict[int, Optional[np.ndarray]] = {}
-    with _open(file, columns, mapped) as parquet:
-        check_columns(file, parquet.schema, columns)
-        kinds = [parquet.schema.field(name).type for name in columns]
-        if not (_is_list_of(kinds[0], pa.types.is_floating) and _is_list_of(kinds[1], pa.types.is_integer)):
-            raise CFlowError(f"{file}: {columns} must be lists of floats and of integers, got {kinds[0]}, {kinds[1]}")
-        end = 0
-        for group, num_rows in enumerate(parquet.group_rows):
-            number, end = end, end + num_rows
-            if not any(number <= wanted < end for wanted in numbers):
-                continue
-            for batch in parquet.batches(group, columns, _BATCH):
-                for values, shape in zip(*(batch.column(name) for name in columns)):
-                    if number in numbers:
-                        images[number] = _image(values, shape, channels, file)
-                    number += 1
-    missing = [number for number in numbers if number not in images]
-    if missing:  # what the footer says of its row groups is not true
-        raise CFlowError(f"{file} has fewer rows than it claims: row {missing[0]} is missing, copy it again")
-    return images
+
+    def __init__(self, segment: Path, tag: str) -> None:
+        self.file = segment.parent.parent / tag / segment.name
+        self._mend = f"download component {tag} of this segment"
+        self._numbers: Dict[Key, int] = {}  # of the rows
+
+    def rows(self, columns: Sequence[str]) -> List[Dict[str, Any]]:
+        """Rows of the file, of these columns.
+
+        Raises:
+            CFlowError: the file is missing, is of another segment, lacks a column or cannot be read.
+        """
+        with file_errors(self.file, self._mend):
+            parquet = pq.ParquetFile(ranged(self.file))
+            check_columns(self.file, parquet.schema_arrow.names, [SEGMENT, *columns], self._mend)
+            rows: List[Dict[str, Any]] = parquet.read([SEGMENT, *columns], use_threads=False).to_pylist()
+        strangers = sorted({str(row[SEGMENT]) for row in rows} - {self.file.stem})
+        if strangers:
+            raise CFlowError(
+                f"{self.file} holds segment {shortened(strangers[0])}; a file is named after its segment: rename it, "
+                f"or copy it again"
+            )
+        for name in {TIME, LASER} & set(columns):
+            wrong = [row[name] for row in rows if not is_whole(row[name], _MOST)]
+            if wrong:
+                raise CFlowError(f"{self.file}: {name} must hold whole numbers up to 2^53, got {wrong[0]!r}")
+        return rows
+
+    def frame_lasers(self) -> Collection[Key]:
+        """Frame time (microseconds) and laser of every row.
+
+        Raises:
+            CFlowError: as `rows`; two rows have the same.
+        """
+        if not self._numbers:
+            keys = [(row[TIME], row[LASER]) for row in self.rows((TIME, LASER))]
+            self._numbers = {key: number for number, key in enumerate(keys)}
+            if len(self._numbers) < len(keys):
+                raise CFlowError(f"{self.file} has two rows of the same frame and laser; copy it again")
+        return self._numbers
+
+    def images(self, keys: Sequence[Key], column: str, channels: int) -> Dict[Key, Optional[np.ndarray]]:
+        """Range images of some rows.
+
+        Args:
+            keys: frame times and lasers.
+            column: name without its `.values` and `.shape`.
+            channels: of each image.
+
+        Returns:
+            Key -> (H, W, channels) image, None where the file has a null.
+
+        Cost: decodes every row group that holds a wanted row, a few rows at a time.
+
+        Raises:
+            CFlowError: there is no such row, the file cannot be read, or a cell is no image.
+        """
+        missing = [key for key in keys if key not in self.frame_lasers()]
+        if missing:
+            raise CFlowError(f"{self.file} has no row for frame {missing[0][0]}, laser {missing[0][1]}; copy it again")
+        wanted = {self._numbers[key]: key for key in keys}
+        columns = [f"{column}.values", f"{column}.shape"]
+        images: Dict[Key, Optional[np.ndarray]] = {}
+        with file_errors(self.file, self._mend):
+            parquet, end = pq.ParquetFile(mapped(self.file)), 0
+            check_columns(self.file, parquet.schema_arrow.names, columns, self._mend)
+            for group in range(parquet.num_row_groups):
+                number, end = end, end + parquet.metadata.row_group(group).num_rows
+                if not any(number <= row < end for row in wanted):
+                    continue
+                for batch in parquet.iter_batches(_BATCH, [group], columns, use_threads=False):
+                    for values, shape in zip(*(batch.column(name) for name in columns)):
+                        if number in wanted:
+                            images[wanted[number]] = _image(values, shape, channels)
+                        number += 1
+        return images
 
 
-def _open(file: Path, columns: Sequence[str], access: Callable[[Path], Any]) -> ParquetFile:
-    """An open parquet file that has these columns."""
-    try:
-        parquet = ParquetFile(file, access(file))
-    except FileNotFoundError:
-        raise CFlowError(f"{file} is missing; download component {file.parent.name} of this segment") from None
-    except OSError as error:
-        raise CFlowError(f"cannot read {file}: {error}; it may be truncated, copy it again") from error
-    names = parquet.names
-    missing = [name for name in columns if name not in names]
-    if missing:
-        raise CFlowError(
-            f"{file} lacks the columns {missing}; it has {shortened(names)}: is it component {file.parent.name}?"
-        )
-    return parquet
-
-
-def read_columns(file: Path, columns: Sequence[str]) -> pa.Table:
-    with _open(file, columns, ranged) as parquet:
-        check_rows(file, sum(parquet.group_rows))
-        return parquet.read(columns)
-
-
-def numbers_of(table: pa.Table, column: str, file: Path) -> np.ndarray:
-    """(rows,) numbers of a column that has no holes; a float column must be finite."""
-    values = table.column(column)
-    kind = values.type
-    if values.null_count or not (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
-        raise CFlowError(f"{file}: {column} must hold a number in every row, got {kind} with {values.null_count} holes")
-    array = values.to_numpy()
-    if not np.isfinite(array).all():
-        raise CFlowError(f"{file}: {column} holds values that are not finite")
-    return array
-
-
-def keys_of(table: pa.Table, column: str, file: Path) -> List[int]:
-    """Whole numbers of a column; times in microseconds are within +-2^53."""
-    array = numbers_of(table, column, file)
-    if array.dtype.kind not in "iu" or (
-        array.size and not -_MAX_KEY <= int(array.min()) <= int(array.max()) <= _MAX_KEY
-    ):
-        raise CFlowError(f"{file}: {column} must hold whole numbers up to 2^53, got {array.dtype}")
-    keys: List[int] = array.tolist()
-    return keys
-
-
-def cell_of(table: pa.Table, column: str, row: int, file: Path) -> Optional[np.ndarray]:
-    """(K,) float64 of a cell that is a number (K = 1) or a list of numbers; holes in it are NaN; None for no cell."""
-    values = table.column(column)
-    is_number = pa.types.is_integer(values.type) or pa.types.is_floating(values.type)
-    if not is_number and not _is_list_of(values.type, pa.types.is_integer, pa.types.is_floating):
-        raise CFlowError(f"{file}: {column} must be numbers or lists of numbers, got {values.type}")
-    cell = values[row]
-    if not cell.is_valid:
-        return None
-    return np.array([cell.as_py()] if is_number else cell.values.to_numpy(zero_copy_only=False), dtype=np.float64)
-
-
-def matrix_of(values: Optional[np.ndarray], where: str) -> np.ndarray:
-    """(4, 4) from 16 numbers, row by row."""
+def matrix_of(values: Any, where: str) -> np.ndarray:
+    """(4, 4) float64 rigid motion from 16 numbers, row by row."""
     if values is None or len(values) != 16:
-        raise CFlowError(
-            f"{where} must be 16 numbers, row by row, got {'nothing' if values is None else f'{len(values)}'}"
-        )
-    return values.reshape(4, 4)
+        raise CFlowError(f"{where} must be 16 numbers, row by row, got {0 if values is None else len(values)}")
+    return rigid_transform(np.reshape(values, (4, 4)), where)
 
 
-def _is_list_of(kind: pa.DataType, *checks: Callable[[pa.DataType], bool]) -> bool:
-    is_list = pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)
-    return bool(is_list and any(check(kind.value_type) for check in checks))
-
-
-def _image(values: Any, shape: Any, channels: int, file: Path) -> Optional[np.ndarray]:
+def _image(values: Any, shape: Any, channels: int) -> Optional[np.ndarray]:
     """(H, W, channels) image of a list cell; None where the cell is null or empty."""
     if not values.is_valid or not shape.is_valid or not len(values.values) or not len(shape.values):
         return None
-    flat, size = values.values.to_numpy(zero_copy_only=False), shape.values[:4].to_pylist()
-    if len(size) != 3 or None in size or min(size) < 1 or size[2] != channels or flat.size != math.prod(size):
-        raise CFlowError(f"{file}: a range image of shape (H, W, {channels}) was expected, got {size} for {flat.size}")
-    if values.values.null_count:
-        raise CFlowError(f"{file}: a range image has {values.values.null_count} empty pixels; copy it again")
-    return flat.reshape(size)
+    size, flat = shape.as_py(), values.values
+    if len(size) != 3 or size[2] != channels or flat.null_count:
+        raise ValueError(f"a range image of shape (H, W, {channels}) was expected, got {size}, {flat.null_count} empty")
+    image: np.ndarray = flat.to_numpy().reshape(size)
+    return image

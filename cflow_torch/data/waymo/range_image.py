@@ -6,7 +6,9 @@ from dataclasses import dataclass
 from typing import Optional, Tuple
 
 import numpy as np
+import torch
 
+from cflow_torch.data.rigid_motion import moved
 from cflow_torch.types import CFlowError
 from cflow_torch.windows.ego_motion import rigid_transform
 
@@ -71,14 +73,12 @@ def rotations_from_angles(angles: np.ndarray) -> np.ndarray:
     Returns:
         (N, 3, 3) float64.
     """
-    angles = np.asarray(angles, dtype=np.float64)
-    (sx, sy, sz), (cx, cy, cz) = np.sin(angles).T, np.cos(angles).T
-    rows = (
-        (cy * cz, sx * sy * cz - cx * sz, cx * sy * cz + sx * sz),
-        (cy * sz, sx * sy * sz + cx * cz, cx * sy * sz - sx * cz),
-        (-sy, sx * cy, cx * cy),
-    )
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    from kornia.geometry.conversions import quaternion_from_euler, quaternion_to_rotation_matrix
+
+    roll, pitch, yaw = torch.from_numpy(np.asarray(angles, dtype=np.float64)).unbind(1)
+    quaternion = torch.stack(quaternion_from_euler(roll, pitch, yaw), dim=1)
+    rotation: np.ndarray = quaternion_to_rotation_matrix(quaternion).numpy()
+    return rotation
 
 
 def range_image_points(
@@ -115,7 +115,7 @@ def range_image_points(
     azimuth, inclination = calibration.column_azimuths(num_columns), calibration.row_inclinations(num_rows)
     distance = image[..., RANGE].reshape(-1)[pixels].astype(np.float64)
     in_laser = distance[:, None] * directions(azimuth[column], inclination[row])
-    points = in_laser @ calibration.T_ego_sensor[:3, :3].T + calibration.T_ego_sensor[:3, 3]
+    points = moved(in_laser, calibration.T_ego_sensor)
     if pixel_poses is None:
         return points, pixels
     if pixel_poses.shape != (num_rows, num_columns, 6) or T_world_ego is None:
@@ -126,4 +126,4 @@ def range_image_points(
     poses = pixel_poses.reshape(-1, 6)[pixels].astype(np.float64)
     world = np.einsum("nij,nj->ni", rotations_from_angles(poses[:, :3]), points) + poses[:, 3:]
     T_ego_world = np.linalg.inv(rigid_transform(T_world_ego, "T_world_ego"))
-    return world @ T_ego_world[:3, :3].T + T_ego_world[:3, 3], pixels
+    return moved(world, T_ego_world), pixels

@@ -1,0 +1,83 @@
+"""The npz of one LiDAR and frame: arrays of numbers, and class names that may be stored as pickled strings."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any, List, Optional
+
+import numpy as np
+
+from cflow_torch.data.file_errors import file_errors
+from cflow_torch.data.npy_file import read_header
+from cflow_torch.data.paths import whole
+from cflow_torch.data.pickles import NUMPY_ARRAYS, StandIn, load_plain
+from cflow_torch.types import CFlowError
+
+_MEND = "copy it from the data set"
+
+
+class Cloud:
+    """One npz, open; arrays are read when asked for.
+
+    Args:
+        file: where it is.
+
+    Raises:
+        CFlowError: no such file, or no npz.
+    """
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+        with file_errors(file, _MEND):
+            self._arrays = np.load(whole(file), allow_pickle=False)
+            self._keys = list(self._arrays.files)
+
+    def numbers(self, key: str, columns: int) -> np.ndarray:
+        """(N, columns) float32 values of an array.
+
+        Raises:
+            CFlowError: there is no such array, it has another type or shape, or is damaged.
+        """
+        if key not in self._keys:
+            raise CFlowError(f"{self.file} has no array {key}; it has {self._keys[:20]}")
+        with file_errors(f"{self.file}: {key}", _MEND):
+            array = self._arrays[key]
+        if (
+            not np.issubdtype(array.dtype, np.floating)
+            or array.size % columns
+            or array.shape[1:] not in ((), (columns,))
+        ):
+            raise CFlowError(f"{self.file}: {key} must be (N, {columns}) floats, got {array.shape} {array.dtype}")
+        return array.reshape(-1, columns).astype(np.float32, copy=False)
+
+    def names(self, key: str) -> Optional[List[str]]:
+        """Texts of an array, however it is shaped; None where there is no such array.
+
+        Raises:
+            CFlowError: it holds anything but text, or is damaged. Nothing that a pickle names is run.
+        """
+        if key not in self._keys:
+            return None
+        with file_errors(f"{self.file}: {key}", _MEND):
+            with self._arrays.zip.open(f"{key}.npy") as member:
+                header = read_header(member)
+                stored = load_plain(member, NUMPY_ARRAYS) if header.dtype.hasobject else self._arrays[key]
+            texts = _elements(stored) if isinstance(stored, StandIn) else np.ravel(stored).tolist()
+            if {type(text) for text in texts} - {str} or len(texts) != math.prod(header.shape):
+                raise ValueError(f"it must hold {math.prod(header.shape)} strings")
+            return texts
+
+
+def _elements(array: StandIn) -> List[Any]:
+    """Elements of a pickled one-dimensional array, or column."""
+    _, shape, _, _, elements = array.state
+    if max(shape) != math.prod(shape):
+        raise ValueError(f"its names have shape {shape}, a column was expected")
+    return [_text(element) if isinstance(element, StandIn) else element for element in elements]
+
+
+def _text(scalar: StandIn) -> str:
+    """A NumPy string scalar."""
+    data: bytes = scalar.parts[1]
+    return data.decode("utf-32-le").rstrip("\0")

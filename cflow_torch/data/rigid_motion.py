@@ -1,0 +1,75 @@
+"""Rigid motions as 4 x 4 matrices: from quaternions, between two times, applied to points. Float64 throughout."""
+
+from __future__ import annotations
+
+from typing import Any, Callable
+
+import numpy as np
+
+from cflow_torch.data.rotations import rotations_between, to_rotations
+from cflow_torch.types import CFlowError
+
+QUATERNION_TOLERANCE = 1e-3  # a quaternion is a rotation only if its length is 1; stored values are within 1e-6
+
+
+def poses_from_quaternions(translation: Any, quaternion: Any, what: Callable[[int], str]) -> np.ndarray:
+    """Poses as files store them.
+
+    Args:
+        translation: (K, 3) numbers, metres; an empty list is K = 0.
+        quaternion: (K, 4) numbers, scalar first (w, x, y, z), of length 1 within `QUATERNION_TOLERANCE`.
+        what: number of a row -> where it is from, for the message.
+
+    Returns:
+        (K, 4, 4) float64.
+
+    Raises:
+        CFlowError: a row is not finite, or its quaternion has another length.
+    """
+    shift = np.asarray(translation, dtype=np.float64).reshape(-1, 3)
+    turn = np.asarray(quaternion, dtype=np.float64).reshape(-1, 4)
+    is_right = np.isfinite(shift).all(axis=1) & (np.abs(np.linalg.norm(turn, axis=1) - 1) <= QUATERNION_TOLERANCE)
+    for row in np.flatnonzero(~is_right):
+        raise CFlowError(
+            f"{what(int(row))} is no rigid motion: quaternion (w, x, y, z) and translation must be finite, the "
+            f"quaternion of length 1, got {turn[row].tolist()}, {shift[row].tolist()}; copy the file again"
+        )
+    return _poses(to_rotations(turn), shift)
+
+
+def poses_at(times: np.ndarray, known_times: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    """Poses at any times, from those around each; before the first and after the last the motion goes on.
+
+    Args:
+        times: (K,) int64.
+        known_times: (M,) int64 of the same unit, ascending, M >= 2.
+        poses: (M, 4, 4) float64 at `known_times`.
+
+    Returns:
+        (K, 4, 4) float64.
+    """
+    left = np.clip(np.searchsorted(known_times, times, side="right") - 1, 0, len(known_times) - 2)
+    fraction = (times - known_times[left]) / (known_times[left + 1] - known_times[left])
+    return between(poses[left], poses[left + 1], fraction)
+
+
+def between(poses0: np.ndarray, poses1: np.ndarray, fraction: np.ndarray) -> np.ndarray:
+    """(K, 4, 4) poses on a straight line and at a constant turn rate, the shorter way round, from (K, 4, 4) to others.
+
+    Args:
+        poses0, poses1: (K, 4, 4) float64.
+        fraction: (K,) float64, 0 = the first, 1 = the second; beyond, the motion goes on.
+    """
+    rotation = rotations_between(poses0[:, :3, :3], poses1[:, :3, :3], fraction)
+    return _poses(rotation, poses0[:, :3, 3] + fraction[:, None] * (poses1[:, :3, 3] - poses0[:, :3, 3]))
+
+
+def moved(points: np.ndarray, T: np.ndarray) -> np.ndarray:
+    """(N, 3) float64 points after the rigid motion `T`, (4, 4) float64."""
+    return np.asarray(points, dtype=np.float64) @ T[:3, :3].T + T[:3, 3]
+
+
+def _poses(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    poses = np.tile(np.eye(4), (len(rotation), 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = rotation, translation
+    return poses
