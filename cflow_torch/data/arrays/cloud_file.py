@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Mapping, Optional, Sequence
+from typing import Mapping, Sequence
 
 import numpy as np
 import pyarrow as pa
@@ -64,13 +64,12 @@ def read_cloud(path: Place, bin_columns: int = KITTI_COLUMNS) -> np.ndarray:
     return points.astype(points.dtype.newbyteorder("="), copy=False)
 
 
-def write_cloud(path: Place, points: np.ndarray, intensity: Optional[np.ndarray] = None) -> None:
+def write_cloud(path: Place, points: np.ndarray) -> None:
     """Write a cloud in the format of the suffix, atomically.
 
     Args:
         path: file name with one of `SUFFIXES`.
-        points: (N, 3) float32 or float64, metres. `.bin` files are float32 whatever is given.
-        intensity: (N,) float, 0 ... 1; a column more. `.bin` files have zeros where it is not given.
+        points: (N, 3) float32 or float64, metres. `.bin` files are float32 whatever is given, with a reflectance of 0.
 
     Raises:
         CFlowError: an unknown suffix, or points of another shape.
@@ -82,20 +81,16 @@ def write_cloud(path: Place, points: np.ndarray, intensity: Optional[np.ndarray]
     if points.ndim != 2 or points.shape[1] != 3 or points.dtype not in (np.float32, np.float64):
         raise CFlowError(f"points have shape {points.shape} and dtype {points.dtype}; give (N, 3) float32 or float64")
     fields = {axis: np.ascontiguousarray(points[:, k]) for k, axis in enumerate(_AXES)}
-    if intensity is not None:
-        fields["intensity"] = np.asarray(intensity, points.dtype)
     if suffix in (".pcd", ".ply"):
         (write_pcd if suffix == ".pcd" else write_ply)(path, fields)
         return
-    table = np.column_stack(list(fields.values()))
     with atomic_file(path) as file:
         if suffix == ".bin":
-            reflectance = np.zeros(len(points)) if intensity is None else intensity
-            file.write(np.column_stack([points, reflectance]).astype("<f4").tobytes())
+            file.write(np.pad(points, ((0, 0), (0, 1))).astype("<f4").tobytes())
         elif suffix == ".npy":
-            np.save(file, table)
+            np.save(file, points)
         elif suffix == ".npz":
-            np.savez(file, points=table)
+            np.savez(file, points=points)
         else:
             (feather.write_feather if suffix == ".feather" else parquet.write_table)(pa.table(fields), file)
 

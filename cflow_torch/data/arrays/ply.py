@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import re
+import warnings
 from itertools import takewhile
 from typing import Dict, Mapping
 
@@ -58,7 +59,10 @@ def read_ply(path: Place) -> Dict[str, np.ndarray]:
         kind = np.dtype([(name, _ORDERS[order] + _TYPES[code]) for _, code, name in properties])
         body = content[header.end() :]
         if order == "ascii":
-            table = np.loadtxt(io.BytesIO(body), kind, max_rows=int(count), ndmin=1)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # numpy's about no points
+                warnings.simplefilter("error", DeprecationWarning)  # and about 256 in a byte
+                table = np.loadtxt(io.BytesIO(body), kind, max_rows=int(count), ndmin=1)
         else:
             table = np.frombuffer(body, kind, int(count))
         if len(table) < int(count):
