@@ -246,7 +246,7 @@ def test_a_failed_write_changes_nothing(folder: Path, drive: Any, monkeypatch: A
     if stage == "write":
         monkeypatch.setattr(aevascenes_writer, "_add_velocities", fail)
     else:
-        monkeypatch.setattr(os, "replace", fail)
+        monkeypatch.setattr(aevascenes_writer.os, "replace", fail)
     with pytest.raises(OSError, match="disk full"):
         write_aevascenes_sequence(drive, folder.parent, overwrite=True)
     assert os.listdir(folder.parent) == [folder.name] and (folder / "sequence.json").read_text() == "old"

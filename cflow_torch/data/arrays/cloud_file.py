@@ -12,8 +12,9 @@ from pyarrow import feather, parquet
 from cflow_torch.data.arrays.pcd import read_pcd, write_pcd
 from cflow_torch.data.arrays.ply import read_ply, write_ply
 from cflow_torch.data.atomic import atomic_file
+from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.npy_file import Header, read_npy, read_npz
-from cflow_torch.data.paths import Place, as_path, read_bytes, remote_errors
+from cflow_torch.data.paths import Place, as_path, read_bytes
 from cflow_torch.types import CFlowError
 
 SUFFIXES = (".npy", ".npz", ".bin", ".pcd", ".ply", ".feather", ".parquet")
@@ -47,9 +48,6 @@ def read_cloud(path: Place, bin_columns: int = KITTI_COLUMNS) -> np.ndarray:
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise CFlowError(f"{path} has suffix {suffix!r}; clouds are {', '.join(SUFFIXES)}")
-    with remote_errors(path):
-        if not path.is_file():
-            raise CFlowError(f"{path} does not exist")
     if suffix == ".bin":
         points = _read_bin(path, bin_columns)
     elif suffix in (".pcd", ".ply"):
@@ -96,10 +94,8 @@ def write_cloud(path: Place, points: np.ndarray) -> None:
 
 
 def _read_bin(path: Path, columns: int) -> np.ndarray:
-    try:
+    with file_errors(path):
         data = read_bytes(path)
-    except OSError as error:
-        raise CFlowError(f"cannot read {path} ({error}); copy it again") from error
     if len(data) % (4 * columns):
         raise CFlowError(
             f"{path} has {len(data)} bytes, no multiple of {4 * columns} ({columns} float32 a point): it is truncated, "
@@ -140,11 +136,9 @@ def _choose(path: Path, arrays: Mapping[str, Header]) -> Sequence[str]:
 
 def _read_table(path: Path) -> np.ndarray:
     read = feather.read_table if path.suffix.lower() == ".feather" else parquet.read_table
-    try:
+    with file_errors(path):
         table = read(pa.BufferReader(read_bytes(path)), use_threads=False)
         table.validate(full=True)
-    except Exception as error:  # a damaged file makes pyarrow raise nearly anything
-        raise CFlowError(f"cannot read {path}: {str(error)[:200]}; it is truncated or damaged") from error
     names = table.column_names
     chosen = _AXES if all(axis in names for axis in _AXES) else tuple(names[:3])
     columns = [table.column(names.index(name)) for name in chosen]

@@ -8,6 +8,7 @@ from typing import Any, Dict, Mapping
 import numpy as np
 
 from cflow_torch.data.atomic import atomic_file
+from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.paths import Place, as_path, read_bytes
 from cflow_torch.types import CFlowError
 
@@ -30,26 +31,18 @@ def read_pcd(path: Place) -> Dict[str, np.ndarray]:
     Raises:
         CFlowError: pypcd4 is missing; no such file, no PCD file of version 0.7, or less data than its header says.
     """
-    try:
-        content = read_bytes(as_path(path))
-    except OSError as error:
-        raise CFlowError(f"cannot read {path} ({error}); give a .pcd file") from error
-    return pcd_fields(content, path)
+    with file_errors(path, "give a .pcd file of version 0.7"):
+        return pcd_fields(read_bytes(as_path(path)), path)
 
 
 def pcd_fields(content: bytes, path: Place) -> Dict[str, np.ndarray]:
     """As `read_pcd`, of what is in the file."""
     pypcd4 = _pypcd4()
-    try:
+    with file_errors(path, "give a .pcd file of version 0.7"):
         cloud = pypcd4.PointCloud.from_fileobj(io.BytesIO(content))
-    except Exception as error:  # pypcd4 lets through what numpy, pydantic and lzf raise
-        raise CFlowError(f"{path} cannot be read as PCD: {' '.join(str(error).split())[:300]}") from error
-    header, table = cloud.metadata, np.atleast_1d(cloud.pc_data)
-    if len(table) != header.width * header.height:
-        raise CFlowError(
-            f"{path} cannot be read as PCD: its header says {header.width} x {header.height} points, it holds "
-            f"{len(table)}; it is truncated or damaged"
-        )
+        header, table = cloud.metadata, np.atleast_1d(cloud.pc_data)
+        if len(table) != header.width * header.height:
+            raise ValueError(f"it holds {len(table)} points, its header says {header.width} x {header.height}")
     # pypcd4 calls padding "#..." and splits fields of several values, of which it mixes up the compressed ones.
     names = [name for name, count in zip(header.fields, header.count) if count == 1 and name[0] != "#"]
     return {name: np.ascontiguousarray(table[name]) for name in names}

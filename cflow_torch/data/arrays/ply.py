@@ -15,6 +15,7 @@ from typing import Dict, Mapping
 import numpy as np
 
 from cflow_torch.data.atomic import atomic_file
+from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.paths import Place, as_path, read_bytes
 from cflow_torch.types import CFlowError
 
@@ -42,14 +43,11 @@ def read_ply(path: Place) -> Dict[str, np.ndarray]:
 
     Source: G. Turk, "The PLY Polygon File Format".
     """
-    try:
+    with file_errors(path):
         content = read_bytes(as_path(path))
-    except OSError as error:
-        raise CFlowError(f"cannot read {path} ({error}); give a .ply file") from error
-    header = re.match(rb"ply\s(.*?)\nend_header\s*?\n", content[:_LONGEST_HEADER], re.DOTALL)
-    if header is None:
-        raise CFlowError(f"{path} cannot be read as PLY: it has no complete header; it is truncated or something else")
-    try:
+        header = re.match(rb"ply\s(.*?)\nend_header\s*?\n", content[:_LONGEST_HEADER], re.DOTALL)
+        if header is None:
+            raise ValueError("it has no complete header")
         lines = [line.split() for line in header[1].decode("ascii").splitlines()]
         lines = [words for words in lines if words and words[0] not in ("comment", "obj_info")]
         (_, order, _), (_, element, count) = lines[:2]
@@ -66,9 +64,7 @@ def read_ply(path: Place) -> Dict[str, np.ndarray]:
         else:
             table = np.frombuffer(body, kind, int(count))
         if len(table) < int(count):
-            raise ValueError(f"it holds {len(table)} of {count} vertices; it is truncated")
-    except (ValueError, KeyError, MemoryError) as error:
-        raise CFlowError(f"{path} cannot be read as PLY: {str(error)[:200]}") from error
+            raise ValueError(f"it holds {len(table)} of {count} vertices")
     return {name: table[name].astype(kind[name].newbyteorder("=")) for name in kind.names or ()}
 
 

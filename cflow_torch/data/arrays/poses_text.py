@@ -11,6 +11,7 @@ from typing import Optional, Sequence, Tuple
 import numpy as np
 
 from cflow_torch.data.atomic import atomic_file
+from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.npy_file import read_npy
 from cflow_torch.data.paths import Place, as_path, read_bytes
 from cflow_torch.data.rotations import rotations_between, to_quaternions, to_rotations
@@ -64,13 +65,22 @@ def read_poses(path: Place) -> Trajectory:
         matrices = values.reshape(len(values), -1, 4)
         if layout == "tum":
             times_ns, matrices = _nanoseconds(path, words[:, 0]), _from_tum(path, values)
+    return Trajectory(checked_poses(matrices, str(path)), times_ns, layout)
+
+
+def checked_poses(matrices: np.ndarray, source: str) -> np.ndarray:
+    """(K, 4, 4) float64 of (K, 4, 4) or (K, 3, 4) numbers.
+
+    Raises:
+        CFlowError: another shape, no numbers, or no rigid motions; `source` is what to call them.
+    """
     if matrices.ndim != 3 or matrices.shape[1:] not in ((3, 4), (4, 4)) or matrices.dtype.kind not in "fiu":
-        raise CFlowError(f"{path} has shape {matrices.shape} and dtype {matrices.dtype}; give (K, 4, 4) numbers")
+        raise CFlowError(f"{source} has shape {matrices.shape} and dtype {matrices.dtype}; give (K, 4, 4) numbers")
     poses = np.tile(np.eye(4), (len(matrices), 1, 1))
     poses[:, : matrices.shape[1]] = matrices
     for row, pose in enumerate(poses):
-        rigid_transform(pose, f"pose {row} of {path}")
-    return Trajectory(poses, times_ns, layout)
+        rigid_transform(pose, f"pose {row} of {source}")
+    return poses
 
 
 def read_calibration(path: Place) -> np.ndarray:
@@ -81,12 +91,10 @@ def read_calibration(path: Place) -> np.ndarray:
     Raises:
         CFlowError: no such file, no such line, no rigid motion.
     """
-    try:
+    with file_errors(path, f"give a file with a line {' or '.join(CALIBRATION_KEYS)} and 12 numbers"):
         lines = [line.replace(":", " ").split() for line in read_bytes(as_path(path)).decode("utf-8").splitlines()]
         row = next((words for words in lines if words and words[0] in CALIBRATION_KEYS), ["no line Tr"])
         matrix = np.array(row[1:], np.float64).reshape(3, 4)
-    except (OSError, ValueError) as error:
-        raise CFlowError(f"{path} needs a line {' or '.join(CALIBRATION_KEYS)} with 12 numbers ({error})") from error
     return rigid_transform(np.concatenate([matrix, [[0, 0, 0, 1]]]), f"{row[0]} of {path}")
 
 
@@ -168,14 +176,11 @@ def _from_tum(path: Place, values: np.ndarray) -> np.ndarray:
 
 def _read_table(path: Place) -> Tuple[np.ndarray, np.ndarray]:
     """(K, C) words of a text file and the finite numbers that they are, K and C at least 1."""
-    try:
+    with file_errors(path, "give lines of as many numbers each"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # numpy's about a file without lines
         text = read_bytes(as_path(path)).decode("utf-8").replace(",", " ")
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # numpy's about a file without lines
-            words = np.loadtxt(io.StringIO(text), str, ndmin=2)
+        words = np.loadtxt(io.StringIO(text), str, ndmin=2)
         values = words.astype(np.float64)
-    except (OSError, ValueError) as error:
-        raise CFlowError(f"{path} cannot be read ({str(error)[:200]}); give lines of as many numbers each") from error
     if not values.size or not np.isfinite(values).all():
         raise CFlowError(f"{path} {'has numbers that are not finite' if values.size else 'is empty'}")
     return words, values

@@ -10,7 +10,14 @@ from typing import Any, Dict, List, Optional, Sequence, Tuple
 import numpy as np
 
 from cflow_torch.data.arrays.cloud_file import KITTI_COLUMNS, SUFFIXES, read_cloud
-from cflow_torch.data.arrays.poses_text import Trajectory, poses_at, read_calibration, read_poses, read_times
+from cflow_torch.data.arrays.poses_text import (
+    Trajectory,
+    checked_poses,
+    poses_at,
+    read_calibration,
+    read_poses,
+    read_times,
+)
 from cflow_torch.data.folders import find_folders
 from cflow_torch.data.log import FlowLabels
 from cflow_torch.data.npy_file import read_npy
@@ -41,14 +48,14 @@ def find_array_logs(root: Place) -> List[Path]:
         CFlowError: `root` is no folder.
     """
 
-    def is_log(folder: Path) -> bool:
-        return bool(_clouds(folder)[1])
-
-    def is_passed(folder: Path) -> bool:
-        return folder.name != GROUND_FOLDER
-
     what = "a folder with one point cloud per file, or a folder of such"
-    return find_folders(as_path(root), is_log, SEARCH_DEPTH, what, is_passed)
+    return find_folders(
+        as_path(root),
+        lambda folder: bool(_clouds(folder)[1]),
+        SEARCH_DEPTH,
+        what,
+        lambda child: child.name != GROUND_FOLDER,
+    )
 
 
 class ArraysLog:
@@ -166,13 +173,10 @@ class ArraysLog:
         if poses is None:
             return None, "", False
         try:
-            matrices = np.asarray(poses, np.float64)
-        except (TypeError, ValueError, OverflowError) as error:
-            raise CFlowError(f"poses={poses!r:.80} are no numbers ({error}); give (K, 4, 4), one per sweep") from None
-        if matrices.ndim != 3 or not len(matrices):
-            raise CFlowError(f"poses have shape {matrices.shape}; give (K, 4, 4), one per sweep")
-        checked = [rigid_transform(pose, f"poses[{row}]") for row, pose in enumerate(matrices)]
-        return Trajectory(np.stack(checked), None, "matrix"), "poses", False
+            matrices = np.asarray(poses)
+        except ValueError as error:
+            raise CFlowError(f"poses are no matrices ({error}); give (K, 4, 4), one per sweep") from error
+        return Trajectory(checked_poses(matrices, "poses"), None, "matrix"), "poses", False
 
     def _times(self, times: Any, trajectory: Optional[Trajectory]) -> Optional[List[int]]:
         """Nanoseconds of each sweep, None = unknown."""
