@@ -15,7 +15,6 @@ from typing import IO, Any, Collection, ContextManager, Iterator, List, Optional
 from cflow_torch.data.paths import Place, as_path, forget_listings, is_remote, remote_errors
 from cflow_torch.types import CFlowError
 
-_SPOOLED = 64 << 20  # bytes of a remote file that are collected in memory; more go to a temporary file here
 # Where a put takes the place of what was there at once, and is seen by nobody before it is complete.
 _WHOLE_PUTS = {"s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "oss", "memory"}
 _TEMPORARY = re.compile(r"\.(?P<target>.+)\.(?P<host>[A-Za-z0-9_-]+)-(?P<process>\d+)-[0-9a-f]{8}\.tmp")
@@ -32,10 +31,10 @@ def atomic_file(path: Place) -> ContextManager[Any]:
 
     Convention:
         - On this machine: a temporary name in the same folder, `.NAME.<host>-<process>-<random>.tmp`, then a rename;
-          contents and names are on disk when the block is done. Only a killed process leaves the temporary file behind,
+          contents and name are on disk when the block is done. Only a killed process leaves the temporary file behind,
           see `remove_stale`.
-        - In an object store: the contents are collected here and put when the block ends. On other file systems of
-          fsspec they are put under a temporary name, then moved.
+        - Elsewhere: a temporary file here, which is put when the block ends: in an object store under its name, on
+          other file systems under a temporary name, then moved.
 
     Raises:
         OSError: as for any file; also if the far side cannot be reached.
@@ -59,7 +58,7 @@ def atomic_name(path: Path) -> Iterator[Path]:
     Yields:
         The temporary name, under which there is no file yet. What is made there must be on disk when the block ends.
     """
-    make_folder(path.parent)
+    path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(temporary_name(path.name))
     try:
         yield temporary
@@ -75,33 +74,23 @@ def atomic_name(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def _put_file(path: Any) -> Iterator[IO[bytes]]:
-    with tempfile.SpooledTemporaryFile(max_size=_SPOOLED) as file:
-        yield file  # type: ignore[misc]
+    with tempfile.TemporaryDirectory() as folder:
+        made = os.path.join(folder, "made")
+        with open(made, "w+b") as file:
+            yield file
         with remote_errors(path):
             if path.protocol in _WHOLE_PUTS:
-                _put(file, path)
+                path.fs.put_file(made, path.path)
                 return
             path.parent.mkdir(parents=True, exist_ok=True)
             temporary = path.parent / temporary_name(path.name)
             try:
-                _put(file, temporary)
+                path.fs.put_file(made, temporary.path)
                 path.fs.mv(temporary.path, path.path)
             except BaseException:
                 with suppress(Exception):
                     temporary.unlink()
                 raise
-
-
-def _put(file: Any, path: Any) -> None:
-    size = file.seek(0, os.SEEK_END) or file.tell()  # seek says nothing before Python 3.11
-    file.seek(0)
-    if size <= _SPOOLED:
-        path.fs.pipe_file(path.path, file.read())
-        return
-    with tempfile.NamedTemporaryFile() as named:  # to send a large file by parts, fsspec wants its name
-        shutil.copyfileobj(file, named)
-        named.flush()
-        path.fs.put_file(named.name, path.path)
 
 
 @contextmanager
@@ -112,7 +101,8 @@ def atomic_folder(folder: Place) -> Iterator[Path]:
         folder: final name, on this machine; the folder above is made if absent.
 
     Yields:
-        An empty folder under a temporary name beside it. If the block raises, it is removed and the older one stays.
+        An empty folder under a temporary name beside it. If the block raises, it is removed and the older one stays;
+        else all files in it are on disk before it takes its name.
 
     Raises:
         CFlowError: the folder would be remote.
@@ -120,14 +110,13 @@ def atomic_folder(folder: Place) -> Iterator[Path]:
     folder = as_path(folder)
     if is_remote(folder):
         raise CFlowError(f"{folder}: folders are written whole on this machine only; write one here and copy it there")
-    make_folder(folder.parent)
     scratch = folder.with_name(temporary_name(folder.name))
     new, old = scratch / "new", scratch / "old"
     try:
         new.mkdir(parents=True)
         yield new
-        for place in (new, *(path for path in new.rglob("*") if path.is_dir())):
-            sync_folder(place)
+        for place in (new, *new.rglob("*")):
+            sync_folder(place)  # files likewise
         if folder.exists():
             os.replace(folder, old)
         try:
@@ -210,25 +199,14 @@ def ready_folder(folder: Place) -> Path:
     return folder
 
 
-def make_folder(folder: Path) -> None:
-    """Make a folder of this machine and those above it where they are absent, durably."""
-    if not folder.is_dir() and folder != folder.parent:
-        make_folder(folder.parent)
-        folder.mkdir(exist_ok=True)
-        sync_folder(folder.parent)
-
-
 def sync_folder(folder: Path) -> None:
-    """Makes the names in a folder durable, where the system allows to open a folder and to wait for it."""
-    try:
+    """Makes the names in a folder, or what is in a file, durable where the system allows to wait for it."""
+    with suppress(OSError):  # some network file systems refuse
         descriptor = os.open(folder, os.O_RDONLY)
-    except OSError:
-        return
-    try:
-        with suppress(OSError):  # some network file systems refuse
+        try:
             os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+        finally:
+            os.close(descriptor)
 
 
 def temporary_name(name: str) -> str:
@@ -250,5 +228,5 @@ def _lives(process: int) -> bool:
     except ProcessLookupError:
         return False
     except (PermissionError, OverflowError):
-        return True
+        pass
     return True

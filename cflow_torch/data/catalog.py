@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import collections.abc
 import inspect
 from dataclasses import dataclass
 from importlib import import_module
-from pathlib import Path
-from typing import Any, Dict, Sequence, Union, get_type_hints
-
-import numpy as np
+from typing import Any, Dict, Sequence
 
 from cflow_torch.data.log import Log
 from cflow_torch.data.log_check import check_log
@@ -87,7 +83,7 @@ def open_log(
 
     Raises:
         CFlowError: a log that cannot be read, or whose name cannot be a folder's; a setting that the reader does not
-            have (the message lists its own).
+            have (the message lists its own) or cannot use.
     """
     data_set = _data_set(name)
     reader = getattr(import_module(f"cflow_torch.data.{data_set.module}"), data_set.log)
@@ -97,9 +93,14 @@ def open_log(
         raise CFlowError(f"data set {name} has no setting {', '.join(unknown)}; it has {', '.join(known) or 'none'}")
     if find_ground is not None and find_ground not in GROUND_METHODS:
         raise CFlowError(f"find_ground={find_ground!r}: give null or one of {', '.join(GROUND_METHODS)}")
-    _check_kinds(name, reader, settings)
-    with remote_errors(source if is_place(source) else source.root):
-        log: Log = reader(source, **settings)
+    try:
+        with remote_errors(source if is_place(source) else source.root):
+            log: Log = reader(source, **settings)
+    except (TypeError, ValueError, AttributeError) as error:
+        if isinstance(error, CFlowError) or not settings:
+            raise
+        given = ", ".join(f"{key}={value!r:.80}" for key, value in settings.items())
+        raise CFlowError(f"data set {name} cannot be opened with {given}: {error}") from error
     safe_name(log.log_id, f"{source}: the log")  # results get that name
     if odometry:
         from cflow_torch.data.odometry import with_poses
@@ -112,31 +113,6 @@ def open_log(
     if check:
         check_log(log)
     return log
-
-
-def _check_kinds(name: str, reader: Any, settings: Dict[str, Any]) -> None:
-    """Refuse a value of another kind than the reader says; lists of numbers are the reader's own business."""
-    hints = get_type_hints(reader.__init__)
-    for key, value in settings.items():
-        if not _is_kind(value, hints.get(key, Any)):
-            kind = str(inspect.signature(reader).parameters[key].annotation).replace("Optional", "null or ")
-            raise CFlowError(f"data set {name}: {key}={value!r:.80}: give {kind}")
-
-
-def _is_kind(value: Any, hint: Any) -> bool:
-    parts: Any = getattr(hint, "__args__", ())
-    if getattr(hint, "__origin__", None) is Union:
-        return any(_is_kind(value, part) for part in parts)
-    if getattr(hint, "__origin__", None) is collections.abc.Sequence:
-        return isinstance(value, (list, tuple)) and all(_is_kind(part, parts[0]) for part in value)
-    if hint is bool:
-        return isinstance(value, (bool, int, np.bool_)) and value in (0, 1)
-    if hint in (int, float):
-        allowed = (int, np.integer) if hint is int else (int, float, np.integer, np.floating)
-        return isinstance(value, allowed) and not isinstance(value, bool)
-    if hint in (str, type(None)):
-        return isinstance(value, hint)
-    return is_place(value) if hint is Path else True
 
 
 def _data_set(name: str) -> DataSet:

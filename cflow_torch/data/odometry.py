@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any, List, Optional, Sequence
+from typing import Any, List, Sequence
 
 import numpy as np
 from tqdm import tqdm
 
-from cflow_torch.data.log import FlowLabels, Log
+from cflow_torch.data.found_ground import ChangedLog
+from cflow_torch.data.log import Log
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.ego_motion import rigid_transform
 
@@ -81,16 +82,14 @@ def _register(log: Log, order: Sequence[int], max_range: float) -> List[np.ndarr
     return poses
 
 
-class PosedLog:
-    """A log with other poses; implements the `Log` protocol.
+class PosedLog(ChangedLog):
+    """Another log with other poses.
 
     Args:
         log: any log.
         poses: (K, 4, 4) `T_world_ego`, one per sweep.
 
     Attributes:
-        log: the log behind it.
-        log_id, timestamps: of that log.
         poses: (K, 4, 4) float64.
 
     Raises:
@@ -98,8 +97,7 @@ class PosedLog:
     """
 
     def __init__(self, log: Log, poses: Any) -> None:
-        self.log, self.log_id = log, log.log_id
-        self.timestamps: Sequence[int] = log.timestamps
+        super().__init__(log)
         if len(poses) != len(log.timestamps):
             raise CFlowError(f"{len(poses)} poses for {len(log.timestamps)} sweeps of log {log.log_id}: give one each")
         self.poses = np.stack([rigid_transform(pose, f"poses[{index}]") for index, pose in enumerate(poses)])
@@ -108,10 +106,6 @@ class PosedLog:
         """The log's sweep with the pose from here."""
         sweep = self.log.sweep(index)
         return Sweep(sweep.points, sweep.is_ground, self.poses[index].copy(), sweep.timestamp_ns)
-
-    def labels(self, index: int) -> Optional[FlowLabels]:
-        """The log's labels."""
-        return self.log.labels(index)
 
 
 def with_poses(log: Log, max_range: float = MAX_RANGE) -> Log:

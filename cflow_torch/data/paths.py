@@ -16,7 +16,7 @@ import tempfile
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path, PosixPath, WindowsPath
-from typing import Any, Dict, Iterator, Optional, Union
+from typing import Any, Iterator, Optional, Union
 
 import pyarrow as pa
 
@@ -24,8 +24,8 @@ from cflow_torch.types import CFlowError
 
 Place = Union[str, Path]
 _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)://")
-_BLOCK = 1 << 18  # bytes; larger ones save few requests: HDF5's metadata is scattered, its data are long reads
-_KEPT_BLOCKS = 128  # of each open file: 32 MiB
+_BLOCK = 1 << 20  # bytes; smaller ones make more requests: HDF5's metadata is scattered, its data are long reads
+_KEPT_BLOCKS = 32  # of each open file: 32 MiB
 _COPIED = 8 << 20  # bytes per request while a file is copied
 _KEPT_COPIES = 4  # files of `mapped`: two of a Waymo segment that is read, two of the one before
 
@@ -122,19 +122,6 @@ def read_bytes(path: Path, most: Optional[int] = None) -> bytes:
     return data
 
 
-def _size(path: Path) -> int:
-    """Bytes of a file on this machine, which must be one."""
-    status = path.stat()
-    if not stat.S_ISREG(status.st_mode) and not stat.S_ISDIR(status.st_mode):
-        raise OSError(errno.EINVAL, "is a device or a pipe, no file", str(path))
-    return status.st_size
-
-
-def _check_size(path: Path, size: int, most: Optional[int]) -> None:
-    if most is not None and size > most:
-        raise CFlowError(f"{path} has {size} bytes, up to {most} are read; is it the right file?")
-
-
 def whole(path: Path) -> Any:
     """What to give a library that reads all of a file: its name, or what is in it if it is remote.
 
@@ -150,12 +137,14 @@ def whole(path: Path) -> Any:
 def ranged(path: Path) -> Any:
     """What to give a library that reads parts of a large file: its name, or an open binary file if it is remote.
 
-    Cost: one request for the blocks of 256 KiB in which the wanted bytes lie; the last 128 of each file are kept.
+    Cost: one request per block of 1 MiB in which wanted bytes lie; the last 32 of each file are kept.
 
     Raises:
         OSError: a remote file cannot be opened; later, that it cannot be read.
     """
-    return io.BufferedReader(_RemoteFile(path, _BLOCK)) if is_remote(path) else str(path)
+    if not is_remote(path):
+        return str(path)
+    return _open(path, cache_type="blockcache", block_size=_BLOCK, cache_options={"maxblocks": _KEPT_BLOCKS})
 
 
 def parts(path: Path) -> Any:
@@ -165,7 +154,7 @@ def parts(path: Path) -> Any:
         OSError: the file cannot be opened, or is a device or a pipe; later, that it cannot be read.
     """
     if is_remote(path):
-        return _RemoteFile(path)
+        return _open(path, cache_type="none")
     _size(path)
     return open(path, "rb")  # noqa: SIM115
 
@@ -185,69 +174,27 @@ def mapped(path: Path) -> Any:
 @lru_cache(maxsize=_KEPT_COPIES)
 def _copy(path: Path) -> pa.Buffer:
     with tempfile.TemporaryFile() as file, parts(path) as stream:
-        shutil.copyfileobj(stream, file, _COPIED)
+        with remote_errors(path):
+            shutil.copyfileobj(stream, file, _COPIED)
         if not file.tell():
             raise CFlowError(f"{path} is empty; copy it again")
         file.flush()
         return pa.py_buffer(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
 
 
-class _RemoteFile(io.RawIOBase):
-    """A remote file that is read by ranges.
+def _open(path: Any, **settings: Any) -> Any:
+    with remote_errors(path):
+        return path.fs.open(path.path, "rb", **settings)
 
-    Args:
-        path: of fsspec.
-        block: bytes; whole blocks are fetched and the last ones used are kept. 0 = what is asked for, nothing is kept.
-    """
 
-    def __init__(self, path: Any, block: int = 0) -> None:
-        super().__init__()
-        self._path, self._block, self._at = path, block, 0
-        self._blocks: Dict[int, bytes] = {}  # the one used last stands last
-        with remote_errors(path):
-            self._size = int(path.stat().st_size)
+def _size(path: Path) -> int:
+    """Bytes of a file on this machine, which must be one."""
+    status = path.stat()
+    if not stat.S_ISREG(status.st_mode) and not stat.S_ISDIR(status.st_mode):
+        raise OSError(errno.EINVAL, "is a device or a pipe, no file", str(path))
+    return status.st_size
 
-    def readable(self) -> bool:
-        return True
 
-    def seekable(self) -> bool:
-        return True
-
-    def tell(self) -> int:
-        return self._at
-
-    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        self._at = offset + (0, self._at, self._size)[whence]
-        return self._at
-
-    def readinto(self, buffer: Any) -> int:
-        end = min(self._at + len(buffer), self._size)
-        if end <= self._at:
-            return 0
-        data = self._blockwise(self._at, end) if self._block else self._fetch(self._at, end)
-        buffer[: len(data)] = data
-        self._at += len(data)
-        return len(data)
-
-    def _fetch(self, start: int, end: int) -> bytes:
-        with remote_errors(self._path):
-            data: bytes = self._path.fs.cat_file(self._path.path, start=start, end=end)
-        if len(data) != end - start:
-            raise OSError(f"{self._path} gave {len(data)} bytes for {start} ... {end}; did it change meanwhile?")
-        return data
-
-    def _blockwise(self, start: int, end: int) -> bytes:
-        size = self._block
-        numbers = range(start // size, (end - 1) // size + 1)
-        missing = [number for number in numbers if number not in self._blocks]
-        if missing:
-            first, last = missing[0], missing[-1] + 1
-            data = self._fetch(first * size, min(last * size, self._size))
-            for number in range(first, last):
-                self._blocks[number] = data[(number - first) * size : (number - first + 1) * size]
-        for number in numbers:
-            self._blocks[number] = self._blocks.pop(number)
-        joined = b"".join(self._blocks[number] for number in numbers)
-        while len(self._blocks) > _KEPT_BLOCKS:
-            del self._blocks[next(iter(self._blocks))]
-        return joined[start - numbers[0] * size : end - numbers[0] * size]
+def _check_size(path: Path, size: int, most: Optional[int]) -> None:
+    if most is not None and size > most:
+        raise CFlowError(f"{path} has {size} bytes, up to {most} are read; is it the right file?")

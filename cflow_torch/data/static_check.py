@@ -47,9 +47,6 @@ class StaticResidual:
         agreement: 0 ... 1, how well the structure of both coincides under the poses; of two sweeps of a street 0.3 to
             0.5. NaN where too little can be compared.
         aligned: agreement after `shift` and `turn` are taken out.
-        inverted: agreement if the poses map the world to the ego frame instead.
-        still: agreement without any ego motion.
-        own: agreement of the later sweep with itself, more than any other can have.
         verdict: what is likely wrong, "" = nothing.
     """
 
@@ -59,9 +56,6 @@ class StaticResidual:
     turn: float
     agreement: float
     aligned: float
-    inverted: float
-    still: float
-    own: float
     verdict: str
 
 
@@ -98,16 +92,31 @@ def static_world_residual(log: Log, index: int, baseline: int = BASELINE) -> Sta
     source, target = _structure(older), _structure(newer)[:, :2]
     patches = _Patches(target)
     source = source[np.random.default_rng(0).permutation(len(source))[:_MOST_POINTS]]
-    own = patches.agreement(target)
-    agreement = patches.agreement(_move(source, T_1_0))
+    moved = _move(source, T_1_0)
+    agreement, (shift, turn, aligned) = patches.agreement(moved), patches.fit(moved)
+    own = patches.agreement(target)  # more than any other sweep can have
+    if own * min(len(source), len(target)) < _FEWEST_IN_PLACE:
+        return StaticResidual(index, index + baseline, shift, turn, float("nan"), float("nan"), "")
     inverted = patches.agreement(_move(source, pose1 @ np.linalg.inv(pose0)))
     still = patches.agreement(source[:, :2])
-    shift, turn, aligned = patches.fit(_move(source, T_1_0))
-    if own * min(len(source), len(target)) < _FEWEST_IN_PLACE:
-        agreement = aligned = inverted = still = own = float("nan")
-    result = (shift, turn, agreement, aligned, inverted, still, own)
-    distance = float(np.linalg.norm(T_1_0[:3, 3]))
-    return StaticResidual(index, index + baseline, *result, verdict=_verdict(*result, distance))
+    size, distance = float(np.linalg.norm(shift)), float(np.linalg.norm(T_1_0[:3, 3]))
+    verdict = ""
+    if inverted > max(_BETTER * agreement, _GOOD, still):
+        verdict = "The poses seem to be inverted: they must map ego coordinates to the world (T_world_ego)."
+    elif still > max(_BETTER * agreement, _GOOD):
+        verdict = (
+            "Without any ego motion it fits better: are the poses of another log, of other times, in another unit, or "
+            "do the points lie in one common frame already (then pass no poses)?"
+        )
+    elif agreement < _HOPELESS * own and aligned < _ALIGNED * own:
+        verdict = "It does not fit at all: are the poses of another log, of other axes (a camera's), times or units?"
+    elif abs(turn) > _TURN or size > _SHIFT + _SHIFT_PER_METRE * distance + _SHIFT_PER_RADIAN * abs(turn):
+        verdict = (
+            f"It is off by {100 * size:.0f} cm and {np.degrees(abs(turn)):.1f} degrees. Points in the frame of the "
+            "LiDAR with poses of the vehicle do this in turns: pass ego_T_lidar. Other causes: axes or times of the "
+            "poses, sweeps that are not de-skewed."
+        )
+    return StaticResidual(index, index + baseline, shift, turn, agreement, aligned, verdict)
 
 
 def check_static_world(log: Log, pairs: int = 2, baseline: int = BASELINE) -> List[StaticResidual]:
@@ -232,35 +241,3 @@ class _Patches:
 def _turned(xy: np.ndarray, turn: float) -> np.ndarray:
     cos, sin = np.cos(turn), np.sin(turn)
     return xy @ np.array([[cos, sin], [-sin, cos]])
-
-
-def _verdict(
-    shift: np.ndarray,
-    turn: float,
-    agreement: float,
-    aligned: float,
-    inverted: float,
-    still: float,
-    own: float,
-    distance: float,
-) -> str:
-    if not np.isfinite(agreement):
-        return ""
-    if inverted > max(_BETTER * agreement, _GOOD, still):
-        return "The poses seem to be inverted: they must map ego coordinates to the world (T_world_ego)."
-    if still > max(_BETTER * agreement, _GOOD):
-        return (
-            "Without any ego motion it fits better: are the poses of another log, of other times, in another unit, or "
-            "do the points lie in one common frame already (then pass no poses)?"
-        )
-    if agreement < _HOPELESS * own and aligned < _ALIGNED * own:
-        return "It does not fit at all: are the poses of another log, of other axes (a camera's), times or units?"
-    size = float(np.linalg.norm(shift))
-    allowed = _SHIFT + _SHIFT_PER_METRE * distance + _SHIFT_PER_RADIAN * abs(turn)
-    if abs(turn) <= _TURN and size <= allowed:
-        return ""
-    return (
-        f"It is off by {100 * size:.0f} cm and {np.degrees(abs(turn)):.1f} degrees. Points in the frame of the LiDAR "
-        "with poses of the vehicle do this in turns: pass ego_T_lidar. Other causes: axes or times of the poses, "
-        "sweeps that are not de-skewed."
-    )

@@ -1,4 +1,4 @@
-"""A synthetic drive: a street scene, a ray-casting LiDAR, and exact flow."""
+"""Simulated drives for the demo, tests and benchmarks: scenes, ray-casting LiDARs, exact flow, and their writers."""
 
 from __future__ import annotations
 

@@ -14,14 +14,12 @@ from cflow_torch.simulator.lidar import Returns, scan, scan_rolling
 from cflow_torch.simulator.motion import Motion
 from cflow_torch.simulator.objects import CATEGORIES, own_truck
 from cflow_torch.simulator.profiles import get_profile, in_weather
-from cflow_torch.simulator.recording import UnitReturns
+from cflow_torch.simulator.recording import Boxes, GroundRaster, UnitReturns
 from cflow_torch.simulator.scene import Scene
 from cflow_torch.simulator.scenes import get_scene
 from cflow_torch.simulator.sensors import LidarProfile
-from cflow_torch.simulator.writers.av2 import Boxes, Channels, GroundRaster
 from cflow_torch.types import CFlowError, Sweep
 
-AXLE_HEIGHT = 0.35  # of the ego frame's origin above the ground in profile av2, metres
 _FIRST_STAMP_NS = 315_970_000_000_000_000
 _CACHED_SWEEPS = 8  # a window of five and its neighbours; a sweep of 100,000 points takes 3 MB
 _BOX_SLACK = 0.1  # annotation boxes are that much larger than the body, so that range noise stays inside, metres
@@ -31,7 +29,7 @@ _RASTER_STEP = 0.3  # metres per cell of the ground raster, as in Argoverse 2
 
 class Drive:
     """A drive through a synthetic scene. Sweeps are simulated when asked for, each from its own random stream, so they
-    do not depend on the order of the calls. It is a `data.recording.Recording`.
+    do not depend on the order of the calls. It is a `recording.Recording`.
 
     In the profiles av2 and demo a sweep is instantaneous: nothing moves while the LiDAR turns. In the others every shot
     has its own time; where the data set moves points to the time stamp by the motion of the ego car, so does the drive,
@@ -124,10 +122,10 @@ class Drive:
             num_points=np.bincount(self._body_of(returns), minlength=len(self.scene.bodies) + 1)[chosen],
         )
 
-    def channels(self, index: int) -> Channels:
+    def channels(self, index: int) -> Dict[str, np.ndarray]:
         """Intensity, laser and firing time of every point of sweep `index`."""
         returns = self.returns(index)
-        return Channels(returns.intensity.numpy(), returns.laser_number.numpy(), returns.offset_ns.numpy())
+        return {name: getattr(returns, name).numpy() for name in ("intensity", "laser_number", "offset_ns")}
 
     def units(self, index: int) -> List[UnitReturns]:
         """What each LiDAR received in sweep `index`; together, in this order, the rows of `sweep(index)`."""
@@ -200,7 +198,7 @@ class Drive:
             return scan_rolling(self._profile, solids, ground, ego, generator)
         solids_now = self.scene.solids(seconds, self._body_poses[index])
         pose = torch.from_numpy(self.poses[index])
-        return scan(self._profile, solids_now, ground, pose, generator, self._profile.sweep_interval_ns)
+        return scan(self._profile, solids_now, ground, pose, generator)
 
     def _extent(self, index: int, returns: Returns) -> np.ndarray:
         """(num_bodies, 3) float64 size of the smallest upright box about a body's axis that holds its points."""

@@ -68,12 +68,7 @@ class EgoMotion:
 
 
 def scan(
-    profile: LidarProfile,
-    solids: Solids,
-    ground: Ground,
-    T_world_ego: Tensor,
-    generator: torch.Generator,
-    sweep_interval_ns: int,
+    profile: LidarProfile, solids: Solids, ground: Ground, T_world_ego: Tensor, generator: torch.Generator
 ) -> Returns:
     """One sweep of all units of a vehicle in a world that stands still meanwhile.
 
@@ -83,7 +78,6 @@ def scan(
         ground: the ground, in the world.
         T_world_ego: (4, 4) float64.
         generator: noise, drop-out and the azimuth at which the turn starts are drawn from it.
-        sweep_interval_ns: duration of one turn.
     """
     parts, first_laser = [], 0
     T_solid_ego = torch.linalg.inv(solids.pose) @ T_world_ego
@@ -103,7 +97,7 @@ def scan(
         points = T_ego_sensor[:3, :3] @ local + T_ego_sensor[:3, 3:]
         column = hit // len(unit.elevations)
         turned = column if unit.span > 0 else unit.num_columns - 1 - column
-        offset_ns = turned * (sweep_interval_ns / unit.num_columns)
+        offset_ns = turned * (profile.sweep_interval_ns / unit.num_columns)
         parts.append(_returns(points, local, image, hit, reflected, unit, (number, first_laser), turned, offset_ns))
         first_laser += len(unit.elevations)
     return _together(parts)

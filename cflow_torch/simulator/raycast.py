@@ -79,7 +79,6 @@ def cast_solids(
     azimuth: Tensor,
     elevation: Tensor,
     max_range: float,
-    max_candidates: int = _MAX_CANDIDATES,
 ) -> Tuple[Tensor, Tensor]:
     """Nearest solid along every ray of a range image.
 
@@ -90,7 +89,6 @@ def cast_solids(
         azimuth: (C,) float64 radians, evenly spaced over one full turn, ascending.
         elevation: (B,) float64 radians, ascending.
         max_range: solids that begin beyond it may be skipped, metres.
-        max_candidates: (ray, solid) pairs that are tested at once; bounds the memory.
 
     Returns:
         (C * B,) float32 range in metres, inf = no hit; (C * B,) int64 solid, -1 = no hit. Ray number column * B + beam.
@@ -110,7 +108,7 @@ def cast_solids(
         sideways += take(matrix[:, 1], solid) * take(sin_azimuth, column)
         return UnitRays(take(origin, solid), sideways, take(matrix[:, 2], solid))
 
-    return nearest_hits(kind, blocks, rays_at, len(azimuth), elevation, max_candidates)  # block = solid
+    return nearest_hits(kind, blocks, rays_at, len(azimuth), elevation)  # block = solid
 
 
 def nearest_hits(
@@ -119,7 +117,6 @@ def nearest_hits(
     rays_at: Callable[[Tensor, Tensor], UnitRays],
     num_columns: int,
     elevation: Tensor,
-    max_candidates: int = _MAX_CANDIDATES,
 ) -> Tuple[Tensor, Tensor]:
     """Nearest solid along every ray of a range image, from the blocks of rays that may meet each solid.
 
@@ -129,7 +126,6 @@ def nearest_hits(
         rays_at: (M,) block number and (M,) column to the rays of that column as the solid of the block sees them.
         num_columns: C, columns of the range image.
         elevation: (B,) float64 radians, ascending.
-        max_candidates: (ray, solid) pairs that are tested at once; bounds the memory.
 
     Returns:
         (C * B,) float32 range in metres, inf = no hit; (C * B,) int64 block of the solid that was hit, -1 = no hit. Ray
@@ -142,7 +138,7 @@ def nearest_hits(
     size, kind_of = blocks.num_columns * height, kind[blocks.solid]
     for this_kind, intersect in ((BOX, _hit_cube), (CYLINDER, _hit_cylinder), (ELLIPSOID, _hit_ball)):
         visible = ((kind_of == this_kind) & (size > 0)).nonzero()[:, 0]
-        chunk = (size[visible].cumsum(0) - 1) // max_candidates
+        chunk = (size[visible].cumsum(0) - 1) // _MAX_CANDIDATES
         for chosen in visible.split(chunk.unique_consecutive(return_counts=True)[1].tolist()) if len(visible) else ():
             # (block, column) pairs, then (block, column, beam) candidates.
             pair, offset = _expand(take(blocks.num_columns, chosen))

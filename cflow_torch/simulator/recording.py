@@ -3,13 +3,45 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Optional, Protocol, Sequence
+from typing import Mapping, Protocol, Sequence, Tuple
 
 import numpy as np
 
-from cflow_torch.data.log import FlowLabels
-from cflow_torch.simulator.writers.av2 import Boxes
-from cflow_torch.types import Sweep
+from cflow_torch.data.log import Log
+
+
+@dataclass(frozen=True)
+class Boxes:
+    """Annotation boxes of one sweep.
+
+    Args:
+        track_id: (M,) UUIDs, the same in every sweep.
+        category: (M,) Argoverse 2 names.
+        size: (M, 3) float64 length, width, height, metres.
+        pose: (M, 4, 4) float64 `T_ego_box`, origin in the middle of the box.
+        num_points: (M,) int64 LiDAR points on the object.
+    """
+
+    track_id: Tuple[str, ...]
+    category: Tuple[str, ...]
+    size: np.ndarray
+    pose: np.ndarray
+    num_points: np.ndarray
+
+
+@dataclass(frozen=True)
+class GroundRaster:
+    """Ground height on a grid.
+
+    Args:
+        height: (H, W) world z in metres at the middle of each cell, row from y, column from x; NaN = unknown.
+        origin: world x, y of the outer corner of cell (0, 0), metres.
+        step: side of a cell, metres.
+    """
+
+    height: np.ndarray
+    origin: Tuple[float, float]
+    step: float
 
 
 @dataclass(frozen=True)
@@ -40,13 +72,13 @@ class UnitReturns:
     num_columns: int
 
 
-class Recording(Protocol):
-    """A drive as a writer sees it. It is a `Log` too."""
+class Recording(Log, Protocol):
+    """A drive as a writer sees it: a log with exact ground masks and truth, and what follows."""
 
-    log_id: str
-    timestamps: Sequence[int]
     poses: np.ndarray
     """(num_sweeps, 4, 4) float64 `T_world_ego` at each time stamp."""
+    calibration: Mapping[str, np.ndarray]
+    """Sensor name -> (4, 4) float64 `T_ego_sensor`."""
 
     def units(self, index: int) -> Sequence[UnitReturns]:
         """The LiDARs of sweep `index`. Their points, moved to the ego frame and put one after the other in this order,
@@ -58,8 +90,8 @@ class Recording(Protocol):
     def boxes(self, index: int) -> Boxes:
         """Annotation boxes of sweep `index`, ego frame, category by Argoverse 2 name."""
 
-    def sweep(self, index: int) -> Sweep:
-        """Points of all units in the ego frame, exact ground mask, pose, time."""
+    def channels(self, index: int) -> Mapping[str, np.ndarray]:
+        """(N,) uint8 intensity, uint8 laser_number, int32 offset_ns of every point; Argoverse 2 alone stores them."""
 
-    def labels(self, index: int) -> Optional[FlowLabels]:
-        """Exact truth of the pair (index, index + 1)."""
+    def ground_raster(self) -> GroundRaster:
+        """Ground height of the whole drive, likewise."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -13,16 +14,19 @@ from cflow_torch.data.odometry import PosedLog, poses_from_odometry, with_poses
 from cflow_torch.data.static_check import check_static_world
 from cflow_torch.simulator import make_drive
 
+needs_kiss_icp = pytest.mark.skipif(find_spec("kiss_icp") is None, reason="needs KISS-ICP (extra odometry)")
+
 
 class NoPoses:
-    """A log whose poses are lost."""
+    """A log whose poses are lost, and perhaps its points."""
 
-    def __init__(self, log) -> None:
+    def __init__(self, log, is_empty=False) -> None:
         self.log, self.log_id, self.timestamps, self.labels = log, log.log_id, log.timestamps, log.labels
+        self.is_empty = is_empty
 
     def sweep(self, index):
         sweep = self.log.sweep(index)
-        return Sweep(sweep.points, sweep.is_ground, None, sweep.timestamp_ns)
+        return Sweep(np.full((200, 3), np.nan, np.float32) if self.is_empty else sweep.points)
 
 
 @pytest.fixture(scope="module")
@@ -37,22 +41,24 @@ def drift(poses: np.ndarray, truth: np.ndarray):
     return np.linalg.norm(difference[:3, 3]), angle
 
 
+@needs_kiss_icp
 def test_a_simulated_drive(drive):
-    pytest.importorskip("kiss_icp", reason="KISS-ICP is not installed (extra odometry)")
     poses = poses_from_odometry(NoPoses(drive))
     assert np.array_equal(poses[0], np.eye(4))
     for index in range(7):  # the first steps too, where KISS-ICP alone misses by 14 cm
         metres, degrees = drift(poses[index : index + 2], drive.poses[index : index + 2])
         assert metres < 0.05 and degrees < 0.2, index
     assert np.array_equal(poses, poses_from_odometry(NoPoses(drive))), "the same again"
+    with pytest.raises(CFlowError, match="fewer than 100 points"):
+        poses_from_odometry(NoPoses(drive, is_empty=True))
+    with pytest.raises(CFlowError, match="max_range"):
+        poses_from_odometry(NoPoses(drive), max_range=0)
 
 
+@needs_kiss_icp
 def test_the_real_drive(kitti_file):
-    pytest.importorskip("kiss_icp", reason="KISS-ICP is not installed (extra odometry)")
-    pytest.importorskip("h5py")
-    from cflow_torch.data.hdf5.reader import HDF5Log
-
-    with HDF5Log(kitti_file) as log:
+    hdf5 = pytest.importorskip("cflow_torch.data.hdf5")
+    with hdf5.HDF5Log(kitti_file) as log:
         poses = poses_from_odometry(NoPoses(log))
         metres, degrees = drift(poses, log.poses)
         assert metres < 0.1 and degrees < 0.5, "after 5 m and 11 degrees"
@@ -69,24 +75,12 @@ def test_without_kiss_icp_the_message_says_what_to_do(drive, monkeypatch):
     assert with_poses(drive) is drive, "nothing is estimated where poses are known"
 
 
-def test_sweeps_that_cannot_be_registered(drive):
-    pytest.importorskip("kiss_icp", reason="KISS-ICP is not installed (extra odometry)")
-
-    class Empty(NoPoses):
-        def sweep(self, index):
-            return Sweep(np.full((200, 3), np.nan, np.float32))
-
-    with pytest.raises(CFlowError, match="fewer than 100 points"):
-        poses_from_odometry(Empty(drive))
-    with pytest.raises(CFlowError, match="max_range"):
-        poses_from_odometry(NoPoses(drive), max_range=0)
-
-
 def test_poses_are_put_on(drive):
     poses = np.stack([scenes.pose(k, 0, 0) for k in range(8)])
-    log = PosedLog(NoPoses(drive), poses)
+    log = PosedLog(drive, poses)
     assert np.array_equal(log.sweep(3).pose, poses[3]) and np.array_equal(log.sweep(3).points, drive.sweep(3).points)
     assert np.array_equal(log.labels(3).flow, drive.labels(3).flow) and list(log.timestamps) == list(drive.timestamps)
+    assert np.array_equal(log.poses, poses) and log.scene is drive.scene, "everything else is the log's"
     for wrong, complaint in ((poses[:7], "7 poses for 8"), (2 * poses, "rigid")):
         with pytest.raises(CFlowError, match=complaint):
             PosedLog(drive, wrong)

@@ -1,4 +1,4 @@
-"""The synthetic drive: geometry against brute force, truth against the next sweep, seeds, poses."""
+"""Simulated drives: rays against brute force, truth against the next sweep, seeds, ways."""
 
 from __future__ import annotations
 
@@ -9,15 +9,17 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
-from cflow_torch.data.log import window
-from cflow_torch.simulator import make_drive
-from cflow_torch.simulator.drive import AXLE_HEIGHT
+from cflow_torch.simulator import make_drive, raycast
+from cflow_torch.simulator.drive import Drive
 from cflow_torch.simulator.ground import Ground
 from cflow_torch.simulator.lidar import scan
-from cflow_torch.simulator.objects import Body, Route, Towed
+from cflow_torch.simulator.objects import Route, Towed
 from cflow_torch.simulator.profiles import PROFILES
+from cflow_torch.simulator.range_image import cast_shots
 from cflow_torch.simulator.raycast import BOX, CYLINDER, ELLIPSOID, Solids, cast_solids, ray_directions
-from cflow_torch.simulator.street import build_street
+from cflow_torch.simulator.rolling import Shots
+from cflow_torch.simulator.scene import Scene, SolidTable
+from cflow_torch.simulator.scenes import SCENES
 from cflow_torch.types import CFlowError
 
 
@@ -38,63 +40,90 @@ def brute_force(solids, origin, directions):
         o = (to_unit[:3, :3] @ origin + to_unit[:3, 3]) / half
         d = (to_unit[:3, :3] @ directions) / half[:, None]
         low, high = np.full(d.shape[1], -np.inf), np.full(d.shape[1], np.inf)
-        axes = {BOX: (0, 1, 2), CYLINDER: (2,), ELLIPSOID: ()}[int(kind)]
-        for k in axes:
-            ends = np.sort(np.stack([(-1 - o[k]) / d[k], (1 - o[k]) / d[k]]), axis=0)
-            low, high = np.maximum(low, ends[0]), np.minimum(high, ends[1])
-        round_axes = {BOX: 0, CYLINDER: 2, ELLIPSOID: 3}[int(kind)]
-        if round_axes:
-            o, d = o[:round_axes], d[:round_axes]
-            a, b, c = (d * d).sum(0), (o[:, None] * d).sum(0), (o * o).sum() - 1
-            with np.errstate(invalid="ignore"):
+        with np.errstate(all="ignore"):
+            for k in {BOX: (0, 1, 2), CYLINDER: (2,), ELLIPSOID: ()}[int(kind)]:
+                ends = np.sort(np.stack([(-1 - o[k]) / d[k], (1 - o[k]) / d[k]]), axis=0)
+                low, high = np.maximum(low, ends[0]), np.minimum(high, ends[1])
+            round_axes = {BOX: 0, CYLINDER: 2, ELLIPSOID: 3}[int(kind)]
+            if round_axes:
+                o, d = o[:round_axes], d[:round_axes]
+                a, b, c = (d * d).sum(0), (o[:, None] * d).sum(0), (o * o).sum() - 1
                 root = np.sqrt(b * b - a * c)
-            low, high = np.fmax(low, (-b - root) / a), np.fmin(high, (-b + root) / a)
-            high[np.isnan(root)] = -np.inf
+                low, high = np.fmax(low, (-b - root) / a), np.fmin(high, (-b + root) / a)
+                high[np.isnan(root)] = -np.inf
         hit = (low <= high) & (low > 0)
         ranges[p, hit] = low[hit]
     return ranges
 
 
-def random_solids(rng, number, spread=30.0):
+def random_solids(rng, number):
     """Solids of all kinds, turned any way, none around the origin; one long wall, one beam overhead."""
     pose = np.tile(np.eye(4), (number, 1, 1))
     pose[:, :3, :3] = np.linalg.qr(rng.normal(size=(number, 3, 3)))[0]
     pose[:, :3, :3] *= np.linalg.det(pose[:, :3, :3])[:, None, None]
-    pose[:, :3, 3] = rng.uniform(-spread, spread, (number, 3)) * (1, 1, 0.2)
-    half = rng.uniform(0.05, 1.5, (number, 3))
-    pose[0, :3, :3], pose[0, :3, 3], half[0] = np.eye(3), (0, 4, 0), (40, 0.1, 2)
-    pose[1, :3, :3], pose[1, :3, 3], half[1] = np.eye(3), (0, 0, 3), (5, 5, 0.1)
+    pose[:, :3, 3] = rng.uniform(-30, 30, (number, 3)) * (1, 1, 0.2)
+    half, kind = rng.uniform(0.05, 1.5, (number, 3)), rng.integers(0, 3, number)
+    pose[0, :3, :3], pose[0, :3, 3], half[0], kind[0] = np.eye(3), (0, 4, 0), (40, 0.1, 2), BOX
+    pose[1, :3, :3], pose[1, :3, 3], half[1], kind[1] = np.eye(3), (0, 0, 3), (5, 5, 0.1), BOX
     keep = np.linalg.norm(pose[:, :3, 3], axis=1) > 2.9
-    kind = rng.integers(0, 3, number)
-    kind[:2] = BOX
     kind, pose, half = kind[keep], pose[keep], half[keep]
     return Solids(*map(torch.from_numpy, (kind, pose, half, np.full(len(kind), 0.5, np.float32), kind < 0)))
 
 
 @pytest.mark.parametrize("max_candidates", [1 << 20, 100])
-def test_cast_solids_equals_brute_force(max_candidates):
-    solids = random_solids(np.random.default_rng(0), 150)
+def test_cast_solids_equals_brute_force(max_candidates, monkeypatch):
+    monkeypatch.setattr(raycast, "_MAX_CANDIDATES", max_candidates)
+    solids = random_solids(np.random.default_rng(0), 80)
     azimuth = 0.003 + 2 * math.pi / 180 * torch.arange(180, dtype=torch.float64)
     elevation = torch.linspace(-0.5, 1.2, 24, dtype=torch.float64)
-    distance, solid = cast_solids(
-        solids.kind, torch.linalg.inv(solids.pose), solids.half_size, azimuth, elevation, 200.0, max_candidates
-    )
+    T_solid_sensor = torch.linalg.inv(solids.pose)
+    distance, solid = cast_solids(solids.kind, T_solid_sensor, solids.half_size, azimuth, elevation, 200.0)
     expected = brute_force(solids, np.zeros(3), ray_directions(azimuth, elevation).numpy())
     nearest = expected.min(0)
     # A ray that grazes an edge may be decided either way in float32; there are a few in 4,320.
     agree = np.isclose(distance.numpy(), nearest, rtol=0, atol=1e-3)  # inf is close to inf only
-    assert agree.mean() > 0.999
-    assert 0.2 < np.isfinite(nearest).mean() < 0.95
+    assert agree.mean() > 0.999 and 0.2 < np.isfinite(nearest).mean() < 0.95
     hit = agree & np.isfinite(nearest)
     assert (solid.numpy()[hit] == expected.argmin(0)[hit]).mean() > 0.999
     assert (solid.numpy()[~np.isfinite(distance.numpy())] == -1).all()
 
 
-def test_cast_solids_of_an_empty_scene_hits_nothing():
-    empty = torch.zeros(0, dtype=torch.int64), torch.zeros(0, 4, 4).double(), torch.zeros(0, 3).double()
-    azimuth, elevation = torch.arange(8).double() * math.pi / 4, torch.zeros(2).double()
-    distance, solid = cast_solids(*empty, azimuth, elevation, 100.0)
-    assert distance.isinf().all() and (solid == -1).all() and len(solid) == 16
+@pytest.mark.parametrize("name", ["av2_rolling", "aevascenes", "waymo"])
+def test_rolling_shots_equal_brute_force(name):
+    """Every ray at its own time, from where its LiDAR then is, against every solid where that then is."""
+    street = SCENES["street"](np.random.default_rng([3, 0]))
+    bodies = tuple(body for body in street.bodies if body.category or len(body.solids) < 5)[:90]
+    scene = Scene(street.ground, street.ego, bodies, SolidTable.of(bodies))
+    drive = Drive(scene, PROFILES[name], 0, 2, "small")
+    seconds = float(drive._seconds[1])
+    ego, solids = drive._motion.ego_motion(seconds), drive._motion.solids(1)
+    checked = wrong = wrong_solid = 0
+    for number in (0, 1):
+        unit = drive._profile.units[number]
+        first, end = unit.seen or (0, unit.num_columns)
+        chosen = np.linspace(0, end - first - 1, 12).astype(int)
+        T_world_sensor = ego.T_world_unit[number].clone()
+        T_world_sensor[:, :3, 3] -= solids.origin
+        azimuth = np.radians(unit.start + unit.span / unit.num_columns * (np.arange(first, end) + 0.5))
+        up = drive.elevations(unit.name)
+        speed = (0.0, 0.0) if unit.is_virtual else ego.speed
+        shots = Shots(torch.from_numpy(azimuth), ego.seconds[number], T_world_sensor, torch.from_numpy(up), speed)
+        max_range = unit.max_range or drive._profile.max_range
+        image, _ = cast_shots(shots, solids, scene.ground, max_range)
+        distance, solid = (values.view(len(azimuth), -1).numpy() for values in (image.distance, image.solid))
+        for column in chosen:
+            now, T = float(ego.seconds[number][column]), ego.T_world_unit[number][column].numpy()
+            there = scene.solids(now, scene.body_poses(np.array([now]))[0])
+            ray = np.stack([np.cos(azimuth[column]) * np.cos(up), np.sin(azimuth[column]) * np.cos(up), np.sin(up)])
+            ranges = brute_force(there, T[:3, 3], T[:3, :3] @ ray)
+            ground, _ = scene.ground.cast(torch.from_numpy(T[:3, 3].copy()), torch.from_numpy(T[:3, :3] @ ray))
+            nearest = np.minimum(ranges.min(0), ground.numpy())
+            who = np.where(ground.numpy() < ranges.min(0), -1, ranges.argmin(0))
+            in_reach = nearest < max_range
+            agree = np.isclose(distance[column], nearest, rtol=0, atol=2e-3)
+            checked, wrong = checked + in_reach.sum(), wrong + (in_reach & ~agree).sum()
+            wrong_solid += (in_reach & agree & (solid[column] != who)).sum()
+    assert checked > 200 and wrong <= 0.002 * checked and wrong_solid <= 0.01 * checked
 
 
 def test_ground_rays_end_on_the_first_surface_they_meet():
@@ -111,8 +140,7 @@ def test_ground_rays_end_on_the_first_surface_they_meet():
     on_face = (np.abs(depth) < 0.01) & (above_road > -1e-9) & (above_road < ground.kerb + 1e-9)
     assert ((on_road & (depth <= 0)) | (on_pavement & (depth > 0)) | on_face).all()
     assert on_road.sum() > 20 and on_pavement.sum() > 20 and (on_face & ~on_road & ~on_pavement).sum() >= 3
-    # Nothing was passed on the way.
-    for part in np.linspace(0, 0.999, 200):
+    for part in np.linspace(0, 0.999, 200):  # nothing was passed on the way
         x, y, z = (origin[:, None] + rays * t * part).numpy()
         assert (z > ground.height(x, y) - 1e-9).all()
     assert ((cosine > 0) & (cosine <= 1)).all()
@@ -120,163 +148,63 @@ def test_ground_rays_end_on_the_first_surface_they_meet():
 
 
 def test_nothing_is_seen_behind_a_wall():
-    """A wall at x = 10 hides the boxes behind it; a box beside it is seen."""
+    """A wall at x = 10 hides the box behind it; a box beside it is seen."""
     pose = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
     pose[:, :3, 3] = torch.tensor([[10.0, 0, 1], [20.0, 0, 1], [20.0, 30, 1]])
     half = torch.tensor([[0.1, 8, 3], [1, 1, 1], [1, 1, 1]], dtype=torch.float64)
-    plain = torch.ones(3)
-    solids = Solids(torch.zeros(3, dtype=torch.int64), pose, half, plain, plain < 0)
+    solids = Solids(torch.zeros(3, dtype=torch.int64), pose, half, torch.ones(3), torch.zeros(3) > 0)
     ground, ego = Ground(slope=(0.0, 0.0), curvature=0.0, kerb=0.0), torch.eye(4, dtype=torch.float64)
-    returns = scan(PROFILES["av2"], solids, ground, ego, torch.Generator().manual_seed(0), 10**8)
+    returns = scan(PROFILES["av2"], solids, ground, ego, torch.Generator().manual_seed(0))
     points, solid = returns.points.numpy(), returns.solid.numpy()
     assert (solid == 0).sum() > 1000 and (solid == 2).sum() > 20 and not (solid == 1).any()
-    shadow = (points[:, 0] > 10.2) & (np.abs(points[:, 1]) < 0.7 * points[:, 0]) & (points[:, 2] < 1.0)
-    assert not shadow.any()
-    lit = (solid < 0) & (points[:, 0] > 5) & (points[:, 0] < 9) & (np.abs(points[:, 1]) < 5)
-    assert lit.any()
+    assert not ((points[:, 0] > 10.2) & (np.abs(points[:, 1]) < 0.7 * points[:, 0]) & (points[:, 2] < 1.0)).any()
+    assert ((solid < 0) & (points[:, 0] > 5) & (points[:, 0] < 9) & (np.abs(points[:, 1]) < 5)).any()
     # Range noise: 1.5 cm on a plane that most rays meet nearly head on.
     front = points[(solid == 0) & (np.abs(points[:, 1]) < 2)]
     assert abs(front[:, 0].mean() - 9.9) < 2e-3 and 0.012 < front[:, 0].std() < 0.018
 
 
-def test_same_seed_same_bytes_in_any_order():
-    first, second = (make_drive(seed=7, num_sweeps=3, profile="demo") for _ in range(2))
-    ahead = [first.sweep(i).points.tobytes() for i in (0, 1, 2)]
-    back = [second.sweep(i).points.tobytes() for i in (2, 1, 0)]
-    assert ahead == back[::-1]
-    assert first.labels(1).flow.tobytes() == second.labels(1).flow.tobytes()
-    assert first.track_ids == second.track_ids
-    other = make_drive(seed=8, num_sweeps=3, profile="demo")
-    assert other.sweep(0).points.tobytes() != ahead[0] and other.track_ids != first.track_ids
+@pytest.mark.parametrize("name", ["demo", "nuscenes"])
+def test_same_seed_same_bytes_in_any_order(name):
+    first, second = (make_drive(seed=7, num_sweeps=2, profile=name, scene="narrow") for _ in range(2))
+    ahead = [first.sweep(i).points.tobytes() for i in (0, 1)]
+    first.sweep(0).points[:] = 0  # a caller's changes do not reach the drive
+    assert ahead == [second.sweep(i).points.tobytes() for i in (1, 0)][::-1]
+    assert first.labels(0).flow.tobytes() == second.labels(0).flow.tobytes() and first.track_ids == second.track_ids
+    assert make_drive(seed=8, num_sweeps=1, profile=name, scene="narrow").sweep(0).points.tobytes() != ahead[0]
 
 
-def test_a_callers_changes_do_not_reach_the_log():
-    log = make_drive(seed=7, num_sweeps=1, profile="demo")
-    before = log.sweep(0).points.copy()
-    log.sweep(0).points[:] = 0
-    log.sweep(0).pose[:] = 0
-    assert np.array_equal(log.sweep(0).points, before) and log.sweep(0).pose[3, 3] == 1
-
-
-def test_shapes_and_types(drive):
-    sweep, labels = drive.sweep(1), drive.labels(1)
-    number = len(sweep.points)
-    assert 60_000 < number < 115_200
-    assert sweep.points.dtype == np.float32 and sweep.points.shape == (number, 3) and np.isfinite(sweep.points).all()
-    assert sweep.is_ground.dtype == bool and 0.05 < sweep.is_ground.mean() < 0.5
-    assert sweep.pose.dtype == np.float64 and sweep.timestamp_ns == drive.timestamps[1]
-    assert np.diff(drive.timestamps).tolist() == [100_000_000] * 4
-    assert labels.flow.shape == (number, 3) and labels.flow.dtype == np.float32
-    assert labels.category.dtype == np.uint8 and labels.is_valid.dtype == bool
-    assert drive.labels(4) is None
-    channels = drive.channels(1)
-    assert np.array_equal(np.unique(channels.laser_number), np.arange(64))
-    assert channels.offset_ns.min() >= 0 and channels.offset_ns.max() < 100_000_000
-    assert len(window(drive, 3, num_history=2).pch) == 2
-
-
-def test_poses_form_a_smooth_drive_with_a_turn(drive):
-    R = drive.poses[:, :3, :3]
-    assert np.allclose(R @ R.transpose(0, 2, 1), np.eye(3), atol=1e-12) and np.allclose(np.linalg.det(R), 1)
-    steps = np.linalg.norm(np.diff(drive.poses[:, :3, 3], axis=0), axis=1)
-    assert np.allclose(steps, drive.scene.ego.speed * 0.1, rtol=0.01)
-    yaw = np.unwrap(np.arctan2(R[:, 1, 0], R[:, 0, 0]))
-    assert math.degrees(yaw[-1] - yaw[-2]) > 1.0
-
-
-def test_ground_is_level_with_the_wheels_and_exact(drive):
-    sweep = drive.sweep(2)
-    near = sweep.is_ground & (np.hypot(*sweep.points[:, :2].T) < 7)
-    assert near.sum() > 100 and abs(np.median(sweep.points[near, 2]) + AXLE_HEIGHT) < 0.05
-    world = transform(sweep.pose, sweep.points[sweep.is_ground].astype(float))
-    height = drive.scene.ground.height(world[:, 0].copy(), world[:, 1].copy())
-    off = np.abs(world[:, 2] - height)
-    depth = drive.scene.ground.pavement_depth(*torch.from_numpy(world[:, :2].copy()).T).numpy()
-    at_kerb = np.abs(depth) < 0.1  # a few centimetres of range noise change the level there
-    assert off[~at_kerb].max() < 0.05 and off.max() < drive.scene.ground.kerb + 0.05
-    assert at_kerb.mean() < 0.1
-
-
-def test_static_flow_is_ego_motion(drive):
+def test_the_static_world_moves_with_the_ego_car_and_the_ground_is_the_ground(drive):
     for i in range(4):
         sweep, labels = drive.sweep(i), drive.labels(i)
-        static = labels.category == 0
+        static, points = labels.category == 0, sweep.points.astype(float)
         T = np.linalg.inv(drive.poses[i + 1]) @ drive.poses[i]
-        points = sweep.points[static].astype(float)
-        assert static.sum() > 40_000 and static[sweep.is_ground].all()
-        assert np.abs(transform(T, points) - points - labels.flow[static]).max() < 2e-6
-        assert labels.is_valid[static].all()
-
-
-def test_static_world_stays_where_it_is(drive):
-    clouds = []
-    for i in (0, 3):
-        points, keep = drive.sweep(i).points, drive.labels(i).category == 0
-        keep &= ~drive.sweep(i).is_ground & (np.linalg.norm(points, axis=1) < 15)
-        clouds.append(transform(drive.poses[i], points[keep].astype(float)))
-    distance, _ = cKDTree(clouds[1]).query(clouds[0])
-    assert len(distance) > 5000 and np.median(distance) < 0.05
+        assert static.sum() > 40_000 and static[sweep.is_ground].all() and labels.is_valid[static].all()
+        assert np.abs(transform(T, points) - points - labels.flow)[static].max() < 2e-6
+    assert drive.labels(4) is None
+    world = transform(sweep.pose, points[sweep.is_ground])
+    off = np.abs(world[:, 2] - drive.scene.ground.height(world[:, 0].copy(), world[:, 1].copy()))
+    depth = drive.scene.ground.pavement_depth(*torch.from_numpy(world[:, :2].copy()).T).numpy()
+    at_kerb = np.abs(depth) < 0.1  # a few centimetres of range noise change the level there
+    assert off[~at_kerb].max() < 0.05 and off.max() < drive.scene.ground.kerb + 0.05 and at_kerb.mean() < 0.1
 
 
 def test_flow_moves_points_onto_the_same_object_in_the_next_sweep(drive):
     """Boxy objects with enough returns; movers must land, and would not without their own motion."""
-    body = [drive._body_of(drive.returns(i)) for i in (1, 2)]
-    points = [drive.sweep(i).points.astype(float) for i in (1, 2)]
-    labels = drive.labels(1)
+    body, points = zip(*((drive._body_of(drive.returns(i)), drive.sweep(i).points.astype(float)) for i in (1, 2)))
     static = transform(np.linalg.inv(drive.poses[2]) @ drive.poses[1], points[0])
-    checked, missed_without = {}, 0
+    landed_at, checked, missed_without = points[0] + drive.labels(1).flow, [], 0
     for b, thing in enumerate(drive.scene.bodies):
         rows, target = body[0] == b, body[1] == b
         if thing.category in (None, "PEDESTRIAN", "BICYCLIST") or rows.sum() < 300 or target.sum() < 300:
             continue
         tree = cKDTree(points[1][target])
-        landed = np.median(tree.query(points[0][rows] + labels.flow[rows])[0])
+        landed = np.median(tree.query(landed_at[rows])[0])
         assert landed < 0.1, thing.category
-        checked[thing.category] = checked.get(thing.category, 0) + 1
-        speed = np.linalg.norm((points[0] + labels.flow - static)[rows], axis=1).mean()
-        if speed > 0.4:
+        checked.append(thing.category)
+        if np.linalg.norm((landed_at - static)[rows], axis=1).mean() > 0.4:
             missed_without += np.median(tree.query(static[rows])[0]) > landed
-    assert set(checked) >= {"REGULAR_VEHICLE", "BUS", "TRUCK_CAB", "VEHICULAR_TRAILER"} and sum(checked.values()) >= 8
-    assert missed_without >= 2
-
-
-def test_traffic_has_the_promised_variety():
-    drive = make_drive(seed=0, num_sweeps=2, profile="av2")
-    sweep, labels = drive.sweep(0), drive.labels(0)
-    T = np.linalg.inv(drive.poses[1]) @ drive.poses[0]
-    residual = labels.flow - (transform(T, sweep.points.astype(float)) - sweep.points)
-    speed, distance = 10 * np.linalg.norm(residual, axis=1), np.linalg.norm(sweep.points[:, :2], axis=1)
-    assert set(np.unique(labels.category)) == {0, 4, 7, 17, 19, 26, 27}
-    assert 15 < speed.max() < 21
-    assert ((speed > 3) & (distance > 40) & (distance < 60)).sum() > 50
-    parked = (labels.category == 19) & (speed < 1e-3)
-    assert parked.sum() > 1000
-    ways = np.stack([body.way(np.array([0.0, 0.1])) for body in drive.scene.bodies])
-    turning = [b.category for b, way in zip(drive.scene.bodies, ways) if abs(way[1, 2] - way[0, 2]) > 0.02]
-    assert "REGULAR_VEHICLE" in turning and "TRUCK_CAB" in turning
-
-
-def test_legs_swing_but_their_truth_is_the_track(drive):
-    walker = next(i for i, b in enumerate(drive.scene.bodies) if b.category == "PEDESTRIAN" and b.way.speed > 1)
-    solids = np.flatnonzero(drive.scene.table.body == walker)
-    poses = [
-        drive.scene.solids(0.1 * i, drive._body_poses[i]).pose.numpy()[solids] for i in (0, 1)
-    ]  # trunk, head, leg, leg
-    relative = [np.linalg.inv(drive._body_poses[i, walker]) @ poses[i] for i in (0, 1)]
-    moved = np.abs(relative[1] - relative[0]).reshape(len(solids), -1).max(1)
-    assert (moved[:2] < 1e-12).all() and (moved[2:] > 0.01).all()
-
-
-def test_boxes_hold_their_points(drive):
-    boxes, points, labels = drive.boxes(1), drive.sweep(1).points.astype(float), drive.labels(1)
-    inside_any = np.zeros(len(points), bool)
-    for pose, size, number in zip(boxes.pose, boxes.size, boxes.num_points):
-        local = (points - pose[:3, 3]) @ pose[:3, :3]
-        inside = (np.abs(local) < size / 2).all(1)
-        assert inside.sum() >= 0.98 * number
-        inside_any |= inside
-    assert inside_any[labels.category > 0].mean() > 0.995
-    assert boxes.num_points.sum() == (labels.category > 0).sum()
+    assert set(checked) >= {"REGULAR_VEHICLE", "BUS", "TRUCK_CAB", "VEHICULAR_TRAILER"} and missed_without >= 2
 
 
 def test_labels_of_bodies_that_leave_the_annotated_range_are_invalid():
@@ -292,54 +220,29 @@ def test_labels_of_bodies_that_leave_the_annotated_range_are_invalid():
     assert (drive.labels(0).category[body == seen] == 0).all()
 
 
-def test_traffic_does_not_collide_in_the_first_second():
-    """Footprints of annotated bodies, by separating axes; the truck's cab and trailer share the hitch."""
-    seconds = np.array([0.0, 0.5, 1.0])
-    signs = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) / 2
-    for seed in range(12):
-        scene = build_street(np.random.default_rng(seed))
-        bodies = [b for b in scene.bodies if b.category]
-        ego = Body([], scene.ego, "REGULAR_VEHICLE", (4.8, 1.9, 1.6))
-        for second in seconds:
-            ways = np.stack([b.way(np.array([second]))[0] for b in (*bodies, ego)])
-            ways[-1, :2] += 1.4 * np.array([np.cos(ways[-1, 2]), np.sin(ways[-1, 2])])  # rear axle to middle
-            axes = np.stack([[np.cos(ways[:, 2]), np.sin(ways[:, 2])], [-np.sin(ways[:, 2]), np.cos(ways[:, 2])]])
-            axes = axes.transpose(2, 0, 1)  # (M, which, xy)
-            sizes = np.array([b.size[:2] for b in (*bodies, ego)])
-            corners = ways[:, None, :2] + np.einsum("ck,mk,mkx->mcx", signs, sizes, axes)
-            spans = np.einsum("mcx,nkx->mnkc", corners, axes)  # corners of m along the axes of n
-            own = np.einsum("mcx,mkx->mkc", corners, axes)
-            apart = (spans.max(-1) < own.min(-1)[None]) | (spans.min(-1) > own.max(-1)[None])
-            apart = apart.any(-1)
-            collides = np.argwhere(~(apart | apart.T))
-            pairs = {
-                tuple(sorted(((*bodies, ego)[i].category, (*bodies, ego)[j].category))) for i, j in collides if i < j
-            }
-            assert pairs <= {("TRUCK_CAB", "VEHICULAR_TRAILER"), ("PEDESTRIAN", "PEDESTRIAN")}, (seed, second)
-
-
-def test_route_is_continuous_and_a_trailer_cuts_the_corner():
+def test_ways_are_continuous_trailers_cut_corners_and_what_brakes_stops():
     route = Route(1.0, 2.0, 0.3, start=-5, speed=4, radius=9, angle=-1.2)
     seconds = np.arange(0, 8, 0.01)
     way = route(seconds)
     assert np.allclose(np.hypot(*np.diff(way[:, :2], axis=0).T), 0.04, atol=1e-6)
     assert way[-1, 2] == pytest.approx(0.3 - 1.2) and np.abs(np.diff(way[:, 2])).max() < 0.005
-    towed = Towed(route, hitch=1.0, wheelbase=6.0, middle=3.0)
-    trailer = towed(seconds)
+    trailer = Towed(route, hitch=1.0, wheelbase=6.0, middle=3.0)(seconds)
     hitch = way[:, :2] - np.stack([np.cos(way[:, 2]), np.sin(way[:, 2])], -1)
     assert np.allclose(np.hypot(*(hitch - trailer[:, :2]).T), 3.0, atol=0.01)
     bend = np.abs(trailer[:, 2] - way[:, 2])
     assert bend.max() > 0.3 and bend[0] < 1e-6
-    assert np.allclose(towed(seconds[300:301]), trailer[300:301], atol=2e-3)
+    brakes = Route(0.0, 0.0, speed=4.0, acceleration=-2.0)
+    assert np.allclose(brakes(np.arange(4.0))[:, 0], [0, 3, 4, 4]) and not brakes.stands
+    starts = Route(0.0, 0.0, speed=2.0, acceleration=1.0)
+    assert np.allclose(starts(np.array([-3.0, -2.0, 0.0, 2.0]))[:, 0], [-2, -2, 0, 6])
 
 
-@pytest.mark.parametrize("wrong", [{"seed": -1}, {"num_sweeps": 0}, {"profile": "sonar"}])
-def test_wrong_arguments_are_refused(wrong):
-    with pytest.raises(CFlowError):
+@pytest.mark.parametrize(
+    "wrong", [{"seed": -1}, {"num_sweeps": 0}, {"profile": "sonar"}, {"scene": "moon"}, {"weather": "hail"}]
+)
+def test_wrong_arguments_are_refused(wrong, drive):
+    with pytest.raises(CFlowError, match="choose one of|must be"):
         make_drive(**wrong)
-
-
-def test_a_missing_sweep_is_refused(drive):
-    for index in (-1, 5):
-        with pytest.raises(CFlowError, match="sweeps 0 ... 4"):
-            drive.sweep(index)
+    for call in (lambda: drive.sweep(-1), lambda: drive.sweep(5), lambda: drive.elevations("FRONT")):
+        with pytest.raises(CFlowError, match="synthetic-av2-0003 has"):
+            call()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Callable, Dict, Mapping, Optional, Sequence, Union
+from typing import Mapping, Sequence
 
 import numpy as np
 import pyarrow as pa
@@ -12,10 +12,9 @@ from pyarrow import feather, parquet
 from cflow_torch.data.arrays.pcd import read_pcd, write_pcd
 from cflow_torch.data.arrays.ply import read_ply, write_ply
 from cflow_torch.data.atomic import atomic_file
-from cflow_torch.data.feather_file import FeatherFile
+from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.npy_file import Header, read_npy, read_npz
-from cflow_torch.data.parquet_file import ParquetFile
-from cflow_torch.data.paths import Place, as_path, read_bytes, remote_errors, whole
+from cflow_torch.data.paths import Place, as_path, read_bytes
 from cflow_torch.types import CFlowError
 
 SUFFIXES = (".npy", ".npz", ".bin", ".pcd", ".ply", ".feather", ".parquet")
@@ -38,7 +37,7 @@ def read_cloud(path: Place, bin_columns: int = KITTI_COLUMNS) -> np.ndarray:
         - `.npy`: (N, 3+) floats, columns x, y, z first; or a structured array with fields x, y, z.
         - `.npz`: arrays x, y, z; or one (N, 3+) array, called points, lidar, xyz or pc if there are several.
         - `.bin`: little-endian float32, `bin_columns` per point.
-        - `.pcd`, `.ply`: fields x, y, z.
+        - `.pcd` (extra `clouds`), `.ply`: fields x, y, z.
         - `.feather`, `.parquet`: columns x, y, z; where there are none of these names, the first three.
         Anything else in the file is ignored. Nothing is unpickled.
 
@@ -49,9 +48,6 @@ def read_cloud(path: Place, bin_columns: int = KITTI_COLUMNS) -> np.ndarray:
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise CFlowError(f"{path} has suffix {suffix!r}; clouds are {', '.join(SUFFIXES)}")
-    with remote_errors(path):
-        if not path.is_file():
-            raise CFlowError(f"{path} does not exist")
     if suffix == ".bin":
         points = _read_bin(path, bin_columns)
     elif suffix in (".pcd", ".ply"):
@@ -66,13 +62,12 @@ def read_cloud(path: Place, bin_columns: int = KITTI_COLUMNS) -> np.ndarray:
     return points.astype(points.dtype.newbyteorder("="), copy=False)
 
 
-def write_cloud(path: Place, points: np.ndarray, intensity: Optional[np.ndarray] = None) -> None:
+def write_cloud(path: Place, points: np.ndarray) -> None:
     """Write a cloud in the format of the suffix, atomically.
 
     Args:
         path: file name with one of `SUFFIXES`.
-        points: (N, 3) float32 or float64, metres. `.bin` files are float32 whatever is given.
-        intensity: (N,) float, 0 ... 1; a column more. `.bin` files have zeros where it is not given.
+        points: (N, 3) float32 or float64, metres. `.bin` files are float32 whatever is given, with a reflectance of 0.
 
     Raises:
         CFlowError: an unknown suffix, or points of another shape.
@@ -84,33 +79,23 @@ def write_cloud(path: Place, points: np.ndarray, intensity: Optional[np.ndarray]
     if points.ndim != 2 or points.shape[1] != 3 or points.dtype not in (np.float32, np.float64):
         raise CFlowError(f"points have shape {points.shape} and dtype {points.dtype}; give (N, 3) float32 or float64")
     fields = {axis: np.ascontiguousarray(points[:, k]) for k, axis in enumerate(_AXES)}
-    if intensity is not None:
-        fields["intensity"] = np.asarray(intensity, points.dtype)
-    if suffix == ".pcd":
-        write_pcd(path, fields)
-    elif suffix == ".ply":
-        write_ply(path, fields)
-    elif suffix == ".bin":
-        reflectance = np.zeros(len(points)) if intensity is None else intensity
-        table = np.column_stack([points, reflectance]).astype("<f4")
-        _write(path, lambda file: file.write(table.tobytes()))
-    elif suffix == ".npy":
-        _write(path, lambda file: np.save(file, np.column_stack(list(fields.values()))))
-    elif suffix == ".npz":
-        _write(path, lambda file: np.savez(file, points=np.column_stack(list(fields.values()))))
-    else:
-        table = pa.table({name: pa.array(values) for name, values in fields.items()})
-        write = feather.write_feather if suffix == ".feather" else parquet.write_table
-        _write(path, lambda file: write(table, file))
+    if suffix in (".pcd", ".ply"):
+        (write_pcd if suffix == ".pcd" else write_ply)(path, fields)
+        return
+    with atomic_file(path) as file:
+        if suffix == ".bin":
+            file.write(np.pad(points, ((0, 0), (0, 1))).astype("<f4").tobytes())
+        elif suffix == ".npy":
+            np.save(file, points)
+        elif suffix == ".npz":
+            np.savez(file, points=points)
+        else:
+            (feather.write_feather if suffix == ".feather" else parquet.write_table)(pa.table(fields), file)
 
 
 def _read_bin(path: Path, columns: int) -> np.ndarray:
-    if columns < 3:
-        raise CFlowError(f"bin_columns={columns}: a point has three coordinates at least")
-    try:
+    with file_errors(path):
         data = read_bytes(path)
-    except OSError as error:
-        raise CFlowError(f"cannot read {path} ({error}); copy it again") from error
     if len(data) % (4 * columns):
         raise CFlowError(
             f"{path} has {len(data)} bytes, no multiple of {4 * columns} ({columns} float32 a point): it is truncated, "
@@ -130,7 +115,9 @@ def _read_numpy(path: Path) -> np.ndarray:
         stored = read_npy(path, mend)
     if stored.dtype.names is not None:
         return _from_fields(path, {name: stored[name] for name in stored.dtype.names})
-    return _table(path, stored)
+    if stored.ndim != 2 or stored.shape[1] < 3:
+        raise CFlowError(f"{path} holds an array of shape {stored.shape}; give (N, 3+), columns x, y, z first")
+    return stored
 
 
 def _choose(path: Path, arrays: Mapping[str, Header]) -> Sequence[str]:
@@ -148,48 +135,26 @@ def _choose(path: Path, arrays: Mapping[str, Header]) -> Sequence[str]:
 
 
 def _read_table(path: Path) -> np.ndarray:
-    try:
-        if path.suffix.lower() == ".feather":
-            table = _positions(path, FeatherFile(path))
-        else:
-            with ParquetFile(path, whole(path)) as file:
-                table = _positions(path, file)
-    except OSError as error:
-        raise CFlowError(f"cannot read {path}: {error}") from error
-    fields: Dict[str, np.ndarray] = {}
-    for name in table.column_names:
-        if not pa.types.is_floating(table.schema.field(name).type) or table.column(name).null_count:
-            raise CFlowError(f"{path}: column {name} must be floating-point metres without empty entries")
-        fields[name] = table.column(name).to_numpy()
-    return np.stack(list(fields.values()), axis=1)
-
-
-def _positions(path: Path, file: Union[FeatherFile, ParquetFile]) -> pa.Table:
-    """The three columns of the positions."""
-    names = _AXES if all(axis in file.names for axis in _AXES) else tuple(file.names[:3])
-    if len(names) < 3:
-        raise CFlowError(f"{path} has the columns {file.names}; it needs x, y, z")
-    return file.read(names).select(names)
+    read = feather.read_table if path.suffix.lower() == ".feather" else parquet.read_table
+    with file_errors(path):
+        table = read(pa.BufferReader(read_bytes(path)), use_threads=False)
+        table.validate(full=True)
+    names = table.column_names
+    chosen = _AXES if all(axis in names for axis in _AXES) else tuple(names[:3])
+    columns = [table.column(names.index(name)) for name in chosen]
+    if len(columns) < 3:
+        raise CFlowError(f"{path} has the columns {names}; it needs x, y, z")
+    if any(not pa.types.is_floating(column.type) or column.null_count for column in columns):
+        raise CFlowError(f"{path}: {', '.join(chosen)} must be floating-point metres without empty entries")
+    return np.stack([column.to_numpy() for column in columns], axis=1)
 
 
 def _from_fields(path: Path, fields: Mapping[str, np.ndarray]) -> np.ndarray:
-    missing = [axis for axis in _AXES if axis not in fields]
-    if missing:
-        raise CFlowError(f"{path} has the fields {list(fields)}; it lacks {', '.join(missing)}")
-    columns = [fields[axis] for axis in _AXES]
-    if any(column.ndim != 1 or len(column) != len(columns[0]) for column in columns):
+    columns = [fields[axis] for axis in _AXES if axis in fields]
+    if len(columns) < 3:
+        raise CFlowError(f"{path} has the fields {list(fields)}; it needs x, y, z")
+    if len({column.shape for column in columns}) > 1 or columns[0].ndim != 1:
         raise CFlowError(f"{path}: x, y, z have shapes {[column.shape for column in columns]}; give (N,) each")
     if any(column.dtype.kind not in "fiu" for column in columns):
         raise CFlowError(f"{path}: x, y, z have dtypes {[str(column.dtype) for column in columns]}; give numbers")
     return np.stack(columns, axis=1)
-
-
-def _table(path: Path, array: np.ndarray) -> np.ndarray:
-    if array.ndim != 2 or array.shape[1] < 3:
-        raise CFlowError(f"{path} holds an array of shape {array.shape}; give (N, 3+), columns x, y, z first")
-    return array
-
-
-def _write(path: Path, write: Callable[[Any], Any]) -> None:
-    with atomic_file(path) as file:
-        write(file)

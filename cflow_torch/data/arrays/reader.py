@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Dict, List, Optional, Sequence, Tuple
 
 import numpy as np
 
 from cflow_torch.data.arrays.cloud_file import KITTI_COLUMNS, SUFFIXES, read_cloud
-from cflow_torch.data.arrays.poses_text import Trajectory, poses_at, read_poses, read_times
+from cflow_torch.data.arrays.poses_text import (
+    Trajectory,
+    checked_poses,
+    poses_at,
+    read_calibration,
+    read_poses,
+    read_times,
+)
 from cflow_torch.data.folders import find_folders
 from cflow_torch.data.log import FlowLabels
 from cflow_torch.data.npy_file import read_npy
@@ -39,6 +47,7 @@ def find_array_logs(root: Place) -> List[Path]:
     Raises:
         CFlowError: `root` is no folder.
     """
+
     what = "a folder with one point cloud per file, or a folder of such"
     return find_folders(
         as_path(root),
@@ -101,6 +110,8 @@ class ArraysLog:
             raise CFlowError(f"{self.folder} is no folder; give a folder with one point cloud per file")
         if poses_of not in ("ego", "lidar"):
             raise CFlowError(f"poses_of={poses_of!r}: give 'ego' or 'lidar'")
+        if type(bin_columns) is not int or bin_columns < 3:
+            raise CFlowError(f"bin_columns={bin_columns!r}: give a whole number, 3 or more")
         self.log_id = self.folder.resolve().name
         self.files = _one_suffix(self.folder, suffix)
         self._bin_columns = bin_columns
@@ -123,8 +134,7 @@ class ArraysLog:
         Raises:
             CFlowError: no such sweep, or its files cannot be read.
         """
-        if not 0 <= index < len(self.files):
-            raise CFlowError(f"log {self.log_id} has sweeps 0 ... {len(self.files) - 1}, asked for {index}")
+        self._check(index)
         points = read_cloud(self.files[index], self._bin_columns)
         if not np.array_equal(self.ego_T_lidar, np.eye(4)):
             points = points.astype(np.float64) @ self.ego_T_lidar[:3, :3].T + self.ego_T_lidar[:3, 3]
@@ -139,9 +149,12 @@ class ArraysLog:
         Raises:
             CFlowError: no such sweep.
         """
+        self._check(index)
+        return None
+
+    def _check(self, index: int) -> None:
         if not 0 <= index < len(self.files):
             raise CFlowError(f"log {self.log_id} has sweeps 0 ... {len(self.files) - 1}, asked for {index}")
-        return None
 
     def _trajectory(self, poses: Any, calibration: Any) -> Tuple[Optional[Trajectory], str, bool]:
         """The poses given or found, what to call them, and whether a calibration made them the LiDAR's."""
@@ -152,19 +165,18 @@ class ArraysLog:
                 return None, "", False
             trajectory = read_poses(file)
             chosen = _beside(self.folder, calibration, ("calib.txt",), "calibration")
-            if chosen is not None and (calibration != "auto" or trajectory.layout == "kitti"):
-                return read_poses(file, chosen), str(file), True
-            return trajectory, str(file), False
+            if chosen is None or (calibration == "auto" and trajectory.layout != "kitti"):
+                return trajectory, str(file), False
+            T_cam_lidar = read_calibration(chosen)
+            in_lidar = np.linalg.inv(T_cam_lidar) @ trajectory.poses @ T_cam_lidar
+            return replace(trajectory, poses=in_lidar), str(file), True
         if poses is None:
             return None, "", False
         try:
-            matrices = np.asarray(poses, np.float64)
-        except (TypeError, ValueError, OverflowError) as error:
-            raise CFlowError(f"poses={poses!r:.80} are no numbers ({error}); give (K, 4, 4), one per sweep") from None
-        if matrices.ndim != 3 or not len(matrices):
-            raise CFlowError(f"poses have shape {matrices.shape}; give (K, 4, 4), one per sweep")
-        checked = [rigid_transform(pose, f"poses[{row}]") for row, pose in enumerate(matrices)]
-        return Trajectory(np.stack(checked), None, "matrix"), "poses", False
+            matrices = np.asarray(poses)
+        except ValueError as error:
+            raise CFlowError(f"poses are no matrices ({error}); give (K, 4, 4), one per sweep") from error
+        return Trajectory(checked_poses(matrices, "poses"), None, "matrix"), "poses", False
 
     def _times(self, times: Any, trajectory: Optional[Trajectory]) -> Optional[List[int]]:
         """Nanoseconds of each sweep, None = unknown."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 from typing import Optional, Union
 
@@ -55,13 +54,11 @@ def _write(log: Log, folder: Path, suffix: str, poses: Optional[str]) -> None:
         write_cloud(folder / "points" / f"{index:06d}{suffix}", np.asarray(sweep.points)[:, :3])
         transforms.append(sweep.pose)
         times.append(sweep.timestamp_ns)
-        masks.append(sweep.is_ground is not None)
-        if sweep.is_ground is not None:
-            file = folder / GROUND_FOLDER / f"{index:06d}.npy"
-            file.parent.mkdir(exist_ok=True)
-            np.save(file, np.asarray(sweep.is_ground))
-    if any(masks) and not all(masks):
-        shutil.rmtree(folder / GROUND_FOLDER)
+        masks.append(sweep.is_ground)
+    if all(mask is not None for mask in masks):
+        (folder / GROUND_FOLDER).mkdir()
+        for index, mask in enumerate(masks):
+            np.save(folder / GROUND_FOLDER / f"{index:06d}.npy", np.asarray(mask))
     known = [time for time in times if time is not None]
     if len(known) == len(times):
         write_times(folder / "times.txt", known)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import uuid
 from pathlib import Path
 from typing import Any, Dict, List, Sequence, Union
@@ -11,11 +10,11 @@ from typing import Any, Dict, List, Sequence, Union
 import numpy as np
 
 from cflow_torch.data.aevascenes.reader import CATEGORY_NAME, GROUND
-from cflow_torch.data.atomic import atomic_folder
 from cflow_torch.data.boxes import points_in_box
 from cflow_torch.data.names import safe_name
-from cflow_torch.simulator.recording import Recording, UnitReturns
-from cflow_torch.simulator.writers.av2 import Boxes, quaternions
+from cflow_torch.data.rotations import to_quaternions
+from cflow_torch.simulator.recording import Boxes, Recording, UnitReturns
+from cflow_torch.simulator.writers.av2 import new_folder
 from cflow_torch.types import CFlowError
 
 CLASS_OF: Dict[str, str] = {
@@ -43,8 +42,6 @@ def write_aevascenes_sequence(
 ) -> Path:
     """Writes `log` to `root/<log_id>`.
 
-    Everything is written to a temporary folder beside it that takes its name when it is complete.
-
     Args:
         log: what to write.
         root: folder of the split, made if absent.
@@ -68,13 +65,10 @@ def write_aevascenes_sequence(
     """
     if layout not in _PATH_KEY:
         raise CFlowError(f"layout is one of {', '.join(_PATH_KEY)}; got {layout!r}")
-    folder = Path(root) / safe_name(log.log_id, "log_id")
-    if folder.exists() and not overwrite:
-        raise CFlowError(f"{folder} exists; give overwrite=True to replace the sequence")
-    with atomic_folder(folder) as new:
-        (new / _FOLDER).mkdir()
-        _write_sequence(log, new, _PATH_KEY[layout])
-    return folder
+    with new_folder(root, log.log_id, overwrite) as folder:
+        (folder / _FOLDER).mkdir()
+        _write_sequence(log, folder, _PATH_KEY[layout])
+    return Path(root) / log.log_id
 
 
 def _write_sequence(log: Recording, folder: Path, path_key: str) -> None:
@@ -114,10 +108,7 @@ def _write_sequence(log: Recording, folder: Path, path_key: str) -> None:
         "vehicle_to_camera_extrinsics": {},
         "camera_intrinsics": {},
     }
-    with open(folder / "sequence.json", "w", encoding="utf-8") as file:
-        json.dump({"metadata": metadata, "frames": frames}, file, default=float)
-        file.flush()
-        os.fsync(file.fileno())
+    (folder / "sequence.json").write_text(json.dumps({"metadata": metadata, "frames": frames}, default=float))
 
 
 def _write_cloud(path: Path, unit: UnitReturns, classes: np.ndarray, where: str) -> None:
@@ -127,19 +118,16 @@ def _write_cloud(path: Path, unit: UnitReturns, classes: np.ndarray, where: str)
             f"{where}, unit {unit.name}: shots {offset.min()} ... {offset.max()} ns after the time stamp; AevaScenes "
             f"stores 0 ... {2**32 - 1}: stamp a sweep with the time of its first shot"
         )
-    with open(path, "wb") as file:
-        np.savez(
-            file,
-            xyz=np.asarray(unit.points, np.float32),
-            velocity=np.asarray(unit.radial_velocity, np.float32)[:, None],
-            reflectivity=np.asarray(unit.intensity, np.float32)[:, None],
-            line_index=np.asarray(unit.ring, np.uint32)[:, None],
-            time_offset_ns=offset.astype(np.uint32)[:, None],
-            semantic_labels=np.array(_CLASSES, dtype=object)[classes][:, None],
-            semantic_labels_idx=classes[:, None],
-        )
-        file.flush()
-        os.fsync(file.fileno())
+    np.savez(
+        path,
+        xyz=np.asarray(unit.points, np.float32),
+        velocity=np.asarray(unit.radial_velocity, np.float32)[:, None],
+        reflectivity=np.asarray(unit.intensity, np.float32)[:, None],
+        line_index=np.asarray(unit.ring, np.uint32)[:, None],
+        time_offset_ns=offset.astype(np.uint32)[:, None],
+        semantic_labels=np.array(_CLASSES, dtype=object)[classes][:, None],
+        semantic_labels_idx=classes[:, None],
+    )
 
 
 def _classes(log: Recording, index: int, boxes: Boxes) -> np.ndarray:
@@ -201,5 +189,5 @@ def _add_velocities(frames: Sequence[Dict[str, Any]], poses: np.ndarray) -> None
 
 
 def _pose(T: np.ndarray) -> Dict[str, Any]:
-    rotation = quaternions(T[None, :3, :3])[0]
+    rotation = to_quaternions(T[None, :3, :3])[0]
     return {"translation": dict(zip(_XYZ, T[:3, 3].tolist())), "rotation": dict(zip("wxyz", rotation.tolist()))}

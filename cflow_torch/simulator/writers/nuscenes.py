@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import hashlib
 import json
-import struct
-import zlib
-from contextlib import contextmanager
+from base64 import b64decode
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any, Dict, Iterator, List, Mapping, Sequence, Union
+from typing import Any, Dict, List, Mapping, Sequence, Union
 
 import numpy as np
 
-from cflow_torch.data.atomic import atomic_file, atomic_folder
 from cflow_torch.data.names import safe_name
 from cflow_torch.data.nuscenes.categories import NUSCENES_NAMES
+from cflow_torch.data.rotations import to_quaternions
 from cflow_torch.simulator.recording import Recording, UnitReturns
-from cflow_torch.simulator.writers.av2 import quaternions
+from cflow_torch.simulator.writers.av2 import new_folder
 from cflow_torch.types import CFlowError
 
+# A PNG of one pixel: the devkit wants a map file, which it opens only to draw it.
+_BLACK_PIXEL = "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAAAAAA6fptVAAAACklEQVR4nGNgAAAAAgABSK+kcQAAAABJRU5ErkJggg=="
 _VISIBILITY = ("v0-40", "v40-60", "v60-80", "v80-100")
 Table = List[Dict[str, Any]]
 
@@ -32,8 +32,6 @@ def write_nuscenes(
     overwrite: bool = False,
 ) -> Path:
     """Writes `recording` to `root/<log_id>`, a data root of nuScenes with one scene of that name.
-
-    All files are written to a temporary folder beside it, and appear under their name at once.
 
     Args:
         recording: what to write. If none of its LiDARs is called LIDAR_TOP, the first one is in the file.
@@ -58,9 +56,7 @@ def write_nuscenes(
     """
 
     def write_points(file: Path, unit: UnitReturns, stamp_ns: int) -> None:
-        rows = np.column_stack([unit.points, unit.intensity, unit.ring]).astype("<f4")
-        with atomic_file(file) as stream:
-            stream.write(rows.tobytes())
+        file.write_bytes(np.column_stack([unit.points, unit.intensity, unit.ring]).astype("<f4").tobytes())
 
     with new_folder(root, recording.log_id, overwrite) as folder:
         scene = SceneWriter(recording, folder, "LIDAR_TOP", NUSCENES_NAMES)
@@ -74,8 +70,8 @@ def write_nuscenes(
             {"token": scene.token("map"), "log_tokens": [log], "category": "semantic_prior", "filename": image}
         ]
         tables["scene"][0]["log_token"] = log
-        with atomic_file(folder / image) as stream:
-            stream.write(_black_pixel())
+        (folder / "maps").mkdir()
+        (folder / image).write_bytes(b64decode(_BLACK_PIXEL))
         write_tables(folder / version, tables)
     return Path(root) / recording.log_id
 
@@ -126,7 +122,9 @@ class SceneWriter:
             for channel, unit in zip(self._channels, units):
                 kind = "samples" if index == sample else "sweeps"
                 name = file_name.format(name=self.recording.log_id, channel=channel, stamp=stamp)
-                write_points(self.folder / kind / channel / name, unit, self.recording.timestamps[index])
+                file = self.folder / kind / channel / name
+                file.parent.mkdir(parents=True, exist_ok=True)
+                write_points(file, unit, self.recording.timestamps[index])
                 token = self.token("sweep", channel, index)
                 tables["ego_pose"].append(
                     {"token": token, "timestamp": stamp, **_pose(np.asarray(self.recording.poses[index]))}
@@ -247,38 +245,13 @@ class SceneWriter:
         tables["sample_annotation"] = [row for rows in tracks.values() for row in rows]
 
 
-@contextmanager
-def new_folder(root: Union[str, Path], name: str, overwrite: bool) -> Iterator[Path]:
-    """A folder to fill, which becomes `root/<name>` when the block ends and vanishes if the block raises.
-
-    Raises:
-        CFlowError: `name` is no folder name, or the folder exists and `overwrite` is False.
-    """
-    folder = Path(root) / safe_name(name, "log_id")
-    if folder.exists() and not overwrite:
-        raise CFlowError(f"{folder} exists already; pass overwrite=True to replace it, or choose another root")
-    with atomic_folder(folder) as new:
-        yield new
-
-
 def write_tables(folder: Path, tables: Mapping[str, Table]) -> None:
     """One JSON file per table."""
+    folder.mkdir()
     for table, rows in tables.items():
-        with atomic_file(folder / f"{table}.json") as stream:
-            stream.write(json.dumps(rows, indent=0, allow_nan=False).encode())
+        (folder / f"{table}.json").write_text(json.dumps(rows, indent=0, allow_nan=False))
 
 
 def _pose(pose: np.ndarray) -> Dict[str, List[float]]:
-    rotation = quaternions(np.asarray(pose, dtype=np.float64)[None, :3, :3])[0]
+    rotation = to_quaternions(pose[None, :3, :3])[0]
     return {"translation": [float(v) for v in pose[:3, 3]], "rotation": rotation.tolist()}
-
-
-def _black_pixel() -> bytes:
-    """A PNG of one grey pixel: the devkit wants a map file, which it opens only to draw it."""
-
-    def chunk(kind: bytes, content: bytes) -> bytes:
-        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
-
-    header = struct.pack(">IIBBBBB", 1, 1, 8, 0, 0, 0, 0)
-    parts = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"\0\0")) + chunk(b"IEND", b"")
-    return b"\x89PNG\r\n\x1a\n" + parts

@@ -10,7 +10,8 @@ import numpy as np
 from cflow_torch.data.arrays.pcd import write_pcd
 from cflow_torch.data.nuscenes.categories import TRUCKSCENES_NAMES
 from cflow_torch.simulator.recording import Recording, UnitReturns
-from cflow_torch.simulator.writers.nuscenes import SceneWriter, new_folder, write_tables
+from cflow_torch.simulator.writers.av2 import new_folder
+from cflow_torch.simulator.writers.nuscenes import SceneWriter, write_tables
 
 # Tables that the devkit wants besides those of nuScenes; a simulated truck has nothing to put there.
 _EMPTY = ("ego_motion_cabin", "ego_motion_chassis", "weather_annotation")
@@ -26,8 +27,6 @@ def write_truckscenes(
 ) -> Path:
     """Writes `recording` to `root/<log_id>`, a data root of TruckScenes with one scene of that name.
 
-    All files are written to a temporary folder beside it, and appear under their name at once.
-
     Args:
         recording: what to write. If none of its LiDARs is called LIDAR_LEFT, the first one is in the file.
         root: folder, made if absent.
@@ -35,7 +34,7 @@ def write_truckscenes(
         key_frame_interval: seconds between samples, which alone have boxes. First and last sweep are samples too, so
             that there is truth for every pair.
         overwrite: replace a scene of that name.
-        data: kind of PCD: "binary", "binary_compressed" (as in the release; a second per 100,000 points), "ascii".
+        data: kind of PCD: "binary", "binary_compressed" (as in the release), "ascii".
 
     Returns:
         The data root.
@@ -53,7 +52,6 @@ def write_truckscenes(
     def write_points(file: Path, unit: UnitReturns, stamp_ns: int) -> None:
         x, y, z = np.asarray(unit.points, dtype=np.float32).T
         times = ((int(stamp_ns) + np.asarray(unit.offset_ns, dtype=np.int64)) // 1000).astype(np.uint64)
-        file.parent.mkdir(parents=True, exist_ok=True)
         fields = {"x": x, "y": y, "z": z, "intensity": unit.intensity.astype(np.float32), "timestamp": times}
         write_pcd(file, fields, data)
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
+from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any, Dict, List, Sequence, Tuple, Union
 
@@ -12,6 +14,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from cflow_torch.data.atomic import sync_folder
 from cflow_torch.data.categories import META_CLASSES
 from cflow_torch.data.names import safe_name
 from cflow_torch.data.waymo.parquet import (
@@ -27,7 +30,7 @@ from cflow_torch.data.waymo.parquet import (
 )
 from cflow_torch.data.waymo.range_image import LASERS, TOP, LaserCalibration
 from cflow_torch.simulator.recording import Recording, UnitReturns
-from cflow_torch.simulator.writers.waymo_encoding import encode_images, poses_of_shots
+from cflow_torch.simulator.writers.waymo_encoding import encode_images, poses_of_shots, true_poses_of_shots
 from cflow_torch.types import CFlowError
 
 BOX_TYPE: Dict[str, int] = {
@@ -51,9 +54,6 @@ def write_waymo_segment(
 ) -> Path:
     """Writes `log` to `root/<component>/<log_id>.parquet`, one row group per frame.
 
-    All files are written to a temporary folder below `root` and moved to their names when all are complete; if a move
-    fails, what was there before comes back.
-
     Args:
         log: what to write. Units called as in `waymo_range_image.LASERS` become these; if none is, they become TOP,
             FRONT, ... in their order.
@@ -67,8 +67,9 @@ def write_waymo_segment(
         The file of the component `lidar`, which `WaymoLog` takes.
 
     Convention:
-        - TOP: each pixel has the vehicle's pose at the time of its shot, interpolated between the poses of the sweeps,
-          and moved so that its point lies exactly where the recording has it. What is left is the rounding of those
+        - TOP: each pixel has the vehicle's pose at the time of its shot, interpolated between the poses of the sweeps
+          (or, where that is too far off, the recording's own, if it knows poses between sweeps), and moved so that its
+          point lies exactly where the recording has it. What is left is the rounding of those
           poses and of ranges to float32: 5e-5 m up to 1 km from the world's origin.
         - The others: range images of the vehicle at the pose of the frame, without poses of pixels. Returns whose rays
           are those of the pixels come back to float32, 5e-6 m at 75 m; others are moved onto the ray.
@@ -100,31 +101,28 @@ def write_waymo_segment(
 def _put_in_place(scratch: Path, places: Dict[str, Path]) -> None:
     """Moves new/<tag> to its place; on failure everything is as before."""
     tags = sorted(places, key=lambda tag: tag == "lidar")  # the file that readers look for comes last
-    moved_away, moved_in = [], []
-    try:
+    with ExitStack() as undo:
         for tag in reversed(tags):
             if places[tag].exists():
                 os.replace(places[tag], scratch / "old" / tag)
-                moved_away.append(tag)
+                undo.callback(os.replace, scratch / "old" / tag, places[tag])
         for tag in tags:
             places[tag].parent.mkdir(exist_ok=True)
             os.replace(scratch / "new" / tag, places[tag])
-            moved_in.append(tag)
-    except BaseException:
-        for tag in reversed(moved_in):
-            places[tag].unlink()
-        for tag in reversed(moved_away):
-            os.replace(scratch / "old" / tag, places[tag])
-        raise
+            undo.callback(places[tag].unlink)
+        undo.pop_all()
 
 
 def _write_components(log: Recording, folder: Path, max_shift: float, is_rolling: bool) -> None:
     times = [(stamp + 500) // 1000 for stamp in log.timestamps]
     if len(set(times)) < len(times):
         raise CFlowError(f"log {log.log_id} has sweeps less than a microsecond apart; Waymo cannot tell them apart")
-    tables: Dict[str, List[Dict[str, Any]]] = {tag: [] for tag in SCHEMAS}
-    writers = {tag: pq.ParquetWriter(folder / tag, SCHEMAS[tag], compression="zstd") for tag in ("lidar", "lidar_pose")}
-    try:
+    with ExitStack() as stack:
+        writers = {
+            tag: stack.enter_context(pq.ParquetWriter(folder / tag, schema, compression="zstd"))
+            for tag, schema in SCHEMAS.items()
+        }
+        tables: Dict[str, List[Dict[str, Any]]] = {tag: [] for tag in SCHEMAS}  # those of one row group
         for index, time in enumerate(times):
             key = {SEGMENT: log.log_id, TIME: time}
             pose, units = np.asarray(log.poses[index], np.float64), log.units(index)
@@ -134,7 +132,10 @@ def _write_components(log: Recording, folder: Path, max_shift: float, is_rolling
                 calibration = _calibration(unit, log.elevations(unit.name))
                 shots = poses_of_shots(log, index, unit.offset_ns, is_rolling) if number == TOP else None
                 where = f"sweep {index} of log {log.log_id}, unit {unit.name}"
-                images = encode_images(unit, calibration, max_shift, where, shots)
+                true_shots = None
+                if shots is not None and is_rolling and hasattr(log, "poses_at"):
+                    true_shots = partial(true_poses_of_shots, log, index, unit.offset_ns)
+                images = encode_images(unit, calibration, max_shift, where, shots, true_shots)
                 cells = {**_cells(f"{LIDAR}1", images["first"]), **_cells(f"{LIDAR}2", images["second"])}
                 rows.append({**key, LASER: number, **cells})
                 if number == TOP:
@@ -147,17 +148,11 @@ def _write_components(log: Recording, folder: Path, max_shift: float, is_rolling
             tables["lidar_box"] += boxes
             tables["vehicle_pose"].append({**key, VEHICLE_POSE: pose.reshape(-1)})
             tables["stats"].append({**key, **_stats(boxes)})
-    finally:
-        for writer in writers.values():
-            writer.close()
-    _add_speeds(tables["lidar_box"], dict(zip(times, np.asarray(log.poses, np.float64))))
-    for tag, rows in tables.items():
-        if tag not in writers:
-            with pq.ParquetWriter(folder / tag, SCHEMAS[tag], compression="zstd") as writer:
-                _write_rows(writer, rows)
+        _add_speeds(tables["lidar_box"], dict(zip(times, np.asarray(log.poses, np.float64))))
+        for tag in ("lidar_calibration", "lidar_box", "vehicle_pose", "stats"):
+            _write_rows(writers[tag], tables[tag])
     for tag in SCHEMAS:
-        with open(folder / tag, "rb+") as file:
-            os.fsync(file.fileno())
+        sync_folder(folder / tag)
 
 
 def _laser_numbers(names: Sequence[str]) -> List[int]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Dict, Optional
+from typing import Any, Callable, Dict, Optional
 
 import numpy as np
 
@@ -18,7 +18,8 @@ from cflow_torch.simulator.recording import Recording, UnitReturns
 from cflow_torch.types import CFlowError
 
 _NODES = 4  # sweeps whose poses are interpolated: a cubic is exact for constant jerk
-# Of a pixel's pose from the interpolated one, metres: a car that begins to turn within a sweep is off by 0.3 at 75 m.
+# Metres, of a pixel's pose from the interpolated one. Where a car begins to turn, the cubic is off by 0.3 m at 75 m in
+# the street (0.4 rad/s), by 1.5 m at the crossing (0.8 rad/s), and by more at the ends of a drive.
 _MAX_POSE_SHIFT = 1.0
 
 
@@ -71,10 +72,25 @@ def poses_of_shots(log: Recording, index: int, offset_ns: np.ndarray, is_rolling
     return ShotPoses(of_shot, pose_angles(T_world_ego), T_world_ego)
 
 
+def true_poses_of_shots(log: Any, index: int, offset_ns: np.ndarray) -> ShotPoses:
+    """Poses at the times of shots, from a recording that knows them between its sweeps (`Drive.poses_at`)."""
+    of_shot = pose_angles(log.poses_at(index, offset_ns))
+    of_shot[:, :3] = of_shot[:, :3].astype(np.float32)
+    return ShotPoses(of_shot, pose_angles(log.poses[index]), log.poses[index])
+
+
 def encode_images(
-    unit: UnitReturns, calibration: LaserCalibration, max_shift: float, where: str, shot_poses: Optional[ShotPoses]
+    unit: UnitReturns,
+    calibration: LaserCalibration,
+    max_shift: float,
+    where: str,
+    shot_poses: Optional[ShotPoses],
+    true_poses: Optional[Callable[[], ShotPoses]] = None,
 ) -> Dict[str, np.ndarray]:
-    """Range images of both returns (the second is empty) and, given poses of the shots, the image of pixel poses."""
+    """Range images of both returns (the second is empty) and, given poses of the shots, the image of pixel poses.
+
+    Where `shot_poses` are too far off for the pixels, `true_poses` take their place.
+    """
     height, width = unit.num_rings, unit.num_columns
     points = np.asarray(unit.points, np.float64)  # laser frame, at the pose of the frame
     seen = points if shot_poses is None else shot_poses.to_shot(points, calibration.T_ego_sensor)
@@ -93,6 +109,8 @@ def encode_images(
     on_rays = distance[:, None].astype(np.float64) * rays
     shift = np.linalg.norm(seen - on_rays, axis=1)
     if len(shift) and shift.max() > max_shift:
+        if true_poses is not None:
+            return encode_images(unit, calibration, max_shift, where, true_poses())
         raise CFlowError(
             f"{where}: {np.count_nonzero(shift > max_shift)} of {len(shift)} returns are off the rays of a {height} x "
             f"{width} range image, by up to {shift.max():.3g} m; record with a profile made for Waymo, say with "
@@ -113,6 +131,7 @@ def encode_images(
 
 
 def pose_angles(pose: np.ndarray) -> np.ndarray:
-    """(6,) roll, pitch, yaw, x, y, z of a transform."""
-    roll, yaw = np.arctan2(pose[2, 1], pose[2, 2]), np.arctan2(pose[1, 0], pose[0, 0])
-    return np.array([roll, -np.arcsin(np.clip(pose[2, 0], -1, 1)), yaw, *pose[:3, 3]])
+    """(..., 6) roll, pitch, yaw, x, y, z of transforms (..., 4, 4)."""
+    roll, yaw = np.arctan2(pose[..., 2, 1], pose[..., 2, 2]), np.arctan2(pose[..., 1, 0], pose[..., 0, 0])
+    pitch = -np.arcsin(np.clip(pose[..., 2, 0], -1, 1))
+    return np.concatenate([np.stack([roll, pitch, yaw], -1), pose[..., :3, 3]], -1)

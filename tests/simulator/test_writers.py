@@ -1,0 +1,148 @@
+"""The Argoverse 2 writer, read with pyarrow alone, and what Waymo's has to do where a turn begins."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pyarrow import feather
+from scipy.spatial import cKDTree
+
+from cflow_torch.data.rotations import to_rotations
+from cflow_torch.data.waymo import WaymoLog
+from cflow_torch.simulator import Drive, make_drive
+from cflow_torch.simulator.writers import waymo_encoding
+from cflow_torch.simulator.writers.av2 import write_av2_log
+from cflow_torch.simulator.writers.waymo import write_waymo_segment
+from cflow_torch.types import CFlowError
+
+POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+
+
+def schema(path):
+    return [(field.name, str(field.type)) for field in feather.read_table(path).schema]
+
+
+def columns(path, *names):
+    table = feather.read_table(path)
+    return np.stack([table[name].to_numpy() for name in names], -1)
+
+
+def read_poses(path):
+    values = columns(path, *POSE)
+    poses = np.tile(np.eye(4), (len(values), 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = to_rotations(values[:, :4]), values[:, 4:]
+    return poses
+
+
+@pytest.fixture(scope="module")
+def drive():
+    return make_drive(seed=2, num_sweeps=3, profile="av2")
+
+
+@pytest.fixture(scope="module")
+def folder(drive, tmp_path_factory):
+    return write_av2_log(drive, tmp_path_factory.mktemp("split") / "val")
+
+
+def test_files_and_schemas_are_those_of_argoverse_2(drive, folder, request):
+    stamps, name = drive.timestamps, drive.log_id
+    assert folder.name == name and os.listdir(folder.parent) == [name]  # no temporary folder stays
+    assert {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()} == {
+        *(f"sensors/lidar/{stamp}.feather" for stamp in stamps),
+        *(f"flow_labels/{stamp}.feather" for stamp in stamps[:-1]),
+        *("city_SE3_egovehicle.feather", "calibration/egovehicle_SE3_sensor.feather", "annotations.feather"),
+        f"map/{name}_ground_height_surface____SYN.npy",
+        f"map/{name}___img_Sim2_city.json",
+        f"map/log_map_archive_{name}____SYN_city_00000.json",
+    }
+    real = request.getfixturevalue("av2_folder")
+    for pattern in ("sensors/lidar/*.feather", "c*.feather", "a*.feather", "calibration/egovehicle_SE3_sensor.feather"):
+        assert schema(next(folder.glob(pattern))) == schema(next(real.glob(pattern))), pattern
+
+
+def test_points_poses_and_calibration_come_back(drive, folder):
+    for i, stamp in enumerate(drive.timestamps):
+        path = folder / "sensors" / "lidar" / f"{stamp}.feather"
+        assert np.array_equal(columns(path, "x", "y", "z"), drive.sweep(i).points.astype(np.float16))
+        for name, values in drive.channels(i).items():
+            assert np.array_equal(feather.read_table(path)[name].to_numpy(), values)
+    path = folder / "city_SE3_egovehicle.feather"
+    assert np.abs(read_poses(path) - drive.poses).max() < 1e-12
+    assert columns(path, "timestamp_ns")[:, 0].tolist() == list(drive.timestamps)
+    path = folder / "calibration" / "egovehicle_SE3_sensor.feather"
+    assert feather.read_table(path)["sensor_name"].to_pylist() == ["up_lidar", "down_lidar"]
+    assert np.abs(read_poses(path) - np.stack(list(drive.calibration.values()))).max() < 1e-12
+
+
+def test_labels_come_back_row_by_row_and_boxes_explain_them(drive, folder):
+    path, labels = folder / "flow_labels" / f"{drive.timestamps[0]}.feather", drive.labels(0)
+    assert np.array_equal(columns(path, "flow_tx_m", "flow_ty_m", "flow_tz_m"), labels.flow)
+    written = {"classes": labels.category, "is_valid": labels.is_valid, "is_ground_0": drive.sweep(0).is_ground}
+    for name, values in written.items():
+        assert np.array_equal(feather.read_table(path)[name].to_numpy(), values)
+    points = drive.sweep(0).points.astype(float)
+    T = np.linalg.inv(drive.poses[1]) @ drive.poses[0]
+    residual = labels.flow + points - points @ T[:3, :3].T - T[:3, 3]
+    dynamic = feather.read_table(path)["dynamic"].to_numpy()
+    assert np.array_equal(dynamic, np.linalg.norm(residual, axis=1) >= 0.05) and dynamic.sum() > 1000
+    # Truth rebuilt from the written boxes and poses alone equals the written flow of the points of each track.
+    path = folder / "annotations.feather"
+    table, poses, body, checked = feather.read_table(path), read_poses(path), drive._body_of(drive.returns(0)), 0
+    stamps, tracks = table["timestamp_ns"].to_numpy(), np.array(table["track_uuid"].to_pylist())
+    for number, track in enumerate(drive.track_ids):
+        rows = body == number
+        if rows.any() and drive.scene.bodies[number].category is not None:
+            box0, box1 = (poses[(stamps == stamp) & (tracks == track)] for stamp in drive.timestamps[:2])
+            motion = box1[0] @ np.linalg.inv(box0[0])
+            flow = points[rows] @ motion[:3, :3].T + motion[:3, 3] - points[rows]
+            assert np.abs(flow - labels.flow[rows]).max() < 1e-5
+            checked += 1
+    assert checked > 20
+
+
+def test_raster_finds_the_ground(drive, folder):
+    """Argoverse 2's rule: pixel = trunc(s (R xy + t)), ground where |z - h| <= 0.3 m or below."""
+    sim2 = json.loads((folder / "map" / f"{drive.log_id}___img_Sim2_city.json").read_text())
+    raster = np.load(folder / "map" / f"{drive.log_id}_ground_height_surface____SYN.npy")
+    sweep = drive.sweep(0)
+    city = sweep.points.astype(float) @ drive.poses[0, :3, :3].T + drive.poses[0, :3, 3]
+    pixel = (sim2["s"] * (city[:, :2] @ np.reshape(sim2["R"], (2, 2)).T + sim2["t"])).astype(np.int64)
+    found = city[:, 2] - raster[pixel[:, 1], pixel[:, 0]].astype(float) <= 0.3
+    # The rule also takes the foot of every object: nothing that stands clear of the ground.
+    true_height = drive.scene.ground.height(city[:, 0].copy(), city[:, 1].copy())
+    clear = city[:, 2] > true_height + 0.3 + drive.scene.ground.kerb + 0.02
+    assert found[sweep.is_ground].all() and clear.sum() > 30_000 and not found[clear].any()
+
+
+def test_an_existing_log_is_only_replaced_on_request(tmp_path):
+    old, new = (make_drive(seed=1, num_sweeps=n, profile="demo") for n in (1, 2))
+    folder = write_av2_log(old, tmp_path)
+    with pytest.raises(CFlowError, match="overwrite=True"):
+        write_av2_log(new, tmp_path)
+    assert len(list((folder / "sensors" / "lidar").iterdir())) == 1
+    assert write_av2_log(new, tmp_path, overwrite=True) == folder
+    assert len(list((folder / "sensors" / "lidar").iterdir())) == 2 and os.listdir(tmp_path) == [folder.name]
+    old.log_id = "../elsewhere"
+    with pytest.raises(CFlowError, match="folder name"):
+        write_av2_log(old, tmp_path)
+
+
+def test_waymo_takes_true_poses_where_a_turn_begins(tmp_path, monkeypatch):
+    """Between sweeps the vehicle's pose is interpolated, and off by more than a metre at 75 m there."""
+    turning, used = make_drive(316, 8, "waymo", "crossing"), []
+    true_poses = waymo_encoding.true_poses_of_shots
+    monkeypatch.setattr(
+        "cflow_torch.simulator.writers.waymo.true_poses_of_shots",
+        lambda log, index, offsets: (used.append(index), true_poses(log, index, offsets))[1],
+    )
+    profile = replace(turning._profile, units=(replace(turning._profile.units[0], num_columns=530),))
+    drive = Drive(turning.scene, profile, 0, 8, "turning")
+    log = WaymoLog(write_waymo_segment(drive, tmp_path))
+    assert used, "else this drive is no test"
+    for index in used:
+        stored, read = drive.sweep(index).points, log.sweep(index).points
+        assert len(stored) == len(read) and cKDTree(read).query(stored)[0].max() < 1e-4
