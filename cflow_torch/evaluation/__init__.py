@@ -1,7 +1,6 @@
 """Scores: dynamic bucket-normalised, three-way and range-wise end-point error, as the public evaluators define them."""
 
-from cflow_torch.evaluation.bucketed import BucketedEPE
-from cflow_torch.evaluation.bucketed_by_range import BucketedByRange
+from cflow_torch.evaluation.bucketed import BucketedByRange, BucketedEPE
 from cflow_torch.evaluation.definitions import DEFINITIONS, Definition
 from cflow_torch.evaluation.frame import EvalFrame
 from cflow_torch.evaluation.metrics import SceneFlowMetrics

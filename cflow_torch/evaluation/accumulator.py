@@ -1,9 +1,11 @@
-"""What every metric shares: scored points go in frame by frame, parts that were scored apart are merged."""
+"""What every metric shares: scored points go into cells frame by frame, parts that were scored apart are merged."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Tuple, Union
+from typing import Sequence, Tuple, Union
+
+import numpy as np
 
 from cflow_torch.evaluation.definitions import Definition, get_definition
 from cflow_torch.evaluation.frame import EvalFrame
@@ -12,25 +14,47 @@ from cflow_torch.types import CFlowError
 
 
 class Accumulator(ABC):
-    """Sums over frames in any order.
+    """Points counted, and their values summed up, per cell; frames in any order.
 
     Args:
         definition: name or `Definition`.
+
+    Attributes:
+        count: int64, points of each cell.
+        sums: float64, one array of the same shape per quantity.
     """
 
-    totals: Tuple[str, ...] = ()
-    """Names of the attributes that add up over frames."""
+    totals: Tuple[str, ...] = ("count", "sums")  # attributes that add up over frames
+    num_quantities = 2  # of each point
 
     def __init__(self, definition: Union[str, Definition] = "opensceneflow") -> None:
         self.definition = get_definition(definition)
+        self.count = np.zeros(self.shape(), dtype=np.int64)
+        self.sums = np.zeros((self.num_quantities, *self.shape()), dtype=np.float64)
+
+    @abstractmethod
+    def shape(self) -> Tuple[int, ...]:
+        """Numbers of cells along each axis."""
+
+    @abstractmethod
+    def cells(self, scored: ScoredPoints) -> Tuple[np.ndarray, Sequence[np.ndarray]]:
+        """(K,) int64 flat cell of the points that count, and their quantities, (K,) float64 each."""
 
     def update(self, frame: EvalFrame) -> None:
         """Add one frame."""
         self.update_points(score_points(frame, self.definition))
 
-    @abstractmethod
     def update_points(self, scored: ScoredPoints) -> None:
         """Add the scored points of one frame."""
+        cell, quantities = self.cells(scored)
+        size = self.count.size
+        sums = np.stack([np.bincount(cell, values, minlength=size) for values in quantities])
+        self._add(np.bincount(cell, minlength=size).reshape(self.count.shape), sums.reshape(self.sums.shape))
+
+    def _add(self, count: np.ndarray, sums: np.ndarray) -> None:
+        """Add what one frame has in each cell."""
+        self.count += count
+        self.sums += sums
 
     def merge(self, other: Accumulator) -> None:
         """Add what another accumulator of the same kind and definition has seen.

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import warnings
-from typing import Any, Dict, Tuple, Union
+from typing import Any, Dict, Sequence, Tuple
 
 import numpy as np
 
 from cflow_torch.data.categories import META_NAMES, meta_class
 from cflow_torch.evaluation.accumulator import Accumulator
-from cflow_torch.evaluation.definitions import Definition
+from cflow_torch.evaluation.definitions import Definition, interval_of, range_names
 from cflow_torch.evaluation.masks import ScoredPoints
+
+_MEANS = ("static_epe", "dynamic_error")
 
 
 def mean_of_present(values: np.ndarray) -> float:
@@ -26,12 +28,10 @@ def bucket_cells(scored: ScoredPoints, definition: Definition) -> Tuple[np.ndarr
     Returns:
         (M,) int64, cell = class * number of buckets + bucket; (M,) bool, False where a point has no cell.
     """
-    edges = np.asarray(definition.speed_edges)
-    meta = meta_class(scored.category)
-    bucket = np.searchsorted(edges, scored.speed, side="right") - 1
+    meta, bucket = meta_class(scored.category), interval_of(scored.speed, definition.speed_edges)
     if definition.background == "static":
         bucket = np.where(meta == META_NAMES.index("BACKGROUND"), 0, bucket)
-    return meta * (len(edges) - 1) + bucket, (meta >= 0) & (bucket >= 0) & (bucket < len(edges) - 1)
+    return meta * (len(definition.speed_edges) - 1) + bucket, (meta >= 0) & (bucket >= 0)
 
 
 def bucket_scores(count: np.ndarray, error_sum: np.ndarray, speed_sum: np.ndarray) -> Dict[str, Any]:
@@ -55,10 +55,7 @@ def bucket_scores(count: np.ndarray, error_sum: np.ndarray, speed_sum: np.ndarra
         }
         for row, name in enumerate(META_NAMES)
     }
-    mean = {
-        key: mean_of_present(np.array([scores[key] for scores in classes.values()], dtype=np.float64))
-        for key in ("static_epe", "dynamic_error")
-    }
+    mean = {key: mean_of_present(np.array([scores[key] for scores in classes.values()])) for key in _MEANS}
     return {"classes": classes, "mean": mean}
 
 
@@ -72,29 +69,19 @@ class BucketedEPE(Accumulator):
     Args:
         definition: name or `Definition`.
 
-    Convention: frames in any order; a bucket holds its lower edge, not its upper one; classes without points are NaN
-    and do not enter the mean over classes.
-
-    Cost: a few arrays of the size of one frame per update; memory (classes x buckets).
+    Convention: a bucket holds its lower edge, not its upper one; classes without points are NaN and do not enter the
+    mean over classes.
     """
 
-    totals = ("count", "error_sum", "speed_sum")
+    def shape(self) -> Tuple[int, ...]:
+        """(classes, buckets)."""
+        return len(META_NAMES), len(self.definition.speed_edges) - 1
 
-    def __init__(self, definition: Union[str, Definition] = "opensceneflow") -> None:
-        super().__init__(definition)
-        shape = (len(META_NAMES), len(self.definition.speed_edges) - 1)
-        self.count = np.zeros(shape, dtype=np.int64)
-        self.error_sum = np.zeros(shape, dtype=np.float64)
-        self.speed_sum = np.zeros(shape, dtype=np.float64)
-
-    def update_points(self, scored: ScoredPoints) -> None:
-        """Add the scored points of one frame."""
+    def cells(self, scored: ScoredPoints) -> Tuple[np.ndarray, Sequence[np.ndarray]]:
+        """Class and bucket; error and speed."""
         cell, keep = bucket_cells(scored, self.definition)
         keep &= scored.in_region
-        size, shape = self.count.size, self.count.shape
-        self.count += np.bincount(cell[keep], minlength=size).reshape(shape)
-        self.error_sum += np.bincount(cell[keep], scored.error[keep], minlength=size).reshape(shape)
-        self.speed_sum += np.bincount(cell[keep], scored.speed[keep], minlength=size).reshape(shape)
+        return cell[keep], (scored.error[keep], scored.speed[keep])
 
     def compute(self) -> Dict[str, Any]:
         """Scores so far.
@@ -104,5 +91,38 @@ class BucketedEPE(Accumulator):
             (points) and "buckets" (`count`, `epe`, `speed`, `normalized` per bucket); "mean": `static_epe`,
             `dynamic_error`; "speed_edges": metres per frame.
         """
-        scores = bucket_scores(self.count, self.error_sum, self.speed_sum)
-        return {**scores, "speed_edges": list(self.definition.speed_edges)}
+        return {**bucket_scores(self.count, *self.sums), "speed_edges": list(self.definition.speed_edges)}
+
+
+class BucketedByRange(Accumulator):
+    """Streaming `BucketedEPE` of every range between the definition's `region_edges`, in one pass.
+
+    Args:
+        definition: name or `Definition`; its `region` ("box" or "disc"), `region_axes` and `closed` tell how a range is
+            measured, its `max_range` does not apply.
+
+    Convention: each point is in one range at most; a range's scores are those of a `BucketedEPE` of its points.
+    """
+
+    def shape(self) -> Tuple[int, ...]:
+        """(ranges, classes, buckets)."""
+        return len(self.definition.region_edges) - 1, len(META_NAMES), len(self.definition.speed_edges) - 1
+
+    def cells(self, scored: ScoredPoints) -> Tuple[np.ndarray, Sequence[np.ndarray]]:
+        """Range, class and bucket; error and speed."""
+        cell, keep = bucket_cells(scored, self.definition)
+        number = interval_of(scored.reach, self.definition.region_edges, self.definition.closed)
+        keep &= number >= 0
+        return (number * self.count[0].size + cell)[keep], (scored.error[keep], scored.speed[keep])
+
+    def compute(self) -> Dict[str, Any]:
+        """Scores so far.
+
+        Returns:
+            "ranges": "0-35", ... -> "classes" and "mean" as `BucketedEPE` gives them; "mean": `static_epe`,
+            `dynamic_error`, mean over all ranges, NaN if a range has no points to score; "speed_edges".
+        """
+        names = range_names(self.definition.region_edges)
+        ranges = {name: bucket_scores(*sums) for name, *sums in zip(names, self.count, *self.sums)}
+        mean = {key: float(np.mean([scores["mean"][key] for scores in ranges.values()])) for key in _MEANS}
+        return {"ranges": ranges, "mean": mean, "speed_edges": list(self.definition.speed_edges)}

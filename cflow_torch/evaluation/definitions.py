@@ -4,26 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Dict, List, Optional, Sequence, Tuple, Union
+from typing import Dict, List, Literal, Optional, Sequence, Tuple, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
 from cflow_torch.types import CFlowError
 
 METRICS = ("bucketed", "bucketed_by_range", "three_way", "range_wise")
-
-_CHOICES: Dict[str, Tuple[Any, ...]] = {
-    "ego_motion": ("points", "stored"),
-    "region": ("box", "disc", "all"),
-    "region_axes": ("t", "t+1"),
-    "residual_axes": ("t", "t+1"),
-    "three_way_flow": ("total", "residual"),
-    "foreground": ("all", "meta"),
-    "background": ("static", "bucketed"),
-    "average": ("points", "frames"),
-    "nan_rows": ("drop", "error"),
-    "norm_dtype": ("float32", "float64"),
-}
 
 SPEED_EDGES: Tuple[float, ...] = (*(float(edge) for edge in np.linspace(0.0, 2.0, 51)), math.inf)
 RANGE_EDGES: Tuple[float, ...] = (0.0, 35.0, 50.0, 75.0, 100.0, math.inf)
@@ -42,7 +29,6 @@ class Definition:
         region: points scored by "bucketed" and "three_way": "box" max(|x|, |y|), "disc" sqrt(x^2 + y^2), "all". Box
             or disc is also how "bucketed_by_range" measures.
         max_range: metres, outer bound of the region.
-        min_range: metres, inner bound; the point that one region leaves out belongs to the next one.
         closed: True: a point at exactly `max_range` counts (<=), False: it does not (<). The same for the upper edge of
             each range of "bucketed_by_range"; the point that one range leaves out belongs to the next one.
         region_edges: metres, ascending edges of the ranges that "bucketed_by_range" scores one by one.
@@ -73,24 +59,23 @@ class Definition:
 
     name: str
     metrics: Tuple[str, ...] = ("bucketed", "three_way", "range_wise")
-    ego_motion: str = "points"
-    region: str = "disc"
+    ego_motion: Literal["points", "stored"] = "points"
+    region: Literal["box", "disc", "all"] = "disc"
     max_range: float = 35.0
-    min_range: float = 0.0
     closed: bool = True
     region_edges: Tuple[float, ...] = REGION_EDGES
-    region_axes: str = "t"
+    region_axes: Literal["t", "t+1"] = "t"
     point_cloud_range: Optional[Tuple[float, ...]] = None
     mask_box: Optional[float] = None
     exclude_ground: bool = True
-    residual_axes: str = "t+1"
-    three_way_flow: str = "total"
+    residual_axes: Literal["t", "t+1"] = "t+1"
+    three_way_flow: Literal["total", "residual"] = "total"
     half_precision: bool = False
-    foreground: str = "all"
-    background: str = "static"
-    average: str = "points"
-    nan_rows: str = "drop"
-    norm_dtype: str = "float64"
+    foreground: Literal["all", "meta"] = "all"
+    background: Literal["static", "bucketed"] = "static"
+    average: Literal["points", "frames"] = "points"
+    nan_rows: Literal["drop", "error"] = "drop"
+    norm_dtype: Literal["float32", "float64"] = "float64"
     dynamic_threshold: float = 0.05
     speed_edges: Tuple[float, ...] = SPEED_EDGES
     range_edges: Tuple[float, ...] = RANGE_EDGES
@@ -98,25 +83,20 @@ class Definition:
     sweep_interval: float = 0.1
 
     def __post_init__(self) -> None:
-        for field, allowed in _CHOICES.items():
-            if getattr(self, field) not in allowed:
-                raise CFlowError(f"definition {self.name}: {field} is one of {allowed}, got {getattr(self, field)!r}")
+        for field, kind in get_type_hints(Definition).items():
+            value, choices = getattr(self, field), get_args(kind)
+            if get_origin(kind) is Literal and value not in choices:
+                raise CFlowError(f"definition {self.name}: {field} is one of {choices}, got {value!r}")
         if not set(self.metrics) <= set(METRICS):
             raise CFlowError(f"definition {self.name}: metrics are some of {METRICS}, got {self.metrics}")
         if "bucketed_by_range" in self.metrics and self.region == "all":
-            raise CFlowError(
-                f"definition {self.name}: bucketed_by_range measures ranges; give region 'box' or 'disc', not 'all'"
-            )
-        if not 0 <= self.min_range < self.max_range:
-            raise CFlowError(
-                f"definition {self.name}: needs 0 <= min_range < max_range, got {self.min_range}, {self.max_range}"
-            )
+            raise CFlowError(f"definition {self.name}: bucketed_by_range measures ranges; region must be box or disc")
+        if not self.max_range > 0:
+            raise CFlowError(f"definition {self.name}: max_range must be positive, got {self.max_range}")
         for field in ("speed_edges", "range_edges", "region_edges"):
             edges = getattr(self, field)
             if len(edges) < 2 or not all(a < b for a, b in zip(edges, edges[1:])):
-                raise CFlowError(
-                    f"definition {self.name}: {field} must ascend and hold two values or more, got {edges}"
-                )
+                raise CFlowError(f"definition {self.name}: {field} must be two ascending values or more, got {edges}")
 
 
 DEFINITIONS: Dict[str, Definition] = {
@@ -167,6 +147,23 @@ def get_definition(definition: Union[str, Definition]) -> Definition:
     if definition not in DEFINITIONS:
         raise CFlowError(f"evaluation definitions are {sorted(DEFINITIONS)}, got {definition!r}")
     return DEFINITIONS[definition]
+
+
+def interval_of(values: np.ndarray, edges: Sequence[float], closed: bool = False) -> np.ndarray:
+    """Which of the intervals between ascending edges each value lies in.
+
+    Args:
+        values: (M,) float.
+        edges: ascending.
+        closed: False: an interval holds its lower edge, True: its upper one, and the first one also 0.
+
+    Returns:
+        (M,) int64, -1 = in none.
+    """
+    number = np.searchsorted(np.asarray(edges), values, side="left" if closed else "right") - 1
+    if closed and edges[0] == 0:
+        number = np.maximum(number, 0)
+    return np.where(number < len(edges) - 1, number, -1)
 
 
 def range_names(edges: Sequence[float]) -> List[str]:

@@ -13,7 +13,7 @@ from cflow_torch.data.log import FlowLabels
 from cflow_torch.types import Array, CFlowError, FlowResult, Window, as_numpy
 
 # Kinds of numbers that are taken for each kind: NumPy would also make numbers of texts and drop imaginary parts.
-_KINDS = {"f": "fiu", "i": "iu", "b": "b"}
+_KINDS = {"f": ("fiu", "hold numbers"), "i": ("iu", "hold whole numbers"), "b": ("b", "be bool")}
 
 
 def ego_motion_flow(points: np.ndarray, T_ego1_ego0: np.ndarray) -> np.ndarray:
@@ -72,24 +72,22 @@ class EvalFrame:
             raise CFlowError("an evaluation frame needs pose_flow or T_ego1_ego0 to tell ego motion from object motion")
         if self.residual_axes not in ("t", "t+1"):
             raise CFlowError(f"residual_axes is 't' or 't+1', got {self.residual_axes!r}")
-        points = as_numpy(self.points)
+        points, labels = as_numpy(self.points), self.labels
         if points.ndim != 2 or points.shape[1] < 3:
             raise CFlowError(f"points must be (N, 3) or wider, got shape {points.shape}")
-        if points.dtype.kind not in _KINDS["f"]:
-            raise CFlowError(f"points must hold numbers, got {points.dtype}")
-        self._set("points", points[:, :3].astype(np.float32))
         rows = len(points)
+        self._set("points", _checked("points", points[:, :3], np.float32, (rows, 3)))
         for name in ("residual_flow", "flow", "pose_flow"):
-            self._keep(name, np.float32, (rows, 3))
+            self._set(name, _checked(name, getattr(self, name), np.float32, (rows, 3)))
         for name in ("is_ground", "eval_mask", "is_dynamic"):
-            self._keep(name, np.bool_, (rows,))
-        self._keep("T_ego1_ego0", np.float64, (4, 4))
-        labels = FlowLabels(
-            flow=self._checked("labels.flow", self.labels.flow, np.float32, (rows, 3)),
-            category=self._checked("labels.category", self.labels.category, np.int64, (rows,)),
-            is_valid=self._checked("labels.is_valid", self.labels.is_valid, np.bool_, (rows,)),
-        )
-        self._set("labels", labels)
+            self._set(name, _checked(name, getattr(self, name), np.bool_, (rows,)))
+        self._set("T_ego1_ego0", _checked("T_ego1_ego0", self.T_ego1_ego0, np.float64, (4, 4)))
+        truth = {
+            "flow": _checked("labels.flow", labels.flow, np.float32, (rows, 3)),
+            "category": _checked("labels.category", labels.category, np.int64, (rows,)),
+            "is_valid": _checked("labels.is_valid", labels.is_valid, np.bool_, (rows,)),
+        }
+        self._set("labels", FlowLabels(**truth))
         if self.pose_flow is None:
             self._set("pose_flow", ego_motion_flow(self.points, self.T_ego1_ego0))  # type: ignore[arg-type]
 
@@ -134,28 +132,23 @@ class EvalFrame:
             CFlowError: the frame has only `pose_flow`.
         """
         if self.T_ego1_ego0 is None:
-            raise CFlowError(
-                "this definition measures in the ego frame of another sweep, which pose_flow alone does not give; "
-                "pass T_ego1_ego0 to the evaluation frame"
-            )
+            raise CFlowError("this definition measures in another frame: pass T_ego1_ego0 to the evaluation frame")
         return as_numpy(self.T_ego1_ego0)
 
     def _set(self, name: str, value: Any) -> None:
         object.__setattr__(self, name, value)
 
-    def _keep(self, name: str, dtype: Any, shape: Tuple[int, ...]) -> None:
-        if getattr(self, name) is not None:
-            self._set(name, self._checked(name, getattr(self, name), dtype, shape))
 
-    @staticmethod
-    def _checked(name: str, value: Array, dtype: Any, shape: Tuple[int, ...]) -> np.ndarray:
-        array = as_numpy(value)
-        if array.size == np.prod(shape) and array.ndim == len(shape) + 1 and array.shape[-1] == 1:
-            array = array[..., 0]  # evaluation masks are stored (N, 1) by some harnesses
-        if array.shape != shape:
-            raise CFlowError(f"{name} must have shape {shape} (one row per point of sweep t), got {array.shape}")
-        if dtype is np.bool_ and array.dtype != np.bool_:
-            raise CFlowError(f"{name} must be bool, got {array.dtype}")
-        if array.dtype.kind not in _KINDS[np.dtype(dtype).kind]:
-            raise CFlowError(f"{name} must hold {'whole ' if dtype is np.int64 else ''}numbers, got {array.dtype}")
-        return array.astype(dtype)
+def _checked(name: str, value: Any, dtype: Any, shape: Tuple[int, ...]) -> Any:
+    """The array in its type; None stays None."""
+    if value is None:
+        return None
+    array = as_numpy(value)
+    if array.size == np.prod(shape) and array.ndim == len(shape) + 1 and array.shape[-1] == 1:
+        array = array[..., 0]  # evaluation masks are stored (N, 1) by some harnesses
+    if array.shape != shape:
+        raise CFlowError(f"{name} must have shape {shape} (one row per point of sweep t), got {array.shape}")
+    kinds, what = _KINDS[np.dtype(dtype).kind]
+    if array.dtype.kind not in kinds:
+        raise CFlowError(f"{name} must {what}, got {array.dtype}")
+    return array.astype(dtype)

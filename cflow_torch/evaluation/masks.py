@@ -54,12 +54,11 @@ def score_points(frame: EvalFrame, definition: Definition) -> ScoredPoints:
     Raises:
         CFlowError: NaN where the definition refuses it; `T_ego1_ego0` is missing where it is needed.
     """
-    keep = _candidates(frame, definition)
-    total = _predicted_total(frame)
+    points, true_total = as_numpy(frame.points), frame.labels.flow
     pose_flow = as_numpy(frame.pose_flow)  # type: ignore[arg-type]
-    has_nan = np.isnan(np.concatenate([total, pose_flow, as_numpy(frame.points), frame.labels.flow], axis=1)).any(
-        axis=1
-    )
+    position, total = _position(frame, definition), _predicted_total(frame)
+    keep = _candidates(frame, definition, position)
+    has_nan = np.isnan(np.concatenate([total, pose_flow, points, true_total], axis=1)).any(axis=1)
     num_nan = int((keep & has_nan).sum())
     if num_nan and definition.nan_rows == "error":
         raise CFlowError(
@@ -67,28 +66,33 @@ def score_points(frame: EvalFrame, definition: Definition) -> ScoredPoints:
             f"them: predict 0 for points without an estimate, or use nan_rows='drop'"
         )
     keep &= ~has_nan
-    points, total, true_total = as_numpy(frame.points)[keep], total[keep], frame.labels.flow[keep]
-    residual, true_residual = total - pose_flow[keep], true_total - pose_flow[keep]
+    points, pose_flow, total, true_total = (values[keep] for values in (points, pose_flow, total, true_total))
+    residual, true_residual = total - pose_flow, true_total - pose_flow
     threshold = np.float32(definition.dynamic_threshold)
-    if frame.is_dynamic is None:
-        predicted_dynamic = np.linalg.norm(residual, axis=1) >= threshold
-    else:
+    predicted_dynamic = np.linalg.norm(residual, axis=1) >= threshold
+    if frame.is_dynamic is not None:
         predicted_dynamic = as_numpy(frame.is_dynamic)[keep]
     if definition.residual_axes == "t":
-        true_residual = _residual_at_t(points, true_total, frame.transform())
-        residual = _predicted_residual_at_t(frame, keep, points, total)
-    predicted_flow, true_flow = (
-        (total, true_total) if definition.three_way_flow == "total" else (residual, true_residual)
-    )
+        T = frame.transform()
+        residual, true_residual = _residual_at_t(points, total, T), _residual_at_t(points, true_total, T)
+        if frame.residual_flow is not None:  # given as a residual: it is only turned
+            given = as_numpy(frame.residual_flow)[keep]
+            residual = given if frame.residual_axes == "t" else (given @ T[:3, :3]).astype(np.float32)
+    is_total = definition.three_way_flow == "total"
+    predicted_flow, true_flow = (total, true_total) if is_total else (residual, true_residual)
     if definition.half_precision:
         predicted_flow, true_flow = predicted_flow.astype(np.float16), true_flow.astype(np.float16)
-    reach = _reach(frame, definition)
+    is_box = definition.region == "box"
+    reach = np.abs(position[:, :2]).max(axis=1) if is_box else np.linalg.norm(position[:, :2], axis=1)
+    in_region = reach <= definition.max_range if definition.closed else reach < definition.max_range
+    if definition.region == "all":
+        in_region = np.ones_like(keep)
     difference = residual.astype(definition.norm_dtype) - true_residual.astype(definition.norm_dtype)
     return ScoredPoints(
         error=np.linalg.norm(difference, axis=1).astype(np.float64),
         speed=np.linalg.norm(true_residual.astype(definition.norm_dtype), axis=1).astype(np.float64),
         category=frame.labels.category[keep],
-        in_region=_in_region(reach, definition)[keep],
+        in_region=in_region[keep],
         reach=reach[keep].astype(np.float64),
         is_close=(np.abs(points[:, :2]) <= CLOSE_RANGE).all(axis=1),
         distance=np.linalg.norm(points, axis=1).astype(np.float64),
@@ -117,15 +121,7 @@ def _residual_at_t(points: np.ndarray, total: np.ndarray, T_ego1_ego0: np.ndarra
     return ((start + total - translation) @ rotation - start).astype(np.float32)
 
 
-def _predicted_residual_at_t(frame: EvalFrame, keep: np.ndarray, points: np.ndarray, total: np.ndarray) -> np.ndarray:
-    """(M, 3) float32 predicted residual in the axes of t; one that was given as a residual is only turned."""
-    if frame.residual_flow is None:
-        return _residual_at_t(points, total, frame.transform())
-    residual = as_numpy(frame.residual_flow)[keep]
-    return residual if frame.residual_axes == "t" else (residual @ frame.transform()[:3, :3]).astype(np.float32)
-
-
-def _candidates(frame: EvalFrame, definition: Definition) -> np.ndarray:
+def _candidates(frame: EvalFrame, definition: Definition, position: np.ndarray) -> np.ndarray:
     """(N,) bool: valid truth, not ground, inside the evaluation mask and the crop."""
     keep = frame.labels.is_valid.copy()
     if definition.exclude_ground and frame.is_ground is not None:
@@ -136,25 +132,8 @@ def _candidates(frame: EvalFrame, definition: Definition) -> np.ndarray:
         keep &= (np.abs(as_numpy(frame.points)[:, :2]) <= definition.mask_box).all(axis=1)
     if definition.point_cloud_range is not None:
         crop = np.asarray(definition.point_cloud_range, dtype=np.float64)
-        position = _position(frame, definition)
         keep &= ((position > crop[:3]) & (position < crop[3:])).all(axis=1)
     return keep
-
-
-def _reach(frame: EvalFrame, definition: Definition) -> np.ndarray:
-    """(N,) distance that regions are measured by."""
-    position = _position(frame, definition)[:, :2]
-    return np.abs(position).max(axis=1) if definition.region == "box" else np.linalg.norm(position, axis=1)
-
-
-def _in_region(reach: np.ndarray, definition: Definition) -> np.ndarray:
-    """(N,) bool: inside the box or disc that scores are given for."""
-    if definition.region == "all":
-        return np.ones(len(reach), dtype=bool)
-    if definition.closed:
-        inner = reach > definition.min_range if definition.min_range > 0 else True
-        return inner & (reach <= definition.max_range)
-    return (reach >= definition.min_range) & (reach < definition.max_range)
 
 
 def _position(frame: EvalFrame, definition: Definition) -> np.ndarray:

@@ -5,14 +5,12 @@ from __future__ import annotations
 from typing import Any, Callable, Dict, Union
 
 from cflow_torch.evaluation.accumulator import Accumulator
-from cflow_torch.evaluation.bucketed import BucketedEPE
-from cflow_torch.evaluation.bucketed_by_range import BucketedByRange
+from cflow_torch.evaluation.bucketed import BucketedByRange, BucketedEPE
 from cflow_torch.evaluation.definitions import Definition, get_definition
 from cflow_torch.evaluation.frame import EvalFrame
 from cflow_torch.evaluation.masks import score_points
 from cflow_torch.evaluation.rangewise import RangeWiseEPE
 from cflow_torch.evaluation.threeway import ThreeWayEPE
-from cflow_torch.types import CFlowError
 
 _ACCUMULATORS: Dict[str, Callable[..., Accumulator]] = {
     "bucketed": BucketedEPE,
@@ -68,10 +66,8 @@ class SceneFlowMetrics:
         Raises:
             CFlowError: the definitions differ.
         """
-        if other.definition != self.definition:
-            raise CFlowError(f"cannot merge scores of {other.definition.name} into {self.definition.name}")
-        for name, part in self.parts.items():
-            part.merge(other.parts[name])
+        for part, another in zip(self.parts.values(), other.parts.values()):
+            part.merge(another)
         self.num_frames += other.num_frames
         self.num_points += other.num_points
         self.num_nan += other.num_nan

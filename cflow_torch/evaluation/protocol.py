@@ -20,22 +20,13 @@ class ProtocolScores:
         overall: unweighted mean over data sets; NaN if anything is missing.
         data_sets: data set -> mean of its ranges; NaN if one of them is missing.
         ranges: range -> unweighted mean over data sets; NaN if one of them is missing.
-        missing: one sentence for each data set or range without a value; empty if all are there.
+        missing: one sentence for each range of a data set without a value; empty if all are there.
     """
 
     overall: float
     data_sets: Dict[str, float]
     ranges: Dict[str, float]
     missing: Tuple[str, ...]
-
-    def to_dict(self) -> Dict[str, Any]:
-        """Plain dictionary, for JSON."""
-        return {
-            "overall": self.overall,
-            "data_sets": dict(self.data_sets),
-            "ranges": dict(self.ranges),
-            "missing": list(self.missing),
-        }
 
 
 def errors_by_range(results: Mapping[str, Any], class_name: Optional[str] = None) -> Dict[str, float]:
@@ -52,16 +43,13 @@ def errors_by_range(results: Mapping[str, Any], class_name: Optional[str] = None
         CFlowError: the metric or the class is not among the results.
     """
     if "bucketed_by_range" not in results:
-        raise CFlowError(
-            f"the results hold {sorted(results)}, not 'bucketed_by_range'; score with definition='challenge_2026' or "
-            f"another one whose metrics include it"
-        )
+        raise CFlowError("the results have no 'bucketed_by_range': score with definition='challenge_2026'")
     errors = {}
     for name, scores in results["bucketed_by_range"]["ranges"].items():
         if class_name is not None and class_name not in scores["classes"]:
             raise CFlowError(f"classes are {sorted(scores['classes'])}, got {class_name!r}")
         row = scores["mean"] if class_name is None else scores["classes"][class_name]
-        errors[name] = math.nan if row["dynamic_error"] is None else float(row["dynamic_error"])
+        errors[name] = _number(row["dynamic_error"])
     return errors
 
 
@@ -94,45 +82,36 @@ def score_data_sets(
     """
     if missing not in ("error", "nan"):
         raise CFlowError(f"missing is 'error' or 'nan', got {missing!r}")
+    given = list(dict.fromkeys(name for row in results.values() for name in row))
     set_names = list(results if data_sets is None else data_sets)
-    range_names = list(dict.fromkeys(name for row in results.values() for name in row) if ranges is None else ranges)
+    range_names = list(given if ranges is None else ranges)
     if not set_names or not range_names:
         raise CFlowError(f"nothing to combine: data sets {set_names}, ranges {range_names}")
-    _refuse_unknown("data set", results, set_names)
+    unknown = [name for name in (*results, *given) if name not in (*set_names, *range_names)]
+    if unknown:
+        raise CFlowError(f"{unknown} given, but only {set_names}, {range_names} asked for; leave out or ask for all")
     reasons: List[str] = []
     table: Dict[str, List[float]] = {}
     for set_name in set_names:
-        row = results.get(set_name)
-        _refuse_unknown(f"range of {set_name}", row or {}, range_names)
-        table[set_name] = [_value(row, name) for name in range_names]
-        if row is None:
-            reasons.append(f"data set {set_name} has no results")
-        else:
-            reasons += [
-                f"data set {set_name}, range {name}: " + ("no moving points (NaN)" if name in row else "no result")
-                for name, value in zip(range_names, table[set_name])
-                if math.isnan(value)
-            ]
+        row = results.get(set_name, {})
+        table[set_name] = [_number(row.get(name)) for name in range_names]
+        for name, value in zip(range_names, table[set_name]):
+            if math.isnan(value):
+                why = "no moving points (NaN)" if name in row else "no result"
+                reasons.append(f"data set {set_name}, range {name}: {why}")
     if reasons and missing == "error":
         raise CFlowError(
-            "; ".join(reasons) + ": an overall score needs them all. Score the missing part, name the data sets and "
-            "ranges that you mean, or pass missing='nan' to get NaN and this list"
+            "; ".join(reasons) + ": score them, name the data sets and ranges that you mean, or pass missing='nan' to "
+            "get NaN and this list"
         )
     per_set = {name: _mean(row) for name, row in table.items()}
     per_range = {name: _mean([row[i] for row in table.values()]) for i, name in enumerate(range_names)}
     return ProtocolScores(_mean(list(per_set.values())), per_set, per_range, tuple(reasons))
 
 
-def _value(row: Optional[Mapping[str, Optional[float]]], name: str) -> float:
-    value = None if row is None else row.get(name)
+def _number(value: Optional[float]) -> float:
     return math.nan if value is None else float(value)
 
 
 def _mean(values: Sequence[float]) -> float:
     return math.fsum(values) / len(values)  # NaN if any is NaN
-
-
-def _refuse_unknown(what: str, given: Mapping[str, Any], allowed: Sequence[str]) -> None:
-    unknown = [name for name in given if name not in allowed]
-    if unknown:
-        raise CFlowError(f"{what}: {unknown} given, but only {list(allowed)} asked for; leave out or ask for all")

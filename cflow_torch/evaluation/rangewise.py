@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any, Dict, Union
+from typing import Any, Dict, Sequence, Tuple
 
 import numpy as np
 
 from cflow_torch.evaluation.accumulator import Accumulator
 from cflow_torch.evaluation.bucketed import mean_of_present
-from cflow_torch.evaluation.definitions import Definition, range_names
+from cflow_torch.evaluation.definitions import interval_of, range_names
 from cflow_torch.evaluation.masks import ScoredPoints
 
 
@@ -22,28 +22,24 @@ class RangeWiseEPE(Accumulator):
     of all frames; "mean" weighs every range that has points the same.
     """
 
-    totals = ("count", "error_sum")
+    num_quantities = 1
 
-    def __init__(self, definition: Union[str, Definition] = "opensceneflow") -> None:
-        super().__init__(definition)
-        shape = (len(self.definition.range_edges) - 1, 2)  # range, static / dynamic
-        self.count = np.zeros(shape, dtype=np.int64)
-        self.error_sum = np.zeros(shape, dtype=np.float64)
+    def shape(self) -> Tuple[int, ...]:
+        """(ranges, static / dynamic)."""
+        return len(self.definition.range_edges) - 1, 2
 
-    def update_points(self, scored: ScoredPoints) -> None:
-        """Add the scored points of one frame."""
-        number = np.searchsorted(np.asarray(self.definition.range_edges), scored.distance, side="right") - 1
+    def cells(self, scored: ScoredPoints) -> Tuple[np.ndarray, Sequence[np.ndarray]]:
+        """Range and motion; error."""
+        number = interval_of(scored.distance, self.definition.range_edges)
         # speed times rate, not divided by the interval: the product is what the harness compares
         dynamic = scored.speed * (1.0 / self.definition.sweep_interval) >= self.definition.range_dynamic_speed
-        keep = (number >= 0) & (number < len(self.count))
-        cell = (2 * number + dynamic)[keep]
-        self.count += np.bincount(cell, minlength=self.count.size).reshape(self.count.shape)
-        self.error_sum += np.bincount(cell, scored.error[keep], minlength=self.count.size).reshape(self.count.shape)
+        keep = number >= 0
+        return (2 * number + dynamic)[keep], (scored.error[keep],)
 
     def compute(self) -> Dict[str, Any]:
         """Per range ("0-35", ...) `static_epe`, `dynamic_epe` in metres, `num_static`, `num_dynamic`; and "mean"."""
         with np.errstate(divide="ignore", invalid="ignore"):
-            epe = self.error_sum / self.count
+            epe = self.sums[0] / self.count
         result: Dict[str, Any] = {
             name: {
                 "static_epe": float(epe[row, 0]),

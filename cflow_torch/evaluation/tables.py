@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Dict, List, Sequence
+from typing import Any, Callable, Dict, List, Sequence, Tuple
+
+Table = Tuple[List[str], List[List[Any]]]
 
 
 def format_table(results: Dict[str, Any]) -> str:
@@ -15,69 +17,67 @@ def format_table(results: Dict[str, Any]) -> str:
     Returns:
         Markdown, one table per metric; "-" where there are no points.
     """
-    lines = [
-        f"definition {results['definition']}: {results['num_frames']} frames, {results['num_points']} points scored, "
-        f"{results['num_nan']} left out for NaN"
-    ]
-    if "bucketed" in results:
-        classes, mean = results["bucketed"]["classes"], results["bucketed"]["mean"]
-        rows = [
-            [name, _number(row["static_epe"]), _number(row["dynamic_error"]), row["num_static"], row["num_dynamic"]]
-            for name, row in classes.items()
-        ]
-        rows.append(["**mean**", _number(mean["static_epe"]), _number(mean["dynamic_error"]), "", ""])
-        lines += ["", *_table(["class", "static EPE [m]", "dynamic error", "static points", "dynamic points"], rows)]
-    if "bucketed_by_range" in results:
-        by_range = results["bucketed_by_range"]
-        names = list(next(iter(by_range["ranges"].values()))["classes"])
-        moving = [name for name in names if name != "BACKGROUND"]
-        rows = [
-            [
-                name,
-                *(_number(scores["classes"][column]["dynamic_error"]) for column in moving),
-                _number(scores["mean"]["dynamic_error"]),
-            ]
-            for name, scores in by_range["ranges"].items()
-        ]
-        rows.append(["**mean**", *("" for _ in moving), _number(by_range["mean"]["dynamic_error"])])
-        lines += ["", *_table(["dynamic error, range [m]", *moving, "mean"], rows)]
-    if "three_way" in results:
-        scores = results["three_way"]
-        keys = ["epe_3way", "epe_fd", "epe_fs", "epe_bs", "dynamic_iou"]
-        header = ["EPE 3-way [m]", "EPE FD [m]", "EPE FS [m]", "EPE BS [m]", "dynamic IoU"]
-        lines += ["", *_table(header, [[_number(scores[key]) for key in keys]])]
-    if "range_wise" in results:
-        rows = [
-            [
-                f"**{name}**" if name == "mean" else name,
-                _number(row["static_epe"]),
-                _number(row["dynamic_epe"]),
-                row.get("num_static", ""),
-                row.get("num_dynamic", ""),
-            ]
-            for name, row in results["range_wise"].items()
-        ]
-        lines += [
-            "",
-            *_table(["range [m]", "static EPE [m]", "dynamic EPE [m]", "static points", "dynamic points"], rows),
-        ]
+    frames, points, num_nan = (results[key] for key in ("num_frames", "num_points", "num_nan"))
+    scored = f"{frames} frames, {points} points scored, {num_nan} left out for NaN"
+    lines = [f"definition {results['definition']}: {scored}"]
+    for metric, table in _TABLES.items():
+        if metric in results:
+            header, rows = table(results[metric])
+            lines += ["", *_markdown(header, rows)]
     return "\n".join(lines) + "\n"
+
+
+def _bucketed(scores: Dict[str, Any]) -> Table:
+    return _static_and_dynamic("class", "dynamic error", "dynamic_error", scores["classes"], scores["mean"])
+
+
+def _range_wise(scores: Dict[str, Any]) -> Table:
+    ranges = {name: row for name, row in scores.items() if name != "mean"}
+    return _static_and_dynamic("range [m]", "dynamic EPE [m]", "dynamic_epe", ranges, scores["mean"])
+
+
+def _static_and_dynamic(of: str, title: str, key: str, scores: Dict[str, Any], mean: Dict[str, float]) -> Table:
+    rows = [
+        [name, _number(row["static_epe"]), _number(row[key]), row["num_static"], row["num_dynamic"]]
+        for name, row in scores.items()
+    ]
+    rows.append(["**mean**", _number(mean["static_epe"]), _number(mean[key]), "", ""])
+    return [of, "static EPE [m]", title, "static points", "dynamic points"], rows
+
+
+def _by_range(scores: Dict[str, Any]) -> Table:
+    classes = next(iter(scores["ranges"].values()))["classes"]
+    moving = [name for name in classes if name != "BACKGROUND"]
+    rows = []
+    for name, own in scores["ranges"].items():
+        columns = [*(own["classes"][column] for column in moving), own["mean"]]
+        rows.append([name, *(_number(column["dynamic_error"]) for column in columns)])
+    rows.append(["**mean**", *("" for _ in moving), _number(scores["mean"]["dynamic_error"])])
+    return ["dynamic error, range [m]", *moving, "mean"], rows
+
+
+def _three_way(scores: Dict[str, Any]) -> Table:
+    keys = ("epe_3way", "epe_fd", "epe_fs", "epe_bs", "dynamic_iou")
+    titles = ["EPE 3-way [m]", "EPE FD [m]", "EPE FS [m]", "EPE BS [m]", "dynamic IoU"]
+    return titles, [[_number(scores[key]) for key in keys]]
+
+
+_TABLES: Dict[str, Callable[[Dict[str, Any]], Table]] = {
+    "bucketed": _bucketed,
+    "bucketed_by_range": _by_range,
+    "three_way": _three_way,
+    "range_wise": _range_wise,
+}
 
 
 def _number(value: float) -> str:
     return "-" if math.isnan(value) else f"{value:.4f}"
 
 
-def _table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> List[str]:
+def _markdown(header: Sequence[object], rows: Sequence[Sequence[object]]) -> List[str]:
     """Lines of a Markdown table, first column flush left, others flush right."""
     cells = [[str(cell) for cell in row] for row in (header, *rows)]
-    widths = [max(len(row[column]) for row in cells) for column in range(len(header))]
-    aligned = [
-        [
-            cell.ljust(width) if column == 0 else cell.rjust(width)
-            for column, (cell, width) in enumerate(zip(row, widths))
-        ]
-        for row in cells
-    ]
-    rule = ["-" * width if column == 0 else "-" * (width - 1) + ":" for column, width in enumerate(widths)]
-    return ["| " + " | ".join(row) + " |" for row in (aligned[0], rule, *aligned[1:])]
+    first, *others = [max(len(cell) for cell in column) for column in zip(*cells)]
+    lines = [[row[0].ljust(first), *(cell.rjust(width) for cell, width in zip(row[1:], others))] for row in cells]
+    lines.insert(1, ["-" * first, *("-" * (width - 1) + ":" for width in others)])
+    return ["| " + " | ".join(line) + " |" for line in lines]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Dict, List, Tuple, Union
+from typing import Any, Dict, Sequence, Tuple, Union
 
 import numpy as np
 
@@ -39,10 +39,8 @@ def point_quantities(predicted: np.ndarray, true: np.ndarray, sweep_interval: fl
     error = np.linalg.norm(predicted - true, axis=1)
     share = error / (np.linalg.norm(true, axis=1) + ACCURACY_EPS)
     time = np.full((len(true), 1), sweep_interval)
-    units: List[np.ndarray] = []
-    for flow in (predicted, true):
-        vector = np.concatenate([flow, time], axis=1)
-        units.append(vector / np.linalg.norm(vector, axis=1, keepdims=True))
+    vectors = [np.concatenate([flow, time], axis=1) for flow in (predicted, true)]
+    units = [vector / np.linalg.norm(vector, axis=1, keepdims=True) for vector in vectors]
     angle = np.arccos(np.clip((units[0] * units[1]).sum(axis=1), -1.0, 1.0))
     strict = (error < ACCURACY_STRICT) | (share < ACCURACY_STRICT)
     relax = (error < ACCURACY_RELAX) | (share < ACCURACY_RELAX)
@@ -61,39 +59,32 @@ class ThreeWayEPE(Accumulator):
     breakdowns are over points in both cases.
     """
 
-    totals = ("count", "num_predicted", "sums", "num_frames", "frame_sums")
+    totals = ("count", "sums", "num_frames", "frame_sums")
+    num_quantities = len(QUANTITIES) + 1  # the last one: 1 where a point is predicted as dynamic
 
     def __init__(self, definition: Union[str, Definition] = "opensceneflow") -> None:
         super().__init__(definition)
-        shape = (len(CATEGORIES), len(MOTIONS), len(DISTANCES))
-        self.count = np.zeros(shape, dtype=np.int64)
-        self.num_predicted = np.zeros(shape, dtype=np.int64)  # points predicted as dynamic
-        self.sums = np.zeros((len(QUANTITIES), *shape), dtype=np.float64)
         self.num_frames = 0
         self.frame_sums = np.zeros(len(_SETS) + 1, dtype=np.float64)  # per-frame values of the sets and the IoU
 
-    def update_points(self, scored: ScoredPoints) -> None:
-        """Add the scored points of one frame."""
-        keep = scored.in_region
-        meta = meta_class(scored.category)
+    def shape(self) -> Tuple[int, ...]:
+        """(categories, motions, distances)."""
+        return len(CATEGORIES), len(MOTIONS), len(DISTANCES)
+
+    def cells(self, scored: ScoredPoints) -> Tuple[np.ndarray, Sequence[np.ndarray]]:
+        """Category, motion and distance; `QUANTITIES`, predicted as dynamic."""
+        keep, meta = scored.in_region, meta_class(scored.category)
         if self.definition.foreground == "meta":
             keep = keep & (meta >= 0)
-        true, predicted = scored.is_dynamic[keep], scored.predicted_dynamic[keep]
-        cell = 4 * scored.category[keep] + 2 * true + ~scored.is_close[keep]
-        quantities = point_quantities(
-            scored.predicted_flow[keep], scored.true_flow[keep], self.definition.sweep_interval
-        )
-        size, shape = self.count.size, self.count.shape
-        count = np.bincount(cell, minlength=size).reshape(shape)
-        num_predicted = np.bincount(cell[predicted], minlength=size).reshape(shape)
-        sums = np.stack([np.bincount(cell, row, minlength=size).reshape(shape) for row in quantities])
-        self.count += count
-        self.num_predicted += num_predicted
-        self.sums += sums
+        cell = 4 * scored.category[keep] + 2 * scored.is_dynamic[keep] + ~scored.is_close[keep]
+        flows = scored.predicted_flow[keep], scored.true_flow[keep]
+        predicted = scored.predicted_dynamic[keep].astype(np.float64)
+        return cell, [*point_quantities(*flows, self.definition.sweep_interval), predicted]
+
+    def _add(self, count: np.ndarray, sums: np.ndarray) -> None:
+        super()._add(count, sums)
         self.num_frames += 1
-        means = [sums[0][place].sum() / (count[place].sum() + FRAME_COUNT_EPS) for place in _SETS.values()]
-        hits, union = _segmentation(count, num_predicted)
-        self.frame_sums += np.array([*means, hits / (union + FRAME_IOU_EPS)])
+        self.frame_sums += _values(count, sums, FRAME_COUNT_EPS, FRAME_IOU_EPS)
 
     def compute(self) -> Dict[str, Any]:
         """Scores so far.
@@ -103,40 +94,39 @@ class ThreeWayEPE(Accumulator):
             "background" / "foreground" -> "static" / "dynamic" -> "all" / "close" / "far" -> `count`, `num_predicted`
             (points predicted as dynamic) and the values of `QUANTITIES`; "by_class": the same per meta class.
         """
-        with np.errstate(divide="ignore", invalid="ignore"):
-            if self.definition.average == "frames":
+        values = _values(self.count, self.sums)
+        if self.definition.average == "frames":
+            with np.errstate(invalid="ignore"):
                 values = self.frame_sums / self.num_frames
-            else:
-                means = [self.sums[0][place].sum() / self.count[place].sum() for place in _SETS.values()]
-                hits, union = _segmentation(self.count, self.num_predicted)
-                values = np.array([*means, np.float64(hits) / union])
-        result: Dict[str, Any] = {key: float(value) for key, value in zip(_SETS, values)}
-        result["epe_3way"] = float(np.mean(values[: len(_SETS)]))
-        result["dynamic_iou"] = float(values[-1])
-        result["num_frames"] = self.num_frames
-        result["breakdown"] = {name: self._group(place) for name, place in _GROUPS.items()}
-        result["by_class"] = {name: self._group(place) for name, place in _META_GROUPS.items()}
-        return result
+        return {
+            **dict(zip(_SETS, values.tolist())),
+            "epe_3way": float(np.mean(values[:-1])),
+            "dynamic_iou": float(values[-1]),
+            "num_frames": self.num_frames,
+            "breakdown": {name: self._group(place) for name, place in _GROUPS.items()},
+            "by_class": {name: self._group(place) for name, place in _META_GROUPS.items()},
+        }
 
     def _group(self, categories: Any) -> Dict[str, Dict[str, Dict[str, float]]]:
         """Motion -> distance -> means over a group of categories."""
-        count, predicted = self.count[categories].sum(axis=0), self.num_predicted[categories].sum(axis=0)
-        sums = self.sums[:, categories].sum(axis=1)
+        count, sums = self.count[categories].sum(axis=0), self.sums[:, categories].sum(axis=1)
         places: Dict[str, Any] = {"all": slice(None), **{name: [place] for place, name in enumerate(DISTANCES)}}
         return {
             motion: {
-                name: _means(count[row, place].sum(), predicted[row, place].sum(), sums[:, row, place].sum(axis=1))
-                for name, place in places.items()
+                name: _means(count[row, place].sum(), sums[:, row, place].sum(axis=1)) for name, place in places.items()
             }
             for row, motion in enumerate(MOTIONS)
         }
 
 
-def _segmentation(count: np.ndarray, num_predicted: np.ndarray) -> Tuple[int, int]:
-    """Points that are dynamic in truth and prediction; in truth or prediction."""
-    return int(num_predicted[:, 1].sum()), int(count[:, 1].sum() + num_predicted[:, 0].sum())
+def _values(count: np.ndarray, sums: np.ndarray, count_eps: float = 0.0, iou_eps: float = 0.0) -> np.ndarray:
+    """(4,) float64: mean error of each of `_SETS`, and the IoU of true and predicted dynamic points."""
+    predicted, true = sums[-1], count[:, 1].sum()
+    with np.errstate(divide="ignore", invalid="ignore"):
+        means = [sums[0][place].sum() / (count[place].sum() + count_eps) for place in _SETS.values()]
+        return np.array([*means, predicted[:, 1].sum() / (true + predicted[:, 0].sum() + iou_eps)])
 
 
-def _means(count: np.integer, num_predicted: np.integer, sums: np.ndarray) -> Dict[str, float]:
+def _means(count: np.integer, sums: np.ndarray) -> Dict[str, float]:
     means = {key: float(total / count) if count else float("nan") for key, total in zip(QUANTITIES, sums)}
-    return {"count": int(count), "num_predicted": int(num_predicted), **means}
+    return {"count": int(count), "num_predicted": int(sums[-1]), **means}

@@ -2,32 +2,36 @@
 
 from __future__ import annotations
 
-import importlib
 from typing import Any, List, Optional, Tuple
 
 import torch
 from torch import Tensor, nn
 
-from cflow_torch.integrations.sequence import Frame, SequenceFlow
+from cflow_torch.integrations.sequence import Frame, SequenceFlow, import_from
 from cflow_torch.types import CFlowError
 from cflow_torch.windows.ego_motion import rigid_transform
+
+_HOW = (
+    "SceneFlowZoo is no package; clone github.com/kylevedder/SceneFlowZoo, install its requirements, and run from its "
+    "root folder or put that on PYTHONPATH"
+)
+_POSES = ("pc_poses_sensor_to_ego", "pc_poses_ego_to_global")
 
 
 class CorrelationFlowModel(nn.Module):
     """What SceneFlowZoo's `ModelWrapper` asks of a model. No parameters, no buffers, nothing to train.
 
     Args:
-        preset: "default", "fast", "keypoints" or "paper", see `make_config`.
+        preset, ground, **settings: as for `SequenceFlow`, for example `num_history=3`.
         device: "auto" = that of the sequence; another one only computes there, the output comes back.
-        ground: None = ground is what `full_pc_mask` leaves out (`with_ground=False`); "auto" or "patchwork" = find it
-            in every sweep as well.
-        **settings: any field of `Config`, for example `num_history=3`.
 
     Raises:
         CFlowError: an unknown setting or an invalid value.
     """
 
-    def __init__(self, preset: str = "default", device: Any = "auto", ground: Optional[str] = None, **settings: Any):
+    def __init__(
+        self, preset: Optional[str] = None, device: Any = "auto", ground: Optional[str] = None, **settings: Any
+    ):
         super().__init__()
         self.sequence_flow = SequenceFlow(preset, device, ground, **settings)
 
@@ -56,7 +60,7 @@ class CorrelationFlowModel(nn.Module):
         """
         if not isinstance(batched_sequence, (list, tuple)):
             raise CFlowError(f"batched_sequence is {type(batched_sequence).__name__}: give a list of sequences")
-        output_class = _output_class()
+        output_class = import_from("dataloaders", "TorchFullFrameOutputSequence", _HOW)
         read = [_read_sequence(sequence, f"batched_sequence[{i}]") for i, sequence in enumerate(batched_sequence)]
         flows = self.sequence_flow([frames for frames, _, _ in read], [first for _, first, _ in read])
         outputs = []
@@ -68,68 +72,37 @@ class CorrelationFlowModel(nn.Module):
         return outputs
 
     def loss_fn(self, input_batch: Any, model_res: Any) -> Any:
-        """There is none.
-
-        Raises:
-            CFlowError: always.
-        """
-        raise CFlowError(
-            "CorrelationFlow has nothing to train: set is_trainable = False in the config and run test_pl.py"
-        )
+        """There is none: always a `CFlowError`."""
+        raise CFlowError("there is nothing to train: set is_trainable = False in the config and run test_pl.py")
 
 
 def register(name: str = "CorrelationFlow") -> None:
-    """Make the model known to the checkout's `models.construct_model`: a config may then say `name="CorrelationFlow"`.
-
-    Args:
-        name: as it stands in the config; case does not matter there.
+    """Make the model known to the checkout's `models.construct_model`, by the name that a config may then give.
 
     Raises:
         CFlowError: no SceneFlowZoo on the path.
     """
-    _zoo("models", "name_to_class_lookup")[name.lower()] = CorrelationFlowModel
-
-
-def _output_class() -> Any:
-    return _zoo("dataloaders", "TorchFullFrameOutputSequence")
-
-
-def _zoo(module: str, attribute: str) -> Any:
-    try:
-        return getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError) as error:
-        raise CFlowError(
-            f"SceneFlowZoo cannot be used ({error}): it is no package; clone "
-            "github.com/kylevedder/SceneFlowZoo, install its requirements, and run from its root folder or put that on "
-            "PYTHONPATH"
-        ) from None
+    import_from("models", "name_to_class_lookup", _HOW)[name.lower()] = CorrelationFlowModel
 
 
 def _read_sequence(sequence: Any, name: str) -> Tuple[List[Frame], int, Tensor]:
     """Sweeps without padding, first sweep that a flow is asked for, (K, PadN) mask: 1, 0, in padding rows NaN."""
-    points, mask = _tensor(sequence, name, "full_pc"), _tensor(sequence, name, "full_pc_mask")
+    for field in ("full_pc", "full_pc_mask", *_POSES):
+        if not isinstance(getattr(sequence, field, None), Tensor):
+            raise CFlowError(f"{name}.{field} is no tensor: give a TorchFullFrameInputSequence")
+    points, mask = sequence.full_pc, sequence.full_pc_mask
     if points.ndim != 3 or points.shape[2] != 3 or points.shape[0] < 2 or not points.is_floating_point():
-        raise CFlowError(
-            f"{name}.full_pc has shape {tuple(points.shape)}, {points.dtype}: give (K, PadN, 3) floating-point metres "
-            "with K of at least 2"
-        )
+        given = f"shape {tuple(points.shape)}, {points.dtype}"
+        raise CFlowError(f"{name}.full_pc has {given}: give (K, PadN, 3) floating-point metres, K of at least 2")
     if mask.shape != points.shape[:2] or not (mask.is_floating_point() or mask.dtype == torch.bool):
-        raise CFlowError(
-            f"{name}.full_pc_mask has shape {tuple(mask.shape)}, {mask.dtype}: give {tuple(points.shape[:2])}, bool or "
-            "float with NaN in padding rows"
-        )
-    if mask.device != points.device:
-        raise CFlowError(
-            f"{name}.full_pc_mask lies on {mask.device}, full_pc on {points.device}: put them on one device"
-        )
+        given, shape = f"shape {tuple(mask.shape)}, {mask.dtype}", tuple(points.shape[:2])
+        raise CFlowError(f"{name}.full_pc_mask has {given}: give {shape}, bool or float with NaN in padding rows")
     is_row = ~torch.isnan(mask) if mask.is_floating_point() else ~torch.isnan(points).all(2)
     poses = []
-    for side in ("pc_poses_sensor_to_ego", "pc_poses_ego_to_global"):
-        pose = _tensor(sequence, name, side).detach().cpu()
-        if pose.shape != (points.shape[0], 4, 4):
-            raise CFlowError(
-                f"{name}.{side} has shape {tuple(pose.shape)}: give ({points.shape[0]}, 4, 4), one a sweep"
-            )
+    for side in _POSES:
+        pose = getattr(sequence, side).detach().cpu()
+        if pose.shape != (len(points), 4, 4):
+            raise CFlowError(f"{name}.{side} has shape {tuple(pose.shape)}: give ({len(points)}, 4, 4), one a sweep")
         poses.append([rigid_transform(matrix, f"{name}.{side}[{k}]") for k, matrix in enumerate(pose)])
     frames = [
         Frame(cloud[rows], part[rows] > 0, sensor_to_ego, ego_to_global)
@@ -140,12 +113,3 @@ def _read_sequence(sequence: Any, name: str) -> Tuple[List[Frame], int, Tensor]:
         raise CFlowError(f"{name}.loader_type is {loader!r}: give LoaderType.CAUSAL or LoaderType.NON_CAUSAL")
     valid = (mask > 0).float().masked_fill(~is_row, torch.nan)
     return frames, len(frames) - 2 if loader == "CAUSAL" else 0, valid
-
-
-def _tensor(sequence: Any, name: str, field: str) -> Tensor:
-    value = getattr(sequence, field, None)
-    if not isinstance(value, Tensor):
-        raise CFlowError(
-            f"{name}.{field} is {type(value).__name__}: give a tensor, as TorchFullFrameInputSequence has it"
-        )
-    return value

@@ -5,6 +5,7 @@ Two harnesses share these data: BucketedSceneFlowEval, and SceneFlowZoo, which i
 
 from __future__ import annotations
 
+import importlib
 import warnings
 from dataclasses import dataclass
 from typing import Any, List, Optional, Sequence, Tuple
@@ -29,8 +30,7 @@ class Frame:
         points: (N, 3) float, metres, in the frame of the sensor.
         takes_part: (N,) bool, False = ground, or outside the range of the data set.
         sensor_to_ego: (4, 4) float64, `T_ego_sensor` of this sweep.
-        ego_to_global: (4, 4) float64, `T_global_ego` of this sweep. "Global" is the ego frame at another sweep; which
-            one does not matter here, it must only be the same for all sweeps of a sequence.
+        ego_to_global: (4, 4) float64, `T_global_ego`; "global" is any frame, the same for all sweeps of a sequence.
         timestamp_ns: nanoseconds, None = unknown.
     """
 
@@ -44,30 +44,33 @@ class Frame:
         """(N, 3) points in the ego frame of this sweep, float64 where the sensor has a frame of its own."""
         if np.array_equal(self.sensor_to_ego, np.eye(4)):
             return self.points
-        if isinstance(self.points, Tensor):
-            return compensate(read_positions(Sweep(self.points), self.points.device), self.sensor_to_ego).t()
-        return compensate(read_positions(Sweep(self.points), torch.device("cpu")), self.sensor_to_ego).t().numpy()
+        device = self.points.device if isinstance(self.points, Tensor) else torch.device("cpu")
+        points = compensate(read_positions(Sweep(self.points), device), self.sensor_to_ego).t()
+        return points if isinstance(self.points, Tensor) else points.numpy()
 
 
 class SequenceFlow(nn.Module):
     """Frames in, residual flow out. No parameters, no buffers.
 
     Args:
-        preset: as in `make_config`.
+        preset: "default", "fast", "keypoints" or "paper", see `make_config`.
         device: "auto" = that of the tensors given, else a GPU if there is one, else the CPU.
-        ground: None = ground is what the frames leave out; "auto" or "patchwork" = find it in every sweep as well, for
-            data sets that are loaded with their ground.
-        **settings: any field of `Config`.
+        ground: None = ground is what the masks of the frames leave out (`with_ground=False`); "auto" or "patchwork" =
+            find it in every sweep as well.
+        **settings: `method`, or any field of the method's settings.
 
     Raises:
         CFlowError: an unknown setting or an invalid value.
     """
 
-    def __init__(self, preset: str = "default", device: Any = "auto", ground: Optional[str] = None, **settings: Any):
+    def __init__(
+        self, preset: Optional[str] = None, device: Any = "auto", ground: Optional[str] = None, **settings: Any
+    ):
         super().__init__()
         if ground not in GROUND:
             raise CFlowError(f"ground={ground!r}: give one of {', '.join(map(repr, GROUND))}")
         self.model = make_model(make_config(preset, **settings), device)
+        self.num_history: int = self.model.config.num_history
         self.ground = ground
         self._looked_for_ground = False
 
@@ -92,18 +95,12 @@ class SequenceFlow(nn.Module):
         """
         windows = [self._windows(frames, first) for frames, first in zip(sequences, firsts)]
         flows: List[List[Tensor]] = [[] for _ in sequences]
-        for step in range(max((len(own) for own in windows), default=0)):
+        for step in range(max(map(len, windows), default=0)):
             members = [index for index, own in enumerate(windows) if step < len(own)]
-            results = self.model([windows[index][step] for index in members])
-            for index, result in zip(members, results):
+            for index, result in zip(members, self.model([windows[index][step] for index in members])):
                 now, following = sequences[index][firsts[index] + step :][:2]
                 flows[index].append(in_axes_of_points(result.residual_flow, now, following))
         return flows
-
-    @property
-    def num_history(self) -> int:
-        """How many sweeps before t are used."""
-        return self.model.config.num_history
 
     def _windows(self, frames: Sequence[Frame], first: int) -> List[Window]:
         oldest = max(first - self.num_history, 0)
@@ -124,10 +121,8 @@ class SequenceFlow(nn.Module):
             self._looked_for_ground = True
             if any(has_ground([points[-2][frames[-2].takes_part]])):
                 warnings.warn(
-                    "there are ground points among those that take part: the ground joins what stands on it into one "
-                    "cluster, so that moving objects are missed. Load the data set with with_ground=False, or pass "
-                    "ground='auto'",
-                    UserWarning,
+                    "there is ground among the points that take part, which joins what stands on it, so that moving "
+                    "objects are missed. Load the data set with with_ground=False, or pass ground='auto'",
                     stacklevel=4,
                 )
         return [
@@ -141,14 +136,11 @@ def in_axes_of_points(residual_flow: Tensor, now: Frame, following: Frame) -> Te
 
     Args:
         residual_flow: (N, 3) float, metres, axes of ego1.
-        now: frame t.
-        following: frame t+1.
+        now, following: frames t and t+1.
 
     Returns:
-        (N, 3) float32; the rotation is done in float64.
-
-    Convention:
-        (R_global_ego0 R_ego_sensor)^T R_global_ego1, no translation: a flow is a difference of positions.
+        (N, 3) float32, times (R_global_ego0 R_ego_sensor)^T R_global_ego1 in float64: no translation, because a flow is
+        a difference of positions.
     """
     turn = np.eye(4)
     to_global = now.ego_to_global[:3, :3] @ now.sensor_to_ego[:3, :3]
@@ -156,11 +148,19 @@ def in_axes_of_points(residual_flow: Tensor, now: Frame, following: Frame) -> Te
     return compensate(residual_flow.double().t(), turn).t().float().contiguous()
 
 
-def times_in_ns(stamps: Sequence[Any]) -> Tuple[Optional[int], ...]:
-    """Time stamps, or None for each if they are no nanoseconds: some data sets number their sweeps 0, 1, 2, ... there.
+def import_from(module: str, name: str, how: str) -> Any:
+    """What a harness's module defines, imported when it is needed.
 
-    Args:
-        stamps: of the sweeps of a sequence, in order.
+    Raises:
+        CFlowError: there is no such module, or another one of that name; `how` says what to install.
     """
+    try:
+        return getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError) as error:
+        raise CFlowError(f"{module}.{name} cannot be used ({error}): {how}") from None
+
+
+def times_in_ns(stamps: Sequence[Any]) -> Tuple[Optional[int], ...]:
+    """Time stamps of sweeps, None for each if they are no nanoseconds: some data sets put numbers 0, 1, ... there."""
     shortest = min((int(b) - int(a) for a, b in zip(stamps, stamps[1:])), default=0)
     return tuple(int(stamp) if shortest >= 1_000_000 else None for stamp in stamps)

@@ -1,4 +1,4 @@
-"""Submission archives: what is written, that it passes, and that every kind of spoiled one is refused by name."""
+"""Submission archives: what is written, that it passes, and that what a leaderboard would refuse is refused by name."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from typing import Any, Callable, Dict, List
 import numpy as np
 import pyarrow as pa
 import pytest
+from public_evaluators import FLOW, LOG, TIME, read_pair
 from pyarrow import feather
 
 from cflow_torch import CFlowError, CorrelationFlow
@@ -38,7 +39,6 @@ from cflow_torch.simulator import make_drive
 from cflow_torch.simulator.writers.av2 import write_av2_log
 from cflow_torch.windows.ego_motion import relative_transform
 
-FLOW = ("flow_tx_m", "flow_ty_m", "flow_tz_m")
 Files = Dict[str, bytes]
 
 
@@ -61,7 +61,7 @@ def archives(log: AV2Log, estimated: Dict[int, Any], tmp_path_factory: pytest.Te
     """Version -> folder, zip, expected frames."""
     result = {}
     for number in (1, 2, 3):
-        version, folder = get_version(number), tmp_path_factory.mktemp(f"v{number}")
+        version, folder = get_version(number), tmp_path_factory.mktemp(f"v{number}") / "files"
         frames = []
         for planned in plan_log(log, version):
             sweeps, flow = estimated[planned.index]
@@ -69,9 +69,8 @@ def archives(log: AV2Log, estimated: Dict[int, Any], tmp_path_factory: pytest.Te
             write_frame(folder, planned.name, encode(version, sweeps, flow, mask)[0])
             frames.append(planned.expect(version))
         write_metadata(folder, version)
-        file = tmp_path_factory.mktemp("zip") / f"v{number}.zip"
-        pack(folder, [frame.name for frame in frames], file, version)
-        result[number] = (folder, file, frames)
+        pack(folder, [frame.name for frame in frames], folder.parent / "a.zip", version)
+        result[number] = (folder, folder.parent / "a.zip", frames)
     return result
 
 
@@ -92,24 +91,21 @@ def read(file: Path) -> Dict[str, np.ndarray]:
     return {name: table[name].to_numpy() for name in table.column_names}
 
 
-@pytest.mark.parametrize("number", [1, 2, 3])
-def test_a_good_archive_passes(number: int, archives: Dict[int, Any]) -> None:
-    folder, file, frames = archives[number]
-    assert len(frames) == 2 and all(frame.rows > 1000 for frame in frames)
-    assert check_submission(folder, get_version(number), frames) == []
-    assert check_submission(file, get_version(number), frames) == []
+def flow_of(columns: Dict[str, np.ndarray]) -> np.ndarray:
+    return np.stack([columns[name] for name in FLOW], 1)
+
+
+# ---- what is written
 
 
 def test_version_1_is_total_flow_of_the_mask(log: AV2Log, estimated: Dict[int, Any], archives: Dict[int, Any]) -> None:
     for index, (sweeps, flow) in estimated.items():
         columns = read(archives[1][0] / log.log_id / f"{log.timestamps[index]}.feather")
-        assert list(columns) == [*FLOW, "is_dynamic"]
+        assert list(columns) == [*FLOW, "is_dynamic"] and flow_of(columns).dtype == np.float16
         points = sweeps.pc0.points
         rows = np.flatnonzero((np.abs(points[:, 0]) <= 50) & (np.abs(points[:, 1]) <= 50) & ~sweeps.pc0.is_ground)
         assert 0 < len(rows) < len(points)
-        for i, name in enumerate(FLOW):
-            assert columns[name].dtype == np.float16
-            np.testing.assert_array_equal(columns[name], flow.flow.numpy()[rows, i].astype(np.float16))
+        np.testing.assert_array_equal(flow_of(columns), flow.flow.numpy()[rows].astype(np.float16))
         speed = np.sqrt((flow.residual_flow.numpy()[rows].astype(np.float64) ** 2).sum(1))
         sure = np.abs(speed - 0.05) > 1e-6
         np.testing.assert_array_equal(columns["is_dynamic"][sure], speed[sure] >= 0.05)
@@ -125,19 +121,11 @@ def test_versions_2_and_3_are_residual_flow_of_all_points(
         columns = read(archives[number][0] / log.log_id / f"{name}.feather")
         assert list(columns) == (["is_valid", *FLOW] if number == 2 else list(FLOW))
         assert number == 3 or (columns["is_valid"].dtype == bool and columns["is_valid"].all())
-        written = np.stack([columns[name] for name in FLOW], 1)
-        assert written.dtype == np.float16 and len(written) == len(sweeps.pc0.points)
-        np.testing.assert_array_equal(written, flow.residual_flow.numpy().astype(np.float16))
-        assert written.any() and not written[sweeps.pc0.is_ground].any()
-
-
-def test_ground_is_zero_whatever_the_result_says(estimated: Dict[int, Any]) -> None:
-    sweeps, flow = estimated[0]
-    loud = type(flow)(**{**vars(flow), "residual_flow": flow.residual_flow + 1})
-    for number in (2, 3):
-        columns, _ = encode(get_version(number), sweeps, loud)
-        values = np.stack([columns[name] for name in FLOW], 1)
-        assert not values[sweeps.pc0.is_ground].any() and values[~sweeps.pc0.is_ground].all()
+        assert flow_of(columns).dtype == np.float16 and flow_of(columns).any()
+        np.testing.assert_array_equal(flow_of(columns), flow.residual_flow.numpy().astype(np.float16))
+        loud = type(flow)(**{**vars(flow), "residual_flow": flow.residual_flow + 50})
+        values = flow_of(encode(get_version(number), sweeps, loud)[0])
+        assert not values[sweeps.pc0.is_ground].any() and values[~sweeps.pc0.is_ground].all(), "ground is 0 in any case"
 
 
 def test_residual_in_axes_of_t(estimated: Dict[int, Any]) -> None:
@@ -147,256 +135,39 @@ def test_residual_in_axes_of_t(estimated: Dict[int, Any]) -> None:
     turn = np.eye(4)
     turn[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
     pc1 = type(sweeps.pc1)(**{**vars(sweeps.pc1), "pose": sweeps.pc1.pose @ turn})
-    turned = type(sweeps)(sweeps.pc0, pc1)
-    T = relative_transform(pc1.pose, sweeps.pc0.pose)
-    start = np.asarray(sweeps.pc0.points, np.float64)
+    T, start = relative_transform(pc1.pose, sweeps.pc0.pose), np.asarray(sweeps.pc0.points, np.float64)
     end = start @ T[:3, :3].T + T[:3, 3] + flow.residual_flow.numpy()
     expected = (end - T[:3, 3]) @ T[:3, :3] - start
-    columns, _ = encode(get_version(2), turned, flow, residual_axes="t")
+    got = flow_of(encode(get_version(2), type(sweeps)(sweeps.pc0, pc1), flow, residual_axes="t")[0]).astype(np.float64)
     moved = flow.residual_flow.numpy().any(1)
-    got = np.stack([columns[name] for name in FLOW], 1).astype(np.float64)
     np.testing.assert_allclose(got[moved], expected[moved], atol=2e-3)
     assert np.abs(got - flow.residual_flow.numpy()).max() > 0.01, "the turn is seen"
-    with pytest.raises(CFlowError, match="residual_axes"):
-        encode(get_version(1), sweeps, flow, np.ones(len(start), bool), residual_axes="t")
-    with pytest.raises(CFlowError, match="t0"):
-        encode(get_version(2), sweeps, flow, residual_axes="t0")
 
 
-def test_rounding_is_reported() -> None:
-    flow = np.array([[1.0, 0, 0], [1 + 2**-11, 0, 0], [0.1, 0.2, 30.01]], np.float32)
-    half, rounding = to_half(flow)
-    lost = np.linalg.norm(half.astype(np.float64) - flow, axis=1)
-    assert rounding.num_points == 3 and rounding.largest == lost.max() and lost[1] == 2**-11
-    assert rounding.mean == pytest.approx(lost.mean()) and "over 3 points" in str(rounding)
-    rounding.add(to_half(np.zeros((3, 3)))[1])
-    assert rounding.mean == pytest.approx(lost.mean() / 2)
-    assert to_half(np.zeros((0, 3)))[1].mean == 0
-    for value, complaint in ((np.nan, "NaN"), (np.inf, "infinite"), (65505.0, "beyond float16")):
-        flow[1, 1] = value
-        with pytest.raises(CFlowError, match=complaint):
-            to_half(flow)
-
-
-def test_masks_and_rows_must_agree(estimated: Dict[int, Any]) -> None:
+def test_what_cannot_be_written_is_refused(estimated: Dict[int, Any]) -> None:
     sweeps, flow = estimated[0]
-    rows = len(sweeps.pc0.points)
-    for number, mask in ((1, None), (2, np.ones(rows, bool)), (1, np.ones(rows - 1, bool))):
-        with pytest.raises(CFlowError, match="mask"):
-            encode(get_version(number), sweeps, flow, mask)
+    mask = np.ones(len(sweeps.pc0.points), bool)
+    for number, given, message in (
+        (1, {}, "mask"),
+        (2, {"mask": mask}, "mask"),
+        (1, {"mask": mask[1:]}, "mask"),
+        (1, {"mask": mask, "residual_axes": "t"}, "residual_axes of version 1"),
+        (2, {"residual_axes": "t0"}, "t0"),
+    ):
+        with pytest.raises(CFlowError, match=message):
+            encode(get_version(number), sweeps, flow, **given)
+    for value, message in ((np.nan, "NaN"), (np.inf, "infinite"), (65505.0, "beyond float16")):
+        with pytest.raises(CFlowError, match=message):
+            to_half(np.array([[0, 0, 0], [0, value, 0]], np.float32))
     with pytest.raises(CFlowError, match="1, 2, 3"):
         get_version(4)
 
 
-# ---- spoiled archives: (what to do to the files of a good one) -> words that one line must hold
-
-Spoil = Callable[[Files, str], None]
-
-
-def table(files: Files, name: str) -> pa.Table:
-    return feather.read_table(pa.BufferReader(files[name]))
-
-
-def store(files: Files, name: str, new: pa.Table) -> None:
-    sink = io.BytesIO()
-    feather.write_feather(new, sink)
-    files[name] = sink.getvalue()
-
-
-def drop_row(files: Files, name: str) -> None:
-    store(files, name, table(files, name).slice(1))
-
-
-def set_value(value: float) -> Spoil:
-    def spoil(files: Files, name: str) -> None:
-        old = table(files, name)
-        values = old["flow_ty_m"].to_numpy().copy()
-        values[7] = value
-        store(files, name, old.set_column(old.column_names.index("flow_ty_m"), "flow_ty_m", pa.array(values)))
-
-    return spoil
-
-
-def retype(column: str, dtype: Any) -> Spoil:
-    def spoil(files: Files, name: str) -> None:
-        old = table(files, name)
-        values = old[column].to_numpy().astype(dtype)
-        store(files, name, old.set_column(old.column_names.index(column), column, pa.array(values)))
-
-    return spoil
-
-
-def empty_value(files: Files, name: str) -> None:
-    old = table(files, name)
-    values = pa.array([None, *old["flow_tx_m"].to_pylist()[1:]], pa.float16())
-    store(files, name, old.set_column(old.column_names.index("flow_tx_m"), "flow_tx_m", values))
-
-
-def rename_column(files: Files, name: str) -> None:
-    old = table(files, name)
-    store(files, name, old.rename_columns([c.replace("flow_tz_m", "flow_z_m") for c in old.column_names]))
-
-
-def extra_column(files: Files, name: str) -> None:
-    old = table(files, name)
-    store(files, name, old.append_column("score", old["flow_tx_m"]))
-
-
-def drop_column(files: Files, name: str) -> None:
-    store(files, name, table(files, name).drop(["flow_tx_m"]))
-
-
-def double_column(files: Files, name: str) -> None:
-    old = table(files, name)
-    store(files, name, old.append_column("flow_tx_m", old["flow_tx_m"]))
-
-
-def truncate(files: Files, name: str) -> None:
-    files[name] = files[name][: len(files[name]) // 2]
-
-
-def not_feather(files: Files, name: str) -> None:
-    files[name] = b"flow\n"
-
-
-def move(new: str) -> Spoil:
-    def spoil(files: Files, name: str) -> None:
-        files[name.rpartition("/")[0] + "/" + new] = files.pop(name)
-
-    return spoil
-
-
-def add(new: str) -> Spoil:
-    def spoil(files: Files, name: str) -> None:
-        files[new.replace("LOG", name.rpartition("/")[0])] = files[name]
-
-    return spoil
-
-
-# kind -> what it does, and the problems that must be found, each by the words of its line. NAME is the frame's name.
-SPOILED: Dict[str, Any] = {
-    "row missing": (drop_row, ["NAME: |rows, expected"]),
-    "NaN": (set_value(np.nan), ["NAME: |flow_ty_m|1 values|NaN"]),
-    "infinite": (set_value(-np.inf), ["NAME: |flow_ty_m|1 values|infinite"]),
-    "integers": (retype("flow_tz_m", np.int16), ["NAME: |flow_tz_m is int16|expected float16"]),
-    "empty value": (empty_value, ["NAME: |flow_tx_m has 1 empty"]),
-    "renamed column": (rename_column, ["NAME: |flow_tz_m is missing", "NAME: |flow_z_m does not belong"]),
-    "extra column": (extra_column, ["NAME: |score does not belong"]),
-    "missing column": (drop_column, ["NAME: |flow_tx_m is missing"]),
-    "double column": (double_column, ["NAME: |flow_tx_m occurs more than once"]),
-    "truncated": (truncate, ["NAME: no feather file"]),
-    "foreign file": (not_feather, ["NAME: no feather file"]),
-    "missing frame": (lambda files, name: files.pop(name), ["NAME: missing frame"]),
-    "wrong file name": (move("flow_t.feather"), ["/flow_t.feather: wrong name", "NAME: missing frame"]),
-    "wrong ending": (add("LOG/readme.txt"), ["/readme.txt: does not belong"]),
-    "extra log": (add("another/1234567890.feather"), ["another/1234567890.feather: extra frame, of a log"]),
-    "path traversal": (add("../1.feather"), ["'../1.feather': unsafe"]),
-    "absolute name": (add("/etc/1.feather"), ["'/etc/1.feather': unsafe"]),
-    "backslash": (add("LOG\\1.feather"), ["1.feather': unsafe"]),
-    "root file": (add("1.feather"), ["1.feather: does not belong"]),
-}
-OWN: Dict[int, Dict[str, Any]] = {
-    1: {
-        "float32": (retype("flow_tx_m", np.float32), ["NAME: |flow_tx_m is float32|expected float16"]),
-        "dynamic as number": (retype("is_dynamic", np.uint8), ["NAME: |is_dynamic is uint8|expected bool"]),
-        "position as name": (move("0000000000.feather"), ["/0000000000.feather: wrong name", "NAME: missing frame"]),
-        "extra frame": (add("LOG/17.feather"), ["/17.feather: extra frame"]),
-        "metadata": (add("metadata.json"), ["metadata.json: does not belong"]),
-    },
-    2: {
-        "valid as number": (retype("is_valid", np.uint8), ["NAME: |is_valid is uint8|expected bool"]),
-        "time stamp as name": (
-            move("315970000000000000.feather"),
-            ["/315970000000000000.feather: wrong name|ten digits", "NAME: missing frame"],
-        ),
-        "extra frame": (add("LOG/0000000003.feather"), ["/0000000003.feather: extra frame"]),
-        "no metadata": (lambda files, _: files.pop("metadata.json"), ["metadata.json: missing|Is Supervised?"]),
-        "metadata no JSON": (lambda files, _: files.update({"metadata.json": b"{"}), ["metadata.json: no JSON"]),
-        "metadata no bool": (
-            lambda files, _: files.update({"metadata.json": b'{"Is Supervised?": "no"}'}),
-            ["metadata.json: must hold|true or false"],
-        ),
-    },
-    3: {
-        "float64": (retype("flow_tz_m", np.float64), ["NAME: |flow_tz_m is float64|expected float16"]),
-        "metadata": (add("metadata.json"), ["metadata.json: does not belong"]),
-    },
-}
-CASES = [(number, kind) for number in (1, 2, 3) for kind in [*SPOILED, *OWN[number]]]
-
-
-def unzip(file: Path) -> Files:
-    with zipfile.ZipFile(file) as archive:
-        return {name: archive.read(name) for name in archive.namelist()}
-
-
-def rezip(files: Files, file: Path) -> Path:
-    with zipfile.ZipFile(file, "w") as archive:
-        for name, data in files.items():
-            archive.writestr(zipfile.ZipInfo(name), data)
-    return file
-
-
-@pytest.mark.parametrize(("number", "kind"), CASES, ids=[f"v{number} {kind}" for number, kind in CASES])
-def test_a_spoiled_archive_is_refused(number: int, kind: str, archives: Dict[int, Any], tmp_path: Path) -> None:
-    _, good, frames = archives[number]
-    spoil, expected = {**SPOILED, **OWN[number]}[kind]
-    files = unzip(good)
-    name = frames[1].name
-    spoil(files, name)
-    problems = check_submission(rezip(files, tmp_path / "a.zip"), get_version(number), frames)
-    assert len(problems) == len(expected), problems
-    for words in expected:
-        assert any(all(word in problem for word in words.replace("NAME", name).split("|")) for problem in problems)
-    assert all("\n" not in problem and frames[0].name not in problem for problem in problems)
-
-
-def test_every_problem_is_listed(archives: Dict[int, Any], tmp_path: Path) -> None:
-    _, good, frames = archives[2]
-    files = unzip(good)
-    drop_row(files, frames[0].name)
-    extra_column(files, frames[0].name)
-    set_value(np.nan)(files, frames[0].name)
-    del files[frames[1].name], files["metadata.json"]
-    files["notes.txt"] = b""
-    problems = check_submission(rezip(files, tmp_path / "a.zip"), get_version(2), frames)
-    assert len(problems) == 6, problems
-
-
-def test_version_2_takes_any_float(archives: Dict[int, Any], tmp_path: Path) -> None:
-    _, good, frames = archives[2]
-    files = unzip(good)
-    retype("flow_tx_m", np.float32)(files, frames[0].name)
-    retype("flow_ty_m", np.float64)(files, frames[1].name)
-    assert check_submission(rezip(files, tmp_path / "a.zip"), get_version(2), frames) == []
-
-
-def test_zips_that_are_none(archives: Dict[int, Any], tmp_path: Path) -> None:
-    _, good, frames = archives[3]
-    whole = good.read_bytes()
-    (tmp_path / "half.zip").write_bytes(whole[: len(whole) // 2])
-    (tmp_path / "empty.zip").write_bytes(b"")
-    for name, word in (("half.zip", "zip"), ("empty.zip", "zip"), ("missing.zip", "does not exist")):
-        (problem,) = check_submission(tmp_path / name, get_version(3), frames)
-        assert name in problem and word in problem
-    damaged = bytearray(whole)
-    damaged[200:260] = bytes(60)  # inside the first entry's data
-    (tmp_path / "damaged.zip").write_bytes(damaged)
-    (problem,) = check_submission(tmp_path / "damaged.zip", get_version(3), frames)
-    assert problem.startswith(frames[0].name) and "cannot be read" in problem
-
-
-def test_a_folder_around_everything_and_a_doubled_name(archives: Dict[int, Any], tmp_path: Path) -> None:
-    for number in (1, 2, 3):
-        _, good, frames = archives[number]
-        files = {f"submission/{name}": data for name, data in unzip(good).items()}
-        (problem,) = check_submission(rezip(files, tmp_path / "a.zip"), get_version(number), frames)
-        assert "'submission/'" in problem
-    shutil.copy(good, tmp_path / "b.zip")
-    with zipfile.ZipFile(tmp_path / "b.zip", "a") as archive, pytest.warns(UserWarning, match="Duplicate"):
-        archive.writestr(frames[0].name, unzip(good)[frames[0].name])
-    (problem,) = check_submission(tmp_path / "b.zip", get_version(3), frames)
-    assert frames[0].name in problem and "2 times" in problem
+def test_rounding_is_reported() -> None:
+    half, rounding = to_half(np.array([[1.0, 0, 0], [1 + 2**-11, 0, 0]], np.float32))
+    assert half.dtype == np.float16 and rounding.largest == 2**-11 and rounding.mean == 2**-12
+    rounding.add(to_half(np.zeros((2, 3)))[1])
+    assert rounding.mean == 2**-13 and "over 4 points" in str(rounding) and to_half(np.zeros((0, 3)))[1].mean == 0
 
 
 def test_the_same_files_make_the_same_zip(archives: Dict[int, Any], tmp_path: Path) -> None:
@@ -406,7 +177,6 @@ def test_the_same_files_make_the_same_zip(archives: Dict[int, Any], tmp_path: Pa
     assert (tmp_path / "again.zip").read_bytes() == good.read_bytes()
     with zipfile.ZipFile(good) as archive:
         assert archive.namelist() == ["metadata.json", *(frame.name for frame in frames)], "sorted"
-        assert {info.compress_type for info in archive.infolist()} == {zipfile.ZIP_DEFLATED}
         assert json.loads(archive.read("metadata.json")) == {"Is Supervised?": False}
     (tmp_path / "copy" / frames[0].name).unlink()
     with pytest.raises(CFlowError, match=frames[0].name):
@@ -414,16 +184,106 @@ def test_the_same_files_make_the_same_zip(archives: Dict[int, Any], tmp_path: Pa
     assert not (tmp_path / "never.zip").exists()
 
 
-def test_only_whole_frames_count_as_done(archives: Dict[int, Any], tmp_path: Path) -> None:
-    folder, _, frames = archives[3]
-    version = get_version(3)
-    shutil.copytree(folder, tmp_path / "copy")
-    assert is_complete(tmp_path / "copy", frames[0], version)
-    assert not is_complete(tmp_path / "copy", Frame(frames[0].name, frames[0].rows + 1), version)
-    file = tmp_path / "copy" / frames[0].name
-    file.write_bytes(file.read_bytes()[:1000])
-    assert not is_complete(tmp_path / "copy", frames[0], version)
-    assert not is_complete(tmp_path / "copy", Frame("log/1.feather", 5), version)
+# ---- spoiled archives: (what to do to one file of a good one) -> words that one line must hold
+
+
+@pytest.mark.parametrize("number", [1, 2, 3])
+def test_a_good_archive_passes(number: int, archives: Dict[int, Any]) -> None:
+    folder, file, frames = archives[number]
+    assert len(frames) == 2 and all(frame.rows > 1000 for frame in frames)
+    version, first = get_version(number), frames[0]
+    assert check_submission(folder, version, frames) == check_submission(file, version, frames) == []
+    assert is_complete(folder, first, version) and not is_complete(folder, Frame("log/1.feather", 5), version)
+    assert not is_complete(folder, Frame(first.name, first.rows + 1), version)
+
+
+def in_table(change: Callable[[pa.Table], pa.Table]) -> Callable[[bytes], bytes]:
+    def spoil(data: bytes) -> bytes:
+        sink = io.BytesIO()
+        feather.write_feather(change(feather.read_table(pa.BufferReader(data))), sink)
+        return sink.getvalue()
+
+    return spoil
+
+
+def column(name: str, change: Callable[[Any], Any]) -> Callable[[bytes], bytes]:
+    return in_table(lambda t: t.set_column(t.column_names.index(name), name, pa.array(change(t[name].to_numpy()))))
+
+
+def with_value(value: Any) -> Callable[[np.ndarray], Any]:
+    return lambda values: [*values[:7], value, *values[8:]] if value is None else np.r_[values[:-1], np.float16(value)]
+
+
+SPOILED: Dict[str, Any] = {
+    "row missing": (3, in_table(lambda t: t.slice(1)), "rows, expected"),
+    "NaN": (3, column("flow_ty_m", with_value(np.nan)), "flow_ty_m has 1 values that are NaN"),
+    "infinite": (1, column("flow_ty_m", with_value(-np.inf)), "flow_ty_m has 1 values that are NaN or infinite"),
+    "empty value": (3, column("flow_tx_m", with_value(None)), "flow_tx_m has 1 empty"),
+    "float64": (3, column("flow_tz_m", lambda v: v.astype(np.float64)), "flow_tz_m is float64, expected float16"),
+    "whole numbers": (2, column("flow_tz_m", lambda v: v.astype(np.int16)), "flow_tz_m is int16, expected float16 or"),
+    "dynamic as number": (1, column("is_dynamic", lambda v: v.astype(np.uint8)), "is_dynamic is uint8, expected bool"),
+    "column missing": (2, in_table(lambda t: t.drop(["is_valid"])), "column is_valid is missing"),
+    "foreign column": (3, in_table(lambda t: t.append_column("score", t["flow_tx_m"])), "score does not belong"),
+    "column twice": (3, in_table(lambda t: t.append_column("flow_tx_m", t["flow_tx_m"])), "flow_tx_m"),
+    "truncated": (3, lambda data: data[: len(data) // 2], "cannot be read"),
+    "no feather": (1, lambda data: b"flow\n", "cannot be read"),
+    "far too large": (2, lambda data: data + bytes(1 << 24), "bytes"),
+}
+
+
+def unzip(file: Path) -> Files:
+    with zipfile.ZipFile(file) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+def rezip(files: Files, file: Path) -> Path:
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in files.items():
+            archive.writestr(zipfile.ZipInfo(name), data)
+    return file
+
+
+@pytest.mark.parametrize("kind", SPOILED)
+def test_a_spoiled_file_is_named(kind: str, archives: Dict[int, Any], tmp_path: Path) -> None:
+    number, spoil, words = SPOILED[kind]
+    _, good, frames = archives[number]
+    files = unzip(good)
+    files[frames[1].name] = spoil(files[frames[1].name])
+    (problem,) = check_submission(rezip(files, tmp_path / "a.zip"), get_version(number), frames)
+    assert problem.startswith(f"{frames[1].name}: ") and words in problem and "\n" not in problem
+
+
+METADATA = [
+    (lambda files: files.pop("metadata.json"), "missing, it must hold"),
+    (lambda files: files.update({"metadata.json": b"{"}), "cannot be read"),
+    (lambda files: files.update({"metadata.json": b'{"Is Supervised?": 0}'}), "must hold"),
+]
+
+
+@pytest.mark.parametrize(("spoil", "words"), METADATA)
+def test_every_problem_of_an_archive_is_listed(spoil: Any, words: str, archives: Any, tmp_path: Path) -> None:
+    _, good, frames = archives[2]
+    files = {**unzip(good), "notes.txt": b""}
+    del files[frames[0].name]
+    spoil(files)
+    foreign, metadata, missing = check_submission(rezip(files, tmp_path / "a.zip"), get_version(2), frames)
+    assert "notes.txt" in foreign and missing == f"{frames[0].name}: missing frame"
+    assert metadata.startswith("metadata.json: ") and words in metadata
+
+
+def test_archives_that_are_none(archives: Dict[int, Any], tmp_path: Path) -> None:
+    _, good, frames = archives[3]
+    whole = good.read_bytes()
+    (tmp_path / "half.zip").write_bytes(whole[: len(whole) // 2])
+    rezip({f"submission/{name}": data for name, data in unzip(good).items()}, tmp_path / "wrapped.zip")
+    for name, words in (("half.zip", "zip"), ("missing.zip", "does not exist"), ("wrapped.zip", "submission/")):
+        (problem,) = check_submission(tmp_path / name, get_version(3), frames)
+        assert name in problem and words in problem
+    damaged = bytearray(whole)
+    damaged[200:260] = bytes(60)  # inside the first entry's data
+    (tmp_path / "damaged.zip").write_bytes(damaged)
+    (problem,) = check_submission(tmp_path / "damaged.zip", get_version(3), frames)
+    assert problem.startswith(frames[0].name) and "cannot be read" in problem
 
 
 # ---- which frames, which points
@@ -446,20 +306,16 @@ def write_scene(file: Path, masked: List[int], num_sweeps: int = 8) -> Path:
 
 def test_frames_go_by_the_masks_of_the_scene(tmp_path: Path) -> None:
     with HDF5Log(write_scene(tmp_path / "scene.h5", [2, 3, 7])) as log:
-        stamps = log.timestamps
         for number in (1, 3):
-            version = get_version(number)
-            plan = plan_log(log, version)
-            assert [frame.name for frame in plan] == [f"scene/{stamps[i]}.feather" for i in (2, 3)], "7 is the last"
-            mask = log.eval_mask(2)
-            assert mask is not None and plan[0].expect(version).rows == (mask.sum() if number == 1 else 42)
+            plan = plan_log(log, get_version(number))
+            assert [frame.name for frame in plan] == [f"scene/{log.timestamps[i]}.feather" for i in (2, 3)], "7 is last"
+            assert plan[0].expect(get_version(number)).rows == (log.eval_mask(2).sum() if number == 1 else 42)
         assert [f.name for f in plan_log(log, get_version(2))] == [f"scene/{i:010d}.feather" for i in (0, 5)]
     with HDF5Log(write_scene(tmp_path / "plain.h5", [])) as log:
         assert [frame.index for frame in plan_log(log, get_version(3))] == [0, 5]
-        with pytest.raises(CFlowError, match="is the last sweep"):
-            plan_log(log, get_version(3), {"plain": [log.timestamps[-1]]})
-        with pytest.raises(CFlowError, match="no sweep 17"):
-            plan_log(log, get_version(3), {"plain": [17]})
+        for stamp, message in ((log.timestamps[-1], "is the last sweep"), (17, "is no sweep")):
+            with pytest.raises(CFlowError, match=message):
+                plan_log(log, get_version(3), {"plain": [stamp]})
         listed = {"plain": [log.timestamps[4], log.timestamps[1]]}
         assert [frame.index for frame in plan_log(log, get_version(2), listed)] == [1, 4]
         assert plan_log(log, get_version(3), {"another": [1]}) == []
@@ -473,40 +329,35 @@ def test_lists_of_frames(tmp_path: Path) -> None:
     file = tmp_path / "frames.txt"
     file.write_text("# evaluated\na-1/100\na-1 200\n\nb, 300  # the last\n")
     assert read_frame_list(file) == {"a-1": [100, 200], "b": [300]}
-    for text, complaint in (("a/1\na 1\n", "line 2.*twice"), ("a/x\n", "line 1"), ("# none\n", "no frame")):
+    for text, complaint in (("a/1\na 1", "line 2.*twice"), ("a/x", "line 1"), ("a", "line 1"), ("#", "no frame")):
         file.write_text(text)
         with pytest.raises(CFlowError, match=complaint):
             read_frame_list(file)
-    pickled = tmp_path / "index_eval.pkl"
-    pickled.write_bytes(b"cos\nsystem\n(S'touch broken'\ntR.")
-    with pytest.raises(CFlowError, match="pickle"):
-        read_frame_list(pickled)
-    with pytest.raises(CFlowError, match="missing.txt"):
-        read_frame_list(tmp_path / "missing.txt")
+    for name, complaint in (("index_eval.pkl", "pickle"), ("missing.txt", "missing.txt")):
+        with pytest.raises(CFlowError, match=complaint):
+            read_frame_list(tmp_path / name)
 
 
 def write_masks(file: Path, log_id: str, timestamp: int, mask: np.ndarray) -> Path:
     """A mask archive of one frame, as av2's tools write it."""
-    with zipfile.ZipFile(file, "w") as archive:
-        sink = io.BytesIO()
-        feather.write_feather(pa.table({"mask": pa.array(mask)}), sink)
-        archive.writestr(f"{log_id}/{timestamp}.feather", sink.getvalue())
-    return file
+    sink = io.BytesIO()
+    feather.write_feather(pa.table({"mask": pa.array(mask)}), sink)
+    return rezip({f"{log_id}/{timestamp}.feather": sink.getvalue()}, file)
 
 
 def test_official_masks_win(log: AV2Log, tmp_path: Path) -> None:
-    sweep = log.sweep(3)
+    sweep, stamp = log.sweep(3), log.timestamps[3]
     mask = np.arange(len(sweep.points)) % 3 == 0
-    masks = MaskArchive(write_masks(tmp_path / "masks.zip", log.log_id, log.timestamps[3], mask))
-    assert masks.frames == {log.log_id: [log.timestamps[3]]}
+    masks = MaskArchive(write_masks(tmp_path / "masks.zip", log.log_id, stamp, mask))
+    assert masks.frames == {log.log_id: [stamp]}
     (planned,) = plan_log(log, get_version(1), masks.frames)
     assert planned.index == 3 and planned.expect(get_version(1), masks).rows == mask.sum()
     np.testing.assert_array_equal(point_mask(log, 3, sweep, masks), mask)
-    short = MaskArchive(write_masks(tmp_path / "short.zip", log.log_id, log.timestamps[3], mask[1:]))
-    with pytest.raises(CFlowError, match="rows"):
-        point_mask(log, 3, sweep, short)
-    with pytest.raises(CFlowError, match="cannot read"):
-        point_mask(log, 2, sweep, masks)
+    short = MaskArchive(write_masks(tmp_path / "short.zip", log.log_id, stamp, mask[1:]))
+    numbers = MaskArchive(write_masks(tmp_path / "numbers.zip", log.log_id, stamp, mask.astype(np.int8)))
+    for index, broken, message in ((3, short, "rows"), (3, numbers, "one bool column"), (2, masks, "cannot read")):
+        with pytest.raises(CFlowError, match=message):
+            point_mask(log, index, sweep, broken)
     with pytest.raises(CFlowError, match="cannot be read as a zip"):
         MaskArchive(__file__)
 
@@ -530,9 +381,8 @@ def test_command_makes_checks_resumes(log: AV2Log, tmp_path: Path, capsys: pytes
 
     assert run(*call, "model.connectivity=4") == 2
     assert "another model" in capsys.readouterr().err
-    assert run(*call, f"archive={tmp_path / 'v3.zip'}") == run(*call, f"archive={tmp_path / 'v3'}") == 0
+    assert run(*call, f"archive={tmp_path / 'v3.zip'}") == 0
     two.unlink()
-    capsys.readouterr()
     assert run(*call, f"archive={tmp_path / 'v3'}") == 1
     error = capsys.readouterr().err
     assert f"{two.name}: missing frame" in error and "problems: 1" in error
@@ -542,104 +392,62 @@ def test_command_makes_checks_resumes(log: AV2Log, tmp_path: Path, capsys: pytes
     assert run(*call, "overwrite=true", "model.connectivity=4") == 0
 
 
-def test_command_leaves_no_archive_when_a_frame_fails(
-    log: AV2Log, tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
-    broken = tmp_path / "log"
+def test_command_leaves_no_archive_when_a_frame_fails(log: AV2Log, tmp_path: Path, capsys: Any) -> None:
+    broken, out = tmp_path / "log", tmp_path / "out"
     shutil.copytree(log.folder, broken)
     sweep = broken / "sensors" / "lidar" / f"{log.timestamps[6]}.feather"
     sweep.write_bytes(sweep.read_bytes()[:1000])
-    out = tmp_path / "out"
     call = ["submit", "data=av2", f"data.root={broken}", f"output={out}", "version=2", "model=paper"]
     assert run(*call) == 1
     error = capsys.readouterr().err
     assert "log/0000000005.feather" in error and sweep.name in error
     assert not (out / "v2.zip").exists() and (out / "v2" / "log" / "0000000000.feather").exists()
     shutil.copy(log.folder / "sensors" / "lidar" / sweep.name, sweep)
-    assert run(*call) == 0, "and goes on when it is mended"
-    assert "already there: 1" in capsys.readouterr().out
+    assert run(*call) == 0 and "already there: 1" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["version=4"], "1, 2, 3"),
-        (["residual_axes=t0"], "residual_axes"),
-        (["masks=masks.zip"], "version 1"),
-        (["version=1", "masks=masks.zip", "frames=frames.txt"], "leave frames="),
-        (["version=1", "masks=nowhere.zip"], "nowhere.zip"),
-        (["frames=index_eval.pkl"], "pickle"),
+        ("masks=masks.zip", "version 1"),
+        ("version=1 masks=a.zip frames=b.txt", "leave frames="),
+        ("version=4", "1, 2, 3"),
     ],
 )
-def test_a_wrong_call_says_how_to_mend_it(
-    arguments: List[str], message: str, log: AV2Log, tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
-    assert run("submit", "data=av2", f"data.root={log.folder}", f"output={tmp_path}", *arguments) == 2
-    captured = capsys.readouterr()
-    assert message in captured.err and "Traceback" not in captured.err
-    assert not list(tmp_path.rglob("*.feather"))
+def test_a_wrong_call_says_how_to_mend_it(arguments: str, message: str, tmp_path: Path, capsys: Any) -> None:
+    assert run("submit", "data=av2", "data.root=.", f"output={tmp_path}", *arguments.split()) == 2
+    assert message in capsys.readouterr().err and not list(tmp_path.rglob("*.feather"))
 
 
 # ---- the real pair
 
-STAMP = 315966265259836000
-MASK_BY_STORED_GROUND, MASK_BY_OWN_GROUND, POINTS = 78_506, 78_507, 99_229
 
-
-def official_masks(av2_folder: Path, file: Path) -> Path:
-    """The masks that av2's tools make of the ground stored with the pair: not ground, |x| and |y| <= 50 m."""
-    sweep = AV2Log(av2_folder).sweep(0)
-    ground = feather.read_table(str(av2_folder / "flow_labels.feather"))["is_ground_0"].to_numpy()
-    mask = (np.abs(sweep.points[:, :2]) <= 50).all(1) & ~ground
-    return write_masks(file, av2_folder.name, STAMP, mask)
-
-
-@pytest.mark.parametrize(("number", "rows", "columns"), [(1, MASK_BY_OWN_GROUND, 4), (2, POINTS, 4), (3, POINTS, 3)])
-def test_the_real_pair(number: int, rows: int, columns: int, av2_folder: Path, tmp_path: Path) -> None:
-    call = ["submit", "data=av2", f"data.root={av2_folder}", f"version={number}", "model=paper"]
+def submit_pair(av2_folder: Path, tmp_path: Path) -> Path:
+    """Writes tmp_path/v1 by the official masks, which it returns."""
+    pair = read_pair(av2_folder)
+    official = (np.abs(pair.points[:, :2]) <= 50).all(1) & ~pair.is_ground
+    masks = write_masks(tmp_path / "masks.zip", LOG, TIME, official)
+    call = ["submit", "data=av2", f"data.root={av2_folder}", "version=1", "model=paper", f"masks={masks}"]
     assert run(*call, f"output={tmp_path}") == 0
-    stem = "0000000000" if number == 2 else STAMP
-    values = read(tmp_path / f"v{number}" / av2_folder.name / f"{stem}.feather")
-    assert len(values) == columns and {len(column) for column in values.values()} == {rows}
-    assert run(*call, f"output={tmp_path / 'other'}", f"archive={tmp_path / f'v{number}.zip'}") == 0
-    with zipfile.ZipFile(tmp_path / f"v{number}.zip") as archive:
-        assert len(archive.namelist()) == (2 if number == 2 else 1)
-    files = unzip(tmp_path / f"v{number}.zip")
-    drop_row(files, f"{av2_folder.name}/{stem}.feather")
-    assert run(*call, f"archive={rezip(files, tmp_path / 'spoiled.zip')}") == 1
+    return masks
 
 
 def test_the_real_pair_with_its_masks(av2_folder: Path, tmp_path: Path) -> None:
-    # Point 31058 lies 0.4 mm before a border of the ground raster (city x 5242.499975, column 566.9986): av2's float32
-    # coordinates (5242.500488) put it in the next cell, where it is ground; float64 does not. So official masks have
-    # one point less than the rule computed here, and they are what a submission goes by.
-    masks = official_masks(av2_folder, tmp_path / "masks.zip")
-    call = ["submit", "data=av2", f"data.root={av2_folder}", "version=1", "model=paper", f"output={tmp_path}"]
-    assert run(*call, f"masks={masks}") == 0
-    values = read(tmp_path / "v1" / av2_folder.name / f"{STAMP}.feather")
-    assert {len(column) for column in values.values()} == {MASK_BY_STORED_GROUND}
-    log, sweep = AV2Log(av2_folder), AV2Log(av2_folder).sweep(0)
-    own, official = point_mask(log, 0, sweep), point_mask(log, 0, sweep, MaskArchive(masks))
+    """Point 31058 lies 0.4 mm before a border of the ground raster (city x 5242.499975, column 566.9986): av2's float32
+    coordinates (5242.500488) put it in the next cell, where it is ground; float64 does not. So official masks have one
+    point less than the rule computed here, and they are what a submission goes by."""
+    masks, log = MaskArchive(submit_pair(av2_folder, tmp_path)), AV2Log(av2_folder)
+    columns = read(tmp_path / "v1" / LOG / f"{TIME}.feather")
+    assert {len(values) for values in columns.values()} == {78_506}
+    own, official = (point_mask(log, 0, log.sweep(0), given) for given in (None, masks))
     assert np.flatnonzero(own != official).tolist() == [31058]
 
 
 def test_av2_accepts_the_real_pair(av2_folder: Path, tmp_path: Path) -> None:
     tools = pytest.importorskip("av2.evaluation.scene_flow.make_submission_archive", reason="av2 is not installed")
-    masks = official_masks(av2_folder, tmp_path / "masks.zip")
-    call = ["submit", "data=av2", f"data.root={av2_folder}", "version=1", "model=paper", f"output={tmp_path}"]
-    assert run(*call, f"masks={masks}") == 0
+    masks = submit_pair(av2_folder, tmp_path)
     tools.validate(tmp_path / "v1", masks)  # raises if it does not like a file
-    file = tmp_path / "v1" / av2_folder.name / f"{STAMP}.feather"
-    files = {file.name: file.read_bytes()}
-    drop_row(files, file.name)
-    file.write_bytes(files[file.name])
+    file = tmp_path / "v1" / LOG / f"{TIME}.feather"
+    file.write_bytes(in_table(lambda t: t.slice(1))(file.read_bytes()))
     with pytest.raises(ValueError, match="rows"):
         tools.validate(tmp_path / "v1", masks)
-
-
-def test_the_real_scene(kitti_file: Path, tmp_path: Path) -> None:
-    with HDF5Log(kitti_file) as log:
-        version = get_version(3)
-        plan = plan_log(log, version)
-        assert len(plan) == 15, "every sweep but the last carries an evaluation mask"
-        assert plan[0].expect(version) == Frame(f"{log.log_id}/{log.timestamps[0]}.feather", len(log.sweep(0).points))

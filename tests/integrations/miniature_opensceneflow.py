@@ -1,9 +1,9 @@
 """OpenSceneFlow in miniature: how that harness feeds a model and what it makes of the answer, replayed without it.
 
 Written from what commit 848bf86 does, in words and code of our own. `SceneDataset` gives the items, `path_b`, `path_a`
-and `collate_for_training` the three batch layouts, `final_flow` puts the total flow together; `evaluate`, `save` and
-`write_test_files` are the harness's scripts. Unlike the harness nothing here swallows an exception. Scores come from
-`cflow_torch.evaluation`, which `test_golden.py` holds against the harness's own functions.
+and `collate_for_training` the three batch layouts, `run` puts the total flow together, `evaluate` is the script
+`eval.py`. Unlike the harness nothing here swallows an exception. Scores come from `cflow_torch.evaluation`, which
+`test_golden.py` holds against the harness's own functions.
 """
 
 from __future__ import annotations
@@ -14,9 +14,6 @@ from pathlib import Path
 from typing import Any, Callable, Dict, Iterator, List, Optional, Tuple
 
 import h5py
-import numpy as np
-import pyarrow as pa
-import pyarrow.feather as feather
 import torch
 from torch import Tensor, nn
 from torch.nn.utils.rnn import pad_sequence
@@ -27,7 +24,6 @@ from cflow_torch.evaluation import EvalFrame, SceneFlowMetrics
 
 TRUTH = ("flow", "flow_is_valid", "flow_category_indices", "flow_instance_id")
 IF_STORED = ("ego_motion", "lidar_dt", "lidar_center", "dufo", *TRUTH)
-DYNAMIC = 0.05  # metres per sweep
 Batch = Dict[str, Any]
 Model = Callable[[Batch], Dict[str, Any]]
 
@@ -213,55 +209,9 @@ def evaluate(model: Any, folder: Path, **layout: Any) -> Dict[str, Any]:
 def frame_of(outcome: Outcome) -> EvalFrame:
     """What `eval.py` scores: the points of the evaluation mask, total flow against stored truth."""
     batch = outcome.batch
-    return EvalFrame(
-        points=batch["origin_pc0"],
-        labels=FlowLabels(*(batch[key].numpy() for key in ("flow", "flow_category_indices", "flow_is_valid"))),
-        flow=outcome.final_flow,
-        pose_flow=outcome.pose_flow,
-        eval_mask=batch["eval_mask"],
-    )
-
-
-def training_frames(batch: Batch, answer: Dict[str, Any]) -> Iterator[EvalFrame]:
-    """What the validation loop of `train.py` scores: per sample the rows that the model says it used, with the model's
-    own pose flow."""
-    for b in range(len(batch["pose0"])):
-        rows = answer["pc0_valid_point_idxes"][b]
-        pose_flow = answer["pose_flow"][b][rows]
-        truth = (batch[key][b][rows].numpy() for key in ("flow", "flow_category_indices", "flow_is_valid"))
-        total = pose_flow + answer["flow"][b]
-        yield EvalFrame(points=batch["pc0"][b][rows], labels=FlowLabels(*truth), flow=total, pose_flow=pose_flow)
-
-
-def save(model: Any, folder: Path, name: str, **layout: Any) -> None:
-    """`save.py`: the total flow of every frame under a key of its sweep; an older one is replaced."""
-    for outcome in outcomes(model, folder, eval=False, **layout):
-        scene, stamp = outcome.batch["scene_id"], outcome.batch["timestamp"]
-        with h5py.File(Path(folder) / f"{scene}.h5", "r+") as file:
-            if name in file[stamp]:
-                del file[stamp][name]
-            file[stamp].create_dataset(name, data=outcome.final_flow.numpy().astype(np.float32))
-
-
-def write_test_files(model: Any, folder: Path, out: Path, version: int, **layout: Any) -> None:
-    """`eval.py data_mode=test save_res=True leaderboard_version=VERSION`: one feather file per frame.
-
-    1: total flow and is_dynamic of the points of the evaluation mask; 2: residual and is_valid of every point; 3: the
-    residual alone.
-    """
-    for outcome in outcomes(model, folder, **layout):
-        batch = outcome.batch
-        mask = batch["eval_mask"]
-        residual = outcome.final_flow - outcome.pose_flow
-        flow = (outcome.final_flow[mask] if version == 1 else residual).numpy().astype(np.float16)
-        columns = {f"flow_t{axis}_m": flow[:, i] for i, axis in enumerate("xyz")}
-        if version == 1:
-            columns["is_dynamic"] = np.linalg.norm(residual[mask].numpy(), axis=1) >= DYNAMIC
-        elif version == 2:
-            columns = {"is_valid": np.ones(len(flow), bool), **columns}
-        file = Path(out) / batch["scene_id"] / f"{batch['timestamp']}.feather"
-        file.parent.mkdir(parents=True, exist_ok=True)
-        feather.write_feather(pa.table(columns), str(file))
+    labels = FlowLabels(*(batch[key].numpy() for key in ("flow", "flow_category_indices", "flow_is_valid")))
+    flows = {"flow": outcome.final_flow, "pose_flow": outcome.pose_flow}
+    return EvalFrame(batch["origin_pc0"], labels, eval_mask=batch["eval_mask"], **flows)
 
 
 # -------------------------------------------------------------------------------------------------- stand-in models
@@ -300,27 +250,6 @@ def true_residual(batch: Batch) -> Tensor:
 # -------------------------------------------------------------------------------------------------- building a model
 
 
-class Wrapper(nn.Module):
-    """The harness's Lightning module as far as building a model goes.
-
-    Args:
-        cfg: the composed settings; `model.target` gets `grid_feature_size`.
-    """
-
-    def __init__(self, cfg: Any) -> None:
-        from hydra.utils import instantiate
-        from omegaconf import open_dict
-
-        super().__init__()
-        target = cfg.model.target
-        low_high = zip(target.point_cloud_range[:3], target.point_cloud_range[3:], target.voxel_size)
-        cells = [abs(int((low - high) / size)) for low, high, size in low_high]
-        with open_dict(target):
-            target["grid_feature_size"] = cells
-        self.model = instantiate(target)
-        self.model.apply(reset_weights)
-
-
 def reset_weights(module: nn.Module) -> None:
     """What the harness does to every module after building the model."""
     if isinstance(module, (nn.Conv2d, nn.Linear)):
@@ -334,13 +263,19 @@ def reset_weights(module: nn.Module) -> None:
 
 def build(cfg: Any, checkpoint: Path) -> nn.Module:
     """The model that `eval.py` makes of its settings and a checkpoint: what the checkpoint says about the model wins,
-    then its weights are loaded strictly."""
-    from omegaconf import DictConfig
+    the target gets `grid_feature_size`, every module is reset, then the weights are loaded strictly."""
+    from hydra.utils import instantiate
+    from omegaconf import DictConfig, open_dict
 
     stored = torch.load(checkpoint, weights_only=True)
     given = DictConfig(stored["hyper_parameters"])
     cfg.output = f"{given.cfg.output}-e{stored['epoch']}-{cfg.data_mode}-v{cfg.leaderboard_version}"
     cfg.model.update(given.cfg.model)
-    wrapper = Wrapper(cfg)
-    wrapper.load_state_dict(stored["state_dict"], strict=True)
-    return wrapper.model.eval()
+    target = cfg.model.target
+    low_high = zip(target.point_cloud_range[:3], target.point_cloud_range[3:], target.voxel_size)
+    with open_dict(target):
+        target["grid_feature_size"] = [abs(int((low - high) / size)) for low, high, size in low_high]
+    model: nn.Module = instantiate(target)
+    model.apply(reset_weights)
+    model.load_state_dict(stored["state_dict"], strict=True)
+    return model.eval()

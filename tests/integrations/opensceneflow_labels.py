@@ -11,6 +11,7 @@ from typing import Any, Dict, Tuple
 
 import numpy as np
 import pyarrow.feather as feather
+from scipy.spatial.transform import Rotation
 
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.boxes import points_in_box
@@ -89,33 +90,29 @@ def growth(inside: np.ndarray, motion: np.ndarray, T_ego1_ego0: np.ndarray) -> n
 
 def read_boxes(log_folder: Path, timestamp: int) -> Dict[str, Box]:
     """Track -> box of one sweep, in the order of the file."""
-    table = feather.read_table(str(log_folder / "annotations.feather")).to_pydict()
-    chosen = [row for row, time in enumerate(table["timestamp_ns"]) if time == timestamp]
-    boxes = {}
-    for row in chosen:
-        size = np.array([table[f"{name}_m"][row] for name in ("length", "width", "height")])
-        boxes[table["track_uuid"][row]] = (CATEGORY_INDEX[table["category"][row]], size, pose_of(table, row))
-    return boxes
+    rows = feather.read_table(str(log_folder / "annotations.feather")).to_pylist()
+    return {
+        row["track_uuid"]: (
+            CATEGORY_INDEX[row["category"]],
+            np.array([row[f"{name}_m"] for name in ("length", "width", "height")]),
+            pose_of(row),
+        )
+        for row in rows
+        if row["timestamp_ns"] == timestamp
+    }
 
 
 def up_lidar(log_folder: Path) -> np.ndarray:
     """(4, 4) float64 T_ego_lidar of the upper LiDAR."""
-    table = feather.read_table(str(log_folder / "calibration" / "egovehicle_SE3_sensor.feather")).to_pydict()
-    return pose_of(table, table["sensor_name"].index("up_lidar"))
+    rows = feather.read_table(str(log_folder / "calibration" / "egovehicle_SE3_sensor.feather")).to_pylist()
+    return next(pose_of(row) for row in rows if row["sensor_name"] == "up_lidar")
 
 
-def pose_of(table: Dict[str, Any], row: int) -> np.ndarray:
+def pose_of(row: Dict[str, Any]) -> np.ndarray:
     """(4, 4) float64 of a row's quaternion and translation."""
-    w, x, y, z = (table[name][row] for name in ("qw", "qx", "qy", "qz"))
-    length = np.sqrt(w * w + x * x + y * y + z * z)
-    w, x, y, z = w / length, x / length, y / length, z / length
     pose = np.eye(4)
-    pose[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    pose[:3, 3] = [table[name][row] for name in ("tx_m", "ty_m", "tz_m")]
+    pose[:3, :3] = Rotation.from_quat([row[name] for name in ("qx", "qy", "qz", "qw")]).as_matrix()
+    pose[:3, 3] = [row[name] for name in ("tx_m", "ty_m", "tz_m")]
     return pose
 
 

@@ -1,7 +1,5 @@
 """Archives for the public leaderboards, versions 1, 2 and 3: written, packed and checked."""
 
-from __future__ import annotations
-
 from cflow_torch.evaluation.submission.archive import pack
 from cflow_torch.evaluation.submission.check import check_submission
 from cflow_torch.evaluation.submission.encode import Rounding, encode

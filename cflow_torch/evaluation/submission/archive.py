@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import zipfile
+from functools import partial
 from pathlib import Path
-from typing import Dict, Iterable, List, Union
+from typing import Callable, Dict, Iterable, Union
 
 from cflow_torch.data.atomic import atomic_file
+from cflow_torch.data.paths import read_bytes
 from cflow_torch.data.zips import member_names, open_zip, read_member
 from cflow_torch.evaluation.submission.versions import METADATA_FILE, SubmissionVersion
 from cflow_torch.types import CFlowError
 
-_ROW_BYTES, _OTHER_BYTES = 64, 1 << 20  # a row has four columns of at most 8 bytes; metadata take some kilobytes
 _EARLIEST = (1980, 1, 1, 0, 0, 0)  # the first time that a zip can hold
 
 
@@ -43,59 +44,29 @@ def pack(folder: Union[str, Path], names: Iterable[str], file: Union[str, Path],
             archive.writestr(entry, (folder / name).read_bytes())
 
 
-class Contents:
-    """The files of a zip or folder, by name.
+def open_archive(path: Union[str, Path]) -> Dict[str, Callable[[int], bytes]]:
+    """The files of a zip or folder.
 
     Args:
-        path: the zip or folder. Hidden files of a folder are passed over (an interrupted writer leaves some, and
-            `pack` takes none); those of a zip are not.
+        path: the zip or folder. Hidden files of a folder are passed over: an interrupted writer leaves some, and
+            `pack` takes none.
 
-    Attributes:
-        names: of all files, sorted; a name that a zip holds twice occurs twice.
+    Returns:
+        Name -> function that reads the file, given the bytes that it may have at most; sorted by name. It raises
+        `CFlowError` or `OSError`.
 
     Raises:
         CFlowError: neither a zip nor a folder.
     """
-
-    def __init__(self, path: Union[str, Path]) -> None:
-        self.path = Path(path)
-        self.names: List[str]
-        self._files: Dict[str, Path] = {}
-        self._zip = None
-        if self.path.is_dir():
-            for file in self.path.rglob("*"):
-                parts = file.relative_to(self.path).parts
-                if file.is_file() and not any(part.startswith(".") for part in parts):
-                    self._files["/".join(parts)] = file
-            self.names = sorted(self._files)
-            return
-        if not self.path.is_file():
-            raise CFlowError(f"{self.path} does not exist; give a zip, or the folder that it is made from")
-        self._zip = open_zip(self.path)
-        self.names = member_names(self._zip)
-
-    def read(self, name: str, rows: int = 0) -> bytes:
-        """Contents of a file.
-
-        Args:
-            name: of the file.
-            rows: that it should have; one that is far too large for them is not read.
-
-        Raises:
-            CFlowError: it cannot be read, or is far too large.
-        """
-        limit = _OTHER_BYTES + _ROW_BYTES * rows
-        if self._zip is not None:
-            return read_member(self._zip, name, limit)
-        try:
-            size = self._files[name].stat().st_size
-            if size > limit:
-                raise CFlowError(f"it has {size} bytes, up to {limit} are right here")
-            return self._files[name].read_bytes()
-        except (OSError, KeyError) as error:
-            raise CFlowError(f"cannot be read ({error})") from error
-
-    def close(self) -> None:
-        """Close the zip."""
-        if self._zip is not None:
-            self._zip.close()
+    path = Path(path)
+    if path.is_dir():
+        files = {file.relative_to(path): file for file in sorted(path.rglob("*")) if file.is_file()}
+        return {
+            name.as_posix(): partial(read_bytes, file)
+            for name, file in files.items()
+            if not any(part.startswith(".") for part in name.parts)
+        }
+    if not path.is_file():
+        raise CFlowError(f"{path} does not exist; give a zip, or the folder that it is made from")
+    archive = open_zip(path)
+    return {name: partial(read_member, archive, name) for name in member_names(archive)}

@@ -12,7 +12,7 @@ from cflow_torch.types import CFlowError, FlowResult, Window, as_numpy
 from cflow_torch.windows.ego_motion import relative_transform
 
 DYNAMIC_THRESHOLD = 0.05  # metres per sweep; as the evaluation's dynamic points
-LARGEST = float(np.finfo(np.float16).max)  # 65504
+LARGEST = float(np.finfo(np.float16).max)  # 65504 m
 RESIDUAL_AXES = ("t+1", "t")
 
 
@@ -21,8 +21,7 @@ class Rounding:
     """What was lost to float16: lengths of the differences, metres.
 
     Args:
-        largest: of one point.
-        total: of all points together.
+        largest, total: of one point, of all points together.
         num_points: points counted.
     """
 
@@ -74,41 +73,35 @@ def encode(
         CFlowError: rows do not agree; a value is NaN, infinite or beyond float16; unknown axes, or "t" for total flow.
     """
     rows = len(sweeps.pc0.points)
-    if len(result.flow) != rows:
-        raise CFlowError(f"the result has {len(result.flow)} rows, the sweep has {rows} points")
     if (mask is not None) != (version.rows == "masked"):
         asks = "only the points of a mask: give one" if mask is None else "every point: give no mask"
         raise CFlowError(f"version {version.number} holds {asks}")
     residual = as_numpy(result.residual_flow).astype(np.float32)
     keep = np.ones(rows, dtype=bool) if mask is None else np.asarray(mask, dtype=bool)
-    if keep.shape != (rows,):
-        raise CFlowError(f"the mask has shape {keep.shape}, the sweep has {rows} points")
+    if len(residual) != rows or keep.shape != (rows,):
+        raise CFlowError(f"the sweep has {rows} points, the result {len(residual)}, the mask {len(keep)}")
+    axes = RESIDUAL_AXES[:1] if version.flow == "total" else RESIDUAL_AXES
+    if residual_axes not in axes:
+        raise CFlowError(
+            f"residual_axes of version {version.number} is one of {', '.join(axes)}, got {residual_axes!r}"
+        )
     if version.flow == "total":
-        if residual_axes != "t+1":
-            raise CFlowError(f"version {version.number} holds total flow: residual_axes has no meaning, leave it out")
         flow = as_numpy(result.flow).astype(np.float32)
     else:
         flow = _turned(residual, sweeps, residual_axes)
         if sweeps.pc0.is_ground is not None:
             flow[as_numpy(sweeps.pc0.is_ground)] = 0.0
     half, rounding = to_half(flow[keep])
-    is_dynamic = np.linalg.norm(residual[keep], axis=1) >= np.float32(DYNAMIC_THRESHOLD)
     columns = {
         "is_valid": np.ones(len(half), dtype=bool),
-        "is_dynamic": is_dynamic,
+        "is_dynamic": np.linalg.norm(residual[keep], axis=1) >= np.float32(DYNAMIC_THRESHOLD),
         **{f"flow_t{axis}_m": half[:, i] for i, axis in enumerate("xyz")},
     }
     return {name: columns[name] for name in version.columns}, rounding
 
 
 def to_half(flow: np.ndarray) -> Tuple[np.ndarray, Rounding]:
-    """Round to float16.
-
-    Args:
-        flow: (M, 3) float.
-
-    Returns:
-        (M, 3) float16, and what was lost.
+    """(M, 3) flow of any float type in float16, and what was lost.
 
     Raises:
         CFlowError: a value is NaN, infinite, or larger than float16 can hold.
@@ -125,8 +118,6 @@ def to_half(flow: np.ndarray) -> Tuple[np.ndarray, Rounding]:
 
 def _turned(residual: np.ndarray, sweeps: Window, axes: str) -> np.ndarray:
     """(N, 3) float32 residual in the axes asked for; a copy."""
-    if axes not in RESIDUAL_AXES:
-        raise CFlowError(f"residual_axes is one of {', '.join(RESIDUAL_AXES)}, got {axes!r}")
     pose0, pose1 = sweeps.pc0.pose, sweeps.pc1.pose
     if axes == "t+1" or pose0 is None or pose1 is None:  # without poses both sweeps lie in one frame
         return residual.copy()

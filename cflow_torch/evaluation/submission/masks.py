@@ -9,7 +9,6 @@ from typing import Dict, List, Optional, Union
 import numpy as np
 import pyarrow as pa
 
-from cflow_torch.data.arrow_file import shortened
 from cflow_torch.data.feather_file import FeatherFile
 from cflow_torch.data.log import Log
 from cflow_torch.data.zips import member_names, open_zip, read_member
@@ -27,7 +26,7 @@ class MaskArchive:
         file: the zip.
 
     Attributes:
-        frames: log id -> time stamps that are evaluated, ascending.
+        frames: log id -> time stamps that are evaluated.
 
     Raises:
         CFlowError: the file is no such zip.
@@ -37,17 +36,11 @@ class MaskArchive:
         self.file = Path(file)
         self.frames: Dict[str, List[int]] = {}
         self._zip = open_zip(self.file)
-        stored = member_names(self._zip)
-        for name, following in zip(stored, [*stored[1:], None]):
-            if name == following:
-                raise CFlowError(f"{self.file} holds {name!r} twice: which one is meant?")
-            match = _MASK.fullmatch(name)
+        for match in map(_MASK.fullmatch, member_names(self._zip)):
             if match is not None:
                 self.frames.setdefault(match["log"], []).append(int(match["stamp"]))
         if not self.frames:
             raise CFlowError(f"{self.file} holds no masks; it must hold <log>/<time stamp>.feather")
-        for stamps in self.frames.values():
-            stamps.sort()
 
     def mask(self, log_id: str, timestamp: int) -> np.ndarray:
         """(N,) bool mask of a sweep.
@@ -57,20 +50,13 @@ class MaskArchive:
         """
         name = f"{log_id}/{timestamp}.feather"
         try:
-            data = read_member(self._zip, name, MAX_MASK_BYTES)
-        except (CFlowError, OSError, ValueError) as error:
+            file = FeatherFile(name, read_member(self._zip, name, MAX_MASK_BYTES))
+            columns = file.read(file.names).columns
+        except CFlowError as error:
             raise CFlowError(f"{self.file}: cannot read {name} ({error})") from error
-        file = FeatherFile(f"{self.file}: {name}", data)
-        if len(file.names) != 1 or not pa.types.is_boolean(file.schema.types[0]):
-            raise CFlowError(f"{self.file}: {name} must hold one bool column, got {shortened(file.names)}")
-        values = file.read(file.names).column(0)
-        if values.null_count:
-            raise CFlowError(f"{self.file}: {name} has {values.null_count} empty values")
-        return values.to_numpy().astype(bool)
-
-    def close(self) -> None:
-        """Close the zip."""
-        self._zip.close()
+        if len(columns) != 1 or not pa.types.is_boolean(columns[0].type) or columns[0].null_count:
+            raise CFlowError(f"{self.file}: {name} must hold one bool column without empty values")
+        return columns[0].to_numpy()
 
 
 def point_mask(log: Log, index: int, sweep: Sweep, masks: Optional[MaskArchive] = None) -> np.ndarray:
@@ -92,15 +78,11 @@ def point_mask(log: Log, index: int, sweep: Sweep, masks: Optional[MaskArchive] 
     mask = log_mask(log, index) if masks is None else masks.mask(log.log_id, log.timestamps[index])
     if mask is None:
         if sweep.is_ground is None:
-            raise CFlowError(
-                f"log {log.log_id} has neither evaluation masks nor ground, so the points of version 1 are unknown: "
-                f"give the official masks, or a log with its map"
-            )
+            raise CFlowError(f"log {log.log_id} has neither masks nor ground: give the official masks, or its map")
         return (np.abs(points[:, :2]) <= _HALF_SIDE).all(axis=1) & ~as_numpy(sweep.is_ground)
     if mask.shape != (len(points),):
-        raise CFlowError(
-            f"evaluation mask of {log.log_id}/{log.timestamps[index]} has {len(mask)} rows, the sweep has {len(points)}"
-        )
+        name = f"{log.log_id}/{log.timestamps[index]}"
+        raise CFlowError(f"evaluation mask of {name} has {len(mask)} rows, the sweep has {len(points)}")
     return mask
 
 

@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import Dict, Iterable, List, Mapping, Optional, Sequence, Union
 
 from cflow_torch.data.log import Log
-from cflow_torch.data.names import safe_name, same_names
+from cflow_torch.data.names import is_stamp, safe_name, same_names
 from cflow_torch.data.paths import read_bytes
 from cflow_torch.evaluation.submission.masks import MaskArchive, log_mask, point_mask
 from cflow_torch.evaluation.submission.versions import SubmissionVersion
 from cflow_torch.types import CFlowError
 
 STRIDE = 5  # every fifth pair of a log is evaluated
-_LISTED = re.compile(r"(?P<log>[^\s,/]+)[\s,/]+(?P<timestamp>[0-9]{1,19})")
 MAX_LIST_BYTES = 1 << 24  # of a list of frames; one of 10,000 has less than a megabyte
 
 
@@ -71,11 +70,12 @@ def plan_log(
         CFlowError: a listed time stamp is not in the log, or is its last; the log's name is no folder name.
     """
     safe_name(log.log_id, "the log")
+    pairs = range(len(log.timestamps) - 1)
     if listed is not None:
         indices = [_position(log, stamp) for stamp in sorted(listed.get(log.log_id, ()))]
     else:
-        indices = _evaluated(log) if version.frames == "evaluated" else []
-        indices = indices or list(range(0, len(log.timestamps) - 1, STRIDE))
+        by_mask = version.frames == "evaluated"
+        indices = [i for i in pairs if by_mask and log_mask(log, i) is not None] or list(pairs[::STRIDE])
     return [PlannedFrame(log, i, version.file_name(log.log_id, i, log.timestamps[i])) for i in indices]
 
 
@@ -91,28 +91,27 @@ def read_frame_list(file: Union[str, Path]) -> Dict[str, List[int]]:
     file = Path(file)
     if file.suffix in (".pkl", ".pickle"):
         raise CFlowError(
-            f"{file} is a pickle, which can run any code when it is opened, so it is not read: give a text file with "
-            f"one <log>/<time stamp> a line, or leave the list out where the scenes carry eval_mask"
+            f"{file} is a pickle, which could run any code, so it is not read: give a text file with one "
+            "<log>/<time stamp> a line, or leave the list out where the scenes carry eval_mask"
         )
     try:
         lines = read_bytes(file, MAX_LIST_BYTES).decode("utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise CFlowError(f"{file} cannot be read as a list of frames ({error})") from error
-    result: Dict[str, Dict[int, None]] = {}
+    result: Dict[str, List[int]] = {}
     for number, line in enumerate(lines, 1):
         entry = line.partition("#")[0].strip()
         if not entry:
             continue
-        match = _LISTED.fullmatch(entry)
-        if match is None:
+        log, *stamps = re.split(r"[\s,/]+", entry)
+        if not log or len(stamps) != 1 or not is_stamp(stamps[0]):
             raise CFlowError(f"{file}, line {number}: {entry!r} is no frame; write <log>/<time stamp>")
-        stamps = result.setdefault(match["log"], {})  # a set that keeps the order
-        if int(match["timestamp"]) in stamps:
+        if int(stamps[0]) in result.setdefault(log, []):
             raise CFlowError(f"{file}, line {number}: {entry!r} is listed twice")
-        stamps[int(match["timestamp"])] = None
+        result[log].append(int(stamps[0]))
     if not result:
         raise CFlowError(f"{file} lists no frame")
-    return {log: list(stamps) for log, stamps in result.items()}
+    return result
 
 
 def require_logs(logs: Iterable[Log], listed: Optional[Mapping[str, Sequence[int]]]) -> None:
@@ -124,27 +123,15 @@ def require_logs(logs: Iterable[Log], listed: Optional[Mapping[str, Sequence[int
     names = [log.log_id for log in logs]
     twice = same_names(names)
     if twice:
-        raise CFlowError(
-            f"several logs are called {', '.join(twice)}: their files would overwrite each other, where the archive is "
-            "unpacked if not here"
-        )
+        raise CFlowError(f"several logs are called {', '.join(twice)}: their files would overwrite each other")
     missing = sorted(set(listed or ()) - set(names))
     if missing:
-        raise CFlowError(
-            f"{len(missing)} listed logs are not in the data: {', '.join(missing[:5])}"
-            + (" ..." if len(missing) > 5 else "")
-        )
-
-
-def _evaluated(log: Log) -> List[int]:
-    return [index for index in range(len(log.timestamps) - 1) if log_mask(log, index) is not None]
+        raise CFlowError(f"{len(missing)} listed logs are not in the data: {', '.join(missing[:5])}")
 
 
 def _position(log: Log, timestamp: int) -> int:
-    try:
-        index = list(log.timestamps).index(timestamp)
-    except ValueError:
-        raise CFlowError(f"log {log.log_id} has no sweep {timestamp}, which is listed") from None
-    if index == len(log.timestamps) - 1:
-        raise CFlowError(f"{log.log_id}/{timestamp} is listed but is the last sweep of its log: it has no flow")
-    return index
+    stamps = list(log.timestamps)
+    if timestamp not in stamps[:-1]:
+        what = "is the last sweep of its log: it has no flow" if timestamp in stamps else "is no sweep of the log"
+        raise CFlowError(f"{log.log_id}/{timestamp} is listed but {what}")
+    return stamps.index(timestamp)

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from typing import Any, Dict, Mapping, Optional, Tuple
 
 from cflow_torch.types import CFlowError
 
 METADATA_FILE = "metadata.json"
-_FLOW_COLUMNS = ("flow_tx_m", "flow_ty_m", "flow_tz_m")
-_TIMESTAMP, _POSITION = re.compile(r"[1-9]\d*"), re.compile(r"\d{10}")
+_FLOW = ("flow_tx_m", "flow_ty_m", "flow_tz_m")
 
 
 @dataclass(frozen=True)
@@ -42,20 +40,12 @@ class SubmissionVersion:
         """Name of a frame's file inside the archive."""
         return f"{log_id}/{index:010d}.feather" if self.naming == "position" else f"{log_id}/{timestamp}.feather"
 
-    def is_stem(self, stem: str) -> bool:
-        """Whether a file's name without its ending can be one of this version."""
-        return (_POSITION if self.naming == "position" else _TIMESTAMP).fullmatch(stem) is not None
-
-
-def _flow_columns(*dtypes: str) -> Dict[str, Tuple[str, ...]]:
-    return dict.fromkeys(_FLOW_COLUMNS, dtypes)
-
 
 VERSIONS: Dict[int, SubmissionVersion] = {
     1: SubmissionVersion(
         number=1,
         server="Argoverse 2 scene flow 2023 (EvalAI challenge 2010, phase 4018)",
-        columns={**_flow_columns("float16"), "is_dynamic": ("bool",)},
+        columns={**dict.fromkeys(_FLOW, ("float16",)), "is_dynamic": ("bool",)},
         flow="total",
         rows="masked",
         frames="evaluated",
@@ -64,7 +54,7 @@ VERSIONS: Dict[int, SubmissionVersion] = {
     2: SubmissionVersion(
         number=2,
         server="Argoverse 2 scene flow 2024 (EvalAI challenge 2210, phase 4396; closed)",
-        columns={"is_valid": ("bool",), **_flow_columns("float16", "float32", "float64")},
+        columns={"is_valid": ("bool",), **dict.fromkeys(_FLOW, ("float16", "float32", "float64"))},
         flow="residual",
         rows="all",
         frames="every 5th",
@@ -74,7 +64,7 @@ VERSIONS: Dict[int, SubmissionVersion] = {
     3: SubmissionVersion(
         number=3,
         server="multi-dataset challenge 2026 (sceneflow.argoverse.org)",
-        columns=_flow_columns("float16"),
+        columns=dict.fromkeys(_FLOW, ("float16",)),
         flow="residual",
         rows="all",
         frames="evaluated",

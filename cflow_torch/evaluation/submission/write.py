@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import Mapping, Union
 
@@ -12,6 +13,7 @@ from pyarrow import feather
 
 from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.names import folder_in
+from cflow_torch.data.paths import read_bytes
 from cflow_torch.evaluation.submission.check import check_file
 from cflow_torch.evaluation.submission.plan import Frame
 from cflow_torch.evaluation.submission.versions import METADATA_FILE, SubmissionVersion
@@ -44,5 +46,4 @@ def write_metadata(folder: Union[str, Path], version: SubmissionVersion) -> None
 
 def is_complete(folder: Union[str, Path], frame: Frame, version: SubmissionVersion) -> bool:
     """Whether a frame's file is there already and passes every check."""
-    file = Path(folder) / frame.name
-    return file.is_file() and not check_file(frame.name, file.read_bytes(), frame.rows, version)
+    return not check_file(frame.name, partial(read_bytes, Path(folder) / frame.name), frame.rows, version)

@@ -9,8 +9,8 @@ from cflow_torch.integrations.opensceneflow.checkpoint import write_null_checkpo
 from cflow_torch.types import CFlowError
 
 
-def main() -> int:
-    """Exit status: 0, or 1 with one line on stderr."""
+def main() -> None:
+    """Write the file; where that fails, end with status 1 and one line on stderr."""
     parser = argparse.ArgumentParser(prog="python -m cflow_torch.integrations.opensceneflow", description=__doc__)
     parser.add_argument("file", metavar="FILE", help="for example cflow.ckpt; its stem is the default name of results")
     parser.add_argument("--overwrite", action="store_true", help="replace a file that is there")
@@ -18,10 +18,8 @@ def main() -> int:
     try:
         print(f"wrote {write_null_checkpoint(arguments.file, overwrite=arguments.overwrite)}")
     except CFlowError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    return 0
+        sys.exit(f"error: {error}")
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

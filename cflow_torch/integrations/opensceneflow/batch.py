@@ -49,8 +49,7 @@ def read_batch(batch: Mapping[str, Any], num_history: int, ego_T_lidar: Any = No
         NaN are padding, or no return, and left out. "flow" and other truth is never read.
 
     Raises:
-        CFlowError: a key is missing, or its value has a wrong shape, or a pose is no finite rigid motion; the message
-            names the key.
+        CFlowError: a missing key, a wrong shape, a pose that is no finite rigid motion; the message names the key.
     """
     history = [f"h{i}" for i in range(1, num_history + 1)]
     present = [name for name in history if f"pc{name}" in batch]
@@ -67,13 +66,9 @@ def _sample(batch: Mapping[str, Any], b: int, history: List[str], ego_T_lidar: A
         poses.append(rigid_transform(_entry(batch, f"pose{name}", b), f"batch['pose{name}'][{b}]"))
     lidar_poses = poses if extrinsics is None else [pose @ extrinsics for pose in poses]
     sweeps = [Sweep(points, None, pose) for points, pose in zip(clouds, lidar_poses)]
-    return Sample(
-        window=Window(sweeps[0], sweeps[1], tuple(sweeps[2:])),
-        rows0=rows[0],
-        rows1=rows[1],
-        T_ego1_ego0=harness_motion(_entry(batch, "pose0", b), _entry(batch, "pose1", b)),
-        T_lidar1_lidar0=None if extrinsics is None else relative_transform(lidar_poses[1], lidar_poses[0]),
-    )
+    T_ego1_ego0 = harness_motion(_entry(batch, "pose0", b), _entry(batch, "pose1", b))
+    T_lidar1_lidar0 = None if extrinsics is None else relative_transform(lidar_poses[1], lidar_poses[0])
+    return Sample(Window(sweeps[0], sweeps[1], tuple(sweeps[2:])), rows[0], rows[1], T_ego1_ego0, T_lidar1_lidar0)
 
 
 def _points(batch: Mapping[str, Any], b: int, name: str) -> Tuple[Tensor, Tensor]:
@@ -89,10 +84,8 @@ def _points(batch: Mapping[str, Any], b: int, name: str) -> Tuple[Tensor, Tensor
         if is_ground.numel() == points.shape[0]:
             wanted = wanted & ~is_ground.to(points.device)
         elif int((~is_ground).sum()) != points.shape[0]:
-            raise CFlowError(
-                f"batch['{mask_key}'][{b}] has {is_ground.numel()} rows, {int((~is_ground).sum())} of them not ground, "
-                f"but batch['{key}'][{b}] has {points.shape[0]} points: give the mask of this sweep"
-            )
+            found = f"{is_ground.numel()} rows, {int((~is_ground).sum())} not ground"
+            raise CFlowError(f"batch['{mask_key}'][{b}] has {found}, but {key} {len(points)} points: give its own mask")
     rows = wanted.nonzero()[:, 0]
     return points[:, :3].index_select(0, rows), rows
 
@@ -139,8 +132,5 @@ def _entry(batch: Mapping[str, Any], key: str, b: int) -> Any:
 
 
 def _described(value: Any) -> str:
-    if isinstance(value, Tensor):
-        return f"a tensor of shape {tuple(value.shape)} and dtype {value.dtype}"
-    return (
-        f"{type(value).__name__} of length {len(value)}" if isinstance(value, (list, tuple)) else type(value).__name__
-    )
+    what = f", {value.dtype}, of shape {tuple(value.shape)}" if isinstance(value, Tensor) else ""
+    return f"a {type(value).__name__}{what}"

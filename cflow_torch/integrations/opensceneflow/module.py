@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import warnings
 from dataclasses import fields
 from typing import Any, Dict, List, Mapping, Optional
@@ -10,32 +11,44 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from cflow_torch.config import CONFIGS, Config, make_config
+from cflow_torch.config import REMOVED, Config, make_config
 from cflow_torch.data.hdf5.frames import beside_harness, harness_pose_flow
 from cflow_torch.estimate import make_model
 from cflow_torch.integrations.opensceneflow.batch import Sample, read_batch
-from cflow_torch.integrations.opensceneflow.timer import make_timer
 from cflow_torch.types import CFlowError, FlowResult
 from cflow_torch.windows.ego_motion import rigid_transform
 
 OUTPUTS = ("full", "valid")
-_SETTINGS = tuple(dict.fromkeys(f.name for kind in CONFIGS.values() for f in fields(kind) if f.name != "num_history"))
+
+
+class SilentTimer:
+    """Stands in for `dztimer.Timing`, the stop watch that the harness uses: takes every call, measures nothing."""
+
+    def __getitem__(self, key: int) -> SilentTimer:
+        """Any step, however deep."""
+        return self
+
+    def start(self, *args: Any, **kwargs: Any) -> None:
+        """Nothing."""
+
+    stop = print = start
 
 
 class CFlow(nn.Module):
-    """CorrelationFlow, dense or key points, as OpenSceneFlow calls a model. No parameters, no buffers, no layers.
+    """A method as OpenSceneFlow calls a model. No parameters, no buffers, no layers.
 
     Args:
         num_frames: sweeps per window as the harness counts them, t+1 and t included: h + 2. None = the preset's, 6 for
-            the dense method, 2 for key points. If the harness gives fewer, fewer are used.
+            "default", 4 for "fast", 2 for the others. If the harness gives fewer, fewer are used.
         ego_T_lidar: (4, 4) nested list or array, coordinates of the points to the frame whose poses the scenes store;
             None = the same frame; "auto" = recognise scenes of Argoverse 2, whose points lie in the frame of up_lidar.
         output: "full" = flow of all rows of pc0, 0 where the method says nothing (both paths of the harness);
             "valid" = only of rows that took part, by "pc0_valid_point_idxes" (not with iter_only, which ignores those).
         device: "auto" = that of the batch.
         voxel_size, grid_feature_size: taken, because the harness wants and gives them; without effect.
-        **settings: any field of `Config` but `num_history`; those not given are the preset's, "keypoints" for
-            method="keypoints", else "default". Others are named in a warning and have no effect.
+        preset, method: as in `make_config`; "default" if neither is given.
+        **settings: any field of the method's settings but `num_history`; those not given are the preset's. Others, of
+            another method for example, are named in a warning and have no effect.
 
     Raises:
         CFlowError: invalid settings.
@@ -51,30 +64,31 @@ class CFlow(nn.Module):
         device: Any = "auto",
         voxel_size: Any = None,
         grid_feature_size: Any = None,
+        preset: Optional[str] = None,
+        method: Optional[str] = None,
         **settings: Any,
     ) -> None:
         super().__init__()
-        unknown = sorted(set(settings) - set(_SETTINGS))
+        config: Config = make_config(preset, method)
+        names = ["pixel_size", *(f.name for f in fields(config) if f.name not in ("method", "num_history"))]
+        unknown = [
+            name + (f" ({REMOVED[name]})" if name in REMOVED else "") for name in sorted(settings) if name not in names
+        ]
         if unknown:
-            warnings.warn(
-                f"settings without effect: {', '.join(unknown)}; the method has {', '.join(_SETTINGS)} "
-                "(history is set by num_frames)",
-                UserWarning,
-                stacklevel=2,
-            )
-        config = make_config(None, **{name: settings[name] for name in settings if name in _SETTINGS})
-        self.estimator = make_model(_with_history(config, num_frames), device)
+            known = f"method={config.method!r} has {', '.join(names)} (history is set by num_frames)"
+            warnings.warn(f"settings without effect: {', '.join(unknown)}; {known}", stacklevel=2)
+        config = config.replace(**{name: value for name, value in settings.items() if name in names})
+        self.config = _with_history(config, num_frames)
+        self.estimator = make_model(self.config, device)
         if output not in OUTPUTS:
             raise CFlowError(f"output={output!r}: give one of {', '.join(map(repr, OUTPUTS))}")
         self.output = output
         self.ego_T_lidar = _extrinsics(ego_T_lidar)
-        self.timer = make_timer()
+        try:
+            self.timer: Any = importlib.import_module("dztimer").Timing()
+        except ImportError:
+            self.timer = SilentTimer()
         self._said_short = False
-
-    @property
-    def config(self) -> Config:
-        """The method's settings."""
-        return self.estimator.config
 
     def forward(self, batch: Mapping[str, Any]) -> Dict[str, List[Tensor]]:
         """Residual flow of every sample.
@@ -97,13 +111,10 @@ class CFlow(nn.Module):
         samples = read_batch(batch, num_history, self.ego_T_lidar)
         self._say_short(samples, num_history)
         results = self.estimator([sample.window for sample in samples])
-        out: Dict[str, List[Tensor]] = {}
         device = results[0].flow.device if results else torch.device("cpu")
         with torch.no_grad(), torch.autocast(device.type, enabled=False):
-            for b, (sample, result) in enumerate(zip(samples, results)):
-                for key, value in self._answer(batch, b, sample, result).items():
-                    out.setdefault(key, []).append(value)
-        return out
+            answers = [self._answer(batch, b, *pair) for b, pair in enumerate(zip(samples, results))]
+        return {key: [answer[key] for answer in answers] for key in (answers[0] if answers else ())}
 
     def _answer(self, batch: Mapping[str, Any], b: int, sample: Sample, result: FlowResult) -> Dict[str, Tensor]:
         """The output of one sample."""
@@ -137,7 +148,6 @@ class CFlow(nn.Module):
                 f"num_frames={num_history + 2} asks for {num_history} history sweeps, the batch has {given}: the flow "
                 f"is estimated from those; pass num_frames={num_history + 2} to the script as well (iter_only), or set "
                 f"model.target.num_frames={given + 2}",
-                UserWarning,
                 stacklevel=3,
             )
 
@@ -147,20 +157,17 @@ def _with_history(config: Config, num_frames: Any) -> Config:
         return config
     if isinstance(num_frames, bool) or not isinstance(num_frames, int) or num_frames < 2:
         raise CFlowError(f"num_frames={num_frames!r}: give a whole number of at least 2; history is num_frames - 2")
-    if config.method == "keypoints" and num_frames > 2:
-        raise CFlowError(
-            f"method='keypoints' matches one pair of sweeps, num_frames={num_frames} was given: give num_frames=2, "
-            "or take model=cflow_keypoints, which has all settings of the variant"
-        )
-    return config.replace(num_history=num_frames - 2)
+    if config.method != "keypoints":
+        return config.replace(num_history=num_frames - 2)
+    if num_frames > 2:
+        raise CFlowError(f"method='keypoints' matches one pair of sweeps: give num_frames=2, got {num_frames}")
+    return config
 
 
 def _extrinsics(ego_T_lidar: Any) -> Any:
     """None, "auto", or a checked (4, 4) float64."""
     if ego_T_lidar is None or (isinstance(ego_T_lidar, str) and ego_T_lidar == "auto"):
         return ego_T_lidar
-    if isinstance(ego_T_lidar, str):
-        raise CFlowError(f"ego_T_lidar={ego_T_lidar!r}: give 'auto', null, or a (4, 4) matrix")
     try:  # Hydra gives lists of a type of its own
         rows = np.array([[float(value) for value in row] for row in ego_T_lidar])
     except (TypeError, ValueError):
