@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from typing import Any, Dict, FrozenSet, List, Sequence, Tuple, Union
+from typing import Any, Dict, FrozenSet, List, Optional, Sequence, Tuple, Union
 
 from cflow_torch.config import Config
 from cflow_torch.data.flow_file import CONTENTS
@@ -50,16 +50,14 @@ class Unit:
         source: one of `catalog.find_sources`.
         first: share of the log's pairs that lies before the span, 0 ... 1.
         last: share that lies before its end.
-        careful: time stamps of frames that a worker died on. Each is read and computed by itself.
-        skip: time stamps of frames that are given up, or done already before a worker died.
+        only: time stamps of the frames of the span that are to be done; None = all of them.
     """
 
     number: int
     source: Any
     first: Fraction = Fraction(0)
     last: Fraction = Fraction(1)
-    careful: FrozenSet[int] = frozenset()
-    skip: FrozenSet[int] = frozenset()
+    only: Optional[FrozenSet[int]] = None
 
     def frames(self, num_pairs: int) -> range:
         """Numbers of the sweeps t of the span, in a log of so many pairs."""
@@ -68,20 +66,12 @@ class Unit:
 
 @dataclass(frozen=True)
 class Opened:
-    """A unit has begun: `total` frames, of which those of time stamps `todo` are not complete yet."""
+    """A unit has begun: time stamps of its `frames`, and of those `todo` that are not complete yet."""
 
     unit: int
     log_id: str
-    total: int
+    frames: Tuple[int, ...]
     todo: Tuple[int, ...]
-
-
-@dataclass(frozen=True)
-class Begun:
-    """Frames that are now in the worker's hands; if it dies, one of them may be why."""
-
-    unit: int
-    timestamps: Tuple[int, ...]
 
 
 @dataclass(frozen=True)
@@ -95,15 +85,15 @@ class Done:
 
 @dataclass(frozen=True)
 class Failed:
-    """A frame that cannot be had and why; `timestamp` None: the whole unit."""
+    """A frame that has no result and why; `timestamp` None: the whole unit."""
 
     unit: int
     name: str
     message: str
-    timestamp: Union[int, None] = None
+    timestamp: Optional[int] = None
 
 
-Event = Union[Opened, Begun, Done, Failed]
+Event = Union[Opened, Done, Failed]
 
 
 def split(units: Sequence[Unit], workers: int) -> List[Unit]:

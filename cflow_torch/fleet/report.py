@@ -7,20 +7,26 @@ import platform
 from typing import Any, Dict, List
 
 from cflow_torch.data.records import strict
+from cflow_torch.fleet.counters import Counters
 from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.shard import Shard
-from cflow_torch.fleet.tally import Tally
 
 _SHOWN = 20  # failures that the table lists; JSON has them all
 
 
 def make_report(
-    tally: Tally, seconds: float, layout: Layout, shard: Shard, engine: str, signal_name: str, about: Dict[str, Any]
+    counters: Counters,
+    seconds: float,
+    layout: Layout,
+    shard: Shard,
+    engine: str,
+    signal_name: str,
+    about: Dict[str, Any],
 ) -> Dict[str, Any]:
     """All figures of a run.
 
     Args:
-        tally: what was done.
+        counters: what was done.
         seconds: from the start of the engine to its end.
         layout: what it ran on.
         shard: which share of the work it was.
@@ -34,8 +40,8 @@ def make_report(
         "unopened_units"; "frames_per_s" of those computed; "stages": seconds per computed frame, summed over the
         workers, that overlap in time; "failures", "waiting".
     """
-    status = "interrupted" if signal_name else "complete" if tally.is_complete else "incomplete"
-    waiting = tally.waiting
+    status = "interrupted" if signal_name else "complete" if counters.is_complete else "incomplete"
+    waiting = counters.waiting
     return {
         "status": status,
         "stopped_by": signal_name or None,
@@ -46,18 +52,18 @@ def make_report(
         "batch": layout.batch,
         "machine": platform.platform(),
         "frames": {
-            "total": tally.total,
-            "complete_before": tally.complete_before,
-            "computed": tally.computed,
-            "failed": tally.num_failed_frames,
-            "failed_logs": len(tally.failures) - tally.num_failed_frames,
+            "total": counters.total,
+            "complete_before": counters.complete_before,
+            "computed": counters.computed,
+            "failed": counters.num_failed_frames,
+            "failed_logs": len(counters.failures) - counters.num_failed_frames,
             "waiting": len(waiting),
-            "unopened_units": tally.num_unopened,
+            "unopened_units": counters.num_unopened,
         },
         "seconds": seconds,
-        "frames_per_s": tally.computed / seconds if seconds > 0 else 0.0,
-        "stages": {name: total / max(1, tally.computed) for name, total in tally.seconds.items()},
-        "failures": [list(failure) for failure in tally.failures],
+        "frames_per_s": counters.computed / seconds if seconds > 0 else 0.0,
+        "stages": {name: total / max(1, counters.computed) for name, total in counters.seconds.items()},
+        "failures": [list(failure) for failure in counters.failures],
         "waiting": waiting,
         **about,
     }

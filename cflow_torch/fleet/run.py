@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import signal
 import time
+from contextlib import closing
 from typing import Any, Dict, Iterator, List, Sequence, Tuple
 
 from cflow_torch.data.atomic import remove_stale
 from cflow_torch.data.names import folder_in
 from cflow_torch.data.paths import as_path
 from cflow_torch.data.records import write_text
-from cflow_torch.fleet.job import Event, Failed, Job, Opened, split
+from cflow_torch.fleet.counters import Counters
+from cflow_torch.fleet.job import Event, Failed, Job, split
 from cflow_torch.fleet.local import run_local
 from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.manifest import removed_logs
@@ -18,7 +20,6 @@ from cflow_torch.fleet.progress import Progress, say
 from cflow_torch.fleet.report import make_report, to_json
 from cflow_torch.fleet.shard import Shard
 from cflow_torch.fleet.stop import StopSignal
-from cflow_torch.fleet.tally import Tally
 from cflow_torch.types import CFlowError
 
 ENGINES = ("local", "ray")
@@ -50,24 +51,23 @@ def run_fleet(
     """
     shares = shard.units(sources)
     units = split(shares, len(layout.devices))
-    tally = Tally(units)
+    counters = Counters(units)
     start = time.perf_counter()
-    with StopSignal() as stop:
-        events = _engine(engine)(job, units, layout, stop, **engine_settings)
+    with StopSignal() as stop, closing(_engine(engine)(job, units, layout, stop, **engine_settings)) as events:
         try:
-            _follow(events, tally, len(units))
+            _follow(events, counters, len(units))
         except KeyboardInterrupt:
             stop.received = stop.received or signal.SIGINT
         except CFlowError as error:  # no worker is left
-            if not tally.total:
+            if not counters.total:
                 raise
             say(f"ended early: {error}")
-        tally.failures += _removed(job.output, tally)
+        counters.failures += _removed(job.output, counters)
         seconds = time.perf_counter() - start
-        name = signal.Signals(stop.received).name if stop.received and not tally.is_complete else ""
-        report = make_report(tally, seconds, layout, shard, engine, name, about)
+        name = signal.Signals(stop.received).name if stop.received and not counters.is_complete else ""
+        report = make_report(counters, seconds, layout, shard, engine, name, about)
         report["is_written"] = True
-        report["exit_status"] = stop.exit_status if name else 0 if tally.is_complete else 1
+        report["exit_status"] = stop.exit_status if name else 0 if counters.is_complete else 1
         try:
             file = report_file(job.output, shard)
             remove_stale(file.parent)
@@ -93,10 +93,10 @@ def _engine(name: str) -> Any:
     raise CFlowError(f"engine={name!r}: give one of {', '.join(ENGINES)}")
 
 
-def _removed(output: str, tally: Tally) -> List[Tuple[str, str]]:
+def _removed(output: str, counters: Counters) -> List[Tuple[str, str]]:
     """(log, message) of what somebody removed while the run was at work."""
     try:
-        gone = removed_logs(as_path(output), sorted(tally.log_ids))
+        gone = removed_logs(as_path(output), sorted(counters.log_ids))
     except OSError as error:
         return [(output, f"cannot be looked at any more ({error})")]
     return [
@@ -104,15 +104,13 @@ def _removed(output: str, tally: Tally) -> List[Tuple[str, str]]:
     ]
 
 
-def _follow(events: Iterator[Event], tally: Tally, num_units: int) -> None:
+def _follow(events: Iterator[Event], counters: Counters, num_units: int) -> None:
     """Count events in, and show how far it is: the total grows as logs are opened."""
-    num_opened = num_frames = 0
     with Progress() as progress:
         for event in events:
-            settled = tally.add(event)
-            if isinstance(event, Opened):
-                num_opened, num_frames = num_opened + 1, num_frames + event.total
-                progress.total = round(num_frames / num_opened * max(num_units, num_opened))
+            settled = counters.add(event)
+            if counters.num_opened:
+                progress.total = round(counters.total * max(1, num_units / counters.num_opened))
             if isinstance(event, Failed):
                 say(f"failed: {event.name}: {event.message}")
             progress.update(settled)
