@@ -5,13 +5,12 @@ from __future__ import annotations
 import time
 from collections import deque
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from typing import Callable, Deque, Iterator, Optional, Protocol, Sequence
+from typing import Any, Callable, Deque, Iterator, Optional, Protocol, Sequence
 
 from cflow_torch.fleet.job import Event, Failed, Unit
 from cflow_torch.fleet.progress import say
 from cflow_torch.fleet.retries import Retries
 from cflow_torch.fleet.work import describe, source_name
-from cflow_torch.fleet.worker_process import Step
 from cflow_torch.types import CFlowError
 
 _POLL_S = 0.2  # how soon a signal is noticed
@@ -27,19 +26,13 @@ class Handle(Protocol):
     """A worker process as its engine sees it. Another process takes its place when it dies."""
 
     def begin(self) -> Future:
-        """Start the process if there is none, and let it make ready."""
+        """Call `WorkerProcess.begin`, in a new process if there is none."""
 
     def step(self, unit: Unit, stop: bool) -> Future:
-        """See `WorkerProcess.step`."""
+        """Call `WorkerProcess.step`."""
 
-    def result(self, call: Future) -> Optional[Step]:
-        """What a call gave.
-
-        Raises:
-            WorkerDied: the process died.
-            CFlowError: the process cannot begin.
-            Exception: what else the call raised; the process lives.
-        """
+    def result(self, call: Future) -> Any:
+        """What a call gave, or raises what it raised; `WorkerDied` if the process is gone."""
 
     def close(self) -> None:
         """End the process, whatever it does."""
@@ -55,59 +48,59 @@ class _Worker:
         self.call: Optional[Future] = None
 
 
-class Dispatcher:
-    """One run of an engine.
+def dispatch(
+    handles: Sequence[Handle], units: Sequence[Unit], stop: Callable[[], bool], retries: int
+) -> Iterator[Event]:
+    """Do all units.
 
     Args:
         handles: the workers, not started yet.
         units: numbered as in `split`.
         stop: asked all the time; from True on, frames in hand are finished and no others begun.
         retries: see `Retries`.
-    """
 
+    Yields:
+        What happens, as it happens.
+
+    Raises:
+        CFlowError: no worker can begin.
+    """
+    handles = handles[: len(units)]
+    try:
+        yield from _Run(handles, units, stop, retries).events()
+    finally:
+        with ThreadPoolExecutor(len(handles)) as closing:  # a process that hangs takes seconds
+            list(closing.map(lambda handle: handle.close(), handles))
+
+
+class _Run:
     def __init__(
         self, handles: Sequence[Handle], units: Sequence[Unit], stop: Callable[[], bool], retries: int
     ) -> None:
-        self._workers = [_Worker(handle) for handle in handles[: len(units)]]
-        self._wanted = len(self._workers)
+        self._workers = [_Worker(handle) for handle in handles]
         self._queue: Deque[Unit] = deque(units)
         self._stop, self._retries = stop, Retries(retries)
         self._failed_starts = 0  # in a row
 
-    def run(self) -> Iterator[Event]:
-        """Do all units.
-
-        Yields:
-            What happens, as it happens.
-
-        Raises:
-            CFlowError: no worker can begin.
-        """
-        all_workers = list(self._workers)
-        try:
-            yield from self._run()
-        finally:
-            with ThreadPoolExecutor(len(all_workers)) as closing:  # one that hangs takes seconds
-                list(closing.map(lambda worker: worker.handle.close(), all_workers))
-
-    def _run(self) -> Iterator[Event]:
+    def events(self) -> Iterator[Event]:
+        """See `dispatch`."""
         told: Optional[float] = None
         while True:
             if self._stop() and told is None:
                 told = time.monotonic()
                 self._queue.clear()
             for worker in self._workers:
-                self._give_work(worker)
-            calls = {worker.call: worker for worker in self._workers if worker.call is not None}
+                if worker.call is None:
+                    self._give_work(worker)
             is_over = told is not None and time.monotonic() - told > _GRACE_S
             if is_over or not (self._queue or any(worker.unit for worker in self._workers)):
                 return
+            calls = {worker.call: worker for worker in self._workers if worker.call is not None}
             for call in wait(calls, timeout=_POLL_S, return_when=FIRST_COMPLETED).done:
-                yield from self._hear(calls[call])
+                calls[call].call = None
+                yield from self._hear(calls[call], call)
 
     def _give_work(self, worker: _Worker) -> None:
-        if worker.call is not None:
-            return
         if worker.is_ready and worker.unit is None and self._queue:
             worker.unit = self._queue.popleft()
         if worker.unit is not None:
@@ -115,10 +108,8 @@ class Dispatcher:
         elif not worker.is_ready and self._queue:
             worker.call = worker.handle.begin()
 
-    def _hear(self, worker: _Worker) -> Iterator[Event]:
+    def _hear(self, worker: _Worker, call: Future) -> Iterator[Event]:
         """The answer to a call."""
-        call, worker.call = worker.call, None
-        assert call is not None
         try:
             step = worker.handle.result(call)
         except WorkerDied as death:
@@ -131,50 +122,34 @@ class Dispatcher:
                 yield Failed(unit.number, source_name(unit.source), describe(error))
         else:
             self._failed_starts, worker.is_ready = 0, True
-            if step is None:
-                return
-            for event in step.events:
+            for event in step.events if step else []:
                 self._retries.follow(event)
                 yield event
-            if step.ended:
+            if step and step.has_ended:
                 worker.unit = None
 
     def _on_exit(self, worker: _Worker, how: str) -> Iterator[Event]:
-        """A worker died. The process that takes its place has to begin first."""
-        if worker.is_ready:
-            worker.is_ready = False
-            yield from self._on_failure(worker, f"the last one {how}")
-            return
-        self._failed_starts += 1
-        if self._failed_starts >= _MOST_FAILED_STARTS:
-            self._leave_out(
-                worker,
-                f"{self._failed_starts} workers one after the other died before they could begin, the last one {how} "
-                "(give fewer engine.workers if it is the memory, else see above)",
-            )
-
-    def _on_failure(self, worker: _Worker, how: str) -> Iterator[Event]:
-        """The unit in hand was not finished."""
-        unit, worker.unit = worker.unit, None
-        if unit is None:
-            return
-        failed, again = self._retries.on_failure(unit, how)
-        for event in failed:
-            self._retries.follow(event)
-            yield event
-        if not self._stop():
-            self._queue.extend(again)
-            self._queue = deque(unit for unit in self._queue if not self._retries.is_given_up(unit))
+        """A worker died: another process has to begin, and what it had in hand is to be done again."""
+        if not worker.is_ready:
+            self._failed_starts += 1
+            if self._failed_starts >= _MOST_FAILED_STARTS:
+                self._leave_out(
+                    worker,
+                    f"{self._failed_starts} workers one after the other died before they could begin, the last one "
+                    f"{how} (give fewer engine.workers if it is the memory, else see above)",
+                )
+        unit, worker.unit, worker.is_ready = worker.unit, None, False
+        if unit is not None:
+            failed, again = self._retries.on_failure(unit, f"the last one {how}")
+            for event in failed:
+                self._retries.follow(event)
+                yield event
+            if not self._stop():
+                left = [unit for unit in self._queue if not self._retries.is_given_up(unit)]
+                self._queue = deque(left + again)
 
     def _leave_out(self, worker: _Worker, why: str) -> None:
         self._workers.remove(worker)
         if not self._workers:
             raise CFlowError(why)
-        say(f"{why}; going on with {len(self._workers)} of {self._wanted} workers")
-
-
-def unanswered(error: Exception) -> Future:
-    """A call that could not be made."""
-    call: Future = Future()
-    call.set_exception(error)
-    return call
+        say(f"{why}; going on with {len(self._workers)} workers")

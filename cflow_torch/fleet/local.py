@@ -10,7 +10,7 @@ from typing import Any, Callable, Iterator, Optional, Sequence
 
 from pebble import ProcessExpired, ProcessPool
 
-from cflow_torch.fleet.dispatch import Dispatcher, WorkerDied, unanswered
+from cflow_torch.fleet.dispatch import WorkerDied, dispatch
 from cflow_torch.fleet.job import Event, Failed, Job, Unit
 from cflow_torch.fleet.machine import Layout, threads
 from cflow_torch.fleet.stop import SIGNALS
@@ -18,7 +18,6 @@ from cflow_torch.fleet.work import Worker, describe, source_name
 from cflow_torch.fleet.worker_process import Step, WorkerProcess
 from cflow_torch.types import CFlowError
 
-# A unit whose worker died is done again once, then frame by frame; so is each of these frames.
 _RETRIES = 1
 
 
@@ -39,7 +38,7 @@ def run_local(
         layout: one worker per device. A single worker without a limit of memory is this very process.
         stop: asked all the time; from True on, frames in hand are finished and no others begun.
         timeout: seconds after which a worker process that has given no sign is replaced.
-        memory: bytes of address space that each worker process may take, of which Python and torch need about 3e9;
+        memory: bytes of address space that each worker process may take, of which Python and torch need some 3e9;
             None = no limit. For a CPU: the driver of a GPU reserves far more than it uses.
 
     Raises:
@@ -52,13 +51,11 @@ def run_local(
     for name, value in (("timeout", timeout), ("memory", 1 if memory is None else memory)):
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not value > 0:
             raise CFlowError(f"engine.{name}={value!r}: give a number above 0")
-    if not units:
-        return
     if len(layout.devices) == 1 and memory is None:
         yield from _run_here(job, units, layout, stop)
-        return
-    handles = [_Process((job, device, layout.threads, memory), timeout) for device in layout.devices]
-    yield from Dispatcher(handles, units, stop, _RETRIES).run()
+    elif units:
+        handles = [_Process((job, device, layout.threads, memory), timeout) for device in layout.devices]
+        yield from dispatch(handles, units, stop, _RETRIES)
 
 
 def _run_here(job: Job, units: Sequence[Unit], layout: Layout, stop: Callable[[], bool]) -> Iterator[Event]:
@@ -79,7 +76,7 @@ def _run_here(job: Job, units: Sequence[Unit], layout: Layout, stop: Callable[[]
 
 
 class _Process:
-    """A `Handle`: a pool of one, so that a worker keeps its log, and that no other shares the pipe that it died on.
+    """A `Handle`: a pool of one process, so that a worker keeps its log, and shares no pipe that it may break.
 
     Args:
         arguments: of `_start`.
@@ -94,19 +91,21 @@ class _Process:
         if self._pool is None:
             context = multiprocessing.get_context("spawn")  # fork and threads, or CUDA, do not go together
             self._pool = ProcessPool(1, initializer=_start, initargs=self._arguments, context=context)
-        return self._schedule(_begin)
+        return self._call(_begin)
 
     def step(self, unit: Unit, stop: bool) -> Future:
-        return self._schedule(_step, unit, stop)
+        return self._call(_step, unit, stop)
 
-    def _schedule(self, function: Callable[..., Any], *arguments: Any) -> Future:
+    def _call(self, function: Callable[..., Any], *arguments: Any) -> Future:
         assert self._pool is not None
         try:
             return self._pool.schedule(function, arguments, timeout=self._timeout)
-        except (BrokenProcessPool, RuntimeError) as error:  # it died between two calls, or could not be started
-            return unanswered(BrokenProcessPool(error))
+        except RuntimeError as error:  # it died between two calls, or could not be started
+            call: Future = Future()
+            call.set_exception(BrokenProcessPool(describe(error.__cause__ or error)))
+            return call
 
-    def result(self, call: Future) -> Optional[Step]:
+    def result(self, call: Future) -> Any:
         error = call.exception()
         if isinstance(error, ProcessExpired):
             raise WorkerDied(_how(error.exitcode))
@@ -114,10 +113,10 @@ class _Process:
             raise WorkerDied(f"after {self._timeout:g} s without a sign")
         if isinstance(error, BrokenProcessPool):
             self.close()
-            raise WorkerDied("with no work in hand")
-        if error is not None and not isinstance(error, Exception):
-            raise RuntimeError(f"{type(error).__name__}: {error}")
-        return call.result()  # type: ignore[no-any-return]
+            raise WorkerDied(f"({error})")
+        if isinstance(error, SystemExit):
+            raise RuntimeError(f"SystemExit: {error}")
+        return call.result()
 
     def close(self) -> None:
         pool, self._pool = self._pool, None
@@ -126,7 +125,7 @@ class _Process:
             pool.join()
 
 
-_process: Optional[WorkerProcess] = None  # of this worker process
+_process: WorkerProcess  # of a worker process
 
 
 def _start(job: Job, device: str, num_threads: int, memory: Optional[float]) -> None:
@@ -142,12 +141,10 @@ def _start(job: Job, device: str, num_threads: int, memory: Optional[float]) -> 
 
 
 def _begin() -> None:
-    assert _process is not None
     _process.begin()
 
 
 def _step(unit: Unit, stop: bool) -> Step:
-    assert _process is not None
     return _process.step(unit, stop)
 
 

@@ -19,12 +19,12 @@ import torch
 
 from cflow_torch import __version__
 from cflow_torch.data.paths import as_path, is_remote
-from cflow_torch.fleet.dispatch import Dispatcher, WorkerDied
+from cflow_torch.fleet.dispatch import WorkerDied, dispatch
 from cflow_torch.fleet.job import Event, Job, Unit
 from cflow_torch.fleet.machine import AUTO, Layout
 from cflow_torch.fleet.manifest import MANIFEST
 from cflow_torch.fleet.work import describe
-from cflow_torch.fleet.worker_process import Step, WorkerProcess
+from cflow_torch.fleet.worker_process import WorkerProcess
 from cflow_torch.types import CFlowError
 
 # Only names and outcomes are kept there; Ray takes 30 % of the memory if it is not told.
@@ -70,26 +70,29 @@ def run_ray(
         raise CFlowError(f"engine.retries={retries!r}: give a whole number of at least 0")
     if not units:
         return
-    ray = _import_ray()
+    try:
+        import ray
+    except ImportError as error:
+        raise CFlowError(f"engine=ray needs Ray ({error}): pip install ray") from None
     is_gpu = layout.devices[0].startswith("cuda")
-    device = "cuda" if is_gpu else layout.devices[0]  # Ray shows a worker its own GPUs only
     needs = {
-        "CPU": (0.0 if is_gpu else float(layout.threads)) if num_cpus == AUTO else _number("num_cpus", num_cpus),
-        "GPU": float(is_gpu) if num_gpus == AUTO else _number("num_gpus", num_gpus),
+        "CPU": _number("num_cpus", num_cpus, 0 if is_gpu else layout.threads),
+        "GPU": _number("num_gpus", num_gpus, int(is_gpu)),
     }
     if is_gpu and not needs["GPU"]:
         raise CFlowError("engine.num_gpus=0: with a GPU as device, give each worker at least a share of one")
     count = min(len(layout.devices), len(units))
     with _cluster(ray, address, count, needs, layout.devices if is_gpu else ()) as is_joined:
         _check_room(ray, needs)
-        must_see = is_joined and not is_remote(as_path(job.output))
-        if not is_remote(as_path(job.output)):  # a worker may be in another folder
-            job = replace(job, output=str(as_path(job.output).absolute()))
-        actor = ray.remote(_Actor).options(
-            num_cpus=needs["CPU"], num_gpus=needs["GPU"], max_restarts=-1, max_task_retries=0
-        )
+        output, must_see = as_path(job.output), is_joined
+        if is_remote(output):
+            must_see = False
+        else:  # a worker may be in another folder
+            job = replace(job, output=str(output.absolute()))
+        actor = ray.remote(_Actor).options(num_cpus=needs["CPU"], num_gpus=needs["GPU"], max_restarts=-1)
+        device = "cuda" if is_gpu else layout.devices[0]  # Ray shows a worker its own GPUs only
         arguments = (job, device, layout.threads, _versions(), os.getcwd(), must_see)
-        yield from Dispatcher([_Handle(ray, actor, arguments) for _ in range(count)], units, stop, retries).run()
+        yield from dispatch([_Handle(ray, actor, arguments) for _ in range(count)], units, stop, retries)
 
 
 class _Actor(WorkerProcess):
@@ -133,9 +136,9 @@ class _Handle:
     def step(self, unit: Unit, stop: bool) -> Future:
         return self._actor.step.remote(unit, stop).future()  # type: ignore[no-any-return]
 
-    def result(self, call: Future) -> Optional[Step]:
+    def result(self, call: Future) -> Any:
         try:
-            return call.result()  # type: ignore[no-any-return]
+            return call.result()
         except self._ray.exceptions.RayTaskError as error:
             raise error.cause from None
         except self._ray.exceptions.RayError as error:
@@ -198,22 +201,12 @@ def _check_room(ray: ModuleType, needs: Dict[str, float]) -> None:
         )
 
 
-def _import_ray() -> ModuleType:
-    try:
-        import ray
-    except ImportError as error:
-        raise CFlowError(f"engine=ray needs Ray ({error}): pip install ray") from None
-    return ray  # type: ignore[no-any-return]
-
-
-def _number(name: str, value: Any) -> float:
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        number = math.nan
-    if not 0 <= number < math.inf:
+def _number(name: str, value: Any, default: float) -> float:
+    if value == AUTO:
+        return default
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value < math.inf:
         raise CFlowError(f"engine.{name}={value!r}: give a number of at least 0, or {AUTO}")
-    return number
+    return value
 
 
 def _versions() -> str:

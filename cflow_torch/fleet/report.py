@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import platform
 from typing import Any, Dict, List
 
-from cflow_torch.data.records import strict
 from cflow_torch.fleet.counters import Counters
 from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.shard import Shard
@@ -15,13 +13,7 @@ _SHOWN = 20  # failures that the table lists; JSON has them all
 
 
 def make_report(
-    counters: Counters,
-    seconds: float,
-    layout: Layout,
-    shard: Shard,
-    engine: str,
-    signal_name: str,
-    about: Dict[str, Any],
+    counters: Counters, seconds: float, layout: Layout, shard: Shard, engine: str, signal_name: str
 ) -> Dict[str, Any]:
     """All figures of a run.
 
@@ -32,7 +24,6 @@ def make_report(
         shard: which share of the work it was.
         engine: "local" or "ray".
         signal_name: what stopped it, "" if nothing did.
-        about: more to keep, e.g. settings and versions.
 
     Returns:
         "status": "complete", "incomplete" (something failed or is missing) or "interrupted"; "frames": "total",
@@ -40,10 +31,9 @@ def make_report(
         "unopened_units"; "frames_per_s" of those computed; "stages": seconds per computed frame, summed over the
         workers, that overlap in time; "failures", "waiting".
     """
-    status = "interrupted" if signal_name else "complete" if counters.is_complete else "incomplete"
     waiting = counters.waiting
     return {
-        "status": status,
+        "status": "interrupted" if signal_name else "complete" if counters.is_complete else "incomplete",
         "stopped_by": signal_name or None,
         "engine": engine,
         "shard": {"index": shard.index, "count": shard.count},
@@ -65,16 +55,16 @@ def make_report(
         "stages": {name: total / max(1, counters.computed) for name, total in counters.seconds.items()},
         "failures": [list(failure) for failure in counters.failures],
         "waiting": waiting,
-        **about,
     }
 
 
 def format_report(report: Dict[str, Any]) -> str:
     """The table."""
-    frames, shard = report["frames"], report["shard"]
+    frames, shard, devices = report["frames"], report["shard"], report["devices"]
+    workers = f"workers: {len(devices)} on {', '.join(sorted(set(devices)))}, threads of each: {report['threads']}"
     rows = [
         ("status", report["status"] + (f" by {report['stopped_by']}" if report["stopped_by"] else "")),
-        ("engine", f"{report['engine']}, {_workers(report)}, shard {shard['index']} of {shard['count']}"),
+        ("engine", f"{report['engine']}, {workers}, shard {shard['index']} of {shard['count']}"),
         ("frames", frames["total"]),
         ("  complete before", frames["complete_before"]),
         ("  computed", frames["computed"]),
@@ -91,8 +81,7 @@ def format_report(report: Dict[str, Any]) -> str:
         rows.append(("ms per frame and worker (stages overlap)", ""))
         rows += [(f"  {name}", f"{1e3 * seconds:.1f}") for name, seconds in report["stages"].items()]
     width = max(len(name) for name, _ in rows)
-    lines = [f"{name:{width}}  {value}".rstrip() for name, value in rows]
-    return "\n".join(lines)
+    return "\n".join(f"{name:{width}}  {value}".rstrip() for name, value in rows)
 
 
 def format_missing(report: Dict[str, Any]) -> str:
@@ -104,18 +93,3 @@ def format_missing(report: Dict[str, Any]) -> str:
     if report["frames"]["unopened_units"]:
         lines.append(f"  {report['frames']['unopened_units']} logs or parts of logs: not begun")
     return "\n".join(lines)
-
-
-def to_json(report: Dict[str, Any]) -> str:
-    """The report as text."""
-    return json.dumps(strict(report), indent=1, allow_nan=False) + "\n"
-
-
-def _workers(report: Dict[str, Any]) -> str:
-    devices, threads = report["devices"], report["threads"]
-    names = ", ".join(sorted(set(devices)))
-    return f"{_count(len(devices), 'worker')} on {names} with {_count(threads, 'thread')} each"
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}{'' if number == 1 else 's'}"

@@ -4,26 +4,24 @@ from __future__ import annotations
 
 import os
 import time
-from dataclasses import dataclass
-from typing import Iterator, List, Optional, Tuple
+from typing import Iterator, List, NamedTuple, Optional
 
 import pyarrow
 import torch
 
-from cflow_torch.fleet.job import Event, Job, Unit
+from cflow_torch.fleet.job import Event, Job, Opened, Unit
 from cflow_torch.fleet.progress import say
 from cflow_torch.fleet.work import DeviceLost, Worker
 
-_REPORT_EVERY_S = 0.5  # calls and answers cost a millisecond or two
+_REPORT_EVERY_S = 0.5  # a call and its answer cost a millisecond or two
 _DEVICE_LOST = 70  # exit status
 
 
-@dataclass(frozen=True)
-class Step:
-    """What happened to a unit since the last call; `ended`: nothing more follows."""
+class Step(NamedTuple):
+    """What happened to a unit since the last call; `has_ended`: nothing more follows."""
 
-    events: Tuple[Event, ...]
-    ended: bool
+    events: List[Event]
+    has_ended: bool
 
 
 class WorkerProcess:
@@ -37,9 +35,7 @@ class WorkerProcess:
 
     def __init__(self, job: Job, device: str, threads: int) -> None:
         self._job, self._device, self._threads = job, device, threads
-        self._worker: Optional[Worker] = None
-        self._unit: Optional[Unit] = None
-        self._events: Iterator[Event] = iter(())
+        self._events: Optional[Iterator[Event]] = None  # of the unit in hand
         self._is_told_to_stop = False
 
     def begin(self) -> None:
@@ -53,28 +49,24 @@ class WorkerProcess:
         self._worker = Worker(self._job, self._device)
 
     def step(self, unit: Unit, stop: bool) -> Step:
-        """Go on with a unit, or begin it, for a while.
+        """Continue a unit for a while, or begin it.
 
         Args:
             unit: the same at each call until it has ended.
             stop: finish the frames in hand and begin no others.
         """
-        assert self._worker is not None
         self._is_told_to_stop = stop
-        if unit != self._unit:
-            self._unit, self._events = unit, self._worker.run(unit, lambda: self._is_told_to_stop)
+        running, self._events = self._events or self._worker.run(unit, lambda: self._is_told_to_stop), None
         events: List[Event] = []
         until = time.monotonic() + _REPORT_EVERY_S
         try:
-            for event in self._events:
+            for event in running:
                 events.append(event)
-                if time.monotonic() > until:
-                    return Step(tuple(events), ended=False)
+                # The parent must know the frames of a unit, should one of them be deadly.
+                if isinstance(event, Opened) or time.monotonic() > until:
+                    self._events = running
+                    return Step(events, has_ended=False)
         except DeviceLost as error:  # a new process may have more luck
             say(str(error))
             os._exit(_DEVICE_LOST)
-        except BaseException:
-            self._unit = None
-            raise
-        self._unit = None
-        return Step(tuple(events), ended=True)
+        return Step(events, has_ended=True)
