@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any, Dict, List
 
 from cflow_torch import make_config
+from cflow_torch.cli.main import main
 from cflow_torch.data.catalog import find_sources
 from cflow_torch.fleet.job import Job
 from cflow_torch.fleet.machine import Layout
@@ -18,8 +20,8 @@ from cflow_torch.simulator.writers.av2 import write_av2_log
 SWEEPS = (4, 6, 3)  # of the logs
 PAIRS = sum(SWEEPS) - len(SWEEPS)
 CONFIG = make_config("paper", pixel_size=0.4, num_history=1)
-# What `cflow flow` needs to be told for the same.
-COMMAND = ["data=av2", "model=paper", "model.pixel_sizes=[0.4]", "model.num_history=1", "data.check=false"]
+# The command for the same.
+COMMAND = ["flow", "data=av2", "model=paper", "model.pixel_sizes=[0.4]", "model.num_history=1", "data.check=false"]
 ONE = Layout(("cpu",), 1, 2)
 TWO = Layout(("cpu", "cpu"), 1, 2)
 
@@ -66,6 +68,18 @@ def run(
     identity = make_identity(job.config, "av2", job.settings, job.contents)
     claim_folder(output, identity, resume, overwrite, shard.count == 1)
     return run_fleet(job, find_sources("av2", root), layout, shard, engine, **engine_settings)
+
+
+def command(*arguments: Any) -> int:
+    """Exit status of `cflow flow` in this process."""
+    before = list(sys.argv)
+    try:
+        main([*COMMAND, "engine.workers=1", *map(str, arguments)])
+    except SystemExit as end:
+        return int(end.code or 0)
+    finally:
+        sys.argv = before
+    return 0
 
 
 def tree(output: Path) -> Dict[str, bytes]:

@@ -114,8 +114,6 @@ class _Process:
         if isinstance(error, BrokenProcessPool):
             self.close()
             raise WorkerDied(f"({error})")
-        if isinstance(error, SystemExit):
-            raise RuntimeError(f"SystemExit: {error}")
         return call.result()
 
     def close(self) -> None:

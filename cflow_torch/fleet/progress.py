@@ -26,7 +26,7 @@ class Progress:
 
     def __init__(self, total: Optional[int] = None, name: str = "") -> None:
         self.total, self.done = total, 0
-        settings = {"total": total, "unit": " frames", "smoothing": 0.05, "desc": name}
+        settings = {"total": total, "unit": " frames", "smoothing": 0.05, "desc": f"{name}: " if name else ""}
         try:
             if sys.stderr.isatty():
                 self._bar: Any = tqdm(bar_format=_BAR, **settings)

@@ -49,7 +49,7 @@ def run_ray(
     have the same versions of this package, torch and numpy; a node that does not is refused.
 
     Args:
-        job: the run.
+        job: the run; its folder is claimed already (`manifest.claim_folder`).
         units: numbered as in `split`.
         layout: one worker per device; those that the cluster has no room for begin when it has. Which GPU is Ray's
             choice.
@@ -81,32 +81,29 @@ def run_ray(
     }
     if is_gpu and not needs["GPU"]:
         raise CFlowError("engine.num_gpus=0: with a GPU as device, give each worker at least a share of one")
+    output = as_path(job.output)
+    if not is_remote(output):  # a worker may be in another folder
+        job = replace(job, output=str(output.absolute()))
     count = min(len(layout.devices), len(units))
-    with _cluster(ray, address, count, needs, layout.devices if is_gpu else ()) as is_joined:
+    with _cluster(ray, address, count, needs, layout.devices if is_gpu else ()):
         _check_room(ray, needs)
-        output, must_see = as_path(job.output), is_joined
-        if is_remote(output):
-            must_see = False
-        else:  # a worker may be in another folder
-            job = replace(job, output=str(output.absolute()))
-        actor = ray.remote(_Actor).options(num_cpus=needs["CPU"], num_gpus=needs["GPU"], max_restarts=-1)
+        actor = ray.remote(_Actor).options(num_cpus=needs["CPU"], num_gpus=needs["GPU"])
         device = "cuda" if is_gpu else layout.devices[0]  # Ray shows a worker its own GPUs only
-        arguments = (job, device, layout.threads, _versions(), os.getcwd(), must_see)
+        arguments = (job, device, layout.threads, _versions(), os.getcwd())
         yield from dispatch([_Handle(ray, actor, arguments) for _ in range(count)], units, stop, retries)
 
 
 class _Actor(WorkerProcess):
-    """Lives in a process of Ray.
+    """Lives in a process of Ray, maybe on another machine.
 
     Args:
         versions: of the driver.
         folder: that the driver works in.
-        must_see: whether this machine must see the output; it may be another one.
     """
 
-    def __init__(self, job: Job, device: str, threads: int, versions: str, folder: str, must_see: bool) -> None:
+    def __init__(self, job: Job, device: str, threads: int, versions: str, folder: str) -> None:
         super().__init__(job, device, threads)
-        self._versions, self._folder, self._must_see = versions, folder, must_see
+        self._versions, self._folder = versions, folder
 
     def begin(self) -> None:
         import ray
@@ -114,7 +111,7 @@ class _Actor(WorkerProcess):
         node = ray.util.get_node_ip_address()
         if self._versions != _versions():
             raise CFlowError(f"node {node} has {_versions()}, where this run began there are {self._versions}")
-        if self._must_see and not (as_path(self._job.output) / MANIFEST).exists():
+        if not (as_path(self._job.output) / MANIFEST).exists():
             raise CFlowError(f"node {node} does not see {self._job.output}: the output must be reachable everywhere")
         with suppress(OSError):  # relative names of data mean the same as in the driver
             os.chdir(self._folder)
@@ -122,7 +119,7 @@ class _Actor(WorkerProcess):
 
 
 class _Handle:
-    """See `dispatch.Handle`. Ray starts an actor that died again."""
+    """See `dispatch.Handle`."""
 
     def __init__(self, ray: ModuleType, actor: Any, arguments: Sequence[Any]) -> None:
         self._ray, self._class, self._arguments = ray, actor, arguments
@@ -142,21 +139,23 @@ class _Handle:
         except self._ray.exceptions.RayTaskError as error:
             raise error.cause from None
         except self._ray.exceptions.RayError as error:
-            raise WorkerDied(f"with {type(error).__name__} (out of memory?)") from error
+            self.close()
+            raise WorkerDied(f"with Ray's {type(error).__name__}") from error
 
     def close(self) -> None:
-        if self._actor is not None:
+        actor, self._actor = self._actor, None
+        if actor is not None:
             with suppress(Exception):  # the cluster is gone: so is the worker
-                self._ray.kill(self._actor)
+                self._ray.kill(actor)
 
 
 @contextmanager
 def _cluster(
     ray: ModuleType, address: Optional[str], workers: int, needs: Dict[str, float], gpus: Sequence[str]
-) -> Iterator[bool]:
-    """Connected to a cluster, whether it was there before. `ray.init` takes SIGTERM for itself; it is given back."""
+) -> Iterator[None]:
+    """Connected to a cluster. `ray.init` takes SIGTERM for itself; it is given back."""
     if ray.is_initialized():
-        yield True
+        yield
         return
     settings: Dict[str, Any] = {"address": address}
     if address is None:
@@ -183,7 +182,7 @@ def _cluster(
         if threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGTERM, before)
     try:
-        yield address is not None
+        yield
     finally:
         ray.shutdown()  # also ends a cluster of this process
 

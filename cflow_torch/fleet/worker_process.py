@@ -11,10 +11,10 @@ import torch
 
 from cflow_torch.fleet.job import Event, Job, Opened, Unit
 from cflow_torch.fleet.progress import say
-from cflow_torch.fleet.work import DeviceLost, Worker
+from cflow_torch.fleet.work import DeviceLost, Worker, describe
 
 _REPORT_EVERY_S = 0.5  # a call and its answer cost a millisecond or two
-_DEVICE_LOST = 70  # exit status
+_ENDED = 70  # exit status
 
 
 class Step(NamedTuple):
@@ -66,7 +66,7 @@ class WorkerProcess:
                 if isinstance(event, Opened) or time.monotonic() > until:
                     self._events = running
                     return Step(events, has_ended=False)
-        except DeviceLost as error:  # a new process may have more luck
-            say(str(error))
-            os._exit(_DEVICE_LOST)
+        except (DeviceLost, SystemExit) as error:  # a new process may have more luck
+            say(f"a worker ends: {describe(error)}")
+            os._exit(_ENDED)
         return Step(events, has_ended=True)

@@ -55,7 +55,9 @@ def fill(patch: pytest.MonkeyPatch, step: str, target: str, count: int = 1_000_0
         return Full(file) if step == "write" else file
 
     def fsync_(descriptor: int) -> None:
-        refuse_if(step == "fsync" and descriptor in descriptors)
+        if descriptor in descriptors:
+            descriptors.remove(descriptor)
+            refuse_if(step == "fsync")
         fsync(descriptor)
 
     def replace_(old: Any, new: Any) -> None:

@@ -6,17 +6,15 @@ import json
 import os
 import re
 import shutil
-import sys
 from pathlib import Path
 from typing import Any, Callable, Dict
 
 import numpy as np
 import pytest
 from pyarrow import feather
-from small_fleet import COMMAND, CONFIG, ONE, PAIRS, SWEEPS, flow_files, frames, make_job, run, tree
+from small_fleet import CONFIG, ONE, PAIRS, SWEEPS, command, flow_files, frames, make_job, run, tree
 
 from cflow_torch import CFlowError, make_config, make_model
-from cflow_torch.cli.main import main
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.flow_file import read_flow
 from cflow_torch.data.log import window
@@ -34,18 +32,6 @@ OTHER = {"config": make_config("paper", pixel_size=0.8)}  # settings of another 
 def out(single_run: Path, tmp_path: Path) -> Path:
     """A copy of a complete run's output."""
     return Path(shutil.copytree(single_run, tmp_path / "out"))
-
-
-def command(*arguments: Any) -> int:
-    """Exit status of `cflow flow`."""
-    before = list(sys.argv)
-    try:
-        main(["flow", *COMMAND, "engine.workers=1", *map(str, arguments)])
-    except SystemExit as end:
-        return int(end.code or 0)
-    finally:
-        sys.argv = before
-    return 0
 
 
 # What the files hold

@@ -1,0 +1,140 @@
+"""Engine `ray`: the same bytes as engine `local`; what a dying worker had in hand is done again, or reported."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from pathlib import Path
+from typing import Any, Callable, Dict, Iterator
+
+import pytest
+from small_fleet import PAIRS, TWO, make_job, run, tree
+
+from cflow_torch import CFlowError
+from cflow_torch.data.av2 import AV2Log
+from cflow_torch.fleet import ray_engine
+from cflow_torch.fleet.counters import Counters
+from cflow_torch.fleet.job import Job, Unit
+from cflow_torch.fleet.machine import Layout
+from cflow_torch.fleet.ray_engine import run_ray
+
+pytest.importorskip("ray", reason="Ray is not installed: pip install ray")
+
+
+def test_equals_the_local_engine_byte_for_byte(fleet: Path, single: Dict[str, bytes], tmp_path: Path) -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    report = run(fleet, tmp_path, TWO, engine="ray")
+    assert (report["exit_status"], report["frames"]["computed"]) == (0, PAIRS)
+    assert {"read", "compute", "write"} <= set(report["stages"])
+    assert tree(tmp_path) == single
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+class LethalActor:
+    """A worker that is killed when it reads a frame whose name is that of a file, as often as is written there.
+
+    The files lie beside the output.
+    """
+
+    def __init__(self, job: Job, *more: Any) -> None:
+        self._folder = Path(job.output).parent / "kills"
+        self._actor = ray_engine._Actor(job, *more)  # in the worker process, where it is the real one
+
+    def begin(self) -> None:
+        self._actor.begin()
+        read = self._actor._worker._read_one
+
+        def lethal_read(log: Any, index: int) -> Any:
+            file = self._folder / f"{log.log_id}.{log.timestamps[index]}"
+            count = int(file.read_text()) if file.exists() else 0
+            if count > 0:
+                file.write_text(str(count - 1))
+                os.kill(os.getpid(), signal.SIGKILL)
+            return read(log, index)
+
+        self._actor._worker._read_one = lethal_read  # type: ignore[method-assign]
+
+    def step(self, unit: Unit, stop: bool) -> Any:
+        return self._actor.step(unit, stop)
+
+
+@pytest.fixture
+def kills(fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[int, int], Path]]:
+    """Makes a frame of the longest log kill its worker so many times; gives the file that counts down."""
+    from ray import cloudpickle
+
+    monkeypatch.setattr(ray_engine, "_Actor", LethalActor)
+    (tmp_path / "kills").mkdir()
+    this = sys.modules[__name__]
+    cloudpickle.register_pickle_by_value(this)  # Ray's processes cannot import a test
+
+    def mark(index: int, count: int) -> Path:
+        log = AV2Log(sorted(fleet.iterdir())[1])
+        file = tmp_path / "kills" / f"{log.log_id}.{log.timestamps[index]}"
+        file.write_text(str(count))
+        return file
+
+    yield mark
+    cloudpickle.unregister_pickle_by_value(this)
+
+
+@pytest.mark.slow
+def test_a_killed_worker_is_replaced_and_a_frame_that_always_kills_is_reported(
+    fleet: Path, single: Dict[str, bytes], tmp_path: Path, kills: Any
+) -> None:
+    once, always = kills(1, 1), kills(3, 1000)
+    report = run(fleet, tmp_path / "out", TWO, engine="ray", retries=1)
+    assert once.read_text() == "0" and 1000 - int(always.read_text()) in (3, 4)
+    ((name, message),) = report["failures"]
+    assert name == always.name.replace(".", "/") and "2 workers died on it" in message
+    assert report["frames"]["computed"] == PAIRS - 1
+    assert tree(tmp_path / "out") == {file: c for file, c in single.items() if file != f"{name}.feather"}
+
+
+@pytest.mark.slow
+def test_stop_lets_the_frames_in_hand_be_finished(fleet: Path, single: Dict[str, bytes], tmp_path: Path) -> None:
+    run(sorted(fleet.iterdir())[0], tmp_path)  # claims the folder
+    (tmp_path / sorted(fleet.iterdir())[0].name / "manifest.json").unlink()
+    units = [Unit(n, source) for n, source in enumerate(sorted(fleet.iterdir()))]
+    counters = Counters(units)
+    for event in run_ray(make_job(tmp_path, redo=True), units, TWO, lambda: bool(counters.computed)):
+        counters.add(event)
+    assert 0 < counters.computed < PAIRS
+    assert run(fleet, tmp_path, TWO, engine="ray")["exit_status"] == 0
+    assert tree(tmp_path) == single
+
+
+def begin(layout: Layout, **settings: Any) -> None:
+    next(run_ray(make_job(Path("nowhere")), [Unit(0, "nothing")], layout, lambda: False, **settings))
+
+
+@pytest.mark.parametrize(
+    "layout, settings, message",
+    [
+        (TWO, {"retries": -1}, "engine.retries"),
+        (TWO, {"num_cpus": "many"}, "engine.num_cpus"),
+        (Layout(("cuda:0",), 1, 1), {"num_gpus": 0}, "a share"),
+        (Layout(("cuda:1",), 1, 1), {}, "CUDA_VISIBLE_DEVICES"),
+    ],
+)
+def test_bad_settings(layout: Layout, settings: Dict[str, Any], message: str) -> None:
+    with pytest.raises(CFlowError, match=message):
+        begin(layout, **settings)
+
+
+def test_no_cluster_at_the_address(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(**_: Any) -> None:
+        raise ConnectionError("nobody there")
+
+    monkeypatch.setattr("ray.init", refuse)
+    with pytest.raises(CFlowError, match="engine.address=auto: no connection .*nobody there"):
+        begin(TWO, address="auto")
+
+
+@pytest.mark.slow
+def test_a_cluster_without_room_and_a_node_that_does_not_see_the_output() -> None:
+    with pytest.raises(CFlowError, match="no node of the Ray cluster has room for a worker of 3 GPU"):
+        begin(Layout(("cuda:0",), 1, 1), num_gpus=3)
+    with pytest.raises(CFlowError, match="does not see .*nowhere: the output must be reachable everywhere"):
+        begin(TWO)
