@@ -98,15 +98,10 @@ Event = Union[Opened, Done, Failed]
 
 def split(units: Sequence[Unit], workers: int) -> List[Unit]:
     """The same frames in enough units to keep all workers busy, numbered from 0."""
-    if workers > 1 and units:
-        parts = -(-_UNITS_PER_WORKER * workers // len(units))
-        units = [
-            replace(
-                unit,
-                first=unit.first + (unit.last - unit.first) * part / parts,
-                last=unit.first + (unit.last - unit.first) * (part + 1) / parts,
-            )
-            for unit in units
-            for part in range(parts)
-        ]
-    return [replace(unit, number=number) for number, unit in enumerate(units)]
+    parts = -(-_UNITS_PER_WORKER * workers // max(1, len(units))) if workers > 1 else 1
+    pieces = []
+    for unit in units:
+        length = (unit.last - unit.first) / parts
+        edges = [unit.first + length * part for part in range(parts + 1)]
+        pieces += [replace(unit, first=first, last=last) for first, last in zip(edges, edges[1:])]
+    return [replace(unit, number=number) for number, unit in enumerate(pieces)]

@@ -148,7 +148,6 @@ def _step(unit: Unit, stop: bool) -> Step:
 
 def _how(status: Optional[int]) -> str:
     """A worker died."""
-    if status is not None and status < 0:
-        name = next((known.name for known in signal.Signals if known == -status), f"signal {-status}")
-        return f"by {name}" + (" (out of memory?)" if -status == signal.SIGKILL else "")
-    return f"with status {status}"
+    if status is None or status >= 0:
+        return f"with status {status}"
+    return f"by signal {-status}, {signal.strsignal(-status)}" + " (out of memory?)" * (-status == signal.SIGKILL)

@@ -14,7 +14,7 @@ import re
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Dict, Iterable, List, Mapping, Optional, Sequence, Set
+from typing import Any, Dict, Mapping, Optional, Sequence, Set
 
 import numpy as np
 import torch
@@ -149,28 +149,6 @@ def complete_frames(folder: Path) -> Set[int]:
     return {int(name[: -len(".feather")]) for name in frames if is_remote(folder) or _is_whole(folder / name)}
 
 
-def check_claimed(folder: Path) -> None:
-    """Notice that a log's folder was removed in the middle of a run: a new one would hold frames of unknown origin.
-
-    Raises:
-        CFlowError: its manifest is gone. In an object store nobody looks.
-    """
-    if not is_remote(folder) and not (folder / MANIFEST).is_file():
-        raise CFlowError(f"{folder} was removed, or its {MANIFEST}, while a run wrote into it: run it again")
-
-
-def removed_logs(output: Path, log_ids: Iterable[str]) -> List[str]:
-    """Those of the logs whose folders are gone; all of them if the run's own manifest is gone.
-
-    Raises:
-        OSError: the output cannot be listed.
-    """
-    forget_listings(output)
-    with remote_errors(output):
-        names = {path.name for path in output.iterdir()} if output.is_dir() else set()
-    return [log_id for log_id in log_ids if log_id not in names or MANIFEST not in names]
-
-
 def frame_file(folder: Path, timestamp: int) -> Path:
     """Where the flow of one frame lies."""
     return folder / f"{timestamp}.feather"
@@ -188,11 +166,7 @@ def _digest(log: Log, index: int) -> str:
     """Of all that a sweep gives to the method."""
     sweep, digest = log.sweep(index), hashlib.sha256()
     for values in (sweep.points, sweep.is_ground, sweep.pose):
-        if values is not None:
-            array = np.ascontiguousarray(as_numpy(values))
-            digest.update(f"{array.dtype}{array.shape}".encode())
-            digest.update(array.tobytes())
-        digest.update(b"|")
+        digest.update(b"none" if values is None else as_numpy(values).tobytes())
     return digest.hexdigest()
 
 
@@ -217,12 +191,12 @@ def _clear(output: Path) -> None:
 def _read(file: Path) -> Optional[Dict[str, Any]]:
     try:
         content = read_json(file)
+        if not isinstance(content, dict):
+            raise CFlowError("no dictionary")
     except FileNotFoundError:
         return None
     except CFlowError as error:
         raise CFlowError(f"{file} is no manifest ({error}): remove it, or {_REMEDY}") from None
-    if not isinstance(content, dict):
-        raise CFlowError(f"{file} is no manifest: remove it, or {_REMEDY}")
     return content
 
 

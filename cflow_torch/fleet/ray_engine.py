@@ -6,7 +6,6 @@ import logging
 import math
 import os
 import signal
-import sys
 import threading
 from concurrent.futures import Future
 from contextlib import contextmanager, suppress
@@ -14,15 +13,11 @@ from dataclasses import replace
 from types import ModuleType
 from typing import Any, Callable, Dict, Iterator, Optional, Sequence
 
-import numpy as np
-import torch
-
-from cflow_torch import __version__
 from cflow_torch.data.paths import as_path, is_remote
 from cflow_torch.fleet.dispatch import WorkerDied, dispatch
 from cflow_torch.fleet.job import Event, Job, Unit
 from cflow_torch.fleet.machine import AUTO, Layout
-from cflow_torch.fleet.manifest import MANIFEST
+from cflow_torch.fleet.manifest import MANIFEST, make_identity
 from cflow_torch.fleet.work import describe
 from cflow_torch.fleet.worker_process import WorkerProcess
 from cflow_torch.types import CFlowError
@@ -85,34 +80,33 @@ def run_ray(
     if not is_remote(output):  # a worker may be in another folder
         job = replace(job, output=str(output.absolute()))
     count = min(len(layout.devices), len(units))
-    with _cluster(ray, address, count, needs, layout.devices if is_gpu else ()):
+    used = sorted(set(layout.devices)) if is_gpu else []
+    if address is None and used not in ([], ["cuda"], [f"cuda:{k}" for k in range(len(used))]):
+        # Ray gives out the GPUs of a machine from the first on.
+        raise CFlowError(f"engine=ray cannot choose {', '.join(used)}: set CUDA_VISIBLE_DEVICES, and give device=cuda")
+    with _cluster(ray, address, count, needs, len(used)):
         _check_room(ray, needs)
         actor = ray.remote(_Actor).options(num_cpus=needs["CPU"], num_gpus=needs["GPU"])
         device = "cuda" if is_gpu else layout.devices[0]  # Ray shows a worker its own GPUs only
-        arguments = (job, device, layout.threads, _versions(), os.getcwd())
+        arguments = (job, device, layout.threads, os.getcwd())
         yield from dispatch([_Handle(ray, actor, arguments) for _ in range(count)], units, stop, retries)
 
 
 class _Actor(WorkerProcess):
-    """Lives in a process of Ray, maybe on another machine.
+    """Lives in a process of Ray, maybe on another machine. `folder` is what the driver works in."""
 
-    Args:
-        versions: of the driver.
-        folder: that the driver works in.
-    """
-
-    def __init__(self, job: Job, device: str, threads: int, versions: str, folder: str) -> None:
+    def __init__(self, job: Job, device: str, threads: int, folder: str) -> None:
         super().__init__(job, device, threads)
-        self._versions, self._folder = versions, folder
+        self._folder = folder
 
     def begin(self) -> None:
         import ray
 
-        node = ray.util.get_node_ip_address()
-        if self._versions != _versions():
-            raise CFlowError(f"node {node} has {_versions()}, where this run began there are {self._versions}")
-        if not (as_path(self._job.output) / MANIFEST).exists():
-            raise CFlowError(f"node {node} does not see {self._job.output}: the output must be reachable everywhere")
+        job, node = self._job, ray.util.get_node_ip_address()
+        if make_identity(job.config, job.reader, job.settings, job.contents)["hash"] != job.identity:
+            raise CFlowError(f"node {node} has other versions of cflow_torch, torch or numpy than this run began with")
+        if not (as_path(job.output) / MANIFEST).exists():
+            raise CFlowError(f"node {node} does not see {job.output}: the output must be reachable everywhere")
         with suppress(OSError):  # relative names of data mean the same as in the driver
             os.chdir(self._folder)
         super().begin()
@@ -137,7 +131,7 @@ class _Handle:
         try:
             return call.result()
         except self._ray.exceptions.RayTaskError as error:
-            raise error.cause from None
+            raise (error.cause or error) from None
         except self._ray.exceptions.RayError as error:
             self.close()
             raise WorkerDied(f"with Ray's {type(error).__name__}") from error
@@ -151,7 +145,7 @@ class _Handle:
 
 @contextmanager
 def _cluster(
-    ray: ModuleType, address: Optional[str], workers: int, needs: Dict[str, float], gpus: Sequence[str]
+    ray: ModuleType, address: Optional[str], workers: int, needs: Dict[str, float], num_gpus: int
 ) -> Iterator[None]:
     """Connected to a cluster. `ray.init` takes SIGTERM for itself; it is given back."""
     if ray.is_initialized():
@@ -159,16 +153,11 @@ def _cluster(
         return
     settings: Dict[str, Any] = {"address": address}
     if address is None:
-        used = sorted(set(gpus))  # Ray gives out the GPUs of a machine from the first on
-        if used not in ([], ["cuda"], [f"cuda:{k}" for k in range(len(used))]):
-            raise CFlowError(
-                f"Ray cannot be told to use {', '.join(used)}: set CUDA_VISIBLE_DEVICES, and give device=cuda"
-            )
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nobody is told
         settings = {
             "address": "local",
             "num_cpus": max(1, math.ceil(workers * needs["CPU"])),
-            "num_gpus": len(used),
+            "num_gpus": num_gpus,
             "object_store_memory": _OBJECT_STORE_BYTES,
             "include_dashboard": False,
         }
@@ -188,14 +177,13 @@ def _cluster(
 
 
 def _check_room(ray: ModuleType, needs: Dict[str, float]) -> None:
-    """Some node could have a worker."""
-    needs = {name: need for name, need in needs.items() if need}
+    """Some node could have a worker, once others leave it room."""
     nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
     if not any(all(node.get(name, 0.0) >= need for name, need in needs.items()) for node in nodes):
-        need = " and ".join(f"{need:g} {name}" for name, need in needs.items())
-        have = "; ".join(", ".join(f"{node.get(name, 0):g} {name}" for name in needs) for node in nodes)
+        has = "; ".join(", ".join(f"{node.get(name, 0.0):g} {name}" for name in needs) for node in nodes)
+        need = ", ".join(f"{need:g} {name}" for name, need in needs.items())
         raise CFlowError(
-            f"no node of the Ray cluster has room for a worker of {need} (they have {have}): "
+            f"no node of the Ray cluster has room for a worker of {need} (they have {has}): "
             "give fewer engine.threads, engine.num_cpus or engine.num_gpus, or start such a node first"
         )
 
@@ -206,10 +194,3 @@ def _number(name: str, value: Any, default: float) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value < math.inf:
         raise CFlowError(f"engine.{name}={value!r}: give a number of at least 0, or {AUTO}")
     return value
-
-
-def _versions() -> str:
-    """What a result depends on."""
-    python = ".".join(map(str, sys.version_info[:2]))
-    torch_version = str(torch.__version__).split("+")[0]
-    return f"cflow_torch {__version__}, torch {torch_version}, numpy {np.__version__}, Python {python}"

@@ -10,13 +10,13 @@ from typing import Any, Dict, Iterator, List, Sequence, Tuple
 
 from cflow_torch.data.atomic import remove_stale
 from cflow_torch.data.names import folder_in
-from cflow_torch.data.paths import as_path
+from cflow_torch.data.paths import as_path, is_remote
 from cflow_torch.data.records import strict, write_text
 from cflow_torch.fleet.counters import Counters
 from cflow_torch.fleet.job import Event, Failed, Job, split
 from cflow_torch.fleet.local import run_local
 from cflow_torch.fleet.machine import Layout
-from cflow_torch.fleet.manifest import removed_logs
+from cflow_torch.fleet.manifest import MANIFEST
 from cflow_torch.fleet.progress import Progress, say
 from cflow_torch.fleet.ray_engine import run_ray
 from cflow_torch.fleet.report import make_report
@@ -86,13 +86,13 @@ def report_file(output: str, shard: Shard) -> Any:
 
 
 def _removed(output: str, counters: Counters) -> List[Tuple[str, str]]:
-    """(log, message) of what somebody removed while the run was at work."""
-    try:
-        gone = removed_logs(as_path(output), sorted(counters.log_ids))
-    except OSError as error:
-        return [(output, f"cannot be looked at any more ({error})")]
-    why = f"its folder in {output} was removed while the run wrote into it: run it again"
-    return [(log_id, why) for log_id in gone]
+    """(log, message) of what somebody removed while the run was at work. In an object store nobody looks."""
+    folder = as_path(output)
+    if is_remote(folder):
+        return []
+    has_manifest = (folder / MANIFEST).is_file()
+    gone = [log for log in sorted(counters.log_ids) if not (has_manifest and (folder / log / MANIFEST).is_file())]
+    return [(log, f"its folder in {output} was removed while the run wrote into it: run it again") for log in gone]
 
 
 def _follow(events: Iterator[Event], counters: Counters, num_units: int) -> None:

@@ -21,7 +21,7 @@ from cflow_torch.data.names import folder_in
 from cflow_torch.data.paths import as_path
 from cflow_torch.estimate import make_model
 from cflow_torch.fleet.job import Done, Event, Failed, Job, Opened, Unit
-from cflow_torch.fleet.manifest import check_claimed, claim_log, complete_frames, frame_file
+from cflow_torch.fleet.manifest import claim_log, complete_frames, frame_file
 from cflow_torch.stages import FlowModel, stage_seconds
 from cflow_torch.types import CFlowError, FlowResult, Window
 
@@ -191,7 +191,6 @@ class Worker:
             result, frame.content = frame.content, None
             file = frame_file(folder, frame.timestamp)
             with _stage(frame, "write"):
-                check_claimed(folder)
                 try:
                     write_flow(file, result, self._job.contents)
                 except FileNotFoundError:  # a run that begins beside this one takes our file for a dead one's

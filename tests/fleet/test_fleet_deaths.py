@@ -11,13 +11,12 @@ from typing import Any, Callable, Dict
 
 import numpy as np
 import pytest
-from small_fleet import PAIRS, TWO, flow_files, make_job, run, tree
+from small_fleet import PAIRS, TWO, make_job, run, tree
 
 from cflow_torch import CFlowError
 from cflow_torch.data.av2 import AV2Log
-from cflow_torch.fleet import dispatch, local, work
-from cflow_torch.fleet.counters import Counters
-from cflow_torch.fleet.job import Done, Unit
+from cflow_torch.fleet import local, work
+from cflow_torch.fleet.job import Unit
 from cflow_torch.fleet.local import run_local
 from cflow_torch.fleet.machine import Layout
 
@@ -93,31 +92,6 @@ def test_a_frame_that_always_kills_takes_no_other_with_it(
     assert failed == name and "2 workers died on it" in message
     assert report["frames"]["computed"] == PAIRS - 1
     assert tree(tmp_path / "out") == {file: c for file, c in single.items() if file != f"{name}.feather"}
-
-
-@pytest.mark.slow
-def test_a_worker_that_hangs_does_not_hold_up_a_stop(
-    fleet: Path, single: Dict[str, bytes], tmp_path: Path, deadly: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(dispatch, "_GRACE_S", 3.0)
-    deadly(1, 4, "hang", 1)
-    mark = next((tmp_path / "deadly").iterdir())
-    units = [Unit(n, source) for n, source in enumerate(sorted(fleet.iterdir()))]
-    counters = Counters(units)
-    for event in run_local(make_job(tmp_path / "out"), units, TWO, lambda: mark.read_text() == "hang:0"):
-        counters.add(event)
-    assert mark.name.replace(".", "/") in counters.waiting
-    assert flow_files(tmp_path / "out").items() <= single.items()
-
-
-@pytest.mark.slow
-def test_an_overwriting_run_repeats_little_after_a_death(fleet: Path, tmp_path: Path, deadly: Any) -> None:
-    deadly(1, 4, "SIGKILL", 1)
-    done = []
-    job, units = make_job(tmp_path / "out", batch=1, redo=True), [Unit(0, sorted(fleet.iterdir())[1])]
-    for event in run_local(job, units, TWO, lambda: False, memory=LIMIT):
-        done += [event.timestamp] if isinstance(event, Done) else []
-    assert len(set(done)) == 5 and len(done) <= 5
 
 
 @pytest.mark.slow

@@ -20,8 +20,8 @@ from cflow_torch.data.av2 import AV2Log
 pytestmark = pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="needs Linux's /proc")
 
 COPIES = 20  # of a log of five pairs: a run of some seconds
-KILLS = 20
-FRAMES_BETWEEN = (0, 6)  # a run is killed once so many more frames are there
+KILLS = 12
+FRAMES_BETWEEN = (0, 5)  # a run is killed once so many more frames are there
 HOW = ("parent SIGKILL", "all SIGKILL", "worker SIGKILL", "parent SIGTERM", "all SIGTERM", "all SIGINT")
 
 
@@ -78,9 +78,7 @@ def flow_of(output: Path) -> Dict[str, bytes]:
     return {n: content for n, content in tree(output).items() if not n.endswith("manifest.json") and "/." not in n}
 
 
-def test_a_killed_run_is_resumed_and_a_stopped_one_ends_in_order(
-    many: Path, expected: Dict[str, bytes], tmp_path: Path
-) -> None:
+def test_a_killed_run_is_resumed_and_its_workers_end(many: Path, expected: Dict[str, bytes], tmp_path: Path) -> None:
     process = start(many, tmp_path, "engine.workers=2")
     wait_for(lambda: len(frames(tmp_path)) > 3, process)
     orphans = workers(process)
@@ -88,17 +86,7 @@ def test_a_killed_run_is_resumed_and_a_stopped_one_ends_in_order(
     process.communicate(timeout=60)
     wait_for(lambda: not live(orphans))
     assert process.returncode == -signal.SIGKILL and len(orphans) == 2 and not live(orphans)
-    before = len(frames(tmp_path))
-    assert 3 < before < len(expected)
-
-    process = start(many, tmp_path, "engine.workers=1")
-    wait_for(lambda: len(frames(tmp_path)) > before + 3, process)
-    os.killpg(process.pid, signal.SIGTERM)
-    printed, _ = process.communicate(timeout=60)
-    assert process.returncode == 128 + signal.SIGTERM, printed
-    assert "interrupted by SIGTERM" in printed and "not done" in printed and "Traceback" not in printed
-    assert before + 3 < len(flow_of(tmp_path)) < len(expected) and flow_of(tmp_path).items() <= expected.items()
-
+    assert 3 < len(frames(tmp_path)) < len(expected) and flow_of(tmp_path).items() <= expected.items()
     assert command(f"data.root={many}", f"output={tmp_path}") == 0
     assert flow_of(tmp_path) == expected, "nothing is lost"
     assert not list(tmp_path.rglob(".*")), "nothing is left behind"

@@ -134,7 +134,7 @@ def test_no_cluster_at_the_address(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.slow
 def test_a_cluster_without_room_and_a_node_that_does_not_see_the_output() -> None:
-    with pytest.raises(CFlowError, match="no node of the Ray cluster has room for a worker of 3 GPU"):
+    with pytest.raises(CFlowError, match="no node of the Ray cluster has room for a worker of 0 CPU, 3 GPU"):
         begin(Layout(("cuda:0",), 1, 1), num_gpus=3)
     with pytest.raises(CFlowError, match="does not see .*nowhere: the output must be reachable everywhere"):
         begin(TWO)

@@ -6,6 +6,7 @@ import json
 import os
 import re
 import shutil
+import signal
 from pathlib import Path
 from typing import Any, Callable, Dict
 
@@ -18,11 +19,11 @@ from cflow_torch import CFlowError, make_config, make_model
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.flow_file import read_flow
 from cflow_torch.data.log import window
-from cflow_torch.fleet import manifest, work
+from cflow_torch.fleet import work
 from cflow_torch.fleet.forecast import format_forecast, make_forecast
 from cflow_torch.fleet.job import Unit
 from cflow_torch.fleet.machine import Layout
-from cflow_torch.fleet.manifest import claim_folder, complete_frames, make_identity
+from cflow_torch.fleet.manifest import complete_frames
 from cflow_torch.fleet.shard import Shard, find_shard
 
 OTHER = {"config": make_config("paper", pixel_size=0.8)}  # settings of another run
@@ -149,18 +150,6 @@ def test_a_folder_without_manifest_has_no_complete_frames(tmp_path: Path) -> Non
     assert complete_frames(tmp_path) == {1}
 
 
-def test_shards_that_begin_together_are_no_conflict(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    identity, read = make_identity(CONFIG, "av2", {}), manifest._read
-
-    def read_and_be_overtaken(file: Path) -> Any:
-        content = read(file)
-        manifest.write_text(tmp_path / "manifest.json", json.dumps(identity))
-        return content
-
-    monkeypatch.setattr(manifest, "_read", read_and_be_overtaken)
-    claim_folder(tmp_path, identity, resume=True, overwrite=False, alone=False)
-
-
 def test_results_may_lie_where_fsspec_reaches(fleet: Path, single_run: Path, tmp_path: Path) -> None:
     fsspec = pytest.importorskip("fsspec", reason="needs the extra remote")
     pytest.importorskip("upath", reason="needs the extra remote")
@@ -269,28 +258,15 @@ def test_an_output_that_is_removed_during_the_run_is_told(
     assert tree(out) == single
 
 
-def test_an_input_that_is_removed_during_the_run(
+def test_a_signal_ends_a_run_in_order(
     fleet: Path, single: Dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    root, out = Path(shutil.copytree(fleet, tmp_path / "root")), tmp_path / "out"
-    during(monkeypatch, 1, lambda: shutil.rmtree(root))
-    report = run(root, out)
-    assert report["status"] == "incomplete" and report["frames"]["failed_logs"] == 2
-    assert tree(out).items() <= single.items() and frames(out)
-
-
-def test_the_clock_on_the_wall_does_not_matter(
-    fleet: Path, single: Dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    import time
-
-    real, looks = time.time, []
-    monkeypatch.setattr(time, "time", lambda: looks.append(0) or real() + (len(looks) % 3 - 1) * 1e7)
-    assert 0 < run(fleet, tmp_path)["seconds"] < 600
-    for number, file in enumerate(frames(tmp_path)):  # files of tomorrow, and of 1970
-        os.utime(file, (0, 0) if number % 2 else (real() + 86400, real() + 86400))
-    frames(tmp_path)[0].unlink()
-    assert run(fleet, tmp_path)["frames"]["computed"] == 1
+    during(monkeypatch, 2, lambda: os.kill(os.getpid(), signal.SIGTERM))
+    report = run(fleet, tmp_path, Layout(("cpu",), 1, 1))
+    assert (report["status"], report["stopped_by"], report["exit_status"]) == ("interrupted", "SIGTERM", 143)
+    assert report["frames"]["computed"] == len(frames(tmp_path)) < PAIRS and report["frames"]["unopened_units"]
+    assert tree(tmp_path).items() <= single.items()
+    assert run(fleet, tmp_path)["frames"]["complete_before"] == report["frames"]["computed"]
     assert tree(tmp_path) == single
 
 
