@@ -174,6 +174,10 @@ def test_an_error_outside_of_frames_costs_the_unit_only(
 # Several workers: the dispatcher, with threads in place of processes
 
 
+class Death(BaseException):
+    """Ends a worker that lives in a thread."""
+
+
 class Thread:
     """A handle whose worker lives in a thread, and dies when it reads a frame that `deadly` says.
 
@@ -213,13 +217,13 @@ class Thread:
             frame = f"{log.log_id}/{log.timestamps[index]}"
             if deadly.get(frame, 0) > 0:
                 deadly[frame] -= 1
-                raise SystemExit
+                raise Death
             return read(worker, log, index)
 
         worker._read_one = deadly_read
         try:
             return self._process.step(unit, stop)
-        except SystemExit:
+        except Death:
             raise WorkerDied("by SIGSEGV") from None
 
     def result(self, call: Future) -> Any:
