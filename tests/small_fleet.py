@@ -1,43 +1,85 @@
-"""A few small logs, the commands on them in this process, and what they leave."""
+"""A few small logs, runs on them in this process, and what they leave."""
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
-from typing import Any, Dict
+from typing import Any, Dict, List
 
+from cflow_torch import make_config
 from cflow_torch.cli.main import main
+from cflow_torch.data.catalog import find_sources
+from cflow_torch.fleet.job import Job
+from cflow_torch.fleet.machine import Layout
+from cflow_torch.fleet.manifest import claim_folder, make_identity
+from cflow_torch.fleet.run import run_fleet
+from cflow_torch.fleet.shard import Shard
 from cflow_torch.simulator import make_drive
 from cflow_torch.simulator.writers.av2 import write_av2_log
 
-SWEEPS = (3, 4)  # of the logs; 5 pairs
+SWEEPS = (4, 6, 3)  # of the logs
 PAIRS = sum(SWEEPS) - len(SWEEPS)
+CONFIG = make_config("paper", pixel_size=0.4, num_history=1)
+# The command for the same.
+COMMAND = ["flow", "data=av2", "model=paper", "model.pixel_sizes=[0.4]", "model.num_history=1", "data.check=false"]
+ONE = Layout(("cpu",), 1, 2)
+TWO = Layout(("cpu", "cpu"), 1, 2)
 
 
 def write_fleet(root: Path) -> Path:
-    """Two logs, of 2 and 3 pairs."""
+    """Three logs, of 3, 5 and 2 pairs."""
     for seed, sweeps in enumerate(SWEEPS):
         write_av2_log(make_drive(seed=seed, num_sweeps=sweeps, profile="demo"), root)
     return root
 
 
-def run(*arguments: Any) -> int:
-    """Exit status of `cflow`."""
-    argv = list(sys.argv)
+def make_job(output: Path, **settings: Any) -> Job:
+    """A run of `CONFIG` on Argoverse 2 logs."""
+    values: Dict[str, Any] = {"config": CONFIG, "settings": {}, "batch": 2, "check": False, **settings}
+    hashed = make_identity(values["config"], "av2", values["settings"])["hash"]
+    return Job(identity=hashed, reader="av2", output=str(output), **values)
+
+
+def run(
+    root: Path,
+    output: Path,
+    layout: Layout = ONE,
+    shard: Shard = Shard(),  # noqa: B008 (immutable)
+    engine: str = "local",
+    resume: bool = True,
+    overwrite: bool = False,
+    settings: Dict[str, Any] = {},  # noqa: B006 (read only)
+    **engine_settings: Any,
+) -> Dict[str, Any]:
+    """`cflow flow` without the command line; the report.
+
+    Args:
+        root: folder of the logs.
+        output: folder of the results.
+        layout: workers.
+        shard: of the work.
+        engine: "local" or "ray".
+        resume: see `claim_folder`.
+        overwrite: see `claim_folder`.
+        settings: of the job, in place of those of `make_job`.
+        **engine_settings: of the engine.
+    """
+    job = make_job(output, batch=layout.batch, redo=overwrite, **settings)
+    identity = make_identity(job.config, "av2", job.settings, job.contents)
+    claim_folder(output, identity, resume, overwrite, shard.count == 1)
+    return run_fleet(job, find_sources("av2", root), layout, shard, engine, **engine_settings)
+
+
+def command(*arguments: Any) -> int:
+    """Exit status of `cflow flow` in this process."""
+    before = list(sys.argv)
     try:
-        main([str(argument) for argument in arguments])
+        main([*COMMAND, "engine.workers=1", *map(str, arguments)])
     except SystemExit as end:
         return int(end.code or 0)
     finally:
-        sys.argv = argv
+        sys.argv = before
     return 0
-
-
-def flow(root: Path, output: Path, *more: str) -> int:
-    """`cflow flow` of a folder of logs by one process, if not told otherwise."""
-    settings = ["data=av2", f'data.root="{root}"', f'output="{output}"', "model=paper", "model.pixel_sizes=[0.4]"]
-    return run("flow", *settings, "data.check=false", "engine.workers=1", "engine.threads=1", *more)
 
 
 def tree(output: Path) -> Dict[str, bytes]:
@@ -46,7 +88,11 @@ def tree(output: Path) -> Dict[str, bytes]:
     return {str(file.relative_to(output)): file.read_bytes() for file in files}
 
 
-def report(output: Path) -> Dict[str, Any]:
-    """Of the only shard."""
-    told: Dict[str, Any] = json.loads((output / "reports" / "shard-0-of-1.json").read_text())
-    return told
+def flow_files(output: Path) -> Dict[str, bytes]:
+    """Those of `tree` that hold flow."""
+    return {name: content for name, content in tree(output).items() if name.endswith(".feather")}
+
+
+def frames(output: Path) -> List[Path]:
+    """Flow files, in order."""
+    return sorted(output.glob("*/*.feather"))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from typing import Any, Dict, FrozenSet, List, Sequence, Tuple, Union
+from typing import Any, Dict, FrozenSet, List, Optional, Sequence, Tuple, Union
 
 from cflow_torch.config import Config
 from cflow_torch.data.flow_file import CONTENTS
@@ -50,16 +50,14 @@ class Unit:
         source: one of `catalog.find_sources`.
         first: share of the log's pairs that lies before the span, 0 ... 1.
         last: share that lies before its end.
-        careful: time stamps of frames that a worker died on. Each is read and computed by itself.
-        skip: time stamps of frames that are given up, or done already before a worker died.
+        only: time stamps of the frames of the span that are to be done; None = all of them.
     """
 
     number: int
     source: Any
     first: Fraction = Fraction(0)
     last: Fraction = Fraction(1)
-    careful: FrozenSet[int] = frozenset()
-    skip: FrozenSet[int] = frozenset()
+    only: Optional[FrozenSet[int]] = None
 
     def frames(self, num_pairs: int) -> range:
         """Numbers of the sweeps t of the span, in a log of so many pairs."""
@@ -68,20 +66,12 @@ class Unit:
 
 @dataclass(frozen=True)
 class Opened:
-    """A unit has begun: `total` frames, of which those of time stamps `todo` are not complete yet."""
+    """A unit has begun: time stamps of its `frames`, and of those `todo` that are not complete yet."""
 
     unit: int
     log_id: str
-    total: int
+    frames: Tuple[int, ...]
     todo: Tuple[int, ...]
-
-
-@dataclass(frozen=True)
-class Begun:
-    """Frames that are now in the worker's hands; if it dies, one of them may be why."""
-
-    unit: int
-    timestamps: Tuple[int, ...]
 
 
 @dataclass(frozen=True)
@@ -95,28 +85,23 @@ class Done:
 
 @dataclass(frozen=True)
 class Failed:
-    """A frame that cannot be had and why; `timestamp` None: the whole unit."""
+    """A frame that has no result and why; `timestamp` None: the whole unit."""
 
     unit: int
     name: str
     message: str
-    timestamp: Union[int, None] = None
+    timestamp: Optional[int] = None
 
 
-Event = Union[Opened, Begun, Done, Failed]
+Event = Union[Opened, Done, Failed]
 
 
 def split(units: Sequence[Unit], workers: int) -> List[Unit]:
     """The same frames in enough units to keep all workers busy, numbered from 0."""
-    if workers > 1 and units:
-        parts = -(-_UNITS_PER_WORKER * workers // len(units))
-        units = [
-            replace(
-                unit,
-                first=unit.first + (unit.last - unit.first) * part / parts,
-                last=unit.first + (unit.last - unit.first) * (part + 1) / parts,
-            )
-            for unit in units
-            for part in range(parts)
-        ]
-    return [replace(unit, number=number) for number, unit in enumerate(units)]
+    parts = -(-_UNITS_PER_WORKER * workers // max(1, len(units))) if workers > 1 else 1
+    pieces = []
+    for unit in units:
+        length = (unit.last - unit.first) / parts
+        edges = [unit.first + length * part for part in range(parts + 1)]
+        pieces += [replace(unit, first=first, last=last) for first, last in zip(edges, edges[1:])]
+    return [replace(unit, number=number) for number, unit in enumerate(pieces)]

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from typing import Any, List, Mapping, Tuple
+from typing import Any, Iterator, List, Mapping, Tuple
 
+import pyarrow
 import torch
 
 from cflow_torch.types import CFlowError
@@ -16,10 +17,9 @@ AUTO = "auto"
 _MOST = 100_000  # workers, threads or windows; more is a slip
 # Bytes that one worker may come to hold: nearly twice the most that `default` was seen to take, see docs/fleet.md.
 WORKER_MEMORY = 1_500_000_000
-# Windows that are computed together. A CPU gains up to 4 (fewer small operations), then loses (cold memory).
-CPU_BATCH = 4
-# Not measured: no GPU was at hand.
-GPU_BATCH = 32
+# Windows that are computed together. A CPU gains up to 4 (fewer small operations), then loses (cold memory). That for a
+# GPU is not measured.
+CPU_BATCH, GPU_BATCH = 4, 32
 
 
 @dataclass(frozen=True)
@@ -89,18 +89,28 @@ def usable_cores(environ: Mapping[str, str]) -> int:
         with suppress(OSError, ValueError):  # "max" is no number
             quota, period = (group / "cpu.max").read_text().split()
             counts.append(int(quota) // int(period))
-    if environ.get("SLURM_CPUS_PER_TASK", "").isdigit():
+    with suppress(KeyError, ValueError):
         counts.append(int(environ["SLURM_CPUS_PER_TASK"]))
-    if environ.get("LOCAL_WORLD_SIZE", "").isdigit():
-        counts.append(min(counts) // max(1, int(environ["LOCAL_WORLD_SIZE"])))
+    with suppress(KeyError, ValueError, ZeroDivisionError):
+        counts.append(min(counts) // int(environ["LOCAL_WORLD_SIZE"]))
     return max(1, min(counts))
 
 
-def _at_least_1(name: str, value: Any) -> int:
+@contextmanager
+def threads(count: int) -> Iterator[None]:
+    """So many threads of torch and of pyarrow in this process, while the block lasts."""
+    before = torch.get_num_threads(), pyarrow.cpu_count()
     try:
-        number = int(str(value))
-    except ValueError:
-        number = 0
+        torch.set_num_threads(count)
+        pyarrow.set_cpu_count(count)
+        yield
+    finally:
+        torch.set_num_threads(before[0])
+        pyarrow.set_cpu_count(before[1])
+
+
+def _at_least_1(name: str, value: Any) -> int:
+    number = int(str(value)) if str(value).isdecimal() else 0
     if not 1 <= number <= _MOST:
         raise CFlowError(f"{name}={value!r}: give a whole number of at least 1, at most {_MOST}, or {AUTO}")
     return number

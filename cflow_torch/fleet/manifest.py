@@ -14,7 +14,7 @@ import re
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Dict, Iterable, List, Mapping, Optional, Sequence, Set
+from typing import Any, Dict, Mapping, Optional, Sequence, Set
 
 import numpy as np
 import torch
@@ -62,8 +62,8 @@ def claim_folder(output: Path, identity: Mapping[str, Any], resume: bool, overwr
     Args:
         output: folder of the run.
         identity: of `make_identity`.
-        resume: go on with what an earlier run of the same identity left.
-        overwrite: throw away the results of another run.
+        resume: continue what an earlier run of the same identity left.
+        overwrite: remove the results of another run.
         alone: no other shard works in this folder.
 
     Raises:
@@ -87,25 +87,17 @@ def claim_folder(output: Path, identity: Mapping[str, Any], resume: bool, overwr
 
 def find_conflict(output: Path, identity: Mapping[str, Any], resume: bool) -> Optional[str]:
     """Why results of this identity must not join those in the folder, to follow a noun; None if they may."""
-    # In this order: a shard that begins beside this one writes the manifest first.
-    has_config, before = (output / "config.yaml").exists(), _read(output / MANIFEST)
-    if before is None:
-        runs = _runs(output)  # an overwriting run was killed when it had removed the manifest, or the manifest is lost
-        foreign = next((log_id for log_id, run in runs.items() if run != identity["hash"]), None)
-        if foreign is not None:
-            return f" ({foreign} is of it)"
-        return f" (its {MANIFEST} is gone)" if has_config and not runs else None
+    before = _read(output / MANIFEST)
+    if before is None:  # an overwriting run was killed when it had removed the manifest, or the manifest is lost
+        for folder in sorted(output.iterdir()) if output.is_dir() else []:
+            log = _read(folder / MANIFEST) if folder.is_dir() else None
+            if log is not None and log.get("run", identity["hash"]) != identity["hash"]:
+                return f" ({folder.name} is of it)"
+        return None
     changed = changes(before, identity, ["hash"])
     if changed:
         return f" ({changed})"
-    return None if resume else " with the same settings (resume=true goes on with it)"
-
-
-def _runs(output: Path) -> Dict[str, Any]:
-    """Folder of a log -> hash of the run that made it."""
-    folders = [folder for folder in sorted(output.iterdir()) if folder.is_dir()] if output.is_dir() else []
-    manifests = {folder.name: _read(folder / MANIFEST) for folder in folders}
-    return {name: manifest["run"] for name, manifest in manifests.items() if manifest and "run" in manifest}
+    return None if resume else " with the same settings (resume=true continues it)"
 
 
 def claim_log(folder: Path, log: Log, run: str) -> None:
@@ -116,18 +108,20 @@ def claim_log(folder: Path, log: Log, run: str) -> None:
 
     Cost: reads three sweeps.
     """
-    now = describe_log(log, run)
+    now = _describe_log(log, run)
     if _read(folder / MANIFEST) is None:
         write_text(folder / MANIFEST, _text(now))
-    before = _read(folder / MANIFEST)  # again: another log of that name may have been quicker
-    if before is None or not _same_log(before, now):
+    before = _read(folder / MANIFEST) or {}  # again: another log of that name may have been quicker
+    digests = before.get("sweeps") or {}
+    is_same = all(before.get(key) == now[key] for key in ("run", "log_id", "timestamps"))
+    if not is_same or any(None not in (digests.get(key), d) and digests[key] != d for key, d in now["sweeps"].items()):
         raise CFlowError(
             f"{folder} holds flow of other sweeps (the log has changed since, or two logs have one name): "
             "remove that folder, or give output=FOLDER"
         )
 
 
-def describe_log(log: Log, run: str) -> Dict[str, Any]:
+def _describe_log(log: Log, run: str) -> Dict[str, Any]:
     """Manifest of a log. A sweep that cannot be read has no digest; its frames will say why."""
     stamps = [int(stamp) for stamp in log.timestamps]
     digests: Dict[str, Optional[str]] = {}
@@ -155,30 +149,6 @@ def complete_frames(folder: Path) -> Set[int]:
     return {int(name[: -len(".feather")]) for name in frames if is_remote(folder) or _is_whole(folder / name)}
 
 
-def check_claimed(folder: Path) -> None:
-    """Notice that a log's folder was removed in the middle of a run: a new one would hold frames of unknown origin.
-
-    Raises:
-        CFlowError: its manifest is gone. In an object store nobody looks.
-    """
-    if not is_remote(folder) and not (folder / MANIFEST).is_file():
-        raise CFlowError(f"{folder} was removed, or its {MANIFEST}, while a run wrote into it: run it again")
-
-
-def removed_logs(output: Path, log_ids: Iterable[str]) -> List[str]:
-    """Those of the logs whose folders are gone; all of them if the run's own manifest is gone.
-
-    Raises:
-        OSError: the output cannot be listed.
-
-    Cost: one listing.
-    """
-    forget_listings(output)
-    with remote_errors(output):
-        names = {path.name for path in output.iterdir()} if output.is_dir() else set()
-    return [log_id for log_id in log_ids if log_id not in names or MANIFEST not in names]
-
-
 def frame_file(folder: Path, timestamp: int) -> Path:
     """Where the flow of one frame lies."""
     return folder / f"{timestamp}.feather"
@@ -192,24 +162,11 @@ def _is_whole(file: Path) -> bool:
     return False
 
 
-def _same_log(before: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
-    if any(before.get(key) != now[key] for key in ("run", "log_id", "timestamps")):
-        return False
-    old = before.get("sweeps")
-    return isinstance(old, dict) and all(
-        old.get(stamp) in (None, digest) for stamp, digest in now["sweeps"].items() if digest is not None
-    )
-
-
 def _digest(log: Log, index: int) -> str:
     """Of all that a sweep gives to the method."""
     sweep, digest = log.sweep(index), hashlib.sha256()
     for values in (sweep.points, sweep.is_ground, sweep.pose):
-        if values is not None:
-            array = np.ascontiguousarray(as_numpy(values))
-            digest.update(f"{array.dtype}{array.shape}".encode())
-            digest.update(array.tobytes())
-        digest.update(b"|")
+        digest.update(b"none" if values is None else as_numpy(values).tobytes())
     return digest.hexdigest()
 
 
@@ -219,29 +176,27 @@ def _clear(output: Path) -> None:
     Its manifest goes first: what is left half-way belongs to none. That of a log goes last: it tells whose frames they
     are.
     """
-    logs: List[Path] = [path for path in output.iterdir() if path.is_dir() and not leaves(output, path)]
+    logs = [path for path in output.iterdir() if path.is_dir() and not leaves(output, path)]
     for name in (MANIFEST, "config.yaml"):
         with suppress(FileNotFoundError):
             (output / name).unlink()
     for folder in logs:
-        files = list(folder.iterdir())
-        for file in sorted(files, key=lambda file: file.name == MANIFEST):
+        for file in sorted(folder.iterdir(), key=lambda file: file.name == MANIFEST):
             if _OURS.fullmatch(file.name):
                 file.unlink()
-        if files and all(_OURS.fullmatch(file.name) for file in files):
-            with suppress(OSError):  # object stores have no folders
-                folder.rmdir()
+        with suppress(OSError):  # something else is left in it; object stores have no folders
+            folder.rmdir()
 
 
 def _read(file: Path) -> Optional[Dict[str, Any]]:
     try:
         content = read_json(file)
+        if not isinstance(content, dict):
+            raise CFlowError("no dictionary")
     except FileNotFoundError:
         return None
     except CFlowError as error:
         raise CFlowError(f"{file} is no manifest ({error}): remove it, or {_REMEDY}") from None
-    if not isinstance(content, dict):
-        raise CFlowError(f"{file} is no manifest: remove it, or {_REMEDY}")
     return content
 
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import os
 import sys
-import time
 from contextlib import contextmanager, suppress
-from typing import Any, Callable, Iterable, Iterator, Optional, Sized
+from typing import Any, Iterable, Iterator, Optional, Sized
 
 from tqdm import tqdm
 
 EVERY = 30.0  # seconds between two lines
 _BAR = "{desc}{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} frames [{elapsed}<{remaining}, {rate_noinv_fmt}]"
+_LINE = "{desc}{n_fmt} of {total_fmt} frames, {rate_noinv_fmt}, {remaining} left"
 
 
 class Progress:
@@ -20,31 +20,29 @@ class Progress:
     Args:
         total: frames in all, None = not known yet; may be set later.
         name: what is done to them, "" = nothing to say.
-        clock: seconds from any start.
 
     Convention: on stderr. Frames per second are those of the last while, not of the whole run.
     """
 
-    def __init__(
-        self, total: Optional[int] = None, name: str = "", clock: Callable[[], float] = time.monotonic
-    ) -> None:
-        self.total, self.done, self._name, self._clock = total, 0, name, clock
-        self._said_at, self._said_done = clock(), 0
-        bar_format = _BAR.replace("{desc}", f"{name}: " if name else "")
+    def __init__(self, total: Optional[int] = None, name: str = "") -> None:
+        self.total, self.done = total, 0
+        settings = {"total": total, "unit": " frames", "smoothing": 0.05, "desc": f"{name}: " if name else ""}
         try:
-            self._bar: Any = tqdm(total=total, unit=" frames", disable=None, smoothing=0.05, bar_format=bar_format)
+            if sys.stderr.isatty():
+                self._bar: Any = tqdm(bar_format=_BAR, **settings)
+            else:  # a short run says nothing
+                self._bar = tqdm(
+                    file=_Lines(), bar_format=_LINE, mininterval=EVERY, miniters=1, delay=EVERY, **settings
+                )
         except OSError:  # it is drawn at once, and the terminal may be gone
-            self._bar = tqdm(total=total, disable=True)
+            self._bar = tqdm(disable=True)
 
     def __enter__(self) -> Progress:
         return self
 
     def __exit__(self, *_: Any) -> None:
-        if self.total is None:
-            self.total = self.done
-        self._bar.total = self.total
+        self._bar.total = self.done if self.total is None else self.total
         with _unheard():
-            self._bar.refresh()
             self._bar.close()
 
     def update(self, frames: int = 1) -> None:
@@ -53,20 +51,17 @@ class Progress:
         self._bar.total = self.total
         with _unheard():
             self._bar.update(frames)
-        if self._bar.disable and self._clock() - self._said_at >= EVERY:
-            self._say()
 
-    def _say(self) -> None:
-        now = self._clock()
-        rate = (self.done - self._said_done) / (now - self._said_at)
-        self._said_at, self._said_done = now, self.done
-        of, left = "", ""
-        if self.total is not None:
-            of = f" of {self.total:,}"
-            if rate > 0:
-                left = f", {tqdm.format_interval(max(0, self.total - self.done) / rate)} left"
-        prefix = f"{self._name}: " if self._name else ""
-        say(f"{prefix}{self.done:,}{of} frames, {rate:.2f} frames/s{left}")
+
+class _Lines:
+    """What a bar writes, a line each time."""
+
+    def write(self, text: str) -> None:
+        if text.strip():
+            sys.stderr.write(text.strip() + "\n")
+
+    def flush(self) -> None:
+        sys.stderr.flush()
 
 
 def say(text: str) -> None:

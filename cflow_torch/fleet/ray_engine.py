@@ -1,26 +1,29 @@
-"""Engine `ray`: Ray Data hands units to actors, on this machine or on a cluster, and brings back what happened."""
+"""Engine `ray`: worker processes are Ray actors, on this machine or on a cluster."""
 
 from __future__ import annotations
 
-import pickle
-import queue
+import logging
+import math
+import os
+import signal
 import threading
-import time
-from dataclasses import dataclass, field, replace
-from typing import Any, Callable, Iterator, List, Optional, Sequence, Set
-
-import pyarrow as pa
+from concurrent.futures import Future
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from types import ModuleType
+from typing import Any, Callable, Dict, Iterator, Optional, Sequence
 
 from cflow_torch.data.paths import as_path, is_remote
-from cflow_torch.fleet.deaths import Deaths
-from cflow_torch.fleet.job import Begun, Done, Event, Failed, Job, Opened, Unit
+from cflow_torch.fleet.dispatch import WorkerDied, dispatch
+from cflow_torch.fleet.job import Event, Job, Unit
 from cflow_torch.fleet.machine import AUTO, Layout
-from cflow_torch.fleet.ray_cluster import Cluster
-from cflow_torch.fleet.ray_worker import ASK_S, News, RayWorker
-from cflow_torch.fleet.work import describe, source_name
+from cflow_torch.fleet.manifest import MANIFEST, make_identity
+from cflow_torch.fleet.work import describe
+from cflow_torch.fleet.worker_process import WorkerProcess
 from cflow_torch.types import CFlowError
 
-_POLL_S = 0.2  # how soon a signal is noticed
+# Only names and outcomes are kept there; Ray takes 30 % of the memory if it is not told.
+_OBJECT_STORE_BYTES = 200 * 2**20
 
 
 def run_ray(
@@ -41,19 +44,19 @@ def run_ray(
     have the same versions of this package, torch and numpy; a node that does not is refused.
 
     Args:
-        job: the run.
+        job: the run; its folder is claimed already (`manifest.claim_folder`).
         units: numbered as in `split`.
-        layout: one worker per device, on a cluster at most as many as it has room for. Which GPU is Ray's choice.
+        layout: one worker per device; those that the cluster has no room for begin when it has. Which GPU is Ray's
+            choice.
         stop: asked all the time; from True on, frames in hand are finished and no others begun.
         address: None = start a cluster in this process, and end it; "auto" or "HOST:PORT" = join the one that this
             machine is part of. A caller that is connected already stays so.
         num_cpus: what a worker takes from the cluster; "auto": its threads, nothing with a GPU.
         num_gpus: likewise, fractions allowed; "auto": 1 if the device is a GPU.
-        retries: how often a frame is done again after a worker died on it.
+        retries: how often a unit, then each of its frames by itself, is done again after a worker died on it.
 
     Yields:
-        What happens, as it happens. A worker that dies is replaced; what it had in hand is done again, one by one, when
-        all else is done. A frame that kills `retries` + 1 workers is `Failed`.
+        What happens, as it happens. A worker that dies is replaced, and its unit done again, see `Retries`.
 
     Raises:
         CFlowError: no Ray, no cluster, no room for one worker, a worker that cannot begin; a setting out of range.
@@ -62,141 +65,132 @@ def run_ray(
         raise CFlowError(f"engine.retries={retries!r}: give a whole number of at least 0")
     if not units:
         return
+    try:
+        import ray
+    except ImportError as error:
+        raise CFlowError(f"engine=ray needs Ray ({error}): pip install ray") from None
+    is_gpu = layout.devices[0].startswith("cuda")
+    needs = {
+        "CPU": _number("num_cpus", num_cpus, 0 if is_gpu else layout.threads),
+        "GPU": _number("num_gpus", num_gpus, int(is_gpu)),
+    }
+    if is_gpu and not needs["GPU"]:
+        raise CFlowError("engine.num_gpus=0: with a GPU as device, give each worker at least a share of one")
     output = as_path(job.output)
     if not is_remote(output):  # a worker may be in another folder
         job = replace(job, output=str(output.absolute()))
-    with Cluster(address, min(len(layout.devices), len(units)), layout, num_cpus, num_gpus) as cluster:
-        yield from _Rounds(job, units, layout, stop, cluster, retries).run()
+    count = min(len(layout.devices), len(units))
+    used = sorted(set(layout.devices)) if is_gpu else []
+    if address is None and used not in ([], ["cuda"], [f"cuda:{k}" for k in range(len(used))]):
+        # Ray gives out the GPUs of a machine from the first on.
+        raise CFlowError(f"engine=ray cannot choose {', '.join(used)}: set CUDA_VISIBLE_DEVICES, and give device=cuda")
+    with _cluster(ray, address, count, needs, len(used)):
+        _check_room(ray, needs)
+        actor = ray.remote(_Actor).options(num_cpus=needs["CPU"], num_gpus=needs["GPU"])
+        device = "cuda" if is_gpu else layout.devices[0]  # Ray shows a worker its own GPUs only
+        arguments = (job, device, layout.threads, os.getcwd())
+        yield from dispatch([_Handle(ray, actor, arguments) for _ in range(count)], units, stop, retries)
 
 
-@dataclass
-class _State:
-    """A unit as the driver sees it."""
+class _Actor(WorkerProcess):
+    """Lives in a process of Ray, maybe on another machine. `folder` is what the driver works in."""
 
-    unit: Unit
-    is_begun: bool = False
-    log_id: Optional[str] = None
-    in_hand: List[int] = field(default_factory=list)  # frames begun and not settled
-    settled: Set[int] = field(default_factory=set)  # frames on disk or failed
+    def __init__(self, job: Job, device: str, threads: int, folder: str) -> None:
+        super().__init__(job, device, threads)
+        self._folder = folder
 
+    def begin(self) -> None:
+        import ray
 
-class _Rounds:
-    """Passes over the units; what is lost with a worker goes into the next pass."""
-
-    def __init__(
-        self, job: Job, units: Sequence[Unit], layout: Layout, stop: Callable[[], bool], cluster: Cluster, retries: int
-    ) -> None:
-        self._job, self._threads, self._stop, self._cluster = job, layout.threads, stop, cluster
-        self._most_deaths = retries + 1
-        self._deaths = Deaths(self._most_deaths)
-        self._states = {unit.number: _State(unit) for unit in units}
-        self._idle_rounds = 0  # in a row, in which no unit was begun
-
-    def run(self) -> Iterator[Event]:
-        """See `run_ray`."""
-        while self._states and not self._stop():
-            yield from self._round()
-            if self._stop():
-                return
-            any_begun = any(state.is_begun for state in self._states.values())
-            self._idle_rounds = 0 if any_begun or self._ended else self._idle_rounds + 1
-            states, self._states = list(self._states.values()), {}
-            for state in states:
-                yield from self._mourn(state)
-
-    def _round(self) -> Iterator[Event]:
-        """All units of now. Those that come to their end leave `_states`."""
-        self._ended, told = 0, 0.0
-        with self._cluster.flag() as flag:
-            actor = RayWorker(self._job, self._cluster.device, self._threads, flag, self._cluster.is_joined)
-            rows = _Rows(self._cluster.map(actor, [pickle.dumps(state.unit) for state in self._states.values()]))
-            try:
-                while True:
-                    if self._stop() and not told:
-                        told = time.monotonic()
-                        flag.set()
-                    if (
-                        told
-                        and time.monotonic() - told > 2 * ASK_S
-                        and not any(state.is_begun for state in self._states.values())
-                    ):
-                        return
-                    try:
-                        news = rows.get(timeout=_POLL_S)
-                    except queue.Empty:
-                        continue
-                    if news is None:
-                        return
-                    yield from self._hear(news)
-            finally:
-                flag.set()
-                rows.close()
-
-    def _hear(self, news: News) -> Iterator[Event]:
-        if news.refusal is not None:
-            raise CFlowError(f"a worker cannot begin: {news.refusal}")
-        state = self._states[news.unit]
-        state.is_begun = True
-        for event in news.events:
-            if isinstance(event, Opened):
-                state.log_id = event.log_id
-            elif isinstance(event, Begun):
-                state.in_hand += event.timestamps
-            elif isinstance(event, (Done, Failed)) and event.timestamp in state.in_hand:
-                state.in_hand.remove(event.timestamp)
-                state.settled.add(event.timestamp)
-                self._deaths.settle(event.unit)
-            yield event
-        if news.ended:
-            self._ended += 1
-            del self._states[news.unit]
-
-    def _mourn(self, state: _State) -> Iterator[Event]:
-        """A unit has no end: its worker died. Blame what it had in hand, and do the rest again."""
-        unit, name = state.unit, state.log_id or source_name(state.unit.source)
-        if not state.is_begun:
-            if self._idle_rounds >= self._most_deaths:
-                yield Failed(unit.number, name, f"{self._idle_rounds} times all workers died before they began")
-            else:
-                self._states[unit.number] = _State(unit)
-            return
-        failed, again = self._deaths.blame(unit, name, state.in_hand, state.settled, "out of memory?")
-        yield from failed
-        if again is not None:
-            self._states[unit.number] = _State(again)
+        job, node = self._job, ray.util.get_node_ip_address()
+        if make_identity(job.config, job.reader, job.settings, job.contents)["hash"] != job.identity:
+            raise CFlowError(f"node {node} has other versions of cflow_torch, torch or numpy than this run began with")
+        if not (as_path(job.output) / MANIFEST).exists():
+            raise CFlowError(f"node {node} does not see {job.output}: the output must be reachable everywhere")
+        with suppress(OSError):  # relative names of data mean the same as in the driver
+            os.chdir(self._folder)
+        super().begin()
 
 
-class _Rows:
-    """Rows of a data set, read by a thread, so that the main one can look for signals."""
+class _Handle:
+    """See `dispatch.Handle`."""
 
-    def __init__(self, batches: Iterator[pa.Table]) -> None:
-        self._queue: queue.Queue = queue.Queue()
-        self._closed = False
-        threading.Thread(target=self._read, args=(batches,), daemon=True).start()
+    def __init__(self, ray: ModuleType, actor: Any, arguments: Sequence[Any]) -> None:
+        self._ray, self._class, self._arguments = ray, actor, arguments
+        self._actor: Any = None
 
-    def get(self, timeout: float) -> Optional[News]:
-        """The next row; None at the end.
+    def begin(self) -> Future:
+        if self._actor is None:
+            self._actor = self._class.remote(*self._arguments)
+        return self._actor.begin.remote().future()  # type: ignore[no-any-return]
 
-        Raises:
-            queue.Empty: none came in time.
-            CFlowError: Ray gave up.
-        """
-        row = self._queue.get(timeout=timeout)
-        if isinstance(row, BaseException):
-            raise CFlowError(f"Ray gave up: {describe(row)}") from row
-        return row  # type: ignore[no-any-return]
+    def step(self, unit: Unit, stop: bool) -> Future:
+        return self._actor.step.remote(unit, stop).future()  # type: ignore[no-any-return]
+
+    def result(self, call: Future) -> Any:
+        try:
+            return call.result()
+        except self._ray.exceptions.RayTaskError as error:
+            raise (error.cause or error) from None
+        except self._ray.exceptions.RayError as error:
+            self.close()
+            raise WorkerDied(f"with Ray's {type(error).__name__}") from error
 
     def close(self) -> None:
-        """Nobody reads any more: the thread ends with the next row."""
-        self._closed = True
+        actor, self._actor = self._actor, None
+        if actor is not None:
+            with suppress(Exception):  # the cluster is gone: so is the worker
+                self._ray.kill(actor)
 
-    def _read(self, batches: Iterator[pa.Table]) -> None:
-        try:
-            for batch in batches:
-                for row in batch["news"].to_pylist():
-                    self._queue.put(pickle.loads(row))
-                if self._closed:
-                    return
-            self._queue.put(None)
-        except BaseException as error:  # whatever it is, the main thread must hear of it
-            self._queue.put(error)
+
+@contextmanager
+def _cluster(
+    ray: ModuleType, address: Optional[str], workers: int, needs: Dict[str, float], num_gpus: int
+) -> Iterator[None]:
+    """Connected to a cluster. `ray.init` takes SIGTERM for itself; it is given back."""
+    if ray.is_initialized():
+        yield
+        return
+    settings: Dict[str, Any] = {"address": address}
+    if address is None:
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nobody is told
+        settings = {
+            "address": "local",
+            "num_cpus": max(1, math.ceil(workers * needs["CPU"])),
+            "num_gpus": num_gpus,
+            "object_store_memory": _OBJECT_STORE_BYTES,
+            "include_dashboard": False,
+        }
+    before = signal.getsignal(signal.SIGTERM)
+    try:
+        ray.init(logging_level=logging.ERROR, **settings)
+    except Exception as error:
+        where = "a Ray cluster of this process" if address is None else f"engine.address={address}"
+        raise CFlowError(f"{where}: no connection ({describe(error)})") from error
+    finally:
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, before)
+    try:
+        yield
+    finally:
+        ray.shutdown()  # also ends a cluster of this process
+
+
+def _check_room(ray: ModuleType, needs: Dict[str, float]) -> None:
+    """Some node could have a worker, once others leave it room."""
+    nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+    if not any(all(node.get(name, 0.0) >= need for name, need in needs.items()) for node in nodes):
+        has = "; ".join(", ".join(f"{node.get(name, 0.0):g} {name}" for name in needs) for node in nodes)
+        need = ", ".join(f"{need:g} {name}" for name, need in needs.items())
+        raise CFlowError(
+            f"no node of the Ray cluster has room for a worker of {need} (they have {has}): "
+            "give fewer engine.threads, engine.num_cpus or engine.num_gpus, or start such a node first"
+        )
+
+
+def _number(name: str, value: Any, default: float) -> float:
+    if value == AUTO:
+        return default
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value < math.inf:
+        raise CFlowError(f"engine.{name}={value!r}: give a number of at least 0, or {AUTO}")
+    return value

@@ -2,31 +2,28 @@
 
 from __future__ import annotations
 
-import json
 import platform
 from typing import Any, Dict, List
 
-from cflow_torch.data.records import strict
+from cflow_torch.fleet.counters import Counters
 from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.shard import Shard
-from cflow_torch.fleet.tally import Tally
 
 _SHOWN = 20  # failures that the table lists; JSON has them all
 
 
 def make_report(
-    tally: Tally, seconds: float, layout: Layout, shard: Shard, engine: str, signal_name: str, about: Dict[str, Any]
+    counters: Counters, seconds: float, layout: Layout, shard: Shard, engine: str, signal_name: str
 ) -> Dict[str, Any]:
     """All figures of a run.
 
     Args:
-        tally: what was done.
+        counters: what was done.
         seconds: from the start of the engine to its end.
         layout: what it ran on.
         shard: which share of the work it was.
         engine: "local" or "ray".
         signal_name: what stopped it, "" if nothing did.
-        about: more to keep, e.g. settings and versions.
 
     Returns:
         "status": "complete", "incomplete" (something failed or is missing) or "interrupted"; "frames": "total",
@@ -34,10 +31,9 @@ def make_report(
         "unopened_units"; "frames_per_s" of those computed; "stages": seconds per computed frame, summed over the
         workers, that overlap in time; "failures", "waiting".
     """
-    status = "interrupted" if signal_name else "complete" if tally.is_complete else "incomplete"
-    waiting = tally.waiting
+    waiting = counters.waiting
     return {
-        "status": status,
+        "status": "interrupted" if signal_name else "complete" if counters.is_complete else "incomplete",
         "stopped_by": signal_name or None,
         "engine": engine,
         "shard": {"index": shard.index, "count": shard.count},
@@ -46,29 +42,29 @@ def make_report(
         "batch": layout.batch,
         "machine": platform.platform(),
         "frames": {
-            "total": tally.total,
-            "complete_before": tally.complete_before,
-            "computed": tally.computed,
-            "failed": tally.num_failed_frames,
-            "failed_logs": len(tally.failures) - tally.num_failed_frames,
+            "total": counters.total,
+            "complete_before": counters.complete_before,
+            "computed": counters.computed,
+            "failed": counters.num_failed_frames,
+            "failed_logs": len(counters.failures) - counters.num_failed_frames,
             "waiting": len(waiting),
-            "unopened_units": tally.num_unopened,
+            "unopened_units": counters.num_unopened,
         },
         "seconds": seconds,
-        "frames_per_s": tally.computed / seconds if seconds > 0 else 0.0,
-        "stages": {name: total / max(1, tally.computed) for name, total in tally.seconds.items()},
-        "failures": [list(failure) for failure in tally.failures],
+        "frames_per_s": counters.computed / seconds if seconds > 0 else 0.0,
+        "stages": {name: total / max(1, counters.computed) for name, total in counters.seconds.items()},
+        "failures": [list(failure) for failure in counters.failures],
         "waiting": waiting,
-        **about,
     }
 
 
 def format_report(report: Dict[str, Any]) -> str:
     """The table."""
-    frames, shard = report["frames"], report["shard"]
+    frames, shard, devices = report["frames"], report["shard"], report["devices"]
+    workers = f"workers: {len(devices)} on {', '.join(sorted(set(devices)))}, threads of each: {report['threads']}"
     rows = [
         ("status", report["status"] + (f" by {report['stopped_by']}" if report["stopped_by"] else "")),
-        ("engine", f"{report['engine']}, {_workers(report)}, shard {shard['index']} of {shard['count']}"),
+        ("engine", f"{report['engine']}, {workers}, shard {shard['index']} of {shard['count']}"),
         ("frames", frames["total"]),
         ("  complete before", frames["complete_before"]),
         ("  computed", frames["computed"]),
@@ -85,8 +81,7 @@ def format_report(report: Dict[str, Any]) -> str:
         rows.append(("ms per frame and worker (stages overlap)", ""))
         rows += [(f"  {name}", f"{1e3 * seconds:.1f}") for name, seconds in report["stages"].items()]
     width = max(len(name) for name, _ in rows)
-    lines = [f"{name:{width}}  {value}".rstrip() for name, value in rows]
-    return "\n".join(lines)
+    return "\n".join(f"{name:{width}}  {value}".rstrip() for name, value in rows)
 
 
 def format_missing(report: Dict[str, Any]) -> str:
@@ -98,18 +93,3 @@ def format_missing(report: Dict[str, Any]) -> str:
     if report["frames"]["unopened_units"]:
         lines.append(f"  {report['frames']['unopened_units']} logs or parts of logs: not begun")
     return "\n".join(lines)
-
-
-def to_json(report: Dict[str, Any]) -> str:
-    """The report as text."""
-    return json.dumps(strict(report), indent=1, allow_nan=False) + "\n"
-
-
-def _workers(report: Dict[str, Any]) -> str:
-    devices, threads = report["devices"], report["threads"]
-    names = ", ".join(sorted(set(devices)))
-    return f"{_count(len(devices), 'worker')} on {names} with {_count(threads, 'thread')} each"
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}{'' if number == 1 else 's'}"

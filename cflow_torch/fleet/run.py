@@ -1,27 +1,30 @@
-"""A whole run: claims the folder, starts the engine, counts, reports."""
+"""A whole run: starts the engine, counts, reports."""
 
 from __future__ import annotations
 
+import json
 import signal
 import time
+from contextlib import closing
 from typing import Any, Dict, Iterator, List, Sequence, Tuple
 
 from cflow_torch.data.atomic import remove_stale
 from cflow_torch.data.names import folder_in
-from cflow_torch.data.paths import as_path
-from cflow_torch.data.records import write_text
-from cflow_torch.fleet.job import Event, Failed, Job, Opened, split
+from cflow_torch.data.paths import as_path, is_remote
+from cflow_torch.data.records import strict, write_text
+from cflow_torch.fleet.counters import Counters
+from cflow_torch.fleet.job import Event, Failed, Job, split
 from cflow_torch.fleet.local import run_local
 from cflow_torch.fleet.machine import Layout
-from cflow_torch.fleet.manifest import removed_logs
+from cflow_torch.fleet.manifest import MANIFEST
 from cflow_torch.fleet.progress import Progress, say
-from cflow_torch.fleet.report import make_report, to_json
+from cflow_torch.fleet.ray_engine import run_ray
+from cflow_torch.fleet.report import make_report
 from cflow_torch.fleet.shard import Shard
 from cflow_torch.fleet.stop import StopSignal
-from cflow_torch.fleet.tally import Tally
 from cflow_torch.types import CFlowError
 
-ENGINES = ("local", "ray")
+ENGINES: Dict[str, Any] = {"local": run_local, "ray": run_ray}
 
 
 def run_fleet(
@@ -48,30 +51,29 @@ def run_fleet(
         What `make_report` returns, which is also in OUTPUT/reports/<shard>.json if "is_written". "exit_status" is 0 if
         every frame of the shard is on disk, 1 if not, 130, 143 or 129 if Ctrl-C, SIGTERM or SIGHUP came first.
     """
-    shares = shard.units(sources)
-    units = split(shares, len(layout.devices))
-    tally = Tally(units)
+    if engine not in ENGINES:
+        raise CFlowError(f"engine={engine!r}: give one of {', '.join(ENGINES)}")
+    units = split(shard.units(sources), len(layout.devices))
+    counters = Counters(units)
     start = time.perf_counter()
-    with StopSignal() as stop:
-        events = _engine(engine)(job, units, layout, stop, **engine_settings)
+    with StopSignal() as stop, closing(ENGINES[engine](job, units, layout, stop, **engine_settings)) as events:
         try:
-            _follow(events, tally, len(units))
+            _follow(events, counters, len(units))
         except KeyboardInterrupt:
             stop.received = stop.received or signal.SIGINT
         except CFlowError as error:  # no worker is left
-            if not tally.total:
+            if not counters.total:
                 raise
             say(f"ended early: {error}")
-        tally.failures += _removed(job.output, tally)
-        seconds = time.perf_counter() - start
-        name = signal.Signals(stop.received).name if stop.received and not tally.is_complete else ""
-        report = make_report(tally, seconds, layout, shard, engine, name, about)
+        counters.failures += _removed(job.output, counters)
+        name = signal.Signals(stop.received).name if stop.received and not counters.is_complete else ""
+        report = {**make_report(counters, time.perf_counter() - start, layout, shard, engine, name), **about}
         report["is_written"] = True
-        report["exit_status"] = stop.exit_status if name else 0 if tally.is_complete else 1
+        report["exit_status"] = stop.exit_status if name else 0 if counters.is_complete else 1
         try:
             file = report_file(job.output, shard)
             remove_stale(file.parent)
-            write_text(file, to_json(report))
+            write_text(file, json.dumps(strict(report), indent=1, allow_nan=False) + "\n")
         except OSError as error:
             say(f"the report could not be written: {error}")
             report["exit_status"], report["is_written"] = report["exit_status"] or 1, False
@@ -83,36 +85,23 @@ def report_file(output: str, shard: Shard) -> Any:
     return folder_in(as_path(output), "reports", "the folder") / f"shard-{shard.index}-of-{shard.count}.json"
 
 
-def _engine(name: str) -> Any:
-    if name == "local":
-        return run_local
-    if name == "ray":
-        from cflow_torch.fleet.ray_engine import run_ray
-
-        return run_ray
-    raise CFlowError(f"engine={name!r}: give one of {', '.join(ENGINES)}")
-
-
-def _removed(output: str, tally: Tally) -> List[Tuple[str, str]]:
-    """(log, message) of what somebody removed while the run was at work."""
-    try:
-        gone = removed_logs(as_path(output), sorted(tally.log_ids))
-    except OSError as error:
-        return [(output, f"cannot be looked at any more ({error})")]
-    return [
-        (log_id, f"its folder in {output} was removed while the run wrote into it: run it again") for log_id in gone
-    ]
+def _removed(output: str, counters: Counters) -> List[Tuple[str, str]]:
+    """(log, message) of what somebody removed while the run was at work. In an object store nobody looks."""
+    folder = as_path(output)
+    if is_remote(folder):
+        return []
+    has_manifest = (folder / MANIFEST).is_file()
+    gone = [log for log in sorted(counters.log_ids) if not (has_manifest and (folder / log / MANIFEST).is_file())]
+    return [(log, f"its folder in {output} was removed while the run wrote into it: run it again") for log in gone]
 
 
-def _follow(events: Iterator[Event], tally: Tally, num_units: int) -> None:
+def _follow(events: Iterator[Event], counters: Counters, num_units: int) -> None:
     """Count events in, and show how far it is: the total grows as logs are opened."""
-    num_opened = num_frames = 0
     with Progress() as progress:
         for event in events:
-            settled = tally.add(event)
-            if isinstance(event, Opened):
-                num_opened, num_frames = num_opened + 1, num_frames + event.total
-                progress.total = round(num_frames / num_opened * max(num_units, num_opened))
+            settled = counters.add(event)
+            if counters.num_opened:
+                progress.total = round(counters.total * max(1, num_units / counters.num_opened))
             if isinstance(event, Failed):
                 say(f"failed: {event.name}: {event.message}")
             progress.update(settled)

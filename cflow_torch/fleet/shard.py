@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Any, List, Mapping, Optional, Sequence, Tuple
+from typing import Any, List, Mapping, Optional, Sequence
 
 from cflow_torch.fleet.job import Unit
 from cflow_torch.types import CFlowError
@@ -34,11 +34,10 @@ class Shard:
         """
         begin, end = (Fraction(edge * len(sources), self.count) for edge in (self.index, self.index + 1))
         units: List[Unit] = []
-        for number in range(int(begin), len(sources)):
+        for number, source in enumerate(sources):
             first, last = max(begin - number, Fraction(0)), min(end - number, Fraction(1))
-            if first >= last:
-                break
-            units.append(Unit(len(units), sources[number], first, last))
+            if first < last:
+                units.append(Unit(len(units), source, first, last))
         return units
 
 
@@ -54,52 +53,42 @@ def find_shard(index: Any, count: Any, environ: Mapping[str, str]) -> Shard:
     Raises:
         CFlowError: not numbers, out of range, an index without a count, a count that the environment contradicts.
     """
-    found = from_environment(environ)
-    if index == AUTO and count == AUTO:
-        return Shard(*(found or (0, 1)))
-    if count == AUTO:
+    if index != AUTO and count == AUTO:
         raise CFlowError(f"shard.index={index} of how many? give shard.count as well")
-    wanted = _number("shard.count", count)
     if index != AUTO:
-        return Shard(_number("shard.index", index), wanted)
-    if wanted == 1 and found is None:
-        return Shard()
-    if found is None or found[1] != wanted:
-        told = "tells no number of tasks" if found is None else f"tells of {found[1]} tasks"
+        return Shard(_number("shard.index", index), _number("shard.count", count))
+    found = _from_environment(environ)
+    wanted = None if count == AUTO else _number("shard.count", count)
+    if wanted not in (None, found.count if found else 1):
+        told = f"tells of {found.count} tasks" if found else "tells no number of tasks"
         raise CFlowError(f"shard.count={wanted}, but the environment {told}: give shard.index as well")
-    return Shard(*found)
+    return found or Shard()
 
 
-def from_environment(environ: Mapping[str, str]) -> Optional[Tuple[int, int]]:
-    """(index, count) that torchrun or SLURM gives this process; None if neither does.
+def _from_environment(environ: Mapping[str, str]) -> Optional[Shard]:
+    """What torchrun or SLURM gives this process; None if neither does.
 
     A SLURM batch script is no task of its step: only `srun` sets SLURM_STEP_NUM_TASKS, so that `--ntasks=8` without
     `srun` does not silently compute one eighth.
     """
-    index, count, found = 0, 1, False
-    if "SLURM_ARRAY_TASK_ID" in environ:
-        lowest, step = _of(environ, "SLURM_ARRAY_TASK_MIN", 0), _of(environ, "SLURM_ARRAY_TASK_STEP", 1)
-        index, found = (_of(environ, "SLURM_ARRAY_TASK_ID") - lowest) // step, True
-        count = _of(environ, "SLURM_ARRAY_TASK_COUNT", index + 1)
-        if count == 1 and _of(environ, "SLURM_ARRAY_TASK_ID") > 0:
+
+    def value(name: str, default: Any = None) -> int:
+        return _number(name, environ.get(name, default))
+
+    index, count, is_array = 0, 1, "SLURM_ARRAY_TASK_ID" in environ
+    if is_array:
+        task = value("SLURM_ARRAY_TASK_ID")
+        index = (task - value("SLURM_ARRAY_TASK_MIN", 0)) // value("SLURM_ARRAY_TASK_STEP", 1)
+        count = value("SLURM_ARRAY_TASK_COUNT", index + 1)
+        if index >= count or (count == 1 and task > 0):
             raise CFlowError(
-                "this SLURM array has one task whose number is not 0: to redo one shard give shard.index and "
-                "shard.count, to do everything shard.index=0 shard.count=1"
-            )
-        if not index < count:
-            raise CFlowError(
-                "the tasks of this SLURM array have numbers with gaps: give shard.index and shard.count, or a range"
+                f"this SLURM array has {count} tasks, and this one is number {task}: give the array a range without "
+                "gaps, or give shard.index and shard.count"
             )
     for rank, tasks in (("RANK", "WORLD_SIZE"), ("SLURM_PROCID", "SLURM_STEP_NUM_TASKS")):
         if rank in environ and tasks in environ:
-            size = _of(environ, tasks)
-            return index * size + _of(environ, rank), count * size
-    return (index, count) if found else None
-
-
-def _of(environ: Mapping[str, str], name: str, default: Optional[int] = None) -> int:
-    text = environ.get(name)
-    return default if text is None and default is not None else _number(name, text)
+            return Shard(index * value(tasks) + value(rank), count * value(tasks))
+    return Shard(index, count) if is_array else None
 
 
 def _number(name: str, value: Any) -> int:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import time
 from collections import deque
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Callable, Deque, Dict, Iterator, List, Sequence, Set, Tuple, Union
+from typing import Any, Callable, Deque, Dict, Iterator, List, Optional, Sequence, Tuple, Union
 
 import torch
 
@@ -19,25 +20,26 @@ from cflow_torch.data.log_check import check_log
 from cflow_torch.data.names import folder_in
 from cflow_torch.data.paths import as_path
 from cflow_torch.estimate import make_model
-from cflow_torch.fleet.job import Begun, Done, Event, Failed, Job, Opened, Unit
-from cflow_torch.fleet.line import Line, Outcome
-from cflow_torch.fleet.manifest import check_claimed, claim_log, complete_frames, frame_file
+from cflow_torch.fleet.job import Done, Event, Failed, Job, Opened, Unit
+from cflow_torch.fleet.manifest import claim_log, complete_frames, frame_file
 from cflow_torch.stages import FlowModel, stage_seconds
 from cflow_torch.types import CFlowError, FlowResult, Window
 
 # Batches that are read ahead, and that wait to be written: enough to even out, little enough for flat memory.
 _AHEAD = 2
-Trouble = Exception  # whatever one frame does must not stop the others
+
+
+class DeviceLost(CFlowError):
+    """The GPU cannot be used any more by this process."""
 
 
 @dataclass
 class _Frame:
     """A frame on its way through a worker."""
 
-    index: int
     timestamp: int
-    seconds: Dict[str, float]
-    content: Union[Window, FlowResult, Trouble, None] = None
+    content: Union[Window, FlowResult, Exception, None] = None
+    seconds: Dict[str, float] = field(default_factory=dict)
 
 
 class Worker:
@@ -53,14 +55,15 @@ class Worker:
         CFlowError: there is no such device, or it cannot be used.
     """
 
-    def __init__(self, job: Job, device: str, ahead: int = _AHEAD, model: Union[FlowModel, None] = None) -> None:
+    def __init__(self, job: Job, device: str, ahead: int = _AHEAD, model: Optional[FlowModel] = None) -> None:
         try:
             torch.zeros(1, device=device)  # now, rather than frame by frame
         except (RuntimeError, AssertionError) as error:
             raise CFlowError(f"no worker can begin on {device}: {describe(error)}") from error
         self._job, self._device, self._ahead = job, device, ahead
         self._model: FlowModel = make_model(job.config, device) if model is None else model
-        self._log: Tuple[Any, Union[Log, None]] = (None, None)
+        self._log: Tuple[Any, Optional[Log]] = (None, None)
+        self._reader, self._writer = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
 
     def run(self, unit: Unit, stop: Callable[[], bool] = lambda: False) -> Iterator[Event]:
         """Do a unit's frames that are not complete.
@@ -70,34 +73,44 @@ class Worker:
             stop: asked before each batch; from True on, what is computed is written and nothing new is begun.
 
         Yields:
-            What happens: `Opened` once, then `Begun`, `Done` and `Failed`, in the order of the log.
+            What happens: `Opened` once, then `Done` and `Failed`, in the order of the log.
 
         Raises:
-            CFlowError: the GPU cannot be used any more.
+            DeviceLost: the GPU cannot be used any more.
         """
         try:
             log = self._open(unit.source)
             folder = folder_in(as_path(self._job.output), log.log_id, "the log")
+            stamps = {i: int(log.timestamps[i]) for i in unit.frames(len(log.timestamps) - 1)}
+            if unit.only is not None:
+                stamps = {i: stamp for i, stamp in stamps.items() if stamp in unit.only}
             complete = set() if self._job.redo else complete_frames(folder)
-            frames = unit.frames(len(log.timestamps) - 1)
-            needless = complete | unit.skip
-            todo = [i for i in frames if log.timestamps[i] not in needless]
+            todo = {i: stamp for i, stamp in stamps.items() if stamp not in complete}
             if todo or complete:
                 claim_log(folder, log, self._job.identity)
             remove_stale(folder)
-            remove_stale(folder, {frame_file(folder, log.timestamps[i]).name for i in todo})  # ours now
-        except Trouble as error:
+            remove_stale(folder, {frame_file(folder, stamp).name for stamp in todo.values()})  # ours now
+        except Exception as error:
             yield Failed(unit.number, source_name(unit.source), describe(error))
             return
-        yield Opened(unit.number, log.log_id, len(frames), tuple(int(log.timestamps[i]) for i in todo))
+        yield Opened(unit.number, log.log_id, tuple(stamps.values()), tuple(todo.values()))
         if todo and self._job.check and unit.first == 0:
-            with suppress(Trouble):  # a sweep that cannot be read is reported when its turn comes
+            with suppress(Exception):  # a sweep that cannot be read is reported when its turn comes
                 check_log(log)
-        careful = {i for i in todo if log.timestamps[i] in unit.careful}
-        yield from self._pass(unit, log, folder, todo, careful, stop)
+        for frame in self._pass(log, folder, list(todo), stop):
+            if isinstance(frame.content, Exception):
+                name = f"{log.log_id}/{frame.timestamp}"
+                yield Failed(unit.number, name, describe(frame.content), frame.timestamp)
+            else:
+                yield Done(unit.number, frame.timestamp, frame.seconds)
 
     def close(self) -> None:
-        """Let go of the log in hand."""
+        """Let go of the log in hand. Calls that hang in a file system are not waited for."""
+        self._reader.shutdown(wait=False)
+        self._writer.shutdown(wait=False)
+        self._close_log()
+
+    def _close_log(self) -> None:
         log, self._log = self._log[1], (None, None)
         while log is not None:  # what is put round a log (recent sweeps, ground, poses) holds it as `log`
             if hasattr(log, "__exit__"):  # an open file
@@ -106,43 +119,39 @@ class Worker:
 
     def _open(self, source: Any) -> Log:
         if self._log[1] is None or self._log[0] != source:
-            self.close()
+            self._close_log()
             log = open_log(self._job.reader, source, **{**self._job.settings, "check": False})
             self._log = (source, RecentSweeps(log, self._job.config.num_history + 2))
         return self._log[1]  # type: ignore[return-value]
 
-    def _pass(
-        self, unit: Unit, log: Log, folder: Path, todo: Sequence[int], careful: Set[int], stop: Callable[[], bool]
-    ) -> Iterator[Event]:
+    def _pass(self, log: Log, folder: Path, todo: Sequence[int], stop: Callable[[], bool]) -> Iterator[_Frame]:
         """Frames through the reading thread, this thread and the writing thread."""
-        ahead = 0 if careful else self._ahead
-        batches = iter(_batches(todo, self._job.batch, careful))
-        reading: Deque[Outcome] = deque()
-        writing: Deque[Outcome] = deque()
-        with Line() as reader, Line() as writer:
-            while True:
-                while len(reading) <= ahead and not stop():
-                    batch = next(batches, None)
-                    if batch is None:
-                        break
-                    yield Begun(unit.number, tuple(int(log.timestamps[i]) for i in batch))
-                    reading.append(reader.submit(self._read, log, batch))
-                if reading and not stop():
-                    frames = reading.popleft().result()
-                    self._compute(frames)
-                    writing.extend(writer.submit(self._write, folder, frame) for frame in frames)
-                elif not writing:
+        size = self._job.batch
+        batches = iter([todo[i : i + size] for i in range(0, len(todo), size)])
+        reading: Deque[Future[List[_Frame]]] = deque()
+        writing: Deque[Future[_Frame]] = deque()
+        while True:
+            while len(reading) <= self._ahead and not stop():
+                batch = next(batches, None)
+                if batch is None:
                     break
-                # Only so many results are held; at the end, or to stop, all are waited for.
-                most = ahead * self._job.batch if reading and not stop() else 0
-                while writing and (len(writing) > most or writing[0].done()):
-                    yield _event(unit, log, writing.popleft().result())
+                reading.append(self._reader.submit(self._read, log, batch))
+            if reading and not stop():
+                frames = reading.popleft().result()
+                self._compute(frames)
+                writing.extend(self._writer.submit(self._write, folder, frame) for frame in frames)
+            elif not writing:
+                break
+            # Only so many results are held; at the end, or to stop, all are waited for.
+            most = self._ahead * size if reading and not stop() else 0
+            while writing and (len(writing) > most or writing[0].done()):
+                yield writing.popleft().result()
 
     def _read(self, log: Log, batch: Sequence[int]) -> List[_Frame]:
         return [self._read_one(log, index) for index in batch]
 
     def _read_one(self, log: Log, index: int) -> _Frame:
-        frame = _Frame(index, int(log.timestamps[index]), {})
+        frame = _Frame(int(log.timestamps[index]))
         with _stage(frame, "read"):
             frame.content = window(log, index, self._job.config.num_history)
         return frame
@@ -156,7 +165,7 @@ class Worker:
         try:
             with stage_seconds() as stages:
                 results = self._model([frame.content for frame in good])  # type: ignore[misc]
-        except Trouble as error:
+        except Exception as error:
             if len(good) == 1:
                 good[0].content = error.with_traceback(None)
                 self._check_device()
@@ -175,14 +184,13 @@ class Worker:
         try:
             torch.zeros(1, device=self._device).item()
         except RuntimeError as error:
-            raise CFlowError(f"{self._device} cannot be used any more: {describe(error)}") from error
+            raise DeviceLost(f"{self._device} cannot be used any more: {describe(error)}") from error
 
     def _write(self, folder: Path, frame: _Frame) -> _Frame:
         if isinstance(frame.content, FlowResult):
             result, frame.content = frame.content, None
             file = frame_file(folder, frame.timestamp)
             with _stage(frame, "write"):
-                check_claimed(folder)
                 try:
                     write_flow(file, result, self._job.contents)
                 except FileNotFoundError:  # a run that begins beside this one takes our file for a dead one's
@@ -196,7 +204,7 @@ def _stage(frame: _Frame, name: str) -> Iterator[None]:
     start = time.perf_counter()
     try:
         yield
-    except Trouble as error:
+    except Exception as error:
         frame.content = error
     frame.seconds[name] = time.perf_counter() - start
 
@@ -210,19 +218,3 @@ def describe(error: BaseException) -> str:
 def source_name(source: Any) -> str:
     """What messages call a log that could not be opened."""
     return str(getattr(source, "scene", None) or getattr(source, "stem", None) or source)
-
-
-def _event(unit: Unit, log: Log, frame: _Frame) -> Event:
-    if isinstance(frame.content, Trouble):
-        return Failed(unit.number, f"{log.log_id}/{frame.timestamp}", describe(frame.content), frame.timestamp)
-    return Done(unit.number, frame.timestamp, frame.seconds)
-
-
-def _batches(todo: Sequence[int], size: int, careful: Set[int]) -> List[List[int]]:
-    """Consecutive frames in batches; careful ones alone."""
-    batches: List[List[int]] = []
-    for index in todo:
-        if index in careful or not batches or len(batches[-1]) == size or batches[-1][-1] in careful:
-            batches.append([])
-        batches[-1].append(index)
-    return batches

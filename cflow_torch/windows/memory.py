@@ -11,13 +11,12 @@ import torch
 
 from cflow_torch.types import CFlowError
 
-# Less than this is not worth a look at the machine.
-_MUCH = 1 << 30
+_MUCH = 1 << 30  # less than this is not worth a look at the machine
 _CGROUP = Path("/sys/fs/cgroup")
 
 
 def require_memory(num_bytes: int, device: torch.device, what: str, mend: str) -> None:
-    """Refuse what does not fit, before any of it is asked for: a system that runs out of memory kills the process.
+    """Refuse what does not fit before it is allocated: a system that runs out of memory kills the process.
 
     Args:
         num_bytes: that are planned with.
@@ -30,7 +29,11 @@ def require_memory(num_bytes: int, device: torch.device, what: str, mend: str) -
     """
     if num_bytes <= _MUCH:
         return
-    free = _free_on_gpu(device) if device.type == "cuda" else available_memory({})
+    if device.type == "cuda":
+        cached = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+        free: Optional[int] = torch.cuda.mem_get_info(device)[0] + cached
+    else:
+        free = available_memory({})
     if free is not None and num_bytes > free:
         raise CFlowError(
             f"{what} needs about {num_bytes / 1e9:.1f} GB of memory ({num_bytes} bytes), {device} has "
@@ -38,35 +41,29 @@ def require_memory(num_bytes: int, device: torch.device, what: str, mend: str) -
         )
 
 
-def _free_on_gpu(device: torch.device) -> int:
-    """Bytes that nobody uses, and what this process keeps in stock."""
-    in_stock = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
-    return torch.cuda.mem_get_info(device)[0] + in_stock
-
-
 def available_memory(environ: Mapping[str, str]) -> Optional[int]:
-    """Bytes that this process may still take: what is free, its groups' limits, its share of a SLURM or torchrun job;
-    None where nobody tells."""
+    """Bytes that this process may still take: what is free, limits of its control groups, its share of a SLURM or
+    torchrun job. None where the system does not tell."""
     free = []
     with suppress(OSError, StopIteration, ValueError):
         lines = Path("/proc/meminfo").read_text().splitlines()
         free.append(1024 * int(next(line for line in lines if line.startswith("MemAvailable")).split()[1]))
     for group in control_groups():
-        with suppress(OSError, ValueError):
+        with suppress(OSError, ValueError):  # "max" is no number
             limit, used = (int((group / name).read_text()) for name in ("memory.max", "memory.current"))
             free.append(limit - used)
-    if environ.get("SLURM_MEM_PER_NODE", "").isdigit():
+    with suppress(KeyError, ValueError):
         free.append(int(environ["SLURM_MEM_PER_NODE"]) << 20)
-    neighbours = re.match(r"\d+", environ.get("LOCAL_WORLD_SIZE") or environ.get("SLURM_STEP_TASKS_PER_NODE") or "1")
-    share = min(free) // max(1, int(neighbours[0])) if free and neighbours else None
-    if environ.get("SLURM_MEM_PER_CPU", "").isdigit():
-        per_task = int(environ["SLURM_MEM_PER_CPU"]) * int(environ.get("SLURM_CPUS_PER_TASK", "1")) << 20
-        share = per_task if share is None else min(share, per_task)
-    return share
+    tasks = re.match(r"\d+", environ.get("LOCAL_WORLD_SIZE") or environ.get("SLURM_STEP_TASKS_PER_NODE") or "")
+    shares = [amount // max(1, int(tasks[0]) if tasks else 1) for amount in free]
+    with suppress(KeyError, ValueError):
+        cores = int(environ.get("SLURM_CPUS_PER_TASK", "1"))
+        shares.append(int(environ["SLURM_MEM_PER_CPU"]) * cores << 20)
+    return min(shares, default=None)
 
 
 def control_groups() -> List[Path]:
-    """Control groups (version 2) that bound this process, the innermost first; none where there are no such."""
+    """Control groups (version 2) of this process, the innermost first; empty where there are none."""
     with suppress(OSError, StopIteration):
         lines = Path("/proc/self/cgroup").read_text().splitlines()
         group = _CGROUP / next(line[3:] for line in lines if line.startswith("0::")).lstrip("/")

@@ -13,83 +13,60 @@ import pytest
 
 from cflow_torch.data import atomic
 
-STEPS = ("open", "write", "flush", "fsync", "rename")
-
-
-def _refuse() -> None:
-    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-
-class _Full:
-    """An open file that takes everything but what `step` does.
-
-    Args:
-        file: the file.
-        step: one of `STEPS`.
-    """
-
-    def __init__(self, file: Any, step: str) -> None:
-        self._file, self._step = file, step
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._file, name)
-
-    def __enter__(self) -> _Full:
-        return self
-
-    def __exit__(self, *_: Any) -> None:
-        self._file.close()
-
-    def write(self, data: Any) -> int:
-        if self._step == "write":
-            self._file.write(bytes(data)[:3])  # a part still finds room
-            _refuse()
-        return int(self._file.write(data))
-
-    def flush(self) -> None:
-        if self._step == "flush":
-            _refuse()
-        self._file.flush()
+STEPS = ("write", "fsync", "rename")
 
 
 def fill(patch: pytest.MonkeyPatch, step: str, target: str, count: int = 1_000_000) -> None:
-    """Let `count` files whose path holds `target` meet a full disk when the package writes them, at one of `STEPS`."""
-    left = [count]
-    descriptors = set()
+    """Let `count` files whose temporary path holds `target` meet a full disk, at one of `STEPS`."""
+    left, descriptors = [count], set()
     replace, fsync = os.replace, os.fsync
 
-    def is_hit(path: Any) -> bool:
-        if target not in str(path) or left[0] == 0:
-            return False
-        left[0] -= 1
-        return True
+    def refuse_if(is_hit: bool) -> None:
+        if is_hit and left[0] > 0:
+            left[0] -= 1
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    class Full:
+        """An open file that takes three bytes."""
+
+        def __init__(self, file: Any) -> None:
+            self.file = file
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(self.file, name)
+
+        def __enter__(self) -> Full:
+            return self
+
+        def __exit__(self, *_: Any) -> None:
+            self.file.close()
+
+        def write(self, data: Any) -> int:
+            if left[0] > 0:
+                self.file.write(bytes(data)[:3])
+            refuse_if(True)
+            return int(self.file.write(data))
 
     def open_(path: Any, mode: str = "r", *rest: Any, **more: Any) -> Any:
-        if "x" not in mode or not is_hit(path):
-            return builtins.open(path, mode, *rest, **more)
-        if step == "open":
-            _refuse()
         file = builtins.open(path, mode, *rest, **more)  # noqa: SIM115
-        if step == "fsync":
-            descriptors.add(file.fileno())
-        return _Full(file, step)
+        if "x" not in mode or target not in str(path):
+            return file
+        descriptors.add(file.fileno())
+        return Full(file) if step == "write" else file
 
     def fsync_(descriptor: int) -> None:
         if descriptor in descriptors:
             descriptors.remove(descriptor)
-            _refuse()
+            refuse_if(step == "fsync")
         fsync(descriptor)
 
     def replace_(old: Any, new: Any) -> None:
-        if is_hit(old):
-            _refuse()
+        refuse_if(step == "rename" and target in str(old))
         replace(old, new)
 
-    if step == "rename":
-        patch.setattr(atomic.os, "replace", replace_)
-    else:
-        patch.setattr(atomic, "open", open_, raising=False)
-        patch.setattr(atomic.os, "fsync", fsync_)
+    patch.setattr(atomic, "open", open_, raising=False)
+    patch.setattr(atomic.os, "fsync", fsync_)
+    patch.setattr(atomic.os, "replace", replace_)
 
 
 class SmallDisk:

@@ -1,0 +1,304 @@
+"""Whole runs: the same files as one frame after the other, resumed, in shards, with logs that are broken."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+from pathlib import Path
+from typing import Any, Callable, Dict
+
+import numpy as np
+import pytest
+from pyarrow import feather
+from small_fleet import CONFIG, ONE, PAIRS, SWEEPS, command, flow_files, frames, make_job, run, tree
+
+from cflow_torch import CFlowError, make_config, make_model
+from cflow_torch.data.av2 import AV2Log
+from cflow_torch.data.flow_file import read_flow
+from cflow_torch.data.log import window
+from cflow_torch.fleet import work
+from cflow_torch.fleet.forecast import format_forecast, make_forecast
+from cflow_torch.fleet.job import Unit
+from cflow_torch.fleet.machine import Layout
+from cflow_torch.fleet.manifest import complete_frames
+from cflow_torch.fleet.shard import Shard, find_shard
+
+OTHER = {"config": make_config("paper", pixel_size=0.8)}  # settings of another run
+
+
+@pytest.fixture
+def out(single_run: Path, tmp_path: Path) -> Path:
+    """A copy of a complete run's output."""
+    return Path(shutil.copytree(single_run, tmp_path / "out"))
+
+
+# What the files hold
+
+
+def test_files_hold_the_results_of_the_method_and_their_origin(fleet: Path, single_run: Path) -> None:
+    model = make_model(CONFIG)
+    for folder in sorted(fleet.iterdir()):
+        log = AV2Log(folder)
+        for index in range(len(log.timestamps) - 1):
+            (expected,) = model([window(log, index, 1)])
+            stored = read_flow(single_run / log.log_id / f"{log.timestamps[index]}.feather")
+            for name, values in expected.numpy().items():
+                np.testing.assert_array_equal(stored.numpy()[name], values, err_msg=name)
+        about = json.loads((single_run / log.log_id / "manifest.json").read_text())
+        assert about["timestamps"] == list(log.timestamps) and about["log_id"] == log.log_id
+    assert len(frames(single_run)) == PAIRS
+
+
+def test_a_batch_changes_no_byte(fleet: Path, single: Dict[str, bytes], tmp_path: Path) -> None:
+    report = run(fleet, tmp_path, Layout(("cpu",), 1, batch=4))
+    assert tree(tmp_path) == single
+    assert (report["status"], report["exit_status"]) == ("complete", 0)
+    assert list(report["frames"].values()) == [PAIRS, 0, PAIRS, 0, 0, 0, 0]
+    assert report["frames_per_s"] == pytest.approx(PAIRS / report["seconds"])
+    assert {"read", "compute", "write", "compute/cluster", "compute/correlate"} <= set(report["stages"])
+    assert json.loads((tmp_path / "reports" / "shard-0-of-1.json").read_text())["frames"] == report["frames"]
+
+
+def test_a_file_has_only_the_contents_asked_for(fleet: Path, single_run: Path, tmp_path: Path) -> None:
+    run(fleet, tmp_path, settings={"contents": ("residual", "is_valid")})
+    file = frames(tmp_path)[0]
+    small, whole = feather.read_table(file), feather.read_table(single_run / file.relative_to(tmp_path))
+    assert small.column_names == ["residual_tx_m", "residual_ty_m", "residual_tz_m", "is_valid"]
+    assert small.equals(whole.select(small.column_names))
+    with pytest.raises(CFlowError, match="contents was"):
+        run(fleet, tmp_path)
+
+
+# Resuming
+
+
+def test_a_second_run_does_only_what_is_missing(fleet: Path, single: Dict[str, bytes], out: Path) -> None:
+    gone = frames(out)[2::3]
+    for file in gone:
+        file.unlink()
+    times = {file: file.stat().st_mtime_ns for file in frames(out)}
+    counted = run(fleet, out)["frames"]
+    assert tree(out) == single
+    assert (counted["computed"], counted["complete_before"]) == (len(gone), PAIRS - len(gone))
+    assert all(file.stat().st_mtime_ns == time for file, time in times.items()), "complete files are left alone"
+
+
+def test_files_that_a_power_cut_spoiled_are_done_again(fleet: Path, single: Dict[str, bytes], out: Path) -> None:
+    for number, file in enumerate(frames(out)[::2]):
+        whole = file.read_bytes()
+        file.write_bytes(b"" if number == 0 else whole[: len(whole) // 2] + bytes(len(whole) - len(whole) // 2))
+    assert run(fleet, out)["frames"]["computed"] == PAIRS // 2
+    assert tree(out) == single
+
+
+def test_other_settings_are_refused_by_name(fleet: Path, single: Dict[str, bytes], out: Path) -> None:
+    with pytest.raises(CFlowError, match=re.escape("method.pixel_sizes was [0.4], is [0.8]") + ".*overwrite=true"):
+        run(fleet, out, settings=OTHER)
+    with pytest.raises(CFlowError, match="find_ground was None, is grid"):
+        run(fleet, out, settings={"settings": {"find_ground": "grid"}})
+    with pytest.raises(CFlowError, match="resume=true"):
+        run(fleet, out, resume=False)
+    with pytest.raises(CFlowError, match="remove the folder yourself"):
+        run(fleet, out, shard=Shard(0, 2), overwrite=True, settings=OTHER)
+    (out / "manifest.json").write_bytes(b"")
+    with pytest.raises(CFlowError, match=f"{out / 'manifest.json'} is no manifest"):
+        run(fleet, out)
+    (out / "manifest.json").unlink()
+    assert run(fleet, out)["frames"]["computed"] == 0
+    assert tree(out) == single, "nothing was touched"
+
+
+def test_overwrite_leaves_nothing_of_the_other_run(fleet: Path, out: Path, tmp_path: Path) -> None:
+    shutil.copytree(out / frames(out)[0].parent.name, out / "a-log-of-the-other-run")
+    (out / "mine.txt").write_text("not of a run")
+    (out / "manifest.json").unlink()  # an earlier attempt was killed in the middle
+    with pytest.raises(CFlowError, match="overwrite=true"):
+        run(fleet, out, settings=OTHER)
+    run(fleet, out, overwrite=True, settings=OTHER)
+    run(fleet, tmp_path / "fresh", settings=OTHER)
+    assert tree(out) == {**tree(tmp_path / "fresh"), "mine.txt": b"not of a run"}
+    assert run(fleet, out, overwrite=True, settings=OTHER)["frames"]["computed"] == PAIRS, "its own frames, too"
+
+
+def test_memory_limit_and_place_are_no_other_settings(fleet: Path, out: Path, tmp_path: Path) -> None:
+    moved = Path(shutil.copytree(fleet, tmp_path / "Straße 東京"))
+    report = run(moved, out, settings={"config": CONFIG.replace(max_memory=5e7)})
+    assert report["frames"]["computed"] == 0
+
+
+def test_a_log_that_has_changed_is_refused_and_the_others_go_on(
+    fleet: Path, single: Dict[str, bytes], out: Path, tmp_path: Path
+) -> None:
+    root = Path(shutil.copytree(fleet, tmp_path / "root"))
+    first, second, _ = sorted(folder.name for folder in root.iterdir())
+    shutil.rmtree(out / second)
+    sweeps = sorted((root / first / "sensors" / "lidar").iterdir())
+    shutil.copy(sweeps[1], sweeps[-1])  # same names, another content
+    ((name, message),) = run(root, out)["failures"]
+    assert name == first and "changed since" in message
+    assert tree(out) == single
+
+
+def test_a_folder_without_manifest_has_no_complete_frames(tmp_path: Path) -> None:
+    (tmp_path / "1.feather").write_bytes(b"ARROW1")
+    assert complete_frames(tmp_path) == set()
+    (tmp_path / "manifest.json").write_text("{}")
+    (tmp_path / "2.feather").write_bytes(b"ARRO")
+    assert complete_frames(tmp_path) == {1}
+
+
+def test_results_may_lie_where_fsspec_reaches(fleet: Path, single_run: Path, tmp_path: Path) -> None:
+    fsspec = pytest.importorskip("fsspec", reason="needs the extra remote")
+    pytest.importorskip("upath", reason="needs the extra remote")
+    memory = fsspec.filesystem("memory")
+    memory.put(str(fleet), "/fleet-data", recursive=True)
+    for computed in (PAIRS, 2):
+        assert command("data.root=memory://fleet-data", "output=memory://fleet-flow") == 0
+        memory.get("/fleet-flow", str(tmp_path), recursive=True)
+        (reports,) = tmp_path.rglob("reports")
+        assert json.loads((reports / "shard-0-of-1.json").read_text())["frames"]["computed"] == computed
+        assert flow_files(reports.parent) == flow_files(single_run)
+        for name in [name for name in memory.find("/fleet-flow") if name.endswith(".feather")][3:5]:
+            memory.rm(name)
+    memory.rm("/fleet-flow", recursive=True)
+    memory.rm("/fleet-data", recursive=True)
+
+
+# Shards
+
+
+def test_shards_together_are_the_single_run(fleet: Path, single: Dict[str, bytes], tmp_path: Path) -> None:
+    for index in (2, 0, 1):
+        shard = find_shard("auto", "auto", {"RANK": str(index), "WORLD_SIZE": "3"})  # as torchrun says
+        assert run(fleet, tmp_path, shard=shard)["shard"] == {"index": index, "count": 3}
+    assert tree(tmp_path) == single
+
+
+def test_a_sweep_over_shards_shares_one_folder(fleet: Path, single_run: Path, tmp_path: Path) -> None:
+    assert command("-m", f"data.root={fleet}", f"output={tmp_path}", "shard.count=2", "shard.index=0,1") == 0
+    reports = [json.loads(file.read_text()) for file in sorted((tmp_path / "reports").iterdir())]
+    assert [report["exit_status"] for report in reports] == [0, 0]
+    assert flow_files(tmp_path) == flow_files(single_run)
+
+
+def test_a_shard_without_frames_is_complete(fleet: Path, tmp_path: Path) -> None:
+    log = sorted(fleet.iterdir())[0]
+    report = run(log, tmp_path, shard=Shard(0, 90))
+    assert (report["frames"]["total"], report["exit_status"]) == (0, 0)
+
+
+# Trouble
+
+
+def test_a_sweep_that_cannot_be_read_costs_its_frames_only(
+    fleet: Path, single: Dict[str, bytes], tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    root, out = Path(shutil.copytree(fleet, tmp_path / "root")), tmp_path / "out"
+    log = sorted(root.iterdir())[1]
+    sweeps = sorted((log / "sensors" / "lidar").iterdir())
+    whole = sweeps[3].read_bytes()
+    sweeps[3].write_bytes(whole[:1000])
+    expected = {f"{log.name}/{sweeps[i].stem}" for i in (2, 3, 4)}  # as t+1, t and history
+    report = run(root, out)
+    assert {name for name, _ in report["failures"]} == expected
+    assert (report["status"], report["exit_status"], report["frames"]["computed"]) == ("incomplete", 1, PAIRS - 3)
+    assert all(name in capsys.readouterr().err for name in sorted(expected)[:1])
+    sweeps[3].write_bytes(whole)
+    assert run(root, out)["exit_status"] == 0
+    assert tree(out).keys() == single.keys()
+
+
+def test_a_log_that_cannot_be_opened_costs_no_other(fleet: Path, single: Dict[str, bytes], tmp_path: Path) -> None:
+    root, out = Path(shutil.copytree(fleet, tmp_path / "root")), tmp_path / "out"
+    first = sorted(root.iterdir())[0]
+    poses = first / "city_SE3_egovehicle.feather"
+    whole = poses.read_bytes()
+    for spoil in (lambda: poses.write_bytes(whole[:100]), poses.unlink, poses.mkdir):
+        spoil()
+        report = run(root, out)
+        assert [name for name, _ in report["failures"]] == [first.name] and report["frames"]["failed_logs"] == 1
+        assert tree(out) == {name: content for name, content in single.items() if not name.startswith(first.name)}
+    poses.rmdir()
+    poses.write_bytes(whole)
+    run(root, out)
+    assert tree(out) == single
+
+
+def during(patch: pytest.MonkeyPatch, number: int, act: Callable[[], Any]) -> None:
+    """Do something when a run begins to write its so-many-th frame."""
+    calls, write = [], work.write_flow
+
+    def write_after(*arguments: Any) -> None:
+        calls.append(0)
+        if len(calls) == number:
+            act()
+        write(*arguments)
+
+    patch.setattr(work, "write_flow", write_after)
+
+
+@pytest.mark.parametrize("which", ["all", "first log"])
+def test_an_output_that_is_removed_during_the_run_is_told(
+    fleet: Path,
+    single: Dict[str, bytes],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture,
+    which: str,
+) -> None:
+    out = tmp_path / "out"
+    place = {"all": out, "first log": out / sorted(fleet.iterdir())[0].name}[which]
+    during(monkeypatch, 5, lambda: shutil.rmtree(place))
+    report = run(fleet, out)
+    assert report["exit_status"] == 1 and any("removed" in message for _, message in report["failures"])
+    assert run(fleet, out)["exit_status"] == 0
+    assert tree(out) == single
+
+
+def test_a_signal_ends_a_run_in_order(
+    fleet: Path, single: Dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    during(monkeypatch, 2, lambda: os.kill(os.getpid(), signal.SIGTERM))
+    report = run(fleet, tmp_path, Layout(("cpu",), 1, 1))
+    assert (report["status"], report["stopped_by"], report["exit_status"]) == ("interrupted", "SIGTERM", 143)
+    assert report["frames"]["computed"] == len(frames(tmp_path)) < PAIRS and report["frames"]["unopened_units"]
+    assert tree(tmp_path).items() <= single.items()
+    assert run(fleet, tmp_path)["frames"]["complete_before"] == report["frames"]["computed"]
+    assert tree(tmp_path) == single
+
+
+# The command
+
+
+def test_the_command_says_what_it_would_do_and_then_does_it(
+    fleet: Path, single_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    out = tmp_path / "out"
+    assert command(f"data.root={fleet}", f"output={out}", "engine.batch=2", "dry_run=true") == 0
+    printed = capsys.readouterr().out
+    assert not out.exists()
+    for folder, sweeps in zip(sorted(fleet.iterdir()), SWEEPS):
+        stamps = AV2Log(folder).timestamps
+        assert re.search(rf"{folder.name} +{sweeps - 1} +0 +{sweeps - 1} +{stamps[0]} \.\.\. {stamps[-2]}", printed)
+    assert f"{PAIRS} frames, 0 complete, {PAIRS} to do" in printed and str(out) in printed
+    for pattern in (r"read [1-9]", r"compute [1-9]", r"write [1-9]", r"time: about", r"disk: 0.0[1-9]", "memory: "):
+        assert re.search(pattern, printed), pattern
+    assert command(f"data.root={fleet}", f"output={out}", "engine.batch=2") == 0
+    assert re.search(rf"computed +{PAIRS}\n", capsys.readouterr().out)
+    assert flow_files(out) == flow_files(single_run)
+    assert command(f"data.root={fleet}", f"output={out}", "engine.name=cloud") == 2
+    assert "local, ray" in capsys.readouterr().err
+
+
+def test_a_forecast_counts_what_is_complete(fleet: Path, out: Path) -> None:
+    gone = frames(out)[:1]
+    for file in gone:
+        file.unlink()
+    units = Shard().units(sorted(fleet.iterdir()))
+    found = make_forecast(make_job(out), [*units, Unit(3, fleet / "nowhere")], ONE)
+    printed = format_forecast(found, make_job(out))
+    assert f"3 logs, {PAIRS} frames, {PAIRS - 1} complete, 1 to do" in printed
+    assert "cannot be opened: nowhere" in printed and found.frame_bytes > 1000

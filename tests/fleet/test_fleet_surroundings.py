@@ -1,0 +1,217 @@
+"""What a run takes from its surroundings: its share of the work, workers of the machine, signals, a terminal."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import sys
+import time
+from fractions import Fraction
+from typing import Any, Dict, List, Tuple
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cflow_torch import CFlowError
+from cflow_torch.fleet import machine, progress
+from cflow_torch.fleet.job import split
+from cflow_torch.fleet.machine import Layout, choose_layout, usable_cores
+from cflow_torch.fleet.progress import Progress, say
+from cflow_torch.fleet.shard import Shard, find_shard
+from cflow_torch.fleet.stop import StopSignal
+from cflow_torch.windows.memory import available_memory
+
+# Shares of the work
+
+
+@given(
+    lengths=st.lists(st.integers(0, 40), min_size=1, max_size=12),
+    count=st.integers(1, 20),
+    workers=st.integers(1, 5),
+)
+def test_shards_and_units_cover_every_frame_once(lengths: List[int], count: int, workers: int) -> None:
+    seen: List[Tuple[int, int]] = []
+    for index in range(count):
+        units = split(Shard(index, count).units(list(range(len(lengths)))), workers)
+        assert [unit.number for unit in units] == list(range(len(units)))
+        seen += [(unit.source, frame) for unit in units for frame in unit.frames(lengths[unit.source])]
+    assert sorted(seen) == [(log, frame) for log, length in enumerate(lengths) for frame in range(length)]
+
+
+def test_a_shard_opens_its_own_logs_only() -> None:
+    units = Shard(1, 3).units(list("abcdef"))
+    assert [(unit.source, unit.first, unit.last) for unit in units] == [("c", 0, 1), ("d", 0, 1)]
+    units = Shard(1, 4).units(list("ab"))
+    assert [(unit.source, unit.first, unit.last) for unit in units] == [("a", Fraction(1, 2), 1)]
+
+
+STEP = {"SLURM_STEP_NUM_TASKS": "4", "SLURM_PROCID": "3"}
+ARRAY = {"SLURM_ARRAY_TASK_ID": "15", "SLURM_ARRAY_TASK_MIN": "11", "SLURM_ARRAY_TASK_STEP": "2"}
+ARRAY_OF_3 = {**ARRAY, "SLURM_ARRAY_TASK_COUNT": "3"}
+TORCHRUN = {"RANK": "5", "WORLD_SIZE": "8"}
+
+
+@pytest.mark.parametrize(
+    ("given_", "environ", "expected"),
+    [
+        (("auto", "auto"), {}, Shard(0, 1)),
+        ((2, 5), {}, Shard(2, 5)),
+        (("2", "5"), STEP, Shard(2, 5)),
+        (("auto", "auto"), STEP, Shard(3, 4)),
+        (("auto", "auto"), ARRAY_OF_3, Shard(2, 3)),
+        (("auto", "auto"), {**ARRAY_OF_3, **STEP}, Shard(11, 12)),
+        (("auto", "auto"), {**TORCHRUN, **STEP}, Shard(5, 8)),
+        (("auto", "auto"), {**ARRAY_OF_3, **TORCHRUN, **STEP}, Shard(21, 24)),
+        (("auto", "auto"), {"SLURM_ARRAY_TASK_ID": "0", "SLURM_ARRAY_TASK_COUNT": "1"}, Shard(0, 1)),
+        (("auto", 4), STEP, Shard(3, 4)),
+        (("auto", 1), {}, Shard(0, 1)),
+        # A batch script without srun is the only process of its job.
+        (("auto", "auto"), {"SLURM_NTASKS": "8", "SLURM_PROCID": "0", "SLURM_JOB_ID": "1"}, Shard(0, 1)),
+    ],
+)
+def test_the_shard_comes_from_settings_or_surroundings(given_: Any, environ: Dict[str, str], expected: Shard) -> None:
+    assert find_shard(*given_, environ) == expected
+
+
+@pytest.mark.parametrize(
+    ("given_", "environ", "message"),
+    [
+        ((3, 3), {}, "0 ... count - 1"),
+        ((-1, 3), {}, "0 ... count - 1"),
+        ((0, 0), {}, "at least 1"),
+        ((1, "auto"), {}, "shard.count"),
+        (("auto", 3), {}, "shard.index"),
+        (("auto", 3), STEP, "4 tasks"),
+        (("one", 3), {}, "whole number"),
+        (("auto", "auto"), {**ARRAY, "SLURM_ARRAY_TASK_COUNT": "2"}, "gaps"),
+        (("auto", "auto"), {"RANK": "x", "WORLD_SIZE": "2"}, "RANK"),
+        (("auto", "auto"), {**ARRAY, "SLURM_ARRAY_TASK_COUNT": "1"}, "give shard.index"),  # one task is done again
+    ],
+)
+def test_a_shard_that_makes_no_sense_is_refused(given_: Any, environ: Dict[str, str], message: str) -> None:
+    with pytest.raises(CFlowError, match=message):
+        find_shard(*given_, environ)
+
+
+# The machine
+
+
+def test_layout_is_chosen_from_the_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(machine, "usable_cores", lambda environ: 16)
+    monkeypatch.setattr(machine, "available_memory", lambda environ: 10 * machine.WORKER_MEMORY + 1)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert choose_layout("auto", "auto", "auto", "auto", {}) == Layout(("cpu",) * 10, 1, machine.CPU_BATCH)
+    assert choose_layout("cpu", 3, "auto", 7, {}) == Layout(("cpu",) * 3, 5, 7)
+    monkeypatch.setattr(machine, "available_memory", lambda environ: 1)
+    assert choose_layout("cpu", "auto", "auto", "auto", {}).devices == ("cpu",)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    assert choose_layout("auto", "auto", "auto", "auto", {}) == Layout(("cuda:0", "cuda:1"), 8, machine.GPU_BATCH)
+    assert choose_layout("cuda", 3, 2, 1, {}) == Layout(("cuda:0", "cuda:1", "cuda:0"), 2, 1)
+    assert choose_layout("auto", "auto", 1, 1, {"LOCAL_RANK": "3"}).devices == ("cuda:1",)
+    assert choose_layout("auto", "auto", 1, 1, {"SLURM_LOCALID": "0"}).devices == ("cuda:0",)
+    assert choose_layout("cuda:1", "auto", 1, 1, {"LOCAL_RANK": "0"}).devices == ("cuda:1",)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
+    with pytest.raises(CFlowError, match="no GPU"):
+        choose_layout("cuda", "auto", 1, 1, {})
+    for workers in (0, "many", 1.5, True):
+        with pytest.raises(CFlowError, match="workers=.*whole number"):
+            choose_layout("cpu", workers, 1, 1, {})
+
+
+def test_cores_and_memory_are_those_of_the_job() -> None:
+    cores, memory = usable_cores({}), available_memory({})
+    assert 1 <= cores <= (os.cpu_count() or 1)
+    assert usable_cores({"SLURM_CPUS_PER_TASK": "1"}) == 1
+    assert usable_cores({"LOCAL_WORLD_SIZE": str(cores)}) == 1
+    assert usable_cores({"SLURM_CPUS_PER_TASK": "many", "LOCAL_WORLD_SIZE": "0"}) == cores
+    assert available_memory({"SLURM_MEM_PER_CPU": "100", "SLURM_CPUS_PER_TASK": "2"}) == 200 << 20
+    assert available_memory({"SLURM_MEM_PER_NODE": "100", "SLURM_STEP_TASKS_PER_NODE": "4(x2)"}) == 25 << 20
+    if memory is not None:
+        assert available_memory({"LOCAL_WORLD_SIZE": "100"}) < memory / 50
+
+
+# Signals
+
+
+def test_the_first_signal_asks_and_the_second_insists() -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    with StopSignal() as stop:
+        assert not stop()
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert stop() and stop.exit_status == 143
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(1)
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="no SIGHUP on this system")
+def test_a_terminal_that_is_closed_stops_a_run_but_not_under_nohup(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: Any) -> int:
+        raise BrokenPipeError
+
+    monkeypatch.setattr(os, "write", broken)  # nobody reads the words
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)  # the tests themselves may run under nohup
+    try:
+        with StopSignal() as stop:
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert stop() and stop.exit_status == 129
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+        with StopSignal() as stop:
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert not stop()
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+# What is printed
+
+
+def test_a_log_file_gets_a_line_now_and_then(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+    with Progress(3, "log-a") as bar:
+        bar.update(3)
+    assert capsys.readouterr().err == "", "a short run says nothing"
+    monkeypatch.setattr(progress, "EVERY", 0.05)
+    with Progress(4, "log-a") as bar:
+        for _ in range(4):
+            time.sleep(0.06)
+            bar.update()
+        bar.update(0)
+    lines = capsys.readouterr().err.splitlines()
+    assert 3 <= len(lines) <= 6 and "\r" not in "".join(lines)
+    assert re.fullmatch(r"log-a: [12] of 4 frames, +[\d.]+ frames/s, 00:00 left", lines[0])
+    assert "4 of 4 frames" in lines[-1]
+
+
+class Gone:
+    """A terminal that was closed."""
+
+    def write(self, text: str) -> int:
+        raise OSError(5, "Input/output error")
+
+    def flush(self) -> None:
+        raise OSError(5, "Input/output error")
+
+    def isatty(self) -> bool:
+        return True
+
+    def fileno(self) -> int:
+        raise OSError(5, "Input/output error")
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # tqdm's, of a bar that never was
+@pytest.mark.parametrize("is_terminal", [True, False])
+def test_work_goes_on_if_nobody_hears(monkeypatch: pytest.MonkeyPatch, is_terminal: bool) -> None:
+    monkeypatch.setattr(progress, "EVERY", 0.0)
+    monkeypatch.setattr(Gone, "isatty", lambda self: is_terminal)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "stderr", Gone())
+        say("a frame failed")
+        with Progress(3) as bar:
+            bar.update(2)
+            bar.update(1)
+    assert bar.done == 3
