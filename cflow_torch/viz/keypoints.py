@@ -10,11 +10,10 @@ import numpy as np
 from cflow_torch.config import Config, make_config
 from cflow_torch.types import Window
 from cflow_torch.viz.bev import longest_flow
-from cflow_torch.viz.legend import draw_wheel
-from cflow_torch.viz.occupancy import crop, draw_occupancy, frame, sweep_marks
+from cflow_torch.viz.occupancy import draw_occupancy, sweep_marks
 from cflow_torch.viz.panel import MOVING
 from cflow_torch.viz.stages import KeyPointMatches, keypoint_matches
-from cflow_torch.viz.style import FAINT, INK, blank_figure, write
+from cflow_torch.viz.style import FAINT, INK, add_heading, add_panel, blank_figure, draw_wheel, name_axes, set_view
 from cflow_torch.viz.wheel import flow_to_rgb
 
 if TYPE_CHECKING:
@@ -53,17 +52,14 @@ def plot_keypoints(window: Window, config: Optional[Config] = None, *, title: Op
     low, high = busiest(start, end)
     if title is None:
         title = f"{len(found.key_points)} key points at t, {len(found.source)} of them matched; shown is a part"
-    write(figure, 0.955, title)
-    panels = [figure.add_axes((left, 0.13, 0.445, 0.74)) for left in (0.04, 0.535)]
-    near = crop(found.images, low, high)
+    add_heading(figure, 0.31, title)
+    panels = [add_panel(figure, left, 0.9, 7.12, 5.1) for left in (0.64, 8.56)]
     points = _middle(found.key_points, found)
     for axes, fade, name in zip(panels, (0.0, _FADE), ("occupancy and key points", "matches")):
-        draw_occupancy(axes, near, fade)
-        frame(axes, low, high)
-        axes.apply_aspect()
+        draw_occupancy(axes, found.images, fade)
+        set_view(axes, low, high, has_ticks=True)
         axes.set_title(name, fontsize=14, color=INK, pad=7)
-        axes.set_xlabel("x, m (forward)", fontsize=10, color=INK)
-    panels[0].set_ylabel("y, m (left)", fontsize=10, color=INK)
+        name_axes(axes, "x, m (forward)", "y, m (left)" if axes is panels[0] else "", 10)
     dot = (0.45 * 72 * panels[0].bbox.width / figure.dpi * found.images.pixel_size / (2 * _HALF_VIEW[0])) ** 2
     panels[0].plot(*points.T, "o", color=_POINT_COLOR, markersize=max(dot**0.5, 1.5), markeredgewidth=0, zorder=3)
     _draw_matches(panels[1], found, start, end, low, high)

@@ -8,8 +8,22 @@ import numpy as np
 import torch
 
 from cflow_torch.ops.labeling import connected_components
-from cflow_torch.viz.legend import SWEEP_RATE, legend_box, wheel_inches
-from cflow_torch.viz.style import FAINT, FRAME, GROUND, INK, STATIC, blank_figure, inches_of, round_length, write
+from cflow_torch.viz.style import (
+    FRAME,
+    GROUND,
+    INK,
+    STATIC,
+    SWEEP_RATE,
+    WHEEL_INCHES,
+    add_caption,
+    add_heading,
+    add_panel,
+    blank_figure,
+    inches_of,
+    legend_box,
+    round_length,
+    set_view,
+)
 from cflow_torch.viz.wheel import flow_to_rgb
 
 if TYPE_CHECKING:
@@ -51,41 +65,29 @@ def new_figure(
     gap, foot = 0.2, 0.42
     full, dpi = (10.0, 100) if len(names) == 1 else (16.0, 112)
     width = full / len(names) - gap * (1 + 1 / len(names))
-    view = _widened(view, 2 * wheel_inches(width)[1] / width)
     extent = view[1] - view[0]
-    height = float(width * extent[1] / extent[0])
+    wanted = np.maximum(extent, (extent[1] / _HIGHEST, extent[0] * 2 * WHEEL_INCHES[1] / width))
+    view = view + np.array([[-0.5], [0.5]]) * (wanted - extent)
+    height = float(width * wanted[1] / wanted[0])
     head = (0.5 if title else 0) + (0.42 if any(names) else 0) or gap
-    total = (full, height + head + foot)
-    figure = blank_figure(total, dpi)
+    figure = blank_figure((full, height + head + foot), dpi)
     from matplotlib.patches import Circle
 
     farthest = float(np.abs(view).max())
     step = max(_RING, round_length(farthest / (0.4 * _MOST_RINGS)))  # rounding takes up to three fifths away
     panels = []
     for i, name in enumerate(names):
-        place = ((gap + i * (width + gap)) / total[0], foot / total[1], width / total[0], height / total[1])
-        axes = figure.add_axes(place)
-        axes.set(xlim=view[:, 0], ylim=view[:, 1], aspect="equal", xticks=[], yticks=[])
-        for spine in axes.spines.values():
-            spine.set(color=FRAME, linewidth=0.8)
+        axes = add_panel(figure, gap + i * (width + gap), foot, width, height)
+        set_view(axes, *view)
         for radius in np.arange(step, farthest + 1e-9, step).tolist():
             axes.add_patch(Circle((0, 0), radius, fill=False, color=FRAME, alpha=0.45, linewidth=0.8, zorder=0.5))
         if name:
             axes.set_title(name, fontsize=14, color=INK, pad=7)
-        axes.apply_aspect()  # now, so that sizes in inches are right from here on
         panels.append(axes)
     if title:
-        write(figure, 1 - 0.3 / total[1], title)
-    caption = f"{caption}   rings: every {step:g} m"
-    figure.text(0.5, 0.2 / total[1], caption, fontsize=11, color=FAINT, ha="center", va="center")
+        add_heading(figure, 0.3, title)
+    add_caption(figure, f"{caption}   rings: every {step:g} m")
     return figure, panels
-
-
-def _widened(view: np.ndarray, lowest: float) -> np.ndarray:
-    """The view, or one round it whose height is at least `lowest` and at most `_HIGHEST` widths."""
-    extent = view[1] - view[0]
-    wanted = np.maximum(extent, (extent[1] / _HIGHEST, extent[0] * lowest))
-    return view + np.array([[-0.5], [0.5]]) * (wanted - extent)
 
 
 def draw_ground(axes: Axes, position: np.ndarray) -> None:
