@@ -10,7 +10,7 @@ import numpy as np
 
 from cflow_torch.types import CFlowError
 from cflow_torch.viz.wheel import wheel_image
-from cflow_torch.viz.writing import Source, whole_file
+from cflow_torch.viz.writing import whole_file
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -38,8 +38,8 @@ def save_animation(figures: Iterable[Figure], path: Union[str, Path], *, frames_
         A .mp4 is H.264, yuv420p; an odd side gets one more white pixel.
 
     Raises:
-        CFlowError: no figure, figures of several sizes, another ending, a rate that cannot be, a folder that
-            cannot be written to, or a missing package. What a generator of figures raises stays as it is.
+        CFlowError: no figure, figures of several sizes, another ending, a rate that cannot be, or a missing package.
+        OSError: the file cannot be written. What a generator of figures raises stays as it is, too.
 
     Cost: a .gif keeps one byte per pixel and picture until the end, a .mp4 nothing.
     """
@@ -48,9 +48,8 @@ def save_animation(figures: Iterable[Figure], path: Union[str, Path], *, frames_
     if not 0 < frames_per_second < np.inf or (is_gif and frames_per_second > _FASTEST_GIF):
         limit = f" up to {_FASTEST_GIF:g}" if is_gif else ""
         raise CFlowError(f"frames_per_second={frames_per_second}: give a positive number{limit}")
-    pictures = Source(_pictures(figures))
-    with whole_file(path, ".gif", ".mp4", source=pictures) as temporary:
-        (_write_gif if is_gif else _write_mp4)(temporary, pictures, frames_per_second)
+    with whole_file(path, ".gif", ".mp4") as temporary:
+        (_write_gif if is_gif else _write_mp4)(temporary, _pictures(figures), frames_per_second)
     return path
 
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from cflow_torch.config import DenseConfig
 from cflow_torch.types import Array, CFlowError, FlowResult, as_numpy
+from cflow_torch.viz import style
 from cflow_torch.viz.panel import MOVING, draw_error, draw_flow, draw_ground, new_figure
-from cflow_torch.viz.style import CORNERS, draw_scale, draw_wheel
 from cflow_torch.viz.writing import whole_file
 
 if TYPE_CHECKING:
@@ -62,8 +62,8 @@ def plot_flow(
     true_flow = None if truth is None else point_rows("truth", truth, len(position))
     if max_flow is not None and not 0 < max_flow < np.inf:
         raise CFlowError(f"max_flow={max_flow}: give a positive length in metres, or None for the longest flow drawn")
-    if legend is not None and legend not in CORNERS:
-        raise CFlowError(f"legend={legend!r}: give None or one of {', '.join(CORNERS)}")
+    if legend is not None and legend not in style.CORNERS:
+        raise CFlowError(f"legend={legend!r}: give None or one of {', '.join(style.CORNERS)}")
 
     floor, position, residual = position[is_floor], position[rest], residual[rest]
     cluster = None
@@ -79,8 +79,8 @@ def plot_flow(
     for axes in panels[:2]:
         draw_ground(axes, floor)
     draw_flow(panels[0], position, residual, cluster, max_flow)
-    draw_scale(panels[0])
-    draw_wheel(panels[0], position, np.linalg.norm(residual, axis=1) > MOVING, max_flow, legend)
+    style.draw_scale(panels[0])
+    style.draw_wheel(panels[0], position, np.linalg.norm(residual, axis=1) > MOVING, max_flow, legend)
     if true_flow is not None:
         draw_flow(panels[1], position, true_flow, None, max_flow)
         draw_error(panels[2], position, residual, true_flow)
@@ -98,7 +98,8 @@ def save_picture(figure: Figure, path: Union[str, Path]) -> Path:
         The path.
 
     Raises:
-        CFlowError: another ending, or a folder that cannot be written to.
+        CFlowError: another ending.
+        OSError: the file cannot be written.
     """
     path = Path(path)
     with whole_file(path, ".png") as temporary:

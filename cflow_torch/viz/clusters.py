@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Optional, Sequence, Union
 import numpy as np
 
 from cflow_torch.types import Array, CFlowError, FlowResult, as_numpy
+from cflow_torch.viz import style
 from cflow_torch.viz.bev import split_sweep
 from cflow_torch.viz.panel import dot_area, draw_ego, draw_ground, new_figure
-from cflow_torch.viz.style import INK, STATIC, draw_scale, legend_box
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -63,11 +63,11 @@ def plot_clusters(
     figure, (axes,) = new_figure(("",), view, title, _CAPTION)
     draw_ground(axes, floor)
     alone, members = position[~has_one], position[has_one]
-    axes.scatter(alone[:, 0], alone[:, 1], s=dot_area(axes), color=STATIC, linewidths=0, zorder=2)
+    axes.scatter(alone[:, 0], alone[:, 1], s=dot_area(axes), color=style.STATIC, linewidths=0, zorder=2)
     order = np.argsort(-size[number], kind="stable")  # small ones on top
     color = cluster_colors(members, number, (0, 0, 0))[order] / 255
     axes.scatter(members[order, 0], members[order, 1], s=3 * dot_area(axes), c=color, linewidths=0, zorder=3)
-    draw_scale(axes)
+    style.draw_scale(axes)
     draw_ego(axes)
     _draw_sizes(axes, position, has_one, size)
     return figure
@@ -109,11 +109,13 @@ def cluster_colors(position: np.ndarray, cluster_id: np.ndarray, no_cluster: Seq
 
 def _draw_sizes(axes: Axes, position: np.ndarray, has_one: np.ndarray, size: np.ndarray) -> None:
     """How many clusters of which size there are, as a small table in a corner."""
-    box = legend_box(axes, position, has_one, (2.3, 1.5))
+    box = style.legend_box(axes, position, has_one, (2.3, 1.5))
     bounds = (1, 10, 100, 1000, np.inf)
     words = ("under 10", "10 to 99", "100 to 999", "1000 or more")
     counts, _ = np.histogram(size, bounds)
     columns = (("points in view", *words, "all"), ("clusters", *map(str, counts), str(len(size))))
     for x, side, column in zip((0.06, 0.94), ("left", "right"), columns):
         text = "\n".join(column)
-        box.text(x, 0.5, text, fontsize=11, color=INK, ha=side, va="center", linespacing=1.5, transform=box.transAxes)
+        box.text(
+            x, 0.5, text, fontsize=11, color=style.INK, ha=side, va="center", linespacing=1.5, transform=box.transAxes
+        )

@@ -9,9 +9,9 @@ import numpy as np
 
 from cflow_torch.config import Config, make_config
 from cflow_torch.types import Window
+from cflow_torch.viz import style
 from cflow_torch.viz.occupancy import draw_occupancy
 from cflow_torch.viz.stages import ClusterCorrelation, cluster_correlation
-from cflow_torch.viz.style import INK, add_heading, add_panel, blank_figure, name_axes, thin_frame, thin_ticks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 _COLORMAP = "viridis"
 _PEAK = "#e6194b"
 _MOST_LINES = 160  # of the surface, a side
-_THIN = 6.0  # a box that is so many times as long as wide
 
 
 def plot_correlation(
@@ -48,7 +47,7 @@ def plot_correlation(
         config, window = make_config("paper"), replace(window, pch=())
     found = cluster_correlation(window, config, cluster_id)
     figure, panels = _lay_out(found.images.t.shape)
-    add_heading(figure, 0.35, title or _title(found, config))
+    style.add_heading(figure, 0.35, title or _title(found, config))
     images, nothing = found.images, np.zeros_like(found.images.t)
     height, width = nothing.shape
     # A shift is shorter than the box: what leaves it does not come back from the other side.
@@ -60,7 +59,7 @@ def plot_correlation(
         "t moved by the shift taken, and t+1",
     )
     for axes, name, t, t1 in zip(panels, names, (images.t, nothing, moved), (nothing, images.t1, images.t1)):
-        draw_occupancy(axes, replace(images, t=t, t1=t1), aspect=_aspect(found))
+        draw_occupancy(axes, replace(images, t=t, t1=t1), aspect="auto")
         _name(axes, name, "x, m", "y, m")
     _draw_map(panels[3], panels[4], found)
     _draw_surface(panels[5], found)
@@ -78,30 +77,25 @@ def _title(found: ClusterCorrelation, config: Config) -> str:
 
 def _lay_out(shape: Tuple[int, int]) -> Tuple[Figure, List[Any]]:
     """The figure and its axes: four images, colour bar, surface."""
-    width, left, right = 3.35, 0.7, 5.25
-    height = float(np.clip(width * shape[0] / shape[1], 1.2, 3.35))
+    left, right = 0.7, 5.25
+    # Square pixels, unless the box is so long and thin that nothing could be seen.
+    height, width = np.maximum(3.35 * np.array(shape) / max(shape), 1.2)
     total = max(2 * height + 2.9, 6.4)
     lower = 0.65 + (total - 2 * height - 2.9) / 2
     upper = lower + height + 1.2
-    figure = blank_figure((16.0, total), 100)
+    figure = style.blank_figure((16.0, total), 100)
     corners = [(left, upper), (right, upper), (left, lower), (right, lower)]
-    panels = [add_panel(figure, x, y, width, height) for x, y in corners]
-    panels.append(add_panel(figure, right + width + 0.2, lower, 0.13, height))
-    panels.append(add_panel(figure, 9.6, 0.2, 6.1, total - 0.9, projection="3d"))
+    panels = [style.add_panel(figure, x, y, width, height) for x, y in corners]
+    panels.append(style.add_panel(figure, right + width + 0.2, lower, 0.13, height))
+    panels.append(style.add_panel(figure, 9.6, 0.2, 6.1, total - 0.9, projection="3d"))
     return figure, panels
 
 
-def _aspect(found: ClusterCorrelation) -> Any:
-    """Of the images: square pixels, unless the box is so long and thin that nothing could be seen."""
-    height, width = found.images.t.shape
-    return "equal" if max(height, width) < _THIN * min(height, width) else "auto"
-
-
 def _name(axes: Axes, title: str, x: str, y: str) -> None:
-    axes.set_title(title, fontsize=12, color=INK, pad=8)
-    name_axes(axes, x, y)
-    thin_ticks(axes)
-    thin_frame(axes)
+    axes.set_title(title, fontsize=12, color=style.INK, pad=8)
+    style.name_axes(axes, x, y)
+    style.thin_ticks(axes)
+    style.thin_frame(axes)
 
 
 def _draw_map(axes: Axes, beside: Axes, found: ClusterCorrelation) -> None:
@@ -116,14 +110,14 @@ def _draw_map(axes: Axes, beside: Axes, found: ClusterCorrelation) -> None:
         interpolation="nearest",
         cmap=_COLORMAP,
         vmin=0,
-        aspect=_aspect(found),
+        aspect="auto",
     )
     dy, dx = found.shift
     axes.plot(0, 0, "+", color="white", markersize=9, markeredgewidth=1.2)
     axes.plot(dx, dy, "o", markersize=13, markeredgewidth=2.2, markerfacecolor="none", markeredgecolor=_PEAK)
     _name(axes, "score of every shift (+: no shift)", *_shift_names(found))
     bar = axes.figure.colorbar(image, cax=beside)
-    bar.ax.tick_params(labelsize=9, labelcolor=INK, color=INK, length=2)
+    bar.ax.tick_params(labelsize=9, labelcolor=style.INK, color=style.INK, length=2)
     outline: Any = bar.outline  # whose type is known wrongly
     outline.set_visible(False)
 
@@ -149,10 +143,10 @@ def _draw_surface(axes: Any, found: ClusterCorrelation) -> None:
     axes.view_init(elev=32, azim=-62)
     names = (*_shift_names(found), "score (NCC)")
     for axis, name in zip((axes.xaxis, axes.yaxis, axes.zaxis), names):
-        axis.set_label_text(name, fontsize=10, color=INK)
+        axis.set_label_text(name, fontsize=10, color=style.INK)
         axis.labelpad = 8
     axes.locator_params(axis="both", nbins=5)
-    axes.tick_params(labelsize=9, labelcolor=INK)
+    axes.tick_params(labelsize=9, labelcolor=style.INK)
 
 
 def _shift_names(found: ClusterCorrelation) -> List[str]:

@@ -13,7 +13,7 @@ from cflow_torch.types import CFlowError, FlowResult, Sweep, as_numpy
 from cflow_torch.viz.clusters import cluster_colors
 from cflow_torch.viz.panel import ARROW_STEPS, MIN_ARROW_POINTS, MOVING, group_medians
 from cflow_torch.viz.wheel import flow_to_rgb
-from cflow_torch.viz.writing import Source, whole_file
+from cflow_torch.viz.writing import whole_file
 
 if TYPE_CHECKING:
     import rerun
@@ -61,7 +61,7 @@ def record_log(
     Raises:
         CFlowError: rerun-sdk is absent or too old, another ending, a `max_flow` that is not positive, no result at all,
             or a result with other rows than its sweep.
-        OSError: the log cannot be read. What `results` raises stays as it is, too.
+        OSError: the log cannot be read, or the file not be written. What `results` raises stays as it is, too.
 
     Cost: about 20 bytes per point and pair on disk for each entity that shows it.
     """
@@ -69,14 +69,13 @@ def record_log(
     if not 0 < max_flow < np.inf:
         raise CFlowError(f"max_flow={max_flow}: give a positive length in metres per sweep")
     rr = load_rerun()
-    pairs = Source((i, log.sweep(i), log.sweep(i + 1), result, log.labels(i)) for i, result in results)
-    with whole_file(path, ".rrd", source=pairs) as temporary:
+    with whole_file(path, ".rrd") as temporary:
         stream = rr.RecordingStream("cflow_torch", recording_id=f"{log.log_id}-{uuid.uuid4().hex}")
         stream.save(temporary)
         try:
             drive = _Drive(rr, stream, max_flow)
-            for pair in pairs:
-                drive.add(*pair)
+            for i, result in results:
+                drive.add(i, log.sweep(i), log.sweep(i + 1), result, log.labels(i))
             drive.end(log.log_id)
             stream.flush()
         finally:
@@ -144,8 +143,7 @@ class _Drive:
 
         moving = shown & (np.linalg.norm(residual, axis=1) > MOVING)
         columns = np.concatenate([position[moving], residual[moving]], axis=1)
-        middle, count = group_medians(cluster[moving], columns)
-        numbers = np.unique(cluster[moving & (cluster >= 0)])
+        numbers, middle, count = group_medians(cluster[moving], columns)
         large = count >= MIN_ARROW_POINTS
         start, vector = middle[large, :3], middle[large, 3:]
         names = [f"cluster {n}: {np.linalg.norm(v):.2f} m per sweep" for n, v in zip(numbers[large], vector)]

@@ -9,21 +9,11 @@ import numpy as np
 
 from cflow_torch.config import Config, make_config
 from cflow_torch.types import FlowResult, Window
+from cflow_torch.viz import style
 from cflow_torch.viz.bev import longest_flow, point_rows, view_of
 from cflow_torch.viz.occupancy import draw_occupancy, sweep_marks
-from cflow_torch.viz.panel import FLOW_CAPTION, draw_flow
+from cflow_torch.viz.panel import FLOW_CAPTION, draw_flow, group_medians
 from cflow_torch.viz.stages import Scale, scales
-from cflow_torch.viz.style import (
-    INK,
-    WHEEL_INCHES,
-    add_caption,
-    add_heading,
-    add_panel,
-    blank_figure,
-    fill_wheel,
-    name_axes,
-    set_view,
-)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -66,46 +56,46 @@ def plot_scales(window: Window, config: Optional[Config] = None, *, title: Optio
     lines = 1 if count <= 4 else 2  # of the panels' names
     more = 0.2 * (lines - 1)  # inches
     below_y, above_y = 0.5, width + 1.2 + more
-    figure = blank_figure((16.0, 2 * width + 2.3 + 2 * more), 100)
+    figure = style.blank_figure((16.0, 2 * width + 2.3 + 2 * more), 100)
     above, below = (
-        [add_panel(figure, left + i * (width + gap), bottom, width, width) for i in range(count)]
+        [style.add_panel(figure, left + i * (width + gap), bottom, width, width) for i in range(count)]
         for bottom in (above_y, below_y)
     )
-    add_heading(figure, 0.32, title or "coarse to fine: " + " → ".join(f"{size:g} m" for size in config.pixel_sizes))
+    style.add_heading(
+        figure, 0.32, title or "coarse to fine: " + " → ".join(f"{size:g} m" for size in config.pixel_sizes)
+    )
     position = point_rows("points", window.pc0.points, None) + result.pose_flow.numpy()
     _draw_near(above, position, found, result, alone)
     max_flow = _draw_flows(below, config, position, found, result, alone)
     for axes in (*above, *below):
         name = axes.get_title().replace(": ", ":\n", lines - 1)
-        axes.set_title(name, fontsize=min(12, 8 * width), color=INK, pad=6)
+        axes.set_title(name, fontsize=min(12, 8 * width), color=style.INK, pad=6)
 
-    marks = add_panel(figure, 16.0 - side, above_y, side, width)
-    marks.legend(handles=sweep_marks(), loc="center left", frameon=False, fontsize=11, labelcolor=INK)
-    wheel, high = WHEEL_INCHES
-    box = add_panel(figure, 16.0 - wheel, below_y + (width - high) / 2, wheel, high)
-    fill_wheel(box, max_flow)
+    marks = style.add_panel(figure, 16.0 - side, above_y, side, width)
+    marks.legend(handles=sweep_marks(), loc="center left", frameon=False, fontsize=11, labelcolor=style.INK)
+    wheel, high = style.WHEEL_INCHES
+    box = style.add_panel(figure, 16.0 - wheel, below_y + (width - high) / 2, wheel, high)
+    style.fill_wheel(box, max_flow)
     for axes in (marks, box):
         axes.axis("off")
-    add_caption(figure, FLOW_CAPTION)
+    style.add_caption(figure, FLOW_CAPTION)
     return figure
 
 
 def _shown(result: FlowResult, alone: FlowResult) -> np.ndarray:
     """(N,) bool, points of the mover whose flow coarse to fine changes most against the finest pixels alone.
 
-    Convention: of the larger clusters, by mean change, at most the flow itself, times the score of the match. If
+    Convention: of the larger clusters, by median change, at most the flow itself, times the score of the match. If
         nothing changes, the fastest.
     """
     cluster, flow = result.cluster_id.numpy(), result.residual_flow.numpy()
-    has_one = cluster >= 0
-    if not has_one.any():
-        return has_one
     change = np.linalg.norm(flow - alone.residual_flow.numpy(), axis=1)
     speed = np.linalg.norm(flow, axis=1)
     weight = (np.minimum(change, speed) if change.any() else speed) * result.score.numpy()
-    size = np.bincount(cluster[has_one])
-    mean = np.bincount(cluster[has_one], weights=weight[has_one]) / np.maximum(size, 1)
-    return cluster == int(np.argmax(np.where(size >= min(_MIN_POINTS, size.max()), mean, -1)))
+    number, median, count = group_medians(cluster, weight[:, None])
+    if not len(number):
+        return cluster >= 0
+    return cluster == number[np.where(count >= min(_MIN_POINTS, count.max()), median[:, 0], -1).argmax()]
 
 
 def _square(position: np.ndarray) -> Tuple[np.ndarray, np.ndarray]:
@@ -130,9 +120,9 @@ def _draw_near(
     names = [f"{one.pixel_size:g} m pixels" for one in images[:-1]] + ["result"]
     for axes, one, name, words in zip(panels, images, names, moved):
         draw_occupancy(axes, one)
-        set_view(axes, low, high, has_ticks=True)
+        style.set_view(axes, low, high, has_ticks=True)
         axes.set_title(f"{name}: t {words}")
-        name_axes(axes, "x, m", "y, m" if axes is panels[0] else "")
+        style.name_axes(axes, "x, m", "y, m" if axes is panels[0] else "")
         axes.tick_params(labelleft=axes is panels[0])
 
 
@@ -158,7 +148,7 @@ def _draw_flows(
     names[-1] += ": the result"
     names.append(f"for comparison: {config.pixel_sizes[-1]:g} m alone")
     for axes, name, flow in zip(panels, names, flows):
-        set_view(axes, *view)
+        style.set_view(axes, *view)
         draw_flow(axes, position[keep], flow, None, max_flow)
         axes.set_title(name)
     return max_flow

@@ -100,15 +100,14 @@ class KeyPointMatches:
 
     Args:
         images: occupancy.
-        key_points: (K, 2) int64, (row, col).
-        source: (M,) int64, key point of each match.
-        shift: (M, 2) int64, (dy, dx), pixels.
+        key_points: (K, 2) float64, (x, y), metres, frame of t+1: the middle of each one's pixel.
+        start, end: (M, 2) float64, likewise, the key point of t and that of t+1 of each match.
     """
 
     images: Occupancy
     key_points: np.ndarray
-    source: np.ndarray
-    shift: np.ndarray
+    start: np.ndarray
+    end: np.ndarray
 
 
 def scales(window: Window, config: Config) -> Tuple[List[Scale], FlowResult]:
@@ -152,11 +151,9 @@ def cluster_correlation(window: Window, config: Config, cluster_id: Optional[int
     if not isinstance(config, DenseConfig) or config.clustering != "components":
         raise _absent(config, "correlation map per cluster", "paper")
     (*_, last), result = scales(window, config)
-    of_point = result.cluster_id.numpy()
-    numbers = np.unique(of_point[of_point >= 0])
+    numbers, flow, count = group_medians(result.cluster_id.numpy(), last.flow)
     if not len(numbers):
         raise CFlowError("no cluster has points in both sweeps: there is no correlation to draw")
-    flow, count = group_medians(of_point, last.flow)
     if cluster_id is None:
         cluster_id = int(numbers[(np.linalg.norm(flow, axis=1) * count).argmax()])
     if cluster_id not in numbers:
@@ -199,8 +196,10 @@ def keypoint_matches(window: Window, config: Config) -> KeyPointMatches:
     sweeps = last.sweeps
     pc1, pc0 = (describe(sweeps.occupancy[:, step], config.patch_size) for step in (0, 1))
     matches = match(pc0, pc1, match_radius(sweeps.batch, sweeps.grid.pixel_size, config), config)
-    key_points = torch.stack((pc0.row, pc0.col), 1)
-    return KeyPointMatches(last.seen(), key_points.numpy(), matches.source.numpy(), matches.shift.numpy())
+    images, size = last.seen(), sweeps.grid.pixel_size
+    key_points = images.lower + (torch.stack((pc0.col, pc0.row), 1).numpy() + 0.5) * size
+    start = key_points[matches.source.numpy()]
+    return KeyPointMatches(images, key_points, start, start + matches.shift.flip(1).numpy() * size)
 
 
 def _absent(config: Config, what: str, preset: str) -> CFlowError:
