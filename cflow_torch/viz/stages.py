@@ -168,7 +168,7 @@ def cluster_correlation(window: Window, config: Config, cluster_id: Optional[int
     pair = int(flat_nonzero((pairs.source == 0) & (pairs.cluster == cluster_id)))
     template = _image(pairs.template, pair, pairs.size[cluster_id])
     target = _image(pairs.target, cluster_id, pairs.size[cluster_id])
-    ncc = _ncc_map(template, target, config.correlation)
+    ncc = _ncc_map(template, target)
     if pairs.radius is not None:
         dy, dx = (torch.arange(n) - n // 2 for n in ncc.shape)
         ncc[dy[:, None] ** 2 + dx**2 > pairs.radius[pair] ** 2] = torch.nan
@@ -223,13 +223,13 @@ def _image(images: Images, number: int, size: Tensor) -> Tensor:
     return image
 
 
-def _ncc_map(template: Tensor, target: Tensor, engine: str) -> Tensor:
+def _ncc_map(template: Tensor, target: Tensor) -> Tensor:
     """(H, W) float64, as `ClusterCorrelation.ncc`. A window of ones over the target counts its pixels."""
     height, width = template.shape
     images = torch.zeros(3, 2 * height, 2 * width)
     images[:, :height, :width] = torch.stack((template, torch.ones_like(template), target))
-    counts = cross_correlate(images, 2, torch.zeros(2, dtype=torch.int64), engine).round().double()
-    # Half of the images is free: negative shifts stand at the far end.
+    counts = cross_correlate(images, 2, torch.zeros(2, dtype=torch.int64)).round().double()
+    # It wraps round, and half of the images is free: negative shifts stand at the far end.
     dy, dx = ((torch.arange(n) - n // 2) % (2 * n) for n in (height, width))
     overlap, in_window = counts[:, dy[:, None], dx]
     energies = in_window * template.double().sum()
