@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Optional, Sequence, Tuple, Union
 import numpy as np
 
 from cflow_torch.config import DenseConfig
-from cflow_torch.data.atomic import atomic_file
 from cflow_torch.types import Array, CFlowError, FlowResult, as_numpy
-from cflow_torch.viz.legend import CORNERS, draw_scale, draw_wheel
+from cflow_torch.viz import style
 from cflow_torch.viz.panel import MOVING, draw_error, draw_flow, draw_ground, new_figure
+from cflow_torch.viz.writing import whole_file
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -56,19 +56,16 @@ def plot_flow(
 
     Cost: linear in the points; about a second for 100,000.
     """
-    position = point_rows("points", points, None)
+    view, position, is_floor, rest = split_sweep(points, is_ground, point_cloud_range)
     given = result_or_residual.residual_flow if isinstance(result_or_residual, FlowResult) else result_or_residual
     residual = point_rows("residual flow", given, len(position))
     true_flow = None if truth is None else point_rows("truth", truth, len(position))
-    ground = ground_rows(is_ground, len(position))
     if max_flow is not None and not 0 < max_flow < np.inf:
         raise CFlowError(f"max_flow={max_flow}: give a positive length in metres, or None for the longest flow drawn")
-    if legend is not None and legend not in CORNERS:
-        raise CFlowError(f"legend={legend!r}: give None or one of {', '.join(CORNERS)}")
-    view, is_inside = view_of(position, point_cloud_range)
+    if legend is not None and legend not in style.CORNERS:
+        raise CFlowError(f"legend={legend!r}: give None or one of {', '.join(style.CORNERS)}")
 
-    floor, rest = position[is_inside & ground], is_inside & ~ground
-    position, residual = position[rest], residual[rest]
+    floor, position, residual = position[is_floor], position[rest], residual[rest]
     cluster = None
     if isinstance(result_or_residual, FlowResult):
         cluster = as_numpy(result_or_residual.cluster_id)[rest]
@@ -82,8 +79,8 @@ def plot_flow(
     for axes in panels[:2]:
         draw_ground(axes, floor)
     draw_flow(panels[0], position, residual, cluster, max_flow)
-    draw_scale(panels[0])
-    draw_wheel(panels[0], position, np.linalg.norm(residual, axis=1) > MOVING, max_flow, legend)
+    style.draw_scale(panels[0])
+    style.draw_wheel(panels[0], position, np.linalg.norm(residual, axis=1) > MOVING, max_flow, legend)
     if true_flow is not None:
         draw_flow(panels[1], position, true_flow, None, max_flow)
         draw_error(panels[2], position, residual, true_flow)
@@ -95,24 +92,18 @@ def save_picture(figure: Figure, path: Union[str, Path]) -> Path:
 
     Args:
         figure: from `plot_flow`.
-        path: ends in .png; its folder exists.
+        path: ends in .png; its folder is made if absent.
 
     Returns:
         The path.
 
     Raises:
-        CFlowError: another ending, no such folder, or a folder that cannot be written to.
+        CFlowError: another ending.
+        OSError: the file cannot be written.
     """
     path = Path(path)
-    if path.suffix.lower() != ".png":
-        raise CFlowError(f"{path} does not end in .png: pictures are written as PNG")
-    if not path.parent.is_dir():
-        raise CFlowError(f"the folder {path.parent} does not exist: make it first")
-    try:
-        with atomic_file(path) as file:
-            figure.savefig(file, format="png", dpi=figure.dpi)
-    except OSError as error:
-        raise CFlowError(f"cannot write {path}: {error}") from error
+    with whole_file(path, ".png") as temporary:
+        figure.savefig(temporary, format="png", dpi=figure.dpi)
     return path
 
 
@@ -127,12 +118,16 @@ def point_rows(name: str, values: Array, count: Optional[int]) -> np.ndarray:
     return array[:, :3].astype(np.float64)
 
 
-def ground_rows(is_ground: Optional[Array], count: int) -> np.ndarray:
-    """(N,) bool."""
-    ground = np.zeros(count, bool) if is_ground is None else as_numpy(is_ground).astype(bool)
-    if ground.shape != (count,):
-        raise CFlowError(f"is_ground has shape {ground.shape}: give ({count},), one entry per point")
-    return ground
+def split_sweep(
+    points: Array, is_ground: Optional[Array], point_cloud_range: Optional[Sequence[float]]
+) -> Tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The view as in `view_of`, positions (N, 3) float64, and (N,) bool each: ground in view, other points in view."""
+    position = point_rows("points", points, None)
+    ground = np.zeros(len(position), bool) if is_ground is None else as_numpy(is_ground).astype(bool)
+    if ground.shape != (len(position),):
+        raise CFlowError(f"is_ground has shape {ground.shape}: give ({len(position)},), one entry per point")
+    view, is_inside = view_of(position, point_cloud_range)
+    return view, position, is_inside & ground, is_inside & ~ground
 
 
 def view_of(position: np.ndarray, point_cloud_range: Optional[Sequence[float]]) -> Tuple[np.ndarray, np.ndarray]:

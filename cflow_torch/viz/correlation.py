@@ -9,9 +9,9 @@ import numpy as np
 
 from cflow_torch.config import Config, make_config
 from cflow_torch.types import Window
-from cflow_torch.viz.occupancy import add_metres, occupancy_rgb, thin
+from cflow_torch.viz import style
+from cflow_torch.viz.occupancy import draw_occupancy
 from cflow_torch.viz.stages import ClusterCorrelation, cluster_correlation
-from cflow_torch.viz.style import INK, blank_figure, write
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 _COLORMAP = "viridis"
 _PEAK = "#e6194b"
 _MOST_LINES = 160  # of the surface, a side
-_THIN = 6.0  # a box that is so many times as long as wide
 
 
 def plot_correlation(
@@ -30,93 +29,73 @@ def plot_correlation(
 
     Args:
         window: sweeps.
-        config: of the dense method, without `proof`; None = the preset "paper", which leaves older sweeps out.
+        config: of the dense method, clusters by components; None = the preset "paper", which leaves older sweeps out.
         cluster_id: as in `FlowResult`; None = the most conspicuous mover, see `stages.cluster_correlation`.
         title: one line above; None = which cluster and what was found.
 
     Returns:
-        Figure, 1600 pixels wide: the cluster at t, at t+1, both with t moved by the shift that the method takes, the
-        map of scores as an image and as a surface, that shift marked in both. Axes in pixels below and to the left,
-        in metres above and to the right.
+        Figure, 1600 pixels wide: the cluster at t, at t+1, both with t moved by the shift that the method takes, in
+        metres, frame of t+1; the map of scores as an image and as a surface, in pixels, that shift marked in both.
 
     Raises:
-        CFlowError: matplotlib is absent, the method has no such map (key points, `proof`, HDBSCAN), no such cluster.
+        CFlowError: matplotlib is absent, no such cluster, or the method has no such map (key points, HDBSCAN, presets
+            default and fast).
 
     Source: the paper's figures of one car and of its NCC map; Eq. norm_correlation, displacement_in_bev.
     """
     if config is None:
         config, window = make_config("paper"), replace(window, pch=())
     found = cluster_correlation(window, config, cluster_id)
-    figure, places = _lay_out(found.images.t.shape)
-    size = found.images.pixel_size
-    dy, dx = found.shift
-    has_coarser = len(config.pixel_sizes) > 1
-    if title is None:
-        title = (
-            f"cluster {found.cluster_id}: moves by {_pair(dx, dy)} pixels of {size:g} m = "
-            f"{_pair(dx * size, dy * size)} m{' beyond the coarser scales' * has_coarser}, score {found.score:.2f}"
-        )
-        if np.abs(found.flow[:2] - found.shift[::-1] * size).max() > 1e-6:  # pooled with what older sweeps say
-            title += f"; with older sweeps {_pair(*found.flow[:2])} m"
-        if has_coarser:
-            title += f"; in all {_pair(*found.total[:2])} m"
-    write(figure, 1 - 0.35 / figure.get_figheight(), title)
-    nothing = np.zeros_like(found.images.t)
-    moved = _moved(found.images.t, found.shift)
-    for place, name, t, t1 in zip(
-        places,
-        (
-            "template: t moved by the coarser scales" if has_coarser else "template: sweep t",
-            "target: sweep t+1",
-            "t moved by the shift taken, and t+1",
-        ),
-        (found.images.t, nothing, moved),
-        (nothing, found.images.t1, found.images.t1),
-    ):
-        _draw_pixels(figure.add_axes(place), name, found, occupancy_rgb(t, t1))
-    _draw_map(figure.add_axes(places[3]), figure.add_axes(places[4]), found)
-    _draw_surface(figure.add_axes(places[5], projection="3d"), found)
+    figure, panels = _lay_out(found.images.t.shape)
+    style.add_heading(figure, 0.35, title or _title(found, config))
+    images, nothing = found.images, np.zeros_like(found.images.t)
+    height, width = nothing.shape
+    # A shift is shorter than the box: what leaves it does not come back from the other side.
+    around = np.pad(images.t, ((0, height), (0, width)))
+    moved = np.roll(around, tuple(found.shift), (0, 1))[:height, :width]
+    names = (
+        "template: t moved by the coarser scales" if len(config.pixel_sizes) > 1 else "template: sweep t",
+        "target: sweep t+1",
+        "t moved by the shift taken, and t+1",
+    )
+    for axes, name, t, t1 in zip(panels, names, (images.t, nothing, moved), (nothing, images.t1, images.t1)):
+        draw_occupancy(axes, replace(images, t=t, t1=t1), aspect="auto")
+        _name(axes, name, "x, m", "y, m")
+    _draw_map(panels[3], panels[4], found)
+    _draw_surface(panels[5], found)
     return figure
 
 
-def _lay_out(shape: Tuple[int, int]) -> Tuple[Figure, List[Tuple[float, float, float, float]]]:
-    """The figure, and (left, bottom, width, height) as fractions of it: four images, colour bar, surface."""
-    width, left, right = 3.35, 0.7, 5.25
-    height = float(np.clip(width * shape[0] / shape[1], 1.2, 3.35))
-    lower, upper = 0.65, 0.65 + height + 1.5
-    total = np.array((16.0, max(upper + height + 1.35, 6.4)))
-    lower, upper = np.array((lower, upper)) + (total[1] - (upper + height + 1.35)) / 2
-    inches = [(left, upper, width, height), (right, upper, width, height), (left, lower, width, height)]
-    inches += [(right, lower, width, height), (right + width + 0.75, lower, 0.13, height)]
-    inches.append((9.6, 0.2, 6.1, total[1] - 0.9))
-    wide, high = total
-    return blank_figure((wide, high), 100), [(x / wide, y / high, w / wide, h / high) for x, y, w, h in inches]
+def _title(found: ClusterCorrelation, config: Config) -> str:
+    size = found.images.pixel_size
+    dy, dx = found.shift
+    title = f"cluster {found.cluster_id}: moves by {_pair(dx, dy)} pixels of {size:g} m = "
+    title += f"{_pair(dx * size, dy * size)} m, score {found.score:.2f}"
+    others = ["coarser scales"] * (len(config.pixel_sizes) > 1) + ["older sweeps"] * (config.num_history > 0)
+    return f"{title}; with {' and '.join(others)} {_pair(*found.flow[:2])} m" if others else title
 
 
-def _moved(template: np.ndarray, shift: np.ndarray) -> np.ndarray:
-    """(H, W) bool, the template moved by whole pixels; what leaves the box is not drawn."""
-    row, col = np.nonzero(template)
-    row, col = row + int(np.rint(shift[0])), col + int(np.rint(shift[1]))
-    inside = (row >= 0) & (row < template.shape[0]) & (col >= 0) & (col < template.shape[1])
-    image = np.zeros_like(template)
-    image[row[inside], col[inside]] = True
-    return image
+def _lay_out(shape: Tuple[int, int]) -> Tuple[Figure, List[Any]]:
+    """The figure and its axes: four images, colour bar, surface."""
+    left, right = 0.7, 5.25
+    # Square pixels, unless the box is so long and thin that nothing could be seen.
+    height, width = np.maximum(3.35 * np.array(shape) / max(shape), 1.2)
+    total = max(2 * height + 2.9, 6.4)
+    lower = 0.65 + (total - 2 * height - 2.9) / 2
+    upper = lower + height + 1.2
+    figure = style.blank_figure((16.0, total), 100)
+    corners = [(left, upper), (right, upper), (left, lower), (right, lower)]
+    panels = [style.add_panel(figure, x, y, width, height) for x, y in corners]
+    panels.append(style.add_panel(figure, right + width + 0.2, lower, 0.13, height))
+    panels.append(style.add_panel(figure, 9.6, 0.2, 6.1, total - 0.9, projection="3d"))
+    return figure, panels
 
 
-def _aspect(found: ClusterCorrelation) -> Any:
-    """Of the images: square pixels, unless the box is so long and thin that nothing could be seen."""
-    height, width = found.images.t.shape
-    return "equal" if max(height, width) < _THIN * min(height, width) else "auto"
-
-
-def _draw_pixels(axes: Axes, name: str, found: ClusterCorrelation, image: np.ndarray) -> None:
-    height, width = found.images.t.shape
-    axes.imshow(image, extent=(0, width, 0, height), origin="lower", interpolation="nearest", aspect=_aspect(found))
-    axes.set_title(name, fontsize=12, color=INK, pad=33)
-    axes.set_xlabel("pixel", fontsize=9, color=INK, labelpad=2)
-    axes.set_ylabel("pixel", fontsize=9, color=INK, labelpad=2)
-    thin(axes, integer=True)
-    add_metres(axes, tuple(found.images.lower), found.images.pixel_size, ("x, m", "y, m"))
+def _name(axes: Axes, title: str, x: str, y: str) -> None:
+    axes.set_title(title, fontsize=12, color=style.INK, pad=8)
+    style.name_axes(axes, x, y)
+    style.thin_ticks(axes)
+    style.thin_frame(axes)
 
 
 def _draw_map(axes: Axes, beside: Axes, found: ClusterCorrelation) -> None:
@@ -131,58 +110,47 @@ def _draw_map(axes: Axes, beside: Axes, found: ClusterCorrelation) -> None:
         interpolation="nearest",
         cmap=_COLORMAP,
         vmin=0,
-        aspect=_aspect(found),
+        aspect="auto",
     )
     dy, dx = found.shift
     axes.plot(0, 0, "+", color="white", markersize=9, markeredgewidth=1.2)
     axes.plot(dx, dy, "o", markersize=13, markeredgewidth=2.2, markerfacecolor="none", markeredgecolor=_PEAK)
-    axes.set_title("score of every shift (+: no shift)", fontsize=12, color=INK, pad=33)
-    axes.set_xlabel("shift in x, pixels", fontsize=9, color=INK, labelpad=2)
-    axes.set_ylabel("shift in y, pixels", fontsize=9, color=INK, labelpad=2)
-    thin(axes, integer=True)
-    add_metres(axes, (0.0, 0.0), found.images.pixel_size, ("m", "m"))
+    _name(axes, "score of every shift (+: no shift)", *_shift_names(found))
     bar = axes.figure.colorbar(image, cax=beside)
-    bar.ax.tick_params(labelsize=9, labelcolor=INK, color=INK, length=2)
+    bar.ax.tick_params(labelsize=9, labelcolor=style.INK, color=style.INK, length=2)
     outline: Any = bar.outline  # whose type is known wrongly
     outline.set_visible(False)
 
 
 def _draw_surface(axes: Any, found: ClusterCorrelation) -> None:
     """The same map as a surface. Args: axes: three-dimensional."""
-    from matplotlib.ticker import MaxNLocator
-
     axes.patch.set_visible(False)  # it would hide the numbers beside it
-    height, width = found.ncc.shape
-    y, x = np.arange(height) - height // 2, np.arange(width) - width // 2
-    scores = np.where(np.isfinite(found.ncc), found.ncc, 0.0)
-    down, right = (-(-n // _MOST_LINES) for n in scores.shape)  # of each block the highest: no peak is lost
-    scores = np.pad(scores, ((0, -height % down), (0, -width % right)))
-    scores = scores.reshape(len(scores) // down, down, -1, right).max(axis=(1, 3))
-    y, x = y[::down] + (down - 1) / 2, x[::right] + (right - 1) / 2
-    if min(scores.shape) == 1:  # a line is no surface: put what is beyond it round it
-        y, x, scores = _widened(y, down), _widened(x, right), np.pad(scores, 1)
-    axes.plot_surface(*np.meshgrid(x, y), scores, cmap=_COLORMAP, rstride=1, cstride=1, linewidth=0, vmin=0)
+    # What is beyond the map is put round it: a line is no surface.
+    scores = np.pad(np.nan_to_num(found.ncc), 1)
+    y, x = (np.arange(n) - 1 - (n - 2) // 2 for n in scores.shape)
+    axes.plot_surface(
+        *np.meshgrid(x, y), scores, cmap=_COLORMAP, linewidth=0, vmin=0, rcount=_MOST_LINES, ccount=_MOST_LINES
+    )
     dy, dx = found.shift
     top = max(float(scores.max()), found.score, 0.1)
     axes.plot([dx, dx], [dy, dy], [found.score, 1.12 * top], color=_PEAK, linewidth=1.6, zorder=10)
     axes.plot([dx], [dy], [1.12 * top], "o", color=_PEAK, markersize=7, zorder=10)
     size = found.images.pixel_size
     axes.text(dx, dy, 1.18 * top, f"{_pair(dx * size, dy * size)} m", fontsize=12, color=_PEAK, ha="center")
-    stretch = np.array([width, height]) / max(width, height)
+    stretch = np.array(found.ncc.shape[::-1]) / max(found.ncc.shape)
     axes.set_box_aspect((*np.maximum(stretch, 0.45), 0.6), zoom=0.9)
     axes.set_zlim(0, 1.15 * top)
     axes.view_init(elev=32, azim=-62)
-    axes.set_xlabel(f"shift in x, pixels of {size:g} m", fontsize=10, color=INK, labelpad=8)
-    axes.set_ylabel(f"shift in y, pixels of {size:g} m", fontsize=10, color=INK, labelpad=8)
-    axes.set_zlabel("score (NCC)", fontsize=10, color=INK, labelpad=4)
-    axes.tick_params(labelsize=9, labelcolor=INK)
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_locator(MaxNLocator(5, integer=True))
+    names = (*_shift_names(found), "score (NCC)")
+    for axis, name in zip((axes.xaxis, axes.yaxis, axes.zaxis), names):
+        axis.set_label_text(name, fontsize=10, color=style.INK)
+        axis.labelpad = 8
+    axes.locator_params(axis="both", nbins=5)
+    axes.tick_params(labelsize=9, labelcolor=style.INK)
 
 
-def _widened(places: np.ndarray, step: int) -> np.ndarray:
-    """One more place at each end."""
-    return np.concatenate([places[:1] - step, places, places[-1:] + step])
+def _shift_names(found: ClusterCorrelation) -> List[str]:
+    return [f"shift in {axis}, pixels of {found.images.pixel_size:g} m" for axis in "xy"]
 
 
 def _pair(x: float, y: float) -> str:

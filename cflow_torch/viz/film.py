@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Iterator, Optional, Sequence
 import numpy as np
 
 from cflow_torch.types import Array, CFlowError, FlowResult
-from cflow_torch.viz.bev import ground_rows, longest_flow, plot_flow, point_rows, view_of
+from cflow_torch.viz.bev import longest_flow, plot_flow, point_rows, split_sweep
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -60,10 +60,8 @@ def flow_figures(
         raise CFlowError(f"width={width}: give 200 ... 4000 pixels")
     corners, longest = [], []
     for frame in frames:
-        position = point_rows("points", frame.points, None)
-        view, is_inside = view_of(position, point_cloud_range)
+        view, position, _, drawn = split_sweep(frame.points, frame.is_ground, point_cloud_range)
         corners.append(view)
-        drawn = is_inside & ~ground_rows(frame.is_ground, len(position))
         longest.append(longest_flow(point_rows("residual flow", frame.result.residual_flow, len(position))[drawn]))
     low, high = np.min(corners, axis=0)[0], np.max(corners, axis=0)[1]
     heights = (-np.inf, np.inf) if point_cloud_range is None else (point_cloud_range[2], point_cloud_range[5])

@@ -9,12 +9,11 @@ import numpy as np
 
 from cflow_torch.config import Config, make_config
 from cflow_torch.types import Window
+from cflow_torch.viz import style
 from cflow_torch.viz.bev import longest_flow
-from cflow_torch.viz.legend import draw_wheel
-from cflow_torch.viz.occupancy import crop, draw_occupancy, frame, sweep_marks
+from cflow_torch.viz.occupancy import draw_occupancy, sweep_marks
 from cflow_torch.viz.panel import MOVING
 from cflow_torch.viz.stages import KeyPointMatches, keypoint_matches
-from cflow_torch.viz.style import FAINT, INK, blank_figure, write
 from cflow_torch.viz.wheel import flow_to_rgb
 
 if TYPE_CHECKING:
@@ -45,41 +44,26 @@ def plot_keypoints(window: Window, config: Optional[Config] = None, *, title: Op
     Raises:
         CFlowError: matplotlib is absent, another method, or bad input.
     """
-    figure = blank_figure((16.0, 6.9), 100)
+    figure = style.blank_figure((16.0, 6.9), 100)
     if config is None:
         config, window = make_config("keypoints"), replace(window, pch=())
     found = keypoint_matches(window, config)
-    start, end = match_lines(found)
-    low, high = busiest(start, end)
+    low, high = busiest(found.start, found.end)
     if title is None:
-        title = f"{len(found.key_points)} key points at t, {len(found.source)} of them matched; shown is a part"
-    write(figure, 0.955, title)
-    panels = [figure.add_axes((left, 0.13, 0.445, 0.74)) for left in (0.04, 0.535)]
-    near = crop(found.images, low, high)
-    points = _middle(found.key_points, found)
+        title = f"{len(found.key_points)} key points at t, {len(found.start)} of them matched; shown is a part"
+    style.add_heading(figure, 0.31, title)
+    panels = [style.add_panel(figure, left, 0.9, 7.12, 5.1) for left in (0.64, 8.56)]
     for axes, fade, name in zip(panels, (0.0, _FADE), ("occupancy and key points", "matches")):
-        draw_occupancy(axes, near, fade)
-        frame(axes, low, high)
-        axes.apply_aspect()
-        axes.set_title(name, fontsize=14, color=INK, pad=7)
-        axes.set_xlabel("x, m (forward)", fontsize=10, color=INK)
-    panels[0].set_ylabel("y, m (left)", fontsize=10, color=INK)
-    dot = (0.45 * 72 * panels[0].bbox.width / figure.dpi * found.images.pixel_size / (2 * _HALF_VIEW[0])) ** 2
-    panels[0].plot(*points.T, "o", color=_POINT_COLOR, markersize=max(dot**0.5, 1.5), markeredgewidth=0, zorder=3)
-    _draw_matches(panels[1], found, start, end, low, high)
+        draw_occupancy(axes, found.images, fade)
+        style.set_view(axes, low, high, has_ticks=True)
+        axes.set_title(name, fontsize=14, color=style.INK, pad=7)
+        style.name_axes(axes, "x, m (forward)", "y, m (left)" if axes is panels[0] else "", 10)
+    pixel = 72 * 7.12 * found.images.pixel_size / (2 * _HALF_VIEW[0])  # points of print
+    dot = max(0.45 * pixel, 1.5)
+    panels[0].plot(*found.key_points.T, "o", color=_POINT_COLOR, markersize=dot, markeredgewidth=0, zorder=3)
+    _draw_matches(panels[1], found, low, high)
     _draw_legend(figure)
     return figure
-
-
-def match_lines(found: KeyPointMatches) -> Tuple[np.ndarray, np.ndarray]:
-    """(M, 2) float64, metres, where each match starts (key point of t) and where it ends (key point of t+1)."""
-    from_pixel = found.key_points[found.source]
-    return _middle(from_pixel, found), _middle(from_pixel + found.shift, found)
-
-
-def _middle(pixels: np.ndarray, found: KeyPointMatches) -> np.ndarray:
-    """(K, 2) float64 (x, y), metres, of (K, 2) pixels (row, col)."""
-    return found.images.lower + (pixels[:, ::-1] + 0.5) * found.images.pixel_size
 
 
 def busiest(start: np.ndarray, end: np.ndarray) -> Tuple[np.ndarray, np.ndarray]:
@@ -98,25 +82,23 @@ def busiest(start: np.ndarray, end: np.ndarray) -> Tuple[np.ndarray, np.ndarray]
     return middle - _HALF_VIEW, middle + _HALF_VIEW
 
 
-def _draw_matches(
-    axes: Axes, found: KeyPointMatches, start: np.ndarray, end: np.ndarray, low: np.ndarray, high: np.ndarray
-) -> None:
+def _draw_matches(axes: Axes, found: KeyPointMatches, low: np.ndarray, high: np.ndarray) -> None:
     from matplotlib.collections import LineCollection
 
-    inside = ((start > low) & (start < high)).all(axis=1)
-    start, end = start[inside], end[inside]
+    inside = ((found.start > low) & (found.start < high)).all(axis=1)
+    start, end = found.start[inside], found.end[inside]
     flow = end - start
     max_flow = longest_flow(flow)
     color = flow_to_rgb(flow, max_flow) / 255
     moves = np.linalg.norm(flow, axis=1) > MOVING
     still = start[~moves]
-    axes.plot(*still.T, "o", color=FAINT, markersize=2.5, markeredgewidth=0, zorder=3)
+    axes.plot(*still.T, "o", color=style.FAINT, markersize=2.5, markeredgewidth=0, zorder=3)
     lines = np.stack([start, end], axis=1)[moves]
-    axes.add_collection(LineCollection(lines, colors=INK, linewidths=1.9, alpha=0.5, zorder=4))
+    axes.add_collection(LineCollection(lines, colors=style.INK, linewidths=1.9, alpha=0.5, zorder=4))
     axes.add_collection(LineCollection(lines, colors=color[moves], linewidths=1.1, zorder=5))
-    axes.scatter(end[moves, 0], end[moves, 1], s=14, c=color[moves], linewidths=0.6, edgecolors=INK, zorder=6)
+    axes.scatter(end[moves, 0], end[moves, 1], s=14, c=color[moves], linewidths=0.6, edgecolors=style.INK, zorder=6)
     along = np.concatenate([start + part * flow for part in np.linspace(0, 1, _ALONG)])
-    draw_wheel(axes, along, np.tile(moves, _ALONG), max_flow)
+    style.draw_wheel(axes, along, np.tile(moves, _ALONG), max_flow)
 
 
 def _draw_legend(figure: Figure) -> None:
@@ -126,5 +108,5 @@ def _draw_legend(figure: Figure) -> None:
     marks = sweep_marks()
     marks.append(Line2D([], [], marker="o", linestyle="", markersize=7, color=_POINT_COLOR, label="key point of t"))
     marks.append(Line2D([], [], linewidth=2.5, color="#00a0b0", label="match that moves, dot at t+1"))
-    marks.append(Line2D([], [], marker="o", linestyle="", markersize=4, color=FAINT, label="match that stays"))
-    figure.legend(handles=marks, loc="lower center", ncol=len(marks), frameon=False, fontsize=11, labelcolor=INK)
+    marks.append(Line2D([], [], marker="o", linestyle="", markersize=4, color=style.FAINT, label="match that stays"))
+    figure.legend(handles=marks, loc="lower center", ncol=len(marks), frameon=False, fontsize=11, labelcolor=style.INK)

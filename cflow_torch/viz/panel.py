@@ -8,8 +8,7 @@ import numpy as np
 import torch
 
 from cflow_torch.ops.labeling import connected_components
-from cflow_torch.viz.legend import SWEEP_RATE, legend_box, wheel_inches
-from cflow_torch.viz.style import FAINT, FRAME, GROUND, INK, STATIC, blank_figure, inches_of, round_length, write
+from cflow_torch.viz import style
 from cflow_torch.viz.wheel import flow_to_rgb
 
 if TYPE_CHECKING:
@@ -24,7 +23,7 @@ OBJECT_PIXEL = 0.5  # metres; movers in touching pixels are one object where no 
 _MAX_PIXELS = 2048  # a side; movers spread wider get larger pixels
 FLOW_CAPTION = (
     f"grey: static   colour: moves more than {MOVING:g} m per sweep   "
-    f"arrow: motion over {ARROW_STEPS} sweeps ({ARROW_STEPS / SWEEP_RATE:g} s at {SWEEP_RATE} Hz)"
+    f"arrow: motion over {ARROW_STEPS} sweeps ({ARROW_STEPS / style.SWEEP_RATE:g} s at {style.SWEEP_RATE} Hz)"
 )
 _RING, _MOST_RINGS = 10.0, 20  # metres between two rings; wider views get wider steps
 _HIGHEST = 2.0  # widths, height of a panel at most; at least it is that of two wheels
@@ -51,46 +50,34 @@ def new_figure(
     gap, foot = 0.2, 0.42
     full, dpi = (10.0, 100) if len(names) == 1 else (16.0, 112)
     width = full / len(names) - gap * (1 + 1 / len(names))
-    view = _widened(view, 2 * wheel_inches(width)[1] / width)
     extent = view[1] - view[0]
-    height = float(width * extent[1] / extent[0])
+    wanted = np.maximum(extent, (extent[1] / _HIGHEST, extent[0] * 2 * style.WHEEL_INCHES[1] / width))
+    view = view + np.array([[-0.5], [0.5]]) * (wanted - extent)
+    height = float(width * wanted[1] / wanted[0])
     head = (0.5 if title else 0) + (0.42 if any(names) else 0) or gap
-    total = (full, height + head + foot)
-    figure = blank_figure(total, dpi)
+    figure = style.blank_figure((full, height + head + foot), dpi)
     from matplotlib.patches import Circle
 
     farthest = float(np.abs(view).max())
-    step = max(_RING, round_length(farthest / (0.4 * _MOST_RINGS)))  # rounding takes up to three fifths away
+    step = max(_RING, style.round_length(farthest / (0.4 * _MOST_RINGS)))  # rounding takes up to three fifths away
     panels = []
     for i, name in enumerate(names):
-        place = ((gap + i * (width + gap)) / total[0], foot / total[1], width / total[0], height / total[1])
-        axes = figure.add_axes(place)
-        axes.set(xlim=view[:, 0], ylim=view[:, 1], aspect="equal", xticks=[], yticks=[])
-        for spine in axes.spines.values():
-            spine.set(color=FRAME, linewidth=0.8)
+        axes = style.add_panel(figure, gap + i * (width + gap), foot, width, height)
+        style.set_view(axes, *view)
         for radius in np.arange(step, farthest + 1e-9, step).tolist():
-            axes.add_patch(Circle((0, 0), radius, fill=False, color=FRAME, alpha=0.45, linewidth=0.8, zorder=0.5))
+            axes.add_patch(Circle((0, 0), radius, fill=False, color=style.FRAME, alpha=0.45, linewidth=0.8, zorder=0.5))
         if name:
-            axes.set_title(name, fontsize=14, color=INK, pad=7)
-        axes.apply_aspect()  # now, so that sizes in inches are right from here on
+            axes.set_title(name, fontsize=14, color=style.INK, pad=7)
         panels.append(axes)
     if title:
-        write(figure, 1 - 0.3 / total[1], title)
-    caption = f"{caption}   rings: every {step:g} m"
-    figure.text(0.5, 0.2 / total[1], caption, fontsize=11, color=FAINT, ha="center", va="center")
+        style.add_heading(figure, 0.3, title)
+    style.add_caption(figure, f"{caption}   rings: every {step:g} m")
     return figure, panels
-
-
-def _widened(view: np.ndarray, lowest: float) -> np.ndarray:
-    """The view, or one round it whose height is at least `lowest` and at most `_HIGHEST` widths."""
-    extent = view[1] - view[0]
-    wanted = np.maximum(extent, (extent[1] / _HIGHEST, extent[0] * lowest))
-    return view + np.array([[-0.5], [0.5]]) * (wanted - extent)
 
 
 def draw_ground(axes: Axes, position: np.ndarray) -> None:
     """Ground points, hardly there."""
-    axes.scatter(position[:, 0], position[:, 1], s=dot_area(axes), color=GROUND, linewidths=0, zorder=1)
+    axes.scatter(position[:, 0], position[:, 1], s=dot_area(axes), color=style.GROUND, linewidths=0, zorder=1)
 
 
 def draw_flow(
@@ -108,7 +95,7 @@ def draw_flow(
     is_mover = np.linalg.norm(flow, axis=1) > MOVING  # False for NaN
     dot = dot_area(axes)
     still = position[~is_mover]
-    axes.scatter(still[:, 0], still[:, 1], s=dot, color=STATIC, linewidths=0, zorder=2)
+    axes.scatter(still[:, 0], still[:, 1], s=dot, color=style.STATIC, linewidths=0, zorder=2)
     position, flow, cluster = position[is_mover], flow[is_mover], None if cluster is None else cluster[is_mover]
     # A dark rim keeps yellow visible on white; that of slow, pale movers is lighter, so that fast ones stand out.
     speed = np.minimum(np.hypot(flow[:, 0], flow[:, 1]) / max_flow, 1)
@@ -120,7 +107,7 @@ def draw_flow(
     axes.scatter(x, y, s=4 * dot, c=color, linewidths=0, zorder=4)
 
     group = _objects(position) if cluster is None else cluster
-    middle, count = group_medians(group, np.concatenate([position[:, :2], flow[:, :2]], axis=1))
+    _, middle, count = group_medians(group, np.concatenate([position[:, :2], flow[:, :2]], axis=1))
     axes.quiver(
         *middle[count >= MIN_ARROW_POINTS].T,
         angles="xy",
@@ -132,7 +119,7 @@ def draw_flow(
         headlength=4.5,
         headaxislength=4,
         minlength=0.5,
-        color=INK,
+        color=style.INK,
         edgecolor="white",
         linewidth=0.7,
         zorder=6,
@@ -159,15 +146,15 @@ def draw_error(axes: Axes, position: np.ndarray, flow: np.ndarray, truth: np.nda
     size = dot_area(axes) * np.where(error > 0, 4, 1)
     axes.set_facecolor(_SLATE)
     dots = axes.scatter(x, y, s=size, c=error, cmap="hot", vmin=0, vmax=MAX_ERROR, linewidths=0, zorder=2)
-    box = legend_box(axes, position, error > 0, (1.8, 0.66))
+    box = style.legend_box(axes, position, error > 0, (1.8, 0.66))
     bar = axes.figure.colorbar(dots, cax=box.inset_axes((0.1, 0.7, 0.8, 0.18)), orientation="horizontal")
     bar.set_ticks([0, 0.1, 0.2, 0.3], labels=["0", "0.1", "0.2", "0.3"])
-    bar.set_label(f"error, m (white ≥ {MAX_ERROR:g})", fontsize=10, color=INK, labelpad=1)
-    bar.ax.tick_params(labelsize=10, labelcolor=INK, color=INK, length=2, pad=2)
+    bar.set_label(f"error, m (white ≥ {MAX_ERROR:g})", fontsize=10, color=style.INK, labelpad=1)
+    bar.ax.tick_params(labelsize=10, labelcolor=style.INK, color=style.INK, length=2, pad=2)
     draw_ego(axes, "white", _SLATE)
 
 
-def group_medians(group: np.ndarray, values: np.ndarray) -> Tuple[np.ndarray, np.ndarray]:
+def group_medians(group: np.ndarray, values: np.ndarray) -> Tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Median of each column within each group.
 
     Args:
@@ -175,14 +162,16 @@ def group_medians(group: np.ndarray, values: np.ndarray) -> Tuple[np.ndarray, np
         values: (N, C) float64.
 
     Returns:
-        (G, C) medians (the upper one of an even count) in ascending order of the group, and (G,) int64 counts.
+        number: (G,) int64, groups, ascending.
+        median: (G, C) float64, the upper one of an even count.
+        count: (G,) int64, rows.
 
     Cost: one sort per column.
     """
     values, group = values[group >= 0], group[group >= 0]
-    _, start, count = np.unique(np.sort(group), return_index=True, return_counts=True)
+    number, start, count = np.unique(np.sort(group), return_index=True, return_counts=True)
     columns = [column[np.lexsort((column, group))][start + count // 2] for column in values.T]
-    return np.stack(columns, axis=1), count
+    return number, np.stack(columns, axis=1), count
 
 
 def _objects(position: np.ndarray) -> np.ndarray:
@@ -200,7 +189,7 @@ def _objects(position: np.ndarray) -> np.ndarray:
     return of_pixel.reshape(occupancy.shape)[0, row, column].numpy()
 
 
-def draw_ego(axes: Axes, color: str = INK, halo: Any = "white") -> None:
+def draw_ego(axes: Axes, color: str = style.INK, halo: Any = "white") -> None:
     """The ego vehicle: an arrow head of a car's length at the origin, pointing to +x."""
     from matplotlib.patheffects import withStroke
 
@@ -211,11 +200,11 @@ def draw_ego(axes: Axes, color: str = INK, halo: Any = "white") -> None:
     axes.fill([2.4, -1.9, -1.0, -1.9], [0, 1.15, 0, -1.15], color=color, linewidth=0, zorder=9, path_effects=effects)
     # The name stands behind the vehicle, where no lane is, unless the view ends there.
     x, side = (-2.3, "right") if left < -0.1 * (right - left) else (2.8, "left")
-    size = 12 if inches_of(axes)[0] > 4 else 9
+    size = 12 if style.inches_of(axes)[0] > 4 else 9
     axes.text(x, 0, "ego", fontsize=size, color=color, ha=side, va="center_baseline", zorder=9, path_effects=effects)
 
 
 def dot_area(axes: Axes) -> float:
     """Area of a static point in square points: about 0.2 m, never less than a fine dot."""
-    points_per_metre = 72 * inches_of(axes)[0] / float(np.diff(axes.get_xlim())[0])
+    points_per_metre = 72 * style.inches_of(axes)[0] / float(np.diff(axes.get_xlim())[0])
     return max((0.2 * points_per_metre) ** 2, 0.5)

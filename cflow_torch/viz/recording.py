@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import os
 import uuid
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Iterable, List, Optional, Tuple, Union
 
 import numpy as np
 
-from cflow_torch.data.atomic import atomic_name
 from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.types import CFlowError, FlowResult, Sweep, as_numpy
-from cflow_torch.viz.coloring import cluster_to_rgb
+from cflow_torch.viz.clusters import cluster_colors
 from cflow_torch.viz.panel import ARROW_STEPS, MIN_ARROW_POINTS, MOVING, group_medians
-from cflow_torch.viz.source import Source
 from cflow_torch.viz.wheel import flow_to_rgb
+from cflow_torch.viz.writing import whole_file
 
 if TYPE_CHECKING:
     import rerun
@@ -28,6 +26,7 @@ MAX_FLOW = 1.5  # metres per sweep: 15 m/s at 10 Hz
 _DOT, _FINE_DOT = -1.5, -0.8  # negative: pixels of the screen
 _STATIC, _GROUND_COLOR, _NEXT_COLOR = (132, 138, 147), (70, 74, 81), (60, 110, 130)
 _EGO_COLOR = (255, 255, 255)
+_NO_CLUSTER = (100, 105, 112)
 _BACKGROUND = (22, 25, 30)
 _CALENDAR = 10**17  # nanoseconds; later ones are a date (1973 and on), earlier ones a duration
 
@@ -62,34 +61,25 @@ def record_log(
     Raises:
         CFlowError: rerun-sdk is absent or too old, another ending, a `max_flow` that is not positive, no result at all,
             or a result with other rows than its sweep.
-        OSError: the log cannot be read. What `results` raises stays as it is, too.
+        OSError: the log cannot be read, or the file not be written. What `results` raises stays as it is, too.
 
     Cost: about 20 bytes per point and pair on disk for each entity that shows it.
     """
     path = Path(path)
-    if path.suffix.lower() != ".rrd":
-        raise CFlowError(f"{path} does not end in .rrd: recordings are written as such")
     if not 0 < max_flow < np.inf:
         raise CFlowError(f"max_flow={max_flow}: give a positive length in metres per sweep")
     rr = load_rerun()
-    pairs = Source((i, log.sweep(i), log.sweep(i + 1), result, log.labels(i)) for i, result in results)
-    try:
-        with atomic_name(path) as temporary:
-            stream = rr.RecordingStream("cflow_torch", recording_id=f"{log.log_id}-{uuid.uuid4().hex}")
-            stream.save(temporary)
-            try:
-                drive = _Drive(rr, stream, max_flow)
-                for pair in pairs:
-                    drive.add(*pair)
-                drive.end(log.log_id)
-                stream.flush()
-            finally:
-                stream.disconnect()
-            _sync(temporary)
-    except OSError as error:
-        if error is pairs.error:
-            raise
-        raise CFlowError(f"cannot write {path}: {error}") from error
+    with whole_file(path, ".rrd") as temporary:
+        stream = rr.RecordingStream("cflow_torch", recording_id=f"{log.log_id}-{uuid.uuid4().hex}")
+        stream.save(temporary)
+        try:
+            drive = _Drive(rr, stream, max_flow)
+            for i, result in results:
+                drive.add(i, log.sweep(i), log.sweep(i + 1), result, log.labels(i))
+            drive.end(log.log_id)
+            stream.flush()
+        finally:
+            stream.disconnect()
     return drive.count
 
 
@@ -141,7 +131,7 @@ class _Drive:
         self._set_time(index, pc0.timestamp_ns)
         self._move(pc1.pose)
         self._points(ESTIMATE, position[shown], self._color(residual[shown]))
-        self._points(CLUSTERS, position[shown], cluster_to_rgb(position[shown], cluster[shown]))
+        self._points(CLUSTERS, position[shown], cluster_colors(position[shown], cluster[shown], _NO_CLUSTER))
         self._points(GROUND, position[is_known & ground], _GROUND_COLOR, _FINE_DOT)
         after = as_numpy(pc1.points)[:, :3]
         self._points(NEXT_SWEEP, after[np.isfinite(after).all(axis=1)], _NEXT_COLOR, _FINE_DOT)
@@ -153,8 +143,7 @@ class _Drive:
 
         moving = shown & (np.linalg.norm(residual, axis=1) > MOVING)
         columns = np.concatenate([position[moving], residual[moving]], axis=1)
-        middle, count = group_medians(cluster[moving], columns)
-        numbers = np.unique(cluster[moving & (cluster >= 0)])
+        numbers, middle, count = group_medians(cluster[moving], columns)
         large = count >= MIN_ARROW_POINTS
         start, vector = middle[large, :3], middle[large, 3:]
         names = [f"cluster {n}: {np.linalg.norm(v):.2f} m per sweep" for n, v in zip(numbers[large], vector)]
@@ -230,11 +219,3 @@ class _Drive:
             beside.insert(0, view("ground truth", ESTIMATE, CLUSTERS, NEXT_SWEEP, ARROWS))
         parts = rrb.Horizontal(rrb.Tabs(estimate, over_next), rrb.Vertical(*beside), column_shares=[2, 1])
         return rrb.Blueprint(parts, collapse_panels=True)
-
-
-def _sync(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDWR)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

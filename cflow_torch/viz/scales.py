@@ -9,12 +9,11 @@ import numpy as np
 
 from cflow_torch.config import Config, make_config
 from cflow_torch.types import FlowResult, Window
+from cflow_torch.viz import style
 from cflow_torch.viz.bev import longest_flow, point_rows, view_of
-from cflow_torch.viz.legend import fill_wheel
-from cflow_torch.viz.occupancy import crop, draw_occupancy, frame, sweep_marks
-from cflow_torch.viz.panel import FLOW_CAPTION, draw_flow
+from cflow_torch.viz.occupancy import draw_occupancy, sweep_marks
+from cflow_torch.viz.panel import FLOW_CAPTION, draw_flow, group_medians
 from cflow_torch.viz.stages import Scale, scales
-from cflow_torch.viz.style import FAINT, FRAME, INK, blank_figure, write
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -30,8 +29,8 @@ def plot_scales(window: Window, config: Optional[Config] = None, *, title: Optio
 
     Args:
         window: sweeps.
-        config: without `proof`; None = the preset "paper" with pixels of 0.4, 0.2 and 0.1 m, which leaves older
-            sweeps out.
+        config: of one of the paper's methods; None = the preset "paper" with pixels of 0.4, 0.2 and 0.1 m, which
+            leaves older sweeps out.
         title: one line above; None = the pixel sizes.
 
     Returns:
@@ -42,7 +41,8 @@ def plot_scales(window: Window, config: Optional[Config] = None, *, title: Optio
     Convention: metres, frame of t+1.
 
     Raises:
-        CFlowError: matplotlib is absent, the method has no scales one after the other (`proof`), or bad input.
+        CFlowError: matplotlib is absent, the method has no scales one after the other (presets default and fast), or
+            bad input.
 
     Source: the paper's multi-scale strategy and its figure.
     """
@@ -56,51 +56,46 @@ def plot_scales(window: Window, config: Optional[Config] = None, *, title: Optio
     lines = 1 if count <= 4 else 2  # of the panels' names
     more = 0.2 * (lines - 1)  # inches
     below_y, above_y = 0.5, width + 1.2 + more
-    total = np.array((16.0, 2 * width + 2.3 + 2 * more))
-    figure = blank_figure((total[0], total[1]), 100)
-
-    def panels(bottom: float, inches: float, first: float, number: int) -> List[Axes]:
-        corners = [(first + i * (inches + gap), bottom) for i in range(number)]
-        return [figure.add_axes((*np.array(c) / total, *inches / total)) for c in corners]
-
-    if title is None:
-        title = "coarse to fine: " + " → ".join(f"{size:g} m" for size in config.pixel_sizes)
-    write(figure, 1 - 0.32 / total[1], title)
+    figure = style.blank_figure((16.0, 2 * width + 2.3 + 2 * more), 100)
+    above, below = (
+        [style.add_panel(figure, left + i * (width + gap), bottom, width, width) for i in range(count)]
+        for bottom in (above_y, below_y)
+    )
+    style.add_heading(
+        figure, 0.32, title or "coarse to fine: " + " → ".join(f"{size:g} m" for size in config.pixel_sizes)
+    )
     position = point_rows("points", window.pc0.points, None) + result.pose_flow.numpy()
-    above, below = (panels(bottom, width, left, count) for bottom in (above_y, below_y))
     _draw_near(above, position, found, result, alone)
     max_flow = _draw_flows(below, config, position, found, result, alone)
-
-    marks = figure.add_axes((1 - side / total[0], above_y / total[1], side / total[0], width / total[1]))
-    marks.legend(handles=sweep_marks(), loc="center left", frameon=False, fontsize=11, labelcolor=INK)
-    marks.axis("off")
-    wheel = side - 0.1
-    (box,) = panels(below_y + (width - 1.14 * wheel) / 2, wheel, 16.0 - wheel, 1)
-    box.axis("off")
-    fill_wheel(box, wheel, max_flow)
-    figure.text(0.5, 0.2 / total[1], FLOW_CAPTION, fontsize=11, color=FAINT, ha="center", va="center")
     for axes in (*above, *below):
         name = axes.get_title().replace(": ", ":\n", lines - 1)
-        axes.set_title(name, fontsize=min(12, 8 * width), color=INK, pad=6)
+        axes.set_title(name, fontsize=min(12, 8 * width), color=style.INK, pad=6)
+
+    marks = style.add_panel(figure, 16.0 - side, above_y, side, width)
+    marks.legend(handles=sweep_marks(), loc="center left", frameon=False, fontsize=11, labelcolor=style.INK)
+    wheel, high = style.WHEEL_INCHES
+    box = style.add_panel(figure, 16.0 - wheel, below_y + (width - high) / 2, wheel, high)
+    style.fill_wheel(box, max_flow)
+    for axes in (marks, box):
+        axes.axis("off")
+    style.add_caption(figure, FLOW_CAPTION)
     return figure
 
 
 def _shown(result: FlowResult, alone: FlowResult) -> np.ndarray:
     """(N,) bool, points of the mover whose flow coarse to fine changes most against the finest pixels alone.
 
-    Convention: of the larger clusters, by mean change, at most the flow itself, times the score of the match. If
+    Convention: of the larger clusters, by median change, at most the flow itself, times the score of the match. If
         nothing changes, the fastest.
     """
     cluster, flow = result.cluster_id.numpy(), result.residual_flow.numpy()
-    has_one = cluster >= 0
-    if not has_one.any():
-        return has_one
     change = np.linalg.norm(flow - alone.residual_flow.numpy(), axis=1)
     speed = np.linalg.norm(flow, axis=1)
     weight = (np.minimum(change, speed) if change.any() else speed) * result.score.numpy()
-    size = np.bincount(cluster[has_one])
-    mean = np.bincount(cluster[has_one], weights=weight[has_one]) / np.maximum(size, 1)
-    return cluster == int(np.argmax(np.where(size >= min(_MIN_POINTS, size.max()), mean, -1)))
+    number, median, count = group_medians(cluster, weight[:, None])
+    if not len(number):
+        return cluster >= 0
+    return cluster == number[np.where(count >= min(_MIN_POINTS, count.max()), median[:, 0], -1).argmax()]
 
 
 def _square(position: np.ndarray) -> Tuple[np.ndarray, np.ndarray]:
@@ -111,28 +106,24 @@ def _square(position: np.ndarray) -> Tuple[np.ndarray, np.ndarray]:
     return middle - half, middle + half
 
 
-def _length(flow: np.ndarray, shown: np.ndarray) -> float:
-    """Length of the median flow of the points that are shown, metres."""
-    return float(np.linalg.norm(np.median(flow[shown], axis=0))) if shown.any() else 0.0
-
-
 def _draw_near(
     panels: List[Axes], position: np.ndarray, found: List[Scale], result: FlowResult, alone: FlowResult
 ) -> None:
     """What each scale sees of one object, and in the last panel where it ends."""
     shown = _shown(result, alone)
-    low, high = _square(np.concatenate([position[shown], (position + found[-1].flow_after)[shown]]))
-    seen = [(scale.before, scale.flow_before) for scale in found] + [(found[-1].after, found[-1].flow_after)]
-    for axes, (images, flow) in zip(panels, seen):
-        draw_occupancy(axes, crop(images, low, high))
-        frame(axes, low, high)
-        is_last, is_first = axes is panels[-1], axes is panels[0]
-        name = "result" if is_last else f"{images.pixel_size:g} m pixels"
-        words = "t as it is" if is_first else f"t moved by {_length(flow, shown):.2f} m"
-        axes.set_title(f"{name}: {words}")
-        axes.set_xlabel("x, m", fontsize=9, color=INK, labelpad=1)
-        axes.tick_params(labelleft=is_first)
-    panels[0].set_ylabel("y, m", fontsize=9, color=INK, labelpad=1)
+    low, high = _square(np.concatenate([position[shown], (position + found[-1].flow)[shown]]))
+    images = [scale.seen() for scale in found] + [found[-1].result()]
+    moved = ["as it is"]
+    for scale in found:
+        flow = np.median(scale.flow[shown], axis=0) if shown.any() else 0.0
+        moved.append(f"moved by {np.linalg.norm(flow):.2f} m")
+    names = [f"{one.pixel_size:g} m pixels" for one in images[:-1]] + ["result"]
+    for axes, one, name, words in zip(panels, images, names, moved):
+        draw_occupancy(axes, one)
+        style.set_view(axes, low, high, has_ticks=True)
+        axes.set_title(f"{name}: t {words}")
+        style.name_axes(axes, "x, m", "y, m" if axes is panels[0] else "")
+        axes.tick_params(labelleft=axes is panels[0])
 
 
 def _draw_flows(
@@ -150,17 +141,14 @@ def _draw_flows(
     """
     view, is_inside = view_of(position, config.point_cloud_range)
     keep = is_inside & result.is_valid.numpy()
-    flows = [scale.flow_after[keep] for scale in found]
+    flows = [scale.flow[keep] for scale in found]
     flows.append(alone.residual_flow.numpy()[keep].astype(np.float64))
     max_flow = longest_flow(np.concatenate(flows))
     names = [f"flow after {size:g} m" for size in config.pixel_sizes]
     names[-1] += ": the result"
     names.append(f"for comparison: {config.pixel_sizes[-1]:g} m alone")
     for axes, name, flow in zip(panels, names, flows):
-        axes.set(xlim=view[:, 0], ylim=view[:, 1], aspect="equal", xticks=[], yticks=[])
-        for spine in axes.spines.values():
-            spine.set(color=FRAME, linewidth=0.8)
-        axes.apply_aspect()
+        style.set_view(axes, *view)
         draw_flow(axes, position[keep], flow, None, max_flow)
         axes.set_title(name)
     return max_flow

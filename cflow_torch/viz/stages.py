@@ -1,30 +1,49 @@
-"""What the method sees on its way, as plain arrays: scales, the correlation of one cluster, key points and matches.
+"""What the paper's methods see on their way, as plain arrays: scales, the correlation of one cluster, key points.
 
-Nothing is computed anew here: a run of the model is watched, and the stage functions of the package are asked again.
+A run of the model is watched from scale to scale; what it does within the finest one, the same functions are asked
+again. The presets default and fast weigh the motions of all scales at once and have none of these.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import List, Optional, Tuple
+from dataclasses import dataclass, replace
+from typing import Any, List, Optional, Tuple
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.config import Config, DenseConfig, KeypointsConfig
 from cflow_torch.dense.clustering import find_clusters
-from cflow_torch.dense.correlation import correlate
-from cflow_torch.dense.projection import project
+from cflow_torch.dense.correlation import best_shifts
+from cflow_torch.dense.projection import ProjectedSweeps, project
 from cflow_torch.dense.templates import Images, make_pairs
+from cflow_torch.estimate import make_model
 from cflow_torch.keypoints.descriptors import describe
 from cflow_torch.keypoints.match_candidates import match_radius
 from cflow_torch.keypoints.matching import match
+from cflow_torch.model import Motion
 from cflow_torch.ops.cross_correlation import cross_correlate
 from cflow_torch.ops.indices import flat_nonzero
 from cflow_torch.types import CFlowError, FlowResult, Window
 from cflow_torch.viz.panel import group_medians
-from cflow_torch.viz.watch import Occupancy, Step, watch
+
+
+@dataclass(frozen=True)
+class Occupancy:
+    """BEV images of a pair of sweeps.
+
+    Args:
+        t, t1: (H, W) bool, sweep t moved by the flow so far, and sweep t+1; row from y, column from x.
+        lower: (2,) float64, metres, corner (x, y) of pixel (0, 0), frame of t+1.
+        pixel_size: metres.
+    """
+
+    t: np.ndarray
+    t1: np.ndarray
+    lower: np.ndarray
+    pixel_size: float
 
 
 @dataclass(frozen=True)
@@ -32,17 +51,25 @@ class Scale:
     """One step from coarse to fine.
 
     Args:
-        before: what this scale sees: sweep t moved by the flow of the coarser ones.
-        after: the same pixels, sweep t moved by the flow that includes this scale's.
-        flow_before, flow_after: (N, 3) float64, residual flow of the rows of pc0 so far, metres per sweep interval.
-        cluster_id: (N,) int64, clusters of this scale, -1 = none.
+        sweeps: what this scale was given: the one window, warped by the flow of the coarser scales.
+        motion: what it added.
+        flow: (N, 3) float64, residual flow of the rows of pc0 with this scale's, metres per sweep interval.
     """
 
-    before: Occupancy
-    after: Occupancy
-    flow_before: np.ndarray
-    flow_after: np.ndarray
-    cluster_id: np.ndarray
+    sweeps: ProjectedSweeps
+    motion: Motion
+    flow: np.ndarray
+
+    def seen(self) -> Occupancy:
+        """The pair that this scale was given: sweep t moved by the flow of the coarser ones."""
+        return _pair(self.sweeps)
+
+    def result(self) -> Occupancy:
+        """The same pixels with sweep t moved by `flow`."""
+        batch = self.sweeps.batch
+        flow = torch.zeros_like(batch.positions)
+        flow[:, batch.sources[0].points] = torch.from_numpy(self.flow).T[: len(flow)]
+        return _pair(project(batch, flow, self.sweeps.grid))
 
 
 @dataclass(frozen=True)
@@ -53,11 +80,10 @@ class ClusterCorrelation:
         cluster_id: as in `FlowResult`.
         images: template (t) and target (t+1): the pixels of the cluster in its box.
         ncc: (H, W) float64 of each shift (dy, dx) at [dy + H // 2, dx + W // 2], 0 ... 1; NaN = not searched.
-        shift: (2,) float64, (dy, dx) that the method takes, pixels.
+        shift: (2,) int64, (dy, dx) that the method takes, pixels.
         score: NCC at that shift.
-        flow: (3,) float64, flow of the cluster at this scale, metres per sweep interval: the shift times the pixel
-            size where there is no history.
-        total: (3,) float64, the same with what the coarser scales found, in the median of its points.
+        flow: (3,) float64, residual flow of the cluster, metres per sweep interval: the shift times the pixel size,
+            with what coarser scales and older sweeps say.
     """
 
     cluster_id: int
@@ -66,115 +92,98 @@ class ClusterCorrelation:
     shift: np.ndarray
     score: float
     flow: np.ndarray
-    total: np.ndarray
 
 
 @dataclass(frozen=True)
 class KeyPointMatches:
-    """Key points of both sweeps and the matches that the ratio test accepts, at the finest scale.
+    """Key points of sweep t and the matches that the ratio test accepts, at the finest scale.
 
     Args:
         images: occupancy.
-        key_points, key_points1: (K, 2) int64, (row, col), sweep t and t+1.
-        source: (M,) int64, key point of t of each match.
-        shift: (M, 2) int64, (dy, dx), pixels.
-        score: (M,) float64, NCC of the descriptors.
+        key_points: (K, 2) float64, (x, y), metres, frame of t+1: the middle of each one's pixel.
+        start, end: (M, 2) float64, likewise, the key point of t and that of t+1 of each match.
     """
 
     images: Occupancy
     key_points: np.ndarray
-    key_points1: np.ndarray
-    source: np.ndarray
-    shift: np.ndarray
-    score: np.ndarray
+    start: np.ndarray
+    end: np.ndarray
 
 
 def scales(window: Window, config: Config) -> Tuple[List[Scale], FlowResult]:
-    """Every scale of a run, coarse to fine, and the run's result.
+    """Every scale of a run on the CPU, coarse to fine, and the run's result.
 
     Raises:
         CFlowError: the method has no scales one after the other, or bad input.
     """
-    steps, result = watch(window, config)
-    found = []
-    for step in steps:
-        points = step.sweeps.batch.sources[0].points
-        after = step.flow_after()
-        before = torch.zeros_like(after) if step.flow is None else step.flow
-        of_point = step.motion.cluster_id.index_select(0, step.motion.cluster(points))
-        found.append(
-            Scale(
-                before=step.occupancy(before),
-                after=step.occupancy(after),
-                flow_before=_rows(before, points),
-                flow_after=_rows(after, points),
-                cluster_id=of_point.numpy(),
-            )
-        )
-    return found, result
+    if config.method == "verified":
+        raise _absent(config, "scales one after the other", "paper")
+    model: Any = make_model(config, "cpu")
+    motion_at_scale = model.motion_at_scale
+    seen: List[Tuple[ProjectedSweeps, Motion]] = []
+
+    def watched(sweeps: ProjectedSweeps) -> Motion:
+        motion = motion_at_scale(sweeps)
+        flow = None if sweeps.flow is None else sweeps.flow.clone()  # the run adds to it
+        seen.append((replace(sweeps, flow=flow), motion))
+        return motion
+
+    model.motion_at_scale = watched
+    (result,) = model([window])
+    points = seen[0][0].batch.sources[0].points
+    so_far = [sweeps.flow for sweeps, _ in seen if sweeps.flow is not None]
+    flows = [F.pad(flow[:, points].T, (0, 3 - len(flow))) for flow in so_far] + [result.residual_flow.double()]
+    return [Scale(*given, flow.numpy()) for given, flow in zip(seen, flows)], result
 
 
+@torch.inference_mode()
 def cluster_correlation(window: Window, config: Config, cluster_id: Optional[int] = None) -> ClusterCorrelation:
     """The correlation of one cluster of a dense run.
 
     Args:
         window: sweeps.
-        config: `method="dense"`, clusters by components.
-        cluster_id: as in `FlowResult`; None = the most conspicuous mover: of the clusters seen in t, the one with most
-            pixels times metres of motion, all scales together.
+        config: a `DenseConfig`, clusters by components.
+        cluster_id: as in `FlowResult`; None = the most conspicuous mover: most points times metres of flow.
 
     Raises:
         CFlowError: a method without such a map, no such cluster, or bad input.
     """
     if not isinstance(config, DenseConfig) or config.clustering != "components":
-        raise CFlowError(
-            f"method={config.method}: only the dense method with clusters by "
-            'components has a correlation map per cluster: give make_config("paper"), or model=paper'
-        )
-    (*_, last), _ = watch(window, config)
-    sweeps, grid = project(last.sweeps.batch, last.flow, last.sweeps.grid), last.sweeps.grid
-    clusters, _, _ = find_clusters(sweeps, config)
-    pairs = make_pairs(clusters, sweeps.batch, grid.pixel_size, config.max_speed)
-    estimates = correlate(clusters, sweeps, config)
-
-    of_pair = flat_nonzero(pairs.source == 0)
-    available = pairs.cluster.index_select(0, of_pair)
-    if available.numel() == 0:
+        raise _absent(config, "correlation map per cluster", "paper")
+    (*_, last), result = scales(window, config)
+    numbers, flow, count = group_medians(result.cluster_id.numpy(), last.flow)
+    if not len(numbers):
         raise CFlowError("no cluster has points in both sweeps: there is no correlation to draw")
-    total = _total_flow(last, clusters.window.numel())
     if cluster_id is None:
-        length = total[available].norm(dim=1)
-        pixels = pairs.template.energy(pairs.cluster.numel()).index_select(0, of_pair)
-        chosen = int((length * pixels).argmax())
-    elif cluster_id in available:
-        chosen = int((available == cluster_id).nonzero())
-    else:
+        cluster_id = int(numbers[(np.linalg.norm(flow, axis=1) * count).argmax()])
+    if cluster_id not in numbers:
         raise CFlowError(
-            f"cluster_id={cluster_id}: no such cluster has points in both sweeps. There are {clusters.window.numel()}; "
+            f"cluster_id={cluster_id}: no such cluster has points in both sweeps. There are {numbers[-1] + 1}; "
             "cluster_id of a FlowResult tells which point is in which"
         )
-    number = int(available[chosen])
-    size, first = clusters.size[number], clusters.first[number]
-    template = _draw(pairs.template, int(of_pair[chosen]), size)
-    target = _draw(pairs.target, number, size)
-    ncc = _ncc_map(template, target, config.correlation)
+    sweeps, grid = last.sweeps, last.sweeps.grid
+    clusters, _, _ = find_clusters(sweeps, config)
+    pairs = make_pairs(clusters, sweeps.batch, grid.pixel_size, config.max_speed)
+    shifts, scores = best_shifts(pairs, config.correlation, config.max_memory)
+    pair = int(flat_nonzero((pairs.source == 0) & (pairs.cluster == cluster_id)))
+    template = _image(pairs.template, pair, pairs.size[cluster_id])
+    target = _image(pairs.target, cluster_id, pairs.size[cluster_id])
+    ncc = _ncc_map(template, target)
     if pairs.radius is not None:
         dy, dx = (torch.arange(n) - n // 2 for n in ncc.shape)
-        reach = pairs.radius[of_pair[chosen]]
-        ncc[dy[:, None] ** 2 + dx**2 > reach * reach] = torch.nan
-    lower = np.array(grid.lower[:2]) + grid.pixel_size * first.flip(0).numpy()
-    shift = (estimates.displacement[number, 0, :2] / grid.pixel_size).flip(0).numpy()
+        ncc[dy[:, None] ** 2 + dx**2 > pairs.radius[pair] ** 2] = torch.nan
+    lower = np.array(grid.lower[:2]) + grid.pixel_size * clusters.first[cluster_id].flip(0).numpy()
     return ClusterCorrelation(
-        cluster_id=number,
+        cluster_id=cluster_id,
         images=Occupancy(template.numpy() > 0, target.numpy() > 0, lower, grid.pixel_size),
         ncc=ncc.numpy(),
-        shift=shift,
-        score=float(estimates.score[number, 0]),
-        flow=last.motion.flow[number].numpy(),
-        total=total[number].numpy(),
+        shift=shifts[pair].numpy(),
+        score=float(scores[pair]),
+        flow=flow[numbers == cluster_id][0],
     )
 
 
+@torch.inference_mode()
 def keypoint_matches(window: Window, config: Config) -> KeyPointMatches:
     """Key points and matches of a run.
 
@@ -182,40 +191,31 @@ def keypoint_matches(window: Window, config: Config) -> KeyPointMatches:
         CFlowError: another method, or bad input.
     """
     if not isinstance(config, KeypointsConfig):
-        raise CFlowError(f'method={config.method}: key points are matched by make_config("keypoints"), model=keypoints')
-    (*_, last), _ = watch(window, config)
-    sweeps = project(last.sweeps.batch, last.flow, last.sweeps.grid)
+        raise _absent(config, "key points", "keypoints")
+    (*_, last), _ = scales(window, config)
+    sweeps = last.sweeps
     pc1, pc0 = (describe(sweeps.occupancy[:, step], config.patch_size) for step in (0, 1))
     matches = match(pc0, pc1, match_radius(sweeps.batch, sweeps.grid.pixel_size, config), config)
-    return KeyPointMatches(
-        images=last.occupancy(last.flow),
-        key_points=torch.stack((pc0.row, pc0.col), 1).numpy(),
-        key_points1=torch.stack((pc1.row, pc1.col), 1).numpy(),
-        source=matches.source.numpy(),
-        shift=matches.shift.numpy(),
-        score=matches.score.numpy(),
-    )
+    images, size = last.seen(), sweeps.grid.pixel_size
+    key_points = images.lower + (torch.stack((pc0.col, pc0.row), 1).numpy() + 0.5) * size
+    start = key_points[matches.source.numpy()]
+    return KeyPointMatches(images, key_points, start, start + matches.shift.flip(1).numpy() * size)
 
 
-def _rows(flow: Tensor, points: slice) -> np.ndarray:
-    """(N, 3) float64 of (A, P)."""
-    rows = np.zeros((points.stop - points.start, 3))
-    rows[:, : len(flow)] = flow[:, points].numpy().T
-    return rows
+def _absent(config: Config, what: str, preset: str) -> CFlowError:
+    """The error of a method that has no such thing to draw."""
+    why = ""
+    if config.method == "verified":
+        why = " (presets default and fast weigh the motions of all scales at once; draw their flow or their clusters)"
+    return CFlowError(f'method={config.method} has no {what}{why}: give make_config("{preset}"), or model={preset}')
 
 
-def _total_flow(step: Step, num_clusters: int) -> Tensor:
-    """(M, 3) float64, median flow of the points of t in each cluster, all scales so far together; 0 without points."""
-    points = step.sweeps.batch.sources[0].points
-    cluster = step.motion.cluster(points).numpy().astype(np.int64)
-    cluster[cluster == num_clusters] = -1
-    median, _ = group_medians(cluster, _rows(step.flow_after(), points))
-    total = torch.zeros(num_clusters, 3, dtype=torch.float64)
-    total[np.unique(cluster[cluster >= 0])] = torch.from_numpy(median)
-    return total
+def _pair(sweeps: ProjectedSweeps) -> Occupancy:
+    t1, t = sweeps.occupancy[0, :2].numpy()
+    return Occupancy(t, t1, np.array(sweeps.grid.lower[:2]), sweeps.grid.pixel_size)
 
 
-def _draw(images: Images, number: int, size: Tensor) -> Tensor:
+def _image(images: Images, number: int, size: Tensor) -> Tensor:
     """(H, W) float32, one of a set of images."""
     pixel = flat_nonzero(images.image == number)
     image = torch.zeros(size.tolist())
@@ -223,13 +223,13 @@ def _draw(images: Images, number: int, size: Tensor) -> Tensor:
     return image
 
 
-def _ncc_map(template: Tensor, target: Tensor, engine: str) -> Tensor:
+def _ncc_map(template: Tensor, target: Tensor) -> Tensor:
     """(H, W) float64, as `ClusterCorrelation.ncc`. A window of ones over the target counts its pixels."""
     height, width = template.shape
     images = torch.zeros(3, 2 * height, 2 * width)
     images[:, :height, :width] = torch.stack((template, torch.ones_like(template), target))
-    counts = cross_correlate(images, 2, torch.zeros(2, dtype=torch.int64), engine).round().double()
-    # Half of the images is free: negative shifts stand at the far end.
+    counts = cross_correlate(images, 2, torch.zeros(2, dtype=torch.int64)).round().double()
+    # It wraps round, and half of the images is free: negative shifts stand at the far end.
     dy, dx = ((torch.arange(n) - n // 2) % (2 * n) for n in (height, width))
     overlap, in_window = counts[:, dy[:, None], dx]
     energies = in_window * template.double().sum()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Optional, Sequence
+from typing import Optional
 
 import numpy as np
 
@@ -16,15 +16,12 @@ PRIMARIES = np.array(
 _POSITION = np.cumsum((0, *TRANSITIONS))  # of each primary on the wheel
 
 
-def flow_to_rgb(
-    flow: Array, max_flow: Optional[float] = None, background: Sequence[float] = (255, 255, 255)
-) -> np.ndarray:
-    """Direction of flow as hue, length as saturation.
+def flow_to_rgb(flow: Array, max_flow: Optional[float] = None) -> np.ndarray:
+    """Direction of flow as hue, length as saturation; zero flow is white.
 
     Args:
         flow: (..., 2+) float, metres; x and y count, further columns are ignored.
         max_flow: length in metres that gets the full hue; None = the longest flow given.
-        background: (3,) RGB in 0 ... 255, colour of zero flow: white, or that of the picture's ground.
 
     Returns:
         (..., 3) uint8 RGB.
@@ -32,22 +29,19 @@ def flow_to_rgb(
     Convention:
         +x is red, then counter-clockwise yellow, green, cyan, blue, magenta. The angle in [0, 2 pi) is spread over 54
         of the 55 steps, as the viewers do, so +y is (255, 230, 0), -x (0, 209, 255), -y (88, 0, 255). Flow longer than
-        `max_flow` gets darker (on a dark background lighter). NaN and infinite flow gets the background.
+        `max_flow` gets darker. NaN and infinite flow is white.
 
     Raises:
-        CFlowError: no x and y, `max_flow` not positive, or a background that is no colour.
+        CFlowError: no x and y, or `max_flow` not positive.
 
     Source: Baker et al., A Database and Evaluation Methodology for Optical Flow (2011); flowpy. The field's viewers cut
         the steps of their wheel to integers, so their colours differ by up to 2 levels.
     """
     vectors = as_numpy(flow).astype(np.float64)
-    ground = np.asarray(background, np.float64)
     if vectors.ndim == 0 or vectors.shape[-1] < 2:
         raise CFlowError(f"flow has shape {vectors.shape}: give (..., 2) or wider, x and y in metres")
     if max_flow is not None and not max_flow > 0:
         raise CFlowError(f"max_flow={max_flow}: give a positive length in metres, or None for the longest flow")
-    if ground.shape != (3,) or not ((ground >= 0) & (ground <= 255)).all():
-        raise CFlowError(f"background={background!r}: give three numbers 0 ... 255 (RGB)")
 
     x, y = vectors[..., 0], vectors[..., 1]
     is_known = np.isfinite(x) & np.isfinite(y)
@@ -58,18 +52,16 @@ def flow_to_rgb(
 
     step = np.mod(np.arctan2(y, x), 2 * np.pi) * ((_POSITION[-1] - 1) / (2 * np.pi))
     hue = np.stack([np.interp(step, _POSITION, channel) for channel in PRIMARIES.T], axis=-1)
-    beyond = 0.0 if ground.mean() > 127 else 255.0
-    inside = ground + np.minimum(radius, 1)[..., None] * (hue - ground)
-    outside = beyond + (hue - beyond) / np.maximum(radius, 1)[..., None]
+    inside = 255 + np.minimum(radius, 1)[..., None] * (hue - 255)
+    outside = hue / np.maximum(radius, 1)[..., None]
     return np.rint(np.where(radius[..., None] > 1, outside, inside)).astype(np.uint8)
 
 
-def wheel_image(size: int, background: Sequence[float] = (255, 255, 255)) -> np.ndarray:
+def wheel_image(size: int) -> np.ndarray:
     """The wheel itself, for legends: +x to the right, +y up, zero flow in the middle, `max_flow` at the rim.
 
     Args:
         size: side of the image in pixels.
-        background: see `flow_to_rgb`.
 
     Returns:
         (size, size, 4) uint8 RGBA, transparent outside the wheel; row 0 is the top.
@@ -79,5 +71,5 @@ def wheel_image(size: int, background: Sequence[float] = (255, 255, 255)) -> np.
     distance = np.hypot(flow[..., 0], flow[..., 1])
     # One pixel of fading makes the rim smooth.
     alpha = np.clip((1 - distance) * (size / 2), 0, 1) * 255
-    rgb = flow_to_rgb(flow / np.maximum(distance, 1)[..., None], 1.0, background)
+    rgb = flow_to_rgb(flow / np.maximum(distance, 1)[..., None], 1.0)
     return np.concatenate([rgb, alpha[..., None].astype(np.uint8)], axis=-1)

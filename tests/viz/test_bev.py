@@ -1,0 +1,263 @@
+"""Bird's-eye pictures of flow and clusters: what they show, where, and how they are saved."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Tuple
+
+import numpy as np
+import pytest
+import torch
+from matplotlib.figure import Figure
+from matplotlib.image import imread
+from matplotlib.patches import Circle
+
+from cflow_torch import CFlowError, FlowResult
+from cflow_torch.data import atomic
+from cflow_torch.viz import flow_to_rgb, panel, plot_clusters, plot_flow, save_picture
+from cflow_torch.viz.clusters import PALETTE, cluster_colors
+from cflow_torch.viz.film import Frame, flow_figures
+
+CAR_FLOW = np.array([-0.6, 0.0, 0.0])
+VAN_FLOW = np.array([0.0, -0.3, 0.0])
+OPEN = (-np.inf,) * 3 + (np.inf,) * 3
+Scene = Tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+def block(x: float, y: float, size: float = 3.0) -> np.ndarray:
+    """Square of points, 10 a metre, centred at (x, y)."""
+    axis = np.arange(-size / 2, size / 2, 0.1)
+    grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2) + (x, y)
+    return np.column_stack([grid, np.ones(len(grid))])
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    """(points, residual flow, cluster): a car at (15, 20), a van at (-20, -8), a wall at (10, -12)."""
+    parts = [block(15, 20), block(-20, -8), block(10, -12)]
+    which = np.repeat([0, 1, 2], [len(part) for part in parts])
+    flow = np.array([CAR_FLOW, VAN_FLOW, np.zeros(3)])[which]
+    return np.concatenate(parts), flow.astype(np.float32), which
+
+
+def result_of(flow: np.ndarray, cluster: np.ndarray) -> FlowResult:
+    residual = torch.from_numpy(flow)
+    ones = torch.ones(len(flow))
+    return FlowResult(residual, 0 * residual, residual, torch.from_numpy(cluster), ones, ones > 0)
+
+
+def pixels(figure: Figure) -> np.ndarray:
+    """(H, W, 3) uint8, row 0 at the top."""
+    figure.canvas.draw()
+    return np.asarray(figure.canvas.buffer_rgba())[..., :3].copy()  # type: ignore[attr-defined]
+
+
+def colors_at(figure: Figure, *places: Tuple[float, float], axes: int = 0) -> np.ndarray:
+    """(K, 3) int, RGB of the picture at positions in metres."""
+    image = pixels(figure)
+    column, row = np.rint(figure.axes[axes].transData.transform(places)).astype(int).T
+    return image[len(image) - 1 - row, column].astype(int)
+
+
+def arrows_of(figure: Figure) -> np.ndarray:
+    """(K, 4) start and vector of the arrows, by x."""
+    (arrows,) = [item for item in figure.axes[0].collections if type(item).__name__ == "Quiver"]
+    assert arrows.scale == 1 / panel.ARROW_STEPS
+    columns = np.column_stack([arrows.X, arrows.Y, arrows.U, arrows.V])
+    return columns[np.argsort(columns[:, 0])]
+
+
+def test_colours_lie_where_the_points_are(scene: Scene) -> None:
+    points, flow, cluster = scene
+    figure = plot_flow(points, result_of(flow, cluster), max_flow=0.6)
+    # A metre off the middle, where the arrow starts.
+    car, van, wall, nothing = colors_at(figure, (16.0, 21.0), (-19.0, -9.0), (11.0, -11.0), (15.0, -25.0))
+    assert car.tolist() == [0, 209, 255]
+    assert np.abs(van - flow_to_rgb(VAN_FLOW, 0.6)).max() <= 1  # matplotlib cuts 128 / 255 * 255 to 127
+    assert np.ptp(wall) < 20 and 150 < wall.mean() < 210
+    assert nothing.tolist() == [255, 255, 255]
+
+
+def test_one_arrow_per_moving_cluster(scene: Scene) -> None:
+    points, flow, cluster = scene
+    expected = [[-20, -8, *VAN_FLOW[:2]], [15, 20, *CAR_FLOW[:2]]]
+    for given in (result_of(flow, cluster), flow):  # with clusters, and with groups found from the points
+        assert np.allclose(arrows_of(plot_flow(points, given)), expected, atol=0.1)
+
+
+def test_group_medians_match_a_loop() -> None:
+    rng = np.random.default_rng(3)
+    group, values = rng.integers(-1, 6, 501), rng.normal(size=(501, 3))
+    number, median, count = panel.group_medians(group, values)
+    assert number.tolist() == list(range(6)) and count.tolist() == [(group == g).sum() for g in range(6)]
+    for g in range(6):
+        ranked = np.sort(values[group == g], axis=0)
+        assert (median[g] == ranked[len(ranked) // 2]).all()
+
+
+def test_ground_is_faint_and_what_is_outside_is_gone(scene: Scene) -> None:
+    points, flow, cluster = scene
+    figure = plot_flow(points, flow, is_ground=cluster == 0, point_cloud_range=(-15, -30, -5, 30, 30, 5))
+    assert colors_at(figure, (16.0, 21.0)).min() > 230  # the car, declared ground
+    assert len(arrows_of(figure)) == 0  # the van is outside
+
+
+def test_truth_adds_truth_and_error(scene: Scene) -> None:
+    points, flow, cluster = scene
+    truth = flow.copy()
+    truth[cluster == 0] = [-0.6, 0.5, 0.0]  # 0.5 m wrong: white
+    truth[cluster == 1] = [0.0, -0.26, 0.0]  # 0.04 m wrong: none
+    truth[cluster == 2] = np.nan
+    figure = plot_flow(points, result_of(flow, cluster), truth=truth)
+    assert [axes.get_title() for axes in figure.axes[:3]] == ["estimate", "ground truth", "error"]
+    (car,) = colors_at(figure, (16.0, 21.0), axes=1)
+    assert np.abs(car - flow_to_rgb(truth[0], 0.8)).max() <= 1  # longest is 0.78 m
+    large, none, unknown = colors_at(figure, (16.0, 21.0), (-19.0, -9.0), (11.0, -11.0), axes=2)
+    assert large.tolist() == [255, 255, 255] and none.max() < 15 and unknown.tolist() == [80, 90, 110]
+
+
+@pytest.mark.parametrize("rows", [0, 40])
+def test_few_or_unknown_points(rows: int) -> None:
+    points, flow = np.full((rows, 3), 3.0), np.full((rows, 3), np.nan)
+    assert pixels(plot_flow(points, flow, truth=flow, point_cloud_range=OPEN)).shape[1] == 1792
+    pixels(plot_clusters(points, np.zeros(rows, int)))
+
+
+@pytest.mark.parametrize("box", [None, (-2, -40, -5, 30, 40, 5), (-100, -1, -5, 100, 1, 5), (0, 0, -5, 1e-3, 50, 5)])
+def test_everything_is_inside_the_picture(scene: Scene, box: tuple) -> None:
+    points, flow, cluster = scene
+    title = "a log with a name that is longer than a picture is wide, " * 3
+    figures = [plot_flow(points, flow, truth=truth, title=title, point_cloud_range=box) for truth in (None, flow)]
+    figures.append(plot_clusters(points, cluster, title=title, point_cloud_range=box))
+    for figure in figures:
+        figure.canvas.draw()
+        (width, height), seen = figure.get_size_inches(), figure.get_tightbbox()
+        assert width / 3.5 < height < 2.2 * width
+        assert min(seen.x0, seen.y0) >= 0 and seen.x1 <= width and seen.y1 <= height
+        frame = figure.axes[0].get_window_extent()
+        assert frame.width > 500 and frame.height > 300
+        texts = [text.get_text() for text in figure.axes[0].texts]
+        low, high = figure.axes[0].get_xlim()
+        assert ("ego" in texts) == (low <= 0 <= high)
+
+
+@pytest.mark.parametrize(
+    ("reach", "step", "length"), [(4, 10, 1), (35, 10, 10), (51.2, 10, 10), (200, 20, 50), (1e6, 1e5, 2e5)]
+)
+def test_rings_and_scale_bar_fit_the_view(reach: float, step: float, length: float) -> None:
+    points = np.array([[reach, 0.0, 0.0], [-reach, 0, 0], [0, 1, 0]])
+    figure = plot_flow(points, np.zeros((3, 3)), point_cloud_range=(-reach, -reach, -5, reach, reach, 5))
+    radii = [item.get_radius() for item in figure.axes[0].patches if isinstance(item, Circle)]
+    assert len(radii) <= 20 and np.allclose(radii, step * np.arange(1, len(radii) + 1))
+    assert f"rings: every {step:g} m" in figure.texts[-1].get_text()
+    x, _ = figure.axes[0].lines[0].get_data()
+    assert np.diff(x) == pytest.approx(length) and -reach < x[0] < x[1] < reach
+    assert f"{length:g} m" in [text.get_text() for text in figure.axes[0].texts]
+
+
+def test_the_name_of_a_log_is_no_formula(scene: Scene) -> None:
+    points, flow, _ = scene
+    for title in ("log $_$ 1", "cost: 3$ and 4$"):
+        figures = [plot_flow(points, flow, title=text) for text in (title, title.replace("$", ""))]
+        with_dollars, without = (figure.texts[0].get_window_extent().width for figure in figures)
+        assert with_dollars > without, "a $ is a letter"
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"points": np.zeros((5, 2))}, "points has shape"),
+        ({"result_or_residual": np.zeros((4, 3))}, "residual flow has shape"),
+        ({"truth": np.zeros((4, 3))}, "truth has shape"),
+        ({"is_ground": np.zeros(4, bool)}, "is_ground has shape"),
+        ({"max_flow": -1.0}, "max_flow"),
+        ({"legend": "middle"}, "upper right"),
+        ({"point_cloud_range": (0, 0, 1, 1)}, "point_cloud_range"),
+        ({"point_cloud_range": (0, 0, 0, 1, 0, 1)}, "point_cloud_range"),
+    ],
+)
+def test_plot_flow_refuses(changed: dict, message: str) -> None:
+    with pytest.raises(CFlowError, match=message):
+        plot_flow(**{"points": np.zeros((5, 3)), "result_or_residual": np.zeros((5, 3)), **changed})
+
+
+# --- clusters
+
+
+def test_colours_of_clusters_lie_where_their_points_are() -> None:
+    points = np.concatenate([block(12, 12), block(12, -8), block(-13, 2)])
+    cluster = np.repeat([5, 2, -1], len(points) // 3)
+    first, second, none = colors_at(plot_clusters(points, cluster), (12, 12), (12, -8), (-13, 2))
+    assert {tuple(first), tuple(second)} == {tuple(color) for color in PALETTE[:2]}
+    assert np.ptp(none) < 20
+
+
+def test_clusters_next_to_each_other_differ_in_colour() -> None:
+    rng = np.random.default_rng(2)
+    corner = rng.uniform(-40, 40, (120, 2))
+    cluster = np.repeat(np.arange(120), 30)
+    colors = cluster_colors(corner[cluster] + rng.uniform(0, 2.5, (3600, 2)), cluster, (0, 0, 0))
+    assert len(np.unique(colors, axis=0)) == len(PALETTE), "all colours are used"
+    of_cluster = colors[::30].astype(int)
+    away = np.abs(corner[:, None] - corner).max(axis=2)
+    one, other = np.nonzero((away < 3.0) & (away > 0))
+    assert len(one) > 50 and (of_cluster[one] != of_cluster[other]).any(axis=1).all()
+    assert (colors.reshape(120, 30, 3) == colors[::30, None]).all(), "one colour a cluster"
+    none = cluster_colors(np.zeros((2, 2)), np.array([-1, -1]), (1, 2, 3))
+    assert none.tolist() == [[1, 2, 3]] * 2
+
+
+@pytest.mark.parametrize("cluster", [np.zeros(4, int), np.zeros((5, 1), int), np.zeros(5)])
+def test_plot_clusters_refuses(cluster: np.ndarray) -> None:
+    with pytest.raises(CFlowError, match="cluster_id"):
+        plot_clusters(np.zeros((5, 3)), cluster)
+
+
+# --- several pairs
+
+
+def test_frames_of_a_film_share_view_and_colours(scene: Scene) -> None:
+    points, flow, cluster = scene
+    frames = [Frame(points, result_of(flow, cluster)), Frame(1.2 * points, result_of(0.5 * flow, cluster), cluster < 1)]
+    for box in (None, OPEN):
+        views, rims = [], []
+        for figure in flow_figures(frames, point_cloud_range=box, width=400):
+            figure.canvas.draw()
+            assert figure.canvas.get_width_height()[0] == 400
+            views.append((figure.axes[0].get_xlim(), figure.axes[0].get_ylim(), figure.canvas.get_width_height()))
+            texts = [text.get_text() for text in figure.findobj(lambda item: hasattr(item, "get_text"))]
+            rims.append([text for text in texts if text.startswith("rim")])
+        assert views[0] == views[1] and rims[0] == rims[1] and rims[0][0].startswith("rim: 0.6 m")
+    with pytest.raises(CFlowError, match="no frame"):
+        list(flow_figures([]))
+    with pytest.raises(CFlowError, match="width=10"):
+        list(flow_figures(frames, width=10))
+
+
+# --- the file
+
+
+def test_a_saved_picture_is_the_picture(scene: Scene, tmp_path: Path) -> None:
+    points, flow, cluster = scene
+    figure = plot_flow(points, result_of(flow, cluster), max_flow=0.6)
+    path = save_picture(figure, tmp_path / "new" / "flow.png")
+    assert (np.rint(imread(str(path))[..., :3] * 255) == pixels(figure)).all()
+    assert [file.name for file in path.parent.iterdir()] == ["flow.png"]
+    with pytest.raises(CFlowError, match=r"does not end in \.png"):
+        save_picture(figure, tmp_path / "flow.pdf")
+
+
+@pytest.mark.parametrize("stage", ["savefig", "replace"])
+def test_a_failed_save_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stage: str) -> None:
+    path, figure = tmp_path / "flow.png", Figure()
+    path.write_bytes(b"old")
+
+    def fail(*arguments: object, **settings: object) -> None:
+        if stage == "savefig":
+            Path(str(arguments[0])).write_bytes(b"half")
+        raise OSError(28, "disk full")
+
+    monkeypatch.setattr(figure if stage == "savefig" else atomic.os, stage, fail)
+    with pytest.raises(OSError, match="disk full.*flow.png"):
+        save_picture(figure, path)
+    assert path.read_bytes() == b"old" and [file.name for file in tmp_path.iterdir()] == ["flow.png"]

@@ -1,0 +1,156 @@
+"""`cflow plot` draws every picture, `cflow view` records a drive; what cannot be drawn is told and leaves nothing."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+from typing import Callable
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+from PIL import Image
+
+from cflow_torch import CFlowError
+from cflow_torch.cli import plot as plot_command
+from cflow_torch.cli import view as view_command
+from cflow_torch.cli.main import main
+from cflow_torch.data.av2 import AV2Log
+from cflow_torch.data.log import window
+from cflow_torch.simulator import make_drive
+from cflow_torch.simulator.writers.av2 import write_av2_log
+
+NAME = "10203656353524179475_7625_000_7645_000"  # to Hydra, a number
+SMALL = "model.point_cloud_range=[-20,-20,-inf,20,20,inf]"
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of one small simulated log: three pairs."""
+    folder = tmp_path_factory.mktemp("drives")
+    write_av2_log(make_drive(seed=3, num_sweeps=4, profile="demo"), folder).rename(folder / NAME)
+    return folder
+
+
+@pytest.fixture
+def cflow(monkeypatch: pytest.MonkeyPatch, drive: Path, tmp_path: Path) -> Callable[..., int]:
+    """A call of a command on that log, which writes to `out` and gives its exit status."""
+    monkeypatch.setattr(sys, "argv", list(sys.argv))
+    monkeypatch.chdir(tmp_path)
+
+    def call(command: str, *arguments: str) -> int:
+        try:
+            main([command, "data=av2", f"data.root={drive}", f"output={tmp_path / 'out'}", *arguments])
+        except SystemExit as stop:
+            return int(stop.code or 0)
+        return 0
+
+    return call
+
+
+@pytest.mark.parametrize("picture", ["flow", "clusters", "keypoints", "correlation", "scales"])
+def test_every_picture(picture: str, cflow: Callable, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    assert cflow("plot", f"picture={picture}", "pair=1", f"log={NAME}", SMALL) == 0
+    (file,) = (tmp_path / "out").iterdir()
+    assert file.name == f"{picture}.png" and imread(str(file)).shape[1] in (1000, 1600, 1792)
+    printed = capsys.readouterr().out
+    assert f"log {NAME}, pair 1" in printed and f"picture: {file}" in printed
+
+
+def test_truth_is_residual_and_only_where_it_is_known(
+    cflow: Callable, drive: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    seen = []
+
+    def spy(*arguments: object, **settings: object) -> None:
+        seen.append(settings["truth"])
+        raise CFlowError("seen")
+
+    monkeypatch.setattr(plot_command, "plot_flow", spy)
+    for truth in ("auto", "false"):
+        assert cflow("plot", "pair=1", "model=paper", f"truth={truth}") == 2
+    assert seen[1] is None
+    log = AV2Log(drive / NAME)
+    labels, sweeps = log.labels(1), window(log, 1)
+    transform = np.linalg.inv(sweeps.pc1.pose) @ sweeps.pc0.pose
+    points = sweeps.pc0.points.astype(float)
+    pose_flow = points @ transform[:3, :3].T + transform[:3, 3] - points
+    expected = np.where(labels.is_valid[:, None], labels.flow - pose_flow, np.nan)
+    assert np.allclose(seen[0], expected, atol=1e-4, equal_nan=True) and np.nanmax(np.abs(expected)) > 0.3
+    monkeypatch.setattr(AV2Log, "labels", lambda self, index: None)
+    assert cflow("plot", "pair=1", "model=paper", "truth=true") == 2 and "truth=true" in capsys.readouterr().err
+
+
+def test_an_animation_has_a_picture_for_every_pair(
+    cflow: Callable, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    assert cflow("plot", "picture=animation", "model=paper", "width=300", "first=1", SMALL) == 0
+    assert "2 pairs from 1 to 2" in capsys.readouterr().out
+    with Image.open(tmp_path / "out" / "animation.gif") as film:
+        assert film.n_frames == 2 and film.size[0] == 300
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["pair=3"], "pair=3"),
+        (["truth=perhaps"], "truth=perhaps"),
+        (["picture=correlation", "model=default"], "model=paper"),
+        (["picture=keypoints", "model=paper"], "model=keypoints"),
+        (["picture=correlation", "cluster=100000"], "cluster_id=100000"),
+        (["picture=animation", "first=9"], "first=9"),
+        (["picture=animation", "legend=middle", "count=1", "model=paper"], "legend"),
+    ],
+)
+def test_a_picture_that_cannot_be_drawn_is_told(
+    arguments: list, message: str, cflow: Callable, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    assert cflow("plot", "pair=0", *arguments) == 2
+    error = capsys.readouterr().err
+    assert message in error and "Traceback" not in error
+    assert not [file for file in tmp_path.rglob("*") if file.is_file()]
+
+
+def test_matplotlib_is_missed_before_the_work(
+    cflow: Callable, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    for name in ("matplotlib", "matplotlib.figure", "matplotlib.backends.backend_agg"):
+        monkeypatch.setitem(sys.modules, name, None)
+    monkeypatch.setattr(plot_command, "find_log", lambda cfg: pytest.fail("work"))
+    assert cflow("plot") == 2 and "pip install matplotlib" in capsys.readouterr().err
+
+
+def test_a_recording_of_what_is_estimated_and_of_what_lies_in_a_folder(
+    cflow: Callable, drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    pytest.importorskip("rerun")
+    assert cflow("view", "model=paper", "data.step=2", "count=5", SMALL) == 0
+    file = tmp_path / "out" / f"{NAME}.rrd"
+    assert f"{file}: 2 pairs" in capsys.readouterr().out and file.stat().st_size > 1e5
+    assert cflow("flow", "model=paper", "engine.workers=1", SMALL, f"output={tmp_path / 'flow'}") == 0
+    sorted((tmp_path / "flow" / NAME).iterdir())[1].unlink()
+    file.unlink()
+    assert cflow("view", f"flow={tmp_path / 'flow'}", "device=no_such_device") == 1, "nothing is estimated"
+    printed = capsys.readouterr()
+    assert f"{file}: 2 pairs" in printed.out and "1 failed" in printed.err and file.is_file()
+    assert cflow("view", "flow=nowhere") == 2 and "flow=nowhere is no folder" in capsys.readouterr().err
+
+
+def test_two_logs_of_one_name_do_not_overwrite_each_other(
+    cflow: Callable, drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    pytest.importorskip("rerun")
+    for split in ("train", "val"):
+        (tmp_path / "data" / split).mkdir(parents=True)
+        (tmp_path / "data" / split / NAME).symlink_to(drive / NAME, target_is_directory=True)
+    assert cflow("view", f"data.root={tmp_path / 'data'}", "model=paper", "count=1", SMALL) == 1
+    printed = capsys.readouterr()
+    assert len(re.findall(r"\.rrd: 1 pair", printed.out)) == 1
+    assert f"1 failed:\n  {NAME}: " in printed.err and "give data.root=PATH more narrowly" in printed.err
+
+
+def test_a_viewer_that_ends_at_once_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "executable", "false")
+    with pytest.raises(CFlowError, match="rerun --web-viewer a.rrd"):
+        view_command._show([Path("a.rrd")])
