@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from difflib import get_close_matches
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Dict, Iterable, List
 
@@ -39,6 +40,7 @@ def settings(command: str) -> Dict[str, Any]:
     return found
 
 
+@lru_cache(maxsize=None)  # commands share the files of groups
 def _settings(file: Path, prefix: str) -> Dict[str, Any]:
     text = file.read_text(encoding="utf-8")
     prefix = "" if "@package _global_" in text else prefix

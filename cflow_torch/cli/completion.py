@@ -75,8 +75,9 @@ def candidates(command: str) -> List[str]:
     """What can stand behind a command: settings end in =, choices are whole."""
     if not (CONFIGS / f"{command}.yaml").exists():
         return [*(_SHELLS if command == "completion" else ()), "--help"]
-    found = [f"{group}={name}" for group, names in groups(command).items() for name in names]
+    choices = groups(command)
+    found = [f"{group}={name}" for group, names in choices.items() for name in names]
     for key, value in settings(command).items():
-        if key not in groups(command):  # picture=flow also sets picture to its own name
+        if key not in choices:  # picture=flow also sets picture to its own name
             found += [f"{key}=true", f"{key}=false"] if isinstance(value, bool) else [f"{key}="]
     return list(dict.fromkeys([*found, "--help", "--cfg", "--multirun"]))

@@ -16,7 +16,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from cflow_torch.cli.record import report
-from cflow_torch.cli.run import Pairs, finish, for_each_pair, make_model, open_logs, output_folder
+from cflow_torch.cli.run import finish, for_each_pair, make_model, open_logs, output_folder
 from cflow_torch.data.atomic import ready_folder, remove_stale
 from cflow_torch.data.flow_file import write_flow
 from cflow_torch.data.log import Log
@@ -50,7 +50,7 @@ def task(cfg: DictConfig) -> None:
 
     for log in logs:
         remove_stale(output / log.log_id)
-    failures += for_each_pair(logs, model, keep, Pairs())
+    failures += for_each_pair(logs, model, keep, lambda log: range(len(log.timestamps) - 1))
     report(cfg, metrics, output)
     print(f"picture: {picture}")
     print(f"flow files, scores, settings: {output}")

@@ -47,7 +47,7 @@ def task(cfg: DictConfig) -> float:
     metrics = SceneFlowMetrics(cfg.definition)
     model = StopWatch(make_model(cfg))
     logs, failures = open_logs(cfg)
-    identity = DataIdentity(cfg, logs)
+    identity = DataIdentity()
     ready_folder(output)
 
     def score(log: Log, index: int, sweeps: Window, result: FlowResult) -> None:
@@ -62,7 +62,7 @@ def task(cfg: DictConfig) -> float:
     failures += for_each_pair(logs, model, score, pairs)
     if metrics.num_frames == 0:
         raise CFlowError("no pair has labels: nothing to score; `cflow flow` estimates the flow without them")
-    results = report(cfg, metrics, output, data=identity.report(), seconds=model.report(), failures=failures)
+    results = report(cfg, metrics, output, data=identity.report(cfg, logs), seconds=model.report(), failures=failures)
     with suppress(UnfinishedJob):  # a job of a sweep has a score all the same; a run on its own ends with status 1
         finish(failures)
     return objective(results)

@@ -65,8 +65,8 @@ def task(cfg: DictConfig) -> None:
     name, workers, threads, batch = (engine.pop(key) for key in ("name", "workers", "threads", "batch"))
     layout = choose_layout(cfg.device, workers, threads, batch, os.environ)
     config = make_model(cfg).config
-    sources = find_logs(cfg)
     contents = _contents(cfg, config.method == "verified")
+    sources = find_logs(cfg)
     identity = make_identity(config, sources.reader, sources.settings, contents)
     job = Job(
         config=config,

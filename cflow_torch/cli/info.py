@@ -22,18 +22,16 @@ from cflow_torch.types import CFlowError
 # Distributions whose module has another name.
 _MODULES = {
     "hydra-core": "hydra",
+    "hydra-joblib-launcher": "hydra_plugins.hydra_joblib_launcher",
+    "hydra-optuna-sweeper": "hydra_plugins.hydra_optuna_sweeper",
+    "hydra-submitit-launcher": "hydra_plugins.hydra_submitit_launcher",
     "opencv-python-headless": "cv2",
     "pillow": "PIL.Image",
     "rerun-sdk": "rerun",
     "scikit-learn": "sklearn",
     "universal-pathlib": "upath",
-    **{
-        f"hydra-{name}": f"hydra_plugins.hydra_{name.replace('-', '_')}"
-        for name in ("joblib-launcher", "optuna-sweeper")
-    },
-    "hydra-submitit-launcher": "hydra_plugins.hydra_submitit_launcher",
 }
-_NATIVE = ("kornia-rs", "pillow")  # what packages above load, and fail with
+_NATIVE = ("kornia-rs", "pillow")  # what packages load, and fail with
 _DEVELOPMENT = re.compile(r"extra\s*==\s*['\"](test|dev|notebooks)")  # extras that no command needs
 
 
@@ -41,26 +39,24 @@ def task(arguments: List[str]) -> None:
     """Run `cflow info`."""
     if arguments:
         raise CFlowError(f"info takes no settings, got {' '.join(arguments)}: cflow info")
-    print(f"cflow_torch {cflow_torch.__version__} in {Path(cflow_torch.__file__).parent}\n", flush=True)
-    print(get_pretty_env_info(), "\nPackages:", sep="\n", flush=True)
-    for name in _asked_for():
-        print(f"  {_state(name)}", flush=True)
-
-
-def _asked_for() -> List[str]:
-    """Distributions that the package and its extras name, and what those load."""
-    asked = [text for text in metadata.requires("cflow_torch") or [] if not _DEVELOPMENT.search(text)]
+    print(f"cflow_torch {cflow_torch.__version__} in {Path(cflow_torch.__file__).parent}", flush=True)
+    print(get_pretty_env_info(), flush=True)
+    try:
+        asked = [text for text in metadata.requires("cflow_torch") or [] if not _DEVELOPMENT.search(text)]
+    except metadata.PackageNotFoundError:
+        print("cflow_torch is not installed, so what it asks for is not known")
+        asked = []
     names = [re.split(r"[^\w.-]", text, maxsplit=1)[0].lower().replace("_", "-") for text in asked]
-    return list(dict.fromkeys([*names, *_NATIVE]))
+    for name in dict.fromkeys([*names, *_NATIVE]):
+        print(_state(name), flush=True)
 
 
 def _state(name: str) -> str:
     try:
         version = metadata.version(name)
+        import_module(_MODULES.get(name, name.replace("-", "_")))
     except metadata.PackageNotFoundError:
         return f"{name} not installed"
-    try:
-        import_module(_MODULES.get(name, name.replace("-", "_")))
     except Exception as error:  # whatever a foreign package raises
         return f"{name} {version} CANNOT BE IMPORTED: {type(error).__name__}: {' '.join(str(error).split())}"
     return f"{name} {version}"

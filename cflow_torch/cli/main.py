@@ -111,9 +111,7 @@ def _run_with_settings(command: str, run: Any, rest: List[str]) -> None:
         try:
             OmegaConf.resolve(cfg)
             return run(cfg)
-        except CFlowError as error:
-            _end_wrong(error)
-        except OmegaConfBaseException as error:  # a setting that refers to none, or was taken out
+        except (CFlowError, OmegaConfBaseException) as error:
             _end_wrong(explain(error, command))
         except Exception as error:
             if given or isinstance(error, UnfinishedJob):

@@ -80,15 +80,15 @@ def find_log(cfg: DictConfig) -> Log:
     if cfg.log is None:
         return open_log(sources.reader, sources.logs[0], **sources.settings)
     # A log mostly has the name of its file or folder: then no other one is opened.
-    named = sorted(sources.logs, key=lambda source: _name(source) != cfg.log)
+    names = {source: getattr(source, "stem", source.name) for source in sources.logs}
     seen = []
-    for source in named:
+    for source in sorted(names, key=lambda source: names[source] != cfg.log):
         try:
             log = open_log(sources.reader, source, **{**sources.settings, "check": False})
         except (CFlowError, OSError) as error:
-            if _name(source) == cfg.log:
+            if names[source] == cfg.log:
                 raise
-            seen.append(f"{_name(source)} ({error})")
+            seen.append(f"{names[source]} ({error})")
             continue
         if log.log_id == cfg.log:
             if sources.settings.get("check", True):
@@ -98,31 +98,23 @@ def find_log(cfg: DictConfig) -> Log:
     raise CFlowError(f"log={cfg.log}: there is no such log; there are {', '.join(sorted(seen))}")
 
 
-def _name(source: Any) -> str:
-    return str(getattr(source, "stem", source))
-
-
-def _title(log: Log, index: int) -> str:
-    return f"{log.log_id}, sweep {log.timestamps[index]}"
-
-
-def _flow(cfg: DictConfig, model: SceneFlowModel, log: Log, sweeps: Window) -> Any:
-    if cfg.truth not in (True, False, "auto"):
-        raise CFlowError(f"truth={cfg.truth}: give true, false or auto")
-    (result,) = model([sweeps])
-    return plot_flow(
-        sweeps.pc0.points,
-        result,
-        is_ground=sweeps.pc0.is_ground,
-        point_cloud_range=model.config.point_cloud_range,
-        max_flow=cfg.max_flow,
-        title=_title(log, cfg.pair),
-        truth=_truth(cfg, log, result),
-    )
+def _from_above(cfg: DictConfig, model: SceneFlowModel, log: Log, sweeps: Window) -> Any:
+    """picture=flow and picture=clusters."""
+    points, (result,) = sweeps.pc0.points, model([sweeps])
+    view: Dict[str, Any] = {
+        "is_ground": sweeps.pc0.is_ground,
+        "point_cloud_range": model.config.point_cloud_range,
+        "title": f"{log.log_id}, sweep {log.timestamps[cfg.pair]}",
+    }
+    if cfg.picture == "clusters":
+        return plot_clusters(points, result, **view)
+    return plot_flow(points, result, max_flow=cfg.max_flow, truth=_truth(cfg, log, result), **view)
 
 
 def _truth(cfg: DictConfig, log: Log, result: FlowResult) -> Optional[np.ndarray]:
     """(N, 3) true residual flow, NaN where unknown; None = it is not drawn."""
+    if cfg.truth not in (True, False, "auto"):
+        raise CFlowError(f"truth={cfg.truth}: give true, false or auto")
     labels = None if cfg.truth is False else log.labels(cfg.pair)
     if labels is None:
         if cfg.truth is True:
@@ -132,20 +124,9 @@ def _truth(cfg: DictConfig, log: Log, result: FlowResult) -> Optional[np.ndarray
     return np.where(labels.is_valid[:, None], truth, np.nan)
 
 
-def _clusters(cfg: DictConfig, model: SceneFlowModel, log: Log, sweeps: Window) -> Any:
-    (result,) = model([sweeps])
-    return plot_clusters(
-        sweeps.pc0.points,
-        result,
-        is_ground=sweeps.pc0.is_ground,
-        point_cloud_range=model.config.point_cloud_range,
-        title=_title(log, cfg.pair),
-    )
-
-
 PICTURES: Dict[str, Callable[[DictConfig, SceneFlowModel, Log, Window], Any]] = {
-    "flow": _flow,
-    "clusters": _clusters,
+    "flow": _from_above,
+    "clusters": _from_above,
     "keypoints": lambda cfg, model, log, sweeps: plot_keypoints(sweeps, model.config),
     "correlation": lambda cfg, model, log, sweeps: plot_correlation(sweeps, model.config, cluster_id=cfg.cluster),
     "scales": lambda cfg, model, log, sweeps: plot_scales(sweeps, model.config),
@@ -156,12 +137,11 @@ def _animate(cfg: DictConfig, model: SceneFlowModel, output: Path) -> Path:
     """Flow of several pairs, then their pictures; nothing is written if one of them fails."""
     if cfg.format not in FORMATS:
         raise CFlowError(f"format={cfg.format}: give one of {', '.join(FORMATS)}")
-    chosen = chosen_pairs(cfg)
-    log = find_log(cfg)
+    chosen, log = chosen_pairs(cfg), find_log(cfg)
     recent = RecentSweeps(log, model.config.num_history + 2)
-    pairs = chosen.of(log)
+    pairs = chosen(log)
     if not pairs:
-        raise CFlowError(f"first={chosen.first}: log {log.log_id} has pairs 0 to {len(log.timestamps) - 2}")
+        raise CFlowError(f"first={cfg.first}: log {log.log_id} has pairs 0 to {len(log.timestamps) - 2}")
     ready_folder(output)
     frames: List[Frame] = []
     for pair in counted(pairs):

@@ -30,19 +30,9 @@ _PLACES = ("config.output", "config.overwrite", "config.data.cache")
 
 
 class DataIdentity:
-    """What exactly was scored: the logs, and a digest of all scored points and labels.
+    """What exactly was scored: the logs, and a digest of all scored points and labels."""
 
-    Args:
-        cfg: resolved settings.
-        logs: the logs that were opened.
-    """
-
-    def __init__(self, cfg: DictConfig, logs: Sequence[Log]) -> None:
-        self._about: Dict[str, Any] = {
-            "label": cfg.data.label,
-            "generator": _generator(cfg),
-            "logs": [{"log_id": log.log_id, "sweeps": len(log.timestamps)} for log in logs],
-        }
+    def __init__(self) -> None:
         self._digest = hashlib.sha256()
 
     def add(self, sweeps: Window, labels: FlowLabels) -> None:
@@ -50,9 +40,11 @@ class DataIdentity:
         for values in (sweeps.pc0.points, labels.flow, labels.category, labels.is_valid):
             self._digest.update(np.ascontiguousarray(values).tobytes())
 
-    def report(self) -> Dict[str, Any]:
+    def report(self, cfg: DictConfig, logs: Sequence[Log]) -> Dict[str, Any]:
         """ "label", "generator" (synthetic benchmark only), "logs", "digest"."""
-        return {**self._about, "digest": self._digest.hexdigest()[:16]}
+        sizes = [{"log_id": log.log_id, "sweeps": len(log.timestamps)} for log in logs]
+        digest = self._digest.hexdigest()[:16]
+        return {"label": cfg.data.label, "generator": _generator(cfg), "logs": sizes, "digest": digest}
 
 
 def finished_results(cfg: DictConfig, folder: Path) -> Optional[Dict[str, Any]]:

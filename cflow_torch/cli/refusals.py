@@ -15,7 +15,9 @@ _PLUGINS = "hydra-joblib-launcher hydra-submitit-launcher hydra-optuna-sweeper"
 
 
 def explain(error: Exception, command: str) -> str:
-    """The message for a call that Hydra refuses."""
+    """The message for a call that Hydra, or a command, refuses."""
+    if isinstance(error, CFlowError):
+        return str(error)
     if isinstance(error, MissingConfigException) and error.options:
         group, _, name = str(error.missing_cfg_file).rpartition("/")
         if group.startswith("hydra/"):

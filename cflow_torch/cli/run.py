@@ -8,9 +8,8 @@ import platform
 import re
 import sys
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Callable, Dict, Iterator, List, Optional, Sequence, Tuple
+from typing import Any, Callable, Dict, Iterator, List, NamedTuple, Sequence, Tuple
 
 import numpy as np
 import torch
@@ -102,21 +101,8 @@ def _folder_name(text: str) -> str:
     return name
 
 
-@dataclass(frozen=True)
-class Pairs:
-    """Every `step`-th pair of a log from `first` on, up to `count` of them (None: all)."""
-
-    first: int = 0
-    step: int = 1
-    count: Optional[int] = None
-
-    def of(self, log: Log) -> range:
-        """Indices of the pairs of a log; none if it is shorter."""
-        return range(self.first, len(log.timestamps) - 1, self.step)[: self.count]
-
-
-def chosen_pairs(cfg: DictConfig, group: str = "") -> Pairs:
-    """The pairs that the settings `first`, `step` and, if there is one, `count` choose.
+def chosen_pairs(cfg: DictConfig, group: str = "") -> Callable[[Log], range]:
+    """Log -> indices of the pairs that the settings `first`, `step` and, if there is one, `count` choose.
 
     Args:
         cfg: resolved settings.
@@ -125,8 +111,9 @@ def chosen_pairs(cfg: DictConfig, group: str = "") -> Pairs:
     Raises:
         CFlowError: one of them is no whole number or too small.
     """
+    first, step = _whole(cfg, f"{group}first", 0), _whole(cfg, f"{group}step", 1)
     count = None if OmegaConf.select(cfg, "count") is None else _whole(cfg, "count", 1)
-    return Pairs(_whole(cfg, f"{group}first", 0), _whole(cfg, f"{group}step", 1), count)
+    return lambda log: range(first, len(log.timestamps) - 1, step)[:count]
 
 
 def _whole(cfg: DictConfig, key: str, least: float = -math.inf) -> int:
@@ -137,15 +124,8 @@ def _whole(cfg: DictConfig, key: str, least: float = -math.inf) -> int:
     return value
 
 
-@dataclass(frozen=True)
-class Sources:
-    """Logs that are not open yet.
-
-    Args:
-        reader: data set, a key of `catalog.DATA_SETS`.
-        settings: of its reader.
-        logs: what `catalog.open_log` takes, one each.
-    """
+class Sources(NamedTuple):
+    """Logs that are not open yet: name of their data set, settings of its reader, what `open_log` takes for each."""
 
     reader: str
     settings: Dict[str, Any]
@@ -203,14 +183,14 @@ def reported(failures: Failures, name: str) -> Iterator[None]:
         say(f"failed: {name}: {error}")
 
 
-def for_each_pair(logs: Sequence[Log], model: FlowModel, use: UseResult, pairs: Pairs) -> Failures:
+def for_each_pair(logs: Sequence[Log], model: FlowModel, use: UseResult, pairs: Callable[[Log], range]) -> Failures:
     """Estimate the flow of the pairs of every log and hand it on; a bad frame is reported and the rest goes on.
 
     Args:
         logs: logs of at least two sweeps.
         model: the method.
         use: what to do with a result.
-        pairs: which ones of a log.
+        pairs: which ones of a log, by index.
 
     Returns:
         (frame, message) of every pair that failed.
@@ -218,7 +198,7 @@ def for_each_pair(logs: Sequence[Log], model: FlowModel, use: UseResult, pairs: 
     history = model.config.num_history
     failures: Failures = []
     recent = [RecentSweeps(log, history + 2) for log in logs]
-    indices = [(log, index) for log in recent for index in pairs.of(log)]
+    indices = [(log, index) for log in recent for index in pairs(log)]
     for log, index in frames(indices):
         with reported(failures, f"{log.log_id}/{log.timestamps[index]}"):
             sweeps = window(log, index, history)

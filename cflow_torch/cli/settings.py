@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, Iterator, List
+from typing import Any, Dict, Iterator, List
 
 import yaml  # type: ignore[import-untyped]
 
@@ -26,13 +26,13 @@ from cflow_torch.types import CFlowError
 
 _PAGE = """# Settings
 
-The same names hold everywhere: `make_config("fast", max_speed=30.0)` in Python, `cflow eval model=fast model.max_speed=30`
-on the command line, `cflow eval -m model.connectivity=4,8` for a sweep. null is None in Python. Words such as
-Alg. clustering are labels of the paper. A wrong name or value is refused with a message that says what is allowed."""
+The same names hold everywhere: `make_config("fast", max_speed=30.0)` in Python, `model=fast model.max_speed=30` behind
+a command, `-m model.connectivity=4,8` for a sweep. null is None in Python. Words such as Alg. clustering are labels of
+the paper. A wrong name or value is refused with a message that says what is allowed."""
 # Literals only: the harness's eval.yaml and save.yaml have nothing to refer to.
 _HARNESS = """\
-# CorrelationFlow, preset {preset}. For OpenSceneFlow: hydra.searchpath=[pkg://cflow_torch.configs.opensceneflow] model={name}
-# Written by `cflow settings --opensceneflow FOLDER`; `cflow settings` says what each setting does.
+# CorrelationFlow, preset {preset}: hydra.searchpath=[pkg://cflow_torch.configs.opensceneflow] model={name}
+# For OpenSceneFlow. Written by `cflow settings --opensceneflow FOLDER`; `cflow settings` says what each setting does.
 name: {name}
 val_monitor: val/Dynamic/Mean
 iter_only: false  # true: the runner for methods without training (needs a GPU, no checkpoint)
@@ -53,25 +53,27 @@ def task(arguments: List[str]) -> None:
         print("\n\n".join(_page()))
     elif len(arguments) == 2 and arguments[0] == "--opensceneflow":
         folder = ready_folder(Path(arguments[1]))
-        for preset in PRESETS:
-            name = "cflow" if preset == "default" else f"cflow_{preset}"
-            write_text(folder / f"{name}.yaml", harness_model(preset, name))
+        for name, text in harness_models().items():
+            write_text(folder / f"{name}.yaml", text)
             print(folder / f"{name}.yaml")
     else:
         raise CFlowError(f"settings takes nothing, or --opensceneflow FOLDER, got {' '.join(arguments)}")
 
 
-def harness_model(preset: str, name: str) -> str:
-    """The YAML of a preset as a model of OpenSceneFlow."""
-    config = make_config(preset)
-    lines = [_HARNESS.format(preset=preset, name=name, num_frames=config.num_history + 2)]
-    for f in fields(config):
-        value = getattr(config, f.name)
-        if f.name == "point_cloud_range":
-            value = [bound if math.isfinite(bound) else math.copysign(_Z, bound) for bound in value]
-        if f.name != "num_history":  # num_frames says it
-            lines.append(f"  {f.name}: {_yaml(value)}  # {describe(f)}\n")
-    return "".join(lines)
+def harness_models() -> Dict[str, str]:
+    """Name -> YAML of each preset as a model of OpenSceneFlow."""
+    models = {}
+    for preset in PRESETS:
+        config = make_config(preset)
+        name = "cflow" if preset == "default" else f"cflow_{preset}"
+        text = _HARNESS.format(preset=preset, name=name, num_frames=config.num_history + 2)
+        region = [min(max(bound, -_Z), _Z) for bound in config.point_cloud_range]
+        for f in fields(config):
+            value = region if f.name == "point_cloud_range" else getattr(config, f.name)
+            if f.name != "num_history":  # num_frames says it
+                text += f"  {f.name}: {_yaml(value)}  # {describe(f)}\n"
+        models[name] = text
+    return models
 
 
 def _page() -> Iterator[str]:

@@ -63,7 +63,7 @@ def task(cfg: DictConfig) -> None:
         with reported(failures, log.log_id):
             if file.name.casefold() in {other.name.casefold() for other in files}:
                 raise CFlowError(f"{file} is of another log of this name: give data.root=PATH more narrowly")
-            results = _results(recent, chosen.of(log), flow, failures)
+            results = _results(recent, chosen(log), flow, failures)
             count = record_log(recent, results, file, max_flow=cfg.max_flow)
             files.append(file)
             print(f"{file}: {count} pair{'' if count == 1 else 's'}, {file.stat().st_size / 1e6:,.1f} MB")
