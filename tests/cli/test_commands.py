@@ -43,7 +43,7 @@ def evaluate(cflow: Cflow, log_folder: Path, tmp_path: Path) -> Cflow:
 def test_demo_leaves_everything(tmp_path: Path, cache: Path, cflow: Cflow, capsys: pytest.CaptureFixture) -> None:
     pytest.importorskip("matplotlib")
     assert cflow("demo", f"output={tmp_path}", "data.num_sweeps=2", "pair=0", "model=fast", SMALL) == 0
-    (log,) = (AV2Log(folder) for folder in cache.glob("*-2/synthetic-*"))
+    (log,) = (AV2Log(folder) for folder in cache.glob("*-2/*/*"))
     assert [file.stem for file in (tmp_path / log.log_id).iterdir()] == [str(log.timestamps[0])]
     scores = results_of(tmp_path)
     assert scores["results"]["num_frames"] == 1 and 0 < scores["results"]["three_way"]["epe_fd"] < 2
@@ -92,6 +92,8 @@ def test_a_results_file_says_everything(log_folder: Path, tmp_path: Path, evalua
     assert 0 < times["min"] <= times["median"] <= times["max"] and times["pairs"] == 1
     assert {"cluster", "correlate"} <= set(times["stages"]) and sum(times["stages"].values()) < times["max"]
     assert record["failures"] == [] and record["date"].startswith("20")
+    assert evaluate("data.first=2", "overwrite=true") == 0
+    assert results_of(tmp_path)["data"]["digest"] != record["data"]["digest"], "of what was scored"
 
 
 def test_a_folder_of_another_run_is_an_error_that_says_so(
