@@ -16,12 +16,12 @@ dependencies = ["torch", "numpy"]
 
 
 def cflow(preset: str = "default", device: _Any = "auto", **overrides: _Any) -> _Module:
-    """CorrelationFlow, a module without parameters: a list of `cflow_torch.Window` in, a list of `FlowResult` out.
+    """A method as a module without parameters: a list of `cflow_torch.Window` in, a list of `FlowResult` out.
 
     Args:
         preset: "default", "fast", "keypoints" or "paper".
         device: "auto" = that of the tensors given, else a GPU if there is one, else the CPU.
-        **overrides: any field of `cflow_torch.Config`, for example `num_history=2`.
+        **overrides: any field of the preset's method, for example `num_history=2`.
 
     Raises:
         CFlowError: an unknown preset or setting, or an invalid value.

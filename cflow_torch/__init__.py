@@ -1,11 +1,17 @@
 """CorrelationFlow: training-free LiDAR scene flow as batched PyTorch."""
 
-from cflow_torch.config import Config, make_config
-from cflow_torch.dense.method import CorrelationFlow
-from cflow_torch.estimate import estimate_flow, make_model
-from cflow_torch.keypoints.method import CorrelationFlowKeypoints
-from cflow_torch.types import CFlowError, FlowResult, Sweep, Window
-from cflow_torch.verified.method import VerifiedFlow
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, List
+
+if TYPE_CHECKING:
+    from cflow_torch.config import Config, make_config
+    from cflow_torch.dense.method import CorrelationFlow
+    from cflow_torch.estimate import estimate_flow, make_model
+    from cflow_torch.keypoints.method import CorrelationFlowKeypoints
+    from cflow_torch.types import CFlowError, FlowResult, Sweep, Window
+    from cflow_torch.verified.method import VerifiedFlow
 
 __version__ = "0.2.0"
 
@@ -23,3 +29,30 @@ __all__ = [
     "make_model",
     "__version__",
 ]
+
+# Where each name is. It is imported when it is first asked for: torch takes seconds, which `cflow --version` need not.
+_MODULES = {
+    "CFlowError": "types",
+    "Config": "config",
+    "CorrelationFlow": "dense.method",
+    "CorrelationFlowKeypoints": "keypoints.method",
+    "FlowResult": "types",
+    "Sweep": "types",
+    "VerifiedFlow": "verified.method",
+    "Window": "types",
+    "estimate_flow": "estimate",
+    "make_config": "config",
+    "make_model": "estimate",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> List[str]:
+    return sorted({*globals(), *__all__})

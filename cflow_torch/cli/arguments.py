@@ -9,6 +9,8 @@ from typing import List
 _NAMES = ("output", "log", "flow", "archive", "frames", "masks", "result_name", "data.root", "data.cache")
 # What Hydra would read as a number or a truth value: 1e5, 2024_11_22, true.
 _NO_TEXT = re.compile(r"[+-]?[._]*\d[\d._]*(e[+-]?[\d_]+)?|true|false", re.IGNORECASE)
+_READABLE = re.compile(r"[\w./\\:+%@?|*$ -]*", re.ASCII)  # without quotes
+_GRAMMAR = re.compile(r"['\"\[{]|(choice|glob|range|shuffle|sort|str|tag)\(|.*\$\{")  # what Hydra gives a meaning
 
 
 def for_hydra(arguments: List[str]) -> List[str]:
@@ -16,7 +18,7 @@ def for_hydra(arguments: List[str]) -> List[str]:
 
     Args:
         arguments: behind the command. A Waymo segment, log=10203656353524179475_7625_000_7645_000, is a whole number to
-            Hydra, which leaves its underscores out.
+            Hydra, which leaves its underscores out, and output=Ausgänge an error.
     """
 
     def is_override(word: str) -> bool:
@@ -27,7 +29,10 @@ def for_hydra(arguments: List[str]) -> List[str]:
 
 def _quoted(override: str) -> str:
     key, _, value = override.partition("=")
-    if key.lstrip("+") not in _NAMES:
+    if key.lstrip("+") not in _NAMES or _GRAMMAR.match(value):
         return override
-    values = [f'"{one}"' if _NO_TEXT.fullmatch(one.strip()) else one for one in value.split(",")]  # of a sweep
+    values = value.split(",")  # of a sweep
+    for number, one in enumerate(values):
+        if _NO_TEXT.fullmatch(one.strip()) or not _READABLE.fullmatch(one):
+            values[number] = '"' + one.replace('"', r"\"") + '"'
     return f"{key}={','.join(values)}"

@@ -14,15 +14,14 @@ examples:
 from __future__ import annotations
 
 from contextlib import suppress
-from pathlib import Path
-from typing import Any, Dict
+from typing import Any
 
 from omegaconf import DictConfig
 
-from cflow_torch.cli.pairs import chosen_pairs
-from cflow_torch.cli.record import DataIdentity, finished_results, write_results
+from cflow_torch.cli.record import DataIdentity, finished_results, objective, report
 from cflow_torch.cli.run import (
     UnfinishedJob,
+    chosen_pairs,
     finish,
     for_each_pair,
     make_model,
@@ -33,7 +32,6 @@ from cflow_torch.data.atomic import ready_folder
 from cflow_torch.data.log import Log
 from cflow_torch.evaluation.frame import EvalFrame
 from cflow_torch.evaluation.metrics import SceneFlowMetrics
-from cflow_torch.evaluation.tables import format_table
 from cflow_torch.stages import StopWatch
 from cflow_torch.types import CFlowError, FlowResult, Window
 
@@ -41,15 +39,15 @@ from cflow_torch.types import CFlowError, FlowResult, Window
 def task(cfg: DictConfig) -> float:
     """Run `cflow eval`; returns the score of a sweep, see `objective`."""
     output = output_folder(cfg)
-    pairs = chosen_pairs(cfg, "data.first", "data.step")
+    pairs = chosen_pairs(cfg, "data.")
     record = finished_results(cfg, output)
     if record is not None:
         print(f"skipped, done before: {output}")
-        return objective_of(record, output)
+        return objective(record["results"])
     metrics = SceneFlowMetrics(cfg.definition)
     model = StopWatch(make_model(cfg))
     logs, failures = open_logs(cfg)
-    identity = DataIdentity(cfg, logs)
+    identity = DataIdentity()
     ready_folder(output)
 
     def score(log: Log, index: int, sweeps: Window, result: FlowResult) -> None:
@@ -61,11 +59,12 @@ def task(cfg: DictConfig) -> float:
             metrics.update(EvalFrame.from_result(sweeps, result, labels, **parts))
             identity.add(sweeps, labels)
 
-    failures += for_each_pair(logs, model, score, pairs.of)
+    failures += for_each_pair(logs, model, score, pairs)
     if metrics.num_frames == 0:
         raise CFlowError("no pair has labels: nothing to score; `cflow flow` estimates the flow without them")
-    results = report(cfg, metrics, output, data=identity.report(), seconds=model.report(), failures=failures)
-    _finish(failures)
+    results = report(cfg, metrics, output, data=identity.report(cfg, logs), seconds=model.report(), failures=failures)
+    with suppress(UnfinishedJob):  # a job of a sweep has a score all the same; a run on its own ends with status 1
+        finish(failures)
     return objective(results)
 
 
@@ -73,43 +72,3 @@ def _of(log: Log, name: str, index: int) -> Any:
     """What a log knows about a pair beyond the protocol; None where it does not."""
     find = getattr(log, name, None)
     return None if find is None else find(index)
-
-
-def report(cfg: DictConfig, metrics: SceneFlowMetrics, output: Path, **about: Any) -> Dict[str, Any]:
-    """Print the scores and write results.json and config.yaml; `about` as for `write_results`."""
-    results = metrics.compute()
-    write_results(cfg, results, output, **about)
-    print(f"{output}: {format_table(results)}")
-    return results
-
-
-def objective(results: Dict[str, Any]) -> float:
-    """The one number that a sweep minimises: the mean dynamic error, of the ranges if the definition has them; else the
-    three-way end-point error in metres. NaN where there is nothing to score."""
-    if "bucketed_by_range" in results:
-        value = results["bucketed_by_range"]["mean"]["dynamic_error"]
-    elif "bucketed" in results:
-        value = results["bucketed"]["mean"]["dynamic_error"]
-    else:
-        value = results["three_way"]["epe_3way"]
-    return float("nan") if value is None else float(value)
-
-
-def objective_of(record: Dict[str, Any], folder: Path) -> float:
-    """`objective` of a record that was read.
-
-    Raises:
-        CFlowError: it lacks the score.
-    """
-    try:
-        return objective(record["results"])
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise CFlowError(
-            f"{folder} holds a results file without its score ({error!r:.80}): give output=FOLDER, or overwrite=true"
-        ) from None
-
-
-def _finish(failures: Any) -> None:
-    """List what failed. A job of a sweep has a score all the same; a run on its own ends with status 1."""
-    with suppress(UnfinishedJob):
-        finish(failures)

@@ -4,9 +4,9 @@ Columns: flow_t{x,y,z}_m total flow, residual_t{x,y,z}_m motion of objects, pose
 metres until the next sweep, axes of the ego frame at t+1), cluster_id, score, is_valid; one row per point of sweep t.
 contents=[residual,is_valid] writes these columns only: the others follow from the poses, and take most of the room.
 contents=[residual,is_valid,confidence] also tells how far each point can be trusted (not model=paper, keypoints).
-OUTPUT/config.yaml holds the resolved settings and versions, OUTPUT/reports what was done. The same command again goes
-on where the last one ended. Ctrl-C, SIGTERM and SIGHUP let the frames in hand be finished. The status is 0 if every
-frame is there, 1 if one is missing, 2 if the call was wrong, 128 and its number after a signal.
+OUTPUT/config.yaml holds the resolved settings and versions, OUTPUT/reports what was done. The same command again
+resumes. Ctrl-C, SIGTERM and SIGHUP let the frames in hand be finished. The status is 0 if every frame is there, 1 if
+one is missing, 2 if the call was wrong, 128 and its number after a signal.
 
 result_name=NAME (HDF5 scenes) also writes the total flow into the scenes themselves, as key NAME of every sweep, where
 the viewers of OpenSceneFlow find it.
@@ -31,7 +31,16 @@ from typing import Any, Dict, Sequence, Tuple
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
-from cflow_torch.cli.run import Failures, UnfinishedJob, find_logs, is_sweep, make_model, output_folder, versions
+from cflow_torch.cli.run import (
+    Failures,
+    UnfinishedJob,
+    find_logs,
+    is_sweep,
+    make_model,
+    output_folder,
+    reported,
+    versions,
+)
 from cflow_torch.data.flow_file import CONTENTS, ON_REQUEST, read_flow
 from cflow_torch.data.hdf5.results import check_result_name, check_writable, write_hdf5_results
 from cflow_torch.data.records import write_text
@@ -51,12 +60,13 @@ def task(cfg: DictConfig) -> None:
     shard = find_shard(cfg.shard.index, cfg.shard.count, os.environ)
     if cfg.result_name is not None:
         _check_results(cfg, shard)
-    engine: Dict[str, Any] = OmegaConf.to_container(cfg.engine, resolve=True)  # type: ignore[assignment]
+    settings: Dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
+    engine = dict(settings["engine"])
     name, workers, threads, batch = (engine.pop(key) for key in ("name", "workers", "threads", "batch"))
     layout = choose_layout(cfg.device, workers, threads, batch, os.environ)
     config = make_model(cfg).config
-    sources = find_logs(cfg)
     contents = _contents(cfg, config.method == "verified")
+    sources = find_logs(cfg)
     identity = make_identity(config, sources.reader, sources.settings, contents)
     job = Job(
         config=config,
@@ -78,11 +88,10 @@ def task(cfg: DictConfig) -> None:
     if cfg.result_name is not None:
         for scene in sources.logs:
             check_writable(scene)
-    settings = OmegaConf.to_container(cfg, resolve=True)
-    kept = {key: settings[key] for key in ("model", "data", "result_name")}  # type: ignore[index,call-overload]
+    kept = {**{key: settings[key] for key in ("model", "data", "result_name")}, "versions": versions()}
     try:
         claim_folder(output, identity, cfg.resume, cfg.overwrite, shard.count == 1)
-        write_text(output / "config.yaml", OmegaConf.to_yaml(OmegaConf.create({**kept, "versions": versions()})))
+        write_text(output / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(kept)))
     except OSError as error:
         raise CFlowError(f"cannot write into {output} ({error}): make room there, or give output=FOLDER") from error
 
@@ -117,7 +126,7 @@ def _contents(cfg: DictConfig, has_confidence: bool) -> Tuple[str, ...]:
     if not given or set(given) - set(allowed):
         raise CFlowError(f"contents={given}: give some of {', '.join(allowed)}")
     if "confidence" in given and not has_confidence:
-        raise CFlowError(f"contents={given}: confidence is there with model.proof=true only")
+        raise CFlowError(f"contents={given}: confidence is there with model=default and model=fast only")
     if cfg.result_name is not None and not set(given) >= set(CONTENTS):
         raise CFlowError("result_name reads the flow files again: it needs all contents")
     return tuple(name for name in allowed if name in given)
@@ -130,9 +139,7 @@ def _into_scenes(name: str, scenes: Sequence[Path], output: Path) -> Failures:
     for scene in tqdm(scenes, desc=name, unit="scene", disable=None):
         folder = output / scene.stem
         stamps = sorted(complete_frames(folder))
-        try:
+        with reported(failures, scene.stem):
             count += write_hdf5_results(scene, name, ((t, read_flow(frame_file(folder, t)).flow) for t in stamps))
-        except (CFlowError, OSError) as error:
-            failures.append((scene.stem, str(error)))
     print(f"sweeps that now have a key {name} in their scene: {count} (the last sweep of a scene has no flow)")
     return failures

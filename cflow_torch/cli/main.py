@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 import select
 import sys
+import traceback
 from contextlib import suppress
 from difflib import get_close_matches
 from importlib import import_module
 from typing import Any, List, Optional
 
 from cflow_torch import __version__
-from cflow_torch.types import CFlowError
 
 COMMANDS = {
     "demo": "simulate a drive, estimate its flow, score it and draw it",
@@ -21,11 +21,12 @@ COMMANDS = {
     "plot": "pictures of the flow and of every stage, ground truth beside it, animations",
     "view": "a recording of a drive for the viewer rerun: flow, clusters, truth, on a timeline",
     "bench": "time every stage against the reference and a plain OpenCV loop",
+    "settings": "every setting with its default and its meaning; model files for OpenSceneFlow",
     "info": "packages, machine, devices: to paste into a bug report",
     "completion": "a script that makes a shell complete commands and settings",
 }
 
-_WITHOUT_SETTINGS = ("info", "completion")
+_WITHOUT_SETTINGS = ("settings", "info", "completion")
 
 HELP = f"""cflow: training-free LiDAR scene flow
 
@@ -38,7 +39,7 @@ examples:
   cflow demo                                          a picture in outputs/demo, no data needed
   cflow flow data=av2 data.root=/data/av2/val         one flow file per pair of sweeps
   cflow eval data=av2 data.root=/data/av2/val model=paper
-  cflow eval model.pixel_sizes=[0.4,0.2,0.1]          any field of the method, see `cflow eval --cfg job`
+  cflow eval model.pixel_sizes=[0.4,0.2,0.1]          any field of the method, see `cflow settings`
   cflow eval -m model.connectivity=4,8                a sweep
   cflow plot picture=correlation pair=2               how one object was found, outputs/plot/correlation.png
   cflow submit data=hdf5 data.root=/data/test version=3
@@ -67,110 +68,88 @@ def main(argv: Optional[List[str]] = None) -> None:
 
 
 def _run(arguments: List[str]) -> None:
-    if not arguments or arguments[0] in ("-h", "--help", "help"):
-        if arguments[1:2] and arguments[1] in COMMANDS:  # cflow help eval
-            return _run([arguments[1], "--help"])
-        print(HELP)
-        return None
-    if arguments[0] in ("-V", "--version"):
-        print(f"cflow_torch {__version__}")
-        return None
-    command, *rest = arguments
+    if arguments[:1] == ["help"]:  # cflow help eval
+        arguments = [*arguments[1:], "--help"]
+    command, *rest = arguments or ["--help"]
+    if command in ("-h", "--help"):
+        return print(HELP)
+    if command in ("-V", "--version"):
+        return print(f"cflow_torch {__version__}")
     if command not in COMMANDS:
         near = get_close_matches(command, COMMANDS, 1)
         hint = f" (did you mean {near[0]}?)" if near else ""
-        print(f"error: unknown command {command!r}{hint}: give one of {', '.join(COMMANDS)}", file=sys.stderr)
-        raise SystemExit(2)
+        _end_wrong(f"unknown command {command!r}{hint}: give one of {', '.join(COMMANDS)}")
     module = import_module(f"cflow_torch.cli.{command}")
     if "-h" in rest or "--help" in rest:
-        print(f"cflow {command}: {COMMANDS[command]}\n\n{module.__doc__}")
-        return None
-    if command in _WITHOUT_SETTINGS:
-        try:
-            return module.task(rest)
-        except CFlowError as error:
-            print(f"error: {error}", file=sys.stderr)
-            raise SystemExit(2) from None
-    return _run_with_settings(command, module.task, rest)
+        from cflow_torch.cli.choices import settings_help
+
+        more = "" if command in _WITHOUT_SETTINGS else settings_help(command)
+        return print(f"cflow {command}: {COMMANDS[command]}\n\n{module.__doc__}{more}", end="")
+    if command not in _WITHOUT_SETTINGS:
+        return _run_with_settings(command, module.task, rest)
+    from cflow_torch.types import CFlowError
+
+    try:
+        return module.task(rest)  # type: ignore[no-any-return]
+    except CFlowError as error:
+        return _end_wrong(error)
 
 
 def _run_with_settings(command: str, run: Any, rest: List[str]) -> None:
     import hydra
+    from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
-    from cflow_torch.cli import settings, wrong_call
     from cflow_torch.cli.arguments import for_hydra
+    from cflow_torch.cli.refusals import explain
+    from cflow_torch.cli.run import UnfinishedJob
+    from cflow_torch.types import CFlowError
 
-    has_begun = False
+    given = os.environ.get("HYDRA_FULL_ERROR")
 
     def task(cfg: Any) -> Any:
-        nonlocal has_begun
         try:
-            settings.check_shape(cfg, command)
-            has_begun = True
+            OmegaConf.resolve(cfg)
             return run(cfg)
-        except CFlowError as error:
-            print(f"error: {error}", file=sys.stderr)
-            raise SystemExit(2) from None
-        except OmegaConfBaseException as error:  # a setting that refers to none, or was taken out
-            print(f"error: {wrong_call.explain(error, command)}", file=sys.stderr)
-            raise SystemExit(2) from None
-        except OSError as error:
-            if given or error.errno is None:
+        except (CFlowError, OmegaConfBaseException) as error:
+            _end_wrong(explain(error, command))
+        except Exception as error:
+            if given or isinstance(error, UnfinishedJob):
                 raise
-            if error.filename is None:
-                _end_refused(error)
-            print(f"error: {_place(error)}", file=sys.stderr)
-            raise SystemExit(2) from None
+            if isinstance(error, OSError) and error.errno is not None:
+                if error.filename is None:
+                    _end_refused(error)
+                reason = error.strerror or error
+                _end_wrong(
+                    f"{error.filename}: {reason}; give places that can be read (data.root=) and written (output=)"
+                )
+            traceback.print_exc()
+            report = "this is a fault of cflow, not of the call: report it with the lines above and `cflow info`"
+            raise UnfinishedJob(report) from None
 
     sys.argv = [f"cflow {command}", *for_hydra(rest)]
     # Hydra prints errors itself, and a closed pipe as one, unless this is set.
-    given = os.environ.get("HYDRA_FULL_ERROR")
     os.environ["HYDRA_FULL_ERROR"] = "1"
     try:
         hydra.main(version_base="1.3", config_path="pkg://cflow_torch.configs", config_name=command)(task)()
-    except SystemExit as stop:
-        if stop.code == 2 and _is_of_parser(stop):  # an option that it does not know
-            print(f"`cflow {command} --help` has examples", file=sys.stderr)
-        raise
+    except UnfinishedJob as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(1) from None
     except BrokenPipeError:  # of Hydra's own printing
         raise
     except Exception as error:
         if given:
             raise
-        _say(error, None if has_begun else wrong_call.explain(error, command))
+        _end_wrong(explain(error, command))
     finally:
-        if given is None:
-            del os.environ["HYDRA_FULL_ERROR"]
-        else:
-            os.environ["HYDRA_FULL_ERROR"] = given
+        os.environ.pop("HYDRA_FULL_ERROR")
+        os.environ.update({} if given is None else {"HYDRA_FULL_ERROR": given})
 
 
-def _say(error: Exception, wrong_call_message: Optional[str]) -> None:
-    """Print what went wrong and end the process."""
-    from cflow_torch.cli.run import UnfinishedJob
-    from cflow_torch.cli.wrong_call import format_bug
-
-    if wrong_call_message is not None:
-        print(f"error: {wrong_call_message}", file=sys.stderr)
-        raise SystemExit(2) from None
-    print(f"error: {error}" if isinstance(error, UnfinishedJob) else format_bug(error), file=sys.stderr)
-    raise SystemExit(1) from None
-
-
-def _place(error: OSError) -> str:
-    """The message for a file or folder that cannot be read, made or written."""
-    return (
-        f"{error.filename}: {error.strerror or error}; give places that can be read (data.root=) and written (output=)"
-    )
-
-
-def _is_of_parser(stop: BaseException) -> bool:
-    """Whether the parser of options ended the process; what a task ends with can come from another process."""
-    trace = stop.__traceback__
-    while trace is not None and trace.tb_next is not None:
-        trace = trace.tb_next
-    return trace is not None and trace.tb_frame.f_globals.get("__name__") == "argparse"
+def _end_wrong(message: object) -> None:
+    """End after a wrong call."""
+    print(f"error: {message}", file=sys.stderr)
+    raise SystemExit(2) from None
 
 
 def _end_refused(error: OSError) -> None:

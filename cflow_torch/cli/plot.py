@@ -27,8 +27,7 @@ import numpy as np
 from omegaconf import DictConfig
 from tqdm import tqdm
 
-from cflow_torch.cli.pairs import chosen_pairs
-from cflow_torch.cli.run import find_logs, make_model, number, output_folder
+from cflow_torch.cli.run import chosen_pairs, find_logs, make_model, output_folder
 from cflow_torch.data.atomic import ready_folder
 from cflow_torch.data.catalog import open_log
 from cflow_torch.data.log import Log, RecentSweeps, window
@@ -59,9 +58,11 @@ def task(cfg: DictConfig) -> None:
     if cfg.picture == "animation":
         path = _animate(cfg, model, output)
     else:
-        pair = number(cfg, "pair")
-        log = find_log(cfg)
-        sweeps = _window(log, pair, model.config.num_history)
+        pair, log = cfg.pair, find_log(cfg)
+        last = len(log.timestamps) - 2
+        if not 0 <= pair <= last:
+            raise CFlowError(f"pair={pair}: log {log.log_id} has {last + 2} sweeps, so pairs 0 to {last}")
+        sweeps = window(log, pair, model.config.num_history)
         ready_folder(output)
         figure = PICTURES[cfg.picture](cfg, model, log, sweeps)
         path = save_picture(figure, output / f"{cfg.picture}.png")
@@ -77,68 +78,43 @@ def find_log(cfg: DictConfig) -> Log:
     """
     sources = find_logs(cfg)
     if cfg.log is None:
-        return _open(sources.reader, sources.logs[0], sources.settings)
-    wanted, seen = str(cfg.log), []
+        return open_log(sources.reader, sources.logs[0], **sources.settings)
     # A log mostly has the name of its file or folder: then no other one is opened.
-    for source in sorted(sources.logs, key=lambda source: _name(source) != wanted):
+    names = {source: getattr(source, "stem", source.name) for source in sources.logs}
+    seen = []
+    for source in sorted(names, key=lambda source: names[source] != cfg.log):
         try:
-            log = _open(sources.reader, source, {**sources.settings, "check": False})
-        except CFlowError as error:
-            if _name(source) == wanted:
+            log = open_log(sources.reader, source, **{**sources.settings, "check": False})
+        except (CFlowError, OSError) as error:
+            if names[source] == cfg.log:
                 raise
-            seen.append(f"{_name(source)} ({error})")
+            seen.append(f"{names[source]} ({error})")
             continue
-        if log.log_id == wanted:
+        if log.log_id == cfg.log:
             if sources.settings.get("check", True):
                 check_log(log)
             return log
         seen.append(log.log_id)
-    raise CFlowError(f"log={wanted}: there is no such log; there are {', '.join(sorted(seen))}")
+    raise CFlowError(f"log={cfg.log}: there is no such log; there are {', '.join(sorted(seen))}")
 
 
-def _open(reader: str, source: Any, settings: Dict[str, Any]) -> Log:
-    try:
-        return open_log(reader, source, **settings)
-    except OSError as error:
-        raise CFlowError(f"cannot open {source}: {error}") from error
-
-
-def _name(source: Any) -> str:
-    return str(getattr(source, "stem", source))
-
-
-def _window(log: Log, pair: int, num_history: int) -> Window:
-    if not 0 <= pair < len(log.timestamps) - 1:
-        raise CFlowError(
-            f"pair={pair}: log {log.log_id} has {len(log.timestamps)} sweeps, so pairs 0 to {len(log.timestamps) - 2}"
-        )
-    try:
-        return window(log, pair, num_history)
-    except OSError as error:
-        raise CFlowError(f"cannot read pair {pair} of {log.log_id}: {error}") from error
-
-
-def _title(log: Log, index: int) -> str:
-    return f"{log.log_id}, sweep {log.timestamps[index]}"
-
-
-def _flow(cfg: DictConfig, model: SceneFlowModel, log: Log, sweeps: Window) -> Any:
-    if cfg.truth not in (True, False, "auto"):
-        raise CFlowError(f"truth={cfg.truth}: give true, false or auto")
-    (result,) = model([sweeps])
-    return plot_flow(
-        sweeps.pc0.points,
-        result,
-        is_ground=sweeps.pc0.is_ground,
-        point_cloud_range=model.config.point_cloud_range,
-        max_flow=number(cfg, "max_flow", float, or_null=True),
-        title=_title(log, cfg.pair),
-        truth=_truth(cfg, log, result),
-    )
+def _from_above(cfg: DictConfig, model: SceneFlowModel, log: Log, sweeps: Window) -> Any:
+    """picture=flow and picture=clusters."""
+    points, (result,) = sweeps.pc0.points, model([sweeps])
+    view: Dict[str, Any] = {
+        "is_ground": sweeps.pc0.is_ground,
+        "point_cloud_range": model.config.point_cloud_range,
+        "title": f"{log.log_id}, sweep {log.timestamps[cfg.pair]}",
+    }
+    if cfg.picture == "clusters":
+        return plot_clusters(points, result, **view)
+    return plot_flow(points, result, max_flow=cfg.max_flow, truth=_truth(cfg, log, result), **view)
 
 
 def _truth(cfg: DictConfig, log: Log, result: FlowResult) -> Optional[np.ndarray]:
     """(N, 3) true residual flow, NaN where unknown; None = it is not drawn."""
+    if cfg.truth not in (True, False, "auto"):
+        raise CFlowError(f"truth={cfg.truth}: give true, false or auto")
     labels = None if cfg.truth is False else log.labels(cfg.pair)
     if labels is None:
         if cfg.truth is True:
@@ -148,24 +124,11 @@ def _truth(cfg: DictConfig, log: Log, result: FlowResult) -> Optional[np.ndarray
     return np.where(labels.is_valid[:, None], truth, np.nan)
 
 
-def _clusters(cfg: DictConfig, model: SceneFlowModel, log: Log, sweeps: Window) -> Any:
-    (result,) = model([sweeps])
-    return plot_clusters(
-        sweeps.pc0.points,
-        result,
-        is_ground=sweeps.pc0.is_ground,
-        point_cloud_range=model.config.point_cloud_range,
-        title=_title(log, cfg.pair),
-    )
-
-
 PICTURES: Dict[str, Callable[[DictConfig, SceneFlowModel, Log, Window], Any]] = {
-    "flow": _flow,
-    "clusters": _clusters,
+    "flow": _from_above,
+    "clusters": _from_above,
     "keypoints": lambda cfg, model, log, sweeps: plot_keypoints(sweeps, model.config),
-    "correlation": lambda cfg, model, log, sweeps: plot_correlation(
-        sweeps, model.config, cluster_id=number(cfg, "cluster", or_null=True)
-    ),
+    "correlation": lambda cfg, model, log, sweeps: plot_correlation(sweeps, model.config, cluster_id=cfg.cluster),
     "scales": lambda cfg, model, log, sweeps: plot_scales(sweeps, model.config),
 }
 
@@ -174,18 +137,15 @@ def _animate(cfg: DictConfig, model: SceneFlowModel, output: Path) -> Path:
     """Flow of several pairs, then their pictures; nothing is written if one of them fails."""
     if cfg.format not in FORMATS:
         raise CFlowError(f"format={cfg.format}: give one of {', '.join(FORMATS)}")
-    chosen = chosen_pairs(cfg, "first", "step", "count")
-    max_flow, width = number(cfg, "max_flow", float, or_null=True), number(cfg, "width")
-    frames_per_second = number(cfg, "frames_per_second", float)
-    log = find_log(cfg)
+    chosen, log = chosen_pairs(cfg), find_log(cfg)
     recent = RecentSweeps(log, model.config.num_history + 2)
-    pairs = chosen.of(log)
+    pairs = chosen(log)
     if not pairs:
-        raise CFlowError(f"first={chosen.first}: log {log.log_id} has pairs 0 to {len(log.timestamps) - 2}")
+        raise CFlowError(f"first={cfg.first}: log {log.log_id} has pairs 0 to {len(log.timestamps) - 2}")
     ready_folder(output)
     frames: List[Frame] = []
     for pair in counted(pairs):
-        sweeps = _window(recent, pair, model.config.num_history)
+        sweeps = window(recent, pair, model.config.num_history)
         (result,) = model([sweeps])
         flow = result.residual_flow
         result = replace(result, pose_flow=flow, flow=flow)  # many frames are kept: let go of what is not drawn
@@ -194,11 +154,11 @@ def _animate(cfg: DictConfig, model: SceneFlowModel, output: Path) -> Path:
     figures = flow_figures(
         frames,
         point_cloud_range=model.config.point_cloud_range,
-        max_flow=max_flow,
+        max_flow=cfg.max_flow,
         legend=cfg.legend,
-        width=width,
+        width=cfg.width,
     )
     print(f"log {log.log_id}, {len(pairs)} pairs from {pairs[0]} to {pairs[-1]}")
     path = output / f"animation.{cfg.format}"
     drawn = tqdm(figures, total=len(frames), unit="picture", disable=None)
-    return save_animation(drawn, path, frames_per_second=frames_per_second)
+    return save_animation(drawn, path, frames_per_second=cfg.frames_per_second)

@@ -10,17 +10,17 @@ import re
 from dataclasses import asdict
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any, Dict, Optional, Sequence, Tuple
+from typing import Any, Dict, Optional, Sequence
 
 import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from cflow_torch.cli.run import versions, write_config
-from cflow_torch.data.json_file import read_json
+from cflow_torch.cli.run import Failures, versions, write_config
 from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.data.records import changes, strict, write_text
-from cflow_torch.evaluation.definitions import get_definition
+from cflow_torch.evaluation.metrics import SceneFlowMetrics
+from cflow_torch.evaluation.tables import format_table
 from cflow_torch.simulator.benchmark import generator_key
 from cflow_torch.types import CFlowError, Window
 
@@ -30,19 +30,9 @@ _PLACES = ("config.output", "config.overwrite", "config.data.cache")
 
 
 class DataIdentity:
-    """What exactly was scored: the logs, and a digest of all scored points and labels.
+    """What exactly was scored: the logs, and a digest of all scored points and labels."""
 
-    Args:
-        cfg: resolved settings.
-        logs: the logs that were opened.
-    """
-
-    def __init__(self, cfg: DictConfig, logs: Sequence[Log]) -> None:
-        self._about: Dict[str, Any] = {
-            "label": cfg.data.label,
-            "generator": _generator(cfg),
-            "logs": [{"log_id": log.log_id, "sweeps": len(log.timestamps)} for log in logs],
-        }
+    def __init__(self) -> None:
         self._digest = hashlib.sha256()
 
     def add(self, sweeps: Window, labels: FlowLabels) -> None:
@@ -50,9 +40,11 @@ class DataIdentity:
         for values in (sweeps.pc0.points, labels.flow, labels.category, labels.is_valid):
             self._digest.update(np.ascontiguousarray(values).tobytes())
 
-    def report(self) -> Dict[str, Any]:
+    def report(self, cfg: DictConfig, logs: Sequence[Log]) -> Dict[str, Any]:
         """ "label", "generator" (synthetic benchmark only), "logs", "digest"."""
-        return {**self._about, "digest": self._digest.hexdigest()[:16]}
+        sizes = [{"log_id": log.log_id, "sweeps": len(log.timestamps)} for log in logs]
+        digest = self._digest.hexdigest()[:16]
+        return {"label": cfg.data.label, "generator": _generator(cfg), "logs": sizes, "digest": digest}
 
 
 def finished_results(cfg: DictConfig, folder: Path) -> Optional[Dict[str, Any]]:
@@ -65,37 +57,41 @@ def finished_results(cfg: DictConfig, folder: Path) -> Optional[Dict[str, Any]]:
     if cfg.overwrite or not file.exists():
         return None
     try:
-        record = read_json(file)
+        record: Dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+        objective(record["results"])
         before = {"versions": record["versions"], "generator": record["data"]["generator"], "config": record["config"]}
     except (ValueError, KeyError, TypeError) as error:
         raise CFlowError(
             f"{file} is no results file of this version ({error!r}): give output=FOLDER, or overwrite=true"
         ) from None
-    now = {"versions": versions(), "generator": _generator(cfg), "config": _plain(cfg)}
-    changed = changes(before, now, _PLACES)
+    changed = changes(before, {"versions": versions(), "generator": _generator(cfg), "config": _plain(cfg)}, _PLACES)
     if changed:
         raise CFlowError(f"{folder} holds results of another run ({changed}): give output=FOLDER, or overwrite=true")
-    return record  # type: ignore[no-any-return]
+    return record
 
 
-def write_results(
+def report(
     cfg: DictConfig,
-    results: Dict[str, Any],
+    metrics: SceneFlowMetrics,
     folder: Path,
     data: Optional[Dict[str, Any]] = None,
     seconds: Optional[Dict[str, Any]] = None,
-    failures: Sequence[Tuple[str, str]] = (),
-) -> None:
-    """Write `folder/results.json` and `folder/config.yaml`, each whole or not at all.
+    failures: Failures = (),  # type: ignore[assignment]
+) -> Dict[str, Any]:
+    """Print the scores, write `folder/results.json` and `folder/config.yaml`, each whole or not at all.
 
     Args:
         cfg: resolved settings.
-        results: what `SceneFlowMetrics.compute` returned.
+        metrics: of all pairs.
         folder: made if absent.
         data: what `DataIdentity.report` returned.
         seconds: what `StopWatch.report` returned.
         failures: pairs and logs that could not be used.
+
+    Returns:
+        What `metrics.compute` returned.
     """
+    results = metrics.compute()
     record = {
         "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         "versions": versions(),
@@ -109,15 +105,27 @@ def write_results(
         "seconds_per_pair": seconds,
         "data": data,
         "config": _plain(cfg),
-        "definition": asdict(get_definition(cfg.definition)),
+        "definition": asdict(metrics.definition),
         "results": results,
     }
     write_config(cfg, folder)
     text = json.dumps(strict(record), indent=1, allow_nan=False)
-    short = re.sub(
-        r"\[\n\s*([^][{}]*?)\n\s*\]", lambda found: f"[{' '.join(found[1].split())}]", text
-    )  # lists on one line
-    write_text(folder / RESULTS, short + "\n")
+    lists = re.compile(r"\[\n\s*([^][{}]*?)\n\s*\]")  # each on one line
+    write_text(folder / RESULTS, lists.sub(lambda found: f"[{' '.join(found[1].split())}]", text) + "\n")
+    print(f"{folder}: {format_table(results)}")
+    return results
+
+
+def objective(results: Dict[str, Any]) -> float:
+    """The one number that a sweep minimises: the mean dynamic error, of the ranges if the definition has them; else the
+    three-way end-point error in metres. NaN where there is nothing to score."""
+    if "bucketed_by_range" in results:
+        value = results["bucketed_by_range"]["mean"]["dynamic_error"]
+    elif "bucketed" in results:
+        value = results["bucketed"]["mean"]["dynamic_error"]
+    else:
+        value = results["three_way"]["epe_3way"]
+    return float("nan") if value is None else float(value)
 
 
 def _generator(cfg: DictConfig) -> Optional[str]:

@@ -1,14 +1,15 @@
-"""What `demo`, `flow` and `eval` share: settings, logs, the loop over pairs that survives bad frames."""
+"""What the commands share: settings, logs, the loop over pairs that survives bad frames."""
 
 from __future__ import annotations
 
 import hashlib
+import math
 import platform
 import re
 import sys
-from dataclasses import dataclass
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Callable, Dict, List, Sequence, Tuple, Type
+from typing import Any, Callable, Dict, Iterator, List, NamedTuple, Sequence, Tuple
 
 import numpy as np
 import torch
@@ -17,7 +18,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from cflow_torch import __version__, estimate
-from cflow_torch.config import config_from
+from cflow_torch.config import CONFIGS, PRESETS, config_from
 from cflow_torch.data.catalog import find_sources, open_log
 from cflow_torch.data.log import Log, RecentSweeps, window
 from cflow_torch.data.names import is_safe_name
@@ -37,7 +38,7 @@ _LONGEST_NAME = 150  # bytes of a folder name; file systems end at 255
 
 
 class UnfinishedJob(RuntimeError):
-    """A job of a sweep that left something undone, and has said what; the other jobs run all the same."""
+    """A job that left something undone, and has said what; the other jobs of a sweep run all the same."""
 
 
 def versions() -> Dict[str, str]:
@@ -56,29 +57,12 @@ def make_model(cfg: DictConfig) -> SceneFlowModel:
     Raises:
         CFlowError: an unknown or invalid setting.
     """
+    schema = OmegaConf.get_type(cfg.model)
+    if schema in CONFIGS.values() and schema is not CONFIGS.get(cfg.model.method):
+        presets = ", ".join(f"model={preset} ({method})" for preset, (method, _) in PRESETS.items())
+        raise CFlowError(f"model.method={cfg.model.method}: choose a preset, which brings its method: {presets}")
     settings: Dict[str, Any] = OmegaConf.to_container(cfg.model, resolve=True)  # type: ignore[assignment]
     return estimate.make_model(config_from(settings), cfg.device)
-
-
-def number(cfg: DictConfig, key: str, kind: Type[float] = int, or_null: bool = False) -> Any:
-    """The value of a setting that is a number.
-
-    Args:
-        cfg: resolved settings.
-        key: in dotted form.
-        kind: int, or float, which takes whole numbers as well.
-        or_null: null is a value, too.
-
-    Raises:
-        CFlowError: it is none.
-    """
-    value = OmegaConf.select(cfg, key)
-    if value is None and or_null:
-        return None
-    if isinstance(value, bool) or not isinstance(value, (int, kind)):
-        what = "a whole number" if kind is int else "a number"
-        raise CFlowError(f"{key}={value}: give {what}{' or null' if or_null else ''}")
-    return value
 
 
 def is_sweep() -> bool:
@@ -117,15 +101,31 @@ def _folder_name(text: str) -> str:
     return name
 
 
-@dataclass(frozen=True)
-class Sources:
-    """Logs that are not open yet.
+def chosen_pairs(cfg: DictConfig, group: str = "") -> Callable[[Log], range]:
+    """Log -> indices of the pairs that the settings `first`, `step` and, if there is one, `count` choose.
 
     Args:
-        reader: data set, a key of `catalog.DATA_SETS`.
-        settings: of its reader.
-        logs: what `catalog.open_log` takes, one each.
+        cfg: resolved settings.
+        group: what stands before the names of the first two: "" or "data.".
+
+    Raises:
+        CFlowError: one of them is no whole number or too small.
     """
+    first, step = _whole(cfg, f"{group}first", 0), _whole(cfg, f"{group}step", 1)
+    count = None if OmegaConf.select(cfg, "count") is None else _whole(cfg, "count", 1)
+    return lambda log: range(first, len(log.timestamps) - 1, step)[:count]
+
+
+def _whole(cfg: DictConfig, key: str, least: float = -math.inf) -> int:
+    value = OmegaConf.select(cfg, key)
+    if type(value) is not int or value < least:
+        bound = f" of at least {least}" if least > -math.inf else ""
+        raise CFlowError(f"{key}={value}: give a whole number{bound}")
+    return value
+
+
+class Sources(NamedTuple):
+    """Logs that are not open yet: name of their data set, settings of its reader, what `open_log` takes for each."""
 
     reader: str
     settings: Dict[str, Any]
@@ -140,11 +140,13 @@ def find_logs(cfg: DictConfig) -> Sources:
     """
     data = cfg.data
     if data.name == "synthetic":
-        seed, num_sweeps = number(cfg, "data.seed"), number(cfg, "data.num_sweeps")
-        return Sources("av2", {"check": False}, benchmark_logs(data.cache, "av2", [seed], num_sweeps))
+        drives = [_whole(cfg, "data.seed")]
+        return Sources(
+            "av2", {"check": False}, benchmark_logs(data.cache, "av2", drives, _whole(cfg, "data.num_sweeps"))
+        )
     if data.name == "benchmark":
         first, num_drives, num_sweeps = (
-            number(cfg, f"data.{key}") for key in ("first_seed", "num_drives", "num_sweeps")
+            _whole(cfg, f"data.{key}") for key in ("first_seed", "num_drives", "num_sweeps")
         )
         chosen = format_of(data.profile)
         logs = benchmark_logs(data.cache, data.profile, range(first, first + num_drives), num_sweeps, data.scenes)
@@ -166,12 +168,19 @@ def open_logs(cfg: DictConfig) -> Tuple[List[Log], Failures]:
     logs: List[Log] = []
     failures: Failures = []
     for source in sources.logs:
-        try:
+        with reported(failures, source.name):
             logs.append(open_log(sources.reader, source, **sources.settings))
-        except (CFlowError, OSError) as error:
-            failures.append((source.name, str(error)))
-            say(f"failed: {source.name}: {error}")
     return logs, failures
+
+
+@contextmanager
+def reported(failures: Failures, name: str) -> Iterator[None]:
+    """A step for one frame or log: if it fails, that is said and noted, and the rest goes on."""
+    try:
+        yield
+    except (CFlowError, OSError) as error:
+        failures.append((name, str(error)))
+        say(f"failed: {name}: {error}")
 
 
 def for_each_pair(logs: Sequence[Log], model: FlowModel, use: UseResult, pairs: Callable[[Log], range]) -> Failures:
@@ -186,18 +195,15 @@ def for_each_pair(logs: Sequence[Log], model: FlowModel, use: UseResult, pairs: 
     Returns:
         (frame, message) of every pair that failed.
     """
-    recent = [RecentSweeps(log, model.config.num_history + 2) for log in logs]
-    indices = [(log, index) for log in recent for index in pairs(log)]
+    history = model.config.num_history
     failures: Failures = []
+    recent = [RecentSweeps(log, history + 2) for log in logs]
+    indices = [(log, index) for log in recent for index in pairs(log)]
     for log, index in frames(indices):
-        try:
-            sweeps = window(log, index, model.config.num_history)
+        with reported(failures, f"{log.log_id}/{log.timestamps[index]}"):
+            sweeps = window(log, index, history)
             (result,) = model([sweeps])
             use(log.log, index, sweeps, result)
-        except (CFlowError, OSError) as error:
-            frame = f"{log.log_id}/{log.timestamps[index]}"
-            failures.append((frame, str(error)))
-            say(f"failed: {frame}: {error}")
     return failures
 
 
@@ -217,7 +223,12 @@ def finish(failures: Failures) -> None:
         raise SystemExit(1)
 
 
+def config_text(cfg: DictConfig) -> str:
+    """The resolved settings and versions as YAML."""
+    settings: Dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
+    return OmegaConf.to_yaml(OmegaConf.create({**settings, "versions": versions()}))
+
+
 def write_config(cfg: DictConfig, folder: Path) -> None:
-    """Write the resolved settings and versions to `folder/config.yaml`."""
-    record = OmegaConf.create({**OmegaConf.to_container(cfg, resolve=True), "versions": versions()})  # type: ignore[dict-item]
-    write_text(folder / "config.yaml", OmegaConf.to_yaml(record))
+    """Write `config_text` to `folder/config.yaml`."""
+    write_text(folder / "config.yaml", config_text(cfg))

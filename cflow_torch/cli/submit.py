@@ -1,5 +1,5 @@
 """Archive for a public leaderboard: OUTPUT/v<version>.zip, made of the files in OUTPUT/v<version>/, checked before it
-is left there. A run that was interrupted goes on where it stopped. OUTPUT/config.yaml holds settings and versions.
+is left there. The same command again resumes. OUTPUT/config.yaml holds settings and versions.
 
 version=1: total flow of the points of the evaluation masks, 2023; version=2: residual flow of all points, 2024;
 version=3: the multi-dataset challenge of 2026, residual flow of all points.
@@ -17,23 +17,22 @@ import sys
 from pathlib import Path
 from typing import Any, Dict, List, Mapping, Optional, Sequence, Tuple
 
-from omegaconf import DictConfig, OmegaConf
+import yaml  # type: ignore[import-untyped]
+from omegaconf import DictConfig
 
 from cflow_torch.cli.run import (
     Failures,
-    FlowModel,
+    config_text,
     finish,
     make_model,
     open_logs,
     output_folder,
-    versions,
+    reported,
     write_config,
 )
-from cflow_torch.cli.settings_file import plain_yaml, read_settings
 from cflow_torch.data.atomic import ready_folder
 from cflow_torch.data.log import Log, window
 from cflow_torch.data.names import folder_in
-from cflow_torch.data.records import flat
 from cflow_torch.evaluation.submission.archive import pack
 from cflow_torch.evaluation.submission.check import check_submission
 from cflow_torch.evaluation.submission.encode import RESIDUAL_AXES, Rounding, encode
@@ -42,10 +41,12 @@ from cflow_torch.evaluation.submission.plan import Frame, PlannedFrame, plan_log
 from cflow_torch.evaluation.submission.versions import SubmissionVersion, get_version
 from cflow_torch.evaluation.submission.write import is_complete, write_frame, write_metadata
 from cflow_torch.fleet.progress import frames as counted
-from cflow_torch.fleet.progress import say
+from cflow_torch.stages import FlowModel
 from cflow_torch.types import CFlowError
 
 Plan = List[Tuple[PlannedFrame, Frame]]
+_Masks = Optional[MaskArchive]
+_Listed = Optional[Mapping[str, Sequence[int]]]
 _SETTINGS = ("version", "model", "data", "frames", "masks", "residual_axes")  # a file depends on these, and no others
 
 
@@ -70,22 +71,17 @@ def task(cfg: DictConfig) -> None:
         return
     folder, file = output / f"v{version.number}", output / f"v{version.number}.zip"
     _claim(cfg, output, folder, file)
-    failures += _write(plan, model, version, masks, cfg.residual_axes, folder)
+    failures += _write(cfg, plan, model, version, masks, folder)
     finish(failures)
-    _pack(plan, version, folder, file)
-    print(f"version {version.number}, for {version.server}: {file}, {file.stat().st_size:,} bytes")
-
-
-def _pack(plan: Plan, version: SubmissionVersion, folder: Path, file: Path) -> None:
-    """Make the archive; it stays only if it passes."""
     write_metadata(folder, version)
     _check(folder, version, plan)
     pack(folder, [frame.name for _, frame in plan], file, version)
     try:
         _check(file, version, plan)
-    except SystemExit:
+    except SystemExit:  # the archive stays only if it passes
         file.unlink()
         raise
+    print(f"version {version.number}, for {version.server}: {file}, {file.stat().st_size:,} bytes")
 
 
 def _claim(cfg: DictConfig, output: Path, folder: Path, file: Path) -> None:
@@ -98,10 +94,12 @@ def _claim(cfg: DictConfig, output: Path, folder: Path, file: Path) -> None:
     ready_folder(output)
     folder_in(output, folder.name, "the folder")
     if record.exists() and not cfg.overwrite:
-        now, before = plain_yaml(OmegaConf.to_yaml(_settings(cfg))), read_settings(record)
-        now["cflow_torch"] = versions()["cflow_torch"]
-        before["cflow_torch"] = flat(before).get("versions.cflow_torch")
-        changed = [name for name in now if now[name] != before.get(name)]
+        try:
+            before = _identity(yaml.safe_load(record.read_text(encoding="utf-8")))
+        except (yaml.YAMLError, LookupError, ValueError, TypeError, AttributeError) as error:
+            raise CFlowError(f"{record} holds no settings ({error!r:.200}): give output=FOLDER, or remove it") from None
+        now = _identity(yaml.safe_load(config_text(cfg)))
+        changed = [name for name in now if now[name] != before[name]]
         if changed:
             raise CFlowError(
                 f"{output} holds files made with another {', '.join(changed)}: give output=FOLDER, or overwrite=true"
@@ -112,62 +110,45 @@ def _claim(cfg: DictConfig, output: Path, folder: Path, file: Path) -> None:
     write_config(cfg, output)
 
 
-def _settings(cfg: DictConfig) -> DictConfig:
-    values: Dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
-    return OmegaConf.create({name: values.get(name) for name in _SETTINGS})
+def _identity(settings: Dict[str, Any]) -> Dict[str, Any]:
+    """What of a config.yaml the files of a submission depend on."""
+    of_files = {name: settings.get(name) for name in _SETTINGS}
+    return {**of_files, "cflow_torch": settings["versions"]["cflow_torch"]}
 
 
-def _plan(
-    logs: Sequence[Log],
-    version: SubmissionVersion,
-    listed: Optional[Mapping[str, Sequence[int]]],
-    masks: Optional[MaskArchive],
-) -> Tuple[Plan, Failures]:
+def _plan(logs: Sequence[Log], version: SubmissionVersion, listed: _Listed, masks: _Masks) -> Tuple[Plan, Failures]:
     """The frames that are needed, with their rows; those whose sweep cannot be read are reported."""
     require_logs(logs, listed)
     frames = [frame for log in logs for frame in plan_log(log, version, listed)]
     if not frames:
         raise CFlowError("no frame to submit: the logs are too short, or the list names none of their sweeps")
     if version.rows == "masked" and masks is None and any(log_mask(f.log, f.index) is None for f in frames):
-        print(
-            "no masks given: points by the official rule, computed here, which can differ by a point from the server's"
-        )
+        print("no masks given: the official rule, computed here, can differ by a point from the server's masks")
     plan: Plan = []
     failures: Failures = []
     for frame in counted(frames, "rows"):
-        try:
+        with reported(failures, frame.name):
             plan.append((frame, frame.expect(version, masks)))
-        except (CFlowError, OSError) as error:
-            failures.append((frame.name, str(error)))
     return plan, failures
 
 
 def _write(
-    plan: Plan,
-    model: FlowModel,
-    version: SubmissionVersion,
-    masks: Optional[MaskArchive],
-    residual_axes: str,
-    folder: Path,
+    cfg: DictConfig, plan: Plan, model: FlowModel, version: SubmissionVersion, masks: _Masks, folder: Path
 ) -> Failures:
     """Estimate and write the frames that are not there yet."""
     failures: Failures = []
-    rounding = Rounding()
-    kept = 0
+    rounding, kept = Rounding(), 0
     for planned, frame in counted(plan):
         if is_complete(folder, frame, version):
             kept += 1
             continue
-        try:
+        with reported(failures, frame.name):
             sweeps = window(planned.log, planned.index, model.config.num_history)
             mask = point_mask(planned.log, planned.index, sweeps.pc0, masks) if version.rows == "masked" else None
             (result,) = model([sweeps])
-            columns, lost = encode(version, sweeps, result, mask, residual_axes)
+            columns, lost = encode(version, sweeps, result, mask, cfg.residual_axes)
             write_frame(folder, frame.name, columns)
             rounding.add(lost)
-        except (CFlowError, OSError) as error:
-            failures.append((frame.name, str(error)))
-            say(f"failed: {frame.name}: {error}")
     print(f"frames written: {len(plan) - kept - len(failures)}, already there: {kept}")
     if rounding.num_points:
         print(f"float16 rounding of the new ones: {rounding}")

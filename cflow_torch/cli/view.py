@@ -22,14 +22,22 @@ from typing import Any, Callable, Iterator, List, Tuple
 
 from omegaconf import DictConfig
 
-from cflow_torch.cli.pairs import chosen_pairs
-from cflow_torch.cli.run import Failures, finish, make_model, number, open_logs, output_folder, write_config
+from cflow_torch.cli.run import (
+    Failures,
+    chosen_pairs,
+    finish,
+    make_model,
+    open_logs,
+    output_folder,
+    reported,
+    write_config,
+)
 from cflow_torch.data.atomic import ready_folder
 from cflow_torch.data.flow_file import read_flow
 from cflow_torch.data.log import Log, RecentSweeps, window
 from cflow_torch.data.paths import as_path, is_remote
 from cflow_torch.fleet.manifest import frame_file
-from cflow_torch.fleet.progress import Progress, say
+from cflow_torch.fleet.progress import Progress
 from cflow_torch.types import CFlowError, FlowResult
 from cflow_torch.viz.recording import load_rerun, record_log
 
@@ -42,37 +50,28 @@ def task(cfg: DictConfig) -> None:
     output = output_folder(cfg)
     if is_remote(output):
         raise CFlowError(f"{output}: recordings are written on this machine only; give output=FOLDER and copy them")
-    chosen = chosen_pairs(cfg, "data.first", "data.step", "count")
-    max_flow = number(cfg, "max_flow", float)
-    if not 0 < max_flow < float("inf"):
-        raise CFlowError(f"max_flow={max_flow}: give a positive length in metres per sweep")
+    chosen = chosen_pairs(cfg, "data.")
+    if cfg.max_flow is None or not 0 < cfg.max_flow < float("inf"):
+        raise CFlowError(f"max_flow={cfg.max_flow}: give a positive length in metres per sweep")
     flow, history = _flow(cfg)
     logs, failures = open_logs(cfg)
     write_config(cfg, ready_folder(output))
     files: List[Path] = []
     for log in logs:
-        pairs = chosen.of(log)
         recent: Any = RecentSweeps(log, history + 2)
         file = output / f"{log.log_id}.rrd"
-        if file.name.casefold() in {other.name.casefold() for other in files}:
-            failures.append((log.log_id, f"{file} is of another log of this name: give data.root=PATH more narrowly"))
-            continue
-        try:
-            count = record_log(recent, _results(recent, pairs, flow, failures), file, max_flow=max_flow)
-        except (CFlowError, OSError) as error:
-            failures.append((log.log_id, _without(f"{log.log_id}: ", str(error))))
-            continue
-        files.append(file)
-        print(f"{file}: {count} pair{'' if count == 1 else 's'}, {file.stat().st_size / 1e6:,.1f} MB")
+        with reported(failures, log.log_id):
+            if file.name.casefold() in {other.name.casefold() for other in files}:
+                raise CFlowError(f"{file} is of another log of this name: give data.root=PATH more narrowly")
+            results = _results(recent, chosen(log), flow, failures)
+            count = record_log(recent, results, file, max_flow=cfg.max_flow)
+            files.append(file)
+            print(f"{file}: {count} pair{'' if count == 1 else 's'}, {file.stat().st_size / 1e6:,.1f} MB")
     if files and not cfg.show:
         print(f"look at it with: rerun {files[0]}")
     if files and cfg.show:
         _show(files)
     finish(failures)
-
-
-def _without(prefix: str, text: str) -> str:
-    return text[len(prefix) :] if text.startswith(prefix) else text
 
 
 def _flow(cfg: DictConfig) -> Tuple[Callable[[Log, int], FlowResult], int]:
@@ -98,15 +97,12 @@ def _results(
     """The flow of each pair; a bad frame is reported and the rest goes on."""
     with Progress(len(pairs), log.log_id) as progress:
         for index in pairs:
-            try:
+            result = None
+            with reported(failures, f"{log.log_id}/{log.timestamps[index]}"):
                 window(log, index)  # both sweeps, which are kept for the recording
                 log.labels(index)
                 result = flow(log, index)
-            except (CFlowError, OSError) as error:
-                frame = f"{log.log_id}/{log.timestamps[index]}"
-                failures.append((frame, str(error)))
-                say(f"failed: {frame}: {error}")
-            else:
+            if result is not None:
                 yield index, result
             progress.update()
 

@@ -47,7 +47,7 @@ def test_one_entry_point_with_help(hubconf):
 
 
 def test_bad_settings_say_what_is_allowed():
-    with pytest.raises(CFlowError, match="paper.*default.*fast.*keypoints"):
+    with pytest.raises(CFlowError, match="default.*fast.*paper.*keypoints"):
         torch.hub.load(ROOT, "cflow", source="local", preset="best")
     with pytest.raises(CFlowError, match="num_histori"):
         torch.hub.load(ROOT, "cflow", source="local", num_histori=1)

@@ -1,0 +1,66 @@
+"""What can stand behind a command: its groups with their choices, and the names of all settings."""
+
+from __future__ import annotations
+
+from difflib import get_close_matches
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Dict, Iterable, List
+
+from omegaconf import OmegaConf
+
+import cflow_torch.configs
+from cflow_torch.config import PRESETS, make_config
+from cflow_torch.data.records import flat
+
+CONFIGS = Path(cflow_torch.configs.__path__[0])
+
+
+def groups(command: str) -> Dict[str, List[str]]:
+    """The groups of a command, each with its choices: {"model": ["default", ...], ...}."""
+    entries = OmegaConf.load(CONFIGS / f"{command}.yaml").defaults
+    names = [str(name) for entry in entries if not isinstance(entry, str) for name in entry]
+    return {name: list(PRESETS) if name == "model" else [file.stem for file in files(name)] for name in names}
+
+
+def files(group: str) -> List[Path]:
+    """The YAML files of a group, sorted by name."""
+    return sorted((CONFIGS / group).glob("*.yaml"))
+
+
+def settings(command: str) -> Dict[str, Any]:
+    """Every setting of a command in dotted form, with its value in one of the choices of its group."""
+    found = _settings(CONFIGS / f"{command}.yaml", "")
+    for preset in PRESETS:
+        found.update({f"model.{name}": value for name, value in make_config(preset).as_dict().items()})
+    for group in groups(command):
+        if group not in ("experiment", "row"):  # they set what others bring
+            for file in files(group):
+                found.update(_settings(file, f"{group}."))
+    return found
+
+
+@lru_cache(maxsize=None)  # commands share the files of groups
+def _settings(file: Path, prefix: str) -> Dict[str, Any]:
+    text = file.read_text(encoding="utf-8")
+    prefix = "" if "@package _global_" in text else prefix
+    values: Dict[str, Any] = OmegaConf.to_container(OmegaConf.create(text))  # type: ignore[assignment]
+    values = {key: value for key, value in values.items() if key not in ("defaults", "hydra")}
+    return {f"{prefix}{key}": value for key, value in flat(values).items()}
+
+
+def near(word: str, known: Iterable[str]) -> str:
+    """ " (did you mean X?)" for the most similar known word; "" if none is similar."""
+    names = list(known)
+    found = get_close_matches(word, names, 1)
+    if not found:  # `pixel_sizes` instead of `model.pixel_sizes`
+        full = {name.rpartition(".")[2]: name for name in names}
+        found = [full[name] for name in get_close_matches(word, full, 1)]
+    return f" (did you mean {found[0]}?)" if found else ""
+
+
+def settings_help(command: str) -> str:
+    """The settings of a command with their defaults and comments, and the choices of its groups, for its help."""
+    own = (CONFIGS / f"{command}.yaml").read_text(encoding="utf-8").partition("\n\n")[2].splitlines()
+    grouped = [f"{group}={'|'.join(names)}" for group, names in groups(command).items()]
+    return "\n  ".join(["\nsettings:", *own, *grouped, "data.NAME, model.NAME, ...: see `cflow settings`"]) + "\n"

@@ -1,0 +1,51 @@
+"""What Hydra refuses, in one line with what to do next. Its own message stands wherever it says enough."""
+
+from __future__ import annotations
+
+import re
+
+from hydra.errors import MissingConfigException, OverrideParseException
+
+from cflow_torch.cli.choices import groups, near, settings
+from cflow_torch.cli.schemas import PICTURES
+from cflow_torch.config import CONFIGS
+from cflow_torch.types import CFlowError
+
+_PLUGINS = "hydra-joblib-launcher hydra-submitit-launcher hydra-optuna-sweeper"
+
+
+def explain(error: Exception, command: str) -> str:
+    """The message for a call that Hydra, or a command, refuses."""
+    if isinstance(error, CFlowError):
+        return str(error)
+    if isinstance(error, MissingConfigException) and error.options:
+        group, _, name = str(error.missing_cfg_file).rpartition("/")
+        if group.startswith("hydra/"):
+            return f"no {group} {name!r} here: joblib, submitit and optuna come with pip install {_PLUGINS}"
+        known = [option for option in error.options if not option.startswith("base_")]
+        return f"{group}={name}{near(name, known)}: give one of {', '.join(known)}"
+    if isinstance(error, OverrideParseException):
+        return f"cannot read {error.override!r}: give NAME=VALUE, special characters in quotes: 'NAME=\"VALUE\"'"
+    message = " ".join((f"{error}: {error.__cause__}" if error.__cause__ else str(error)).split())
+    unknown = re.search(r"Key '.*?' (?:is )?not in .*full_key: (\S+) object_type=(\w+)", message)
+    if unknown:
+        return _unknown(unknown[1], unknown[2], command)
+    message = message.partition(" full_key:")[0].replace("Error merging override ", "")
+    return f"{message}; `cflow {command} --help` has examples"
+
+
+def _unknown(key: str, kind: str, command: str) -> str:
+    """The message for a setting that is not there: of another method or picture, gone, or mistyped."""
+    group, _, name = key.rpartition(".")
+    method = {config.__name__: config for config in CONFIGS.values()}.get(kind)
+    if group == "model" and method is not None and name != "pixel_size":
+        try:
+            method().replace(**{name: None})
+        except CFlowError as error:
+            if not str(error).startswith("unknown"):
+                return str(error)
+    owners = [f"picture={picture}" for picture, types in PICTURES.items() if key in types]
+    if command == "plot" and owners:
+        return f"setting {key!r} belongs to {' or '.join(owners)}: give that as well, or leave it out"
+    known = [*groups(command), *settings(command)]
+    return f"unknown setting {key!r}{near(key, known)}: `cflow {command} --cfg job` prints every one"

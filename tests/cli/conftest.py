@@ -1,0 +1,58 @@
+"""A small log, `cflow` in this process, and settings as Hydra composes them."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any, Callable
+
+import hydra
+import pytest
+from hydra.core.hydra_config import HydraConfig
+
+from cflow_torch.cli import schemas  # noqa: F401 (registers them)
+from cflow_torch.cli.main import main
+from cflow_torch.simulator import make_drive
+from cflow_torch.simulator.writers.av2 import write_av2_log
+
+
+@pytest.fixture(scope="session")
+def log_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small simulated log in Argoverse 2's format: three pairs."""
+    return write_av2_log(make_drive(seed=3, num_sweeps=4, profile="demo"), tmp_path_factory.mktemp("drive"))
+
+
+@pytest.fixture(scope="session")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where simulated drives are kept."""
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture
+def cflow(cache: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
+    """A call of `cflow`, which gives its exit status."""
+    monkeypatch.setenv("CFLOW_CACHE", str(cache))
+    monkeypatch.setattr(sys, "argv", list(sys.argv))
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+
+    def call(*arguments: object) -> int:
+        try:
+            main([str(argument) for argument in arguments])
+        except SystemExit as stop:
+            return int(stop.code or 0)
+        return 0
+
+    return call
+
+
+@pytest.fixture(scope="session")
+def compose() -> Callable[..., Any]:
+    """The settings of a command, `hydra` among them."""
+
+    def settings(command: str, *overrides: str) -> Any:
+        with hydra.initialize_config_module("cflow_torch.configs", version_base="1.3"):
+            cfg = hydra.compose(command, list(overrides), return_hydra_config=True)
+        HydraConfig.instance().set_config(cfg)
+        return cfg
+
+    return settings

@@ -1,0 +1,169 @@
+"""demo, flow and eval as a user runs them: what they leave, and what they do when something is wrong."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from pathlib import Path
+from typing import Any, Callable, Dict
+
+import numpy as np
+import pytest
+from omegaconf import OmegaConf
+
+from cflow_torch import CorrelationFlow, make_config
+from cflow_torch.cli import run
+from cflow_torch.cli.record import objective
+from cflow_torch.config import config_from
+from cflow_torch.data.av2 import AV2Log
+from cflow_torch.data.flow_file import read_flow
+from cflow_torch.data.log import window
+
+Cflow = Callable[..., int]
+SMALL = "model.point_cloud_range=[-20,-20,-inf,20,20,inf]"
+
+
+def results_of(folder: Path) -> Dict[str, Any]:
+    """results.json as strict JSON."""
+
+    def refuse(constant: str) -> None:
+        raise AssertionError(f"{constant} is no JSON")
+
+    return json.loads((folder / "results.json").read_text(), parse_constant=refuse)
+
+
+@pytest.fixture
+def evaluate(cflow: Cflow, log_folder: Path, tmp_path: Path) -> Cflow:
+    """`cflow eval` of the small log into `tmp_path`, by the paper's method."""
+    call = ("eval", "data=av2", f"data.root={log_folder}", "data.check=false", f"output={tmp_path}", "model=paper")
+    return lambda *arguments: cflow(*call, *arguments)
+
+
+def test_demo_leaves_everything(tmp_path: Path, cache: Path, cflow: Cflow, capsys: pytest.CaptureFixture) -> None:
+    pytest.importorskip("matplotlib")
+    assert cflow("demo", f"output={tmp_path}", "data.num_sweeps=2", "pair=0", "model=fast", SMALL) == 0
+    (log,) = (AV2Log(folder) for folder in cache.glob("*-2/*/*"))
+    assert [file.stem for file in (tmp_path / log.log_id).iterdir()] == [str(log.timestamps[0])]
+    scores = results_of(tmp_path)
+    assert scores["results"]["num_frames"] == 1 and 0 < scores["results"]["three_way"]["epe_fd"] < 2
+    left: Any = OmegaConf.to_container(OmegaConf.load(tmp_path / "config.yaml").model)
+    region = (-20.0, -20.0, -np.inf, 20.0, 20.0, np.inf)
+    assert config_from(left) == make_config("fast", point_cloud_range=region)
+    assert (tmp_path / "flow.png").read_bytes().startswith(b"\x89PNG")
+    printed = capsys.readouterr().out
+    assert f"picture: {tmp_path / 'flow.png'}" in printed and "CAR" in printed
+    assert not list(tmp_path.rglob(".*")), "no temporary file is left"
+
+
+def test_demo_without_matplotlib_lacks_the_picture_only(
+    tmp_path: Path, cflow: Cflow, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    for name in ("matplotlib", "matplotlib.figure", "matplotlib.backends.backend_agg"):
+        monkeypatch.setitem(sys.modules, name, None)
+    assert cflow("demo", f"output={tmp_path}", "data.num_sweeps=2", "pair=0", "model=paper", SMALL) == 0
+    printed = capsys.readouterr()
+    assert "picture: none" in printed.out and "pip install matplotlib" in printed.out and not printed.err
+    assert results_of(tmp_path)["num_pairs"] == 1 and not list(tmp_path.glob("*.png"))
+
+
+def test_flow_files_hold_the_method_s_result(log_folder: Path, tmp_path: Path, cflow: Cflow) -> None:
+    call = ("flow", "data=av2", f"data.root={log_folder}", "data.check=false", f"output={tmp_path}", "model=paper")
+    assert cflow(*call, "engine.workers=1") == 0
+    log = AV2Log(log_folder)
+    for index in range(3):
+        (expected,) = CorrelationFlow.from_preset("paper")([window(log, index)])
+        stored = read_flow(tmp_path / log.log_id / f"{log.timestamps[index]}.feather")
+        for name in ("flow", "residual_flow", "cluster_id", "score", "is_valid"):
+            np.testing.assert_array_equal(getattr(stored, name), getattr(expected, name), err_msg=name)
+
+
+def test_a_results_file_says_everything(log_folder: Path, tmp_path: Path, evaluate: Cflow) -> None:
+    assert evaluate("data.first=1") == 0
+    record = results_of(tmp_path)
+    assert record["num_pairs"] == record["results"]["num_frames"] == 2  # pairs 1 and 2
+    assert record["results"]["definition"] == record["definition"]["name"] == "opensceneflow"
+    assert record["definition"]["region"] == "disc" and record["definition"]["speed_edges"][-1] == "inf"
+    assert {"bucketed", "three_way", "range_wise", "num_points"} <= set(record["results"])
+    assert set(record["versions"]) == {"cflow_torch", "torch", "numpy", "python"}
+    assert record["config"]["model"]["pixel_sizes"] == [0.1] and record["config"]["experiment_name"] is None
+    assert record["data"]["logs"] == [{"log_id": log_folder.name, "sweeps": 4}] and len(record["data"]["digest"]) == 16
+    times = record["seconds_per_pair"]
+    assert 0 < times["min"] <= times["median"] <= times["max"] and times["pairs"] == 1
+    assert {"cluster", "correlate"} <= set(times["stages"]) and sum(times["stages"].values()) < times["max"]
+    assert record["failures"] == [] and record["date"].startswith("20")
+    assert evaluate("data.first=2", "overwrite=true") == 0
+    assert results_of(tmp_path)["data"]["digest"] != record["data"]["digest"], "of what was scored"
+
+
+def test_a_folder_of_another_run_is_an_error_that_says_so(
+    tmp_path: Path, evaluate: Cflow, capsys: pytest.CaptureFixture
+) -> None:
+    file = tmp_path / "results.json"
+    assert evaluate("data.step=3") == 0
+    first = file.read_bytes()
+    assert evaluate("device=cpu", "data.step=2") == 2
+    error = capsys.readouterr().err
+    assert "config.data.step was 3, is 2" in error and "config.device was auto" in error and "overwrite=true" in error
+    file.write_bytes(first.replace(b'"torch": "', b'"torch": "0.'))
+    assert evaluate("data.step=3") == 2 and "versions.torch" in capsys.readouterr().err
+    for broken in (first[:1000], b"{}", first.replace(b'"bucketed"', b'"a"').replace(b'"three_way"', b'"b"')):
+        file.write_bytes(broken)
+        assert evaluate("data.step=3") == 2 and "no results file" in capsys.readouterr().err
+    assert evaluate("data.step=3", "overwrite=true") == 0
+    capsys.readouterr()
+    (tmp_path / "there").mkdir()
+    file.rename(tmp_path / "there" / "results.json")
+    assert evaluate("data.step=3", f"output={tmp_path / 'there'}") == 0
+    assert "skipped" in capsys.readouterr().out, "where a run lies does not matter"
+
+
+def test_bad_frames_and_bad_logs_are_reported_and_the_rest_goes_on(
+    log_folder: Path, tmp_path: Path, evaluate: Cflow, capsys: pytest.CaptureFixture
+) -> None:
+    root = tmp_path / "root"
+    for name in ("broken", "good", "no-poses"):
+        shutil.copytree(log_folder, root / name)
+    (root / "no-poses" / "city_SE3_egovehicle.feather").unlink()
+    sweeps = sorted((root / "broken" / "sensors" / "lidar").iterdir())
+    sweeps[3].write_bytes(sweeps[3].read_bytes()[:1000])
+    assert evaluate(f"data.root={root}") == 1
+    record, frame, error = results_of(tmp_path), f"broken/{sweeps[2].stem}", capsys.readouterr().err
+    assert "2 failed:" in error and f"  {frame}: " in error and "  no-poses: " in error
+    assert record["num_pairs"] == 2 + 3 and [name for name, _ in record["failures"]] == ["no-poses", frame]
+
+
+def test_a_failure_ends_a_run_and_leaves_a_sweep_going(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(SystemExit, match="1"):
+        run.finish([("a", "bad")])
+    monkeypatch.setattr(run, "is_sweep", lambda: True)
+    run.finish([])
+    with pytest.raises(run.UnfinishedJob, match="1"):
+        run.finish([("a", "bad")])
+
+
+def test_real_hdf5_data(kitti_file: Path, tmp_path: Path, cflow: Cflow) -> None:
+    pytest.importorskip("h5py")
+    call = ("eval", "data=hdf5", f"data.root={kitti_file}", f"output={tmp_path}", "model=paper", "data.step=3")
+    assert cflow(*call) == 0
+    car = results_of(tmp_path)["results"]["bucketed"]["classes"]["CAR"]
+    assert car["num_dynamic"] > 300 and 0.02 < car["dynamic_error"] < 0.4
+
+
+def test_the_score_of_a_sweep() -> None:
+    mean = {"mean": {"dynamic_error": 0.25}}
+    assert objective({"bucketed": mean, "three_way": {"epe_3way": 1.0}}) == 0.25
+    assert objective({"bucketed": mean, "bucketed_by_range": {"mean": {"dynamic_error": 0.5}}}) == 0.5
+    assert objective({"three_way": {"epe_3way": 1.0}}) == 1.0
+    assert np.isnan(objective({"bucketed": {"mean": {"dynamic_error": None}}}))
+
+
+@pytest.mark.parametrize("call", ["demo pair=0", "eval", "flow"])
+def test_an_output_that_cannot_be_made_is_named(
+    call: str, tmp_path: Path, cflow: Cflow, capsys: pytest.CaptureFixture
+) -> None:
+    (tmp_path / "file").touch()
+    assert cflow(*call.split(), f"output={tmp_path}/file/below", "data.num_sweeps=2", "model=paper") == 2
+    error = capsys.readouterr().err
+    assert f"error: cannot write into {tmp_path}/file/below" in error and "give output=FOLDER" in error
+    assert "Traceback" not in error

@@ -1,0 +1,154 @@
+"""Experiments: one command per table and figure of the paper, a folder per job, resumable; launchers and sweepers."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any, Callable, Dict, List, Tuple
+
+import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import OmegaConf
+
+from cflow_torch.cli.choices import CONFIGS
+from cflow_torch.cli.record import objective
+from cflow_torch.cli.run import _folder_name, make_model
+
+Cflow = Callable[..., int]
+Compose = Callable[..., Any]
+SCALES = (0.8, 0.4, 0.3, 0.2, 0.1)
+# How many jobs an experiment has, and what the first and the last one are.
+JOBS: Dict[str, Tuple[int, Dict[str, Any], Dict[str, Any]]] = {
+    "pixel_size": (4, {"pixel_sizes": (0.05,)}, {"pixel_sizes": (0.4,)}),
+    "views": (2, {"sectional_view": False}, {"sectional_view": True}),
+    "clustering": (2, {"clustering": "components"}, {"clustering": "hdbscan"}),
+    "history": (10, {"num_history": 0, "pixel_sizes": (0.1,)}, {"num_history": 9}),
+    "scales": (15, {"num_history": 0, "pixel_sizes": (0.1,)}, {"num_history": 4, "pixel_sizes": SCALES}),
+    "keypoints": (6, {"method": "dense", "num_history": 0}, {"densify": "clusters", "patch_size": 41}),
+    "datasets": (2, {"num_history": 4, "pixel_sizes": SCALES}, {"densify": "clusters", "patch_size": 41}),
+}
+JOBS["range_split"] = JOBS["datasets"]
+
+
+def jobs_of(compose: Compose, experiment: str) -> List[Tuple[str, ...]]:
+    """What every job of an experiment's sweep overrides."""
+    whole = compose("eval", f"experiment={experiment}")
+    assert str(whole.hydra.mode) == "RunMode.MULTIRUN"
+    params = [f"{key}={value}" for key, value in whole.hydra.sweeper.params.items()]
+    swept = OverridesParser.create().parse_overrides(params)
+    choices = [[f"{o.get_key_element()}={v}" for v in o.sweep_string_iterator()] for o in swept]
+    return list(itertools.product(*choices))
+
+
+@pytest.mark.parametrize("experiment", JOBS)
+def test_the_jobs_of_an_experiment_are_the_rows_of_its_table(experiment: str, compose: Compose) -> None:
+    far, jobs = experiment in ("datasets", "range_split"), jobs_of(compose, experiment)
+    count, *ends = JOBS[experiment]
+    assert len(jobs) == count
+    for job, settings in zip((jobs[0], jobs[-1]), ends):
+        cfg = compose("eval", f"experiment={experiment}", *job)
+        config = make_model(cfg).config
+        assert {name: getattr(config, name) for name in settings} == settings
+        assert config.method == ("keypoints" if "densify" in settings else "dense")
+        assert config.point_cloud_range[0] == (-70 if far else -35)
+        assert cfg.definition == ("challenge_2026" if far else "opensceneflow")
+        assert cfg.data.label == "benchmark" and cfg.experiment_name == experiment
+
+
+@pytest.mark.parametrize(
+    ("row", "expected"),
+    [
+        ("dense_h4", {"num_history": 4, "pixel_sizes": (0.1,)}),
+        ("components", {"densify": "components", "patch_size": 11}),
+        ("nearest", {"densify": "nearest", "ratio_threshold": 1.1}),
+        ("clusters", {"densify": "clusters", "patch_size": 11}),
+    ],
+)
+def test_the_other_rows_of_key_points(row: str, expected: Dict[str, Any], compose: Compose) -> None:
+    config = make_model(compose("eval", "experiment=keypoints", f"row={row}", "data=av2", "data.root=there")).config
+    assert {name: getattr(config, name) for name in expected} == expected
+    assert config.point_cloud_range[0] == -35
+
+
+def test_every_experiment_is_checked() -> None:
+    assert sorted(JOBS) == sorted(file.stem for file in CONFIGS.glob("experiment/*.yaml"))
+
+
+# ---------------------------------------------------------------- one folder per job, resumable
+
+
+def test_a_sweep_keeps_every_result_and_resumes(
+    log_folder: Path, tmp_path: Path, cflow: Cflow, capsys: pytest.CaptureFixture
+) -> None:
+    data = ("data=av2", f"data.root={log_folder}", "data.check=false", "data.step=2")
+    call = ("eval", "-m", "experiment=history", *data, f"output={tmp_path}", "model.num_history=0,2")
+    assert cflow(*call) == 0
+    files = sorted(tmp_path.rglob("results.json"))
+    assert len(files) == 2 and all(file.parent.parent == tmp_path / "history" for file in files)
+    assert all(f"model.num_history={h}" in file.parent.name for h, file in zip((0, 2), files))
+    records = [json.loads(file.read_text()) for file in files]
+    assert [r["config"]["model"]["num_history"] for r in records] == [0, 2]
+    assert {r["config"]["experiment_name"] for r in records} == {"history"}
+    assert len({r["data"]["digest"] for r in records}) == 1, "all settings see the same windows"
+    assert not [file for file in tmp_path.rglob(".*") if file.is_file()], "no temporary file is left"
+    capsys.readouterr()
+
+    before = {file: file.stat().st_mtime_ns for file in files}
+    files[1].unlink()  # as if it had been stopped there
+    assert cflow(*call) == 0
+    assert capsys.readouterr().out.count("skipped, done before") == 1
+    assert files[0].stat().st_mtime_ns == before[files[0]] and files[1].exists()
+    assert cflow(*call, "overwrite=true") == 0
+    assert files[0].stat().st_mtime_ns > before[files[0]]
+
+
+def test_a_row_is_a_setting_of_the_sweep(log_folder: Path, tmp_path: Path, cflow: Cflow) -> None:
+    data = ("data=av2", f"data.root={log_folder}", "data.check=false", "data.step=3", f"output={tmp_path}")
+    assert cflow("eval", "-m", "experiment=keypoints", "row=dense_h0,nearest", *data) == 0
+    records = [json.loads(file.read_text()) for file in sorted(tmp_path.glob("keypoints/*/results.json"))]
+    assert [r["config"]["model"]["method"] for r in records] == ["dense", "keypoints"]
+
+
+def test_folder_names_are_safe_and_different() -> None:
+    texts = ["a=1,b=2", "a=1,b=[0.4,0.2]", "data.root=/a/b", "data.root=_a_b", "data.root=/a_b", "x" * 400, "x" * 401]
+    names = [_folder_name(text) for text in texts]
+    assert len(set(names)) == len(texts)
+    assert names[:2] == texts[:2], "readable where it can be"
+    assert all(len(name) < 200 and "/" not in name for name in names)
+    assert _folder_name("..") not in (".", "..")
+
+
+# ---------------------------------------------------------------- launchers and sweepers
+
+PLUGINS = {
+    "joblib": (
+        "hydra_plugins.hydra_joblib_launcher",
+        ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "model.connectivity=4,8"],
+    ),
+    "submitit": ("hydra_plugins.hydra_submitit_launcher", ["hydra/launcher=submitit_local", "model.connectivity=4,8"]),
+    "optuna": (
+        "hydra_plugins.hydra_optuna_sweeper",
+        ["hydra/sweeper=optuna", "hydra.sweeper.n_trials=2", "model.max_extent=interval(5,30)"],
+    ),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("plugin", sorted(PLUGINS))
+def test_sweeps_with_plugins(plugin: str, log_folder: Path, tmp_path: Path) -> None:
+    module, settings = PLUGINS[plugin]
+    pytest.importorskip(module)
+    command = [sys.executable, "-m", "cflow_torch.cli.main", "eval", "-m", *settings, "model=paper", "data=av2"]
+    call = [*command, f"data.root={log_folder}", f"output={tmp_path}"]
+    done = subprocess.run(call, capture_output=True, text=True, cwd=str(tmp_path))
+    assert done.returncode == 0, done.stderr
+    records = [json.loads(file.read_text()) for file in tmp_path.glob("*/results.json")]
+    assert len(records) == 2
+    if plugin == "optuna":
+        best = OmegaConf.load(tmp_path / "optimization_results.yaml")
+        assert best.best_value == pytest.approx(min(objective(r["results"]) for r in records))
+    else:
+        assert {r["config"]["model"]["connectivity"] for r in records} == {4, 8}

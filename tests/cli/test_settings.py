@@ -1,0 +1,155 @@
+"""What can stand behind a command: presets, groups, types, names, and the pages made of them."""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, Callable
+
+import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import OmegaConf
+
+from cflow_torch import make_config
+from cflow_torch.cli import settings
+from cflow_torch.cli.arguments import for_hydra
+from cflow_torch.cli.choices import CONFIGS, groups
+from cflow_torch.cli.choices import settings as known_settings
+from cflow_torch.cli.main import COMMANDS, HELP
+from cflow_torch.cli.run import make_model
+from cflow_torch.config import CONFIGS as METHODS
+from cflow_torch.config import PRESETS, REMOVED
+
+Cflow = Callable[..., int]
+Compose = Callable[..., Any]
+WITH_SETTINGS = [command for command in COMMANDS if (CONFIGS / f"{command}.yaml").exists()]
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_preset_is_the_same_as_in_python(preset: str, compose: Compose) -> None:
+    assert make_model(compose("eval", f"model={preset}")).config == make_config(preset)
+
+
+@pytest.mark.parametrize("command", WITH_SETTINGS)
+def test_every_choice_of_every_group_composes(command: str, compose: Compose) -> None:
+    choices = groups(command)
+    for group in ("row", "experiment"):  # see test_experiments.py
+        choices.pop(group, None)
+    for number in range(max(map(len, choices.values()))):
+        call = {group: names[number % len(names)] for group, names in choices.items()}
+        cfg = compose(command, *(f"{group}={name}" for group, name in call.items()))
+        assert call.items() <= dict(cfg.hydra.runtime.choices).items()
+        make_model(cfg)
+
+
+def test_every_setting_of_an_example_is_there() -> None:
+    texts = [HELP, *((Path(settings.__file__).parent / f"{command}.py").read_text() for command in WITH_SETTINGS)]
+    lines = [line for text in texts for line in text.splitlines() if line.startswith("  cflow ")]
+    assert len(lines) > 30
+    for command, *words in (shlex.split(line.strip().partition("   ")[0])[1:] for line in lines):
+        for key, _, value in (word.partition("=") for word in words if "=" in word and command in WITH_SETTINGS):
+            choices = groups(command)
+            assert key in choices or key in known_settings(command), (command, key)
+            assert value in choices.get(key, [value]), (command, key, value)
+
+
+# ---------------------------------------------------------------- a user's own preset, and settings that went
+
+
+@pytest.fixture
+def mine(tmp_path: Path) -> Callable[[str], Path]:
+    """A folder with a preset model/mine.yaml of this text."""
+
+    def write(text: str) -> Path:
+        (tmp_path / "model").mkdir()
+        (tmp_path / "model" / "mine.yaml").write_text(text)
+        return tmp_path
+
+    return write
+
+
+def test_a_preset_of_one_s_own_says_only_what_it_changes(
+    mine: Callable[[str], Path], cflow: Cflow, capsys: pytest.CaptureFixture
+) -> None:
+    folder = mine("defaults: [base_verified, _self_]\nnum_history: 3\n")
+    call = ("eval", "--config-dir", folder, "model=mine", "model.max_speed=20", "--cfg", "job", "-p", "model")
+    assert cflow(*call) == 0
+    given = OmegaConf.create(capsys.readouterr().out)
+    assert given == OmegaConf.create(METHODS["verified"](num_history=3, max_speed=20.0).as_dict())
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("defaults: [base_verified, _self_]\nuse_timestamps: true\n", REMOVED["use_timestamps"]),
+        ("defaults: [base_dense, _self_]\nthorough: true\n", "thorough is a setting of method verified"),
+        ("method: dense\nproof: true\n", REMOVED["proof"]),  # a file of version 0.1
+        ("defaults: [base_dense, _self_]\nnum_history: many\n", "could not be converted to Integer"),
+        ("num_history: 3\n", "method=None: give one of"),
+    ],
+)
+def test_a_preset_of_one_s_own_that_is_wrong(
+    text: str, message: str, mine: Callable[[str], Path], cflow: Cflow, capsys: pytest.CaptureFixture
+) -> None:
+    assert cflow("eval", "--config-dir", mine(text), "model=mine", "data.num_sweeps=2") == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and message in error and error.count("\n") == 1
+
+
+@pytest.mark.parametrize("setting", ["model.proof", "++model.proof", "model.yaw", "+model.keypoint_block"])
+def test_a_setting_that_went_says_what_to_do(setting: str, cflow: Cflow, capsys: pytest.CaptureFixture) -> None:
+    name = setting.rpartition(".")[2]
+    assert cflow("eval", f"{setting}=1") == 2
+    assert capsys.readouterr().err == f"error: setting {name} went with version 0.2: {REMOVED[name]}\n"
+
+
+# ---------------------------------------------------------------- names
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["10203656353524179475_7625_000_7645_000", "1e5", "2024_11_22", "-1.5", "true", "a_1", "Ausgänge/東京", 'it\'s "ü"']
+    + ["a (1)", "x=y", "s3://bucket/a", "C:\\data", "50%", "a#b"],
+)
+def test_names_are_text_whatever_they_look_like(name: str) -> None:
+    read = OverridesParser.create().parse_overrides(for_hydra([f"log={name}", f"+data.root={name}", "pair=1"]))
+    assert [override.value() for override in read] == [name, name, 1]
+
+
+def test_what_hydra_gives_a_meaning_keeps_it(compose: Compose) -> None:
+    cfg = compose("plot", *for_hydra(["log=null", "output=${device}"]))
+    assert cfg.log is None and cfg.output == "auto"
+    assert for_hydra(["-m", "log=1_0,b,2_0", "pair=1,2"]) == ['log="1_0",b,"2_0"', "pair=1,2", "-m"]
+    assert for_hydra(["log=choice(a,b)", "log='1_0'"]) == ["log=choice(a,b)", "log='1_0'"]
+
+
+# ---------------------------------------------------------------- cflow settings
+
+
+def test_the_page_has_every_setting(cflow: Cflow, capsys: pytest.CaptureFixture) -> None:
+    assert cflow("settings") == 0
+    page = capsys.readouterr().out
+    rows = [line[2:-2].split(" | ") for line in page.splitlines() if line.startswith("| `model.")]
+    assert len(rows) == sum(len(fields(kind)) for kind in METHODS.values())
+    name, *cells = next(row for row in reversed(rows) if row[0] == "`model.num_history`")
+    assert cells[:3] == ["`0`", "default `4`, fast `2`", "a whole number of at least 0"] and "sweeps" in cells[3]
+    assert "dense \\| keypoints" in page, "cells end at bars"
+    for file in CONFIGS.glob("data/*.yaml"):
+        assert f"\n## data={file.stem}\n" in page and file.read_text().strip() in page
+
+
+def test_the_harness_s_models_are_those_of_the_package(tmp_path: Path, cflow: Cflow) -> None:
+    assert cflow("settings", "--opensceneflow", tmp_path / "model") == 0
+    committed = {file.name: file.read_text() for file in (CONFIGS / "opensceneflow" / "model").glob("*.yaml")}
+    assert committed == {file.name: file.read_text() for file in (tmp_path / "model").iterdir()}
+    for preset in PRESETS:
+        config = make_config(preset)
+        name = "cflow" if preset == "default" else f"cflow_{preset}"
+        target: Any = OmegaConf.to_container(OmegaConf.create(committed[f"{name}.yaml"]).target, resolve=False)
+        region = target["point_cloud_range"]
+        assert region[:2] + region[3:5] == [*config.point_cloud_range[:2], *config.point_cloud_range[3:5]]
+        assert region[2::3] == [-1000.0, 1000.0], "finite: the harness computes with it"
+        settings = {**config.as_dict(), "point_cloud_range": region}
+        assert target["num_frames"] == settings.pop("num_history", 0) + 2
+        assert settings.items() <= target.items()
