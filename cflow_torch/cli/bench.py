@@ -100,7 +100,7 @@ def format_report(report: Dict[str, Any]) -> str:
     rows = [("total, median", seconds["median"]), ("least", seconds["min"]), ("most", seconds["max"])]
     rows += list(seconds["stages"].items())
     lines = [
-        f"method {model['method']}, num_history {model['num_history'] if 'num_history' in model else 0}, pixel_sizes "
+        f"method {model['method']}, num_history {model.get('num_history', 0)}, pixel_sizes "
         f"{model['pixel_sizes']}; device {report['device']}, {report['threads']} thread(s)",
         f"{machine_['cpu']}, {machine_['cores']} cores; torch {report['versions']['torch']}",
         f"log {report['log']}: {report['windows']} pairs, {report['points']:.0f} points a sweep, each "

@@ -44,8 +44,7 @@ def load() -> List[Tuple[Window, FlowLabels]]:
     items = []
     for seed in SEEDS:
         drive = make_drive(seed=seed, num_sweeps=2 * WINDOWS_PER_DRIVE)
-        for index in range(0, 2 * WINDOWS_PER_DRIVE, 2):
-            items.append((window(drive, index, 0), drive.labels(index)))
+        items += [(window(drive, i, 0), drive.labels(i)) for i in range(0, 2 * WINDOWS_PER_DRIVE, 2)]
     return items
 
 

@@ -1,4 +1,4 @@
-"""How much a model does and holds, counted without a clock: the same figures on a busy machine, a fast one, another day."""
+"""How much a model does and holds, counted without a clock: the same figures on a busy machine and on a fast one."""
 
 from __future__ import annotations
 

@@ -1,13 +1,13 @@
 #!/usr/bin/env python3
-"""Everything that needs a GPU, in one run of at most eight minutes: equality with the CPU, speed, launches, memory, tests.
+"""What needs a GPU, in one run of at most eight minutes: equality with the CPU, speed, launches, memory, tests.
 
   PYTHONPATH=. python scripts/benchmarks/gpu_check.py                      tables, and outputs/gpu_check.json
   PYTHONPATH=. python scripts/benchmarks/gpu_check.py --output FILE --skip tests
   PYTHONPATH=. python scripts/benchmarks/gpu_check.py --windows FILE.npz   simulated windows: made once, then read
 
 It has never run on a GPU: none was at hand. Without one it compares the CPU with itself, which shows that the script
-works and nothing else. Needs torch and NumPy; what the simulator needs (pyarrow), unless the windows were made elsewhere;
-pytest for the tests. Parts that the time does not allow are left out, and it says so.
+works and nothing else. Needs torch and NumPy; pyarrow for the simulator, unless the windows were made elsewhere; pytest
+for the tests. Parts that the time does not allow are left out, and it says so.
 """
 
 from __future__ import annotations
