@@ -1,12 +1,13 @@
 #!/usr/bin/env python3
 """Confidence of the flow (docs/confidence.md): fit its table on simulated drives, see on others whether it is right.
 
-  python scripts/calibrate_confidence.py fit CACHE           writes cflow_torch/confidence.json; seeds 100 ... 103
-  python scripts/calibrate_confidence.py evaluate CACHE --seeds 300 301 302 303 --figure docs/confidence.png
-  python scripts/calibrate_confidence.py evaluate --real FOLDER      Argoverse 2 pair and KITTI 0000 below FOLDER
+  python scripts/benchmarks/calibrate_confidence.py fit CACHE                 writes verified/confidence.json
+  python scripts/benchmarks/calibrate_confidence.py evaluate CACHE --seeds 300 301 302 303 --figure docs/confidence.png
+  python scripts/benchmarks/calibrate_confidence.py evaluate --real FOLDER    Argoverse 2 pair, KITTI 0000 below FOLDER
 
-CACHE is a folder for the simulated drives (`data/benchmark.py`). Five sensors, four kinds of scenes, pairs (h = 0) and
-history (h = 4), region +-70 m, ground excluded. Right = end-point error of the residual flow below 0.1 m per interval.
+CACHE is a folder for the simulated drives (`simulator/benchmark.py`). Five sensors, four kinds of scenes, pairs (h = 0)
+and history (h = 4), region +-70 m, ground excluded; seeds 100 ... 103 to fit. Right = end-point error of the residual
+flow below 0.1 m per interval.
 """
 
 from __future__ import annotations

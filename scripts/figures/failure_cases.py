@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
 """The failures of docs/limits.md: its pictures and its table, from small simulated drives (failure_scenes.py).
 
-  python scripts/failure_cases.py                         docs/pictures/limit_*.png, and the table
-  python scripts/failure_cases.py --only rail fast        some of them
-  python scripts/failure_cases.py --pictures ""           the table alone
+  python scripts/figures/failure_cases.py                         docs/pictures/limit_*.png, and the table
+  python scripts/figures/failure_cases.py --only rail fast        some of them
+  python scripts/figures/failure_cases.py --pictures ""           the table alone
 
 Each row is the mean over the seeds of the mean end-point error of the points named, metres per sweep, smallest and
 largest in brackets, and their mean confidence (docs/confidence.md). Pictures show one seed: the first
@@ -17,13 +17,12 @@ import io
 import math
 import warnings
 from pathlib import Path
-from typing import Iterator, List, Sequence
+from typing import Iterator, Optional, Sequence
 
 import numpy as np
 from failure_scenes import CASES, Case
 from PIL import Image
 
-from cflow_torch.data.atomic import atomic_file
 from cflow_torch.viz import plot_flow
 
 # The case, and the seed that is drawn.
@@ -38,15 +37,13 @@ PICTURED = {
     "wrong_frame": 0,
     "appearing": 0,
 }
-KEPT = 64  # colours of a picture that its palette has exactly
 SEEDS = (0, 1, 2, 3, 4)
-FOLDER = Path(__file__).resolve().parents[1] / "docs" / "pictures"
+FOLDER = Path(__file__).resolve().parents[2] / "docs" / "pictures"
 
 
 def draw(case: Case) -> Image.Image:
     """A row of estimate, truth and error for the first and the last setting, on one scale of colours."""
     low, high = case.view[:2], case.view[2:]
-    bounds = (*low, -math.inf, *high, math.inf)
     kept = ~case.is_ground
     shown = np.all((case.points[:, :2] >= low) & (case.points[:, :2] <= high), axis=1) & kept
     longest = np.linalg.norm(case.truth[shown], axis=1).max()
@@ -54,8 +51,9 @@ def draw(case: Case) -> Image.Image:
     tried = list(zip(case.attempts, case.errors()))
     for attempt, error in tried[:1] + tried[1:][-1:]:
         figure = plot_flow(
-            *(case.points[kept], attempt.residual[kept]),
-            point_cloud_range=bounds,
+            case.points[kept],
+            attempt.residual[kept],
+            point_cloud_range=(*low, -math.inf, *high, math.inf),
             max_flow=max(math.ceil(10 * longest) / 10, 0.5),
             truth=case.truth[kept],
             title=f"{attempt.name.replace('`', '')}: error {error:.2f} m ({case.whose})",
@@ -63,34 +61,10 @@ def draw(case: Case) -> Image.Image:
         buffer = io.BytesIO()
         figure.savefig(buffer, format="png", dpi=figure.dpi)
         rows.append(np.asarray(Image.open(buffer).convert("RGB")))
-    return with_palette(np.concatenate(rows))
-
-
-def with_palette(pixels: np.ndarray) -> Image.Image:
-    """256 colours, half of the bytes: the most frequent ones as they are, the rest dithered, which is mostly the wheel.
-
-    Args:
-        pixels: (H, W, 3) uint8 RGB.
-    """
-    colors, count = np.unique(pixels.reshape(-1, 3), axis=0, return_counts=True)
-    kept, rest = np.split(colors[np.argsort(-count, kind="stable")], [KEPT])
-    of_rest = Image.fromarray(rest[None]).quantize(256 - KEPT).getpalette() or []
-    palette = Image.new("P", (1, 1))
-    palette.putpalette([*kept.ravel().tolist(), *of_rest[: 3 * (256 - KEPT)]])
-    picture = Image.fromarray(pixels)
-    exact, smooth = (
-        np.asarray(picture.quantize(palette=palette, dither=dither))
-        for dither in (Image.Dither.NONE, Image.Dither.FLOYDSTEINBERG)
-    )
-    is_kept = np.isin(_codes(pixels), _codes(kept))
-    result = Image.fromarray(np.where(is_kept, exact, smooth), mode="P")
-    result.putpalette(palette.getpalette())
-    return result
-
-
-def _codes(colors: np.ndarray) -> np.ndarray:
-    """(...) int32, one number per colour, of (..., 3) uint8."""
-    return colors.astype(np.int32) @ np.array([1 << 16, 1 << 8, 1], np.int32)
+    picture = Image.fromarray(np.concatenate(rows))
+    return picture.quantize(
+        palette=picture.quantize(256)
+    )  # half of the bytes; dithered, so that the wheel stays smooth
 
 
 def table(names: Sequence[str], seeds: Sequence[int]) -> Iterator[str]:
@@ -107,23 +81,18 @@ def table(names: Sequence[str], seeds: Sequence[int]) -> Iterator[str]:
             yield f"| {' | '.join((*heading, attempt.name, error, trust))} |"
 
 
-def main(arguments: Sequence[str] = ()) -> None:
-    """See the module."""
+def main(arguments: Optional[Sequence[str]] = None) -> None:
+    """Print the table, draw the pictures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="+", choices=tuple(CASES), default=tuple(CASES), metavar="CASE")
     parser.add_argument("--seeds", nargs="+", type=int, default=SEEDS)
     parser.add_argument("--pictures", default=str(FOLDER), metavar="FOLDER", help='"" = none')
-    args = parser.parse_args(arguments or None)
+    given = parser.parse_args(arguments)
     warnings.simplefilter("ignore", UserWarning)  # that ground was left in, which is one of the cases
-    lines: List[str] = list(table(args.only, args.seeds))
-    print("\n".join(lines))
-    if not args.pictures:
-        return
-    folder = Path(args.pictures)
-    folder.mkdir(parents=True, exist_ok=True)
-    for name in (name for name in args.only if name in PICTURED):
-        with atomic_file(folder / f"limit_{name}.png") as file:
-            draw(CASES[name](PICTURED[name])).save(file, format="PNG", optimize=True)
+    print("\n".join(table(given.only, given.seeds)))
+    for name in (name for name in given.only if name in PICTURED and given.pictures):
+        Path(given.pictures).mkdir(parents=True, exist_ok=True)
+        draw(CASES[name](PICTURED[name])).save(Path(given.pictures) / f"limit_{name}.png", optimize=True)
 
 
 if __name__ == "__main__":

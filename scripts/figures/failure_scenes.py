@@ -8,7 +8,7 @@ from typing import Any, Callable, Dict, List, NamedTuple, Optional, Sequence, Tu
 
 import numpy as np
 
-from cflow_torch import FlowResult, Sweep, Window, estimate_flow, make_config, make_model
+from cflow_torch import FlowResult, Sweep, estimate_flow, make_config, make_model
 from cflow_torch.data.log import Log, window
 from cflow_torch.simulator import objects
 from cflow_torch.simulator.drive import Drive
@@ -21,6 +21,7 @@ PAIR, NUM_SWEEPS = 5, 7  # sweep t, so that four older ones exist
 FLAT = Ground((0.0, 0.0), 0.0, kerb=0.0, half_widths=(1e4, 1.0), crossing_x=1e5)
 EAST, NORTH, WEST = 0.0, math.pi / 2, math.pi
 WIDE = (-100.0, -100.0, -math.inf, 100.0, 100.0, math.inf)
+View = Tuple[float, float, float, float]
 
 
 class Attempt(NamedTuple):
@@ -59,7 +60,7 @@ class Case:
     truth: np.ndarray
     concerned: np.ndarray
     attempts: List[Attempt]
-    view: Tuple[float, float, float, float]
+    view: View
 
     def errors(self) -> List[float]:
         """Mean end-point error of the points concerned, metres per sweep, of each attempt."""
@@ -74,9 +75,9 @@ class Case:
 
 def long_side(seed: int) -> Case:
     """The aperture problem: the side of a tram looks the same a metre further on."""
-    drive = _drive([_tram(), objects.car(_rng(seed), Route(12, -4, WEST, speed=8))], Route(0, 0, speed=4), seed)
+    drive, view = _tram(seed), (-14, -14, 30, 18)
     attempts = [_flow(drive, "paper"), _flow(drive, "paper", num_history=4)]
-    return _case(drive, attempts, "a long side seen in two sweeps", "tram of 32 m, 8 m/s", [0], (-14, -14, 30, 18))
+    return _case(drive, attempts, "a long side seen in two sweeps", "tram of 32 m, 8 m/s", [0], view)
 
 
 def rail(seed: int) -> Case:
@@ -84,41 +85,38 @@ def rail(seed: int) -> Case:
     posts = [box(x - 0.05, x + 0.05, -0.03, 0.03, -0.3, 0.45, 0.5) for x in (-8, -4, 0, 4, 8)]
     beam = box(-10, 10, -0.04, 0.04, 0.45, 0.76, 0.6)
     rails = [Body([beam, *posts], Route(x, y)) for x in range(-100, 140, 20) for y in (-3.2, 9.0)]
-    rng = _rng(seed)
+    rng = np.random.default_rng(seed)
     cars = [objects.car(rng, Route(20, 0, speed=27)), objects.car(rng, Route(-12, 4, speed=31))]
-    drive = _drive([*rails, *cars], Route(0, 0, speed=27), seed)
+    drive, rows = _drive([*rails, *cars], seed, speed=27), range(len(rails))
     attempts = [_flow(drive, "paper"), _flow(drive, "default")]
-    rows = list(range(len(rails)))
     return _case(drive, attempts, "guard rails at speed", "rails, which stand still", rows, (-22, -25, 30, 13))
 
 
 def slow_person(seed: int) -> Case:
     """People who walk along a hedge, within its component."""
-    rng = _rng(seed)
+    rng = np.random.default_rng(seed)
     hedge = [objects.bush(rng, x, 5.5 + rng.uniform(-0.2, 0.2), 60) for x in np.arange(4, 14, 1.2).tolist()]
     people = [Route(8, 4.7, EAST, start=-0.6, speed=1.2), Route(12, 4.6, WEST, start=-0.5, speed=1.0)]
-    drive = _drive([*hedge, *(objects.pedestrian(rng, way) for way in people)], Route(0, 0, speed=5), seed)
-    attempts = [_flow(drive, "default"), _flow(drive, "default", num_history=0)]
+    drive = _drive([*hedge, *(objects.pedestrian(rng, way) for way in people)], seed)
     rows = [len(hedge), len(hedge) + 1]
-    return _case(drive, attempts, "slow people in a hedge", "two people, 1.1 m/s", rows, (-6, -6, 20, 13))
+    return _case(drive, _with_and_without_history(drive), "slow people in a hedge", "two people, 1.1 m/s", rows)
 
 
 def crowd(seed: int) -> Case:
     """Somebody who walks through a group that stands."""
-    rng = _rng(seed)
+    rng = np.random.default_rng(seed)
     people = [objects.pedestrian(rng, Route(8, 4.5, EAST, start=-0.5, speed=1.2))]
     for x, y in ((x, y) for x in (6.5, 7.2, 7.9, 8.6, 9.3) for y in (3.9, 5.1)):
         people.append(objects.pedestrian(rng, Route(x + rng.uniform(-0.1, 0.1), y + rng.uniform(-0.1, 0.1))))
-    drive = _drive(people, Route(0, 0, speed=5), seed)
-    attempts = [_flow(drive, "default"), _flow(drive, "default", num_history=0)]
-    return _case(drive, attempts, "a person in a crowd", "who walks, 1.2 m/s", [0], (-6, -6, 20, 13))
+    drive = _drive(people, seed)
+    return _case(drive, _with_and_without_history(drive), "a person in a crowd", "who walks, 1.2 m/s", [0])
 
 
 def touching(seed: int) -> Case:
     """A car that passes a parked one a hand's breadth away."""
-    rng = _rng(seed)
+    rng = np.random.default_rng(seed)
     bodies = [objects.car(rng, Route(6, 3.0, EAST, speed=9)), objects.car(rng, Route(11, 5.05))]
-    drive = _drive([*bodies, objects.wall(10, 8, 40, 0.5, 3)], Route(0, 0, speed=5), seed)
+    drive = _drive([*bodies, objects.wall(10, 8, 40, 0.5, 3)], seed)
     attempts = [_flow(drive, "paper"), _flow(drive, "default")]
     return _case(drive, attempts, "two cars that touch", "both: one at 9 m/s, one parked", [0, 1], (-6, -7, 20, 12))
 
@@ -126,80 +124,76 @@ def touching(seed: int) -> Case:
 def turning(seed: int) -> Case:
     """A bus that turns by 4.5 degrees a sweep."""
     bus = objects.bus(Route(14, -6, NORTH, start=4, speed=7, radius=9, angle=NORTH))
-    drive = _drive([bus], Route(0, 0), seed)
-    changes = ({"yaw": False}, {}, {"num_history": 0})
-    attempts = [_flow(drive, "default", **change) for change in changes]
-    return _case(drive, attempts, "an object that turns", "bus, 7 m/s, 4.5 degrees a sweep", [0], (-8, -11, 22, 11))
+    drive, view = _drive([bus], seed, speed=0), (-8, -11, 22, 11)
+    attempts = [_flow(drive, "default", thorough=False), *_with_and_without_history(drive)]
+    return _case(drive, attempts, "an object that turns", "bus, 7 m/s, 4.5 degrees a sweep", [0], view)
 
 
 def vertical(seed: int) -> Case:
     """A car that climbs what rises by 15 % before it."""
-    rng, ground = _rng(seed), replace(FLAT, curvature=0.006)
-    bodies = [objects.car(rng, Route(22, -3, EAST, speed=12)), objects.wall(25, 8, 30, 0.5, 4)]
-    drive = _drive(bodies, Route(0, 0, speed=3), seed, ground=ground)
+    bodies = [objects.car(np.random.default_rng(seed), Route(22, -3, EAST, speed=12)), objects.wall(25, 8, 30, 0.5, 4)]
+    drive, view = _drive(bodies, seed, speed=3, ground=replace(FLAT, curvature=0.006)), (10, -12, 38, 6)
     attempts = [_flow(drive, "paper", num_history=4), _flow(drive, "paper", num_history=4, sectional_view=True)]
-    return _case(drive, attempts, "vertical motion", "car that rises by 0.18 m a sweep", [0], (10, -12, 38, 6))
+    return _case(drive, attempts, "vertical motion", "car that rises by 0.18 m a sweep", [0], view)
 
 
 def fast(seed: int) -> Case:
     """Cars faster than `max_speed` allows."""
-    rng = _rng(seed)
+    rng = np.random.default_rng(seed)
     bodies = [objects.car(rng, Route(-4, 4, EAST, speed=48)), objects.car(rng, Route(-10, -4, WEST, -20, 52))]
-    drive = _drive([*bodies, objects.wall(25, 9, 30, 0.5, 4)], Route(0, 0, speed=20), seed)
+    drive, view = _drive([*bodies, objects.wall(25, 9, 30, 0.5, 4)], seed, speed=20), (-54, -37, 40, 32)
     attempts = [_flow(drive, "default"), _flow(drive, "default", max_speed=60)]
-    return _case(drive, attempts, "faster than max_speed", "two cars, 48 and 52 m/s", [0, 1], (-54, -37, 40, 32))
+    return _case(drive, attempts, "faster than max_speed", "two cars, 48 and 52 m/s", [0, 1], view)
 
 
 def large(seed: int) -> Case:
     """An object longer than `max_object`: the tram again."""
-    drive = _drive([_tram(), objects.car(_rng(seed), Route(12, -4, WEST, speed=8))], Route(0, 0, speed=4), seed)
-    attempts = [_flow(drive, "default"), _flow(drive, "default", max_object=60, aperture=False)]
-    return _case(drive, attempts, "longer than max_object", "tram of 32 m, 8 m/s", [0], (-14, -14, 30, 18))
+    drive, view = _tram(seed), (-14, -14, 30, 18)
+    attempts = [_flow(drive, "default"), _flow(drive, "default", max_object=60, thorough=False)]
+    return _case(drive, attempts, "longer than max_object", "tram of 32 m, 8 m/s", [0], view)
 
 
 def beyond_region(seed: int) -> Case:
     """Cars and people that lie outside `point_cloud_range`."""
-    rng, bodies = _rng(seed), []
+    rng, bodies = np.random.default_rng(seed), []
     for x in (20, 40, 60, 80):
         bodies.append(objects.car(rng, Route(x, 3.5, WEST, speed=9)))
         bodies.append(objects.pedestrian(rng, Route(x, -4, NORTH, speed=1.4)))
-    drive = _drive(bodies, Route(0, 0, speed=5), seed)
-    attempts = [_flow(drive, "default"), _flow(drive, "default", point_cloud_range=WIDE)]
-    rows = [4, 5, 6, 7]
-    return _case(drive, attempts, "outside the region", "cars and people 60 and 80 m away", rows, (-2, -28, 86, 28))
+    drive, view = _drive(bodies, seed), (-2, -28, 86, 28)
+    wide = _flow(drive, "default", point_cloud_range=WIDE)._replace(name="`default`, point_cloud_range=±100 m")
+    attempts = [_flow(drive, "default"), wide]
+    return _case(drive, attempts, "outside the region", "cars and people 60 and 80 m away", [4, 5, 6, 7], view)
 
 
 def ground_left_in(seed: int) -> Case:
     """No ground mask: the ground joins what stands on it."""
-    rng = _rng(seed)
+    rng = np.random.default_rng(seed)
     bodies = [
         objects.car(rng, Route(8, 3.5, WEST, speed=9)),
         objects.car(rng, Route(14, -3.5, EAST, speed=11)),
         objects.pedestrian(rng, Route(7, -6, EAST, speed=1.4)),
         objects.wall(10, 9, 30, 0.5, 4),
     ]
-    drive = _drive(bodies, Route(0, 0, speed=5), seed)
+    drive = _drive(bodies, seed)
     attempts = [_without_masks(drive, None), _without_masks(drive, "auto")]
     return _case(drive, attempts, "ground left in", "two cars and a person", [0, 1, 2], (-6, -19, 28, 6))
 
 
 def wrong_frame(seed: int) -> Case:
     """Poses of the vehicle, points of a LiDAR 1.4 m ahead of it, in a turn."""
-    way = Route(0, 0, speed=6, radius=12, angle=1.2)
-    drive = _drive(_place(seed), way, seed)
+    drive, rows, view = place(seed), range(1, 11), (-4, -16, 40, 16)
     attempts = [_flow(drive, "default", log=MisplacedPoses(drive)), _flow(drive, "default")]
     attempts = [a._replace(name=f"`default`, {frame} frame") for a, frame in zip(attempts, ("wrong", "right"))]
-    rows = list(range(1, 11))
-    return _case(drive, attempts, "points and poses of different frames", "what stands still", rows, (-4, -16, 40, 16))
+    return _case(drive, attempts, "points and poses of different frames", "what stands still", rows, view)
 
 
 def appearing(seed: int, later: int = 0) -> Case:
     """A car that comes out from behind a van, so many sweeps later than that it is first seen."""
-    rng = _rng(seed)
+    rng = np.random.default_rng(seed)
     hidden = objects.car(rng, Route(13.9 - 0.9 * (PAIR + later) + 4.5, 7, WEST, speed=9))
-    bodies = [hidden, objects.van(rng, Route(8, 3.5)), objects.wall(10, 14, 30, 0.5, 4)]
-    drive = _drive(bodies, Route(0, 0), seed)
-    return _case(drive, [_flow(drive, "default")], "an object that appears", "car, 9 m/s", [0], (-6, -6, 24, 16))
+    drive = _drive([hidden, objects.van(rng, Route(8, 3.5)), objects.wall(10, 14, 30, 0.5, 4)], seed, speed=0)
+    view = (-6, -6, 24, 16)
+    return _case(drive, [_flow(drive, "default")], "an object that appears", "car, 9 m/s", [0], view)
 
 
 def appeared(seed: int) -> Case:
@@ -209,12 +203,12 @@ def appeared(seed: int) -> Case:
 
 def rolling_shutter(seed: int, profile: str = "av2_rolling") -> Case:
     """Oncoming traffic under a sensor that turns while the world moves."""
-    rng = _rng(seed)
+    rng = np.random.default_rng(seed)
     bodies = [objects.car(rng, Route(x, 4, WEST, speed=27)) for x in (18, 30)]
     bodies += [objects.car(rng, Route(x, -4, EAST, speed=27)) for x in (-20, 22)]
-    drive = _drive([*bodies, objects.wall(10, 12, 60, 0.5, 4)], Route(0, 0, speed=20), seed, profile=profile)
-    attempts = [_flow(drive, "default")]
-    return _case(drive, attempts, "rolling shutter", "two oncoming cars, closing at 47 m/s", [0, 1], (-30, -20, 26, 21))
+    drive = _drive([*bodies, objects.wall(10, 12, 60, 0.5, 4)], seed, speed=20, profile=profile)
+    whose, view = "two oncoming cars, closing at 47 m/s", (-30, -20, 26, 21)
+    return _case(drive, [_flow(drive, "default")], "rolling shutter", whose, [0, 1], view)
 
 
 def frozen_world(seed: int) -> Case:
@@ -236,33 +230,33 @@ class MisplacedPoses:
 
     def __init__(self, log: Log) -> None:
         self.log, self.log_id, self.timestamps, self.labels = log, "misplaced", log.timestamps, log.labels
-        self._T_vehicle_points = np.eye(4)
-        self._T_vehicle_points[0, 3] = 1.4
 
     def sweep(self, index: int) -> Sweep:
+        """The sweep with the wrong pose."""
         sweep = self.log.sweep(index)
-        return replace(sweep, pose=sweep.pose @ np.linalg.inv(self._T_vehicle_points))
+        return replace(sweep, pose=sweep.pose @ np.array([[1, 0, 0, -1.4], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]))
 
 
-def _tram() -> Body:
-    return Body([box(-16, 16, -1.3, 1.3, 0.35, 3.3, 0.6)], Route(6, 6, EAST, speed=8), "BUS", (32.0, 2.6, 3.3))
-
-
-def _place(seed: int) -> List[Body]:
-    """One car that drives (row 0), and walls, parked cars and posts."""
-    rng = _rng(seed)
+def place(seed: int) -> Drive:
+    """A turn past one car that drives (row 0), and walls, parked cars and posts."""
+    rng = np.random.default_rng(seed)
     bodies = [objects.car(rng, Route(12, 4, WEST, speed=9))]
     bodies += [objects.wall(20, 12, 40, 0.5, 4), objects.wall(20, -12, 40, 0.5, 4), objects.wall(45, 0, 0.5, 24, 4)]
     bodies += [objects.car(rng, Route(x, -7)) for x in (0, 7, 14, 22)]
-    return bodies + [objects.pole(x, 8, 5, 0.12) for x in (0, 10, 20)]
+    bodies += [objects.pole(x, 8, 5, 0.12) for x in (0, 10, 20)]
+    return _drive(bodies, seed, speed=6, radius=12, angle=1.2)
 
 
-def _rng(seed: int) -> np.random.Generator:
-    return np.random.default_rng(seed)
+def _tram(seed: int) -> Drive:
+    tram = Body([box(-16, 16, -1.3, 1.3, 0.35, 3.3, 0.6)], Route(6, 6, EAST, speed=8), "BUS", (32.0, 2.6, 3.3))
+    return _drive([tram, objects.car(np.random.default_rng(seed), Route(12, -4, WEST, speed=8))], seed, speed=4)
 
 
-def _drive(bodies: Sequence[Body], ego: Route, seed: int, ground: Ground = FLAT, profile: str = "av2") -> Drive:
-    scene = Scene(ground, ego, tuple(bodies), SolidTable.of(tuple(bodies)))
+def _drive(
+    bodies: Sequence[Body], seed: int, *, ground: Ground = FLAT, profile: str = "av2", speed: float = 5, **way: float
+) -> Drive:
+    """A drive past bodies, straight on if `way` does not say otherwise."""
+    scene = Scene(ground, Route(0, 0, speed=speed, **way), tuple(bodies), SolidTable.of(tuple(bodies)))
     return Drive(scene, get_profile(profile), seed, NUM_SWEEPS, "failure")
 
 
@@ -277,17 +271,18 @@ def _flow(drive: Drive, preset: str, log: Optional[Log] = None, **overrides: Any
     """The flow of the pair by a preset, from `log` if its poses or points shall be others."""
     config = make_config(preset, **overrides)
     (result,) = make_model(config)([window(log or drive, PAIR, config.num_history)])
-    changes = [f"{name}={_short(value)}" for name, value in overrides.items()]
-    return _attempt(drive, ", ".join([f"`{preset}`", *changes]), result)
+    return _attempt(drive, ", ".join([f"`{preset}`", *(f"{k}={v}" for k, v in overrides.items())]), result)
+
+
+def _with_and_without_history(drive: Drive) -> List[Attempt]:
+    return [_flow(drive, "default"), _flow(drive, "default", num_history=0)]
 
 
 def _without_masks(drive: Drive, ground: Optional[str]) -> Attempt:
-    sweeps: Window = window(drive, PAIR, 4)
+    sweeps = window(drive, PAIR, 4)
     T = [np.linalg.inv(sweeps.pc1.pose) @ sweep.pose for sweep in (sweeps.pc0, *sweeps.pch)]
-    clouds = [sweep.points for sweep in sweeps.pch]
-    result = estimate_flow(
-        *(sweeps.pc0.points, sweeps.pc1.points), T_ego1_ego0=T[0], pch=clouds, T_ego1_egoh=T[1:], ground=ground
-    )
+    history = {"pch": [sweep.points for sweep in sweeps.pch], "T_ego1_egoh": T[1:]}
+    result = estimate_flow(sweeps.pc0.points, sweeps.pc1.points, T_ego1_ego0=T[0], ground=ground, **history)
     return _attempt(drive, f"`default`, ground={ground!r}", result)
 
 
@@ -296,19 +291,15 @@ def _attempt(drive: Drive, name: str, result: FlowResult) -> Attempt:
     return Attempt(name, result.flow.numpy() - _pose_flow(drive), confidence)
 
 
-def _short(value: Any) -> str:
-    return "±100 m" if value == WIDE else str(value)
-
-
 def _case(
     drive: Drive,
     attempts: List[Attempt],
     title: str,
     whose: str,
     bodies: Sequence[int],
-    view: Tuple[float, float, float, float],
+    view: View = (-6, -6, 20, 13),
 ) -> Case:
     sweep, returns = drive.sweep(PAIR), drive.returns(PAIR)
     body = np.append(drive.scene.table.body, -1)[returns.solid.numpy()]  # ground = -1
     truth = drive.labels(PAIR).flow - _pose_flow(drive)
-    return Case(title, whose, sweep.points, sweep.is_ground, truth, np.isin(body, bodies), attempts, view)
+    return Case(title, whose, sweep.points, sweep.is_ground, truth, np.isin(body, list(bodies)), attempts, view)

@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
 """Accuracy and time of ground finding: simulated drives, the Argoverse 2 pair against its map, KITTI's stored mask.
 
-  python scripts/ground_figures.py                          every table; a method or data set that is absent is left out
-  CFLOW_DATA=FOLDER python scripts/ground_figures.py        where the real data lies (else ../shared/data)
+  python scripts/figures/ground.py                          every table; a method or data set that is absent is left out
+  CFLOW_DATA=FOLDER python scripts/figures/ground.py        where the real data lies (else ../shared/data)
 
 Prints Markdown, and a line per call from Patchwork++ (`| grep '^|'` drops it). "raster rule": ground is what lies at
 most 0.3 m above the true surface, or below it. "hit": the ray met the ground. Times are the median of 15 calls for one
@@ -124,7 +124,7 @@ def median_ms(call: Callable[[], object], calls: int = 15) -> Tuple[float, float
 
 def main() -> None:
     torch.set_num_threads(1)
-    root = Path(os.environ.get("CFLOW_DATA") or Path(__file__).resolve().parents[2] / "shared" / "data")
+    root = Path(os.environ.get("CFLOW_DATA") or Path(__file__).resolve().parents[3] / "shared" / "data")
     methods: Dict[str, Dict[str, Any]] = {}
     for method, settings in METHODS.items():
         try:
