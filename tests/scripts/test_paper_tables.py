@@ -1,0 +1,134 @@
+"""The paper's numbers agree with themselves, and tables and figures hold ours beside them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, Dict, List, Tuple
+
+import numpy as np
+import pytest
+
+from cflow_torch.config import Config, make_config
+from cflow_torch.data.records import strict
+
+CLASSES = ("CAR", "OTHER_VEHICLES", "PEDESTRIAN", "WHEELED_VRU")
+SCALES = [(0.1,), (0.2, 0.1), (0.4, 0.2, 0.1), (0.8, 0.4, 0.2, 0.1), (0.8, 0.4, 0.3, 0.2, 0.1)]
+PAPER = make_config("paper")
+KEYS = make_config("paper", method="keypoints")
+# The settings of the rows of each table, in the paper's order.
+JOBS: Dict[str, List[Config]] = {
+    "pixel_size": [PAPER.replace(pixel_size=size) for size in (0.05, 0.1, 0.2, 0.4)],
+    "views": [PAPER, PAPER.replace(sectional_view=True)],
+    "clustering": [PAPER, PAPER.replace(clustering="hdbscan")],
+    "keypoints": [KEYS, KEYS.replace(densify="nearest"), PAPER, PAPER.replace(num_history=4)],
+    "history": [PAPER.replace(num_history=h) for h in range(10)],
+    "scales": [PAPER.replace(num_history=h, pixel_sizes=sizes) for h in (0, 2, 4) for sizes in SCALES],
+    "datasets": [PAPER, KEYS],
+    "range_split": [PAPER, KEYS],
+}
+
+
+@pytest.fixture()
+def paper(script: Any) -> Dict[str, Any]:
+    return script("paper", "results").load_paper()
+
+
+def test_tables_agree_with_themselves(paper: Dict[str, Any]) -> None:
+    rounding = 1e-4 + 1e-9  # four decimals on both sides
+    for name in ("pixel_size", "views", "clustering", "keypoints"):
+        for row, values in paper[name]["rows"].items():
+            assert abs(np.mean(values[:4]) - values[4]) <= rounding, (name, row)
+    base = paper["pixel_size"]["rows"]["0.1"][:5]
+    assert paper["views"]["rows"]["BEV"][:5] == paper["clustering"]["rows"]["Connected components"][:5] == base
+    assert paper["keypoints"]["rows"]["CorrelationFlow (h=0)"] == base
+
+
+def test_figures_agree_with_each_other(paper: Dict[str, Any]) -> None:
+    for h in (0, 2, 4):
+        assert paper["history"]["rows"][f"h={h}"] == paper["scales"]["rows"][f"h={h}, 1 scales"]
+    # What the table calls h=4 is the figure's h=3.
+    np.testing.assert_allclose(
+        paper["keypoints"]["rows"]["CorrelationFlow (h=4)"], paper["history"]["rows"]["h=3"], atol=6e-5
+    )
+    for values in paper["datasets"]["bars"].values():
+        assert abs(np.mean(values[1:]) - values[0]) <= 1e-4
+    columns = paper["datasets"]["at"]
+    for data_set, lines in paper["range_split"]["panels"].items():
+        for method, (short, far) in lines.items():
+            printed = paper["datasets"]["bars"][method][columns.index(data_set)]
+            assert abs((short + far) / 2 - printed) <= 1e-4, (data_set, method)
+
+
+def write_run(root: Path, experiment: str, number: int, config: Config) -> None:
+    """A results file in which all errors are around (number + 1) / 10."""
+    error = 0.1 * (number + 1)
+    scores = {name: {"dynamic_error": error + 0.01 * k} for k, name in enumerate(CLASSES)}
+    ranges = {name: {"mean": {"dynamic_error": error + 0.2 * k}} for k, name in enumerate(("0-35", "35-70"))}
+    record = {
+        "results": {
+            "bucketed": {"classes": scores, "mean": {"dynamic_error": error + 0.015}},
+            "bucketed_by_range": {"ranges": ranges, "mean": {"dynamic_error": error + 0.1}},
+        },
+        "definition": {"name": "opensceneflow"},
+        "num_pairs": 20,
+        "failures": [],
+        "seconds_per_pair": {"median": 0.5, "stages": {"cluster": 0.125, "correlate": 0.25, "pool": 0.0625}},
+        "data": {"logs": [1, 2], "digest": "abc"},
+        "config": {
+            "experiment_name": experiment,
+            "data": {"name": "av2", "label": "small"},
+            "model": strict(config.as_dict()),
+        },
+        "versions": {"cflow_torch": "0.1.0", "torch": "2"},
+        "date": "2026-01-02T03:04:05+00:00",
+        "machine": {"threads": 1},
+    }
+    folder = root / experiment / str(number)
+    folder.mkdir(parents=True)
+    (folder / "results.json").write_text(json.dumps(record))
+
+
+def write_all(root: Path, leave_out: Tuple[Tuple[str, int], ...] = ()) -> None:
+    for experiment, configs in JOBS.items():
+        for number, config in enumerate(configs):
+            if (experiment, number) not in leave_out:
+                write_run(root, experiment, number, config)
+
+
+def table(root: Path, name: str) -> List[List[str]]:
+    return [line.split(",") for line in (root / "paper" / f"{name}.csv").read_text().splitlines()]
+
+
+def test_tables_have_the_papers_numbers_beside_ours(tmp_path: Path, script: Any, capsys: Any) -> None:
+    pytest.importorskip("matplotlib")
+    write_all(tmp_path)
+    assert script("paper", "pages").main([str(tmp_path)]) == 0
+    assert "Missing" not in capsys.readouterr().err, "every row of the paper is known by its settings"
+    assert table(tmp_path, "pixel_size")[3:5] == [
+        ["0.1", "paper", "0.3093", "0.3458", "0.3746", "0.3799", "0.3524", "0.4674"],
+        ["0.1", "small", "0.2000", "0.2100", "0.2200", "0.2300", "0.2150", "0.5000"],
+    ]
+    views = table(tmp_path, "views")
+    assert views[2][1:] == ["small", "0.1000", "0.1100", "0.1200", "0.1300", "0.1150", "0.3125"]  # correlate + pool
+    assert views[4][1:] == ["small", "+0.1000", "+0.1000", "+0.1000", "+0.1000", "+0.1000", "+0.0000"]
+    assert table(tmp_path, "datasets")[-2][:3] == ["CorrelationFlow", "ours", "0.2000"]
+    assert table(tmp_path, "range_split")[-1][-2:] == ["0.2000", "0.4000"]
+    for name in ("history", "scales", "datasets", "range_split"):
+        assert (tmp_path / "paper" / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_missing_and_broken_runs_are_told(tmp_path: Path, script: Any, capsys: Any) -> None:
+    write_all(tmp_path, leave_out=(("history", 3), ("clustering", 0), ("clustering", 1)))
+    (tmp_path / "broken").mkdir()
+    (tmp_path / "broken" / "results.json").write_text("{")
+    pages = script("paper", "pages")
+    paper, (runs, remarks) = pages.load_paper(), pages.load_runs(tmp_path)
+    missing = pages.missing_runs(paper, runs)
+    assert [line.split(" (cflow")[0] for line in missing] == [
+        "clustering, any data: Connected components; HDBSCAN",
+        "history, small: h=3",
+    ]
+    assert len(remarks) == 1 and "broken" in remarks[0]
+    rows = {row[0]: row[2:] for row in pages.class_cells(paper["history"], runs["history"]) if row[1] == "small"}
+    assert rows["h=3"] == ["-"] * 6 and "-" not in rows["h=4"]
