@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # The flow of a simulated street, with a picture: outputs/demo/flow.png. Arguments go to `cflow demo`.
 set -euo pipefail
-LOCK=demo
+STAMP=demo EXTRAS=viz
 . "$(dirname "${BASH_SOURCE[0]}")/install.sh"
 cd "$ROOT"
 exec "$PYTHON" -m cflow_torch.cli.main demo "$@"

@@ -1,15 +1,13 @@
 #!/usr/bin/env bash
-# Make .venv in the checkout and install the package into it, from the files whose versions and hashes scripts/locked
-# names. Does nothing if that was done. Sourced by demo.sh and test.sh, which say in $LOCK which list they need; leaves the
-# interpreter's path in $PYTHON. Each list that is installed leaves a stamp, so that a script that needs less than another
-# one before it starts at once.
+# Make .venv in the checkout and install the package into it, in the versions that constraints.txt names. Does nothing if
+# that was done: each list of extras leaves a stamp. Sourced by demo.sh and test.sh, which say in $EXTRAS what they need
+# and in $STAMP its name; leaves the interpreter's path in $PYTHON.
 set -euo pipefail
 ROOT="$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)"
 PYTHON="$ROOT/.venv/bin/python"
-LOCKED="$ROOT/scripts/locked"
-WANTED="$(cat "$LOCKED"/*.txt "$ROOT/pyproject.toml" | cksum)"
+WANTED="$(cat "$ROOT/scripts/constraints.txt" "$ROOT/pyproject.toml" "$ROOT/setup.py" | cksum)"
 
-if [ "$(cat "$ROOT/.venv/installed-$LOCK" 2>/dev/null || true)" != "$WANTED" ]; then
+if [ "$(cat "$ROOT/.venv/installed-$STAMP" 2>/dev/null || true)" != "$WANTED" ]; then
   if [ ! -x "$PYTHON" ]; then
     BASE=""
     for candidate in python3.11 python3.12 python3.13 python3.10 python3; do
@@ -25,21 +23,15 @@ if [ "$(cat "$ROOT/.venv/installed-$LOCK" 2>/dev/null || true)" != "$WANTED" ]; 
     echo "making $ROOT/.venv with $("$BASE" --version)"
     "$BASE" -m venv "$ROOT/.venv"
   fi
-  echo "installing what $LOCK needs (once; a minute or more)"
-  # No file that is not listed: dependencies are not looked up, and what has no wheel is built with what is installed.
+  echo "installing what $STAMP needs (once; a minute or more)"
   # --no-compile: Python compiles what it imports, which is a fraction of what torch brings.
-  install=("$PYTHON" -m pip install --quiet --no-compile --no-deps --no-build-isolation)
-  "${install[@]}" --require-hashes --requirement "$LOCKED/build.txt"
-  # A CPU build of torch where pip is told of one (PyPI has none for Linux): it spares gigabytes.
-  "${install[@]}" --require-hashes --requirement "$LOCKED/cpu.txt" 2>/dev/null || true
-  "${install[@]}" --require-hashes --requirement "$LOCKED/$LOCK.txt"
-  "${install[@]}" --editable "$ROOT"
-  if "$PYTHON" -c 'import importlib.metadata as m, sys; sys.exit(sys.platform != "linux" or "+cpu" in m.version("torch"))'; then
-    "${install[@]}" --require-hashes --requirement "$LOCKED/cuda.txt"
-  fi
-  "$PYTHON" -m pip check >"$ROOT/.venv/pip-check" || { cat "$ROOT/.venv/pip-check" >&2; exit 1; }
-  echo "$WANTED" >"$ROOT/.venv/installed-$LOCK"
-  if [ "$LOCK" = test ]; then
+  install=("$PYTHON" -m pip install --quiet --no-compile --constraint "$ROOT/scripts/constraints.txt")
+  "${install[@]}" setuptools wheel
+  # Where pip finds a CPU build of the pinned torch, it takes that one, which spares gigabytes. What has no wheel, and the
+  # package itself, is built with the setuptools of the line above.
+  (cd "$ROOT" && "${install[@]}" --no-build-isolation --editable ".[$EXTRAS]")
+  echo "$WANTED" >"$ROOT/.venv/installed-$STAMP"
+  if [ "$STAMP" = test ]; then
     echo "$WANTED" >"$ROOT/.venv/installed-demo"  # part of it
   fi
 fi

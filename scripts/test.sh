@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # The tests. Arguments go to pytest; without any, the slow ones are left out and several processes share the rest.
 set -euo pipefail
-LOCK=test
+STAMP=test EXTRAS=dev,ray,rerun,video
 . "$(dirname "${BASH_SOURCE[0]}")/install.sh"
 cd "$ROOT"
 if [ $# -eq 0 ]; then

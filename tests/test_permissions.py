@@ -46,9 +46,7 @@ COMMANDS: Dict[str, List[str]] = {
 }
 
 
-@pytest.mark.parametrize(
-    "name", [*("eval", "info"), *(pytest.param(name, marks=pytest.mark.slow) for name in ("demo", "flow"))]
-)
+@pytest.mark.parametrize("name", ["eval", *(pytest.param(n, marks=pytest.mark.slow) for n in ("demo", "flow", "info"))])
 def test_a_command_stays_in_its_folders(name: str, tmp_path: Path) -> None:
     for folder in ("home", "work", "temporary"):
         (tmp_path / folder).mkdir()

@@ -1,64 +1,168 @@
-"""Times the method against its targets, its reference and a plain OpenCV loop: tables and OUTPUT/bench.json.
+"""Times the method on your data: total and stages, windows per second, memory; a table and OUTPUT/bench.json.
 
-One window of the first log, all on the same data in the same run, medians; times of one stage after the other,
-windows per second in batches, memory. Other work on the machine spoils the figures.
+Pairs of the first log, spread evenly over it, one at a time and in batches. Times start with the points in memory and
+end with the flow on the device. Other work on the machine spoils the figures.
 
 examples:
   cflow bench                                                    a simulated street
   cflow bench data=av2 data.root=/data/av2/val/LOG repeats=50    real data, more runs
-  cflow bench num_threads=1 opencv=false                         one core; without the OpenCV loop
+  cflow bench model=paper num_threads=4 'batches=[1,8]'          another method, more threads
 """
 
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+import os
+import platform
+import sys
+from contextlib import contextmanager
+from typing import Any, Dict, Iterator, List, Sequence
 
+import torch
 from omegaconf import DictConfig, OmegaConf
 
-from cflow_torch.bench.measure import run_bench
-from cflow_torch.bench.table import format_bench, format_targets
-from cflow_torch.bench.target_row import FULL
-from cflow_torch.bench.targets import measure_targets
-from cflow_torch.cli.run import finish, make_model, number, open_logs
+from cflow_torch.cli.run import find_logs, make_model, versions
 from cflow_torch.data.atomic import ready_folder
-from cflow_torch.data.log import window
+from cflow_torch.data.catalog import open_log
+from cflow_torch.data.log import Log, window
 from cflow_torch.data.paths import as_path
-from cflow_torch.data.records import write_text
-from cflow_torch.types import CFlowError
+from cflow_torch.data.records import strict, write_text
+from cflow_torch.stages import FlowModel, StopWatch
+from cflow_torch.types import CFlowError, Window
 
 
 def task(cfg: DictConfig) -> None:
     """Run `cflow bench`."""
     output = as_path(cfg.output)
-    repeats, num_threads = number(cfg, "repeats"), number(cfg, "num_threads", or_null=True)
-    if not OmegaConf.is_list(cfg.batches) or not all(type(batch) is int and batch > 0 for batch in cfg.batches):
+    repeats, num_pairs = _count("repeats", cfg.repeats), _count("pairs", cfg.pairs)
+    num_threads = None if cfg.num_threads is None else _count("num_threads", cfg.num_threads)
+    if not OmegaConf.is_list(cfg.batches) or not all(type(size) is int and size > 0 for size in cfg.batches):
         raise CFlowError(f"batches={cfg.batches}: give a list of whole numbers of at least 1, as in 'batches=[1,8]'")
     model = make_model(cfg)
-    logs, failures = open_logs(cfg)
-    finish(failures)
+    sources = find_logs(cfg)
+    log = open_log(sources.reader, sources.logs[0], **sources.settings)
+    windows = _windows(log, num_pairs, model.config.num_history)
     ready_folder(output)
-    config, log = model.config, logs[0]
-    history, scales = FULL.num_history, FULL.pixel_sizes
-    longest = len(log.timestamps) - 2
-    index = min(max(history, config.num_history), longest)
-    configs = {
-        "as configured": config,
-        "twice the region": config.replace(point_cloud_range=[2 * bound for bound in config.point_cloud_range]),
-    }
-    if config.method == "dense" and longest >= history:
-        configs[f"h = {history}"] = config.replace(num_history=history)
-        configs[f"h = {history}, {len(scales)} scales"] = config.replace(num_history=history, pixel_sizes=scales)
-    elif config.method == "dense":
-        print(f"log {log.log_id} has {longest + 2} sweeps: rows with h = {history} need {history + 2}")
-    sweeps = window(log, index, max(history, config.num_history))
-    settings = {"repeats": repeats, "num_threads": num_threads, "device": cfg.device}
-    result = run_bench([sweeps], configs, with_reference=cfg.reference, with_opencv=cfg.opencv, **settings)
-    print(format_bench(result))
-    targets = measure_targets(
-        sweeps, result, batches=cfg.batches, with_opencv=cfg.opencv, with_hdbscan=cfg.hdbscan, **settings
-    )
-    print("\n" + format_targets(targets))
-    result["targets"] = [asdict(row) for row in targets]
-    write_text(output / "bench.json", json.dumps(result, indent=2) + "\n")
+    with using_threads(num_threads) as threads:
+        report = {"log": log.log_id, **measure(model, windows, repeats, list(cfg.batches))}
+    report = {**report, "threads": threads, "machine": machine(), "versions": versions()}
+    report["model"] = model.config.as_dict()
+    print(format_report(report))
+    write_text(output / "bench.json", json.dumps(strict(report), indent=1, allow_nan=False) + "\n")
     print(f"written to {output / 'bench.json'}")
+
+
+def measure(model: FlowModel, windows: Sequence[Window], repeats: int, batches: Sequence[int] = ()) -> Dict[str, Any]:
+    """Seconds and memory of a method.
+
+    Args:
+        model: the method.
+        windows: at least one; a batch that is larger takes them again from the first.
+        repeats: timed runs of each window, and of each batch; one before them warms up.
+        batches: numbers of windows in a batch.
+
+    Returns:
+        "points" (mean number per sweep), "windows", "repeats", "device"; "seconds": of one window, see
+        `StopWatch.report`; "batches": size -> "median" (seconds of a batch), "windows_per_s"; "peak_bytes": on a GPU
+        the most that was allocated there at once, else the most that the process ever held, None = not known.
+    """
+    watch = StopWatch(model)
+    device = watch(windows[:1])[0].flow.device
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
+    for _ in range(repeats):
+        for each in windows:
+            watch([each])
+    throughput = {}
+    for size in batches:
+        of_batch = StopWatch(model)
+        for _ in range(1 + repeats):
+            of_batch([windows[i % len(windows)] for i in range(size)])
+        median = of_batch.report()["median"]
+        throughput[size] = {"median": median, "windows_per_s": size / median}
+    sweeps = [sweep for each in windows for sweep in (each.pc0, each.pc1, *each.pch)]
+    return {
+        "points": sum(len(sweep.points) for sweep in sweeps) / len(sweeps),
+        "windows": len(windows),
+        "repeats": repeats,
+        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else str(device),
+        "seconds": watch.report(),
+        "batches": throughput,
+        "peak_bytes": torch.cuda.max_memory_allocated(device) if device.type == "cuda" else _most_resident(),
+    }
+
+
+def format_report(report: Dict[str, Any]) -> str:
+    """What `cflow bench` prints, as Markdown."""
+    seconds, machine_, model = report["seconds"], report["machine"], report["model"]
+    peak = "not known" if report["peak_bytes"] is None else f"{report['peak_bytes'] / 1e6:.0f} MB"
+    whose = "of the process" if report["device"] == "cpu" else "allocated on the device"
+    rows = [("total, median", seconds["median"]), ("least", seconds["min"]), ("most", seconds["max"])]
+    rows += list(seconds["stages"].items())
+    lines = [
+        f"method {model['method']}, num_history {model.get('num_history', 0)}, pixel_sizes "
+        f"{model['pixel_sizes']}; device {report['device']}, {report['threads']} thread(s)",
+        f"{machine_['cpu']}, {machine_['cores']} cores; torch {report['versions']['torch']}",
+        f"log {report['log']}: {report['windows']} pairs, {report['points']:.0f} points a sweep, each "
+        f"{report['repeats']} times",
+        f"most memory {whose}: {peak}",
+        "",
+        *_table([["one window", "ms"], *([name, f"{1000 * value:.1f}"] for name, value in rows)]),
+    ]
+    if report["batches"]:
+        cells = [["windows in a batch", "ms", "windows per second"]]
+        for size, figures in report["batches"].items():
+            cells.append([str(size), f"{1000 * figures['median']:.1f}", f"{figures['windows_per_s']:.1f}"])
+        lines += ["", *_table(cells)]
+    return "\n".join(lines)
+
+
+def machine() -> Dict[str, Any]:
+    """What times depend on besides the code: "platform", "cpu", "cores"."""
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8") as file:
+            models = [line.split(":", 1)[1].strip() for line in file if line.startswith("model name")]
+    except OSError:
+        models = []
+    cpu = models[0] if models else platform.processor() or "unknown"
+    return {"platform": platform.platform(), "cpu": cpu, "cores": os.cpu_count()}
+
+
+@contextmanager
+def using_threads(number: Any) -> Iterator[int]:
+    """So many threads of torch while it is open, None = as many as it has; yields their number."""
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(number or before)
+        yield torch.get_num_threads()
+    finally:
+        torch.set_num_threads(before)
+
+
+def _windows(log: Log, count: int, num_history: int) -> List[Window]:
+    """So many windows, spread evenly over those with the whole history; without such, the last one."""
+    last = len(log.timestamps) - 2
+    first = min(num_history, last)
+    count = min(count, last - first + 1)
+    return [window(log, first + (last - first) * i // max(count - 1, 1), num_history) for i in range(count)]
+
+
+def _count(name: str, value: Any) -> int:
+    if type(value) is not int or value < 1:
+        raise CFlowError(f"{name}={value}: give a whole number of at least 1")
+    return value
+
+
+def _most_resident() -> Any:
+    """Bytes that the process held at most since it began; None where the system does not say."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return None
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return most if sys.platform == "darwin" else 1024 * most
+
+
+def _table(rows: Sequence[Sequence[str]]) -> List[str]:
+    rule = ["---", *["---:"] * (len(rows[0]) - 1)]
+    return ["| " + " | ".join(row) + " |" for row in (rows[0], rule, *rows[1:])]

@@ -1,1 +1,0 @@
-"""Benchmark: the method against its reference and against a plain OpenCV loop."""

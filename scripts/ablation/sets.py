@@ -1,0 +1,228 @@
+"""The scored windows behind the figures of the ablation: real data, sets made of it, simulated drives.
+
+Settings were chosen on the groups "real" and "sim" with seeds 100 ... 103; not on "odd", the other windows of KITTI,
+nor on other seeds.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any, Callable, List, Optional, Sequence, Tuple
+
+import numpy as np
+from made import chain_flow, paste_static
+
+from cflow_torch.data.av2 import AV2Log
+from cflow_torch.data.catalog import open_log
+from cflow_torch.data.hdf5 import HDF5Log
+from cflow_torch.data.log import FlowLabels, RecentSweeps, window
+from cflow_torch.evaluation.frame import EvalFrame, ego_motion_flow
+from cflow_torch.simulator.benchmark import benchmark_logs, format_of
+from cflow_torch.types import CFlowError, Sweep, Window, as_numpy
+
+HISTORY = 4
+NEAR, REGION = 35.0, 70.0  # metres, half sides: what is scored of real data; what simulated drives are estimated in
+PROFILES = ("av2", "nuscenes", "truckscenes", "waymo", "aevascenes")
+SCENES = ("street", "highway", "crossing", "narrow")
+SIMULATED_SWEEPS, SIMULATED_WINDOWS = 15, (9, 12)  # per drive
+AV2 = Path("av2-7fab2350", "val", "7fab2350-7eaf-3b7e-a39d-6937a4c1bede")
+KITTI = Path("kitti-0000", "kitti-0000-a.h5")
+
+
+@dataclass(frozen=True)
+class Item:
+    """One window and its truth.
+
+    Args:
+        window: sweeps with poses.
+        labels: truth, rows of `window.pc0`.
+        pose_flow: (N, 3) float32, metres, axes of t+1: the part of the true flow that ego motion causes.
+        eval_mask: (N,) bool, True = scored; None = all valid points that are not ground.
+    """
+
+    window: Window
+    labels: FlowLabels
+    pose_flow: np.ndarray
+    eval_mask: Optional[np.ndarray] = None
+
+    def frame(self, residual_flow: Any) -> EvalFrame:
+        """What the metrics take, for (N, 3) estimated residual flow."""
+        return EvalFrame(
+            points=self.window.pc0.points,
+            labels=self.labels,
+            residual_flow=residual_flow,
+            pose_flow=self.pose_flow,
+            T_ego1_ego0=between(self.window.pc0, self.window.pc1),
+            is_ground=self.window.pc0.is_ground,
+            eval_mask=self.eval_mask,
+        )
+
+
+@dataclass(frozen=True)
+class ScoredSet:
+    """Windows that one figure is the mean of.
+
+    Args:
+        name: for example "kitti h=4" or "sim waymo 100-103 h=4"; unique.
+        group: "real", "odd", "sim" or "sim0".
+        history: older sweeps that are used.
+        half_side: metres, of the region that flow is estimated in.
+        load: makes the windows.
+        step: sweeps of the recording from t to t+1.
+    """
+
+    name: str
+    group: str
+    history: int
+    half_side: float
+    load: Callable[[], List[Item]]
+    step: int = 1
+
+    def items(self) -> List[Item]:
+        """The windows with as much history as is used."""
+        return [replace(i, window=replace(i.window, pch=i.window.pch[: self.history])) for i in self.load()]
+
+
+def make_sets(groups: Sequence[str], seeds: Sequence[Tuple[int, int]], cache: Path) -> List[ScoredSet]:
+    """The sets of some groups; those of "sim" (h = 4) and "sim0" (h = 0) once per range of seeds.
+
+    Args:
+        groups: names of `ScoredSet.group`.
+        seeds: first and last seed of each range, a multiple of four seeds for an even mix of scenes.
+        cache: folder for simulated drives, made where they are absent.
+    """
+    sets = []
+    for name, group, history, load, step in _REAL:
+        if group in groups:
+            sets.append(ScoredSet(name, group, history, NEAR, load, step))
+    for group, history in (("sim", HISTORY), ("sim0", 0)):
+        for first, last in seeds if group in groups else ():
+            for profile in PROFILES:
+                name = f"sim {profile} {first}-{last} h={history}"
+                load = partial(simulated, profile, first, last, cache)
+                sets.append(ScoredSet(name, group, history, REGION, load))
+    return sets
+
+
+def between(start: Sweep, end: Sweep) -> np.ndarray:
+    """(4, 4) float64 T_end_start, ego coordinates of one sweep to those of another."""
+    T_world_start, T_world_end = as_numpy(start.pose, np.float64), as_numpy(end.pose, np.float64)
+    return np.linalg.inv(T_world_end) @ T_world_start
+
+
+def make_item(scored: Window, labels: FlowLabels, eval_mask: Optional[np.ndarray] = None) -> Item:
+    """An item whose ego motion is that of the poses."""
+    pose_flow = ego_motion_flow(as_numpy(scored.pc0.points)[:, :3], between(scored.pc0, scored.pc1))
+    return Item(scored, labels, pose_flow, eval_mask)
+
+
+def data_root() -> Path:
+    """Folder of the real data: $CFLOW_DATA, else ../shared/data beside the checkout.
+
+    Raises:
+        CFlowError: it is not there.
+    """
+    root = Path(os.environ.get("CFLOW_DATA") or Path(__file__).resolve().parents[3] / "shared" / "data")
+    for part in (AV2, KITTI):
+        if not (root / part).exists():
+            raise CFlowError(
+                f"no {part} in {root}: set CFLOW_DATA to the folder of the real data, or leave out the sets "
+                "real and odd (--sets sim)"
+            )
+    return root
+
+
+@lru_cache(maxsize=None)
+def av2_pair() -> List[Item]:
+    """The real Argoverse 2 pair; ego motion as its labels have it, 0.8 mm off the poses."""
+    folder = data_root() / AV2
+    log = AV2Log(folder)
+    item = make_item(window(log, 0), log.labels(0))
+    with np.load(folder / "ego_motion.npz") as stored:
+        T_ego1_ego0 = stored["ego_motion"][0].astype(np.float64)
+    return [replace(item, pose_flow=ego_motion_flow(item.window.pc0.points, T_ego1_ego0))]
+
+
+@lru_cache(maxsize=None)
+def _kitti() -> Tuple[HDF5Log, RecentSweeps]:
+    log = HDF5Log(data_root() / KITTI)
+    return log, RecentSweeps(log, len(log.timestamps))
+
+
+@lru_cache(maxsize=None)
+def kitti() -> List[Item]:
+    """Every labelled pair of KITTI 0000."""
+    log, sweeps = _kitti()
+    pairs = range(len(log.timestamps) - 1)
+    return [make_item(window(sweeps, i, HISTORY), log.labels(i), log.eval_mask(i)) for i in pairs]
+
+
+@lru_cache(maxsize=None)
+def kitti_steps(step: int) -> List[Item]:
+    """Pairs (t, t + step) of KITTI 0000; the labels of the pairs between, chained object by object."""
+    log, sweeps = _kitti()
+    items = []
+    for start in range(len(log.timestamps) - step):
+        pairs = []
+        for i in range(start, start + step):
+            labels, sweep = log.labels(i), sweeps.sweep(i)
+            usable = labels.is_valid & ~sweep.is_ground
+            pairs.append((sweep.points, log.values(i, "flow_instance_id"), labels.flow, usable))
+        scored = Window(sweeps.sweep(start), sweeps.sweep(start + step))
+        first = log.labels(start)
+        flow, is_known = chain_flow(pairs, ego_motion_flow(scored.pc0.points, between(scored.pc0, scored.pc1)))
+        labels = FlowLabels(flow, first.category, first.is_valid & is_known)
+        items.append(make_item(scored, labels, log.eval_mask(start)))
+    return items
+
+
+@lru_cache(maxsize=None)
+def merged() -> List[Item]:
+    """The pairs of KITTI 0000, every mover with something static pasted beside it."""
+    log, _ = _kitti()
+    items = []
+    for number, item in enumerate(kitti()):
+        pair = Window(item.window.pc0, item.window.pc1)
+        scored = item.eval_mask & item.labels.is_valid
+        made = paste_static(pair, item.labels, log.values(number, "flow_instance_id"), scored, number)
+        more = len(made[1].flow) - len(item.labels.flow)
+        items.append(make_item(*made, np.concatenate([item.eval_mask, np.ones(more, bool)])))
+    return items
+
+
+@lru_cache(maxsize=None)
+def simulated(profile: str, first: int, last: int, cache: Path) -> List[Item]:
+    """Windows of the simulated drives of one sensor, read as that data set is."""
+    chosen = format_of(profile)
+    items = []
+    for source in benchmark_logs(cache, profile, range(first, last + 1), SIMULATED_SWEEPS, SCENES):
+        log = open_log(chosen.data_set, source, check=False, **dict(chosen.settings))
+        sweeps = RecentSweeps(log, SIMULATED_SWEEPS)
+        pairs = range(HISTORY, len(log.timestamps) - 1)
+        for wanted in SIMULATED_WINDOWS:  # not every sweep of every data set has labels
+            nearest = sorted(pairs, key=lambda i: abs(i - wanted))  # noqa: B023
+            index = next(i for i in nearest if log.labels(i) is not None)
+            items.append(make_item(window(sweeps, index, HISTORY), log.labels(index)))
+    return items
+
+
+def _every_second(load: Callable[[], List[Item]], start: int) -> Callable[[], List[Item]]:
+    return lambda: load()[start::2]
+
+
+_STEPS = {step: partial(kitti_steps, step) for step in (3, 5)}
+# Name, group, history, windows, step. At h = 4 only windows with the whole history.
+_REAL: Tuple[Tuple[str, str, int, Callable[[], List[Item]], int], ...] = (
+    ("av2 pair h=0", "real", 0, av2_pair, 1),
+    ("kitti h=0", "real", 0, kitti, 1),
+    ("kitti h=4", "real", 4, _every_second(kitti, 4), 1),
+    ("third sweeps h=0", "real", 0, _every_second(_STEPS[3], 0), 3),
+    ("fifth sweeps h=0", "real", 0, _every_second(_STEPS[5], 0), 5),
+    ("merge h=0", "real", 0, merged, 1),
+    ("kitti odd h=4", "odd", 4, _every_second(kitti, 5), 1),
+    ("third sweeps odd h=0", "odd", 0, _every_second(_STEPS[3], 1), 3),
+    ("fifth sweeps odd h=0", "odd", 0, _every_second(_STEPS[5], 1), 5),
+)

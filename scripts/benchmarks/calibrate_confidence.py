@@ -1,0 +1,241 @@
+#!/usr/bin/env python3
+"""Confidence of the flow (docs/confidence.md): fit its table on simulated drives, see on others whether it is right.
+
+  python scripts/benchmarks/calibrate_confidence.py fit CACHE                 writes verified/confidence.json
+  python scripts/benchmarks/calibrate_confidence.py evaluate CACHE --seeds 300 301 302 303 --figure docs/confidence.png
+  python scripts/benchmarks/calibrate_confidence.py evaluate --real FOLDER    Argoverse 2 pair, KITTI 0000 below FOLDER
+
+CACHE is a folder for the simulated drives (`simulator/benchmark.py`). Five sensors, four kinds of scenes, pairs (h = 0)
+and history (h = 4), region +-70 m, ground excluded; seeds 100 ... 103 to fit. Right = end-point error of the residual
+flow below 0.1 m per interval.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from pathlib import Path
+from typing import Any, Dict, Iterator, List, Optional, Sequence, Tuple
+
+import numpy as np
+import torch
+
+from cflow_torch import make_config, make_model
+from cflow_torch.data.catalog import find_sources, open_log
+from cflow_torch.data.log import window
+from cflow_torch.evaluation.frame import ego_motion_flow
+from cflow_torch.simulator.benchmark import FORMATS, benchmark_logs
+from cflow_torch.types import FlowResult, Window
+from cflow_torch.verified import confidence
+
+RIGHT = 0.1  # metres
+MOVES = 0.05  # metres; a true motion of at least this is dynamic
+SCENES = ("street", "highway", "crossing", "narrow")
+NUM_SWEEPS, MOST_HISTORY = 15, 4
+PICKS = (9, 12)  # sweeps of a drive, or the nearest that have labels
+DROPPED = (0.0, 0.05, 0.1, 0.2, 0.3, 0.5)
+NUM_BINS = 10  # of the reliability table
+MOST_POINTS = 3000  # of a window in a bin of the table when it is fitted, so that one lorry does not decide it
+BOX = (-70.0, -70.0, -math.inf, 70.0, 70.0, math.inf)
+TABLE_FILE = Path(confidence.__file__).with_name("confidence.json")
+# A row of the statistics: of the points of one bin of the table, all and dynamic ones.
+POINTS, RIGHT_ONES, DYNAMIC, RIGHT_DYNAMIC, ERROR, DYNAMIC_ERROR = range(6)
+Truth = Tuple[Window, np.ndarray, np.ndarray]  # window, true residual flow (N, 3), points that count (N,)
+
+
+def simulated(cache: Path, seeds: Sequence[int]) -> Iterator[Truth]:
+    """Windows of all sensors."""
+    for profile, chosen in FORMATS.items():
+        for source in benchmark_logs(cache, profile, seeds, NUM_SWEEPS, SCENES):
+            log = open_log(chosen.data_set, source, check=False, **dict(chosen.settings))
+            late = range(MOST_HISTORY, len(log.timestamps) - 1)
+            for pick in PICKS:
+                nearest = sorted(late, key=lambda i: abs(i - pick))
+                yield _windowed(log, next(i for i in nearest if log.labels(i) is not None))
+
+
+def real(name: str, root: Path) -> Iterator[Truth]:
+    """Windows of all logs of a data set below a folder."""
+    for source in find_sources(name, root):
+        log = open_log(name, source, check=False)
+        for i in range(min(MOST_HISTORY, len(log.timestamps) - 2), len(log.timestamps) - 1):
+            if log.labels(i) is not None:
+                yield _windowed(log, i)
+
+
+def _windowed(log: Any, i: int) -> Truth:
+    sweeps, truth = window(log, i, MOST_HISTORY), log.labels(i)
+    T_ego1_ego0 = np.linalg.inv(sweeps.pc1.pose) @ sweeps.pc0.pose
+    mask = log.eval_mask(i) if hasattr(log, "eval_mask") else None
+    counts = truth.is_valid if mask is None else truth.is_valid & mask
+    return sweeps, truth.flow - ego_motion_flow(np.asarray(sweeps.pc0.points)[:, :3], T_ego1_ego0), counts
+
+
+def statistics(windows: Iterator[Truth], histories: Sequence[int], most: float = math.inf) -> np.ndarray:
+    """(C, 6) float64: sums over the points of each of the C bins of the table.
+
+    Args:
+        windows: with h = 4.
+        histories: each window is looked at with each of these h.
+        most: points that a window counts at most in a bin: those beyond weigh nothing, all of them alike.
+    """
+    num_bins = len(confidence.TABLE["probabilities"])
+    kept, sums = confidence.TABLE["probabilities"], np.zeros((num_bins, 6))
+    models = {h: make_model(make_config("default", num_history=h, point_cloud_range=BOX)) for h in histories}
+    confidence.TABLE["probabilities"] = [i / num_bins for i in range(num_bins)]  # says which bin it is
+    try:
+        for number, (sweeps, truth, counts) in enumerate(windows, 1):
+            for h, model in models.items():
+                (result,) = model([Window(sweeps.pc0, sweeps.pc1, sweeps.pch[:h])])
+                of_window = _sums(result, truth, counts, num_bins)
+                sums += of_window * np.minimum(1, most / np.maximum(of_window[:, :1], 1))
+            print(f"\r{number} windows", end="", file=sys.stderr, flush=True)
+    finally:
+        confidence.TABLE["probabilities"] = kept
+    print(file=sys.stderr)
+    return sums
+
+
+def _sums(result: FlowResult, truth: np.ndarray, counts: np.ndarray, num_bins: int) -> np.ndarray:
+    found = result.numpy()
+    rows = np.flatnonzero(found["is_valid"] & counts)
+    place = np.rint(found["confidence"][rows] * num_bins).astype(int)
+    error = np.linalg.norm(found["residual_flow"][rows] - truth[rows], axis=1)
+    moves = np.linalg.norm(truth[rows], axis=1) >= MOVES
+    right = error < RIGHT
+    columns = (np.ones(len(rows)), right, moves, right & moves, error, error * moves)
+    return np.stack([np.bincount(place, column, num_bins) for column in columns], 1)
+
+
+def fit(sums: np.ndarray) -> List[float]:
+    """Probability of each bin: share of right points, made monotone along each row of the table."""
+    table = confidence.TABLE
+    sizes = [1, 1 + len(table["crowd"]), 1 + len(table["share"])] + 4 * [1 + len(table["margin"])]
+    starts = np.cumsum([0, *sizes])
+    result: List[float] = []
+    for row, (start, end) in enumerate(zip(starts, starts[1:])):
+        points, right = sums[start:end, POINTS], sums[start:end, RIGHT_ONES]
+        prior = right.sum() / max(points.sum(), 1)
+        share = (right + prior) / (points + 1)
+        rising = monotone(share if row != 1 else -share, points + 1)  # the more is unlinked, the worse
+        result += [round(abs(float(value)), 4) for value in rising]
+    return result
+
+
+def monotone(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """The rising sequence nearest to some values in weighted squares: neighbours that fall are pooled."""
+    pools: List[List[float]] = []  # mean, weight, length
+    for value, weight in zip(values.tolist(), weights.tolist()):
+        pools.append([value, weight, 1])
+        while len(pools) > 1 and pools[-2][0] >= pools[-1][0]:
+            mean, weight, length = pools.pop()
+            before = pools[-1]
+            total = before[1] + weight
+            pools[-1] = [(before[0] * before[1] + mean * weight) / total, total, before[2] + length]
+    return np.repeat([pool[0] for pool in pools], [int(pool[2]) for pool in pools])
+
+
+def reliability(sums: np.ndarray, dynamic: bool = False) -> Tuple[List[Tuple[float, float, int]], float]:
+    """Mean confidence, share of right ones and number of points by tenths of confidence; expected calibration error."""
+    told = np.array(confidence.TABLE["probabilities"])
+    points, right = sums[:, [DYNAMIC, RIGHT_DYNAMIC] if dynamic else [POINTS, RIGHT_ONES]].T
+    tenth = np.minimum((told * NUM_BINS).astype(int), NUM_BINS - 1)
+    rows, gap = [], 0.0
+    for i in range(NUM_BINS):
+        inside = tenth == i
+        number = points[inside].sum()
+        if number:
+            rows.append(((told * points)[inside].sum() / number, right[inside].sum() / number, int(number)))
+            gap += abs(rows[-1][0] - rows[-1][1]) * number
+    return rows, gap / max(points.sum(), 1)
+
+
+def sparsification(sums: np.ndarray, dynamic: bool, shares: Sequence[float]) -> List[float]:
+    """Mean error of what is left when a share is dropped, the least confident first; of equals all alike.
+
+    Args:
+        sums: see `statistics`.
+        dynamic: of dynamic points, else of static ones; shares are of these.
+        shares: from 0 to below 1.
+    """
+    order = np.argsort(confidence.TABLE["probabilities"], kind="stable")
+    points, error = sums[order, DYNAMIC], sums[order, DYNAMIC_ERROR]
+    if not dynamic:
+        points, error = sums[order, POINTS] - points, sums[order, ERROR] - error
+    mean = error / np.maximum(points, 1)
+    before = np.concatenate(([0.0], np.cumsum(points)[:-1]))
+    result = []
+    for share in shares:
+        left = np.clip(before + points - share * points.sum(), 0, points)
+        result.append(float((mean * left).sum() / max(left.sum(), 1)))
+    return result
+
+
+def report(name: str, sums: np.ndarray) -> None:
+    rows, gap = reliability(sums)
+    print(f"\n### {name}\n\nExpected calibration error {gap:.4f}; of dynamic points {reliability(sums, True)[1]:.3f}\n")
+    print("| mean confidence | share right | points |\n|---|---|---|")
+    for mean, share, number in rows:
+        print(f"| {mean:.3f} | {share:.3f} | {number} |")
+    print(f"\n| dropped | {' | '.join(f'{100 * share:.0f} %' for share in DROPPED)} |\n|{'---|' * (1 + len(DROPPED))}")
+    for kind, dynamic in (("dynamic", True), ("static", False)):
+        values = sparsification(sums, dynamic, DROPPED)
+        print(f"| {kind} EPE, m | {' | '.join(f'{value:.4f}' for value in values)} |")
+
+
+def draw(sets: Dict[str, np.ndarray], path: Path) -> None:
+    """Reliability and error over the share that is dropped, a line per set."""
+    from matplotlib.figure import Figure
+
+    styles = ({"color": "blue", "marker": "o"}, {"color": "orange", "marker": "s"}, {"color": "green", "marker": "^"})
+    figure = Figure(figsize=(13, 4.2), layout="constrained")
+    diagram, moving, standing = figure.subplots(1, 3)
+    diagram.plot([0, 1], [0, 1], color="0.6", linestyle="--", label="as told")
+    shares = np.linspace(0, 0.5, 26)
+    for (name, sums), style in zip(sets.items(), styles):
+        rows, gap = reliability(sums)
+        diagram.plot([r[0] for r in rows], [r[1] for r in rows], label=f"{name}: error {gap:.3f}", **style)
+        for axes, dynamic in ((moving, True), (standing, False)):
+            axes.plot(100 * shares, sparsification(sums, dynamic, shares), label=name, markevery=5, **style)
+    diagram.set(xlabel="confidence", ylabel="share of points right to 0.1 m", title="Reliability", xlim=(0, 1.02))
+    moving.set(xlabel="least confident dropped, %", ylabel="EPE, m", title="Dynamic points")
+    standing.set(xlabel="least confident dropped, %", ylabel="EPE, m", title="Static points")
+    for axes in (diagram, moving, standing):
+        axes.set_ylim(bottom=0)
+        axes.grid(alpha=0.3)
+        axes.legend(fontsize=9)
+    figure.savefig(path, dpi=110)
+
+
+def main(arguments: Optional[Sequence[str]] = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("task", choices=("fit", "evaluate"))
+    parser.add_argument("cache", type=Path, nargs="?", help="folder of the simulated drives")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[100, 101, 102, 103])
+    parser.add_argument("--real", type=Path, help="evaluate: folder with av2-7fab2350 and kitti-0000")
+    parser.add_argument("--figure", type=Path, help="evaluate: PNG to draw")
+    args = parser.parse_args(arguments)
+    torch.set_num_threads(1)
+    if args.task == "fit":
+        sums = statistics(simulated(args.cache, args.seeds), (0, 4), MOST_POINTS)
+        table = {**confidence.TABLE, "probabilities": fit(sums)}
+        TABLE_FILE.write_text(json.dumps(table) + "\n", encoding="utf-8")
+        return
+    sets: Dict[str, np.ndarray] = {}
+    if args.cache is not None:
+        for h in (0, 4):
+            sets[f"simulated, h = {h}"] = statistics(simulated(args.cache, args.seeds), (h,))
+    if args.real is not None:
+        sets["Argoverse 2 pair"] = statistics(real("av2", args.real / "av2-7fab2350"), (0,))
+        for h in (0, 4):
+            sets[f"KITTI 0000, h = {h}"] = statistics(real("hdf5", args.real / "kitti-0000"), (h,))
+    for name, sums in sets.items():
+        report(name, sums)
+    if args.figure is not None:
+        draw(sets, args.figure)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,290 @@
+#!/usr/bin/env python3
+"""What needs a GPU, in one run of at most eight minutes: equality with the CPU, speed, launches, memory, tests.
+
+  PYTHONPATH=. python scripts/benchmarks/gpu_check.py                      tables, and outputs/gpu_check.json
+  PYTHONPATH=. python scripts/benchmarks/gpu_check.py --output FILE --skip tests
+  PYTHONPATH=. python scripts/benchmarks/gpu_check.py --windows FILE.npz   simulated windows: made once, then read
+
+It has never run on a GPU: none was at hand. Without one it compares the CPU with itself, which shows that the script
+works and nothing else. Needs torch and NumPy; pyarrow for the simulator, unless the windows were made elsewhere; pytest
+for the tests. Parts that the time does not allow are left out, and it says so.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import subprocess
+import sys
+import time
+import warnings
+from collections import Counter
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any, Callable, Dict, List, Sequence, Tuple
+
+import numpy as np
+import torch
+from counts import count_allocations, count_work
+from table import markdown
+from torch.profiler import ProfilerActivity, profile
+
+from cflow_torch import Config, FlowResult, Sweep, Window, make_config, make_model
+from cflow_torch.stages import StopWatch, stage_seconds
+
+ROOT = Path(__file__).resolve().parents[2]
+BUDGET_SECONDS, TEST_SECONDS = 440.0, 150.0
+TOLERANCE = 1e-4  # metres; scores and confidences too
+EXACT = ("cluster_id", "is_valid")
+SCALES = (0.8, 0.4, 0.3, 0.2, 0.1)
+PAPER, KEYS, DEFAULT = make_config("paper"), make_config("paper", method="keypoints"), make_config("default")
+TWO = PAPER.replace(num_history=2, pixel_sizes=(0.4, 0.1))
+LITTLE = 30_000_000  # bytes: less than a batch needs
+# name -> (settings, number of windows in a batch)
+VARIANTS: Dict[str, Tuple[Config, int]] = {
+    "dense, h = 0": (PAPER, 1),
+    "dense, h = 0, +-70 m": (PAPER.replace(point_cloud_range=(-70.0, -70.0, -3.0, 70.0, 70.0, 5.0)), 1),
+    "dense, h = 0, connectivity 4": (PAPER.replace(connectivity=4), 1),
+    "dense, h = 0, conv": (
+        PAPER.replace(correlation="conv", point_cloud_range=(-20.0, -20.0, -3.0, 20.0, 20.0, 5.0)),
+        1,
+    ),
+    "dense, h = 4, 5 scales": (PAPER.replace(num_history=4, pixel_sizes=SCALES), 1),
+    "dense, h = 2, 2 scales": (TWO, 3),
+    "dense, h = 2, 2 scales, max_memory 30 MB": (TWO.replace(max_memory=LITTLE), 3),
+    "dense, max_speed": (TWO.replace(max_speed=30.0), 1),
+    "dense, sectional view": (TWO.replace(sectional_view=True), 2),
+    "key points": (KEYS, 1),
+    "key points, preset keypoints": (make_config("keypoints"), 1),
+    "key points, nearest": (KEYS.replace(densify="nearest"), 1),
+    "key points, max_memory 30 MB": (KEYS.replace(max_memory=LITTLE), 3),
+    "preset default": (DEFAULT, 3),
+    "preset default, h = 0": (DEFAULT.replace(num_history=0), 3),
+    "preset default, max_memory 30 MB": (DEFAULT.replace(max_memory=LITTLE), 3),
+    "preset fast": (make_config("fast"), 3),
+}
+MEASURED: Dict[str, Config] = {
+    "dense, h = 4, 5 scales": VARIANTS["dense, h = 4, 5 scales"][0],
+    "dense, h = 0": PAPER,
+    "key points": KEYS,
+    "preset default": DEFAULT,
+}
+# Beginnings of the names of calls into CUDA: the ends differ from version to version.
+LAUNCHES = ("cudaLaunchKernel", "cuLaunchKernel")
+WAITS = ("cudaStreamSynchronize", "cudaDeviceSynchronize", "cudaEventSynchronize")
+COPIES = ("cudaMemcpy", "cudaMemset")
+SEEDS, SWEEPS = (7, 8, 9), 6  # t + 1, t, and a history of four
+STREETS: List[Window] = []  # filled by `main`
+Rows = List[Dict[str, Any]]
+
+
+def make_streets() -> Dict[str, np.ndarray]:
+    """Simulated windows as arrays: points, ground, pose and time of every sweep, t+1 first."""
+    from cflow_torch.data.log import window
+    from cflow_torch.simulator import make_drive
+
+    arrays = {}
+    for number, seed in enumerate(SEEDS):
+        sweeps = window(make_drive(seed=seed, num_sweeps=SWEEPS), SWEEPS - 2, SWEEPS - 2)
+        for step, sweep in enumerate((sweeps.pc1, sweeps.pc0, *sweeps.pch)):
+            for field in fields(Sweep):
+                arrays[f"{number}/{step}/{field.name}"] = np.asarray(getattr(sweep, field.name))
+    return arrays
+
+
+def read_streets(arrays: Dict[str, np.ndarray]) -> List[Window]:
+    """The windows of `make_streets`."""
+    windows = []
+    for number in range(len(SEEDS)):
+        sweeps = []
+        for step in range(SWEEPS):
+            points, is_ground, pose, time_ns = (arrays[f"{number}/{step}/{field.name}"] for field in fields(Sweep))
+            sweeps.append(Sweep(points, is_ground, pose, int(time_ns)))
+        windows.append(Window(sweeps[1], sweeps[0], tuple(sweeps[2:])))
+    return windows
+
+
+def windows_for(config: Config, number: int) -> List[Window]:
+    """Different windows with the history that a config takes; after the third, the same again."""
+    chosen = [STREETS[i % len(STREETS)] for i in range(number)]
+    return [replace(sweeps, pch=sweeps.pch[: config.num_history]) for sweeps in chosen]
+
+
+def check_equality(device: str) -> Rows:
+    """GPU against CPU, every variant: rows that differ in each field, the largest difference of the floats."""
+    rows = []
+    for name, (config, number) in VARIANTS.items():
+        windows = windows_for(config, number)
+        there, here = (make_model(config, where)(windows) for where in (device, "cpu"))
+        rows.append({"variant": name, **compare(there, here)})
+    return rows
+
+
+def compare(there: Sequence[FlowResult], here: Sequence[FlowResult]) -> Dict[str, Any]:
+    """Points, points that differ in each field, the largest difference of a float, and the verdict."""
+    row: Dict[str, Any] = {"points": sum(len(result.flow) for result in here)}
+    largest = 0.0
+    for field in fields(FlowResult):
+        row[field.name] = 0
+        for a, b in zip(there, here):
+            x, y = getattr(a, field.name), getattr(b, field.name)
+            if y is None:  # only the verified method has a confidence
+                continue
+            x = x.cpu()
+            row[field.name] += int((x != y).view(len(y), -1).any(1).sum())
+            if x.is_floating_point() and x.numel():
+                largest = max(largest, float((x - y).abs().max()))
+    row["largest_difference"] = largest
+    row["same"] = all(row[name] == 0 for name in EXACT) and largest <= TOLERANCE
+    return row
+
+
+def measure_speed(device: str) -> Rows:
+    """Milliseconds of a batch and windows per second, from NumPy arrays and from tensors on the device."""
+    rows = []
+    for name, config in MEASURED.items():
+        for size in (1, 8, 32) if device == "cuda" else (1, 2):
+            host = windows_for(config, size)
+            for kind, windows in (("arrays", host), (device, [on_device(each, device) for each in host])):
+                watch, end = StopWatch(make_model(config, device)), time.monotonic() + 2
+                for run in range(30):
+                    if run < 3 or time.monotonic() < end:
+                        watch(windows)
+                median = watch.report()["median"]
+                rows.append(
+                    {"work": name, "input": kind, "batch": size, "ms": 1000 * median, "windows/s": size / median}
+                )
+    return rows
+
+
+def on_device(sweeps: Window, device: str) -> Window:
+    """The points already uploaded."""
+
+    def uploaded(sweep: Sweep) -> Sweep:
+        points, is_ground = (torch.as_tensor(np.asarray(x)).to(device) for x in (sweep.points, sweep.is_ground))
+        return replace(sweep, points=points, is_ground=is_ground)
+
+    return Window(uploaded(sweeps.pc0), uploaded(sweeps.pc1), tuple(map(uploaded, sweeps.pch)))
+
+
+def count_launches(device: str) -> Rows:
+    """Kernel launches, waits and copies of one warm window, by the profiler; and what `count_work` counts."""
+    rows = []
+    for name, config in MEASURED.items():
+        windows, model = windows_for(config, 1), make_model(config, device)
+        row: Dict[str, Any] = {"work": name, **count_work(lambda: model(windows))}  # noqa: B023
+        if device == "cuda":
+            row.update(by_profiler(lambda: model(windows)))  # noqa: B023
+            row["places"] = waiting_lines(lambda: model(windows))  # noqa: B023
+        rows.append(row)
+    return rows
+
+
+def by_profiler(run: Callable[[], Any]) -> Dict[str, Any]:
+    """Launches, waits and copies that CUDA saw, and milliseconds of its kernels."""
+    with stage_seconds() as stages:
+        run()
+    torch.cuda.synchronize()
+    with profile(activities=[ProfilerActivity.CPU, ProfilerActivity.CUDA]) as profiler:
+        run()
+        torch.cuda.synchronize()
+    events = profiler.events() or []
+    on_gpu = [e for e in events if e.device_type == torch.autograd.DeviceType.CUDA and e.name not in stages]
+    return {
+        "launches": sum(event.name.startswith(LAUNCHES) for event in events),
+        "syncs": sum(event.name.startswith(WAITS) for event in events) - 1,  # the last one is ours
+        "copies": sum(event.name.startswith(COPIES) for event in events),
+        "gpu_ms": sum(event.time_range.elapsed_us() for event in on_gpu) / 1000,
+    }
+
+
+def waiting_lines(run: Callable[[], Any]) -> str:
+    """Lines of Python at which torch says that the host waits, and how often."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        torch.cuda.set_sync_debug_mode("warn")
+        try:
+            run()
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
+    places = Counter(f"{Path(w.filename).name}:{w.lineno}" for w in caught if "synchron" in str(w.message))
+    return ", ".join(f"{place} x{n}" for place, n in places.most_common())
+
+
+def measure_memory(device: str) -> Rows:
+    """Most memory at once, with and without a limit; the limit must not change the flow."""
+    rows = []
+    size = 32 if device == "cuda" else 2
+    for name, config in MEASURED.items():
+        batch = windows_for(config, size)
+        free = [result.to("cpu") for result in make_model(config, device)(batch)]
+        for limit in (None, 1_000_000_000, 200_000_000):
+            model = make_model(config.replace(max_memory=limit), device)
+            _, peak = count_allocations(lambda: model(batch))  # noqa: B023
+            row = {"work": name, "batch": size, "max_memory_MB": limit and limit / 1e6, "peak_MB": peak / 1e6}
+            rows.append({**row, "same": compare(model(batch), free)["same"]})
+    return rows
+
+
+def run_tests(_: str) -> Rows:
+    """`pytest -m cuda` over the files that have such tests."""
+    files = [file for file in sorted((ROOT / "tests").rglob("test_*.py")) if "pytest.mark.cuda" in file.read_text()]
+    call = [sys.executable, "-m", "pytest", "-m", "cuda", "-rfE", *map(str, files)]
+    try:
+        done = subprocess.run(call, cwd=ROOT, capture_output=True, text=True, timeout=TEST_SECONDS)
+    except subprocess.TimeoutExpired:
+        return [{"tests": f"not done after {TEST_SECONDS:g} s", "same": False}]
+    lines = (done.stdout or done.stderr).strip().splitlines()
+    failed = [line for line in lines if line.startswith(("FAILED", "ERROR"))]
+    return [{"tests": line, "same": done.returncode in (0, 5)} for line in [lines[-1], *failed]]
+
+
+PARTS: Dict[str, Callable[[str], Rows]] = {
+    "equality": check_equality,
+    "speed": measure_speed,
+    "launches": count_launches,
+    "memory": measure_memory,
+    "tests": run_tests,
+}
+
+
+def main() -> None:
+    """Run the parts, print tables, write one JSON; the status is 1 if results differ or a part failed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--output", type=Path, default=Path("outputs/gpu_check.json"))
+    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu", choices=("cuda", "cpu"))
+    parser.add_argument("--skip", nargs="*", default=[], choices=list(PARTS))
+    parser.add_argument("--windows", type=Path, help="file of the simulated windows, made if it is not there")
+    given = parser.parse_args()
+    start = time.monotonic()
+    arrays = dict(np.load(given.windows)) if given.windows and given.windows.exists() else make_streets()
+    if given.windows and not given.windows.exists():
+        np.savez_compressed(given.windows, **arrays)  # type: ignore[arg-type]
+    STREETS.extend(read_streets(arrays))
+    name = torch.cuda.get_device_name() if given.device == "cuda" else "no GPU: the CPU is compared with itself"
+    report: Dict[str, Any] = {"device": name, "platform": platform.platform(), "torch": torch.__version__}
+    print(json.dumps(report))
+    wrong: List[str] = []
+    for title, part in PARTS.items():
+        spent = time.monotonic() - start
+        if title in given.skip or spent > BUDGET_SECONDS - (TEST_SECONDS if title == "tests" else 0):
+            print(f"\n## {title}: left out after {spent:.0f} s")
+            continue
+        try:
+            rows = report[title] = part(given.device)
+        except Exception as error:  # the other parts are worth having
+            report[title] = f"{type(error).__name__}: {error}"
+            print(f"\n## {title}: {report[title]}")
+            wrong.append(title)
+            continue
+        print(f"\n## {title}\n\n{markdown([list(rows[0]), *(list(row.values()) for row in rows)])}", flush=True)
+        wrong += [f"{title}: {next(iter(row.values()))}" for row in rows if not row.get("same", True)]
+        given.output.parent.mkdir(parents=True, exist_ok=True)
+        given.output.write_text(json.dumps(report, indent=1) + "\n")
+    if wrong:
+        raise SystemExit("wrong: " + "; ".join(wrong))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,137 @@
+"""What the paper prints, and what our results files hold: both by experiment and row."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Dict, List, Mapping, Tuple
+
+from omegaconf import OmegaConf
+
+from cflow_torch.config import PRESETS
+from cflow_torch.evaluation.protocol import ProtocolScores, errors_by_range, score_data_sets
+
+PAPER_FILE = Path(__file__).resolve().with_name("figures.yaml")
+# The paper's name of a class -> that of the evaluation.
+CLASSES = {"CAR": "CAR", "OTHER": "OTHER_VEHICLES", "PED": "PEDESTRIAN", "VRU": "WHEELED_VRU"}
+METHODS = {"dense": "CorrelationFlow", "keypoints": "CorrelationFlow-Keypoint"}
+RANGES = ("0-35", "35-70")
+DENSIFIED = {
+    "components": "Connected components",
+    "nearest": "Nearest neighbour",
+    "clusters": "Clusters (not in the paper)",
+}
+PRESET = "Preset keypoints (not in the paper)"
+STAGES = {"views": ("correlate", "pool"), "clustering": ("cluster",)}  # what the paper's time column holds
+
+
+@dataclass(frozen=True)
+class Run:
+    """One results file.
+
+    Args:
+        experiment: name of the table or figure.
+        data_set: what was scored, as tables call it.
+        row: row of the table, or point of the figure.
+        record: content of results.json.
+    """
+
+    experiment: str
+    data_set: str
+    row: str
+    record: Dict[str, Any]
+
+    def values(self) -> List[float]:
+        """Dynamic bucket-normalised error of CAR, OTHER, PED, VRU, and their mean; NaN = no moving points."""
+        scores = self.record["results"]["bucketed"]
+        classes = [scores["classes"][name]["dynamic_error"] for name in CLASSES.values()]
+        return [math.nan if value is None else value for value in (*classes, scores["mean"]["dynamic_error"])]
+
+    def seconds(self) -> float:
+        """Median seconds per pair of what the paper's time column holds."""
+        times = self.record["seconds_per_pair"]
+        stages = STAGES.get(self.experiment)
+        return float(times["median"] if stages is None else sum(times["stages"].get(name, 0.0) for name in stages))
+
+
+Ours = Mapping[str, Mapping[str, Run]]  # data set -> row
+Runs = Dict[str, Dict[str, Dict[str, Run]]]  # experiment -> data set -> row
+
+
+def load_paper() -> Dict[str, Any]:
+    """What the paper prints, by experiment; figures of classes have `rows` as the tables do."""
+    paper: Dict[str, Any] = OmegaConf.to_container(OmegaConf.load(PAPER_FILE))  # type: ignore[assignment]
+    for name in ("history", "scales"):
+        figure, rows = paper[name], {}
+        for at, x in enumerate(figure["at"]):
+            for h in ("",) if name == "history" else ("h=0", "h=2", "h=4"):
+                lines = {c: figure["lines"][c] if name == "history" else figure["panels"][c][h] for c in CLASSES}
+                values = [lines[c][at] for c in CLASSES]
+                rows[f"h={x}" if name == "history" else f"{h}, {x} scales"] = [*values, sum(values) / len(values)]
+        figure["rows"], figure["row"] = dict(sorted(rows.items(), key=lambda row: row[0].split(",")[0])), "setting"
+    return paper
+
+
+def row_of(experiment: str, model: Dict[str, Any]) -> str:
+    """The row of a table that a run's settings belong to."""
+    sizes, h = model["pixel_sizes"], model.get("num_history", 0)
+    if experiment == "pixel_size":
+        return ", ".join(f"{size:g}" for size in sizes)
+    if experiment == "views":
+        return "+Sectional" if model["sectional_view"] else "BEV"
+    if experiment == "clustering":
+        return "HDBSCAN" if model["clustering"] == "hdbscan" else "Connected components"
+    if experiment == "history":
+        return f"h={h}"
+    if experiment == "scales":
+        return f"h={h}, {len(sizes)} scales"
+    if experiment == "keypoints":
+        if model["method"] == "dense":
+            return f"CorrelationFlow (h={h})"
+        same = model["densify"] == "clusters" and model["patch_size"] == PRESETS["keypoints"][1]["patch_size"]
+        return PRESET if same else DENSIFIED[model["densify"]]
+    return METHODS[model["method"]]
+
+
+def load_runs(folder: Path) -> Tuple[Runs, List[str]]:
+    """All runs of experiments below a folder, and remarks on files that were not used."""
+    runs: Runs = {}
+    remarks: List[str] = []
+    for file in sorted(folder.rglob("results.json")):
+        try:
+            record = json.loads(file.read_text(encoding="utf-8"))
+            config = record["config"]
+            experiment = config.get("experiment_name")
+        except (ValueError, KeyError, TypeError) as error:
+            remarks.append(f"{file} is no results file of this version ({error!r})")
+            continue
+        if experiment is None:
+            continue
+        data = config["data"]
+        name = data["label"] + (f" ({data['profile']})" if data["name"] == "benchmark" else "")
+        run = Run(experiment, name, row_of(experiment, config["model"]), record)
+        rows = runs.setdefault(experiment, {}).setdefault(name, {})
+        if run.row in rows:
+            older, newer = sorted((run, rows[run.row]), key=lambda r: r.record["date"])
+            remarks.append(f"{experiment}, {name}, {run.row}: two runs; the one of {newer.record['date']} is shown")
+            run = newer
+        rows[run.row] = run
+    return runs, remarks
+
+
+def range_errors(run: Run) -> List[float]:
+    """Error of a run of `datasets` or `range_split` at short and long range; NaN = no moving points."""
+    errors = errors_by_range(run.record["results"])
+    return [errors[name] for name in RANGES]
+
+
+def protocol(ours: Ours) -> Dict[str, ProtocolScores]:
+    """Our variants over our data sets, as the challenge combines them: method -> scores."""
+    result = {}
+    for method in METHODS.values():
+        errors = {name: dict(zip(RANGES, range_errors(runs[method]))) for name, runs in ours.items() if method in runs}
+        if errors:
+            result[method] = score_data_sets(errors, data_sets=list(ours), ranges=RANGES, missing="nan")
+    return result

@@ -1,0 +1,59 @@
+#!/usr/bin/env python3
+"""Every table and figure of the paper: runs all experiments, then makes the pages.
+
+  python scripts/paper/tables.py                                   the whole synthetic benchmark
+  python scripts/paper/tables.py data=benchmark_small              20 windows, a few minutes
+  python scripts/paper/tables.py data=av2 data.root=/data/av2/val output=outputs/av2val
+  python scripts/paper/tables.py --only history scales             some of them
+
+Arguments with "=" are Hydra overrides and go to every `cflow eval -m experiment=...`. Runs that are done are skipped:
+call it again to resume after an interruption. output=FOLDER (default outputs/paper) gets the results, FOLDER/paper the
+pages.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Optional, Sequence
+
+import pages
+
+# Those that need the most time, or an extra, last.
+EXPERIMENTS = ("pixel_size", "views", "history", "scales", "keypoints", "datasets", "range_split", "clustering")
+
+
+def main(arguments: Optional[Sequence[str]] = None) -> int:
+    """Run the experiments; returns 1 if any of them failed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("overrides", nargs="*", metavar="SETTING=VALUE")
+    parser.add_argument("--only", nargs="+", choices=EXPERIMENTS, default=EXPERIMENTS)
+    given = parser.parse_intermixed_args(arguments)
+    wrong = [text for text in given.overrides if "=" not in text]
+    if wrong:
+        print(f"error: {wrong} are no settings: give NAME=VALUE", file=sys.stderr)
+        return 2
+    outputs = [text.partition("=")[2] for text in given.overrides if text.startswith("output=")]
+    output = Path(outputs[-1] if outputs else "outputs/paper")
+    overrides = [text for text in given.overrides if not text.startswith("output=")]
+    failed = []
+    for name in given.only:
+        start = time.monotonic()
+        call = [sys.executable, "-m", "cflow_torch.cli.main", "eval", "-m", f"experiment={name}", f"output={output}"]
+        status = subprocess.run([*call, *overrides]).returncode
+        print(f"{name}: {time.monotonic() - start:.0f} s, exit status {status}", flush=True)
+        if status:
+            failed.append(name)
+    if not output.is_dir():
+        return 1
+    status = pages.main([str(output)])
+    if failed:
+        print(f"failed: {', '.join(failed)}; call again to resume", file=sys.stderr)
+    return 1 if failed else status
+
+
+if __name__ == "__main__":
+    sys.exit(main())

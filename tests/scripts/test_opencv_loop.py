@@ -1,0 +1,121 @@
+"""The OpenCV loop, the competitor of the benchmark, computes the same flow as the paper's method."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scenes import RANGE, pose, scene
+
+from cflow_torch import CFlowError, Config, CorrelationFlow, FlowResult, Sweep, Window, make_config
+from cflow_torch.data.av2 import AV2Log
+from cflow_torch.data.log import window
+
+pytest.importorskip("cv2")
+S = 0.25  # pixel of the small scenes
+# (row, col, height, width) and the shift per sweep (rows, cols): apart by more than the shifts of three sweeps.
+OBJECTS = [((5, 5, 9, 6), (0, 1)), ((5, 30, 5, 9), (1, -1)), ((32, 8, 7, 7), (-1, 0)), ((35, 40, 12, 8), (0, 0))]
+
+
+@pytest.fixture()
+def loop(script: Any) -> Any:
+    return script("benchmarks", "opencv_loop")
+
+
+def config(**overrides: Any) -> Config:
+    small = {"pixel_sizes": (S,), "point_cloud_range": RANGE, "max_extent": 5.0}
+    return make_config("paper", **{**small, **overrides})
+
+
+def ell(row: int, col: int, height: int, width: int) -> np.ndarray:
+    """Points in the middle of the pixels of an L: its correlation has one peak."""
+    pixels = [(r, 0) for r in range(height)] + [(height - 1, c) for c in range(1, width)]
+    x = [RANGE[0] + (col + c + 0.5) * S for _, c in pixels]
+    y = [RANGE[1] + (row + r + 0.5) * S for r, _ in pixels]
+    return np.stack([x, y, np.linspace(0, 1, len(x))], 1)
+
+
+def moving_ells(num_history: int) -> Window:
+    def sweep(step: int) -> Sweep:
+        """All objects `step` sweeps after t + 1."""
+        return Sweep(np.concatenate([ell(r + step * v, c + step * u, h, w) for (r, c, h, w), (v, u) in OBJECTS]))
+
+    return Window(sweep(-1), sweep(0), tuple(sweep(-2 - i) for i in range(num_history)))
+
+
+def true_flow() -> np.ndarray:
+    return np.concatenate([np.tile([u * S, v * S, 0.0], (h + w - 1, 1)) for (_, _, h, w), (v, u) in OBJECTS])
+
+
+def assert_same(result: FlowResult, expected: FlowResult) -> None:
+    for name in ("residual_flow", "pose_flow", "flow", "score"):
+        torch.testing.assert_close(getattr(result, name), getattr(expected, name), rtol=0, atol=1e-6)
+    assert torch.equal(result.cluster_id, expected.cluster_id)
+    assert torch.equal(result.is_valid, expected.is_valid)
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        {},
+        {"connectivity": 4},
+        {"max_speed": 3.0},
+        {"num_history": 2},
+        {"num_history": 1, "pixel_sizes": (0.5, 0.25)},
+    ],
+    ids=str,
+)
+def test_it_finds_objects_moved_by_whole_pixels(loop: Any, overrides: dict) -> None:
+    settings = config(**overrides)
+    sweeps = moving_ells(settings.num_history)
+    result = loop.opencv_flow(sweeps, settings)
+    assert_same(result, CorrelationFlow(settings, "cpu")([sweeps])[0])
+    if len(settings.pixel_sizes) == 1:
+        np.testing.assert_allclose(result.residual_flow, true_flow(), rtol=0, atol=1e-6)
+
+
+def test_it_pools_like_the_method(loop: Any) -> None:
+    # The object stops: estimates of different lengths and directions, an even number of them.
+    places = [(20, 20), (20, 20), (20, 18), (18, 18), (17, 15)]  # (row, col) at t+1, t, t-1, ...
+    first, *rest = (Sweep(ell(row, col, 14, 11)) for row, col in places)
+    sweeps, settings = Window(rest[0], first, tuple(rest[1:])), config(num_history=3, max_extent=50.0)
+    (expected,) = CorrelationFlow(settings, "cpu")([sweeps])
+    assert expected.residual_flow.abs().max() > 0
+    assert_same(loop.opencv_flow(sweeps, settings), expected)
+
+
+@pytest.mark.parametrize("stamps", [False, True])
+@pytest.mark.parametrize("overrides", [{}, {"num_history": 3}, {"num_history": 2, "max_extent": 2.0}], ids=str)
+def test_it_takes_the_same_points_into_the_same_clusters(loop: Any, overrides: dict, stamps: bool) -> None:
+    # Poses, ground, points that are not finite or out of range, splits. Noisy objects tie, so no claim on their flow.
+    settings = config(**overrides)
+    sweeps = scene(1, num_history=settings.num_history, stamps=stamps)
+    result, (expected,) = loop.opencv_flow(sweeps, settings), CorrelationFlow(settings, "cpu")([sweeps])
+    assert expected.cluster_id.max() > 0
+    assert torch.equal(result.cluster_id, expected.cluster_id)
+    assert torch.equal(result.is_valid, expected.is_valid)
+    torch.testing.assert_close(result.pose_flow, expected.pose_flow, rtol=0, atol=1e-6)
+
+
+def test_without_clusters_all_is_zero(loop: Any) -> None:
+    far = Sweep(np.array([[100.0, 0, 0], [math.nan, 0, 0]]), pose=pose(1, 0, 0))
+    empty = Sweep(np.zeros((0, 3)), pose=pose(0, 0, 0))
+    for sweeps in (Window(far, empty), Window(empty, far), Window(empty, empty)):
+        assert_same(loop.opencv_flow(sweeps, config()), CorrelationFlow(config(), "cpu")([sweeps])[0])
+
+
+def test_it_agrees_on_the_real_pair(loop: Any, av2_folder: Any) -> None:
+    settings, sweeps = make_config("paper"), window(AV2Log(av2_folder), 0)
+    result, (expected,) = loop.opencv_flow(sweeps, settings), CorrelationFlow(settings, "cpu")([sweeps])
+    assert torch.equal(result.cluster_id, expected.cluster_id)
+    same = (result.residual_flow - expected.residual_flow).abs().amax(1) <= 1e-5
+    assert same[expected.is_valid].double().mean() >= 0.95
+
+
+@pytest.mark.parametrize("other", ["keypoints", "default"])
+def test_it_refuses_other_methods(loop: Any, other: str) -> None:
+    with pytest.raises(CFlowError, match="OpenCV loop has"):
+        loop.opencv_flow(moving_ells(0), make_config(other))
