@@ -74,4 +74,3 @@ class WindowCounts:
         before = self._before[axis]
         begin, end = shift.clamp(min=0), torch.minimum(length, length + shift)
         return before.index_select(0, first + end) - before.index_select(0, first + begin)
-

@@ -38,9 +38,10 @@ def broken(page: Path) -> List[str]:
         target = unquote("".join(parts))
         path, _, anchor = target.partition("#")
         place = (page.parent / path).resolve() if path else page
-        if not re.match(r"https?:|mailto:", target):
-            if not place.exists() or ROOT not in (place, *place.parents) or (anchor and anchor not in anchors(place)):
-                wrong.append(target)
+        if re.match(r"https?:|mailto:", target):
+            continue
+        if not place.exists() or ROOT not in (place, *place.parents) or (anchor and anchor not in anchors(place)):
+            wrong.append(target)
     return wrong
 
 
