@@ -31,7 +31,7 @@ INSTALL = {
     "old": ["--constraint", ROOT / "scripts" / "constraints_old.txt"],
     "new": ["--upgrade", "--upgrade-strategy", "eager"],
 }
-PACKAGE = ("cflow_torch", "configs", "setup.py")
+PACKAGE = ("cflow_torch", "configs")
 NEED_PACKAGE = ("tests/test_distribution.py", "tests/integrations/test_hubconf.py")  # these look at the checkout
 # The wheel of this Python, nothing else, is what is imported.
 INSTALLED = """

@@ -5,7 +5,7 @@
 set -euo pipefail
 ROOT="$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)"
 PYTHON="$ROOT/.venv/bin/python"
-WANTED="$(cat "$ROOT/scripts/constraints.txt" "$ROOT/pyproject.toml" "$ROOT/setup.py" | cksum)"
+WANTED="$(cat "$ROOT/scripts/constraints.txt" "$ROOT/pyproject.toml" | cksum)"
 
 if [ "$(cat "$ROOT/.venv/installed-$STAMP" 2>/dev/null || true)" != "$WANTED" ]; then
   if [ ! -x "$PYTHON" ]; then
