@@ -8,7 +8,7 @@ examples:
   cflow eval data=hdf5 data.root=/data/scenes model=fast     a cheaper method
   cflow eval definition=av2                    scores as another public evaluator defines them
   cflow eval -m model.connectivity=4,8         a sweep: outputs/eval/model.connectivity=4/results.json, ...
-  cflow eval -m experiment=pixel_size          a table or figure of the paper, see docs/experiments.md
+  cflow eval -m experiment=pixel_size          a table or figure of the paper, see docs/settings.md
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Matching of key points by normalised correlation, all windows at once (Sec. Matching keypoints).
 
-The descriptors of a group of key points times those of its candidates within the gate is one small matrix product of
+The descriptors of a group of key points times those of its match candidates is one small matrix product of
 counts. Few candidates come near the best of their key point; only those are looked at exactly.
 """
 
@@ -81,7 +81,7 @@ def match(pc0: KeyPoints, pc1: KeyPoints, reach: Tensor, config: KeypointsConfig
         then smallest dx. A match is accepted if R > rho R' holds for the second best R', on integers; equality does
         not hold, so a tie for the best is not accepted. Without a second candidate there is nothing to test.
 
-    Cost: time (key points x candidates within the gate) x L^2; memory a fixed number of pairs, plus L^2 bytes a point.
+    Cost: time (key points x match candidates) x L^2; memory a fixed number of pairs, plus L^2 bytes a point.
     """
     best = _best_candidates(pc0, pc1, reach, config)
     source = flat_nonzero(best.is_clear)
@@ -159,7 +159,7 @@ def _contenders(
         candidate.masked_fill_((slot >= pairing.count[groups, None]).flatten(), num_target)
         overlap = _overlap(patch0, member, patch1, candidate)
 
-        # Outside the gate the overlap becomes 0: dy^2 + dx^2 - limit - 1, term by term, is negative inside. The terms
+        # Out of reach the overlap becomes 0: dy^2 + dx^2 - limit - 1, term by term, is negative inside. The terms
         # may exceed 31 bits, their sum does not. Masks of bits are ten times faster than masks of truth values.
         row, col = row1.index_select(0, candidate).view(shape), col1.index_select(0, candidate).view(shape)
         inside = (row * row).addcmul_(col, col) + offset[groups]

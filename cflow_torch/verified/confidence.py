@@ -1,4 +1,4 @@
-"""How far the flow of a point can be trusted: counts that need no truth -> a probability (docs/confidence.md).
+"""How far the flow of a point can be trusted: counts that need no truth -> a probability (docs/verified.md).
 
 What moves is trusted by how much worse its motion explains the sweeps when it is displaced: along a wall that slides or
 a trunk of few points nothing gets worse. What stands still is trusted by the share of its neighbourhood that is found

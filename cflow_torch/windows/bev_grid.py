@@ -90,10 +90,10 @@ class Grid:
         row = (positions[1] - self.lower[1]).div_(size).int()
         return col.add_(row, alpha=self.width)
 
-    def project(
+    def pixel_of_image(
         self, positions: Tensor, image: Tensor, num_images: int, takes_part: Optional[Tensor] = None
-    ) -> Tuple[Tensor, Tensor]:
-        """Binary images that are set where a point falls, and the pixel of every point.
+    ) -> Tensor:
+        """The pixel of every point in a stack of images.
 
         Args:
             positions: (2, N) or (3, N) float64, metres, frame of t+1.
@@ -103,27 +103,20 @@ class Grid:
                 are inside and take part.
 
         Returns:
-            occupancy: (B, H, W) bool.
-            pixel: (N,) int64, flat index into `occupancy`; B * H * W for points that are left out.
+            (N,) int32, or int64 where int32 is too small: flat index into B x H x W pixels; B * H * W for points that
+            are left out.
         """
-        pixel = self.pixel_of_image(positions, image, num_images, takes_part).long()
-        return self.draw(pixel, num_images), pixel
-
-    def pixel_of_image(
-        self, positions: Tensor, image: Tensor, num_images: int, takes_part: Optional[Tensor] = None
-    ) -> Tensor:
-        """(N,) int32, or int64 if it must be: the pixel of every point, as in `project`."""
-        nowhere = num_images * self.height * self.width
+        num_pixels = num_images * self.height * self.width
         pixel = self.pixel(positions)
-        if nowhere > torch.iinfo(torch.int32).max:
+        if num_pixels > torch.iinfo(torch.int32).max:
             pixel = pixel.long()
         pixel.add_(image, alpha=self.height * self.width)
         if takes_part is not None:  # a product: masked_fill_ would take four times as long
-            pixel.sub_(nowhere).mul_(takes_part.to(pixel.dtype)).add_(nowhere)
+            pixel.sub_(num_pixels).mul_(takes_part.to(pixel.dtype)).add_(num_pixels)
         return pixel
 
     def draw(self, pixel: Tensor, num_images: int) -> Tensor:
-        """(B, H, W) bool: the images that are set at these (N,) int64 pixels, as `project` numbers them."""
+        """(B, H, W) bool: the images that are set at these (N,) int64 pixels, as `pixel_of_image` numbers them."""
         num_pixels = num_images * self.height * self.width
         occupancy = torch.zeros(num_pixels + 1, dtype=torch.bool, device=pixel.device).index_fill_(0, pixel, True)
         return occupancy[:-1].view(num_images, self.height, self.width)

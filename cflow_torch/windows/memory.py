@@ -15,14 +15,14 @@ _MUCH = 1 << 30  # less than this is not worth a look at the machine
 _CGROUP = Path("/sys/fs/cgroup")
 
 
-def require_memory(num_bytes: int, device: torch.device, what: str, mend: str) -> None:
+def require_memory(num_bytes: int, device: torch.device, what: str, remedy: str) -> None:
     """Refuse what does not fit before it is allocated: a system that runs out of memory kills the process.
 
     Args:
         num_bytes: that are planned with.
         device: whose memory.
         what: "a window of ..., " to begin the message with.
-        mend: what to do about it.
+        remedy: what to do about it.
 
     Raises:
         CFlowError: more is needed than there is.
@@ -37,7 +37,7 @@ def require_memory(num_bytes: int, device: torch.device, what: str, mend: str) -
     if free is not None and num_bytes > free:
         raise CFlowError(
             f"{what} needs about {num_bytes / 1e9:.1f} GB of memory ({num_bytes} bytes), {device} has "
-            f"{free / 1e9:.1f} GB left: {mend}"
+            f"{free / 1e9:.1f} GB left: {remedy}"
         )
 
 

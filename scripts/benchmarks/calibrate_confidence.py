@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Confidence of the flow (docs/confidence.md): fit its table on simulated drives, see on others whether it is right.
+"""Confidence of the flow (docs/verified.md): fit its table on simulated drives, see on others whether it is right.
 
   python scripts/benchmarks/calibrate_confidence.py fit CACHE                 writes verified/confidence.json
   python scripts/benchmarks/calibrate_confidence.py evaluate CACHE --seeds 300 301 302 303 --figure docs/confidence.png

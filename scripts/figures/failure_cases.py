@@ -6,7 +6,7 @@
   python scripts/figures/failure_cases.py --pictures ""           the table alone
 
 Each row is the mean over the seeds of the mean end-point error of the points named, metres per sweep, smallest and
-largest in brackets, and their mean confidence (docs/confidence.md). Pictures show one seed: the first
+largest in brackets, and their mean confidence (docs/verified.md). Pictures show one seed: the first
 setting above the last, each with estimate, truth and error.
 """
 

@@ -1,4 +1,4 @@
-"""How far the flow of a point can be trusted: counts -> a bin -> a probability (docs/confidence.md)."""
+"""How far the flow of a point can be trusted: counts -> a bin -> a probability (docs/verified.md)."""
 
 from __future__ import annotations
 

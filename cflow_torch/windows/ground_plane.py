@@ -1,0 +1,124 @@
+"""The plane on which most flat spots near the vehicle lie, in whole millimetres."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Tuple
+
+import torch
+from torch import Tensor
+
+from cflow_torch.ops.lower_surface import UNKNOWN
+
+REACH = 131.072  # metres; points with |x| or |y| beyond are not looked at
+# Cells are powers of two of a millimetre: floor division is a shift, also of negative numbers.
+_NEAR_BITS, _NEAR_CELLS = 11, 32  # 2.048 m, |x|, |y| < 32.768 m
+_STEP, _STEP_BITS = 2, 12  # tilt is the median step of flat cells 4.096 m apart ...
+_MAX_STEP = 1024  # ... of at most 25 %
+_FARTHEST_HEIGHT = 1e7  # metres; still fits the sort key
+_TRIM = 10  # the lowest tenth of the points of a cell does not count: multipath
+_FLAT, _FLAT_POINTS = 250, 4  # a near cell is flat if half of its points, at least 4 in all, lie in that layer, mm
+_LAYER = 300  # flat cells of the ground differ by at most that (kerbs), mm
+# There is ground if there are so many pairs of flat cells that are level enough, and a sixth as many as near cells.
+# Simulated drives (seeds 400-409) have at least three times as many; with their ground removed at most a tenth.
+_FEWEST_PAIRS, _SMALLEST_SHARE = 20, 6
+
+
+@dataclass(frozen=True)
+class Plane:
+    """The ground near the vehicle, one plane per sweep.
+
+    Args:
+        is_there: (B,) bool, False = no ground was found; then the rest means nothing.
+        step_x, step_y: (B,) int64, rise in mm per 4096 mm.
+        height: (B,) int64, mm, at the origin.
+    """
+
+    is_there: Tensor
+    step_x: Tensor
+    step_y: Tensor
+    height: Tensor
+
+    def at(self, x: Tensor, y: Tensor, sweep: Tensor) -> Tensor:
+        """(N,) int64 height in mm at x, y (N,) int64 mm."""
+        rise = self.step_x.index_select(0, sweep).mul_(x).add_(self.step_y.index_select(0, sweep).mul_(y))
+        return (rise >> _STEP_BITS).add_(self.height.index_select(0, sweep))
+
+
+def near_plane(points: Tensor, sweep: Tensor, counts: Tensor, num_sweeps: int) -> Plane:
+    """The plane on which most flat spots near the vehicle lie.
+
+    Args:
+        points: (3, N) int64, mm.
+        sweep: (N,) int64, sweep of each point.
+        counts: (N,) bool, False = leave the point out.
+        num_sweeps: B.
+
+    Convention: ties go to the lowest height.
+    """
+    size, num_cells = _NEAR_CELLS, num_sweeps * _NEAR_CELLS * _NEAR_CELLS
+    col, row = (points[:2] >> _NEAR_BITS).add_(size // 2)
+    is_near = (((col | row) & -size) == 0).logical_and_(counts)  # both in 0 ... size - 1
+    cell = (sweep * size).add_(row).mul_(size).add_(col).masked_fill_(~is_near, num_cells)
+    low, middle, count = (v.view(num_sweeps, size, size) for v in order_statistics(cell, points[2], num_cells))
+    is_seen = count >= _FLAT_POINTS
+    is_flat = is_seen & (middle - low <= _FLAT)
+    step_x, num_x = _median_step(low[:, :, :-_STEP], low[:, :, _STEP:], is_flat[:, :, :-_STEP] & is_flat[:, :, _STEP:])
+    step_y, num_y = _median_step(low[:, :-_STEP], low[:, _STEP:], is_flat[:, :-_STEP] & is_flat[:, _STEP:])
+    pairs = num_x + num_y
+    is_there = (pairs >= _FEWEST_PAIRS) & (pairs * _SMALLEST_SHARE >= is_seen.flatten(1).sum(1))
+
+    centre = ((torch.arange(size, device=low.device) - size // 2) << _NEAR_BITS) + (1 << (_NEAR_BITS - 1))
+    rise = (step_x[:, None, None] * centre + step_y[:, None, None] * centre[:, None]) >> _STEP_BITS
+    nothing = torch.iinfo(torch.int64).max // 2
+    heights = (low - rise).masked_fill_(~is_flat, nothing).flatten(1).sort(1).values
+    place = torch.arange(heights.shape[1], device=low.device)
+    in_layer = torch.searchsorted(heights, heights + _LAYER, right=True) - place  # counted from each cell upwards
+    in_layer.masked_fill_(heights == nothing, 0)
+    most = in_layer.amax(1)
+    first = torch.where(in_layer == most[:, None], place, heights.shape[1]).amin(1)
+    height = heights.gather(1, (first + most // 2)[:, None].clamp_(max=heights.shape[1] - 1))[:, 0]
+    return Plane(is_there, step_x, step_y, torch.where(is_there, height, 0))
+
+
+def order_statistics(cell: Tensor, height: Tensor, num_cells: int) -> Tuple[Tensor, Tensor, Tensor]:
+    """Low end (a tenth cut off), median and number of the heights of each cell.
+
+    Args:
+        cell: (N,) int64, 0 ... num_cells; those in cell num_cells are left out.
+        height: (N,) int64, mm, |height| < 2^36.
+
+    Returns:
+        Three times (num_cells,) int64; the first two mean nothing where the number is 0.
+    """
+    offset, bits = 1 << 36, 37
+    key = (cell << bits).add_(height).add_(offset).sort().values  # by cell, then by height
+    count = torch.bincount(cell, minlength=num_cells + 1)[:-1]
+    if key.numel() == 0:
+        return torch.zeros_like(count), torch.zeros_like(count), count
+    ordered = (key & ((1 << bits) - 1)).sub_(offset)
+    start = count.cumsum(0).sub_(count)
+    last = ordered.numel() - 1
+    low, middle = (
+        ordered.index_select(0, torch.div(count, part, rounding_mode="floor").add_(start).clamp_(max=last))
+        for part in (_TRIM, 2)
+    )
+    return low, middle, count
+
+
+def _median_step(here: Tensor, there: Tensor, is_pair: Tensor) -> Tuple[Tensor, Tensor]:
+    """(B,) int64: median of there - here over the pairs that are no steeper than allowed; number of such pairs."""
+    step = there - here
+    counts = is_pair & (step.abs() <= _MAX_STEP)
+    ordered = step.masked_fill(~counts, UNKNOWN).flatten(1).sort(1).values
+    number = counts.flatten(1).sum(1)
+    median = ordered.gather(1, (number // 2)[:, None].clamp_(max=ordered.shape[1] - 1))[:, 0]
+    return torch.where(number > 0, median, 0), number
+
+
+def millimetres(positions: Tensor) -> Tuple[Tensor, Tensor]:
+    """(3, N) int64 mm, and (N,) bool: the point is finite and on the grid; the others are moved to the origin."""
+    x, y, z = positions.abs()
+    # A millimetre inside: rounding must not lead off the grid.
+    inside = (x < REACH - 0.001).logical_and_(y < REACH - 0.001).logical_and_(z < _FARTHEST_HEIGHT)
+    return (positions * 1000).masked_fill_(~inside, 0).round_().long(), inside
