@@ -7,9 +7,10 @@ import math
 from pathlib import Path
 from typing import Any, Dict, List, Sequence, Tuple
 
+import cflow_torch
 from oracle.height_slices import Pixel, SlicedSweeps, Vector, count
 
-FILE = Path(__file__).parents[2] / "cflow_torch" / "verified" / "confidence.json"
+FILE = Path(cflow_torch.__file__).parent / "verified" / "confidence.json"
 TABLE: Dict[str, Any] = json.loads(FILE.read_text(encoding="utf-8"))
 DISPLACEMENT = 0.4  # metres per interval
 BLOCK = 1.6  # metres
