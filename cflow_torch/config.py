@@ -229,9 +229,9 @@ REMOVED = {
     "proof_z": "its name is significance",
     "clearance": "its name is min_height",
     "use_timestamps": "time stamps count wherever every sweep of a window has one",
-    **dict.fromkeys(("children", "aperture", "relocate", "yaw", "keypoint_block"), "a part of thorough=True"),
+    **dict.fromkeys(("children", "aperture", "relocate", "yaw", "slow", "keypoint_block"), "a part of thorough=True"),
     **dict.fromkeys(
-        ("slow", "nudge", "zero_test", "subpixel", "height_slices", "slice_height", "mutual_check"), "leave it out"
+        ("nudge", "zero_test", "subpixel", "height_slices", "slice_height", "mutual_check"), "leave it out"
     ),
     "second_best_distance": "leave it out",
 }
