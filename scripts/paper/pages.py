@@ -3,10 +3,10 @@
 
   python scripts/paper/pages.py RESULTS [--output FOLDER]
 
-RESULTS: a folder that holds results.json files of `cflow eval -m experiment=...`, at any depth. Writes the page FOLDER.md
-(default: RESULTS/paper.md), and to FOLDER per table or figure NAME.md, NAME.csv, NAME.tex, for figures NAME.png and
-NAME.pdf too (needs matplotlib). Of figures the page has the means, NAME.md the classes. Missing runs are listed on the
-page and on the screen, "-" in the tables. `--output docs/paper` makes docs/paper.md.
+RESULTS: a folder that holds results.json files of `cflow eval -m experiment=...`, at any depth. Writes the page
+FOLDER.md (default: RESULTS/paper.md), and to FOLDER per table or figure NAME.md, NAME.csv, NAME.tex, for figures
+NAME.png and NAME.pdf too (needs matplotlib). Of figures the page has the means, NAME.md the classes. Missing runs are
+listed on the page and on the screen, "-" in the tables. `--output docs/paper` makes docs/paper.md.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ def set_cells(paper: Dict[str, Any], ours: Ours) -> Cells:
 
 
 def mean_cells(cells: Cells) -> Cells:
-    """Of a figure's `class_cells` the means: a column per point of the figure, for "h=0, 2 scales" per number of scales.
+    """Of a figure's `class_cells` the means: a column per point, for "h=0, 2 scales" per number of scales.
 
     Rows: the paper and each data set, once for each h where points are named by h and scales.
     """
@@ -197,7 +197,8 @@ def main(arguments: Optional[Sequence[str]] = None) -> int:
         shown = mean_cells(cells) if is_figure and name not in PER_SET else cells
         page += [f"## {about['title']} ({about['label']})", "", markdown(shown)]
         runs_told = about_runs(ours)
-        notes = [*(["runs as above"] if runs_told and runs_told == told else runs_told), *([about["note"]] if "note" in about else [])]
+        notes = ["runs as above"] if runs_told and runs_told == told else list(runs_told)
+        notes += [about["note"]] if "note" in about else []
         told = runs_told or told
         if name in PER_SET:
             notes += [f"{method}: {reason}" for method, score in protocol(ours).items() for reason in score.missing]
