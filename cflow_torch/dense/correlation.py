@@ -21,7 +21,7 @@ from cflow_torch.ops.window_counts import WindowCounts
 # Working memory of a pair per sample of its class: spectra, counts, and what is looked up in them.
 _BYTES_PER_SAMPLE = 48
 # Samples of templates that are correlated together, and of correlations that are looked through together. On a CPU they
-# are to stay in the cache (2^14 ... 2^26 were tried, docs/benchmarks); a GPU wants few launches.
+# are to stay in the cache (2^14 ... 2^26 were tried); a GPU wants few launches.
 _AT_ONCE_CPU, _IN_PART_CPU = 1 << 18, 1 << 21
 _AT_ONCE_GPU, _IN_PART_GPU = 1 << 26, 1 << 26
 

@@ -8,7 +8,7 @@ import torch
 
 # Elements of a piece. On a CPU what is computed from a piece stays in the cache, and no large temporary array is asked
 # of the system, whose fresh pages cost more than the arithmetic. 2^14 ... 2^18 were tried on a window of six sweeps
-# with five scales and on a pair with one (stage times of the dense method, docs/benchmarks). A GPU wants few launches.
+# with five scales and on a pair with one (stage times of the dense method). A GPU wants few launches.
 CHUNK_ON_CPU = 1 << 17
 CHUNK_ON_GPU = 1 << 26
 

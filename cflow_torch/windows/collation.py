@@ -29,7 +29,7 @@ from cflow_torch.windows.validation import (
 # Working memory of a pixel of every sweep (occupancy and cluster) before the clusters of a window are known.
 _BYTES_PER_PIXEL = 10
 # What windows of a group may take on a CPU where `max_memory` says nothing: about 9 of a pair, 4 of six sweeps. Fresh
-# pages of larger arrays cost more than the operations that larger groups save (windows/s in docs/benchmarks).
+# pages of larger arrays cost more than the operations that larger groups save.
 _BYTES_ON_CPU = 1 << 29
 
 

@@ -3,9 +3,10 @@
 
   python scripts/paper/pages.py RESULTS [--output FOLDER]
 
-RESULTS: a folder that holds results.json files of `cflow eval -m experiment=...`, at any depth. Writes to FOLDER
-(default: RESULTS/paper) paper.md with everything, and per table or figure NAME.md, NAME.csv, NAME.tex, for figures
-NAME.png and NAME.pdf too (needs matplotlib). Missing runs are listed in paper.md and on the screen, "-" in the tables.
+RESULTS: a folder that holds results.json files of `cflow eval -m experiment=...`, at any depth. Writes the page
+FOLDER.md (default: RESULTS/paper.md), and to FOLDER per table or figure NAME.md, NAME.csv, NAME.tex, for figures
+NAME.png and NAME.pdf too (needs matplotlib). Of figures the page has the means, NAME.md the classes. Missing runs are
+listed on the page and on the screen, "-" in the tables. `--output docs/paper` makes docs/paper.md.
 """
 
 from __future__ import annotations
@@ -23,6 +24,18 @@ from results import CLASSES, METHODS, RANGES, Ours, Runs, load_paper, load_runs,
 from cflow_torch.data.atomic import atomic_file
 
 PER_SET = ("datasets", "range_split")  # experiments whose columns are data sets, not classes
+INTRODUCTION = """# The paper's tables beside ours
+
+```bash
+cflow eval -m experiment=pixel_size                     # one table or figure
+python scripts/paper/tables.py                          # all of them, then this page in outputs/paper
+python scripts/paper/tables.py data=benchmark_small     # all of them on 20 windows
+python scripts/paper/pages.py outputs/paper             # the page alone, from results that are there
+```
+
+Dynamic bucket-normalised EPE, lower is better. The paper's rows are of Argoverse 2 val, ours of other data: what can be
+compared is which way a change goes, not the numbers. What each experiment varies: docs/settings.md.
+"""
 Cells = List[List[str]]
 
 
@@ -71,6 +84,20 @@ def set_cells(paper: Dict[str, Any], ours: Ours) -> Cells:
     return cells
 
 
+def mean_cells(cells: Cells) -> Cells:
+    """Of a figure's `class_cells` the means: a column per point, for "h=0, 2 scales" per number of scales.
+
+    Rows: the paper and each data set, once for each h where points are named by h and scales.
+    """
+    lines: Dict[str, Dict[str, str]] = {}
+    for point, origin, *_, mean, _seconds in cells[1:]:
+        line, _, column = point.rpartition(", ")
+        lines.setdefault(f"{line}, {origin}" if line else origin, {})[column] = mean
+    columns = list(dict.fromkeys(column for values in lines.values() for column in values))
+    rows = [[line, *(values.get(column, "-") for column in columns)] for line, values in lines.items()]
+    return [["mean of the classes", *columns], *rows]
+
+
 def number(value: float, signed: bool = False) -> str:
     """Four decimals, "-" for NaN."""
     return "-" if math.isnan(value) else f"{value:+.4f}" if signed else f"{value:.4f}"
@@ -114,7 +141,8 @@ def about_runs(ours: Ours) -> List[str]:
 
 def markdown(cells: Cells) -> str:
     """A Markdown table."""
-    rule = ["---"] * 2 + ["---:"] * (len(cells[0]) - 2)
+    words = 1 + (cells[0][1] == "from")
+    rule = ["---"] * words + ["---:"] * (len(cells[0]) - words)
     return "".join("| " + " | ".join(row) + " |\n" for row in (cells[0], rule, *cells[1:]))
 
 
@@ -158,30 +186,37 @@ def main(arguments: Optional[Sequence[str]] = None) -> int:
     except ImportError as error:
         draw = None
         remarks.append(f"no pictures: {error}")
-    page = ["# The paper's tables and figures", "", "Dynamic bucket-normalised EPE, lower is better.", ""]
+    page: List[str] = [INTRODUCTION]
+    told: List[str] = []
     for name, about in paper.items():
         ours = runs.get(name, {})
         cells = (set_cells if name in PER_SET else class_cells)(about, ours)
         for ending, text in (("md", markdown(cells)), ("csv", comma_separated(cells)), ("tex", latex(cells))):
             write(output / f"{name}.{ending}", text)
-        page += [f"## {about['title']} ({about['label']})", "", markdown(cells)]
-        notes = [*about_runs(ours), *([about["note"]] if "note" in about else [])]
+        is_figure = "at" in about
+        shown = mean_cells(cells) if is_figure and name not in PER_SET else cells
+        page += [f"## {about['title']} ({about['label']})", "", markdown(shown)]
+        runs_told = about_runs(ours)
+        notes = ["runs as above"] if runs_told and runs_told == told else list(runs_told)
+        notes += [about["note"]] if "note" in about else []
+        told = runs_told or told
         if name in PER_SET:
             notes += [f"{method}: {reason}" for method, score in protocol(ours).items() for reason in score.missing]
         page += [f"- {line}" for line in notes]
-        if draw is not None and "at" in about:
+        if draw is not None and is_figure:
             for ending in ("png", "pdf"):
                 with atomic_file(output / f"{name}.{ending}") as stream:
                     draw(name, about, ours).savefig(stream, format=ending, dpi=130)
-            page += ["", f"![{about['title']}]({name}.png)"]
+            page += ["", f"![{about['title']}]({output.name}/{name}.png)"]
         page.append("")
     missing = missing_runs(paper, runs)
     for title, lines in (("Missing runs", missing), ("Remarks", remarks)):
         if lines:
             page += [f"## {title}", "", *(f"- {line}" for line in lines), ""]
             print(f"{title}:", *lines, sep="\n  ", file=sys.stderr)
-    write(output / "paper.md", "\n".join(page))
-    print(f"tables and figures: {output}/paper.md")
+    file = output.with_name(f"{output.name}.md")
+    write(file, "\n".join(page))
+    print(f"tables and figures: {file}")
     return 0
 
 

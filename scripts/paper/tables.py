@@ -7,8 +7,8 @@
   python scripts/paper/tables.py --only history scales             some of them
 
 Arguments with "=" are Hydra overrides and go to every `cflow eval -m experiment=...`. Runs that are done are skipped:
-call it again to resume after an interruption. output=FOLDER (default outputs/paper) gets the results, FOLDER/paper the
-pages.
+call it again to resume after an interruption. output=FOLDER (default outputs/paper) gets the results, FOLDER/paper.md
+and FOLDER/paper the tables and figures.
 """
 
 from __future__ import annotations

@@ -114,8 +114,11 @@ def test_tables_have_the_papers_numbers_beside_ours(tmp_path: Path, script: Any,
     assert views[4][1:] == ["small", "+0.1000", "+0.1000", "+0.1000", "+0.1000", "+0.1000", "+0.0000"]
     assert table(tmp_path, "datasets")[-2][:3] == ["CorrelationFlow", "ours", "0.2000"]
     assert table(tmp_path, "range_split")[-1][-2:] == ["0.2000", "0.4000"]
+    page = (tmp_path / "paper.md").read_text()
+    assert "| h=2, small | 0.6150 | 0.7150 | 0.8150 | 0.9150 | 1.0150 |" in page, "means by number of scales"
     for name in ("history", "scales", "datasets", "range_split"):
         assert (tmp_path / "paper" / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+        assert f"](paper/{name}.png)" in page
 
 
 def test_missing_and_broken_runs_are_told(tmp_path: Path, script: Any, capsys: Any) -> None:
