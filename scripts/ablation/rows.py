@@ -47,7 +47,6 @@ ROWS: Tuple[Setting, ...] = (
     _default(", significance 1", significance=1.0),
     _default(", significance 2", significance=2.0),
     _default(" - min_height", min_height=None),
-    _default(" - max_object", max_object=None),
     _default(" - max_speed", max_speed=None),
     _default(", scale .1", pixel_sizes=(0.1,)),
     _default(", scales .2 .1", pixel_sizes=(0.2, 0.1)),
