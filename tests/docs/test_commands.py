@@ -1,0 +1,91 @@
+"""What README, the quick start and the page of the harnesses show runs as it stands.
+
+Left out is what needs a data set (/data, /path, s3://), the network, a shell script or another repository; of `cflow`
+commands with a data set, the settings are composed.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import re
+import shlex
+import sys
+from pathlib import Path
+from typing import Any, Dict, List, Tuple
+
+import numpy as np
+import pytest
+
+from cflow_torch.cli.main import main
+from cflow_torch.simulator import make_drive
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = ("README.md", "docs/quick_start.md", "docs/harness.md")
+BLOCK = re.compile(r"^```(bash|python)\n(.*?)^```", re.M | re.S)
+DATA = re.compile(r"/data|/path|s3://|experiment=")
+FILE = re.compile(r"# \w+\.py\n")  # first line of a block that is a file of another repository
+EXTRAS = ("bucketed_scene_flow_eval", "h5py")
+
+
+def parts(page: str) -> List[Tuple[str, Any]]:
+    """A page in its order: ("python", text) of a block, ("cflow", words) of a command, ("module", words) of -m."""
+    found: List[Tuple[str, Any]] = []
+    for language, text in BLOCK.findall((ROOT / page).read_text(encoding="utf-8")):
+        if language == "python":
+            found.append((language, text))
+            continue
+        for line in text.replace("\\\n", " ").splitlines():
+            words = shlex.split(line, comments=True)
+            if words[:1] == ["cflow"]:
+                found.append(("cflow", words[1:]))
+            elif words[:2] == ["python", "-m"]:
+                found.append(("module", words[2:]))
+    return found
+
+
+WITH_DATA = [words for page in PAGES for kind, words in parts(page) if kind == "cflow" and DATA.search(" ".join(words))]
+
+
+def run(kind: str, part: Any, names: Dict[str, Any]) -> None:
+    """Run one part in this process; a status that is not 0 is an error."""
+    if kind == "python":
+        if not FILE.match(part) and all(importlib.util.find_spec(name) for name in EXTRAS if name in part):
+            exec(compile(part, "page", "exec"), names)
+    elif kind == "module":
+        sys.argv = part
+        importlib.import_module(f"{part[0]}.__main__").main()
+    elif not DATA.search(" ".join(part)):
+        try:
+            main(part)
+        except SystemExit as stop:
+            assert not stop.code, part
+
+
+@pytest.fixture
+def names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Dict[str, Any]:
+    """In an empty folder, the arrays that README begins with."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", list(sys.argv))
+    drive = make_drive(seed=1, num_sweeps=2, profile="demo")
+    motion = np.linalg.inv(drive.poses[1]) @ drive.poses[0]
+    return {"pc0": drive.sweep(0).points, "pc1": drive.sweep(1).points, "T_ego1_ego0": motion}
+
+
+@pytest.mark.parametrize("words", WITH_DATA, ids=" ".join)
+def test_settings_of_commands_with_data_exist(words: List[str], names: Dict[str, Any]) -> None:
+    run("cflow", [*(word for word in words if word != "-m"), "--cfg", "job"], names)
+
+
+@pytest.mark.parametrize("page", PAGES[:2])
+def test_python_runs(page: str, names: Dict[str, Any]) -> None:
+    for kind, part in parts(page):
+        if kind == "python":
+            run(kind, part, names)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", PAGES)
+def test_commands_and_python_run_in_the_order_of_the_page(page: str, names: Dict[str, Any]) -> None:
+    for kind, part in parts(page):
+        run(kind, part, names)
