@@ -1,14 +1,14 @@
 """What README, the quick start and the page of the harnesses show runs as it stands.
 
-Left out is what needs a data set (/data, /path, s3://), the network, a shell script or another repository; of `cflow`
-commands with a data set, the settings are composed.
+Left out is what needs data (/data, /path), the network or another repository; of `cflow` commands with data, the settings
+are composed.
 """
 
 from __future__ import annotations
 
-import importlib
 import importlib.util
 import re
+import runpy
 import shlex
 import sys
 from pathlib import Path
@@ -23,9 +23,8 @@ from cflow_torch.simulator import make_drive
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = ("README.md", "docs/quick_start.md", "docs/harness.md")
 BLOCK = re.compile(r"^```(bash|python)\n(.*?)^```", re.M | re.S)
-DATA = re.compile(r"/data|/path|s3://|experiment=")
+DATA = re.compile(r"/data|/path|experiment=")
 FILE = re.compile(r"# \w+\.py\n")  # first line of a block that is a file of another repository
-EXTRAS = ("bucketed_scene_flow_eval", "h5py")
 
 
 def parts(page: str) -> List[Tuple[str, Any]]:
@@ -37,29 +36,34 @@ def parts(page: str) -> List[Tuple[str, Any]]:
             continue
         for line in text.replace("\\\n", " ").splitlines():
             words = shlex.split(line, comments=True)
-            if words[:1] == ["cflow"]:
-                found.append(("cflow", words[1:]))
-            elif words[:2] == ["python", "-m"]:
-                found.append(("module", words[2:]))
+            found += [("cflow", words[1:])] if words[:1] == ["cflow"] else []
+            found += [("module", words[2:])] if words[:2] == ["python", "-m"] else []
     return found
 
 
-WITH_DATA = [words for page in PAGES for kind, words in parts(page) if kind == "cflow" and DATA.search(" ".join(words))]
+COMMANDS = {" ".join(words) for page in PAGES for kind, words in parts(page) if kind == "cflow"}
+
+
+def cflow(*words: str) -> None:
+    """`cflow WORDS` in this process; a status that is not 0 is an error."""
+    try:
+        main(list(words))
+    except SystemExit as stop:
+        assert not stop.code, words
 
 
 def run(kind: str, part: Any, names: Dict[str, Any]) -> None:
-    """Run one part in this process; a status that is not 0 is an error."""
+    """Run one part of a page in this process, unless it is one of those left out."""
     if kind == "python":
-        if not FILE.match(part) and all(importlib.util.find_spec(name) for name in EXTRAS if name in part):
+        if not FILE.match(part) and (
+            "from bucketed" not in part or importlib.util.find_spec("bucketed_scene_flow_eval")
+        ):
             exec(compile(part, "page", "exec"), names)
     elif kind == "module":
         sys.argv = part
-        importlib.import_module(f"{part[0]}.__main__").main()
+        runpy.run_module(part[0], run_name="__main__")
     elif not DATA.search(" ".join(part)):
-        try:
-            main(part)
-        except SystemExit as stop:
-            assert not stop.code, part
+        cflow(*part)
 
 
 @pytest.fixture
@@ -72,20 +76,19 @@ def names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Dict[str, Any]:
     return {"pc0": drive.sweep(0).points, "pc1": drive.sweep(1).points, "T_ego1_ego0": motion}
 
 
-@pytest.mark.parametrize("words", WITH_DATA, ids=" ".join)
-def test_settings_of_commands_with_data_exist(words: List[str], names: Dict[str, Any]) -> None:
-    run("cflow", [*(word for word in words if word != "-m"), "--cfg", "job"], names)
+@pytest.mark.parametrize("command", sorted(filter(DATA.search, COMMANDS)))
+def test_settings_of_commands_with_data_exist(command: str, names: Dict[str, Any]) -> None:
+    cflow(*command.replace(" -m ", " ").split(), "--cfg", "job")
 
 
 @pytest.mark.parametrize("page", PAGES[:2])
 def test_python_runs(page: str, names: Dict[str, Any]) -> None:
-    for kind, part in parts(page):
-        if kind == "python":
-            run(kind, part, names)
+    for part in (part for part in parts(page) if part[0] == "python"):
+        run(*part, names)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES)
 def test_commands_and_python_run_in_the_order_of_the_page(page: str, names: Dict[str, Any]) -> None:
-    for kind, part in parts(page):
-        run(kind, part, names)
+    for part in parts(page):
+        run(*part, names)
