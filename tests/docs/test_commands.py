@@ -1,12 +1,10 @@
 """What README, the quick start and the page of the harnesses show runs as it stands.
 
-Left out is what needs data (/data, /path), the network or another repository; of `cflow` commands with data, the settings
-are composed.
+Left out is what needs data, the network or another repository; of `cflow` commands with data, settings are composed.
 """
 
 from __future__ import annotations
 
-import importlib.util
 import re
 import runpy
 import shlex
@@ -24,7 +22,7 @@ ROOT = Path(__file__).resolve().parents[2]
 PAGES = ("README.md", "docs/quick_start.md", "docs/harness.md")
 BLOCK = re.compile(r"^```(bash|python)\n(.*?)^```", re.M | re.S)
 DATA = re.compile(r"/data|/path|experiment=")
-FILE = re.compile(r"# \w+\.py\n")  # first line of a block that is a file of another repository
+FOREIGN = re.compile(r"# \w+\.py\n|from bucketed_scene_flow_eval")  # how Python of other repositories begins
 
 
 def parts(page: str) -> List[Tuple[str, Any]]:
@@ -55,9 +53,7 @@ def cflow(*words: str) -> None:
 def run(kind: str, part: Any, names: Dict[str, Any]) -> None:
     """Run one part of a page in this process, unless it is one of those left out."""
     if kind == "python":
-        if not FILE.match(part) and (
-            "from bucketed" not in part or importlib.util.find_spec("bucketed_scene_flow_eval")
-        ):
+        if not FOREIGN.match(part):
             exec(compile(part, "page", "exec"), names)
     elif kind == "module":
         sys.argv = part
