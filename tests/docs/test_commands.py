@@ -1,0 +1,90 @@
+"""What README, the quick start and the page of the harnesses show runs as it stands.
+
+Left out is what needs data, the network or another repository; of `cflow` commands with data, settings are composed.
+"""
+
+from __future__ import annotations
+
+import re
+import runpy
+import shlex
+import sys
+from pathlib import Path
+from typing import Any, Dict, List, Tuple
+
+import numpy as np
+import pytest
+
+from cflow_torch.cli.main import main
+from cflow_torch.simulator import make_drive
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = ("README.md", "docs/quick_start.md", "docs/harness.md")
+BLOCK = re.compile(r"^```(bash|python)\n(.*?)^```", re.M | re.S)
+DATA = re.compile(r"/data|/path|experiment=")
+FOREIGN = re.compile(r"# \w+\.py\n|from bucketed_scene_flow_eval")  # how Python of other repositories begins
+
+
+def parts(page: str) -> List[Tuple[str, Any]]:
+    """A page in its order: ("python", text) of a block, ("cflow", words) of a command, ("module", words) of -m."""
+    found: List[Tuple[str, Any]] = []
+    for language, text in BLOCK.findall((ROOT / page).read_text(encoding="utf-8")):
+        if language == "python":
+            found.append((language, text))
+            continue
+        for line in text.replace("\\\n", " ").splitlines():
+            words = shlex.split(line, comments=True)
+            found += [("cflow", words[1:])] if words[:1] == ["cflow"] else []
+            found += [("module", words[2:])] if words[:2] == ["python", "-m"] else []
+    return found
+
+
+COMMANDS = {" ".join(words) for page in PAGES for kind, words in parts(page) if kind == "cflow"}
+
+
+def cflow(*words: str) -> None:
+    """`cflow WORDS` in this process; a status that is not 0 is an error."""
+    try:
+        main(list(words))
+    except SystemExit as stop:
+        assert not stop.code, words
+
+
+def run(kind: str, part: Any, names: Dict[str, Any]) -> None:
+    """Run one part of a page in this process, unless it is one of those left out."""
+    if kind == "python":
+        if not FOREIGN.match(part):
+            exec(compile(part, "page", "exec"), names)
+    elif kind == "module":
+        sys.argv = part
+        runpy.run_module(part[0], run_name="__main__")
+    elif not DATA.search(" ".join(part)):
+        cflow(*part)
+
+
+@pytest.fixture
+def names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Dict[str, Any]:
+    """In an empty folder, the arrays that README begins with."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", list(sys.argv))
+    drive = make_drive(seed=1, num_sweeps=2, profile="demo")
+    motion = np.linalg.inv(drive.poses[1]) @ drive.poses[0]
+    return {"pc0": drive.sweep(0).points, "pc1": drive.sweep(1).points, "T_ego1_ego0": motion}
+
+
+@pytest.mark.parametrize("command", sorted(filter(DATA.search, COMMANDS)))
+def test_settings_of_commands_with_data_exist(command: str, names: Dict[str, Any]) -> None:
+    cflow(*command.replace(" -m ", " ").split(), "--cfg", "job")
+
+
+@pytest.mark.parametrize("page", PAGES[:2])
+def test_python_runs(page: str, names: Dict[str, Any]) -> None:
+    for part in (part for part in parts(page) if part[0] == "python"):
+        run(*part, names)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", PAGES)
+def test_commands_and_python_run_in_the_order_of_the_page(page: str, names: Dict[str, Any]) -> None:
+    for part in parts(page):
+        run(*part, names)
