@@ -298,7 +298,7 @@ def test_logs_are_found(tmp_path):
         ("poses.txt", "1 2 3\n", {}, "numbers a line"),
         ("poses.txt", "1 2 x\n", {}, "lines of as many numbers"),
         ("poses.txt", "2 0 0 0 0 1 0 0 0 0 1 0\n" * 3, {}, "not rigid"),
-        ("poses.txt", "0 0 0 0 0 0 0 2\n", {}, "length 2"),
+        ("poses.txt", "0 0 0 0 0 0 0 2\n", {}, "pose 0 is no rigid motion"),
         ("poses.txt", "1 0 0 0 0 0 0 1\n0 0 0 0 0 0 0 1\n", {}, "ascend"),
         ("poses.txt", "nan 0 0 0 0 0 0 1\n", {}, "not finite"),
         ("poses.txt", "# nothing\n", {}, "is empty"),

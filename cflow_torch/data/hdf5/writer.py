@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any, Dict, List, Union
 
@@ -14,6 +13,7 @@ from cflow_torch.data.hdf5.index_file import write_index
 from cflow_torch.data.hdf5.reader import EXTRINSIC, HDF5Log, find_hdf5_scenes
 from cflow_torch.data.hdf5.stored import import_h5py
 from cflow_torch.data.log import Log
+from cflow_torch.data.rigid_motion import moved
 from cflow_torch.types import CFlowError
 from cflow_torch.windows.ego_motion import rigid_transform
 
@@ -74,8 +74,6 @@ def write_hdf5_scene(
                 group = scene.create_group(str(int(stamp)))
                 for key, value in _sweep(log, index, extrinsics, pose_dtype, eval_step, identity).items():
                     group.create_dataset(key, data=value)
-        with open(new, "rb") as written:
-            os.fsync(written.fileno())
 
 
 def write_index_files(folder: Union[str, Path]) -> None:
@@ -108,7 +106,7 @@ def _sweep(
     ego_points = np.asarray(sweep.points)[:, :3]
     inverse = np.linalg.inv(extrinsics)
     in_ego = np.array_equal(extrinsics, np.eye(4))
-    points = ego_points if in_ego else ego_points.astype(np.float64) @ inverse[:3, :3].T + inverse[:3, 3]
+    points = ego_points if in_ego else moved(ego_points, inverse)
     pose = np.asarray(sweep.pose, np.float64)
     values: Dict[str, np.ndarray] = {"lidar": points.astype(np.float32), "pose": pose.astype(pose_dtype)}
     if sweep.is_ground is not None:
