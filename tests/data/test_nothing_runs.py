@@ -13,7 +13,6 @@ from tiny_recording import TinyRecording
 
 from cflow_torch import CFlowError
 from cflow_torch.data.aevascenes import AevaScenesLog
-from cflow_torch.data.hdf5.index_file import read_index
 from cflow_torch.data.npy_file import read_npy, read_npz
 from cflow_torch.simulator.writers.aevascenes import write_aevascenes_sequence
 
@@ -43,17 +42,6 @@ def objects(marker: Path, shape: Tuple[int, ...] = (1,)) -> np.ndarray:
 def test_the_payload_works(tmp_path: Path) -> None:
     pickle.loads(pickle.dumps(Payload(tmp_path / "marker")))
     assert (tmp_path / "marker").is_dir()
-
-
-@pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
-def test_index_files(protocol: int, marker: Path, tmp_path: Path) -> None:
-    file, name = tmp_path / "index_eval.pkl", str(marker).encode()
-    by_hand = (b"(S'" + name + b"'\nios\nmkdir\n.", b"cos\nmkdir\n(S'" + name + b"'\ntR.", b"Pany\n.", b"\x82\x01.")
-    values = (Payload(marker), [[Payload(marker), "1"]], [["scene", Payload(marker)]])
-    for content in (*(pickle.dumps(value, protocol) for value in values), *by_hand):
-        file.write_bytes(content)
-        with pytest.raises(CFlowError, match="index_eval.pkl"):
-            read_index(file)
 
 
 def test_arrays_of_objects(marker: Path, tmp_path: Path) -> None:
