@@ -13,7 +13,8 @@ from tiny_recording import TinyRecording
 
 from cflow_torch import CFlowError
 from cflow_torch.data.aevascenes import AevaScenesLog
-from cflow_torch.data.npy_file import read_npy, read_npz
+from cflow_torch.data.arrays.cloud_file import read_cloud
+from cflow_torch.data.npy_file import read_npy
 from cflow_torch.simulator.writers.aevascenes import write_aevascenes_sequence
 
 
@@ -49,8 +50,8 @@ def test_arrays_of_objects(marker: Path, tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", points=objects(marker, (4, 3)))
     with pytest.raises(CFlowError, match="a.npy.*copy it"):
         read_npy(tmp_path / "a.npy", "copy it")
-    with pytest.raises(CFlowError, match="a.npz.*copy it"):
-        read_npz(tmp_path / "a.npz", "copy it", lambda headers: ["points"])
+    with pytest.raises(CFlowError, match="a.npz.*no file of plain arrays"):
+        read_cloud(tmp_path / "a.npz")
 
 
 @pytest.mark.parametrize("key", ["semantic_labels", "xyz", "velocity"])

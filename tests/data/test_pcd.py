@@ -53,17 +53,6 @@ def test_every_type_comes_back(tmp_path, data, rows):
         assert again[name].dtype == values.dtype and np.array_equal(again[name], values), name
 
 
-def test_a_compressed_organised_cloud_made_by_hand(tmp_path):
-    """Two points, three float32 fields, one field after the other: x = (1, 2), y = (0, 0), z = (0, 0)."""
-    plain = struct.pack("<6f", 1, 2, 0, 0, 0, 0)
-    # 9 plain bytes, then 15 zeros from one back.
-    stream = bytes([8, *plain[:8], 0, 7 << 5, 15 - 9, 0])
-    body = struct.pack("<II", len(stream), 24) + stream
-    file = write(tmp_path / "a.pcd", body, WIDTH="1", HEIGHT="2", VIEWPOINT="1 2 3 1 0 0 0", DATA="binary_compressed")
-    cloud = read_pcd(file)
-    assert cloud["x"].tolist() == [1, 2] and cloud["y"].tolist() == [0, 0] and cloud["z"].tolist() == [0, 0]
-
-
 def test_padding_and_fields_of_several_values_are_left_out(tmp_path):
     rows = np.zeros(2, [("x", "<f4"), ("pad", "V4"), ("normal", "<f4", 3), ("t", "<u8")])
     rows["x"], rows["normal"], rows["t"] = (1.5, np.nan), 7, (3, 2**60 + 1)
