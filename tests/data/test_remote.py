@@ -282,31 +282,6 @@ def test_a_local_file_has_the_usual_rights_and_is_on_disk(tmp_path, monkeypatch)
     assert (tmp_path / "a" / "b").stat().st_mode == (tmp_path / "plain").stat().st_mode
 
 
-@pytest.mark.slow
-def test_a_real_object_store(written, monkeypatch):
-    """A server on this machine that speaks S3."""
-    pytest.importorskip("s3fs", reason="s3fs is not installed")
-    moto = pytest.importorskip("moto.server", reason="moto[server] is not installed")
-    server = moto.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
-    server.start()
-    monkeypatch.setenv("AWS_DEFAULT_REGION", "us-east-1")
-    url = "http://{}:{}".format(*server.get_host_and_port())
-    s3 = upath.UPath("s3://bucket", endpoint_url=url, key="a", secret="b")
-    s3.fs.mkdir("bucket")
-    for name in DATA_SETS:
-        s3.fs.put(str(written(name)), (s3 / name).path, recursive=True)
-        paths.forget_listings(s3)
-        (source,), (expected,) = find_sources(name, s3 / name), find_sources(name, written(name))
-        assert_same_logs(open_log(name, source, check=False), open_log(name, expected, check=False))
-    with atomic_file(s3 / "out" / "1") as file:
-        file.write(b"whole")
-    with pytest.raises(KeyboardInterrupt), atomic_file(s3 / "out" / "2") as file:
-        file.write(b"half")
-        raise KeyboardInterrupt
-    assert names(s3 / "out") == ("1",) and (s3 / "out" / "1").read_bytes() == b"whole"
-    server.stop()
-
-
 WRITER = """
 import sys, time
 from cflow_torch.data.atomic import atomic_file, atomic_folder
