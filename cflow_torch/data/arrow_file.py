@@ -1,4 +1,4 @@
-"""Columns of Arrow tables, of a feather or a parquet file, as NumPy arrays and texts."""
+"""Columns of Arrow tables as NumPy arrays and texts."""
 
 from __future__ import annotations
 
@@ -7,38 +7,10 @@ from typing import Any, List, Sequence
 import numpy as np
 import pyarrow as pa
 
-from cflow_torch.data.file_errors import shortened as shortened
+from cflow_torch.data.file_errors import shortened
 from cflow_torch.types import CFlowError
 
 _INT64_MAX = (1 << 63) - 1
-
-
-class TableFile:
-    """A file that holds one table, read into memory.
-
-    Args:
-        file: where it is, for messages.
-        table: what it holds.
-
-    Attributes:
-        schema, names, num_rows: of the table, its columns, its rows.
-    """
-
-    def __init__(self, file: Any, table: pa.Table) -> None:
-        table.validate(full=True)
-        self.file, self._table = file, table
-        self.schema: pa.Schema = table.schema
-        self.names: List[str] = table.column_names
-        self.num_rows: int = table.num_rows
-
-    def read(self, columns: Sequence[str]) -> pa.Table:
-        """Some columns, in the order that is asked for.
-
-        Raises:
-            CFlowError: a column is missing or occurs twice.
-        """
-        check_columns(self.file, self.names, columns)
-        return self._table.select(list(columns))
 
 
 def check_columns(file: Any, names: Sequence[str], columns: Sequence[str], mend: str = "copy it again") -> None:

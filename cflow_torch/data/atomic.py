@@ -47,8 +47,6 @@ def atomic_file(path: Place) -> ContextManager[Any]:
 def _renamed_file(path: Path) -> Iterator[IO[bytes]]:
     with atomic_name(path) as temporary, open(temporary, "xb") as file:
         yield file
-        file.flush()
-        os.fsync(file.fileno())
 
 
 @contextmanager
@@ -56,12 +54,14 @@ def atomic_name(path: Path) -> Iterator[Path]:
     """As `atomic_file` on this machine, for libraries that open a file themselves.
 
     Yields:
-        The temporary name, under which there is no file yet. What is made there must be on disk when the block ends.
+        The temporary name, under which there is no file yet.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(temporary_name(path.name))
     try:
         yield temporary
+        with open(temporary, "r+b") as written:
+            os.fsync(written.fileno())
         os.replace(temporary, path)
     except BaseException as error:
         with suppress(FileNotFoundError):

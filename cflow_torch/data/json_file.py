@@ -11,7 +11,6 @@ from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.paths import read_bytes
 
 MAX_JSON_BYTES = 64 << 20  # of a document; the largest that belongs to a log has about 10 MB
-MAX_DEPTH = 64  # lists and objects in each other, of settings files
 _SHORT = reprlib.Repr()
 _SHORT.maxlist, _SHORT.maxstring, _SHORT.maxother = 12, 80, 80
 

@@ -147,18 +147,6 @@ def ranged(path: Path) -> Any:
     return _open(path, cache_type="blockcache", block_size=_BLOCK, cache_options={"maxblocks": _KEPT_BLOCKS})
 
 
-def parts(path: Path) -> Any:
-    """An open binary file of which every `read` fetches just the bytes that it asks for, if it is remote.
-
-    Raises:
-        OSError: the file cannot be opened, or is a device or a pipe; later, that it cannot be read.
-    """
-    if is_remote(path):
-        return _open(path, cache_type="none")
-    _size(path)
-    return open(path, "rb")  # noqa: SIM115
-
-
 def mapped(path: Path) -> Any:
     """What to give pyarrow to read a large file again and again: its name, or a copy on this machine if it is remote.
 
@@ -173,7 +161,7 @@ def mapped(path: Path) -> Any:
 
 @lru_cache(maxsize=_KEPT_COPIES)
 def _copy(path: Path) -> pa.Buffer:
-    with tempfile.TemporaryFile() as file, parts(path) as stream:
+    with tempfile.TemporaryFile() as file, _open(path, cache_type="none") as stream:
         with remote_errors(path):
             shutil.copyfileobj(stream, file, _COPIED)
         if not file.tell():

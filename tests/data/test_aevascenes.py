@@ -6,7 +6,6 @@ import io
 import json
 import math
 import pickle
-import shutil
 import zipfile
 from pathlib import Path
 from typing import Any, Dict
@@ -15,7 +14,7 @@ import numpy as np
 import pytest
 
 from cflow_torch.data.aevascenes.clouds import Cloud
-from cflow_torch.data.aevascenes.reader import CATEGORY_NAME, AevaScenesLog, find_aevascenes_sequences
+from cflow_torch.data.aevascenes.reader import CATEGORY_NAME, AevaScenesLog
 from cflow_torch.data.boxes import category_indices, flow_from_boxes, make_boxes
 from cflow_torch.data.categories import CATEGORIES, CATEGORY_INDEX, meta_class
 from cflow_torch.simulator import make_drive
@@ -221,6 +220,3 @@ def test_what_there_is_not(folder: Path, tmp_path: Path) -> None:
             AevaScenesLog(folder, **settings)
     with pytest.raises(CFlowError, match="0 ... 2"):
         AevaScenesLog(folder).sweep(3)
-    other = Path(shutil.copytree(folder, tmp_path / "data" / "validation" / "b"))
-    assert find_aevascenes_sequences(tmp_path) == sorted([folder, other])
-    assert find_aevascenes_sequences(folder) == [folder] and find_aevascenes_sequences(folder / "pointcloud_raw") == []

@@ -127,17 +127,6 @@ def test_sweeps_and_poses(folder: Path) -> None:
     assert log.labels(0) is None
 
 
-def test_find_logs(folder: Path, tmp_path: Path) -> None:
-    other = tmp_path / "train" / "deep" / "b-log"
-    for time in TIMES:
-        write_sweep(other, time)
-    assert find_av2_logs(folder) == [folder]
-    assert find_av2_logs(tmp_path / "val") == [folder]
-    assert find_av2_logs(tmp_path) == sorted([other, folder])
-    with pytest.raises(CFlowError, match="no folder"):
-        find_av2_logs(tmp_path / "nowhere")
-
-
 def test_stored_labels_come_before_boxes(folder: Path) -> None:
     annotate(folder, box_columns(100, 10.0), box_columns(200, 10.0), box_columns(300, 13.0))
     write(folder / "flow_labels.feather", label_columns(flow_tx_m=np.zeros(3, dtype=np.float32)))

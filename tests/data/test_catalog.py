@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import json
 import pickle
-import warnings
 from pathlib import Path
-from typing import Any, Dict, List
+from typing import Any, Dict
 
 import numpy as np
 import pytest
@@ -16,7 +15,6 @@ from cflow_torch.data import catalog
 from cflow_torch.data.arrays import write_array_log
 from cflow_torch.data.catalog import DATA_SETS, find_sources, open_log
 from cflow_torch.data.found_ground import GroundFoundLog
-from cflow_torch.data.log_check import GroundWarning
 from cflow_torch.simulator import Drive, make_drive
 from cflow_torch.simulator.benchmark import FORMATS
 from cflow_torch.types import CFlowError
@@ -85,16 +83,22 @@ def test_wrong_calls(arrays: Path, name: str, settings: Dict[str, Any], complain
         open_log(name, arrays, **settings)
 
 
+@pytest.mark.parametrize(
+    "name, log", [("av2", "sensors/lidar/1.npy"), ("aevascenes", "sequence.json"), ("arrays", "1.npy")]
+)
+def test_logs_are_found_below_and_at_a_folder(name: str, log: str, tmp_path: Path) -> None:
+    """Nothing is looked at below a log, in hidden folders, or further down than the layouts go."""
+    for place in ("b", "a/x", "b/points/y", ".hidden", "1/2/3/4/5"):
+        for file in (log, log.replace("1", "2")):
+            (tmp_path / place / file).parent.mkdir(parents=True, exist_ok=True)
+            (tmp_path / place / file).write_bytes(b"")
+    assert find_sources(name, tmp_path) == [tmp_path / "a" / "x", tmp_path / "b"]
+    assert find_sources(name, tmp_path / "b") == [tmp_path / "b"]
+    with pytest.raises(CFlowError, match="nowhere is no folder"):
+        find_sources(name, tmp_path / "nowhere")
+
+
 def test_nothing_of_the_format_there(tmp_path: Path) -> None:
     for name in DATA_SETS:
         with pytest.raises(CFlowError, match=r"no |none|there is"):
             find_sources(name, tmp_path)
-
-
-@pytest.mark.parametrize("remedy", [[], ["data.find_ground=grid"], ["data.check=false"]])
-def test_cflow_flow_warns_of_ground_and_takes_the_remedies(arrays: Path, tmp_path: Path, remedy: List[str]) -> None:
-    call = ["flow", "data=arrays", f"data.root={arrays}", "model=paper", "engine.workers=1", f"output={tmp_path}"]
-    with warnings.catch_warnings(record=True) as caught:
-        main([*call, *remedy])
-    assert len(list(tmp_path.rglob("*.feather"))) == 2
-    assert any(issubclass(warning.category, GroundWarning) for warning in caught) == (not remedy)

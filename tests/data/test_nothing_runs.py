@@ -13,8 +13,8 @@ from tiny_recording import TinyRecording
 
 from cflow_torch import CFlowError
 from cflow_torch.data.aevascenes import AevaScenesLog
-from cflow_torch.data.hdf5.index_file import read_index
-from cflow_torch.data.npy_file import read_npy, read_npz
+from cflow_torch.data.arrays.cloud_file import read_cloud
+from cflow_torch.data.npy_file import read_npy
 from cflow_torch.simulator.writers.aevascenes import write_aevascenes_sequence
 
 
@@ -45,24 +45,13 @@ def test_the_payload_works(tmp_path: Path) -> None:
     assert (tmp_path / "marker").is_dir()
 
 
-@pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
-def test_index_files(protocol: int, marker: Path, tmp_path: Path) -> None:
-    file, name = tmp_path / "index_eval.pkl", str(marker).encode()
-    by_hand = (b"(S'" + name + b"'\nios\nmkdir\n.", b"cos\nmkdir\n(S'" + name + b"'\ntR.", b"Pany\n.", b"\x82\x01.")
-    values = (Payload(marker), [[Payload(marker), "1"]], [["scene", Payload(marker)]])
-    for content in (*(pickle.dumps(value, protocol) for value in values), *by_hand):
-        file.write_bytes(content)
-        with pytest.raises(CFlowError, match="index_eval.pkl"):
-            read_index(file)
-
-
 def test_arrays_of_objects(marker: Path, tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", objects(marker, (4, 3)))
     np.savez(tmp_path / "a.npz", points=objects(marker, (4, 3)))
     with pytest.raises(CFlowError, match="a.npy.*copy it"):
         read_npy(tmp_path / "a.npy", "copy it")
-    with pytest.raises(CFlowError, match="a.npz.*copy it"):
-        read_npz(tmp_path / "a.npz", "copy it", lambda headers: ["points"])
+    with pytest.raises(CFlowError, match="a.npz.*no file of plain arrays"):
+        read_cloud(tmp_path / "a.npz")
 
 
 @pytest.mark.parametrize("key", ["semantic_labels", "xyz", "velocity"])

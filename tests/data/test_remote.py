@@ -18,7 +18,6 @@ import pytest
 from tiny_recording import TinyRecording
 
 from cflow_torch.data import paths
-from cflow_torch.data.arrays.reader import ArraysLog
 from cflow_torch.data.arrays.writer import write_array_log
 from cflow_torch.data.atomic import atomic_file, atomic_folder, ready_folder, remove_stale
 from cflow_torch.data.catalog import find_sources, open_log
@@ -176,7 +175,7 @@ def test_addresses(tmp_path, monkeypatch):
 
 def test_a_pipe_is_no_file(tmp_path):
     os.mkfifo(tmp_path / "pipe")
-    for read in (paths.read_bytes, paths.whole, paths.parts):
+    for read in (paths.read_bytes, paths.whole):
         with pytest.raises(OSError, match="device or a pipe"):
             read(tmp_path / "pipe")
 
@@ -189,19 +188,6 @@ def test_every_data_set_is_read_as_from_a_local_folder(written, far, name):
     assert_same_logs(open_log(name, source, check=False), open_log(name, expected, check=False))
 
 
-@pytest.mark.parametrize("suffix", [".npy", ".bin", ".pcd", ".ply", ".feather", ".parquet"])
-def test_every_kind_of_cloud(far, tmp_path, suffix):
-    local = write_array_log(TinyRecording(log_id="00"), tmp_path / "sequences", suffix, "kitti")
-    (tmp_path / "poses").mkdir()
-    (local / "poses.txt").rename(tmp_path / "poses" / "00.txt")  # where KITTI has them
-    (local / "calib.txt").write_text("Tr: 0 -1 0 0 0 0 -1 0.5 1 0 0 0.25\n")
-    (source,) = find_sources("arrays", far(tmp_path / "sequences"))
-    assert_same_logs(ArraysLog(source), ArraysLog(local))
-    assert ArraysLog(source).poses is not None
-    named = ArraysLog(source, poses=far(tmp_path / "poses" / "00.txt"), times="times.txt")
-    assert_same_logs(named, ArraysLog(local))
-
-
 def test_large_files_are_read_in_blocks_that_are_kept(far, tmp_path, monkeypatch):
     data = np.random.default_rng(0).bytes(100_000)
     (tmp_path / "a").write_bytes(data)
@@ -210,9 +196,6 @@ def test_large_files_are_read_in_blocks_that_are_kept(far, tmp_path, monkeypatch
     for at, count in ((5, 10), (9_000, 999), (90_000, 5_000), (95_000, 10_000), (3, 2)):
         assert file.seek(at) == at and file.read(count) == data[at : at + count]
     assert Far.requests - before == 2, "blocks 0 and 9"
-    with paths.parts(far(tmp_path / "a")) as parts:
-        parts.seek(50_000)
-        assert parts.read(7) == data[50_000:50_007]
     copies = {paths.mapped(far(tmp_path / "a")).read() for _ in range(3)}
     assert copies == {data}
     before = Far.requests
@@ -297,31 +280,6 @@ def test_a_local_file_has_the_usual_rights_and_is_on_disk(tmp_path, monkeypatch)
     assert synced == [path.stat().st_ino for path in (tmp_path / "a" / "b", tmp_path / "a")]
     (tmp_path / "plain").write_bytes(b"x")
     assert (tmp_path / "a" / "b").stat().st_mode == (tmp_path / "plain").stat().st_mode
-
-
-@pytest.mark.slow
-def test_a_real_object_store(written, monkeypatch):
-    """A server on this machine that speaks S3."""
-    pytest.importorskip("s3fs", reason="s3fs is not installed")
-    moto = pytest.importorskip("moto.server", reason="moto[server] is not installed")
-    server = moto.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
-    server.start()
-    monkeypatch.setenv("AWS_DEFAULT_REGION", "us-east-1")
-    url = "http://{}:{}".format(*server.get_host_and_port())
-    s3 = upath.UPath("s3://bucket", endpoint_url=url, key="a", secret="b")
-    s3.fs.mkdir("bucket")
-    for name in DATA_SETS:
-        s3.fs.put(str(written(name)), (s3 / name).path, recursive=True)
-        paths.forget_listings(s3)
-        (source,), (expected,) = find_sources(name, s3 / name), find_sources(name, written(name))
-        assert_same_logs(open_log(name, source, check=False), open_log(name, expected, check=False))
-    with atomic_file(s3 / "out" / "1") as file:
-        file.write(b"whole")
-    with pytest.raises(KeyboardInterrupt), atomic_file(s3 / "out" / "2") as file:
-        file.write(b"half")
-        raise KeyboardInterrupt
-    assert names(s3 / "out") == ("1",) and (s3 / "out" / "1").read_bytes() == b"whole"
-    server.stop()
 
 
 WRITER = """

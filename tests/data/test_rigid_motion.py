@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from cflow_torch.data.rigid_motion import between, moved, poses_at, poses_from_quaternions
+from cflow_torch.data.rotations import to_quaternions, to_rotations
 from cflow_torch.types import CFlowError
 
 HALF = math.sqrt(0.5)
@@ -60,3 +61,13 @@ def test_the_way_between_two_poses(turn: float) -> None:
     at = poses_at(np.array([150, 200]), np.array([100, 200]), poses)
     slerp = Slerp([100, 200], Rotation.from_matrix(poses[:, :3, :3]))
     assert np.abs(at[:, :3, :3] - slerp([150, 200]).as_matrix()).max() < 1e-14
+
+
+def test_quaternions_of_any_rotation_and_of_half_turns() -> None:
+    """Half turns about each axis are where naive formulas divide by zero."""
+    q = np.concatenate([np.eye(4), np.random.default_rng(0).normal(size=(200, 4))])
+    matrices = Rotation.from_quat(q[:, [1, 2, 3, 0]]).as_matrix()
+    found = to_quaternions(matrices)
+    assert (found[:, 0] >= 0).all() and np.abs(np.linalg.norm(found, axis=1) - 1).max() < 1e-15
+    for quaternions in (found, 3 * q):
+        assert np.abs(to_rotations(quaternions) - matrices).max() < 1e-14

@@ -61,11 +61,11 @@ class Cloud:
             return None
         with file_errors(f"{self.file}: {key}", _MEND):
             with self._arrays.zip.open(f"{key}.npy") as member:
-                header = read_header(member)
-                stored = load_plain(member, NUMPY_ARRAYS) if header.dtype.hasobject else self._arrays[key]
+                shape, dtype = read_header(member)
+                stored = load_plain(member, NUMPY_ARRAYS) if dtype.hasobject else self._arrays[key]
             texts = _elements(stored) if isinstance(stored, StandIn) else np.ravel(stored).tolist()
-            if {type(text) for text in texts} - {str} or len(texts) != math.prod(header.shape):
-                raise ValueError(f"it must hold {math.prod(header.shape)} strings")
+            if {type(text) for text in texts} - {str} or len(texts) != math.prod(shape):
+                raise ValueError(f"it must hold {math.prod(shape)} strings")
             return texts
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from pathlib import Path
-from typing import Any, Dict, List, Optional, Sequence, Tuple
+from typing import Any, Dict, List, Optional, Sequence
 
 import numpy as np
 
@@ -100,7 +101,8 @@ class AevaScenesLog(NumberedSweeps):
         if clouds not in _PATHS:
             raise CFlowError(f"clouds is one of {', '.join(_PATHS)}; got {clouds!r}")
         self._clouds, self._ground = clouds, ground
-        self._last: Tuple[int, List[Cloud]] = (-1, [])
+        # Several arrays of a sweep's clouds are read one after the other.
+        self._clouds_of = lru_cache(1)(self._open_clouds)
         self._file = self.folder / "sequence.json"
         with file_errors(self._file, _MEND):
             content = read_json(self._file)
@@ -155,21 +157,17 @@ class AevaScenesLog(NumberedSweeps):
         clouds = zip(self._clouds_of(index), self._mounts)
         return np.concatenate([moved(cloud.numbers("xyz", 3), mount) for cloud, mount in clouds]).astype(np.float32)
 
-    def _clouds_of(self, index: int) -> List[Cloud]:
-        """Those of the last sweep are kept, as several arrays of each are read one after the other."""
-        where = f"{self._file}, frame {self._timestamp(index)}"
-        if index != self._last[0]:
-            clouds = []
-            for name in self.lidars:
-                with file_errors(where, _MEND):
-                    entry = self._frames[index]["point_cloud"][name]
-                    paths = [entry[key] for key in _PATHS[self._clouds] if key in entry]
-                if not paths:
-                    has = f"no {self._clouds} cloud, only {shown(entry)}"
-                    raise CFlowError(f"{where}, {name}: {has}; raw clouds come with version 2 of the data set")
-                clouds.append(Cloud(inside(self.folder, paths[0], f"{where}, {name}: the path")))
-            self._last = index, clouds
-        return self._last[1]
+    def _open_clouds(self, index: int) -> List[Cloud]:
+        where, clouds = f"{self._file}, frame {self._timestamp(index)}", []
+        for name in self.lidars:
+            with file_errors(where, _MEND):
+                entry = self._frames[index]["point_cloud"][name]
+                paths = [entry[key] for key in _PATHS[self._clouds] if key in entry]
+            if not paths:
+                has = f"no {self._clouds} cloud, only {shown(entry)}"
+                raise CFlowError(f"{where}, {name}: {has}; raw clouds come with version 2 of the data set")
+            clouds.append(Cloud(inside(self.folder, paths[0], f"{where}, {name}: the path")))
+        return clouds
 
     def _boxes(self, index: int) -> Boxes:
         where = f"{self._file}, frame {self.timestamps[index]}"

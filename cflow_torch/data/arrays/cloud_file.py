@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Mapping, Sequence
+from typing import Mapping
 
 import numpy as np
 import pyarrow as pa
@@ -13,8 +13,8 @@ from cflow_torch.data.arrays.pcd import read_pcd, write_pcd
 from cflow_torch.data.arrays.ply import read_ply, write_ply
 from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.file_errors import file_errors
-from cflow_torch.data.npy_file import Header, read_npy, read_npz
-from cflow_torch.data.paths import Place, as_path, read_bytes
+from cflow_torch.data.npy_file import read_npy
+from cflow_torch.data.paths import Place, as_path, read_bytes, whole
 from cflow_torch.types import CFlowError
 
 SUFFIXES = (".npy", ".npz", ".bin", ".pcd", ".ply", ".feather", ".parquet")
@@ -107,10 +107,17 @@ def _read_bin(path: Path, columns: int) -> np.ndarray:
 def _read_numpy(path: Path) -> np.ndarray:
     mend = "it is truncated, or no file of plain arrays"
     if path.suffix.lower() == ".npz":
-        arrays = read_npz(path, mend, lambda headers: _choose(path, headers))
-        if len(arrays) > 1:
-            return _from_fields(path, arrays)
-        (stored,) = arrays.values()
+        with file_errors(path, mend), np.load(whole(path), allow_pickle=False) as arrays:
+            if all(axis in arrays.files for axis in _AXES):
+                return _from_fields(path, {axis: arrays[axis] for axis in _AXES})
+            named = [name for name in arrays.files if name in _CLOUD_KEYS]
+            found = [arrays[name] for name in named or arrays.files]
+            tables = [array for array in found if array.ndim == 2 and array.shape[1] >= 3]
+            tables = tables or [array for array in found if array.dtype.names is not None]
+            if len(tables) != 1:
+                has = ", ".join(arrays.files)[:200]
+                raise CFlowError(f"{path} holds {has}; give x, y, z, or one (N, 3+) array, or name it {_CLOUD_KEYS[0]}")
+        (stored,) = tables
     else:
         stored = read_npy(path, mend)
     if stored.dtype.names is not None:
@@ -118,20 +125,6 @@ def _read_numpy(path: Path) -> np.ndarray:
     if stored.ndim != 2 or stored.shape[1] < 3:
         raise CFlowError(f"{path} holds an array of shape {stored.shape}; give (N, 3+), columns x, y, z first")
     return stored
-
-
-def _choose(path: Path, arrays: Mapping[str, Header]) -> Sequence[str]:
-    """Names of the cloud's arrays among those of an .npz file: x, y, z, or one."""
-    if all(axis in arrays for axis in _AXES):
-        return _AXES
-    tables = [name for name, array in arrays.items() if len(array.shape) == 2 and array.shape[1] >= 3]
-    named = [name for name in tables if name in _CLOUD_KEYS]
-    chosen = named or tables or [name for name, array in arrays.items() if array.dtype.names is not None]
-    if len(chosen) != 1:
-        raise CFlowError(
-            f"{path} holds {list(arrays)[:20]}; it must hold x, y, z, or one (N, 3+) array, or name it {_CLOUD_KEYS[0]}"
-        )
-    return chosen
 
 
 def _read_table(path: Path) -> np.ndarray:

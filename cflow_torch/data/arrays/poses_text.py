@@ -14,12 +14,12 @@ from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.npy_file import read_npy
 from cflow_torch.data.paths import Place, as_path, read_bytes
-from cflow_torch.data.rotations import rotations_between, to_quaternions, to_rotations
+from cflow_torch.data.rigid_motion import between, poses_from_quaternions
+from cflow_torch.data.rotations import to_quaternions
 from cflow_torch.types import CFlowError
 from cflow_torch.windows.ego_motion import rigid_transform
 
 CALIBRATION_KEYS = ("Tr", "Tr_velo_to_cam", "Tr_velo_cam")  # KITTI's odometry, raw and tracking sets
-_QUATERNION_TOLERANCE = 1e-3  # of the length; TUM files have 4 to 17 digits
 _LONGEST_GAP_NS = 500_000_000  # between two poses, over which an interpolation is still a guess worth making
 
 
@@ -62,9 +62,13 @@ def read_poses(path: Place) -> Trajectory:
                 f"{path} has {values.shape[1]} numbers a line; poses have 12 (KITTI), 8 (TUM: t x y z qx qy qz qw) or "
                 "16 (4 x 4)"
             )
-        matrices = values.reshape(len(values), -1, 4)
         if layout == "tum":
-            times_ns, matrices = _nanoseconds(path, words[:, 0]), _from_tum(path, values)
+            times_ns = _nanoseconds(path, words[:, 0])
+            matrices = poses_from_quaternions(
+                values[:, 1:4], values[:, [7, 4, 5, 6]], lambda row: f"{path}: pose {row}"
+            )
+        else:
+            matrices = values.reshape(len(values), -1, 4)
     return Trajectory(checked_poses(matrices, str(path)), times_ns, layout)
 
 
@@ -159,19 +163,7 @@ def poses_at(trajectory: Trajectory, times_ns: Sequence[int], source: str) -> np
             "do both count from the same moment?"
         )
     share = (wanted - known[before]) / np.maximum(gap, 1)
-    first, last = trajectory.poses[before], trajectory.poses[after]
-    middle = first + share[:, None, None] * (last - first)
-    middle[:, :3, :3] = rotations_between(first[:, :3, :3], last[:, :3, :3], share)
-    return np.where((share == 0)[:, None, None], first, middle)
-
-
-def _from_tum(path: Place, values: np.ndarray) -> np.ndarray:
-    """(K, 3, 4) float64 from (K, 8) rows t x y z qx qy qz qw."""
-    length = np.linalg.norm(values[:, 4:], axis=1)
-    bad = np.flatnonzero(np.abs(length - 1) > _QUATERNION_TOLERANCE)
-    if bad.size:
-        raise CFlowError(f"{path}: the quaternion of pose {bad[0]} has length {length[bad[0]]:.4g}, it must be 1")
-    return np.concatenate([to_rotations(values[:, [7, 4, 5, 6]]), values[:, 1:4, None]], axis=2)
+    return between(trajectory.poses[before], trajectory.poses[after], share)
 
 
 def _read_table(path: Place) -> Tuple[np.ndarray, np.ndarray]:

@@ -19,9 +19,10 @@ from cflow_torch.data.arrays.poses_text import (
     read_times,
 )
 from cflow_torch.data.folders import find_folders
-from cflow_torch.data.log import FlowLabels
+from cflow_torch.data.log import FlowLabels, NumberedSweeps
 from cflow_torch.data.npy_file import read_npy
 from cflow_torch.data.paths import Place, as_path, is_place, is_remote
+from cflow_torch.data.rigid_motion import moved
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.ego_motion import rigid_transform
 
@@ -58,7 +59,7 @@ def find_array_logs(root: Place) -> List[Path]:
     )
 
 
-class ArraysLog:
+class ArraysLog(NumberedSweeps):
     """A folder of point clouds; implements the `Log` protocol.
 
     Args:
@@ -125,19 +126,16 @@ class ArraysLog:
         if self.poses is not None and (in_lidar or poses_of == "lidar"):
             self.poses = self.poses @ np.linalg.inv(self.ego_T_lidar)
 
-    def __len__(self) -> int:
-        return len(self.files)
-
     def sweep(self, index: int) -> Sweep:
         """Sweep number `index`: (N, 3) float32 in the ego frame, pose, ground mask and time where they are known.
 
         Raises:
             CFlowError: no such sweep, or its files cannot be read.
         """
-        self._check(index)
+        self._timestamp(index)
         points = read_cloud(self.files[index], self._bin_columns)
         if not np.array_equal(self.ego_T_lidar, np.eye(4)):
-            points = points.astype(np.float64) @ self.ego_T_lidar[:3, :3].T + self.ego_T_lidar[:3, 3]
+            points = moved(points, self.ego_T_lidar)
         is_ground = None if self._ground is None else _read_mask(self._ground, self.files[index].stem, len(points))
         pose = None if self.poses is None else self.poses[index].copy()
         time = self.timestamps[index] if self._has_times else None
@@ -149,12 +147,8 @@ class ArraysLog:
         Raises:
             CFlowError: no such sweep.
         """
-        self._check(index)
+        self._timestamp(index)
         return None
-
-    def _check(self, index: int) -> None:
-        if not 0 <= index < len(self.files):
-            raise CFlowError(f"log {self.log_id} has sweeps 0 ... {len(self.files) - 1}, asked for {index}")
 
     def _trajectory(self, poses: Any, calibration: Any) -> Tuple[Optional[Trajectory], str, bool]:
         """The poses given or found, what to call them, and whether a calibration made them the LiDAR's."""

@@ -1,4 +1,4 @@
-"""OpenSceneFlow's HDF5 scenes: reader, writer, results, index files."""
+"""OpenSceneFlow's HDF5 scenes: reader, writer, results."""
 
 from __future__ import annotations
 

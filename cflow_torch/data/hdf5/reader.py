@@ -9,7 +9,6 @@ from typing import Any, List, Optional, Sequence, Tuple
 import numpy as np
 
 from cflow_torch.data.hdf5.frames import StoredMotion, harness_motion, is_argoverse2, recognized_extrinsics
-from cflow_torch.data.hdf5.index_file import read_index
 from cflow_torch.data.hdf5.stored import member, open_scene, scene_errors
 from cflow_torch.data.log import FlowLabels, NumberedSweeps
 from cflow_torch.data.names import is_stamp
@@ -57,7 +56,7 @@ class HDF5Log(NumberedSweeps):
           sensor frame and poses of the ego vehicle.
         - "auto": the file's attribute `ego_T_lidar` if it has one (our writer's do), otherwise what the first sweep
           looks like, see `recognized_extrinsics`.
-        - Index files beside a scene are pickles; only `eval_frames` reads one, and runs nothing in it.
+        - Index files beside a scene are pickles: they are never opened.
 
     Raises:
         CFlowError: h5py is missing, the file is no HDF5 file, it holds fewer than two sweeps, or `ego_T_lidar` is no
@@ -150,36 +149,6 @@ class HDF5Log(NumberedSweeps):
         """
         values = self._needed(index, key)
         return values[:, 0] if values.ndim == 2 and values.shape[1] == 1 else values
-
-    def eval_frames(self, index_file: Optional[Place] = None) -> List[int]:
-        """Numbers of the sweeps to score, ascending.
-
-        Args:
-            index_file: OpenSceneFlow's index; None = `index_eval.pkl` beside the scene, if there is one.
-
-        Returns:
-            The scene's entries of the index file; without a file, the sweeps with `eval_mask`; without those, the
-            sweeps with `flow`. The last sweep of the scene has no successor and is left out.
-
-        Raises:
-            CFlowError: the file is no index, or it names a sweep that the scene does not have.
-        """
-        beside = self.file.parent / "index_eval.pkl"
-        if index_file is None and beside.is_file():
-            index_file = beside
-        if index_file is None:
-            for key in ("eval_mask", "flow"):
-                found = [index for index in range(len(self)) if self._array(index, key) is not None]
-                if found:
-                    break
-        else:
-            number = {stamp: index for index, stamp in enumerate(self.timestamps)}
-            stamps = {stamp for scene, stamp in read_index(index_file) if scene == self.log_id}
-            missing = sorted(stamps - set(number))
-            if missing:
-                raise CFlowError(f"{index_file} names sweep {missing[0]}, which {self.file} does not have: delete it")
-            found = sorted(number[stamp] for stamp in stamps)
-        return [index for index in found if index < len(self) - 1]
 
     @property
     def poses(self) -> np.ndarray:

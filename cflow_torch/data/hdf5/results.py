@@ -11,7 +11,7 @@ from typing import Any, Iterable, Tuple, Union
 
 import numpy as np
 
-from cflow_torch.data.atomic import remove_stale, sync_folder, temporary_name
+from cflow_torch.data.atomic import atomic_name, remove_stale
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.hdf5.stored import import_h5py, member
 from cflow_torch.types import Array, CFlowError, as_numpy
@@ -86,10 +86,9 @@ def write_hdf5_results(file: Union[str, Path], name: str, results: Iterable[Tupl
     check_writable(file)
     file = Path(file).resolve()  # a link stays a link
     remove_stale(file.parent)  # copies of writers that were killed
-    copy = file.with_name(temporary_name(file.name))
-    try:
+    count = 0
+    with atomic_name(file) as copy:
         shutil.copy(file, copy)
-        count = 0
         with _writing(file):
             scene = h5py.File(copy, "r+")
         try:
@@ -99,15 +98,7 @@ def write_hdf5_results(file: Union[str, Path], name: str, results: Iterable[Tupl
         finally:
             with _writing(file):
                 scene.close()
-        if count:
-            with open(copy, "rb") as written:
-                os.fsync(written.fileno())
-            os.replace(copy, file)
-            sync_folder(file.parent)
-        return count
-    finally:
-        if copy.exists():
-            copy.unlink()
+    return count
 
 
 def _write(scene: Any, file: Path, timestamp: str, name: str, flow: np.ndarray) -> None:

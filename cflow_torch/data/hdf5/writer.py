@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import os
+import pickle
 from pathlib import Path
 from typing import Any, Dict, List, Union
 
 import numpy as np
 
-from cflow_torch.data.atomic import atomic_name
+from cflow_torch.data.atomic import atomic_file, atomic_name
 from cflow_torch.data.boxes import points_in_box
-from cflow_torch.data.hdf5.index_file import write_index
 from cflow_torch.data.hdf5.reader import EXTRINSIC, HDF5Log, find_hdf5_scenes
 from cflow_torch.data.hdf5.stored import import_h5py
 from cflow_torch.data.log import Log
+from cflow_torch.data.rigid_motion import moved
 from cflow_torch.types import CFlowError
 from cflow_torch.windows.ego_motion import rigid_transform
 
@@ -66,20 +66,19 @@ def write_hdf5_scene(
         raise CFlowError(f"log {log.log_id}: time stamps must be different numbers from 0, they name the groups")
     file = Path(file)
     identity: Dict[str, int] = {}
-    with atomic_name(file) as new:
-        with h5py.File(new, "w") as scene:
-            if store_extrinsics:
-                scene.attrs[EXTRINSIC] = extrinsics
-            for index, stamp in enumerate(log.timestamps):
-                group = scene.create_group(str(int(stamp)))
-                for key, value in _sweep(log, index, extrinsics, pose_dtype, eval_step, identity).items():
-                    group.create_dataset(key, data=value)
-        with open(new, "rb") as written:
-            os.fsync(written.fileno())
+    with atomic_name(file) as new, h5py.File(new, "w") as scene:
+        if store_extrinsics:
+            scene.attrs[EXTRINSIC] = extrinsics
+        for index, stamp in enumerate(log.timestamps):
+            group = scene.create_group(str(int(stamp)))
+            for key, value in _sweep(log, index, extrinsics, pose_dtype, eval_step, identity).items():
+                group.create_dataset(key, data=value)
 
 
 def write_index_files(folder: Union[str, Path]) -> None:
     """Write `index_total.pkl`, `index_flow.pkl` and `index_eval.pkl` for all scenes of a folder, taken from the groups.
+
+    Convention: each is OpenSceneFlow's pickled list of [scene, time stamp], both strings.
 
     Raises:
         CFlowError: no such folder, or a scene that cannot be read.
@@ -90,12 +89,13 @@ def write_index_files(folder: Union[str, Path]) -> None:
         with HDF5Log(file, ego_T_lidar=None) as log:
             keys = [log.keys(k) for k in range(len(log.timestamps))]
             for stamp, names in zip(log.timestamps, keys):
-                entry = (log.log_id, stamp)
+                entry = [log.log_id, str(stamp)]
                 total.append(entry)
                 flow += [entry] * ("flow" in names)
                 scored += [entry] * ("eval_mask" in names)
     for name, entries in (("total", total), ("flow", flow), ("eval", scored)):
-        write_index(folder / f"index_{name}.pkl", entries)
+        with atomic_file(folder / f"index_{name}.pkl") as index:
+            pickle.dump(entries, index, protocol=4)
 
 
 def _sweep(
@@ -108,7 +108,7 @@ def _sweep(
     ego_points = np.asarray(sweep.points)[:, :3]
     inverse = np.linalg.inv(extrinsics)
     in_ego = np.array_equal(extrinsics, np.eye(4))
-    points = ego_points if in_ego else ego_points.astype(np.float64) @ inverse[:3, :3].T + inverse[:3, 3]
+    points = ego_points if in_ego else moved(ego_points, inverse)
     pose = np.asarray(sweep.pose, np.float64)
     values: Dict[str, np.ndarray] = {"lidar": points.astype(np.float32), "pose": pose.astype(pose_dtype)}
     if sweep.is_ground is not None:

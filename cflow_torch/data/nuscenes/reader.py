@@ -78,22 +78,20 @@ class NuScenesLog(NumberedSweeps):
             raise CFlowError(f"sweep_step={sweep_step}: it is 1 for all sweeps, 2 for every second one")
         self.log_id, self._root, self._own_vehicle = source.scene, as_path(source.root), own_vehicle
         folder = self._root / source.version
-        scene = (source.tables or Tables(folder)).scene(source.scene)
+        sample_times, known, annotations = (source.tables or Tables(folder)).scene(source.scene)
         with file_errors(folder / "category.json"):
-            category_indices(scene.annotations.category, self._categories)
-        missing = [] if lidars is None else [name for name in lidars if name not in scene.lidars]
-        if missing or not scene.lidars:
-            raise CFlowError(
-                f"scene {self.log_id} in {folder} has no LiDAR {missing or ''}; it has {list(scene.lidars)}"
-            )
-        self._lidars = {name: scene.lidars[name] for name in lidars or scene.lidars}
+            category_indices(annotations.category, self._categories)
+        missing = [] if lidars is None else [name for name in lidars if name not in known]
+        if missing or not known:
+            raise CFlowError(f"scene {self.log_id} in {folder} has no LiDAR {missing or ''}; it has {list(known)}")
+        self._lidars = {name: known[name] for name in lidars or known}
         reference = self._lidars[self._reference if self._reference in self._lidars else next(iter(self._lidars))]
         kept = np.flatnonzero(_is_kept(reference.is_key_frame, sweep_step))
         self.timestamps = reference.times[kept].tolist()
         self._check_count(f"scene {self.log_id} in {folder}")
         self._poses, self._T_ego_world = reference.ego[kept], np.linalg.inv(reference.ego[kept])
         self._odometry = (reference.times, reference.ego)
-        self._tracks = Tracks(scene.sample_times, scene.annotations)
+        self._tracks = Tracks(sample_times, annotations)
 
     def sweep(self, index: int) -> Sweep:
         """Sweep number `index`: LiDAR after LiDAR, in the order of sensor.json, moved to one ego frame."""

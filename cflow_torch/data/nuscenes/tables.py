@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections import defaultdict
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
-from typing import Collection, Dict, List, Mapping, Optional, Sequence, Tuple
+from typing import Collection, Dict, List, Optional, Sequence, Tuple
 
 import numpy as np
 
@@ -82,15 +83,6 @@ class Annotations:
     pose: np.ndarray
 
 
-@dataclass(frozen=True)
-class SceneTables:
-    """One scene: sample times (ascending int64, microseconds), LiDARs by channel in the order of sensor.json, boxes."""
-
-    sample_times: np.ndarray
-    lidars: Mapping[str, LidarChain]
-    annotations: Annotations
-
-
 def find_scenes(root: Place, foreign: Collection[str], data_set: str) -> List[SceneSource]:
     """The scenes of all versions under a folder, by folder and name. Those of one version share their tables.
 
@@ -114,7 +106,7 @@ def find_scenes(root: Place, foreign: Collection[str], data_set: str) -> List[Sc
     found = []
     for version in sorted(set(versions) - set(alien)):
         tables = Tables(version)
-        found += [SceneSource(version.parent, version.name, name, tables) for name in tables.scene_names()]
+        found += [SceneSource(version.parent, version.name, name, tables) for name in tables.scenes]
     return found
 
 
@@ -152,43 +144,43 @@ class Tables:
         self.folder = as_path(folder)
         self._rows: Dict[str, Dict[str, List[Row]]] = {}  # table -> token of the scene -> its rows
         self._by_token: Dict[str, _ByToken] = {}
-        self._scenes: Optional[Dict[str, str]] = None  # name -> token
 
-    def scene_names(self) -> List[str]:
-        """Sorted names.
+    @cached_property
+    def scenes(self) -> Dict[str, str]:
+        """Name of each scene -> its token, by name.
 
         Raises:
             CFlowError: scene.json cannot be read, has two scenes of one name, or a name that no folder can have.
         """
-        if self._scenes is None:
-            rows, file = read_table(self.folder, "scene"), self.folder / "scene.json"
-            scenes = {safe_name(row["name"], f"{file}: the scene"): row["token"] for row in rows}
-            if len(scenes) < len(rows):
-                raise CFlowError(f"{file} has {len(rows)} scenes, but {len(scenes)} names; {_COPY}")
-            self._scenes = scenes
-        return sorted(self._scenes)
+        rows, file = read_table(self.folder, "scene"), self.folder / "scene.json"
+        scenes = {safe_name(row["name"], f"{file}: the scene"): row["token"] for row in rows}
+        if len(scenes) < len(rows):
+            raise CFlowError(f"{file} has {len(rows)} scenes, but {len(scenes)} names; {_COPY}")
+        return dict(sorted(scenes.items()))
 
-    def scene(self, name: str) -> SceneTables:
+    def scene(self, name: str) -> Tuple[np.ndarray, Dict[str, LidarChain], Annotations]:
         """All rows of a scene, linked and checked.
+
+        Returns:
+            Sample times (ascending int64, microseconds), LiDARs by channel in the order of sensor.json, boxes.
 
         Raises:
             CFlowError: no such scene; a table that is missing, truncated, or no table of this format; a row that names
                 another one which does not exist; two sweeps of a LiDAR, or two samples, at one time.
         """
-        names = self.scene_names()
-        if name not in names or self._scenes is None:
-            raise CFlowError(f"{self.folder / 'scene.json'} has no scene {name!r}; it has {names[:5]} ...")
+        if name not in self.scenes:
+            raise CFlowError(f"{self.folder / 'scene.json'} has no scene {name!r}; it has {list(self.scenes)[:5]} ...")
         with file_errors(f"{self.folder}, {name}", _COPY):
             if not self._rows:
                 self._load()
-            rows = {table: by_scene[self._scenes[name]] for table, by_scene in self._rows.items()}
+            rows = {table: by_scene[self.scenes[name]] for table, by_scene in self._rows.items()}
             samples = self._ordered("sample", rows["sample"])
             channels: Dict[str, List[Row]] = {row["channel"]: [] for row in self._by_token["sensor"].values()}
             for row in self._ordered("sample_data", rows["sample_data"], "calibrated_sensor_token"):
                 mount = self._by_token["calibrated_sensor"][row["calibrated_sensor_token"]]
                 channels[self._by_token["sensor"][mount["sensor_token"]]["channel"]].append(row)
             lidars = {channel: self._chain(sweeps) for channel, sweeps in channels.items() if sweeps}
-            return SceneTables(_times(samples), lidars, self._annotations(rows["sample_annotation"]))
+            return _times(samples), lidars, self._annotations(rows["sample_annotation"])
 
     def _load(self) -> None:
         by_token = self._by_token
