@@ -113,17 +113,6 @@ def test_earlier_frames_are_history_nearest_first_and_every_frame_gets_a_flow(st
     np.testing.assert_array_equal(estimator(2).last(make_frames(sweeps)).full_flow, flows[3].full_flow)
 
 
-def test_pairs_of_frame_and_data_as_load_frame_list_gives_them(stand_in: None) -> None:
-    sweeps = drive(3)
-    frames, pairs = make_frames(sweeps), []
-    for frame, sweep in zip(frames, sweeps):
-        frame.pc.mask = np.ones(len(sweep.points), dtype=bool)
-        pairs.append((frame, SimpleNamespace(is_ground_points=sweep.is_ground, in_range_mask=None)))
-    for flow, reference in zip(estimator(1)(pairs), estimator(1)(make_frames(sweeps))):
-        np.testing.assert_array_equal(flow.full_flow, reference.full_flow)
-        assert flow.mask.all()
-
-
 @pytest.mark.parametrize("dtype", [np.float16, np.float64])
 def test_a_sensor_with_a_frame_of_its_own(stand_in: None, dtype: Any) -> None:
     """nuScenes: points, and the truth of the flow, are in the axes of the sensor."""
@@ -170,14 +159,6 @@ def test_overlapping_items_lend_each_other_history(stand_in: None, length: int) 
         check_flow(flow, expected(logs[int(name[-1])], index, 2))
 
 
-def test_items_that_do_not_overlap_stand_alone(stand_in: None) -> None:
-    log = drive(6)
-    taken = estimator(2).evaluate(DataSet([log], 3, "NON_CAUSAL", step=3)).taken
-    assert sorted(index for _, index in taken) == [0, 1, 3, 4]
-    for (_, index), flow in taken.items():
-        check_flow(flow, expected(log[index // 3 * 3 :], index % 3, 2))
-
-
 def test_numbers_of_sweeps_are_not_taken_for_times(stand_in: None) -> None:
     assert times_in_ns([0, 1, 2]) == (None, None, None)
     assert times_in_ns([10**9, 10**9 + 10**8]) == (10**9, 10**9 + 10**8)
@@ -207,16 +188,6 @@ def test_ground_that_the_data_set_left_in(stand_in: None) -> None:
     assert not flow.full_flow[:-2000].any() and flow.mask.all()
 
 
-def test_any_method_and_setting(stand_in: None) -> None:
-    estimate = CorrelationFlowEstimator(method="keypoints", device="cpu")
-    assert estimate.sequence_flow.model.config.method == "keypoints"
-    assert CorrelationFlowEstimator().sequence_flow.num_history == 4, "the preset default"
-    with pytest.raises(CFlowError, match="unknown setting voxel"):
-        CorrelationFlowEstimator(voxel=0.1)
-    with pytest.raises(CFlowError, match="ground='yes'"):
-        CorrelationFlowEstimator(ground="yes")
-
-
 @pytest.mark.parametrize(
     ("path", "value", "complaint"),
     [
@@ -244,13 +215,6 @@ def test_bad_frames_are_refused_by_the_name_of_the_field(stand_in: None, path: s
         estimator()(frames)
     with pytest.raises(CFlowError, match="at least two frames"):
         estimator()(frames[:1])
-
-
-def test_the_package_is_asked_for_when_it_is_needed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "bucketed_scene_flow_eval", None)
-    monkeypatch.setitem(sys.modules, "bucketed_scene_flow_eval.datastructures", None)
-    with pytest.raises(CFlowError, match="pip install 'bucketed-scene-flow-eval>=2.0.25'"):
-        estimator()(make_frames(drive(2)))
 
 
 # ------------------------------------------------------------------------------------------------------------ live
