@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from public_evaluators import score
 
-from cflow_torch.data.categories import CATEGORY_INDEX, META_CLASSES
+from cflow_torch.data.categories import CATEGORY_INDEX
 from cflow_torch.data.log import FlowLabels
 from cflow_torch.evaluation import (
     DEFINITIONS,
@@ -204,20 +204,6 @@ def test_three_way_by_hand() -> None:
     foreground = results["breakdown"]["foreground"]["dynamic"]["all"]
     assert (foreground["count"], foreground["accuracy_strict"]) == (2, 0.5)
     assert results["breakdown"]["background"]["dynamic"]["all"]["count"] == 1
-
-
-def test_breakdown_by_class_adds_up_to_the_foreground() -> None:
-    results = scores(replace(DEFINITIONS[OSF], foreground="meta", region="all"), *random_frames(3))["three_way"]
-    for motion in ("static", "dynamic"):
-        for distance in ("all", "close", "far"):
-            whole = results["breakdown"]["foreground"][motion][distance]
-            parts = [results["by_class"][name][motion][distance] for name in META_CLASSES if name != "BACKGROUND"]
-            for key in ("count", "num_predicted"):
-                assert sum(part[key] for part in parts) == whole[key]
-            for key in ("epe", "accuracy_strict", "accuracy_relax", "angle_error"):
-                total = sum(part[key] * part["count"] for part in parts if part["count"])
-                assert total / whole["count"] == pytest.approx(whole[key], rel=1e-12)
-    assert flat(results["by_class"]["BACKGROUND"]) == close_to(results["breakdown"]["background"])
 
 
 def test_accuracy_is_absolute_or_relative_and_the_angle_in_space_time() -> None:

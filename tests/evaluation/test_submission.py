@@ -380,19 +380,6 @@ def test_command_leaves_no_archive_when_a_frame_fails(log: AV2Log, tmp_path: Pat
     assert run(*call) == 0 and "already there: 1" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ("masks=masks.zip", "version 1"),
-        ("version=1 masks=a.zip frames=b.txt", "leave frames="),
-        ("version=4", "1, 2, 3"),
-    ],
-)
-def test_a_wrong_call_says_how_to_mend_it(arguments: str, message: str, tmp_path: Path, capsys: Any) -> None:
-    assert run("submit", "data=av2", "data.root=.", f"output={tmp_path}", *arguments.split()) == 2
-    assert message in capsys.readouterr().err and not list(tmp_path.rglob("*.feather"))
-
-
 # ---- the real pair
 
 

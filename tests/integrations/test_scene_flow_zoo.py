@@ -119,21 +119,6 @@ def test_a_batch_of_sequences_of_any_length_and_kind() -> None:
         np.testing.assert_array_equal(output.valid_flow_mask.numpy(), alone.valid_flow_mask.numpy())
 
 
-def test_what_a_lightning_module_sees() -> None:
-    model = CorrelationFlowModel(**SETTINGS)
-    assert not list(model.parameters()) and not list(model.buffers()) and not model.state_dict()
-    with pytest.raises(CFlowError, match="nothing to train"):
-        model.loss_fn([], [])
-    sequence = make_sequence(drive(2))
-    before = {name: value.clone() for name, value in vars(sequence).items() if isinstance(value, Tensor)}
-    with torch.enable_grad():
-        sequence.full_pc.requires_grad_(True)
-        (output,) = model("train", [sequence], None)
-    assert not output.ego_flows.requires_grad
-    for name, value in before.items():  # the batch is not modified
-        np.testing.assert_array_equal(getattr(sequence, name).detach().numpy(), value.numpy())
-
-
 def test_a_config_finds_it_once_it_is_registered(zoo: Dict[str, Any]) -> None:
     register()
     model = zoo["correlationflow"](preset="fast", max_speed=30.0, device="cpu")
@@ -155,9 +140,7 @@ def test_outside_of_a_checkout(monkeypatch: pytest.MonkeyPatch) -> None:
     [
         ({"full_pc": None}, r"batched_sequence\[1\]\.full_pc is no tensor"),
         ({"full_pc": torch.zeros(1, 640, 3)}, r"full_pc has shape \(1, 640, 3\).*at least 2"),
-        ({"full_pc": torch.zeros(2, 640, 3, dtype=torch.int64)}, r"full_pc has shape .*int64"),
         ({"full_pc_mask": torch.zeros(2, 7)}, r"full_pc_mask has shape \(2, 7\).*give \(2, 640\)"),
-        ({"pc_poses_ego_to_global": torch.eye(4)}, r"pc_poses_ego_to_global has shape \(4, 4\): give \(2, 4, 4\)"),
         ({"pc_poses_ego_to_global": torch.full((2, 4, 4), NAN)}, r"pc_poses_ego_to_global\[0\] holds NaN"),
         ({"pc_poses_sensor_to_ego": 2 * torch.eye(4).repeat(2, 1, 1)}, r"pc_poses_sensor_to_ego\[0\] is not rigid"),
         ({"loader_type": "causal"}, r"loader_type is None: give LoaderType\.CAUSAL"),
