@@ -54,12 +54,8 @@ def on_two_threads(config: Config, windows: List[Window]) -> Results:
         torch.set_num_threads(before)
 
 
-def with_little_memory(config: Config, windows: List[Window]) -> Results:
-    return together(config.replace(max_memory=500_000), windows)
-
-
 def in_pieces(config: Config, windows: List[Window]) -> Results:
-    """Points, images, look-ups and key points in pieces of other sizes."""
+    """Little memory; points, images, look-ups and key points in pieces of other sizes."""
     pieces = {
         "ops.chunks.CHUNK_ON_CPU": 997,
         "dense.correlation._AT_ONCE_CPU": 600,
@@ -72,7 +68,7 @@ def in_pieces(config: Config, windows: List[Window]) -> Results:
     with pytest.MonkeyPatch.context() as patch:
         for name, value in pieces.items():
             patch.setattr(f"cflow_torch.{name}", value)
-        return together(config, windows)
+        return together(config.replace(max_memory=500_000), windows)
 
 
 def shuffled(config: Config, windows: List[Window]) -> Results:
@@ -103,7 +99,6 @@ WAYS: Dict[str, Way] = {
         backwards_and_again,
         among_others,
         on_two_threads,
-        with_little_memory,
         in_pieces,
         shuffled,
         while_training,
