@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any, Callable, List
 
-import numpy as np
 from scenes import RANGE, scene
 
 from cflow_torch import Config, FlowResult, Sweep, Window, make_config
@@ -32,11 +31,6 @@ def windows_for(config: Config, number: int = 1) -> List[Window]:
 def changed(window: Window, change: Callable[[Sweep], Sweep]) -> Window:
     """The same change of every sweep."""
     return Window(change(window.pc0), change(window.pc1), tuple(map(change, window.pch)))
-
-
-def on_a_raster(sweep: Sweep) -> Sweep:
-    """Points, without pose, at whole multiples of 1/64 m: exact in float32 near the origin, in float64 anywhere."""
-    return Sweep(np.round(np.asarray(sweep.points, dtype=np.float64) * 64) / 64, sweep.is_ground)
 
 
 def num_moving(result: FlowResult) -> int:

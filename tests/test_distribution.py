@@ -63,7 +63,8 @@ def test_the_wheel_says_what_it_is(built: Tuple[Path, Path]) -> None:
         told = metadata.Metadata.from_email(archive.read(names["METADATA"]), validate=False)
         assert archive.read(names["LICENSE"]) == (ROOT / "LICENSE").read_bytes()
         assert b"cflow = cflow_torch.cli.main:main" in archive.read(names["entry_points.txt"])
-    assert told.name.replace("-", "_") == "cflow_torch" and str(told.version) == cflow_torch.__version__
+    assert told.name.replace("-", "_") == "cflow_torch"  # newer setuptools write a hyphen
+    assert str(told.version) == cflow_torch.__version__
     assert str(told.requires_python) == ">=3.8"
     assert told.description.strip() == (ROOT / "README.md").read_text(encoding="utf-8").strip()
 
@@ -81,20 +82,18 @@ def test_the_source_distribution_is_all_that_a_packager_needs(built: Tuple[Path,
     assert not [name for name in names if re.search(r"\.py[co]$|__pycache__|^outputs|^multirun|\.git", name)]
 
 
+@pytest.mark.slow
 def test_the_wheel_runs_alone(built: Tuple[Path, Path], tmp_path: Path) -> None:
-    """Outside the checkout: help, versions, a flow. torch and the like come from the environment of the tests."""
+    """Outside the checkout: a flow. torch and the like come from the environment of the tests."""
     installed, home = tmp_path / "installed", tmp_path / "elsewhere"
     home.mkdir()
     with zipfile.ZipFile(built[0]) as archive:
         archive.extractall(installed)
-
-    def run(*arguments: str) -> str:
-        environment = {**os.environ, "PYTHONPATH": str(installed), "OMP_NUM_THREADS": "1"}
-        done = subprocess.run([sys.executable, *arguments], capture_output=True, text=True, cwd=home, env=environment)
-        assert done.returncode == 0, done.stdout + done.stderr
-        return done.stdout
-
-    where = run("-c", "import cflow_torch, cflow_torch.configs as c; print(cflow_torch.__file__, *c.__path__)")
-    assert all(str(installed) in path for path in where.split()), where
-    run("-m", "cflow_torch.cli.main", "flow", "model=paper", "data.num_sweeps=2", "engine.workers=1")
+    code = "import cflow_torch, cflow_torch.configs as c, cflow_torch.cli.main as m; m.main(); "
+    code += "print(cflow_torch.__file__, *c.__path__)"
+    command = [sys.executable, "-c", code, "flow", "model=paper", "data.num_sweeps=2", "engine.workers=1"]
+    environment = {**os.environ, "PYTHONPATH": str(installed), "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, capture_output=True, text=True, cwd=home, env=environment)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.splitlines()[-1].count(str(installed)) == 2, "not the checkout"
     assert len(list(home.glob("outputs/flow/*/*.feather"))) == 1

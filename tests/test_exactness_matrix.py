@@ -5,17 +5,15 @@ from __future__ import annotations
 import warnings
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any, Callable, Dict, List, Tuple
+from typing import Callable, Dict, List, Tuple
 
 import numpy as np
 import pytest
 import torch
-from preset_windows import PRESETS, changed, num_moving, small, windows_for
+from preset_windows import PRESETS, num_moving, small, windows_for
 from scenes import assert_same_bits, reordered, rows_of
 
-from cflow_torch import Config, FlowResult, Sweep, Window, make_config, make_model
-from cflow_torch.data.log import window as window_of
-from cflow_torch.simulator import make_drive
+from cflow_torch import Config, FlowResult, Sweep, Window, make_model
 
 Results = List[FlowResult]
 Way = Callable[[Config, List[Window]], Results]
@@ -56,12 +54,8 @@ def on_two_threads(config: Config, windows: List[Window]) -> Results:
         torch.set_num_threads(before)
 
 
-def with_little_memory(config: Config, windows: List[Window]) -> Results:
-    return together(config.replace(max_memory=500_000), windows)
-
-
 def in_pieces(config: Config, windows: List[Window]) -> Results:
-    """Points, images, look-ups and key points in pieces of other sizes."""
+    """Little memory; points, images, look-ups and key points in pieces of other sizes."""
     pieces = {
         "ops.chunks.CHUNK_ON_CPU": 997,
         "dense.correlation._AT_ONCE_CPU": 600,
@@ -74,7 +68,7 @@ def in_pieces(config: Config, windows: List[Window]) -> Results:
     with pytest.MonkeyPatch.context() as patch:
         for name, value in pieces.items():
             patch.setattr(f"cflow_torch.{name}", value)
-        return together(config, windows)
+        return together(config.replace(max_memory=500_000), windows)
 
 
 def shuffled(config: Config, windows: List[Window]) -> Results:
@@ -102,11 +96,9 @@ def while_training(config: Config, windows: List[Window]) -> Results:
 WAYS: Dict[str, Way] = {
     way.__name__: way
     for way in (
-        together,
         backwards_and_again,
         among_others,
         on_two_threads,
-        with_little_memory,
         in_pieces,
         shuffled,
         while_training,
@@ -129,31 +121,4 @@ def test_no_way_changes_a_bit(preset: str, way: str) -> None:
     found = WAYS[way](config, windows)
     assert len(found) == len(results)
     for one, other in zip(found, results):
-        assert_same_bits(one, other)
-
-
-def as_tensors(sweep: Sweep) -> Sweep:
-    return replace(sweep, points=torch.from_numpy(sweep.points), is_ground=torch.from_numpy(sweep.is_ground))
-
-
-@pytest.mark.parametrize("preset", PRESETS)
-def test_a_device_may_be_given_in_any_form(preset: str) -> None:
-    config, windows, results = expected(preset)
-    forms: List[Any] = ["auto", "cpu", torch.device("cpu"), torch.device("cpu", 0)]
-    for device in forms:
-        # "auto" is the device of the tensors given.
-        window = windows[0] if device != "auto" else changed(windows[0], as_tensors)
-        (result,) = make_model(config, device)([window])
-        assert result.flow.device.type == "cpu"
-        assert_same_bits(result, results[0])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("way", WAYS)
-@pytest.mark.parametrize("preset", PRESETS)
-def test_no_way_changes_a_bit_of_a_street(preset: str, way: str) -> None:
-    """Two windows of a simulated drive of some 100,000 points a sweep, with the preset's own region and history."""
-    config, drive = make_config(preset), make_drive(seed=7, num_sweeps=7)
-    windows = [window_of(drive, index, config.num_history) for index in (4, 5)]
-    for one, other in zip(WAYS[way](config, windows), plainly(config, windows)):
         assert_same_bits(one, other)

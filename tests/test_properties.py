@@ -112,13 +112,6 @@ def test_a_shift_by_whole_pixels_shifts_the_scene(window, shift, overrides):
 
 
 @PROFILE
-@given(windows(max_history=0), st.tuples(st.integers(-5, 5), st.integers(-5, 5)))
-def test_a_shift_by_whole_coarse_pixels_shifts_all_scales(window, shift):
-    sizes, shifted = {"pixel_sizes": (4 * S, 2 * S, S)}, moved(window, np.array([*shift, 0]) * 4 * S)
-    assert_same(cflow(shifted, **sizes), cflow(window, **sizes))
-
-
-@PROFILE
 @given(windows(), st.integers(-3, 3))
 def test_a_shift_along_z_shifts_the_sectional_view(window, steps):
     shifted = moved(window, np.array([0, 0, steps * S]))
@@ -135,14 +128,6 @@ def test_company_and_order_of_points_do_not_matter(batch, overrides, seed):
     if not any(np.array_equal(s.points, o.points) for i, s in enumerate(sources) for o in sources[:i]):
         # A repeated sweep in another order would be no repetition any more.
         assert_same_bits(cflow(mixed, **overrides), rows_of(cflow(batch[0], **overrides), order))
-
-
-@PROFILE
-@given(windows())
-def test_points_given_twice_count_once(window):
-    is_ground = window.pc1.is_ground
-    twice = Sweep(np.repeat(window.pc1.points, 2, 0), None if is_ground is None else np.repeat(is_ground, 2))
-    assert_same_bits(cflow(replace(window, pc1=twice)), cflow(window))
 
 
 @PROFILE

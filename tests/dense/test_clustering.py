@@ -114,10 +114,3 @@ def test_a_cluster_needs_pixels_at_t1_and_before():
     clusters, columns = cluster_images(torch.from_numpy(images), 0.25, config())
     assert clusters.first.tolist() == [[2, 12], [2, 20]]
     assert dict(zip((columns.pixel - 60).tolist(), columns.cluster.tolist())) == {1: 2, 6: 2, 12: 0, 20: 1, 22: 1}
-
-
-def test_windows_do_not_join():
-    images = np.ones((6, 2, 4, 5), dtype=bool)
-    for max_extent in (1000.0, 0.5):  # oversized: eroded as one, stays whole
-        clusters = found(images, config(max_extent=max_extent))
-        assert clusters.window.tolist() == list(range(6)) and clusters.id_in_window().tolist() == [0] * 6

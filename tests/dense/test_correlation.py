@@ -158,13 +158,6 @@ def test_what_is_searched():
     assert shift_of([(0, 0)], [(0, 4)], (1, 8))[0] == [0, 0] and shift_of([(0, 4)], [(0, 0)], (1, 8))[0] == [0, -4]
 
 
-def test_no_pairs():
-    none = torch.zeros(0, dtype=torch.int64)
-    nothing = Images(none, none, none)
-    shift, score = best_shifts(TemplatePairs(nothing, nothing, none, none, torch.zeros(0, 2).long()))
-    assert shift.shape == (0, 2) and score.shape == (0,)
-
-
 def test_company_chunks_and_memory_do_not_matter(monkeypatch):
     rng = np.random.default_rng(12)
     targets, pairs = random_pairs(rng, [(5, 6), (20, 20), (9, 33), (70, 3)], 10, False)

@@ -56,7 +56,8 @@ def test_engines_equal_the_oracle(engines):
 
 
 def test_the_real_pair_equals_the_oracle(av2_folder):
-    result = flow_as_oracle(window_of(AV2Log(av2_folder), 0), make_config("paper"))
+    near = (-20.0, -15.0, -math.inf, 15.0, 15.0, math.inf)  # the whole is slow for the oracle
+    result = flow_as_oracle(window_of(AV2Log(av2_folder), 0), make_config("paper", point_cloud_range=near))
     assert (result.residual_flow.norm(dim=1) >= 0.05).sum() > 1000  # there is something to find
 
 

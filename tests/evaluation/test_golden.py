@@ -108,16 +108,6 @@ def test_opensceneflow_npz(pair: Pair) -> None:
     assert results["three_way"]["breakdown"]["foreground"]["dynamic"]["all"]["count"] == 1_819
 
 
-def test_classes_within_35_metres(pair: Pair) -> None:
-    counts = {}
-    for region in ("disc", "box"):
-        classes = scores(pair, replace(DEFINITIONS["opensceneflow"], region=region))["bucketed"]["classes"]
-        counts[region] = {name: row["num_static"] + row["num_dynamic"] for name, row in classes.items()}
-    classes = ("CAR", "PEDESTRIAN", "WHEELED_VRU", "OTHER_VEHICLES")
-    assert [counts["disc"][name] for name in classes] == [7800, 250, 166, 0]
-    assert counts["box"]["WHEELED_VRU"] == 166 + 39  # a parked motorcycle in a corner of the box
-
-
 def test_opensceneflow_range_wise(pair: Pair) -> None:
     ranges = scores(pair, "opensceneflow")["range_wise"]
     counts = {name: (row["num_static"], row["num_dynamic"]) for name, row in ranges.items() if name != "mean"}

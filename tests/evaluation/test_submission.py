@@ -34,7 +34,7 @@ from cflow_torch.evaluation.submission import (
 )
 from cflow_torch.evaluation.submission.encode import to_half
 from cflow_torch.evaluation.submission.masks import MaskArchive, point_mask
-from cflow_torch.evaluation.submission.plan import read_frame_list, require_logs
+from cflow_torch.evaluation.submission.plan import require_logs
 from cflow_torch.simulator import make_drive
 from cflow_torch.simulator.writers.av2 import write_av2_log
 from cflow_torch.windows.ego_motion import relative_transform
@@ -217,16 +217,12 @@ def with_value(value: Any) -> Callable[[np.ndarray], Any]:
 SPOILED: Dict[str, Any] = {
     "row missing": (3, in_table(lambda t: t.slice(1)), "rows, expected"),
     "NaN": (3, column("flow_ty_m", with_value(np.nan)), "flow_ty_m has 1 values that are NaN"),
-    "infinite": (1, column("flow_ty_m", with_value(-np.inf)), "flow_ty_m has 1 values that are NaN or infinite"),
     "empty value": (3, column("flow_tx_m", with_value(None)), "flow_tx_m has 1 empty"),
     "float64": (3, column("flow_tz_m", lambda v: v.astype(np.float64)), "flow_tz_m is float64, expected float16"),
-    "whole numbers": (2, column("flow_tz_m", lambda v: v.astype(np.int16)), "flow_tz_m is int16, expected float16 or"),
     "dynamic as number": (1, column("is_dynamic", lambda v: v.astype(np.uint8)), "is_dynamic is uint8, expected bool"),
     "column missing": (2, in_table(lambda t: t.drop(["is_valid"])), "column is_valid is missing"),
     "foreign column": (3, in_table(lambda t: t.append_column("score", t["flow_tx_m"])), "score does not belong"),
-    "column twice": (3, in_table(lambda t: t.append_column("flow_tx_m", t["flow_tx_m"])), "flow_tx_m"),
     "truncated": (3, lambda data: data[: len(data) // 2], "cannot be read"),
-    "no feather": (1, lambda data: b"flow\n", "cannot be read"),
     "far too large": (2, lambda data: data + bytes(1 << 24), "bytes"),
 }
 
@@ -253,22 +249,13 @@ def test_a_spoiled_file_is_named(kind: str, archives: Dict[int, Any], tmp_path: 
     assert problem.startswith(f"{frames[1].name}: ") and words in problem and "\n" not in problem
 
 
-METADATA = [
-    (lambda files: files.pop("metadata.json"), "missing, it must hold"),
-    (lambda files: files.update({"metadata.json": b"{"}), "cannot be read"),
-    (lambda files: files.update({"metadata.json": b'{"Is Supervised?": 0}'}), "must hold"),
-]
-
-
-@pytest.mark.parametrize(("spoil", "words"), METADATA)
-def test_every_problem_of_an_archive_is_listed(spoil: Any, words: str, archives: Any, tmp_path: Path) -> None:
+def test_every_problem_of_an_archive_is_listed(archives: Dict[int, Any], tmp_path: Path) -> None:
     _, good, frames = archives[2]
-    files = {**unzip(good), "notes.txt": b""}
+    files = {**unzip(good), "notes.txt": b"", "metadata.json": b"{"}
     del files[frames[0].name]
-    spoil(files)
     foreign, metadata, missing = check_submission(rezip(files, tmp_path / "a.zip"), get_version(2), frames)
     assert "notes.txt" in foreign and missing == f"{frames[0].name}: missing frame"
-    assert metadata.startswith("metadata.json: ") and words in metadata
+    assert metadata.startswith("metadata.json: cannot be read")
 
 
 def test_archives_that_are_none(archives: Dict[int, Any], tmp_path: Path) -> None:
@@ -323,19 +310,6 @@ def test_frames_go_by_the_masks_of_the_scene(tmp_path: Path) -> None:
             require_logs([log], {"another": [1], "plain": [2]})
         with pytest.raises(CFlowError, match="several"):
             require_logs([log, log], None)
-
-
-def test_lists_of_frames(tmp_path: Path) -> None:
-    file = tmp_path / "frames.txt"
-    file.write_text("# evaluated\na-1/100\na-1 200\n\nb, 300  # the last\n")
-    assert read_frame_list(file) == {"a-1": [100, 200], "b": [300]}
-    for text, complaint in (("a/1\na 1", "line 2.*twice"), ("a/x", "line 1"), ("a", "line 1"), ("#", "no frame")):
-        file.write_text(text)
-        with pytest.raises(CFlowError, match=complaint):
-            read_frame_list(file)
-    for name, complaint in (("index_eval.pkl", "pickle"), ("missing.txt", "missing.txt")):
-        with pytest.raises(CFlowError, match=complaint):
-            read_frame_list(tmp_path / name)
 
 
 def write_masks(file: Path, log_id: str, timestamp: int, mask: np.ndarray) -> Path:
@@ -404,19 +378,6 @@ def test_command_leaves_no_archive_when_a_frame_fails(log: AV2Log, tmp_path: Pat
     assert not (out / "v2.zip").exists() and (out / "v2" / "log" / "0000000000.feather").exists()
     shutil.copy(log.folder / "sensors" / "lidar" / sweep.name, sweep)
     assert run(*call) == 0 and "already there: 1" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ("masks=masks.zip", "version 1"),
-        ("version=1 masks=a.zip frames=b.txt", "leave frames="),
-        ("version=4", "1, 2, 3"),
-    ],
-)
-def test_a_wrong_call_says_how_to_mend_it(arguments: str, message: str, tmp_path: Path, capsys: Any) -> None:
-    assert run("submit", "data=av2", "data.root=.", f"output={tmp_path}", *arguments.split()) == 2
-    assert message in capsys.readouterr().err and not list(tmp_path.rglob("*.feather"))
 
 
 # ---- the real pair

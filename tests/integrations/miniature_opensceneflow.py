@@ -11,7 +11,7 @@ from __future__ import annotations
 import pickle
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Callable, Dict, Iterator, List, Optional, Tuple
+from typing import Any, Callable, Dict, Iterator, List, Tuple
 
 import h5py
 import torch
@@ -214,37 +214,9 @@ def frame_of(outcome: Outcome) -> EvalFrame:
     return EvalFrame(batch["origin_pc0"], labels, eval_mask=batch["eval_mask"], **flows)
 
 
-# -------------------------------------------------------------------------------------------------- stand-in models
-
-
-class Returns:
-    """A model that knows the answer.
-
-    Args:
-        residual: batch -> (N, 3) residual of every row of `origin_pc0`; None = zeros.
-        style: "full": rows of pc0 in a list; "tensor": the same as one (1, N', 3) tensor; "valid": with
-            `pc0_valid_point_idxes`, in an order that is not that of the rows.
-    """
-
-    def __init__(self, residual: Optional[Callable[[Batch], Tensor]] = None, style: str = "full") -> None:
-        self.residual, self.style = residual, style
-
-    def __call__(self, batch: Batch) -> Dict[str, Any]:
-        rows = ~batch["gm0"][0]
-        flow = torch.zeros(int(rows.sum()), 3) if self.residual is None else self.residual(batch)[rows]
-        if self.style == "tensor":
-            return {"flow": flow[None]}
-        if self.style == "full":
-            return {"flow": [flow], "pose_flow": None}
-        order = torch.arange(len(flow))
-        order = torch.cat([order[1::2], order[::2]])
-        return {"flow": [flow[order]], "pc0_valid_point_idxes": [order]}
-
-
-def true_residual(batch: Batch) -> Tensor:
-    """Stored truth without the harness's own pose flow: the best answer a model can give."""
-    pose_flow = pose_flow_of(batch["origin_pc0"][0], relative_pose(batch["pose0"][0], batch["pose1"][0]))
-    return batch["flow"][0] - pose_flow
+def nothing_moves(batch: Batch) -> Dict[str, Any]:
+    """A model: zeros for the rows of pc0."""
+    return {"flow": [torch.zeros(batch["pc0"][0].shape)], "pose_flow": None}
 
 
 # -------------------------------------------------------------------------------------------------- building a model

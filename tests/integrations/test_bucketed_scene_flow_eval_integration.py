@@ -32,7 +32,6 @@ from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.log import window
 from cflow_torch.evaluation import EvalFrame
 from cflow_torch.integrations.bucketed_scene_flow_eval import CorrelationFlowEstimator
-from cflow_torch.integrations.sequence import times_in_ns
 
 # ------------------------------------------------------------------------------ frames with the same fields, no package
 
@@ -113,21 +112,9 @@ def test_earlier_frames_are_history_nearest_first_and_every_frame_gets_a_flow(st
     np.testing.assert_array_equal(estimator(2).last(make_frames(sweeps)).full_flow, flows[3].full_flow)
 
 
-def test_pairs_of_frame_and_data_as_load_frame_list_gives_them(stand_in: None) -> None:
-    sweeps = drive(3)
-    frames, pairs = make_frames(sweeps), []
-    for frame, sweep in zip(frames, sweeps):
-        frame.pc.mask = np.ones(len(sweep.points), dtype=bool)
-        pairs.append((frame, SimpleNamespace(is_ground_points=sweep.is_ground, in_range_mask=None)))
-    for flow, reference in zip(estimator(1)(pairs), estimator(1)(make_frames(sweeps))):
-        np.testing.assert_array_equal(flow.full_flow, reference.full_flow)
-        assert flow.mask.all()
-
-
-@pytest.mark.parametrize("dtype", [np.float16, np.float64])
-def test_a_sensor_with_a_frame_of_its_own(stand_in: None, dtype: Any) -> None:
+def test_a_sensor_with_a_frame_of_its_own(stand_in: None) -> None:
     """nuScenes: points, and the truth of the flow, are in the axes of the sensor."""
-    sweeps = [replace(sweep, points=np.asarray(sweep.points).astype(dtype)) for sweep in drive(2)]
+    sweeps = drive(2)
     sensor_to_ego = pose(1.0, 0.2, math.radians(-90), 1.8)
     inverse = np.linalg.inv(sensor_to_ego)
     (flow,) = estimator()(make_frames(sweeps))
@@ -170,26 +157,6 @@ def test_overlapping_items_lend_each_other_history(stand_in: None, length: int) 
         check_flow(flow, expected(logs[int(name[-1])], index, 2))
 
 
-def test_items_that_do_not_overlap_stand_alone(stand_in: None) -> None:
-    log = drive(6)
-    taken = estimator(2).evaluate(DataSet([log], 3, "NON_CAUSAL", step=3)).taken
-    assert sorted(index for _, index in taken) == [0, 1, 3, 4]
-    for (_, index), flow in taken.items():
-        check_flow(flow, expected(log[index // 3 * 3 :], index % 3, 2))
-
-
-def test_numbers_of_sweeps_are_not_taken_for_times(stand_in: None) -> None:
-    assert times_in_ns([0, 1, 2]) == (None, None, None)
-    assert times_in_ns([10**9, 10**9 + 10**8]) == (10**9, 10**9 + 10**8)
-    timed, numbered, late = make_frames(drive(3)), make_frames(drive(3)), make_frames(drive(3))
-    for number, frame in enumerate(numbered):
-        frame.log_timestamp = number
-    late[0].log_timestamp -= 3 * 10**8  # the sweep before t is 0.4 s old, so its motion is divided by 5, not by 2
-    flows = [estimator(1)(frames)[1].full_flow for frames in (timed, numbered, late)]
-    np.testing.assert_array_equal(flows[0], flows[1])
-    assert np.abs(flows[2] - flows[1]).max() > 0.05
-
-
 def test_ground_that_the_data_set_left_in(stand_in: None) -> None:
     """with_ground=True: the masks do not tell. Said once; ground='auto' finds it."""
     rng = np.random.default_rng(0)
@@ -207,28 +174,14 @@ def test_ground_that_the_data_set_left_in(stand_in: None) -> None:
     assert not flow.full_flow[:-2000].any() and flow.mask.all()
 
 
-def test_any_method_and_setting(stand_in: None) -> None:
-    estimate = CorrelationFlowEstimator(method="keypoints", device="cpu")
-    assert estimate.sequence_flow.model.config.method == "keypoints"
-    assert CorrelationFlowEstimator().sequence_flow.num_history == 4, "the preset default"
-    with pytest.raises(CFlowError, match="unknown setting voxel"):
-        CorrelationFlowEstimator(voxel=0.1)
-    with pytest.raises(CFlowError, match="ground='yes'"):
-        CorrelationFlowEstimator(ground="yes")
-
-
 @pytest.mark.parametrize(
     ("path", "value", "complaint"),
     [
         ("pc", AttributeError, r"frames\[1\] is SimpleNamespace without 'pc'"),
         ("pc.mask", AttributeError, r"frames\[1\]\.pc is SimpleNamespace without 'mask'"),
         ("pc.mask", np.ones(3, dtype=bool), r"frames\[1\]\.pc\.mask has shape \(3,\)"),
-        ("pc.mask", np.ones(558), r"frames\[1\]\.pc\.mask has shape \(558,\), float64"),
         ("pc.full_pc", np.zeros((5, 4)), r"frames\[1\]\.pc\.full_pc has shape \(5, 4\)"),
-        ("pc.full_pc", np.zeros((5, 3), dtype=int), r"frames\[1\]\.pc\.full_pc .*int"),
         ("pc.pose.ego_to_global", np.full((4, 4), np.nan), r"frames\[1\]\.pc\.pose\.ego_to_global holds NaN"),
-        ("pc.pose.sensor_to_ego", np.diag([2.0, 1, 1, 1]), r"frames\[1\]\.pc\.pose\.sensor_to_ego is not rigid"),
-        ("log_id", "other", r"frames\[1\]\.log_id.* 'other', 1 after 'log', 0"),
         ("log_idx", 2, r"frames\[1\]\.log_id, log_idx.* 2 after 'log', 0"),
         ("log_timestamp", None, r"frames\[1\]\.log_timestamp is None"),
     ],
@@ -244,13 +197,6 @@ def test_bad_frames_are_refused_by_the_name_of_the_field(stand_in: None, path: s
         estimator()(frames)
     with pytest.raises(CFlowError, match="at least two frames"):
         estimator()(frames[:1])
-
-
-def test_the_package_is_asked_for_when_it_is_needed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "bucketed_scene_flow_eval", None)
-    monkeypatch.setitem(sys.modules, "bucketed_scene_flow_eval.datastructures", None)
-    with pytest.raises(CFlowError, match="pip install 'bucketed-scene-flow-eval>=2.0.25'"):
-        estimator()(make_frames(drive(2)))
 
 
 # ------------------------------------------------------------------------------------------------------------ live

@@ -12,7 +12,7 @@ import pytest
 import torch
 from scenes import assert_same, scene
 
-from cflow_torch import CFlowError, CorrelationFlowKeypoints, make_config, make_model
+from cflow_torch import make_config, make_model
 
 ROOT = str(Path(__file__).resolve().parents[2])
 
@@ -31,26 +31,8 @@ def test_it_is_the_model_of_the_preset():
     window = scene(0, num_history=1)
     model = torch.hub.load(ROOT, "cflow", source="local", preset="fast", device="cpu", num_history=1)
     assert model.config == make_config("fast", num_history=1)
-    assert_same(model([window])[0], make_model(make_config("fast", num_history=1))([window])[0])
-
-
-def test_other_presets_and_the_default():
-    keypoints = torch.hub.load(ROOT, "cflow", source="local", preset="keypoints")
-    assert isinstance(keypoints, CorrelationFlowKeypoints)
     assert torch.hub.load(ROOT, "cflow", source="local").config == make_config()
-
-
-def test_one_entry_point_with_help(hubconf):
-    # What torch.hub.list takes for an entry point.
-    assert [name for name, value in vars(hubconf).items() if callable(value) and not name.startswith("_")] == ["cflow"]
-    assert "preset" in (hubconf.cflow.__doc__ or "")
-
-
-def test_bad_settings_say_what_is_allowed():
-    with pytest.raises(CFlowError, match="default.*fast.*paper.*keypoints"):
-        torch.hub.load(ROOT, "cflow", source="local", preset="best")
-    with pytest.raises(CFlowError, match="num_histori"):
-        torch.hub.load(ROOT, "cflow", source="local", num_histori=1)
+    assert_same(model([window])[0], make_model(make_config("fast", num_history=1))([window])[0])
 
 
 def test_dependencies_are_what_loading_needs(hubconf, tmp_path):

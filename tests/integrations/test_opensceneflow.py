@@ -12,7 +12,6 @@ import sys
 import warnings
 from pathlib import Path
 from typing import Any, Dict, List, Optional
-from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -139,36 +138,11 @@ def test_zero_on_the_harness_s_own_scene(own: Path, av2_folder: Path) -> None:
     assert official is not None
     difference = np.linalg.norm(osf.load(own)["flow"][0].numpy() - official.flow, axis=1)
     assert (difference > 1e-3).sum() == 804, "its truth is another one"
-    results = osf.evaluate(osf.Returns(), own)
+    results = osf.evaluate(osf.nothing_moves, own)
     check(results, 5e-7, epe_fd=0.676812, epe_3way=0.231902, CAR=0.010684)  # six digits are known
     check(results, epe_fs=0.0107423, epe_bs=0.0081513, dynamic_iou=0.0)
     check(results, BACKGROUND=0.0081513, PEDESTRIAN=0.00892663, WHEELED_VRU=0.00994298, MEAN=0.00942622)
     assert [results["bucketed"]["classes"][name]["dynamic_error"] for name in ("CAR", "PEDESTRIAN")] == [1.0, 1.0]
-
-
-def test_correct_static_warp_on_the_harness_s_own_scene(own: Path, av2_folder: Path) -> None:
-    """Model of a static world in the sensor frame: T_s p - T p, T as the harness has it."""
-    ego_T_lidar = up_lidar(av2_folder)
-
-    def residual(batch: osf.Batch) -> Tensor:
-        T = osf.relative_pose(batch["pose0"][0], batch["pose1"][0]).double().numpy()
-        points = batch["origin_pc0"][0].double().numpy()
-        T_lidar = np.linalg.inv(ego_T_lidar) @ T @ ego_T_lidar
-        return torch.from_numpy((moved(T_lidar, points) - moved(T, points)).astype(np.float32))
-
-    results = osf.evaluate(osf.Returns(residual), own)
-    check(results, 5e-7, epe_fd=0.674522, epe_3way=0.227345)
-    check(results, epe_fs=0.00618095, epe_bs=0.00133243)
-
-
-@pytest.mark.parametrize("style", ["full", "tensor", "valid"])
-def test_truth_returned(style: str, own: Path) -> None:
-    results = osf.evaluate(osf.Returns(osf.true_residual, style), own)
-    three_way = results["three_way"]
-    assert three_way["epe_fd"] < 2e-9 and three_way["epe_bs"] < 1e-10  # the harness: 9.77e-10, 1.46e-11
-    assert results["bucketed"]["classes"]["CAR"]["dynamic_error"] < 1e-8
-    by_runner = osf.evaluate(osf.Returns(osf.true_residual, style), own, path="A")["three_way"]
-    assert by_runner["epe_fd"] > 0.1 if style == "valid" else by_runner["epe_fd"] < 2e-9, "it ignores indices"
 
 
 # ---------------------------------------------------------------------------------------------- the module: same flow
@@ -259,43 +233,21 @@ def test_full_and_valid_output_mean_the_same(ego_T_lidar: Any, small: Path) -> N
     assert same_bits(first.final_flow[ground], first.pose_flow[ground])
 
 
-def test_the_harness_s_matmul_precision_changes_nothing(small: Path) -> None:
-    batch = osf.path_b(osf.load(small, 5, 6))
-    models = [CFlow(**settings) for settings in VARIANTS.values()]
-    expected = [answer(model, batch)["flow"][0] for model in models]
-    try:
-        torch.set_float32_matmul_precision("medium")
-        assert all(same_bits(answer(model, batch)["flow"][0], flow) for model, flow in zip(models, expected))
-    finally:
-        torch.set_float32_matmul_precision("highest")
-
-
-@pytest.mark.parametrize("key", ["pc0", "pc1", "pch1"])
-def test_rows_of_nan_beside_a_mask(key: str, small: Path) -> None:
+def test_rows_of_nan_beside_a_mask(small: Path) -> None:
     """Some data sets store NaN for no return: such rows are no points, and every other row has its flow."""
     model, batch = CFlow(**VARIANTS["dense"]), osf.path_b(osf.load(small, 5, 6), top_num_frames=6)
     expected = answer(model, batch)["flow"][0]
-    nan, no_ground, gm = torch.full((1, 3, 3), float("nan")), torch.zeros(1, 3, dtype=torch.bool), f"gm{key[2:]}"
-    holed = {**batch, key: torch.cat([nan, batch[key]], dim=1), gm: torch.cat([no_ground, batch[gm]], dim=1)}
-    if key == "pc0":
-        holed["origin_pc0"] = torch.cat([nan, batch["origin_pc0"]], dim=1)
+    nan, no_ground = torch.full((1, 3, 3), float("nan")), torch.zeros(1, 3, dtype=torch.bool)
+    holed = dict(batch)
+    for end in ("0", "1", "h1"):
+        holed[f"pc{end}"] = torch.cat([nan, batch[f"pc{end}"]], dim=1)
+        holed[f"gm{end}"] = torch.cat([no_ground, batch[f"gm{end}"]], dim=1)
+    holed["origin_pc0"] = torch.cat([nan, batch["origin_pc0"]], dim=1)
     with torch.inference_mode():
         outcome = osf.run(model, holed)
     flow = outcome.answer["flow"]
-    assert same_bits(flow[3:] if key == "pc0" else flow, expected)
-    if key == "pc0":
-        assert not flow[:3].any() and outcome.final_flow[:3].isnan().all() and not outcome.final_flow[3:].isnan().any()
-
-
-def test_empty_and_all_ground(small: Path) -> None:
-    model, raw = CFlow(**VARIANTS["dense"]), osf.load(small, 5, 6)
-    for end in ("0", "1", "h2"):
-        bare = {**raw, f"gm{end}": torch.ones_like(raw[f"gm{end}"])}
-        with torch.inference_mode():
-            outcome = osf.run(model, osf.path_b(bare, top_num_frames=6))
-        assert outcome.final_flow.shape == outcome.pose_flow.shape and outcome.final_flow.isfinite().all()
-        if end != "h2":
-            assert same_bits(outcome.final_flow, outcome.pose_flow), "nothing to match, nothing found"
+    assert same_bits(flow[3:], expected) and not flow[:3].any()
+    assert outcome.final_flow[:3].isnan().all() and not outcome.final_flow[3:].isnan().any()
 
 
 def test_less_history_than_asked_for_is_said_once(small: Path) -> None:
@@ -309,15 +261,10 @@ def test_less_history_than_asked_for_is_said_once(small: Path) -> None:
 BAD: Dict[str, Any] = {
     "missing": (None, ["pc0", "pose0", "poseh4"]),
     "NaN": (lambda t: t * float("nan"), ["pose1", "poseh3"]),
-    "two columns": (lambda t: t[..., :2], ["pc1", "pch2"]),
-    "whole numbers": (lambda t: t.long(), ["pc0", "pch1"]),
     "one dimension too few": (lambda t: t[0], ["pc0", "pose0", "gm0"]),
-    "3 x 4": (lambda t: t[:, :3], ["pose0"]),
     "not rigid": (lambda t: 2 * t, ["poseh4"]),
     "no samples": (lambda t: t[:0], ["pc1", "pose1", "gmh1"]),
     "of another sweep": (lambda t: t[:, :-7], ["gm0", "gmh4"]),
-    "no mask": (lambda t: t.float(), ["gm1"]),
-    "an array": (lambda t: t.numpy(), ["pch3"]),
     "nothing": (lambda t: None, ["pose1", "gm0"]),
 }
 
@@ -333,30 +280,6 @@ def test_a_bad_batch_is_named(what: str, key: str, small: Path) -> None:
 
 
 # ---------------------------------------------------------------------------------------------- the module: as a module
-
-
-@pytest.mark.parametrize("variant", VARIANTS)
-def test_nothing_to_learn_load_or_reset(variant: str, small: Path) -> None:
-    model, batch = CFlow(**VARIANTS[variant]), osf.path_b(osf.load(small, 5, 6))
-    assert not list(model.parameters()) and not list(model.buffers()) and not model.state_dict()
-    learnt = (nn.modules.conv._ConvNd, nn.Linear, nn.modules.batchnorm._BatchNorm)
-    assert not [module for module in model.modules() if isinstance(module, learnt)]
-    expected = answer(model, batch)["flow"][0]
-    model.apply(osf.reset_weights)
-    model.load_state_dict({}, strict=True)
-    assert same_bits(answer(model.to("cpu").eval().train(), batch)["flow"][0], expected)
-
-
-def test_timer_of_the_harness_or_none(monkeypatch: pytest.MonkeyPatch, small: Path) -> None:
-    monkeypatch.setitem(sys.modules, "dztimer", MagicMock())
-    model = CFlow(**VARIANTS["dense"])
-    osf.run(model, osf.path_b(osf.load(small, 5, 6)))
-    model.timer[12].start.assert_called_once_with("One Scan")
-    monkeypatch.setitem(sys.modules, "dztimer", None)
-    timer = CFlow(**VARIANTS["dense"]).timer
-    timer[5][1].start("Compute Loss")
-    timer[5][1].stop()
-    timer.print(random_colors=False, bold=False)
 
 
 def test_settings_of_the_method_and_others() -> None:
@@ -450,12 +373,11 @@ def test_configuration_is_found_and_is_the_preset(name: str, tmp_path: Path) -> 
 # ---------------------------------------------------------------------------------------------- ego_T_lidar
 
 
-@pytest.mark.parametrize("given", [EGO_T_LIDAR, EGO_T_LIDAR.tolist(), torch.from_numpy(EGO_T_LIDAR)], ids=type)
-def test_extrinsics_mend_the_harness_s_pose_flow(given: Any, tmp_path: Path) -> None:
+def test_extrinsics_mend_the_harness_s_pose_flow(tmp_path: Path) -> None:
     """A scene with points in the sensor frame and poses of the ego frame, which the file does not tell."""
     layout = {"points_frame": "sensor", "ego_T_lidar": EGO_T_LIDAR, "store_extrinsics": False}
     folder, index = store(tmp_path, SmallDrive(0), **layout), 5
-    model = CFlow(**VARIANTS["dense"], ego_T_lidar=given)
+    model = CFlow(**VARIANTS["dense"], ego_T_lidar=EGO_T_LIDAR.tolist())
     with torch.inference_mode():
         outcome = osf.run(model, osf.path_b(osf.load(folder, index, 6)))
     motions = []
@@ -495,8 +417,7 @@ def test_auto_recognizes_argoverse(height: float, first_stamp: int, recognized: 
 # ---------------------------------------------------------------------------------------------- the real pair
 
 
-@pytest.mark.parametrize("points_frame", ["ego", "sensor"])
-@pytest.mark.parametrize("preset", ["fast", "keypoints"])
+@pytest.mark.parametrize(("preset", "points_frame"), [("fast", "sensor"), ("keypoints", "ego")])
 def test_real_pair_scores_as_cflow_eval(preset: str, points_frame: str, av2_folder: Path, tmp_path: Path) -> None:
     """Batches do not tell the time of t+1, so that the gate of the key points is the one for 0.1 s; the pair's
     0.100196 s make a gate of 2 m a little wider. A gate of 2.03 m and the wider one hold the same pixels. Nor do they

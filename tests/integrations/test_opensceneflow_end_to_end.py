@@ -122,27 +122,18 @@ Three-way  0.231902
 | OTHER_VEHICLES | nan          |       nan |
 | Mean           |   0.00942622 |       nan |
 """
-BAD = {
-    "status": (1, GOOD),
-    "swallowed": (0, f"==> Exception occur during training/validation step: a fault. Skip this batch.\n{GOOD}"),
-    "silent": (0, ""),
-    "no mean": (0, GOOD.replace("| Mean ", "| Average ")),
-    "no EPE_BS": (0, GOOD.replace("EPE_BS     0.0081513", "")),
-    "nothing scored": (0, GOOD.replace("0.00942622", "nan")),
-}
 
 
-def test_checker_takes_a_good_run() -> None:
+def test_checker_takes_a_good_run_and_refuses_a_failed_or_empty_one() -> None:
     first, second = read_scores(checked_text(0, GOOD + GOOD.replace("0.676812", "0.5")))
     expected = {"EPE_FD": 0.676812, "EPE_BS": 0.0081513, "EPE_FS": 0.0107423, "IoU": 0.0, "Three-way": 0.231902}
     assert first == pytest.approx({**expected, "static": 0.00942622, "dynamic": np.nan}, abs=0, nan_ok=True)
     assert second["EPE_FD"] == 0.5
-
-
-@pytest.mark.parametrize("kind", BAD)
-def test_checker_refuses_a_failed_run_or_an_empty_table(kind: str) -> None:
-    with pytest.raises(BadRun):
-        read_scores(checked_text(*BAD[kind]))
+    swallowed = f"==> Exception occur during training/validation step: a fault. Skip this batch.\n{GOOD}"
+    no_mean, nothing_scored = GOOD.replace("| Mean ", "| Average "), GOOD.replace("0.00942622", "nan")
+    for status, text in ((1, GOOD), (0, swallowed), (0, ""), (0, no_mean), (0, nothing_scored)):
+        with pytest.raises(BadRun):
+            read_scores(checked_text(status, text))
 
 
 # ------------------------------------------------------------------------------------------------ CorrelationFlow

@@ -119,33 +119,6 @@ def test_a_batch_of_sequences_of_any_length_and_kind() -> None:
         np.testing.assert_array_equal(output.valid_flow_mask.numpy(), alone.valid_flow_mask.numpy())
 
 
-def test_bool_masks_and_double_precision() -> None:
-    sweeps = [replace(sweep, points=np.nan_to_num(sweep.points)) for sweep in drive(2)]
-    sequence = make_sequence(sweeps)
-    doubles = {name: value.double() for name, value in vars(sequence).items() if isinstance(value, Tensor)}
-    variants = [sequence, replace(sequence, full_pc_mask=sequence.full_pc_mask == 1), replace(sequence, **doubles)]
-    reference, *others = run(variants)
-    for output in others:
-        assert output.ego_flows.dtype == torch.float32
-        np.testing.assert_array_equal(output.flow(0), reference.flow(0))
-        np.testing.assert_array_equal(output.mask(0), reference.mask(0))
-
-
-def test_what_a_lightning_module_sees() -> None:
-    model = CorrelationFlowModel(**SETTINGS)
-    assert not list(model.parameters()) and not list(model.buffers()) and not model.state_dict()
-    with pytest.raises(CFlowError, match="nothing to train"):
-        model.loss_fn([], [])
-    sequence = make_sequence(drive(2))
-    before = {name: value.clone() for name, value in vars(sequence).items() if isinstance(value, Tensor)}
-    with torch.enable_grad():
-        sequence.full_pc.requires_grad_(True)
-        (output,) = model("train", [sequence], None)
-    assert not output.ego_flows.requires_grad
-    for name, value in before.items():  # the batch is not modified
-        np.testing.assert_array_equal(getattr(sequence, name).detach().numpy(), value.numpy())
-
-
 def test_a_config_finds_it_once_it_is_registered(zoo: Dict[str, Any]) -> None:
     register()
     model = zoo["correlationflow"](preset="fast", max_speed=30.0, device="cpu")
@@ -154,11 +127,9 @@ def test_a_config_finds_it_once_it_is_registered(zoo: Dict[str, Any]) -> None:
         zoo["correlationflow"](voxel=0.1)
 
 
-@pytest.mark.parametrize("modules", [{}, {"dataloaders": ModuleType("dataloaders"), "models": ModuleType("models")}])
-def test_outside_of_a_checkout(monkeypatch: pytest.MonkeyPatch, modules: Dict[str, Any]) -> None:
-    """No such packages, or others of the same name."""
+def test_outside_of_a_checkout(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("dataloaders", "models"):
-        monkeypatch.setitem(sys.modules, name, modules.get(name))
+        monkeypatch.setitem(sys.modules, name, None)
     for call in (lambda: run([make_sequence(drive(2))]), register):
         with pytest.raises(CFlowError, match="clone github.com/kylevedder/SceneFlowZoo"):
             call()
@@ -169,9 +140,7 @@ def test_outside_of_a_checkout(monkeypatch: pytest.MonkeyPatch, modules: Dict[st
     [
         ({"full_pc": None}, r"batched_sequence\[1\]\.full_pc is no tensor"),
         ({"full_pc": torch.zeros(1, 640, 3)}, r"full_pc has shape \(1, 640, 3\).*at least 2"),
-        ({"full_pc": torch.zeros(2, 640, 3, dtype=torch.int64)}, r"full_pc has shape .*int64"),
         ({"full_pc_mask": torch.zeros(2, 7)}, r"full_pc_mask has shape \(2, 7\).*give \(2, 640\)"),
-        ({"pc_poses_ego_to_global": torch.eye(4)}, r"pc_poses_ego_to_global has shape \(4, 4\): give \(2, 4, 4\)"),
         ({"pc_poses_ego_to_global": torch.full((2, 4, 4), NAN)}, r"pc_poses_ego_to_global\[0\] holds NaN"),
         ({"pc_poses_sensor_to_ego": 2 * torch.eye(4).repeat(2, 1, 1)}, r"pc_poses_sensor_to_ego\[0\] is not rigid"),
         ({"loader_type": "causal"}, r"loader_type is None: give LoaderType\.CAUSAL"),

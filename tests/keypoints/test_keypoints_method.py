@@ -53,7 +53,7 @@ def test_kornia_equals_the_oracle(densify):
 
 
 def test_real_drives_equal_the_oracle(av2_folder, kitti_file):
-    near = (-20.0, -10.0, -math.inf, 0.0, 5.0, math.inf)
+    near = (-15.0, -8.0, -math.inf, 0.0, 3.0, math.inf)
     with HDF5Log(kitti_file) as log:
         windows = [window_of(AV2Log(av2_folder), 0), window_of(log, 9, 0)]
     for window, densify in zip(windows, ("clusters", "nearest")):

@@ -94,27 +94,6 @@ def test_oversized_clusters_link_pixels_of_the_closing(connectivity):
         assert same_partition(found[image], expected[image]) and (found[image] >= 0).all()
 
 
-@pytest.mark.parametrize(
-    "pixels, extent",
-    [
-        ([(5, 5), (8, 8)], 6),  # staggered contact of two 3 x 3 squares
-        ([(0, 0), (3, 3)], 5),  # the same in the corner, where the square is clipped
-    ],
-)
-def test_erosion_splits_an_oversized_component(pixels, extent):
-    image = image_of(pixels, (14, 14))
-    assert cluster([image, image], 0.5, extent * 0.5, 8)[image].tolist() == [0, 0]  # exactly d^max is not too large
-    assert cluster([image, image], 0.5, extent * 0.5 - 0.01, 8)[image].tolist() == [0, 1]
-
-
-def test_clusters_need_pixels_at_t1_and_before():
-    at_t1 = image_of([(9, 2), (2, 10), (2, 30)], (12, 40))
-    at_t, older = image_of([(9, 3), (2, 20)], (12, 40)), image_of([(1, 30), (5, 20)], (12, 40))
-    found = cluster([at_t1, at_t, older], 1.0, 1000.0, 8)
-    assert found[1, 30] == found[2, 30] == 0  # first in raster order, by a pixel of the oldest sweep
-    assert found[9, 2] == found[9, 3] == 1 and np.count_nonzero(found >= 0) == 4
-
-
 def test_counts_and_ncc_are_those_of_opencv():
     rng = np.random.default_rng(3)
     for height, width in [(1, 1), (1, 6), (5, 1), (4, 4), (7, 9), (31, 18), (60, 41)]:
@@ -149,12 +128,6 @@ def test_the_peak_is_that_of_the_ncc_map():
         assert score == pytest.approx(scores.max(), abs=1e-15)
         rows, columns = np.nonzero(scores > scores.max() - 1e-12)
         assert (dy, dx) == min((y * y + x * x, y, x) for y, x in zip(rows - height // 2, columns - width // 2))[1:]
-
-
-def test_fewer_other_pixels_in_the_window_win():
-    # The template pixel matches at -1 and at +1; the window at +1 no longer holds the first target pixel.
-    found = scene_flow_in_1view(image_of([(0, 1)], (1, 5)), image_of([(0, 0), (0, 2)], (1, 5)), 1.0)
-    assert found == ((1.0, 0.0), 1.0)
 
 
 def test_quotients_of_counts_rank_as_fractions():

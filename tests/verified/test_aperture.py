@@ -144,8 +144,3 @@ def test_a_line_of_exactly_the_largest_width():
     for last, is_line in ((32, True), (33, False)):
         two = {(r, c) for r in (28, last) for c in range(10, 70)}
         assert slides({0: two, 1: two}, (0, 12), size=0.15) == is_line
-
-
-def test_nothing_in_nothing_out():
-    assert answers([Scene([], {}, 2, np.zeros((0, 3, 2)))]) == []
-    assert answers([Scene([{1: rail(10, 60)}, {}], {}, 2, np.full((2, 1, 2), 20.0))]) == [[False], [False]]

@@ -12,7 +12,7 @@ from scenes import config, same_bits, scene, sweeps_of
 
 from cflow_torch.verified.candidates import _find_peaks, list_motions, propose
 from cflow_torch.verified.component_tree import find_components
-from cflow_torch.verified.paired_test import VerifiedLevel, best_candidate
+from cflow_torch.verified.paired_test import VerifiedLevel
 
 
 @pytest.mark.parametrize("block", [1, 2])
@@ -70,22 +70,6 @@ def test_motions_by_hand():
     found = list_motions(given, available, torch.tensor([[1.0, 2.0, 3.0]] * 2).double(), [other])
     assert found[0].tolist() == [[3.0, 0.0], [2.0, 0.0], [4.0, 0.0], [3.0, 0.0], [0.5, -1.0]]
     assert found[1].tolist() == [[0.0, 1.5], [0.0, 0.0], [0.0, 1.5], [0.0, 0.0], [0.0, 0.0]]
-
-
-def test_sweeps_that_a_window_lacks_change_no_choice():
-    # A window of two sweeps, alone and in a batch with windows of six. Evidence depends on the motion alone.
-    given, available, intervals, other = random_estimates(4, 1)
-    alone = list_motions(given, available, intervals, [other])
-    padded = [torch.cat((v, v.new_zeros((300, 4, *v.shape[2:]))), 1) for v in (given, available, intervals)]
-    together = list_motions(*padded, [other])
-
-    def evidence(motions: torch.Tensor) -> torch.Tensor:
-        y, x = (3 * motions).floor().long().unbind(2)
-        return ((7 * y - 5 * x) % 11) * (motions != 0).any(2)
-
-    assert (evidence(together) > 0).any(1).sum() > 100
-    for a, b in zip(best_candidate(evidence(alone), alone), best_candidate(evidence(together), together)):
-        assert same_bits(a, b)
 
 
 def test_parts_are_asked_for_the_motion_of_the_whole_and_looked_for_if_they_differ():

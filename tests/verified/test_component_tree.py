@@ -135,12 +135,3 @@ def test_parts_pass_on_the_evidence_of_their_component():
 
 def test_a_part_in_two_wholes_counts_for_the_first():
     assert winners([[-1, 0, 1, 1], [0, 0, 0, 1]], [[3, 2], [3, 1]]) == [(1, 0), (1, 0), (0, 1), (0, 1)]
-
-
-def test_parents_by_hand():
-    above, below = as_level([-1, 0, 0, 0, 1, 1, -1]), as_level([0, 0, 0, -1, 1, 2, 3])
-    parent = below.parents(above)
-    assert parent.tolist() == [0, 1, 1, 2]  # 2 = none
-    assert below.equals_parent(above, parent).tolist() == [False] * 4
-    same = as_level([-1, 0, 0, 0, 1, 2, 3])
-    assert same.equals_parent(above, same.parents(above)).tolist() == [True, False, False, False]

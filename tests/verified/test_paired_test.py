@@ -65,13 +65,6 @@ def test_counts_equal_the_oracle(num_windows, num_steps):
         assert expected.max() > 5
 
 
-def test_pieces_do_not_matter(monkeypatch):
-    whole = Scene(3).found()
-    for looks in (1, 50):
-        monkeypatch.setattr(fast, "_LOOKS_ON_CPU", looks)
-        assert all(same_bits(a, b) for a, b in zip(Scene(3).found(), whole))
-
-
 def test_batch_equals_loop():
     scene = Scene(4, num_windows=3, num_steps=4)
     alone = [scene.found(slice(window, window + 1)) for window in range(3)]
@@ -117,12 +110,3 @@ def test_much_evidence_is_told_apart():
     evidence = torch.tensor([[2**36 - 2, 2**36 - 1, 2**36 - 1], [1, 0, 2**36 - 1]])
     motion, most = fast.best_candidate(evidence, torch.arange(12, dtype=torch.float64).view(2, 3, 2))
     assert motion.tolist() == [[2.0, 3.0], [10.0, 11.0]] and most.tolist() == [2**36 - 1] * 2
-
-
-def test_no_components_and_no_pixels():
-    nothing = torch.zeros((0, 3, 2), dtype=torch.float64)
-    sweeps = from_images(np.zeros((1, 2, 3, 4), dtype=np.uint8))
-    won, lost = fast.count_wins(sweeps, sweeps.pixel, nothing, torch.zeros(0, dtype=torch.bool))
-    assert won.shape == lost.shape == (0, 3)
-    motion, most = fast.best_candidate(fast.evidence_of(won, lost, 2.0), nothing)
-    assert motion.shape == (0, 2) and most.shape == (0,)

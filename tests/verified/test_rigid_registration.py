@@ -12,7 +12,7 @@ from moving_scenes import Scene, moving_scene, one_object, reordered
 from oracle import rigid_registration as oracle
 from scenes import same_bits
 
-from cflow_torch.verified.rigid_motion import RigidMotion, rotate
+from cflow_torch.verified.rigid_motion import RigidMotion
 from cflow_torch.verified.rigid_registration import register
 from cflow_torch.verified.voxel_centroids import UNITS
 
@@ -116,9 +116,3 @@ def test_a_step_is_the_least_squares_of_its_pairs():
         rhs.append(-math.sqrt(20) * UNITS * 2 * turn)
         wanted = np.linalg.lstsq(np.array(rows), np.array(rhs), rcond=None)[0]
         np.testing.assert_allclose(oracle.gauss_newton(pairs, given, way, turn), wanted, rtol=1e-8, atol=1e-9)
-
-
-def test_rotate_is_the_rotation():
-    x, y = rotate(torch.tensor([math.tan(0.15)]), torch.tensor([2.0]), torch.tensor([1.0]))
-    assert abs(float(x) - (2 * math.cos(0.3) - math.sin(0.3))) < 1e-6
-    assert abs(float(y) - (2 * math.sin(0.3) + math.cos(0.3))) < 1e-6

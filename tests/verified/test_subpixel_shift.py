@@ -56,11 +56,6 @@ def test_ties(new, flow, expected_flow):
     assert oracle_shift(window.points(), [flow], window.sweeps) == [expected_flow]
 
 
-def test_slices_do_not_meet_each_other():
-    scene = one_object([np.array([[0.12, 0.02, 0.7]]), np.array([[0.02, 0.02, 0.2]])], (0.02, 0.01))
-    assert torch.equal(shifted(scene), scene.in_pixels())
-
-
 def test_a_known_shift_is_found_to_a_fifth_of_a_pixel():
     """A dense object moved by a fraction of a pixel, from two thirds of a pixel off."""
     rng = np.random.default_rng(0)

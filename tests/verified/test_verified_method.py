@@ -13,7 +13,6 @@ from scenes import (
     config,
     flow_as_oracle,
     needs_gpu,
-    needs_kornia_labelling,
     reordered,
     rows_of,
     scene,
@@ -25,7 +24,7 @@ from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.hdf5.reader import HDF5Log
 from cflow_torch.data.log import window as window_of
 
-NEAR = (-15.0, -10.0, -math.inf, 0.0, 4.0, math.inf)  # the whole takes the oracle minutes
+NEAR = (-12.0, -8.0, -math.inf, 0.0, 4.0, math.inf)  # the whole takes the oracle minutes
 
 
 # ------------------------------------------------------------------------------------------- equal to the oracle
@@ -94,14 +93,6 @@ def test_alone_or_in_a_batch_in_any_order_of_points():
         assert_same_bits(model([mixed])[0], rows_of(result, order))
 
 
-@pytest.mark.parametrize(
-    "engines", [{"correlation": "conv"}, pytest.param({"labeling": "kornia"}, marks=needs_kornia_labelling)]
-)
-def test_engines_do_not_matter(engines):
-    window, settings = scene(6, num_history=1), config("verified", num_history=1)
-    assert_same(VerifiedFlow(settings.replace(**engines))([window])[0], VerifiedFlow(settings)([window])[0])
-
-
 @pytest.mark.cuda
 @needs_gpu
 def test_cuda_equals_cpu():
@@ -143,15 +134,6 @@ def test_a_wall_that_seems_to_slide_stands_still():
     for thorough in (False, True):
         result = flow_as_oracle(window, MODEL.replace(thorough=thorough))
         assert bool((result.residual_flow[:, 0] > 1.0).any()) != thorough
-
-
-def test_what_the_sub_pixel_shift_puts_to_rest_is_not_registered(monkeypatch):
-    model, window = VerifiedFlow(MODEL), turning_car(1)
-    moved = model([window])[0].residual_flow.any(1)
-    monkeypatch.setattr(
-        "cflow_torch.verified.method.shift_between_pixels", lambda points, sweeps, motion: torch.zeros_like(motion)
-    )
-    assert moved.sum() > 5 * model([window])[0].residual_flow.any(1).sum()  # what is left is slow motion
 
 
 def test_longer_than_max_object_does_not_move():
@@ -210,11 +192,3 @@ def mean_error(window: Window, first: int) -> float:
 def test_time_stamps_are_heeded(times):
     assert mean_error(uneven_drive(times), times[0]) < 0.03
     assert mean_error(uneven_drive(times, stamped=False), times[0]) > 0.06  # places say t-1, t-2, ...
-
-
-def test_even_or_missing_time_stamps_are_the_same():
-    with_stamps, without = (
-        VerifiedFlow(MODEL.replace(num_history=2))([uneven_drive((100, 200, 300), stamped)])[0]
-        for stamped in (True, False)
-    )
-    assert_same(with_stamps, without)

@@ -45,12 +45,6 @@ def test_a_relative_transform_maps_through_the_world():
     assert np.allclose(moved, [-1.0, 0.0, 0.0, 1.0], atol=1e-12)
 
 
-def test_a_rigid_transform_keeps_float64():
-    T = pose(1e5 + 1e-7, 2.0, 0.3)
-    assert np.array_equal(rigid_transform(T, "T"), T)
-    assert rigid_transform(pose(1.0, 2.0, 0.3).astype(np.float32), "T").dtype == np.float64
-
-
 @pytest.mark.parametrize(
     "matrix, complaint",
     [

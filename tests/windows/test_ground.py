@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import warnings
 from typing import List, Tuple
 
@@ -175,12 +174,6 @@ def test_real_sweeps_against_the_map_and_the_stored_mask(av2_folder, kitti_file)
     with HDF5Log(kitti_file) as log:
         sweep = log.sweep(7)
         assert overlap(find_ground(sweep.points), sweep.is_ground) > 0.93
-
-
-def test_patchwork_is_optional(monkeypatch, sweeps):
-    monkeypatch.setitem(sys.modules, "pypatchworkpp", None)
-    with pytest.raises(CFlowError, match="pip install pypatchworkpp"):
-        find_ground(sweeps[0].points, method="patchwork")
 
 
 def test_patchwork():

@@ -25,17 +25,13 @@ def refused(*sweeps: Sweep, match: str) -> None:
     "points, complaint",
     [
         (P0[:, :2], r"shape \(50, 2\).*\(N, 3\+\)"),
-        (P0[None], r"shape \(1, 50, 3\)"),
         (np.zeros((3, 1001)), "give its transpose"),
         (P0.astype(np.int64), "dtype int64.*float"),
-        (P0.astype(object), "dtype object"),
         (P0.astype(complex), "dtype complex128"),
         (torch.from_numpy(P0).int(), "dtype torch.int32"),
-        (np.zeros((4, 3), dtype=[("x", "f4")]), "dtype"),
         (np.ma.masked_greater(P0, 0.5), "masked array"),
         (torch.from_numpy(P0).to_sparse(), "layout"),
         (P0.tolist(), "is list"),
-        ("points.npy", "is str"),
     ],
 )
 def test_points_of_the_wrong_kind(points, complaint):
@@ -49,10 +45,8 @@ def test_points_of_the_wrong_kind(points, complaint):
     "mask, complaint",
     [
         (np.zeros(3, dtype=bool), r"shape \(3,\)"),
-        (np.zeros((50, 1), dtype=bool), r"shape \(50, 1\)"),
         (np.zeros(50, dtype=np.uint8), "dtype uint8.*bool"),
         (torch.zeros(50), "dtype torch.float32.*bool"),
-        (np.ma.masked_array(np.zeros(50, bool), [True] * 50), "masked array"),
         ([False] * 50, "is list"),
     ],
 )
