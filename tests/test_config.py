@@ -90,7 +90,7 @@ def test_a_setting_of_version_0_1_says_what_to_do_without(name):
 def test_a_setting_of_another_method_names_that_method():
     for preset, name, owners in (
         ("keypoints", "num_history", "dense and verified"),
-        ("paper", "max_object", "verified"),
+        ("paper", "significance", "verified"),
         ("default", "patch_size", "keypoints"),
         ("default", "clustering", "dense"),
     ):

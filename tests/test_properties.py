@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from oracle.component_tree import with_longest
 from scenes import assert_same, assert_same_bits, flow_as_oracle, pose, reordered, rows_of
 
 from cflow_torch import FlowResult, Sweep, Window, make_model
@@ -67,7 +68,6 @@ verified = st.fixed_dictionaries(
     {
         "connectivity": st.sampled_from([4, 8]),
         "max_speed": st.sampled_from([None, 3.0]),
-        "max_object": st.sampled_from([None, 2 * S, 1.0]),
         "significance": st.sampled_from([0.0, 1.0]),
         "min_height": st.sampled_from([None, 0.2]),
         "pixel_sizes": st.sampled_from([(S,), (4 * S, S), (2 * S, S)]),
@@ -91,9 +91,9 @@ def test_dense_equals_the_oracle(window, overrides):
 
 
 @settings(PROFILE, max_examples=40)
-@given(windows(), verified)
-def test_verified_equals_the_oracle(window, overrides):
-    flow_as_oracle(window, small("verified", **overrides))
+@given(windows(), verified, st.sampled_from([None, 2 * S, 1.0]))
+def test_verified_equals_the_oracle(window, overrides, longest):
+    flow_as_oracle(window, with_longest(small("verified", **overrides), longest))
 
 
 @settings(PROFILE, max_examples=30)

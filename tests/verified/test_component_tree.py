@@ -29,7 +29,7 @@ def random_images(seed: int, shape: tuple, density: float) -> np.ndarray:
 def test_components_equal_the_oracle(block, is_undilated):
     total = 0
     for seed, (shape, density) in enumerate([((2, 3, 23, 1), 0.15), ((3, 2, 40, 45), 0.01), ((2, 4, 63, 60), 0.01)]):
-        settings = config("verified", connectivity=(4, 8)[seed % 2], max_object=1.3, max_extent=3.0)
+        settings = oracle.with_longest(config("verified", connectivity=(4, 8)[seed % 2], max_extent=3.0), 1.3)
         sweeps = from_images(random_images(seed, shape, density))
         level, start = find_components(sweeps, block, is_undilated, settings), 0
         for window in range(shape[0]):
@@ -48,13 +48,13 @@ def test_exactly_the_largest_object_is_not_too_long():
     images = np.zeros((2, 2, 9, 30), dtype=np.uint8)
     images[0, 0, 4, 3:11] = images[1, 0, 1:8, 5] = 1  # t+1: 8 pixels = 2 m, 7 pixels
     images[:, 1, 4, 2:29] = 1  # t is longer
-    for max_object, too_long in (
+    for longest, too_long in (
         (2.0, [False, False]),
         (1.9, [True, False]),
         (0.25, [True, True]),
         (None, [False] * 2),
     ):
-        settings = config("verified", max_object=max_object, max_extent=99.0)
+        settings = oracle.with_longest(config("verified", max_extent=99.0), longest)
         assert find_components(from_images(images), 1, False, settings).too_long.tolist() == too_long
 
 
