@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import os
-import select
 import sys
 import traceback
-from contextlib import suppress
 from difflib import get_close_matches
 from importlib import import_module
 from typing import Any, List, Optional
@@ -20,7 +18,7 @@ COMMANDS = {
     "submit": "write and check an archive for a public leaderboard",
     "plot": "pictures of the flow and of every stage, ground truth beside it, animations",
     "view": "a recording of a drive for the viewer rerun: flow, clusters, truth, on a timeline",
-    "bench": "time every stage against the reference and a plain OpenCV loop",
+    "bench": "time the method and its stages on your data; memory, windows per second",
     "settings": "every setting with its default and its meaning; model files for OpenSceneFlow",
     "info": "packages, machine, devices: to paste into a bug report",
     "completion": "a script that makes a shell complete commands and settings",
@@ -100,12 +98,11 @@ def _run_with_settings(command: str, run: Any, rest: List[str]) -> None:
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
+    from cflow_torch.cli import schemas  # noqa: F401 (registers them)
     from cflow_torch.cli.arguments import for_hydra
     from cflow_torch.cli.refusals import explain
     from cflow_torch.cli.run import UnfinishedJob
     from cflow_torch.types import CFlowError
-
-    given = os.environ.get("HYDRA_FULL_ERROR")
 
     def task(cfg: Any) -> Any:
         try:
@@ -113,9 +110,9 @@ def _run_with_settings(command: str, run: Any, rest: List[str]) -> None:
             return run(cfg)
         except (CFlowError, OmegaConfBaseException) as error:
             _end_wrong(explain(error, command))
+        except UnfinishedJob:
+            raise
         except Exception as error:
-            if given or isinstance(error, UnfinishedJob):
-                raise
             if isinstance(error, OSError) and error.errno is not None:
                 if error.filename is None:
                     _end_refused(error)
@@ -128,8 +125,7 @@ def _run_with_settings(command: str, run: Any, rest: List[str]) -> None:
             raise UnfinishedJob(report) from None
 
     sys.argv = [f"cflow {command}", *for_hydra(rest)]
-    # Hydra prints errors itself, and a closed pipe as one, unless this is set.
-    os.environ["HYDRA_FULL_ERROR"] = "1"
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # else Hydra prints errors itself, and a closed pipe as one
     try:
         hydra.main(version_base="1.3", config_path="pkg://cflow_torch.configs", config_name=command)(task)()
     except UnfinishedJob as error:
@@ -138,12 +134,7 @@ def _run_with_settings(command: str, run: Any, rest: List[str]) -> None:
     except BrokenPipeError:  # of Hydra's own printing
         raise
     except Exception as error:
-        if given:
-            raise
         _end_wrong(explain(error, command))
-    finally:
-        os.environ.pop("HYDRA_FULL_ERROR")
-        os.environ.update({} if given is None else {"HYDRA_FULL_ERROR": given})
 
 
 def _end_wrong(message: object) -> None:
@@ -153,32 +144,12 @@ def _end_wrong(message: object) -> None:
 
 
 def _end_refused(error: OSError) -> None:
-    """End after the system refused something that has no name: mostly to print, on a full disk, to a reader who left.
-
-    What cannot be printed is given up: else it would be tried once more.
-    """
-    status = 1
-    if isinstance(error, BrokenPipeError) and _is_unread():
-        status = 128 + 13  # as if SIGPIPE had ended it
-    else:
-        with suppress(OSError):
-            print(f"error: {error}: no file is named, so it is mostly what this command prints to", file=sys.stderr)
-    try:
-        sys.stdout.flush()
-    except OSError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    raise SystemExit(status) from None
-
-
-def _is_unread() -> bool:
-    """Whether nobody reads what is printed any more (`cflow info | head`): then commands end without a word."""
-    try:
-        poll = select.poll()
-        for stream in (sys.stdout, sys.stderr):
-            poll.register(stream.fileno(), 0)
-        return any(event & (select.POLLERR | select.POLLHUP) for _, event in poll.poll(0))
-    except (AttributeError, OSError, ValueError):  # no such call on this system, no such file
-        return True
+    """End after the system refused to print: on a full disk, or to a reader who left (`cflow info | head`)."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # else it would be tried once more
+    if isinstance(error, BrokenPipeError):
+        raise SystemExit(128 + 13) from None  # as if SIGPIPE had ended it
+    print(f"error: {error}: no file is named, so it is mostly what this command prints to", file=sys.stderr)
+    raise SystemExit(1) from None
 
 
 if __name__ == "__main__":

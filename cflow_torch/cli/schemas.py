@@ -22,45 +22,25 @@ from cflow_torch.cli.choices import CONFIGS, SETTERS, files, groups, own_setting
 from cflow_torch.config import CONFIGS as METHODS
 from cflow_torch.config import PRESETS, Config, make_config
 
-# A name has one type in all commands; one that is not here takes any value.
+# A setting has the type of its default in configs/; one whose default is null or auto takes any value, but for these.
 _TYPES: Dict[str, Any] = {
-    "archive": Optional[str],
     "batches": List[int],
     "cluster": Optional[int],
-    "count": Optional[int],
-    "definition": str,
-    "dry_run": bool,
     "experiment_name": Optional[str],
-    "first": int,
-    "flow": Optional[str],
-    "format": str,
-    "frames": Optional[str],
-    "frames_per_second": float,
-    "legend": str,
-    "log": Optional[str],
-    "masks": Optional[str],
     "max_flow": Optional[float],
-    "num_threads": Optional[int],
-    "output": str,
-    "overwrite": bool,
-    "pair": int,
-    "pairs": int,
-    "picture": str,
-    "repeats": int,
-    "residual_axes": str,
-    "result_name": Optional[str],
-    "resume": bool,
-    "show": bool,
-    "step": int,
-    "width": int,
 }
 
 
 def _schema(file: Path, *bases: type) -> type:
-    names = {name.partition(".")[0] for name in own_settings(file)}
+    types = {name.partition(".")[0]: _type(name, value) for name, value in own_settings(file).items()}
     if not bases:
-        names.update(group for group in groups(file.stem) if group not in SETTERS)
-    return make_dataclass(file.stem, [(name, _TYPES.get(name, Any), MISSING) for name in sorted(names)], bases=bases)
+        types.update({group: Any for group in groups(file.stem) if group not in SETTERS})
+    return make_dataclass(file.stem, [(name, kind, MISSING) for name, kind in types.items()], bases=bases)
+
+
+def _type(name: str, value: Any) -> Any:
+    any_value = value is None or value == "auto" or isinstance(value, list)
+    return _TYPES.get(name, Any if any_value else type(value))
 
 
 def _node(config: Config) -> Any:
@@ -76,12 +56,11 @@ def _register() -> None:
         store(f"base_{method}", _node(kind()), "model")
     for preset in PRESETS:
         store(preset, _node(make_config(preset)), "model")
-    for file in CONFIGS.glob("*.yaml"):
-        if file.stem != "hydra":
-            store(f"base_{file.stem}", _schema(file))
-    plot = _schema(CONFIGS / "plot.yaml")
+    schemas = {file.stem: _schema(file) for file in CONFIGS.glob("*.yaml") if file.stem != "hydra"}
+    for name, schema in schemas.items():
+        store(f"base_{name}", schema)
     for file in files("picture"):
-        store(f"base_{file.stem}", _schema(file, plot), "picture", package="_global_")
+        store(f"base_{file.stem}", _schema(file, schemas["plot"]), "picture", package="_global_")
 
 
 _register()

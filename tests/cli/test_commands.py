@@ -142,14 +142,6 @@ def test_a_failure_ends_a_run_and_leaves_a_sweep_going(monkeypatch: pytest.Monke
         run.finish([("a", "bad")])
 
 
-def test_real_hdf5_data(kitti_file: Path, tmp_path: Path, cflow: Cflow) -> None:
-    pytest.importorskip("h5py")
-    call = ("eval", "data=hdf5", f"data.root={kitti_file}", f"output={tmp_path}", "model=paper", "data.step=3")
-    assert cflow(*call) == 0
-    car = results_of(tmp_path)["results"]["bucketed"]["classes"]["CAR"]
-    assert car["num_dynamic"] > 300 and 0.02 < car["dynamic_error"] < 0.4
-
-
 def test_the_score_of_a_sweep() -> None:
     mean = {"mean": {"dynamic_error": 0.25}}
     assert objective({"bucketed": mean, "three_way": {"epe_3way": 1.0}}) == 0.25
@@ -158,12 +150,9 @@ def test_the_score_of_a_sweep() -> None:
     assert np.isnan(objective({"bucketed": {"mean": {"dynamic_error": None}}}))
 
 
-@pytest.mark.parametrize("call", ["demo pair=0", "eval", "flow"])
-def test_an_output_that_cannot_be_made_is_named(
-    call: str, tmp_path: Path, cflow: Cflow, capsys: pytest.CaptureFixture
-) -> None:
+def test_an_output_that_cannot_be_made_is_named(tmp_path: Path, evaluate: Cflow, capsys: pytest.CaptureFixture) -> None:
     (tmp_path / "file").touch()
-    assert cflow(*call.split(), f"output={tmp_path}/file/below", "data.num_sweeps=2", "model=paper") == 2
+    assert evaluate(f"output={tmp_path}/file/below") == 2
     error = capsys.readouterr().err
     assert f"error: cannot write into {tmp_path}/file/below" in error and "give output=FOLDER" in error
     assert "Traceback" not in error
