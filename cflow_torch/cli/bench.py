@@ -20,7 +20,6 @@ from omegaconf import DictConfig
 
 from cflow_torch.cli import run
 from cflow_torch.data.atomic import ready_folder
-from cflow_torch.data.catalog import open_log
 from cflow_torch.data.log import Log, window
 from cflow_torch.data.records import strict, write_text
 from cflow_torch.fleet.machine import threads
@@ -37,7 +36,7 @@ def task(cfg: DictConfig) -> None:
         raise CFlowError(f"batches={cfg.batches}: give whole numbers of at least 1, as in 'batches=[1,8]'")
     model = run.make_model(cfg)
     sources = run.find_logs(cfg)
-    log = open_log(sources.reader, sources.logs[0], **sources.settings)
+    log = sources.open(sources.logs[0])
     windows = _windows(log, num_pairs, model.config.num_history)
     ready_folder(output)
     with threads(num_threads):
@@ -94,10 +93,10 @@ def format_report(report: Dict[str, Any]) -> str:
     peak = "not known" if report["peak_bytes"] is None else f"{report['peak_bytes'] / 1e6:.0f} MB"
     rows = {"total, median": seconds["median"], "least": seconds["min"], "most": seconds["max"], **seconds["stages"]}
     lines = [
-        f"method {model['method']}, pixel_sizes {model['pixel_sizes']}; torch {report['versions']['torch']}",
+        f"method {model['method']}, num_history {model.get('num_history', 0)}, pixel_sizes {model['pixel_sizes']}",
         f"device {report['device']}; {report['machine']['cpu']}, {report['threads']} thread(s)",
         f"log {report['log']}: {report['windows']} pairs, {report['points']:.0f} points a sweep, each "
-        f"{report['repeats']} times",
+        f"{report['repeats']} times; torch {report['versions']['torch']}",
         f"most memory (CPU: of the process, GPU: allocated there): {peak}",
         "",
         "| one window | ms |",

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import select
 import sys
 import traceback
+from contextlib import suppress
 from difflib import get_close_matches
 from importlib import import_module
 from typing import Any, List, Optional
@@ -144,12 +146,32 @@ def _end_wrong(message: object) -> None:
 
 
 def _end_refused(error: OSError) -> None:
-    """End after the system refused to print: on a full disk, or to a reader who left (`cflow info | head`)."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # else it would be tried once more
-    if isinstance(error, BrokenPipeError):
-        raise SystemExit(128 + 13) from None  # as if SIGPIPE had ended it
-    print(f"error: {error}: no file is named, so it is mostly what this command prints to", file=sys.stderr)
-    raise SystemExit(1) from None
+    """End after the system refused something that has no name: mostly to print, on a full disk, to a reader who left.
+
+    What cannot be printed is given up: else it would be tried once more.
+    """
+    status = 1
+    if isinstance(error, BrokenPipeError) and _is_unread():
+        status = 128 + 13  # as if SIGPIPE had ended it
+    else:
+        with suppress(OSError):
+            print(f"error: {error}: no file is named, so it is mostly what this command prints to", file=sys.stderr)
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    raise SystemExit(status) from None
+
+
+def _is_unread() -> bool:
+    """Whether nobody reads what is printed any more (`cflow info | head`): then commands end without a word."""
+    try:
+        poll = select.poll()
+        for stream in (sys.stdout, sys.stderr):
+            poll.register(stream.fileno(), 0)
+        return any(event & (select.POLLERR | select.POLLHUP) for _, event in poll.poll(0))
+    except (AttributeError, OSError, ValueError):  # no such call on this system, no such file
+        return True
 
 
 if __name__ == "__main__":

@@ -30,7 +30,6 @@ from tqdm import tqdm
 
 from cflow_torch.cli import run
 from cflow_torch.data.atomic import ready_folder
-from cflow_torch.data.catalog import open_log
 from cflow_torch.data.log import Log, RecentSweeps, window
 from cflow_torch.data.log_check import check_log
 from cflow_torch.data.paths import is_remote
@@ -77,13 +76,13 @@ def find_log(cfg: DictConfig) -> Log:
     """
     sources = run.find_logs(cfg)
     if cfg.log is None:
-        return open_log(sources.reader, sources.logs[0], **sources.settings)
+        return sources.open(sources.logs[0])
     # A log mostly has the name of its file or folder: then no other one is opened.
     names = [getattr(source, "stem", source.name) for source in sources.logs]
     chosen = [source for source, name in zip(sources.logs, names) if name == cfg.log]
     for source in chosen or sources.logs:
         with suppress(*(() if chosen else (CFlowError, OSError))):
-            log = open_log(sources.reader, source, **{**sources.settings, "check": False})
+            log = sources.open(source, check=False)
             if log.log_id == cfg.log:
                 if sources.settings.get("check", True):
                     check_log(log)

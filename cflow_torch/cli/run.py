@@ -149,6 +149,10 @@ class Sources(NamedTuple):
     settings: Dict[str, Any]
     logs: List[Any]
 
+    def open(self, source: Any, **changed: Any) -> Log:
+        """One of the logs, with other settings of the reader where they are given; see `open_log`."""
+        return open_log(self.reader, source, **{**self.settings, **changed})
+
 
 def find_logs(cfg: DictConfig) -> Sources:
     """The logs of `cfg.data`; simulated ones are made first, if they are not in the cache.
@@ -185,7 +189,7 @@ def open_logs(cfg: DictConfig) -> Tuple[List[Log], Failures]:
     failures: Failures = []
     for source in sources.logs:
         with reported(failures, source.name):
-            logs.append(open_log(sources.reader, source, **sources.settings))
+            logs.append(sources.open(source))
     return logs, failures
 
 

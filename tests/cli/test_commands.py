@@ -12,13 +12,11 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from cflow_torch import CorrelationFlow, make_config
+from cflow_torch import make_config
 from cflow_torch.cli import run
 from cflow_torch.cli.record import objective
 from cflow_torch.config import config_from
 from cflow_torch.data.av2 import AV2Log
-from cflow_torch.data.flow_file import read_flow
-from cflow_torch.data.log import window
 
 Cflow = Callable[..., int]
 SMALL = "model.point_cloud_range=[-20,-20,-inf,20,20,inf]"
@@ -65,17 +63,6 @@ def test_demo_without_matplotlib_lacks_the_picture_only(
     printed = capsys.readouterr()
     assert "picture: none" in printed.out and "pip install matplotlib" in printed.out and not printed.err
     assert results_of(tmp_path)["num_pairs"] == 1 and not list(tmp_path.glob("*.png"))
-
-
-def test_flow_files_hold_the_method_s_result(log_folder: Path, tmp_path: Path, cflow: Cflow) -> None:
-    call = ("flow", "data=av2", f"data.root={log_folder}", "data.check=false", f"output={tmp_path}", "model=paper")
-    assert cflow(*call, "engine.workers=1") == 0
-    log = AV2Log(log_folder)
-    for index in range(3):
-        (expected,) = CorrelationFlow.from_preset("paper")([window(log, index)])
-        stored = read_flow(tmp_path / log.log_id / f"{log.timestamps[index]}.feather")
-        for name in ("flow", "residual_flow", "cluster_id", "score", "is_valid"):
-            np.testing.assert_array_equal(getattr(stored, name), getattr(expected, name), err_msg=name)
 
 
 def test_a_results_file_says_everything(log_folder: Path, tmp_path: Path, evaluate: Cflow) -> None:
