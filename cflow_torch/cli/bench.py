@@ -12,41 +12,36 @@ examples:
 from __future__ import annotations
 
 import json
-import os
-import platform
 import sys
-from contextlib import contextmanager
-from typing import Any, Dict, Iterator, List, Sequence
+from typing import Any, Dict, List, Sequence
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
-from cflow_torch.cli.run import find_logs, make_model, versions
+from cflow_torch.cli import run
 from cflow_torch.data.atomic import ready_folder
-from cflow_torch.data.catalog import open_log
 from cflow_torch.data.log import Log, window
-from cflow_torch.data.paths import as_path
 from cflow_torch.data.records import strict, write_text
+from cflow_torch.fleet.machine import threads
 from cflow_torch.stages import FlowModel, StopWatch
 from cflow_torch.types import CFlowError, Window
 
 
 def task(cfg: DictConfig) -> None:
     """Run `cflow bench`."""
-    output = as_path(cfg.output)
-    repeats, num_pairs = _count("repeats", cfg.repeats), _count("pairs", cfg.pairs)
-    num_threads = None if cfg.num_threads is None else _count("num_threads", cfg.num_threads)
-    if not OmegaConf.is_list(cfg.batches) or not all(type(size) is int and size > 0 for size in cfg.batches):
-        raise CFlowError(f"batches={cfg.batches}: give a list of whole numbers of at least 1, as in 'batches=[1,8]'")
-    model = make_model(cfg)
-    sources = find_logs(cfg)
-    log = open_log(sources.reader, sources.logs[0], **sources.settings)
+    output = run.output_folder(cfg)
+    repeats, num_pairs = run.whole_number(cfg, "repeats", 1), run.whole_number(cfg, "pairs", 1)
+    num_threads = torch.get_num_threads() if cfg.num_threads is None else run.whole_number(cfg, "num_threads", 1)
+    if any(size < 1 for size in cfg.batches):
+        raise CFlowError(f"batches={cfg.batches}: give whole numbers of at least 1, as in 'batches=[1,8]'")
+    model = run.make_model(cfg)
+    sources = run.find_logs(cfg)
+    log = sources.open(sources.logs[0])
     windows = _windows(log, num_pairs, model.config.num_history)
     ready_folder(output)
-    with using_threads(num_threads) as threads:
-        report = {"log": log.log_id, **measure(model, windows, repeats, list(cfg.batches))}
-    report = {**report, "threads": threads, "machine": machine(), "versions": versions()}
-    report["model"] = model.config.as_dict()
+    with threads(num_threads):
+        report = {"log": log.log_id, **measure(model, windows, repeats, cfg.batches), "machine": run.machine()}
+    report.update(threads=num_threads, versions=run.versions(), model=model.config.as_dict())
     print(format_report(report))
     write_text(output / "bench.json", json.dumps(strict(report), indent=1, allow_nan=False) + "\n")
     print(f"written to {output / 'bench.json'}")
@@ -94,49 +89,25 @@ def measure(model: FlowModel, windows: Sequence[Window], repeats: int, batches: 
 
 def format_report(report: Dict[str, Any]) -> str:
     """What `cflow bench` prints, as Markdown."""
-    seconds, machine_, model = report["seconds"], report["machine"], report["model"]
+    seconds, model = report["seconds"], report["model"]
     peak = "not known" if report["peak_bytes"] is None else f"{report['peak_bytes'] / 1e6:.0f} MB"
-    whose = "of the process" if report["device"] == "cpu" else "allocated on the device"
-    rows = [("total, median", seconds["median"]), ("least", seconds["min"]), ("most", seconds["max"])]
-    rows += list(seconds["stages"].items())
+    rows = {"total, median": seconds["median"], "least": seconds["min"], "most": seconds["max"], **seconds["stages"]}
     lines = [
-        f"method {model['method']}, num_history {model.get('num_history', 0)}, pixel_sizes "
-        f"{model['pixel_sizes']}; device {report['device']}, {report['threads']} thread(s)",
-        f"{machine_['cpu']}, {machine_['cores']} cores; torch {report['versions']['torch']}",
+        f"method {model['method']}, num_history {model.get('num_history', 0)}, pixel_sizes {model['pixel_sizes']}",
+        f"device {report['device']}; {report['machine']['cpu']}, {report['threads']} thread(s)",
         f"log {report['log']}: {report['windows']} pairs, {report['points']:.0f} points a sweep, each "
-        f"{report['repeats']} times",
-        f"most memory {whose}: {peak}",
+        f"{report['repeats']} times; torch {report['versions']['torch']}",
+        f"most memory (CPU: of the process, GPU: allocated there): {peak}",
         "",
-        *_table([["one window", "ms"], *([name, f"{1000 * value:.1f}"] for name, value in rows)]),
+        "| one window | ms |",
+        "|---|---:|",
+        *(f"| {name} | {1000 * value:.1f} |" for name, value in rows.items()),
     ]
     if report["batches"]:
-        cells = [["windows in a batch", "ms", "windows per second"]]
-        for size, figures in report["batches"].items():
-            cells.append([str(size), f"{1000 * figures['median']:.1f}", f"{figures['windows_per_s']:.1f}"])
-        lines += ["", *_table(cells)]
+        lines += ["", "| windows in a batch | ms | windows per second |", "|---|---:|---:|"]
+    for size, figures in report["batches"].items():
+        lines.append(f"| {size} | {1000 * figures['median']:.1f} | {figures['windows_per_s']:.1f} |")
     return "\n".join(lines)
-
-
-def machine() -> Dict[str, Any]:
-    """What times depend on besides the code: "platform", "cpu", "cores"."""
-    try:
-        with open("/proc/cpuinfo", encoding="utf-8") as file:
-            models = [line.split(":", 1)[1].strip() for line in file if line.startswith("model name")]
-    except OSError:
-        models = []
-    cpu = models[0] if models else platform.processor() or "unknown"
-    return {"platform": platform.platform(), "cpu": cpu, "cores": os.cpu_count()}
-
-
-@contextmanager
-def using_threads(number: Any) -> Iterator[int]:
-    """So many threads of torch while it is open, None = as many as it has; yields their number."""
-    before = torch.get_num_threads()
-    try:
-        torch.set_num_threads(number or before)
-        yield torch.get_num_threads()
-    finally:
-        torch.set_num_threads(before)
 
 
 def _windows(log: Log, count: int, num_history: int) -> List[Window]:
@@ -147,12 +118,6 @@ def _windows(log: Log, count: int, num_history: int) -> List[Window]:
     return [window(log, first + (last - first) * i // max(count - 1, 1), num_history) for i in range(count)]
 
 
-def _count(name: str, value: Any) -> int:
-    if type(value) is not int or value < 1:
-        raise CFlowError(f"{name}={value}: give a whole number of at least 1")
-    return value
-
-
 def _most_resident() -> Any:
     """Bytes that the process held at most since it began; None where the system does not say."""
     try:
@@ -161,8 +126,3 @@ def _most_resident() -> Any:
         return None
     most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return most if sys.platform == "darwin" else 1024 * most
-
-
-def _table(rows: Sequence[Sequence[str]]) -> List[str]:
-    rule = ["---", *["---:"] * (len(rows[0]) - 1)]
-    return ["| " + " | ".join(row) + " |" for row in (rows[0], rule, *rows[1:])]

@@ -14,6 +14,7 @@ from cflow_torch.config import PRESETS, make_config
 from cflow_torch.data.records import flat
 
 CONFIGS = Path(cflow_torch.configs.__path__[0])
+SETTERS = ("experiment", "row")  # groups that set what others bring
 
 
 def groups(command: str) -> Dict[str, List[str]]:
@@ -30,23 +31,22 @@ def files(group: str) -> List[Path]:
 
 def settings(command: str) -> Dict[str, Any]:
     """Every setting of a command in dotted form, with its value in one of the choices of its group."""
-    found = _settings(CONFIGS / f"{command}.yaml", "")
+    found = dict(own_settings(CONFIGS / f"{command}.yaml"))
     for preset in PRESETS:
         found.update({f"model.{name}": value for name, value in make_config(preset).as_dict().items()})
     for group in groups(command):
-        if group not in ("experiment", "row"):  # they set what others bring
+        if group not in SETTERS:
+            prefix = "" if group == "picture" else f"{group}."
             for file in files(group):
-                found.update(_settings(file, f"{group}."))
+                found.update({f"{prefix}{name}": value for name, value in own_settings(file).items()})
     return found
 
 
 @lru_cache(maxsize=None)  # commands share the files of groups
-def _settings(file: Path, prefix: str) -> Dict[str, Any]:
-    text = file.read_text(encoding="utf-8")
-    prefix = "" if "@package _global_" in text else prefix
-    values: Dict[str, Any] = OmegaConf.to_container(OmegaConf.create(text))  # type: ignore[assignment]
-    values = {key: value for key, value in values.items() if key not in ("defaults", "hydra")}
-    return {f"{prefix}{key}": value for key, value in flat(values).items()}
+def own_settings(file: Path) -> Dict[str, Any]:
+    """The settings that a YAML file gives, in dotted form."""
+    values: Dict[str, Any] = OmegaConf.to_container(OmegaConf.load(file))  # type: ignore[assignment]
+    return flat({key: value for key, value in values.items() if key not in ("defaults", "hydra")})
 
 
 def near(word: str, known: Iterable[str]) -> str:

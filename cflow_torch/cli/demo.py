@@ -15,49 +15,44 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from cflow_torch.cli.record import report
-from cflow_torch.cli.run import finish, for_each_pair, make_model, open_logs, output_folder
+from cflow_torch.cli import run
+from cflow_torch.cli.record import Scores
 from cflow_torch.data.atomic import ready_folder, remove_stale
 from cflow_torch.data.flow_file import write_flow
 from cflow_torch.data.log import Log
 from cflow_torch.data.names import folder_in
-from cflow_torch.evaluation.frame import EvalFrame
-from cflow_torch.evaluation.metrics import SceneFlowMetrics
-from cflow_torch.model import SceneFlowModel
+from cflow_torch.stages import StopWatch
 from cflow_torch.types import CFlowError, FlowResult, Window
 from cflow_torch.viz.bev import plot_flow, save_picture
 
 
 def task(cfg: DictConfig) -> None:
     """Run `cflow demo`."""
-    output, picture = output_folder(cfg), "none"
-    metrics = SceneFlowMetrics(cfg.definition)
-    model = make_model(cfg)
-    logs, failures = open_logs(cfg)
-    num_pairs = max((len(log.timestamps) - 1 for log in logs), default=0)
-    if logs and not 0 <= cfg.pair < num_pairs:
-        raise CFlowError(f"pair={cfg.pair}: the drive has {num_pairs} pairs, give 0 ... {num_pairs - 1}")
+    output, picture = run.output_folder(cfg), "none"
+    scores = Scores(cfg)
+    model = StopWatch(run.make_model(cfg))
+    logs, failures = run.open_logs(cfg)
+    if logs:
+        run.check_pair(cfg.pair, max(logs, key=lambda log: len(log.timestamps)))
     ready_folder(output)
 
     def keep(log: Log, index: int, sweeps: Window, result: FlowResult) -> None:
         nonlocal picture
         write_flow(folder_in(output, log.log_id, "the log") / f"{log.timestamps[index]}.feather", result)
-        labels = log.labels(index)
-        if labels is not None:
-            metrics.update(EvalFrame.from_result(sweeps, result, labels))
+        scores.add(log, index, sweeps, result)
         if index == cfg.pair:
             picture = _draw(log, model, sweeps, result, output)
 
     for log in logs:
         remove_stale(output / log.log_id)
-    failures += for_each_pair(logs, model, keep, lambda log: range(len(log.timestamps) - 1))
-    report(cfg, metrics, output)
+    failures += run.for_each_pair(logs, model, keep, lambda log: range(len(log.timestamps) - 1))
+    scores.report(output, logs, model.report(), failures)
     print(f"picture: {picture}")
     print(f"flow files, scores, settings: {output}")
-    finish(failures)
+    run.finish(failures)
 
 
-def _draw(log: Log, model: SceneFlowModel, sweeps: Window, result: FlowResult, output: Path) -> str:
+def _draw(log: Log, model: StopWatch, sweeps: Window, result: FlowResult, output: Path) -> str:
     """The file of the picture, or why there is none: matplotlib is an extra."""
     try:
         figure = plot_flow(

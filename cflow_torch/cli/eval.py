@@ -14,61 +14,32 @@ examples:
 from __future__ import annotations
 
 from contextlib import suppress
-from typing import Any
 
 from omegaconf import DictConfig
 
-from cflow_torch.cli.record import DataIdentity, finished_results, objective, report
-from cflow_torch.cli.run import (
-    UnfinishedJob,
-    chosen_pairs,
-    finish,
-    for_each_pair,
-    make_model,
-    open_logs,
-    output_folder,
-)
+from cflow_torch.cli import run
+from cflow_torch.cli.record import Scores, finished_results, objective
 from cflow_torch.data.atomic import ready_folder
-from cflow_torch.data.log import Log
-from cflow_torch.evaluation.frame import EvalFrame
-from cflow_torch.evaluation.metrics import SceneFlowMetrics
 from cflow_torch.stages import StopWatch
-from cflow_torch.types import CFlowError, FlowResult, Window
+from cflow_torch.types import CFlowError
 
 
 def task(cfg: DictConfig) -> float:
     """Run `cflow eval`; returns the score of a sweep, see `objective`."""
-    output = output_folder(cfg)
-    pairs = chosen_pairs(cfg, "data.")
+    output = run.output_folder(cfg)
+    pairs = run.chosen_pairs(cfg, "data.")
     record = finished_results(cfg, output)
     if record is not None:
         print(f"skipped, done before: {output}")
         return objective(record["results"])
-    metrics = SceneFlowMetrics(cfg.definition)
-    model = StopWatch(make_model(cfg))
-    logs, failures = open_logs(cfg)
-    identity = DataIdentity()
+    scores = Scores(cfg)
+    model = StopWatch(run.make_model(cfg))
+    logs, failures = run.open_logs(cfg)
     ready_folder(output)
-
-    def score(log: Log, index: int, sweeps: Window, result: FlowResult) -> None:
-        labels = log.labels(index)
-        if labels is not None:
-            parts = {"eval_mask": _of(log, "eval_mask", index)}
-            if metrics.definition.ego_motion == "stored":
-                parts["stored_motion"] = _of(log, "stored_motion", index)
-            metrics.update(EvalFrame.from_result(sweeps, result, labels, **parts))
-            identity.add(sweeps, labels)
-
-    failures += for_each_pair(logs, model, score, pairs)
-    if metrics.num_frames == 0:
+    failures += run.for_each_pair(logs, model, scores.add, pairs)
+    if scores.metrics.num_frames == 0:
         raise CFlowError("no pair has labels: nothing to score; `cflow flow` estimates the flow without them")
-    results = report(cfg, metrics, output, data=identity.report(cfg, logs), seconds=model.report(), failures=failures)
-    with suppress(UnfinishedJob):  # a job of a sweep has a score all the same; a run on its own ends with status 1
-        finish(failures)
+    results = scores.report(output, logs, model.report(), failures)
+    with suppress(run.UnfinishedJob):  # a job of a sweep has a score all the same; a run on its own ends with status 1
+        run.finish(failures)
     return objective(results)
-
-
-def _of(log: Log, name: str, index: int) -> Any:
-    """What a log knows about a pair beyond the protocol; None where it does not."""
-    find = getattr(log, name, None)
-    return None if find is None else find(index)

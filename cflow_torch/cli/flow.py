@@ -31,16 +31,9 @@ from typing import Any, Dict, Sequence, Tuple
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
-from cflow_torch.cli.run import (
-    Failures,
-    UnfinishedJob,
-    find_logs,
-    is_sweep,
-    make_model,
-    output_folder,
-    reported,
-    versions,
-)
+from cflow_torch.cli import run
+from cflow_torch.cli.run import Failures
+from cflow_torch.data.atomic import ready_folder
 from cflow_torch.data.flow_file import CONTENTS, ON_REQUEST, read_flow
 from cflow_torch.data.hdf5.results import check_result_name, check_writable, write_hdf5_results
 from cflow_torch.data.records import write_text
@@ -56,7 +49,7 @@ from cflow_torch.types import CFlowError
 
 def task(cfg: DictConfig) -> None:
     """Run `cflow flow`."""
-    output = output_folder(cfg)
+    output = run.output_folder(cfg)
     shard = find_shard(cfg.shard.index, cfg.shard.count, os.environ)
     if cfg.result_name is not None:
         _check_results(cfg, shard)
@@ -64,9 +57,9 @@ def task(cfg: DictConfig) -> None:
     engine = dict(settings["engine"])
     name, workers, threads, batch = (engine.pop(key) for key in ("name", "workers", "threads", "batch"))
     layout = choose_layout(cfg.device, workers, threads, batch, os.environ)
-    config = make_model(cfg).config
+    config = run.make_model(cfg).config
     contents = _contents(cfg, config.method == "verified")
-    sources = find_logs(cfg)
+    sources = run.find_logs(cfg)
     identity = make_identity(config, sources.reader, sources.settings, contents)
     job = Job(
         config=config,
@@ -88,14 +81,11 @@ def task(cfg: DictConfig) -> None:
     if cfg.result_name is not None:
         for scene in sources.logs:
             check_writable(scene)
-    kept = {**{key: settings[key] for key in ("model", "data", "result_name")}, "versions": versions()}
-    try:
-        claim_folder(output, identity, cfg.resume, cfg.overwrite, shard.count == 1)
-        write_text(output / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(kept)))
-    except OSError as error:
-        raise CFlowError(f"cannot write into {output} ({error}): make room there, or give output=FOLDER") from error
-
-    about = {"config": settings, "versions": versions()}
+    kept = {**{key: settings[key] for key in ("model", "data", "result_name")}, "versions": run.versions()}
+    ready_folder(output)
+    claim_folder(output, identity, cfg.resume, cfg.overwrite, shard.count == 1)
+    write_text(output / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(kept)))
+    about = {"config": settings, "versions": run.versions()}
     report = run_fleet(job, sources.logs, layout, shard, name, about, **engine)
     missing = format_missing(report)
     status = report["exit_status"]
@@ -107,8 +97,8 @@ def task(cfg: DictConfig) -> None:
     print(f"{format_report(report)}\nflow files in {output}, {where}")
     if status:
         print(f"missing:\n{missing}", file=sys.stderr)
-        if is_sweep():  # Hydra lets the other jobs run before it ends with status 1
-            raise UnfinishedJob(f"not every frame is there: see {report_file(job.output, shard)}")
+        if run.is_sweep():  # Hydra lets the other jobs run before it ends with status 1
+            raise run.UnfinishedJob(f"not every frame is there: see {report_file(job.output, shard)}")
         raise SystemExit(status)
 
 
@@ -139,7 +129,7 @@ def _into_scenes(name: str, scenes: Sequence[Path], output: Path) -> Failures:
     for scene in tqdm(scenes, desc=name, unit="scene", disable=None):
         folder = output / scene.stem
         stamps = sorted(complete_frames(folder))
-        with reported(failures, scene.stem):
+        with run.reported(failures, scene.stem):
             count += write_hdf5_results(scene, name, ((t, read_flow(frame_file(folder, t)).flow) for t in stamps))
     print(f"sweeps that now have a key {name} in their scene: {count} (the last sweep of a scene has no flow)")
     return failures

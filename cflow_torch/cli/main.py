@@ -20,7 +20,7 @@ COMMANDS = {
     "submit": "write and check an archive for a public leaderboard",
     "plot": "pictures of the flow and of every stage, ground truth beside it, animations",
     "view": "a recording of a drive for the viewer rerun: flow, clusters, truth, on a timeline",
-    "bench": "time every stage against the reference and a plain OpenCV loop",
+    "bench": "time the method and its stages on your data; memory, windows per second",
     "settings": "every setting with its default and its meaning; model files for OpenSceneFlow",
     "info": "packages, machine, devices: to paste into a bug report",
     "completion": "a script that makes a shell complete commands and settings",
@@ -100,12 +100,11 @@ def _run_with_settings(command: str, run: Any, rest: List[str]) -> None:
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
+    from cflow_torch.cli import schemas  # noqa: F401 (registers them)
     from cflow_torch.cli.arguments import for_hydra
     from cflow_torch.cli.refusals import explain
     from cflow_torch.cli.run import UnfinishedJob
     from cflow_torch.types import CFlowError
-
-    given = os.environ.get("HYDRA_FULL_ERROR")
 
     def task(cfg: Any) -> Any:
         try:
@@ -113,9 +112,9 @@ def _run_with_settings(command: str, run: Any, rest: List[str]) -> None:
             return run(cfg)
         except (CFlowError, OmegaConfBaseException) as error:
             _end_wrong(explain(error, command))
+        except UnfinishedJob:
+            raise
         except Exception as error:
-            if given or isinstance(error, UnfinishedJob):
-                raise
             if isinstance(error, OSError) and error.errno is not None:
                 if error.filename is None:
                     _end_refused(error)
@@ -128,8 +127,7 @@ def _run_with_settings(command: str, run: Any, rest: List[str]) -> None:
             raise UnfinishedJob(report) from None
 
     sys.argv = [f"cflow {command}", *for_hydra(rest)]
-    # Hydra prints errors itself, and a closed pipe as one, unless this is set.
-    os.environ["HYDRA_FULL_ERROR"] = "1"
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # else Hydra prints errors itself, and a closed pipe as one
     try:
         hydra.main(version_base="1.3", config_path="pkg://cflow_torch.configs", config_name=command)(task)()
     except UnfinishedJob as error:
@@ -138,12 +136,7 @@ def _run_with_settings(command: str, run: Any, rest: List[str]) -> None:
     except BrokenPipeError:  # of Hydra's own printing
         raise
     except Exception as error:
-        if given:
-            raise
         _end_wrong(explain(error, command))
-    finally:
-        os.environ.pop("HYDRA_FULL_ERROR")
-        os.environ.update({} if given is None else {"HYDRA_FULL_ERROR": given})
 
 
 def _end_wrong(message: object) -> None:

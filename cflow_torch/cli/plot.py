@@ -19,6 +19,7 @@ examples:
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Callable, Dict, List, Optional
@@ -27,9 +28,8 @@ import numpy as np
 from omegaconf import DictConfig
 from tqdm import tqdm
 
-from cflow_torch.cli.run import chosen_pairs, find_logs, make_model, output_folder
+from cflow_torch.cli import run
 from cflow_torch.data.atomic import ready_folder
-from cflow_torch.data.catalog import open_log
 from cflow_torch.data.log import Log, RecentSweeps, window
 from cflow_torch.data.log_check import check_log
 from cflow_torch.data.paths import is_remote
@@ -50,18 +50,16 @@ FORMATS = ("gif", "mp4")
 
 def task(cfg: DictConfig) -> None:
     """Run `cflow plot`."""
-    output = output_folder(cfg)
+    output = run.output_folder(cfg)
     if is_remote(output):
         raise CFlowError(f"output={cfg.output}: pictures are written to a folder of this machine")
     blank_figure((1, 1), 100)  # without matplotlib: now, not after the work
-    model = make_model(cfg)
+    model = run.make_model(cfg)
     if cfg.picture == "animation":
         path = _animate(cfg, model, output)
     else:
         pair, log = cfg.pair, find_log(cfg)
-        last = len(log.timestamps) - 2
-        if not 0 <= pair <= last:
-            raise CFlowError(f"pair={pair}: log {log.log_id} has {last + 2} sweeps, so pairs 0 to {last}")
+        run.check_pair(pair, log)
         sweeps = window(log, pair, model.config.num_history)
         ready_folder(output)
         figure = PICTURES[cfg.picture](cfg, model, log, sweeps)
@@ -76,26 +74,20 @@ def find_log(cfg: DictConfig) -> Log:
     Raises:
         CFlowError: no log of that name, or it cannot be opened.
     """
-    sources = find_logs(cfg)
+    sources = run.find_logs(cfg)
     if cfg.log is None:
-        return open_log(sources.reader, sources.logs[0], **sources.settings)
+        return sources.open(sources.logs[0])
     # A log mostly has the name of its file or folder: then no other one is opened.
-    names = {source: getattr(source, "stem", source.name) for source in sources.logs}
-    seen = []
-    for source in sorted(names, key=lambda source: names[source] != cfg.log):
-        try:
-            log = open_log(sources.reader, source, **{**sources.settings, "check": False})
-        except (CFlowError, OSError) as error:
-            if names[source] == cfg.log:
-                raise
-            seen.append(f"{names[source]} ({error})")
-            continue
-        if log.log_id == cfg.log:
-            if sources.settings.get("check", True):
-                check_log(log)
-            return log
-        seen.append(log.log_id)
-    raise CFlowError(f"log={cfg.log}: there is no such log; there are {', '.join(sorted(seen))}")
+    names = [getattr(source, "stem", source.name) for source in sources.logs]
+    chosen = [source for source, name in zip(sources.logs, names) if name == cfg.log]
+    for source in chosen or sources.logs:
+        with suppress(*(() if chosen else (CFlowError, OSError))):
+            log = sources.open(source, check=False)
+            if log.log_id == cfg.log:
+                if sources.settings.get("check", True):
+                    check_log(log)
+                return log
+    raise CFlowError(f"log={cfg.log}: there is no such log; there are {', '.join(sorted(names))}")
 
 
 def _from_above(cfg: DictConfig, model: SceneFlowModel, log: Log, sweeps: Window) -> Any:
@@ -137,7 +129,7 @@ def _animate(cfg: DictConfig, model: SceneFlowModel, output: Path) -> Path:
     """Flow of several pairs, then their pictures; nothing is written if one of them fails."""
     if cfg.format not in FORMATS:
         raise CFlowError(f"format={cfg.format}: give one of {', '.join(FORMATS)}")
-    chosen, log = chosen_pairs(cfg), find_log(cfg)
+    chosen, log = run.chosen_pairs(cfg), find_log(cfg)
     recent = RecentSweeps(log, model.config.num_history + 2)
     pairs = chosen(log)
     if not pairs:

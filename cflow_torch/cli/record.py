@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import platform
 import re
 from dataclasses import asdict
 from datetime import datetime, timezone
@@ -13,38 +11,84 @@ from pathlib import Path
 from typing import Any, Dict, Optional, Sequence
 
 import numpy as np
-import torch
 from omegaconf import DictConfig, OmegaConf
 
-from cflow_torch.cli.run import Failures, versions, write_config
-from cflow_torch.data.log import FlowLabels, Log
+from cflow_torch.cli.run import Failures, machine, versions, write_config
+from cflow_torch.data.log import Log
 from cflow_torch.data.records import changes, strict, write_text
+from cflow_torch.evaluation.frame import EvalFrame
 from cflow_torch.evaluation.metrics import SceneFlowMetrics
 from cflow_torch.evaluation.tables import format_table
 from cflow_torch.simulator.benchmark import generator_key
-from cflow_torch.types import CFlowError, Window
+from cflow_torch.types import CFlowError, FlowResult, Window
 
 RESULTS = "results.json"
 # Settings that say where things lie, not what is computed.
 _PLACES = ("config.output", "config.overwrite", "config.data.cache")
 
 
-class DataIdentity:
-    """What exactly was scored: the logs, and a digest of all scored points and labels."""
+class Scores:
+    """Scores of a run by `cfg.definition`, and a digest of all scored points and labels."""
 
-    def __init__(self) -> None:
-        self._digest = hashlib.sha256()
+    def __init__(self, cfg: DictConfig) -> None:
+        self.metrics = SceneFlowMetrics(cfg.definition)
+        self._cfg, self._digest = cfg, hashlib.sha256()
 
-    def add(self, sweeps: Window, labels: FlowLabels) -> None:
-        """Count in one scored pair."""
+    def add(self, log: Log, index: int, sweeps: Window, result: FlowResult) -> None:
+        """Count in the flow of one pair, if the pair has labels."""
+        labels = log.labels(index)
+        if labels is None:
+            return
+        parts = {"eval_mask": _if_known(log, "eval_mask", index)}
+        if self.metrics.definition.ego_motion == "stored":
+            parts["stored_motion"] = _if_known(log, "stored_motion", index)
+        self.metrics.update(EvalFrame.from_result(sweeps, result, labels, **parts))
         for values in (sweeps.pc0.points, labels.flow, labels.category, labels.is_valid):
             self._digest.update(np.ascontiguousarray(values).tobytes())
 
-    def report(self, cfg: DictConfig, logs: Sequence[Log]) -> Dict[str, Any]:
-        """ "label", "generator" (synthetic benchmark only), "logs", "digest"."""
-        sizes = [{"log_id": log.log_id, "sweeps": len(log.timestamps)} for log in logs]
-        digest = self._digest.hexdigest()[:16]
-        return {"label": cfg.data.label, "generator": _generator(cfg), "logs": sizes, "digest": digest}
+    def report(self, folder: Path, logs: Sequence[Log], seconds: Dict[str, Any], failures: Failures) -> Dict[str, Any]:
+        """Print the scores, write `folder/results.json` and `folder/config.yaml`, each whole or not at all.
+
+        Args:
+            folder: made if absent.
+            logs: that were scored.
+            seconds: what `StopWatch.report` returned.
+            failures: pairs and logs that could not be used.
+
+        Returns:
+            What `metrics.compute` returned.
+        """
+        results = self.metrics.compute()
+        data = {
+            "label": self._cfg.data.label,
+            "generator": _generator(self._cfg),
+            "logs": [{"log_id": log.log_id, "sweeps": len(log.timestamps)} for log in logs],
+            "digest": self._digest.hexdigest()[:16],
+        }
+        record = {
+            "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+            "versions": versions(),
+            "machine": machine(),
+            "num_pairs": results["num_frames"],
+            "failures": [list(failure) for failure in failures],
+            "seconds_per_pair": seconds,
+            "data": data,
+            "config": _plain(self._cfg),
+            "definition": asdict(self.metrics.definition),
+            "results": results,
+        }
+        write_config(self._cfg, folder)
+        text = json.dumps(strict(record), indent=1, allow_nan=False)
+        lists = re.compile(r"\[\n\s*([^][{}]*?)\n\s*\]")  # each on one line
+        write_text(folder / RESULTS, lists.sub(lambda found: f"[{' '.join(found[1].split())}]", text) + "\n")
+        print(f"{folder}: {format_table(results)}")
+        return results
+
+
+def _if_known(log: Log, name: str, index: int) -> Any:
+    """What a log knows about a pair beyond the protocol; None where it does not."""
+    find = getattr(log, name, None)
+    return None if find is None else find(index)
 
 
 def finished_results(cfg: DictConfig, folder: Path) -> Optional[Dict[str, Any]]:
@@ -64,56 +108,26 @@ def finished_results(cfg: DictConfig, folder: Path) -> Optional[Dict[str, Any]]:
         raise CFlowError(
             f"{file} is no results file of this version ({error!r}): give output=FOLDER, or overwrite=true"
         ) from None
-    changed = changes(before, {"versions": versions(), "generator": _generator(cfg), "config": _plain(cfg)}, _PLACES)
-    if changed:
-        raise CFlowError(f"{folder} holds results of another run ({changed}): give output=FOLDER, or overwrite=true")
+    now = {"versions": versions(), "generator": _generator(cfg), "config": _plain(cfg)}
+    refuse_changes(folder, before, now, _PLACES)
     return record
 
 
-def report(
-    cfg: DictConfig,
-    metrics: SceneFlowMetrics,
-    folder: Path,
-    data: Optional[Dict[str, Any]] = None,
-    seconds: Optional[Dict[str, Any]] = None,
-    failures: Failures = (),  # type: ignore[assignment]
-) -> Dict[str, Any]:
-    """Print the scores, write `folder/results.json` and `folder/config.yaml`, each whole or not at all.
+def refuse_changes(folder: Path, before: Dict[str, Any], now: Dict[str, Any], ignored: Sequence[str] = ()) -> None:
+    """Results of different runs are never mixed.
 
     Args:
-        cfg: resolved settings.
-        metrics: of all pairs.
-        folder: made if absent.
-        data: what `DataIdentity.report` returned.
-        seconds: what `StopWatch.report` returned.
-        failures: pairs and logs that could not be used.
+        folder: that holds results.
+        before: what they were made with.
+        now: what this run would be made with.
+        ignored: names of settings, joined by dots, that may differ.
 
-    Returns:
-        What `metrics.compute` returned.
+    Raises:
+        CFlowError: anything else differs.
     """
-    results = metrics.compute()
-    record = {
-        "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
-        "versions": versions(),
-        "machine": {
-            "platform": platform.platform(),
-            "cores": os.cpu_count(),
-            "threads": torch.get_num_threads(),
-        },
-        "num_pairs": results["num_frames"],
-        "failures": [list(failure) for failure in failures],
-        "seconds_per_pair": seconds,
-        "data": data,
-        "config": _plain(cfg),
-        "definition": asdict(metrics.definition),
-        "results": results,
-    }
-    write_config(cfg, folder)
-    text = json.dumps(strict(record), indent=1, allow_nan=False)
-    lists = re.compile(r"\[\n\s*([^][{}]*?)\n\s*\]")  # each on one line
-    write_text(folder / RESULTS, lists.sub(lambda found: f"[{' '.join(found[1].split())}]", text) + "\n")
-    print(f"{folder}: {format_table(results)}")
-    return results
+    changed = changes(before, now, ignored)
+    if changed:
+        raise CFlowError(f"{folder} holds results of another run ({changed}): give output=FOLDER, or overwrite=true")
 
 
 def objective(results: Dict[str, Any]) -> float:

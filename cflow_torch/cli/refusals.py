@@ -6,8 +6,7 @@ import re
 
 from hydra.errors import MissingConfigException, OverrideParseException
 
-from cflow_torch.cli.choices import groups, near, settings
-from cflow_torch.cli.schemas import PICTURES
+from cflow_torch.cli.choices import files, groups, near, own_settings, settings
 from cflow_torch.config import CONFIGS
 from cflow_torch.types import CFlowError
 
@@ -44,7 +43,7 @@ def _unknown(key: str, kind: str, command: str) -> str:
         except CFlowError as error:
             if not str(error).startswith("unknown"):
                 return str(error)
-    owners = [f"picture={picture}" for picture, types in PICTURES.items() if key in types]
+    owners = [f"picture={file.stem}" for file in files("picture") if key in own_settings(file)]
     if command == "plot" and owners:
         return f"setting {key!r} belongs to {' or '.join(owners)}: give that as well, or leave it out"
     known = [*groups(command), *settings(command)]

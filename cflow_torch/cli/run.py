@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-import math
+import os
 import platform
 import re
 import sys
@@ -18,7 +18,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from cflow_torch import __version__, estimate
-from cflow_torch.config import CONFIGS, PRESETS, config_from
+from cflow_torch.config import config_from
 from cflow_torch.data.catalog import find_sources, open_log
 from cflow_torch.data.log import Log, RecentSweeps, window
 from cflow_torch.data.names import is_safe_name
@@ -51,16 +51,23 @@ def versions() -> Dict[str, str]:
     }
 
 
+def machine() -> Dict[str, Any]:
+    """What times depend on besides the code: "platform", "cpu", "cores", "threads" (of torch)."""
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8") as file:
+            models = [line.split(":", 1)[1].strip() for line in file if line.startswith("model name")]
+    except OSError:
+        models = []
+    cpu = models[0] if models else platform.processor() or "unknown"
+    return {"platform": platform.platform(), "cpu": cpu, "cores": os.cpu_count(), "threads": torch.get_num_threads()}
+
+
 def make_model(cfg: DictConfig) -> SceneFlowModel:
     """The method that `cfg.model` and `cfg.device` describe.
 
     Raises:
         CFlowError: an unknown or invalid setting.
     """
-    schema = OmegaConf.get_type(cfg.model)
-    if schema in CONFIGS.values() and schema is not CONFIGS.get(cfg.model.method):
-        presets = ", ".join(f"model={preset} ({method})" for preset, (method, _) in PRESETS.items())
-        raise CFlowError(f"model.method={cfg.model.method}: choose a preset, which brings its method: {presets}")
     settings: Dict[str, Any] = OmegaConf.to_container(cfg.model, resolve=True)  # type: ignore[assignment]
     return estimate.make_model(config_from(settings), cfg.device)
 
@@ -111,17 +118,28 @@ def chosen_pairs(cfg: DictConfig, group: str = "") -> Callable[[Log], range]:
     Raises:
         CFlowError: one of them is no whole number or too small.
     """
-    first, step = _whole(cfg, f"{group}first", 0), _whole(cfg, f"{group}step", 1)
-    count = None if OmegaConf.select(cfg, "count") is None else _whole(cfg, "count", 1)
+    first, step = whole_number(cfg, f"{group}first", 0), whole_number(cfg, f"{group}step", 1)
+    count = None if OmegaConf.select(cfg, "count") is None else whole_number(cfg, "count", 1)
     return lambda log: range(first, len(log.timestamps) - 1, step)[:count]
 
 
-def _whole(cfg: DictConfig, key: str, least: float = -math.inf) -> int:
+def whole_number(cfg: DictConfig, key: str, least: int) -> int:
+    """A setting, by its dotted name, that is at least so much.
+
+    Raises:
+        CFlowError: it is no whole number, or too small.
+    """
     value = OmegaConf.select(cfg, key)
     if type(value) is not int or value < least:
-        bound = f" of at least {least}" if least > -math.inf else ""
-        raise CFlowError(f"{key}={value}: give a whole number{bound}")
+        raise CFlowError(f"{key}={value}: give a whole number of at least {least}")
     return value
+
+
+def check_pair(pair: int, log: Log) -> None:
+    """Refuse the number of a pair that the log does not have."""
+    last = len(log.timestamps) - 2
+    if not 0 <= pair <= last:
+        raise CFlowError(f"pair={pair}: log {log.log_id} has pairs 0 to {last}")
 
 
 class Sources(NamedTuple):
@@ -130,6 +148,10 @@ class Sources(NamedTuple):
     reader: str
     settings: Dict[str, Any]
     logs: List[Any]
+
+    def open(self, source: Any, **changed: Any) -> Log:
+        """One of the logs, with other settings of the reader where they are given; see `open_log`."""
+        return open_log(self.reader, source, **{**self.settings, **changed})
 
 
 def find_logs(cfg: DictConfig) -> Sources:
@@ -140,16 +162,14 @@ def find_logs(cfg: DictConfig) -> Sources:
     """
     data = cfg.data
     if data.name == "synthetic":
-        drives = [_whole(cfg, "data.seed")]
-        return Sources(
-            "av2", {"check": False}, benchmark_logs(data.cache, "av2", drives, _whole(cfg, "data.num_sweeps"))
-        )
+        seed, num_sweeps = whole_number(cfg, "data.seed", 0), whole_number(cfg, "data.num_sweeps", 1)
+        logs = benchmark_logs(data.cache, "av2", [seed], num_sweeps)
+        return Sources("av2", {"check": False}, logs)
     if data.name == "benchmark":
-        first, num_drives, num_sweeps = (
-            _whole(cfg, f"data.{key}") for key in ("first_seed", "num_drives", "num_sweeps")
-        )
+        first, num_drives = whole_number(cfg, "data.first_seed", 0), whole_number(cfg, "data.num_drives", 1)
+        seeds, num_sweeps = range(first, first + num_drives), whole_number(cfg, "data.num_sweeps", 1)
         chosen = format_of(data.profile)
-        logs = benchmark_logs(data.cache, data.profile, range(first, first + num_drives), num_sweeps, data.scenes)
+        logs = benchmark_logs(data.cache, data.profile, seeds, num_sweeps, data.scenes)
         return Sources(chosen.data_set, {"check": False, **chosen.settings}, logs)
     if OmegaConf.is_missing(data, "root"):
         raise CFlowError("where is the data? give data.root=PATH, one log or a folder of logs")
@@ -169,7 +189,7 @@ def open_logs(cfg: DictConfig) -> Tuple[List[Log], Failures]:
     failures: Failures = []
     for source in sources.logs:
         with reported(failures, source.name):
-            logs.append(open_log(sources.reader, source, **sources.settings))
+            logs.append(sources.open(source))
     return logs, failures
 
 

@@ -12,56 +12,35 @@ and `cflow eval --config-dir FOLDER model=mine` takes it.
 from __future__ import annotations
 
 from dataclasses import make_dataclass
-from typing import Any, Dict, Optional
+from pathlib import Path
+from typing import Any, Dict, List, Optional
 
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, OmegaConf
 
-from cflow_torch.config import CONFIGS, PRESETS, Config, make_config
+from cflow_torch.cli.choices import CONFIGS, SETTERS, files, groups, own_settings
+from cflow_torch.config import CONFIGS as METHODS
+from cflow_torch.config import PRESETS, Config, make_config
 
-_ALL = {"output": str, "device": Any, "model": Any, "data": Any}
-COMMANDS: Dict[str, Dict[str, Any]] = {
-    "demo": {"definition": str, "pair": int},
-    "eval": {"definition": str, "overwrite": bool, "experiment_name": Optional[str]},
-    "flow": {
-        "engine": Any,
-        "resume": bool,
-        "overwrite": bool,
-        "dry_run": bool,
-        "shard": make_dataclass("Shard", [(name, Any, MISSING) for name in ("index", "count")]),
-        "contents": Any,
-        "result_name": Optional[str],
-    },
-    "submit": {
-        "version": Any,
-        "archive": Optional[str],
-        "frames": Optional[str],
-        "masks": Optional[str],
-        "residual_axes": str,
-        "overwrite": bool,
-    },
-    "view": {"flow": Optional[str], "count": Optional[int], "max_flow": Optional[float], "show": bool},
-    "plot": {"log": Optional[str], "pair": int, "picture": str},
-}
-# What a picture adds to the settings of `cflow plot`.
-PICTURES: Dict[str, Dict[str, Any]] = {
-    "flow": {"truth": Any, "max_flow": Optional[float]},
-    "correlation": {"cluster": Optional[int]},
-    "animation": {
-        "first": int,
-        "step": int,
-        "count": Optional[int],
-        "format": str,
-        "frames_per_second": float,
-        "width": int,
-        "max_flow": Optional[float],
-        "legend": str,
-    },
+# A setting has the type of its default in configs/; one whose default is null or auto takes any value, but for these.
+_TYPES: Dict[str, Any] = {
+    "batches": List[int],
+    "cluster": Optional[int],
+    "experiment_name": Optional[str],
+    "max_flow": Optional[float],
 }
 
 
-def _schema(name: str, types: Dict[str, Any], *bases: type) -> type:
-    return make_dataclass(name, [(key, kind, MISSING) for key, kind in types.items()], bases=bases)
+def _schema(file: Path, *bases: type) -> type:
+    types = {name.partition(".")[0]: _type(name, value) for name, value in own_settings(file).items()}
+    if not bases:
+        types.update({group: Any for group in groups(file.stem) if group not in SETTERS})
+    return make_dataclass(file.stem, [(name, kind, MISSING) for name, kind in types.items()], bases=bases)
+
+
+def _type(name: str, value: Any) -> Any:
+    any_value = value is None or value == "auto" or isinstance(value, list)
+    return _TYPES.get(name, Any if any_value else type(value))
 
 
 def _node(config: Config) -> Any:
@@ -73,15 +52,15 @@ def _node(config: Config) -> Any:
 
 def _register() -> None:
     store = ConfigStore.instance().store
-    for method, kind in CONFIGS.items():
+    for method, kind in METHODS.items():
         store(f"base_{method}", _node(kind()), "model")
     for preset in PRESETS:
         store(preset, _node(make_config(preset)), "model")
-    schemas = {name: _schema(name, {**_ALL, **types}) for name, types in COMMANDS.items()}
+    schemas = {file.stem: _schema(file) for file in CONFIGS.glob("*.yaml") if file.stem != "hydra"}
     for name, schema in schemas.items():
         store(f"base_{name}", schema)
-    for name, types in PICTURES.items():
-        store(f"base_{name}", _schema(name, types, schemas["plot"]), "picture", package="_global_")
+    for file in files("picture"):
+        store(f"base_{file.stem}", _schema(file, schemas["plot"]), "picture", package="_global_")
 
 
 _register()

@@ -20,16 +20,9 @@ from typing import Any, Dict, List, Mapping, Optional, Sequence, Tuple
 import yaml  # type: ignore[import-untyped]
 from omegaconf import DictConfig
 
-from cflow_torch.cli.run import (
-    Failures,
-    config_text,
-    finish,
-    make_model,
-    open_logs,
-    output_folder,
-    reported,
-    write_config,
-)
+from cflow_torch.cli import run
+from cflow_torch.cli.record import refuse_changes
+from cflow_torch.cli.run import Failures
 from cflow_torch.data.atomic import ready_folder
 from cflow_torch.data.log import Log, window
 from cflow_torch.data.names import folder_in
@@ -52,7 +45,7 @@ _SETTINGS = ("version", "model", "data", "frames", "masks", "residual_axes")  # 
 
 def task(cfg: DictConfig) -> None:
     """Run `cflow submit`."""
-    version, output = get_version(cfg.version), output_folder(cfg)
+    version, output = get_version(cfg.version), run.output_folder(cfg)
     if cfg.residual_axes not in RESIDUAL_AXES:
         raise CFlowError(f"residual_axes is one of {', '.join(RESIDUAL_AXES)}, got {cfg.residual_axes!r}")
     if cfg.masks is not None and version.rows != "masked":
@@ -61,18 +54,18 @@ def task(cfg: DictConfig) -> None:
         raise CFlowError("masks= says which frames are evaluated: leave frames= out")
     masks = None if cfg.masks is None else MaskArchive(cfg.masks)
     listed = read_frame_list(cfg.frames) if cfg.frames is not None else None if masks is None else masks.frames
-    model = make_model(cfg)
-    logs, failures = open_logs(cfg)
+    model = run.make_model(cfg)
+    logs, failures = run.open_logs(cfg)
     plan, unreadable = _plan(logs, version, listed, masks)
     failures += unreadable
     if cfg.archive is not None:
-        finish(failures)  # a log that cannot be read leaves open what the archive must hold
+        run.finish(failures)  # a log that cannot be read leaves open what the archive must hold
         _check(cfg.archive, version, plan)
         return
     folder, file = output / f"v{version.number}", output / f"v{version.number}.zip"
     _claim(cfg, output, folder, file)
     failures += _write(cfg, plan, model, version, masks, folder)
-    finish(failures)
+    run.finish(failures)
     write_metadata(folder, version)
     _check(folder, version, plan)
     pack(folder, [frame.name for _, frame in plan], file, version)
@@ -93,25 +86,21 @@ def _claim(cfg: DictConfig, output: Path, folder: Path, file: Path) -> None:
     record = output / "config.yaml"
     ready_folder(output)
     folder_in(output, folder.name, "the folder")
-    if record.exists() and not cfg.overwrite:
-        try:
-            before = _identity(yaml.safe_load(record.read_text(encoding="utf-8")))
-        except (yaml.YAMLError, LookupError, ValueError, TypeError, AttributeError) as error:
-            raise CFlowError(f"{record} holds no settings ({error!r:.200}): give output=FOLDER, or remove it") from None
-        now = _identity(yaml.safe_load(config_text(cfg)))
-        changed = [name for name in now if now[name] != before[name]]
-        if changed:
-            raise CFlowError(
-                f"{output} holds files made with another {', '.join(changed)}: give output=FOLDER, or overwrite=true"
-            )
     if cfg.overwrite:
         shutil.rmtree(folder, ignore_errors=True)
         file.unlink(missing_ok=True)
-    write_config(cfg, output)
+    elif record.exists():
+        try:
+            before = _identity(record.read_text(encoding="utf-8"))
+        except (yaml.YAMLError, LookupError, ValueError, TypeError, AttributeError) as error:
+            raise CFlowError(f"{record} holds no settings ({error!r:.200}): give output=FOLDER, or remove it") from None
+        refuse_changes(output, before, _identity(run.config_text(cfg)))
+    run.write_config(cfg, output)
 
 
-def _identity(settings: Dict[str, Any]) -> Dict[str, Any]:
+def _identity(text: str) -> Dict[str, Any]:
     """What of a config.yaml the files of a submission depend on."""
+    settings = yaml.safe_load(text)
     of_files = {name: settings.get(name) for name in _SETTINGS}
     return {**of_files, "cflow_torch": settings["versions"]["cflow_torch"]}
 
@@ -127,7 +116,7 @@ def _plan(logs: Sequence[Log], version: SubmissionVersion, listed: _Listed, mask
     plan: Plan = []
     failures: Failures = []
     for frame in counted(frames, "rows"):
-        with reported(failures, frame.name):
+        with run.reported(failures, frame.name):
             plan.append((frame, frame.expect(version, masks)))
     return plan, failures
 
@@ -142,7 +131,7 @@ def _write(
         if is_complete(folder, frame, version):
             kept += 1
             continue
-        with reported(failures, frame.name):
+        with run.reported(failures, frame.name):
             sweeps = window(planned.log, planned.index, model.config.num_history)
             mask = point_mask(planned.log, planned.index, sweeps.pc0, masks) if version.rows == "masked" else None
             (result,) = model([sweeps])

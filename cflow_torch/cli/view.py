@@ -22,16 +22,8 @@ from typing import Any, Callable, Iterator, List, Tuple
 
 from omegaconf import DictConfig
 
-from cflow_torch.cli.run import (
-    Failures,
-    chosen_pairs,
-    finish,
-    make_model,
-    open_logs,
-    output_folder,
-    reported,
-    write_config,
-)
+from cflow_torch.cli import run
+from cflow_torch.cli.run import Failures
 from cflow_torch.data.atomic import ready_folder
 from cflow_torch.data.flow_file import read_flow
 from cflow_torch.data.log import Log, RecentSweeps, window
@@ -47,20 +39,20 @@ _PATIENCE = 3  # seconds in which a viewer that cannot run ends
 def task(cfg: DictConfig) -> None:
     """Run `cflow view`."""
     load_rerun()  # before hours of work
-    output = output_folder(cfg)
+    output = run.output_folder(cfg)
     if is_remote(output):
         raise CFlowError(f"{output}: recordings are written on this machine only; give output=FOLDER and copy them")
-    chosen = chosen_pairs(cfg, "data.")
+    chosen = run.chosen_pairs(cfg, "data.")
     if cfg.max_flow is None or not 0 < cfg.max_flow < float("inf"):
         raise CFlowError(f"max_flow={cfg.max_flow}: give a positive length in metres per sweep")
     flow, history = _flow(cfg)
-    logs, failures = open_logs(cfg)
-    write_config(cfg, ready_folder(output))
+    logs, failures = run.open_logs(cfg)
+    run.write_config(cfg, ready_folder(output))
     files: List[Path] = []
     for log in logs:
         recent: Any = RecentSweeps(log, history + 2)
         file = output / f"{log.log_id}.rrd"
-        with reported(failures, log.log_id):
+        with run.reported(failures, log.log_id):
             if file.name.casefold() in {other.name.casefold() for other in files}:
                 raise CFlowError(f"{file} is of another log of this name: give data.root=PATH more narrowly")
             results = _results(recent, chosen(log), flow, failures)
@@ -71,7 +63,7 @@ def task(cfg: DictConfig) -> None:
         print(f"look at it with: rerun {files[0]}")
     if files and cfg.show:
         _show(files)
-    finish(failures)
+    run.finish(failures)
 
 
 def _flow(cfg: DictConfig) -> Tuple[Callable[[Log, int], FlowResult], int]:
@@ -81,7 +73,7 @@ def _flow(cfg: DictConfig) -> Tuple[Callable[[Log, int], FlowResult], int]:
         if not folder.is_dir():
             raise CFlowError(f"flow={cfg.flow} is no folder: give one that `cflow flow` left")
         return lambda log, index: read_flow(frame_file(folder / log.log_id, log.timestamps[index])), 0
-    model = make_model(cfg)
+    model = run.make_model(cfg)
     history = model.config.num_history
 
     def estimate(log: Log, index: int) -> FlowResult:
@@ -98,7 +90,7 @@ def _results(
     with Progress(len(pairs), log.log_id) as progress:
         for index in pairs:
             result = None
-            with reported(failures, f"{log.log_id}/{log.timestamps[index]}"):
+            with run.reported(failures, f"{log.log_id}/{log.timestamps[index]}"):
                 window(log, index)  # both sweeps, which are kept for the recording
                 log.labels(index)
                 result = flow(log, index)

@@ -28,7 +28,7 @@ from table import markdown
 from timing import alternate, median_ratio, synchronise, threads
 
 from cflow_torch import CFlowError, Config, FlowResult, Window, make_config, make_model
-from cflow_torch.cli.bench import machine
+from cflow_torch.cli.run import machine
 from cflow_torch.data.catalog import find_sources, open_log
 from cflow_torch.data.log import window
 from cflow_torch.dense import clustering

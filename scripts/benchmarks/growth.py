@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from cflow_torch import Config, Sweep, Window, make_config, make_model
-from cflow_torch.cli.bench import machine
+from cflow_torch.cli.run import machine
 from cflow_torch.data.log import window
 from cflow_torch.simulator import make_drive
 from cflow_torch.stages import StopWatch

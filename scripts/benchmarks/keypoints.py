@@ -19,7 +19,7 @@ from counts import count_allocations
 from table import markdown
 
 from cflow_torch import Sweep, Window, make_config, make_model
-from cflow_torch.cli.bench import using_threads
+from cflow_torch.fleet.machine import threads
 from cflow_torch.stages import StopWatch
 
 DENSITY = 0.04
@@ -79,7 +79,7 @@ def main() -> None:
     given = parser.parse_args()
     print(f"{given.threads} thread(s), torch {torch.__version__}, preset `keypoints`\n")
     header = ["key points", "gate m", "candidates each", "ms", "ns per pair", "extra MB"]
-    with using_threads(given.threads):
+    with threads(given.threads):
         print(markdown([header, *(measure(*row, given.repeats, given.device) for row in ROWS)]))
 
 

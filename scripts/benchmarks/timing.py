@@ -5,11 +5,11 @@ from __future__ import annotations
 import statistics
 import time
 from contextlib import contextmanager
-from typing import Any, Callable, Iterator, List, Optional, Sequence
+from typing import Any, Callable, Iterator, List, Sequence
 
 import torch
 
-from cflow_torch.cli.bench import using_threads
+from cflow_torch.fleet import machine
 
 # Rest between two timed runs: worker threads of the library that ran before spin for some milliseconds after their
 # last job, and would take the cores from the other one. (A product of large matrices in the OpenCV loop, whose BLAS
@@ -47,14 +47,14 @@ def synchronise(tensor: torch.Tensor) -> None:
 
 
 @contextmanager
-def threads(number: Optional[int]) -> Iterator[int]:
-    """The same number of threads for torch and OpenCV, None = as many as torch has now; as before afterwards."""
+def threads(number: int) -> Iterator[None]:
+    """The same number of threads for torch and OpenCV; as before afterwards."""
     import cv2
 
     before = cv2.getNumThreads()
     try:
-        with using_threads(number) as used:
-            cv2.setNumThreads(used)
-            yield used
+        with machine.threads(number):
+            cv2.setNumThreads(number)
+            yield
     finally:
         cv2.setNumThreads(before)

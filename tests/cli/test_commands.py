@@ -12,13 +12,11 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from cflow_torch import CorrelationFlow, make_config
+from cflow_torch import make_config
 from cflow_torch.cli import run
 from cflow_torch.cli.record import objective
 from cflow_torch.config import config_from
 from cflow_torch.data.av2 import AV2Log
-from cflow_torch.data.flow_file import read_flow
-from cflow_torch.data.log import window
 
 Cflow = Callable[..., int]
 SMALL = "model.point_cloud_range=[-20,-20,-inf,20,20,inf]"
@@ -65,17 +63,6 @@ def test_demo_without_matplotlib_lacks_the_picture_only(
     printed = capsys.readouterr()
     assert "picture: none" in printed.out and "pip install matplotlib" in printed.out and not printed.err
     assert results_of(tmp_path)["num_pairs"] == 1 and not list(tmp_path.glob("*.png"))
-
-
-def test_flow_files_hold_the_method_s_result(log_folder: Path, tmp_path: Path, cflow: Cflow) -> None:
-    call = ("flow", "data=av2", f"data.root={log_folder}", "data.check=false", f"output={tmp_path}", "model=paper")
-    assert cflow(*call, "engine.workers=1") == 0
-    log = AV2Log(log_folder)
-    for index in range(3):
-        (expected,) = CorrelationFlow.from_preset("paper")([window(log, index)])
-        stored = read_flow(tmp_path / log.log_id / f"{log.timestamps[index]}.feather")
-        for name in ("flow", "residual_flow", "cluster_id", "score", "is_valid"):
-            np.testing.assert_array_equal(getattr(stored, name), getattr(expected, name), err_msg=name)
 
 
 def test_a_results_file_says_everything(log_folder: Path, tmp_path: Path, evaluate: Cflow) -> None:
@@ -142,14 +129,6 @@ def test_a_failure_ends_a_run_and_leaves_a_sweep_going(monkeypatch: pytest.Monke
         run.finish([("a", "bad")])
 
 
-def test_real_hdf5_data(kitti_file: Path, tmp_path: Path, cflow: Cflow) -> None:
-    pytest.importorskip("h5py")
-    call = ("eval", "data=hdf5", f"data.root={kitti_file}", f"output={tmp_path}", "model=paper", "data.step=3")
-    assert cflow(*call) == 0
-    car = results_of(tmp_path)["results"]["bucketed"]["classes"]["CAR"]
-    assert car["num_dynamic"] > 300 and 0.02 < car["dynamic_error"] < 0.4
-
-
 def test_the_score_of_a_sweep() -> None:
     mean = {"mean": {"dynamic_error": 0.25}}
     assert objective({"bucketed": mean, "three_way": {"epe_3way": 1.0}}) == 0.25
@@ -158,12 +137,9 @@ def test_the_score_of_a_sweep() -> None:
     assert np.isnan(objective({"bucketed": {"mean": {"dynamic_error": None}}}))
 
 
-@pytest.mark.parametrize("call", ["demo pair=0", "eval", "flow"])
-def test_an_output_that_cannot_be_made_is_named(
-    call: str, tmp_path: Path, cflow: Cflow, capsys: pytest.CaptureFixture
-) -> None:
+def test_an_output_that_cannot_be_made_is_named(tmp_path: Path, evaluate: Cflow, capsys: pytest.CaptureFixture) -> None:
     (tmp_path / "file").touch()
-    assert cflow(*call.split(), f"output={tmp_path}/file/below", "data.num_sweeps=2", "model=paper") == 2
+    assert evaluate(f"output={tmp_path}/file/below") == 2
     error = capsys.readouterr().err
     assert f"error: cannot write into {tmp_path}/file/below" in error and "give output=FOLDER" in error
     assert "Traceback" not in error

@@ -354,7 +354,7 @@ def test_command_makes_checks_resumes(log: AV2Log, tmp_path: Path, capsys: pytes
     assert one.stat().st_mtime_ns == before and (tmp_path / "v3.zip").read_bytes() == first
 
     assert run(*call, "model.connectivity=4") == 2
-    assert "another model" in capsys.readouterr().err
+    assert "model.connectivity was 8, is 4" in capsys.readouterr().err
     assert run(*call, f"archive={tmp_path / 'v3.zip'}") == 0
     two.unlink()
     assert run(*call, f"archive={tmp_path / 'v3'}") == 1
