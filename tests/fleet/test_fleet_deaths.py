@@ -21,7 +21,7 @@ from cflow_torch.fleet.local import run_local
 from cflow_torch.fleet.machine import Layout
 
 DEADLY = "CFLOW_TEST_DEADLY"  # folder of files log.time stamp, each of which holds a name of `WAYS` and how often
-REAL_START = local._start
+REAL_BEGIN = local._begin
 LIMIT = 12e9  # bytes, of a worker's address space
 
 WAYS: Dict[str, Callable[[], Any]] = {
@@ -35,9 +35,9 @@ WAYS: Dict[str, Callable[[], Any]] = {
 }
 
 
-def deadly_start(*arguments: Any) -> None:
+def deadly_begin(*arguments: Any) -> None:
     """A worker process that dies when it reads a frame of `DEADLY`."""
-    REAL_START(*arguments)
+    REAL_BEGIN(*arguments)
     read = work.window
 
     def deadly_read(log: Any, index: int, num_history: int) -> Any:
@@ -52,13 +52,17 @@ def deadly_start(*arguments: Any) -> None:
     work.window = deadly_read
 
 
+def die(*_: Any) -> None:
+    os._exit(1)
+
+
 @pytest.fixture
 def deadly(fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[int, int, str, int], str]:
     """Makes a frame (number of a log, of a sweep) deadly in a way, so many times; gives its name."""
     folder = tmp_path / "deadly"
     folder.mkdir()
     monkeypatch.setenv(DEADLY, str(folder))
-    monkeypatch.setattr(local, "_start", deadly_start)
+    monkeypatch.setattr(local, "_begin", deadly_begin)
 
     def mark(number: int, index: int, way: str, count: int) -> str:
         log = AV2Log(sorted(fleet.iterdir())[number])
@@ -99,7 +103,7 @@ def test_workers_that_cannot_begin_are_one_clear_error(fleet: Path, tmp_path: Pa
     units = [Unit(n, source) for n, source in enumerate(sorted(fleet.iterdir()))]
     with pytest.raises(CFlowError, match="no worker can begin on nowhere"):
         list(run_local(make_job(tmp_path), units, Layout(("nowhere", "nowhere"), 1, 2), lambda: False))
-    monkeypatch.setattr(local, "_start", os._exit)  # as a system does that has no memory for it
+    monkeypatch.setattr(local, "_begin", die)  # as a system does that has no memory for it
     start = time.monotonic()
     with pytest.raises(CFlowError, match="died before they could begin.*engine.workers"):
         list(run_local(make_job(tmp_path), units, TWO, lambda: False))

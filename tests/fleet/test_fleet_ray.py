@@ -14,10 +14,10 @@ from small_fleet import PAIRS, TWO, make_job, run, tree
 from cflow_torch import CFlowError
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.fleet import ray_engine
-from cflow_torch.fleet.counters import Counters
 from cflow_torch.fleet.job import Job, Unit
 from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.ray_engine import run_ray
+from cflow_torch.fleet.report import Counters
 
 pytest.importorskip("ray", reason="Ray is not installed: pip install ray")
 
@@ -37,13 +37,13 @@ class LethalActor:
     The files lie beside the output.
     """
 
-    def __init__(self, job: Job, *more: Any) -> None:
+    def __init__(self, folder: str, job: Job, *more: Any) -> None:
         self._folder = Path(job.output).parent / "kills"
-        self._actor = ray_engine._Actor(job, *more)  # in the worker process, where it is the real one
+        self._actor = ray_engine._Actor(folder, job, *more)  # in the worker process, where it is the real one
 
     def begin(self) -> None:
         self._actor.begin()
-        read = self._actor._worker._read_one
+        read = self._actor._process._worker._read_one
 
         def lethal_read(log: Any, index: int) -> Any:
             file = self._folder / f"{log.log_id}.{log.timestamps[index]}"
@@ -53,7 +53,7 @@ class LethalActor:
                 os.kill(os.getpid(), signal.SIGKILL)
             return read(log, index)
 
-        self._actor._worker._read_one = lethal_read  # type: ignore[method-assign]
+        self._actor._process._worker._read_one = lethal_read  # type: ignore[method-assign]
 
     def step(self, unit: Unit, stop: bool) -> Any:
         return self._actor.step(unit, stop)

@@ -214,4 +214,4 @@ def test_work_goes_on_if_nobody_hears(monkeypatch: pytest.MonkeyPatch, is_termin
         with Progress(3) as bar:
             bar.update(2)
             bar.update(1)
-    assert bar.done == 3
+    assert bar.n == 3

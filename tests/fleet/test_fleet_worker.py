@@ -14,12 +14,11 @@ from small_fleet import CONFIG, PAIRS, SWEEPS, flow_files, make_job, tree
 from cflow_torch import CFlowError, FlowResult, Window, make_config, make_model
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.fleet import dispatch as dispatching
-from cflow_torch.fleet.counters import Counters
 from cflow_torch.fleet.dispatch import WorkerDied, dispatch
 from cflow_torch.fleet.job import Done, Event, Failed, Job, Opened, Unit
 from cflow_torch.fleet.local import run_local
 from cflow_torch.fleet.machine import Layout
-from cflow_torch.fleet.report import format_missing, format_report, make_report
+from cflow_torch.fleet.report import Counters, format_missing, format_report
 from cflow_torch.fleet.shard import Shard
 from cflow_torch.fleet.work import Worker
 from cflow_torch.fleet.worker_process import WorkerProcess
@@ -202,7 +201,6 @@ class Thread:
         if self.started <= self.stillborn:
             raise WorkerDied("by SIGKILL")
         self._process = WorkerProcess(self.job, "cpu", 1)
-        self._process.begin()
         self._process._worker._ahead = 0
 
     def step(self, unit: Unit, stop: bool) -> Future:
@@ -337,7 +335,7 @@ def test_a_report_of_trouble_lists_what_is_missing() -> None:
     assert counters.add(Failed(1, "b", "no log")) == 0
     assert counters.add(Opened(0, "a", stamps[12:], stamps[13:])) == 1, "12 was written before its worker died"
     assert counters.add(Opened(0, "a", (20,), (20,))) == 0, "by itself"
-    told = make_report(counters, 4.0, Layout(("cpu",), 2, 1), Shard(), "local", "SIGTERM")
+    told = counters.report(4.0, Layout(("cpu",), 2, 1), Shard(), "local", "SIGTERM")
     assert told["status"] == "interrupted" and told["stopped_by"] == "SIGTERM"
     assert list(told["frames"].values()) == [40, 10, 2, 1, 1, 27, 1]
     missing = format_missing(told).splitlines()
