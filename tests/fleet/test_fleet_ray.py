@@ -17,7 +17,6 @@ from cflow_torch.fleet import ray_engine
 from cflow_torch.fleet.job import Job, Unit
 from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.ray_engine import run_ray
-from cflow_torch.fleet.report import Counters
 
 pytest.importorskip("ray", reason="Ray is not installed: pip install ray")
 
@@ -92,19 +91,6 @@ def test_a_killed_worker_is_replaced_and_a_frame_that_always_kills_is_reported(
     assert tree(tmp_path / "out") == {file: c for file, c in single.items() if file != f"{name}.feather"}
 
 
-@pytest.mark.slow
-def test_stop_lets_the_frames_in_hand_be_finished(fleet: Path, single: Dict[str, bytes], tmp_path: Path) -> None:
-    run(sorted(fleet.iterdir())[0], tmp_path)  # claims the folder
-    (tmp_path / sorted(fleet.iterdir())[0].name / "manifest.json").unlink()
-    units = [Unit(n, source) for n, source in enumerate(sorted(fleet.iterdir()))]
-    counters = Counters(units)
-    for event in run_ray(make_job(tmp_path, redo=True), units, TWO, lambda: bool(counters.computed)):
-        counters.add(event)
-    assert 0 < counters.computed < PAIRS
-    assert run(fleet, tmp_path, TWO, engine="ray")["exit_status"] == 0
-    assert tree(tmp_path) == single
-
-
 def begin(layout: Layout, **settings: Any) -> None:
     next(run_ray(make_job(Path("nowhere")), [Unit(0, "nothing")], layout, lambda: False, **settings))
 
@@ -121,15 +107,6 @@ def begin(layout: Layout, **settings: Any) -> None:
 def test_bad_settings(layout: Layout, settings: Dict[str, Any], message: str) -> None:
     with pytest.raises(CFlowError, match=message):
         begin(layout, **settings)
-
-
-def test_no_cluster_at_the_address(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(**_: Any) -> None:
-        raise ConnectionError("nobody there")
-
-    monkeypatch.setattr("ray.init", refuse)
-    with pytest.raises(CFlowError, match="engine.address=auto: no connection .*nobody there"):
-        begin(TWO, address="auto")
 
 
 @pytest.mark.slow
