@@ -22,8 +22,8 @@ class Step(NamedTuple):
     has_ended: bool
 
 
-class WorkerProcess:
-    """Lives in the worker process.
+class WorkerProcess(Worker):
+    """A worker that lives in a process of its own.
 
     Args:
         job: the run.
@@ -36,7 +36,7 @@ class WorkerProcess:
 
     def __init__(self, job: Job, device: str, threads: int) -> None:
         set_threads(threads)
-        self._worker = Worker(job, device)
+        super().__init__(job, device)
         self._events: Optional[Iterator[Event]] = None  # of the unit in hand
         self._is_told_to_stop = False
 
@@ -48,7 +48,7 @@ class WorkerProcess:
             stop: finish the frames in hand and begin no others.
         """
         self._is_told_to_stop = stop
-        running, self._events = self._events or self._worker.run(unit, lambda: self._is_told_to_stop), None
+        running, self._events = self._events or self.run(unit, lambda: self._is_told_to_stop), None
         events: List[Event] = []
         until = time.monotonic() + _REPORT_EVERY_S
         try:

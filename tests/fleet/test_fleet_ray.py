@@ -42,7 +42,7 @@ class LethalActor:
 
     def begin(self) -> None:
         self._actor.begin()
-        read = self._actor._process._worker._read_one
+        read = self._actor._process._read_one
 
         def lethal_read(log: Any, index: int) -> Any:
             file = self._folder / f"{log.log_id}.{log.timestamps[index]}"
@@ -52,7 +52,7 @@ class LethalActor:
                 os.kill(os.getpid(), signal.SIGKILL)
             return read(log, index)
 
-        self._actor._process._worker._read_one = lethal_read  # type: ignore[method-assign]
+        self._actor._process._read_one = lethal_read  # type: ignore[method-assign]
 
     def step(self, unit: Unit, stop: bool) -> Any:
         return self._actor.step(unit, stop)

@@ -176,14 +176,14 @@ class Thread:
         if self.started <= self.stillborn:
             raise WorkerDied("by SIGKILL")
         self._process = WorkerProcess(self.job, "cpu", 1)
-        self._process._worker._ahead = 0
+        self._process._ahead = 0
 
     def step(self, unit: Unit, stop: bool) -> Future:
         return self._thread.submit(self._step, unit, stop)
 
     def _step(self, unit: Unit, stop: bool) -> Any:
         """As the real one, but without read-ahead, so that frames before the deadly one are on disk."""
-        worker, deadly = self._process._worker, self.deadly
+        worker, deadly = self._process, self.deadly
         read = Worker._read_one
 
         def deadly_read(log: Any, index: int) -> Any:
