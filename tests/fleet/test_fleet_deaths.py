@@ -22,8 +22,6 @@ LIMIT = 12e9  # bytes, of a worker's address space
 WAYS: Dict[str, Callable[[], Any]] = {
     "SIGKILL": lambda: os.kill(os.getpid(), signal.SIGKILL),
     "SIGSEGV": lambda: os.kill(os.getpid(), signal.SIGSEGV),
-    "SIGABRT": os.abort,
-    "status 3": lambda: os._exit(3),
     "SystemExit": lambda: sys.exit("out"),
     "hang": lambda: os.kill(os.getpid(), signal.SIGSTOP),
     "memory": lambda: np.ones(int(LIMIT), np.uint8),

@@ -102,14 +102,6 @@ def test_events_come_in_the_order_of_the_log(source: Path, tmp_path: Path) -> No
     assert all({"read", "compute", "write", "compute/project"} <= set(event.seconds) for event in done)
 
 
-def test_a_worker_that_is_told_to_stop_finishes_what_it_has_in_hand(source: Path, tmp_path: Path) -> None:
-    stop = lambda: bool(flow_files(tmp_path))  # noqa: E731
-    events = list(Worker(make_job(tmp_path, batch=1), "cpu").run(Unit(0, source), stop))
-    done = [event.timestamp for event in events if isinstance(event, Done)]
-    assert 1 <= len(done) < 5
-    assert sorted(int(Path(name).stem) for name in flow_files(tmp_path)) == done
-
-
 def test_a_gpu_that_is_lost_ends_its_worker(source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     model = Stumbling(AV2Log(source).timestamps, lambda: RuntimeError("assert"))
     worker = Worker(make_job(tmp_path, batch=1), "cpu", model=model)

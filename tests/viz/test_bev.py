@@ -144,12 +144,9 @@ def test_everything_is_inside_the_picture(scene: Scene, box: tuple) -> None:
     [
         ({"points": np.zeros((5, 2))}, "points has shape"),
         ({"result_or_residual": np.zeros((4, 3))}, "residual flow has shape"),
-        ({"truth": np.zeros((4, 3))}, "truth has shape"),
-        ({"is_ground": np.zeros(4, bool)}, "is_ground has shape"),
         ({"max_flow": -1.0}, "max_flow"),
         ({"legend": "middle"}, "upper right"),
         ({"point_cloud_range": (0, 0, 1, 1)}, "point_cloud_range"),
-        ({"point_cloud_range": (0, 0, 0, 1, 0, 1)}, "point_cloud_range"),
     ],
 )
 def test_plot_flow_refuses(changed: dict, message: str) -> None:
