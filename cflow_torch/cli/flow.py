@@ -37,7 +37,7 @@ from cflow_torch.data.atomic import ready_folder
 from cflow_torch.data.flow_file import CONTENTS, ON_REQUEST, read_flow
 from cflow_torch.data.hdf5.results import check_result_name, check_writable, write_hdf5_results
 from cflow_torch.data.records import write_text
-from cflow_torch.fleet.forecast import format_forecast, make_forecast
+from cflow_torch.fleet.forecast import forecast
 from cflow_torch.fleet.job import Job
 from cflow_torch.fleet.machine import choose_layout
 from cflow_torch.fleet.manifest import claim_folder, complete_frames, find_conflict, frame_file, make_identity
@@ -74,7 +74,7 @@ def task(cfg: DictConfig) -> None:
     )
     if cfg.dry_run:
         conflict = find_conflict(output, identity, cfg.resume or cfg.overwrite)
-        print(format_forecast(make_forecast(job, shard.units(sources.logs), layout), job))
+        print(forecast(job, shard.units(sources.logs), layout))
         if conflict is not None:
             print(f"{output} holds results of another run{conflict}; overwrite=true would replace them")
         return

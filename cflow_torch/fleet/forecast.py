@@ -5,9 +5,9 @@ from __future__ import annotations
 import shutil
 import tempfile
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Dict, List, Optional, Sequence, Tuple
+from typing import Dict, Iterator, Sequence, Tuple
 
 from tqdm import tqdm
 
@@ -21,35 +21,12 @@ from cflow_torch.fleet.work import Worker, describe, source_name
 _GB = 1e9
 
 
-@dataclass
-class Forecast:
-    """What a run would do.
-
-    Args:
-        logs: of each log: name, frames, complete ones, time stamps of the first and the last frame ("" without any).
-        failures: logs that cannot be opened and why.
-        workers: at once.
-        seconds: of one frame by stage, one worker alone, measured on a few frames; empty if nothing is to be done.
-        memory: bytes of one worker, measured after these frames; None where the system does not tell.
-        frame_bytes: size of one flow file.
-        free_bytes: room where the output goes; None on an object store.
-    """
-
-    logs: List[Tuple[str, int, int, str]] = field(default_factory=list)
-    failures: List[Tuple[str, str]] = field(default_factory=list)
-    workers: int = 1
-    seconds: Dict[str, float] = field(default_factory=dict)
-    memory: Optional[int] = None
-    frame_bytes: int = 0
-    free_bytes: Optional[int] = None
-
-
-def make_forecast(job: Job, units: Sequence[Unit], layout: Layout) -> Forecast:
-    """Open every log, count, and try a few frames.
+def forecast(job: Job, units: Sequence[Unit], layout: Layout) -> str:
+    """Open every log, count, and try a few frames: as text, a line per log.
 
     Cost: opens all logs; computes two batches.
     """
-    found = Forecast(workers=len(layout.devices))
+    rows, failures, trial = [], [], None
     for unit in units:
         try:
             log = open_log(job.reader, unit.source, **{**job.settings, "check": False})
@@ -57,53 +34,56 @@ def make_forecast(job: Job, units: Sequence[Unit], layout: Layout) -> Forecast:
             complete = set() if job.redo else complete_frames(as_path(job.output) / log.log_id)
             todo = [stamp for stamp in stamps if stamp not in complete]
             span = f"{stamps[0]} ... {stamps[-1]}" if stamps else ""
-            found.logs.append((log.log_id, len(stamps), len(stamps) - len(todo), span))
-            if todo and not found.seconds:
-                _try(job, replace(unit, only=frozenset(todo[: 2 * job.batch])), layout, found)
+            rows.append((log.log_id, len(stamps), len(stamps) - len(todo), len(todo), span))
+            if todo and trial is None:
+                trial = _try(job, replace(unit, only=frozenset(todo[: 2 * job.batch])), layout)
         except Exception as error:
-            found.failures.append((source_name(unit.source), describe(error)))
-    output = as_path(job.output)
-    if not is_remote(output):
-        with suppress(OSError):
-            found.free_bytes = shutil.disk_usage(next(path for path in (output, *output.parents) if path.exists())).free
-    return found
+            failures.append(f"cannot be opened: {source_name(unit.source)}: {describe(error)}")
 
-
-def format_forecast(found: Forecast, job: Job) -> str:
-    """As text, a line per log."""
-    width = max([len(name) for name, *_ in found.logs] + [3])
+    width = max([len(name) for name, *_ in rows] + [3])
     lines = [f"{'log':{width}}  frames  complete  to do  time stamps"]
-    for name, total, complete, span in found.logs:
-        lines.append(f"{name:{width}}  {total:6}  {complete:8}  {total - complete:5}  {span}")
-    lines += [f"cannot be opened: {name}: {message}" for name, message in found.failures]
-    total, complete = sum(log[1] for log in found.logs), sum(log[2] for log in found.logs)
-    todo = total - complete
-    lines.append(f"{len(found.logs)} logs, {total} frames, {complete} complete, {todo} to do")
+    lines += [f"{name:{width}}  {total:6}  {before:8}  {left:5}  {span}" for name, total, before, left, span in rows]
+    lines += failures
+    total, before, left = (sum(column) for column in zip(*(row[1:4] for row in rows))) if rows else (0, 0, 0)
+    lines.append(f"{len(rows)} logs, {total} frames, {before} complete, {left} to do")
     lines.append(f"outputs: {frame_file(as_path(job.output) / '<log>', 0).parent}/<time stamp>.feather")
-    if found.seconds:
-        stages = ", ".join(f"{name} {1e3 * seconds:.1f}" for name, seconds in found.seconds.items())
-        lines.append(f"one frame on one worker, ms (tried on {job.batch} at once): {stages}")
-        time = tqdm.format_interval(todo * sum(found.seconds.values()) / found.workers)
-        lines.append(f"time: about {time} with {found.workers} workers, less where stages overlap")
-        room = "" if found.free_bytes is None else f", {found.free_bytes / _GB:.1f} GB are free there"
-        lines.append(f"disk: {todo * found.frame_bytes / _GB:.2f} GB{room}")
-        if found.memory is not None:
-            lines.append(f"memory: {found.workers} x {found.memory / _GB:.2f} GB")
+    if trial is not None:
+        lines += _costs(job, layout, left, *trial)
     lines.append("dry run: nothing was written")
     return "\n".join(lines)
 
 
-def _try(job: Job, unit: Unit, layout: Layout, found: Forecast) -> None:
-    """Read, compute and write two batches, as a worker would. The first warms up, if there is a second."""
+def _try(job: Job, unit: Unit, layout: Layout) -> Tuple[Dict[str, float], int]:
+    """Read, compute and write two batches, as a worker would. The first warms up, if there is a second.
+
+    Returns:
+        Seconds of one frame by stage, and the bytes of its file.
+    """
     with tempfile.TemporaryDirectory() as scratch, threads(layout.threads):
         worker = Worker(replace(job, output=scratch, check=False), layout.devices[0])
         done = [event for event in worker.run(unit) if isinstance(event, Done)]
         worker.close()
-        found.frame_bytes = max(file.stat().st_size for file in Path(scratch).rglob("*.feather"))
+        frame_bytes = max(file.stat().st_size for file in Path(scratch).rglob("*.feather"))
     timed = done[job.batch :] or done
-    for stage in ("read", "compute", "write"):
-        found.seconds[stage] = sum(event.seconds[stage] for event in timed) / len(timed)
+    stages = ("read", "compute", "write")
+    return {stage: sum(event.seconds[stage] for event in timed) / len(timed) for stage in stages}, frame_bytes
+
+
+def _costs(job: Job, layout: Layout, todo: int, seconds: Dict[str, float], frame_bytes: int) -> Iterator[str]:
+    """Time, room and memory for the frames that are to be done."""
+    workers, output = len(layout.devices), as_path(job.output)
+    stages = ", ".join(f"{name} {1e3 * value:.1f}" for name, value in seconds.items())
+    yield f"one frame on one worker, ms (tried on {job.batch} at once): {stages}"
+    time = tqdm.format_interval(todo * sum(seconds.values()) / workers)
+    yield f"time: about {time} with {workers} workers, less where stages overlap"
+    room = ""
+    if not is_remote(output):
+        with suppress(OSError):
+            free = shutil.disk_usage(next(path for path in (output, *output.parents) if path.exists())).free
+            room = f", {free / _GB:.1f} GB are free there"
+    yield f"disk: {todo * frame_bytes / _GB:.2f} GB{room}"
     with suppress(ImportError):  # not on every system
         import resource
 
-        found.memory = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        memory = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        yield f"memory: {workers} x {memory / _GB:.2f} GB"

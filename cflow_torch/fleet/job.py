@@ -51,6 +51,7 @@ class Unit:
         first: share of the log's pairs that lies before the span, 0 ... 1.
         last: share that lies before its end.
         only: time stamps of the frames of the span that are to be done; None = all of them.
+        deaths: workers that have died on it.
     """
 
     number: int
@@ -58,6 +59,7 @@ class Unit:
     first: Fraction = Fraction(0)
     last: Fraction = Fraction(1)
     only: Optional[FrozenSet[int]] = None
+    deaths: int = 0
 
     def frames(self, num_pairs: int) -> range:
         """Numbers of the sweeps t of the span, in a log of so many pairs."""

@@ -46,7 +46,7 @@ def run_local(
 
     Yields:
         What happens, as it happens. A worker that dies or is killed is replaced, and its unit done again, see
-        `Retries`; a frame that kills its workers even by itself is `Failed`.
+        `dispatch`; a frame that kills its workers even by itself is `Failed`.
     """
     for name, value in (("timeout", timeout), ("memory", 1 if memory is None else memory)):
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not value > 0:
@@ -79,7 +79,7 @@ class _Process:
     """A `Handle`: a pool of one process, so that a worker keeps its log, and shares no pipe that it may break.
 
     Args:
-        arguments: of `_start`.
+        arguments: of `_begin`.
         timeout: seconds that a call may take.
     """
 
@@ -90,8 +90,8 @@ class _Process:
     def begin(self) -> Future:
         if self._pool is None:
             context = multiprocessing.get_context("spawn")  # fork and threads, or CUDA, do not go together
-            self._pool = ProcessPool(1, initializer=_start, initargs=self._arguments, context=context)
-        return self._call(_begin)
+            self._pool = ProcessPool(1, context=context)
+        return self._call(_begin, *self._arguments)
 
     def step(self, unit: Unit, stop: bool) -> Future:
         return self._call(_step, unit, stop)
@@ -126,7 +126,7 @@ class _Process:
 _process: WorkerProcess  # of a worker process
 
 
-def _start(job: Job, device: str, num_threads: int, memory: Optional[float]) -> None:
+def _begin(job: Job, device: str, num_threads: int, memory: Optional[float]) -> None:
     """A worker process begins. Signals are the business of the parent, which says when to stop."""
     global _process
     for number in SIGNALS:
@@ -136,10 +136,6 @@ def _start(job: Job, device: str, num_threads: int, memory: Optional[float]) -> 
 
         resource.setrlimit(resource.RLIMIT_AS, (int(memory), int(memory)))
     _process = WorkerProcess(job, device, num_threads)
-
-
-def _begin() -> None:
-    _process.begin()
 
 
 def _step(unit: Unit, stop: bool) -> Step:

@@ -96,17 +96,21 @@ def usable_cores(environ: Mapping[str, str]) -> int:
     return max(1, min(counts))
 
 
+def set_threads(count: int) -> None:
+    """So many threads of torch and of pyarrow in this process."""
+    torch.set_num_threads(count)
+    pyarrow.set_cpu_count(count)
+
+
 @contextmanager
 def threads(count: int) -> Iterator[None]:
-    """So many threads of torch and of pyarrow in this process, while the block lasts."""
-    before = torch.get_num_threads(), pyarrow.cpu_count()
+    """So many threads, while the block lasts."""
+    before = torch.get_num_threads()
+    set_threads(count)
     try:
-        torch.set_num_threads(count)
-        pyarrow.set_cpu_count(count)
         yield
     finally:
-        torch.set_num_threads(before[0])
-        pyarrow.set_cpu_count(before[1])
+        set_threads(before)
 
 
 def _at_least_1(name: str, value: Any) -> int:

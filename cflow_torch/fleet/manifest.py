@@ -72,13 +72,12 @@ def claim_folder(output: Path, identity: Mapping[str, Any], resume: bool, overwr
     forget_listings(output)
     why = find_conflict(output, identity, resume or overwrite)
     if why is not None:
-        if not overwrite:
-            raise CFlowError(f"{output} holds results of another run{why}: {_REMEDY}")
-        if not alone:
-            raise CFlowError(
-                f"{output} holds results of another run{why}: with several shards, remove the folder yourself (shards "
-                "that begin together cannot agree who does), or give output=FOLDER"
+        if not (overwrite and alone):
+            several = (
+                "with several shards, remove the folder yourself (shards that begin together cannot agree who does)"
             )
+            remedy = f"{several}, or give output=FOLDER" if overwrite else _REMEDY
+            raise CFlowError(f"{output} holds results of another run{why}: {remedy}")
         _clear(output)
     remove_stale(output)
     if not (output / MANIFEST).exists():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from typing import Any, Iterable, Iterator, Optional, Sized
 
 from tqdm import tqdm
@@ -14,8 +14,37 @@ _BAR = "{desc}{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} frames [{elapsed}<{r
 _LINE = "{desc}{n_fmt} of {total_fmt} frames, {rate_noinv_fmt}, {remaining} left"
 
 
-class Progress:
-    """Counts frames; a context manager.
+class _Stderr:
+    """What is said may be lost: a terminal that was closed, a full disk, a `tee` that Ctrl-C ended."""
+
+    def write(self, text: str) -> None:
+        try:
+            sys.stderr.write(text)
+            sys.stderr.flush()
+        except OSError:
+            with suppress(OSError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())  # else the rest is tried at the end
+
+    def flush(self) -> None:
+        """It is flushed."""
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(sys.stderr, name)
+
+
+class _Lines(_Stderr):
+    """What a bar writes, a line each time."""
+
+    def write(self, text: str) -> None:
+        if text.strip():
+            super().write(text.strip() + "\n")
+
+
+_STDERR = _Stderr()
+
+
+class Progress(tqdm):  # type: ignore[type-arg]
+    """Counts frames; a context manager, as every bar of tqdm.
 
     Args:
         total: frames in all, None = not known yet; may be set later.
@@ -25,60 +54,16 @@ class Progress:
     """
 
     def __init__(self, total: Optional[int] = None, name: str = "") -> None:
-        self.total, self.done = total, 0
         settings = {"total": total, "unit": " frames", "smoothing": 0.05, "desc": f"{name}: " if name else ""}
-        try:
-            if sys.stderr.isatty():
-                self._bar: Any = tqdm(bar_format=_BAR, **settings)
-            else:  # a short run says nothing
-                self._bar = tqdm(
-                    file=_Lines(), bar_format=_LINE, mininterval=EVERY, miniters=1, delay=EVERY, **settings
-                )
-        except OSError:  # it is drawn at once, and the terminal may be gone
-            self._bar = tqdm(disable=True)
-
-    def __enter__(self) -> Progress:
-        return self
-
-    def __exit__(self, *_: Any) -> None:
-        self._bar.total = self.done if self.total is None else self.total
-        with _unheard():
-            self._bar.close()
-
-    def update(self, frames: int = 1) -> None:
-        """So many frames more are done."""
-        self.done += frames
-        self._bar.total = self.total
-        with _unheard():
-            self._bar.update(frames)
-
-
-class _Lines:
-    """What a bar writes, a line each time."""
-
-    def write(self, text: str) -> None:
-        if text.strip():
-            sys.stderr.write(text.strip() + "\n")
-
-    def flush(self) -> None:
-        sys.stderr.flush()
+        if sys.stderr.isatty():
+            super().__init__(file=_STDERR, bar_format=_BAR, **settings)
+        else:  # a short run says nothing
+            super().__init__(file=_Lines(), bar_format=_LINE, mininterval=EVERY, miniters=1, delay=EVERY, **settings)
 
 
 def say(text: str) -> None:
     """A line on stderr, above the bar; the work goes on even if nobody hears it."""
-    with _unheard():
-        tqdm.write(text, file=sys.stderr)
-        sys.stderr.flush()
-
-
-@contextmanager
-def _unheard() -> Iterator[None]:
-    """What is said on the way may be lost: a terminal that was closed, a full disk, a `tee` that Ctrl-C ended."""
-    try:
-        yield
-    except OSError:
-        with suppress(OSError):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())  # else the rest is tried again at the end
+    tqdm.write(text, file=_STDERR)
 
 
 def frames(items: Iterable[Any], name: str = "") -> Iterator[Any]:

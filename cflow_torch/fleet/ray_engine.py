@@ -19,7 +19,7 @@ from cflow_torch.fleet.job import Event, Job, Unit
 from cflow_torch.fleet.machine import AUTO, Layout
 from cflow_torch.fleet.manifest import MANIFEST, make_identity
 from cflow_torch.fleet.work import describe
-from cflow_torch.fleet.worker_process import WorkerProcess
+from cflow_torch.fleet.worker_process import Step, WorkerProcess
 from cflow_torch.types import CFlowError
 
 # Only names and outcomes are kept there; Ray takes 30 % of the memory if it is not told.
@@ -56,7 +56,7 @@ def run_ray(
         retries: how often a unit, then each of its frames by itself, is done again after a worker died on it.
 
     Yields:
-        What happens, as it happens. A worker that dies is replaced, and its unit done again, see `Retries`.
+        What happens, as it happens. A worker that dies is replaced, and its unit done again, see `dispatch`.
 
     Raises:
         CFlowError: no Ray, no cluster, no room for one worker, a worker that cannot begin; a setting out of range.
@@ -88,16 +88,21 @@ def run_ray(
         _check_room(ray, needs)
         actor = ray.remote(_Actor).options(num_cpus=needs["CPU"], num_gpus=needs["GPU"])
         device = "cuda" if is_gpu else layout.devices[0]  # Ray shows a worker its own GPUs only
-        arguments = (job, device, layout.threads, os.getcwd())
+        arguments = (os.getcwd(), job, device, layout.threads)
         yield from dispatch([_Handle(ray, actor, arguments) for _ in range(count)], units, stop, retries)
 
 
-class _Actor(WorkerProcess):
-    """Lives in a process of Ray, maybe on another machine. `folder` is what the driver works in."""
+class _Actor:
+    """Lives in a process of Ray, maybe on another machine.
 
-    def __init__(self, job: Job, device: str, threads: int, folder: str) -> None:
-        super().__init__(job, device, threads)
-        self._folder = folder
+    Args:
+        folder: what the driver works in.
+        job: the run.
+        more: of `WorkerProcess`.
+    """
+
+    def __init__(self, folder: str, job: Job, *more: Any) -> None:
+        self._folder, self._job, self._more = folder, job, more
 
     def begin(self) -> None:
         import ray
@@ -109,7 +114,10 @@ class _Actor(WorkerProcess):
             raise CFlowError(f"node {node} does not see {job.output}: the output must be reachable everywhere")
         with suppress(OSError):  # relative names of data mean the same as in the driver
             os.chdir(self._folder)
-        super().begin()
+        self._process = WorkerProcess(job, *self._more)
+
+    def step(self, unit: Unit, stop: bool) -> Step:
+        return self._process.step(unit, stop)
 
 
 class _Handle:

@@ -1,61 +1,127 @@
-"""The last word of a run: what is there, what is not, how long it took; as a table and as JSON."""
+"""What a run has done: counted from the events of its workers, then as a table and as JSON."""
 
 from __future__ import annotations
 
 import platform
-from typing import Any, Dict, List
+from collections import Counter
+from typing import Any, Dict, List, Sequence, Tuple
 
-from cflow_torch.fleet.counters import Counters
+from cflow_torch.fleet.job import Done, Event, Opened, Unit
 from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.shard import Shard
 
 _SHOWN = 20  # failures that the table lists; JSON has them all
+_WAITING, _BEFORE, _COMPUTED, _FAILED = "waiting", "complete_before", "computed", "failed"  # states of a frame
 
 
-def make_report(
-    counters: Counters, seconds: float, layout: Layout, shard: Shard, engine: str, signal_name: str
-) -> Dict[str, Any]:
-    """All figures of a run.
+class Counters:
+    """Counts frames, each once, however often its unit was begun.
 
     Args:
-        counters: what was done.
-        seconds: from the start of the engine to its end.
-        layout: what it ran on.
-        shard: which share of the work it was.
-        engine: "local" or "ray".
-        signal_name: what stopped it, "" if nothing did.
-
-    Returns:
-        "status": "complete", "incomplete" (something failed or is missing) or "interrupted"; "frames": "total",
-        "complete_before", "computed", "failed", "failed_logs" (or parts of logs), "waiting" (of begun logs) and
-        "unopened_units"; "frames_per_s" of those computed; "stages": seconds per computed frame, summed over the
-        workers, that overlap in time; "failures", "waiting".
+        units: what was asked for.
     """
-    waiting = counters.waiting
-    return {
-        "status": "interrupted" if signal_name else "complete" if counters.is_complete else "incomplete",
-        "stopped_by": signal_name or None,
-        "engine": engine,
-        "shard": {"index": shard.index, "count": shard.count},
-        "devices": list(layout.devices),
-        "threads": layout.threads,
-        "batch": layout.batch,
-        "machine": platform.platform(),
-        "frames": {
-            "total": counters.total,
-            "complete_before": counters.complete_before,
-            "computed": counters.computed,
-            "failed": counters.num_failed_frames,
-            "failed_logs": len(counters.failures) - counters.num_failed_frames,
-            "waiting": len(waiting),
-            "unopened_units": counters.num_unopened,
-        },
-        "seconds": seconds,
-        "frames_per_s": counters.computed / seconds if seconds > 0 else 0.0,
-        "stages": {name: total / max(1, counters.computed) for name, total in counters.seconds.items()},
-        "failures": [list(failure) for failure in counters.failures],
-        "waiting": waiting,
-    }
+
+    def __init__(self, units: Sequence[Unit]) -> None:
+        self.failures: List[Tuple[str, str]] = []  # (frame or log, message)
+        self._log_ids: Dict[int, str] = {}  # of units that were opened
+        self._states: Dict[Tuple[int, int], str] = {}  # (unit number, time stamp) -> state
+        self._unopened = {unit.number for unit in units}
+        self._seconds: Counter[str] = Counter()  # by stage, of all workers together
+
+    @property
+    def total(self) -> int:
+        """Frames of the units that were opened."""
+        return len(self._states)
+
+    @property
+    def num_opened(self) -> int:
+        """Units that were begun."""
+        return len(self._log_ids)
+
+    @property
+    def log_ids(self) -> List[str]:
+        """Logs of which frames are on disk, in order."""
+        return sorted(
+            {self._log_ids[unit] for (unit, _), state in self._states.items() if state in (_BEFORE, _COMPUTED)}
+        )
+
+    @property
+    def waiting(self) -> List[str]:
+        """Frames of opened units that are neither on disk nor failed, in order."""
+        waiting = sorted(key for key, state in self._states.items() if state == _WAITING)
+        return [f"{self._log_ids[unit]}/{stamp}" for unit, stamp in waiting]
+
+    @property
+    def computed(self) -> int:
+        """Frames that this run has written."""
+        return list(self._states.values()).count(_COMPUTED)
+
+    @property
+    def is_complete(self) -> bool:
+        """Every frame is on disk."""
+        return not (self.failures or self._unopened or self.waiting)
+
+    def add(self, event: Event) -> int:
+        """Count an event in; returns the number of frames that it settles (on disk, or failed)."""
+        unit, states = event.unit, {}
+        self._unopened.discard(unit)
+        if isinstance(event, Opened):
+            # A unit is opened again after its worker died: what is no longer to be done got its name before.
+            complete = _COMPUTED if unit in self._log_ids else _BEFORE
+            self._log_ids[unit] = event.log_id
+            states = {**dict.fromkeys(event.frames, complete), **dict.fromkeys(event.todo, _WAITING)}
+        elif isinstance(event, Done):
+            states = {event.timestamp: _COMPUTED}
+            self._seconds.update(event.seconds)
+        else:
+            self.failures.append((event.name, event.message))
+            states = {} if event.timestamp is None else {event.timestamp: _FAILED}
+        unsettled = {stamp: s for stamp, s in states.items() if self._states.get((unit, stamp), _WAITING) == _WAITING}
+        self._states.update({(unit, stamp): state for stamp, state in unsettled.items()})
+        return sum(state != _WAITING for state in unsettled.values())
+
+    def report(self, seconds: float, layout: Layout, shard: Shard, engine: str, signal_name: str) -> Dict[str, Any]:
+        """All figures of a run.
+
+        Args:
+            seconds: from the start of the engine to its end.
+            layout: what it ran on.
+            shard: which share of the work it was.
+            engine: "local" or "ray".
+            signal_name: what stopped it, "" if nothing did.
+
+        Returns:
+            "status": "complete", "incomplete" (something failed or is missing) or "interrupted"; "frames": "total",
+            "complete_before", "computed", "failed", "failed_logs" (or parts of logs), "waiting" (of begun logs) and
+            "unopened_units"; "frames_per_s" of those computed; "stages": seconds per computed frame, summed over the
+            workers, that overlap in time; "failures", "waiting".
+        """
+        counts = Counter(self._states.values())
+        computed, failed = counts[_COMPUTED], counts[_FAILED]
+        return {
+            "status": "interrupted" if signal_name else "complete" if self.is_complete else "incomplete",
+            "stopped_by": signal_name or None,
+            "engine": engine,
+            "shard": {"index": shard.index, "count": shard.count},
+            "devices": list(layout.devices),
+            "threads": layout.threads,
+            "batch": layout.batch,
+            "machine": platform.platform(),
+            "frames": {
+                "total": self.total,
+                "complete_before": counts[_BEFORE],
+                "computed": computed,
+                "failed": failed,
+                "failed_logs": len(self.failures) - failed,
+                "waiting": counts[_WAITING],
+                "unopened_units": len(self._unopened),
+            },
+            "seconds": seconds,
+            "frames_per_s": computed / seconds if seconds > 0 else 0.0,
+            "stages": {name: total / max(1, computed) for name, total in self._seconds.items()},
+            "failures": [list(failure) for failure in self.failures],
+            "waiting": self.waiting,
+        }
 
 
 def format_report(report: Dict[str, Any]) -> str:

@@ -12,14 +12,13 @@ from cflow_torch.data.atomic import remove_stale
 from cflow_torch.data.names import folder_in
 from cflow_torch.data.paths import as_path, is_remote
 from cflow_torch.data.records import strict, write_text
-from cflow_torch.fleet.counters import Counters
 from cflow_torch.fleet.job import Event, Failed, Job, split
 from cflow_torch.fleet.local import run_local
 from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.manifest import MANIFEST
 from cflow_torch.fleet.progress import Progress, say
 from cflow_torch.fleet.ray_engine import run_ray
-from cflow_torch.fleet.report import make_report
+from cflow_torch.fleet.report import Counters
 from cflow_torch.fleet.shard import Shard
 from cflow_torch.fleet.stop import StopSignal
 from cflow_torch.types import CFlowError
@@ -48,8 +47,8 @@ def run_fleet(
         **engine_settings: of the engine.
 
     Returns:
-        What `make_report` returns, which is also in OUTPUT/reports/<shard>.json if "is_written". "exit_status" is 0 if
-        every frame of the shard is on disk, 1 if not, 130, 143 or 129 if Ctrl-C, SIGTERM or SIGHUP came first.
+        As `Counters.report`, which is also in OUTPUT/reports/<shard>.json if "is_written". "exit_status" is 0 if every
+        frame of the shard is on disk, 1 if not, 130, 143 or 129 if Ctrl-C, SIGTERM or SIGHUP came first.
     """
     if engine not in ENGINES:
         raise CFlowError(f"engine={engine!r}: give one of {', '.join(ENGINES)}")
@@ -67,7 +66,7 @@ def run_fleet(
             say(f"ended early: {error}")
         counters.failures += _removed(job.output, counters)
         name = signal.Signals(stop.received).name if stop.received and not counters.is_complete else ""
-        report = {**make_report(counters, time.perf_counter() - start, layout, shard, engine, name), **about}
+        report = {**counters.report(time.perf_counter() - start, layout, shard, engine, name), **about}
         report["is_written"] = True
         report["exit_status"] = stop.exit_status if name else 0 if counters.is_complete else 1
         try:
@@ -91,7 +90,7 @@ def _removed(output: str, counters: Counters) -> List[Tuple[str, str]]:
     if is_remote(folder):
         return []
     has_manifest = (folder / MANIFEST).is_file()
-    gone = [log for log in sorted(counters.log_ids) if not (has_manifest and (folder / log / MANIFEST).is_file())]
+    gone = [log for log in counters.log_ids if not (has_manifest and (folder / log / MANIFEST).is_file())]
     return [(log, f"its folder in {output} was removed while the run wrote into it: run it again") for log in gone]
 
 
@@ -105,4 +104,4 @@ def _follow(events: Iterator[Event], counters: Counters, num_units: int) -> None
             if isinstance(event, Failed):
                 say(f"failed: {event.name}: {event.message}")
             progress.update(settled)
-        progress.total = progress.done
+        progress.total = progress.n

@@ -7,9 +7,8 @@ from fractions import Fraction
 from typing import Any, List, Mapping, Optional, Sequence
 
 from cflow_torch.fleet.job import Unit
+from cflow_torch.fleet.machine import AUTO
 from cflow_torch.types import CFlowError
-
-AUTO = "auto"
 
 
 @dataclass(frozen=True)

@@ -48,19 +48,18 @@ class Worker:
     Args:
         job: the run.
         device: where to compute.
-        ahead: batches read ahead and waiting to be written; 0 = read, compute and write in turn.
         model: stands in for the method (tests).
 
     Raises:
         CFlowError: there is no such device, or it cannot be used.
     """
 
-    def __init__(self, job: Job, device: str, ahead: int = _AHEAD, model: Optional[FlowModel] = None) -> None:
+    def __init__(self, job: Job, device: str, model: Optional[FlowModel] = None) -> None:
         try:
             torch.zeros(1, device=device)  # now, rather than frame by frame
         except (RuntimeError, AssertionError) as error:
             raise CFlowError(f"no worker can begin on {device}: {describe(error)}") from error
-        self._job, self._device, self._ahead = job, device, ahead
+        self._job, self._device, self._ahead = job, device, _AHEAD
         self._model: FlowModel = make_model(job.config, device) if model is None else model
         self._log: Tuple[Any, Optional[Log]] = (None, None)
         self._reader, self._writer = ThreadPoolExecutor(1), ThreadPoolExecutor(1)

@@ -6,10 +6,8 @@ import os
 import time
 from typing import Iterator, List, NamedTuple, Optional
 
-import pyarrow
-import torch
-
 from cflow_torch.fleet.job import Event, Job, Opened, Unit
+from cflow_torch.fleet.machine import set_threads
 from cflow_torch.fleet.progress import say
 from cflow_torch.fleet.work import DeviceLost, Worker, describe
 
@@ -24,29 +22,23 @@ class Step(NamedTuple):
     has_ended: bool
 
 
-class WorkerProcess:
-    """Lives in the worker process.
+class WorkerProcess(Worker):
+    """A worker that lives in a process of its own.
 
     Args:
         job: the run.
         device: where to compute.
         threads: of this process.
+
+    Raises:
+        CFlowError: there is no such device, or it cannot be used.
     """
 
     def __init__(self, job: Job, device: str, threads: int) -> None:
-        self._job, self._device, self._threads = job, device, threads
+        set_threads(threads)
+        super().__init__(job, device)
         self._events: Optional[Iterator[Event]] = None  # of the unit in hand
         self._is_told_to_stop = False
-
-    def begin(self) -> None:
-        """Make ready.
-
-        Raises:
-            CFlowError: there is no such device, or it cannot be used.
-        """
-        torch.set_num_threads(self._threads)
-        pyarrow.set_cpu_count(self._threads)
-        self._worker = Worker(self._job, self._device)
 
     def step(self, unit: Unit, stop: bool) -> Step:
         """Continue a unit for a while, or begin it.
@@ -56,7 +48,7 @@ class WorkerProcess:
             stop: finish the frames in hand and begin no others.
         """
         self._is_told_to_stop = stop
-        running, self._events = self._events or self._worker.run(unit, lambda: self._is_told_to_stop), None
+        running, self._events = self._events or self.run(unit, lambda: self._is_told_to_stop), None
         events: List[Event] = []
         until = time.monotonic() + _REPORT_EVERY_S
         try:

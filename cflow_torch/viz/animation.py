@@ -55,12 +55,9 @@ def save_animation(figures: Iterable[Figure], path: Union[str, Path], *, frames_
 
 def _pictures(figures: Iterable[Figure]) -> Iterator[Picture]:
     """RGB images."""
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure as FigureClass
-        from PIL import Image
-    except ImportError as error:
-        raise CFlowError("pictures need matplotlib: pip install matplotlib") from error
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure as FigureClass
+    from PIL import Image
 
     size = None
     for number, figure in enumerate(figures):

@@ -14,7 +14,6 @@ from small_fleet import PAIRS, TWO, make_job, run, tree
 from cflow_torch import CFlowError
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.fleet import ray_engine
-from cflow_torch.fleet.counters import Counters
 from cflow_torch.fleet.job import Job, Unit
 from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.ray_engine import run_ray
@@ -37,13 +36,13 @@ class LethalActor:
     The files lie beside the output.
     """
 
-    def __init__(self, job: Job, *more: Any) -> None:
+    def __init__(self, folder: str, job: Job, *more: Any) -> None:
         self._folder = Path(job.output).parent / "kills"
-        self._actor = ray_engine._Actor(job, *more)  # in the worker process, where it is the real one
+        self._actor = ray_engine._Actor(folder, job, *more)  # in the worker process, where it is the real one
 
     def begin(self) -> None:
         self._actor.begin()
-        read = self._actor._worker._read_one
+        read = self._actor._process._read_one
 
         def lethal_read(log: Any, index: int) -> Any:
             file = self._folder / f"{log.log_id}.{log.timestamps[index]}"
@@ -53,7 +52,7 @@ class LethalActor:
                 os.kill(os.getpid(), signal.SIGKILL)
             return read(log, index)
 
-        self._actor._worker._read_one = lethal_read  # type: ignore[method-assign]
+        self._actor._process._read_one = lethal_read  # type: ignore[method-assign]
 
     def step(self, unit: Unit, stop: bool) -> Any:
         return self._actor.step(unit, stop)
@@ -92,19 +91,6 @@ def test_a_killed_worker_is_replaced_and_a_frame_that_always_kills_is_reported(
     assert tree(tmp_path / "out") == {file: c for file, c in single.items() if file != f"{name}.feather"}
 
 
-@pytest.mark.slow
-def test_stop_lets_the_frames_in_hand_be_finished(fleet: Path, single: Dict[str, bytes], tmp_path: Path) -> None:
-    run(sorted(fleet.iterdir())[0], tmp_path)  # claims the folder
-    (tmp_path / sorted(fleet.iterdir())[0].name / "manifest.json").unlink()
-    units = [Unit(n, source) for n, source in enumerate(sorted(fleet.iterdir()))]
-    counters = Counters(units)
-    for event in run_ray(make_job(tmp_path, redo=True), units, TWO, lambda: bool(counters.computed)):
-        counters.add(event)
-    assert 0 < counters.computed < PAIRS
-    assert run(fleet, tmp_path, TWO, engine="ray")["exit_status"] == 0
-    assert tree(tmp_path) == single
-
-
 def begin(layout: Layout, **settings: Any) -> None:
     next(run_ray(make_job(Path("nowhere")), [Unit(0, "nothing")], layout, lambda: False, **settings))
 
@@ -113,7 +99,6 @@ def begin(layout: Layout, **settings: Any) -> None:
     "layout, settings, message",
     [
         (TWO, {"retries": -1}, "engine.retries"),
-        (TWO, {"num_cpus": "many"}, "engine.num_cpus"),
         (Layout(("cuda:0",), 1, 1), {"num_gpus": 0}, "a share"),
         (Layout(("cuda:1",), 1, 1), {}, "CUDA_VISIBLE_DEVICES"),
     ],
@@ -121,15 +106,6 @@ def begin(layout: Layout, **settings: Any) -> None:
 def test_bad_settings(layout: Layout, settings: Dict[str, Any], message: str) -> None:
     with pytest.raises(CFlowError, match=message):
         begin(layout, **settings)
-
-
-def test_no_cluster_at_the_address(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(**_: Any) -> None:
-        raise ConnectionError("nobody there")
-
-    monkeypatch.setattr("ray.init", refuse)
-    with pytest.raises(CFlowError, match="engine.address=auto: no connection .*nobody there"):
-        begin(TWO, address="auto")
 
 
 @pytest.mark.slow

@@ -13,17 +13,14 @@ from typing import Any, Callable, Dict
 import numpy as np
 import pytest
 from pyarrow import feather
-from small_fleet import CONFIG, ONE, PAIRS, SWEEPS, command, flow_files, frames, make_job, run, tree
+from small_fleet import CONFIG, PAIRS, SWEEPS, command, flow_files, frames, run, tree
 
 from cflow_torch import CFlowError, make_config, make_model
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.flow_file import read_flow
 from cflow_torch.data.log import window
 from cflow_torch.fleet import work
-from cflow_torch.fleet.forecast import format_forecast, make_forecast
-from cflow_torch.fleet.job import Unit
 from cflow_torch.fleet.machine import Layout
-from cflow_torch.fleet.manifest import complete_frames
 from cflow_torch.fleet.shard import Shard, find_shard
 
 OTHER = {"config": make_config("paper", pixel_size=0.8)}  # settings of another run
@@ -142,14 +139,6 @@ def test_a_log_that_has_changed_is_refused_and_the_others_go_on(
     assert tree(out) == single
 
 
-def test_a_folder_without_manifest_has_no_complete_frames(tmp_path: Path) -> None:
-    (tmp_path / "1.feather").write_bytes(b"ARROW1")
-    assert complete_frames(tmp_path) == set()
-    (tmp_path / "manifest.json").write_text("{}")
-    (tmp_path / "2.feather").write_bytes(b"ARRO")
-    assert complete_frames(tmp_path) == {1}
-
-
 def test_results_may_lie_where_fsspec_reaches(fleet: Path, single_run: Path, tmp_path: Path) -> None:
     fsspec = pytest.importorskip("fsspec", reason="needs the extra remote")
     pytest.importorskip("upath", reason="needs the extra remote")
@@ -182,12 +171,6 @@ def test_a_sweep_over_shards_shares_one_folder(fleet: Path, single_run: Path, tm
     reports = [json.loads(file.read_text()) for file in sorted((tmp_path / "reports").iterdir())]
     assert [report["exit_status"] for report in reports] == [0, 0]
     assert flow_files(tmp_path) == flow_files(single_run)
-
-
-def test_a_shard_without_frames_is_complete(fleet: Path, tmp_path: Path) -> None:
-    log = sorted(fleet.iterdir())[0]
-    report = run(log, tmp_path, shard=Shard(0, 90))
-    assert (report["frames"]["total"], report["exit_status"]) == (0, 0)
 
 
 # Trouble
@@ -240,18 +223,11 @@ def during(patch: pytest.MonkeyPatch, number: int, act: Callable[[], Any]) -> No
     patch.setattr(work, "write_flow", write_after)
 
 
-@pytest.mark.parametrize("which", ["all", "first log"])
 def test_an_output_that_is_removed_during_the_run_is_told(
-    fleet: Path,
-    single: Dict[str, bytes],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture,
-    which: str,
+    fleet: Path, single: Dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "out"
-    place = {"all": out, "first log": out / sorted(fleet.iterdir())[0].name}[which]
-    during(monkeypatch, 5, lambda: shutil.rmtree(place))
+    during(monkeypatch, 5, lambda: shutil.rmtree(out / sorted(fleet.iterdir())[0].name))
     report = run(fleet, out)
     assert report["exit_status"] == 1 and any("removed" in message for _, message in report["failures"])
     assert run(fleet, out)["exit_status"] == 0
@@ -289,16 +265,8 @@ def test_the_command_says_what_it_would_do_and_then_does_it(
     assert command(f"data.root={fleet}", f"output={out}", "engine.batch=2") == 0
     assert re.search(rf"computed +{PAIRS}\n", capsys.readouterr().out)
     assert flow_files(out) == flow_files(single_run)
+    frames(out)[0].unlink()
+    assert command(f"data.root={fleet}", f"output={out}", "engine.batch=2", "dry_run=true") == 0
+    assert f"{PAIRS} frames, {PAIRS - 1} complete, 1 to do" in capsys.readouterr().out
     assert command(f"data.root={fleet}", f"output={out}", "engine.name=cloud") == 2
     assert "local, ray" in capsys.readouterr().err
-
-
-def test_a_forecast_counts_what_is_complete(fleet: Path, out: Path) -> None:
-    gone = frames(out)[:1]
-    for file in gone:
-        file.unlink()
-    units = Shard().units(sorted(fleet.iterdir()))
-    found = make_forecast(make_job(out), [*units, Unit(3, fleet / "nowhere")], ONE)
-    printed = format_forecast(found, make_job(out))
-    assert f"3 logs, {PAIRS} frames, {PAIRS - 1} complete, 1 to do" in printed
-    assert "cannot be opened: nowhere" in printed and found.frame_bytes > 1000

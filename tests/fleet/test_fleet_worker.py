@@ -9,17 +9,16 @@ from pathlib import Path
 from typing import Any, Callable, Dict, Iterator, List, Optional, Sequence
 
 import pytest
-from small_fleet import CONFIG, PAIRS, SWEEPS, flow_files, make_job, tree
+from small_fleet import CONFIG, PAIRS, flow_files, make_job, tree
 
-from cflow_torch import CFlowError, FlowResult, Window, make_config, make_model
+from cflow_torch import CFlowError, FlowResult, Window, make_model
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.fleet import dispatch as dispatching
-from cflow_torch.fleet.counters import Counters
 from cflow_torch.fleet.dispatch import WorkerDied, dispatch
 from cflow_torch.fleet.job import Done, Event, Failed, Job, Opened, Unit
 from cflow_torch.fleet.local import run_local
 from cflow_torch.fleet.machine import Layout
-from cflow_torch.fleet.report import format_missing, format_report, make_report
+from cflow_torch.fleet.report import Counters, format_missing, format_report
 from cflow_torch.fleet.shard import Shard
 from cflow_torch.fleet.work import Worker
 from cflow_torch.fleet.worker_process import WorkerProcess
@@ -103,35 +102,6 @@ def test_events_come_in_the_order_of_the_log(source: Path, tmp_path: Path) -> No
     assert all({"read", "compute", "write", "compute/project"} <= set(event.seconds) for event in done)
 
 
-def test_windows_of_one_log_share_the_sweeps_that_were_read(source: Path, tmp_path: Path, monkeypatch) -> None:
-    read: List[int] = []
-    sweep = AV2Log.sweep
-    monkeypatch.setattr(AV2Log, "sweep", lambda self, index: read.append(index) or sweep(self, index))
-    worker = Worker(make_job(tmp_path), "cpu")
-    for part in range(5):  # one frame after the other, as after a crash
-        only = frozenset([int(AV2Log(source).timestamps[part])])
-        assert any(isinstance(event, Done) for event in worker.run(Unit(0, source, only=only)))
-    digests = 5 * 3  # each call looks whether the log is the same, mostly in vain
-    assert len(read) <= SWEEPS[1] + digests and sorted(set(read)) == list(range(SWEEPS[1]))
-
-
-def test_a_worker_that_is_told_to_stop_finishes_what_it_has_in_hand(source: Path, tmp_path: Path) -> None:
-    stop = lambda: bool(flow_files(tmp_path))  # noqa: E731
-    events = list(Worker(make_job(tmp_path, batch=1), "cpu").run(Unit(0, source), stop))
-    done = [event.timestamp for event in events if isinstance(event, Done)]
-    assert 1 <= len(done) < 5
-    assert sorted(int(Path(name).stem) for name in flow_files(tmp_path)) == done
-
-
-def test_a_worker_closes_the_file_it_read(kitti_file: Path, tmp_path: Path) -> None:
-    pytest.importorskip("h5py", reason="needs the extra hdf5")
-    worker = Worker(Job(make_config("paper"), "0" * 64, "hdf5", {}, str(tmp_path)), "cpu")
-    scene = worker._open(kitti_file).log
-    assert scene._scene, "it is open"
-    worker.close()
-    assert not scene._scene
-
-
 def test_a_gpu_that_is_lost_ends_its_worker(source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     model = Stumbling(AV2Log(source).timestamps, lambda: RuntimeError("assert"))
     worker = Worker(make_job(tmp_path, batch=1), "cpu", model=model)
@@ -157,18 +127,14 @@ def test_an_error_outside_of_frames_costs_the_unit_only(
         return real(self, log, *rest)
 
     monkeypatch.setattr(Worker, "_pass", pass_)
-    for handles in (None, 2):
-        out = tmp_path / str(handles)
-        units = [Unit(n, folder) for n, folder in enumerate([first, *others])]
-        if handles is None:
-            events = list(run_local(make_job(out), units, Layout(("cpu",), 1, 2), lambda: False))
-        else:
-            events = list(dispatch([Thread(make_job(out)) for _ in range(2)], units, lambda: False, 1))
-        assert [(e.name, e.message) for e in events if isinstance(e, Failed)] == [
-            (first.name, "RuntimeError: can't start new thread")
-        ]
-        assert flow_files(out) == {n: c for n, c in flow_files(out).items() if n in single}
-        assert len(flow_files(out)) == PAIRS - 3
+    units = [Unit(n, folder) for n, folder in enumerate([first, *others])]
+    here = run_local(make_job(tmp_path / "here"), units, Layout(("cpu",), 1, 2), lambda: False)
+    apart = dispatch([Thread(make_job(tmp_path / "apart")) for _ in range(2)], units, lambda: False, 1)
+    for name, events in (("here", here), ("apart", apart)):
+        failed = [(e.name, e.message) for e in events if isinstance(e, Failed)]
+        assert failed == [(first.name, "RuntimeError: can't start new thread")]
+        assert len(flow_files(tmp_path / name)) == PAIRS - 3
+        assert flow_files(tmp_path / name).items() <= single.items()
 
 
 # Several workers: the dispatcher, with threads in place of processes
@@ -202,15 +168,14 @@ class Thread:
         if self.started <= self.stillborn:
             raise WorkerDied("by SIGKILL")
         self._process = WorkerProcess(self.job, "cpu", 1)
-        self._process.begin()
-        self._process._worker._ahead = 0
+        self._process._ahead = 0
 
     def step(self, unit: Unit, stop: bool) -> Future:
         return self._thread.submit(self._step, unit, stop)
 
     def _step(self, unit: Unit, stop: bool) -> Any:
         """As the real one, but without read-ahead, so that frames before the deadly one are on disk."""
-        worker, deadly = self._process._worker, self.deadly
+        worker, deadly = self._process, self.deadly
         read = Worker._read_one
 
         def deadly_read(log: Any, index: int) -> Any:
@@ -337,7 +302,7 @@ def test_a_report_of_trouble_lists_what_is_missing() -> None:
     assert counters.add(Failed(1, "b", "no log")) == 0
     assert counters.add(Opened(0, "a", stamps[12:], stamps[13:])) == 1, "12 was written before its worker died"
     assert counters.add(Opened(0, "a", (20,), (20,))) == 0, "by itself"
-    told = make_report(counters, 4.0, Layout(("cpu",), 2, 1), Shard(), "local", "SIGTERM")
+    told = counters.report(4.0, Layout(("cpu",), 2, 1), Shard(), "local", "SIGTERM")
     assert told["status"] == "interrupted" and told["stopped_by"] == "SIGTERM"
     assert list(told["frames"].values()) == [40, 10, 2, 1, 1, 27, 1]
     missing = format_missing(told).splitlines()

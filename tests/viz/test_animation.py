@@ -66,14 +66,6 @@ def test_what_moves_leaves_no_trace_and_what_stands_still_does_not_flicker(tmp_p
     assert (pictures[0][70:-2] < 100).any(), "the text is there"
 
 
-@pytest.mark.parametrize(("rate", "duration"), [(3, 330), (50, 20), (0.5, 2000)])
-def test_rates_are_rounded_to_what_a_gif_can_say(rate: float, duration: int, tmp_path: Path) -> None:
-    pictures = [patch(RED), patch(RED), patch(BLUE)]
-    save_animation(pictures, tmp_path / "a.gif", frames_per_second=rate)
-    durations = [duration for _, duration in frames_of(tmp_path / "a.gif")]
-    assert sum(durations) == 3 * duration and durations[-1] == duration, "equal pictures keep their time"
-
-
 @pytest.mark.parametrize(("width", "height"), [(200, 100), (201, 101)])
 def test_a_video_has_every_picture(width: int, height: int, tmp_path: Path) -> None:
     ffmpeg = pytest.importorskip("imageio_ffmpeg")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import sys
 from pathlib import Path
 from typing import Callable
@@ -14,7 +13,6 @@ from PIL import Image
 
 from cflow_torch import CFlowError
 from cflow_torch.cli import plot as plot_command
-from cflow_torch.cli import view as view_command
 from cflow_torch.cli.main import main
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.log import window
@@ -135,22 +133,3 @@ def test_a_recording_of_what_is_estimated_and_of_what_lies_in_a_folder(
     printed = capsys.readouterr()
     assert f"{file}: 2 pairs" in printed.out and "1 failed" in printed.err and file.is_file()
     assert cflow("view", "flow=nowhere") == 2 and "flow=nowhere is no folder" in capsys.readouterr().err
-
-
-def test_two_logs_of_one_name_do_not_overwrite_each_other(
-    cflow: Callable, drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
-    pytest.importorskip("rerun")
-    for split in ("train", "val"):
-        (tmp_path / "data" / split).mkdir(parents=True)
-        (tmp_path / "data" / split / NAME).symlink_to(drive / NAME, target_is_directory=True)
-    assert cflow("view", f"data.root={tmp_path / 'data'}", "model=paper", "count=1", SMALL) == 1
-    printed = capsys.readouterr()
-    assert len(re.findall(r"\.rrd: 1 pair", printed.out)) == 1
-    assert f"1 failed:\n  {NAME}: " in printed.err and "give data.root=PATH more narrowly" in printed.err
-
-
-def test_a_viewer_that_ends_at_once_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "executable", "false")
-    with pytest.raises(CFlowError, match="rerun --web-viewer a.rrd"):
-        view_command._show([Path("a.rrd")])

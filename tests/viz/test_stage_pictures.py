@@ -82,23 +82,6 @@ def test_the_peak_of_the_map_is_the_flow_of_the_cluster(overrides: dict) -> None
     assert moving >= 2
 
 
-def test_the_default_cluster_moves_most_over_all_scales() -> None:
-    sweeps = scene(8)
-    for settings in (paper(), paper(**TWO_SIZES)):
-        (result,) = make_model(settings)([sweeps])
-        chosen, weights = stages.cluster_correlation(sweeps, settings), {}
-        for number in np.unique(result.cluster_id[result.cluster_id >= 0].numpy()):
-            flow = np.sort(result.residual_flow[result.cluster_id == number].numpy(), axis=0)
-            weights[number] = len(flow) * np.linalg.norm(flow[len(flow) // 2])
-        assert chosen.cluster_id == max(weights, key=weights.__getitem__)
-        # Its pixels are where its points are: all in the frame of t+1.
-        if len(settings.pixel_sizes) == 1:
-            rows = (result.cluster_id == chosen.cluster_id).numpy()
-            place = (sweeps.pc0.points.astype(float) + result.pose_flow.numpy())[rows, :2]
-            col, row = np.floor((place - chosen.images.lower) / SIZE + 1e-6).astype(int).T
-            assert chosen.images.t[row.clip(0), col.clip(0)].mean() > 0.99
-
-
 def test_matches_of_one_object_are_its_motion() -> None:
     found = stages.keypoint_matches(one_object(), keypoints())
     assert np.allclose(found.end - found.start, (1.0, -0.5)) and len(found.start) > 10
@@ -198,10 +181,3 @@ def test_nothing_to_draw() -> None:
 def test_a_method_without_such_a_picture_is_told(plot: Any, settings: Config, message: str) -> None:
     with pytest.raises(CFlowError, match=message):
         plot(scene(4), settings)
-
-
-@pytest.mark.parametrize("plot", [plot_correlation, plot_keypoints, plot_scales])
-def test_presets_of_their_own_leave_older_sweeps_out(plot: Any) -> None:
-    plot(scene(4, num_history=2))
-    with pytest.raises(CFlowError, match="num_history"):
-        plot(scene(4, num_history=2), keypoints() if plot is plot_keypoints else paper())
