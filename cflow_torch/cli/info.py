@@ -27,6 +27,7 @@ _MODULES = {
     "hydra-submitit-launcher": "hydra_plugins.hydra_submitit_launcher",
     "opencv-python-headless": "cv2",
     "pillow": "PIL.Image",
+    "pyyaml": "yaml",
     "rerun-sdk": "rerun",
     "scikit-learn": "sklearn",
     "universal-pathlib": "upath",
@@ -48,6 +49,8 @@ def task(arguments: List[str]) -> None:
         asked = []
     names = [re.split(r"[^\w.-]", text, maxsplit=1)[0].lower().replace("_", "-") for text in asked]
     for name in dict.fromkeys([*names, *_NATIVE]):
+        if name == "cflow-torch":  # its own extras
+            continue
         print(_state(name), flush=True)
 
 
