@@ -39,11 +39,6 @@ class StopSignal:
         """Whether to stop."""
         return self.received is not None
 
-    @property
-    def exit_status(self) -> int:
-        """What a process that a signal ended gives back."""
-        return 128 + (self.received or 0)
-
     def _receive(self, number: int, _: Any) -> None:
         if self.received is not None:
             raise KeyboardInterrupt
