@@ -10,10 +10,9 @@ from typing import Any, Callable, Iterator, Optional, Sequence
 
 from pebble import ProcessExpired, ProcessPool
 
-from cflow_torch.fleet.dispatch import WorkerDied, dispatch
+from cflow_torch.fleet.dispatch import SIGNALS, WorkerDied, dispatch
 from cflow_torch.fleet.job import Event, Job, Unit
 from cflow_torch.fleet.machine import Layout, threads
-from cflow_torch.fleet.stop import SIGNALS
 from cflow_torch.fleet.work import Worker, describe
 from cflow_torch.fleet.worker_process import Step, WorkerProcess
 from cflow_torch.types import CFlowError

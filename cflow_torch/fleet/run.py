@@ -1,24 +1,26 @@
-"""A whole run: starts the engine, counts, reports."""
+"""A whole run: starts the engine, counts, listens to signals, reports."""
 
 from __future__ import annotations
 
 import json
+import os
 import signal
+import threading
 import time
-from contextlib import closing
-from typing import Any, Dict, Iterator, Sequence
+from contextlib import closing, suppress
+from typing import Any, Dict, Iterator, Optional, Sequence
 
 from cflow_torch.data.atomic import remove_stale
 from cflow_torch.data.names import folder_in
 from cflow_torch.data.paths import as_path
 from cflow_torch.data.records import strict, write_text
+from cflow_torch.fleet.dispatch import SIGNALS
 from cflow_torch.fleet.job import Event, Failed, Job, Shard, split
 from cflow_torch.fleet.local import run_local
 from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.progress import Progress, say
 from cflow_torch.fleet.ray_engine import run_ray
 from cflow_torch.fleet.report import Counters
-from cflow_torch.fleet.stop import StopSignal
 from cflow_torch.types import CFlowError
 
 ENGINES: Dict[str, Any] = {"local": run_local, "ray": run_ray}
@@ -93,3 +95,39 @@ def _follow(events: Iterator[Event], counters: Counters, num_units: int) -> None
                 say(f"failed: {event.name}: {event.message}")
             progress.update(settled)
         progress.total = progress.n
+
+
+class StopSignal:
+    """While it is open, the first of `SIGNALS` only sets `received`; the second raises KeyboardInterrupt.
+
+    Schedulers send SIGTERM some seconds before they kill (preemption, time limit). Outside the main thread, where
+    Python cannot catch signals, it does nothing.
+    """
+
+    def __init__(self) -> None:
+        self.received: Optional[int] = None
+        self._before: Dict[int, Any] = {}
+
+    def __enter__(self) -> StopSignal:
+        if threading.current_thread() is threading.main_thread():
+            for number in SIGNALS:
+                if number == signal.SIGINT or signal.getsignal(number) is not signal.SIG_IGN:  # nohup stays nohup
+                    self._before[number] = signal.signal(number, self._receive)
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def __call__(self) -> bool:
+        """Whether to stop."""
+        return self.received is not None
+
+    def _receive(self, number: int, _: Any) -> None:
+        if self.received is not None:
+            raise KeyboardInterrupt
+        self.received = number
+        name = signal.Signals(number).name
+        # Not print: the signal may have come in the middle of one. Nobody may read it any more (`| head`).
+        with suppress(OSError):
+            os.write(2, f"\n{name}: finishing the frames in hand; once more to end at once\n".encode())

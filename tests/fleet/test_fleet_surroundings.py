@@ -19,7 +19,7 @@ from cflow_torch.fleet import machine, progress
 from cflow_torch.fleet.job import Shard, find_shard, split
 from cflow_torch.fleet.machine import Layout, choose_layout, usable_cores
 from cflow_torch.fleet.progress import Progress, say
-from cflow_torch.fleet.stop import StopSignal
+from cflow_torch.fleet.run import StopSignal
 
 # Shares of the work
 
