@@ -7,11 +7,10 @@
 old: the versions of constraints_old.txt (torch 2.0.1, numpy 1.24, kornia 0.7.3), meant for Python 3.8.
 new: the newest of everything that pip finds, meant for Python 3.13.
 
-The interpreter is that of --python, else of $PYTHON_OLD or $PYTHON_NEW. What is tested is the last commit, or with
---working-tree the tracked files as they are. The tests that are not slow run in a folder without the package, so that
-only the wheel can be imported; real data is taken from $CFLOW_DATA, else from ../shared/data beside the checkout. Each
-needs about 6 GB: pip may find torch with CUDA only. The exit status is that of pytest; FOLDER/NAME/freeze.txt has the
-versions.
+The interpreter is that of --python, else of $PYTHON_OLD or $PYTHON_NEW. What is tested is the last commit. The
+tests that are not slow run in a folder without the package, so that only the wheel can be imported; real data is taken
+from $CFLOW_DATA, else from ../shared/data beside the checkout. Each needs about 6 GB: pip may find torch with CUDA
+only. The exit status is that of pytest; FOLDER/NAME/freeze.txt has the versions.
 """
 
 from __future__ import annotations
@@ -48,7 +47,6 @@ def main(arguments: Optional[Sequence[str]] = None) -> int:
     parser.add_argument("name", choices=sorted(INSTALL))
     parser.add_argument("--python", help="interpreter of the environment")
     parser.add_argument("--folder", type=Path, default=ROOT / "outputs" / "environments", help="for what is installed")
-    parser.add_argument("--working-tree", action="store_true", help="test what is not committed, too")
     parser.add_argument("-k", dest="chosen", default="", metavar="EXPRESSION", help="only these tests, as in pytest -k")
     given = parser.parse_args(arguments)
     base = given.python or os.environ.get(f"PYTHON_{given.name.upper()}")
@@ -58,7 +56,7 @@ def main(arguments: Optional[Sequence[str]] = None) -> int:
     home.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="cflow-check-") as temporary:
         source = Path(temporary) / "source"
-        copy_checkout(source, given.working_tree)
+        copy_checkout(source)
         run(sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", Path(temporary) / "wheel", source)
         (wheel,) = (Path(temporary) / "wheel").glob("*.whl")
         python = install(given.name, base, home, wheel)
@@ -71,11 +69,10 @@ def main(arguments: Optional[Sequence[str]] = None) -> int:
         return subprocess.run([python, "-m", "pytest", *tests], cwd=source, env=environment()).returncode
 
 
-def copy_checkout(target: Path, with_changes: bool) -> None:
-    """The tracked files of the last commit, or as they are now."""
-    commit = subprocess.check_output(["git", "stash", "create"], cwd=ROOT, text=True).strip() if with_changes else ""
+def copy_checkout(target: Path) -> None:
+    """The tracked files of the last commit."""
     archive = target.with_suffix(".tar")
-    run("git", "archive", "-o", archive, commit or "HEAD", cwd=ROOT)
+    run("git", "archive", "-o", archive, "HEAD", cwd=ROOT)
     with tarfile.open(archive) as files:
         files.extractall(target)  # noqa: S202
 

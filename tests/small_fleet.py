@@ -9,11 +9,10 @@ from typing import Any, Dict, List
 from cflow_torch import make_config
 from cflow_torch.cli.main import main
 from cflow_torch.data.catalog import find_sources
-from cflow_torch.fleet.job import Job
+from cflow_torch.fleet.job import Job, Shard
 from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.manifest import claim_folder, make_identity
 from cflow_torch.fleet.run import run_fleet
-from cflow_torch.fleet.shard import Shard
 from cflow_torch.simulator import make_drive
 from cflow_torch.simulator.writers.av2 import write_av2_log
 
@@ -35,7 +34,7 @@ def write_fleet(root: Path) -> Path:
 
 def make_job(output: Path, **settings: Any) -> Job:
     """A run of `CONFIG` on Argoverse 2 logs."""
-    values: Dict[str, Any] = {"config": CONFIG, "settings": {}, "batch": 2, "check": False, **settings}
+    values: Dict[str, Any] = {"config": CONFIG, "settings": {"check": False}, "batch": 2, **settings}
     hashed = make_identity(values["config"], "av2", values["settings"])["hash"]
     return Job(identity=hashed, reader="av2", output=str(output), **values)
 

@@ -12,7 +12,6 @@ examples:
 from __future__ import annotations
 
 import json
-import sys
 from typing import Any, Dict, List, Sequence
 
 import torch
@@ -25,6 +24,7 @@ from cflow_torch.data.records import strict, write_text
 from cflow_torch.fleet.machine import threads
 from cflow_torch.stages import FlowModel, StopWatch
 from cflow_torch.types import CFlowError, Window
+from cflow_torch.windows.memory import peak_memory
 
 
 def task(cfg: DictConfig) -> None:
@@ -83,7 +83,7 @@ def measure(model: FlowModel, windows: Sequence[Window], repeats: int, batches: 
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else str(device),
         "seconds": watch.report(),
         "batches": throughput,
-        "peak_bytes": torch.cuda.max_memory_allocated(device) if device.type == "cuda" else _most_resident(),
+        "peak_bytes": torch.cuda.max_memory_allocated(device) if device.type == "cuda" else peak_memory(),
     }
 
 
@@ -116,13 +116,3 @@ def _windows(log: Log, count: int, num_history: int) -> List[Window]:
     first = min(num_history, last)
     count = min(count, last - first + 1)
     return [window(log, first + (last - first) * i // max(count - 1, 1), num_history) for i in range(count)]
-
-
-def _most_resident() -> Any:
-    """Bytes that the process held at most since it began; None where the system does not say."""
-    try:
-        import resource
-    except ImportError:  # Windows
-        return None
-    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return most if sys.platform == "darwin" else 1024 * most

@@ -38,12 +38,11 @@ from cflow_torch.data.flow_file import CONTENTS, ON_REQUEST, read_flow
 from cflow_torch.data.hdf5.results import check_result_name, check_writable, write_hdf5_results
 from cflow_torch.data.records import write_text
 from cflow_torch.fleet.forecast import forecast
-from cflow_torch.fleet.job import Job
+from cflow_torch.fleet.job import Job, Shard, find_shard
 from cflow_torch.fleet.machine import choose_layout
 from cflow_torch.fleet.manifest import claim_folder, complete_frames, find_conflict, frame_file, make_identity
 from cflow_torch.fleet.report import format_missing, format_report
 from cflow_torch.fleet.run import report_file, run_fleet
-from cflow_torch.fleet.shard import Shard, find_shard
 from cflow_torch.types import CFlowError
 
 
@@ -65,12 +64,11 @@ def task(cfg: DictConfig) -> None:
         config=config,
         identity=identity["hash"],
         reader=sources.reader,
-        settings={key: value for key, value in sources.settings.items() if key != "check"},
+        settings=sources.settings,
         output=str(output),
         contents=contents,
         batch=layout.batch,
         redo=cfg.overwrite,
-        check=sources.settings.get("check", True),
     )
     if cfg.dry_run:
         conflict = find_conflict(output, identity, cfg.resume or cfg.overwrite)
@@ -93,8 +91,7 @@ def task(cfg: DictConfig) -> None:
         failures = _into_scenes(cfg.result_name, sources.logs, output)
         missing += "".join(f"\n  {scene}: {message}" for scene, message in failures)
         status = status or int(bool(failures))
-    where = f"report in {report_file(job.output, shard)}" if report["is_written"] else "no report"
-    print(f"{format_report(report)}\nflow files in {output}, {where}")
+    print(f"{format_report(report)}\nflow files in {output}, report in {report_file(job.output, shard)}")
     if status:
         print(f"missing:\n{missing}", file=sys.stderr)
         if run.is_sweep():  # Hydra lets the other jobs run before it ends with status 1

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import select
 import sys
 import traceback
 from contextlib import suppress
@@ -59,7 +58,7 @@ def main(argv: Optional[List[str]] = None) -> None:
         finally:
             sys.stdout.flush()
     except OSError as error:
-        if error.filename is not None or error.errno is None:
+        if error.errno is None:
             raise
         _end_refused(error)
     except KeyboardInterrupt:
@@ -116,12 +115,7 @@ def _run_with_settings(command: str, run: Any, rest: List[str]) -> None:
             raise
         except Exception as error:
             if isinstance(error, OSError) and error.errno is not None:
-                if error.filename is None:
-                    _end_refused(error)
-                reason = error.strerror or error
-                _end_wrong(
-                    f"{error.filename}: {reason}; give places that can be read (data.root=) and written (output=)"
-                )
+                _end_refused(error)
             traceback.print_exc()
             report = "this is a fault of cflow, not of the call: report it with the lines above and `cflow info`"
             raise UnfinishedJob(report) from None
@@ -146,32 +140,22 @@ def _end_wrong(message: object) -> None:
 
 
 def _end_refused(error: OSError) -> None:
-    """End after the system refused something that has no name: mostly to print, on a full disk, to a reader who left.
+    """End after the system refused a file, or something that has no name: mostly to print, to a reader who left.
 
     What cannot be printed is given up: else it would be tried once more.
     """
-    status = 1
-    if isinstance(error, BrokenPipeError) and _is_unread():
-        status = 128 + 13  # as if SIGPIPE had ended it
-    else:
+    if error.filename is not None:
+        reason = error.strerror or error
+        _end_wrong(f"{error.filename}: {reason}; give places that can be read (data.root=) and written (output=)")
+    is_unread = isinstance(error, BrokenPipeError)  # `cflow info | head`: commands end without a word
+    if not is_unread:
         with suppress(OSError):
             print(f"error: {error}: no file is named, so it is mostly what this command prints to", file=sys.stderr)
     try:
         sys.stdout.flush()
     except OSError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    raise SystemExit(status) from None
-
-
-def _is_unread() -> bool:
-    """Whether nobody reads what is printed any more (`cflow info | head`): then commands end without a word."""
-    try:
-        poll = select.poll()
-        for stream in (sys.stdout, sys.stderr):
-            poll.register(stream.fileno(), 0)
-        return any(event & (select.POLLERR | select.POLLHUP) for _, event in poll.poll(0))
-    except (AttributeError, OSError, ValueError):  # no such call on this system, no such file
-        return True
+    raise SystemExit(128 + 13 if is_unread else 1) from None  # as if SIGPIPE had ended it
 
 
 if __name__ == "__main__":

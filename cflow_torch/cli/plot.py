@@ -31,7 +31,6 @@ from tqdm import tqdm
 from cflow_torch.cli import run
 from cflow_torch.data.atomic import ready_folder
 from cflow_torch.data.log import Log, RecentSweeps, window
-from cflow_torch.data.log_check import check_log
 from cflow_torch.data.paths import is_remote
 from cflow_torch.fleet.progress import frames as counted
 from cflow_torch.model import SceneFlowModel
@@ -82,10 +81,8 @@ def find_log(cfg: DictConfig) -> Log:
     chosen = [source for source, name in zip(sources.logs, names) if name == cfg.log]
     for source in chosen or sources.logs:
         with suppress(*(() if chosen else (CFlowError, OSError))):
-            log = sources.open(source, check=False)
+            log = sources.open(source)
             if log.log_id == cfg.log:
-                if sources.settings.get("check", True):
-                    check_log(log)
                 return log
     raise CFlowError(f"log={cfg.log}: there is no such log; there are {', '.join(sorted(names))}")
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import re
 from dataclasses import asdict
 from datetime import datetime, timezone
 from pathlib import Path
@@ -39,9 +38,8 @@ class Scores:
         labels = log.labels(index)
         if labels is None:
             return
-        parts = {"eval_mask": _if_known(log, "eval_mask", index)}
-        if self.metrics.definition.ego_motion == "stored":
-            parts["stored_motion"] = _if_known(log, "stored_motion", index)
+        wanted = ("eval_mask", "stored_motion") if self.metrics.definition.ego_motion == "stored" else ("eval_mask",)
+        parts = {name: getattr(log, name)(index) for name in wanted if hasattr(log, name)}
         self.metrics.update(EvalFrame.from_result(sweeps, result, labels, **parts))
         for values in (sweeps.pc0.points, labels.flow, labels.category, labels.is_valid):
             self._digest.update(np.ascontiguousarray(values).tobytes())
@@ -78,17 +76,9 @@ class Scores:
             "results": results,
         }
         write_config(self._cfg, folder)
-        text = json.dumps(strict(record), indent=1, allow_nan=False)
-        lists = re.compile(r"\[\n\s*([^][{}]*?)\n\s*\]")  # each on one line
-        write_text(folder / RESULTS, lists.sub(lambda found: f"[{' '.join(found[1].split())}]", text) + "\n")
+        write_text(folder / RESULTS, json.dumps(strict(record), indent=1, allow_nan=False) + "\n")
         print(f"{folder}: {format_table(results)}")
         return results
-
-
-def _if_known(log: Log, name: str, index: int) -> Any:
-    """What a log knows about a pair beyond the protocol; None where it does not."""
-    find = getattr(log, name, None)
-    return None if find is None else find(index)
 
 
 def finished_results(cfg: DictConfig, folder: Path) -> Optional[Dict[str, Any]]:

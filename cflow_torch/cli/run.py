@@ -149,9 +149,9 @@ class Sources(NamedTuple):
     settings: Dict[str, Any]
     logs: List[Any]
 
-    def open(self, source: Any, **changed: Any) -> Log:
-        """One of the logs, with other settings of the reader where they are given; see `open_log`."""
-        return open_log(self.reader, source, **{**self.settings, **changed})
+    def open(self, source: Any) -> Log:
+        """One of the logs, see `open_log`."""
+        return open_log(self.reader, source, **self.settings)
 
 
 def find_logs(cfg: DictConfig) -> Sources:

@@ -29,11 +29,9 @@ from cflow_torch.data.flow_file import read_flow
 from cflow_torch.data.log import Log, RecentSweeps, window
 from cflow_torch.data.paths import as_path, is_remote
 from cflow_torch.fleet.manifest import frame_file
-from cflow_torch.fleet.progress import Progress
+from cflow_torch.fleet.progress import frames as counted
 from cflow_torch.types import CFlowError, FlowResult
 from cflow_torch.viz.recording import load_rerun, record_log
-
-_PATIENCE = 3  # seconds in which a viewer that cannot run ends
 
 
 def task(cfg: DictConfig) -> None:
@@ -61,8 +59,9 @@ def task(cfg: DictConfig) -> None:
             print(f"{file}: {count} pair{'' if count == 1 else 's'}, {file.stat().st_size / 1e6:,.1f} MB")
     if files and not cfg.show:
         print(f"look at it with: rerun {files[0]}")
-    if files and cfg.show:
-        _show(files)
+    if files and cfg.show:  # the viewer stays when this command ends; by default it listens for data from anywhere
+        command = [sys.executable, "-m", "rerun", "--bind", "127.0.0.1", *map(str, files)]
+        subprocess.Popen(command, start_new_session=True)
     run.finish(failures)
 
 
@@ -87,29 +86,11 @@ def _results(
     log: Log, pairs: range, flow: Callable[[Log, int], FlowResult], failures: Failures
 ) -> Iterator[Tuple[int, FlowResult]]:
     """The flow of each pair; a bad frame is reported and the rest goes on."""
-    with Progress(len(pairs), log.log_id) as progress:
-        for index in pairs:
-            result = None
-            with run.reported(failures, f"{log.log_id}/{log.timestamps[index]}"):
-                window(log, index)  # both sweeps, which are kept for the recording
-                log.labels(index)
-                result = flow(log, index)
-            if result is not None:
-                yield index, result
-            progress.update()
-
-
-def _show(files: List[Path]) -> None:
-    """Open the viewer, which stays when this command ends."""
-    # By default the viewer listens for data from anywhere.
-    command = [sys.executable, "-m", "rerun", "--bind", "127.0.0.1", *map(str, files)]
-    viewer = subprocess.Popen(command, start_new_session=True)
-    try:
-        status = viewer.wait(_PATIENCE)
-    except subprocess.TimeoutExpired:
-        return
-    if status:
-        raise CFlowError(
-            f"the viewer ended at once (status {status}). Without a screen: `rerun --web-viewer {files[0]}`, or copy "
-            "the file to a machine that has one"
-        )
+    for index in counted(pairs, log.log_id):
+        result = None
+        with run.reported(failures, f"{log.log_id}/{log.timestamps[index]}"):
+            window(log, index)  # both sweeps, which are kept for the recording
+            log.labels(index)
+            result = flow(log, index)
+        if result is not None:
+            yield index, result

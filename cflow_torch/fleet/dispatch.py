@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import time
 from collections import Counter, deque
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
@@ -13,6 +14,7 @@ from cflow_torch.fleet.progress import say
 from cflow_torch.fleet.work import describe, source_name
 from cflow_torch.types import CFlowError
 
+SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]  # end a run
 _POLL_S = 0.2  # how soon a signal is noticed
 _GRACE_S = 20.0  # that workers have for the frames in hand after a signal; schedulers kill after 30 s and more
 _MOST_FAILED_STARTS = 3  # workers that died one after the other before they could begin: so would all others

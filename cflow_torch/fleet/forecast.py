@@ -17,6 +17,7 @@ from cflow_torch.fleet.job import Done, Job, Unit
 from cflow_torch.fleet.machine import Layout, threads
 from cflow_torch.fleet.manifest import complete_frames, frame_file
 from cflow_torch.fleet.work import Worker, describe, source_name
+from cflow_torch.windows.memory import peak_memory
 
 _GB = 1e9
 
@@ -60,7 +61,7 @@ def _try(job: Job, unit: Unit, layout: Layout) -> Tuple[Dict[str, float], int]:
         Seconds of one frame by stage, and the bytes of its file.
     """
     with tempfile.TemporaryDirectory() as scratch, threads(layout.threads):
-        worker = Worker(replace(job, output=scratch, check=False), layout.devices[0])
+        worker = Worker(replace(job, output=scratch, settings={**job.settings, "check": False}), layout.devices[0])
         done = [event for event in worker.run(unit) if isinstance(event, Done)]
         worker.close()
         frame_bytes = max(file.stat().st_size for file in Path(scratch).rglob("*.feather"))
@@ -82,8 +83,6 @@ def _costs(job: Job, layout: Layout, todo: int, seconds: Dict[str, float], frame
             free = shutil.disk_usage(next(path for path in (output, *output.parents) if path.exists())).free
             room = f", {free / _GB:.1f} GB are free there"
     yield f"disk: {todo * frame_bytes / _GB:.2f} GB{room}"
-    with suppress(ImportError):  # not on every system
-        import resource
-
-        memory = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    memory = peak_memory()
+    if memory is not None:
         yield f"memory: {workers} x {memory / _GB:.2f} GB"

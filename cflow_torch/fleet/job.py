@@ -1,13 +1,15 @@
-"""What is to be done, in pieces small enough to be sent to any machine, and what comes back."""
+"""What is to be done: a run, the share of this process, its pieces; and what comes back."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from typing import Any, Dict, FrozenSet, List, Optional, Sequence, Tuple, Union
+from typing import Any, Dict, FrozenSet, List, Mapping, Optional, Sequence, Tuple, Union
 
 from cflow_torch.config import Config
 from cflow_torch.data.flow_file import CONTENTS
+from cflow_torch.fleet.machine import AUTO
+from cflow_torch.types import CFlowError
 
 # Units per worker, so that the last one does not keep the others waiting long. A log is cut only if there are too few
 # logs: each piece reads h + 1 sweeps that its neighbour reads as well.
@@ -27,7 +29,6 @@ class Job:
         contents: of a flow file, names of `flow_file.CONTENTS` and `ON_REQUEST`.
         batch: windows that are computed together.
         redo: compute frames that are there already.
-        check: warn of logs whose static world does not stay put.
     """
 
     config: Config
@@ -38,7 +39,6 @@ class Job:
     contents: Tuple[str, ...] = CONTENTS
     batch: int = 1
     redo: bool = False
-    check: bool = True
 
 
 @dataclass(frozen=True)
@@ -107,3 +107,89 @@ def split(units: Sequence[Unit], workers: int) -> List[Unit]:
         edges = [unit.first + length * part for part in range(parts + 1)]
         pieces += [replace(unit, first=first, last=last) for first, last in zip(edges, edges[1:])]
     return [replace(unit, number=number) for number, unit in enumerate(pieces)]
+
+
+@dataclass(frozen=True)
+class Shard:
+    """Share number `index`, 0 ... `count` - 1, of `count`."""
+
+    index: int = 0
+    count: int = 1
+
+    def __post_init__(self) -> None:
+        if self.count < 1 or not 0 <= self.index < self.count:
+            raise CFlowError(
+                f"shard.index={self.index} of shard.count={self.count}: give a count of at least 1 and an "
+                "index of 0 ... count - 1"
+            )
+
+    def units(self, sources: Sequence[Any]) -> List[Unit]:
+        """This shard's part of the logs.
+
+        The logs, one after the other, are one line that is cut into `count` pieces of equal length; so a shard opens
+        its own logs only, and shares at most its first and its last with a neighbour.
+        """
+        begin, end = (Fraction(edge * len(sources), self.count) for edge in (self.index, self.index + 1))
+        units: List[Unit] = []
+        for number, source in enumerate(sources):
+            first, last = max(begin - number, Fraction(0)), min(end - number, Fraction(1))
+            if first < last:
+                units.append(Unit(len(units), source, first, last))
+        return units
+
+
+def find_shard(index: Any, count: Any, environ: Mapping[str, str]) -> Shard:
+    """The shard of this process.
+
+    Args:
+        index: from 0, or "auto".
+        count: number of shards, or "auto".
+        environ: environment variables. "auto" is torchrun's RANK and WORLD_SIZE, else the task of an `srun` step, times
+            the task of a SLURM array, whichever there are; else the only shard.
+
+    Raises:
+        CFlowError: not numbers, out of range, an index without a count, a count that the environment contradicts.
+    """
+    if index != AUTO and count == AUTO:
+        raise CFlowError(f"shard.index={index} of how many? give shard.count as well")
+    if index != AUTO:
+        return Shard(_number("shard.index", index), _number("shard.count", count))
+    found = _from_environment(environ)
+    wanted = None if count == AUTO else _number("shard.count", count)
+    if wanted not in (None, found.count if found else 1):
+        told = f"tells of {found.count} tasks" if found else "tells no number of tasks"
+        raise CFlowError(f"shard.count={wanted}, but the environment {told}: give shard.index as well")
+    return found or Shard()
+
+
+def _from_environment(environ: Mapping[str, str]) -> Optional[Shard]:
+    """What torchrun or SLURM gives this process; None if neither does.
+
+    A SLURM batch script is no task of its step: only `srun` sets SLURM_STEP_NUM_TASKS, so that `--ntasks=8` without
+    `srun` does not silently compute one eighth.
+    """
+
+    def value(name: str, default: Any = None) -> int:
+        return _number(name, environ.get(name, default))
+
+    index, count, is_array = 0, 1, "SLURM_ARRAY_TASK_ID" in environ
+    if is_array:
+        task = value("SLURM_ARRAY_TASK_ID")
+        index = (task - value("SLURM_ARRAY_TASK_MIN", 0)) // value("SLURM_ARRAY_TASK_STEP", 1)
+        count = value("SLURM_ARRAY_TASK_COUNT", index + 1)
+        if index >= count or (count == 1 and task > 0):
+            raise CFlowError(
+                f"this SLURM array has {count} tasks, and this one is number {task}: give the array a range without "
+                "gaps, or give shard.index and shard.count"
+            )
+    for rank, tasks in (("RANK", "WORLD_SIZE"), ("SLURM_PROCID", "SLURM_STEP_NUM_TASKS")):
+        if rank in environ and tasks in environ:
+            return Shard(index * value(tasks) + value(rank), count * value(tasks))
+    return Shard(index, count) if is_array else None
+
+
+def _number(name: str, value: Any) -> int:
+    try:
+        return int(str(value))
+    except ValueError:
+        raise CFlowError(f"{name}={value!r}: give a whole number") from None

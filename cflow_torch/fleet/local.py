@@ -10,11 +10,10 @@ from typing import Any, Callable, Iterator, Optional, Sequence
 
 from pebble import ProcessExpired, ProcessPool
 
-from cflow_torch.fleet.dispatch import WorkerDied, dispatch
-from cflow_torch.fleet.job import Event, Failed, Job, Unit
+from cflow_torch.fleet.dispatch import SIGNALS, WorkerDied, dispatch
+from cflow_torch.fleet.job import Event, Job, Unit
 from cflow_torch.fleet.machine import Layout, threads
-from cflow_torch.fleet.stop import SIGNALS
-from cflow_torch.fleet.work import Worker, describe, source_name
+from cflow_torch.fleet.work import Worker, describe
 from cflow_torch.fleet.worker_process import Step, WorkerProcess
 from cflow_torch.types import CFlowError
 
@@ -65,12 +64,7 @@ def _run_here(job: Job, units: Sequence[Unit], layout: Layout, stop: Callable[[]
             for unit in units:
                 if stop():
                     break
-                try:
-                    yield from worker.run(unit, stop)
-                except CFlowError:  # no frame can be computed any more
-                    raise
-                except Exception as error:  # no memory for a thread, say
-                    yield Failed(unit.number, source_name(unit.source), describe(error))
+                yield from worker.run(unit, stop)
     finally:
         worker.close()
 

@@ -63,7 +63,7 @@ def claim_folder(output: Path, identity: Mapping[str, Any], resume: bool, overwr
         output: folder of the run.
         identity: of `make_identity`.
         resume: continue what an earlier run of the same identity left.
-        overwrite: remove the results of another run.
+        overwrite: remove what earlier runs left.
         alone: no other shard works in this folder.
 
     Raises:
@@ -71,13 +71,11 @@ def claim_folder(output: Path, identity: Mapping[str, Any], resume: bool, overwr
     """
     forget_listings(output)
     why = find_conflict(output, identity, resume or overwrite)
-    if why is not None:
-        if not (overwrite and alone):
-            several = (
-                "with several shards, remove the folder yourself (shards that begin together cannot agree who does)"
-            )
-            remedy = f"{several}, or give output=FOLDER" if overwrite else _REMEDY
-            raise CFlowError(f"{output} holds results of another run{why}: {remedy}")
+    if why is not None and not overwrite:
+        raise CFlowError(f"{output} holds results of another run{why}: {_REMEDY}")
+    if why is not None and not alone:  # shards that begin together cannot agree who removes them
+        raise CFlowError(f"{output} holds results of another run{why}: remove the folder, or give output=FOLDER")
+    if overwrite and alone and output.is_dir():
         _clear(output)
     remove_stale(output)
     if not (output / MANIFEST).exists():
@@ -87,11 +85,7 @@ def claim_folder(output: Path, identity: Mapping[str, Any], resume: bool, overwr
 def find_conflict(output: Path, identity: Mapping[str, Any], resume: bool) -> Optional[str]:
     """Why results of this identity must not join those in the folder, to follow a noun; None if they may."""
     before = _read(output / MANIFEST)
-    if before is None:  # an overwriting run was killed when it had removed the manifest, or the manifest is lost
-        for folder in sorted(output.iterdir()) if output.is_dir() else []:
-            log = _read(folder / MANIFEST) if folder.is_dir() else None
-            if log is not None and log.get("run", identity["hash"]) != identity["hash"]:
-                return f" ({folder.name} is of it)"
+    if before is None:
         return None
     changed = changes(before, identity, ["hash"])
     if changed:
@@ -111,9 +105,11 @@ def claim_log(folder: Path, log: Log, run: str) -> None:
     if _read(folder / MANIFEST) is None:
         write_text(folder / MANIFEST, _text(now))
     before = _read(folder / MANIFEST) or {}  # again: another log of that name may have been quicker
-    digests = before.get("sweeps") or {}
-    is_same = all(before.get(key) == now[key] for key in ("run", "log_id", "timestamps"))
-    if not is_same or any(None not in (digests.get(key), d) and digests[key] != d for key, d in now["sweeps"].items()):
+    if before.get("run") != run:
+        raise CFlowError(f"{folder} holds flow of another run: remove that folder, or give output=FOLDER")
+    is_same = all(before.get(key) == now[key] for key in ("log_id", "timestamps"))
+    both = now["sweeps"].keys() & (before.get("sweeps") or {}).keys()
+    if not is_same or any(before["sweeps"][key] != now["sweeps"][key] for key in both):
         raise CFlowError(
             f"{folder} holds flow of other sweeps (the log has changed since, or two logs have one name): "
             "remove that folder, or give output=FOLDER"
@@ -123,9 +119,8 @@ def claim_log(folder: Path, log: Log, run: str) -> None:
 def _describe_log(log: Log, run: str) -> Dict[str, Any]:
     """Manifest of a log. A sweep that cannot be read has no digest; its frames will say why."""
     stamps = [int(stamp) for stamp in log.timestamps]
-    digests: Dict[str, Optional[str]] = {}
+    digests = {}
     for index in sorted({0, len(stamps) // 2, len(stamps) - 1} & set(range(len(stamps)))):
-        digests[str(stamps[index])] = None
         with suppress(CFlowError, OSError):
             digests[str(stamps[index])] = _digest(log, index)
     return {"run": run, "log_id": log.log_id, "timestamps": stamps, "sweeps": digests}

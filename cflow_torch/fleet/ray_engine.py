@@ -74,8 +74,6 @@ def run_ray(
         "CPU": _number("num_cpus", num_cpus, 0 if is_gpu else layout.threads),
         "GPU": _number("num_gpus", num_gpus, int(is_gpu)),
     }
-    if is_gpu and not needs["GPU"]:
-        raise CFlowError("engine.num_gpus=0: with a GPU as device, give each worker at least a share of one")
     output = as_path(job.output)
     if not is_remote(output):  # a worker may be in another folder
         job = replace(job, output=str(output.absolute()))

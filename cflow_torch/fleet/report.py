@@ -6,9 +6,8 @@ import platform
 from collections import Counter
 from typing import Any, Dict, List, Sequence, Tuple
 
-from cflow_torch.fleet.job import Done, Event, Opened, Unit
+from cflow_torch.fleet.job import Done, Event, Opened, Shard, Unit
 from cflow_torch.fleet.machine import Layout
-from cflow_torch.fleet.shard import Shard
 
 _SHOWN = 20  # failures that the table lists; JSON has them all
 _WAITING, _BEFORE, _COMPUTED, _FAILED = "waiting", "complete_before", "computed", "failed"  # states of a frame
@@ -39,22 +38,10 @@ class Counters:
         return len(self._log_ids)
 
     @property
-    def log_ids(self) -> List[str]:
-        """Logs of which frames are on disk, in order."""
-        return sorted(
-            {self._log_ids[unit] for (unit, _), state in self._states.items() if state in (_BEFORE, _COMPUTED)}
-        )
-
-    @property
     def waiting(self) -> List[str]:
         """Frames of opened units that are neither on disk nor failed, in order."""
         waiting = sorted(key for key, state in self._states.items() if state == _WAITING)
         return [f"{self._log_ids[unit]}/{stamp}" for unit, stamp in waiting]
-
-    @property
-    def computed(self) -> int:
-        """Frames that this run has written."""
-        return list(self._states.values()).count(_COMPUTED)
 
     @property
     def is_complete(self) -> bool:

@@ -1,26 +1,26 @@
-"""A whole run: starts the engine, counts, reports."""
+"""A whole run: starts the engine, counts, listens to signals, reports."""
 
 from __future__ import annotations
 
 import json
+import os
 import signal
+import threading
 import time
-from contextlib import closing
-from typing import Any, Dict, Iterator, List, Sequence, Tuple
+from contextlib import closing, suppress
+from typing import Any, Dict, Iterator, Optional, Sequence
 
 from cflow_torch.data.atomic import remove_stale
 from cflow_torch.data.names import folder_in
-from cflow_torch.data.paths import as_path, is_remote
+from cflow_torch.data.paths import as_path
 from cflow_torch.data.records import strict, write_text
-from cflow_torch.fleet.job import Event, Failed, Job, split
+from cflow_torch.fleet.dispatch import SIGNALS
+from cflow_torch.fleet.job import Event, Failed, Job, Shard, split
 from cflow_torch.fleet.local import run_local
 from cflow_torch.fleet.machine import Layout
-from cflow_torch.fleet.manifest import MANIFEST
 from cflow_torch.fleet.progress import Progress, say
 from cflow_torch.fleet.ray_engine import run_ray
 from cflow_torch.fleet.report import Counters
-from cflow_torch.fleet.shard import Shard
-from cflow_torch.fleet.stop import StopSignal
 from cflow_torch.types import CFlowError
 
 ENGINES: Dict[str, Any] = {"local": run_local, "ray": run_ray}
@@ -47,8 +47,9 @@ def run_fleet(
         **engine_settings: of the engine.
 
     Returns:
-        As `Counters.report`, which is also in OUTPUT/reports/<shard>.json if "is_written". "exit_status" is 0 if every
-        frame of the shard is on disk, 1 if not, 130, 143 or 129 if Ctrl-C, SIGTERM or SIGHUP came first.
+        As `Counters.report`, which is also in OUTPUT/reports/<shard>.json. "exit_status" is 0 if every frame of the
+        shard is on disk, 1 if not or if the report could not be written, 130, 143 or 129 if Ctrl-C, SIGTERM or SIGHUP
+        came first.
     """
     if engine not in ENGINES:
         raise CFlowError(f"engine={engine!r}: give one of {', '.join(ENGINES)}")
@@ -64,34 +65,23 @@ def run_fleet(
             if not counters.total:
                 raise
             say(f"ended early: {error}")
-        counters.failures += _removed(job.output, counters)
-        name = signal.Signals(stop.received).name if stop.received and not counters.is_complete else ""
+        ended_by = 0 if counters.is_complete else stop.received or 0
+        name = signal.Signals(ended_by).name if ended_by else ""
         report = {**counters.report(time.perf_counter() - start, layout, shard, engine, name), **about}
-        report["is_written"] = True
-        report["exit_status"] = stop.exit_status if name else 0 if counters.is_complete else 1
+        report["exit_status"] = 128 + ended_by if ended_by else 0 if counters.is_complete else 1
         try:
             file = report_file(job.output, shard)
             remove_stale(file.parent)
             write_text(file, json.dumps(strict(report), indent=1, allow_nan=False) + "\n")
         except OSError as error:
             say(f"the report could not be written: {error}")
-            report["exit_status"], report["is_written"] = report["exit_status"] or 1, False
+            report["exit_status"] = report["exit_status"] or 1
     return report
 
 
 def report_file(output: str, shard: Shard) -> Any:
     """Where a shard's report lies."""
     return folder_in(as_path(output), "reports", "the folder") / f"shard-{shard.index}-of-{shard.count}.json"
-
-
-def _removed(output: str, counters: Counters) -> List[Tuple[str, str]]:
-    """(log, message) of what somebody removed while the run was at work. In an object store nobody looks."""
-    folder = as_path(output)
-    if is_remote(folder):
-        return []
-    has_manifest = (folder / MANIFEST).is_file()
-    gone = [log for log in counters.log_ids if not (has_manifest and (folder / log / MANIFEST).is_file())]
-    return [(log, f"its folder in {output} was removed while the run wrote into it: run it again") for log in gone]
 
 
 def _follow(events: Iterator[Event], counters: Counters, num_units: int) -> None:
@@ -105,3 +95,39 @@ def _follow(events: Iterator[Event], counters: Counters, num_units: int) -> None
                 say(f"failed: {event.name}: {event.message}")
             progress.update(settled)
         progress.total = progress.n
+
+
+class StopSignal:
+    """While it is open, the first of `SIGNALS` only sets `received`; the second raises KeyboardInterrupt.
+
+    Schedulers send SIGTERM some seconds before they kill (preemption, time limit). Outside the main thread, where
+    Python cannot catch signals, it does nothing.
+    """
+
+    def __init__(self) -> None:
+        self.received: Optional[int] = None
+        self._before: Dict[int, Any] = {}
+
+    def __enter__(self) -> StopSignal:
+        if threading.current_thread() is threading.main_thread():
+            for number in SIGNALS:
+                if number == signal.SIGINT or signal.getsignal(number) is not signal.SIG_IGN:  # nohup stays nohup
+                    self._before[number] = signal.signal(number, self._receive)
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def __call__(self) -> bool:
+        """Whether to stop."""
+        return self.received is not None
+
+    def _receive(self, number: int, _: Any) -> None:
+        if self.received is not None:
+            raise KeyboardInterrupt
+        self.received = number
+        name = signal.Signals(number).name
+        # Not print: the signal may have come in the middle of one. Nobody may read it any more (`| head`).
+        with suppress(OSError):
+            os.write(2, f"\n{name}: finishing the frames in hand; once more to end at once\n".encode())

@@ -93,7 +93,7 @@ class Worker:
             yield Failed(unit.number, source_name(unit.source), describe(error))
             return
         yield Opened(unit.number, log.log_id, tuple(stamps.values()), tuple(todo.values()))
-        if todo and self._job.check and unit.first == 0:
+        if todo and self._job.settings.get("check", True) and unit.first == 0:
             with suppress(Exception):  # a sweep that cannot be read is reported when its turn comes
                 check_log(log)
         for frame in self._pass(log, folder, list(todo), stop):
@@ -190,10 +190,7 @@ class Worker:
             result, frame.content = frame.content, None
             file = frame_file(folder, frame.timestamp)
             with _stage(frame, "write"):
-                try:
-                    write_flow(file, result, self._job.contents)
-                except FileNotFoundError:  # a run that begins beside this one takes our file for a dead one's
-                    write_flow(file, result, self._job.contents)
+                write_flow(file, result, self._job.contents)
         return frame
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import re
+import sys
 from contextlib import suppress
 from pathlib import Path
 from typing import List, Mapping, Optional
@@ -42,8 +42,8 @@ def require_memory(num_bytes: int, device: torch.device, what: str, remedy: str)
 
 
 def available_memory(environ: Mapping[str, str]) -> Optional[int]:
-    """Bytes that this process may still take: what is free, limits of its control groups, its share of a SLURM or
-    torchrun job. None where the system does not tell."""
+    """Bytes that this process may still take: what is free, limits of its control groups, its share of a torchrun job.
+    None where the system does not tell."""
     free = []
     with suppress(OSError, StopIteration, ValueError):
         lines = Path("/proc/meminfo").read_text().splitlines()
@@ -52,14 +52,17 @@ def available_memory(environ: Mapping[str, str]) -> Optional[int]:
         with suppress(OSError, ValueError):  # "max" is no number
             limit, used = (int((group / name).read_text()) for name in ("memory.max", "memory.current"))
             free.append(limit - used)
-    with suppress(KeyError, ValueError):
-        free.append(int(environ["SLURM_MEM_PER_NODE"]) << 20)
-    tasks = re.match(r"\d+", environ.get("LOCAL_WORLD_SIZE") or environ.get("SLURM_STEP_TASKS_PER_NODE") or "")
-    shares = [amount // max(1, int(tasks[0]) if tasks else 1) for amount in free]
-    with suppress(KeyError, ValueError):
-        cores = int(environ.get("SLURM_CPUS_PER_TASK", "1"))
-        shares.append(int(environ["SLURM_MEM_PER_CPU"]) * cores << 20)
-    return min(shares, default=None)
+    return min(free) // int(environ.get("LOCAL_WORLD_SIZE", 1)) if free else None
+
+
+def peak_memory() -> Optional[int]:
+    """Bytes that this process held at most since it began; None where the system does not say."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return None
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return most if sys.platform == "darwin" else 1024 * most
 
 
 def control_groups() -> List[Path]:

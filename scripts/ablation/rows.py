@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any, Dict, Optional, Tuple
+from typing import Any, Dict, Tuple
 
 from sets import ScoredSet
 
@@ -25,9 +25,9 @@ class Setting:
     preset: str
     overrides: Dict[str, Any] = field(default_factory=dict)
 
-    def for_set(self, scored: ScoredSet, half_side: Optional[float] = None) -> Config:
-        """The settings for a set; `half_side`, metres, wins over that of the set."""
-        half = half_side or scored.half_side
+    def for_set(self, scored: ScoredSet) -> Config:
+        """The settings for a set."""
+        half = scored.half_side
         region = (-half, -half, -math.inf, half, half, math.inf)
         of_set = {"num_history": scored.history, "point_cloud_range": region}
         return make_config(self.preset, **{**of_set, **self.overrides})

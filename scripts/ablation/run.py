@@ -10,7 +10,7 @@ five sensors, h = 4), sim0 (the same, h = 0). Every setting gets the history and
 were used to choose settings, 400-403 to look at the choice; 300 and above are for the last score only.
 
 OUTPUT gets ablation.md and ablation.csv, row by row. Figures are kept one by one in OUTPUT/rows: after an interruption
-call it again. Those of other code are made anew, unless --any-code is given.
+call it again. Those of other code are made anew.
 """
 
 from __future__ import annotations
@@ -53,10 +53,10 @@ def main(arguments: Optional[Sequence[str]] = None) -> int:
         rows = [Setting(" ".join([given.preset, *(f"{k}={v}" for k, v in overrides.items())]), given.preset, overrides)]
     scores: Dict[str, Dict[str, Figures]] = {}
     try:
-        sets, store = make_sets(given.sets, given.seeds, given.cache), Store(given.output / "rows", given.any_code)
+        sets, store = make_sets(given.sets, given.seeds, given.cache), Store(given.output / "rows")
         for number, setting in enumerate(rows, 1):
             start = time.monotonic()
-            figures = {scored.name: store.get(scored, setting.for_set(scored, given.box)) for scored in sets}
+            figures = {scored.name: store.get(scored, setting.for_set(scored)) for scored in sets}
             scores[setting.name] = with_means(figures)
             page = f"{NOTE}\n{markdown(shown_cells(scores))}"
             write_text(given.output / "ablation.md", page)
@@ -84,12 +84,10 @@ def parse(arguments: Optional[Sequence[str]]) -> argparse.Namespace:
     parser.add_argument("--only", nargs="+", choices=[row.name for row in ROWS], metavar="ROW")
     parser.add_argument("--preset", help="score this one with what --set changes, in place of the rows")
     parser.add_argument("--set", nargs="+", type=_setting, default=[], metavar="NAME=VALUE")
-    parser.add_argument("--box", type=float, help="half side of the region, metres; default: the set's")
     parser.add_argument("--output", type=Path, default=Path("outputs/ablation"))
     cache = Path(os.environ.get("CFLOW_CACHE") or "outputs/cache")
     parser.add_argument("--cache", type=Path, default=cache, help="folder for simulated drives; default $CFLOW_CACHE")
     parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--any-code", action="store_true", help="also take kept figures that other code made")
     return parser.parse_args(arguments)
 
 

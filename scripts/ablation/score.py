@@ -115,11 +115,10 @@ class Store:
 
     Args:
         folder: where they are kept.
-        any_code: also take figures that another version of the code made.
     """
 
-    def __init__(self, folder: Path, any_code: bool = False) -> None:
-        self.folder, self.any_code = folder, any_code
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
 
     def get(self, scored: ScoredSet, config: Config) -> Figures:
         """Figures of a setting on a set: those that are kept, else new ones."""
@@ -128,7 +127,7 @@ class Store:
         file = self.folder / f"{scored.name.replace(' ', '-')}-{name}.json"
         if file.is_file():
             record = json.loads(file.read_text(encoding="utf-8"))
-            if self.any_code or record["code"] == code_key():
+            if record["code"] == code_key():
                 return _nan_for_null(record["figures"])
         frames = estimate(scored, config)
         figures = simulated_figures(frames) if scored.group.startswith("sim") else pooled_figures(frames, scored.step)

@@ -38,11 +38,3 @@ def test_the_command_writes_what_it_prints(tmp_path: Path, capsys: Any, monkeypa
     assert torch.get_num_threads() == threads
     printed = capsys.readouterr().out
     assert f"{1000 * report['seconds']['median']:.1f}" in printed and "windows per second" in printed
-
-
-@pytest.mark.parametrize("setting", ["repeats=0", "pairs=many", "batches=[0]"])
-def test_wrong_settings_are_named(setting: str, capsys: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sys.argv", ["cflow"])
-    with pytest.raises(SystemExit, match="2"):
-        main(["bench", setting])
-    assert setting in capsys.readouterr().err

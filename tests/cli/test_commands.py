@@ -135,11 +135,3 @@ def test_the_score_of_a_sweep() -> None:
     assert objective({"bucketed": mean, "bucketed_by_range": {"mean": {"dynamic_error": 0.5}}}) == 0.5
     assert objective({"three_way": {"epe_3way": 1.0}}) == 1.0
     assert np.isnan(objective({"bucketed": {"mean": {"dynamic_error": None}}}))
-
-
-def test_an_output_that_cannot_be_made_is_named(tmp_path: Path, evaluate: Cflow, capsys: pytest.CaptureFixture) -> None:
-    (tmp_path / "file").touch()
-    assert evaluate(f"output={tmp_path}/file/below") == 2
-    error = capsys.readouterr().err
-    assert f"error: cannot write into {tmp_path}/file/below" in error and "give output=FOLDER" in error
-    assert "Traceback" not in error

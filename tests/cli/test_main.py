@@ -63,6 +63,8 @@ def test_version_and_help_come_without_torch(cflow: Cflow, capsys: pytest.Captur
         ("eval model.densify=nearest", "densify is a setting of method keypoints, not of verified"),
         ("eval model.method=dense", "is a setting of method verified"),
         ("eval model.num_history=-1", "num_history=-1: give a whole number of at least 0"),
+        ("bench repeats=0", "repeats=0: give a whole number of at least 1"),
+        ("bench batches=[0]", "batches=[0]: give whole numbers of at least 1"),
         ("eval data.step=0", "data.step=0: give a whole number of at least 1"),
         ("eval definition=mine data.num_sweeps=2", "mine"),
         ("demo pair=99 data.num_sweeps=2", "has pairs 0 to 0"),

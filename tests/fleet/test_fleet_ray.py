@@ -99,7 +99,6 @@ def begin(layout: Layout, **settings: Any) -> None:
     "layout, settings, message",
     [
         (TWO, {"retries": -1}, "engine.retries"),
-        (Layout(("cuda:0",), 1, 1), {"num_gpus": 0}, "a share"),
         (Layout(("cuda:1",), 1, 1), {}, "CUDA_VISIBLE_DEVICES"),
     ],
 )

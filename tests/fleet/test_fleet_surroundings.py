@@ -16,11 +16,10 @@ from hypothesis import strategies as st
 
 from cflow_torch import CFlowError
 from cflow_torch.fleet import machine, progress
-from cflow_torch.fleet.job import split
+from cflow_torch.fleet.job import Shard, find_shard, split
 from cflow_torch.fleet.machine import Layout, choose_layout, usable_cores
 from cflow_torch.fleet.progress import Progress, say
-from cflow_torch.fleet.shard import Shard, find_shard
-from cflow_torch.fleet.stop import StopSignal
+from cflow_torch.fleet.run import StopSignal
 
 # Shares of the work
 
@@ -131,7 +130,7 @@ def test_the_first_signal_asks_and_the_second_insists() -> None:
     with StopSignal() as stop:
         assert not stop()
         os.kill(os.getpid(), signal.SIGTERM)
-        assert stop() and stop.exit_status == 143
+        assert stop() and stop.received == signal.SIGTERM
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGINT)
             time.sleep(1)
@@ -148,7 +147,7 @@ def test_a_terminal_that_is_closed_stops_a_run_but_not_under_nohup(monkeypatch: 
     try:
         with StopSignal() as stop:
             os.kill(os.getpid(), signal.SIGHUP)
-            assert stop() and stop.exit_status == 129
+            assert stop() and stop.received == signal.SIGHUP
         signal.signal(signal.SIGHUP, signal.SIG_IGN)
         with StopSignal() as stop:
             os.kill(os.getpid(), signal.SIGHUP)
