@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, Iterator, List
+from typing import Any, Dict, Iterator, List
 
 import yaml  # type: ignore[import-untyped]
 
@@ -29,6 +29,22 @@ _PAGE = """# Settings
 The same names hold everywhere: `make_config("fast", max_speed=30.0)` in Python, `model=fast model.max_speed=30` behind
 a command, `-m model.connectivity=4,8` for a sweep. null is None in Python. Words such as Alg. clustering are labels of
 the paper. A wrong name or value is refused with a message that says what is allowed."""
+# Literals only: the harness's eval.yaml and save.yaml have nothing to refer to.
+_HARNESS = """\
+# CorrelationFlow, preset {preset}: hydra.searchpath=[pkg://cflow_torch.configs.opensceneflow] model={name}
+# For OpenSceneFlow. Written by `cflow settings --opensceneflow FOLDER`; `cflow settings` says what each setting does.
+name: {name}
+val_monitor: val/Dynamic/Mean
+iter_only: false  # true: the runner for methods without training (needs a GPU, no checkpoint)
+target:
+  _target_: cflow_torch.integrations.opensceneflow.CFlow
+  num_frames: {num_frames}  # sweeps per window, t+1 and t included: h + 2
+  ego_T_lidar: auto  # auto | null | 4 x 4: points in the sensor frame, poses of the vehicle (Argoverse 2)
+  output: full  # full | valid (by pc0_valid_point_idxes)
+  device: auto  # auto = that of the batch
+  voxel_size: [0.1, 0.1, 2000.0]  # the harness asks for it; without effect, pixel_sizes counts
+"""
+_Z = 1000.0  # metres; the harness computes with the region, so its bounds are finite, and z is wide open
 
 
 def task(arguments: List[str]) -> None:
@@ -37,11 +53,27 @@ def task(arguments: List[str]) -> None:
         print("\n\n".join(_page()))
     elif len(arguments) == 2 and arguments[0] == "--opensceneflow":
         folder = ready_folder(Path(arguments[1]))
-        for file in files("opensceneflow/model"):
-            write_text(folder / file.name, file.read_text(encoding="utf-8"))
-            print(folder / file.name)
+        for name, text in harness_models().items():
+            write_text(folder / f"{name}.yaml", text)
+            print(folder / f"{name}.yaml")
     else:
         raise CFlowError(f"settings takes nothing, or --opensceneflow FOLDER, got {' '.join(arguments)}")
+
+
+def harness_models() -> Dict[str, str]:
+    """Name -> YAML of each preset as a model of OpenSceneFlow."""
+    models = {}
+    for preset in PRESETS:
+        config = make_config(preset)
+        name = "cflow" if preset == "default" else f"cflow_{preset}"
+        text = _HARNESS.format(preset=preset, name=name, num_frames=config.num_history + 2)
+        region = [min(max(bound, -_Z), _Z) for bound in config.point_cloud_range]
+        for f in fields(config):
+            value = region if f.name == "point_cloud_range" else getattr(config, f.name)
+            if f.name != "num_history":  # num_frames says it
+                text += f"  {f.name}: {_yaml(value)}  # {describe(f)}\n"
+        models[name] = text
+    return models
 
 
 def _page() -> Iterator[str]:

@@ -139,13 +139,14 @@ def test_the_page_has_every_setting(cflow: Cflow, capsys: pytest.CaptureFixture)
         assert f"\n## data={file.stem}\n" in page and file.read_text().strip() in page
 
 
-def test_the_harness_s_models_have_the_settings_of_the_presets(tmp_path: Path, cflow: Cflow) -> None:
+def test_the_harness_s_models_are_those_of_the_package(tmp_path: Path, cflow: Cflow) -> None:
     assert cflow("settings", "--opensceneflow", tmp_path / "model") == 0
-    written = {file.name: file.read_text() for file in (tmp_path / "model").iterdir()}
+    committed = {file.name: file.read_text() for file in (CONFIGS / "opensceneflow" / "model").glob("*.yaml")}
+    assert committed == {file.name: file.read_text() for file in (tmp_path / "model").iterdir()}
     for preset in PRESETS:
         config = make_config(preset)
         name = "cflow" if preset == "default" else f"cflow_{preset}"
-        target: Any = OmegaConf.to_container(OmegaConf.create(written[f"{name}.yaml"]).target, resolve=False)
+        target: Any = OmegaConf.to_container(OmegaConf.create(committed[f"{name}.yaml"]).target, resolve=False)
         region = target["point_cloud_range"]
         assert region[:2] + region[3:5] == [*config.point_cloud_range[:2], *config.point_cloud_range[3:5]]
         assert region[2::3] == [-1000.0, 1000.0], "finite: the harness computes with it"
