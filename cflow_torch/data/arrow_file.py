@@ -10,8 +10,6 @@ import pyarrow as pa
 from cflow_torch.data.file_errors import shortened
 from cflow_torch.types import CFlowError
 
-_INT64_MAX = (1 << 63) - 1
-
 
 def check_columns(file: Any, names: Sequence[str], columns: Sequence[str], mend: str = "copy it again") -> None:
     """Refuse columns that are asked for and missing, or there several times.
@@ -43,12 +41,9 @@ def integers(table: pa.Table, column: str, file: Any) -> np.ndarray:
     """(rows,) int64 numbers of an integer column.
 
     Raises:
-        CFlowError: another type, empty entries, or numbers beyond int64.
+        CFlowError: another type, or empty entries.
     """
-    values = _column(table, column, file, "integer", pa.types.is_integer).to_numpy()
-    if values.size and int(values.max()) > _INT64_MAX:
-        raise CFlowError(f"{file}: {column} holds {values.max()}, more than {_INT64_MAX}")
-    return values.astype(np.int64)
+    return _column(table, column, file, "integer", pa.types.is_integer).to_numpy().astype(np.int64)
 
 
 def bools(table: pa.Table, column: str, file: Any) -> np.ndarray:

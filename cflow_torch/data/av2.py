@@ -129,9 +129,8 @@ class AV2Log(NumberedSweeps):
         missing = [time for time in self.timestamps if time not in row_of]
         if missing:
             raise CFlowError(
-                f"{file} has no pose for sweep {missing[0]}"
-                + (f" and {len(missing) - 1} more" if len(missing) > 1 else "")
-                + "; every sweep needs a pose at exactly its time stamp"
+                f"{file} has no pose for sweep {missing[0]} ({len(missing)} missing); every sweep needs a pose at "
+                "exactly its time stamp"
             )
         rows = [row_of[time] for time in self.timestamps]
         return dict(zip(self.timestamps, _poses(table.take(rows), file, self.timestamps)))

@@ -63,12 +63,9 @@ def as_path(place: Place) -> Path:
         raise CFlowError(f"{place} is not on this machine, which needs: pip install universal_pathlib fsspec") from None
     try:
         fsspec.get_filesystem_class(scheme)
-    except ImportError as error:  # it names the package
-        raise CFlowError(f"{place} needs one more package: {error}") from error
-    except ValueError as error:
+    except (ImportError, ValueError) as error:  # it names the package
         raise CFlowError(f"fsspec has no file system {scheme}:// ({error}): {place}; is it written right?") from error
-    rest = place[match.end() :].rstrip("/")
-    path: Any = UPath(f"{scheme}://{rest}")
+    path: Any = UPath(f"{scheme}://{place[match.end() :].rstrip('/')}")
     return path  # type: ignore[no-any-return]
 
 
@@ -164,8 +161,6 @@ def _copy(path: Path) -> pa.Buffer:
     with tempfile.TemporaryFile() as file, _open(path, cache_type="none") as stream:
         with remote_errors(path):
             shutil.copyfileobj(stream, file, _COPIED)
-        if not file.tell():
-            raise CFlowError(f"{path} is empty; copy it again")
         file.flush()
         return pa.py_buffer(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
 

@@ -190,7 +190,7 @@ def test_finding_scenes_and_reading_their_tables_once(tiny, tmp_path):
             edit(tiny, file.stem, lambda rows, file=file: rows + json.loads(file.read_text()))
     for root in (tiny, tiny / VERSION):
         sources = find_nuscenes_scenes(root)
-        assert [(source.root, source.version, source.scene) for source in sources] == [
+        assert [(source.root, source.version, source.name) for source in sources] == [
             (tiny, VERSION, name) for name in ("second", "tiny")
         ]
     first = NuScenesLog(sources[1])

@@ -51,8 +51,6 @@ def test_a_simulated_drive(drive):
     assert np.array_equal(poses, poses_from_odometry(NoPoses(drive))), "the same again"
     with pytest.raises(CFlowError, match="fewer than 100 points"):
         poses_from_odometry(NoPoses(drive, is_empty=True))
-    with pytest.raises(CFlowError, match="max_range"):
-        poses_from_odometry(NoPoses(drive), max_range=0)
 
 
 @needs_kiss_icp

@@ -8,8 +8,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from cflow_torch.data.rigid_motion import between, moved, poses_at, poses_from_quaternions
-from cflow_torch.data.rotations import to_quaternions, to_rotations
+from cflow_torch.data.rigid_motion import (
+    between,
+    moved,
+    poses_at,
+    poses_from_quaternions,
+    to_quaternions,
+    to_rotations,
+)
 from cflow_torch.types import CFlowError
 
 HALF = math.sqrt(0.5)

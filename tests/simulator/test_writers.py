@@ -11,7 +11,7 @@ import pytest
 from pyarrow import feather
 from scipy.spatial import cKDTree
 
-from cflow_torch.data.rotations import to_rotations
+from cflow_torch.data.rigid_motion import to_rotations
 from cflow_torch.data.waymo import WaymoLog
 from cflow_torch.simulator import Drive, make_drive
 from cflow_torch.simulator.writers import waymo_encoding

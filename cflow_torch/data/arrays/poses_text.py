@@ -14,8 +14,7 @@ from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.npy_file import read_npy
 from cflow_torch.data.paths import Place, as_path, read_bytes
-from cflow_torch.data.rigid_motion import between, poses_from_quaternions
-from cflow_torch.data.rotations import to_quaternions
+from cflow_torch.data.rigid_motion import between, poses_from_quaternions, to_quaternions
 from cflow_torch.types import CFlowError
 from cflow_torch.windows.ego_motion import rigid_transform
 

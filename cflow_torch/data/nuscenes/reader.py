@@ -76,9 +76,9 @@ class NuScenesLog(NumberedSweeps):
     ) -> None:
         if sweep_step < 1:
             raise CFlowError(f"sweep_step={sweep_step}: it is 1 for all sweeps, 2 for every second one")
-        self.log_id, self._root, self._own_vehicle = source.scene, as_path(source.root), own_vehicle
+        self.log_id, self._root, self._own_vehicle = source.name, as_path(source.root), own_vehicle
         folder = self._root / source.version
-        sample_times, known, annotations = (source.tables or Tables(folder)).scene(source.scene)
+        sample_times, known, annotations = (source.tables or Tables(folder)).scene(source.name)
         with file_errors(folder / "category.json"):
             category_indices(annotations.category, self._categories)
         missing = [] if lidars is None else [name for name in lidars if name not in known]

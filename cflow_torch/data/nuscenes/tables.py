@@ -31,19 +31,14 @@ class SceneSource:
     Args:
         root: data root, which `sample_data.filename` is relative to.
         version: folder of the tables, for example "v1.0-mini".
-        scene: name of the scene.
+        name: of the scene.
         tables: the tables of that version, shared by its scenes so that they are read once; None = read them anew.
     """
 
     root: Path
     version: str
-    scene: str
+    name: str
     tables: Optional[Tables] = field(default=None, repr=False, compare=False)
-
-    @property
-    def name(self) -> str:
-        """Name of the scene."""
-        return self.scene
 
 
 @dataclass(frozen=True)
