@@ -119,15 +119,10 @@ def atomic_folder(folder: Place) -> Iterator[Path]:
             sync_folder(place)  # files likewise
         if folder.exists():
             os.replace(folder, old)
-        try:
-            os.replace(new, folder)
-        except BaseException:
-            if old.exists():
-                os.replace(old, folder)
-            raise
+        os.replace(new, folder)
         sync_folder(folder.parent)
     finally:
-        shutil.rmtree(scratch, ignore_errors=True)
+        _remove(scratch, folder)
 
 
 def remove_stale(folder: Place, targets: Optional[Collection[str]] = None) -> List[str]:
@@ -165,6 +160,7 @@ def remove_stale(folder: Place, targets: Optional[Collection[str]] = None) -> Li
 
 
 def _remove(path: Path, target: Path) -> None:
+    """Remove a temporary file or folder; the older folder that it was to replace comes back if nothing did."""
     if not path.is_dir():
         with suppress(FileNotFoundError):
             path.unlink()

@@ -8,13 +8,12 @@ from typing import Dict, List, Optional, Sequence, Union
 import numpy as np
 import pyarrow as pa
 
-from cflow_torch.data.arrow_file import bools, floats, integers, texts
+from cflow_torch.data.arrow_file import FeatherFile, bools, floats, integers, texts
 from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes, make_boxes
 from cflow_torch.data.categories import CATEGORIES
-from cflow_torch.data.feather_file import FeatherFile
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.folders import find_folders
-from cflow_torch.data.ground import get_rule, read_ground_raster
+from cflow_torch.data.ground import GROUND_RULES, read_ground_raster
 from cflow_torch.data.log import FlowLabels, NumberedSweeps
 from cflow_torch.data.names import is_stamp
 from cflow_torch.data.paths import Place, as_path, remote_errors
@@ -76,7 +75,8 @@ class AV2Log(NumberedSweeps):
         self._poses = self._read_poses()
         self._rule, self._raster = ground, None
         if ground is not None:
-            get_rule(ground)
+            if ground not in GROUND_RULES:
+                raise CFlowError(f"ground rules are {sorted(GROUND_RULES)}, got {ground!r}")
             self._raster = read_ground_raster(self.folder / "map")
         if require_ground and self._raster is None:
             raise CFlowError(

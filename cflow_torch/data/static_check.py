@@ -104,13 +104,11 @@ def static_world_residual(log: Log, index: int, baseline: int = BASELINE) -> Sta
     verdict = ""
     if inverted > max(_BETTER * agreement, _GOOD, still):
         verdict = "The poses seem to be inverted: they must map ego coordinates to the world (T_world_ego)."
-    elif still > max(_BETTER * agreement, _GOOD):
+    elif still > max(_BETTER * agreement, _GOOD) or max(agreement / _HOPELESS, aligned / _ALIGNED) < own:
         verdict = (
-            "Without any ego motion it fits better: are the poses of another log, of other times, in another unit, or "
-            "do the points lie in one common frame already (then pass no poses)?"
+            "It does not fit: are the poses of another log, of other axes (a camera's), times or units, or do the "
+            "points lie in one common frame already (then pass no poses)?"
         )
-    elif agreement < _HOPELESS * own and aligned < _ALIGNED * own:
-        verdict = "It does not fit at all: are the poses of another log, of other axes (a camera's), times or units?"
     elif abs(turn) > _TURN or size > _SHIFT + _SHIFT_PER_METRE * distance + _SHIFT_PER_RADIAN * abs(turn):
         verdict = (
             f"It is off by {100 * size:.0f} cm and {np.degrees(abs(turn)):.1f} degrees. Points in the frame of the "

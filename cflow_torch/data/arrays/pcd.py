@@ -51,22 +51,14 @@ def write_pcd(path: Place, fields: Mapping[str, np.ndarray]) -> None:
 
     Args:
         path: file name.
-        fields: field name -> (N,) array of float32, float64 or integers.
+        fields: field name without spaces -> (N,) array of float32, float64 or integers, all of one length.
 
     Raises:
-        CFlowError: pypcd4 is missing; no fields, names with spaces, arrays of different lengths, other dtypes.
+        CFlowError: pypcd4 is missing.
     """
     pypcd4 = _pypcd4()
-    shapes = {values.shape for values in fields.values()}
-    if len(shapes) != 1 or len(next(iter(shapes))) != 1 or any(len(name.split()) != 1 for name in fields):
-        raise CFlowError(
-            f"fields {list(fields)} have shapes {shapes}: give names without spaces and (N,) of one length"
-        )
-    try:
-        kinds = [values.dtype for values in fields.values()]
-        cloud = pypcd4.PointCloud.from_points(list(fields.values()), list(fields), kinds)
-    except KeyError as error:
-        raise CFlowError(f"a field has dtype {error}: PCD stores float32, float64 and integers") from error
+    kinds = [values.dtype for values in fields.values()]
+    cloud = pypcd4.PointCloud.from_points(list(fields.values()), list(fields), kinds)
     with atomic_file(path) as file:
         cloud.save(file, pypcd4.Encoding.BINARY)
 

@@ -48,15 +48,9 @@ def find_array_logs(root: Place) -> List[Path]:
     Raises:
         CFlowError: `root` is no folder.
     """
-
     what = "a folder with one point cloud per file, or a folder of such"
-    return find_folders(
-        as_path(root),
-        lambda folder: bool(_clouds(folder)[1]),
-        SEARCH_DEPTH,
-        what,
-        lambda child: child.name != GROUND_FOLDER,
-    )
+    is_log, is_passed = (lambda folder: bool(_clouds(folder)[1])), (lambda child: child.name != GROUND_FOLDER)
+    return find_folders(as_path(root), is_log, SEARCH_DEPTH, what, is_passed)
 
 
 class ArraysLog(NumberedSweeps):

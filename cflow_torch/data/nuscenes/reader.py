@@ -225,10 +225,6 @@ def pcd_bin_points(content: bytes, file: Place) -> np.ndarray:
 
 def _is_kept(is_key_frame: np.ndarray, step: int) -> np.ndarray:
     """(M,) bool: key frames, and every `step`-th sweep counted from the last one."""
-    kept = np.zeros(len(is_key_frame), dtype=bool)
-    since = 0
-    for row, is_key in enumerate(is_key_frame):
-        since = 0 if is_key else since
-        kept[row] = since % step == 0
-        since += 1
-    return kept
+    row = np.arange(len(is_key_frame))
+    last_key = np.maximum.accumulate(np.where(is_key_frame, row, 0))
+    return (row - last_key) % step == 0

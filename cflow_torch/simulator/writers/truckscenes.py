@@ -13,6 +13,7 @@ from cflow_torch.simulator.writers.av2 import new_folder
 from cflow_torch.simulator.writers.nuscenes import NUSCENES_NAMES, SceneWriter, write_tables
 
 # Tables that the devkit wants besides those of nuScenes; a simulated truck has nothing to put there.
+_VERSION, _KEY_FRAME_INTERVAL = "v1.2-mini", 0.5  # seconds
 _EMPTY = ("ego_motion_cabin", "ego_motion_chassis", "weather_annotation")
 TRUCKSCENES_NAMES: Dict[str, str] = {
     **NUSCENES_NAMES,
@@ -22,21 +23,12 @@ TRUCKSCENES_NAMES: Dict[str, str] = {
 """Argoverse 2 name of a box -> the nearest category of TruckScenes."""
 
 
-def write_truckscenes(
-    recording: Recording,
-    root: Union[str, Path],
-    version: str = "v1.2-mini",
-    key_frame_interval: float = 0.5,
-    overwrite: bool = False,
-) -> Path:
+def write_truckscenes(recording: Recording, root: Union[str, Path], overwrite: bool = False) -> Path:
     """Writes `recording` to `root/<log_id>`, a data root of TruckScenes with one scene of that name.
 
     Args:
         recording: what to write. If none of its LiDARs is called LIDAR_LEFT, the first one is in the file.
         root: folder, made if absent.
-        version: name of the folder of the tables.
-        key_frame_interval: seconds between samples, which alone have boxes. First and last sweep are samples too, so
-            that there is truth for every pair.
         overwrite: replace a scene of that name.
 
     Returns:
@@ -60,6 +52,6 @@ def write_truckscenes(
 
     with new_folder(root, recording.log_id, overwrite) as folder:
         scene = SceneWriter(recording, folder, "LIDAR_LEFT", TRUCKSCENES_NAMES)
-        tables = scene.write("{channel}_{stamp}.pcd", write_points, key_frame_interval)
-        write_tables(folder / version, {**tables, **{name: [] for name in _EMPTY}})
+        tables = scene.write("{channel}_{stamp}.pcd", write_points, _KEY_FRAME_INTERVAL)
+        write_tables(folder / _VERSION, {**tables, **{name: [] for name in _EMPTY}})
     return Path(root) / recording.log_id
