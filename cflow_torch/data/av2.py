@@ -128,10 +128,7 @@ class AV2Log(NumberedSweeps):
         row_of = {time: row for row, time in enumerate(integers(table, "timestamp_ns", file).tolist())}
         missing = [time for time in self.timestamps if time not in row_of]
         if missing:
-            raise CFlowError(
-                f"{file} has no pose for sweep {missing[0]} ({len(missing)} missing); every sweep needs a pose at "
-                "exactly its time stamp"
-            )
+            raise CFlowError(f"{file} has no pose for sweep {missing[0]}, at exactly its time ({len(missing)} missing)")
         rows = [row_of[time] for time in self.timestamps]
         return dict(zip(self.timestamps, _poses(table.take(rows), file, self.timestamps)))
 
@@ -140,9 +137,7 @@ class AV2Log(NumberedSweeps):
         table = stored.read((*_FLOW, "classes"))
         rows = len(self._points(timestamp))
         if table.num_rows != rows:
-            raise CFlowError(
-                f"{file} has {table.num_rows} rows but sweep {timestamp} has {rows} points; labels need one each"
-            )
+            raise CFlowError(f"{file} has {table.num_rows} rows but sweep {timestamp} has {rows} points")
         category = integers(table, "classes", file)
         if category.size and not 0 <= category.min() <= category.max() < len(CATEGORIES):
             raise CFlowError(

@@ -86,9 +86,7 @@ def read_ground_raster(map_folder: Path) -> Optional[GroundRaster]:
         )
     heights = read_npy(rasters[0], "copy the map folder again")
     if heights.ndim != 2 or heights.dtype.kind not in "fiu":
-        raise CFlowError(
-            f"{rasters[0]} must hold a (H, W) raster of numbers, got shape {heights.shape} and dtype {heights.dtype}"
-        )
+        raise CFlowError(f"{rasters[0]} must hold (H, W) numbers, got shape {heights.shape} and dtype {heights.dtype}")
     with file_errors(alignments[0], "copy the map folder again"):
         alignment = read_json(alignments[0])
         raster = GroundRaster(

@@ -15,10 +15,7 @@ MAX_NAME_BYTES = 255  # of one folder or file, in UTF-8: what file systems take
 # No dot in front (hidden), no drive, no separator of any system, no device of Windows, no dot or blank at the end:
 # outputs are copied to other systems.
 _NAME = re.compile(r"(?!\.|[A-Z]:|(CON|PRN|AUX|NUL|CONIN\$|CONOUT\$|(COM|LPT)[0-9]) *(\.|$))[^/\\]*[^/\\. ]", re.I)
-_RULE = (
-    "names have printable letters, up to 255 bytes, no / or \\, no dot in front, no dot or blank at the end, and are "
-    "no drive or device of Windows (C:, CON, aux.txt)"
-)
+_RULE = "names are up to 255 bytes, without / and \\, dots in front, dots or blanks behind, and no device (C:, CON)"
 _SHOWN = 80  # characters of a name in a message
 
 

@@ -44,12 +44,10 @@ def as_path(place: Place) -> Path:
         CFlowError: it is no name; the extra `remote` is missing, or the package of the scheme's file system, or fsspec
             does not know the scheme.
     """
+    if not is_place(place) or place == "" or "\0" in str(place):
+        raise CFlowError(f'{str(place)[:80]!r} is no place: give a name, "scheme://..." or a path')
     if not isinstance(place, str):
-        if not is_place(place):
-            raise CFlowError(f'{str(place)[:80]!r} is no place: give a name, "scheme://..." or a path')
         return place
-    if not place or "\0" in place:
-        raise CFlowError(f"{place[:80]!r} is no place: give the name of a file or folder")
     match = _SCHEME.match(place)
     if match is None:
         return Path(place)

@@ -56,10 +56,7 @@ def read_poses(path: Place) -> Trajectory:
         words, values = _read_table(path)
         layout = {8: "tum", 12: "kitti", 16: "matrix"}.get(values.shape[1], "")
         if not layout:
-            raise CFlowError(
-                f"{path} has {values.shape[1]} numbers a line; poses have 12 (KITTI), 8 (TUM: t x y z qx qy qz qw) or "
-                "16 (4 x 4)"
-            )
+            raise CFlowError(f"{path} has {values.shape[1]} numbers a line; poses have 12 (KITTI), 8 (TUM) or 16")
         if layout == "tum":
             times_ns = _nanoseconds(path, words[:, 0])
             matrices = poses_from_quaternions(

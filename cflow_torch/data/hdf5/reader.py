@@ -180,9 +180,7 @@ class HDF5Log(NumberedSweeps):
         stored = self._array(index, "lidar")
         shape: Tuple[int, ...] = () if stored is None else stored.shape
         if len(shape) != 2 or shape[1] < 3:
-            raise CFlowError(
-                f"{self.file}: lidar of sweep {self.timestamps[index]} has shape {shape}, expected (N, 3+)"
-            )
+            raise CFlowError(f"{self.file}: lidar of sweep {self.timestamps[index]} has shape {shape}, not (N, 3+)")
         return int(shape[0])
 
     def _values(

@@ -213,8 +213,7 @@ def pcd_bin_points(content: bytes, file: Place) -> np.ndarray:
     """
     if not content or len(content) % (_COLUMNS * _ROW.itemsize):
         raise CFlowError(
-            f"{file} has {len(content)} bytes, which is no whole number of rows of five float32 (x, y, z, intensity, "
-            "ring): it is truncated or another format; copy it again"
+            f"{file} has {len(content)} bytes, no whole number of rows of five float32: it is truncated; copy it again"
         )
     rows = np.frombuffer(content, dtype=_ROW).reshape(-1, _COLUMNS)
     ring = rows[:, 4]

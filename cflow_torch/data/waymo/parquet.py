@@ -59,8 +59,7 @@ class Component:
         strangers = sorted({str(row[SEGMENT]) for row in rows} - {self.file.stem})
         if strangers:
             raise CFlowError(
-                f"{self.file} holds segment {shortened(strangers[0])}; a file is named after its segment: rename it, "
-                f"or copy it again"
+                f"{self.file} holds segment {shortened(strangers[0])}, which is not its name; copy it again"
             )
         for name in {TIME, LASER} & set(columns):
             wrong = [row[name] for row in rows if not is_whole(row[name], _MOST)]
