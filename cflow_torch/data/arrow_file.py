@@ -1,16 +1,15 @@
-"""Columns of Arrow tables as NumPy arrays and texts."""
+"""Feather files (Arrow IPC, version 2), and columns of Arrow tables as NumPy arrays and texts."""
 
 from __future__ import annotations
 
-from typing import Any, List, Sequence
+from typing import Any, List, Optional, Sequence
 
 import numpy as np
 import pyarrow as pa
 
-from cflow_torch.data.file_errors import shortened
+from cflow_torch.data.file_errors import file_errors, shortened
+from cflow_torch.data.paths import read_bytes
 from cflow_torch.types import CFlowError
-
-_INT64_MAX = (1 << 63) - 1
 
 
 def check_columns(file: Any, names: Sequence[str], columns: Sequence[str], mend: str = "copy it again") -> None:
@@ -25,6 +24,40 @@ def check_columns(file: Any, names: Sequence[str], columns: Sequence[str], mend:
     doubled = [name for name in columns if names.count(name) > 1]
     if doubled:
         raise CFlowError(f"{file} has several columns {doubled}; keep one")
+
+
+class FeatherFile:
+    """A feather file, in memory.
+
+    Args:
+        file: where it is, a path; with `data` just its name in messages.
+        data: its contents; None = they are read, all at once: a file that shrinks meanwhile does no harm.
+
+    Attributes:
+        schema, names, num_rows: of the table, its columns, its rows.
+
+    Raises:
+        CFlowError: the file is missing, cannot be reached, or is damaged.
+    """
+
+    def __init__(self, file: Any, data: Optional[bytes] = None) -> None:
+        with file_errors(file, "copy it from the data set"):
+            source = read_bytes(file) if data is None else data
+            self._table = pa.ipc.open_file(source, options=pa.ipc.IpcReadOptions(use_threads=False)).read_all()
+            self._table.validate(full=True)
+        self.file = file
+        self.schema: pa.Schema = self._table.schema
+        self.names: List[str] = self._table.column_names
+        self.num_rows: int = self._table.num_rows
+
+    def read(self, columns: Sequence[str]) -> pa.Table:
+        """Some columns, in the order that is asked for.
+
+        Raises:
+            CFlowError: a column is missing or occurs twice.
+        """
+        check_columns(self.file, self.names, columns)
+        return self._table.select(list(columns))
 
 
 def floats(table: pa.Table, columns: Sequence[str], file: Any, dtype: type = np.float64) -> np.ndarray:
@@ -43,12 +76,9 @@ def integers(table: pa.Table, column: str, file: Any) -> np.ndarray:
     """(rows,) int64 numbers of an integer column.
 
     Raises:
-        CFlowError: another type, empty entries, or numbers beyond int64.
+        CFlowError: another type, or empty entries.
     """
-    values = _column(table, column, file, "integer", pa.types.is_integer).to_numpy()
-    if values.size and int(values.max()) > _INT64_MAX:
-        raise CFlowError(f"{file}: {column} holds {values.max()}, more than {_INT64_MAX}")
-    return values.astype(np.int64)
+    return _column(table, column, file, "integer", pa.types.is_integer).to_numpy().astype(np.int64)
 
 
 def bools(table: pa.Table, column: str, file: Any) -> np.ndarray:

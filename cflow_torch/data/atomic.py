@@ -10,7 +10,7 @@ import socket
 import tempfile
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO, Any, Collection, ContextManager, Iterator, List, Optional
+from typing import IO, Any, Collection, Iterator, List, Optional
 
 from cflow_torch.data.paths import Place, as_path, forget_listings, is_remote, remote_errors
 from cflow_torch.types import CFlowError
@@ -20,14 +20,15 @@ _WHOLE_PUTS = {"s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "oss", "memory"}
 _TEMPORARY = re.compile(r"\.(?P<target>.+)\.(?P<host>[A-Za-z0-9_-]+)-(?P<process>\d+)-[0-9a-f]{8}\.tmp")
 
 
-def atomic_file(path: Place) -> ContextManager[Any]:
+@contextmanager
+def atomic_file(path: Place) -> Iterator[Any]:
     """Open a binary file for writing that takes its name only when everything is written.
 
     Args:
         path: final name; its folder is made if absent.
 
-    Returns:
-        A context manager of the open file. If its block raises, nothing is left of it, and an older file stays.
+    Yields:
+        The open file. If the block raises, nothing is left of it, and an older file stays.
 
     Convention:
         - On this machine: a temporary name in the same folder, `.NAME.<host>-<process>-<random>.tmp`, then a rename;
@@ -40,13 +41,12 @@ def atomic_file(path: Place) -> ContextManager[Any]:
         OSError: as for any file; also if the far side cannot be reached.
     """
     path = as_path(path)
-    return _put_file(path) if is_remote(path) else _renamed_file(path)
-
-
-@contextmanager
-def _renamed_file(path: Path) -> Iterator[IO[bytes]]:
-    with atomic_name(path) as temporary, open(temporary, "xb") as file:
-        yield file
+    if is_remote(path):
+        with _put_file(path) as file:
+            yield file
+    else:
+        with atomic_name(path) as temporary, open(temporary, "xb") as file:
+            yield file
 
 
 @contextmanager
@@ -119,15 +119,10 @@ def atomic_folder(folder: Place) -> Iterator[Path]:
             sync_folder(place)  # files likewise
         if folder.exists():
             os.replace(folder, old)
-        try:
-            os.replace(new, folder)
-        except BaseException:
-            if old.exists():
-                os.replace(old, folder)
-            raise
+        os.replace(new, folder)
         sync_folder(folder.parent)
     finally:
-        shutil.rmtree(scratch, ignore_errors=True)
+        _remove(scratch, folder)
 
 
 def remove_stale(folder: Place, targets: Optional[Collection[str]] = None) -> List[str]:
@@ -165,6 +160,7 @@ def remove_stale(folder: Place, targets: Optional[Collection[str]] = None) -> Li
 
 
 def _remove(path: Path, target: Path) -> None:
+    """Remove a temporary file or folder; the older folder that it was to replace comes back if nothing did."""
     if not path.is_dir():
         with suppress(FileNotFoundError):
             path.unlink()

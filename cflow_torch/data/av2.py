@@ -8,13 +8,12 @@ from typing import Dict, List, Optional, Sequence, Union
 import numpy as np
 import pyarrow as pa
 
-from cflow_torch.data.arrow_file import bools, floats, integers, texts
+from cflow_torch.data.arrow_file import FeatherFile, bools, floats, integers, texts
 from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes, make_boxes
 from cflow_torch.data.categories import CATEGORIES
-from cflow_torch.data.feather_file import FeatherFile
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.folders import find_folders
-from cflow_torch.data.ground import get_rule, read_ground_raster
+from cflow_torch.data.ground import GROUND_RULES, read_ground_raster
 from cflow_torch.data.log import FlowLabels, NumberedSweeps
 from cflow_torch.data.names import is_stamp
 from cflow_torch.data.paths import Place, as_path, remote_errors
@@ -76,7 +75,8 @@ class AV2Log(NumberedSweeps):
         self._poses = self._read_poses()
         self._rule, self._raster = ground, None
         if ground is not None:
-            get_rule(ground)
+            if ground not in GROUND_RULES:
+                raise CFlowError(f"ground rules are {sorted(GROUND_RULES)}, got {ground!r}")
             self._raster = read_ground_raster(self.folder / "map")
         if require_ground and self._raster is None:
             raise CFlowError(
@@ -128,11 +128,7 @@ class AV2Log(NumberedSweeps):
         row_of = {time: row for row, time in enumerate(integers(table, "timestamp_ns", file).tolist())}
         missing = [time for time in self.timestamps if time not in row_of]
         if missing:
-            raise CFlowError(
-                f"{file} has no pose for sweep {missing[0]}"
-                + (f" and {len(missing) - 1} more" if len(missing) > 1 else "")
-                + "; every sweep needs a pose at exactly its time stamp"
-            )
+            raise CFlowError(f"{file} has no pose for sweep {missing[0]}, at exactly its time ({len(missing)} missing)")
         rows = [row_of[time] for time in self.timestamps]
         return dict(zip(self.timestamps, _poses(table.take(rows), file, self.timestamps)))
 
@@ -141,9 +137,7 @@ class AV2Log(NumberedSweeps):
         table = stored.read((*_FLOW, "classes"))
         rows = len(self._points(timestamp))
         if table.num_rows != rows:
-            raise CFlowError(
-                f"{file} has {table.num_rows} rows but sweep {timestamp} has {rows} points; labels need one each"
-            )
+            raise CFlowError(f"{file} has {table.num_rows} rows but sweep {timestamp} has {rows} points")
         category = integers(table, "classes", file)
         if category.size and not 0 <= category.min() <= category.max() < len(CATEGORIES):
             raise CFlowError(

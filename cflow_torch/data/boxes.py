@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
-from typing import Any, List, Mapping, Sequence, Tuple
+from typing import Any, List, Mapping, Sequence
 
 import numpy as np
 
@@ -15,6 +15,8 @@ from cflow_torch.data.rigid_motion import moved
 from cflow_torch.types import CFlowError
 
 _LISTED = 20  # names in a message
+# Metres added to length, width and height of the boxes of t: annotated boxes are a little tight.
+_MARGIN = (0.2, 0.2, 0.0)
 
 
 @dataclass(frozen=True)
@@ -34,13 +36,9 @@ class Boxes:
     pose: np.ndarray
 
     def __post_init__(self) -> None:
-        count = len(self.track_id)
-        shapes = (self.category.shape, self.size.shape, self.pose.shape)
-        if shapes != ((count,), (count, 3), (count, 4, 4)):
-            raise CFlowError(f"{count} boxes need category (K,), size (K, 3), pose (K, 4, 4); got {shapes}")
         if not (np.isfinite(self.size).all() and np.isfinite(self.pose).all()):
             raise CFlowError("a box holds numbers that are not finite; copy the annotations again")
-        if len(set(self.track_id)) != count:
+        if len(set(self.track_id)) < len(self.track_id):
             twice = sorted(name for name, times in Counter(self.track_id).items() if times > 1)
             raise CFlowError(f"a track may have one box per sweep; named twice: {twice[:_LISTED]}")
 
@@ -82,20 +80,13 @@ def points_in_box(points: np.ndarray, size: np.ndarray, pose: np.ndarray) -> np.
     return (np.abs(local) <= np.asarray(size) / 2).all(axis=1)
 
 
-def flow_from_boxes(
-    points: np.ndarray,
-    boxes0: Boxes,
-    boxes1: Boxes,
-    T_ego1_ego0: np.ndarray,
-    margin: Tuple[float, float, float] = (0.2, 0.2, 0.0),
-) -> FlowLabels:
+def flow_from_boxes(points: np.ndarray, boxes0: Boxes, boxes1: Boxes, T_ego1_ego0: np.ndarray) -> FlowLabels:
     """Truth of a pair of sweeps from the boxes of both.
 
     Args:
         points: (N, 3) float, metres, ego frame of t.
         boxes0, boxes1: boxes of sweep t and t+1, each in the ego frame of its sweep.
         T_ego1_ego0: (4, 4) float64, ego coordinates of t to those of t+1.
-        margin: metres added to length, width and height of the boxes of t: annotated boxes are a little tight.
 
     Returns:
         Labels: TOTAL flow, rounded to float32 once at the end. Points in a box whose track ends have the category of
@@ -114,7 +105,7 @@ def flow_from_boxes(
     is_valid = np.ones(len(start), dtype=bool)
     successor = {track: row for row, track in enumerate(boxes1.track_id)}
     for row, track in enumerate(boxes0.track_id):
-        inside = _rows_in_box(start, boxes0.size[row] + np.asarray(margin), boxes0.pose[row])
+        inside = _rows_in_box(start, boxes0.size[row] + _MARGIN, boxes0.pose[row])
         category[inside] = boxes0.category[row]
         if track not in successor:
             is_valid[inside] = False

@@ -9,9 +9,8 @@ import pyarrow as pa
 import torch
 from pyarrow import feather
 
-from cflow_torch.data.arrow_file import bools, floats, integers
+from cflow_torch.data.arrow_file import FeatherFile, bools, floats, integers
 from cflow_torch.data.atomic import atomic_file
-from cflow_torch.data.feather_file import FeatherFile
 from cflow_torch.data.paths import Place, as_path
 from cflow_torch.types import CFlowError, FlowResult
 

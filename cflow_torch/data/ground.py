@@ -49,11 +49,8 @@ class GroundRaster:
             (N,) bool: within the threshold of the surface (limit included) or below it.
 
         Convention: outside the raster and where its height is NaN a point is not ground.
-
-        Raises:
-            CFlowError: no rule has this name.
         """
-        threshold, rounded = get_rule(rule)
+        threshold, rounded = GROUND_RULES[rule]
         xyz: np.ndarray = np.asarray(points, dtype=np.float64)
         inside = np.isfinite(xyz[:, :2]).all(axis=1)
         position = (np.where(inside[:, None], xyz[:, :2], 0.0) @ self.rotation.T + self.translation) * self.scale
@@ -64,17 +61,6 @@ class GroundRaster:
         with np.errstate(invalid="ignore"):
             above = xyz[:, 2] - height
             return (np.abs(above) <= threshold) | (above < 0)
-
-
-def get_rule(rule: str) -> Tuple[float, Callable[[np.ndarray], Any]]:
-    """A rule by name.
-
-    Raises:
-        CFlowError: no rule has this name.
-    """
-    if rule not in GROUND_RULES:
-        raise CFlowError(f"ground rules are {sorted(GROUND_RULES)}, got {rule!r}")
-    return GROUND_RULES[rule]
 
 
 def read_ground_raster(map_folder: Path) -> Optional[GroundRaster]:
@@ -100,9 +86,7 @@ def read_ground_raster(map_folder: Path) -> Optional[GroundRaster]:
         )
     heights = read_npy(rasters[0], "copy the map folder again")
     if heights.ndim != 2 or heights.dtype.kind not in "fiu":
-        raise CFlowError(
-            f"{rasters[0]} must hold a (H, W) raster of numbers, got shape {heights.shape} and dtype {heights.dtype}"
-        )
+        raise CFlowError(f"{rasters[0]} must hold (H, W) numbers, got shape {heights.shape} and dtype {heights.dtype}")
     with file_errors(alignments[0], "copy the map folder again"):
         alignment = read_json(alignments[0])
         raster = GroundRaster(

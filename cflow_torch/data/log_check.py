@@ -32,11 +32,8 @@ def check_log(log: Log) -> None:
             check(log)
 
 
-def check_ground(log: Log) -> bool:
+def check_ground(log: Log) -> None:
     """Warn if the first sweep has ground points, but no mask that says so.
-
-    Returns:
-        Whether it has.
 
     Warns:
         GroundWarning: once.
@@ -44,8 +41,7 @@ def check_ground(log: Log) -> bool:
     Cost: reads one sweep; some milliseconds.
     """
     sweep = log.sweep(0)
-    is_left_in = sweep.is_ground is None and has_ground([sweep.points])[0]
-    if is_left_in:
+    if sweep.is_ground is None and has_ground([sweep.points])[0]:
         warnings.warn(
             f"log {log.log_id}: there are ground points, and no masks. The ground joins what stands on it into one "
             "cluster, so that moving objects are missed. Give data.find_ground=grid (in Python find_ground='grid'), or "
@@ -53,4 +49,3 @@ def check_ground(log: Log) -> bool:
             GroundWarning,
             stacklevel=2,
         )
-    return is_left_in

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import unicodedata
 from collections import Counter
 from pathlib import Path
 from typing import Any, Iterable, List
@@ -13,10 +12,18 @@ from cflow_torch.data.paths import is_remote
 from cflow_torch.types import CFlowError
 
 MAX_NAME_BYTES = 255  # of one folder or file, in UTF-8: what file systems take
-_SEPARATOR = re.compile(r"[/\\]|^[A-Za-z]:")  # also those of other systems: outputs are copied there
-# Windows opens a device instead of a file for these, whatever follows the first dot.
-_RESERVED = re.compile(r"(CON|PRN|AUX|NUL|CONIN\$|CONOUT\$|(COM|LPT)[0-9\u00b9\u00b2\u00b3]) *(\..*)?", re.I | re.S)
+# No dot in front (hidden), no drive, no separator of any system, no device of Windows, no dot or blank at the end:
+# outputs are copied to other systems.
+_NAME = re.compile(r"(?!\.|[A-Z]:|(CON|PRN|AUX|NUL|CONIN\$|CONOUT\$|(COM|LPT)[0-9]) *(\.|$))[^/\\]*[^/\\. ]", re.I)
+_RULE = "names are up to 255 bytes, without / and \\, dots in front, dots or blanks behind, and no device (C:, CON)"
 _SHOWN = 80  # characters of a name in a message
+
+
+def is_safe_name(name: Any) -> bool:
+    """Whether it is the name of one file or folder on every system."""
+    if not isinstance(name, str) or not name.isprintable() or not _NAME.fullmatch(name):
+        return False
+    return len(name.encode()) <= MAX_NAME_BYTES
 
 
 def safe_name(name: Any, what: str) -> str:
@@ -30,19 +37,12 @@ def safe_name(name: Any, what: str) -> str:
         The same name.
 
     Raises:
-        CFlowError: no text, empty, begins with a dot, has a separator (/, \\, C:), a control character or a lone
-            surrogate, ends in a dot or blank, is reserved on Windows (CON, aux.txt), or has over 255 bytes.
+        CFlowError: `is_safe_name` says no.
     """
-    why = _fault(name)
-    if why:
+    if not is_safe_name(name):
         shown = ascii(name)[: _SHOWN + 2] if isinstance(name, str) else f"a {type(name).__name__}"
-        raise CFlowError(f"{what} {shown} is no folder name and no file name: {why}; rename it in the data")
+        raise CFlowError(f"{what} {shown} is no folder name and no file name: {_RULE}; rename it in the data")
     return str(name)
-
-
-def is_safe_name(name: Any) -> bool:
-    """Whether `safe_name` takes it."""
-    return not _fault(name)
 
 
 def inside(folder: Path, relative: Any, what: str) -> Path:
@@ -56,13 +56,11 @@ def inside(folder: Path, relative: Any, what: str) -> Path:
     Raises:
         CFlowError: no text, empty, absolute, or a part that `safe_name` refuses, `..` among them.
     """
-    parts = relative.split("/") if isinstance(relative, str) else []
+    parts = relative.split("/") if isinstance(relative, str) else [""]
     named = [part for part in parts if part not in ("", ".")]
-    fault = next(filter(None, map(_fault, named)), "" if named else "it names no file")
-    if parts and (not parts[0] or ".." in parts):
-        fault = f"it leaves {folder}"
-    if fault:
-        raise CFlowError(f"{what} {ascii(relative)[:_SHOWN]} is not read: {fault}; give a name below {folder}")
+    if not parts[0] or not named or not all(map(is_safe_name, named)):
+        shown = ascii(relative)[:_SHOWN]
+        raise CFlowError(f"{what} {shown} is not read: it must name a file below {folder}; {_RULE}")
     return folder.joinpath(*named)
 
 
@@ -98,28 +96,7 @@ def is_stamp(name: str) -> bool:
 
 
 def same_names(names: Iterable[str]) -> List[str]:
-    """Names that some file system cannot tell from another one of them: the same but for case or Unicode form."""
+    """Names that some file system cannot tell from another one of them: the same but for case."""
     listed = list(names)
-    keys = [unicodedata.normalize("NFC", unicodedata.normalize("NFC", name).casefold()) for name in listed]
-    count = Counter(keys)
-    return sorted({name for name, key in zip(listed, keys) if count[key] > 1})
-
-
-def _fault(name: Any) -> str:
-    """What is wrong with the name of one file; "" if nothing is."""
-    if not isinstance(name, str):
-        return "it is no text"
-    if name in ("", ".", ".."):
-        return "it names no file of its own"
-    if name[0] == ".":
-        return "it begins with a dot, so it would be hidden, and passed over"
-    if _SEPARATOR.search(name):
-        return "it has a separator of folders or a drive"
-    if any(unicodedata.category(letter) in ("Cc", "Cs", "Zl", "Zp") for letter in name):
-        return "it has a control character or half of a surrogate pair"
-    if name[-1] in ". ":
-        return "it ends in a dot or blank, which Windows leaves out"
-    if _RESERVED.fullmatch(name):
-        return "it is a device on Windows"
-    size = len(name.encode())
-    return f"it has {size} bytes, more than {MAX_NAME_BYTES}" if size > MAX_NAME_BYTES else ""
+    count = Counter(name.casefold() for name in listed)
+    return sorted({name for name in listed if count[name.casefold()] > 1})

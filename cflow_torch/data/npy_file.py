@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import IO, Tuple
 
 import numpy as np
-from numpy.lib import format as npy
 
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.paths import whole
@@ -27,14 +25,3 @@ def read_npy(path: Path, mend: str) -> np.ndarray:
         if not isinstance(array, np.ndarray):
             raise ValueError("it is an archive, no .npy file")
         return array
-
-
-def read_header(stream: IO[bytes]) -> Tuple[Tuple[int, ...], np.dtype]:
-    """Shape and dtype, which stand before the data of an array; the stream stands at the data afterwards.
-
-    Raises:
-        Exception: whatever NumPy raises for a damaged one.
-    """
-    version = npy.read_magic(stream)
-    shape, _, dtype = (npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0)(stream)
-    return shape, dtype

@@ -15,16 +15,14 @@ from cflow_torch.windows.ego_motion import rigid_transform
 # KISS-ICP starts as if the vehicle stood still: its first steps miss by up to 14 cm at 6 m/s, later ones by 1 to 3 cm.
 _RUN_IN = 5  # sweeps
 _FEWEST_POINTS = 100
-MAX_RANGE = 100.0  # metres; KISS-ICP's own default, from which it takes its voxel size (a hundredth)
+_MAX_RANGE = 100.0  # metres; KISS-ICP's own default, from which it takes its voxel size (a hundredth)
 
 
-def poses_from_odometry(log: Log, max_range: float = MAX_RANGE) -> np.ndarray:
+def poses_from_odometry(log: Log) -> np.ndarray:
     """`T_world_ego` of every sweep; the world is the ego frame of the first.
 
     Args:
         log: its sweeps' poses are not looked at; ground points are used too, they hold height and tilt.
-        max_range: metres; points further away are left out. Indoors and with short-sighted sensors give less: the size
-            of KISS-ICP's voxels follows from it.
 
     Returns:
         (K, 4, 4) float64, in the frame that the points are in.
@@ -42,18 +40,16 @@ def poses_from_odometry(log: Log, max_range: float = MAX_RANGE) -> np.ndarray:
 
     Source: Vizzo et al., "KISS-ICP: In Defense of Point-to-Point ICP", RA-L 2023.
     """
-    if not max_range > 0:
-        raise CFlowError(f"max_range={max_range}: give metres above 0")
     last = len(log.timestamps) - 1
     turn = min(_RUN_IN, last // 2)
-    forward = _register(log, range(last + 1), max_range)
-    backward = _register(log, range(min(2 * turn, last), -1, -1), max_range)[::-1]
+    forward = _register(log, range(last + 1))
+    backward = _register(log, range(min(2 * turn, last), -1, -1))[::-1]
     start = [np.eye(4)] + [np.linalg.inv(backward[0]) @ pose for pose in backward[1 : turn + 1]]
     onwards = start[turn] @ np.linalg.inv(forward[turn])
     return np.stack(start + [onwards @ pose for pose in forward[turn + 1 :]])
 
 
-def _register(log: Log, order: Sequence[int], max_range: float) -> List[np.ndarray]:
+def _register(log: Log, order: Sequence[int]) -> List[np.ndarray]:
     """Poses of sweeps in the order given, the world being that of the first of them."""
     try:
         from kiss_icp.config import load_config
@@ -65,17 +61,17 @@ def _register(log: Log, order: Sequence[int], max_range: float) -> List[np.ndarr
         ) from None
     config = load_config(None)
     config.data.deskew = False
-    config.data.max_range = float(max_range)
-    config.mapping.voxel_size = float(max_range) / 100
+    config.data.max_range = _MAX_RANGE
+    config.mapping.voxel_size = _MAX_RANGE / 100
     config.registration.max_num_threads = 1
     odometry = KissICP(config)
     poses = []
     for index in tqdm(order, desc="odometry", unit="sweep", disable=None):
         points = np.asarray(log.sweep(index).points)[:, :3].astype(np.float64)
         points = points[np.isfinite(points).all(1)]
-        if (np.linalg.norm(points, axis=1) < max_range).sum() < _FEWEST_POINTS:
+        if (np.linalg.norm(points, axis=1) < _MAX_RANGE).sum() < _FEWEST_POINTS:
             raise CFlowError(
-                f"sweep {index} of log {log.log_id} has fewer than {_FEWEST_POINTS} points within {max_range} m"
+                f"sweep {index} of log {log.log_id} has fewer than {_FEWEST_POINTS} points within {_MAX_RANGE} m"
             )
         odometry.register_frame(np.ascontiguousarray(points), np.zeros(len(points)))
         poses.append(rigid_transform(odometry.last_pose, f"the pose that KISS-ICP gives for sweep {index}"))
@@ -108,7 +104,7 @@ class PosedLog(ChangedLog):
         return Sweep(sweep.points, sweep.is_ground, self.poses[index].copy(), sweep.timestamp_ns)
 
 
-def with_poses(log: Log, max_range: float = MAX_RANGE) -> Log:
+def with_poses(log: Log) -> Log:
     """The log itself if its first sweep has a pose, else the log with poses from odometry.
 
     Raises:
@@ -116,4 +112,4 @@ def with_poses(log: Log, max_range: float = MAX_RANGE) -> Log:
     """
     if log.sweep(0).pose is not None:
         return log
-    return PosedLog(log, poses_from_odometry(log, max_range))
+    return PosedLog(log, poses_from_odometry(log))

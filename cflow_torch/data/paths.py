@@ -44,12 +44,10 @@ def as_path(place: Place) -> Path:
         CFlowError: it is no name; the extra `remote` is missing, or the package of the scheme's file system, or fsspec
             does not know the scheme.
     """
+    if not is_place(place) or place == "" or "\0" in str(place):
+        raise CFlowError(f'{str(place)[:80]!r} is no place: give a name, "scheme://..." or a path')
     if not isinstance(place, str):
-        if not is_place(place):
-            raise CFlowError(f'{str(place)[:80]!r} is no place: give a name, "scheme://..." or a path')
         return place
-    if not place or "\0" in place:
-        raise CFlowError(f"{place[:80]!r} is no place: give the name of a file or folder")
     match = _SCHEME.match(place)
     if match is None:
         return Path(place)
@@ -63,12 +61,9 @@ def as_path(place: Place) -> Path:
         raise CFlowError(f"{place} is not on this machine, which needs: pip install universal_pathlib fsspec") from None
     try:
         fsspec.get_filesystem_class(scheme)
-    except ImportError as error:  # it names the package
-        raise CFlowError(f"{place} needs one more package: {error}") from error
-    except ValueError as error:
+    except (ImportError, ValueError) as error:  # it names the package
         raise CFlowError(f"fsspec has no file system {scheme}:// ({error}): {place}; is it written right?") from error
-    rest = place[match.end() :].rstrip("/")
-    path: Any = UPath(f"{scheme}://{rest}")
+    path: Any = UPath(f"{scheme}://{place[match.end() :].rstrip('/')}")
     return path  # type: ignore[no-any-return]
 
 
@@ -164,8 +159,6 @@ def _copy(path: Path) -> pa.Buffer:
     with tempfile.TemporaryFile() as file, _open(path, cache_type="none") as stream:
         with remote_errors(path):
             shutil.copyfileobj(stream, file, _COPIED)
-        if not file.tell():
-            raise CFlowError(f"{path} is empty; copy it again")
         file.flush()
         return pa.py_buffer(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
 

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any, Dict, List
 
 from cflow_torch.data.atomic import atomic_file
+from cflow_torch.data.file_errors import shortened
 
 _SHOWN = 5  # differences that a message lists
-_LONGEST = 200  # characters of a setting in it
 
 
 def write_text(path: Path, text: str) -> None:
@@ -48,12 +48,5 @@ def changes(before: Any, now: Any, ignored: Any = ()) -> str:
     """
     old, new = flat(before), flat(now)
     changed = sorted(key for key in {*old, *new} - set(ignored) if old.get(key) != new.get(key))
-    shown = "; ".join(
-        f"{key[:_LONGEST]} was {_short(old.get(key))}, is {_short(new.get(key))}" for key in changed[:_SHOWN]
-    )
+    shown = "; ".join(f"{key} was {shortened(old.get(key))}, is {shortened(new.get(key))}" for key in changed[:_SHOWN])
     return shown + (f" and {len(changed) - _SHOWN} more" if len(changed) > _SHOWN else "")
-
-
-def _short(value: Any) -> str:
-    text = str(value)
-    return text if len(text) <= _LONGEST else text[:_LONGEST] + " ..."

@@ -1,12 +1,12 @@
-"""Rigid motions as 4 x 4 matrices: from quaternions, between two times, applied to points. Float64 throughout."""
+"""Rotations and rigid motions: quaternions (by kornia), motion between two times, applied to points. All float64."""
 
 from __future__ import annotations
 
 from typing import Any, Callable
 
 import numpy as np
+import torch
 
-from cflow_torch.data.rotations import rotations_between, to_rotations
 from cflow_torch.types import CFlowError
 
 QUATERNION_TOLERANCE = 1e-3  # a quaternion is a rotation only if its length is 1; stored values are within 1e-6
@@ -60,13 +60,40 @@ def between(poses0: np.ndarray, poses1: np.ndarray, fraction: np.ndarray) -> np.
         poses0, poses1: (K, 4, 4) float64.
         fraction: (K,) float64, 0 = the first, 1 = the second; beyond, the motion goes on.
     """
-    rotation = rotations_between(poses0[:, :3, :3], poses1[:, :3, :3], fraction)
+    rotation = _rotations_between(poses0[:, :3, :3], poses1[:, :3, :3], fraction)
     return _poses(rotation, poses0[:, :3, 3] + fraction[:, None] * (poses1[:, :3, 3] - poses0[:, :3, 3]))
 
 
 def moved(points: np.ndarray, T: np.ndarray) -> np.ndarray:
     """(N, 3) float64 points after the rigid motion `T`, (4, 4) float64."""
     return np.asarray(points, dtype=np.float64) @ T[:3, :3].T + T[:3, 3]
+
+
+def to_quaternions(rotations: np.ndarray) -> np.ndarray:
+    """Unit quaternions (M, 4) float64, scalar first and not negative, of rotation matrices (M, 3, 3)."""
+    from kornia.geometry.conversions import rotation_matrix_to_quaternion
+
+    matrices = torch.from_numpy(np.array(rotations, np.float64))
+    found = rotation_matrix_to_quaternion(matrices, eps=0.0).numpy()  # kornia 0.7 adds eps before it takes the root
+    found = found / np.linalg.norm(found, axis=1, keepdims=True)
+    return np.where(found[:, :1] < 0, -found, found)
+
+
+def to_rotations(quaternions: np.ndarray) -> np.ndarray:
+    """Rotation matrices (M, 3, 3) float64 of quaternions (M, 4), scalar first, of any length but 0."""
+    from kornia.geometry.conversions import quaternion_to_rotation_matrix
+
+    return quaternion_to_rotation_matrix(torch.from_numpy(np.array(quaternions, np.float64))).numpy()
+
+
+def _rotations_between(first: np.ndarray, last: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """(M, 3, 3) rotations on the shorter way from one to another, at constant turn rate."""
+    # Not kornia's `Quaternion.slerp`: before kornia 0.8 it may take the longer way, and gives NaN for equal rotations.
+    from kornia.geometry.conversions import axis_angle_to_quaternion, quaternion_to_axis_angle
+
+    turn = quaternion_to_axis_angle(torch.from_numpy(to_quaternions(np.swapaxes(first, 1, 2) @ last)))
+    part = axis_angle_to_quaternion(turn * torch.from_numpy(np.asarray(share, np.float64))[:, None])
+    return np.asarray(first, np.float64) @ to_rotations(part.numpy())
 
 
 def _poses(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:

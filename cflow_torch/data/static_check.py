@@ -13,6 +13,7 @@ from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.ego_motion import rigid_transform
 
 BASELINE = 5  # sweeps between the two that are compared: a wrong frame shows by how far the vehicle turned
+_PAIRS = 2  # that are looked at in a log
 _NEAREST, _FARTHEST = 2.5, 50.0  # metres from the origin: without the own car, and near enough for dense structure
 _CELL = 1.0  # metres, side of the cells whose points are taken as one patch of a wall
 _FEWEST = 6  # points in a cell
@@ -103,13 +104,11 @@ def static_world_residual(log: Log, index: int, baseline: int = BASELINE) -> Sta
     verdict = ""
     if inverted > max(_BETTER * agreement, _GOOD, still):
         verdict = "The poses seem to be inverted: they must map ego coordinates to the world (T_world_ego)."
-    elif still > max(_BETTER * agreement, _GOOD):
+    elif still > max(_BETTER * agreement, _GOOD) or max(agreement / _HOPELESS, aligned / _ALIGNED) < own:
         verdict = (
-            "Without any ego motion it fits better: are the poses of another log, of other times, in another unit, or "
-            "do the points lie in one common frame already (then pass no poses)?"
+            "It does not fit: are the poses of another log, of other axes (a camera's), times or units, or do the "
+            "points lie in one common frame already (then pass no poses)?"
         )
-    elif agreement < _HOPELESS * own and aligned < _ALIGNED * own:
-        verdict = "It does not fit at all: are the poses of another log, of other axes (a camera's), times or units?"
     elif abs(turn) > _TURN or size > _SHIFT + _SHIFT_PER_METRE * distance + _SHIFT_PER_RADIAN * abs(turn):
         verdict = (
             f"It is off by {100 * size:.0f} cm and {np.degrees(abs(turn)):.1f} degrees. Points in the frame of the "
@@ -119,14 +118,11 @@ def static_world_residual(log: Log, index: int, baseline: int = BASELINE) -> Sta
     return StaticResidual(index, index + baseline, shift, turn, agreement, aligned, verdict)
 
 
-def check_static_world(log: Log, pairs: int = 2, baseline: int = BASELINE) -> List[StaticResidual]:
-    """Warn if the static world does not stay put in a few pairs of sweeps of a log.
+def check_static_world(log: Log) -> List[StaticResidual]:
+    """Warn if the static world does not stay put in two pairs of sweeps of a log.
 
     Args:
-        log: any log.
-        pairs: how many pairs to look at: those over which the vehicle turns most, if the log has `poses`, else spread
-            evenly.
-        baseline: sweeps between the two of a pair; fewer in a shorter log.
+        log: any log. The pairs are those over which the vehicle turns most, if it has `poses`, else first and last.
 
     Returns:
         What was found; empty for a log without poses.
@@ -136,10 +132,10 @@ def check_static_world(log: Log, pairs: int = 2, baseline: int = BASELINE) -> Li
 
     Cost: reads two sweeps a pair; 0.15 s each.
     """
-    baseline = min(baseline, len(log.timestamps) - 1)
+    baseline = min(BASELINE, len(log.timestamps) - 1)
     if baseline < 1 or log.sweep(0).pose is None:
         return []
-    found = [static_world_residual(log, index, baseline) for index in _choose(log, pairs, baseline)]
+    found = [static_world_residual(log, index, baseline) for index in _choose(log, baseline)]
     bad = [residual for residual in found if residual.verdict]
     if bad:
         worst = max(bad, key=lambda residual: float(np.linalg.norm(residual.shift)))
@@ -152,17 +148,17 @@ def check_static_world(log: Log, pairs: int = 2, baseline: int = BASELINE) -> Li
     return found
 
 
-def _choose(log: Any, pairs: int, baseline: int) -> List[int]:
+def _choose(log: Any, baseline: int) -> List[int]:
     """First sweeps of pairs that do not overlap, those with the largest turn first."""
     last = len(log.timestamps) - 1 - baseline
     poses: Optional[np.ndarray] = getattr(log, "poses", None)
     if poses is None:
-        return sorted({int(k) for k in np.linspace(0, last, pairs)})
+        return sorted({0, last})
     relative = np.linalg.inv(poses[baseline:]) @ poses[:-baseline]
     order = np.argsort(-np.abs(np.arctan2(relative[:, 1, 0], relative[:, 0, 0])), kind="stable")
     chosen: List[int] = []
     for index in order.tolist():
-        if len(chosen) < pairs and all(abs(index - other) >= baseline for other in chosen):
+        if len(chosen) < _PAIRS and all(abs(index - other) >= baseline for other in chosen):
             chosen.append(index)
     return chosen
 

@@ -16,7 +16,7 @@ import pytest
 from cflow_torch.data.aevascenes.clouds import Cloud
 from cflow_torch.data.aevascenes.reader import CATEGORY_NAME, AevaScenesLog
 from cflow_torch.data.boxes import category_indices, flow_from_boxes, make_boxes
-from cflow_torch.data.categories import CATEGORIES, CATEGORY_INDEX, meta_class
+from cflow_torch.data.categories import CATEGORY_INDEX
 from cflow_torch.simulator import make_drive
 from cflow_torch.simulator.writers.aevascenes import CLASS_OF, write_aevascenes_sequence
 from cflow_torch.types import CFlowError
@@ -122,12 +122,6 @@ def test_a_simulated_drive_comes_back(tmp_path: Path, layout: str) -> None:
     assert np.abs(labels.flow - true.flow)[same].max() < 1e-5
 
 
-def test_every_category_has_a_class() -> None:
-    assert set(CATEGORY_NAME.values()) <= set(CATEGORIES) and len(CATEGORY_NAME) == 25
-    there_and_back = [CATEGORY_INDEX[CATEGORY_NAME[CLASS_OF[name]]] for name in CATEGORIES[1:]]
-    assert np.array_equal(meta_class(np.array(there_and_back)), meta_class(np.arange(1, 31)))
-
-
 def npz_with_pickle(file: Path, pickled: bytes) -> Path:
     header = io.BytesIO()
     np.lib.format.write_array_header_1_0(header, {"descr": "|O", "fortran_order": False, "shape": (2, 1)})
@@ -149,26 +143,9 @@ def test_strings_of_every_kind(tmp_path: Path, protocol: int) -> None:
 
 
 @pytest.mark.parametrize(
-    "pickled",
-    [
-        pickle.dumps(np.array([["car"], [3]], dtype=object)),
-        pickle.dumps(np.array([["car"], ["road"], ["car"]], dtype=object)),
-        pickle.dumps(np.array([["car"], [np.float64(3)]], dtype=object)),
-        pickle.dumps(np.array([["car"], ["road"]], dtype=object))[:-20],
-        b"",
-    ],
-)
-def test_what_holds_no_strings_is_refused(tmp_path: Path, pickled: bytes) -> None:
-    with pytest.raises(CFlowError, match="cannot read .*a.npz: semantic_labels"):
-        Cloud(npz_with_pickle(tmp_path / "a.npz", pickled)).names("semantic_labels")
-
-
-@pytest.mark.parametrize(
     ("damage", "message"),
     [
         (lambda file: file.write_bytes(file.read_bytes()[:300]), "cannot read .*damaged"),
-        (lambda file: file.write_bytes(b""), "cannot read .*damaged"),
-        (lambda file: file.write_text("a poem, not an archive"), "cannot read .*damaged"),
         (lambda file: file.unlink(), "is missing; copy"),
         (lambda file: save(file, points=np.zeros((3, 3))), "no array xyz.*points"),
         (lambda file: save(file, xyz=np.zeros((3, 2))), r"\(N, 3\)"),
@@ -188,20 +165,12 @@ def test_damaged_cloud(folder: Path, damage: Any, message: str) -> None:
     ("change", "message"),
     [
         (lambda c: c.clear(), "'metadata'"),
-        (lambda c: c.update(frames="many"), "cannot read"),
-        (lambda c: c.update(frames=c["frames"][:1]), "1 sweeps"),
         (lambda c: c.update(frames=c["frames"] * 2), "must be different"),
-        (lambda c: c["metadata"].pop("vehicle_to_lidar_extrinsics"), "vehicle_to_lidar_extrinsics"),
-        (lambda c: c["metadata"]["sensors"].update(lidars=6), "cannot read"),
         (lambda c: c["frames"][1].update(timestamp_ns="noon"), "64-bit integers"),
-        (lambda c: c["frames"][1].pop("ego_pose"), "'ego_pose'"),
         (lambda c: c["frames"][1]["ego_pose"]["rotation"].update(w=3.0), "no rigid motion"),
-        (lambda c: c["frames"][1]["ego_pose"]["translation"].update(x=None), "no rigid motion"),
-        (lambda c: c["frames"][1].pop("point_cloud"), "'point_cloud'"),
         (lambda c: c["frames"][1]["point_cloud"]["left_lidar"].clear(), "no compensated cloud.*version 2"),
         (lambda c: c["frames"][1]["boxes"][0].update({"class": "tank"}), "unknown categories .*tank"),
         (lambda c: c["frames"][1]["boxes"][0].update(reference_frame="WORLD"), "VEHICLE, got 'WORLD'"),
-        (lambda c: c["frames"][1]["boxes"][0].pop("dimensions"), "'dimensions'"),
         (lambda c: c["frames"][1].update(boxes=[box("a", "car", 0.0)] * 2), "named twice"),
     ],
 )
@@ -210,13 +179,3 @@ def test_damaged_sequence(folder: Path, change: Any, message: str) -> None:
     with pytest.raises(CFlowError, match=message) as error:
         AevaScenesLog(folder).labels(0)
     assert "sequence.json" in str(error.value)
-
-
-def test_what_there_is_not(folder: Path, tmp_path: Path) -> None:
-    with pytest.raises(CFlowError, match="sequence.json is missing"):
-        AevaScenesLog(tmp_path)
-    for settings, message in (({"clouds": "skewed"}, "compensated, raw"), ({"lidars": ("roof",)}, "roof")):
-        with pytest.raises(CFlowError, match=message):
-            AevaScenesLog(folder, **settings)
-    with pytest.raises(CFlowError, match="0 ... 2"):
-        AevaScenesLog(folder).sweep(3)

@@ -16,7 +16,6 @@ from cflow_torch.data.av2 import AV2Log, find_av2_logs
 from cflow_torch.data.boxes import Boxes, flow_from_boxes
 from cflow_torch.data.ground import GroundRaster, read_ground_raster
 from cflow_torch.data.log import window
-from cflow_torch.data.rigid_motion import moved
 from cflow_torch.types import CFlowError
 
 TIMES = (100, 200, 300)
@@ -183,10 +182,8 @@ SWEEP, POSES, LABELS = "sensors/lidar/100.feather", "city_SE3_egovehicle.feather
     [
         (POSES, pose_columns((100, 300)), "no pose for sweep 200"),
         (POSES, {**pose_columns(), "qw": np.full(3, 0.9)}, "the pose of 100 is no rigid motion"),
-        (POSES, {**pose_columns(), "tx_m": ["a", "b", "c"]}, "must be floating point"),
         (POSES, {**pose_columns(), "timestamp_ns": np.array(TIMES, dtype=np.float64)}, "timestamp_ns must be integer"),
         (POSES, {key: value for key, value in pose_columns().items() if key != "qz"}, r"lacks the columns \['qz'\]"),
-        (SWEEP, {"x": [1, 2], "y": [1.0, 2.0], "z": [1.0, 2.0]}, "must be floating point"),
         (SWEEP, {"x": [1.0, None], "y": [1.0, 2.0], "z": [1.0, 2.0]}, "1 empty entries in x"),
         (LABELS, label_columns(rows=2), "2 rows but sweep 100 has 3 points"),
         (LABELS, label_columns(classes=np.array([0, 31, 0], dtype=np.uint8)), "classes are 0 ... 30"),
@@ -218,35 +215,11 @@ def test_truncated_and_missing_files_are_refused_when_they_are_read(folder: Path
     AV2Log(folder).sweep(0)
 
 
-def test_bad_annotations_are_refused(folder: Path) -> None:
-    for rows, message in (
-        ((box_columns(100, 10.0, category="SPACESHIP"), box_columns(200, 10.0)), "SPACESHIP"),
-        ((box_columns(100, 10.0), box_columns(100, 20.0), box_columns(200, 10.0)), r"named twice: \['a'\]"),
-        (({**box_columns(100, 10.0), "qw": 0.5}, box_columns(200, 10.0)), "pose of a is no rigid motion"),
-    ):
-        annotate(folder, *rows)
-        with pytest.raises(CFlowError, match=f"annotations.feather.*{message}"):
-            AV2Log(folder).labels(0)
-
-
 def turned(angle: float, x: float, y: float) -> np.ndarray:
     pose = np.eye(4)
     pose[:2, :2] = [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
     pose[:2, 3] = [x, y]
     return pose
-
-
-def test_box_flow_is_the_rigid_motion_of_the_box() -> None:
-    rng = np.random.default_rng(0)
-    pose0, pose1, T = turned(0.3, 8, -2), turned(0.5, 9, -1), turned(-0.02, -1, 0)
-    local = rng.uniform(-1, 1, (40, 3)) * [2.0, 1.0, 0.7]
-    points = moved(local, pose0)
-    one = {"track_id": ["a"], "category": np.array([19], np.uint8), "size": np.array([[4.0, 2.0, 1.5]])}
-    labels = flow_from_boxes(
-        np.concatenate([points, [[30.0, 0, 0]]]), Boxes(pose=pose0[None], **one), Boxes(pose=pose1[None], **one), T
-    )
-    np.testing.assert_allclose(labels.flow[:40], moved(local, pose1) - points, atol=1e-6)
-    np.testing.assert_allclose(labels.flow[40], T[:3, :3] @ [30, 0, 0] + T[:3, 3] - [30, 0, 0], atol=1e-6)
 
 
 def test_margin_overlap_and_end_of_track() -> None:
@@ -263,8 +236,6 @@ def test_margin_overlap_and_end_of_track() -> None:
     np.testing.assert_array_equal(labels.category, [17, 4, 0, 17])
     np.testing.assert_array_equal(labels.is_valid, [False, False, True, False])
     np.testing.assert_allclose(labels.flow[[0, 3], 0], 0.5, atol=1e-6)
-    tight = flow_from_boxes(points, boxes0, boxes1, np.eye(4), margin=(0, 0, 0))
-    np.testing.assert_array_equal(tight.category, [17, 0, 0, 17])
 
 
 def raster(heights: Sequence[Sequence[float]]) -> GroundRaster:
@@ -299,12 +270,6 @@ def test_map_of_a_log(folder: Path) -> None:
     sim2.write_text("{}")
     with pytest.raises(CFlowError, match="cannot read .*img_Sim2_city.json.*copy the map folder again"):
         AV2Log(folder)
-    sim2.write_text(json.dumps({"R": [1, 0, 0, 1], "t": [-990, 10], "s": 1.0}))
-    for content in (np.zeros(40), np.zeros((2, 2), dtype=object)):
-        np.save(maps / "x_ground_height_surface____PIT.npy", content)
-        with pytest.raises(CFlowError, match="ground_height_surface"):
-            AV2Log(folder)
-    whole = maps / "x_ground_height_surface____PIT.npy"
-    whole.write_bytes(whole.read_bytes()[:100])
-    with pytest.raises(CFlowError, match="cannot read .*ground_height_surface"):
+    np.save(maps / "x_ground_height_surface____PIT.npy", np.zeros(40))
+    with pytest.raises(CFlowError, match="ground_height_surface"):
         AV2Log(folder)

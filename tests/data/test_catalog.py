@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 from cflow_torch.cli.main import main
-from cflow_torch.data import catalog
 from cflow_torch.data.arrays import write_array_log
-from cflow_torch.data.catalog import DATA_SETS, find_sources, open_log
+from cflow_torch.data.catalog import find_sources, open_log
 from cflow_torch.data.found_ground import GroundFoundLog
 from cflow_torch.simulator import Drive, make_drive
 from cflow_torch.simulator.benchmark import FORMATS
@@ -60,14 +59,6 @@ def test_ground_is_found_where_there_is_no_mask(drive: Drive, arrays: Path) -> N
     assert np.array_equal(kept, drive.sweep(0).is_ground), "a mask that is there is kept"
 
 
-def test_a_log_is_looked_at_unless_told_otherwise(arrays: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (source,), calls = find_sources("arrays", arrays), []
-    monkeypatch.setattr(catalog, "check_log", calls.append)
-    open_log("arrays", source)
-    open_log("arrays", source, check=False)
-    assert len(calls) == 1
-
-
 @pytest.mark.parametrize(
     "name, settings, complaint",
     [
@@ -96,9 +87,3 @@ def test_logs_are_found_below_and_at_a_folder(name: str, log: str, tmp_path: Pat
     assert find_sources(name, tmp_path / "b") == [tmp_path / "b"]
     with pytest.raises(CFlowError, match="nowhere is no folder"):
         find_sources(name, tmp_path / "nowhere")
-
-
-def test_nothing_of_the_format_there(tmp_path: Path) -> None:
-    for name in DATA_SETS:
-        with pytest.raises(CFlowError, match=r"no |none|there is"):
-            find_sources(name, tmp_path)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,7 @@ import pytest
 
 from cflow_torch import CFlowError
 from cflow_torch.data.hdf5.reader import HDF5Log, find_hdf5_scenes
-from cflow_torch.data.hdf5.writer import write_hdf5_scene, write_index_files
+from cflow_torch.data.hdf5.writer import write_hdf5_scene
 from cflow_torch.data.log import window
 from cflow_torch.data.rigid_motion import moved
 from cflow_torch.simulator import make_drive
@@ -196,37 +195,3 @@ def test_argoverse_scenes_without_extrinsics_are_recognised(drive, tmp_path):
             assert np.array_equal(plain.sweep(0).pose, drive.poses[0].astype(np.float32))
     with pytest.raises(CFlowError, match="ego_T_lidar of"):
         HDF5Log(file, ego_T_lidar=np.ones((4, 4)))
-
-
-def test_index_files_are_what_the_harness_reads(tmp_path):
-    write_scene(tmp_path / "scene.h5")
-    write_index_files(tmp_path)
-    names = {name: pickle.loads((tmp_path / f"index_{name}.pkl").read_bytes()) for name in ("total", "flow", "eval")}
-    assert names["total"] == [["scene", str(stamp)] for stamp in STAMPS]
-    assert names["flow"] == names["eval"] == names["total"][:2]
-
-
-def test_what_cannot_be_written(drive, tmp_path):
-    class NoPose:
-        log_id, timestamps, labels = "bare", drive.timestamps, drive.labels
-
-        def sweep(self, index):
-            return type(drive.sweep(0))(drive.sweep(index).points)
-
-    for log, settings, complaint in (
-        (NoPose(), {}, "no pose"),
-        (NoPose(), {"points_frame": "sensor"}, "does not know its own"),
-        (drive, {"points_frame": "camera"}, "points_frame"),
-        (drive, {"pose_dtype": "float16"}, "pose_dtype"),
-    ):
-        with pytest.raises(CFlowError, match=complaint):
-            write_hdf5_scene(log, tmp_path / "a.h5", **settings)
-        assert not list(tmp_path.iterdir()), "nothing half-written"
-
-
-def test_the_real_scene(kitti_file):
-    with HDF5Log(kitti_file) as log:
-        assert len(log.timestamps) == 16 and log.labels(15) is None
-        sweep, labels = log.sweep(0), log.labels(0)
-        assert len(labels.flow) == len(sweep.points) == len(log.eval_mask(0))
-        assert 0.05 < (log.sweep(1).timestamp_ns - sweep.timestamp_ns) / 1e9 < 0.15

@@ -151,4 +151,3 @@ def test_mode_links_and_open_readers_survive(scene: Path, tmp_path: Path) -> Non
         np.testing.assert_array_equal(log.sweep(0).points, points)
     assert link.is_symlink() and scene.stat().st_mode & 0o777 == 0o640
     assert f"{STAMPS[0]}/cflow" in contents(scene)
-    assert write_hdf5_results(scene, "cflow", []) == 0

@@ -7,7 +7,6 @@ from importlib.util import find_spec
 
 import numpy as np
 import pytest
-import scenes
 
 from cflow_torch import CFlowError, Sweep
 from cflow_torch.data.odometry import PosedLog, poses_from_odometry, with_poses
@@ -51,8 +50,6 @@ def test_a_simulated_drive(drive):
     assert np.array_equal(poses, poses_from_odometry(NoPoses(drive))), "the same again"
     with pytest.raises(CFlowError, match="fewer than 100 points"):
         poses_from_odometry(NoPoses(drive, is_empty=True))
-    with pytest.raises(CFlowError, match="max_range"):
-        poses_from_odometry(NoPoses(drive), max_range=0)
 
 
 @needs_kiss_icp
@@ -73,14 +70,3 @@ def test_without_kiss_icp_the_message_says_what_to_do(drive, monkeypatch):
         with pytest.raises(CFlowError, match=r"pip install kiss-icp.*poses\.txt"):
             call(NoPoses(drive))
     assert with_poses(drive) is drive, "nothing is estimated where poses are known"
-
-
-def test_poses_are_put_on(drive):
-    poses = np.stack([scenes.pose(k, 0, 0) for k in range(8)])
-    log = PosedLog(drive, poses)
-    assert np.array_equal(log.sweep(3).pose, poses[3]) and np.array_equal(log.sweep(3).points, drive.sweep(3).points)
-    assert np.array_equal(log.labels(3).flow, drive.labels(3).flow) and list(log.timestamps) == list(drive.timestamps)
-    assert np.array_equal(log.poses, poses) and log.scene is drive.scene, "everything else is the log's"
-    for wrong, complaint in ((poses[:7], "7 poses for 8"), (2 * poses, "rigid")):
-        with pytest.raises(CFlowError, match=complaint):
-            PosedLog(drive, wrong)

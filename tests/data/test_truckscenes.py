@@ -137,7 +137,6 @@ def test_bad_sweeps(recording, tiny):
             log.sweep(0)
     for change, complaint in [
         ({"timestamp": None}, r"lacks the fields \['timestamp'\]"),
-        ({name: values[:0] for name, values in fields.items()}, "holds no points"),
         ({"timestamp": fields["timestamp"] - fields["timestamp"].min()}, "microseconds since 1970.* deskew=False"),
         ({"timestamp": fields["timestamp"] * np.uint64(1000)}, "microseconds since 1970.* deskew=False"),
     ]:
@@ -145,9 +144,6 @@ def test_bad_sweeps(recording, tiny):
         with pytest.raises(CFlowError, match=f"{file.name}.*{complaint}"):
             log.sweep(0)
     assert len(log.sweep(1).points) > 0
-    file.unlink()
-    with pytest.raises(CFlowError, match=f"{file.name} is missing; copy"):
-        log.sweep(0)
 
 
 def test_the_other_data_set_is_refused_or_passed_over(tiny, tmp_path):

@@ -1,31 +1,18 @@
-"""data=benchmark: drives that are made once, kept under a digest of their generator, and not those of tuning."""
+"""data=benchmark: drives that are made once, and kept under a digest of their generator."""
 
 from __future__ import annotations
 
 import shutil
 from pathlib import Path
 
-import cflow_torch.configs
 import numpy as np
 import pytest
-from omegaconf import OmegaConf
 
 from cflow_torch import CFlowError
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.log import window
 from cflow_torch.simulator import benchmark, make_drive
 from cflow_torch.simulator.benchmark import benchmark_logs
-
-TUNING_SEEDS = {*range(100, 104), *range(200, 210), *range(400, 410)}
-
-
-def test_it_is_large_enough_and_apart_from_tuning_data() -> None:
-    folder = Path(cflow_torch.configs.__path__[0]) / "data"
-    full = OmegaConf.load(folder / "benchmark.yaml")
-    small = OmegaConf.merge(full, OmegaConf.load(folder / "benchmark_small.yaml"))
-    counts = [len(range(data.first, data.num_sweeps - 1, data.step)) * data.num_drives for data in (full, small)]
-    assert counts[0] >= 200 and 15 <= counts[1] <= 30 and full.first >= 9, "every window has nine older sweeps"
-    assert not TUNING_SEEDS & set(range(full.first_seed, full.first_seed + full.num_drives))
 
 
 def test_a_drive_is_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -142,13 +142,6 @@ def test_radial_velocity_is_the_derivative_of_the_range(name, drives):
         assert velocity[row] == pytest.approx((after - before) / 2e-3, abs=0.02)
 
 
-def test_aeva_velocities_are_noisy_and_the_same_again(drives):
-    drive = drives["aevascenes"]
-    one, again = (np.concatenate([unit.radial_velocity for unit in drive.units(0)]) for _ in range(2))
-    still = one[drive.returns(0).solid.numpy() < 0]
-    assert still.std() == pytest.approx(0.1, rel=0.05) and abs(still.mean()) < 0.005 and np.array_equal(one, again)
-
-
 def test_the_truck_does_not_see_itself_and_its_trailer_hides_things(drives):
     drive = drives["truckscenes"]
     returns, points = drive.returns(0), drive.sweep(0).points

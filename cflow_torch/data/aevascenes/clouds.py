@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any, List, Optional
 
 import numpy as np
+from numpy.lib import format as npy
 
 from cflow_torch.data.file_errors import file_errors
-from cflow_torch.data.npy_file import read_header
 from cflow_torch.data.paths import whole
 from cflow_torch.data.pickles import NUMPY_ARRAYS, StandIn, load_plain
 from cflow_torch.types import CFlowError
@@ -61,7 +61,8 @@ class Cloud:
             return None
         with file_errors(f"{self.file}: {key}", _MEND):
             with self._arrays.zip.open(f"{key}.npy") as member:
-                shape, dtype = read_header(member)
+                is_first = npy.read_magic(member) == (1, 0)
+                shape, _, dtype = (npy.read_array_header_1_0 if is_first else npy.read_array_header_2_0)(member)
                 stored = load_plain(member, NUMPY_ARRAYS) if dtype.hasobject else self._arrays[key]
             texts = _elements(stored) if isinstance(stored, StandIn) else np.ravel(stored).tolist()
             if {type(text) for text in texts} - {str} or len(texts) != math.prod(shape):

@@ -113,7 +113,6 @@ def _read_numpy(path: Path) -> np.ndarray:
             named = [name for name in arrays.files if name in _CLOUD_KEYS]
             found = [arrays[name] for name in named or arrays.files]
             tables = [array for array in found if array.ndim == 2 and array.shape[1] >= 3]
-            tables = tables or [array for array in found if array.dtype.names is not None]
             if len(tables) != 1:
                 has = ", ".join(arrays.files)[:200]
                 raise CFlowError(f"{path} holds {has}; give x, y, z, or one (N, 3+) array, or name it {_CLOUD_KEYS[0]}")

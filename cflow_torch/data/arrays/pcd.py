@@ -12,8 +12,6 @@ from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.paths import Place, as_path, read_bytes
 from cflow_torch.types import CFlowError
 
-_DATA = ("ascii", "binary", "binary_compressed")
-
 
 def read_pcd(path: Place) -> Dict[str, np.ndarray]:
     """The fields of a cloud.
@@ -48,33 +46,21 @@ def pcd_fields(content: bytes, path: Place) -> Dict[str, np.ndarray]:
     return {name: np.ascontiguousarray(table[name]) for name in names}
 
 
-def write_pcd(path: Place, fields: Mapping[str, np.ndarray], data: str = "binary") -> None:
-    """Write a cloud, atomically.
+def write_pcd(path: Place, fields: Mapping[str, np.ndarray]) -> None:
+    """Write a binary cloud, atomically.
 
     Args:
         path: file name.
-        fields: field name -> (N,) array of float32, float64 or integers.
-        data: "binary", "binary_compressed" or "ascii" (floats with 10 decimals).
+        fields: field name without spaces -> (N,) array of float32, float64 or integers, all of one length.
 
     Raises:
-        CFlowError: pypcd4 is missing; no fields, names with spaces, arrays of different lengths, other dtypes, unknown
-            `data`.
+        CFlowError: pypcd4 is missing.
     """
     pypcd4 = _pypcd4()
-    if data not in _DATA:
-        raise CFlowError(f"data={data!r}: PCD data are {', '.join(_DATA)}")
-    shapes = {values.shape for values in fields.values()}
-    if len(shapes) != 1 or len(next(iter(shapes))) != 1 or any(len(name.split()) != 1 for name in fields):
-        raise CFlowError(
-            f"fields {list(fields)} have shapes {shapes}: give names without spaces and (N,) of one length"
-        )
-    try:
-        kinds = [values.dtype for values in fields.values()]
-        cloud = pypcd4.PointCloud.from_points(list(fields.values()), list(fields), kinds)
-    except KeyError as error:
-        raise CFlowError(f"a field has dtype {error}: PCD stores float32, float64 and integers") from error
+    kinds = [values.dtype for values in fields.values()]
+    cloud = pypcd4.PointCloud.from_points(list(fields.values()), list(fields), kinds)
     with atomic_file(path) as file:
-        cloud.save(file, pypcd4.Encoding(data))
+        cloud.save(file, pypcd4.Encoding.BINARY)
 
 
 def _pypcd4() -> Any:

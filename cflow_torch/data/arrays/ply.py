@@ -17,7 +17,6 @@ import numpy as np
 from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.paths import Place, as_path, read_bytes
-from cflow_torch.types import CFlowError
 
 _CODES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
 _NAMES = dict(zip(_CODES, ("char", "uchar", "short", "ushort", "int", "uint", "float", "double")))
@@ -73,20 +72,12 @@ def write_ply(path: Place, fields: Mapping[str, np.ndarray]) -> None:
 
     Args:
         path: file name.
-        fields: property name -> (N,) float32, float64 or integers of up to 32 bits.
-
-    Raises:
-        CFlowError: arrays of different lengths or other dtypes.
+        fields: property name -> (N,) float32, float64 or integers of up to 32 bits, all of one length.
     """
-    try:
-        kinds = {name: values.dtype.str[1:] for name, values in fields.items()}
-        properties = "".join(f"property {_NAMES[kind]} {name}\n" for name, kind in kinds.items())
-        little = np.dtype([(name, "<" + kind) for name, kind in kinds.items()])
-        table = np.rec.fromarrays(list(fields.values()), dtype=little)
-    except (ValueError, KeyError, IndexError) as error:
-        raise CFlowError(
-            f"cannot write {path} ({error}): give (N,) float32, float64 or integers of up to 32 bits"
-        ) from error
+    kinds = {name: values.dtype.str[1:] for name, values in fields.items()}
+    properties = "".join(f"property {_NAMES[kind]} {name}\n" for name, kind in kinds.items())
+    little = np.dtype([(name, "<" + kind) for name, kind in kinds.items()])
+    table = np.rec.fromarrays(list(fields.values()), dtype=little)
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(table)}\n{properties}end_header\n"
     with atomic_file(path) as file:
         file.write(header.encode("ascii") + table.tobytes())

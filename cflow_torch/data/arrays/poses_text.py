@@ -10,12 +10,10 @@ from typing import Optional, Sequence, Tuple
 
 import numpy as np
 
-from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.npy_file import read_npy
 from cflow_torch.data.paths import Place, as_path, read_bytes
-from cflow_torch.data.rigid_motion import between, poses_from_quaternions
-from cflow_torch.data.rotations import to_quaternions
+from cflow_torch.data.rigid_motion import between, poses_from_quaternions, to_quaternions
 from cflow_torch.types import CFlowError
 from cflow_torch.windows.ego_motion import rigid_transform
 
@@ -58,10 +56,7 @@ def read_poses(path: Place) -> Trajectory:
         words, values = _read_table(path)
         layout = {8: "tum", 12: "kitti", 16: "matrix"}.get(values.shape[1], "")
         if not layout:
-            raise CFlowError(
-                f"{path} has {values.shape[1]} numbers a line; poses have 12 (KITTI), 8 (TUM: t x y z qx qy qz qw) or "
-                "16 (4 x 4)"
-            )
+            raise CFlowError(f"{path} has {values.shape[1]} numbers a line; poses have 12 (KITTI), 8 (TUM) or 16")
         if layout == "tum":
             times_ns = _nanoseconds(path, words[:, 0])
             matrices = poses_from_quaternions(
@@ -116,8 +111,7 @@ def read_times(path: Place) -> np.ndarray:
 
 def write_kitti_poses(path: Place, poses: np.ndarray) -> None:
     """Write (K, 4, 4) poses as 12 numbers a line, with 17 digits."""
-    with atomic_file(path) as file:
-        np.savetxt(file, np.asarray(poses)[:, :3].reshape(-1, 12), "%.17g")
+    np.savetxt(path, np.asarray(poses)[:, :3].reshape(-1, 12), "%.17g")
 
 
 def write_tum_poses(path: Place, times_ns: Sequence[int], poses: np.ndarray) -> None:
@@ -125,14 +119,12 @@ def write_tum_poses(path: Place, times_ns: Sequence[int], poses: np.ndarray) -> 
     poses = np.asarray(poses, np.float64)
     numbers = np.concatenate([poses[:, :3, 3], to_quaternions(poses[:, :3, :3])[:, [1, 2, 3, 0]]], axis=1)
     lines = [" ".join([_seconds(time), *(f"{v:.17g}" for v in row)]) for time, row in zip(times_ns, numbers)]
-    with atomic_file(path) as file:
-        np.savetxt(file, lines, "%s")
+    np.savetxt(path, lines, "%s")
 
 
 def write_times(path: Place, times_ns: Sequence[int]) -> None:
     """Write nanoseconds as one time in seconds a line, with 9 decimals."""
-    with atomic_file(path) as file:
-        np.savetxt(file, [_seconds(time) for time in times_ns], "%s")
+    np.savetxt(path, [_seconds(time) for time in times_ns], "%s")
 
 
 def poses_at(trajectory: Trajectory, times_ns: Sequence[int], source: str) -> np.ndarray:
@@ -149,9 +141,7 @@ def poses_at(trajectory: Trajectory, times_ns: Sequence[int], source: str) -> np
     Raises:
         CFlowError: a time before the first or after the last pose, or in a gap of more than half a second.
     """
-    if trajectory.times_ns is None:
-        raise CFlowError(f"{source} has no times, so its poses cannot be interpolated")
-    known, wanted = trajectory.times_ns, np.asarray(times_ns, np.int64)
+    known, wanted = np.asarray(trajectory.times_ns), np.asarray(times_ns, np.int64)
     after = np.searchsorted(known, wanted).clip(0, len(known) - 1)  # the first pose that is not before
     before = np.where(known[after] == wanted, after, after - 1).clip(0)
     gap = known[after] - known[before]

@@ -48,15 +48,9 @@ def find_array_logs(root: Place) -> List[Path]:
     Raises:
         CFlowError: `root` is no folder.
     """
-
     what = "a folder with one point cloud per file, or a folder of such"
-    return find_folders(
-        as_path(root),
-        lambda folder: bool(_clouds(folder)[1]),
-        SEARCH_DEPTH,
-        what,
-        lambda child: child.name != GROUND_FOLDER,
-    )
+    is_log, is_passed = (lambda folder: bool(_clouds(folder)[1])), (lambda child: child.name != GROUND_FOLDER)
+    return find_folders(as_path(root), is_log, SEARCH_DEPTH, what, is_passed)
 
 
 class ArraysLog(NumberedSweeps):
@@ -107,8 +101,6 @@ class ArraysLog(NumberedSweeps):
         bin_columns: int = KITTI_COLUMNS,
     ) -> None:
         self.folder = as_path(folder)
-        if not self.folder.is_dir():
-            raise CFlowError(f"{self.folder} is no folder; give a folder with one point cloud per file")
         if poses_of not in ("ego", "lidar"):
             raise CFlowError(f"poses_of={poses_of!r}: give 'ego' or 'lidar'")
         if type(bin_columns) is not int or bin_columns < 3:
@@ -229,9 +221,7 @@ def _one_suffix(folder: Path, suffix: Optional[str]) -> List[Path]:
             f"{', '.join(POINT_FOLDERS)}; scene flow needs two or more"
         )
     if len(kinds) > 1:
-        raise CFlowError(
-            f"{place} has clouds of several kinds ({', '.join(sorted(kinds))}): choose one with suffix=..."
-        )
+        raise CFlowError(f"{place} has several kinds of clouds, {', '.join(sorted(kinds))}: choose one with suffix=...")
     return sorted(next(iter(kinds.values())), key=lambda path: natural_key(path.stem))
 
 

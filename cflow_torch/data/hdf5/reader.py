@@ -69,18 +69,14 @@ class HDF5Log(NumberedSweeps):
         self._scene = open_scene(self.file)
         # HDF5 itself closes after the interpreter has gone, which a file read through Python does not survive.
         weakref.finalize(self, self._scene.close)
-        try:
-            with scene_errors(self.file):
-                self.timestamps = sorted(int(name) for name in self._scene if is_stamp(name))
-            self._check_count(self.file)
-            if isinstance(ego_T_lidar, str) and ego_T_lidar == "auto":
-                ego_T_lidar = self._stated_extrinsics()
-            elif ego_T_lidar is None:
-                ego_T_lidar = np.eye(4)
-            self.ego_T_lidar = rigid_transform(ego_T_lidar, f"ego_T_lidar of {self.file}")
-        except BaseException:
-            self._scene.close()
-            raise
+        with scene_errors(self.file):
+            self.timestamps = sorted(int(name) for name in self._scene if is_stamp(name))
+        self._check_count(self.file)
+        if isinstance(ego_T_lidar, str) and ego_T_lidar == "auto":
+            ego_T_lidar = self._stated_extrinsics()
+        elif ego_T_lidar is None:
+            ego_T_lidar = np.eye(4)
+        self.ego_T_lidar = rigid_transform(ego_T_lidar, f"ego_T_lidar of {self.file}")
 
     def __enter__(self) -> HDF5Log:
         return self
@@ -184,9 +180,7 @@ class HDF5Log(NumberedSweeps):
         stored = self._array(index, "lidar")
         shape: Tuple[int, ...] = () if stored is None else stored.shape
         if len(shape) != 2 or shape[1] < 3:
-            raise CFlowError(
-                f"{self.file}: lidar of sweep {self.timestamps[index]} has shape {shape}, expected (N, 3+)"
-            )
+            raise CFlowError(f"{self.file}: lidar of sweep {self.timestamps[index]} has shape {shape}, not (N, 3+)")
         return int(shape[0])
 
     def _values(

@@ -107,8 +107,7 @@ def _sweep(
         raise CFlowError(f"sweep {index} of log {log.log_id} has no pose, which the layout needs")
     ego_points = np.asarray(sweep.points)[:, :3]
     inverse = np.linalg.inv(extrinsics)
-    in_ego = np.array_equal(extrinsics, np.eye(4))
-    points = ego_points if in_ego else moved(ego_points, inverse)
+    points = moved(ego_points, inverse)
     pose = np.asarray(sweep.pose, np.float64)
     values: Dict[str, np.ndarray] = {"lidar": points.astype(np.float32), "pose": pose.astype(pose_dtype)}
     if sweep.is_ground is not None:
@@ -117,8 +116,7 @@ def _sweep(
         following = np.asarray(log.sweep(index + 1).pose, np.float64)
         values["ego_motion"] = (np.linalg.inv(following) @ pose).astype(np.float32)
     if labels is not None:
-        flow = labels.flow if in_ego else labels.flow.astype(np.float64) @ inverse[:3, :3].T
-        values["flow"] = flow.astype(np.float32)
+        values["flow"] = (labels.flow.astype(np.float64) @ inverse[:3, :3].T).astype(np.float32)
         values["flow_is_valid"] = labels.is_valid
         values["flow_category_indices"] = labels.category.astype(np.uint8)
         if eval_step and index % eval_step == 0:

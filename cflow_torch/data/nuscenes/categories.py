@@ -1,4 +1,4 @@
-"""What nuScenes and TruckScenes call things, in the names of Argoverse 2, and back."""
+"""What nuScenes and TruckScenes call things, in the names of Argoverse 2."""
 
 from __future__ import annotations
 
@@ -42,22 +42,3 @@ TRUCKSCENES_CATEGORIES: Dict[str, str] = {
     OWN_TRAILER: "NONE",
 }
 """Category of a box -> name in Argoverse 2, as for nuScenes."""
-
-NUSCENES_NAMES: Dict[str, str] = {
-    **{name: own for own, name in reversed(NUSCENES_CATEGORIES.items()) if name != "NONE"},
-    **dict.fromkeys(("BICYCLIST", "WHEELED_DEVICE", "WHEELED_RIDER"), "vehicle.bicycle"),
-    **dict.fromkeys(("BOX_TRUCK", "TRUCK_CAB"), "vehicle.truck"),
-    "CONSTRUCTION_BARREL": "movable_object.trafficcone",
-    "DOG": "animal",
-    "MOTORCYCLIST": "vehicle.motorcycle",
-    "OFFICIAL_SIGNALER": "human.pedestrian.police_officer",
-    "SCHOOL_BUS": "vehicle.bus.rigid",
-}
-"""Argoverse 2 name of a box -> the nearest category of nuScenes, of the same meta class."""
-
-TRUCKSCENES_NAMES: Dict[str, str] = {
-    **NUSCENES_NAMES,
-    "SIGN": "static_object.traffic_sign",
-    "STOP_SIGN": "static_object.traffic_sign",
-}
-"""Argoverse 2 name of a box -> the nearest category of TruckScenes."""

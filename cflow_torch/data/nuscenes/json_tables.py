@@ -47,10 +47,7 @@ def read_table(folder: Path, table: str, key: str = "", values: Collection[str] 
     def use(row: Row) -> Optional[Row]:  # called for each row as it is parsed, so that the rest is never held
         missing = [name for name in names if name not in row]
         if missing:
-            raise CFlowError(
-                f"{file}: a row lacks {missing}; it has {shown(sorted(row))}. Put the table {table} of the data set "
-                "there"
-            )
+            raise CFlowError(f"{file}: a row lacks {missing}; it has {shown(sorted(row))}. Copy the table again")
         return {name: row[name] for name in names} if not key or row[key] in values else None
 
     with file_errors(file, "copy all tables of the version"):

@@ -76,9 +76,9 @@ class NuScenesLog(NumberedSweeps):
     ) -> None:
         if sweep_step < 1:
             raise CFlowError(f"sweep_step={sweep_step}: it is 1 for all sweeps, 2 for every second one")
-        self.log_id, self._root, self._own_vehicle = source.scene, as_path(source.root), own_vehicle
+        self.log_id, self._root, self._own_vehicle = source.name, as_path(source.root), own_vehicle
         folder = self._root / source.version
-        sample_times, known, annotations = (source.tables or Tables(folder)).scene(source.scene)
+        sample_times, known, annotations = (source.tables or Tables(folder)).scene(source.name)
         with file_errors(folder / "category.json"):
             category_indices(annotations.category, self._categories)
         missing = [] if lidars is None else [name for name in lidars if name not in known]
@@ -213,8 +213,7 @@ def pcd_bin_points(content: bytes, file: Place) -> np.ndarray:
     """
     if not content or len(content) % (_COLUMNS * _ROW.itemsize):
         raise CFlowError(
-            f"{file} has {len(content)} bytes, which is no whole number of rows of five float32 (x, y, z, intensity, "
-            "ring): it is truncated or another format; copy it again"
+            f"{file} has {len(content)} bytes, no whole number of rows of five float32: it is truncated; copy it again"
         )
     rows = np.frombuffer(content, dtype=_ROW).reshape(-1, _COLUMNS)
     ring = rows[:, 4]
@@ -225,10 +224,6 @@ def pcd_bin_points(content: bytes, file: Place) -> np.ndarray:
 
 def _is_kept(is_key_frame: np.ndarray, step: int) -> np.ndarray:
     """(M,) bool: key frames, and every `step`-th sweep counted from the last one."""
-    kept = np.zeros(len(is_key_frame), dtype=bool)
-    since = 0
-    for row, is_key in enumerate(is_key_frame):
-        since = 0 if is_key else since
-        kept[row] = since % step == 0
-        since += 1
-    return kept
+    row = np.arange(len(is_key_frame))
+    last_key = np.maximum.accumulate(np.where(is_key_frame, row, 0))
+    return (row - last_key) % step == 0

@@ -31,19 +31,14 @@ class SceneSource:
     Args:
         root: data root, which `sample_data.filename` is relative to.
         version: folder of the tables, for example "v1.0-mini".
-        scene: name of the scene.
+        name: of the scene.
         tables: the tables of that version, shared by its scenes so that they are read once; None = read them anew.
     """
 
     root: Path
     version: str
-    scene: str
+    name: str
     tables: Optional[Tables] = field(default=None, repr=False, compare=False)
-
-    @property
-    def name(self) -> str:
-        """Name of the scene."""
-        return self.scene
 
 
 @dataclass(frozen=True)
@@ -111,15 +106,7 @@ def find_scenes(root: Place, foreign: Collection[str], data_set: str) -> List[Sc
 
 
 class _ByToken(Dict[str, Row]):
-    """Rows of a table by their token.
-
-    Args:
-        folder: of the version.
-        table: name in `FIELDS`.
-
-    Raises:
-        CFlowError: the table cannot be read; later, a token is looked up that it does not have.
-    """
+    """Rows of a table by their token; looking up one that it does not have is an error."""
 
     def __init__(self, folder: Path, table: str, key: str = "", values: Collection[str] = ()) -> None:
         super().__init__((row["token"], row) for row in read_table(folder, table, key, values))

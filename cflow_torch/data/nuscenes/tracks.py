@@ -33,8 +33,7 @@ class Tracks:
             boxes = self._rows[int(sample)]
             if annotations.track[row] in boxes:
                 raise CFlowError(
-                    f"sample_annotation.json has instance {annotations.track[row]} twice in one sample; an object has "
-                    "one box per sample, copy the tables again"
+                    f"sample_annotation.json has instance {annotations.track[row]} twice in one sample; copy it again"
                 )
             boxes[annotations.track[row]] = row
 

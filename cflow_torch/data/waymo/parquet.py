@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any, Collection, Dict, List, Optional, Sequence, Tuple
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.parquet as pq
 
 from cflow_torch.data.arrow_file import check_columns
@@ -25,59 +24,6 @@ LIDAR, PIXEL_POSE = "[LiDARComponent].range_image_return", "[LiDARPoseComponent]
 CALIBRATION, BOX = "[LiDARCalibrationComponent].", "[LiDARBoxComponent]."
 VEHICLE_POSE = "[VehiclePoseComponent].world_from_vehicle.transform"
 """Beginnings of the columns that are read, and one whole name."""
-
-STATS = "[StatsComponent]."
-_IMAGE, _SHAPE, _TRANSFORM = pa.list_(pa.float32()), pa.list_(pa.int32(), 3), pa.list_(pa.float64(), 16)
-_FRAME_KEYS: List[Tuple[str, Any]] = [(SEGMENT, pa.string()), (TIME, pa.int64())]
-SCHEMAS: Dict[str, pa.Schema] = {
-    "lidar": pa.schema(
-        [
-            *_FRAME_KEYS,
-            (LASER, pa.int8()),
-            *((f"{LIDAR}{k}.{part}", kind) for k in (1, 2) for part, kind in (("values", _IMAGE), ("shape", _SHAPE))),
-        ]
-    ),
-    "lidar_calibration": pa.schema(
-        [
-            (SEGMENT, pa.string()),
-            (LASER, pa.int8()),
-            (f"{CALIBRATION}extrinsic.transform", _TRANSFORM),
-            (f"{CALIBRATION}beam_inclination.min", pa.float64()),
-            (f"{CALIBRATION}beam_inclination.max", pa.float64()),
-            (f"{CALIBRATION}beam_inclination.values", pa.list_(pa.float64())),
-        ]
-    ),
-    "lidar_pose": pa.schema(
-        [*_FRAME_KEYS, (LASER, pa.int8()), (f"{PIXEL_POSE}.values", _IMAGE), (f"{PIXEL_POSE}.shape", _SHAPE)]
-    ),
-    "vehicle_pose": pa.schema([*_FRAME_KEYS, (VEHICLE_POSE, _TRANSFORM)]),
-    "lidar_box": pa.schema(
-        [
-            *_FRAME_KEYS,
-            (TRACK, pa.string()),
-            *((f"{BOX}box.{part}.{axis}", pa.float64()) for part in ("center", "size") for axis in "xyz"),
-            (f"{BOX}box.heading", pa.float64()),
-            (f"{BOX}type", pa.int8()),
-            (f"{BOX}num_lidar_points_in_box", pa.int64()),
-            (f"{BOX}num_top_lidar_points_in_box", pa.int64()),
-            *((f"{BOX}{part}.{axis}", pa.float64()) for part in ("speed", "acceleration") for axis in "xyz"),
-            (f"{BOX}difficulty_level.detection", pa.int8()),
-            (f"{BOX}difficulty_level.tracking", pa.int8()),
-        ]
-    ),
-    "stats": pa.schema(
-        [
-            *_FRAME_KEYS,
-            *((STATS + name, pa.string()) for name in ("time_of_day", "location", "weather")),
-            *(
-                (f"{STATS}{sensor}_object_counts.{part}", pa.list_(kind))
-                for sensor in ("lidar", "camera")
-                for part, kind in (("types", pa.int8()), ("counts", pa.int32()))
-            ),
-        ]
-    ),
-}
-"""Component -> its columns, as the official classes print them."""
 
 _MOST = 1 << 53  # of a time in microseconds, which becomes nanoseconds in an int64
 _BATCH = 8  # rows of range images held at once while looking for one
@@ -113,8 +59,7 @@ class Component:
         strangers = sorted({str(row[SEGMENT]) for row in rows} - {self.file.stem})
         if strangers:
             raise CFlowError(
-                f"{self.file} holds segment {shortened(strangers[0])}; a file is named after its segment: rename it, "
-                f"or copy it again"
+                f"{self.file} holds segment {shortened(strangers[0])}, which is not its name; copy it again"
             )
         for name in {TIME, LASER} & set(columns):
             wrong = [row[name] for row in rows if not is_whole(row[name], _MOST)]

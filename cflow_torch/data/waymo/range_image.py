@@ -105,11 +105,9 @@ def range_image_points(
     Raises:
         CFlowError: shapes that do not fit, or a frame pose that is missing or not rigid.
     """
-    if image.ndim != 3 or image.shape[2] <= NO_LABEL_ZONE:
+    if image.ndim != 3 or image.shape[2] <= NO_LABEL_ZONE or not image.size:
         raise CFlowError(f"a range image has shape (H, W, 4), got {image.shape}")
     num_rows, num_columns = image.shape[:2]
-    if not image.size:
-        raise CFlowError(f"a range image of shape {image.shape} has no pixels; is the file damaged? Copy it again")
     pixels = np.flatnonzero(image[..., RANGE] > 0)
     row, column = np.divmod(pixels, num_columns)
     azimuth, inclination = calibration.column_azimuths(num_columns), calibration.row_inclinations(num_rows)

@@ -177,9 +177,7 @@ class WaymoLog(NumberedSweeps):
         stored = {row[TIME]: row[VEHICLE_POSE] for row in component.rows((TIME, VEHICLE_POSE))}
         missing = [time for time in times if time not in stored]
         if missing:
-            raise CFlowError(
-                f"{component.file} has no pose for frame {missing[0]} ({len(missing)} missing); copy it again"
-            )
+            raise CFlowError(f"{component.file} has no pose for frame {missing[0]}; copy it again")
         return {time: matrix_of(stored[time], f"{component.file}: the pose of frame {time}") for time in times}
 
     def _read_boxes(self) -> Dict[int, Boxes]:

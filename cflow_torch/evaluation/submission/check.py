@@ -8,7 +8,7 @@ from typing import Any, Callable, List, Mapping, Sequence, Union
 
 import numpy as np
 
-from cflow_torch.data.feather_file import FeatherFile
+from cflow_torch.data.arrow_file import FeatherFile
 from cflow_torch.data.json_file import parse_json
 from cflow_torch.evaluation.submission.archive import open_archive
 from cflow_torch.evaluation.submission.plan import Frame

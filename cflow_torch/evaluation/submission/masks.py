@@ -9,7 +9,7 @@ from typing import Dict, List, Optional, Union
 import numpy as np
 import pyarrow as pa
 
-from cflow_torch.data.feather_file import FeatherFile
+from cflow_torch.data.arrow_file import FeatherFile
 from cflow_torch.data.log import Log
 from cflow_torch.data.zips import member_names, open_zip, read_member
 from cflow_torch.types import CFlowError, Sweep, as_numpy

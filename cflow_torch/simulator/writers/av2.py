@@ -13,7 +13,7 @@ from pyarrow import feather
 
 from cflow_torch.data.atomic import atomic_folder
 from cflow_torch.data.names import safe_name
-from cflow_torch.data.rotations import to_quaternions
+from cflow_torch.data.rigid_motion import to_quaternions
 from cflow_torch.simulator.recording import Boxes, GroundRaster, Recording
 from cflow_torch.types import CFlowError
 

@@ -12,8 +12,8 @@ from typing import Any, Dict, List, Mapping, Sequence, Union
 import numpy as np
 
 from cflow_torch.data.names import safe_name
-from cflow_torch.data.nuscenes.categories import NUSCENES_NAMES
-from cflow_torch.data.rotations import to_quaternions
+from cflow_torch.data.nuscenes.categories import NUSCENES_CATEGORIES
+from cflow_torch.data.rigid_motion import to_quaternions
 from cflow_torch.simulator.recording import Recording, UnitReturns
 from cflow_torch.simulator.writers.av2 import new_folder
 from cflow_torch.types import CFlowError
@@ -22,6 +22,17 @@ from cflow_torch.types import CFlowError
 _BLACK_PIXEL = "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAAAAAA6fptVAAAACklEQVR4nGNgAAAAAgABSK+kcQAAAABJRU5ErkJggg=="
 _VISIBILITY = ("v0-40", "v40-60", "v60-80", "v80-100")
 Table = List[Dict[str, Any]]
+NUSCENES_NAMES: Dict[str, str] = {
+    **{name: own for own, name in reversed(NUSCENES_CATEGORIES.items()) if name != "NONE"},
+    **dict.fromkeys(("BICYCLIST", "WHEELED_DEVICE", "WHEELED_RIDER"), "vehicle.bicycle"),
+    **dict.fromkeys(("BOX_TRUCK", "TRUCK_CAB"), "vehicle.truck"),
+    "CONSTRUCTION_BARREL": "movable_object.trafficcone",
+    "DOG": "animal",
+    "MOTORCYCLIST": "vehicle.motorcycle",
+    "OFFICIAL_SIGNALER": "human.pedestrian.police_officer",
+    "SCHOOL_BUS": "vehicle.bus.rigid",
+}
+"""Argoverse 2 name of a box -> the nearest category of nuScenes, of the same meta class."""
 
 
 def write_nuscenes(

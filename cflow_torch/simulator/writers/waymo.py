@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import tempfile
 from contextlib import ExitStack
 from functools import partial
@@ -17,20 +16,11 @@ import pyarrow.parquet as pq
 from cflow_torch.data.atomic import sync_folder
 from cflow_torch.data.categories import META_CLASSES
 from cflow_torch.data.names import safe_name
-from cflow_torch.data.waymo.parquet import (
-    BOX,
-    LASER,
-    LIDAR,
-    PIXEL_POSE,
-    SCHEMAS,
-    SEGMENT,
-    TIME,
-    TRACK,
-    VEHICLE_POSE,
-)
+from cflow_torch.data.waymo.parquet import BOX, LASER, LIDAR, PIXEL_POSE, SEGMENT, TIME, TRACK, VEHICLE_POSE
 from cflow_torch.data.waymo.range_image import LASERS, TOP, LaserCalibration
 from cflow_torch.simulator.recording import Recording, UnitReturns
 from cflow_torch.simulator.writers.waymo_encoding import encode_images, poses_of_shots, true_poses_of_shots
+from cflow_torch.simulator.writers.waymo_schemas import SCHEMAS
 from cflow_torch.types import CFlowError
 
 BOX_TYPE: Dict[str, int] = {
@@ -45,13 +35,7 @@ del BOX_TYPE["RAILED_VEHICLE"]
 _XYZ = ("x", "y", "z")
 
 
-def write_waymo_segment(
-    log: Recording,
-    root: Union[str, Path],
-    overwrite: bool = False,
-    max_shift: float = 0.005,
-    is_rolling: bool = True,
-) -> Path:
+def write_waymo_segment(log: Recording, root: Union[str, Path], overwrite: bool = False) -> Path:
     """Writes `log` to `root/<component>/<log_id>.parquet`, one row group per frame.
 
     Args:
@@ -59,9 +43,6 @@ def write_waymo_segment(
             FRONT, ... in their order.
         root: folder of the split, made if absent.
         overwrite: replace a segment of that name.
-        max_shift: metres. A return is stored as a range in the direction of its pixel; one that this moves further is
-            refused. TOP's pixels have poses that make up for it.
-        is_rolling: the vehicle moves while TOP turns (its points are compensated for that); False = it stands still.
 
     Returns:
         The file of the component `lidar`, which `WaymoLog` takes.
@@ -72,7 +53,7 @@ def write_waymo_segment(
           point lies exactly where the recording has it. What is left is the rounding of those
           poses and of ranges to float32: 5e-5 m up to 1 km from the world's origin.
         - The others: range images of the vehicle at the pose of the frame, without poses of pixels. Returns whose rays
-          are those of the pixels come back to float32, 5e-6 m at 75 m; others are moved onto the ray.
+          are those of the pixels come back to float32, 5e-6 m at 75 m; others are moved onto the ray, by up to 5 mm.
         - Times are rounded to microseconds. Boxes keep heading only: roll and pitch of a box are lost.
         - No second returns, no elongation, no no-label zones, no accelerations: the files say so.
 
@@ -87,33 +68,22 @@ def write_waymo_segment(
     if present and not overwrite:
         raise CFlowError(f"{present[0]} exists; give overwrite=True to replace the segment")
     root.mkdir(parents=True, exist_ok=True)
-    scratch = Path(tempfile.mkdtemp(prefix=f".{log.log_id}-", dir=root))
-    try:
-        (scratch / "new").mkdir()
-        (scratch / "old").mkdir()
-        _write_components(log, scratch / "new", max_shift, is_rolling)
-        _put_in_place(scratch, places)
-    finally:
-        shutil.rmtree(scratch, ignore_errors=True)
+    with tempfile.TemporaryDirectory(prefix=f".{log.log_id}-", dir=root) as folder:
+        _write_components(log, Path(folder))
+        _put_in_place(Path(folder), places)
     return places["lidar"]
 
 
-def _put_in_place(scratch: Path, places: Dict[str, Path]) -> None:
-    """Moves new/<tag> to its place; on failure everything is as before."""
-    tags = sorted(places, key=lambda tag: tag == "lidar")  # the file that readers look for comes last
-    with ExitStack() as undo:
-        for tag in reversed(tags):
-            if places[tag].exists():
-                os.replace(places[tag], scratch / "old" / tag)
-                undo.callback(os.replace, scratch / "old" / tag, places[tag])
-        for tag in tags:
-            places[tag].parent.mkdir(exist_ok=True)
-            os.replace(scratch / "new" / tag, places[tag])
-            undo.callback(places[tag].unlink)
-        undo.pop_all()
+def _put_in_place(folder: Path, places: Dict[str, Path]) -> None:
+    """Moves <tag> to its place. The file that readers look for goes first and comes last: none is ever half old."""
+    if places["lidar"].exists():
+        places["lidar"].unlink()
+    for tag in sorted(places, key=lambda tag: tag == "lidar"):
+        places[tag].parent.mkdir(exist_ok=True)
+        os.replace(folder / tag, places[tag])
 
 
-def _write_components(log: Recording, folder: Path, max_shift: float, is_rolling: bool) -> None:
+def _write_components(log: Recording, folder: Path) -> None:
     times = [(stamp + 500) // 1000 for stamp in log.timestamps]
     if len(set(times)) < len(times):
         raise CFlowError(f"log {log.log_id} has sweeps less than a microsecond apart; Waymo cannot tell them apart")
@@ -130,12 +100,12 @@ def _write_components(log: Recording, folder: Path, max_shift: float, is_rolling
             rows: List[Dict[str, Any]] = []
             for unit, number in sorted(zip(units, numbers), key=lambda pair: pair[1]):
                 calibration = _calibration(unit, log.elevations(unit.name))
-                shots = poses_of_shots(log, index, unit.offset_ns, is_rolling) if number == TOP else None
+                shots = poses_of_shots(log, index, unit.offset_ns) if number == TOP else None
                 where = f"sweep {index} of log {log.log_id}, unit {unit.name}"
                 true_shots = None
-                if shots is not None and is_rolling and hasattr(log, "poses_at"):
+                if shots is not None and hasattr(log, "poses_at"):
                     true_shots = partial(true_poses_of_shots, log, index, unit.offset_ns)
-                images = encode_images(unit, calibration, max_shift, where, shots, true_shots)
+                images = encode_images(unit, calibration, where, shots, true_shots)
                 cells = {**_cells(f"{LIDAR}1", images["first"]), **_cells(f"{LIDAR}2", images["second"])}
                 rows.append({**key, LASER: number, **cells})
                 if number == TOP:

@@ -21,6 +21,7 @@ _NODES = 4  # sweeps whose poses are interpolated: a cubic is exact for constant
 # Metres, of a pixel's pose from the interpolated one. Where a car begins to turn, the cubic is off by 0.3 m at 75 m in
 # the street (0.4 rad/s), by 1.5 m at the crossing (0.8 rad/s), and by more at the ends of a drive.
 _MAX_POSE_SHIFT = 1.0
+_MAX_SHIFT = 0.005  # metres, of the returns of the other lasers, whose pixels have no poses
 
 
 @dataclass(frozen=True)
@@ -54,14 +55,14 @@ class ShotPoses:
         return points @ T[:3, :3].T + T[:3, 3]
 
 
-def poses_of_shots(log: Recording, index: int, offset_ns: np.ndarray, is_rolling: bool) -> ShotPoses:
+def poses_of_shots(log: Recording, index: int, offset_ns: np.ndarray) -> ShotPoses:
     """Poses at the times of shots: the polynomial through the angles and positions of the four nearest sweeps."""
     first = min(max(index - 1, 0), max(len(log.timestamps) - _NODES, 0))
     nodes = range(first, min(first + _NODES, len(log.timestamps)))
     values = np.stack([pose_angles(np.asarray(log.poses[node], np.float64)) for node in nodes])
     values[:, :3] = np.unwrap(values[:, :3], axis=0)
     seconds = np.array([(log.timestamps[node] - log.timestamps[index]) * 1e-9 for node in nodes])
-    at = np.asarray(offset_ns, np.float64) * 1e-9 * is_rolling
+    at = np.asarray(offset_ns, np.float64) * 1e-9
     weights = np.ones((len(at), len(nodes)))
     for k, own in enumerate(seconds):
         for other in np.delete(seconds, k):
@@ -82,7 +83,6 @@ def true_poses_of_shots(log: Any, index: int, offset_ns: np.ndarray) -> ShotPose
 def encode_images(
     unit: UnitReturns,
     calibration: LaserCalibration,
-    max_shift: float,
     where: str,
     shot_poses: Optional[ShotPoses],
     true_poses: Optional[Callable[[], ShotPoses]] = None,
@@ -104,17 +104,16 @@ def encode_images(
         # Interpolated poses may err by a pixel. The recording counts columns as the image does, from another first one.
         start = np.bincount((column - unit.column) % width).argmax()
         column = (np.asarray(unit.column, np.int64) + start) % width
-        max_shift = _MAX_POSE_SHIFT
     rays = directions(azimuths[column], calibration.row_inclinations(height)[row])
     on_rays = distance[:, None].astype(np.float64) * rays
     shift = np.linalg.norm(seen - on_rays, axis=1)
+    max_shift = _MAX_SHIFT if shot_poses is None else _MAX_POSE_SHIFT
     if len(shift) and shift.max() > max_shift:
         if true_poses is not None:
-            return encode_images(unit, calibration, max_shift, where, true_poses())
+            return encode_images(unit, calibration, where, true_poses())
         raise CFlowError(
             f"{where}: {np.count_nonzero(shift > max_shift)} of {len(shift)} returns are off the rays of a {height} x "
-            f"{width} range image, by up to {shift.max():.3g} m; record with a profile made for Waymo, say with "
-            f"is_rolling whether the vehicle moves during a sweep, or (not for TOP) allow max_shift"
+            f"{width} range image, by up to {shift.max():.3g} m; record with a profile made for Waymo"
         )
     pixel = row * width + column
     if len(np.unique(pixel)) < len(pixel):

@@ -1,0 +1,72 @@
+"""The columns of Waymo's parquet files, as the official classes print them."""
+
+from __future__ import annotations
+
+from typing import Any, Dict, List, Tuple
+
+import pyarrow as pa
+
+from cflow_torch.data.waymo.parquet import (
+    BOX,
+    CALIBRATION,
+    LASER,
+    LIDAR,
+    PIXEL_POSE,
+    SEGMENT,
+    TIME,
+    TRACK,
+    VEHICLE_POSE,
+)
+
+STATS = "[StatsComponent]."
+_IMAGE, _SHAPE, _TRANSFORM = pa.list_(pa.float32()), pa.list_(pa.int32(), 3), pa.list_(pa.float64(), 16)
+_FRAME_KEYS: List[Tuple[str, Any]] = [(SEGMENT, pa.string()), (TIME, pa.int64())]
+SCHEMAS: Dict[str, pa.Schema] = {
+    "lidar": pa.schema(
+        [
+            *_FRAME_KEYS,
+            (LASER, pa.int8()),
+            *((f"{LIDAR}{k}.{part}", kind) for k in (1, 2) for part, kind in (("values", _IMAGE), ("shape", _SHAPE))),
+        ]
+    ),
+    "lidar_calibration": pa.schema(
+        [
+            (SEGMENT, pa.string()),
+            (LASER, pa.int8()),
+            (f"{CALIBRATION}extrinsic.transform", _TRANSFORM),
+            (f"{CALIBRATION}beam_inclination.min", pa.float64()),
+            (f"{CALIBRATION}beam_inclination.max", pa.float64()),
+            (f"{CALIBRATION}beam_inclination.values", pa.list_(pa.float64())),
+        ]
+    ),
+    "lidar_pose": pa.schema(
+        [*_FRAME_KEYS, (LASER, pa.int8()), (f"{PIXEL_POSE}.values", _IMAGE), (f"{PIXEL_POSE}.shape", _SHAPE)]
+    ),
+    "vehicle_pose": pa.schema([*_FRAME_KEYS, (VEHICLE_POSE, _TRANSFORM)]),
+    "lidar_box": pa.schema(
+        [
+            *_FRAME_KEYS,
+            (TRACK, pa.string()),
+            *((f"{BOX}box.{part}.{axis}", pa.float64()) for part in ("center", "size") for axis in "xyz"),
+            (f"{BOX}box.heading", pa.float64()),
+            (f"{BOX}type", pa.int8()),
+            (f"{BOX}num_lidar_points_in_box", pa.int64()),
+            (f"{BOX}num_top_lidar_points_in_box", pa.int64()),
+            *((f"{BOX}{part}.{axis}", pa.float64()) for part in ("speed", "acceleration") for axis in "xyz"),
+            (f"{BOX}difficulty_level.detection", pa.int8()),
+            (f"{BOX}difficulty_level.tracking", pa.int8()),
+        ]
+    ),
+    "stats": pa.schema(
+        [
+            *_FRAME_KEYS,
+            *((STATS + name, pa.string()) for name in ("time_of_day", "location", "weather")),
+            *(
+                (f"{STATS}{sensor}_object_counts.{part}", pa.list_(kind))
+                for sensor in ("lidar", "camera")
+                for part, kind in (("types", pa.int8()), ("counts", pa.int32()))
+            ),
+        ]
+    ),
+}
+"""Component -> its columns."""
