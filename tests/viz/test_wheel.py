@@ -8,13 +8,6 @@ import torch
 from cflow_torch.viz import flow_to_rgb, wheel_image
 
 
-def test_primary_hues() -> None:
-    steps = {0: (255, 0, 0), 15: (255, 255, 0), 21: (0, 255, 0), 25: (0, 255, 255), 36: (0, 0, 255), 49: (255, 0, 255)}
-    for step, color in steps.items():
-        angle = 2 * np.pi * step / 54
-        assert tuple(flow_to_rgb(np.array([np.cos(angle), np.sin(angle)]))) == color
-
-
 def test_axes_of_the_ego_frame() -> None:
     # By hand: steps 0, 13.5, 27, 40.5 of 54. 13.5 / 15 of green is 229.5, a tie, hence one level either way.
     expected = [(255, 0, 0), (255, 229.5, 0), (0, 255 - 255 * 2 / 11, 255), (255 * 4.5 / 13, 0, 255)]
