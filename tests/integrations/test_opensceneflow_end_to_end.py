@@ -133,15 +133,6 @@ def test_eval_of_the_real_pair(harness: Harness, checkpoint: Path, av2_folder: P
 
 
 @pytest.mark.slow
-def test_sweep(harness: Harness, checkpoint: Path, data: Path) -> None:
-    """Three values by the harness's own -m."""
-    wanted = ["-m", "model=cflow", *places(checkpoint, data), TARGET_PIXELS, "model.target.num_frames=2,3,4"]
-    jobs = read_scores(harness.run("frames", "eval.py", *wanted))
-    assert jobs == [approximately(replayed(data, module(pixel_sizes=PIXELS, num_frames=n))) for n in (2, 3, 4)]
-    assert len({json.dumps(job) for job in jobs}) == 3
-
-
-@pytest.mark.slow
 def test_runner_without_checkpoint(harness: Harness, data: Path, scores: List[Dict[str, float]]) -> None:
     """The second path: history comes with its ground. The same flow, so the same digits."""
     overrides = ["model=cflow", "model.iter_only=true", f"dataset_path={data}", "num_frames=6", "+num_workers=0"]

@@ -163,12 +163,6 @@ def test_clusters_next_to_each_other_differ_in_colour() -> None:
     assert none.tolist() == [[1, 2, 3]] * 2
 
 
-@pytest.mark.parametrize("cluster", [np.zeros(4, int), np.zeros((5, 1), int), np.zeros(5)])
-def test_plot_clusters_refuses(cluster: np.ndarray) -> None:
-    with pytest.raises(CFlowError, match="cluster_id"):
-        plot_clusters(np.zeros((5, 3)), cluster)
-
-
 # --- several pairs
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 
 from cflow_torch.viz import flow_to_rgb, wheel_image
 
@@ -19,13 +18,6 @@ def test_saturation_follows_length() -> None:
     red = flow_to_rgb(np.array([[0.0, 0], [0.25, 0], [0.5, 0], [1, 0], [2, 0]]), max_flow=1.0)
     assert red.tolist() == [[255, 255, 255], [255, 191, 191], [255, 128, 128], [255, 0, 0], [128, 0, 0]]
     assert (flow_to_rgb(np.array([[np.nan, 0.0], [np.inf, 1.0]])) == 255).all()
-
-
-def test_longest_flow_sets_the_scale_and_z_is_ignored() -> None:
-    flow = np.array([[0.0, 0.2, 9.0], [0.4, 0.0, 0.0]])
-    assert (flow_to_rgb(flow) == flow_to_rgb(flow, 0.4)).all()
-    assert (flow_to_rgb(torch.from_numpy(flow)) == flow_to_rgb(flow[:, :2])).all()
-    assert flow_to_rgb(np.zeros((0, 3))).shape == (0, 3)
 
 
 def test_wheel_image_has_the_axes_of_the_picture() -> None:
