@@ -166,14 +166,6 @@ def one_object(clouds: Sequence[np.ndarray], flow: Sequence[float], interval: fl
     return _draw([list(clouds)], [owners], [np.array(flow)], [interval * np.arange(len(clouds))], 0.1)
 
 
-def reordered(scene: Scene, seed: int = 0) -> Scene:
-    """The same with its points in another order."""
-    batch = scene.sweeps.batch
-    order = torch.randperm(batch.image.numel(), generator=torch.Generator().manual_seed(seed))
-    other = _batch(batch.positions[:, order], batch.image[order], batch.elapsed)
-    return scene._replace(sweeps=HeightSlicedSweeps.of(other, scene.sweeps.grid))
-
-
 def _draw(
     clouds: List[List[np.ndarray]],
     owners: List[List[np.ndarray]],

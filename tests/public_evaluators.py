@@ -50,7 +50,6 @@ class Pair:
 
     folder: Path
     points: np.ndarray
-    next_points: np.ndarray
     labels: FlowLabels
     is_dynamic: np.ndarray  # as the label file says
     is_ground: np.ndarray  # as the label file says
@@ -67,7 +66,6 @@ def read_pair(folder: Path) -> Pair:
     return Pair(
         folder=folder,
         points=now.points,
-        next_points=following.points,
         labels=labels,
         is_dynamic=stored["dynamic"].to_numpy(),
         is_ground=stored["is_ground_0"].to_numpy(),

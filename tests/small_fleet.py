@@ -50,19 +50,7 @@ def run(
     settings: Dict[str, Any] = {},  # noqa: B006 (read only)
     **engine_settings: Any,
 ) -> Dict[str, Any]:
-    """`cflow flow` without the command line; the report.
-
-    Args:
-        root: folder of the logs.
-        output: folder of the results.
-        layout: workers.
-        shard: of the work.
-        engine: "local" or "ray".
-        resume: see `claim_folder`.
-        overwrite: see `claim_folder`.
-        settings: of the job, in place of those of `make_job`.
-        **engine_settings: of the engine.
-    """
+    """`cflow flow` without the command line; the report. `settings` are the job's, in place of those of `make_job`."""
     job = make_job(output, batch=layout.batch, redo=overwrite, **settings)
     identity = make_identity(job.config, "av2", job.settings, job.contents)
     claim_folder(output, identity, resume, overwrite, shard.count == 1)

@@ -129,12 +129,6 @@ def test_the_paper_s_base_row_and_what_presets_change():
         make_config(pixel_size=0.2, pixel_sizes=(0.4,))
 
 
-def test_values_get_their_plain_types():
-    config = DenseConfig(pixel_sizes=[1], point_cloud_range=range(6), max_extent=3, ego_box=[-1, -1, 1, 1])
-    assert config.pixel_sizes == (1.0,) and config.point_cloud_range == (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
-    assert [type(v) for v in (config.max_extent, *config.ego_box, config.num_history)] == [float] * 5 + [int]
-
-
 @pytest.mark.parametrize("preset", PRESETS)
 def test_a_dictionary_goes_round(preset):
     config = make_config(preset, point_cloud_range=(-1, -2, -3, 1, 2, 3), ego_box=(-1, -1, 1, 1), max_speed=None)

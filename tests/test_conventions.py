@@ -76,27 +76,11 @@ def test_without_transforms_all_points_lie_in_the_frame_of_t1():
     assert torch.equal(result.flow, result.residual_flow) and result.flow[0].tolist() == [2, 1, 0]
 
 
-def test_pc0_plus_flow_lies_on_t1():
-    T_ego1_ego0 = transform(90, 3, 1)
-    pc1 = ell(2, 4) + [1, -2, 0]  # moves by (1, -2) in the axes of t+1
-    pc0 = through(np.linalg.inv(T_ego1_ego0), ell(2, 4))
-    result = flow_of(pc0, pc1, T_ego1_ego0=T_ego1_ego0)
-    np.testing.assert_allclose(pc0 + result.flow.numpy(), pc1, atol=1e-6)
-    np.testing.assert_allclose(result.pose_flow, through(T_ego1_ego0, pc0) - pc0, atol=1e-6)
-    assert torch.equal(result.flow, result.residual_flow + result.pose_flow)
-
-
 def test_flow_has_the_axes_of_t1():
     T_ego1_ego0 = transform(-90, 0, 0)  # the vehicle turns left by 90 degrees; its world turns right
     pc0, ahead = ell(4), np.array([2.0, 0, 0])  # what was ahead at t is on the right at t+1
     result = flow_of(pc0, through(T_ego1_ego0, pc0 + ahead), T_ego1_ego0=T_ego1_ego0)
     assert result.residual_flow.tolist() == [[0, -2, 0]] * 10
-
-
-def test_flow_is_metres_until_the_next_sweep():
-    for interval in (100_000_000, 500_000_000):
-        window = Window(Sweep(ell(), timestamp_ns=0), Sweep(ell(2), timestamp_ns=interval))
-        assert flow_of_window(window).residual_flow[0].tolist() == [2, 0, 0]
 
 
 def test_time_stamps_are_nanoseconds_and_speeds_metres_per_second():
@@ -116,24 +100,7 @@ def test_history_is_nearest_first():
         flow_of_window(Window(now, newest, (t2, t1)), num_history=2)
 
 
-def test_the_place_in_the_history_is_the_number_of_steps():
-    # 4 m in what is said to be two steps, beside 1 m in one: the mean of the middle two estimates.
-    result = flow_of(ell(), ell(1), pch=[ell(-3)], num_history=1)
-    assert result.residual_flow[0].tolist() == [1.5, 0, 0]
-
-
 # --------------------------------------------------------------------------------------------------------- rows
-
-
-def test_rows_are_those_of_pc0():
-    pc0 = np.concatenate([ell(), [[500.0, 0, 0], [np.nan, 0, 0]], ell(0, 12)])
-    pc1 = np.concatenate([ell(2), ell(0, 12)])
-    order = np.random.default_rng(0).permutation(len(pc0))
-    one, other = flow_of(pc0, pc1), flow_of(pc0[order], pc1)
-    assert one.residual_flow[:, 0].tolist() == [2] * 10 + [0] * 12
-    for name, values in one.numpy().items():
-        assert len(values) == len(pc0)
-        np.testing.assert_array_equal(other.numpy()[name], values[order])
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
@@ -169,17 +136,6 @@ def test_the_region_is_that_of_the_frame_of_t1():
 
 
 # ----------------------------------------------------------------------------------------------------- clusters
-
-
-def test_cluster_ids_count_in_raster_order():
-    points = points_of([(10, 0), (2, 15), (2, 5)])  # (row, column)
-    assert flow_of(points, points).cluster_id.tolist() == [2, 1, 0]
-
-
-def test_a_cluster_is_seen_before_and_at_t1():
-    pc0, pc1 = points_of([(0, 0), (10, 10)]), points_of([(0, 0), (0, 10)])
-    result = flow_of(pc0, pc1)
-    assert result.cluster_id.tolist() == [0, -1] and result.is_valid.tolist() == [True, True]
 
 
 # -------------------------------------------------------------------------------------------------- correlation

@@ -9,7 +9,7 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from oracle.component_tree import with_longest
-from scenes import assert_same, assert_same_bits, flow_as_oracle, pose, reordered, rows_of
+from scenes import assert_same, flow_as_oracle, pose
 
 from cflow_torch import FlowResult, Sweep, Window, make_model
 from cflow_torch.config import CONFIGS, Config
@@ -116,18 +116,6 @@ def test_a_shift_by_whole_pixels_shifts_the_scene(window, shift, overrides):
 def test_a_shift_along_z_shifts_the_sectional_view(window, steps):
     shifted = moved(window, np.array([0, 0, steps * S]))
     assert_same(cflow(shifted, sectional_view=True), cflow(window, sectional_view=True))
-
-
-@PROFILE
-@given(st.lists(windows(), min_size=1, max_size=5), dense, st.integers(0, 99))
-def test_company_and_order_of_points_do_not_matter(batch, overrides, seed):
-    for together, window in zip(make_model(small(**overrides), "cpu")(batch), batch):
-        assert_same_bits(together, cflow(window, **overrides))
-    mixed, order = reordered(batch[0], seed)
-    sources = [batch[0].pc0, *batch[0].pch]
-    if not any(np.array_equal(s.points, o.points) for i, s in enumerate(sources) for o in sources[:i]):
-        # A repeated sweep in another order would be no repetition any more.
-        assert_same_bits(cflow(mixed, **overrides), rows_of(cflow(batch[0], **overrides), order))
 
 
 @PROFILE

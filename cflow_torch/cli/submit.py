@@ -26,13 +26,12 @@ from cflow_torch.cli.run import Failures
 from cflow_torch.data.atomic import ready_folder
 from cflow_torch.data.log import Log, window
 from cflow_torch.data.names import folder_in
-from cflow_torch.evaluation.submission.archive import pack
 from cflow_torch.evaluation.submission.check import check_submission
 from cflow_torch.evaluation.submission.encode import RESIDUAL_AXES, Rounding, encode
 from cflow_torch.evaluation.submission.masks import MaskArchive, log_mask, point_mask
 from cflow_torch.evaluation.submission.plan import Frame, PlannedFrame, plan_log, read_frame_list, require_logs
 from cflow_torch.evaluation.submission.versions import SubmissionVersion, get_version
-from cflow_torch.evaluation.submission.write import is_complete, write_frame, write_metadata
+from cflow_torch.evaluation.submission.write import is_complete, pack, write_frame, write_metadata
 from cflow_torch.fleet.progress import frames as counted
 from cflow_torch.stages import FlowModel
 from cflow_torch.types import CFlowError

@@ -8,8 +8,7 @@ from typing import Sequence, Tuple, Union
 import numpy as np
 
 from cflow_torch.evaluation.definitions import Definition, get_definition
-from cflow_torch.evaluation.frame import EvalFrame
-from cflow_torch.evaluation.masks import ScoredPoints, score_points
+from cflow_torch.evaluation.masks import ScoredPoints
 from cflow_torch.types import CFlowError
 
 
@@ -39,10 +38,6 @@ class Accumulator(ABC):
     @abstractmethod
     def cells(self, scored: ScoredPoints) -> Tuple[np.ndarray, Sequence[np.ndarray]]:
         """(K,) int64 flat cell of the points that count, and their quantities, (K,) float64 each."""
-
-    def update(self, frame: EvalFrame) -> None:
-        """Add one frame."""
-        self.update_points(score_points(frame, self.definition))
 
     def update_points(self, scored: ScoredPoints) -> None:
         """Add the scored points of one frame."""

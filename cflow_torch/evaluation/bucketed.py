@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from typing import Any, Dict, Sequence, Tuple
 
 import numpy as np
@@ -17,9 +16,8 @@ _MEANS = ("static_epe", "dynamic_error")
 
 def mean_of_present(values: np.ndarray) -> float:
     """Mean of the values that are not NaN; NaN where there are none."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", category=RuntimeWarning)
-        return float(np.nanmean(values)) if values.size else float("nan")
+    count = (~np.isnan(values)).sum()
+    return float(np.nansum(values) / count) if count else float("nan")
 
 
 def bucket_cells(scored: ScoredPoints, definition: Definition) -> Tuple[np.ndarray, np.ndarray]:
@@ -65,9 +63,6 @@ class BucketedEPE(Accumulator):
     With e and v the mean end-point error and mean true speed of all points of a class in a bucket, over all frames:
     `static_epe` = e of the first bucket in metres; `dynamic_error` = mean of e / v over the other buckets that have
     points, each bucket with the same weight. A prediction of "nothing moves" has a dynamic error of exactly 1.
-
-    Args:
-        definition: name or `Definition`.
 
     Convention: a bucket holds its lower edge, not its upper one; classes without points are NaN and do not enter the
     mean over classes.

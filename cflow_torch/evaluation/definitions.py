@@ -26,8 +26,8 @@ class Definition:
         metrics: which of `METRICS` are computed.
         ego_motion: whose motion is taken out of the flow: "points": that of the frame of the points; "stored": by the
             poses as the data has them, also where those are of another frame (OpenSceneFlow's Argoverse 2 scenes).
-        region: points scored by "bucketed" and "three_way": "box" max(|x|, |y|), "disc" sqrt(x^2 + y^2), "all". Box
-            or disc is also how "bucketed_by_range" measures.
+        region: points scored by "bucketed" and "three_way": "box" max(|x|, |y|), "disc" sqrt(x^2 + y^2), "all".
+            "bucketed_by_range" measures by the box if it is the region, else by the disc.
         max_range: metres, outer bound of the region.
         closed: True: a point at exactly `max_range` counts (<=), False: it does not (<). The same for the upper edge of
             each range of "bucketed_by_range"; the point that one range leaves out belongs to the next one.
@@ -89,10 +89,6 @@ class Definition:
                 raise CFlowError(f"definition {self.name}: {field} is one of {choices}, got {value!r}")
         if not set(self.metrics) <= set(METRICS):
             raise CFlowError(f"definition {self.name}: metrics are some of {METRICS}, got {self.metrics}")
-        if "bucketed_by_range" in self.metrics and self.region == "all":
-            raise CFlowError(f"definition {self.name}: bucketed_by_range measures ranges; region must be box or disc")
-        if not self.max_range > 0:
-            raise CFlowError(f"definition {self.name}: max_range must be positive, got {self.max_range}")
         for field in ("speed_edges", "range_edges", "region_edges"):
             edges = getattr(self, field)
             if len(edges) < 2 or not all(a < b for a, b in zip(edges, edges[1:])):

@@ -12,9 +12,6 @@ from cflow_torch.data.hdf5.frames import StoredMotion, beside_harness, harness_p
 from cflow_torch.data.log import FlowLabels
 from cflow_torch.types import Array, CFlowError, FlowResult, Window, as_numpy
 
-# Kinds of numbers that are taken for each kind: NumPy would also make numbers of texts and drop imaginary parts.
-_KINDS = {"f": ("fiu", "hold numbers"), "i": ("iu", "hold whole numbers"), "b": ("b", "be bool")}
-
 
 def ego_motion_flow(points: np.ndarray, T_ego1_ego0: np.ndarray) -> np.ndarray:
     """Flow that ego motion alone causes, T p - p.
@@ -45,7 +42,6 @@ class EvalFrame:
             in another frame need it.
         is_ground: (N,) bool, True = ground; None = no point is ground.
         eval_mask: (N,) bool, True = scored; None = all.
-        is_dynamic: (N,) bool, predicted dynamic points (IoU); None = residual of at least the definition's threshold.
         residual_axes: "t+1" or "t", axes that `residual_flow` is given in. This package predicts in "t+1".
 
     Convention: everything is checked and turned to NumPy when the frame is made.
@@ -62,7 +58,6 @@ class EvalFrame:
     T_ego1_ego0: Optional[Array] = None
     is_ground: Optional[Array] = None
     eval_mask: Optional[Array] = None
-    is_dynamic: Optional[Array] = None
     residual_axes: str = "t+1"
 
     def __post_init__(self) -> None:
@@ -79,7 +74,7 @@ class EvalFrame:
         self._set("points", _checked("points", points[:, :3], np.float32, (rows, 3)))
         for name in ("residual_flow", "flow", "pose_flow"):
             self._set(name, _checked(name, getattr(self, name), np.float32, (rows, 3)))
-        for name in ("is_ground", "eval_mask", "is_dynamic"):
+        for name in ("is_ground", "eval_mask"):
             self._set(name, _checked(name, getattr(self, name), np.bool_, (rows,)))
         self._set("T_ego1_ego0", _checked("T_ego1_ego0", self.T_ego1_ego0, np.float64, (4, 4)))
         truth = {
@@ -144,11 +139,6 @@ def _checked(name: str, value: Any, dtype: Any, shape: Tuple[int, ...]) -> Any:
     if value is None:
         return None
     array = as_numpy(value)
-    if array.size == np.prod(shape) and array.ndim == len(shape) + 1 and array.shape[-1] == 1:
-        array = array[..., 0]  # evaluation masks are stored (N, 1) by some harnesses
     if array.shape != shape:
         raise CFlowError(f"{name} must have shape {shape} (one row per point of sweep t), got {array.shape}")
-    kinds, what = _KINDS[np.dtype(dtype).kind]
-    if array.dtype.kind not in kinds:
-        raise CFlowError(f"{name} must {what}, got {array.dtype}")
     return array.astype(dtype)

@@ -70,8 +70,6 @@ def score_points(frame: EvalFrame, definition: Definition) -> ScoredPoints:
     residual, true_residual = total - pose_flow, true_total - pose_flow
     threshold = np.float32(definition.dynamic_threshold)
     predicted_dynamic = np.linalg.norm(residual, axis=1) >= threshold
-    if frame.is_dynamic is not None:
-        predicted_dynamic = as_numpy(frame.is_dynamic)[keep]
     if definition.residual_axes == "t":
         T = frame.transform()
         residual, true_residual = _residual_at_t(points, total, T), _residual_at_t(points, true_total, T)

@@ -28,16 +28,6 @@ class SceneFlowMetrics:
             `Definition`.
 
     Convention: frames in any order; `merge` joins parts that were scored apart.
-
-    Example:
-        >>> import numpy as np
-        >>> from cflow_torch.data.log import FlowLabels
-        >>> still = np.zeros((1, 3), dtype=np.float32)
-        >>> moves = FlowLabels(still + 0.5, np.array([19], dtype=np.uint8), np.array([True]))
-        >>> metrics = SceneFlowMetrics("opensceneflow")
-        >>> metrics.update(EvalFrame(points=still, labels=moves, residual_flow=still, pose_flow=still))
-        >>> metrics.compute()["bucketed"]["classes"]["CAR"]["dynamic_error"]
-        1.0
     """
 
     def __init__(self, definition: Union[str, Definition] = "opensceneflow") -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from statistics import fmean
 from typing import Any, Dict, List, Mapping, Optional, Sequence, Tuple
 
 from cflow_torch.types import CFlowError
@@ -29,28 +30,22 @@ class ProtocolScores:
     missing: Tuple[str, ...]
 
 
-def errors_by_range(results: Mapping[str, Any], class_name: Optional[str] = None) -> Dict[str, float]:
-    """Dynamic bucket-normalised error of each range, of what `SceneFlowMetrics.compute` returned.
+def errors_by_range(results: Mapping[str, Any]) -> Dict[str, float]:
+    """Dynamic bucket-normalised error of each range, mean over classes, of what `SceneFlowMetrics.compute` returned.
 
     Args:
         results: scores of a definition with the metric "bucketed_by_range", also as read back from results.json.
-        class_name: a meta class; None = the mean over classes.
 
     Returns:
         Range ("0-35", ...) -> error; NaN where the range has no moving points.
 
     Raises:
-        CFlowError: the metric or the class is not among the results.
+        CFlowError: the metric is not among the results.
     """
     if "bucketed_by_range" not in results:
         raise CFlowError("the results have no 'bucketed_by_range': score with definition='challenge_2026'")
-    errors = {}
-    for name, scores in results["bucketed_by_range"]["ranges"].items():
-        if class_name is not None and class_name not in scores["classes"]:
-            raise CFlowError(f"classes are {sorted(scores['classes'])}, got {class_name!r}")
-        row = scores["mean"] if class_name is None else scores["classes"][class_name]
-        errors[name] = _number(row["dynamic_error"])
-    return errors
+    ranges = results["bucketed_by_range"]["ranges"]
+    return {name: _number(scores["mean"]["dynamic_error"]) for name, scores in ranges.items()}
 
 
 def score_data_sets(
@@ -74,11 +69,6 @@ def score_data_sets(
     Raises:
         CFlowError: something is missing (unless `missing="nan"`); data sets or ranges that were not asked for; nothing
             to combine.
-
-    Example:
-        >>> scores = score_data_sets({"A": {"0-35": 0.25, "35-70": 0.75}, "B": {"0-35": 0.25, "35-70": 0.25}})
-        >>> scores.data_sets, scores.overall
-        ({'A': 0.5, 'B': 0.25}, 0.375)
     """
     if missing not in ("error", "nan"):
         raise CFlowError(f"missing is 'error' or 'nan', got {missing!r}")
@@ -104,14 +94,10 @@ def score_data_sets(
             "; ".join(reasons) + ": score them, name the data sets and ranges that you mean, or pass missing='nan' to "
             "get NaN and this list"
         )
-    per_set = {name: _mean(row) for name, row in table.items()}
-    per_range = {name: _mean([row[i] for row in table.values()]) for i, name in enumerate(range_names)}
-    return ProtocolScores(_mean(list(per_set.values())), per_set, per_range, tuple(reasons))
+    per_set = {name: fmean(row) for name, row in table.items()}  # NaN if any is NaN
+    per_range = {name: fmean([row[i] for row in table.values()]) for i, name in enumerate(range_names)}
+    return ProtocolScores(fmean(per_set.values()), per_set, per_range, tuple(reasons))
 
 
 def _number(value: Optional[float]) -> float:
     return math.nan if value is None else float(value)
-
-
-def _mean(values: Sequence[float]) -> float:
-    return math.fsum(values) / len(values)  # NaN if any is NaN

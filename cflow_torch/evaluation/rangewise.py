@@ -15,9 +15,6 @@ from cflow_torch.evaluation.masks import ScoredPoints
 class RangeWiseEPE(Accumulator):
     """Streaming range-wise EPE; the definition's region does not apply, every category counts.
 
-    Args:
-        definition: name or `Definition`.
-
     Convention: distance includes height; a range holds its lower edge, not its upper one; means are over all points
     of all frames; "mean" weighs every range that has points the same.
     """

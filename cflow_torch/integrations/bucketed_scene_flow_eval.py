@@ -20,11 +20,6 @@ class CorrelationFlowEstimator:
 
     Raises:
         CFlowError: an unknown setting or an invalid value.
-
-    Example:
-        dataset = Argoverse2CausalSceneFlow(root, with_ground=False)
-        evaluator = CorrelationFlowEstimator("default").evaluate(dataset)
-        evaluator.compute_results()
     """
 
     def __init__(
@@ -59,22 +54,21 @@ class CorrelationFlowEstimator:
         """The `EgoLidarFlow` of `frames[-2]`: what a causal data set scores. Frames and errors as for `__call__`."""
         return self._flows(_read_frames(frames), len(frames) - 2)[0]
 
-    def evaluate(self, dataset: Any, evaluator: Any = None) -> Any:
+    def evaluate(self, dataset: Any) -> Any:
         """Estimate and score all that a data set scores.
 
         Args:
             dataset: an `AbstractDataset`. Causal: the frame before the last of each item is scored; non-causal: every
                 frame but the last.
-            evaluator: None = `dataset.evaluator()`.
 
         Returns:
-            The evaluator; `compute_results()` is yours to call. Errors as for `__call__`.
+            `dataset.evaluator()`, fed; `compute_results()` is yours to call. Errors as for `__call__`.
 
         Convention:
             Items that overlap (a causal data set, step 1) lend each other their history: with `subsequence_length=2`
             every frame of a log but its last is scored, the first ones with a shorter history.
         """
-        evaluator = dataset.evaluator() if evaluator is None else evaluator
+        evaluator = dataset.evaluator()
         is_causal = dataset.loader_type().name == "CAUSAL"
         known: List[_LogFrame] = []
         for number in range(len(dataset)):
@@ -116,7 +110,7 @@ def _read_frames(frames: Any) -> List[_LogFrame]:
         if (new.log_id, new.log_idx) != (old.log_id, old.log_idx + 1):
             places = f"{new.log_id!r}, {new.log_idx} after {old.log_id!r}, {old.log_idx}"
             raise CFlowError(f"frames[{i}].log_id, log_idx: {places}; give consecutive frames of one log")
-    stamps = times_in_ns([_number(frame, f"frames[{i}]", "log_timestamp") for i, (frame, _) in enumerate(pairs)])
+    stamps = times_in_ns([_field(frame, f"frames[{i}]", "log_timestamp") for i, (frame, _) in enumerate(pairs)])
     return [frame._replace(sweep=replace(frame.sweep, timestamp_ns=t)) for frame, t in zip(read, stamps)]
 
 
@@ -124,14 +118,14 @@ def _read_frame(name: str, frame: Any, data: Any) -> _LogFrame:
     """A frame without its time; `data` is its `TimeSyncedAVLidarData`, or None."""
     points = _field(frame, name, "pc.full_pc")
     points = np.asarray(getattr(points, "points", points))
-    if points.ndim != 2 or points.shape[1] != 3 or not np.issubdtype(points.dtype, np.floating):
-        raise CFlowError(f"{name}.pc.full_pc has shape {points.shape}, {points.dtype}: give (N, 3) float metres")
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise CFlowError(f"{name}.pc.full_pc has shape {points.shape}: give (N, 3) metres")
     takes_part = mask = _mask(frame, name, "pc.mask", len(points))
     if data is not None:
         takes_part = mask & ~_mask(data, f"{name}[1]", "is_ground_points", len(points))
     T_ego_sensor, T_global_ego = (_pose(frame, name, f"pc.pose.{side}") for side in ("sensor_to_ego", "ego_to_global"))
     sweep = Frame(points, takes_part, T_ego_sensor, T_global_ego)
-    return _LogFrame(_field(frame, name, "log_id"), _number(frame, name, "log_idx"), sweep, mask)
+    return _LogFrame(_field(frame, name, "log_id"), _field(frame, name, "log_idx"), sweep, mask)
 
 
 def _earlier(known: Sequence[_LogFrame], first: _LogFrame, num_history: int) -> List[_LogFrame]:
@@ -154,14 +148,6 @@ def _field(holder: Any, name: str, path: str) -> Any:
             raise CFlowError(f"{name} is {type(holder).__name__} without {field!r}: give TimeSyncedSceneFlowFrames")
         holder, name = getattr(holder, field), f"{name}.{field}"
     return holder
-
-
-def _number(holder: Any, name: str, path: str) -> int:
-    value = _field(holder, name, path)
-    try:
-        return int(value)
-    except (TypeError, ValueError):
-        raise CFlowError(f"{name}.{path} is {value!r}: give a whole number") from None
 
 
 def _mask(holder: Any, name: str, path: str, length: int) -> np.ndarray:

@@ -53,13 +53,11 @@ class CorrelationFlowModel(nn.Module):
                 of the sweep's own points; 0 for points that take no part, NaN in padding rows.
             valid_flow_mask: float32 like the loader's masks: `full_pc_mask` as 0 and 1, NaN in padding rows. A 0
                 outside the method's range is a prediction like any other.
-            Padding rows are those with NaN in `full_pc_mask`; of a bool mask, those of NaN points.
+            Padding rows are those with NaN in `full_pc_mask`.
 
         Raises:
             CFlowError: by the name of the field, for example "batched_sequence[0].full_pc_mask"; no SceneFlowZoo.
         """
-        if not isinstance(batched_sequence, (list, tuple)):
-            raise CFlowError(f"batched_sequence is {type(batched_sequence).__name__}: give a list of sequences")
         output_class = import_from("dataloaders", "TorchFullFrameOutputSequence", _HOW)
         read = [_read_sequence(sequence, f"batched_sequence[{i}]") for i, sequence in enumerate(batched_sequence)]
         flows = self.sequence_flow([frames for frames, _, _ in read], [first for _, first, _ in read])
@@ -91,13 +89,12 @@ def _read_sequence(sequence: Any, name: str) -> Tuple[List[Frame], int, Tensor]:
         if not isinstance(getattr(sequence, field, None), Tensor):
             raise CFlowError(f"{name}.{field} is no tensor: give a TorchFullFrameInputSequence")
     points, mask = sequence.full_pc, sequence.full_pc_mask
-    if points.ndim != 3 or points.shape[2] != 3 or points.shape[0] < 2 or not points.is_floating_point():
-        given = f"shape {tuple(points.shape)}, {points.dtype}"
-        raise CFlowError(f"{name}.full_pc has {given}: give (K, PadN, 3) floating-point metres, K of at least 2")
-    if mask.shape != points.shape[:2] or not (mask.is_floating_point() or mask.dtype == torch.bool):
-        given, shape = f"shape {tuple(mask.shape)}, {mask.dtype}", tuple(points.shape[:2])
-        raise CFlowError(f"{name}.full_pc_mask has {given}: give {shape}, bool or float with NaN in padding rows")
-    is_row = ~torch.isnan(mask) if mask.is_floating_point() else ~torch.isnan(points).all(2)
+    if points.ndim != 3 or points.shape[2] != 3 or points.shape[0] < 2:
+        raise CFlowError(f"{name}.full_pc has shape {tuple(points.shape)}: give (K, PadN, 3) metres, K of at least 2")
+    if mask.shape != points.shape[:2]:
+        given, shape = tuple(mask.shape), tuple(points.shape[:2])
+        raise CFlowError(f"{name}.full_pc_mask has shape {given}: give {shape}, float with NaN in padding rows")
+    is_row = ~torch.isnan(mask)
     poses = []
     for side in _POSES:
         pose = getattr(sequence, side).detach().cpu()

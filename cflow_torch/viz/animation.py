@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, Iterable, Iterator, Union
 
 import numpy as np
 
+from cflow_torch.data.atomic import atomic_name
 from cflow_torch.types import CFlowError
 from cflow_torch.viz.wheel import wheel_image
-from cflow_torch.viz.writing import whole_file
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from PIL.Image import Image as Picture
 
-_FASTEST_GIF = 50.0  # frames per second; viewers show shorter frames slowly
+_SHORTEST = 2  # hundredths of a second; viewers show shorter frames of a .gif slowly
 _WHEEL_SIDE = 200  # pixels
 
 
@@ -27,7 +27,7 @@ def save_animation(figures: Iterable[Figure], path: Union[str, Path], *, frames_
         figures: at least one, each of the same size in pixels (size in inches times dpi) on an opaque background;
             drawn one at a time, so a generator needs the memory of one.
         path: ends in .gif or .mp4; its folder is made if absent. An older file is replaced.
-        frames_per_second: pictures per second, at most 50 in a .gif. A .gif counts in hundredths of a second.
+        frames_per_second: pictures per second. A .gif counts in hundredths of a second and shows at most 50.
 
     Returns:
         The path.
@@ -44,34 +44,29 @@ def save_animation(figures: Iterable[Figure], path: Union[str, Path], *, frames_
     Cost: a .gif keeps one byte per pixel and picture until the end, a .mp4 nothing.
     """
     path = Path(path)
-    is_gif = path.suffix.lower() == ".gif"
-    if not 0 < frames_per_second < np.inf or (is_gif and frames_per_second > _FASTEST_GIF):
-        limit = f" up to {_FASTEST_GIF:g}" if is_gif else ""
-        raise CFlowError(f"frames_per_second={frames_per_second}: give a positive number{limit}")
-    with whole_file(path, ".gif", ".mp4") as temporary:
-        (_write_gif if is_gif else _write_mp4)(temporary, _pictures(figures), frames_per_second)
+    if not 0 < frames_per_second < np.inf:
+        raise CFlowError(f"frames_per_second={frames_per_second}: give a positive number")
+    if path.suffix.lower() not in (".gif", ".mp4"):
+        raise CFlowError(f"{path} does not end in .gif or .mp4: give a file that does")
+    write = _write_gif if path.suffix.lower() == ".gif" else _write_mp4
+    with atomic_name(path) as temporary:
+        write(temporary, _pictures(figures), frames_per_second)
     return path
 
 
 def _pictures(figures: Iterable[Figure]) -> Iterator[Picture]:
     """RGB images."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure as FigureClass
     from PIL import Image
 
     size = None
     for number, figure in enumerate(figures):
-        if not isinstance(figure, FigureClass):
-            raise CFlowError(f"picture {number} is a {type(figure).__name__}: give matplotlib Figures")
         canvas = FigureCanvasAgg(figure)
         canvas.draw()
         picture = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
         size = size or picture.size
         if picture.size != size:
-            raise CFlowError(
-                f"picture {number} is {picture.width} x {picture.height} pixels, the first one {size[0]} x {size[1]}: "
-                "give figures of one size (inches times dpi)"
-            )
+            raise CFlowError(f"picture {number} has {picture.size} pixels, the first one {size}: give one size")
         yield picture
     if size is None:
         raise CFlowError("no picture: an animation needs at least one figure")
@@ -84,7 +79,7 @@ def _write_gif(path: Path, pictures: Iterator[Picture], frames_per_second: float
     for picture in pictures:
         palette = palette or _palette(picture)
         frames.append(picture.quantize(palette=palette, dither=Image.Dither.NONE))
-    duration = 10 * max(2, round(100 / frames_per_second))  # milliseconds
+    duration = 10 * max(_SHORTEST, round(100 / frames_per_second))  # milliseconds
     frames[0].save(
         path,
         format="GIF",
@@ -114,10 +109,6 @@ def _write_mp4(path: Path, pictures: Iterator[Picture], frames_per_second: float
         import imageio_ffmpeg
     except ImportError as error:
         raise CFlowError(".mp4 needs imageio-ffmpeg: pip install imageio-ffmpeg, or save a .gif") from error
-    try:
-        imageio_ffmpeg.get_ffmpeg_exe()
-    except RuntimeError as error:
-        raise CFlowError(f"no ffmpeg ({error}): name one in IMAGEIO_FFMPEG_EXE, or save a .gif") from error
 
     first = next(pictures)
     even = "pad=ceil(iw/2)*2:ceil(ih/2)*2:color=white"  # yuv420p holds colours of two by two pixels
@@ -138,5 +129,3 @@ def _write_mp4(path: Path, pictures: Iterator[Picture], frames_per_second: float
             writer.send(picture.tobytes())
     finally:
         writer.close()
-    if not path.is_file() or not path.stat().st_size:
-        raise CFlowError("ffmpeg wrote nothing: name another one in IMAGEIO_FFMPEG_EXE, or save a .gif")

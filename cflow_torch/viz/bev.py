@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Optional, Sequence, Tuple, Union
 import numpy as np
 
 from cflow_torch.config import DenseConfig
+from cflow_torch.data.atomic import atomic_name
 from cflow_torch.types import Array, CFlowError, FlowResult, as_numpy
 from cflow_torch.viz import style
 from cflow_torch.viz.panel import MOVING, draw_error, draw_flow, draw_ground, new_figure
-from cflow_torch.viz.writing import whole_file
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -60,8 +60,6 @@ def plot_flow(
     given = result_or_residual.residual_flow if isinstance(result_or_residual, FlowResult) else result_or_residual
     residual = point_rows("residual flow", given, len(position))
     true_flow = None if truth is None else point_rows("truth", truth, len(position))
-    if max_flow is not None and not 0 < max_flow < np.inf:
-        raise CFlowError(f"max_flow={max_flow}: give a positive length in metres, or None for the longest flow drawn")
     if legend is not None and legend not in style.CORNERS:
         raise CFlowError(f"legend={legend!r}: give None or one of {', '.join(style.CORNERS)}")
 
@@ -102,19 +100,18 @@ def save_picture(figure: Figure, path: Union[str, Path]) -> Path:
         OSError: the file cannot be written.
     """
     path = Path(path)
-    with whole_file(path, ".png") as temporary:
+    if path.suffix.lower() != ".png":
+        raise CFlowError(f"{path} does not end in .png: give a file that does")
+    with atomic_name(path) as temporary:
         figure.savefig(temporary, format="png", dpi=figure.dpi)
     return path
 
 
-def point_rows(name: str, values: Array, count: Optional[int]) -> np.ndarray:
-    """(N, 3) float64."""
+def point_rows(name: str, values: Array, count: Optional[int] = None) -> np.ndarray:
+    """(N, 3) float64; N is the count, or any number."""
     array = as_numpy(values)
     if array.ndim != 2 or array.shape[1] < 3 or (count is not None and len(array) != count):
-        rows = "N" if count is None else str(count)
-        raise CFlowError(f"{name} has shape {array.shape}: give ({rows}, 3), one row per point")
-    if array.dtype.kind not in "fiu":
-        raise CFlowError(f"{name} has type {array.dtype}: give numbers, metres")
+        raise CFlowError(f"{name} has shape {array.shape}: give (N, 3), one row per point")
     return array[:, :3].astype(np.float64)
 
 
@@ -122,7 +119,7 @@ def split_sweep(
     points: Array, is_ground: Optional[Array], point_cloud_range: Optional[Sequence[float]]
 ) -> Tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """The view as in `view_of`, positions (N, 3) float64, and (N,) bool each: ground in view, other points in view."""
-    position = point_rows("points", points, None)
+    position = point_rows("points", points)
     ground = np.zeros(len(position), bool) if is_ground is None else as_numpy(is_ground).astype(bool)
     if ground.shape != (len(position),):
         raise CFlowError(f"is_ground has shape {ground.shape}: give ({len(position)},), one entry per point")
@@ -136,8 +133,7 @@ def view_of(position: np.ndarray, point_cloud_range: Optional[Sequence[float]]) 
     bounds = np.asarray(default if point_cloud_range is None else point_cloud_range, np.float64)
     if bounds.shape != (6,) or not (bounds[:3] < bounds[3:]).all():
         raise CFlowError(
-            f"point_cloud_range={point_cloud_range}: give (x0, y0, z0, x1, y1, z1) in metres, each low end below its "
-            f"high end, for example {default}"
+            f"point_cloud_range={point_cloud_range}: give (x0, y0, z0, x1, y1, z1), metres, low ends below high ones"
         )
     low, high = bounds[:3], bounds[3:]
     is_inside = np.isfinite(position).all(axis=1) & ((position >= low) & (position <= high)).all(axis=1)

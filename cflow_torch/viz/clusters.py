@@ -51,10 +51,7 @@ def plot_clusters(
     given = result_or_cluster_id
     cluster = as_numpy(given.cluster_id if isinstance(given, FlowResult) else given)
     if cluster.shape != (len(position),) or cluster.dtype.kind not in "iu":
-        raise CFlowError(
-            f"cluster_id has shape {cluster.shape} and type {cluster.dtype}: give ({len(position)},) integers, one "
-            "per point, negative = in no cluster"
-        )
+        raise CFlowError(f"cluster_id has shape {cluster.shape}, {cluster.dtype}: give ({len(position)},) integers")
 
     floor, position, cluster = position[is_floor], position[rest], cluster[rest]
     has_one = cluster >= 0

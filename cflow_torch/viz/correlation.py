@@ -22,16 +22,13 @@ _PEAK = "#e6194b"
 _MOST_LINES = 160  # of the surface, a side
 
 
-def plot_correlation(
-    window: Window, config: Optional[Config] = None, *, cluster_id: Optional[int] = None, title: Optional[str] = None
-) -> Figure:
+def plot_correlation(window: Window, config: Optional[Config] = None, *, cluster_id: Optional[int] = None) -> Figure:
     """How one cluster's motion is found: its pixels at t and t+1, and their normalised cross-correlation.
 
     Args:
         window: sweeps.
         config: of the dense method, clusters by components; None = the preset "paper", which leaves older sweeps out.
         cluster_id: as in `FlowResult`; None = the most conspicuous mover, see `stages.cluster_correlation`.
-        title: one line above; None = which cluster and what was found.
 
     Returns:
         Figure, 1600 pixels wide: the cluster at t, at t+1, both with t moved by the shift that the method takes, in
@@ -47,7 +44,7 @@ def plot_correlation(
         config, window = make_config("paper"), replace(window, pch=())
     found = cluster_correlation(window, config, cluster_id)
     figure, panels = _lay_out(found.images.t.shape)
-    style.add_heading(figure, 0.35, title or _title(found, config))
+    style.add_heading(figure, 0.35, _title(found, config))
     images, nothing = found.images, np.zeros_like(found.images.t)
     height, width = nothing.shape
     # A shift is shorter than the box: what leaves it does not come back from the other side.

@@ -42,7 +42,7 @@ def flow_figures(
     """A picture as `plot_flow` makes it for each of several pairs, for `save_animation`.
 
     Args:
-        frames: pairs, in order.
+        frames: at least one pair, in order.
         point_cloud_range: as for `plot_flow`; sides that are open end where the points of all frames end.
         max_flow: residual flow at the rim of the colour wheel, metres per sweep; None = the longest of all frames.
         legend: corner of the colour wheel, see `plot_flow`.
@@ -52,10 +52,8 @@ def flow_figures(
         Figures of one size, one at a time.
 
     Raises:
-        CFlowError: no frame, or as `plot_flow`.
+        CFlowError: another width, or as `plot_flow`.
     """
-    if not frames:
-        raise CFlowError("no frame: give at least one pair")
     if not 200 <= width <= 4000:
         raise CFlowError(f"width={width}: give 200 ... 4000 pixels")
     corners, longest = [], []

@@ -27,13 +27,12 @@ _ALONG = 9  # places of a line that a legend may hide
 _FADE = 0.72  # of the pixels behind the matches
 
 
-def plot_keypoints(window: Window, config: Optional[Config] = None, *, title: Optional[str] = None) -> Figure:
+def plot_keypoints(window: Window, config: Optional[Config] = None) -> Figure:
     """Key points of a pair of sweeps and their matches, close up where most of them move.
 
     Args:
         window: sweeps.
         config: of the key-point method; None = the preset "keypoints", which leaves older sweeps out.
-        title: one line above; None = how many key points and matches there are.
 
     Returns:
         Figure, 1600 pixels wide. Left: the pixels of both sweeps, the key points of t as dots. Right: a line from every
@@ -49,8 +48,7 @@ def plot_keypoints(window: Window, config: Optional[Config] = None, *, title: Op
         config, window = make_config("keypoints"), replace(window, pch=())
     found = keypoint_matches(window, config)
     low, high = busiest(found.start, found.end)
-    if title is None:
-        title = f"{len(found.key_points)} key points at t, {len(found.start)} of them matched; shown is a part"
+    title = f"{len(found.key_points)} key points at t, {len(found.start)} of them matched; shown is a part"
     style.add_heading(figure, 0.31, title)
     panels = [style.add_panel(figure, left, 0.9, 7.12, 5.1) for left in (0.64, 8.56)]
     for axes, fade, name in zip(panels, (0.0, _FADE), ("occupancy and key points", "matches")):

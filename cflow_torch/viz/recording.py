@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any, Iterable, List, Optional, Tuple, Union
 
 import numpy as np
 
+from cflow_torch.data.atomic import atomic_name
 from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.types import CFlowError, FlowResult, Sweep, as_numpy
 from cflow_torch.viz.clusters import cluster_colors
 from cflow_torch.viz.panel import ARROW_STEPS, MIN_ARROW_POINTS, MOVING, group_medians
 from cflow_torch.viz.wheel import flow_to_rgb
-from cflow_torch.viz.writing import whole_file
 
 if TYPE_CHECKING:
     import rerun
@@ -59,7 +59,7 @@ def record_log(
         Timelines: `sweep`, the index; `time`, where sweeps have times.
 
     Raises:
-        CFlowError: rerun-sdk is absent or too old, another ending, a `max_flow` that is not positive, no result at all,
+        CFlowError: rerun-sdk is absent, another ending, a `max_flow` that is not positive, no result at all,
             or a result with other rows than its sweep.
         OSError: the log cannot be read, or the file not be written. What `results` raises stays as it is, too.
 
@@ -68,8 +68,10 @@ def record_log(
     path = Path(path)
     if not 0 < max_flow < np.inf:
         raise CFlowError(f"max_flow={max_flow}: give a positive length in metres per sweep")
+    if path.suffix.lower() != ".rrd":
+        raise CFlowError(f"{path} does not end in .rrd: give a file that does")
     rr = load_rerun()
-    with whole_file(path, ".rrd") as temporary:
+    with atomic_name(path) as temporary:
         stream = rr.RecordingStream("cflow_torch", recording_id=f"{log.log_id}-{uuid.uuid4().hex}")
         stream.save(temporary)
         try:
@@ -87,14 +89,12 @@ def load_rerun() -> Any:
     """The package.
 
     Raises:
-        CFlowError: it is absent or too old.
+        CFlowError: it is absent.
     """
     try:
         import rerun as rr
     except ImportError as error:
         raise CFlowError("recordings need rerun-sdk (Python 3.9 or newer): pip install 'rerun-sdk>=0.23'") from error
-    if not hasattr(rr, "set_time"):
-        raise CFlowError(f"rerun-sdk {rr.__version__} is too old: pip install --upgrade rerun-sdk")
     return rr
 
 
@@ -112,7 +112,6 @@ class _Drive:
         self.count = 0
         self.has_truth = False
         self.first_pose: Optional[np.ndarray] = None
-        self.has_dates: Optional[bool] = None
         self.trajectory: List[np.ndarray] = []
 
     def add(self, index: int, pc0: Sweep, pc1: Sweep, result: FlowResult, labels: Optional[FlowLabels]) -> None:
@@ -174,13 +173,9 @@ class _Drive:
 
     def _set_time(self, index: int, timestamp_ns: Optional[int]) -> None:
         self.stream.set_time("sweep", sequence=index)
-        if timestamp_ns is None:
-            return
-        if self.has_dates is None:
-            self.has_dates = timestamp_ns >= _CALENDAR
-        if self.has_dates:
+        if timestamp_ns is not None and timestamp_ns >= _CALENDAR:
             self.stream.set_time("time", timestamp=np.datetime64(int(timestamp_ns), "ns"))
-        else:
+        elif timestamp_ns is not None:
             self.stream.set_time("time", duration=np.timedelta64(int(timestamp_ns), "ns"))
 
     def _move(self, pose: Any) -> None:

@@ -24,14 +24,13 @@ _SMALLEST = 4.0  # metres, half a side
 _MIN_POINTS = 30  # of the object that is shown
 
 
-def plot_scales(window: Window, config: Optional[Config] = None, *, title: Optional[str] = None) -> Figure:
+def plot_scales(window: Window, config: Optional[Config] = None) -> Figure:
     """Coarse to fine, one column per pixel size.
 
     Args:
         window: sweeps.
         config: of one of the paper's methods; None = the preset "paper" with pixels of 0.4, 0.2 and 0.1 m, which
             leaves older sweeps out.
-        title: one line above; None = the pixel sizes.
 
     Returns:
         Figure, 1600 pixels wide. Above, close up on the object where this changes most: sweep t moved by the flow of
@@ -61,10 +60,8 @@ def plot_scales(window: Window, config: Optional[Config] = None, *, title: Optio
         [style.add_panel(figure, left + i * (width + gap), bottom, width, width) for i in range(count)]
         for bottom in (above_y, below_y)
     )
-    style.add_heading(
-        figure, 0.32, title or "coarse to fine: " + " → ".join(f"{size:g} m" for size in config.pixel_sizes)
-    )
-    position = point_rows("points", window.pc0.points, None) + result.pose_flow.numpy()
+    style.add_heading(figure, 0.32, "coarse to fine: " + " → ".join(f"{size:g} m" for size in config.pixel_sizes))
+    position = point_rows("points", window.pc0.points) + result.pose_flow.numpy()
     _draw_near(above, position, found, result, alone)
     max_flow = _draw_flows(below, config, position, found, result, alone)
     for axes in (*above, *below):

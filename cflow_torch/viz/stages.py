@@ -157,10 +157,7 @@ def cluster_correlation(window: Window, config: Config, cluster_id: Optional[int
     if cluster_id is None:
         cluster_id = int(numbers[(np.linalg.norm(flow, axis=1) * count).argmax()])
     if cluster_id not in numbers:
-        raise CFlowError(
-            f"cluster_id={cluster_id}: no such cluster has points in both sweeps. There are {numbers[-1] + 1}; "
-            "cluster_id of a FlowResult tells which point is in which"
-        )
+        raise CFlowError(f"cluster_id={cluster_id}: no such cluster is in both sweeps; the last is {numbers[-1]}")
     sweeps, grid = last.sweeps, last.sweeps.grid
     clusters, _, _ = find_clusters(sweeps, config)
     pairs = make_pairs(clusters, sweeps.batch, grid.pixel_size, config.max_speed)
@@ -204,10 +201,7 @@ def keypoint_matches(window: Window, config: Config) -> KeyPointMatches:
 
 def _absent(config: Config, what: str, preset: str) -> CFlowError:
     """The error of a method that has no such thing to draw."""
-    why = ""
-    if config.method == "verified":
-        why = " (presets default and fast weigh the motions of all scales at once; draw their flow or their clusters)"
-    return CFlowError(f'method={config.method} has no {what}{why}: give make_config("{preset}"), or model={preset}')
+    return CFlowError(f'method={config.method} has no {what}: give make_config("{preset}"), or model={preset}')
 
 
 def _pair(sweeps: ProjectedSweeps) -> Occupancy:

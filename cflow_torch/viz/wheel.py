@@ -32,14 +32,12 @@ def flow_to_rgb(flow: Array, max_flow: Optional[float] = None) -> np.ndarray:
         `max_flow` gets darker. NaN and infinite flow is white.
 
     Raises:
-        CFlowError: no x and y, or `max_flow` not positive.
+        CFlowError: `max_flow` is not positive.
 
     Source: Baker et al., A Database and Evaluation Methodology for Optical Flow (2011); flowpy. The field's viewers cut
         the steps of their wheel to integers, so their colours differ by up to 2 levels.
     """
     vectors = as_numpy(flow).astype(np.float64)
-    if vectors.ndim == 0 or vectors.shape[-1] < 2:
-        raise CFlowError(f"flow has shape {vectors.shape}: give (..., 2) or wider, x and y in metres")
     if max_flow is not None and not max_flow > 0:
         raise CFlowError(f"max_flow={max_flow}: give a positive length in metres, or None for the longest flow")
 

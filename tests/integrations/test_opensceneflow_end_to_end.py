@@ -27,7 +27,7 @@ import miniature_opensceneflow as osf
 import pyarrow as pa
 import pyarrow.feather as feather
 from opensceneflow_labels import write_own_scene
-from opensceneflow_stubs.harness import BadRun, Harness, checked_text, printed, read_scores
+from opensceneflow_stubs.harness import Harness, printed, read_scores
 
 from cflow_torch.cli.main import main
 from cflow_torch.data.hdf5 import write_hdf5_scene
@@ -110,32 +110,6 @@ def approximately(scores: Dict[str, float]) -> Any:
     return pytest.approx(scores, rel=1e-5, abs=1e-9, nan_ok=True)  # the last digit may be rounded the other way
 
 
-# ------------------------------------------------------------------------------------------- the checker, always run
-
-GOOD = """
-EPE_FD     0.676812
-EPE_BS     0.0081513
-EPE_FS     0.0107423
-IoU        0
-Three-way  0.231902
-| Class          |       Static |   Dynamic |
-| OTHER_VEHICLES | nan          |       nan |
-| Mean           |   0.00942622 |       nan |
-"""
-
-
-def test_checker_takes_a_good_run_and_refuses_a_failed_or_empty_one() -> None:
-    first, second = read_scores(checked_text(0, GOOD + GOOD.replace("0.676812", "0.5")))
-    expected = {"EPE_FD": 0.676812, "EPE_BS": 0.0081513, "EPE_FS": 0.0107423, "IoU": 0.0, "Three-way": 0.231902}
-    assert first == pytest.approx({**expected, "static": 0.00942622, "dynamic": np.nan}, abs=0, nan_ok=True)
-    assert second["EPE_FD"] == 0.5
-    swallowed = f"==> Exception occur during training/validation step: a fault. Skip this batch.\n{GOOD}"
-    no_mean, nothing_scored = GOOD.replace("| Mean ", "| Average "), GOOD.replace("0.00942622", "nan")
-    for status, text in ((1, GOOD), (0, swallowed), (0, ""), (0, no_mean), (0, nothing_scored)):
-        with pytest.raises(BadRun):
-            read_scores(checked_text(status, text))
-
-
 # ------------------------------------------------------------------------------------------------ CorrelationFlow
 
 
@@ -156,15 +130,6 @@ def test_eval_of_the_real_pair(harness: Harness, checkpoint: Path, av2_folder: P
     out = tmp_path / "out"
     main(["eval", "data=hdf5", f"data.root={tmp_path / 'val'}", f"output={out}", "model.min_height=null"])
     assert found == approximately(printed(json.loads((out / "results.json").read_text())["results"]))
-
-
-@pytest.mark.slow
-def test_sweep(harness: Harness, checkpoint: Path, data: Path) -> None:
-    """Three values by the harness's own -m."""
-    wanted = ["-m", "model=cflow", *places(checkpoint, data), TARGET_PIXELS, "model.target.num_frames=2,3,4"]
-    jobs = read_scores(harness.run("frames", "eval.py", *wanted))
-    assert jobs == [approximately(replayed(data, module(pixel_sizes=PIXELS, num_frames=n))) for n in (2, 3, 4)]
-    assert len({json.dumps(job) for job in jobs}) == 3
 
 
 @pytest.mark.slow

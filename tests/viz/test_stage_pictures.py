@@ -141,9 +141,9 @@ def test_key_points_draw_the_matches_and_the_wheel_hides_none(monkeypatch: pytes
 def test_every_text_is_inside_its_picture() -> None:
     sweeps = scene(4)
     figures = [
-        plot_correlation(sweeps, paper(), title="log $_$ 1"),
-        plot_keypoints(sweeps, keypoints(), title="log $_$ 1"),
-        plot_scales(sweeps, paper(**TWO_SIZES), title="log $_$ 1"),
+        plot_correlation(sweeps, paper()),
+        plot_keypoints(sweeps, keypoints()),
+        plot_scales(sweeps, paper(**TWO_SIZES)),
         plot_scales(sweeps, paper(pixel_sizes=(1.6, 0.8, 0.6, 0.4, 0.2, 0.15))),
     ]
     for figure in figures:
@@ -170,8 +170,8 @@ def test_nothing_to_draw() -> None:
 @pytest.mark.parametrize(
     ("plot", "settings", "message"),
     [
-        (plot_correlation, make_config("default"), r"method=verified.*presets default and fast.*model=paper"),
-        (plot_scales, make_config("fast"), r"method=verified.*presets default and fast.*model=paper"),
+        (plot_correlation, make_config("default"), r"method=verified.*model=paper"),
+        (plot_scales, make_config("fast"), r"method=verified.*model=paper"),
         (plot_keypoints, make_config("fast"), r"method=verified.*model=keypoints"),
         (plot_keypoints, paper(), "method=dense has no key points.*model=keypoints"),
         (plot_correlation, keypoints(), "method=keypoints has no correlation map.*model=paper"),

@@ -3,16 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 
 from cflow_torch.viz import flow_to_rgb, wheel_image
-
-
-def test_primary_hues() -> None:
-    steps = {0: (255, 0, 0), 15: (255, 255, 0), 21: (0, 255, 0), 25: (0, 255, 255), 36: (0, 0, 255), 49: (255, 0, 255)}
-    for step, color in steps.items():
-        angle = 2 * np.pi * step / 54
-        assert tuple(flow_to_rgb(np.array([np.cos(angle), np.sin(angle)]))) == color
 
 
 def test_axes_of_the_ego_frame() -> None:
@@ -26,13 +18,6 @@ def test_saturation_follows_length() -> None:
     red = flow_to_rgb(np.array([[0.0, 0], [0.25, 0], [0.5, 0], [1, 0], [2, 0]]), max_flow=1.0)
     assert red.tolist() == [[255, 255, 255], [255, 191, 191], [255, 128, 128], [255, 0, 0], [128, 0, 0]]
     assert (flow_to_rgb(np.array([[np.nan, 0.0], [np.inf, 1.0]])) == 255).all()
-
-
-def test_longest_flow_sets_the_scale_and_z_is_ignored() -> None:
-    flow = np.array([[0.0, 0.2, 9.0], [0.4, 0.0, 0.0]])
-    assert (flow_to_rgb(flow) == flow_to_rgb(flow, 0.4)).all()
-    assert (flow_to_rgb(torch.from_numpy(flow)) == flow_to_rgb(flow[:, :2])).all()
-    assert flow_to_rgb(np.zeros((0, 3))).shape == (0, 3)
 
 
 def test_wheel_image_has_the_axes_of_the_picture() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Dict, Iterable, List, Mapping, Optional, Sequence, Union
@@ -72,7 +71,7 @@ def plan_log(
     safe_name(log.log_id, "the log")
     pairs = range(len(log.timestamps) - 1)
     if listed is not None:
-        indices = [_position(log, stamp) for stamp in sorted(listed.get(log.log_id, ()))]
+        indices = [_position(log, stamp) for stamp in sorted(set(listed.get(log.log_id, ())))]
     else:
         by_mask = version.frames == "evaluated"
         indices = [i for i in pairs if by_mask and log_mask(log, i) is not None] or list(pairs[::STRIDE])
@@ -80,37 +79,28 @@ def plan_log(
 
 
 def read_frame_list(file: Union[str, Path]) -> Dict[str, List[int]]:
-    """A list of frames: plain text, one `<log>/<time stamp>` a line (a blank or comma does as well), # for comments.
+    """A list of frames: plain text, one `<log>/<time stamp>` a line, # for comments.
 
     Returns:
         Log id -> time stamps.
 
     Raises:
-        CFlowError: the file cannot be read, is a pickle, names a frame twice, or a line is no frame.
+        CFlowError: the file is no text, cannot be read, or a line is no frame.
     """
     file = Path(file)
-    if file.suffix in (".pkl", ".pickle"):
-        raise CFlowError(
-            f"{file} is a pickle, which could run any code, so it is not read: give a text file with one "
-            "<log>/<time stamp> a line, or leave the list out where the scenes carry eval_mask"
-        )
     try:
         lines = read_bytes(file, MAX_LIST_BYTES).decode("utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise CFlowError(f"{file} cannot be read as a list of frames ({error})") from error
+        raise CFlowError(f"{file} cannot be read as a text file of frames ({error})") from error
     result: Dict[str, List[int]] = {}
     for number, line in enumerate(lines, 1):
         entry = line.partition("#")[0].strip()
         if not entry:
             continue
-        log, *stamps = re.split(r"[\s,/]+", entry)
-        if not log or len(stamps) != 1 or not is_stamp(stamps[0]):
+        log, _, stamp = entry.rpartition("/")
+        if not log or not is_stamp(stamp):
             raise CFlowError(f"{file}, line {number}: {entry!r} is no frame; write <log>/<time stamp>")
-        if int(stamps[0]) in result.setdefault(log, []):
-            raise CFlowError(f"{file}, line {number}: {entry!r} is listed twice")
-        result[log].append(int(stamps[0]))
-    if not result:
-        raise CFlowError(f"{file} lists no frame")
+        result.setdefault(log, []).append(int(stamp))
     return result
 
 
@@ -132,6 +122,5 @@ def require_logs(logs: Iterable[Log], listed: Optional[Mapping[str, Sequence[int
 def _position(log: Log, timestamp: int) -> int:
     stamps = list(log.timestamps)
     if timestamp not in stamps[:-1]:
-        what = "is the last sweep of its log: it has no flow" if timestamp in stamps else "is no sweep of the log"
-        raise CFlowError(f"{log.log_id}/{timestamp} is listed but {what}")
+        raise CFlowError(f"{log.log_id}/{timestamp} is listed but is no sweep of the log, or its last: it has no flow")
     return stamps.index(timestamp)

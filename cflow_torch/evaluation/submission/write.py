@@ -1,11 +1,12 @@
-"""Files of a submission folder, each whole or absent."""
+"""Files of a submission folder, each whole or absent, and their zip: the same bytes every time."""
 
 from __future__ import annotations
 
 import json
+import zipfile
 from functools import partial
 from pathlib import Path
-from typing import Mapping, Union
+from typing import Iterable, Mapping, Union
 
 import numpy as np
 import pyarrow as pa
@@ -17,6 +18,8 @@ from cflow_torch.data.paths import read_bytes
 from cflow_torch.evaluation.submission.check import check_file
 from cflow_torch.evaluation.submission.plan import Frame
 from cflow_torch.evaluation.submission.versions import METADATA_FILE, SubmissionVersion
+
+_EARLIEST = (1980, 1, 1, 0, 0, 0)  # the first time that a zip can hold
 
 
 def write_frame(folder: Union[str, Path], name: str, columns: Mapping[str, np.ndarray]) -> None:
@@ -47,3 +50,28 @@ def write_metadata(folder: Union[str, Path], version: SubmissionVersion) -> None
 def is_complete(folder: Union[str, Path], frame: Frame, version: SubmissionVersion) -> bool:
     """Whether a frame's file is there already and passes every check."""
     return not check_file(frame.name, partial(read_bytes, Path(folder) / frame.name), frame.rows, version)
+
+
+def pack(folder: Union[str, Path], names: Iterable[str], file: Union[str, Path], version: SubmissionVersion) -> None:
+    """Zip the files of a submission folder, atomically.
+
+    Args:
+        folder: root of the submission.
+        names: frames to take.
+        file: the zip to write.
+        version: its metadata file is added if it has one.
+
+    Convention: entries sorted by name, dated 1980-01-01, mode 0644, deflated: the same files and the same zlib give
+        the same bytes.
+
+    Raises:
+        OSError: a file is missing; then there is no zip.
+    """
+    folder = Path(folder)
+    entries = sorted({*names, *([METADATA_FILE] if version.metadata is not None else [])})
+    with atomic_file(file) as raw, zipfile.ZipFile(raw, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name in entries:
+            entry = zipfile.ZipInfo(name, _EARLIEST)
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            entry.create_system, entry.external_attr = 3, 0o100644 << 16
+            archive.writestr(entry, (folder / name).read_bytes())

@@ -17,7 +17,7 @@ def main() -> None:
     arguments = parser.parse_args()
     try:
         print(f"wrote {write_null_checkpoint(arguments.file, overwrite=arguments.overwrite)}")
-    except CFlowError as error:
+    except (CFlowError, OSError) as error:
         sys.exit(f"error: {error}")
 
 

@@ -75,8 +75,8 @@ def _points(batch: Mapping[str, Any], b: int, name: str) -> Tuple[Tensor, Tensor
     """Points of one sweep that are finite and not ground, and their rows."""
     key = f"pc{name}"
     points = _entry(batch, key, b)
-    if not isinstance(points, Tensor) or points.ndim != 2 or points.shape[1] < 3 or not points.is_floating_point():
-        raise CFlowError(f"batch['{key}'][{b}] is {_described(points)}: give a floating-point tensor of shape (N, 3)")
+    if not isinstance(points, Tensor) or points.ndim != 2 or points.shape[1] < 3:
+        raise CFlowError(f"batch['{key}'][{b}] is {_described(points)}: give a tensor of shape (N, 3)")
     wanted = points[:, :3].isfinite().all(dim=1)
     mask_key = f"gm{name}"
     if mask_key in batch:
@@ -107,7 +107,7 @@ def _extrinsics(batch: Mapping[str, Any], b: int, ego_T_lidar: Any) -> Optional[
     is_ground = _mask(batch, "gm0", b)
     points = _entry(batch, "origin_pc0" if "origin_pc0" in batch else "pc0", b)
     stamp = _entry(batch, "timestamp", b)
-    stamp = str(stamp.item() if isinstance(stamp, Tensor) and stamp.numel() == 1 else stamp)
+    stamp = str(stamp.item() if isinstance(stamp, Tensor) else stamp)
     if is_ground.numel() != len(points) or not stamp.isdigit():
         return None
     found = recognized_extrinsics(int(stamp), points.cpu().numpy(), is_ground.cpu().numpy())
@@ -126,9 +126,7 @@ def _entry(batch: Mapping[str, Any], key: str, b: int) -> Any:
     try:
         return value[b]
     except (IndexError, TypeError, KeyError):
-        raise CFlowError(
-            f"batch['{key}'] is {_described(value)}: give one entry per sample, as batch['pose0']"
-        ) from None
+        raise CFlowError(f"batch['{key}'] is {_described(value)}: give one entry per sample") from None
 
 
 def _described(value: Any) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import warnings
 from dataclasses import fields
 from typing import Any, Dict, List, Mapping, Optional
@@ -11,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from cflow_torch.config import REMOVED, Config, make_config
+from cflow_torch.config import Config, make_config
 from cflow_torch.data.hdf5.frames import beside_harness, harness_pose_flow
 from cflow_torch.estimate import make_model
 from cflow_torch.integrations.opensceneflow.batch import Sample, read_batch
@@ -71,9 +70,7 @@ class CFlow(nn.Module):
         super().__init__()
         config: Config = make_config(preset, method)
         names = ["pixel_size", *(f.name for f in fields(config) if f.name not in ("method", "num_history"))]
-        unknown = [
-            name + (f" ({REMOVED[name]})" if name in REMOVED else "") for name in sorted(settings) if name not in names
-        ]
+        unknown = [name for name in sorted(settings) if name not in names]
         if unknown:
             known = f"method={config.method!r} has {', '.join(names)} (history is set by num_frames)"
             warnings.warn(f"settings without effect: {', '.join(unknown)}; {known}", stacklevel=2)
@@ -84,10 +81,7 @@ class CFlow(nn.Module):
             raise CFlowError(f"output={output!r}: give one of {', '.join(map(repr, OUTPUTS))}")
         self.output = output
         self.ego_T_lidar = _extrinsics(ego_T_lidar)
-        try:
-            self.timer: Any = importlib.import_module("dztimer").Timing()
-        except ImportError:
-            self.timer = SilentTimer()
+        self.timer = SilentTimer()
         self._said_short = False
 
     def forward(self, batch: Mapping[str, Any]) -> Dict[str, List[Tensor]]:
@@ -111,10 +105,9 @@ class CFlow(nn.Module):
         samples = read_batch(batch, num_history, self.ego_T_lidar)
         self._say_short(samples, num_history)
         results = self.estimator([sample.window for sample in samples])
-        device = results[0].flow.device if results else torch.device("cpu")
-        with torch.no_grad(), torch.autocast(device.type, enabled=False):
+        with torch.no_grad(), torch.autocast(results[0].flow.device.type, enabled=False):
             answers = [self._answer(batch, b, *pair) for b, pair in enumerate(zip(samples, results))]
-        return {key: [answer[key] for answer in answers] for key in (answers[0] if answers else ())}
+        return {key: [answer[key] for answer in answers] for key in answers[0]}
 
     def _answer(self, batch: Mapping[str, Any], b: int, sample: Sample, result: FlowResult) -> Dict[str, Tensor]:
         """The output of one sample."""
@@ -141,7 +134,7 @@ class CFlow(nn.Module):
 
     def _say_short(self, samples: List[Sample], num_history: int) -> None:
         """Once: the harness gives less history than asked for."""
-        given = min((len(sample.window.pch) for sample in samples), default=num_history)
+        given = min(len(sample.window.pch) for sample in samples)
         if given < num_history and not self._said_short:
             self._said_short = True
             warnings.warn(
@@ -153,15 +146,11 @@ class CFlow(nn.Module):
 
 
 def _with_history(config: Config, num_frames: Any) -> Config:
-    if num_frames is None:
+    if num_frames is None or (config.method == "keypoints" and num_frames == 2):
         return config
-    if isinstance(num_frames, bool) or not isinstance(num_frames, int) or num_frames < 2:
-        raise CFlowError(f"num_frames={num_frames!r}: give a whole number of at least 2; history is num_frames - 2")
-    if config.method != "keypoints":
-        return config.replace(num_history=num_frames - 2)
-    if num_frames > 2:
-        raise CFlowError(f"method='keypoints' matches one pair of sweeps: give num_frames=2, got {num_frames}")
-    return config
+    if not isinstance(num_frames, int) or num_frames < 2 or config.method == "keypoints":
+        raise CFlowError(f"num_frames={num_frames!r}: give a whole number of at least 2; for key points, 2")
+    return config.replace(num_history=num_frames - 2)
 
 
 def _extrinsics(ego_T_lidar: Any) -> Any:
