@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 from pathlib import Path
 from typing import Any, List, Optional
@@ -10,7 +11,7 @@ import numpy as np
 from numpy.lib import format as npy
 
 from cflow_torch.data.file_errors import file_errors
-from cflow_torch.data.paths import whole
+from cflow_torch.data.paths import read_bytes
 from cflow_torch.data.pickles import NUMPY_ARRAYS, StandIn, load_plain
 from cflow_torch.types import CFlowError
 
@@ -18,7 +19,7 @@ _MEND = "copy it from the data set"
 
 
 class Cloud:
-    """One npz, open; arrays are read when asked for.
+    """One npz in memory; arrays are unpacked when asked for.
 
     Args:
         file: where it is.
@@ -30,7 +31,7 @@ class Cloud:
     def __init__(self, file: Path) -> None:
         self.file = file
         with file_errors(file, _MEND):
-            self._arrays = np.load(whole(file), allow_pickle=False)
+            self._arrays = np.load(io.BytesIO(read_bytes(file)), allow_pickle=False)
             self._keys = list(self._arrays.files)
 
     def numbers(self, key: str, columns: int) -> np.ndarray:
