@@ -10,7 +10,6 @@ from typing import Any, Callable, Dict, Optional
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.paths import read_bytes
 
-MAX_JSON_BYTES = 64 << 20  # of a document; the largest that belongs to a log has about 10 MB
 _SHORT = reprlib.Repr()
 _SHORT.maxlist, _SHORT.maxstring, _SHORT.maxother = 12, 80, 80
 
@@ -22,10 +21,10 @@ def read_json(file: Path) -> Any:
         needs finite ones checks, since 1e999 is infinite too.
 
     Raises:
-        CFlowError: more than `MAX_JSON_BYTES`, not UTF-8, or no JSON.
+        CFlowError: not UTF-8, or no JSON.
         OSError: as `read_bytes`.
     """
-    return parse_json(read_bytes(file, MAX_JSON_BYTES), file)
+    return parse_json(read_bytes(file), file)
 
 
 def parse_json(data: bytes, file: Any, use: Optional[Callable[[Dict[str, Any]], Any]] = None) -> Any:

@@ -16,7 +16,7 @@ import tempfile
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path, PosixPath, WindowsPath
-from typing import Any, Iterator, Optional, Union
+from typing import Any, Iterator, Union
 
 import pyarrow as pa
 
@@ -96,25 +96,21 @@ def forget_listings(path: Any) -> None:
         path.fs.invalidate_cache()
 
 
-def read_bytes(path: Path, most: Optional[int] = None) -> bytes:
+def read_bytes(path: Path) -> bytes:
     """All of a file, in one request if it is remote.
 
     Args:
         path: of a regular file. Reading a device or a pipe, which an unpacked archive can hold, would never end.
-        most: bytes that it may have.
 
     Raises:
-        CFlowError: it has more.
         OSError: as for a local file, and if the far side cannot be reached.
     """
     if not is_remote(path):
-        _check_size(path, _size(path), most)
+        _size(path)
         return path.read_bytes()
     remote: Any = path
     with remote_errors(path):
-        data = bytes(remote.fs.cat_file(remote.path))  # pathlib's own way asks for the size first
-    _check_size(path, len(data), most)
-    return data
+        return bytes(remote.fs.cat_file(remote.path))  # pathlib's own way asks for the size first
 
 
 def whole(path: Path) -> Any:
@@ -174,8 +170,3 @@ def _size(path: Path) -> int:
     if not stat.S_ISREG(status.st_mode) and not stat.S_ISDIR(status.st_mode):
         raise OSError(errno.EINVAL, "is a device or a pipe, no file", str(path))
     return status.st_size
-
-
-def _check_size(path: Path, size: int, most: Optional[int]) -> None:
-    if most is not None and size > most:
-        raise CFlowError(f"{path} has {size} bytes, up to {most} are read; is it the right file?")

@@ -17,10 +17,3 @@ def test_what_is_no_json_is_refused_by_the_name_of_the_file(content: bytes, tmp_
     with pytest.raises(CFlowError, match="cannot read .*a.json as JSON") as error:
         read_json(file)
     assert len(str(error.value)) < 700
-
-
-def test_large_files_are_not_read(tmp_path: Path) -> None:
-    with open(tmp_path / "large.json", "wb") as file:
-        file.truncate(65 << 20)
-    with pytest.raises(CFlowError, match="68157440 bytes, up to 67108864"):
-        read_json(tmp_path / "large.json")

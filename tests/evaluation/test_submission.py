@@ -207,7 +207,6 @@ SPOILED: Dict[str, Any] = {
     ),
     "foreign column": (3, in_table(lambda t: t.append_column("score", t["flow_tx_m"])), "flow_tz_m, score, expected"),
     "truncated": (3, lambda data: data[: len(data) // 2], "cannot be read"),
-    "far too large": (2, lambda data: data + bytes(1 << 24), "bytes"),
 }
 
 
@@ -325,7 +324,7 @@ def test_official_masks_win(log: AV2Log, tmp_path: Path) -> None:
     for index, broken, message in ((3, short, "rows"), (3, numbers, "one bool column"), (2, masks, "cannot read")):
         with pytest.raises(CFlowError, match=message):
             point_mask(log, index, sweep, broken)
-    with pytest.raises(CFlowError, match="cannot be read as a zip"):
+    with pytest.raises(CFlowError, match="not a zip"):
         MaskArchive(__file__)
 
 

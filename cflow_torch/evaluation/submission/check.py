@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zipfile
 from functools import partial
 from pathlib import Path
 from typing import Any, Callable, Dict, List, Mapping, Sequence, Union
@@ -10,15 +11,14 @@ from typing import Any, Callable, Dict, List, Mapping, Sequence, Union
 import numpy as np
 
 from cflow_torch.data.arrow_file import FeatherFile
+from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.json_file import parse_json
 from cflow_torch.data.paths import read_bytes
-from cflow_torch.data.zips import member_names, open_zip, read_member
 from cflow_torch.evaluation.submission.plan import Frame
 from cflow_torch.evaluation.submission.versions import METADATA_FILE, SubmissionVersion
 from cflow_torch.types import CFlowError
 
 _DTYPES = {"halffloat": "float16", "float": "float32", "double": "float64"}  # Arrow's names -> NumPy's
-_ROW_BYTES, _OTHER_BYTES = 64, 1 << 20  # a row has four columns of at most 8 bytes; metadata take some kilobytes
 
 
 def check_submission(path: Union[str, Path], version: SubmissionVersion, expected: Sequence[Frame]) -> List[str]:
@@ -52,7 +52,7 @@ def check_submission(path: Union[str, Path], version: SubmissionVersion, expecte
     return problems
 
 
-def open_archive(path: Union[str, Path]) -> Dict[str, Callable[[int], bytes]]:
+def open_archive(path: Union[str, Path]) -> Dict[str, Callable[[], bytes]]:
     """The files of a zip or folder.
 
     Args:
@@ -60,8 +60,7 @@ def open_archive(path: Union[str, Path]) -> Dict[str, Callable[[int], bytes]]:
             `pack` takes none.
 
     Returns:
-        Name -> function that reads the file, given the bytes that it may have at most; sorted by name. It raises
-        `CFlowError` or `OSError`.
+        Name -> function that reads the file.
 
     Raises:
         CFlowError: neither a zip nor a folder.
@@ -76,26 +75,28 @@ def open_archive(path: Union[str, Path]) -> Dict[str, Callable[[int], bytes]]:
         }
     if not path.is_file():
         raise CFlowError(f"{path} does not exist; give a zip, or the folder that it is made from")
-    archive = open_zip(path)
-    return {name: partial(read_member, archive, name) for name in member_names(archive)}
+    with file_errors(path):
+        archive = zipfile.ZipFile(path)
+    return {name: partial(archive.read, name) for name in archive.namelist() if not name.endswith("/")}
 
 
-def check_file(name: str, read: Callable[[int], bytes], rows: int, version: SubmissionVersion) -> List[str]:
+def check_file(name: str, read: Callable[[], bytes], rows: int, version: SubmissionVersion) -> List[str]:
     """All problems of one frame's file, or of the metadata.
 
     Args:
         name: inside of the archive.
-        read: gives the contents, told the bytes that there may be at most.
+        read: gives the contents.
         rows: number of rows that it must have.
         version: the format.
     """
     try:
-        data = read(_OTHER_BYTES + _ROW_BYTES * rows)
-        if name == METADATA_FILE:
-            problems = _check_metadata(parse_json(data, name), version.metadata or {})
-        else:
-            problems = _check_frame(FeatherFile(name, data), rows, version)
-    except (CFlowError, OSError) as error:
+        with file_errors(name):  # a damaged zip makes zipfile raise nearly anything
+            data = read()
+            if name == METADATA_FILE:
+                problems = _check_metadata(parse_json(data, name), version.metadata or {})
+            else:
+                problems = _check_frame(FeatherFile(name, data), rows, version)
+    except CFlowError as error:
         problems = [f"cannot be read ({' '.join(str(error).split())[:400]})"]
     return [f"{name}: {problem}" for problem in problems]
 

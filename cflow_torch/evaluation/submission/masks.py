@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import zipfile
 from pathlib import Path
 from typing import Dict, List, Optional, Union
 
@@ -10,11 +11,10 @@ import numpy as np
 import pyarrow as pa
 
 from cflow_torch.data.arrow_file import FeatherFile
+from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.log import Log
-from cflow_torch.data.zips import member_names, open_zip, read_member
 from cflow_torch.types import CFlowError, Sweep, as_numpy
 
-MAX_MASK_BYTES = 1 << 26  # of one mask's file; one of 100,000 points takes some kilobytes
 _MASK = re.compile(r"(?P<log>.+)/(?P<stamp>0|[1-9][0-9]{0,18})\.feather", re.ASCII)
 _HALF_SIDE = 50.0  # metres; the official masks hold the points that are not ground with |x|, |y| <= 50
 
@@ -35,8 +35,9 @@ class MaskArchive:
     def __init__(self, file: Union[str, Path]) -> None:
         self.file = Path(file)
         self.frames: Dict[str, List[int]] = {}
-        self._zip = open_zip(self.file)
-        for match in map(_MASK.fullmatch, member_names(self._zip)):
+        with file_errors(self.file):
+            self._zip = zipfile.ZipFile(self.file)
+        for match in map(_MASK.fullmatch, sorted(self._zip.namelist())):
             if match is not None:
                 self.frames.setdefault(match["log"], []).append(int(match["stamp"]))
         if not self.frames:
@@ -49,11 +50,9 @@ class MaskArchive:
             CFlowError: no mask for this sweep, or it cannot be read.
         """
         name = f"{log_id}/{timestamp}.feather"
-        try:
-            file = FeatherFile(name, read_member(self._zip, name, MAX_MASK_BYTES))
+        with file_errors(f"{self.file}: {name}"):
+            file = FeatherFile(name, self._zip.read(name))
             columns = file.read(file.names).columns
-        except CFlowError as error:
-            raise CFlowError(f"{self.file}: cannot read {name} ({error})") from error
         if len(columns) != 1 or not pa.types.is_boolean(columns[0].type) or columns[0].null_count:
             raise CFlowError(f"{self.file}: {name} must hold one bool column without empty values")
         return columns[0].to_numpy()

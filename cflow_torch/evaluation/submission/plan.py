@@ -14,7 +14,6 @@ from cflow_torch.evaluation.submission.versions import SubmissionVersion
 from cflow_torch.types import CFlowError
 
 STRIDE = 5  # every fifth pair of a log is evaluated
-MAX_LIST_BYTES = 1 << 24  # of a list of frames; one of 10,000 has less than a megabyte
 
 
 @dataclass(frozen=True)
@@ -89,7 +88,7 @@ def read_frame_list(file: Union[str, Path]) -> Dict[str, List[int]]:
     """
     file = Path(file)
     try:
-        lines = read_bytes(file, MAX_LIST_BYTES).decode("utf-8").splitlines()
+        lines = read_bytes(file).decode("utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise CFlowError(f"{file} cannot be read as a text file of frames ({error})") from error
     result: Dict[str, List[int]] = {}
