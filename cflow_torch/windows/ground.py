@@ -20,7 +20,7 @@ from torch import Tensor
 from cflow_torch.ops.lower_surface import UNKNOWN, lower_surface
 from cflow_torch.types import Array, CFlowError, Sweep, Window
 from cflow_torch.windows.ground_plane import REACH, millimetres, near_plane, order_statistics
-from cflow_torch.windows.validation import check_plain, choose_device, read_positions
+from cflow_torch.windows.validation import check_points, choose_device, read_positions
 
 METHODS = ("grid", "patchwork")
 THRESHOLD = 0.3  # metres above the surface; the rule of the Argoverse 2 raster
@@ -130,7 +130,7 @@ def has_ground(clouds: Sequence[Array], most_points: int = 30_000, device: Any =
     if not clouds:
         return []
     for number, cloud in enumerate(clouds):
-        _check(cloud, number)
+        check_points(cloud, f"points of sweep {number}")
     thinned = [cloud[:: max(1, -(-cloud.shape[0] // most_points))] for cloud in clouds]
     positions, sweep = _stack(thinned, device)
     points, inside = millimetres(positions)
@@ -165,7 +165,7 @@ def ground_points(positions: Tensor, sweep: Tensor, num_sweeps: int, threshold: 
 def _stack(clouds: Sequence[Array], device: Any) -> Tuple[Tensor, Tensor]:
     """(3, N) float64 positions of all clouds and (N,) int64 cloud of each, on one device."""
     for number, cloud in enumerate(clouds):
-        _check(cloud, number)
+        check_points(cloud, f"points of sweep {number}")
     sweeps = [Sweep(cloud) for cloud in clouds]
     chosen = choose_device([Window(sweep, sweep) for sweep in sweeps], device)
     positions = [read_positions(sweep, chosen) for sweep in sweeps]
@@ -173,16 +173,6 @@ def _stack(clouds: Sequence[Array], device: Any) -> Tuple[Tensor, Tensor]:
     count = torch.tensor([part.shape[1] for part in positions], device=chosen)
     of_point = torch.arange(len(clouds), device=chosen).repeat_interleave(count, output_size=together.shape[1])
     return together, of_point
-
-
-def _check(cloud: Any, number: int) -> None:
-    check_plain(cloud, f"points of sweep {number}")
-    if not isinstance(cloud, (np.ndarray, Tensor)) or cloud.ndim != 2 or cloud.shape[1] < 3:
-        given = tuple(cloud.shape) if isinstance(cloud, (np.ndarray, Tensor)) else type(cloud).__name__
-        raise CFlowError(f"points of sweep {number} are {given}: give an array or tensor of shape (N, 3+), metres")
-    is_float = cloud.is_floating_point() if isinstance(cloud, Tensor) else np.issubdtype(cloud.dtype, np.floating)
-    if not is_float:
-        raise CFlowError(f"points of sweep {number} have dtype {cloud.dtype}: give floating-point metres")
 
 
 def _patchwork(positions: Tensor, sweep: Tensor, num_sweeps: int) -> Tensor:

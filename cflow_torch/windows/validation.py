@@ -42,7 +42,7 @@ def check_windows(windows: Any, config: Optional[Config] = None) -> None:
         for name, sweep in _named_sweeps(window):
             if not isinstance(sweep, Sweep):
                 raise CFlowError(f"{name} is {type(sweep).__name__}: give cflow_torch.Sweep(points, ...)")
-            _check_points(sweep.points, name)
+            check_points(sweep.points, name)
             if config is not None:
                 _check_resolution(sweep.points.dtype, name, config)
 
@@ -74,7 +74,8 @@ def _named_sweeps(window: Window) -> List[Tuple[str, Sweep]]:
     return [("pc1", window.pc1), ("pc0", window.pc0), *older]
 
 
-def _check_points(points: Any, name: str) -> None:
+def check_points(points: Any, name: str) -> None:
+    """Refuse what is not (N, 3+) floats."""
     if not isinstance(points, (np.ndarray, Tensor)):
         raise CFlowError(f"{name} is {type(points).__name__}: give a NumPy array or a torch tensor of shape (N, 3+)")
     check_plain(points, name)
@@ -181,27 +182,22 @@ def choose_device(windows: Sequence[Window], device: Any) -> torch.device:
     if not (isinstance(device, str) and device == "auto"):
         try:
             torch.empty(0, device=device)
-            if torch.device(device).type == "meta":
-                raise RuntimeError("it holds no numbers")
-            return torch.device(device)
+            chosen = torch.device(device)
         except (RuntimeError, TypeError, AssertionError) as error:
             reason = str(error).splitlines()[0]
             raise CFlowError(f"device={device!r} cannot be used ({reason}): give 'auto', 'cpu' or 'cuda'") from None
-    found = {
-        array.device
-        for window in windows
-        for _, sweep in _named_sweeps(window)
-        for array in (sweep.points, sweep.is_ground)
-        if isinstance(array, Tensor)
-    }
-    if {one.type for one in found} == {"meta"}:
-        raise CFlowError("tensors lie on the device 'meta', which holds no numbers: give tensors with values")
-    if len(found) > 1:
-        names = ", ".join(sorted(str(d) for d in found))
-        raise CFlowError(f"tensors lie on different devices ({names}): put them on one, or pass device=...")
-    if found:
-        return found.pop()
-    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    else:
+        arrays = [
+            a for window in windows for _, sweep in _named_sweeps(window) for a in (sweep.points, sweep.is_ground)
+        ]
+        found = {array.device for array in arrays if isinstance(array, Tensor)}
+        if len(found) > 1:
+            names = ", ".join(sorted(str(d) for d in found))
+            raise CFlowError(f"tensors lie on different devices ({names}): put them on one, or pass device=...")
+        chosen = found.pop() if found else torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    if chosen.type == "meta":
+        raise CFlowError("the device 'meta' holds no numbers: give tensors with values, and 'auto', 'cpu' or 'cuda'")
+    return chosen
 
 
 def read_positions(sweep: Sweep, device: torch.device, rows: slice = _ALL_ROWS) -> Tensor:
