@@ -22,24 +22,17 @@ def check_log(log: Log) -> None:
         log: any log. A sweep that cannot be read is passed over: it is reported when its turn comes.
 
     Warns:
-        GroundWarning: see `check_ground`.
+        GroundWarning: the first sweep has ground points, but no mask that says so.
         StaticWorldWarning: see `check_static_world`.
 
     Cost: reads up to five sweeps; about 0.3 s.
     """
-    for check in (check_ground, check_static_world):
+    for check in (_check_ground, check_static_world):
         with suppress(CFlowError, OSError):
             check(log)
 
 
-def check_ground(log: Log) -> None:
-    """Warn if the first sweep has ground points, but no mask that says so.
-
-    Warns:
-        GroundWarning: once.
-
-    Cost: reads one sweep; some milliseconds.
-    """
+def _check_ground(log: Log) -> None:
     sweep = log.sweep(0)
     if sweep.is_ground is None and has_ground([sweep.points])[0]:
         warnings.warn(

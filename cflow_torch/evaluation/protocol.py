@@ -52,7 +52,6 @@ def score_data_sets(
     results: Mapping[str, Mapping[str, Optional[float]]],
     data_sets: Optional[Sequence[str]] = None,
     ranges: Optional[Sequence[str]] = None,
-    missing: str = "error",
 ) -> ProtocolScores:
     """Combine the errors of several data sets.
 
@@ -60,18 +59,14 @@ def score_data_sets(
         results: data set -> range -> error, for example `{"AV2": errors_by_range(scores)}`; NaN or None = no value.
         data_sets: those that must be there, for example `CHALLENGE_DATA_SETS`; None = those of `results`.
         ranges: those that every data set must have; None = every range that any data set has.
-        missing: "error": refuse results with a hole; "nan": NaN for every mean that a hole enters, and the reasons
-            in `ProtocolScores.missing`. A mean over fewer sets or ranges than asked for is never given.
 
     Returns:
-        Overall, per data set, per range.
+        Overall, per data set, per range: NaN for every mean that a hole enters, and the reasons in `missing`. A mean
+        over fewer sets or ranges than asked for is never given.
 
     Raises:
-        CFlowError: something is missing (unless `missing="nan"`); data sets or ranges that were not asked for; nothing
-            to combine.
+        CFlowError: data sets or ranges that were not asked for; nothing to combine.
     """
-    if missing not in ("error", "nan"):
-        raise CFlowError(f"missing is 'error' or 'nan', got {missing!r}")
     given = list(dict.fromkeys(name for row in results.values() for name in row))
     set_names = list(results if data_sets is None else data_sets)
     range_names = list(given if ranges is None else ranges)
@@ -89,11 +84,6 @@ def score_data_sets(
             if math.isnan(value):
                 why = "no moving points (NaN)" if name in row else "no result"
                 reasons.append(f"data set {set_name}, range {name}: {why}")
-    if reasons and missing == "error":
-        raise CFlowError(
-            "; ".join(reasons) + ": score them, name the data sets and ranges that you mean, or pass missing='nan' to "
-            "get NaN and this list"
-        )
     per_set = {name: fmean(row) for name, row in table.items()}  # NaN if any is NaN
     per_range = {name: fmean([row[i] for row in table.values()]) for i, name in enumerate(range_names)}
     return ProtocolScores(fmean(per_set.values()), per_set, per_range, tuple(reasons))

@@ -10,7 +10,6 @@ All of it is arithmetic on whole millimetres: the same bits in any batch, in any
 
 from __future__ import annotations
 
-import warnings
 from typing import Any, List, Sequence, Tuple
 
 import numpy as np
@@ -50,9 +49,6 @@ def find_ground(points: Array, method: str = "grid", threshold: float = THRESHOL
         NaN and infinite points and points with |x| or |y| >= 131 m are not ground. Order of points, other sweeps of
         the batch and shifts by whole millimetres in z do not change the result.
 
-    Warns:
-        UserWarning: there are points, and all of them lie 131 m away or further.
-
     Raises:
         CFlowError: wrong shape, dtype, method or threshold; Patchwork++ is not installed.
 
@@ -91,24 +87,9 @@ def find_ground_batch(
     else:
         is_ground = _patchwork(positions, sweep, len(clouds))
     masks = is_ground.split([cloud.shape[0] for cloud in clouds])
-    for number, mask in enumerate(masks):
-        if not bool(mask.any()):
-            _warn_if_far(positions[:, sweep == number], number)
     return [
         mask.to(cloud.device) if isinstance(cloud, Tensor) else mask.cpu().numpy() for mask, cloud in zip(masks, clouds)
     ]
-
-
-def _warn_if_far(positions: Tensor, number: int) -> None:
-    """(3, N) positions of a sweep, all of them too far from the origin to be looked at."""
-    nearest = positions[:2].abs().amax(0).nan_to_num(torch.inf).amin() if positions.numel() else torch.zeros(())
-    if REACH <= nearest < torch.inf:
-        warnings.warn(
-            f"no point of sweep {number} lies within {REACH:.0f} m of the origin, so no ground was found: give points "
-            "in the frame of the vehicle or of the sensor",
-            UserWarning,
-            stacklevel=4,
-        )
 
 
 def has_ground(clouds: Sequence[Array], most_points: int = 30_000, device: Any = "auto") -> List[bool]:

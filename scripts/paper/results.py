@@ -133,5 +133,5 @@ def protocol(ours: Ours) -> Dict[str, ProtocolScores]:
     for method in METHODS.values():
         errors = {name: dict(zip(RANGES, range_errors(runs[method]))) for name, runs in ours.items() if method in runs}
         if errors:
-            result[method] = score_data_sets(errors, data_sets=list(ours), ranges=RANGES, missing="nan")
+            result[method] = score_data_sets(errors, data_sets=list(ours), ranges=RANGES)
     return result

@@ -9,7 +9,7 @@ import pytest
 
 from cflow_torch import CFlowError, Sweep
 from cflow_torch.data.av2 import AV2Log
-from cflow_torch.data.log_check import GroundWarning, check_ground, check_log
+from cflow_torch.data.log_check import GroundWarning, check_log
 from cflow_torch.data.static_check import StaticWorldWarning, check_static_world, static_world_residual
 from cflow_torch.simulator import make_drive
 
@@ -124,6 +124,6 @@ def test_both_checks_are_made_of_a_log_that_is_opened(drive):
     assert any("data.find_ground=grid" in str(warning.message) for warning in caught)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        check_ground(drive)
+        check_log(drive)
         for good in (drive, Changed(drive, masks=False, ground=False), Changed(drive, is_broken=True)):
             check_log(good)
