@@ -72,7 +72,9 @@ def read(path: Path) -> Tuple[Rows, List[str]]:
     timelines: List[str] = []
     for chunk in chunks.RrdReader(path).stream().to_chunks():
         timelines += chunk.timeline_names
-        for row in chunk.to_record_batch().to_pylist():
+        batch = chunk.to_record_batch()
+        columns = [name for name in batch.schema.names if ":" in name or name == "sweep"]  # not the clock's
+        for row in batch.select(columns).to_pylist():
             kept = {name.rpartition(":")[2]: value for name, value in row.items() if ":" in name}
             rows.setdefault(chunk.entity_path.lstrip("/"), {})[row.get("sweep", -1)] = kept
     return rows, timelines
