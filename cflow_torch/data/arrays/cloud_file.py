@@ -105,7 +105,7 @@ def _read_bin(path: Path, columns: int) -> np.ndarray:
 
 
 def _read_numpy(path: Path) -> np.ndarray:
-    mend = "it is truncated, or no file of plain arrays"
+    mend = "give plain arrays, no file of pickled objects"
     if path.suffix.lower() == ".npz":
         with file_errors(path, mend), np.load(whole(path), allow_pickle=False) as arrays:
             if all(axis in arrays.files for axis in _AXES):
