@@ -11,7 +11,7 @@ from typing import Any, Dict, List, Tuple
 
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cflow_torch import CFlowError
@@ -24,6 +24,7 @@ from cflow_torch.fleet.run import StopSignal
 # Shares of the work
 
 
+@settings(deadline=None)  # the first call imports
 @given(
     lengths=st.lists(st.integers(0, 40), min_size=1, max_size=12),
     count=st.integers(1, 20),

@@ -43,7 +43,8 @@ def pcd_fields(content: bytes, path: Place) -> Dict[str, np.ndarray]:
             raise ValueError(f"it holds {len(table)} points, its header says {header.width} x {header.height}")
     # pypcd4 calls padding "#..." and splits fields of several values, of which it mixes up the compressed ones.
     names = [name for name, count in zip(header.fields, header.count) if count == 1 and name[0] != "#"]
-    return {name: np.ascontiguousarray(table[name]) for name in names}
+    # Of a cloud without points, pypcd4 1.4 makes a table of two dimensions.
+    return {name: np.ascontiguousarray(table[name]).reshape(-1) for name in names}
 
 
 def write_pcd(path: Place, fields: Mapping[str, np.ndarray]) -> None:
