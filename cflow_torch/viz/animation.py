@@ -100,8 +100,9 @@ def _palette(picture: Picture) -> Picture:
     sample = Image.new("RGB", (max(picture.width, _WHEEL_SIDE), picture.height + _WHEEL_SIDE), "white")
     sample.paste(picture, (0, 0))
     sample.paste(wheel, (0, picture.height), wheel)
-    # Median cut counts pixels and would drop the few of a small mover.
-    return sample.quantize(256, method=Image.Quantize.MAXCOVERAGE)
+    # Median cut counts pixels and would drop the few of a small mover. A round of k-means moves each colour into the
+    # middle of those that it stands for.
+    return sample.quantize(256, method=Image.Quantize.MAXCOVERAGE, kmeans=1)
 
 
 def _write_mp4(path: Path, pictures: Iterator[Picture], frames_per_second: float) -> None:
