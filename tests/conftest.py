@@ -47,7 +47,7 @@ def bsfe() -> Iterator[ModuleType]:
     """bucketed_scene_flow_eval.datasets; open3d, which it imports for its viewer alone, is replaced by a mock."""
     if importlib.util.find_spec("bucketed_scene_flow_eval") is None:
         pytest.skip(WHY_SKIPPED)
-    mocked = importlib.util.find_spec("open3d") is None
+    mocked = "open3d" not in sys.modules and importlib.util.find_spec("open3d") is None
     if mocked:
         sys.modules["open3d"] = MagicMock()
     yield pytest.importorskip("bucketed_scene_flow_eval.datasets", reason=WHY_SKIPPED)
