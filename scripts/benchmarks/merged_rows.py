@@ -15,6 +15,7 @@ _SCRIPTS = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(_SCRIPTS / folder) for folder in ("ablation", "figures")]
 
 import failure_drives  # noqa: E402
+import merged_drives  # noqa: E402
 from failure_drives import PAIR, Staged  # noqa: E402
 from sets import HISTORY, Item, ScoredSet, make_item, make_sets  # noqa: E402
 
@@ -24,6 +25,7 @@ from cflow_torch.types import CFlowError  # noqa: E402
 
 MOVES = 0.05  # metres per sweep
 STEPS = (0.1, 0.3, 0.55, 1.0, 1.5)  # metres per sweep of the vehicle beside façades
+GAPS = (0.1, 0.2, 0.3, 0.5)  # metres from walkers to a wall
 # Older versions of the package do not look at sweeps after t+1.
 _FUTURE: Dict[str, Any] = {"num_future": 4} if "num_future" in inspect.signature(window).parameters else {}
 
@@ -64,9 +66,13 @@ _SCENES: Dict[str, Tuple[Callable[..., Staged], str]] = {
     "rolling": (failure_drives.rolling_shutter, "dynamic ≤ .04"),
     "appears": (failure_drives.appearing, ""),
 }
+for _gap in GAPS:
+    _SCENES[f"walkers-{_gap:g}"] = (partial(merged_drives.walkers, gap=_gap), "")
+for _name in ("tree", "bridge", "gantry", "wires", "train", "abreast"):
+    _SCENES[_name] = (getattr(merged_drives, _name), "")
 for _profile in ("av2", "waymo"):
     for _step in STEPS:
-        _drive = partial(failure_drives.facade, step=_step, profile=_profile)
+        _drive = partial(merged_drives.facade, step=_step, profile=_profile)
         _SCENES[f"facade-{_profile}-{_step:g}"] = (_drive, "stands ≤ .002")
 
 

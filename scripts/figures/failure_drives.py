@@ -1,9 +1,9 @@
-"""Small simulated drives that the method finds hard: where something moves beside, below or behind what stands."""
+"""Drives of docs/limits.md that are scored elsewhere too, and what small simulated drives are made of."""
 
 from __future__ import annotations
 
 import math
-from typing import List, NamedTuple, Sequence, Tuple
+from typing import NamedTuple, Sequence, Tuple
 
 import numpy as np
 
@@ -91,44 +91,3 @@ def rolling_shutter(seed: int, profile: str = "av2_rolling") -> Staged:
     bodies += [objects.car(rng, Route(x, -4, EAST, speed=27)) for x in (-20, 22)]
     drive = drive_past([*bodies, objects.wall(10, 12, 60, 0.5, 4)], seed, speed=20, profile=profile)
     return Staged(drive, "rolling shutter", "two oncoming cars, closing at 47 m/s", [0, 1], (-30, -20, 26, 21))
-
-
-def facade(seed: int, step: float = 0.55, profile: str = "av2") -> Staged:
-    """Houses along the road behind parked cars, whose shadows glide over the fronts as the vehicle passes.
-
-    Args:
-        seed: of the street and of the noise.
-        step: metres that the vehicle drives in a sweep of 0.1 s.
-        profile: of the sensors.
-    """
-    rng, speed = np.random.default_rng(seed), 10 * step
-    bodies = [
-        objects.car(rng, Route(26, 3.2, WEST, speed=8)),
-        objects.car(rng, Route(13, 0, start=-8 * PAIR / 10, speed=8)),
-    ]
-    for kerb, front in ((-4.3, -7.0), (7.5, 10.2)):
-        side, x = math.copysign(1.0, kerb), -45.0
-        while x < 60:
-            bodies.append(objects.car(rng, Route(x, kerb - side * rng.uniform(0.9, 1.1), rng.uniform(-0.02, 0.02))))
-            x += rng.uniform(5.3, 9.0)
-        bodies += _fronts(rng, front)
-    drive = drive_past(bodies, seed, profile=profile, speed=speed, start=-speed * PAIR / 10)
-    return Staged(drive, "a façade behind parked cars", "what stands", [0, 1], (-20, -12, 30, 14))
-
-
-def _fronts(rng: np.random.Generator, front: float) -> List[Body]:
-    """House after house along y = `front`: a front with pilasters, window sills, doorsteps and drain pipes."""
-    houses, begin, side = [], -50.0, math.copysign(1.0, front)
-    while begin < 65:
-        width, back, pitch = rng.uniform(8, 14), rng.choice((0.0, 0.0, 0.3)), rng.uniform(1.8, 2.6)
-        y, height = front + side * back, rng.uniform(6, 11)
-        houses.append(objects.wall(begin + width / 2, y + side * 4, width, 8, height, rng.uniform(0.3, 0.6)))
-        for x in np.arange(begin + 0.9, begin + width - 0.6, pitch).tolist():
-            if rng.uniform() < 0.15:
-                parts = [box(-0.6, 0.6, -0.4, 0.4, -0.1, 0.35, 0.5)]  # a doorstep
-            else:
-                parts = [box(-0.55, 0.55, -0.12, 0.12, z, z + 0.12, 0.5) for z in (0.9, 3.7)]  # sills of two windows
-            houses.append(Body([*parts, box(0.75, 0.95, -0.08, 0.08, 0.0, 5.0, 0.5)], Route(x, y)))  # and a pilaster
-        houses.append(objects.pole(begin, front - side * 0.1, 6, 0.06))
-        begin += width + (rng.uniform(1, 3) if rng.uniform() < 0.2 else 0.0)
-    return houses
