@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Callable, Dict, List, NamedTuple, Optional, Sequence
 
 import failure_drives
+import merged_drives
 import numpy as np
 from failure_drives import EAST, FLAT, NORTH, PAIR, WEST, Staged, View, body_of, drive_past
 
@@ -195,13 +196,32 @@ def frozen_world(seed: int) -> Case:
     return replace(rolling_shutter(seed, "av2"), title="the same, instantaneous sweeps")
 
 
+def facade(seed: int) -> Case:
+    """Parked cars and the fronts behind them, from a vehicle at walking speed."""
+    staged = merged_drives.facade(seed, 0.1)
+    standing = range(len(staged.bodies), len(staged.drive.scene.bodies))
+    return _staged_case(staged._replace(whose="what stands", bodies=standing), [_flow(staged.drive, "default")])
+
+
+def _by_default(stage: Callable[[int], Staged]) -> Callable[[int], Case]:
+    """What `default` makes of a drive."""
+
+    def case(seed: int) -> Case:
+        staged = stage(seed)
+        return _staged_case(staged, [_flow(staged.drive, "default")])
+
+    return case
+
+
+_MERGED = ("tree", "bridge", "gantry", "wires", "walkers", "train", "abreast")
 CASES: Dict[str, Callable[[int], Case]] = {
     case.__name__: case
     for case in (
         *(long_side, rail, slow_person, crowd, touching, turning, vertical, fast, large, beyond_region),
-        *(ground_left_in, wrong_frame, appearing, appeared, rolling_shutter, frozen_world),
+        *(ground_left_in, wrong_frame, appearing, appeared, rolling_shutter, frozen_world, facade),
     )
 }
+CASES.update({name: _by_default(getattr(merged_drives, name)) for name in _MERGED})
 
 
 class MisplacedPoses:

@@ -118,7 +118,7 @@ def facade(seed: int, step: float = 0.55, profile: str = "av2") -> Staged:
             x += rng.uniform(6.2, 9.5)
         bodies += _fronts(rng, front)
     drive = _past(bodies, seed, 10 * step, profile=profile)
-    return Staged(drive, "a façade behind parked cars", "what stands", [0, 1], (-20, -12, 30, 14))
+    return Staged(drive, "a façade behind parked cars", "two cars, 8 m/s", [0, 1], (-20, -12, 30, 14))
 
 
 def _fronts(rng: np.random.Generator, front: float) -> List[Body]:
