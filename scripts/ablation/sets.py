@@ -74,6 +74,7 @@ class ScoredSet:
         half_side: metres, of the region that flow is estimated in; None = that of the preset.
         load: makes the windows.
         step: sweeps of the recording from t to t+1.
+        reach: metres, half side of the box that is scored.
     """
 
     name: str
@@ -82,6 +83,7 @@ class ScoredSet:
     half_side: Optional[float]
     load: Callable[[], List[Item]]
     step: int = 1
+    reach: float = NEAR
 
     def items(self) -> List[Item]:
         """The windows with as much history as is used."""

@@ -12,7 +12,7 @@ import numpy as np
 from merged_rows import MOVES
 from rows import Setting
 from score import Figures, pooled_figures, simulated_figures, with_means
-from sets import NEAR, Item, ScoredSet
+from sets import Item, ScoredSet
 
 from cflow_torch import make_model
 from cflow_torch.config import Config
@@ -103,7 +103,7 @@ def measure(sets: Sequence[ScoredSet], settings: Sequence[Setting]) -> List[Meas
                 (result,) = model([taken])
                 times[i].append(time.perf_counter() - start)
                 frames[i].append(item.frame(result.residual_flow))
-                misses[i].append(find_misses(item, result, scored.step))
+                misses[i].append(find_misses(item, result, scored))
         for of_setting, of_set in zip(scores, frames):
             of_setting[scored.name] = figures_of(scored, of_set)
     measured = []
@@ -122,8 +122,8 @@ def figures_of(scored: ScoredSet, frames: Sequence[EvalFrame]) -> Figures:
     if scored.group == "sim":
         return simulated_figures(frames)
     if scored.group != "scene":
-        return pooled_figures(frames, scored.step)
-    parts = [pooled_figures([frame]) for frame in frames]
+        return pooled_figures(frames, scored.step, scored.reach)
+    parts = [pooled_figures([frame], reach=scored.reach) for frame in frames]
     return {key: mean_of_present(np.array([part[key] for part in parts])) for key in parts[0]}
 
 
@@ -135,17 +135,17 @@ def cut(window: Window, config: Config) -> Window:
     return replace(window, **sweeps)
 
 
-def find_misses(item: Item, result: FlowResult, step: int) -> Misses:
-    """Missed movers among the points of a window that are scored within 35 m; `step`: sweeps from t to t+1."""
+def find_misses(item: Item, result: FlowResult, scored: ScoredSet) -> Misses:
+    """Missed movers among the points of a window that are scored."""
     sweep, truth = item.window.pc0, item.labels.flow - item.pose_flow
-    counts = item.labels.is_valid & (np.abs(as_numpy(sweep.points)[:, :2]) <= NEAR).all(1)
+    counts = item.labels.is_valid & (np.abs(as_numpy(sweep.points)[:, :2]) <= scored.reach).all(1)
     if sweep.is_ground is not None:
         counts &= ~as_numpy(sweep.is_ground)
     if item.eval_mask is not None:
         counts &= item.eval_mask
     speed, estimate = np.linalg.norm(truth, axis=1), as_numpy(result.residual_flow)
-    moves = counts & (speed >= MOVES * step) & (item.labels.category > 0)
-    stands = counts & (speed < MOVES * step)
+    moves = counts & (speed >= MOVES * scored.step) & (item.labels.category > 0)
+    stands = counts & (speed < MOVES * scored.step)
     missed = moves & (np.linalg.norm(estimate, axis=1) < 0.5 * speed)
     confidence = np.zeros(0) if result.confidence is None else as_numpy(result.confidence)
     of_missed, of_standing = (confidence[rows] if len(confidence) else confidence for rows in (missed, stands))

@@ -17,7 +17,7 @@ sys.path[:0] = [str(_SCRIPTS / folder) for folder in ("ablation", "figures")]
 import failure_drives  # noqa: E402
 import merged_drives  # noqa: E402
 from failure_drives import PAIR, Staged  # noqa: E402
-from sets import HISTORY, Item, ScoredSet, make_item, make_sets  # noqa: E402
+from sets import HISTORY, NEAR, Item, ScoredSet, make_item, make_sets  # noqa: E402
 
 from cflow_torch.config import PRESETS  # noqa: E402
 from cflow_torch.data.log import window  # noqa: E402
@@ -68,7 +68,7 @@ _SCENES: Dict[str, Tuple[Callable[..., Staged], str]] = {
 }
 for _gap in GAPS:
     _SCENES[f"walkers-{_gap:g}"] = (partial(merged_drives.walkers, gap=_gap), "")
-for _name in ("tree", "bridge", "gantry", "wires", "train", "abreast"):
+for _name in ("tree", "bridge", "gantry", "wires", "train", "abreast", "border"):
     _SCENES[_name] = (getattr(merged_drives, _name), "")
 for _profile in ("av2", "waymo"):
     for _step in STEPS:
@@ -87,15 +87,19 @@ def all_rows(scene_seeds: Tuple[int, int], seeds: Sequence[Tuple[int, int]], cac
     real = {scored.name: scored for scored in make_sets(("real", "merged"), (), cache)}
     for name, (of_set, target) in _REAL.items():
         yield Row(name, (real[of_set],), target)
-    first, last = scene_seeds
-    for name, (stage, target) in _SCENES.items():
-        yield Row(name, (ScoredSet(name, "scene", HISTORY, None, partial(_items, stage, first, last)),), target)
+    small = {name: _small_set(name, stage, scene_seeds) for name, (stage, _) in _SCENES.items()}
+    for name, (_, target) in _SCENES.items():
+        yield Row(name, (small[name],), target)
     if "offline" in PRESETS:
-        appears = ScoredSet("appears", "scene", HISTORY, None, partial(_items, failure_drives.appearing, first, last))
-        yield Row("appears-offline", (appears,), "dynamic ≤ .10", "offline")
+        yield Row("appears-offline", (small["appears"],), "dynamic ≤ .10", "offline")
     for start, end in seeds:
         sets = tuple(make_sets(("sim",), ((start, end),), cache))
         yield Row(f"sim-{start}-{end}", sets, "near ≤ .09, far ≤ .25, static ≤ .004")
+
+
+def _small_set(name: str, stage: Callable[[int], Staged], seeds: Tuple[int, int]) -> ScoredSet:
+    reach = merged_drives.BORDERS[-1] if name == "border" else NEAR
+    return ScoredSet(name, "scene", HISTORY, None, partial(_items, stage, *seeds), reach=reach)
 
 
 def chosen(rows: Sequence[Row], only: Optional[Sequence[str]]) -> List[Row]:

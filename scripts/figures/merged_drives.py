@@ -9,12 +9,13 @@ import math
 from typing import Any, List, Sequence
 
 import numpy as np
-from failure_drives import EAST, PAIR, WEST, Staged, drive_past
+from failure_drives import EAST, NORTH, PAIR, WEST, Staged, drive_past
 
 from cflow_torch.simulator import objects
 from cflow_torch.simulator.objects import Body, Route, Solid, box
 from cflow_torch.simulator.raycast import CYLINDER
 
+BORDERS = (51.2, 76.8)  # metres, half sides of regions
 SECONDS = 0.1 * PAIR  # from the first sweep to the one that counts
 
 
@@ -98,6 +99,27 @@ def abreast(seed: int) -> Staged:
     ways = (_at(8, 3.2, EAST, 9), _at(9, 5.2, EAST, 13), _at(12, -4.0, WEST, 10))
     drive = _past([*(objects.car(rng, way) for way in ways), objects.wall(10, -5.4, 50, 0.5, 2.5)], seed, 6)
     return Staged(drive, "cars abreast, a car along a wall", "three cars, 9-13 m/s", [0, 1, 2], (-6, -8, 26, 10))
+
+
+def border(seed: int) -> Staged:
+    """What stands on the borders of two regions, and what crosses them: cars, a bus, a wall."""
+    rng = np.random.default_rng(seed)
+    movers, fixed = [], []
+    for edge in BORDERS:
+        out, back, aside, *at_edge = rng.uniform(0, 1, 6).tolist()
+        # The side that is seen lies within a metre of the border: 2.2 m off a car's middle, 6 m off a bus's.
+        movers += [
+            objects.car(rng, _at(edge + 2.2 - out, 3, EAST, 14)),
+            objects.bus(_at(2, edge + 6 - aside, NORTH, 9)),
+        ]
+        movers += [
+            objects.car(rng, _at(edge + 2.2 + back, -3, WEST, 12)),
+            objects.car(rng, _at(-edge - 1.7, -3, WEST, 10)),
+        ]
+        fixed += [objects.car(rng, Route(-edge - 2.7 + x, y)) for x, y in zip(at_edge, (6, 9))]
+        fixed += [objects.wall(edge, 8, 12, 0.3, 3), objects.car(rng, Route(7, -edge - 1.4 + at_edge[2]))]
+    drive = _past([*movers, *fixed], seed, 5)
+    return Staged(drive, "the region's border", "cars and buses", list(range(len(movers))), (-82, -82, 82, 82))
 
 
 def facade(seed: int, step: float = 0.55, profile: str = "av2") -> Staged:
