@@ -7,8 +7,8 @@
   python scripts/benchmarks/merged_motion.py --set --set significance=1       as it is, and with something changed
 
 Rows: real data (CFLOW_DATA, else ../shared/data) within 35 m (crown, 7fab, a0: h = 0; c2, a4: h = 4); small simulated
-drives (failure_drives.py and merged_drives.py in scripts/figures), a window per seed, h = 4, the preset's region, scored
-within 35 m, "border" within 76.8 m; sim: drives of five sensors, h = 4, region +-70 m, mean over the sensors.
+drives (failure_drives.py and merged_drives.py in scripts/figures), a window per seed, h = 4, the preset's region,
+scored within 35 m, "border" within 76.8 m; sim: drives of five sensors, h = 4, region +-70 m, mean over the sensors.
 
 Columns: end-point errors in metres over all points of the row (small drives: mean over the drives), ground excluded.
 dynamic: of objects that move by 0.05 m a sweep or more (of a small drive, those that it is about). pedestrian: mean of
