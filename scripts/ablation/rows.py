@@ -27,9 +27,10 @@ class Setting:
 
     def for_set(self, scored: ScoredSet) -> Config:
         """The settings for a set."""
-        half = scored.half_side
-        region = (-half, -half, -math.inf, half, half, math.inf)
-        of_set = {"num_history": scored.history, "point_cloud_range": region}
+        of_set: Dict[str, Any] = {"num_history": scored.history}
+        if scored.half_side is not None:
+            half = scored.half_side
+            of_set["point_cloud_range"] = (-half, -half, -math.inf, half, half, math.inf)
         return make_config(self.preset, **{**of_set, **self.overrides})
 
 

@@ -6,7 +6,8 @@
   python scripts/ablation/run.py --preset default --set significance=1    any setting
 
 Sets: real (CFLOW_DATA, else ../shared/data), odd (the other windows of the same KITTI drive), sim (simulated drives of
-five sensors, h = 4), sim0 (the same, h = 0). Every setting gets the history and the region of the set. Seeds 100-103
+five sensors, h = 4), sim0 (the same, h = 0), merged (what a bird's-eye view merges: a car under a crown, walkers by a
+wall). Every setting gets the history and the region of the set. Seeds 100-103
 were used to choose settings, 400-403 to look at the choice; 300 and above are for the last score only.
 
 OUTPUT gets ablation.md and ablation.csv, row by row. Figures are kept one by one in OUTPUT/rows: after an interruption
@@ -35,7 +36,7 @@ from sets import make_sets
 from cflow_torch.data.records import write_text
 from cflow_torch.types import CFlowError
 
-GROUPS = ("real", "odd", "sim", "sim0")
+GROUPS = ("real", "odd", "sim", "sim0", "merged")
 NOTE = """Real data: +-35 m, ground excluded; EPE in metres over all points, dynamic / static (KITTI h=0: dynamic /
 pedestrian, error over speed / static). Simulated drives: region +-70 m; mean over five sensors of the mean dynamic
 bucket-normalised error (error over speed), 0-35 m / 35-70 m, and of the static EPE within 35 m; classes over the points
@@ -80,10 +81,10 @@ def parse(arguments: Optional[Sequence[str]]) -> argparse.Namespace:
     """Arguments of the command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sets", nargs="+", choices=GROUPS, default=list(GROUPS[:3]))
-    parser.add_argument("--seeds", nargs="+", type=_seeds, default=[(100, 103)], metavar="FIRST-LAST")
+    parser.add_argument("--seeds", nargs="+", type=seed_range, default=[(100, 103)], metavar="FIRST-LAST")
     parser.add_argument("--only", nargs="+", choices=[row.name for row in ROWS], metavar="ROW")
     parser.add_argument("--preset", help="score this one with what --set changes, in place of the rows")
-    parser.add_argument("--set", nargs="+", type=_setting, default=[], metavar="NAME=VALUE")
+    parser.add_argument("--set", nargs="+", type=override, default=[], metavar="NAME=VALUE")
     parser.add_argument("--output", type=Path, default=Path("outputs/ablation"))
     cache = Path(os.environ.get("CFLOW_CACHE") or "outputs/cache")
     parser.add_argument("--cache", type=Path, default=cache, help="folder for simulated drives; default $CFLOW_CACHE")
@@ -91,14 +92,16 @@ def parse(arguments: Optional[Sequence[str]]) -> argparse.Namespace:
     return parser.parse_args(arguments)
 
 
-def _seeds(text: str) -> Tuple[int, int]:
+def seed_range(text: str) -> Tuple[int, int]:
+    """First and last seed of "100-103"."""
     match = re.fullmatch(r"(\d+)-(\d+)", text)
     if match is None or int(match[1]) > int(match[2]):
         raise argparse.ArgumentTypeError(f"{text!r}: give a first and a last seed, for example 100-103")
     return int(match[1]), int(match[2])
 
 
-def _setting(text: str) -> Tuple[str, Any]:
+def override(text: str) -> Tuple[str, Any]:
+    """Name and value of "significance=1"."""
     name, found, value = text.partition("=")
     if not found:
         raise argparse.ArgumentTypeError(f"{text!r}: give NAME=VALUE, for example significance=1")

@@ -41,12 +41,13 @@ def estimate(scored: ScoredSet, config: Config) -> List[EvalFrame]:
     return frames
 
 
-def pooled_figures(frames: Sequence[EvalFrame], step: int = 1) -> Figures:
-    """Means over all points of a set within 35 m.
+def pooled_figures(frames: Sequence[EvalFrame], step: int = 1, reach: float = NEAR) -> Figures:
+    """Means over all points of a set in a square box around the sensor.
 
     Args:
         frames: windows with estimates.
         step: sweeps from t to t+1; a point is dynamic from 0.05 m per sweep on.
+        reach: metres, half side of the box.
 
     Returns:
         "dynamic", "static": EPE in metres of dynamic objects, of the static background; "pedestrian": mean of error
@@ -56,7 +57,7 @@ def pooled_figures(frames: Sequence[EvalFrame], step: int = 1) -> Figures:
         name="pooled",
         metrics=("three_way",),
         region="box",
-        max_range=NEAR,
+        max_range=reach,
         dynamic_threshold=DYNAMIC * step,
     )
     three_way = ThreeWayEPE(definition)

@@ -30,6 +30,8 @@ SCENES = ("street", "highway", "crossing", "narrow")
 SIMULATED_SWEEPS, SIMULATED_WINDOWS = 15, (9, 12)  # per drive
 AV2 = Path("av2-7fab2350", "val", "7fab2350-7eaf-3b7e-a39d-6937a4c1bede")
 KITTI = Path("kitti-0000", "kitti-0000-a.h5")
+KITTI_LATER = Path("kitti-0000", "kitti-0000-c2.h5")
+CROWN = Path("av2-crown", "av2-crown.h5")
 
 
 @dataclass(frozen=True)
@@ -67,19 +69,21 @@ class ScoredSet:
 
     Args:
         name: for example "kitti h=4" or "sim waymo 100-103 h=4"; unique.
-        group: "real", "odd", "sim" or "sim0".
+        group: "real", "odd", "merged", "sim" or "sim0".
         history: older sweeps that are used.
-        half_side: metres, of the region that flow is estimated in.
+        half_side: metres, of the region that flow is estimated in; None = that of the preset.
         load: makes the windows.
         step: sweeps of the recording from t to t+1.
+        reach: metres, half side of the box that is scored.
     """
 
     name: str
     group: str
     history: int
-    half_side: float
+    half_side: Optional[float]
     load: Callable[[], List[Item]]
     step: int = 1
+    reach: float = NEAR
 
     def items(self) -> List[Item]:
         """The windows with as much history as is used."""
@@ -147,15 +151,15 @@ def av2_pair() -> List[Item]:
 
 
 @lru_cache(maxsize=None)
-def _kitti() -> Tuple[HDF5Log, RecentSweeps]:
-    log = HDF5Log(data_root() / KITTI)
+def _scene(path: Path) -> Tuple[HDF5Log, RecentSweeps]:
+    log = HDF5Log(data_root() / path)
     return log, RecentSweeps(log, len(log.timestamps))
 
 
 @lru_cache(maxsize=None)
-def kitti() -> List[Item]:
-    """Every labelled pair of KITTI 0000."""
-    log, sweeps = _kitti()
+def kitti(path: Path = KITTI) -> List[Item]:
+    """Every labelled pair of a part of KITTI 0000, or of another scene of that layout."""
+    log, sweeps = _scene(path)
     pairs = range(len(log.timestamps) - 1)
     return [make_item(window(sweeps, i, HISTORY), log.labels(i), log.eval_mask(i)) for i in pairs]
 
@@ -163,7 +167,7 @@ def kitti() -> List[Item]:
 @lru_cache(maxsize=None)
 def kitti_steps(step: int) -> List[Item]:
     """Pairs (t, t + step) of KITTI 0000; the labels of the pairs between, chained object by object."""
-    log, sweeps = _kitti()
+    log, sweeps = _scene(KITTI)
     items = []
     for start in range(len(log.timestamps) - step):
         pairs = []
@@ -182,7 +186,7 @@ def kitti_steps(step: int) -> List[Item]:
 @lru_cache(maxsize=None)
 def merged() -> List[Item]:
     """The pairs of KITTI 0000, every mover with something static pasted beside it."""
-    log, _ = _kitti()
+    log, _ = _scene(KITTI)
     items = []
     for number, item in enumerate(kitti()):
         pair = Window(item.window.pc0, item.window.pc1)
@@ -225,4 +229,6 @@ _REAL: Tuple[Tuple[str, str, int, Callable[[], List[Item]], int], ...] = (
     ("kitti odd h=4", "odd", 4, _every_second(kitti, 5), 1),
     ("third sweeps odd h=0", "odd", 0, _every_second(_STEPS[3], 1), 3),
     ("fifth sweeps odd h=0", "odd", 0, _every_second(_STEPS[5], 1), 5),
+    ("crown h=0", "merged", 0, partial(kitti, CROWN), 1),
+    ("later kitti h=4", "merged", 4, _every_second(partial(kitti, KITTI_LATER), 4), 1),
 )
