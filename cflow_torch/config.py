@@ -101,6 +101,11 @@ class Config:
         """Sweeps after t+1 that are used."""
         return 0
 
+    @property
+    def num_sweeps(self) -> int:
+        """Sweeps of a whole window: history, t, t+1 and what comes after."""
+        return self.num_history + 2 + self.num_future
+
     def replace(self: Kind, **overrides: Any) -> Kind:
         """A copy with some fields changed; an unknown field raises `CFlowError` that lists the fields."""
         return replace(self, **_known(type(self), overrides))
@@ -165,7 +170,8 @@ class VerifiedConfig(_WithHistory):
     method: str = _method("verified")
     num_future: int = setting(  # type: ignore[assignment]
         0,
-        "sweeps after t+1 that are used, offline: they decide on what no sweep before t shows. Twice the time",
+        "sweeps after t+1 that are used, offline: they decide on objects that they show more than twice as often as "
+        "the sweeps before t do. Takes twice the time",
         low=0,
     )
     max_object: Optional[float] = setting(
@@ -199,6 +205,8 @@ class VerifiedConfig(_WithHistory):
                 "of the finest one, for example (0.4, 0.2, 0.1)"
             )
 
+
+WINDOW = ("num_history", "num_future")  # settings that say which sweeps a window has
 
 CONFIGS: Dict[str, Type[Config]] = {"dense": DenseConfig, "keypoints": KeypointsConfig, "verified": VerifiedConfig}
 
@@ -250,7 +258,8 @@ def make_config(preset: Optional[str] = None, method: Optional[str] = None, **ov
     """The settings of a preset with some fields replaced.
 
     Args:
-        preset: "default", "fast", "offline", "paper" or "keypoints"; None = the preset of the method, "default" if none is given.
+        preset: "default", "fast", "offline", "paper" or "keypoints"; None = the preset of the method, "default" if none
+            is given.
         method: "dense" (preset "paper"), "keypoints" or "verified" (presets "default", "fast", "offline"); None = the
             preset's. "keypoints" with preset "paper" are the paper's key points.
         **overrides: any field of the method's settings; `pixel_size=0.1` is short for `pixel_sizes=(0.1,)`.

@@ -30,7 +30,7 @@ def windows_for(config: Config, number: int = 1) -> List[Window]:
 
 def changed(window: Window, change: Callable[[Sweep], Sweep]) -> Window:
     """The same change of every sweep."""
-    return Window(change(window.pc0), change(window.pc1), tuple(map(change, window.pch)))
+    return Window(*map(change, (window.pc0, window.pc1)), *(tuple(map(change, s)) for s in (window.pch, window.pcf)))
 
 
 def num_moving(result: FlowResult) -> int:

@@ -83,8 +83,9 @@ def list_motions(estimates: Tensor, available: Tensor, intervals: Tensor, others
 
     Source: pool: Sec. leverage_past_pcs.
     """
-    is_known, ones = available[:, :, None], torch.ones_like(intervals)
-    per_interval = torch.where(is_known, estimates, torch.zeros_like(estimates)) / intervals.where(available, ones)[:, :, None]
+    is_known = available[:, :, None]
+    divisor = torch.where(available, intervals, torch.ones_like(intervals))
+    per_interval = torch.where(is_known, estimates, torch.zeros_like(estimates)) / divisor[:, :, None]
     found: List[Tensor] = [per_interval]
     if estimates.shape[1] > 1:
         found.insert(0, pool(F.pad(per_interval, (0, 1)), available)[:, None, :2])  # without any estimate: 0

@@ -21,7 +21,7 @@ from cflow_torch.verified.candidates import propose
 from cflow_torch.verified.component_tree import Objects, find_components, select_objects
 from cflow_torch.verified.confidence import confidence_of
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
-from cflow_torch.verified.offline import motion_of_both_sides
+from cflow_torch.verified.offline import best_nearby, motion_by_both_sides
 from cflow_torch.verified.paired_test import VerifiedLevel, verify
 from cflow_torch.verified.rigid_motion import RigidMotion, TurningMotion
 from cflow_torch.verified.rigid_registration import register
@@ -65,7 +65,7 @@ class VerifiedFlow(SceneFlowModel):
         """Motion of everything in a batch, by occupied pixel; ids number what moves together or stands together."""
         if self.config.num_future == 0:
             return self.estimate(batch)
-        return motion_of_both_sides(batch, self.estimate, self.grid(self.config.pixel_sizes[-1]), self.config)
+        return motion_by_both_sides(batch, self.estimate)
 
     def estimate(self, batch: Batch) -> TurningMotion:
         """The same by all sweeps alike, before t or after t+1."""
@@ -86,11 +86,14 @@ class VerifiedFlow(SceneFlowModel):
                 levels.append(verify(level, candidates.motion, candidates.score, sweeps, config))
         with stage("select"):
             objects, motion = _select(levels)
+            if config.num_future > 0:
+                motion = best_nearby(sweeps, objects, motion, config)
         with stage("register"):
             rigid = self.register(objects, motion, levels, sweeps)
         with stage("confidence"):
             confidence = confidence_of(sweeps, objects, rigid)
-            return _by_pixel(objects, rigid, levels[-1].score, confidence, sweeps, config.thorough)
+            is_numbered = config.thorough or config.num_future > 0
+            return _by_pixel(objects, rigid, levels[-1].score, confidence, sweeps, is_numbered)
 
     def scales(self) -> List[Tuple[int, bool]]:
         """Of each level, coarse to fine: finest pixels a side of its pixels; are its components undilated?"""

@@ -17,7 +17,7 @@ from cflow_torch.simulator.objects import Body, Route, box
 from cflow_torch.simulator.profiles import get_profile
 from cflow_torch.simulator.scene import Scene, SolidTable
 
-PAIR, NUM_SWEEPS = 5, 7  # sweep t, so that four older ones exist
+PAIR, NUM_SWEEPS = 5, 11  # sweep t, so that there are four older ones, and four after t+1
 FLAT = Ground((0.0, 0.0), 0.0, kerb=0.0, half_widths=(1e4, 1.0), crossing_x=1e5)
 EAST, NORTH, WEST = 0.0, math.pi / 2, math.pi
 WIDE = (-100.0, -100.0, -math.inf, 100.0, 100.0, math.inf)
@@ -193,7 +193,8 @@ def appearing(seed: int, later: int = 0) -> Case:
     hidden = objects.car(rng, Route(13.9 - 0.9 * (PAIR + later) + 4.5, 7, WEST, speed=9))
     drive = _drive([hidden, objects.van(rng, Route(8, 3.5)), objects.wall(10, 14, 30, 0.5, 4)], seed, speed=0)
     view = (-6, -6, 24, 16)
-    return _case(drive, [_flow(drive, "default")], "an object that appears", "car, 9 m/s", [0], view)
+    attempts = [_flow(drive, "default"), _flow(drive, "offline")]
+    return _case(drive, attempts, "an object that appears", "car, 9 m/s", [0], view)
 
 
 def appeared(seed: int) -> Case:
@@ -270,7 +271,7 @@ def _pose_flow(drive: Drive) -> np.ndarray:
 def _flow(drive: Drive, preset: str, log: Optional[Log] = None, **overrides: Any) -> Attempt:
     """The flow of the pair by a preset, from `log` if its poses or points shall be others."""
     config = make_config(preset, **overrides)
-    (result,) = make_model(config)([window(log or drive, PAIR, config.num_history)])
+    (result,) = make_model(config)([window(log or drive, PAIR, config.num_history, config.num_future)])
     return _attempt(drive, ", ".join([f"`{preset}`", *(f"{k}={v}" for k, v in overrides.items())]), result)
 
 
