@@ -147,6 +147,16 @@ def test_what_vanishes_goes_by_the_past():
     assert_same_bits(result, VerifiedFlow(OFFLINE)([replace(window, pcf=())])[0])
 
 
+def test_a_wall_that_seems_to_slide_after_t1_stands_still():
+    # Its samples travel with the sensor, 0.5 m a sweep: only over the whole window is that a long way.
+    rng = np.random.default_rng(0)
+    wall = np.stack((rng.uniform(-4, 4, 250), np.full(250, 3.05), rng.uniform(-1, 1, 250)), 1)
+    sweeps = [Sweep(wall + (0.5 * k, 0.0, 0.0)) for k in range(6)]
+    for thorough in (False, True):
+        result = flow_as_oracle(Window(*sweeps[:2], (), tuple(sweeps[2:])), OFFLINE.replace(thorough=thorough))
+        assert bool((result.residual_flow[:, 0] > 0.4).any()) != thorough
+
+
 def test_ids_of_both_sides_are_apart():
     sweeps = drive(is_hidden=True)
     (result,) = VerifiedFlow(OFFLINE)([window_at_t(sweeps, 4, 4)])
