@@ -8,6 +8,7 @@ explain most; what moves is then placed between the pixels, registered and turne
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import List, Tuple
 
 import torch
@@ -19,8 +20,9 @@ from cflow_torch.stages import stage
 from cflow_torch.verified import keypoint_candidates, slow_motion
 from cflow_torch.verified.candidates import propose
 from cflow_torch.verified.component_tree import Objects, find_components, select_objects
-from cflow_torch.verified.confidence import confidence_of
+from cflow_torch.verified.confidence import confidence_of, margin_of
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
+from cflow_torch.verified.layers import join_moving, points_at_rest, points_of_lower_layers
 from cflow_torch.verified.offline import best_nearby, motion_by_both_sides
 from cflow_torch.verified.paired_test import VerifiedLevel, verify
 from cflow_torch.verified.rigid_motion import RigidMotion, TurningMotion
@@ -69,14 +71,25 @@ class VerifiedFlow(SceneFlowModel):
 
     def estimate(self, batch: Batch) -> TurningMotion:
         """The same by all sweeps alike, before t or after t+1."""
+        grid = self.grid(self.config.pixel_sizes[-1])
+        with stage("project"):
+            sweeps = HeightSlicedSweeps.of(batch, grid, self.config.min_height)
+        found = self.look(sweeps, self.scales())
+        if not self.config.thorough:
+            return found
+        with stage("layers"):
+            is_lower = points_of_lower_layers(sweeps, points_at_rest(sweeps, found))
+            lower = HeightSlicedSweeps.of(replace(batch, takes_part=is_lower), grid)
+        return join_moving(found, self.look(lower, [(1, False), (1, True)], is_first=False), batch)
+
+    def look(self, sweeps: HeightSlicedSweeps, scales: List[Tuple[int, bool]], is_first: bool = True) -> TurningMotion:
+        """What some points do, found at some scales. What could as well be displaced stands still."""
         config, key_points = self.config, None
         levels: List[VerifiedLevel] = []
-        with stage("project"):
-            sweeps = HeightSlicedSweeps.of(batch, self.grid(config.pixel_sizes[-1]), config.min_height)
-        if config.thorough:
+        if config.thorough and is_first:
             with stage("match"):
                 key_points = keypoint_candidates.match_key_points(sweeps, config)
-        for block, is_undilated in self.scales():
+        for block, is_undilated in scales:
             above = levels[-1] if levels else None
             with stage("cluster"):
                 level = find_components(sweeps, block, is_undilated, config)
@@ -91,7 +104,9 @@ class VerifiedFlow(SceneFlowModel):
         with stage("register"):
             rigid = self.register(objects, motion, levels, sweeps)
         with stage("confidence"):
-            confidence = confidence_of(sweeps, objects, rigid)
+            margin = margin_of(sweeps, objects, rigid)
+            rigid = rigid.only(margin > 0)
+            confidence = confidence_of(sweeps, objects, rigid, margin)
             is_numbered = config.thorough or config.num_future > 0
             return _by_pixel(objects, rigid, levels[-1].score, confidence, sweeps, is_numbered)
 

@@ -6,10 +6,12 @@ from dataclasses import dataclass
 from typing import Tuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.model import Motion
-from cflow_torch.ops.indices import flat_nonzero
+from cflow_torch.ops.indices import flat_nonzero, split_index
+from cflow_torch.windows.collation import Batch
 
 
 @dataclass(frozen=True)
@@ -31,6 +33,10 @@ class RigidMotion:
         """Objects that do not turn."""
         still = torch.zeros_like(flow)
         return cls(flow, still[:, 0], still)
+
+    def only(self, moves: Tensor) -> RigidMotion:
+        """The motion of some objects, (G,) bool; the others stand still."""
+        return RigidMotion(self.flow.masked_fill(~moves[:, None], 0.0), self.turn.masked_fill(~moves, 0.0), self.centre)
 
     def flow_at(self, which: Tensor, x: Tensor, y: Tensor) -> Tuple[Tensor, Tensor]:
         """x and y of the flow, metres per interval, of points of t (K,), by their object and their place in metres."""
@@ -68,3 +74,31 @@ class TurningMotion(Motion):
         x, y = rigid.flow_at(cluster.index_select(0, turns), *positions[:2].index_select(1, turns).unbind(0))
         flow[turns, 0], flow[turns, 1] = x + 0.0, y + 0.0  # no -0.0
         return flow.float()
+
+
+def join(first: TurningMotion, second: TurningMotion, takes_second: Tensor, batch: Batch) -> TurningMotion:
+    """Two motions of the same points, one for each point. In a window the ids of the second follow those of the first.
+
+    Args:
+        first, second: of L and M clusters; the result has L + 1 + M, since entry L stays "none" as well.
+        takes_second: (K,) bool, for the first K points of the batch, at least those of t+1 and t.
+        batch: of these points.
+    """
+    count = takes_second.numel()
+    at_t = slice(batch.num_newest, batch.sources[-1].points.stop)
+    window = split_index(batch.image[at_t].long(), batch.num_steps)[0]
+    num_ids = torch.zeros(batch.num_windows, dtype=torch.int64, device=window.device)
+    num_ids.scatter_reduce_(0, window, 1 + first.cluster_id.index_select(0, first.cluster(at_t)), "amax")
+    offset = torch.zeros_like(second.cluster_id)
+    offset.scatter_(0, second.cluster(at_t).long(), num_ids.index_select(0, window))
+    ids = second.cluster_id + offset.masked_fill_(second.cluster_id < 0, 0)
+    both = {
+        name: torch.cat((getattr(first, name), getattr(second, name)))
+        for name in ("flow", "score", "confidence", "turn", "centre")
+    }
+    return TurningMotion(
+        of_place=torch.cat((first.of_place, second.of_place + first.cluster_id.numel())),
+        place=torch.where(takes_second, second.place[:count] + first.of_place.numel(), first.place[:count]),
+        cluster_id=torch.cat((first.cluster_id, ids)),
+        **both,
+    )
