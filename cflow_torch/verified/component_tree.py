@@ -129,6 +129,19 @@ class Objects:
         """G."""
         return self.component.numel()
 
+    def split(self, part: Tensor, wanted: Tensor, num_components: int) -> Objects:
+        """Parts of them taken out as objects of their own.
+
+        Args:
+            part: (P,) int64, part of each pixel, H = none.
+            wanted: (H,) bool, the parts that are taken out.
+            num_components: of all levels; the parts are numbered after them.
+        """
+        none = num_components + wanted.numel()
+        whole = F.pad(self.component, (0, 1), value=none).index_select(0, self.of_pixel)
+        is_out = F.pad(wanted, (0, 1)).index_select(0, part)
+        return number_objects(torch.where(is_out, num_components + part, whole), none)
+
     def pixels_of(self, wanted: Tensor) -> Tensor:
         """(P,) int64, `of_pixel` for the objects that are wanted, (G,) bool; G for all other pixels."""
         return torch.where(F.pad(wanted, (0, 1)).index_select(0, self.of_pixel), self.of_pixel, self.count)
@@ -165,6 +178,11 @@ def select_objects(levels: Sequence[Level], evidence: Sequence[Tensor]) -> Objec
         of_pixel = torch.where(wins.index_select(0, whole.component), whole.component + offset, of_pixel)
         part, value = whole, torch.maximum(own, total)
 
+    return number_objects(of_pixel, num_components)
+
+
+def number_objects(of_pixel: Tensor, num_components: int) -> Objects:
+    """Objects by the component, (P,) int64, that each pixel belongs to; `num_components` = none."""
     position = torch.arange(of_pixel.numel(), device=of_pixel.device)
     first = segment_amin(position, of_pixel, num_components + 1, of_pixel.numel())[:num_components]
     first, component = first.sort()

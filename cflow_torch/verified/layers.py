@@ -92,15 +92,16 @@ def points_of_lower_layers(sweeps: HeightSlicedSweeps, at_rest: Tensor) -> Tenso
 def _cells(sweeps: HeightSlicedSweeps, rows: Tensor) -> Cells:
     """The cells of some points, (K,) int64 rows of the batch."""
     batch, grid = sweeps.batch, sweeps.grid
-    shape = (*(int((grid.upper[axis] - grid.lower[axis]) / _CELL) + 1 for axis in (1, 0)), _NUM_SLICES)
+    num_rows, num_cols = (int((grid.upper[axis] - grid.lower[axis]) / _CELL) + 1 for axis in (1, 0))
     x, y, z = batch.positions.index_select(1, rows).unbind(0)
     window = divide(batch.image.index_select(0, rows).long(), batch.num_steps)
     row, col = ((values - low).div_(_CELL).long() for values, low in ((y, grid.lower[1]), (x, grid.lower[0])))
     height = (z / SLICE_HEIGHT).floor_().clamp_(-(2.0**40), 2.0**40).long()
     lowest = segment_amin(height, window, batch.num_windows, 1 << 41)
     height = (height - lowest.index_select(0, window)).clamp_(max=_NUM_SLICES - 1)
-    key, of_point = torch.unique(((window * shape[0] + row) * shape[1] + col) * shape[2] + height, return_inverse=True)
-    return Cells(key, shape, of_point)
+    key = ((window * num_rows + row) * num_cols + col) * _NUM_SLICES + height
+    key, of_point = torch.unique(key, return_inverse=True)
+    return Cells(key, (num_rows, num_cols, _NUM_SLICES), of_point)
 
 
 def _join(cells: Cells) -> Tensor:

@@ -23,6 +23,7 @@ from cflow_torch.verified.component_tree import Objects, find_components, select
 from cflow_torch.verified.confidence import confidence_of, margin_of
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 from cflow_torch.verified.layers import join_moving, points_at_rest, points_of_lower_layers
+from cflow_torch.verified.local_motion import find_local_motion
 from cflow_torch.verified.offline import best_nearby, motion_by_both_sides
 from cflow_torch.verified.paired_test import VerifiedLevel, verify
 from cflow_torch.verified.rigid_motion import RigidMotion, TurningMotion
@@ -101,6 +102,10 @@ class VerifiedFlow(SceneFlowModel):
             objects, motion = _select(levels)
             if config.num_future > 0:
                 motion = best_nearby(sweeps, objects, motion, config)
+        if config.thorough and is_first:
+            with stage("local"):
+                num_components = sum(level.level.num_components for level in levels)
+                objects, motion = find_local_motion(sweeps, objects, motion, num_components)
         with stage("register"):
             rigid = self.register(objects, motion, levels, sweeps)
         with stage("confidence"):
@@ -123,7 +128,8 @@ class VerifiedFlow(SceneFlowModel):
         pixel_size, moves = sweeps.grid.pixel_size, motion.any(1)
         if not self.config.thorough:
             return RigidMotion.translation(motion.flip(1) * pixel_size)
-        too_long = torch.cat([level.level.too_long for level in levels]).index_select(0, objects.component)
+        too_long = F.pad(torch.cat([level.level.too_long for level in levels]), (0, 1))
+        too_long = too_long.index_select(0, objects.component.clamp(max=too_long.numel() - 1))
         slow = slow_motion.slow_motion(sweeps, objects, ~moves & ~too_long)
         points = points_of_objects(sweeps, objects, moves)
         is_pair = (sweeps.elapsed != 0).sum(1) == 1  # with history one of many sweeps would decide

@@ -13,11 +13,12 @@ from cflow_torch.config import VerifiedConfig
 from cflow_torch.ops.indices import flat_nonzero
 from cflow_torch.verified.aperture import slides_along_itself
 from cflow_torch.verified.component_tree import Level
-from cflow_torch.verified.height_slices import HeightSlicedSweeps, count_slices
+from cflow_torch.verified.height_slices import NUM_SLICES, HeightSlicedSweeps, count_slices
 
 # Look-ups (pixel x sweep x candidate) done at once: their temporaries take about 64 bytes each.
 _LOOKS_ON_CPU = 1 << 18
 _LOOKS_ON_GPU = 1 << 24
+_FAR = 2  # pixels, in y or in x
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,9 @@ def count_wins(
     """Paired counts of candidate motions against standing still.
 
     A slice of a pixel is won by a motion if another sweep has it where the motion takes the pixel and not where the
-    pixel is; it is lost the other way round. Slices found in both places, or in neither, say nothing.
+    pixel is; it is lost the other way round. Slices found in both places, or in neither, say nothing. A motion of two
+    pixels or more finds a slice "not" in a place only if none of the 3 x 3 pixels there has it: beams meet a side at
+    other places in each sweep, and a side that stands must not look as if it had left.
 
     Args:
         sweeps: finest images and their P occupied pixels.
@@ -81,7 +84,7 @@ def count_wins(
     Cost: P (S - 1) C look-ups at most, of the pixels of tested components only.
     """
     count, num_candidates, _ = candidates.shape
-    pixel, step = _looks(sweeps, flat_nonzero(F.pad(tested, (0, 1)).index_select(0, component)))
+    pixel, step = looks(sweeps, flat_nonzero(F.pad(tested, (0, 1)).index_select(0, component)))
     sums = torch.zeros(count * num_candidates, dtype=torch.int64, device=component.device)
     column = torch.arange(num_candidates, device=component.device)
     at_once = _LOOKS_ON_CPU if component.device.type == "cpu" else _LOOKS_ON_GPU
@@ -91,18 +94,24 @@ def count_wins(
         # One of the two is 0.
         k = sweeps.elapsed[window, sweeps.step.index_select(0, some)] - sweeps.elapsed[window, other]
         own, of_some = sweeps.slices.index_select(0, some)[:, None], component.index_select(0, some)
-        here = own & sweeps.slices_at(window, other, row, col)[:, None]
+        seen = sweeps.with_around.index_select(0, sweeps.index(window, other, row, col))[:, None]
+        here, near_here = own & seen, own & (seen >> NUM_SLICES)
         move = (candidates.index_select(0, of_some) * k[:, None, None] + 0.5).floor_().long()
         y, x = row[:, None] + move[:, :, 0], col[:, None] + move[:, :, 1]
-        there = own & sweeps.slices_at(window[:, None], other[:, None], y, x)
+        index = sweeps.index(window[:, None], other[:, None], y, x)
+        seen = sweeps.with_around.index_select(0, index.view(-1)).view(index.shape)
+        there, near_there = own & seen, own & (seen >> NUM_SLICES)
+        is_far = move.abs().amax(2) >= _FAR
+        won = there & ~torch.where(is_far, near_here, here)
+        lost = here & ~torch.where(is_far, near_there, there)
         # Both counts in one number, won * 2^32 + lost, because sums cost more than look-ups.
-        counts = (count_slices(there & ~here).long() << 32) + count_slices(here & ~there)
+        counts = (count_slices(won).long() << 32) + count_slices(lost)
         sums.index_add_(0, (of_some[:, None] * num_candidates + column).view(-1), counts.view(-1))
     sums = sums.view(count, num_candidates)
     return sums >> 32, sums & 0xFFFFFFFF
 
 
-def _looks(sweeps: HeightSlicedSweeps, member: Tensor) -> Tuple[Tensor, Tensor]:
+def looks(sweeps: HeightSlicedSweeps, member: Tensor) -> Tuple[Tensor, Tensor]:
     """(L,) int64 each: pixels that look at another sweep, and the sweep. Some (K,) int64 pixels are members."""
     step = sweeps.step.index_select(0, member)
     older = member.index_select(0, flat_nonzero(step > 0))

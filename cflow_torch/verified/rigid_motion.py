@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Tuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.model import Motion

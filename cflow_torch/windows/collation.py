@@ -53,6 +53,7 @@ class Batch:
         elapsed: (B, S) float64, sweep intervals from the sweep to t+1: the k that divides an estimate and
             scales a warp (0 for step 0 and for sweeps that a window lacks, negative for sweeps after t+1).
         seconds: (B, S) float64, the same in seconds, for `max_speed`.
+        origin: (B, S, 3) float64, metres, frame of t+1: where the ego frame of each sweep has its origin.
         sources: of each window, what its result is made of.
         ground: of the ground points of t and t+1; None = nothing asks.
     """
@@ -65,6 +66,7 @@ class Batch:
     num_steps: int
     elapsed: Tensor
     seconds: Tensor
+    origin: Tensor
     sources: Tuple[Source, ...]
     ground: Optional[GroundHeights] = None
 
@@ -82,6 +84,7 @@ class Batch:
             num_steps=kept.numel(),
             elapsed=self.elapsed.index_select(1, kept),
             seconds=self.seconds.index_select(1, kept),
+            origin=self.origin.index_select(1, kept),
         )
 
 
@@ -171,6 +174,7 @@ def make_batch(
     first_future = 1 + max(len(sources) - count for sources, count in zip(kept, num_future))
     num_steps = first_future + max(num_future)
     elapsed, seconds = np.zeros((2, len(windows), num_steps))
+    origin = np.zeros((len(windows), num_steps, 3))
     sweeps: List[Tuple[int, int, str, Sweep]] = []
     for index, (window, sources, count) in enumerate(zip(windows, kept, num_future)):
         steps = [*range(1, 1 + len(sources) - count), *range(first_future, first_future + count)]
@@ -195,6 +199,7 @@ def make_batch(
         if step > 0 and to_ego1[index] is not None:
             transform = to_ego1[index] @ rigid_transform(sweep.pose, f"pose of {name}", farthest)
             check_distance(transform, name)
+            origin[index, step] = transform[:3, 3]
         if step == 1:
             with torch.inference_mode(False):  # becomes part of the result
                 pose_flow = torch.zeros((sweep.points.shape[0], 3), dtype=torch.float32, device=device)
@@ -227,6 +232,7 @@ def make_batch(
         num_steps=num_steps,
         elapsed=torch.as_tensor(elapsed, device=device),
         seconds=torch.as_tensor(seconds, device=device),
+        origin=torch.as_tensor(origin, device=device),
         sources=tuple(of_pc0),
         ground=ground,
     )
