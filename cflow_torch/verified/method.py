@@ -20,6 +20,7 @@ from cflow_torch.verified import keypoint_candidates, slow_motion
 from cflow_torch.verified.candidates import propose
 from cflow_torch.verified.component_tree import Objects, find_components, select_objects
 from cflow_torch.verified.confidence import confidence_of
+from cflow_torch.verified.deskewing import deskew, stretch_of
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 from cflow_torch.verified.paired_test import VerifiedLevel, verify
 from cflow_torch.verified.rigid_motion import RigidMotion, TurningMotion
@@ -27,6 +28,9 @@ from cflow_torch.verified.rigid_registration import register
 from cflow_torch.verified.subpixel_shift import shift_between_pixels
 from cflow_torch.verified.voxel_centroids import points_of_objects
 from cflow_torch.windows.collation import Batch
+
+import os
+_NUM_ROUNDS = int(os.environ.get("ROUNDS", 2))  # of "take the points to one instant, register them"
 
 
 class VerifiedFlow(SceneFlowModel):
@@ -59,6 +63,11 @@ class VerifiedFlow(SceneFlowModel):
         or of the descriptors of key points, one after the other."""
         most = max(keypoint_candidates.BYTES_PER_POINT, slow_motion.BYTES_PER_POINT) if self.config.thorough else 0
         return int(super().bytes_per_point) + 170 + most
+
+    @property
+    def needs_times(self) -> bool:  # type: ignore[override]
+        """Whether the times of points are asked for."""
+        return bool(self.config.thorough)
 
     def motion(self, batch: Batch) -> TurningMotion:
         """Motion of everything in a batch, by occupied pixel; ids number what moves together or stands together."""
@@ -102,9 +111,14 @@ class VerifiedFlow(SceneFlowModel):
         slow = slow_motion.slow_motion(sweeps, objects, ~moves & ~too_long)
         points = points_of_objects(sweeps, objects, moves)
         is_pair = (sweeps.elapsed > 0).sum(1) == 1  # with history one of many sweeps would decide
-        motion = shift_between_pixels(points.take(is_pair.index_select(0, points.window)), sweeps, motion)
+        motion = motion / stretch_of(points, sweeps, objects.count)[:, None]
+        rigid = RigidMotion.translation(motion.flip(1) * pixel_size)
+        sharp, _ = deskew(points.take(is_pair.index_select(0, points.window)), sweeps, rigid)
+        motion = shift_between_pixels(sharp, sweeps, motion)
         points = points.take(motion.any(1).index_select(0, points.owner))
-        rigid = register(points, sweeps, motion.flip(1) * pixel_size)
+        rigid = start = RigidMotion.translation(motion.flip(1) * pixel_size)
+        for _ in range(1 if points.time is None else _NUM_ROUNDS):
+            rigid = register(*deskew(points, sweeps, rigid), start.flow)
         return RigidMotion(torch.where(slow.any(1, keepdim=True), slow, rigid.flow), rigid.turn, rigid.centre)
 
 

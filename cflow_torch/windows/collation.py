@@ -22,12 +22,15 @@ from cflow_torch.windows.validation import (
     check_distance,
     elapsed_times,
     read_ground,
+    read_point_times,
     read_positions,
     source_sweeps,
 )
 
 # Working memory of a pixel of every sweep (occupancy and cluster) before the clusters of a window are known.
 _BYTES_PER_PIXEL = 10
+# Times of points are multiples of this part of a sweep interval: their sums are exact, in any order of the points.
+_TICKS = 1 << 20
 # What windows of a group may take on a CPU where `max_memory` says nothing: about 9 of a pair, 4 of six sweeps. Fresh
 # pages of larger arrays cost more than the operations that larger groups save.
 _BYTES_ON_CPU = 1 << 29
@@ -53,6 +56,8 @@ class Batch:
         seconds: (B, S) float64, the same in seconds, for `max_speed`.
         sources: of each window, what its result is made of.
         ground: of the ground points of t and t+1; None = nothing asks.
+        point_times: (P,) float32, sweep intervals from the instant of its sweep to the measurement of each point, whole
+            2^-20; 0 in windows of which a sweep has none. None = no window has them, or nothing asks.
     """
 
     positions: Tensor
@@ -65,6 +70,7 @@ class Batch:
     seconds: Tensor
     sources: Tuple[Source, ...]
     ground: Optional[GroundHeights] = None
+    point_times: Optional[Tensor] = None
 
 
 @dataclass(frozen=True)
@@ -128,6 +134,7 @@ def make_batch(
     device: torch.device,
     num_axes: int = 2,
     needs_ground: bool = False,
+    needs_times: bool = False,
 ) -> Batch:
     """Check windows, bring every sweep into the frame of its t+1, keep what takes part.
 
@@ -138,6 +145,7 @@ def make_batch(
         device: where the batch is to lie.
         num_axes: coordinates that are kept, 2 or 3.
         needs_ground: whether heights of the ground are kept as well.
+        needs_times: whether the times of points are kept as well.
 
     Returns:
         The batch, on one device.
@@ -169,6 +177,8 @@ def make_batch(
     positions = torch.empty((num_axes, most), dtype=torch.float64, device=device)
     takes_part = torch.ones(most, dtype=torch.bool, device=device)
     image = torch.empty(most, dtype=torch.int32, device=device)
+    has_times = [needs_times and _has_point_times(window, older) for window, older in zip(windows, kept)]
+    point_times = torch.zeros(most, dtype=torch.float32, device=device) if any(has_times) else None
     stop, num_newest, sources = 0, 0, []
     for step, index, name, sweep in sweeps:
         start, transform = stop, None
@@ -179,6 +189,10 @@ def make_batch(
             with torch.inference_mode(False):  # becomes part of the result
                 pose_flow = torch.zeros((sweep.points.shape[0], 3), dtype=torch.float32, device=device)
             sources.append(Source(slice(start, start + len(pose_flow)), pose_flow))
+        times = None
+        if has_times[index]:
+            times = read_point_times(sweep, name, device) / (seconds[index, 1] / elapsed[index, 1])
+            times = torch.floor(times * _TICKS + 0.5) / _TICKS
         for rows, raw, moved, inside, ground_inside in _pieces(
             sweep, name, transform, 3 if step == 1 else num_axes, grid, config, device
         ):
@@ -195,6 +209,8 @@ def make_batch(
                 points = slice(stop, stop + row.numel())
                 for values, of_axis in zip(positions[:, points].unbind(0), moved.unbind(0)):
                     torch.index_select(of_axis, 0, row, out=values)
+            if times is not None and point_times is not None:
+                point_times[points] = times[rows] if step == 1 else times[rows].index_select(0, row)
             stop = points.stop
         image[start:stop] = index * num_steps + step
         num_newest = stop if step == 0 else num_newest
@@ -209,7 +225,13 @@ def make_batch(
         seconds=torch.as_tensor(seconds, device=device),
         sources=tuple(sources),
         ground=ground,
+        point_times=None if point_times is None else point_times[:stop],
     )
+
+
+def _has_point_times(window: Window, older: Sequence[Tuple[str, Sweep, int]]) -> bool:
+    """Whether every sweep that is used has them: one without would seem to be measured at other times."""
+    return all(sweep.point_times is not None for sweep in (window.pc1, *(sweep for _, sweep, _ in older)))
 
 
 def _pieces(

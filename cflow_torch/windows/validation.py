@@ -15,6 +15,8 @@ from cflow_torch.types import CFlowError, Sweep, Window, as_numpy
 
 # No sweep of a window is further away than this, metres: 2 s at 50 m/s.
 _FARTHEST_POSE = 100.0
+# No point of a sweep is measured further from its instant than this, seconds: other numbers are of another unit.
+_LONGEST_POINT_TIME = 10.0
 # Sweeps that differ at all differ in their first points: those are compared before the whole clouds are.
 _FIRST_POINTS = 64
 _ALL_ROWS = slice(None)
@@ -43,6 +45,8 @@ def check_windows(windows: Any, config: Optional[Config] = None) -> None:
             if not isinstance(sweep, Sweep):
                 raise CFlowError(f"{name} is {type(sweep).__name__}: give cflow_torch.Sweep(points, ...)")
             check_points(sweep.points, name)
+            if sweep.point_times is not None:
+                _check_point_times(sweep, name)
             if config is not None:
                 _check_resolution(sweep.points.dtype, name, config)
 
@@ -86,6 +90,17 @@ def check_points(points: Any, name: str) -> None:
     is_floating = points.is_floating_point() if isinstance(points, Tensor) else np.issubdtype(points.dtype, np.floating)
     if not is_floating:
         raise CFlowError(f"{name} has dtype {points.dtype}: give floating-point metres")
+
+
+def _check_point_times(sweep: Sweep, name: str) -> None:
+    """Refuse what is not a float for each point; their values are looked at when they are read."""
+    times, wanted = sweep.point_times, f"give ({sweep.points.shape[0]},) floats, seconds after the sweep's time stamp"
+    if not isinstance(times, (np.ndarray, Tensor)):
+        raise CFlowError(f"point times of {name} are {type(times).__name__}: {wanted}")
+    check_plain(times, f"point times of {name}")
+    is_floating = times.is_floating_point() if isinstance(times, Tensor) else np.issubdtype(times.dtype, np.floating)
+    if tuple(times.shape) != (sweep.points.shape[0],) or not is_floating:
+        raise CFlowError(f"point times of {name} have shape {tuple(times.shape)} and dtype {times.dtype}: {wanted}")
 
 
 def resolution(dtype: Any, distance: float) -> float:
@@ -188,7 +203,10 @@ def choose_device(windows: Sequence[Window], device: Any) -> torch.device:
             raise CFlowError(f"device={device!r} cannot be used ({reason}): give 'auto', 'cpu' or 'cuda'") from None
     else:
         arrays = [
-            a for window in windows for _, sweep in _named_sweeps(window) for a in (sweep.points, sweep.is_ground)
+            a
+            for window in windows
+            for _, sweep in _named_sweeps(window)
+            for a in (sweep.points, sweep.is_ground, sweep.point_times)
         ]
         found = {array.device for array in arrays if isinstance(array, Tensor)}
         if len(found) > 1:
@@ -230,3 +248,20 @@ def read_ground(sweep: Sweep, name: str, num_points: int, device: torch.device) 
     if isinstance(mask, np.ndarray):
         mask = torch.from_numpy(np.array(mask))
     return mask.to(device)
+
+
+def read_point_times(sweep: Sweep, name: str, device: torch.device) -> Tensor:
+    """(N,) float64 seconds; the sweep must have point times, of a shape that was checked.
+
+    Raises:
+        CFlowError: a time is not finite, or too long to be a time within a sweep.
+    """
+    given = sweep.point_times
+    times = given.detach() if isinstance(given, Tensor) else torch.from_numpy(np.array(given, dtype=np.float64))
+    times = times.to(device, torch.float64)
+    if not bool((times.abs() <= _LONGEST_POINT_TIME).all()):  # False for NaN
+        raise CFlowError(
+            f"point times of {name} are not all finite and within {_LONGEST_POINT_TIME:g} s of 0: give seconds after "
+            "the sweep's time stamp (nanoseconds / 1e9; no time of day)"
+        )
+    return times
