@@ -30,6 +30,9 @@ def estimate_flow(
     pch: Sequence[Array] = (),  # (Nh, 3+) each, nearest first
     T_ego1_egoh: Sequence[Optional[Array]] = (),
     gmh: Sequence[Optional[Array]] = (),
+    dt0: Optional[Array] = None,  # (N0,), seconds
+    dt1: Optional[Array] = None,  # (N1,), seconds
+    dth: Sequence[Optional[Array]] = (),
     method: Optional[str] = None,
     preset: Optional[str] = None,
     ground: Optional[str] = None,
@@ -47,6 +50,9 @@ def estimate_flow(
         pch: older sweeps t-1, t-2, ..., at most `num_history`.
         T_ego1_egoh: (4, 4) of each of `pch`; may be left out only if `T_ego1_ego0` is left out too.
         gmh: ground mask of each of `pch`; empty = nothing is ground.
+        dt0, dt1: times of points, seconds after the instant of their sweep, see `Sweep.point_times`. The preset
+            `default` uses them if every sweep has them.
+        dth: those of each of `pch`.
         method: "dense", "keypoints" or "verified"; None = the preset's.
         preset: "default", "fast", "keypoints" or "paper"; None = "default", or that of the method, see `make_config`.
         ground: None = as the masks say; "auto" = find the ground of every sweep without a mask (`find_ground`);
@@ -80,7 +86,7 @@ def estimate_flow(
         raise CFlowError(f"ground={ground!r}: give one of {', '.join(map(repr, GROUND))}")
     config = make_config(preset, method, **overrides)
     transforms = _per_sweep("T_ego1_egoh", T_ego1_egoh, pch)
-    masks = _per_sweep("gmh", gmh, pch)
+    masks, times = _per_sweep("gmh", gmh, pch), _per_sweep("dth", dth, pch)
     moved = T_ego1_ego0 is not None or any(t is not None for t in transforms)
     if moved and len(pch) > 0 and len(T_ego1_egoh) == 0:
         raise CFlowError(
@@ -88,15 +94,15 @@ def estimate_flow(
             "(None for a sweep that already lies in the frame of t+1)"
         )
 
-    def sweep(points: Array, is_ground: Optional[Array], transform: Optional[Array]) -> Sweep:
+    def sweep(points: Array, is_ground: Any, times: Optional[Array], transform: Optional[Array]) -> Sweep:
         # The world is the ego frame at t+1, so T_ego1_ego is the pose.
         pose = (np.eye(4) if transform is None else transform) if moved else None
-        return Sweep(points, is_ground, pose)
+        return Sweep(points, is_ground, pose, point_times=times)
 
     window = Window(
-        pc0=sweep(pc0, gm0, T_ego1_ego0),
-        pc1=sweep(pc1, gm1, None),
-        pch=tuple(sweep(*parts) for parts in zip(pch, masks, transforms)),
+        pc0=sweep(pc0, gm0, dt0, T_ego1_ego0),
+        pc1=sweep(pc1, gm1, dt1, None),
+        pch=tuple(sweep(*parts) for parts in zip(pch, masks, times, transforms)),
     )
     window = _find_ground(window, ground, device)
     (result,) = make_model(config, device)([window])

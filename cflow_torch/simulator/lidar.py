@@ -97,7 +97,7 @@ def scan(
         points = T_ego_sensor[:3, :3] @ local + T_ego_sensor[:3, 3:]
         column = hit // len(unit.elevations)
         turned = column if unit.span > 0 else unit.num_columns - 1 - column
-        offset_ns = turned * (profile.sweep_interval_ns / unit.num_columns)
+        offset_ns = torch.zeros_like(turned)
         parts.append(_returns(points, local, image, hit, reflected, unit, (number, first_laser), turned, offset_ns))
         first_laser += len(unit.elevations)
     return _together(parts)

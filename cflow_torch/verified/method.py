@@ -20,7 +20,7 @@ from cflow_torch.verified import keypoint_candidates, slow_motion
 from cflow_torch.verified.candidates import propose
 from cflow_torch.verified.component_tree import Objects, find_components, select_objects
 from cflow_torch.verified.confidence import confidence_of
-from cflow_torch.verified.deskewing import deskew, stretch_of
+from cflow_torch.verified.deskewing import register_deskewed
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 from cflow_torch.verified.paired_test import VerifiedLevel, verify
 from cflow_torch.verified.rigid_motion import RigidMotion, TurningMotion
@@ -28,9 +28,6 @@ from cflow_torch.verified.rigid_registration import register
 from cflow_torch.verified.subpixel_shift import shift_between_pixels
 from cflow_torch.verified.voxel_centroids import points_of_objects
 from cflow_torch.windows.collation import Batch
-
-import os
-_NUM_ROUNDS = int(os.environ.get("ROUNDS", 2))  # of "take the points to one instant, register them"
 
 
 class VerifiedFlow(SceneFlowModel):
@@ -89,9 +86,9 @@ class VerifiedFlow(SceneFlowModel):
         with stage("select"):
             objects, motion = _select(levels)
         with stage("register"):
-            rigid = self.register(objects, motion, levels, sweeps)
+            rigid, seen = self.register(objects, motion, levels, sweeps)
         with stage("confidence"):
-            confidence = confidence_of(sweeps, objects, rigid)
+            confidence = confidence_of(sweeps, objects, seen)
             return _by_pixel(objects, rigid, levels[-1].score, confidence, sweeps, config.thorough)
 
     def scales(self) -> List[Tuple[int, bool]]:
@@ -102,24 +99,23 @@ class VerifiedFlow(SceneFlowModel):
 
     def register(
         self, objects: Objects, motion: Tensor, levels: List[VerifiedLevel], sweeps: HeightSlicedSweeps
-    ) -> RigidMotion:
-        """Motion of G objects in metres, from (G, 2) float64 (y, x), finest pixels per sweep interval."""
+    ) -> Tuple[RigidMotion, RigidMotion]:
+        """Motion of G objects in metres, from (G, 2) float64 (y, x), finest pixels per sweep interval; and the motion
+        that the images show, which differs where points have times of their own."""
         pixel_size, moves = sweeps.grid.pixel_size, motion.any(1)
         if not self.config.thorough:
-            return RigidMotion.translation(motion.flip(1) * pixel_size)
+            rigid = RigidMotion.translation(motion.flip(1) * pixel_size)
+            return rigid, rigid
         too_long = torch.cat([level.level.too_long for level in levels]).index_select(0, objects.component)
         slow = slow_motion.slow_motion(sweeps, objects, ~moves & ~too_long)
         points = points_of_objects(sweeps, objects, moves)
         is_pair = (sweeps.elapsed > 0).sum(1) == 1  # with history one of many sweeps would decide
-        motion = motion / stretch_of(points, sweeps, objects.count)[:, None]
-        rigid = RigidMotion.translation(motion.flip(1) * pixel_size)
-        sharp, _ = deskew(points.take(is_pair.index_select(0, points.window)), sweeps, rigid)
-        motion = shift_between_pixels(sharp, sweeps, motion)
+        motion = shift_between_pixels(points.take(is_pair.index_select(0, points.window)), sweeps, motion)
         points = points.take(motion.any(1).index_select(0, points.owner))
-        rigid = start = RigidMotion.translation(motion.flip(1) * pixel_size)
-        for _ in range(1 if points.time is None else _NUM_ROUNDS):
-            rigid = register(*deskew(points, sweeps, rigid), start.flow)
-        return RigidMotion(torch.where(slow.any(1, keepdim=True), slow, rigid.flow), rigid.turn, rigid.centre)
+        start = motion.flip(1) * pixel_size
+        seen = register(points, sweeps, start)
+        seen = RigidMotion(torch.where(slow.any(1, keepdim=True), slow, seen.flow), seen.turn, seen.centre)
+        return register_deskewed(points, sweeps, start, seen), seen
 
 
 def _select(levels: List[VerifiedLevel]) -> Tuple[Objects, Tensor]:

@@ -94,6 +94,7 @@ class Voxels:
         owner, window, step, part: (V,) int64, as for `ObjectPoints`.
         x, y: (V + 1,) float64, centroid, whole units of 1/1024 m from the lower corner of the region; the last entry,
             of no voxel, is far away.
+        time: (V,) float64, mean of `ObjectPoints.time`; None = there are none.
 
     Convention: a coordinate is rounded to the nearest unit, their mean down to a whole one.
 
@@ -117,6 +118,9 @@ class Voxels:
             torch.zeros_like(key).scatter_(0, voxel, values) for values in (points.owner, points.window, points.step)
         )
         self.part = key & (num_slices - 1)
+        self.time: Optional[Tensor] = None
+        if points.time is not None:
+            self.time = torch.zeros_like(count, dtype=torch.float64).index_add_(0, voxel, points.time.double()) / count
 
     @staticmethod
     def _centroids(values: Tensor, voxel: Tensor, count: Tensor) -> Tensor:
