@@ -142,7 +142,9 @@ class SceneFlowModel(nn.Module):
             for part in split_windows(windows, grid, device, self.bytes_per_point, self.config.max_memory):
                 with torch.inference_mode():  # a tenth faster than no_grad: the work is many small operations
                     with stage("compensate"):
-                        batch = make_batch(part, self.config, grid, device, self.num_axes, self.needs_ground, self.needs_times)
+                        batch = make_batch(
+                            part, self.config, grid, device, self.num_axes, self.needs_ground, self.needs_times
+                        )
                     motion = self.motion(batch)
                 with stage("spread"):  # outside of inference mode: a training loop may use these tensors
                     results += _results(batch, motion)

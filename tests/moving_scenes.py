@@ -62,18 +62,23 @@ class OracleWindow:
         }
         self.flow: List[Vector] = [(x, y) for x, y in scene.flow[mine].tolist()]
         self.flow_in_pixels: List[Vector] = [(y / size, x / size) for x, y in self.flow]
-        self._config = VerifiedConfig(pixel_sizes=(size,), point_cloud_range=(*grid.lower, *grid.upper))
+        self.config = VerifiedConfig(pixel_sizes=(size,), point_cloud_range=(*grid.lower, *grid.upper))
         self._clouds = [
             sweeps.batch.positions[:, sweeps.batch.image == window * sweeps.num_steps + step].T.numpy()
             for step in range(sweeps.num_steps)
         ]
+        times = sweeps.batch.point_times
+        self._times: Optional[List[np.ndarray]] = None
+        if times is not None:
+            images = [window * sweeps.num_steps + step for step in range(sweeps.num_steps)]
+            self._times = [times[sweeps.batch.image == image].double().numpy() for image in images]
 
     def points(
         self, wanted: Optional[Sequence[bool]] = None, height: float = SLICE_HEIGHT, num_slices: int = NUM_SLICES
     ) -> List[Point]:
         """Of the objects wanted, of all of them if nothing is said."""
         wanted = [True] * self.num_objects if wanted is None else wanted
-        return listed_points(wanted, self.object_of, self._clouds, self._config, height, num_slices)
+        return listed_points(wanted, self.object_of, self._clouds, self.config, height, num_slices, self._times)
 
 
 def for_oracle(sweeps: HeightSlicedSweeps, window: int) -> SlicedSweeps:

@@ -74,7 +74,7 @@ def stretch_of(points: ObjectPoints, sweeps: HeightSlicedSweeps, rigid: RigidMot
         the weight of a pair, k the intervals between its sweeps, a and b the mean times of its voxels in intervals. So
         the motion divided by it explains the pairs best. 1 for objects without pairs, and where it is below 0.75.
 
-    Convention: b - a is rounded to a 1024th, halves up.
+    Convention: k is rounded to a 16th and b - a to a 1024th, halves up.
     """
     pairs = _VoxelPairs(Voxels(points, sweeps), sweeps, rigid.flow.t().contiguous() * UNITS)
     sums = pairs.look(pairs.given, rigid.turn)[1]
@@ -164,7 +164,16 @@ class _VoxelPairs:
         wk = w * k
         wkk = wk * k
         e_a = wk * (r_x * e_y - r_y * e_x)
-        terms = (w, wkk, wkk * r_x, wkk * r_y, wkk * (r_x * r_x + r_y * r_y), wk * e_x, wk * e_y, e_a)
+        terms: Tuple[Tensor, ...] = (
+            w,
+            wkk,
+            wkk * r_x,
+            wkk * r_y,
+            wkk * (r_x * r_x + r_y * r_y),
+            wk * e_x,
+            wk * e_y,
+            e_a,
+        )
         if voxels.time is not None:
             late = voxels.time.index_select(0, later) - voxels.time.index_select(0, earlier)
             terms += (wk * (whole(UNITS * late) / UNITS),)

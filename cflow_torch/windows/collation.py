@@ -189,10 +189,10 @@ def make_batch(
             with torch.inference_mode(False):  # becomes part of the result
                 pose_flow = torch.zeros((sweep.points.shape[0], 3), dtype=torch.float32, device=device)
             sources.append(Source(slice(start, start + len(pose_flow)), pose_flow))
-        times = None
+        offsets = None
         if has_times[index]:
-            times = read_point_times(sweep, name, device) / (seconds[index, 1] / elapsed[index, 1])
-            times = torch.floor(times * _TICKS + 0.5) / _TICKS
+            offsets = read_point_times(sweep, name, device) / (seconds[index, 1] / elapsed[index, 1])
+            offsets = torch.floor(offsets * _TICKS + 0.5) / _TICKS
         for rows, raw, moved, inside, ground_inside in _pieces(
             sweep, name, transform, 3 if step == 1 else num_axes, grid, config, device
         ):
@@ -209,8 +209,8 @@ def make_batch(
                 points = slice(stop, stop + row.numel())
                 for values, of_axis in zip(positions[:, points].unbind(0), moved.unbind(0)):
                     torch.index_select(of_axis, 0, row, out=values)
-            if times is not None and point_times is not None:
-                point_times[points] = times[rows] if step == 1 else times[rows].index_select(0, row)
+            if offsets is not None and point_times is not None:
+                point_times[points] = offsets[rows] if step == 1 else offsets[rows].index_select(0, row)
             stop = points.stop
         image[start:stop] = index * num_steps + step
         num_newest = stop if step == 0 else num_newest
