@@ -50,7 +50,7 @@ def test_motion_and_points_equal_the_oracle(num_steps):
     scene = moving_scene(range(8), num_steps, snap=1 / 16, speed=0.8)
     rng = np.random.default_rng(num_steps)
     times = np.floor(rng.choice([-0.4, 0.1, 0.3], scene.sweeps.batch.image.numel()) * 2**20) / 2**20
-    times += (scene.sweeps.batch.image.numpy() % num_steps) * 0.125  # what is older was measured later
+    times -= (scene.sweeps.batch.image.numpy() % num_steps) * 0.125  # what is older was measured earlier
     scene = with_times(scene, torch.from_numpy(times))
     points = scene.points()
     seen = register(points, scene.sweeps, scene.flow)
