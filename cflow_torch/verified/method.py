@@ -11,7 +11,6 @@ from __future__ import annotations
 from typing import List, Tuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.model import SceneFlowModel
@@ -20,10 +19,11 @@ from cflow_torch.verified import keypoint_candidates, slow_motion
 from cflow_torch.verified.candidates import propose
 from cflow_torch.verified.component_tree import Objects, find_components, select_objects
 from cflow_torch.verified.confidence import confidence_of
+from cflow_torch.verified.deskewing import register_deskewed
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 from cflow_torch.verified.offline import best_nearby, motion_by_both_sides
 from cflow_torch.verified.paired_test import VerifiedLevel, verify
-from cflow_torch.verified.rigid_motion import RigidMotion, TurningMotion
+from cflow_torch.verified.rigid_motion import RigidMotion, TurningMotion, motion_by_pixel
 from cflow_torch.verified.rigid_registration import register
 from cflow_torch.verified.subpixel_shift import shift_between_pixels
 from cflow_torch.verified.voxel_centroids import points_of_objects
@@ -61,6 +61,11 @@ class VerifiedFlow(SceneFlowModel):
         most = max(keypoint_candidates.BYTES_PER_POINT, slow_motion.BYTES_PER_POINT) if self.config.thorough else 0
         return int(super().bytes_per_point) + 170 + most
 
+    @property
+    def needs_times(self) -> bool:  # type: ignore[override]
+        """Whether the times of points are asked for."""
+        return bool(self.config.thorough)
+
     def motion(self, batch: Batch) -> TurningMotion:
         """Motion of everything in a batch, by occupied pixel; ids number what moves together or stands together."""
         if self.config.num_future == 0:
@@ -89,11 +94,11 @@ class VerifiedFlow(SceneFlowModel):
             if config.num_future > 0:
                 motion = best_nearby(sweeps, objects, motion, config)
         with stage("register"):
-            rigid = self.register(objects, motion, levels, sweeps)
+            rigid, seen = self.register(objects, motion, levels, sweeps)
         with stage("confidence"):
-            confidence = confidence_of(sweeps, objects, rigid)
+            confidence = confidence_of(sweeps, objects, seen)
             is_numbered = config.thorough or config.num_future > 0
-            return _by_pixel(objects, rigid, levels[-1].score, confidence, sweeps, is_numbered)
+            return motion_by_pixel(objects, rigid, levels[-1].score, confidence, sweeps, is_numbered)
 
     def scales(self) -> List[Tuple[int, bool]]:
         """Of each level, coarse to fine: finest pixels a side of its pixels; are its components undilated?"""
@@ -103,50 +108,26 @@ class VerifiedFlow(SceneFlowModel):
 
     def register(
         self, objects: Objects, motion: Tensor, levels: List[VerifiedLevel], sweeps: HeightSlicedSweeps
-    ) -> RigidMotion:
-        """Motion of G objects in metres, from (G, 2) float64 (y, x), finest pixels per sweep interval."""
+    ) -> Tuple[RigidMotion, RigidMotion]:
+        """Motion of G objects in metres, from (G, 2) float64 (y, x), finest pixels per sweep interval; and the motion
+        that the images show, which differs where points have times of their own."""
         pixel_size, moves = sweeps.grid.pixel_size, motion.any(1)
         if not self.config.thorough:
-            return RigidMotion.translation(motion.flip(1) * pixel_size)
+            rigid = RigidMotion.translation(motion.flip(1) * pixel_size)
+            return rigid, rigid
         too_long = torch.cat([level.level.too_long for level in levels]).index_select(0, objects.component)
         slow = slow_motion.slow_motion(sweeps, objects, ~moves & ~too_long)
         points = points_of_objects(sweeps, objects, moves)
         is_pair = (sweeps.elapsed != 0).sum(1) == 1  # with history one of many sweeps would decide
         motion = shift_between_pixels(points.take(is_pair.index_select(0, points.window)), sweeps, motion)
         points = points.take(motion.any(1).index_select(0, points.owner))
-        rigid = register(points, sweeps, motion.flip(1) * pixel_size)
-        return RigidMotion(torch.where(slow.any(1, keepdim=True), slow, rigid.flow), rigid.turn, rigid.centre)
+        start = motion.flip(1) * pixel_size
+        seen = register(points, sweeps, start)
+        seen = RigidMotion(torch.where(slow.any(1, keepdim=True), slow, seen.flow), seen.turn, seen.centre)
+        return register_deskewed(points, sweeps, start, seen), seen
 
 
 def _select(levels: List[VerifiedLevel]) -> Tuple[Objects, Tensor]:
     """The objects among all components, and their motion as in `VerifiedLevel`."""
     objects = select_objects([level.level for level in levels], [level.evidence for level in levels])
     return objects, torch.cat([level.motion for level in levels]).index_select(0, objects.component)
-
-
-def _by_pixel(
-    objects: Objects,
-    rigid: RigidMotion,
-    score: Tensor,
-    confidence: Tensor,
-    sweeps: HeightSlicedSweeps,
-    is_numbered: bool,
-) -> TurningMotion:
-    """The motion of G objects, (P,) scores, (P + 1,) confidence by pixel: clusters are pixels, and M is P.
-
-    Args:
-        is_numbered: whether `sweeps.number` was made; else the pixels of t are numbered, which costs less.
-    """
-    window = sweeps.window.index_select(0, objects.first)
-    ids = torch.arange(window.numel(), device=window.device) - torch.searchsorted(window, window)
-    of_pixel = F.pad(objects.of_pixel, (0, 1), value=objects.count)
-    return TurningMotion(
-        of_place=sweeps.number if is_numbered else sweeps.number_at_t(),
-        place=sweeps.place,
-        flow=F.pad(rigid.flow, (0, 1, 0, 1)).index_select(0, of_pixel) + 0.0,  # + 0.0 turns -0.0 into 0.0
-        cluster_id=F.pad(ids, (0, 1), value=-1).index_select(0, of_pixel),
-        score=F.pad(score.masked_fill(objects.of_pixel == objects.count, 0.0), (0, 1)),
-        confidence=confidence,
-        turn=F.pad(rigid.turn, (0, 1)).index_select(0, of_pixel),
-        centre=F.pad(rigid.centre, (0, 0, 0, 1)).index_select(0, of_pixel),
-    )
