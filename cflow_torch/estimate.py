@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import replace
-from typing import Any, Optional, Sequence
+from typing import Any, Iterator, Optional, Sequence, Tuple
 
 import numpy as np
 
@@ -30,9 +30,13 @@ def estimate_flow(
     pch: Sequence[Array] = (),  # (Nh, 3+) each, nearest first
     T_ego1_egoh: Sequence[Optional[Array]] = (),
     gmh: Sequence[Optional[Array]] = (),
+    dt0: Optional[Array] = None,  # (N0,), seconds
+    dt1: Optional[Array] = None,  # (N1,), seconds
+    dth: Sequence[Optional[Array]] = (),
     pcf: Sequence[Array] = (),  # (Nf, 3+) each, nearest first
     T_ego1_egof: Sequence[Optional[Array]] = (),
     gmf: Sequence[Optional[Array]] = (),
+    dtf: Sequence[Optional[Array]] = (),
     method: Optional[str] = None,
     preset: Optional[str] = None,
     ground: Optional[str] = None,
@@ -50,7 +54,11 @@ def estimate_flow(
         pch: older sweeps t-1, t-2, ..., at most `num_history`.
         T_ego1_egoh: (4, 4) of each of `pch`; may be left out only if `T_ego1_ego0` is left out too.
         gmh: ground mask of each of `pch`; empty = nothing is ground.
-        pcf, T_ego1_egof, gmf: the same for sweeps t+2, t+3, ..., at most `num_future`; preset "offline" takes them.
+        dt0, dt1: times of points, seconds after the instant of their sweep, see `Sweep.point_times`. The presets
+            `default` and `offline` use them if every sweep has them.
+        dth: those of each of `pch`.
+        pcf, T_ego1_egof, gmf, dtf: the same for sweeps t+2, t+3, ..., at most `num_future`; preset "offline" takes
+            them.
         method: "dense", "keypoints" or "verified"; None = the preset's.
         preset: "default", "fast", "offline", "keypoints" or "paper"; None = "default", or that of the method, see
             `make_config`.
@@ -84,28 +92,25 @@ def estimate_flow(
     if ground not in GROUND:
         raise CFlowError(f"ground={ground!r}: give one of {', '.join(map(repr, GROUND))}")
     config = make_config(preset, method, **overrides)
-    sides = (("h", pch, T_ego1_egoh, gmh), ("f", pcf, T_ego1_egof, gmf))
-    transforms = [_per_sweep(f"T_ego1_ego{side}", f"pc{side}", given, clouds) for side, clouds, given, _ in sides]
-    masks = [_per_sweep(f"gm{side}", f"pc{side}", given, clouds) for side, clouds, _, given in sides]
-    moved = any(transform is not None for transform in (T_ego1_ego0, *transforms[0], *transforms[1]))
-    for side, clouds, given, _ in sides:
+    moved = any(transform is not None for transform in (T_ego1_ego0, *T_ego1_egoh, *T_ego1_egof))
+    for side, clouds, given in (("h", pch, T_ego1_egoh), ("f", pcf, T_ego1_egof)):
         if moved and len(clouds) > 0 and len(given) == 0:
             other = "another transform" if T_ego1_ego0 is None else "T_ego1_ego0"
             raise CFlowError(
                 f"{other} is given but T_ego1_ego{side} is not: give one transform per sweep of pc{side} "
                 "(None for a sweep that already lies in the frame of t+1)"
             )
+    frame1 = np.eye(4) if moved else None  # the world is the ego frame at t+1, so T_ego1_ego is the pose
 
-    def sweep(points: Array, is_ground: Optional[Array], transform: Optional[Array]) -> Sweep:
-        # The world is the ego frame at t+1, so T_ego1_ego is the pose.
-        pose = (np.eye(4) if transform is None else transform) if moved else None
-        return Sweep(points, is_ground, pose)
+    def sweep(points: Array, is_ground: Any, transform: Optional[Array], times: Optional[Array]) -> Sweep:
+        return Sweep(points, is_ground, frame1 if transform is None else transform, point_times=times)
 
-    past, future = (
-        tuple(sweep(*parts) for parts in zip(clouds, *others))
-        for clouds, *others in ((pch, masks[0], transforms[0]), (pcf, masks[1], transforms[1]))
+    window = Window(
+        pc0=sweep(pc0, gm0, T_ego1_ego0, dt0),
+        pc1=sweep(pc1, gm1, None, dt1),
+        pch=tuple(sweep(*parts) for parts in _parts("h", pch, gm=gmh, T_ego1_ego=T_ego1_egoh, dt=dth)),
+        pcf=tuple(sweep(*parts) for parts in _parts("f", pcf, gm=gmf, T_ego1_ego=T_ego1_egof, dt=dtf)),
     )
-    window = Window(sweep(pc0, gm0, T_ego1_ego0), sweep(pc1, gm1, None), past, future)
     window = _find_ground(window, ground, device)
     (result,) = make_model(config, device)([window])
     _warn_if_nothing_takes_part(result, window, config)
@@ -172,9 +177,11 @@ def _warn_if_nothing_takes_part(result: FlowResult, window: Window, config: Conf
     )
 
 
-def _per_sweep(name: str, of: str, values: Sequence[Any], clouds: Sequence[Array]) -> Sequence[Any]:
-    if len(values) == 0:
-        return [None] * len(clouds)
-    if len(values) != len(clouds):
-        raise CFlowError(f"{name} has {len(values)} entries for {len(clouds)} sweeps of {of}: give one per sweep")
-    return values
+def _parts(side: str, clouds: Sequence[Array], **others: Sequence[Any]) -> Iterator[Tuple[Any, ...]]:
+    """Points and what else is known of each sweep of one side, "h" or "f"; None where nothing is given."""
+    for name, values in others.items():
+        if len(values) not in (0, len(clouds)):
+            raise CFlowError(
+                f"{name}{side} has {len(values)} entries for {len(clouds)} sweeps of pc{side}: give one per sweep"
+            )
+    return zip(clouds, *(values if len(values) > 0 else [None] * len(clouds) for values in others.values()))

@@ -12,7 +12,8 @@ from cflow_torch.config import CONFIGS, Config, make_config
 from cflow_torch.stages import stage
 from cflow_torch.types import CFlowError, FlowResult, Window
 from cflow_torch.windows.bev_grid import Grid
-from cflow_torch.windows.collation import Batch, make_batch, split_windows
+from cflow_torch.windows.collation import Batch, make_batch
+from cflow_torch.windows.memory import split_windows
 from cflow_torch.windows.validation import check_windows, choose_device
 
 
@@ -80,6 +81,7 @@ class SceneFlowModel(nn.Module):
     method = ""
     num_axes = 2  # coordinates of points that are asked for; 2 = x and y
     needs_ground = False  # whether the heights of ground points are asked for
+    needs_times = False  # whether the times of points are asked for
     bytes_per_point = 160  # working memory before clusters are known: positions, pixels, temporaries
 
     def __init__(self, config: Config, device: Any = "auto") -> None:
@@ -141,7 +143,9 @@ class SceneFlowModel(nn.Module):
             for part in split_windows(windows, grid, device, self.bytes_per_point, self.config.max_memory):
                 with torch.inference_mode():  # a tenth faster than no_grad: the work is many small operations
                     with stage("compensate"):
-                        batch = make_batch(part, self.config, grid, device, self.num_axes, self.needs_ground)
+                        batch = make_batch(
+                            part, self.config, grid, device, self.num_axes, self.needs_ground, self.needs_times
+                        )
                     motion = self.motion(batch)
                 with stage("spread"):  # outside of inference mode: a training loop may use these tensors
                     results += _results(batch, motion)

@@ -37,12 +37,17 @@ class Sweep:
         pose: (4, 4) float64 `T_world_ego`, ego coordinates to world; None = the points already lie in
             the frame of t+1 (then no sweep of the window may have a pose).
         timestamp_ns: time of the sweep in nanoseconds, None = unknown.
+        point_times: (N,) float, seconds from the instant of the sweep to the measurement of each point, negative =
+            before it; None = all at once. That instant is the one that `timestamp_ns` and `pose` belong to and to which
+            the motion of the vehicle has been compensated. The verified method (`thorough`) uses them where every
+            sweep of a window has them.
     """
 
     points: Array
     is_ground: Optional[Array] = None
     pose: Optional[Array] = None
     timestamp_ns: Optional[int] = None
+    point_times: Optional[Array] = None
 
 
 @dataclass(frozen=True)
@@ -65,6 +70,9 @@ class Window:
 @dataclass(frozen=True)
 class FlowResult:
     """Flow t -> t+1 of every point of pc0, rows in pc0's order (ground and out-of-range rows included).
+
+    It is the displacement of the thing that a point lies on, from the instant of sweep t to that of sweep t+1; for a
+    point with a time of its own, over one sweep interval, from the place where it was measured.
 
     Args:
         residual_flow: (N, 3) float32, metres per sweep interval, axes of ego1: motion of objects.

@@ -62,25 +62,30 @@ class OracleWindow:
         }
         self.flow: List[Vector] = [(x, y) for x, y in scene.flow[mine].tolist()]
         self.flow_in_pixels: List[Vector] = [(y / size, x / size) for x, y in self.flow]
-        self._config = VerifiedConfig(pixel_sizes=(size,), point_cloud_range=(*grid.lower, *grid.upper))
+        self.config = VerifiedConfig(pixel_sizes=(size,), point_cloud_range=(*grid.lower, *grid.upper))
         self._clouds = [
             sweeps.batch.positions[:, sweeps.batch.image == window * sweeps.num_steps + step].T.numpy()
             for step in range(sweeps.num_steps)
         ]
+        times = sweeps.batch.point_times
+        self._times: Optional[List[np.ndarray]] = None
+        if times is not None:
+            images = [window * sweeps.num_steps + step for step in range(sweeps.num_steps)]
+            self._times = [times[sweeps.batch.image == image].double().numpy() for image in images]
 
     def points(
         self, wanted: Optional[Sequence[bool]] = None, height: float = SLICE_HEIGHT, num_slices: int = NUM_SLICES
     ) -> List[Point]:
         """Of the objects wanted, of all of them if nothing is said."""
         wanted = [True] * self.num_objects if wanted is None else wanted
-        return listed_points(wanted, self.object_of, self._clouds, self._config, height, num_slices)
+        return listed_points(wanted, self.object_of, self._clouds, self.config, height, num_slices, self._times)
 
 
 def for_oracle(sweeps: HeightSlicedSweeps, window: int) -> SlicedSweeps:
     """One window of some sweeps; sweeps that it lacks are left out."""
     images = sweeps.image[:-1].view(sweeps.num_windows, sweeps.num_steps, sweeps.grid.height, sweeps.grid.width)
     elapsed = sweeps.elapsed[window].tolist()
-    steps = [step for step, k in enumerate(elapsed) if step == 0 or k > 0]
+    steps = [step for step, k in enumerate(elapsed) if step == 0 or k != 0]
     return SlicedSweeps(
         [images[window, step].numpy() for step in steps],
         [elapsed[step] for step in steps],
@@ -113,31 +118,35 @@ def from_images(
 
 def moving_scene(
     seeds: Sequence[int],
-    num_steps: int = 2,
+    num_past: int = 2,
     pixel_size: float = 0.1,
     snap: float = 0.0,
     num_points: int = 40,
     speed: float = 0.4,
     size: Tuple[float, float] = (0.2, 1.5),
+    num_future: int = 0,
 ) -> Scene:
     """Objects that translate and turn, seen anew in every sweep, some at the border, some missing in some sweeps.
 
     Args:
         seeds: one per window, which depends on nothing else.
-        num_steps: S.
+        num_past: sweeps up to t+1.
         pixel_size: metres.
         snap: metres, places are rounded to multiples of it: equal distances and shared voxels; 0 = they are not.
         num_points: of an object and sweep.
         speed: metres per interval, standard deviation.
         size: metres, shortest and longest side of an object.
+        num_future: sweeps after t+1.
     """
+    places = np.array([*range(num_past), *range(-1, -1 - num_future, -1)])
+    num_steps = len(places)
     clouds: List[List[np.ndarray]] = []
     owners: List[List[np.ndarray]] = []
     flows: List[np.ndarray] = []
     elapsed = []
     for seed in seeds:
         rng = np.random.default_rng(seed)
-        times = np.arange(num_steps) * (1.0 if rng.random() < 0.5 else rng.uniform(0.8, 1.2))
+        times = places * (1.0 if rng.random() < 0.5 else rng.uniform(0.8, 1.2))
         elapsed.append(times)
         parts: List[List[np.ndarray]] = [[] for _ in range(num_steps)]
         of_parts: List[List[np.ndarray]] = [[] for _ in range(num_steps)]
@@ -160,10 +169,12 @@ def moving_scene(
     return _draw(clouds, owners, flows, elapsed, pixel_size)
 
 
-def one_object(clouds: Sequence[np.ndarray], flow: Sequence[float], interval: float = 1.0) -> Scene:
-    """One object, (N, 3) points in every sweep, t+1 first, and the motion to start from."""
+def one_object(clouds: Sequence[np.ndarray], flow: Sequence[float], elapsed: Optional[Sequence[float]] = None) -> Scene:
+    """One object, (N, 3) points in every sweep, t+1 first, and the motion to start from; sweeps `elapsed` before t+1,
+    None = 0, 1, 2, ... intervals."""
+    times = np.arange(len(clouds)) if elapsed is None else np.array(elapsed)
     owners = [np.zeros(len(cloud), dtype=np.int64) for cloud in clouds]
-    return _draw([list(clouds)], [owners], [np.array(flow)], [interval * np.arange(len(clouds))], 0.1)
+    return _draw([list(clouds)], [owners], [np.array(flow)], [times.astype(np.float64)], 0.1)
 
 
 def _draw(

@@ -109,10 +109,10 @@ def reordered(window: Window, seed: int = 0) -> Tuple[Window, np.ndarray]:
     rng = np.random.default_rng(seed)
     sweeps = [window.pc0, window.pc1, *window.pch, *window.pcf]
     orders = [rng.permutation(len(sweep.points)) for sweep in sweeps]
-    mixed = [
-        replace(s, points=s.points[order], is_ground=None if s.is_ground is None else s.is_ground[order])
-        for s, order in zip(sweeps, orders)
-    ]
+    mixed = []
+    for sweep, order in zip(sweeps, orders):
+        columns = {name: getattr(sweep, name) for name in ("points", "is_ground", "point_times")}
+        mixed.append(replace(sweep, **{k: None if column is None else column[order] for k, column in columns.items()}))
     first_future = 2 + len(window.pch)
     return Window(mixed[0], mixed[1], tuple(mixed[2:first_future]), tuple(mixed[first_future:])), orders[0]
 

@@ -87,11 +87,14 @@ class AV2Log(NumberedSweeps):
     def sweep(self, index: int) -> Sweep:
         """Sweep number `index`, with ground where the log has a raster."""
         timestamp = self._timestamp(index)
-        points, pose = self._points(timestamp), self._poses[timestamp]
-        is_ground = None
+        points, pose, file = self._points(timestamp), self._poses[timestamp], self._files[timestamp]
+        is_ground, stored = None, FeatherFile(file)
+        times = None  # logs made by others may lack them
+        if "offset_ns" in stored.names:
+            times = integers(stored.read(["offset_ns"]), "offset_ns", file) * 1e-9
         if self._raster is not None and self._rule is not None:
             is_ground = self._raster.is_ground(moved(points, pose), self._rule)
-        return Sweep(points=points, is_ground=is_ground, pose=pose.copy(), timestamp_ns=timestamp)
+        return Sweep(points=points, is_ground=is_ground, pose=pose.copy(), timestamp_ns=timestamp, point_times=times)
 
     def labels(self, index: int) -> Optional[FlowLabels]:
         """Truth of the pair (index, index + 1).

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 from cflow_torch.data.log import Log
@@ -47,4 +48,4 @@ class GroundFoundLog(ChangedLog):
         if sweep.is_ground is not None:
             return sweep
         is_ground: Any = find_ground(sweep.points, self.method)
-        return Sweep(sweep.points, is_ground, sweep.pose, sweep.timestamp_ns)
+        return replace(sweep, is_ground=is_ground)

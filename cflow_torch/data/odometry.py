@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, List, Sequence
 
 import numpy as np
@@ -101,7 +102,7 @@ class PosedLog(ChangedLog):
     def sweep(self, index: int) -> Sweep:
         """The log's sweep with the pose from here."""
         sweep = self.log.sweep(index)
-        return Sweep(sweep.points, sweep.is_ground, self.poses[index].copy(), sweep.timestamp_ns)
+        return replace(sweep, pose=self.poses[index].copy())
 
 
 def with_poses(log: Log) -> Log:

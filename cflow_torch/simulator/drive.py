@@ -70,10 +70,15 @@ class Drive:
         return self._motion.ego_poses(self._seconds[index] + 1e-9 * np.asarray(offset_ns, np.float64))
 
     def sweep(self, index: int) -> Sweep:
-        """Sweep `index`: (N, 3) float32 points in its ego frame, exact ground mask, float64 pose, time."""
+        """Sweep `index`: (N, 3) float32 points in its ego frame, exact ground mask, float64 pose, time; the times of
+        points where shots have their own."""
         returns = self.returns(index)
         return Sweep(
-            returns.points.numpy().copy(), (returns.solid < 0).numpy(), self.poses[index].copy(), self.timestamps[index]
+            points=returns.points.numpy().copy(),
+            is_ground=(returns.solid < 0).numpy(),
+            pose=self.poses[index].copy(),
+            timestamp_ns=self.timestamps[index],
+            point_times=returns.offset_ns.numpy() * 1e-9 if self._profile.is_rolling else None,
         )
 
     def labels(self, index: int) -> Optional[FlowLabels]:

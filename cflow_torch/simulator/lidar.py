@@ -29,7 +29,7 @@ class Returns:
         solid: (N,) int64, the solid that was hit; -1 = the ground.
         intensity: (N,) uint8.
         laser_number: (N,) uint8, running on from unit to unit (modulo 256).
-        offset_ns: (N,) int32, time of the shot after the time stamp.
+        offset_ns: (N,) int32, time of the shot after the time stamp; 0 where the world stands still meanwhile.
         unit: (N,) int64, number of the unit that received it; ascending.
         local: (N, 3) float32, metres, the points in the frame of their unit.
         ring: (N,) int32, number of the beam, lowest first.
@@ -70,7 +70,7 @@ class EgoMotion:
 def scan(
     profile: LidarProfile, solids: Solids, ground: Ground, T_world_ego: Tensor, generator: torch.Generator
 ) -> Returns:
-    """One sweep of all units of a vehicle in a world that stands still meanwhile.
+    """One sweep of all units of a vehicle in a world that stands still meanwhile: all shots at the time stamp.
 
     Args:
         profile: the units and their quality.
@@ -97,7 +97,7 @@ def scan(
         points = T_ego_sensor[:3, :3] @ local + T_ego_sensor[:3, 3:]
         column = hit // len(unit.elevations)
         turned = column if unit.span > 0 else unit.num_columns - 1 - column
-        offset_ns = turned * (profile.sweep_interval_ns / unit.num_columns)
+        offset_ns = torch.zeros_like(turned)
         parts.append(_returns(points, local, image, hit, reflected, unit, (number, first_laser), turned, offset_ns))
         first_laser += len(unit.elevations)
     return _together(parts)

@@ -7,7 +7,7 @@ could not see says nothing there: else shadows that pass over a wall would move 
 
 from __future__ import annotations
 
-from typing import NamedTuple, Tuple
+from typing import List, NamedTuple, Tuple
 
 import torch
 import torch.nn.functional as F
@@ -17,7 +17,7 @@ from cflow_torch.ops.indices import divide, flat_nonzero
 from cflow_torch.ops.labeling import connected_components
 from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import NUM_SLICES, SLICE_HEIGHT, HeightSlicedSweeps, count_slices
-from cflow_torch.verified.paired_test import evidence_of, looks
+from cflow_torch.verified.paired_test import VerifiedLevel, evidence_of, looks
 from cflow_torch.verified.visibility import RangeImages
 
 _STEP, _REACH = 0.1, 3  # metres per sweep interval between velocities; steps to the fastest one
@@ -49,15 +49,15 @@ class _Looks(NamedTuple):
 
 
 def find_local_motion(
-    sweeps: HeightSlicedSweeps, objects: Objects, motion: Tensor, num_components: int
+    objects: Objects, motion: Tensor, levels: List[VerifiedLevel], sweeps: HeightSlicedSweeps
 ) -> Tuple[Objects, Tensor]:
     """Groups of pixels that move within objects that stand, of windows with history.
 
     Args:
-        sweeps: finest images, P occupied pixels.
         objects: G of them.
         motion: (G, 2) float64, (y, x), finest pixels per sweep interval.
-        num_components: of all levels.
+        levels: that the objects were chosen from.
+        sweeps: finest images, P occupied pixels.
 
     Returns:
         The objects with the groups taken out of them as objects of their own, and the motion of all.
@@ -83,6 +83,7 @@ def find_local_motion(
     candidates = velocities.index_select(0, of_group)[:, None]
     won, lost = _wins_of_groups(sweeps, found, group, candidates[:, 0])
     moves = (evidence_of(won, lost, _Z) > 0) & (_num_slices(sweeps, group, count) >= _UPRIGHT)
+    num_components = sum(level.level.num_components for level in levels)
     of_component = motion.new_zeros((num_components + count, 2))
     of_component[objects.component] = motion
     of_component[num_components:] = candidates[:, 0]

@@ -12,7 +12,6 @@ from dataclasses import replace
 from typing import List, Tuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.model import SceneFlowModel
@@ -26,10 +25,8 @@ from cflow_torch.verified.layers import join_moving, points_at_rest, points_of_l
 from cflow_torch.verified.local_motion import find_local_motion
 from cflow_torch.verified.offline import best_nearby, motion_by_both_sides
 from cflow_torch.verified.paired_test import VerifiedLevel, verify
-from cflow_torch.verified.rigid_motion import RigidMotion, TurningMotion
-from cflow_torch.verified.rigid_registration import register
-from cflow_torch.verified.subpixel_shift import shift_between_pixels
-from cflow_torch.verified.voxel_centroids import points_of_objects
+from cflow_torch.verified.refinement import as_found, refine
+from cflow_torch.verified.rigid_motion import TurningMotion, motion_by_pixel
 from cflow_torch.windows.collation import Batch
 
 
@@ -63,6 +60,11 @@ class VerifiedFlow(SceneFlowModel):
         or of the descriptors of key points, one after the other."""
         most = max(keypoint_candidates.BYTES_PER_POINT, slow_motion.BYTES_PER_POINT) if self.config.thorough else 0
         return int(super().bytes_per_point) + 170 + most
+
+    @property
+    def needs_times(self) -> bool:  # type: ignore[override]
+        """Whether the times of points are asked for."""
+        return bool(self.config.thorough)
 
     def motion(self, batch: Batch) -> TurningMotion:
         """Motion of everything in a batch, by occupied pixel; ids number what moves together or stands together."""
@@ -104,16 +106,16 @@ class VerifiedFlow(SceneFlowModel):
                 motion = best_nearby(sweeps, objects, motion, config)
         if config.thorough and is_first:
             with stage("local"):
-                num_components = sum(level.level.num_components for level in levels)
-                objects, motion = find_local_motion(sweeps, objects, motion, num_components)
+                objects, motion = find_local_motion(objects, motion, levels, sweeps)
         with stage("register"):
-            rigid = self.register(objects, motion, levels, sweeps)
+            rigid, seen = refine(objects, motion, levels, sweeps) if config.thorough else as_found(motion, sweeps)
         with stage("confidence"):
-            margin = margin_of(sweeps, objects, rigid)
-            rigid = rigid.only(margin > 0)
-            confidence = confidence_of(sweeps, objects, rigid, margin)
+            margin = margin_of(sweeps, objects, seen)
+            is_certain = margin > 0
+            rigid, seen = rigid.only(is_certain), seen.only(is_certain)
+            confidence = confidence_of(sweeps, objects, seen, margin)
             is_numbered = config.thorough or config.num_future > 0
-            return _by_pixel(objects, rigid, levels[-1].score, confidence, sweeps, is_numbered)
+            return motion_by_pixel(objects, rigid, levels[-1].score, confidence, sweeps, is_numbered)
 
     def scales(self) -> List[Tuple[int, bool]]:
         """Of each level, coarse to fine: finest pixels a side of its pixels; are its components undilated?"""
@@ -121,53 +123,8 @@ class VerifiedFlow(SceneFlowModel):
         levels = [(round(size / sizes[-1]), False) for size in sizes]
         return [*levels, (1, True)] if self.config.thorough else levels
 
-    def register(
-        self, objects: Objects, motion: Tensor, levels: List[VerifiedLevel], sweeps: HeightSlicedSweeps
-    ) -> RigidMotion:
-        """Motion of G objects in metres, from (G, 2) float64 (y, x), finest pixels per sweep interval."""
-        pixel_size, moves = sweeps.grid.pixel_size, motion.any(1)
-        if not self.config.thorough:
-            return RigidMotion.translation(motion.flip(1) * pixel_size)
-        too_long = F.pad(torch.cat([level.level.too_long for level in levels]), (0, 1))
-        too_long = too_long.index_select(0, objects.component.clamp(max=too_long.numel() - 1))
-        slow = slow_motion.slow_motion(sweeps, objects, ~moves & ~too_long)
-        points = points_of_objects(sweeps, objects, moves)
-        is_pair = (sweeps.elapsed != 0).sum(1) == 1  # with history one of many sweeps would decide
-        motion = shift_between_pixels(points.take(is_pair.index_select(0, points.window)), sweeps, motion)
-        points = points.take(motion.any(1).index_select(0, points.owner))
-        rigid = register(points, sweeps, motion.flip(1) * pixel_size)
-        return RigidMotion(torch.where(slow.any(1, keepdim=True), slow, rigid.flow), rigid.turn, rigid.centre)
-
 
 def _select(levels: List[VerifiedLevel]) -> Tuple[Objects, Tensor]:
     """The objects among all components, and their motion as in `VerifiedLevel`."""
     objects = select_objects([level.level for level in levels], [level.evidence for level in levels])
     return objects, torch.cat([level.motion for level in levels]).index_select(0, objects.component)
-
-
-def _by_pixel(
-    objects: Objects,
-    rigid: RigidMotion,
-    score: Tensor,
-    confidence: Tensor,
-    sweeps: HeightSlicedSweeps,
-    is_numbered: bool,
-) -> TurningMotion:
-    """The motion of G objects, (P,) scores, (P + 1,) confidence by pixel: clusters are pixels, and M is P.
-
-    Args:
-        is_numbered: whether `sweeps.number` was made; else the pixels of t are numbered, which costs less.
-    """
-    window = sweeps.window.index_select(0, objects.first)
-    ids = torch.arange(window.numel(), device=window.device) - torch.searchsorted(window, window)
-    of_pixel = F.pad(objects.of_pixel, (0, 1), value=objects.count)
-    return TurningMotion(
-        of_place=sweeps.number if is_numbered else sweeps.number_at_t(),
-        place=sweeps.place,
-        flow=F.pad(rigid.flow, (0, 1, 0, 1)).index_select(0, of_pixel) + 0.0,  # + 0.0 turns -0.0 into 0.0
-        cluster_id=F.pad(ids, (0, 1), value=-1).index_select(0, of_pixel),
-        score=F.pad(score.masked_fill(objects.of_pixel == objects.count, 0.0), (0, 1)),
-        confidence=confidence,
-        turn=F.pad(rigid.turn, (0, 1)).index_select(0, of_pixel),
-        centre=F.pad(rigid.centre, (0, 0, 0, 1)).index_select(0, of_pixel),
-    )

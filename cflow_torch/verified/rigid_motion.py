@@ -6,10 +6,13 @@ from dataclasses import dataclass
 from typing import Tuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.model import Motion
 from cflow_torch.ops.indices import flat_nonzero, split_index
+from cflow_torch.verified.component_tree import Objects
+from cflow_torch.verified.height_slices import HeightSlicedSweeps
 from cflow_torch.windows.collation import Batch
 
 
@@ -100,4 +103,32 @@ def join(first: TurningMotion, second: TurningMotion, takes_second: Tensor, batc
         place=torch.where(takes_second, second.place[:count] + first.of_place.numel(), first.place[:count]),
         cluster_id=torch.cat((first.cluster_id, ids)),
         **both,
+    )
+
+
+def motion_by_pixel(
+    objects: Objects,
+    rigid: RigidMotion,
+    score: Tensor,
+    confidence: Tensor,
+    sweeps: HeightSlicedSweeps,
+    is_numbered: bool,
+) -> TurningMotion:
+    """The motion of G objects, (P,) scores, (P + 1,) confidence by pixel: clusters are pixels, and M is P.
+
+    Args:
+        is_numbered: whether `sweeps.number` was made; else the pixels of t are numbered, which costs less.
+    """
+    window = sweeps.window.index_select(0, objects.first)
+    ids = torch.arange(window.numel(), device=window.device) - torch.searchsorted(window, window)
+    of_pixel = F.pad(objects.of_pixel, (0, 1), value=objects.count)
+    return TurningMotion(
+        of_place=sweeps.number if is_numbered else sweeps.number_at_t(),
+        place=sweeps.place,
+        flow=F.pad(rigid.flow, (0, 1, 0, 1)).index_select(0, of_pixel) + 0.0,  # + 0.0 turns -0.0 into 0.0
+        cluster_id=F.pad(ids, (0, 1), value=-1).index_select(0, of_pixel),
+        score=F.pad(score.masked_fill(objects.of_pixel == objects.count, 0.0), (0, 1)),
+        confidence=confidence,
+        turn=F.pad(rigid.turn, (0, 1)).index_select(0, of_pixel),
+        centre=F.pad(rigid.centre, (0, 0, 0, 1)).index_select(0, of_pixel),
     )

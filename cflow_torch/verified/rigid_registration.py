@@ -18,6 +18,9 @@ from cflow_torch.verified.voxel_centroids import UNITS, ObjectPoints, Voxels, me
 _SIGMA = 0.15  # metres, of the weight of a pair of voxels
 _MOST_TIME = 2.5  # sweep intervals: t, t-1 and their jitter; older sweeps are not looked at
 _NUM_STEPS = 4
+# What goes a quarter of the way round the sensor in an interval would be nearer than its own length. Times that differ
+# by more are those of a place that is met at the end of one sweep and at the start of the next: nothing moves there.
+_LEAST_STRETCH = 0.75
 _LONGEST_WAY = 0.15  # metres per interval, in x and in y, from the given flow
 _LARGEST_TURN = 0.1  # tangent of half the angle per interval
 _HELD = 150.0  # perfect pairs of voxels that the given translation is worth
@@ -58,6 +61,27 @@ def register(points: ObjectPoints, sweeps: HeightSlicedSweeps, flow: Tensor) -> 
     return RigidMotion(best_way.t() / UNITS, best_turn, pairs.centre.t() / UNITS + corner)
 
 
+def stretch_of(points: ObjectPoints, sweeps: HeightSlicedSweeps, rigid: RigidMotion) -> Tensor:
+    """By what factor the time between two sightings of an object is longer than that between the sweeps.
+
+    Args:
+        points: of the objects that move, with times.
+        sweeps: finest images.
+        rigid: motion of G objects as it is seen: what `register` found.
+
+    Returns:
+        (G,) float64: sum of w k (k + b - a) over the sum of w k^2, over the pairs of voxels that find each other; w is
+        the weight of a pair, k the intervals between its sweeps, a and b the mean times of its voxels in intervals. So
+        the motion divided by it explains the pairs best. 1 for objects without pairs, and where it is below 0.75.
+
+    Convention: k is rounded to a 16th and b - a to a 1024th, halves up.
+    """
+    pairs = _VoxelPairs(Voxels(points, sweeps), sweeps, rigid.flow.t().contiguous() * UNITS)
+    sums = pairs.look(pairs.given, rigid.turn)[1]
+    stretch = torch.where(sums.s > 0, 1 + sums.late / sums.s, torch.ones_like(sums.s))
+    return torch.where(stretch < _LEAST_STRETCH, torch.ones_like(stretch), stretch)
+
+
 class _Sums(NamedTuple):
     """Normal equations, (G,) float64 each: sums over pairs of weight w, time k, arm r, error e; lengths in units."""
 
@@ -68,6 +92,7 @@ class _Sums(NamedTuple):
     e_x: Tensor  # w k e_x
     e_y: Tensor
     e_a: Tensor  # w k (r x e)
+    late: Tensor  # w k (b - a), of times of points a and b; 0 without them
 
 
 class _VoxelPairs:
@@ -102,14 +127,14 @@ class _VoxelPairs:
             way: (2, G) float64, units per interval.
             turn: (G,) float64.
         """
-        total = torch.zeros((8, self.num), dtype=torch.float64, device=way.device)
+        total = torch.zeros((9, self.num), dtype=torch.float64, device=way.device)
         for some in chunks(0, self._voxel.numel(), way.device, 9):
             self._look(some, way, turn, total)
         weight, *sums = total.unbind(0)
         return weight, _Sums(*sums)
 
     def _look(self, some: slice, way: Tensor, turn: Tensor, total: Tensor) -> None:
-        """Add those of some looks to (8, G) sums."""
+        """Add those of some looks to (9, G) sums."""
         voxels, voxel, owner = self.voxels, self._voxel[some], self._owner[some]
         time, is_back = self._time[some], self._is_back[some]
         c_x, c_y = self.centre.index_select(1, owner).unbind(0)
@@ -139,7 +164,19 @@ class _VoxelPairs:
         wk = w * k
         wkk = wk * k
         e_a = wk * (r_x * e_y - r_y * e_x)
-        terms = (w, wkk, wkk * r_x, wkk * r_y, wkk * (r_x * r_x + r_y * r_y), wk * e_x, wk * e_y, e_a)
+        terms: Tuple[Tensor, ...] = (
+            w,
+            wkk,
+            wkk * r_x,
+            wkk * r_y,
+            wkk * (r_x * r_x + r_y * r_y),
+            wk * e_x,
+            wk * e_y,
+            e_a,
+        )
+        if voxels.time is not None:
+            late = voxels.time.index_select(0, later) - voxels.time.index_select(0, earlier)
+            terms += (wk * (whole(UNITS * late) / UNITS),)
         for out, term in zip(total, terms):
             out.index_add_(0, owner, term)
 

@@ -7,7 +7,6 @@ vanishes and appears, as if it moved. A range image of each sweep, seen from the
 from __future__ import annotations
 
 import math
-from typing import Tuple
 
 import torch
 import torch.nn.functional as F

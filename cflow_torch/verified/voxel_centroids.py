@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Optional
 
 import torch
 import torch.nn.functional as F
@@ -27,6 +28,7 @@ class ObjectPoints:
         pixel: (N,) int64, number of its occupied pixel, 0 ... P - 1.
         part: (N,) int64, height slice, 0 ... 3 (or as many as `points_of_objects` was asked for).
         position: (2, N) float64, x and y, metres, frame of t+1; inside the region.
+        time: (N,) float32, sweep intervals, `Batch.point_times`; None = there are none.
     """
 
     owner: Tensor
@@ -35,14 +37,19 @@ class ObjectPoints:
     pixel: Tensor
     part: Tensor
     position: Tensor
+    time: Optional[Tensor] = None
 
     def take(self, wanted: Tensor) -> ObjectPoints:
         """Some of them, (N,) bool."""
-        index = flat_nonzero(wanted)
+        return self.at(flat_nonzero(wanted))
+
+    def at(self, index: Tensor) -> ObjectPoints:
+        """Some of them, (K,) int64."""
         owner, window, step, pixel, part = (
             values.index_select(0, index) for values in (self.owner, self.window, self.step, self.pixel, self.part)
         )
-        return ObjectPoints(owner, window, step, pixel, part, self.position.index_select(1, index))
+        time = None if self.time is None else self.time.index_select(0, index)
+        return ObjectPoints(owner, window, step, pixel, part, self.position.index_select(1, index), time)
 
 
 def points_of_objects(
@@ -70,7 +77,9 @@ def points_of_objects(
     x, y, z = sweeps.batch.positions.index_select(1, rows).unbind(0)
     window, step = split_index(sweeps.batch.image.index_select(0, rows).long(), sweeps.num_steps)
     part = slice_of(z, slice_height, num_slices).long()
-    return ObjectPoints(of_pixel.index_select(0, pixel), window, step, pixel, part, torch.stack((x, y)))
+    times = sweeps.batch.point_times
+    time = None if times is None else times.index_select(0, rows)
+    return ObjectPoints(of_pixel.index_select(0, pixel), window, step, pixel, part, torch.stack((x, y)), time)
 
 
 class Voxels:
@@ -85,6 +94,7 @@ class Voxels:
         owner, window, step, part: (V,) int64, as for `ObjectPoints`.
         x, y: (V + 1,) float64, centroid, whole units of 1/1024 m from the lower corner of the region; the last entry,
             of no voxel, is far away.
+        time: (V,) float64, mean of `ObjectPoints.time`; None = there are none.
 
     Convention: a coordinate is rounded to the nearest unit, their mean down to a whole one.
 
@@ -108,6 +118,9 @@ class Voxels:
             torch.zeros_like(key).scatter_(0, voxel, values) for values in (points.owner, points.window, points.step)
         )
         self.part = key & (num_slices - 1)
+        self.time: Optional[Tensor] = None
+        if points.time is not None:
+            self.time = torch.zeros_like(count, dtype=torch.float64).index_add_(0, voxel, points.time.double()) / count
 
     @staticmethod
     def _centroids(values: Tensor, voxel: Tensor, count: Tensor) -> Tensor:

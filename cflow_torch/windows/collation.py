@@ -17,20 +17,8 @@ from cflow_torch.types import Sweep, Window
 from cflow_torch.windows.bev_grid import Grid
 from cflow_torch.windows.ego_motion import compensate, rigid_transform
 from cflow_torch.windows.ground_heights import GroundHeights
-from cflow_torch.windows.memory import require_memory
-from cflow_torch.windows.validation import (
-    check_distance,
-    elapsed_times,
-    read_ground,
-    read_positions,
-    source_sweeps,
-)
-
-# Working memory of a pixel of every sweep (occupancy and cluster) before the clusters of a window are known.
-_BYTES_PER_PIXEL = 10
-# What windows of a group may take on a CPU where `max_memory` says nothing: about 9 of a pair, 4 of six sweeps. Fresh
-# pages of larger arrays cost more than the operations that larger groups save.
-_BYTES_ON_CPU = 1 << 29
+from cflow_torch.windows.point_times import has_point_times, read_point_times
+from cflow_torch.windows.validation import check_distance, elapsed_times, read_ground, read_positions, source_sweeps
 
 
 @dataclass(frozen=True)
@@ -56,6 +44,8 @@ class Batch:
         origin: (B, S, 3) float64, metres, frame of t+1: where the ego frame of each sweep has its origin.
         sources: of each window, what its result is made of.
         ground: of the ground points of t and t+1; None = nothing asks.
+        point_times: (P,) float32, sweep intervals from the instant of its sweep to the measurement of each point, whole
+            2^-20; 0 in windows of which a sweep has none. None = no window has them, or nothing asks.
     """
 
     positions: Tensor
@@ -69,6 +59,7 @@ class Batch:
     origin: Tensor
     sources: Tuple[Source, ...]
     ground: Optional[GroundHeights] = None
+    point_times: Optional[Tensor] = None
 
     def take_steps(self, wanted: Tensor) -> Batch:
         """The batch of some of the sweeps. Args: wanted: (S,) bool, True for steps 0 and 1."""
@@ -85,6 +76,7 @@ class Batch:
             elapsed=self.elapsed.index_select(1, kept),
             seconds=self.seconds.index_select(1, kept),
             origin=self.origin.index_select(1, kept),
+            point_times=None if self.point_times is None else self.point_times.index_select(0, rows),
         )
 
 
@@ -101,47 +93,6 @@ class Source:
     pose_flow: Tensor
 
 
-def split_windows(
-    windows: Sequence[Window], grid: Grid, device: torch.device, bytes_per_point: int, max_memory: Optional[float]
-) -> List[List[Window]]:
-    """Windows in groups that fit the memory, in order. The result of a window does not depend on its group.
-
-    Args:
-        windows: B windows, checked; an empty list gives no group.
-        grid: the finest scale, whose images are the largest.
-        device: where the work is done; on a CPU large groups only cost more.
-        bytes_per_point: what a method plans with for each point.
-        max_memory: bytes; None = one group, or groups of `_BYTES_ON_CPU`.
-
-    Returns:
-        Groups of at least one window.
-
-    Raises:
-        CFlowError: a window alone needs more memory than there is.
-    """
-    groups: List[List[Window]] = []
-    if max_memory is None and device.type == "cpu":
-        max_memory = _BYTES_ON_CPU
-    used = 0
-    for window in windows:
-        sweeps = (window.pc1, window.pc0, *window.pch, *window.pcf)
-        points = sum(sweep.points.shape[0] for sweep in sweeps)
-        needed = bytes_per_point * points + (_BYTES_PER_PIXEL * len(sweeps) + 30) * grid.height * grid.width
-        require_memory(
-            needed,
-            device,
-            f"a window of {points} points in {len(sweeps)} sweeps, on {grid.width} x {grid.height} pixels of "
-            f"{grid.pixel_size} m,",
-            "give a smaller point_cloud_range, larger pixel_sizes or fewer points",
-        )
-        if not groups or (max_memory is not None and used + needed > max_memory):
-            groups.append([])
-            used = 0
-        groups[-1].append(window)
-        used += needed
-    return groups
-
-
 def make_batch(
     windows: Sequence[Window],
     config: Config,
@@ -149,6 +100,7 @@ def make_batch(
     device: torch.device,
     num_axes: int = 2,
     needs_ground: bool = False,
+    needs_times: bool = False,
 ) -> Batch:
     """Check windows, bring every sweep into the frame of its t+1, keep what takes part.
 
@@ -159,6 +111,7 @@ def make_batch(
         device: where the batch is to lie.
         num_axes: coordinates that are kept, 2 or 3.
         needs_ground: whether heights of the ground are kept as well.
+        needs_times: whether the times of points are kept as well.
 
     Returns:
         The batch, on one device.
@@ -193,6 +146,8 @@ def make_batch(
     positions = torch.empty((num_axes, most), dtype=torch.float64, device=device)
     takes_part = torch.ones(most, dtype=torch.bool, device=device)
     image = torch.empty(most, dtype=torch.int32, device=device)
+    has_times = [needs_times and has_point_times(window, sources) for window, sources in zip(windows, kept)]
+    point_times = torch.zeros(most, dtype=torch.float32, device=device) if any(has_times) else None
     stop, num_newest, of_pc0 = 0, 0, []
     for step, index, name, sweep in sweeps:
         start, transform = stop, None
@@ -204,6 +159,8 @@ def make_batch(
             with torch.inference_mode(False):  # becomes part of the result
                 pose_flow = torch.zeros((sweep.points.shape[0], 3), dtype=torch.float32, device=device)
             of_pc0.append(Source(slice(start, start + len(pose_flow)), pose_flow))
+        interval = seconds[index, 1] / elapsed[index, 1]
+        times = read_point_times(sweep, name, interval, device) if has_times[index] else None
         for rows, raw, moved, inside, ground_inside in _pieces(
             sweep, name, transform, 3 if step == 1 else num_axes, grid, config, device
         ):
@@ -220,6 +177,8 @@ def make_batch(
                 points = slice(stop, stop + row.numel())
                 for values, of_axis in zip(positions[:, points].unbind(0), moved.unbind(0)):
                     torch.index_select(of_axis, 0, row, out=values)
+            if times is not None and point_times is not None:
+                point_times[points] = times[rows] if step == 1 else times[rows].index_select(0, row)
             stop = points.stop
         image[start:stop] = index * num_steps + step
         num_newest = stop if step == 0 else num_newest
@@ -235,6 +194,7 @@ def make_batch(
         origin=torch.as_tensor(origin, device=device),
         sources=tuple(of_pc0),
         ground=ground,
+        point_times=None if point_times is None else point_times[:stop],
     )
 
 

@@ -1,18 +1,24 @@
-"""How much memory a process may still take, and the refusal of what needs more."""
+"""How much memory a process may still take, the refusal of what needs more, and groups of windows that fit it."""
 
 from __future__ import annotations
 
 import sys
 from contextlib import suppress
 from pathlib import Path
-from typing import List, Mapping, Optional
+from typing import List, Mapping, Optional, Sequence
 
 import torch
 
-from cflow_torch.types import CFlowError
+from cflow_torch.types import CFlowError, Window
+from cflow_torch.windows.bev_grid import Grid
 
 _MUCH = 1 << 30  # less than this is not worth a look at the machine
 _CGROUP = Path("/sys/fs/cgroup")
+# Working memory of a pixel of every sweep (occupancy and cluster) before the clusters of a window are known.
+_BYTES_PER_PIXEL = 10
+# What windows of a group may take on a CPU where `max_memory` says nothing: about 9 of a pair, 4 of six sweeps. Fresh
+# pages of larger arrays cost more than the operations that larger groups save.
+_BYTES_ON_CPU = 1 << 29
 
 
 def require_memory(num_bytes: int, device: torch.device, what: str, remedy: str) -> None:
@@ -72,3 +78,44 @@ def control_groups() -> List[Path]:
         group = _CGROUP / next(line[3:] for line in lines if line.startswith("0::")).lstrip("/")
         return [folder for folder in (group, *group.parents) if _CGROUP in (folder, *folder.parents)]
     return []
+
+
+def split_windows(
+    windows: Sequence[Window], grid: Grid, device: torch.device, bytes_per_point: int, max_memory: Optional[float]
+) -> List[List[Window]]:
+    """Windows in groups that fit the memory, in order. The result of a window does not depend on its group.
+
+    Args:
+        windows: B windows, checked; an empty list gives no group.
+        grid: the finest scale, whose images are the largest.
+        device: where the work is done; on a CPU large groups only cost more.
+        bytes_per_point: what a method plans with for each point.
+        max_memory: bytes; None = one group, or groups of `_BYTES_ON_CPU`.
+
+    Returns:
+        Groups of at least one window.
+
+    Raises:
+        CFlowError: a window alone needs more memory than there is.
+    """
+    groups: List[List[Window]] = []
+    if max_memory is None and device.type == "cpu":
+        max_memory = _BYTES_ON_CPU
+    used = 0
+    for window in windows:
+        sweeps = (window.pc1, window.pc0, *window.pch, *window.pcf)
+        points = sum(sweep.points.shape[0] for sweep in sweeps)
+        needed = bytes_per_point * points + (_BYTES_PER_PIXEL * len(sweeps) + 30) * grid.height * grid.width
+        require_memory(
+            needed,
+            device,
+            f"a window of {points} points in {len(sweeps)} sweeps, on {grid.width} x {grid.height} pixels of "
+            f"{grid.pixel_size} m,",
+            "give a smaller point_cloud_range, larger pixel_sizes or fewer points",
+        )
+        if not groups or (max_memory is not None and used + needed > max_memory):
+            groups.append([])
+            used = 0
+        groups[-1].append(window)
+        used += needed
+    return groups

@@ -44,6 +44,8 @@ def check_windows(windows: Any, config: Optional[Config] = None) -> None:
             if not isinstance(sweep, Sweep):
                 raise CFlowError(f"{name} is {type(sweep).__name__}: give cflow_torch.Sweep(points, ...)")
             check_points(sweep.points, name)
+            if sweep.point_times is not None:
+                _check_point_times(sweep, name)
             if config is not None:
                 _check_resolution(sweep.points.dtype, name, config)
 
@@ -96,6 +98,17 @@ def check_points(points: Any, name: str) -> None:
     is_floating = points.is_floating_point() if isinstance(points, Tensor) else np.issubdtype(points.dtype, np.floating)
     if not is_floating:
         raise CFlowError(f"{name} has dtype {points.dtype}: give floating-point metres")
+
+
+def _check_point_times(sweep: Sweep, name: str) -> None:
+    """Refuse what is not a float for each point; their values are looked at when they are read."""
+    times, wanted = sweep.point_times, f"give ({sweep.points.shape[0]},) floats, seconds after the sweep's time stamp"
+    if not isinstance(times, (np.ndarray, Tensor)):
+        raise CFlowError(f"point times of {name} are {type(times).__name__}: {wanted}")
+    check_plain(times, f"point times of {name}")
+    is_floating = times.is_floating_point() if isinstance(times, Tensor) else np.issubdtype(times.dtype, np.floating)
+    if tuple(times.shape) != (sweep.points.shape[0],) or not is_floating:
+        raise CFlowError(f"point times of {name} have shape {tuple(times.shape)} and dtype {times.dtype}: {wanted}")
 
 
 def resolution(dtype: Any, distance: float) -> float:
@@ -201,7 +214,10 @@ def choose_device(windows: Sequence[Window], device: Any) -> torch.device:
             raise CFlowError(f"device={device!r} cannot be used ({reason}): give 'auto', 'cpu' or 'cuda'") from None
     else:
         arrays = [
-            a for window in windows for _, sweep in _named_sweeps(window) for a in (sweep.points, sweep.is_ground)
+            a
+            for window in windows
+            for _, sweep in _named_sweeps(window)
+            for a in (sweep.points, sweep.is_ground, sweep.point_times)
         ]
         found = {array.device for array in arrays if isinstance(array, Tensor)}
         if len(found) > 1:

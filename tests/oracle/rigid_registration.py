@@ -36,12 +36,14 @@ class RigidMotion(NamedTuple):
 
 
 class Pair(NamedTuple):
-    """A voxel of an earlier sweep and one of t+1: time between, turned arm of the first, what is missing, weight."""
+    """A voxel of an earlier sweep and one of t+1: time between, turned arm of the first, what is missing, weight; how
+    much longer than between the sweeps it is between the points, in intervals."""
 
     time: float
     arm: Tuple[int, int]
     error: Tuple[int, int]
     weight: float
+    late: float
 
 
 def register(points: Sequence[Point], flow: Sequence[Vector], sweeps: SlicedSweeps) -> List[RigidMotion]:
@@ -109,7 +111,8 @@ def find_pairs(
             error = (later.x - x, later.y - y)
             r_x, r_y = rotate(turn * time, earlier.x - centre[0], earlier.y - centre[1])
             weight = meeting_weight(error[0] ** 2 + error[1] ** 2, SIGMA)
-            found.append(Pair(time, (whole(r_x), whole(r_y)), error, weight))
+            late = whole((later.time - earlier.time) * UNITS) / UNITS
+            found.append(Pair(time, (whole(r_x), whole(r_y)), error, weight, late))
     return found
 
 
@@ -134,7 +137,7 @@ def gauss_newton(found: Sequence[Pair], given: Vector, way: Vector, turn: float)
     and to no turn.
     """
     s = s_x = s_y = s_xy = e_x = e_y = e_a = 0.0
-    for time, (r_x, r_y), (x, y), w in found:
+    for time, (r_x, r_y), (x, y), w, _ in found:
         k = whole(time * 16) / 16
         s += w * k * k
         s_x += w * k * k * r_x

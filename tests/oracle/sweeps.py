@@ -18,12 +18,15 @@ class Cloud(NamedTuple):
         takes_part: (N,) bool, finite, neither ground nor of the vehicle itself.
         intervals: k, sweep intervals to t+1: 1 for t, 2 for t-1, -1 for t+2 ..., or by time stamps; 0 for t+1 itself.
         seconds: the same in seconds.
+        times: (N,) float64, sweep intervals from the instant of the sweep to each point, whole 2^-20; None = a sweep of
+            the window has none.
     """
 
     points: np.ndarray
     takes_part: np.ndarray
     intervals: float
     seconds: float
+    times: Optional[np.ndarray] = None
 
 
 class PointMotion(NamedTuple):
@@ -59,17 +62,29 @@ def compensate(window: Window, config: Config) -> Tuple[List[Cloud], Cloud]:
     sweeps = [*past, *window.pcf[: config.num_future]]
     stamps = [sweep.timestamp_ns for sweep in (window.pc1, *sweeps)]
     clouds: List[Cloud] = []
+    is_repeat = [
+        any(_is_repeat(sweep, other) for other in [*sweeps[:m], *[window.pc1] * (m >= len(past))])
+        for m, sweep in enumerate(sweeps)
+    ]
+    interval = config.sweep_interval if None in stamps else (stamps[0] - stamps[1]) / 1e9  # type: ignore[operator]
+    kept = [sweep for sweep, repeats in zip(sweeps, is_repeat) if not repeats]
+    has_times = all(sweep.point_times is not None for sweep in (window.pc1, *kept))
     for m, sweep in enumerate(sweeps):
-        is_future = m >= len(past)
-        if any(_is_repeat(sweep, other) for other in [*sweeps[:m], *[window.pc1] * is_future]):
+        if is_repeat[m]:
             continue
-        place = len(past) - 1 - m if is_future else m + 1
+        place = len(past) - 1 - m if m >= len(past) else m + 1
         intervals, seconds = float(place), place * config.sweep_interval
         if None not in stamps:
             gap, first_gap = stamps[0] - stamps[m + 1], stamps[0] - stamps[1]  # type: ignore[operator]
             intervals, seconds = gap / first_gap, gap / 1e9
-        clouds.append(Cloud(_in_frame_of(window.pc1, sweep), _takes_part(sweep, config), intervals, seconds))
-    return clouds, Cloud(xyz(window.pc1), _takes_part(window.pc1, config), 0.0, 0.0)
+        times = _point_times(sweep, interval) if has_times else None
+        clouds.append(Cloud(_in_frame_of(window.pc1, sweep), _takes_part(sweep, config), intervals, seconds, times))
+    times = _point_times(window.pc1, interval) if has_times else None
+    return clouds, Cloud(xyz(window.pc1), _takes_part(window.pc1, config), 0.0, 0.0, times)
+
+
+def _point_times(sweep: Sweep, interval: float) -> np.ndarray:
+    return np.floor(as_numpy(sweep.point_times, np.float64) / interval * 2**20 + 0.5) / 2**20
 
 
 def xyz(sweep: Sweep) -> np.ndarray:

@@ -15,6 +15,7 @@ from oracle.aperture import slides_along_itself
 from oracle.candidates import find_peak, keypoint_motion, keypoint_shifts, list_motions
 from oracle.component_tree import Level, equals_parent, find_components, parents, winners
 from oracle.confidence import confidences
+from oracle.deskewing import register_deskewed
 from oracle.ground_residue import ground_heights, is_residue
 from oracle.height_slices import Pixel, SlicedSweeps, Vector, slice_image
 from oracle.paired_test import best_candidate, count_wins, evidence_of
@@ -51,7 +52,6 @@ def verified_flow(
         clouds: sweeps m = t, t-1, ... nearest first, then t+2, t+3, ...
         cloud1: sweep t+1.
         ground: (N, 3) float64, metres, frame of t+1, ground points of t and t+1 where they are known.
-
     """
     past = [cloud for cloud in clouds if cloud.intervals > 0]
     first, shown = flow_by(past, cloud1, ground, config)
@@ -95,6 +95,9 @@ def flow_by(
         for cloud, keep in zip((cloud1, *clouds), drawn):
             keep[keep] = ~is_residue(cloud.points[keep], means, config.min_height, config)
     points = [cloud.points[keep] for cloud, keep in zip((cloud1, *clouds), drawn)]
+    times = None
+    if cloud1.times is not None:
+        times = [cloud.times[keep] for cloud, keep in zip((cloud1, *clouds), drawn)]  # type: ignore[index]
     sweeps = SlicedSweeps(
         [slice_image(of_sweep, config) for of_sweep in points],
         [cloud.intervals for cloud in (cloud1, *clouds)],
@@ -120,8 +123,8 @@ def flow_by(
             best_nearby(sweeps, [pixel for pixel, owner in object_of.items() if owner == i], motion, config)
             for i, motion in enumerate(motions)
         ]
-    rigid = settle(sweeps, motions, may_creep, object_of, points, config)
-    trust, of_left_out = confidences(sweeps, object_of, [motion.flow for motion in rigid])
+    rigid, seen = settle(sweeps, motions, may_creep, object_of, points, config, times)
+    trust, of_left_out = confidences(sweeps, object_of, [motion.flow for motion in seen])
 
     num_points, score_of = len(clouds[0].points), dict(zip(sweeps.pixels(), levels[-1].scores))
     flow, ids, scores = np.zeros((num_points, 3)), np.full(num_points, -1, dtype=np.int64), np.zeros(num_points)
@@ -201,8 +204,9 @@ def settle(
     object_of: Dict[Pixel, int],
     clouds: Sequence[np.ndarray],
     config: VerifiedConfig,
-) -> List[RigidMotion]:
-    """Where objects have gone in metres, between the pixels.
+    times: Optional[Sequence[np.ndarray]] = None,
+) -> Tuple[List[RigidMotion], List[RigidMotion]]:
+    """Where objects have gone in metres, between the pixels, and where the images show them to have gone.
 
     Args:
         sweeps: the window.
@@ -210,13 +214,15 @@ def settle(
         may_creep: of each object, whether it may move slowly if it has not moved so far.
         object_of: object of each pixel that belongs to one.
         clouds: (N, 3) float64 of t+1, t, t-1, ..., the points that are drawn.
+        times: (N,) of each of them, sweep intervals; None = there are none.
 
     Convention: only pairs of sweeps have slow motion, as with history slow objects leave their pixels, and are shifted
         between the pixels, as with history one of many sweeps would decide.
     """
     size, is_pair = sweeps.pixel_size, len(sweeps.images) == 2
     if not config.thorough:
-        return [RigidMotion((x * size, y * size), 0.0, (0.0, 0.0)) for y, x in motions]
+        moved = [RigidMotion((x * size, y * size), 0.0, (0.0, 0.0)) for y, x in motions]
+        return moved, moved
     slow: List[Optional[Vector]] = [None] * len(motions)
     if is_pair:
         members: List[List[Pixel]] = [[] for _ in motions]
@@ -227,9 +233,11 @@ def settle(
         ]
         cubes = points_of_objects(asked, object_of, clouds, config, size, NUM_LAYERS)
         slow = slow_motion(cubes, len(motions), sweeps)
-    points = points_of_objects([any(motion) for motion in motions], object_of, clouds, config)
+    points = points_of_objects([any(motion) for motion in motions], object_of, clouds, config, times=times)
     if is_pair:
         motions = shift_between_pixels(points, motions, sweeps)
         points = [point for point in points if any(motions[point.owner])]
-    rigid = register(points, [(x * size, y * size) for y, x in motions], sweeps)
-    return [motion if flow is None else motion._replace(flow=flow) for motion, flow in zip(rigid, slow)]
+    start = [(x * size, y * size) for y, x in motions]
+    found = register(points, start, sweeps)
+    seen = [motion if flow is None else motion._replace(flow=flow) for motion, flow in zip(found, slow)]
+    return (seen if times is None else register_deskewed(points, start, seen, sweeps, config)), seen

@@ -15,23 +15,26 @@ UNITS = 1024  # of a metre: centroids are whole numbers of them
 
 
 class Point(NamedTuple):
-    """A point of an object: sweep, height slice, object, place in metres (frame of t+1)."""
+    """A point of an object: sweep, height slice, object, place in metres (frame of t+1), time in sweep intervals."""
 
     step: int
     part: int
     owner: int
     x: float
     y: float
+    time: float = 0.0
 
 
 class Voxel(NamedTuple):
-    """Sweep, height slice and object of some points of a pixel, and their centroid in units from the lower corner."""
+    """Sweep, height slice and object of some points of a pixel, their centroid in units from the lower corner, and the
+    mean of their times."""
 
     step: int
     part: int
     owner: int
     x: int
     y: int
+    time: float
 
 
 Place = Tuple[int, int, int, int]  # step, row, col, part
@@ -45,6 +48,7 @@ def points_of_objects(
     config: VerifiedConfig,
     slice_height: float = SLICE_HEIGHT,
     num_slices: int = NUM_SLICES,
+    times: Optional[Sequence[np.ndarray]] = None,
 ) -> List[Point]:
     """Points of some objects.
 
@@ -54,13 +58,16 @@ def points_of_objects(
         clouds: (N, 3) float64 of t+1, t, t-1, ..., the points that are drawn.
         config: for the finest pixels.
         slice_height, num_slices: metres, and how many slices are told apart.
+        times: (N,) of each of the clouds, sweep intervals; None = all 0.
     """
     points = []
     for m, cloud in enumerate(clouds):
-        for (r, c), (x, y, z) in zip(project_bev(cloud, config, config.pixel_sizes[-1]).tolist(), cloud.tolist()):
+        late = [0.0] * len(cloud) if times is None else times[m].tolist()
+        pixels = project_bev(cloud, config, config.pixel_sizes[-1]).tolist()
+        for (r, c), (x, y, z), time in zip(pixels, cloud.tolist(), late):
             owner = object_of.get((m, r, c), -1)
             if owner >= 0 and wanted[owner]:
-                points.append(Point(m, slice_of(z, slice_height, num_slices), owner, x, y))
+                points.append(Point(m, slice_of(z, slice_height, num_slices), owner, x, y, time))
     return points
 
 
@@ -75,7 +82,8 @@ def centroids(points: Sequence[Point], sweeps: SlicedSweeps) -> Voxels:
     for place, inside in members.items():
         x = sum(whole((p.x - x0) * UNITS) for p in inside) // len(inside)
         y = sum(whole((p.y - y0) * UNITS) for p in inside) // len(inside)
-        voxels[place] = Voxel(inside[0].step, inside[0].part, inside[0].owner, x, y)
+        time = sum(p.time for p in inside) / len(inside)
+        voxels[place] = Voxel(inside[0].step, inside[0].part, inside[0].owner, x, y, time)
     return voxels
 
 

@@ -59,7 +59,7 @@ def test_finds_a_slow_person(truth):
     clouds = [person(truth, rng), person((0.0, 0.0), rng)]
     flow = found(one_object(clouds, (0.0, 0.0)))[0].numpy()
     assert np.linalg.norm(flow - truth) < 0.025
-    later = found(one_object(clouds, (0.0, 0.0), interval=2.0))[0].numpy()  # the same way in twice the time
+    later = found(one_object(clouds, (0.0, 0.0), (0.0, 2.0)))[0].numpy()  # the same way in twice the time
     np.testing.assert_allclose(later, flow / 2, atol=1e-12)
 
 

@@ -15,9 +15,10 @@ from scenes import RANGE, assert_same_bits, assert_zeros, config, flow_as_oracle
 
 from cflow_torch import FlowResult, Sweep, Window, make_model
 from cflow_torch.config import Config
-from cflow_torch.windows import collation
+from cflow_torch.windows import memory
 from cflow_torch.windows.bev_grid import Grid
-from cflow_torch.windows.collation import make_batch, split_windows
+from cflow_torch.windows.collation import make_batch
+from cflow_torch.windows.memory import split_windows
 
 CPU = torch.device("cpu")
 EMPTY, FAR = np.zeros((0, 3), dtype=np.float32), np.full((3, 3), 1000.0)
@@ -160,7 +161,7 @@ def test_windows_are_grouped_by_memory(monkeypatch):
 
     assert sizes() == [5] and sizes(1) == [1] * 5
     assert sum(sizes(1_000_000)) == 5 and 1 < len(sizes(1_000_000)) < 5
-    monkeypatch.setattr(collation, "_BYTES_ON_CPU", 1)
+    monkeypatch.setattr(memory, "_BYTES_ON_CPU", 1)
     assert sizes() == [1] * 5 and split_windows([], grid, CPU, 160, None) == []
 
 

@@ -52,6 +52,20 @@ class Cloud:
             raise CFlowError(f"{self.file}: {key} must be (N, {columns}) floats, got {array.shape} {array.dtype}")
         return array.reshape(-1, columns).astype(np.float32, copy=False)
 
+    def seconds(self, key: str, rows: int) -> Optional[np.ndarray]:
+        """(rows,) float64 of an array of whole nanoseconds, one per row; None where there is no such array.
+
+        Raises:
+            CFlowError: it has another type or shape, or is damaged.
+        """
+        if key not in self._keys:
+            return None
+        with file_errors(f"{self.file}: {key}", _MEND):
+            array = self._arrays[key]
+        if not np.issubdtype(array.dtype, np.integer) or array.shape not in ((rows,), (rows, 1)):
+            raise CFlowError(f"{self.file}: {key} must be ({rows}, 1) integers, got {array.shape} {array.dtype}")
+        return array.reshape(rows) * 1e-9
+
     def names(self, key: str) -> Optional[List[str]]:
         """Texts of an array, however it is shaped; None where there is no such array.
 

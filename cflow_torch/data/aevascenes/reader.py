@@ -131,7 +131,7 @@ class AevaScenesLog(NumberedSweeps):
             if len(is_ground) != len(points):
                 file = self._clouds_of(index)[0].file
                 raise CFlowError(f"{file} and its neighbours: {len(points)} points but {len(is_ground)} class names")
-        return Sweep(points, is_ground, self._poses[index].copy(), self.timestamps[index])
+        return Sweep(points, is_ground, self._poses[index].copy(), self.timestamps[index], self._point_times(index))
 
     def radial_velocity(self, index: int) -> np.ndarray:
         """(N,) float32 m/s along the ray of each point of sweep `index`, positive = receding from its LiDAR.
@@ -156,6 +156,13 @@ class AevaScenesLog(NumberedSweeps):
         """(N, 3) float32, vehicle frame."""
         clouds = zip(self._clouds_of(index), self._mounts)
         return np.concatenate([moved(cloud.numbers("xyz", 3), mount) for cloud, mount in clouds]).astype(np.float32)
+
+    def _point_times(self, index: int) -> Optional[np.ndarray]:
+        """(N,) float64 seconds after the time stamp; None where a cloud does not tell."""
+        clouds = self._clouds_of(index)
+        times = [cloud.seconds("time_offset_ns", len(cloud.numbers("xyz", 3))) for cloud in clouds]
+        known = [of_cloud for of_cloud in times if of_cloud is not None]
+        return np.concatenate(known) if len(known) == len(times) else None
 
     def _open_clouds(self, index: int) -> List[Cloud]:
         where, clouds = f"{self._file}, frame {self._timestamp(index)}", []

@@ -93,7 +93,8 @@ class HDF5Log(NumberedSweeps):
         if not np.array_equal(self.ego_T_lidar, np.eye(4)):
             pose = rigid_transform(pose, f"pose of sweep {timestamp} in {self.file}") @ self.ego_T_lidar
         nanoseconds = timestamp if timestamp >= _FIRST_NANOSECOND else timestamp * 1000
-        return Sweep(points[:, :3], is_ground, pose, nanoseconds)
+        times = self._column(index, "lidar_dt", rows, np.float32)
+        return Sweep(points[:, :3], is_ground, pose, nanoseconds, times)
 
     def labels(self, index: int) -> Optional[FlowLabels]:
         """Truth of the pair (index, index + 1); None where the sweep has no `flow`."""

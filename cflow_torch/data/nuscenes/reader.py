@@ -95,8 +95,9 @@ class NuScenesLog(NumberedSweeps):
 
     def sweep(self, index: int) -> Sweep:
         """Sweep number `index`: LiDAR after LiDAR, in the order of sensor.json, moved to one ego frame."""
-        points, _ = self._cloud(index)
-        return Sweep(points, None, self._poses[index].copy(), self.timestamps[index] * 1000)
+        points, lag = self._cloud(index)
+        times = lag * 1e-6 if lag.any() else None
+        return Sweep(points, None, self._poses[index].copy(), self.timestamps[index] * 1000, times)
 
     def labels(self, index: int) -> Optional[FlowLabels]:
         """Truth of the pair (index, index + 1), from the boxes at both times.

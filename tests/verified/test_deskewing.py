@@ -1,0 +1,250 @@
+"""De-skewing of what moves: the oracle's motion, hand-made truths, times that change nothing or are refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import List, Sequence, Tuple
+
+import numpy as np
+import pytest
+import torch
+from moving_scenes import LOWER, UPPER, Scene, moving_scene, one_object
+from oracle import deskewing as oracle
+from oracle import rigid_registration
+from scenes import assert_same_bits, flow_as_oracle, reordered, rows_of
+from turning_car import MODEL, turning_car
+
+from cflow_torch import CFlowError, FlowResult, VerifiedFlow, Window, estimate_flow
+from cflow_torch.verified.deskewing import deskew, register_deskewed
+from cflow_torch.verified.rigid_motion import RigidMotion
+from cflow_torch.verified.rigid_registration import register
+
+HISTORY = MODEL.replace(num_history=3)
+
+
+def with_times(scene: Scene, times: torch.Tensor) -> Scene:
+    sweeps = scene.sweeps
+    return scene._replace(sweeps=replace(sweeps, batch=replace(sweeps.batch, point_times=times.float())))
+
+
+def late(window: Window, seed: int) -> Window:
+    """Times of two units half a turn apart, with places of points as they were."""
+    rng, sweeps = np.random.default_rng(seed), []
+    for sweep in (window.pc0, window.pc1, *window.pch):
+        angle = np.arctan2(sweep.points[:, 1], sweep.points[:, 0]) / (2 * np.pi)
+        times = 0.1 * ((angle + 0.5 * rng.integers(0, 2, len(angle))) % 1.0) + rng.uniform(0, 0.01)
+        sweeps.append(replace(sweep, point_times=times))
+    return Window(sweeps[0], sweeps[1], tuple(sweeps[2:]))
+
+
+def at_once(window: Window) -> Window:
+    sweeps = [replace(s, point_times=np.zeros(len(s.points))) for s in (window.pc0, window.pc1, *window.pch)]
+    return Window(sweeps[0], sweeps[1], tuple(sweeps[2:]))
+
+
+# ------------------------------------------------------------------------------------------- equal to the oracle
+
+
+@pytest.mark.parametrize("num_past, num_future", [(2, 0), (4, 0), (2, 3)])
+def test_motion_and_points_equal_the_oracle(num_past, num_future):
+    scene = moving_scene(range(8), num_past, snap=1 / 16, speed=0.8, num_future=num_future)
+    rng, num_steps = np.random.default_rng(num_past), num_past + num_future
+    times = np.floor(rng.choice([-0.4, 0.1, 0.3], scene.sweeps.batch.image.numel()) * 2**20) / 2**20
+    place = np.array([*range(num_past), *range(-1, -1 - num_future, -1)])
+    times -= place[scene.sweeps.batch.image.numpy() % num_steps] * 0.125  # what is older was measured earlier
+    scene = with_times(scene, torch.from_numpy(times))
+    points = scene.points()
+    seen = register(points, scene.sweeps, scene.flow)
+    found = register_deskewed(points, scene.sweeps, scene.flow, seen)
+    sharp, drawn = deskew(points, scene.sweeps, seen)
+    assert len(sharp.owner) < len(points.owner), "some leave the region or meet another object"
+    expected: List[rigid_registration.RigidMotion] = []
+    places: List[Tuple[int, ...]] = []
+    stretched = 0
+    for number, window in enumerate(scene.windows()):
+        of_window = rigid_registration.register(window.points(), window.flow, window.sweeps)
+        stretch = oracle.stretch_of(window.points(), of_window, window.sweeps)
+        stretched += sum(s not in (0.0, 1.0) for s in stretch)
+        moved = oracle.deskew(window.points(), of_window, window.sweeps, window.config)
+        places += [(number, p.step, p.owner + len(expected), p.part, round(1e6 * p.x), round(1e6 * p.y)) for p in moved]
+        expected += oracle.register_deskewed(window.points(), window.flow, of_window, window.sweeps, window.config)
+    assert stretched > 10
+    x, y = (torch.round(1e6 * values).long().tolist() for values in sharp.position)
+    names = zip(sharp.window.tolist(), sharp.step.tolist(), sharp.owner.tolist(), sharp.part.tolist(), x, y)
+    assert sorted(names) == sorted(places)
+    image = drawn.window * num_steps + drawn.step
+    place = (image * drawn.grid.height + drawn.row) * drawn.grid.width + drawn.col
+    assert torch.equal(place, drawn.pixel) and torch.equal(drawn.number[drawn.pixel], torch.arange(len(drawn.pixel)))
+    for name in ("flow", "turn", "centre"):
+        values = np.array([getattr(motion, name) for motion in expected])
+        np.testing.assert_allclose(getattr(found, name), values.reshape(getattr(found, name).shape), atol=1e-6)
+
+
+@pytest.mark.parametrize("num_history", [0, 2])
+def test_the_whole_method_equals_the_oracle(num_history):
+    window = late(turning_car(3, num_history, 0.4), 3)
+    settings = MODEL.replace(num_history=num_history)
+    assert flow_as_oracle(window, settings).residual_flow.any()
+    without = VerifiedFlow(settings)([replace(window, pc0=replace(window.pc0, point_times=None))])[0]
+    assert not torch.equal(VerifiedFlow(settings)([window])[0].residual_flow, without.residual_flow)
+
+
+# --------------------------------------------------------------------------------------------------- hand-made truth
+
+
+def seen_box(
+    velocity: Sequence[float], times: Sequence[Sequence[float]], elapsed: Sequence[int] = (0, 1, 2)
+) -> Tuple[List[np.ndarray], np.ndarray]:
+    """A box of points that is met twice a sweep, by two units at the times given, the second 0.5 m higher: clouds of
+    the sweeps that are so many intervals before t+1, and times."""
+    grid = np.stack(np.meshgrid(np.arange(-0.5, 0.6, 0.23), np.arange(-0.4, 0.5, 0.23), [0.2, 1.2]), -1)
+    box, way, up = grid.reshape(-1, 3), np.array([*velocity, 0.0]), np.array([0.0, 0.0, 0.5])
+    clouds = [
+        np.concatenate([box + unit * up + way * (a - k) for unit, a in enumerate(of_sweep)])
+        for k, of_sweep in zip(elapsed, times)
+    ]
+    return clouds, np.concatenate([np.repeat(of_sweep, len(box)) for of_sweep in times])
+
+
+@pytest.mark.parametrize("elapsed", [(0, 1), (0, 1, 2), (0, 1, -1, -2)])
+def test_a_known_motion_under_known_times_is_found(elapsed):
+    velocity = (0.8, -0.3)
+    clouds, of_points = seen_box(velocity, [(0.05 - 0.1 * k, 0.55 - 0.1 * k) for k in elapsed], elapsed)
+    apparent = [1.1 * v for v in velocity]  # an interval and a tenth lie between two sightings
+    scene = with_times(one_object(clouds, apparent, elapsed), torch.from_numpy(of_points))
+    points = scene.points()
+    seen = register(points, scene.sweeps, scene.flow)
+    np.testing.assert_allclose(seen.flow[0], apparent, atol=1e-3)
+    found = register_deskewed(points, scene.sweeps, scene.flow, seen)
+    np.testing.assert_allclose(found.flow[0], velocity, atol=1e-3)
+    assert abs(float(found.turn)) < 1e-3
+
+    sharp, _ = deskew(points, scene.sweeps, found)
+    for step in range(len(elapsed)):  # the images of both units become one
+        first, second = sharp.position[:, sharp.step == step].chunk(2, 1)
+        assert (first - second).abs().max() < 2e-3
+
+
+def test_what_turns_is_turned_back():
+    """At the instants of all sweeps the places are those of a motion without times."""
+    rng, turn, flow, centre = np.random.default_rng(0), 0.04, np.array([0.5, 0.2]), np.array([-0.3, 0.1])
+    shape, times = rng.uniform(-0.6, 0.6, (200, 2)), rng.uniform(-0.5, 0.5, (3, 200)).astype(np.float32)
+
+    def at(since: np.ndarray) -> np.ndarray:
+        # The angle whose half has the tangent k * turn, as in the registration, for k intervals: here it is small.
+        angle = 2 * since * np.arctan(turn)
+        x, y = np.cos(angle) * shape[:, 0] - np.sin(angle) * shape[:, 1], np.sin(angle) * shape[:, 0]
+        y = y + np.cos(angle) * shape[:, 1]
+        return np.stack((x, y), 1) + centre + flow * since[:, None]
+
+    clouds = [np.concatenate((at(1 - k + times[k]), np.full((200, 1), 0.2)), 1) for k in range(3)]
+    scene = with_times(one_object(clouds, flow), torch.from_numpy(times.ravel()))
+    rigid = RigidMotion(*(torch.from_numpy(np.array(values)) for values in ([flow], [turn], [centre])))
+    sharp, _ = deskew(scene.points(), scene.sweeps, rigid)
+    for step in range(3):
+        truth = at(np.full(200, 1.0 - step))
+        assert np.abs(sharp.position[:, sharp.step == step].T.numpy() - truth).max() < 1e-3
+
+
+def test_times_that_differ_by_a_turn_of_the_sensor_are_not_believed():
+    """What is met at the end of one sweep and at the start of the next would be faster by far than it seems."""
+    clouds, of_points = seen_box((0.3, 0.0), [(0.0,), (0.0,)])
+    of_points[len(clouds[0]) :] = 0.9
+    scene = with_times(one_object(clouds, (0.3, 0.0)), torch.from_numpy(of_points))
+    seen = register(scene.points(), scene.sweeps, scene.flow)
+    assert torch.equal(register_deskewed(scene.points(), scene.sweeps, scene.flow, seen).flow, seen.flow)
+
+
+def test_points_that_leave_the_region_are_left_out():
+    cloud = np.array([[UPPER[0] - 0.05, 0.05, 0.2], [LOWER[0] + 0.05, 0.05, 0.2]])
+    scene = with_times(one_object([cloud, cloud], (1.0, 0.0)), torch.full((4,), -0.5))
+    rigid = RigidMotion.translation(scene.flow)
+    sharp, drawn = deskew(scene.points(), scene.sweeps, rigid)
+    assert sharp.position[0].tolist() == pytest.approx([LOWER[0] + 0.55] * 2) and len(drawn.pixel) == 2
+
+
+# ------------------------------------------------------------------------------------------------ what must not matter
+
+
+@pytest.mark.parametrize("num_history", [0, 3])
+def test_times_of_zero_and_times_of_some_sweeps_change_no_bit(num_history):
+    window, model = turning_car(4, num_history), VerifiedFlow(HISTORY)
+    (expected,) = model([window])
+    assert expected.residual_flow.any()
+    assert_same_bits(model([at_once(window)])[0], expected)
+    some = late(window, 1)
+    assert_same_bits(model([replace(some, pc1=replace(some.pc1, point_times=None))])[0], expected)
+
+
+def test_neighbours_in_a_batch_and_the_order_of_points_do_not_matter():
+    windows = [late(turning_car(0, 3, 0.4), 0), turning_car(1, 3, 0.4), late(turning_car(2, 0, 0.4), 2)]
+    model = VerifiedFlow(HISTORY)
+    for window, result in zip(windows, model(windows)):
+        assert_same_bits(model([window])[0], result)
+        mixed, order = reordered(window)
+        assert_same_bits(model([mixed])[0], rows_of(result, order))
+
+
+def test_what_is_not_thorough_does_not_look_at_them():
+    window, model = turning_car(4, 1), VerifiedFlow(MODEL.replace(num_history=1, thorough=False))
+    expected, found = (model([w])[0] for w in (window, late(window, 1)))
+    assert_same_bits(found, expected)
+
+
+# ------------------------------------------------------------------------------------------------------- what is given
+
+
+def flow_with(times: object) -> FlowResult:
+    window = late(turning_car(4), 1)
+    return VerifiedFlow(MODEL)([replace(window, pc0=replace(window.pc0, point_times=times))])[0]
+
+
+def test_times_may_be_arrays_or_tensors_of_any_width():
+    times = np.floor(late(turning_car(4), 1).pc0.point_times * 2**12) / 2**12
+    expected = flow_with(times)
+    for given in (times.astype(np.float32), torch.from_numpy(times), torch.from_numpy(times).float()):
+        assert_same_bits(flow_with(given), expected)
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (lambda times: times[:-1], "shape"),
+        (lambda times: times[:, None], "shape"),
+        (lambda times: times.tolist(), "list"),
+        (lambda times: (1e9 * times).astype(np.int64), "int64"),
+        (lambda times: 1e9 * times, "nanoseconds"),
+        (lambda times: np.where(np.arange(len(times)) == 3, np.nan, times), "finite"),
+        (lambda times: np.where(np.arange(len(times)) == 3, np.inf, times), "finite"),
+        (lambda times: np.ma.masked_array(times), "masked"),
+    ],
+)
+def test_times_that_are_none_are_refused(change, message):
+    times = late(turning_car(4), 1).pc0.point_times
+    with pytest.raises(CFlowError, match=message) as caught:
+        flow_with(change(times))
+    assert "pc0" in str(caught.value)
+
+
+def test_estimate_flow_takes_them():
+    window = late(turning_car(4, 1), 1)
+    sweeps = (window.pc0, window.pc1, *window.pch)
+    p0, p1, ph = (sweep.points for sweep in sweeps)
+    gm0, gm1, gmh = (sweep.is_ground for sweep in sweeps)
+    dt0, dt1, dth = (sweep.point_times for sweep in sweeps)
+    settings = {"point_cloud_range": MODEL.point_cloud_range, "num_history": 1}
+    found = estimate_flow(p0, p1, pch=[ph], gm0=gm0, gm1=gm1, gmh=[gmh], dt0=dt0, dt1=dt1, dth=[dth], **settings)
+    (expected,) = VerifiedFlow.from_preset("default", **settings)([window])
+    assert_same_bits(found, expected)
+    with pytest.raises(CFlowError, match="dth has 2 entries"):
+        estimate_flow(p0, p1, pch=[ph], dth=[dth, dth])
+
+
+def test_time_stamps_say_how_long_an_interval_is():
+    """Two tenths of a second between the sweeps: the same times are half as many intervals."""
+    window = late(turning_car(4), 1)
+    pc0, pc1 = (replace(s, timestamp_ns=stamp) for s, stamp in ((window.pc0, 0), (window.pc1, 200_000_000)))
+    half = [replace(s, point_times=0.5 * s.point_times, timestamp_ns=None) for s in (pc0, pc1)]
+    (found,) = VerifiedFlow(MODEL.replace(max_speed=None))([Window(pc0, pc1)])
+    (expected,) = VerifiedFlow(MODEL.replace(max_speed=None))([Window(*half)])
+    assert_same_bits(found, expected)
