@@ -192,6 +192,7 @@ class VerifiedConfig(_WithHistory):
 
 CONFIGS: Dict[str, Type[Config]] = {"dense": DenseConfig, "keypoints": KeypointsConfig, "verified": VerifiedConfig}
 
+_REGION = (-76.8, -76.8, -math.inf, 76.8, 76.8, math.inf)
 _HARNESS_REGION = (-51.2, -51.2, -math.inf, 51.2, 51.2, math.inf)
 # The method of each preset, and what it changes in the method's defaults.
 PRESETS: Dict[str, Tuple[str, Dict[str, Any]]] = {
@@ -200,13 +201,13 @@ PRESETS: Dict[str, Tuple[str, Dict[str, Any]]] = {
         {
             "num_history": 4,
             "pixel_sizes": (0.4, 0.2, 0.1),
-            "point_cloud_range": _HARNESS_REGION,
+            "point_cloud_range": _REGION,
             "max_speed": 40.0,
         },
     ),
     "fast": (
         "verified",
-        {"num_history": 2, "point_cloud_range": _HARNESS_REGION, "max_speed": 40.0, "thorough": False},
+        {"num_history": 2, "point_cloud_range": _REGION, "max_speed": 40.0, "thorough": False},
     ),
     "paper": ("dense", {}),
     # Best mean of scripts/ablation/keypoint_settings.py on its simulated set.

@@ -8,6 +8,7 @@ explain most; what moves is then placed between the pixels, registered and turne
 
 from __future__ import annotations
 
+import math
 from typing import List, Tuple
 
 import torch
@@ -26,7 +27,13 @@ from cflow_torch.verified.rigid_motion import RigidMotion, TurningMotion
 from cflow_torch.verified.rigid_registration import register
 from cflow_torch.verified.subpixel_shift import shift_between_pixels
 from cflow_torch.verified.voxel_centroids import points_of_objects
+from cflow_torch.windows.bev_grid import Grid
 from cflow_torch.windows.collation import Batch
+
+
+# Metres around the region that are looked at as well, so that what crosses its border is seen whole: at least the way
+# of 40 m/s in a sweep.
+MARGIN = 4.0
 
 
 class VerifiedFlow(SceneFlowModel):
@@ -59,6 +66,12 @@ class VerifiedFlow(SceneFlowModel):
         or of the descriptors of key points, one after the other."""
         most = max(keypoint_candidates.BYTES_PER_POINT, slow_motion.BYTES_PER_POINT) if self.config.thorough else 0
         return int(super().bytes_per_point) + 170 + most
+
+    def grid(self, pixel_size: float) -> Grid:
+        """The BEV at a pixel size, metres: the region and its margin of whole pixels of the coarsest size."""
+        x0, y0, z0, x1, y1, z1 = self.config.point_cloud_range
+        wide = math.ceil(MARGIN / self.config.pixel_sizes[0]) * self.config.pixel_sizes[0]
+        return Grid(pixel_size, (x0 - wide, y0 - wide, z0), (x1 + wide, y1 + wide, z1))
 
     def motion(self, batch: Batch) -> TurningMotion:
         """Motion of everything in a batch, by occupied pixel; ids number what moves together or stands together."""
@@ -132,7 +145,7 @@ def _by_pixel(
     of_pixel = F.pad(objects.of_pixel, (0, 1), value=objects.count)
     return TurningMotion(
         of_place=sweeps.number if is_numbered else sweeps.number_at_t(),
-        place=sweeps.place,
+        place=torch.where(sweeps.batch.has_result, sweeps.place, sweeps.image.numel() - 1),
         flow=F.pad(rigid.flow, (0, 1, 0, 1)).index_select(0, of_pixel) + 0.0,  # + 0.0 turns -0.0 into 0.0
         cluster_id=F.pad(ids, (0, 1), value=-1).index_select(0, of_pixel),
         score=F.pad(score.masked_fill(objects.of_pixel == objects.count, 0.0), (0, 1)),

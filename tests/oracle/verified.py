@@ -5,6 +5,7 @@ Order of reading: verified_flow -> verify_level -> `candidates`, `paired_test`; 
 
 from __future__ import annotations
 
+import math
 from typing import Dict, List, NamedTuple, Optional, Sequence
 
 import numpy as np
@@ -52,7 +53,8 @@ def verified_flow(
         ground: (N, 3) float64, metres, frame of t+1, ground points of t and t+1 where they are known.
 
     """
-    size = config.pixel_sizes[-1]
+    is_inside = in_range(clouds[0].points, config)
+    config, size = with_margin(config), config.pixel_sizes[-1]
     drawn = [cloud.takes_part & in_range(cloud.points, config) for cloud in (cloud1, *clouds)]
     if config.min_height is not None:
         means = ground_heights(ground, config)
@@ -85,13 +87,20 @@ def verified_flow(
     num_points, score_of = len(clouds[0].points), dict(zip(sweeps.pixels(), levels[-1].scores))
     flow, ids, scores = np.zeros((num_points, 3)), np.full(num_points, -1, dtype=np.int64), np.zeros(num_points)
     confidence = np.full(num_points, of_left_out)
-    rows = np.flatnonzero(drawn[1])
+    rows = np.flatnonzero(drawn[1] & is_inside)
     for i, (r, c) in zip(rows.tolist(), project_bev(clouds[0].points[rows], config, size).tolist()):
         confidence[i] = trust[1, r, c]
         if (1, r, c) in object_of:
             ids[i], scores[i] = object_of[1, r, c], score_of[1, r, c]
             flow[i, :2] = rigid[ids[i]].flow_at(*clouds[0].points[i, :2].tolist())
     return PointMotion([flow], ids, scores, confidence)
+
+
+def with_margin(config: VerifiedConfig) -> VerifiedConfig:
+    """The settings with the region that is looked at: all around larger by whole coarsest pixels, at least 4 m."""
+    wide = math.ceil(4.0 / config.pixel_sizes[0]) * config.pixel_sizes[0]
+    x0, y0, z0, x1, y1, z1 = config.point_cloud_range
+    return config.replace(point_cloud_range=(x0 - wide, y0 - wide, z0, x1 + wide, y1 + wide, z1))
 
 
 def verify_level(
