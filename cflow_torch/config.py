@@ -96,6 +96,16 @@ class Config:
         """h, sweeps before t that are used."""
         return 0
 
+    @property
+    def num_future(self) -> int:
+        """Sweeps after t+1 that are used."""
+        return 0
+
+    @property
+    def num_sweeps(self) -> int:
+        """Sweeps of a whole window: history, t, t+1 and what comes after."""
+        return self.num_history + 2 + self.num_future
+
     def replace(self: Kind, **overrides: Any) -> Kind:
         """A copy with some fields changed; an unknown field raises `CFlowError` that lists the fields."""
         return replace(self, **_known(type(self), overrides))
@@ -158,6 +168,12 @@ class VerifiedConfig(_WithHistory):
     """Settings of `VerifiedFlow`: motion candidates of all scales at once, verified at the finest pixels."""
 
     method: str = _method("verified")
+    num_future: int = setting(  # type: ignore[assignment]
+        0,
+        "sweeps after t+1 that are used, offline: they decide on objects that they show more than twice as often as "
+        "the sweeps before t do. Takes twice the time",
+        low=0,
+    )
     max_object: Optional[float] = setting(
         25.0,
         "metres: what is longer than this at t+1 does not move, and has the score of the coarser component around it, "
@@ -190,25 +206,26 @@ class VerifiedConfig(_WithHistory):
             )
 
 
+WINDOW = ("num_history", "num_future")  # settings that say which sweeps a window has
+
 CONFIGS: Dict[str, Type[Config]] = {"dense": DenseConfig, "keypoints": KeypointsConfig, "verified": VerifiedConfig}
 
 _REGION = (-76.8, -76.8, -math.inf, 76.8, 76.8, math.inf)
 _HARNESS_REGION = (-51.2, -51.2, -math.inf, 51.2, 51.2, math.inf)
+_DEFAULT = {
+    "num_history": 4,
+    "pixel_sizes": (0.4, 0.2, 0.1),
+    "point_cloud_range": _REGION,
+    "max_speed": 40.0,
+}
 # The method of each preset, and what it changes in the method's defaults.
 PRESETS: Dict[str, Tuple[str, Dict[str, Any]]] = {
-    "default": (
-        "verified",
-        {
-            "num_history": 4,
-            "pixel_sizes": (0.4, 0.2, 0.1),
-            "point_cloud_range": _REGION,
-            "max_speed": 40.0,
-        },
-    ),
+    "default": ("verified", _DEFAULT),
     "fast": (
         "verified",
         {"num_history": 2, "point_cloud_range": _REGION, "max_speed": 40.0, "thorough": False},
     ),
+    "offline": ("verified", {**_DEFAULT, "num_future": 4}),
     "paper": ("dense", {}),
     # Best mean of scripts/ablation/keypoint_settings.py on its simulated set.
     "keypoints": (
@@ -242,9 +259,10 @@ def make_config(preset: Optional[str] = None, method: Optional[str] = None, **ov
     """The settings of a preset with some fields replaced.
 
     Args:
-        preset: "default", "fast", "paper" or "keypoints"; None = the preset of the method, "default" if none is given.
-        method: "dense" (preset "paper"), "keypoints" or "verified" (presets "default", "fast"); None = the preset's.
-            "keypoints" with preset "paper" are the paper's key points.
+        preset: "default", "fast", "offline", "paper" or "keypoints"; None = the preset of the method, "default" if none
+            is given.
+        method: "dense" (preset "paper"), "keypoints" or "verified" (presets "default", "fast", "offline"); None = the
+            preset's. "keypoints" with preset "paper" are the paper's key points.
         **overrides: any field of the method's settings; `pixel_size=0.1` is short for `pixel_sizes=(0.1,)`.
 
     Returns:

@@ -30,6 +30,9 @@ def estimate_flow(
     pch: Sequence[Array] = (),  # (Nh, 3+) each, nearest first
     T_ego1_egoh: Sequence[Optional[Array]] = (),
     gmh: Sequence[Optional[Array]] = (),
+    pcf: Sequence[Array] = (),  # (Nf, 3+) each, nearest first
+    T_ego1_egof: Sequence[Optional[Array]] = (),
+    gmf: Sequence[Optional[Array]] = (),
     method: Optional[str] = None,
     preset: Optional[str] = None,
     ground: Optional[str] = None,
@@ -47,8 +50,10 @@ def estimate_flow(
         pch: older sweeps t-1, t-2, ..., at most `num_history`.
         T_ego1_egoh: (4, 4) of each of `pch`; may be left out only if `T_ego1_ego0` is left out too.
         gmh: ground mask of each of `pch`; empty = nothing is ground.
+        pcf, T_ego1_egof, gmf: the same for sweeps t+2, t+3, ..., at most `num_future`; preset "offline" takes them.
         method: "dense", "keypoints" or "verified"; None = the preset's.
-        preset: "default", "fast", "keypoints" or "paper"; None = "default", or that of the method, see `make_config`.
+        preset: "default", "fast", "offline", "keypoints" or "paper"; None = "default", or that of the method, see
+            `make_config`.
         ground: None = as the masks say; "auto" = find the ground of every sweep without a mask (`find_ground`);
             "patchwork" = the same by Patchwork++ (`pip install pypatchworkpp`).
         device: "auto" = that of the tensors given, else a GPU if there is one, else the CPU.
@@ -79,25 +84,28 @@ def estimate_flow(
     if ground not in GROUND:
         raise CFlowError(f"ground={ground!r}: give one of {', '.join(map(repr, GROUND))}")
     config = make_config(preset, method, **overrides)
-    transforms = _per_sweep("T_ego1_egoh", T_ego1_egoh, pch)
-    masks = _per_sweep("gmh", gmh, pch)
-    moved = T_ego1_ego0 is not None or any(t is not None for t in transforms)
-    if moved and len(pch) > 0 and len(T_ego1_egoh) == 0:
-        raise CFlowError(
-            "T_ego1_ego0 is given but T_ego1_egoh is not: give one transform per sweep of pch "
-            "(None for a sweep that already lies in the frame of t+1)"
-        )
+    sides = (("h", pch, T_ego1_egoh, gmh), ("f", pcf, T_ego1_egof, gmf))
+    transforms = [_per_sweep(f"T_ego1_ego{side}", f"pc{side}", given, clouds) for side, clouds, given, _ in sides]
+    masks = [_per_sweep(f"gm{side}", f"pc{side}", given, clouds) for side, clouds, _, given in sides]
+    moved = any(transform is not None for transform in (T_ego1_ego0, *transforms[0], *transforms[1]))
+    for side, clouds, given, _ in sides:
+        if moved and len(clouds) > 0 and len(given) == 0:
+            other = "another transform" if T_ego1_ego0 is None else "T_ego1_ego0"
+            raise CFlowError(
+                f"{other} is given but T_ego1_ego{side} is not: give one transform per sweep of pc{side} "
+                "(None for a sweep that already lies in the frame of t+1)"
+            )
 
     def sweep(points: Array, is_ground: Optional[Array], transform: Optional[Array]) -> Sweep:
         # The world is the ego frame at t+1, so T_ego1_ego is the pose.
         pose = (np.eye(4) if transform is None else transform) if moved else None
         return Sweep(points, is_ground, pose)
 
-    window = Window(
-        pc0=sweep(pc0, gm0, T_ego1_ego0),
-        pc1=sweep(pc1, gm1, None),
-        pch=tuple(sweep(*parts) for parts in zip(pch, masks, transforms)),
+    past, future = (
+        tuple(sweep(*parts) for parts in zip(clouds, *others))
+        for clouds, *others in ((pch, masks[0], transforms[0]), (pcf, masks[1], transforms[1]))
     )
+    window = Window(sweep(pc0, gm0, T_ego1_ego0), sweep(pc1, gm1, None), past, future)
     window = _find_ground(window, ground, device)
     (result,) = make_model(config, device)([window])
     _warn_if_nothing_takes_part(result, window, config)
@@ -124,14 +132,14 @@ def _find_ground(window: Window, ground: Optional[str], device: Any) -> Window:
     """The window with the masks that it lacks; the same window, and maybe a warning, if none are asked for."""
     check_windows([window])
     chosen = choose_device([window], device)
-    sweeps = [window.pc0, window.pc1, *window.pch]
+    sweeps = [window.pc0, window.pc1, *window.pch, *window.pcf]
     bare = [index for index, sweep in enumerate(sweeps) if sweep.is_ground is None]
     clouds = [sweeps[index].points for index in bare]
     if ground is None:
         if any(has_ground(clouds, device=chosen)):
             warnings.warn(
                 "there are ground points in a sweep without a ground mask: the ground joins what stands on it into one "
-                "cluster, so that moving objects are missed. Pass ground='auto', or masks gm0 and gm1 (gmh) "
+                "cluster, so that moving objects are missed. Pass ground='auto', or masks gm0 and gm1 (gmh, gmf) "
                 "(all False if this is no ground)",
                 UserWarning,
                 stacklevel=3,
@@ -140,7 +148,8 @@ def _find_ground(window: Window, ground: Optional[str], device: Any) -> Window:
     method = "grid" if ground == "auto" else ground
     for index, mask in zip(bare, find_ground_batch(clouds, method, device=chosen)):
         sweeps[index] = replace(sweeps[index], is_ground=mask)
-    return Window(sweeps[0], sweeps[1], tuple(sweeps[2:]))
+    first_future = 2 + len(window.pch)
+    return Window(sweeps[0], sweeps[1], tuple(sweeps[2:first_future]), tuple(sweeps[first_future:]))
 
 
 def _warn_if_nothing_takes_part(result: FlowResult, window: Window, config: Config) -> None:
@@ -163,9 +172,9 @@ def _warn_if_nothing_takes_part(result: FlowResult, window: Window, config: Conf
     )
 
 
-def _per_sweep(name: str, values: Sequence[Any], pch: Sequence[Array]) -> Sequence[Any]:
+def _per_sweep(name: str, of: str, values: Sequence[Any], clouds: Sequence[Array]) -> Sequence[Any]:
     if len(values) == 0:
-        return [None] * len(pch)
-    if len(values) != len(pch):
-        raise CFlowError(f"{name} has {len(values)} entries for {len(pch)} sweeps of pch: give one per sweep")
+        return [None] * len(clouds)
+    if len(values) != len(clouds):
+        raise CFlowError(f"{name} has {len(values)} entries for {len(clouds)} sweeps of {of}: give one per sweep")
     return values

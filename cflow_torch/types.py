@@ -47,17 +47,19 @@ class Sweep:
 
 @dataclass(frozen=True)
 class Window:
-    """The sweeps t-h ... t+1 that one flow is estimated from.
+    """The sweeps that one flow is estimated from: t-h ... t+1 and, offline, some after t+1.
 
     Args:
         pc0: sweep t; the flow is given for its points.
         pc1: sweep t+1; its ego frame is the frame of the flow.
         pch: sweeps t-1, t-2, ... t-h, nearest first; may be shorter than `num_history`.
+        pcf: sweeps t+2, t+3, ..., nearest first; may be shorter than `num_future`.
     """
 
     pc0: Sweep
     pc1: Sweep
     pch: Tuple[Sweep, ...] = ()
+    pcf: Tuple[Sweep, ...] = ()
 
 
 @dataclass(frozen=True)

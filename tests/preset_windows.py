@@ -8,12 +8,12 @@ from scenes import RANGE, scene
 
 from cflow_torch import Config, FlowResult, Sweep, Window, make_config
 
-PRESETS = ("default", "fast", "paper", "keypoints")
+PRESETS = ("default", "fast", "offline", "paper", "keypoints")
 
 
 def small(preset: str, **overrides: Any) -> Config:
     """A preset on 16 m x 14 m with pixels of 0.25 m, two older sweeps where it takes any."""
-    given = {"pixel_sizes": (0.5, 0.25) if preset == "default" else (0.25,), "max_extent": 5.0}
+    given = {"pixel_sizes": (0.5, 0.25) if preset in ("default", "offline") else (0.25,), "max_extent": 5.0}
     if preset != "keypoints":
         given["num_history"] = 2
     return make_config(preset, **{"point_cloud_range": RANGE, **given, **overrides})
@@ -23,14 +23,19 @@ def windows_for(config: Config, number: int = 1) -> List[Window]:
     """Windows in which every preset finds motion; the last of several is a pair."""
     seeds = (12, 11, 3, 8)[:number]
     return [
-        scene(seed, num_history=0 if number > 1 and seed == seeds[-1] else config.num_history, num_points=90)
+        scene(
+            seed,
+            num_history=0 if number > 1 and seed == seeds[-1] else config.num_history,
+            num_future=config.num_future,
+            num_points=90,
+        )
         for seed in seeds
     ]
 
 
 def changed(window: Window, change: Callable[[Sweep], Sweep]) -> Window:
     """The same change of every sweep."""
-    return Window(change(window.pc0), change(window.pc1), tuple(map(change, window.pch)))
+    return Window(*map(change, (window.pc0, window.pc1)), *(tuple(map(change, s)) for s in (window.pch, window.pcf)))
 
 
 def num_moving(result: FlowResult) -> int:

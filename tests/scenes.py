@@ -52,6 +52,7 @@ def scene(
     seed: int,
     *,
     num_history: int = 0,
+    num_future: int = 0,
     poses: bool = True,
     stamps: bool = False,
     num_objects: int = 9,
@@ -70,7 +71,7 @@ def scene(
         objects.append(("box" if i % 2 else "ell", size, rng.uniform(-3, 3), rng.uniform((-7, -6), (7, 6)), velocity))
     turn, speed = rng.normal(0, 0.02), rng.normal(0.5, 0.2)
     sweeps = []
-    for k in range(num_history + 2):  # sweeps t+1, t, t-1, ...
+    for k in [*range(num_history + 2), *range(-1, -1 - num_future, -1)]:  # sweeps t+1, t, t-1, ..., then t+2, t+3, ...
         clouds = []
         for kind, size, yaw, place, velocity in objects:
             if k and rng.random() < 0.12:
@@ -89,9 +90,10 @@ def scene(
         points = (points @ T_world_ego[:3, :3]).astype(np.float32)
         points[5, 0], points[11, 2], points[17, 1] = np.nan, np.inf, -np.inf
         order = rng.permutation(len(points))
-        stamp = 1_700_000_000_000_000_000 - 100_000_000 * k - int(k > 0) * int(rng.integers(0, 20_000_000))
+        stamp = 1_700_000_000_000_000_000 - 100_000_000 * k - int(k != 0) * int(rng.integers(0, 20_000_000))
         sweeps.append(Sweep(points[order], is_ground[order], T_world_ego if poses else None, stamp if stamps else None))
-    return Window(pc0=sweeps[1], pc1=sweeps[0], pch=tuple(sweeps[2:]))
+    first_future = num_history + 2
+    return Window(sweeps[1], sweeps[0], tuple(sweeps[2:first_future]), tuple(sweeps[first_future:]))
 
 
 def sweeps_of(windows: List[Window], settings: VerifiedConfig) -> HeightSlicedSweeps:
@@ -105,13 +107,14 @@ def sweeps_of(windows: List[Window], settings: VerifiedConfig) -> HeightSlicedSw
 def reordered(window: Window, seed: int = 0) -> Tuple[Window, np.ndarray]:
     """Points of every sweep in another order, and the order of those of pc0."""
     rng = np.random.default_rng(seed)
-    sweeps = [window.pc0, window.pc1, *window.pch]
+    sweeps = [window.pc0, window.pc1, *window.pch, *window.pcf]
     orders = [rng.permutation(len(sweep.points)) for sweep in sweeps]
     mixed = [
         replace(s, points=s.points[order], is_ground=None if s.is_ground is None else s.is_ground[order])
         for s, order in zip(sweeps, orders)
     ]
-    return Window(mixed[0], mixed[1], tuple(mixed[2:])), orders[0]
+    first_future = 2 + len(window.pch)
+    return Window(mixed[0], mixed[1], tuple(mixed[2:first_future]), tuple(mixed[first_future:])), orders[0]
 
 
 def rows_of(result: FlowResult, rows: np.ndarray) -> FlowResult:

@@ -99,7 +99,8 @@ def test_a_setting_of_another_method_names_that_method():
 
 
 def test_presets_and_methods():
-    methods = {"default": VerifiedConfig, "fast": VerifiedConfig, "paper": DenseConfig, "keypoints": KeypointsConfig}
+    methods = {**dict.fromkeys(("default", "fast", "offline"), VerifiedConfig), "paper": DenseConfig}
+    methods["keypoints"] = KeypointsConfig
     assert {name: type(make_config(name)) for name in PRESETS} == methods
     assert make_config() == make_config("default") == make_config(method="verified")
     assert make_config(method="dense") == make_config("paper") == DenseConfig()
@@ -112,7 +113,7 @@ def test_presets_and_methods():
     for preset, method in (("fast", "dense"), ("default", "keypoints"), ("keypoints", "verified")):
         with pytest.raises(CFlowError, match=f"preset='{preset}' is of method=.*leave one of them out"):
             make_config(preset, method)
-    with pytest.raises(CFlowError, match="preset='best': give one of 'default', 'fast', 'paper', 'keypoints'"):
+    with pytest.raises(CFlowError, match="preset='best': give one of 'default', 'fast', 'offline', 'paper'"):
         make_config("best")
     with pytest.raises(CFlowError, match="method='sparse': give one of 'dense', 'keypoints', 'verified'"):
         make_config(method="sparse")
@@ -124,6 +125,7 @@ def test_the_paper_s_base_row_and_what_presets_change():
     assert paper.point_cloud_range == (-35.0, -35.0, -INF, 35.0, 35.0, INF) and paper.max_speed is None
     assert (default.pixel_sizes, default.num_history, default.thorough) == ((0.4, 0.2, 0.1), 4, True)
     assert (fast.pixel_sizes, fast.num_history, fast.thorough) == ((0.1,), 2, False)
+    assert make_config("offline") == default.replace(num_future=4) and make_config("offline").num_sweeps == 10
     assert make_config(pixel_size=0.2).pixel_sizes == (0.2,)
     with pytest.raises(CFlowError, match="give one of them"):
         make_config(pixel_size=0.2, pixel_sizes=(0.4,))

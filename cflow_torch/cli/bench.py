@@ -18,6 +18,7 @@ import torch
 from omegaconf import DictConfig
 
 from cflow_torch.cli import run
+from cflow_torch.config import Config
 from cflow_torch.data.atomic import ready_folder
 from cflow_torch.data.log import Log, window
 from cflow_torch.data.records import strict, write_text
@@ -37,7 +38,7 @@ def task(cfg: DictConfig) -> None:
     model = run.make_model(cfg)
     sources = run.find_logs(cfg)
     log = sources.open(sources.logs[0])
-    windows = _windows(log, num_pairs, model.config.num_history)
+    windows = _windows(log, num_pairs, model.config)
     ready_folder(output)
     with threads(num_threads):
         report = {"log": log.log_id, **measure(model, windows, repeats, cfg.batches), "machine": run.machine()}
@@ -75,7 +76,7 @@ def measure(model: FlowModel, windows: Sequence[Window], repeats: int, batches: 
             of_batch([windows[i % len(windows)] for i in range(size)])
         median = of_batch.report()["median"]
         throughput[size] = {"median": median, "windows_per_s": size / median}
-    sweeps = [sweep for each in windows for sweep in (each.pc0, each.pc1, *each.pch)]
+    sweeps = [sweep for each in windows for sweep in (each.pc0, each.pc1, *each.pch, *each.pcf)]
     return {
         "points": sum(len(sweep.points) for sweep in sweeps) / len(sweeps),
         "windows": len(windows),
@@ -110,9 +111,11 @@ def format_report(report: Dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _windows(log: Log, count: int, num_history: int) -> List[Window]:
-    """So many windows, spread evenly over those with the whole history; without such, the last one."""
-    last = len(log.timestamps) - 2
-    first = min(num_history, last)
+def _windows(log: Log, count: int, config: Config) -> List[Window]:
+    """So many windows, spread evenly over those with all sweeps before and after; without such, the last ones."""
+    end = len(log.timestamps) - 2
+    first = min(config.num_history, end)
+    last = max(end - config.num_future, first)
     count = min(count, last - first + 1)
-    return [window(log, first + (last - first) * i // max(count - 1, 1), num_history) for i in range(count)]
+    chosen = [first + (last - first) * i // max(count - 1, 1) for i in range(count)]
+    return [window(log, index, config.num_history, config.num_future) for index in chosen]

@@ -59,7 +59,7 @@ def task(cfg: DictConfig) -> None:
     else:
         pair, log = cfg.pair, find_log(cfg)
         run.check_pair(pair, log)
-        sweeps = window(log, pair, model.config.num_history)
+        sweeps = window(log, pair, model.config.num_history, model.config.num_future)
         ready_folder(output)
         figure = PICTURES[cfg.picture](cfg, model, log, sweeps)
         path = save_picture(figure, output / f"{cfg.picture}.png")
@@ -127,14 +127,14 @@ def _animate(cfg: DictConfig, model: SceneFlowModel, output: Path) -> Path:
     if cfg.format not in FORMATS:
         raise CFlowError(f"format={cfg.format}: give one of {', '.join(FORMATS)}")
     chosen, log = run.chosen_pairs(cfg), find_log(cfg)
-    recent = RecentSweeps(log, model.config.num_history + 2)
+    recent = RecentSweeps(log, model.config.num_sweeps)
     pairs = chosen(log)
     if not pairs:
         raise CFlowError(f"first={cfg.first}: log {log.log_id} has pairs 0 to {len(log.timestamps) - 2}")
     ready_folder(output)
     frames: List[Frame] = []
     for pair in counted(pairs):
-        sweeps = window(recent, pair, model.config.num_history)
+        sweeps = window(recent, pair, model.config.num_history, model.config.num_future)
         (result,) = model([sweeps])
         flow = result.residual_flow
         result = replace(result, pose_flow=flow, flow=flow)  # many frames are kept: let go of what is not drawn

@@ -215,13 +215,13 @@ def for_each_pair(logs: Sequence[Log], model: FlowModel, use: UseResult, pairs: 
     Returns:
         (frame, message) of every pair that failed.
     """
-    history = model.config.num_history
+    config = model.config
     failures: Failures = []
-    recent = [RecentSweeps(log, history + 2) for log in logs]
+    recent = [RecentSweeps(log, config.num_sweeps) for log in logs]
     indices = [(log, index) for log in recent for index in pairs(log)]
     for log, index in frames(indices):
         with reported(failures, f"{log.log_id}/{log.timestamps[index]}"):
-            sweeps = window(log, index, history)
+            sweeps = window(log, index, config.num_history, config.num_future)
             (result,) = model([sweeps])
             use(log.log, index, sweeps, result)
     return failures

@@ -19,7 +19,7 @@ import yaml  # type: ignore[import-untyped]
 
 from cflow_torch.cli.choices import CONFIGS, files
 from cflow_torch.config import CONFIGS as METHODS
-from cflow_torch.config import PRESETS, describe, make_config
+from cflow_torch.config import PRESETS, WINDOW, describe, make_config
 from cflow_torch.data.atomic import ready_folder
 from cflow_torch.data.records import write_text
 from cflow_torch.types import CFlowError
@@ -61,16 +61,17 @@ def task(arguments: List[str]) -> None:
 
 
 def harness_models() -> Dict[str, str]:
-    """Name -> YAML of each preset as a model of OpenSceneFlow."""
+    """Name -> YAML of each preset as a model of OpenSceneFlow, which gives no sweeps after t+1."""
     models = {}
-    for preset in PRESETS:
-        config = make_config(preset)
+    for preset, config in ((preset, make_config(preset)) for preset in PRESETS):
+        if config.num_future > 0:
+            continue
         name = "cflow" if preset == "default" else f"cflow_{preset}"
         text = _HARNESS.format(preset=preset, name=name, num_frames=config.num_history + 2)
         region = [min(max(bound, -_Z), _Z) for bound in config.point_cloud_range]
         for f in fields(config):
             value = region if f.name == "point_cloud_range" else getattr(config, f.name)
-            if f.name != "num_history":  # num_frames says it
+            if f.name not in WINDOW:  # num_frames says it
                 text += f"  {f.name}: {_yaml(value)}  # {describe(f)}\n"
         models[name] = text
     return models

@@ -131,7 +131,7 @@ def _write(
             kept += 1
             continue
         with run.reported(failures, frame.name):
-            sweeps = window(planned.log, planned.index, model.config.num_history)
+            sweeps = window(planned.log, planned.index, model.config.num_history, model.config.num_future)
             mask = point_mask(planned.log, planned.index, sweeps.pc0, masks) if version.rows == "masked" else None
             (result,) = model([sweeps])
             columns, lost = encode(version, sweeps, result, mask, cfg.residual_axes)

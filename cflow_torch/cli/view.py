@@ -43,12 +43,12 @@ def task(cfg: DictConfig) -> None:
     chosen = run.chosen_pairs(cfg, "data.")
     if cfg.max_flow is None or not 0 < cfg.max_flow < float("inf"):
         raise CFlowError(f"max_flow={cfg.max_flow}: give a positive length in metres per sweep")
-    flow, history = _flow(cfg)
+    flow, num_sweeps = _flow(cfg)
     logs, failures = run.open_logs(cfg)
     run.write_config(cfg, ready_folder(output))
     files: List[Path] = []
     for log in logs:
-        recent: Any = RecentSweeps(log, history + 2)
+        recent: Any = RecentSweeps(log, num_sweeps)
         file = output / f"{log.log_id}.rrd"
         with run.reported(failures, log.log_id):
             if file.name.casefold() in {other.name.casefold() for other in files}:
@@ -66,20 +66,20 @@ def task(cfg: DictConfig) -> None:
 
 
 def _flow(cfg: DictConfig) -> Tuple[Callable[[Log, int], FlowResult], int]:
-    """(What gives the flow of a pair, how many older sweeps it needs)."""
+    """(What gives the flow of a pair, how many sweeps that takes)."""
     if cfg.flow is not None:
         folder = as_path(cfg.flow)
         if not folder.is_dir():
             raise CFlowError(f"flow={cfg.flow} is no folder: give one that `cflow flow` left")
-        return lambda log, index: read_flow(frame_file(folder / log.log_id, log.timestamps[index])), 0
+        return lambda log, index: read_flow(frame_file(folder / log.log_id, log.timestamps[index])), 2
     model = run.make_model(cfg)
-    history = model.config.num_history
+    config = model.config
 
     def estimate(log: Log, index: int) -> FlowResult:
-        (result,) = model([window(log, index, history)])
+        (result,) = model([window(log, index, config.num_history, config.num_future)])
         return result
 
-    return estimate, history
+    return estimate, config.num_sweeps
 
 
 def _results(

@@ -49,10 +49,11 @@ class Log(Protocol):
         """Truth of the pair (index, index + 1), None where the log has none."""
 
 
-def window(log: Log, index: int, num_history: int = 0) -> Window:
+def window(log: Log, index: int, num_history: int = 0, num_future: int = 0) -> Window:
     """The window whose flow is that of sweep `index` to sweep `index + 1`.
 
-    At the start of a log fewer than `num_history` sweeps exist; the window is then shorter.
+    At the start of a log fewer than `num_history` sweeps exist before it, at its end fewer than `num_future` after
+    `index + 1`; the window is then shorter.
 
     Raises:
         CFlowError: `index` has no successor, or a sweep cannot be read.
@@ -63,7 +64,9 @@ def window(log: Log, index: int, num_history: int = 0) -> Window:
             f"{len(log.timestamps) - 1}, got {index}"
         )
     history = range(index - 1, max(index - 1 - num_history, -1), -1)
-    return Window(log.sweep(index), log.sweep(index + 1), tuple(log.sweep(i) for i in history))
+    future = range(index + 2, min(index + 2 + num_future, len(log.timestamps)))
+    past, later = (tuple(log.sweep(i) for i in indices) for indices in (history, future))
+    return Window(log.sweep(index), log.sweep(index + 1), past, later)
 
 
 class NumberedSweeps:

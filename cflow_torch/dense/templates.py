@@ -81,7 +81,7 @@ def make_pairs(clusters: Clusters, batch: Batch, pixel_size: float, max_speed: O
     radius = None
     if max_speed is not None:
         seconds = batch.seconds[clusters.window[cluster], source + 1]
-        radius = max_speed * seconds / torch.full_like(seconds, pixel_size) + 1
+        radius = max_speed * seconds.abs() / torch.full_like(seconds, pixel_size) + 1
     return TemplatePairs(
         Images(pair_of_slot[slot], row[older], col[older]),
         Images(pixels.cluster[newest], row[newest], col[newest]),

@@ -120,7 +120,7 @@ class Worker:
         if self._log[1] is None or self._log[0] != source:
             self._close_log()
             log = open_log(self._job.reader, source, **{**self._job.settings, "check": False})
-            self._log = (source, RecentSweeps(log, self._job.config.num_history + 2))
+            self._log = (source, RecentSweeps(log, self._job.config.num_sweeps))
         return self._log[1]  # type: ignore[return-value]
 
     def _pass(self, log: Log, folder: Path, todo: Sequence[int], stop: Callable[[], bool]) -> Iterator[_Frame]:
@@ -152,7 +152,7 @@ class Worker:
     def _read_one(self, log: Log, index: int) -> _Frame:
         frame = _Frame(int(log.timestamps[index]))
         with _stage(frame, "read"):
-            frame.content = window(log, index, self._job.config.num_history)
+            frame.content = window(log, index, self._job.config.num_history, self._job.config.num_future)
         return frame
 
     def _compute(self, frames: List[_Frame]) -> None:

@@ -53,7 +53,7 @@ class SequenceFlow(nn.Module):
     """Frames in, residual flow out. No parameters, no buffers.
 
     Args:
-        preset: "default", "fast", "keypoints" or "paper", see `make_config`.
+        preset: "default", "fast", "offline", "keypoints" or "paper", see `make_config`.
         device: "auto" = that of the tensors given, else a GPU if there is one, else the CPU.
         ground: None = ground is what the masks of the frames leave out (`with_ground=False`); "auto" or "patchwork" =
             find it in every sweep as well.
@@ -87,8 +87,9 @@ class SequenceFlow(nn.Module):
             in the axes of frame i's points. Rows that take no part are 0.
 
         Convention:
-            Frame i has frames i - 1, i - 2, ... as history, as many as there are, at most `num_history`: every pair
-            gets a flow. The i-th windows of all sequences are computed together.
+            Frame i has frames i - 1, i - 2, ... as history, as many as there are, at most `num_history`, and likewise
+            frames i + 2, i + 3, ... as future (preset "offline"): every pair gets a flow. The i-th windows of all
+            sequences are computed together.
 
         Raises:
             CFlowError: bad input, see `cflow_torch.windows.collation.make_batch`.
@@ -106,7 +107,12 @@ class SequenceFlow(nn.Module):
         oldest = max(first - self.num_history, 0)
         sweeps = self._sweeps(frames[oldest:])
         return [
-            Window(sweeps[i], sweeps[i + 1], tuple(sweeps[max(i - self.num_history, 0) : i][::-1]))
+            Window(
+                sweeps[i],
+                sweeps[i + 1],
+                tuple(sweeps[max(i - self.num_history, 0) : i][::-1]),
+                tuple(sweeps[i + 2 : i + 2 + self.model.config.num_future]),
+            )
             for i in range(first - oldest, len(sweeps) - 1)
         ]
 

@@ -54,7 +54,7 @@ def slides_along_itself(sweeps: HeightSlicedSweeps, owner: Tensor, candidates: T
 
     # Its window, of each component; those without pixels at t+1 are no lines.
     window = torch.zeros_like(is_line, dtype=torch.int64).scatter_(0, component, sweeps.window.index_select(0, newest))
-    intervals = sweeps.elapsed.amax(1).index_select(0, window)[:, None]
+    intervals = (sweeps.elapsed.amax(1) - sweeps.elapsed.amin(1)).index_select(0, window)[:, None]
     y, x = candidates.unbind(2)
     across = axis_y[:, None] * x - axis_x[:, None] * y
     square = y * y + x * x
@@ -110,9 +110,9 @@ def _is_covered(sweeps: HeightSlicedSweeps, owner: Tensor, looked_at: Tensor) ->
 
     members = flat_nonzero(torch.cat((looked_at, looked_at.new_zeros(1))).index_select(0, owner))
     window, step = sweeps.window.index_select(0, members), sweeps.step.index_select(0, members)
-    # From t+1 into all older sweeps of the window, from those into t+1.
-    older = (sweeps.elapsed > 0).index_select(0, window)
-    others = torch.where((step == 0)[:, None], older, torch.arange(num_steps, device=row.device) == 0)
+    # From t+1 into all other sweeps of the window, from those into t+1.
+    given = (sweeps.elapsed != 0).index_select(0, window)
+    others = torch.where((step == 0)[:, None], given, torch.arange(num_steps, device=row.device) == 0)
     looking, other = split_index(flat_nonzero(others), num_steps)
     where = in_image.index_select(0, members.index_select(0, looking))
     where += (window.index_select(0, looking) * num_steps + other) * (height * width)

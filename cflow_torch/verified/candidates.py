@@ -75,7 +75,7 @@ def list_motions(estimates: Tensor, available: Tensor, intervals: Tensor, others
     Args:
         estimates: (M, K, 2) float64, (y, x) finest pixels m -> t+1, nearest sweep first.
         available: (M, K) bool, False = there is no estimate; whatever stands there is not looked at.
-        intervals: (M, K) float64, sweep intervals from m to t+1; at least 1 where an estimate is available.
+        intervals: (M, K) float64, sweep intervals from m to t+1; not 0 where an estimate is available.
         others: (M, 2) float64 each, pixels per sweep interval, motions from elsewhere.
 
     Convention:
@@ -84,7 +84,8 @@ def list_motions(estimates: Tensor, available: Tensor, intervals: Tensor, others
     Source: pool: Sec. leverage_past_pcs.
     """
     is_known = available[:, :, None]
-    per_interval = torch.where(is_known, estimates, torch.zeros_like(estimates)) / intervals.clamp(min=1)[:, :, None]
+    divisor = torch.where(available, intervals, torch.ones_like(intervals))
+    per_interval = torch.where(is_known, estimates, torch.zeros_like(estimates)) / divisor[:, :, None]
     found: List[Tensor] = [per_interval]
     if estimates.shape[1] > 1:
         found.insert(0, pool(F.pad(per_interval, (0, 1)), available)[:, None, :2])  # without any estimate: 0

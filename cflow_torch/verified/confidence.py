@@ -60,7 +60,7 @@ def _bins(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMotion) -> T
     y, x = ((at.double() + 0.5) * size for at in (sweeps.row, sweeps.col))
     x, y = x + sweeps.grid.lower[0], y + sweeps.grid.lower[1]
     is_far = x * x + y * y >= float(TABLE["far"]) ** 2
-    has_history = ((sweeps.elapsed > 0).sum(1) > 1).index_select(0, sweeps.window)
+    has_history = ((sweeps.elapsed != 0).sum(1) > 1).index_select(0, sweeps.window)
     kind = 2 * has_history.long() + is_far.long()
     moving = 3 + len(crowd) + len(share) + kind * (1 + len(TABLE["margin"])) + F.pad(margin, (0, 1))[objects.of_pixel]
 

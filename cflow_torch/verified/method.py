@@ -22,6 +22,7 @@ from cflow_torch.verified.candidates import propose
 from cflow_torch.verified.component_tree import Objects, find_components, select_objects
 from cflow_torch.verified.confidence import confidence_of
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
+from cflow_torch.verified.offline import best_nearby, motion_by_both_sides
 from cflow_torch.verified.paired_test import VerifiedLevel, verify
 from cflow_torch.verified.rigid_motion import RigidMotion, TurningMotion
 from cflow_torch.verified.rigid_registration import register
@@ -30,14 +31,13 @@ from cflow_torch.verified.voxel_centroids import points_of_objects
 from cflow_torch.windows.bev_grid import Grid
 from cflow_torch.windows.collation import Batch
 
-
 # Metres around the region that are looked at as well, so that what crosses its border is seen whole: at least the way
 # of 40 m/s in a sweep.
 MARGIN = 4.0
 
 
 class VerifiedFlow(SceneFlowModel):
-    """What the presets `default` and `fast` run: windows in, flow out. No parameters, no buffers, no state.
+    """What the presets `default`, `fast` and `offline` run: windows in, flow out. No parameters, no buffers, no state.
 
     Args:
         config: a `VerifiedConfig`; `VerifiedFlow.from_preset` makes it from a preset.
@@ -75,6 +75,12 @@ class VerifiedFlow(SceneFlowModel):
 
     def motion(self, batch: Batch) -> TurningMotion:
         """Motion of everything in a batch, by occupied pixel; ids number what moves together or stands together."""
+        if self.config.num_future == 0:
+            return self.estimate(batch)
+        return motion_by_both_sides(batch, self.estimate)
+
+    def estimate(self, batch: Batch) -> TurningMotion:
+        """The same by all sweeps alike, before t or after t+1."""
         config, key_points = self.config, None
         levels: List[VerifiedLevel] = []
         with stage("project"):
@@ -92,11 +98,14 @@ class VerifiedFlow(SceneFlowModel):
                 levels.append(verify(level, candidates.motion, candidates.score, sweeps, config))
         with stage("select"):
             objects, motion = _select(levels)
+            if config.num_future > 0:
+                motion = best_nearby(sweeps, objects, motion, config)
         with stage("register"):
             rigid = self.register(objects, motion, levels, sweeps)
         with stage("confidence"):
             confidence = confidence_of(sweeps, objects, rigid)
-            return _by_pixel(objects, rigid, levels[-1].score, confidence, sweeps, config.thorough)
+            is_numbered = config.thorough or config.num_future > 0
+            return _by_pixel(objects, rigid, levels[-1].score, confidence, sweeps, is_numbered)
 
     def scales(self) -> List[Tuple[int, bool]]:
         """Of each level, coarse to fine: finest pixels a side of its pixels; are its components undilated?"""
@@ -114,7 +123,7 @@ class VerifiedFlow(SceneFlowModel):
         too_long = torch.cat([level.level.too_long for level in levels]).index_select(0, objects.component)
         slow = slow_motion.slow_motion(sweeps, objects, ~moves & ~too_long)
         points = points_of_objects(sweeps, objects, moves)
-        is_pair = (sweeps.elapsed > 0).sum(1) == 1  # with history one of many sweeps would decide
+        is_pair = (sweeps.elapsed != 0).sum(1) == 1  # with history one of many sweeps would decide
         motion = shift_between_pixels(points.take(is_pair.index_select(0, points.window)), sweeps, motion)
         points = points.take(motion.any(1).index_select(0, points.owner))
         rigid = register(points, sweeps, motion.flip(1) * pixel_size)

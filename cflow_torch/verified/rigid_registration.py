@@ -88,7 +88,7 @@ class _VoxelPairs:
         back = torch.arange(1, num_steps, device=older.device).repeat_interleave(newest.numel())
         step = torch.cat((voxels.step.index_select(0, older), back))
         time = sweeps.elapsed.flatten().index_select(0, voxels.window.index_select(0, voxel) * num_steps + step)
-        kept = flat_nonzero((time > 0) & (time <= _MOST_TIME))
+        kept = flat_nonzero((time != 0) & (time.abs() <= _MOST_TIME))
         self._voxel, self._time = voxel.index_select(0, kept), time.index_select(0, kept)
         self._is_back = kept >= older.numel()
         self._step = torch.where(self._is_back, step.index_select(0, kept), 0)  # where it looks

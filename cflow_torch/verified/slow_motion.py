@@ -56,7 +56,7 @@ def slow_motion(sweeps: HeightSlicedSweeps, objects: Objects, wanted: Tensor) ->
     Cost: eight look-ups a pixel of the objects wanted; of those that lean, 103 times 25 for each cube.
     """
     window = sweeps.window.index_select(0, objects.first)
-    is_pair = (sweeps.elapsed > 0).sum(1) == 1
+    is_pair = (sweeps.elapsed != 0).sum(1) == 1
     wanted = wanted & is_pair.index_select(0, window)
     wanted = wanted & _leans(sweeps, objects, wanted)
     if not bool(wanted.any()):

@@ -41,7 +41,7 @@ def plot_correlation(window: Window, config: Optional[Config] = None, *, cluster
     Source: the paper's figures of one car and of its NCC map; Eq. norm_correlation, displacement_in_bev.
     """
     if config is None:
-        config, window = make_config("paper"), replace(window, pch=())
+        config, window = make_config("paper"), replace(window, pch=(), pcf=())
     found = cluster_correlation(window, config, cluster_id)
     figure, panels = _lay_out(found.images.t.shape)
     style.add_heading(figure, 0.35, _title(found, config))

@@ -45,7 +45,7 @@ def plot_keypoints(window: Window, config: Optional[Config] = None) -> Figure:
     """
     figure = style.blank_figure((16.0, 6.9), 100)
     if config is None:
-        config, window = make_config("keypoints"), replace(window, pch=())
+        config, window = make_config("keypoints"), replace(window, pch=(), pcf=())
     found = keypoint_matches(window, config)
     low, high = busiest(found.start, found.end)
     title = f"{len(found.key_points)} key points at t, {len(found.start)} of them matched; shown is a part"

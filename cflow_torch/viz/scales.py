@@ -46,7 +46,7 @@ def plot_scales(window: Window, config: Optional[Config] = None) -> Figure:
     Source: the paper's multi-scale strategy and its figure.
     """
     if config is None:
-        config, window = make_config("paper", pixel_sizes=(0.4, 0.2, 0.1)), replace(window, pch=())
+        config, window = make_config("paper", pixel_sizes=(0.4, 0.2, 0.1)), replace(window, pch=(), pcf=())
     found, result = scales(window, config)
     _, alone = scales(window, config.replace(pixel_sizes=config.pixel_sizes[-1:]))
     count = len(found) + 1

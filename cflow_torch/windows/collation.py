@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Iterator, List, Optional, Sequence, Tuple
 
 import numpy as np
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from cflow_torch.config import Config
 from cflow_torch.ops.chunks import chunks
-from cflow_torch.ops.indices import flat_nonzero
+from cflow_torch.ops.indices import flat_nonzero, split_index
 from cflow_torch.types import Sweep, Window
 from cflow_torch.windows.bev_grid import Grid
 from cflow_torch.windows.ego_motion import compensate, rigid_transform
@@ -35,7 +35,8 @@ _BYTES_ON_CPU = 1 << 29
 
 @dataclass(frozen=True)
 class Batch:
-    """Points of all sweeps of all windows, sweep by sweep: t+1 of every window, then t of every window, then t-1, ...
+    """Points of all sweeps of all windows, sweep by sweep: t+1 of every window, then t of every window, then t-1, ...,
+    then t+2, t+3, ...
 
     Points that do not take part (not finite, ground, the vehicle's own, outside the images) are left out, but for those
     of pc0: all its rows are here, so that results are read off without being scattered. The images may be larger than
@@ -45,13 +46,14 @@ class Batch:
         positions: (A, P) float64, metres, frame of t+1 of the point's window; A = 2, x and y, where nothing asks for z,
             else 3.
         takes_part: (P,) bool, False = a row of pc0 that does not take part; its position means nothing.
-        has_result: (P,) bool, takes part and lies in the region; means nothing for other sweeps than pc0.
-        image: (P,) int32, window * num_steps + step of each point; step 0 = sweep t+1, 1 = t, 2 = t-1, ...
+        has_result: (P,) bool, False = a row of pc0 that does not take part, or lies outside the region.
+        image: (P,) int32, window * num_steps + step of each point; step 0 = sweep t+1, 1 = t, 2 = t-1, ...,
+            steps of sweeps after t+1 stand behind those of the longest history.
         num_newest: number of points of t+1, the first ones; they are never warped.
         num_windows: B.
-        num_steps: S, 1 + the longest list of source sweeps.
+        num_steps: S, 1 + the longest list of sweeps up to t + the longest list of sweeps after t+1.
         elapsed: (B, S) float64, sweep intervals from the sweep to t+1: the k that divides an estimate and
-            scales a warp (0 for step 0).
+            scales a warp (0 for step 0 and for sweeps that a window lacks, negative for sweeps after t+1).
         seconds: (B, S) float64, the same in seconds, for `max_speed`.
         sources: of each window, what its result is made of.
         ground: of the ground points of t and t+1; None = nothing asks.
@@ -68,6 +70,23 @@ class Batch:
     seconds: Tensor
     sources: Tuple[Source, ...]
     ground: Optional[GroundHeights] = None
+
+    def take_steps(self, wanted: Tensor) -> Batch:
+        """The batch of some of the sweeps. Args: wanted: (S,) bool, True for steps 0 and 1."""
+        kept, number = flat_nonzero(wanted), wanted.cumsum(0) - 1
+        window, step = split_index(self.image.long(), self.num_steps)
+        rows = flat_nonzero(wanted.index_select(0, step))  # rows of pc0 stay where they are: newer ones stay as well
+        image = window * kept.numel() + number.index_select(0, step)
+        return replace(
+            self,
+            positions=self.positions.index_select(1, rows),
+            takes_part=self.takes_part.index_select(0, rows),
+            has_result=self.has_result.index_select(0, rows),
+            image=image.index_select(0, rows).int(),
+            num_steps=kept.numel(),
+            elapsed=self.elapsed.index_select(1, kept),
+            seconds=self.seconds.index_select(1, kept),
+        )
 
 
 @dataclass(frozen=True)
@@ -106,7 +125,7 @@ def split_windows(
         max_memory = _BYTES_ON_CPU
     used = 0
     for window in windows:
-        sweeps = (window.pc1, window.pc0, *window.pch)
+        sweeps = (window.pc1, window.pc0, *window.pch, *window.pcf)
         points = sum(sweep.points.shape[0] for sweep in sweeps)
         needed = bytes_per_point * points + (_BYTES_PER_PIXEL * len(sweeps) + 30) * grid.height * grid.width
         require_memory(
@@ -136,7 +155,7 @@ def make_batch(
 
     Args:
         windows: B windows, at least one.
-        config: `ego_box`, `sweep_interval`, `point_cloud_range`; `num_history` bounds the history that is accepted.
+        config: `ego_box`, `sweep_interval`, `point_cloud_range`; `num_history`, `num_future` bound what is accepted.
         grid: the images, which hold the region; which of the scales they belong to does not matter here.
         device: where the batch is to lie.
         num_axes: coordinates that are kept, 2 or 3.
@@ -147,20 +166,22 @@ def make_batch(
 
     Raises:
         CFlowError: wrong shape or dtype, a transform that is not rigid, mixed devices, poses for some sweeps
-            only, more history than `num_history`, time stamps out of order or with gaps, poses too far apart.
+            only, more sweeps than `num_history`, `num_future`, time stamps out of order, poses too far apart.
 
     Cost: linear in points; the only Python loop over sweeps, because they arrive as a list.
     """
     kept = [source_sweeps(window, config) for window in windows]
-    num_steps = 1 + max(len(sources) for sources in kept)
+    num_future = [sum(way < 0 for _, _, way in sources) for sources in kept]
+    first_future = 1 + max(len(sources) - count for sources, count in zip(kept, num_future))
+    num_steps = first_future + max(num_future)
     elapsed, seconds = np.zeros((2, len(windows), num_steps))
     sweeps: List[Tuple[int, int, str, Sweep]] = []
-    for index, (window, older) in enumerate(zip(windows, kept)):
-        times = elapsed_times(window, older, config)
-        elapsed[index, 1 : 1 + len(times)], seconds[index, 1 : 1 + len(times)] = zip(*times)
-        named = [("pc1", window.pc1), *((name, sweep) for name, sweep, _ in older)]
-        sweeps += [(step, index, name, sweep) for step, (name, sweep) in enumerate(named)]
-    sweeps.sort(key=lambda entry: entry[0])  # stable: all t+1, then all t, then what is older
+    for index, (window, sources, count) in enumerate(zip(windows, kept, num_future)):
+        steps = [*range(1, 1 + len(sources) - count), *range(first_future, first_future + count)]
+        elapsed[index, steps], seconds[index, steps] = zip(*elapsed_times(window, sources, config))
+        sweeps.append((0, index, "pc1", window.pc1))
+        sweeps += [(step, index, name, sweep) for step, (name, sweep, _) in zip(steps, sources)]
+    sweeps.sort(key=lambda entry: entry[0])  # stable: all t+1, then all t, then what is older, then what is newer
     farthest = max(map(abs, (*grid.lower[:2], *grid.upper[:2])))
     to_ego1 = [
         None if window.pc1.pose is None else np.linalg.inv(rigid_transform(window.pc1.pose, "pose1", farthest))
@@ -174,7 +195,7 @@ def make_batch(
     region = Grid(grid.pixel_size, config.point_cloud_range[:3], config.point_cloud_range[3:])
     has_result = takes_part if region == grid else torch.ones_like(takes_part)
     image = torch.empty(most, dtype=torch.int32, device=device)
-    stop, num_newest, sources = 0, 0, []
+    stop, num_newest, of_pc0 = 0, 0, []
     for step, index, name, sweep in sweeps:
         start, transform = stop, None
         if step > 0 and to_ego1[index] is not None:
@@ -183,7 +204,7 @@ def make_batch(
         if step == 1:
             with torch.inference_mode(False):  # becomes part of the result
                 pose_flow = torch.zeros((sweep.points.shape[0], 3), dtype=torch.float32, device=device)
-            sources.append(Source(slice(start, start + len(pose_flow)), pose_flow))
+            of_pc0.append(Source(slice(start, start + len(pose_flow)), pose_flow))
         for rows, raw, moved, inside, ground_inside in _pieces(
             sweep, name, transform, 3 if step == 1 else num_axes, grid, config, device
         ):
@@ -215,7 +236,7 @@ def make_batch(
         num_steps=num_steps,
         elapsed=torch.as_tensor(elapsed, device=device),
         seconds=torch.as_tensor(seconds, device=device),
-        sources=tuple(sources),
+        sources=tuple(of_pc0),
         ground=ground,
     )
 

@@ -37,8 +37,9 @@ def check_windows(windows: Any, config: Optional[Config] = None) -> None:
     for window in windows:
         if not isinstance(window, Window):
             raise CFlowError(f"the list holds {type(window).__name__}: give cflow_torch.Window(pc0=Sweep(...), ...)")
-        if not isinstance(window.pch, (list, tuple)):
-            raise CFlowError(f"pch is {type(window.pch).__name__}: give a tuple of cflow_torch.Sweep, () for none")
+        for name, others in (("pch", window.pch), ("pcf", window.pcf)):
+            if not isinstance(others, (list, tuple)):
+                raise CFlowError(f"{name} is {type(others).__name__}: give a tuple of cflow_torch.Sweep, () for none")
         for name, sweep in _named_sweeps(window):
             if not isinstance(sweep, Sweep):
                 raise CFlowError(f"{name} is {type(sweep).__name__}: give cflow_torch.Sweep(points, ...)")
@@ -48,13 +49,19 @@ def check_windows(windows: Any, config: Optional[Config] = None) -> None:
 
 
 def source_sweeps(window: Window, config: Config) -> List[Tuple[str, Sweep, int]]:
-    """(name, sweep, steps to t+1) of pc0 and the history, repeated sweeps left out."""
-    if len(window.pch) > config.num_history:
-        raise CFlowError(
-            f"the window has {len(window.pch)} history sweeps but num_history={config.num_history}: "
-            "pass num_history, or fewer sweeps"
-        )
-    sweeps = [window.pc1, window.pc0, *window.pch]
+    """(name, sweep, steps to t+1) of pc0, the history and what comes after t+1, repeated sweeps left out.
+
+    Steps are 1 for pc0, 2, 3, ... for the history, and -1, -2, ... for t+2, t+3, ..., which stand last.
+    """
+    for kind, setting, given, most in (
+        ("history", "num_history", window.pch, config.num_history),
+        ("future", "num_future", window.pcf, config.num_future),
+    ):
+        if len(given) > most:
+            raise CFlowError(
+                f"the window has {len(given)} {kind} sweeps but {setting}={most}: pass {setting}, or fewer sweeps"
+            )
+    sweeps = [window.pc1, window.pc0, *window.pch, *window.pcf]
     with_pose = [sweep.pose is not None for sweep in sweeps]
     if any(with_pose) and not all(with_pose):
         raise CFlowError(
@@ -62,16 +69,19 @@ def source_sweeps(window: Window, config: Config) -> List[Tuple[str, Sweep, int]
             "(then all points must already lie in the frame of t+1)"
         )
     sources: List[Tuple[str, Sweep, int]] = []
+    num_past = 1 + len(window.pch)
     for step, (name, sweep) in enumerate(_named_sweeps(window)[1:], 1):
-        if not any(_same(sweep, other) for _, other, _ in sources):
-            sources.append((name, sweep, step))
+        is_future = step > num_past
+        repeats = any(_same(sweep, other) for _, other, _ in sources) or (is_future and _same(sweep, window.pc1))
+        if not repeats:
+            sources.append((name, sweep, num_past - step if is_future else step))
     return sources
 
 
 def _named_sweeps(window: Window) -> List[Tuple[str, Sweep]]:
-    """Every sweep under its name, t+1 first, then from newest to oldest."""
-    older = [(f"pch{i}", sweep) for i, sweep in enumerate(window.pch, 1)]
-    return [("pc1", window.pc1), ("pc0", window.pc0), *older]
+    """Every sweep under its name: t+1, then t, t-1, ... from newest to oldest, then t+2, t+3, ..."""
+    others = [(f"pc{side}{i}", sweep) for side in "hf" for i, sweep in enumerate(getattr(window, f"pc{side}"), 1)]
+    return [("pc1", window.pc1), ("pc0", window.pc0), *others]
 
 
 def check_points(points: Any, name: str) -> None:
@@ -133,16 +143,19 @@ def _same(a: Sweep, b: Sweep) -> bool:
 def elapsed_times(
     window: Window, sources: Sequence[Tuple[str, Sweep, int]], config: Config
 ) -> Sequence[Tuple[float, float]]:
-    """(sweep intervals, seconds) from each source sweep to t+1, by time stamps where every sweep has one."""
-    if any(sweep.timestamp_ns is None for sweep in (window.pc1, window.pc0, *window.pch)):
+    """(sweep intervals, seconds) from each source sweep to t+1, by time stamps where every sweep has one.
+
+    Both are negative for sweeps after t+1.
+    """
+    if any(sweep.timestamp_ns is None for _, sweep in _named_sweeps(window)):
         return [(float(step), step * config.sweep_interval) for _, _, step in sources]
     newest = _nanoseconds(window.pc1, "pc1")
     gaps = [newest - _nanoseconds(sweep, name) for name, sweep, _ in sources]
-    intervals = [later - earlier for earlier, later in zip([0, *gaps], gaps)]
-    if min(intervals) <= 0:
+    before, after = ([way * gap for gap, (_, _, step) in zip(gaps, sources) if way * step > 0] for way in (1, -1))
+    if min(later - earlier for side in (before, after) for earlier, later in zip([0, *side], side)) <= 0:
         raise CFlowError(
             f"time stamps of the window are out of order (nanoseconds before t+1: {gaps}): "
-            "give pc1, pc0, pch1, ... from newest to oldest"
+            "give pc1, pc0, pch1, ... from newest to oldest, and pcf1, ... after pc1 from oldest to newest"
         )
     return [(gap / gaps[0], gap / 1e9) for gap in gaps]
 

@@ -43,6 +43,7 @@ ROWS: Tuple[Setting, ...] = (
     Setting("paper, scales .4 .2 .1", "paper", {"pixel_sizes": (0.4, 0.2, 0.1)}),
     Setting("fast", "fast"),
     _default(""),
+    Setting("offline", "offline"),
     _default(" - thorough", thorough=False),
     _default(", significance 0", significance=0.0),
     _default(", significance 1", significance=1.0),

@@ -36,7 +36,8 @@ def estimate(scored: ScoredSet, config: Config) -> List[EvalFrame]:
     """The frames of a set with the flow of one setting, window by window."""
     model, frames = make_model(config), []
     for item in scored.items():
-        window = replace(item.window, pch=item.window.pch[: config.num_history])
+        past, future = item.window.pch[: config.num_history], item.window.pcf[: config.num_future]
+        window = replace(item.window, pch=past, pcf=future)
         frames.append(item.frame(model([window])[0].residual_flow))
     return frames
 

@@ -23,7 +23,7 @@ from cflow_torch.evaluation.frame import EvalFrame, ego_motion_flow
 from cflow_torch.simulator.benchmark import benchmark_logs, format_of
 from cflow_torch.types import CFlowError, Sweep, Window, as_numpy
 
-HISTORY = 4
+HISTORY = FUTURE = 4
 NEAR, REGION = 35.0, 70.0  # metres, half sides: what is scored of real data; what simulated drives are estimated in
 PROFILES = ("av2", "nuscenes", "truckscenes", "waymo", "aevascenes")
 SCENES = ("street", "highway", "crossing", "narrow")
@@ -161,7 +161,7 @@ def kitti(path: Path = KITTI) -> List[Item]:
     """Every labelled pair of a part of KITTI 0000, or of another scene of that layout."""
     log, sweeps = _scene(path)
     pairs = range(len(log.timestamps) - 1)
-    return [make_item(window(sweeps, i, HISTORY), log.labels(i), log.eval_mask(i)) for i in pairs]
+    return [make_item(window(sweeps, i, HISTORY, FUTURE), log.labels(i), log.eval_mask(i)) for i in pairs]
 
 
 @lru_cache(maxsize=None)
@@ -209,7 +209,7 @@ def simulated(profile: str, first: int, last: int, cache: Path) -> List[Item]:
         for wanted in SIMULATED_WINDOWS:  # not every sweep of every data set has labels
             nearest = sorted(pairs, key=lambda i: abs(i - wanted))  # noqa: B023
             index = next(i for i in nearest if log.labels(i) is not None)
-            items.append(make_item(window(sweeps, index, HISTORY), log.labels(index)))
+            items.append(make_item(window(sweeps, index, HISTORY, FUTURE), log.labels(index)))
     return items
 
 

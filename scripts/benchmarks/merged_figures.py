@@ -129,10 +129,7 @@ def figures_of(scored: ScoredSet, frames: Sequence[EvalFrame]) -> Figures:
 
 def cut(window: Window, config: Config) -> Window:
     """The window with as many sweeps as a setting looks at."""
-    sweeps = {"pch": window.pch[: config.num_history]}
-    if hasattr(window, "pcf"):
-        sweeps["pcf"] = window.pcf[: getattr(config, "num_future", 0)]
-    return replace(window, **sweeps)
+    return replace(window, pch=window.pch[: config.num_history], pcf=window.pcf[: config.num_future])
 
 
 def find_misses(item: Item, result: FlowResult, scored: ScoredSet) -> Misses:

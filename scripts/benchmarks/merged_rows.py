@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import inspect
 import sys
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, Callable, Dict, Iterator, List, Optional, Sequence, Tuple
+from typing import Callable, Dict, Iterator, List, Optional, Sequence, Tuple
 
 import numpy as np
 
@@ -26,8 +25,7 @@ from cflow_torch.types import CFlowError  # noqa: E402
 MOVES = 0.05  # metres per sweep
 STEPS = (0.1, 0.3, 0.55, 1.0, 1.5)  # metres per sweep of the vehicle beside façades
 GAPS = (0.1, 0.2, 0.3, 0.5)  # metres from walkers to a wall
-# Older versions of the package do not look at sweeps after t+1.
-_FUTURE: Dict[str, Any] = {"num_future": 4} if "num_future" in inspect.signature(window).parameters else {}
+FUTURE = 4  # sweeps after t+1 that the windows of small drives have
 
 
 @dataclass(frozen=True)
@@ -127,7 +125,7 @@ def _items(stage: Callable[[int], Staged], first: int, last: int) -> List[Item]:
     for seed in range(first, last + 1):
         staged = stage(seed)
         drive, labels = staged.drive, staged.drive.labels(PAIR)
-        item = make_item(window(drive, PAIR, HISTORY, **_FUTURE), labels)
+        item = make_item(window(drive, PAIR, HISTORY, FUTURE), labels)
         moves = np.linalg.norm(labels.flow - item.pose_flow, axis=1) >= MOVES
         is_other = moves & ~np.isin(failure_drives.body_of(drive), list(staged.bodies))
         items.append(Item(item.window, labels, item.pose_flow, ~is_other))

@@ -177,7 +177,7 @@ def wrong_frame(seed: int) -> Case:
 def appearing(seed: int, later: int = 0) -> Case:
     """A car that comes out from behind a van, so many sweeps later than that it is first seen."""
     staged = failure_drives.appearing(seed, later)
-    return _staged_case(staged, [_flow(staged.drive, "default")])
+    return _staged_case(staged, [_flow(staged.drive, "default"), _flow(staged.drive, "offline")])
 
 
 def appeared(seed: int) -> Case:
@@ -256,7 +256,7 @@ def _pose_flow(drive: Drive) -> np.ndarray:
 def _flow(drive: Drive, preset: str, log: Optional[Log] = None, **overrides: Any) -> Attempt:
     """The flow of the pair by a preset, from `log` if its poses or points shall be others."""
     config = make_config(preset, **overrides)
-    (result,) = make_model(config)([window(log or drive, PAIR, config.num_history)])
+    (result,) = make_model(config)([window(log or drive, PAIR, config.num_history, config.num_future)])
     return _attempt(drive, ", ".join([f"`{preset}`", *(f"{k}={v}" for k, v in overrides.items())]), result)
 
 

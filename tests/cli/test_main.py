@@ -33,7 +33,7 @@ def test_every_command_says_what_it_does_and_shows_how(
     text = capsys.readouterr().out
     assert text.startswith(f"cflow {command}: {COMMANDS[command]}") and f"\nexamples:\n  cflow {command}" in text
     if (CONFIGS / f"{command}.yaml").exists():
-        assert "\n  output: outputs/" in text and "\n  model=default|fast|paper|keypoints\n" in text
+        assert "\n  output: outputs/" in text and "\n  model=default|fast|offline|paper|keypoints\n" in text
     assert cflow("help", command) == 0
     assert capsys.readouterr().out == text
 
@@ -57,7 +57,7 @@ def test_version_and_help_come_without_torch(cflow: Cflow, capsys: pytest.Captur
         ("fliw", "unknown command 'fliw' (did you mean flow?): give one of demo, flow,"),
         ("eval modle=paper", "unknown setting 'modle' (did you mean model?): `cflow eval --cfg job`"),
         ("flow num_history=2", "(did you mean model.num_history?)"),
-        ("eval model=papr", "model=papr (did you mean paper?): give one of default, fast, keypoints, paper"),
+        ("eval model=papr", "model=papr (did you mean paper?): give one of default, fast, keypoints, offline, paper"),
         ("eval -m hydra/launcher=joblob data.seed=1,2", "pip install hydra-joblib-launcher hydra-submitit-launcher"),
         ("eval model.pixel_sizes=[0.2", "cannot read 'model.pixel_sizes=[0.2'"),
         ("eval model.densify=nearest", "densify is a setting of method keypoints, not of verified"),

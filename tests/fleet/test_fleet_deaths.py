@@ -33,14 +33,14 @@ def deadly_begin(*arguments: Any) -> None:
     REAL_BEGIN(*arguments)
     read = work.window
 
-    def deadly_read(log: Any, index: int, num_history: int) -> Any:
+    def deadly_read(log: Any, index: int, *num_sweeps: int) -> Any:
         file = Path(os.environ[DEADLY]) / f"{log.log_id}.{log.timestamps[index]}"
         if file.exists():
             way, count = file.read_text().split(":")
             if int(count) > 0:
                 file.write_text(f"{way}:{int(count) - 1}")
                 WAYS[way]()
-        return read(log, index, num_history)
+        return read(log, index, *num_sweeps)
 
     work.window = deadly_read
 

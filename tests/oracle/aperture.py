@@ -22,7 +22,7 @@ def slides_along_itself(sweeps: SlicedSweeps, members: Sequence[Pixel], candidat
         across, square = axis_y * x - axis_x * y, y * y + x * x
         # The sine of the angle between the two is at most 0.2.
         is_along = across * across <= 0.04 * square * (axis_y * axis_y + axis_x * axis_x)
-        is_far = square * max(sweeps.elapsed) ** 2 >= (1.2 / sweeps.pixel_size) ** 2
+        is_far = square * (max(sweeps.elapsed) - min(sweeps.elapsed)) ** 2 >= (1.2 / sweeps.pixel_size) ** 2
         result.append(stays and is_along and is_far)
     return result
 

@@ -53,4 +53,4 @@ def search_radius(config: Config, seconds: float, pixel_size: float) -> Optional
     """Longest displacement in pixels: max_speed * time / s + one pixel; None = the paper's, half of the box."""
     if config.max_speed is None:
         return None
-    return config.max_speed * seconds / pixel_size + 1
+    return config.max_speed * abs(seconds) / pixel_size + 1

@@ -93,7 +93,7 @@ def find_pairs(
     found = []
     for voxel in members:
         for step, time in enumerate(sweeps.elapsed):
-            if not 0 < time <= MOST_TIME or voxel.step not in (0, step):
+            if not 0 < abs(time) <= MOST_TIME or voxel.step not in (0, step):
                 continue
             if voxel.step == 0:  # back to sweep `step`
                 x, y = voxel.x - centre[0] - time * way[0], voxel.y - centre[1] - time * way[1]

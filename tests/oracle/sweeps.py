@@ -16,7 +16,7 @@ class Cloud(NamedTuple):
     Attributes:
         points: (N, 3) float64, metres, frame of t+1; NaN for a point that was not finite.
         takes_part: (N,) bool, finite, neither ground nor of the vehicle itself.
-        intervals: k, sweep intervals to t+1: 1 for t, 2 for t-1 ..., or by time stamps; 0 for t+1 itself.
+        intervals: k, sweep intervals to t+1: 1 for t, 2 for t-1, -1 for t+2 ..., or by time stamps; 0 for t+1 itself.
         seconds: the same in seconds.
     """
 
@@ -46,20 +46,25 @@ def compensate(window: Window, config: Config) -> Tuple[List[Cloud], Cloud]:
     """Eq. def_scene_flow: every sweep in the frame of t+1, by inv(pose1) @ pose.
 
     Returns:
-        Sweeps m = t, t-1, ..., nearest first, at most `config.num_history` before t; and sweep t+1.
+        Sweeps m = t, t-1, ..., nearest first, at most `config.num_history` before t, then t+2, t+3, ..., at most
+        `config.num_future`; and sweep t+1.
 
     Convention:
-        A sweep that repeats a newer one (same points, same pose) is dropped; the others keep their place in time.
+        A sweep that repeats one before it in this list, or one after t+1 that repeats t+1 (same points, same pose), is
+        dropped; the others keep their place in time.
         Without poses the points already lie in the frame of t+1. Times are those of the time stamps if all sweeps
         have one, else places in the window.
     """
-    sweeps = [window.pc0, *window.pch[: config.num_history]]
+    past = [window.pc0, *window.pch[: config.num_history]]
+    sweeps = [*past, *window.pcf[: config.num_future]]
     stamps = [sweep.timestamp_ns for sweep in (window.pc1, *sweeps)]
     clouds: List[Cloud] = []
     for m, sweep in enumerate(sweeps):
-        if any(_is_repeat(sweep, newer) for newer in sweeps[:m]):
+        is_future = m >= len(past)
+        if any(_is_repeat(sweep, other) for other in [*sweeps[:m], *[window.pc1] * is_future]):
             continue
-        intervals, seconds = float(m + 1), (m + 1) * config.sweep_interval
+        place = len(past) - 1 - m if is_future else m + 1
+        intervals, seconds = float(place), place * config.sweep_interval
         if None not in stamps:
             gap, first_gap = stamps[0] - stamps[m + 1], stamps[0] - stamps[1]  # type: ignore[operator]
             intervals, seconds = gap / first_gap, gap / 1e9

@@ -6,7 +6,8 @@ Order of reading: verified_flow -> verify_level -> `candidates`, `paired_test`; 
 from __future__ import annotations
 
 import math
-from typing import Dict, List, NamedTuple, Optional, Sequence
+from itertools import product
+from typing import Dict, List, NamedTuple, Optional, Sequence, Tuple
 
 import numpy as np
 
@@ -48,13 +49,54 @@ def verified_flow(
     """The motion of every point of sweep t.
 
     Args:
-        clouds: sweeps m = t, t-1, ... nearest first.
+        clouds: sweeps m = t, t-1, ... nearest first, then t+2, t+3, ...
         cloud1: sweep t+1.
         ground: (N, 3) float64, metres, frame of t+1, ground points of t and t+1 where they are known.
 
     """
     is_inside = in_range(clouds[0].points, config)
-    config, size = with_margin(config), config.pixel_sizes[-1]
+    config = with_margin(config)
+    past = [cloud for cloud in clouds if cloud.intervals > 0]
+    first, shown = flow_by(past, cloud1, ground, is_inside, config)
+    if len(past) == len(clouds):
+        return first
+    future = [clouds[0], *(cloud for cloud in clouds if cloud.intervals < 0)]
+    return by_side(first, shown, *flow_by(future, cloud1, ground, is_inside, config))
+
+
+def by_side(first: PointMotion, shown: List[int], second: PointMotion, shown_after: List[int]) -> PointMotion:
+    """Each point goes by the side after t+1 if that shows its object more than twice as often as the other does.
+
+    Args:
+        first, second: by the sweeps before t, by those after t+1.
+        shown, shown_after: of each point, how many sweeps of that side show its object; 0 if it has none.
+
+    Convention: ids of the second go on after those of the first.
+    """
+    chosen = [(second if after > 2 * before else first) for before, after in zip(shown, shown_after)]
+    ids_after = second.cluster_id + (second.cluster_id >= 0) * (first.cluster_id.max(initial=-1) + 1)
+    flow, ids, scores, trust = (
+        np.array([values[motion is second][i] for i, motion in enumerate(chosen)])
+        for values in (
+            (first.flow[0], second.flow[0]),
+            (first.cluster_id, ids_after),
+            (first.score, second.score),
+            (first.confidence, second.confidence),
+        )
+    )
+    return PointMotion([flow.reshape(-1, 3)], ids.astype(np.int64), scores, trust)
+
+
+def flow_by(
+    clouds: Sequence[Cloud],
+    cloud1: Cloud,
+    ground: Sequence[np.ndarray],
+    is_inside: np.ndarray,
+    config: VerifiedConfig,
+) -> Tuple[PointMotion, List[int]]:
+    """The motion of every point of sweep t by the sweeps given, and how many beside t and t+1 show its object; of those
+    that are not inside, none and 0."""
+    size = config.pixel_sizes[-1]
     drawn = [cloud.takes_part & in_range(cloud.points, config) for cloud in (cloud1, *clouds)]
     if config.min_height is not None:
         means = ground_heights(ground, config)
@@ -81,19 +123,38 @@ def verified_flow(
     object_of = {pixel: chosen.index(winner) for pixel, winner in zip(sweeps.pixels(), won) if winner is not None}
     motions = [levels[level].motions[component] for level, component in chosen]
     may_creep = [not levels[level].level.too_long[component] for level, component in chosen]
+    if any(time < 0 for time in sweeps.elapsed):
+        motions = [
+            best_nearby(sweeps, [pixel for pixel, owner in object_of.items() if owner == i], motion, config)
+            for i, motion in enumerate(motions)
+        ]
     rigid = settle(sweeps, motions, may_creep, object_of, points, config)
     trust, of_left_out = confidences(sweeps, object_of, [motion.flow for motion in rigid])
 
     num_points, score_of = len(clouds[0].points), dict(zip(sweeps.pixels(), levels[-1].scores))
     flow, ids, scores = np.zeros((num_points, 3)), np.full(num_points, -1, dtype=np.int64), np.zeros(num_points)
-    confidence = np.full(num_points, of_left_out)
+    confidence, shown = np.full(num_points, of_left_out), [0] * num_points
+    shown_in = [{m for (m, _, _), owner in object_of.items() if owner == i and m > 1} for i in range(len(chosen))]
     rows = np.flatnonzero(drawn[1] & is_inside)
     for i, (r, c) in zip(rows.tolist(), project_bev(clouds[0].points[rows], config, size).tolist()):
         confidence[i] = trust[1, r, c]
         if (1, r, c) in object_of:
             ids[i], scores[i] = object_of[1, r, c], score_of[1, r, c]
             flow[i, :2] = rigid[ids[i]].flow_at(*clouds[0].points[i, :2].tolist())
-    return PointMotion([flow], ids, scores, confidence)
+            shown[i] = len(shown_in[ids[i]])
+    return PointMotion([flow], ids, scores, confidence), shown
+
+
+def best_nearby(sweeps: SlicedSweeps, members: Sequence[Pixel], motion: Vector, config: VerifiedConfig) -> Vector:
+    """The motion of most evidence within two pixels of that of an object; of equals the nearest, then the first."""
+    offsets = sorted(product(range(-2, 3), repeat=2), key=lambda offset: offset[0] ** 2 + offset[1] ** 2)
+    found = [(motion[0] + dy, motion[1] + dx) for dy, dx in offsets]
+    if not any(motion):
+        return motion
+    best, most = best_candidate(
+        [evidence_of(*count_wins(sweeps, members, one), config.significance) for one in found], found
+    )
+    return best if most > 0 else motion
 
 
 def with_margin(config: VerifiedConfig) -> VerifiedConfig:

@@ -49,6 +49,12 @@ def test_what_appears_is_wrong_at_first_and_its_confidence_says_so(scenes_of: An
     assert first.confidences()[0] < 0.5 < later.confidences()[0]
 
 
+def test_sweeps_after_t1_mend_what_appears(scenes_of: Any) -> None:
+    for seed in range(3):  # in the second a van stands near, so that the car is a part of its coarse component
+        online, offline = scenes_of.appearing(seed).errors()
+        assert online > 0.4 and offline < 0.1
+
+
 def test_a_wrong_frame_is_found_by_the_static_check(scenes_of: Any) -> None:
     from cflow_torch.data.static_check import StaticWorldWarning, check_static_world
 

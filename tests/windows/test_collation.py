@@ -206,13 +206,13 @@ def test_forms_of_arrays_do_not_matter_and_are_left_alone():
     assert num_moving(expected) > 100
     for form in FORMS.values():
         given = changed(plain, lambda sweep, form=form: replace(sweep, points=form(sweep.points)))
-        before = [as_bytes(sweep.points) for sweep in (given.pc0, given.pc1, *given.pch)]
+        before = [as_bytes(sweep.points) for sweep in (given.pc0, given.pc1, *given.pch, *given.pcf)]
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             result = cflow(given, settings)
         assert_same_bits(result, expected)
         assert not result.flow.requires_grad
-        assert [as_bytes(sweep.points) for sweep in (given.pc0, given.pc1, *given.pch)] == before
+        assert [as_bytes(sweep.points) for sweep in (given.pc0, given.pc1, *given.pch, *given.pcf)] == before
 
 
 def test_results_do_not_change_with_the_input():
@@ -221,6 +221,6 @@ def test_results_do_not_change_with_the_input():
     given = changed(windows_for(settings)[0], lambda sweep: Sweep(torch.from_numpy(sweep.points), sweep.is_ground))
     result = cflow(given, settings)
     kept = rows_of(result, np.arange(len(result.flow)))
-    for sweep in (given.pc0, given.pc1, *given.pch):
+    for sweep in (given.pc0, given.pc1, *given.pch, *given.pcf):
         sweep.points.fill_(7.0)
     assert_same_bits(result, kept)

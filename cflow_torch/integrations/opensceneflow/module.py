@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from cflow_torch.config import Config, make_config
+from cflow_torch.config import WINDOW, Config, make_config
 from cflow_torch.data.hdf5.frames import beside_harness, harness_pose_flow
 from cflow_torch.estimate import make_model
 from cflow_torch.integrations.opensceneflow.batch import Sample, read_batch
@@ -48,8 +48,8 @@ class CFlow(nn.Module):
         device: "auto" = that of the batch.
         voxel_size, grid_feature_size: taken, because the harness wants and gives them; without effect.
         preset, method: as in `make_config`; "default" if neither is given.
-        **settings: any field of the method's settings but `num_history`; those not given are the preset's. Others, of
-            another method for example, are named in a warning and have no effect.
+        **settings: any field of the method's settings but `num_history` and `num_future`; those not given are the
+            preset's. Others, of another method for example, are named in a warning and have no effect.
 
     Raises:
         CFlowError: invalid settings.
@@ -71,7 +71,7 @@ class CFlow(nn.Module):
     ) -> None:
         super().__init__()
         config: Config = make_config(preset, method)
-        names = ["pixel_size", *(f.name for f in fields(config) if f.name not in ("method", "num_history"))]
+        names = ["pixel_size", *(f.name for f in fields(config) if f.name not in ("method", *WINDOW))]
         unknown = [name for name in sorted(settings) if name not in names]
         if unknown:
             known = f"method={config.method!r} has {', '.join(names)} (history is set by num_frames)"

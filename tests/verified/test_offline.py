@@ -1,0 +1,335 @@
+"""Sweeps after t+1: equal to the oracle, what they mend, what they leave alone, what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import List, Optional, Sequence, Tuple
+
+import numpy as np
+import pytest
+import torch
+from oracle.component_tree import with_longest
+from oracle.height_slices import SlicedSweeps
+from oracle.verified import best_nearby as best_nearby_of_oracle
+from scenes import (
+    assert_same,
+    assert_same_bits,
+    config,
+    flow_as_oracle,
+    needs_gpu,
+    reordered,
+    rows_of,
+    scene,
+    sweeps_of,
+)
+from turning_car import MODEL, upright_box
+
+from cflow_torch import CFlowError, FlowResult, Sweep, VerifiedFlow, Window, estimate_flow, make_config, make_model
+from cflow_torch.data.log import window as window_of
+from cflow_torch.verified.component_tree import Objects
+from cflow_torch.verified.offline import best_nearby
+
+OFFLINE = MODEL.replace(num_history=4, num_future=4)
+SPEED = 0.9  # metres per sweep, along -x
+
+
+def bare(points: np.ndarray, **values) -> Sweep:
+    return Sweep(points.astype(np.float32), **values)
+
+
+TIMES = (-4, -3, -2, -1, 0, 1, 2, 3, 4, 5)  # of sweeps; t = 0, t+1 = 1
+
+
+def drive(is_hidden: bool, times: Sequence[float] = TIMES, seen: Sequence[int] = range(10)) -> List[Sweep]:
+    """A car and a post.
+
+    Args:
+        is_hidden: whether the car comes out from behind something: a corner of its front is first seen at t.
+        times: of the ten sweeps.
+        seen: sweeps that show the car at all.
+    """
+    rng, sweeps = np.random.default_rng(3), []
+    for k, time in enumerate(times):
+        car = upright_box((3.0 - SPEED * time, 0.0), (4.4, 1.8), 0.0, rng, 2000)
+        shows = (car[:, 0] + 0.7 * car[:, 1] < 0.35) if is_hidden else np.ones(len(car), dtype=bool)
+        post = upright_box((-2.0, 5.0), (0.4, 0.4), 0.0, rng, 60)
+        cloud = np.concatenate((car[shows & (k in seen)], post))
+        sweeps.append(Sweep(cloud.astype(np.float32), timestamp_ns=10**12 + round(1e8 * time)))
+    return sweeps
+
+
+def error_of_car(window: Window, result: FlowResult) -> float:
+    is_car = np.abs(window.pc0.points[:, 1]) < 2
+    assert is_car.sum() > 50
+    return float((result.residual_flow[is_car] - torch.tensor([-SPEED, 0.0, 0.0])).norm(dim=1).mean())
+
+
+def window_at_t(sweeps: Sequence[Sweep], num_history: int, num_future: int) -> Window:
+    """t is the fifth sweep."""
+    return Window(sweeps[4], sweeps[5], tuple(sweeps[4 - num_history : 4][::-1]), tuple(sweeps[6 : 6 + num_future]))
+
+
+# ------------------------------------------------------------------------------------------- equal to the oracle
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_equals_the_oracle_on_random_scenes(seed):
+    past, future = (0, 1, 0, 2)[seed % 4], (3, 1, 4)[seed % 3]
+    settings = config(
+        "verified",
+        num_history=past,
+        num_future=future,
+        pixel_sizes=((0.25,), (0.5, 0.25))[seed % 2],
+        max_speed=(None, 6.0)[seed % 3 == 0],
+        min_height=(None, 0.3)[seed % 5 > 0],
+        thorough=seed % 4 != 1,
+    )
+    settings = with_longest(settings, (None, 4.0)[seed % 3 > 0])
+    window = scene(700 + seed, num_history=past, num_future=future, poses=seed % 5 > 0, stamps=seed % 2 > 0)
+    result, (without,) = flow_as_oracle(window, settings), make_model(settings)([replace(window, pcf=())])
+    assert past > 0 or not torch.equal(result.residual_flow, without.residual_flow), "the future counts"
+
+
+def test_an_object_that_appears_equals_the_oracle():
+    region = (-4.0, -3.0, -3.0, 4.0, 6.0, 3.0)
+    window = window_at_t(drive(is_hidden=True), 1, 4)
+    settings = make_config("offline", point_cloud_range=region)
+    assert error_of_car(window, flow_as_oracle(window, settings)) < 0.1
+
+
+def test_the_motion_nearby_is_that_of_the_oracle():
+    window = scene(2, num_future=2)
+    settings = config("verified", num_future=2)
+    sweeps = sweeps_of([window], settings)
+    # Four quarters of the region as objects, which move somehow; one stands still.
+    of_pixel = 2 * (sweeps.row > 30).long() + (sweeps.col > 30).long()
+    first = torch.stack([(of_pixel == i).nonzero()[0, 0] for i in range(4)])
+    motion = torch.tensor([[1.25, -2.0], [0.0, 0.0], [-1.0, 3.0], [0.5, 0.5]], dtype=torch.float64)
+    found = best_nearby(sweeps, Objects(of_pixel, torch.arange(4), first), motion, settings)
+    pixels = list(zip(sweeps.step.tolist(), sweeps.row.tolist(), sweeps.col.tolist()))
+    images = list(sweeps.image[:-1].view(sweeps.num_steps, sweeps.grid.height, sweeps.grid.width).numpy())
+    plain = SlicedSweeps(images, sweeps.elapsed[0].tolist(), [], sweeps.grid.pixel_size, (0.0, 0.0))
+    for i in range(4):
+        members = [pixel for pixel, owner in zip(pixels, of_pixel.tolist()) if owner == i]
+        assert tuple(found[i].tolist()) == best_nearby_of_oracle(plain, members, tuple(motion[i].tolist()), settings)
+    assert not torch.equal(found, motion) and not found[1].any()
+
+
+# ------------------------------------------------------------------------------------------------ what it is for
+
+
+def test_a_car_that_comes_out_from_behind_something_has_its_motion():
+    sweeps, model = drive(is_hidden=True), VerifiedFlow(OFFLINE)
+    for num_history in (4, 0):  # behind something; in the first window of a log
+        online, offline = (window_at_t(sweeps, num_history, num_future) for num_future in (0, 4))
+        assert error_of_car(online, model([online])[0]) > 0.8
+        assert error_of_car(offline, model([offline])[0]) < 0.03
+
+
+@pytest.mark.parametrize(
+    "num_past, num_future, changes", [(0, 1, True), (1, 2, False), (1, 3, True), (2, 4, False), (4, 4, False)]
+)
+def test_the_future_decides_where_it_shows_an_object_more_than_twice_as_often(num_past, num_future, changes):
+    sweeps, model = drive(is_hidden=False, seen=range(4 - num_past, 10)), VerifiedFlow(OFFLINE)
+    window = window_at_t(sweeps, 4, num_future)
+    (result,), (without,) = model([window]), model([replace(window, pcf=())])
+    is_car = np.abs(window.pc0.points[:, 1]) < 2
+    assert torch.equal(result.residual_flow[is_car], without.residual_flow[is_car]) != changes
+    if not changes:
+        assert_same_bits(result, without)
+    assert_same_bits(without, VerifiedFlow(OFFLINE.replace(num_future=0))([replace(window, pcf=())])[0])
+
+
+def test_what_vanishes_goes_by_the_past():
+    sweeps = drive(is_hidden=False, seen=range(6))  # until t+1
+    window = window_at_t(sweeps, 4, 4)
+    (result,) = VerifiedFlow(OFFLINE)([window])
+    assert_same_bits(result, VerifiedFlow(OFFLINE)([replace(window, pcf=())])[0])
+
+
+def test_a_wall_that_seems_to_slide_after_t1_stands_still():
+    # Its samples travel with the sensor, 0.5 m a sweep: only over the whole window is that a long way.
+    rng = np.random.default_rng(0)
+    wall = np.stack((rng.uniform(-4, 4, 250), np.full(250, 3.05), rng.uniform(-1, 1, 250)), 1)
+    sweeps = [Sweep(wall + (0.5 * k, 0.0, 0.0)) for k in range(6)]
+    for thorough in (False, True):
+        result = flow_as_oracle(Window(*sweeps[:2], (), tuple(sweeps[2:])), OFFLINE.replace(thorough=thorough))
+        assert bool((result.residual_flow[:, 0] > 0.4).any()) != thorough
+
+
+def test_ids_of_both_sides_are_apart():
+    sweeps = drive(is_hidden=True)
+    (result,) = VerifiedFlow(OFFLINE)([window_at_t(sweeps, 4, 4)])
+    is_car = torch.from_numpy(np.abs(sweeps[4].points[:, 1]) < 2)
+    car, post = set(result.cluster_id[is_car].tolist()), set(result.cluster_id[~is_car].tolist())
+    assert -1 not in car | post and not car & post
+
+
+def test_time_stamps_of_the_future_are_heeded():
+    sweeps = drive(is_hidden=True, times=(-4, -3, -2, -1, 0, 1, 1.5, 3.2, 4, 4.4))
+    window = window_at_t(sweeps, 4, 4)
+    bare_of = lambda s: tuple(replace(sweep, timestamp_ns=None) for sweep in s)  # noqa: E731
+    unstamped = Window(*bare_of((window.pc0, window.pc1)), bare_of(window.pch), bare_of(window.pcf))
+    right, wrong = (error_of_car(w, VerifiedFlow(OFFLINE)([w])[0]) for w in (window, unstamped))
+    assert right < 0.05 < wrong
+
+
+# --------------------------------------------------------------------------------------------- what must not matter
+
+
+def mixed_windows() -> List[Window]:
+    """With and without a past, with and without a future, of all lengths."""
+    lengths = ((2, 2), (0, 3), (1, 0), (0, 0), (0, 1))
+    return [scene(40 + i, num_history=h, num_future=f) for i, (h, f) in enumerate(lengths)]
+
+
+@pytest.mark.parametrize("thorough", [True, False])
+def test_alone_or_in_a_batch_in_any_order_of_points(thorough):
+    windows, model = mixed_windows(), VerifiedFlow(config("verified", num_history=2, num_future=3, thorough=thorough))
+    for window, result in zip(windows, model(windows)):
+        assert_same_bits(model([window])[0], result)
+        mixed, order = reordered(window)
+        assert_same_bits(model([mixed])[0], rows_of(result, order))
+
+
+@pytest.mark.cuda
+@needs_gpu
+def test_cuda_equals_cpu():
+    settings = config("verified", num_history=2, num_future=3)
+    for on_cpu, on_gpu in zip(*(VerifiedFlow(settings, device)(mixed_windows()) for device in ("cpu", "cuda"))):
+        assert_same(on_gpu, on_cpu, atol=1e-4)
+
+
+def test_repeated_sweeps_after_t1_are_left_out():
+    # Harnesses repeat the last sweep of a scene where there is no next one.
+    window, model = scene(5, num_history=1, num_future=1), VerifiedFlow(config("verified", num_history=1, num_future=4))
+    (later,) = window.pcf
+    (expected,) = model([window])
+    assert_same_bits(model([replace(window, pcf=(later, later, later))])[0], expected)
+    (without,) = model([replace(window, pcf=())])
+    assert_same_bits(model([replace(window, pcf=(window.pc1, window.pc1))])[0], without)
+
+
+def test_empty_and_hopeless_windows():
+    empty, lost = bare(np.zeros((0, 3))), bare(np.full((5, 3), np.nan))
+    one = bare(np.zeros((1, 3)))
+    for pc0, pc1, later in ((empty, empty, one), (lost, one, empty), (one, lost, one), (one, one, lost)):
+        result = flow_as_oracle(Window(pc0, pc1, (), (later,)), OFFLINE)
+        assert result.residual_flow.shape == (len(pc0.points), 3) and not result.residual_flow.any()
+
+
+# ------------------------------------------------------------------------------------------------- ways to give it
+
+
+class ShortLog:
+    """A log of ten sweeps."""
+
+    log_id, sweeps = "short", drive(is_hidden=False)
+    timestamps = [sweep.timestamp_ns for sweep in sweeps]
+
+    def sweep(self, index: int) -> Sweep:
+        assert index >= 0
+        return self.sweeps[index]
+
+
+@pytest.mark.parametrize(
+    "index, past, future", [(0, [], [2, 3]), (3, [2, 1], [5, 6]), (7, [6, 5], [9]), (8, [7, 6], [])]
+)
+def test_windows_of_a_log_are_shorter_at_both_ends(index, past, future):
+    log = ShortLog()
+    window = window_of(log, index, 2, 2)
+    given = ((window.pc0, window.pc1), window.pch, window.pcf)
+    places = [[log.timestamps.index(sweep.timestamp_ns) for sweep in sweeps] for sweeps in given]
+    assert places == [[index, index + 1], past, future]
+
+
+def test_the_call_is_the_module():
+    window, settings = scene(6, num_history=1, num_future=2), config("verified", num_history=1, num_future=2)
+
+    def side(sweeps: Tuple[Sweep, ...], name: str) -> dict:
+        return {
+            f"pc{name}": [sweep.points for sweep in sweeps],
+            f"T_ego1_ego{name}": [np.linalg.inv(window.pc1.pose) @ sweep.pose for sweep in sweeps],
+            f"gm{name}": [sweep.is_ground for sweep in sweeps],
+        }
+
+    called = estimate_flow(
+        window.pc0.points,
+        window.pc1.points,
+        T_ego1_ego0=np.linalg.inv(window.pc1.pose) @ window.pc0.pose,
+        gm0=window.pc0.is_ground,
+        gm1=window.pc1.is_ground,
+        **side(window.pch, "h"),
+        **side(window.pcf, "f"),
+        **settings.as_dict(),
+    )
+    expected = make_model(settings)([window])[0]
+    assert_same_bits(called, expected)
+    assert not torch.equal(expected.residual_flow, make_model(settings)([replace(window, pcf=())])[0].residual_flow)
+
+
+def test_ground_of_the_future_is_found_too():
+    sweeps = drive(is_hidden=False)
+    rng = np.random.default_rng(0)
+    floor = np.concatenate((rng.uniform(-7, 7, (4000, 2)), np.full((4000, 1), -1.75)), 1)
+    clouds = [np.concatenate((sweep.points, floor.astype(np.float32))) for sweep in sweeps]
+    result = estimate_flow(clouds[4], clouds[5], pcf=clouds[6:], ground="auto", preset="offline")
+    assert not result.is_valid[-4000:].any() and result.is_valid[: len(sweeps[4].points)].float().mean() > 0.9
+    assert error_of_car(Window(sweeps[4], sweeps[5]), replace(result, residual_flow=result.residual_flow[:-4000])) < 0.1
+
+
+# ------------------------------------------------------------------------------------------------------ what is refused
+
+P = np.random.default_rng(0).uniform(-5, 5, (50, 3)).astype(np.float32)
+
+
+def later(offset: float, stamp: Optional[int], pose: Optional[np.ndarray] = None) -> Sweep:
+    return Sweep(P + np.float32(offset), pose=pose, timestamp_ns=stamp)
+
+
+@pytest.mark.parametrize(
+    "pcf, complaint",
+    [
+        ((later(1, 200), later(2, 150)), "out of order.*pcf1"),
+        ((later(1, 100),), "out of order"),  # the time of t+1
+        ((later(1, 50),), "out of order"),
+        ((later(1, 200, np.eye(4)),), "pose of every sweep"),
+        ((later(1, float("nan")),), "timestamp_ns of pcf1"),
+        ((Sweep(P[:, :2]),), r"pcf1 has shape \(50, 2\)"),
+        ((P,), "pcf1 is ndarray"),
+        (P, "pcf is ndarray"),
+        (tuple(later(i, 200 + i) for i in range(5)), "5 future sweeps but num_future=4"),
+    ],
+)
+def test_bad_sweeps_after_t1_are_refused(pcf, complaint):
+    window = Window(later(-1, 0), later(0, 100), (), pcf)
+    with pytest.raises(CFlowError, match=complaint):
+        VerifiedFlow(OFFLINE)([window])
+
+
+def test_poses_of_the_future_are_checked():
+    far = np.eye(4)
+    far[0, 3] = 500
+    for pose, complaint in ((far, "moves 500 m between pcf1 and pc1"), (-np.eye(4), "pose of pcf1 is not rigid")):
+        with pytest.raises(CFlowError, match=complaint):
+            VerifiedFlow(OFFLINE)([Window(later(-1, 0, np.eye(4)), later(0, 9, np.eye(4)), (), (later(1, 18, pose),))])
+
+
+@pytest.mark.parametrize("preset", ["default", "fast", "paper", "keypoints"])
+def test_other_presets_take_none(preset):
+    with pytest.raises(CFlowError, match="1 future sweeps but num_future=0"):
+        estimate_flow(P, P + 1, pcf=[P + 2], preset=preset)
+
+
+@pytest.mark.parametrize(
+    "arguments, complaint",
+    [
+        ({"T_ego1_ego0": np.eye(4)}, "T_ego1_ego0 is given but T_ego1_egof is not"),
+        ({"pch": [P - 1], "T_ego1_egoh": [np.eye(4)]}, "another transform is given but T_ego1_egof is not"),
+        ({"T_ego1_egof": [np.eye(4)] * 2}, "T_ego1_egof has 2 entries for 1 sweeps of pcf"),
+        ({"gmf": [None, None]}, "gmf has 2 entries for 1 sweeps of pcf"),
+    ],
+)
+def test_arguments_that_make_no_sense(arguments, complaint):
+    with pytest.raises(CFlowError, match=complaint):
+        estimate_flow(P, P + 1, pcf=[P + 2], preset="offline", **arguments)
