@@ -176,8 +176,8 @@ class VerifiedConfig(_WithHistory):
     )
     max_object: Optional[float] = setting(
         25.0,
-        "metres: what is longer than this at t+1 does not move, and has the score of the coarser component around it, "
-        "or 0. None = anything may move",
+        "metres: what is longer than this at t+1 moves only if both of its ends are seen to travel (trams, trains); "
+        "else it has the score of the coarser component around it, or 0. None = anything may move",
         above=0,
     )
     significance: float = setting(

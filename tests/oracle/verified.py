@@ -200,7 +200,7 @@ def verify_level(
         values = [0] * len(found)
         if not level.too_long[i]:
             values = [evidence_of(*count_wins(sweeps, members, motion), config.significance) for motion in found]
-        if config.thorough:
+        if config.thorough and not level.travels[i]:
             slides = slides_along_itself(sweeps, members, found)
             values = [0 if slid else value for slid, value in zip(slides, values)]
         motion, most = best_candidate(values, found)
