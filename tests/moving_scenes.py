@@ -212,6 +212,7 @@ def _batch(positions: torch.Tensor, image: torch.Tensor, elapsed: torch.Tensor) 
     return Batch(
         positions=positions,
         takes_part=torch.ones(image.numel(), dtype=torch.bool),
+        has_result=torch.ones(image.numel(), dtype=torch.bool),
         image=image.int(),
         num_newest=0,
         num_windows=elapsed.shape[0],

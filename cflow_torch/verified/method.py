@@ -8,6 +8,7 @@ explain most; what moves is then placed between the pixels, registered and turne
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import List, Tuple
 
@@ -27,7 +28,12 @@ from cflow_torch.verified.offline import best_nearby, motion_by_both_sides
 from cflow_torch.verified.paired_test import VerifiedLevel, verify
 from cflow_torch.verified.refinement import as_found, refine
 from cflow_torch.verified.rigid_motion import TurningMotion, motion_by_pixel
+from cflow_torch.windows.bev_grid import Grid
 from cflow_torch.windows.collation import Batch
+
+# Metres around the region that are looked at as well, so that what crosses its border is seen whole: at least the way
+# of 40 m/s in a sweep.
+MARGIN = 4.0
 
 
 class VerifiedFlow(SceneFlowModel):
@@ -65,6 +71,12 @@ class VerifiedFlow(SceneFlowModel):
     def needs_times(self) -> bool:  # type: ignore[override]
         """Whether the times of points are asked for."""
         return bool(self.config.thorough)
+
+    def grid(self, pixel_size: float) -> Grid:
+        """The BEV at a pixel size, metres: the region and its margin of whole pixels of the coarsest size."""
+        x0, y0, z0, x1, y1, z1 = self.config.point_cloud_range
+        wide = math.ceil(MARGIN / self.config.pixel_sizes[0]) * self.config.pixel_sizes[0]
+        return Grid(pixel_size, (x0 - wide, y0 - wide, z0), (x1 + wide, y1 + wide, z1))
 
     def motion(self, batch: Batch) -> TurningMotion:
         """Motion of everything in a batch, by occupied pixel; ids number what moves together or stands together."""

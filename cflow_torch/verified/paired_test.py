@@ -52,7 +52,8 @@ def verify(
     tested = (motion != 0).any(2).any(1) & ~level.too_long
     evidence = evidence_of(*count_wins(sweeps, level.component, motion, tested), config.significance)
     if config.thorough:
-        owner = torch.where(F.pad(tested, (0, 1)).index_select(0, level.component), level.component, tested.numel())
+        asked = tested & ~level.travels
+        owner = torch.where(F.pad(asked, (0, 1)).index_select(0, level.component), level.component, tested.numel())
         evidence = evidence.masked_fill(slides_along_itself(sweeps, owner, motion), 0)
     return VerifiedLevel(level, *best_candidate(evidence, motion), score)
 

@@ -124,7 +124,7 @@ def motion_by_pixel(
     of_pixel = F.pad(objects.of_pixel, (0, 1), value=objects.count)
     return TurningMotion(
         of_place=sweeps.number if is_numbered else sweeps.number_at_t(),
-        place=sweeps.place,
+        place=torch.where(sweeps.batch.has_result, sweeps.place, sweeps.image.numel() - 1),
         flow=F.pad(rigid.flow, (0, 1, 0, 1)).index_select(0, of_pixel) + 0.0,  # + 0.0 turns -0.0 into 0.0
         cluster_id=F.pad(ids, (0, 1), value=-1).index_select(0, of_pixel),
         score=F.pad(score.masked_fill(objects.of_pixel == objects.count, 0.0), (0, 1)),

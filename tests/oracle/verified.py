@@ -5,6 +5,7 @@ Order of reading: verified_flow -> verify_level -> `candidates`, `paired_test`; 
 
 from __future__ import annotations
 
+import math
 from itertools import product
 from typing import Dict, List, NamedTuple, Optional, Sequence, Tuple
 
@@ -53,12 +54,14 @@ def verified_flow(
         cloud1: sweep t+1.
         ground: (N, 3) float64, metres, frame of t+1, ground points of t and t+1 where they are known.
     """
+    is_inside = in_range(clouds[0].points, config)
+    config = with_margin(config)
     past = [cloud for cloud in clouds if cloud.intervals > 0]
-    first, shown = flow_by(past, cloud1, ground, config)
+    first, shown = flow_by(past, cloud1, ground, is_inside, config)
     if len(past) == len(clouds):
         return first
     future = [clouds[0], *(cloud for cloud in clouds if cloud.intervals < 0)]
-    return by_side(first, shown, *flow_by(future, cloud1, ground, config))
+    return by_side(first, shown, *flow_by(future, cloud1, ground, is_inside, config))
 
 
 def by_side(first: PointMotion, shown: List[int], second: PointMotion, shown_after: List[int]) -> PointMotion:
@@ -85,9 +88,14 @@ def by_side(first: PointMotion, shown: List[int], second: PointMotion, shown_aft
 
 
 def flow_by(
-    clouds: Sequence[Cloud], cloud1: Cloud, ground: Sequence[np.ndarray], config: VerifiedConfig
+    clouds: Sequence[Cloud],
+    cloud1: Cloud,
+    ground: Sequence[np.ndarray],
+    is_inside: np.ndarray,
+    config: VerifiedConfig,
 ) -> Tuple[PointMotion, List[int]]:
-    """The motion of every point of sweep t by the sweeps given, and how many beside t and t+1 show its object."""
+    """The motion of every point of sweep t by the sweeps given, and how many beside t and t+1 show its object; of those
+    that are not inside, none and 0."""
     size = config.pixel_sizes[-1]
     drawn = [cloud.takes_part & in_range(cloud.points, config) for cloud in (cloud1, *clouds)]
     if config.min_height is not None:
@@ -130,7 +138,7 @@ def flow_by(
     flow, ids, scores = np.zeros((num_points, 3)), np.full(num_points, -1, dtype=np.int64), np.zeros(num_points)
     confidence, shown = np.full(num_points, of_left_out), [0] * num_points
     shown_in = [{m for (m, _, _), owner in object_of.items() if owner == i and m > 1} for i in range(len(chosen))]
-    rows = np.flatnonzero(drawn[1])
+    rows = np.flatnonzero(drawn[1] & is_inside)
     for i, (r, c) in zip(rows.tolist(), project_bev(clouds[0].points[rows], config, size).tolist()):
         confidence[i] = trust[1, r, c]
         if (1, r, c) in object_of:
@@ -150,6 +158,13 @@ def best_nearby(sweeps: SlicedSweeps, members: Sequence[Pixel], motion: Vector, 
         [evidence_of(*count_wins(sweeps, members, one), config.significance) for one in found], found
     )
     return best if most > 0 else motion
+
+
+def with_margin(config: VerifiedConfig) -> VerifiedConfig:
+    """The settings with the region that is looked at: all around larger by whole coarsest pixels, at least 4 m."""
+    wide = math.ceil(4.0 / config.pixel_sizes[0]) * config.pixel_sizes[0]
+    x0, y0, z0, x1, y1, z1 = config.point_cloud_range
+    return config.replace(point_cloud_range=(x0 - wide, y0 - wide, z0, x1 + wide, y1 + wide, z1))
 
 
 def verify_level(
@@ -188,7 +203,7 @@ def verify_level(
         values = [0] * len(found)
         if not level.too_long[i]:
             values = [evidence_of(*count_wins(sweeps, members, motion), config.significance) for motion in found]
-        if config.thorough:
+        if config.thorough and not level.travels[i]:
             slides = slides_along_itself(sweeps, members, found)
             values = [0 if slid else value for slid, value in zip(slides, values)]
         motion, most = best_candidate(values, found)
