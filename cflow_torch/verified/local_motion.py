@@ -7,6 +7,7 @@ could not see says nothing there: else shadows that pass over a wall would move 
 
 from __future__ import annotations
 
+import math
 from typing import List, NamedTuple, Tuple
 
 import torch
@@ -32,20 +33,49 @@ class _Looks(NamedTuple):
     """L looks of pixels into other sweeps, as `looks` gives them, with what they find where the pixel stands.
 
     Args:
-        pixel, other: (L,) int64.
-        k: (L,) float64, sweep intervals from the pixel's sweep to the other one.
-        to_newest: (L,) float64, sweep intervals from the pixel's sweep to t+1.
+        pixel: (L,) int64.
+        way: (L,) int64, from which sweep to which: an index into the times of `_Ways`.
+        start: (L,) int64, where the pixel stands in the other sweep, an index into the image of `_Ways`.
         own, here: (L,) uint8, slices of the pixel; those of them that are found, or cannot be seen, where it stands.
         found: (L,) uint8, those that are found.
     """
 
     pixel: Tensor
-    other: Tensor
-    k: Tensor
-    to_newest: Tensor
+    way: Tensor
+    start: Tensor
     own: Tensor
     here: Tensor
     found: Tensor
+
+    def take(self, wanted: Tensor) -> _Looks:
+        """Some of them, (K,) int64."""
+        return _Looks(*(values.index_select(0, wanted) for values in self))
+
+
+class _Ways(NamedTuple):
+    """From which sweep to which looks go, and images with a free margin, so that no look leaves them.
+
+    Args:
+        k: (B * 2 S,) float64, sweep intervals from an older sweep m to t+1 (m = 0 ... S - 1), then from t+1 to m.
+        to_newest: (B * 2 S,) float64, sweep intervals from the looking sweep to t+1.
+        image: flat uint8, slices of all sweeps.
+        width: pixels a row of it.
+    """
+
+    k: Tensor
+    to_newest: Tensor
+    image: Tensor
+    width: int
+
+    def offsets(self, velocity: Tensor) -> Tensor:
+        """(B * 2 S,) int64, how far a velocity, (2,) float64, takes pixels in `image`."""
+        down, right = (torch.floor(self.k * v + 0.5).long() for v in velocity)
+        return down * self.width + right
+
+    def wins(self, some: _Looks, offset: Tensor) -> Tuple[Tensor, Tensor]:
+        """(L,) uint8 each: slices that are won and lost where each look, (L,) int64, is taken."""
+        there = some.own & self.image.index_select(0, some.start + offset)
+        return there & ~some.here, some.found & ~there
 
 
 def find_local_motion(
@@ -74,14 +104,14 @@ def find_local_motion(
     if members.numel() == 0:
         return objects, motion
     velocities = _velocities(sweeps)
-    found = _look(sweeps, members)
-    best, z = _best_velocity(sweeps, found, velocities)
+    ways, found = _look(sweeps, members)
+    best, z = _best_velocity(sweeps, ways, found, velocities)
     if not bool((z > 0).any()):
         return objects, motion
-    group, of_group = _groups(sweeps, found, velocities, best, z)
+    group, of_group = _groups(sweeps, ways, found, velocities, best, z)
     count = of_group.numel()
     candidates = velocities.index_select(0, of_group)[:, None]
-    won, lost = _wins_of_groups(sweeps, found, group, candidates[:, 0])
+    won, lost = _wins_of_groups(ways, found, group, candidates[:, 0])
     moves = (evidence_of(won, lost, _Z) > 0) & (_num_slices(sweeps, group, count) >= _UPRIGHT)
     num_components = sum(level.level.num_components for level in levels)
     of_component = motion.new_zeros((num_components + count, 2))
@@ -91,14 +121,17 @@ def find_local_motion(
     return objects, of_component.index_select(0, objects.component)
 
 
-def _wins_of_groups(sweeps: HeightSlicedSweeps, found: _Looks, group: Tensor, motion: Tensor) -> Tuple[Tensor, Tensor]:
+def _wins_of_groups(ways: _Ways, found: _Looks, group: Tensor, motion: Tensor) -> Tuple[Tensor, Tensor]:
     """(H,) int64 each: what groups of pixels, (P,) int64, win and lose by their motions, (H, 2) float64."""
     own = group.index_select(0, found.pixel)
     member = flat_nonzero(own < len(motion))
-    some, own = _Looks(*(values.index_select(0, member) for values in found)), own.index_select(0, member)
-    counts = _wins(sweeps, some, motion.index_select(0, own).t())
+    some, own = found.take(member), own.index_select(0, member)
+    k = ways.k.index_select(0, some.way)
+    down, right = (torch.floor(k * v.index_select(0, own) + 0.5).long() for v in motion.unbind(1))
     zeros = torch.zeros_like(motion[:, 0], dtype=torch.int64)
-    won, lost = (zeros.index_add(0, own, count.long()) for count in counts)
+    won, lost = (
+        zeros.index_add(0, own, count_slices(slices).long()) for slices in ways.wins(some, down * ways.width + right)
+    )
     return won, lost
 
 
@@ -128,22 +161,31 @@ def _is_of_walker(sweeps: HeightSlicedSweeps, velocities: Tensor) -> Tensor:
     return (off > 1.05 * _STEP / size) & (torch.linalg.vector_norm(velocities, dim=1) * size < _FASTEST)
 
 
-def _look(sweeps: HeightSlicedSweeps, members: Tensor) -> _Looks:
+def _look(sweeps: HeightSlicedSweeps, members: Tensor) -> Tuple[_Ways, _Looks]:
     """What pixels, (K,) int64, find where they stand."""
+    num_steps, elapsed, grid = sweeps.num_steps, sweeps.elapsed, sweeps.grid
+    longest = float(elapsed.abs().amax()) * _REACH * _STEP / grid.pixel_size
+    margin = math.ceil(longest) + 1
+    image = sweeps.image[:-1].view(-1, grid.height, grid.width)
+    image = F.pad(image, (margin, margin, margin, margin))
+    ways = _Ways(
+        torch.cat((elapsed, -elapsed), 1).view(-1),
+        torch.cat((elapsed, torch.zeros_like(elapsed)), 1).view(-1),
+        image.view(-1),
+        image.shape[2],
+    )
+
     pixel, other = looks(sweeps, members)
-    window, step, row, col = (
-        values.index_select(0, pixel) for values in (sweeps.window, sweeps.step, sweeps.row, sweeps.col)
-    )
-    to_newest = sweeps.elapsed[window, step]
-    k = to_newest - sweeps.elapsed[window, other]
-    exists = flat_nonzero(k != 0)
-    pixel, other, k, to_newest, window, row, col = (
-        values.index_select(0, exists) for values in (pixel, other, k, to_newest, window, row, col)
-    )
+    window, step = (values.index_select(0, pixel) for values in (sweeps.window, sweeps.step))
+    way = window * (2 * num_steps) + torch.where(step > 0, step, num_steps + other)
+    exists = flat_nonzero(ways.k.index_select(0, way))
+    pixel, other, window, way = (values.index_select(0, exists) for values in (pixel, other, window, way))
+    row, col = (values.index_select(0, pixel) for values in (sweeps.row, sweeps.col))
+    start = ((window * num_steps + other) * image.shape[1] + row + margin) * image.shape[2] + col + margin
     own = sweeps.slices.index_select(0, pixel)
-    found = own & sweeps.slices_at(window, other, row, col)
+    found = own & ways.image.index_select(0, start)
     here = found | (own & _hidden_slices(sweeps, pixel, other, flat_nonzero(found != own)))
-    return _Looks(pixel, other, k, to_newest, own, here, found)
+    return ways, _Looks(pixel, way, start, own, here, found)
 
 
 def _hidden_slices(sweeps: HeightSlicedSweeps, pixel: Tensor, other: Tensor, asked: Tensor) -> Tensor:
@@ -162,20 +204,18 @@ def _hidden_slices(sweeps: HeightSlicedSweeps, pixel: Tensor, other: Tensor, ask
     return hidden.index_copy_(0, asked, slices)
 
 
-def _wins(sweeps: HeightSlicedSweeps, some: _Looks, velocity: Tensor) -> Tuple[Tensor, Tensor]:
-    """(L,) uint8 each: slices that a velocity, (2,) or (2, L) float64, wins and loses in each look."""
+def _landing(
+    sweeps: HeightSlicedSweeps, ways: _Ways, some: _Looks, velocity: Tensor, side: int
+) -> Tuple[Tensor, Tensor, Tensor]:
+    """(L,) int64 each: window, row and col of the cell where a velocity takes each pixel at t+1, kept in the image.
+
+    Args:
+        side: finest pixels a side of a cell.
+    """
     window, row, col = (values.index_select(0, some.pixel) for values in (sweeps.window, sweeps.row, sweeps.col))
-    down, right = (torch.floor(some.k * v + 0.5).long() for v in velocity)
-    there = some.own & sweeps.slices_at(window, some.other, row + down, col + right)
-    return count_slices(there & ~some.here), count_slices(some.found & ~there)
-
-
-def _cell(sweeps: HeightSlicedSweeps, some: _Looks, velocity: Tensor, side: int, cols: int) -> Tensor:
-    """(L,) int64: row * cols + col of the cell where a velocity takes each pixel at t+1, kept inside the image."""
-    row, col = (values.index_select(0, some.pixel) for values in (sweeps.row, sweeps.col))
-    down, right = (torch.floor(some.to_newest * v + 0.5).long() for v in velocity)
+    down, right = (torch.floor(ways.to_newest * v + 0.5).long().index_select(0, some.way) for v in velocity)
     row, col = (row + down).clamp_(0, sweeps.grid.height - 1), (col + right).clamp_(0, sweeps.grid.width - 1)
-    return divide(row, side) * cols + divide(col, side)
+    return window, divide(row, side), divide(col, side)
 
 
 def _shape(sweeps: HeightSlicedSweeps) -> Tuple[int, int, int]:
@@ -184,35 +224,40 @@ def _shape(sweeps: HeightSlicedSweeps) -> Tuple[int, int, int]:
     return side, -(-sweeps.grid.height // side), -(-sweeps.grid.width // side)
 
 
-def _best_velocity(sweeps: HeightSlicedSweeps, found: _Looks, velocities: Tensor) -> Tuple[Tensor, Tensor]:
+def _best_velocity(sweeps: HeightSlicedSweeps, ways: _Ways, found: _Looks, velocities: Tensor) -> Tuple[Tensor, Tensor]:
     """Of each cell, (B, rows, cols): the velocity of the best seed within a cell of it, int64, and its z, 0 = none."""
     side, rows, cols = _shape(sweeps)
-    window = sweeps.window.index_select(0, found.pixel)
-    shape = (sweeps.num_windows, 1, rows, cols)
-    best_z = torch.zeros(shape, dtype=torch.float64, device=velocities.device)
-    best = torch.zeros(shape, dtype=torch.int64, device=velocities.device)
+    shape = (sweeps.num_windows, rows, cols)
+    best_z = torch.zeros(shape, dtype=torch.float64, device=velocities.device).view(-1)
+    best = torch.zeros_like(best_z, dtype=torch.int64)
     for index, velocity in enumerate(velocities):
-        counts = _wins(sweeps, found, velocity)
-        cell = _cell(sweeps, found, velocity, side, cols) + window * (rows * cols)
-        sums = torch.zeros((2, best.numel()), dtype=torch.float32, device=cell.device)
-        for out, count in zip(sums, counts):
-            some = flat_nonzero(count)
-            out.index_add_(0, cell.index_select(0, some), count.index_select(0, some).float())
-        won, lost = (F.avg_pool2d(out.view(shape), 3, 1, 1, divisor_override=1).double() for out in sums)
+        won, lost = ways.wins(found, ways.offsets(velocity).index_select(0, found.way))
+        some = flat_nonzero((won | lost).bool())
+        window, row, col = _landing(sweeps, ways, found.take(some), velocity, side)
+        # Both counts in one number, won * 2^16 + lost, with a free margin of a cell.
+        counts = (count_slices(won.index_select(0, some)).int() << 16) + count_slices(lost.index_select(0, some))
+        sums = torch.zeros((sweeps.num_windows, rows + 2, cols + 2), dtype=torch.int32, device=counts.device)
+        sums.view(-1).index_add_(0, (window * (rows + 2) + row + 1) * (cols + 2) + col + 1, counts)
+        sums = sums[:, :-2] + sums[:, 1:-1] + sums[:, 2:]
+        sums = (sums[:, :, :-2] + sums[:, :, 1:-1] + sums[:, :, 2:]).view(-1)
+        at = flat_nonzero(sums >= _SEED_WON << 16)
+        sums = sums.index_select(0, at)
+        won, lost = (sums >> 16).double(), (sums & 0xFFFF).double()
         surplus, noise = won - lost, won + lost
-        is_seed = (won >= _SEED_WON) & (surplus > 0) & (surplus * surplus >= _SEED_Z**2 * noise)
+        is_seed = (surplus > 0) & (surplus * surplus >= _SEED_Z**2 * noise)
         z = torch.where(is_seed, surplus / torch.sqrt(noise), torch.zeros_like(won))
-        best = torch.where(z > best_z, index, best)
-        best_z = torch.maximum(z, best_z)
-    is_wanted = _is_of_walker(sweeps, velocities).gather(1, best.view(sweeps.num_windows, -1)).view(shape)
-    best_z = best_z.masked_fill(~is_wanted, 0.0)
+        better = flat_nonzero(z > best_z.index_select(0, at))
+        best_z.index_copy_(0, at.index_select(0, better), z.index_select(0, better))
+        best.index_fill_(0, at.index_select(0, better), index)
+    is_wanted = _is_of_walker(sweeps, velocities).gather(1, best.view(sweeps.num_windows, -1)).view(-1)
+    best_z = best_z.masked_fill(~is_wanted, 0.0).view(sweeps.num_windows, 1, rows, cols)
     spread, place = F.max_pool2d(best_z, 3, 1, 1, return_indices=True)
     best = best.view(sweeps.num_windows, -1).gather(1, place.view(sweeps.num_windows, -1))
-    return best.view(-1, rows, cols), spread.view(-1, rows, cols)
+    return best.view(shape), spread.view(shape)
 
 
 def _groups(
-    sweeps: HeightSlicedSweeps, found: _Looks, velocities: Tensor, best: Tensor, z: Tensor
+    sweeps: HeightSlicedSweeps, ways: _Ways, found: _Looks, velocities: Tensor, best: Tensor, z: Tensor
 ) -> Tuple[Tensor, Tensor]:
     """Pixels that win by the velocity of the cell that it takes them to, with the pixels around; joined cell by cell.
 
@@ -222,20 +267,20 @@ def _groups(
     """
     side, rows, cols = _shape(sweeps)
     height, width, num_pixels = sweeps.grid.height, sweeps.grid.width, sweeps.pixel.numel()
-    window = sweeps.window.index_select(0, found.pixel)
     occupied = flat_nonzero(z > 0)
     component = torch.full((z.numel(),), -1, dtype=torch.int64, device=z.device)
     component[occupied] = connected_components(z > 0, occupied)
     taken = torch.zeros(num_pixels, dtype=torch.int64, device=z.device)  # 1 + component * velocities + velocity
     strength = torch.zeros(num_pixels, dtype=torch.float64, device=z.device)
     for index in torch.unique(best[z > 0]).tolist():
-        cell = _cell(sweeps, found, velocities[index], side, cols) + window * (rows * cols)
+        window, row, col = _landing(sweeps, ways, found, velocities[index], side)
+        cell = (window * rows + row) * cols + col
         near = flat_nonzero((best.view(-1).index_select(0, cell) == index) & (z.view(-1).index_select(0, cell) > 0))
-        some = _Looks(*(values.index_select(0, near) for values in found))
-        cell = cell.index_select(0, near)
-        won, lost = _wins(sweeps, some, velocities[index])
+        some, cell = found.take(near), cell.index_select(0, near)
+        won, lost = map(count_slices, ways.wins(some, ways.offsets(velocities[index]).index_select(0, some.way)))
         # Fine place at t+1, by look; its 3 x 3 pixels together.
-        fine = _cell(sweeps, some, velocities[index], 1, width) + window.index_select(0, near) * (height * width)
+        window, row, col = _landing(sweeps, ways, some, velocities[index], 1)
+        fine = (window * height + row) * width + col
         places, fine = torch.unique(fine, return_inverse=True)
         gain = torch.zeros(places.numel() + 1, dtype=torch.int64, device=z.device)
         gain.index_add_(0, fine, won.long() - lost.long())
