@@ -22,7 +22,7 @@ from cflow_torch.verified.paired_test import count_wins
 from cflow_torch.verified.rigid_motion import RigidMotion
 
 # Bounds of the bins and the probabilities, written by scripts/benchmarks/calibrate_confidence.py. Bins, in order: left
-# out; unlinked, by `crowd`; still, by `share`; moving, by `margin`: pairs near, pairs far, with history near and far.
+# out; unlinked, by `crowd`; still, by `share`, but where a local motion is likely, by `doubt`; moving, by `margin`: pairs near, pairs far, with history near and far.
 TABLE = json.loads(Path(__file__).with_name("confidence.json").read_text(encoding="utf-8"))
 DISPLACEMENT = 0.4  # metres per interval, along x and along y
 BLOCK = 1.6  # metres, sides of a neighbourhood
@@ -36,7 +36,9 @@ def margin_of(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMotion) 
     return _margin(sweeps, objects, motion, motion.any(1))
 
 
-def confidence_of(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMotion, margin: Tensor) -> Tensor:
+def confidence_of(
+    sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMotion, margin: Tensor, doubt: Tensor
+) -> Tensor:
     """Probability that the motion of a pixel of t is right to 0.1 m per sweep interval.
 
     Args:
@@ -44,6 +46,7 @@ def confidence_of(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMoti
         objects: G of them.
         rigid: their motion. Turns are not looked at: an object counts as it moves at its centre.
         margin: as `margin_of` gives it.
+        doubt: (P,) float64, how much speaks for a local motion around each pixel, standard deviations of noise.
 
     Returns:
         (P + 1,) float32; entry P is for points whose pixel was left out. Means nothing for pixels of other sweeps.
@@ -51,7 +54,7 @@ def confidence_of(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMoti
     Cost: one look-up for each pixel of t; six for each pixel of what moves and each sweep.
     """
     probabilities = torch.tensor(TABLE["probabilities"], dtype=torch.float32, device=sweeps.elapsed.device)
-    return probabilities.index_select(0, F.pad(_bins(sweeps, objects, rigid, margin), (0, 1)))
+    return probabilities.index_select(0, F.pad(_bins(sweeps, objects, rigid, margin, doubt), (0, 1)))
 
 
 def _pixels_per_interval(sweeps: HeightSlicedSweeps, rigid: RigidMotion) -> Tensor:
@@ -59,7 +62,7 @@ def _pixels_per_interval(sweeps: HeightSlicedSweeps, rigid: RigidMotion) -> Tens
     return rigid.flow.flip(1) / torch.full_like(rigid.flow, sweeps.grid.pixel_size)
 
 
-def _bins(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMotion, margin: Tensor) -> Tensor:
+def _bins(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMotion, margin: Tensor, doubt: Tensor) -> Tensor:
     """(P,) int64, place of each pixel in the table."""
     size = sweeps.grid.pixel_size
     motion = _pixels_per_interval(sweeps, rigid)
@@ -68,13 +71,16 @@ def _bins(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMotion, marg
     crowd, share = TABLE["crowd"], TABLE["share"]
     unlinked = 1 + _count([number >= bound for bound in crowd])
     still = 2 + len(crowd) + _count([10 * found >= bound * number for bound in share])
+    num_doubts = _count([doubt >= bound for bound in TABLE["doubt"]])
+    still = torch.where(num_doubts > 0, 2 + len(crowd) + len(share) + num_doubts, still)
 
     y, x = ((at.double() + 0.5) * size for at in (sweeps.row, sweeps.col))
     x, y = x + sweeps.grid.lower[0], y + sweeps.grid.lower[1]
     is_far = x * x + y * y >= float(TABLE["far"]) ** 2
     has_history = ((sweeps.elapsed != 0).sum(1) > 1).index_select(0, sweeps.window)
     kind = 2 * has_history.long() + is_far.long()
-    moving = 3 + len(crowd) + len(share) + kind * (1 + len(TABLE["margin"])) + F.pad(margin, (0, 1))[objects.of_pixel]
+    first = 3 + len(crowd) + len(share) + len(TABLE["doubt"])
+    moving = first + kind * (1 + len(TABLE["margin"])) + F.pad(margin, (0, 1))[objects.of_pixel]
 
     still = torch.where(objects.of_pixel == objects.count, unlinked, still)
     return torch.where(F.pad(moves, (0, 1)).index_select(0, objects.of_pixel), moving, still)

@@ -24,7 +24,8 @@ from cflow_torch.verified.visibility import RangeImages
 _STEP, _REACH = 0.1, 3  # metres per sweep interval between velocities; steps to the fastest one
 _FASTEST = 0.25  # metres per interval: what is best at a velocity beyond may be a shadow that is faster still
 _CELL = 0.3  # metres; won and lost are summed over 3 x 3 cells
-_SEED_Z, _SEED_WON = 6, 12  # standard deviations of noise, and slices, that such a square must show
+_SEED_Z = 6  # standard deviations of noise that such a square must show
+_LEAST_WON = 4  # slices; fewer are not looked at
 _Z = 4.0  # standard deviations of noise that a group as a whole is granted
 _UPRIGHT = 3  # height slices that it must have: rings of beams on a bonnet or a roof move as well
 
@@ -80,7 +81,7 @@ class _Ways(NamedTuple):
 
 def find_local_motion(
     objects: Objects, motion: Tensor, levels: List[VerifiedLevel], sweeps: HeightSlicedSweeps
-) -> Tuple[Objects, Tensor]:
+) -> Tuple[Objects, Tensor, Tensor]:
     """Groups of pixels that move within objects that stand, of windows with history.
 
     Args:
@@ -90,7 +91,8 @@ def find_local_motion(
         sweeps: finest images, P occupied pixels.
 
     Returns:
-        The objects with the groups taken out of them as objects of their own, and the motion of all.
+        The objects with the groups taken out of them as objects of their own; the motion of all; and (P,) float64, the z
+        of the best velocity around each pixel: where something stands, how likely that is wrong. 0 without history.
 
     Convention:
         Velocities are whole steps of 0.1 m per interval, at most 0.3 m long, in raster order; of equals the first. What
@@ -102,12 +104,17 @@ def find_local_motion(
     has_history = ((sweeps.elapsed != 0).sum(1) > 1).index_select(0, sweeps.window)
     members = flat_nonzero(at_rest & has_history)
     if members.numel() == 0:
-        return objects, motion
+        return objects, motion, torch.zeros_like(sweeps.row, dtype=torch.float64)
     velocities = _velocities(sweeps)
     ways, found = _look(sweeps, members)
     best, z = _best_velocity(sweeps, ways, found, velocities)
-    if not bool((z > 0).any()):
-        return objects, motion
+    side, rows, cols = _shape(sweeps)
+    doubt = z.view(-1).index_select(
+        0, (sweeps.window * rows + divide(sweeps.row, side)) * cols + divide(sweeps.col, side)
+    )
+    z = z.masked_fill(z < _SEED_Z, 0.0)
+    if not bool(z.any()):
+        return objects, motion, doubt
     group, of_group = _groups(sweeps, ways, found, velocities, best, z)
     count = of_group.numel()
     candidates = velocities.index_select(0, of_group)[:, None]
@@ -118,7 +125,7 @@ def find_local_motion(
     of_component[objects.component] = motion
     of_component[num_components:] = candidates[:, 0]
     objects = objects.split(group, moves, num_components)
-    return objects, of_component.index_select(0, objects.component)
+    return objects, of_component.index_select(0, objects.component), doubt
 
 
 def _wins_of_groups(ways: _Ways, found: _Looks, group: Tensor, motion: Tensor) -> Tuple[Tensor, Tensor]:
@@ -225,7 +232,7 @@ def _shape(sweeps: HeightSlicedSweeps) -> Tuple[int, int, int]:
 
 
 def _best_velocity(sweeps: HeightSlicedSweeps, ways: _Ways, found: _Looks, velocities: Tensor) -> Tuple[Tensor, Tensor]:
-    """Of each cell, (B, rows, cols): the velocity of the best seed within a cell of it, int64, and its z, 0 = none."""
+    """Of each cell, (B, rows, cols): the best velocity within a cell of it, int64, and its z, 0 = none is believed."""
     side, rows, cols = _shape(sweeps)
     shape = (sweeps.num_windows, rows, cols)
     best_z = torch.zeros(shape, dtype=torch.float64, device=velocities.device).view(-1)
@@ -240,20 +247,18 @@ def _best_velocity(sweeps: HeightSlicedSweeps, ways: _Ways, found: _Looks, veloc
         sums.view(-1).index_add_(0, (window * (rows + 2) + row + 1) * (cols + 2) + col + 1, counts)
         sums = sums[:, :-2] + sums[:, 1:-1] + sums[:, 2:]
         sums = (sums[:, :, :-2] + sums[:, :, 1:-1] + sums[:, :, 2:]).view(-1)
-        at = flat_nonzero(sums >= _SEED_WON << 16)
+        at = flat_nonzero(sums >= _LEAST_WON << 16)
         sums = sums.index_select(0, at)
         won, lost = (sums >> 16).double(), (sums & 0xFFFF).double()
-        surplus, noise = won - lost, won + lost
-        is_seed = (surplus > 0) & (surplus * surplus >= _SEED_Z**2 * noise)
-        z = torch.where(is_seed, surplus / torch.sqrt(noise), torch.zeros_like(won))
+        z = (won - lost) / torch.sqrt(won + lost)
         better = flat_nonzero(z > best_z.index_select(0, at))
         best_z.index_copy_(0, at.index_select(0, better), z.index_select(0, better))
         best.index_fill_(0, at.index_select(0, better), index)
     is_wanted = _is_of_walker(sweeps, velocities).gather(1, best.view(sweeps.num_windows, -1)).view(-1)
     best_z = best_z.masked_fill(~is_wanted, 0.0).view(sweeps.num_windows, 1, rows, cols)
-    spread, place = F.max_pool2d(best_z, 3, 1, 1, return_indices=True)
+    around, place = F.max_pool2d(best_z, 3, 1, 1, return_indices=True)
     best = best.view(sweeps.num_windows, -1).gather(1, place.view(sweeps.num_windows, -1))
-    return best.view(shape), spread.view(shape)
+    return best.view(shape), around.view(shape)
 
 
 def _groups(

@@ -116,16 +116,17 @@ class VerifiedFlow(SceneFlowModel):
             objects, motion = _select(levels)
             if config.num_future > 0:
                 motion = best_nearby(sweeps, objects, motion, config)
+        doubt = torch.zeros_like(sweeps.row, dtype=torch.float64)
         if config.thorough and is_first:
             with stage("local"):
-                objects, motion = find_local_motion(objects, motion, levels, sweeps)
+                objects, motion, doubt = find_local_motion(objects, motion, levels, sweeps)
         with stage("register"):
             rigid, seen = refine(objects, motion, levels, sweeps) if config.thorough else as_found(motion, sweeps)
         with stage("confidence"):
             margin = margin_of(sweeps, objects, seen)
             is_certain = margin > 0
             rigid, seen = rigid.only(is_certain), seen.only(is_certain)
-            confidence = confidence_of(sweeps, objects, seen, margin)
+            confidence = confidence_of(sweeps, objects, seen, margin, doubt)
             is_numbered = config.thorough or config.num_future > 0
             return motion_by_pixel(objects, rigid, levels[-1].score, confidence, sweeps, is_numbered)
 
