@@ -72,7 +72,8 @@ class Case:
 def long_side(seed: int) -> Case:
     """The aperture problem: the side of a tram looks the same a metre further on."""
     staged = failure_drives.tram(seed)
-    attempts = [_flow(staged.drive, "paper"), _flow(staged.drive, "paper", num_history=4)]
+    ways = (("default", 0), ("paper", 0), ("paper", 4), ("offline", 0), ("default", 4))
+    attempts = [_flow(staged.drive, preset, num_history=number) for preset, number in ways]
     return _staged_case(staged._replace(title="a long side seen in two sweeps"), attempts)
 
 
