@@ -219,5 +219,6 @@ def _batch(positions: torch.Tensor, image: torch.Tensor, elapsed: torch.Tensor) 
         num_steps=elapsed.shape[1],
         elapsed=elapsed,
         seconds=elapsed * 0.1,
+        origin=torch.zeros((*elapsed.shape, 3), dtype=torch.float64),
         sources=(),
     )

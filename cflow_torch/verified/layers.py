@@ -22,6 +22,7 @@ from cflow_torch.windows.collation import Batch
 _CELL = 0.4  # metres, side of a cell; it is as high as a slice
 _NUM_SLICES = 1 << 12  # from the lowest cell of a window on; what lies higher counts as one slice
 _GROUND = 4.0  # metres: the lowest cell of the nine squares of this side around stands on the ground
+_GAP = 3  # slices, at least, from a cell to the next one above it: less lies between the body of a car and its roof
 # What moves on the ground, in slices: it begins at most this far above it, and is neither flat nor taller than a bus.
 _HIGHEST_FOOT, _SMALLEST, _LARGEST = 2, 1, 10
 # Half of the 26 neighbours, (down, right, up); the other half is the same links seen from the other side.
@@ -68,7 +69,7 @@ def points_of_lower_layers(sweeps: HeightSlicedSweeps, at_rest: Tensor) -> Tenso
 
     Convention:
         Cells of 0.4 m x 0.4 m x 0.5 m join with their 26 neighbours. A component lies under another one where that has
-        the next occupied cell above it in any column.
+        the next occupied cell above it in any column, with two empty ones at least between them.
 
     Cost: linear in the points; 13 look-ups for each cell, a few rounds of union-find.
     """
@@ -77,7 +78,8 @@ def points_of_lower_layers(sweeps: HeightSlicedSweeps, at_rest: Tensor) -> Tenso
     component = _join(cells)
     count = cells.key.numel()
     column, height = split_index(cells.key, _NUM_SLICES)
-    is_pair = flat_nonzero((column[1:] == column[:-1]) & (component[1:] != component[:-1]))
+    is_above = (height[1:] - height[:-1] >= _GAP) & (component[1:] != component[:-1])
+    is_pair = flat_nonzero(is_above & (column[1:] == column[:-1]))
     is_under, is_over = (
         torch.zeros(count, dtype=torch.bool, device=rows.device).index_fill_(0, component.index_select(0, at), True)
         for at in (is_pair, is_pair + 1)

@@ -91,8 +91,8 @@ def find_local_motion(
         sweeps: finest images, P occupied pixels.
 
     Returns:
-        The objects with the groups taken out of them as objects of their own; the motion of all; and (P,) float64, the z
-        of the best velocity around each pixel: where something stands, how likely that is wrong. 0 without history.
+        The objects with the groups taken out of them as objects of their own; the motion of all; and (P,) float64, z of
+        the best velocity around each pixel: where something stands, how likely that is wrong. 0 without history.
 
     Convention:
         Velocities are whole steps of 0.1 m per interval, at most 0.3 m long, in raster order; of equals the first. What

@@ -79,7 +79,8 @@ def count_wins(
 
     Convention:
         A pixel is taken by floor(k f + 0.5) pixels, elementwise float64; k = elapsed intervals, negative from t+1 into
-        the past. What it meets counts whatever component it is of. Sweeps that a window lacks are empty: no counts.
+        the past. What it meets counts whatever component it is of. A place outside the image has nothing, nor has any
+        of the pixels around it. Sweeps that a window lacks are empty: no counts.
         Fewer than 2^31 slices of a component may be compared.
 
     Cost: P (S - 1) C look-ups at most, of the pixels of tested components only.

@@ -9,6 +9,7 @@ from typing import Any, Dict, List, Sequence, Tuple
 
 import cflow_torch
 from oracle.height_slices import Pixel, SlicedSweeps, Vector, count
+from oracle.paired_test import count_wins
 
 FILE = Path(cflow_torch.__file__).parent / "verified" / "confidence.json"
 TABLE: Dict[str, Any] = json.loads(FILE.read_text(encoding="utf-8"))
@@ -65,25 +66,30 @@ def neighbourhoods(
 
 
 def margin_bin(sweeps: SlicedSweeps, members: Sequence[Pixel], motion: Vector) -> int:
-    """Bin of what an object's motion loses by being displaced by 0.4 m per interval, the best of four ways."""
+    """Bin of what an object's motion loses by being displaced by 0.4 m per interval, the best of four ways.
+
+    In standard deviations of what it finds: what it has more than standing still, and what is found where it stands.
+    0 for what stands still.
+    """
+    if not any(motion):
+        return 0
     off = DISPLACEMENT / sweeps.pixel_size
-    found, *displaced = (
-        found_again(sweeps, members, (motion[0] + y, motion[1] + x))
+    counts = [
+        count_wins(sweeps, members, (motion[0] + y, motion[1] + x))
         for y, x in ((0.0, 0.0), (off, 0.0), (-off, 0.0), (0.0, off), (0.0, -off))
-    )
-    gain = found - max(displaced)
+    ]
+    surplus, *displaced = (won - lost for won, lost in counts)
+    gain, found = surplus - max(displaced), surplus + found_where_it_stands(sweeps, members)
     return sum(gain > 0 and gain**2 >= bound**2 * found for bound in TABLE["margin"])
 
 
-def found_again(sweeps: SlicedSweeps, members: Sequence[Pixel], motion: Vector) -> int:
-    """Slices of an object that another sweep has where the motion takes them: m looks at t+1 and t+1 at m."""
-    found = 0
-    for m, r, c in members:
-        for other in [0] if m > 0 else range(1, len(sweeps.images)):
-            k = sweeps.elapsed[m] - sweeps.elapsed[other]
-            dy, dx = (math.floor(f * k + 0.5) for f in motion)
-            found += count(sweeps.at(m, r, c) & sweeps.at(other, r + dy, c + dx))
-    return found
+def found_where_it_stands(sweeps: SlicedSweeps, members: Sequence[Pixel]) -> int:
+    """Slices of an object that another sweep has at the same place: m looks at t+1 and t+1 at m."""
+    return sum(
+        count(sweeps.at(m, r, c) & sweeps.at(other, r, c))
+        for m, r, c in members
+        for other in ([0] if m > 0 else range(1, len(sweeps.images)))
+    )
 
 
 def table_place(kind: str, bin_of_kind: int, has_history: bool = False, is_far: bool = False) -> int:
