@@ -184,10 +184,11 @@ def look(
             best_nearby(sweeps, [pixel for pixel, owner in object_of.items() if owner == i], motion, config)
             for i, motion in enumerate(motions)
         ]
+    doubt: Dict[Pixel, float] = {}
     if config.thorough and seen is not None and len(clouds) > 2:  # with history nothing creeps
         in_sight = [cloud.points[keep] for cloud, keep in zip(clouds, seen)]
         origins = [cloud.origin for cloud in clouds]
-        object_of, motions = find_local_motion(sweeps, object_of, motions, points, in_sight, origins, config)
+        object_of, motions, doubt = find_local_motion(sweeps, object_of, motions, points, in_sight, origins, config)
         may_creep = [False] * len(motions)
     rigid, shown = settle(sweeps, motions, may_creep, object_of, points, config, times)
     for i, motion in enumerate(shown):
@@ -195,7 +196,7 @@ def look(
         if margin_bin(sweeps, members, (motion.flow[1] / size, motion.flow[0] / size)) == 0:
             rigid[i] = rigid[i]._replace(flow=(0.0, 0.0), turn=0.0)
             shown[i] = shown[i]._replace(flow=(0.0, 0.0), turn=0.0)
-    trust, of_left_out = confidences(sweeps, object_of, [motion.flow for motion in shown])
+    trust, of_left_out = confidences(sweeps, object_of, [motion.flow for motion in shown], doubt)
 
     owners = [np.full(len(cloud.points), -1, dtype=np.int64) for cloud in clouds]
     score_of = dict(zip(sweeps.pixels(), levels[-1].scores))
