@@ -221,7 +221,8 @@ def _groups(
         velocity: (H,) int64 of each group.
     """
     side, rows, cols = _shape(sweeps)
-    height, width, num_pixels = sweeps.grid.height, sweeps.grid.width, sweeps.pixel.numel()
+    # One more row and column, which are empty: the last pixel of a row is not beside the first one of the next.
+    height, width, num_pixels = sweeps.grid.height, sweeps.grid.width + 1, sweeps.pixel.numel()
     window = sweeps.window.index_select(0, found.pixel)
     occupied = flat_nonzero(z > 0)
     component = torch.full((z.numel(),), -1, dtype=torch.int64, device=z.device)
@@ -235,7 +236,7 @@ def _groups(
         cell = cell.index_select(0, near)
         won, lost = _wins(sweeps, some, velocities[index])
         # Fine place at t+1, by look; its 3 x 3 pixels together.
-        fine = _cell(sweeps, some, velocities[index], 1, width) + window.index_select(0, near) * (height * width)
+        fine = _cell(sweeps, some, velocities[index], 1, width) + window.index_select(0, near) * ((height + 1) * width)
         places, fine = torch.unique(fine, return_inverse=True)
         gain = torch.zeros(places.numel() + 1, dtype=torch.int64, device=z.device)
         gain.index_add_(0, fine, won.long() - lost.long())
