@@ -111,7 +111,10 @@ def _is_of_walker(sweeps: HeightSlicedSweeps, velocities: Tensor) -> Tensor:
     size = sweeps.grid.pixel_size
     of_sensor = -sweeps.batch.origin[:, 1, :2].flip(1) / (sweeps.elapsed[:, 1] * size)[:, None]
     off = torch.linalg.vector_norm(velocities - of_sensor[:, None], dim=2)
-    return (off > 1.05 * _STEP / size) & (torch.linalg.vector_norm(velocities, dim=1) * size < _FASTEST)
+    stands = torch.linalg.vector_norm(of_sensor, dim=1) * size < _STEP / 2
+    return ((off > 1.05 * _STEP / size) | stands[:, None]) & (
+        torch.linalg.vector_norm(velocities, dim=1) * size < _FASTEST
+    )
 
 
 def _cell(sweeps: HeightSlicedSweeps, some: Looks, velocity: Tensor, seeds: _Best) -> Tensor:

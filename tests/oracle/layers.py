@@ -33,8 +33,9 @@ def points_of_lower_layers(
         Of each sweep (N,) bool.
 
     Convention: components of cells that touch, corners included, all sweeps together. The next occupied cell above a
-        cell of a lower layer, if it is of another component and two cells at least are empty between, is above it; nothing of another component is the next
-        below one. Its lowest cell over the ground and its height are those of something that moves on the ground.
+        cell of a lower layer is above it if it is of another component and two cells at least are empty between them;
+        nothing of another component is the next below one. Its lowest cell over the ground and its height are those of
+        something that moves on the ground.
     """
     x0, y0 = config.point_cloud_range[:2]
     cell_of: Dict[Tuple[int, int], Cell] = {}  # by sweep and row

@@ -177,7 +177,8 @@ def best_velocity(
 
     def is_believed(velocity: Vector) -> bool:
         off = math.hypot(velocity[0] - sensor[0], velocity[1] - sensor[1])
-        return off > 1.05 * STEP / size and math.hypot(*velocity) * size < FASTEST
+        stands = math.hypot(*sensor) * size < STEP / 2
+        return (off > 1.05 * STEP / size or stands) and math.hypot(*velocity) * size < FASTEST
 
     own = {cell: found for cell, found in own.items() if is_believed(velocities[found[0]])}
     result: Dict[Cell, Tuple[int, float]] = {}

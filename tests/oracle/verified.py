@@ -191,12 +191,11 @@ def look(
         object_of, motions, doubt = find_local_motion(sweeps, object_of, motions, points, in_sight, origins, config)
         may_creep = [False] * len(motions)
     rigid, shown = settle(sweeps, motions, may_creep, object_of, points, config, times)
+    trust, of_left_out = confidences(sweeps, object_of, [motion.flow for motion in shown], doubt)
     for i, motion in enumerate(shown):
         members = [pixel for pixel, owner in object_of.items() if owner == i]
         if margin_bin(sweeps, members, (motion.flow[1] / size, motion.flow[0] / size)) == 0:
             rigid[i] = rigid[i]._replace(flow=(0.0, 0.0), turn=0.0)
-            shown[i] = shown[i]._replace(flow=(0.0, 0.0), turn=0.0)
-    trust, of_left_out = confidences(sweeps, object_of, [motion.flow for motion in shown], doubt)
 
     owners = [np.full(len(cloud.points), -1, dtype=np.int64) for cloud in clouds]
     score_of = dict(zip(sweeps.pixels(), levels[-1].scores))
