@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Dict, List, Optional, Sequence, Tuple
+from typing import Dict, Sequence
 
 import numpy as np
 import torch
 from moving_scenes import for_oracle
 from oracle import local_motion as oracle
-from oracle.height_slices import Pixel, Vector
-from scenes import pose, reordered, sweeps_of
+from oracle.height_slices import Pixel
+from scenes import pose, sweeps_of
 
 from cflow_torch import Sweep, Window
 from cflow_torch.config import VerifiedConfig
