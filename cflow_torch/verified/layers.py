@@ -49,7 +49,8 @@ def points_at_rest(sweeps: HeightSlicedSweeps, found: TurningMotion) -> Tensor:
     """(N,) bool: points of all sweeps that take part and that nothing moved so far."""
     moves = (found.flow != 0).any(1) | (found.turn != 0)
     takes_part = sweeps.batch.takes_part & (sweeps.place < sweeps.image.numel() - 1)
-    return takes_part & ~moves.index_select(0, found.cluster(slice(None)))
+    # By the pixel: points of t in the margin of the images have no result, but they may move.
+    return takes_part & ~moves.index_select(0, found.of_place.index_select(0, sweeps.place))
 
 
 def join_moving(first: TurningMotion, second: TurningMotion, batch: Batch) -> TurningMotion:

@@ -76,9 +76,8 @@ def by_pixel(objects: Objects, motion: torch.Tensor, sweeps: HeightSlicedSweeps,
 def expected(objects: Objects, motion: torch.Tensor, sweeps: HeightSlicedSweeps, window: int, settings):
     batch, before = sweeps.batch, for_oracle(sweeps, window)
     steps = [step for step, k in enumerate(sweeps.elapsed[window].tolist()) if step == 0 or k != 0]
-    clouds = []
-    for step in steps:
-        clouds.append(batch.positions[:, (batch.image == window * batch.num_steps + step) & batch.takes_part].T.numpy())
+    images = [window * batch.num_steps + step for step in steps]
+    clouds = [batch.positions[:, (batch.image == image) & batch.takes_part].T.numpy() for image in images]
     origins = [batch.origin[window, step].tolist() for step in steps]
     object_of, motions = by_pixel(objects, motion, sweeps, window)
     return oracle.find_local_motion(before, object_of, motions, clouds, clouds, origins, settings)
