@@ -20,7 +20,7 @@ from oracle.height_slices import Pixel, SlicedSweeps, Vector, slice_image
 from oracle.layers import points_of_lower_layers
 from oracle.local_motion import find_local_motion
 from oracle.offline import Estimate, best_nearby, by_side
-from oracle.paired_test import best_candidate, count_wins, evidence_of
+from oracle.paired_test import best_candidate, count_wins, evidence_of, is_found_where_it_stands
 from oracle.pixels import in_range, project_bev
 from oracle.refinement import settle
 from oracle.rigid_registration import RigidMotion
@@ -256,6 +256,8 @@ def verify_level(
             slides = slides_along_itself(sweeps, members, found)
             values = [0 if slid else value for slid, value in zip(slides, values)]
         motion, most = best_candidate(values, found)
+        if is_found_where_it_stands(sweeps, members, motion):
+            motion, most = (0.0, 0.0), 0
         motions.append(motion)
         evidence.append(most)
     return VerifiedLevel(level, motions, evidence, list(scores.values()))

@@ -153,3 +153,18 @@ def test_much_evidence_is_told_apart():
     evidence = torch.tensor([[2**36 - 2, 2**36 - 1, 2**36 - 1], [1, 0, 2**36 - 1]])
     motion, most = fast.best_candidate(evidence, torch.arange(12, dtype=torch.float64).view(2, 3, 2))
     assert motion.tolist() == [[2.0, 3.0], [10.0, 11.0]] and most.tolist() == [2**36 - 1] * 2
+
+
+def test_a_wall_is_still_where_it_stood_and_a_car_is_not():
+    # By six pixels: all that is left of the wall, all but its first six columns of the car.
+    wall = np.concatenate((row(*range(2, 22)), row(*range(2, 22))), 1)
+    car = np.concatenate((row(*range(8, 20)), row(*range(2, 14))), 1)
+    for images, stands in ((wall, True), (car, False)):
+        sweeps, motion = from_images(images), torch.tensor([[0.0, 6.0]], dtype=torch.float64)
+        assert fast.is_found_where_it_stands(sweeps, torch.zeros_like(sweeps.pixel), motion).tolist() == [stands]
+        of_loop = for_oracle(sweeps, 0)
+        assert oracle.is_found_where_it_stands(of_loop, of_loop.pixels(), (0.0, 6.0)) == stands
+    # A motion of three pixels is not asked about.
+    sweeps = from_images(wall)
+    short = torch.tensor([[0.0, 3.0]], dtype=torch.float64)
+    assert fast.is_found_where_it_stands(sweeps, torch.zeros_like(sweeps.pixel), short).tolist() == [False]
