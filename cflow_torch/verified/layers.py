@@ -49,7 +49,8 @@ def points_at_rest(sweeps: HeightSlicedSweeps, found: TurningMotion) -> Tensor:
     """(N,) bool: points of all sweeps that take part and that nothing moved so far."""
     moves = (found.flow != 0).any(1) | (found.turn != 0)
     takes_part = sweeps.batch.takes_part & (sweeps.place < sweeps.image.numel() - 1)
-    return takes_part & ~moves.index_select(0, found.cluster(slice(None)))
+    # By the pixel: points of t in the margin of the images have no result, but they may move.
+    return takes_part & ~moves.index_select(0, found.of_place.index_select(0, sweeps.place))
 
 
 def join_moving(first: TurningMotion, second: TurningMotion, batch: Batch) -> TurningMotion:
@@ -97,7 +98,8 @@ def _cells(sweeps: HeightSlicedSweeps, rows: Tensor) -> Cells:
     num_rows, num_cols = (int((grid.upper[axis] - grid.lower[axis]) / _CELL) + 1 for axis in (1, 0))
     x, y, z = batch.positions.index_select(1, rows).unbind(0)
     window = divide(batch.image.index_select(0, rows).long(), batch.num_steps)
-    row, col = ((values - low).div_(_CELL).long() for values, low in ((y, grid.lower[1]), (x, grid.lower[0])))
+    size = torch.full((), _CELL, dtype=x.dtype, device=x.device)  # see `Grid.pixel`
+    row, col = ((values - low).div_(size).long() for values, low in ((y, grid.lower[1]), (x, grid.lower[0])))
     height = (z / SLICE_HEIGHT).floor_().clamp_(-(2.0**40), 2.0**40).long()
     lowest = segment_amin(height, window, batch.num_windows, 1 << 41)
     height = (height - lowest.index_select(0, window)).clamp_(max=_NUM_SLICES - 1)

@@ -1,13 +1,11 @@
 """Local motion: slow walkers beside a wall, in a hedge, in a crowd move within a component that stands.
 
 With history a walker leaves its place by several pixels, and a paired test on its own pixels shows it. What stood still
-so far is tested at a grid of small velocities, all at once, over squares as wide as a walker. A place that some sweep
-could not see says nothing there: else shadows that pass over a wall would move it.
+so far is tested at a grid of small velocities, all at once, over squares as wide as a walker.
 """
 
 from __future__ import annotations
 
-import math
 from typing import List, NamedTuple, Tuple
 
 import torch
@@ -17,66 +15,42 @@ from torch import Tensor
 from cflow_torch.ops.indices import divide, flat_nonzero
 from cflow_torch.ops.labeling import connected_components
 from cflow_torch.verified.component_tree import Objects
-from cflow_torch.verified.height_slices import NUM_SLICES, SLICE_HEIGHT, HeightSlicedSweeps, count_slices
-from cflow_torch.verified.paired_test import VerifiedLevel, evidence_of, looks
-from cflow_torch.verified.visibility import RangeImages
+from cflow_torch.verified.height_slices import NUM_SLICES, HeightSlicedSweeps
+from cflow_torch.verified.local_evidence import Looks, at_newest, look, wins
+from cflow_torch.verified.paired_test import VerifiedLevel, evidence_of
 
 _STEP, _REACH = 0.1, 3  # metres per sweep interval between velocities; steps to the fastest one
 _FASTEST = 0.25  # metres per interval: what is best at a velocity beyond may be a shadow that is faster still
 _CELL = 0.3  # metres; won and lost are summed over 3 x 3 cells
 _SEED_Z = 6  # standard deviations of noise that such a square must show
-_LEAST_WON = 4  # slices; fewer are not looked at
+_LEAST_WON = 4  # slices; a square that wins fewer is not looked at
 _Z = 4.0  # standard deviations of noise that a group as a whole is granted
+_LOW = (1 << 32) - 1  # the lower half of a number that holds two counts
 _UPRIGHT = 3  # height slices that it must have: rings of beams on a bonnet or a roof move as well
 
 
-class _Looks(NamedTuple):
-    """L looks of pixels into other sweeps, as `looks` gives them, with what they find where the pixel stands.
+class _Best(NamedTuple):
+    """What moves where at t+1, by cells of all windows.
 
     Args:
-        pixel: (L,) int64.
-        way: (L,) int64, from which sweep to which: an index into the times of `_Ways`.
-        start: (L,) int64, where the pixel stands in the other sweep, an index into the image of `_Ways`.
-        own, here: (L,) uint8, slices of the pixel; those of them that are found, or cannot be seen, where it stands.
-        found: (L,) uint8, those that are found.
+        side: finest pixels a side of a cell.
+        best: (B, rows, cols) int64, number of the best velocity, -1 = none.
+        z: (B, rows, cols) float64, its surplus in standard deviations of noise; 0 = none.
     """
 
-    pixel: Tensor
-    way: Tensor
-    start: Tensor
-    own: Tensor
-    here: Tensor
-    found: Tensor
+    side: int
+    best: Tensor
+    z: Tensor
 
-    def take(self, wanted: Tensor) -> _Looks:
-        """Some of them, (K,) int64."""
-        return _Looks(*(values.index_select(0, wanted) for values in self))
+    def at(self, window: Tensor, row: Tensor, col: Tensor) -> Tensor:
+        """(P,) float64: z at pixels, (P,) int64 each."""
+        _, rows, cols = self.z.shape
+        cell = (window * rows + divide(row, self.side)) * cols + divide(col, self.side)
+        return self.z.view(-1).index_select(0, cell)
 
-
-class _Ways(NamedTuple):
-    """From which sweep to which looks go, and images with a free margin, so that no look leaves them.
-
-    Args:
-        k: (B * 2 S,) float64, sweep intervals from an older sweep m to t+1 (m = 0 ... S - 1), then from t+1 to m.
-        to_newest: (B * 2 S,) float64, sweep intervals from the looking sweep to t+1.
-        image: flat uint8, slices of all sweeps.
-        width: pixels a row of it.
-    """
-
-    k: Tensor
-    to_newest: Tensor
-    image: Tensor
-    width: int
-
-    def offsets(self, velocity: Tensor) -> Tensor:
-        """(B * 2 S,) int64, how far a velocity, (2,) float64, takes pixels in `image`."""
-        down, right = (torch.floor(self.k * v + 0.5).long() for v in velocity)
-        return down * self.width + right
-
-    def wins(self, some: _Looks, offset: Tensor) -> Tuple[Tensor, Tensor]:
-        """(L,) uint8 each: slices that are won and lost where each look, (L,) int64, is taken."""
-        there = some.own & self.image.index_select(0, some.start + offset)
-        return there & ~some.here, some.found & ~there
+    def only(self, wanted: Tensor) -> _Best:
+        """Those of some cells, (B, rows, cols) bool."""
+        return _Best(self.side, self.best.masked_fill(~wanted, -1), self.z.masked_fill(~wanted, 0.0))
 
 
 def find_local_motion(
@@ -106,48 +80,20 @@ def find_local_motion(
     if members.numel() == 0:
         return objects, motion, torch.zeros_like(sweeps.row, dtype=torch.float64)
     velocities = _velocities(sweeps)
-    ways, found = _look(sweeps, members)
-    best, z = _best_velocity(sweeps, ways, found, velocities)
-    side, rows, cols = _shape(sweeps)
-    doubt = z.view(-1).index_select(
-        0, (sweeps.window * rows + divide(sweeps.row, side)) * cols + divide(sweeps.col, side)
-    )
-    z = z.masked_fill(z < _SEED_Z, 0.0)
-    if not bool(z.any()):
+    found = look(sweeps, members)
+    around = _find_best(sweeps, found, velocities)
+    doubt = around.at(sweeps.window, sweeps.row, sweeps.col)
+    seeds = around.only(around.z >= _SEED_Z)
+    if not bool((seeds.best >= 0).any()):
         return objects, motion, doubt
-    group, of_group = _groups(sweeps, ways, found, velocities, best, z)
-    count = of_group.numel()
-    candidates = velocities.index_select(0, of_group)[:, None]
-    won, lost = _wins_of_groups(ways, found, group, candidates[:, 0])
-    moves = (evidence_of(won, lost, _Z) > 0) & (_num_slices(sweeps, group, count) >= _UPRIGHT)
+    group, of_group = _groups(sweeps, found, velocities, seeds)
+    candidates = velocities.index_select(0, of_group)
+    won, lost = _wins_of_groups(sweeps, found, group, candidates)
+    moves = (evidence_of(won, lost, _Z) > 0) & (_num_slices(sweeps, group, len(candidates)) >= _UPRIGHT)
     num_components = sum(level.level.num_components for level in levels)
-    of_component = motion.new_zeros((num_components + count, 2))
-    of_component[objects.component] = motion
-    of_component[num_components:] = candidates[:, 0]
+    of_component = F.pad(candidates, (0, 0, num_components, 0)).index_copy_(0, objects.component, motion)
     objects = objects.split(group, moves, num_components)
     return objects, of_component.index_select(0, objects.component), doubt
-
-
-def _wins_of_groups(ways: _Ways, found: _Looks, group: Tensor, motion: Tensor) -> Tuple[Tensor, Tensor]:
-    """(H,) int64 each: what groups of pixels, (P,) int64, win and lose by their motions, (H, 2) float64."""
-    own = group.index_select(0, found.pixel)
-    member = flat_nonzero(own < len(motion))
-    some, own = found.take(member), own.index_select(0, member)
-    k = ways.k.index_select(0, some.way)
-    down, right = (torch.floor(k * v.index_select(0, own) + 0.5).long() for v in motion.unbind(1))
-    zeros = torch.zeros_like(motion[:, 0], dtype=torch.int64)
-    won, lost = (
-        zeros.index_add(0, own, count_slices(slices).long()) for slices in ways.wins(some, down * ways.width + right)
-    )
-    return won, lost
-
-
-def _num_slices(sweeps: HeightSlicedSweeps, group: Tensor, count: int) -> Tensor:
-    """(H,) int64: height slices of each of `count` groups of pixels, (P,) int64."""
-    has = torch.zeros((NUM_SLICES, count + 1), dtype=torch.bool, device=group.device)
-    for index, of_slice in enumerate(has):
-        of_slice.index_fill_(0, group.index_select(0, flat_nonzero((sweeps.slices & (1 << index)).bool())), True)
-    return has.sum(0)[:count]
 
 
 def _velocities(sweeps: HeightSlicedSweeps) -> Tensor:
@@ -165,142 +111,127 @@ def _is_of_walker(sweeps: HeightSlicedSweeps, velocities: Tensor) -> Tensor:
     size = sweeps.grid.pixel_size
     of_sensor = -sweeps.batch.origin[:, 1, :2].flip(1) / (sweeps.elapsed[:, 1] * size)[:, None]
     off = torch.linalg.vector_norm(velocities - of_sensor[:, None], dim=2)
-    return (off > 1.05 * _STEP / size) & (torch.linalg.vector_norm(velocities, dim=1) * size < _FASTEST)
-
-
-def _look(sweeps: HeightSlicedSweeps, members: Tensor) -> Tuple[_Ways, _Looks]:
-    """What pixels, (K,) int64, find where they stand."""
-    num_steps, elapsed, grid = sweeps.num_steps, sweeps.elapsed, sweeps.grid
-    longest = float(elapsed.abs().amax()) * _REACH * _STEP / grid.pixel_size
-    margin = math.ceil(longest) + 1
-    image = sweeps.image[:-1].view(-1, grid.height, grid.width)
-    image = F.pad(image, (margin, margin, margin, margin))
-    ways = _Ways(
-        torch.cat((elapsed, -elapsed), 1).view(-1),
-        torch.cat((elapsed, torch.zeros_like(elapsed)), 1).view(-1),
-        image.view(-1),
-        image.shape[2],
+    stands = torch.linalg.vector_norm(of_sensor, dim=1) * size < _STEP / 2
+    return ((off > 1.05 * _STEP / size) | stands[:, None]) & (
+        torch.linalg.vector_norm(velocities, dim=1) * size < _FASTEST
     )
 
-    pixel, other = looks(sweeps, members)
-    window, step = (values.index_select(0, pixel) for values in (sweeps.window, sweeps.step))
-    way = window * (2 * num_steps) + torch.where(step > 0, step, num_steps + other)
-    exists = flat_nonzero(ways.k.index_select(0, way))
-    pixel, other, window, way = (values.index_select(0, exists) for values in (pixel, other, window, way))
-    row, col = (values.index_select(0, pixel) for values in (sweeps.row, sweeps.col))
-    start = ((window * num_steps + other) * image.shape[1] + row + margin) * image.shape[2] + col + margin
-    own = sweeps.slices.index_select(0, pixel)
-    found = own & ways.image.index_select(0, start)
-    here = found | (own & _hidden_slices(sweeps, pixel, other, flat_nonzero(found != own)))
-    return ways, _Looks(pixel, way, start, own, here, found)
+
+def _cell(sweeps: HeightSlicedSweeps, some: Looks, velocity: Tensor, seeds: _Best) -> Tensor:
+    """(L,) int64: cell, counted through all windows, where a velocity, (2,) float64, takes each pixel at t+1."""
+    row, col = (divide(values, seeds.side) for values in at_newest(sweeps, some, velocity))
+    _, rows, cols = seeds.best.shape
+    return (some.window * rows + row) * cols + col
 
 
-def _hidden_slices(sweeps: HeightSlicedSweeps, pixel: Tensor, other: Tensor, asked: Tensor) -> Tensor:
-    """(L,) uint8: slices that the other sweep cannot see where the pixel of a look stands; 0 where not `asked` (K,)."""
-    pixel_size, (lower_x, lower_y) = sweeps.grid.pixel_size, sweeps.grid.lower[:2]
-    images, hidden = RangeImages(sweeps), torch.zeros_like(pixel, dtype=torch.uint8)
-    pixel, other = pixel.index_select(0, asked), other.index_select(0, asked)
-    window, row, col = (values.index_select(0, pixel) for values in (sweeps.window, sweeps.row, sweeps.col))
-    x, y = (col.double() + 0.5) * pixel_size + lower_x, (row.double() + 0.5) * pixel_size + lower_y
-    first = torch.floor(sweeps.lowest / SLICE_HEIGHT).index_select(0, pixel)
-    slices = torch.zeros_like(pixel, dtype=torch.uint8)
-    for index in range(NUM_SLICES):
-        # Of the heights that share this slice, the lowest that the pixel may have.
-        height = first + (index - first).remainder(NUM_SLICES) + 0.5
-        slices |= images.hide(window, other, x, y, height * SLICE_HEIGHT).to(torch.uint8) << index
-    return hidden.index_copy_(0, asked, slices)
+def _find_best(sweeps: HeightSlicedSweeps, found: Looks, velocities: Tensor) -> _Best:
+    """Of each cell the best velocity of the 3 x 3 cells around; of equals the first cell.
 
-
-def _landing(
-    sweeps: HeightSlicedSweeps, ways: _Ways, some: _Looks, velocity: Tensor, side: int
-) -> Tuple[Tensor, Tensor, Tensor]:
-    """(L,) int64 each: window, row and col of the cell where a velocity takes each pixel at t+1, kept in the image.
-
-    Args:
-        side: finest pixels a side of a cell.
+    What is best in a cell counts only if it is believed, see `_is_of_walker`.
     """
-    window, row, col = (values.index_select(0, some.pixel) for values in (sweeps.window, sweeps.row, sweeps.col))
-    down, right = (torch.floor(ways.to_newest * v + 0.5).long().index_select(0, some.way) for v in velocity)
-    row, col = (row + down).clamp_(0, sweeps.grid.height - 1), (col + right).clamp_(0, sweeps.grid.width - 1)
-    return window, divide(row, side), divide(col, side)
-
-
-def _shape(sweeps: HeightSlicedSweeps) -> Tuple[int, int, int]:
-    """Finest pixels a side of a cell, rows and columns of cells."""
     side = max(1, round(_CELL / sweeps.grid.pixel_size))
-    return side, -(-sweeps.grid.height // side), -(-sweeps.grid.width // side)
-
-
-def _best_velocity(sweeps: HeightSlicedSweeps, ways: _Ways, found: _Looks, velocities: Tensor) -> Tuple[Tensor, Tensor]:
-    """Of each cell, (B, rows, cols): the best velocity within a cell of it, int64, and its z, 0 = none is believed."""
-    side, rows, cols = _shape(sweeps)
-    shape = (sweeps.num_windows, rows, cols)
-    best_z = torch.zeros(shape, dtype=torch.float64, device=velocities.device).view(-1)
-    best = torch.zeros_like(best_z, dtype=torch.int64)
+    shape = (sweeps.num_windows, -(-sweeps.grid.height // side), -(-sweeps.grid.width // side))
+    own = _Best(
+        side,
+        torch.full(shape, -1, dtype=torch.int64, device=velocities.device),
+        torch.zeros(shape, dtype=torch.float64, device=velocities.device),
+    )
+    best, best_z = own.best.view(-1), own.z.view(-1)
     for index, velocity in enumerate(velocities):
-        won, lost = ways.wins(found, ways.offsets(velocity).index_select(0, found.way))
-        some = flat_nonzero((won | lost).bool())
-        window, row, col = _landing(sweeps, ways, found.take(some), velocity, side)
-        # Both counts in one number, won * 2^16 + lost, with a free margin of a cell.
-        counts = (count_slices(won.index_select(0, some)).int() << 16) + count_slices(lost.index_select(0, some))
-        sums = torch.zeros((sweeps.num_windows, rows + 2, cols + 2), dtype=torch.int32, device=counts.device)
-        sums.view(-1).index_add_(0, (window * (rows + 2) + row + 1) * (cols + 2) + col + 1, counts)
-        sums = sums[:, :-2] + sums[:, 1:-1] + sums[:, 2:]
-        sums = (sums[:, :, :-2] + sums[:, :, 1:-1] + sums[:, :, 2:]).view(-1)
-        at = flat_nonzero(sums >= _LEAST_WON << 16)
-        sums = sums.index_select(0, at)
-        won, lost = (sums >> 16).double(), (sums & 0xFFFF).double()
-        z = (won - lost) / torch.sqrt(won + lost)
-        better = flat_nonzero(z > best_z.index_select(0, at))
-        best_z.index_copy_(0, at.index_select(0, better), z.index_select(0, better))
-        best.index_fill_(0, at.index_select(0, better), index)
-    is_wanted = _is_of_walker(sweeps, velocities).gather(1, best.view(sweeps.num_windows, -1)).view(-1)
-    best_z = best_z.masked_fill(~is_wanted, 0.0).view(sweeps.num_windows, 1, rows, cols)
-    around, place = F.max_pool2d(best_z, 3, 1, 1, return_indices=True)
-    best = best.view(sweeps.num_windows, -1).gather(1, place.view(sweeps.num_windows, -1))
-    return best.view(shape), around.view(shape)
+        won, lost = wins(sweeps, found, velocity)
+        counts = (won.long() << 32) + lost  # both in one number: sums cost more than look-ups
+        says = flat_nonzero((won | lost).bool())
+        at = _cell(sweeps, found, velocity, own).index_select(0, says)
+        sums = torch.zeros_like(best).index_add_(0, at, counts.index_select(0, says))
+        sums = _sum_around(sums.view(shape)).view(-1)
+        cell = flat_nonzero(sums >= _LEAST_WON << 32)
+        sums = sums.index_select(0, cell)
+        surplus, noise = ((sums >> 32) - (sums & _LOW)).double(), ((sums >> 32) + (sums & _LOW)).double()
+        z = surplus / torch.sqrt(noise)
+        better = flat_nonzero(z > best_z.index_select(0, cell))
+        cell = cell.index_select(0, better)
+        best.index_fill_(0, cell, index)
+        best_z.index_copy_(0, cell, z.index_select(0, better))
+    cell = flat_nonzero(best >= 0)
+    window = divide(cell, shape[1] * shape[2])
+    is_believed = _is_of_walker(sweeps, velocities)[window, best.index_select(0, cell)]
+    cell = cell.index_select(0, flat_nonzero(~is_believed))
+    best.index_fill_(0, cell, -1)
+    best_z.index_fill_(0, cell, 0.0)
+    z, place = F.max_pool2d(own.z[:, None], 3, 1, 1, return_indices=True)
+    best = best.view(shape[0], -1).gather(1, place.view(shape[0], -1))
+    return _Best(side, best.view(shape), z.view(shape))
 
 
-def _groups(
-    sweeps: HeightSlicedSweeps, ways: _Ways, found: _Looks, velocities: Tensor, best: Tensor, z: Tensor
-) -> Tuple[Tensor, Tensor]:
-    """Pixels that win by the velocity of the cell that it takes them to, with the pixels around; joined cell by cell.
+def _sum_around(values: Tensor) -> Tensor:
+    """(B, rows, cols): sums of the 3 x 3 elements around each."""
+    rows = values.clone()
+    rows[:, 1:] += values[:, :-1]
+    rows[:, :-1] += values[:, 1:]
+    around = rows.clone()
+    around[:, :, 1:] += rows[:, :, :-1]
+    around[:, :, :-1] += rows[:, :, 1:]
+    return around
+
+
+def _groups(sweeps: HeightSlicedSweeps, found: Looks, velocities: Tensor, seeds: _Best) -> Tuple[Tensor, Tensor]:
+    """Pixels that win, with those around, by the velocity of the cell that it takes them to; joined cell by cell.
 
     Returns:
         group: (P,) int64 of each pixel, H = none.
         velocity: (H,) int64 of each group.
+
+    Convention: of several velocities that of largest z takes a pixel, of equals the first.
     """
-    side, rows, cols = _shape(sweeps)
-    height, width, num_pixels = sweeps.grid.height, sweeps.grid.width, sweeps.pixel.numel()
-    occupied = flat_nonzero(z > 0)
-    component = torch.full((z.numel(),), -1, dtype=torch.int64, device=z.device)
-    component[occupied] = connected_components(z > 0, occupied)
-    taken = torch.zeros(num_pixels, dtype=torch.int64, device=z.device)  # 1 + component * velocities + velocity
-    strength = torch.zeros(num_pixels, dtype=torch.float64, device=z.device)
-    for index in torch.unique(best[z > 0]).tolist():
-        window, row, col = _landing(sweeps, ways, found, velocities[index], side)
-        cell = (window * rows + row) * cols + col
-        near = flat_nonzero((best.view(-1).index_select(0, cell) == index) & (z.view(-1).index_select(0, cell) > 0))
+    best, z, count = seeds.best.view(-1), seeds.z.view(-1), len(velocities)
+    occupied = flat_nonzero(best >= 0)
+    component = torch.zeros_like(best).index_copy_(0, occupied, connected_components(seeds.best >= 0, occupied))
+    name = torch.full_like(sweeps.pixel, -1)  # component * count + velocity, -1 = none
+    strength = torch.zeros_like(name, dtype=torch.float64)
+    for index in torch.unique(best.index_select(0, occupied)).tolist():
+        cell = _cell(sweeps, found, velocities[index], seeds)
+        near = flat_nonzero(best.index_select(0, cell) == index)
         some, cell = found.take(near), cell.index_select(0, near)
-        won, lost = map(count_slices, ways.wins(some, ways.offsets(velocities[index]).index_select(0, some.way)))
-        # Fine place at t+1, by look; its 3 x 3 pixels together.
-        window, row, col = _landing(sweeps, ways, some, velocities[index], 1)
-        fine = (window * height + row) * width + col
-        places, fine = torch.unique(fine, return_inverse=True)
-        gain = torch.zeros(places.numel() + 1, dtype=torch.int64, device=z.device)
-        gain.index_add_(0, fine, won.long() - lost.long())
-        around = torch.zeros_like(gain[:-1])
-        for offset in [down * width + right for down in (-1, 0, 1) for right in (-1, 0, 1)]:
-            at = torch.searchsorted(places, places + offset).clamp_(max=places.numel() - 1)
-            around += gain.index_select(0, at) * (places.index_select(0, at) == places + offset)
-        wins = flat_nonzero((around > 0).index_select(0, fine))
-        pixel, cell = some.pixel.index_select(0, wins), cell.index_select(0, wins)
-        value = z.view(-1).index_select(0, cell)
-        better = flat_nonzero(value > strength.index_select(0, pixel))
-        pixel, cell, value = (values.index_select(0, better) for values in (pixel, cell, value))
-        strength.index_copy_(0, pixel, value)
-        taken.index_copy_(0, pixel, 1 + component.index_select(0, cell) * len(velocities) + index)
-    names, group = torch.unique(taken, return_inverse=True)
-    if int(names[0]) > 0:  # every pixel has one
-        return group, (names - 1) % len(velocities)
-    return torch.where(group == 0, names.numel() - 1, group - 1), (names[1:] - 1) % len(velocities)
+        is_stronger = z.index_select(0, cell) > strength.index_select(0, some.pixel)
+        taken = flat_nonzero(is_stronger & (_gain_around(sweeps, some, velocities[index]) > 0))
+        pixel, cell = some.pixel.index_select(0, taken), cell.index_select(0, taken)
+        # Looks of one pixel are taken to one cell: all that write at one place write the same.
+        strength.index_copy_(0, pixel, z.index_select(0, cell))
+        name.index_copy_(0, pixel, component.index_select(0, cell) * count + index)
+    names, group = torch.unique(F.pad(name, (1, 0), value=-1), return_inverse=True)  # -1 is there, the first one
+    return (group[1:] - 1).remainder_(names.numel()), names[1:] % count
+
+
+def _gain_around(sweeps: HeightSlicedSweeps, some: Looks, velocity: Tensor) -> Tensor:
+    """(L,) int64: slices that a velocity, (2,) float64, wins less those that it loses, by all looks whose pixels it
+    takes to one of the 3 x 3 pixels around that of each look at t+1."""
+    won, lost = wins(sweeps, some, velocity)
+    row, col = at_newest(sweeps, some, velocity)
+    # One more row and column, which are empty: the last pixel of a row is not beside the first one of the next.
+    height, width = sweeps.grid.height + 1, sweeps.grid.width + 1
+    place, of_look = torch.unique((some.window * height + row) * width + col, return_inverse=True)
+    gain = torch.zeros_like(place).index_add_(0, of_look, won.long() - lost.long())
+    around = torch.zeros_like(gain)
+    for offset in (down * width + right for down in (-1, 0, 1) for right in (-1, 0, 1)):
+        at = torch.searchsorted(place, place + offset).clamp_(max=place.numel() - 1)
+        around += gain.index_select(0, at) * (place.index_select(0, at) == place + offset)
+    return around.index_select(0, of_look)
+
+
+def _wins_of_groups(sweeps: HeightSlicedSweeps, found: Looks, group: Tensor, motion: Tensor) -> Tuple[Tensor, Tensor]:
+    """(H,) int64 each: what groups of pixels, (P,) int64, win and lose by their motions, (H, 2) float64."""
+    own = group.index_select(0, found.pixel)
+    member = flat_nonzero(own < len(motion))
+    some, own = found.take(member), own.index_select(0, member)
+    counts = wins(sweeps, some, motion.index_select(0, own).t())
+    zeros = torch.zeros_like(motion[:, 0], dtype=torch.int64)
+    won, lost = (zeros.index_add(0, own, count.long()) for count in counts)
+    return won, lost
+
+
+def _num_slices(sweeps: HeightSlicedSweeps, group: Tensor, count: int) -> Tensor:
+    """(H,) int64: height slices of each of `count` groups of pixels, (P,) int64."""
+    has = torch.zeros((NUM_SLICES, count + 1), dtype=torch.bool, device=group.device)
+    for index, of_slice in enumerate(has):
+        of_slice.index_fill_(0, group.index_select(0, flat_nonzero((sweeps.slices & (1 << index)).bool())), True)
+    return has.sum(0)[:count]

@@ -124,9 +124,8 @@ class VerifiedFlow(SceneFlowModel):
             rigid, seen = refine(objects, motion, levels, sweeps) if config.thorough else as_found(motion, sweeps)
         with stage("confidence"):
             margin = margin_of(sweeps, objects, seen)
-            is_certain = margin > 0
-            rigid, seen = rigid.only(is_certain), seen.only(is_certain)
             confidence = confidence_of(sweeps, objects, seen, margin, doubt)
+            rigid = rigid.only(margin > 0)
             is_numbered = config.thorough or config.num_future > 0
             return motion_by_pixel(objects, rigid, levels[-1].score, confidence, sweeps, is_numbered)
 

@@ -19,6 +19,7 @@ from cflow_torch.verified.height_slices import NUM_SLICES, HeightSlicedSweeps, c
 _LOOKS_ON_CPU = 1 << 18
 _LOOKS_ON_GPU = 1 << 24
 _FAR = 2  # pixels, in y or in x
+_FARTHER, _STILL_THERE = 4, 97  # pixels, per cent
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,9 @@ def verify(
         asked = tested & ~level.travels
         owner = torch.where(F.pad(asked, (0, 1)).index_select(0, level.component), level.component, tested.numel())
         evidence = evidence.masked_fill(slides_along_itself(sweeps, owner, motion), 0)
-    return VerifiedLevel(level, *best_candidate(evidence, motion), score)
+    best, most = best_candidate(evidence, motion)
+    stands = is_found_where_it_stands(sweeps, level.component, best)
+    return VerifiedLevel(level, best.masked_fill(stands[:, None], 0.0), most.masked_fill(stands, 0), score)
 
 
 def count_wins(
@@ -111,6 +114,35 @@ def count_wins(
         sums.index_add_(0, (of_some[:, None] * num_candidates + column).view(-1), counts.view(-1))
     sums = sums.view(count, num_candidates)
     return sums >> 32, sums & 0xFFFFFFFF
+
+
+def is_found_where_it_stands(sweeps: HeightSlicedSweeps, component: Tensor, motion: Tensor) -> Tensor:
+    """Which components have not moved as a whole, because nearly all of them is still where it was: a wall beside which
+    somebody walks.
+
+    Args:
+        sweeps: finest images and their P occupied pixels.
+        component: (P,) int64, component of each occupied pixel, M = none.
+        motion: (M, 2) float64, (y, x) finest pixels per sweep interval.
+
+    Returns:
+        (M,) bool: of the slices in looks that the motion takes at least four pixels, in y or in x, at least 97 per cent
+        are found within a pixel of where they stand. False without such looks.
+
+    Cost: a look-up for each pixel and sweep of what moves.
+    """
+    moves = motion.any(1)
+    pixel, other = looks(sweeps, flat_nonzero(F.pad(moves, (0, 1)).index_select(0, component)))
+    owner, window = component.index_select(0, pixel), sweeps.window.index_select(0, pixel)
+    k = sweeps.elapsed[window, sweeps.step.index_select(0, pixel)] - sweeps.elapsed[window, other]
+    move = (motion.index_select(0, owner) * k[:, None] + 0.5).floor_().abs().amax(1)
+    far = flat_nonzero(move >= _FARTHER)
+    pixel, other, owner, window = (values.index_select(0, far) for values in (pixel, other, owner, window))
+    row, col, own = (values.index_select(0, pixel) for values in (sweeps.row, sweeps.col, sweeps.slices))
+    near = sweeps.with_around.index_select(0, sweeps.index(window, other, row, col)) >> NUM_SLICES
+    zeros = torch.zeros_like(motion[:, 0], dtype=torch.int64)
+    total, found = (zeros.index_add(0, owner, count_slices(slices).long()) for slices in (own, own & near))
+    return (total > 0) & (100 * found >= _STILL_THERE * total)
 
 
 def looks(sweeps: HeightSlicedSweeps, member: Tensor) -> Tuple[Tensor, Tensor]:

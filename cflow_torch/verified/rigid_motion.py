@@ -79,7 +79,8 @@ class TurningMotion(Motion):
 
 
 def join(first: TurningMotion, second: TurningMotion, takes_second: Tensor, batch: Batch) -> TurningMotion:
-    """Two motions of the same points, one for each point. In a window the ids of the second follow those of the first.
+    """Two motions of the same points, one for each point. In a window the ids of the second follow those of the first,
+    in all sweeps: an object has one id wherever it is seen.
 
     Args:
         first, second: of L and M clusters; the result has L + 1 + M, since entry L stays "none" as well.
@@ -87,12 +88,11 @@ def join(first: TurningMotion, second: TurningMotion, takes_second: Tensor, batc
         batch: of these points.
     """
     count = takes_second.numel()
-    at_t = slice(batch.num_newest, batch.sources[-1].points.stop)
-    window = split_index(batch.image[at_t].long(), batch.num_steps)[0]
+    window = split_index(batch.image[:count].long(), batch.num_steps)[0]
     num_ids = torch.zeros(batch.num_windows, dtype=torch.int64, device=window.device)
-    num_ids.scatter_reduce_(0, window, 1 + first.cluster_id.index_select(0, first.cluster(at_t)), "amax")
+    num_ids.scatter_reduce_(0, window, 1 + first.cluster_id.index_select(0, first.cluster(slice(count))), "amax")
     offset = torch.zeros_like(second.cluster_id)
-    offset.scatter_(0, second.cluster(at_t).long(), num_ids.index_select(0, window))
+    offset.scatter_(0, second.cluster(slice(count)).long(), num_ids.index_select(0, window))
     ids = second.cluster_id + offset.masked_fill_(second.cluster_id < 0, 0)
     both = {
         name: torch.cat((getattr(first, name), getattr(second, name)))

@@ -7,11 +7,13 @@ vanishes and appears, as if it moved. A range image of each sweep, seen from the
 from __future__ import annotations
 
 import math
+from typing import Tuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from cflow_torch.ops.indices import divide, flat_nonzero
 from cflow_torch.ops.segments import segment_amin
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 
@@ -51,7 +53,7 @@ class RangeImages:
         place, distance = self._place(window * self._num_steps + step, x, y, z)
         return self._nearest.index_select(0, place) < distance - _NEARER
 
-    def _place(self, image: Tensor, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
+    def _place(self, image: Tensor, x: Tensor, y: Tensor, z: Tensor) -> Tuple[Tensor, Tensor]:
         """Direction in the range images, and the distance over ground, metres."""
         x0, y0, z0 = self._origin.view(-1, 3).index_select(0, image).unbind(1)
         x, y, z = x - x0, y - y0, z - z0
@@ -66,13 +68,12 @@ class RangeImages:
         """(B,) float64, metres, above the origin of t+1: from the height that one near point of fifty is below."""
         batch = sweeps.batch
         x, y, z = batch.positions[:, : batch.num_newest].unbind(0)
-        near = torch.nonzero((x * x + y * y <= _AROUND**2) & batch.takes_part[: batch.num_newest])[:, 0]
-        window = torch.div(batch.image.index_select(0, near).long(), batch.num_steps, rounding_mode="floor")
-        height, order = z.index_select(0, near).sort()
-        window, order = window.index_select(0, order).sort(stable=True)
+        near = flat_nonzero((x * x + y * y <= _AROUND**2) & batch.takes_part[: batch.num_newest])
+        window = divide(batch.image.index_select(0, near).long(), batch.num_steps)
+        height, by_height = z.index_select(0, near).sort()
+        window, by_window = window.index_select(0, by_height).sort(stable=True)
         count = torch.bincount(window, minlength=batch.num_windows)
-        first = count.cumsum(0) - count + torch.div(count, 50, rounding_mode="floor")
-        if near.numel() == 0:
-            return torch.zeros_like(batch.elapsed[:, 0])
-        lowest = height.index_select(0, order).index_select(0, first.clamp(max=near.numel() - 1))
-        return torch.where(count > 0, lowest + _ABOVE_LOWEST, torch.zeros_like(lowest))
+        chosen = count.cumsum(0) - count + divide(count, 50)
+        # Without near points it is 0.
+        height = F.pad(height.index_select(0, by_window), (0, 1), value=-_ABOVE_LOWEST)
+        return height.index_select(0, torch.where(count > 0, chosen, near.numel())) + _ABOVE_LOWEST

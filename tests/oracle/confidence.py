@@ -18,7 +18,7 @@ BLOCK = 1.6  # metres
 
 
 def confidences(
-    sweeps: SlicedSweeps, object_of: Dict[Pixel, int], flows: Sequence[Vector]
+    sweeps: SlicedSweeps, object_of: Dict[Pixel, int], flows: Sequence[Vector], doubt: Dict[Pixel, float]
 ) -> Tuple[Dict[Pixel, float], float]:
     """Probability of every pixel of t, and that of a point whose pixel was left out.
 
@@ -26,6 +26,7 @@ def confidences(
         sweeps: the window.
         object_of: object of each pixel that belongs to one.
         flows: (x, y) metres per interval of each object at its centre.
+        doubt: how much speaks for a local motion around a pixel; 0 where it is not named.
     """
     size = sweeps.pixel_size
     motions = [(y / size, x / size) for x, y in flows]
@@ -43,7 +44,12 @@ def confidences(
         if owner is None:
             place = table_place("unlinked", sum(number >= bound for bound in TABLE["crowd"]))
         elif owner not in margins:
-            place = table_place("still", sum(10 * found >= bound * number for bound in TABLE["share"]))
+            doubts = sum(doubt.get(pixel, 0.0) >= bound for bound in TABLE["doubt"])
+            place = (
+                table_place("doubt", doubts - 1)
+                if doubts
+                else table_place("still", sum(10 * found >= bound * number for bound in TABLE["share"]))
+            )
         else:
             x, y = (c + 0.5) * size + sweeps.lower[0], (r + 0.5) * size + sweeps.lower[1]
             is_far = x * x + y * y >= TABLE["far"] ** 2
@@ -93,9 +99,9 @@ def found_where_it_stands(sweeps: SlicedSweeps, members: Sequence[Pixel]) -> int
 
 
 def table_place(kind: str, bin_of_kind: int, has_history: bool = False, is_far: bool = False) -> int:
-    """Place in the table, whose kinds are "left out", "unlinked", "still", "moving" (which has four parts)."""
-    sizes: List[int] = [1, 1 + len(TABLE["crowd"]), 1 + len(TABLE["share"])]
-    start = sum(sizes[: ["left out", "unlinked", "still", "moving"].index(kind)])
+    """Place in the table, whose kinds are "left out", "unlinked", "still", "doubt", "moving" (which has four parts)."""
+    sizes: List[int] = [1, 1 + len(TABLE["crowd"]), 1 + len(TABLE["share"]), len(TABLE["doubt"])]
+    start = sum(sizes[: ["left out", "unlinked", "still", "doubt", "moving"].index(kind)])
     return start + bin_of_kind + (2 * has_history + is_far) * (1 + len(TABLE["margin"]))
 
 

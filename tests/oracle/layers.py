@@ -14,7 +14,7 @@ from oracle.height_slices import SLICE_HEIGHT
 SIDE = 0.4  # metres, of a cell
 NUM_SLICES = 4096  # from the lowest cell on; what lies higher counts as the last one
 SQUARE = 10  # cells a side of a square that has one height of the ground
-HIGHEST_FOOT, SMALLEST, LARGEST = 2, 1, 10  # slices
+GAP, HIGHEST_FOOT, SMALLEST, LARGEST = 3, 2, 1, 10  # slices
 
 Cell = Tuple[int, int, int]  # row, column, slice
 
@@ -33,8 +33,9 @@ def points_of_lower_layers(
         Of each sweep (N,) bool.
 
     Convention: components of cells that touch, corners included, all sweeps together. The next occupied cell above a
-        cell of a lower layer, if it is of another component, is above it; nothing of another component is the next
-        below one. Its lowest cell over the ground and its height are those of something that moves on the ground.
+        cell of a lower layer is above it if it is of another component and two cells at least are empty between them;
+        nothing of another component is the next below one. Its lowest cell over the ground and its height are those of
+        something that moves on the ground.
     """
     x0, y0 = config.point_cloud_range[:2]
     cell_of: Dict[Tuple[int, int], Cell] = {}  # by sweep and row
@@ -56,7 +57,7 @@ def points_of_lower_layers(
     under, over = set(), set()
     for (row, col), heights in columns.items():
         for low, high in zip(heights, heights[1:]):
-            if component[row, col, low] != component[row, col, high]:
+            if high - low >= GAP and component[row, col, low] != component[row, col, high]:
                 under.add(component[row, col, low])
                 over.add(component[row, col, high])
 

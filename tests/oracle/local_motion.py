@@ -17,7 +17,7 @@ from oracle.visibility import RangeImage, sensor_height
 
 STEP, REACH, FASTEST = 0.1, 3, 0.25  # metres per interval, steps, metres per interval
 SIDE = 0.3  # metres, of a cell
-SEED_Z, SEED_WON, GROUP_Z, UPRIGHT = 6, 12, 4.0, 3
+SEED_Z, LEAST_WON, GROUP_Z, UPRIGHT = 6, 4, 4.0, 3
 
 Cell = Tuple[int, int]
 
@@ -48,7 +48,7 @@ def find_local_motion(
     seen: Sequence[np.ndarray],
     origins: Sequence[Sequence[float]],
     config: VerifiedConfig,
-) -> Tuple[Dict[Pixel, int], List[Vector]]:
+) -> Tuple[Dict[Pixel, int], List[Vector], Dict[Pixel, float]]:
     """Groups of pixels that move within objects that stand.
 
     Args:
@@ -61,15 +61,19 @@ def find_local_motion(
         config: for the finest pixels.
 
     Returns:
-        The objects with the groups as objects of their own, numbered by their first pixel, and the motions of all.
+        The objects with the groups as objects of their own, numbered by their first pixel; the motions of all; and z of
+        the best velocity in the cell of each pixel, where there is one.
 
     Convention: see the functions below. Pixels of no object stand as well.
     """
     if len(sweeps.images) < 3:
-        return object_of, list(motions)
+        return object_of, list(motions), {}
     looks = look(sweeps, object_of, motions, points, seen, origins, config)
     velocities = small_velocities(sweeps.pixel_size)
     best = best_velocity(sweeps, looks, velocities, origins[1])
+    side = max(1, round(SIDE / sweeps.pixel_size))
+    doubt = {(m, r, c): best.get((r // side, c // side), (0, 0.0))[1] for m, r, c in sweeps.pixels()}
+    best = {cell: found for cell, found in best.items() if found[1] >= SEED_Z}
     label: Dict[Pixel, Tuple[int, int]] = {pixel: (0, own) for pixel, own in object_of.items()}
     for number, ((_, index), members) in enumerate(sorted(groups(sweeps, looks, velocities, best).items())):
         pairs = [wins(sweeps, one, velocities[index]) for one in looks if one.pixel in members]
@@ -82,7 +86,7 @@ def find_local_motion(
     ordered = list(dict.fromkeys(label[pixel] for pixel in sweeps.pixels() if pixel in label))
     moved = [motions[own] if kind == 0 else velocities[kind - 1] for kind, own in ordered]
     number_of = {one: number for number, one in enumerate(ordered)}
-    return {pixel: number_of[label[pixel]] for pixel in sweeps.pixels() if pixel in label}, moved
+    return {pixel: number_of[label[pixel]] for pixel in sweeps.pixels() if pixel in label}, moved, doubt
 
 
 def small_velocities(pixel_size: float) -> List[Vector]:
@@ -166,14 +170,15 @@ def best_velocity(
         for cell in won:
             surplus, noise = won[cell] - lost[cell], won[cell] + lost[cell]
             is_inside = 0 <= cell[0] < height and 0 <= cell[1] < width
-            if is_inside and won[cell] >= SEED_WON and surplus > 0 and surplus**2 >= SEED_Z**2 * noise:
+            if is_inside and won[cell] >= LEAST_WON and surplus > 0:
                 z = surplus / math.sqrt(noise)
                 if z > own.get(cell, (0, 0.0))[1]:
                     own[cell] = index, z
 
     def is_believed(velocity: Vector) -> bool:
         off = math.hypot(velocity[0] - sensor[0], velocity[1] - sensor[1])
-        return off > 1.05 * STEP / size and math.hypot(*velocity) * size < FASTEST
+        stands = math.hypot(*sensor) * size < STEP / 2
+        return (off > 1.05 * STEP / size or stands) and math.hypot(*velocity) * size < FASTEST
 
     own = {cell: found for cell, found in own.items() if is_believed(velocities[found[0]])}
     result: Dict[Cell, Tuple[int, float]] = {}

@@ -20,7 +20,7 @@ from oracle.height_slices import Pixel, SlicedSweeps, Vector, slice_image
 from oracle.layers import points_of_lower_layers
 from oracle.local_motion import find_local_motion
 from oracle.offline import Estimate, best_nearby, by_side
-from oracle.paired_test import best_candidate, count_wins, evidence_of
+from oracle.paired_test import best_candidate, count_wins, evidence_of, is_found_where_it_stands
 from oracle.pixels import in_range, project_bev
 from oracle.refinement import settle
 from oracle.rigid_registration import RigidMotion
@@ -184,18 +184,18 @@ def look(
             best_nearby(sweeps, [pixel for pixel, owner in object_of.items() if owner == i], motion, config)
             for i, motion in enumerate(motions)
         ]
+    doubt: Dict[Pixel, float] = {}
     if config.thorough and seen is not None and len(clouds) > 2:  # with history nothing creeps
         in_sight = [cloud.points[keep] for cloud, keep in zip(clouds, seen)]
         origins = [cloud.origin for cloud in clouds]
-        object_of, motions = find_local_motion(sweeps, object_of, motions, points, in_sight, origins, config)
+        object_of, motions, doubt = find_local_motion(sweeps, object_of, motions, points, in_sight, origins, config)
         may_creep = [False] * len(motions)
     rigid, shown = settle(sweeps, motions, may_creep, object_of, points, config, times)
+    trust, of_left_out = confidences(sweeps, object_of, [motion.flow for motion in shown], doubt)
     for i, motion in enumerate(shown):
         members = [pixel for pixel, owner in object_of.items() if owner == i]
         if margin_bin(sweeps, members, (motion.flow[1] / size, motion.flow[0] / size)) == 0:
             rigid[i] = rigid[i]._replace(flow=(0.0, 0.0), turn=0.0)
-            shown[i] = shown[i]._replace(flow=(0.0, 0.0), turn=0.0)
-    trust, of_left_out = confidences(sweeps, object_of, [motion.flow for motion in shown])
 
     owners = [np.full(len(cloud.points), -1, dtype=np.int64) for cloud in clouds]
     score_of = dict(zip(sweeps.pixels(), levels[-1].scores))
@@ -256,6 +256,8 @@ def verify_level(
             slides = slides_along_itself(sweeps, members, found)
             values = [0 if slid else value for slid, value in zip(slides, values)]
         motion, most = best_candidate(values, found)
+        if is_found_where_it_stands(sweeps, members, motion):
+            motion, most = (0.0, 0.0), 0
         motions.append(motion)
         evidence.append(most)
     return VerifiedLevel(level, motions, evidence, list(scores.values()))
