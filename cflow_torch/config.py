@@ -216,14 +216,14 @@ _DEFAULT = {
     "num_history": 4,
     "pixel_sizes": (0.4, 0.2, 0.1),
     "point_cloud_range": _REGION,
-    "max_speed": 40.0,
+    "max_speed": 60.0,
 }
 # The method of each preset, and what it changes in the method's defaults.
 PRESETS: Dict[str, Tuple[str, Dict[str, Any]]] = {
     "default": ("verified", _DEFAULT),
     "fast": (
         "verified",
-        {"num_history": 2, "point_cloud_range": _REGION, "max_speed": 40.0, "thorough": False},
+        {"num_history": 2, "point_cloud_range": _REGION, "max_speed": 60.0, "thorough": False},
     ),
     "offline": ("verified", {**_DEFAULT, "num_future": 4}),
     "paper": ("dense", {}),

@@ -192,7 +192,7 @@ def look(
         may_creep = [False] * len(motions)
     rigid, shown = settle(sweeps, motions, may_creep, object_of, points, config, times)
     trust, of_left_out = confidences(sweeps, object_of, [motion.flow for motion in shown], doubt)
-    for i, motion in enumerate(shown):
+    for i, motion in enumerate(shown if config.thorough else []):
         members = [pixel for pixel, owner in object_of.items() if owner == i]
         if margin_bin(sweeps, members, (motion.flow[1] / size, motion.flow[0] / size)) == 0:
             rigid[i] = rigid[i]._replace(flow=(0.0, 0.0), turn=0.0)
