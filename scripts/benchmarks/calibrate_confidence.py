@@ -121,7 +121,7 @@ def fit(sums: np.ndarray) -> List[float]:
         share = (right + prior) / (points + 1)
         is_falling = row in (1, 3)  # the more is unlinked, or speaks for a local motion, the worse
         rising = monotone(-share if is_falling else share, points + 1)
-        result += [round(abs(float(value)), 4) for value in rising]
+        result += [min(round(abs(float(value)), 4), 0.9999) for value in rising]  # nothing is certain
     return result
 
 

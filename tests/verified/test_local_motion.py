@@ -212,7 +212,8 @@ def test_a_walker_beside_a_wall_moves_and_the_wall_stands(monkeypatch):
     flow = VerifiedFlow(MODEL)([window])[0].residual_flow.numpy()
     assert np.abs(flow[is_walker].mean(0) - (0.13, 0.0, 0.0)).max() < 0.03
     assert not flow[~is_walker].any()
-    monkeypatch.setattr(method, "find_local_motion", lambda objects, motion, _, sweeps: (objects, motion, 0.0 * sweeps.row))
+    nothing = lambda objects, motion, _, sweeps: (objects, motion, 0.0 * sweeps.row)  # noqa: E731
+    monkeypatch.setattr(method, "find_local_motion", nothing)
     assert not VerifiedFlow(MODEL)([window])[0].residual_flow.any()
 
 
