@@ -176,8 +176,8 @@ class VerifiedConfig(_WithHistory):
     )
     max_object: Optional[float] = setting(
         25.0,
-        "metres: what is longer than this at t+1 does not move, and has the score of the coarser component around it, "
-        "or 0. None = anything may move",
+        "metres: what is longer than this at t+1 moves only if both of its ends are seen to travel (trams, trains); "
+        "else it has the score of the coarser component around it, or 0. None = anything may move",
         above=0,
     )
     significance: float = setting(
@@ -210,19 +210,20 @@ WINDOW = ("num_history", "num_future")  # settings that say which sweeps a windo
 
 CONFIGS: Dict[str, Type[Config]] = {"dense": DenseConfig, "keypoints": KeypointsConfig, "verified": VerifiedConfig}
 
+_REGION = (-76.8, -76.8, -math.inf, 76.8, 76.8, math.inf)
 _HARNESS_REGION = (-51.2, -51.2, -math.inf, 51.2, 51.2, math.inf)
 _DEFAULT = {
     "num_history": 4,
     "pixel_sizes": (0.4, 0.2, 0.1),
-    "point_cloud_range": _HARNESS_REGION,
-    "max_speed": 40.0,
+    "point_cloud_range": _REGION,
+    "max_speed": 60.0,
 }
 # The method of each preset, and what it changes in the method's defaults.
 PRESETS: Dict[str, Tuple[str, Dict[str, Any]]] = {
     "default": ("verified", _DEFAULT),
     "fast": (
         "verified",
-        {"num_history": 2, "point_cloud_range": _HARNESS_REGION, "max_speed": 40.0, "thorough": False},
+        {"num_history": 2, "point_cloud_range": _REGION, "max_speed": 60.0, "thorough": False},
     ),
     "offline": ("verified", {**_DEFAULT, "num_future": 4}),
     "paper": ("dense", {}),

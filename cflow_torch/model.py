@@ -119,7 +119,7 @@ class SceneFlowModel(nn.Module):
         raise NotImplementedError
 
     def grid(self, pixel_size: float) -> Grid:
-        """The BEV at a pixel size, metres."""
+        """The BEV at a pixel size, metres. It holds `point_cloud_range`; only what lies there has results."""
         bounds = self.config.point_cloud_range
         return Grid(pixel_size, bounds[:3], bounds[3:])
 
@@ -157,7 +157,7 @@ def _results(batch: Batch, motion: Motion) -> List[FlowResult]:
     results = []
     for source in batch.sources:
         points = source.points
-        cluster, is_valid = motion.cluster(points), batch.takes_part[points].clone()
+        cluster, is_valid = motion.cluster(points), batch.has_result[points].clone()
         residual = motion.residual_flow(points, batch.positions[:, points])
         cluster_id, score = (values.index_select(0, cluster) for values in (motion.cluster_id, motion.score))
         confidence = motion.confidence

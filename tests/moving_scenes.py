@@ -212,11 +212,13 @@ def _batch(positions: torch.Tensor, image: torch.Tensor, elapsed: torch.Tensor) 
     return Batch(
         positions=positions,
         takes_part=torch.ones(image.numel(), dtype=torch.bool),
+        has_result=torch.ones(image.numel(), dtype=torch.bool),
         image=image.int(),
         num_newest=0,
         num_windows=elapsed.shape[0],
         num_steps=elapsed.shape[1],
         elapsed=elapsed,
         seconds=elapsed * 0.1,
+        origin=torch.zeros((*elapsed.shape, 3), dtype=torch.float64),
         sources=(),
     )

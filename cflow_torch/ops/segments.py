@@ -11,11 +11,11 @@ from torch import Tensor
 _FAR = 1 << 61
 
 
-def segment_amin(values: Tensor, index: Tensor, num_segments: int, empty: int) -> Tensor:
+def segment_amin(values: Tensor, index: Tensor, num_segments: int, empty: float) -> Tensor:
     """Smallest value of each segment.
 
     Args:
-        values: (N,) integers.
+        values: (N,) numbers.
         index: (N,) int64, segment of each value, 0 ... num_segments - 1.
         num_segments: S.
         empty: result of a segment without values; must not be smaller than any value.

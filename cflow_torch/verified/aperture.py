@@ -50,7 +50,7 @@ def slides_along_itself(sweeps: HeightSlicedSweeps, owner: Tensor, candidates: T
     num_components = len(candidates)
     newest = flat_nonzero((owner < num_components) & (sweeps.step == 0))
     component, row, col = (values.index_select(0, newest) for values in (owner, sweeps.row, sweeps.col))
-    is_line, axis_y, axis_x = _principal_axes(component, row, col, num_components, sweeps.grid.pixel_size)
+    is_line, axis_y, axis_x = principal_axes(component, row, col, num_components, sweeps.grid.pixel_size)
 
     # Its window, of each component; those without pixels at t+1 are no lines.
     window = torch.zeros_like(is_line, dtype=torch.int64).scatter_(0, component, sweeps.window.index_select(0, newest))
@@ -67,7 +67,7 @@ def slides_along_itself(sweeps: HeightSlicedSweeps, owner: Tensor, candidates: T
     return suspect & _is_covered(sweeps, owner, looked_at)[:, None]
 
 
-def _principal_axes(
+def principal_axes(
     component: Tensor, row: Tensor, col: Tensor, num_components: int, pixel_size: float
 ) -> Tuple[Tensor, Tensor, Tensor]:
     """Whether each component is a line, (A,) bool, and y and x of its direction, (A,) float64, of any length.

@@ -20,6 +20,7 @@ from cflow_torch.dense.clustering import Clusters, cluster_images
 from cflow_torch.ops.indices import flat_nonzero
 from cflow_torch.ops.segments import bounding_boxes, segment_amin
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
+from cflow_torch.verified.long_vehicles import ends_travel
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,8 @@ class Level:
         images: (B, S, height, width) uint8, slices of each pixel.
         clusters: M components; their boxes and pixels are in pixels of this level.
         component: (P,) int64, component of each occupied finest pixel, M = none.
-        too_long: (M,) bool, longer at t+1 than any object: it does not move.
+        too_long: (M,) bool, longer at t+1 than other objects, and not seen to travel: it does not move.
+        travels: (M,) bool, as long, but both ends are seen to travel, see `ends_travel`.
     """
 
     block: int
@@ -41,6 +43,7 @@ class Level:
     clusters: Clusters
     component: Tensor
     too_long: Tensor
+    travels: Tensor
 
     @property
     def num_components(self) -> int:
@@ -105,8 +108,9 @@ def find_components(sweeps: HeightSlicedSweeps, block: int, is_undilated: bool, 
     row, col, own = (values.index_select(0, newest) for values in (sweeps.row, sweeps.col, component))
     _, size = bounding_boxes(row, col, own, count)  # every component has pixels at t+1
     longest = math.inf if config.max_object is None else config.max_object
-    too_long = torch.maximum(size[:, 0], size[:, 1]).double() * pixel_size > longest
-    return Level(block, is_undilated, images, clusters, component, too_long)
+    is_long = torch.maximum(size[:, 0], size[:, 1]).double() * pixel_size > longest
+    travels = ends_travel(sweeps, component, is_long)
+    return Level(block, is_undilated, images, clusters, component, is_long & ~travels, travels)
 
 
 @dataclass(frozen=True)
@@ -128,6 +132,19 @@ class Objects:
     def count(self) -> int:
         """G."""
         return self.component.numel()
+
+    def split(self, part: Tensor, wanted: Tensor, num_components: int) -> Objects:
+        """Parts of them taken out as objects of their own.
+
+        Args:
+            part: (P,) int64, part of each pixel, H = none.
+            wanted: (H,) bool, the parts that are taken out.
+            num_components: of all levels; the parts are numbered after them.
+        """
+        none = num_components + wanted.numel()
+        whole = F.pad(self.component, (0, 1), value=none).index_select(0, self.of_pixel)
+        is_out = F.pad(wanted, (0, 1)).index_select(0, part)
+        return number_objects(torch.where(is_out, num_components + part, whole), none)
 
     def pixels_of(self, wanted: Tensor) -> Tensor:
         """(P,) int64, `of_pixel` for the objects that are wanted, (G,) bool; G for all other pixels."""
@@ -165,6 +182,11 @@ def select_objects(levels: Sequence[Level], evidence: Sequence[Tensor]) -> Objec
         of_pixel = torch.where(wins.index_select(0, whole.component), whole.component + offset, of_pixel)
         part, value = whole, torch.maximum(own, total)
 
+    return number_objects(of_pixel, num_components)
+
+
+def number_objects(of_pixel: Tensor, num_components: int) -> Objects:
+    """Objects by the component, (P,) int64, that each pixel belongs to; `num_components` = none."""
     position = torch.arange(of_pixel.numel(), device=of_pixel.device)
     first = segment_amin(position, of_pixel, num_components + 1, of_pixel.numel())[:num_components]
     first, component = first.sort()

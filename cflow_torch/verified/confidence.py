@@ -22,20 +22,32 @@ from cflow_torch.verified.paired_test import count_wins
 from cflow_torch.verified.rigid_motion import RigidMotion
 
 # Bounds of the bins and the probabilities, written by scripts/benchmarks/calibrate_confidence.py. Bins, in order: left
-# out; unlinked, by `crowd`; still, by `share`; moving, by `margin`: pairs near, pairs far, with history near and far.
+# out; unlinked, by `crowd`; still, by `share`, or where a local motion is likely by `doubt`; moving, by `margin`: pairs
+# near, pairs far, with history near and far.
 TABLE = json.loads(Path(__file__).with_name("confidence.json").read_text(encoding="utf-8"))
 DISPLACEMENT = 0.4  # metres per interval, along x and along y
 BLOCK = 1.6  # metres, sides of a neighbourhood
 _NOWHERE = 1e7  # pixels, outside every image
 
 
-def confidence_of(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMotion) -> Tensor:
+def margin_of(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMotion) -> Tensor:
+    """(G,) int64: how much worse the sweeps would be explained if the motion of an object were displaced; 0 = hardly
+    worse, so that nothing speaks for this motion. Arguments as for `confidence_of`."""
+    motion = _pixels_per_interval(sweeps, rigid)
+    return _margin(sweeps, objects, motion, motion.any(1))
+
+
+def confidence_of(
+    sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMotion, margin: Tensor, doubt: Tensor
+) -> Tensor:
     """Probability that the motion of a pixel of t is right to 0.1 m per sweep interval.
 
     Args:
         sweeps: finest images, P occupied pixels.
         objects: G of them.
         rigid: their motion. Turns are not looked at: an object counts as it moves at its centre.
+        margin: as `margin_of` gives it.
+        doubt: (P,) float64, how much speaks for a local motion around each pixel, standard deviations of noise.
 
     Returns:
         (P + 1,) float32; entry P is for points whose pixel was left out. Means nothing for pixels of other sweeps.
@@ -43,26 +55,33 @@ def confidence_of(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMoti
     Cost: one look-up for each pixel of t; six for each pixel of what moves and each sweep.
     """
     probabilities = torch.tensor(TABLE["probabilities"], dtype=torch.float32, device=sweeps.elapsed.device)
-    return probabilities.index_select(0, F.pad(_bins(sweeps, objects, rigid), (0, 1)))
+    return probabilities.index_select(0, F.pad(_bins(sweeps, objects, rigid, margin, doubt), (0, 1)))
 
 
-def _bins(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMotion) -> Tensor:
+def _pixels_per_interval(sweeps: HeightSlicedSweeps, rigid: RigidMotion) -> Tensor:
+    """(G, 2) float64, (y, x), finest pixels."""
+    return rigid.flow.flip(1) / torch.full_like(rigid.flow, sweeps.grid.pixel_size)
+
+
+def _bins(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMotion, margin: Tensor, doubt: Tensor) -> Tensor:
     """(P,) int64, place of each pixel in the table."""
     size = sweeps.grid.pixel_size
-    motion = rigid.flow.flip(1) / torch.full_like(rigid.flow, size)
+    motion = _pixels_per_interval(sweeps, rigid)
     moves = motion.any(1)
     number, found = _neighbourhood(sweeps, F.pad(motion, (0, 0, 0, 1)).index_select(0, objects.of_pixel))
     crowd, share = TABLE["crowd"], TABLE["share"]
     unlinked = 1 + _count([number >= bound for bound in crowd])
     still = 2 + len(crowd) + _count([10 * found >= bound * number for bound in share])
+    num_doubts = _count([doubt >= bound for bound in TABLE["doubt"]])
+    still = torch.where(num_doubts > 0, 2 + len(crowd) + len(share) + num_doubts, still)
 
-    margin = _margin(sweeps, objects, motion, moves)
     y, x = ((at.double() + 0.5) * size for at in (sweeps.row, sweeps.col))
     x, y = x + sweeps.grid.lower[0], y + sweeps.grid.lower[1]
     is_far = x * x + y * y >= float(TABLE["far"]) ** 2
     has_history = ((sweeps.elapsed != 0).sum(1) > 1).index_select(0, sweeps.window)
     kind = 2 * has_history.long() + is_far.long()
-    moving = 3 + len(crowd) + len(share) + kind * (1 + len(TABLE["margin"])) + F.pad(margin, (0, 1))[objects.of_pixel]
+    first = 3 + len(crowd) + len(share) + len(TABLE["doubt"])
+    moving = first + kind * (1 + len(TABLE["margin"])) + F.pad(margin, (0, 1))[objects.of_pixel]
 
     still = torch.where(objects.of_pixel == objects.count, unlinked, still)
     return torch.where(F.pad(moves, (0, 1)).index_select(0, objects.of_pixel), moving, still)

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Optional, Tuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.ops.chunks import chunks
 from cflow_torch.ops.indices import divide, flat_nonzero, occupied, split_index
+from cflow_torch.ops.segments import segment_amin
 from cflow_torch.verified.ground_residue import TALL, clear_ground_residue, is_tall
 from cflow_torch.windows.bev_grid import Grid
 from cflow_torch.windows.collation import Batch
@@ -134,6 +137,27 @@ class HeightSlicedSweeps:
         """
         number = torch.full_like(self.image, self.pixel.numel(), dtype=torch.int32)
         return number.scatter_(0, self.pixel, torch.arange(self.pixel.numel(), device=number.device).int())
+
+    @cached_property
+    def with_around(self) -> Tensor:
+        """(B * S * H * W + 1,) uint8: `image`, and in the upper four bits the slices of the 3 x 3 pixels around each.
+
+        Cost: a few passes over the images, once.
+        """
+        image = self.image[:-1].view(-1, self.grid.height, self.grid.width)
+        rows = image.clone()
+        rows[:, 1:] |= image[:, :-1]
+        rows[:, :-1] |= image[:, 1:]
+        around = rows.clone()
+        around[:, :, 1:] |= rows[:, :, :-1]
+        around[:, :, :-1] |= rows[:, :, 1:]
+        return F.pad((around << NUM_SLICES | image).view(-1), (0, 1))
+
+    @cached_property
+    def lowest(self) -> Tensor:
+        """(P,) float64, metres: height of the lowest point of each occupied pixel."""
+        number = self.number.index_select(0, self.place).long()
+        return segment_amin(self.batch.positions[2], number, self.pixel.numel() + 1, math.inf)[:-1]
 
     def number_at_t(self) -> Tensor:
         """The same for points of sweep t: undefined for what is empty and for other sweeps, P at the last place.

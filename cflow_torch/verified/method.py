@@ -8,6 +8,8 @@ explain most; what moves is then placed between the pixels, registered and turne
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from typing import List, Tuple
 
 import torch
@@ -18,16 +20,20 @@ from cflow_torch.stages import stage
 from cflow_torch.verified import keypoint_candidates, slow_motion
 from cflow_torch.verified.candidates import propose
 from cflow_torch.verified.component_tree import Objects, find_components, select_objects
-from cflow_torch.verified.confidence import confidence_of
-from cflow_torch.verified.deskewing import register_deskewed
+from cflow_torch.verified.confidence import confidence_of, margin_of
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
+from cflow_torch.verified.layers import join_moving, points_at_rest, points_of_lower_layers
+from cflow_torch.verified.local_motion import find_local_motion
 from cflow_torch.verified.offline import best_nearby, motion_by_both_sides
 from cflow_torch.verified.paired_test import VerifiedLevel, verify
-from cflow_torch.verified.rigid_motion import RigidMotion, TurningMotion, motion_by_pixel
-from cflow_torch.verified.rigid_registration import register
-from cflow_torch.verified.subpixel_shift import shift_between_pixels
-from cflow_torch.verified.voxel_centroids import points_of_objects
+from cflow_torch.verified.refinement import as_found, refine
+from cflow_torch.verified.rigid_motion import TurningMotion, motion_by_pixel
+from cflow_torch.windows.bev_grid import Grid
 from cflow_torch.windows.collation import Batch
+
+# Metres around the region that are looked at as well, so that what crosses its border is seen whole: at least the way
+# of 40 m/s in a sweep.
+MARGIN = 4.0
 
 
 class VerifiedFlow(SceneFlowModel):
@@ -66,6 +72,12 @@ class VerifiedFlow(SceneFlowModel):
         """Whether the times of points are asked for."""
         return bool(self.config.thorough)
 
+    def grid(self, pixel_size: float) -> Grid:
+        """The BEV at a pixel size, metres: the region and its margin of whole pixels of the coarsest size."""
+        x0, y0, z0, x1, y1, z1 = self.config.point_cloud_range
+        wide = math.ceil(MARGIN / self.config.pixel_sizes[0]) * self.config.pixel_sizes[0]
+        return Grid(pixel_size, (x0 - wide, y0 - wide, z0), (x1 + wide, y1 + wide, z1))
+
     def motion(self, batch: Batch) -> TurningMotion:
         """Motion of everything in a batch, by occupied pixel; ids number what moves together or stands together."""
         if self.config.num_future == 0:
@@ -74,14 +86,25 @@ class VerifiedFlow(SceneFlowModel):
 
     def estimate(self, batch: Batch) -> TurningMotion:
         """The same by all sweeps alike, before t or after t+1."""
+        grid = self.grid(self.config.pixel_sizes[-1])
+        with stage("project"):
+            sweeps = HeightSlicedSweeps.of(batch, grid, self.config.min_height)
+        found = self.look(sweeps, self.scales())
+        if not self.config.thorough:
+            return found
+        with stage("layers"):
+            is_lower = points_of_lower_layers(sweeps, points_at_rest(sweeps, found))
+            lower = HeightSlicedSweeps.of(replace(batch, takes_part=is_lower), grid)
+        return join_moving(found, self.look(lower, [(1, False), (1, True)], is_first=False), batch)
+
+    def look(self, sweeps: HeightSlicedSweeps, scales: List[Tuple[int, bool]], is_first: bool = True) -> TurningMotion:
+        """What some points do, found at some scales. What could as well be displaced stands still."""
         config, key_points = self.config, None
         levels: List[VerifiedLevel] = []
-        with stage("project"):
-            sweeps = HeightSlicedSweeps.of(batch, self.grid(config.pixel_sizes[-1]), config.min_height)
-        if config.thorough:
+        if config.thorough and is_first:
             with stage("match"):
                 key_points = keypoint_candidates.match_key_points(sweeps, config)
-        for block, is_undilated in self.scales():
+        for block, is_undilated in scales:
             above = levels[-1] if levels else None
             with stage("cluster"):
                 level = find_components(sweeps, block, is_undilated, config)
@@ -93,10 +116,16 @@ class VerifiedFlow(SceneFlowModel):
             objects, motion = _select(levels)
             if config.num_future > 0:
                 motion = best_nearby(sweeps, objects, motion, config)
+        doubt = torch.zeros_like(sweeps.row, dtype=torch.float64)
+        if config.thorough and is_first:
+            with stage("local"):
+                objects, motion, doubt = find_local_motion(objects, motion, levels, sweeps)
         with stage("register"):
-            rigid, seen = self.register(objects, motion, levels, sweeps)
+            rigid, seen = refine(objects, motion, levels, sweeps) if config.thorough else as_found(motion, sweeps)
         with stage("confidence"):
-            confidence = confidence_of(sweeps, objects, seen)
+            margin = margin_of(sweeps, objects, seen)
+            confidence = confidence_of(sweeps, objects, seen, margin, doubt)
+            rigid = rigid.only(margin > 0) if config.thorough else rigid
             is_numbered = config.thorough or config.num_future > 0
             return motion_by_pixel(objects, rigid, levels[-1].score, confidence, sweeps, is_numbered)
 
@@ -105,26 +134,6 @@ class VerifiedFlow(SceneFlowModel):
         sizes = self.config.pixel_sizes
         levels = [(round(size / sizes[-1]), False) for size in sizes]
         return [*levels, (1, True)] if self.config.thorough else levels
-
-    def register(
-        self, objects: Objects, motion: Tensor, levels: List[VerifiedLevel], sweeps: HeightSlicedSweeps
-    ) -> Tuple[RigidMotion, RigidMotion]:
-        """Motion of G objects in metres, from (G, 2) float64 (y, x), finest pixels per sweep interval; and the motion
-        that the images show, which differs where points have times of their own."""
-        pixel_size, moves = sweeps.grid.pixel_size, motion.any(1)
-        if not self.config.thorough:
-            rigid = RigidMotion.translation(motion.flip(1) * pixel_size)
-            return rigid, rigid
-        too_long = torch.cat([level.level.too_long for level in levels]).index_select(0, objects.component)
-        slow = slow_motion.slow_motion(sweeps, objects, ~moves & ~too_long)
-        points = points_of_objects(sweeps, objects, moves)
-        is_pair = (sweeps.elapsed != 0).sum(1) == 1  # with history one of many sweeps would decide
-        motion = shift_between_pixels(points.take(is_pair.index_select(0, points.window)), sweeps, motion)
-        points = points.take(motion.any(1).index_select(0, points.owner))
-        start = motion.flip(1) * pixel_size
-        seen = register(points, sweeps, start)
-        seen = RigidMotion(torch.where(slow.any(1, keepdim=True), slow, seen.flow), seen.turn, seen.centre)
-        return register_deskewed(points, sweeps, start, seen), seen
 
 
 def _select(levels: List[VerifiedLevel]) -> Tuple[Objects, Tensor]:

@@ -19,7 +19,7 @@ from cflow_torch.ops.indices import flat_nonzero, split_index
 from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 from cflow_torch.verified.paired_test import best_candidate, count_wins, evidence_of
-from cflow_torch.verified.rigid_motion import TurningMotion
+from cflow_torch.verified.rigid_motion import TurningMotion, join
 from cflow_torch.windows.collation import Batch
 
 # How often the future must show an object for each time that the past does. At 1, façades that a moving ego vehicle
@@ -47,7 +47,8 @@ def motion_by_both_sides(batch: Batch, estimate: Callable[[Batch], TurningMotion
     is_pair = torch.arange(batch.num_steps, device=is_after.device) < 2
     before, after = batch.take_steps(~is_after), batch.take_steps(is_pair | is_after)
     first, second = estimate(before), estimate(after)
-    return _join(first, second, num_shown(after, second) > _TIMES * num_shown(before, first), batch)
+    takes_second = num_shown(after, second) > _TIMES * num_shown(before, first)
+    return join(first, second, F.pad(takes_second, (batch.num_newest, 0)), batch)
 
 
 def num_shown(batch: Batch, motion: TurningMotion) -> Tensor:
@@ -90,31 +91,3 @@ def best_nearby(sweeps: HeightSlicedSweeps, objects: Objects, motion: Tensor, co
     wins = count_wins(sweeps, objects.of_pixel, candidates, motion.any(1) & has_after)
     best, evidence = best_candidate(evidence_of(*wins, config.significance), candidates)
     return torch.where((evidence > 0)[:, None], best, motion)
-
-
-def _join(first: TurningMotion, second: TurningMotion, takes_second: Tensor, batch: Batch) -> TurningMotion:
-    """Two motions of the same N points of t, one for each point.
-
-    Args:
-        first, second: of L and M clusters; the result has L + 1 + M, since entry L stays "none" as well.
-        takes_second: (N,) bool.
-        batch: of these points.
-    """
-    at_t = slice(batch.num_newest, batch.num_newest + takes_second.numel())
-    window = split_index(batch.image[at_t].long(), batch.num_steps)[0]
-    num_ids = torch.zeros(batch.num_windows, dtype=torch.int64, device=window.device)
-    num_ids.scatter_reduce_(0, window, 1 + first.cluster_id.index_select(0, first.cluster(at_t)), "amax")
-    offset = torch.zeros_like(second.cluster_id)
-    offset.scatter_(0, second.cluster(at_t).long(), num_ids.index_select(0, window))
-    ids = second.cluster_id + offset.masked_fill_(second.cluster_id < 0, 0)
-    place = torch.where(takes_second, second.place[at_t] + first.of_place.numel(), first.place[at_t])
-    both = {
-        name: torch.cat((getattr(first, name), getattr(second, name)))
-        for name in ("flow", "score", "confidence", "turn", "centre")
-    }
-    return TurningMotion(
-        of_place=torch.cat((first.of_place, second.of_place + first.cluster_id.numel())),
-        place=F.pad(place, (batch.num_newest, 0)),
-        cluster_id=torch.cat((first.cluster_id, ids)),
-        **both,
-    )

@@ -13,11 +13,13 @@ from cflow_torch.config import VerifiedConfig
 from cflow_torch.ops.indices import flat_nonzero
 from cflow_torch.verified.aperture import slides_along_itself
 from cflow_torch.verified.component_tree import Level
-from cflow_torch.verified.height_slices import HeightSlicedSweeps, count_slices
+from cflow_torch.verified.height_slices import NUM_SLICES, HeightSlicedSweeps, count_slices
 
 # Look-ups (pixel x sweep x candidate) done at once: their temporaries take about 64 bytes each.
 _LOOKS_ON_CPU = 1 << 18
 _LOOKS_ON_GPU = 1 << 24
+_FAR = 2  # pixels, in y or in x
+_FARTHER, _STILL_THERE = 4, 97  # pixels, per cent
 
 
 @dataclass(frozen=True)
@@ -51,9 +53,12 @@ def verify(
     tested = (motion != 0).any(2).any(1) & ~level.too_long
     evidence = evidence_of(*count_wins(sweeps, level.component, motion, tested), config.significance)
     if config.thorough:
-        owner = torch.where(F.pad(tested, (0, 1)).index_select(0, level.component), level.component, tested.numel())
+        asked = tested & ~level.travels
+        owner = torch.where(F.pad(asked, (0, 1)).index_select(0, level.component), level.component, tested.numel())
         evidence = evidence.masked_fill(slides_along_itself(sweeps, owner, motion), 0)
-    return VerifiedLevel(level, *best_candidate(evidence, motion), score)
+    best, most = best_candidate(evidence, motion)
+    stands = is_found_where_it_stands(sweeps, level.component, best)
+    return VerifiedLevel(level, best.masked_fill(stands[:, None], 0.0), most.masked_fill(stands, 0), score)
 
 
 def count_wins(
@@ -62,7 +67,9 @@ def count_wins(
     """Paired counts of candidate motions against standing still.
 
     A slice of a pixel is won by a motion if another sweep has it where the motion takes the pixel and not where the
-    pixel is; it is lost the other way round. Slices found in both places, or in neither, say nothing.
+    pixel is; it is lost the other way round. Slices found in both places, or in neither, say nothing. A motion of two
+    pixels or more finds a slice "not" in a place only if none of the 3 x 3 pixels there has it: beams meet a side at
+    other places in each sweep, and a side that stands must not look as if it had left.
 
     Args:
         sweeps: finest images and their P occupied pixels.
@@ -75,13 +82,14 @@ def count_wins(
 
     Convention:
         A pixel is taken by floor(k f + 0.5) pixels, elementwise float64; k = elapsed intervals, negative from t+1 into
-        the past. What it meets counts whatever component it is of. Sweeps that a window lacks are empty: no counts.
+        the past. What it meets counts whatever component it is of. A place outside the image has nothing, nor has any
+        of the pixels around it. Sweeps that a window lacks are empty: no counts.
         Fewer than 2^31 slices of a component may be compared.
 
     Cost: P (S - 1) C look-ups at most, of the pixels of tested components only.
     """
     count, num_candidates, _ = candidates.shape
-    pixel, step = _looks(sweeps, flat_nonzero(F.pad(tested, (0, 1)).index_select(0, component)))
+    pixel, step = looks(sweeps, flat_nonzero(F.pad(tested, (0, 1)).index_select(0, component)))
     sums = torch.zeros(count * num_candidates, dtype=torch.int64, device=component.device)
     column = torch.arange(num_candidates, device=component.device)
     at_once = _LOOKS_ON_CPU if component.device.type == "cpu" else _LOOKS_ON_GPU
@@ -91,18 +99,53 @@ def count_wins(
         # One of the two is 0.
         k = sweeps.elapsed[window, sweeps.step.index_select(0, some)] - sweeps.elapsed[window, other]
         own, of_some = sweeps.slices.index_select(0, some)[:, None], component.index_select(0, some)
-        here = own & sweeps.slices_at(window, other, row, col)[:, None]
+        seen = sweeps.with_around.index_select(0, sweeps.index(window, other, row, col))[:, None]
+        here, near_here = own & seen, own & (seen >> NUM_SLICES)
         move = (candidates.index_select(0, of_some) * k[:, None, None] + 0.5).floor_().long()
         y, x = row[:, None] + move[:, :, 0], col[:, None] + move[:, :, 1]
-        there = own & sweeps.slices_at(window[:, None], other[:, None], y, x)
+        index = sweeps.index(window[:, None], other[:, None], y, x)
+        seen = sweeps.with_around.index_select(0, index.view(-1)).view(index.shape)
+        there, near_there = own & seen, own & (seen >> NUM_SLICES)
+        is_far = move.abs().amax(2) >= _FAR
+        won = there & ~torch.where(is_far, near_here, here)
+        lost = here & ~torch.where(is_far, near_there, there)
         # Both counts in one number, won * 2^32 + lost, because sums cost more than look-ups.
-        counts = (count_slices(there & ~here).long() << 32) + count_slices(here & ~there)
+        counts = (count_slices(won).long() << 32) + count_slices(lost)
         sums.index_add_(0, (of_some[:, None] * num_candidates + column).view(-1), counts.view(-1))
     sums = sums.view(count, num_candidates)
     return sums >> 32, sums & 0xFFFFFFFF
 
 
-def _looks(sweeps: HeightSlicedSweeps, member: Tensor) -> Tuple[Tensor, Tensor]:
+def is_found_where_it_stands(sweeps: HeightSlicedSweeps, component: Tensor, motion: Tensor) -> Tensor:
+    """Which components have not moved as a whole, because nearly all of them is still where it was: a wall beside which
+    somebody walks.
+
+    Args:
+        sweeps: finest images and their P occupied pixels.
+        component: (P,) int64, component of each occupied pixel, M = none.
+        motion: (M, 2) float64, (y, x) finest pixels per sweep interval.
+
+    Returns:
+        (M,) bool: of the slices in looks that the motion takes at least four pixels, in y or in x, at least 97 per cent
+        are found within a pixel of where they stand. False without such looks.
+
+    Cost: a look-up for each pixel and sweep of what moves.
+    """
+    moves = motion.any(1)
+    pixel, other = looks(sweeps, flat_nonzero(F.pad(moves, (0, 1)).index_select(0, component)))
+    owner, window = component.index_select(0, pixel), sweeps.window.index_select(0, pixel)
+    k = sweeps.elapsed[window, sweeps.step.index_select(0, pixel)] - sweeps.elapsed[window, other]
+    move = (motion.index_select(0, owner) * k[:, None] + 0.5).floor_().abs().amax(1)
+    far = flat_nonzero(move >= _FARTHER)
+    pixel, other, owner, window = (values.index_select(0, far) for values in (pixel, other, owner, window))
+    row, col, own = (values.index_select(0, pixel) for values in (sweeps.row, sweeps.col, sweeps.slices))
+    near = sweeps.with_around.index_select(0, sweeps.index(window, other, row, col)) >> NUM_SLICES
+    zeros = torch.zeros_like(motion[:, 0], dtype=torch.int64)
+    total, found = (zeros.index_add(0, owner, count_slices(slices).long()) for slices in (own, own & near))
+    return (total > 0) & (100 * found >= _STILL_THERE * total)
+
+
+def looks(sweeps: HeightSlicedSweeps, member: Tensor) -> Tuple[Tensor, Tensor]:
     """(L,) int64 each: pixels that look at another sweep, and the sweep. Some (K,) int64 pixels are members."""
     step = sweeps.step.index_select(0, member)
     older = member.index_select(0, flat_nonzero(step > 0))

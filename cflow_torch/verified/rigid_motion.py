@@ -10,9 +10,10 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.model import Motion
-from cflow_torch.ops.indices import flat_nonzero
+from cflow_torch.ops.indices import flat_nonzero, split_index
 from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
+from cflow_torch.windows.collation import Batch
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,10 @@ class RigidMotion:
         """Objects that do not turn."""
         still = torch.zeros_like(flow)
         return cls(flow, still[:, 0], still)
+
+    def only(self, moves: Tensor) -> RigidMotion:
+        """The motion of some objects, (G,) bool; the others stand still."""
+        return RigidMotion(self.flow.masked_fill(~moves[:, None], 0.0), self.turn.masked_fill(~moves, 0.0), self.centre)
 
     def flow_at(self, which: Tensor, x: Tensor, y: Tensor) -> Tuple[Tensor, Tensor]:
         """x and y of the flow, metres per interval, of points of t (K,), by their object and their place in metres."""
@@ -73,6 +78,34 @@ class TurningMotion(Motion):
         return flow.float()
 
 
+def join(first: TurningMotion, second: TurningMotion, takes_second: Tensor, batch: Batch) -> TurningMotion:
+    """Two motions of the same points, one for each point. In a window the ids of the second follow those of the first,
+    in all sweeps: an object has one id wherever it is seen.
+
+    Args:
+        first, second: of L and M clusters; the result has L + 1 + M, since entry L stays "none" as well.
+        takes_second: (K,) bool, for the first K points of the batch, at least those of t+1 and t.
+        batch: of these points.
+    """
+    count = takes_second.numel()
+    window = split_index(batch.image[:count].long(), batch.num_steps)[0]
+    num_ids = torch.zeros(batch.num_windows, dtype=torch.int64, device=window.device)
+    num_ids.scatter_reduce_(0, window, 1 + first.cluster_id.index_select(0, first.cluster(slice(count))), "amax")
+    offset = torch.zeros_like(second.cluster_id)
+    offset.scatter_(0, second.cluster(slice(count)).long(), num_ids.index_select(0, window))
+    ids = second.cluster_id + offset.masked_fill_(second.cluster_id < 0, 0)
+    both = {
+        name: torch.cat((getattr(first, name), getattr(second, name)))
+        for name in ("flow", "score", "confidence", "turn", "centre")
+    }
+    return TurningMotion(
+        of_place=torch.cat((first.of_place, second.of_place + first.cluster_id.numel())),
+        place=torch.where(takes_second, second.place[:count] + first.of_place.numel(), first.place[:count]),
+        cluster_id=torch.cat((first.cluster_id, ids)),
+        **both,
+    )
+
+
 def motion_by_pixel(
     objects: Objects,
     rigid: RigidMotion,
@@ -91,7 +124,7 @@ def motion_by_pixel(
     of_pixel = F.pad(objects.of_pixel, (0, 1), value=objects.count)
     return TurningMotion(
         of_place=sweeps.number if is_numbered else sweeps.number_at_t(),
-        place=sweeps.place,
+        place=torch.where(sweeps.batch.has_result, sweeps.place, sweeps.image.numel() - 1),
         flow=F.pad(rigid.flow, (0, 1, 0, 1)).index_select(0, of_pixel) + 0.0,  # + 0.0 turns -0.0 into 0.0
         cluster_id=F.pad(ids, (0, 1), value=-1).index_select(0, of_pixel),
         score=F.pad(score.masked_fill(objects.of_pixel == objects.count, 0.0), (0, 1)),

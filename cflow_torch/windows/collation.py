@@ -26,13 +26,15 @@ class Batch:
     """Points of all sweeps of all windows, sweep by sweep: t+1 of every window, then t of every window, then t-1, ...,
     then t+2, t+3, ...
 
-    Points that do not take part (not finite, ground, the vehicle's own, outside the region) are left out, but for those
-    of pc0: all its rows are here, so that results are read off without being scattered.
+    Points that do not take part (not finite, ground, the vehicle's own, outside the images) are left out, but for those
+    of pc0: all its rows are here, so that results are read off without being scattered. The images may be larger than
+    the region: what lies in their margin takes part, but has no result.
 
     Args:
         positions: (A, P) float64, metres, frame of t+1 of the point's window; A = 2, x and y, where nothing asks for z,
             else 3.
         takes_part: (P,) bool, False = a row of pc0 that does not take part; its position means nothing.
+        has_result: (P,) bool, False = a row of pc0 that does not take part, or lies outside the region.
         image: (P,) int32, window * num_steps + step of each point; step 0 = sweep t+1, 1 = t, 2 = t-1, ...,
             steps of sweeps after t+1 stand behind those of the longest history.
         num_newest: number of points of t+1, the first ones; they are never warped.
@@ -41,6 +43,7 @@ class Batch:
         elapsed: (B, S) float64, sweep intervals from the sweep to t+1: the k that divides an estimate and
             scales a warp (0 for step 0 and for sweeps that a window lacks, negative for sweeps after t+1).
         seconds: (B, S) float64, the same in seconds, for `max_speed`.
+        origin: (B, S, 3) float64, metres, frame of t+1: where the ego frame of each sweep has its origin.
         sources: of each window, what its result is made of.
         ground: of the ground points of t and t+1; None = nothing asks.
         point_times: (P,) float32, sweep intervals from the instant of its sweep to the measurement of each point, whole
@@ -49,12 +52,14 @@ class Batch:
 
     positions: Tensor
     takes_part: Tensor
+    has_result: Tensor
     image: Tensor
     num_newest: int
     num_windows: int
     num_steps: int
     elapsed: Tensor
     seconds: Tensor
+    origin: Tensor
     sources: Tuple[Source, ...]
     ground: Optional[GroundHeights] = None
     point_times: Optional[Tensor] = None
@@ -69,10 +74,12 @@ class Batch:
             self,
             positions=self.positions.index_select(1, rows),
             takes_part=self.takes_part.index_select(0, rows),
+            has_result=self.has_result.index_select(0, rows),
             image=image.index_select(0, rows).int(),
             num_steps=kept.numel(),
             elapsed=self.elapsed.index_select(1, kept),
             seconds=self.seconds.index_select(1, kept),
+            origin=self.origin.index_select(1, kept),
             point_times=None if self.point_times is None else self.point_times.index_select(0, rows),
         )
 
@@ -103,8 +110,8 @@ def make_batch(
 
     Args:
         windows: B windows, at least one.
-        config: `ego_box`, `sweep_interval`; `num_history`, `num_future` bound what is accepted.
-        grid: the region; which of the scales it belongs to does not matter here.
+        config: `ego_box`, `sweep_interval`, `point_cloud_range`; `num_history`, `num_future` bound what is accepted.
+        grid: the images, which hold the region; which of the scales they belong to does not matter here.
         device: where the batch is to lie.
         num_axes: coordinates that are kept, 2 or 3.
         needs_ground: whether heights of the ground are kept as well.
@@ -124,6 +131,7 @@ def make_batch(
     first_future = 1 + max(len(sources) - count for sources, count in zip(kept, num_future))
     num_steps = first_future + max(num_future)
     elapsed, seconds = np.zeros((2, len(windows), num_steps))
+    origin = np.zeros((len(windows), num_steps, 3))
     sweeps: List[Tuple[int, int, str, Sweep]] = []
     for index, (window, sources, count) in enumerate(zip(windows, kept, num_future)):
         steps = [*range(1, 1 + len(sources) - count), *range(first_future, first_future + count)]
@@ -141,6 +149,8 @@ def make_batch(
     most = sum(sweep.points.shape[0] for _, _, _, sweep in sweeps)
     positions = torch.empty((num_axes, most), dtype=torch.float64, device=device)
     takes_part = torch.ones(most, dtype=torch.bool, device=device)
+    region = Grid(grid.pixel_size, config.point_cloud_range[:3], config.point_cloud_range[3:])
+    has_result = takes_part if region == grid else torch.ones_like(takes_part)
     image = torch.empty(most, dtype=torch.int32, device=device)
     has_times = [needs_times and has_point_times(window, sources) for window, sources in zip(windows, kept)]
     point_times = torch.zeros(most, dtype=torch.float32, device=device) if any(has_times) else None
@@ -150,6 +160,7 @@ def make_batch(
         if step > 0 and to_ego1[index] is not None:
             transform = to_ego1[index] @ rigid_transform(sweep.pose, f"pose of {name}", farthest)
             check_distance(transform, name)
+            origin[index, step] = transform[:3, 3]
         if step == 1:
             with torch.inference_mode(False):  # becomes part of the result
                 pose_flow = torch.zeros((sweep.points.shape[0], 3), dtype=torch.float32, device=device)
@@ -165,6 +176,8 @@ def make_batch(
                 points = slice(stop, stop + inside.numel())
                 positions[:, points] = moved[:num_axes]
                 takes_part[points] = inside
+                if has_result is not takes_part:
+                    torch.logical_and(inside, region.contains(moved), out=has_result[points])
                 if transform is not None:
                     _write_pose_flow(pose_flow[rows], raw, moved)
             else:
@@ -180,12 +193,14 @@ def make_batch(
     return Batch(
         positions=positions[:, :stop],
         takes_part=takes_part[:stop],
+        has_result=has_result[:stop],
         image=image[:stop],
         num_newest=num_newest,
         num_windows=len(windows),
         num_steps=num_steps,
         elapsed=torch.as_tensor(elapsed, device=device),
         seconds=torch.as_tensor(seconds, device=device),
+        origin=torch.as_tensor(origin, device=device),
         sources=tuple(of_pc0),
         ground=ground,
         point_times=None if point_times is None else point_times[:stop],

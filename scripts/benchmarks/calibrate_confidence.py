@@ -112,15 +112,16 @@ def _sums(result: FlowResult, truth: np.ndarray, counts: np.ndarray, num_bins: i
 def fit(sums: np.ndarray) -> List[float]:
     """Probability of each bin: share of right points, made monotone along each row of the table."""
     table = confidence.TABLE
-    sizes = [1, 1 + len(table["crowd"]), 1 + len(table["share"])] + 4 * [1 + len(table["margin"])]
+    sizes = [1, 1 + len(table["crowd"]), 1 + len(table["share"]), len(table["doubt"])] + 4 * [1 + len(table["margin"])]
     starts = np.cumsum([0, *sizes])
     result: List[float] = []
     for row, (start, end) in enumerate(zip(starts, starts[1:])):
         points, right = sums[start:end, POINTS], sums[start:end, RIGHT_ONES]
         prior = right.sum() / max(points.sum(), 1)
         share = (right + prior) / (points + 1)
-        rising = monotone(share if row != 1 else -share, points + 1)  # the more is unlinked, the worse
-        result += [round(abs(float(value)), 4) for value in rising]
+        is_falling = row in (1, 3)  # the more is unlinked, or speaks for a local motion, the worse
+        rising = monotone(-share if is_falling else share, points + 1)
+        result += [min(round(abs(float(value)), 4), 0.9999) for value in rising]  # nothing is certain
     return result
 
 

@@ -29,13 +29,13 @@ from cflow_torch.viz import plot_flow
 PICTURED = {
     "long_side": 0,
     "rail": 0,
-    "slow_person": 1,
     "touching": 0,
     "turning": 4,
     "fast": 2,
     "ground_left_in": 1,
     "wrong_frame": 0,
     "appearing": 0,
+    "bridge": 0,
 }
 SEEDS = (0, 1, 2, 3, 4)
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "pictures"

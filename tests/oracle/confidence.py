@@ -9,6 +9,7 @@ from typing import Any, Dict, List, Sequence, Tuple
 
 import cflow_torch
 from oracle.height_slices import Pixel, SlicedSweeps, Vector, count
+from oracle.paired_test import count_wins
 
 FILE = Path(cflow_torch.__file__).parent / "verified" / "confidence.json"
 TABLE: Dict[str, Any] = json.loads(FILE.read_text(encoding="utf-8"))
@@ -17,7 +18,7 @@ BLOCK = 1.6  # metres
 
 
 def confidences(
-    sweeps: SlicedSweeps, object_of: Dict[Pixel, int], flows: Sequence[Vector]
+    sweeps: SlicedSweeps, object_of: Dict[Pixel, int], flows: Sequence[Vector], doubt: Dict[Pixel, float]
 ) -> Tuple[Dict[Pixel, float], float]:
     """Probability of every pixel of t, and that of a point whose pixel was left out.
 
@@ -25,6 +26,7 @@ def confidences(
         sweeps: the window.
         object_of: object of each pixel that belongs to one.
         flows: (x, y) metres per interval of each object at its centre.
+        doubt: how much speaks for a local motion around a pixel; 0 where it is not named.
     """
     size = sweeps.pixel_size
     motions = [(y / size, x / size) for x, y in flows]
@@ -42,7 +44,12 @@ def confidences(
         if owner is None:
             place = table_place("unlinked", sum(number >= bound for bound in TABLE["crowd"]))
         elif owner not in margins:
-            place = table_place("still", sum(10 * found >= bound * number for bound in TABLE["share"]))
+            doubts = sum(doubt.get(pixel, 0.0) >= bound for bound in TABLE["doubt"])
+            place = (
+                table_place("doubt", doubts - 1)
+                if doubts
+                else table_place("still", sum(10 * found >= bound * number for bound in TABLE["share"]))
+            )
         else:
             x, y = (c + 0.5) * size + sweeps.lower[0], (r + 0.5) * size + sweeps.lower[1]
             is_far = x * x + y * y >= TABLE["far"] ** 2
@@ -65,31 +72,36 @@ def neighbourhoods(
 
 
 def margin_bin(sweeps: SlicedSweeps, members: Sequence[Pixel], motion: Vector) -> int:
-    """Bin of what an object's motion loses by being displaced by 0.4 m per interval, the best of four ways."""
+    """Bin of what an object's motion loses by being displaced by 0.4 m per interval, the best of four ways.
+
+    In standard deviations of what it finds: what it has more than standing still, and what is found where it stands.
+    0 for what stands still.
+    """
+    if not any(motion):
+        return 0
     off = DISPLACEMENT / sweeps.pixel_size
-    found, *displaced = (
-        found_again(sweeps, members, (motion[0] + y, motion[1] + x))
+    counts = [
+        count_wins(sweeps, members, (motion[0] + y, motion[1] + x))
         for y, x in ((0.0, 0.0), (off, 0.0), (-off, 0.0), (0.0, off), (0.0, -off))
-    )
-    gain = found - max(displaced)
+    ]
+    surplus, *displaced = (won - lost for won, lost in counts)
+    gain, found = surplus - max(displaced), surplus + found_where_it_stands(sweeps, members)
     return sum(gain > 0 and gain**2 >= bound**2 * found for bound in TABLE["margin"])
 
 
-def found_again(sweeps: SlicedSweeps, members: Sequence[Pixel], motion: Vector) -> int:
-    """Slices of an object that another sweep has where the motion takes them: m looks at t+1 and t+1 at m."""
-    found = 0
-    for m, r, c in members:
-        for other in [0] if m > 0 else range(1, len(sweeps.images)):
-            k = sweeps.elapsed[m] - sweeps.elapsed[other]
-            dy, dx = (math.floor(f * k + 0.5) for f in motion)
-            found += count(sweeps.at(m, r, c) & sweeps.at(other, r + dy, c + dx))
-    return found
+def found_where_it_stands(sweeps: SlicedSweeps, members: Sequence[Pixel]) -> int:
+    """Slices of an object that another sweep has at the same place: m looks at t+1 and t+1 at m."""
+    return sum(
+        count(sweeps.at(m, r, c) & sweeps.at(other, r, c))
+        for m, r, c in members
+        for other in ([0] if m > 0 else range(1, len(sweeps.images)))
+    )
 
 
 def table_place(kind: str, bin_of_kind: int, has_history: bool = False, is_far: bool = False) -> int:
-    """Place in the table, whose kinds are "left out", "unlinked", "still", "moving" (which has four parts)."""
-    sizes: List[int] = [1, 1 + len(TABLE["crowd"]), 1 + len(TABLE["share"])]
-    start = sum(sizes[: ["left out", "unlinked", "still", "moving"].index(kind)])
+    """Place in the table, whose kinds are "left out", "unlinked", "still", "doubt", "moving" (which has four parts)."""
+    sizes: List[int] = [1, 1 + len(TABLE["crowd"]), 1 + len(TABLE["share"]), len(TABLE["doubt"])]
+    start = sum(sizes[: ["left out", "unlinked", "still", "doubt", "moving"].index(kind)])
     return start + bin_of_kind + (2 * has_history + is_far) * (1 + len(TABLE["margin"]))
 
 

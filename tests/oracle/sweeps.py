@@ -20,6 +20,7 @@ class Cloud(NamedTuple):
         seconds: the same in seconds.
         times: (N,) float64, sweep intervals from the instant of the sweep to each point, whole 2^-20; None = a sweep of
             the window has none.
+        origin: (x, y, z), metres, frame of t+1: where the ego frame of the sweep has its origin.
     """
 
     points: np.ndarray
@@ -27,6 +28,7 @@ class Cloud(NamedTuple):
     intervals: float
     seconds: float
     times: Optional[np.ndarray] = None
+    origin: Tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 class PointMotion(NamedTuple):
@@ -78,7 +80,8 @@ def compensate(window: Window, config: Config) -> Tuple[List[Cloud], Cloud]:
             gap, first_gap = stamps[0] - stamps[m + 1], stamps[0] - stamps[1]  # type: ignore[operator]
             intervals, seconds = gap / first_gap, gap / 1e9
         times = _point_times(sweep, interval) if has_times else None
-        clouds.append(Cloud(_in_frame_of(window.pc1, sweep), _takes_part(sweep, config), intervals, seconds, times))
+        moved, keeps = _in_frame_of(window.pc1, sweep), _takes_part(sweep, config)
+        clouds.append(Cloud(moved, keeps, intervals, seconds, times, _origin(window.pc1, sweep)))
     times = _point_times(window.pc1, interval) if has_times else None
     return clouds, Cloud(xyz(window.pc1), _takes_part(window.pc1, config), 0.0, 0.0, times)
 
@@ -111,6 +114,13 @@ def _in_frame_of(sweep1: Sweep, sweep: Sweep) -> np.ndarray:
     for axis, (r_x, r_y, r_z, translation) in enumerate(T_ego1_ego[:3]):
         moved[finite, axis] = ((r_x * x + r_y * y) + r_z * z) + translation
     return moved
+
+
+def _origin(sweep1: Sweep, sweep: Sweep) -> Tuple[float, float, float]:
+    if sweep.pose is None or sweep1.pose is None:
+        return 0.0, 0.0, 0.0
+    x, y, z = (np.linalg.inv(as_numpy(sweep1.pose, np.float64)) @ as_numpy(sweep.pose, np.float64))[:3, 3].tolist()
+    return x, y, z
 
 
 def _is_repeat(sweep: Sweep, newer: Sweep) -> bool:

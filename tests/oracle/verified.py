@@ -1,11 +1,11 @@
 """The verified method: components at several pixel sizes, motion candidates, the paired test, registration.
 
-Order of reading: verified_flow -> verify_level -> `candidates`, `paired_test`; then settle.
+Order of reading: verified_flow -> estimate -> look -> verify_level -> `candidates`, `paired_test`; then `refinement`.
 """
 
 from __future__ import annotations
 
-from itertools import product
+import math
 from typing import Dict, List, NamedTuple, Optional, Sequence, Tuple
 
 import numpy as np
@@ -14,17 +14,17 @@ from cflow_torch.config import VerifiedConfig
 from oracle.aperture import slides_along_itself
 from oracle.candidates import find_peak, keypoint_motion, keypoint_shifts, list_motions
 from oracle.component_tree import Level, equals_parent, find_components, parents, winners
-from oracle.confidence import confidences
-from oracle.deskewing import register_deskewed
+from oracle.confidence import confidences, margin_bin
 from oracle.ground_residue import ground_heights, is_residue
 from oracle.height_slices import Pixel, SlicedSweeps, Vector, slice_image
-from oracle.paired_test import best_candidate, count_wins, evidence_of
+from oracle.layers import points_of_lower_layers
+from oracle.local_motion import find_local_motion
+from oracle.offline import Estimate, best_nearby, by_side
+from oracle.paired_test import best_candidate, count_wins, evidence_of, is_found_where_it_stands
 from oracle.pixels import in_range, project_bev
-from oracle.rigid_registration import RigidMotion, register
-from oracle.slow_motion import NUM_LAYERS, leans, slow_motion
-from oracle.subpixel_shift import shift_between_pixels
+from oracle.refinement import settle
+from oracle.rigid_registration import RigidMotion
 from oracle.sweeps import Cloud, PointMotion
-from oracle.voxel_centroids import points_of_objects
 
 
 class VerifiedLevel(NamedTuple):
@@ -43,6 +43,26 @@ class VerifiedLevel(NamedTuple):
     scores: List[float]
 
 
+class Found(NamedTuple):
+    """What a look at some points finds.
+
+    Attributes:
+        owners: of each sweep, t+1 first, (N,) int64, object of each point, -1 = none.
+        rigid: motion of each object.
+        scores: of sweep t, (N,) float64, as in `VerifiedLevel`; 0 without an object.
+        confidence: of sweep t, (N,) float64.
+    """
+
+    owners: List[np.ndarray]
+    rigid: List[RigidMotion]
+    scores: np.ndarray
+    confidence: np.ndarray
+
+    def moves(self, m: int) -> np.ndarray:
+        """(N,) bool, points of a sweep whose object moves."""
+        return np.array([i >= 0 and any(self.rigid[i].flow) for i in self.owners[m].tolist()], dtype=bool)
+
+
 def verified_flow(
     clouds: Sequence[Cloud], cloud1: Cloud, ground: Sequence[np.ndarray], config: VerifiedConfig
 ) -> PointMotion:
@@ -53,61 +73,102 @@ def verified_flow(
         cloud1: sweep t+1.
         ground: (N, 3) float64, metres, frame of t+1, ground points of t and t+1 where they are known.
     """
+    is_inside = in_range(clouds[0].points, config)
+    config = with_margin(config)
     past = [cloud for cloud in clouds if cloud.intervals > 0]
-    first, shown = flow_by(past, cloud1, ground, config)
+    before = estimate([cloud1, *past], ground, is_inside, config)
     if len(past) == len(clouds):
-        return first
-    future = [clouds[0], *(cloud for cloud in clouds if cloud.intervals < 0)]
-    return by_side(first, shown, *flow_by(future, cloud1, ground, config))
+        return before.motion
+    future = [cloud for cloud in clouds if cloud.intervals < 0]
+    return by_side(before, estimate([cloud1, clouds[0], *future], ground, is_inside, config))
 
 
-def by_side(first: PointMotion, shown: List[int], second: PointMotion, shown_after: List[int]) -> PointMotion:
-    """Each point goes by the side after t+1 if that shows its object more than twice as often as the other does.
+def estimate(
+    clouds: Sequence[Cloud], ground: Sequence[np.ndarray], is_inside: np.ndarray, config: VerifiedConfig
+) -> Estimate:
+    """The motion of every point of sweep t by some sweeps, t+1 first; points of t that are not inside have none.
 
-    Args:
-        first, second: by the sweeps before t, by those after t+1.
-        shown, shown_after: of each point, how many sweeps of that side show its object; 0 if it has none.
+    With thorough settings the lower layers of what is at rest are looked at once more; what that moves goes by it.
 
-    Convention: ids of the second go on after those of the first.
+    Convention: ids of the second look go on after those of the first that points of any sweep have.
     """
-    chosen = [(second if after > 2 * before else first) for before, after in zip(shown, shown_after)]
-    ids_after = second.cluster_id + (second.cluster_id >= 0) * (first.cluster_id.max(initial=-1) + 1)
-    flow, ids, scores, trust = (
-        np.array([values[motion is second][i] for i, motion in enumerate(chosen)])
-        for values in (
-            (first.flow[0], second.flow[0]),
-            (first.cluster_id, ids_after),
-            (first.score, second.score),
-            (first.confidence, second.confidence),
-        )
-    )
-    return PointMotion([flow.reshape(-1, 3)], ids.astype(np.int64), scores, trust)
-
-
-def flow_by(
-    clouds: Sequence[Cloud], cloud1: Cloud, ground: Sequence[np.ndarray], config: VerifiedConfig
-) -> Tuple[PointMotion, List[int]]:
-    """The motion of every point of sweep t by the sweeps given, and how many beside t and t+1 show its object."""
     size = config.pixel_sizes[-1]
-    drawn = [cloud.takes_part & in_range(cloud.points, config) for cloud in (cloud1, *clouds)]
+    seen = [cloud.takes_part & in_range(cloud.points, config) for cloud in clouds]
+    drawn = [keep.copy() for keep in seen]
     if config.min_height is not None:
         means = ground_heights(ground, config)
-        for cloud, keep in zip((cloud1, *clouds), drawn):
+        for cloud, keep in zip(clouds, drawn):
             keep[keep] = ~is_residue(cloud.points[keep], means, config.min_height, config)
-    points = [cloud.points[keep] for cloud, keep in zip((cloud1, *clouds), drawn)]
+    scales = [(round(s / size), False) for s in config.pixel_sizes] + [(1, True)] * config.thorough
+    found = look(clouds, drawn, seen, scales, config)
+    first = has_result(found, is_inside)
+    owners, takes_second, second = first.owners, np.zeros(len(is_inside), dtype=bool), None
+    if config.thorough:
+        at_rest = [keep & ~found.moves(m) for m, keep in enumerate(drawn)]
+        lower = [np.zeros_like(keep) for keep in drawn]
+        of_drawn = points_of_lower_layers(
+            [cloud.points[keep] for cloud, keep in zip(clouds, drawn)],
+            [rest[keep].tolist() for rest, keep in zip(at_rest, drawn)],
+            config,
+        )
+        for keep, of_sweep, wanted in zip(drawn, lower, of_drawn):
+            of_sweep[keep] = wanted
+        second = has_result(look(clouds, lower, None, [(1, False), (1, True)], config), is_inside)
+        num_ids = 1 + max(own.max(initial=-1) for own in owners)
+        owners = [np.where(second.moves(m), num_ids + second.owners[m], own) for m, own in enumerate(owners)]
+        takes_second = second.moves(1)
+
+    of_t, flow = clouds[1].points, np.zeros((len(is_inside), 3))
+    for i in np.flatnonzero(owners[1] >= 0).tolist():
+        chosen = second if second is not None and takes_second[i] else first
+        flow[i, :2] = chosen.rigid[chosen.owners[1][i]].flow_at(*of_t[i, :2].tolist())
+    scores, confidence = first.scores, first.confidence
+    if second is not None:
+        scores = np.where(takes_second, second.scores, scores)
+        confidence = np.where(takes_second, second.confidence, confidence)
+    shows = [set(own.tolist()) for own in owners[2:]]
+    shown = [sum(own in of_sweep for of_sweep in shows) if own >= 0 else 0 for own in owners[1].tolist()]
+    ids = max(own.max(initial=-1) for own in owners[:2])
+    return Estimate(PointMotion([flow], owners[1], scores, confidence), shown, 1 + int(ids))
+
+
+def has_result(found: Found, is_inside: np.ndarray) -> Found:
+    """The same for the points of t that are inside; the others have no object."""
+    newest, of_t, *others = found.owners
+    of_t = np.where(is_inside, of_t, -1)
+    return found._replace(owners=[newest, of_t, *others], scores=np.where(of_t >= 0, found.scores, 0.0))
+
+
+def look(
+    clouds: Sequence[Cloud],
+    drawn: Sequence[np.ndarray],
+    seen: Optional[Sequence[np.ndarray]],
+    scales: Sequence[Tuple[int, bool]],
+    config: VerifiedConfig,
+) -> Found:
+    """What some points do, found at some scales. What could as well be displaced stands still.
+
+    Args:
+        clouds: of the sweeps, t+1 first.
+        drawn: of each sweep (N,) bool, the points.
+        seen: of each sweep (N,) bool, the same with the ground's residue; None = neither key points nor local motion
+            are asked, as in a second look.
+        scales: of each level finest pixels a side, and whether its components are undilated.
+    """
+    size = config.pixel_sizes[-1]
+    points = [cloud.points[keep] for cloud, keep in zip(clouds, drawn)]
     times = None
-    if cloud1.times is not None:
-        times = [cloud.times[keep] for cloud, keep in zip((cloud1, *clouds), drawn)]  # type: ignore[index]
+    if clouds[0].times is not None:
+        times = [cloud.times[keep] for cloud, keep in zip(clouds, drawn)]  # type: ignore[index]
     sweeps = SlicedSweeps(
         [slice_image(of_sweep, config) for of_sweep in points],
-        [cloud.intervals for cloud in (cloud1, *clouds)],
-        [cloud.seconds for cloud in (cloud1, *clouds)],
+        [cloud.intervals for cloud in clouds],
+        [cloud.seconds for cloud in clouds],
         size,
         config.point_cloud_range[:2],  # type: ignore[arg-type]
     )
-    shifts = keypoint_shifts(sweeps, config) if config.thorough else None
+    shifts = keypoint_shifts(sweeps, config) if config.thorough and seen is not None else None
     levels: List[VerifiedLevel] = []
-    scales = [(round(s / size), False) for s in config.pixel_sizes] + [(1, True)] * config.thorough
     for block, is_undilated in scales:
         level = find_components(sweeps, block, is_undilated, config)
         levels.append(verify_level(sweeps, level, is_undilated, levels[-1] if levels else None, shifts, config))
@@ -123,33 +184,36 @@ def flow_by(
             best_nearby(sweeps, [pixel for pixel, owner in object_of.items() if owner == i], motion, config)
             for i, motion in enumerate(motions)
         ]
-    rigid, seen = settle(sweeps, motions, may_creep, object_of, points, config, times)
-    trust, of_left_out = confidences(sweeps, object_of, [motion.flow for motion in seen])
+    doubt: Dict[Pixel, float] = {}
+    if config.thorough and seen is not None and len(clouds) > 2:  # with history nothing creeps
+        in_sight = [cloud.points[keep] for cloud, keep in zip(clouds, seen)]
+        origins = [cloud.origin for cloud in clouds]
+        object_of, motions, doubt = find_local_motion(sweeps, object_of, motions, points, in_sight, origins, config)
+        may_creep = [False] * len(motions)
+    rigid, shown = settle(sweeps, motions, may_creep, object_of, points, config, times)
+    trust, of_left_out = confidences(sweeps, object_of, [motion.flow for motion in shown], doubt)
+    for i, motion in enumerate(shown if config.thorough else []):
+        members = [pixel for pixel, owner in object_of.items() if owner == i]
+        if margin_bin(sweeps, members, (motion.flow[1] / size, motion.flow[0] / size)) == 0:
+            rigid[i] = rigid[i]._replace(flow=(0.0, 0.0), turn=0.0)
 
-    num_points, score_of = len(clouds[0].points), dict(zip(sweeps.pixels(), levels[-1].scores))
-    flow, ids, scores = np.zeros((num_points, 3)), np.full(num_points, -1, dtype=np.int64), np.zeros(num_points)
-    confidence, shown = np.full(num_points, of_left_out), [0] * num_points
-    shown_in = [{m for (m, _, _), owner in object_of.items() if owner == i and m > 1} for i in range(len(chosen))]
-    rows = np.flatnonzero(drawn[1])
-    for i, (r, c) in zip(rows.tolist(), project_bev(clouds[0].points[rows], config, size).tolist()):
-        confidence[i] = trust[1, r, c]
-        if (1, r, c) in object_of:
-            ids[i], scores[i] = object_of[1, r, c], score_of[1, r, c]
-            flow[i, :2] = rigid[ids[i]].flow_at(*clouds[0].points[i, :2].tolist())
-            shown[i] = len(shown_in[ids[i]])
-    return PointMotion([flow], ids, scores, confidence), shown
+    owners = [np.full(len(cloud.points), -1, dtype=np.int64) for cloud in clouds]
+    score_of = dict(zip(sweeps.pixels(), levels[-1].scores))
+    scores, confidence = np.zeros(len(owners[1])), np.full(len(owners[1]), of_left_out)
+    for m, (cloud, keep) in enumerate(zip(clouds, drawn)):
+        rows = np.flatnonzero(keep)
+        for i, (r, c) in zip(rows.tolist(), project_bev(cloud.points[rows], config, size).tolist()):
+            owners[m][i] = object_of.get((m, r, c), -1)
+            if m == 1:
+                scores[i], confidence[i] = score_of[1, r, c], trust[1, r, c]
+    return Found(owners, rigid, scores, confidence)
 
 
-def best_nearby(sweeps: SlicedSweeps, members: Sequence[Pixel], motion: Vector, config: VerifiedConfig) -> Vector:
-    """The motion of most evidence within two pixels of that of an object; of equals the nearest, then the first."""
-    offsets = sorted(product(range(-2, 3), repeat=2), key=lambda offset: offset[0] ** 2 + offset[1] ** 2)
-    found = [(motion[0] + dy, motion[1] + dx) for dy, dx in offsets]
-    if not any(motion):
-        return motion
-    best, most = best_candidate(
-        [evidence_of(*count_wins(sweeps, members, one), config.significance) for one in found], found
-    )
-    return best if most > 0 else motion
+def with_margin(config: VerifiedConfig) -> VerifiedConfig:
+    """The settings with the region that is looked at: all around larger by whole coarsest pixels, at least 4 m."""
+    wide = math.ceil(4.0 / config.pixel_sizes[0]) * config.pixel_sizes[0]
+    x0, y0, z0, x1, y1, z1 = config.point_cloud_range
+    return config.replace(point_cloud_range=(x0 - wide, y0 - wide, z0, x1 + wide, y1 + wide, z1))
 
 
 def verify_level(
@@ -188,56 +252,12 @@ def verify_level(
         values = [0] * len(found)
         if not level.too_long[i]:
             values = [evidence_of(*count_wins(sweeps, members, motion), config.significance) for motion in found]
-        if config.thorough:
+        if config.thorough and not level.travels[i]:
             slides = slides_along_itself(sweeps, members, found)
             values = [0 if slid else value for slid, value in zip(slides, values)]
         motion, most = best_candidate(values, found)
+        if is_found_where_it_stands(sweeps, members, motion):
+            motion, most = (0.0, 0.0), 0
         motions.append(motion)
         evidence.append(most)
     return VerifiedLevel(level, motions, evidence, list(scores.values()))
-
-
-def settle(
-    sweeps: SlicedSweeps,
-    motions: Sequence[Vector],
-    may_creep: Sequence[bool],
-    object_of: Dict[Pixel, int],
-    clouds: Sequence[np.ndarray],
-    config: VerifiedConfig,
-    times: Optional[Sequence[np.ndarray]] = None,
-) -> Tuple[List[RigidMotion], List[RigidMotion]]:
-    """Where objects have gone in metres, between the pixels, and where the images show them to have gone.
-
-    Args:
-        sweeps: the window.
-        motions: of each object (y, x), finest pixels per sweep interval.
-        may_creep: of each object, whether it may move slowly if it has not moved so far.
-        object_of: object of each pixel that belongs to one.
-        clouds: (N, 3) float64 of t+1, t, t-1, ..., the points that are drawn.
-        times: (N,) of each of them, sweep intervals; None = there are none.
-
-    Convention: only pairs of sweeps have slow motion, as with history slow objects leave their pixels, and are shifted
-        between the pixels, as with history one of many sweeps would decide.
-    """
-    size, is_pair = sweeps.pixel_size, len(sweeps.images) == 2
-    if not config.thorough:
-        moved = [RigidMotion((x * size, y * size), 0.0, (0.0, 0.0)) for y, x in motions]
-        return moved, moved
-    slow: List[Optional[Vector]] = [None] * len(motions)
-    if is_pair:
-        members: List[List[Pixel]] = [[] for _ in motions]
-        for pixel, owner in object_of.items():
-            members[owner].append(pixel)
-        asked = [
-            may and not any(motion) and leans(sweeps, own) for may, motion, own in zip(may_creep, motions, members)
-        ]
-        cubes = points_of_objects(asked, object_of, clouds, config, size, NUM_LAYERS)
-        slow = slow_motion(cubes, len(motions), sweeps)
-    points = points_of_objects([any(motion) for motion in motions], object_of, clouds, config, times=times)
-    if is_pair:
-        motions = shift_between_pixels(points, motions, sweeps)
-        points = [point for point in points if any(motions[point.owner])]
-    start = [(x * size, y * size) for y, x in motions]
-    found = register(points, start, sweeps)
-    seen = [motion if flow is None else motion._replace(flow=flow) for motion, flow in zip(found, slow)]
-    return (seen if times is None else register_deskewed(points, start, seen, sweeps, config)), seen

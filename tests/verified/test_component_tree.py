@@ -74,7 +74,7 @@ def as_level(labels: List[int]) -> Level:
     nothing = torch.zeros(0, dtype=torch.int64)
     clusters = Clusters(torch.zeros(count), nothing, nothing, Pixels(nothing, nothing, nothing, nothing))
     component = torch.tensor([label if label >= 0 else count for label in labels], dtype=torch.int64)
-    return Level(1, False, nothing, clusters, component, torch.zeros(count, dtype=torch.bool))
+    return Level(1, False, nothing, clusters, component, *torch.zeros((2, count), dtype=torch.bool))
 
 
 def numbered(labels: List[int]) -> List[int]:

@@ -28,13 +28,14 @@ def numbered(monkeypatch):
 def test_the_table_is_monotone_and_the_oracle_reads_it():
     assert oracle.TABLE == confidence.TABLE
     table, start, rows = confidence.TABLE, 1, []
-    for bounds in ("crowd", "share", *4 * ("margin",)):
-        rows.append(table["probabilities"][start : start + 1 + len(table[bounds])])
-        start += len(rows[-1])
+    for bounds in ("crowd", "share", "doubt", *4 * ("margin",)):
+        length = len(table[bounds]) + (bounds != "doubt")
+        rows.append(table["probabilities"][start : start + length])
+        start += length
     assert start == len(table["probabilities"]) and all(0 < p < 1 for p in table["probabilities"])
-    unlinked, *others = rows
-    assert unlinked == sorted(unlinked, reverse=True) and unlinked[0] > unlinked[-1]
-    assert all(row == sorted(row) and row[0] < row[-1] for row in others)
+    unlinked, still, doubt, *moving = rows
+    assert all(row == sorted(row, reverse=True) and row[0] > row[-1] for row in (unlinked, doubt))
+    assert all(row == sorted(row) and row[0] < row[-1] for row in (still, *moving))
 
 
 def test_every_bin_equals_the_oracle(numbered):

@@ -10,7 +10,7 @@ import pytest
 import torch
 from oracle.component_tree import with_longest
 from oracle.height_slices import SlicedSweeps
-from oracle.verified import best_nearby as best_nearby_of_oracle
+from oracle.offline import best_nearby as best_nearby_of_oracle
 from scenes import (
     assert_same,
     assert_same_bits,

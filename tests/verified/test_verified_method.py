@@ -25,7 +25,7 @@ from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.hdf5.reader import HDF5Log
 from cflow_torch.data.log import window as window_of
 
-NEAR = (-12.0, -8.0, -math.inf, 0.0, 4.0, math.inf)  # the whole takes the oracle minutes
+NEAR = (-9.0, -5.0, -math.inf, -3.0, 1.0, math.inf)  # the whole takes the oracle minutes
 
 
 # ------------------------------------------------------------------------------------------- equal to the oracle
