@@ -6,17 +6,19 @@ so far is tested at a grid of small velocities, all at once, over squares as wid
 
 from __future__ import annotations
 
+import math
 from typing import List, NamedTuple, Tuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from cflow_torch.ops.indices import divide, flat_nonzero
+from cflow_torch.ops.indices import divide, flat_nonzero, split_index
 from cflow_torch.ops.labeling import connected_components
+from cflow_torch.ops.segments import segment_amin
 from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import NUM_SLICES, HeightSlicedSweeps
-from cflow_torch.verified.local_evidence import Looks, at_newest, look, wins
+from cflow_torch.verified.local_evidence import Looks, Trials, look, try_all
 from cflow_torch.verified.paired_test import VerifiedLevel, evidence_of
 
 _STEP, _REACH = 0.1, 3  # metres per sweep interval between velocities; steps to the fastest one
@@ -25,7 +27,6 @@ _CELL = 0.3  # metres; won and lost are summed over 3 x 3 cells
 _SEED_Z = 6  # standard deviations of noise that such a square must show
 _LEAST_WON = 4  # slices; a square that wins fewer is not looked at
 _Z = 4.0  # standard deviations of noise that a group as a whole is granted
-_LOW = (1 << 32) - 1  # the lower half of a number that holds two counts
 _UPRIGHT = 3  # height slices that it must have: rings of beams on a bonnet or a roof move as well
 
 
@@ -42,11 +43,14 @@ class _Best(NamedTuple):
     best: Tensor
     z: Tensor
 
+    def cell(self, window: Tensor, row: Tensor, col: Tensor) -> Tensor:
+        """The cell of pixels, counted through all windows; int64 of one shape."""
+        _, rows, cols = self.z.shape
+        return (window * rows + divide(row, self.side)) * cols + divide(col, self.side)
+
     def at(self, window: Tensor, row: Tensor, col: Tensor) -> Tensor:
         """(P,) float64: z at pixels, (P,) int64 each."""
-        _, rows, cols = self.z.shape
-        cell = (window * rows + divide(row, self.side)) * cols + divide(col, self.side)
-        return self.z.view(-1).index_select(0, cell)
+        return self.z.view(-1).index_select(0, self.cell(window, row, col))
 
     def only(self, wanted: Tensor) -> _Best:
         """Those of some cells, (B, rows, cols) bool."""
@@ -72,7 +76,8 @@ def find_local_motion(
         Velocities are whole steps of 0.1 m per interval, at most 0.3 m long, in raster order; of equals the first. What
         a pixel wins or loses counts where its velocity takes it at t+1.
 
-    Cost: 28 look-ups for each pixel at rest and sweep, and a range image of each sweep.
+    Cost: 28 look-ups for each pixel at rest and sweep that finds something new, or is near to what does; a range image
+    of each sweep.
     """
     at_rest = ~F.pad(motion.any(1), (0, 1)).index_select(0, objects.of_pixel)
     has_history = ((sweeps.elapsed != 0).sum(1) > 1).index_select(0, sweeps.window)
@@ -81,15 +86,18 @@ def find_local_motion(
         return objects, motion, torch.zeros_like(sweeps.row, dtype=torch.float64)
     velocities = _velocities(sweeps)
     found = look(sweeps, members)
-    around = _find_best(sweeps, found, velocities)
+    side = max(1, round(_CELL / sweeps.grid.pixel_size))
+    tried = try_all(sweeps, found.take(_near_winners(sweeps, found, velocities, side)), velocities)
+    around = _find_best(sweeps, tried, velocities, side)
     doubt = around.at(sweeps.window, sweeps.row, sweeps.col)
     seeds = around.only(around.z >= _SEED_Z)
     if not bool((seeds.best >= 0).any()):
         return objects, motion, doubt
-    group, of_group = _groups(sweeps, found, velocities, seeds)
+    group, of_group = _groups(sweeps, tried, seeds)
     candidates = velocities.index_select(0, of_group)
-    won, lost = _wins_of_groups(sweeps, found, group, candidates)
-    moves = (evidence_of(won, lost, _Z) > 0) & (_num_slices(sweeps, group, len(candidates)) >= _UPRIGHT)
+    moves = (evidence_of(*_wins_of_groups(tried, group, of_group), _Z) > 0) & (
+        _num_slices(sweeps, group, len(candidates)) >= _UPRIGHT
+    )
     num_components = sum(level.level.num_components for level in levels)
     of_component = F.pad(candidates, (0, 0, num_components, 0)).index_copy_(0, objects.component, motion)
     objects = objects.split(group, moves, num_components)
@@ -117,64 +125,69 @@ def _is_of_walker(sweeps: HeightSlicedSweeps, velocities: Tensor) -> Tensor:
     )
 
 
-def _cell(sweeps: HeightSlicedSweeps, some: Looks, velocity: Tensor, seeds: _Best) -> Tensor:
-    """(L,) int64: cell, counted through all windows, where a velocity, (2,) float64, takes each pixel at t+1."""
-    row, col = (divide(values, seeds.side) for values in at_newest(sweeps, some, velocity))
-    _, rows, cols = seeds.best.shape
-    return (some.window * rows + row) * cols + col
+def _near_winners(sweeps: HeightSlicedSweeps, found: Looks, velocities: Tensor, side: int) -> Tensor:
+    """(K,) int64: looks that may count in a cell that wins enough. Few find anything new; of these alone it is asked
+    first where they are taken."""
+    new = found.take(flat_nonzero(found.own & ~found.here))
+    sums = _sums_around(sweeps, try_all(sweeps, new, velocities), side)
+    wins = (sums >= _LEAST_WON << 16).any(0)
+    farthest = float(sweeps.elapsed.abs().amax()) * _REACH * _STEP / sweeps.grid.pixel_size
+    reach = int(farthest / side) + 2
+    near = wins[:, None].float()
+    for size in ((2 * reach + 1, 1), (1, 2 * reach + 1)):
+        near = F.max_pool2d(near, size, 1, (size[0] // 2, size[1] // 2))
+    _, _, rows, cols = near.shape
+    row, col = divide(found.row, side) + 1, divide(found.col, side) + 1
+    return flat_nonzero(near.view(-1).index_select(0, (found.window * rows + row) * cols + col))
 
 
-def _find_best(sweeps: HeightSlicedSweeps, found: Looks, velocities: Tensor) -> _Best:
+def _sums_around(sweeps: HeightSlicedSweeps, tried: Trials, side: int) -> Tensor:
+    """(V, B, rows + 2, cols + 2) int32, won * 2^16 + lost in the 3 x 3 cells around each; of the free cells around the
+    images it means nothing."""
+    says = flat_nonzero(tried.won | tried.lost)
+    look, velocity = split_index(says, tried.won.shape[1])
+    row, col, won, lost = (
+        values.view(-1).index_select(0, says) for values in (tried.row, tried.col, tried.won, tried.lost)
+    )
+    rows, cols = (-(-size // side) + 2 for size in (sweeps.grid.height, sweeps.grid.width))
+    image = velocity * sweeps.num_windows + tried.looks.window.index_select(0, look)
+    cell = (image * rows + divide(row, side) + 1) * cols + divide(col, side) + 1
+    counts = (won.int() << 16) + lost
+    shape = (tried.won.shape[1], sweeps.num_windows, rows, cols)
+    sums = torch.zeros(math.prod(shape), dtype=torch.int32, device=cell.device)
+    for offset in (down * cols + right for down in (-1, 0, 1) for right in (-1, 0, 1)):
+        sums.index_add_(0, cell + offset, counts)
+    return sums.view(shape)
+
+
+def _find_best(sweeps: HeightSlicedSweeps, tried: Trials, velocities: Tensor, side: int) -> _Best:
     """Of each cell the best velocity of the 3 x 3 cells around; of equals the first cell.
 
     What is best in a cell counts only if it is believed, see `_is_of_walker`.
     """
-    side = max(1, round(_CELL / sweeps.grid.pixel_size))
-    shape = (sweeps.num_windows, -(-sweeps.grid.height // side), -(-sweeps.grid.width // side))
-    own = _Best(
-        side,
-        torch.full(shape, -1, dtype=torch.int64, device=velocities.device),
-        torch.zeros(shape, dtype=torch.float64, device=velocities.device),
-    )
-    best, best_z = own.best.view(-1), own.z.view(-1)
-    for index, velocity in enumerate(velocities):
-        won, lost = wins(sweeps, found, velocity)
-        counts = (won.long() << 32) + lost  # both in one number: sums cost more than look-ups
-        says = flat_nonzero((won | lost).bool())
-        at = _cell(sweeps, found, velocity, own).index_select(0, says)
-        sums = torch.zeros_like(best).index_add_(0, at, counts.index_select(0, says))
-        sums = _sum_around(sums.view(shape)).view(-1)
-        cell = flat_nonzero(sums >= _LEAST_WON << 32)
-        sums = sums.index_select(0, cell)
-        surplus, noise = ((sums >> 32) - (sums & _LOW)).double(), ((sums >> 32) + (sums & _LOW)).double()
-        z = surplus / torch.sqrt(noise)
-        better = flat_nonzero(z > best_z.index_select(0, cell))
-        cell = cell.index_select(0, better)
-        best.index_fill_(0, cell, index)
-        best_z.index_copy_(0, cell, z.index_select(0, better))
-    cell = flat_nonzero(best >= 0)
-    window = divide(cell, shape[1] * shape[2])
-    is_believed = _is_of_walker(sweeps, velocities)[window, best.index_select(0, cell)]
-    cell = cell.index_select(0, flat_nonzero(~is_believed))
-    best.index_fill_(0, cell, -1)
-    best_z.index_fill_(0, cell, 0.0)
-    z, place = F.max_pool2d(own.z[:, None], 3, 1, 1, return_indices=True)
+    sums = _sums_around(sweeps, tried, side)
+    asked = flat_nonzero(sums[:, :, 1:-1, 1:-1] >= _LEAST_WON << 16)
+    shape = (sweeps.num_windows, sums.shape[2] - 2, sums.shape[3] - 2)
+    velocity, cell = split_index(asked, math.prod(shape))
+    line, col = split_index(cell, shape[2])
+    window, row = split_index(line, shape[1])
+    counts = sums[velocity, window, row + 1, col + 1]
+    won, lost = counts >> 16, counts & 0xFFFF
+    z = (won - lost).double() / torch.sqrt((won + lost).double())
+    most = z.new_zeros(math.prod(shape)).scatter_reduce_(0, cell, z, "amax")
+    is_best = (z > 0) & (z == most.index_select(0, cell))
+    first = segment_amin(torch.where(is_best, velocity, len(velocities)), cell, most.numel(), len(velocities))
+    is_believed = _is_of_walker(sweeps, velocities)[window, velocity]
+    chosen = flat_nonzero(is_best & (velocity == first.index_select(0, cell)) & is_believed)
+    cell, best, best_z = cell.index_select(0, chosen), torch.full_like(first, -1), torch.zeros_like(most)
+    best.index_copy_(0, cell, velocity.index_select(0, chosen))
+    best_z.index_copy_(0, cell, z.index_select(0, chosen))
+    best_z, place = F.max_pool2d(best_z.view(shape)[:, None], 3, 1, 1, return_indices=True)
     best = best.view(shape[0], -1).gather(1, place.view(shape[0], -1))
-    return _Best(side, best.view(shape), z.view(shape))
+    return _Best(side, best.view(shape), best_z.view(shape))
 
 
-def _sum_around(values: Tensor) -> Tensor:
-    """(B, rows, cols): sums of the 3 x 3 elements around each."""
-    rows = values.clone()
-    rows[:, 1:] += values[:, :-1]
-    rows[:, :-1] += values[:, 1:]
-    around = rows.clone()
-    around[:, :, 1:] += rows[:, :, :-1]
-    around[:, :, :-1] += rows[:, :, 1:]
-    return around
-
-
-def _groups(sweeps: HeightSlicedSweeps, found: Looks, velocities: Tensor, seeds: _Best) -> Tuple[Tensor, Tensor]:
+def _groups(sweeps: HeightSlicedSweeps, tried: Trials, seeds: _Best) -> Tuple[Tensor, Tensor]:
     """Pixels that win, with those around, by the velocity of the cell that it takes them to; joined cell by cell.
 
     Returns:
@@ -183,33 +196,42 @@ def _groups(sweeps: HeightSlicedSweeps, found: Looks, velocities: Tensor, seeds:
 
     Convention: of several velocities that of largest z takes a pixel, of equals the first.
     """
-    best, z, count = seeds.best.view(-1), seeds.z.view(-1), len(velocities)
+    best, z, count = seeds.best.view(-1), seeds.z.view(-1), tried.won.shape[1]
     occupied = flat_nonzero(best >= 0)
     component = torch.zeros_like(best).index_copy_(0, occupied, connected_components(seeds.best >= 0, occupied))
+    cell = seeds.cell(tried.looks.window[:, None], tried.row, tried.col)
+    is_there = best.index_select(0, cell.view(-1)).view_as(cell) == torch.arange(count, device=cell.device)
+    near = flat_nonzero(is_there)
+    look, velocity = split_index(near, count)
+    cell = cell.view(-1).index_select(0, near)
+    taken = flat_nonzero(_gain_around(sweeps, tried, near) > 0)
+    cell, velocity = cell.index_select(0, taken), velocity.index_select(0, taken)
+    pixel = tried.looks.pixel.index_select(0, look.index_select(0, taken))
+    # Looks of one pixel are taken to one cell by a velocity: all of them say the same.
+    strength = z.index_select(0, cell)
+    most = torch.zeros_like(sweeps.pixel, dtype=torch.float64).scatter_reduce_(0, pixel, strength, "amax")
+    strongest = flat_nonzero(strength == most.index_select(0, pixel))
+    pixel, cell, velocity = (values.index_select(0, strongest) for values in (pixel, cell, velocity))
+    first = segment_amin(velocity, pixel, sweeps.pixel.numel(), count)
+    chosen = flat_nonzero(velocity == first.index_select(0, pixel))
+    pixel, cell, velocity = (values.index_select(0, chosen) for values in (pixel, cell, velocity))
     name = torch.full_like(sweeps.pixel, -1)  # component * count + velocity, -1 = none
-    strength = torch.zeros_like(name, dtype=torch.float64)
-    for index in torch.unique(best.index_select(0, occupied)).tolist():
-        cell = _cell(sweeps, found, velocities[index], seeds)
-        near = flat_nonzero(best.index_select(0, cell) == index)
-        some, cell = found.take(near), cell.index_select(0, near)
-        is_stronger = z.index_select(0, cell) > strength.index_select(0, some.pixel)
-        taken = flat_nonzero(is_stronger & (_gain_around(sweeps, some, velocities[index]) > 0))
-        pixel, cell = some.pixel.index_select(0, taken), cell.index_select(0, taken)
-        # Looks of one pixel are taken to one cell: all that write at one place write the same.
-        strength.index_copy_(0, pixel, z.index_select(0, cell))
-        name.index_copy_(0, pixel, component.index_select(0, cell) * count + index)
+    name.index_copy_(0, pixel, component.index_select(0, cell) * count + velocity)
     names, group = torch.unique(F.pad(name, (1, 0), value=-1), return_inverse=True)  # -1 is there, the first one
     return (group[1:] - 1).remainder_(names.numel()), names[1:] % count
 
 
-def _gain_around(sweeps: HeightSlicedSweeps, some: Looks, velocity: Tensor) -> Tensor:
-    """(L,) int64: slices that a velocity, (2,) float64, wins less those that it loses, by all looks whose pixels it
-    takes to one of the 3 x 3 pixels around that of each look at t+1."""
-    won, lost = wins(sweeps, some, velocity)
-    row, col = at_newest(sweeps, some, velocity)
+def _gain_around(sweeps: HeightSlicedSweeps, tried: Trials, some: Tensor) -> Tensor:
+    """(K,) int64: slices won less those lost by all of some looks under velocities, (K,) int64 into the (L, V) trials,
+    that take their pixels to one of the 3 x 3 pixels around that of each at t+1, by the same velocity."""
+    look, velocity = split_index(some, tried.won.shape[1])
+    row, col, won, lost = (
+        values.view(-1).index_select(0, some) for values in (tried.row, tried.col, tried.won, tried.lost)
+    )
     # One more row and column, which are empty: the last pixel of a row is not beside the first one of the next.
     height, width = sweeps.grid.height + 1, sweeps.grid.width + 1
-    place, of_look = torch.unique((some.window * height + row) * width + col, return_inverse=True)
+    image = velocity * sweeps.num_windows + tried.looks.window.index_select(0, look)
+    place, of_look = torch.unique((image * height + row) * width + col, return_inverse=True)
     gain = torch.zeros_like(place).index_add_(0, of_look, won.long() - lost.long())
     around = torch.zeros_like(gain)
     for offset in (down * width + right for down in (-1, 0, 1) for right in (-1, 0, 1)):
@@ -218,14 +240,14 @@ def _gain_around(sweeps: HeightSlicedSweeps, some: Looks, velocity: Tensor) -> T
     return around.index_select(0, of_look)
 
 
-def _wins_of_groups(sweeps: HeightSlicedSweeps, found: Looks, group: Tensor, motion: Tensor) -> Tuple[Tensor, Tensor]:
-    """(H,) int64 each: what groups of pixels, (P,) int64, win and lose by their motions, (H, 2) float64."""
-    own = group.index_select(0, found.pixel)
-    member = flat_nonzero(own < len(motion))
-    some, own = found.take(member), own.index_select(0, member)
-    counts = wins(sweeps, some, motion.index_select(0, own).t())
-    zeros = torch.zeros_like(motion[:, 0], dtype=torch.int64)
-    won, lost = (zeros.index_add(0, own, count.long()) for count in counts)
+def _wins_of_groups(tried: Trials, group: Tensor, velocity: Tensor) -> Tuple[Tensor, Tensor]:
+    """(H,) int64 each: what groups of pixels, (P,) int64, win and lose by their velocities, (H,) int64."""
+    own = group.index_select(0, tried.looks.pixel)
+    member = flat_nonzero(own < velocity.numel())
+    own = own.index_select(0, member)
+    of_own = velocity.index_select(0, own)
+    zeros = torch.zeros_like(velocity)
+    won, lost = (zeros.index_add(0, own, counts[member, of_own].long()) for counts in (tried.won, tried.lost))
     return won, lost
 
 

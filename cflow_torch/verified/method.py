@@ -126,8 +126,7 @@ class VerifiedFlow(SceneFlowModel):
             margin = margin_of(sweeps, objects, seen)
             confidence = confidence_of(sweeps, objects, seen, margin, doubt)
             rigid = rigid.only(margin > 0) if config.thorough else rigid
-            is_numbered = config.thorough or config.num_future > 0
-            return motion_by_pixel(objects, rigid, levels[-1].score, confidence, sweeps, is_numbered)
+            return motion_by_pixel(objects, rigid, levels[-1].score, confidence, sweeps)
 
     def scales(self) -> List[Tuple[int, bool]]:
         """Of each level, coarse to fine: finest pixels a side of its pixels; are its components undilated?"""

@@ -165,7 +165,7 @@ class Voxels:
         place = (line[:, None] + col).flatten(0, 1)
         inside = (is_row[:, None] & is_col).view_as(place)
         place.masked_fill_(~inside, self._sweeps.image.numel() - 1)
-        pixel = self._sweeps.number.index_select(0, place.view(-1)).view_as(place).long()
+        pixel = self._sweeps.number_at(place.view(-1)).view_as(place)
         return self._of_key.index_select(0, pixel.mul_(self._num_slices).add_(part).view(-1)).view_as(place)
 
 
