@@ -5,7 +5,7 @@ A place that some sweep could not see says nothing: else shadows that pass over 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, Tuple
 
 import torch
 from torch import Tensor
@@ -54,37 +54,14 @@ def look(sweeps: HeightSlicedSweeps, members: Tensor) -> Looks:
     return some._replace(here=some.found | _hidden_slices(sweeps, some))
 
 
-class Trials(NamedTuple):
-    """L looks under each of V velocities.
-
-    Args:
-        looks: L of them.
-        won, lost: (L, V) uint8, slices.
-        row, col: (L, V) int64, where the pixel is at t+1, kept in the image.
-    """
-
-    looks: Looks
-    won: Tensor
-    lost: Tensor
-    row: Tensor
-    col: Tensor
-
-
-def try_all(sweeps: HeightSlicedSweeps, some: Looks, velocities: Tensor) -> Trials:
-    """What velocities, (V, 2) float64, (y, x) finest pixels per interval, win and lose in looks."""
-    num_steps, height, width = sweeps.num_steps, sweeps.grid.height, sweeps.grid.width
+def try_all(sweeps: HeightSlicedSweeps, some: Looks, velocities: Tensor) -> Tuple[Tensor, Tensor]:
+    """(L, V) uint8 each: slices that velocities, (V, 2) float64, (y, x) finest pixels per interval, win and lose in
+    each look."""
+    num_steps = sweeps.num_steps
     moves = moves_of(sweeps.elapsed, velocities.expand(sweeps.num_windows, -1, -1))
-    first = some.window * (2 * num_steps)
-    which = first + way_of(some.step, some.other, num_steps)
+    which = some.window * (2 * num_steps) + way_of(some.step, some.other, num_steps)
     there = some.own[:, None] & sweeps.at_moved(sweeps.image, some.window, some.other, some.row, some.col, moves, which)
-    down, right = (ways.index_select(0, first + some.step) for ways in moves.unbind(2))
-    return Trials(
-        some,
-        count_slices(there & ~some.here[:, None]),
-        count_slices(some.found[:, None] & ~there),
-        down.add_(some.row[:, None]).clamp_(0, height - 1),
-        right.add_(some.col[:, None]).clamp_(0, width - 1),
-    )
+    return count_slices(there & ~some.here[:, None]), count_slices(some.found[:, None] & ~there)
 
 
 def _hidden_slices(sweeps: HeightSlicedSweeps, some: Looks) -> Tensor:

@@ -18,43 +18,88 @@ from cflow_torch.ops.labeling import connected_components
 from cflow_torch.ops.segments import segment_amin
 from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import NUM_SLICES, HeightSlicedSweeps
-from cflow_torch.verified.local_evidence import Looks, Trials, look, try_all
-from cflow_torch.verified.paired_test import VerifiedLevel, evidence_of
+from cflow_torch.verified.local_evidence import Looks, look, try_all
+from cflow_torch.verified.paired_test import VerifiedLevel, evidence_of, moves_of
 
 _STEP, _REACH = 0.1, 3  # metres per sweep interval between velocities; steps to the fastest one
 _FASTEST = 0.25  # metres per interval: what is best at a velocity beyond may be a shadow that is faster still
 _CELL = 0.3  # metres; won and lost are summed over 3 x 3 cells
 _SEED_Z = 6  # standard deviations of noise that such a square must show
-_LEAST_WON = 4  # slices; a square that wins fewer is not looked at
+_LEAST_WON = 16  # slices; a square that wins fewer is not looked at: it cannot show four standard deviations
 _Z = 4.0  # standard deviations of noise that a group as a whole is granted
 _UPRIGHT = 3  # height slices that it must have: rings of beams on a bonnet or a roof move as well
+
+
+class _Cells:
+    """Cells of all windows, with free ones around each image, so that no velocity leads out of them.
+
+    Args:
+        sweeps: finest images.
+        velocities: (V, 2) float64, (y, x), finest pixels per sweep interval.
+
+    Attributes:
+        side: pixels a side of a cell.
+        reach: number of free cells on each side of an image.
+        shape: (windows, rows, cols), the free ones counted.
+        count: of all windows.
+    """
+
+    def __init__(self, sweeps: HeightSlicedSweeps, velocities: Tensor) -> None:
+        grid = sweeps.grid
+        self.velocities, self._num_steps = velocities, sweeps.num_steps
+        self.side = max(1, round(_CELL / grid.pixel_size))
+        moves = moves_of(sweeps.elapsed, velocities.expand(sweeps.num_windows, -1, -1))
+        moves = moves.view(sweeps.num_windows, 2, self._num_steps, -1, 2)[:, 0]  # from each sweep to t+1
+        self.reach = int(moves.abs().amax()) // self.side + 2
+        rows, cols = (-(-size // self.side) + 2 * self.reach for size in (grid.height, grid.width))
+        self.shape = (sweeps.num_windows, rows, cols)
+        self.count = math.prod(self.shape)
+        # How many cells further a pixel is taken, by its place in its own; velocity after velocity.
+        line = torch.arange(self.side, device=moves.device)
+        down, right = (divide(moves[:, :, None, :, axis] + line[:, None], self.side) for axis in (0, 1))
+        ways = down[:, :, :, None] * cols + right[:, :, None]
+        ways = ways.reshape(-1, len(velocities)) + torch.arange(len(velocities), device=moves.device) * self.count
+        self._ways = ways.int() if len(velocities) * self.count < 1 << 31 else ways
+
+    def own(self, window: Tensor, row: Tensor, col: Tensor) -> Tensor:
+        """(K,) int64, the cell of pixels."""
+        _, rows, cols = self.shape
+        return (window * rows + divide(row, self.side) + self.reach) * cols + divide(col, self.side) + self.reach
+
+    def at_newest(self, some: Looks) -> Tensor:
+        """(L, V) int32 or int64, velocity * count + the cell where it takes the pixel at t+1."""
+        kind = some.window * self._num_steps + some.step
+        for place in (some.row, some.col):
+            kind = kind * self.side + place % self.side
+        ways = self._ways.index_select(0, kind)
+        return ways.add_(self.own(some.window, some.row, some.col).to(ways.dtype)[:, None])
+
+    def add_around(self, sums: Tensor, place: Tensor, counts: Tensor) -> None:
+        """Add counts (K,) to those of the 3 x 3 cells around places, (K,) as of `at_newest`."""
+        for offset in self.around():
+            sums.index_add_(0, place + offset, counts)
+
+    def around(self) -> List[int]:
+        """How far the 3 x 3 cells around one are from it."""
+        return [down * self.shape[2] + right for down in (-1, 0, 1) for right in (-1, 0, 1)]
+
+    def is_free(self) -> Tensor:
+        """(windows, rows, cols) bool: which cells lie around the images."""
+        free = torch.ones(self.shape, dtype=torch.bool, device=self._ways.device)
+        free[:, self.reach : -self.reach, self.reach : -self.reach] = False
+        return free
 
 
 class _Best(NamedTuple):
     """What moves where at t+1, by cells of all windows.
 
     Args:
-        side: finest pixels a side of a cell.
         best: (B, rows, cols) int64, number of the best velocity, -1 = none.
         z: (B, rows, cols) float64, its surplus in standard deviations of noise; 0 = none.
     """
 
-    side: int
     best: Tensor
     z: Tensor
-
-    def cell(self, window: Tensor, row: Tensor, col: Tensor) -> Tensor:
-        """The cell of pixels, counted through all windows; int64 of one shape."""
-        _, rows, cols = self.z.shape
-        return (window * rows + divide(row, self.side)) * cols + divide(col, self.side)
-
-    def at(self, window: Tensor, row: Tensor, col: Tensor) -> Tensor:
-        """(P,) float64: z at pixels, (P,) int64 each."""
-        return self.z.view(-1).index_select(0, self.cell(window, row, col))
-
-    def only(self, wanted: Tensor) -> _Best:
-        """Those of some cells, (B, rows, cols) bool."""
-        return _Best(self.side, self.best.masked_fill(~wanted, -1), self.z.masked_fill(~wanted, 0.0))
 
 
 def find_local_motion(
@@ -84,20 +129,25 @@ def find_local_motion(
     members = flat_nonzero(at_rest & has_history)
     if members.numel() == 0:
         return objects, motion, torch.zeros_like(sweeps.row, dtype=torch.float64)
-    velocities = _velocities(sweeps)
-    found = look(sweeps, members)
-    side = max(1, round(_CELL / sweeps.grid.pixel_size))
-    tried = try_all(sweeps, found.take(_near_winners(sweeps, found, velocities, side)), velocities)
-    around = _find_best(sweeps, tried, velocities, side)
-    doubt = around.at(sweeps.window, sweeps.row, sweeps.col)
-    seeds = around.only(around.z >= _SEED_Z)
-    if not bool((seeds.best >= 0).any()):
+    cells, found = _Cells(sweeps, _velocities(sweeps)), look(sweeps, members)
+    sums = _sums_of_winners(sweeps, found, cells)
+    asked = flat_nonzero(sums >= _LEAST_WON)
+    found, place, counts = _looks_near(found, asked, cells)
+    trials = try_all(sweeps, found, cells.velocities)
+    counts = flat_nonzero(counts & trials[1].bool())
+    lost = trials[1].view(-1).index_select(0, counts).int()
+    gain = sums.index_select(0, asked)
+    cells.add_around(sums, place.view(-1).index_select(0, counts), -lost)
+    around = _find_best(sweeps, asked, gain, gain - sums.index_select(0, asked), cells)
+    doubt = around.z.view(-1).index_select(0, cells.own(sweeps.window, sweeps.row, sweeps.col))
+    is_seed = around.z >= _SEED_Z
+    if not bool(is_seed.any()):
         return objects, motion, doubt
-    group, of_group = _groups(sweeps, tried, seeds)
-    candidates = velocities.index_select(0, of_group)
-    moves = (evidence_of(*_wins_of_groups(tried, group, of_group), _Z) > 0) & (
-        _num_slices(sweeps, group, len(candidates)) >= _UPRIGHT
-    )
+    seeds = _Best(around.best.masked_fill(~is_seed, -1), around.z.masked_fill(~is_seed, 0.0))
+    group, of_group = _groups(sweeps, found, trials, seeds, cells)
+    candidates = cells.velocities.index_select(0, of_group)
+    is_significant = evidence_of(*_wins_of_groups(found, trials, group, of_group), _Z) > 0
+    moves = is_significant & (_num_slices(sweeps, group, len(candidates)) >= _UPRIGHT)
     num_components = sum(level.level.num_components for level in levels)
     of_component = F.pad(candidates, (0, 0, num_components, 0)).index_copy_(0, objects.component, motion)
     objects = objects.split(group, moves, num_components)
@@ -125,69 +175,59 @@ def _is_of_walker(sweeps: HeightSlicedSweeps, velocities: Tensor) -> Tensor:
     )
 
 
-def _near_winners(sweeps: HeightSlicedSweeps, found: Looks, velocities: Tensor, side: int) -> Tensor:
-    """(K,) int64: looks that may count in a cell that wins enough. Few find anything new; of these alone it is asked
-    first where they are taken."""
+def _sums_of_winners(sweeps: HeightSlicedSweeps, found: Looks, cells: _Cells) -> Tensor:
+    """(V * all cells,) int32, slices won in the 3 x 3 cells around each. Few looks find anything new."""
     new = found.take(flat_nonzero(found.own & ~found.here))
-    sums = _sums_around(sweeps, try_all(sweeps, new, velocities), side)
-    wins = (sums >= _LEAST_WON << 16).any(0)
-    farthest = float(sweeps.elapsed.abs().amax()) * _REACH * _STEP / sweeps.grid.pixel_size
-    reach = int(farthest / side) + 2
-    near = wins[:, None].float()
-    for size in ((2 * reach + 1, 1), (1, 2 * reach + 1)):
-        near = F.max_pool2d(near, size, 1, (size[0] // 2, size[1] // 2))
-    _, _, rows, cols = near.shape
-    row, col = divide(found.row, side) + 1, divide(found.col, side) + 1
-    return flat_nonzero(near.view(-1).index_select(0, (found.window * rows + row) * cols + col))
+    won, _ = try_all(sweeps, new, cells.velocities)
+    wins = flat_nonzero(won)
+    place, won = (values.view(-1).index_select(0, wins) for values in (cells.at_newest(new), won))
+    sums = torch.zeros(len(cells.velocities) * cells.count, dtype=torch.int32, device=won.device)
+    cells.add_around(sums, place, won.int())
+    return sums
 
 
-def _sums_around(sweeps: HeightSlicedSweeps, tried: Trials, side: int) -> Tensor:
-    """(V, B, rows + 2, cols + 2) int32, won * 2^16 + lost in the 3 x 3 cells around each; of the free cells around the
-    images it means nothing."""
-    says = flat_nonzero(tried.won | tried.lost)
-    look, velocity = split_index(says, tried.won.shape[1])
-    row, col, won, lost = (
-        values.view(-1).index_select(0, says) for values in (tried.row, tried.col, tried.won, tried.lost)
-    )
-    rows, cols = (-(-size // side) + 2 for size in (sweeps.grid.height, sweeps.grid.width))
-    image = velocity * sweeps.num_windows + tried.looks.window.index_select(0, look)
-    cell = (image * rows + divide(row, side) + 1) * cols + divide(col, side) + 1
-    counts = (won.int() << 16) + lost
-    shape = (tried.won.shape[1], sweeps.num_windows, rows, cols)
-    sums = torch.zeros(math.prod(shape), dtype=torch.int32, device=cell.device)
-    for offset in (down * cols + right for down in (-1, 0, 1) for right in (-1, 0, 1)):
-        sums.index_add_(0, cell + offset, counts)
-    return sums.view(shape)
+def _looks_near(found: Looks, asked: Tensor, cells: _Cells) -> Tuple[Looks, Tensor, Tensor]:
+    """The looks that some velocity takes beside a cell that is asked about, (A,) int64 into (V, all cells); where each
+    velocity takes them, as of `at_newest`; and (L, V) bool, whether that is beside such a cell."""
+    is_near = torch.zeros(len(cells.velocities) * cells.count, dtype=torch.bool, device=asked.device)
+    for offset in cells.around():
+        is_near.index_fill_(0, asked + offset, True)
+    place = cells.at_newest(found)
+    near = is_near.index_select(0, place.view(-1)).view_as(place)
+    kept = flat_nonzero(near.any(1))
+    return found.take(kept), place.index_select(0, kept), near.index_select(0, kept)
 
 
-def _find_best(sweeps: HeightSlicedSweeps, tried: Trials, velocities: Tensor, side: int) -> _Best:
+def _find_best(sweeps: HeightSlicedSweeps, asked: Tensor, gain: Tensor, loss: Tensor, cells: _Cells) -> _Best:
     """Of each cell the best velocity of the 3 x 3 cells around; of equals the first cell.
 
     What is best in a cell counts only if it is believed, see `_is_of_walker`.
+
+    Args:
+        asked: (A,) int64, velocity * count + cell.
+        gain, loss: (A,) int32, slices that the velocity wins and loses there.
     """
-    sums = _sums_around(sweeps, tried, side)
-    asked = flat_nonzero(sums[:, :, 1:-1, 1:-1] >= _LEAST_WON << 16)
-    shape = (sweeps.num_windows, sums.shape[2] - 2, sums.shape[3] - 2)
-    velocity, cell = split_index(asked, math.prod(shape))
-    line, col = split_index(cell, shape[2])
-    window, row = split_index(line, shape[1])
-    counts = sums[velocity, window, row + 1, col + 1]
-    won, lost = counts >> 16, counts & 0xFFFF
-    z = (won - lost).double() / torch.sqrt((won + lost).double())
-    most = z.new_zeros(math.prod(shape)).scatter_reduce_(0, cell, z, "amax")
-    is_best = (z > 0) & (z == most.index_select(0, cell))
-    first = segment_amin(torch.where(is_best, velocity, len(velocities)), cell, most.numel(), len(velocities))
-    is_believed = _is_of_walker(sweeps, velocities)[window, velocity]
-    chosen = flat_nonzero(is_best & (velocity == first.index_select(0, cell)) & is_believed)
-    cell, best, best_z = cell.index_select(0, chosen), torch.full_like(first, -1), torch.zeros_like(most)
-    best.index_copy_(0, cell, velocity.index_select(0, chosen))
-    best_z.index_copy_(0, cell, z.index_select(0, chosen))
-    best_z, place = F.max_pool2d(best_z.view(shape)[:, None], 3, 1, 1, return_indices=True)
-    best = best.view(shape[0], -1).gather(1, place.view(shape[0], -1))
-    return _Best(side, best.view(shape), best_z.view(shape))
+    count, is_free = len(cells.velocities), cells.is_free().view(-1)
+    velocity, at = split_index(asked, cells.count)
+    z = (gain - loss).double() / torch.sqrt((gain + loss).double())
+    z.masked_fill_(is_free.index_select(0, at), 0.0)
+    most = z.new_zeros(cells.count).scatter_reduce_(0, at, z, "amax")
+    is_best = (z > 0) & (z == most.index_select(0, at))
+    first = segment_amin(torch.where(is_best, velocity, count), at, cells.count, count)
+    is_believed = _is_of_walker(sweeps, cells.velocities)[divide(at, cells.count // sweeps.num_windows), velocity]
+    chosen = flat_nonzero(is_best & (velocity == first.index_select(0, at)) & is_believed)
+    at, best, best_z = at.index_select(0, chosen), torch.full_like(first, -1), torch.zeros_like(most)
+    best.index_copy_(0, at, velocity.index_select(0, chosen))
+    best_z.index_copy_(0, at, z.index_select(0, chosen))
+    best_z, place = F.max_pool2d(best_z.view(cells.shape)[:, None], 3, 1, 1, return_indices=True)
+    best = best.view(len(best_z), -1).gather(1, place.view(len(best_z), -1)).view(cells.shape)
+    is_free = is_free.view(cells.shape)
+    return _Best(best.masked_fill_(is_free, -1), best_z[:, 0].masked_fill_(is_free, 0.0))
 
 
-def _groups(sweeps: HeightSlicedSweeps, tried: Trials, seeds: _Best) -> Tuple[Tensor, Tensor]:
+def _groups(
+    sweeps: HeightSlicedSweeps, found: Looks, trials: Tuple[Tensor, Tensor], seeds: _Best, cells: _Cells
+) -> Tuple[Tensor, Tensor]:
     """Pixels that win, with those around, by the velocity of the cell that it takes them to; joined cell by cell.
 
     Returns:
@@ -196,24 +236,21 @@ def _groups(sweeps: HeightSlicedSweeps, tried: Trials, seeds: _Best) -> Tuple[Te
 
     Convention: of several velocities that of largest z takes a pixel, of equals the first.
     """
-    best, z, count = seeds.best.view(-1), seeds.z.view(-1), tried.won.shape[1]
+    best, z, count = seeds.best.view(-1), seeds.z.view(-1), len(cells.velocities)
     occupied = flat_nonzero(best >= 0)
     component = torch.zeros_like(best).index_copy_(0, occupied, connected_components(seeds.best >= 0, occupied))
-    cell = seeds.cell(tried.looks.window[:, None], tried.row, tried.col)
+    cell = cells.at_newest(found) % cells.count
     is_there = best.index_select(0, cell.view(-1)).view_as(cell) == torch.arange(count, device=cell.device)
     near = flat_nonzero(is_there)
+    near = near.index_select(0, flat_nonzero(_gain_around(sweeps, found, trials, near, cells) > 0))
     look, velocity = split_index(near, count)
-    cell = cell.view(-1).index_select(0, near)
-    taken = flat_nonzero(_gain_around(sweeps, tried, near) > 0)
-    cell, velocity = cell.index_select(0, taken), velocity.index_select(0, taken)
-    pixel = tried.looks.pixel.index_select(0, look.index_select(0, taken))
+    cell, pixel = cell.view(-1).index_select(0, near), found.pixel.index_select(0, look)
     # Looks of one pixel are taken to one cell by a velocity: all of them say the same.
     strength = z.index_select(0, cell)
     most = torch.zeros_like(sweeps.pixel, dtype=torch.float64).scatter_reduce_(0, pixel, strength, "amax")
-    strongest = flat_nonzero(strength == most.index_select(0, pixel))
-    pixel, cell, velocity = (values.index_select(0, strongest) for values in (pixel, cell, velocity))
-    first = segment_amin(velocity, pixel, sweeps.pixel.numel(), count)
-    chosen = flat_nonzero(velocity == first.index_select(0, pixel))
+    is_strongest = strength == most.index_select(0, pixel)
+    first = segment_amin(torch.where(is_strongest, velocity, count), pixel, sweeps.pixel.numel(), count)
+    chosen = flat_nonzero(is_strongest & (velocity == first.index_select(0, pixel)))
     pixel, cell, velocity = (values.index_select(0, chosen) for values in (pixel, cell, velocity))
     name = torch.full_like(sweeps.pixel, -1)  # component * count + velocity, -1 = none
     name.index_copy_(0, pixel, component.index_select(0, cell) * count + velocity)
@@ -221,18 +258,24 @@ def _groups(sweeps: HeightSlicedSweeps, tried: Trials, seeds: _Best) -> Tuple[Te
     return (group[1:] - 1).remainder_(names.numel()), names[1:] % count
 
 
-def _gain_around(sweeps: HeightSlicedSweeps, tried: Trials, some: Tensor) -> Tensor:
-    """(K,) int64: slices won less those lost by all of some looks under velocities, (K,) int64 into the (L, V) trials,
-    that take their pixels to one of the 3 x 3 pixels around that of each at t+1, by the same velocity."""
-    look, velocity = split_index(some, tried.won.shape[1])
-    row, col, won, lost = (
-        values.view(-1).index_select(0, some) for values in (tried.row, tried.col, tried.won, tried.lost)
+def _gain_around(
+    sweeps: HeightSlicedSweeps, found: Looks, trials: Tuple[Tensor, Tensor], some: Tensor, cells: _Cells
+) -> Tensor:
+    """(K,) int64: slices won less those lost by all of some looks under velocities, (K,) int64 into (L, V), that take
+    their pixels to one of the 3 x 3 pixels around that of each at t+1, by the same velocity."""
+    look, velocity = split_index(some, len(cells.velocities))
+    window, step, row, col = (
+        values.index_select(0, look) for values in (found.window, found.step, found.row, found.col)
     )
-    # One more row and column, which are empty: the last pixel of a row is not beside the first one of the next.
-    height, width = sweeps.grid.height + 1, sweeps.grid.width + 1
-    image = velocity * sweeps.num_windows + tried.looks.window.index_select(0, look)
-    place, of_look = torch.unique((image * height + row) * width + col, return_inverse=True)
-    gain = torch.zeros_like(place).index_add_(0, of_look, won.long() - lost.long())
+    k = sweeps.elapsed[window, step][:, None]
+    down, right = torch.floor(cells.velocities.index_select(0, velocity) * k + 0.5).long().unbind(1)
+    # More rows and columns, as the last cells may reach beyond the image, and an empty one: the last pixel of a row is
+    # not beside the first one of the next.
+    height, width = sweeps.grid.height + cells.side, sweeps.grid.width + cells.side
+    image = velocity * sweeps.num_windows + window
+    place, of_look = torch.unique((image * height + row + down) * width + col + right, return_inverse=True)
+    won, lost = (counts.view(-1).index_select(0, some).long() for counts in trials)
+    gain = torch.zeros_like(place).index_add_(0, of_look, won - lost)
     around = torch.zeros_like(gain)
     for offset in (down * width + right for down in (-1, 0, 1) for right in (-1, 0, 1)):
         at = torch.searchsorted(place, place + offset).clamp_(max=place.numel() - 1)
@@ -240,14 +283,15 @@ def _gain_around(sweeps: HeightSlicedSweeps, tried: Trials, some: Tensor) -> Ten
     return around.index_select(0, of_look)
 
 
-def _wins_of_groups(tried: Trials, group: Tensor, velocity: Tensor) -> Tuple[Tensor, Tensor]:
+def _wins_of_groups(
+    found: Looks, trials: Tuple[Tensor, Tensor], group: Tensor, velocity: Tensor
+) -> Tuple[Tensor, Tensor]:
     """(H,) int64 each: what groups of pixels, (P,) int64, win and lose by their velocities, (H,) int64."""
-    own = group.index_select(0, tried.looks.pixel)
+    own = group.index_select(0, found.pixel)
     member = flat_nonzero(own < velocity.numel())
     own = own.index_select(0, member)
     of_own = velocity.index_select(0, own)
-    zeros = torch.zeros_like(velocity)
-    won, lost = (zeros.index_add(0, own, counts[member, of_own].long()) for counts in (tried.won, tried.lost))
+    won, lost = (torch.zeros_like(velocity).index_add_(0, own, counts[member, of_own].long()) for counts in trials)
     return won, lost
 
 
