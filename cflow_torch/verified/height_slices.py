@@ -186,14 +186,15 @@ class HeightSlicedSweeps:
 
         Cost: a few passes over the images, once.
         """
-        image = self.image[:-1].view(-1, self.grid.height, self.grid.width)
-        rows = image.clone()
-        rows[:, 1:] |= image[:, :-1]
-        rows[:, :-1] |= image[:, 1:]
-        around = rows.clone()
-        around[:, :, 1:] |= rows[:, :, :-1]
-        around[:, :, :-1] |= rows[:, :, 1:]
-        return F.pad((around << NUM_SLICES | image).view(-1), (0, 1))
+        shape = (-1, self.grid.height, self.grid.width)
+        both = self.image.clone()
+        image, around = (values[:-1].view(shape) for values in (self.image, both))
+        around[:, 1:] |= image[:, :-1]
+        around[:, :-1] |= image[:, 1:]
+        pairs = around[:, :, 1:] | around[:, :, :-1]
+        around[:, :, 1:] |= pairs
+        around[:, :, :-1] |= pairs
+        return both.bitwise_left_shift_(NUM_SLICES).bitwise_or_(self.image)
 
     @cached_property
     def lowest(self) -> Tensor:
