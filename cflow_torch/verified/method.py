@@ -95,7 +95,7 @@ class VerifiedFlow(SceneFlowModel):
         with stage("layers"):
             is_lower = points_of_lower_layers(sweeps, points_at_rest(sweeps, found))
             lower = HeightSlicedSweeps.of(replace(batch, takes_part=is_lower), grid)
-        return join_moving(found, self.look(lower, [(1, False), (1, True)], is_first=False), batch)
+        return join_moving(found, self.look(lower, [(1, False)], is_first=False), batch)
 
     def look(self, sweeps: HeightSlicedSweeps, scales: List[Tuple[int, bool]], is_first: bool = True) -> TurningMotion:
         """What some points do, found at some scales. What could as well be displaced stands still."""
