@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from cflow_torch.config import CONFIGS, Config, make_config
+from cflow_torch.ops.threads import one_thread
 from cflow_torch.stages import stage
 from cflow_torch.types import CFlowError, FlowResult, Window
 from cflow_torch.windows.bev_grid import Grid
@@ -124,6 +125,7 @@ class SceneFlowModel(nn.Module):
         return Grid(pixel_size, bounds[:3], bounds[3:])
 
     @torch.no_grad()
+    @one_thread()
     def forward(self, windows: Sequence[Window]) -> List[FlowResult]:
         """Flow t -> t+1 for the points of every window's pc0.
 
@@ -131,7 +133,8 @@ class SceneFlowModel(nn.Module):
             windows: B windows; numbers of points, sweeps and extents may differ.
 
         Returns:
-            B results, each independent of the other windows.
+            B results, each independent of the other windows. On a CPU one thread computes them, whatever torch is set to:
+            use more cores by windows, in processes.
 
         Raises:
             CFlowError: bad input, see `make_batch`.
