@@ -133,8 +133,9 @@ class SceneFlowModel(nn.Module):
             windows: B windows; numbers of points, sweeps and extents may differ.
 
         Returns:
-            B results, each independent of the other windows. On a CPU one thread computes them, whatever torch is set to:
-            use more cores by windows, in processes.
+            B results, each independent of the other windows.
+
+        Cost: one thread of the CPU, whatever torch is set to; it is set back afterwards. More cores: more processes.
 
         Raises:
             CFlowError: bad input, see `make_batch`.
