@@ -20,6 +20,7 @@ import sys
 import tempfile
 import time
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any, Callable, Dict, Iterator, List, Sequence, Tuple
 
@@ -34,7 +35,7 @@ FULL = {**PAPER, "num_history": HISTORY, "pixel_sizes": SCALES}
 KEYS = {"preset": "keypoints"}
 REST_S = 0.02  # threads of what ran before spin for some milliseconds
 FLOW_PAIRS, FLOW_LOGS = 40, 5
-Rows = List[Dict[str, Any]]
+Rows = Iterator[Dict[str, Any]]
 
 
 def like_default(**more: Any) -> Dict[str, Any]:
@@ -139,7 +140,6 @@ def latencies(versions: Dict[str, Measurer], repeats: int) -> Rows:
     four = {"num_history": HISTORY}
     scales = {"pixel_sizes": (0.4, 0.2, 0.1)}
     default0, default4 = {"preset": "default", "num_history": 0}, {"preset": "default", **four}
-    rows: Rows = []
     for name, target, options, other, of in (
         ("`default` / `paper`, h 0", "<= 2", default0, like_default(), "ours"),
         ("`default` / `paper`, h 4", "<= 2", default4, like_default(**four), "ours"),
@@ -156,8 +156,7 @@ def latencies(versions: Dict[str, Measurer], repeats: int) -> Rows:
         row["ms"] = "{:.1f} and {:.1f}".format(*(1000 * statistics.median(seconds) for seconds in (ours[0], theirs)))
         for old in ours[1:]:
             row["before / now"] = ratio(old, ours[0])
-        rows.append(row)
-    return rows
+        yield row
 
 
 def two_processes(start: Callable[[], Measurer], repeats: int) -> Rows:
@@ -179,12 +178,10 @@ def two_processes(start: Callable[[], Measurer], repeats: int) -> Rows:
                 of_call.append(value)
     for measurer in both:
         measurer.end()
-    rows: Rows = []
     for name, here, there in zip(("paper", "default"), alone, beside):
         ms = "{:.1f} and {:.1f}".format(*(1000 * statistics.median(seconds) for seconds in (there, here)))
         about = {"what": f"`{name}`, two processes at once / alone", "target": "<= 1.3"}
-        rows.append({**about, "is": ratio(there, here), "ms": ms})
-    return rows
+        yield {**about, "is": ratio(there, here), "ms": ms}
 
 
 def flow_on_cores(folder: Path, preset: str, repeats: int) -> Rows:
@@ -212,10 +209,10 @@ def flow_on_cores(folder: Path, preset: str, repeats: int) -> Rows:
                 values.append(1e9 * (len(written) - 1) / (written[-1] - written[0]))
     speeds = "{:.1f} and {:.1f} windows/s".format(*(statistics.median(rates[count]) for count in (2, 1)))
     name = f"`cflow flow`, `{preset}`, two cores / one"
-    return [{"what": name, "target": ">= 1.8", "is": ratio(rates[2], rates[1]), "ms": speeds}]
+    yield {"what": name, "target": ">= 1.8", "is": ratio(rates[2], rates[1]), "ms": speeds}
 
 
-def counts(clouds: Sequence[Any]) -> Iterator[Dict[str, Any]]:
+def counts(clouds: Sequence[Any]) -> Rows:
     """Launches and waits of a window on a pretend accelerator; launches of sixteen windows against one."""
     sys.path.insert(0, str(ROOT / "tests"))
     import pretend_device
@@ -260,6 +257,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=20)
     parser.add_argument("--rounds", type=int, default=3, help="of cflow flow")
     parser.add_argument("--folder", type=Path, default=Path("outputs/benchmarks/speed"), help="drives and scratch")
+    parser.add_argument("--only", nargs="*", choices=("processes", "latency", "counts", "flow"))
     parser.add_argument("--json", type=Path)
     parser.add_argument("--serve", help=argparse.SUPPRESS)
     given = parser.parse_args()
@@ -272,13 +270,20 @@ def main() -> None:
     clouds, file = load(given.data_set, given.root), given.folder.resolve() / "clouds.pickle"
     file.write_bytes(pickle.dumps(clouds))
     checkouts = {"now": ROOT, **({"before": given.before.resolve()} if given.before else {})}
-    rows = two_processes(lambda: Measurer(file, ROOT), max(3, given.repeats // 4))
     servers = {name: Measurer(file, checkout, OMP_NUM_THREADS="1") for name, checkout in checkouts.items()}
-    rows += latencies(servers, given.repeats)
+    parts = {
+        "processes": two_processes(lambda: Measurer(file, ROOT), max(3, given.repeats // 4)),
+        "latency": latencies(servers, given.repeats),
+        "counts": counts(clouds),
+        "flow": chain(*(flow_on_cores(given.folder, preset, given.rounds) for preset in ("paper", "default"))),
+    }
+    rows = []
+    for name in given.only or parts:
+        for row in parts[name]:
+            rows.append(row)
+            print(row, file=sys.stderr, flush=True)
     for server in servers.values():
         server.end()
-    rows += [*counts(clouds), *flow_on_cores(given.folder, "paper", given.rounds)]
-    rows += flow_on_cores(given.folder, "default", given.rounds)
     columns = list(dict.fromkeys(key for row in rows for key in row))
     about = {"points": len(clouds[0][0]), "older_sweeps": len(clouds) - 2, "repeats": given.repeats}
     report = {"machine": machine(), "versions": versions(), **about, "rows": rows}
