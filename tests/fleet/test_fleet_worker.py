@@ -163,7 +163,7 @@ class Thread:
     def _begin(self) -> None:
         if self.started <= self.stillborn:
             raise WorkerDied("by SIGKILL")
-        self._process = WorkerProcess(self.job, "cpu", 1)
+        self._process = WorkerProcess(self.job, "cpu")
         self._process._ahead = 0
 
     def step(self, unit: Unit, stop: bool) -> Future:
