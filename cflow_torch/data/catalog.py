@@ -41,6 +41,9 @@ DATA_SETS: Dict[str, DataSet] = {
         "truckscenes", "find_truckscenes_scenes", "TruckScenesLog", "TruckScenes scene (a folder with v1.*)"
     ),
     "waymo": DataSet("waymo", "find_waymo_segments", "WaymoLog", "Waymo segment (a file lidar/*.parquet)"),
+    "pandaset": DataSet(
+        "pandaset", "find_pandaset_sequences", "PandaSetLog", "PandaSet sequence (a folder with lidar/poses.json)"
+    ),
     "aevascenes": DataSet(
         "aevascenes", "find_aevascenes_sequences", "AevaScenesLog", "AevaScenes sequence (a folder with sequence.json)"
     ),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Callable
+from typing import Any, Callable, Sequence
 
 import numpy as np
 import torch
@@ -35,6 +35,19 @@ def poses_from_quaternions(translation: Any, quaternion: Any, what: Callable[[in
             f"quaternion of length 1, got {turn[row].tolist()}, {shift[row].tolist()}; copy the file again"
         )
     return _poses(to_rotations(turn), shift)
+
+
+def poses_of_nodes(nodes: Sequence[Any], translation: str, rotation: str, what: str) -> np.ndarray:
+    """(K, 4, 4) float64 poses of K JSON objects with members {x, y, z} and {w, x, y, z} of these names.
+
+    Raises:
+        CFlowError: as `poses_from_quaternions`.
+    """
+    shifts, turns = (
+        [[node[key][axis] for axis in axes] for node in nodes]
+        for key, axes in ((translation, "xyz"), (rotation, "wxyz"))
+    )
+    return poses_from_quaternions(shifts, turns, lambda row: f"{what} {row}")
 
 
 def poses_at(times: np.ndarray, known_times: np.ndarray, poses: np.ndarray) -> np.ndarray:

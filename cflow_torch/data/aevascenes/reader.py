@@ -16,7 +16,7 @@ from cflow_torch.data.json_file import is_whole, read_json, shown
 from cflow_torch.data.log import FlowLabels, NumberedSweeps
 from cflow_torch.data.names import inside
 from cflow_torch.data.paths import Place, as_path
-from cflow_torch.data.rigid_motion import moved, poses_from_quaternions
+from cflow_torch.data.rigid_motion import moved, poses_of_nodes
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.ego_motion import relative_transform
 
@@ -193,6 +193,4 @@ class AevaScenesLog(NumberedSweeps):
 
     def _poses_of(self, nodes: Sequence[Any], what: str) -> np.ndarray:
         """(K, 4, 4) float64 from objects with translation {x, y, z} and rotation {w, x, y, z}."""
-        translation = [[node["translation"][key] for key in "xyz"] for node in nodes]
-        rotation = [[node["rotation"][key] for key in "wxyz"] for node in nodes]
-        return poses_from_quaternions(translation, rotation, lambda row: f"{self._file}: {what}: number {row}")
+        return poses_of_nodes(nodes, "translation", "rotation", f"{self._file}: {what}: number")

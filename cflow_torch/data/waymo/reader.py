@@ -9,7 +9,7 @@ from typing import Dict, List, Optional, Sequence, Tuple
 
 import numpy as np
 
-from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes, make_boxes
+from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes, make_boxes, upright_poses
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.folders import find_folders
 from cflow_torch.data.log import FlowLabels, NumberedSweeps
@@ -203,13 +203,3 @@ class WaymoLog(NumberedSweeps):
                     upright_poses([[row[name] for name in heading_centre] for row in known]),
                 )
         return boxes
-
-
-def upright_poses(heading_centre: Sequence[Sequence[float]]) -> np.ndarray:
-    """(K, 4, 4) float64 poses of boxes that turn about z only, from heading (radians) and x, y, z (metres) of each."""
-    values = np.array(heading_centre, dtype=np.float64).reshape(-1, 4)
-    pose = np.tile(np.eye(4), (len(values), 1, 1))
-    cos, sin = np.cos(values[:, 0]), np.sin(values[:, 0])
-    pose[:, 0, 0], pose[:, 0, 1], pose[:, 1, 0], pose[:, 1, 1] = cos, -sin, sin, cos
-    pose[:, :3, 3] = values[:, 1:]
-    return pose
