@@ -65,7 +65,7 @@ def category_indices(names: Sequence[Any], known: Mapping[Any, str]) -> List[int
     return [CATEGORY_INDEX[known[name]] for name in names]
 
 
-def upright_poses(heading_centre: Sequence[Sequence[float]]) -> np.ndarray:
+def upright_poses(heading_centre: Any) -> np.ndarray:
     """(K, 4, 4) float64 poses of boxes that turn about z only, from heading (radians) and x, y, z (metres) of each."""
     values = np.array(heading_centre, dtype=np.float64).reshape(-1, 4)
     pose = np.tile(np.eye(4), (len(values), 1, 1))

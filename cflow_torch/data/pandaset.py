@@ -130,8 +130,8 @@ class PandaSetLog(NumberedSweeps):
         category, is_valid = np.zeros(len(points), np.uint8), np.zeros(len(points), bool)
         for lidar in _LIDARS:
             rows = np.flatnonzero(lidars == lidar)
-            boxes = [self._boxes(cuboids[k], files[k], index + k, lidar) for k in (0, 1)]
-            part = flow_from_boxes(points[rows], *boxes, T_ego1_ego0)
+            boxes0, boxes1 = (self._boxes(cuboids[k], files[k], index + k, lidar) for k in (0, 1))
+            part = flow_from_boxes(points[rows], boxes0, boxes1, T_ego1_ego0)
             flow[rows], category[rows], is_valid[rows] = part.flow, part.category, part.is_valid
         return FlowLabels(flow, category, is_valid)
 

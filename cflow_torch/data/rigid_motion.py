@@ -43,10 +43,8 @@ def poses_of_nodes(nodes: Sequence[Any], translation: str, rotation: str, what: 
     Raises:
         CFlowError: as `poses_from_quaternions`.
     """
-    shifts, turns = (
-        [[node[key][axis] for axis in axes] for node in nodes]
-        for key, axes in ((translation, "xyz"), (rotation, "wxyz"))
-    )
+    shifts = [[node[translation][axis] for axis in "xyz"] for node in nodes]
+    turns = [[node[rotation][axis] for axis in "wxyz"] for node in nodes]
     return poses_from_quaternions(shifts, turns, lambda row: f"{what} {row}")
 
 

@@ -44,13 +44,18 @@ def find_waymo_segments(root: Place) -> List[Path]:
         root: such a file, a folder `lidar`, a split (holds `lidar`), or a folder at most three levels above `lidar`.
 
     Raises:
-        CFlowError: `root` does not exist.
+        CFlowError: `root` does not exist, or holds files of version 1.
     """
     root = as_path(root)
-    if root.is_file():
+    if root.is_file() and root.suffix != ".tfrecord":
         return [root]
     what = "<split>/lidar/<segment>.parquet, or a split"
     root = root.parent if root.name == "lidar" else root
+    if root.suffix == ".tfrecord" or next(root.glob("*.tfrecord"), None):
+        raise CFlowError(
+            f"{root}: .tfrecord is version 1 of the Waymo Open Dataset, which is not read; download the parquet files of "
+            "version 2 (components lidar, lidar_pose, lidar_calibration, vehicle_pose, lidar_box), which has the same drives"
+        )
     splits = find_folders(root, lambda folder: (folder / "lidar").is_dir(), SEARCH_DEPTH, what)
     return sorted(file for split in splits for file in (split / "lidar").glob("*.parquet"))
 
