@@ -47,6 +47,7 @@ DATA_SETS: Dict[str, DataSet] = {
     "aevascenes": DataSet(
         "aevascenes", "find_aevascenes_sequences", "AevaScenesLog", "AevaScenes sequence (a folder with sequence.json)"
     ),
+    "bags": DataSet("bags", "find_bags", "BagLog", "bag (.bag, .mcap, or the folder of a ROS 2 bag)"),
     "arrays": DataSet("arrays", "find_array_logs", "ArraysLog", "folder of point clouds"),
 }
 

@@ -258,7 +258,7 @@ def test_a_real_sweep(data_root: Path, tmp_path: Path) -> None:
     elevation = np.degrees(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])))
     far = np.linalg.norm(points, axis=1) > 2.5
     assert -31 < elevation[far].min() < -29 and 10 < elevation[far].max() < 11  # HDL-32E
-    # A quarter of it lies on the vehicle itself, which the reader leaves out, and nothing else: the next return is 3 m off.
+    # A quarter lies on the vehicle itself. The reader leaves out this and nothing else: the next return is 3 m off.
     recording = TinyRecording(("LIDAR_TOP",))
     recording.mounts["LIDAR_TOP"] = rigid(turn_z(-np.pi / 2), (0.943713, 0.0, 1.84023))  # as the data set has it
     data = write_nuscenes(recording, tmp_path / "data", key_frame_interval=0.1)

@@ -53,8 +53,8 @@ def find_waymo_segments(root: Place) -> List[Path]:
     root = root.parent if root.name == "lidar" else root
     if root.suffix == ".tfrecord" or next(root.glob("*.tfrecord"), None):
         raise CFlowError(
-            f"{root}: .tfrecord is version 1 of the Waymo Open Dataset, which is not read; download the parquet files of "
-            "version 2 (components lidar, lidar_pose, lidar_calibration, vehicle_pose, lidar_box), which has the same drives"
+            f"{root}: .tfrecord is version 1 of the Waymo Open Dataset, which is not read; download the parquet files "
+            "of version 2, which has the same drives: lidar, lidar_pose, lidar_calibration, vehicle_pose, lidar_box"
         )
     splits = find_folders(root, lambda folder: (folder / "lidar").is_dir(), SEARCH_DEPTH, what)
     return sorted(file for split in splits for file in (split / "lidar").glob("*.parquet"))
