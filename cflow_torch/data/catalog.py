@@ -48,6 +48,7 @@ DATA_SETS: Dict[str, DataSet] = {
         "aevascenes", "find_aevascenes_sequences", "AevaScenesLog", "AevaScenes sequence (a folder with sequence.json)"
     ),
     "bags": DataSet("bags", "find_bags", "BagLog", "bag (.bag, .mcap, or the folder of a ROS 2 bag)"),
+    "kiss_icp": DataSet("kiss_icp", "find_kiss_icp", "KissICPLog", "data for a loader of KISS-ICP"),
     "arrays": DataSet("arrays", "find_array_logs", "ArraysLog", "folder of point clouds"),
 }
 

@@ -30,7 +30,7 @@ class BagWriter:
 
     def __init__(self, folder: Path, form: str) -> None:
         ros1, store = form == "ros1", typesys.Stores
-        self.types = typesys.get_typestore(store.ROS1_NOETIC if ros1 else store.ROS2_JAZZY)
+        self.types = typesys.get_typestore(store.ROS1_NOETIC if ros1 else store.ROS2_HUMBLE)
         if ros1:
             definition, name = "geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"
             self.types.register(typesys.get_types_from_msg(definition, name))
