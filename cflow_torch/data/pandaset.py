@@ -26,36 +26,23 @@ _POSITION, _SIZE = (
     tuple(f"{what}.{axis}" for axis in axes) for what, axes in (("position", "xyz"), ("dimensions", "yxz"))
 )
 
-CATEGORY_NAME: Dict[str, str] = {
-    "Animals - Bird": "ANIMAL",
-    "Animals - Other": "ANIMAL",
-    "Bicycle": "BICYCLE",
-    "Bus": "BUS",
-    "Car": "REGULAR_VEHICLE",
-    "Cones": "CONSTRUCTION_CONE",
-    "Construction Signs": "SIGN",
-    "Emergency Vehicle": "LARGE_VEHICLE",
-    "Medium-sized Truck": "TRUCK",
-    "Motorcycle": "MOTORCYCLE",
-    "Motorized Scooter": "WHEELED_DEVICE",
-    "Other Vehicle - Construction Vehicle": "LARGE_VEHICLE",
-    "Other Vehicle - Pedicab": "WHEELED_DEVICE",
-    "Other Vehicle - Uncommon": "LARGE_VEHICLE",
-    "Pedestrian": "PEDESTRIAN",
-    "Pedestrian with Object": "PEDESTRIAN",
-    "Personal Mobility Device": "WHEELED_DEVICE",
-    "Pickup Truck": "REGULAR_VEHICLE",
-    "Pylons": "CONSTRUCTION_CONE",
-    "Road Barriers": "NONE",
-    "Rolling Containers": "NONE",
-    "Semi-truck": "TRUCK",
-    "Signs": "SIGN",
-    "Temporary Construction Barriers": "NONE",
-    "Towed Object": "VEHICULAR_TRAILER",
-    "Train": "RAILED_VEHICLE",
-    "Tram / Subway": "RAILED_VEHICLE",
-    "Trolley": "BUS",
+_LABELS = {
+    "ANIMAL": ("Animals - Bird", "Animals - Other"),
+    "BICYCLE": ("Bicycle",),
+    "BUS": ("Bus", "Trolley"),
+    "CONSTRUCTION_CONE": ("Cones", "Pylons"),
+    "LARGE_VEHICLE": ("Emergency Vehicle", "Other Vehicle - Construction Vehicle", "Other Vehicle - Uncommon"),
+    "MOTORCYCLE": ("Motorcycle",),
+    "NONE": ("Road Barriers", "Rolling Containers", "Temporary Construction Barriers"),
+    "PEDESTRIAN": ("Pedestrian", "Pedestrian with Object"),
+    "RAILED_VEHICLE": ("Train", "Tram / Subway"),
+    "REGULAR_VEHICLE": ("Car", "Pickup Truck"),
+    "SIGN": ("Construction Signs", "Signs"),
+    "TRUCK": ("Medium-sized Truck", "Semi-truck"),
+    "VEHICULAR_TRAILER": ("Towed Object",),
+    "WHEELED_DEVICE": ("Motorized Scooter", "Other Vehicle - Pedicab", "Personal Mobility Device"),
 }
+CATEGORY_NAME: Dict[str, str] = {label: name for name, labels in _LABELS.items() for label in labels}
 """Label of a cuboid -> Argoverse 2 name. The data set publishes no such map: this one is cflow_torch's."""
 
 

@@ -273,7 +273,6 @@ def filled(column: Any, value: Any, kind: Any = None) -> Any:
         ("lidar_box", filled("key.laser_object_id", "a"), "named twice"),
         ("lidar_box", filled("[LiDARBoxComponent].box.size.x", None, pa.float64()), "not finite"),
         ("vehicle_pose", filled(2, [2.0] * 16), "not rigid"),
-        ("vehicle_pose", filled("key.frame_timestamp_micros", 1.5), "whole numbers"),
         ("lidar", filled(4, [2, 2, 4]), "cannot reshape"),
         ("lidar_pose", filled(4, [7, 60, 9]), "range image of shape"),
     ],
