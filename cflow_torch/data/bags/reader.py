@@ -62,6 +62,7 @@ class BagLog(NumberedSweeps):
 
     Attributes:
         log_id: name of the file or folder, without its suffix.
+        poses: (K, 4, 4) float64 `T_world_ego` of every sweep; None = unknown.
         timestamps: nanoseconds, of the clouds' headers (where they are 0: of their arrival). Clouds before the first
             or after the last pose are left out.
         topic, frame: those in use.
@@ -92,25 +93,28 @@ class BagLog(NumberedSweeps):
             raise CFlowError(f"{self.path}: bags are read from this machine only; copy it here")
         self.log_id = self.path.resolve().stem if self.path.is_file() else self.path.resolve().name
         self._deskew = deskew
+        self.poses: Optional[np.ndarray] = None
         self._opened: Tuple[int, Any] = (0, None)
         self._mount = None if ego_T_lidar is None else rigid_transform(ego_T_lidar, "ego_T_lidar")
         with file_errors(f"{self.path}", "is it a whole bag of ROS 1 (.bag), ROS 2 (folder) or MCAP?"):
-            topics = self._topics()
+            topics = {connection.topic: connection.msgtype for connection in self._reader().connections}
             self.topic = self._chosen(topics, (_CLOUD,), topic, "topic")
-            self._arrival, tracks = self._scan(topics)
+            self._arrival, tracks = self._scan()
             self.frame = frame or (_BASE if self._frames.are_joined(_BASE, self._lidar) else self._lidar)
             if poses == "auto":
                 has_tf = len(self._frames.moves(self.frame)) > 1
                 poses = "tf" if has_tf else self._chosen(topics, _POSE_TYPES, None, "poses") if tracks else None
             elif poses not in (None, "tf"):
                 poses = self._chosen(topics, _POSE_TYPES, poses, "poses")
-            self._track = None if poses is None else self._trajectory(poses, tracks)
             self.timestamps = sorted(self._arrival)
-            if self._track is not None:
-                first, last = self._track.times_ns[[0, -1]]  # type: ignore[index]
+            if poses is not None:
+                self._known_times, self._known_poses = self._trajectory(poses, tracks)
+                first, last = self._known_times[[0, -1]]
                 self.timestamps = [time for time in self.timestamps if first <= time <= last]
             self._check_count(f"{self.path}: {self.topic}, while there are poses,")
-            self.poses = None if self._track is None else covered_poses(self._track, self.timestamps, str(poses))
+            if poses is not None:
+                known = Trajectory(self._known_poses, self._known_times, "bag")
+                self.poses = covered_poses(known, self.timestamps, poses)
             if self._mount is None:
                 self._frames.between(self.frame, self._lidar, np.array(self.timestamps[:1]))
 
@@ -123,11 +127,11 @@ class BagLog(NumberedSweeps):
             if mount is None:
                 mount = self._frames.between(self.frame, self._lidar, np.array([time]))[0]
             points = moved(points, mount)
-        if self.poses is None or self._track is None:
+        if self.poses is None:
             return Sweep(points.astype(np.float32), None, None, time, times)
         if times is not None and self._deskew:
             shots, group = np.unique(np.round(times / _SLICE).astype(np.int64), return_inverse=True)
-            at = poses_at(time + shots * round(_SLICE * 1e9), self._track.times_ns, self._track.poses)  # type: ignore[arg-type]
+            at = poses_at(time + shots * round(_SLICE * 1e9), self._known_times, self._known_poses)
             T = (np.linalg.inv(self.poses[index]) @ at)[group]
             points = np.einsum("nij,nj->ni", T[:, :3, :3], points) + T[:, :3, 3]
         return Sweep(points.astype(np.float32), None, self.poses[index].copy(), time, times)
@@ -156,10 +160,6 @@ class BagLog(NumberedSweeps):
     def __getstate__(self) -> Dict[str, Any]:
         return {**self.__dict__, "_opened": (0, None)}
 
-    def _topics(self) -> Dict[str, str]:
-        """Topic -> type of its messages."""
-        return {connection.topic: connection.msgtype for connection in self._reader().connections}
-
     def _chosen(self, topics: Dict[str, str], types: Tuple[str, ...], name: Optional[str], setting: str) -> str:
         """The topic of one of these types that is named, or the only one."""
         found = sorted(topic for topic, kind in topics.items() if kind in types and name in (None, topic))
@@ -169,7 +169,7 @@ class BagLog(NumberedSweeps):
             raise CFlowError(f"{what} of type {' or '.join(types)}: choose one with {setting}=...; the bag has {there}")
         return found[0]
 
-    def _scan(self, topics: Dict[str, str]) -> Tuple[Dict[int, int], Dict[str, List[Sample]]]:
+    def _scan(self) -> Tuple[Dict[int, int], Dict[str, List[Sample]]]:
         """Time of each cloud -> of its arrival; samples of poses by topic. The frames are filled."""
         self._lidar = ""
         self._child: Dict[str, str] = {}
@@ -197,8 +197,8 @@ class BagLog(NumberedSweeps):
         self._frames = Frames(parents, links)
         return arrival, tracks
 
-    def _trajectory(self, poses: str, tracks: Dict[str, List[Sample]]) -> Trajectory:
-        """`T_world_ego` at all times that transforms or messages tell."""
+    def _trajectory(self, poses: str, tracks: Dict[str, List[Sample]]) -> Tuple[np.ndarray, np.ndarray]:
+        """(M,) int64 times that transforms or messages tell, and (M, 4, 4) `T_world_ego` at them."""
         if poses == "tf":
             times = self._frames.moves(self.frame)
             matrices = self._frames.in_root(self.frame, times)
@@ -209,7 +209,7 @@ class BagLog(NumberedSweeps):
                 matrices = matrices @ self._frames.between(child, self.frame, times)
         if len(times) < 2:
             raise CFlowError(f"poses={poses}: fewer than two poses of {self.frame}; give another, or poses=null")
-        return Trajectory(matrices, times, "bag")
+        return times, matrices
 
     def _cloud(self, time: int) -> Any:
         """The message of a sweep."""
