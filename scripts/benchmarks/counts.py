@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import tracemalloc
 from collections import Counter
 from functools import lru_cache
@@ -29,6 +30,8 @@ _WAITING = {
     "masked_select",
     "bincount",
 }
+# Functions of ops/indices.py that NumPy does on a CPU and torch on a GPU, where the host need not wait for them.
+_NUMPY_ON_CPU = {"divide", "largest_of_rows"}
 # Not views by their schema, but nothing is computed.
 _IDLE = {"_unsafe_view", "lift_fresh", "detach_"}
 
@@ -149,7 +152,9 @@ class _Calls(TorchFunctionMode):
     def __torch_function__(self, func: Any, types: Any, args: Tuple[Any, ...] = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
         name = getattr(func, "__name__", "")
-        if name in ("numpy", "tolist", "cpu") and args[0].device.type == "cpu":  # else the copy is seen as an operation
+        # On another device the copy is seen as an operation.
+        is_wait = name in ("numpy", "tolist") and args[0].device.type == "cpu"
+        if is_wait and sys._getframe(1).f_code.co_name not in _NUMPY_ON_CPU:
             self.waits[name] += 1
         moves = name == "to" and any(isinstance(value, (torch.device, str)) for value in (*args, *kwargs.values()))
         self.uploads += moves or name in ("tensor", "as_tensor")
