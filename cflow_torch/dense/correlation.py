@@ -14,7 +14,7 @@ from cflow_torch.dense.packing import Packing, Search, pack
 from cflow_torch.dense.projection import ProjectedSweeps
 from cflow_torch.dense.templates import TemplatePairs, make_pairs
 from cflow_torch.ops.cross_correlation import cross_correlate
-from cflow_torch.ops.indices import flat_nonzero, largest_of_rows
+from cflow_torch.ops.indices import flat_nonzero, largest_of_rows, take_columns
 from cflow_torch.ops.segments import segment_amin
 from cflow_torch.ops.window_counts import WindowCounts
 
@@ -205,14 +205,13 @@ def _candidates(
     near = [(piece > least).view(-1) for piece, least in zip(pieces, needed)]
     place = flat_nonzero(torch.cat(near))
     pair = torch.searchsorted(end, place, right=True)
-    *edges, stride, start = torch.cat((low, high, stride[None], start[None])).index_select(1, pair)
-    low, high = torch.stack(edges).view(2, 2, -1)
-    shift = Search(low, high, stride, start).shift(place - start)
-    is_searched = (shift <= high).all(0)
+    found = take_columns(torch.cat((low, high, stride[None], start[None])), pair)
+    shift = Search(found[:2], found[2:4], found[4], found[5]).shift(place - found[5])
+    is_searched = (shift <= found[2:4]).all(0)
     if radius is not None:
         is_searched &= (shift * shift).sum(0) <= square.index_select(0, pair)
     found = torch.stack((pair + part.start, *shift, samples.index_select(0, place).long()))
-    return found.index_select(1, flat_nonzero(is_searched))
+    return take_columns(found, flat_nonzero(is_searched))
 
 
 def _best_of_each_pair(
@@ -233,7 +232,7 @@ def _best_of_each_pair(
     square = (count * count).double()
     bound = square.new_zeros(num_pairs).scatter_reduce_(0, pair, square / most, "amax")
     kept = flat_nonzero(square / torch.maximum(least, count) >= bound.index_select(0, pair))
-    pair, target, dy, dx, count = torch.stack((pair, target, *shift, count)).index_select(1, kept)
+    pair, target, dy, dx, count = take_columns(torch.stack((pair, target, *shift, count)), kept)
     energy = windows.count(target, torch.stack((dy, dx)))
     value = square.index_select(0, kept) / energy
     best_value = value.new_zeros(num_pairs).scatter_reduce_(0, pair, value, "amax")

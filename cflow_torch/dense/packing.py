@@ -11,6 +11,7 @@ from torch import Tensor
 
 from cflow_torch.dense.templates import TemplatePairs
 from cflow_torch.ops.cross_correlation import FAST_LENGTHS
+from cflow_torch.ops.indices import take_columns
 from cflow_torch.types import CFlowError, as_numpy
 from cflow_torch.windows.bev_grid import LONGEST_SIDE
 from cflow_torch.windows.memory import require_memory
@@ -154,7 +155,7 @@ def pack(pairs: TemplatePairs) -> Packing:
         (*low[clusters].T, *high[clusters].T, stride[clusters], searched[class_of_target[clusters]], packed, clusters)
     )
     uploaded = torch.from_numpy(np.concatenate((start, stride[of_image], table.ravel()))).to(device)
-    of_pixel = uploaded[: 2 * len(start)].view(2, -1).index_select(1, image)
+    of_pixel = take_columns(uploaded[: 2 * len(start)].view(2, -1), image)
     of_pair = uploaded[2 * len(start) :].view(len(table), -1)
     sample = torch.cat((template.row, target.row)).mul_(of_pixel[1]).add_(of_pixel[0])
     sample += torch.cat((template.col, target.col))

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from cflow_torch.ops.indices import take_columns
 from cflow_torch.ops.spans import spans
 
 
@@ -27,7 +28,7 @@ class WindowCounts:
         area = size[:, 0] * edges[1]
         numbers = np.concatenate((size.T, first_edge, area.cumsum()[None] - area, edges[1:]))
         self._numbers = torch.from_numpy(numbers).to(image.device)
-        _, _, *edge, start, stride = self._numbers.index_select(1, image)
+        *edge, start, stride = take_columns(self._numbers[2:], image)
         # Pixels in the rows above, and in the columns to the left, of every row and column. What lies before a row
         # (column, image) cancels.
         place, one = torch.cat((edge[0] + row, edge[1] + col)).add_(1), torch.ones_like(image)
@@ -39,7 +40,7 @@ class WindowCounts:
 
     def bounds(self, image: Tensor, shift: Tensor) -> Tuple[Tensor, Tensor]:
         """(K,) int64 each, `count` is at least the first and at most the second. Args as for `count`."""
-        size, first = self._numbers.index_select(1, image)[:4].view(2, 2, -1)
+        size, first = take_columns(self._numbers[:4], image).view(2, 2, -1)
         begin, end = shift.clamp(min=0), torch.minimum(size, size + shift)
         edges = torch.stack((begin, end, torch.zeros_like(size), size)).add_(first)
         begin, end, first, last = self._before.index_select(0, edges.view(-1)).view(edges.shape)
@@ -55,12 +56,12 @@ class WindowCounts:
 
         Cost: linear in the height of the windows.
         """
-        height, width, _, _, start, stride = self._numbers.index_select(1, image)
+        height, width, _, _, start, stride = take_columns(self._numbers, image)
         (top, left), (down, right) = shift.clamp(min=0), shift.abs()
         num_rows = height - down
         row = spans(top, num_rows)
         window = torch.repeat_interleave(num_rows, output_size=row.numel())
-        start, stride, width = torch.stack((start + left, stride, width - right)).index_select(1, window)
+        start, stride, width = take_columns(torch.stack((start + left, stride, width - right)), window)
         start += row.mul_(stride)
         in_row = self._table.index_select(0, start + width) - self._table.index_select(0, start)
         return torch.zeros_like(image).index_add_(0, window, in_row)
