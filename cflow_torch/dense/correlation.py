@@ -104,8 +104,7 @@ def best_shifts(pairs: TemplatePairs, engine: str = "fft", max_memory: Optional[
     radius = None if pairs.radius is None else pairs.radius.index_select(0, packing.pairs)
     target_energy = packing.energy.index_select(0, packing.clusters + num_pairs)
     found = [
-        _candidates(part, counts, largest, packing.search, target_energy, radius)
-        for part, counts, largest in _correlated(packing, engine, max_memory)
+        _candidates(*run, packing.search, target_energy, radius) for run in _correlated(packing, engine, max_memory)
     ]
     place, dy, dx, count = torch.cat(found, 1)
     target = pairs.target
@@ -123,34 +122,46 @@ def best_shifts(pairs: TemplatePairs, engine: str = "fft", max_memory: Optional[
 
 def _correlated(
     packing: Packing, engine: str, max_memory: Optional[float]
-) -> Iterator[Tuple[slice, List[Tensor], Tensor]]:
-    """Runs of packed pairs, their correlations, class by class, each (n, searched) float32 counts, and the sample of
-    the largest count of each pair.
+) -> Iterator[Tuple[slice, Tensor, List[Tensor], Tensor]]:
+    """Runs of packed pairs, their searched counts, one pair after the other, the same piece by piece as
+    (n, searched), and the sample of each pair's largest.
+
+    The counts of a run are overwritten by those of the next.
     """
-    blocks = packing.samples.split([(j + n) * y * x for j, n, y, x, *_ in packing.classes])
-    at_once, in_part = _samples_at_once(packing.samples.device, max_memory)
-    pending: List[Tensor] = []
+    device, classes = packing.samples.device, packing.classes
+    blocks = packing.samples.split([(found.templates + found.targets) * found.area for found in classes])
+    at_once, in_part = _samples_at_once(device, max_memory)
+    steps = [min(found.templates, max(1, at_once // found.area)) for found in classes]
+    size = max(in_part, max(step * found.searched for step, found in zip(steps, classes)))
+    dtype = torch.float32 if max(found.most for found in classes) < 1 << 24 else torch.float64
+    samples = torch.empty(
+        min(size, sum(found.templates * found.searched for found in classes)), dtype=dtype, device=device
+    )
+    pieces: List[Tensor] = []
     largest: List[Tensor] = []
     first_pair = last_pair = used = 0
-    for block, (num_templates, _, height, width, searched, most) in zip(blocks, packing.classes):
-        images, own = block.view(-1, height, width), packing.own[last_pair : last_pair + num_templates]
-        step = max(1, at_once // (height * width))
-        for begin in range(0, num_templates, step):
-            end = min(begin + step, num_templates)
-            if pending and used + (end - begin) * searched > in_part:
-                yield slice(first_pair, last_pair), pending, torch.cat(largest)
-                pending, largest, first_pair, used = [], [], last_pair, 0
-            wanted, some = own[begin:end], images
-            if end - begin < num_templates:  # a run of pairs needs a run of targets: both are in the order of clusters
-                targets = images[num_templates + wanted[0] : num_templates + wanted[-1] + 1]
+    for block, found, step in zip(blocks, classes, steps):
+        images = block.view(-1, found.height, found.width)
+        own = packing.own[last_pair : last_pair + found.templates]
+        for begin in range(0, found.templates, step):
+            end = min(begin + step, found.templates)
+            wanted, some, stop = own[begin:end], images, used + (end - begin) * found.searched
+            if stop > len(samples):
+                yield slice(first_pair, last_pair), samples[:used], pieces, torch.cat(largest)
+                pieces, largest, first_pair, used, stop = [], [], last_pair, 0, stop - used
+            if (
+                end - begin < found.templates
+            ):  # a run of pairs needs a run of targets: both are in the order of clusters
+                targets = images[found.templates + wanted[0] : found.templates + wanted[-1] + 1]
                 wanted, some = wanted - wanted[0], torch.cat((images[begin:end], targets))
-            target = torch.from_numpy(wanted).to(block.device)
-            counts = cross_correlate(some.view(torch.uint8).float(), end - begin, target, engine, most)
-            pending.append(counts.flatten(1)[:, :searched])
-            largest.append(largest_of_rows(pending[-1]))
-            last_pair += end - begin
-            used += (end - begin) * searched
-    yield slice(first_pair, last_pair), pending, torch.cat(largest)
+            target = torch.from_numpy(wanted).to(device)
+            counts = cross_correlate(some.view(torch.uint8).float(), end - begin, target, engine, found.most)
+            piece = samples[used:stop].view(end - begin, -1)
+            torch.round(counts.flatten(1)[:, : found.searched], out=piece)
+            pieces.append(piece)
+            largest.append(largest_of_rows(piece))
+            last_pair, used = last_pair + end - begin, stop
+    yield slice(first_pair, last_pair), samples[:used], pieces, torch.cat(largest)
 
 
 def _samples_at_once(device: torch.device, max_memory: Optional[float]) -> Tuple[int, int]:
@@ -164,7 +175,8 @@ def _samples_at_once(device: torch.device, max_memory: Optional[float]) -> Tuple
 
 def _candidates(
     part: slice,
-    counts: List[Tensor],
+    samples: Tensor,
+    pieces: List[Tensor],
     largest: Tensor,
     search: Search,
     target_energy: Tensor,
@@ -177,7 +189,7 @@ def _candidates(
 
     Args:
         part: the pairs that are looked at.
-        counts, largest: of these pairs, as `_correlated` gives them; samples outside the search are ignored.
+        samples, pieces, largest: of these pairs, as `_correlated` gives them; samples outside the search are ignored.
         search: of each packed pair.
         target_energy: (J,) int64, pixels of each pair's target.
         radius: (J,) float64, pixels; None = no limit.
@@ -185,12 +197,6 @@ def _candidates(
     low, high, stride = search.low[:, part], search.high[:, part], search.stride[part]
     searched = search.searched[part]
     end = searched.cumsum(0)
-    sizes = [values.numel() for values in counts]
-    dtype = torch.float64 if any(values.dtype == torch.float64 for values in counts) else torch.float32
-    samples = torch.empty(sum(sizes), dtype=dtype, device=largest.device)
-    pieces = [piece.view(values.shape) for piece, values in zip(samples.split(sizes), counts)]
-    for piece, values in zip(pieces, counts):
-        torch.round(values, out=piece)
     # Two samples for a lower bound: no shift, and the largest count, moved into the search if it stands outside.
     middle = low[0] * stride + low[1]
     dy, dx = torch.minimum(Search(low, high, stride, searched).shift(largest), high)
@@ -201,9 +207,8 @@ def _candidates(
     start = end - searched
     bound = torch.maximum(samples.index_select(0, start + middle), samples.index_select(0, start + probe))
     # 1 less, because the quotient is rounded; counts of 0 are never better than no shift at all.
-    needed = (bound * bound / target_energy[part] - 1).clamp_(min=0.5)[:, None].split([len(each) for each in counts])
-    near = [(piece > least).view(-1) for piece, least in zip(pieces, needed)]
-    place = flat_nonzero(torch.cat(near))
+    needed = (bound * bound / target_energy[part] - 1).clamp_(min=0.5)[:, None].split([len(piece) for piece in pieces])
+    place = flat_nonzero(torch.cat([(piece > least).view(-1) for piece, least in zip(pieces, needed)]))
     pair = torch.searchsorted(end, place, right=True)
     found = take_columns(torch.cat((low, high, stride[None], start[None])), pair)
     shift = Search(found[:2], found[2:4], found[4], found[5]).shift(place - found[5])

@@ -61,6 +61,11 @@ class SizeClass(NamedTuple):
     searched: int
     most: int
 
+    @property
+    def area(self) -> int:
+        """Samples of an image."""
+        return self.height * self.width
+
 
 @dataclass(frozen=True)
 class Packing:
@@ -134,9 +139,9 @@ def pack(pairs: TemplatePairs) -> Packing:
     np.maximum.at(most, kind // 2, energies)
     images = np.bincount(kind, minlength=2 * len(keys)).reshape(-1, 2)
     classes = [SizeClass(*row) for row in np.column_stack((images, *divmod(keys, _BASE), searched, most)).tolist()]
-    total = sum((found.templates + found.targets) * found.height * found.width for found in classes)
+    total = sum((found.templates + found.targets) * found.area for found in classes)
     require_memory(
-        total + _BYTES_PER_SAMPLE * max(found.height * found.width for found in classes),
+        total + _BYTES_PER_SAMPLE * max(found.area for found in classes),
         device,
         f"a cluster that is {size.max()} pixels long",
         "give a max_speed, so that it is searched less far, a smaller point_cloud_range or larger pixel_sizes",
