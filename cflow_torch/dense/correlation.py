@@ -142,23 +142,21 @@ def _correlated(
     first_pair = last_pair = used = 0
     for block, found, step in zip(blocks, classes, steps):
         images = block.view(-1, found.height, found.width)
-        own = packing.own[last_pair : last_pair + found.templates]
+        own = packing.own_on_host[last_pair : last_pair + found.templates]
         for begin in range(0, found.templates, step):
             end = min(begin + step, found.templates)
             wanted, some, stop = own[begin:end], images, used + (end - begin) * found.searched
             if stop > len(samples):
                 yield slice(first_pair, last_pair), samples[:used], pieces, torch.cat(largest)
                 pieces, largest, first_pair, used, stop = [], [], last_pair, 0, stop - used
-            if (
-                end - begin < found.templates
-            ):  # a run of pairs needs a run of targets: both are in the order of clusters
+            target = packing.own[last_pair : last_pair + end - begin]
+            # A run of pairs needs a run of targets: both are in the order of clusters.
+            if end - begin < found.templates:
                 targets = images[found.templates + wanted[0] : found.templates + wanted[-1] + 1]
-                wanted, some = wanted - wanted[0], torch.cat((images[begin:end], targets))
-            target = torch.from_numpy(wanted).to(device)
+                target, some = target - int(wanted[0]), torch.cat((images[begin:end], targets))
             counts = cross_correlate(some.view(torch.uint8).float(), end - begin, target, engine, found.most)
             piece = samples[used:stop].view(end - begin, -1)
-            torch.round(counts.flatten(1)[:, : found.searched], out=piece)
-            pieces.append(piece)
+            pieces.append(piece.copy_(counts.flatten(1)[:, : found.searched]).round_())
             largest.append(largest_of_rows(piece))
             last_pair, used = last_pair + end - begin, stop
     yield slice(first_pair, last_pair), samples[:used], pieces, torch.cat(largest)

@@ -25,7 +25,7 @@ _LINES_GPU = tuple(144 << 2 * k for k in range(9))
 # Spectra, counts and tables of an image that is correlated alone, the largest one.
 _BYTES_PER_SAMPLE = 80
 # Classes are numbered by height and width of their images, both below this.
-_BASE = 1 << 17
+_BASE = 1 << 24
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,8 @@ class Packing:
     Args:
         samples: (A,) bool.
         classes: of the images.
-        own: (J,) int64, on the host: target of each packed pair, counted through the targets of its class.
+        own: (J,) int64, target of each packed pair, counted through the targets of its class.
+        own_on_host: the same.
         search: what is searched for each packed pair.
         pairs: (J,) int64, pairs in the order in which their templates are packed.
         clusters: (J,) int64, target of each of them in the order in which targets were given.
@@ -84,7 +85,8 @@ class Packing:
 
     samples: Tensor
     classes: List[SizeClass]
-    own: np.ndarray
+    own: Tensor
+    own_on_host: np.ndarray
     search: Search
     pairs: Tensor
     clusters: Tensor
@@ -156,9 +158,8 @@ def pack(pairs: TemplatePairs) -> Packing:
     place, first = np.empty(num_targets, np.int64), images[:, 1].cumsum() - images[:, 1]
     place[packed_targets] = np.arange(num_targets) - first[class_of_target[packed_targets]]
     clusters = cluster[packed]
-    table = np.stack(
-        (*low[clusters].T, *high[clusters].T, stride[clusters], searched[class_of_target[clusters]], packed, clusters)
-    )
+    of_search = *low.T, *high.T, stride, searched[class_of_target], place
+    table = np.stack((*(values[clusters] for values in of_search), packed, clusters))
     uploaded = torch.from_numpy(np.concatenate((start, stride[of_image], table.ravel()))).to(device)
     of_pixel = take_columns(uploaded[: 2 * len(start)].view(2, -1), image)
     of_pair = uploaded[2 * len(start) :].view(len(table), -1)
@@ -166,7 +167,8 @@ def pack(pairs: TemplatePairs) -> Packing:
     sample += torch.cat((template.col, target.col))
     samples = torch.zeros(total, dtype=torch.bool, device=device).index_fill_(0, sample, True)
     search = Search(of_pair[:2], of_pair[2:4], of_pair[4], of_pair[5])
-    return Packing(samples, classes, place[clusters], search, of_pair[6], of_pair[7], energy, size)
+    *_, own, first, second = of_pair
+    return Packing(samples, classes, own, place[clusters], search, first, second, energy, size)
 
 
 def _at_least(lengths: Sequence[int], values: np.ndarray) -> np.ndarray:
