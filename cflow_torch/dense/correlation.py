@@ -122,9 +122,8 @@ def best_shifts(pairs: TemplatePairs, engine: str = "fft", max_memory: Optional[
 
 def _correlated(
     packing: Packing, engine: str, max_memory: Optional[float]
-) -> Iterator[Tuple[slice, Tensor, List[Tensor], Tensor]]:
-    """Runs of packed pairs, their searched counts, one pair after the other, the same piece by piece as
-    (n, searched), and the sample of each pair's largest.
+) -> Iterator[Tuple[slice, Tensor, List[Tensor]]]:
+    """Runs of packed pairs, their searched counts, one pair after the other, and the same as (n, searched) pieces.
 
     The counts of a run are overwritten by those of the next.
     """
@@ -132,13 +131,11 @@ def _correlated(
     blocks = packing.samples.split([(found.templates + found.targets) * found.area for found in classes])
     at_once, in_part = _samples_at_once(device, max_memory)
     steps = [min(found.templates, max(1, at_once // found.area)) for found in classes]
-    size = max(in_part, max(step * found.searched for step, found in zip(steps, classes)))
+    size = max(in_part, *(step * found.searched for step, found in zip(steps, classes)))
+    size = min(size, sum(found.templates * found.searched for found in classes))
     dtype = torch.float32 if max(found.most for found in classes) < 1 << 24 else torch.float64
-    samples = torch.empty(
-        min(size, sum(found.templates * found.searched for found in classes)), dtype=dtype, device=device
-    )
+    samples = torch.empty(size, dtype=dtype, device=device)
     pieces: List[Tensor] = []
-    largest: List[Tensor] = []
     first_pair = last_pair = used = 0
     for block, found, step in zip(blocks, classes, steps):
         images = block.view(-1, found.height, found.width)
@@ -147,8 +144,8 @@ def _correlated(
             end = min(begin + step, found.templates)
             wanted, some, stop = own[begin:end], images, used + (end - begin) * found.searched
             if stop > len(samples):
-                yield slice(first_pair, last_pair), samples[:used], pieces, torch.cat(largest)
-                pieces, largest, first_pair, used, stop = [], [], last_pair, 0, stop - used
+                yield slice(first_pair, last_pair), samples[:used], pieces
+                pieces, first_pair, used, stop = [], last_pair, 0, stop - used
             target = packing.own[last_pair : last_pair + end - begin]
             # A run of pairs needs a run of targets: both are in the order of clusters.
             if end - begin < found.templates:
@@ -157,9 +154,8 @@ def _correlated(
             counts = cross_correlate(some.view(torch.uint8).float(), end - begin, target, engine, found.most)
             piece = samples[used:stop].view(end - begin, -1)
             pieces.append(piece.copy_(counts.flatten(1)[:, : found.searched]).round_())
-            largest.append(largest_of_rows(piece))
             last_pair, used = last_pair + end - begin, stop
-    yield slice(first_pair, last_pair), samples[:used], pieces, torch.cat(largest)
+    yield slice(first_pair, last_pair), samples[:used], pieces
 
 
 def _samples_at_once(device: torch.device, max_memory: Optional[float]) -> Tuple[int, int]:
@@ -175,7 +171,6 @@ def _candidates(
     part: slice,
     samples: Tensor,
     pieces: List[Tensor],
-    largest: Tensor,
     search: Search,
     target_energy: Tensor,
     radius: Optional[Tensor],
@@ -187,7 +182,7 @@ def _candidates(
 
     Args:
         part: the pairs that are looked at.
-        samples, pieces, largest: of these pairs, as `_correlated` gives them; samples outside the search are ignored.
+        samples, pieces: of these pairs, as `_correlated` gives them; samples outside the search are ignored.
         search: of each packed pair.
         target_energy: (J,) int64, pixels of each pair's target.
         radius: (J,) float64, pixels; None = no limit.
@@ -196,7 +191,7 @@ def _candidates(
     searched = search.searched[part]
     end = searched.cumsum(0)
     # Two samples for a lower bound: no shift, and the largest count, moved into the search if it stands outside.
-    middle = low[0] * stride + low[1]
+    middle, largest = low[0] * stride + low[1], torch.cat([largest_of_rows(piece) for piece in pieces])
     dy, dx = torch.minimum(Search(low, high, stride, searched).shift(largest), high)
     probe = middle + dy * stride + dx
     if radius is not None:

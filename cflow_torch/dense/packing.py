@@ -106,8 +106,6 @@ def pack(pairs: TemplatePairs) -> Packing:
     An image takes H + low_y rows of W + low_x samples, and a target stands low_y rows and low_x columns further down.
     Then shift (dy, dx) of the correlation stands at sample (dy + low_y) * stride + dx + low_x, and no other pair of
     pixels adds to the samples that are searched: neither across the end of a row nor across that of the image.
-
-    Cost: linear in pixels. The classes are found on the host, which must know them anyway.
     """
     device, num_pairs, num_targets = pairs.size.device, len(pairs.cluster), len(pairs.size)
     template, target = pairs.template, pairs.target
@@ -153,8 +151,7 @@ def pack(pairs: TemplatePairs) -> Packing:
     area, start = (height * length)[of_image[order]], np.empty_like(order)
     start[order] = area.cumsum() - area
     start[num_pairs:] += low[:, 0] * stride + low[:, 1]
-    is_pair = order < num_pairs
-    packed, packed_targets = order[is_pair], order[~is_pair] - num_pairs
+    packed, packed_targets = order[order < num_pairs], order[order >= num_pairs] - num_pairs
     place, first = np.empty(num_targets, np.int64), images[:, 1].cumsum() - images[:, 1]
     place[packed_targets] = np.arange(num_targets) - first[class_of_target[packed_targets]]
     clusters = cluster[packed]

@@ -44,10 +44,7 @@ def cross_correlate(
     """
     if engine == "conv":
         return _by_conv(images, num_templates, own)
-    return _by_fft(images.to(_fft_dtype(images, most)), num_templates, own)
-
-
-def _by_fft(images: Tensor, num_templates: int, own: Tensor) -> Tensor:
+    images = images.to(_fft_dtype(images, most))
     height, width = images.shape[-2:]
     spectrum = torch.fft.rfft(images[..., 0, :]) if height == 1 else torch.fft.rfft2(images)
     product = spectrum[num_templates:].index_select(0, own).mul_(spectrum[:num_templates].conj())
