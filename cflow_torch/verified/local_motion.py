@@ -6,7 +6,6 @@ so far is tested at a grid of small velocities, all at once, over squares as wid
 
 from __future__ import annotations
 
-import math
 from typing import List, NamedTuple, Tuple
 
 import torch
@@ -18,76 +17,16 @@ from cflow_torch.ops.labeling import connected_components
 from cflow_torch.ops.segments import segment_amin
 from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import NUM_SLICES, HeightSlicedSweeps
+from cflow_torch.verified.local_cells import Cells
 from cflow_torch.verified.local_evidence import Looks, look, try_all
-from cflow_torch.verified.paired_test import VerifiedLevel, evidence_of, moves_of
+from cflow_torch.verified.paired_test import VerifiedLevel, evidence_of
 
 _STEP, _REACH = 0.1, 3  # metres per sweep interval between velocities; steps to the fastest one
 _FASTEST = 0.25  # metres per interval: what is best at a velocity beyond may be a shadow that is faster still
-_CELL = 0.3  # metres; won and lost are summed over 3 x 3 cells
 _SEED_Z = 6  # standard deviations of noise that such a square must show
 _LEAST_WON = 16  # slices; a square that wins fewer is not looked at: it cannot show four standard deviations
 _Z = 4.0  # standard deviations of noise that a group as a whole is granted
 _UPRIGHT = 3  # height slices that it must have: rings of beams on a bonnet or a roof move as well
-
-
-class _Cells:
-    """Cells of all windows, with free ones around each image, so that no velocity leads out of them.
-
-    Args:
-        sweeps: finest images.
-        velocities: (V, 2) float64, (y, x), finest pixels per sweep interval.
-
-    Attributes:
-        side: pixels a side of a cell.
-        reach: number of free cells on each side of an image.
-        shape: (windows, rows, cols), the free ones counted.
-        count: of all windows.
-    """
-
-    def __init__(self, sweeps: HeightSlicedSweeps, velocities: Tensor) -> None:
-        grid = sweeps.grid
-        self.velocities, self._num_steps = velocities, sweeps.num_steps
-        self.side = max(1, round(_CELL / grid.pixel_size))
-        moves = moves_of(sweeps.elapsed, velocities.expand(sweeps.num_windows, -1, -1))
-        moves = moves.view(sweeps.num_windows, 2, self._num_steps, -1, 2)[:, 0]  # from each sweep to t+1
-        self.reach = int(moves.abs().amax()) // self.side + 2
-        rows, cols = (-(-size // self.side) + 2 * self.reach for size in (grid.height, grid.width))
-        self.shape = (sweeps.num_windows, rows, cols)
-        self.count = math.prod(self.shape)
-        # How many cells further a pixel is taken, by its place in its own; velocity after velocity.
-        line = torch.arange(self.side, device=moves.device)
-        down, right = (divide(moves[:, :, None, :, axis] + line[:, None], self.side) for axis in (0, 1))
-        ways = down[:, :, :, None] * cols + right[:, :, None]
-        ways = ways.reshape(-1, len(velocities)) + torch.arange(len(velocities), device=moves.device) * self.count
-        self._ways = ways.int() if len(velocities) * self.count < 1 << 31 else ways
-
-    def own(self, window: Tensor, row: Tensor, col: Tensor) -> Tensor:
-        """(K,) int64, the cell of pixels."""
-        _, rows, cols = self.shape
-        return (window * rows + divide(row, self.side) + self.reach) * cols + divide(col, self.side) + self.reach
-
-    def at_newest(self, some: Looks) -> Tensor:
-        """(L, V) int32 or int64, velocity * count + the cell where it takes the pixel at t+1."""
-        kind = some.window * self._num_steps + some.step
-        for place in (some.row, some.col):
-            kind = kind * self.side + place % self.side
-        ways = self._ways.index_select(0, kind)
-        return ways.add_(self.own(some.window, some.row, some.col).to(ways.dtype)[:, None])
-
-    def add_around(self, sums: Tensor, place: Tensor, counts: Tensor) -> None:
-        """Add counts (K,) to those of the 3 x 3 cells around places, (K,) as of `at_newest`."""
-        for offset in self.around():
-            sums.index_add_(0, place + offset, counts)
-
-    def around(self) -> List[int]:
-        """How far the 3 x 3 cells around one are from it."""
-        return [down * self.shape[2] + right for down in (-1, 0, 1) for right in (-1, 0, 1)]
-
-    def is_free(self) -> Tensor:
-        """(windows, rows, cols) bool: which cells lie around the images."""
-        free = torch.ones(self.shape, dtype=torch.bool, device=self._ways.device)
-        free[:, self.reach : -self.reach, self.reach : -self.reach] = False
-        return free
 
 
 class _Best(NamedTuple):
@@ -129,16 +68,8 @@ def find_local_motion(
     members = flat_nonzero(at_rest & has_history)
     if members.numel() == 0:
         return objects, motion, torch.zeros_like(sweeps.row, dtype=torch.float64)
-    cells, found = _Cells(sweeps, _velocities(sweeps)), look(sweeps, members)
-    sums = _sums_of_winners(sweeps, found, cells)
-    asked = flat_nonzero(sums >= _LEAST_WON)
-    found, place, counts = _looks_near(found, asked, cells)
-    trials = try_all(sweeps, found, cells.velocities)
-    counts = flat_nonzero(counts & trials[1].bool())
-    lost = trials[1].view(-1).index_select(0, counts).int()
-    gain = sums.index_select(0, asked)
-    cells.add_around(sums, place.view(-1).index_select(0, counts), -lost)
-    around = _find_best(sweeps, asked, gain, gain - sums.index_select(0, asked), cells)
+    cells = Cells(sweeps, _velocities(sweeps))
+    found, trials, around = _try_everywhere(sweeps, look(sweeps, members), cells)
     doubt = around.z.view(-1).index_select(0, cells.own(sweeps.window, sweeps.row, sweeps.col))
     is_seed = around.z >= _SEED_Z
     if not bool(is_seed.any()):
@@ -175,7 +106,23 @@ def _is_of_walker(sweeps: HeightSlicedSweeps, velocities: Tensor) -> Tensor:
     )
 
 
-def _sums_of_winners(sweeps: HeightSlicedSweeps, found: Looks, cells: _Cells) -> Tensor:
+def _try_everywhere(
+    sweeps: HeightSlicedSweeps, found: Looks, cells: Cells
+) -> Tuple[Looks, Tuple[Tensor, Tensor], _Best]:
+    """The best velocity of each cell; the looks that count there, and what every velocity wins and loses in them."""
+    sums = _sums_of_winners(sweeps, found, cells)
+    asked = flat_nonzero(sums >= _LEAST_WON)
+    gain = sums.index_select(0, asked)
+    found, place, is_near = _looks_near(found, asked, cells)
+    won, lost = try_all(sweeps, found, cells.velocities)
+    loses = flat_nonzero(is_near & lost.bool())
+    place, losses = (values.view(-1).index_select(0, loses) for values in (place, lost))
+    cells.add_around(sums, place, -losses.int())
+    loss = gain - sums.index_select(0, asked)
+    return found, (won, lost), _find_best(sweeps, asked, gain, loss, cells)
+
+
+def _sums_of_winners(sweeps: HeightSlicedSweeps, found: Looks, cells: Cells) -> Tensor:
     """(V * all cells,) int32, slices won in the 3 x 3 cells around each. Few looks find anything new."""
     new = found.take(flat_nonzero(found.own & ~found.here))
     won, _ = try_all(sweeps, new, cells.velocities)
@@ -186,7 +133,7 @@ def _sums_of_winners(sweeps: HeightSlicedSweeps, found: Looks, cells: _Cells) ->
     return sums
 
 
-def _looks_near(found: Looks, asked: Tensor, cells: _Cells) -> Tuple[Looks, Tensor, Tensor]:
+def _looks_near(found: Looks, asked: Tensor, cells: Cells) -> Tuple[Looks, Tensor, Tensor]:
     """The looks that some velocity takes beside a cell that is asked about, (A,) int64 into (V, all cells); where each
     velocity takes them, as of `at_newest`; and (L, V) bool, whether that is beside such a cell."""
     is_near = torch.zeros(len(cells.velocities) * cells.count, dtype=torch.bool, device=asked.device)
@@ -198,7 +145,7 @@ def _looks_near(found: Looks, asked: Tensor, cells: _Cells) -> Tuple[Looks, Tens
     return found.take(kept), place.index_select(0, kept), near.index_select(0, kept)
 
 
-def _find_best(sweeps: HeightSlicedSweeps, asked: Tensor, gain: Tensor, loss: Tensor, cells: _Cells) -> _Best:
+def _find_best(sweeps: HeightSlicedSweeps, asked: Tensor, gain: Tensor, loss: Tensor, cells: Cells) -> _Best:
     """Of each cell the best velocity of the 3 x 3 cells around; of equals the first cell.
 
     What is best in a cell counts only if it is believed, see `_is_of_walker`.
@@ -226,7 +173,7 @@ def _find_best(sweeps: HeightSlicedSweeps, asked: Tensor, gain: Tensor, loss: Te
 
 
 def _groups(
-    sweeps: HeightSlicedSweeps, found: Looks, trials: Tuple[Tensor, Tensor], seeds: _Best, cells: _Cells
+    sweeps: HeightSlicedSweeps, found: Looks, trials: Tuple[Tensor, Tensor], seeds: _Best, cells: Cells
 ) -> Tuple[Tensor, Tensor]:
     """Pixels that win, with those around, by the velocity of the cell that it takes them to; joined cell by cell.
 
@@ -259,7 +206,7 @@ def _groups(
 
 
 def _gain_around(
-    sweeps: HeightSlicedSweeps, found: Looks, trials: Tuple[Tensor, Tensor], some: Tensor, cells: _Cells
+    sweeps: HeightSlicedSweeps, found: Looks, trials: Tuple[Tensor, Tensor], some: Tensor, cells: Cells
 ) -> Tensor:
     """(K,) int64: slices won less those lost by all of some looks under velocities, (K,) int64 into (L, V), that take
     their pixels to one of the 3 x 3 pixels around that of each at t+1, by the same velocity."""
