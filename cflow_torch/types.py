@@ -14,17 +14,8 @@ from torch import Tensor
 Array = Union[np.ndarray, Tensor]
 # Names in flow files and data frames -> fields of `FlowResult`.
 VECTORS = {"flow": "flow", "residual": "residual_flow", "pose": "pose_flow"}
-OBJECT = np.dtype(
-    [
-        ("id", np.int64),
-        ("centre", np.float64, (3,)),
-        ("size", np.float64, (3,)),
-        ("velocity", np.float64, (3,)),
-        ("heading", np.float64),
-        ("num_points", np.int64),
-        ("confidence", np.float64),
-    ]
-)
+_OBJECT = np.dtype("i8, 3f8, 3f8, 3f8, f8, i8, f8")
+_OBJECT.names = ("id", "centre", "size", "velocity", "heading", "num_points", "confidence")
 
 
 def as_numpy(value: Array, dtype: Optional[Any] = None) -> np.ndarray:
@@ -176,7 +167,7 @@ class FlowResult:
         ids, first, inverse, count = np.unique(
             cluster[order], return_index=True, return_inverse=True, return_counts=True
         )
-        objects = np.zeros(len(ids), OBJECT)
+        objects = np.zeros(len(ids), _OBJECT)
         if len(ids) == 0:
             return objects
 

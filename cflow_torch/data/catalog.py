@@ -134,12 +134,15 @@ def _user_logs(target: str, settings: Mapping[str, Any]) -> Sequence[Log]:
     try:
         made = instantiate({"_target_": target, **settings}, _convert_="all")
     except InstantiationException as error:
-        cause = error.__cause__
+        cause = error.__cause__ or error
         if isinstance(cause, CFlowError):
             raise cause from None
-        if cause is not None and not isinstance(cause, ImportError):  # its author wants to see where
+        if not isinstance(cause, ImportError):  # its author wants to see where
             _log.error("the reader %s fails", target, exc_info=cause)
-        raise CFlowError(f"the reader {target} fails: {' '.join(str(error).split())}") from error
+        where = (
+            "; modules beside the configuration and installed ones are found" if isinstance(cause, ImportError) else ""
+        )
+        raise CFlowError(f"the reader {target} fails: {type(cause).__name__}: {cause}") from error
     if hasattr(made, "sweep"):
         return [made]
     return made if hasattr(made, "__getitem__") else list(made)
