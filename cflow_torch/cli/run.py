@@ -79,9 +79,10 @@ def output_folder(cfg: DictConfig) -> Path:
 
     A sweep over shards is one run in pieces: its jobs share `cfg.output` itself.
     """
-    folder, hydra = as_path(cfg.output), HydraConfig.get()
-    is_shard = any(override.startswith("shard.index=") for override in hydra.overrides.task)
-    return folder if is_shard or not is_sweep() else folder / hydra.sweep.subdir
+    folder = as_path(cfg.output)
+    if not is_sweep() or any(override.startswith("shard.index=") for override in HydraConfig.get().overrides.task):
+        return folder
+    return folder / HydraConfig.get().sweep.subdir
 
 
 def complete_data(data: DictConfig) -> DictConfig:
@@ -91,7 +92,8 @@ def complete_data(data: DictConfig) -> DictConfig:
         CFlowError: the format is not recognised.
     """
     if "_target_" in data:
-        return OmegaConf.merge({"label": HydraConfig.get().runtime.choices.data, "first": 0, "step": 1}, data)  # type: ignore[return-value]
+        defaults = {"label": HydraConfig.get().runtime.choices["data"], "first": 0, "step": 1}
+        return OmegaConf.merge(defaults, data)  # type: ignore[return-value]
     if data.get("name") != AUTO:
         return data
     name = "synthetic"

@@ -139,10 +139,9 @@ def _user_logs(target: str, settings: Mapping[str, Any]) -> Sequence[Log]:
             raise cause from None
         if not isinstance(cause, ImportError):  # its author wants to see where
             _log.error("the reader %s fails", target, exc_info=cause)
-        where = (
-            "; modules beside the configuration and installed ones are found" if isinstance(cause, ImportError) else ""
-        )
-        raise CFlowError(f"the reader {target} fails: {type(cause).__name__}: {cause}") from error
+        raise CFlowError(
+            f"the reader {target} fails: {type(cause).__name__}: {' '.join(str(cause).split())}"
+        ) from error
     if hasattr(made, "sweep"):
         return [made]
     return made if hasattr(made, "__getitem__") else list(made)

@@ -140,7 +140,7 @@ def test_a_reader_of_one_s_own_by_configuration_alone(
         ("_target_: reader_of_mine.Absent\n", "Absent"),
         (
             "_target_: reader_of_mine.several\nfolder: /no/such\nspeed: 1\n",
-            "reader_of_mine.several fails: Error",
+            "reader_of_mine.several fails: FileNotFoundError",
         ),
         ("_target_: builtins.list\n", "builtins.list returned no log"),
     ],
