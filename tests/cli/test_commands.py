@@ -121,6 +121,7 @@ def test_bad_frames_and_bad_logs_are_reported_and_the_rest_goes_on(
 
 
 def test_a_failure_ends_a_run_and_leaves_a_sweep_going(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run, "is_sweep", lambda: False)  # whatever settings were composed before
     with pytest.raises(SystemExit, match="1"):
         run.finish([("a", "bad")])
     monkeypatch.setattr(run, "is_sweep", lambda: True)
