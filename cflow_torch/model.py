@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from cflow_torch.config import CONFIGS, Config, make_config
+from cflow_torch.ops.threads import one_thread
 from cflow_torch.stages import stage
 from cflow_torch.types import CFlowError, FlowResult, Window
 from cflow_torch.windows.bev_grid import Grid
@@ -124,6 +125,7 @@ class SceneFlowModel(nn.Module):
         return Grid(pixel_size, bounds[:3], bounds[3:])
 
     @torch.no_grad()
+    @one_thread()
     def forward(self, windows: Sequence[Window]) -> List[FlowResult]:
         """Flow t -> t+1 for the points of every window's pc0.
 
@@ -132,6 +134,8 @@ class SceneFlowModel(nn.Module):
 
         Returns:
             B results, each independent of the other windows.
+
+        Cost: one thread of the CPU, whatever torch is set to; it is set back afterwards. More cores: more processes.
 
         Raises:
             CFlowError: bad input, see `make_batch`.

@@ -6,7 +6,7 @@ import statistics
 import threading
 import time
 from contextlib import contextmanager
-from typing import Any, Dict, Iterator, List, Protocol, Sequence
+from typing import Any, Dict, Iterator, List, Protocol, Sequence, Tuple
 
 import torch
 from torch.profiler import record_function
@@ -59,8 +59,7 @@ class StopWatch:
 
     def __init__(self, model: FlowModel) -> None:
         self.model, self.config = model, model.config
-        self._seconds: List[float] = []
-        self._stages: List[Dict[str, float]] = []
+        self.pairs: List[Tuple[float, Dict[str, float]]] = []  # seconds, and those of the stages
 
     def __call__(self, windows: Sequence[Window]) -> List[FlowResult]:
         """What the method gives."""
@@ -69,15 +68,14 @@ class StopWatch:
             results = self.model(windows)
             if results and results[0].flow.is_cuda:
                 torch.cuda.synchronize(results[0].flow.device)
-            self._seconds.append(time.perf_counter() - start)
-        self._stages.append(stages)
+            self.pairs.append((time.perf_counter() - start, stages))
         return results
 
     def report(self) -> Dict[str, Any]:
         """Seconds per pair: "median", "min", "max", "pairs" that were timed, "stages" (median of each)."""
-        counted, stages = self._seconds[1:] or self._seconds, self._stages[1:] or self._stages
-        if not counted:
+        if not self.pairs:
             return {"pairs": 0}
+        counted, stages = zip(*(self.pairs[1:] or self.pairs))
         names = list(dict.fromkeys(name for pair in stages for name in pair))
         return {
             "median": statistics.median(counted),

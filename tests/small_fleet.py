@@ -21,8 +21,8 @@ PAIRS = sum(SWEEPS) - len(SWEEPS)
 CONFIG = make_config("paper", pixel_size=0.4, num_history=1)
 # The command for the same.
 COMMAND = ["flow", "data=av2", "model=paper", "model.pixel_sizes=[0.4]", "model.num_history=1", "data.check=false"]
-ONE = Layout(("cpu",), 1, 2)
-TWO = Layout(("cpu", "cpu"), 1, 2)
+ONE = Layout(("cpu",), 2)
+TWO = Layout(("cpu", "cpu"), 2)
 
 
 def write_fleet(root: Path) -> Path:

@@ -129,3 +129,21 @@ def test_a_stop_watch_stands_in_for_the_method_and_knows_its_stages():
         set(report["stages"]) == names | {"local", "layers", "confidence"}
         and sum(report["stages"].values()) <= 3 * report["max"]
     )
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_the_number_of_threads_is_as_before(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the caller's process, also after an error; while a window is computed it is one."""
+    seen, before = [], torch.get_num_threads()
+    model = CorrelationFlow.from_preset("paper")
+    motion = model.motion
+    monkeypatch.setattr(model, "motion", lambda batch: (seen.append(torch.get_num_threads()), motion(batch))[1])
+    try:
+        torch.set_num_threads(number)
+        model([scene(0)])
+        with pytest.raises(CFlowError):
+            model(["no window"])
+        estimate_flow(P0, P1, ground="auto")
+        assert (seen, torch.get_num_threads()) == ([1], number)
+    finally:
+        torch.set_num_threads(before)

@@ -45,15 +45,6 @@ def among_others(config: Config, windows: List[Window]) -> Results:
     return make_model(config, "cpu")(batch)[1::2]
 
 
-def on_two_threads(config: Config, windows: List[Window]) -> Results:
-    before = torch.get_num_threads()
-    try:
-        torch.set_num_threads(3 - min(before, 2))
-        return plainly(config, windows)
-    finally:
-        torch.set_num_threads(before)
-
-
 def in_pieces(config: Config, windows: List[Window]) -> Results:
     """Little memory; points, images, look-ups and key points in pieces of other sizes."""
     pieces = {
@@ -98,7 +89,6 @@ WAYS: Dict[str, Way] = {
     for way in (
         backwards_and_again,
         among_others,
-        on_two_threads,
         in_pieces,
         shuffled,
         while_training,

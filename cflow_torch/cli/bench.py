@@ -6,7 +6,7 @@ end with the flow on the device. Other work on the machine spoils the figures.
 examples:
   cflow bench                                                    a simulated street
   cflow bench data=av2 data.root=/data/av2/val/LOG repeats=50    real data, more runs
-  cflow bench model=paper num_threads=4 'batches=[1,8]'          another method, more threads
+  cflow bench model=paper 'batches=[1,8]'                        another method
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from cflow_torch.config import Config
 from cflow_torch.data.atomic import ready_folder
 from cflow_torch.data.log import Log, window
 from cflow_torch.data.records import strict, write_text
-from cflow_torch.fleet.machine import threads
 from cflow_torch.stages import FlowModel, StopWatch
 from cflow_torch.types import CFlowError, Window
 from cflow_torch.windows.memory import peak_memory
@@ -32,7 +31,6 @@ def task(cfg: DictConfig) -> None:
     """Run `cflow bench`."""
     output = run.output_folder(cfg)
     repeats, num_pairs = run.whole_number(cfg, "repeats", 1), run.whole_number(cfg, "pairs", 1)
-    num_threads = torch.get_num_threads() if cfg.num_threads is None else run.whole_number(cfg, "num_threads", 1)
     if any(size < 1 for size in cfg.batches):
         raise CFlowError(f"batches={cfg.batches}: give whole numbers of at least 1, as in 'batches=[1,8]'")
     model = run.make_model(cfg)
@@ -40,9 +38,8 @@ def task(cfg: DictConfig) -> None:
     log = sources.open(sources.logs[0])
     windows = _windows(log, num_pairs, model.config)
     ready_folder(output)
-    with threads(num_threads):
-        report = {"log": log.log_id, **measure(model, windows, repeats, cfg.batches), "machine": run.machine()}
-    report.update(threads=num_threads, versions=run.versions(), model=model.config.as_dict())
+    report = {"log": log.log_id, **measure(model, windows, repeats, cfg.batches), "machine": run.machine()}
+    report.update(versions=run.versions(), model=model.config.as_dict())
     print(format_report(report))
     write_text(output / "bench.json", json.dumps(strict(report), indent=1, allow_nan=False) + "\n")
     print(f"written to {output / 'bench.json'}")
@@ -95,7 +92,7 @@ def format_report(report: Dict[str, Any]) -> str:
     rows = {"total, median": seconds["median"], "least": seconds["min"], "most": seconds["max"], **seconds["stages"]}
     lines = [
         f"method {model['method']}, num_history {model.get('num_history', 0)}, pixel_sizes {model['pixel_sizes']}",
-        f"device {report['device']}; {report['machine']['cpu']}, {report['threads']} thread(s)",
+        f"device {report['device']}; {report['machine']['cpu']}, one thread",
         f"log {report['log']}: {report['windows']} pairs, {report['points']:.0f} points a sweep, each "
         f"{report['repeats']} times; torch {report['versions']['torch']}",
         f"most memory (CPU: of the process, GPU: allocated there): {peak}",

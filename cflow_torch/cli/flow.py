@@ -54,8 +54,8 @@ def task(cfg: DictConfig) -> None:
         _check_results(cfg, shard)
     settings: Dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
     engine = dict(settings["engine"])
-    name, workers, threads, batch = (engine.pop(key) for key in ("name", "workers", "threads", "batch"))
-    layout = choose_layout(cfg.device, workers, threads, batch, os.environ)
+    name, workers, batch = (engine.pop(key) for key in ("name", "workers", "batch"))
+    layout = choose_layout(cfg.device, workers, batch, os.environ)
     config = run.make_model(cfg).config
     contents = _contents(cfg, config.method == "verified")
     sources = run.find_logs(cfg)

@@ -17,15 +17,16 @@ from omegaconf import DictConfig, OmegaConf
 
 from cflow_torch import __version__, estimate
 from cflow_torch.cli.choices import CONFIGS, own_settings
+from cflow_torch.cli.estimates import estimates
 from cflow_torch.config import config_from
 from cflow_torch.data.catalog import AUTO, find_sources, find_user_sources, open_log, recognise
 from cflow_torch.data.log import Log, RecentSweeps, window
 from cflow_torch.data.paths import as_path
 from cflow_torch.data.records import write_text
-from cflow_torch.fleet.progress import frames, say
+from cflow_torch.fleet.progress import say
 from cflow_torch.model import SceneFlowModel
 from cflow_torch.simulator.benchmark import benchmark_logs, format_of
-from cflow_torch.stages import FlowModel
+from cflow_torch.stages import StopWatch
 from cflow_torch.types import CFlowError, FlowResult, Window
 
 Failures = List[Tuple[str, str]]
@@ -207,7 +208,7 @@ def reported(failures: Failures, name: str) -> Iterator[None]:
         say(f"failed: {name}: {error}")
 
 
-def for_each_pair(logs: Sequence[Log], model: FlowModel, use: UseResult, pairs: Callable[[Log], range]) -> Failures:
+def for_each_pair(logs: Sequence[Log], model: StopWatch, use: UseResult, pairs: Callable[[Log], range]) -> Failures:
     """Estimate the flow of the pairs of every log and hand it on; a bad frame is reported and the rest goes on.
 
     Args:
@@ -223,11 +224,13 @@ def for_each_pair(logs: Sequence[Log], model: FlowModel, use: UseResult, pairs: 
     failures: Failures = []
     recent = [RecentSweeps(log, config.num_sweeps) for log in logs]
     indices = [(log, index) for log in recent for index in pairs(log)]
-    for log, index in frames(indices):
+
+    def read(pair: Tuple[RecentSweeps, int]) -> Window:
+        return window(*pair, config.num_history, config.num_future)
+
+    for (log, index), answer in estimates(model, indices, read):
         with reported(failures, f"{log.log_id}/{log.timestamps[index]}"):
-            sweeps = window(log, index, config.num_history, config.num_future)
-            (result,) = model([sweeps])
-            use(log.log, index, sweeps, result)
+            use(log.log, index, *answer())
     return failures
 
 

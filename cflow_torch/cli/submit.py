@@ -21,6 +21,7 @@ import yaml  # type: ignore[import-untyped]
 from omegaconf import DictConfig
 
 from cflow_torch.cli import run
+from cflow_torch.cli.estimates import estimates
 from cflow_torch.cli.record import refuse_changes
 from cflow_torch.cli.run import Failures
 from cflow_torch.data.atomic import ready_folder
@@ -33,8 +34,8 @@ from cflow_torch.evaluation.submission.plan import Frame, PlannedFrame, plan_log
 from cflow_torch.evaluation.submission.versions import SubmissionVersion, get_version
 from cflow_torch.evaluation.submission.write import is_complete, pack, write_frame, write_metadata
 from cflow_torch.fleet.progress import frames as counted
-from cflow_torch.stages import FlowModel
-from cflow_torch.types import CFlowError
+from cflow_torch.stages import StopWatch
+from cflow_torch.types import CFlowError, Window
 
 Plan = List[Tuple[PlannedFrame, Frame]]
 _Masks = Optional[MaskArchive]
@@ -53,7 +54,7 @@ def task(cfg: DictConfig) -> None:
         raise CFlowError("masks= says which frames are evaluated: leave frames= out")
     masks = None if cfg.masks is None else MaskArchive(cfg.masks)
     listed = read_frame_list(cfg.frames) if cfg.frames is not None else None if masks is None else masks.frames
-    model = run.make_model(cfg)
+    model = StopWatch(run.make_model(cfg))
     logs, failures = run.open_logs(cfg)
     plan, unreadable = _plan(logs, version, listed, masks)
     failures += unreadable
@@ -121,23 +122,24 @@ def _plan(logs: Sequence[Log], version: SubmissionVersion, listed: _Listed, mask
 
 
 def _write(
-    cfg: DictConfig, plan: Plan, model: FlowModel, version: SubmissionVersion, masks: _Masks, folder: Path
+    cfg: DictConfig, plan: Plan, model: StopWatch, version: SubmissionVersion, masks: _Masks, folder: Path
 ) -> Failures:
     """Estimate and write the frames that are not there yet."""
     failures: Failures = []
-    rounding, kept = Rounding(), 0
-    for planned, frame in counted(plan):
-        if is_complete(folder, frame, version):
-            kept += 1
-            continue
+    rounding, config = Rounding(), model.config
+    todo = [pair for pair in plan if not is_complete(folder, pair[1], version)]
+
+    def read(pair: Tuple[PlannedFrame, Frame]) -> Window:
+        return window(pair[0].log, pair[0].index, config.num_history, config.num_future)
+
+    for (planned, frame), estimate in estimates(model, todo, read):
         with run.reported(failures, frame.name):
-            sweeps = window(planned.log, planned.index, model.config.num_history, model.config.num_future)
+            sweeps, result = estimate()
             mask = point_mask(planned.log, planned.index, sweeps.pc0, masks) if version.rows == "masked" else None
-            (result,) = model([sweeps])
             columns, lost = encode(version, sweeps, result, mask, cfg.residual_axes)
             write_frame(folder, frame.name, columns)
             rounding.add(lost)
-    print(f"frames written: {len(plan) - kept - len(failures)}, already there: {kept}")
+    print(f"frames written: {len(todo) - len(failures)}, already there: {len(plan) - len(todo)}")
     if rounding.num_points:
         print(f"float16 rounding of the new ones: {rounding}")
     return failures

@@ -45,8 +45,8 @@ class AV2Log(NumberedSweeps):
 
     Args:
         folder: log folder with `sensors/lidar/<ns>.feather` and `city_SE3_egovehicle.feather`.
-        ground: rule for the map raster, "av2-api" or "bsfe" (`cflow_torch.data.ground`); None = no ground masks.
-        require_ground: refuse a log whose map has no ground raster. Otherwise its sweeps have `is_ground` None.
+        ground: rule for the map raster, "av2-api" or "bsfe" (`cflow_torch.data.ground`); None = no ground masks. A log
+            whose map has no raster has none either.
 
     Attributes:
         log_id: name of the folder.
@@ -60,7 +60,7 @@ class AV2Log(NumberedSweeps):
             the wrong type, poses that are no rigid motion or do not cover a sweep.
     """
 
-    def __init__(self, folder: Place, ground: Optional[str] = "av2-api", require_ground: bool = False) -> None:
+    def __init__(self, folder: Place, ground: Optional[str] = "av2-api") -> None:
         self.folder = as_path(folder)
         if not _is_log(self.folder):
             raise CFlowError(f"{self.folder} is no Argoverse 2 log: it holds no folder sensors/lidar")
@@ -78,11 +78,6 @@ class AV2Log(NumberedSweeps):
             if ground not in GROUND_RULES:
                 raise CFlowError(f"ground rules are {sorted(GROUND_RULES)}, got {ground!r}")
             self._raster = read_ground_raster(self.folder / "map")
-        if require_ground and self._raster is None:
-            raise CFlowError(
-                f"log {self.log_id} has no ground raster (map/*_ground_height_surface____*.npy) or ground=None was "
-                f"given; fetch the map, or open the log with require_ground=False and segment the ground yourself"
-            )
 
     def sweep(self, index: int) -> Sweep:
         """Sweep number `index`, with ground where the log has a raster."""

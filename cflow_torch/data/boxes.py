@@ -65,6 +65,16 @@ def category_indices(names: Sequence[Any], known: Mapping[Any, str]) -> List[int
     return [CATEGORY_INDEX[known[name]] for name in names]
 
 
+def upright_poses(heading_centre: Any) -> np.ndarray:
+    """(K, 4, 4) float64 poses of boxes that turn about z only, from heading (radians) and x, y, z (metres) of each."""
+    values = np.array(heading_centre, dtype=np.float64).reshape(-1, 4)
+    pose = np.tile(np.eye(4), (len(values), 1, 1))
+    cos, sin = np.cos(values[:, 0]), np.sin(values[:, 0])
+    pose[:, 0, 0], pose[:, 0, 1], pose[:, 1, 0], pose[:, 1, 1] = cos, -sin, sin, cos
+    pose[:, :3, 3] = values[:, 1:]
+    return pose
+
+
 def points_in_box(points: np.ndarray, size: np.ndarray, pose: np.ndarray) -> np.ndarray:
     """Points inside an oriented box, faces included.
 

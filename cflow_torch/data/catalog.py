@@ -45,9 +45,14 @@ DATA_SETS: Dict[str, DataSet] = {
         "truckscenes", "find_truckscenes_scenes", "TruckScenesLog", "TruckScenes scene (a folder with v1.*)"
     ),
     "waymo": DataSet("waymo", "find_waymo_segments", "WaymoLog", "Waymo segment (a file lidar/*.parquet)"),
+    "pandaset": DataSet(
+        "pandaset", "find_pandaset_sequences", "PandaSetLog", "PandaSet sequence (a folder with lidar/poses.json)"
+    ),
     "aevascenes": DataSet(
         "aevascenes", "find_aevascenes_sequences", "AevaScenesLog", "AevaScenes sequence (a folder with sequence.json)"
     ),
+    "bags": DataSet("bags", "find_bags", "BagLog", "bag (.bag, .mcap, or the folder of a ROS 2 bag)"),
+    "kiss_icp": DataSet("kiss_icp", "find_kiss_icp", "KissICPLog", "data for a loader of KISS-ICP"),
     "arrays": DataSet("arrays", "find_array_logs", "ArraysLog", "folder of point clouds"),
 }
 

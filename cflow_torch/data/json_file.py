@@ -1,17 +1,13 @@
-"""JSON documents: one error for what is wrong with them, and checks of the values that they hold."""
+"""JSON documents, with one error for what is wrong with them."""
 
 from __future__ import annotations
 
 import json
-import reprlib
 from pathlib import Path
 from typing import Any, Callable, Dict, Optional
 
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.paths import read_bytes
-
-_SHORT = reprlib.Repr()
-_SHORT.maxlist, _SHORT.maxstring, _SHORT.maxother = 12, 80, 80
 
 
 def read_json(file: Path) -> Any:
@@ -40,13 +36,3 @@ def parse_json(data: bytes, file: Any, use: Optional[Callable[[Dict[str, Any]], 
     """
     with file_errors(f"{file} as JSON"):
         return json.loads(data.decode("utf-8-sig"), object_hook=use)
-
-
-def shown(value: Any) -> str:
-    """A value for a message: short, however large or deep it is."""
-    return _SHORT.repr(value)[:200]
-
-
-def is_whole(value: Any, most: int = (1 << 63) - 1) -> bool:
-    """Whether a value is a whole number from -most to most, by default one that an int64 can hold."""
-    return type(value) is int and abs(value) <= most

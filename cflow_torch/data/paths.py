@@ -27,6 +27,7 @@ _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)://")
 _BLOCK = 1 << 20  # bytes; smaller ones make more requests: HDF5's metadata is scattered, its data are long reads
 _KEPT_BLOCKS = 32  # of each open file: 32 MiB
 _COPIED = 8 << 20  # bytes per request while a file is copied
+_POINTER = b"version https://git-lfs.github.com/spec/"  # what git leaves in place of a file that is not fetched
 _KEPT_COPIES = 4  # files of `mapped`: two of a Waymo segment that is read, two of the one before
 
 
@@ -106,7 +107,7 @@ def read_bytes(path: Path) -> bytes:
         OSError: as for a local file, and if the far side cannot be reached.
     """
     if not is_remote(path):
-        _size(path)
+        _check(path)
         return path.read_bytes()
     remote: Any = path
     with remote_errors(path):
@@ -121,8 +122,7 @@ def whole(path: Path) -> Any:
     """
     if is_remote(path):
         return io.BytesIO(read_bytes(path))
-    _size(path)
-    return str(path)
+    return _check(path)
 
 
 def ranged(path: Path) -> Any:
@@ -134,7 +134,7 @@ def ranged(path: Path) -> Any:
         OSError: a remote file cannot be opened; later, that it cannot be read.
     """
     if not is_remote(path):
-        return str(path)
+        return _check(path)
     return _open(path, cache_type="blockcache", block_size=_BLOCK, cache_options={"maxblocks": _KEPT_BLOCKS})
 
 
@@ -147,7 +147,7 @@ def mapped(path: Path) -> Any:
     Raises:
         OSError: a remote file cannot be read, or there is no room for the copy.
     """
-    return pa.BufferReader(_copy(path)) if is_remote(path) else str(path)
+    return pa.BufferReader(_copy(path)) if is_remote(path) else _check(path)
 
 
 @lru_cache(maxsize=_KEPT_COPIES)
@@ -164,9 +164,13 @@ def _open(path: Any, **settings: Any) -> Any:
         return path.fs.open(path.path, "rb", **settings)
 
 
-def _size(path: Path) -> int:
-    """Bytes of a file on this machine, which must be one."""
-    status = path.stat()
-    if not stat.S_ISREG(status.st_mode) and not stat.S_ISDIR(status.st_mode):
+def _check(path: Path) -> str:
+    """Name of a file on this machine, which must be one, with data in it."""
+    mode = path.stat().st_mode
+    if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
         raise OSError(errno.EINVAL, "is a device or a pipe, no file", str(path))
-    return status.st_size
+    if stat.S_ISREG(mode):
+        with open(path, "rb") as file:
+            if file.read(len(_POINTER)) == _POINTER:
+                raise CFlowError(f"{path} is a git-lfs pointer, not the data: run git lfs pull there, or download it")
+    return str(path)

@@ -3,15 +3,28 @@
 from __future__ import annotations
 
 import pickle
-from typing import IO, Any, Collection, Tuple
+from typing import IO, Any, Dict, FrozenSet, Tuple
+
+import numpy as np
 
 Name = Tuple[str, str]  # module, name in it
-_ARRAYS = ("numpy.core.multiarray", "numpy._core.multiarray")
-NUMPY_ARRAYS: Collection[Name] = frozenset(
+_NUMPY = (("multiarray", "_reconstruct"), ("multiarray", "scalar"), ("numeric", "_frombuffer"))
+NUMPY_ARRAYS: FrozenSet[Name] = frozenset(
     [("numpy", "ndarray"), ("numpy", "dtype")]
-    + [(module, name) for module in _ARRAYS for name in ("_reconstruct", "scalar")]
+    + [(f"numpy.{core}.{module}", name) for core in ("core", "_core") for module, name in _NUMPY]
 )
-"""What the pickle of a NumPy array of strings names."""
+"""What the pickle of a NumPy array names."""
+DATA_FRAMES: FrozenSet[Name] = NUMPY_ARRAYS | {
+    ("builtins", "slice"),
+    ("pandas._libs.internals", "_unpickle_block"),
+    ("pandas.core.frame", "DataFrame"),
+    ("pandas.core.indexes.base", "Index"),
+    ("pandas.core.indexes.base", "_new_Index"),
+    ("pandas.core.indexes.numeric", "Int64Index"),
+    ("pandas.core.indexes.range", "RangeIndex"),
+    ("pandas.core.internals.managers", "BlockManager"),
+}
+"""What the pickle of a data frame names, as pandas 1 and 2 write it."""
 
 
 class StandIn:
@@ -22,9 +35,13 @@ class StandIn:
         state: what its `__setstate__` would get; None = nothing.
     """
 
-    def __init__(self, *parts: Any) -> None:
-        self.parts = parts
-        self.state: Any = None
+    parts: Tuple[Any, ...]
+    state: Any = None
+
+    def __new__(cls, *parts: Any) -> StandIn:  # the one that every way of building calls
+        made = super().__new__(cls)
+        made.parts = parts
+        return made
 
     def __setstate__(self, state: Any) -> None:
         self.state = state
@@ -33,7 +50,7 @@ class StandIn:
 class _Unpickler(pickle.Unpickler):
     """Makes plain values (numbers, texts, lists, tuples and the like), and stand-ins for names that are allowed."""
 
-    def __init__(self, stream: IO[bytes], allowed: Collection[Name]) -> None:
+    def __init__(self, stream: IO[bytes], allowed: FrozenSet[Name]) -> None:
         super().__init__(stream, encoding="ascii")
         self._allowed = allowed
 
@@ -43,7 +60,7 @@ class _Unpickler(pickle.Unpickler):
         raise pickle.UnpicklingError(f"it asks for {module}.{name}, which is never run")
 
 
-def load_plain(stream: IO[bytes], allowed: Collection[Name] = ()) -> Any:
+def load_plain(stream: IO[bytes], allowed: FrozenSet[Name] = frozenset()) -> Any:
     """What a pickle holds.
 
     Args:
@@ -54,3 +71,41 @@ def load_plain(stream: IO[bytes], allowed: Collection[Name] = ()) -> Any:
         Exception: whatever the unpickler raises for a damaged pickle, or one that names something else.
     """
     return _Unpickler(stream, allowed).load()
+
+
+def array_of(stand_in: StandIn) -> np.ndarray:
+    """The array that a stand-in is for, of numbers, texts or truth values; one of objects keeps them as they are.
+
+    Raises:
+        Exception: nearly any, if it stands for something else.
+    """
+    if stand_in.state is None:  # `_frombuffer`, of pickles of protocol 5
+        data, dtype, shape, order = stand_in.parts
+    else:
+        _, shape, dtype, is_fortran, data = stand_in.state
+        order = "F" if is_fortran else "C"
+    kind = np.dtype(dtype.state[1] + dtype.parts[0])
+    values = np.array(data + [None], object)[:-1] if kind.hasobject else np.frombuffer(data, kind)
+    return values.reshape(shape, order=order)
+
+
+def load_columns(stream: IO[bytes]) -> Dict[str, np.ndarray]:
+    """Columns of a data frame that pandas pickled, by name; without pandas.
+
+    Raises:
+        Exception: as `load_plain` and `array_of`.
+    """
+    frame = load_plain(stream, DATA_FRAMES).state
+    manager = frame["_mgr"] if "_mgr" in frame else frame["_data"]
+    if manager.state is None:
+        blocks, axes = [block.parts[:2] for block in manager.parts[0]], manager.parts[1]
+    else:  # pandas 1.2 and older
+        layout = manager.state[3]["0.14.1"]
+        blocks, axes = [(block["values"], block["mgr_locs"]) for block in layout["blocks"]], layout["axes"]
+    names = array_of(axes[0].parts[1]["data"])
+    columns: Dict[str, np.ndarray] = {}
+    for values, place in blocks:
+        is_slice = place.state is None and len(place.parts) == 3
+        chosen = slice(*place.parts) if is_slice else array_of(place)
+        columns.update(zip(names[chosen].tolist(), array_of(values)))
+    return columns

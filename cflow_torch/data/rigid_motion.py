@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Callable
+from typing import Any, Callable, Sequence
 
 import numpy as np
 import torch
@@ -35,6 +35,17 @@ def poses_from_quaternions(translation: Any, quaternion: Any, what: Callable[[in
             f"quaternion of length 1, got {turn[row].tolist()}, {shift[row].tolist()}; copy the file again"
         )
     return _poses(to_rotations(turn), shift)
+
+
+def poses_of_nodes(nodes: Sequence[Any], translation: str, rotation: str, what: str) -> np.ndarray:
+    """(K, 4, 4) float64 poses of K JSON objects with members {x, y, z} and {w, x, y, z} of these names.
+
+    Raises:
+        CFlowError: as `poses_from_quaternions`.
+    """
+    shifts = [[node[translation][axis] for axis in "xyz"] for node in nodes]
+    turns = [[node[rotation][axis] for axis in "wxyz"] for node in nodes]
+    return poses_from_quaternions(shifts, turns, lambda row: f"{what} {row}")
 
 
 def poses_at(times: np.ndarray, known_times: np.ndarray, poses: np.ndarray) -> np.ndarray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Iterator, List, NamedTuple, Optional, Tuple
+from typing import Iterator, List, Optional, Tuple
 
 import torch
 from torch import Tensor
@@ -14,7 +14,7 @@ from cflow_torch.dense.packing import Packing, Search, pack
 from cflow_torch.dense.projection import ProjectedSweeps
 from cflow_torch.dense.templates import TemplatePairs, make_pairs
 from cflow_torch.ops.cross_correlation import cross_correlate
-from cflow_torch.ops.indices import flat_nonzero
+from cflow_torch.ops.indices import flat_nonzero, largest_of_rows, take_columns
 from cflow_torch.ops.segments import segment_amin
 from cflow_torch.ops.window_counts import WindowCounts
 
@@ -50,18 +50,6 @@ class Estimates:
         """(M,) float32, that of the nearest sweep with the cluster."""
         newest = self.available.int().argmax(1, keepdim=True)
         return self.score.gather(1, newest)[:, 0]
-
-
-class Correlation(NamedTuple):
-    """Correlations of n pairs of a class.
-
-    Args:
-        counts: (n, Y * X) float, to be rounded.
-        searched: number of leading samples that a shift may stand at.
-    """
-
-    counts: Tensor
-    searched: int
 
 
 def correlate(clusters: Clusters, sweeps: ProjectedSweeps, config: DenseConfig) -> Estimates:
@@ -110,76 +98,64 @@ def best_shifts(pairs: TemplatePairs, engine: str = "fft", max_memory: Optional[
     Source: Eq. norm_correlation, displacement_in_bev, Alg. scene_flow_1view.
     """
     num_pairs, device = pairs.cluster.numel(), pairs.size.device
-    shift = torch.zeros((num_pairs, 2), dtype=torch.int64, device=device)
-    score = torch.zeros(num_pairs, dtype=torch.float32, device=device)
     if num_pairs == 0:
-        return shift, score
-    search, packing = pack(pairs)
-    order = packing.pairs
-    own = pairs.cluster.index_select(0, order)
-    search = search.take(own)
-    target_energy = pairs.target.energy(len(pairs.size)).index_select(0, own)
-    radius = None if pairs.radius is None else pairs.radius.index_select(0, order)
-
-    found = []
-    for part, counts in _correlated(packing, own, engine, max_memory):
-        wanted = Search(search.low[part], search.high[part], search.stride[part])
-        pair, *rest = _candidates(counts, wanted, target_energy[part], None if radius is None else radius[part])
-        found.append((pair + part.start, *rest))
-    place, dy, dx, count = found[0] if len(found) == 1 else map(torch.cat, zip(*found))
+        return pairs.cluster.new_zeros((0, 2)), torch.zeros(0, dtype=torch.float32, device=device)
+    packing = pack(pairs)
+    radius = None if pairs.radius is None else pairs.radius.index_select(0, packing.pairs)
+    target_energy = packing.energy.index_select(0, packing.clusters + num_pairs)
+    found = [
+        _candidates(*run, packing.search, target_energy, radius) for run in _correlated(packing, engine, max_memory)
+    ]
+    place, dy, dx, count = torch.cat(found, 1)
     target = pairs.target
-    pair, dy, dx, count, energy = _best_of_each_pair(
-        WindowCounts(target.image, target.row, target.col, pairs.size),
-        order.index_select(0, place),
-        own.index_select(0, place),
-        dy,
-        dx,
+    dy, dx, count, energy = _best_of_each_pair(
+        WindowCounts(target.image, target.row, target.col, packing.size),
+        packing.pairs.index_select(0, place),
+        packing.clusters.index_select(0, place),
+        torch.stack((dy, dx)),
         count,
         num_pairs,
     )
-    shift[pair] = torch.stack((dy, dx), 1)
-    energies = pairs.template.energy(num_pairs).index_select(0, pair) * energy
-    score[pair] = (count.double() / torch.sqrt(energies.double())).float()
-    return shift, score
+    energies = (packing.energy[:num_pairs] * energy).clamp_(min=1)  # 0 where nothing overlaps
+    return torch.stack((dy, dx), 1), (count.double() / torch.sqrt(energies.double())).float()
 
 
 def _correlated(
-    packing: Packing, own: Tensor, engine: str, max_memory: Optional[float]
-) -> Iterator[Tuple[slice, List[Correlation]]]:
-    """Runs of pairs, in packing order, and their correlations, class by class.
+    packing: Packing, engine: str, max_memory: Optional[float]
+) -> Iterator[Tuple[slice, Tensor, List[Tensor]]]:
+    """Runs of packed pairs, their searched counts, one pair after the other, and the same as (n, searched) pieces.
 
-    Args:
-        packing: the images.
-        own: (J,) int64, target of each pair, in packing order.
-        engine, max_memory: as for `best_shifts`.
+    The counts of a run are overwritten by those of the next.
     """
-    place = torch.empty_like(packing.targets)
-    place.scatter_(0, packing.targets, torch.arange(place.numel(), device=place.device))
-    own = place.index_select(0, own)
-    blocks = packing.samples.split([(j + n) * y * x for j, n, y, x, _ in packing.classes])
-    at_once, in_part = _samples_at_once(own.device, max_memory)
-    pending: List[Correlation] = []
-    first_pair = last_pair = first_target = used = 0
-    for block, (num_templates, num_targets, height, width, searched) in zip(blocks, packing.classes):
-        images = block.view(-1, height, width)
-        step = max(1, at_once // (height * width))
-        for begin in range(0, num_templates, step):
-            end = min(begin + step, num_templates)
-            if pending and used + (end - begin) * searched > in_part:
-                yield slice(first_pair, last_pair), pending
-                pending, first_pair, used = [], last_pair, 0
-            wanted = own[last_pair : last_pair + end - begin] - first_target
-            some = images
-            if end - begin < num_templates:  # a run of pairs needs a run of targets: both are in the order of clusters
-                low, high = int(wanted.min()), int(wanted.max())
-                some = torch.cat((images[begin:end], images[num_templates + low : num_templates + high + 1]))
-                wanted = wanted - low
-            counts = cross_correlate(some.view(torch.uint8).float(), end - begin, wanted, engine)
-            pending.append(Correlation(counts.flatten(1), searched))
-            last_pair += end - begin
-            used += (end - begin) * searched
-        first_target += num_targets
-    yield slice(first_pair, last_pair), pending
+    device, classes = packing.samples.device, packing.classes
+    blocks = packing.samples.split([(found.templates + found.targets) * found.area for found in classes])
+    at_once, in_part = _samples_at_once(device, max_memory)
+    steps = [min(found.templates, max(1, at_once // found.area)) for found in classes]
+    size = max(in_part, *(step * found.searched for step, found in zip(steps, classes)))
+    size = min(size, sum(found.templates * found.searched for found in classes))
+    dtype = torch.float32 if max(found.most for found in classes) < 1 << 24 else torch.float64
+    samples = torch.empty(size, dtype=dtype, device=device)
+    pieces: List[Tensor] = []
+    first_pair = last_pair = used = 0
+    for block, found, step in zip(blocks, classes, steps):
+        images = block.view(-1, found.height, found.width)
+        own = packing.own_on_host[last_pair : last_pair + found.templates]
+        for begin in range(0, found.templates, step):
+            end = min(begin + step, found.templates)
+            wanted, some, stop = own[begin:end], images, used + (end - begin) * found.searched
+            if stop > len(samples):
+                yield slice(first_pair, last_pair), samples[:used], pieces
+                pieces, first_pair, used, stop = [], last_pair, 0, stop - used
+            target = packing.own[last_pair : last_pair + end - begin]
+            # A run of pairs needs a run of targets: both are in the order of clusters.
+            if end - begin < found.templates:
+                targets = images[found.templates + wanted[0] : found.templates + wanted[-1] + 1]
+                target, some = target - int(wanted[0]), torch.cat((images[begin:end], targets))
+            counts = cross_correlate(some.view(torch.uint8).float(), end - begin, target, engine, found.most)
+            piece = samples[used:stop].view(end - begin, -1)
+            pieces.append(piece.copy_(counts.flatten(1)[:, : found.searched]).round_())
+            last_pair, used = last_pair + end - begin, stop
+    yield slice(first_pair, last_pair), samples[:used], pieces
 
 
 def _samples_at_once(device: torch.device, max_memory: Optional[float]) -> Tuple[int, int]:
@@ -192,97 +168,77 @@ def _samples_at_once(device: torch.device, max_memory: Optional[float]) -> Tuple
 
 
 def _candidates(
-    parts: List[Correlation], search: Search, target_energy: Tensor, radius: Optional[Tensor]
-) -> Tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Shifts that may be the best of their pair: (K,) pair, dy, dx, count.
+    part: slice,
+    samples: Tensor,
+    pieces: List[Tensor],
+    search: Search,
+    target_energy: Tensor,
+    radius: Optional[Tensor],
+) -> Tensor:
+    """Shifts that may be the best of their pair: (4, K) int64, packed pair, dy, dx, count.
 
     A window holds at least the pixels that coincide and at most all of the target's, so count^2 / energy lies between
     count^2 / target energy and count. What is below the largest of the lower bounds need not be looked at.
 
     Args:
-        parts: correlations of J pairs; what stands at samples outside the search is ignored.
-        search: of each pair.
+        part: the pairs that are looked at.
+        samples, pieces: of these pairs, as `_correlated` gives them; samples outside the search are ignored.
+        search: of each packed pair.
         target_energy: (J,) int64, pixels of each pair's target.
         radius: (J,) float64, pixels; None = no limit.
     """
+    low, high, stride = search.low[:, part], search.high[:, part], search.stride[part]
+    searched = search.searched[part]
+    end = searched.cumsum(0)
     # Two samples for a lower bound: no shift, and the largest count, moved into the search if it stands outside.
-    counts = [part.counts[:, : part.searched] for part in parts]
-    largest = torch.cat([part.argmax(1) for part in counts])
-    middle = search.low[:, 0] * search.stride + search.low[:, 1]
-    dy, dx = search.shift(largest)
-    dy, dx = torch.minimum(dy, search.high[:, 0]), torch.minimum(dx, search.high[:, 1])
-    probe = middle + dy * search.stride + dx
+    middle, largest = low[0] * stride + low[1], torch.cat([largest_of_rows(piece) for piece in pieces])
+    dy, dx = torch.minimum(Search(low, high, stride, searched).shift(largest), high)
+    probe = middle + dy * stride + dx
     if radius is not None:
-        square = (radius * radius).floor()
+        square = (radius[part] * radius[part]).floor()
         probe = torch.where(dy * dy + dx * dx <= square, probe, middle)
-    sizes = [len(part) for part in counts]
-    probes = torch.stack((middle, probe), 1).split(sizes)
-    bound = torch.cat([part.gather(1, places).amax(1) for part, places in zip(counts, probes)]).round_()
-    # 1 less, because counts are not rounded yet; counts of 0 are never better than no shift at all.
-    needed = (bound * bound / target_energy - 1).clamp_(min=0.5)[:, None].split(sizes)
-    place = flat_nonzero(torch.cat([(part > least).flatten() for part, least in zip(counts, needed)]))
-    # Which pair and sample each place is: n pairs of a class have as many samples each.
-    shape = [(len(part), part.shape[1]) for part in counts]
-    table = torch.tensor([(n, width, n * width) for n, width in shape], device=place.device)
-    ends = table[:, 2].cumsum(0)
-    kind = torch.searchsorted(ends, place, right=True)
-    first_pair, width, first = torch.stack(
-        (table[:, 0].cumsum(0) - table[:, 0], table[:, 1], ends - table[:, 2])
-    ).index_select(1, kind)
-    within = place - first
-    in_class = within // width
-    pair, sample = first_pair + in_class, within - in_class * width
-    count = torch.cat(
-        [
-            part.counts.view(-1).index_select(0, rows * part.counts.shape[1] + samples)
-            for part, rows, samples in zip(parts, *_split(place, ends, in_class, sample))
-        ]
-    )
-    search = search.take(pair)
-    dy, dx = search.shift(sample)
-    is_searched = (dy <= search.high[:, 0]) & (dx <= search.high[:, 1])
+    start = end - searched
+    bound = torch.maximum(samples.index_select(0, start + middle), samples.index_select(0, start + probe))
+    # 1 less, because the quotient is rounded; counts of 0 are never better than no shift at all.
+    needed = (bound * bound / target_energy[part] - 1).clamp_(min=0.5)[:, None].split([len(piece) for piece in pieces])
+    place = flat_nonzero(torch.cat([(piece > least).view(-1) for piece, least in zip(pieces, needed)]))
+    pair = torch.searchsorted(end, place, right=True)
+    found = take_columns(torch.cat((low, high, stride[None], start[None])), pair)
+    shift = Search(found[:2], found[2:4], found[4], found[5]).shift(place - found[5])
+    is_searched = (shift <= found[2:4]).all(0)
     if radius is not None:
-        is_searched &= dy * dy + dx * dx <= square.index_select(0, pair)
-    kept = flat_nonzero(is_searched)
-    pair, dy, dx, count = (values.index_select(0, kept) for values in (pair, dy, dx, count.round_().long()))
-    return pair, dy, dx, count
-
-
-def _split(place: Tensor, ends: Tensor, *values: Tensor) -> List[Tuple[Tensor, ...]]:
-    """Each of `values` in one piece per class."""
-    stops = torch.searchsorted(place, ends).tolist()
-    sizes = [stop - start for start, stop in zip([0, *stops], stops)]
-    return [value.split(sizes) for value in values]
+        is_searched &= (shift * shift).sum(0) <= square.index_select(0, pair)
+    found = torch.stack((pair + part.start, *shift, samples.index_select(0, place).long()))
+    return take_columns(found, flat_nonzero(is_searched))
 
 
 def _best_of_each_pair(
-    windows: WindowCounts, pair: Tensor, target: Tensor, dy: Tensor, dx: Tensor, count: Tensor, num_pairs: int
-) -> Tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """The best candidate of each pair that has one: (F,) pair, dy, dx, count, energy; ties as in `best_shifts`.
+    windows: WindowCounts, pair: Tensor, target: Tensor, shift: Tensor, count: Tensor, num_pairs: int
+) -> Tensor:
+    """The best candidate of each pair: (4, J) int64, dy, dx, count, energy, all 0 without any; ties as in
+    `best_shifts`.
 
     Args:
         windows: the targets; the energy of a shift (denominator of Eq. norm_correlation) is their pixels under the
             H x W window at that shift.
-        pair, target, dy, dx, count: (K,) int64, candidates.
+        pair, target, count: (K,) int64, candidates.
+        shift: (2, K) int64, their dy and dx.
         num_pairs: J.
     """
     # Bounds of the energy, cheap and close, leave few candidates. Division rounds monotonically: no winner is lost.
-    least, most = windows.bounds(target, dy, dx)
+    least, most = windows.bounds(target, shift)
     square = (count * count).double()
-    bound = (square / most).new_zeros(num_pairs).scatter_reduce_(0, pair, square / most, "amax")
+    bound = square.new_zeros(num_pairs).scatter_reduce_(0, pair, square / most, "amax")
     kept = flat_nonzero(square / torch.maximum(least, count) >= bound.index_select(0, pair))
-    pair, target, dy, dx, count, square = (
-        values.index_select(0, kept) for values in (pair, target, dy, dx, count, square)
-    )
-    energy = windows.count(target, dy, dx)
-    value = square / energy
+    pair, target, dy, dx, count = take_columns(torch.stack((pair, target, *shift, count)), kept)
+    energy = windows.count(target, torch.stack((dy, dx)))
+    value = square.index_select(0, kept) / energy
     best_value = value.new_zeros(num_pairs).scatter_reduce_(0, pair, value, "amax")
-    tied = flat_nonzero(value == best_value.index_select(0, pair))
-    pair, dy, dx, count, energy = (values.index_select(0, tied) for values in (pair, dy, dx, count, energy))
     # One number that orders shifts: length, then dy, then dx. It fits: images have at most 2^15 pixels a side.
-    span = 1 << 16
+    span, last = 1 << 16, torch.iinfo(torch.int64).max
     order = ((dy * dy + dx * dx) * span + dy + span // 2) * span + dx + span // 2
-    first = segment_amin(order, pair, num_pairs, torch.iinfo(torch.int64).max)
-    best = flat_nonzero(order == first.index_select(0, pair))
-    pair, dy, dx, count, energy = (values.index_select(0, best) for values in (pair, dy, dx, count, energy))
-    return pair, dy, dx, count, energy
+    order.masked_fill_(value < best_value.index_select(0, pair), last)
+    first = segment_amin(order, pair, num_pairs, last)
+    best = torch.zeros((4, num_pairs + 1), dtype=torch.int64, device=pair.device)  # the last one is for the others
+    best[:, torch.where(order == first.index_select(0, pair), pair, num_pairs)] = torch.stack((dy, dx, count, energy))
+    return best[:, :num_pairs]

@@ -14,7 +14,7 @@ from tqdm import tqdm
 from cflow_torch.data.catalog import open_log
 from cflow_torch.data.paths import as_path, is_remote
 from cflow_torch.fleet.job import Done, Job, Unit
-from cflow_torch.fleet.machine import Layout, threads
+from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.manifest import complete_frames, frame_file
 from cflow_torch.fleet.work import Worker, describe, source_name
 from cflow_torch.windows.memory import peak_memory
@@ -60,7 +60,7 @@ def _try(job: Job, unit: Unit, layout: Layout) -> Tuple[Dict[str, float], int]:
     Returns:
         Seconds of one frame by stage, and the bytes of its file.
     """
-    with tempfile.TemporaryDirectory() as scratch, threads(layout.threads):
+    with tempfile.TemporaryDirectory() as scratch:
         worker = Worker(replace(job, output=scratch, settings={**job.settings, "check": False}), layout.devices[0])
         done = [event for event in worker.run(unit) if isinstance(event, Done)]
         worker.close()

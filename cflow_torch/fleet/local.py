@@ -12,7 +12,7 @@ from pebble import ProcessExpired, ProcessPool
 
 from cflow_torch.fleet.dispatch import SIGNALS, WorkerDied, dispatch
 from cflow_torch.fleet.job import Event, Job, Unit
-from cflow_torch.fleet.machine import Layout, threads
+from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.work import Worker, describe
 from cflow_torch.fleet.worker_process import Step, WorkerProcess
 from cflow_torch.types import CFlowError
@@ -53,18 +53,17 @@ def run_local(
     if len(layout.devices) == 1 and memory is None:
         yield from _run_here(job, units, layout, stop)
     elif units:
-        handles = [_Process((job, device, layout.threads, memory), timeout) for device in layout.devices]
+        handles = [_Process((job, device, memory), timeout) for device in layout.devices]
         yield from dispatch(handles, units, stop, _RETRIES)
 
 
 def _run_here(job: Job, units: Sequence[Unit], layout: Layout, stop: Callable[[], bool]) -> Iterator[Event]:
     worker = Worker(job, layout.devices[0])
     try:
-        with threads(layout.threads):
-            for unit in units:
-                if stop():
-                    break
-                yield from worker.run(unit, stop)
+        for unit in units:
+            if stop():
+                break
+            yield from worker.run(unit, stop)
     finally:
         worker.close()
 
@@ -120,7 +119,7 @@ class _Process:
 _process: WorkerProcess  # of a worker process
 
 
-def _begin(job: Job, device: str, num_threads: int, memory: Optional[float]) -> None:
+def _begin(job: Job, device: str, memory: Optional[float]) -> None:
     """A worker process begins. Signals are the business of the parent, which says when to stop."""
     global _process
     for number in SIGNALS:
@@ -129,7 +128,7 @@ def _begin(job: Job, device: str, num_threads: int, memory: Optional[float]) -> 
         import resource  # not on every system
 
         resource.setrlimit(resource.RLIMIT_AS, (int(memory), int(memory)))
-    _process = WorkerProcess(job, device, num_threads)
+    _process = WorkerProcess(job, device)
 
 
 def _step(unit: Unit, stop: bool) -> Step:

@@ -1,20 +1,19 @@
-"""How many workers, threads and devices this machine gives a run, and how large its batches are."""
+"""How many workers and devices this machine gives a run, and how large its batches are."""
 
 from __future__ import annotations
 
 import os
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, Iterator, List, Mapping, Tuple
+from typing import Any, List, Mapping, Tuple
 
-import pyarrow
 import torch
 
 from cflow_torch.types import CFlowError
 from cflow_torch.windows.memory import available_memory, control_groups
 
 AUTO = "auto"
-_MOST = 100_000  # workers, threads or windows; more is a slip
+_MOST = 100_000  # workers or windows; more is a slip
 # Bytes that one worker may come to hold: nearly twice the most that `default` was seen to take, see docs/fleet.md.
 WORKER_MEMORY = 1_500_000_000
 # Windows that are computed together. A CPU gains up to 4 (fewer small operations), then loses (cold memory). That for a
@@ -28,22 +27,19 @@ class Layout:
 
     Args:
         devices: one per worker.
-        threads: of one worker.
         batch: windows that are computed together.
     """
 
     devices: Tuple[str, ...]
-    threads: int
     batch: int
 
 
-def choose_layout(device: str, workers: Any, threads: Any, batch: Any, environ: Mapping[str, str]) -> Layout:
+def choose_layout(device: str, workers: Any, batch: Any, environ: Mapping[str, str]) -> Layout:
     """Fill in what is "auto".
 
     Args:
         device: "auto", "cpu", "cuda" or "cuda:2".
         workers: processes, or "auto": on a CPU one per core (as far as memory goes), on GPUs one per GPU.
-        threads: of each worker, or "auto": the cores shared out.
         batch: windows, or "auto".
         environ: LOCAL_RANK or SLURM_LOCALID choose the GPU where several processes share a machine;
             LOCAL_WORLD_SIZE and SLURM_CPUS_PER_TASK bound the cores.
@@ -52,18 +48,16 @@ def choose_layout(device: str, workers: Any, threads: Any, batch: Any, environ: 
         CFlowError: not a whole number of at least 1; a GPU where there is none.
     """
     gpus = _gpus(device, environ)
-    cores = usable_cores(environ)
     if workers != AUTO:
         count = _at_least_1("workers", workers)
     elif gpus:
         count = len(gpus)
     else:
-        memory = available_memory(environ)
+        cores, memory = usable_cores(environ), available_memory(environ)
         count = cores if memory is None else max(1, min(cores, memory // WORKER_MEMORY))
-    per_worker = max(1, cores // count) if threads == AUTO else _at_least_1("threads", threads)
     size = (GPU_BATCH if gpus else CPU_BATCH) if batch == AUTO else _at_least_1("batch", batch)
     devices = tuple(gpus[k % len(gpus)] for k in range(count)) if gpus else ("cpu",) * count
-    return Layout(devices, per_worker, size)
+    return Layout(devices, size)
 
 
 def _gpus(device: str, environ: Mapping[str, str]) -> List[str]:
@@ -94,23 +88,6 @@ def usable_cores(environ: Mapping[str, str]) -> int:
     with suppress(KeyError, ValueError, ZeroDivisionError):
         counts.append(min(counts) // int(environ["LOCAL_WORLD_SIZE"]))
     return max(1, min(counts))
-
-
-def set_threads(count: int) -> None:
-    """So many threads of torch and of pyarrow in this process."""
-    torch.set_num_threads(count)
-    pyarrow.set_cpu_count(count)
-
-
-@contextmanager
-def threads(count: int) -> Iterator[None]:
-    """So many threads, while the block lasts."""
-    before = torch.get_num_threads()
-    set_threads(count)
-    try:
-        yield
-    finally:
-        set_threads(before)
 
 
 def _at_least_1(name: str, value: Any) -> int:

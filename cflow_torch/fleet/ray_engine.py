@@ -51,7 +51,7 @@ def run_ray(
         stop: asked all the time; from True on, frames in hand are finished and no others begun.
         address: None = start a cluster in this process, and end it; "auto" or "HOST:PORT" = join the one that this
             machine is part of. A caller that is connected already stays so.
-        num_cpus: what a worker takes from the cluster; "auto": its threads, nothing with a GPU.
+        num_cpus: what a worker takes from the cluster; "auto": 1, nothing with a GPU.
         num_gpus: likewise, fractions allowed; "auto": 1 if the device is a GPU.
         retries: how often a unit, then each of its frames by itself, is done again after a worker died on it.
 
@@ -71,7 +71,7 @@ def run_ray(
         raise CFlowError(f"engine=ray needs Ray ({error}): pip install ray") from None
     is_gpu = layout.devices[0].startswith("cuda")
     needs = {
-        "CPU": _number("num_cpus", num_cpus, 0 if is_gpu else layout.threads),
+        "CPU": _number("num_cpus", num_cpus, int(not is_gpu)),
         "GPU": _number("num_gpus", num_gpus, int(is_gpu)),
     }
     output = as_path(job.output)
@@ -86,7 +86,7 @@ def run_ray(
         _check_room(ray, needs)
         actor = ray.remote(_Actor).options(num_cpus=needs["CPU"], num_gpus=needs["GPU"])
         device = "cuda" if is_gpu else layout.devices[0]  # Ray shows a worker its own GPUs only
-        arguments = (os.getcwd(), job, device, layout.threads)
+        arguments = (os.getcwd(), job, device)
         yield from dispatch([_Handle(ray, actor, arguments) for _ in range(count)], units, stop, retries)
 
 
@@ -190,7 +190,7 @@ def _check_room(ray: ModuleType, needs: Dict[str, float]) -> None:
         need = ", ".join(f"{need:g} {name}" for name, need in needs.items())
         raise CFlowError(
             f"no node of the Ray cluster has room for a worker of {need} (they have {has}): "
-            "give fewer engine.threads, engine.num_cpus or engine.num_gpus, or start such a node first"
+            "give fewer engine.num_cpus or engine.num_gpus, or start such a node first"
         )
 
 

@@ -91,7 +91,6 @@ class Counters:
             "engine": engine,
             "shard": {"index": shard.index, "count": shard.count},
             "devices": list(layout.devices),
-            "threads": layout.threads,
             "batch": layout.batch,
             "machine": platform.platform(),
             "frames": {
@@ -114,7 +113,7 @@ class Counters:
 def format_report(report: Dict[str, Any]) -> str:
     """The table."""
     frames, shard, devices = report["frames"], report["shard"], report["devices"]
-    workers = f"workers: {len(devices)} on {', '.join(sorted(set(devices)))}, threads of each: {report['threads']}"
+    workers = f"workers: {len(devices)} on {', '.join(sorted(set(devices)))}"
     rows = [
         ("status", report["status"] + (f" by {report['stopped_by']}" if report["stopped_by"] else "")),
         ("engine", f"{report['engine']}, {workers}, shard {shard['index']} of {shard['count']}"),

@@ -6,8 +6,10 @@ import os
 import time
 from typing import Iterator, List, NamedTuple, Optional
 
+import pyarrow
+import torch
+
 from cflow_torch.fleet.job import Event, Job, Opened, Unit
-from cflow_torch.fleet.machine import set_threads
 from cflow_torch.fleet.progress import say
 from cflow_torch.fleet.work import DeviceLost, Worker, describe
 
@@ -28,14 +30,15 @@ class WorkerProcess(Worker):
     Args:
         job: the run.
         device: where to compute.
-        threads: of this process.
 
     Raises:
         CFlowError: there is no such device, or it cannot be used.
     """
 
-    def __init__(self, job: Job, device: str, threads: int) -> None:
-        set_threads(threads)
+    def __init__(self, job: Job, device: str) -> None:
+        if device == "cpu":  # the other cores have workers of their own
+            torch.set_num_threads(1)
+            pyarrow.set_cpu_count(1)
         super().__init__(job, device)
         self._events: Optional[Iterator[Event]] = None  # of the unit in hand
         self._is_told_to_stop = False

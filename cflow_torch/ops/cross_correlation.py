@@ -7,7 +7,7 @@ result; engines, devices and batch sizes then agree to the last bit.
 from __future__ import annotations
 
 import math
-from typing import Tuple
+from typing import Optional, Tuple
 
 import torch
 import torch.nn.functional as F
@@ -21,7 +21,9 @@ _FFT_LARGEST_ERROR = 0.25
 FAST_LENGTHS = tuple(sorted(n << k for k in range(14) for n in (8, 9, 10, 12, 15, 21, 22, 25, 27, 28)))
 
 
-def cross_correlate(images: Tensor, num_templates: int, own: Tensor, engine: str = "fft") -> Tensor:
+def cross_correlate(
+    images: Tensor, num_templates: int, own: Tensor, engine: str = "fft", most: Optional[int] = None
+) -> Tensor:
     """Number of coinciding pixels for shifts of templates over targets (numerator of Eq. norm_correlation).
 
     Args:
@@ -29,6 +31,7 @@ def cross_correlate(images: Tensor, num_templates: int, own: Tensor, engine: str
         num_templates: J.
         own: (J,) int64, target of each template; a target's spectrum serves all its templates.
         engine: "fft" or "conv" (conv2d).
+        most: no image has more ones; None = it is not known, and large images are counted.
 
     Returns:
         (J, Y, X) float, less than 1/2 away from the sum over p of template[j](p) * target(p + (y, x)): round it.
@@ -39,12 +42,10 @@ def cross_correlate(images: Tensor, num_templates: int, own: Tensor, engine: str
 
     Cost: "fft" Y X log(Y X) per template and target; "conv" (Y X)^2 per template.
     """
-    return _by_fft(images, num_templates, own) if engine == "fft" else _by_conv(images, num_templates, own)
-
-
-def _by_fft(images: Tensor, num_templates: int, own: Tensor) -> Tensor:
+    if engine == "conv":
+        return _by_conv(images, num_templates, own)
+    images = images.to(_fft_dtype(images, most))
     height, width = images.shape[-2:]
-    images = images.to(_fft_dtype(images))
     spectrum = torch.fft.rfft(images[..., 0, :]) if height == 1 else torch.fft.rfft2(images)
     product = spectrum[num_templates:].index_select(0, own).mul_(spectrum[:num_templates].conj())
     if height == 1:
@@ -52,14 +53,13 @@ def _by_fft(images: Tensor, num_templates: int, own: Tensor) -> Tensor:
     return torch.fft.irfft2(product, s=(height, width))
 
 
-def _fft_dtype(images: Tensor) -> torch.dtype:
+def _fft_dtype(images: Tensor, most: Optional[int]) -> torch.dtype:
     # The number of samples bounds the norms without looking at the images (no synchronisation).
     samples = math.prod(images.shape[1:])
     error = _FFT_ERROR_MARGIN * torch.finfo(torch.float32).eps * math.log2(samples)
-    if error * samples <= _FFT_LARGEST_ERROR:
-        return torch.float32
-    largest = float(images.flatten(1).sum(1).max()) if len(images) else 0.0
-    return torch.float32 if error * largest <= _FFT_LARGEST_ERROR else torch.float64
+    if error * samples > _FFT_LARGEST_ERROR:
+        samples = int(images.flatten(1).sum(1).max()) if most is None else most
+    return torch.float32 if error * samples <= _FFT_LARGEST_ERROR else torch.float64
 
 
 def _by_conv(images: Tensor, num_templates: int, own: Tensor) -> Tensor:

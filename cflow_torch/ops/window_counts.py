@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from typing import Tuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from cflow_torch.ops.indices import take_columns
 from cflow_torch.ops.spans import spans
 
 
@@ -15,62 +17,51 @@ class WindowCounts:
 
     Args:
         image, row, col: (P,) int64, which image and where in it; each pixel once.
-        size: (N, 2) int64, height and width H, W of each image.
+        size: (N, 2) int64, height and width H, W of each image; an array, because lengths of tables follow from it.
 
     Cost: linear in the area of the images.
     """
 
-    def __init__(self, image: Tensor, row: Tensor, col: Tensor, size: Tensor) -> None:
-        self._size = size
-        self._energy = torch.bincount(image, minlength=len(size))
-        # Pixels in the rows above, and in the columns to the left, of every row and column.
-        self._edges = size + 1
-        self._first_edge = self._edges.cumsum(0) - self._edges
-        above, left = (
-            torch.bincount(
-                self._first_edge[:, axis].index_select(0, image) + place + 1, minlength=int(self._edges[:, axis].sum())
-            ).cumsum(0)
-            for axis, place in enumerate((row, col))
-        )
-        self._before = above, left
-        # Running sum over rows of W + 1 samples, the first of them free. What lies before a row cancels.
-        self._stride = self._edges[:, 1]
-        area = size[:, 0] * self._stride
-        self._start = area.cumsum(0) - area
-        pixel = self._start.index_select(0, image) + row * self._stride.index_select(0, image) + col + 1
-        table = torch.zeros(int(area.sum()), dtype=torch.int32, device=size.device)
-        self._table = table.index_fill_(0, pixel, 1).cumsum(0)
+    def __init__(self, image: Tensor, row: Tensor, col: Tensor, size: np.ndarray) -> None:
+        edges = np.ascontiguousarray(size.T) + 1
+        first_edge = (edges.cumsum() - edges.ravel()).reshape(edges.shape)
+        area = size[:, 0] * edges[1]
+        numbers = np.concatenate((size.T, first_edge, area.cumsum()[None] - area, edges[1:]))
+        self._numbers = torch.from_numpy(numbers).to(image.device)
+        *edge, start, stride = take_columns(self._numbers[2:], image)
+        # Pixels in the rows above, and in the columns to the left, of every row and column. What lies before a row
+        # (column, image) cancels.
+        place, one = torch.cat((edge[0] + row, edge[1] + col)).add_(1), torch.ones_like(image)
+        zeros = torch.zeros(int(edges.sum()), dtype=torch.int64, device=image.device)
+        self._before = zeros.index_add_(0, place, one.repeat(2)).cumsum(0)
+        # Running sum over rows of W + 1 samples, the first of them free.
+        table = torch.zeros(int(area.sum()), dtype=torch.int32, device=image.device)
+        self._table = table.index_fill_(0, stride.mul_(row).add_(start).add_(col).add_(1), 1).cumsum(0)
 
-    def bounds(self, image: Tensor, dy: Tensor, dx: Tensor) -> Tuple[Tensor, Tensor]:
+    def bounds(self, image: Tensor, shift: Tensor) -> Tuple[Tensor, Tensor]:
         """(K,) int64 each, `count` is at least the first and at most the second. Args as for `count`."""
-        energy = self._energy.index_select(0, image)
-        rows, cols = (self._within(axis, image, shift) for axis, shift in enumerate((dy, dx)))
-        return rows + cols - energy, torch.minimum(rows, cols)
+        size, first = take_columns(self._numbers[:4], image).view(2, 2, -1)
+        begin, end = shift.clamp(min=0), torch.minimum(size, size + shift)
+        edges = torch.stack((begin, end, torch.zeros_like(size), size)).add_(first)
+        begin, end, first, last = self._before.index_select(0, edges.view(-1)).view(edges.shape)
+        rows, cols = end - begin
+        return rows + cols - (last - first)[0], torch.minimum(rows, cols)
 
-    def count(self, image: Tensor, dy: Tensor, dx: Tensor) -> Tensor:
+    def count(self, image: Tensor, shift: Tensor) -> Tensor:
         """(K,) int64, set pixels in rows dy ... H - 1 + dy and columns dx ... W - 1 + dx.
 
         Args:
             image: (K,) int64.
-            dy, dx: (K,) int64, |dy| <= H, |dx| <= W.
+            shift: (2, K) int64, dy and dx, |dy| <= H, |dx| <= W.
 
         Cost: linear in the height of the windows.
         """
-        height, width = self._size.index_select(0, image).t()
-        stride = self._stride.index_select(0, image)
-        num_rows = height - dy.abs()
-        row = spans(dy.clamp(min=0), num_rows)
+        height, width, _, _, start, stride = take_columns(self._numbers, image)
+        (top, left), (down, right) = shift.clamp(min=0), shift.abs()
+        num_rows = height - down
+        row = spans(top, num_rows)
         window = torch.repeat_interleave(num_rows, output_size=row.numel())
-        left = (self._start.index_select(0, image) + dx.clamp(min=0)).index_select(0, window)
-        left += row.mul_(stride.index_select(0, window))
-        right = left + (width - dx.abs()).index_select(0, window)
-        in_row = self._table.index_select(0, right) - self._table.index_select(0, left)
+        start, stride, width = take_columns(torch.stack((start + left, stride, width - right)), window)
+        start += row.mul_(stride)
+        in_row = self._table.index_select(0, start + width) - self._table.index_select(0, start)
         return torch.zeros_like(image).index_add_(0, window, in_row)
-
-    def _within(self, axis: int, image: Tensor, shift: Tensor) -> Tensor:
-        """(K,) int64, pixels in the rows (columns) under the window."""
-        length = self._size[:, axis].index_select(0, image)
-        first = self._first_edge[:, axis].index_select(0, image)
-        before = self._before[axis]
-        begin, end = shift.clamp(min=0), torch.minimum(length, length + shift)
-        return before.index_select(0, first + end) - before.index_select(0, first + begin)

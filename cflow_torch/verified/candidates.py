@@ -154,13 +154,14 @@ def _parabola(
     line = newest + (source.index_select(0, of_pixel) + 1) * height + row
     own = flat.index_select(0, line * width + col)
 
-    def shared(down: int, right: int) -> Tensor:
-        dy, dx = shift.index_select(0, of_pixel).unbind(1)
-        y, x = row + dy + down, col + dx + right
-        inside = (y >= 0) & (y < height) & (x >= 0) & (x < width)
-        there = flat.index_select(0, ((newest + y) * width + x).mul_(inside))
-        count = count_slices(own & there).long().mul_(inside)
-        return torch.zeros(len(shift), dtype=torch.int64, device=shift.device).index_add_(0, of_pixel, count)
-
-    middle = shared(0, 0)
-    return torch.stack((vertex(shared(-1, 0), middle, shared(1, 0)), vertex(shared(0, -1), middle, shared(0, 1))), 1)
+    beside = torch.tensor(((0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)), device=shift.device)
+    dy, dx = shift.index_select(0, of_pixel).unbind(1)
+    y, x = ((at + way)[:, None] + step for at, way, step in ((row, dy, beside[:, 0]), (col, dx, beside[:, 1])))
+    inside = (y >= 0) & (y < height) & (x >= 0) & (x < width)
+    there = flat.index_select(0, ((newest[:, None] + y) * width + x).mul_(inside).view(-1)).view_as(inside)
+    counts = count_slices(own[:, None] & there).long().mul_(inside)
+    of_beside = of_pixel[:, None] * len(beside) + torch.arange(len(beside), device=shift.device)
+    sums = torch.zeros(len(shift) * len(beside), dtype=torch.int64, device=shift.device)
+    sums.index_add_(0, of_beside.view(-1), counts.view(-1))
+    middle, above, below, left, right = sums.view(-1, len(beside)).unbind(1)
+    return torch.stack((vertex(above, middle, below), vertex(left, middle, right)), 1)

@@ -129,14 +129,56 @@ class HeightSlicedSweeps:
         index = self.index(window, step, row, col)
         return self.image.index_select(0, index.reshape(-1)).view(index.shape)
 
+    def at_moved(
+        self, image: Tensor, window: Tensor, step: Tensor, row: Tensor, col: Tensor, move: Tensor, which: Tensor
+    ) -> Tensor:
+        """What an image holds where moves take pixels; 0 outside.
+
+        Args:
+            image: (B * S * H * W + 1,), `image` or one of its shape.
+            window, step, row, col: (L,) int64, where the pixels stand and the sweep that is looked at.
+            move: (T, C, 2) int64, (down, right), pixels; C at least 1.
+            which: (L,) int64, the C moves of each pixel.
+
+        Returns:
+            (L, C), type of `image`.
+
+        Cost: one look-up each; moves are kept as offsets, so that places are checked only near the border.
+        """
+        height, width = self.grid.height, self.grid.width
+        start = ((window * self.num_steps + step) * height + row) * width + col
+        down, right = move.unbind(2)
+        index = (down * width + right).index_select(0, which).add_(start[:, None])
+        leaves = torch.zeros_like(which, dtype=torch.bool)
+        for at, ways, size in ((row, down, height), (col, right, width)):
+            leaves |= (at + ways.amin(1).index_select(0, which) < 0) | (
+                at + ways.amax(1).index_select(0, which) >= size
+            )
+        some = flat_nonzero(leaves)
+        window, step, row, col, which = (
+            values.index_select(0, some)[:, None] for values in (window, step, row, col, which)
+        )
+        down, right = (ways.index_select(0, which[:, 0]) for ways in (down, right))
+        index.index_copy_(0, some, self.index(window, step, row + down, col + right))
+        return image.index_select(0, index.view(-1)).view(index.shape)
+
     @cached_property
     def number(self) -> Tensor:
-        """(B * S * H * W + 1,) int32: position of each pixel in the list, P where none is occupied.
+        """(B * S * H * W + 1,) int32: position of each occupied pixel in the list, P at the last place; undefined for
+        what is empty.
 
-        Cost: one pass over the images, once.
+        Cost: that of the occupied pixels, once; the rest is not touched.
         """
-        number = torch.full_like(self.image, self.pixel.numel(), dtype=torch.int32)
+        number = torch.empty_like(self.image, dtype=torch.int32)
+        number[-1:] = self.pixel.numel()
         return number.scatter_(0, self.pixel, torch.arange(self.pixel.numel(), device=number.device).int())
+
+    def number_at(self, place: Tensor) -> Tensor:
+        """(K,) int64, position in the list of places (K,) int64 that may be empty: P there."""
+        count = self.pixel.numel()
+        number = self.number.index_select(0, place).long().clamp_(0, count)
+        # Where nothing was written any number may stand: it counts if its pixel is this one.
+        return number.masked_fill_(F.pad(self.pixel, (0, 1), value=-1).index_select(0, number) != place, count)
 
     @cached_property
     def with_around(self) -> Tensor:
@@ -144,30 +186,21 @@ class HeightSlicedSweeps:
 
         Cost: a few passes over the images, once.
         """
-        image = self.image[:-1].view(-1, self.grid.height, self.grid.width)
-        rows = image.clone()
-        rows[:, 1:] |= image[:, :-1]
-        rows[:, :-1] |= image[:, 1:]
-        around = rows.clone()
-        around[:, :, 1:] |= rows[:, :, :-1]
-        around[:, :, :-1] |= rows[:, :, 1:]
-        return F.pad((around << NUM_SLICES | image).view(-1), (0, 1))
+        shape = (-1, self.grid.height, self.grid.width)
+        both = self.image.clone()
+        image, around = (values[:-1].view(shape) for values in (self.image, both))
+        around[:, 1:] |= image[:, :-1]
+        around[:, :-1] |= image[:, 1:]
+        pairs = around[:, :, 1:] | around[:, :, :-1]
+        around[:, :, 1:] |= pairs
+        around[:, :, :-1] |= pairs
+        return both.bitwise_left_shift_(NUM_SLICES).bitwise_or_(self.image)
 
     @cached_property
     def lowest(self) -> Tensor:
         """(P,) float64, metres: height of the lowest point of each occupied pixel."""
         number = self.number.index_select(0, self.place).long()
         return segment_amin(self.batch.positions[2], number, self.pixel.numel() + 1, math.inf)[:-1]
-
-    def number_at_t(self) -> Tensor:
-        """The same for points of sweep t: undefined for what is empty and for other sweeps, P at the last place.
-
-        Cost: that of the pixels of t; the rest is not touched.
-        """
-        number = torch.empty_like(self.image, dtype=torch.int32)
-        at_t = flat_nonzero(self.step == 1)
-        number[-1:] = self.pixel.numel()
-        return number.scatter_(0, self.pixel.index_select(0, at_t), at_t.int())
 
     def coarsen(self, block: int) -> Tuple[Tensor, Tensor]:
         """The same images at pixels of `block` x `block` finest ones.

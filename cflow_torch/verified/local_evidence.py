@@ -12,7 +12,7 @@ from torch import Tensor
 
 from cflow_torch.ops.indices import flat_nonzero
 from cflow_torch.verified.height_slices import NUM_SLICES, SLICE_HEIGHT, HeightSlicedSweeps, count_slices
-from cflow_torch.verified.paired_test import looks
+from cflow_torch.verified.paired_test import looks, moves_of, way_of
 from cflow_torch.verified.visibility import RangeImages
 
 
@@ -21,9 +21,7 @@ class Looks(NamedTuple):
 
     Args:
         pixel, other: (L,) int64.
-        window, row, col: (L,) int64, of the pixel.
-        k: (L,) float64, sweep intervals from the pixel's sweep to the other one.
-        to_newest: (L,) float64, sweep intervals from the pixel's sweep to t+1.
+        window, step, row, col: (L,) int64, of the pixel.
         own: (L,) uint8, slices of the pixel.
         found: (L,) uint8, those that the other sweep has where the pixel stands.
         here: (L,) uint8, those and what the other sweep cannot see there.
@@ -32,10 +30,9 @@ class Looks(NamedTuple):
     pixel: Tensor
     other: Tensor
     window: Tensor
+    step: Tensor
     row: Tensor
     col: Tensor
-    k: Tensor
-    to_newest: Tensor
     own: Tensor
     found: Tensor
     here: Tensor
@@ -48,27 +45,23 @@ class Looks(NamedTuple):
 def look(sweeps: HeightSlicedSweeps, members: Tensor) -> Looks:
     """What pixels, (K,) int64, find where they stand, in all sweeps that their window has."""
     pixel, other = looks(sweeps, members)
-    window, step = (values.index_select(0, pixel) for values in (sweeps.window, sweeps.step))
-    to_newest = sweeps.elapsed[window, step]
-    k = to_newest - sweeps.elapsed[window, other]
-    row, col, own = (values.index_select(0, pixel) for values in (sweeps.row, sweeps.col, sweeps.slices))
+    window, step, row, col, own = (
+        values.index_select(0, pixel) for values in (sweeps.window, sweeps.step, sweeps.row, sweeps.col, sweeps.slices)
+    )
     found = own & sweeps.slices_at(window, other, row, col)
-    some = Looks(pixel, other, window, row, col, k, to_newest, own, found, found).take(flat_nonzero(k != 0))
+    has_other = sweeps.elapsed[window, step] != sweeps.elapsed[window, other]
+    some = Looks(pixel, other, window, step, row, col, own, found, found).take(flat_nonzero(has_other))
     return some._replace(here=some.found | _hidden_slices(sweeps, some))
 
 
-def wins(sweeps: HeightSlicedSweeps, some: Looks, velocity: Tensor) -> Tuple[Tensor, Tensor]:
-    """(L,) uint8 each: slices that a velocity, (2,) or (2, L) float64, wins and loses in each look."""
-    down, right = (torch.floor(some.k * v + 0.5).long() for v in velocity)
-    there = some.own & sweeps.slices_at(some.window, some.other, some.row + down, some.col + right)
-    return count_slices(there & ~some.here), count_slices(some.found & ~there)
-
-
-def at_newest(sweeps: HeightSlicedSweeps, some: Looks, velocity: Tensor) -> Tuple[Tensor, Tensor]:
-    """(L,) int64 each: row and column where a velocity, (2,) float64, takes each pixel at t+1, kept in the image."""
-    down, right = (torch.floor(some.to_newest * v + 0.5).long() for v in velocity)
-    row, col = (some.row + down).clamp_(0, sweeps.grid.height - 1), (some.col + right).clamp_(0, sweeps.grid.width - 1)
-    return row, col
+def try_all(sweeps: HeightSlicedSweeps, some: Looks, velocities: Tensor) -> Tuple[Tensor, Tensor]:
+    """(L, V) uint8 each: slices that velocities, (V, 2) float64, (y, x) finest pixels per interval, win and lose in
+    each look."""
+    num_steps = sweeps.num_steps
+    moves = moves_of(sweeps.elapsed, velocities.expand(sweeps.num_windows, -1, -1))
+    which = some.window * (2 * num_steps) + way_of(some.step, some.other, num_steps)
+    there = some.own[:, None] & sweeps.at_moved(sweeps.image, some.window, some.other, some.row, some.col, moves, which)
+    return count_slices(there & ~some.here[:, None]), count_slices(some.found[:, None] & ~there)
 
 
 def _hidden_slices(sweeps: HeightSlicedSweeps, some: Looks) -> Tensor:
@@ -77,7 +70,7 @@ def _hidden_slices(sweeps: HeightSlicedSweeps, some: Looks) -> Tensor:
     images, hidden, missing = RangeImages(sweeps), torch.zeros_like(some.own), some.own & ~some.found
     for index in range(NUM_SLICES):
         asked = flat_nonzero((missing & (1 << index)).bool())
-        pixel, other, window, row, col = (values.index_select(0, asked) for values in some[:5])
+        pixel, other, window, _, row, col = (values.index_select(0, asked) for values in some[:6])
         x, y = (col.double() + 0.5) * size + lower_x, (row.double() + 0.5) * size + lower_y
         # Of the heights that share this slice, the lowest that the pixel may have.
         first = torch.floor(sweeps.lowest.index_select(0, pixel) / SLICE_HEIGHT)

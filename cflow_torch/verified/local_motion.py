@@ -12,20 +12,20 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from cflow_torch.ops.indices import divide, flat_nonzero
+from cflow_torch.ops.indices import divide, flat_nonzero, split_index
 from cflow_torch.ops.labeling import connected_components
+from cflow_torch.ops.segments import segment_amin
 from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import NUM_SLICES, HeightSlicedSweeps
-from cflow_torch.verified.local_evidence import Looks, at_newest, look, wins
+from cflow_torch.verified.local_cells import Cells
+from cflow_torch.verified.local_evidence import Looks, look, try_all
 from cflow_torch.verified.paired_test import VerifiedLevel, evidence_of
 
 _STEP, _REACH = 0.1, 3  # metres per sweep interval between velocities; steps to the fastest one
 _FASTEST = 0.25  # metres per interval: what is best at a velocity beyond may be a shadow that is faster still
-_CELL = 0.3  # metres; won and lost are summed over 3 x 3 cells
 _SEED_Z = 6  # standard deviations of noise that such a square must show
-_LEAST_WON = 4  # slices; a square that wins fewer is not looked at
+_LEAST_WON = 16  # slices; a square that wins fewer is not looked at: it cannot show four standard deviations
 _Z = 4.0  # standard deviations of noise that a group as a whole is granted
-_LOW = (1 << 32) - 1  # the lower half of a number that holds two counts
 _UPRIGHT = 3  # height slices that it must have: rings of beams on a bonnet or a roof move as well
 
 
@@ -33,24 +33,12 @@ class _Best(NamedTuple):
     """What moves where at t+1, by cells of all windows.
 
     Args:
-        side: finest pixels a side of a cell.
         best: (B, rows, cols) int64, number of the best velocity, -1 = none.
         z: (B, rows, cols) float64, its surplus in standard deviations of noise; 0 = none.
     """
 
-    side: int
     best: Tensor
     z: Tensor
-
-    def at(self, window: Tensor, row: Tensor, col: Tensor) -> Tensor:
-        """(P,) float64: z at pixels, (P,) int64 each."""
-        _, rows, cols = self.z.shape
-        cell = (window * rows + divide(row, self.side)) * cols + divide(col, self.side)
-        return self.z.view(-1).index_select(0, cell)
-
-    def only(self, wanted: Tensor) -> _Best:
-        """Those of some cells, (B, rows, cols) bool."""
-        return _Best(self.side, self.best.masked_fill(~wanted, -1), self.z.masked_fill(~wanted, 0.0))
 
 
 def find_local_motion(
@@ -72,24 +60,25 @@ def find_local_motion(
         Velocities are whole steps of 0.1 m per interval, at most 0.3 m long, in raster order; of equals the first. What
         a pixel wins or loses counts where its velocity takes it at t+1.
 
-    Cost: 28 look-ups for each pixel at rest and sweep, and a range image of each sweep.
+    Cost: 28 look-ups for each pixel at rest and sweep that finds something new, or is near to what does; a range image
+    of each sweep.
     """
     at_rest = ~F.pad(motion.any(1), (0, 1)).index_select(0, objects.of_pixel)
     has_history = ((sweeps.elapsed != 0).sum(1) > 1).index_select(0, sweeps.window)
     members = flat_nonzero(at_rest & has_history)
     if members.numel() == 0:
         return objects, motion, torch.zeros_like(sweeps.row, dtype=torch.float64)
-    velocities = _velocities(sweeps)
-    found = look(sweeps, members)
-    around = _find_best(sweeps, found, velocities)
-    doubt = around.at(sweeps.window, sweeps.row, sweeps.col)
-    seeds = around.only(around.z >= _SEED_Z)
-    if not bool((seeds.best >= 0).any()):
+    cells = Cells(sweeps, _velocities(sweeps))
+    found, trials, around = _try_everywhere(sweeps, look(sweeps, members), cells)
+    doubt = around.z.view(-1).index_select(0, cells.own(sweeps.window, sweeps.row, sweeps.col))
+    is_seed = around.z >= _SEED_Z
+    if not bool(is_seed.any()):
         return objects, motion, doubt
-    group, of_group = _groups(sweeps, found, velocities, seeds)
-    candidates = velocities.index_select(0, of_group)
-    won, lost = _wins_of_groups(sweeps, found, group, candidates)
-    moves = (evidence_of(won, lost, _Z) > 0) & (_num_slices(sweeps, group, len(candidates)) >= _UPRIGHT)
+    seeds = _Best(around.best.masked_fill(~is_seed, -1), around.z.masked_fill(~is_seed, 0.0))
+    group, of_group = _groups(sweeps, found, trials, seeds, cells)
+    candidates = cells.velocities.index_select(0, of_group)
+    is_significant = evidence_of(*_wins_of_groups(found, trials, group, of_group), _Z) > 0
+    moves = is_significant & (_num_slices(sweeps, group, len(candidates)) >= _UPRIGHT)
     num_components = sum(level.level.num_components for level in levels)
     of_component = F.pad(candidates, (0, 0, num_components, 0)).index_copy_(0, objects.component, motion)
     objects = objects.split(group, moves, num_components)
@@ -117,64 +106,75 @@ def _is_of_walker(sweeps: HeightSlicedSweeps, velocities: Tensor) -> Tensor:
     )
 
 
-def _cell(sweeps: HeightSlicedSweeps, some: Looks, velocity: Tensor, seeds: _Best) -> Tensor:
-    """(L,) int64: cell, counted through all windows, where a velocity, (2,) float64, takes each pixel at t+1."""
-    row, col = (divide(values, seeds.side) for values in at_newest(sweeps, some, velocity))
-    _, rows, cols = seeds.best.shape
-    return (some.window * rows + row) * cols + col
+def _try_everywhere(
+    sweeps: HeightSlicedSweeps, found: Looks, cells: Cells
+) -> Tuple[Looks, Tuple[Tensor, Tensor], _Best]:
+    """The best velocity of each cell; the looks that count there, and what every velocity wins and loses in them."""
+    sums = _sums_of_winners(sweeps, found, cells)
+    asked = flat_nonzero(sums >= _LEAST_WON)
+    gain = sums.index_select(0, asked)
+    found, place, is_near = _looks_near(found, asked, cells)
+    won, lost = try_all(sweeps, found, cells.velocities)
+    loses = flat_nonzero(is_near & lost.bool())
+    place, losses = (values.view(-1).index_select(0, loses) for values in (place, lost))
+    cells.add_around(sums, place, -losses.int())
+    loss = gain - sums.index_select(0, asked)
+    return found, (won, lost), _find_best(sweeps, asked, gain, loss, cells)
 
 
-def _find_best(sweeps: HeightSlicedSweeps, found: Looks, velocities: Tensor) -> _Best:
+def _sums_of_winners(sweeps: HeightSlicedSweeps, found: Looks, cells: Cells) -> Tensor:
+    """(V * all cells,) int32, slices won in the 3 x 3 cells around each. Few looks find anything new."""
+    new = found.take(flat_nonzero(found.own & ~found.here))
+    won, _ = try_all(sweeps, new, cells.velocities)
+    wins = flat_nonzero(won)
+    place, won = (values.view(-1).index_select(0, wins) for values in (cells.at_newest(new), won))
+    sums = torch.zeros(len(cells.velocities) * cells.count, dtype=torch.int32, device=won.device)
+    cells.add_around(sums, place, won.int())
+    return sums
+
+
+def _looks_near(found: Looks, asked: Tensor, cells: Cells) -> Tuple[Looks, Tensor, Tensor]:
+    """The looks that some velocity takes beside a cell that is asked about, (A,) int64 into (V, all cells); where each
+    velocity takes them, as of `at_newest`; and (L, V) bool, whether that is beside such a cell."""
+    is_near = torch.zeros(len(cells.velocities) * cells.count, dtype=torch.bool, device=asked.device)
+    for offset in cells.around():
+        is_near.index_fill_(0, asked + offset, True)
+    place = cells.at_newest(found)
+    near = is_near.index_select(0, place.view(-1)).view_as(place)
+    kept = flat_nonzero(near.any(1))
+    return found.take(kept), place.index_select(0, kept), near.index_select(0, kept)
+
+
+def _find_best(sweeps: HeightSlicedSweeps, asked: Tensor, gain: Tensor, loss: Tensor, cells: Cells) -> _Best:
     """Of each cell the best velocity of the 3 x 3 cells around; of equals the first cell.
 
     What is best in a cell counts only if it is believed, see `_is_of_walker`.
+
+    Args:
+        asked: (A,) int64, velocity * count + cell.
+        gain, loss: (A,) int32, slices that the velocity wins and loses there.
     """
-    side = max(1, round(_CELL / sweeps.grid.pixel_size))
-    shape = (sweeps.num_windows, -(-sweeps.grid.height // side), -(-sweeps.grid.width // side))
-    own = _Best(
-        side,
-        torch.full(shape, -1, dtype=torch.int64, device=velocities.device),
-        torch.zeros(shape, dtype=torch.float64, device=velocities.device),
-    )
-    best, best_z = own.best.view(-1), own.z.view(-1)
-    for index, velocity in enumerate(velocities):
-        won, lost = wins(sweeps, found, velocity)
-        counts = (won.long() << 32) + lost  # both in one number: sums cost more than look-ups
-        says = flat_nonzero((won | lost).bool())
-        at = _cell(sweeps, found, velocity, own).index_select(0, says)
-        sums = torch.zeros_like(best).index_add_(0, at, counts.index_select(0, says))
-        sums = _sum_around(sums.view(shape)).view(-1)
-        cell = flat_nonzero(sums >= _LEAST_WON << 32)
-        sums = sums.index_select(0, cell)
-        surplus, noise = ((sums >> 32) - (sums & _LOW)).double(), ((sums >> 32) + (sums & _LOW)).double()
-        z = surplus / torch.sqrt(noise)
-        better = flat_nonzero(z > best_z.index_select(0, cell))
-        cell = cell.index_select(0, better)
-        best.index_fill_(0, cell, index)
-        best_z.index_copy_(0, cell, z.index_select(0, better))
-    cell = flat_nonzero(best >= 0)
-    window = divide(cell, shape[1] * shape[2])
-    is_believed = _is_of_walker(sweeps, velocities)[window, best.index_select(0, cell)]
-    cell = cell.index_select(0, flat_nonzero(~is_believed))
-    best.index_fill_(0, cell, -1)
-    best_z.index_fill_(0, cell, 0.0)
-    z, place = F.max_pool2d(own.z[:, None], 3, 1, 1, return_indices=True)
-    best = best.view(shape[0], -1).gather(1, place.view(shape[0], -1))
-    return _Best(side, best.view(shape), z.view(shape))
+    count, is_free = len(cells.velocities), cells.is_free().view(-1)
+    velocity, at = split_index(asked, cells.count)
+    z = (gain - loss).double() / torch.sqrt((gain + loss).double())
+    z.masked_fill_(is_free.index_select(0, at), 0.0)
+    most = z.new_zeros(cells.count).scatter_reduce_(0, at, z, "amax")
+    is_best = (z > 0) & (z == most.index_select(0, at))
+    first = segment_amin(torch.where(is_best, velocity, count), at, cells.count, count)
+    is_believed = _is_of_walker(sweeps, cells.velocities)[divide(at, cells.count // sweeps.num_windows), velocity]
+    chosen = flat_nonzero(is_best & (velocity == first.index_select(0, at)) & is_believed)
+    at, best, best_z = at.index_select(0, chosen), torch.full_like(first, -1), torch.zeros_like(most)
+    best.index_copy_(0, at, velocity.index_select(0, chosen))
+    best_z.index_copy_(0, at, z.index_select(0, chosen))
+    best_z, place = F.max_pool2d(best_z.view(cells.shape)[:, None], 3, 1, 1, return_indices=True)
+    best = best.view(len(best_z), -1).gather(1, place.view(len(best_z), -1)).view(cells.shape)
+    is_free = is_free.view(cells.shape)
+    return _Best(best.masked_fill_(is_free, -1), best_z[:, 0].masked_fill_(is_free, 0.0))
 
 
-def _sum_around(values: Tensor) -> Tensor:
-    """(B, rows, cols): sums of the 3 x 3 elements around each."""
-    rows = values.clone()
-    rows[:, 1:] += values[:, :-1]
-    rows[:, :-1] += values[:, 1:]
-    around = rows.clone()
-    around[:, :, 1:] += rows[:, :, :-1]
-    around[:, :, :-1] += rows[:, :, 1:]
-    return around
-
-
-def _groups(sweeps: HeightSlicedSweeps, found: Looks, velocities: Tensor, seeds: _Best) -> Tuple[Tensor, Tensor]:
+def _groups(
+    sweeps: HeightSlicedSweeps, found: Looks, trials: Tuple[Tensor, Tensor], seeds: _Best, cells: Cells
+) -> Tuple[Tensor, Tensor]:
     """Pixels that win, with those around, by the velocity of the cell that it takes them to; joined cell by cell.
 
     Returns:
@@ -183,34 +183,46 @@ def _groups(sweeps: HeightSlicedSweeps, found: Looks, velocities: Tensor, seeds:
 
     Convention: of several velocities that of largest z takes a pixel, of equals the first.
     """
-    best, z, count = seeds.best.view(-1), seeds.z.view(-1), len(velocities)
+    best, z, count = seeds.best.view(-1), seeds.z.view(-1), len(cells.velocities)
     occupied = flat_nonzero(best >= 0)
     component = torch.zeros_like(best).index_copy_(0, occupied, connected_components(seeds.best >= 0, occupied))
+    cell = cells.at_newest(found) % cells.count
+    is_there = best.index_select(0, cell.view(-1)).view_as(cell) == torch.arange(count, device=cell.device)
+    near = flat_nonzero(is_there)
+    near = near.index_select(0, flat_nonzero(_gain_around(sweeps, found, trials, near, cells) > 0))
+    look, velocity = split_index(near, count)
+    cell, pixel = cell.view(-1).index_select(0, near), found.pixel.index_select(0, look)
+    # Looks of one pixel are taken to one cell by a velocity: all of them say the same.
+    strength = z.index_select(0, cell)
+    most = torch.zeros_like(sweeps.pixel, dtype=torch.float64).scatter_reduce_(0, pixel, strength, "amax")
+    is_strongest = strength == most.index_select(0, pixel)
+    first = segment_amin(torch.where(is_strongest, velocity, count), pixel, sweeps.pixel.numel(), count)
+    chosen = flat_nonzero(is_strongest & (velocity == first.index_select(0, pixel)))
+    pixel, cell, velocity = (values.index_select(0, chosen) for values in (pixel, cell, velocity))
     name = torch.full_like(sweeps.pixel, -1)  # component * count + velocity, -1 = none
-    strength = torch.zeros_like(name, dtype=torch.float64)
-    for index in torch.unique(best.index_select(0, occupied)).tolist():
-        cell = _cell(sweeps, found, velocities[index], seeds)
-        near = flat_nonzero(best.index_select(0, cell) == index)
-        some, cell = found.take(near), cell.index_select(0, near)
-        is_stronger = z.index_select(0, cell) > strength.index_select(0, some.pixel)
-        taken = flat_nonzero(is_stronger & (_gain_around(sweeps, some, velocities[index]) > 0))
-        pixel, cell = some.pixel.index_select(0, taken), cell.index_select(0, taken)
-        # Looks of one pixel are taken to one cell: all that write at one place write the same.
-        strength.index_copy_(0, pixel, z.index_select(0, cell))
-        name.index_copy_(0, pixel, component.index_select(0, cell) * count + index)
+    name.index_copy_(0, pixel, component.index_select(0, cell) * count + velocity)
     names, group = torch.unique(F.pad(name, (1, 0), value=-1), return_inverse=True)  # -1 is there, the first one
     return (group[1:] - 1).remainder_(names.numel()), names[1:] % count
 
 
-def _gain_around(sweeps: HeightSlicedSweeps, some: Looks, velocity: Tensor) -> Tensor:
-    """(L,) int64: slices that a velocity, (2,) float64, wins less those that it loses, by all looks whose pixels it
-    takes to one of the 3 x 3 pixels around that of each look at t+1."""
-    won, lost = wins(sweeps, some, velocity)
-    row, col = at_newest(sweeps, some, velocity)
-    # One more row and column, which are empty: the last pixel of a row is not beside the first one of the next.
-    height, width = sweeps.grid.height + 1, sweeps.grid.width + 1
-    place, of_look = torch.unique((some.window * height + row) * width + col, return_inverse=True)
-    gain = torch.zeros_like(place).index_add_(0, of_look, won.long() - lost.long())
+def _gain_around(
+    sweeps: HeightSlicedSweeps, found: Looks, trials: Tuple[Tensor, Tensor], some: Tensor, cells: Cells
+) -> Tensor:
+    """(K,) int64: slices won less those lost by all of some looks under velocities, (K,) int64 into (L, V), that take
+    their pixels to one of the 3 x 3 pixels around that of each at t+1, by the same velocity."""
+    look, velocity = split_index(some, len(cells.velocities))
+    window, step, row, col = (
+        values.index_select(0, look) for values in (found.window, found.step, found.row, found.col)
+    )
+    k = sweeps.elapsed[window, step][:, None]
+    down, right = torch.floor(cells.velocities.index_select(0, velocity) * k + 0.5).long().unbind(1)
+    # More rows and columns, as the last cells may reach beyond the image, and an empty one: the last pixel of a row is
+    # not beside the first one of the next.
+    height, width = sweeps.grid.height + cells.side, sweeps.grid.width + cells.side
+    image = velocity * sweeps.num_windows + window
+    place, of_look = torch.unique((image * height + row + down) * width + col + right, return_inverse=True)
+    won, lost = (counts.view(-1).index_select(0, some).long() for counts in trials)
+    gain = torch.zeros_like(place).index_add_(0, of_look, won - lost)
     around = torch.zeros_like(gain)
     for offset in (down * width + right for down in (-1, 0, 1) for right in (-1, 0, 1)):
         at = torch.searchsorted(place, place + offset).clamp_(max=place.numel() - 1)
@@ -218,14 +230,15 @@ def _gain_around(sweeps: HeightSlicedSweeps, some: Looks, velocity: Tensor) -> T
     return around.index_select(0, of_look)
 
 
-def _wins_of_groups(sweeps: HeightSlicedSweeps, found: Looks, group: Tensor, motion: Tensor) -> Tuple[Tensor, Tensor]:
-    """(H,) int64 each: what groups of pixels, (P,) int64, win and lose by their motions, (H, 2) float64."""
+def _wins_of_groups(
+    found: Looks, trials: Tuple[Tensor, Tensor], group: Tensor, velocity: Tensor
+) -> Tuple[Tensor, Tensor]:
+    """(H,) int64 each: what groups of pixels, (P,) int64, win and lose by their velocities, (H,) int64."""
     own = group.index_select(0, found.pixel)
-    member = flat_nonzero(own < len(motion))
-    some, own = found.take(member), own.index_select(0, member)
-    counts = wins(sweeps, some, motion.index_select(0, own).t())
-    zeros = torch.zeros_like(motion[:, 0], dtype=torch.int64)
-    won, lost = (zeros.index_add(0, own, count.long()) for count in counts)
+    member = flat_nonzero(own < velocity.numel())
+    own = own.index_select(0, member)
+    of_own = velocity.index_select(0, own)
+    won, lost = (torch.zeros_like(velocity).index_add_(0, own, counts[member, of_own].long()) for counts in trials)
     return won, lost
 
 

@@ -95,7 +95,7 @@ class VerifiedFlow(SceneFlowModel):
         with stage("layers"):
             is_lower = points_of_lower_layers(sweeps, points_at_rest(sweeps, found))
             lower = HeightSlicedSweeps.of(replace(batch, takes_part=is_lower), grid)
-        return join_moving(found, self.look(lower, [(1, False), (1, True)], is_first=False), batch)
+        return join_moving(found, self.look(lower, [(1, False)], is_first=False), batch)
 
     def look(self, sweeps: HeightSlicedSweeps, scales: List[Tuple[int, bool]], is_first: bool = True) -> TurningMotion:
         """What some points do, found at some scales. What could as well be displaced stands still."""
@@ -126,8 +126,7 @@ class VerifiedFlow(SceneFlowModel):
             margin = margin_of(sweeps, objects, seen)
             confidence = confidence_of(sweeps, objects, seen, margin, doubt)
             rigid = rigid.only(margin > 0) if config.thorough else rigid
-            is_numbered = config.thorough or config.num_future > 0
-            return motion_by_pixel(objects, rigid, levels[-1].score, confidence, sweeps, is_numbered)
+            return motion_by_pixel(objects, rigid, levels[-1].score, confidence, sweeps)
 
     def scales(self) -> List[Tuple[int, bool]]:
         """Of each level, coarse to fine: finest pixels a side of its pixels; are its components undilated?"""

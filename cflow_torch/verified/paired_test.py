@@ -88,32 +88,54 @@ def count_wins(
 
     Cost: P (S - 1) C look-ups at most, of the pixels of tested components only.
     """
-    count, num_candidates, _ = candidates.shape
-    pixel, step = looks(sweeps, flat_nonzero(F.pad(tested, (0, 1)).index_select(0, component)))
+    (count, num_candidates, _), num_steps = candidates.shape, sweeps.num_steps
+    pixel, other = looks(sweeps, flat_nonzero(F.pad(tested, (0, 1)).index_select(0, component)))
     sums = torch.zeros(count * num_candidates, dtype=torch.int64, device=component.device)
     column = torch.arange(num_candidates, device=component.device)
+    window = F.pad(torch.zeros_like(tested, dtype=torch.int64), (0, 1)).scatter_(0, component, sweeps.window)
+    chosen, number = flat_nonzero(tested), tested.cumsum(0) - 1
+    elapsed = sweeps.elapsed.index_select(0, window.index_select(0, chosen))
+    moves = moves_of(elapsed, candidates.index_select(0, chosen))
+    is_far = moves.abs().amax(2) >= _FAR
+    counts_of = _counts_of(component.device)
     at_once = _LOOKS_ON_CPU if component.device.type == "cpu" else _LOOKS_ON_GPU
     size = max(1, at_once // num_candidates)
-    for some, other in zip(pixel.split(size), step.split(size)):
-        window, row, col = (values.index_select(0, some) for values in (sweeps.window, sweeps.row, sweeps.col))
-        # One of the two is 0.
-        k = sweeps.elapsed[window, sweeps.step.index_select(0, some)] - sweeps.elapsed[window, other]
-        own, of_some = sweeps.slices.index_select(0, some)[:, None], component.index_select(0, some)
-        seen = sweeps.with_around.index_select(0, sweeps.index(window, other, row, col))[:, None]
+    for some, step in zip(pixel.split(size), other.split(size)):
+        window, row, col, of_some = (
+            values.index_select(0, some) for values in (sweeps.window, sweeps.row, sweeps.col, component)
+        )
+        way = way_of(sweeps.step.index_select(0, some), step, num_steps)
+        which = number.index_select(0, of_some) * (2 * num_steps) + way
+        seen = sweeps.with_around.index_select(0, sweeps.index(window, step, row, col))
+        own = sweeps.slices.index_select(0, some)
         here, near_here = own & seen, own & (seen >> NUM_SLICES)
-        move = (candidates.index_select(0, of_some) * k[:, None, None] + 0.5).floor_().long()
-        y, x = row[:, None] + move[:, :, 0], col[:, None] + move[:, :, 1]
-        index = sweeps.index(window[:, None], other[:, None], y, x)
-        seen = sweeps.with_around.index_select(0, index.view(-1)).view(index.shape)
-        there, near_there = own & seen, own & (seen >> NUM_SLICES)
-        is_far = move.abs().amax(2) >= _FAR
-        won = there & ~torch.where(is_far, near_here, here)
-        lost = here & ~torch.where(is_far, near_there, there)
-        # Both counts in one number, won * 2^32 + lost, because sums cost more than look-ups.
-        counts = (count_slices(won).long() << 32) + count_slices(lost)
-        sums.index_add_(0, (of_some[:, None] * num_candidates + column).view(-1), counts.view(-1))
+        seen = sweeps.at_moved(sweeps.with_around, window, step, row, col, moves, which)
+        far = is_far.index_select(0, which)
+        won = seen & torch.where(far, (own & ~near_here)[:, None], (own & ~here)[:, None])
+        lost = here[:, None] & ~torch.where(far, seen >> NUM_SLICES, seen)
+        counts = counts_of.index_select(0, (won | lost << NUM_SLICES).view(-1).int())
+        sums.index_add_(0, (of_some[:, None] * num_candidates + column).view(-1), counts)
     sums = sums.view(count, num_candidates)
     return sums >> 32, sums & 0xFFFFFFFF
+
+
+def moves_of(elapsed: Tensor, motion: Tensor) -> Tensor:
+    """(T * 2 S, C, 2) int64, whole pixels that motions, (T, C, 2) float64 per sweep interval, lead from each sweep to
+    t+1, then from t+1 to each. elapsed: (T, S) float64, intervals."""
+    k = torch.cat((elapsed, -elapsed), 1)[:, :, None, None]
+    return (motion[:, None] * k + 0.5).floor_().long().flatten(0, 1)
+
+
+def way_of(step: Tensor, other: Tensor, num_steps: int) -> Tensor:
+    """(L,) int64: which of the 2 S ways of `moves_of` leads from a sweep to the other; one of the two is t+1."""
+    return torch.where(other > 0, num_steps + other, step)
+
+
+def _counts_of(device: torch.device) -> Tensor:
+    """(256,) int64: set bits of the lower half of a byte times 2^32, plus those of its upper half. Both counts are in
+    one number because sums cost more than look-ups."""
+    byte = torch.arange(256, dtype=torch.uint8, device=device)
+    return (count_slices(byte & 15).long() << 32) + count_slices(byte >> NUM_SLICES).long()
 
 
 def is_found_where_it_stands(sweeps: HeightSlicedSweeps, component: Tensor, motion: Tensor) -> Tensor:

@@ -36,10 +36,11 @@ def refine(
     moves = motion.any(1)
     too_long = F.pad(torch.cat([level.level.too_long for level in levels]), (0, 1))
     too_long = too_long.index_select(0, objects.component.clamp(max=too_long.numel() - 1))  # parts of them are not
-    slow = slow_motion(sweeps, objects, ~moves & ~too_long)
-    points = points_of_objects(sweeps, objects, moves)
-    is_pair = (sweeps.elapsed != 0).sum(1) == 1  # with history one of many sweeps would decide
-    motion = shift_between_pixels(points.take(is_pair.index_select(0, points.window)), sweeps, motion)
+    points, slow = points_of_objects(sweeps, objects, moves), torch.zeros_like(motion)
+    is_pair = (sweeps.elapsed != 0).sum(1) == 1
+    if bool(is_pair.any()):  # with history slow objects leave their pixels, and one of many sweeps would decide
+        slow = slow_motion(sweeps, objects, ~moves & ~too_long)
+        motion = shift_between_pixels(points.take(is_pair.index_select(0, points.window)), sweeps, motion)
     points = points.take(motion.any(1).index_select(0, points.owner))
     start = motion.flip(1) * sweeps.grid.pixel_size
     seen = register(points, sweeps, start)

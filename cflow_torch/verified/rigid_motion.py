@@ -89,18 +89,19 @@ def join(first: TurningMotion, second: TurningMotion, takes_second: Tensor, batc
     """
     count = takes_second.numel()
     window = split_index(batch.image[:count].long(), batch.num_steps)[0]
+    of_first, of_second = (motion.cluster(slice(count)).long() for motion in (first, second))
     num_ids = torch.zeros(batch.num_windows, dtype=torch.int64, device=window.device)
-    num_ids.scatter_reduce_(0, window, 1 + first.cluster_id.index_select(0, first.cluster(slice(count))), "amax")
+    num_ids.scatter_reduce_(0, window, 1 + first.cluster_id.index_select(0, of_first), "amax")
     offset = torch.zeros_like(second.cluster_id)
-    offset.scatter_(0, second.cluster(slice(count)).long(), num_ids.index_select(0, window))
+    offset.scatter_(0, of_second, num_ids.index_select(0, window))
     ids = second.cluster_id + offset.masked_fill_(second.cluster_id < 0, 0)
     both = {
         name: torch.cat((getattr(first, name), getattr(second, name)))
         for name in ("flow", "score", "confidence", "turn", "centre")
     }
     return TurningMotion(
-        of_place=torch.cat((first.of_place, second.of_place + first.cluster_id.numel())),
-        place=torch.where(takes_second, second.place[:count] + first.of_place.numel(), first.place[:count]),
+        of_place=torch.where(takes_second, of_second + first.cluster_id.numel(), of_first),
+        place=torch.arange(count, device=window.device),
         cluster_id=torch.cat((first.cluster_id, ids)),
         **both,
     )
@@ -112,18 +113,13 @@ def motion_by_pixel(
     score: Tensor,
     confidence: Tensor,
     sweeps: HeightSlicedSweeps,
-    is_numbered: bool,
 ) -> TurningMotion:
-    """The motion of G objects, (P,) scores, (P + 1,) confidence by pixel: clusters are pixels, and M is P.
-
-    Args:
-        is_numbered: whether `sweeps.number` was made; else the pixels of t are numbered, which costs less.
-    """
+    """The motion of G objects, (P,) scores, (P + 1,) confidence by pixel: clusters are pixels, and M is P."""
     window = sweeps.window.index_select(0, objects.first)
     ids = torch.arange(window.numel(), device=window.device) - torch.searchsorted(window, window)
     of_pixel = F.pad(objects.of_pixel, (0, 1), value=objects.count)
     return TurningMotion(
-        of_place=sweeps.number if is_numbered else sweeps.number_at_t(),
+        of_place=sweeps.number,
         place=torch.where(sweeps.batch.has_result, sweeps.place, sweeps.image.numel() - 1),
         flow=F.pad(rigid.flow, (0, 1, 0, 1)).index_select(0, of_pixel) + 0.0,  # + 0.0 turns -0.0 into 0.0
         cluster_id=F.pad(ids, (0, 1), value=-1).index_select(0, of_pixel),

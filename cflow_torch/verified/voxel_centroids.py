@@ -143,7 +143,9 @@ class Voxels:
         voxel = self.around(window, step, part, x, y, 1)
         dx = self.x.index_select(0, voxel.view(-1)).view_as(voxel).sub_(x)
         dy = self.y.index_select(0, voxel.view(-1)).view_as(voxel).sub_(y)
-        return voxel.gather(0, dx.mul_(dx).add_(dy.mul_(dy)).argmin(0, keepdim=True))[0]
+        # The square and the place in one number: its least is found several times faster than by argmin.
+        key = dx.mul_(dx).add_(dy.mul_(dy)).long().mul_(16).add_(torch.arange(9, device=x.device)[:, None])
+        return voxel.gather(0, key.amin(0, keepdim=True).bitwise_and_(15))[0]
 
     def around(self, window: Tensor, step: Tensor, part: Tensor, x: Tensor, y: Tensor, reach: int) -> Tensor:
         """Voxels of a sweep in the pixels around a place, `reach` pixels each way, and in the slice given.
@@ -165,7 +167,7 @@ class Voxels:
         place = (line[:, None] + col).flatten(0, 1)
         inside = (is_row[:, None] & is_col).view_as(place)
         place.masked_fill_(~inside, self._sweeps.image.numel() - 1)
-        pixel = self._sweeps.number.index_select(0, place.view(-1)).view_as(place).long()
+        pixel = self._sweeps.number_at(place.view(-1)).view_as(place)
         return self._of_key.index_select(0, pixel.mul_(self._num_slices).add_(part).view(-1)).view_as(place)
 
 

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from cflow_torch.ops.lower_surface import UNKNOWN, lower_surface
+from cflow_torch.ops.threads import one_thread
 from cflow_torch.types import Array, CFlowError, Sweep, Window
 from cflow_torch.windows.ground_plane import REACH, millimetres, near_plane, order_statistics
 from cflow_torch.windows.validation import check_points, choose_device, read_positions
@@ -57,6 +58,7 @@ def find_ground(points: Array, method: str = "grid", threshold: float = THRESHOL
     return find_ground_batch([points], method, threshold, device)[0]
 
 
+@one_thread()
 def find_ground_batch(
     clouds: Sequence[Array], method: str = "grid", threshold: float = THRESHOLD, device: Any = "auto"
 ) -> List[Array]:
@@ -92,6 +94,7 @@ def find_ground_batch(
     ]
 
 
+@one_thread()
 def has_ground(clouds: Sequence[Array], most_points: int = 30_000, device: Any = "auto") -> List[bool]:
     """Whether there is ground in each of several sweeps, from a part of their points.
 

@@ -1,60 +1,16 @@
-"""How much a model does and holds, counted without a clock: the same figures on a busy machine and on a fast one."""
+"""How much memory a model takes, counted without a clock: the same figures on a busy machine and on a fast one."""
 
 from __future__ import annotations
 
 import tracemalloc
-from collections import Counter
-from functools import lru_cache
-from typing import Any, Callable, Dict, List, Tuple
+from typing import Any, Callable, List, Tuple
 
 import torch
-from torch import Tensor
-from torch.overrides import TorchFunctionMode
 from torch.profiler import ProfilerActivity, profile
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from cflow_torch.types import FlowResult
 
 Run = Callable[[], List[FlowResult]]
-
-# Operations after which the host must wait for a GPU: the size or value of the result decides what comes next. Some
-# wait twice (unique, bincount); they count once.
-_WAITING = {
-    "_local_scalar_dense",  # item, int, float, bool of a tensor
-    "nonzero",
-    "equal",
-    "_unique2",
-    "unique_dim",
-    "unique_consecutive",
-    "masked_select",
-    "bincount",
-}
-# Not views by their schema, but nothing is computed.
-_IDLE = {"_unsafe_view", "lift_fresh", "detach_"}
-
-
-def count_work(run: Run) -> Dict[str, int]:
-    """Count what one call of a model does.
-
-    Args:
-        run: calls the model; called twice.
-
-    Returns:
-        "operations": tensor operations that torch dispatched, views left out: on a GPU each is about one kernel launch,
-        on a CPU each costs some microseconds, whatever its size. "waits": times that the host would wait for a GPU:
-        `nonzero`, `item`, `equal`, `unique`, indices by a mask, ... "uploads": times that values of the host would be
-        sent to a GPU: `torch.tensor`, `as_tensor`, `to(device)`.
-
-    Convention:
-        On the CPU waits and uploads stand in for a GPU: they count the calls that would wait or send there. The counts
-        depend on the input and the device, hardly on the version of torch, and not on threads.
-    """
-    run()
-    operations, calls = _Operations(), _Calls()
-    with calls, operations:
-        run()
-    waits = operations.waits + calls.waits
-    return {"operations": operations.count, "waits": sum(waits.values()), "uploads": calls.uploads}
 
 
 def count_allocations(run: Run) -> Tuple[int, int]:
@@ -114,77 +70,3 @@ def _count_on_gpu(run: Run, device: torch.device) -> Tuple[int, int]:
     after = torch.cuda.memory_stats(device)
     total, most, now = "allocated_bytes.all.allocated", "allocated_bytes.all.peak", "allocated_bytes.all.current"
     return after[total] - before[total], after[most] - before[now]
-
-
-class _Operations(TorchDispatchMode):
-    """Counts what reaches torch's kernels."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.count = 0
-        self.waits: Counter = Counter()
-
-    def __torch_dispatch__(self, func: Any, types: Any, args: Tuple[Any, ...] = (), kwargs: Any = None) -> Any:
-        kwargs = kwargs or {}
-        # In inference mode composite operations come undivided. One with a number is one operation with a tensor, which
-        # torch 2.0 would hand the number all the same.
-        if _is_composite(func) and func._overloadname != "Scalar":
-            with self:
-                return func.decompose(*args, **kwargs)
-        result = func(*args, **kwargs)
-        if func.namespace == "aten" and not _is_view(func):
-            self.count += 1
-            self.waits[_name(func)] += _must_wait(_name(func), args, kwargs, result)
-        return result
-
-
-class _Calls(TorchFunctionMode):
-    """Counts calls that leave torch or enter it, which no kernel sees."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.waits: Counter = Counter()
-        self.uploads = 0
-
-    def __torch_function__(self, func: Any, types: Any, args: Tuple[Any, ...] = (), kwargs: Any = None) -> Any:
-        kwargs = kwargs or {}
-        name = getattr(func, "__name__", "")
-        if name in ("numpy", "tolist", "cpu") and args[0].device.type == "cpu":  # else the copy is seen as an operation
-            self.waits[name] += 1
-        moves = name == "to" and any(isinstance(value, (torch.device, str)) for value in (*args, *kwargs.values()))
-        self.uploads += moves or name in ("tensor", "as_tensor")
-        return func(*args, **kwargs)
-
-
-@lru_cache(maxsize=None)
-def _name(func: Any) -> str:
-    """`add` of aten::add.Tensor."""
-    return func._schema.name.split("::")[-1]
-
-
-@lru_cache(maxsize=None)
-def _is_composite(func: Any) -> bool:
-    """Made of other operations."""
-    return torch._C._dispatch_has_kernel_for_dispatch_key(func.name(), "CompositeImplicitAutograd")
-
-
-@lru_cache(maxsize=None)
-def _is_view(func: Any) -> bool:
-    """The result is another look at the input: nothing is computed."""
-    aliases = [value.alias_info for value in func._schema.returns]
-    return _name(func) in _IDLE or any(alias is not None and not alias.is_write for alias in aliases)
-
-
-def _must_wait(name: str, args: Tuple[Any, ...], kwargs: Dict[str, Any], result: Any) -> bool:
-    """Whether the host would wait for a GPU."""
-    if name in _WAITING:
-        return True
-    if name == "repeat_interleave":
-        return kwargs.get("output_size") is None
-    if name in ("index", "index_put", "index_put_", "_index_put_impl_"):
-        by_mask = any(isinstance(i, Tensor) and i.dtype in (torch.bool, torch.uint8) for i in args[1])
-        return by_mask and (name == "index" or args[2].numel() != 1)  # one value: `masked_fill`, which does not wait
-    if name in ("_to_copy", "copy_"):
-        source = args[1] if name == "copy_" else args[0]
-        return source.is_cuda and not result.is_cuda
-    return False

@@ -13,10 +13,11 @@ import pytest
 from omegaconf import OmegaConf
 
 from cflow_torch import make_config
-from cflow_torch.cli import run
+from cflow_torch.cli import estimates, run
 from cflow_torch.cli.record import objective
 from cflow_torch.config import config_from
 from cflow_torch.data.av2 import AV2Log
+from cflow_torch.fleet.machine import Layout
 
 Cflow = Callable[..., int]
 SMALL = "model.point_cloud_range=[-20,-20,-inf,20,20,inf]"
@@ -121,7 +122,7 @@ def test_bad_frames_and_bad_logs_are_reported_and_the_rest_goes_on(
 
 
 def test_a_failure_ends_a_run_and_leaves_a_sweep_going(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(run, "is_sweep", lambda: False)  # whatever settings were composed before
+    monkeypatch.setattr(run, "is_sweep", lambda: False)
     with pytest.raises(SystemExit, match="1"):
         run.finish([("a", "bad")])
     monkeypatch.setattr(run, "is_sweep", lambda: True)
@@ -136,3 +137,21 @@ def test_the_score_of_a_sweep() -> None:
     assert objective({"bucketed": mean, "bucketed_by_range": {"mean": {"dynamic_error": 0.5}}}) == 0.5
     assert objective({"three_way": {"epe_3way": 1.0}}) == 1.0
     assert np.isnan(objective({"bucketed": {"mean": {"dynamic_error": None}}}))
+
+
+def test_worker_processes_give_what_one_process_gives(
+    log_folder: Path, tmp_path: Path, evaluate: Cflow, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    """Scores, times of all pairs, and a bad frame that is reported while the rest goes on."""
+    root = tmp_path / "data" / "log"
+    shutil.copytree(log_folder, root)
+    sorted(root.glob("sensors/lidar/*"))[0].write_bytes(b"no feather")
+    records = []
+    for name, least in (("one", 50), ("two", 1)):
+        monkeypatch.setattr(estimates, "_PAIRS_PER_WORKER", least)
+        monkeypatch.setattr(estimates, "choose_layout", lambda *_: Layout(("cpu",) * 2, 1))
+        assert evaluate(f"data.root={root}", f"output={tmp_path / name}") == 1
+        records.append(results_of(tmp_path / name))
+    one, two = records
+    assert two["num_pairs"] == 2 and two["seconds_per_pair"]["pairs"] == one["seconds_per_pair"]["pairs"]
+    assert all(one[key] == two[key] for key in ("results", "failures", "data"))

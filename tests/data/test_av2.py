@@ -71,7 +71,7 @@ def folder(tmp_path: Path) -> Path:
 
 def test_real_log(av2_folder: Path, data_root: Path) -> None:
     assert av2_folder in find_av2_logs(data_root)
-    log = AV2Log(av2_folder, require_ground=True)
+    log = AV2Log(av2_folder)
     assert log.log_id == av2_folder.name
     assert list(log.timestamps) == [315966265259836000, 315966265360032000]
     pair = window(log, 0)
@@ -166,8 +166,6 @@ def test_bad_logs_are_refused(folder: Path, tmp_path: Path) -> None:
                 ask(index)
     with pytest.raises(CFlowError, match="ground rules are"):
         AV2Log(folder, ground="patchwork")
-    with pytest.raises(CFlowError, match="no ground raster"):
-        AV2Log(folder, require_ground=True)
     for time in TIMES[1:]:
         (folder / "sensors" / "lidar" / f"{time}.feather").unlink()
     with pytest.raises(CFlowError, match="has 1 sweeps"):
@@ -264,7 +262,7 @@ def test_map_of_a_log(folder: Path) -> None:
         AV2Log(folder)
     sim2 = maps / "x___img_Sim2_city.json"
     sim2.write_text(json.dumps({"R": [1, 0, 0, 1], "t": [-990, 10], "s": 1.0}))
-    sweep = AV2Log(folder, require_ground=True).sweep(0)
+    sweep = AV2Log(folder).sweep(0)
     np.testing.assert_array_equal(sweep.is_ground, [False, False, True])  # z = 3, 0.5, 0
     np.testing.assert_array_equal(AV2Log(folder, ground="bsfe").sweep(0).is_ground, [False, False, True])
     sim2.write_text("{}")

@@ -9,6 +9,9 @@ import numpy as np
 import pytest
 
 from cflow_torch import CFlowError, Sweep
+from cflow_torch.data.arrays.cloud_file import write_cloud
+from cflow_torch.data.arrays.poses_text import write_kitti_poses
+from cflow_torch.data.catalog import find_sources, open_log
 from cflow_torch.data.odometry import PosedLog, poses_from_odometry, with_poses
 from cflow_torch.data.static_check import check_static_world
 from cflow_torch.simulator import make_drive
@@ -70,3 +73,30 @@ def test_without_kiss_icp_the_message_says_what_to_do(drive, monkeypatch):
         with pytest.raises(CFlowError, match=r"pip install kiss-icp.*poses\.txt"):
             call(NoPoses(drive))
     assert with_poses(drive) is drive, "nothing is estimated where poses are known"
+
+
+@needs_kiss_icp
+def test_its_own_loaders(drive, tmp_path):
+    """KITTI's layout, whose scans the loader corrects by a fifth of a degree."""
+    folder = tmp_path / "sequences" / "03"
+    (folder / "velodyne").mkdir(parents=True)
+    (tmp_path / "poses").mkdir()
+    for index in range(3):
+        write_cloud(folder / "velodyne" / f"{index:06d}.bin", drive.sweep(index).points)
+    (folder / "calib.txt").write_text("Tr: 1 0 0 0 0 1 0 0 0 0 1 0\n")
+    write_kitti_poses(tmp_path / "poses" / "03.txt", drive.poses[:3])
+    (source,) = find_sources("kiss_icp", tmp_path)
+    log = open_log("kiss_icp", source, check=False, loader="kitti", sequence="03")
+    assert len(log.timestamps) == 3 and log.log_id == f"{tmp_path.name}-03" and log.labels(0) is None
+    assert np.allclose(log.sweep(2).pose, drive.poses[2], atol=1e-6)
+    given, read = drive.sweep(1).points, log.sweep(1).points
+    assert (
+        read.dtype == np.float32 and (np.linalg.norm(read - given, axis=1) < 0.01 * np.linalg.norm(given, axis=1)).all()
+    )
+    for settings, message in (
+        ({"loader": "mcap"}, "give one of apollo.*or take data=bags"),
+        ({"loader": "kitti"}, "loader kitti fails: .*sequence"),
+        ({"loader": "apollo"}, "fails: .*open3d"),
+    ):
+        with pytest.raises(CFlowError, match=message):
+            open_log("kiss_icp", source, **settings)

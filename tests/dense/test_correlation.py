@@ -14,7 +14,7 @@ from oracle.dense import scene_flow_in_1view
 from scenes import needs_gpu, same_bits
 
 from cflow_torch import CFlowError
-from cflow_torch.dense import correlation
+from cflow_torch.dense import correlation, packing
 from cflow_torch.dense.correlation import best_shifts
 from cflow_torch.dense.templates import Images, TemplatePairs
 from cflow_torch.windows import memory
@@ -170,6 +170,14 @@ def test_company_chunks_and_memory_do_not_matter(monkeypatch):
             assert torch.equal(found[0], shift) and same_bits(found[1], score)
     monkeypatch.setattr(correlation, "_AT_ONCE_CPU", 600)
     monkeypatch.setattr(correlation, "_IN_PART_CPU", 900)
+    found = best_shifts(as_pairs(targets, pairs))
+    assert torch.equal(found[0], shift) and same_bits(found[1], score)
+
+
+def test_lines_of_a_gpu_give_the_same(monkeypatch):
+    targets, pairs = random_pairs(np.random.default_rng(3), [(5, 6), (300, 290), (40, 41)], 4, False)
+    shift, score = best_shifts(as_pairs(targets, pairs))
+    monkeypatch.setattr(packing, "_LINES_CPU", packing._LINES_GPU)
     found = best_shifts(as_pairs(targets, pairs))
     assert torch.equal(found[0], shift) and same_bits(found[1], score)
 

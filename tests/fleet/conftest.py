@@ -21,7 +21,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def single_run(fleet: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The output of one worker, one window at a time. Read only."""
     output = tmp_path_factory.mktemp("single") / "flow"
-    assert run(fleet, output, Layout(("cpu",), 1, batch=1))["status"] == "complete"
+    assert run(fleet, output, Layout(("cpu",), batch=1))["status"] == "complete"
     return output
 
 

@@ -99,7 +99,7 @@ def begin(layout: Layout, **settings: Any) -> None:
     "layout, settings, message",
     [
         (TWO, {"retries": -1}, "engine.retries"),
-        (Layout(("cuda:1",), 1, 1), {}, "CUDA_VISIBLE_DEVICES"),
+        (Layout(("cuda:1",), 1), {}, "CUDA_VISIBLE_DEVICES"),
     ],
 )
 def test_bad_settings(layout: Layout, settings: Dict[str, Any], message: str) -> None:
@@ -110,6 +110,6 @@ def test_bad_settings(layout: Layout, settings: Dict[str, Any], message: str) ->
 @pytest.mark.slow
 def test_a_cluster_without_room_and_a_node_that_does_not_see_the_output() -> None:
     with pytest.raises(CFlowError, match="no node of the Ray cluster has room for a worker of 0 CPU, 3 GPU"):
-        begin(Layout(("cuda:0",), 1, 1), num_gpus=3)
+        begin(Layout(("cuda:0",), 1), num_gpus=3)
     with pytest.raises(CFlowError, match="does not see .*nowhere: the output must be reachable everywhere"):
         begin(TWO)

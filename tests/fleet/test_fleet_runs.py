@@ -50,7 +50,7 @@ def test_files_hold_the_results_of_the_method_and_their_origin(fleet: Path, sing
 
 
 def test_a_batch_changes_no_byte(fleet: Path, single: Dict[str, bytes], tmp_path: Path) -> None:
-    report = run(fleet, tmp_path, Layout(("cpu",), 1, batch=4))
+    report = run(fleet, tmp_path, Layout(("cpu",), batch=4))
     assert tree(tmp_path) == single
     assert (report["status"], report["exit_status"]) == ("complete", 0)
     assert list(report["frames"].values()) == [PAIRS, 0, PAIRS, 0, 0, 0, 0]
@@ -226,7 +226,7 @@ def test_a_signal_ends_a_run_in_order(
     fleet: Path, single: Dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     during(monkeypatch, 2, lambda: os.kill(os.getpid(), signal.SIGTERM))
-    report = run(fleet, tmp_path, Layout(("cpu",), 1, 1))
+    report = run(fleet, tmp_path, Layout(("cpu",), 1))
     assert (report["status"], report["stopped_by"], report["exit_status"]) == ("interrupted", "SIGTERM", 143)
     assert report["frames"]["computed"] == len(frames(tmp_path)) < PAIRS and report["frames"]["unopened_units"]
     assert tree(tmp_path).items() <= single.items()

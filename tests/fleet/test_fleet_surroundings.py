@@ -96,23 +96,23 @@ def test_layout_is_chosen_from_the_machine(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(machine, "usable_cores", lambda environ: 16)
     monkeypatch.setattr(machine, "available_memory", lambda environ: 10 * machine.WORKER_MEMORY + 1)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert choose_layout("auto", "auto", "auto", "auto", {}) == Layout(("cpu",) * 10, 1, machine.CPU_BATCH)
-    assert choose_layout("cpu", 3, "auto", 7, {}) == Layout(("cpu",) * 3, 5, 7)
+    assert choose_layout("auto", "auto", "auto", {}) == Layout(("cpu",) * 10, machine.CPU_BATCH)
+    assert choose_layout("cpu", 3, 7, {}) == Layout(("cpu",) * 3, 7)
     monkeypatch.setattr(machine, "available_memory", lambda environ: 1)
-    assert choose_layout("cpu", "auto", "auto", "auto", {}).devices == ("cpu",)
+    assert choose_layout("cpu", "auto", "auto", {}).devices == ("cpu",)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-    assert choose_layout("auto", "auto", "auto", "auto", {}) == Layout(("cuda:0", "cuda:1"), 8, machine.GPU_BATCH)
-    assert choose_layout("cuda", 3, 2, 1, {}) == Layout(("cuda:0", "cuda:1", "cuda:0"), 2, 1)
-    assert choose_layout("auto", "auto", 1, 1, {"LOCAL_RANK": "3"}).devices == ("cuda:1",)
-    assert choose_layout("auto", "auto", 1, 1, {"SLURM_LOCALID": "0"}).devices == ("cuda:0",)
-    assert choose_layout("cuda:1", "auto", 1, 1, {"LOCAL_RANK": "0"}).devices == ("cuda:1",)
+    assert choose_layout("auto", "auto", "auto", {}) == Layout(("cuda:0", "cuda:1"), machine.GPU_BATCH)
+    assert choose_layout("cuda", 3, 1, {}) == Layout(("cuda:0", "cuda:1", "cuda:0"), 1)
+    assert choose_layout("auto", "auto", 1, {"LOCAL_RANK": "3"}).devices == ("cuda:1",)
+    assert choose_layout("auto", "auto", 1, {"SLURM_LOCALID": "0"}).devices == ("cuda:0",)
+    assert choose_layout("cuda:1", "auto", 1, {"LOCAL_RANK": "0"}).devices == ("cuda:1",)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
     with pytest.raises(CFlowError, match="no GPU"):
-        choose_layout("cuda", "auto", 1, 1, {})
+        choose_layout("cuda", "auto", 1, {})
     for workers in (0, "many", 1.5, True):
         with pytest.raises(CFlowError, match="workers=.*whole number"):
-            choose_layout("cpu", workers, 1, 1, {})
+            choose_layout("cpu", workers, 1, {})
 
 
 def test_cores_are_those_of_the_job() -> None:

@@ -163,7 +163,7 @@ class Thread:
     def _begin(self) -> None:
         if self.started <= self.stillborn:
             raise WorkerDied("by SIGKILL")
-        self._process = WorkerProcess(self.job, "cpu", 1)
+        self._process = WorkerProcess(self.job, "cpu")
         self._process._ahead = 0
 
     def step(self, unit: Unit, stop: bool) -> Future:
@@ -297,7 +297,7 @@ def test_a_report_of_trouble_lists_what_is_missing() -> None:
     assert counters.add(Failed(1, "b", "no log")) == 0
     assert counters.add(Opened(0, "a", stamps[12:], stamps[13:])) == 1, "12 was written before its worker died"
     assert counters.add(Opened(0, "a", (20,), (20,))) == 0, "by itself"
-    told = counters.report(4.0, Layout(("cpu",), 2, 1), Shard(), "local", "SIGTERM")
+    told = counters.report(4.0, Layout(("cpu",), 1), Shard(), "local", "SIGTERM")
     assert told["status"] == "interrupted" and told["stopped_by"] == "SIGTERM"
     assert list(told["frames"].values()) == [40, 10, 2, 1, 1, 27, 1]
     missing = format_missing(told).splitlines()
@@ -310,4 +310,4 @@ def test_settings_of_the_engine_are_checked(source: Path, tmp_path: Path) -> Non
     job, units = replace(make_job(tmp_path)), [Unit(0, source)]
     for settings in ({"timeout": 0}, {"timeout": "long"}, {"memory": -1}, {"memory": True}):
         with pytest.raises(CFlowError, match=f"engine.{next(iter(settings))}=.*above 0"):
-            list(run_local(job, units, Layout(("cpu",), 1, 1), lambda: False, **settings))
+            list(run_local(job, units, Layout(("cpu",), 1), lambda: False, **settings))

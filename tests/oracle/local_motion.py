@@ -17,7 +17,7 @@ from oracle.visibility import RangeImage, sensor_height
 
 STEP, REACH, FASTEST = 0.1, 3, 0.25  # metres per interval, steps, metres per interval
 SIDE = 0.3  # metres, of a cell
-SEED_Z, LEAST_WON, GROUP_Z, UPRIGHT = 6, 4, 4.0, 3
+SEED_Z, LEAST_WON, GROUP_Z, UPRIGHT = 6, 16, 4.0, 3
 
 Cell = Tuple[int, int]
 
@@ -148,7 +148,7 @@ def best_velocity(
 
     Convention: what a look wins and loses counts in the 3 x 3 cells around the one where its pixel is at t+1. The
         velocity of largest z, the first of equals, must be believed. Of the cells around, the first of largest z in
-        raster order decides. Cells stay inside the image.
+        raster order decides. Cells outside the image do not count.
 
     Args:
         origin: of the ego frame of t.
@@ -239,11 +239,10 @@ def components(cells: Set[Cell]) -> Dict[Cell, Cell]:
 
 
 def cell_at(sweeps: SlicedSweeps, pixel: Pixel, velocity: Vector, side: int) -> Cell:
-    """The cell of some pixels a side where a velocity takes a pixel at t+1, kept inside the image."""
+    """The cell of some pixels a side where a velocity takes a pixel at t+1."""
     m, r, c = pixel
-    height, width = sweeps.images[0].shape
     dy, dx = _shift(velocity, sweeps.elapsed[m])
-    return min(max(r + dy, 0), height - 1) // side, min(max(c + dx, 0), width - 1) // side
+    return (r + dy) // side, (c + dx) // side
 
 
 def _shift(velocity: Vector, k: float) -> Tuple[int, int]:

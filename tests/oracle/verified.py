@@ -113,7 +113,7 @@ def estimate(
         )
         for keep, of_sweep, wanted in zip(drawn, lower, of_drawn):
             of_sweep[keep] = wanted
-        second = has_result(look(clouds, lower, None, [(1, False), (1, True)], config), is_inside)
+        second = has_result(look(clouds, lower, None, [(1, False)], config), is_inside)
         num_ids = 1 + max(own.max(initial=-1) for own in owners)
         owners = [np.where(second.moves(m), num_ids + second.owners[m], own) for m, own in enumerate(owners)]
         takes_second = second.moves(1)

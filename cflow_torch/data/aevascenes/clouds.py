@@ -5,14 +5,14 @@ from __future__ import annotations
 import io
 import math
 from pathlib import Path
-from typing import Any, List, Optional
+from typing import List, Optional
 
 import numpy as np
 from numpy.lib import format as npy
 
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.paths import read_bytes
-from cflow_torch.data.pickles import NUMPY_ARRAYS, StandIn, load_plain
+from cflow_torch.data.pickles import NUMPY_ARRAYS, StandIn, array_of, load_plain
 from cflow_torch.types import CFlowError
 
 _MEND = "copy it from the data set"
@@ -78,19 +78,11 @@ class Cloud:
             with self._arrays.zip.open(f"{key}.npy") as member:
                 is_first = npy.read_magic(member) == (1, 0)
                 shape, _, dtype = (npy.read_array_header_1_0 if is_first else npy.read_array_header_2_0)(member)
-                stored = load_plain(member, NUMPY_ARRAYS) if dtype.hasobject else self._arrays[key]
-            texts = _elements(stored) if isinstance(stored, StandIn) else np.ravel(stored).tolist()
+                stored = array_of(load_plain(member, NUMPY_ARRAYS)) if dtype.hasobject else self._arrays[key]
+            texts = [_text(text) if isinstance(text, StandIn) else text for text in stored.ravel().tolist()]
             if {type(text) for text in texts} - {str} or len(texts) != math.prod(shape):
                 raise ValueError(f"it must hold {math.prod(shape)} strings")
             return texts
-
-
-def _elements(array: StandIn) -> List[Any]:
-    """Elements of a pickled one-dimensional array, or column."""
-    _, shape, _, _, elements = array.state
-    if max(shape) != math.prod(shape):
-        raise ValueError(f"its names have shape {shape}, a column was expected")
-    return [_text(element) if isinstance(element, StandIn) else element for element in elements]
 
 
 def _text(scalar: StandIn) -> str:

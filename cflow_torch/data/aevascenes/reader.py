@@ -10,13 +10,13 @@ import numpy as np
 
 from cflow_torch.data.aevascenes.clouds import Cloud
 from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes, make_boxes
-from cflow_torch.data.file_errors import file_errors
+from cflow_torch.data.file_errors import file_errors, shortened
 from cflow_torch.data.folders import find_folders
-from cflow_torch.data.json_file import is_whole, read_json, shown
+from cflow_torch.data.json_file import read_json
 from cflow_torch.data.log import FlowLabels, NumberedSweeps
 from cflow_torch.data.names import inside
 from cflow_torch.data.paths import Place, as_path
-from cflow_torch.data.rigid_motion import moved, poses_from_quaternions
+from cflow_torch.data.rigid_motion import moved, poses_of_nodes
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.ego_motion import relative_transform
 
@@ -109,11 +109,11 @@ class AevaScenesLog(NumberedSweeps):
             mounts, known = content["metadata"]["vehicle_to_lidar_extrinsics"], content["metadata"]["sensors"]["lidars"]
             self.lidars: Sequence[str] = tuple(known if lidars is None else lidars)
             if not self.lidars or not set(self.lidars) <= set(known):
-                raise CFlowError(f"{self._file} has the LiDARs {shown(known)}; got {shown(list(self.lidars))}")
+                raise CFlowError(f"{self._file} has the LiDARs {shortened(known)}; got {shortened(list(self.lidars))}")
             by_time: Dict[int, Dict[str, Any]] = {frame["timestamp_ns"]: frame for frame in content["frames"]}
-            if len(by_time) < len(content["frames"]) or not all(map(is_whole, by_time)):
+            if len(by_time) < len(content["frames"]) or {type(time) for time in by_time} - {int}:
                 raise CFlowError(
-                    f"{self._file}: timestamp_ns must be different 64-bit integers, got {shown(list(by_time))}"
+                    f"{self._file}: timestamp_ns must be different integers, got {shortened(list(by_time))}"
                 )
             self.timestamps = sorted(by_time)
             self._check_count(self._file)
@@ -171,7 +171,7 @@ class AevaScenesLog(NumberedSweeps):
                 entry = self._frames[index]["point_cloud"][name]
                 paths = [entry[key] for key in _PATHS[self._clouds] if key in entry]
             if not paths:
-                has = f"no {self._clouds} cloud, only {shown(entry)}"
+                has = f"no {self._clouds} cloud, only {shortened(entry)}"
                 raise CFlowError(f"{where}, {name}: {has}; raw clouds come with version 2 of the data set")
             clouds.append(Cloud(inside(self.folder, paths[0], f"{where}, {name}: the path")))
         return clouds
@@ -183,7 +183,7 @@ class AevaScenesLog(NumberedSweeps):
             boxes = [box for box in boxes if CATEGORY_NAME.get(box["class"]) != "NONE"]
             strange = [box for box in boxes if box.get("reference_frame", "VEHICLE") != "VEHICLE"]
             if strange:
-                raise CFlowError(f"boxes are in VEHICLE, got {shown(strange[0]['reference_frame'])}")
+                raise CFlowError(f"boxes are in VEHICLE, got {shortened(repr(strange[0]['reference_frame']))}")
             return make_boxes(
                 [str(box["id"]) for box in boxes],
                 category_indices([box["class"] for box in boxes], CATEGORY_NAME),
@@ -193,6 +193,4 @@ class AevaScenesLog(NumberedSweeps):
 
     def _poses_of(self, nodes: Sequence[Any], what: str) -> np.ndarray:
         """(K, 4, 4) float64 from objects with translation {x, y, z} and rotation {w, x, y, z}."""
-        translation = [[node["translation"][key] for key in "xyz"] for node in nodes]
-        rotation = [[node["rotation"][key] for key in "wxyz"] for node in nodes]
-        return poses_from_quaternions(translation, rotation, lambda row: f"{self._file}: {what}: number {row}")
+        return poses_of_nodes(nodes, "translation", "rotation", f"{self._file}: {what}: number")

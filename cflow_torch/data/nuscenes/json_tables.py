@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Collection, Dict, List, Optional, Tuple
 
-from cflow_torch.data.file_errors import file_errors
-from cflow_torch.data.json_file import parse_json, shown
+from cflow_torch.data.file_errors import file_errors, shortened
+from cflow_torch.data.json_file import parse_json
 from cflow_torch.data.paths import read_bytes
 from cflow_torch.types import CFlowError
 
@@ -47,7 +47,7 @@ def read_table(folder: Path, table: str, key: str = "", values: Collection[str] 
     def use(row: Row) -> Optional[Row]:  # called for each row as it is parsed, so that the rest is never held
         missing = [name for name in names if name not in row]
         if missing:
-            raise CFlowError(f"{file}: a row lacks {missing}; it has {shown(sorted(row))}. Copy the table again")
+            raise CFlowError(f"{file}: a row lacks {missing}; it has {shortened(sorted(row))}. Copy the table again")
         return {name: row[name] for name in names} if not key or row[key] in values else None
 
     with file_errors(file, "copy all tables of the version"):

@@ -10,9 +10,8 @@ from typing import Collection, Dict, List, Optional, Sequence, Tuple
 
 import numpy as np
 
-from cflow_torch.data.file_errors import file_errors
+from cflow_torch.data.file_errors import file_errors, shortened
 from cflow_torch.data.folders import find_folders
-from cflow_torch.data.json_file import shown
 from cflow_torch.data.names import safe_name
 from cflow_torch.data.nuscenes.json_tables import Row, read_table
 from cflow_torch.data.paths import Place, as_path
@@ -113,7 +112,7 @@ class _ByToken(Dict[str, Row]):
         self._file = folder / f"{table}.json"
 
     def __missing__(self, token: str) -> Row:
-        raise CFlowError(f"{self._file} has no row {shown(token)}, which another table names; {_COPY}")
+        raise CFlowError(f"{self._file} has no row {shortened(repr(token))}, which another table names; {_COPY}")
 
 
 class Tables:

@@ -10,7 +10,6 @@ import pyarrow.parquet as pq
 
 from cflow_torch.data.arrow_file import check_columns
 from cflow_torch.data.file_errors import file_errors, shortened
-from cflow_torch.data.json_file import is_whole
 from cflow_torch.data.paths import mapped, ranged
 from cflow_torch.types import CFlowError
 from cflow_torch.windows.ego_motion import rigid_transform
@@ -25,7 +24,6 @@ CALIBRATION, BOX = "[LiDARCalibrationComponent].", "[LiDARBoxComponent]."
 VEHICLE_POSE = "[VehiclePoseComponent].world_from_vehicle.transform"
 """Beginnings of the columns that are read, and one whole name."""
 
-_MOST = 1 << 53  # of a time in microseconds, which becomes nanoseconds in an int64
 _BATCH = 8  # rows of range images held at once while looking for one
 Key = Tuple[int, int]  # frame time in microseconds, laser
 
@@ -61,10 +59,6 @@ class Component:
             raise CFlowError(
                 f"{self.file} holds segment {shortened(strangers[0])}, which is not its name; copy it again"
             )
-        for name in {TIME, LASER} & set(columns):
-            wrong = [row[name] for row in rows if not is_whole(row[name], _MOST)]
-            if wrong:
-                raise CFlowError(f"{self.file}: {name} must hold whole numbers up to 2^53, got {wrong[0]!r}")
         return rows
 
     def frame_lasers(self) -> Collection[Key]:

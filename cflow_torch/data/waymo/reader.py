@@ -9,7 +9,7 @@ from typing import Dict, List, Optional, Sequence, Tuple
 
 import numpy as np
 
-from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes, make_boxes
+from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes, make_boxes, upright_poses
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.folders import find_folders
 from cflow_torch.data.log import FlowLabels, NumberedSweeps
@@ -44,13 +44,18 @@ def find_waymo_segments(root: Place) -> List[Path]:
         root: such a file, a folder `lidar`, a split (holds `lidar`), or a folder at most three levels above `lidar`.
 
     Raises:
-        CFlowError: `root` does not exist.
+        CFlowError: `root` does not exist, or holds files of version 1.
     """
     root = as_path(root)
-    if root.is_file():
+    if root.is_file() and root.suffix != ".tfrecord":
         return [root]
     what = "<split>/lidar/<segment>.parquet, or a split"
     root = root.parent if root.name == "lidar" else root
+    if root.suffix == ".tfrecord" or next(root.glob("*.tfrecord"), None):
+        raise CFlowError(
+            f"{root}: .tfrecord is version 1 of the Waymo Open Dataset, which is not read; download the parquet files "
+            "of version 2, which has the same drives: lidar, lidar_pose, lidar_calibration, vehicle_pose, lidar_box"
+        )
     splits = find_folders(root, lambda folder: (folder / "lidar").is_dir(), SEARCH_DEPTH, what)
     return sorted(file for split in splits for file in (split / "lidar").glob("*.parquet"))
 
@@ -203,13 +208,3 @@ class WaymoLog(NumberedSweeps):
                     upright_poses([[row[name] for name in heading_centre] for row in known]),
                 )
         return boxes
-
-
-def upright_poses(heading_centre: Sequence[Sequence[float]]) -> np.ndarray:
-    """(K, 4, 4) float64 poses of boxes that turn about z only, from heading (radians) and x, y, z (metres) of each."""
-    values = np.array(heading_centre, dtype=np.float64).reshape(-1, 4)
-    pose = np.tile(np.eye(4), (len(values), 1, 1))
-    cos, sin = np.cos(values[:, 0]), np.sin(values[:, 0])
-    pose[:, 0, 0], pose[:, 0, 1], pose[:, 1, 0], pose[:, 1, 1] = cos, -sin, sin, cos
-    pose[:, :3, 3] = values[:, 1:]
-    return pose

@@ -1,0 +1,73 @@
+"""Messages of type sensor_msgs/PointCloud2 as arrays: any layout of fields, padding, byte order, several rows."""
+
+from __future__ import annotations
+
+from typing import Any, Optional, Tuple
+
+import numpy as np
+
+_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # PointField.datatype
+_TIME_FIELDS = ("t", "time", "timestamp", "offset_time", "time_stamp")
+_UNITS = (1.0, 1e-3, 1e-6, 1e-9)  # seconds
+_SHORTEST, _LONGEST = 0.005, 5.0  # seconds of a sweep: a thousandfold, so that only one unit fits
+
+
+def points_and_times(message: Any, stamp_ns: int) -> Tuple[np.ndarray, Optional[np.ndarray]]:
+    """Points of a cloud, without those that are not finite or at the origin, which mean "no return".
+
+    Args:
+        message: PointCloud2 as rosbags reads it.
+        stamp_ns: time of the sweep.
+
+    Returns:
+        (N, 3) float64 metres in the frame of the message; (N,) float64 seconds after the stamp, see `seconds_after`,
+        None = not known.
+
+    Raises:
+        ValueError: no fields x, y, z, an unknown type, or fewer data than the message says.
+    """
+    fields = {field.name: field for field in message.fields}
+    names = [*"xyz", *[name for name in _TIME_FIELDS if name in fields][:1]]
+    missing = [name for name in names if name not in fields]
+    if missing:
+        raise ValueError(f"the cloud lacks the fields {missing}; it has {list(fields)}")
+    order = ">" if message.is_bigendian else "<"
+    kinds = [order + _TYPES[fields[name].datatype] for name in names]
+    offsets, step = [fields[name].offset for name in names], message.point_step
+    kind = np.dtype({"names": names, "formats": kinds, "offsets": offsets, "itemsize": step})
+    row_step = message.row_step or message.width * step
+    rows = np.frombuffer(message.data, np.uint8, message.height * row_step).reshape(message.height, row_step)
+    table = np.ascontiguousarray(rows[:, : message.width * step]).view(kind).reshape(-1)
+    points = np.stack([table[axis] for axis in "xyz"], axis=1).astype(np.float64)
+    kept = np.isfinite(points).all(axis=1) & (points != 0).any(axis=1)
+    times = seconds_after(table[names[3]][kept], stamp_ns) if len(names) > 3 else None
+    return points[kept], times
+
+
+def seconds_after(values: np.ndarray, stamp_ns: int) -> Optional[np.ndarray]:
+    """Times of points as seconds after the stamp of their sweep.
+
+    Args:
+        values: (N,) as stored, of any unit.
+        stamp_ns: time of the sweep.
+
+    Returns:
+        (N,) float64; None if they are all the same, or span what no sweep lasts in any unit.
+
+    Convention: the unit, from seconds to nanoseconds, is that in which they span 5 ms to 5 s. Values of at most 5 s
+    count from the stamp, larger ones from 1970; if that is more than 5 s off the stamp, they are of a clock of their
+    own, of which the first shot is taken for the stamp.
+    """
+    if not len(values):
+        return None
+    first = values.min()
+    span = float(values.max() - first)
+    unit = next((unit for unit in _UNITS if _SHORTEST <= span * unit < _LONGEST), None)
+    if unit is None:
+        return None
+    start = float(first) * unit
+    if abs(start) > _LONGEST:
+        start = (int(first) * round(unit * 1e9) if first.dtype.kind in "iu" else round(start * 1e9)) - stamp_ns
+        start = start * 1e-9 if abs(start) <= _LONGEST * 1e9 else 0.0
+    since: np.ndarray = (values - first).astype(np.float64) * unit + start
+    return since

@@ -1,0 +1,239 @@
+"""Reader of ROS 1, ROS 2 and MCAP bags, by rosbags (extra `bags`): clouds of one topic, poses of another or of TF."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any, Dict, List, Optional, Tuple
+
+import numpy as np
+
+from cflow_torch.data.arrays.poses_text import Trajectory
+from cflow_torch.data.arrays.poses_text import poses_at as covered_poses
+from cflow_torch.data.bags.frames import Frames, Sample, sample, sorted_poses
+from cflow_torch.data.bags.point_cloud2 import points_and_times
+from cflow_torch.data.file_errors import file_errors, shortened
+from cflow_torch.data.folders import find_folders
+from cflow_torch.data.log import FlowLabels, NumberedSweeps
+from cflow_torch.data.paths import Place, as_path, is_remote, whole
+from cflow_torch.data.rigid_motion import moved, poses_at
+from cflow_torch.types import CFlowError, Sweep
+from cflow_torch.windows.ego_motion import rigid_transform
+
+SUFFIXES = (".bag", ".mcap", ".db3")
+SEARCH_DEPTH = 3
+_CLOUD = "sensor_msgs/msg/PointCloud2"
+_POSES = tuple(f"{name}Stamped" for name in ("geometry_msgs/msg/Pose", "geometry_msgs/msg/PoseWithCovariance"))
+_POSE_TYPES = ("nav_msgs/msg/Odometry", *_POSES)
+_TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+_BASE = "base_link"  # the vehicle, by ROS's REP 105: x ahead, y left, z up
+_SLICE = 1e-4  # seconds for which one pose of the vehicle is good enough: 3 mm at 30 m/s
+
+
+def find_bags(root: Place) -> List[Path]:
+    """All bags under a folder, sorted: files `.bag` (ROS 1), `.mcap`, `.db3`, and folders with a metadata.yaml (ROS 2).
+
+    Args:
+        root: a bag, or a folder at most three levels above them.
+
+    Raises:
+        CFlowError: `root` does not exist.
+    """
+    root = as_path(root)
+    if root.is_file():
+        return [root]
+    folders = find_folders(root, lambda folder: bool(_bags_in(folder)), SEARCH_DEPTH, "a bag, or a folder of bags")
+    return sorted(bag for folder in folders for bag in _bags_in(folder))
+
+
+class BagLog(NumberedSweeps):
+    """One bag; implements the `Log` protocol.
+
+    Args:
+        path: a file, or the folder of a ROS 2 bag, on this machine.
+        topic: of the clouds (sensor_msgs/PointCloud2); None = the only such topic.
+        poses: "tf" = from the transforms; a topic of nav_msgs/Odometry, geometry_msgs/PoseStamped or
+            PoseWithCovarianceStamped; None = no poses; "auto" = the first of these that there is: transforms in which
+            the ego frame moves, the only topic of such a type, none.
+        frame: name of the ego frame; None = base_link where transforms join it to the LiDAR, else the LiDAR's own.
+        ego_T_lidar: (4, 4), coordinates of the clouds to the ego frame; None = what the transforms say.
+        deskew: move each point with the pose that the vehicle had when it was measured, where poses and times of points
+            are known; False: the clouds are compensated already.
+
+    Attributes:
+        log_id: name of the file or folder, without its suffix.
+        poses: (K, 4, 4) float64 `T_world_ego` of every sweep; None = unknown.
+        timestamps: nanoseconds, of the clouds' headers (where they are 0: of their arrival). Clouds before the first
+            or after the last pose are left out.
+        topic, frame: those in use.
+
+    Convention: points are float32 in the ego frame; poses are float64 `T_world_ego`, the world being the root of the
+        transforms, or that of the topic, interpolated at the time of the cloud. A topic's poses are those of its
+        `child_frame_id`, if transforms join it to the ego frame, else of the ego frame itself. `is_ground` is None.
+        Times of points: see `point_cloud2.seconds_after`.
+
+    Cost: opening reads all clouds, poses and transforms of the bag once.
+
+    Raises:
+        CFlowError: rosbags is missing; no bag; no such topic, or several and none chosen; fewer than two sweeps;
+            frames that nothing joins.
+    """
+
+    def __init__(
+        self,
+        path: Place,
+        topic: Optional[str] = None,
+        poses: Optional[str] = "auto",
+        frame: Optional[str] = None,
+        ego_T_lidar: Any = None,
+        deskew: bool = True,
+    ) -> None:
+        self.path = as_path(path)
+        if is_remote(self.path):
+            raise CFlowError(f"{self.path}: bags are read from this machine only; copy it here")
+        self.log_id = self.path.resolve().stem if self.path.is_file() else self.path.resolve().name
+        self._deskew = deskew
+        self.poses: Optional[np.ndarray] = None
+        self._opened: Tuple[int, Any] = (0, None)
+        self._mount = None if ego_T_lidar is None else rigid_transform(ego_T_lidar, "ego_T_lidar")
+        with file_errors(f"{self.path}", "is it a whole bag of ROS 1 (.bag), ROS 2 (folder) or MCAP?"):
+            topics = {connection.topic: connection.msgtype for connection in self._reader().connections}
+            self.topic = self._chosen(topics, (_CLOUD,), topic, "topic")
+            self._arrival, tracks = self._scan()
+            self.frame = frame or (_BASE if self._frames.are_joined(_BASE, self._lidar) else self._lidar)
+            if poses == "auto":
+                has_tf = len(self._frames.moves(self.frame)) > 1
+                poses = "tf" if has_tf else self._chosen(topics, _POSE_TYPES, None, "poses") if tracks else None
+            elif poses not in (None, "tf"):
+                poses = self._chosen(topics, _POSE_TYPES, poses, "poses")
+            self.timestamps = sorted(self._arrival)
+            if poses is not None:
+                self._known_times, self._known_poses = self._trajectory(poses, tracks)
+                first, last = self._known_times[[0, -1]]
+                self.timestamps = [time for time in self.timestamps if first <= time <= last]
+            self._check_count(f"{self.path}: {self.topic}, while there are poses,")
+            if poses is not None:
+                known = Trajectory(self._known_poses, self._known_times, "bag")
+                self.poses = covered_poses(known, self.timestamps, poses)
+            if self._mount is None:
+                self._frames.between(self.frame, self._lidar, np.array(self.timestamps[:1]))
+
+    def sweep(self, index: int) -> Sweep:
+        """Sweep number `index`, without ground mask."""
+        time = self._timestamp(index)
+        with file_errors(f"{self.path}, {self.topic} at {time} ns"):
+            points, times = points_and_times(self._cloud(time), time)
+            mount = self._mount
+            if mount is None:
+                mount = self._frames.between(self.frame, self._lidar, np.array([time]))[0]
+            points = moved(points, mount)
+        if self.poses is None:
+            return Sweep(points.astype(np.float32), None, None, time, times)
+        if times is not None and self._deskew:
+            shots, group = np.unique(np.round(times / _SLICE).astype(np.int64), return_inverse=True)
+            at = poses_at(time + shots * round(_SLICE * 1e9), self._known_times, self._known_poses)
+            T = (np.linalg.inv(self.poses[index]) @ at)[group]
+            points = np.einsum("nij,nj->ni", T[:, :3, :3], points) + T[:, :3, 3]
+        return Sweep(points.astype(np.float32), None, self.poses[index].copy(), time, times)
+
+    def labels(self, index: int) -> Optional[FlowLabels]:
+        """None: bags have no truth."""
+        self._timestamp(index)
+        return None
+
+    def _reader(self) -> Any:
+        """The open bag, of this process: one that is forked or unpickled opens it anew."""
+        if self._opened[0] != os.getpid():
+            try:
+                from rosbags.highlevel import AnyReader
+                from rosbags.typesys import Stores, get_typestore
+            except ImportError:
+                raise CFlowError("bags need rosbags: pip install 'cflow_torch[bags]'") from None
+            for file in [self.path] if self.path.is_file() else self.path.iterdir():
+                whole(file)
+            # Bags of ROS 2 before Iron do not say how their messages are built; these types never changed.
+            reader = AnyReader([self.path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+            reader.open()
+            self._opened = (os.getpid(), reader)
+        return self._opened[1]
+
+    def __getstate__(self) -> Dict[str, Any]:
+        return {**self.__dict__, "_opened": (0, None)}
+
+    def _chosen(self, topics: Dict[str, str], types: Tuple[str, ...], name: Optional[str], setting: str) -> str:
+        """The topic of one of these types that is named, or the only one."""
+        found = sorted(topic for topic, kind in topics.items() if kind in types and name in (None, topic))
+        if len(found) != 1:
+            there = shortened(", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items())))
+            what = f"{setting}={name}" if name else f"{len(found)} topics"
+            raise CFlowError(f"{what} of type {' or '.join(types)}: choose one with {setting}=...; the bag has {there}")
+        return found[0]
+
+    def _scan(self) -> Tuple[Dict[int, int], Dict[str, List[Sample]]]:
+        """Time of each cloud -> of its arrival; samples of poses by topic. The frames are filled."""
+        self._lidar = ""
+        self._child: Dict[str, str] = {}
+        arrival: Dict[int, int] = {}
+        parents: Dict[str, str] = {}
+        links: Dict[str, List[Sample]] = {}
+        tracks: Dict[str, List[Sample]] = {}
+        reader = self._reader()
+        wanted = [c for c in reader.connections if c.topic == self.topic or c.msgtype in (*_POSE_TYPES, *_TF_TYPES)]
+        for connection, arrived, data in reader.messages(wanted):
+            message = reader.deserialize(data, connection.msgtype)
+            if connection.topic == self.topic:
+                arrival.setdefault(_stamp(message, arrived), arrived)
+                self._lidar = self._lidar or _name(message.header.frame_id)
+            elif connection.msgtype in _TF_TYPES:
+                for link in message.transforms:
+                    child, T = _name(link.child_frame_id), link.transform
+                    parents[child] = _name(link.header.frame_id)
+                    links.setdefault(child, []).append(sample(_stamp(link, arrived), T.translation, T.rotation))
+            else:
+                pose = getattr(message.pose, "pose", message.pose)
+                at = sample(_stamp(message, arrived), pose.position, pose.orientation)
+                tracks.setdefault(connection.topic, []).append(at)
+                self._child[connection.topic] = _name(getattr(message, "child_frame_id", ""))
+        self._frames = Frames(parents, links)
+        return arrival, tracks
+
+    def _trajectory(self, poses: str, tracks: Dict[str, List[Sample]]) -> Tuple[np.ndarray, np.ndarray]:
+        """(M,) int64 times that transforms or messages tell, and (M, 4, 4) `T_world_ego` at them."""
+        if poses == "tf":
+            times = self._frames.moves(self.frame)
+            matrices = self._frames.in_root(self.frame, times)
+        else:
+            times, matrices = sorted_poses(tracks.get(poses, []), poses)
+            child = self._child.get(poses, "")
+            if child and self._frames.are_joined(child, self.frame):
+                matrices = matrices @ self._frames.between(child, self.frame, times)
+        if len(times) < 2:
+            raise CFlowError(f"poses={poses}: fewer than two poses of {self.frame}; give another, or poses=null")
+        return times, matrices
+
+    def _cloud(self, time: int) -> Any:
+        """The message of a sweep."""
+        reader, arrived = self._reader(), self._arrival[time]
+        clouds = [connection for connection in reader.connections if connection.topic == self.topic]
+        for connection, _, data in reader.messages(clouds, start=arrived, stop=arrived + 1):
+            message = reader.deserialize(data, connection.msgtype)
+            if _stamp(message, arrived) == time:
+                return message
+        raise CFlowError("the cloud is not there any more; was the bag changed?")
+
+
+def _stamp(message: Any, arrived: int) -> int:
+    """Nanoseconds of a header; where it is 0, when the message came."""
+    stamp = message.header.stamp
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec) or arrived
+
+
+def _name(frame: str) -> str:
+    """Without the slash in front that ROS 1 allows."""
+    return frame.lstrip("/")
+
+
+def _bags_in(folder: Path) -> List[Path]:
+    if (folder / "metadata.yaml").is_file():
+        return [folder]
+    return [file for file in folder.iterdir() if file.suffix in SUFFIXES and file.is_file()]

@@ -1,0 +1,90 @@
+"""What KISS-ICP's own loaders read, as logs (extra `odometry`): HeLiPR, MulRan, NCLT, Boreas and others."""
+
+from __future__ import annotations
+
+import io
+from contextlib import contextmanager, redirect_stdout
+from pathlib import Path
+from typing import Any, Iterator, List, Optional
+
+import numpy as np
+
+from cflow_torch.data.file_errors import shortened
+from cflow_torch.data.log import FlowLabels, NumberedSweeps
+from cflow_torch.data.paths import Place, as_path
+from cflow_torch.types import CFlowError, Sweep
+from cflow_torch.windows.ego_motion import rigid_transform
+
+_OTHERS = {"rosbag": "bags", "mcap": "bags"}  # loaders that go forward only: our reader
+
+
+def find_kiss_icp(root: Place) -> List[Path]:
+    """The place itself: what lies there, only the loader knows."""
+    return [as_path(root)]
+
+
+class KissICPLog(NumberedSweeps):
+    """One sequence; implements the `Log` protocol.
+
+    Args:
+        root: file or folder that the loader takes.
+        loader: its name: kitti, kitti_raw, helipr, mulran, ncd, nclt, boreas, apollo, ouster, generic, ...
+        sequence: of the data set, for loaders that want one: "00".
+
+    Attributes:
+        log_id: name of the file or folder, and the sequence.
+        timestamps: 0, 1, 2, ...: the loaders tell no times that all of them share; 0.1 s between sweeps is assumed.
+
+    Convention: points and poses are as the loader gives them, in the frame of the LiDAR; poses are the data set's own
+    (`gt_poses`), None where it has none. `is_ground` and times of points are None.
+
+    Raises:
+        CFlowError: KISS-ICP is missing, or what its loader needs; no such loader; nothing that it can read.
+    """
+
+    def __init__(self, root: Place, loader: str, sequence: Optional[str] = None) -> None:
+        self.root = as_path(root)
+        try:
+            from kiss_icp.datasets import available_dataloaders, dataset_factory
+        except ImportError:
+            raise CFlowError("KISS-ICP's loaders need it: pip install 'cflow_torch[odometry]'") from None
+        names = sorted(set(available_dataloaders()) - set(_OTHERS))
+        if loader not in names:
+            other = f", or take data={_OTHERS[loader]}" if loader in _OTHERS else ""
+            raise CFlowError(f"loader={loader}: give one of {', '.join(names)}{other}")
+        self.log_id = "-".join([self.root.resolve().name, *([str(sequence)] if sequence is not None else [])])
+        self._what = f"{self.root}, KISS-ICP's loader {loader}"
+        with _loader_errors(self._what):
+            given = {} if sequence is None else {"sequence": str(sequence)}
+            self._dataset = dataset_factory(loader, self.root, **given)
+            self.timestamps = range(len(self._dataset))
+            poses = getattr(self._dataset, "gt_poses", None)
+        self._check_count(self._what)
+        self._poses = None if poses is None else np.asarray(poses, np.float64)
+        if self._poses is not None and len(self._poses) != len(self):
+            raise CFlowError(f"{self._what}: {len(self._poses)} poses for {len(self)} sweeps; copy the data set again")
+
+    def sweep(self, index: int) -> Sweep:
+        """Sweep number `index`: points, and the pose where the data set has it."""
+        self._timestamp(index)
+        with _loader_errors(f"{self._what}, sweep {index}"):
+            found = self._dataset[index]
+            points = np.asarray(found[0] if isinstance(found, tuple) else found, np.float32)[:, :3]
+        pose = None if self._poses is None else rigid_transform(self._poses[index], f"{self._what}: pose {index}")
+        return Sweep(points, None, pose)
+
+    def labels(self, index: int) -> Optional[FlowLabels]:
+        """None: these data sets have no truth of motion."""
+        self._timestamp(index)
+        return None
+
+
+@contextmanager
+def _loader_errors(what: str) -> Iterator[None]:
+    """The loaders print what they miss, and leave the program."""
+    said: Any = io.StringIO()
+    try:
+        with redirect_stdout(said):
+            yield
+    except (Exception, SystemExit) as error:
+        raise CFlowError(f"{what} fails: {shortened(said.getvalue())} {type(error).__name__}: {error}") from error

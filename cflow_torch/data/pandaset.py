@@ -1,0 +1,155 @@
+"""Reader of PandaSet: data frames that pandas pickled, read without pandas; nothing that a pickle names is run."""
+
+from __future__ import annotations
+
+import gzip
+import io
+from pathlib import Path
+from typing import Dict, List, Optional, Sequence, Tuple
+
+import numpy as np
+
+from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes, make_boxes, upright_poses
+from cflow_torch.data.file_errors import file_errors
+from cflow_torch.data.folders import find_folders
+from cflow_torch.data.json_file import read_json
+from cflow_torch.data.log import FlowLabels, NumberedSweeps
+from cflow_torch.data.paths import Place, as_path, read_bytes, remote_errors
+from cflow_torch.data.pickles import load_columns
+from cflow_torch.data.rigid_motion import moved, poses_of_nodes
+from cflow_torch.types import CFlowError, Sweep
+
+SEARCH_DEPTH = 2  # <root>/<data set>/<sequence>
+_LIDARS = (0, 1)  # Pandar64, which turns, and PandarGT, which looks ahead
+_EVERY_LIDAR = -1  # of a cuboid; an object that both LiDARs see apart has a cuboid for each
+_POSITION, _SIZE = (
+    tuple(f"{what}.{axis}" for axis in axes) for what, axes in (("position", "xyz"), ("dimensions", "yxz"))
+)
+
+_LABELS = {
+    "ANIMAL": ("Animals - Bird", "Animals - Other"),
+    "BICYCLE": ("Bicycle",),
+    "BUS": ("Bus", "Trolley"),
+    "CONSTRUCTION_CONE": ("Cones", "Pylons"),
+    "LARGE_VEHICLE": ("Emergency Vehicle", "Other Vehicle - Construction Vehicle", "Other Vehicle - Uncommon"),
+    "MOTORCYCLE": ("Motorcycle",),
+    "NONE": ("Road Barriers", "Rolling Containers", "Temporary Construction Barriers"),
+    "PEDESTRIAN": ("Pedestrian", "Pedestrian with Object"),
+    "RAILED_VEHICLE": ("Train", "Tram / Subway"),
+    "REGULAR_VEHICLE": ("Car", "Pickup Truck"),
+    "SIGN": ("Construction Signs", "Signs"),
+    "TRUCK": ("Medium-sized Truck", "Semi-truck"),
+    "VEHICULAR_TRAILER": ("Towed Object",),
+    "WHEELED_DEVICE": ("Motorized Scooter", "Other Vehicle - Pedicab", "Personal Mobility Device"),
+}
+CATEGORY_NAME: Dict[str, str] = {label: name for name, labels in _LABELS.items() for label in labels}
+"""Label of a cuboid -> Argoverse 2 name. The data set publishes no such map: this one is cflow_torch's."""
+
+
+def find_pandaset_sequences(root: Place) -> List[Path]:
+    """Folders of all sequences under a folder, sorted.
+
+    Args:
+        root: a sequence (holds `lidar/poses.json`), or a folder at most two levels above the sequences.
+
+    Raises:
+        CFlowError: `root` is no folder.
+    """
+    what = "a sequence (it holds lidar/poses.json), or a folder of sequences"
+    return find_folders(as_path(root), lambda folder: (folder / "lidar" / "poses.json").is_file(), SEARCH_DEPTH, what)
+
+
+class PandaSetLog(NumberedSweeps):
+    """One sequence; implements the `Log` protocol.
+
+    Args:
+        folder: sequence folder with `lidar/00.pkl.gz` ..., `lidar/poses.json` and `lidar/timestamps.json`.
+
+    Attributes:
+        log_id: name of the folder.
+        timestamps: sweep times in nanoseconds, ascending.
+
+    Convention:
+        - Points are stored in the world, compensated for ego motion. Here they are float32 in the frame of the LiDAR's
+          pose at the sweep's time (x to the right, y ahead, z up), those of both LiDARs in the order of the file.
+        - The data set has no ground masks: `is_ground` is None.
+        - Truth comes from the tracked cuboids of `annotations/cuboids`; each LiDAR's points from the cuboids that are
+          meant for it.
+
+    Raises:
+        CFlowError: a file is missing or cannot be read; fewer than two sweeps; another number of poses or times.
+    """
+
+    def __init__(self, folder: Place) -> None:
+        self.folder = as_path(folder)
+        self.log_id = self.folder.resolve().name
+        lidar = self.folder / "lidar"
+        self._files = sorted(lidar.glob("*.pkl.gz"))
+        with file_errors(lidar / "timestamps.json"):
+            self.timestamps = [round(float(seconds) * 1e9) for seconds in read_json(lidar / "timestamps.json")]
+        with file_errors(lidar / "poses.json"):
+            stored = read_json(lidar / "poses.json")
+            self._poses = poses_of_nodes(stored, "position", "heading", f"{lidar / 'poses.json'}: pose")
+        self._check_count(self.folder)
+        if not len(self._files) == len(self._poses) == len(self.timestamps):
+            counts = f"{len(self._files)} sweeps, {len(self._poses)} poses and {len(self.timestamps)} time stamps"
+            raise CFlowError(f"{lidar} holds {counts}; copy it again")
+
+    def sweep(self, index: int) -> Sweep:
+        """Sweep number `index`, without ground mask."""
+        time = self._timestamp(index)
+        points, shots, _ = self._cloud(index)
+        return Sweep(points, None, self._poses[index].copy(), time, shots - time * 1e-9)
+
+    def labels(self, index: int) -> Optional[FlowLabels]:
+        """Truth of the pair (index, index + 1); None for the last sweep, and where either has no cuboids."""
+        self._timestamp(index)
+        if index == len(self) - 1:
+            return None
+        files = [self.folder / "annotations" / "cuboids" / self._files[k].name for k in (index, index + 1)]
+        with remote_errors(self.folder):
+            if not all(file.exists() for file in files):
+                return None
+        points, _, lidars = self._cloud(index)
+        cuboids = [_columns(file, ("uuid", "label", "yaw", "cuboids.sensor_id", *_POSITION, *_SIZE)) for file in files]
+        T_ego1_ego0 = np.linalg.inv(self._poses[index + 1]) @ self._poses[index]
+        flow = np.zeros((len(points), 3), np.float32)
+        category, is_valid = np.zeros(len(points), np.uint8), np.zeros(len(points), bool)
+        for lidar in _LIDARS:
+            rows = np.flatnonzero(lidars == lidar)
+            boxes0, boxes1 = (self._boxes(cuboids[k], files[k], index + k, lidar) for k in (0, 1))
+            part = flow_from_boxes(points[rows], boxes0, boxes1, T_ego1_ego0)
+            flow[rows], category[rows], is_valid[rows] = part.flow, part.category, part.is_valid
+        return FlowLabels(flow, category, is_valid)
+
+    def _cloud(self, index: int) -> Tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(N, 3) float32 points in the frame of the pose, (N,) float64 unix times in seconds, (N,) which LiDAR."""
+        names = ("x", "y", "z", "t", "d")
+        columns = _columns(self._files[index], names)
+        with file_errors(self._files[index]):
+            table = np.stack([columns[name] for name in names]).astype(np.float64)
+        points = moved(table[:3].T, np.linalg.inv(self._poses[index]))
+        return points.astype(np.float32), table[3], table[4]
+
+    def _boxes(self, cuboids: Dict[str, np.ndarray], file: Path, index: int, lidar: int) -> Boxes:
+        """Cuboids for the points of a LiDAR, in the frame of sweep `index`. Yaw 0 is the world's y axis."""
+        with file_errors(file):
+            rows = np.flatnonzero(np.isin(cuboids["cuboids.sensor_id"], (_EVERY_LIDAR, lidar)))
+            heading_centre = np.stack([cuboids[name][rows] for name in ("yaw", *_POSITION)], axis=1)
+            world = upright_poses(heading_centre + (np.pi / 2, 0, 0, 0))
+            return make_boxes(
+                cuboids["uuid"][rows].tolist(),
+                category_indices(cuboids["label"][rows].tolist(), CATEGORY_NAME),
+                np.stack([cuboids[name][rows] for name in _SIZE], axis=1),
+                np.linalg.inv(self._poses[index]) @ world,
+            )
+
+
+def _columns(file: Path, names: Sequence[str]) -> Dict[str, np.ndarray]:
+    """Columns of a pickled data frame."""
+    with file_errors(file):
+        columns = load_columns(io.BytesIO(gzip.decompress(read_bytes(file))))
+        missing = [name for name in names if name not in columns]
+        if missing:
+            raise CFlowError(f"it lacks the columns {missing}; it has {list(columns)}")
+        return {name: columns[name] for name in names}

@@ -1,0 +1,126 @@
+"""PandaSet: a recording written as the data set has it, by pandas, comes back; pickles are never run."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import io
+import json
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tiny_recording import CAR_SIZE, NUM_ON_CAR, NUM_STATIC, TinyRecording
+
+from cflow_torch import CFlowError
+from cflow_torch.data.catalog import find_sources, open_log
+from cflow_torch.data.pandaset import PandaSetLog
+from cflow_torch.data.pickles import load_columns
+
+# Two points (x, y, d, label) by pandas 1.0.5 in protocol 4: the layout of its time, which the released files are of.
+OLD_FRAME = (
+    "H4sIAAAAAAAC/5VTUWsTQRDO5u5qrBZbsGhfij6o0YfDgg8KYktTBD08oe/l2Eu22eDdJezu2QQN6EOqhXnr+A/9Af4Dnd27QKJRcB9u5mbn"
+    "m29mduaT/+2713AHtka86HEddodKhKeK5wLh6hE3/KXTL/HhZ5xiG4KkR0aE3UX/QWGEKnimw5wXvC+URrh+mA27795U/xW+fUIBbi8De2Is"
+    "dJhyTXzrSSHOklfWRgB5DYK5bpn9ini7KPPRpILnZWYGXCk+Ib5Eie6w0EaVXUMQCJwjwhWicy6XGDVm2GEpfsFjbEcs8mcotyHomcnIlgjN"
+    "t0/x4mt16wH7iHEcv/5Jx32ifYPpha2BjREYhWY9osl4KjIUdAd+YXsVl+cUQW7AzqpSFS/6ttZjKxfqk49iCLThylCa4GszHGHUtIoghbmY"
+    "gsjlTXnL1iF35lU0o+Y5yl1oni5l//y37Bs2+86d6r1/7FeydVDJRi03D5Dc/uRgc47BAod8sYphs47YYLX8V8S7rp9ehysE77DUro+uzA15"
+    "w3Zla0W9sxon78n71p9aV7f8rxhWY+QD/p+A9iJATBHWHod7T8K9aiY5PSnKdVhL7bRrpKysfe09z0p78wxaeV8ldEkr0UrLAQ1sQWqgs0FX"
+    "uJGk92OWtbSZnMkjOZYfyOYtWWNn9SK/topSu4FLaHRpUe1qzJc2yYXhbldOiIcbQ9s4xTINfwFmhAxy7wMAAA=="
+)
+
+
+@pytest.fixture
+def sequence(tmp_path: Path) -> Path:
+    """Three sweeps of two LiDARs. The car has a cuboid for each of them, the parked one a cuboid for both."""
+    pandas = pytest.importorskip("pandas", reason="writes the files")
+    recording, folder = TinyRecording(num_sweeps=3), tmp_path / "pandaset" / "042"
+    (folder / "lidar").mkdir(parents=True)
+    (folder / "annotations" / "cuboids").mkdir(parents=True)
+    count = NUM_STATIC + NUM_ON_CAR
+    poses = []
+    for index, stamp in enumerate(recording.timestamps):
+        x, y, z = recording.world(index).T
+        shots = [unit.offset_ns for unit in recording.units(index)]
+        columns = {"x": x, "y": y, "z": z, "i": 0 * x, "t": (stamp + np.concatenate(shots)) * 1e-9}
+        frame = pandas.DataFrame({**columns, "d": np.repeat([0, 1], count)})
+        frame.to_pickle(folder / "lidar" / f"{index:02d}.pkl.gz")
+        half = recording.pose_at(stamp)[:3, :3]
+        w, qz = np.sqrt((1 + half[0, 0]) / 2), np.sign(half[1, 0]) * np.sqrt((1 - half[0, 0]) / 2)
+        position = dict(zip("xyz", recording.poses[index][:3, 3]))
+        poses.append({"position": position, "heading": {"w": w, "x": 0.0, "y": 0.0, "z": qz}})
+        rows = []
+        for track, sensor, pose, label in (
+            ("a", 0, recording.car_at(stamp), "Car"),
+            ("b", 1, recording.car_at(stamp), "Car"),
+            ("c", -1, recording.parked(), "Semi-truck"),
+        ):
+            yaw = np.arctan2(pose[1, 0], pose[0, 0]) - np.pi / 2
+            length, width, height = CAR_SIZE
+            rows.append([track, label, yaw, *pose[:3, 3], width, length, height, False, None, sensor])
+        names = ["uuid", "label", "yaw", *(f"position.{a}" for a in "xyz"), *(f"dimensions.{a}" for a in "xyz")]
+        names += ["stationary", "attributes.rider_status", "cuboids.sensor_id"]
+        pandas.DataFrame(rows, columns=names).to_pickle(folder / "annotations" / "cuboids" / f"{index:02d}.pkl.gz")
+    (folder / "lidar" / "poses.json").write_text(json.dumps(poses))
+    (folder / "lidar" / "timestamps.json").write_text(json.dumps([t * 1e-9 for t in recording.timestamps]))
+    return folder
+
+
+def test_a_recording_comes_back(sequence: Path) -> None:
+    recording = TinyRecording(num_sweeps=3)
+    assert find_sources("pandaset", sequence.parents[1]) == [sequence] == find_sources("pandaset", sequence)
+    log = open_log("pandaset", sequence, check=False)
+    assert log.log_id == "042" and np.allclose(log.timestamps, recording.timestamps, rtol=0, atol=300)
+    sweep = log.sweep(1)
+    assert np.allclose(sweep.pose, recording.poses[1], atol=1e-9) and sweep.points.dtype == np.float32
+    world = sweep.points @ sweep.pose[:3, :3].T + sweep.pose[:3, 3]
+    assert np.allclose(world, recording.world(1), atol=1e-4)
+    offsets = np.concatenate([unit.offset_ns for unit in recording.units(1)]) * 1e-9
+    assert np.allclose(sweep.point_times, offsets, atol=1e-6)
+
+
+def test_cuboids_become_flow(sequence: Path) -> None:
+    recording, log = TinyRecording(num_sweeps=3), PandaSetLog(sequence)
+    labels, points = log.labels(1), log.sweep(1).points
+    assert labels is not None and labels.is_valid.all() and log.labels(2) is None
+    stamps, poses = recording.timestamps, recording.poses
+    moved = recording.car_at(stamps[2]) @ np.linalg.inv(recording.car_at(stamps[1]))
+    # Shots of up to 99 ms later miss the front of the cuboid: those inside are judged.
+    local = np.c_[recording.world(1), np.ones(len(points))] @ np.linalg.inv(recording.car_at(stamps[1])).T
+    inside = (np.abs(local[:, :3]) <= CAR_SIZE / 2 + [0.1, 0.1, 0]).all(1)
+    assert inside[:40].any() and inside[40:].any(), "both LiDARs see the car"
+    for rows, motion, category in ((inside, moved, 19), (~inside, np.eye(4), 0)):
+        T = np.linalg.inv(poses[2]) @ motion @ poses[1]
+        expected = points @ T[:3, :3].T + T[:3, 3] - points
+        assert np.allclose(labels.flow[rows], expected[rows], atol=1e-4)
+        assert (labels.category[rows] == category).all()
+
+
+def test_frames_of_old_pandas() -> None:
+    columns = load_columns(io.BytesIO(gzip.decompress(base64.b64decode(OLD_FRAME))))
+    assert {name: values.tolist() for name, values in columns.items()} == {
+        "x": [1.0, 3.0],
+        "y": [2.0, 4.0],
+        "d": [0, 1],
+        "label": ["Car", "Bus"],
+    }
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (pickle.dumps(["no frame"]), "cannot read"),
+        (pickle.dumps(Path("a")), "never run"),
+        (b"", "cannot read"),
+    ],
+)
+def test_other_pickles_are_refused(content: bytes, message: str, sequence: Path) -> None:
+    for file in ("lidar/01.pkl.gz", "annotations/cuboids/01.pkl.gz"):
+        whole = (sequence / file).read_bytes()
+        (sequence / file).write_bytes(gzip.compress(content))
+        log: Any = PandaSetLog(sequence)
+        with pytest.raises(CFlowError, match=message) as error:
+            log.sweep(1), log.labels(0)
+        assert str(sequence / file) in str(error.value)
+        (sequence / file).write_bytes(whole)

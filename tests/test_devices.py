@@ -1,0 +1,64 @@
+"""Any device: the CPU's bits, no tensors of two devices, few launches and few waits. On a pretend accelerator."""
+
+from __future__ import annotations
+
+from typing import Callable, Dict, Tuple
+
+import pretend_device
+import pytest
+import torch
+from preset_windows import small, windows_for
+from pretend_device import PretendDevice
+from scenes import assert_same_bits
+
+from cflow_torch import Config, make_model
+
+pytestmark = pytest.mark.skipif(not pretend_device.IS_THERE, reason="torch before 2.9 has no backends in Python")
+
+SCALES = (0.8, 0.4, 0.3, 0.2, 0.1)
+# Launches and waits of one window, launches of sixteen: what was counted, and 15 % more.
+BOUNDS: Dict[str, Tuple[Config, int, int, int]] = {
+    "paper": (small("paper", num_history=0), 630, 33, 1665),
+    "paper, h = 4, 5 scales": (small("paper", num_history=4, pixel_sizes=SCALES), 3754, 143, 6721),
+    "keypoints": (small("keypoints"), 918, 36, 1954),
+    "fast": (small("fast"), 2104, 88, 5433),
+    "default": (small("default"), 10454, 357, 13783),
+    "offline": (small("offline"), 21656, 737, 26918),
+}
+
+
+@pytest.mark.parametrize("name", [*list(BOUNDS)[:-1], pytest.param("offline", marks=pytest.mark.slow)])
+def test_bits_of_the_cpu_and_few_operations(name: str) -> None:
+    config, *bounds = BOUNDS[name]
+    windows = windows_for(config, 4)
+    with PretendDevice() as device:
+        model = make_model(config, pretend_device.DEVICE)
+        results = [result.to("cpu") for result in model(windows)]
+        one, sixteen = (device.count(lambda batch=batch: model(batch)) for batch in (windows[:1], windows[:1] * 16))
+    for result, expected in zip(results, make_model(config, "cpu")(windows)):
+        assert_same_bits(result, expected)
+    counted = (*one, sixteen[0])
+    assert all(number <= bound for number, bound in zip(counted, bounds)), f"counted {counted}, allowed {bounds}"
+
+
+@pytest.mark.parametrize(
+    "mix",
+    [
+        lambda there: there + torch.ones(3),
+        lambda there: torch.cat([there, torch.ones(3)]),
+        lambda there: torch.ones(3).index_select(0, there.long()),
+        lambda there: there.numpy(),
+    ],
+)
+def test_two_devices_do_not_mix(mix: Callable[[torch.Tensor], torch.Tensor]) -> None:
+    with PretendDevice(), pytest.raises((RuntimeError, TypeError)):
+        mix(torch.zeros(3, device=pretend_device.DEVICE))
+
+
+def test_what_is_counted() -> None:
+    with PretendDevice() as device:
+        there = torch.arange(4, device=pretend_device.DEVICE)
+        assert device.count(lambda: there.view(2, 2) + 1) == (1, 0)
+        assert device.count(lambda: there[there > 1])[1] == 1
+        assert device.count(lambda: there.sum().item())[1] == 1
+        assert device.count(lambda: torch.tensor([1.0], device=there.device))[1] == 1
