@@ -15,7 +15,7 @@ from cflow_torch.model import SceneFlowModel
 from cflow_torch.types import Array, CFlowError, FlowResult, Sweep, Window, as_numpy
 from cflow_torch.verified.method import VerifiedFlow
 from cflow_torch.windows.ground import find_ground_batch, has_ground
-from cflow_torch.windows.validation import check_windows, choose_device
+from cflow_torch.windows.validation import check_windows, choose_device, keep_nearest
 
 GROUND = (None, "auto", "patchwork")
 
@@ -39,6 +39,7 @@ def estimate_flow(
     dtf: Sequence[Optional[Array]] = (),
     method: Optional[str] = None,
     preset: Optional[str] = None,
+    config: Optional[Config] = None,
     ground: Optional[str] = None,
     device: Any = "auto",
     **overrides: Any,
@@ -51,7 +52,7 @@ def estimate_flow(
         T_ego1_ego0: (4, 4), maps coordinates of the ego frame at t to the one at t+1 (pose1^-1 pose0);
             None = pc0 already lies in the frame of t+1.
         gm0, gm1: ground masks, True = ground; None = nothing is ground, unless `ground` says otherwise.
-        pch: older sweeps t-1, t-2, ..., at most `num_history`.
+        pch: older sweeps t-1, t-2, ...; the nearest `num_history` of them are used.
         T_ego1_egoh: (4, 4) of each of `pch`; may be left out only if `T_ego1_ego0` is left out too.
         gmh: ground mask of each of `pch`; empty = nothing is ground.
         dt0, dt1: times of points, seconds after the instant of their sweep, see `Sweep.point_times`. The presets
@@ -62,6 +63,7 @@ def estimate_flow(
         method: "dense", "keypoints" or "verified"; None = the preset's.
         preset: "default", "fast", "offline", "keypoints" or "paper"; None = "default", or that of the method, see
             `make_config`.
+        config: settings, from `make_config`, in place of `method` and `preset`.
         ground: None = as the masks say; "auto" = find the ground of every sweep without a mask (`find_ground`);
             "patchwork" = the same by Patchwork++ (`pip install pypatchworkpp`).
         device: "auto" = that of the tensors given, else a GPU if there is one, else the CPU.
@@ -91,7 +93,12 @@ def estimate_flow(
     """
     if ground not in GROUND:
         raise CFlowError(f"ground={ground!r}: give one of {', '.join(map(repr, GROUND))}")
-    config = make_config(preset, method, **overrides)
+    if config is None:
+        config = make_config(preset, method, **overrides)
+    elif not isinstance(config, Config) or (preset, method) != (None, None):
+        raise CFlowError("config is the result of make_config, and stands in place of preset and method")
+    elif overrides:
+        config = config.replace(**overrides)
     moved = any(transform is not None for transform in (T_ego1_ego0, *T_ego1_egoh, *T_ego1_egof))
     for side, clouds, given in (("h", pch, T_ego1_egoh), ("f", pcf, T_ego1_egof)):
         if moved and len(clouds) > 0 and len(given) == 0:
@@ -111,7 +118,8 @@ def estimate_flow(
         pch=tuple(sweep(*parts) for parts in _parts("h", pch, gm=gmh, T_ego1_ego=T_ego1_egoh, dt=dth)),
         pcf=tuple(sweep(*parts) for parts in _parts("f", pcf, gm=gmf, T_ego1_ego=T_ego1_egof, dt=dtf)),
     )
-    window = _find_ground(window, ground, device)
+    check_windows([window])
+    window = _find_ground(keep_nearest(window, config.num_history), ground, device)
     (result,) = make_model(config, device)([window])
     _warn_if_nothing_takes_part(result, window, config)
     return result
@@ -135,7 +143,6 @@ def make_model(config: Config, device: Any = "auto") -> SceneFlowModel:
 
 def _find_ground(window: Window, ground: Optional[str], device: Any) -> Window:
     """The window with the masks that it lacks; the same window, and maybe a warning, if none are asked for."""
-    check_windows([window])
     chosen = choose_device([window], device)
     sweeps = [window.pc0, window.pc1, *window.pch, *window.pcf]
     bare = [index for index, sweep in enumerate(sweeps) if sweep.is_ground is None]

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # The flow of a simulated street, with a picture: outputs/demo/flow.png. Arguments go to `cflow demo`.
 set -euo pipefail
-STAMP=demo EXTRAS=viz
+STAMP=demo EXTRAS=viz,hdf5
 . "$(dirname "${BASH_SOURCE[0]}")/install.sh"
 cd "$ROOT"
 exec "$PYTHON" -m cflow_torch.cli.main demo "$@"

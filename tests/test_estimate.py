@@ -28,7 +28,8 @@ EYE = np.eye(4)
 @pytest.mark.parametrize(
     "arguments, complaint",
     [
-        ({"pch": [P1, P0], "preset": "paper"}, "2 history sweeps.*num_history=0"),
+        ({"pcf": [P1, P0], "preset": "paper"}, "2 future sweeps.*num_future=0"),
+        ({"config": make_config("paper"), "method": "dense"}, "in place of preset and method"),
         ({"pch": [P1], "gmh": [None, None]}, "gmh has 2 entries for 1"),
         ({"pch": [P1], "T_ego1_egoh": [EYE, EYE]}, "T_ego1_egoh has 2 entries for 1"),
         ({"pch": [P1], "T_ego1_ego0": EYE}, "T_ego1_ego0 is given but T_ego1_egoh is not"),

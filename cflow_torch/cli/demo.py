@@ -24,11 +24,18 @@ from cflow_torch.data.names import folder_in
 from cflow_torch.stages import StopWatch
 from cflow_torch.types import CFlowError, FlowResult, Window
 from cflow_torch.viz.bev import plot_flow, save_picture
+from cflow_torch.viz.style import blank_figure
 
 
 def task(cfg: DictConfig) -> None:
     """Run `cflow demo`."""
     output, picture = run.output_folder(cfg), "none"
+    draws = True
+    try:
+        blank_figure((1, 1), 100)
+    except CFlowError as error:  # matplotlib is an extra
+        draws = False
+        print(f"no picture ({error}); flow, scores and settings come all the same")
     scores = Scores(cfg)
     model = StopWatch(run.make_model(cfg))
     logs, failures = run.open_logs(cfg)
@@ -40,7 +47,7 @@ def task(cfg: DictConfig) -> None:
         nonlocal picture
         write_flow(folder_in(output, log.log_id, "the log") / f"{log.timestamps[index]}.feather", result)
         scores.add(log, index, sweeps, result)
-        if index == cfg.pair:
+        if draws and index == cfg.pair:
             picture = _draw(log, model, sweeps, result, output)
 
     for log in logs:
@@ -53,15 +60,12 @@ def task(cfg: DictConfig) -> None:
 
 
 def _draw(log: Log, model: StopWatch, sweeps: Window, result: FlowResult, output: Path) -> str:
-    """The file of the picture, or why there is none: matplotlib is an extra."""
-    try:
-        figure = plot_flow(
-            sweeps.pc0.points,
-            result,
-            is_ground=sweeps.pc0.is_ground,
-            point_cloud_range=model.config.point_cloud_range,
-            title=f"CorrelationFlow, {log.log_id}",
-        )
-    except CFlowError as error:
-        return f"none ({error})"
+    """The file of the picture."""
+    figure = plot_flow(
+        sweeps.pc0.points,
+        result,
+        is_ground=sweeps.pc0.is_ground,
+        point_cloud_range=model.config.point_cloud_range,
+        title=f"CorrelationFlow, {log.log_id}",
+    )
     return str(save_picture(figure, output / "flow.png"))

@@ -100,8 +100,8 @@ def task(cfg: DictConfig) -> None:
 
 
 def _check_results(cfg: DictConfig, shard: Shard) -> None:
-    if cfg.data.name != "hdf5":
-        raise CFlowError(f"result_name writes into HDF5 scenes: it needs data=hdf5, not data={cfg.data.name}")
+    if cfg.data.get("name") != "hdf5":
+        raise CFlowError("result_name writes into HDF5 scenes: it needs data=hdf5")
     if shard.count > 1:
         raise CFlowError("result_name writes into whole scenes: give it to a last run without shards")
     check_result_name(cfg.result_name)

@@ -31,16 +31,19 @@ HELP = f"""cflow: training-free LiDAR scene flow
 
 usage: cflow COMMAND [SETTING=VALUE ...]
 
+what most people do:
+  cflow demo                    a simulated street: a picture in outputs/demo, no data needed
+  cflow flow /data/av2/val      the flow of your data, one file per pair of sweeps; the format is recognised
+  cflow eval /data/av2/val      its scores, where the data has labels
+
 commands:
 {chr(10).join(f"  {name:10}  {text}" for name, text in COMMANDS.items())}
 
-examples:
-  cflow demo                                          a picture in outputs/demo, no data needed
-  cflow flow data=av2 data.root=/data/av2/val         one flow file per pair of sweeps
-  cflow eval data=av2 data.root=/data/av2/val model=paper
-  cflow eval model.pixel_sizes=[0.4,0.2,0.1]          any field of the method, see `cflow settings`
-  cflow eval -m model.connectivity=4,8                a sweep
-  cflow plot picture=correlation pair=2               how one object was found, outputs/plot/correlation.png
+more examples:
+  cflow flow data=arrays data.root=/data/drive data.find_ground=grid    a format and its settings by name
+  cflow eval model=paper model.pixel_sizes=[0.4,0.2,0.1]                any field of the method, see `cflow settings`
+  cflow eval -m model.connectivity=4,8                                  a sweep
+  cflow plot picture=correlation pair=2                                 how one object was found
   cflow submit data=hdf5 data.root=/data/test version=3
 
 `cflow COMMAND --help` says more; `cflow COMMAND --cfg job` prints every setting and its value; `cflow --version`.
@@ -96,18 +99,23 @@ def _run(arguments: List[str]) -> None:
 
 def _run_with_settings(command: str, run: Any, rest: List[str]) -> None:
     import hydra
+    from hydra.core.hydra_config import HydraConfig
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
     from cflow_torch.cli import schemas  # noqa: F401 (registers them)
     from cflow_torch.cli.arguments import for_hydra
     from cflow_torch.cli.refusals import explain
-    from cflow_torch.cli.run import UnfinishedJob
+    from cflow_torch.cli.run import UnfinishedJob, complete_data
     from cflow_torch.types import CFlowError
 
     def task(cfg: Any) -> Any:
         try:
             OmegaConf.resolve(cfg)
+            for source in HydraConfig.get().runtime.config_sources:
+                if source.schema == "file" and source.path not in sys.path:  # where a user's own reader may lie
+                    sys.path.append(source.path)
+            cfg.data = complete_data(cfg.data)
             return run(cfg)
         except (CFlowError, OmegaConfBaseException) as error:
             _end_wrong(explain(error, command))

@@ -133,7 +133,7 @@ def objective(results: Dict[str, Any]) -> float:
 
 
 def _generator(cfg: DictConfig) -> Optional[str]:
-    return generator_key() if cfg.data.name == "benchmark" else None
+    return generator_key() if cfg.data.get("name") == "benchmark" else None
 
 
 def _plain(cfg: DictConfig) -> Any:

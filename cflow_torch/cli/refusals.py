@@ -47,4 +47,6 @@ def _unknown(key: str, kind: str, command: str) -> str:
     if command == "plot" and owners:
         return f"setting {key!r} belongs to {' or '.join(owners)}: give that as well, or leave it out"
     known = [*groups(command), *settings(command)]
+    if key in known:  # of other data sets, or of all of ours
+        return f"the chosen configuration has no setting {key!r}: give +{key}=VALUE to add it, or leave it out"
     return f"unknown setting {key!r}{near(key, known)}: `cflow {command} --cfg job` prints every one"

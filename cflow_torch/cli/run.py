@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import platform
-import re
 import sys
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,11 +16,11 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from cflow_torch import __version__, estimate
+from cflow_torch.cli.choices import CONFIGS, own_settings
 from cflow_torch.cli.estimates import estimates
 from cflow_torch.config import config_from
-from cflow_torch.data.catalog import find_sources, open_log
+from cflow_torch.data.catalog import AUTO, find_sources, find_user_sources, open_log, recognise
 from cflow_torch.data.log import Log, RecentSweeps, window
-from cflow_torch.data.names import is_safe_name
 from cflow_torch.data.paths import as_path
 from cflow_torch.data.records import write_text
 from cflow_torch.fleet.progress import say
@@ -34,8 +32,7 @@ from cflow_torch.types import CFlowError, FlowResult, Window
 Failures = List[Tuple[str, str]]
 UseResult = Callable[[Log, int, Window, FlowResult], None]
 # Settings of `data` that are not the reader's.
-_NOT_THE_READERS = ("name", "label", "root", "first", "step")
-_LONGEST_NAME = 150  # bytes of a folder name; file systems end at 255
+_NOT_THE_READERS = ("label", "first", "step")
 
 
 class UnfinishedJob(RuntimeError):
@@ -79,34 +76,37 @@ def is_sweep() -> bool:
 
 
 def output_folder(cfg: DictConfig) -> Path:
-    """Where a run writes: `cfg.output`; for a job of a sweep, a folder below it that no other job shares.
+    """Where a run writes: `cfg.output`; for a job of a sweep the folder below it that Hydra names, see hydra.yaml.
 
-    Its name is what was overridden for this job (`output` and `overwrite` aside), with the experiment, if one was
-    chosen, as a folder above: `outputs/eval/pixel_size/model.pixel_sizes=[0.2]`. A sweep over shards is one run in
-    pieces: its jobs share `cfg.output` itself.
+    A sweep over shards is one run in pieces: its jobs share `cfg.output` itself.
     """
     folder = as_path(cfg.output)
-    if not is_sweep():
+    if not is_sweep() or any(override.startswith("shard.index=") for override in HydraConfig.get().overrides.task):
         return folder
-    parts = []
-    for override in HydraConfig.get().overrides.task:
-        key, _, value = override.partition("=")
-        if key == "shard.index":
-            return folder
-        if key == "experiment":
-            folder = folder / _folder_name(value)
-        elif key not in ("output", "overwrite"):
-            parts.append(override)
-    return folder / (_folder_name(",".join(sorted(parts))) or "base")
+    return folder / HydraConfig.get().sweep.subdir
 
 
-def _folder_name(text: str) -> str:
-    """Text as one folder name; different texts keep different names."""
-    name = re.sub(r"[^\w.,=+@\[\]-]", "_", text.replace(" ", ""))
-    name = name.encode()[:_LONGEST_NAME].decode(errors="ignore")
-    if text and (name != text or not is_safe_name(name)):
-        name = name.lstrip(".") + "-" + hashlib.sha256(text.encode(errors="surrogatepass")).hexdigest()[:8]
-    return name
+def complete_data(data: DictConfig) -> DictConfig:
+    """Settings of the data set that data=auto stands for, which is said; those that a user's own reader may leave out.
+
+    Raises:
+        CFlowError: the format is not recognised.
+    """
+    if "_target_" in data:
+        defaults = {"label": HydraConfig.get().runtime.choices["data"], "first": 0, "step": 1}
+        return OmegaConf.merge(defaults, data)  # type: ignore[return-value]
+    if data.get("name") != AUTO:
+        return data
+    name = "synthetic"
+    if data.root is not None:
+        name = recognise(data.root)
+        print(f"{data.root}: data={name}")
+    settings, known = OmegaConf.load(CONFIGS / "data" / f"{name}.yaml"), {"name"}
+    for choice in (AUTO, "synthetic"):
+        known |= own_settings(CONFIGS / "data" / f"{choice}.yaml").keys()
+    given = {key: value for key, value in data.items() if key not in known - set(settings)}
+    given.update(name=name, label=data.label or settings.label)
+    return OmegaConf.merge(settings, given)  # type: ignore[return-value]
 
 
 def chosen_pairs(cfg: DictConfig, group: str = "") -> Callable[[Log], range]:
@@ -162,6 +162,11 @@ def find_logs(cfg: DictConfig) -> Sources:
         CFlowError: no log at all.
     """
     data = cfg.data
+    given: Dict[str, Any] = OmegaConf.to_container(data, resolve=True)  # type: ignore[assignment]
+    settings = {str(key): value for key, value in given.items() if key not in _NOT_THE_READERS}
+    if "_target_" in data:
+        target = settings.pop("_target_")
+        return Sources(target, settings, find_user_sources(target, settings))
     if data.name == "synthetic":
         seed, num_sweeps = whole_number(cfg, "data.seed", 0), whole_number(cfg, "data.num_sweeps", 1)
         logs = benchmark_logs(data.cache, "av2", [seed], num_sweeps)
@@ -173,10 +178,9 @@ def find_logs(cfg: DictConfig) -> Sources:
         logs = benchmark_logs(data.cache, data.profile, seeds, num_sweeps, data.scenes)
         return Sources(chosen.data_set, {"check": False, **chosen.settings}, logs)
     if OmegaConf.is_missing(data, "root"):
-        raise CFlowError("where is the data? give data.root=PATH, one log or a folder of logs")
-    given: Dict[str, Any] = OmegaConf.to_container(data, resolve=True)  # type: ignore[assignment]
-    settings = {str(key): value for key, value in given.items() if key not in _NOT_THE_READERS}
-    return Sources(data.name, settings, list(find_sources(data.name, data.root)))
+        raise CFlowError("where is the data? give data.root=PATH, or the path alone")
+    name, root = settings.pop("name"), settings.pop("root")
+    return Sources(name, settings, list(find_sources(name, root)))
 
 
 def open_logs(cfg: DictConfig) -> Tuple[List[Log], Failures]:

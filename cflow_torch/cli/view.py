@@ -71,7 +71,15 @@ def _flow(cfg: DictConfig) -> Tuple[Callable[[Log, int], FlowResult], int]:
         folder = as_path(cfg.flow)
         if not folder.is_dir():
             raise CFlowError(f"flow={cfg.flow} is no folder: give one that `cflow flow` left")
-        return lambda log, index: read_flow(frame_file(folder / log.log_id, log.timestamps[index])), 2
+
+        def stored(log: Log, index: int) -> FlowResult:
+            file = frame_file(folder / log.log_id, log.timestamps[index])
+            result = read_flow(file)
+            if any(getattr(result, name) is None for name in ("residual_flow", "pose_flow", "cluster_id", "is_valid")):
+                raise CFlowError(f"{file} holds too little for a picture: run `cflow flow` with all contents")
+            return result
+
+        return stored, 2
     model = run.make_model(cfg)
     config = model.config
 

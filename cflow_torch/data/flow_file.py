@@ -12,12 +12,9 @@ from pyarrow import feather
 from cflow_torch.data.arrow_file import FeatherFile, bools, floats, integers
 from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.paths import Place, as_path
-from cflow_torch.types import CFlowError, FlowResult
+from cflow_torch.types import VECTORS, CFlowError, FlowResult, vector_columns
 
-_VECTORS = {"flow": "flow", "residual": "residual_flow", "pose": "pose_flow"}  # name in the file -> field
-_SCALARS = ("cluster_id", "score", "is_valid")
-_AXES = "xyz"
-CONTENTS = (*_VECTORS, *_SCALARS)
+CONTENTS = (*VECTORS, "cluster_id", "score", "is_valid")
 ON_REQUEST = ("confidence",)  # what a file has only if it is named
 
 
@@ -37,38 +34,41 @@ def write_flow(path: Place, result: FlowResult, contents: Sequence[str] = CONTEN
     Raises:
         CFlowError: the result has no confidence, and it was asked for.
     """
-    columns = {}
-    for name in contents:
-        given = getattr(result, _VECTORS.get(name, name))
-        if given is None:
-            raise CFlowError(f"{name} was asked for, but this result has none: estimate it with preset default or fast")
-        values = given.detach().cpu().numpy()
-        if name in _VECTORS:
-            columns.update({f"{name}_t{axis}_m": values[:, i] for i, axis in enumerate(_AXES)})
-        else:
-            columns[name] = values
+    columns = result.columns()
+    names = [column for name in contents for column in (vector_columns(name) if name in VECTORS else [name])]
+    if not columns.keys() >= set(names):
+        lacking = ", ".join(sorted(set(names) - columns.keys()))
+        raise CFlowError(f"{lacking}: asked for, but this result has none: estimate it with preset default or fast")
     with atomic_file(path) as file:
-        feather.write_feather(pa.table({name: pa.array(values) for name, values in columns.items()}), file)
+        feather.write_feather(pa.table({name: pa.array(columns[name]) for name in names}), file)
 
 
 def read_flow(path: Place) -> FlowResult:
     """Read what `write_flow` wrote.
 
+    Returns:
+        The result; fields that the file does not hold are None.
+
     Raises:
-        CFlowError: the file is missing, cannot be reached, is truncated, or was not written with all contents.
+        CFlowError: the file is missing, cannot be reached, is truncated, or holds none of the contents.
     """
     path = as_path(path)
+    scalars = {"cluster_id": integers, "is_valid": bools}
+    fields = {}
     try:
         file = FeatherFile(path)
-        names = [*_SCALARS, *(name for name in ON_REQUEST if name in file.names)]
-        axes = {name: [f"{name}_t{axis}_m" for axis in _AXES] for name in _VECTORS}
-        table = file.read([*(column for columns in axes.values() for column in columns), *names])
-        read = {"cluster_id": integers, "is_valid": bools}
-        values = {name: read[name](table, name, path) for name in names if name in read}
-        values.update({name: floats(table, [name], path, np.float32)[:, 0] for name in names if name not in read})
-        values.update({_VECTORS[name]: floats(table, columns, path, np.float32) for name, columns in axes.items()})
+        for name in (*CONTENTS, *ON_REQUEST):
+            columns = vector_columns(name) if name in VECTORS else [name]
+            if not set(columns) & set(file.names):
+                continue
+            table = file.read(columns)
+            if name in scalars:
+                fields[name] = scalars[name](table, name, path)
+            else:
+                values = floats(table, columns, path, np.float32)
+                fields[VECTORS.get(name, name)] = values if name in VECTORS else values[:, 0]
+        if not fields:
+            raise CFlowError(f"its columns are {', '.join(file.names)}")
     except CFlowError as error:
-        raise CFlowError(
-            f"{path} is no flow file ({error}): give one that `cflow flow` wrote with all its contents"
-        ) from error
-    return FlowResult(**{name: torch.from_numpy(np.array(array)) for name, array in values.items()})
+        raise CFlowError(f"{path} is no flow file ({error}): give one that `cflow flow` wrote") from error
+    return FlowResult.of({name: torch.from_numpy(np.array(array)) for name, array in fields.items()})

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, Optional
 
-from cflow_torch.data.log import Log
+from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.types import Sweep
 from cflow_torch.windows.ground import find_ground
 
 
-class ChangedLog:
+class ChangedLog(Log):
     """Another log whose sweeps are changed; everything else is the other's.
 
     Args:
@@ -18,7 +18,11 @@ class ChangedLog:
     """
 
     def __init__(self, log: Log) -> None:
-        self.log, self.log_id, self.timestamps, self.labels = log, log.log_id, log.timestamps, log.labels
+        self.log, self.log_id, self.timestamps = log, log.log_id, log.timestamps
+
+    def labels(self, index: int) -> Optional[FlowLabels]:
+        """The log's labels."""
+        return self.log.labels(index)
 
     def __getattr__(self, name: str) -> Any:
         if name == "log" or name.startswith("__"):  # it is being unpickled; what Python asks of a class

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Optional, Protocol, Sequence
+from typing import Any, Iterator, List, Optional, Protocol, Sequence
 
 import numpy as np
+from torch.utils.data import Dataset
 
 from cflow_torch.types import CFlowError, Sweep, Window
 
@@ -27,26 +28,38 @@ class FlowLabels:
 
 
 class Log(Protocol):
-    """One drive.
+    """One drive: a sequence of sweeps. `len(log)`, `log[-1]` and `for sweep in log` work.
+
+    A reader of one's own is a class that inherits from this one, sets `log_id` and `timestamps`, and has `sweep`.
+
+    Attributes:
+        log_id: name, safe as a folder name.
+        timestamps: sweep times, ascending.
 
     Raises:
         CFlowError: from `sweep` and `labels`: there is no sweep of this number, or a file of it is missing, damaged, or
             of another size than what belongs to it. Other sweeps can be read then.
     """
 
-    @property
-    def log_id(self) -> str:
-        """Name, safe as a folder name."""
-
-    @property
-    def timestamps(self) -> Sequence[int]:
-        """Sweep times, ascending."""
+    log_id: str
+    timestamps: Sequence[int]
 
     def sweep(self, index: int) -> Sweep:
         """Sweep number `index` with float32 points, float64 pose `T_world_ego`, ground mask, time."""
+        raise NotImplementedError
 
     def labels(self, index: int) -> Optional[FlowLabels]:
         """Truth of the pair (index, index + 1), None where the log has none."""
+        return None
+
+    def __len__(self) -> int:
+        return len(self.timestamps)
+
+    def __getitem__(self, index: int) -> Sweep:
+        return self.sweep(range(len(self))[index])
+
+    def __iter__(self) -> Iterator[Sweep]:
+        return map(self.sweep, range(len(self)))
 
 
 def window(log: Log, index: int, num_history: int = 0, num_future: int = 0) -> Window:
@@ -69,14 +82,52 @@ def window(log: Log, index: int, num_history: int = 0, num_future: int = 0) -> W
     return Window(log.sweep(index), log.sweep(index + 1), past, later)
 
 
-class NumberedSweeps:
-    """What readers share: sweeps are asked for by number."""
+def windows(log: Log, num_history: int = 0, num_future: int = 0) -> Iterator[Window]:
+    """The window of every pair of a log, in order; each sweep is read once.
 
-    log_id: str
-    timestamps: Sequence[int]
+    Raises:
+        CFlowError: a sweep cannot be read.
+    """
+    recent = RecentSweeps(log, num_history + num_future + 2)
+    return (window(recent, index, num_history, num_future) for index in range(len(log.timestamps) - 1))
+
+
+class WindowDataset(Dataset):  # type: ignore[type-arg]
+    """The windows of some logs, for a `torch.utils.data.DataLoader`, whose workers then read the files.
+
+    Args:
+        logs: any number; each must be one that can be pickled, where the workers do not begin as forks.
+        num_history, num_future: as in `window`.
+
+    Example:
+        >>> data = WindowDataset(logs, num_history=model.config.num_history)
+        >>> loader = DataLoader(data, batch_size=4, num_workers=2, collate_fn=data.collate)
+        >>> for batch in loader:
+        ...     results = model(batch)
+    """
+
+    def __init__(self, logs: Sequence[Log], num_history: int = 0, num_future: int = 0) -> None:
+        self._pairs = [(log, index) for log in logs for index in range(len(log.timestamps) - 1)]
+        self._num_history, self._num_future = num_history, num_future
+        self._recent: Optional[RecentSweeps] = None
 
     def __len__(self) -> int:
-        return len(self.timestamps)
+        return len(self._pairs)
+
+    def __getitem__(self, number: int) -> Window:
+        log, index = self._pairs[number]
+        if self._recent is None or self._recent.log is not log:
+            self._recent = RecentSweeps(log, self._num_history + self._num_future + 2)
+        return window(self._recent, index, self._num_history, self._num_future)
+
+    @staticmethod
+    def collate(windows: Sequence[Window]) -> List[Window]:
+        """A batch, as models take it: sweeps differ in their numbers of points, so nothing is stacked."""
+        return list(windows)
+
+
+class NumberedSweeps(Log):
+    """What readers share: sweeps are asked for by number."""
 
     def _timestamp(self, index: int) -> int:
         """Time stamp of sweep `index`; refuses a number that no sweep has."""
@@ -90,7 +141,7 @@ class NumberedSweeps:
             raise CFlowError(f"{where} has {len(self.timestamps)} sweeps; scene flow needs two or more")
 
 
-class RecentSweeps:
+class RecentSweeps(Log):
     """A log that remembers its last sweeps: neighbouring windows share all but one.
 
     Args:
@@ -99,5 +150,16 @@ class RecentSweeps:
     """
 
     def __init__(self, log: Log, count: int) -> None:
-        self.log, self.log_id, self.timestamps, self.labels = log, log.log_id, log.timestamps, log.labels
-        self.sweep = lru_cache(count)(log.sweep)
+        self.log, self.log_id, self.timestamps, self._count = log, log.log_id, log.timestamps, count
+        self._sweep = lru_cache(count)(log.sweep)
+
+    def __reduce__(self) -> Any:
+        return RecentSweeps, (self.log, self._count)
+
+    def sweep(self, index: int) -> Sweep:
+        """The log's sweep."""
+        return self._sweep(index)
+
+    def labels(self, index: int) -> Optional[FlowLabels]:
+        """The log's labels."""
+        return self.log.labels(index)

@@ -9,7 +9,7 @@ from typing import Dict, List, Optional
 import numpy as np
 import torch
 
-from cflow_torch.data.log import FlowLabels
+from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.simulator.lidar import Returns, scan, scan_rolling
 from cflow_torch.simulator.motion import Motion
 from cflow_torch.simulator.objects import CATEGORIES, own_truck
@@ -27,7 +27,7 @@ _ROUNDING = 1e-4  # boxes hold their points also after those are rounded to floa
 _RASTER_STEP = 0.3  # metres per cell of the ground raster, as in Argoverse 2
 
 
-class Drive:
+class Drive(Log):
     """A drive through a synthetic scene. Sweeps are simulated when asked for, each from its own random stream, so they
     do not depend on the order of the calls. It is a `recording.Recording`.
 

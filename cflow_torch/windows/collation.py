@@ -18,7 +18,14 @@ from cflow_torch.windows.bev_grid import Grid
 from cflow_torch.windows.ego_motion import compensate, rigid_transform
 from cflow_torch.windows.ground_heights import GroundHeights
 from cflow_torch.windows.point_times import has_point_times, read_point_times
-from cflow_torch.windows.validation import check_distance, elapsed_times, read_ground, read_positions, source_sweeps
+from cflow_torch.windows.validation import (
+    check_distance,
+    elapsed_times,
+    keep_nearest,
+    read_ground,
+    read_positions,
+    source_sweeps,
+)
 
 
 @dataclass(frozen=True)
@@ -110,7 +117,8 @@ def make_batch(
 
     Args:
         windows: B windows, at least one.
-        config: `ego_box`, `sweep_interval`, `point_cloud_range`; `num_history`, `num_future` bound what is accepted.
+        config: `ego_box`, `sweep_interval`, `point_cloud_range`; the nearest `num_history` older
+            sweeps are used; `num_future` bounds what is accepted.
         grid: the images, which hold the region; which of the scales they belong to does not matter here.
         device: where the batch is to lie.
         num_axes: coordinates that are kept, 2 or 3.
@@ -122,10 +130,11 @@ def make_batch(
 
     Raises:
         CFlowError: wrong shape or dtype, a transform that is not rigid, mixed devices, poses for some sweeps
-            only, more sweeps than `num_history`, `num_future`, time stamps out of order, poses too far apart.
+            only, more sweeps after t+1 than `num_future`, time stamps out of order, poses too far apart.
 
     Cost: linear in points; the only Python loop over sweeps, because they arrive as a list.
     """
+    windows = [keep_nearest(window, config.num_history) for window in windows]
     kept = [source_sweeps(window, config) for window in windows]
     num_future = [sum(way < 0 for _, _, way in sources) for sources in kept]
     first_future = 1 + max(len(sources) - count for sources, count in zip(kept, num_future))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any, List, Optional, Sequence, Tuple
 
 import numpy as np
@@ -20,6 +22,7 @@ _FIRST_POINTS = 64
 _ALL_ROWS = slice(None)
 # No sweep has so many columns; three or four rows of them are coordinates of that many points.
 _MOST_COLUMNS = 1000
+_log = logging.getLogger(__name__)
 
 
 def check_windows(windows: Any, config: Optional[Config] = None) -> None:
@@ -50,19 +53,24 @@ def check_windows(windows: Any, config: Optional[Config] = None) -> None:
                 _check_resolution(sweep.points.dtype, name, config)
 
 
+def keep_nearest(window: Window, num_history: int) -> Window:
+    """The window with so many older sweeps at most, the nearest ones; a note is logged if that leaves some out."""
+    if len(window.pch) <= num_history:
+        return window
+    _log.info("of %d history sweeps the nearest %d are used (num_history)", len(window.pch), num_history)
+    return replace(window, pch=window.pch[:num_history])
+
+
 def source_sweeps(window: Window, config: Config) -> List[Tuple[str, Sweep, int]]:
     """(name, sweep, steps to t+1) of pc0, the history and what comes after t+1, repeated sweeps left out.
 
     Steps are 1 for pc0, 2, 3, ... for the history, and -1, -2, ... for t+2, t+3, ..., which stand last.
     """
-    for kind, setting, given, most in (
-        ("history", "num_history", window.pch, config.num_history),
-        ("future", "num_future", window.pcf, config.num_future),
-    ):
-        if len(given) > most:
-            raise CFlowError(
-                f"the window has {len(given)} {kind} sweeps but {setting}={most}: pass {setting}, or fewer sweeps"
-            )
+    if len(window.pcf) > config.num_future:
+        raise CFlowError(
+            f"the window has {len(window.pcf)} future sweeps but num_future={config.num_future}: pass num_future, or "
+            "fewer sweeps"
+        )
     sweeps = [window.pc1, window.pc0, *window.pch, *window.pcf]
     with_pose = [sweep.pose is not None for sweep in sweeps]
     if any(with_pose) and not all(with_pose):

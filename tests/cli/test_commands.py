@@ -62,7 +62,7 @@ def test_demo_without_matplotlib_lacks_the_picture_only(
         monkeypatch.setitem(sys.modules, name, None)
     assert cflow("demo", f"output={tmp_path}", "data.num_sweeps=2", "pair=0", "model=paper", SMALL) == 0
     printed = capsys.readouterr()
-    assert "picture: none" in printed.out and "pip install matplotlib" in printed.out and not printed.err
+    assert printed.out.startswith("no picture (") and "pip install matplotlib" in printed.out and not printed.err
     assert results_of(tmp_path)["num_pairs"] == 1 and not list(tmp_path.glob("*.png"))
 
 

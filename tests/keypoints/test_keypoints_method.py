@@ -173,5 +173,3 @@ def test_whole_pixel_shifts_of_boxes_are_found():
 def test_history_is_refused():
     with pytest.raises(CFlowError, match="num_history is a setting of method dense and verified"):
         make_config("keypoints", num_history=2)
-    with pytest.raises(CFlowError, match=r"2 history sweeps but num_history=0"):
-        CorrelationFlowKeypoints(config("keypoints"))([scene(1, num_history=2)])

@@ -93,8 +93,13 @@ def test_time_stamps_that_are_none_are_named(stamp):
         refused(pc0, pc1, match=f"timestamp_ns of {name} is .*whole nanoseconds")
 
 
-def test_more_history_than_is_asked_for():
-    refused(*map(Sweep, (P0, P1, P0 + 1, P0 + 2)), match="2 history sweeps but num_history=1")
+def test_of_more_history_than_is_asked_for_the_nearest_is_used(caplog):
+    model = CorrelationFlow.from_preset("paper", num_history=1)
+    pc0, pc1, *older = map(Sweep, (P0, P1, P0 + 1, P0 + 2))
+    with caplog.at_level("INFO", "cflow_torch"):
+        more, fewer = model([Window(pc0, pc1, tuple(older)), Window(pc0, pc1, tuple(older[:1]))])
+    assert all(np.array_equal(values, fewer.numpy()[name]) for name, values in more.numpy().items())
+    assert "of 2 history sweeps the nearest 1 are used" in caplog.text and len(caplog.records) == 1
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,152 @@
+"""A path is enough; a data set of one's own by configuration alone."""
+
+from __future__ import annotations
+
+import json
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Callable
+
+import numpy as np
+import pytest
+
+from cflow_torch.cli.arguments import for_hydra
+from cflow_torch.data.arrays import write_array_log
+from cflow_torch.data.catalog import _MARKS, DATA_SETS, recognise
+from cflow_torch.data.flow_file import read_flow
+from cflow_torch.simulator import make_drive
+from cflow_torch.simulator.benchmark import FORMATS
+from cflow_torch.types import CFlowError
+
+Cflow = Callable[..., int]
+SMALL = "model.point_cloud_range=[-20,-20,-inf,20,20,inf]"
+
+
+def written(name: str, folder: Path) -> Path:
+    """A small drive in one of the formats that there is a writer for."""
+    drive = make_drive(seed=3, num_sweeps=3, profile="demo" if name in ("av2", "arrays", "hdf5") else name)
+    if name == "arrays":
+        return write_array_log(drive, folder)
+    if name == "hdf5":
+        pytest.importorskip("h5py")
+        from cflow_torch.data.hdf5.writer import write_hdf5_scene
+
+        write_hdf5_scene(drive, folder / "scene.h5")
+        return folder
+    module = import_module(f"cflow_torch.simulator.writers.{FORMATS[name].module}")
+    getattr(module, FORMATS[name].function)(drive, folder)
+    return folder
+
+
+@pytest.mark.parametrize("name", ["arrays", "hdf5", *FORMATS])
+def test_a_path_is_enough(name: str, tmp_path: Path, cflow: Cflow, capsys: pytest.CaptureFixture) -> None:
+    root = written(name, tmp_path / "data")
+    call = ("flow", root, f"output={tmp_path / 'out'}", "model=paper", SMALL, "engine.workers=1", "data.check=false")
+    assert cflow(*call) == 0
+    assert f"{root}: data={name}\n" in capsys.readouterr().out
+    files = list((tmp_path / "out").glob("*/*.feather"))
+    assert files and all(read_flow(file).is_valid.any() for file in files)
+    assert cflow(call[0], f"data={name}", f"data.root={root}", *call[2:]) == 0
+    assert f"complete before  {len(files)}" in capsys.readouterr().out.replace("  complete", "complete"), "the same run"
+
+
+def test_what_is_not_recognised_is_an_error_that_says_so(tmp_path: Path) -> None:
+    for place, message in (
+        ("absent", "no file and no folder"),
+        ("empty", "no format fits what lies"),
+    ):
+        (tmp_path / "empty").mkdir(exist_ok=True)
+        with pytest.raises(CFlowError, match=message):
+            recognise(tmp_path / place)
+    (tmp_path / "both" / "a" / "sensors" / "lidar").mkdir(parents=True)
+    (tmp_path / "both" / "b" / "lidar").mkdir(parents=True)
+    (tmp_path / "both" / "b" / "lidar" / "x.parquet").touch()
+    with pytest.raises(CFlowError, match="several formats fit, av2 and waymo"):
+        recognise(tmp_path / "both")
+    assert recognise(tmp_path / "both" / "b" / "lidar") == recognise(tmp_path / "both" / "b") == "waymo"
+    (tmp_path / "both" / "x.h5").touch()
+    assert recognise(tmp_path / "both") == recognise(tmp_path / "both" / "x.h5") == "hdf5", "what lies nearest"
+    assert set(DATA_SETS) - set(_MARKS) <= {"arrays", "kiss_icp"}, "all others have a mark"
+
+
+def test_a_path_among_settings_and_options() -> None:
+    call = ["-m", "/a b/c", "model=paper,fast", "--config-dir", "conf", "-p", "model"]
+    assert for_hydra(call) == ['data.root="/a b/c"', "model=paper,fast", "-m", "--config-dir", "conf", "-p", "model"]
+
+
+# ---------------------------------------------------------------- a reader of one's own
+
+READER = """
+import numpy as np
+from cflow_torch.data.log import FlowLabels, Log
+from cflow_torch.types import Sweep
+
+class Mine(Log):
+    def __init__(self, folder, speed):
+        self.log_id, self.timestamps, self.speed = "mine", range(0, 300_000_000, 100_000_000), speed
+        self.points = np.load(f"{folder}/car.npy")
+
+    def sweep(self, index):
+        moved = self.points + np.float32([0.1 * self.speed * index, 0, 0])
+        return Sweep(moved, np.zeros(len(moved), bool), np.eye(4), self.timestamps[index])
+
+    def labels(self, index):
+        flow = np.zeros_like(self.points) + np.float32([0.1 * self.speed, 0, 0])
+        return FlowLabels(flow, np.full(len(flow), 19, np.uint8), np.ones(len(flow), bool))
+
+def several(folder, speed):
+    logs = [Mine(folder, speed), Mine(folder, -speed)]
+    logs[1].log_id = "back"
+    return logs
+"""
+
+
+@pytest.fixture
+def mine(tmp_path: Path) -> Path:
+    """A user's folder: a reader, a data set that names it, a file that it reads."""
+    (tmp_path / "my" / "data").mkdir(parents=True)
+    (tmp_path / "my" / "reader_of_mine.py").write_text(READER)
+    text = f"_target_: reader_of_mine.several\nfolder: {tmp_path}\nspeed: 10.0\n"
+    (tmp_path / "my" / "data" / "mine.yaml").write_text(text)
+    car = 0.1 * np.stack(np.meshgrid(range(45), range(18), range(15)), -1).reshape(-1, 3) + 5.05
+    np.save(tmp_path / "car.npy", car.astype(np.float32))
+    return tmp_path
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_reader_of_one_s_own_by_configuration_alone(
+    workers: int, mine: Path, cflow: Cflow, capsys: pytest.CaptureFixture
+) -> None:
+    pytest.importorskip("matplotlib")
+    own = ("--config-dir", mine / "my", "data=mine", "data.speed=5", "model=paper")
+    assert cflow("flow", *own, f"output={mine / 'flow'}", f"engine.workers={workers}") == 0
+    for log, speed in (("mine", 0.5), ("back", -0.5)):
+        assert np.allclose(read_flow(mine / "flow" / log / "0.feather").residual_flow[:, 0], speed)
+    if workers > 1:
+        return
+    assert cflow("eval", *own, f"output={mine / 'eval'}", "data.step=2") == 2
+    assert "give +data.step=VALUE" in capsys.readouterr().err
+    assert cflow("eval", *own, f"output={mine / 'eval'}", "+data.step=2") == 0
+    record: Any = json.loads((mine / "eval" / "results.json").read_text())
+    assert record["num_pairs"] == 2 and record["results"]["three_way"]["epe_fd"] < 1e-6
+    assert record["data"]["label"] == "mine" and record["config"]["data"]["speed"] == 5
+    assert cflow("plot", *own, f"output={mine / 'plot'}", "pair=1", "log=back") == 0
+    assert (mine / "plot" / "flow.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("_target_: reader_of_mine.Absent\n", "Absent"),
+        (
+            "_target_: reader_of_mine.several\nfolder: /no/such\nspeed: 1\n",
+            "reader_of_mine.several fails: FileNotFoundError",
+        ),
+        ("_target_: builtins.list\n", "builtins.list returned no log"),
+    ],
+)
+def test_a_reader_that_fails(text: str, message: str, mine: Path, cflow: Cflow, capsys: pytest.CaptureFixture) -> None:
+    (mine / "my" / "data" / "mine.yaml").write_text(text)
+    assert cflow("eval", "--config-dir", mine / "my", "data=mine", f"output={mine / 'out'}") == 2
+    error = capsys.readouterr().err
+    assert error.splitlines()[-1].startswith("error: ") and message in error

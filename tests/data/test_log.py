@@ -1,0 +1,153 @@
+"""Logs as sequences, their windows, and windows for a DataLoader; results as files, tables and objects."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+from typing import Any, Sequence
+
+import numpy as np
+import pytest
+from torch.utils.data import DataLoader
+
+from cflow_torch import CFlowError, FlowResult, Window, make_config, make_model
+from cflow_torch.data.flow_file import CONTENTS, ON_REQUEST, read_flow, write_flow
+from cflow_torch.data.log import Log, RecentSweeps, WindowDataset, window, windows
+from cflow_torch.simulator import Drive, make_drive
+from cflow_torch.types import Sweep
+
+
+@pytest.fixture(scope="module")
+def drive() -> Drive:
+    return make_drive(seed=1, num_sweeps=5, profile="demo")
+
+
+@pytest.fixture(scope="module")
+def result(drive: Drive) -> FlowResult:
+    """Flow of the last pair but one by the default preset."""
+    (result,) = make_model(make_config())([window(drive, 3, 3)])
+    return result
+
+
+def points_of(windows: Sequence[Window]) -> list:
+    return [[sweep.points for sweep in (w.pc0, w.pc1, *w.pch, *w.pcf)] for w in windows]
+
+
+def test_a_log_is_a_sequence_whatever_is_put_round_it(drive: Drive) -> None:
+    class Mine(Log):
+        log_id, timestamps = "mine", (0, 1, 2)
+
+        def sweep(self, index: int) -> Sweep:
+            return Sweep(np.full((index, 3), index, np.float32))
+
+    for log in (Mine(), RecentSweeps(Mine(), 2)):
+        assert [len(sweep.points) for sweep in log] == [0, 1, 2] and len(log) == 3
+        assert len(log[-1].points) == 2 and log.labels(0) is None
+        with pytest.raises(IndexError):
+            log[3]
+    recent = pickle.loads(pickle.dumps(RecentSweeps(drive, 2)))
+    assert np.array_equal(recent.sweep(1).points, drive.sweep(1).points)
+
+
+def test_windows_are_those_of_each_pair_and_read_a_sweep_once(drive: Drive) -> None:
+    class Counted(Log):
+        log_id, timestamps, read = drive.log_id, drive.timestamps, []  # noqa: RUF012
+
+        def sweep(self, index: int) -> Sweep:
+            self.read.append(index)
+            return drive.sweep(index)
+
+    found = list(windows(Counted(), num_history=2, num_future=1))
+    expected = [window(drive, index, 2, 1) for index in range(4)]
+    assert all(map(np.array_equal, sum(points_of(found), []), sum(points_of(expected), [])))
+    assert sorted(Counted.read) == [0, 1, 2, 3, 4]
+
+
+def test_a_data_loader_with_workers_equals_the_loop(drive: Drive) -> None:
+    model = make_model(make_config("fast", num_history=2))
+    data = WindowDataset([drive, make_drive(seed=2, num_sweeps=3, profile="demo")], num_history=2)
+    loader: Any = DataLoader(data, batch_size=2, num_workers=2, collate_fn=data.collate)
+    loaded = [result for batch in loader for result in model(batch)]
+    looped = [result for number in range(len(data)) for result in model([data[number]])]
+    assert len(loaded) == len(looped) == 6 and any(result.residual_flow.any() for result in looped)
+    for one, other in zip(loaded, looped):
+        assert all(np.array_equal(values, other.numpy()[name]) for name, values in one.numpy().items())
+
+
+# ---------------------------------------------------------------- results
+
+
+def test_a_result_is_the_same_from_its_file(result: FlowResult, tmp_path: Path) -> None:
+    result.save(tmp_path / "a.npz")
+    again = FlowResult.load(tmp_path / "a.npz").numpy()
+    assert again.keys() == result.numpy().keys() and "confidence" in again
+    assert all(np.array_equal(values, again[name]) for name, values in result.numpy().items())
+    np.savez(tmp_path / "objects.npz", flow=np.array([{}], dtype=object))
+    np.savez(tmp_path / "other.npz", points=np.zeros(3))
+    (tmp_path / "short.npz").write_bytes((tmp_path / "a.npz").read_bytes()[:1000])
+    for name in ("objects", "other", "short", "absent"):
+        with pytest.raises(CFlowError, match=f"{name}.npz is no result"):
+            FlowResult.load(tmp_path / f"{name}.npz")
+
+
+@pytest.mark.parametrize(
+    "contents", [(*CONTENTS, *ON_REQUEST), ("residual", "is_valid"), ("score",), ("flow", "cluster_id")]
+)
+def test_every_flow_file_can_be_read(contents: Sequence[str], result: FlowResult, tmp_path: Path) -> None:
+    file = tmp_path / "1.feather"
+    write_flow(file, result, contents)
+    again, columns = read_flow(file), result.columns()
+    wanted = {name for name in columns if name.startswith(tuple(f"{c}_t" for c in contents)) or name in contents}
+    assert again.columns().keys() == wanted
+    assert all(np.array_equal(values, columns[name]) for name, values in again.columns().items())
+    with pytest.raises(CFlowError, match="no flow file"):
+        read_flow(Path(__file__))
+
+
+def test_a_data_frame_has_a_row_per_point(drive: Drive, result: FlowResult, monkeypatch: pytest.MonkeyPatch) -> None:
+    pandas = pytest.importorskip("pandas")
+    points = drive.sweep(3).points
+    frame = result.to_pandas(points)
+    assert isinstance(frame, pandas.DataFrame) and list(frame.columns[:4]) == ["x", "y", "z", "residual_tx_m"]
+    assert np.array_equal(frame[["flow_tx_m", "flow_ty_m", "flow_tz_m"]], result.flow) and len(frame) == len(points)
+    with pytest.raises(CFlowError, match="a row per row"):
+        result.to_pandas(points[1:])
+    monkeypatch.setitem(__import__("sys").modules, "pandas", None)
+    with pytest.raises(CFlowError, match="pip install pandas"):
+        result.to_pandas()
+
+
+def test_objects_are_the_movers_of_the_simulator(drive: Drive, result: FlowResult) -> None:
+    """Of everything that is seen with 50 points or more; the lorry with its trailer turns, and is no rigid body."""
+    objects = result.objects(drive.sweep(3).points)
+    assert (
+        len(objects)
+        and (np.diff(objects["id"]) > 0).all()
+        and (np.linalg.norm(objects["velocity"], axis=1) >= 0.5).all()
+    )
+    T, before, after = np.linalg.inv(drive.poses[4]) @ drive.poses[3], drive.boxes(3), drive.boxes(4)
+    num_movers, num_missed, is_found = 0, 0, np.zeros(len(objects), bool)
+    for track, pose0, count, category in zip(before.track_id, before.pose, before.num_points, before.category):
+        number = after.track_id.index(track)
+        pose, size = after.pose[number], after.size[number]
+        velocity = (pose - T @ pose0)[:3, 3] / 0.1
+        within = (np.abs((objects["centre"] - pose[:3, 3]) @ pose[:3, :3]) <= size / 2).all(1)
+        if np.linalg.norm(velocity) < 0.5:
+            continue
+        is_found |= within
+        if count < 50 or category in ("TRUCK_CAB", "VEHICULAR_TRAILER"):
+            continue
+        num_movers += 1
+        if not within.any():
+            num_missed += 1
+            continue
+        row = max(objects[within], key=lambda one: one["num_points"])
+        assert np.linalg.norm(row["velocity"] - velocity) < 0.75, category
+        assert 0.7 * count < row["num_points"] <= count and (row["size"] < size + 0.6).all(), category
+        difference = np.angle(np.exp(1j * (row["heading"] - np.arctan2(pose[1, 0], pose[0, 0]))))
+        assert abs(difference) < 0.4, category
+    assert num_movers >= 6 and num_missed <= 1 and is_found[objects["confidence"] > 0.7].mean() > 0.8
+    with pytest.raises(CFlowError, match="without"):
+        FlowResult.of({"flow": result.flow}).objects(drive.sweep(3).points)
+    empty = result.objects(drive.sweep(3).points, min_speed=1e3)
+    assert len(empty) == 0 and empty.dtype == objects.dtype
