@@ -9,6 +9,7 @@ from typing import Any, Callable
 
 import numpy as np
 import pytest
+from tiny_recording import TinyRecording
 
 from cflow_torch.cli.arguments import for_hydra
 from cflow_torch.data.arrays import write_array_log
@@ -24,6 +25,13 @@ SMALL = "model.point_cloud_range=[-20,-20,-inf,20,20,inf]"
 
 def written(name: str, folder: Path) -> Path:
     """A small drive in one of the formats that there is a writer for."""
+    if name == "bags":
+        pytest.importorskip("rosbags")
+        from bag_writer import write_bag
+
+        folder.mkdir()
+        write_bag(folder, "mcap", TinyRecording(("velodyne",), num_sweeps=3))
+        return folder
     drive = make_drive(seed=3, num_sweeps=3, profile="demo" if name in ("av2", "arrays", "hdf5") else name)
     if name == "arrays":
         return write_array_log(drive, folder)
@@ -38,7 +46,7 @@ def written(name: str, folder: Path) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("name", ["arrays", "hdf5", *FORMATS])
+@pytest.mark.parametrize("name", ["arrays", "bags", "hdf5", *FORMATS])
 def test_a_path_is_enough(name: str, tmp_path: Path, cflow: Cflow, capsys: pytest.CaptureFixture) -> None:
     root = written(name, tmp_path / "data")
     call = ("flow", root, f"output={tmp_path / 'out'}", "model=paper", SMALL, "engine.workers=1", "data.check=false")

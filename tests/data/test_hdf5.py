@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from pathlib import Path
 
 import numpy as np
@@ -60,6 +61,12 @@ def test_what_is_stored_is_read(tmp_path):
         assert log.labels(2) is None
         assert len(window(log, 1, 4).pch) == 1
     assert find_hdf5_scenes(tmp_path) == find_hdf5_scenes(file) == [file]
+
+
+def test_another_process_opens_the_file_itself(tmp_path):
+    with HDF5Log(write_scene(tmp_path / "a.h5")) as log, pickle.loads(pickle.dumps(log)) as other:
+        assert np.array_equal(other.sweep(1).points, log.sweep(1).points, equal_nan=True)
+        assert np.array_equal(other.ego_T_lidar, log.ego_T_lidar)
 
 
 @pytest.mark.parametrize(

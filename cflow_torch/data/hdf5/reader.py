@@ -78,6 +78,9 @@ class HDF5Log(NumberedSweeps):
             ego_T_lidar = np.eye(4)
         self.ego_T_lidar = rigid_transform(ego_T_lidar, f"ego_T_lidar of {self.file}")
 
+    def __reduce__(self) -> Any:
+        return HDF5Log, (self.file, self.ego_T_lidar)  # another process opens the file itself
+
     def __enter__(self) -> HDF5Log:
         return self
 
