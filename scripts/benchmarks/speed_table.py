@@ -14,6 +14,7 @@ import argparse
 import json
 import os
 import pickle
+import shutil
 import statistics
 import subprocess
 import sys
@@ -190,9 +191,8 @@ def flow_on_cores(folder: Path, preset: str, repeats: int) -> Rows:
 
     (drive,) = benchmark_logs(folder / "drives", "av2", [900], FLOW_PAIRS + 1)
     for number in range(FLOW_LOGS):
-        (folder / "logs").mkdir(exist_ok=True)
-        if not (folder / "logs" / f"log-{number}").is_symlink():
-            (folder / "logs" / f"log-{number}").symlink_to(drive.resolve())
+        if not (folder / "logs" / f"log-{number}").exists():  # a link to the folder would be one log, seen five times
+            shutil.copytree(drive, folder / "logs" / f"log-{number}", copy_function=os.link)
     cores = sorted(os.sched_getaffinity(0))[:2]
     rates: Dict[int, List[float]] = {1: [], 2: []}
     for _ in range(repeats):

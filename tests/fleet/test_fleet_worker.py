@@ -268,7 +268,7 @@ def test_a_worker_that_cannot_begin_leaves_the_work_to_the_others(fleet: Path, t
 def test_a_stop_lets_the_frames_in_hand_be_finished(fleet: Path, tmp_path: Path) -> None:
     units = [Unit(n, source) for n, source in enumerate(sorted(fleet.iterdir()))]
     job = make_job(tmp_path, batch=1)
-    counters = follow(dispatch([Thread(job), Thread(job)], units, lambda: bool(flow_files(tmp_path)), 1), units)
+    counters = follow(dispatch([Thread(job), Thread(job)], units, lambda: any(tmp_path.rglob("*.feather")), 1), units)
     assert 0 < len(flow_files(tmp_path)) < PAIRS
     assert len(counters.waiting) + len(flow_files(tmp_path)) == counters.total
 
