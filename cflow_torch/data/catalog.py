@@ -144,8 +144,9 @@ def _user_logs(target: str, settings: Mapping[str, Any]) -> Sequence[Log]:
             raise cause from None
         if not isinstance(cause, ImportError):  # its author wants to see where
             _log.error("the reader %s fails", target, exc_info=cause)
+        place = "" if not isinstance(cause, ImportError) else "; put its module beside the configuration, or install it"
         raise CFlowError(
-            f"the reader {target} fails: {type(cause).__name__}: {' '.join(str(cause).split())}"
+            f"the reader {target} fails: {type(cause).__name__}: {' '.join(str(cause).split())}{place}"
         ) from error
     if hasattr(made, "sweep"):
         return [made]

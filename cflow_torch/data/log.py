@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Iterator, List, Optional, Protocol, Sequence
+from typing import Any, Iterator, List, Optional, Protocol, Sequence, Union
 
 import numpy as np
 from torch.utils.data import Dataset
@@ -96,7 +96,7 @@ class WindowDataset(Dataset):  # type: ignore[type-arg]
     """The windows of some logs, for a `torch.utils.data.DataLoader`, whose workers then read the files.
 
     Args:
-        logs: any number; each must be one that can be pickled, where the workers do not begin as forks.
+        logs: one or any number; each must be one that can be pickled, where the workers do not begin as forks.
         num_history, num_future: as in `window`.
 
     Example:
@@ -106,8 +106,9 @@ class WindowDataset(Dataset):  # type: ignore[type-arg]
         ...     results = model(batch)
     """
 
-    def __init__(self, logs: Sequence[Log], num_history: int = 0, num_future: int = 0) -> None:
-        self._pairs = [(log, index) for log in logs for index in range(len(log.timestamps) - 1)]
+    def __init__(self, logs: Union[Log, Sequence[Log]], num_history: int = 0, num_future: int = 0) -> None:
+        several: Any = [logs] if hasattr(logs, "timestamps") else logs
+        self._pairs = [(log, index) for log in several for index in range(len(log.timestamps) - 1)]
         self._num_history, self._num_future = num_history, num_future
         self._recent: Optional[RecentSweeps] = None
 

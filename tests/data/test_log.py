@@ -74,6 +74,10 @@ def test_a_data_loader_with_workers_equals_the_loop(drive: Drive) -> None:
         assert all(np.array_equal(values, other.numpy()[name]) for name, values in one.numpy().items())
 
 
+def test_one_log_is_a_data_set_as_well(drive: Drive) -> None:
+    assert len(WindowDataset(drive)) == len(WindowDataset([drive])) == len(drive.timestamps) - 1
+
+
 # ---------------------------------------------------------------- results
 
 
