@@ -46,7 +46,10 @@ def written(name: str, folder: Path) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("name", ["arrays", "bags", "hdf5", *FORMATS])
+OTHERS = (pytest.param(name, marks=pytest.mark.slow) for name in FORMATS if name != "av2")
+
+
+@pytest.mark.parametrize("name", ["arrays", "av2", "bags", "hdf5", *OTHERS])
 def test_a_path_is_enough(name: str, tmp_path: Path, cflow: Cflow, capsys: pytest.CaptureFixture) -> None:
     root = written(name, tmp_path / "data")
     call = ("flow", root, f"output={tmp_path / 'out'}", "model=paper", SMALL, "engine.workers=1", "data.check=false")
@@ -121,7 +124,7 @@ def mine(tmp_path: Path) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("workers", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_a_reader_of_one_s_own_by_configuration_alone(
     workers: int, mine: Path, cflow: Cflow, capsys: pytest.CaptureFixture
 ) -> None:

@@ -61,6 +61,7 @@ def deadly(fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Call
     return mark
 
 
+@pytest.mark.slow
 def test_workers_that_die_once_lose_nothing_and_one_without_memory_its_frame(
     fleet: Path, single: Dict[str, bytes], tmp_path: Path, deadly: Any
 ) -> None:

@@ -21,6 +21,7 @@ from cflow_torch.fleet.ray_engine import run_ray
 pytest.importorskip("ray", reason="Ray is not installed: pip install ray")
 
 
+@pytest.mark.slow
 def test_equals_the_local_engine_byte_for_byte(fleet: Path, single: Dict[str, bytes], tmp_path: Path) -> None:
     before = signal.getsignal(signal.SIGTERM)
     report = run(fleet, tmp_path, TWO, engine="ray")
