@@ -157,17 +157,16 @@ class SceneFlowModel(nn.Module):
 
 
 def _results(batch: Batch, motion: Motion) -> List[FlowResult]:
-    """One full-length result per window, for all rows of its pc0; those that took no part have residual flow 0."""
-    results = []
-    for source in batch.sources:
-        points = source.points
-        cluster, is_valid = motion.cluster(points), batch.has_result[points].clone()
-        residual = motion.residual_flow(points, batch.positions[:, points])
-        cluster_id, score = (values.index_select(0, cluster) for values in (motion.cluster_id, motion.score))
-        confidence = motion.confidence
-        if confidence is not None:
-            confidence = confidence.index_select(0, cluster).masked_fill_(~is_valid, 0.0)
-        results.append(
-            FlowResult(residual, source.pose_flow, residual + source.pose_flow, cluster_id, score, is_valid, confidence)
-        )
-    return results
+    """One full-length result per window, for all rows of its pc0; those that took no part have residual flow 0. The
+    results of a batch lie in the same memory, one behind the other."""
+    points = slice(batch.rows[0].start, batch.rows[-1].stop)
+    cluster, is_valid = motion.cluster(points), batch.has_result[points].clone()
+    residual = motion.residual_flow(points, batch.positions[:, points])
+    cluster_id, score = (values.index_select(0, cluster) for values in (motion.cluster_id, motion.score))
+    confidence = motion.confidence
+    if confidence is not None:
+        confidence = confidence.index_select(0, cluster).masked_fill_(~is_valid, 0.0)
+    columns = (residual, batch.pose_flow, residual + batch.pose_flow, cluster_id, score, is_valid, confidence)
+    sizes = [rows.stop - rows.start for rows in batch.rows]
+    of_window = [[None] * len(sizes) if column is None else column.split(sizes) for column in columns]
+    return [FlowResult(*fields) for fields in zip(*of_window)]

@@ -68,7 +68,7 @@ class Scale:
         """The same pixels with sweep t moved by `flow`."""
         batch = self.sweeps.batch
         flow = torch.zeros_like(batch.positions)
-        flow[:, batch.sources[0].points] = torch.from_numpy(self.flow).T[: len(flow)]
+        flow[:, batch.rows[0]] = torch.from_numpy(self.flow).T[: len(flow)]
         return _pair(project(batch, flow, self.sweeps.grid))
 
 
@@ -130,7 +130,7 @@ def scales(window: Window, config: Config) -> Tuple[List[Scale], FlowResult]:
 
     model.motion_at_scale = watched
     (result,) = model([window])
-    points = seen[0][0].batch.sources[0].points
+    points = seen[0][0].batch.rows[0]
     so_far = [sweeps.flow for sweeps, _ in seen if sweeps.flow is not None]
     flows = [F.pad(flow[:, points].T, (0, 3 - len(flow))) for flow in so_far] + [result.residual_flow.double()]
     return [Scale(*given, flow.numpy()) for given, flow in zip(seen, flows)], result

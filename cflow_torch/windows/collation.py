@@ -2,30 +2,20 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
-from typing import Iterator, List, Optional, Sequence, Tuple
+from itertools import accumulate
+from typing import Optional, Sequence, Tuple, Union
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from cflow_torch.config import Config
-from cflow_torch.ops.chunks import chunks
 from cflow_torch.ops.indices import flat_nonzero, split_index
-from cflow_torch.types import Sweep, Window
+from cflow_torch.types import Window
 from cflow_torch.windows.bev_grid import Grid
-from cflow_torch.windows.ego_motion import compensate, rigid_transform
 from cflow_torch.windows.ground_heights import GroundHeights
-from cflow_torch.windows.point_times import has_point_times, read_point_times
-from cflow_torch.windows.validation import (
-    check_distance,
-    elapsed_times,
-    keep_nearest,
-    read_ground,
-    read_positions,
-    source_sweeps,
-)
+from cflow_torch.windows.pieces import groups_of, read_pieces
+from cflow_torch.windows.timeline import Timeline
 
 
 @dataclass(frozen=True)
@@ -51,7 +41,8 @@ class Batch:
             scales a warp (0 for step 0 and for sweeps that a window lacks, negative for sweeps after t+1).
         seconds: (B, S) float64, the same in seconds, for `max_speed`.
         origin: (B, S, 3) float64, metres, frame of t+1: where the ego frame of each sweep has its origin.
-        sources: of each window, what its result is made of.
+        rows: of each window, where the rows of its pc0 are among the P points; they follow each other.
+        pose_flow: (N, 3) float32, metres, T_ego1_ego0 p - p of all rows of pc0; 0 for points that are not finite.
         ground: of the ground points of t and t+1; None = nothing asks.
         point_times: (P,) float32, sweep intervals from the instant of its sweep to the measurement of each point, whole
             2^-20; 0 in windows of which a sweep has none. None = no window has them, or nothing asks.
@@ -67,7 +58,8 @@ class Batch:
     elapsed: Tensor
     seconds: Tensor
     origin: Tensor
-    sources: Tuple[Source, ...]
+    rows: Tuple[slice, ...]
+    pose_flow: Tensor
     ground: Optional[GroundHeights] = None
     point_times: Optional[Tensor] = None
 
@@ -89,19 +81,6 @@ class Batch:
             origin=self.origin.index_select(1, kept),
             point_times=None if self.point_times is None else self.point_times.index_select(0, rows),
         )
-
-
-@dataclass(frozen=True)
-class Source:
-    """pc0 of one window: its N rows.
-
-    Args:
-        points: where they are among the P points of the batch.
-        pose_flow: (N, 3) float32.
-    """
-
-    points: slice
-    pose_flow: Tensor
 
 
 def make_batch(
@@ -132,73 +111,50 @@ def make_batch(
         CFlowError: wrong shape or dtype, a transform that is not rigid, mixed devices, poses for some sweeps
             only, more sweeps after t+1 than `num_future`, time stamps out of order, poses too far apart.
 
-    Cost: linear in points; the only Python loop over sweeps, because they arrive as a list.
+    Cost: linear in points; the only Python loops over sweeps, because they arrive as lists; on a GPU each
+        is read by itself, and what follows is done for all at once.
     """
-    windows = [keep_nearest(window, config.num_history) for window in windows]
-    kept = [source_sweeps(window, config) for window in windows]
-    num_future = [sum(way < 0 for _, _, way in sources) for sources in kept]
-    first_future = 1 + max(len(sources) - count for sources, count in zip(kept, num_future))
-    num_steps = first_future + max(num_future)
-    elapsed, seconds = np.zeros((2, len(windows), num_steps))
-    origin = np.zeros((len(windows), num_steps, 3))
-    sweeps: List[Tuple[int, int, str, Sweep]] = []
-    for index, (window, sources, count) in enumerate(zip(windows, kept, num_future)):
-        steps = [*range(1, 1 + len(sources) - count), *range(first_future, first_future + count)]
-        elapsed[index, steps], seconds[index, steps] = zip(*elapsed_times(window, sources, config))
-        sweeps.append((0, index, "pc1", window.pc1))
-        sweeps += [(step, index, name, sweep) for step, (name, sweep, _) in zip(steps, sources)]
-    sweeps.sort(key=lambda entry: entry[0])  # stable: all t+1, then all t, then what is older, then what is newer
-    farthest = max(map(abs, (*grid.lower[:2], *grid.upper[:2])))
-    to_ego1 = [
-        None if window.pc1.pose is None else np.linalg.inv(rigid_transform(window.pc1.pose, "pose1", farthest))
-        for window in windows
-    ]
-
+    timeline = Timeline.of(windows, config, grid, needs_times)
     ground = GroundHeights(len(windows), grid, device) if needs_ground else None
-    most = sum(sweep.points.shape[0] for _, _, _, sweep in sweeps)
+    most, num_steps = sum(entry.sweep.points.shape[0] for entry in timeline.entries), timeline.table.shape[2]
     positions = torch.empty((num_axes, most), dtype=torch.float64, device=device)
     takes_part = torch.ones(most, dtype=torch.bool, device=device)
     region = Grid(grid.pixel_size, config.point_cloud_range[:3], config.point_cloud_range[3:])
     has_result = takes_part if region == grid else torch.ones_like(takes_part)
     image = torch.empty(most, dtype=torch.int32, device=device)
-    has_times = [needs_times and has_point_times(window, sources) for window, sources in zip(windows, kept)]
-    point_times = torch.zeros(most, dtype=torch.float32, device=device) if any(has_times) else None
-    stop, num_newest, of_pc0 = 0, 0, []
-    for step, index, name, sweep in sweeps:
-        start, transform = stop, None
-        if step > 0 and to_ego1[index] is not None:
-            transform = to_ego1[index] @ rigid_transform(sweep.pose, f"pose of {name}", farthest)
-            check_distance(transform, name)
-            origin[index, step] = transform[:3, 3]
-        if step == 1:
-            with torch.inference_mode(False):  # becomes part of the result
-                pose_flow = torch.zeros((sweep.points.shape[0], 3), dtype=torch.float32, device=device)
-            of_pc0.append(Source(slice(start, start + len(pose_flow)), pose_flow))
-        interval = seconds[index, 1] / elapsed[index, 1]
-        times = read_point_times(sweep, name, interval, device) if has_times[index] else None
-        for rows, raw, moved, inside, ground_inside in _pieces(
-            sweep, name, transform, 3 if step == 1 else num_axes, grid, config, device
-        ):
-            if ground is not None and ground_inside is not None and step <= 1:
-                ground.add(index, moved.index_select(1, flat_nonzero(ground_inside)))
-            if step == 1:  # all rows
-                points = slice(stop, stop + inside.numel())
-                positions[:, points] = moved[:num_axes]
-                takes_part[points] = inside
+    has_times = any(entry.interval is not None for entry in timeline.entries)
+    point_times = torch.zeros(most, dtype=torch.float32, device=device) if has_times else None
+    num_rows = [window.pc0.points.shape[0] for window in windows]
+    with torch.inference_mode(False):  # becomes part of the results
+        pose_flow = torch.zeros((sum(num_rows), 3), dtype=torch.float32, device=device)
+    stop = num_newest = 0
+    for group in groups_of(timeline.entries, device):
+        first_step = group[0].step
+        for piece in read_pieces(group, 3 if first_step == 1 else num_axes, grid, config, device):
+            if ground is not None and piece.is_ground is not None and first_step <= 1:
+                found = flat_nonzero(piece.is_ground)
+                ground.add(_take(piece.window, found), piece.moved.index_select(1, found))
+            if first_step == 1:  # all rows
+                points = slice(stop, stop + piece.takes_part.numel())
+                positions[:, points] = piece.moved[:num_axes]
+                takes_part[points] = piece.takes_part
                 if has_result is not takes_part:
-                    torch.logical_and(inside, region.contains(moved), out=has_result[points])
-                if transform is not None:
-                    _write_pose_flow(pose_flow[rows], raw, moved)
+                    torch.logical_and(piece.takes_part, region.contains(piece.moved), out=has_result[points])
+                row = None
             else:
-                row = flat_nonzero(inside)
+                row = flat_nonzero(piece.takes_part)
                 points = slice(stop, stop + row.numel())
-                for values, of_axis in zip(positions[:, points].unbind(0), moved.unbind(0)):
+                for values, of_axis in zip(positions[:, points].unbind(0), piece.moved.unbind(0)):
                     torch.index_select(of_axis, 0, row, out=values)
-            if times is not None and point_times is not None:
-                point_times[points] = times[rows] if step == 1 else times[rows].index_select(0, row)
+            image[points] = _take(piece.window * num_steps + piece.step, row)
+            if point_times is not None and piece.times is not None:
+                point_times[points] = _take(piece.times, row)
+            if first_step == 1 and piece.moved is not piece.raw:
+                _write_pose_flow(pose_flow[stop - num_newest : points.stop - num_newest], piece.raw, piece.moved)
             stop = points.stop
-        image[start:stop] = index * num_steps + step
-        num_newest = stop if step == 0 else num_newest
+        num_newest = stop if first_step == 0 else num_newest
+    elapsed, seconds, *origin = torch.as_tensor(timeline.table, device=device).unbind(0)
+    starts = [num_newest, *(num_newest + last for last in accumulate(num_rows))]
     return Batch(
         positions=positions[:, :stop],
         takes_part=takes_part[:stop],
@@ -207,48 +163,19 @@ def make_batch(
         num_newest=num_newest,
         num_windows=len(windows),
         num_steps=num_steps,
-        elapsed=torch.as_tensor(elapsed, device=device),
-        seconds=torch.as_tensor(seconds, device=device),
-        origin=torch.as_tensor(origin, device=device),
-        sources=tuple(of_pc0),
+        elapsed=elapsed,
+        seconds=seconds,
+        origin=torch.stack(origin, 2),
+        rows=tuple(slice(*ends) for ends in zip(starts, starts[1:])),
+        pose_flow=pose_flow,
         ground=ground,
         point_times=None if point_times is None else point_times[:stop],
     )
 
 
-def _pieces(
-    sweep: Sweep,
-    name: str,
-    transform: Optional[np.ndarray],
-    num_axes: int,
-    grid: Grid,
-    config: Config,
-    device: torch.device,
-) -> Iterator[Tuple[slice, Tensor, Tensor, Tensor, Optional[Tensor]]]:
-    """A sweep piece by piece.
-
-    Yields:
-        Rows; (3, N) positions as given; (A or 3, N) in the frame of t+1; (N,) takes part; (N,) is ground
-        inside the region, if known.
-    """
-    num_points = sweep.points.shape[0]
-    is_ground = None if sweep.is_ground is None else read_ground(sweep, name, num_points, device)
-    # z matters where the region bounds it. After a transform, a z that is not finite has spoiled x and y as well.
-    is_flat = transform is not None and math.isinf(grid.lower[2]) and math.isinf(grid.upper[2])
-    checked_axes = 2 if is_flat else 3
-    matrix = None if transform is None else torch.as_tensor(transform, device=device)
-    for rows in chunks(0, num_points, device):
-        raw = read_positions(sweep, device, rows)
-        moved = compensate(raw, matrix, max(num_axes, checked_axes))
-        inside = grid.contains(moved[:checked_axes])
-        ground_inside = None
-        if is_ground is not None:
-            ground_inside = inside & is_ground[rows]
-            inside &= ~is_ground[rows]
-        if config.ego_box is not None:
-            x0, y0, x1, y1 = config.ego_box
-            inside &= (raw[0] < x0) | (raw[0] > x1) | (raw[1] < y0) | (raw[1] > y1)
-        yield rows, raw, moved, inside, ground_inside
+def _take(values: Union[int, Tensor], row: Optional[Tensor]) -> Union[int, Tensor]:
+    """Values of some points, None = of all; a number stands for the same value everywhere."""
+    return values if row is None or not isinstance(values, Tensor) else values.index_select(0, row)
 
 
 def _write_pose_flow(pose_flow: Tensor, raw: Tensor, moved: Tensor) -> None:

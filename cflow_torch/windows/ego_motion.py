@@ -90,7 +90,8 @@ def compensate(positions: Tensor, T_ego1_ego: Optional[Array], num_axes: int = 3
 
     Args:
         positions: (3, N) float64, metres, in the ego frame of their sweep; rows x, y, z.
-        T_ego1_ego: (4, 4) float64, array or tensor, None = already in the frame of t+1.
+        T_ego1_ego: (4, 4) float64, array or tensor, or (4, 4, N), one for each point; None = already in the frame of
+            t+1.
         num_axes: A, how many coordinates are asked for: 2 = x and y only.
 
     Returns:
@@ -105,7 +106,8 @@ def compensate(positions: Tensor, T_ego1_ego: Optional[Array], num_axes: int = 3
     if T_ego1_ego is None:
         return positions[:num_axes]
     x, y, z = positions.unbind(0)
-    r0, r1, r2, t = torch.as_tensor(T_ego1_ego[:num_axes], dtype=torch.float64, device=x.device)[:, :, None].unbind(1)
+    matrix = torch.as_tensor(T_ego1_ego[:num_axes], dtype=torch.float64, device=x.device)
+    r0, r1, r2, t = matrix.view(*matrix.shape[:2], -1).unbind(1)
     result = r0 * x
     term = r1 * y
     result += term

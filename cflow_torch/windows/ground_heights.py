@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Union
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -32,12 +34,17 @@ class GroundHeights:
         self._heights = torch.zeros((num_windows, *shape), dtype=torch.int64, device=device)
         self._counts = torch.zeros_like(self._heights)
 
-    def add(self, window: int, positions: Tensor) -> None:
-        """Count ground points, (3, N) float64, metres, frame of t+1, inside the region."""
-        block = self._block(positions)
+    def add(self, window: Union[int, Tensor], positions: Tensor) -> None:
+        """Count ground points.
+
+        Args:
+            window: (N,) int64, or one for all.
+            positions: (3, N) float64, metres, frame of t+1, inside the region.
+        """
+        block = self._block(positions).long() + window * self._heights[0].numel()
         height = torch.floor(positions[2] * 100).clamp_(-_HIGHEST, _HIGHEST).long()
-        self._heights[window].view(-1).index_add_(0, block, height)
-        self._counts[window].view(-1).index_add_(0, block, torch.ones_like(height))
+        self._heights.view(-1).index_add_(0, block, height)
+        self._counts.view(-1).index_add_(0, block, torch.ones_like(height))
 
     def mean(self) -> Tensor:
         """(B, Y, X) int64, centimetres: mean over 3 x 3 blocks, rounded down; far below everything where they hold

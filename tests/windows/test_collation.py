@@ -150,7 +150,7 @@ def test_a_batch_by_hand():
     assert batch.positions[:, [0, 7]].t().tolist() == [[2.0, 3.0], [-3.0, 1.0]]
     assert batch.elapsed.tolist() == [[0, 1, 2], [0, 1, 0]]
     assert batch.seconds.tolist() == [[0, 0.1, 0.2], [0, 0.2, 0]]
-    assert [source.points for source in batch.sources] == [slice(3, 6), slice(6, 7)]
+    assert batch.rows == (slice(3, 6), slice(6, 7))
 
 
 def test_windows_are_grouped_by_memory(monkeypatch):
