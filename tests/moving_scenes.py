@@ -220,5 +220,6 @@ def _batch(positions: torch.Tensor, image: torch.Tensor, elapsed: torch.Tensor) 
         elapsed=elapsed,
         seconds=elapsed * 0.1,
         origin=torch.zeros((*elapsed.shape, 3), dtype=torch.float64),
-        sources=(),
+        rows=(),
+        pose_flow=torch.zeros(0, 3),
     )
