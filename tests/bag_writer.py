@@ -29,9 +29,13 @@ class BagWriter:
             definition, name = "geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"
             self.types.register(typesys.get_types_from_msg(definition, name))
             self.bag = rosbag1.Writer(folder / "drive.bag")
-        else:
+        elif hasattr(rosbag2, "StoragePlugin"):
             plugin = {"ros2": rosbag2.StoragePlugin.SQLITE3, "mcap": rosbag2.StoragePlugin.MCAP}[form]
             self.bag = rosbag2.Writer(folder / "drive", version=9, storage_plugin=plugin)
+        elif form == "ros2":  # rosbags of Python 3.8
+            self.bag = rosbag2.Writer(folder / "drive")
+        else:
+            pytest.skip("this version of rosbags does not write MCAP")
         self.ros1, self.topics = ros1, {}
         self.bag.open()
 

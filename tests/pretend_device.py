@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils import backend_registration
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves, tree_map
+from torch.utils._pytree import tree_flatten, tree_map
 
 IS_THERE = hasattr(backend_registration, "_setup_privateuseone_for_python_backend")
 # The size or the value of the result decides what the host does next.
@@ -85,7 +85,7 @@ class PretendDevice(TorchDispatchMode):
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = dict(kwargs or {})
         name = func._schema.name.split("::")[1]
-        tensors = [x for x in tree_leaves((args, kwargs)) if isinstance(x, Tensor)]
+        tensors = [x for x in tree_flatten((args, kwargs))[0] if isinstance(x, Tensor)]
         remote = [x for x in tensors if isinstance(x, _Remote)]
         local = [x for x in tensors if not isinstance(x, _Remote)]
         target = torch.device(kwargs["device"]) if kwargs.get("device") is not None else None
