@@ -64,7 +64,8 @@ def static_world_residual(log: Log, index: int, baseline: int = BASELINE) -> Sta
     """Compare two sweeps of a log in one frame.
 
     Args:
-        log: with poses; without ground masks, low points are left out by a simple rule.
+        log: without poses the sensor is taken to stand still; without ground masks, low points are left out by a
+            simple rule.
         index: the older sweep.
         baseline: sweeps to the later one.
 
@@ -76,7 +77,7 @@ def static_world_residual(log: Log, index: int, baseline: int = BASELINE) -> Sta
         the turn, 12 cm for 1.35 m and 5 degrees.
 
     Raises:
-        CFlowError: no such pair of sweeps, or they have no poses.
+        CFlowError: no such pair of sweeps.
 
     Cost: reads two sweeps and takes about 0.15 s on one core.
 
@@ -86,9 +87,8 @@ def static_world_residual(log: Log, index: int, baseline: int = BASELINE) -> Sta
     if baseline < 1 or not 0 <= index < count - baseline:
         raise CFlowError(f"log {log.log_id} has {count} sweeps; there is no pair {index}, {index + baseline}")
     older, newer = log.sweep(index), log.sweep(index + baseline)
-    if older.pose is None or newer.pose is None:
-        raise CFlowError(f"log {log.log_id} has no poses to check; see cflow_torch.data.odometry")
-    pose0, pose1 = rigid_transform(older.pose, "pose"), rigid_transform(newer.pose, "pose")
+    has_poses = older.pose is not None and newer.pose is not None
+    pose0, pose1 = (rigid_transform(s.pose, "pose") if has_poses else np.eye(4) for s in (older, newer))
     T_1_0 = np.linalg.inv(pose1) @ pose0
     source, target = _structure(older), _structure(newer)[:, :2]
     patches = _Patches(target)
@@ -115,6 +115,11 @@ def static_world_residual(log: Log, index: int, baseline: int = BASELINE) -> Sta
             "LiDAR with poses of the vehicle do this in turns: pass ego_T_lidar. Other causes: axes or times of the "
             "poses, sweeps that are not de-skewed."
         )
+    if verdict and not has_poses:
+        verdict = (
+            "There are no poses, and the sensor seems to move: give poses, or data.odometry=true (in Python "
+            "`with_poses` of cflow_torch.data.odometry)."
+        )
     return StaticResidual(index, index + baseline, shift, turn, agreement, aligned, verdict)
 
 
@@ -125,7 +130,7 @@ def check_static_world(log: Log) -> List[StaticResidual]:
         log: any log. The pairs are those over which the vehicle turns most, if it has `poses`, else first and last.
 
     Returns:
-        What was found; empty for a log without poses.
+        What was found; empty for a log of one sweep.
 
     Warns:
         StaticWorldWarning: once, with the verdict on the worst pair.
@@ -133,7 +138,7 @@ def check_static_world(log: Log) -> List[StaticResidual]:
     Cost: reads two sweeps a pair; 0.15 s each.
     """
     baseline = min(BASELINE, len(log.timestamps) - 1)
-    if baseline < 1 or log.sweep(0).pose is None:
+    if baseline < 1:
         return []
     found = [static_world_residual(log, index, baseline) for index in _choose(log, baseline)]
     bad = [residual for residual in found if residual.verdict]

@@ -138,7 +138,7 @@ def format_report(report: Dict[str, Any]) -> str:
 
 def format_missing(report: Dict[str, Any]) -> str:
     """What is not there, a line each; "" if nothing is missing."""
-    lines: List[str] = [f"  {name}: {message}" for name, message in report["failures"]]
+    lines: List[str] = list(dict.fromkeys(f"  {name}: {message}" for name, message in report["failures"]))  # of parts
     lines += [f"  {name}: not done" for name in report["waiting"]]
     if len(lines) > _SHOWN:
         lines[_SHOWN:] = [f"  and {len(lines) - _SHOWN} more, all of them in the report"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from cflow_torch.data.bags import BagLog
 from cflow_torch.data.bags.point_cloud2 import points_and_times, seconds_after
 from cflow_torch.data.catalog import find_sources, open_log
 from cflow_torch.data.log import window
+from cflow_torch.data.log_check import SkewWarning, check_log
 
 
 @pytest.fixture
@@ -67,10 +69,22 @@ def test_without_poses(recording: TinyRecording, tmp_path: Path) -> None:
     assert np.allclose(sweep.points, expected, atol=1e-4)
 
 
+def test_a_field_of_times_that_is_not_known_is_told(recording: TinyRecording, tmp_path: Path) -> None:
+    path = write_bag(tmp_path, "ros1", recording)
+    log = BagLog(path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", SkewWarning)
+        check_log(log)
+        path.write_bytes(path.read_bytes().replace(b"\x01\x00\x00\x00t", b"\x01\x00\x00\x00u"))
+        check_log(BagLog(path, deskew=False))
+    with pytest.warns(SkewWarning, match="deskew"):
+        check_log(BagLog(path))
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({}, r"2 topics of type .*PointCloud2: choose one with topic=.*/other"),
+        ({}, r"2 topics of type .*PointCloud2.*data.topic=NAME.*/other"),
         ({"topic": "/scan"}, "topic=/scan"),
         ({"topic": "/other", "poses": "/odom"}, "poses=/odom"),
         ({"topic": "/other", "frame": "base_link"}, "no transform leads from velodyne to base_link"),

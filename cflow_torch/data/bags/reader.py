@@ -65,7 +65,7 @@ class BagLog(NumberedSweeps):
         poses: (K, 4, 4) float64 `T_world_ego` of every sweep; None = unknown.
         timestamps: nanoseconds, of the clouds' headers (where they are 0: of their arrival). Clouds before the first
             or after the last pose are left out.
-        topic, frame: those in use.
+        topic, frame, deskew: those in use.
 
     Convention: points are float32 in the ego frame; poses are float64 `T_world_ego`, the world being the root of the
         transforms, or that of the topic, interpolated at the time of the cloud. A topic's poses are those of its
@@ -92,7 +92,7 @@ class BagLog(NumberedSweeps):
         if is_remote(self.path):
             raise CFlowError(f"{self.path}: bags are read from this machine only; copy it here")
         self.log_id = self.path.resolve().stem if self.path.is_file() else self.path.resolve().name
-        self._deskew = deskew
+        self.deskew = deskew
         self.poses: Optional[np.ndarray] = None
         self._opened: Tuple[int, Any] = (0, None)
         self._mount = None if ego_T_lidar is None else rigid_transform(ego_T_lidar, "ego_T_lidar")
@@ -129,7 +129,7 @@ class BagLog(NumberedSweeps):
             points = moved(points, mount)
         if self.poses is None:
             return Sweep(points.astype(np.float32), None, None, time, times)
-        if times is not None and self._deskew:
+        if times is not None and self.deskew:
             shots, group = np.unique(np.round(times / _SLICE).astype(np.int64), return_inverse=True)
             at = poses_at(time + shots * round(_SLICE * 1e9), self._known_times, self._known_poses)
             T = (np.linalg.inv(self.poses[index]) @ at)[group]
@@ -166,7 +166,10 @@ class BagLog(NumberedSweeps):
         if len(found) != 1:
             there = shortened(", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items())))
             what = f"{setting}={name}" if name else f"{len(found)} topics"
-            raise CFlowError(f"{what} of type {' or '.join(types)}: choose one with {setting}=...; the bag has {there}")
+            raise CFlowError(
+                f"{what} of type {' or '.join(types)}: choose one with {setting}=NAME, "
+                f"in commands data.{setting}=NAME; the bag has {there}"
+            )
         return found[0]
 
     def _scan(self) -> Tuple[Dict[int, int], Dict[str, List[Sample]]]:
