@@ -35,6 +35,8 @@ OLD_FRAME = (
 def sequence(tmp_path: Path) -> Path:
     """Three sweeps of two LiDARs. The car has a cuboid for each of them, the parked one a cuboid for both."""
     pandas = pytest.importorskip("pandas", reason="writes the files")
+    if int(pandas.__version__.partition(".")[0]) > 2:
+        pytest.skip("the reader refuses what pandas 3 writes; the released files are of pandas 1")
     recording, folder = TinyRecording(num_sweeps=3), tmp_path / "pandaset" / "042"
     (folder / "lidar").mkdir(parents=True)
     (folder / "annotations" / "cuboids").mkdir(parents=True)
