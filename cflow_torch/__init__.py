@@ -6,6 +6,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, List
 
 if TYPE_CHECKING:
+    from cflow_torch.applications.stream import FlowStream
     from cflow_torch.config import Config, make_config
     from cflow_torch.dense.method import CorrelationFlow
     from cflow_torch.estimate import estimate_flow, make_model
@@ -21,6 +22,7 @@ __all__ = [
     "CorrelationFlow",
     "CorrelationFlowKeypoints",
     "FlowResult",
+    "FlowStream",
     "Sweep",
     "VerifiedFlow",
     "Window",
@@ -37,6 +39,7 @@ _MODULES = {
     "CorrelationFlow": "dense.method",
     "CorrelationFlowKeypoints": "keypoints.method",
     "FlowResult": "types",
+    "FlowStream": "applications.stream",
     "Sweep": "types",
     "VerifiedFlow": "verified.method",
     "Window": "types",

@@ -28,6 +28,7 @@ _TYPES: Dict[str, Any] = {
     "cluster": Optional[int],
     "experiment_name": Optional[str],
     "max_flow": Optional[float],
+    "pace": Optional[float],
 }
 
 

@@ -52,31 +52,55 @@ def poses_from_odometry(log: Log) -> np.ndarray:
 
 def _register(log: Log, order: Sequence[int]) -> List[np.ndarray]:
     """Poses of sweeps in the order given, the world being that of the first of them."""
-    try:
-        from kiss_icp.config import load_config
-        from kiss_icp.kiss_icp import KissICP
-    except ImportError:
-        raise CFlowError(
-            f"log {log.log_id} has no poses, and estimating them needs KISS-ICP: pip install kiss-icp, "
-            "or give poses (for bare arrays T_ego1_ego0, for a folder poses.txt)"
-        ) from None
-    config = load_config(None)
-    config.data.deskew = False
-    config.data.max_range = _MAX_RANGE
-    config.mapping.voxel_size = _MAX_RANGE / 100
-    config.registration.max_num_threads = 1
-    odometry = KissICP(config)
-    poses = []
-    for index in tqdm(order, desc="odometry", unit="sweep", disable=None):
-        points = np.asarray(log.sweep(index).points)[:, :3].astype(np.float64)
+    odometry = Odometry()
+    return [
+        odometry.next_pose(np.asarray(log.sweep(index).points), f"sweep {index} of log {log.log_id}")
+        for index in tqdm(order, desc="odometry", unit="sweep", disable=None)
+    ]
+
+
+class Odometry:
+    """KISS-ICP with the settings of `poses_from_odometry`, sweep after sweep.
+
+    Raises:
+        CFlowError: KISS-ICP is not installed.
+    """
+
+    def __init__(self) -> None:
+        try:
+            from kiss_icp.config import load_config
+            from kiss_icp.kiss_icp import KissICP
+        except ImportError:
+            raise CFlowError(
+                "there are no poses, and estimating them needs KISS-ICP: pip install kiss-icp, "
+                "or give poses (for bare arrays T_ego1_ego0, for a folder poses.txt)"
+            ) from None
+        config = load_config(None)
+        config.data.deskew = False
+        config.data.max_range = _MAX_RANGE
+        config.mapping.voxel_size = _MAX_RANGE / 100
+        config.registration.max_num_threads = 1
+        self._odometry = KissICP(config)
+
+    def next_pose(self, points: np.ndarray, name: str) -> np.ndarray:
+        """`T_world_ego` of the next sweep; the world is the ego frame of the first.
+
+        Args:
+            points: (N, 3+) float, metres.
+            name: what to call the sweep in an error.
+
+        Returns:
+            (4, 4) float64.
+
+        Raises:
+            CFlowError: fewer than 100 finite points in range, or the result is no rigid motion.
+        """
+        points = points[:, :3].astype(np.float64)
         points = points[np.isfinite(points).all(1)]
         if (np.linalg.norm(points, axis=1) < _MAX_RANGE).sum() < _FEWEST_POINTS:
-            raise CFlowError(
-                f"sweep {index} of log {log.log_id} has fewer than {_FEWEST_POINTS} points within {_MAX_RANGE} m"
-            )
-        odometry.register_frame(np.ascontiguousarray(points), np.zeros(len(points)))
-        poses.append(rigid_transform(odometry.last_pose, f"the pose that KISS-ICP gives for sweep {index}"))
-    return poses
+            raise CFlowError(f"{name} has fewer than {_FEWEST_POINTS} points within {_MAX_RANGE} m")
+        self._odometry.register_frame(np.ascontiguousarray(points), np.zeros(len(points)))
+        return rigid_transform(self._odometry.last_pose, f"the pose that KISS-ICP gives for {name}")
 
 
 class PosedLog(ChangedLog):

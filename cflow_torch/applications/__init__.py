@@ -1,0 +1,1 @@
+"""What is made of flow: labels, static sweeps, tracks, streams."""

@@ -1,0 +1,97 @@
+"""Plays a log as if it were live: each sweep is pushed when it was recorded, its flow is timed. OUTPUT/stream.json.
+
+The first log of the data. Latency counts from the moment a sweep is there to the flow of the sweep before it; what is
+late delays what follows. Sweeps without poses get them from KISS-ICP (extra odometry), within that time.
+
+examples:
+  cflow stream drive.bag                          in the time of the recording
+  cflow stream /data/av2/val/LOG pace=null        as fast as it goes
+  cflow stream drive.bag model=fast device=cuda
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from typing import Any, Dict, List
+
+import numpy as np
+from omegaconf import DictConfig
+from tqdm import tqdm
+
+from cflow_torch.applications.stream import FlowStream
+from cflow_torch.cli import run
+from cflow_torch.data.atomic import ready_folder
+from cflow_torch.data.log import Log
+from cflow_torch.data.records import strict, write_text
+from cflow_torch.types import CFlowError
+
+
+def task(cfg: DictConfig) -> None:
+    """Run `cflow stream`."""
+    output, pace = run.output_folder(cfg), cfg.pace
+    if pace is not None and not (isinstance(pace, (int, float)) and pace > 0):
+        raise CFlowError(f"pace={pace}: give a number above 0, 1 = as recorded, or null = as fast as it goes")
+    count = None if cfg.count is None else run.whole_number(cfg, "count", 2)
+    stream = FlowStream(config=run.make_model(cfg).config, device=cfg.device, max_gap=cfg.max_gap)
+    sources = run.find_logs(cfg)
+    log = sources.open(sources.logs[0])
+    ready_folder(output)
+    report = {"log": log.log_id, **play(stream, log, pace, count), "machine": run.machine(), "versions": run.versions()}
+    print(format_report(report))
+    write_text(output / "stream.json", json.dumps(strict(report), indent=1, allow_nan=False) + "\n")
+    print(f"written to {output / 'stream.json'}")
+
+
+def play(stream: FlowStream, log: Log, pace: Any = None, count: Any = None) -> Dict[str, Any]:
+    """Push the sweeps of a log.
+
+    Args:
+        stream: where to.
+        log: the sweeps.
+        pace: how many times faster than recorded; None = each as soon as the one before it is done.
+        count: so many sweeps; None = all.
+
+    Returns:
+        "sweeps", "results"; "latency": "p50" and "p99", seconds from the moment a sweep is due to the flow of the one
+        before it, so that what is late delays what follows; "interval": median seconds between sweeps, None where
+        `pace` is; "in_time": share of results that were there before the next sweep; "rate": sweeps per second.
+    """
+    stamps = np.array(log.timestamps[:count], dtype=np.int64)
+    due = None if pace is None else (stamps - stamps[0]) / 1e9 / pace
+    latencies: List[float] = []
+    begin = time.perf_counter()
+    progress = tqdm(range(len(stamps)), desc=f"stream {log.log_id}", unit="sweep", disable=None)
+    for index in progress:
+        sweep = log.sweep(index)
+        arrival = time.perf_counter() if due is None else begin + due[index]
+        time.sleep(max(arrival - time.perf_counter(), 0.0))
+        result = stream.push(sweep.points, sweep.pose, sweep.timestamp_ns, sweep.is_ground, sweep.point_times)
+        if result is not None:
+            result.is_valid.any().item()  # a GPU answers before it is done
+            latencies.append(time.perf_counter() - arrival)
+            progress.set_postfix_str(f"latency {1000 * latencies[-1]:.0f} ms")
+    seconds = time.perf_counter() - begin
+    p50, p99 = np.percentile(latencies or [np.nan], (50, 99)).tolist()
+    interval = None if due is None or len(due) < 2 else float(np.median(np.diff(due)))
+    return {
+        "sweeps": len(stamps),
+        "results": len(latencies),
+        "latency": {"p50": p50, "p99": p99},
+        "interval": interval,
+        "in_time": None if interval is None else float(np.mean(np.array(latencies) <= interval)),
+        "rate": len(stamps) / seconds,
+    }
+
+
+def format_report(report: Dict[str, Any]) -> str:
+    """What `cflow stream` prints."""
+    p50, p99 = (1000 * report["latency"][name] for name in ("p50", "p99"))
+    lines = [
+        f"log {report['log']}: {report['sweeps']} sweeps, {report['results']} results, {report['rate']:.1f} sweeps/s",
+        f"latency: median {p50:.0f} ms, 99 % within {p99:.0f} ms",
+    ]
+    if report["interval"] is not None:
+        share, interval = 100 * report["in_time"], 1000 * report["interval"]
+        lines.append(f"{share:.0f} % of the results were there before the next sweep (every {interval:.0f} ms)")
+    return "\n".join(lines)

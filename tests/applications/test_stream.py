@@ -1,0 +1,170 @@
+"""Streams: the flow of windows to the bit; gaps, late, repeated and bad sweeps, reused buffers, bounded memory."""
+
+from __future__ import annotations
+
+import gc
+import json
+import weakref
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, List, Optional
+
+import numpy as np
+import pytest
+import torch
+from preset_windows import small
+from scenes import assert_same_bits, scene
+
+from cflow_torch import CFlowError, FlowResult, FlowStream, Sweep, Window, make_model
+from cflow_torch.cli.main import main
+from cflow_torch.simulator import make_drive
+
+
+@pytest.fixture(scope="module")
+def sweeps() -> List[Sweep]:
+    """Seven sweeps of a vehicle that drives and turns, oldest first, 0.08 to 0.1 s apart, with ground."""
+    window = scene(12, num_history=5, stamps=True, num_points=90)
+    return [*window.pch[::-1], window.pc0, window.pc1]
+
+
+def push(stream: FlowStream, sweep: Sweep, **changes: Any) -> Optional[FlowResult]:
+    sweep = replace(sweep, **changes)
+    return stream.push(sweep.points, sweep.pose, sweep.timestamp_ns, sweep.is_ground, sweep.point_times)
+
+
+def expected(sweeps: List[Sweep], index: int, settings: Any) -> FlowResult:
+    """Flow of sweep `index` with all the history that there is."""
+    oldest = max(index - settings.num_history, 0)
+    (result,) = make_model(settings, "cpu")(
+        [Window(sweeps[index], sweeps[index + 1], tuple(sweeps[oldest:index][::-1]))]
+    )
+    return result
+
+
+@pytest.mark.parametrize("preset", ["default", "paper", "keypoints"])
+def test_results_are_those_of_windows(preset: str, sweeps: List[Sweep]) -> None:
+    settings = small(preset)
+    timed = [replace(s, point_times=np.linspace(0, 0.09, len(s.points))) for s in sweeps]
+    stream = FlowStream(config=settings, device="cpu")
+    assert push(stream, timed[0]) is None and stream.window is None
+    for index, sweep in enumerate(timed[1:]):
+        result = push(stream, sweep)
+        assert result is not None
+        assert_same_bits(result, expected(timed, index, settings))
+        assert np.array_equal(stream.window.pc0.points, timed[index].points, equal_nan=True)
+
+
+def test_only_what_is_needed_is_kept_and_buffers_may_be_reused(sweeps: List[Sweep]) -> None:
+    settings, buffer = small("paper", num_history=1), np.empty((2000, 3), np.float32)
+    stream, seen = FlowStream(config=settings), []
+    for index, sweep in enumerate(sweeps):
+        count = len(sweep.points)
+        buffer[:count] = sweep.points
+        result = push(stream, sweep, points=buffer[:count])
+        buffer.fill(7.0)
+        if result is not None:
+            assert_same_bits(result, expected(sweeps, index - 1, settings))
+            seen.append(weakref.ref(stream.window.pc0.points))
+    gc.collect()
+    assert [reference() is not None for reference in seen] == [False] * 4 + [True, True]
+
+
+def test_gaps_late_and_repeated_sweeps(sweeps: List[Sweep], caplog: pytest.LogCaptureFixture) -> None:
+    settings = small("fast", num_history=2)
+    stream = FlowStream(config=settings, max_gap=0.5)
+    for sweep in sweeps[:3]:
+        last = push(stream, sweep)
+    assert last is not None
+    assert push(stream, sweeps[2]) is None and push(stream, sweeps[1]) is None  # repeated, late
+    assert_same_bits(push(stream, sweeps[3]), expected(sweeps, 2, settings))  # as if they had not come
+    later = 1_000_000_000
+    lost = [replace(sweep, timestamp_ns=sweep.timestamp_ns + later) for sweep in sweeps[4:]]
+    assert push(stream, lost[0]) is None and "begins anew" in caplog.text
+    assert_same_bits(push(stream, lost[1]), expected(lost, 0, settings))  # no history from before
+    assert push(stream, sweeps[0]) is None  # the clock was set back: a bag from its start
+    assert_same_bits(push(stream, sweeps[1]), expected(sweeps, 0, settings))
+    stream.reset()
+    assert push(stream, sweeps[5]) is None
+
+
+def test_seconds_are_times_and_none_is_an_interval(sweeps: List[Sweep]) -> None:
+    settings = small("fast", num_history=2, max_speed=8.0)
+    regular = [replace(sweep, timestamp_ns=None) for sweep in sweeps]
+    stream, by_second = FlowStream(config=settings), FlowStream(config=settings)
+    for index, sweep in enumerate(regular[:4]):
+        result = push(stream, sweep)
+        again = by_second.push(sweep.points, sweep.pose, 10.0 + 0.1 * index, sweep.is_ground)
+        if index:
+            assert_same_bits(result, expected(regular, index - 1, settings))
+            assert torch.allclose(again.residual_flow, result.residual_flow, atol=1e-5)
+
+
+BAD = [
+    ({"points": np.zeros((5, 2))}, r"give \(N, 3\+\)", True),
+    ({"pose": np.zeros((4, 4))}, "not rigid", True),
+    ({"is_ground": np.zeros(3, bool)}, "one per point", True),
+    ({"pose": None}, "a pose and some have none", False),
+    ({"timestamp_ns": None}, "a time and some have none", False),
+]
+
+
+@pytest.mark.parametrize("bad, message, first", [*BAD, *(case[:2] + (False,) for case in BAD[:3])])
+def test_a_bad_sweep_is_refused_and_the_stream_goes_on(
+    bad: dict, message: str, first: bool, sweeps: List[Sweep]
+) -> None:
+    settings = small("fast", num_history=2)
+    stream = FlowStream(config=settings)
+    good = sweeps[:3]
+    for sweep in good[: 0 if first else 2]:
+        push(stream, sweep)
+    with pytest.raises(CFlowError, match=message):
+        push(stream, sweeps[2], **bad)
+    for sweep in good if first else good[2:]:
+        result = push(stream, sweep)
+    assert_same_bits(result, expected(good, 1, settings))
+
+
+@pytest.mark.parametrize(
+    "settings, message",
+    [
+        ({"preset": "offline"}, "does not know later sweeps"),
+        ({"ground": "grass"}, "ground="),
+        ({"max_gap": 0}, "max_gap"),
+    ],
+)
+def test_settings_that_a_stream_cannot_have(settings: dict, message: str) -> None:
+    with pytest.raises(CFlowError, match=message):
+        FlowStream(**settings)
+
+
+def test_ground_is_found_once_and_poses_by_odometry() -> None:
+    drive = make_drive(seed=2, num_sweeps=4, profile="demo")
+    stream = FlowStream("fast", ground="auto")
+    if find_spec("kiss_icp") is None:
+        with pytest.raises(CFlowError, match="pip install kiss-icp"):
+            stream.push(drive.sweep(0).points)
+        return
+    for index in range(4):
+        result = stream.push(drive.sweep(index).points, time=drive.timestamps[index])
+    found, truth = stream.window.pc1.is_ground, drive.sweep(3).is_ground
+    assert (found.numpy() == truth).mean() > 0.95
+    moved = np.linalg.inv(stream.window.pc0.pose) @ stream.window.pc1.pose
+    true = np.linalg.inv(drive.sweep(2).pose) @ drive.sweep(3).pose
+    assert np.abs(moved - true).max() < 0.2 and result.residual_flow.any()
+
+
+def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    main(
+        [
+            "stream",
+            "data.num_sweeps=4",
+            f"data.cache={tmp_path / 'cache'}",
+            "model=fast",
+            "pace=null",
+            f"output={tmp_path / 'out'}",
+        ]
+    )
+    report = json.loads((tmp_path / "out" / "stream.json").read_text())
+    assert report["sweeps"] == 4 and report["results"] == 3 and report["in_time"] is None
+    assert 0 < report["latency"]["p50"] <= report["latency"]["p99"] and "latency: median" in capsys.readouterr().out
