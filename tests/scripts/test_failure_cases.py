@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -61,11 +60,3 @@ def test_a_wrong_frame_is_found_by_the_static_check(scenes_of: Any) -> None:
         check_static_world(good)
     with pytest.warns(StaticWorldWarning, match="ego_T_lidar"):
         check_static_world(scenes_of.MisplacedPoses(good))
-
-
-@pytest.mark.slow
-def test_pictures_and_table(script: Any, tmp_path: Path, capsys: Any) -> None:
-    pytest.importorskip("matplotlib")
-    script("figures", "failure_cases").main(["--only", "fast", "--seeds", "0", "--pictures", str(tmp_path)])
-    assert len(capsys.readouterr().out.splitlines()) == 2 + 2
-    assert [file.name for file in tmp_path.iterdir()] == ["limit_fast.png"]
