@@ -119,17 +119,6 @@ def test_a_shift_along_z_shifts_the_sectional_view(window, steps):
 
 
 @PROFILE
-@given(windows(), dense)
-def test_points_of_a_cluster_share_one_flow(window, overrides):
-    result = cflow(window, **{**overrides, "pixel_sizes": (S,)})
-    ids = result.cluster_id
-    for i in range(int(ids.max()) + 1 if ids.numel() else 0):
-        assert len(result.residual_flow[ids == i].unique(dim=0)) <= 1 and len(result.score[ids == i].unique()) <= 1
-    assert not result.residual_flow[ids < 0].any() and not result.score[ids < 0].any()
-    assert (ids[~result.is_valid] == -1).all() and ((result.score >= 0) & (result.score <= 1)).all()
-
-
-@PROFILE
 @given(windows(max_history=1), st.integers(0, 30))
 def test_total_flow_is_the_sum(window, angle):
     poses = [pose(0.3 * i, 0.1 * i, 0.01 * angle * i) for i in range(3)]
