@@ -9,6 +9,7 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from oracle.component_tree import with_longest
+from preset_windows import changed
 from scenes import assert_same, flow_as_oracle, pose
 
 from cflow_torch import FlowResult, Sweep, Window, make_model
@@ -50,8 +51,7 @@ def windows(draw, max_history: int = 3) -> Window:
 
 
 def moved(window: Window, shift: np.ndarray) -> Window:
-    sweeps = [replace(s, points=s.points + shift) for s in (window.pc0, window.pc1, *window.pch)]
-    return Window(sweeps[0], sweeps[1], tuple(sweeps[2:]))
+    return changed(window, lambda sweep: replace(sweep, points=sweep.points + shift))
 
 
 dense = st.fixed_dictionaries(

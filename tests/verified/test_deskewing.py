@@ -11,10 +11,11 @@ import torch
 from moving_scenes import LOWER, UPPER, Scene, moving_scene, one_object
 from oracle import deskewing as oracle
 from oracle import rigid_registration
+from preset_windows import changed
 from scenes import assert_same_bits, flow_as_oracle
 from turning_car import MODEL, turning_car
 
-from cflow_torch import CFlowError, FlowResult, VerifiedFlow, Window
+from cflow_torch import CFlowError, FlowResult, Sweep, VerifiedFlow, Window
 from cflow_torch.verified.deskewing import deskew, register_deskewed
 from cflow_torch.verified.rigid_motion import RigidMotion
 from cflow_torch.verified.rigid_registration import register
@@ -29,17 +30,18 @@ def with_times(scene: Scene, times: torch.Tensor) -> Scene:
 
 def late(window: Window, seed: int) -> Window:
     """Times of two units half a turn apart, with places of points as they were."""
-    rng, sweeps = np.random.default_rng(seed), []
-    for sweep in (window.pc0, window.pc1, *window.pch):
+    rng = np.random.default_rng(seed)
+
+    def timed(sweep: Sweep) -> Sweep:
         angle = np.arctan2(sweep.points[:, 1], sweep.points[:, 0]) / (2 * np.pi)
         times = 0.1 * ((angle + 0.5 * rng.integers(0, 2, len(angle))) % 1.0) + rng.uniform(0, 0.01)
-        sweeps.append(replace(sweep, point_times=times))
-    return Window(sweeps[0], sweeps[1], tuple(sweeps[2:]))
+        return replace(sweep, point_times=times)
+
+    return changed(window, timed)
 
 
 def at_once(window: Window) -> Window:
-    sweeps = [replace(s, point_times=np.zeros(len(s.points))) for s in (window.pc0, window.pc1, *window.pch)]
-    return Window(sweeps[0], sweeps[1], tuple(sweeps[2:]))
+    return changed(window, lambda sweep: replace(sweep, point_times=np.zeros(len(sweep.points))))
 
 
 # ------------------------------------------------------------------------------------------- equal to the oracle
