@@ -217,11 +217,6 @@ def frame_of(outcome: Outcome) -> EvalFrame:
     return EvalFrame(batch["origin_pc0"], labels, eval_mask=batch["eval_mask"], **flows)
 
 
-def nothing_moves(batch: Batch) -> Dict[str, Any]:
-    """A model: zeros for the rows of pc0."""
-    return {"flow": [torch.zeros(batch["pc0"][0].shape)], "pose_flow": None}
-
-
 def up_lidar(log_folder: Path) -> np.ndarray:
     """(4, 4) float64 T_ego_lidar of the upper LiDAR of an Argoverse 2 log, in whose frame the harness stores points."""
     rows = feather.read_table(str(log_folder / "calibration" / "egovehicle_SE3_sensor.feather")).to_pylist()
