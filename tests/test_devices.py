@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Callable, Dict, Tuple
+from typing import Dict, Tuple
 
 import numpy as np
 import pretend_device
 import pytest
-import torch
 from preset_windows import changed, small, windows_for
 from pretend_device import PretendDevice
 from scenes import assert_same_bits
@@ -55,26 +54,3 @@ def test_sweeps_that_are_read_together_may_differ() -> None:
     for result, window in zip(results, windows):
         (alone,) = make_model(config, "cpu")([window])
         assert_same_bits(result, alone)
-
-
-@pytest.mark.parametrize(
-    "mix",
-    [
-        lambda there: there + torch.ones(3),
-        lambda there: torch.cat([there, torch.ones(3)]),
-        lambda there: torch.ones(3).index_select(0, there.long()),
-        lambda there: there.numpy(),
-    ],
-)
-def test_two_devices_do_not_mix(mix: Callable[[torch.Tensor], torch.Tensor]) -> None:
-    with PretendDevice(), pytest.raises((RuntimeError, TypeError)):
-        mix(torch.zeros(3, device=pretend_device.DEVICE))
-
-
-def test_what_is_counted() -> None:
-    with PretendDevice() as device:
-        there = torch.arange(4, device=pretend_device.DEVICE)
-        assert device.count(lambda: there.view(2, 2) + 1) == (1, 0)
-        assert device.count(lambda: there[there > 1])[1] == 1
-        assert device.count(lambda: there.sum().item())[1] == 1
-        assert device.count(lambda: torch.tensor([1.0], device=there.device))[1] == 1

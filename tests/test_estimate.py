@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from preset_windows import changed
 from scenes import assert_same_bits, assert_zeros, config, scene
 
 from cflow_torch import (
@@ -33,6 +35,10 @@ EYE = np.eye(4)
         ({"pch": [P1], "gmh": [None, None]}, "gmh has 2 entries for 1"),
         ({"pch": [P1], "T_ego1_egoh": [EYE, EYE]}, "T_ego1_egoh has 2 entries for 1"),
         ({"pch": [P1], "T_ego1_ego0": EYE}, "T_ego1_ego0 is given but T_ego1_egoh is not"),
+        ({"pch": [P1], "dth": [None, None]}, "dth has 2 entries"),
+        ({"pcf": [P1], "T_ego1_ego0": EYE, "preset": "offline"}, "T_ego1_ego0 is given but T_ego1_egof is not"),
+        ({"pcf": [P1], "T_ego1_egof": [EYE] * 2, "preset": "offline"}, "T_ego1_egof has 2 entries for 1 sweeps of pcf"),
+        ({"pcf": [P1], "gmf": [None, None], "preset": "offline"}, "gmf has 2 entries for 1 sweeps of pcf"),
         ({"T_ego1_ego0": EYE[None]}, r"pc0 has shape \(1, 4, 4\)"),
         ({"T_ego1_ego0": EYE, "pch": [P1], "T_ego1_egoh": [np.diag([1, 1, -1, 1.0])]}, "pch1 is not rigid"),
         ({"max_hight": 3}, "unknown setting max_hight: the fields are pixel_size"),
@@ -46,22 +52,24 @@ def test_arguments_that_make_no_sense(arguments, complaint):
     assert isinstance(caught.value, ValueError)
 
 
-@pytest.mark.parametrize("method", ["dense", "verified"])
-def test_the_call_is_the_module(method):
-    window, settings = scene(6, num_history=2), config(method, num_history=2)
-    to_ego1 = [np.linalg.inv(window.pc1.pose) @ sweep.pose for sweep in (window.pc0, *window.pch)]
-    called = estimate_flow(
-        window.pc0.points,
-        window.pc1.points,
-        T_ego1_ego0=to_ego1[0],
-        gm0=window.pc0.is_ground,
-        gm1=window.pc1.is_ground,
-        pch=[sweep.points for sweep in window.pch],
-        T_ego1_egoh=to_ego1[1:],
-        gmh=[sweep.is_ground for sweep in window.pch],
-        **settings.as_dict(),
-    )
-    assert_same_bits(called, make_model(settings)([window])[0])
+@pytest.mark.parametrize("method, num_future", [("dense", 0), ("verified", 2)])
+def test_the_call_is_the_module(method, num_future):
+    """With history, sweeps after t+1 and the times of points."""
+    rng, settings = np.random.default_rng(0), config(method, num_history=1)
+    settings = settings.replace(num_future=num_future) if num_future else settings
+    window = scene(6, num_history=1, num_future=num_future)
+    window = changed(window, lambda sweep: replace(sweep, point_times=rng.uniform(0, 0.1, len(sweep.points))))
+    arguments = {"T_ego1_ego0": np.linalg.inv(window.pc1.pose) @ window.pc0.pose}
+    for prefix, column in (("gm", "is_ground"), ("dt", "point_times"), ("pc", "points")):
+        arguments.update({f"{prefix}{k}": getattr(sweep, column) for k, sweep in enumerate((window.pc0, window.pc1))})
+        for side, sweeps in (("h", window.pch), ("f", window.pcf)):
+            arguments[f"{prefix}{side}"] = [getattr(sweep, column) for sweep in sweeps]
+            arguments[f"T_ego1_ego{side}"] = [np.linalg.inv(window.pc1.pose) @ sweep.pose for sweep in sweeps]
+    (expected,) = make_model(settings)([window])
+    assert_same_bits(estimate_flow(**arguments, **settings.as_dict()), expected)
+    if num_future:
+        for less in (replace(window, pcf=()), replace(window, pc1=replace(window.pc1, point_times=None))):
+            assert not torch.equal(make_model(settings)([less])[0].residual_flow, expected.residual_flow)
 
 
 def test_everything_ground_and_single_points():

@@ -9,6 +9,7 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from oracle.component_tree import with_longest
+from preset_windows import changed
 from scenes import assert_same, flow_as_oracle, pose
 
 from cflow_torch import FlowResult, Sweep, Window, make_model
@@ -50,8 +51,7 @@ def windows(draw, max_history: int = 3) -> Window:
 
 
 def moved(window: Window, shift: np.ndarray) -> Window:
-    sweeps = [replace(s, points=s.points + shift) for s in (window.pc0, window.pc1, *window.pch)]
-    return Window(sweeps[0], sweeps[1], tuple(sweeps[2:]))
+    return changed(window, lambda sweep: replace(sweep, points=sweep.points + shift))
 
 
 dense = st.fixed_dictionaries(
@@ -116,17 +116,6 @@ def test_a_shift_by_whole_pixels_shifts_the_scene(window, shift, overrides):
 def test_a_shift_along_z_shifts_the_sectional_view(window, steps):
     shifted = moved(window, np.array([0, 0, steps * S]))
     assert_same(cflow(shifted, sectional_view=True), cflow(window, sectional_view=True))
-
-
-@PROFILE
-@given(windows(), dense)
-def test_points_of_a_cluster_share_one_flow(window, overrides):
-    result = cflow(window, **{**overrides, "pixel_sizes": (S,)})
-    ids = result.cluster_id
-    for i in range(int(ids.max()) + 1 if ids.numel() else 0):
-        assert len(result.residual_flow[ids == i].unique(dim=0)) <= 1 and len(result.score[ids == i].unique()) <= 1
-    assert not result.residual_flow[ids < 0].any() and not result.score[ids < 0].any()
-    assert (ids[~result.is_valid] == -1).all() and ((result.score >= 0) & (result.score <= 1)).all()
 
 
 @PROFILE

@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.feather as feather
 import pytest
+from scenes import pose
 
 from cflow_torch.data.av2 import AV2Log, find_av2_logs
 from cflow_torch.data.boxes import Boxes, flow_from_boxes
@@ -213,22 +214,15 @@ def test_truncated_and_missing_files_are_refused_when_they_are_read(folder: Path
     AV2Log(folder).sweep(0)
 
 
-def turned(angle: float, x: float, y: float) -> np.ndarray:
-    pose = np.eye(4)
-    pose[:2, :2] = [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
-    pose[:2, 3] = [x, y]
-    return pose
-
-
 def test_margin_overlap_and_end_of_track() -> None:
     points = np.array([[2.05, 0, 0], [0, 1.05, 0], [0, 0, 0.8], [1.9, 0, 0]])
     boxes0 = Boxes(
         track_id=["ends", "stays"],
         category=np.array([4, 17], np.uint8),
         size=np.array([[4.0, 2.0, 1.5], [0.4, 0.4, 1.5]]),
-        pose=np.stack([np.eye(4), turned(0, 1.9, 0)]),
+        pose=np.stack([np.eye(4), pose(1.9, 0, 0)]),
     )
-    boxes1 = Boxes(["stays"], np.array([17], np.uint8), boxes0.size[1:], turned(0, 2.4, 0)[None])
+    boxes1 = Boxes(["stays"], np.array([17], np.uint8), boxes0.size[1:], pose(2.4, 0, 0)[None])
     labels = flow_from_boxes(points, boxes0, boxes1, np.eye(4))
     # 10 cm more per side in length and width, none in height; the last box wins, an ended one leaves its mark
     np.testing.assert_array_equal(labels.category, [17, 4, 0, 17])

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from oracle import reference_flow
 from scenes import (
     assert_same,
-    assert_same_bits,
-    assert_zeros,
     box,
     config,
     flow_as_oracle,
@@ -80,26 +76,6 @@ def test_drives_equal_the_oracle(kitti_file, data_root, settings):
             assert (result.residual_flow.norm(dim=1) >= 0.05).sum() > 500
 
 
-def test_a_mixed_batch_equals_the_loop():
-    """Windows of different sizes, numbers of sweeps, with and without poses; two of them empty."""
-    first, nothing = scene(1), Sweep(np.zeros((0, 3), dtype=np.float32))
-    batch = [
-        scene(0, num_history=3),
-        first,
-        Window(nothing, nothing),
-        scene(2, num_history=1, poses=False, num_objects=2, num_points=15),
-        replace(first, pc1=Sweep(first.pc1.points[:0], pose=first.pc1.pose)),
-        scene(3, num_history=2, num_objects=16),
-    ]
-    model = CorrelationFlow(config(num_history=3, sectional_view=True, pixel_sizes=(0.5, 0.25), max_speed=8.0))
-    for window, result, backwards in zip(batch, model(batch), model(batch[::-1])[::-1]):
-        (alone,) = model([window])
-        assert_same_bits(result, alone)
-        assert_same_bits(backwards, alone)
-        assert_same(alone, reference_flow(window, model.config))
-    assert_zeros(model([batch[4]])[0], len(first.pc0.points))
-
-
 @pytest.mark.cuda
 @needs_gpu
 @pytest.mark.parametrize("num_history, pixel_sizes", [(0, (0.25,)), (2, (0.5, 0.25))])
@@ -143,27 +119,6 @@ def test_a_still_world_seen_from_a_moving_sensor():
     assert not result.residual_flow.any() and torch.equal(result.flow, result.pose_flow)
     without = estimate_flow(pc_world, pc1, **PAPER)
     assert not without.pose_flow.any() and without.residual_flow.any()  # else the test would see nothing
-
-
-def test_history_outvotes_one_bad_estimate():
-    """One object, 0.5 m per sweep along x; at t it is seen one step too far, so t -> t+1 alone gives the wrong flow."""
-    at = [street(3)[1] + [0.5 * step, 0.0, 0.0] for step in (0, -1, -2, -3, -4)]
-    wrong = at[1] + [0.25, 0.0, 0.0]
-    assert (estimate_flow(wrong, at[0], **PAPER).residual_flow[:, 0] == 0.25).all()
-    with_history = estimate_flow(wrong, at[0], pch=at[2:], num_history=3, **PAPER)
-    assert (with_history.residual_flow == torch.tensor([0.5, 0.0, 0.0])).all()
-
-
-def test_coarse_to_fine_adds_up():
-    """A truth of 0.9 m: half-way between the pixels of the first two scales, reached by the last."""
-    pc0 = street(4)[1]
-    found = [
-        estimate_flow(pc0, pc0 + [0.9, 0, 0], preset="paper", pixel_sizes=sizes, point_cloud_range=WIDE).residual_flow
-        for sizes in [(0.8,), (0.8, 0.2), (0.8, 0.2, 0.1)]
-    ]
-    assert torch.allclose(found[0], torch.tensor([0.8, 0, 0]), atol=1e-6)
-    assert torch.allclose((found[1][:, 0] - 0.9).abs(), torch.tensor(0.1), atol=1e-6)  # off by half a pixel
-    assert torch.allclose(found[2], torch.tensor([0.9, 0, 0]), atol=1e-6)
 
 
 def test_max_speed_bounds_the_flow():
@@ -270,38 +225,3 @@ def test_older_sweeps_are_warped_by_their_steps():
     window = Window(row_of_dots(11.5, 6), row_of_dots(18.5, 6), (row_of_dots(4.5, 6),))
     result = flow_as_oracle(window, TWO_SCALES.replace(num_history=1))
     assert result.residual_flow[:, 0].tolist() == [7.0] * 6 and result.score.tolist() == [1.0] * 6
-
-
-# --------------------------------------------------------------------------------- what history and scales are for
-
-
-def car(rng: np.random.Generator, x: float, seen: float = 4.5) -> np.ndarray:
-    """(N, 3) rear and the first metres `seen` of the right side of a car, as a LiDAR behind it sees them."""
-    rear = np.stack([np.zeros(400), rng.uniform(0, 1.8, 400), rng.uniform(0, 1.4, 400)], 1)
-    side = np.stack([rng.uniform(0, seen, 700), np.zeros(700), rng.uniform(0, 1.4, 700)], 1)
-    return np.concatenate((rear, side)) + rng.normal(0, 0.01, (1100, 3)) + (x, 8.0, 0.0)
-
-
-def error(sweeps: list, truth: tuple, **overrides) -> float:
-    """Mean end-point error of the points of sweep t; `sweeps` from t+1 back."""
-    window = Window(Sweep(sweeps[1]), Sweep(sweeps[0]), tuple(Sweep(sweep) for sweep in sweeps[2:]))
-    (result,) = CorrelationFlow(make_config("paper", **overrides))([window])
-    return float((result.residual_flow - torch.tensor(truth)).norm(dim=1).mean())
-
-
-@pytest.mark.parametrize("num_history", [0, 4])
-def test_coarse_levels_help_a_car_whose_footprints_do_not_overlap(num_history):
-    # 30 m/s are 3 m a sweep. Two metres of the car are seen, so a metre lies between its footprints.
-    rng = np.random.default_rng(0)
-    sweeps = [car(rng, 20.0 - 3.0 * k, seen=2.0) for k in range(num_history + 2)]
-    truth = (3.0, 0.0, 0.0)
-    assert error(sweeps, truth, num_history=num_history) == pytest.approx(3.0)  # 0.1 m pixels do not connect them
-    assert error(sweeps, truth, num_history=num_history, pixel_sizes=(0.4, 0.2, 0.1)) < 0.1
-
-
-def test_history_measures_motion_below_a_pixel():
-    # 0.4 m/s are 0.04 m a sweep: a pair of sweeps can only say 0 or 0.1 m, five sweeps see it move two pixels.
-    rng = np.random.default_rng(1)
-    sweeps = [car(rng, 10.0 - 0.04 * k) for k in range(6)]
-    assert error(sweeps[:2], (0.04, 0.0, 0.0)) > 0.035
-    assert error(sweeps, (0.04, 0.0, 0.0), num_history=4) < 0.02

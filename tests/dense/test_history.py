@@ -8,31 +8,8 @@ import numpy as np
 import pytest
 import torch
 from oracle.history import pool as oracle_pool
-from scenes import same_bits
 
 from cflow_torch.dense.history import pool
-
-
-def by_angles(estimates: np.ndarray) -> np.ndarray:
-    """The same with sine, cosine and arc tangent; for estimates of positive length in general position."""
-    angle = np.arctan2(estimates[:, 1], estimates[:, 0])
-    mean = math.atan2(np.sin(angle).sum(), np.cos(angle).sum())
-    offset = np.sort((angle - mean + np.pi) % (2 * np.pi) - np.pi)
-    low, high = offset[(len(offset) - 1) // 2], offset[len(offset) // 2]
-    middle = mean + math.atan2(math.sin(low) + math.sin(high), math.cos(low) + math.cos(high))
-    length = np.median(np.hypot(estimates[:, 0], estimates[:, 1]))
-    return np.array([length * math.cos(middle), length * math.sin(middle), np.median(estimates[:, 2])])
-
-
-@pytest.mark.parametrize("count", [2, 3, 4, 5])
-@pytest.mark.parametrize("spread", [0.3, 3.0])
-def test_pool_equals_trigonometry(spread, count):
-    rng = np.random.default_rng(count)
-    angle = rng.uniform(-np.pi, np.pi, (300, 1)) + rng.uniform(-spread, spread, (300, count))
-    length = rng.uniform(0.1, 3.0, (300, count))
-    given = np.stack([length * np.cos(angle), length * np.sin(angle), rng.normal(size=(300, count))], 2)
-    found = pool(torch.from_numpy(given), torch.ones((300, count), dtype=torch.bool)).numpy()
-    np.testing.assert_allclose(found, [by_angles(estimates) for estimates in given], atol=1e-9)
 
 
 def rows(rng: np.random.Generator, num_rows: int, count: int) -> np.ndarray:
@@ -77,11 +54,3 @@ def test_pool_by_hand(estimates, expected):
     found = pool(given, torch.ones(given.shape[:2], dtype=torch.bool))[0].tolist()
     assert found == pytest.approx(list(expected), abs=1e-15)
     assert oracle_pool([np.array(e, dtype=float) for e in estimates]).tolist() == pytest.approx(found, abs=1e-15)
-
-
-def test_rows_are_independent_and_may_be_none():
-    given = torch.from_numpy(rows(np.random.default_rng(2), 40, 4))
-    available = torch.ones(40, 4, dtype=torch.bool)
-    alone = [pool(given[i : i + 1], available[i : i + 1]) for i in range(40)]
-    assert same_bits(torch.cat(alone), pool(given, available))
-    assert pool(given[:0], available[:0]).shape == (0, 3)

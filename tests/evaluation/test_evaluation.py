@@ -13,6 +13,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from public_evaluators import score
+from scenes import pose
 
 from cflow_torch.data.categories import CATEGORY_INDEX
 from cflow_torch.data.log import FlowLabels
@@ -243,17 +244,10 @@ def test_ranges_and_their_speed_threshold() -> None:
 # ---------------------------------------------------------------------------------------------- axes and input
 
 
-def yaw(angle: float) -> np.ndarray:
-    T = np.eye(4)
-    T[:2, :2] = [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
-    T[:3, 3] = [-1.0, 0.2, 0.01]
-    return T
-
-
 @pytest.mark.parametrize("definition", NAMES)
 def test_residual_total_and_axes_agree(definition: str) -> None:
     rng = np.random.default_rng(1)
-    T, points = yaw(0.05), rng.uniform(-30, 30, (50, 3)) * [1, 1, 0.05]
+    T, points = pose(-1.0, 0.2, 0.05, 0.01), rng.uniform(-30, 30, (50, 3)) * [1, 1, 0.05]
     residual, predicted = rng.normal(0, 1, (2, 50, 3)).astype(np.float32)
     pose_flow = ego_motion_flow(points, T)
     labels = FlowLabels(pose_flow + residual, np.full(50, CAR, dtype=np.uint8), np.ones(50, dtype=bool))

@@ -34,6 +34,7 @@ from public_evaluators import (
     write_bsfe_truth,
     write_log,
 )
+from scenes import pose
 
 from cflow_torch import CorrelationFlow
 from cflow_torch.data.av2 import AV2Log
@@ -182,9 +183,8 @@ def made_up(kind: str, seed: int) -> MadeUp:
         points[:, 2] = rng.choice([-2.5, -2.49, 0, 2.49, 2.5], n)
     else:
         true *= 0.001 if kind == "only static" else 1
-        angle = rng.uniform(-0.05, 0.05)
-        T[:2, :2] = [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
-        T[:3, 3] = [rng.uniform(-3, 0), 0.1, 0.01]
+        angle, x = rng.uniform(-0.05, 0.05), rng.uniform(-3, 0)
+        T = pose(x, 0.1, angle, 0.01)
         # A total flow in float32 carries 1e-7 m, so keep clear of the limits that such an error would cross.
         speed = np.linalg.norm(true, axis=1, keepdims=True)
         near = np.abs(speed - np.append(EDGES[1:], 0.05)).min(axis=1, keepdims=True) < 1e-5

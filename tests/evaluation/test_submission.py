@@ -15,6 +15,7 @@ import pyarrow as pa
 import pytest
 from public_evaluators import FLOW, LOG, TIME, read_pair
 from pyarrow import feather
+from scenes import pose
 
 from cflow_torch import CFlowError, CorrelationFlow
 from cflow_torch.cli.main import main
@@ -129,9 +130,7 @@ def test_versions_2_and_3_are_residual_flow_of_all_points(
 def test_residual_in_axes_of_t(estimated: Dict[int, Any]) -> None:
     # Where the point ends, seen from t, minus where it started: T^-1 (p + flow) - p.
     sweeps, flow = estimated[5]
-    yaw = np.deg2rad(3.0)
-    turn = np.eye(4)
-    turn[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+    turn = pose(0, 0, np.deg2rad(3.0))
     pc1 = type(sweeps.pc1)(**{**vars(sweeps.pc1), "pose": sweeps.pc1.pose @ turn})
     T, start = relative_transform(pc1.pose, sweeps.pc0.pose), np.asarray(sweeps.pc0.points, np.float64)
     end = start @ T[:3, :3].T + T[:3, 3] + flow.residual_flow.numpy()

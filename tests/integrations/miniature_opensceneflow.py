@@ -14,12 +14,15 @@ from pathlib import Path
 from typing import Any, Callable, Dict, Iterator, List, Tuple
 
 import h5py
+import numpy as np
 import torch
+from pyarrow import feather
 from torch import Tensor, nn
 from torch.nn.utils.rnn import pad_sequence
 from torch.utils.data import default_collate
 
 from cflow_torch.data.log import FlowLabels
+from cflow_torch.data.rigid_motion import poses_from_quaternions
 from cflow_torch.evaluation import EvalFrame, SceneFlowMetrics
 
 TRUTH = ("flow", "flow_is_valid", "flow_category_indices", "flow_instance_id")
@@ -214,9 +217,12 @@ def frame_of(outcome: Outcome) -> EvalFrame:
     return EvalFrame(batch["origin_pc0"], labels, eval_mask=batch["eval_mask"], **flows)
 
 
-def nothing_moves(batch: Batch) -> Dict[str, Any]:
-    """A model: zeros for the rows of pc0."""
-    return {"flow": [torch.zeros(batch["pc0"][0].shape)], "pose_flow": None}
+def up_lidar(log_folder: Path) -> np.ndarray:
+    """(4, 4) float64 T_ego_lidar of the upper LiDAR of an Argoverse 2 log, in whose frame the harness stores points."""
+    rows = feather.read_table(str(log_folder / "calibration" / "egovehicle_SE3_sensor.feather")).to_pylist()
+    (row,) = (row for row in rows if row["sensor_name"] == "up_lidar")
+    shift, turn = ([row[name] for name in names] for names in (("tx_m", "ty_m", "tz_m"), ("qw", "qx", "qy", "qz")))
+    return poses_from_quaternions([shift], [turn], str)[0]
 
 
 # -------------------------------------------------------------------------------------------------- building a model

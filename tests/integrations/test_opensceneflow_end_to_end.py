@@ -26,10 +26,10 @@ import h5py
 import miniature_opensceneflow as osf
 import pyarrow as pa
 import pyarrow.feather as feather
-from opensceneflow_labels import write_own_scene
 from opensceneflow_stubs.harness import Harness, printed, read_scores
 
 from cflow_torch.cli.main import main
+from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.hdf5 import write_hdf5_scene
 from cflow_torch.data.hdf5.writer import write_index_files
 from cflow_torch.evaluation.submission import Frame, check_submission, get_version
@@ -120,10 +120,9 @@ def test_eval_prints_what_the_replay_computes(scores: List[Dict[str, float]], da
 
 @pytest.mark.slow
 def test_eval_of_the_real_pair(harness: Harness, checkpoint: Path, av2_folder: Path, tmp_path: Path) -> None:
-    """As the harness's own extraction stores it, points of the sensor and poses of the vehicle: `ego_T_lidar` is found
-    by the module itself."""
-    (tmp_path / "val").mkdir()
-    write_own_scene(av2_folder, tmp_path / "val" / f"{av2_folder.name}.h5")
+    """With points of the sensor and poses of the vehicle: `ego_T_lidar` is found by the module itself."""
+    layout = {"points_frame": "sensor", "ego_T_lidar": osf.up_lidar(av2_folder), "store_extrinsics": False}
+    write_hdf5_scene(AV2Log(av2_folder), tmp_path / "val" / f"{av2_folder.name}.h5", **layout, pose_dtype="float32")
     write_index_files(tmp_path / "val")
     (found,) = read_scores(harness.run("real", "eval.py", "model=cflow", *places(checkpoint, tmp_path)))
     assert found == approximately(replayed(tmp_path, module()))

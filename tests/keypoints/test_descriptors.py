@@ -7,10 +7,10 @@ from typing import List, Tuple
 import numpy as np
 import pytest
 import torch
-from oracle.matching import described_keypoints, detect_keypoints
+from oracle.matching import detect_keypoints
 from scipy import ndimage
 
-from cflow_torch.keypoints.descriptors import describe, detect
+from cflow_torch.keypoints.descriptors import detect
 
 
 def block(rows, cols) -> List[Tuple[int, int]]:
@@ -43,27 +43,3 @@ def test_keypoints_are_at_distance_one():
         image = rng.random((23, 31)) < density
         distance = ndimage.distance_transform_edt(np.pad(image, 1))[1:-1, 1:-1]  # outside the image is background
         assert np.array_equal(detect(torch.from_numpy(image)).numpy(), distance == 1)
-
-
-@pytest.mark.parametrize("patch_size", [1, 5])
-def test_descriptors_equal_the_oracle(patch_size):
-    images = np.random.default_rng(1).random((2, 9, 12)) < 0.5
-    points, start = describe(torch.from_numpy(images), patch_size), 0
-    for window, image in enumerate(images):
-        expected = described_keypoints(image, patch_size)
-        mine = slice(start, start + len(expected.pixels))
-        assert points.window[mine].eq(window).all()
-        assert torch.stack((points.row, points.col), 1)[mine].tolist() == expected.pixels.tolist()
-        assert points.patch[mine].tolist() == expected.descriptors.astype(int).tolist()
-        assert points.energy[mine].tolist() == expected.energies.tolist()
-        start = mine.stop
-    assert points.place.tolist() == detect(torch.from_numpy(images)).flatten().nonzero()[:, 0].tolist()
-    assert start == len(points.place) > 50
-
-
-def test_a_descriptor_is_the_patch_with_zeros_outside():
-    image = np.zeros((4, 5), dtype=bool)
-    image[:3, :3] = image[3, 4] = True
-    patches = describe(torch.from_numpy(image)[None], 3).patch.view(-1, 3, 3).tolist()
-    assert patches[0] == [[0, 0, 0], [0, 1, 1], [0, 1, 1]]  # (1, 1) is no key point, but occupied
-    assert patches[-1] == [[0, 0, 0], [0, 1, 0], [0, 0, 0]]

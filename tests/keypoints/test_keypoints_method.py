@@ -10,19 +10,16 @@ import torch
 from oracle.keypoints import match_radius
 from scenes import (
     assert_same,
-    assert_same_bits,
     assert_zeros,
     box,
     config,
     flow_as_oracle,
     needs_gpu,
     needs_kornia_labelling,
-    reordered,
-    rows_of,
     scene,
 )
 
-from cflow_torch import CFlowError, CorrelationFlowKeypoints, Sweep, Window, estimate_flow, make_config
+from cflow_torch import CorrelationFlowKeypoints, Sweep, Window, estimate_flow, make_config
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.hdf5.reader import HDF5Log
 from cflow_torch.data.log import window as window_of
@@ -65,22 +62,6 @@ def test_real_drives_equal_the_oracle(av2_folder, kitti_file):
 @pytest.mark.parametrize("preset", ["keypoints", "paper"])
 def test_the_whole_real_pair_equals_the_oracle(av2_folder, preset):
     flow_as_oracle(window_of(AV2Log(av2_folder), 0), make_config(preset, method="keypoints"))
-
-
-@pytest.mark.parametrize("densify", DENSIFIERS)
-def test_company_memory_and_order_of_points_do_not_matter(densify, monkeypatch):
-    nothing = Sweep(np.zeros((0, 3)))
-    windows = [scene(60), scene(61, num_points=5), Window(nothing, Sweep(np.zeros((4, 3)))), scene(62)]
-    settings = config("keypoints", densify=densify)
-    model = CorrelationFlowKeypoints(settings)
-    alone = [model([window])[0] for window in windows]
-    mixed, order = reordered(windows[0])
-    assert_same_bits(model([mixed])[0], rows_of(alone[0], order))
-    for found in (model(windows), CorrelationFlowKeypoints(settings.replace(max_memory=3e6))(windows)):
-        for together, single in zip(found, alone):
-            assert_same_bits(together, single)
-    monkeypatch.setattr("cflow_torch.ops.nearest._COMPARED_AT_ONCE", 1)
-    assert_same_bits(model(windows[:1])[0], alone[0])
 
 
 @pytest.mark.cuda
@@ -168,8 +149,3 @@ def test_whole_pixel_shifts_of_boxes_are_found():
     )
     assert np.array_equal(result.residual_flow.numpy(), np.repeat(shifts, 4000, axis=0).astype(np.float32))
     assert result.cluster_id.unique().tolist() == [0, 1, 2]
-
-
-def test_history_is_refused():
-    with pytest.raises(CFlowError, match="num_history is a setting of method dense and verified"):
-        make_config("keypoints", num_history=2)

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import math
-from fractions import Fraction
 from typing import Dict, List, Tuple
 
 import numpy as np
 import pytest
 import torch
-from oracle.matching import describe as oracle_describe
-from oracle.matching import detect_keypoints, match_keypoints, passes_ratio_test
+from oracle.matching import detect_keypoints, match_keypoints
 from scenes import config
 
 from cflow_torch.keypoints import match_candidates, matching
@@ -49,29 +46,6 @@ def test_matches_equal_the_oracle(patch_size, ratio):
     assert total > 0
 
 
-def test_matches_are_those_of_all_pairs_in_fractions():
-    rng, total = np.random.default_rng(11), 0
-    for reach, ratio in ((2.0, 1.0), (4.0, 1.1), (60.0, 1.1)):
-        images = rng.random((2, 13, 16)) < 0.3
-        sides = [[tuple(p) for p in detect_keypoints(image).tolist()] for image in images]
-        patches = [
-            dict(zip(side, oracle_describe(image, np.array(side), 5).astype(int))) for side, image in zip(sides, images)
-        ]
-        expected = []
-        for p in sides[0]:
-            ranked = []
-            for q in (q for q in sides[1] if math.dist(p, q) <= reach):
-                c, (dy, dx) = int(patches[0][p] @ patches[1][q]), (q[0] - p[0], q[1] - p[1])
-                ranked.append((-Fraction(c * c, int(patches[1][q].sum())), dx * dx + dy * dy, dy, dx))
-            ranked.sort()
-            if ranked and (len(ranked) == 1 or -ranked[0][0] > Fraction(str(ratio)) ** 2 * -ranked[1][0]):
-                expected.append((*p, ranked[0][3], ranked[0][2]))
-        settings = config("keypoints", patch_size=5, ratio_threshold=ratio)
-        assert [m[:4] for m in match_keypoints(images[0], images[1], reach, settings)] == expected
-        total += assert_equals_oracle(images[:1], images[1:], reach, patch_size=5, ratio_threshold=ratio)
-    assert total > 0
-
-
 # ---------------------------------------------------------------------------------------------------------- by hand
 
 
@@ -97,23 +71,6 @@ def test_the_ratio_test_is_strict_and_exact():
     # Second best 1 / 1.2^2 = 25 / 36 of the energy: 36 against 25 ones.
     pc0, pc1 = hand_made([[5, 5]], [36]), hand_made([[5, 6], [5, 9]], [36, 25])
     assert shifts(pc0, pc1, ratio=1.2) == {} and shifts(pc0, pc1, ratio=1.1999) == {0: (0, 1)}
-
-
-@pytest.mark.parametrize(
-    "counts, ratio, accepted",
-    [
-        ((11, 20, 10, 20), 1.1, False),  # 11 = 1.1 x 10 exactly
-        ((11, 20, 10, 20), 1.0999, True),
-        ((11, 25, 12, 36), 1.1, False),  # 11 / 5 = 1.1 x 12 / 6
-        ((5, 9, 5, 9), 1.0, False),
-        ((2601, 2601, 2600, 2601), 1.0, True),
-        ((2600, 2600, 2601, 2601), 1.0, False),
-        ((1, 1, 1, 4), 2.0, False),
-        ((1, 1, 1, 5), 2.0, True),
-    ],
-)
-def test_the_oracle_s_ratio_test(counts, ratio, accepted):
-    assert passes_ratio_test(*counts, ratio) is accepted
 
 
 def test_a_single_candidate_has_no_rival_and_equal_ones_are_none():

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
-from scenes import needs_gpu
 
 from cflow_torch.ops.cross_correlation import cross_correlate
 from cflow_torch.ops.window_counts import WindowCounts
@@ -78,13 +77,3 @@ def test_pixels_under_a_window_and_their_bounds():
     found, (least, most) = table.count(*given), table.bounds(*given)
     assert found.tolist() == expected and sum(expected) > 100
     assert (least <= found).all() and (found <= most).all()
-
-
-@pytest.mark.cuda
-@needs_gpu
-@pytest.mark.parametrize("engine", ENGINES)
-def test_counts_on_cuda_equal_cpu(engine):
-    template, target = torch.rand((2, 4, 40, 33), generator=torch.Generator().manual_seed(2)) < 0.4
-    own = torch.tensor([1, 0, 3, 2])
-    on_gpu = counts(template.cuda(), target.cuda(), own.cuda(), engine).cpu()
-    assert torch.equal(on_gpu, counts(template, target, own, "fft"))

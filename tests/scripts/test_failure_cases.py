@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import warnings
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 # Case: error of the first setting at least, of the last one at most, metres per sweep.
 MENDED = {
-    "long_side": (0.09, 0.06),
-    "rail": (1.5, 0.1),
-    "touching": (0.35, 0.02),
-    "turning": (0.2, 0.14),
-    "vertical": (0.17, 0.04),
-    "fast": (0.4, 0.02),
-    "ground_left_in": (1.0, 0.03),
-    "wrong_frame": (0.05, 0.001),
+    "long_side": (0.7, 0.045),
+    "rail": (1.8, 0.03),
+    "touching": (0.4, 0.005),
+    "turning": (0.2, 0.13),
+    "vertical": (0.17, 0.02),
+    "fast": (4.0, 0.012),
+    "ground_left_in": (1.1, 0.03),
+    "wrong_frame": (0.07, 0.0005),
 }
 
 
@@ -42,14 +41,14 @@ def test_the_failure_is_there_and_the_setting_mends_it(scenes_of: Any, name: str
 @pytest.mark.slow
 def test_what_appears_is_wrong_at_first(scenes_of: Any) -> None:
     first, later = scenes_of.appearing(0), scenes_of.appeared(0)
-    assert first.errors()[0] > 0.4 > 0.05 > later.errors()[0]
-    assert later.confidences()[0] > 0.5
+    assert first.errors()[0] > 0.8 and later.errors()[0] < 0.01
+    assert later.confidences()[0] > 0.8
 
 
 def test_sweeps_after_t1_mend_what_appears(scenes_of: Any) -> None:
     for seed in range(3):  # in the second a van stands near, so that the car is a part of its coarse component
         online, offline = scenes_of.appearing(seed).errors()
-        assert online > 0.4 and offline < 0.1
+        assert online > 0.8 and offline < 0.09
 
 
 def test_a_wrong_frame_is_found_by_the_static_check(scenes_of: Any) -> None:
@@ -61,11 +60,3 @@ def test_a_wrong_frame_is_found_by_the_static_check(scenes_of: Any) -> None:
         check_static_world(good)
     with pytest.warns(StaticWorldWarning, match="ego_T_lidar"):
         check_static_world(scenes_of.MisplacedPoses(good))
-
-
-@pytest.mark.slow
-def test_pictures_and_table(script: Any, tmp_path: Path, capsys: Any) -> None:
-    pytest.importorskip("matplotlib")
-    script("figures", "failure_cases").main(["--only", "fast", "--seeds", "0", "--pictures", str(tmp_path)])
-    assert len(capsys.readouterr().out.splitlines()) == 2 + 2
-    assert [file.name for file in tmp_path.iterdir()] == ["limit_fast.png"]

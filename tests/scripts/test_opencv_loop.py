@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from scenes import RANGE, pose, scene
+from scenes import RANGE
 
-from cflow_torch import CFlowError, Config, CorrelationFlow, FlowResult, Sweep, Window, make_config
+from cflow_torch import Config, CorrelationFlow, FlowResult, Sweep, Window, make_config
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.log import window
 
@@ -77,45 +76,9 @@ def test_it_finds_objects_moved_by_whole_pixels(loop: Any, overrides: dict) -> N
         np.testing.assert_allclose(result.residual_flow, true_flow(), rtol=0, atol=1e-6)
 
 
-def test_it_pools_like_the_method(loop: Any) -> None:
-    # The object stops: estimates of different lengths and directions, an even number of them.
-    places = [(20, 20), (20, 20), (20, 18), (18, 18), (17, 15)]  # (row, col) at t+1, t, t-1, ...
-    first, *rest = (Sweep(ell(row, col, 14, 11)) for row, col in places)
-    sweeps, settings = Window(rest[0], first, tuple(rest[1:])), config(num_history=3, max_extent=50.0)
-    (expected,) = CorrelationFlow(settings, "cpu")([sweeps])
-    assert expected.residual_flow.abs().max() > 0
-    assert_same(loop.opencv_flow(sweeps, settings), expected)
-
-
-@pytest.mark.parametrize("stamps", [False, True])
-@pytest.mark.parametrize("overrides", [{}, {"num_history": 3}, {"num_history": 2, "max_extent": 2.0}], ids=str)
-def test_it_takes_the_same_points_into_the_same_clusters(loop: Any, overrides: dict, stamps: bool) -> None:
-    # Poses, ground, points that are not finite or out of range, splits. Noisy objects tie, so no claim on their flow.
-    settings = config(**overrides)
-    sweeps = scene(1, num_history=settings.num_history, stamps=stamps)
-    result, (expected,) = loop.opencv_flow(sweeps, settings), CorrelationFlow(settings, "cpu")([sweeps])
-    assert expected.cluster_id.max() > 0
-    assert torch.equal(result.cluster_id, expected.cluster_id)
-    assert torch.equal(result.is_valid, expected.is_valid)
-    torch.testing.assert_close(result.pose_flow, expected.pose_flow, rtol=0, atol=1e-6)
-
-
-def test_without_clusters_all_is_zero(loop: Any) -> None:
-    far = Sweep(np.array([[100.0, 0, 0], [math.nan, 0, 0]]), pose=pose(1, 0, 0))
-    empty = Sweep(np.zeros((0, 3)), pose=pose(0, 0, 0))
-    for sweeps in (Window(far, empty), Window(empty, far), Window(empty, empty)):
-        assert_same(loop.opencv_flow(sweeps, config()), CorrelationFlow(config(), "cpu")([sweeps])[0])
-
-
 def test_it_agrees_on_the_real_pair(loop: Any, av2_folder: Any) -> None:
     settings, sweeps = make_config("paper"), window(AV2Log(av2_folder), 0)
     result, (expected,) = loop.opencv_flow(sweeps, settings), CorrelationFlow(settings, "cpu")([sweeps])
     assert torch.equal(result.cluster_id, expected.cluster_id)
     same = (result.residual_flow - expected.residual_flow).abs().amax(1) <= 1e-5
     assert same[expected.is_valid].double().mean() >= 0.95
-
-
-@pytest.mark.parametrize("other", ["keypoints", "default"])
-def test_it_refuses_other_methods(loop: Any, other: str) -> None:
-    with pytest.raises(CFlowError, match="OpenCV loop has"):
-        loop.opencv_flow(moving_ells(0), make_config(other))

@@ -11,10 +11,11 @@ import torch
 from moving_scenes import LOWER, UPPER, Scene, moving_scene, one_object
 from oracle import deskewing as oracle
 from oracle import rigid_registration
-from scenes import assert_same_bits, flow_as_oracle, reordered, rows_of
+from preset_windows import changed
+from scenes import assert_same_bits, flow_as_oracle
 from turning_car import MODEL, turning_car
 
-from cflow_torch import CFlowError, FlowResult, VerifiedFlow, Window, estimate_flow
+from cflow_torch import CFlowError, FlowResult, Sweep, VerifiedFlow, Window
 from cflow_torch.verified.deskewing import deskew, register_deskewed
 from cflow_torch.verified.rigid_motion import RigidMotion
 from cflow_torch.verified.rigid_registration import register
@@ -29,17 +30,18 @@ def with_times(scene: Scene, times: torch.Tensor) -> Scene:
 
 def late(window: Window, seed: int) -> Window:
     """Times of two units half a turn apart, with places of points as they were."""
-    rng, sweeps = np.random.default_rng(seed), []
-    for sweep in (window.pc0, window.pc1, *window.pch):
+    rng = np.random.default_rng(seed)
+
+    def timed(sweep: Sweep) -> Sweep:
         angle = np.arctan2(sweep.points[:, 1], sweep.points[:, 0]) / (2 * np.pi)
         times = 0.1 * ((angle + 0.5 * rng.integers(0, 2, len(angle))) % 1.0) + rng.uniform(0, 0.01)
-        sweeps.append(replace(sweep, point_times=times))
-    return Window(sweeps[0], sweeps[1], tuple(sweeps[2:]))
+        return replace(sweep, point_times=times)
+
+    return changed(window, timed)
 
 
 def at_once(window: Window) -> Window:
-    sweeps = [replace(s, point_times=np.zeros(len(s.points))) for s in (window.pc0, window.pc1, *window.pch)]
-    return Window(sweeps[0], sweeps[1], tuple(sweeps[2:]))
+    return changed(window, lambda sweep: replace(sweep, point_times=np.zeros(len(sweep.points))))
 
 
 # ------------------------------------------------------------------------------------------- equal to the oracle
@@ -176,15 +178,6 @@ def test_times_of_zero_and_times_of_some_sweeps_change_no_bit(num_history):
     assert_same_bits(model([replace(some, pc1=replace(some.pc1, point_times=None))])[0], expected)
 
 
-def test_neighbours_in_a_batch_and_the_order_of_points_do_not_matter():
-    windows = [late(turning_car(0, 3, 0.4), 0), turning_car(1, 3, 0.4), late(turning_car(2, 0, 0.4), 2)]
-    model = VerifiedFlow(HISTORY)
-    for window, result in zip(windows, model(windows)):
-        assert_same_bits(model([window])[0], result)
-        mixed, order = reordered(window)
-        assert_same_bits(model([mixed])[0], rows_of(result, order))
-
-
 def test_what_is_not_thorough_does_not_look_at_them():
     window, model = turning_car(4, 1), VerifiedFlow(MODEL.replace(num_history=1, thorough=False))
     expected, found = (model([w])[0] for w in (window, late(window, 1)))
@@ -224,20 +217,6 @@ def test_times_that_are_none_are_refused(change, message):
     with pytest.raises(CFlowError, match=message) as caught:
         flow_with(change(times))
     assert "pc0" in str(caught.value)
-
-
-def test_estimate_flow_takes_them():
-    window = late(turning_car(4, 1), 1)
-    sweeps = (window.pc0, window.pc1, *window.pch)
-    p0, p1, ph = (sweep.points for sweep in sweeps)
-    gm0, gm1, gmh = (sweep.is_ground for sweep in sweeps)
-    dt0, dt1, dth = (sweep.point_times for sweep in sweeps)
-    settings = {"point_cloud_range": MODEL.point_cloud_range, "num_history": 1}
-    found = estimate_flow(p0, p1, pch=[ph], gm0=gm0, gm1=gm1, gmh=[gmh], dt0=dt0, dt1=dt1, dth=[dth], **settings)
-    (expected,) = VerifiedFlow.from_preset("default", **settings)([window])
-    assert_same_bits(found, expected)
-    with pytest.raises(CFlowError, match="dth has 2 entries"):
-        estimate_flow(p0, p1, pch=[ph], dth=[dth, dth])
 
 
 def test_time_stamps_say_how_long_an_interval_is():

@@ -12,7 +12,7 @@ from preset_windows import changed
 from scenes import assert_same_bits, flow_as_oracle, reordered, rows_of
 from turning_car import upright_box
 
-from cflow_torch import FlowResult, Sweep, VerifiedFlow, Window, estimate_flow, make_config
+from cflow_torch import FlowResult, Sweep, VerifiedFlow, Window, make_config
 
 # Small enough for the oracle.
 OFFLINE = make_config("offline", point_cloud_range=(-5.0, -3.0, -3.0, 4.0, 6.0, 3.0))
@@ -62,39 +62,9 @@ def test_the_whole_method_equals_the_oracle():
     assert not torch.equal(found.residual_flow, MODEL([bare(window)])[0].residual_flow)
 
 
-def without_times_of(window: Window, index: int) -> Window:
-    """The sweep of that index, of pc0, pc1, the history and the future, has none."""
-    sweeps = [window.pc0, window.pc1, *window.pch, *window.pcf]
-    sweeps[index] = replace(sweeps[index], point_times=None)
-    first_future = 2 + len(window.pch)
-    return Window(sweeps[0], sweeps[1], tuple(sweeps[2:first_future]), tuple(sweeps[first_future:]))
-
-
-def test_windows_without_times_are_the_same_to_the_last_bit():
-    window = rolling_drive()
-    (with_times,), (expected,) = MODEL([window]), MODEL([bare(window)])
-    assert not torch.equal(with_times.residual_flow, expected.residual_flow)
-    for index in range(2 + len(window.pch) + len(window.pcf)):  # one that lacks them is enough, also the last
-        assert_same_bits(MODEL([without_times_of(window, index)])[0], expected)
-    at_once = changed(window, lambda sweep: replace(sweep, point_times=np.zeros(len(sweep.points))))
-    assert_same_bits(MODEL([at_once])[0], expected)
-
-
 def test_alone_or_in_a_batch_in_any_order_of_points():
     windows: List[Window] = [rolling_drive(), bare(rolling_drive(0)), rolling_drive(1, 0), rolling_drive(0, 2)]
     for window, result in zip(windows, MODEL(windows)):
         assert_same_bits(MODEL([window])[0], result)
         mixed, order = reordered(window)
         assert_same_bits(MODEL([mixed])[0], rows_of(result, order))
-
-
-def test_estimate_flow_takes_both():
-    window = rolling_drive()
-    settings = {"preset": "offline", "point_cloud_range": OFFLINE.point_cloud_range}
-    clouds, times = (
-        {f"{name}{side}": [getattr(sweep, field) for sweep in getattr(window, f"pc{side}")] for side in "hf"}
-        for name, field in (("pc", "points"), ("dt", "point_times"))
-    )
-    given = (window.pc0.points, window.pc1.points)
-    newest = {"dt0": window.pc0.point_times, "dt1": window.pc1.point_times}
-    assert_same_bits(estimate_flow(*given, **clouds, **newest, **times, **settings), MODEL([window])[0])

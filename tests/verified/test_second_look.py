@@ -72,14 +72,6 @@ def test_equals_the_oracle(num_history, num_future, start):
     assert error(window, result, car, (WAY, 0.0, 0.0)) < 0.1
 
 
-def test_ids_of_both_looks_are_apart():
-    window = avenue(2)
-    (result,) = VerifiedFlow(SETTINGS)([window])
-    under = is_under_crown(window)
-    first, second = set(result.cluster_id[~under].tolist()), set(result.cluster_id[under].tolist())
-    assert -1 not in second and not first & second
-
-
 @pytest.mark.slow
 def test_the_future_decides_for_what_a_second_look_finds():
     # Both cars appear at t: of the sweeps after t+1 four show each of them, of those before t none.

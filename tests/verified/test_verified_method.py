@@ -8,16 +8,7 @@ import numpy as np
 import pytest
 import torch
 from oracle.component_tree import with_longest
-from scenes import (
-    assert_same,
-    assert_same_bits,
-    config,
-    flow_as_oracle,
-    needs_gpu,
-    reordered,
-    rows_of,
-    scene,
-)
+from scenes import assert_same_bits, config, flow_as_oracle, reordered, rows_of, scene
 from turning_car import MODEL, car_of, turning_car, upright_box
 
 from cflow_torch import Sweep, VerifiedFlow, Window, make_config
@@ -25,7 +16,9 @@ from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.hdf5.reader import HDF5Log
 from cflow_torch.data.log import window as window_of
 
-NEAR = (-9.0, -5.0, -math.inf, -3.0, 1.0, math.inf)  # the whole takes the oracle minutes
+# The whole takes the oracle many minutes.
+NEAR = (-9.0, -5.0, -math.inf, -3.0, 1.0, math.inf)
+WIDER = (-35.0, -25.0, -math.inf, 25.0, 25.0, math.inf)
 
 
 # ------------------------------------------------------------------------------------------- equal to the oracle
@@ -53,11 +46,6 @@ def test_presets_equal_the_oracle(preset):
     assert flow_as_oracle(turning_car(5, settings.num_history, 0.5), settings).residual_flow.any()
 
 
-def test_a_turning_car_equals_the_oracle():
-    for seed in range(3):
-        assert flow_as_oracle(turning_car(seed, share=0.4), MODEL).residual_flow.any()
-
-
 @pytest.mark.parametrize("preset", ["default", "fast"])
 def test_a_part_of_the_real_pair_equals_the_oracle(av2_folder, preset):
     settings = with_longest(make_config(preset, point_cloud_range=NEAR), 6.0)
@@ -74,10 +62,10 @@ def test_a_part_of_kitti_equals_the_oracle(kitti_file, num_history):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("preset", ["default", "fast"])
-def test_real_drives_equal_the_oracle(av2_folder, data_root, preset):
-    flow_as_oracle(window_of(AV2Log(av2_folder), 0), make_config(preset))
+def test_more_of_real_drives_equals_the_oracle(av2_folder, data_root, preset):
+    settings = make_config(preset, point_cloud_range=WIDER)
+    flow_as_oracle(window_of(AV2Log(av2_folder), 0), settings)
     with HDF5Log(data_root / "av2-crown" / "av2-crown.h5") as log:
-        settings = make_config(preset)
         flow_as_oracle(window_of(log, len(log) - 2, settings.num_history), settings)
 
 
@@ -92,15 +80,6 @@ def test_alone_or_in_a_batch_in_any_order_of_points():
         assert_same_bits(model([window])[0], result)
         mixed, order = reordered(window)
         assert_same_bits(model([mixed])[0], rows_of(result, order))
-
-
-@pytest.mark.cuda
-@needs_gpu
-def test_cuda_equals_cpu():
-    windows = [turning_car(0, 2), turning_car(1), turning_car(2, 1), turning_car(3, 2)]
-    settings = MODEL.replace(num_history=2)
-    for on_cpu, on_gpu in zip(VerifiedFlow(settings, "cpu")(windows), VerifiedFlow(settings, "cuda")(windows)):
-        assert_same(on_gpu, on_cpu, atol=1e-4)
 
 
 def test_empty_and_hopeless_windows():

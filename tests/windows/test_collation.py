@@ -17,7 +17,6 @@ from cflow_torch import FlowResult, Sweep, Window, make_model
 from cflow_torch.config import Config
 from cflow_torch.windows import memory
 from cflow_torch.windows.bev_grid import Grid
-from cflow_torch.windows.collation import make_batch
 from cflow_torch.windows.memory import split_windows
 
 CPU = torch.device("cpu")
@@ -135,22 +134,6 @@ def test_the_box_is_that_of_the_sweep_and_holds_its_ends():
 
 
 # ----------------------------------------------------------------------------------------------- batch and groups
-
-
-def test_a_batch_by_hand():
-    grid = Grid(1.0, RANGE[:3], RANGE[3:])
-    pc0 = np.array([[1.0, 2.0, 0.0], [99.0, 0.0, 0.0], [-3.0, 1.0, 1.0]])
-    one = Window(Sweep(pc0, np.array([False, False, True])), Sweep(pc0[:1] + 1), (Sweep(pc0[2:]),))
-    two = Window(Sweep(pc0[:1], timestamp_ns=0), Sweep(pc0, timestamp_ns=200_000_000))
-    batch = make_batch([one, two], config(num_history=1), grid, CPU)
-    assert (batch.num_windows, batch.num_steps, batch.num_newest) == (2, 3, 3)
-    # t+1 of both, then t of both (all rows), then t-1: window * 3 + step.
-    assert batch.image.tolist() == [0, 3, 3, 1, 1, 1, 4, 2]
-    assert batch.takes_part.tolist() == [True] * 4 + [False, False, True, True]
-    assert batch.positions[:, [0, 7]].t().tolist() == [[2.0, 3.0], [-3.0, 1.0]]
-    assert batch.elapsed.tolist() == [[0, 1, 2], [0, 1, 0]]
-    assert batch.seconds.tolist() == [[0, 0.1, 0.2], [0, 0.2, 0]]
-    assert batch.rows == (slice(3, 6), slice(6, 7))
 
 
 def test_windows_are_grouped_by_memory(monkeypatch):
