@@ -26,7 +26,6 @@ from cflow_torch.cli.record import refuse_changes
 from cflow_torch.cli.run import Failures
 from cflow_torch.data.atomic import ready_folder
 from cflow_torch.data.log import Log, window
-from cflow_torch.data.names import folder_in
 from cflow_torch.evaluation.submission.check import check_submission
 from cflow_torch.evaluation.submission.encode import RESIDUAL_AXES, Rounding, encode
 from cflow_torch.evaluation.submission.masks import MaskArchive, log_mask, point_mask
@@ -85,7 +84,6 @@ def _claim(cfg: DictConfig, output: Path, folder: Path, file: Path) -> None:
     """
     record = output / "config.yaml"
     ready_folder(output)
-    folder_in(output, folder.name, "the folder")
     if cfg.overwrite:
         shutil.rmtree(folder, ignore_errors=True)
         file.unlink(missing_ok=True)
