@@ -3,31 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, Optional
+from typing import Any
 
-from cflow_torch.data.log import FlowLabels, Log
+from cflow_torch.data.log import ChangedLog, Log
 from cflow_torch.types import Sweep
 from cflow_torch.windows.ground import find_ground
-
-
-class ChangedLog(Log):
-    """Another log whose sweeps are changed; everything else is the other's.
-
-    Args:
-        log: any log.
-    """
-
-    def __init__(self, log: Log) -> None:
-        self.log, self.log_id, self.timestamps = log, log.log_id, log.timestamps
-
-    def labels(self, index: int) -> Optional[FlowLabels]:
-        """The log's labels."""
-        return self.log.labels(index)
-
-    def __getattr__(self, name: str) -> Any:
-        if name == "log" or name.startswith("__"):  # it is being unpickled; what Python asks of a class
-            raise AttributeError(name)
-        return getattr(self.log, name)
 
 
 class GroundFoundLog(ChangedLog):

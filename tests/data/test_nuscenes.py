@@ -116,8 +116,6 @@ def test_an_object_that_one_sample_lacks_is_a_guess():
     np.testing.assert_allclose(alone.pose[:, 0, 3], [5.0, 1.0])  # nothing tells how they move
     assert tracks.at(500_000)[0].track == ["a"] and tracks.at(500_000)[1].all()
     assert tracks.at(-1) is None and tracks.at(1_500_001) is None and tracks_of().at(0) is None
-    with pytest.raises(CFlowError, match="instance a twice"):
-        tracks_of((0, "a", 0.0, 0, 4), (0, "a", 5.0, 0, 4))
 
 
 def test_points_of_a_half_known_object_are_not_valid(tmp_path):
