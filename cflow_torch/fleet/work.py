@@ -147,11 +147,13 @@ class Worker:
                 yield writing.popleft().result()
 
     def _read(self, log: Log, batch: Sequence[int]) -> List[_Frame]:
-        frames = [_Frame(int(log.timestamps[index])) for index in batch]
-        for frame, index in zip(frames, batch):
-            with _stage(frame, "read"):
-                frame.content = window(log, index, self._job.config.num_history, self._job.config.num_future)
-        return frames
+        return [self._read_one(log, index) for index in batch]
+
+    def _read_one(self, log: Log, index: int) -> _Frame:
+        frame = _Frame(int(log.timestamps[index]))
+        with _stage(frame, "read"):
+            frame.content = window(log, index, self._job.config.num_history, self._job.config.num_future)
+        return frame
 
     def _compute(self, frames: List[_Frame]) -> None:
         """Windows to results, together; if that fails, each by itself, so that one bad frame spoils no other."""
