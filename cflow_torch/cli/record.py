@@ -99,25 +99,10 @@ def finished_results(cfg: DictConfig, folder: Path) -> Optional[Dict[str, Any]]:
             f"{file} is no results file of this version ({error!r}): give output=FOLDER, or overwrite=true"
         ) from None
     now = {"versions": versions(), "generator": _generator(cfg), "config": _plain(cfg)}
-    refuse_changes(folder, before, now, _PLACES)
-    return record
-
-
-def refuse_changes(folder: Path, before: Dict[str, Any], now: Dict[str, Any], ignored: Sequence[str] = ()) -> None:
-    """Results of different runs are never mixed.
-
-    Args:
-        folder: that holds results.
-        before: what they were made with.
-        now: what this run would be made with.
-        ignored: names of settings, joined by dots, that may differ.
-
-    Raises:
-        CFlowError: anything else differs.
-    """
-    changed = changes(before, now, ignored)
+    changed = changes(before, now, _PLACES)
     if changed:
         raise CFlowError(f"{folder} holds results of another run ({changed}): give output=FOLDER, or overwrite=true")
+    return record
 
 
 def objective(results: Dict[str, Any]) -> float:

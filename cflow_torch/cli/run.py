@@ -250,12 +250,7 @@ def finish(failures: Failures) -> None:
         raise SystemExit(1)
 
 
-def config_text(cfg: DictConfig) -> str:
-    """The resolved settings and versions as YAML."""
-    settings: Dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
-    return OmegaConf.to_yaml(OmegaConf.create({**settings, "versions": versions()}))
-
-
 def write_config(cfg: DictConfig, folder: Path) -> None:
-    """Write `config_text` to `folder/config.yaml`."""
-    write_text(folder / "config.yaml", config_text(cfg))
+    """Write the resolved settings and versions to `folder/config.yaml`."""
+    settings: Dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
+    write_text(folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create({**settings, "versions": versions()})))

@@ -17,22 +17,22 @@ import sys
 from pathlib import Path
 from typing import Any, Dict, List, Mapping, Optional, Sequence, Tuple
 
-import yaml  # type: ignore[import-untyped]
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
+from cflow_torch import __version__
 from cflow_torch.cli import run
 from cflow_torch.cli.estimates import estimates
-from cflow_torch.cli.record import refuse_changes
 from cflow_torch.cli.run import Failures
 from cflow_torch.data.atomic import ready_folder
 from cflow_torch.data.log import Log, window
-from cflow_torch.data.names import folder_in
+from cflow_torch.data.records import strict
 from cflow_torch.evaluation.submission.check import check_submission
 from cflow_torch.evaluation.submission.encode import RESIDUAL_AXES, Rounding, encode
 from cflow_torch.evaluation.submission.masks import MaskArchive, log_mask, point_mask
 from cflow_torch.evaluation.submission.plan import Frame, PlannedFrame, plan_log, read_frame_list, require_logs
 from cflow_torch.evaluation.submission.versions import SubmissionVersion, get_version
 from cflow_torch.evaluation.submission.write import is_complete, pack, write_frame, write_metadata
+from cflow_torch.fleet.manifest import claim_folder
 from cflow_torch.fleet.progress import frames as counted
 from cflow_torch.stages import StopWatch
 from cflow_torch.types import CFlowError, Window
@@ -78,31 +78,15 @@ def task(cfg: DictConfig) -> None:
 
 
 def _claim(cfg: DictConfig, output: Path, folder: Path, file: Path) -> None:
-    """Take the output folder for these settings; files of other settings are never mixed in.
-
-    Raises:
-        CFlowError: it holds files of other settings.
-    """
-    record = output / "config.yaml"
+    """Take the output folder for these settings; files of other settings are never mixed in."""
+    settings: Dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
+    identity = strict({**{name: settings[name] for name in _SETTINGS}, "cflow_torch": __version__})
     ready_folder(output)
-    folder_in(output, folder.name, "the folder")
     if cfg.overwrite:
         shutil.rmtree(folder, ignore_errors=True)
         file.unlink(missing_ok=True)
-    elif record.exists():
-        try:
-            before = _identity(record.read_text(encoding="utf-8"))
-        except (yaml.YAMLError, LookupError, ValueError, TypeError, AttributeError) as error:
-            raise CFlowError(f"{record} holds no settings ({error!r:.200}): give output=FOLDER, or remove it") from None
-        refuse_changes(output, before, _identity(run.config_text(cfg)))
+    claim_folder(output, identity, resume=True, overwrite=cfg.overwrite, alone=True)
     run.write_config(cfg, output)
-
-
-def _identity(text: str) -> Dict[str, Any]:
-    """What of a config.yaml the files of a submission depend on."""
-    settings = yaml.safe_load(text)
-    of_files = {name: settings.get(name) for name in _SETTINGS}
-    return {**of_files, "cflow_torch": settings["versions"]["cflow_torch"]}
 
 
 def _plan(logs: Sequence[Log], version: SubmissionVersion, listed: _Listed, masks: _Masks) -> Tuple[Plan, Failures]:

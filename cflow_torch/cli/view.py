@@ -51,7 +51,7 @@ def task(cfg: DictConfig) -> None:
         recent: Any = RecentSweeps(log, num_sweeps)
         file = output / f"{log.log_id}.rrd"
         with run.reported(failures, log.log_id):
-            if file.name.casefold() in {other.name.casefold() for other in files}:
+            if file in files:
                 raise CFlowError(f"{file} is of another log of this name: give data.root=PATH more narrowly")
             results = _results(recent, chosen(log), flow, failures)
             count = record_log(recent, results, file, max_flow=cfg.max_flow)

@@ -34,7 +34,7 @@ class FeatherFile:
         data: its contents; None = they are read, all at once: a file that shrinks meanwhile does no harm.
 
     Attributes:
-        schema, names, num_rows: of the table, its columns, its rows.
+        names, num_rows: of the columns, of the table.
 
     Raises:
         CFlowError: the file is missing, cannot be reached, or is damaged.
@@ -46,7 +46,6 @@ class FeatherFile:
             self._table = pa.ipc.open_file(source, options=pa.ipc.IpcReadOptions(use_threads=False)).read_all()
             self._table.validate(full=True)
         self.file = file
-        self.schema: pa.Schema = self._table.schema
         self.names: List[str] = self._table.column_names
         self.num_rows: int = self._table.num_rows
 

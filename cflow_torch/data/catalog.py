@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import inspect
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import Any, Dict, List, Mapping, Sequence
 
-from cflow_torch.data.log import Log
+from cflow_torch.data.log import ChangedLog, Log
 from cflow_torch.data.log_check import check_log
 from cflow_torch.data.names import safe_name
 from cflow_torch.data.paths import as_path, is_place, remote_errors
-from cflow_torch.types import CFlowError
+from cflow_torch.types import CFlowError, Sweep
+from cflow_torch.windows.ground import find_ground as ground_of
 
 GROUND_METHODS = ("grid", "patchwork")
 _OF_ALL = ("find_ground", "odometry", "check")  # settings that every data set has
@@ -199,8 +200,6 @@ def open_log(
 
         log = with_poses(log)
     if find_ground is not None:
-        from cflow_torch.data.found_ground import GroundFoundLog
-
         log = GroundFoundLog(log, find_ground)
     if check:
         check_log(log)
@@ -222,6 +221,31 @@ def _open(name: str, source: Any, settings: Mapping[str, Any]) -> Log:
             raise
         given = ", ".join(f"{key}={value!r:.80}" for key, value in settings.items())
         raise CFlowError(f"data set {name} cannot be opened with {given}: {error}") from error
+
+
+class GroundFoundLog(ChangedLog):
+    """Another log, with the ground of sweeps without a mask found from their points.
+
+    Args:
+        log: any log.
+        method: as for `cflow_torch.windows.ground.find_ground`.
+
+    Convention: a mask that the log has is kept.
+
+    Cost: one call of `find_ground` per sweep that is read.
+    """
+
+    def __init__(self, log: Log, method: str = "grid") -> None:
+        super().__init__(log)
+        self.method = method
+
+    def sweep(self, index: int) -> Sweep:
+        """The log's sweep with a ground mask."""
+        sweep = self.log.sweep(index)
+        if sweep.is_ground is not None:
+            return sweep
+        is_ground: Any = ground_of(sweep.points, self.method)
+        return replace(sweep, is_ground=is_ground)
 
 
 def _data_set(name: str) -> DataSet:

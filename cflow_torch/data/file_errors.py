@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any, Iterator
 
-from cflow_torch.data.paths import is_remote
 from cflow_torch.types import CFlowError
 
 _MAX_TEXT = 400  # characters of what a library says; a damaged name can be a million long
@@ -24,12 +22,9 @@ def file_errors(file: Any, mend: str = "copy it again", doing: str = "read") -> 
         doing: what is done with the file, for the message.
 
     Raises:
-        CFlowError: as said. A folder, a pipe or a device in place of a file is refused before anything is read: a pipe
-            would be waited for.
+        CFlowError: as said.
     """
     try:
-        if isinstance(file, Path) and not is_remote(file) and file.exists() and not file.is_file():
-            raise OSError("it is a folder, a pipe or a device")
         yield
     except CFlowError as error:
         if str(file) in str(error):

@@ -142,7 +142,27 @@ class NumberedSweeps(Log):
             raise CFlowError(f"{where} has {len(self.timestamps)} sweeps; scene flow needs two or more")
 
 
-class RecentSweeps(Log):
+class ChangedLog(Log):
+    """Another log whose sweeps are changed; everything else is the other's.
+
+    Args:
+        log: any log.
+    """
+
+    def __init__(self, log: Log) -> None:
+        self.log, self.log_id, self.timestamps = log, log.log_id, log.timestamps
+
+    def labels(self, index: int) -> Optional[FlowLabels]:
+        """The log's labels."""
+        return self.log.labels(index)
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "log" or name.startswith("__"):  # it is being unpickled; what Python asks of a class
+            raise AttributeError(name)
+        return getattr(self.log, name)
+
+
+class RecentSweeps(ChangedLog):
     """A log that remembers its last sweeps: neighbouring windows share all but one.
 
     Args:
@@ -151,7 +171,8 @@ class RecentSweeps(Log):
     """
 
     def __init__(self, log: Log, count: int) -> None:
-        self.log, self.log_id, self.timestamps, self._count = log, log.log_id, log.timestamps, count
+        super().__init__(log)
+        self._count = count
         self._sweep = lru_cache(count)(log.sweep)
 
     def __reduce__(self) -> Any:
@@ -160,7 +181,3 @@ class RecentSweeps(Log):
     def sweep(self, index: int) -> Sweep:
         """The log's sweep."""
         return self._sweep(index)
-
-    def labels(self, index: int) -> Optional[FlowLabels]:
-        """The log's labels."""
-        return self.log.labels(index)

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import re
-from collections import Counter
 from pathlib import Path
-from typing import Any, Iterable, List
+from typing import Any
 
-from cflow_torch.data.paths import is_remote
 from cflow_torch.types import CFlowError
 
 MAX_NAME_BYTES = 255  # of one folder or file, in UTF-8: what file systems take
@@ -68,35 +65,16 @@ def folder_in(output: Path, name: Any, what: str) -> Path:
     """The folder `output/<name>` to write into.
 
     Args:
-        output: folder of the run; may be a link itself, and may not be there yet.
+        output: folder of the run.
         name: from data.
         what: what it is the name of, for the message.
 
     Raises:
-        CFlowError: `safe_name` refuses the name, or it is a link that leaves `output`.
+        CFlowError: `safe_name` refuses the name.
     """
-    folder = output / safe_name(name, what)
-    if leaves(output, folder):
-        where = f"{folder} is a link to {os.path.realpath(folder)}, outside of {output}"
-        raise CFlowError(f"{where}: nothing is written there; remove the link, or give output=FOLDER")
-    return folder
-
-
-def leaves(output: Path, path: Path) -> bool:
-    """Whether a path in a folder is a link, or lies behind one, that leads out of it."""
-    if is_remote(output):
-        return False
-    root, real = os.path.realpath(output), os.path.realpath(path)
-    return real != root and not real.startswith(root.rstrip(os.sep) + os.sep)
+    return output / safe_name(name, what)
 
 
 def is_stamp(name: str) -> bool:
     """Whether a name is a time stamp: digits 0 to 9 that an int64 can hold."""
     return name.isascii() and name.isdigit() and len(name) < 20 and int(name) < 1 << 63
-
-
-def same_names(names: Iterable[str]) -> List[str]:
-    """Names that some file system cannot tell from another one of them: the same but for case."""
-    listed = list(names)
-    count = Counter(name.casefold() for name in listed)
-    return sorted({name for name in listed if count[name.casefold()] > 1})

@@ -8,8 +8,7 @@ from typing import Any, List, Sequence
 import numpy as np
 from tqdm import tqdm
 
-from cflow_torch.data.found_ground import ChangedLog
-from cflow_torch.data.log import Log
+from cflow_torch.data.log import ChangedLog, Log
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.ego_motion import rigid_transform
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 from typing import Any, Callable, Dict, Union
 
 from cflow_torch.evaluation.accumulator import Accumulator
-from cflow_torch.evaluation.bucketed import BucketedByRange, BucketedEPE
+from cflow_torch.evaluation.bucketed import BucketedByRange, BucketedEPE, RangeWiseEPE
 from cflow_torch.evaluation.definitions import Definition, get_definition
 from cflow_torch.evaluation.frame import EvalFrame
 from cflow_torch.evaluation.masks import score_points
-from cflow_torch.evaluation.rangewise import RangeWiseEPE
 from cflow_torch.evaluation.threeway import ThreeWayEPE
 
 _ACCUMULATORS: Dict[str, Callable[..., Accumulator]] = {

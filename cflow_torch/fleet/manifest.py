@@ -25,7 +25,6 @@ from cflow_torch.data.atomic import remove_stale
 from cflow_torch.data.flow_file import CONTENTS
 from cflow_torch.data.json_file import read_json
 from cflow_torch.data.log import Log
-from cflow_torch.data.names import leaves
 from cflow_torch.data.paths import forget_listings, is_remote, remote_errors
 from cflow_torch.data.records import changes, strict, write_text
 from cflow_torch.types import CFlowError, as_numpy
@@ -170,7 +169,7 @@ def _clear(output: Path) -> None:
     Its manifest goes first: what is left half-way belongs to none. That of a log goes last: it tells whose frames they
     are.
     """
-    logs = [path for path in output.iterdir() if path.is_dir() and not leaves(output, path)]
+    logs = [path for path in output.iterdir() if (path / MANIFEST).exists()]
     for name in (MANIFEST, "config.yaml"):
         with suppress(FileNotFoundError):
             (output / name).unlink()

@@ -11,7 +11,6 @@ from contextlib import closing, suppress
 from typing import Any, Dict, Iterator, Optional, Sequence
 
 from cflow_torch.data.atomic import remove_stale
-from cflow_torch.data.names import folder_in
 from cflow_torch.data.paths import as_path
 from cflow_torch.data.records import strict, write_text
 from cflow_torch.fleet.dispatch import SIGNALS
@@ -81,7 +80,7 @@ def run_fleet(
 
 def report_file(output: str, shard: Shard) -> Any:
     """Where a shard's report lies."""
-    return folder_in(as_path(output), "reports", "the folder") / f"shard-{shard.index}-of-{shard.count}.json"
+    return as_path(output) / "reports" / f"shard-{shard.index}-of-{shard.count}.json"
 
 
 def _follow(events: Iterator[Event], counters: Counters, num_units: int) -> None:

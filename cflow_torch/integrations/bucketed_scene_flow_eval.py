@@ -110,22 +110,20 @@ def _read_frames(frames: Any) -> List[_LogFrame]:
         if (new.log_id, new.log_idx) != (old.log_id, old.log_idx + 1):
             places = f"{new.log_id!r}, {new.log_idx} after {old.log_id!r}, {old.log_idx}"
             raise CFlowError(f"frames[{i}].log_id, log_idx: {places}; give consecutive frames of one log")
-    stamps = times_in_ns([_field(frame, f"frames[{i}]", "log_timestamp") for i, (frame, _) in enumerate(pairs)])
+    stamps = times_in_ns([frame.log_timestamp for frame, _ in pairs])
     return [frame._replace(sweep=replace(frame.sweep, timestamp_ns=t)) for frame, t in zip(read, stamps)]
 
 
 def _read_frame(name: str, frame: Any, data: Any) -> _LogFrame:
     """A frame without its time; `data` is its `TimeSyncedAVLidarData`, or None."""
-    points = _field(frame, name, "pc.full_pc")
-    points = np.asarray(getattr(points, "points", points))
+    points = np.asarray(getattr(frame.pc.full_pc, "points", frame.pc.full_pc))
     if points.ndim != 2 or points.shape[1] != 3:
         raise CFlowError(f"{name}.pc.full_pc has shape {points.shape}: give (N, 3) metres")
-    takes_part = mask = _mask(frame, name, "pc.mask", len(points))
+    takes_part = mask = _mask(frame.pc.mask, f"{name}.pc.mask", len(points))
     if data is not None:
-        takes_part = mask & ~_mask(data, f"{name}[1]", "is_ground_points", len(points))
-    T_ego_sensor, T_global_ego = (_pose(frame, name, f"pc.pose.{side}") for side in ("sensor_to_ego", "ego_to_global"))
-    sweep = Frame(points, takes_part, T_ego_sensor, T_global_ego)
-    return _LogFrame(_field(frame, name, "log_id"), _field(frame, name, "log_idx"), sweep, mask)
+        takes_part = mask & ~_mask(data.is_ground_points, f"{name}[1].is_ground_points", len(points))
+    T_ego_sensor, T_global_ego = (_pose(frame.pc.pose, name, side) for side in ("sensor_to_ego", "ego_to_global"))
+    return _LogFrame(frame.log_id, frame.log_idx, Frame(points, takes_part, T_ego_sensor, T_global_ego), mask)
 
 
 def _earlier(known: Sequence[_LogFrame], first: _LogFrame, num_history: int) -> List[_LogFrame]:
@@ -141,22 +139,13 @@ def _earlier(known: Sequence[_LogFrame], first: _LogFrame, num_history: int) -> 
     ]
 
 
-def _field(holder: Any, name: str, path: str) -> Any:
-    """What lies at a path of attributes, "pc.pose.ego_to_global"."""
-    for field in path.split("."):
-        if not hasattr(holder, field):
-            raise CFlowError(f"{name} is {type(holder).__name__} without {field!r}: give TimeSyncedSceneFlowFrames")
-        holder, name = getattr(holder, field), f"{name}.{field}"
-    return holder
-
-
-def _mask(holder: Any, name: str, path: str, length: int) -> np.ndarray:
-    mask = np.asarray(_field(holder, name, path))
+def _mask(values: Any, name: str, length: int) -> np.ndarray:
+    mask = np.asarray(values)
     if mask.shape != (length,) or mask.dtype != np.bool_:
-        raise CFlowError(f"{name}.{path} has shape {mask.shape}, {mask.dtype}: give ({length},) bool, one per point")
+        raise CFlowError(f"{name} has shape {mask.shape}, {mask.dtype}: give ({length},) bool, one per point")
     return mask
 
 
-def _pose(holder: Any, name: str, path: str) -> np.ndarray:
-    pose = _field(holder, name, path)
-    return rigid_transform(pose.to_array() if hasattr(pose, "to_array") else pose, f"{name}.{path}")
+def _pose(poses: Any, name: str, side: str) -> np.ndarray:
+    pose = getattr(poses, side)
+    return rigid_transform(pose.to_array() if hasattr(pose, "to_array") else pose, f"{name}.pc.pose.{side}")

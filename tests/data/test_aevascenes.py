@@ -165,8 +165,7 @@ def test_damaged_cloud(folder: Path, damage: Any, message: str) -> None:
     ("change", "message"),
     [
         (lambda c: c.clear(), "'metadata'"),
-        (lambda c: c.update(frames=c["frames"] * 2), "must be different"),
-        (lambda c: c["frames"][1].update(timestamp_ns="noon"), "different integers"),
+        (lambda c: c["frames"][1].update(timestamp_ns="noon"), "cannot read .*TypeError"),
         (lambda c: c["frames"][1]["ego_pose"]["rotation"].update(w=3.0), "no rigid motion"),
         (lambda c: c["frames"][1]["point_cloud"]["left_lidar"].clear(), "no compensated cloud.*version 2"),
         (lambda c: c["frames"][1]["boxes"][0].update({"class": "tank"}), "unknown categories .*tank"),

@@ -12,8 +12,7 @@ import pytest
 
 from cflow_torch.cli.main import main
 from cflow_torch.data.arrays import write_array_log
-from cflow_torch.data.catalog import find_sources, open_log
-from cflow_torch.data.found_ground import GroundFoundLog
+from cflow_torch.data.catalog import GroundFoundLog, find_sources, open_log
 from cflow_torch.simulator import Drive, make_drive
 from cflow_torch.simulator.benchmark import FORMATS
 from cflow_torch.types import CFlowError

@@ -13,7 +13,7 @@ from tiny_recording import CAR_VELOCITY, TinyRecording
 from cflow_torch.data.arrays.pcd import read_pcd, write_pcd
 from cflow_torch.data.nuscenes.reader import find_nuscenes_scenes
 from cflow_torch.data.rigid_motion import moved
-from cflow_torch.data.truckscenes.reader import TruckScenesLog, find_truckscenes_scenes
+from cflow_torch.data.truckscenes import TruckScenesLog, find_truckscenes_scenes
 from cflow_torch.simulator.writers.nuscenes import write_nuscenes
 from cflow_torch.simulator.writers.truckscenes import write_truckscenes
 from cflow_torch.types import CFlowError

@@ -1,7 +1,5 @@
 """AevaScenes: reader."""
 
-from __future__ import annotations
-
 from cflow_torch.data.aevascenes.reader import AevaScenesLog, find_aevascenes_sequences
 
 __all__ = ["AevaScenesLog", "find_aevascenes_sequences"]

@@ -1,7 +1,5 @@
 """Your own files, one point cloud per sweep: reader and writer, file formats, poses."""
 
-from __future__ import annotations
-
 from cflow_torch.data.arrays.reader import ArraysLog, find_array_logs
 from cflow_torch.data.arrays.writer import write_array_log
 

@@ -19,7 +19,7 @@ from cflow_torch.data.arrays.poses_text import (
     read_times,
 )
 from cflow_torch.data.folders import find_folders
-from cflow_torch.data.log import FlowLabels, NumberedSweeps
+from cflow_torch.data.log import NumberedSweeps
 from cflow_torch.data.npy_file import read_npy
 from cflow_torch.data.paths import Place, as_path, is_place, is_remote
 from cflow_torch.data.rigid_motion import moved
@@ -133,15 +133,6 @@ class ArraysLog(NumberedSweeps):
         time = self.timestamps[index] if self._has_times else None
         return Sweep(points.astype(np.float32, copy=False), is_ground, pose, time)
 
-    def labels(self, index: int) -> Optional[FlowLabels]:
-        """None: bare clouds have no truth.
-
-        Raises:
-            CFlowError: no such sweep.
-        """
-        self._timestamp(index)
-        return None
-
     def _trajectory(self, poses: Any, calibration: Any) -> Tuple[Optional[Trajectory], str, bool]:
         """The poses given or found, what to call them, and whether a calibration made them the LiDAR's."""
         if is_place(poses):
@@ -158,11 +149,7 @@ class ArraysLog(NumberedSweeps):
             return replace(trajectory, poses=in_lidar), str(file), True
         if poses is None:
             return None, "", False
-        try:
-            matrices = np.asarray(poses)
-        except ValueError as error:
-            raise CFlowError(f"poses are no matrices ({error}); give (K, 4, 4), one per sweep") from error
-        return Trajectory(checked_poses(matrices, "poses"), None, "matrix"), "poses", False
+        return Trajectory(checked_poses(np.asarray(poses), "poses"), None, "matrix"), "poses", False
 
     def _times(self, times: Any, trajectory: Optional[Trajectory]) -> Optional[List[int]]:
         """Nanoseconds of each sweep, None = unknown."""

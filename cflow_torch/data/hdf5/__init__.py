@@ -1,7 +1,5 @@
 """OpenSceneFlow's HDF5 scenes: reader, writer, results."""
 
-from __future__ import annotations
-
 from cflow_torch.data.hdf5.reader import HDF5Log, find_hdf5_scenes
 from cflow_torch.data.hdf5.results import write_hdf5_results
 from cflow_torch.data.hdf5.writer import write_hdf5_scene

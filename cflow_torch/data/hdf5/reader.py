@@ -170,10 +170,7 @@ class HDF5Log(NumberedSweeps):
 
     def _group(self, index: int) -> Any:
         """The group of a sweep."""
-        found = member(self._scene, str(self._timestamp(index)), self.file)
-        if found is None:
-            raise CFlowError(f"{self.file} lists a sweep {self.timestamps[index]} that it does not have; copy it again")
-        return found
+        return member(self._scene, str(self._timestamp(index)), self.file)
 
     def _array(self, index: int, key: str) -> Optional[Any]:
         """What a sweep has under a key, not read yet; None where it is absent."""

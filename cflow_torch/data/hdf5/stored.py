@@ -54,10 +54,10 @@ def member(group: Any, name: str, where: Place) -> Optional[Any]:
     if not name or "/" in name or name == ".":
         return None
     with scene_errors(f"{where}: {name}"):
-        links = group.id.links  # h5py's own `in` and `get` open what a link names, be it a file elsewhere
-        if not links.exists(name.encode()):
+        link = group.get(name, getlink=True)
+        if link is None:
             return None
-        is_own = links.get_info(name.encode()).type == h5py.h5l.TYPE_HARD
+        is_own = isinstance(link, h5py.HardLink)  # else `group[name]` opens what it names, be it a file elsewhere
         found: Any = group[name] if is_own else None
         is_array = isinstance(found, h5py.Dataset)
         if not is_own or (is_array and (found.is_virtual or found.external)):

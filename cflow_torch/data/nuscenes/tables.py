@@ -6,21 +6,37 @@ from collections import defaultdict
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Collection, Dict, List, Optional, Sequence, Tuple
+from typing import Any, Collection, Dict, List, Optional, Sequence, Tuple
 
 import numpy as np
 
-from cflow_torch.data.file_errors import file_errors, shortened
+from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.folders import find_folders
+from cflow_torch.data.json_file import parse_json
 from cflow_torch.data.names import safe_name
-from cflow_torch.data.nuscenes.json_tables import Row, read_table
-from cflow_torch.data.paths import Place, as_path
+from cflow_torch.data.paths import Place, as_path, read_bytes
 from cflow_torch.data.rigid_motion import poses_from_quaternions
 from cflow_torch.types import CFlowError
 
 SEARCH_DEPTH = 3  # levels of folders below the one that is searched, to one that holds a scene.json
 _SENSOR_FOLDERS = ("samples", "sweeps", "maps")  # lie beside the tables and hold very many files
 _COPY = "copy the tables again"
+Row = Dict[str, Any]
+# The fields that are read; every other field of the format may be absent.
+FIELDS: Dict[str, Tuple[str, ...]] = {
+    "scene": ("token", "name"),
+    "sample": ("token", "timestamp", "scene_token"),
+    "sensor": ("token", "channel", "modality"),
+    "calibrated_sensor": ("token", "sensor_token", "translation", "rotation"),
+    "sample_data": (
+        *("sample_token", "ego_pose_token", "calibrated_sensor_token"),
+        *("timestamp", "is_key_frame", "filename"),
+    ),
+    "ego_pose": ("token", "translation", "rotation"),
+    "category": ("token", "name"),
+    "instance": ("token", "category_token"),
+    "sample_annotation": ("sample_token", "instance_token", "translation", "size", "rotation"),
+}
 
 
 @dataclass(frozen=True)
@@ -104,15 +120,34 @@ def find_scenes(root: Place, foreign: Collection[str], data_set: str) -> List[Sc
     return found
 
 
-class _ByToken(Dict[str, Row]):
-    """Rows of a table by their token; looking up one that it does not have is an error."""
+def read_table(folder: Path, table: str, key: str = "", values: Collection[str] = ()) -> List[Row]:
+    """Rows of a table with the fields of `FIELDS`.
 
-    def __init__(self, folder: Path, table: str, key: str = "", values: Collection[str] = ()) -> None:
-        super().__init__((row["token"], row) for row in read_table(folder, table, key, values))
-        self._file = folder / f"{table}.json"
+    Args:
+        folder: of the version.
+        table: name in `FIELDS`.
+        key, values: only rows whose field `key` is one of `values`; no key = all rows.
 
-    def __missing__(self, token: str) -> Row:
-        raise CFlowError(f"{self._file} has no row {shortened(repr(token))}, which another table names; {_COPY}")
+    Cost: memory of twice the file, and of the rows that are kept.
+
+    Raises:
+        CFlowError: the file is missing, truncated, no list of rows, or a row lacks a field.
+    """
+    file = folder / f"{table}.json"
+
+    def use(row: Row) -> Optional[Row]:  # called for each row as it is parsed, so that the rest is never held
+        chosen = {name: row[name] for name in FIELDS[table]}
+        return chosen if not key or row[key] in values else None
+
+    with file_errors(file, "copy all tables of the version"):
+        rows = parse_json(read_bytes(file), file, use)
+        if not isinstance(rows, list) or not all(row is None or type(row) is dict for row in rows):
+            raise ValueError("it is no list of rows")
+        return [row for row in rows if row is not None]
+
+
+def _by_token(rows: Sequence[Row]) -> Dict[str, Row]:
+    return {row["token"]: row for row in rows}
 
 
 class Tables:
@@ -129,7 +164,7 @@ class Tables:
     def __init__(self, folder: Place) -> None:
         self.folder = as_path(folder)
         self._rows: Dict[str, Dict[str, List[Row]]] = {}  # table -> token of the scene -> its rows
-        self._by_token: Dict[str, _ByToken] = {}
+        self._by_token: Dict[str, Dict[str, Row]] = {}
 
     @cached_property
     def scenes(self) -> Dict[str, str]:
@@ -171,12 +206,13 @@ class Tables:
     def _load(self) -> None:
         by_token = self._by_token
         for table in ("sensor", "category", "instance", "sample"):
-            by_token[table] = _ByToken(self.folder, table)
+            by_token[table] = _by_token(read_table(self.folder, table))
         lidars = [token for token, row in by_token["sensor"].items() if row["modality"] == "lidar"]
-        by_token["calibrated_sensor"] = _ByToken(self.folder, "calibrated_sensor", "sensor_token", lidars)
-        mounts = by_token["calibrated_sensor"]
+        mounts = _by_token(read_table(self.folder, "calibrated_sensor", "sensor_token", lidars))
+        by_token["calibrated_sensor"] = mounts
         sweeps = read_table(self.folder, "sample_data", "calibrated_sensor_token", mounts)
-        by_token["ego_pose"] = _ByToken(self.folder, "ego_pose", "token", {row["ego_pose_token"] for row in sweeps})
+        moments = {row["ego_pose_token"] for row in sweeps}
+        by_token["ego_pose"] = _by_token(read_table(self.folder, "ego_pose", "token", moments))
         rows = {"sample_data": sweeps, "sample_annotation": read_table(self.folder, "sample_annotation")}
         for table, content in (*rows.items(), ("sample", list(by_token["sample"].values()))):
             grouped: Dict[str, List[Row]] = defaultdict(list)

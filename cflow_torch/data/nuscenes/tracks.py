@@ -8,7 +8,6 @@ import numpy as np
 
 from cflow_torch.data.nuscenes.tables import Annotations
 from cflow_torch.data.rigid_motion import between
-from cflow_torch.types import CFlowError
 
 
 class Tracks:
@@ -20,9 +19,6 @@ class Tracks:
 
     Attributes:
         start, end: times of the first and of the last sample, microseconds.
-
-    Raises:
-        CFlowError: an object has two boxes in one sample.
     """
 
     def __init__(self, sample_times: np.ndarray, annotations: Annotations) -> None:
@@ -30,12 +26,7 @@ class Tracks:
         self.start, self.end = (int(sample_times[0]), int(sample_times[-1])) if len(sample_times) else (0, 0)
         self._rows: List[Dict[str, int]] = [{} for _ in sample_times]  # per sample: track -> row
         for row, sample in enumerate(np.searchsorted(sample_times, annotations.time)):
-            boxes = self._rows[int(sample)]
-            if annotations.track[row] in boxes:
-                raise CFlowError(
-                    f"sample_annotation.json has instance {annotations.track[row]} twice in one sample; copy it again"
-                )
-            boxes[annotations.track[row]] = row
+            self._rows[int(sample)][annotations.track[row]] = row
 
     def at(self, time: int) -> Optional[Tuple[Annotations, np.ndarray]]:
         """Boxes at a time; None before the first sample, after the last, and in a scene without annotations.

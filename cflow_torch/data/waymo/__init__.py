@@ -1,7 +1,5 @@
 """Waymo Open, version 2: reader."""
 
-from __future__ import annotations
-
 from cflow_torch.data.waymo.reader import WaymoLog, find_waymo_segments
 
 __all__ = ["WaymoLog", "find_waymo_segments"]

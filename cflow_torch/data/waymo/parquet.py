@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow.parquet as pq
 
 from cflow_torch.data.arrow_file import check_columns
-from cflow_torch.data.file_errors import file_errors, shortened
+from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.paths import mapped, ranged
 from cflow_torch.types import CFlowError
 from cflow_torch.windows.ego_motion import rigid_transform
@@ -48,30 +48,23 @@ class Component:
         """Rows of the file, of these columns.
 
         Raises:
-            CFlowError: the file is missing, is of another segment, lacks a column or cannot be read.
+            CFlowError: the file is missing, lacks a column or cannot be read.
         """
         with file_errors(self.file, self._mend):
             parquet = pq.ParquetFile(ranged(self.file))
-            check_columns(self.file, parquet.schema_arrow.names, [SEGMENT, *columns], self._mend)
-            rows: List[Dict[str, Any]] = parquet.read([SEGMENT, *columns], use_threads=False).to_pylist()
-        strangers = sorted({str(row[SEGMENT]) for row in rows} - {self.file.stem})
-        if strangers:
-            raise CFlowError(
-                f"{self.file} holds segment {shortened(strangers[0])}, which is not its name; copy it again"
-            )
-        return rows
+            check_columns(self.file, parquet.schema_arrow.names, columns, self._mend)
+            rows: List[Dict[str, Any]] = parquet.read(list(columns), use_threads=False).to_pylist()
+            return rows
 
     def frame_lasers(self) -> Collection[Key]:
         """Frame time (microseconds) and laser of every row.
 
         Raises:
-            CFlowError: as `rows`; two rows have the same.
+            CFlowError: as `rows`.
         """
         if not self._numbers:
-            keys = [(row[TIME], row[LASER]) for row in self.rows((TIME, LASER))]
-            self._numbers = {key: number for number, key in enumerate(keys)}
-            if len(self._numbers) < len(keys):
-                raise CFlowError(f"{self.file} has two rows of the same frame and laser; copy it again")
+            rows = self.rows((TIME, LASER))
+            self._numbers = {(row[TIME], row[LASER]): number for number, row in enumerate(rows)}
         return self._numbers
 
     def images(self, keys: Sequence[Key], column: str, channels: int) -> Dict[Key, Optional[np.ndarray]]:

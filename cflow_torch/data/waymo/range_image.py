@@ -105,8 +105,6 @@ def range_image_points(
     Raises:
         CFlowError: shapes that do not fit, or a frame pose that is missing or not rigid.
     """
-    if image.ndim != 3 or image.shape[2] <= NO_LABEL_ZONE or not image.size:
-        raise CFlowError(f"a range image has shape (H, W, 4), got {image.shape}")
     num_rows, num_columns = image.shape[:2]
     pixels = np.flatnonzero(image[..., RANGE] > 0)
     row, column = np.divmod(pixels, num_columns)

@@ -83,8 +83,7 @@ class WaymoLog(NumberedSweeps):
         released files are not sorted by time, so that can be the whole file (seconds).
 
     Raises:
-        CFlowError: a file is missing, cannot be read, belongs to another segment or lacks columns; fewer than two
-            frames; a frame without pose.
+        CFlowError: a file is missing, cannot be read or lacks columns; fewer than two frames; a frame without pose.
     """
 
     def __init__(self, file: Place, lasers: Sequence[str] = tuple(LASERS), both_returns: bool = False) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Dict, Iterable, List, Mapping, Optional, Sequence, Union
 
 from cflow_torch.data.log import Log
-from cflow_torch.data.names import is_stamp, safe_name, same_names
+from cflow_torch.data.names import is_stamp, safe_name
 from cflow_torch.data.paths import read_bytes
 from cflow_torch.evaluation.submission.masks import MaskArchive, log_mask, point_mask
 from cflow_torch.evaluation.submission.versions import SubmissionVersion
@@ -104,13 +104,13 @@ def read_frame_list(file: Union[str, Path]) -> Dict[str, List[int]]:
 
 
 def require_logs(logs: Iterable[Log], listed: Optional[Mapping[str, Sequence[int]]]) -> None:
-    """Refuse two logs of one name, upper and lower case taken as one, and a list that names logs which are not there.
+    """Refuse two logs of one name, and a list that names logs which are not there.
 
     Raises:
         CFlowError: as said.
     """
     names = [log.log_id for log in logs]
-    twice = same_names(names)
+    twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise CFlowError(f"several logs are called {', '.join(twice)}: their files would overwrite each other")
     missing = sorted(set(listed or ()) - set(names))

@@ -31,7 +31,7 @@ def write_frame(folder: Union[str, Path], name: str, columns: Mapping[str, np.nd
         columns: what `encode` returned.
 
     Raises:
-        CFlowError: the log's name cannot be a folder's, or its folder is a link that leaves the submission's.
+        CFlowError: the log's name cannot be a folder's.
     """
     log_id, _, stem = name.rpartition("/")
     file = folder_in(Path(folder), log_id, "the log") / stem

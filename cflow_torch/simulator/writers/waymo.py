@@ -13,7 +13,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from cflow_torch.data.atomic import sync_folder
 from cflow_torch.data.categories import META_CLASSES
 from cflow_torch.data.names import safe_name
 from cflow_torch.data.waymo.parquet import BOX, LASER, LIDAR, PIXEL_POSE, SEGMENT, TIME, TRACK, VEHICLE_POSE
@@ -121,8 +120,6 @@ def _write_components(log: Recording, folder: Path) -> None:
         _add_speeds(tables["lidar_box"], dict(zip(times, np.asarray(log.poses, np.float64))))
         for tag in ("lidar_calibration", "lidar_box", "vehicle_pose", "stats"):
             _write_rows(writers[tag], tables[tag])
-    for tag in SCHEMAS:
-        sync_folder(folder / tag)
 
 
 def _laser_numbers(names: Sequence[str]) -> List[int]:
