@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, List
 
 if TYPE_CHECKING:
     from cflow_torch.applications.stream import FlowStream
+    from cflow_torch.applications.tracking import Tracker, track
     from cflow_torch.config import Config, make_config
     from cflow_torch.dense.method import CorrelationFlow
     from cflow_torch.estimate import estimate_flow, make_model
@@ -24,11 +25,13 @@ __all__ = [
     "FlowResult",
     "FlowStream",
     "Sweep",
+    "Tracker",
     "VerifiedFlow",
     "Window",
     "estimate_flow",
     "make_config",
     "make_model",
+    "track",
     "__version__",
 ]
 
@@ -41,11 +44,13 @@ _MODULES = {
     "FlowResult": "types",
     "FlowStream": "applications.stream",
     "Sweep": "types",
+    "Tracker": "applications.tracking",
     "VerifiedFlow": "verified.method",
     "Window": "types",
     "estimate_flow": "estimate",
     "make_config": "config",
     "make_model": "estimate",
+    "track": "applications.tracking",
 }
 
 

@@ -1,0 +1,58 @@
+"""Tables of tracks: joined, sifted, and on disk as Parquet."""
+
+from __future__ import annotations
+
+from typing import Dict, Sequence
+
+import numpy as np
+import pyarrow as pa
+from pyarrow import parquet
+
+from cflow_torch.data.atomic import atomic_file
+from cflow_torch.data.file_errors import file_errors
+from cflow_torch.data.paths import Place, as_path, read_bytes
+from cflow_torch.types import CFlowError
+
+Table = Dict[str, np.ndarray]
+TRACKS_FILE = "tracks.parquet"  # beside the flow files of a log
+_WHOLE = ("sweep", "timestamp_ns", "id", "num_moving", "cluster_id", "num_points")
+_REAL = ("x", "y", "z", "vx", "vy", "vz", "velocity_std", "length", "width", "height", "heading", "age", "confidence")
+COLUMNS = {**dict.fromkeys(_WHOLE, np.int64), **dict.fromkeys(_REAL, np.float64), "is_moving": np.bool_}
+
+
+def join_tables(tables: Sequence[Table]) -> Table:
+    """Tables one below the other; of none, all columns without rows."""
+    return {
+        name: np.concatenate([np.zeros(0, kind), *(table[name] for table in tables)]).astype(kind)
+        for name, kind in COLUMNS.items()
+    }
+
+
+def confirmed(table: Table, min_moving: int) -> Table:
+    """The rows of tracks that move in so many sweeps or more, also the rows before that was known."""
+    number, inverse = np.unique(table["id"], return_inverse=True)
+    most = np.zeros(len(number), np.int64)
+    np.maximum.at(most, inverse, table["num_moving"])
+    chosen = (most >= min_moving)[inverse]
+    return {name: values[chosen] for name, values in table.items()}
+
+
+def write_tracks(path: Place, table: Table) -> None:
+    """Write the table of `track` as Parquet, atomically."""
+    with atomic_file(path) as file:
+        parquet.write_table(pa.table(dict(table)), file)
+
+
+def read_tracks(path: Place) -> Table:
+    """Read what `write_tracks` wrote.
+
+    Raises:
+        CFlowError: no such file, or no table of tracks.
+    """
+    path = as_path(path)
+    with file_errors(path, "give a table that `cflow flow tracks=true` wrote"):
+        table = parquet.read_table(pa.BufferReader(read_bytes(path)), use_threads=False)
+    lacking = sorted(COLUMNS.keys() - set(table.column_names))
+    if lacking:
+        raise CFlowError(f"{path} lacks {', '.join(lacking)}: give a table that `cflow flow tracks=true` wrote")
+    return {name: table.column(name).to_numpy().astype(kind) for name, kind in COLUMNS.items()}

@@ -1,0 +1,322 @@
+"""Objects through time: the moving groups of each sweep, linked by their own flow, and filtered in the world frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Dict, Iterable, NamedTuple, Optional, Tuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from cflow_torch.applications.kalman import States
+from cflow_torch.applications.linking import box_of_point, boxes, link
+from cflow_torch.applications.track_table import confirmed, join_tables
+from cflow_torch.config import make_config
+from cflow_torch.data.log import Log, RecentSweeps, window
+from cflow_torch.estimate import make_model
+from cflow_torch.types import CFlowError, FlowResult, Window, as_numpy
+
+MOVING = 0.05  # metres per sweep: residual flow of what moves, as in evaluation
+MIN_MOVING = 3  # sweeps in which a track must have moved: fewer are mostly noise of what stands
+_MIN_POINTS = 5
+_MIN_SHARE = 0.1  # of voxels that two groups have in common, for a link
+_STANDS = 0.3  # share of a track's points that must be found in its box where it is said to stand
+_MARGIN = 0.2  # metres by which that box is larger
+_MAX_MISSED = 3  # sweeps that a track survives unseen
+_ACCELERATION = 3.0  # m/s², standard deviation
+_NOISE = (0.4, 0.02)  # standard deviations: metres of a box's centre, metres per sweep of a group's flow
+
+
+class Tracked(NamedTuple):
+    """What a `Tracker` says about one sweep.
+
+    Args:
+        table: a row for each track that is seen in the sweep, see `track`.
+        track_id: (N,) int64 for every point of the sweep, -1 = of no track.
+    """
+
+    table: Dict[str, np.ndarray]
+    track_id: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """The points of a sweep that take part, in the world, and its G moving groups.
+
+    Args:
+        row: (M,) rows of the sweep; point, step: (M, 3) position and residual flow; group: (M,) -1 = does not move.
+        cluster: (G,) cluster_id of each group; count: (G,) points; confidence: (G,).
+    """
+
+    row: Tensor
+    point: Tensor
+    step: Tensor
+    group: Tensor
+    cluster: Tensor
+    count: Tensor
+    confidence: Tensor
+
+    @classmethod
+    def of(cls, sweeps: Window, result: FlowResult) -> _Seen:
+        flow = result.residual_flow.double()
+        points = torch.as_tensor(as_numpy(sweeps.pc0.points, np.float64)[:, :3].copy(), device=flow.device)
+        if len(points) != len(flow):
+            raise CFlowError(f"the flow has {len(flow)} rows, its sweep {len(points)} points: give its own window")
+        row = (result.is_valid & points.isfinite().all(1)).nonzero()[:, 0]
+        pose0, pose1 = (_pose(sweep.pose).to(flow.device) for sweep in (sweeps.pc0, sweeps.pc1))
+        step = flow[row] @ pose1[:3, :3].T
+        is_moving = (result.cluster_id[row] >= 0) & (step.norm(dim=1) >= MOVING)
+        group = torch.full_like(row, -1)
+        cluster, group[is_moving], count = torch.unique(
+            result.cluster_id[row][is_moving], return_inverse=True, return_counts=True
+        )
+        number = torch.where(count >= _MIN_POINTS, (count >= _MIN_POINTS).cumsum(0) - 1, -1)
+        group = torch.cat([number, number.new_full((1,), -1)])[group]
+        cluster, count = cluster[number >= 0], count[number >= 0]
+        given = flow.new_full((len(flow),), torch.nan) if result.confidence is None else result.confidence.double()
+        seen = cls(row, points[row] @ pose0[:3, :3].T + pose0[:3, 3], step, group, cluster, count, count)
+        return cls(**{**seen.__dict__, "confidence": seen.mean(given[row][:, None])[:, 0]})
+
+    def mean(self, values: Tensor) -> Tensor:
+        """(G, C) means over groups of (M, C)."""
+        moves = self.group >= 0
+        total = values.new_zeros(len(self.count), values.shape[1]).index_add_(0, self.group[moves], values[moves])
+        return total / self.count[:, None]
+
+
+class Tracker:
+    """Links moving groups over the sweeps of a drive, sweep by sweep.
+
+    A group's points, moved by its flow, overlap with the points of one group of the next sweep. What stops is followed
+    as long as there are points in its box; what is not seen for up to three sweeps is expected where its velocity takes
+    it. Memory: the points of the tracks that are alive.
+
+    Args:
+        sweep_interval: seconds from sweep to sweep where sweeps have no time stamps.
+
+    Example:
+        >>> tracker = Tracker()
+        >>> for window in windows(log, num_history=model.config.num_history):
+        ...     table, track_id = tracker.push(window, model([window])[0])
+    """
+
+    def __init__(self, sweep_interval: float = 0.1) -> None:
+        if not sweep_interval > 0:
+            raise CFlowError(f"sweep_interval={sweep_interval}: give the seconds from one sweep to the next")
+        self._interval = sweep_interval
+        self._clock: Optional[Tuple[float, float]] = None  # of the last sweep, and when its flow ends
+        self._num_sweeps, self._num_tracks = 0, 0
+        self._tracks: Dict[str, Tensor] = {}
+        self._points, self._owner = torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, dtype=torch.int64)
+
+    def push(self, sweeps: Window, result: FlowResult) -> Tracked:
+        """Go on by one sweep.
+
+        Args:
+            sweeps: the window of the pair t, t+1; its pc0, the poses and the time stamps are looked at.
+            result: its flow; residual_flow, cluster_id, is_valid and, if there, confidence.
+
+        Returns:
+            The tracks at t. Those that have moved in fewer than `MIN_MOVING` sweeps so far (`num_moving`) are mostly
+            noise of what stands.
+
+        Raises:
+            CFlowError: a sweep that is not later than the one before, a result of another sweep, or without what is
+                needed.
+        """
+        if any(getattr(result, name) is None for name in ("residual_flow", "cluster_id", "is_valid")):
+            raise CFlowError("tracks need residual flow, cluster_id and is_valid: `cflow flow` writes them by default")
+        now, interval, elapsed, late = self._times(sweeps)
+        seen = _Seen.of(sweeps, result)
+        tracks = self._tracks or _no_tracks(seen.point.device)
+        points, owner = self._points.to(seen.point.device), self._owner.to(seen.point.device)
+        states = States(tracks["position"], tracks["velocity"], tracks["covariance"])
+        points = points + late * states.velocity[owner]  # frames without a result
+        place = tracks["place"] + late * states.velocity
+        states = states.predict(elapsed, _ACCELERATION)
+
+        # What moves goes on by overlap; of the rest, what is still in its box stands.
+        moves = seen.group >= 0
+        linked, group = link(points, owner, seen.point[moves], seen.group[moves], _MIN_SHARE)
+        may_stand = tracks["num_moving"] >= MIN_MOVING
+        may_stand[linked] = False
+        waiting = may_stand.nonzero()[:, 0]
+        boxed = box_of_point(
+            seen.point[~moves], place[waiting], tracks["size"][waiting] + _MARGIN, tracks["heading"][waiting]
+        )
+        found = torch.bincount(boxed[boxed >= 0], minlength=len(waiting))
+        is_there = found >= (_STANDS * tracks["num_points"][waiting]).clamp(min=_MIN_POINTS)
+        stands = waiting[is_there]
+
+        # New tracks, then measurements of all that is seen.
+        is_new = torch.ones_like(seen.count, dtype=torch.bool)
+        is_new[group] = False
+        fresh = is_new.nonzero()[:, 0]
+        flow = seen.mean(seen.step)
+        heading = torch.atan2(flow[:, 1], flow[:, 0])
+        is_fast = states.velocity[linked, :2].norm(dim=1) >= MOVING / interval
+        smooth = torch.atan2(states.velocity[linked, 1], states.velocity[linked, 0])
+        heading[group] = torch.where(is_fast, smooth, heading[group])
+        centre, size = boxes(seen.point[moves], seen.group[moves], heading)
+        num_old = len(tracks["id"])
+        of_group = torch.empty_like(seen.count)
+        of_group[group] = linked
+        of_group[fresh] = num_old + torch.arange(len(fresh), device=fresh.device)
+        noise = centre.new_tensor([_NOISE[0], _NOISE[1] / interval])
+        begun = {
+            "id": self._num_tracks + torch.arange(len(fresh), device=fresh.device),
+            "position": centre[fresh],
+            "velocity": flow[fresh] / interval,
+            "covariance": torch.diag(noise**2).expand(len(fresh), 2, 2),
+            "begin": centre.new_full((len(fresh),), now),
+            **{name: tracks[name].new_zeros(len(fresh), *tracks[name].shape[1:]) for name in _MEASURED},
+        }
+        self._num_tracks += len(fresh)
+        tracks = {
+            **tracks,
+            **{"place": place, "position": states.position, "velocity": states.velocity},
+            "covariance": states.covariance,
+        }
+        tracks = {name: torch.cat([tracks[name], begun[name]]) for name in tracks}
+        tracks["missed"] += 1
+        tracks["is_moving"][:] = False
+        tracks["cluster"][:] = -1
+        measured = {"place": centre, "size": size, "heading": heading, "num_points": seen.count}
+        measured.update(cluster=seen.cluster, confidence=seen.confidence)
+        for name, values in measured.items():
+            tracks[name][of_group] = values
+        tracks["is_moving"][of_group] = True
+        tracks["num_moving"][of_group] += 1
+        tracks["num_points"][stands] = torch.maximum(found[is_there], tracks["num_points"][stands])
+        step = torch.zeros_like(tracks["place"])
+        step[of_group] = flow
+        both = torch.cat([linked, stands])
+        tracks["missed"][torch.cat([of_group, stands])] = 0
+        old = States(tracks["position"][both], tracks["velocity"][both], tracks["covariance"][both])
+        better = old.update(tracks["place"][both], step[both] / interval, noise.expand(len(both), 2))
+        for name in ("position", "velocity", "covariance"):
+            tracks[name][both] = getattr(better, name)
+
+        # Points of each track, where the next sweep should have them.
+        point_track = torch.full_like(seen.group, -1)
+        point_track[moves] = of_group[seen.group[moves]]
+        of_box = torch.full((len(waiting) + 1,), -1, device=owner.device)
+        of_box[:-1][is_there] = stands
+        point_track[~moves] = of_box[boxed]
+        track_id = torch.full((len(result.residual_flow),), -1, device=owner.device)
+        has = point_track >= 0
+        track_id[seen.row[has]] = tracks["id"][point_track[has]]
+        is_seen = tracks["missed"] == 0
+        onward = torch.where(tracks["is_moving"][:, None], step, tracks["velocity"] * interval)
+        tracks["place"] = tracks["place"] + onward
+        missing = ~is_seen[owner]
+        moved = seen.point[has] + torch.where(moves[has][:, None], seen.step[has], onward[point_track[has]])
+        points = torch.cat([points[missing] + onward[owner[missing]], moved])
+        owner = torch.cat([owner[missing], point_track[has]])
+        table = self._table(tracks, is_seen, now, sweeps.pc0.timestamp_ns, step)
+        self._keep(tracks, points, owner)
+        self._num_sweeps += 1
+        return Tracked(table, track_id.cpu().numpy())
+
+    def _times(self, sweeps: Window) -> Tuple[float, float, float, float]:
+        """Seconds: of t; from t to t+1; from the sweep before to t; of these, what its flow does not span."""
+        begin, end = sweeps.pc0.timestamp_ns, sweeps.pc1.timestamp_ns
+        has_times = begin is not None and end is not None
+        interval = (end - begin) * 1e-9 if has_times else self._interval  # type: ignore[operator]
+        last, due = self._clock or (None, None)
+        now = begin * 1e-9 if has_times else 0.0 if due is None else due  # type: ignore[operator]
+        self._clock = now, now + interval
+        if last is None or due is None:
+            return now, interval, interval, 0.0
+        if now <= last:
+            raise CFlowError(f"a sweep {last - now:.3f} s before the last one: push sweeps in the order of time")
+        return now, interval, now - last, now - due
+
+    def _table(
+        self, tracks: Dict[str, Tensor], is_seen: Tensor, now: float, stamp: Optional[int], step: Tensor
+    ) -> Dict[str, np.ndarray]:
+        part = {name: values[is_seen].cpu().numpy() for name, values in tracks.items()}
+        count = len(part["id"])
+        axes = {"": part["position"], "v": part["velocity"]}
+        columns = {f"{name}{axis}": values[:, k] for name, values in axes.items() for k, axis in enumerate("xyz")}
+        return {
+            "sweep": np.full(count, self._num_sweeps),
+            "timestamp_ns": np.full(count, self._num_sweeps if stamp is None else stamp),
+            "id": part["id"],
+            **columns,
+            "velocity_std": np.sqrt(part["covariance"][:, 1, 1]),
+            **dict(zip(("length", "width", "height"), part["size"].T)),
+            "heading": part["heading"],
+            "age": now - part["begin"],
+            "num_moving": part["num_moving"],
+            "is_moving": part["is_moving"],
+            "cluster_id": part["cluster"],
+            "num_points": part["num_points"],
+            "confidence": part["confidence"],
+        }
+
+    def _keep(self, tracks: Dict[str, Tensor], points: Tensor, owner: Tensor) -> None:
+        """Forget tracks that have not been seen for too long."""
+        lives = tracks["missed"] <= _MAX_MISSED
+        number = torch.where(lives, lives.cumsum(0) - 1, -1)[owner]
+        self._tracks = {name: values[lives] for name, values in tracks.items()}
+        self._points, self._owner = points[number >= 0], number[number >= 0]
+
+
+def track(
+    log: Log, results: Optional[Iterable[Tuple[int, FlowResult]]] = None, sweep_interval: float = 0.1
+) -> Dict[str, np.ndarray]:
+    """The moving objects of a drive, each with one id.
+
+    Args:
+        log: the drive. Without poses, all sweeps lie in one frame, which is then the world.
+        results: (index, flow of sweep `index` to `index + 1`), ascending; sweeps without a result are bridged. None =
+            flow of the preset `default`, estimated now.
+        sweep_interval: seconds from sweep to sweep where sweeps have no time stamps.
+
+    Returns:
+        Column -> (R,) array, a row per track and sweep in which it is seen, sorted by sweep, then id: `sweep`,
+        `timestamp_ns`, `id`; x, y, z middle of the box, filtered, metres in the world; vx, vy, vz m/s over ground,
+        filtered; `velocity_std` m/s, standard deviation of each of the three (errors are taken to be independent);
+        length (along the heading), width, height metres, of what is seen of it; `heading` radians in the world from +x
+        to the left; `age` seconds since it was first seen; `num_moving` sweeps so far in which it moved; `is_moving`,
+        False = it has moved and stands now; `cluster_id` of this sweep's flow, -1 where it stands; `num_points`;
+        `confidence` of the flow when it last moved, NaN where the method has none.
+        `pandas.DataFrame(table)` takes it. Tracks that have moved in fewer than `MIN_MOVING` sweeps are left out.
+
+    Raises:
+        CFlowError: see `Tracker.push`; a sweep cannot be read.
+    """
+    if results is None:
+        model = make_model(make_config("default"))
+        recent = RecentSweeps(log, model.config.num_sweeps)
+        every = (window(recent, index, model.config.num_history) for index in range(len(log.timestamps) - 1))
+        results = ((index, model([sweeps])[0]) for index, sweeps in enumerate(every))
+    else:
+        recent = RecentSweeps(log, 2)
+    tracker, tables = Tracker(sweep_interval), []
+    for index, result in results:
+        table = tracker.push(window(recent, index), result).table
+        where = {"sweep": index, "timestamp_ns": int(log.timestamps[index])}
+        tables.append({**table, **{name: np.full(len(table["id"]), value) for name, value in where.items()}})
+    return confirmed(join_tables(tables), MIN_MOVING)
+
+
+_MEASURED = (
+    *("place", "size", "heading", "num_points", "cluster", "confidence"),
+    *("is_moving", "num_moving", "missed"),
+)
+
+
+def _no_tracks(device: torch.device) -> Dict[str, Tensor]:
+    shapes: Dict[str, Tuple[int, ...]] = dict.fromkeys(("position", "velocity", "place", "size"), (0, 3))
+    shapes.update(covariance=(0, 2, 2), heading=(0,), begin=(0,), confidence=(0,))
+    tracks = {name: torch.zeros(shape, dtype=torch.float64, device=device) for name, shape in shapes.items()}
+    whole = ("id", "num_points", "cluster", "num_moving", "missed")
+    tracks.update({name: torch.zeros(0, dtype=torch.int64, device=device) for name in whole})
+    return {**tracks, "is_moving": torch.zeros(0, dtype=torch.bool, device=device)}
+
+
+def _pose(pose: Any) -> Tensor:
+    return torch.eye(4, dtype=torch.float64) if pose is None else torch.as_tensor(as_numpy(pose, np.float64).copy())

@@ -1,0 +1,194 @@
+"""Tracks of simulated drives of five sensors beside what single sweeps give: `FlowResult.objects` and their velocities.
+
+python scripts/benchmarks/tracks.py                        a drive of 20 sweeps per sensor and scene
+python scripts/benchmarks/tracks.py --model fast --only av2
+
+Drives of seeds 300 and above; settings of the tracker were chosen on seeds 400 and 401. Ground masks are exact where
+the data set has masks and found by grid elsewhere; nuScenes is read at 10 Hz. An object counts in a sweep if it moves
+at 0.5 m/s or more and at least 20 of its points take part.
+
+columns: object-sweeps; share that a group that moves / a track covers (recall); id switches per 100 object-sweeps with
+a track; error of the velocity, m/s, mean and median over the same object-sweeps: of single sweeps, of tracks; rows of
+static things per 100 rows, of single sweeps' groups and of tracks.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Dict, Iterator, List, Optional, Tuple
+
+import numpy as np
+import torch
+from table import markdown
+
+from cflow_torch import Tracker, make_config, make_model
+from cflow_torch.applications.track_table import confirmed, join_tables
+from cflow_torch.applications.tracking import MIN_MOVING, MOVING
+from cflow_torch.data.found_ground import GroundFoundLog
+from cflow_torch.data.log import FlowLabels, Log, RecentSweeps, window
+from cflow_torch.simulator import make_drive
+from cflow_torch.simulator.drive import Drive
+from cflow_torch.types import FlowResult, Sweep, Window
+
+SENSORS = ("av2", "nuscenes", "waymo", "truckscenes", "aevascenes")
+WITH_MASKS = ("av2", "aevascenes")
+SPEED, POINTS = 0.5, 20  # m/s and points of an object that counts
+Row = Dict[str, Any]
+
+
+class SimulatedLog(Log):
+    """A simulated drive as its data set gives it: every so many sweeps, masks or none; with the truth."""
+
+    def __init__(self, profile: str, seed: int, scene: str, num_sweeps: int) -> None:
+        self._step, self._has_masks = 2 if profile == "nuscenes" else 1, profile in WITH_MASKS
+        self.drive: Drive = make_drive(seed, num_sweeps * self._step, profile, scene)
+        self.log_id, self.timestamps = self.drive.log_id, self.drive.timestamps[:: self._step]
+
+    def sweep(self, index: int) -> Sweep:
+        """As the drive's."""
+        sweep = self.drive.sweep(index * self._step)
+        return sweep if self._has_masks else replace(sweep, is_ground=None)
+
+    def labels(self, index: int) -> Optional[FlowLabels]:
+        """None: `truth` says more."""
+        return None
+
+    def truth(self, index: int) -> Tuple[np.ndarray, np.ndarray]:
+        """(N,) number of the body that each point lies on, the last = ground; (bodies + 1, 3) m/s over ground."""
+        times = (np.array(self.timestamps[index : index + 2]) - self.timestamps[0]) * 1e-9
+        now, then = self.drive.scene.body_poses(times)[:, :, :3, 3]
+        velocity = np.concatenate([(then - now) / (times[1] - times[0]), np.zeros((1, 3))])
+        table, solid = self.drive.scene.table, self.drive.returns(index * self._step).solid.numpy()
+        return np.append(table.body, len(now))[solid], velocity
+
+    def opened(self) -> Log:
+        """The log with ground."""
+        return self if self._has_masks else GroundFoundLog(self, "grid")
+
+
+def score(log: SimulatedLog, pairs: Iterator[Tuple[int, Window, FlowResult]]) -> Row:
+    """Counts and errors of a drive, to be summed."""
+    tracker, tables, sweeps = Tracker(), [], []
+    for index, given, result in pairs:
+        table, track_id = tracker.push(given, result)
+        tables.append({**table, "sweep": np.full(len(table["id"]), index)})
+        sweeps.append((index, result.numpy(), given, track_id))
+    kept = confirmed(join_tables(tables), MIN_MOVING)
+    counts: Row = dict.fromkeys(("objects", "grouped", "tracked", "switches", "groups", "false_groups"), 0)
+    counts.update(rows=len(kept["id"]), false_rows=0, raw=[], filtered=[], z=[])
+    last: Dict[int, int] = {}
+    for index, flow, given, track_id in sweeps:
+        body, velocity = log.truth(index)
+        takes_part, ground = flow["is_valid"], len(velocity) - 1
+        seconds = (log.timestamps[index + 1] - log.timestamps[index]) * 1e-9
+        moves = (np.linalg.norm(flow["residual_flow"], axis=1) >= MOVING) & (flow["cluster_id"] >= 0)
+        rotation = np.asarray(given.pc1.pose)[:3, :3]
+        here = {name: values[kept["sweep"] == index] for name, values in kept.items()}
+        track_id = np.where(np.isin(track_id, here["id"]), track_id, -1)
+        is_mover = np.linalg.norm(velocity, axis=1) >= SPEED
+        for group, owner in _owners(flow["cluster_id"], moves, body):
+            counts["groups"] += 1
+            counts["false_groups"] += not is_mover[owner]
+        for _, owner in _owners(track_id, track_id >= 0, body):
+            has_moved = is_mover[owner] or (owner < ground and not log.drive.scene.bodies[owner].stands)
+            counts["false_rows"] += not has_moved
+        for mover in np.flatnonzero(is_mover):
+            on = takes_part & (body == mover)
+            if on.sum() < POINTS:
+                continue
+            counts["objects"] += 1
+            group = _most(flow["cluster_id"][on & moves])
+            number = _most(track_id[on & (track_id >= 0)])
+            counts["grouped"] += group is not None
+            if number is None:
+                continue
+            counts["tracked"] += 1
+            counts["switches"] += last.get(mover, number) != number
+            last[mover] = number
+            if group is None:
+                continue
+            raw = rotation @ flow["residual_flow"][moves & (flow["cluster_id"] == group)].mean(0) / seconds
+            row = np.flatnonzero(here["id"] == number)[0]
+            filtered = np.array([here[name][row] for name in ("vx", "vy", "vz")])
+            counts["raw"].append(float(np.linalg.norm(raw - velocity[mover])))
+            counts["filtered"].append(float(np.linalg.norm(filtered - velocity[mover])))
+            counts["z"].append(counts["filtered"][-1] / float(here["velocity_std"][row]) / 3**0.5)
+    return counts
+
+
+def _most(numbers: np.ndarray) -> Optional[int]:
+    """The number that occurs most often; None of none."""
+    values, count = np.unique(numbers, return_counts=True)
+    return int(values[count.argmax()]) if len(values) else None
+
+
+def _owners(number: np.ndarray, chosen: np.ndarray, body: np.ndarray) -> Iterator[Tuple[int, int]]:
+    """Each number that occurs five times or more among the chosen points, and the body that most of them lie on."""
+    for value, count in zip(*np.unique(number[chosen], return_counts=True)):
+        owner = _most(body[chosen & (number == value)])
+        if count >= 5 and owner is not None:
+            yield int(value), owner
+
+
+def summary(sensor: str, parts: List[Row]) -> Row:
+    """A line of the table."""
+    total = {name: sum((part[name] for part in parts[1:]), parts[0][name]) for name in parts[0]}
+    raw, filtered = (total[name] or [float("nan")] for name in ("raw", "filtered"))
+
+    def share(part: str, whole: str) -> float:
+        return 100 * total[part] / max(1, total[whole])
+
+    return {
+        "sensor": sensor,
+        "objects": total["objects"],
+        "recall of groups, %": share("grouped", "objects"),
+        "recall of tracks, %": share("tracked", "objects"),
+        "switches / 100": share("switches", "tracked"),
+        "velocity, single (mean, median)": f"{np.mean(raw):.3f}, {np.median(raw):.3f}",
+        "velocity, tracks": f"{np.mean(filtered):.3f}, {np.median(filtered):.3f}",
+        "static groups, %": share("false_groups", "groups"),
+        "static rows, %": share("false_rows", "rows"),
+        "rows": total["rows"],
+    }
+
+
+def main() -> None:
+    """Simulate, estimate, track, print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--model", default="default", help="preset")
+    parser.add_argument("--only", nargs="*", default=SENSORS, choices=SENSORS)
+    parser.add_argument("--scenes", nargs="*", default=("street", "crossing"))
+    parser.add_argument("--first-seed", type=int, default=300)
+    parser.add_argument("--num-sweeps", type=int, default=20)
+    parser.add_argument("--json", type=Path)
+    given = parser.parse_args()
+    torch.set_num_threads(1)
+    model = make_model(make_config(given.model), "auto")
+
+    def pairs(log: Log) -> Iterator[Tuple[int, Window, FlowResult]]:
+        recent = RecentSweeps(log, model.config.num_sweeps)
+        for index in range(len(log.timestamps) - 1):
+            sweeps = window(recent, index, model.config.num_history, model.config.num_future)
+            yield index, sweeps, model([sweeps])[0]
+
+    rows, everything = [], []
+    for sensor in given.only:
+        logs = [
+            SimulatedLog(sensor, given.first_seed + number, scene, given.num_sweeps)
+            for number, scene in enumerate(given.scenes)
+        ]
+        parts = [score(log, pairs(log.opened())) for log in logs]
+        everything += parts
+        rows.append(summary(sensor, parts))
+        print(rows[-1], flush=True)
+    rows.append(summary("all", everything))
+    print(markdown([list(rows[0]), *(list(row.values()) for row in rows)]))
+    if given.json:
+        given.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
