@@ -17,7 +17,7 @@ Table = Dict[str, np.ndarray]
 TRACKS_FILE = "tracks.parquet"  # beside the flow files of a log
 _WHOLE = ("sweep", "timestamp_ns", "id", "num_moving", "cluster_id", "num_points")
 _REAL = ("x", "y", "z", "vx", "vy", "vz", "velocity_std", "length", "width", "height", "heading", "age", "confidence")
-COLUMNS = {**dict.fromkeys(_WHOLE, np.int64), **dict.fromkeys(_REAL, np.float64), "is_moving": np.bool_}
+COLUMNS = {**dict.fromkeys(_WHOLE, np.int64), **dict.fromkeys(_REAL, np.float64), "is_moving": np.bool_, "is_confirmed": np.bool_}
 
 
 def join_tables(tables: Sequence[Table]) -> Table:
@@ -28,12 +28,9 @@ def join_tables(tables: Sequence[Table]) -> Table:
     }
 
 
-def confirmed(table: Table, min_moving: int) -> Table:
-    """The rows of tracks that move in so many sweeps or more, also the rows before that was known."""
-    number, inverse = np.unique(table["id"], return_inverse=True)
-    most = np.zeros(len(number), np.int64)
-    np.maximum.at(most, inverse, table["num_moving"])
-    chosen = (most >= min_moving)[inverse]
+def confirmed(table: Table) -> Table:
+    """The rows of tracks that are confirmed at some time, also their rows before."""
+    chosen = np.isin(table["id"], table["id"][table["is_confirmed"]])
     return {name: values[chosen] for name, values in table.items()}
 
 

@@ -18,7 +18,12 @@ from cflow_torch.estimate import make_model
 from cflow_torch.types import CFlowError, FlowResult, Window, as_numpy
 
 MOVING = 0.05  # metres per sweep: residual flow of what moves, as in evaluation
-MIN_MOVING = 3  # sweeps in which a track must have moved: fewer are mostly noise of what stands
+# A track is confirmed by what it has shown while it moved: most groups that do not last are noise of what stands.
+_MIN_MOVING = 3  # sweeps
+_MIN_EVIDENCE = 2.0  # sum of the log-odds of its confidence
+_NO_CONFIDENCE = 0.7  # log-odds, of methods without
+_THIN = 0.12  # metres; a narrower box is no evidence: posts, and slices of fronts along which a shadow glides
+_MIN_WAY = (0.5, 0.5)  # metres that its box must have gone the way of its flow, and their share of that way
 _MIN_POINTS = 5
 _MIN_SHARE = 0.1  # of voxels that two groups have in common, for a link
 _STANDS = 0.3  # share of a track's points that must be found in its box where it is said to stand
@@ -139,7 +144,7 @@ class Tracker:
         # What moves goes on by overlap; of the rest, what is still in its box stands.
         moves = seen.group >= 0
         linked, group = link(points, owner, seen.point[moves], seen.group[moves], _MIN_SHARE)
-        may_stand = tracks["num_moving"] >= MIN_MOVING
+        may_stand = tracks["is_confirmed"].clone()
         may_stand[linked] = False
         waiting = may_stand.nonzero()[:, 0]
         boxed = box_of_point(
@@ -170,6 +175,7 @@ class Tracker:
             "velocity": flow[fresh] / interval,
             "covariance": torch.diag(noise**2).expand(len(fresh), 2, 2),
             "begin": centre.new_full((len(fresh),), now),
+            "start": centre[fresh],
             **{name: tracks[name].new_zeros(len(fresh), *tracks[name].shape[1:]) for name in _MEASURED},
         }
         self._num_tracks += len(fresh)
@@ -188,9 +194,21 @@ class Tracker:
             tracks[name][of_group] = values
         tracks["is_moving"][of_group] = True
         tracks["num_moving"][of_group] += 1
+        odds = torch.logit(seen.confidence, 0.01).nan_to_num(_NO_CONFIDENCE)
+        tracks["evidence"][of_group] += odds * (size[:, :2].amin(1) >= _THIN)
+        gone = tracks["place"] - tracks["start"]  # by the box, against the way that its flow tells
+        way = tracks["way"].norm(dim=1)
+        along = (gone * tracks["way"]).sum(1) / way.clamp(min=1e-9)
+        tracks["is_confirmed"] |= (
+            tracks["is_moving"]
+            & (tracks["num_moving"] >= _MIN_MOVING)
+            & (tracks["evidence"] >= _MIN_EVIDENCE)
+            & (along >= (_MIN_WAY[1] * way).clamp(min=_MIN_WAY[0]))
+        )
         tracks["num_points"][stands] = torch.maximum(found[is_there], tracks["num_points"][stands])
         step = torch.zeros_like(tracks["place"])
         step[of_group] = flow
+        tracks["way"] = tracks["way"] + step
         both = torch.cat([linked, stands])
         tracks["missed"][torch.cat([of_group, stands])] = 0
         old = States(tracks["position"][both], tracks["velocity"][both], tracks["covariance"][both])
@@ -251,6 +269,7 @@ class Tracker:
             "age": now - part["begin"],
             "num_moving": part["num_moving"],
             "is_moving": part["is_moving"],
+            "is_confirmed": part["is_confirmed"],
             "cluster_id": part["cluster"],
             "num_points": part["num_points"],
             "confidence": part["confidence"],
@@ -300,22 +319,22 @@ def track(
         table = tracker.push(window(recent, index), result).table
         where = {"sweep": index, "timestamp_ns": int(log.timestamps[index])}
         tables.append({**table, **{name: np.full(len(table["id"]), value) for name, value in where.items()}})
-    return confirmed(join_tables(tables), MIN_MOVING)
+    return confirmed(join_tables(tables))
 
 
 _MEASURED = (
     *("place", "size", "heading", "num_points", "cluster", "confidence"),
-    *("is_moving", "num_moving", "missed"),
+    *("is_moving", "is_confirmed", "num_moving", "missed", "way", "evidence"),
 )
 
 
 def _no_tracks(device: torch.device) -> Dict[str, Tensor]:
-    shapes: Dict[str, Tuple[int, ...]] = dict.fromkeys(("position", "velocity", "place", "size"), (0, 3))
-    shapes.update(covariance=(0, 2, 2), heading=(0,), begin=(0,), confidence=(0,))
+    shapes: Dict[str, Tuple[int, ...]] = dict.fromkeys(("position", "velocity", "place", "size", "start", "way"), (0, 3))
+    shapes.update(covariance=(0, 2, 2), heading=(0,), begin=(0,), confidence=(0,), evidence=(0,))
     tracks = {name: torch.zeros(shape, dtype=torch.float64, device=device) for name, shape in shapes.items()}
     whole = ("id", "num_points", "cluster", "num_moving", "missed")
     tracks.update({name: torch.zeros(0, dtype=torch.int64, device=device) for name in whole})
-    return {**tracks, "is_moving": torch.zeros(0, dtype=torch.bool, device=device)}
+    return {**tracks, **{name: torch.zeros(0, dtype=torch.bool, device=device) for name in ("is_moving", "is_confirmed")}}
 
 
 def _pose(pose: Any) -> Tensor:

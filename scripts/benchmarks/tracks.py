@@ -26,7 +26,7 @@ from table import markdown
 
 from cflow_torch import Tracker, make_config, make_model
 from cflow_torch.applications.track_table import confirmed, join_tables
-from cflow_torch.applications.tracking import MIN_MOVING, MOVING
+from cflow_torch.applications.tracking import MOVING
 from cflow_torch.data.found_ground import GroundFoundLog
 from cflow_torch.data.log import FlowLabels, Log, RecentSweeps, window
 from cflow_torch.simulator import make_drive
@@ -76,7 +76,7 @@ def score(log: SimulatedLog, pairs: Iterator[Tuple[int, Window, FlowResult]]) ->
         table, track_id = tracker.push(given, result)
         tables.append({**table, "sweep": np.full(len(table["id"]), index)})
         sweeps.append((index, result.numpy(), given, track_id))
-    kept = confirmed(join_tables(tables), MIN_MOVING)
+    kept = confirmed(join_tables(tables))
     counts: Row = dict.fromkeys(("objects", "grouped", "tracked", "switches", "groups", "false_groups"), 0)
     counts.update(rows=len(kept["id"]), false_rows=0, raw=[], filtered=[], z=[])
     last: Dict[int, int] = {}
