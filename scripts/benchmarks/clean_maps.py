@@ -1,0 +1,151 @@
+"""How well moving points are taken out: `CleanLog` beside DUFOMap, on simulated drives and on real scenes.
+
+python scripts/benchmarks/clean_maps.py
+python scripts/benchmarks/clean_maps.py --only --root data/kitti-0000 --logs kitti-0000-c2
+
+Scores of DynamicMap_Benchmark, by point: static accuracy SA (share of the points that stand and are kept), dynamic
+accuracy DA (share of the points that move and are removed), AA = sqrt(SA DA), HA = 2 SA DA / (SA + DA); per cent.
+A point moves by a true residual flow of 0.05 m a sweep. Waiting: share removed of the points of things that stand now
+and move elsewhere in the drive; they count neither for SA nor for DA. Ground counts. Points within 50 m, all sweeps but
+the last; in real scenes those with labels. Seconds of processor time per sweep, one thread, flow included.
+
+DUFOMap: pip install dufomap; its own settings (0.1 m, d_s 0.2, d_p 2, clusters and propagation), rays from the LiDAR
+(the first one of several). Without it its rows are left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import Any, Dict, Iterator, List, Tuple
+
+import numpy as np
+import torch
+from table import markdown
+from tracks import SENSORS, SimulatedLog
+
+from cflow_torch import make_config, make_model
+from cflow_torch.applications.cleaning import CleanLog
+from cflow_torch.applications.tracking import MOVING
+from cflow_torch.data.catalog import find_sources, open_log, recognise
+from cflow_torch.data.log import Log, RecentSweeps, window
+
+RANGE = 50.0  # metres
+DUFO = (0.1, 0.2, 2)
+
+
+def truths(log: Any) -> Iterator[Tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """For each sweep but the last, of each point: does it count, does it move, does it move at some time?"""
+    for index in range(len(log.timestamps) - 1):
+        sweep = log.sweep(index)
+        points = np.asarray(sweep.points, np.float64)[:, :3]
+        if hasattr(log, "truth"):
+            labels = log.drive.labels(index * log.step)
+            body, velocity = log.truth(index)
+            stands = np.array([body.stands for body in log.drive.scene.bodies] + [True])
+            seconds = (log.timestamps[index + 1] - log.timestamps[index]) * 1e-9
+            moves, known = (np.linalg.norm(velocity, axis=1) * seconds >= MOVING)[body], labels.is_valid
+            ever = ~stands[body]
+        else:
+            labels = log.labels(index)
+            transform = np.linalg.inv(log.sweep(index + 1).pose) @ sweep.pose
+            still = points @ transform[:3, :3].T + transform[:3, 3] - points
+            moves = np.linalg.norm(labels.flow - still, axis=1) >= MOVING
+            ever, known = moves, labels.is_valid
+        yield known & (np.hypot(points[:, 0], points[:, 1]) < RANGE), moves, ever
+
+
+def dufomap_labels(log: Log, T_ego_lidar: np.ndarray) -> Tuple[List[np.ndarray], float]:
+    """Points that DUFOMap calls dynamic in each sweep, and seconds per sweep."""
+    from dufomap import dufomap
+
+    begin = time.process_time()
+    first, sweeps = np.asarray(log.sweep(0).pose), []
+    to_lidar = np.linalg.inv(T_ego_lidar)
+    for sweep in log:
+        points = np.asarray(sweep.points, np.float64)[:, :3] @ to_lidar[:3, :3].T + to_lidar[:3, 3]
+        sweeps.append((points, np.linalg.inv(first) @ np.asarray(sweep.pose) @ T_ego_lidar))
+    made = dufomap(*DUFO, num_threads=1)
+    made.setCluster(0, 20, 0.2)
+    for points, pose in sweeps:
+        made.run(points, pose, cloud_transform=True)
+    made.oncePropagateCluster(if_propagate=True, if_cluster=True)
+    labels = [np.asarray(made.segment(points, pose, cloud_transform=True)) == 1 for points, pose in sweeps]
+    return labels, (time.process_time() - begin) / len(sweeps)
+
+
+def scores(name: str, removed: List[np.ndarray], truth: List[Any], seconds: float) -> Dict[str, Any]:
+    """A line of the table."""
+    total = np.zeros((3, 2))
+    for gone, (counts, moves, ever) in zip(removed, truth):
+        for row, chosen in enumerate((counts & ~moves & ~ever, counts & moves, counts & ~moves & ever)):
+            total[row] += (gone & chosen).sum(), chosen.sum()
+    standing, moving, waiting = 100 * total[:, 0] / np.maximum(total[:, 1], 1)
+    kept = 100 - standing
+    return {
+        "what": name,
+        "SA": kept,
+        "DA": moving,
+        "AA": float(np.sqrt(kept * moving)),
+        "HA": 2 * kept * moving / max(kept + moving, 1e-9),
+        "waiting": waiting if total[2, 1] else "",
+        "seconds": seconds,
+    }
+
+
+def main() -> None:
+    """Simulate, estimate, clean, print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--model", default="offline", help="preset")
+    parser.add_argument("--only", nargs="*", default=("av2", "nuscenes", "waymo"), choices=SENSORS, help="sensors")
+    parser.add_argument("--scene", default="crossing")
+    parser.add_argument("--seed", type=int, default=300)
+    parser.add_argument("--num-sweeps", type=int, default=20)
+    parser.add_argument("--root", type=Path, help="real logs with labels and poses, in the frame of their LiDAR")
+    parser.add_argument("--logs", nargs="*", help="which of them")
+    parser.add_argument("--json", type=Path)
+    given = parser.parse_args()
+    torch.set_num_threads(1)
+    model = make_model(make_config(given.model), "auto")
+    cases: List[Tuple[str, Any, Log, np.ndarray]] = []
+    for sensor in given.only:
+        made = SimulatedLog(sensor, given.seed, given.scene, given.num_sweeps)
+        cases.append((sensor, made, made.opened(), next(iter(made.drive.calibration.values()))))
+    if given.root is not None:
+        reader = recognise(given.root)
+        real = [open_log(reader, source, check=False) for source in find_sources(reader, given.root)]
+        cases += [(log.log_id, log, log, np.eye(4)) for log in real if not given.logs or log.log_id in given.logs]
+    rows = []
+    for name, log, opened, T_ego_lidar in cases:
+        recent, pairs = RecentSweeps(opened, model.config.num_sweeps), range(len(opened.timestamps) - 1)
+        truth = list(truths(log))
+        for index in pairs:  # simulating and reading is no part of the time
+            recent.sweep(index)
+        flow, seconds = [], 0.0
+        for index in pairs:
+            sweeps = window(recent, index, model.config.num_history, model.config.num_future)
+            begin = time.process_time()
+            flow.append(model([sweeps])[0])
+            seconds += time.process_time() - begin
+        for label, standing in (("cflow", False), ("cflow, standing", True)):
+            begin = time.process_time()
+            clean = CleanLog(opened, flow=flow.__getitem__, standing=standing)
+            removed = [clean.moving(index) for index in pairs]
+            spent = (seconds + time.process_time() - begin) / len(flow)
+            rows.append(scores(f"{name}: {label}", removed, truth, spent))
+            print(rows[-1], flush=True)
+        try:
+            labels, spent = dufomap_labels(opened, T_ego_lidar)
+            rows.append(scores(f"{name}: DUFOMap", labels, truth, spent))
+            print(rows[-1], flush=True)
+        except ImportError as error:
+            print(f"no DUFOMap: {error}", flush=True)
+    print(markdown([list(rows[0]), *(list(row.values()) for row in rows)]))
+    if given.json:
+        given.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
