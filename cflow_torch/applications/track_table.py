@@ -17,7 +17,12 @@ Table = Dict[str, np.ndarray]
 TRACKS_FILE = "tracks.parquet"  # beside the flow files of a log
 _WHOLE = ("sweep", "timestamp_ns", "id", "num_moving", "cluster_id", "num_points")
 _REAL = ("x", "y", "z", "vx", "vy", "vz", "velocity_std", "length", "width", "height", "heading", "age", "confidence")
-COLUMNS = {**dict.fromkeys(_WHOLE, np.int64), **dict.fromkeys(_REAL, np.float64), "is_moving": np.bool_, "is_confirmed": np.bool_}
+COLUMNS = {
+    **dict.fromkeys(_WHOLE, np.int64),
+    **dict.fromkeys(_REAL, np.float64),
+    "is_moving": np.bool_,
+    "is_confirmed": np.bool_,
+}
 
 
 def join_tables(tables: Sequence[Table]) -> Table:

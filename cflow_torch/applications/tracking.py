@@ -181,7 +181,7 @@ class Tracker:
         self._num_tracks += len(fresh)
         tracks = {
             **tracks,
-            **{"place": place, "position": states.position, "velocity": states.velocity},
+            "place": place, "position": states.position, "velocity": states.velocity,
             "covariance": states.covariance,
         }
         tracks = {name: torch.cat([tracks[name], begun[name]]) for name in tracks}
@@ -329,12 +329,17 @@ _MEASURED = (
 
 
 def _no_tracks(device: torch.device) -> Dict[str, Tensor]:
-    shapes: Dict[str, Tuple[int, ...]] = dict.fromkeys(("position", "velocity", "place", "size", "start", "way"), (0, 3))
+    shapes: Dict[str, Tuple[int, ...]] = dict.fromkeys(
+        ("position", "velocity", "place", "size", "start", "way"), (0, 3)
+    )
     shapes.update(covariance=(0, 2, 2), heading=(0,), begin=(0,), confidence=(0,), evidence=(0,))
     tracks = {name: torch.zeros(shape, dtype=torch.float64, device=device) for name, shape in shapes.items()}
     whole = ("id", "num_points", "cluster", "num_moving", "missed")
     tracks.update({name: torch.zeros(0, dtype=torch.int64, device=device) for name in whole})
-    return {**tracks, **{name: torch.zeros(0, dtype=torch.bool, device=device) for name in ("is_moving", "is_confirmed")}}
+    return {
+        **tracks,
+        **{name: torch.zeros(0, dtype=torch.bool, device=device) for name in ("is_moving", "is_confirmed")},
+    }
 
 
 def _pose(pose: Any) -> Tensor:

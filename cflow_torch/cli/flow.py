@@ -11,6 +11,9 @@ one is missing, 2 if the call was wrong, 128 and its number after a signal.
 result_name=NAME (HDF5 scenes) also writes the total flow into the scenes themselves, as key NAME of every sweep, where
 the viewers of OpenSceneFlow find it.
 
+tracks=true also writes OUTPUT/<log id>/tracks.parquet, the moving objects of a log through time, when all of its frames
+are there: a row per object and sweep with id, box, velocity. With shards, whichever ends last does it.
+
 examples:
   cflow flow data=av2 data.root=/data/av2/val output=outputs/val
   cflow flow data=av2 data.root=/data/av2/val dry_run=true        frames, outputs, time, memory, disk
@@ -19,6 +22,7 @@ examples:
   cflow flow engine=ray engine.address=auto ...                   on a Ray cluster
   cflow flow data=av2 data.root=s3://bucket/val output=s3://bucket/flow
   cflow flow data=hdf5 data.root=/data/scenes result_name=cflow
+  cflow flow /data/drive tracks=true 'contents=[residual,cluster_id,is_valid,confidence]'
 """
 
 from __future__ import annotations
@@ -31,6 +35,8 @@ from typing import Any, Dict, Sequence, Tuple
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
+from cflow_torch.applications.track_table import TRACKS_FILE, write_tracks
+from cflow_torch.applications.tracking import track
 from cflow_torch.cli import run
 from cflow_torch.cli.run import Failures
 from cflow_torch.data.atomic import ready_folder
@@ -43,7 +49,10 @@ from cflow_torch.fleet.machine import choose_layout
 from cflow_torch.fleet.manifest import claim_folder, complete_frames, find_conflict, frame_file, make_identity
 from cflow_torch.fleet.report import format_missing, format_report
 from cflow_torch.fleet.run import report_file, run_fleet
+from cflow_torch.fleet.work import source_name
 from cflow_torch.types import CFlowError
+
+_FOR_TRACKS = {"residual", "cluster_id", "is_valid"}  # contents
 
 
 def task(cfg: DictConfig) -> None:
@@ -91,6 +100,10 @@ def task(cfg: DictConfig) -> None:
         failures = _into_scenes(cfg.result_name, sources.logs, output)
         missing += "".join(f"\n  {scene}: {message}" for scene, message in failures)
         status = status or int(bool(failures))
+    if cfg.tracks and report["stopped_by"] is None:
+        failures = _write_tracks(sources, shard, output)
+        missing += "".join(f"\n  {log}: {message}" for log, message in failures)
+        status = status or int(bool(failures))
     print(f"{format_report(report)}\nflow files in {output}, report in {report_file(job.output, shard)}")
     if status:
         print(f"missing:\n{missing}", file=sys.stderr)
@@ -116,7 +129,24 @@ def _contents(cfg: DictConfig, has_confidence: bool) -> Tuple[str, ...]:
         raise CFlowError(f"contents={given}: confidence is there with model=default and model=fast only")
     if cfg.result_name is not None and not set(given) >= set(CONTENTS):
         raise CFlowError("result_name reads the flow files again: it needs all contents")
+    if cfg.tracks and not set(given) >= _FOR_TRACKS:
+        raise CFlowError(f"tracks=true reads the flow files again: contents needs {', '.join(sorted(_FOR_TRACKS))}")
     return tuple(name for name in allowed if name in given)
+
+
+def _write_tracks(sources: run.Sources, shard: Shard, output: Path) -> Failures:
+    """The tracks of each log of this shard whose frames are all there, whoever computed them."""
+    failures: Failures = []
+    flow = run.stored_flow(output, ())
+    for unit in tqdm(shard.units(sources.logs), desc="tracks", unit="log", disable=None):
+        with run.reported(failures, source_name(unit.source)):
+            log = sources.open(unit.source)
+            folder = output / log.log_id
+            stamps = [int(stamp) for stamp in log.timestamps[:-1]]
+            if complete_frames(folder) >= set(stamps) and not (folder / TRACKS_FILE).exists():
+                results = ((index, flow(log, index)) for index in range(len(stamps)))
+                write_tracks(folder / TRACKS_FILE, track(log, results))
+    return failures
 
 
 def _into_scenes(name: str, scenes: Sequence[Path], output: Path) -> Failures:

@@ -20,6 +20,7 @@ COMMANDS = {
     "plot": "pictures of the flow and of every stage, ground truth beside it, animations",
     "view": "a recording of a drive for the viewer rerun: flow, clusters, truth, on a timeline",
     "stream": "play a log as if it were live: flow as sweeps arrive, its latency",
+    "clean": "logs without what moves, and maps of what stands",
     "bench": "time the method and its stages on your data; memory, windows per second",
     "settings": "every setting with its default and its meaning; model files for OpenSceneFlow",
     "info": "packages, machine, devices: to paste into a bug report",

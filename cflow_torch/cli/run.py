@@ -20,9 +20,11 @@ from cflow_torch.cli.choices import CONFIGS, own_settings
 from cflow_torch.cli.estimates import estimates
 from cflow_torch.config import config_from
 from cflow_torch.data.catalog import AUTO, find_sources, find_user_sources, open_log, recognise
+from cflow_torch.data.flow_file import read_flow
 from cflow_torch.data.log import Log, RecentSweeps, window
 from cflow_torch.data.paths import as_path
 from cflow_torch.data.records import write_text
+from cflow_torch.fleet.manifest import frame_file
 from cflow_torch.fleet.progress import say
 from cflow_torch.model import SceneFlowModel
 from cflow_torch.simulator.benchmark import benchmark_logs, format_of
@@ -196,6 +198,30 @@ def open_logs(cfg: DictConfig) -> Tuple[List[Log], Failures]:
         with reported(failures, source.name):
             logs.append(sources.open(source))
     return logs, failures
+
+
+def stored_flow(folder: Any, needed: Sequence[str]) -> Callable[[Log, int], FlowResult]:
+    """What gives the flow of a pair as `cflow flow` left it.
+
+    Args:
+        folder: its output.
+        needed: fields of `FlowResult` that each file must hold.
+
+    Raises:
+        CFlowError: there is no such folder; from the call, a file that is missing, or holds too little.
+    """
+    place = as_path(folder)
+    if not place.is_dir():
+        raise CFlowError(f"flow={folder} is no folder: give one that `cflow flow` left")
+
+    def read(log: Log, index: int) -> FlowResult:
+        file = frame_file(place / log.log_id, log.timestamps[index])
+        result = read_flow(file)
+        if any(getattr(result, name) is None for name in needed):
+            raise CFlowError(f"{file} holds too little for this: run `cflow flow` with all contents")
+        return result
+
+    return read
 
 
 @contextmanager

@@ -2,7 +2,7 @@
 
 Points of sweep t coloured by residual flow, an arrow per moving cluster, the clusters, sweep t+1, the true flow where
 the log has labels, and the ego vehicle's way, along a timeline of sweeps. The flow is estimated now; flow=FOLDER shows
-what `cflow flow` left there instead. `rerun FILE` opens a recording, on any machine; show=true does so at the end.
+what `cflow flow` left there instead, and the tracks if it wrote them (boxes with ids). `rerun FILE` opens a recording, on any machine; show=true does so at the end.
 OUTPUT/config.yaml holds the resolved settings and versions.
 
 examples:
@@ -22,13 +22,12 @@ from typing import Any, Callable, Iterator, List, Tuple
 
 from omegaconf import DictConfig
 
+from cflow_torch.applications.track_table import TRACKS_FILE, read_tracks
 from cflow_torch.cli import run
 from cflow_torch.cli.run import Failures
 from cflow_torch.data.atomic import ready_folder
-from cflow_torch.data.flow_file import read_flow
 from cflow_torch.data.log import Log, RecentSweeps, window
 from cflow_torch.data.paths import as_path, is_remote
-from cflow_torch.fleet.manifest import frame_file
 from cflow_torch.fleet.progress import frames as counted
 from cflow_torch.types import CFlowError, FlowResult
 from cflow_torch.viz.recording import load_rerun, record_log
@@ -54,7 +53,9 @@ def task(cfg: DictConfig) -> None:
             if file in files:
                 raise CFlowError(f"{file} is of another log of this name: give data.root=PATH more narrowly")
             results = _results(recent, chosen(log), flow, failures)
-            count = record_log(recent, results, file, max_flow=cfg.max_flow)
+            tracks = None if cfg.flow is None else as_path(cfg.flow) / log.log_id / TRACKS_FILE
+            table = None if tracks is None or not tracks.exists() else read_tracks(tracks)
+            count = record_log(recent, results, file, max_flow=cfg.max_flow, tracks=table)
             files.append(file)
             print(f"{file}: {count} pair{'' if count == 1 else 's'}, {file.stat().st_size / 1e6:,.1f} MB")
     if files and not cfg.show:
@@ -68,18 +69,7 @@ def task(cfg: DictConfig) -> None:
 def _flow(cfg: DictConfig) -> Tuple[Callable[[Log, int], FlowResult], int]:
     """(What gives the flow of a pair, how many sweeps that takes)."""
     if cfg.flow is not None:
-        folder = as_path(cfg.flow)
-        if not folder.is_dir():
-            raise CFlowError(f"flow={cfg.flow} is no folder: give one that `cflow flow` left")
-
-        def stored(log: Log, index: int) -> FlowResult:
-            file = frame_file(folder / log.log_id, log.timestamps[index])
-            result = read_flow(file)
-            if any(getattr(result, name) is None for name in ("residual_flow", "pose_flow", "cluster_id", "is_valid")):
-                raise CFlowError(f"{file} holds too little for a picture: run `cflow flow` with all contents")
-            return result
-
-        return stored, 2
+        return run.stored_flow(cfg.flow, ("residual_flow", "pose_flow", "cluster_id", "is_valid")), 2
     model = run.make_model(cfg)
     config = model.config
 

@@ -3,6 +3,7 @@
 OUTPUT/manifest.json              identity of the run and its hash
 OUTPUT/<log id>/manifest.json     the log: its time stamps, digests of its first, middle and last sweep
 OUTPUT/<log id>/<ns>.feather      a complete frame: files take their names when they are on disk
+OUTPUT/<log id>/tracks.parquet    objects through time, made of all frames of a log when they are complete
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from cflow_torch.types import CFlowError, as_numpy
 MANIFEST = "manifest.json"
 _FORMAT = 1
 _ENDING = b"ARROW1"  # of every feather file
-_OURS = re.compile(r"[0-9]+\.feather|manifest\.json|\..+\.tmp")
+_OURS = re.compile(r"[0-9]+\.feather|manifest\.json|tracks\.parquet|\..+\.tmp")
 _REMEDY = "give output=FOLDER, or overwrite=true"
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import uuid
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Iterable, List, Optional, Tuple, Union
+from typing import TYPE_CHECKING, Any, Iterable, List, Mapping, Optional, Tuple, Union
 
 import numpy as np
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 EGO = "world/ego_vehicle"
 ESTIMATE, TRUTH = f"{EGO}/lidar/cflow", f"{EGO}/lidar/ground_truth"
 CLUSTERS, ARROWS = f"{EGO}/lidar/clusters", f"{EGO}/arrows"
+TRACKS = "world/tracks"
 GROUND, NEXT_SWEEP = f"{EGO}/lidar/ground", f"{EGO}/lidar/next_sweep"
 MAX_FLOW = 1.5  # metres per sweep: 15 m/s at 10 Hz
 _DOT, _FINE_DOT = -1.5, -0.8  # negative: pixels of the screen
@@ -37,6 +38,7 @@ def record_log(
     path: Union[str, Path],
     *,
     max_flow: float = MAX_FLOW,
+    tracks: Optional[Mapping[str, np.ndarray]] = None,
 ) -> int:
     """Writes a drive as .rrd, the format of the viewer rerun. The file appears complete or not at all.
 
@@ -46,6 +48,7 @@ def record_log(
             estimates them needs the memory of one.
         path: ends in .rrd; its folder is made if absent, an older file is replaced.
         max_flow: residual flow with the full colour, metres per sweep; the same for the whole drive. Faster is paler.
+        tracks: table of `cflow_torch.track`; its boxes at sweep t are shown with ids and speeds.
 
     Returns:
         Number of pairs in the recording.
@@ -55,7 +58,8 @@ def record_log(
         first pair; in its frame, which is that of t+1: lidar/cflow (points of t, moved by the ego motion, coloured by
         residual flow; up to `panel.MOVING` grey), lidar/clusters, lidar/ground,
         lidar/next_sweep (points of t+1), lidar/ground_truth (coloured by the true residual flow, where there are
-        labels), arrows (one per moving cluster, `panel.ARROW_STEPS` sweeps long). world/trajectory is the way driven.
+        labels), arrows (one per moving cluster, `panel.ARROW_STEPS` sweeps long). world/trajectory is the way driven,
+        world/tracks the boxes of `tracks`.
         Timelines: `sweep`, the index; `time`, where sweeps have times.
 
     Raises:
@@ -78,6 +82,8 @@ def record_log(
             drive = _Drive(rr, stream, max_flow)
             for i, result in results:
                 drive.add(i, log.sweep(i), log.sweep(i + 1), result, log.labels(i))
+                if tracks is not None:
+                    drive.add_tracks({name: values[tracks["sweep"] == i] for name, values in tracks.items()})
             drive.end(log.log_id)
             stream.flush()
         finally:
@@ -156,6 +162,22 @@ class _Drive:
         )
         self.stream.log(ARROWS, arrows, strict=True)
         self.count += 1
+
+    def add_tracks(self, rows: Mapping[str, np.ndarray]) -> None:
+        """Boxes of the pair that was added last, at sweep t, in the world."""
+        T_shown_world = np.eye(4) if self.first_pose is None else np.linalg.inv(self.first_pose)
+        centre = np.stack([rows[axis] for axis in "xyz"], 1) @ T_shown_world[:3, :3].T + T_shown_world[:3, 3]
+        heading = rows["heading"] + np.arctan2(T_shown_world[1, 0], T_shown_world[0, 0])
+        turn = np.zeros((len(heading), 4))  # quaternions x, y, z, w
+        turn[:, 2], turn[:, 3] = np.sin(heading / 2), np.cos(heading / 2)
+        boxes = self.rr.Boxes3D(
+            centers=centre,
+            half_sizes=np.stack([rows[name] for name in ("length", "width", "height")], 1) / 2,
+            quaternions=turn,
+            colors=cluster_colors(centre, rows["id"], _NO_CLUSTER),
+            labels=[f"{n}: {np.hypot(x, y):.1f} m/s" for n, x, y in zip(rows["id"], rows["vx"], rows["vy"])],
+        )
+        self.stream.log(TRACKS, boxes, strict=True)
 
     def end(self, log_id: str) -> None:
         """Log what is known only now, and how the viewer lays it out."""

@@ -1,0 +1,78 @@
+"""Logs without what moves: OUTPUT/<log id>, a folder of point clouds with poses, times and ground as data=arrays reads.
+
+A point moves if its residual flow is 0.05 m a sweep or more. standing=true goes by tracks and takes out as well what
+moves at another time of the log, such as a car that waits. map=true writes OUTPUT/<log id>.ply, what stands in the
+world, one point per voxel. Only x, y, z are kept. A log is written whole or not at all; the same command again does
+those that are missing. OUTPUT/config.yaml holds the resolved settings and versions.
+
+examples:
+  cflow clean /data/drive map=true voxel_size=0.2            any format that is recognised, bags as well
+  cflow clean data=av2 data.root=/data/av2/val standing=true
+  cflow clean /data/drive flow=outputs/flow                  by the flow that `cflow flow` left there
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Any, Callable, Optional
+
+from omegaconf import DictConfig, OmegaConf
+
+from cflow_torch.applications.cleaning import CleanLog, static_map
+from cflow_torch.cli import run
+from cflow_torch.cli.record import refuse_changes
+from cflow_torch.data.arrays import ArraysLog, write_array_log
+from cflow_torch.data.arrays.cloud_file import SUFFIXES, write_cloud
+from cflow_torch.data.atomic import ready_folder
+from cflow_torch.data.log import Log
+from cflow_torch.data.paths import is_remote
+from cflow_torch.data.records import write_text
+from cflow_torch.types import CFlowError, FlowResult
+
+
+def task(cfg: DictConfig) -> None:
+    """Run `cflow clean`."""
+    output = run.output_folder(cfg)
+    if is_remote(output):
+        raise CFlowError(f"{output}: logs are written whole on this machine only; give output=FOLDER and copy them")
+    if cfg.suffix is not None and cfg.suffix not in SUFFIXES:
+        raise CFlowError(f"suffix={cfg.suffix}: give one of {', '.join(SUFFIXES)}")
+    if not cfg.voxel_size > 0:
+        raise CFlowError(f"voxel_size={cfg.voxel_size}: give a positive length in metres")
+    needed = ("residual_flow", "cluster_id", "is_valid")
+    stored = None if cfg.flow is None else run.stored_flow(cfg.flow, needed)
+    model = None if stored is not None else run.make_model(cfg)
+    logs, failures = run.open_logs(cfg)
+    _claim(cfg, ready_folder(output))
+    for log in logs:
+        folder, file = output / log.log_id, output / f"{log.log_id}.ply"
+        flow: Optional[Callable[[int], FlowResult]] = None if stored is None else partial(stored, log)
+        with run.reported(failures, log.log_id):
+            if not folder.exists():
+                clean = CleanLog(log, model, flow, cfg.standing)
+                poses = None if log.sweep(0).pose is None else "kitti"
+                write_array_log(clean, output, cfg.suffix or _own_suffix(log), poses)
+            print(f"{folder}: {len(log.timestamps)} sweeps")
+            if cfg.map and not file.exists():
+                points = static_map(ArraysLog(folder, ground=None), cfg.voxel_size)
+                write_cloud(file, points)
+                print(f"{file}: {len(points)} points")
+    run.finish(failures)
+
+
+def _claim(cfg: DictConfig, output: Path) -> None:
+    """Refuse a folder with logs of other settings."""
+    file, now = output / "config.yaml", OmegaConf.create(run.config_text(cfg))
+    if file.exists():
+        before: Any = OmegaConf.to_container(OmegaConf.load(file))
+        refuse_changes(output, before, OmegaConf.to_container(now), ("output", "device", "map"))  # type: ignore[arg-type]
+    write_text(file, run.config_text(cfg))
+
+
+def _own_suffix(log: Log) -> str:
+    """Of the clouds of a log that consists of such, whatever it is wrapped in."""
+    inner: Any = log
+    while inner is not None and not isinstance(inner, ArraysLog):
+        inner = getattr(inner, "log", None)
+    return ".npy" if inner is None else str(inner.files[0].suffix.lower())
