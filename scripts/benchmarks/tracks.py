@@ -8,8 +8,8 @@ the data set has masks and found by grid elsewhere; nuScenes is read at 10 Hz. A
 at 0.5 m/s or more and at least 20 of its points take part.
 
 columns: object-sweeps; share that a group that moves / a track covers (recall); id switches per 100 object-sweeps with
-a track; error of the horizontal velocity, m/s, mean and median over the same object-sweeps: of single sweeps, of tracks; rows of
-static things per 100 rows, of single sweeps' groups and of tracks.
+a track; error of the horizontal velocity, m/s, mean and median over the same object-sweeps: of single sweeps, of
+tracks; rows of static things per 100 rows, of single sweeps' groups and of tracks.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def score(log: SimulatedLog, pairs: Iterator[Tuple[int, Window, FlowResult]]) ->
         here = {name: values[kept["sweep"] == index] for name, values in kept.items()}
         track_id = np.where(np.isin(track_id, here["id"]), track_id, -1)
         is_mover = np.linalg.norm(velocity, axis=1) >= SPEED
-        for group, owner in _owners(flow["cluster_id"], moves, body):
+        for _, owner in _owners(flow["cluster_id"], moves, body):
             counts["groups"] += 1
             counts["false_groups"] += not is_mover[owner]
         for _, owner in _owners(track_id, track_id >= 0, body):
