@@ -33,6 +33,21 @@ _ACCELERATION = 3.0  # m/s², standard deviation
 _NOISE = (0.4, 0.02)  # standard deviations: metres of a box's centre, metres per sweep of a group's flow
 
 
+# Of K tracks, by name: states; the measured box, where the next sweep should have it (place); where it was first (start),
+# and the sum of its flow since (way); when (begin, seconds).
+_Tracks = Dict[str, Tensor]
+_NO_TRACKS: _Tracks = {
+    **{
+        name: torch.zeros(0, 3, dtype=torch.float64)
+        for name in ("position", "velocity", "place", "size", "start", "way")
+    },
+    **{name: torch.zeros(0, dtype=torch.float64) for name in ("heading", "begin", "confidence", "evidence")},
+    **{name: torch.zeros(0, dtype=torch.int64) for name in ("id", "num_points", "cluster", "num_moving", "missed")},
+    **{name: torch.zeros(0, dtype=torch.bool) for name in ("is_moving", "is_confirmed")},
+    "covariance": torch.zeros(0, 2, 2, dtype=torch.float64),
+}
+
+
 class Tracked(NamedTuple):
     """What a `Tracker` says about one sweep.
 
@@ -112,7 +127,7 @@ class Tracker:
         self._interval = sweep_interval
         self._clock: Optional[Tuple[float, float]] = None  # of the last sweep, and when its flow ends
         self._num_sweeps, self._num_tracks = 0, 0
-        self._tracks: Dict[str, Tensor] = {}
+        self._tracks: _Tracks = {}
         self._points, self._owner = torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, dtype=torch.int64)
 
     def push(self, sweeps: Window, result: FlowResult) -> Tracked:
@@ -123,8 +138,7 @@ class Tracker:
             result: its flow; residual_flow, cluster_id, is_valid and, if there, confidence.
 
         Returns:
-            The tracks at t. Those that have moved in fewer than `MIN_MOVING` sweeps so far (`num_moving`) are mostly
-            noise of what stands.
+            The tracks at t. Those that are not `is_confirmed` (yet) are mostly noise of what stands.
 
         Raises:
             CFlowError: a sweep that is not later than the one before, a result of another sweep, or without what is
@@ -134,108 +148,114 @@ class Tracker:
             raise CFlowError("tracks need residual flow, cluster_id and is_valid: `cflow flow` writes them by default")
         now, interval, elapsed, late = self._times(sweeps)
         seen = _Seen.of(sweeps, result)
-        tracks = self._tracks or _no_tracks(seen.point.device)
-        points, owner = self._points.to(seen.point.device), self._owner.to(seen.point.device)
-        states = States(tracks["position"], tracks["velocity"], tracks["covariance"])
-        points = points + late * states.velocity[owner]  # frames without a result
-        place = tracks["place"] + late * states.velocity
-        states = states.predict(elapsed, _ACCELERATION)
+        tracks, points, owner = self._predicted(seen.point.device, elapsed, late)
+        linked, group, stands, boxed = self._found(tracks, points, owner, seen)
+        flow = seen.mean(seen.step)
+        tracks, of_group = self._measured(tracks, seen, flow, (linked, group), stands, (now, interval))
 
-        # What moves goes on by overlap; of the rest, what is still in its box stands.
+        # Which track each point is of, and where the next sweep should have it.
+        moves = seen.group >= 0
+        point_track = torch.full_like(seen.group, -1)
+        point_track[moves] = of_group[seen.group[moves]]
+        point_track[~moves] = boxed
+        has = point_track >= 0
+        track_id = torch.full((len(result.residual_flow),), -1, device=owner.device)
+        track_id[seen.row[has]] = tracks["id"][point_track[has]]
+        onward = tracks["velocity"] * interval
+        onward[of_group] = flow
+        tracks["place"] = tracks["place"] + onward
+        missing = tracks["missed"][owner] > 0
+        moved = seen.point[has] + torch.where(moves[has, None], seen.step[has], onward[point_track[has]])
+        points = torch.cat([points[missing] + onward[owner[missing]], moved])
+        table = self._table(tracks, now, sweeps.pc0.timestamp_ns)
+        self._keep(tracks, points, torch.cat([owner[missing], point_track[has]]))
+        self._num_sweeps += 1
+        return Tracked(table, track_id.cpu().numpy())
+
+    def _predicted(self, device: torch.device, elapsed: float, late: float) -> Tuple[_Tracks, Tensor, Tensor]:
+        """Tracks, and their points with the numbers of their tracks, where they are expected now.
+
+        Boxes and points are where the last flow brings them, and go on by `late` seconds if that was for too short.
+        """
+        tracks = {name: values.to(device) for name, values in (self._tracks or _NO_TRACKS).items()}
+        points, owner = self._points.to(device), self._owner.to(device)
+        tracks["place"] = tracks["place"] + late * tracks["velocity"]
+        tracks.update(vars(_states(tracks).predict(elapsed, _ACCELERATION)))
+        return tracks, points + late * tracks["velocity"][owner], owner
+
+    @staticmethod
+    def _found(
+        tracks: _Tracks, points: Tensor, owner: Tensor, seen: _Seen
+    ) -> Tuple[Tensor, Tensor, Tuple[Tensor, Tensor], Tensor]:
+        """Tracks and the groups that they are linked to; tracks that stand, with how many points; and of each point
+        that does not move, the track whose box it is in, -1 = none."""
         moves = seen.group >= 0
         linked, group = link(points, owner, seen.point[moves], seen.group[moves], _MIN_SHARE)
         may_stand = tracks["is_confirmed"].clone()
         may_stand[linked] = False
         waiting = may_stand.nonzero()[:, 0]
-        boxed = box_of_point(
-            seen.point[~moves], place[waiting], tracks["size"][waiting] + _MARGIN, tracks["heading"][waiting]
-        )
-        found = torch.bincount(boxed[boxed >= 0], minlength=len(waiting))
-        is_there = found >= (_STANDS * tracks["num_points"][waiting]).clamp(min=_MIN_POINTS)
-        stands = waiting[is_there]
+        size = tracks["size"][waiting] + _MARGIN
+        boxed = box_of_point(seen.point[~moves], tracks["place"][waiting], size, tracks["heading"][waiting])
+        count = torch.bincount(boxed[boxed >= 0], minlength=len(waiting))
+        is_there = count >= (_STANDS * tracks["num_points"][waiting]).clamp(min=_MIN_POINTS)
+        of_box = torch.cat([torch.where(is_there, waiting, -1), waiting.new_full((1,), -1)])
+        return linked, group, (waiting[is_there], count[is_there]), of_box[boxed]
 
-        # New tracks, then measurements of all that is seen.
+    def _measured(
+        self,
+        tracks: _Tracks,
+        seen: _Seen,
+        flow: Tensor,
+        links: Tuple[Tensor, Tensor],
+        stands: Tuple[Tensor, Tensor],
+        times: Tuple[float, float],
+    ) -> Tuple[_Tracks, Tensor]:
+        """The tracks after this sweep, new ones last, and the track of each group."""
+        (linked, group), (now, interval), num_old = links, times, len(tracks["id"])
+        heading = torch.atan2(flow[:, 1], flow[:, 0])
+        velocity = tracks["velocity"][linked]
+        is_fast = velocity[:, :2].norm(dim=1) >= MOVING / interval
+        heading[group] = torch.where(is_fast, torch.atan2(velocity[:, 1], velocity[:, 0]), heading[group])
+        moves = seen.group >= 0
+        centre, size = boxes(seen.point[moves], seen.group[moves], heading)
         is_new = torch.ones_like(seen.count, dtype=torch.bool)
         is_new[group] = False
-        fresh = is_new.nonzero()[:, 0]
-        flow = seen.mean(seen.step)
-        heading = torch.atan2(flow[:, 1], flow[:, 0])
-        is_fast = states.velocity[linked, :2].norm(dim=1) >= MOVING / interval
-        smooth = torch.atan2(states.velocity[linked, 1], states.velocity[linked, 0])
-        heading[group] = torch.where(is_fast, smooth, heading[group])
-        centre, size = boxes(seen.point[moves], seen.group[moves], heading)
-        num_old = len(tracks["id"])
-        of_group = torch.empty_like(seen.count)
+        of_group = num_old + is_new.cumsum(0) - 1
         of_group[group] = linked
-        of_group[fresh] = num_old + torch.arange(len(fresh), device=fresh.device)
         noise = centre.new_tensor([_NOISE[0], _NOISE[1] / interval])
-        begun = {
-            "id": self._num_tracks + torch.arange(len(fresh), device=fresh.device),
-            "position": centre[fresh],
-            "velocity": flow[fresh] / interval,
-            "covariance": torch.diag(noise**2).expand(len(fresh), 2, 2),
-            "begin": centre.new_full((len(fresh),), now),
-            "start": centre[fresh],
-            **{name: tracks[name].new_zeros(len(fresh), *tracks[name].shape[1:]) for name in _MEASURED},
-        }
-        self._num_tracks += len(fresh)
-        tracks = {
-            **tracks,
-            "place": place, "position": states.position, "velocity": states.velocity,
-            "covariance": states.covariance,
-        }
-        tracks = {name: torch.cat([tracks[name], begun[name]]) for name in tracks}
+
+        count = int(is_new.sum())
+        fresh = {name: values.new_zeros(count, *values.shape[1:]) for name, values in tracks.items()}
+        fresh["id"] += self._num_tracks + torch.arange(count, device=centre.device)
+        fresh["covariance"] += torch.diag(noise**2)
+        fresh["begin"] += now
+        fresh.update(start=centre[is_new], position=centre[is_new], velocity=flow[is_new] / interval)
+        self._num_tracks += count
+        tracks = {name: torch.cat([values, fresh[name]]) for name, values in tracks.items()}
+
         tracks["missed"] += 1
         tracks["is_moving"][:] = False
         tracks["cluster"][:] = -1
         measured = {"place": centre, "size": size, "heading": heading, "num_points": seen.count}
         measured.update(cluster=seen.cluster, confidence=seen.confidence)
+        measured.update(is_moving=torch.ones_like(is_new), missed=torch.zeros_like(seen.count))
         for name, values in measured.items():
             tracks[name][of_group] = values
-        tracks["is_moving"][of_group] = True
+        tracks["missed"][stands[0]] = 0
+        tracks["num_points"][stands[0]] = torch.maximum(stands[1], tracks["num_points"][stands[0]])
         tracks["num_moving"][of_group] += 1
         odds = torch.logit(seen.confidence, 0.01).nan_to_num(_NO_CONFIDENCE)
         tracks["evidence"][of_group] += odds * (size[:, :2].amin(1) >= _THIN)
-        gone = tracks["place"] - tracks["start"]  # by the box, against the way that its flow tells
-        way = tracks["way"].norm(dim=1)
-        along = (gone * tracks["way"]).sum(1) / way.clamp(min=1e-9)
-        tracks["is_confirmed"] |= (
-            tracks["is_moving"]
-            & (tracks["num_moving"] >= _MIN_MOVING)
-            & (tracks["evidence"] >= _MIN_EVIDENCE)
-            & (along >= (_MIN_WAY[1] * way).clamp(min=_MIN_WAY[0]))
-        )
-        tracks["num_points"][stands] = torch.maximum(found[is_there], tracks["num_points"][stands])
-        step = torch.zeros_like(tracks["place"])
-        step[of_group] = flow
-        tracks["way"] = tracks["way"] + step
-        both = torch.cat([linked, stands])
-        tracks["missed"][torch.cat([of_group, stands])] = 0
-        old = States(tracks["position"][both], tracks["velocity"][both], tracks["covariance"][both])
-        better = old.update(tracks["place"][both], step[both] / interval, noise.expand(len(both), 2))
-        for name in ("position", "velocity", "covariance"):
-            tracks[name][both] = getattr(better, name)
+        _confirm(tracks)
+        tracks["way"][of_group] += flow  # to the next sweep
 
-        # Points of each track, where the next sweep should have them.
-        point_track = torch.full_like(seen.group, -1)
-        point_track[moves] = of_group[seen.group[moves]]
-        of_box = torch.full((len(waiting) + 1,), -1, device=owner.device)
-        of_box[:-1][is_there] = stands
-        point_track[~moves] = of_box[boxed]
-        track_id = torch.full((len(result.residual_flow),), -1, device=owner.device)
-        has = point_track >= 0
-        track_id[seen.row[has]] = tracks["id"][point_track[has]]
-        is_seen = tracks["missed"] == 0
-        onward = torch.where(tracks["is_moving"][:, None], step, tracks["velocity"] * interval)
-        tracks["place"] = tracks["place"] + onward
-        missing = ~is_seen[owner]
-        moved = seen.point[has] + torch.where(moves[has][:, None], seen.step[has], onward[point_track[has]])
-        points = torch.cat([points[missing] + onward[owner[missing]], moved])
-        owner = torch.cat([owner[missing], point_track[has]])
-        table = self._table(tracks, is_seen, now, sweeps.pc0.timestamp_ns, step)
-        self._keep(tracks, points, owner)
-        self._num_sweeps += 1
-        return Tracked(table, track_id.cpu().numpy())
+        both, step = torch.cat([linked, stands[0]]), torch.zeros_like(tracks["place"])
+        step[of_group] = flow
+        old = _states({name: values[both] for name, values in tracks.items()})
+        better = old.update(tracks["place"][both], step[both] / interval, noise.expand(len(both), 2))
+        for name, values in vars(better).items():
+            tracks[name][both] = values
+        return tracks, of_group
 
     def _times(self, sweeps: Window) -> Tuple[float, float, float, float]:
         """Seconds: of t; from t to t+1; from the sweep before to t; of these, what its flow does not span."""
@@ -251,10 +271,8 @@ class Tracker:
             raise CFlowError(f"a sweep {last - now:.3f} s before the last one: push sweeps in the order of time")
         return now, interval, now - last, now - due
 
-    def _table(
-        self, tracks: Dict[str, Tensor], is_seen: Tensor, now: float, stamp: Optional[int], step: Tensor
-    ) -> Dict[str, np.ndarray]:
-        part = {name: values[is_seen].cpu().numpy() for name, values in tracks.items()}
+    def _table(self, tracks: _Tracks, now: float, stamp: Optional[int]) -> Dict[str, np.ndarray]:
+        part = {name: values[tracks["missed"] == 0].cpu().numpy() for name, values in tracks.items()}
         count = len(part["id"])
         axes = {"": part["position"], "v": part["velocity"]}
         columns = {f"{name}{axis}": values[:, k] for name, values in axes.items() for k, axis in enumerate("xyz")}
@@ -275,7 +293,7 @@ class Tracker:
             "confidence": part["confidence"],
         }
 
-    def _keep(self, tracks: Dict[str, Tensor], points: Tensor, owner: Tensor) -> None:
+    def _keep(self, tracks: _Tracks, points: Tensor, owner: Tensor) -> None:
         """Forget tracks that have not been seen for too long."""
         lives = tracks["missed"] <= _MAX_MISSED
         number = torch.where(lives, lives.cumsum(0) - 1, -1)[owner]
@@ -302,7 +320,8 @@ def track(
         to the left; `age` seconds since it was first seen; `num_moving` sweeps so far in which it moved; `is_moving`,
         False = it has moved and stands now; `cluster_id` of this sweep's flow, -1 where it stands; `num_points`;
         `confidence` of the flow when it last moved, NaN where the method has none.
-        `pandas.DataFrame(table)` takes it. Tracks that have moved in fewer than `MIN_MOVING` sweeps are left out.
+        `pandas.DataFrame(table)` takes it. `is_confirmed` is True from the sweep on in which enough has been seen of
+        its motion: three sweeps, half a metre, and confidence; tracks that never get there are left out.
 
     Raises:
         CFlowError: see `Tracker.push`; a sweep cannot be read.
@@ -322,24 +341,18 @@ def track(
     return confirmed(join_tables(tables))
 
 
-_MEASURED = (
-    *("place", "size", "heading", "num_points", "cluster", "confidence"),
-    *("is_moving", "is_confirmed", "num_moving", "missed", "way", "evidence"),
-)
+def _confirm(tracks: _Tracks) -> None:
+    """Say of each track whether it has shown by now that it moves: by evidence, and by the way that its box has gone
+    beside the way that its flow tells."""
+    way = tracks["way"].norm(dim=1)
+    along = ((tracks["place"] - tracks["start"]) * tracks["way"]).sum(1) / way.clamp(min=1e-9)
+    has_gone = tracks["is_moving"] & (along >= (_MIN_WAY[1] * way).clamp(min=_MIN_WAY[0]))
+    is_evident = (tracks["num_moving"] >= _MIN_MOVING) & (tracks["evidence"] >= _MIN_EVIDENCE)
+    tracks["is_confirmed"] |= has_gone & is_evident
 
 
-def _no_tracks(device: torch.device) -> Dict[str, Tensor]:
-    shapes: Dict[str, Tuple[int, ...]] = dict.fromkeys(
-        ("position", "velocity", "place", "size", "start", "way"), (0, 3)
-    )
-    shapes.update(covariance=(0, 2, 2), heading=(0,), begin=(0,), confidence=(0,), evidence=(0,))
-    tracks = {name: torch.zeros(shape, dtype=torch.float64, device=device) for name, shape in shapes.items()}
-    whole = ("id", "num_points", "cluster", "num_moving", "missed")
-    tracks.update({name: torch.zeros(0, dtype=torch.int64, device=device) for name in whole})
-    return {
-        **tracks,
-        **{name: torch.zeros(0, dtype=torch.bool, device=device) for name in ("is_moving", "is_confirmed")},
-    }
+def _states(tracks: _Tracks) -> States:
+    return States(tracks["position"], tracks["velocity"], tracks["covariance"])
 
 
 def _pose(pose: Any) -> Tensor:

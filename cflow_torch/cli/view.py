@@ -2,8 +2,8 @@
 
 Points of sweep t coloured by residual flow, an arrow per moving cluster, the clusters, sweep t+1, the true flow where
 the log has labels, and the ego vehicle's way, along a timeline of sweeps. The flow is estimated now; flow=FOLDER shows
-what `cflow flow` left there instead, and the tracks if it wrote them (boxes with ids). `rerun FILE` opens a recording, on any machine; show=true does so at the end.
-OUTPUT/config.yaml holds the resolved settings and versions.
+what `cflow flow` left there instead, and boxes with ids if it left tracks. `rerun FILE` opens a recording, on any
+machine; show=true does so at the end. OUTPUT/config.yaml holds the resolved settings and versions.
 
 examples:
   cflow view                                                   a simulated street, no data needed
