@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, List
 
 if TYPE_CHECKING:
     from cflow_torch.applications.stream import FlowStream
+    from cflow_torch.applications.cleaning import CleanLog, static_map
     from cflow_torch.applications.tracking import Tracker, track
     from cflow_torch.config import Config, make_config
     from cflow_torch.dense.method import CorrelationFlow
@@ -19,6 +20,7 @@ __version__ = "0.2.0"
 
 __all__ = [
     "CFlowError",
+    "CleanLog",
     "Config",
     "CorrelationFlow",
     "CorrelationFlowKeypoints",
@@ -31,6 +33,7 @@ __all__ = [
     "estimate_flow",
     "make_config",
     "make_model",
+    "static_map",
     "track",
     "__version__",
 ]
@@ -38,6 +41,7 @@ __all__ = [
 # Where each name is. It is imported when it is first asked for: torch takes seconds, which `cflow --version` need not.
 _MODULES = {
     "CFlowError": "types",
+    "CleanLog": "applications.cleaning",
     "Config": "config",
     "CorrelationFlow": "dense.method",
     "CorrelationFlowKeypoints": "keypoints.method",
@@ -50,6 +54,7 @@ _MODULES = {
     "estimate_flow": "estimate",
     "make_config": "config",
     "make_model": "estimate",
+    "static_map": "applications.cleaning",
     "track": "applications.tracking",
 }
 

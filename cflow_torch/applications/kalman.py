@@ -10,8 +10,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-_BEYOND = 3.0  # standard deviations; what is farther off counts as if it were as noisy as that
-
 
 @dataclass(frozen=True)
 class States:
@@ -40,15 +38,9 @@ class States:
         Args:
             position, velocity: (K, 3) float64, measured.
             noise: (K, 2) float64, standard deviations of the two, per axis.
-
-        Convention: a measurement that lies more than three standard deviations off is taken to be noisier by that
-        factor, so that one wrong flow does not turn an object.
         """
         off = torch.stack([position - self.position, velocity - self.velocity], 1)  # (K, 2, 3)
-        variance = noise**2
-        expected = self.covariance.diagonal(dim1=1, dim2=2) + variance
-        excess = off.square().sum(2) / (3 * _BEYOND**2 * expected)
-        spread = self.covariance + torch.diag_embed(variance * excess.clamp(min=1))
+        spread = self.covariance + torch.diag_embed(noise**2)
         gain = torch.linalg.solve(spread, self.covariance).transpose(1, 2)  # both are symmetric
         change = gain @ off
         left = torch.eye(2, dtype=gain.dtype, device=gain.device) - gain

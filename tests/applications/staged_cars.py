@@ -1,0 +1,62 @@
+"""Box-shaped cars before a wall, with exact flow by hand."""
+
+from __future__ import annotations
+
+from typing import Any, List, Sequence, Tuple
+
+import numpy as np
+import torch
+
+from cflow_torch import FlowResult, Sweep
+from cflow_torch.data.log import Log
+
+INTERVAL_NS = 100_000_000
+_BODY = np.stack(np.meshgrid(np.arange(0, 4, 0.2), np.arange(0, 1.6, 0.2), np.arange(0, 1.4, 0.2)), -1).reshape(-1, 3)
+_WALL = np.stack(np.meshgrid(np.arange(-10, 30, 0.2), [12.0], np.arange(0, 3, 0.2)), -1).reshape(-1, 3)
+
+
+class Staged(Log):
+    """Box-shaped cars with exact flow, before a wall.
+
+    Args:
+        ways: (K, T, 2) x, y of the corner of each car at each sweep; NaN = hidden.
+        poses: (T, 4, 4) of the vehicle, None = no poses.
+    """
+
+    def __init__(self, ways: Any, poses: Any = None) -> None:
+        self.ways, self.poses, self.log_id = np.asarray(ways, float), poses, "staged"
+        self.timestamps = [INTERVAL_NS * (1 + index) for index in range(self.ways.shape[1])]
+
+    def world(self, index: int) -> Tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Points, their residual flow in the world, their car (-1 = the wall)."""
+        points, flow, car = [_WALL], [np.zeros_like(_WALL)], [np.full(len(_WALL), -1)]
+        for number, way in enumerate(self.ways):
+            if np.isfinite(way[index]).all():
+                points.append(_BODY + [*way[index], 0])
+                after = way[min(index + 1, len(way) - 1)]
+                step = np.nan_to_num(after - way[index]) if np.isfinite(after).all() else way[index] - way[index - 1]
+                flow.append(np.zeros_like(_BODY) + [*step, 0])
+                car.append(np.full(len(_BODY), number))
+        return np.concatenate(points), np.concatenate(flow), np.concatenate(car)
+
+    def sweep(self, index: int) -> Sweep:
+        points = self.world(index)[0]
+        pose = None if self.poses is None else self.poses[index]
+        if pose is not None:
+            points = (points - pose[:3, 3]) @ pose[:3, :3]
+        return Sweep(points.astype(np.float32), None, pose, self.timestamps[index])
+
+    def result(self, index: int, confidence: float = 0.9) -> FlowResult:
+        _, flow, car = self.world(index)
+        if self.poses is not None:
+            flow = flow @ self.poses[index + 1][:3, :3]
+        values = {"residual_flow": torch.from_numpy(flow).float(), "cluster_id": torch.from_numpy(car + 1)}
+        values["is_valid"] = torch.ones(len(car), dtype=torch.bool)
+        return FlowResult.of({**values, "confidence": torch.full((len(car),), confidence)})
+
+    def results(self) -> List[Tuple[int, FlowResult]]:
+        return [(index, self.result(index)) for index in range(len(self) - 1)]
+
+
+def straight(start: Sequence[float], step: Sequence[float], count: int = 12) -> np.ndarray:
+    return np.asarray(start, float) + np.arange(count)[:, None] * np.asarray(step, float)

@@ -1,0 +1,113 @@
+"""What moves is taken out, also where it waits; logs come back from disk; the map has one point per voxel."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Callable
+
+import numpy as np
+import pytest
+from staged_cars import Staged, straight
+
+from cflow_torch import CFlowError, CleanLog, Sweep, static_map
+from cflow_torch.data.arrays import ArraysLog, write_array_log
+from cflow_torch.data.log import Log
+
+
+def cleaned(log: Staged, **more: Any) -> CleanLog:
+    return CleanLog(log, flow=log.result, **more)
+
+
+def test_the_wall_stays_and_the_cars_go_in_every_sweep() -> None:
+    log = Staged([straight((0, 0), (0.9, 0.0)), straight((20, 5), (-1.0, 0.0))])
+    clean = cleaned(log)
+    for index in range(len(log)):  # the last one has no flow of its own
+        assert np.array_equal(clean.moving(index), log.world(index)[2] >= 0), index
+        assert len(clean[index].points) == (log.world(index)[2] < 0).sum()
+        assert clean[index].timestamp_ns == log.timestamps[index]
+
+
+def waiting() -> Staged:
+    """A car that waits for eight sweeps and starts, one that stops, one that is parked and never moves."""
+    start = np.cumsum([0.0] * 8 + [0.1, 0.2, 0.4, 0.7, 1.0, 1.0, 1.0, 1.0])
+    stop = np.cumsum([1.0, 1.0, 1.0, 1.0, 0.7, 0.4, 0.2, 0.1] + [0.0] * 8)
+    ways = [np.stack([start, 0 * start], 1), np.stack([stop, 0 * stop + 5], 1), straight((25, 0), (0, 0), 16)]
+    return Staged(ways)
+
+
+def test_what_waits_is_taken_out_by_its_track_and_what_is_parked_stays() -> None:
+    log = waiting()
+    by_flow, by_tracks = cleaned(log), cleaned(log, standing=True)
+    for index in range(len(log) - 1):
+        car = log.world(index)[2]
+        assert np.array_equal(by_tracks.moving(index), (car == 0) | (car == 1)), index
+    assert not by_flow.moving(2)[log.world(2)[2] == 0].any() and not by_flow.moving(12)[log.world(12)[2] == 1].any()
+
+
+def test_ground_and_times_of_points_go_with_their_rows() -> None:
+    class Whole(Staged):
+        def sweep(self, index: int) -> Sweep:
+            points = super().sweep(index).points
+            rows = np.arange(len(points))
+            return Sweep(points, rows % 7 == 0, None, self.timestamps[index], rows * 1e-6)
+
+    log = Whole([straight((0, 0), (0.9, 0.0))])
+    sweep, stays = cleaned(log)[3], np.flatnonzero(~cleaned(log).moving(3))
+    assert np.array_equal(sweep.is_ground, stays % 7 == 0) and np.allclose(sweep.point_times, stays * 1e-6)
+
+
+def test_a_clean_log_is_written_and_read_as_any_other(tmp_path: Path) -> None:
+    poses = np.tile(np.eye(4), (12, 1, 1))
+    poses[:, 0, 3] = np.arange(12)
+    log = Staged([straight((0, 0), (0.9, 0.0))], poses)
+    back = ArraysLog(write_array_log(cleaned(log), tmp_path, ".ply"))
+    assert len(back) == 12 and np.allclose(back.poses, poses)
+    assert np.allclose(back[4].points, log.sweep(4).points[log.world(4)[2] < 0])
+    points = static_map(back, 0.4)
+    wall = log.world(0)[0][log.world(0)[2] < 0]
+    voxels = np.unique(np.floor(points / 0.4), axis=0)
+    assert len(voxels) == len(points), "one of each voxel"
+    assert np.array_equal(voxels, np.unique(np.floor(wall.astype(np.float32).astype(float) / 0.4), axis=0))
+
+
+def test_empty_sweeps_are_no_error() -> None:
+    class Nothing(Log):
+        log_id, timestamps = "nothing", (1, 2, 3)
+
+        def sweep(self, index: int) -> Sweep:
+            return Sweep(np.zeros((0, 3), np.float32), None, np.eye(4), 10**8 * index)
+
+    for standing in (False, True):
+        clean = CleanLog(Nothing(), standing=standing)
+        assert [len(sweep.points) for sweep in clean] == [0, 0, 0]
+    assert static_map(clean).shape == (0, 3)
+
+
+def test_what_cannot_be_done_is_said() -> None:
+    log = Staged([straight((0, 0), (0.9, 0.0))])
+    with pytest.raises(CFlowError, match="odometry"):
+        static_map(cleaned(log))
+    with pytest.raises(CFlowError, match="voxel_size"):
+        static_map(log, 0.0)
+    with pytest.raises(CFlowError, match="rows"):
+        CleanLog(log, flow=lambda index: Staged(log.ways[:, :, :] * np.nan).result(index)).moving(0)
+    log.poses = np.tile(np.eye(4), (12, 1, 1))
+    with pytest.raises(CFlowError, match="larger voxels"):
+        static_map(log, 1e-5)
+
+
+def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+    from test_tracks_of_runs import cflow  # the same small drive and call
+
+    call: Callable[..., int] = cflow(tmp_path, monkeypatch)
+    settings = ("model=fast", "map=true", "voxel_size=0.5", "suffix=.ply")
+    assert call("clean", "clean", *settings) == 0
+    (file,) = (tmp_path / "clean").glob("*.ply")
+    log = ArraysLog(tmp_path / "clean" / file.stem)
+    assert len(log) == 4 and len(log[0].points) > 1000 and log[0].is_ground is not None
+    before = file.read_bytes()
+    file.unlink()
+    assert call("clean", "clean", *settings) == 0 and file.read_bytes() == before, "only what is missing is done"
+    capsys.readouterr()
+    assert call("clean", "clean", "model=fast", "standing=true") == 2 and "standing" in capsys.readouterr().err
+    assert call("clean", "other", "suffix=.xyz") == 2 and ".ply" in capsys.readouterr().err

@@ -1,0 +1,201 @@
+"""Ids of what moves: through crossings, occlusions, waiting, empty sweeps; a filter against plain loops; tables on disk."""
+
+from __future__ import annotations
+
+from typing import Any, Dict, List
+
+import numpy as np
+import pytest
+import torch
+from staged_cars import Staged, straight
+
+from cflow_torch import CFlowError, FlowResult, Sweep, Tracker, Window, track
+from cflow_torch.applications.kalman import States
+from cflow_torch.applications.linking import box_of_point, boxes, link
+from cflow_torch.applications.track_table import join_tables, read_tracks, write_tracks
+
+
+def ids_of(log: Staged, table: Dict[str, np.ndarray], car: int) -> List[int]:
+    """Ids of the rows that lie on a car, in order."""
+    ids = []
+    for index in range(len(log) - 1):
+        centre = log.ways[car, index] + [1.9, 0.7]
+        here = table["sweep"] == index
+        near = np.hypot(table["x"] - centre[0], table["y"] - centre[1]) < 1.0
+        ids += table["id"][here & near].tolist()
+    return ids
+
+
+def test_two_crossing_cars_keep_their_ids_and_velocities() -> None:
+    log = Staged([straight((0, 0), (0.8, 0.8)), straight((-6, 9), (0.8, -0.8))])
+    table = track(log, log.results())
+    first, second = ids_of(log, table, 0), ids_of(log, table, 1)
+    assert len(set(first)) == len(set(second)) == 1 and first[0] != second[0]
+    assert len(first) == len(second) == 11 and len(table["id"]) == 22, "and nothing else"
+    last = table["sweep"] == 10
+    velocity = np.stack([table["vx"], table["vy"]], 1)[last & (table["id"] == second[0])][0]
+    assert np.allclose(velocity, (8, -8), atol=0.01)
+    assert np.allclose(table["age"][last], 1.0) and np.all(np.diff(table["sweep"]) >= 0)
+    assert np.all(table["velocity_std"] < 0.5) and np.allclose(table["heading"][table["id"] == first[0]], np.pi / 4)
+
+
+@pytest.mark.parametrize("gap", [2, 3])
+def test_an_occlusion_is_bridged(gap: int) -> None:
+    way = straight((0, 0), (0.9, 0.0))
+    way[5 : 5 + gap] = np.nan
+    log = Staged([way])
+    table = track(log, log.results())
+    assert len(set(table["id"])) == 1 and len(table["id"]) == 11 - gap
+    assert not np.isin(table["sweep"], range(5, 5 + gap)).any()
+
+
+def test_what_is_hidden_for_long_is_another_track() -> None:
+    way = straight((0, 0), (0.9, 0.0), 20)
+    way[5:12] = np.nan
+    log = Staged([way])
+    assert len(set(track(log, log.results())["id"])) == 2
+
+
+def test_a_car_that_waits_keeps_its_id() -> None:
+    steps = [1.0] * 6 + [0.7, 0.4, 0.2] + [0.0] * 8 + [0.2, 0.5, 0.8, 1.0]
+    way = np.stack([np.cumsum([0.0, *steps]), np.zeros(len(steps) + 1)], 1)
+    log = Staged([way])
+    table = track(log, log.results())
+    assert set(table["id"]) == {table["id"][0]} and len(table["id"]) == len(steps)
+    stands = np.isin(table["sweep"], range(9, 17))
+    assert np.array_equal(~table["is_moving"], stands) and np.all(table["cluster_id"][stands] == -1)
+    assert np.hypot(table["vx"], table["vy"])[table["sweep"] == 16] < 0.1
+    assert np.allclose(table["heading"][stands], 0, atol=0.01), "which way it faced"
+
+
+def test_poses_take_the_vehicle_out_and_turn_the_flow() -> None:
+    poses = np.tile(np.eye(4), (12, 1, 1))
+    for index, pose in enumerate(poses):
+        turn = 0.05 * index
+        pose[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+        pose[:3, 3] = (100 + 0.7 * index, -50, 3)
+    ways = [straight((105, -50), (0.8, 0.3))]
+    moved, still = Staged(ways, poses), Staged(ways)
+    here, there = track(moved, moved.results()), track(still, still.results())
+    for name in ("x", "y", "z", "vx", "vy", "vz", "heading", "length"):
+        assert np.allclose(here[name], there[name], atol=1e-3), name
+    assert np.array_equal(here["id"], there["id"])
+
+
+def test_what_moves_for_a_moment_or_in_its_place_only_is_no_track() -> None:
+    log = Staged([straight((0, 0), (0.0, 0.0)), straight((15, 0), (0.9, 0.0))])
+    results = log.results()
+    for index, result in results:
+        flicker = result.cluster_id == 1
+        result.residual_flow[flicker] = torch.tensor([0.15, 0.0, 0.0]) * (1.0 if index < 6 else 0.0)
+    table = track(log, results)
+    assert len(set(table["id"])) == 1 and np.all(table["x"] > 12), "the box of the first never went anywhere"
+
+
+def test_without_confidence_three_sweeps_are_enough_and_noise_is_not() -> None:
+    log = Staged([straight((0, 0), (0.9, 0.0))])
+    unsure = [(index, log.result(index, 0.5)) for index in range(11)]
+    assert len(track(log, unsure)["id"]) == 0
+    for _, result in unsure:
+        object.__setattr__(result, "confidence", None)
+    table = track(log, unsure)
+    assert len(table["id"]) == 11 and np.isnan(table["confidence"]).all() and table["is_confirmed"].sum() == 9
+
+
+def test_empty_sweeps_and_missing_frames() -> None:
+    log = Staged([straight((0, 0), (0.9, 0.0))])
+    empty = FlowResult.of(
+        {
+            "residual_flow": torch.zeros(0, 3),
+            "cluster_id": torch.zeros(0, dtype=torch.int64),
+            "is_valid": torch.zeros(0, dtype=torch.bool),
+        }
+    )
+    tracker, ids = Tracker(), []
+    for index in range(11):
+        nothing = Sweep(np.zeros((0, 3), np.float32), None, None, log.timestamps[index])
+        is_empty = index in (0, 6)
+        sweeps = Window(nothing if is_empty else log.sweep(index), log.sweep(index + 1))
+        table, track_id = tracker.push(sweeps, empty if is_empty else log.result(index))
+        assert len(track_id) == len(sweeps.pc0.points) and len(table["id"]) == (not is_empty)
+        ids += table["id"].tolist()
+        assert set(track_id) <= {-1, *ids}
+    assert len(set(ids)) == 1
+    assert len(set(track(log, [pair for pair in log.results() if pair[0] not in (4, 5)])["id"])) == 1
+    assert all(len(values) == 0 for values in track(log, []).values())
+
+
+def test_what_is_wrong_is_said() -> None:
+    log = Staged([straight((0, 0), (0.9, 0.0))])
+    tracker = Tracker()
+    tracker.push(Window(log.sweep(3), log.sweep(4)), log.result(3))
+    with pytest.raises(CFlowError, match="order of time"):
+        tracker.push(Window(log.sweep(2), log.sweep(3)), log.result(2))
+    with pytest.raises(CFlowError, match="rows"):
+        Tracker().push(Window(Sweep(np.zeros((5, 3), np.float32)), log.sweep(3)), log.result(2))
+    with pytest.raises(CFlowError, match="cluster_id"):
+        Tracker().push(Window(log.sweep(2), log.sweep(3)), FlowResult.of({"residual_flow": torch.zeros(5, 3)}))
+
+
+def test_links_are_those_of_plain_loops() -> None:
+    generator = np.random.default_rng(0)
+    for _ in range(20):
+        clouds = [generator.uniform(0, 3, (60, 3)) for _ in range(2)]
+        groups = [generator.integers(0, 6, 60) for _ in range(2)]
+        voxels = [
+            [{tuple(v) for v in np.floor(c[g == n] / (0.3, 0.3, 0.9)).astype(int)} for n in range(6)]
+            for c, g in zip(clouds, groups)
+        ]
+        shares = [
+            (-len(a & b) / len(a | b), i, j)
+            for i, a in enumerate(voxels[0])
+            for j, b in enumerate(voxels[1])
+            if a & b and len(a & b) / len(a | b) >= 0.05
+        ]
+        expected: Dict[int, int] = {}
+        for _, i, j in sorted(shares):
+            if i not in expected and j not in expected.values():
+                expected[i] = j
+        given = [torch.from_numpy(value) for value in (clouds[0], groups[0], clouds[1], groups[1])]
+        earlier, later = link(*given, 0.05)
+        assert dict(zip(earlier.tolist(), later.tolist())) == expected
+
+
+def test_boxes_hold_their_points() -> None:
+    generator = np.random.default_rng(1)
+    points, group = torch.from_numpy(generator.normal(size=(80, 3))), torch.arange(80) % 4
+    heading = torch.tensor([0.0, 0.5, 2.0, -3.0], dtype=torch.float64)
+    centre, size = boxes(points, group, heading)
+    for number in range(4):
+        own = slice(number, number + 1)
+        inside = box_of_point(points, centre[own], size[own] + 1e-9, heading[own])
+        assert (inside[group == number] == 0).all()
+        inside = box_of_point(points, centre[own], size[own] * 0.99, heading[own])
+        assert (inside[group == number] == -1).sum() >= 4, "points on the faces"
+
+
+def test_the_filter_is_the_textbook_one() -> None:
+    one = torch.ones(1, 3, dtype=torch.float64)
+    before = States(0 * one, 5 * one, torch.tensor([[[0.2, 0.05], [0.05, 0.1]]], dtype=torch.float64))
+    after = before.predict(0.1, 2.0).update(0.55 * one, 5.1 * one, torch.tensor([[0.3, 0.2]], dtype=torch.float64))
+    F, P = np.array([[1, 0.1], [0, 1]]), before.covariance[0].numpy()
+    push = 2.0 * np.array([0.005, 0.1])
+    P = F @ P @ F.T + np.outer(push, push)
+    gain = P @ np.linalg.inv(P + np.diag([0.09, 0.04]))
+    expected = np.array([0.5, 5.0]) + gain @ (np.array([0.55, 5.1]) - [0.5, 5.0])
+    assert np.allclose([after.position[0, 0], after.velocity[0, 0]], expected)
+    assert np.allclose(after.covariance[0], (np.eye(2) - gain) @ P)
+
+
+def test_a_table_comes_back_from_disk(tmp_path: Any) -> None:
+    log = Staged([straight((0, 0), (0.9, 0.0))])
+    table = track(log, log.results())
+    write_tracks(tmp_path / "tracks.parquet", table)
+    back = read_tracks(tmp_path / "tracks.parquet")
+    assert back.keys() == table.keys() and all(np.array_equal(back[name], table[name]) for name in table)
+    write_tracks(tmp_path / "none.parquet", join_tables([]))
+    assert len(read_tracks(tmp_path / "none.parquet")["id"]) == 0
+    (tmp_path / "broken.parquet").write_bytes(b"PAR1")
+    for name in ("broken.parquet", "missing.parquet"):
+        with pytest.raises(CFlowError, match="tracks=true"):
+            read_tracks(tmp_path / name)

@@ -1,0 +1,72 @@
+"""`cflow flow tracks=true`: a table once a log is complete, the same after a run that was cut off and in shards."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Callable
+
+import numpy as np
+import pytest
+
+from cflow_torch.applications.track_table import read_tracks
+from cflow_torch.cli.main import main
+from cflow_torch.simulator import make_drive
+from cflow_torch.simulator.writers.av2 import write_av2_log
+
+SMALL = "model.point_cloud_range=[-20,-20,-inf,20,20,inf]"
+
+
+def cflow(folder: Path, monkeypatch: pytest.MonkeyPatch, num_sweeps: int = 4) -> Callable[..., int]:
+    """A call of a command on a small simulated drive, (command, folder of its output, settings) -> exit status."""
+    write_av2_log(make_drive(seed=3, num_sweeps=num_sweeps, profile="demo"), folder / "data")
+    monkeypatch.setattr(sys, "argv", list(sys.argv))
+
+    def call(command: str, output: str, *settings: str) -> int:
+        try:
+            main([command, "data=av2", f"data.root={folder / 'data'}", f"output={folder / output}", SMALL, *settings])
+        except SystemExit as stop:
+            return int(stop.code or 0)
+        return 0
+
+    return call
+
+
+def test_resumed_and_sharded_runs_write_the_same_table(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    call = cflow(tmp_path, monkeypatch, 7)
+    run = ("model=fast", "tracks=true", "engine.workers=1")
+    assert call("flow", "whole", *run) == 0
+    (file,) = (tmp_path / "whole").glob("*/tracks.parquet")
+    whole = read_tracks(file)
+    assert len(whole["id"]) > 5 and set(whole["sweep"]) <= set(range(6))
+    for index in (0, 1):
+        there = list((tmp_path / "shards").glob("*/tracks.parquet"))
+        assert not there, "half of the frames are no log"
+        assert call("flow", "shards", *run, f"shard.index={index}", "shard.count=2") == 0
+    (other,) = (tmp_path / "shards").glob("*/tracks.parquet")
+    assert other.read_bytes() == file.read_bytes()
+
+    before = file.read_bytes()
+    file.unlink()
+    sorted(file.parent.glob("*.feather"))[2].unlink()
+    assert call("flow", "whole", *run) == 0 and file.read_bytes() == before
+    assert call("flow", "whole", *run[:1], "overwrite=true") == 0 and not file.exists(), "of another run"
+    capsys.readouterr()
+    assert call("flow", "small", *run, "contents=[residual]") == 2 and "cluster_id" in capsys.readouterr().err
+
+
+def test_the_viewer_shows_the_boxes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("rerun")
+    from cflow_torch.viz import recording
+
+    call, shown = cflow(tmp_path, monkeypatch, 6), []
+    assert call("flow", "flow", "model=fast", "tracks=true", "engine.workers=1") == 0
+    add = recording._Drive.add_tracks
+    monkeypatch.setattr(recording._Drive, "add_tracks", lambda self, rows: (shown.append(rows), add(self, rows)))
+    assert call("view", "view", f"flow={tmp_path / 'flow'}") == 0
+    (file,) = (tmp_path / "flow").glob("*/tracks.parquet")
+    ids = np.concatenate([rows["id"] for rows in shown])
+    assert len(shown) == 5 and np.array_equal(ids, read_tracks(file)["id"]) and len(ids) > 3
+    assert len(list((tmp_path / "view").glob("*.rrd"))) == 1
