@@ -33,8 +33,8 @@ _ACCELERATION = 3.0  # m/s², standard deviation
 _NOISE = (0.4, 0.02)  # standard deviations: metres of a box's centre, metres per sweep of a group's flow
 
 
-# Of K tracks, by name: states; the measured box, where the next sweep should have it (place); where it was first (start),
-# and the sum of its flow since (way); when (begin, seconds).
+# Of K tracks, by name: states; the measured box; where the next sweep should have it (place), where it was first
+# (start), and the sum of its flow since (way); when that was (begin, seconds).
 _Tracks = Dict[str, Tensor]
 _NO_TRACKS: _Tracks = {
     **{

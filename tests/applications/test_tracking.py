@@ -1,4 +1,4 @@
-"""Ids of what moves: through crossings, occlusions, waiting, empty sweeps; a filter against plain loops; tables on disk."""
+"""Ids of what moves: through crossings, occlusions, waiting, empty sweeps; the filter and links by hand; files."""
 
 from __future__ import annotations
 
