@@ -6,8 +6,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, List
 
 if TYPE_CHECKING:
-    from cflow_torch.applications.stream import FlowStream
     from cflow_torch.applications.cleaning import CleanLog, static_map
+    from cflow_torch.applications.stream import FlowStream
     from cflow_torch.applications.tracking import Tracker, track
     from cflow_torch.config import Config, make_config
     from cflow_torch.dense.method import CorrelationFlow
