@@ -21,13 +21,12 @@ from omegaconf import DictConfig, OmegaConf
 
 from cflow_torch.applications.cleaning import CleanLog, static_map
 from cflow_torch.cli import run
-from cflow_torch.cli.record import refuse_changes
 from cflow_torch.data.arrays import ArraysLog, write_array_log
 from cflow_torch.data.arrays.cloud_file import SUFFIXES, write_cloud
 from cflow_torch.data.atomic import ready_folder
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import is_remote
-from cflow_torch.data.records import write_text
+from cflow_torch.data.records import changes, write_text
 from cflow_torch.types import CFlowError, FlowResult
 
 
@@ -63,10 +62,13 @@ def task(cfg: DictConfig) -> None:
 
 def _claim(cfg: DictConfig, output: Path) -> None:
     """Refuse a folder with logs of other settings."""
-    file, now = output / "config.yaml", OmegaConf.create(run.config_text(cfg))
+    file = output / "config.yaml"
     if file.exists():
-        before: Any = OmegaConf.to_container(OmegaConf.load(file))
-        refuse_changes(output, before, OmegaConf.to_container(now), ("output", "device", "map"))  # type: ignore[arg-type]
+        texts = file.read_text(encoding="utf-8"), run.config_text(cfg)
+        before, now = (OmegaConf.to_container(OmegaConf.create(text)) for text in texts)
+        changed = changes(before, now, ("output", "device", "map"))
+        if changed:
+            raise CFlowError(f"{output} holds logs of another run ({changed}): remove it, or give output=FOLDER")
     write_text(file, run.config_text(cfg))
 
 
