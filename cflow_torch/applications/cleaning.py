@@ -159,7 +159,9 @@ def static_map(log: Log, voxel_size: float = 0.1) -> np.ndarray:
     """
     if not voxel_size > 0:
         raise CFlowError(f"voxel_size={voxel_size}: give a positive length in metres")
-    known, parts, origin = np.zeros(0, np.int64), [np.zeros((0, 3))], None
+    known: Any = np.zeros(0, np.int64)
+    parts: List[Any] = [np.zeros((0, 3))]
+    origin: Any = None
     for index in range(len(log.timestamps)):
         sweep = log.sweep(index)
         if sweep.pose is None:
@@ -171,7 +173,7 @@ def static_map(log: Log, voxel_size: float = 0.1) -> np.ndarray:
         if ((voxel < 0) | (voxel >= 2 * _REACH)).any():
             raise CFlowError(f"the map is more than {_REACH * voxel_size:.0f} m long: give larger voxels, or parts")
         key, first = np.unique((voxel[:, 0] << 42) | (voxel[:, 1] << 21) | voxel[:, 2], return_index=True)
-        place = np.searchsorted(known, key)
+        place: Any = np.searchsorted(known, key)
         is_new = np.append(known, -1)[place] != key
         parts.append(points[np.sort(first[is_new])])
         known = np.insert(known, place[is_new], key[is_new])

@@ -26,7 +26,7 @@ from cflow_torch.data.arrays.cloud_file import SUFFIXES, write_cloud
 from cflow_torch.data.atomic import ready_folder
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import is_remote
-from cflow_torch.data.records import changes, write_text
+from cflow_torch.data.records import changes
 from cflow_torch.types import CFlowError, FlowResult
 
 
@@ -64,12 +64,13 @@ def _claim(cfg: DictConfig, output: Path) -> None:
     """Refuse a folder with logs of other settings."""
     file = output / "config.yaml"
     if file.exists():
-        texts = file.read_text(encoding="utf-8"), run.config_text(cfg)
-        before, now = (OmegaConf.to_container(OmegaConf.create(text)) for text in texts)
+        before: Any = OmegaConf.to_container(OmegaConf.load(file))
+        settings: Any = OmegaConf.to_container(cfg, resolve=True)
+        now = {**settings, "versions": run.versions()}
         changed = changes(before, now, ("output", "device", "map"))
         if changed:
             raise CFlowError(f"{output} holds logs of another run ({changed}): remove it, or give output=FOLDER")
-    write_text(file, run.config_text(cfg))
+    run.write_config(cfg, output)
 
 
 def _own_suffix(log: Log) -> str:
