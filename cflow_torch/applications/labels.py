@@ -24,6 +24,7 @@ AGREEMENT = 1.3  # chosen on simulated drives of five sensors, seeds 100 to 103
 _REACH = 0.5  # metres from where the flow leads to the next point that moves
 _ALIKE = (0.1, 0.5)  # two motions are alike if they differ by at most so many metres, or by this part of their length
 _SMALLEST = 20  # points of a group that stands; those of OpenSceneFlow's own recipe have as many
+_MOST = 32_767  # groups that an int16 can number
 _NND = (0.14, 4.4)  # metres from a point to the nearest of the next sweep: faster than 5 km/h, slower than 160
 
 
@@ -82,13 +83,14 @@ def find_labels(
         (time stamp, labels), in order. The labels of N points:
         `ground_mask` (N,) bool.
         `dufo` (N,) uint8, 1 = moves at least `MOVING` a sweep and is no ground.
-        `cluster` (N,) int16, groups of at least 20 points and those that move, numbered from 1; 0 = ground, no group.
+        `cluster` (N,) int16, groups that move and those of at least 20 points; 0 = ground, no group. Those that move
+        have the first numbers, from 1: `seflowpp_auto` keeps numbers in 8 bits.
         `dufocluster` (N,) int16, those groups where `dufo` is 1, else 0.
         `nnd` (N,) uint8, 1 = the nearest point of the next sweep is 0.14 m to 4.4 m away after ego motion, ground
         included.
 
     Convention: the last sweep moves as its flow back to the sweep before says, with time reversed; its `nnd` looks at
-        that sweep. Of more than 32,767 groups in a sweep the last have no number.
+        that sweep. The groups of a sweep after the 32,767th have no number.
 
     Raises:
         CFlowError: results without confidence, another number of results or of points, SciPy is missing.
@@ -209,14 +211,14 @@ def _is_confirmed(movers: Sequence[Movers], trees: Sequence[Any], index: int) ->
 
 
 def _numbered(group: np.ndarray, moves: np.ndarray, is_ground: np.ndarray) -> np.ndarray:
-    """(N,) int16: groups that move or are large enough, from 1 in their old order."""
+    """(N,) int16: groups that move, numbered from 1 in their old order, then those that are large enough."""
     has_group = (group >= 0) & ~is_ground
     count = np.bincount(group[has_group], minlength=1)
-    is_kept = count >= _SMALLEST
-    is_kept[group[moves]] = True
-    number = np.cumsum(is_kept) * is_kept
-    number[number > np.iinfo(np.int16).max] = 0
-    return np.where(has_group, number[np.where(has_group, group, 0)], 0).astype(np.int16)
+    does_move = np.bincount(group[moves], minlength=len(count)) > 0
+    ids = np.concatenate([np.flatnonzero(does_move), np.flatnonzero(~does_move & (count >= _SMALLEST))])
+    number = np.zeros(len(count), np.int16)
+    number[ids[:_MOST]] = np.arange(1, len(ids[:_MOST]) + 1)
+    return np.where(has_group, number[np.where(has_group, group, 0)], np.int16(0))
 
 
 def _nearest_is_apart(tree: Callable[..., Any], sweep: Sweep, other: Sweep, workers: int) -> np.ndarray:

@@ -82,6 +82,9 @@ def test_types_and_meanings_of_every_sweep(labelled: Path, drives: Path) -> None
         assert not (moves & ground).any() and not new["cluster"][ground].any()
         np.testing.assert_array_equal(new["dufocluster"], np.where(moves, new["cluster"], 0))
         assert (new["cluster"][moves] > 0).all(), "a moving point without a group would be trained to stand"
+        assert set(new["cluster"][moves]) == set(range(1, new["dufocluster"].max() + 1)), (
+            "the harness has 8 bits for them"
+        )
         count = np.bincount(new["cluster"])[1:]
         assert (
             count.min() > 0 and (count[np.setdiff1d(new["cluster"][~moves], [0, *new["dufocluster"]]) - 1] >= 20).all()
