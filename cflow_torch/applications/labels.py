@@ -15,7 +15,7 @@ import numpy as np
 
 from cflow_torch.data.catalog import open_log
 from cflow_torch.data.hdf5.results import write_hdf5_labels
-from cflow_torch.data.log import Log, windows
+from cflow_torch.data.log import Log, RecentSweeps, windows
 from cflow_torch.stages import FlowModel
 from cflow_torch.types import CFlowError, FlowResult, Sweep, Window, as_numpy
 
@@ -97,7 +97,7 @@ def find_labels(
 
     Cost: reads the log twice; two searches of nearest neighbours a sweep, one of all points, one of what moves.
     """
-    tree = _import_tree()
+    tree, log = _import_tree(), RecentSweeps(log, 3)
     movers: List[Movers] = []
     groups: List[np.ndarray] = []
     for index, result in enumerate(_with_last(log, flows, model)):
@@ -236,5 +236,5 @@ def _import_tree() -> Callable[..., Any]:
     try:
         from scipy.spatial import cKDTree
     except ImportError:
-        raise CFlowError('labels need SciPy: pip install "cflow_torch[label]"') from None
+        raise CFlowError("labels need SciPy: pip install scipy") from None
     return cKDTree

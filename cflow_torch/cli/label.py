@@ -36,7 +36,7 @@ from cflow_torch.fleet.machine import choose_layout
 from cflow_torch.fleet.manifest import complete_frames, frame_file
 from cflow_torch.types import CFlowError
 
-_CONTENTS = ("residual", "cluster_id", "is_valid", "confidence")
+_CONTENTS = ("residual", "cluster_id", "confidence")
 
 
 def task(cfg: DictConfig) -> None:

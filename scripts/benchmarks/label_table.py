@@ -65,11 +65,12 @@ def peer(file: str) -> Dict[str, Any]:
 def ours(file: str, presets: List[str]) -> Dict[str, Any]:
     """Labels of a scene by each preset, with their seconds a sweep."""
     import torch
+    from scipy import spatial  # noqa: F401 (not to be timed)
 
     from cflow_torch import make_config, make_model
     from cflow_torch.applications.labels import find_labels
     from cflow_torch.data.hdf5 import HDF5Log
-    from cflow_torch.data.log import RecentSweeps, windows
+    from cflow_torch.data.log import RecentSweeps, window, windows
 
     torch.set_num_threads(1)
     answer = {}
@@ -78,6 +79,7 @@ def ours(file: str, presets: List[str]) -> Dict[str, Any]:
         log = HDF5Log(file)
         held = RecentSweeps(log, len(log))
         sweeps = list(held)
+        model([window(held, 0)])
         start = time.process_time()
         flows = (model([w])[0] for w in windows(held, model.config.num_history, model.config.num_future))
         labels = [each["dufo"] > 0 for _, each in find_labels(held, flows, model)]
