@@ -18,7 +18,9 @@ examples:
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from pathlib import Path
+from typing import Optional
 
 from omegaconf import DictConfig
 from tqdm import tqdm
@@ -50,7 +52,10 @@ def task(cfg: DictConfig) -> None:
     def check(job: Job, sources: Sources) -> None:
         for scene in sources.logs:
             check_writable(scene)
-            _is_labelled(scene, job)
+            maker = None
+            with suppress(CFlowError):  # a scene that cannot be read is reported when its turn comes
+                maker = labelled_by(scene)
+            _check_maker(scene, maker, job)
 
     done = compute(cfg, shard, _CONTENTS, check)
     if done is not None:
@@ -66,7 +71,9 @@ def _label(done: FlowRun, shard: Shard, cfg: DictConfig) -> Failures:
     for scene in tqdm(scenes, desc="labels", unit="scene", disable=None):
         folder = as_path(done.job.output) / scene.stem
         with run.reported(failures, scene.stem):
-            if _is_labelled(scene, done.job):
+            maker = labelled_by(scene)
+            _check_maker(scene, maker, done.job)
+            if maker == done.job.identity and not done.job.redo:
                 continue
             log = done.sources.open(scene)
             stamps = log.timestamps[:-1]
@@ -81,13 +88,9 @@ def _label(done: FlowRun, shard: Shard, cfg: DictConfig) -> Failures:
     return failures
 
 
-def _is_labelled(scene: Path, job: Job) -> bool:
-    """Whether a run of the same settings has labelled a scene.
-
-    Raises:
-        CFlowError: it has labels of other settings or of somebody else, which are not to be replaced.
-    """
-    maker = labelled_by(scene, job.redo)
+def _check_maker(scene: Path, maker: Optional[str], job: Job) -> None:
+    """Refuse a scene with labels that are not this run's, unless they are to be replaced."""
     if maker not in (None, job.identity) and not job.redo:
-        raise CFlowError(f"{scene} has labels of other settings: overwrite=true replaces them")
-    return maker == job.identity and not job.redo
+        raise CFlowError(
+            f"{scene} has labels of other settings or of another program: overwrite=true replaces them, or label a copy"
+        )

@@ -169,7 +169,8 @@ def test_labels_of_others_are_not_replaced_unasked(scenes: Path, tmp_path: Path,
         label_scene(file, make_model(make_config("fast"), "cpu"))
     assert cflow(scenes, output) == 2
     error = capsys.readouterr().err
-    assert "scene-2.h5 has dufo already: overwrite=true" in error and error.count("\n") == 1
+    assert "scene-2.h5 has labels of other settings or of another program: overwrite=true" in error
+    assert error.count("\n") == 1
     assert file.read_bytes() == before and not list(tmp_path.glob("out/*/*.feather"))
     assert cflow(scenes, output, "overwrite=true") == 0
     assert all(sweep["dufo"].dtype == np.uint8 and sweep["dufo"].max() == 1 for sweep in stored(file))
@@ -210,16 +211,19 @@ def test_shards_label_every_scene_once(scenes: Path, tmp_path: Path, capsys: Any
     assert all("dufo" in sweep for file in scenes.iterdir() for sweep in stored(file))
 
 
-def test_a_scene_of_one_sweep_is_reported_and_the_others_are_labelled(
+def test_scenes_that_cannot_be_labelled_are_reported_and_the_others_are(
     scenes: Path, tmp_path: Path, capsys: Any
 ) -> None:
+    """One of a single sweep, and one that is no scene."""
+    (scenes / "scene-3.h5").write_bytes(b"no scene")
     single = scenes / "scene-1.h5"
     with h5py.File(single, "r+") as scene:
         for name in sorted(scene, key=int)[1:]:
             del scene[name]
     before = single.read_bytes()
     assert cflow(scenes, f"output={tmp_path / 'out'}") == 1
-    assert "has 1 sweeps; scene flow needs two or more" in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert "has 1 sweeps; scene flow needs two or more" in error and "scene-3.h5" in error and "Traceback" not in error
     assert single.read_bytes() == before and "dufo" in stored(scenes / "scene-2.h5")[0]
 
 

@@ -8,7 +8,7 @@ import shutil
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any, Iterable, Iterator, Mapping, Optional, Tuple, Union
+from typing import Any, Iterable, Iterator, List, Mapping, Optional, Tuple, Union
 
 import numpy as np
 
@@ -121,8 +121,10 @@ def write_hdf5_labels(
     """
     count = 0
     with _changed(file) as scene:
-        if not overwrite:
-            check_unlabelled(scene, file)
+        with _writing(file):
+            found = [] if overwrite else _labels_in(scene)
+        if found:
+            raise CFlowError(f"{file} has {', '.join(found)} already: overwrite=true replaces them, or label a copy")
         for timestamp, values in labels:
             _write_labels(scene, Path(file), str(timestamp), values)
             count += 1
@@ -130,30 +132,20 @@ def write_hdf5_labels(
     return count
 
 
-def labelled_by(file: Union[str, Path], overwrite: bool = False) -> Optional[str]:
-    """What made the labels of a scene, by its attribute; None if it has none.
+def labelled_by(file: Union[str, Path]) -> Optional[str]:
+    """What made the labels of a scene: `made_by`, "" if that is not known; None if it has no labels.
 
     Raises:
-        CFlowError: it has labels that somebody else wrote, and `overwrite` is False; it cannot be read.
+        CFlowError: it cannot be read.
     """
     with open_scene(Path(file)) as scene, file_errors(file):
-        if LABELLED in scene.attrs:
-            return str(scene.attrs[LABELLED])
-        if not overwrite:
-            check_unlabelled(scene, file)
-    return None
+        made_by = scene.attrs.get(LABELLED, "" if _labels_in(scene) else None)
+        return None if made_by is None else str(made_by)
 
 
-def check_unlabelled(scene: Any, file: Union[str, Path]) -> None:
-    """Refuse an open scene that has labels.
-
-    Raises:
-        CFlowError: as said.
-    """
-    with file_errors(file):
-        found = sorted({key for stamp in scene if is_stamp(stamp) for key in set(scene[stamp]) & set(LABELS)})
-    if found:
-        raise CFlowError(f"{file} has {', '.join(found)} already: overwrite=true replaces them, or label a copy")
+def _labels_in(scene: Any) -> List[str]:
+    """Keys of labels that sweeps of an open scene have."""
+    return sorted({key for stamp in scene if is_stamp(stamp) for key in set(scene[stamp]) & set(LABELS)})
 
 
 @contextmanager
