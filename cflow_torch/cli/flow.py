@@ -30,7 +30,7 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
-from typing import Any, Dict, Sequence, Tuple
+from typing import Any, Callable, Dict, NamedTuple, Optional, Sequence, Tuple
 
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
@@ -38,10 +38,11 @@ from tqdm import tqdm
 from cflow_torch.applications.track_table import TRACKS_FILE, write_tracks
 from cflow_torch.applications.tracking import track
 from cflow_torch.cli import run
-from cflow_torch.cli.run import Failures
+from cflow_torch.cli.run import Failures, Sources
 from cflow_torch.data.atomic import ready_folder
 from cflow_torch.data.flow_file import CONTENTS, ON_REQUEST, read_flow
 from cflow_torch.data.hdf5.results import check_result_name, check_writable, write_hdf5_results
+from cflow_torch.data.paths import as_path
 from cflow_torch.data.records import write_text
 from cflow_torch.fleet.forecast import forecast
 from cflow_torch.fleet.job import Job, Shard, find_shard
@@ -55,18 +56,54 @@ from cflow_torch.types import CFlowError
 _FOR_TRACKS = {"residual", "cluster_id", "is_valid"}  # contents
 
 
+class FlowRun(NamedTuple):
+    """A run that has ended: its logs, its job, its report."""
+
+    sources: Sources
+    job: Job
+    report: Dict[str, Any]
+
+
 def task(cfg: DictConfig) -> None:
     """Run `cflow flow`."""
-    output = run.output_folder(cfg)
     shard = find_shard(cfg.shard.index, cfg.shard.count, os.environ)
     if cfg.result_name is not None:
         _check_results(cfg, shard)
+    contents = _contents(cfg, run.make_model(cfg).config.method == "verified")
+    done = compute(cfg, shard, contents, _check_scenes if cfg.result_name is not None else None)
+    if done is None:
+        return
+    failures: Failures = []
+    if cfg.result_name is not None and done.report["stopped_by"] is None:  # a signal leaves no time for it
+        failures = _into_scenes(cfg.result_name, done.sources.logs, as_path(done.job.output))
+    if cfg.tracks and done.report["stopped_by"] is None:
+        failures += _write_tracks(done.sources, shard, as_path(done.job.output))
+    finish(done, shard, failures)
+
+
+def compute(
+    cfg: DictConfig, shard: Shard, contents: Tuple[str, ...], check: Optional[Callable[[Job, Sources], None]] = None
+) -> Optional[FlowRun]:
+    """Estimate the flow of all logs of a shard into files, or say what would be done.
+
+    Args:
+        cfg: settings; those of `cflow flow`.
+        shard: which share of the logs.
+        contents: of a flow file.
+        check: refuses logs before anything is computed.
+
+    Returns:
+        What was done; None with dry_run=true.
+
+    Raises:
+        CFlowError: a setting, the logs or the output folder are refused.
+    """
+    output = run.output_folder(cfg)
     settings: Dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
     engine = dict(settings["engine"])
     name, workers, batch = (engine.pop(key) for key in ("name", "workers", "batch"))
     layout = choose_layout(cfg.device, workers, batch, os.environ)
     config = run.make_model(cfg).config
-    contents = _contents(cfg, config.method == "verified")
     sources = run.find_logs(cfg)
     identity = make_identity(config, sources.reader, sources.settings, contents)
     job = Job(
@@ -84,32 +121,43 @@ def task(cfg: DictConfig) -> None:
         print(forecast(job, shard.units(sources.logs), layout))
         if conflict is not None:
             print(f"{output} holds results of another run{conflict}; overwrite=true would replace them")
-        return
-    if cfg.result_name is not None:
-        for scene in sources.logs:
-            check_writable(scene)
-    kept = {**{key: settings[key] for key in ("model", "data", "result_name")}, "versions": run.versions()}
+        return None
+    if check is not None:
+        check(job, sources)
+    kept = {**{key: settings.get(key) for key in ("model", "data", "result_name")}, "versions": run.versions()}
     ready_folder(output)
     claim_folder(output, identity, cfg.resume, cfg.overwrite, shard.count == 1)
     write_text(output / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(kept)))
     about = {"config": settings, "versions": run.versions()}
-    report = run_fleet(job, sources.logs, layout, shard, name, about, **engine)
-    missing = format_missing(report)
-    status = report["exit_status"]
-    if cfg.result_name is not None and report["stopped_by"] is None:  # a signal leaves no time for it
-        failures = _into_scenes(cfg.result_name, sources.logs, output)
-        missing += "".join(f"\n  {scene}: {message}" for scene, message in failures)
-        status = status or int(bool(failures))
-    if cfg.tracks and report["stopped_by"] is None:
-        failures = _write_tracks(sources, shard, output)
-        missing += "".join(f"\n  {log}: {message}" for log, message in failures)
-        status = status or int(bool(failures))
-    print(f"{format_report(report)}\nflow files in {output}, report in {report_file(job.output, shard)}")
+    return FlowRun(sources, job, run_fleet(job, sources.logs, layout, shard, name, about, **engine))
+
+
+def finish(done: FlowRun, shard: Shard, failures: Failures) -> None:
+    """Print what was done, and end the process with another status than 0 if something is missing.
+
+    Args:
+        done: the run.
+        shard: its share.
+        failures: what failed after it.
+
+    Raises:
+        SystemExit: something is missing.
+        UnfinishedJob: the same in a job of a sweep.
+    """
+    report, file = done.report, report_file(done.job.output, shard)
+    status = report["exit_status"] or int(bool(failures))
+    print(f"{format_report(report)}\nflow files in {done.job.output}, report in {file}")
     if status:
+        missing = format_missing(report) + "".join(f"\n  {scene}: {message}" for scene, message in failures)
         print(f"missing:\n{missing}", file=sys.stderr)
         if run.is_sweep():  # Hydra lets the other jobs run before it ends with status 1
-            raise run.UnfinishedJob(f"not every frame is there: see {report_file(job.output, shard)}")
+            raise run.UnfinishedJob(f"not every frame is there: see {file}")
         raise SystemExit(status)
+
+
+def _check_scenes(job: Job, sources: Sources) -> None:
+    for scene in sources.logs:
+        check_writable(scene)
 
 
 def _check_results(cfg: DictConfig, shard: Shard) -> None:

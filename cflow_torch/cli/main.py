@@ -15,6 +15,7 @@ from cflow_torch import __version__
 COMMANDS = {
     "demo": "simulate a drive, estimate its flow, score it and draw it",
     "flow": "estimate the flow of every pair of sweeps of one log or a fleet; shards, resumes, Ray",
+    "label": "labels for self-supervised training, into OpenSceneFlow's scenes",
     "eval": "estimate and score every labelled pair of a data set",
     "submit": "write and check an archive for a public leaderboard",
     "plot": "pictures of the flow and of every stage, ground truth beside it, animations",

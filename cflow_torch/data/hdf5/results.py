@@ -1,27 +1,31 @@
-"""A method's flow as a key of OpenSceneFlow's HDF5 scenes, where the harness's viewers look for it."""
+"""What is written into OpenSceneFlow's HDF5 scenes: a method's flow, labels for self-supervised training."""
 
 from __future__ import annotations
 
 import os
 import re
 import shutil
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any, Iterable, Tuple, Union
+from typing import Any, Iterable, Iterator, List, Mapping, Optional, Tuple, Union
 
 import numpy as np
 
 from cflow_torch.data.atomic import atomic_name, remove_stale
 from cflow_torch.data.file_errors import file_errors
-from cflow_torch.data.hdf5.stored import import_h5py, member
+from cflow_torch.data.hdf5.stored import import_h5py, member, open_scene
+from cflow_torch.data.names import is_stamp
 from cflow_torch.types import Array, CFlowError, as_numpy
 
+LABELS = ("dufo", "cluster", "dufocluster", "nnd")  # keys of labels for self-supervised training
+LABELLED = "cflow_labels"  # attribute of a scene that has ours
 # Keys that scenes bring, and names that the viewers give a meaning of their own.
 RESERVED_KEYS = frozenset(
     (
         *("lidar", "lidar_id", "lidar_dt", "lidar_center", "ground_mask", "pose", "ego_motion", "eval_mask"),
         *("flow", "flow_is_valid", "flow_category_indices", "flow_instance_id"),
-        *("dufo", "cluster", "dufocluster", "nnd", "label", "raw", "pc0_dynamic", "pc1_dynamic", "pch1_dynamic"),
+        *(*LABELS, "label", "raw", "pc0_dynamic", "pc1_dynamic", "pch1_dynamic"),
         *("pc0", "pc1", "gm0", "gm1", "pose0", "pose1"),
     )
 )
@@ -81,41 +85,132 @@ def write_hdf5_results(file: Union[str, Path], name: str, results: Iterable[Tupl
 
     Cost: one copy of the scene, in time and, until the end, in space.
     """
-    h5py = import_h5py()
     check_result_name(name)
+    count = 0
+    with _changed(file) as scene:
+        for timestamp, flow in results:
+            _write_flow(scene, Path(file), str(timestamp), name, as_numpy(flow))
+            count += 1
+    return count
+
+
+def write_hdf5_labels(
+    file: Union[str, Path],
+    labels: Iterable[Tuple[int, Mapping[str, np.ndarray]]],
+    made_by: str = "",
+    overwrite: bool = False,
+) -> int:
+    """Write labels for self-supervised training into a scene.
+
+    Args:
+        file: `<scene>.h5`; every other key keeps its contents.
+        labels: (time stamp, {key: (N,) values}) of sweeps, keys of `LABELS` and `ground_mask`, which is only written
+            where the sweep has none; taken one by one.
+        made_by: what they were made by, kept as the attribute `LABELLED` of the scene.
+        overwrite: replace labels that are there.
+
+    Returns:
+        Number of sweeps written.
+
+    Convention: as `write_hdf5_results`: the scene is the old one or the new one.
+
+    Raises:
+        CFlowError: as there; or the scene has labels, and `overwrite` is False.
+
+    Cost: one copy of the scene.
+    """
+    count = 0
+    with _changed(file) as scene:
+        with _writing(file):
+            found = [] if overwrite else _labels_in(scene)
+        if found:
+            raise CFlowError(f"{file} has {', '.join(found)} already: overwrite=true replaces them, or label a copy")
+        for timestamp, values in labels:
+            _write_labels(scene, Path(file), str(timestamp), values)
+            count += 1
+        scene.attrs[LABELLED] = made_by
+    return count
+
+
+def labelled_by(file: Union[str, Path]) -> Optional[str]:
+    """What made the labels of a scene: `made_by`, "" if that is not known; None if it has no labels.
+
+    Raises:
+        CFlowError: it cannot be read.
+    """
+    with open_scene(Path(file)) as scene, file_errors(file):
+        made_by = scene.attrs.get(LABELLED, "" if _labels_in(scene) else None)
+        return None if made_by is None else str(made_by)
+
+
+def _labels_in(scene: Any) -> List[str]:
+    """Keys of labels that sweeps of an open scene have."""
+    return sorted({key for stamp in scene if is_stamp(stamp) for key in set(scene[stamp]) & set(LABELS)})
+
+
+@contextmanager
+def _changed(file: Union[str, Path]) -> Iterator[Any]:
+    """A copy of a scene, open to be changed, that takes its place when the block ends, and is removed if it raises."""
+    h5py = import_h5py()
     check_writable(file)
     file = Path(file).resolve()  # a link stays a link
     remove_stale(file.parent)  # copies of writers that were killed
-    count = 0
     with atomic_name(file) as copy:
         shutil.copy(file, copy)
         with _writing(file):
             scene = h5py.File(copy, "r+")
         try:
-            for timestamp, flow in results:
-                _write(scene, file, str(timestamp), name, as_numpy(flow))
-                count += 1
+            yield scene
         finally:
             with _writing(file):
                 scene.close()
-    return count
 
 
-def _write(scene: Any, file: Path, timestamp: str, name: str, flow: np.ndarray) -> None:
-    where = f"{file}: sweep {timestamp}"
+def _sweep(scene: Any, file: Path, timestamp: str) -> Tuple[Any, int]:
+    """The group of a sweep and its number of points."""
     sweep = member(scene, timestamp, file)
-    points = None if sweep is None else member(sweep, "lidar", where)
+    points = None if sweep is None else member(sweep, "lidar", f"{file}: sweep {timestamp}")
     if sweep is None or points is None:
         raise CFlowError(f"{file} has no sweep {timestamp}")
+    return sweep, len(points)
+
+
+def _write_flow(scene: Any, file: Path, timestamp: str, name: str, flow: np.ndarray) -> None:
+    where = f"{file}: sweep {timestamp}"
+    sweep, rows = _sweep(scene, file, timestamp)
     with _writing(where):
-        rows = len(points)
         if flow.shape != (rows, 3):
             raise CFlowError(f"{file}: the flow of sweep {timestamp} has shape {flow.shape}, expected ({rows}, 3)")
         older = member(sweep, name, where)
-        if older is None:
-            sweep.create_dataset(name, data=flow.astype(np.float32))
-            return
         # Two names of one dataset: another key would change as well.
-        if older.shape != (rows, 3) or older.dtype != np.float32 or import_h5py().h5o.get_info(older.id).rc > 1:
+        if older is not None and not _is_like(older, (rows, 3), np.float32):
             raise CFlowError(f"{file}: {name} of sweep {timestamp} is no flow result, it is not replaced")
-        older[...] = flow  # in its old place: deleting would leave a hole that HDF5 never gives back
+        _store(sweep, name, older, flow.astype(np.float32))
+
+
+def _write_labels(scene: Any, file: Path, timestamp: str, labels: Mapping[str, np.ndarray]) -> None:
+    where = f"{file}: sweep {timestamp}"
+    sweep, rows = _sweep(scene, file, timestamp)
+    with _writing(where):
+        for key, values in labels.items():
+            if values.shape != (rows,):
+                raise CFlowError(f"{where}: {key} has shape {values.shape}, expected ({rows},)")
+            older = member(sweep, key, where)
+            if older is not None and key not in LABELS:
+                continue
+            if older is not None and not _is_like(older, values.shape, values.dtype):
+                del sweep[key]
+                older = None
+            _store(sweep, key, older, values)
+
+
+def _is_like(stored: Any, shape: Tuple[int, ...], dtype: Any) -> bool:
+    """Whether a dataset can take such values in its place, and has one name only."""
+    return bool(stored.shape == shape and stored.dtype == dtype and import_h5py().h5o.get_info(stored.id).rc == 1)
+
+
+def _store(sweep: Any, key: str, older: Any, values: np.ndarray) -> None:
+    if older is None:
+        sweep.create_dataset(key, data=values)
+    else:
+        older[...] = values  # in its old place: deleting would leave a hole that HDF5 never gives back

@@ -1,0 +1,271 @@
+"""Labels for self-supervised training: types, meanings, what is left alone, and that no scene is ever half labelled."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any, Dict, List
+
+import numpy as np
+import pytest
+
+from cflow_torch import CFlowError, make_config, make_model
+from cflow_torch.applications import labels
+from cflow_torch.applications.labels import find_labels, label_scene
+from cflow_torch.cli.main import main
+from cflow_torch.data.hdf5 import HDF5Log, write_hdf5_results, write_hdf5_scene
+from cflow_torch.data.log import windows
+from cflow_torch.simulator import make_drive
+
+h5py = pytest.importorskip("h5py")
+spatial = pytest.importorskip("scipy.spatial")
+
+KEYS = {"dufo": np.uint8, "cluster": np.int16, "dufocluster": np.int16, "nnd": np.uint8, "ground_mask": np.bool_}
+CALL = ["label", "model=fast", "engine.workers=1", "data.check=false"]
+
+
+@pytest.fixture(scope="module")
+def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two scenes of five sweeps."""
+    folder = tmp_path_factory.mktemp("drives")
+    for seed in (1, 2):
+        write_hdf5_scene(make_drive(seed, 5, "demo"), folder / f"scene-{seed}.h5")
+    return folder
+
+
+@pytest.fixture
+def scenes(drives: Path, tmp_path: Path) -> Path:
+    """A copy of them."""
+    return Path(shutil.copytree(drives, tmp_path / "scenes"))
+
+
+@pytest.fixture(scope="module")
+def labelled(drives: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The first of them with labels by the preset offline."""
+    file = Path(shutil.copy(drives / "scene-1.h5", tmp_path_factory.mktemp("labelled")))
+    assert label_scene(file, make_model(make_config("offline"), "cpu")) == 5
+    return file
+
+
+def stored(file: Path) -> List[Dict[str, Any]]:
+    """Every value of every sweep."""
+    with h5py.File(file, "r") as scene:
+        return [{key: scene[stamp][key][()] for key in scene[stamp]} for stamp in sorted(scene, key=int)]
+
+
+def cflow(*arguments: Any) -> int:
+    """Exit status of `cflow label` in this process."""
+    before = list(sys.argv)
+    try:
+        main([*CALL, *map(str, arguments)])
+    except SystemExit as end:
+        return int(end.code or 0)
+    finally:
+        sys.argv = before
+    return 0
+
+
+def test_types_and_meanings_of_every_sweep(labelled: Path, drives: Path) -> None:
+    before, after = stored(drives / "scene-1.h5"), stored(labelled)
+    for old, new in zip(before, after):
+        assert set(new) == set(old) | set(KEYS)
+        for key, value in old.items():
+            np.testing.assert_array_equal(new[key], value)
+        for key, dtype in KEYS.items():
+            assert new[key].dtype == dtype and new[key].shape == (len(old["lidar"]),)
+        moves, ground = new["dufo"] > 0, new["ground_mask"]
+        assert moves.any() and new["dufo"].max() == 1 and new["nnd"].max() == 1
+        assert not (moves & ground).any() and not new["cluster"][ground].any()
+        np.testing.assert_array_equal(new["dufocluster"], np.where(moves, new["cluster"], 0))
+        assert (new["cluster"][moves] > 0).all(), "a moving point without a group would be trained to stand"
+        assert set(new["cluster"][moves]) == set(range(1, new["dufocluster"].max() + 1)), (
+            "the harness has 8 bits for them"
+        )
+        count = np.bincount(new["cluster"])[1:]
+        assert (
+            count.min() > 0 and (count[np.setdiff1d(new["cluster"][~moves], [0, *new["dufocluster"]]) - 1] >= 20).all()
+        )
+
+
+def test_moving_points_are_those_of_the_truth_in_the_last_sweep_too(labelled: Path, drives: Path) -> None:
+    sweeps, found, missed, false = stored(labelled), 0, 0, 0
+    with HDF5Log(labelled) as log:
+        moving = set()
+        for index, sweep in enumerate(sweeps):
+            if "flow" in sweep:
+                T = np.linalg.inv(log.poses[index + 1]) @ log.poses[index]
+                points = sweep["lidar"].astype(np.float64)
+                residual = sweep["flow"] - (points @ T[:3, :3].T + T[:3, 3] - points)
+                moves = np.linalg.norm(residual, axis=1) >= 0.05
+                moving = set(sweep["flow_instance_id"][moves & ~sweep["ground_mask"]]) - {0}
+            else:  # the last one has no flow: what moved in the sweep before moves
+                moves = np.isin(sweep["flow_instance_id"], list(moving))
+            counts = ~sweep["ground_mask"] & (np.linalg.norm(sweep["lidar"][:, :2], axis=1) <= 50)
+            parts = [int((counts & a & b).sum()) for a, b in zip([sweep["dufo"] > 0] * 2, [moves, ~moves])]
+            found, false = found + parts[0], false + parts[1]
+            missed += int((counts & moves & (sweep["dufo"] == 0)).sum())
+            assert parts[0] > 0.7 * (counts & moves).sum() > 0, f"sweep {index}"
+    assert found / (found + false) > 0.9 and found / (found + missed) > 0.8
+
+
+def test_nnd_is_the_nearest_point_of_the_next_sweep(labelled: Path) -> None:
+    sweeps = stored(labelled)
+    with HDF5Log(labelled) as log:
+        for index, other in ((0, 1), (4, 3)):
+            T = np.linalg.inv(log.poses[other]) @ log.poses[index]
+            points = sweeps[index]["lidar"][::50].astype(np.float64) @ T[:3, :3].T + T[:3, 3]
+            nearest = spatial.distance.cdist(points, sweeps[other]["lidar"]).min(1)
+            expected = (nearest >= 0.14) & (nearest < 4.4)
+            assert 0 < expected.mean() < 1
+            np.testing.assert_array_equal(sweeps[index]["nnd"][::50], expected)
+
+
+def test_motion_that_neighbouring_sweeps_deny_is_not_believed() -> None:
+    """Of three groups one keeps its motion, one reverses it, one is not there in the other sweeps."""
+
+    def movers(index: int) -> labels.Movers:
+        shape = np.stack(np.meshgrid(*[np.arange(5) * 0.2] * 3), -1).reshape(-1, 3)
+        steady, reverses, once = shape + [index, 0, 0], shape + [0, 9, 0], shape + [0, 30, 9 * index]
+        velocity = np.repeat([[10.0, 0, 0], [10.0 * (-1) ** index, 0, 0], [0, 10, 0]], len(shape), 0)
+        count = len(velocity)
+        positions = np.concatenate([steady, reverses, once])
+        return labels.Movers(
+            np.arange(count), positions, velocity, np.arange(count) // len(shape), np.full(count, 0.7), 0.1 * index
+        )
+
+    three = [movers(index) for index in range(3)]
+    believed = labels._is_confirmed(three, [spatial.cKDTree(each.positions) for each in three], 1)
+    assert believed.reshape(3, -1).tolist() == [[True] * 125, [False] * 125, [False] * 125]
+    none = three[1]._replace(**{name: getattr(three[1], name)[:0] for name in labels.Movers._fields[:-1]})
+    assert len(labels._is_confirmed([none, none], [None, None], 0)) == 0
+
+
+def test_ground_is_found_only_where_it_is_missing(scenes: Path) -> None:
+    file = scenes / "scene-1.h5"
+    before = stored(file)
+    with h5py.File(file, "r+") as scene:
+        names = sorted(scene, key=int)
+        del scene[names[1]]["ground_mask"]
+        scene[names[2]]["ground_mask"][...] = before[2]["ground_mask"] & (np.arange(len(before[2]["lidar"])) % 2 == 0)
+        mine = scene[names[2]]["ground_mask"][()]
+    label_scene(file, make_model(make_config("fast"), "cpu"))
+    after = stored(file)
+    np.testing.assert_array_equal(after[2]["ground_mask"], mine)
+    found, truth = after[1]["ground_mask"], before[1]["ground_mask"]
+    assert found.dtype == np.bool_ and (found & truth).sum() / (found | truth).sum() > 0.9
+
+
+def test_labels_of_others_are_not_replaced_unasked(scenes: Path, tmp_path: Path, capsys: Any) -> None:
+    file, output = scenes / "scene-2.h5", f"output={tmp_path / 'out'}"
+    with h5py.File(file, "r+") as scene:
+        for name in scene:
+            scene[name]["dufo"] = np.full(len(scene[name]["lidar"]), 7, np.int64)
+    before = file.read_bytes()
+    with pytest.raises(CFlowError, match="has dufo already: overwrite=true"):
+        label_scene(file, make_model(make_config("fast"), "cpu"))
+    assert cflow(scenes, output) == 2
+    error = capsys.readouterr().err
+    assert "scene-2.h5 has labels of other settings or of another program: overwrite=true" in error
+    assert error.count("\n") == 1
+    assert file.read_bytes() == before and not list(tmp_path.glob("out/*/*.feather"))
+    assert cflow(scenes, output, "overwrite=true") == 0
+    assert all(sweep["dufo"].dtype == np.uint8 and sweep["dufo"].max() == 1 for sweep in stored(file))
+    assert cflow(scenes, output, "model.significance=2") == 2
+    assert "has labels of other settings" in capsys.readouterr().err
+
+
+def test_a_killed_run_leaves_whole_scenes_and_goes_on(scenes: Path, tmp_path: Path) -> None:
+    """Killed in the middle of the second scene, whose copy is half written."""
+    before = {file.name: file.read_bytes() for file in scenes.iterdir()}
+    output = f"output={tmp_path / 'out'}"
+    code = (
+        "import os, signal\nfrom cflow_torch.cli.main import main\nfrom cflow_torch.data.hdf5 import results\n"
+        "write, count = results._write_labels, []\n"
+        "def die(*arguments):\n"
+        "    count.append(1)\n"
+        "    write(*arguments)\n"
+        "    if len(count) == 7: os.kill(os.getpid(), signal.SIGKILL)\n"
+        f"results._write_labels = die\nmain({[*CALL, str(scenes), output]!r})\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    first, second = scenes / "scene-1.h5", scenes / "scene-2.h5"
+    assert second.read_bytes() == before["scene-2.h5"] and first.read_bytes() != before["scene-1.h5"]
+    assert any(name.endswith(".tmp") for name in os.listdir(scenes))
+    place, frames = first.stat().st_ino, {f: f.stat().st_mtime_ns for f in tmp_path.glob("out/*/*.feather")}
+    assert cflow(scenes, output) == 0
+    assert first.stat().st_ino == place, "a labelled scene is left alone"
+    assert frames == {f: f.stat().st_mtime_ns for f in tmp_path.glob("out/*/*.feather")}, "flow is not computed again"
+    assert all("nnd" in sweep for sweep in stored(second)) and sorted(os.listdir(scenes)) == sorted(before)
+
+
+def test_shards_label_every_scene_once(scenes: Path, tmp_path: Path, capsys: Any) -> None:
+    """Three shards of two scenes: the middle one has a part of both."""
+    for index, count in ((1, 0), (0, 1), (2, 1)):
+        assert cflow(scenes, f"output={tmp_path / 'out'}", f"shard.index={index}", "shard.count=3") == 0
+        assert f"scenes labelled: {count}," in capsys.readouterr().out
+    assert all("dufo" in sweep for file in scenes.iterdir() for sweep in stored(file))
+
+
+def test_scenes_that_cannot_be_labelled_are_reported_and_the_others_are(
+    scenes: Path, tmp_path: Path, capsys: Any
+) -> None:
+    """One of a single sweep, and one that is no scene."""
+    (scenes / "scene-3.h5").write_bytes(b"no scene")
+    single = scenes / "scene-1.h5"
+    with h5py.File(single, "r+") as scene:
+        for name in sorted(scene, key=int)[1:]:
+            del scene[name]
+    before = single.read_bytes()
+    assert cflow(scenes, f"output={tmp_path / 'out'}") == 1
+    error = capsys.readouterr().err
+    assert "has 1 sweeps; scene flow needs two or more" in error and "scene-3.h5" in error and "Traceback" not in error
+    assert single.read_bytes() == before and "dufo" in stored(scenes / "scene-2.h5")[0]
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        ("{}", "no scene (a file *.h5) in {}"),
+        ("{}/nowhere", "nowhere is neither a file nor a folder"),
+        ("data=av2 data.root={}", "labels are for HDF5 scenes of OpenSceneFlow"),
+        ("{} model=paper", "give model=offline, default or fast"),
+    ],
+)
+def test_a_wrong_call_is_one_clear_error(call: str, message: str, tmp_path: Path, capsys: Any) -> None:
+    assert cflow(*call.format(tmp_path).split(), f"output={tmp_path / 'out'}") == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and error.count("\n") == 1 and message.format(tmp_path) in error
+
+
+def test_flow_that_is_not_of_the_log_is_refused(scenes: Path) -> None:
+    model = make_model(make_config("fast"), "cpu")
+    with HDF5Log(scenes / "scene-1.h5") as log:
+        flows = [model([each])[0] for each in windows(log, 2)]
+        for wrong, message in ((flows[:-1], "has 3 flows"), ([*flows[1:], flows[0]], "rows of another sweep")):
+            with pytest.raises(CFlowError, match=message):
+                list(find_labels(log, wrong, model))
+    with pytest.raises(CFlowError, match="key of the scenes themselves"):
+        write_hdf5_results(scenes / "scene-1.h5", "dufo", [])
+
+
+@pytest.mark.slow
+def test_the_real_drive_reaches_what_is_aimed_at(kitti_file: Path, tmp_path: Path) -> None:
+    """Precision .9, recall .8 of points that move within 50 m, no ground."""
+    file = Path(shutil.copy(kitti_file, tmp_path))
+    file.chmod(0o644)
+    label_scene(file, make_model(make_config("offline"), "cpu"))
+    found = np.zeros(3, int)
+    with HDF5Log(file) as log:
+        for index in range(len(log) - 1):
+            points, truth = log.values(index, "lidar").astype(np.float64), log.labels(index)
+            T = np.linalg.inv(log.poses[index + 1]) @ log.poses[index]
+            moves = np.linalg.norm(truth.flow - (points @ T[:3, :3].T + T[:3, 3] - points), axis=1) >= 0.05
+            counts = truth.is_valid & ~log.values(index, "ground_mask") & (np.linalg.norm(points[:, :2], axis=1) <= 50)
+            dufo = log.values(index, "dufo") > 0
+            found += [(counts & a & b).sum() for a, b in ((dufo, moves), (dufo, ~moves), (~dufo, moves))]
+    assert found[0] / (found[0] + found[1]) >= 0.9 and found[0] / (found[0] + found[2]) >= 0.8, found
