@@ -5,8 +5,9 @@
 
 RESULTS: a folder that holds results.json files of `cflow eval -m experiment=...`, at any depth. Writes the page
 FOLDER.md (default: RESULTS/paper.md), and to FOLDER per table or figure NAME.md, NAME.csv, NAME.tex, for figures
-NAME.png and NAME.pdf too (needs matplotlib). Of figures the page has the means, NAME.md the classes. Missing runs are
-listed on the page and on the screen, "-" in the tables. `--output docs/paper` makes docs/paper.md.
+NAME.png and NAME.pdf too (needs matplotlib). Of figures the page has the means, NAME.md the classes; across data sets
+the page has CorrelationFlow, NAME.md every method. Missing runs are listed on the page and on the screen, "-" in the
+tables. `--output docs/paper` makes docs/paper.md.
 """
 
 from __future__ import annotations
@@ -26,15 +27,8 @@ from cflow_torch.data.atomic import atomic_file
 PER_SET = ("datasets", "range_split")  # experiments whose columns are data sets, not classes
 INTRODUCTION = """# The paper's tables beside ours
 
-```bash
-cflow eval -m experiment=pixel_size                     # one table or figure
-python scripts/paper/tables.py                          # all of them, then this page in outputs/paper
-python scripts/paper/tables.py data=benchmark_small     # all of them on 20 windows
-python scripts/paper/pages.py outputs/paper             # the page alone, from results that are there
-```
-
 Dynamic bucket-normalised EPE, lower is better. The paper's rows are of Argoverse 2 val, ours of other data: what can be
-compared is which way a change goes, not the numbers. What each experiment varies: docs/settings.md.
+compared is which way a change goes, not the numbers. Commands, and what each experiment varies: docs/settings.md.
 """
 Cells = List[List[str]]
 
@@ -194,13 +188,18 @@ def main(arguments: Optional[Sequence[str]] = None) -> int:
         for ending, text in (("md", markdown(cells)), ("csv", comma_separated(cells)), ("tex", latex(cells))):
             write(output / f"{name}.{ending}", text)
         is_figure = "at" in about
-        shown = mean_cells(cells) if is_figure and name not in PER_SET else cells
+        shown = cells
+        if name in PER_SET:
+            shown = [row for row in cells if row is cells[0] or row[0] in METHODS.values()]
+        elif is_figure:
+            shown = mean_cells(cells)
         page += [f"## {about['title']} ({about['label']})", "", markdown(shown)]
         runs_told = about_runs(ours)
         notes = ["runs as above"] if runs_told and runs_told == told else list(runs_told)
         notes += [about["note"]] if "note" in about else []
         told = runs_told or told
         if name in PER_SET:
+            notes.append("the paper's other methods: in the picture, numbers in scripts/paper/figures.yaml")
             notes += [f"{method}: {reason}" for method, score in protocol(ours).items() for reason in score.missing]
         page += [f"- {line}" for line in notes]
         if draw is not None and is_figure:
