@@ -17,7 +17,7 @@ from cflow_torch.windows.bev_grid import Grid
 from cflow_torch.windows.ego_motion import compensate
 from cflow_torch.windows.point_times import read_point_times
 from cflow_torch.windows.timeline import Entry
-from cflow_torch.windows.validation import read_ground, read_positions
+from cflow_torch.windows.validation import join_positions, read_ground, read_positions
 
 
 @dataclass(frozen=True)
@@ -78,8 +78,8 @@ def read_pieces(
     is_flat = matrix is not None and math.isinf(grid.lower[2]) and math.isinf(grid.upper[2])
     checked_axes = 2 if is_flat else 3
     for rows in chunks(0, sizes[0], device) if len(group) == 1 else [slice(None)]:
-        read = [read_positions(entry.sweep, device, rows) for entry in group]
-        raw = read[0] if len(read) == 1 else torch.cat(read, 1)
+        sweeps = [entry.sweep for entry in group]
+        raw = read_positions(sweeps[0], device, rows) if len(sweeps) == 1 else join_positions(sweeps, device)
         moved = raw if matrix is None else compensate(raw, matrix, max(num_axes, checked_axes))
         takes_part, is_ground = grid.contains(moved[:checked_axes]), None
         if ground is not None:

@@ -35,7 +35,7 @@ def main() -> int:
         )
         axes.plot(range(1, NUM_SWEEPS), 1000 * np.array(found), ".-", label=preset)
     axes.axhline(1000 * INTERVAL, color="0.6", linewidth=0.8)
-    axes.text(NUM_SWEEPS - 1, 1000 * INTERVAL, "the next sweep", ha="right", va="bottom", color="0.4", fontsize=8)
+    axes.text(0, 1000 * INTERVAL, "the next sweep", ha="left", va="top", color="0.4", fontsize=8)
     axes.set(xlabel="sweep", ylabel="latency (ms)", ylim=(0, None))
     axes.legend(frameon=False, ncols=3, loc="upper left", fontsize=8)
     figure.savefig(PICTURE, dpi=110)
