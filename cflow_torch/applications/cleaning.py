@@ -10,8 +10,9 @@ import numpy as np
 import torch
 
 from cflow_torch.applications.linking import box_of_point, boxes
+from cflow_torch.applications.moving_groups import MOVING
 from cflow_torch.applications.track_table import confirmed, join_tables
-from cflow_torch.applications.tracking import MOVING, Tracker
+from cflow_torch.applications.tracking import Tracker
 from cflow_torch.config import make_config
 from cflow_torch.data.log import Log, RecentSweeps, window
 from cflow_torch.estimate import make_model

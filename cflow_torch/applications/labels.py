@@ -13,13 +13,13 @@ from typing import Any, Callable, Dict, Iterable, Iterator, List, NamedTuple, Se
 
 import numpy as np
 
+from cflow_torch.applications.moving_groups import MOVING
 from cflow_torch.data.catalog import open_log
 from cflow_torch.data.hdf5.results import write_hdf5_labels
 from cflow_torch.data.log import Log, RecentSweeps, windows
 from cflow_torch.stages import FlowModel
 from cflow_torch.types import CFlowError, FlowResult, Sweep, Window, as_numpy
 
-MOVING = 0.05  # metres a sweep; the harness's scores call a point dynamic from here on
 AGREEMENT = 1.3  # chosen on simulated drives of five sensors, seeds 100 to 103
 _REACH = 0.5  # metres from where the flow leads to the next point that moves
 _ALIKE = (0.1, 0.5)  # two motions are alike if they differ by at most so many metres, or by this part of their length

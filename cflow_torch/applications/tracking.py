@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Dict, Iterable, NamedTuple, Optional, Tuple
+from typing import Dict, Iterable, NamedTuple, Optional, Tuple
 
 import numpy as np
 import torch
@@ -11,20 +10,19 @@ from torch import Tensor
 
 from cflow_torch.applications.kalman import States
 from cflow_torch.applications.linking import box_of_point, boxes, link
+from cflow_torch.applications.moving_groups import MIN_POINTS, MOVING, MovingGroups
 from cflow_torch.applications.track_table import confirmed, join_tables
 from cflow_torch.config import make_config
 from cflow_torch.data.log import Log, RecentSweeps, window
 from cflow_torch.estimate import make_model
-from cflow_torch.types import CFlowError, FlowResult, Window, as_numpy
+from cflow_torch.types import CFlowError, FlowResult, Window
 
-MOVING = 0.05  # metres per sweep: residual flow of what moves, as in evaluation
 # A track is confirmed by what it has shown while it moved: most groups that do not last are noise of what stands.
 _MIN_MOVING = 3  # sweeps
 _MIN_EVIDENCE = 2.0  # sum of the log-odds of its confidence
 _NO_CONFIDENCE = 0.7  # log-odds, of methods without
 _THIN = 0.12  # metres; a narrower box is no evidence: posts, and slices of fronts along which a shadow glides
 _MIN_WAY = (0.5, 0.5)  # metres that its box must have gone the way of its flow, and their share of that way
-_MIN_POINTS = 5
 _MIN_SHARE = 0.1  # of voxels that two groups have in common, for a link
 _STANDS = 0.3  # share of a track's points that must be found in its box where it is said to stand
 _MARGIN = 0.2  # metres by which that box is larger
@@ -58,51 +56,6 @@ class Tracked(NamedTuple):
 
     table: Dict[str, np.ndarray]
     track_id: np.ndarray
-
-
-@dataclass(frozen=True)
-class _Seen:
-    """The points of a sweep that take part, in the world, and its G moving groups.
-
-    Args:
-        row: (M,) rows of the sweep; point, step: (M, 3) position and residual flow; group: (M,) -1 = does not move.
-        cluster: (G,) cluster_id of each group; count: (G,) points; confidence: (G,).
-    """
-
-    row: Tensor
-    point: Tensor
-    step: Tensor
-    group: Tensor
-    cluster: Tensor
-    count: Tensor
-    confidence: Tensor
-
-    @classmethod
-    def of(cls, sweeps: Window, result: FlowResult) -> _Seen:
-        flow = result.residual_flow.double()
-        points = torch.as_tensor(as_numpy(sweeps.pc0.points, np.float64)[:, :3].copy(), device=flow.device)
-        if len(points) != len(flow):
-            raise CFlowError(f"the flow has {len(flow)} rows, its sweep {len(points)} points: give its own window")
-        row = (result.is_valid & points.isfinite().all(1)).nonzero()[:, 0]
-        pose0, pose1 = (_pose(sweep.pose).to(flow.device) for sweep in (sweeps.pc0, sweeps.pc1))
-        step = flow[row] @ pose1[:3, :3].T
-        is_moving = (result.cluster_id[row] >= 0) & (step.norm(dim=1) >= MOVING)
-        group = torch.full_like(row, -1)
-        cluster, group[is_moving], count = torch.unique(
-            result.cluster_id[row][is_moving], return_inverse=True, return_counts=True
-        )
-        number = torch.where(count >= _MIN_POINTS, (count >= _MIN_POINTS).cumsum(0) - 1, -1)
-        group = torch.cat([number, number.new_full((1,), -1)])[group]
-        cluster, count = cluster[number >= 0], count[number >= 0]
-        given = flow.new_full((len(flow),), torch.nan) if result.confidence is None else result.confidence.double()
-        seen = cls(row, points[row] @ pose0[:3, :3].T + pose0[:3, 3], step, group, cluster, count, count)
-        return cls(**{**seen.__dict__, "confidence": seen.mean(given[row][:, None])[:, 0]})
-
-    def mean(self, values: Tensor) -> Tensor:
-        """(G, C) means over groups of (M, C)."""
-        moves = self.group >= 0
-        total = values.new_zeros(len(self.count), values.shape[1]).index_add_(0, self.group[moves], values[moves])
-        return total / self.count[:, None]
 
 
 class Tracker:
@@ -147,7 +100,7 @@ class Tracker:
         if any(getattr(result, name) is None for name in ("residual_flow", "cluster_id", "is_valid")):
             raise CFlowError("tracks need residual flow, cluster_id and is_valid: `cflow flow` writes them by default")
         now, interval, elapsed, late = self._times(sweeps)
-        seen = _Seen.of(sweeps, result)
+        seen = MovingGroups.of(sweeps, result)
         tracks, points, owner = self._predicted(seen.point.device, elapsed, late)
         linked, group, stands, boxed = self._found(tracks, points, owner, seen)
         flow = seen.mean(seen.step)
@@ -185,7 +138,7 @@ class Tracker:
 
     @staticmethod
     def _found(
-        tracks: _Tracks, points: Tensor, owner: Tensor, seen: _Seen
+        tracks: _Tracks, points: Tensor, owner: Tensor, seen: MovingGroups
     ) -> Tuple[Tensor, Tensor, Tuple[Tensor, Tensor], Tensor]:
         """Tracks and the groups that they are linked to; tracks that stand, with how many points; and of each point
         that does not move, the track whose box it is in, -1 = none."""
@@ -197,14 +150,14 @@ class Tracker:
         size = tracks["size"][waiting] + _MARGIN
         boxed = box_of_point(seen.point[~moves], tracks["place"][waiting], size, tracks["heading"][waiting])
         count = torch.bincount(boxed[boxed >= 0], minlength=len(waiting))
-        is_there = count >= (_STANDS * tracks["num_points"][waiting]).clamp(min=_MIN_POINTS)
+        is_there = count >= (_STANDS * tracks["num_points"][waiting]).clamp(min=MIN_POINTS)
         of_box = torch.cat([torch.where(is_there, waiting, -1), waiting.new_full((1,), -1)])
         return linked, group, (waiting[is_there], count[is_there]), of_box[boxed]
 
     def _measured(
         self,
         tracks: _Tracks,
-        seen: _Seen,
+        seen: MovingGroups,
         flow: Tensor,
         links: Tuple[Tensor, Tensor],
         stands: Tuple[Tensor, Tensor],
@@ -353,7 +306,3 @@ def _confirm(tracks: _Tracks) -> None:
 
 def _states(tracks: _Tracks) -> States:
     return States(tracks["position"], tracks["velocity"], tracks["covariance"])
-
-
-def _pose(pose: Any) -> Tensor:
-    return torch.eye(4, dtype=torch.float64) if pose is None else torch.as_tensor(as_numpy(pose, np.float64).copy())

@@ -31,7 +31,7 @@ from tracks import SimulatedLog
 
 from cflow_torch import make_config, make_model
 from cflow_torch.applications.cleaning import CleanLog
-from cflow_torch.applications.tracking import MOVING
+from cflow_torch.applications.moving_groups import MOVING
 from cflow_torch.data.catalog import find_sources, open_log, recognise
 from cflow_torch.data.log import Log, RecentSweeps, window
 from cflow_torch.simulator import objects

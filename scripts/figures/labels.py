@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from cflow_torch import make_config, make_model
-from cflow_torch.applications.labels import MOVING, label_scene
+from cflow_torch.applications.labels import label_scene
+from cflow_torch.applications.moving_groups import MOVING
 from cflow_torch.data.hdf5 import HDF5Log, write_hdf5_scene
 from cflow_torch.simulator import make_drive
 from cflow_torch.viz.style import FAINT, GROUND, INK, STATIC, add_panel, blank_figure
