@@ -22,12 +22,12 @@ from typing import Any, Dict, Iterator, List, Optional, Tuple
 
 import numpy as np
 import torch
-from cflow_torch.data.found_ground import GroundFoundLog
 from table import markdown
 
 from cflow_torch import Tracker, make_config, make_model
-from cflow_torch.applications.track_table import confirmed, join_tables
 from cflow_torch.applications.moving_groups import MOVING
+from cflow_torch.applications.track_table import confirmed, join_tables
+from cflow_torch.data.catalog import GroundFoundLog
 from cflow_torch.data.log import FlowLabels, Log, RecentSweeps, window
 from cflow_torch.simulator import make_drive
 from cflow_torch.simulator.drive import Drive
