@@ -45,6 +45,7 @@ from cflow_torch.viz.scales import plot_scales
 from cflow_torch.viz.style import blank_figure
 
 FORMATS = ("gif", "mp4")
+_PAIR = 3  # that is drawn if none is named: with some history before it
 
 
 def task(cfg: DictConfig) -> None:
@@ -57,7 +58,10 @@ def task(cfg: DictConfig) -> None:
     if cfg.picture == "animation":
         path = _animate(cfg, model, output)
     else:
-        pair, log = cfg.pair, find_log(cfg)
+        log = find_log(cfg)
+        if cfg.pair is None:
+            cfg.pair = min(_PAIR, len(log.timestamps) - 2)
+        pair = cfg.pair
         run.check_pair(pair, log)
         sweeps = window(log, pair, model.config.num_history, model.config.num_future)
         ready_folder(output)

@@ -29,6 +29,7 @@ _TYPES: Dict[str, Any] = {
     "experiment_name": Optional[str],
     "max_flow": Optional[float],
     "pace": Optional[float],
+    "pair": Optional[int],
 }
 
 
