@@ -17,7 +17,7 @@ from small_fleet import COMMAND, command, frames, tree
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="needs Linux's /proc")
 
-COPIES = 20  # of a log of five pairs: a run of some seconds
+COPIES = 40  # of a log of five pairs: a run of some seconds
 KILLS = 12
 FRAMES_BETWEEN = (0, 5)  # a run is killed once so many more frames are there
 HOW = ("parent SIGKILL", "all SIGKILL", "worker SIGKILL", "parent SIGTERM", "all SIGTERM", "all SIGINT")
