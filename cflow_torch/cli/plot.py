@@ -28,6 +28,7 @@ import numpy as np
 from omegaconf import DictConfig
 from tqdm import tqdm
 
+from cflow_torch.applications.deskewing import deskew
 from cflow_torch.cli import run
 from cflow_torch.data.atomic import ready_folder
 from cflow_torch.data.log import Log, RecentSweeps, window
@@ -94,6 +95,8 @@ def find_log(cfg: DictConfig) -> Log:
 def _from_above(cfg: DictConfig, model: SceneFlowModel, log: Log, sweeps: Window) -> Any:
     """picture=flow and picture=clusters."""
     points, (result,) = sweeps.pc0.points, model([sweeps])
+    if cfg.deskew:
+        points = deskew(sweeps, result).cpu()
     view: Dict[str, Any] = {
         "is_ground": sweeps.pc0.is_ground,
         "point_cloud_range": model.config.point_cloud_range,

@@ -143,6 +143,8 @@ def test_a_reader_of_one_s_own_by_configuration_alone(
     assert record["data"]["label"] == "mine" and record["config"]["data"]["speed"] == 5
     assert cflow("plot", *own, f"output={mine / 'plot'}", "log=back") == 0
     assert (mine / "plot" / "flow.png").exists()
+    assert cflow("plot", *own, f"output={mine / 'plot'}", "deskew=true") == 2
+    assert "no times of points" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
