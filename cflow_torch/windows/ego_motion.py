@@ -90,7 +90,7 @@ def compensate(positions: Tensor, T_ego1_ego: Optional[Array], num_axes: int = 3
 
     Args:
         positions: (3, N) float64, metres, in the ego frame of their sweep; rows x, y, z.
-        T_ego1_ego: (4, 4) float64, array or tensor, or (4, 4, N), one for each point; None = already in the frame of
+        T_ego1_ego: (4, 4) float64, array or tensor, or (3, 4, N), that of each point; None = already in the frame of
             t+1.
         num_axes: A, how many coordinates are asked for: 2 = x and y only.
 

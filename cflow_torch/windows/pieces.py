@@ -67,7 +67,8 @@ def read_pieces(
     window: Union[int, Tensor] = group[0].window
     step: Union[int, Tensor] = group[0].step
     if any(T is not None for T in matrices):
-        matrix = torch.as_tensor(np.stack([np.eye(4) if T is None else T for T in matrices], 2), device=device)
+        given = np.stack([np.eye(4) if T is None else T for T in matrices], 2)[:3]  # the last row is known
+        matrix = torch.as_tensor(given, device=device)
     if len(group) > 1:
         count = torch.as_tensor(sizes, device=device)
         of_point = torch.arange(len(sizes), device=device).repeat_interleave(count, output_size=sum(sizes))
