@@ -31,8 +31,9 @@ def atomic_file(path: Place) -> Iterator[Any]:
         The open file. If the block raises, nothing is left of it, and an older file stays.
 
     Convention:
-        - On this machine: a temporary name in the same folder, `.NAME.<host>-<process>-<random>.tmp`; a rename when the
-          contents are on disk. Only a killed process leaves the temporary file behind, see `remove_stale`.
+        - On this machine: a temporary name in the same folder, `.NAME.<host>-<process>-<random>.tmp`, then a rename;
+          contents and name are on disk when the block is done. Only a killed process leaves the temporary file behind,
+          see `remove_stale`.
         - Elsewhere: a temporary file here, which is put when the block ends: in an object store under its name, on
           other file systems under a temporary name, then moved.
 
@@ -59,7 +60,8 @@ def atomic_name(path: Path) -> Iterator[Path]:
     temporary = path.with_name(temporary_name(path.name))
     try:
         yield temporary
-        _sync(temporary)
+        with open(temporary, "r+b") as written:
+            os.fsync(written.fileno())
         os.replace(temporary, path)
     except BaseException as error:
         with suppress(FileNotFoundError):
@@ -67,6 +69,7 @@ def atomic_name(path: Path) -> Iterator[Path]:
         if isinstance(error, OSError) and error.errno is not None and error.filename is None:
             error.filename = str(path)  # "no space left" of what?
         raise
+    sync_folder(path.parent)
 
 
 @contextmanager
@@ -92,14 +95,14 @@ def _put_file(path: Any) -> Iterator[IO[bytes]]:
 
 @contextmanager
 def atomic_folder(folder: Place) -> Iterator[Path]:
-    """A folder to fill that takes its name only when the block ends, and all files in it are on disk.
+    """A folder to fill that takes its name only when the block ends, in place of an older one of that name.
 
     Args:
-        folder: final name, on this machine; the folder above is made if absent. An older one of that name is removed
-            just before.
+        folder: final name, on this machine; the folder above is made if absent.
 
     Yields:
-        An empty folder under a temporary name beside it. If the block raises, it is removed and the older one stays.
+        An empty folder under a temporary name beside it. If the block raises, it is removed and the older one stays;
+        else all files in it are on disk before it takes its name.
 
     Raises:
         CFlowError: the folder would be remote.
@@ -107,17 +110,19 @@ def atomic_folder(folder: Place) -> Iterator[Path]:
     folder = as_path(folder)
     if is_remote(folder):
         raise CFlowError(f"{folder}: folders are written whole on this machine only; write one here and copy it there")
-    new = folder.with_name(temporary_name(folder.name))
+    scratch = folder.with_name(temporary_name(folder.name))
+    new, old = scratch / "new", scratch / "old"
     try:
         new.mkdir(parents=True)
         yield new
-        for file in filter(Path.is_file, new.rglob("*")):
-            _sync(file)
+        for place in (new, *new.rglob("*")):
+            sync_folder(place)  # files likewise
         if folder.exists():
-            shutil.rmtree(folder)
+            os.replace(folder, old)
         os.replace(new, folder)
+        sync_folder(folder.parent)
     finally:
-        shutil.rmtree(new, ignore_errors=True)
+        _remove(scratch, folder)
 
 
 def remove_stale(folder: Place, targets: Optional[Collection[str]] = None) -> List[str]:
@@ -131,7 +136,8 @@ def remove_stale(folder: Place, targets: Optional[Collection[str]] = None) -> Li
     Returns:
         Sorted names of what was removed; empty if the folder does not exist.
 
-    Convention: hosts are told apart by name, so two containers of one name must not share a folder without `targets`.
+    Convention: a folder that was killed while it took the place of an older one gets the older one back. Hosts are told
+        apart by name, so two containers of one name must not share a folder without `targets`.
 
     Raises:
         OSError: the folder cannot be listed, or a file in it not be removed.
@@ -148,13 +154,20 @@ def remove_stale(folder: Place, targets: Optional[Collection[str]] = None) -> Li
             else:
                 is_stale = match["target"] in targets
             if is_stale:
+                _remove(path, folder / match["target"])
                 removed.append(path.name)
-                if path.is_dir():
-                    shutil.rmtree(path)
-                else:
-                    with suppress(FileNotFoundError):
-                        path.unlink()
     return sorted(removed)
+
+
+def _remove(path: Path, target: Path) -> None:
+    """Remove a temporary file or folder; the older folder that it was to replace comes back if nothing did."""
+    if not path.is_dir():
+        with suppress(FileNotFoundError):
+            path.unlink()
+        return
+    if (path / "old").is_dir() and not target.exists():
+        os.replace(path / "old", target)
+    shutil.rmtree(path)
 
 
 def ready_folder(folder: Place) -> Path:
@@ -182,9 +195,14 @@ def ready_folder(folder: Place) -> Path:
     return folder
 
 
-def _sync(file: Path) -> None:
-    with open(file, "r+b") as written:
-        os.fsync(written.fileno())
+def sync_folder(folder: Path) -> None:
+    """Makes the names in a folder, or what is in a file, durable where the system allows to wait for it."""
+    with suppress(OSError):  # some network file systems refuse
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
 
 
 def temporary_name(name: str) -> str:

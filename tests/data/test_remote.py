@@ -277,7 +277,7 @@ def test_a_local_file_has_the_usual_rights_and_is_on_disk(tmp_path, monkeypatch)
     monkeypatch.setattr(os, "fsync", lambda at: (synced.append(os.fstat(at).st_ino), real(at)))
     with atomic_file(tmp_path / "a" / "b") as file:
         file.write(b"x")
-    assert synced == [(tmp_path / "a" / "b").stat().st_ino]
+    assert synced == [path.stat().st_ino for path in (tmp_path / "a" / "b", tmp_path / "a")]
     (tmp_path / "plain").write_bytes(b"x")
     assert (tmp_path / "a" / "b").stat().st_mode == (tmp_path / "plain").stat().st_mode
 
@@ -308,3 +308,11 @@ def test_what_a_killed_process_leaves_is_removed(tmp_path):
         process.wait()
     assert remove_stale(tmp_path) == list(left) and names(tmp_path) == tuple(sorted(others))
     assert remove_stale(tmp_path / "absent") == []
+
+
+def test_a_folder_that_was_being_replaced_comes_back(tmp_path):
+    old = tmp_path / ".log.elsewhere-1-0123abcd.tmp" / "old"
+    old.mkdir(parents=True)
+    (old / "a").write_bytes(b"old")
+    assert len(remove_stale(tmp_path, ["log"])) == 1
+    assert names(tmp_path) == ("log",) and (tmp_path / "log" / "a").read_bytes() == b"old"
