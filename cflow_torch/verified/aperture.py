@@ -1,8 +1,9 @@
 """The aperture problem: a line that seems to slide along itself has most likely not moved.
 
 Walls, hedges and guard rails are sampled by a sensor that moves, so their samples seem to move with it, along the
-line. If every sweep sees something all along the line, the line itself has stayed. A car seen from its side is a line
-as well, but it leaves the place where it was.
+line. If t+1 sees something all along where the line was, or the older sweeps all along where it is, the line itself
+has stayed: one end of it may come into sight or leave it. A car seen from its side is a line as well, but one of its
+ends leaves the place where it was, the other comes to a new one.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ _ALONG = 0.04
 # Shorter ways than this, metres over the window, are left alone.
 _LEAST_WAY = 1.2
 # Side of the cells in which the other sweeps are looked at, metres, and the share that must hold something, per cent.
-_CELL, _COVERED = 0.4, 85
+_CELL, _COVERED = 0.4, 90
 
 
 def slides_along_itself(sweeps: HeightSlicedSweeps, owner: Tensor, candidates: Tensor) -> Tensor:
@@ -36,8 +37,8 @@ def slides_along_itself(sweeps: HeightSlicedSweeps, owner: Tensor, candidates: T
 
     Returns:
         (A, C) bool: the component is a line at t+1, the motion points along it and leads at least 1.2 m over the
-        window, and at least 85 % of looks find something at the same place: from its pixels at t+1 into every other
-        sweep, from its older pixels into t+1.
+        window, and at least 90 % of looks find something at the same place: of those from its pixels at t+1 into every
+        other sweep, or of those from its older pixels into t+1.
 
     Convention:
         Moments are sums of integers, everything else elementwise float64 in the written order. Standard deviations are
@@ -97,7 +98,7 @@ def principal_axes(
 
 
 def _is_covered(sweeps: HeightSlicedSweeps, owner: Tensor, looked_at: Tensor) -> Tensor:
-    """(A,) bool: enough looks of a component find something; of those not `looked_at` (A,) it means nothing."""
+    """(A,) bool: enough looks of a component, of one way in time, find something; of those not `looked_at` (A,) it means nothing."""
     num_components, num_steps = looked_at.numel(), sweeps.num_steps
     side = max(1, round(_CELL / sweeps.grid.pixel_size))
     # A free margin all around: neighbours need no bounds check.
@@ -119,9 +120,9 @@ def _is_covered(sweeps: HeightSlicedSweeps, owner: Tensor, looked_at: Tensor) ->
     finds = torch.zeros_like(where, dtype=torch.bool)
     for offset in [down * width + right for down in (-1, 0, 1) for right in (-1, 0, 1)]:
         finds |= is_occupied.index_select(0, where + offset)
-    component = owner.index_select(0, members.index_select(0, looking))
+    by_way = owner.index_select(0, members.index_select(0, looking)) * 2 + (other == 0)
     looks, found = (
-        torch.zeros(num_components, dtype=torch.int64, device=row.device).index_add_(0, component, values)
-        for values in (torch.ones_like(component), finds.long())
+        torch.zeros(2 * num_components, dtype=torch.int64, device=row.device).index_add_(0, by_way, values)
+        for values in (torch.ones_like(by_way), finds.long())
     )
-    return found * 100 >= looks * _COVERED
+    return ((looks > 0) & (found * 100 >= looks * _COVERED)).view(-1, 2).any(1)

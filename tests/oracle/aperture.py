@@ -13,7 +13,7 @@ def slides_along_itself(sweeps: SlicedSweeps, members: Sequence[Pixel], candidat
 
     Returns:
         Of each candidate, whether the component is a line at t+1, the motion points along it and leads at least 1.2 m
-        over the window, and the other sweeps see something all along it.
+        over the window, and the other sweeps see something all along it, or t+1 all along where it was.
     """
     is_line, axis_y, axis_x = principal_axis([(r, c) for m, r, c in members if m == 0], sweeps.pixel_size)
     stays = is_line and is_covered(sweeps, members)
@@ -47,15 +47,15 @@ def principal_axis(pixels: Sequence[Tuple[int, int]], pixel_size: float) -> Tupl
 
 
 def is_covered(sweeps: SlicedSweeps, members: Sequence[Pixel]) -> bool:
-    """At least 85 % of looks find something: from t+1 into every other sweep, from those into t+1.
+    """At least 90 % of looks find something: of those from t+1 into all other sweeps, or of those from them into t+1.
 
     Convention: a look finds what lies in the same cell of about 0.4 m a side (whole pixels) or in one beside it.
     """
     side = max(1, round(0.4 / sweeps.pixel_size))
     cells = {(m, r // side, c // side) for m, r, c in sweeps.pixels()}
-    looks = found = 0
+    forward, backward = [], []
     for m, r, c in members:
         for other in [0] if m > 0 else range(1, len(sweeps.images)):
-            looks += 1
-            found += any((other, r // side + dy, c // side + dx) in cells for dy in (-1, 0, 1) for dx in (-1, 0, 1))
-    return found * 100 >= looks * 85
+            finds = any((other, r // side + dy, c // side + dx) in cells for dy in (-1, 0, 1) for dx in (-1, 0, 1))
+            (forward if m > 0 else backward).append(finds)
+    return any(sum(looks) * 100 >= len(looks) * 90 for looks in (forward, backward) if looks)

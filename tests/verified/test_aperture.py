@@ -125,6 +125,12 @@ def test_a_rail_that_stays_slides_and_one_that_leaves_does_not():
     assert not slides({0: rail(10, 60), 1: rail(10, 60)}, (12, 0))
 
 
+def test_a_rail_that_comes_into_sight_or_leaves_it_at_one_end_slides():
+    assert slides({0: rail(10, 80), 1: rail(10, 60)}, (0, 12))
+    assert slides({0: rail(10, 60), 1: rail(10, 80)}, (0, 12))
+    assert not slides({0: rail(10, 60)}, (0, 12))
+
+
 def test_what_stands_there_need_not_belong_to_the_component():
     assert slides({0: rail(30, 80), 1: rail(10, 60)}, (0, 20), others={0: rail(2, 30), 1: rail(60, 82)})
 
@@ -134,7 +140,8 @@ def test_exactly_the_least_way_and_the_share():
     way = 1.2 / 0.1
     assert slides(still, (0, way)) and not slides(still, (0, np.nextafter(way, 0)))
     assert slides({**still, 3: rail(10, 60)}, (0, way / 3), num_sweeps=4, others={2: rail(10, 60)})
-    # Of 80 looks 8, 10, 16 and 24 find nothing in their cell of four pixels or beside it; 12 may.
+    # Of 40 looks into the past and 40 back, 4 and 4, 4 and 6, 8 and 8, 12 and 12 find nothing in their cell of four
+    # pixels or beside it; 4 may.
     found = [slides({0: rail(0, 40), 1: rail(s, s + 40)}, (0, 13)) for s in (8, 10, 12, 16)]
     assert found == [True, True, False, False]
 
