@@ -24,7 +24,7 @@ _ALONG = 0.04
 # Shorter ways than this, metres over the window, are left alone.
 _LEAST_WAY = 1.2
 # Side of the cells in which the other sweeps are looked at, metres, and the share that must hold something, per cent.
-_CELL, _COVERED = 0.4, 90
+_CELL, _COVERED = 0.4, 88
 
 
 def slides_along_itself(sweeps: HeightSlicedSweeps, owner: Tensor, candidates: Tensor) -> Tensor:
@@ -37,7 +37,7 @@ def slides_along_itself(sweeps: HeightSlicedSweeps, owner: Tensor, candidates: T
 
     Returns:
         (A, C) bool: the component is a line at t+1, the motion points along it and leads at least 1.2 m over the
-        window, and at least 90 % of looks find something at the same place: of those from its pixels at t+1 into every
+        window, and at least 88 % of looks find something at the same place: of those from its pixels at t+1 into every
         other sweep, or of those from its older pixels into t+1.
 
     Convention:
@@ -98,7 +98,8 @@ def principal_axes(
 
 
 def _is_covered(sweeps: HeightSlicedSweeps, owner: Tensor, looked_at: Tensor) -> Tensor:
-    """(A,) bool: enough looks of a component, of one way in time, find something; of those not `looked_at` (A,) it means nothing."""
+    """(A,) bool: of the looks of a component forward or backward in time enough find something; of those that are not
+    `looked_at`, (A,), it means nothing."""
     num_components, num_steps = looked_at.numel(), sweeps.num_steps
     side = max(1, round(_CELL / sweeps.grid.pixel_size))
     # A free margin all around: neighbours need no bounds check.
@@ -120,9 +121,9 @@ def _is_covered(sweeps: HeightSlicedSweeps, owner: Tensor, looked_at: Tensor) ->
     finds = torch.zeros_like(where, dtype=torch.bool)
     for offset in [down * width + right for down in (-1, 0, 1) for right in (-1, 0, 1)]:
         finds |= is_occupied.index_select(0, where + offset)
-    by_way = owner.index_select(0, members.index_select(0, looking)) * 2 + (other == 0)
+    way = owner.index_select(0, members.index_select(0, looking)) * 2 + (other == 0)
     looks, found = (
-        torch.zeros(2 * num_components, dtype=torch.int64, device=row.device).index_add_(0, by_way, values)
-        for values in (torch.ones_like(by_way), finds.long())
+        torch.zeros(2 * num_components, dtype=torch.int64, device=row.device).index_add_(0, way, values)
+        for values in (torch.ones_like(way), finds.long())
     )
     return ((looks > 0) & (found * 100 >= looks * _COVERED)).view(-1, 2).any(1)

@@ -35,9 +35,9 @@ class RangeImages:
         batch = sweeps.batch
         self._num_steps, self._origin = batch.num_steps, batch.origin.clone()
         self._origin[:, :, 2] += self._sensor_height(sweeps)[:, None]
-        image, (x, y, z) = batch.image.long(), batch.positions.unbind(0)
-        place, distance = self._place(image, x, y, z)
-        distance = distance.masked_fill(~batch.takes_part, math.inf)
+        seen = flat_nonzero(batch.takes_part)
+        x, y, z = batch.positions.index_select(1, seen).unbind(0)
+        place, distance = self._place(batch.image.index_select(0, seen).long(), x, y, z)
         num_images = batch.num_windows * batch.num_steps
         nearest = segment_amin(distance, place, num_images * _ELEVATIONS * _AZIMUTHS, math.inf)
         nearest = F.pad(nearest.view(num_images, 1, _ELEVATIONS, _AZIMUTHS), (1, 1, 0, 0), mode="circular")

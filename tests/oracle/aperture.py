@@ -47,7 +47,7 @@ def principal_axis(pixels: Sequence[Tuple[int, int]], pixel_size: float) -> Tupl
 
 
 def is_covered(sweeps: SlicedSweeps, members: Sequence[Pixel]) -> bool:
-    """At least 90 % of looks find something: of those from t+1 into all other sweeps, or of those from them into t+1.
+    """At least 88 % of looks find something: of those from t+1 into all other sweeps, or of those from them into t+1.
 
     Convention: a look finds what lies in the same cell of about 0.4 m a side (whole pixels) or in one beside it.
     """
@@ -58,4 +58,4 @@ def is_covered(sweeps: SlicedSweeps, members: Sequence[Pixel]) -> bool:
         for other in [0] if m > 0 else range(1, len(sweeps.images)):
             finds = any((other, r // side + dy, c // side + dx) in cells for dy in (-1, 0, 1) for dx in (-1, 0, 1))
             (forward if m > 0 else backward).append(finds)
-    return any(sum(looks) * 100 >= len(looks) * 90 for looks in (forward, backward) if looks)
+    return any(sum(looks) * 100 >= len(looks) * 88 for looks in (forward, backward) if looks)
