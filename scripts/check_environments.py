@@ -20,7 +20,6 @@ import os
 import shutil
 import subprocess
 import sys
-import tarfile
 import tempfile
 from pathlib import Path
 from typing import Dict, Optional, Sequence
@@ -56,7 +55,7 @@ def main(arguments: Optional[Sequence[str]] = None) -> int:
     home.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="cflow-check-") as temporary:
         source = Path(temporary) / "source"
-        copy_checkout(source)
+        run("git", "clone", "--quiet", "--depth", "1", ROOT.as_uri(), source)
         run(sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", Path(temporary) / "wheel", source)
         (wheel,) = (Path(temporary) / "wheel").glob("*.whl")
         python = install(given.name, base, home, wheel)
@@ -67,14 +66,6 @@ def main(arguments: Optional[Sequence[str]] = None) -> int:
         tests = ["tests", "-m", "not slow", *(f"--ignore={file}" for file in NEED_PACKAGE)]
         tests += ["-k", given.chosen] if given.chosen else []
         return subprocess.run([python, "-m", "pytest", *tests], cwd=source, env=environment()).returncode
-
-
-def copy_checkout(target: Path) -> None:
-    """The tracked files of the last commit."""
-    archive = target.with_suffix(".tar")
-    run("git", "archive", "-o", archive, "HEAD", cwd=ROOT)
-    with tarfile.open(archive) as files:
-        files.extractall(target)  # noqa: S202
 
 
 def install(name: str, base: str, home: Path, wheel: Path) -> Path:

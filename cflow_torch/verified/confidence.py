@@ -21,7 +21,7 @@ from cflow_torch.verified.height_slices import HeightSlicedSweeps, count_slices
 from cflow_torch.verified.paired_test import count_wins
 from cflow_torch.verified.rigid_motion import RigidMotion
 
-# Bounds of the bins and the probabilities, written by scripts/benchmarks/calibrate_confidence.py. Bins, in order: left
+# Bounds of the bins and the probabilities, written by scripts/ablation/calibrate_confidence.py. Bins, in order: left
 # out; unlinked, by `crowd`; still, by `share`, or where a local motion is likely by `doubt`; moving, by `margin`: pairs
 # near, pairs far, with history near and far.
 TABLE = json.loads(Path(__file__).with_name("confidence.json").read_text(encoding="utf-8"))

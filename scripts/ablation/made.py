@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import List, NamedTuple, Sequence, Tuple
 
 import numpy as np
@@ -19,7 +20,7 @@ GAP = 0.22  # metres between a mover and what is pasted: within one component at
 MOVER_POINTS, STATIC_POINTS = 20, 80  # fewest of a mover; of a component that is pasted, per sweep
 LONGER_SIDE = (0.6, 4.0)  # metres, of a component that is pasted
 REACH, PIXEL = 34.0, 0.1  # metres: half side of the square that components are looked for in; side of its pixels
-DYNAMIC = 0.05  # metres per sweep
+MOVES = 0.05  # metres per sweep
 SQUARE = np.ones((3, 3), bool)
 
 
@@ -82,7 +83,7 @@ def paste_static(
     points0 = pc0.points.astype(np.float64) @ T_ego1_ego0[:3, :3].T + T_ego1_ego0[:3, 3]  # frame of t+1
     residual = labels.flow - ego_motion_flow(pc0.points, T_ego1_ego0)
     counted = scored & ~pc0.is_ground & (np.abs(pc0.points[:, :2]) <= REACH + 1).all(1)
-    is_dynamic = counted & (np.linalg.norm(residual, axis=1) >= DYNAMIC)
+    is_dynamic = counted & (np.linalg.norm(residual, axis=1) >= MOVES)
     static = counted & ~is_dynamic & (instance == 0)
     components = find_components(points0, pair, static, instance)
     added: List[Component] = []
@@ -146,9 +147,5 @@ def beside(component: Component, mover: np.ndarray, residual: np.ndarray) -> Com
 
 def _append(sweep: Sweep, points: np.ndarray) -> Sweep:
     """A sweep with more points that are not ground."""
-    return Sweep(
-        np.concatenate([sweep.points, points.astype(np.float32)]),
-        np.concatenate([sweep.is_ground, np.zeros(len(points), bool)]),
-        sweep.pose,
-        sweep.timestamp_ns,
-    )
+    is_ground = np.concatenate([sweep.is_ground, np.zeros(len(points), bool)])
+    return replace(sweep, points=np.concatenate([sweep.points, points.astype(np.float32)]), is_ground=is_ground)

@@ -1,19 +1,20 @@
-"""The scored windows behind the figures of the ablation: real data, sets made of it, simulated drives.
+"""The scored windows behind the figures of the ablation: real data, sets made of it, simulated drives, small ones too.
 
-Settings were chosen on the groups "real" and "sim" with seeds 100 ... 103; not on "odd", the other windows of KITTI,
-nor on other seeds.
+Settings were chosen on the groups "real", "merged", "scenes" and "sim" with seeds 100 ... 103; not on "odd", the other
+windows of KITTI, nor on other seeds.
 """
 
 from __future__ import annotations
 
 import os
+import sys
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, Callable, List, Optional, Sequence, Tuple
+from typing import Any, Callable, Dict, List, Optional, Sequence, Tuple
 
 import numpy as np
-from made import chain_flow, paste_static
+from made import MOVES, chain_flow, paste_static
 
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.catalog import open_log
@@ -23,11 +24,16 @@ from cflow_torch.evaluation.frame import EvalFrame, ego_motion_flow
 from cflow_torch.simulator.benchmark import benchmark_logs, format_of
 from cflow_torch.types import CFlowError, Sweep, Window, as_numpy
 
+sys.path.append(str(Path(__file__).resolve().parents[1] / "figures"))
+import drives  # noqa: E402
+
 HISTORY = FUTURE = 4
 NEAR, REGION = 35.0, 70.0  # metres, half sides: what is scored of real data; what simulated drives are estimated in
 PROFILES = ("av2", "nuscenes", "truckscenes", "waymo", "aevascenes")
 SCENES = ("street", "highway", "crossing", "narrow")
 SIMULATED_SWEEPS, SIMULATED_WINDOWS = 15, (9, 12)  # per drive
+SCENE_SEEDS = (0, 1, 2, 3, 4)  # of the small drives
+GROUPS = ("real", "odd", "merged", "scenes", "sim")
 AV2 = Path("av2-7fab2350", "val", "7fab2350-7eaf-3b7e-a39d-6937a4c1bede")
 KITTI = Path("kitti-0000", "kitti-0000-a.h5")
 KITTI_LATER = Path("kitti-0000", "kitti-0000-c2.h5")
@@ -69,12 +75,13 @@ class ScoredSet:
 
     Args:
         name: for example "kitti h=4" or "sim waymo 100-103 h=4"; unique.
-        group: "real", "odd", "merged", "sim" or "sim0".
+        group: one of `GROUPS`.
         history: older sweeps that are used.
         half_side: metres, of the region that flow is estimated in; None = that of the preset.
         load: makes the windows.
         step: sweeps of the recording from t to t+1.
         reach: metres, half side of the box that is scored.
+        mean: name of the mean over the sensors that it is a part of, "" = none.
     """
 
     name: str
@@ -84,31 +91,41 @@ class ScoredSet:
     load: Callable[[], List[Item]]
     step: int = 1
     reach: float = NEAR
+    mean: str = ""
 
     def items(self) -> List[Item]:
         """The windows with as much history as is used."""
         return [replace(i, window=replace(i.window, pch=i.window.pch[: self.history])) for i in self.load()]
 
 
-def make_sets(groups: Sequence[str], seeds: Sequence[Tuple[int, int]], cache: Path) -> List[ScoredSet]:
-    """The sets of some groups; those of "sim" (h = 4) and "sim0" (h = 0) once per range of seeds.
+def make_sets(names: Sequence[str], seeds: Sequence[Tuple[int, int]], cache: Path) -> List[ScoredSet]:
+    """The sets of some names; those of "sim" once per range of seeds.
 
     Args:
-        groups: names of `ScoredSet.group`.
+        names: of groups or of single sets; "walkers" stands for "walkers-0.1" and so on.
         seeds: first and last seed of each range, a multiple of four seeds for an even mix of scenes.
         cache: folder for simulated drives, made where they are absent.
+
+    Raises:
+        CFlowError: there is no such set.
     """
-    sets = []
-    for name, group, history, load, step in _REAL:
-        if group in groups:
-            sets.append(ScoredSet(name, group, history, NEAR, load, step))
-    for group, history in (("sim", HISTORY), ("sim0", 0)):
-        for first, last in seeds if group in groups else ():
-            for profile in PROFILES:
-                name = f"sim {profile} {first}-{last} h={history}"
-                load = partial(simulated, profile, first, last, cache)
-                sets.append(ScoredSet(name, group, history, REGION, load))
-    return sets
+    sets = [ScoredSet(name, group, history, NEAR, load, step) for name, group, history, load, step in _REAL]
+    for name, stage in _SCENES.items():
+        reach = drives.BORDERS[-1] if name == "border" else NEAR
+        sets.append(ScoredSet(name, "scenes", HISTORY, None, partial(staged, stage), reach=reach))
+    for first, last in seeds:
+        for profile in PROFILES:
+            name, mean = (f"sim {word}{first}-{last} h={HISTORY}" for word in (f"{profile} ", ""))
+            load = partial(simulated, profile, range(first, last + 1), cache)
+            sets.append(ScoredSet(name, "sim", HISTORY, REGION, load, mean=mean))
+    for name in names:
+        if not any(_is_of(scored, name) for scored in sets):
+            raise CFlowError(f"there is no set {name!r}; give {', '.join((*GROUPS, *(s.name for s in sets)))}")
+    return [scored for scored in sets if any(_is_of(scored, name) for name in names)]
+
+
+def _is_of(scored: ScoredSet, name: str) -> bool:
+    return name in (scored.name, scored.group) or scored.name.startswith(f"{name}-")
 
 
 def between(start: Sweep, end: Sweep) -> np.ndarray:
@@ -134,7 +151,7 @@ def data_root() -> Path:
         if not (root / part).exists():
             raise CFlowError(
                 f"no {part} in {root}: set CFLOW_DATA to the folder of the real data, or leave out the sets "
-                "real and odd (--sets sim)"
+                "real, odd and merged (--sets sim)"
             )
     return root
 
@@ -198,11 +215,11 @@ def merged() -> List[Item]:
 
 
 @lru_cache(maxsize=None)
-def simulated(profile: str, first: int, last: int, cache: Path) -> List[Item]:
+def simulated(profile: str, seeds: Sequence[int], cache: Path) -> List[Item]:
     """Windows of the simulated drives of one sensor, read as that data set is."""
     chosen = format_of(profile)
     items = []
-    for source in benchmark_logs(cache, profile, range(first, last + 1), SIMULATED_SWEEPS, SCENES):
+    for source in benchmark_logs(cache, profile, seeds, SIMULATED_SWEEPS, SCENES):
         log = open_log(chosen.data_set, source, check=False, **dict(chosen.settings))
         sweeps = RecentSweeps(log, SIMULATED_SWEEPS)
         pairs = range(HISTORY, len(log.timestamps) - 1)
@@ -210,6 +227,19 @@ def simulated(profile: str, first: int, last: int, cache: Path) -> List[Item]:
             nearest = sorted(pairs, key=lambda i: abs(i - wanted))  # noqa: B023
             index = next(i for i in nearest if log.labels(i) is not None)
             items.append(make_item(window(sweeps, index, HISTORY, FUTURE), log.labels(index)))
+    return items
+
+
+@lru_cache(maxsize=None)
+def staged(stage: Callable[[int], drives.Staged]) -> List[Item]:
+    """The pair of a small drive, once per seed. What moves but is not looked at does not count; what stands does."""
+    items = []
+    for seed in SCENE_SEEDS:
+        drive, _, _, bodies, _ = stage(seed)
+        item = make_item(window(drive, drives.PAIR, HISTORY, FUTURE), drive.labels(drives.PAIR))
+        moves = np.linalg.norm(item.labels.flow - item.pose_flow, axis=1) >= MOVES
+        is_other = moves & ~np.isin(drives.body_of(drive), list(bodies))
+        items.append(replace(item, eval_mask=~is_other))
     return items
 
 
@@ -232,3 +262,17 @@ _REAL: Tuple[Tuple[str, str, int, Callable[[], List[Item]], int], ...] = (
     ("crown h=0", "merged", 0, partial(kitti, CROWN), 1),
     ("later kitti h=4", "merged", 4, _every_second(partial(kitti, KITTI_LATER), 4), 1),
 )
+_SCENES: Dict[str, Callable[[int], drives.Staged]] = {
+    "hedge": drives.hedge,
+    "crowd": drives.crowd,
+    "tram": drives.tram,
+    "rolling": drives.rolling_shutter,
+    "appears": drives.appearing,
+    **{f"walkers-{gap:g}": partial(drives.walkers, gap=gap) for gap in (0.1, 0.2, 0.3, 0.5)},
+    "tree": drives.tree,
+    "bridge": drives.bridge,
+    "gantry": drives.gantry,
+    "wires": drives.wires,
+    "abreast": drives.abreast,
+    "border": drives.border,
+}

@@ -4,7 +4,7 @@ python scripts/benchmarks/clean_maps.py
 python scripts/benchmarks/clean_maps.py --only --root data/kitti-0000 --logs kitti-0000-c2
 
 Scores of DynamicMap_Benchmark, by point: static accuracy SA (share of the points that stand and are kept), dynamic
-accuracy DA (share of the points that move and are removed), AA = sqrt(SA DA), HA = 2 SA DA / (SA + DA); per cent.
+accuracy DA (share of the points that move and are removed), AA = sqrt(SA DA); per cent.
 A point moves by a true residual flow of 0.05 m a sweep. Waiting: share removed of the points of things that stand now
 and move elsewhere in the drive; they count neither for SA nor for DA. Ground counts. Points within 50 m, all sweeps but
 the last; in real scenes those with labels. Seconds of processor time per sweep, one thread, flow included.
@@ -26,6 +26,7 @@ from typing import Any, Dict, Iterator, List, Tuple
 
 import numpy as np
 import torch
+from peers import RANGE, dufomap_labels
 from table import markdown
 from tracks import SimulatedLog
 
@@ -34,6 +35,7 @@ from cflow_torch.applications.cleaning import CleanLog
 from cflow_torch.applications.moving_groups import MOVING
 from cflow_torch.data.catalog import find_sources, open_log, recognise
 from cflow_torch.data.log import Log, RecentSweeps, window
+from cflow_torch.evaluation.frame import ego_motion_flow
 from cflow_torch.simulator import objects
 from cflow_torch.simulator.drive import Drive
 from cflow_torch.simulator.ground import Ground
@@ -41,7 +43,6 @@ from cflow_torch.simulator.objects import Route
 from cflow_torch.simulator.profiles import get_profile
 from cflow_torch.simulator.scene import Scene, SolidTable
 
-RANGE = 50.0  # metres
 DUFO = {"d_p 2": (0.1, 0.2, 2), "d_p 1": (0.1, 0.2, 1)}
 
 
@@ -59,8 +60,7 @@ def truths(log: Any) -> Iterator[Tuple[np.ndarray, np.ndarray, np.ndarray]]:
             ever = ~stands[body]
         else:
             labels = log.labels(index)
-            transform = np.linalg.inv(log.sweep(index + 1).pose) @ sweep.pose
-            still = points @ transform[:3, :3].T + transform[:3, 3] - points
+            still = ego_motion_flow(points, np.linalg.inv(log.sweep(index + 1).pose) @ sweep.pose)
             moves = np.linalg.norm(labels.flow - still, axis=1) >= MOVING
             ever, known = moves, labels.is_valid
         yield known & (np.hypot(points[:, 0], points[:, 1]) < RANGE), moves, ever
@@ -81,25 +81,13 @@ def light(num_sweeps: int) -> SimulatedLog:
     return log
 
 
-def dufomap_labels(
-    log: Log, T_ego_lidar: np.ndarray, settings: Tuple[float, float, int]
-) -> Tuple[List[np.ndarray], float]:
+def by_dufomap(log: Log, T_ego_lidar: np.ndarray, settings: Tuple[float, float, int]) -> Tuple[List[np.ndarray], float]:
     """Points that DUFOMap calls dynamic in each sweep, and seconds per sweep."""
-    from dufomap import dufomap
-
     begin = time.process_time()
-    first, sweeps = np.asarray(log.sweep(0).pose), []
-    to_lidar = np.linalg.inv(T_ego_lidar)
-    for sweep in log:
-        points = np.asarray(sweep.points, np.float64)[:, :3] @ to_lidar[:3, :3].T + to_lidar[:3, 3]
-        sweeps.append((points, np.linalg.inv(first) @ np.asarray(sweep.pose) @ T_ego_lidar))
-    made = dufomap(*settings, num_threads=1)
-    made.setCluster(0, 20, 0.2)
-    for points, pose in sweeps:
-        distance = np.linalg.norm(points, axis=1)
-        made.run(points[(distance > 2) & (distance < RANGE)], pose, cloud_transform=True)
-    made.oncePropagateCluster(if_propagate=True, if_cluster=True)
-    labels = [np.asarray(made.segment(points, pose, cloud_transform=True)) == 1 for points, pose in sweeps]
+    sweeps, to_lidar = list(log), np.linalg.inv(T_ego_lidar)
+    to_first = np.linalg.inv(np.asarray(sweeps[0].pose))
+    points = [np.asarray(sweep.points, np.float64)[:, :3] @ to_lidar[:3, :3].T + to_lidar[:3, 3] for sweep in sweeps]
+    labels = dufomap_labels(points, [to_first @ np.asarray(sweep.pose) @ T_ego_lidar for sweep in sweeps], settings)
     return labels, (time.process_time() - begin) / len(sweeps)
 
 
@@ -117,7 +105,6 @@ def scores(name: str, removed: List[np.ndarray], truth: List[Any], seconds: floa
         "SA": kept,
         "DA": moving,
         "AA": float(np.sqrt(kept * moving)),
-        "HA": 2 * kept * moving / max(kept + moving, 1e-9),
         "waiting": float(waiting) if total[2, 1] else "",
         "seconds": seconds,
     }
@@ -167,12 +154,12 @@ def main() -> None:
             print(rows[-1], flush=True)
         try:
             for label, settings in DUFO.items():
-                labels, spent = dufomap_labels(opened, T_ego_lidar, settings)
+                labels, spent = by_dufomap(opened, T_ego_lidar, settings)
                 rows.append(scores(f"{name}: DUFOMap, {label}", labels, truth, spent))
                 print(rows[-1], flush=True)
         except ImportError as error:
             print(f"no DUFOMap: {error}", flush=True)
-    print(markdown([list(rows[0]), *(list(row.values()) for row in rows)]))
+    print(markdown(rows))
     if given.json:
         given.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
 

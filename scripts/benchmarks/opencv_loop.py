@@ -1,8 +1,9 @@
 """The dense method as one would write it by hand with OpenCV and NumPy: a loop over clusters, one thread of thought.
 
 The competitor of the benchmark. It does the same work as `CorrelationFlow` (history and scales included, no sectional
-view) and is written to be fast: points in column-major order, one label image, pixels sorted by label once, crops in
-float32. What differs is rounding: `cv2.matchTemplate` computes float32 scores, so ties of the argmax fall otherwise.
+view, no `max_speed`) and is written to be fast: points in column-major order, one label image, pixels sorted by label
+once, crops in float32. What differs is rounding: `cv2.matchTemplate` computes float32 scores, so ties of the argmax
+fall otherwise.
 """
 
 from __future__ import annotations
@@ -27,13 +28,11 @@ class Cloud(NamedTuple):
     Args:
         xy: (2, N) float64, metres, frame of t+1.
         steps: k, sweep intervals to t+1.
-        seconds: elapsed time to t+1.
         rows: (N,) int64, rows of the sweep that these points are.
     """
 
     xy: np.ndarray
     steps: float
-    seconds: float
     rows: np.ndarray
 
 
@@ -66,7 +65,7 @@ def opencv_flow(window: Window, config: Config) -> FlowResult:
     """Flow of every point of `window.pc0`.
 
     Args:
-        window: sweeps t-h ... t+1, taken as valid.
+        window: sweeps t-h ... t+1 at equal intervals, taken as valid.
         config: settings; the fields that choose engines mean nothing here.
 
     Returns:
@@ -81,11 +80,13 @@ def opencv_flow(window: Window, config: Config) -> FlowResult:
     Cost: one `cv2.matchTemplate` per cluster, sweep and scale.
     """
     opencv()  # absent: say so before anything else
-    if not isinstance(config, DenseConfig) or config.clustering != "components" or config.sectional_view:
-        raise CFlowError("the OpenCV loop has method='dense', clustering='components', sectional_view=False only")
+    if not isinstance(config, DenseConfig) or config.clustering != "components":
+        raise CFlowError("the OpenCV loop has method='dense', clustering='components' only")
+    if config.sectional_view or config.max_speed is not None:
+        raise CFlowError("the OpenCV loop has sectional_view=False, max_speed=None only")
     points0, moved0 = _compensate(window.pc0, window.pc1)
     clouds = _clouds(window, moved0, config)
-    cloud1 = _cloud(window.pc1, _columns(window.pc1), 0.0, 0.0, config)
+    cloud1 = _cloud(window.pc1, _columns(window.pc1), 0.0, config)
     flows: List[np.ndarray] = []
     for pixel_size in config.pixel_sizes:
         warped = [cloud._replace(xy=cloud.xy + cloud.steps * flow) for cloud, flow in zip(clouds, flows)] or clouds
@@ -129,7 +130,7 @@ def motion_at_scale(
     """
     images, pixels = zip(*(project(cloud.xy, pixel_size, config) for cloud in (cloud1, *clouds)))
     clusters = find_clusters(images, pixel_size, config)
-    estimates, scores, seen = _correlate(clusters, images, clouds, pixel_size, config)
+    estimates, scores, seen = _correlate(clusters, images, len(clouds), pixel_size)
     motion = np.zeros((2, len(scores) + 1))  # the last column is for points in no cluster, number -1
     motion[:, :-1] = _pool(estimates / np.array([cloud.steps for cloud in clouds]), seen)
     numbers = [np.where(pixel >= 0, clusters.number.ravel().take(pixel), -1) for pixel in pixels[1:]]
@@ -226,15 +227,15 @@ def _grouped(pixel: np.ndarray, label: np.ndarray, width: int) -> Groups:
 
 
 def _correlate(
-    clusters: Clusters, images: Sequence[np.ndarray], clouds: Sequence[Cloud], pixel_size: float, config: Config
+    clusters: Clusters, images: Sequence[np.ndarray], num_clouds: int, pixel_size: float
 ) -> Tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The loop. Shifts (2, M, K) in metres, scores (M,) of the newest sweep, and which (M, K) sweeps had pixels."""
     cv2 = opencv()
     num_clusters = len(clusters.boxes)
-    shifts = np.zeros((2, num_clusters, len(clouds)))
+    shifts = np.zeros((2, num_clusters, num_clouds))
     scores = np.zeros(num_clusters, np.float32)
-    seen = np.zeros((num_clusters, len(clouds)), bool)
-    for m in range(len(clouds)):
+    seen = np.zeros((num_clusters, num_clouds), bool)
+    for m in range(num_clouds):
         present = clusters.number[images[m + 1].view(bool)]
         seen[present[present >= 0], m] = True
     for i, (top, left, height, width) in enumerate(clusters.boxes):
@@ -245,14 +246,8 @@ def _correlate(
         for m in np.flatnonzero(seen[i]).tolist():
             template = (images[m + 1][crop] & own).astype(np.float32)
             low_y, high_y, low_x, high_x = height // 2, height - 1 - height // 2, width // 2, width - 1 - width // 2
-            reach = None if config.max_speed is None else config.max_speed * clouds[m].seconds / pixel_size + 1
-            if reach is not None:
-                low_y, high_y, low_x, high_x = (min(side, int(reach)) for side in (low_y, high_y, low_x, high_x))
             padded = cv2.copyMakeBorder(target, low_y, high_y, low_x, high_x, cv2.BORDER_CONSTANT)
             score = cv2.matchTemplate(padded, template, cv2.TM_CCORR_NORMED)
-            if reach is not None:
-                dy, dx = np.ogrid[-low_y : high_y + 1, -low_x : high_x + 1]
-                score[dy * dy + dx * dx > reach * reach] = 0
             _, peak, _, (x, y) = cv2.minMaxLoc(score)
             if peak > _SMALLEST_SCORE:
                 shifts[:, i, m] = (x - low_x) * pixel_size, (y - low_y) * pixel_size
@@ -291,23 +286,15 @@ def _middle(mask: np.ndarray) -> Tuple[np.ndarray, np.ndarray]:
 
 
 def _clouds(window: Window, moved0: np.ndarray, config: Config) -> List[Cloud]:
-    """Sweeps t, t-1, ... in the frame of t+1, those left out that repeat a newer one."""
-    sweeps = [window.pc0, *window.pch[: config.num_history]]
-    stamps: List[Any] = [sweep.timestamp_ns for sweep in (window.pc1, *sweeps)]
-    clouds = []
-    for m, sweep in enumerate(sweeps):
-        if any(_repeats(sweep, newer) for newer in sweeps[:m]):
-            continue
-        steps, seconds = float(m + 1), (m + 1) * config.sweep_interval
-        if None not in stamps:
-            seconds = (stamps[0] - stamps[m + 1]) / 1e9
-            steps = (stamps[0] - stamps[m + 1]) / (stamps[0] - stamps[1])
-        moved = moved0 if m == 0 else _compensate(sweep, window.pc1)[1]
-        clouds.append(_cloud(sweep, moved, steps, seconds, config))
+    """Sweeps t, t-1, ... in the frame of t+1."""
+    older = window.pch[: config.num_history]
+    clouds = [_cloud(window.pc0, moved0, 1.0, config)]
+    for m, sweep in enumerate(older, 2):
+        clouds.append(_cloud(sweep, _compensate(sweep, window.pc1)[1], float(m), config))
     return clouds
 
 
-def _cloud(sweep: Sweep, moved: np.ndarray, steps: float, seconds: float, config: Config) -> Cloud:
+def _cloud(sweep: Sweep, moved: np.ndarray, steps: float, config: Config) -> Cloud:
     """The points of a sweep that are finite, not ground and inside the region; `moved` (3, N) in the frame of t+1."""
     x0, y0, z0, x1, y1, z1 = config.point_cloud_range
     x, y, z = moved
@@ -315,7 +302,7 @@ def _cloud(sweep: Sweep, moved: np.ndarray, steps: float, seconds: float, config
     if sweep.is_ground is not None:
         takes_part &= ~_numpy(sweep.is_ground)
     rows = np.flatnonzero(takes_part)
-    return Cloud(moved[:2].take(rows, 1), steps, seconds, rows)
+    return Cloud(moved[:2].take(rows, 1), steps, rows)
 
 
 def _compensate(sweep: Sweep, sweep1: Sweep) -> Tuple[np.ndarray, np.ndarray]:
@@ -336,11 +323,6 @@ def _compensate(sweep: Sweep, sweep1: Sweep) -> Tuple[np.ndarray, np.ndarray]:
 
 def _columns(sweep: Sweep) -> np.ndarray:
     return np.ascontiguousarray(_numpy(sweep.points)[:, :3].T, dtype=np.float64)
-
-
-def _repeats(sweep: Sweep, newer: Sweep) -> bool:
-    same_pose = np.array_equal(_numpy(sweep.pose), _numpy(newer.pose))
-    return same_pose and np.array_equal(_numpy(sweep.points), _numpy(newer.points))
 
 
 def _numpy(values: Any) -> np.ndarray:

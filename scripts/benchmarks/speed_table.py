@@ -283,11 +283,10 @@ def main() -> None:
             print(row, file=sys.stderr, flush=True)
     for server in servers.values():
         server.end()
-    columns = list(dict.fromkeys(key for row in rows for key in row))
     about = {"points": len(clouds[0][0]), "older_sweeps": len(clouds) - 2, "repeats": given.repeats}
     report = {"machine": machine(), "versions": versions(), **about, "rows": rows}
     print(json.dumps({key: value for key, value in report.items() if key != "rows"}))
-    print(markdown([columns, *([row.get(column, "") for column in columns] for row in rows)]))
+    print(markdown(rows))
     if given.json:
         given.json.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
 

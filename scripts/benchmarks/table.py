@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, Sequence
+from typing import Any, Mapping, Sequence
 
 
-def markdown(rows: Sequence[Sequence[Any]]) -> str:
-    """A table: the header, then the rows; numbers with four digits."""
-    cells = [[f"{value:.4g}" if isinstance(value, float) else str(value) for value in row] for row in rows]
-    return "".join("| " + " | ".join(row) + " |\n" for row in (cells[0], ["---"] * len(cells[0]), *cells[1:]))
+def markdown(rows: Sequence[Mapping[str, Any]]) -> str:
+    """A table with a column per key; numbers with four digits, nothing where a row lacks a key."""
+    columns = list(dict.fromkeys(key for row in rows for key in row))
+    values = ([row.get(column, "") for column in columns] for row in rows)
+    cells = [[f"{value:.4g}" if isinstance(value, float) else str(value) for value in row] for row in values]
+    return "".join("| " + " | ".join(row) + " |\n" for row in (columns, ["---"] * len(columns), *cells))

@@ -30,10 +30,10 @@ from cflow_torch.applications.track_table import confirmed, join_tables
 from cflow_torch.data.catalog import GroundFoundLog
 from cflow_torch.data.log import FlowLabels, Log, RecentSweeps, window
 from cflow_torch.simulator import make_drive
+from cflow_torch.simulator.benchmark import FORMATS
 from cflow_torch.simulator.drive import Drive
 from cflow_torch.types import FlowResult, Sweep, Window
 
-SENSORS = ("av2", "nuscenes", "waymo", "truckscenes", "aevascenes")
 WITH_MASKS = ("av2", "aevascenes")
 SPEED, POINTS = 0.5, 20  # m/s and points of an object that counts
 Row = Dict[str, Any]
@@ -78,7 +78,7 @@ def score(log: SimulatedLog, pairs: Iterator[Tuple[int, Window, FlowResult]]) ->
         sweeps.append((index, result.numpy(), given, track_id))
     kept = confirmed(join_tables(tables))
     counts: Row = dict.fromkeys(("objects", "grouped", "tracked", "switches", "groups", "false_groups"), 0)
-    counts.update(rows=len(kept["id"]), false_rows=0, raw=[], filtered=[], z=[])
+    counts.update(rows=len(kept["id"]), false_rows=0, raw=[], filtered=[])
     last: Dict[int, int] = {}
     for index, flow, given, track_id in sweeps:
         body, velocity = log.truth(index)
@@ -115,7 +115,6 @@ def score(log: SimulatedLog, pairs: Iterator[Tuple[int, Window, FlowResult]]) ->
             filtered = np.array([here[name][row] for name in ("vx", "vy")])
             counts["raw"].append(float(np.linalg.norm((raw - velocity[mover])[:2])))
             counts["filtered"].append(float(np.linalg.norm(filtered - velocity[mover, :2])))
-            counts["z"].append(counts["filtered"][-1] / float(here["velocity_std"][row]) / 2**0.5)
     return counts
 
 
@@ -159,7 +158,7 @@ def main() -> None:
     """Simulate, estimate, track, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--model", default="default", help="preset")
-    parser.add_argument("--only", nargs="*", default=SENSORS, choices=SENSORS)
+    parser.add_argument("--only", nargs="*", default=tuple(FORMATS), choices=tuple(FORMATS))
     parser.add_argument("--scenes", nargs="*", default=("street", "crossing"))
     parser.add_argument("--first-seed", type=int, default=300)
     parser.add_argument("--num-sweeps", type=int, default=20)
@@ -185,7 +184,7 @@ def main() -> None:
         rows.append(summary(sensor, parts))
         print(rows[-1], flush=True)
     rows.append(summary("all", everything))
-    print(markdown([list(rows[0]), *(list(row.values()) for row in rows)]))
+    print(markdown(rows))
     if given.json:
         given.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
 

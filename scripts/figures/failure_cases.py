@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""The failures of docs/limits.md: its pictures and its table, from small simulated drives (failure_scenes.py).
+"""The failures of docs/limits.md: its pictures and its table, from small simulated drives (drives.py).
 
   python scripts/figures/failure_cases.py                         docs/pictures/limit_*.png, and the table
   python scripts/figures/failure_cases.py --only rail fast        some of them
@@ -16,47 +16,182 @@ import argparse
 import io
 import math
 import warnings
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Iterator, Optional, Sequence
+from typing import Any, Callable, Dict, Iterator, List, NamedTuple, Optional, Sequence, Tuple
 
+import drives
 import numpy as np
-from failure_scenes import CASES, Case
+from drives import PAIR, Staged, body_of
 from PIL import Image
 
+from cflow_torch import FlowResult, Sweep, make_config, make_model
+from cflow_torch.data.catalog import ChangedLog, GroundFoundLog
+from cflow_torch.data.log import window
+from cflow_torch.simulator.drive import Drive
 from cflow_torch.viz import plot_flow
 
-# The case, and the seed that is drawn.
-PICTURED = {
-    "long_side": 0,
-    "rail": 0,
-    "touching": 0,
-    "turning": 4,
-    "fast": 2,
-    "ground_left_in": 1,
-    "wrong_frame": 0,
-    "appearing": 0,
-    "bridge": 0,
-}
 SEEDS = (0, 1, 2, 3, 4)
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "pictures"
+WIDE = (-100.0, -100.0, -math.inf, 100.0, 100.0, math.inf)
+
+
+class Attempt(NamedTuple):
+    """One setting.
+
+    Args:
+        name: preset and what is changed of it.
+        residual: (N, 3) what it says, total flow less the flow of the TRUE ego motion, metres per sweep.
+        confidence: (N,) 0 ... 1, None where the setting has none.
+    """
+
+    name: str
+    residual: np.ndarray
+    confidence: Optional[np.ndarray]
+
+
+@dataclass(frozen=True)
+class Case:
+    """A failure.
+
+    Args:
+        staged: the drive, and what of it is looked at.
+        attempts: the one that fails first.
+    """
+
+    staged: Staged
+    attempts: List[Attempt]
+
+    @property
+    def truth(self) -> np.ndarray:
+        """(N, 3) true residual flow, metres per sweep."""
+        return self.staged.drive.labels(PAIR).flow - _pose_flow(self.staged.drive)
+
+    @property
+    def concerned(self) -> np.ndarray:
+        """(N,) bool, points that the error is of."""
+        return np.isin(body_of(self.staged.drive), list(self.staged.bodies))
+
+    def errors(self) -> List[float]:
+        """Mean end-point error of the points concerned, metres per sweep, of each attempt."""
+        lengths = (np.linalg.norm(attempt.residual - self.truth, axis=1) for attempt in self.attempts)
+        return [float(length[self.concerned].mean()) for length in lengths]
+
+    def confidences(self) -> List[float]:
+        """Mean confidence of the points concerned, of each attempt; NaN where it has none."""
+        given = (attempt.confidence for attempt in self.attempts)
+        return [math.nan if one is None else float(one[self.concerned].mean()) for one in given]
+
+
+Way = Callable[[Drive], Attempt]
+
+
+def by(preset: str, name: str = "", of: Callable[[Drive], Any] = lambda drive: drive, **overrides: Any) -> Way:
+    """The flow of the pair by a preset.
+
+    Args:
+        preset: see `make_config`.
+        name: what the table calls it; "" = the preset and the overrides.
+        of: log of a drive, if its poses or points shall be others.
+        **overrides: of the preset's settings.
+    """
+
+    def attempt(drive: Drive) -> Attempt:
+        config = make_config(preset, **overrides)
+        (result,) = make_model(config)([window(of(drive), PAIR, config.num_history, config.num_future)])
+        told = ", ".join([f"`{preset}`", *(f"{k}={v}" for k, v in overrides.items())])
+        return _attempt(drive, name or told, result)
+
+    return attempt
+
+
+class MisplacedPoses(ChangedLog):
+    """A log whose poses are those of a place 1.4 m behind the frame of its points."""
+
+    def sweep(self, index: int) -> Sweep:
+        """The sweep with the wrong pose."""
+        sweep = self.log.sweep(index)
+        return replace(sweep, pose=sweep.pose @ np.array([[1, 0, 0, -1.4], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]))
+
+
+class WithoutMasks(ChangedLog):
+    """A log whose sweeps have no ground masks."""
+
+    def sweep(self, index: int) -> Sweep:
+        """The sweep without its mask."""
+        return replace(self.log.sweep(index), is_ground=None)
+
+
+_DEFAULT = (by("default"),)
+_SECTIONAL_VIEW = (by("paper", num_history=4), by("paper", num_history=4, sectional_view=True))
+_PAPER_AND_DEFAULT = (by("paper"), by("default"))
+_HISTORY_OR_NOT = (by("default"), by("default", num_history=0))
+_LONG_SIDE = (by("default", num_history=0), by("offline", num_history=0), by("default", num_history=4))
+_GROUND = (
+    by("default", "`default`, ground=None", WithoutMasks),
+    by("default", "`default`, ground='auto'", lambda drive: GroundFoundLog(WithoutMasks(drive))),
+)
+_WRONG_FRAME = (by("default", "`default`, wrong frame", MisplacedPoses), by("default", "`default`, right frame"))
+_WIDE = by("default", "`default`, point_cloud_range=±100 m", point_cloud_range=WIDE)
+# The drive, the settings it is tried with (the one that fails first), and the seed that is drawn.
+CASES: Dict[str, Tuple[Callable[[int], Staged], Sequence[Way], Optional[int]]] = {
+    "long_side": (drives.tram, _LONG_SIDE, 0),
+    "rail": (drives.rail, _PAPER_AND_DEFAULT, 0),
+    "bridge": (drives.bridge, _DEFAULT, 0),
+    "gantry": (drives.gantry, _DEFAULT, None),
+    "crowd": (drives.crowd, _HISTORY_OR_NOT, None),
+    "touching": (drives.touching, _PAPER_AND_DEFAULT, 0),
+    "turning": (drives.turning, (by("default", thorough=False), *_HISTORY_OR_NOT), 4),
+    "abreast": (drives.abreast, _DEFAULT, None),
+    "vertical": (drives.vertical, _SECTIONAL_VIEW, None),
+    "fast": (drives.fast, (by("default", max_speed=40), by("default")), 2),
+    "beyond_region": (drives.far, (by("default"), _WIDE), None),
+    "ground_left_in": (drives.street, _GROUND, 1),
+    "wrong_frame": (drives.turn, _WRONG_FRAME, 0),
+    "appearing": (drives.appearing, (by("default"), by("offline")), 0),
+    "appeared": (partial(drives.appearing, later=4), _DEFAULT, None),
+    "rolling_shutter": (drives.rolling_shutter, _DEFAULT, None),
+    "frozen_world": (partial(drives.rolling_shutter, profile="av2"), _DEFAULT, None),
+}
+
+
+def make_case(name: str, seed: int) -> Case:
+    """A drive, and the flow of its pair by each setting."""
+    stage, ways, _ = CASES[name]
+    staged = stage(seed)
+    return Case(staged, [way(staged.drive) for way in ways])
+
+
+def _attempt(drive: Drive, name: str, result: FlowResult) -> Attempt:
+    confidence = None if result.confidence is None else result.confidence.numpy()
+    return Attempt(name, result.flow.numpy() - _pose_flow(drive), confidence)
+
+
+def _pose_flow(drive: Drive) -> np.ndarray:
+    """(N, 3) true flow of ego motion alone, PAIR -> PAIR + 1."""
+    points = drive.sweep(PAIR).points.astype(np.float64)
+    T = np.linalg.inv(drive.poses[PAIR + 1]) @ drive.poses[PAIR]
+    return points @ T[:3, :3].T + T[:3, 3] - points
 
 
 def draw(case: Case) -> Image.Image:
     """A row of estimate, truth and error for the first and the last setting, on one scale of colours."""
-    low, high = case.view[:2], case.view[2:]
-    kept = ~case.is_ground
-    shown = np.all((case.points[:, :2] >= low) & (case.points[:, :2] <= high), axis=1) & kept
-    longest = np.linalg.norm(case.truth[shown], axis=1).max()
+    low, high = case.staged.view[:2], case.staged.view[2:]
+    sweep, truth = case.staged.drive.sweep(PAIR), case.truth
+    kept = ~sweep.is_ground
+    shown = np.all((sweep.points[:, :2] >= low) & (sweep.points[:, :2] <= high), axis=1) & kept
+    longest = np.linalg.norm(truth[shown], axis=1).max()
     rows = []
     tried = list(zip(case.attempts, case.errors()))
     for attempt, error in tried[:1] + tried[1:][-1:]:
         figure = plot_flow(
-            case.points[kept],
+            sweep.points[kept],
             attempt.residual[kept],
             point_cloud_range=(*low, -math.inf, *high, math.inf),
             max_flow=max(math.ceil(10 * longest) / 10, 0.5),
-            truth=case.truth[kept],
-            title=f"{attempt.name.replace('`', '')}: error {error:.2f} m ({case.whose})",
+            truth=truth[kept],
+            title=f"{attempt.name.replace('`', '')}: error {error:.2f} m ({case.staged.whose})",
         )
         buffer = io.BytesIO()
         figure.savefig(buffer, format="png", dpi=figure.dpi)
@@ -72,10 +207,10 @@ def table(names: Sequence[str], seeds: Sequence[int]) -> Iterator[str]:
     yield "| | of | setting | error, m | confidence |"
     yield "|---|---|---|---|---|"
     for name in names:
-        cases = [CASES[name](seed) for seed in seeds]
+        cases = [make_case(name, seed) for seed in seeds]
         errors, confidences = np.array([c.errors() for c in cases]), np.array([c.confidences() for c in cases])
         for i, attempt in enumerate(cases[0].attempts):
-            heading = (cases[0].title, cases[0].whose) if i == 0 else ("", "")
+            heading = (cases[0].staged.title, cases[0].staged.whose) if i == 0 else ("", "")
             error = f"{errors[:, i].mean():.3f} ({errors[:, i].min():.3f}–{errors[:, i].max():.3f})"
             trust = "-" if np.isnan(confidences[:, i]).any() else f"{confidences[:, i].mean():.2f}"
             yield f"| {' | '.join((*heading, attempt.name, error, trust))} |"
@@ -90,9 +225,11 @@ def main(arguments: Optional[Sequence[str]] = None) -> None:
     given = parser.parse_args(arguments)
     warnings.simplefilter("ignore", UserWarning)  # that ground was left in, which is one of the cases
     print("\n".join(table(given.only, given.seeds)))
-    for name in (name for name in given.only if name in PICTURED and given.pictures):
-        Path(given.pictures).mkdir(parents=True, exist_ok=True)
-        draw(CASES[name](PICTURED[name])).save(Path(given.pictures) / f"limit_{name}.png", optimize=True)
+    for name in given.only if given.pictures else ():
+        *_, seed = CASES[name]
+        if seed is not None:
+            Path(given.pictures).mkdir(parents=True, exist_ok=True)
+            draw(make_case(name, seed)).save(Path(given.pictures) / f"limit_{name}.png", optimize=True)
 
 
 if __name__ == "__main__":

@@ -1,28 +1,23 @@
-#!/usr/bin/env python3
 """The tables and figures of the paper from results files, the paper's numbers beside ours.
 
-  python scripts/paper/pages.py RESULTS [--output FOLDER]
-
-RESULTS: a folder that holds results.json files of `cflow eval -m experiment=...`, at any depth. Writes the page
-FOLDER.md (default: RESULTS/paper.md), and to FOLDER per table or figure NAME.md, NAME.csv, NAME.tex, for figures
-NAME.png and NAME.pdf too (needs matplotlib). Of figures the page has the means, NAME.md the classes; across data sets
-the page has CorrelationFlow, NAME.md every method. Missing runs are listed on the page and on the screen, "-" in the
-tables. `--output docs/paper` makes docs/paper.md.
+Per table or figure NAME.md and NAME.csv, for figures NAME.png too (needs matplotlib). Of figures the page has the
+means, NAME.md the classes; across data sets the page has CorrelationFlow, NAME.md every method. Missing runs are listed
+on the page and on the screen, "-" in the tables.
 """
 
 from __future__ import annotations
 
-import argparse
 import csv
 import io
 import math
 import sys
 from pathlib import Path
-from typing import Any, Dict, List, Optional, Sequence
+from typing import Any, Dict, List
 
 from results import CLASSES, METHODS, RANGES, Ours, Runs, load_paper, load_runs, protocol, range_errors
 
 from cflow_torch.data.atomic import atomic_file
+from cflow_torch.data.records import write_text
 
 PER_SET = ("datasets", "range_split")  # experiments whose columns are data sets, not classes
 INTRODUCTION = """# The paper's tables beside ours
@@ -140,16 +135,6 @@ def markdown(cells: Cells) -> str:
     return "".join("| " + " | ".join(row) + " |\n" for row in (cells[0], rule, *cells[1:]))
 
 
-def latex(cells: Cells) -> str:
-    """A LaTeX tabular in the style of booktabs."""
-    special = {"_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#", "+": "{+}"}
-    text = [["".join(special.get(c, c) for c in cell) for cell in row] for row in cells]
-    lines = [" & ".join(row) + r" \\" for row in text]
-    columns = "ll" + "r" * (len(cells[0]) - 2)
-    return "\n".join([rf"\begin{{tabular}}{{{columns}}}", r"\toprule", lines[0], r"\midrule", *lines[1:],
-                      r"\bottomrule", r"\end{tabular}", ""])  # fmt: skip
-
-
 def comma_separated(cells: Cells) -> str:
     """The table as CSV."""
     text = io.StringIO()
@@ -157,24 +142,15 @@ def comma_separated(cells: Cells) -> str:
     return text.getvalue()
 
 
-def write(file: Path, text: str) -> None:
-    """Write a text file that appears whole or not at all."""
-    with atomic_file(file) as stream:
-        stream.write(text.encode())
+def write_pages(results: Path, output: Path) -> None:
+    """Write the page OUTPUT.md, and to OUTPUT the tables and figures one by one.
 
-
-def main(arguments: Optional[Sequence[str]] = None) -> int:
-    """Write everything; returns the exit status."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("results", type=Path, help="folder with results.json files")
-    parser.add_argument("--output", type=Path, help="default: RESULTS/paper")
-    given = parser.parse_args(arguments)
-    if not given.results.is_dir():
-        print(f"error: {given.results} is no folder; give the output folder of the experiments", file=sys.stderr)
-        return 2
-    output = given.output or given.results / "paper"
+    Args:
+        results: folder that holds results.json files of `cflow eval -m experiment=...`, at any depth.
+        output: folder.
+    """
     paper = load_paper()
-    runs, remarks = load_runs(given.results)
+    runs, remarks = load_runs(results)
     try:
         from plots import draw
     except ImportError as error:
@@ -185,8 +161,8 @@ def main(arguments: Optional[Sequence[str]] = None) -> int:
     for name, about in paper.items():
         ours = runs.get(name, {})
         cells = (set_cells if name in PER_SET else class_cells)(about, ours)
-        for ending, text in (("md", markdown(cells)), ("csv", comma_separated(cells)), ("tex", latex(cells))):
-            write(output / f"{name}.{ending}", text)
+        write_text(output / f"{name}.md", markdown(cells))
+        write_text(output / f"{name}.csv", comma_separated(cells))
         is_figure = "at" in about
         shown = cells
         if name in PER_SET:
@@ -203,9 +179,8 @@ def main(arguments: Optional[Sequence[str]] = None) -> int:
             notes += [f"{method}: {reason}" for method, score in protocol(ours).items() for reason in score.missing]
         page += [f"- {line}" for line in notes]
         if draw is not None and is_figure:
-            for ending in ("png", "pdf"):
-                with atomic_file(output / f"{name}.{ending}") as stream:
-                    draw(name, about, ours).savefig(stream, format=ending, dpi=130)
+            with atomic_file(output / f"{name}.png") as stream:
+                draw(name, about, ours).savefig(stream, format="png", dpi=130)
             page += ["", f"![{about['title']}]({output.name}/{name}.png)"]
         page.append("")
     missing = missing_runs(paper, runs)
@@ -214,10 +189,5 @@ def main(arguments: Optional[Sequence[str]] = None) -> int:
             page += [f"## {title}", "", *(f"- {line}" for line in lines), ""]
             print(f"{title}:", *lines, sep="\n  ", file=sys.stderr)
     file = output.with_name(f"{output.name}.md")
-    write(file, "\n".join(page))
+    write_text(file, "\n".join(page))
     print(f"tables and figures: {file}")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

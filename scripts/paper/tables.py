@@ -5,10 +5,11 @@
   python scripts/paper/tables.py data=benchmark_small              20 windows, a few minutes
   python scripts/paper/tables.py data=av2 data.root=/data/av2/val output=outputs/av2val
   python scripts/paper/tables.py --only history scales             some of them
+  python scripts/paper/tables.py --only --page docs/paper          none: the page of what outputs/paper holds
 
 Arguments with "=" are Hydra overrides and go to every `cflow eval -m experiment=...`. Runs that are done are skipped:
-call it again to resume after an interruption. output=FOLDER (default outputs/paper) gets the results, FOLDER/paper.md
-and FOLDER/paper the tables and figures.
+call it again to resume after an interruption. output=FOLDER (default outputs/paper) gets the results; --page (default
+FOLDER/paper) the tables and figures, and the page beside it, FOLDER/paper.md.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import time
 from pathlib import Path
 from typing import Optional, Sequence
 
-import pages
+from pages import write_pages
 
 # Those that need the most time, or an extra, last.
 EXPERIMENTS = ("pixel_size", "views", "history", "scales", "keypoints", "datasets", "range_split", "clustering")
@@ -30,7 +31,8 @@ def main(arguments: Optional[Sequence[str]] = None) -> int:
     """Run the experiments; returns 1 if any of them failed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("overrides", nargs="*", metavar="SETTING=VALUE")
-    parser.add_argument("--only", nargs="+", choices=EXPERIMENTS, default=EXPERIMENTS)
+    parser.add_argument("--only", nargs="*", choices=EXPERIMENTS, default=EXPERIMENTS)
+    parser.add_argument("--page", type=Path, help="folder of the tables and figures")
     given = parser.parse_intermixed_args(arguments)
     wrong = [text for text in given.overrides if "=" not in text]
     if wrong:
@@ -49,10 +51,10 @@ def main(arguments: Optional[Sequence[str]] = None) -> int:
             failed.append(name)
     if not output.is_dir():
         return 1
-    status = pages.main([str(output)])
+    write_pages(output, given.page or output / "paper")
     if failed:
         print(f"failed: {', '.join(failed)}; call again to resume", file=sys.stderr)
-    return 1 if failed else status
+    return 1 if failed else 0
 
 
 if __name__ == "__main__":

@@ -21,8 +21,8 @@ MENDED = {
 
 
 @pytest.fixture()
-def scenes_of(script: Any) -> Any:
-    return script("figures", "failure_scenes")
+def failures(script: Any) -> Any:
+    return script("figures", "failure_cases")
 
 
 QUICK = ("touching", "wrong_frame")
@@ -30,8 +30,8 @@ QUICK = ("touching", "wrong_frame")
 
 @pytest.mark.filterwarnings("ignore:there are ground points")
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[] if n in QUICK else pytest.mark.slow) for n in MENDED])
-def test_the_failure_is_there_and_the_setting_mends_it(scenes_of: Any, name: str) -> None:
-    case = scenes_of.CASES[name](0)
+def test_the_failure_is_there_and_the_setting_mends_it(failures: Any, name: str) -> None:
+    case = failures.make_case(name, 0)
     assert case.concerned.sum() > 50
     fails, mended = MENDED[name]
     errors = case.errors()
@@ -39,24 +39,24 @@ def test_the_failure_is_there_and_the_setting_mends_it(scenes_of: Any, name: str
 
 
 @pytest.mark.slow
-def test_what_appears_is_wrong_at_first(scenes_of: Any) -> None:
-    first, later = scenes_of.appearing(0), scenes_of.appeared(0)
+def test_what_appears_is_wrong_at_first(failures: Any) -> None:
+    first, later = failures.make_case("appearing", 0), failures.make_case("appeared", 0)
     assert first.errors()[0] > 0.8 and later.errors()[0] < 0.01
     assert later.confidences()[0] > 0.8
 
 
-def test_sweeps_after_t1_mend_what_appears(scenes_of: Any) -> None:
+def test_sweeps_after_t1_mend_what_appears(failures: Any) -> None:
     for seed in range(3):  # in the second a van stands near, so that the car is a part of its coarse component
-        online, offline = scenes_of.appearing(seed).errors()
+        online, offline = failures.make_case("appearing", seed).errors()
         assert online > 0.8 and offline < 0.09
 
 
-def test_a_wrong_frame_is_found_by_the_static_check(scenes_of: Any) -> None:
+def test_a_wrong_frame_is_found_by_the_static_check(failures: Any) -> None:
     from cflow_torch.data.static_check import StaticWorldWarning, check_static_world
 
-    good = scenes_of.place(0)
+    good = failures.drives.turn(0).drive
     with warnings.catch_warnings():
         warnings.simplefilter("error", StaticWorldWarning)
         check_static_world(good)
     with pytest.warns(StaticWorldWarning, match="ego_T_lidar"):
-        check_static_world(scenes_of.MisplacedPoses(good))
+        check_static_world(failures.MisplacedPoses(good))

@@ -61,7 +61,6 @@ def assert_same(result: FlowResult, expected: FlowResult) -> None:
     [
         {},
         {"connectivity": 4},
-        {"max_speed": 3.0},
         {"num_history": 2},
         {"num_history": 1, "pixel_sizes": (0.5, 0.25)},
     ],

@@ -1,13 +1,13 @@
 #!/usr/bin/env python3
 """Confidence of the flow (docs/verified.md): fit its table on simulated drives, see on others whether it is right.
 
-  python scripts/benchmarks/calibrate_confidence.py fit CACHE                 writes verified/confidence.json
-  python scripts/benchmarks/calibrate_confidence.py evaluate CACHE --seeds 300 301 302 303 --figure docs/confidence.png
-  python scripts/benchmarks/calibrate_confidence.py evaluate --real FOLDER    Argoverse 2 pair, KITTI 0000 below FOLDER
+  python scripts/ablation/calibrate_confidence.py fit CACHE                 writes verified/confidence.json
+  python scripts/ablation/calibrate_confidence.py evaluate CACHE --seeds 300 301 302 303 --figure docs/confidence.png
+  python scripts/ablation/calibrate_confidence.py evaluate --real             Argoverse 2 pair, KITTI 0000 (CFLOW_DATA)
 
-CACHE is a folder for the simulated drives (`simulator/benchmark.py`). Five sensors, four kinds of scenes, pairs (h = 0)
-and history (h = 4), region +-70 m, ground excluded; seeds 100 ... 103 to fit. Right = end-point error of the residual
-flow below 0.1 m per interval.
+CACHE is a folder for the simulated drives. Windows are those of sets.py: five sensors, four kinds of scenes, pairs
+(h = 0) and history (h = 4), region +-70 m, ground excluded; seeds 100 ... 103 to fit. Right = end-point error of the
+residual flow below 0.1 m per interval.
 """
 
 from __future__ import annotations
@@ -16,25 +16,22 @@ import argparse
 import json
 import math
 import sys
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Dict, Iterator, List, Optional, Sequence, Tuple
+from typing import Dict, Iterable, Iterator, List, Optional, Sequence, Tuple
 
 import numpy as np
+import sets
 import torch
+from made import MOVES
+from sets import Item
+from sklearn.isotonic import isotonic_regression
 
 from cflow_torch import make_config, make_model
-from cflow_torch.data.catalog import find_sources, open_log
-from cflow_torch.data.log import window
-from cflow_torch.evaluation.frame import ego_motion_flow
-from cflow_torch.simulator.benchmark import FORMATS, benchmark_logs
-from cflow_torch.types import FlowResult, Window
+from cflow_torch.types import FlowResult
 from cflow_torch.verified import confidence
 
 RIGHT = 0.1  # metres
-MOVES = 0.05  # metres; a true motion of at least this is dynamic
-SCENES = ("street", "highway", "crossing", "narrow")
-NUM_SWEEPS, MOST_HISTORY = 15, 4
-PICKS = (9, 12)  # sweeps of a drive, or the nearest that have labels
 DROPPED = (0.0, 0.05, 0.1, 0.2, 0.3, 0.5)
 NUM_BINS = 10  # of the reliability table
 MOST_POINTS = 3000  # of a window in a bin of the table when it is fitted, so that one lorry does not decide it
@@ -42,42 +39,25 @@ BOX = (-70.0, -70.0, -math.inf, 70.0, 70.0, math.inf)
 TABLE_FILE = Path(confidence.__file__).with_name("confidence.json")
 # A row of the statistics: of the points of one bin of the table, all and dynamic ones.
 POINTS, RIGHT_ONES, DYNAMIC, RIGHT_DYNAMIC, ERROR, DYNAMIC_ERROR = range(6)
-Truth = Tuple[Window, np.ndarray, np.ndarray]  # window, true residual flow (N, 3), points that count (N,)
 
 
-def simulated(cache: Path, seeds: Sequence[int]) -> Iterator[Truth]:
+def simulated(cache: Path, seeds: Sequence[int]) -> Iterator[Item]:
     """Windows of all sensors."""
-    for profile, chosen in FORMATS.items():
-        for source in benchmark_logs(cache, profile, seeds, NUM_SWEEPS, SCENES):
-            log = open_log(chosen.data_set, source, check=False, **dict(chosen.settings))
-            late = range(MOST_HISTORY, len(log.timestamps) - 1)
-            for pick in PICKS:
-                nearest = sorted(late, key=lambda i: abs(i - pick))
-                yield _windowed(log, next(i for i in nearest if log.labels(i) is not None))
+    for profile in sets.PROFILES:
+        yield from sets.simulated(profile, tuple(seeds), cache)
 
 
-def real(name: str, root: Path) -> Iterator[Truth]:
-    """Windows of all logs of a data set below a folder."""
-    for source in find_sources(name, root):
-        log = open_log(name, source, check=False)
-        for i in range(min(MOST_HISTORY, len(log.timestamps) - 2), len(log.timestamps) - 1):
-            if log.labels(i) is not None:
-                yield _windowed(log, i)
+def kitti() -> Iterator[Item]:
+    """Windows of both parts of KITTI 0000 that have the whole history."""
+    for path in (sets.KITTI, sets.KITTI_LATER):
+        yield from sets.kitti(path)[sets.HISTORY :]
 
 
-def _windowed(log: Any, i: int) -> Truth:
-    sweeps, truth = window(log, i, MOST_HISTORY), log.labels(i)
-    T_ego1_ego0 = np.linalg.inv(sweeps.pc1.pose) @ sweeps.pc0.pose
-    mask = log.eval_mask(i) if hasattr(log, "eval_mask") else None
-    counts = truth.is_valid if mask is None else truth.is_valid & mask
-    return sweeps, truth.flow - ego_motion_flow(np.asarray(sweeps.pc0.points)[:, :3], T_ego1_ego0), counts
-
-
-def statistics(windows: Iterator[Truth], histories: Sequence[int], most: float = math.inf) -> np.ndarray:
+def statistics(items: Iterable[Item], histories: Sequence[int], most: float = math.inf) -> np.ndarray:
     """(C, 6) float64: sums over the points of each of the C bins of the table.
 
     Args:
-        windows: with h = 4.
+        items: with h = 4.
         histories: each window is looked at with each of these h.
         most: points that a window counts at most in a bin: those beyond weigh nothing, all of them alike.
     """
@@ -86,10 +66,10 @@ def statistics(windows: Iterator[Truth], histories: Sequence[int], most: float =
     models = {h: make_model(make_config("default", num_history=h, point_cloud_range=BOX)) for h in histories}
     confidence.TABLE["probabilities"] = [i / num_bins for i in range(num_bins)]  # says which bin it is
     try:
-        for number, (sweeps, truth, counts) in enumerate(windows, 1):
+        for number, item in enumerate(items, 1):
             for h, model in models.items():
-                (result,) = model([Window(sweeps.pc0, sweeps.pc1, sweeps.pch[:h])])
-                of_window = _sums(result, truth, counts, num_bins)
+                (result,) = model([replace(item.window, pch=item.window.pch[:h], pcf=())])
+                of_window = _sums(result, item, num_bins)
                 sums += of_window * np.minimum(1, most / np.maximum(of_window[:, :1], 1))
             print(f"\r{number} windows", end="", file=sys.stderr, flush=True)
     finally:
@@ -98,8 +78,9 @@ def statistics(windows: Iterator[Truth], histories: Sequence[int], most: float =
     return sums
 
 
-def _sums(result: FlowResult, truth: np.ndarray, counts: np.ndarray, num_bins: int) -> np.ndarray:
-    found = result.numpy()
+def _sums(result: FlowResult, item: Item, num_bins: int) -> np.ndarray:
+    found, truth = result.numpy(), item.labels.flow - item.pose_flow
+    counts = item.labels.is_valid if item.eval_mask is None else item.labels.is_valid & item.eval_mask
     rows = np.flatnonzero(found["is_valid"] & counts)
     place = np.rint(found["confidence"][rows] * num_bins).astype(int)
     error = np.linalg.norm(found["residual_flow"][rows] - truth[rows], axis=1)
@@ -120,22 +101,9 @@ def fit(sums: np.ndarray) -> List[float]:
         prior = right.sum() / max(points.sum(), 1)
         share = (right + prior) / (points + 1)
         is_falling = row in (1, 3)  # the more is unlinked, or speaks for a local motion, the worse
-        rising = monotone(-share if is_falling else share, points + 1)
+        rising = isotonic_regression(-share if is_falling else share, sample_weight=points + 1)
         result += [min(round(abs(float(value)), 4), 0.9999) for value in rising]  # nothing is certain
     return result
-
-
-def monotone(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """The rising sequence nearest to some values in weighted squares: neighbours that fall are pooled."""
-    pools: List[List[float]] = []  # mean, weight, length
-    for value, weight in zip(values.tolist(), weights.tolist()):
-        pools.append([value, weight, 1])
-        while len(pools) > 1 and pools[-2][0] >= pools[-1][0]:
-            mean, weight, length = pools.pop()
-            before = pools[-1]
-            total = before[1] + weight
-            pools[-1] = [(before[0] * before[1] + mean * weight) / total, total, before[2] + length]
-    return np.repeat([pool[0] for pool in pools], [int(pool[2]) for pool in pools])
 
 
 def reliability(sums: np.ndarray, dynamic: bool = False) -> Tuple[List[Tuple[float, float, int]], float]:
@@ -186,7 +154,7 @@ def report(name: str, sums: np.ndarray) -> None:
         print(f"| {kind} EPE, m | {' | '.join(f'{value:.4f}' for value in values)} |")
 
 
-def draw(sets: Dict[str, np.ndarray], path: Path) -> None:
+def draw(sums_of: Dict[str, np.ndarray], path: Path) -> None:
     """Reliability and error over the share that is dropped, a line per set."""
     from matplotlib.figure import Figure
 
@@ -195,7 +163,7 @@ def draw(sets: Dict[str, np.ndarray], path: Path) -> None:
     diagram, moving, standing = figure.subplots(1, 3)
     diagram.plot([0, 1], [0, 1], color="0.6", linestyle="--", label="as told")
     shares = np.linspace(0, 0.5, 26)
-    for (name, sums), style in zip(sets.items(), styles):
+    for (name, sums), style in zip(sums_of.items(), styles):
         rows, gap = reliability(sums)
         diagram.plot([r[0] for r in rows], [r[1] for r in rows], label=f"{name}: error {gap:.3f}", **style)
         for axes, dynamic in ((moving, True), (standing, False)):
@@ -215,7 +183,7 @@ def main(arguments: Optional[Sequence[str]] = None) -> None:
     parser.add_argument("task", choices=("fit", "evaluate"))
     parser.add_argument("cache", type=Path, nargs="?", help="folder of the simulated drives")
     parser.add_argument("--seeds", type=int, nargs="+", default=[100, 101, 102, 103])
-    parser.add_argument("--real", type=Path, help="evaluate: folder with av2-7fab2350 and kitti-0000")
+    parser.add_argument("--real", action="store_true", help="evaluate: real data, too")
     parser.add_argument("--figure", type=Path, help="evaluate: PNG to draw")
     args = parser.parse_args(arguments)
     torch.set_num_threads(1)
@@ -224,18 +192,18 @@ def main(arguments: Optional[Sequence[str]] = None) -> None:
         table = {**confidence.TABLE, "probabilities": fit(sums)}
         TABLE_FILE.write_text(json.dumps(table) + "\n", encoding="utf-8")
         return
-    sets: Dict[str, np.ndarray] = {}
-    if args.cache is not None:
-        for h in (0, 4):
-            sets[f"simulated, h = {h}"] = statistics(simulated(args.cache, args.seeds), (h,))
-    if args.real is not None:
-        sets["Argoverse 2 pair"] = statistics(real("av2", args.real / "av2-7fab2350"), (0,))
-        for h in (0, 4):
-            sets[f"KITTI 0000, h = {h}"] = statistics(real("hdf5", args.real / "kitti-0000"), (h,))
-    for name, sums in sets.items():
+    sums_of: Dict[str, np.ndarray] = {}
+    for h in (0, sets.HISTORY) if args.cache is not None else ():
+        sums_of[f"simulated, h = {h}"] = statistics(simulated(args.cache, args.seeds), (h,))
+    if args.real:
+        pair = [sets.make_item(item.window, item.labels) for item in sets.av2_pair()]  # ego motion of the poses
+        sums_of["Argoverse 2 pair"] = statistics(pair, (0,))
+        for h in (0, sets.HISTORY):
+            sums_of[f"KITTI 0000, h = {h}"] = statistics(kitti(), (h,))
+    for name, sums in sums_of.items():
         report(name, sums)
     if args.figure is not None:
-        draw(sets, args.figure)
+        draw(sums_of, args.figure)
 
 
 if __name__ == "__main__":

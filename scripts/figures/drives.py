@@ -1,0 +1,286 @@
+"""Small simulated drives that are hard: those of docs/limits.md, and what a bird's-eye view merges.
+
+The vehicle is at the origin, heading along x, at the sweep that counts.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any, NamedTuple, Sequence, Tuple
+
+import numpy as np
+
+from cflow_torch.simulator import objects
+from cflow_torch.simulator.drive import Drive
+from cflow_torch.simulator.ground import Ground
+from cflow_torch.simulator.objects import Body, Route, Solid, box
+from cflow_torch.simulator.profiles import get_profile
+from cflow_torch.simulator.raycast import CYLINDER
+from cflow_torch.simulator.scene import Scene, SolidTable
+
+PAIR, NUM_SWEEPS = 5, 11  # sweep t, so that four older ones exist, and four after t+1
+FLAT = Ground((0.0, 0.0), 0.0, kerb=0.0, half_widths=(1e4, 1.0), crossing_x=1e5)
+EAST, NORTH, WEST = 0.0, math.pi / 2, math.pi
+BORDERS = (51.2, 76.8)  # metres, half sides of regions
+SECONDS = 0.1 * PAIR  # from the first sweep to the one that counts
+View = Tuple[float, float, float, float]
+
+
+class Staged(NamedTuple):
+    """A drive, and what of it is looked at.
+
+    Args:
+        drive: the pair that counts is (PAIR, PAIR + 1).
+        title: what is hard, a line.
+        whose: the points that the error is of.
+        bodies: their numbers in the scene.
+        view: (x0, y0, x1, y1) metres, frame of t, what a picture shows.
+    """
+
+    drive: Drive
+    title: str
+    whose: str
+    bodies: Sequence[int]
+    view: View = (-6, -6, 20, 13)
+
+
+def drive_past(
+    bodies: Sequence[Body], seed: int, *, ground: Ground = FLAT, profile: str = "av2", speed: float = 5, **way: float
+) -> Drive:
+    """A drive past bodies, straight on if `way` does not say otherwise."""
+    scene = Scene(ground, Route(0, 0, speed=speed, **way), tuple(bodies), SolidTable.of(tuple(bodies)))
+    return Drive(scene, get_profile(profile), seed, NUM_SWEEPS, "failure")
+
+
+def body_of(drive: Drive) -> np.ndarray:
+    """(N,) number of the body that each point of sweep t lies on, -1 = ground."""
+    return np.append(drive.scene.table.body, -1)[drive.returns(PAIR).solid.numpy()]
+
+
+def hedge(seed: int) -> Staged:
+    """People who walk along a hedge, within its component."""
+    rng = np.random.default_rng(seed)
+    leaves = [objects.bush(rng, x, 5.5 + rng.uniform(-0.2, 0.2), 60) for x in np.arange(4, 14, 1.2).tolist()]
+    people = [Route(8, 4.7, EAST, start=-0.6, speed=1.2), Route(12, 4.6, WEST, start=-0.5, speed=1.0)]
+    drive = drive_past([*leaves, *(objects.pedestrian(rng, way) for way in people)], seed)
+    return Staged(drive, "slow people in a hedge", "two people, 1.1 m/s", [len(leaves), len(leaves) + 1])
+
+
+def crowd(seed: int) -> Staged:
+    """Somebody who walks through a group that stands."""
+    rng = np.random.default_rng(seed)
+    people = [objects.pedestrian(rng, Route(8, 4.5, EAST, start=-0.5, speed=1.2))]
+    for x, y in ((x, y) for x in (6.5, 7.2, 7.9, 8.6, 9.3) for y in (3.9, 5.1)):
+        people.append(objects.pedestrian(rng, Route(x + rng.uniform(-0.1, 0.1), y + rng.uniform(-0.1, 0.1))))
+    return Staged(drive_past(people, seed), "a person in a crowd", "who walks, 1.2 m/s", [0])
+
+
+def tram(seed: int) -> Staged:
+    """A tram of 32 m."""
+    long = Body([box(-16, 16, -1.3, 1.3, 0.35, 3.3, 0.6)], Route(6, 6, EAST, speed=8), "BUS", (32.0, 2.6, 3.3))
+    drive = drive_past([long, objects.car(np.random.default_rng(seed), Route(12, -4, WEST, speed=8))], seed, speed=4)
+    return Staged(drive, "a long side seen in two sweeps", "tram of 32 m, 8 m/s", [0], (-14, -14, 30, 18))
+
+
+def appearing(seed: int, later: int = 0) -> Staged:
+    """A car that comes out from behind a van, so many sweeps later than that it is first seen."""
+    rng = np.random.default_rng(seed)
+    hidden = objects.car(rng, Route(13.9 - 0.9 * (PAIR + later) + 4.5, 7, WEST, speed=9))
+    drive = drive_past([hidden, objects.van(rng, Route(8, 3.5)), objects.wall(10, 14, 30, 0.5, 4)], seed, speed=0)
+    title = f"the same, {later} sweeps later" if later else "an object that appears"
+    return Staged(drive, title, "car, 9 m/s", [0], (-6, -6, 24, 16))
+
+
+def rolling_shutter(seed: int, profile: str = "av2_rolling") -> Staged:
+    """Oncoming traffic under a sensor that turns while the world moves."""
+    rng = np.random.default_rng(seed)
+    bodies = [objects.car(rng, Route(x, 4, WEST, speed=27)) for x in (18, 30)]
+    bodies += [objects.car(rng, Route(x, -4, EAST, speed=27)) for x in (-20, 22)]
+    drive = drive_past([*bodies, objects.wall(10, 12, 60, 0.5, 4)], seed, speed=20, profile=profile)
+    title = "rolling shutter" if profile == "av2_rolling" else "the same, instantaneous sweeps"
+    return Staged(drive, title, "two oncoming cars, closing at 47 m/s", [0, 1], (-30, -20, 26, 21))
+
+
+def rail(seed: int) -> Staged:
+    """Guard rails, whose seen part travels with the vehicle."""
+    posts = [box(x - 0.05, x + 0.05, -0.03, 0.03, -0.3, 0.45, 0.5) for x in (-8, -4, 0, 4, 8)]
+    beam = box(-10, 10, -0.04, 0.04, 0.45, 0.76, 0.6)
+    rails = [Body([beam, *posts], Route(x, y)) for x in range(-100, 140, 20) for y in (-3.2, 9.0)]
+    rng = np.random.default_rng(seed)
+    cars = [objects.car(rng, Route(20, 0, speed=27)), objects.car(rng, Route(-12, 4, speed=31))]
+    drive, rows = drive_past([*rails, *cars], seed, speed=27), range(len(rails))
+    return Staged(drive, "guard rails at speed", "rails, which stand still", rows, (-22, -25, 30, 13))
+
+
+def touching(seed: int) -> Staged:
+    """A car that passes a parked one a hand's breadth away."""
+    rng = np.random.default_rng(seed)
+    bodies = [objects.car(rng, Route(6, 3.0, EAST, speed=9)), objects.car(rng, Route(11, 5.05))]
+    drive = drive_past([*bodies, objects.wall(10, 8, 40, 0.5, 3)], seed)
+    return Staged(drive, "two cars that touch", "both: one at 9 m/s, one parked", [0, 1], (-6, -7, 20, 12))
+
+
+def turning(seed: int) -> Staged:
+    """A bus that turns by 4.5 degrees a sweep."""
+    bus = objects.bus(Route(14, -6, NORTH, start=4, speed=7, radius=9, angle=NORTH))
+    drive = drive_past([bus], seed, speed=0)
+    return Staged(drive, "an object that turns", "bus, 7 m/s, 4.5 degrees a sweep", [0], (-8, -11, 22, 11))
+
+
+def vertical(seed: int) -> Staged:
+    """A car that climbs what rises by 15 % before it."""
+    bodies = [objects.car(np.random.default_rng(seed), Route(22, -3, EAST, speed=12)), objects.wall(25, 8, 30, 0.5, 4)]
+    drive = drive_past(bodies, seed, speed=3, ground=replace(FLAT, curvature=0.006))
+    return Staged(drive, "vertical motion", "car that rises by 0.18 m a sweep", [0], (10, -12, 38, 6))
+
+
+def fast(seed: int) -> Staged:
+    """Cars of 48 and 52 m/s."""
+    rng = np.random.default_rng(seed)
+    bodies = [objects.car(rng, Route(-4, 4, EAST, speed=48)), objects.car(rng, Route(-10, -4, WEST, -20, 52))]
+    drive = drive_past([*bodies, objects.wall(25, 9, 30, 0.5, 4)], seed, speed=20)
+    return Staged(drive, "faster than max_speed", "two cars, 48 and 52 m/s", [0, 1], (-54, -37, 40, 32))
+
+
+def far(seed: int) -> Staged:
+    """Cars and people within `point_cloud_range` and outside of it."""
+    rng, bodies = np.random.default_rng(seed), []
+    for x in (20, 40, 82, 90):
+        bodies.append(objects.car(rng, Route(x, 3.5, WEST, speed=9)))
+        bodies.append(objects.pedestrian(rng, Route(x, -4, NORTH, speed=1.4)))
+    drive, whose = drive_past(bodies, seed), "cars and people 82 and 90 m away"
+    return Staged(drive, "outside the region", whose, [4, 5, 6, 7], (-2, -30, 96, 30))
+
+
+def street(seed: int) -> Staged:
+    """Two cars, a person, a wall."""
+    rng = np.random.default_rng(seed)
+    bodies = [
+        objects.car(rng, Route(8, 3.5, WEST, speed=9)),
+        objects.car(rng, Route(14, -3.5, EAST, speed=11)),
+        objects.pedestrian(rng, Route(7, -6, EAST, speed=1.4)),
+        objects.wall(10, 9, 30, 0.5, 4),
+    ]
+    return Staged(drive_past(bodies, seed), "ground left in", "two cars and a person", [0, 1, 2], (-6, -19, 28, 6))
+
+
+def turn(seed: int) -> Staged:
+    """A turn past one car that drives, and walls, parked cars and posts."""
+    rng = np.random.default_rng(seed)
+    bodies = [objects.car(rng, Route(12, 4, WEST, speed=9))]
+    bodies += [objects.wall(20, 12, 40, 0.5, 4), objects.wall(20, -12, 40, 0.5, 4), objects.wall(45, 0, 0.5, 24, 4)]
+    bodies += [objects.car(rng, Route(x, -7)) for x in (0, 7, 14, 22)]
+    bodies += [objects.pole(x, 8, 5, 0.12) for x in (0, 10, 20)]
+    drive, title = drive_past(bodies, seed, speed=6, radius=12, angle=1.2), "points and poses of different frames"
+    return Staged(drive, title, "what stands still", range(1, 11), (-4, -16, 40, 16))
+
+
+def tree(seed: int) -> Staged:
+    """Trees whose crowns hang over a lane, and a car below them."""
+    rng = np.random.default_rng(seed)
+    bodies = [objects.car(rng, _at(7 + rng.uniform(-1, 1), 4.0, WEST, 11)), objects.car(rng, _at(20, -4, EAST, 9))]
+    for x in (3.5, 8.0, 12.5):
+        bodies.append(objects.pole(x, 7.2, 5.0, 0.18))
+        bodies += [_crown(rng, x + rng.uniform(-0.5, 0.5), y, rng.uniform(0.3, 0.9)) for y in (7.0, 5.2, 3.6)]
+    return Staged(_past(bodies, seed, 5), "a car under a tree", "car, 11 m/s", [0], (-6, -7, 26, 12))
+
+
+def bridge(seed: int) -> Staged:
+    """A bridge of 9 m across the road, cars below it."""
+    slab = [box(-4.5, 4.5, -14, 14, 4.7, 5.5, 0.5), box(-4.5, -4.2, -14, 14, 5.5, 6.4, 0.5)]
+    abutments = [box(-4.5, 4.5, side * 10 - 1, side * 10 + 1, -1, 4.7, 0.5) for side in (-1, 1)]
+    return _below(seed, Body([*slab, *abutments], Route(16, 0)), "cars under a bridge")
+
+
+def gantry(seed: int) -> Staged:
+    """A gantry with signs over the lanes, cars below it."""
+    posts = [box(-0.2, 0.2, side * 9 - 0.2, side * 9 + 0.2, 0, 6.2, 0.5) for side in (-1, 1)]
+    signs = [box(-0.1, 0.1, y - 1.4, y + 1.4, 4.6, 6.4, 0.8) for y in (-5.5, -2, 2, 5.5)]
+    return _below(
+        seed, Body([box(-0.2, 0.2, -9, 9, 5.6, 6.0, 0.5), *posts, *signs], Route(16, 0)), "cars under a gantry"
+    )
+
+
+def _below(seed: int, above: Body, title: str) -> Staged:
+    rng = np.random.default_rng(seed)
+    ways = (_at(16, 4, WEST, 16), _at(15, -3.5, EAST, 14), _at(18, 7, WEST, 22))
+    cars = [objects.car(rng, way) for way in ways]
+    return Staged(_past([*cars, above], seed, 12), title, "three cars, 14-22 m/s", [0, 1, 2], (-6, -16, 34, 16))
+
+
+def wires(seed: int) -> Staged:
+    """Wires of a tramway along two lanes and across them, cars below."""
+    rng = np.random.default_rng(seed)
+    along = [_wire(0, y, z, 120) for y in (3.5, -3.5) for z in (4.6, 5.4)]
+    across = [_wire(x, 0, 5.0, 20, across=True) for x in (4, 9, 14, 19)]
+    posts = [objects.pole(x, y, 6.0, 0.12) for x in (4, 9, 14, 19) for y in (-10, 10)]
+    cars = [objects.car(rng, _at(x, y, to, speed)) for x, y, to, speed in ((8, 3.5, WEST, 8), (14, -3.5, EAST, 10))]
+    drive = _past([*cars, Body([*along, *across], Route(0, 0)), *posts], seed, 5)
+    return Staged(drive, "cars under wires", "two cars, 8 and 10 m/s", [0, 1], (-6, -12, 26, 12))
+
+
+def walkers(seed: int, gap: float = 0.3) -> Staged:
+    """Two people who walk along house fronts, one each way.
+
+    Args:
+        seed: of the people, the street and the noise.
+        gap: metres from their shoulders to the wall.
+    """
+    rng = np.random.default_rng(seed)
+    y = 6.0 - gap - 0.25
+    ways = [_at(x + rng.uniform(-0.5, 0.5), y, to, speed) for x, to, speed in ((4, EAST, 1.2), (10, WEST, 1.4))]
+    people = [objects.pedestrian(rng, way) for way in ways]
+    fronts = [objects.wall(x, 10, 9.7, 8, rng.uniform(5, 9)) for x in (-24, -14, -4, 6, 16, 26)]
+    pipes = [objects.pole(x, 5.95, 5, 0.05) for x in (-19, -9, 1, 11, 21)]
+    drive = _past([*people, *fronts, *pipes], seed, 3)
+    return Staged(drive, f"walkers {gap:g} m from a wall", "two people, 1.2 and 1.4 m/s", [0, 1], (-6, -4, 20, 12))
+
+
+def abreast(seed: int) -> Staged:
+    """Two cars side by side at different speeds, and one close along a wall."""
+    rng = np.random.default_rng(seed)
+    ways = (_at(8, 3.2, EAST, 9), _at(9, 5.2, EAST, 13), _at(12, -4.0, WEST, 10))
+    drive = _past([*(objects.car(rng, way) for way in ways), objects.wall(10, -5.4, 50, 0.5, 2.5)], seed, 6)
+    return Staged(drive, "cars abreast, a car along a wall", "three cars, 9-13 m/s", [0, 1, 2], (-6, -8, 26, 10))
+
+
+def border(seed: int) -> Staged:
+    """What stands on the borders of two regions, and what crosses them: cars, a bus, a wall."""
+    rng = np.random.default_rng(seed)
+    movers, fixed = [], []
+    for edge in BORDERS:
+        out, back, aside, *at_edge = rng.uniform(0, 1, 6).tolist()
+        # The side that is seen lies within a metre of the border: 2.2 m off a car's middle, 6 m off a bus's.
+        movers += [
+            objects.car(rng, _at(edge + 2.2 - out, 3, EAST, 14)),
+            objects.bus(_at(2, edge + 6 - aside, NORTH, 9)),
+        ]
+        movers += [
+            objects.car(rng, _at(edge + 2.2 + back, -3, WEST, 12)),
+            objects.car(rng, _at(-edge - 1.7, -3, WEST, 10)),
+        ]
+        fixed += [objects.car(rng, Route(-edge - 2.7 + x, y)) for x, y in zip(at_edge, (6, 9))]
+        fixed += [objects.wall(edge, 8, 12, 0.3, 3), objects.car(rng, Route(7, -edge - 1.4 + at_edge[2]))]
+    drive = _past([*movers, *fixed], seed, 5)
+    return Staged(drive, "the region's border", "cars and buses", list(range(len(movers))), (-82, -82, 82, 82))
+
+
+def _crown(rng: np.random.Generator, x: float, y: float, lift: float) -> Body:
+    """The crown of a tree without its trunk, `lift` metres higher than it would be."""
+    leaves = objects.tree(rng, x, y, 90).solids[1:]
+    return Body([leaf._replace(centre=(*leaf.centre[:2], leaf.centre[2] + lift)) for leaf in leaves], Route(x, y))
+
+
+def _wire(x: float, y: float, z: float, length: float, across: bool = False) -> Solid:
+    turn = {"roll": math.pi / 2} if across else {"pitch": math.pi / 2}
+    return Solid(CYLINDER, (x, y, z), (0.02, 0.02, length / 2), albedo=0.4, **turn)
+
+
+def _at(x: float, y: float, heading: float, speed: float) -> Route:
+    """Straight on through a place at the sweep that counts."""
+    return Route(x, y, heading, start=-speed * SECONDS, speed=speed)
+
+
+def _past(bodies: Sequence[Body], seed: int, speed: float, **more: Any) -> Any:
+    return drive_past(bodies, seed, speed=speed, start=-speed * SECONDS, **more)
