@@ -15,8 +15,8 @@ Columns: end-point errors in metres over all points within 35 m ("border": 76.8 
 the drives. dynamic: of objects that move by 0.05 m a sweep or more; of a small drive, those that it is about.
 pedestrian: error over speed. static: background. stands: all that stands, parked cars too. near, far: dynamic
 bucket-normalised error, mean over the classes, 0-35 m and 35-70 m. missed: share of moving points whose flow is less
-than half of the true one. flagged: share of these with a confidence below 0.5. moving: number of moving points. The
-JSON file has near and far of each class, too.
+than half of the true one. flagged: share of these with a confidence below 0.5; at 1 %: with one that at most 1 % of
+what stands is below. moving: number of moving points. The JSON file has near and far of each class, too.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from cflow_torch.config import Config, make_config
 from cflow_torch.data.records import strict, write_text
 from cflow_torch.types import CFlowError
 
-COLUMNS = ("dynamic", "pedestrian", "static", "stands", "near", "far", "missed", "flagged", "moving")
+COLUMNS = ("dynamic", "pedestrian", "static", "stands", "near", "far", "missed", "flagged", "at 1 %", "moving")
 
 
 def main(arguments: Optional[Sequence[str]] = None) -> int:

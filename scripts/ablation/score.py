@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Dict, List, Sequence
 
@@ -59,7 +60,8 @@ def pooled_figures(
         "dynamic", "static": EPE in metres of dynamic objects, of the static background; "stands": of all that does not
         move, parked cars too; "pedestrian": mean of error divided by speed of dynamic pedestrians; "missed": share of
         dynamic objects whose flow is less than half of the true one; "flagged": share of these with a confidence below
-        0.5; "moving": points of dynamic objects. NaN where there is nothing.
+        0.5; "at 1 %": with one that at most 1 % of what does not move is below; "moving": points of dynamic objects.
+        NaN where there is nothing.
     """
     definition = Definition(
         name="pooled",
@@ -73,6 +75,7 @@ def pooled_figures(
     of_standing: List[np.ndarray] = []
     is_missed: List[np.ndarray] = []
     of_missed: List[np.ndarray] = []
+    at_rest: List[np.ndarray] = []
     for frame, confidence in zip(frames, confidences):
         points = score_points(frame, definition)
         three_way.update_points(points)
@@ -81,21 +84,29 @@ def pooled_figures(
         of_standing.append(points.error[points.in_region & ~points.is_dynamic])
         truth, estimate = frame.labels.flow - frame.pose_flow, as_numpy(frame.residual_flow)
         speed = np.linalg.norm(truth, axis=1)
-        moves = is_scored(frame, reach) & (speed >= MOVES * step) & (frame.labels.category > 0)
+        counts = is_scored(frame, reach)
+        moves = counts & (speed >= MOVES * step) & (frame.labels.category > 0)
         missed = np.linalg.norm(estimate, axis=1) < 0.5 * speed
         is_missed.append(missed[moves])
         of_missed.append(confidence[moves & missed])
+        at_rest.append(confidence[counts & (speed < MOVES * step)])
     means = three_way.compute()
-    is_low = [np.where(np.isnan(of_window), np.nan, of_window < LOW) for of_window in of_missed]
+    warned, resting = np.concatenate(of_missed), np.sort(np.concatenate(at_rest))
+    rare = resting[len(resting) // 100] if len(resting) else math.nan
     return {
         "dynamic": means["epe_fd"],
         "static": means["epe_bs"],
         "stands": mean_of_present(np.concatenate(of_standing)),
         "pedestrian": mean_of_present(np.concatenate(of_pedestrians)),
         "missed": mean_of_present(np.concatenate(is_missed)),
-        "flagged": mean_of_present(np.concatenate(is_low)),
+        "flagged": _share_below(warned, LOW),
+        "at 1 %": _share_below(warned, rare),
         "moving": float(sum(map(len, is_missed))),
     }
+
+
+def _share_below(confidence: np.ndarray, bound: float) -> float:
+    return mean_of_present(np.where(np.isnan(confidence) | math.isnan(bound), np.nan, confidence < bound))
 
 
 def is_scored(frame: EvalFrame, reach: float) -> np.ndarray:

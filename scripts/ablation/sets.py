@@ -269,6 +269,11 @@ _SCENES: Dict[str, Callable[[int], drives.Staged]] = {
     "rolling": drives.rolling_shutter,
     "appears": drives.appearing,
     **{f"walkers-{gap:g}": partial(drives.walkers, gap=gap) for gap in (0.1, 0.2, 0.3, 0.5)},
+    **{
+        f"facade-{profile}-{step:g}": partial(drives.facade, step=step, profile=profile)
+        for profile in ("av2", "waymo")
+        for step in (0.1, 0.3, 0.55, 1.0, 1.5)  # metres of the vehicle per sweep
+    },
     "tree": drives.tree,
     "bridge": drives.bridge,
     "gantry": drives.gantry,

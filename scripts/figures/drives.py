@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any, NamedTuple, Sequence, Tuple
+from typing import Any, List, NamedTuple, Sequence, Tuple
 
 import numpy as np
 
@@ -237,6 +237,27 @@ def walkers(seed: int, gap: float = 0.3) -> Staged:
     return Staged(drive, f"walkers {gap:g} m from a wall", "two people, 1.2 and 1.4 m/s", [0, 1], (-6, -4, 20, 12))
 
 
+def facade(seed: int, step: float = 0.55, profile: str = "av2") -> Staged:
+    """Houses along the road behind parked cars, whose shadows glide over the fronts as the vehicle passes.
+
+    Args:
+        seed: of the street and of the noise.
+        step: metres that the vehicle drives in a sweep of 0.1 s.
+        profile: of the sensors.
+    """
+    rng = np.random.default_rng(seed)
+    bodies = [objects.car(rng, _at(22, 3.2, WEST, 8)), objects.car(rng, _at(13, 0, EAST, 8))]
+    for kerb, front in ((-4.3, -7.0), (7.5, 10.2)):
+        side, x = math.copysign(1.0, kerb), -45.0
+        while x < 60:
+            make = objects.van if rng.uniform() < 0.25 else objects.car
+            bodies.append(make(rng, Route(x, kerb - side * rng.uniform(1.0, 1.1), rng.uniform(-0.02, 0.02))))
+            x += rng.uniform(6.2, 9.5)
+        bodies += _fronts(rng, front)
+    drive = _past(bodies, seed, 10 * step, profile=profile)
+    return Staged(drive, "a façade behind parked cars", "two cars, 8 m/s", [0, 1], (-20, -12, 30, 14))
+
+
 def abreast(seed: int) -> Staged:
     """Two cars side by side at different speeds, and one close along a wall."""
     rng = np.random.default_rng(seed)
@@ -264,6 +285,24 @@ def border(seed: int) -> Staged:
         fixed += [objects.wall(edge, 8, 12, 0.3, 3), objects.car(rng, Route(7, -edge - 1.4 + at_edge[2]))]
     drive = _past([*movers, *fixed], seed, 5)
     return Staged(drive, "the region's border", "cars and buses", list(range(len(movers))), (-82, -82, 82, 82))
+
+
+def _fronts(rng: np.random.Generator, front: float) -> List[Body]:
+    """House after house along y = `front`: with pilasters, window sills, doorsteps and drain pipes."""
+    houses, begin, side = [], -50.0, math.copysign(1.0, front)
+    while begin < 65:
+        width, back, pitch = rng.uniform(8, 14), rng.choice((0.0, 0.0, 0.3)), rng.uniform(1.8, 2.6)
+        y, height = front + side * back, rng.uniform(6, 11)
+        houses.append(objects.wall(begin + width / 2, y + side * 4, width, 8, height, rng.uniform(0.3, 0.6)))
+        for x in np.arange(begin + 0.9, begin + width - 0.6, pitch).tolist():
+            if rng.uniform() < 0.15:
+                parts = [box(-0.6, 0.6, -0.4, 0.4, -0.1, 0.35, 0.5)]  # a doorstep
+            else:
+                parts = [box(-0.55, 0.55, -0.12, 0.12, z, z + 0.12, 0.5) for z in (0.9, 3.7)]  # sills of two windows
+            houses.append(Body([*parts, box(0.75, 0.95, -0.08, 0.08, 0.0, 5.0, 0.5)], Route(x, y)))  # and a pilaster
+        houses.append(objects.pole(begin, front - side * 0.1, 6, 0.06))
+        begin += width + (rng.uniform(1, 3) if rng.uniform() < 0.2 else 0.0)
+    return houses
 
 
 def _crown(rng: np.random.Generator, x: float, y: float, lift: float) -> Body:
