@@ -69,6 +69,11 @@ class Cells:
         """How far the 3 x 3 cells around one are from it."""
         return [down * self.shape[2] + right for down in (-1, 0, 1) for right in (-1, 0, 1)]
 
+    def within_reach(self) -> Tensor:
+        """(K,) int64: how far the cells are from one that a velocity may lead from beside it."""
+        line = torch.arange(-self.reach, self.reach + 1, device=self._ways.device)
+        return (line[:, None] * self.shape[2] + line).view(-1)
+
     def is_free(self) -> Tensor:
         """(windows, rows, cols) bool: which cells lie around the images."""
         free = torch.ones(self.shape, dtype=torch.bool, device=self._ways.device)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from itertools import product
-from typing import Dict, List, NamedTuple, Sequence, Set, Tuple
+from typing import Dict, List, NamedTuple, Optional, Sequence, Set, Tuple
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from oracle.visibility import RangeImage, sensor_height
 
 STEP, REACH, FASTEST = 0.1, 3, 0.25  # metres per interval, steps, metres per interval
 SIDE = 0.3  # metres, of a cell
+FINER, SUSPECT_Z = 2, 2
 SEED_Z, LEAST_WON, GROUP_Z, UPRIGHT = 6, 16, 4.0, 3
 
 Cell = Tuple[int, int]
@@ -69,8 +70,10 @@ def find_local_motion(
     if len(sweeps.images) < 3:
         return object_of, list(motions), {}
     looks = look(sweeps, object_of, motions, points, seen, origins, config)
-    velocities = small_velocities(sweeps.pixel_size)
-    best = best_velocity(sweeps, looks, velocities, origins[1])
+    coarse = best_velocity(sweeps, looks, small_velocities(sweeps.pixel_size), origins[1])
+    suspects = {cell for cell, (_, z) in coarse.items() if z >= SUSPECT_Z}
+    velocities = small_velocities(sweeps.pixel_size, FINER)
+    best = best_velocity(sweeps, looks, velocities, origins[1], suspects) if suspects else {}
     side = max(1, round(SIDE / sweeps.pixel_size))
     doubt = {(m, r, c): best.get((r // side, c // side), (0, 0.0))[1] for m, r, c in sweeps.pixels()}
     best = {cell: found for cell, found in best.items() if found[1] >= SEED_Z}
@@ -89,10 +92,11 @@ def find_local_motion(
     return {pixel: number_of[label[pixel]] for pixel in sweeps.pixels() if pixel in label}, moved, doubt
 
 
-def small_velocities(pixel_size: float) -> List[Vector]:
-    """(y, x), finest pixels per interval, in raster order: whole steps of 0.1 m, at most three long, not none."""
-    steps = [(dy, dx) for dy, dx in product(range(-REACH, REACH + 1), repeat=2) if 0 < dy**2 + dx**2 <= REACH**2]
-    return [(dy * (STEP / pixel_size), dx * (STEP / pixel_size)) for dy, dx in steps]
+def small_velocities(pixel_size: float, parts: int = 1) -> List[Vector]:
+    """(y, x), finest pixels per interval, in raster order: parts of steps of 0.1 m, at most three long, not none."""
+    reach, step = REACH * parts, STEP / parts / pixel_size
+    steps = [(dy, dx) for dy, dx in product(range(-reach, reach + 1), repeat=2) if 0 < dy**2 + dx**2 <= reach**2]
+    return [(dy * step, dx * step) for dy, dx in steps]
 
 
 def look(
@@ -142,7 +146,11 @@ def wins(sweeps: SlicedSweeps, one: Look, velocity: Vector) -> Tuple[int, int]:
 
 
 def best_velocity(
-    sweeps: SlicedSweeps, looks: Sequence[Look], velocities: Sequence[Vector], origin: Sequence[float]
+    sweeps: SlicedSweeps,
+    looks: Sequence[Look],
+    velocities: Sequence[Vector],
+    origin: Sequence[float],
+    asked: Optional[Set[Cell]] = None,
 ) -> Dict[Cell, Tuple[int, float]]:
     """Velocity, by its number, and z of the cells that have one.
 
@@ -152,6 +160,7 @@ def best_velocity(
 
     Args:
         origin: of the ego frame of t.
+        asked: cells that may have one; None = all.
     """
     size = sweeps.pixel_size
     side = max(1, round(SIDE / size))
@@ -169,8 +178,8 @@ def best_velocity(
                 lost[cell] += counts[1]
         for cell in won:
             surplus, noise = won[cell] - lost[cell], won[cell] + lost[cell]
-            is_inside = 0 <= cell[0] < height and 0 <= cell[1] < width
-            if is_inside and won[cell] >= LEAST_WON and surplus > 0:
+            may = 0 <= cell[0] < height and 0 <= cell[1] < width and (asked is None or cell in asked)
+            if may and won[cell] >= LEAST_WON and surplus > 0:
                 z = surplus / math.sqrt(noise)
                 if z > own.get(cell, (0, 0.0))[1]:
                     own[cell] = index, z
