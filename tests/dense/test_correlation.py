@@ -13,7 +13,7 @@ from oracle.dense import scene_flow_in_1view
 from scenes import same_bits
 
 from cflow_torch import CFlowError
-from cflow_torch.dense import correlation, packing
+from cflow_torch.dense import packing
 from cflow_torch.dense.correlation import best_shifts
 from cflow_torch.dense.templates import Images, TemplatePairs
 from cflow_torch.windows import memory
@@ -136,22 +136,6 @@ def test_what_is_searched():
     assert shift_of([(3, 3)], [(6, 7)], (11, 11), float(np.nextafter(5, 0)))[0] == [0, 0]
     # Of even sizes one shift less on the far side.
     assert shift_of([(0, 0)], [(0, 4)], (1, 8))[0] == [0, 0] and shift_of([(0, 4)], [(0, 0)], (1, 8))[0] == [0, -4]
-
-
-def test_company_chunks_and_memory_do_not_matter(monkeypatch):
-    rng = np.random.default_rng(12)
-    targets, pairs = random_pairs(rng, [(5, 6), (20, 20), (9, 33), (70, 3)], 10, False)
-    shift, score = best_shifts(as_pairs(targets, pairs))
-    for i, (template, own, _) in enumerate(pairs):
-        alone = best_shifts(as_pairs([targets[own]], [(template, 0, None)]))
-        assert torch.equal(alone[0][0], shift[i]) and same_bits(alone[1][0], score[i])
-    for engine in ENGINES:
-        for found in (best_shifts(as_pairs(targets, pairs), engine, limit) for limit in (1, 100_000)):
-            assert torch.equal(found[0], shift) and same_bits(found[1], score)
-    monkeypatch.setattr(correlation, "_AT_ONCE_CPU", 600)
-    monkeypatch.setattr(correlation, "_IN_PART_CPU", 900)
-    found = best_shifts(as_pairs(targets, pairs))
-    assert torch.equal(found[0], shift) and same_bits(found[1], score)
 
 
 def test_lines_of_a_gpu_give_the_same(monkeypatch):

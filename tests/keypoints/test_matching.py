@@ -102,24 +102,6 @@ def test_no_key_points():
 # ------------------------------------------------------------------------------------------ what must not matter
 
 
-def test_tiles_groups_and_pieces_do_not_show(monkeypatch):
-    rng = np.random.default_rng(3)
-    images = rng.random((2, 2, 24, 40)) < 0.08
-    expected = matched(*images, 8.0, patch_size=15, ratio_threshold=1.0)
-    assert len(expected.source) > 20
-    for rows, cols, band, group, pairs, strip in (
-        (1, 1, 1, 1, 1, 5),
-        (3, 2, 5, 2, 50, 11),
-        (64, 9, 2, 40, 1 << 17, 63),
-    ):
-        names = ("_TILE_ROWS", "_TILE_COLS", "_BAND", "_GROUP", "_PAIRS_AT_ONCE_CPU")
-        for name, value in zip(names, (rows, cols, band, group, pairs)):
-            monkeypatch.setattr(match_candidates, name, value)
-        monkeypatch.setattr(matching, "_STRIP_NUMBERS", strip)
-        found = matched(*images, 8.0, patch_size=15, ratio_threshold=1.0)
-        assert all(torch.equal(getattr(found, n), getattr(expected, n)) for n in ("source", "shift", "score"))
-
-
 def test_all_within_the_radius_are_candidates():
     rng = np.random.default_rng(4)
     images = torch.from_numpy(rng.random((2, 50, 90)) < 0.05)

@@ -126,14 +126,6 @@ def test_repeated_sweeps_after_t1_are_left_out():
     assert_same_bits(model([replace(window, pcf=(window.pc1, window.pc1))])[0], without)
 
 
-def test_empty_and_hopeless_windows():
-    empty, lost = bare(np.zeros((0, 3))), bare(np.full((5, 3), np.nan))
-    one = bare(np.zeros((1, 3)))
-    for pc0, pc1, later in ((empty, empty, one), (lost, one, empty), (one, lost, one), (one, one, lost)):
-        result = flow_as_oracle(Window(pc0, pc1, (), (later,)), OFFLINE)
-        assert result.residual_flow.shape == (len(pc0.points), 3) and not result.residual_flow.any()
-
-
 # ------------------------------------------------------------------------------------------------- ways to give it
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from oracle.component_tree import with_longest
-from scenes import assert_same_bits, config, flow_as_oracle, reordered, rows_of, scene
+from scenes import config, flow_as_oracle, scene
 from turning_car import MODEL, car_of, turning_car, upright_box
 
 from cflow_torch import Sweep, VerifiedFlow, Window, make_config
@@ -70,24 +70,6 @@ def test_more_of_real_drives_equals_the_oracle(av2_folder, data_root, preset):
 
 
 # --------------------------------------------------------------------------------------------- what must not matter
-
-
-def test_alone_or_in_a_batch_in_any_order_of_points():
-    # Mixed lengths of history: only the windows that are pairs are shifted, whatever lies beside them.
-    windows = [turning_car(seed, history, 0.4) for seed, history in ((0, 2), (1, 0), (2, 1), (3, 2))]
-    model = VerifiedFlow(MODEL.replace(num_history=2))
-    for window, result in zip(windows, model(windows)):
-        assert_same_bits(model([window])[0], result)
-        mixed, order = reordered(window)
-        assert_same_bits(model([mixed])[0], rows_of(result, order))
-
-
-def test_empty_and_hopeless_windows():
-    empty, lost = Sweep(np.zeros((0, 3), np.float32)), Sweep(np.full((5, 3), np.nan, np.float32))
-    one = Sweep(np.zeros((1, 3), np.float32))
-    for pc0, pc1 in ((empty, empty), (lost, one), (one, lost), (one, one)):
-        result = flow_as_oracle(Window(pc0, pc1), MODEL)
-        assert result.residual_flow.shape == (len(pc0.points), 3) and not result.residual_flow.any()
 
 
 # ---------------------------------------------------------------------------------------------- what parts are for
