@@ -7,12 +7,13 @@ import json
 import shutil
 import zipfile
 from pathlib import Path
-from typing import Any, Callable, Dict, List
+from typing import Any, Callable, Dict
 
 import numpy as np
 import pyarrow as pa
 import pytest
 from command_line import cflow
+from hdf5_scene import write_scene
 from public_evaluators import FLOW, LOG, TIME, read_pair
 from pyarrow import feather
 from scenes import pose
@@ -244,29 +245,14 @@ def test_archives_that_are_none(archives: Dict[int, Any], tmp_path: Path) -> Non
 # ---- which frames, which points
 
 
-def write_scene(file: Path, masked: List[int], num_sweeps: int = 8) -> Path:
-    """An HDF5 scene whose sweeps `masked` carry an evaluation mask."""
-    h5py = pytest.importorskip("h5py")
-    rng = np.random.default_rng(0)
-    with h5py.File(file, "w") as scene:
-        for index in range(num_sweeps):
-            group = scene.create_group(str(10**18 + index * 10**8))
-            group["lidar"] = rng.uniform(-60, 60, (40 + index, 3)).astype(np.float32)
-            group["ground_mask"] = rng.random(40 + index) < 0.3
-            group["pose"] = np.eye(4)
-            if index in masked:
-                group["eval_mask"] = rng.random((40 + index, 1)) < 0.5
-    return file
-
-
 def test_frames_go_by_the_masks_of_the_scene(tmp_path: Path) -> None:
-    with HDF5Log(write_scene(tmp_path / "scene.h5", [2, 3, 7])) as log:
+    with HDF5Log(write_scene(tmp_path / "scene.h5", range(8), 1, [2, 3, 7])) as log:
         for number in (1, 3):
             plan = plan_log(log, get_version(number))
             assert [frame.name for frame in plan] == [f"scene/{log.timestamps[i]}.feather" for i in (2, 3)], "7 is last"
-            assert plan[0].expect(get_version(number)).rows == (log.eval_mask(2).sum() if number == 1 else 42)
+            assert plan[0].expect(get_version(number)).rows == (log.eval_mask(2).sum() if number == 1 else 52)
         assert [f.name for f in plan_log(log, get_version(2))] == [f"scene/{i:010d}.feather" for i in (0, 5)]
-    with HDF5Log(write_scene(tmp_path / "plain.h5", [])) as log:
+    with HDF5Log(write_scene(tmp_path / "plain.h5", range(8), 1, [])) as log:
         assert [frame.index for frame in plan_log(log, get_version(3))] == [0, 5]
         for stamp in (log.timestamps[-1], 17):
             with pytest.raises(CFlowError, match="is no sweep of the log, or its last"):
