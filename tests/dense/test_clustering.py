@@ -84,28 +84,6 @@ def test_connectivity_matters_at_the_corners():
     assert count(corner, connectivity=8) == 1 and count(corner, connectivity=4) == 2
 
 
-def test_exactly_the_largest_extent_is_not_oversized():
-    # Dilated, the component is 11 pixels long: 2.75 m. Oversized, it would fall apart
-    # at the gap, where the two dilated parts touch along two pixels only.
-    image = drawing("." * 13, "..####.......", "........###..", "." * 13)
-    assert count(image, max_extent=2.75) == 1
-    assert count(image, max_extent=float(np.nextafter(2.75, 0))) == 2
-
-
-def test_the_border_cuts_the_dilated_box_and_ignores_what_lies_outside():
-    # The same at the left border: 10 pixels, 2.5 m.
-    image = drawing("." * 13, "####.........", "......###....", "." * 13)
-    assert count(image, max_extent=2.5) == 1 and count(image, max_extent=2.4) == 2
-    # In the first rows the two parts touch along two pixels, which is all that fits into the image.
-    assert count(drawing("####.......", "......###..", "." * 11), max_extent=0.5) == 1
-
-
-def test_only_oversized_components_are_split():
-    split_me = ("#####............", ".......#####.....", "..............###")
-    image = drawing("##...............", "....##...........", *["." * 17] * 3, *split_me, "." * 17)
-    assert found(image, config(max_extent=3.0)).size.tolist() == [[2, 6], [1, 5], [1, 5], [1, 3]]
-
-
 def test_a_cluster_needs_pixels_at_t1_and_before():
     images = np.zeros((1, 3, 5, 30), dtype=bool)
     images[0, 0, 2, [1, 12, 20]] = True  # t+1

@@ -99,26 +99,6 @@ def test_every_small_image_equals_the_oracle():
     assert_equals_oracle(images, [(template, own, None) for own in range(len(images)) for template in images[::3]])
 
 
-@pytest.mark.parametrize(
-    "target, best",
-    [
-        ([(3, 1), (3, 5)], (0, -2)),  # equal distance left and right: the smaller dx
-        ([(1, 3), (5, 3)], (-2, 0)),  # above and below: the smaller dy
-        ([(3, 5), (4, 3)], (1, 0)),  # the nearer one
-        ([(2, 4), (4, 2)], (-1, 1)),  # same distance: dy before dx
-        ([(3, 3), (3, 4)], (0, 0)),  # where it is
-    ],
-)
-def test_ties(target, best):
-    image, template = np.zeros((2, 7, 7), dtype=bool)
-    template[3, 3] = True
-    for pixel in target:
-        image[pixel] = True
-    for engine in ENGINES:
-        assert best_shifts(as_pairs([image], [(template, 0, None)]), engine)[0].tolist() == [list(best)]
-    assert scene_flow_in_1view(template, image, 1.0)[0] == best[::-1]
-
-
 def shift_of(template: List[Tuple[int, int]], target: List[Tuple[int, int]], shape, radius=None) -> Tuple[list, float]:
     image, other = np.zeros((2, *shape), dtype=bool)
     for pixels, drawn in ((template, image), (target, other)):

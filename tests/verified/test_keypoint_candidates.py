@@ -1,4 +1,4 @@
-"""Key points as motion candidates: the oracle's matches and medians, and what they are for."""
+"""Key points as motion candidates: the oracle's matches, and what they are for."""
 
 from __future__ import annotations
 
@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 import torch
 from moving_scenes import for_oracle
-from oracle.candidates import keypoint_motion, keypoint_shifts
+from oracle.candidates import keypoint_shifts
 from scenes import config, scene, sweeps_of
-from test_component_tree import as_level
 
 from cflow_torch import Sweep, Window, make_model
-from cflow_torch.verified.keypoint_candidates import KeyPointMotion, match_key_points
+from cflow_torch.verified.keypoint_candidates import match_key_points
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -28,18 +27,6 @@ def test_matches_equal_the_oracle(seed):
         for (_, r, c), shift in keypoint_shifts(for_oracle(sweeps, window), settings).items()
     }
     assert mine == expected and len(expected) > 10
-
-
-def test_medians_equal_the_oracle():
-    rng = np.random.default_rng(0)
-    labels = np.where(rng.random(60) < 0.2, -1, rng.integers(0, 7, 60))
-    pixel, shifts = np.sort(rng.permutation(60)[:35]), rng.integers(-3, 4, (35, 2)).astype(np.float64)
-    pixel = pixel[labels[pixel] != 4]  # a component without a match
-    shifts = shifts[: len(pixel)]
-    found = KeyPointMotion(torch.from_numpy(pixel), torch.from_numpy(shifts)).of_components(as_level(labels.tolist()))
-    listed = {(1, int(p), 0): tuple(shift) for p, shift in zip(pixel, shifts.tolist())}
-    expected = [keypoint_motion([(1, int(p), 0) for p in np.flatnonzero(labels == i)], listed) for i in range(7)]
-    assert found.tolist() == [list(motion) for motion in expected] and expected[4] == (0.0, 0.0)
 
 
 def test_they_find_what_moves_farther_than_it_is_long():
