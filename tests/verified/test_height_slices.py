@@ -52,6 +52,7 @@ def test_coarse_pixels_have_the_slices_of_all_their_pixels(block):
         assert np.array_equal(coarse[window], [coarsen(image, block) for image in images[window]])
     height, width = coarse.shape[2:]
     assert same_bits(column, (sweeps.window * height + sweeps.row // block) * width + sweeps.col // block)
+    assert same_bits(sweeps.slices_at(sweeps.window, sweeps.step, sweeps.row, sweeps.col), sweeps.slices)
 
 
 def test_slices_by_hand():

@@ -141,8 +141,8 @@ def test_pairs_and_empty_windows_are_left_alone():
 
 
 def column(slices: int, velocity: Sequence[float], sensor: Sequence[float] = (0.0, 0.0)) -> int:
-    """Groups that are found in a thing, so many slices high, that crosses a larger one which stands, if the sensor
-    drives."""
+    """Groups that are found in a thing, so many slices high, that crosses a larger one which stands, as the oracle
+    finds them, if the sensor drives."""
     rng = np.random.default_rng(3)
     thing = rng.uniform((0.0, 0.0, -1.5), (0.5, 0.5, 0.5 * slices - 1.5), (250, 3))
     wall, sweeps = rng.uniform((-2.0, 0.7, -1.5), (2.0, 1.0, 0.5), (900, 3)), []
@@ -151,7 +151,10 @@ def column(slices: int, velocity: Sequence[float], sensor: Sequence[float] = (0.
         points = np.concatenate((thing - [*(k * np.array(velocity)), 0.0], wall)) - T_world_ego[:3, 3]
         sweeps.append(Sweep(points.astype(np.float32), pose=T_world_ego))
     objects, motion, levels, images = asked([Window(sweeps[1], sweeps[0], tuple(sweeps[2:]))], settings_of())
-    return int(find_local_motion(objects, torch.zeros_like(motion), levels, images)[1].any(1).sum())
+    found = find_local_motion(objects, torch.zeros_like(motion), levels, images)
+    *truth, _ = expected(objects, torch.zeros_like(motion), images, 0, settings_of())
+    assert list(by_pixel(found[0], found[1], images, 0)) == truth
+    return int(found[1].any(1).sum())
 
 
 def test_what_is_believed():
