@@ -58,6 +58,7 @@ def in_pieces(config: Config, windows: List[Window]) -> Results:
         "keypoints.match_candidates._BAND": 5,
         "keypoints.match_candidates._GROUP": 2,
         "keypoints.matching._STRIP_NUMBERS": 11,
+        "keypoints.matching._CONTENDERS_AT_ONCE": 40,
     }
     with pytest.MonkeyPatch.context() as patch:
         for name, value in pieces.items():

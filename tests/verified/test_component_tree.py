@@ -44,9 +44,6 @@ def test_components_equal_the_oracle(block, is_undilated):
     assert total > 10
 
 
-# ------------------------------------------------------------------------------------------------ parents, winners
-
-
 def as_level(labels: List[int]) -> Level:
     """A level that knows nothing but the component of each pixel, -1 = none."""
     count = max(labels, default=-1) + 1
