@@ -118,6 +118,14 @@ def test_what_is_searched():
     assert shift_of([(0, 0)], [(0, 4)], (1, 8))[0] == [0, 0] and shift_of([(0, 4)], [(0, 0)], (1, 8))[0] == [0, -4]
 
 
+def test_company_does_not_matter():
+    targets, pairs = random_pairs(np.random.default_rng(12), [(5, 6), (20, 20), (9, 33), (70, 3)], 10, False)
+    shift, score = best_shifts(as_pairs(targets, pairs))
+    for i, (template, own, _) in enumerate(pairs):
+        alone = best_shifts(as_pairs([targets[own]], [(template, 0, None)]))
+        assert torch.equal(alone[0][0], shift[i]) and same_bits(alone[1][0], score[i])
+
+
 def test_lines_of_a_gpu_give_the_same(monkeypatch):
     targets, pairs = random_pairs(np.random.default_rng(3), [(5, 6), (300, 290), (40, 41)], 4, False)
     shift, score = best_shifts(as_pairs(targets, pairs))
