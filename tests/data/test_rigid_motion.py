@@ -6,11 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cflow_torch.data.rigid_motion import (
-    poses_from_quaternions,
-    to_quaternions,
-    to_rotations,
-)
+from cflow_torch.data.rigid_motion import poses_from_quaternions, to_quaternions, to_rotations
 
 
 @pytest.mark.parametrize("count", [0, 1, 3, 4, 50])  # old kornia crosses along the wrong axis where there are three

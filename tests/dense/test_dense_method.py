@@ -7,16 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from scenes import (
-    assert_same,
-    box,
-    config,
-    flow_as_oracle,
-    needs_gpu,
-    needs_kornia_labelling,
-    pose,
-    scene,
-)
+from scenes import assert_same, box, config, flow_as_oracle, needs_gpu, needs_kornia_labelling, pose, scene
 
 from cflow_torch import CorrelationFlow, Sweep, Window, estimate_flow, make_config
 from cflow_torch.data.av2 import AV2Log

@@ -8,15 +8,7 @@ import numpy as np
 import pytest
 import torch
 from oracle.keypoints import match_radius
-from scenes import (
-    assert_same,
-    box,
-    config,
-    flow_as_oracle,
-    needs_gpu,
-    needs_kornia_labelling,
-    scene,
-)
+from scenes import assert_same, box, config, flow_as_oracle, needs_gpu, needs_kornia_labelling, scene
 
 from cflow_torch import CorrelationFlowKeypoints, Sweep, Window, estimate_flow, make_config
 from cflow_torch.data.av2 import AV2Log

@@ -6,10 +6,7 @@ import numpy as np
 import torch
 
 from cflow_torch.ops.indices import divide, split_index
-from cflow_torch.ops.segments import (
-    masked_median,
-    segment_median,
-)
+from cflow_torch.ops.segments import masked_median, segment_median
 
 
 def test_medians_are_numpys():

@@ -8,12 +8,7 @@ from typing import List, Optional, Sequence
 import numpy as np
 import pytest
 import torch
-from scenes import (
-    assert_same_bits,
-    config,
-    flow_as_oracle,
-    scene,
-)
+from scenes import assert_same_bits, config, flow_as_oracle, scene
 from turning_car import MODEL, upright_box
 
 from cflow_torch import CFlowError, FlowResult, Sweep, VerifiedFlow, Window, estimate_flow, make_model

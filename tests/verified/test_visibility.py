@@ -16,18 +16,6 @@ REGION = (-20.0, -20.0, -3.0, 20.0, 20.0, 5.0)
 SETTINGS = VerifiedConfig(pixel_sizes=(0.25,), point_cloud_range=REGION, num_history=3, num_future=2, min_height=None)
 
 
-def asked(windows: Sequence[Window], places: np.ndarray) -> torch.Tensor:
-    """(B, S, K) bool: which places are hidden in which sweep."""
-    sweeps = sweeps_of(list(windows), SETTINGS)
-    images, (num_windows, num_steps) = RangeImages(sweeps), sweeps.elapsed.shape
-    hidden = torch.zeros((num_windows, num_steps, len(places)), dtype=torch.bool)
-    for window in range(num_windows):
-        for step in range(num_steps):
-            where = [torch.full((len(places),), at) for at in (window, step)]
-            hidden[window, step] = images.hide(*where, *torch.from_numpy(places).T)
-    return hidden
-
-
 def screen(distance: float, at: Sequence[float] = (0.0, 0.0)) -> np.ndarray:
     """4 m wide and 2 m high, dense, so far before a sensor that stands 1.6 m over the ground, which is at z = -2."""
     y, z = np.meshgrid(np.arange(-2, 2, 0.02), np.arange(-2, 0, 0.05))
@@ -40,7 +28,9 @@ def hides(newest: np.ndarray, older: np.ndarray, places: Sequence[Sequence[float
     T_world_ego = pose(0.0, way, 0.0)
     clouds = [np.concatenate((cloud, ground)) for cloud in (newest, older)]
     pc1, pc0 = Sweep(clouds[0], pose=np.eye(4)), Sweep(clouds[1] - T_world_ego[:3, 3], pose=T_world_ego)
-    return asked([Window(pc0, pc1)], np.array(places))[0].tolist()
+    images, first = RangeImages(sweeps_of([Window(pc0, pc1)], SETTINGS)), torch.zeros(len(places), dtype=torch.int64)
+    columns = torch.tensor(places, dtype=torch.float64).unbind(1)
+    return [images.hide(first, first + step, *columns).tolist() for step in (0, 1)]
 
 
 def test_what_is_behind_a_screen_is_hidden():
