@@ -1,4 +1,4 @@
-"""Visibility: what is behind something is hidden, what is beside it is not."""
+"""Visibility: the oracle's answers on random returns; what is behind something is hidden, what is beside it is not."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ from typing import List, Sequence
 
 import numpy as np
 import torch
-from scenes import pose, sweeps_of
+from oracle import visibility as oracle
+from scenes import pose, scene, sweeps_of
 
 from cflow_torch import Sweep, Window
 from cflow_torch.config import VerifiedConfig
@@ -14,6 +15,44 @@ from cflow_torch.verified.visibility import RangeImages
 
 REGION = (-20.0, -20.0, -3.0, 20.0, 20.0, 5.0)
 SETTINGS = VerifiedConfig(pixel_sizes=(0.25,), point_cloud_range=REGION, num_history=3, num_future=2, min_height=None)
+_rng = np.random.default_rng(0)
+_GRID = np.stack(np.meshgrid(np.arange(-7.95, 8, 1.0), np.arange(-6.95, 7, 1.0), (-1.75, -0.25, 1.25)), -1)
+PLACES = np.concatenate((_rng.uniform((-25, -25, -9), (25, 25, 9), (300, 3)), _GRID.reshape(-1, 3)))
+
+
+def asked(windows: Sequence[Window], places: np.ndarray = PLACES) -> torch.Tensor:
+    """(B, S, K) bool: which places are hidden in which sweep."""
+    sweeps = sweeps_of(list(windows), SETTINGS)
+    images, (num_windows, num_steps) = RangeImages(sweeps), sweeps.elapsed.shape
+    hidden = torch.zeros((num_windows, num_steps, len(places)), dtype=torch.bool)
+    for window in range(num_windows):
+        for step in range(num_steps):
+            where = [torch.full((len(places),), at) for at in (window, step)]
+            hidden[window, step] = images.hide(*where, *torch.from_numpy(places).T)
+    return hidden
+
+
+def expected(windows: Sequence[Window]) -> List[List[List[bool]]]:
+    batch = sweeps_of(list(windows), SETTINGS).batch
+    result = []
+    for window in range(len(windows)):
+        rows = [(batch.image == window * batch.num_steps + step) & batch.takes_part for step in range(batch.num_steps)]
+        clouds = [batch.positions[:, row].T.numpy() for row in rows]
+        height = oracle.sensor_height(clouds[0])
+        images = [oracle.RangeImage(*of, height) for of in zip(clouds, batch.origin[window].tolist())]
+        result.append([[image.hides(place) for place in PLACES.tolist()] for image in images])
+    return result
+
+
+def test_answers_equal_the_oracle():
+    for seed in range(4):
+        windows = [
+            scene(70 + 5 * seed + i, num_history=(seed + i) % 3, num_future=2 * (i == 1), poses=seed % 4 > 0)
+            for i in range(1 + seed % 3)
+        ]
+        hidden = asked(windows)
+        assert hidden.tolist() == expected(windows)
+        assert 0.02 < hidden.float().mean() < 0.3
 
 
 def screen(distance: float, at: Sequence[float] = (0.0, 0.0)) -> np.ndarray:
@@ -28,9 +67,7 @@ def hides(newest: np.ndarray, older: np.ndarray, places: Sequence[Sequence[float
     T_world_ego = pose(0.0, way, 0.0)
     clouds = [np.concatenate((cloud, ground)) for cloud in (newest, older)]
     pc1, pc0 = Sweep(clouds[0], pose=np.eye(4)), Sweep(clouds[1] - T_world_ego[:3, 3], pose=T_world_ego)
-    images, first = RangeImages(sweeps_of([Window(pc0, pc1)], SETTINGS)), torch.zeros(len(places), dtype=torch.int64)
-    columns = torch.tensor(places, dtype=torch.float64).unbind(1)
-    return [images.hide(first, first + step, *columns).tolist() for step in (0, 1)]
+    return asked([Window(pc0, pc1)], np.array(places))[0].tolist()
 
 
 def test_what_is_behind_a_screen_is_hidden():
