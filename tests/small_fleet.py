@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any, Dict, List
 
+from command_line import cflow
+
 from cflow_torch import make_config
-from cflow_torch.cli.main import main
 from cflow_torch.data.catalog import find_sources
 from cflow_torch.fleet.job import Job, Shard
 from cflow_torch.fleet.machine import Layout
@@ -59,14 +59,7 @@ def run(
 
 def command(*arguments: Any) -> int:
     """Exit status of `cflow flow` in this process."""
-    before = list(sys.argv)
-    try:
-        main([*COMMAND, "engine.workers=1", *map(str, arguments)])
-    except SystemExit as end:
-        return int(end.code or 0)
-    finally:
-        sys.argv = before
-    return 0
+    return cflow(*COMMAND, "engine.workers=1", *arguments)
 
 
 def tree(output: Path) -> Dict[str, bytes]:

@@ -9,15 +9,7 @@ from dataclasses import fields
 import pytest
 
 from cflow_torch import CFlowError, make_config, make_model
-from cflow_torch.config import (
-    CONFIGS,
-    PRESETS,
-    REMOVED,
-    DenseConfig,
-    KeypointsConfig,
-    VerifiedConfig,
-    config_from,
-)
+from cflow_torch.config import CONFIGS, PRESETS, REMOVED, DenseConfig, KeypointsConfig, VerifiedConfig, config_from
 
 INF = math.inf
 

@@ -53,8 +53,12 @@ def in_pieces(config: Config, windows: List[Window]) -> Results:
         "dense.correlation._IN_PART_CPU": 900,
         "verified.paired_test._LOOKS_ON_CPU": 500,
         "keypoints.match_candidates._PAIRS_AT_ONCE_CPU": 5000,
+        "keypoints.match_candidates._TILE_ROWS": 3,
         "keypoints.match_candidates._TILE_COLS": 5,
+        "keypoints.match_candidates._BAND": 5,
+        "keypoints.match_candidates._GROUP": 2,
         "keypoints.matching._STRIP_NUMBERS": 11,
+        "keypoints.matching._CONTENDERS_AT_ONCE": 40,
     }
     with pytest.MonkeyPatch.context() as patch:
         for name, value in pieces.items():

@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from oracle.component_tree import with_longest
 from preset_windows import changed
 from scenes import assert_same, flow_as_oracle, pose
 
@@ -93,7 +92,7 @@ def test_dense_equals_the_oracle(window, overrides):
 @settings(PROFILE, max_examples=40)
 @given(windows(), verified, st.sampled_from([None, 2 * S, 1.0]))
 def test_verified_equals_the_oracle(window, overrides, longest):
-    flow_as_oracle(window, with_longest(small("verified", **overrides), longest))
+    flow_as_oracle(window, small("verified", max_object=longest, **overrides))
 
 
 @settings(PROFILE, max_examples=30)

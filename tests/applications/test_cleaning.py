@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Callable
+from typing import Any
 
 import numpy as np
 import pytest
 from staged_cars import Staged, straight
+from test_tracks_of_runs import calls_on_a_drive
 
 from cflow_torch import CFlowError, CleanLog, Sweep, static_map
 from cflow_torch.data.arrays import ArraysLog, write_array_log
@@ -96,10 +97,8 @@ def test_what_cannot_be_done_is_said() -> None:
         static_map(log, 1e-5)
 
 
-def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
-    from test_tracks_of_runs import cflow  # the same small drive and call
-
-    call: Callable[..., int] = cflow(tmp_path, monkeypatch)
+def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    call = calls_on_a_drive(tmp_path)
     settings = ("model=fast", "map=true", "voxel_size=0.5", "suffix=.ply")
     assert call("clean", "clean", *settings) == 0
     (file,) = (tmp_path / "clean").glob("*.ply")

@@ -12,11 +12,11 @@ from typing import Any, Dict, List
 
 import numpy as np
 import pytest
+from command_line import cflow
 
 from cflow_torch import CFlowError, make_config, make_model
 from cflow_torch.applications import labels
 from cflow_torch.applications.labels import find_labels, label_scene
-from cflow_torch.cli.main import main
 from cflow_torch.data.hdf5 import HDF5Log, write_hdf5_results, write_hdf5_scene
 from cflow_torch.data.log import windows
 from cflow_torch.simulator import make_drive
@@ -57,16 +57,9 @@ def stored(file: Path) -> List[Dict[str, Any]]:
         return [{key: scene[stamp][key][()] for key in scene[stamp]} for stamp in sorted(scene, key=int)]
 
 
-def cflow(*arguments: Any) -> int:
-    """Exit status of `cflow label` in this process."""
-    before = list(sys.argv)
-    try:
-        main([*CALL, *map(str, arguments)])
-    except SystemExit as end:
-        return int(end.code or 0)
-    finally:
-        sys.argv = before
-    return 0
+def label(*arguments: Any) -> int:
+    """Exit status of `cflow label`."""
+    return cflow(*CALL, *arguments)
 
 
 def test_types_and_meanings_of_every_sweep(labelled: Path, drives: Path) -> None:
@@ -167,14 +160,14 @@ def test_labels_of_others_are_not_replaced_unasked(scenes: Path, tmp_path: Path,
     before = file.read_bytes()
     with pytest.raises(CFlowError, match="has dufo already: overwrite=true"):
         label_scene(file, make_model(make_config("fast"), "cpu"))
-    assert cflow(scenes, output) == 2
+    assert label(scenes, output) == 2
     error = capsys.readouterr().err
     assert "scene-2.h5 has labels of other settings or of another program: overwrite=true" in error
     assert error.count("\n") == 1
     assert file.read_bytes() == before and not list(tmp_path.glob("out/*/*.feather"))
-    assert cflow(scenes, output, "overwrite=true") == 0
+    assert label(scenes, output, "overwrite=true") == 0
     assert all(sweep["dufo"].dtype == np.uint8 and sweep["dufo"].max() == 1 for sweep in stored(file))
-    assert cflow(scenes, output, "model.significance=2") == 2
+    assert label(scenes, output, "model.significance=2") == 2
     assert "has labels of other settings" in capsys.readouterr().err
 
 
@@ -197,7 +190,7 @@ def test_a_killed_run_leaves_whole_scenes_and_goes_on(scenes: Path, tmp_path: Pa
     assert second.read_bytes() == before["scene-2.h5"] and first.read_bytes() != before["scene-1.h5"]
     assert any(name.endswith(".tmp") for name in os.listdir(scenes))
     place, frames = first.stat().st_ino, {f: f.stat().st_mtime_ns for f in tmp_path.glob("out/*/*.feather")}
-    assert cflow(scenes, output) == 0
+    assert label(scenes, output) == 0
     assert first.stat().st_ino == place, "a labelled scene is left alone"
     assert frames == {f: f.stat().st_mtime_ns for f in tmp_path.glob("out/*/*.feather")}, "flow is not computed again"
     assert all("nnd" in sweep for sweep in stored(second)) and sorted(os.listdir(scenes)) == sorted(before)
@@ -206,7 +199,7 @@ def test_a_killed_run_leaves_whole_scenes_and_goes_on(scenes: Path, tmp_path: Pa
 def test_shards_label_every_scene_once(scenes: Path, tmp_path: Path, capsys: Any) -> None:
     """Three shards of two scenes: the middle one has a part of both."""
     for index, count in ((1, 0), (0, 1), (2, 1)):
-        assert cflow(scenes, f"output={tmp_path / 'out'}", f"shard.index={index}", "shard.count=3") == 0
+        assert label(scenes, f"output={tmp_path / 'out'}", f"shard.index={index}", "shard.count=3") == 0
         assert f"scenes labelled: {count}," in capsys.readouterr().out
     assert all("dufo" in sweep for file in scenes.iterdir() for sweep in stored(file))
 
@@ -221,7 +214,7 @@ def test_scenes_that_cannot_be_labelled_are_reported_and_the_others_are(
         for name in sorted(scene, key=int)[1:]:
             del scene[name]
     before = single.read_bytes()
-    assert cflow(scenes, f"output={tmp_path / 'out'}") == 1
+    assert label(scenes, f"output={tmp_path / 'out'}") == 1
     error = capsys.readouterr().err
     assert "has 1 sweeps; scene flow needs two or more" in error and "scene-3.h5" in error and "Traceback" not in error
     assert single.read_bytes() == before and "dufo" in stored(scenes / "scene-2.h5")[0]
@@ -237,7 +230,7 @@ def test_scenes_that_cannot_be_labelled_are_reported_and_the_others_are(
     ],
 )
 def test_a_wrong_call_is_one_clear_error(call: str, message: str, tmp_path: Path, capsys: Any) -> None:
-    assert cflow(*call.format(tmp_path).split(), f"output={tmp_path / 'out'}") == 2
+    assert label(*call.format(tmp_path).split(), f"output={tmp_path / 'out'}") == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ") and error.count("\n") == 1 and message.format(tmp_path) in error
 

@@ -13,11 +13,11 @@ from typing import Any, List, Optional
 import numpy as np
 import pytest
 import torch
+from command_line import cflow
 from preset_windows import small
 from scenes import assert_same_bits, scene
 
 from cflow_torch import CFlowError, FlowResult, FlowStream, Sweep, Window, make_model
-from cflow_torch.cli.main import main
 from cflow_torch.simulator import make_drive
 
 
@@ -155,16 +155,8 @@ def test_ground_is_found_once_and_poses_by_odometry() -> None:
 
 
 def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    main(
-        [
-            "stream",
-            "data.num_sweeps=4",
-            f"data.cache={tmp_path / 'cache'}",
-            "model=fast",
-            "pace=null",
-            f"output={tmp_path / 'out'}",
-        ]
-    )
+    data = ("data.num_sweeps=4", f"data.cache={tmp_path / 'cache'}")
+    assert cflow("stream", *data, "model=fast", "pace=null", f"output={tmp_path / 'out'}") == 0
     report = json.loads((tmp_path / "out" / "stream.json").read_text())
     assert report["sweeps"] == 4 and report["results"] == 3 and report["in_time"] is None
     assert 0 < report["latency"]["p50"] <= report["latency"]["p99"] and "latency: median" in capsys.readouterr().out

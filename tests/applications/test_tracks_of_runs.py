@@ -2,40 +2,29 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Callable
 
 import numpy as np
 import pytest
+from command_line import cflow
 
 from cflow_torch.applications.track_table import read_tracks
-from cflow_torch.cli.main import main
 from cflow_torch.simulator import make_drive
 from cflow_torch.simulator.writers.av2 import write_av2_log
 
 SMALL = "model.point_cloud_range=[-20,-20,-inf,20,20,inf]"
 
 
-def cflow(folder: Path, monkeypatch: pytest.MonkeyPatch, num_sweeps: int = 4) -> Callable[..., int]:
+def calls_on_a_drive(folder: Path, num_sweeps: int = 4) -> Callable[..., int]:
     """A call of a command on a small simulated drive, (command, folder of its output, settings) -> exit status."""
     write_av2_log(make_drive(seed=3, num_sweeps=num_sweeps, profile="demo"), folder / "data")
-    monkeypatch.setattr(sys, "argv", list(sys.argv))
-
-    def call(command: str, output: str, *settings: str) -> int:
-        try:
-            main([command, "data=av2", f"data.root={folder / 'data'}", f"output={folder / output}", SMALL, *settings])
-        except SystemExit as stop:
-            return int(stop.code or 0)
-        return 0
-
-    return call
+    data = ("data=av2", f"data.root={folder / 'data'}", SMALL)
+    return lambda command, output, *settings: cflow(command, *data, f"output={folder / output}", *settings)
 
 
-def test_resumed_and_sharded_runs_write_the_same_table(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
-    call = cflow(tmp_path, monkeypatch, 7)
+def test_resumed_and_sharded_runs_write_the_same_table(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    call = calls_on_a_drive(tmp_path, 7)
     run = ("model=fast", "tracks=true", "engine.workers=1")
     assert call("flow", "whole", *run) == 0
     (file,) = (tmp_path / "whole").glob("*/tracks.parquet")
@@ -61,7 +50,7 @@ def test_the_viewer_shows_the_boxes(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     pytest.importorskip("rerun")
     from cflow_torch.viz import recording
 
-    call, shown = cflow(tmp_path, monkeypatch, 6), []
+    call, shown = calls_on_a_drive(tmp_path, 6), []
     assert call("flow", "flow", "model=fast", "tracks=true", "engine.workers=1") == 0
     add = recording._Drive.add_tracks
     monkeypatch.setattr(recording._Drive, "add_tracks", lambda self, rows: (shown.append(rows), add(self, rows)))

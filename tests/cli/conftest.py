@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any, Callable
 
+import command_line
 import hydra
 import pytest
 from hydra.core.hydra_config import HydraConfig
 
 from cflow_torch.cli import schemas  # noqa: F401 (registers them)
-from cflow_torch.cli.main import main
 from cflow_torch.simulator import make_drive
 from cflow_torch.simulator.writers.av2 import write_av2_log
 
@@ -32,17 +31,8 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def cflow(cache: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
     """A call of `cflow`, which gives its exit status."""
     monkeypatch.setenv("CFLOW_CACHE", str(cache))
-    monkeypatch.setattr(sys, "argv", list(sys.argv))
     monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
-
-    def call(*arguments: object) -> int:
-        try:
-            main([str(argument) for argument in arguments])
-        except SystemExit as stop:
-            return int(stop.code or 0)
-        return 0
-
-    return call
+    return command_line.cflow
 
 
 @pytest.fixture(scope="session")

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from command_line import cflow
 from scenes import RANGE, scene
 
 from cflow_torch import make_config, make_model
 from cflow_torch.cli.bench import measure
-from cflow_torch.cli.main import main
 
 
 def test_it_measures_total_stages_and_batches() -> None:
@@ -26,10 +26,9 @@ def test_it_measures_total_stages_and_batches() -> None:
     assert report["peak_bytes"] > 2**20
 
 
-def test_the_command_writes_what_it_prints(tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sys.argv", ["cflow"])
+def test_the_command_writes_what_it_prints(tmp_path: Path, capsys: Any) -> None:
     data = ["data.num_sweeps=3", f"data.cache={tmp_path}", "model=paper", "pairs=5", "repeats=1", "batches=[2]"]
-    main(["bench", *data, f"output={tmp_path / 'out'}"])
+    assert cflow("bench", *data, f"output={tmp_path / 'out'}") == 0
     report = json.loads((tmp_path / "out" / "bench.json").read_text())
     assert report["windows"] == 2, "the log has two pairs"
     assert report["model"]["method"] == "dense"

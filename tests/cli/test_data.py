@@ -3,56 +3,25 @@
 from __future__ import annotations
 
 import json
-from importlib import import_module
 from pathlib import Path
 from typing import Any, Callable
 
 import numpy as np
 import pytest
-from tiny_recording import TinyRecording
+from small_logs import SMALL_LOGS, write_small_log
 
 from cflow_torch.cli.arguments import for_hydra
-from cflow_torch.data.arrays import write_array_log
 from cflow_torch.data.catalog import _MARKS, DATA_SETS, recognise
 from cflow_torch.data.flow_file import read_flow
-from cflow_torch.simulator import make_drive
-from cflow_torch.simulator.benchmark import FORMATS
 from cflow_torch.types import CFlowError
 
 Cflow = Callable[..., int]
-SMALL = "model.point_cloud_range=[-20,-20,-inf,20,20,inf]"
 
 
-def written(name: str, folder: Path) -> Path:
-    """A small drive in one of the formats that there is a writer for."""
-    if name == "bags":
-        pytest.importorskip("rosbags")
-        from bag_writer import write_bag
-
-        folder.mkdir()
-        write_bag(folder, "mcap", TinyRecording(("velodyne",), num_sweeps=3))
-        return folder
-    drive = make_drive(seed=3, num_sweeps=3, profile="demo" if name in ("av2", "arrays", "hdf5") else name)
-    if name == "arrays":
-        return write_array_log(drive, folder)
-    if name == "hdf5":
-        pytest.importorskip("h5py")
-        from cflow_torch.data.hdf5.writer import write_hdf5_scene
-
-        write_hdf5_scene(drive, folder / "scene.h5")
-        return folder
-    module = import_module(f"cflow_torch.simulator.writers.{FORMATS[name].module}")
-    getattr(module, FORMATS[name].function)(drive, folder)
-    return folder
-
-
-OTHERS = (pytest.param(name, marks=pytest.mark.slow) for name in FORMATS if name != "av2")
-
-
-@pytest.mark.parametrize("name", ["arrays", "av2", "bags", "hdf5", *OTHERS])
+@pytest.mark.parametrize("name", SMALL_LOGS)
 def test_a_path_is_enough(name: str, tmp_path: Path, cflow: Cflow, capsys: pytest.CaptureFixture) -> None:
-    root = written(name, tmp_path / "data")
-    call = ("flow", root, f"output={tmp_path / 'out'}", "model=paper", SMALL, "engine.workers=1", "data.check=false")
+    root = write_small_log(name, tmp_path / "data")
+    call = ("flow", root, f"output={tmp_path / 'out'}", "model=paper", "engine.workers=1", "data.check=false")
     assert cflow(*call) == 0
     assert f"{root}: data={name}\n" in capsys.readouterr().out
     files = list((tmp_path / "out").glob("*/*.feather"))

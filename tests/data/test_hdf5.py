@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import pickle
-from pathlib import Path
 
 import numpy as np
 import pytest
+from hdf5_scene import STAMPS, write_scene
 
 from cflow_torch import CFlowError
 from cflow_torch.data.hdf5.reader import HDF5Log, find_hdf5_scenes
@@ -16,34 +16,6 @@ from cflow_torch.data.rigid_motion import moved
 from cflow_torch.simulator import make_drive
 
 h5py = pytest.importorskip("h5py")
-
-STAMPS = (1_533_279_682_150_532, 1_533_279_682_250_532, 1_533_279_682_350_532)  # microseconds
-
-
-def write_scene(file: Path, stamps=STAMPS, **replaced) -> Path:
-    """Sweeps of 50 points, columns x, y, z, intensity; the last one has no flow. `replaced` values go into sweep 0."""
-    rng = np.random.default_rng(0)
-    with h5py.File(file, "w") as scene:
-        for index, stamp in enumerate(stamps):
-            group = scene.create_group(str(stamp))
-            pose = np.eye(4)
-            pose[0, 3] = index
-            values = {
-                "lidar": rng.uniform(-5, 5, (50, 4)).astype(np.float32),
-                "ground_mask": rng.random(50) < 0.3,
-                "pose": pose,
-            }
-            if index < len(stamps) - 1:
-                values["flow"] = rng.normal(size=(50, 3)).astype(np.float32)
-                values["flow_is_valid"] = rng.random(50) < 0.9
-                values["flow_category_indices"] = rng.integers(0, 30, 50).astype(np.int8)
-                values["eval_mask"] = rng.random((50, 1)) < 0.5
-            if index == 0:
-                values.update(replaced)
-            for key, value in values.items():
-                if value is not None:
-                    group[key] = value
-    return file
 
 
 def test_what_is_stored_is_read(tmp_path):

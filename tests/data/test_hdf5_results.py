@@ -11,6 +11,7 @@ from typing import Any, Dict
 import numpy as np
 import pytest
 import torch
+from hdf5_scene import STAMPS, write_scene
 
 from cflow_torch import CFlowError
 from cflow_torch.data.hdf5.reader import HDF5Log, find_hdf5_scenes
@@ -18,27 +19,15 @@ from cflow_torch.data.hdf5.results import RESERVED_KEYS, write_hdf5_results
 
 h5py = pytest.importorskip("h5py")
 
-STAMPS = tuple(10**18 + index * 10**8 for index in range(3))
-
 
 @pytest.fixture
 def scene(tmp_path: Path) -> Path:
-    """Three sweeps of 60, 61 and 62 points: a box that moves, and ground."""
-    rng = np.random.default_rng(0)
-    file = tmp_path / "scene.h5"
-    with h5py.File(file, "w") as new:
-        for index, stamp in enumerate(STAMPS):
-            group = new.create_group(str(stamp))
-            box = rng.uniform(0, 2, (50, 3)) + [5 + index, 0, 0]
-            ground = rng.uniform(-9, 9, (10 + index, 3)) * [1, 1, 0]
-            group["lidar"] = np.concatenate([box, ground]).astype(np.float32)
-            group["ground_mask"] = np.arange(60 + index) >= 50
-            group["pose"] = np.eye(4)
-    return file
+    """Three sweeps of 50, 51 and 52 points."""
+    return write_scene(tmp_path / "scene.h5", growth=1)
 
 
 def flow_of(index: int, value: float = 1.0) -> np.ndarray:
-    return np.full((60 + index, 3), value, np.float32)
+    return np.full((50 + index, 3), value, np.float32)
 
 
 def contents(file: Path) -> Dict[str, Any]:
@@ -54,14 +43,14 @@ def assert_unchanged(file: Path, before: bytes) -> None:
 
 def test_a_result_is_written_and_the_rest_stays(scene: Path) -> None:
     before = contents(scene)
-    results = [(STAMPS[0], flow_of(0, 0.25)), (STAMPS[1], torch.full((61, 3), 0.1, dtype=torch.float64))]
+    results = [(STAMPS[0], flow_of(0, 0.25)), (STAMPS[1], torch.full((51, 3), 0.1, dtype=torch.float64))]
     assert write_hdf5_results(scene, "cflow", results) == 2
     after = contents(scene)
     assert set(after) - set(before) == {f"{STAMPS[0]}/cflow", f"{STAMPS[1]}/cflow"}
     for key, value in before.items():
         np.testing.assert_array_equal(after[key], value)
     stored = after[f"{STAMPS[1]}/cflow"]
-    assert stored.dtype == np.float32 and stored.shape == (61, 3) and (stored == np.float32(0.1)).all()
+    assert stored.dtype == np.float32 and stored.shape == (51, 3) and (stored == np.float32(0.1)).all()
     assert find_hdf5_scenes(scene.parent) == [scene] and os.listdir(scene.parent) == [scene.name]
 
 
@@ -86,8 +75,8 @@ def test_names_that_are_taken_or_none(scene: Path) -> None:
 @pytest.mark.parametrize(
     ("stamp", "flow", "complaint"),
     [
-        (STAMPS[0], flow_of(1), r"\(61, 3\), expected \(60, 3\)"),
-        (STAMPS[0], flow_of(0)[:, :2], r"\(60, 2\)"),
+        (STAMPS[0], flow_of(1), r"\(51, 3\), expected \(50, 3\)"),
+        (STAMPS[0], flow_of(0)[:, :2], r"\(50, 2\)"),
         (17, flow_of(0), "no sweep 17"),
     ],
 )
@@ -100,7 +89,7 @@ def test_a_wrong_result_changes_nothing(stamp: int, flow: np.ndarray, complaint:
 
 def test_a_key_that_is_no_flow_is_not_replaced(scene: Path) -> None:
     with h5py.File(scene, "r+") as file:
-        file[str(STAMPS[0])]["mine"] = np.arange(60)
+        file[str(STAMPS[0])]["mine"] = np.arange(50)
     before = scene.read_bytes()
     with pytest.raises(CFlowError, match="mine.*no flow result"):
         write_hdf5_results(scene, "mine", [(STAMPS[0], flow_of(0))])
@@ -113,7 +102,7 @@ def test_a_killed_process_changes_nothing(scene: Path) -> None:
         "import os, signal, sys, numpy as np\n"
         "from cflow_torch.data.hdf5.results import write_hdf5_results\n"
         "def results():\n"
-        f"    yield {STAMPS[0]}, np.ones((60, 3))\n"
+        f"    yield {STAMPS[0]}, np.ones((50, 3))\n"
         "    os.kill(os.getpid(), signal.SIGKILL)\n"
         "write_hdf5_results(sys.argv[1], 'cflow', results())\n"
     )

@@ -15,28 +15,19 @@ from typing import Any, Callable, Iterator, Tuple
 
 import numpy as np
 import pytest
-from tiny_recording import TinyRecording
+from small_logs import SMALL_LOGS, write_small_log
 
 from cflow_torch.data import paths
-from cflow_torch.data.arrays.writer import write_array_log
 from cflow_torch.data.atomic import atomic_file, atomic_folder, ready_folder, remove_stale
 from cflow_torch.data.catalog import find_sources, open_log
-from cflow_torch.data.hdf5.writer import write_hdf5_scene, write_index_files
 from cflow_torch.data.paths import as_path, is_remote
-from cflow_torch.simulator import Drive, make_drive
-from cflow_torch.simulator.profiles import PROFILES
-from cflow_torch.simulator.writers.aevascenes import write_aevascenes_sequence
-from cflow_torch.simulator.writers.av2 import write_av2_log
-from cflow_torch.simulator.writers.nuscenes import write_nuscenes
-from cflow_torch.simulator.writers.truckscenes import write_truckscenes
-from cflow_torch.simulator.writers.waymo import write_waymo_segment
 from cflow_torch.types import CFlowError
 
 upath = pytest.importorskip("upath", reason="needs the extra remote: pip install universal_pathlib fsspec")
 fsspec = pytest.importorskip("fsspec")
 LocalFileSystem = pytest.importorskip("fsspec.implementations.local").LocalFileSystem
 pytestmark = pytest.mark.filterwarnings("ignore:UPath 'far' filesystem not explicitly implemented")
-DATA_SETS = ("av2", "hdf5", "nuscenes", "truckscenes", "waymo", "aevascenes", "arrays")
+REMOTE = [name for name in SMALL_LOGS if name != "bags"]
 
 
 class Unreachable(Exception):
@@ -95,31 +86,7 @@ def far(monkeypatch: Any) -> Iterator[Callable[[Path], Any]]:
 def written(tmp_path_factory: Any) -> Callable[[str], Path]:
     """Data set -> local folder with one small log of it, made when it is first asked for."""
     folder = tmp_path_factory.mktemp("local")
-    drive = make_drive(seed=3, num_sweeps=3, profile="demo")
-
-    def write(name: str) -> Path:
-        root = folder / name
-        if root.is_dir():
-            return root
-        if name == "nuscenes":
-            write_nuscenes(TinyRecording(("LIDAR_TOP",)), root)
-        elif name == "truckscenes":
-            write_truckscenes(TinyRecording(("LIDAR_LEFT", "LIDAR_RIGHT")), root)
-        elif name == "waymo":
-            roof = replace(PROFILES["waymo"].units[0], num_columns=265)
-            write_waymo_segment(Drive(drive.scene, replace(PROFILES["waymo"], units=(roof,)), 3, 2, "small"), root)
-        elif name == "av2":
-            write_av2_log(drive, root)
-        elif name == "aevascenes":
-            write_aevascenes_sequence(drive, root)
-        elif name == "arrays":
-            write_array_log(drive, root, ".npz", "tum")
-        else:
-            write_hdf5_scene(drive, root / f"{drive.log_id}.h5")
-            write_index_files(root)
-        return root
-
-    return write
+    return lambda name: folder / name if (folder / name).is_dir() else write_small_log(name, folder / name)
 
 
 @pytest.fixture(params=["memory", "file"])
@@ -180,7 +147,7 @@ def test_a_pipe_is_no_file(tmp_path):
             read(tmp_path / "pipe")
 
 
-@pytest.mark.parametrize("name", DATA_SETS)
+@pytest.mark.parametrize("name", REMOTE)
 def test_every_data_set_is_read_as_from_a_local_folder(written, far, name):
     (expected,) = find_sources(name, written(name))
     (source,) = pickle.loads(pickle.dumps(find_sources(name, far(written(name)))))
@@ -203,7 +170,7 @@ def test_large_files_are_read_in_blocks_that_are_kept(far, tmp_path, monkeypatch
 
 
 @pytest.mark.parametrize("error", [FileNotFoundError, Unreachable, asyncio.TimeoutError])
-@pytest.mark.parametrize("name", DATA_SETS)
+@pytest.mark.parametrize("name", REMOTE)
 def test_errors_of_the_far_side_are_one_frames(written, far, name, error, monkeypatch):
     monkeypatch.setattr(paths, "_BLOCK", 1000)
     monkeypatch.setattr(paths, "_KEPT_BLOCKS", 1)

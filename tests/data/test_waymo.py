@@ -19,7 +19,7 @@ from cflow_torch.data.categories import CATEGORY_INDEX
 from cflow_torch.data.log import FlowLabels, window
 from cflow_torch.data.rigid_motion import moved
 from cflow_torch.data.waymo.parquet import LIDAR, TIME, VEHICLE_POSE, Component, matrix_of
-from cflow_torch.data.waymo.range_image import LaserCalibration, range_image_points, rotations_from_angles
+from cflow_torch.data.waymo.range_image import LaserCalibration, rotations_from_angles
 from cflow_torch.data.waymo.reader import BOX_CATEGORY, WaymoLog, find_waymo_segments
 from cflow_torch.simulator.recording import Boxes, UnitReturns
 from cflow_torch.simulator.writers.waymo import BOX_TYPE, write_waymo_segment
@@ -130,31 +130,11 @@ def with_column(table: pa.Table, name: str, values: Any) -> pa.Table:
     return table.set_column(table.column_names.index(name), name, values)
 
 
-def test_pixels_by_hand() -> None:
-    """Four columns look to 135, 45, -45 and -135 degrees of the vehicle, whatever the laser's yaw; row 0 is above."""
-    calibration = LaserCalibration(transform(yaw=math.pi / 2, x=1, y=2, z=3), np.array([0.0, math.pi / 6]))
-    image = np.full((2, 4, 4), -1.0, np.float32)
-    image[0, 1, 0], image[1, 3, 0], image[1, 0, 0] = 2.0, 4.0, 0.0
-    points, pixels = range_image_points(image, calibration)
-    assert pixels.tolist() == [1, 7]  # range 0 is no return either
-    half = math.sqrt(0.5)
-    expected = [[1 + math.sqrt(3) * half, 2 + math.sqrt(3) * half, 4], [1 - 4 * half, 2 - 4 * half, 3]]
-    np.testing.assert_allclose(points, expected, atol=1e-14)
+def test_rows_columns_and_angles_by_hand() -> None:
+    """Of a laser without a table of inclinations; the columns go round from behind the vehicle by its left."""
     even = LaserCalibration(np.eye(4), None, math.radians(-90), math.radians(30))
     np.testing.assert_allclose(np.degrees(even.row_inclinations(4)), [15, -15, -45, -75], atol=1e-12)
     np.testing.assert_allclose(np.degrees(even.column_azimuths(4)), [135, 45, -45, -135], atol=1e-12)
-
-
-def test_pixel_pose_by_hand() -> None:
-    """Rolled by 90 degrees (y to z), then turned by 90 (x to y): x to y, y to z, z to x."""
-    calibration = LaserCalibration(np.eye(4), np.array([0.0, 0.1]))
-    image = np.full((2, 4, 4), -1.0, np.float32)
-    image[1, 2] = (math.sqrt(2), 0, 0, -1)  # the point (1, -1, 0)
-    poses = np.zeros((2, 4, 6), np.float32)
-    poses[1, 2] = (math.pi / 2, 0, math.pi / 2, 100, 0, 0)
-    points, _ = range_image_points(image, calibration, poses, transform(yaw=math.pi, x=90))
-    # In the world (100 + 0, 1, -1); the frame stands at x = 90 and looks back.
-    np.testing.assert_allclose(points, [[-10, -1, -1]], atol=1e-6)
     angles = np.array([[0.1, -0.2, 3.0], [-3.0, 1.5, -0.7]])
     np.testing.assert_allclose(rotations_from_angles(angles), [transform(*a)[:3, :3] for a in angles], atol=1e-15)
 

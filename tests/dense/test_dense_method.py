@@ -7,16 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from scenes import (
-    assert_same,
-    box,
-    config,
-    flow_as_oracle,
-    needs_gpu,
-    needs_kornia_labelling,
-    pose,
-    scene,
-)
+from scenes import assert_same, box, config, flow_as_oracle, needs_gpu, needs_kornia_labelling, pose, scene
 
 from cflow_torch import CorrelationFlow, Sweep, Window, estimate_flow, make_config
 from cflow_torch.data.av2 import AV2Log
@@ -119,6 +110,17 @@ def test_a_still_world_seen_from_a_moving_sensor():
     assert not result.residual_flow.any() and torch.equal(result.flow, result.pose_flow)
     without = estimate_flow(pc_world, pc1, **PAPER)
     assert not without.pose_flow.any() and without.residual_flow.any()  # else the test would see nothing
+    start = pose(3.0, 1.0, 1.5)
+    posed = Window(Sweep(pc_world, pose=start), Sweep(pc1, pose=start @ pose(0.9, 0.1, 0.05)))
+    settings = {name: value for name, value in PAPER.items() if name != "preset"}
+    assert_same(CorrelationFlow(make_config("paper", **settings))([posed])[0], result)
+
+
+def test_flow_has_the_axes_of_t1():
+    """The vehicle turns left by 90 degrees: what drives ahead at t goes to the right at t+1."""
+    T_ego1_ego0, car = np.linalg.inv(pose(0.0, 0.0, math.pi / 2)), street(2)[1]
+    result = estimate_flow(car, (car + [0.5, 0, 0]) @ T_ego1_ego0[:3, :3].T, T_ego1_ego0=T_ego1_ego0, **PAPER)
+    np.testing.assert_allclose(result.residual_flow, [[0, -0.5, 0]] * 400, atol=1e-6)
 
 
 def test_max_speed_bounds_the_flow():

@@ -28,18 +28,6 @@ def test_equals_the_oracle_in_a_batch(overrides):
         assert_same(result, reference_flow(window, settings))
 
 
-def test_clusters_split_what_components_join():
-    # Two boxes 0.3 m apart: one component of 0.25 m pixels, two clusters of points.
-    pytest.importorskip("hdbscan")
-    left, right = np.random.default_rng(0).uniform(0, 1, (2, 400, 3))
-    right[:, 0] += 1.3
-    window = Window(Sweep(np.concatenate((left, right))), Sweep(np.concatenate((left, right + (0.5, 0, 0)))))
-    by_component = CorrelationFlow(config())([window])[0]
-    by_density = CorrelationFlow(config(clustering="hdbscan"))([window])[0]
-    assert by_component.cluster_id.unique().tolist() == [0]
-    assert by_density.cluster_id[:400].unique().tolist() != by_density.cluster_id[400:].unique().tolist()
-
-
 def test_fewer_points_than_a_cluster_needs():
     few = Sweep(np.random.default_rng(0).uniform(0, 1, (8, 3)))
     (result,) = CorrelationFlow(config(clustering="hdbscan"))([Window(few, few)])

@@ -1,4 +1,4 @@
-"""Pooling of several estimates (Sec. leverage_past_pcs): the oracle's, trigonometry, known answers."""
+"""Pooling of several estimates (Sec. leverage_past_pcs): known answers, the oracle's as well."""
 
 from __future__ import annotations
 
@@ -10,25 +10,6 @@ import torch
 from oracle.history import pool as oracle_pool
 
 from cflow_torch.dense.history import pool
-
-
-def rows(rng: np.random.Generator, num_rows: int, count: int) -> np.ndarray:
-    """Estimates as they occur: whole pixels divided by whole steps, so ties, zeros and opposites abound."""
-    pixels = rng.integers(-3, 4, (num_rows, count, 3)) * (rng.random((num_rows, count, 1)) < 0.8)
-    free = rng.normal(size=(num_rows, count, 3))
-    whole = pixels * 0.1 / np.arange(1, count + 1)[None, :, None]
-    return np.where(rng.random((num_rows, 1, 1)) < 0.7, whole, free)
-
-
-@pytest.mark.parametrize("count", [1, 2, 3, 4, 9])
-def test_pool_equals_the_oracle(count):
-    rng = np.random.default_rng(20 + count)
-    given, available = rows(rng, 1000, count), rng.random((1000, count)) < 0.75
-    available[np.arange(1000), rng.integers(0, count, 1000)] = True
-    given[~available] = math.nan  # must not be looked at
-    found = pool(torch.from_numpy(given), torch.from_numpy(available)).numpy()
-    expected = [oracle_pool(list(estimates[mask])) for estimates, mask in zip(given, available)]
-    np.testing.assert_allclose(found, expected, atol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -14,8 +14,8 @@ from typing import Any, Dict, List, Tuple
 
 import numpy as np
 import pytest
+from command_line import cflow
 
-from cflow_torch.cli.main import main
 from cflow_torch.simulator import make_drive
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -42,14 +42,6 @@ def parts(page: str) -> List[Tuple[str, Any]]:
 COMMANDS = {" ".join(words) for page in PAGES for kind, words in parts(page) if kind == "cflow"}
 
 
-def cflow(*words: str) -> None:
-    """`cflow WORDS` in this process; a status that is not 0 is an error."""
-    try:
-        main(list(words))
-    except SystemExit as stop:
-        assert not stop.code, words
-
-
 def run(kind: str, part: Any, names: Dict[str, Any]) -> None:
     """Run one part of a page in this process, unless it is one of those left out."""
     if kind == "python":
@@ -59,7 +51,7 @@ def run(kind: str, part: Any, names: Dict[str, Any]) -> None:
         sys.argv = part
         runpy.run_module(part[0], run_name="__main__")
     elif not DATA.search(" ".join(part)):
-        cflow(*part)
+        assert cflow(*part) == 0, part
 
 
 @pytest.fixture
@@ -74,7 +66,7 @@ def names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Dict[str, Any]:
 
 @pytest.mark.parametrize("command", sorted(filter(DATA.search, COMMANDS)))
 def test_settings_of_commands_with_data_exist(command: str, names: Dict[str, Any]) -> None:
-    cflow(*command.replace(" -m ", " ").split(), "--cfg", "job")
+    assert cflow(*command.replace(" -m ", " ").split(), "--cfg", "job") == 0
 
 
 @pytest.mark.parametrize("page", PAGES[:2])

@@ -5,20 +5,20 @@ from __future__ import annotations
 import io
 import json
 import shutil
-import sys
 import zipfile
 from pathlib import Path
-from typing import Any, Callable, Dict, List
+from typing import Any, Callable, Dict
 
 import numpy as np
 import pyarrow as pa
 import pytest
+from command_line import cflow
+from hdf5_scene import write_scene
 from public_evaluators import FLOW, LOG, TIME, read_pair
 from pyarrow import feather
 from scenes import pose
 
 from cflow_torch import CFlowError, CorrelationFlow
-from cflow_torch.cli.main import main
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.hdf5.reader import HDF5Log
 from cflow_torch.data.log import window
@@ -71,18 +71,6 @@ def archives(log: AV2Log, estimated: Dict[int, Any], tmp_path_factory: pytest.Te
         pack(folder, [frame.name for frame in frames], folder.parent / "a.zip", version)
         result[number] = (folder, folder.parent / "a.zip", frames)
     return result
-
-
-def run(*arguments: object) -> int:
-    """Exit status of a command."""
-    argv = list(sys.argv)
-    try:
-        main([str(argument) for argument in arguments])
-    except SystemExit as stop:
-        return int(stop.code or 0)
-    finally:
-        sys.argv = argv
-    return 0
 
 
 def read(file: Path) -> Dict[str, np.ndarray]:
@@ -257,29 +245,14 @@ def test_archives_that_are_none(archives: Dict[int, Any], tmp_path: Path) -> Non
 # ---- which frames, which points
 
 
-def write_scene(file: Path, masked: List[int], num_sweeps: int = 8) -> Path:
-    """An HDF5 scene whose sweeps `masked` carry an evaluation mask."""
-    h5py = pytest.importorskip("h5py")
-    rng = np.random.default_rng(0)
-    with h5py.File(file, "w") as scene:
-        for index in range(num_sweeps):
-            group = scene.create_group(str(10**18 + index * 10**8))
-            group["lidar"] = rng.uniform(-60, 60, (40 + index, 3)).astype(np.float32)
-            group["ground_mask"] = rng.random(40 + index) < 0.3
-            group["pose"] = np.eye(4)
-            if index in masked:
-                group["eval_mask"] = rng.random((40 + index, 1)) < 0.5
-    return file
-
-
 def test_frames_go_by_the_masks_of_the_scene(tmp_path: Path) -> None:
-    with HDF5Log(write_scene(tmp_path / "scene.h5", [2, 3, 7])) as log:
+    with HDF5Log(write_scene(tmp_path / "scene.h5", range(8), 1, [2, 3, 7])) as log:
         for number in (1, 3):
             plan = plan_log(log, get_version(number))
             assert [frame.name for frame in plan] == [f"scene/{log.timestamps[i]}.feather" for i in (2, 3)], "7 is last"
-            assert plan[0].expect(get_version(number)).rows == (log.eval_mask(2).sum() if number == 1 else 42)
+            assert plan[0].expect(get_version(number)).rows == (log.eval_mask(2).sum() if number == 1 else 52)
         assert [f.name for f in plan_log(log, get_version(2))] == [f"scene/{i:010d}.feather" for i in (0, 5)]
-    with HDF5Log(write_scene(tmp_path / "plain.h5", [])) as log:
+    with HDF5Log(write_scene(tmp_path / "plain.h5", range(8), 1, [])) as log:
         assert [frame.index for frame in plan_log(log, get_version(3))] == [0, 5]
         for stamp in (log.timestamps[-1], 17):
             with pytest.raises(CFlowError, match="is no sweep of the log, or its last"):
@@ -332,7 +305,7 @@ def test_official_masks_win(log: AV2Log, tmp_path: Path) -> None:
 
 def test_command_makes_checks_resumes(log: AV2Log, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     call = ["submit", "data=av2", f"data.root={log.folder}", f"output={tmp_path}", "version=3", "model=paper"]
-    assert run(*call) == 0
+    assert cflow(*call) == 0
     printed = capsys.readouterr().out
     assert "frames written: 2" in printed and "float16 rounding" in printed and "v3.zip: passes" in printed
     first = (tmp_path / "v3.zip").read_bytes()
@@ -340,21 +313,21 @@ def test_command_makes_checks_resumes(log: AV2Log, tmp_path: Path, capsys: pytes
     before = one.stat().st_mtime_ns
     two.write_bytes(two.read_bytes()[:500])
     (two.parent / f".{two.name}.abc").write_bytes(b"left by a killed run")
-    assert run(*call) == 0
+    assert cflow(*call) == 0
     assert "frames written: 1, already there: 1" in capsys.readouterr().out
     assert one.stat().st_mtime_ns == before and (tmp_path / "v3.zip").read_bytes() == first
 
-    assert run(*call, "model.connectivity=4") == 2
+    assert cflow(*call, "model.connectivity=4") == 2
     assert "model.connectivity was 8, is 4" in capsys.readouterr().err
-    assert run(*call, f"archive={tmp_path / 'v3.zip'}") == 0
+    assert cflow(*call, f"archive={tmp_path / 'v3.zip'}") == 0
     two.unlink()
-    assert run(*call, f"archive={tmp_path / 'v3'}") == 1
+    assert cflow(*call, f"archive={tmp_path / 'v3'}") == 1
     error = capsys.readouterr().err
     assert f"{two.name}: missing" in error and "problems: 1" in error
     (tmp_path / "v3" / "notes.txt").write_text("mine")
-    assert run(*call) == 1, "a foreign file is not packed silently"
+    assert cflow(*call) == 1, "a foreign file is not packed silently"
     assert "notes.txt" in capsys.readouterr().err
-    assert run(*call, "overwrite=true", "model.connectivity=4") == 0
+    assert cflow(*call, "overwrite=true", "model.connectivity=4") == 0
 
 
 # ---- the real pair
@@ -366,7 +339,7 @@ def submit_pair(av2_folder: Path, tmp_path: Path) -> Path:
     official = (np.abs(pair.points[:, :2]) <= 50).all(1) & ~pair.is_ground
     masks = write_masks(tmp_path / "masks.zip", LOG, TIME, official)
     call = ["submit", "data=av2", f"data.root={av2_folder}", "version=1", "model=paper", f"masks={masks}"]
-    assert run(*call, f"output={tmp_path}") == 0
+    assert cflow(*call, f"output={tmp_path}") == 0
     return masks
 
 

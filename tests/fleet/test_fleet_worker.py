@@ -88,19 +88,6 @@ def test_a_batch_that_failed_is_let_go_before_its_frames_are_tried_alone(source:
     assert alive == [False] * 5
 
 
-def test_events_come_in_the_order_of_the_log(source: Path, tmp_path: Path) -> None:
-    stamps = tuple(int(stamp) for stamp in AV2Log(source).timestamps[:5])
-    worker = Worker(make_job(tmp_path), "cpu")
-    events = list(worker.run(Unit(7, source, only=frozenset(stamps[1:3]))))
-    assert events[0] == Opened(7, source.name, stamps[1:3], stamps[1:3])
-    assert [event.timestamp for event in events if isinstance(event, Done)] == list(stamps[1:3])
-    events = list(worker.run(Unit(7, source)))
-    assert events[0] == Opened(7, source.name, stamps, (stamps[0], *stamps[3:]))
-    assert [event.timestamp for event in events if isinstance(event, Done)] == [stamps[0], *stamps[3:]]
-    done = [event for event in events if isinstance(event, Done)]
-    assert all({"read", "compute", "write", "compute/project"} <= set(event.seconds) for event in done)
-
-
 def test_a_gpu_that_is_lost_ends_its_worker(source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     model = Stumbling(AV2Log(source).timestamps, lambda: RuntimeError("assert"))
     worker = Worker(make_job(tmp_path, batch=1), "cpu", model=model)

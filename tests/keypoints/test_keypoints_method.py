@@ -8,16 +8,7 @@ import numpy as np
 import pytest
 import torch
 from oracle.keypoints import match_radius
-from scenes import (
-    assert_same,
-    assert_zeros,
-    box,
-    config,
-    flow_as_oracle,
-    needs_gpu,
-    needs_kornia_labelling,
-    scene,
-)
+from scenes import assert_same, box, config, flow_as_oracle, needs_gpu, needs_kornia_labelling, scene
 
 from cflow_torch import CorrelationFlowKeypoints, Sweep, Window, estimate_flow, make_config
 from cflow_torch.data.av2 import AV2Log
@@ -127,16 +118,6 @@ def test_the_radius_of_matches():
     for stamps, expected in [((0, 100_000_000), 3.0), ((0, 50_000_000), 0.0), ((None, 50_000_000), 3.0)]:
         window = Window(sweep([(5, 5)], timestamp_ns=stamps[0]), sweep([(5, 8)], timestamp_ns=stamps[1]))
         assert flow_as_oracle(window, METRE.replace(gate_radius=3.0)).residual_flow[0, 0] == expected
-
-
-@pytest.mark.parametrize("densify", DENSIFIERS)
-def test_empty_sweeps(densify):
-    some, nothing = sweep(ELL), Sweep(np.zeros((0, 3)))
-    for pc0, pc1 in ((nothing, nothing), (nothing, some), (some, nothing)):
-        result = flow_as_oracle(Window(pc0, pc1), METRE.replace(densify=densify))
-        assert not result.residual_flow.any() and not result.score.any()
-        if densify == "nearest":
-            assert_zeros(result, len(pc0.points))
 
 
 def test_whole_pixel_shifts_of_boxes_are_found():

@@ -1,4 +1,4 @@
-"""Matching of key points: the oracle's matches, fractions, the ratio test and ties by hand, exact products."""
+"""Matching of key points: fractions, the ratio test and ties by hand, exact products."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from typing import Dict, List, Tuple
 import numpy as np
 import pytest
 import torch
-from oracle.matching import detect_keypoints, match_keypoints
 from scenes import config
 
 from cflow_torch.keypoints import match_candidates, matching
@@ -19,31 +18,6 @@ def matched(images: np.ndarray, images1: np.ndarray, reach: float, **overrides) 
     settings = config("keypoints", **overrides)
     pc0, pc1 = (describe(torch.from_numpy(i), settings.patch_size) for i in (images, images1))
     return match(pc0, pc1, torch.full((len(images),), reach, dtype=torch.float64), settings)
-
-
-def assert_equals_oracle(images: np.ndarray, images1: np.ndarray, reach: float, **overrides) -> int:
-    settings = config("keypoints", **overrides)
-    found, start, total = matched(images, images1, reach, **overrides), 0, 0
-    for image, image1 in zip(images, images1):
-        pixels = [tuple(p) for p in detect_keypoints(image).tolist()]
-        expected = match_keypoints(image, image1, reach, settings)
-        mine = slice(total, total + len(expected))
-        assert found.source[mine].tolist() == [start + pixels.index((m.row, m.column)) for m in expected]
-        assert found.shift[mine].tolist() == [[m.dy, m.dx] for m in expected]
-        assert found.score[mine].tolist() == pytest.approx([m.score for m in expected], abs=1e-12)
-        start, total = start + len(pixels), mine.stop
-    assert len(found.source) == total
-    return total
-
-
-@pytest.mark.parametrize("patch_size, ratio", [(1, 1.0), (5, 1.0), (5, 1.1), (11, 1.02), (13, 1.3)])
-def test_matches_equal_the_oracle(patch_size, ratio):
-    rng, total = np.random.default_rng(patch_size), 0
-    for reach in (2.0, 3.3, 60.0):
-        images = rng.random((2, 2, 25, 31)) < 0.1
-        images[1] = np.roll(images[0], (1, 2), (1, 2)) ^ (rng.random((2, 25, 31)) < 0.02)
-        total += assert_equals_oracle(images[0], images[1], reach, patch_size=patch_size, ratio_threshold=ratio)
-    assert total > 0
 
 
 # ---------------------------------------------------------------------------------------------------------- by hand
@@ -82,7 +56,6 @@ def test_the_energy_of_the_candidate_counts():
     # One pixel, two candidates with E = 2 near by and one with E = 1 farther off: c = 1 in all.
     image, image1 = np.zeros((2, 1, 12, 12), dtype=bool)
     image[0, 5, 5] = image1[0, 5, 6] = image1[0, 5, 7] = image1[0, 5, 1] = True
-    assert assert_equals_oracle(image, image1, 10.0, patch_size=3) == 1
     assert matched(image, image1, 10.0, patch_size=3).shift.tolist() == [[0, -4]]
 
 
@@ -100,24 +73,6 @@ def test_no_key_points():
 
 
 # ------------------------------------------------------------------------------------------ what must not matter
-
-
-def test_tiles_groups_and_pieces_do_not_show(monkeypatch):
-    rng = np.random.default_rng(3)
-    images = rng.random((2, 2, 24, 40)) < 0.08
-    expected = matched(*images, 8.0, patch_size=15, ratio_threshold=1.0)
-    assert len(expected.source) > 20
-    for rows, cols, band, group, pairs, strip in (
-        (1, 1, 1, 1, 1, 5),
-        (3, 2, 5, 2, 50, 11),
-        (64, 9, 2, 40, 1 << 17, 63),
-    ):
-        names = ("_TILE_ROWS", "_TILE_COLS", "_BAND", "_GROUP", "_PAIRS_AT_ONCE_CPU")
-        for name, value in zip(names, (rows, cols, band, group, pairs)):
-            monkeypatch.setattr(match_candidates, name, value)
-        monkeypatch.setattr(matching, "_STRIP_NUMBERS", strip)
-        found = matched(*images, 8.0, patch_size=15, ratio_threshold=1.0)
-        assert all(torch.equal(getattr(found, n), getattr(expected, n)) for n in ("source", "shift", "score"))
 
 
 def test_all_within_the_radius_are_candidates():

@@ -141,19 +141,6 @@ def test_logs_pile_up_nothing(tmp_path: Path, unclosed: List[str]) -> None:
     assert grown(logs(tmp_path)) == [] and unclosed == []
 
 
-def test_growth_is_found() -> None:
-    kept: List[Any] = []
-
-    def leaking() -> Iterator[None]:
-        while True:
-            kept.append(open(os.devnull))  # noqa: SIM115
-            yield
-
-    assert grown(leaking()) == ["files", "objects"]
-    for file in kept:
-        file.close()
-
-
 @pytest.mark.parametrize("profile", ["av2", "nuscenes", "truckscenes", "waymo", "aevascenes"])
 def test_every_reader_closes_its_files(tmp_path: Path, profile: str, unclosed: List[str]) -> None:
     """Also those that turn out to be broken, one file after the other."""

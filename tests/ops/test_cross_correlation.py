@@ -1,4 +1,4 @@
-"""Cross-correlation counts and pixels under a window, against pairs of pixels one by one."""
+"""Cross-correlation counts, against pairs of pixels one by one."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import torch
 import torch.nn.functional as F
 
 from cflow_torch.ops.cross_correlation import cross_correlate
-from cflow_torch.ops.window_counts import WindowCounts
 
 ENGINES = ("fft", "conv")
 
@@ -60,20 +59,3 @@ def test_engines_agree_on_large_images():
     template, target = torch.rand((2, 2, 130, 200), generator=torch.Generator().manual_seed(0)) < 0.5
     own = torch.tensor([1, 0])
     assert torch.equal(counts(template, target, own, "fft"), counts(template, target, own, "conv"))
-
-
-def test_pixels_under_a_window_and_their_bounds():
-    rng, sizes = np.random.default_rng(1), [(1, 1), (5, 9), (12, 3), (7, 7)]
-    images = [rng.random(size) < 0.4 for size in sizes]
-    pixels = np.concatenate([np.column_stack([np.full(i.sum(), n), np.argwhere(i)]) for n, i in enumerate(images)])
-    table = WindowCounts(*torch.from_numpy(pixels).t().contiguous(), np.array(sizes))
-    image = rng.integers(0, len(sizes), 200)
-    dy, dx = (rng.integers(-np.array(sizes)[image, axis], np.array(sizes)[image, axis] + 1) for axis in (0, 1))
-    expected = [
-        int(np.pad(images[n], [(12, 12), (12, 12)])[12 + y : 12 + y + sizes[n][0], 12 + x : 12 + x + sizes[n][1]].sum())
-        for n, y, x in zip(image, dy, dx)
-    ]
-    given = tuple(map(torch.from_numpy, (image, np.stack((dy, dx)))))
-    found, (least, most) = table.count(*given), table.bounds(*given)
-    assert found.tolist() == expected and sum(expected) > 100
-    assert (least <= found).all() and (found <= most).all()

@@ -61,20 +61,6 @@ def test_images_of_every_size_equal_scipy(connectivity, reach):
         assert label(images, connectivity, reach).tolist() == by_scipy(images, connectivity, reach).tolist()
 
 
-@pytest.mark.parametrize("reach", [1, 3])
-@pytest.mark.parametrize("connectivity", [4, 8])
-def test_two_pixels_link_exactly_within_reach(connectivity, reach):
-    """Every offset up to 5, at every place relative to the blocks, the far pixel on the border of the image."""
-    for dy, dx in [(dy, dx) for dy in range(6) for dx in range(-5, 6) if (dy, dx) > (0, 0)]:
-        images = np.zeros((16, dy + 4, abs(dx) + 4), dtype=bool)
-        for i in range(16):
-            row, col = i // 4, i % 4 + max(-dx, 0)
-            images[i, row, col] = images[i, row + dy, col + dx] = True
-        linked = label(images, connectivity, reach)[1::2] == np.arange(0, 32, 2)
-        corner = connectivity == 4 and dy == abs(dx) == reach
-        assert linked.tolist() == [max(dy, abs(dx)) <= reach and not corner] * 16, (dy, dx)
-
-
 def test_without_union_find_kornia_says_what_to_do(monkeypatch):
     monkeypatch.delattr(contrib, "connected_components_union_find", raising=False)
     with pytest.raises(CFlowError, match="kornia >= 0.9.*sparse"):

@@ -1,42 +1,12 @@
-"""Reductions over segments, medians, indices and runs, against NumPy and by hand."""
+"""Medians of segments and divisions of indices, against NumPy."""
 
 from __future__ import annotations
 
 import numpy as np
-import pytest
 import torch
 
-from cflow_torch.ops.indices import divide, flat_nonzero, occupied, split_index
-from cflow_torch.ops.parabola import vertex
-from cflow_torch.ops.segments import (
-    bounding_boxes,
-    first_of_segment,
-    masked_median,
-    segment_amin,
-    segment_ends,
-    segment_median,
-)
-from cflow_torch.ops.spans import spans
-
-
-def test_segment_reductions():
-    index, values = torch.tensor([2, 0, 2, 4, 0]), torch.tensor([5, 3, -7, 1, 9])
-    assert segment_amin(values, index, 6, 99).tolist() == [3, 99, -7, 99, 1, 99]
-    assert first_of_segment(torch.tensor([3, 1, 3, 1, 0]), 4).tolist() == [0, 1, 0, 1, 4]
-    first, last = segment_ends(values, index, 5)
-    assert first[[0, 2, 4]].tolist() == [3, -7, 1] and last[[0, 2, 4]].tolist() == [9, 5, 1]
-    assert (last < first)[[1, 3]].all()
-
-
-def test_bounding_boxes():
-    rng = np.random.default_rng(5)
-    index = rng.permutation(np.concatenate([np.arange(12), rng.integers(0, 12, 80)]))
-    rows, cols = rng.integers(-50, 50, (2, index.size))
-    first, size = bounding_boxes(*map(torch.from_numpy, (rows, cols, index)), 12)
-    for segment in range(12):
-        r, c = rows[index == segment], cols[index == segment]
-        assert first[segment].tolist() == [r.min(), c.min()]
-        assert size[segment].tolist() == [np.ptp(r) + 1, np.ptp(c) + 1]
+from cflow_torch.ops.indices import divide, split_index
+from cflow_torch.ops.segments import masked_median, segment_median
 
 
 def test_medians_are_numpys():
@@ -54,36 +24,9 @@ def test_medians_are_numpys():
     assert segment_median(nothing, nothing.long(), 3).tolist() == [0, 0, 0]
 
 
-def test_indices_of_set_elements():
-    for size in (1, 7, 8, 9, 1000):
-        image = torch.from_numpy((np.random.default_rng(size).random(size) < 0.1).astype(np.uint8) * 4)
-        expected = image.nonzero()[:, 0].tolist()
-        assert occupied(image).tolist() == flat_nonzero(image.bool()).tolist() == expected
-
-
 def test_division_of_indices():
     index = torch.tensor([0, 1, 6, 7, 8, 2**40, 2**62 + 5])
     for width in (1, 2, 7, 701, 2**31 + 1):
         row, col = split_index(index, width)
         assert [tuple(pair) for pair in zip(row.tolist(), col.tolist())] == [divmod(i, width) for i in index.tolist()]
     assert divide(torch.tensor(7), 2) == 3 and divide(torch.tensor(7), 2).shape == ()
-
-
-def test_spans_are_runs_one_after_the_other():
-    start, count = torch.tensor([5, 0, 9, 3]), torch.tensor([2, 0, 3, 1])
-    assert spans(start, count).tolist() == spans(start, count, 6).tolist() == [5, 6, 9, 10, 11, 3]
-
-
-@pytest.mark.parametrize(
-    "counts, offset",
-    [
-        ((3, 9, 3), 0.0),
-        ((2, 9, 6), 4 / 20),  # (high - low) / (2 (2 top - low - high))
-        ((9, 9, 0), -0.5),
-        ((12, 9, 5), -0.5),  # no farther than half a step
-        ((9, 9, 9), 0.0),
-        ((12, 9, 12), 0.0),  # curves upwards
-    ],
-)
-def test_the_top_of_a_parabola(counts, offset):
-    assert vertex(*torch.tensor(counts)).item() == offset

@@ -32,11 +32,6 @@ class Level(NamedTuple):
     travels: List[bool]
 
 
-def with_longest(config: VerifiedConfig, metres: Optional[float]) -> VerifiedConfig:
-    """The settings with another length up to which objects move."""
-    return config.replace(max_object=metres)
-
-
 def find_components(sweeps: SlicedSweeps, block: int, is_undilated: bool, config: VerifiedConfig) -> Level:
     """Components at pixels of `block` x `block` finest ones: of Alg. clustering, or plain ones."""
     images, reach = [coarsen(image, block) for image in sweeps.images], 1 if is_undilated else 3

@@ -8,11 +8,10 @@ import torch
 from moving_scenes import for_oracle
 from oracle import candidates as oracle
 from oracle.component_tree import find_components as oracle_components
-from scenes import config, same_bits, scene, sweeps_of
+from scenes import config, scene, sweeps_of
 
-from cflow_torch.verified.candidates import _find_peaks, list_motions, propose
+from cflow_torch.verified.candidates import _find_peaks, list_motions
 from cflow_torch.verified.component_tree import find_components
-from cflow_torch.verified.paired_test import VerifiedLevel
 
 
 @pytest.mark.parametrize("block", [1, 2])
@@ -61,28 +60,3 @@ def test_motions_equal_the_oracle(num_sweeps):
     for mine, f, known, k, parent in zip(*(v.tolist() for v in (found, given, available, intervals, other))):
         estimates = [tuple(v) if is_known else None for v, is_known in zip(f, known)]
         np.testing.assert_allclose(mine, oracle.list_motions(estimates, k, [tuple(parent)]), atol=1e-9)
-
-
-def test_motions_by_hand():
-    given = torch.tensor([[[2.0, 0.0], [8.0, 0.0], [9.0, 0.0]], [[5.0, 5.0], [0.0, 3.0], [1.0, 1.0]]]).double()
-    available = torch.tensor([[True, True, True], [False, True, False]])
-    other = torch.tensor([[0.5, -1.0], [0.0, 0.0]]).double()
-    found = list_motions(given, available, torch.tensor([[1.0, 2.0, 3.0]] * 2).double(), [other])
-    assert found[0].tolist() == [[3.0, 0.0], [2.0, 0.0], [4.0, 0.0], [3.0, 0.0], [0.5, -1.0]]
-    assert found[1].tolist() == [[0.0, 1.5], [0.0, 0.0], [0.0, 1.5], [0.0, 0.0], [0.0, 0.0]]
-
-
-def test_parts_are_asked_for_the_motion_of_the_whole_and_looked_for_if_they_differ():
-    settings = config("verified", num_history=1, pixel_size=0.1)
-    sweeps = sweeps_of([scene(3, num_history=1)], settings)
-    whole, part = (find_components(sweeps, 1, undilated, settings) for undilated in (False, True))
-    motion = torch.arange(2.0 * whole.num_components, dtype=torch.float64).view(-1, 2) + 1
-    score = torch.full((sweeps.pixel.numel(),), 0.25)
-    above = VerifiedLevel(whole, motion, motion[:, 0].long(), score)
-    found = propose(part, sweeps, above, None, settings)
-    parent = part.parents(whole)
-    assert same_bits(found.motion[:, -1], motion[parent])
-    same = part.equals_parent(whole, parent)
-    assert same.any() and (~same).any()
-    assert not found.motion[same, :-1].any()  # what has not fallen apart is known
-    assert (found.score[same[part.component.clamp(max=len(same) - 1)]] == 0.25).all()

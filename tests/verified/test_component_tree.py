@@ -1,4 +1,4 @@
-"""The component tree: the oracle's components, parents and winners on random ones, known ones by hand."""
+"""The component tree: the oracle's components, parents and winners on random ones."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def random_images(seed: int, shape: tuple, density: float) -> np.ndarray:
 def test_components_equal_the_oracle(block, is_undilated):
     total = 0
     for seed, (shape, density) in enumerate([((2, 3, 23, 1), 0.15), ((3, 2, 40, 45), 0.01), ((2, 4, 63, 60), 0.01)]):
-        settings = oracle.with_longest(config("verified", connectivity=(4, 8)[seed % 2], max_extent=3.0), 1.3)
+        settings = config("verified", connectivity=(4, 8)[seed % 2], max_extent=3.0, max_object=1.3)
         sweeps = from_images(random_images(seed, shape, density))
         level, start = find_components(sweeps, block, is_undilated, settings), 0
         for window in range(shape[0]):
@@ -42,30 +42,6 @@ def test_components_equal_the_oracle(block, is_undilated):
         assert level.num_components == start
         total += start
     assert total > 10
-
-
-def test_exactly_the_largest_object_is_not_too_long():
-    images = np.zeros((2, 2, 9, 30), dtype=np.uint8)
-    images[0, 0, 4, 3:11] = images[1, 0, 1:8, 5] = 1  # t+1: 8 pixels = 2 m, 7 pixels
-    images[:, 1, 4, 2:29] = 1  # t is longer
-    for longest, too_long in (
-        (2.0, [False, False]),
-        (1.9, [True, False]),
-        (0.25, [True, True]),
-        (None, [False] * 2),
-    ):
-        settings = oracle.with_longest(config("verified", max_extent=99.0), longest)
-        assert find_components(from_images(images), 1, False, settings).too_long.tolist() == too_long
-
-
-def test_undilated_components_neither_join_over_gaps_nor_split():
-    images = np.zeros((1, 2, 3, 40), dtype=np.uint8)
-    images[0, :, 1, :30] = images[0, :, 1, 31:33] = 1  # 7.5 m long, longer than max_extent
-    counts = [find_components(from_images(images), 1, u, config("verified")).num_components for u in (True, False)]
-    assert counts == [2, 1]
-
-
-# ------------------------------------------------------------------------------------------------ parents, winners
 
 
 def as_level(labels: List[int]) -> Level:
@@ -117,21 +93,3 @@ def test_parents_and_winners_equal_the_oracle(tree):
         parent = part.parents(whole)
         assert torch.where(parent < whole.num_components, parent, -1).tolist() == oracle.parents(level, above)
         assert part.equals_parent(whole, parent).tolist() == oracle.equals_parent(level, above)
-
-
-def test_the_whole_must_have_more_evidence_than_its_parts_together():
-    levels = [[0, 0, 0, 0], [0, 0, 1, -1]]
-    assert winners(levels, [[6], [3, 2]]) == [(0, 0)] * 4  # the pixel without a part of its own goes along
-    assert winners(levels, [[5], [3, 2]]) == [(1, 0), (1, 0), (1, 1), None]
-    assert winners(levels, [[0], [0, 0]]) == [(1, 0), (1, 0), (1, 1), None]
-
-
-def test_parts_pass_on_the_evidence_of_their_component():
-    levels = [[0, 0, 0, 0], [0, 0, 1, 1], [0, 1, 2, 3]]
-    # Left the middle level wins with 7 against 3, right its parts do with 4 against 1.
-    assert winners(levels, [[11], [7, 1], [1, 2, 2, 2]]) == [(1, 0), (1, 0), (2, 2), (2, 3)]
-    assert winners(levels, [[12], [7, 1], [1, 2, 2, 2]]) == [(0, 0)] * 4
-
-
-def test_a_part_in_two_wholes_counts_for_the_first():
-    assert winners([[-1, 0, 1, 1], [0, 0, 0, 1]], [[3, 2], [3, 1]]) == [(1, 0), (1, 0), (0, 1), (0, 1)]

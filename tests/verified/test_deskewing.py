@@ -8,7 +8,7 @@ from typing import List, Sequence, Tuple
 import numpy as np
 import pytest
 import torch
-from moving_scenes import LOWER, UPPER, Scene, moving_scene, one_object
+from moving_scenes import Scene, moving_scene, one_object
 from oracle import deskewing as oracle
 from oracle import rigid_registration
 from preset_windows import changed
@@ -17,7 +17,6 @@ from turning_car import MODEL, turning_car
 
 from cflow_torch import CFlowError, FlowResult, Sweep, VerifiedFlow, Window
 from cflow_torch.verified.deskewing import deskew, register_deskewed
-from cflow_torch.verified.rigid_motion import RigidMotion
 from cflow_torch.verified.rigid_registration import register
 
 HISTORY = MODEL.replace(num_history=3)
@@ -127,27 +126,6 @@ def test_a_known_motion_under_known_times_is_found(elapsed):
         assert (first - second).abs().max() < 2e-3
 
 
-def test_what_turns_is_turned_back():
-    """At the instants of all sweeps the places are those of a motion without times."""
-    rng, turn, flow, centre = np.random.default_rng(0), 0.04, np.array([0.5, 0.2]), np.array([-0.3, 0.1])
-    shape, times = rng.uniform(-0.6, 0.6, (200, 2)), rng.uniform(-0.5, 0.5, (3, 200)).astype(np.float32)
-
-    def at(since: np.ndarray) -> np.ndarray:
-        # The angle whose half has the tangent k * turn, as in the registration, for k intervals: here it is small.
-        angle = 2 * since * np.arctan(turn)
-        x, y = np.cos(angle) * shape[:, 0] - np.sin(angle) * shape[:, 1], np.sin(angle) * shape[:, 0]
-        y = y + np.cos(angle) * shape[:, 1]
-        return np.stack((x, y), 1) + centre + flow * since[:, None]
-
-    clouds = [np.concatenate((at(1 - k + times[k]), np.full((200, 1), 0.2)), 1) for k in range(3)]
-    scene = with_times(one_object(clouds, flow), torch.from_numpy(times.ravel()))
-    rigid = RigidMotion(*(torch.from_numpy(np.array(values)) for values in ([flow], [turn], [centre])))
-    sharp, _ = deskew(scene.points(), scene.sweeps, rigid)
-    for step in range(3):
-        truth = at(np.full(200, 1.0 - step))
-        assert np.abs(sharp.position[:, sharp.step == step].T.numpy() - truth).max() < 1e-3
-
-
 def test_times_that_differ_by_a_turn_of_the_sensor_are_not_believed():
     """What is met at the end of one sweep and at the start of the next would be faster by far than it seems."""
     clouds, of_points = seen_box((0.3, 0.0), [(0.0,), (0.0,)])
@@ -155,14 +133,6 @@ def test_times_that_differ_by_a_turn_of_the_sensor_are_not_believed():
     scene = with_times(one_object(clouds, (0.3, 0.0)), torch.from_numpy(of_points))
     seen = register(scene.points(), scene.sweeps, scene.flow)
     assert torch.equal(register_deskewed(scene.points(), scene.sweeps, scene.flow, seen).flow, seen.flow)
-
-
-def test_points_that_leave_the_region_are_left_out():
-    cloud = np.array([[UPPER[0] - 0.05, 0.05, 0.2], [LOWER[0] + 0.05, 0.05, 0.2]])
-    scene = with_times(one_object([cloud, cloud], (1.0, 0.0)), torch.full((4,), -0.5))
-    rigid = RigidMotion.translation(scene.flow)
-    sharp, drawn = deskew(scene.points(), scene.sweeps, rigid)
-    assert sharp.position[0].tolist() == pytest.approx([LOWER[0] + 0.55] * 2) and len(drawn.pixel) == 2
 
 
 # ------------------------------------------------------------------------------------------------ what must not matter

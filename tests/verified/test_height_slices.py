@@ -1,4 +1,4 @@
-"""Height-sliced sweeps: the oracle's images, where each point and each occupied pixel is, slices by hand."""
+"""Height-sliced sweeps: the oracle's images, coarse ones as well, slices by hand."""
 
 from __future__ import annotations
 
@@ -42,19 +42,6 @@ def test_images_equal_the_oracle_in_a_batch():
     assert set(found.ravel().tolist()) == set(range(16))
 
 
-def test_points_and_pixels_know_their_places():
-    sweeps = sweeps_of([scene(1, num_history=2), scene(2)], PLAIN)
-    assert same_bits(sweeps.place == sweeps.image.numel() - 1, ~sweeps.batch.takes_part)
-    drawn = torch.zeros_like(sweeps.image, dtype=torch.bool)
-    drawn[sweeps.place[sweeps.batch.takes_part]] = True
-    assert same_bits(drawn, sweeps.image != 0)
-    assert sweeps.pixel.tolist() == sweeps.image.nonzero()[:, 0].tolist()
-    assert same_bits(sweeps.slices_at(sweeps.window, sweeps.step, sweeps.row, sweeps.col), sweeps.slices)
-    assert bool((sweeps.slices != 0).all())
-    assert sweeps.number[sweeps.pixel].tolist() == list(range(sweeps.pixel.numel()))
-    assert int(sweeps.number[-1]) == sweeps.pixel.numel()
-
-
 @pytest.mark.parametrize("block", [1, 2, 3])
 def test_coarse_pixels_have_the_slices_of_all_their_pixels(block):
     rng = np.random.default_rng(block)
@@ -65,6 +52,7 @@ def test_coarse_pixels_have_the_slices_of_all_their_pixels(block):
         assert np.array_equal(coarse[window], [coarsen(image, block) for image in images[window]])
     height, width = coarse.shape[2:]
     assert same_bits(column, (sweeps.window * height + sweeps.row // block) * width + sweeps.col // block)
+    assert same_bits(sweeps.slices_at(sweeps.window, sweeps.step, sweeps.row, sweeps.col), sweeps.slices)
 
 
 def test_slices_by_hand():

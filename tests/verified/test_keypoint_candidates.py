@@ -1,45 +1,12 @@
-"""Key points as motion candidates: the oracle's matches and medians, and what they are for."""
+"""Key points as motion candidates: what they are for."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
-from moving_scenes import for_oracle
-from oracle.candidates import keypoint_motion, keypoint_shifts
-from scenes import config, scene, sweeps_of
-from test_component_tree import as_level
+from scenes import config
 
 from cflow_torch import Sweep, Window, make_model
-from cflow_torch.verified.keypoint_candidates import KeyPointMotion, match_key_points
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_matches_equal_the_oracle(seed):
-    settings = config("verified", num_history=1, pixel_size=0.1, max_speed=(None, 6.0)[seed % 2])
-    sweeps = sweeps_of([scene(40 + seed, num_history=1), scene(50 + seed)], settings)
-    found = match_key_points(sweeps, settings)
-    assert sweeps.step[found.pixel].eq(1).all()
-    places = torch.stack((sweeps.window, sweeps.row, sweeps.col), 1)[found.pixel].tolist()
-    mine = dict(zip(map(tuple, places), map(tuple, found.motion.tolist())))
-    expected = {
-        (window, r, c): shift
-        for window in range(2)
-        for (_, r, c), shift in keypoint_shifts(for_oracle(sweeps, window), settings).items()
-    }
-    assert mine == expected and len(expected) > 10
-
-
-def test_medians_equal_the_oracle():
-    rng = np.random.default_rng(0)
-    labels = np.where(rng.random(60) < 0.2, -1, rng.integers(0, 7, 60))
-    pixel, shifts = np.sort(rng.permutation(60)[:35]), rng.integers(-3, 4, (35, 2)).astype(np.float64)
-    pixel = pixel[labels[pixel] != 4]  # a component without a match
-    shifts = shifts[: len(pixel)]
-    found = KeyPointMotion(torch.from_numpy(pixel), torch.from_numpy(shifts)).of_components(as_level(labels.tolist()))
-    listed = {(1, int(p), 0): tuple(shift) for p, shift in zip(pixel, shifts.tolist())}
-    expected = [keypoint_motion([(1, int(p), 0) for p in np.flatnonzero(labels == i)], listed) for i in range(7)]
-    assert found.tolist() == [list(motion) for motion in expected] and expected[4] == (0.0, 0.0)
 
 
 def test_they_find_what_moves_farther_than_it_is_long():

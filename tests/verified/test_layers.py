@@ -1,4 +1,4 @@
-"""Layers: the oracle's points on random boxes; a car under a crown or a bridge moves, what is no vehicle stays."""
+"""Layers: the oracle's points on random boxes; what is one and what is none."""
 
 from __future__ import annotations
 
@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 import torch
 from oracle import layers as oracle
-from scenes import reordered, sweeps_of
+from scenes import sweeps_of
 
-from cflow_torch import Sweep, VerifiedFlow, Window, make_config
+from cflow_torch import Sweep, Window
 from cflow_torch.config import VerifiedConfig
-from cflow_torch.verified import method
 from cflow_torch.verified.layers import points_of_lower_layers
 
 REGION = (-9.0, -7.0, -2.0, 9.0, 7.0, 30.0)
@@ -66,21 +65,6 @@ def test_points_equal_the_oracle():
     assert sum(0.05 < share < 0.5 for share in shares) > 6
 
 
-def test_the_order_of_points_means_nothing():
-    window = slabs(3)
-    mixed, order = reordered(window)
-    assert lower([mixed])[0][1].tolist() == lower([window])[0][1][order].tolist()
-
-
-def test_nothing_at_rest_and_nothing_lower():
-    sweeps = sweeps_of([slabs(0), slabs(1)], SETTINGS)
-    nothing = torch.zeros_like(sweeps.batch.takes_part)
-    assert not points_of_lower_layers(sweeps, nothing).any()
-    assert not np.concatenate(lower([things([POST])], 2.0)[0]).any()
-    empty = Sweep(np.zeros((0, 3), np.float32))
-    assert [mask.tolist() for mask in lower([Window(empty, empty)])[0]] == [[], []]
-
-
 def filled(box: Box, rng: np.random.Generator, density: float = 60.0) -> np.ndarray:
     """Points all over a box, so many in a cubic metre."""
     low, high = np.array(box)
@@ -113,32 +97,3 @@ def test_what_is_a_lower_layer(thing, others, is_lower):
     count = len(filled(thing, np.random.default_rng(0)))
     assert (found[:count] == is_lower).all()
     assert not found[count:].any() or others[1:]  # in the last case what lies below is one
-
-
-CAR_SPEED = 0.7
-
-
-def under(cover: Box) -> Tuple[Window, np.ndarray]:
-    """A car that drives under something that stands, five sweeps; which points of t are the car's."""
-    rng = np.random.default_rng(5)
-    car = filled(((-2.0, -0.9, -1.6), (2.0, 0.9, -0.1)), rng, 80.0)
-    above, sweeps = filled(cover, rng, 60.0), []
-    for k in range(6):  # t+1 first
-        moved = car[rng.random(len(car)) < 0.7] - (CAR_SPEED * k, 0.0, 0.0)
-        seen = above[rng.random(len(above)) < 0.7]
-        points = np.concatenate((moved, seen)) + rng.normal(0, 0.01, (len(moved) + len(seen), 3))
-        sweeps.append((Sweep(points.astype(np.float32)), np.arange(len(points)) < len(moved)))
-    (newest, _), (own, is_car), *older = sweeps
-    return Window(own, newest, tuple(sweep for sweep, _ in older)), is_car
-
-
-@pytest.mark.parametrize("cover", [((-5.0, -3.0, 2.2), (5.0, 3.0, 5.0)), ((-4.0, -8.0, 2.6), (4.0, 8.0, 3.4))])
-def test_a_car_moves_under_what_stands(cover, monkeypatch):
-    window, is_car = under(cover)
-    model = VerifiedFlow(make_config("default", point_cloud_range=(-10.0, -10.0, -3.0, 10.0, 10.0, 8.0)))
-    flow = model([window])[0].residual_flow.numpy()
-    assert np.linalg.norm(flow[is_car] - (CAR_SPEED, 0.0, 0.0), axis=1).mean() < 0.03
-    assert not flow[~is_car].any()
-    monkeypatch.setattr(method, "points_of_lower_layers", lambda _, at_rest: torch.zeros_like(at_rest))
-    flat = model([window])[0].residual_flow.numpy()
-    assert np.linalg.norm(flat[is_car] - (CAR_SPEED, 0.0, 0.0), axis=1).mean() > 0.3  # merged with what is above

@@ -10,7 +10,7 @@ import torch
 from moving_scenes import for_oracle
 from oracle import local_motion as oracle
 from oracle.height_slices import Pixel
-from scenes import pose, reordered, same_bits, sweeps_of
+from scenes import pose, sweeps_of
 
 from cflow_torch import Sweep, VerifiedFlow, Window, make_config
 from cflow_torch.config import VerifiedConfig
@@ -126,14 +126,6 @@ def test_the_last_place_of_a_row_is_not_beside_the_first_of_the_next():
         assert as_oracle([crossing(rng), crossing(rng)], settings, seed) > 0
 
 
-def test_the_order_of_points_means_nothing():
-    windows = [walkers(1), walkers(2)]
-    given, mixed = (asked(some, settings_of()) for some in (windows, [reordered(window)[0] for window in windows]))
-    found, again = find_local_motion(*given), find_local_motion(*mixed)
-    assert same_bits(found[0].of_pixel, again[0].of_pixel) and same_bits(found[1], again[1])
-    assert found[0].count > given[0].count
-
-
 def test_pairs_and_empty_windows_are_left_alone():
     empty = Sweep(np.zeros((0, 3), np.float32))
     for windows in ([walkers(1, 0)], [Window(empty, empty)], [Window(empty, empty, (empty,))]):
@@ -145,7 +137,7 @@ def test_pairs_and_empty_windows_are_left_alone():
     assert as_oracle([walkers(1, 0), Window(empty, empty), walkers(1), Window(one, empty, (empty, one))], settings_of())
 
 
-# --------------------------------------------------------------------------------------------- what is believed
+# ----------------------------------------------------------------------------------------- what it is for
 
 
 def column(slices: int, velocity: Sequence[float], sensor: Sequence[float] = (0.0, 0.0)) -> int:
@@ -155,19 +147,14 @@ def column(slices: int, velocity: Sequence[float], sensor: Sequence[float] = (0.
     thing = rng.uniform((0.0, 0.0, -1.5), (0.5, 0.5, 0.5 * slices - 1.5), (250, 3))
     wall, sweeps = rng.uniform((-2.0, 0.7, -1.5), (2.0, 1.0, 0.5), (900, 3)), []
     for k in range(5):
-        T_world_ego = np.eye(4)
-        T_world_ego[:2, 3] = -k * np.array(sensor)
+        T_world_ego = pose(-k * sensor[0], -k * sensor[1], 0.0)
         points = np.concatenate((thing - [*(k * np.array(velocity)), 0.0], wall)) - T_world_ego[:3, 3]
         sweeps.append(Sweep(points.astype(np.float32), pose=T_world_ego))
-    settings = settings_of()
-    given = asked([Window(sweeps[1], sweeps[0], tuple(sweeps[2:]))], settings)
-    objects, motion, levels, images = given
+    objects, motion, levels, images = asked([Window(sweeps[1], sweeps[0], tuple(sweeps[2:]))], settings_of())
     found = find_local_motion(objects, torch.zeros_like(motion), levels, images)
-    *truth, _ = expected(objects, torch.zeros_like(motion), images, 0, settings)
+    *truth, _ = expected(objects, torch.zeros_like(motion), images, 0, settings_of())
     assert list(by_pixel(found[0], found[1], images, 0)) == truth
-    new = found[1][found[1].any(1)]
-    assert not len(new) or (new * 0.1 - torch.tensor(velocity).flip(0)).norm(dim=1).min() < 0.051
-    return len(new)
+    return int(found[1].any(1).sum())
 
 
 def test_what_is_believed():
@@ -194,17 +181,6 @@ def beside_a_wall(speed: float, density: float) -> Tuple[Window, np.ndarray]:
 
 
 MODEL = make_config("default", point_cloud_range=(-10.0, -10.0, -3.0, 10.0, 10.0, 8.0))
-
-
-@pytest.mark.parametrize("speed, density", [(0.13, 20.0), (0.15, 40.0), (0.2, 130.0)])
-def test_a_walker_in_what_stands_is_taken_out(speed, density):
-    objects, motion, levels, sweeps = asked([beside_a_wall(speed, density)[0]], MODEL)
-    found, motion, _ = find_local_motion(objects, torch.zeros_like(motion), levels, sweeps)
-    is_walker = (sweeps.row + 0.5) * sweeps.grid.pixel_size + sweeps.grid.lower[1] < 2.9
-    moves = torch.nn.functional.pad(motion.any(1), (0, 1))[found.of_pixel]
-    assert moves[is_walker].double().mean() > 0.8 and moves[~is_walker].double().mean() < 0.03
-    taken = motion[motion.any(1)] * sweeps.grid.pixel_size
-    assert (taken - torch.tensor([0.0, speed])).norm(dim=1).min() < 0.051  # y, x
 
 
 def test_a_walker_beside_a_wall_moves_and_the_wall_stands(monkeypatch):

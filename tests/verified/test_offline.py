@@ -8,13 +8,7 @@ from typing import List, Optional, Sequence
 import numpy as np
 import pytest
 import torch
-from oracle.component_tree import with_longest
-from scenes import (
-    assert_same_bits,
-    config,
-    flow_as_oracle,
-    scene,
-)
+from scenes import assert_same_bits, config, flow_as_oracle, scene
 from turning_car import MODEL, upright_box
 
 from cflow_torch import CFlowError, FlowResult, Sweep, VerifiedFlow, Window, estimate_flow, make_model
@@ -72,10 +66,10 @@ def test_equals_the_oracle_on_random_scenes(seed):
         num_future=future,
         pixel_sizes=((0.25,), (0.5, 0.25))[seed % 2],
         max_speed=(None, 6.0)[seed % 3 == 0],
+        max_object=(None, 4.0)[seed % 3 > 0],
         min_height=(None, 0.3)[seed % 5 > 0],
         thorough=seed % 4 != 1,
     )
-    settings = with_longest(settings, (None, 4.0)[seed % 3 > 0])
     window = scene(700 + seed, num_history=past, num_future=future, poses=seed % 5 > 0, stamps=seed % 2 > 0)
     result, (without,) = flow_as_oracle(window, settings), make_model(settings)([replace(window, pcf=())])
     assert past > 0 or not torch.equal(result.residual_flow, without.residual_flow), "the future counts"
@@ -124,14 +118,6 @@ def test_repeated_sweeps_after_t1_are_left_out():
     assert_same_bits(model([replace(window, pcf=(later, later, later))])[0], expected)
     (without,) = model([replace(window, pcf=())])
     assert_same_bits(model([replace(window, pcf=(window.pc1, window.pc1))])[0], without)
-
-
-def test_empty_and_hopeless_windows():
-    empty, lost = bare(np.zeros((0, 3))), bare(np.full((5, 3), np.nan))
-    one = bare(np.zeros((1, 3)))
-    for pc0, pc1, later in ((empty, empty, one), (lost, one, empty), (one, lost, one), (one, one, lost)):
-        result = flow_as_oracle(Window(pc0, pc1, (), (later,)), OFFLINE)
-        assert result.residual_flow.shape == (len(pc0.points), 3) and not result.residual_flow.any()
 
 
 # ------------------------------------------------------------------------------------------------- ways to give it
@@ -183,11 +169,8 @@ def later(offset: float, stamp: Optional[int], pose: Optional[np.ndarray] = None
     [
         ((later(1, 200), later(2, 150)), "out of order.*pcf1"),
         ((later(1, 100),), "out of order"),  # the time of t+1
-        ((later(1, 50),), "out of order"),
         ((later(1, 200, np.eye(4)),), "pose of every sweep"),
-        ((later(1, float("nan")),), "timestamp_ns of pcf1"),
         ((Sweep(P[:, :2]),), r"pcf1 has shape \(50, 2\)"),
-        ((P,), "pcf1 is ndarray"),
         (P, "pcf is ndarray"),
         (tuple(later(i, 200 + i) for i in range(5)), "5 future sweeps but num_future=4"),
     ],

@@ -38,15 +38,6 @@ def test_equals_the_oracle(pixel_size, num_windows, snap):
     assert 0 < int(flow.any(1).sum()) < len(flow)
 
 
-def test_only_what_is_wanted_and_only_in_pairs():
-    scene = slow_scene(range(6))
-    flow, wanted = found(scene), torch.arange(len(scene.flow)) % 2 == 0
-    assert flow[~wanted].any()
-    assert torch.equal(slow_motion(scene.sweeps, scene.objects, wanted), flow.masked_fill(~wanted[:, None], 0.0))
-    assert not slow_motion(scene.sweeps, scene.objects, torch.zeros_like(wanted)).any()
-    assert not found(moving_scene(range(6), 3, num_points=150, speed=0.08, size=(0.2, 0.8))).any()
-
-
 def person(shift, rng) -> np.ndarray:
     """An upright cylinder, sampled anew."""
     angle, height = rng.uniform(0, 2 * np.pi, 400), rng.uniform(0.0, 1.5, 400)

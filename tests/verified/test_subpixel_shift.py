@@ -1,4 +1,4 @@
-"""Sub-pixel shift of objects: the oracle's; ties; known shifts are found."""
+"""Sub-pixel shift of objects: the oracle's; known shifts are found."""
 
 from __future__ import annotations
 
@@ -31,28 +31,6 @@ def test_equals_the_oracle(snap, num_points):
         assert torch.allclose(found, expected(scene), rtol=0, atol=1e-9)
         moved += int((found - torch.floor(scene.in_pixels() + 0.5)).abs().ge(0.75).any(1).sum())
     assert moved > 0
-
-
-@pytest.mark.parametrize(
-    "new, flow, expected_flow",
-    [
-        ([(0, 0)], (0.2, -0.3), (0.0, 0.0)),  # rounded to whole pixels
-        ([(0, 1), (0, -1)], (0.0, 0.0), (0.0, -1.0)),  # equally near: the first in raster order
-        ([(1, 1), (-1, 0)], (0.0, 0.0), (-1.0, 0.0)),  # the nearer one
-        ([(2, 0)], (0.0, 0.0), (0.0, 0.0)),  # too far: nothing is met
-        ([(2, 0)], (0.3, 0.2), (0.3, 0.2)),  # nothing is met: not rounded
-        ([(2, 0)], (0.5, 0.0), (2.0, 0.0)),  # halves up, then one on
-        ([(0, 0), (0, 1)], (0.0, 0.0), (0.0, 0.5)),  # the parabola goes half a pixel at most
-    ],
-)
-def test_ties(new, flow, expected_flow):
-    """One voxel at t, some at t+1, each at the same place of its pixel: the four grids count the same."""
-    at = np.array([[0.02, 0.02, 0.2]])
-    scene = one_object([np.concatenate([at + (0.1 * dx, 0.1 * dy, 0.0) for dy, dx in new]), at], (0.0, 0.0))
-    given = torch.tensor([flow], dtype=torch.float64)
-    assert shift_between_pixels(scene.points(), scene.sweeps, given).tolist() == [list(expected_flow)]
-    (window,) = scene.windows()
-    assert oracle_shift(window.points(), [flow], window.sweeps) == [expected_flow]
 
 
 def test_a_known_shift_is_found_to_a_fifth_of_a_pixel():

@@ -1,8 +1,6 @@
-"""Voxels: the oracle's centroids and nearest ones, ties, borders, the table of weights."""
+"""Voxels: the oracle's centroids and nearest ones, borders."""
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 import pytest
@@ -10,7 +8,7 @@ import torch
 from moving_scenes import LOWER, moving_scene, one_object
 from oracle import voxel_centroids as oracle
 
-from cflow_torch.verified.voxel_centroids import UNITS, Voxels, meeting_weights
+from cflow_torch.verified.voxel_centroids import UNITS, Voxels
 
 
 @pytest.mark.parametrize("snap", [0.0, 1 / 16])
@@ -52,15 +50,3 @@ def test_nearest_does_not_look_across_the_border():
     x = torch.full_like(y, int((scene.sweeps.grid.width - 0.5) * 0.1 * UNITS))
     x[-1] = 20
     assert voxels.nearest(zero, zero, zero, x.double(), y.double()).tolist() == [2, 2, 2, 2, 2, 0]
-
-
-def test_weights_are_those_of_a_gaussian():
-    for sigma in (0.15, 0.07):
-        table = meeting_weights(sigma, torch.device("cpu"))
-        assert table[[0, -1]].tolist() == [256 * oracle.meeting_weight(0, sigma), 0.0]
-        for square in range(0, 2048 * 64, 997):
-            metres = math.sqrt(square) / UNITS
-            assert float(table[square // 64]) == 256 * oracle.meeting_weight(square, sigma)
-            assert float(table[square // 64]) == pytest.approx(
-                256 * math.exp(-(metres**2) / (2 * sigma**2)), abs=256 * 32 / (2 * (sigma * UNITS) ** 2) + 0.5
-            )

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 from typing import Callable
 
+import command_line
 import numpy as np
 import pytest
 from matplotlib.image import imread
@@ -13,7 +14,6 @@ from PIL import Image
 
 from cflow_torch import CFlowError
 from cflow_torch.cli import plot as plot_command
-from cflow_torch.cli.main import main
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.log import window
 from cflow_torch.simulator import make_drive
@@ -34,17 +34,9 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def cflow(monkeypatch: pytest.MonkeyPatch, drive: Path, tmp_path: Path) -> Callable[..., int]:
     """A call of a command on that log, which writes to `out` and gives its exit status."""
-    monkeypatch.setattr(sys, "argv", list(sys.argv))
     monkeypatch.chdir(tmp_path)
-
-    def call(command: str, *arguments: str) -> int:
-        try:
-            main([command, "data=av2", f"data.root={drive}", f"output={tmp_path / 'out'}", *arguments])
-        except SystemExit as stop:
-            return int(stop.code or 0)
-        return 0
-
-    return call
+    given = ("data=av2", f"data.root={drive}", f"output={tmp_path / 'out'}")
+    return lambda command, *arguments: command_line.cflow(command, *given, *arguments)
 
 
 @pytest.mark.parametrize("picture", ["flow", "clusters", "keypoints", "correlation", "scales"])

@@ -31,13 +31,6 @@ def test_pixels_equal_the_oracle(size):
     assert col.max() == grid.width - 1  # the upper end belongs to the last pixel
 
 
-def test_a_pixel_is_a_true_division():
-    # 0.7 / 0.1 = 6.999..., so 0.7 lies in column 6; times the reciprocal it would be column 7.
-    grid = Grid(0.1, (0.0, 0.0, -INF), (2.0, 2.0, INF))
-    x = torch.tensor([0.3, 0.6, 0.7, 1.7], dtype=torch.float64)
-    assert grid.pixel(torch.stack((x, 0 * x, x))).tolist() == [math.floor(v / 0.1) for v in x.tolist()]
-
-
 def test_the_region_includes_both_ends_and_no_nan():
     grid = Grid(0.5, (-1.0, -2.0, -3.0), (1.0, 2.0, 3.0))
     inside = [(-1, -2, -3), (1, 2, 3), (0, 0, 0)]

@@ -20,7 +20,7 @@ from cflow_torch.windows.bev_grid import Grid
 from cflow_torch.windows.memory import split_windows
 
 CPU = torch.device("cpu")
-EMPTY, FAR = np.zeros((0, 3), dtype=np.float32), np.full((3, 3), 1000.0)
+EMPTY, FAR, LOST = np.zeros((0, 3), dtype=np.float32), np.full((3, 3), 1000.0), np.full((5, 3), np.nan)
 P0, P1 = np.random.default_rng(0).uniform(-5, 5, (2, 50, 3)).astype(np.float32)
 
 
@@ -32,42 +32,30 @@ def cflow(window: Window, settings: Config) -> FlowResult:
 # ------------------------------------------------------------------------------------------------- what takes part
 
 
-@pytest.mark.parametrize("column, bad", [(0, np.nan), (1, np.inf), (2, -np.inf), (2, np.nan)])
-def test_points_that_are_not_finite_are_left_out(column, bad):
-    clean, rows = scene(11, num_history=1), np.array([3, 100, 101, 400])
-
-    def broken(sweep: Sweep) -> Sweep:
-        points = sweep.points.copy()
-        points[rows, column] = bad
-        return replace(sweep, points=points)
-
-    def without(sweep: Sweep) -> Sweep:
-        return replace(sweep, points=np.delete(sweep.points, rows, 0), is_ground=np.delete(sweep.is_ground, rows))
-
-    result = cflow(changed(clean, broken), config(num_history=1))
-    kept = np.delete(np.arange(len(clean.pc0.points)), rows)
-    assert_same_bits(rows_of(result, kept), cflow(changed(clean, without), config(num_history=1)))
-    assert_zeros(rows_of(result, rows), len(rows))
-    assert not result.flow[rows].any() and not result.is_valid[rows].any()
-
-
-@pytest.mark.parametrize("with_pose", [False, True])
+@pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize(
-    "pc0, pc1, pch",
+    "pc0, pc1, others",
     [
+        (EMPTY, EMPTY, ()),
         (EMPTY, P1, (P0,)),
         (P0, EMPTY, (P1,)),
         (P0[:1], P0[:1] + 3, ()),
+        (P0[:1], P0[:1], (LOST,)),
+        (LOST, P0[:1], (EMPTY,)),
+        (P0[:1], LOST, (P0[:1],)),
         (FAR, P1, ()),
         (P0, FAR, (P1,)),
     ],
 )
-def test_nothing_to_find_gives_zeros_of_the_right_shape(pc0, pc1, pch, with_pose):
-    sweeps = [Sweep(p, pose=pose(1, 2, 0.3) if with_pose else None) for p in (pc0, pc1, *pch)]
-    window = Window(sweeps[0], sweeps[1], tuple(sweeps[2:]))
-    settings = config(num_history=2, sectional_view=True, pixel_sizes=(0.4, 0.2), max_speed=5.0)
-    result = flow_as_oracle(window, settings)
-    assert_zeros(result, len(pc0))
+def test_nothing_to_find_gives_zeros_of_the_right_shape(pc0, pc1, others, preset):
+    """Sweeps before t, and after t+1 where the preset takes any."""
+    overrides = {"sectional_view": True, "pixel_sizes": (0.4, 0.2), "max_speed": 5.0} if preset == "paper" else {}
+    settings = small(preset, **overrides)
+    sweeps, more = ([Sweep(p, pose=pose(1, 2, 0.3)) for p in clouds] for clouds in ((pc0, pc1), others))
+    result = flow_as_oracle(Window(*sweeps, tuple(more), tuple(more) if settings.num_future else ()), settings)
+    if preset == "paper" and pc1 is not pc0:
+        assert_zeros(result, len(pc0))
+    assert result.residual_flow.shape == (len(pc0), 3) and not result.residual_flow.any()
     low, high = np.array(RANGE[:3]), np.array(RANGE[3:])
     assert result.is_valid.tolist() == [bool(((p >= low) & (p <= high)).all()) for p in pc0]
 

@@ -1,25 +1,12 @@
-"""Patches around pixels, nearest set pixels, and the lower surface of height maps, against loops."""
+"""Nearest set pixels and the lower surface of height maps, against loops."""
 
 from __future__ import annotations
 
 import numpy as np
-import pytest
 import torch
 
 from cflow_torch.ops.lower_surface import UNKNOWN, _cone, lower_surface
 from cflow_torch.ops.nearest import nearest_set_pixel
-from cflow_torch.ops.patches import gather_patches
-
-
-@pytest.mark.parametrize("size", [1, 3, 13])
-def test_patches_have_zeros_outside_the_image(size):
-    images, half = np.random.default_rng(size).random((3, 6, 9)) < 0.4, size // 2
-    place = [torch.from_numpy(index) for index in np.indices(images.shape).reshape(3, -1)]
-    patches, energy = gather_patches(torch.from_numpy(images), *place, size)
-    padded = np.pad(images, [(0, 0), (half, half), (half, half)])
-    expected = [padded[b, r : r + size, c : c + size].flatten() for b, r, c in np.ndindex(images.shape)]
-    assert np.array_equal(patches.numpy(), expected) and patches.dtype == torch.uint8
-    assert energy.tolist() == [int(patch.sum()) for patch in expected] and energy.dtype == torch.int64
 
 
 def test_the_nearest_set_pixel_is_the_first_of_the_nearest():

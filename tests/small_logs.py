@@ -1,0 +1,50 @@
+"""A small log of each data set, as simulated drives and tiny recordings are written."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from tiny_recording import TinyRecording
+
+from cflow_torch.data.arrays import write_array_log
+from cflow_torch.simulator import Drive, make_drive
+from cflow_torch.simulator.profiles import PROFILES
+from cflow_torch.simulator.writers.aevascenes import write_aevascenes_sequence
+from cflow_torch.simulator.writers.av2 import write_av2_log
+from cflow_torch.simulator.writers.nuscenes import write_nuscenes
+from cflow_torch.simulator.writers.truckscenes import write_truckscenes
+from cflow_torch.simulator.writers.waymo import write_waymo_segment
+
+SIMULATED = {"av2": write_av2_log, "aevascenes": write_aevascenes_sequence}
+SMALL_LOGS = (*SIMULATED, "arrays", "bags", "hdf5", "nuscenes", "truckscenes", "waymo")
+
+
+def write_small_log(name: str, folder: Path) -> Path:
+    """Three sweeps or more; the folder."""
+    drive = make_drive(seed=3, num_sweeps=3, profile="demo")
+    if name in SIMULATED:
+        SIMULATED[name](drive, folder)
+    elif name == "arrays":
+        write_array_log(drive, folder, ".npz", "tum")
+    elif name == "bags":
+        pytest.importorskip("rosbags")
+        from bag_writer import write_bag
+
+        folder.mkdir()
+        write_bag(folder, "mcap", TinyRecording(("velodyne",), num_sweeps=3))
+    elif name == "hdf5":
+        pytest.importorskip("h5py")
+        from cflow_torch.data.hdf5.writer import write_hdf5_scene, write_index_files
+
+        write_hdf5_scene(drive, folder / f"{drive.log_id}.h5")
+        write_index_files(folder)
+    elif name == "nuscenes":
+        write_nuscenes(TinyRecording(("LIDAR_TOP",)), folder)
+    elif name == "truckscenes":
+        write_truckscenes(TinyRecording(("LIDAR_LEFT", "LIDAR_RIGHT")), folder)
+    else:
+        roof = replace(PROFILES["waymo"].units[0], num_columns=265)
+        write_waymo_segment(Drive(drive.scene, replace(PROFILES["waymo"], units=(roof,)), 3, 2, "small"), folder)
+    return folder
