@@ -121,3 +121,9 @@ def test_a_rail_that_comes_into_sight_or_leaves_it_at_one_end_slides():
 
 def test_what_stands_there_need_not_belong_to_the_component():
     assert slides({0: rail(30, 80), 1: rail(10, 60)}, (0, 20), others={0: rail(2, 30), 1: rail(60, 82)})
+
+
+def test_the_share_that_must_be_covered():
+    # A cell has four pixels. Of 34 looks 4 find nothing in theirs or beside it, of 33 too.
+    assert slides({0: rail(0, 34), 1: rail(10, 44)}, (0, 13))
+    assert not slides({0: rail(0, 33), 1: rail(11, 44)}, (0, 13))
