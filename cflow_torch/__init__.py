@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from cflow_torch.types import CFlowError, FlowResult, Sweep, Window
     from cflow_torch.verified.method import VerifiedFlow
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 
 __all__ = [
     "CFlowError",
