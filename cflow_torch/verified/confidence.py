@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Sequence, Tuple
+from typing import NamedTuple, Sequence, Tuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.ops.indices import divide, flat_nonzero
+from cflow_torch.verified.aperture import principal_axes
 from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import HeightSlicedSweeps, count_slices
 from cflow_torch.verified.paired_test import count_wins
@@ -30,11 +31,34 @@ BLOCK = 1.6  # metres, sides of a neighbourhood
 _NOWHERE = 1e7  # pixels, outside every image
 
 
-def margin_of(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMotion) -> Tensor:
-    """(G,) int64: how much worse the sweeps would be explained if the motion of an object were displaced; 0 = hardly
-    worse, so that nothing speaks for this motion. Arguments as for `confidence_of`."""
+class Margin(NamedTuple):
+    """How much worse the sweeps would be explained if the motions of G objects were displaced.
+
+    Args:
+        bin: (G,) int64, in the table; 0 = hardly worse.
+        moves: (G,) bool, whether that shows that it moves. Of hardly worse ones those do that are better at all and
+            have left the place where they were, if they are no lines: a rail seems to leave its place as well.
+    """
+
+    bin: Tensor
+    moves: Tensor
+
+
+def margin_of(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMotion) -> Margin:
+    """The margin of each object. Arguments as for `confidence_of`."""
     motion = _pixels_per_interval(sweeps, rigid)
-    return _margin(sweeps, objects, motion, motion.any(1))
+    off = DISPLACEMENT / sweeps.grid.pixel_size
+    ways = [[0.0, 0.0], [off, 0.0], [-off, 0.0], [0.0, off], [0.0, -off], [_NOWHERE, _NOWHERE]]
+    candidates = motion[:, None] + torch.tensor(ways, dtype=torch.float64, device=motion.device)
+    won, lost = count_wins(sweeps, objects.of_pixel, candidates, motion.any(1))
+    surplus = won - lost  # found under the motion less found where it stands
+    stays = lost[:, 5]  # who moves out of the image loses all that is found where it stands
+    gain, found = (surplus[:, 0] - surplus[:, 1:5].amax(1)).clamp(min=0), surplus[:, 0] + stays
+    bins = _count([(gain > 0) & (gain * gain >= bound * bound * found) for bound in TABLE["margin"]])
+    newest = flat_nonzero((sweeps.step == 0) & (objects.of_pixel < objects.count))
+    at_newest = (values.index_select(0, newest) for values in (objects.of_pixel, sweeps.row, sweeps.col))
+    is_line, _, _ = principal_axes(*at_newest, objects.count, sweeps.grid.pixel_size)
+    return Margin(bins, (bins > 0) | ((gain > 0) & (surplus[:, 0] > stays) & ~is_line))
 
 
 def confidence_of(
@@ -46,7 +70,7 @@ def confidence_of(
         sweeps: finest images, P occupied pixels.
         objects: G of them.
         rigid: their motion. Turns are not looked at: an object counts as it moves at its centre.
-        margin: as `margin_of` gives it.
+        margin: (G,) int64, its bins.
         doubt: (P,) float64, how much speaks for a local motion around each pixel, standard deviations of noise.
 
     Returns:
@@ -110,18 +134,6 @@ def _neighbourhood(sweeps: HeightSlicedSweeps, motion: Tensor) -> Tuple[Tensor, 
     for out, slices in zip(sums, (own, there)):
         out.index_add_(0, at, count_slices(slices).long())
     return sums[0].index_select(0, block), sums[1].index_select(0, block)
-
-
-def _margin(sweeps: HeightSlicedSweeps, objects: Objects, motion: Tensor, moves: Tensor) -> Tensor:
-    """(G,) int64, bin of what a motion loses by being displaced, in standard deviations of what it finds."""
-    off = DISPLACEMENT / sweeps.grid.pixel_size
-    ways = [[0.0, 0.0], [off, 0.0], [-off, 0.0], [0.0, off], [0.0, -off], [_NOWHERE, _NOWHERE]]
-    candidates = motion[:, None] + torch.tensor(ways, dtype=torch.float64, device=motion.device)
-    won, lost = count_wins(sweeps, objects.of_pixel, candidates, moves)
-    surplus = won - lost  # found under the motion less found where it stands
-    found = surplus[:, 0] + lost[:, 5]  # who moves out of the image loses all that is found where it stands
-    gain = (surplus[:, 0] - surplus[:, 1:5].amax(1)).clamp(min=0)
-    return _count([(gain > 0) & (gain * gain >= bound * bound * found) for bound in TABLE["margin"]])
 
 
 def _count(masks: Sequence[Tensor]) -> Tensor:

@@ -124,8 +124,8 @@ class VerifiedFlow(SceneFlowModel):
             rigid, seen = refine(objects, motion, levels, sweeps) if config.thorough else as_found(motion, sweeps)
         with stage("confidence"):
             margin = margin_of(sweeps, objects, seen)
-            confidence = confidence_of(sweeps, objects, seen, margin, doubt)
-            rigid = rigid.only(margin > 0) if config.thorough else rigid
+            confidence = confidence_of(sweeps, objects, seen, margin.bin, doubt)
+            rigid = rigid.only(margin.moves) if config.thorough else rigid
             return motion_by_pixel(objects, rigid, levels[-1].score, confidence, sweeps)
 
     def scales(self) -> List[Tuple[int, bool]]:

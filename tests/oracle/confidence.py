@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Dict, List, Sequence, Tuple
 
 import cflow_torch
+from oracle.aperture import principal_axis
 from oracle.height_slices import Pixel, SlicedSweeps, Vector, count
 from oracle.paired_test import count_wins
 
@@ -33,7 +34,7 @@ def confidences(
     members: List[List[Pixel]] = [[] for _ in flows]
     for pixel, owner in object_of.items():
         members[owner].append(pixel)
-    margins = {i: margin_bin(sweeps, members[i], motion) for i, motion in enumerate(motions) if any(motion)}
+    margins = {i: margin(sweeps, members[i], motion)[0] for i, motion in enumerate(motions) if any(motion)}
     at_t = [pixel for pixel in sweeps.pixels() if pixel[0] == 1]
     blocks = neighbourhoods(sweeps, at_t, {p: motions[object_of[p]] for p in at_t if p in object_of})
     result = {}
@@ -71,22 +72,26 @@ def neighbourhoods(
     return sums
 
 
-def margin_bin(sweeps: SlicedSweeps, members: Sequence[Pixel], motion: Vector) -> int:
-    """Bin of what an object's motion loses by being displaced by 0.4 m per interval, the best of four ways.
+def margin(sweeps: SlicedSweeps, members: Sequence[Pixel], motion: Vector) -> Tuple[int, bool]:
+    """Bin of what an object's motion loses by being displaced by 0.4 m per interval, the best of four ways; and whether
+    it moves at all.
 
     In standard deviations of what it finds: what it has more than standing still, and what is found where it stands.
-    0 for what stands still.
+    0 for what stands still. In bin 0 that moves which loses something, is found less where it stands than where it
+    moves to, and is no line.
     """
     if not any(motion):
-        return 0
+        return 0, False
     off = DISPLACEMENT / sweeps.pixel_size
     counts = [
         count_wins(sweeps, members, (motion[0] + y, motion[1] + x))
         for y, x in ((0.0, 0.0), (off, 0.0), (-off, 0.0), (0.0, off), (0.0, -off))
     ]
     surplus, *displaced = (won - lost for won, lost in counts)
-    gain, found = surplus - max(displaced), surplus + found_where_it_stands(sweeps, members)
-    return sum(gain > 0 and gain**2 >= bound**2 * found for bound in TABLE["margin"])
+    gain, stays = surplus - max(displaced), found_where_it_stands(sweeps, members)
+    number = sum(gain > 0 and gain**2 >= bound**2 * (surplus + stays) for bound in TABLE["margin"])
+    is_line, _, _ = principal_axis([(r, c) for m, r, c in members if m == 0], sweeps.pixel_size)
+    return number, number > 0 or (gain > 0 and surplus > stays and not is_line)
 
 
 def found_where_it_stands(sweeps: SlicedSweeps, members: Sequence[Pixel]) -> int:

@@ -14,7 +14,7 @@ from cflow_torch.config import VerifiedConfig
 from oracle.aperture import slides_along_itself
 from oracle.candidates import find_peak, keypoint_motion, keypoint_shifts, list_motions
 from oracle.component_tree import Level, equals_parent, find_components, parents, winners
-from oracle.confidence import confidences, margin_bin
+from oracle.confidence import confidences, margin
 from oracle.ground_residue import ground_heights, is_residue
 from oracle.height_slices import Pixel, SlicedSweeps, Vector, slice_image
 from oracle.layers import points_of_lower_layers
@@ -194,7 +194,7 @@ def look(
     trust, of_left_out = confidences(sweeps, object_of, [motion.flow for motion in shown], doubt)
     for i, motion in enumerate(shown if config.thorough else []):
         members = [pixel for pixel, owner in object_of.items() if owner == i]
-        if margin_bin(sweeps, members, (motion.flow[1] / size, motion.flow[0] / size)) == 0:
+        if not margin(sweeps, members, (motion.flow[1] / size, motion.flow[0] / size))[1]:
             rigid[i] = rigid[i]._replace(flow=(0.0, 0.0), turn=0.0)
 
     owners = [np.full(len(cloud.points), -1, dtype=np.int64) for cloud in clouds]

@@ -84,6 +84,15 @@ def test_a_wall_is_trusted_less_than_a_car():
     assert result.confidence[:600].max() < result.confidence[600:].min()
 
 
+@pytest.mark.parametrize("width", [1.0, 0.0])
+def test_what_could_nearly_as_well_be_displaced_moves_if_it_left_its_place_and_is_no_line(width):
+    # 8 m long, it moves by 5 m; 0.4 m more or less is hardly worse for it.
+    x, y = np.meshgrid(np.arange(-7.95, 0.0, 0.1), (3.05, 3.05 + width))
+    points = np.stack((x.ravel(), y.ravel(), np.full(x.size, 0.1)), 1)
+    result = flow_as_oracle(Window(Sweep(points), Sweep(points + (5.0, 0.0, 0.0))), MODEL.replace(max_speed=60.0))
+    assert np.allclose(result.residual_flow[:, 0], 5.0 if width else 0.0, atol=0.2)
+
+
 @pytest.mark.slow
 def test_dropping_what_is_least_trusted_lowers_the_error():
     drive = make_drive(seed=11, num_sweeps=8)
