@@ -56,8 +56,8 @@ def margin_of(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMotion) 
     gain, found = (surplus[:, 0] - surplus[:, 1:5].amax(1)).clamp(min=0), surplus[:, 0] + stays
     bins = _count([(gain > 0) & (gain * gain >= bound * bound * found) for bound in TABLE["margin"]])
     newest = flat_nonzero((sweeps.step == 0) & (objects.of_pixel < objects.count))
-    at_newest = (values.index_select(0, newest) for values in (objects.of_pixel, sweeps.row, sweeps.col))
-    is_line, _, _ = principal_axes(*at_newest, objects.count, sweeps.grid.pixel_size)
+    owner, row, col = (values.index_select(0, newest) for values in (objects.of_pixel, sweeps.row, sweeps.col))
+    is_line, _, _ = principal_axes(owner, row, col, objects.count, sweeps.grid.pixel_size)
     return Margin(bins, (bins > 0) | ((gain > 0) & (surplus[:, 0] > stays) & ~is_line))
 
 
