@@ -32,7 +32,7 @@ _LEAST_CUBES = 6
 _BLOCK = 410  # units, side of the blocks that vote
 _SIGMA = 0.07  # metres, of the weight of two centroids
 _AROUND = 2  # pixels in which a cube looks for others
-_BEYOND = 2.0**14  # units: no cube is looked for so far away
+_BEYOND = 2.0**11  # units: no cube is looked for so far away, and squares stay exact in float32
 BYTES_PER_POINT = 560  # cubes and the 25 around each
 
 
@@ -122,7 +122,7 @@ class _Cubes:
         # What a shift from t to t+1 leaves to go: seen from t+1 all signs change.
         sign = (2 * step - 1).double()
         self._x, self._y = (
-            values.index_select(0, near.view(-1)).view_as(near).sub_(own).clamp_(-_BEYOND, _BEYOND).mul_(sign)
+            values.index_select(0, near.view(-1)).view_as(near).sub_(own).clamp_(-_BEYOND, _BEYOND).mul_(sign).float()
             for values, own in ((voxels.x, x), (voxels.y, y))
         )
         self._place = torch.stack((x, y))
@@ -179,6 +179,6 @@ class _Cubes:
 
     def _meet(self, shift: Tensor) -> Tensor:
         """(K,) float64 weight of what each cube meets at its shift, (K or 1, 2)."""
-        x, y = self._x - shift[:, 0], self._y - shift[:, 1]
+        x, y = (values - along.float() for values, along in zip((self._x, self._y), shift.unbind(1)))
         square = x.mul_(x).add_(y.mul_(y)).amin(0)
         return self._weight.index_select(0, (square / 64).long().clamp_(max=2048)) / 256
