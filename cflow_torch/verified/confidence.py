@@ -9,56 +9,22 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import NamedTuple, Sequence, Tuple
+from typing import Sequence, Tuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.ops.indices import divide, flat_nonzero
-from cflow_torch.verified.aperture import principal_axes
 from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import HeightSlicedSweeps, count_slices
-from cflow_torch.verified.paired_test import count_wins
 from cflow_torch.verified.rigid_motion import RigidMotion
 
 # Bounds of the bins and the probabilities, written by scripts/ablation/calibrate_confidence.py. Bins, in order: left
 # out; unlinked, by `crowd`; still, by `share`, or where a local motion is likely by `doubt`; moving, by `margin`: pairs
 # near, pairs far, with history near and far.
 TABLE = json.loads(Path(__file__).with_name("confidence.json").read_text(encoding="utf-8"))
-DISPLACEMENT = 0.4  # metres per interval, along x and along y
 BLOCK = 1.6  # metres, sides of a neighbourhood
-_NOWHERE = 1e7  # pixels, outside every image
-
-
-class Margin(NamedTuple):
-    """How much worse the sweeps would be explained if the motions of G objects were displaced.
-
-    Args:
-        bin: (G,) int64, in the table; 0 = hardly worse.
-        moves: (G,) bool, whether that shows that it moves. Of hardly worse ones those do that are better at all and
-            have left the place where they were, if they are no lines: a rail seems to leave its place as well.
-    """
-
-    bin: Tensor
-    moves: Tensor
-
-
-def margin_of(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMotion) -> Margin:
-    """The margin of each object. Arguments as for `confidence_of`."""
-    motion = _pixels_per_interval(sweeps, rigid)
-    off = DISPLACEMENT / sweeps.grid.pixel_size
-    ways = [[0.0, 0.0], [off, 0.0], [-off, 0.0], [0.0, off], [0.0, -off], [_NOWHERE, _NOWHERE]]
-    candidates = motion[:, None] + torch.tensor(ways, dtype=torch.float64, device=motion.device)
-    won, lost = count_wins(sweeps, objects.of_pixel, candidates, motion.any(1))
-    surplus = won - lost  # found under the motion less found where it stands
-    stays = lost[:, 5]  # who moves out of the image loses all that is found where it stands
-    gain, found = (surplus[:, 0] - surplus[:, 1:5].amax(1)).clamp(min=0), surplus[:, 0] + stays
-    bins = _count([(gain > 0) & (gain * gain >= bound * bound * found) for bound in TABLE["margin"]])
-    newest = flat_nonzero((sweeps.step == 0) & (objects.of_pixel < objects.count))
-    owner, row, col = (values.index_select(0, newest) for values in (objects.of_pixel, sweeps.row, sweeps.col))
-    is_line, _, _ = principal_axes(owner, row, col, objects.count, sweeps.grid.pixel_size)
-    return Margin(bins, (bins > 0) | ((gain > 0) & (surplus[:, 0] > stays) & ~is_line))
 
 
 def confidence_of(
@@ -70,27 +36,22 @@ def confidence_of(
         sweeps: finest images, P occupied pixels.
         objects: G of them.
         rigid: their motion. Turns are not looked at: an object counts as it moves at its centre.
-        margin: (G,) int64, its bins.
+        margin: (G,) float64, of each motion, `Margin.z`.
         doubt: (P,) float64, how much speaks for a local motion around each pixel, standard deviations of noise.
 
     Returns:
         (P + 1,) float32; entry P is for points whose pixel was left out. Means nothing for pixels of other sweeps.
 
-    Cost: one look-up for each pixel of t; six for each pixel of what moves and each sweep.
+    Cost: one look-up for each pixel of t.
     """
     probabilities = torch.tensor(TABLE["probabilities"], dtype=torch.float32, device=sweeps.elapsed.device)
     return probabilities.index_select(0, F.pad(_bins(sweeps, objects, rigid, margin, doubt), (0, 1)))
 
 
-def _pixels_per_interval(sweeps: HeightSlicedSweeps, rigid: RigidMotion) -> Tensor:
-    """(G, 2) float64, (y, x), finest pixels."""
-    return rigid.flow.flip(1) / torch.full_like(rigid.flow, sweeps.grid.pixel_size)
-
-
 def _bins(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMotion, margin: Tensor, doubt: Tensor) -> Tensor:
     """(P,) int64, place of each pixel in the table."""
     size = sweeps.grid.pixel_size
-    motion = _pixels_per_interval(sweeps, rigid)
+    motion = rigid.pixels_per_interval(size)
     moves = motion.any(1)
     number, found = _neighbourhood(sweeps, F.pad(motion, (0, 0, 0, 1)).index_select(0, objects.of_pixel))
     crowd, share = TABLE["crowd"], TABLE["share"]
@@ -105,7 +66,8 @@ def _bins(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMotion, marg
     has_history = ((sweeps.elapsed != 0).sum(1) > 1).index_select(0, sweeps.window)
     kind = 2 * has_history.long() + is_far.long()
     first = 3 + len(crowd) + len(share) + len(TABLE["doubt"])
-    moving = first + kind * (1 + len(TABLE["margin"])) + F.pad(margin, (0, 1))[objects.of_pixel]
+    num_margins = _count([margin >= bound for bound in TABLE["margin"]])
+    moving = first + kind * (1 + len(TABLE["margin"])) + F.pad(num_margins, (0, 1))[objects.of_pixel]
 
     still = torch.where(objects.of_pixel == objects.count, unlinked, still)
     return torch.where(F.pad(moves, (0, 1)).index_select(0, objects.of_pixel), moving, still)

@@ -20,10 +20,11 @@ from cflow_torch.stages import stage
 from cflow_torch.verified import keypoint_candidates, slow_motion
 from cflow_torch.verified.candidates import propose
 from cflow_torch.verified.component_tree import Objects, find_components, select_objects
-from cflow_torch.verified.confidence import confidence_of, margin_of
+from cflow_torch.verified.confidence import confidence_of
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 from cflow_torch.verified.layers import join_moving, points_at_rest, points_of_lower_layers
 from cflow_torch.verified.local_motion import find_local_motion
+from cflow_torch.verified.margin import margin_of
 from cflow_torch.verified.offline import best_nearby, motion_by_both_sides
 from cflow_torch.verified.paired_test import VerifiedLevel, verify
 from cflow_torch.verified.refinement import as_found, refine
@@ -33,7 +34,7 @@ from cflow_torch.windows.collation import Batch
 
 # Metres around the region that are looked at as well, so that what crosses its border is seen whole: at least the way
 # of 40 m/s in a sweep.
-MARGIN = 4.0
+_AROUND = 4.0
 
 
 class VerifiedFlow(SceneFlowModel):
@@ -73,9 +74,9 @@ class VerifiedFlow(SceneFlowModel):
         return bool(self.config.thorough)
 
     def grid(self, pixel_size: float) -> Grid:
-        """The BEV at a pixel size, metres: the region and its margin of whole pixels of the coarsest size."""
+        """The BEV at a pixel size, metres: the region and whole pixels of the coarsest size around it."""
         x0, y0, z0, x1, y1, z1 = self.config.point_cloud_range
-        wide = math.ceil(MARGIN / self.config.pixel_sizes[0]) * self.config.pixel_sizes[0]
+        wide = math.ceil(_AROUND / self.config.pixel_sizes[0]) * self.config.pixel_sizes[0]
         return Grid(pixel_size, (x0 - wide, y0 - wide, z0), (x1 + wide, y1 + wide, z1))
 
     def motion(self, batch: Batch) -> TurningMotion:
@@ -124,7 +125,7 @@ class VerifiedFlow(SceneFlowModel):
             rigid, seen = refine(objects, motion, levels, sweeps) if config.thorough else as_found(motion, sweeps)
         with stage("confidence"):
             margin = margin_of(sweeps, objects, seen)
-            confidence = confidence_of(sweeps, objects, seen, margin.bin, doubt)
+            confidence = confidence_of(sweeps, objects, seen, margin.z, doubt)
             rigid = rigid.only(margin.moves) if config.thorough else rigid
             return motion_by_pixel(objects, rigid, levels[-1].score, confidence, sweeps)
 

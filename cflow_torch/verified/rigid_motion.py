@@ -36,6 +36,10 @@ class RigidMotion:
         still = torch.zeros_like(flow)
         return cls(flow, still[:, 0], still)
 
+    def pixels_per_interval(self, pixel_size: float) -> Tensor:
+        """(G, 2) float64, (y, x): the flow at the centre, in pixels of a size in metres."""
+        return self.flow.flip(1) / torch.full_like(self.flow, pixel_size)
+
     def only(self, moves: Tensor) -> RigidMotion:
         """The motion of some objects, (G,) bool; the others stand still."""
         return RigidMotion(self.flow.masked_fill(~moves[:, None], 0.0), self.turn.masked_fill(~moves, 0.0), self.centre)

@@ -77,8 +77,8 @@ def margin(sweeps: SlicedSweeps, members: Sequence[Pixel], motion: Vector) -> Tu
     it moves at all.
 
     In standard deviations of what it finds: what it has more than standing still, and what is found where it stands.
-    0 for what stands still. In bin 0 that moves which loses something, is found less where it stands than where it
-    moves to, and is no line.
+    0 for what stands still. What loses at least one standard deviation moves; of the rest that which loses something,
+    is found less where it stands than where it moves to, and is no line.
     """
     if not any(motion):
         return 0, False
@@ -91,7 +91,8 @@ def margin(sweeps: SlicedSweeps, members: Sequence[Pixel], motion: Vector) -> Tu
     gain, stays = surplus - max(displaced), found_where_it_stands(sweeps, members)
     number = sum(gain > 0 and gain**2 >= bound**2 * (surplus + stays) for bound in TABLE["margin"])
     is_line, _, _ = principal_axis([(r, c) for m, r, c in members if m == 0], sweeps.pixel_size)
-    return number, number > 0 or (gain > 0 and surplus > stays and not is_line)
+    moves = gain > 0 and (gain**2 >= surplus + stays or (surplus > stays and not is_line))
+    return number, moves
 
 
 def found_where_it_stands(sweeps: SlicedSweeps, members: Sequence[Pixel]) -> int:
