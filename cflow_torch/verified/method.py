@@ -28,6 +28,7 @@ from cflow_torch.verified.margin import margin_of
 from cflow_torch.verified.offline import best_nearby, motion_by_both_sides
 from cflow_torch.verified.paired_test import VerifiedLevel, verify
 from cflow_torch.verified.refinement import as_found, refine
+from cflow_torch.verified.relinking import relink
 from cflow_torch.verified.rigid_motion import TurningMotion, motion_by_pixel
 from cflow_torch.windows.bev_grid import Grid
 from cflow_torch.windows.collation import Batch
@@ -121,6 +122,8 @@ class VerifiedFlow(SceneFlowModel):
         if config.thorough and is_first:
             with stage("local"):
                 objects, motion, doubt = find_local_motion(objects, motion, levels, sweeps)
+            with stage("relink"):
+                objects, motion = relink(objects, motion, sweeps, config)
         with stage("register"):
             rigid, seen = refine(objects, motion, levels, sweeps) if config.thorough else as_found(motion, sweeps)
         with stage("confidence"):

@@ -23,6 +23,7 @@ from oracle.offline import Estimate, best_nearby, by_side
 from oracle.paired_test import best_candidate, count_wins, evidence_of, is_found_where_it_stands
 from oracle.pixels import in_range, project_bev
 from oracle.refinement import settle
+from oracle.relinking import relink
 from oracle.rigid_registration import RigidMotion
 from oracle.sweeps import Cloud, PointMotion
 
@@ -189,6 +190,7 @@ def look(
         in_sight = [cloud.points[keep] for cloud, keep in zip(clouds, seen)]
         origins = [cloud.origin for cloud in clouds]
         object_of, motions, doubt = find_local_motion(sweeps, object_of, motions, points, in_sight, origins, config)
+        object_of, motions = relink(sweeps, object_of, motions, config)
         may_creep = [False] * len(motions)
     rigid, shown = settle(sweeps, motions, may_creep, object_of, points, config, times)
     trust, of_left_out = confidences(sweeps, object_of, [motion.flow for motion in shown], doubt)
