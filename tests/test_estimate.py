@@ -134,7 +134,7 @@ def test_a_stop_watch_stands_in_for_the_method_and_knows_its_stages():
     assert report["pairs"] == 2 and 0 < report["min"] <= report["median"] <= report["max"]
     names = {"compensate", "project", "match", "cluster", "correlate", "verify", "select", "register", "spread"}
     assert (
-        set(report["stages"]) == names | {"local", "layers", "confidence"}
+        set(report["stages"]) == names | {"local", "relink", "layers", "confidence"}
         and sum(report["stages"].values()) <= 3 * report["max"]
     )
 
