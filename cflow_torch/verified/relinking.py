@@ -25,7 +25,7 @@ from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import NUM_SLICES, HeightSlicedSweeps, count_slices
 
 _CELL = 0.8  # metres; pixels in cells that touch are one thing
-_LEAST, _LONGEST = 8, 12.0  # slices, metres in y and in x, of a thing
+_LEAST, _LONGEST = 4, 12.0  # slices, metres in y and in x, of a thing
 _OTHERS = (0, 2, 3)  # steps in which a thing of t is looked for: t+1, t-1, t-2
 _FOUND, _IN_SWEEPS = 60, 2  # per cent of its slices that must be found, and in how many of them
 
@@ -66,7 +66,7 @@ def relink(
         The objects with those things, as they are seen in all four sweeps, as objects of their own; the motion of all.
 
     Convention:
-        A thing has eight slices at least and a box of 12 m at most. Of a thing at t and one at t+1 or t-1, the
+        A thing has four slices at least and a box of 12 m at most. Of a thing at t and one at t+1 or t-1, the
         differences of the first corners, of the last corners and of the middles of their boxes are candidates, in this
         order; by the other thing, in the order of the list. A slice is found if one of the 3 x 3 pixels where the
         motion takes it has it and is linked to nothing. The candidate that finds most in all three sweeps counts, of

@@ -68,7 +68,7 @@ def things_of(rest: SlicedSweeps, m: int) -> List[Thing]:
         rows, cols = [r for _, r, _ in own], [c for _, _, c in own]
         thing = Thing(own, (min(rows), min(cols)), (max(rows), max(cols)))
         longest = 1 + max(last - first for first, last in zip(thing.first, thing.last))
-        if sum(count(rest.at(*pixel)) for pixel in own) >= 8 and longest * rest.pixel_size <= 12.0:
+        if sum(count(rest.at(*pixel)) for pixel in own) >= 4 and longest * rest.pixel_size <= 12.0:
             things.append(thing)
     return things
 
