@@ -142,19 +142,23 @@ def _join(rest: HeightSlicedSweeps) -> _Things:
 
 def _candidates(things: _Things, rest: HeightSlicedSweeps, config: VerifiedConfig) -> Tuple[Tensor, Tensor]:
     """(C,) int64 things of t, and (C, 2) float64, (y, x), pixels per sweep interval."""
-    at_t, beside = flat_nonzero(things.step == 1), flat_nonzero((things.step == 0) | (things.step == 2))
-    is_pair = things.window.index_select(0, at_t)[:, None] == things.window.index_select(0, beside)
-    source, target = split_index(flat_nonzero(is_pair.view(-1)), max(beside.numel(), 1))
-    source, target = at_t.index_select(0, source), beside.index_select(0, target)
-    elapsed = rest.elapsed.index_select(0, things.window.index_select(0, source))
-    intervals = elapsed[:, 1] - elapsed.gather(1, things.step.index_select(0, target)[:, None])[:, 0]
-    first, last = (at.index_select(0, target) - at.index_select(0, source) for at in (things.first, things.last))
-    way = torch.stack((2 * first, 2 * last, first + last), 1).double() / 2
-    velocity = (way / intervals[:, None, None]).flatten(0, 1) + 0.0  # no -0.0
     speed = math.inf if config.max_speed is None else config.max_speed
     fastest = speed * config.sweep_interval / rest.grid.pixel_size
-    kept = flat_nonzero((velocity * velocity).sum(1) <= fastest * fastest)
-    return source.repeat_interleave(3).index_select(0, kept), velocity.index_select(0, kept)
+    at_t, beside = flat_nonzero(things.step == 1), flat_nonzero((things.step == 0) | (things.step == 2))
+    sources, velocities = [at_t[:0]], [rest.elapsed.new_zeros((0, 2))]
+    for some in chunks(0, at_t.numel(), at_t.device, 8 * max(beside.numel(), 1)):  # all pairs may be many
+        is_pair = things.window.index_select(0, at_t[some])[:, None] == things.window.index_select(0, beside)
+        source, target = split_index(flat_nonzero(is_pair.view(-1)), max(beside.numel(), 1))
+        source, target = at_t[some].index_select(0, source), beside.index_select(0, target)
+        elapsed = rest.elapsed.index_select(0, things.window.index_select(0, source))
+        intervals = elapsed[:, 1] - elapsed.gather(1, things.step.index_select(0, target)[:, None])[:, 0]
+        first, last = (at.index_select(0, target) - at.index_select(0, source) for at in (things.first, things.last))
+        way = torch.stack((2 * first, 2 * last, first + last), 1).double() / 2
+        velocity = (way / intervals[:, None, None]).flatten(0, 1) + 0.0  # no -0.0
+        kept = flat_nonzero((velocity * velocity).sum(1) <= fastest * fastest)
+        sources.append(source.repeat_interleave(3).index_select(0, kept))
+        velocities.append(velocity.index_select(0, kept))
+    return torch.cat(sources), torch.cat(velocities)
 
 
 def _looks(
