@@ -23,10 +23,8 @@ _THIN, _LONG = 0.3, 1.0
 _ALONG = 0.04
 # Shorter ways than this, metres over the window, are left alone.
 _LEAST_WAY = 1.2
-# Side of the cells in which the other sweeps are looked at, metres, and the share that must hold something.
-_CELL, _COVERED = 0.4, 0.88
-# A line that moves uncovers as much of its length as it goes; one that stays less than this part of it.
-_UNCOVERED = 0.5
+# Side of the cells in which the other sweeps are looked at, metres, and the share that must hold something, per cent.
+_CELL, _COVERED = 0.4, 88
 
 
 def slides_along_itself(sweeps: HeightSlicedSweeps, owner: Tensor, candidates: Tensor) -> Tensor:
@@ -39,15 +37,13 @@ def slides_along_itself(sweeps: HeightSlicedSweeps, owner: Tensor, candidates: T
 
     Returns:
         (A, C) bool: the component is a line at t+1, the motion points along it and leads at least 1.2 m over the
-        window, and nearly all looks find something at the same place: of those from its pixels at t+1 into every
-        other sweep, or of those from its older pixels into t+1. Nearly all are 88 %, and more if the line is long: at
-        most half as much may be missing as the motion would uncover, its way less 0.8 m by the length of the line.
+        window, and at least 88 % of looks find something at the same place: of those from its pixels at t+1 into every
+        other sweep, or of those from its older pixels into t+1.
 
     Convention:
         Moments are sums of integers, everything else elementwise float64 in the written order. Standard deviations are
         those of the pixels' places, at most 0.3 m across and at least 1 m along. "The same place" is a cell of about
-        0.4 m (whole pixels) and its eight neighbours. The way is that of the mean time between t+1 and the other
-        sweeps, the length the diagonal of the box at t+1. Zero motion never slides.
+        0.4 m (whole pixels) and its eight neighbours. Zero motion never slides.
 
     Cost: some ten passes over the pixels; nine look-ups for each look of the few components that are suspect.
     Source: the aperture problem; not in the paper.
@@ -69,12 +65,7 @@ def slides_along_itself(sweeps: HeightSlicedSweeps, owner: Tensor, candidates: T
     looked_at = suspect.any(1)
     if not bool(looked_at.any()):
         return suspect
-    _, size = bounding_boxes(row, col, component, num_components)
-    length = size.double().square().sum(1).sqrt()[:, None]
-    elapsed = sweeps.elapsed.abs().sum(1) / (sweeps.elapsed != 0).sum(1).clamp(min=1)
-    way = square.sqrt() * elapsed.index_select(0, window)[:, None] - 2 * _CELL / sweeps.grid.pixel_size
-    least = (1 - _UNCOVERED * way / length).clamp(min=_COVERED, max=1.0)
-    return suspect & (_share_covered(sweeps, owner, looked_at)[:, None] >= least)
+    return suspect & _is_covered(sweeps, owner, looked_at)[:, None]
 
 
 def principal_axes(
@@ -106,9 +97,9 @@ def principal_axes(
     return is_line, torch.where(is_wide, cov, large - var_x), torch.where(is_wide, large - var_y, cov)
 
 
-def _share_covered(sweeps: HeightSlicedSweeps, owner: Tensor, looked_at: Tensor) -> Tensor:
-    """(A,) float64: share of the looks of a component that find something, forward or backward in time, the larger one;
-    of those that are not `looked_at`, (A,), it means nothing."""
+def _is_covered(sweeps: HeightSlicedSweeps, owner: Tensor, looked_at: Tensor) -> Tensor:
+    """(A,) bool: of the looks of a component forward or backward in time enough find something; of those that are not
+    `looked_at`, (A,), it means nothing."""
     num_components, num_steps = looked_at.numel(), sweeps.num_steps
     side = max(1, round(_CELL / sweeps.grid.pixel_size))
     # A free margin all around: neighbours need no bounds check.
@@ -135,4 +126,4 @@ def _share_covered(sweeps: HeightSlicedSweeps, owner: Tensor, looked_at: Tensor)
         torch.zeros(2 * num_components, dtype=torch.int64, device=row.device).index_add_(0, way, values)
         for values in (torch.ones_like(way), finds.long())
     )
-    return (found.double() / looks.clamp(min=1)).view(-1, 2).amax(1)
+    return ((looks > 0) & (found * 100 >= looks * _COVERED)).view(-1, 2).any(1)

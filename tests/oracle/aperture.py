@@ -13,25 +13,17 @@ def slides_along_itself(sweeps: SlicedSweeps, members: Sequence[Pixel], candidat
 
     Returns:
         Of each candidate, whether the component is a line at t+1, the motion points along it and leads at least 1.2 m
-        over the window, and the other sweeps see something nearly all along it, or t+1 nearly all along where it was:
-        88 %, and at most half as much is missing as the motion would uncover (its way in the mean time between sweeps,
-        less 0.8 m).
+        over the window, and the other sweeps see something all along it, or t+1 all along where it was.
     """
-    newest = [(r, c) for m, r, c in members if m == 0]
-    is_line, axis_y, axis_x = principal_axis(newest, sweeps.pixel_size)
-    covered = share_covered(sweeps, members)
-    height, width = (max(at) - min(at) + 1 if newest else 1 for at in (list(zip(*newest)) or [(), ()]))
-    length = math.sqrt(height**2 + width**2)
-    elapsed = sum(abs(k) for k in sweeps.elapsed) / max(len(sweeps.elapsed) - 1, 1)
+    is_line, axis_y, axis_x = principal_axis([(r, c) for m, r, c in members if m == 0], sweeps.pixel_size)
+    stays = is_line and is_covered(sweeps, members)
     result = []
     for y, x in candidates:
         across, square = axis_y * x - axis_x * y, y * y + x * x
         # The sine of the angle between the two is at most 0.2.
         is_along = across * across <= 0.04 * square * (axis_y * axis_y + axis_x * axis_x)
         is_far = square * (max(sweeps.elapsed) - min(sweeps.elapsed)) ** 2 >= (1.2 / sweeps.pixel_size) ** 2
-        way = math.sqrt(square) * elapsed - 2 * 0.4 / sweeps.pixel_size
-        stays = covered >= min(max(1 - 0.5 * way / length, 0.88), 1.0)
-        result.append(is_line and stays and is_along and is_far)
+        result.append(stays and is_along and is_far)
     return result
 
 
@@ -54,9 +46,8 @@ def principal_axis(pixels: Sequence[Tuple[int, int]], pixel_size: float) -> Tupl
     return (is_line, cov, mean + root - var_y) if var_y < var_x else (is_line, mean + root - var_x, cov)
 
 
-def share_covered(sweeps: SlicedSweeps, members: Sequence[Pixel]) -> float:
-    """Share of looks that find something: of those from t+1 into all other sweeps, or of those from them into t+1, the
-    larger one.
+def is_covered(sweeps: SlicedSweeps, members: Sequence[Pixel]) -> bool:
+    """At least 88 % of looks find something: of those from t+1 into all other sweeps, or of those from them into t+1.
 
     Convention: a look finds what lies in the same cell of about 0.4 m a side (whole pixels) or in one beside it.
     """
@@ -67,4 +58,4 @@ def share_covered(sweeps: SlicedSweeps, members: Sequence[Pixel]) -> float:
         for other in [0] if m > 0 else range(1, len(sweeps.images)):
             finds = any((other, r // side + dy, c // side + dx) in cells for dy in (-1, 0, 1) for dx in (-1, 0, 1))
             (forward if m > 0 else backward).append(finds)
-    return max((sum(looks) / len(looks) for looks in (forward, backward) if looks), default=0.0)
+    return any(sum(looks) * 100 >= len(looks) * 88 for looks in (forward, backward) if looks)

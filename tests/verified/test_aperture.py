@@ -113,12 +113,6 @@ def test_a_rail_that_stays_slides_and_one_that_leaves_does_not():
     assert not slides({0: rail(10, 60), 1: rail(10, 60)}, (12, 0))
 
 
-def test_a_long_side_that_leaves_its_place_does_not_slide():
-    # The side of a lorry, 14 m, goes 2.25 m. Of its looks 11 % find nothing, of what it uncovers more than half.
-    assert not slides({0: rail(19, 75), 1: rail(10, 66)}, (0, 9), size=0.25)
-    assert slides({0: rail(12, 68), 1: rail(10, 66)}, (0, 9), size=0.25)
-
-
 def test_a_rail_that_comes_into_sight_or_leaves_it_at_one_end_slides():
     assert slides({0: rail(10, 80), 1: rail(10, 60)}, (0, 12))
     assert slides({0: rail(10, 60), 1: rail(10, 80)}, (0, 12))
@@ -130,9 +124,6 @@ def test_what_stands_there_need_not_belong_to_the_component():
 
 
 def test_the_share_that_must_be_covered():
-    # A cell has four pixels. One way in time, 2 of 59 looks find nothing in theirs or beside it, then 3; 2.5 may.
-    assert slides({0: rail(0, 59), 1: rail(7, 66)}, (0, 13))
-    assert not slides({0: rail(0, 59), 1: rail(8, 67)}, (0, 13))
-    # By a longer way 7 of 59 may, then 7 of 58 may not.
-    assert slides({0: rail(0, 59), 1: rail(12, 71)}, (0, 30))
-    assert not slides({0: rail(0, 58), 1: rail(13, 71)}, (0, 30))
+    # A cell has four pixels. One way in time, 7 of 59 looks find nothing in theirs or beside it, then 7 of 58.
+    assert slides({0: rail(0, 59), 1: rail(12, 71)}, (0, 13))
+    assert not slides({0: rail(0, 58), 1: rail(13, 71)}, (0, 13))
