@@ -26,7 +26,7 @@ from cflow_torch.verified.height_slices import NUM_SLICES, HeightSlicedSweeps, c
 
 _CELL = 0.8  # metres; pixels in cells that touch are one thing
 _LEAST, _LONGEST = 4, 12.0  # slices, metres in y and in x, of a thing
-_OTHERS = (0, 2, 3)  # steps in which a thing of t is looked for: t+1, t-1, t-2
+_OTHERS = (0, 2, 3)  # steps, ascending, in which a thing of t is looked for: t+1, t-1, t-2
 _FOUND, _IN_SWEEPS = 60, 2  # per cent of its slices that must be found, and in how many of them
 
 
@@ -177,7 +177,7 @@ def _looks(
 
 def _find(rest: HeightSlicedSweeps, things: _Things, source: Tensor, velocity: Tensor) -> Tensor:
     """(C, 3) int64, slices of each candidate's thing that are found in each of the other sweeps."""
-    others = [other for other in _OTHERS if other < rest.num_steps]
+    others = _OTHERS[: rest.num_steps - 1]
     found = torch.zeros((len(others), source.numel()), dtype=torch.int64, device=source.device)
     for some in chunks(0, source.numel(), source.device, 64):
         for counts, other in zip(found, others):
@@ -201,7 +201,7 @@ def _claim(rest: HeightSlicedSweeps, things: _Things, moving: Tensor, velocity: 
     own = things.pixel.index_select(0, spans(things.start.index_select(0, moving), count))
     group = torch.arange(moving.numel(), device=own.device)
     claims, pixels = [group.repeat_interleave(count)], [own]
-    for other in (other for other in _OTHERS if other < rest.num_steps):
+    for other in _OTHERS[: rest.num_steps - 1]:
         candidate, pixel, row, col = _looks(rest, things, moving, velocity, other)
         window, step = rest.window.index_select(0, pixel), torch.full_like(pixel, other)
         for down in (-1, 0, 1):
