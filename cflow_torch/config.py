@@ -1,4 +1,4 @@
-"""Settings: each stands here once, with its default, its bounds and its help. Presets hold only what they change."""
+"""All settings, each with its default, its bounds and its help. A preset lists only the settings that it changes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def setting(
     """A field of a `Config`.
 
     Args:
-        default: what it is where nothing is said.
+        default: its value if you give none.
         help: what it does, with its unit.
         low, high: smallest and largest value, both allowed.
         above: largest value that is not allowed.
@@ -56,31 +56,17 @@ class Config:
     )
     ego_box: Optional[Tuple[float, ...]] = setting(
         None,
-        "(x0, y0, x1, y1), metres, both ends included, frame of each sweep: points in it are returns of the vehicle "
-        "itself and take no part. None = there are none",
-    )
-    connectivity: int = setting(
-        8, "4: pixels join along their sides, 8: also across their corners (Sec. clustering)", choices=(4, 8)
-    )
-    max_extent: float = setting(
-        20.0,
-        "d^max, metres: longer side of a component's bounding box above which it is eroded and labelled again "
-        "(Alg. clustering)",
-        above=0,
+        "(x0, y0, x1, y1), metres, both ends included, frame of each sweep: the method ignores the points in this box, "
+        "which are returns of the vehicle itself. None = it ignores none",
     )
     max_speed: Optional[float] = setting(
         None,
-        "m/s: a displacement longer than max_speed * elapsed time + one pixel is not searched. None = the paper's "
-        "search range, half of the cluster's bounding box",
+        "m/s: the search ends at displacements of max_speed * elapsed time + one pixel. None = the paper's search "
+        "range, half of the cluster's bounding box",
         above=0,
     )
     sweep_interval: float = setting(
         0.1, "seconds between consecutive sweeps where time stamps are missing", low=1e-6, high=1e6
-    )
-    labeling: str = setting(
-        "sparse",
-        "engine of morphology and labelling: sparse (occupied pixels only) or kornia (dense images); the same result",
-        choices=("sparse", "kornia"),
     )
     max_memory: Optional[float] = setting(
         None, "bytes of working memory that the method may plan with. None = no limit", above=0, high=float(_MOST)
@@ -103,7 +89,7 @@ class Config:
 
     @property
     def num_sweeps(self) -> int:
-        """Sweeps of a whole window: history, t, t+1 and what comes after."""
+        """Sweeps of a whole window: the history, t, t+1 and the sweeps after it."""
         return self.num_history + 2 + self.num_future
 
     def replace(self: Kind, **overrides: Any) -> Kind:
@@ -113,6 +99,26 @@ class Config:
     def as_dict(self) -> Dict[str, Any]:
         """Plain dictionary, field by field, ready for YAML or JSON; `config_from` reads it."""
         return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self).items()}
+
+
+@dataclass(frozen=True)
+class ClusteringConfig(Config):
+    """Settings of the paper's clustering (Alg. clustering), which its two methods share."""
+
+    connectivity: int = setting(
+        8, "4: pixels join along their sides, 8: also across their corners (Sec. clustering)", choices=(4, 8)
+    )
+    max_extent: float = setting(
+        20.0,
+        "d^max, metres: longer side of a component's bounding box above which it is eroded and labelled again "
+        "(Alg. clustering)",
+        above=0,
+    )
+    labeling: str = setting(
+        "sparse",
+        "engine of morphology and labelling: sparse (occupied pixels only) or kornia (dense images); the same result",
+        choices=("sparse", "kornia"),
+    )
 
 
 @dataclass(frozen=True)
@@ -126,7 +132,7 @@ class _WithHistory(Config):
 
 
 @dataclass(frozen=True)
-class DenseConfig(_WithHistory):
+class DenseConfig(_WithHistory, ClusteringConfig):
     """Settings of `CorrelationFlow`, the paper's dense method. The defaults are the paper's base row."""
 
     method: str = _method("dense")
@@ -140,7 +146,7 @@ class DenseConfig(_WithHistory):
 
 
 @dataclass(frozen=True)
-class KeypointsConfig(Config):
+class KeypointsConfig(ClusteringConfig):
     """Settings of `CorrelationFlowKeypoints`, the paper's key-point variant, which matches one pair of sweeps."""
 
     method: str = _method("keypoints")
@@ -170,30 +176,28 @@ class VerifiedConfig(_WithHistory):
     method: str = _method("verified")
     num_future: int = setting(  # type: ignore[assignment]
         0,
-        "sweeps after t+1 that are used, offline: they decide on objects that they show more than twice as often as "
-        "the sweeps before t do. Takes twice the time",
+        "sweeps after t+1 that are used, offline: they decide the motion of objects that they show more than twice as "
+        "often as the sweeps before t do. The method then takes twice the time",
         low=0,
     )
     max_object: Optional[float] = setting(
         25.0,
-        "metres: what is longer than this at t+1 moves only if both of its ends are seen to travel (trams, trains); "
-        "else it has the score of the coarser component around it, or 0. None = anything may move",
+        "metres: a component that is longer than this at t+1 moves only if both of its ends move (trams, trains). "
+        "None = a component of any length may move",
         above=0,
     )
     significance: float = setting(
-        1.5, "z: standard deviations of noise by which a motion must explain more than standing still", low=0, high=1000
+        1.5,
+        "z: a motion must explain the sweeps better than no motion by this many standard deviations of noise",
+        low=0,
+        high=1000,
     )
     min_height: Optional[float] = setting(
         0.4,
-        "metres: pixels that stand out of the ground around them by less are left out, where ground is known. "
-        "None = none are",
+        "metres: where the ground is known, the method ignores pixels that rise less than this above the ground around "
+        "them, unless a taller pixel is near. None = it ignores none",
         above=0,
         high=1000,
-    )
-    thorough: bool = setting(
-        True,
-        "also: parts that are not dilated, candidates of key points, the aperture test, motion between the pixels, "
-        "turns. False = none of these, several times faster",
     )
 
     def __post_init__(self) -> None:
@@ -221,10 +225,7 @@ _DEFAULT = {
 # The method of each preset, and what it changes in the method's defaults.
 PRESETS: Dict[str, Tuple[str, Dict[str, Any]]] = {
     "default": ("verified", _DEFAULT),
-    "fast": (
-        "verified",
-        {"num_history": 2, "point_cloud_range": _REGION, "max_speed": 60.0, "thorough": False},
-    ),
+    "fast": ("verified", {"num_history": 2, "point_cloud_range": _REGION, "max_speed": 60.0}),
     "offline": ("verified", {**_DEFAULT, "num_future": 4}),
     "paper": ("dense", {}),
     # Chosen on the simulated seeds 200 ... 209: docs/method.md.
@@ -241,17 +242,16 @@ PRESETS: Dict[str, Tuple[str, Dict[str, Any]]] = {
 }
 _PRESET_OF_METHOD = {"dense": "paper", "keypoints": "keypoints", "verified": "default"}
 
-# Settings of version 0.1, and what to do without them.
+# Settings of earlier versions, and what to do without them.
 REMOVED = {
+    "thorough": "leave it out, every step of the method is always on; preset fast has one scale and less history",
     "proof": "the method says so now: preset default or fast (method='verified'), or paper (method='dense')",
     "proof_z": "its name is significance",
     "clearance": "its name is min_height",
     "use_timestamps": "time stamps count wherever every sweep of a window has one",
-    **dict.fromkeys(("children", "aperture", "relocate", "yaw", "slow", "keypoint_block"), "a part of thorough=True"),
-    **dict.fromkeys(
-        ("nudge", "zero_test", "subpixel", "height_slices", "slice_height", "mutual_check"), "leave it out"
-    ),
-    "second_best_distance": "leave it out",
+    **dict.fromkeys(("children", "aperture", "yaw", "slow"), "leave it out, this step is always on"),
+    **dict.fromkeys(("relocate", "keypoint_block", "nudge", "zero_test", "subpixel"), "leave it out"),
+    **dict.fromkeys(("height_slices", "slice_height", "mutual_check", "second_best_distance"), "leave it out"),
 }
 
 
@@ -314,7 +314,7 @@ def _known(kind: Type[Config], overrides: Dict[str, Any]) -> Dict[str, Any]:
     unknown = sorted(set(overrides) - set(names))
     for name in unknown:
         if name in REMOVED:
-            raise CFlowError(f"setting {name} went with version 0.2: {REMOVED[name]}")
+            raise CFlowError(f"setting {name} was removed: {REMOVED[name]}")
         owners = [method for method, other in CONFIGS.items() if name in (f.name for f in fields(other))]
         if owners:
             raise CFlowError(

@@ -45,8 +45,8 @@ class Sweep:
         timestamp_ns: time of the sweep in nanoseconds, None = unknown.
         point_times: (N,) float, seconds from the instant of the sweep to the measurement of each point, negative =
             before it; None = all at once. That instant is the one that `timestamp_ns` and `pose` belong to and to which
-            the motion of the vehicle has been compensated. The verified method (`thorough`) uses them where every
-            sweep of a window has them.
+            the motion of the vehicle has been compensated. The verified method uses them where every sweep of a window
+            has them.
     """
 
     points: Array

@@ -6,9 +6,9 @@ from typing import Dict, List, NamedTuple, Optional, Sequence, Tuple
 
 import numpy as np
 import torch
-from oracle.height_slices import NUM_SLICES, SLICE_HEIGHT, Pixel, SlicedSweeps, Vector
-from oracle.voxel_centroids import Point
-from oracle.voxel_centroids import points_of_objects as listed_points
+from oracle.height_slices import NUM_SLICES, SLICE_HEIGHT, Pixel, Place, SlicedSweeps, Vector
+from oracle.voxels import Point
+from oracle.voxels import points_of_objects as listed_points
 
 from cflow_torch.config import VerifiedConfig
 from cflow_torch.verified.component_tree import Objects
@@ -37,13 +37,9 @@ class Scene(NamedTuple):
         """Of all objects."""
         return points_of_objects(self.sweeps, self.objects, torch.ones(len(self.flow), dtype=torch.bool))
 
-    def in_pixels(self) -> torch.Tensor:
-        """(G, 2) float64, the flow, (y, x) pixels per interval."""
-        return self.flow.flip(1) / self.sweeps.grid.pixel_size
-
     def windows(self) -> List[OracleWindow]:
         """The same for the oracle, window by window."""
-        return [OracleWindow(self, window) for window in range(self.sweeps.num_windows)]
+        return [OracleWindow(self, window) for window in range(self.sweeps.batch.num_windows)]
 
 
 class OracleWindow:
@@ -51,54 +47,50 @@ class OracleWindow:
 
     def __init__(self, scene: Scene, window: int) -> None:
         sweeps, objects = scene.sweeps, scene.objects
-        mine = sweeps.window[objects.first] == window
+        mine = sweeps.pixels.window[objects.first] == window
         size, grid = sweeps.grid.pixel_size, sweeps.grid
         self.sweeps = for_oracle(sweeps, window)
-        pixels = self.sweeps.pixels()
-        owners = objects.of_pixel[sweeps.window == window] - int((~mine).cumprod(0).sum())
+        owners = objects.of_pixel[sweeps.pixels.window == window] - int((~mine).cumprod(0).sum())
         self.num_objects = int(mine.sum())
         self.object_of: Dict[Pixel, int] = {
-            pixel: owner for pixel, owner in zip(pixels, owners.tolist()) if 0 <= owner < self.num_objects
+            pixel: owner for pixel, owner in zip(self.sweeps.pixels(), owners.tolist()) if 0 <= owner < self.num_objects
         }
         self.flow: List[Vector] = [(x, y) for x, y in scene.flow[mine].tolist()]
-        self.flow_in_pixels: List[Vector] = [(y / size, x / size) for x, y in self.flow]
         self.config = VerifiedConfig(pixel_sizes=(size,), point_cloud_range=(*grid.lower, *grid.upper))
-        self._clouds = [
-            sweeps.batch.positions[:, sweeps.batch.image == window * sweeps.num_steps + step].T.numpy()
-            for step in range(sweeps.num_steps)
-        ]
-        times = sweeps.batch.point_times
-        self._times: Optional[List[np.ndarray]] = None
-        if times is not None:
-            images = [window * sweeps.num_steps + step for step in range(sweeps.num_steps)]
-            self._times = [times[sweeps.batch.image == image].double().numpy() for image in images]
 
-    def points(
-        self, wanted: Optional[Sequence[bool]] = None, height: float = SLICE_HEIGHT, num_slices: int = NUM_SLICES
-    ) -> List[Point]:
-        """Of the objects wanted, of all of them if nothing is said."""
-        wanted = [True] * self.num_objects if wanted is None else wanted
-        return listed_points(wanted, self.object_of, self._clouds, self.config, height, num_slices, self._times)
+    def members(self) -> List[List[Pixel]]:
+        """Pixels of each object."""
+        return [[pixel for pixel, own in self.object_of.items() if own == i] for i in range(self.num_objects)]
+
+    def points(self) -> List[Point]:
+        """Of all objects."""
+        return listed_points(self.sweeps, self.object_of, [True] * self.num_objects)
 
 
 def for_oracle(sweeps: HeightSlicedSweeps, window: int) -> SlicedSweeps:
     """One window of some sweeps; sweeps that it lacks are left out."""
-    images = sweeps.image[:-1].view(sweeps.num_windows, sweeps.num_steps, sweeps.grid.height, sweeps.grid.width)
+    batch, pixels, grid = sweeps.batch, sweeps.pixels, sweeps.grid
     elapsed = sweeps.elapsed[window].tolist()
     steps = [step for step, k in enumerate(elapsed) if step == 0 or k != 0]
-    return SlicedSweeps(
-        [images[window, step].numpy() for step in steps],
-        [elapsed[step] for step in steps],
-        [float(sweeps.batch.seconds[window, step]) for step in steps],
-        sweeps.grid.pixel_size,
-        sweeps.grid.lower[:2],
-    )
+    clouds, images = [], []
+    times = torch.zeros(batch.image.numel()) if batch.point_times is None else batch.point_times
+    for step in steps:
+        drawn = sweeps.pixel_of_point[: batch.image.numel()] < sweeps.num_pixels
+        mine = drawn & (batch.image == window * sweeps.num_steps + step)
+        table = torch.cat((batch.positions, times.double()[None]))[:, mine]
+        clouds.append([Place(*row) for row in table.T.tolist()])
+        mine = (pixels.window == window) & (pixels.step == step)
+        cells = zip(pixels.row[mine].tolist(), pixels.col[mine].tolist())
+        images.append(dict(zip(cells, pixels.slices[mine].tolist())))
+    seconds, shape = batch.seconds[window].tolist(), (grid.height, grid.width)
+    given = [elapsed[step] for step in steps], [seconds[step] for step in steps]
+    return SlicedSweeps(clouds, images, *given, grid.pixel_size, grid.lower[:2], shape)
 
 
 def from_images(
     images: np.ndarray, pixel_size: float = 0.25, elapsed: Optional[np.ndarray] = None
 ) -> HeightSlicedSweeps:
-    """Sweeps without points.
+    """Sweeps with a point in the middle of every slice that is set.
 
     Args:
         images: (B, S, H, W) uint8, bits of slices.
@@ -106,14 +98,13 @@ def from_images(
         elapsed: (B, S) float64, intervals to t+1; None = 0, 1, 2, ...
     """
     num_windows, num_steps, height, width = images.shape
-    grid = Grid(pixel_size, (0.0, 0.0, -1.0), ((width - 0.5) * pixel_size, (height - 0.5) * pixel_size, 1.0))
+    grid = Grid(pixel_size, (0.0, 0.0, -1.0), ((width - 0.5) * pixel_size, (height - 0.5) * pixel_size, 3.0))
     assert (grid.height, grid.width) == (height, width)
     times = np.tile(np.arange(num_steps, dtype=np.float64), (num_windows, 1)) if elapsed is None else elapsed
-    batch = _batch(torch.zeros((3, 0), dtype=torch.float64), torch.zeros(0), torch.from_numpy(times))
-    pixel = torch.from_numpy(np.flatnonzero(images))
-    window, step, row, col = map(torch.from_numpy, np.nonzero(images))
-    image = torch.from_numpy(np.append(images.ravel(), np.uint8(0)))
-    return HeightSlicedSweeps(batch, grid, image, pixel[:0], pixel, window, step, row, col, image[pixel])
+    window, step, row, col, part = np.nonzero(images[..., None] >> np.arange(NUM_SLICES, dtype=np.uint8) & 1)
+    places = np.stack(((col + 0.5) * pixel_size, (row + 0.5) * pixel_size, (part + 0.5) * SLICE_HEIGHT))
+    image = torch.from_numpy(window * num_steps + step)
+    return HeightSlicedSweeps.of(_batch(torch.from_numpy(places), image, torch.from_numpy(times)), grid)
 
 
 def moving_scene(
@@ -194,7 +185,7 @@ def _draw(
     assert batch.num_steps == num_steps
     sweeps = HeightSlicedSweeps.of(batch, grid)
     # The first point of a pixel says whose it is. Objects are numbered by their first pixel, so by window.
-    _, first_point = np.unique(sweeps.number[sweeps.place].numpy(), return_index=True)
+    _, first_point = np.unique(sweeps.pixel_of_point.numpy(), return_index=True)
     of_pixel = owner[inside.numpy()][first_point]
     present, first = np.unique(of_pixel[of_pixel >= 0], return_index=True)
     first = np.flatnonzero(of_pixel >= 0)[first]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Callable, List
+from typing import Any, Callable, Dict, List
 
 from scenes import RANGE, scene
 
@@ -13,7 +13,9 @@ PRESETS = ("default", "fast", "offline", "paper", "keypoints")
 
 def small(preset: str, **overrides: Any) -> Config:
     """A preset on 16 m x 14 m with pixels of 0.25 m, two older sweeps where it takes any."""
-    given = {"pixel_sizes": (0.5, 0.25) if preset in ("default", "offline") else (0.25,), "max_extent": 5.0}
+    given: Dict[str, Any] = {"pixel_sizes": (0.5, 0.25) if preset in ("default", "offline") else (0.25,)}
+    if preset in ("paper", "keypoints"):
+        given["max_extent"] = 5.0
     if preset != "keypoints":
         given["num_history"] = 2
     return make_config(preset, **{"point_cloud_range": RANGE, **given, **overrides})

@@ -12,6 +12,7 @@ from cflow_torch import CFlowError, make_config, make_model
 from cflow_torch.config import CONFIGS, PRESETS, REMOVED, DenseConfig, KeypointsConfig, VerifiedConfig, config_from
 
 INF = math.inf
+CLUSTERING = ("connectivity", "max_extent", "labeling")
 
 
 @pytest.mark.parametrize(
@@ -73,9 +74,9 @@ def test_an_unknown_setting_lists_the_fields():
 
 
 @pytest.mark.parametrize("name", REMOVED)
-def test_a_setting_of_version_0_1_says_what_to_do_without(name):
+def test_a_removed_setting_says_what_to_do_without_it(name):
     assert all(name not in (f.name for f in fields(kind)) for kind in CONFIGS.values())
-    with pytest.raises(CFlowError, match=f"setting {name} went with version 0.2: ..."):
+    with pytest.raises(CFlowError, match=f"setting {name} was removed: ..."):
         make_config(**{name: 1})
 
 
@@ -85,6 +86,7 @@ def test_a_setting_of_another_method_names_that_method():
         ("paper", "significance", "verified"),
         ("default", "patch_size", "keypoints"),
         ("default", "clustering", "dense"),
+        *((preset, name, "dense and keypoints") for preset in ("default", "fast", "offline") for name in CLUSTERING),
     ):
         with pytest.raises(CFlowError, match=f"{name} is a setting of method {owners}, not of"):
             make_config(preset, **{name: 1})
@@ -115,8 +117,8 @@ def test_the_paper_s_base_row_and_what_presets_change():
     paper, default, fast = (make_config(name) for name in ("paper", "default", "fast"))
     assert (paper.pixel_sizes, paper.num_history, paper.sectional_view) == ((0.1,), 0, False)
     assert paper.point_cloud_range == (-35.0, -35.0, -INF, 35.0, 35.0, INF) and paper.max_speed is None
-    assert (default.pixel_sizes, default.num_history, default.thorough) == ((0.4, 0.2, 0.1), 4, True)
-    assert (fast.pixel_sizes, fast.num_history, fast.thorough) == ((0.1,), 2, False)
+    assert (default.pixel_sizes, default.num_history) == ((0.4, 0.2, 0.1), 4)
+    assert fast == default.replace(pixel_size=0.1, num_history=2)
     assert make_config("offline") == default.replace(num_future=4) and make_config("offline").num_sweeps == 10
     assert make_config(pixel_size=0.2).pixel_sizes == (0.2,)
     with pytest.raises(CFlowError, match="give one of them"):
@@ -130,6 +132,6 @@ def test_a_dictionary_goes_round(preset):
     assert list(plain) == [f.name for f in fields(config)] and plain["method"] == config.method
     assert config_from(plain) == make_config(preset, **plain) == config
     assert config_from({"method": config.method}) == CONFIGS[config.method]()
-    for wrong in ({}, {"method": "sparse"}, {**plain, "voxel_size": 1}, {**plain, "max_extent": -1}):
+    for wrong in ({}, {"method": "sparse"}, {**plain, "voxel_size": 1}, {**plain, "max_speed": -1}):
         with pytest.raises(CFlowError, match="give|the fields are"):
             config_from(wrong)

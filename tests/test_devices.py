@@ -22,9 +22,9 @@ BOUNDS: Dict[str, Tuple[Config, int, int, int]] = {
     "paper": (small("paper", num_history=0), 633, 35, 755),
     "paper, h = 4, 5 scales": (small("paper", num_history=4, pixel_sizes=SCALES), 3692, 146, 4016),
     "keypoints": (small("keypoints"), 917, 34, 1045),
-    "fast": (small("fast"), 2094, 88, 2326),
-    "default": (small("default"), 10442, 355, 10676),
-    "offline": (small("offline"), 21529, 725, 21970),
+    "fast": (small("fast"), 4150, 121, 4317),
+    "default": (small("default"), 4199, 121, 4364),
+    "offline": (small("offline"), 4524, 140, 4828),
 }
 
 

@@ -132,11 +132,8 @@ def test_a_stop_watch_stands_in_for_the_method_and_knows_its_stages():
     assert_same_bits(results[0], make_model(watch.config)([window])[0])
     report = watch.report()
     assert report["pairs"] == 2 and 0 < report["min"] <= report["median"] <= report["max"]
-    names = {"compensate", "project", "match", "cluster", "correlate", "verify", "select", "register", "spread"}
-    assert (
-        set(report["stages"]) == names | {"local", "relink", "layers", "confidence"}
-        and sum(report["stages"].values()) <= 3 * report["max"]
-    )
+    names = {"compensate", "draw", "change", "tree", "propose", "verify", "select", "refine", "confidence", "spread"}
+    assert set(report["stages"]) == names and sum(report["stages"].values()) <= 3 * report["max"]
 
 
 @pytest.mark.parametrize("number", [1, 2])

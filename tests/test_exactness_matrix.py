@@ -51,7 +51,7 @@ def in_pieces(config: Config, windows: List[Window]) -> Results:
         "ops.chunks.CHUNK_ON_CPU": 997,
         "dense.correlation._AT_ONCE_CPU": 600,
         "dense.correlation._IN_PART_CPU": 900,
-        "verified.paired_test._LOOKS_ON_CPU": 500,
+        "verified.paired_test._AT_ONCE_CPU": 500,
         "keypoints.match_candidates._PAIRS_AT_ONCE_CPU": 5000,
         "keypoints.match_candidates._TILE_ROWS": 3,
         "keypoints.match_candidates._TILE_COLS": 5,

@@ -20,8 +20,10 @@ PROFILE = settings(deadline=None, max_examples=15, derandomize=True, suppress_he
 
 
 def small(method: str = "dense", **overrides) -> Config:
-    history = {} if method == "keypoints" else {"num_history": 3}
-    return CONFIGS[method](pixel_sizes=(S,), point_cloud_range=RANGE, max_extent=2.0, **history).replace(**overrides)
+    of_method = {} if method == "keypoints" else {"num_history": 3}
+    if method != "verified":
+        of_method["max_extent"] = 2.0
+    return CONFIGS[method](pixel_sizes=(S,), point_cloud_range=RANGE, **of_method).replace(**overrides)
 
 
 def cflow(window: Window, *method: str, **overrides) -> FlowResult:
@@ -65,12 +67,10 @@ dense = st.fixed_dictionaries(
 )
 verified = st.fixed_dictionaries(
     {
-        "connectivity": st.sampled_from([4, 8]),
         "max_speed": st.sampled_from([None, 3.0]),
         "significance": st.sampled_from([0.0, 1.0]),
         "min_height": st.sampled_from([None, 0.2]),
         "pixel_sizes": st.sampled_from([(S,), (4 * S, S), (2 * S, S)]),
-        "thorough": st.booleans(),
     }
 )
 keypoints = st.fixed_dictionaries(

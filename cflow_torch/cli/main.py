@@ -45,7 +45,7 @@ commands:
 more examples:
   cflow flow data=arrays data.root=/data/drive data.find_ground=grid    a format and its settings by name
   cflow eval model=paper model.pixel_sizes=[0.4,0.2,0.1]                any field of the method, see `cflow settings`
-  cflow eval -m model.connectivity=4,8                                  a sweep
+  cflow eval -m model.num_history=0,2,4                                 a sweep
   cflow plot picture=correlation pair=2                                 how one object was found
   cflow submit data=hdf5 data.root=/data/test version=3
 

@@ -27,7 +27,7 @@ from cflow_torch.types import CFlowError
 _PAGE = """# Settings
 
 The same names hold everywhere: `make_config("fast", max_speed=30.0)` in Python, `model=fast model.max_speed=30` behind
-a command, `-m model.connectivity=4,8` for a sweep. null is None in Python. Words such as Alg. clustering are labels of
+a command, `-m model.num_history=0,2,4` for a sweep. null is None in Python. Words such as Alg. clustering are labels of
 the paper. A wrong name or value is refused with a message that says what is allowed."""
 # Literals only: the harness's eval.yaml and save.yaml have nothing to refer to.
 _HARNESS = """\

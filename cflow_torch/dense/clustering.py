@@ -9,10 +9,10 @@ from typing import NamedTuple, Tuple
 import torch
 from torch import Tensor
 
-from cflow_torch.config import Config
-from cflow_torch.dense.components import Places, components, components_by_size
+from cflow_torch.config import ClusteringConfig
+from cflow_torch.dense.components import Places, components_by_size
 from cflow_torch.dense.projection import ProjectedSweeps
-from cflow_torch.ops.indices import divide, flat_nonzero, split_index
+from cflow_torch.ops.indices import divide, flat_nonzero, lazy_empty, renumber, split_index
 from cflow_torch.ops.labeling import pad
 from cflow_torch.ops.segments import bounding_boxes, segment_ends
 
@@ -79,7 +79,7 @@ class Columns(NamedTuple):
     cluster: Tensor
 
 
-def find_clusters(sweeps: ProjectedSweeps, config: Config) -> Tuple[Clusters, Tensor, Tensor]:
+def find_clusters(sweeps: ProjectedSweeps, config: ClusteringConfig) -> Tuple[Clusters, Tensor, Tensor]:
     """Alg. clustering, from the projection of the aggregated sweeps on: dilate, label, validate by size.
 
     Args:
@@ -96,7 +96,7 @@ def find_clusters(sweeps: ProjectedSweeps, config: Config) -> Tuple[Clusters, Te
     _, num_steps, height, width = occupancy.shape
     area = height * width
     clusters, columns = cluster_images(occupancy, sweeps.grid.pixel_size, config)
-    of_place = torch.empty(occupancy.numel() + 1, dtype=torch.int32, device=occupancy.device)
+    of_place = lazy_empty(occupancy.numel() + 1, torch.int32, occupancy.device)
     place = torch.add(columns.pixel, columns.window, alpha=num_steps * area)
     number_of_place = columns.cluster.int()
     for index in range(num_steps):
@@ -105,14 +105,13 @@ def find_clusters(sweeps: ProjectedSweeps, config: Config) -> Tuple[Clusters, Te
     return clusters, of_place, sweeps.pixel
 
 
-def cluster_images(images: Tensor, pixel_size: float, config: Config, reach: int = 3) -> Tuple[Clusters, Columns]:
+def cluster_images(images: Tensor, pixel_size: float, config: ClusteringConfig) -> Tuple[Clusters, Columns]:
     """The clusters of images, and where they are.
 
     Args:
         images: (B, S, H, W) bool, or uint8 that is 0 where nothing is, of every sweep; index 0 of S is sweep t+1.
         pixel_size: s, metres.
         config: `connectivity`, `max_extent` (d^max), `labeling`.
-        reach: 3 = Alg. clustering; 1 = plain components: neither dilated nor validated by size.
 
     Convention:
         Clusters never join across windows. Both engines give the same clusters.
@@ -126,10 +125,7 @@ def cluster_images(images: Tensor, pixel_size: float, config: Config, reach: int
     padded_row, col = split_index(pixels, aggregated.shape[2])
     window, row = split_index(padded_row, aggregated.shape[1])
     places = Places(pixels, padded_row, row, col)
-    if reach == 1:
-        component, num_components = components(aggregated, places, 1, config)
-    else:
-        component, num_components = components_by_size(aggregated, height, width, places, pixel_size, config)
+    component, num_components = components_by_size(aggregated, height, width, places, pixel_size, config)
 
     # Which sweeps saw each pixel. Sweep m lies m images behind t+1.
     pixel_in_window = torch.add(col, row, alpha=width)
@@ -145,7 +141,7 @@ def cluster_images(images: Tensor, pixel_size: float, config: Config, reach: int
     left, right = (values.index_select(0, live) for values in segment_ends(col, component, num_components))
     top, bottom = divide(first, aggregated.shape[2]), divide(last, aggregated.shape[2])
     window_of_cluster, top_in_window = split_index(top, aggregated.shape[1])
-    cluster = _numbers(live, num_components).index_select(0, component)
+    cluster = renumber(live, num_components).index_select(0, component)
 
     member = flat_nonzero((cluster < live.numel()) & seen)
     step, pixel = split_index(member, max(pixels.numel(), 1))
@@ -174,7 +170,7 @@ def keep_live(
         number: (C,) int64, cluster of each component, M = none.
     """
     live = flat_nonzero(_can_move(component, num_components, step == 0, step > 0))
-    number = _numbers(live, num_components)
+    number = renumber(live, num_components)[:-1]
     cluster = number.index_select(0, component)
     kept = flat_nonzero(cluster < live.numel())
     pixels = Pixels(*(values.index_select(0, kept) for values in (cluster, step, row, col)))
@@ -197,9 +193,3 @@ def _can_move(component: Tensor, num_components: int, newest: Tensor, before: Te
     kinds = torch.zeros(3 * num_components, dtype=torch.bool, device=kind.device).index_fill_(0, kind, True)
     only_before, only_newest, both = kinds.view(3, -1)
     return (only_before & only_newest).logical_or_(both)
-
-
-def _numbers(live: Tensor, num_components: int) -> Tensor:
-    """(C,) int64, place of each component in `live` (M,), M = it is not there."""
-    number = torch.full((num_components,), live.numel(), dtype=torch.int64, device=live.device)
-    return number.scatter_(0, live, torch.arange(live.numel(), device=live.device))

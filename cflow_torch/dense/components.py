@@ -1,4 +1,4 @@
-"""Components of binary images: dilated, validated by size (Alg. clustering), or plain."""
+"""Components of binary images: dilated and validated by size (Alg. clustering)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Tuple
 import torch
 from torch import Tensor
 
-from cflow_torch.config import Config
+from cflow_torch.config import ClusteringConfig
 from cflow_torch.ops.indices import split_index
 from cflow_torch.ops.labeling import connected_components_kornia, label_blocks, pad
 from cflow_torch.ops.morphology import close_3x3, dilate_3x3_kornia, erode_3x3_kornia
@@ -31,7 +31,7 @@ class Places:
     col: Tensor
 
 
-def label_components(image: Tensor, pixels: Tensor, pixel_size: float, config: Config) -> Tensor:
+def label_components(image: Tensor, pixels: Tensor, pixel_size: float, config: ClusteringConfig) -> Tensor:
     """Components of a dilated image, the oversized ones eroded and labelled again (Alg. clustering).
 
     Args:
@@ -53,7 +53,7 @@ def label_components(image: Tensor, pixels: Tensor, pixel_size: float, config: C
 
 
 def components_by_size(
-    padded: Tensor, height: int, width: int, places: Places, pixel_size: float, config: Config
+    padded: Tensor, height: int, width: int, places: Places, pixel_size: float, config: ClusteringConfig
 ) -> Tuple[Tensor, int]:
     """Component, under any name, of the set pixels of padded images of height x width, and more than the largest.
 
@@ -61,7 +61,7 @@ def components_by_size(
     that lies in their union, so none sees another.
     """
     dilated = dilate_3x3_kornia(padded) if config.labeling == "kornia" else padded
-    component, count = components(dilated, places, 3, config)
+    component, count = _components(dilated, places, 3, config)
     top, bottom = segment_ends(places.row, component, count)
     left, right = segment_ends(places.col, component, count)
     # The dilation adds a pixel on every side, cut off at the border.
@@ -78,11 +78,11 @@ def components_by_size(
         closed = pad([erode_3x3_kornia(dilate_3x3_kornia(alone[:, :height, :width]))])
     else:
         closed = close_3x3(alone, height, width)
-    part, num_parts = components(closed, places, 1, config)
+    part, num_parts = _components(closed, places, 1, config)
     return torch.where(oversized, part.add_(count), component), count + num_parts
 
 
-def components(padded: Tensor, places: Places, reach: int, config: Config) -> Tuple[Tensor, int]:
+def _components(padded: Tensor, places: Places, reach: int, config: ClusteringConfig) -> Tuple[Tensor, int]:
     """Component of pixels of padded images (kornia: dilated ones if `reach` is 3), and more than the largest."""
     if config.labeling == "kornia":
         return connected_components_kornia(padded, places.pixel, config.connectivity), places.pixel.numel()

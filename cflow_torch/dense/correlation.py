@@ -13,6 +13,7 @@ from cflow_torch.dense.clustering import Clusters
 from cflow_torch.dense.packing import Packing, Search, pack
 from cflow_torch.dense.projection import ProjectedSweeps
 from cflow_torch.dense.templates import TemplatePairs, make_pairs
+from cflow_torch.ops.chunks import chunks
 from cflow_torch.ops.cross_correlation import cross_correlate
 from cflow_torch.ops.indices import flat_nonzero, largest_of_rows, take_columns
 from cflow_torch.ops.segments import segment_amin
@@ -226,7 +227,8 @@ def _best_of_each_pair(
         num_pairs: J.
     """
     # Bounds of the energy, cheap and close, leave few candidates. Division rounds monotonically: no winner is lost.
-    least, most = windows.bounds(target, shift)
+    parts = [windows.bounds(target[some], shift[:, some]) for some in chunks(0, len(pair), pair.device, 16)]
+    least, most = (torch.cat(bounds) for bounds in zip(*parts)) if parts else (count, count)
     square = (count * count).double()
     bound = square.new_zeros(num_pairs).scatter_reduce_(0, pair, square / most, "amax")
     kept = flat_nonzero(square / torch.maximum(least, count) >= bound.index_select(0, pair))

@@ -20,7 +20,7 @@ from cflow_torch.windows.memory import require_memory
 # small, and few classes mean few kernel launches. Larger images are rare; on a CPU they keep two dimensions, whose
 # transforms cost less than those of a line, and have classes of their own by height and width. On a GPU a batch of many
 # windows is to have no more classes than one window.
-_LINES_CPU = tuple(144 << 2 * k for k in range(4))  # square clusters of 8, 16, 32, 64 pixels
+_LINES_CPU = tuple(144 << k for k in range(8))  # square clusters of 8, 11, 16, ... 90 pixels
 _LINES_GPU = tuple(144 << 2 * k for k in range(9))
 # Spectra, counts and tables of an image that is correlated alone, the largest one.
 _BYTES_PER_SAMPLE = 80

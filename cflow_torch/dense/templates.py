@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Optional
+from typing import Optional, Union
 
 import torch
 from torch import Tensor
@@ -58,13 +58,15 @@ class TemplatePairs:
     radius: Optional[Tensor] = None
 
 
-def make_pairs(clusters: Clusters, batch: Batch, pixel_size: float, max_speed: Optional[float]) -> TemplatePairs:
+def make_pairs(
+    clusters: Clusters, batch: Batch, pixel_size: Union[float, Tensor], max_speed: Optional[float]
+) -> TemplatePairs:
     """All pairs of some clusters.
 
     Args:
         clusters: M clusters.
         batch: for the elapsed time of each sweep.
-        pixel_size: metres, of the images of the clusters.
+        pixel_size: metres, of the images of the clusters: one, or (M,) float64.
         max_speed: m/s; None = no bound.
     """
     num_clusters, num_sources = clusters.window.numel(), batch.num_steps - 1
@@ -81,7 +83,8 @@ def make_pairs(clusters: Clusters, batch: Batch, pixel_size: float, max_speed: O
     radius = None
     if max_speed is not None:
         seconds = batch.seconds[clusters.window[cluster], source + 1]
-        radius = max_speed * seconds.abs() / torch.full_like(seconds, pixel_size) + 1
+        size = pixel_size[cluster] if isinstance(pixel_size, Tensor) else torch.full_like(seconds, pixel_size)
+        radius = max_speed * seconds.abs() / size + 1
     return TemplatePairs(
         Images(pair_of_slot[slot], row[older], col[older]),
         Images(pixels.cluster[newest], row[newest], col[newest]),

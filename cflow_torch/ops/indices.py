@@ -1,11 +1,12 @@
-"""Where a mask is set, a row is largest, and where in its image that is."""
+"""Named words for what is done with index tensors: select, look up, count, renumber, divide."""
 
 from __future__ import annotations
 
-from typing import Tuple
+from typing import Optional, Tuple
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 
@@ -24,6 +25,88 @@ def flat_nonzero(mask: Tensor) -> Tensor:
     if mask.device.type == "cpu":
         return torch.from_numpy(np.flatnonzero(mask.numpy()))
     return mask.flatten().nonzero()[:, 0]
+
+
+def gather(index: Tensor, *tensors: Tensor) -> Tuple[Tensor, ...]:
+    """The elements of several tensors at the same indices.
+
+    Args:
+        index: (K,) int64.
+        tensors: (N, ...) each.
+
+    Returns:
+        (K, ...) each.
+    """
+    return tuple(values.index_select(0, index) for values in tensors)
+
+
+def lookup(table: Tensor, index: Tensor, missing: float = 0) -> Tensor:
+    """Entries of a table, with a default for the index behind its end.
+
+    Args:
+        table: (N, ...).
+        index: (K,) int64, 0 ... N; N stands for "none".
+        missing: what N gives.
+
+    Returns:
+        (K, ...), dtype of the table.
+    """
+    padding = (0, 0) * (table.dim() - 1) + (0, 1)
+    return F.pad(table, padding, value=missing).index_select(0, index)
+
+
+def scatter_count(index: Tensor, size: int, weights: Optional[Tensor] = None) -> Tensor:
+    """How often each index occurs, or the sum of its weights.
+
+    Args:
+        index: (N,) int64, 0 ... size - 1.
+        size: S.
+        weights: (N,) or (R, N) numbers; None = 1 each.
+
+    Returns:
+        (S,) int64, or (S,) or (R, S) in the dtype of the weights.
+
+    Cost: one pass, without a synchronisation (`torch.bincount` has one).
+    """
+    if weights is None or weights.dim() == 1:
+        weights = torch.ones_like(index) if weights is None else weights
+        return weights.new_zeros(size).index_add_(0, index, weights)
+    num_rows = len(weights)
+    row = torch.arange(num_rows, device=index.device) * size
+    # On the CPU sums along a second dimension are many times slower than sums of one dimension.
+    return scatter_count((index + row[:, None]).view(-1), num_rows * size, weights.flatten()).view(num_rows, size)
+
+
+def renumber(index: Tensor, size: int) -> Tensor:
+    """Position of each number in a list.
+
+    Args:
+        index: (K,) int64, different numbers below S.
+        size: S.
+
+    Returns:
+        (S + 1,) int64; K for numbers that are not in the list, and for S, which stands for "none".
+    """
+    number = torch.full((size + 1,), index.numel(), dtype=torch.int64, device=index.device)
+    return number.scatter_(0, index, torch.arange(index.numel(), device=index.device))
+
+
+def lazy_zeros(size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """(size,) zeros, of which only a small part will be written or read.
+
+    Cost: on the CPU that of the pages that are touched. NumPy asks the system for zeroed pages, and for large ones:
+    several times faster than `torch.zeros` for tens of megabytes.
+    """
+    if device.type == "cpu":
+        return torch.from_numpy(np.zeros(size, torch.empty(0, dtype=dtype).numpy().dtype))
+    return torch.zeros(size, dtype=dtype, device=device)
+
+
+def lazy_empty(size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """(size,) of anything, of which only a small part will be written. Cost: as for `lazy_zeros`."""
+    if device.type == "cpu":
+        return torch.from_numpy(np.empty(size, torch.empty(0, dtype=dtype).numpy().dtype))
+    return torch.empty(size, dtype=dtype, device=device)
 
 
 def take_columns(table: Tensor, index: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
-from typing import Sequence
+from typing import List, Sequence, Tuple
 
 import torch
 import torch.nn.functional as F
@@ -44,12 +44,14 @@ class Blocks:
     Args:
         side: pixels a side.
         cols: blocks per row.
+        first: smallest name that a component of these images may have.
         num_components: V, more than the largest component.
         component: (all blocks,) int64, 0 ... V - 1; undefined for blocks without set pixels.
     """
 
     side: int
     cols: int
+    first: int
     num_components: int
     component: Tensor
 
@@ -105,31 +107,64 @@ def label_blocks(padded: Tensor, connectivity: int, reach: int) -> Blocks:
     Cost: one pass over the image, a few rounds of union-find over its blocks, and some host synchronisations.
     Source: Sec. clustering; contraction of blocks as in block-based labelling (bolelli2022connected).
     """
-    side = reach + 1 if connectivity == 8 else reach
-    cols = padded.shape[2] // side
-    # A row of a block is one number with a byte per pixel; its rows go into the bits of those bytes.
-    cells = F.pad(padded.view(-1, 3), (0, 1)) if side == 3 else padded
-    words = cells.view(-1).view(_WORD[side]).view(-1, side, cols)
-    masks = words[:, 0]
-    for row in range(1, side):
-        masks = torch.add(masks, words[:, row], alpha=1 << row)
-    masks = masks.flatten()
+    return label_together([(padded, reach)], connectivity)[0]
+
+
+def label_together(images: Sequence[Tuple[Tensor, int]], connectivity: int = 8) -> List[Blocks]:
+    """Components of several sets of padded images by one union-find.
+
+    Args:
+        images: of each set the padded images and the reach, as `label_blocks` takes them.
+        connectivity: 4 or 8.
+
+    Returns:
+        The components of each set. All sets count their components together: `num_components` is that of all, and the
+        components of a set follow those of the set before.
+
+    Cost: as `label_blocks`; the number of operations hardly grows with the number of sets.
+    """
+    device, num_sets = images[0][0].device, len(images)
+    sides = [reach + 1 if connectivity == 8 else reach for _, reach in images]
+    cols = [padded.shape[2] // side for (padded, _), side in zip(images, sides)]
+    parts = [_block_masks(padded, side) for (padded, _), side in zip(images, sides)]
+    masks = parts[0] if num_sets == 1 else torch.cat([part.int() for part in parts])
     nodes = flat_nonzero(masks.bool())  # on the CPU ten times faster than `masks != 0`
-    node_of_block = torch.empty(masks.shape, dtype=torch.int64, device=masks.device)
-    node_of_block.scatter_(0, nodes, torch.arange(nodes.numel(), device=masks.device))
+    node_of_block = torch.empty(masks.shape, dtype=torch.int64, device=device)
+    node_of_block.scatter_(0, nodes, torch.arange(nodes.numel(), device=device))
 
     # Four look-ups per block: which of its neighbours hold a pixel that one of its own pixels reaches?
     own = masks.index_select(0, nodes).int()
     own |= own >> 4  # two columns of at most four bits in a byte
-    table = _reachable(side, connectivity, reach, masks.device)
-    reached = table.index_select(0, own & 0xFF)
-    if side > 2:
-        reached |= table.index_select(0, ((own >> 16) & 0xFF).add_(1 << 8))
-    neighbours = nodes[:, None] + _offsets(cols, masks.device)
+    offsets, tables = _neighbourhoods(tuple(sides), tuple(cols), connectivity, tuple(r for _, r in images), device)
+    left, right = own & 0xFF, ((own >> 16) & 0xFF).add_(1 << 8)
+    if num_sets > 1:
+        ends = torch.tensor([len(part) for part in parts[:-1]], device=device).cumsum(0)
+        of_set = torch.bucketize(nodes, ends, right=True)
+        left, right = (columns + (of_set << 9) for columns in (left, right))
+        offsets = offsets.index_select(0, of_set)
+    reached = tables.index_select(0, left)
+    if max(sides) > 2:
+        reached |= tables.index_select(0, right)
+    neighbours = nodes[:, None] + offsets
     edges = flat_nonzero((reached & masks.take(neighbours)).bool())
     targets = node_of_block.index_select(0, neighbours.view(-1).index_select(0, edges))
     root = union_find(nodes.numel(), edges >> 2, targets)  # four neighbours
-    return Blocks(side, cols, nodes.numel(), node_of_block.scatter_(0, nodes, root))
+    component = node_of_block.scatter_(0, nodes, root).split([len(part) for part in parts])
+    first = [0, *torch.searchsorted(nodes, ends).tolist()] if num_sets > 1 else [0]
+    return [
+        Blocks(side, width, start, nodes.numel(), part)
+        for side, width, start, part in zip(sides, cols, first, component)
+    ]
+
+
+def _block_masks(padded: Tensor, side: int) -> Tensor:
+    """(blocks,) int8, int16 or int32: a byte for each column of a block, whose bits are its rows."""
+    cells = F.pad(padded.view(-1, 3), (0, 1)) if side == 3 else padded
+    words = cells.view(-1).view(_WORD[side]).view(-1, side, padded.shape[2] // side)
+    masks = words[:, 0]
+    for row in range(1, side):
+        masks = torch.add(masks, words[:, row], alpha=1 << row)
+    return masks.flatten()
 
 
 def connected_components(occupancy: Tensor, pixels: Tensor, connectivity: int = 8, reach: int = 1) -> Tensor:
@@ -219,9 +254,13 @@ def connected_components_kornia(occupancy: Tensor, pixels: Tensor, connectivity:
 
 
 @lru_cache(maxsize=256)
-def _offsets(cols: int, device: torch.device) -> Tensor:
-    """(4,) int64, how far away the neighbours of a block are."""
-    return torch.tensor([down * cols + right for down, right in _NEIGHBOURS], device=device)
+def _neighbourhoods(
+    sides: Tuple[int, ...], cols: Tuple[int, ...], connectivity: int, reaches: Tuple[int, ...], device: torch.device
+) -> Tuple[Tensor, Tensor]:
+    """(sets, 4) int64, how far away the neighbours of a block are; (512 sets, 4) int32, `_reachable` of each set."""
+    offsets = torch.tensor([[down * width + right for down, right in _NEIGHBOURS] for width in cols], device=device)
+    tables = [_reachable(side, connectivity, reach, device) for side, reach in zip(sides, reaches)]
+    return offsets, torch.cat(tables)
 
 
 @lru_cache(maxsize=32)

@@ -1,71 +1,81 @@
-"""The aperture problem: a line that seems to slide along itself has most likely not moved.
+"""The aperture problem: long thin things that seem to slide along themselves, and long vehicles that really do.
 
-Walls, hedges and guard rails are sampled by a sensor that moves, so their samples seem to move with it, along the
-line. If t+1 sees something all along where the line was, or the older sweeps all along where it is, the line itself
-has stayed: one end of it may come into sight or leave it. A car seen from its side is a line as well, but one of its
-ends leaves the place where it was, the other comes to a new one.
+Walls, hedges and guard rails are sampled by a sensor that moves, so their samples seem to move with it, along the line.
+If t+1 sees something all along where the line was, or the older sweeps all along where it is, the line itself is
+static: one end of it may come into sight or leave it. A car seen from its side is a line as well, but its rear leaves
+the old place, and its front comes to a new one.
+
+What is longer than other objects moves only if both of its ends do, as those of a tram. The ends of a wall do not: one
+stays, or each goes where the view of it ends. The ends of a guard rail may keep pace with the ego vehicle, since its
+few beams meet it at places that are fixed in the vehicle's frame; but no vehicle is as low as a rail.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Tuple
 
 import torch
 from torch import Tensor
 
-from cflow_torch.ops.indices import divide, flat_nonzero, split_index
-from cflow_torch.ops.segments import bounding_boxes
-from cflow_torch.verified.height_slices import HeightSlicedSweeps
+from cflow_torch.ops.indices import divide, flat_nonzero, gather, renumber, scatter_count, split_index
+from cflow_torch.ops.segments import segment_amin
+from cflow_torch.verified.height_slices import HeightSlicedSweeps, Pixels, count_slices
 
 # A line: largest standard deviation across and smallest along, metres.
 _THIN, _LONG = 0.3, 1.0
 # Squared sine of the largest angle between a line and a motion along it.
 _ALONG = 0.04
-# Shorter ways than this, metres over the window, are left alone.
-_LEAST_WAY = 1.2
-# Side of the cells in which the other sweeps are looked at, metres, and the share that must hold something, per cent.
+# Shorter displacements than this over the window, metres, tell nothing.
+_LEAST_TRAVEL = 1.2
+# Side of the cells in which other sweeps are compared, metres, and the share that must hold something, per cent.
 _CELL, _COVERED = 0.4, 88
+# The displacements of two ends that move together differ by at most this share of their sum.
+_ALIKE = 0.1
+# Height slices in a pixel at t+1, on average: guard rails have one or, across a slice's border, two.
+_TALL = 2
 
 
-def slides_along_itself(sweeps: HeightSlicedSweeps, owner: Tensor, candidates: Tensor) -> Tensor:
+def slides_along_itself(sweeps: HeightSlicedSweeps, members: Pixels, owner: Tensor, candidates: Tensor) -> Tensor:
     """Which motions are explained by a line that stays where it is.
 
     Args:
-        sweeps: finest images of all windows and their P occupied pixels.
-        owner: (P,) int64, component of each occupied pixel, A = none of these.
+        sweeps: images of all windows.
+        members: K pixels of components.
+        owner: (K,) int64, component of each of them.
         candidates: (A, C, 2) float64 (y, x), fine pixels per sweep interval.
 
     Returns:
         (A, C) bool: the component is a line at t+1, the motion points along it and leads at least 1.2 m over the
-        window, and at least 88 % of looks find something at the same place: of those from its pixels at t+1 into every
-        other sweep, or of those from its older pixels into t+1.
+        window, and at least 88 % of comparisons find something at the same place: of those from its pixels at t+1 with
+        every other sweep, or of those from its older pixels with t+1.
 
     Convention:
         Moments are sums of integers, everything else elementwise float64 in the written order. Standard deviations are
         those of the pixels' places, at most 0.3 m across and at least 1 m along. "The same place" is a cell of about
         0.4 m (whole pixels) and its eight neighbours. Zero motion never slides.
 
-    Cost: some ten passes over the pixels; nine look-ups for each look of the few components that are suspect.
+    Cost: some passes over the pixels; nine look-ups for each comparison of the few components that are suspect.
     Source: the aperture problem; not in the paper.
     """
-    num_components = len(candidates)
-    newest = flat_nonzero((owner < num_components) & (sweeps.step == 0))
-    component, row, col = (values.index_select(0, newest) for values in (owner, sweeps.row, sweeps.col))
-    is_line, axis_y, axis_x = principal_axes(component, row, col, num_components, sweeps.grid.pixel_size)
+    count, pixel_size = len(candidates), sweeps.grid.pixel_size
+    newest = flat_nonzero(members.step == 0)
+    component, row, col, window = gather(newest, owner, members.row, members.col, members.window)
+    is_line, axis_y, axis_x = principal_axes(component, row, col, count, pixel_size)
 
     # Its window, of each component; those without pixels at t+1 are no lines.
-    window = torch.zeros_like(is_line, dtype=torch.int64).scatter_(0, component, sweeps.window.index_select(0, newest))
+    window = torch.zeros_like(is_line, dtype=torch.int64).scatter_(0, component, window)
     intervals = (sweeps.elapsed.amax(1) - sweeps.elapsed.amin(1)).index_select(0, window)[:, None]
     y, x = candidates.unbind(2)
     across = axis_y[:, None] * x - axis_x[:, None] * y
     square = y * y + x * x
     length = (axis_y * axis_y + axis_x * axis_x)[:, None]
     suspect = is_line[:, None] & (across * across <= _ALONG * square * length)
-    suspect &= square * (intervals * intervals) >= (_LEAST_WAY / sweeps.grid.pixel_size) ** 2
-    looked_at = suspect.any(1)
-    if not bool(looked_at.any()):
+    suspect &= square * (intervals * intervals) >= (_LEAST_TRAVEL / pixel_size) ** 2
+    asked = flat_nonzero(suspect.any(1).index_select(0, owner))
+    if asked.numel() == 0:
         return suspect
-    return suspect & _is_covered(sweeps, owner, looked_at)[:, None]
+    return suspect & _is_covered(sweeps, members.take(asked), owner.index_select(0, asked), count)[:, None]
 
 
 def principal_axes(
@@ -79,15 +89,16 @@ def principal_axes(
         pixel_size: s, metres.
     """
     # Counted from the corner of its box, sums of squares stay exact.
-    first, _ = bounding_boxes(row, col, component, num_components)
-    y, x = row - first[:, 0].index_select(0, component), col - first[:, 1].index_select(0, component)
-    n, sum_y, sum_x, sum_yy, sum_xx, sum_yx = (
-        torch.zeros(num_components, dtype=torch.int64, device=row.device).index_add_(0, component, values).double()
-        for values in (torch.ones_like(y), y, x, y * y, x * x, y * x)
-    )
+    top, left = (segment_amin(at, component, num_components, 1 << 61).index_select(0, component) for at in (row, col))
+    y, x = row - top, col - left
+    moments = torch.stack((torch.ones_like(y), y, x, y * y, x * x, y * x))
+    n, sum_y, sum_x, sum_yy, sum_xx, sum_yx = scatter_count(component, num_components, moments).double()
     n = n.clamp(min=1)
-    var_y, var_x = (n * sum_yy - sum_y * sum_y) / (n * n), (n * sum_xx - sum_x * sum_x) / (n * n)
-    cov = (n * sum_yx - sum_y * sum_x) / (n * n)
+    square = n * n
+    var_y, var_x, cov = (
+        (n * sums - product) / square
+        for sums, product in ((sum_yy, sum_y * sum_y), (sum_xx, sum_x * sum_x), (sum_yx, sum_y * sum_x))
+    )
     # Eigenvalues of the 2 x 2 matrix; of the two ways to write the eigenvector, the one that does not vanish.
     mean, half = (var_y + var_x) / 2, (var_y - var_x) / 2
     root = torch.sqrt(half * half + cov * cov)
@@ -97,33 +108,85 @@ def principal_axes(
     return is_line, torch.where(is_wide, cov, large - var_x), torch.where(is_wide, large - var_y, cov)
 
 
-def _is_covered(sweeps: HeightSlicedSweeps, owner: Tensor, looked_at: Tensor) -> Tensor:
-    """(A,) bool: of the looks of a component forward or backward in time enough find something; of those that are not
-    `looked_at`, (A,), it means nothing."""
-    num_components, num_steps = looked_at.numel(), sweeps.num_steps
-    side = max(1, round(_CELL / sweeps.grid.pixel_size))
-    # A free margin all around: neighbours need no bounds check.
-    height, width = -(-sweeps.grid.height // side) + 2, -(-sweeps.grid.width // side) + 2
-    row, col = divide(sweeps.row, side) + 1, divide(sweeps.col, side) + 1
-    in_image = torch.add(col, row, alpha=width)
-    image = torch.add(sweeps.step, sweeps.window, alpha=num_steps)
-    is_occupied = torch.zeros(sweeps.num_windows * num_steps * height * width, dtype=torch.bool, device=row.device)
-    is_occupied.index_fill_(0, torch.add(in_image, image, alpha=height * width), True)
+def _is_covered(sweeps: HeightSlicedSweeps, members: Pixels, owner: Tensor, count: int) -> Tensor:
+    """(A,) bool: of the comparisons of a component forward or backward in time enough find something.
 
-    members = flat_nonzero(torch.cat((looked_at, looked_at.new_zeros(1))).index_select(0, owner))
-    window, step = sweeps.window.index_select(0, members), sweeps.step.index_select(0, members)
-    # From t+1 into all other sweeps of the window, from those into t+1.
-    given = (sweeps.elapsed != 0).index_select(0, window)
-    others = torch.where((step == 0)[:, None], given, torch.arange(num_steps, device=row.device) == 0)
-    looking, other = split_index(flat_nonzero(others), num_steps)
-    where = in_image.index_select(0, members.index_select(0, looking))
-    where += (window.index_select(0, looking) * num_steps + other) * (height * width)
-    finds = torch.zeros_like(where, dtype=torch.bool)
-    for offset in [down * width + right for down in (-1, 0, 1) for right in (-1, 0, 1)]:
-        finds |= is_occupied.index_select(0, where + offset)
-    way = owner.index_select(0, members.index_select(0, looking)) * 2 + (other == 0)
-    looks, found = (
-        torch.zeros(2 * num_components, dtype=torch.int64, device=row.device).index_add_(0, way, values)
-        for values in (torch.ones_like(way), finds.long())
+    Args:
+        members, owner: K pixels of the components that are asked for; the answer of others is False.
+    """
+    num_steps, grid, pixels = sweeps.num_steps, sweeps.grid, sweeps.pixels
+    side = max(1, round(_CELL / grid.pixel_size))
+    # A free margin all around: neighbours need no bounds check.
+    height, width = -(-grid.height // side) + 2, -(-grid.width // side) + 2
+
+    def cell(of: Pixels, step: Tensor) -> Tensor:
+        place = torch.add(divide(of.row, side), torch.add(step, of.window, alpha=num_steps), alpha=height)
+        return torch.add(divide(of.col, side), place, alpha=width).add_(width + 1)
+
+    size = sweeps.batch.num_windows * num_steps * height * width
+    is_occupied = torch.zeros(size, dtype=torch.bool, device=owner.device)
+    is_occupied.index_fill_(0, cell(pixels, pixels.step), True)
+    # From t+1 to all other sweeps of the window, from those to t+1.
+    every = torch.arange(num_steps, device=owner.device)
+    given = (sweeps.elapsed != 0).index_select(0, members.window)
+    others = torch.where((members.step == 0)[:, None], given, every == 0)
+    member, step = split_index(flat_nonzero(others), num_steps)
+    where, owner = cell(members.take(member), step), owner.index_select(0, member)
+    line = torch.arange(-1, 2, device=owner.device)
+    near = (line[:, None] * width + line).view(-1)
+    finds = is_occupied.index_select(0, (where[:, None] + near).view(-1)).view(-1, len(near)).any(1)
+    tally = scatter_count(owner * 2 + (step == 0), 2 * count, 1 + (finds.long() << 32))
+    total, found = tally & 0xFFFFFFFF, tally >> 32
+    return ((total > 0) & (found * 100 >= total * _COVERED)).view(-1, 2).any(1)
+
+
+def both_ends_move(sweeps: HeightSlicedSweeps, roots: Tensor, is_long: Tensor) -> Tensor:
+    """Which long components move from end to end.
+
+    Args:
+        sweeps: P occupied pixels.
+        roots: (L, P) int64, component of each pixel at each level.
+        is_long: (V,) bool, those that are asked about; each has pixels at t+1.
+
+    Returns:
+        (V,) bool: between the sweep that is farthest in time from t+1 and t+1 both ends have gone the same way along
+        the component, at least 1.2 m, alike to a tenth of their sum; and its pixels at t+1 have two slices on average.
+        False for all others.
+
+    Convention:
+        The component lies along the principal axis of its pixels at t+1; its ends in a sweep are the least and largest
+        projection of its pixels there, elementwise float64 in the written order. Of sweeps equally far in time the
+        first. A component without pixels in that sweep does not move.
+
+    Cost: some passes over the pixels of long components.
+    Source: not in the paper.
+    """
+    name = flat_nonzero(is_long)
+    if name.numel() == 0:
+        return torch.zeros_like(is_long)
+    count = name.numel()
+    number = renumber(name, is_long.numel()).index_select(0, roots.flatten())
+    some = flat_nonzero(number < count)
+    pixels, owner = sweeps.pixels.take(some % roots.shape[1]), number.index_select(0, some)
+    newest = flat_nonzero(pixels.step == 0)
+    of_newest, row, col, slices = gather(newest, owner, pixels.row, pixels.col, pixels.slices)
+    _, axis_y, axis_x = principal_axes(of_newest, row, col, count, sweeps.grid.pixel_size)
+    is_tall = scatter_count(of_newest, count, count_slices(slices).long() - _TALL) >= 0
+
+    place = pixels.row * axis_y.index_select(0, owner) + pixels.col * axis_x.index_select(0, owner)
+    is_farthest = pixels.step == sweeps.elapsed.abs().argmax(1).index_select(0, pixels.window)
+    (low, high), (low_then, high_then) = (
+        _ends(place.index_select(0, some), owner.index_select(0, some), count)
+        for some in (newest, flat_nonzero(is_farthest))
     )
-    return ((looks > 0) & (found * 100 >= looks * _COVERED)).view(-1, 2).any(1)
+    low, high = low - low_then, high - high_then  # infinite or NaN where one of them is not seen
+    both, least = low + high, 2 * _LEAST_TRAVEL / sweeps.grid.pixel_size
+    is_far = both * both >= (least * least) * (axis_y * axis_y + axis_x * axis_x)
+    moves = is_tall & is_far & ((low - high).abs() <= _ALIKE * both.abs())
+    return torch.zeros_like(is_long).index_copy_(0, name, moves)
+
+
+def _ends(place: Tensor, owner: Tensor, count: int) -> Tuple[Tensor, Tensor]:
+    """Least and largest of the places (K,) float64 of each component, (M,) float64; infinite where there are none."""
+    infinite = place.new_full((count,), math.inf)
+    return infinite.scatter_reduce(0, owner, place, "amin"), (-infinite).scatter_reduce(0, owner, place, "amax")

@@ -1,82 +1,78 @@
-"""Motion candidates of components: peaks of the correlation with each sweep, their pool, motions from elsewhere."""
+"""Motion candidates of nodes: peaks of the correlation with each sweep, their pool, the pools of the nodes around."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import List, Optional, Sequence, Tuple
+from typing import List, NamedTuple, Sequence, Tuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.config import VerifiedConfig
+from cflow_torch.dense.clustering import Clusters
+from cflow_torch.dense.clustering import Pixels as ClusterPixels
 from cflow_torch.dense.correlation import best_shifts
 from cflow_torch.dense.history import pool
 from cflow_torch.dense.templates import TemplatePairs, make_pairs
-from cflow_torch.ops.indices import flat_nonzero
+from cflow_torch.ops.indices import (
+    flat_nonzero,
+    gather,
+    lazy_empty,
+    lazy_zeros,
+    lookup,
+    scatter_count,
+    take_columns,
+)
 from cflow_torch.ops.parabola import vertex
-from cflow_torch.verified.component_tree import Level
-from cflow_torch.verified.height_slices import HeightSlicedSweeps, count_slices
-from cflow_torch.verified.keypoint_candidates import KeyPointMotion
-from cflow_torch.verified.paired_test import VerifiedLevel
+from cflow_torch.ops.segments import bounding_boxes
+from cflow_torch.verified.component_tree import Components, Nodes
+from cflow_torch.verified.height_slices import OWN, HeightSlicedSweeps, count_slices
+
+# A node whose box has more pixels is correlated at a coarser scale: its parts are followed at the finer ones.
+_LARGEST_BOX = 1 << 12
 
 
-@dataclass(frozen=True)
-class Candidates:
-    """What M components may have done.
+class Candidates(NamedTuple):
+    """What N nodes may have done.
 
     Args:
-        motion: (M, C, 2) float64, (y, x), finest pixels per sweep interval, in the order in which ties are decided; 0
+        motion: (N, C, 2) float64, (y, x), finest pixels per sweep interval, in the order in which ties are decided; 0
             stands for what is not known.
-        score: (P,) float32 of each occupied finest pixel: NCC of the finest component so far that was looked for.
+        score: (N,) float32, NCC with the nearest sweep that has the node.
     """
 
     motion: Tensor
     score: Tensor
 
 
-def propose(
-    level: Level,
-    sweeps: HeightSlicedSweeps,
-    above: Optional[VerifiedLevel],
-    key_points: Optional[KeyPointMotion],
-    config: VerifiedConfig,
-) -> Candidates:
-    """Candidates of the components of a level.
+def propose(nodes: Nodes, components: Components, sweeps: HeightSlicedSweeps, config: VerifiedConfig) -> Candidates:
+    """Candidates of all nodes, each correlated at its own pixel size.
 
     Args:
-        level: M components.
+        nodes: N of them.
+        components: at which scales they are.
         sweeps: finest images.
-        above: the coarser level: its components propose their motion to the parts. None = this is the coarsest.
-        key_points: what they say; None = they are not asked.
         config: `max_speed`, `correlation`, `max_memory`.
     """
-    wanted, others = ~level.too_long, []
-    if above is not None:
-        parent = level.parents(above.level)
-        others.append(F.pad(above.motion, (0, 0, 0, 1)).index_select(0, parent))
-        if level.is_undilated:  # what has not fallen apart is known
-            wanted &= ~level.equals_parent(above.level, parent)
-    if key_points is not None:
-        others.append(key_points.of_components(level))
-    estimates, scores, available = _find_peaks(level, wanted, sweeps, config)
-    intervals = sweeps.elapsed[level.clusters.window, 1:]
+    estimates, scores, available = _find_peaks(nodes, components, sweeps, config)
+    intervals = sweeps.elapsed.index_select(0, nodes.window)[:, 1:]
+    own = list_motions(estimates, available, intervals)
+    others, around = [], nodes.parent
+    for _ in range(components.num_levels - 1):
+        others.append(lookup(own[:, 0], around))
+        around = lookup(nodes.parent, around, nodes.count)
     newest = available.int().argmax(1, keepdim=True)
-    score = F.pad(scores.gather(1, newest)[:, 0], (0, 1)).index_select(0, level.component)
-    if above is not None:
-        score = torch.where(F.pad(wanted, (0, 1)).index_select(0, level.component), score, above.score)
-    return Candidates(list_motions(estimates, available, intervals, others), score)
+    return Candidates(torch.cat((own, torch.stack(others, 1)), 1), scores.gather(1, newest)[:, 0])
 
 
-def list_motions(estimates: Tensor, available: Tensor, intervals: Tensor, others: Sequence[Tensor] = ()) -> Tensor:
-    """(M, C, 2) float64, pixels per sweep interval: the pool of the estimates (where K > 1), each estimate by its
-    interval, the others.
+def list_motions(estimates: Tensor, available: Tensor, intervals: Tensor) -> Tensor:
+    """(M, C, 2) float64, pixels per sweep interval: the pool of the estimates (where K > 1), then each
+    estimate divided by its interval.
 
     Args:
         estimates: (M, K, 2) float64, (y, x) finest pixels m -> t+1, nearest sweep first.
-        available: (M, K) bool, False = there is no estimate; whatever stands there is not looked at.
+        available: (M, K) bool, False = there is no estimate; its entry is ignored.
         intervals: (M, K) float64, sweep intervals from m to t+1; not 0 where an estimate is available.
-        others: (M, 2) float64 each, pixels per sweep interval, motions from elsewhere.
 
     Convention:
         Of one estimate the pool is the estimate itself, so sweeps that a window lacks change no choice. No -0.0.
@@ -89,79 +85,118 @@ def list_motions(estimates: Tensor, available: Tensor, intervals: Tensor, others
     found: List[Tensor] = [per_interval]
     if estimates.shape[1] > 1:
         found.insert(0, pool(F.pad(per_interval, (0, 1)), available)[:, None, :2])  # without any estimate: 0
-    return torch.cat([*found, *(motion[:, None] for motion in others)], 1) + 0.0  # turns -0.0 into 0.0
+    return torch.cat(found, 1) + 0.0  # turns -0.0 into 0.0
 
 
 def _find_peaks(
-    level: Level, wanted: Tensor, sweeps: HeightSlicedSweeps, config: VerifiedConfig
+    nodes: Nodes, components: Components, sweeps: HeightSlicedSweeps, config: VerifiedConfig
 ) -> Tuple[Tensor, Tensor, Tensor]:
-    """Displacement m -> t+1 of components for every earlier sweep m, to parts of a pixel.
+    """Displacement m -> t+1 of nodes for every other sweep m, to parts of a pixel.
 
     Args:
-        level: M components.
-        wanted: (M,) bool, components that are looked for; the others cost nothing.
-        sweeps, config: as for `propose`.
+        nodes, components, sweeps, config: as for `propose`.
 
     Returns:
-        estimates: (M, S - 1, 2) float64, (y, x), finest pixels m -> t+1, nearest sweep first.
-        scores: (M, S - 1) float32, NCC at the peak.
-        available: (M, S - 1) bool, False = not wanted, or no pixel in that sweep; both above are 0 there.
+        estimates: (N, S - 1, 2) float64, (y, x), finest pixels m -> t+1, nearest sweep first.
+        scores: (N, S - 1) float32, NCC at the peak.
+        available: (N, S - 1) bool, False = no pixel in that sweep; both above are 0 there.
 
-    Convention: a peak at no shift stays there. The parabola counts slices, whatever component they are of at t+1.
+    Convention: a peak at no shift stays there. The parabola counts slices of the node's own pixels.
     """
-    clusters = level.clusters.take(wanted)
-    pairs = make_pairs(clusters, sweeps.batch, sweeps.grid.pixel_size * level.block, config.max_speed)
+    images = _NodeImages.of(nodes, components.blocks, sweeps.num_steps)
+    clusters = Clusters(nodes.window, images.first, images.size, images.pixels)
+    pairs = make_pairs(clusters, sweeps.batch, images.block.double() * sweeps.grid.pixel_size, config.max_speed)
     shift, score = best_shifts(pairs, config.correlation, config.max_memory)
-    moves = shift.any(1)
-    moved = flat_nonzero(moves)
-    peak, place = shift.index_select(0, moved), shift.double()
-    corner, window = (
-        values.index_select(0, pairs.cluster.index_select(0, moved)) for values in (clusters.first, clusters.window)
-    )
-    place[moved] = peak + _parabola(level.images, pairs, moves, corner, window, peak)
-
-    shape = (wanted.numel(), sweeps.num_steps - 1)
-    estimates = torch.zeros((*shape, 2), dtype=torch.float64, device=shift.device)
-    scores = torch.zeros(shape, dtype=torch.float32, device=shift.device)
-    available = torch.zeros(shape, dtype=torch.bool, device=shift.device)
-    component = flat_nonzero(wanted).index_select(0, pairs.cluster)
-    estimates[component, pairs.source] = place * level.block
-    scores[component, pairs.source] = score
-    available[component, pairs.source] = True
+    place = shift + _parabola(images, pairs, shift)
+    place *= images.block.index_select(0, pairs.cluster)[:, None]
+    shape, slot = (nodes.count, sweeps.num_steps - 1), pairs.cluster * (sweeps.num_steps - 1) + pairs.source
+    estimates = place.new_zeros((shape[0] * shape[1], 2)).index_copy_(0, slot, place).view(*shape, 2)
+    scores = score.new_zeros(shape[0] * shape[1]).index_copy_(0, slot, score).view(shape)
+    available = torch.zeros_like(scores, dtype=torch.bool)
+    available.view(-1).index_fill_(0, slot, True)
     return estimates, scores, available
 
 
-def _parabola(
-    images: Tensor, pairs: TemplatePairs, moves: Tensor, corner: Tensor, window: Tensor, shift: Tensor
-) -> Tensor:
-    """(K, 2) float64, (y, x), pixels: tops of the parabolas through the slices that templates share with sweep t+1.
+class _NodeImages(NamedTuple):
+    """A small image of each of N nodes for each of S sweeps, at the scale at which the node is correlated.
 
     Args:
-        images: (B, S, height, width) uint8, slices of each pixel.
-        pairs: J of them.
-        moves: (J,) bool, the K pairs that are asked about.
-        corner: (K, 2) int64, (row, col) of the corner of each template.
-        window: (K,) int64.
-        shift: (K, 2) int64, (dy, dx), of the peak.
+        block: (N,) int64, finest pixels a side of a pixel.
+        first: (N, 2) int64, top-left (row, col) of the box over all sweeps, in pixels of the scale.
+        size: (N, 2) int64, its height and width.
+        start: (N,) int64, where the images of a node begin.
+        image: (I,) uint8, slices of the pixels of all images, one behind the other.
+        pixels: the pixels that are set.
     """
-    _, num_steps, height, width = images.shape
-    flat = images.reshape(-1)
-    template = pairs.template.take(moves)
-    of_pixel, source = template.image, pairs.source.index_select(0, flat_nonzero(moves))
-    top, left = corner.index_select(0, of_pixel).unbind(1)
-    row, col = template.row + top, template.col + left
-    newest = window.index_select(0, of_pixel) * (num_steps * height)  # first row of t+1
-    line = newest + (source.index_select(0, of_pixel) + 1) * height + row
-    own = flat.index_select(0, line * width + col)
 
-    beside = torch.tensor(((0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)), device=shift.device)
-    dy, dx = shift.index_select(0, of_pixel).unbind(1)
-    y, x = ((at + way)[:, None] + step for at, way, step in ((row, dy, beside[:, 0]), (col, dx, beside[:, 1])))
-    inside = (y >= 0) & (y < height) & (x >= 0) & (x < width)
-    there = flat.index_select(0, ((newest[:, None] + y) * width + x).mul_(inside).view(-1)).view_as(inside)
-    counts = count_slices(own[:, None] & there).long().mul_(inside)
-    of_beside = of_pixel[:, None] * len(beside) + torch.arange(len(beside), device=shift.device)
-    sums = torch.zeros(len(shift) * len(beside), dtype=torch.int64, device=shift.device)
-    sums.index_add_(0, of_beside.view(-1), counts.view(-1))
-    middle, above, below, left, right = sums.view(-1, len(beside)).unbind(1)
-    return torch.stack((vertex(above, middle, below), vertex(left, middle, right)), 1)
+    block: Tensor
+    first: Tensor
+    size: Tensor
+    start: Tensor
+    image: Tensor
+    pixels: ClusterPixels
+
+    @classmethod
+    def of(cls, nodes: Nodes, blocks: Sequence[int], num_steps: int) -> _NodeImages:
+        """Draw the nodes.
+
+        Convention: the scale is that of the level; if the box is larger than `_LARGEST_BOX` pixels there, the finest
+            scale at which it is not, or the coarsest.
+        """
+        members, node, device = nodes.members, nodes.node, nodes.node.device
+        corner, extent = bounding_boxes(members.row, members.col, node, nodes.count)
+        block = torch.tensor(blocks, device=device)
+        tops = torch.div(corner[:, None], block[:, None], rounding_mode="floor")  # (N, scales, 2)
+        sizes = torch.div((corner + extent - 1)[:, None], block[:, None], rounding_mode="floor") - tops + 1
+        num_small = (sizes.prod(2) <= _LARGEST_BOX).sum(1)  # they come first, as scales are coarse to fine
+        scale = torch.minimum(nodes.level.clamp(max=len(blocks) - 1), (num_small - 1).clamp(min=0))
+        at = (torch.arange(nodes.count, device=device), scale)
+        block, first, size = block[scale], tops[at], sizes[at]
+        area = size.prod(1) * num_steps
+        end = area.cumsum(0)
+
+        # Pixels that fall into one at their scale are found by drawing them.
+        table = torch.stack((end - area, block, *size.unbind(1), *first.unbind(1)))
+        start, side, height, width, top, left = take_columns(table, node)
+        row, col = (torch.div(values, side, rounding_mode="floor") for values in (members.row, members.col))
+        place = (members.step * height + row - top).mul_(width).add_(start).add_(col - left)
+        total = int(end[-1]) if nodes.count else 0
+        # Where several of the finest pixels fall into one, all slices are set.
+        slices = torch.where(side == 1, members.slices, OWN)
+        image = lazy_zeros(total, torch.uint8, device).index_copy_(0, place, slices)
+        node_at = lazy_empty(total, torch.int32, device).scatter_(0, place, node.int())
+        place = flat_nonzero(image)
+        node = node_at.index_select(0, place).long()
+        start, _, height, width, top, left = take_columns(table, node)
+        place -= start
+        line = torch.div(place, width, rounding_mode="floor")
+        step = torch.div(line, height, rounding_mode="floor")
+        pixels = ClusterPixels(node, step, line - step * height + top, place - line * width + left)
+        return cls(block, first, size, end - area, image, pixels)
+
+
+def _parabola(images: _NodeImages, pairs: TemplatePairs, shift: Tensor) -> Tensor:
+    """(J, 2) float64, (y, x), pixels of each scale: tops of the parabolas through the pixels that templates share with
+    their targets at their peaks and beside them; 0 for pairs that do not move.
+
+    Args:
+        images: of all nodes.
+        pairs: J of them.
+        shift: (J, 2) int64, (dy, dx), of the peak.
+    """
+    is_moved = shift.any(1)
+    some = flat_nonzero(is_moved.index_select(0, pairs.template.image))
+    pair, row, col = gather(some, pairs.template.image, pairs.template.row, pairs.template.col)
+    (dy, dx), node = shift.index_select(0, pair).unbind(1), pairs.cluster.index_select(0, pair)
+    (height, width), start = images.size.index_select(0, node).unbind(1), images.start.index_select(0, node)
+    beside = torch.tensor(((0, -1, 1, 0, 0), (0, 0, 0, -1, 1)), device=shift.device)
+    y, x = (row + dy)[:, None] + beside[0], (col + dx)[:, None] + beside[1]
+    inside = (y >= 0) & (y < height[:, None]) & (x >= 0) & (x < width[:, None])
+    place = (start[:, None] + y * width[:, None] + x).mul_(inside)
+    own = images.image.index_select(0, start + ((pairs.source.index_select(0, pair) + 1) * height + row) * width + col)
+    there = images.image.index_select(0, place.view(-1)).view_as(place)
+    meets = count_slices(own[:, None] & there) * inside
+    of_beside = pair[:, None] * 5 + torch.arange(5, device=shift.device)
+    sums = scatter_count(of_beside.view(-1), len(shift) * 5, meets.view(-1).long()).view(-1, 5)
+    middle, above, below, left, right = sums.unbind(1)
+    return torch.stack((vertex(above, middle, below), vertex(left, middle, right)), 1) * is_moved[:, None]

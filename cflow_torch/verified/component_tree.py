@@ -1,126 +1,109 @@
-"""The component tree: components of the finest pixels at several pixel sizes, and which of them are objects.
+"""The component tree: components at several scales, those of them that may move, and the cut that selects objects.
 
-A component at one pixel size holds parts at the next finer one. It may be one object whose parts are too small to be
-followed, or several objects that move apart. Each has evidence: what its own best motion explains beyond noise. If the
-whole has more than its parts together, they take its motion; if not, each keeps its own.
+A component at one scale holds parts at the next finer one. It may be one object whose parts are too small to be
+followed, or several objects that move apart. All components that may move are nodes of one list, whatever their scale,
+and every later step runs once, on that list.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Sequence
+from typing import Optional, Sequence, Tuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from cflow_torch.config import VerifiedConfig
-from cflow_torch.dense.clustering import Clusters, cluster_images
-from cflow_torch.ops.indices import flat_nonzero
+from cflow_torch.ops.indices import divide, flat_nonzero, gather, lazy_zeros, lookup, renumber, scatter_count
+from cflow_torch.ops.labeling import label_together, padded_size
 from cflow_torch.ops.segments import bounding_boxes, segment_amin
-from cflow_torch.verified.height_slices import HeightSlicedSweeps
-from cflow_torch.verified.long_vehicles import ends_travel
+from cflow_torch.verified.aperture import both_ends_move
+from cflow_torch.verified.changed_pixels import ChangedPixels
+from cflow_torch.verified.height_slices import HeightSlicedSweeps, Pixels
+
+# The static test: a component may move only if more than one of so many of its pixels is missing somewhere.
+_MISSING = 20
+# Metres: changed pixels that reach farther at t+1 are not those of a person or of a cyclist.
+_LOCAL = 3.0
+# What every object costs, sixteenths of a slice of evidence: parts move on their own only if they explain more by it.
+_PRICE = 16 * 4
 
 
 @dataclass(frozen=True)
-class Level:
-    """Components at one pixel size, all windows.
+class Components:
+    """All components of all windows. They have V names, level by level; some names are free.
 
     Args:
-        block: k, finest pixels a side of a pixel of this level.
-        is_undilated: whether pixels must touch to belong together.
-        images: (B, S, height, width) uint8, slices of each pixel.
-        clusters: M components; their boxes and pixels are in pixels of this level.
-        component: (P,) int64, component of each occupied finest pixel, M = none.
-        too_long: (M,) bool, longer at t+1 than other objects, and not seen to travel: it does not move.
-        travels: (M,) bool, as long, but both ends are seen to travel, see `ends_travel`.
+        roots: (L, P) int64, component of each pixel at each level, coarse to fine; the last level is not dilated.
+        changed: (Q,) int64, pixels that changed, positions in the list.
+        changed_root: (Q,) int64, component of each of them among the changed pixels only.
+        firsts: first name of each level; that of the components of changed pixels follows.
+        parent: (V + 1,) int64, component of the next coarser level; V = none.
+        size: (V,) int64, number of pixels; 0 = a free name.
+        is_linked: (V,) bool, it has pixels at t+1 and before.
+        may_move: (V,) bool, it is linked, and the static test does not rule a motion out.
+        blocks: of each scale the finest pixels a side of a pixel of its images.
     """
 
-    block: int
-    is_undilated: bool
-    images: Tensor
-    clusters: Clusters
-    component: Tensor
-    too_long: Tensor
-    travels: Tensor
+    roots: Tensor
+    changed: Tensor
+    changed_root: Tensor
+    firsts: Tuple[int, ...]
+    parent: Tensor
+    size: Tensor
+    is_linked: Tensor
+    may_move: Tensor
+    blocks: Tuple[int, ...]
 
     @property
-    def num_components(self) -> int:
-        """M."""
-        return self.clusters.window.numel()
+    def count(self) -> int:
+        """V."""
+        return self.size.numel()
 
-    def parents(self, above: Level) -> Tensor:
-        """The component of a coarser level that holds each component.
-
-        Components are nested but where an oversized one was eroded and fell apart: then one pixel decides.
-
-        Args:
-            above: N components.
-
-        Returns:
-            (M,) int64, component of the first pixel (in the order of the list) that has one above; N = none has.
-        """
-        held = flat_nonzero(above.component < above.num_components)
-        own = self.component.index_select(0, held)
-        first = segment_amin(held, own, self.num_components + 1, self.component.numel())[: self.num_components]
-        return F.pad(above.component, (0, 1), value=above.num_components).index_select(0, first)
-
-    def equals_parent(self, above: Level, parent: Tensor) -> Tensor:
-        """(M,) bool: which components have the same pixels as their parent, so that its estimates are theirs.
-
-        Args:
-            above: N components.
-            parent: (M,) int64, as `parents` gives it.
-        """
-        count, count_above = self.num_components, above.num_components
-        size = torch.bincount(self.component, minlength=count + 1)[:count]
-        size_above = torch.bincount(above.component, minlength=count_above + 1)
-        own_parent = F.pad(parent, (0, 1), value=count_above).index_select(0, self.component)
-        shared = flat_nonzero((own_parent == above.component) & (above.component < count_above))
-        common = torch.bincount(self.component.index_select(0, shared), minlength=count + 1)[:count]
-        return (common == size) & (common == size_above.index_select(0, parent)) & (parent < count_above)
+    @property
+    def num_levels(self) -> int:
+        """L."""
+        return len(self.roots)
 
 
-def find_components(sweeps: HeightSlicedSweeps, block: int, is_undilated: bool, config: VerifiedConfig) -> Level:
-    """Components at one pixel size.
+@dataclass(frozen=True)
+class Nodes:
+    """N components that may move: coarse to fine, then those of changed pixels, then those under overhangs.
 
     Args:
-        sweeps: P occupied pixels.
-        block: k, finest pixels a side of a pixel of this level.
-        is_undilated: False = Alg. clustering (dilated, eroded again if oversized); True = plain components, for the
-            parts of those.
-        config: `connectivity`, `max_extent`, `labeling`, `max_object`.
-
-    Returns:
-        The level. No point is projected again. Lengths at t+1 are the longer side of the box of the finest pixels.
-
-    Cost: as `cluster_images`, and some passes over the images of this level and the finest pixels.
+        component: (N,) int64, its name; those under overhangs are named from V on.
+        level: (N,) int64, 0 ... L - 1; L = changed pixels, L + 1 = under an overhang.
+        parent: (N,) int64, the next coarser node around it; N = none.
+        window: (N,) int64.
+        travels: (N,) bool, it is longer than other objects, and both of its ends move.
+        pixel: (A,) int64, pixels of all nodes, positions in the list; a pixel of several nodes is here several times.
+        node: (A,) int64, node of each of them.
+        members: the same pixels.
     """
-    images, column = sweeps.coarsen(block)
-    pixel_size = sweeps.grid.pixel_size
-    clusters, columns = cluster_images(images, pixel_size * block, config, 1 if is_undilated else 3)
-    count, area = clusters.window.numel(), images[0, 0].numel()
-    of_column = torch.empty(sweeps.num_windows * area, dtype=torch.int64, device=column.device)
-    of_column.scatter_(0, torch.add(columns.pixel, columns.window, alpha=area), columns.cluster)
-    component = of_column.index_select(0, column)  # empty columns are never asked for
-    newest = flat_nonzero((sweeps.step == 0) & (component < count))
-    row, col, own = (values.index_select(0, newest) for values in (sweeps.row, sweeps.col, component))
-    _, size = bounding_boxes(row, col, own, count)  # every component has pixels at t+1
-    longest = math.inf if config.max_object is None else config.max_object
-    is_long = torch.maximum(size[:, 0], size[:, 1]).double() * pixel_size > longest
-    travels = ends_travel(sweeps, component, is_long)
-    return Level(block, is_undilated, images, clusters, component, is_long & ~travels, travels)
+
+    component: Tensor
+    level: Tensor
+    parent: Tensor
+    window: Tensor
+    travels: Tensor
+    pixel: Tensor
+    node: Tensor
+    members: Pixels
+
+    @property
+    def count(self) -> int:
+        """N."""
+        return self.component.numel()
 
 
 @dataclass(frozen=True)
 class Objects:
-    """The components that won: what moves together. Numbered by window, then by their first pixel in the list.
+    """The components that were selected as objects. They are numbered by window, then by their first pixel.
 
     Args:
-        of_pixel: (P,) int64, object of each occupied finest pixel, G = none.
-        component: (G,) int64, which component it is, counted through all levels, coarse to fine: M_0 of the coarsest
-            level, then M_1 of the next, ...
+        of_pixel: (P,) int64, object of each occupied pixel, G = none.
+        component: (G,) int64, name of the component.
         first: (G,) int64, position of its first pixel in the list.
     """
 
@@ -133,65 +116,182 @@ class Objects:
         """G."""
         return self.component.numel()
 
-    def split(self, part: Tensor, wanted: Tensor, num_components: int) -> Objects:
-        """Parts of them taken out as objects of their own.
 
-        Args:
-            part: (P,) int64, part of each pixel, H = none.
-            wanted: (H,) bool, the parts that are taken out.
-            num_components: of all levels; the parts are numbered after them.
-        """
-        none = num_components + wanted.numel()
-        whole = F.pad(self.component, (0, 1), value=none).index_select(0, self.of_pixel)
-        is_out = F.pad(wanted, (0, 1)).index_select(0, part)
-        return number_objects(torch.where(is_out, num_components + part, whole), none)
-
-    def pixels_of(self, wanted: Tensor) -> Tensor:
-        """(P,) int64, `of_pixel` for the objects that are wanted, (G,) bool; G for all other pixels."""
-        return torch.where(F.pad(wanted, (0, 1)).index_select(0, self.of_pixel), self.of_pixel, self.count)
-
-
-def select_objects(levels: Sequence[Level], evidence: Sequence[Tensor]) -> Objects:
-    """Bottom up: a component wins where it has more evidence than its parts together.
+def find_components(sweeps: HeightSlicedSweeps, change: ChangedPixels, blocks: Sequence[int]) -> Components:
+    """Components of all scales by one union-find, and the static test.
 
     Args:
-        levels: coarse to fine.
-        evidence: of each level (M,) int64, at least 0; sums must stay below 2^63.
+        sweeps: P occupied pixels.
+        change: what they show.
+        blocks: finest pixels a side of a pixel, coarse to fine, the last one 1. Each scale is dilated as in
+            Alg. clustering, but nothing is eroded: so scales are nested. Plain components of the finest pixels follow.
+
+    Convention: the static test holds in windows with history only.
+
+    Cost: one pass over the images of each scale, a few rounds of union-find, some passes over the pixels.
+    """
+    pixels, grid, num_windows = sweeps.pixels, sweeps.grid, sweeps.batch.num_windows
+    changed = flat_nonzero(change.has_changed)
+    images, places = [], []
+    for block in blocks:
+        height, width = -(-grid.height // block), -(-grid.width // block)
+        row, col = (divide(pixels.row, block), divide(pixels.col, block)) if block > 1 else (pixels.row, pixels.col)
+        places.append((torch.add(row, pixels.window, alpha=padded_size(height)), col))
+        images.append((_draw(places[-1][0], places[-1][1], num_windows, height, width), 3))
+    images.append((images[-1][0], 1))
+    places.append(places[-1])
+    of_changed = gather(changed, *places[-1])
+    if sweeps.num_steps > 2:
+        images.append((_draw(of_changed[0], of_changed[1], num_windows, grid.height, grid.width), 1))
+    found = label_together(images)
+    roots = torch.stack([part.of_pixel(*at) for part, at in zip(found, places)])
+    changed_root, count = found[-1].of_pixel(*of_changed), found[0].num_components
+    parent = torch.full((count + 1,), count, dtype=torch.int64, device=changed.device)
+    for coarse, fine in zip(roots, roots[1:]):
+        parent.scatter_(0, fine, coarse)
+
+    firsts = tuple(part.first for part in found)
+    root = torch.cat((roots[-1], changed_root))
+    codes = _codes(sweeps, change)
+    sums = scatter_count(root, count + 1, torch.cat((codes, codes.index_select(1, changed)), 1))
+    # What the components of a level hold adds up to what those of the coarser level hold.
+    for level in range(len(roots) - 1, 0, -1):
+        names = slice(firsts[level], (*firsts, count)[level + 1])
+        sums += scatter_count(parent[names], count + 1, sums[:, names])
+    (size, num_missing), num_newest = sums[:, :-1] & 0xFFFFFFFF, sums[0, :-1] >> 32
+    is_linked = (num_newest > 0) & (num_newest < size)
+    may_move = is_linked & (num_missing * _MISSING > size)
+    return Components(roots, changed, changed_root, firsts, parent, size, is_linked, may_move, tuple(blocks))
+
+
+def _codes(sweeps: HeightSlicedSweeps, change: ChangedPixels) -> Tensor:
+    """(2, P) int64: 1, plus 2^32 for pixels at t+1, so that one sum counts both; and 1 for pixels that are missing
+    somewhere, or, without history, may be."""
+    pixels = sweeps.pixels
+    may_move = change.is_missing | ~sweeps.has_history.index_select(0, pixels.window)
+    return torch.stack((1 + ((pixels.step == 0).long() << 32), may_move.long()))
+
+
+def _draw(row: Tensor, col: Tensor, num_windows: int, height: int, width: int) -> Tensor:
+    """(B, H', W') bool padded images, set at rows, counted through all of them, and columns (K,) int64."""
+    shape = num_windows, padded_size(height), padded_size(width)
+    image = lazy_zeros(math.prod(shape), torch.bool, row.device)
+    return image.index_fill_(0, torch.add(col, row, alpha=shape[2]), True).view(shape)
+
+
+def movable_nodes(sweeps: HeightSlicedSweeps, components: Components, longest: Optional[float]) -> Nodes:
+    """The components that may move, as a list.
+
+    Args:
+        sweeps: P occupied pixels.
+        components: V names.
+        longest: metres; what is longer at t+1 moves only if both of its ends do. None = anything may move.
+
+    Convention: a plain component that equals the dilated one around it is not in the list a second time. A length is
+        that of the longer side of the box of the pixels at t+1.
+
+    Cost: linear in the pixels of the nodes.
+    """
+    roots, count, may_move = components.roots, components.count, components.may_move
+    length = _length(sweeps, components) * sweeps.grid.pixel_size
+    is_long = may_move & (length > (math.inf if longest is None else longest))
+    travels = both_ends_move(sweeps, roots, is_long)
+    may_move = may_move & (travels | ~is_long)
+    if len(components.firsts) > components.num_levels:
+        may_move[components.firsts[-1] :] &= length[components.firsts[-1] :] <= _LOCAL
+    # A plain component of as many pixels as its parent is the same component once more.
+    size, parent = F.pad(components.size, (0, 1)), components.parent
+    is_node = F.pad(may_move, (0, 1))
+    plain = slice(components.firsts[components.num_levels - 1], (*components.firsts, count)[components.num_levels])
+    is_node[plain] &= size[plain] != size.index_select(0, parent[plain])
+    name = flat_nonzero(is_node)
+    number, around = renumber(name, count), parent.index_select(0, name)
+    for _ in range(components.num_levels - 2):
+        around = torch.where(is_node.index_select(0, around), around, parent.index_select(0, around))
+    pixel = torch.arange(roots.shape[1], device=roots.device).repeat(components.num_levels)
+    node = number.index_select(0, torch.cat((roots.flatten(), components.changed_root)))
+    kept = flat_nonzero(node < len(name))
+    node, pixel = gather(kept, node, torch.cat((pixel, components.changed)))
+    members = sweeps.pixels.take(pixel)
+    return Nodes(
+        component=name,
+        level=torch.bucketize(name, torch.tensor(components.firsts[1:], device=name.device), right=True),
+        parent=number.index_select(0, around),
+        window=torch.zeros_like(name).scatter_(0, node, members.window),
+        travels=travels.index_select(0, name),
+        pixel=pixel,
+        node=node,
+        members=members,
+    )
+
+
+def _length(sweeps: HeightSlicedSweeps, components: Components) -> Tensor:
+    """(V,) float64, pixels: longer side of the box of each component at t+1."""
+    step, row, col = sweeps.pixels.step, sweeps.pixels.row, sweeps.pixels.col
+    newest = flat_nonzero(step == 0)
+    changed = flat_nonzero(step.index_select(0, components.changed) == 0)
+    root = torch.cat((components.roots[:, newest].flatten(), components.changed_root[changed]))
+    row, col = gather(torch.cat((newest.repeat(components.num_levels), components.changed[changed])), row, col)
+    return bounding_boxes(row, col, root, components.count)[1].amax(1).double()
+
+
+def select_objects(nodes: Nodes, components: Components, evidence: Tensor, num_pixels: int) -> Tuple[Objects, Tensor]:
+    """Cut the tree from below: a component wins where its one motion has more evidence than its parts together.
+
+    Args:
+        nodes: N of them.
+        components: V names; those under overhangs follow.
+        evidence: (N,) int64, of the best motion of each, 0 = none is significant; sums must stay below 2^63.
+        num_pixels: P, those of the copies included.
 
     Returns:
-        The winners. A pixel belongs to the coarsest of its components that won; if none did, to its finest one. Pixels
-        of no finest component (not linked between sweeps) go with a coarser one that wins.
+        The objects, and the node of each, (G,) int64, N = none. A pixel belongs to the coarsest of its nodes that won.
+        If none did, it moves with the node of its changed pixels, if that does; else it is static with its finest
+        component, or belongs to none if that is not linked. Pixels of copies belong to a node that moves, or to none.
 
-    Convention:
-        The whole must have more; at a draw the parts keep their own motion. Evidence of a part that is no longer held
-        by anything (see `Level.parents`) is lost to what lies above.
+    Convention: a part counts with its evidence less `_PRICE`, at least 0. The whole must have more; at a draw the parts
+        keep their own motion.
 
-    Cost: a few passes over the pixels per level; the only Python loop is over levels.
+    Cost: a few passes over the nodes for each level, and over the pixels.
     """
-    first_of_level = [0]
-    for level in levels:
-        first_of_level.append(first_of_level[-1] + level.num_components)
-    num_components = first_of_level[-1]
+    count, num_levels = nodes.count, components.num_levels
+    parts = evidence.new_zeros(count + 1)
+    for level in range(num_levels - 1, 0, -1):  # finer levels first: what a node holds is complete when its turn comes
+        value = torch.maximum(evidence, parts[:-1])
+        value = (value - _PRICE).clamp_(min=0)
+        parts.index_add_(0, nodes.parent, value.masked_fill_(nodes.level != level, 0))
+    own = torch.arange(count + 1, device=evidence.device)
+    winner = torch.where(F.pad(evidence, (0, 1)) > parts, own, count)
+    winner[-1:] = count
+    parent = F.pad(nodes.parent, (0, 1), value=count)
+    for _ in range(num_levels - 1):  # coarse winners spread to what they hold, a level at a time
+        around = winner.index_select(0, parent)
+        winner = torch.where(around < count, around, winner)
 
-    part, value = levels[-1], evidence[-1]
-    of_pixel = torch.where(part.component < value.numel(), part.component + first_of_level[-2], num_components)
-    for whole, own, offset in reversed(list(zip(levels[:-1], evidence[:-1], first_of_level))):
-        total = torch.zeros(own.numel() + 1, dtype=torch.int64, device=own.device)
-        total = total.index_add_(0, part.parents(whole), value)[:-1]
-        wins = F.pad(own > total, (0, 1))
-        of_pixel = torch.where(wins.index_select(0, whole.component), whole.component + offset, of_pixel)
-        part, value = whole, torch.maximum(own, total)
+    # Nodes are numbered coarse to fine, so the largest number is that of the finest one.
+    in_tree = (nodes.level < num_levels).index_select(0, nodes.node)
+    finest, other = (
+        torch.full((num_pixels,), -1, dtype=torch.int64, device=own.device).scatter_reduce_(
+            0, nodes.pixel, torch.where(wanted, nodes.node, -1), "amax"
+        )
+        for wanted in (in_tree, ~in_tree)
+    )
+    moving = winner.index_select(0, finest.remainder(count + 1))  # -1 becomes "none"
+    other = torch.where(lookup(evidence > 0, other.remainder(count + 1)), other, count)
+    moving = torch.where(moving < count, moving, other)
+    none, num_own = components.count + count, components.roots.shape[1]
+    name = torch.full((num_pixels,), none, dtype=torch.int64, device=own.device)
+    name[:num_own] = torch.where(components.is_linked.index_select(0, components.roots[-1]), components.roots[-1], none)
+    name = torch.where(moving < count, lookup(nodes.component, moving), name)
+    objects = number_objects(name, none)
+    return objects, renumber(nodes.component, none).index_select(0, objects.component)
 
-    return number_objects(of_pixel, num_components)
 
-
-def number_objects(of_pixel: Tensor, num_components: int) -> Objects:
-    """Objects by the component, (P,) int64, that each pixel belongs to; `num_components` = none."""
-    position = torch.arange(of_pixel.numel(), device=of_pixel.device)
-    first = segment_amin(position, of_pixel, num_components + 1, of_pixel.numel())[:num_components]
-    first, component = first.sort()
-    count = int((first < of_pixel.numel()).sum())
-    first, component = first[:count], component[:count]
-    number = torch.full((num_components + 1,), count, dtype=torch.int64, device=first.device)
-    number.scatter_(0, component, torch.arange(count, device=first.device))
-    return Objects(number.index_select(0, of_pixel), component, first)
+def number_objects(name: Tensor, num_names: int) -> Objects:
+    """Objects by the name of the component that each pixel belongs to, (P,) int64; `num_names` = none."""
+    is_used = torch.zeros(num_names + 1, dtype=torch.bool, device=name.device).index_fill_(0, name, True)
+    component = flat_nonzero(is_used[:-1])
+    position = torch.arange(len(name), device=name.device)
+    first, order = segment_amin(position, name, num_names + 1, len(name)).index_select(0, component).sort()
+    component = component.index_select(0, order)
+    return Objects(renumber(component, num_names).index_select(0, name), component, first)

@@ -1,76 +1,113 @@
-"""How far the flow of a point can be trusted: counts that need no truth -> a probability (docs/verified.md).
+"""Which motions are distinctive, and how far you can trust the flow of a point (docs/verified.md).
 
-What moves is trusted by how much worse its motion explains the sweeps when it is displaced: along a wall that slides or
-a trunk of few points nothing gets worse. What stands still is trusted by the share of its neighbourhood that is found
-again. What could not be linked to t+1 is trusted the less the more of it there is.
+The margin of a motion says how much worse it explains the sweeps when it is displaced. Along a wall that seems to slide
+nothing gets worse, and a trunk of few points fits many places: what fits as well when displaced is static.
+
+Counts that need no truth give every point a probability, from a table. A moving object is trusted by its margin, a
+static one by the share of its neighbourhood that is matched. What could not be linked to t+1 is trusted the less the
+more of it there is.
 """
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Sequence, Tuple
+from typing import NamedTuple, Tuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
-from cflow_torch.ops.indices import divide, flat_nonzero
+from cflow_torch.ops.indices import divide, flat_nonzero, gather, lookup, scatter_count
+from cflow_torch.verified.aperture import principal_axes
 from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import HeightSlicedSweeps, count_slices
+from cflow_torch.verified.paired_test import count_wins
 from cflow_torch.verified.rigid_motion import RigidMotion
 
 # Bounds of the bins and the probabilities, written by scripts/ablation/calibrate_confidence.py. Bins, in order: left
-# out; unlinked, by `crowd`; still, by `share`, or where a local motion is likely by `doubt`; moving, by `margin`: pairs
-# near, pairs far, with history near and far.
+# out; unlinked, by `crowd`; static, by `share`; moving, by `margin`: pairs near, pairs far, with history near and far.
 TABLE = json.loads(Path(__file__).with_name("confidence.json").read_text(encoding="utf-8"))
-BLOCK = 1.6  # metres, sides of a neighbourhood
+_BLOCK = 1.6  # metres, sides of a neighbourhood
+_DISPLACEMENT = 0.4  # metres per interval, along x and along y
+_Z = 1.0  # standard deviations of noise by which a motion must be better than displaced
 
 
-def confidence_of(
-    sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMotion, margin: Tensor, doubt: Tensor
-) -> Tensor:
+class MotionMargin(NamedTuple):
+    """The margins of G objects.
+
+    Args:
+        z: (G,) float64, slices matched by the motion less those matched by the best displaced one, in standard
+            deviations of noise; 0 = it is not better, or the object is static.
+        is_dynamic: (G,) bool, it moves: its motion is better by one standard deviation, or is better at all and it has
+            left its old place, and is not a line: a rail seems to leave its place as well.
+    """
+
+    z: Tensor
+    is_dynamic: Tensor
+
+
+def motion_margin(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMotion) -> MotionMargin:
+    """The margin of each object.
+
+    Args:
+        sweeps: finest images.
+        objects: G of them.
+        rigid: their motion. Rotations are ignored: an object counts as if it moved as its centre does.
+
+    Cost: five look-ups for each pixel of the moving objects and each sweep.
+    """
+    size, device = sweeps.grid.pixel_size, rigid.flow.device
+    motion, off = rigid.pixels_per_interval(size), _DISPLACEMENT / size
+    displaced = torch.tensor([(0, 0), (off, 0), (-off, 0), (0, off), (0, -off)], dtype=torch.float64, device=device)
+    pixel = flat_nonzero(lookup(motion.any(1), objects.of_pixel))
+    members, owner = sweeps.pixels.take(pixel), objects.of_pixel.index_select(0, pixel)
+    wins = count_wins(sweeps, members, owner, motion[:, None] + displaced, motion.any(1))
+    surplus = wins.won - wins.lost
+    gain, matched = (surplus[:, 0] - surplus[:, 1:].amax(1)).clamp(min=0), surplus[:, 0] + wins.in_place
+    z = torch.where(gain > 0, gain.double() / matched.double().sqrt(), 0.0)
+    newest = flat_nonzero(members.step == 0)
+    owner, row, col = gather(newest, owner, members.row, members.col)
+    is_line, _, _ = principal_axes(owner, row, col, objects.count, size)
+    return MotionMargin(z, (z >= _Z) | ((gain > 0) & (surplus[:, 0] > wins.in_place) & ~is_line))
+
+
+def confidence_of(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMotion, margin: Tensor) -> Tensor:
     """Probability that the motion of a pixel of t is right to 0.1 m per sweep interval.
 
     Args:
         sweeps: finest images, P occupied pixels.
         objects: G of them.
-        rigid: their motion. Turns are not looked at: an object counts as it moves at its centre.
-        margin: (G,) float64, of each motion, `Margin.z`.
-        doubt: (P,) float64, how much speaks for a local motion around each pixel, standard deviations of noise.
+        rigid: their motion. Rotations are ignored: an object counts as if it moved as its centre does.
+        margin: (G,) float64, of each motion, `MotionMargin.z`.
 
     Returns:
-        (P + 1,) float32; entry P is for points whose pixel was left out. Means nothing for pixels of other sweeps.
+        (P + 1,) float32; entry P is for points whose pixel was left out. Undefined for pixels of other sweeps.
 
     Cost: one look-up for each pixel of t.
     """
-    probabilities = torch.tensor(TABLE["probabilities"], dtype=torch.float32, device=sweeps.elapsed.device)
-    return probabilities.index_select(0, F.pad(_bins(sweeps, objects, rigid, margin, doubt), (0, 1)))
-
-
-def _bins(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMotion, margin: Tensor, doubt: Tensor) -> Tensor:
-    """(P,) int64, place of each pixel in the table."""
-    size = sweeps.grid.pixel_size
+    pixels, size, device = sweeps.pixels, sweeps.grid.pixel_size, margin.device
     motion = rigid.pixels_per_interval(size)
-    moves = motion.any(1)
-    number, found = _neighbourhood(sweeps, F.pad(motion, (0, 0, 0, 1)).index_select(0, objects.of_pixel))
-    crowd, share = TABLE["crowd"], TABLE["share"]
-    unlinked = 1 + _count([number >= bound for bound in crowd])
-    still = 2 + len(crowd) + _count([10 * found >= bound * number for bound in share])
-    num_doubts = _count([doubt >= bound for bound in TABLE["doubt"]])
-    still = torch.where(num_doubts > 0, 2 + len(crowd) + len(share) + num_doubts, still)
+    number, matched = _neighbourhood(sweeps, lookup(motion, objects.of_pixel))
+    crowd, share, bounds = (TABLE[name] for name in ("crowd", "share", "margin"))
+    unlinked = 1 + _bin(number, crowd)
+    static = 2 + len(crowd) + sum(10 * matched >= bound * number for bound in share)
 
-    y, x = ((at.double() + 0.5) * size for at in (sweeps.row, sweeps.col))
+    y, x = ((at.double() + 0.5) * size for at in (pixels.row, pixels.col))
     x, y = x + sweeps.grid.lower[0], y + sweeps.grid.lower[1]
     is_far = x * x + y * y >= float(TABLE["far"]) ** 2
-    has_history = ((sweeps.elapsed != 0).sum(1) > 1).index_select(0, sweeps.window)
-    kind = 2 * has_history.long() + is_far.long()
-    first = 3 + len(crowd) + len(share) + len(TABLE["doubt"])
-    num_margins = _count([margin >= bound for bound in TABLE["margin"]])
-    moving = first + kind * (1 + len(TABLE["margin"])) + F.pad(num_margins, (0, 1))[objects.of_pixel]
+    kind = 2 * sweeps.has_history.index_select(0, pixels.window) + is_far.long()
+    first = 3 + len(crowd) + len(share)
+    moving = first + kind * (1 + len(bounds)) + lookup(_bin(margin, bounds), objects.of_pixel)
 
-    still = torch.where(objects.of_pixel == objects.count, unlinked, still)
-    return torch.where(F.pad(moves, (0, 1)).index_select(0, objects.of_pixel), moving, still)
+    static = torch.where(objects.of_pixel == objects.count, unlinked, static)
+    place = torch.where(lookup(motion.any(1), objects.of_pixel), moving, static)
+    probabilities = torch.tensor(TABLE["probabilities"], dtype=torch.float32, device=device)
+    return torch.cat((probabilities.index_select(0, place), probabilities[:1]))
+
+
+def _bin(values: Tensor, bounds: list[float]) -> Tensor:
+    """(K,) int64, how many of the ascending bounds each value reaches."""
+    return torch.bucketize(values, torch.tensor(bounds, dtype=values.dtype, device=values.device), right=True)
 
 
 def _neighbourhood(sweeps: HeightSlicedSweeps, motion: Tensor) -> Tuple[Tensor, Tensor]:
@@ -83,21 +120,15 @@ def _neighbourhood(sweeps: HeightSlicedSweeps, motion: Tensor) -> Tuple[Tensor, 
     Returns:
         (P,) int64 each.
     """
-    side = max(1, round(BLOCK / sweeps.grid.pixel_size))
+    pixels, side = sweeps.pixels, max(1, round(_BLOCK / sweeps.grid.pixel_size))
     height, width = -(-sweeps.grid.height // side), -(-sweeps.grid.width // side)
-    block = (sweeps.window * height + divide(sweeps.row, side)) * width + divide(sweeps.col, side)
-    source = flat_nonzero(sweeps.step == 1)
-    window, row, col, own, at = (
-        values.index_select(0, source) for values in (sweeps.window, sweeps.row, sweeps.col, sweeps.slices, block)
-    )
-    move = (motion.index_select(0, source) * sweeps.elapsed[window, 1][:, None] + 0.5).floor_().long()
-    there = own & sweeps.slices_at(window, torch.zeros_like(window), row + move[:, 0], col + move[:, 1])
-    sums = torch.zeros((2, sweeps.num_windows * height * width), dtype=torch.int64, device=block.device)
-    for out, slices in zip(sums, (own, there)):
-        out.index_add_(0, at, count_slices(slices).long())
-    return sums[0].index_select(0, block), sums[1].index_select(0, block)
-
-
-def _count(masks: Sequence[Tensor]) -> Tensor:
-    """(K,) int64, in how many of some (K,) masks each element is set."""
-    return torch.stack(list(masks)).sum(0)
+    block = (pixels.window * height + divide(pixels.row, side)) * width + divide(pixels.col, side)
+    source = flat_nonzero(pixels.step == 1)
+    of_t, block_of_t = pixels.take(source), block.index_select(0, source)
+    elapsed = sweeps.elapsed[:, 1].index_select(0, of_t.window)
+    row, col = (motion.index_select(0, source) * elapsed[:, None] + 0.5).floor_().long().unbind(1)
+    place = sweeps.index(of_t.window, torch.zeros_like(row), of_t.row + row, of_t.col + col)
+    matched = of_t.slices & sweeps.image.index_select(0, place)
+    both = count_slices(of_t.slices).long() + (count_slices(matched).long() << 32)
+    sums = scatter_count(block_of_t, sweeps.batch.num_windows * height * width, both).index_select(0, block)
+    return sums & 0xFFFFFFFF, sums >> 32

@@ -1,4 +1,8 @@
-"""Height-sliced occupancy: the finest images of all sweeps with four height slices a pixel, and what is occupied."""
+"""Height-sliced occupancy: images of all sweeps at the finest pixels, with four height slices a pixel.
+
+A slice is half a metre of height, and slices repeat every two metres, so that a wheel cannot match a roof. One byte of
+an image holds the slices of its pixel, and those of the 3 x 3 pixels around it.
+"""
 
 from __future__ import annotations
 
@@ -6,52 +10,88 @@ import itertools
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Optional, Tuple
+from typing import Optional, Tuple, Union
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.ops.chunks import chunks
-from cflow_torch.ops.indices import divide, flat_nonzero, occupied, split_index
+from cflow_torch.ops.indices import (
+    divide,
+    flat_nonzero,
+    gather,
+    lazy_zeros,
+    lookup,
+    occupied,
+    renumber,
+    split_index,
+)
 from cflow_torch.ops.segments import segment_amin
-from cflow_torch.verified.ground_residue import TALL, clear_ground_residue, is_tall
 from cflow_torch.windows.bev_grid import Grid
 from cflow_torch.windows.collation import Batch
 
-# Height slices are told apart by this many numbers, then they repeat: 2 m of four slices of 0.5 m.
 NUM_SLICES = 4
 SLICE_HEIGHT = 0.5  # metres
+OWN = (1 << NUM_SLICES) - 1  # bits of the slices of the pixel itself
 # Beyond this float64 only holds multiples of 16, so cutting heights off here changes no slice.
 _HIGHEST_SLICE = 2.0**56
+# A low pixel belongs to the object of a tall one that is at most so many rows and columns away.
+_RESIDUE_REACH = 2
 
 
 @dataclass(frozen=True)
-class HeightSlicedSweeps:
-    """All sweeps of all windows as the verified method sees them: bits of height slices of P occupied pixels.
+class Pixels:
+    """Occupied pixels of sweeps.
 
     Args:
-        batch: the points.
-        grid: the finest BEV.
-        image: (B * S * H * W + 1,) uint8, bit c = a point of height slice c lies there; the last entry, always 0, is
-            for whatever lies outside the images. Step 0 of S is sweep t+1, 1 = t, ...
-        place: (N,) int64, flat index into `image` of every point; its last entry for those that take no part or lie on
-            a pixel that is left out.
-        pixel: (P,) int64, flat indices of the occupied pixels, ascending.
-        window, step, row, col: (P,) int64, where each of them lies.
-        slices: (P,) uint8, what `image` holds there.
+        index: (K,) int64, flat index into the images.
+        window, step, row, col: (K,) int64, where each of them lies; step 0 is sweep t+1, 1 = t, 2 = t-1, ...
+        slices: (K,) uint8, its height slices, a bit each.
     """
 
-    batch: Batch
-    grid: Grid
-    image: Tensor
-    place: Tensor
-    pixel: Tensor
+    index: Tensor
     window: Tensor
     step: Tensor
     row: Tensor
     col: Tensor
     slices: Tensor
+
+    def take(self, index: Tensor) -> Pixels:
+        """Some of them, (L,) int64 positions in the list."""
+        return Pixels(*gather(index, *self._columns()))
+
+    def followed_by(self, others: Pixels) -> Pixels:
+        """These pixels, then the others."""
+        return Pixels(*(torch.cat(both) for both in zip(self._columns(), others._columns())))
+
+    def _columns(self) -> Tuple[Tensor, ...]:
+        return self.index, self.window, self.step, self.row, self.col, self.slices
+
+
+@dataclass(frozen=True)
+class HeightSlicedSweeps:
+    """All sweeps of all windows, as the verified method sees them.
+
+    Args:
+        batch: the points.
+        grid: the finest BEV.
+        image: (I,) uint8 with I - 1 = 2 B S H W. Bits 0 ... 3: a point of this height slice lies here; bits 4 ... 7:
+            one lies in the 3 x 3 pixels around. The second half is empty until `with_copies` draws there. The last
+            entry, always 0, is for whatever lies outside.
+        rank: (I,) int32, 1 + position of each occupied pixel in the list; 0 for empty pixels.
+        pixels: the P occupied pixels, ascending.
+        pixel_of_point: (N + K,) int64, position in the list of the pixel of each point, then of each copy; P for points
+            that are inactive or lie on a pixel that was left out.
+        copied: (K,) int64, the points that have copies; empty before `with_copies`.
+    """
+
+    batch: Batch
+    grid: Grid
+    image: Tensor
+    rank: Tensor
+    pixels: Pixels
+    pixel_of_point: Tensor
+    copied: Tensor
 
     @classmethod
     def of(cls, batch: Batch, grid: Grid, min_height: Optional[float] = None) -> HeightSlicedSweeps:
@@ -60,45 +100,91 @@ class HeightSlicedSweeps:
         Args:
             batch: positions with three axes.
             grid: the finest BEV.
-            min_height: metres; pixels that do not stand out of the ground of the batch by this much are left out, see
-                `clear_ground_residue`. None = all are drawn.
+            min_height: metres; pixels that rise less than this above the ground of the batch are left out, unless they
+                are next to one that does. None = all are drawn.
 
         Convention:
-            The slice of a height z is floor(z / 0.5 m) mod 4 in float64.
+            The slice of a height z is floor(z / 0.5 m) mod 4 in float64. A height is compared with the ground in
+            centimetres. "Next to": at most two rows and two columns away.
 
         Cost: linear in points and pixels.
         """
-        num_images, num_points = batch.num_windows * batch.num_steps, batch.image.numel()
-        image = torch.zeros(num_images * grid.height * grid.width + 1, dtype=torch.uint8, device=batch.image.device)
-        place = torch.empty(num_points, dtype=torch.int64, device=image.device)
+        device, num_images = batch.image.device, batch.num_windows * batch.num_steps
+        num_points, num_places = batch.image.numel(), num_images * grid.height * grid.width
+        image = lazy_zeros(2 * num_places + 1, torch.uint8, device)
+        place = torch.empty(num_points, dtype=torch.int64, device=device)
+        part, is_tall = (torch.empty(num_points, dtype=of, device=device) for of in (torch.uint8, torch.bool))
         ground = None if min_height is None or batch.ground is None else batch.ground.mean()
-        for points in chunks(0, num_points, image.device):
-            positions, takes_part = batch.positions[:, points], batch.takes_part[points]
-            at = grid.pixel_of_image(positions, batch.image[points], num_images, takes_part).long()
-            # Rows that take no part have any slice: what they draw is wiped off.
-            part = slice_of(positions[2], SLICE_HEIGHT)
-            for index in range(NUM_SLICES):
-                set_bit(image, at.index_select(0, flat_nonzero(part == index)), 1 << index)
-            if ground is not None and min_height is not None and batch.ground is not None:
+        for points in chunks(0, num_points, device):
+            positions = batch.positions[:, points]
+            at = grid.pixel_of_image(positions, batch.image[points], num_images, batch.takes_part[points]).long()
+            image.index_fill_(0, at, 1)
+            place[points] = at
+            part[points] = slice_of(positions[2], SLICE_HEIGHT)
+            if ground is not None and batch.ground is not None and min_height is not None:
                 window = divide(batch.image[points].long(), batch.num_steps)
                 height = batch.ground.below(positions, window, ground)
-                high = flat_nonzero(is_tall(positions[2], height, min_height) & (at < image.numel() - 1))
-                set_bit(image, at.index_select(0, high), TALL)
-            place[points] = at
-        image[-1:] = 0
-        pixel = occupied(image)
+                is_tall[points] = positions[2] * 100 >= height + round(100 * min_height)
+        if ground is not None:  # after all points are drawn: a tall one makes its pixel tall whatever else lies there
+            image.index_fill_(0, torch.where(is_tall, place, num_places), 2)
+        image[num_places] = 0  # it stood for points that are inactive
+        pixel = occupied(image[:num_places])
+        rank = lazy_zeros(len(image), torch.int32, device)
         if ground is not None:
-            pixel = clear_ground_residue(image, pixel, grid)
-            place = torch.where(image.index_select(0, place) != 0, place, image.numel() - 1)
-        of_image, within = split_index(pixel, grid.height * grid.width)
-        window, step = split_index(of_image, batch.num_steps)
-        row, col = split_index(within, grid.width)
-        return cls(batch, grid, image, place, pixel, window, step, row, col, image.index_select(0, pixel))
+            is_kept = _is_near_tall(image, pixel, grid)
+            left_out, pixel = (
+                pixel.index_select(0, flat_nonzero(~is_kept)),
+                pixel.index_select(0, flat_nonzero(is_kept)),
+            )
+            image.index_fill_(0, left_out, 0)
+        rank.scatter_(0, pixel, torch.arange(1, len(pixel) + 1, dtype=torch.int32, device=device))
+        pixel_of_point = (rank.index_select(0, place).long() - 1).remainder_(len(pixel) + 1)
+        pixels = _pixels(pixel, _slices(pixel_of_point, part, len(pixel)), grid, batch.num_steps)
+        _draw_neighbourhoods(image, pixels, grid)
+        return cls(batch, grid, image, rank, pixels, pixel_of_point, pixel[:0])
+
+    def with_copies(self, rows: Tensor) -> HeightSlicedSweeps:
+        """The sweeps, and once more some of their points: in further windows B ... 2 B - 1, drawn by themselves.
+
+        Args:
+            rows: (K,) int64, points of the batch.
+
+        Returns:
+            Sweeps that have the copies behind their points, whose pixels follow the others, and the same images: these
+            sweeps must not be asked for copies a second time.
+
+        Cost: that of the copies.
+        """
+        count, of_row = self.num_pixels, self.pixel_of_point.index_select(0, rows)
+        part = slice_of(self.batch.positions[2].index_select(0, rows), SLICE_HEIGHT)
+        is_copied = torch.zeros(count, dtype=torch.bool, device=rows.device).index_fill_(0, of_row, True)
+        pixel = flat_nonzero(is_copied)
+        of_copy = renumber(pixel, count).index_select(0, of_row)
+        own, slices = self.pixels.take(pixel), _slices(of_copy, part, len(pixel))
+        place, window = own.index + self.image.numel() // 2, own.window + self.batch.num_windows
+        pixels = Pixels(place, window, own.step, own.row, own.col, slices)
+        _draw_neighbourhoods(self.image, pixels, self.grid)
+        rank = torch.arange(count + 1, count + 1 + len(pixel), dtype=torch.int32, device=rows.device)
+        of_point = self.pixel_of_point + (self.pixel_of_point == count) * len(pixel)  # "none" is a larger number now
+        return HeightSlicedSweeps(
+            self.batch.with_twice_the_windows(),
+            self.grid,
+            self.image,
+            self.rank.scatter_(0, place, rank),
+            self.pixels.followed_by(pixels),
+            torch.cat((of_point, of_copy + count)),
+            rows,
+        )
 
     @property
-    def num_windows(self) -> int:
-        """B."""
-        return self.batch.num_windows
+    def num_home_windows(self) -> int:
+        """Windows that are not copies."""
+        return self.image.numel() // (2 * self.num_steps * self.grid.height * self.grid.width)
+
+    @property
+    def num_pixels(self) -> int:
+        """P."""
+        return len(self.pixels.index)
 
     @property
     def num_steps(self) -> int:
@@ -109,6 +195,11 @@ class HeightSlicedSweeps:
     def elapsed(self) -> Tensor:
         """(B, S) float64, sweep intervals from each sweep to t+1."""
         return self.batch.elapsed
+
+    @property
+    def has_history(self) -> Tensor:
+        """(B,) bool, whether a window has more sweeps than t and t+1."""
+        return (self.batch.elapsed != 0).sum(1) > 1
 
     def index(self, window: Tensor, step: Tensor, row: Tensor, col: Tensor) -> Tensor:
         """Flat index into `image` of pixels that may lie outside it.
@@ -125,118 +216,81 @@ class HeightSlicedSweeps:
         flat = ((window * self.num_steps + step) * height + row) * width + col
         return torch.where(inside, flat, self.image.numel() - 1)
 
-    def slices_at(self, window: Tensor, step: Tensor, row: Tensor, col: Tensor) -> Tensor:
-        """uint8, shape of `index`: the slices at pixels that may lie outside; 0 there."""
-        index = self.index(window, step, row, col)
-        return self.image.index_select(0, index.reshape(-1)).view(index.shape)
-
-    def at_moved(
-        self, image: Tensor, window: Tensor, step: Tensor, row: Tensor, col: Tensor, move: Tensor, which: Tensor
-    ) -> Tensor:
-        """What an image holds where moves take pixels; 0 outside.
-
-        Args:
-            image: (B * S * H * W + 1,), `image` or one of its shape.
-            window, step, row, col: (L,) int64, where the pixels stand and the sweep that is looked at.
-            move: (T, C, 2) int64, (down, right), pixels; C at least 1.
-            which: (L,) int64, the C moves of each pixel.
-
-        Returns:
-            (L, C), type of `image`.
-
-        Cost: one look-up each; moves are kept as offsets, so that places are checked only near the border.
-        """
-        height, width = self.grid.height, self.grid.width
-        start = ((window * self.num_steps + step) * height + row) * width + col
-        down, right = move.unbind(2)
-        index = (down * width + right).index_select(0, which).add_(start[:, None])
-        leaves = torch.zeros_like(which, dtype=torch.bool)
-        for at, ways, size in ((row, down, height), (col, right, width)):
-            leaves |= (at + ways.amin(1).index_select(0, which) < 0) | (
-                at + ways.amax(1).index_select(0, which) >= size
-            )
-        some = flat_nonzero(leaves)
-        window, step, row, col, which = (
-            values.index_select(0, some)[:, None] for values in (window, step, row, col, which)
-        )
-        down, right = (ways.index_select(0, which[:, 0]) for ways in (down, right))
-        index.index_copy_(0, some, self.index(window, step, row + down, col + right))
-        return image.index_select(0, index.view(-1)).view(index.shape)
-
-    @cached_property
-    def number(self) -> Tensor:
-        """(B * S * H * W + 1,) int32: position of each occupied pixel in the list, P at the last place; undefined for
-        what is empty.
-
-        Cost: that of the occupied pixels, once; the rest is not touched.
-        """
-        number = torch.empty_like(self.image, dtype=torch.int32)
-        number[-1:] = self.pixel.numel()
-        return number.scatter_(0, self.pixel, torch.arange(self.pixel.numel(), device=number.device).int())
-
-    def number_at(self, place: Tensor) -> Tensor:
-        """(K,) int64, position in the list of places (K,) int64 that may be empty: P there."""
-        count = self.pixel.numel()
-        number = self.number.index_select(0, place).long().clamp_(0, count)
-        # Where nothing was written any number may stand: it counts if its pixel is this one.
-        return number.masked_fill_(F.pad(self.pixel, (0, 1), value=-1).index_select(0, number) != place, count)
-
-    @cached_property
-    def with_around(self) -> Tensor:
-        """(B * S * H * W + 1,) uint8: `image`, and in the upper four bits the slices of the 3 x 3 pixels around each.
-
-        Cost: nine look-ups for each occupied pixel, once.
-        """
-        both, above = self.image.clone(), self.slices << NUM_SLICES
-        for down, right in itertools.product((-1, 0, 1), repeat=2):
-            # No two pixels have the same place, but outside: there anything may be written.
-            place = self.index(self.window, self.step, self.row + down, self.col + right)
-            both.index_copy_(0, place, both.index_select(0, place).bitwise_or_(above))
-        both[-1:] = 0
-        return both
+    def point(self, index: Tensor) -> Tensor:
+        """(L,) int64, rows of the batch of some points or copies, (L,) int64 below N + K."""
+        num_points = self.batch.image.numel()
+        own = torch.where(index < num_points, index, 0)
+        return torch.where(index < num_points, own, lookup(self.copied, (index - num_points).clamp_(min=0)))
 
     @cached_property
     def lowest(self) -> Tensor:
         """(P,) float64, metres: height of the lowest point of each occupied pixel."""
-        number = self.number.index_select(0, self.place).long()
-        return segment_amin(self.batch.positions[2], number, self.pixel.numel() + 1, math.inf)[:-1]
-
-    def coarsen(self, block: int) -> Tuple[Tensor, Tensor]:
-        """The same images at pixels of `block` x `block` finest ones.
-
-        Returns:
-            images: (B, S, height, width) uint8; a coarse pixel has the slices of all its finest pixels.
-            column: (P,) int64 the column of each occupied finest pixel. A column is a coarse pixel whatever the sweep:
-                (window * height + row) * width + col.
-        """
-        height, width = -(-self.grid.height // block), -(-self.grid.width // block)
-        shape = (self.num_windows, self.num_steps, height, width)
-        row, col = (self.row, self.col) if block == 1 else (divide(self.row, block), divide(self.col, block))
-        column = torch.add(col, torch.add(row, self.window, alpha=height), alpha=width)
-        if block == 1:
-            return self.image[:-1].view(shape), column
-        step = torch.add(self.step, self.window, alpha=self.num_steps - 1)
-        index = torch.add(column, step, alpha=height * width)
-        image = torch.zeros(shape, dtype=torch.uint8, device=column.device)
-        for bit in range(NUM_SLICES):
-            set_bit(image.view(-1), index.index_select(0, flat_nonzero((self.slices & (1 << bit)).bool())), 1 << bit)
-        return image, column
+        return segment_amin(self.batch.positions[2], self.pixel_of_point, self.num_pixels + 1, math.inf)[:-1]
 
 
-def slice_of(z: Tensor, slice_height: float, num_slices: int = NUM_SLICES) -> Tensor:
+def slice_of(z: Tensor, slice_height: Union[float, Tensor], num_slices: int = NUM_SLICES) -> Tensor:
     """(N,) uint8: slice of heights (N,) float64, metres, floor(z / slice_height) mod n; 0 for NaN. n: a power of 2, at
-    most 16."""
-    layer = (z / torch.full((), slice_height, dtype=z.dtype, device=z.device)).floor_()
+    most 16. Slice heights: one, or (N,) float64."""
+    if not isinstance(slice_height, Tensor):
+        slice_height = torch.full((), slice_height, dtype=z.dtype, device=z.device)  # see `Grid.pixel`
+    layer = (z / slice_height).floor_()
     layer.clamp_(-_HIGHEST_SLICE, _HIGHEST_SLICE).nan_to_num_(0.0)
     return (layer.long() & (num_slices - 1)).to(torch.uint8)
-
-
-def set_bit(image: Tensor, index: Tensor, bit: int) -> None:
-    """Set a bit of an image at some flat indices. All that write at one write the same: order means nothing."""
-    image.index_copy_(0, index, image.index_select(0, index).bitwise_or_(bit))
 
 
 def count_slices(slices: Tensor) -> Tensor:
     """Set bits, 0 ... 4, of uint8 values below 16; uint8 of the same shape."""
     pairs = (slices & 5) + ((slices >> 1) & 5)
     return (pairs & 3) + (pairs >> 2)
+
+
+def slice_bits(slices: Tensor) -> Tuple[Tensor, Tensor]:
+    """The set bits of (K,) uint8 masks of slices: position of the mask and number of the bit, (L,) int64 each."""
+    bits = (slices[:, None] >> torch.arange(NUM_SLICES, dtype=torch.uint8, device=slices.device)) & 1
+    return split_index(flat_nonzero(bits.bool()), NUM_SLICES)
+
+
+def _slices(of_point: Tensor, part: Tensor, num_pixels: int) -> Tensor:
+    """(P,) uint8 masks of the slices, (N,) uint8, of the points of each pixel; a point of pixel P counts nowhere."""
+    lanes = torch.zeros((num_pixels + 1) * NUM_SLICES, dtype=torch.bool, device=part.device)
+    lanes.index_fill_(0, torch.add(part, of_point, alpha=NUM_SLICES), True)
+    # A pixel is four bytes that hold 0 or 1; read as one number, its bits are 0, 8, 16 and 24.
+    word = lanes.view(torch.int32)[:num_pixels]
+    word = word | (word >> 7)
+    return (word | (word >> 14)).bitwise_and_(OWN).to(torch.uint8)
+
+
+def _pixels(pixel: Tensor, slices: Tensor, grid: Grid, num_steps: int) -> Pixels:
+    """Pixels by their flat indices."""
+    of_image, within = split_index(pixel, grid.height * grid.width)
+    return Pixels(pixel, *split_index(of_image, num_steps), *split_index(within, grid.width), slices)
+
+
+def _draw_neighbourhoods(image: Tensor, pixels: Pixels, grid: Grid) -> None:
+    """Write the slices of pixels, and into the upper bits of the 3 x 3 pixels around each what lies there."""
+    image.index_copy_(0, pixels.index, pixels.slices)
+    above, outside = pixels.slices << NUM_SLICES, image.numel() - 1
+    is_row = {-1: pixels.row > 0, 0: pixels.row >= 0, 1: pixels.row < grid.height - 1}
+    is_col = {-1: pixels.col > 0, 0: pixels.col >= 0, 1: pixels.col < grid.width - 1}
+    for down, right in itertools.product((-1, 0, 1), repeat=2):
+        # No two pixels have the same place here, but outside: there anything may be written.
+        inside = is_row[down] & is_col[right]
+        place = torch.where(inside, pixels.index + (down * grid.width + right), outside)
+        image.index_copy_(0, place, image.index_select(0, place).bitwise_or_(above))
+    image[outside] = 0
+
+
+def _is_near_tall(image: Tensor, pixel: Tensor, grid: Grid) -> Tensor:
+    """(P,) bool: is a pixel of value 2 at most `_RESIDUE_REACH` rows and columns away from each of these flat indices?
+    Ground residue, which a ground mask left over, seems to move, because it looks different in every sweep."""
+    answer = image.index_select(0, pixel) == 2
+    low = flat_nonzero(~answer)
+    line, col = split_index(pixel.index_select(0, low), grid.width)
+    number, row = split_index(line, grid.height)
+    reach = torch.arange(-_RESIDUE_REACH, _RESIDUE_REACH + 1, device=pixel.device)
+    # Beyond the border the border's pixel is looked up, which is as near.
+    rows = (row[:, None] + reach).clamp_(0, grid.height - 1).add_(number[:, None], alpha=grid.height)
+    cols = (col[:, None] + reach).clamp_(0, grid.width - 1)
+    place = torch.add(cols[:, None], rows[:, :, None], alpha=grid.width)
+    is_tall = image.index_select(0, place.view(-1)).view(len(low), len(reach) ** 2) == 2
+    return answer.index_copy_(0, low, is_tall.any(1))

@@ -1,84 +1,89 @@
-"""The paired test: candidate motions of components against standing still, over all sweeps, both ways (McNemar's)."""
+"""The paired test (McNemar's): candidate motions against "static", over all sweeps, in both time directions."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Tuple
+from typing import NamedTuple, Tuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
-from cflow_torch.config import VerifiedConfig
-from cflow_torch.ops.indices import flat_nonzero
+from cflow_torch.ops.indices import flat_nonzero, gather, renumber
 from cflow_torch.verified.aperture import slides_along_itself
-from cflow_torch.verified.component_tree import Level
-from cflow_torch.verified.height_slices import NUM_SLICES, HeightSlicedSweeps, count_slices
+from cflow_torch.verified.component_tree import Nodes
+from cflow_torch.verified.height_slices import NUM_SLICES, OWN, HeightSlicedSweeps, Pixels, count_slices, slice_bits
 
-# Look-ups (pixel x sweep x candidate) done at once: their temporaries take about 64 bytes each.
-_LOOKS_ON_CPU = 1 << 18
-_LOOKS_ON_GPU = 1 << 24
+# Comparisons (pixel x sweep x candidate) done at once: their temporaries take about 64 bytes each.
+_AT_ONCE_CPU, _AT_ONCE_GPU = 1 << 18, 1 << 24
 _FAR = 2  # pixels, in y or in x
-_FARTHER, _STILL_THERE = 4, 97  # pixels, per cent
-
-
-@dataclass(frozen=True)
-class VerifiedLevel:
-    """A level and the best motion of each of its M components.
-
-    Args:
-        level: the components.
-        motion: (M, 2) float64, (y, x), finest pixels per sweep interval; 0 = none is significant.
-        evidence: (M,) int64, of that motion, sixteenths of a slice.
-        score: as in `Candidates`.
-    """
-
-    level: Level
-    motion: Tensor
-    evidence: Tensor
-    score: Tensor
+_CHANGED_Z, _CHANGED_SLICES = 4.0, 3
 
 
 def verify(
-    level: Level, motion: Tensor, score: Tensor, sweeps: HeightSlicedSweeps, config: VerifiedConfig
-) -> VerifiedLevel:
-    """The candidate of each component that explains the sweeps best, if it does so significantly.
-
-    Args:
-        level: M components.
-        motion, score: as in `Candidates`.
-        sweeps: finest images.
-        config: `significance`, `thorough`.
-    """
-    tested = (motion != 0).any(2).any(1) & ~level.too_long
-    evidence = evidence_of(*count_wins(sweeps, level.component, motion, tested), config.significance)
-    if config.thorough:
-        asked = tested & ~level.travels
-        owner = torch.where(F.pad(asked, (0, 1)).index_select(0, level.component), level.component, tested.numel())
-        evidence = evidence.masked_fill(slides_along_itself(sweeps, owner, motion), 0)
-    best, most = best_candidate(evidence, motion)
-    stands = is_found_where_it_stands(sweeps, level.component, best)
-    return VerifiedLevel(level, best.masked_fill(stands[:, None], 0.0), most.masked_fill(stands, 0), score)
-
-
-def count_wins(
-    sweeps: HeightSlicedSweeps, component: Tensor, candidates: Tensor, tested: Tensor
+    sweeps: HeightSlicedSweeps, nodes: Nodes, candidates: Tensor, num_levels: int, significance: float
 ) -> Tuple[Tensor, Tensor]:
-    """Paired counts of candidate motions against standing still.
-
-    A slice of a pixel is won by a motion if another sweep has it where the motion takes the pixel and not where the
-    pixel is; it is lost the other way round. Slices found in both places, or in neither, say nothing. A motion of two
-    pixels or more finds a slice "not" in a place only if none of the 3 x 3 pixels there has it: beams meet a side at
-    other places in each sweep, and a side that stands must not look as if it had left.
+    """The candidate of each node that explains the sweeps best, if it does so significantly.
 
     Args:
-        sweeps: finest images and their P occupied pixels.
-        component: (P,) int64, component of each occupied pixel, M = none.
+        sweeps: images.
+        nodes: N of them.
+        candidates: (N, C, 2) float64, (y, x), finest pixels per sweep interval.
+        num_levels: L; nodes of changed pixels, level L, must convince more: they need `_CHANGED_Z` standard deviations
+            and `_CHANGED_SLICES` different slices.
+        significance: z of all other nodes.
+
+    Returns:
+        motion: (N, 2) float64, (y, x), finest pixels per sweep interval; 0 = none is significant.
+        evidence: (N,) int64, of that motion, sixteenths of a slice.
+    """
+    tested = (candidates != 0).any(2).any(1)
+    wins = count_wins(sweeps, nodes.members, nodes.node, candidates, tested)
+    evidence, is_changed = evidence_of(wins.won, wins.lost, significance), nodes.level == num_levels
+    strict = evidence_of(wins.won, wins.lost, _CHANGED_Z) * (_num_slices(nodes, is_changed) >= _CHANGED_SLICES)[:, None]
+    evidence = torch.where(is_changed[:, None], strict, evidence)
+    asked = flat_nonzero((tested & ~nodes.travels).index_select(0, nodes.node))
+    slides = slides_along_itself(sweeps, nodes.members.take(asked), nodes.node.index_select(0, asked), candidates)
+    return best_candidate(evidence.masked_fill(slides, 0), candidates)
+
+
+def _num_slices(nodes: Nodes, wanted: Tensor) -> Tensor:
+    """(N,) int64, different slices of some nodes, (N,) bool; 0 for the others."""
+    some = flat_nonzero(wanted.index_select(0, nodes.node))
+    entry, bit = slice_bits(nodes.members.slices.index_select(0, some))
+    place = nodes.node.index_select(0, some.index_select(0, entry)) * NUM_SLICES + bit
+    has = torch.zeros(nodes.count * NUM_SLICES, dtype=torch.bool, device=place.device).index_fill_(0, place, True)
+    return has.view(-1, NUM_SLICES).sum(1)
+
+
+class Wins(NamedTuple):
+    """Paired counts of M components with C candidate motions each.
+
+    Args:
+        won, lost: (M, C) int64, slices.
+        in_place: (M,) int64, slices that other sweeps have where they are, whatever the motion.
+    """
+
+    won: Tensor
+    lost: Tensor
+    in_place: Tensor
+
+
+def count_wins(sweeps: HeightSlicedSweeps, members: Pixels, owner: Tensor, candidates: Tensor, tested: Tensor) -> Wins:
+    """Paired counts of candidate motions against "static".
+
+    For each slice of a pixel we check another sweep at two places: where the motion would take the pixel, and where it
+    is. The motion wins the slice if it is found only at the first, and loses it if only at the second; slices found at
+    both or at neither are ignored. For motions of two pixels or more, "not found" means absent from the 3 x 3 pixels as
+    well: beams sample a surface at other places in each sweep, and a static side must not look as if it had left.
+
+    Args:
+        sweeps: images.
+        members: K pixels of components.
+        owner: (K,) int64, component of each of them, M = none.
         candidates: (M, C, 2) float64, (y, x) finest pixels per sweep interval, axes of ego1; C at least 1.
         tested: (M,) bool, False = its counts are 0 and cost nothing.
 
     Returns:
-        won, lost: (M, C) int64 slices, summed over all sweeps m before t+1: m looks at t+1, t+1 looks at m.
+        The counts, summed over all sweeps m other than t+1: m compared with t+1, and t+1 with m.
 
     Convention:
         A pixel is taken by floor(k f + 0.5) pixels, elementwise float64; k = elapsed intervals, negative from t+1 into
@@ -86,95 +91,111 @@ def count_wins(
         of the pixels around it. Sweeps that a window lacks are empty: no counts.
         Fewer than 2^31 slices of a component may be compared.
 
-    Cost: P (S - 1) C look-ups at most, of the pixels of tested components only.
+    Cost: K (S - 1) C look-ups at most, of the pixels of tested components only.
     """
-    (count, num_candidates, _), num_steps = candidates.shape, sweeps.num_steps
-    pixel, other = looks(sweeps, flat_nonzero(F.pad(tested, (0, 1)).index_select(0, component)))
-    sums = torch.zeros(count * num_candidates, dtype=torch.int64, device=component.device)
-    column = torch.arange(num_candidates, device=component.device)
-    window = F.pad(torch.zeros_like(tested, dtype=torch.int64), (0, 1)).scatter_(0, component, sweeps.window)
-    chosen, number = flat_nonzero(tested), tested.cumsum(0) - 1
-    elapsed = sweeps.elapsed.index_select(0, window.index_select(0, chosen))
-    moves = moves_of(elapsed, candidates.index_select(0, chosen))
-    is_far = moves.abs().amax(2) >= _FAR
-    counts_of = _counts_of(component.device)
-    at_once = _LOOKS_ON_CPU if component.device.type == "cpu" else _LOOKS_ON_GPU
-    size = max(1, at_once // num_candidates)
-    for some, step in zip(pixel.split(size), other.split(size)):
-        window, row, col, of_some = (
-            values.index_select(0, some) for values in (sweeps.window, sweeps.row, sweeps.col, component)
-        )
-        way = way_of(sweeps.step.index_select(0, some), step, num_steps)
-        which = number.index_select(0, of_some) * (2 * num_steps) + way
-        seen = sweeps.with_around.index_select(0, sweeps.index(window, step, row, col))
-        own = sweeps.slices.index_select(0, some)
-        here, near_here = own & seen, own & (seen >> NUM_SLICES)
-        seen = sweeps.at_moved(sweeps.with_around, window, step, row, col, moves, which)
-        far = is_far.index_select(0, which)
-        won = seen & torch.where(far, (own & ~near_here)[:, None], (own & ~here)[:, None])
+    (count, num_candidates, _), num_steps, device = candidates.shape, sweeps.num_steps, owner.device
+    chosen = flat_nonzero(tested)
+    number = renumber(chosen, count).index_select(0, owner)
+    some = flat_nonzero(number < len(chosen))
+    members, number = members.take(some), number.index_select(0, some)
+    window = torch.zeros_like(chosen).scatter_(0, number, members.window)
+    moves = Moves.of(sweeps, window, candidates.index_select(0, chosen))
+    counts_of, column = _counts_of(device), torch.arange(num_candidates, device=device)
+    sums = torch.zeros(len(chosen) * num_candidates, dtype=torch.int64, device=device)
+    in_place = torch.zeros(len(chosen), dtype=torch.int64, device=device)
+    border, first = moves.to_border(members), members.index - members.step * moves.area
+    pixel, step = comparisons(members.step, num_steps)
+    size = max(1, (_AT_ONCE_CPU if device.type == "cpu" else _AT_ONCE_GPU) // num_candidates)
+    for at, to in zip(pixel.split(size), step.split(size)):
+        of, start, own, from_step, near_border = gather(at, number, first, members.slices, members.step, border)
+        start.add_(to, alpha=moves.area)
+        seen = sweeps.image.index_select(0, start)
+        here, near = own & seen, own & (seen >> NUM_SLICES)
+        left, left_far = (own & ~here)[:, None], (own & ~near)[:, None]
+        which = of * (2 * num_steps) + torch.where(to > 0, to + num_steps, from_step)
+        place = moves.offset.index_select(0, which).add_(start[:, None])
+        leaves = flat_nonzero(near_border < moves.longest.index_select(0, which))
+        place.index_copy_(0, leaves, moves.checked(members, *gather(leaves, at, to, which)))
+        seen, far = sweeps.image.index_select(0, place.view(-1)).view_as(place), moves.is_far.index_select(0, which)
+        won = seen & torch.where(far, left_far, left)  # no slice of the neighbourhood is left
         lost = here[:, None] & ~torch.where(far, seen >> NUM_SLICES, seen)
         counts = counts_of.index_select(0, (won | lost << NUM_SLICES).view(-1).int())
-        sums.index_add_(0, (of_some[:, None] * num_candidates + column).view(-1), counts)
-    sums = sums.view(count, num_candidates)
-    return sums >> 32, sums & 0xFFFFFFFF
+        sums.index_add_(0, (of[:, None] * num_candidates + column).view(-1), counts)
+        in_place.index_add_(0, of, count_slices(here).long())
+    result = torch.zeros((count, num_candidates + 1), dtype=torch.int64, device=device)
+    result.index_copy_(0, chosen, torch.cat((sums.view(-1, num_candidates), in_place[:, None]), 1))
+    both = result[:, :-1]
+    return Wins(both >> 32, both & 0xFFFFFFFF, result[:, -1])
 
 
-def moves_of(elapsed: Tensor, motion: Tensor) -> Tensor:
-    """(T * 2 S, C, 2) int64, whole pixels that motions, (T, C, 2) float64 per sweep interval, lead from each sweep to
-    t+1, then from t+1 to each. elapsed: (T, S) float64, intervals."""
-    k = torch.cat((elapsed, -elapsed), 1)[:, :, None, None]
-    return (motion[:, None] * k + 0.5).floor_().long().flatten(0, 1)
+class Moves(NamedTuple):
+    """Where C motions of each of T components lead from each of S sweeps to t+1, then from t+1 to each: 2 S T rows.
+
+    Args:
+        sweeps: images.
+        down, right: (2 S T, C) int64, whole pixels.
+        offset: (2 S T, C) int64, the same as an offset of flat indices.
+        longest: (2 S T,) int64, longest side of any of the moves of a row, pixels.
+        is_far: (2 S T, C) bool, a side is at least two pixels long.
+    """
+
+    sweeps: HeightSlicedSweeps
+    down: Tensor
+    right: Tensor
+    offset: Tensor
+    longest: Tensor
+    is_far: Tensor
+
+    @classmethod
+    def of(cls, sweeps: HeightSlicedSweeps, window: Tensor, motion: Tensor) -> Moves:
+        """Moves of components: their window, (T,) int64, and motion, (T, C, 2) float64 per sweep interval."""
+        elapsed = sweeps.elapsed.index_select(0, window)
+        k = torch.cat((elapsed, -elapsed), 1)[:, :, None, None]
+        down, right = (motion[:, None] * k + 0.5).floor_().long().flatten(0, 1).unbind(2)
+        side = torch.maximum(down.abs(), right.abs())
+        # In float64, because the CPU finds the largest of int64 many times slower.
+        longest = side.double().amax(1).long()
+        return cls(sweeps, down, right, down * sweeps.grid.width + right, longest, side >= _FAR)
+
+    @property
+    def area(self) -> int:
+        """Pixels of an image."""
+        return self.sweeps.grid.height * self.sweeps.grid.width
+
+    def to_border(self, pixels: Pixels) -> Tensor:
+        """(K,) int64, pixels from each pixel to the nearest border."""
+        grid = self.sweeps.grid
+        y, x = torch.minimum(pixels.row, grid.height - 1 - pixels.row), grid.width - 1 - pixels.col
+        return torch.minimum(y, torch.minimum(pixels.col, x))
+
+    def checked(self, members: Pixels, at: Tensor, to: Tensor, which: Tensor) -> Tensor:
+        """(L, C) flat indices where moves take pixels, that of "outside" for those that leave the image."""
+        window, row, col = gather(at, members.window, members.row, members.col)
+        down, right = gather(which, self.down, self.right)
+        return self.sweeps.index(window[:, None], to[:, None], row[:, None] + down, col[:, None] + right)
 
 
-def way_of(step: Tensor, other: Tensor, num_steps: int) -> Tensor:
-    """(L,) int64: which of the 2 S ways of `moves_of` leads from a sweep to the other; one of the two is t+1."""
-    return torch.where(other > 0, num_steps + other, step)
+def comparisons(step: Tensor, num_steps: int) -> Tuple[Tensor, Tensor]:
+    """All comparisons of pixels with other sweeps: those of every other sweep with t+1, those of t+1 with every other.
+
+    Args:
+        step: (K,) int64, sweep of each pixel; 0 = t+1.
+        num_steps: S.
+
+    Returns:
+        Position of the pixel, and step of the sweep that it is compared with, (L,) int64 each.
+    """
+    older, newest = flat_nonzero(step > 0), flat_nonzero(step == 0)
+    every = torch.arange(1, num_steps, device=older.device)
+    to = every[:, None].expand(-1, newest.numel()).reshape(-1)
+    return torch.cat((older, newest.repeat(every.numel()))), torch.cat((torch.zeros_like(older), to))
 
 
 def _counts_of(device: torch.device) -> Tensor:
     """(256,) int64: set bits of the lower half of a byte times 2^32, plus those of its upper half. Both counts are in
     one number because sums cost more than look-ups."""
     byte = torch.arange(256, dtype=torch.uint8, device=device)
-    return (count_slices(byte & 15).long() << 32) + count_slices(byte >> NUM_SLICES).long()
-
-
-def is_found_where_it_stands(sweeps: HeightSlicedSweeps, component: Tensor, motion: Tensor) -> Tensor:
-    """Which components have not moved as a whole, because nearly all of them is still where it was: a wall beside which
-    somebody walks.
-
-    Args:
-        sweeps: finest images and their P occupied pixels.
-        component: (P,) int64, component of each occupied pixel, M = none.
-        motion: (M, 2) float64, (y, x) finest pixels per sweep interval.
-
-    Returns:
-        (M,) bool: of the slices in looks that the motion takes at least four pixels, in y or in x, at least 97 per cent
-        are found within a pixel of where they stand. False without such looks.
-
-    Cost: a look-up for each pixel and sweep of what moves.
-    """
-    moves = motion.any(1)
-    pixel, other = looks(sweeps, flat_nonzero(F.pad(moves, (0, 1)).index_select(0, component)))
-    owner, window = component.index_select(0, pixel), sweeps.window.index_select(0, pixel)
-    k = sweeps.elapsed[window, sweeps.step.index_select(0, pixel)] - sweeps.elapsed[window, other]
-    move = (motion.index_select(0, owner) * k[:, None] + 0.5).floor_().abs().amax(1)
-    far = flat_nonzero(move >= _FARTHER)
-    pixel, other, owner, window = (values.index_select(0, far) for values in (pixel, other, owner, window))
-    row, col, own = (values.index_select(0, pixel) for values in (sweeps.row, sweeps.col, sweeps.slices))
-    near = sweeps.with_around.index_select(0, sweeps.index(window, other, row, col)) >> NUM_SLICES
-    zeros = torch.zeros_like(motion[:, 0], dtype=torch.int64)
-    total, found = (zeros.index_add(0, owner, count_slices(slices).long()) for slices in (own, own & near))
-    return (total > 0) & (100 * found >= _STILL_THERE * total)
-
-
-def looks(sweeps: HeightSlicedSweeps, member: Tensor) -> Tuple[Tensor, Tensor]:
-    """(L,) int64 each: pixels that look at another sweep, and the sweep. Some (K,) int64 pixels are members."""
-    step = sweeps.step.index_select(0, member)
-    older = member.index_select(0, flat_nonzero(step > 0))
-    newest = member.index_select(0, flat_nonzero(step == 0))
-    every = torch.arange(1, sweeps.num_steps, device=member.device)
-    pixel = torch.cat((older, newest.repeat(every.numel())))
-    return pixel, torch.cat((torch.zeros_like(older), every.repeat_interleave(newest.numel())))
+    return (count_slices(byte & OWN).long() << 32) + count_slices(byte >> NUM_SLICES).long()
 
 
 def evidence_of(won: Tensor, lost: Tensor, z: float) -> Tensor:
@@ -202,7 +223,7 @@ def best_candidate(evidence: Tensor, candidates: Tensor) -> Tuple[Tensor, Tensor
         motion: (M, 2) float64; 0 where no candidate has any.
         evidence: (M,) int64, of that motion.
 
-    Convention: of equal candidates the first.
+    Convention: ties go to the first candidate.
     """
     num_candidates = evidence.shape[1]
     reverse = torch.arange(num_candidates - 1, -1, -1, device=evidence.device)

@@ -1,54 +1,123 @@
-"""Refinement: the motion of objects from whole pixels to centimetres, with turns and slow motion."""
+"""Refinement: the motion of objects from whole pixels to centimetres, with rotation, and in time."""
 
 from __future__ import annotations
 
-from typing import List, Tuple
+import math
+from dataclasses import replace
+from typing import Optional, Tuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
+from cflow_torch.ops.indices import flat_nonzero, gather, lazy_zeros, split_index
+from cflow_torch.ops.segments import bounding_boxes, segment_amin
 from cflow_torch.verified.component_tree import Objects
-from cflow_torch.verified.deskewing import register_deskewed
-from cflow_torch.verified.height_slices import HeightSlicedSweeps
-from cflow_torch.verified.paired_test import VerifiedLevel
-from cflow_torch.verified.rigid_motion import RigidMotion
-from cflow_torch.verified.rigid_registration import register
-from cflow_torch.verified.slow_motion import slow_motion
-from cflow_torch.verified.subpixel_shift import shift_between_pixels
-from cflow_torch.verified.voxel_centroids import points_of_objects
+from cflow_torch.verified.height_slices import HeightSlicedSweeps, Pixels
+from cflow_torch.verified.rigid_motion import RigidMotion, rotate
+from cflow_torch.verified.rigid_registration import register, stretch_of
+from cflow_torch.verified.subpixel_motion import subpixel_motion
+from cflow_torch.verified.voxel_centroids import ObjectPoints, points_of_objects
 
 
 def refine(
-    objects: Objects, motion: Tensor, levels: List[VerifiedLevel], sweeps: HeightSlicedSweeps
+    sweeps: HeightSlicedSweeps, objects: Objects, motion: Tensor, longest: Optional[float]
 ) -> Tuple[RigidMotion, RigidMotion]:
     """The final motion of objects.
 
     Args:
+        sweeps: finest images.
         objects: G of them.
         motion: (G, 2) float64, (y, x), finest pixels per sweep interval.
-        levels: that the objects were chosen from: what is too long does not creep.
-        sweeps: finest images.
+        longest: metres; what is longer at t+1 and static stays static. None = no bound.
 
     Returns:
-        The motion in metres; and the motion that the images show, which differs where points have times of their own.
+        The motion in metres; and the apparent motion, that of the images, which differs where points have times.
     """
     moves = motion.any(1)
-    too_long = F.pad(torch.cat([level.level.too_long for level in levels]), (0, 1))
-    too_long = too_long.index_select(0, objects.component.clamp(max=too_long.numel() - 1))  # parts of them are not
-    points, slow = points_of_objects(sweeps, objects, moves), torch.zeros_like(motion)
-    is_pair = (sweeps.elapsed != 0).sum(1) == 1
-    if bool(is_pair.any()):  # with history slow objects leave their pixels, and one of many sweeps would decide
-        slow = slow_motion(sweeps, objects, ~moves & ~too_long)
-        motion = shift_between_pixels(points.take(is_pair.index_select(0, points.window)), sweeps, motion)
-    points = points.take(motion.any(1).index_select(0, points.owner))
-    start = motion.flip(1) * sweeps.grid.pixel_size
-    seen = register(points, sweeps, start)
-    seen = RigidMotion(torch.where(slow.any(1, keepdim=True), slow, seen.flow), seen.turn, seen.centre)
-    return register_deskewed(points, sweeps, start, seen), seen
+    newest = flat_nonzero((sweeps.pixels.step == 0) & (objects.of_pixel < objects.count))
+    row, col, owner = gather(newest, sweeps.pixels.row, sweeps.pixels.col, objects.of_pixel)
+    length = bounding_boxes(row, col, owner, objects.count)[1].amax(1).double() * sweeps.grid.pixel_size
+    start = subpixel_motion(sweeps, objects, motion, length <= (math.inf if longest is None else longest))
+    points = points_of_objects(sweeps, objects, moves)
+    found = register(points, sweeps, start.masked_fill(~moves[:, None], 0.0))
+    apparent = RigidMotion(torch.where(moves[:, None], found.flow, start), found.turn, found.centre)
+    return register_deskewed(points, sweeps, start, apparent), apparent
 
 
-def as_found(motion: Tensor, sweeps: HeightSlicedSweeps) -> Tuple[RigidMotion, RigidMotion]:
-    """The same without refinement."""
-    rigid = RigidMotion.translation(motion.flip(1) * sweeps.grid.pixel_size)
-    return rigid, rigid
+def register_deskewed(
+    points: ObjectPoints, sweeps: HeightSlicedSweeps, start: Tensor, apparent: RigidMotion
+) -> RigidMotion:
+    """The motion of objects per sweep interval, from the apparent motion and the times of points.
+
+    Args:
+        points: of the objects that move, of all sweeps. Without times all is as it is apparent.
+        sweeps: finest images.
+        start: (G, 2) float64, x and y, metres per sweep interval, what the registration started from.
+        apparent: what it found.
+
+    Returns:
+        The motion. Of more than two sweeps the points are de-skewed and registered once more, from the start divided by
+        the same factor. Of pairs the motion is divided only: smooth sides, once they are sharp, slide towards the
+        pattern of the beams, which goes with the vehicle, and no third sweep holds them.
+
+    Convention: times of 0 change nothing, to the last bit.
+
+    Cost: twice that of `register`, and a sort of the points.
+    """
+    if points.time is None:
+        return apparent
+    stretch = stretch_of(points, sweeps, apparent)[:, None]
+    divided = RigidMotion(apparent.flow / stretch, apparent.turn, apparent.centre)
+    is_pair = ~sweeps.has_history
+    points = points.take(~is_pair.index_select(0, points.window))
+    again = register(*deskew(points, sweeps, divided), start / stretch)
+    is_again = torch.bincount(points.owner, minlength=len(start)) > 0
+    return RigidMotion(
+        torch.where(is_again[:, None], again.flow, divided.flow),
+        torch.where(is_again, again.turn, divided.turn),
+        torch.where(is_again[:, None], again.centre, divided.centre),
+    )
+
+
+def deskew(
+    points: ObjectPoints, sweeps: HeightSlicedSweeps, rigid: RigidMotion
+) -> Tuple[ObjectPoints, HeightSlicedSweeps]:
+    """Points of objects where they were at the instant of their sweep.
+
+    Args:
+        points: of G objects, with times.
+        sweeps: finest images.
+        rigid: motion of the objects, which pass and turn in proportion to time.
+
+    Returns:
+        The points, and sweeps whose occupied pixels are those where the points lie now; their images stay as they were.
+
+    Convention: points that leave the region are left out. Where objects meet in a pixel, the points of the first of
+    them stay. Points whose time is 0 stay exactly where they are.
+
+    Cost: a sort of the points.
+    """
+    assert points.time is not None
+    grid, num_steps, owner = sweeps.grid, sweeps.num_steps, points.owner
+    time, image = points.time.double(), points.window * num_steps + points.step
+    flow, centre = rigid.flow.index_select(0, owner).t(), rigid.centre.index_select(0, owner).t()
+    # The centre is that of t; at the instant of another sweep it has moved on.
+    since_t = (sweeps.elapsed[:, 1:2] - sweeps.elapsed).flatten().index_select(0, image)
+    position = points.position - flow * time
+    arm = position - centre - flow * since_t
+    position = position + (rotate(-time * rigid.turn.index_select(0, owner), arm) - arm)
+
+    inside = flat_nonzero(grid.contains(position))
+    position, image = position.index_select(1, inside), image.index_select(0, inside)
+    place = grid.pixel_of_image(position, image, sweeps.batch.num_windows * num_steps).long()
+    pixel, number = torch.unique(place, return_inverse=True)
+    moved = replace(points.at(inside), position=position, pixel=number)
+    first = segment_amin(moved.owner, number, pixel.numel(), len(rigid.turn)).index_select(0, number)
+    of_image, within = split_index(pixel, grid.height * grid.width)
+    window, step = split_index(of_image, num_steps)
+    slices = torch.zeros_like(pixel, dtype=torch.uint8)  # unused downstream
+    pixels = Pixels(pixel, window, step, *split_index(within, grid.width), slices)
+    rank = lazy_zeros(len(sweeps.rank), torch.int32, pixel.device)
+    rank.scatter_(0, pixel, torch.arange(1, len(pixel) + 1, dtype=torch.int32, device=pixel.device))
+    drawn = replace(sweeps, pixels=pixels, rank=rank)
+    return moved.take(moved.owner == first), drawn

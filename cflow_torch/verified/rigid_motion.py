@@ -10,10 +10,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.model import Motion
-from cflow_torch.ops.indices import flat_nonzero, split_index
+from cflow_torch.ops.indices import flat_nonzero, lookup
 from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
-from cflow_torch.windows.collation import Batch
 
 
 @dataclass(frozen=True)
@@ -48,15 +47,17 @@ class RigidMotion:
         """x and y of the flow, metres per interval, of points of t (K,), by their object and their place in metres."""
         (c_x, c_y), (v_x, v_y) = (values.index_select(0, which).unbind(1) for values in (self.centre, self.flow))
         x, y = x - c_x, y - c_y
-        turned_x, turned_y = rotate(self.turn.index_select(0, which), x, y)
+        turned_x, turned_y = rotate(self.turn.index_select(0, which), torch.stack((x, y)))
         return (turned_x - x) + v_x, (turned_y - y) + v_y
 
 
-def rotate(turn: Tensor, x: Tensor, y: Tensor) -> Tuple[Tensor, Tensor]:
-    """Places turned about the origin by the angle whose half has the tangent `turn`."""
-    n = 1 + turn * turn
-    cos, sin = (1 - turn * turn) / n, 2 * turn / n
-    return cos * x - sin * y, sin * x + cos * y
+def rotate(turn: Tensor, place: Tensor) -> Tensor:
+    """(2, K): places, x and y, rotated about the origin by the angle whose half has the tangent `turn`, (K,)."""
+    square = turn * turn
+    n = 1 + square
+    cos, sin = (1 - square) / n, 2 * turn / n
+    x, y = place
+    return torch.stack((cos * x - sin * y, sin * x + cos * y))
 
 
 @dataclass(frozen=True)
@@ -82,53 +83,43 @@ class TurningMotion(Motion):
         return flow.float()
 
 
-def join(first: TurningMotion, second: TurningMotion, takes_second: Tensor, batch: Batch) -> TurningMotion:
-    """Two motions of the same points, one for each point. In a window the ids of the second follow those of the first,
-    in all sweeps: an object has one id wherever it is seen.
-
-    Args:
-        first, second: of L and M clusters; the result has L + 1 + M, since entry L stays "none" as well.
-        takes_second: (K,) bool, for the first K points of the batch, at least those of t+1 and t.
-        batch: of these points.
-    """
-    count = takes_second.numel()
-    window = split_index(batch.image[:count].long(), batch.num_steps)[0]
-    of_first, of_second = (motion.cluster(slice(count)).long() for motion in (first, second))
-    num_ids = torch.zeros(batch.num_windows, dtype=torch.int64, device=window.device)
-    num_ids.scatter_reduce_(0, window, 1 + first.cluster_id.index_select(0, of_first), "amax")
-    offset = torch.zeros_like(second.cluster_id)
-    offset.scatter_(0, of_second, num_ids.index_select(0, window))
-    ids = second.cluster_id + offset.masked_fill_(second.cluster_id < 0, 0)
-    both = {
-        name: torch.cat((getattr(first, name), getattr(second, name)))
-        for name in ("flow", "score", "confidence", "turn", "centre")
-    }
-    return TurningMotion(
-        of_place=torch.where(takes_second, of_second + first.cluster_id.numel(), of_first),
-        place=torch.arange(count, device=window.device),
-        cluster_id=torch.cat((first.cluster_id, ids)),
-        **both,
-    )
-
-
 def motion_by_pixel(
+    sweeps: HeightSlicedSweeps,
     objects: Objects,
     rigid: RigidMotion,
     score: Tensor,
     confidence: Tensor,
-    sweeps: HeightSlicedSweeps,
+    is_weak: Tensor,
 ) -> TurningMotion:
-    """The motion of G objects, (P,) scores, (P + 1,) confidence by pixel: clusters are pixels, and M is P."""
-    window = sweeps.window.index_select(0, objects.first)
-    ids = torch.arange(window.numel(), device=window.device) - torch.searchsorted(window, window)
+    """The motion of G objects, by pixel: clusters are the P pixels. Scores are (G,), confidence is (P + 1,).
+    Objects that are weak, (G,) bool, give way to moving objects under an overhang.
+
+    Convention: in a window the ids of objects of its copies go on after those of the window itself.
+    """
+    home = sweeps.pixels.window.index_select(0, objects.first) % len(sweeps.batch.rows)
+    ordered, order = home.sort(stable=True)
+    position = torch.arange(len(home), device=home.device)
+    ids = torch.empty_like(home).index_copy_(0, order, position - torch.searchsorted(ordered, ordered))
     of_pixel = F.pad(objects.of_pixel, (0, 1), value=objects.count)
+    moves = rigid.flow.any(1) | (rigid.turn != 0)
     return TurningMotion(
-        of_place=sweeps.number,
-        place=torch.where(sweeps.batch.has_result, sweeps.place, sweeps.image.numel() - 1),
+        of_place=torch.arange(sweeps.num_pixels + 1, device=home.device),
+        place=_pixel_of_result(sweeps, lookup(moves, of_pixel), lookup(moves & ~is_weak, of_pixel)),
         flow=F.pad(rigid.flow, (0, 1, 0, 1)).index_select(0, of_pixel) + 0.0,  # + 0.0 turns -0.0 into 0.0
         cluster_id=F.pad(ids, (0, 1), value=-1).index_select(0, of_pixel),
-        score=F.pad(score.masked_fill(objects.of_pixel == objects.count, 0.0), (0, 1)),
+        score=lookup(score, of_pixel),
         confidence=confidence,
         turn=F.pad(rigid.turn, (0, 1)).index_select(0, of_pixel),
         centre=F.pad(rigid.centre, (0, 0, 0, 1)).index_select(0, of_pixel),
     )
+
+
+def _pixel_of_result(sweeps: HeightSlicedSweeps, moves: Tensor, is_sure: Tensor) -> Tensor:
+    """(N,) int64, the pixel whose motion each point has, P = none: that of its copy, if that moves and its own is not
+    sure to move; (P + 1,) bool each."""
+    num_points = sweeps.batch.image.numel()
+    pixel, copy = sweeps.pixel_of_point[:num_points], sweeps.pixel_of_point[num_points:]
+    own = pixel.index_select(0, sweeps.copied)
+    takes_copy = moves.index_select(0, copy) & ~is_sure.index_select(0, own)
+    pixel = pixel.index_copy(0, sweeps.copied, torch.where(takes_copy, copy, own))
+    return torch.where(sweeps.batch.has_result, pixel, sweeps.num_pixels)

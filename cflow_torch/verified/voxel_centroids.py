@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Optional
+from typing import Optional, Union
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from cflow_torch.ops.indices import flat_nonzero, split_index
+from cflow_torch.ops.indices import flat_nonzero, gather, lookup, scatter_count
 from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import NUM_SLICES, SLICE_HEIGHT, HeightSlicedSweeps, slice_of
 
 # Centroids are whole numbers of 1 / UNITS metre: their sums are exact, in any order of the points and on any device.
 UNITS = 1024
 _BEYOND = 2.0**28  # units: a place far beyond every other
+_FARTHEST = 2.0**48  # square units: no square between voxels of a region is as large
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ def points_of_objects(
     sweeps: HeightSlicedSweeps,
     objects: Objects,
     wanted: Tensor,
-    slice_height: float = SLICE_HEIGHT,
+    slice_height: Union[float, Tensor] = SLICE_HEIGHT,
     num_slices: int = NUM_SLICES,
 ) -> ObjectPoints:
     """The points of some objects in all sweeps, in the order of the batch.
@@ -65,21 +66,21 @@ def points_of_objects(
         sweeps: finest images.
         objects: G of them.
         wanted: (G,) bool.
-        slice_height: metres.
+        slice_height: metres; one for all, or (G,) float64.
         num_slices: a power of 2.
 
     Cost: two look-ups a point, the rest for those that are kept.
     """
-    of_pixel = F.pad(objects.pixels_of(wanted), (0, 1), value=objects.count)
-    pixel = sweeps.number.index_select(0, sweeps.place)
-    rows = flat_nonzero((of_pixel < objects.count).index_select(0, pixel))
-    pixel = pixel.index_select(0, rows).long()
+    points = flat_nonzero(lookup(lookup(wanted, objects.of_pixel), sweeps.pixel_of_point))
+    pixel, rows = sweeps.pixel_of_point.index_select(0, points), sweeps.point(points)
     x, y, z = sweeps.batch.positions.index_select(1, rows).unbind(0)
-    window, step = split_index(sweeps.batch.image.index_select(0, rows).long(), sweeps.num_steps)
+    window, step, owner = gather(pixel, sweeps.pixels.window, sweeps.pixels.step, objects.of_pixel)
+    if isinstance(slice_height, Tensor):
+        slice_height = slice_height.index_select(0, owner)
     part = slice_of(z, slice_height, num_slices).long()
     times = sweeps.batch.point_times
     time = None if times is None else times.index_select(0, rows)
-    return ObjectPoints(of_pixel.index_select(0, pixel), window, step, pixel, part, torch.stack((x, y)), time)
+    return ObjectPoints(owner, window, step, pixel, part, torch.stack((x, y)), time)
 
 
 class Voxels:
@@ -92,8 +93,8 @@ class Voxels:
 
     Attributes:
         owner, window, step, part: (V,) int64, as for `ObjectPoints`.
-        x, y: (V + 1,) float64, centroid, whole units of 1/1024 m from the lower corner of the region; the last entry,
-            of no voxel, is far away.
+        place: (2, V + 1) float64, x and y of the centroid, whole units of 1/1024 m from the lower corner of the region;
+            the last entry, of no voxel, is far away.
         time: (V,) float64, mean of `ObjectPoints.time`; None = there are none.
 
     Convention: a coordinate is rounded to the nearest unit, their mean down to a whole one.
@@ -102,73 +103,65 @@ class Voxels:
     """
 
     def __init__(self, points: ObjectPoints, sweeps: HeightSlicedSweeps, num_slices: int = NUM_SLICES) -> None:
-        self._sweeps, self._num_slices = sweeps, num_slices
+        self._sweeps, self._num_slices, self.num_steps = sweeps, num_slices, sweeps.num_steps
         key, voxel, count = torch.unique(
             points.pixel * num_slices + points.part, return_inverse=True, return_counts=True
         )
-        self.x, self.y = (
-            self._centroids(values - lower, voxel, count)
-            for values, lower in zip(points.position.unbind(0), sweeps.grid.lower)
-        )
-        num_keys = num_slices * (sweeps.pixel.numel() + 1)
-        self._of_key = torch.full((num_keys,), key.numel(), dtype=torch.int64, device=key.device)
-        self._of_key.scatter_(0, key, torch.arange(key.numel(), device=key.device))
+        corner = torch.tensor(sweeps.grid.lower[:2], dtype=torch.float64, device=key.device)[:, None]
+        sums = scatter_count(voxel, key.numel(), whole((points.position - corner) * UNITS))
+        self.place = F.pad(torch.floor(sums / count), (0, 1), value=_BEYOND)
+        # The first pixel of the table is "none", as in `HeightSlicedSweeps.rank`.
+        self._of_key = torch.full((num_slices * (sweeps.num_pixels + 1),), key.numel(), device=key.device)
+        self._of_key.scatter_(0, key + num_slices, torch.arange(key.numel(), device=key.device))
         # Of all points of a voxel these are the same, so it does not matter which of them is written last.
-        self.owner, self.window, self.step = (
-            torch.zeros_like(key).scatter_(0, voxel, values) for values in (points.owner, points.window, points.step)
-        )
+        first = torch.zeros_like(key).scatter_(0, voxel, torch.arange(len(voxel), device=key.device))
+        self.owner, self.window, self.step = gather(first, points.owner, points.window, points.step)
         self.part = key & (num_slices - 1)
         self.time: Optional[Tensor] = None
         if points.time is not None:
             self.time = torch.zeros_like(count, dtype=torch.float64).index_add_(0, voxel, points.time.double()) / count
 
-    @staticmethod
-    def _centroids(values: Tensor, voxel: Tensor, count: Tensor) -> Tensor:
-        """(V + 1,) mean, in units, of the (N,) coordinates in each voxel."""
-        sums = torch.zeros_like(count, dtype=values.dtype).index_add_(0, voxel, whole(values * UNITS))
-        return F.pad(torch.floor(sums / count), (0, 1), value=_BEYOND)
-
-    def nearest(self, window: Tensor, step: Tensor, part: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    def nearest(self, sweep: Tensor, part: Tensor, place: Tensor) -> Tensor:
         """Nearest voxel of a sweep, in the 3 x 3 pixels around a place and in the slice given.
 
         Args:
-            window, step, part: (K,) int64.
-            x, y: (K,) float64, units from the lower corner, anywhere.
+            sweep: (K,) int64, window * S + step.
+            part: (K,) int64.
+            place: (2, K) float64, x and y, units from the lower corner, anywhere.
 
         Returns:
             (K,) int64, V = there is none.
 
         Cost: nine look-ups each.
         """
-        voxel = self.around(window, step, part, x, y, 1)
-        dx = self.x.index_select(0, voxel.view(-1)).view_as(voxel).sub_(x)
-        dy = self.y.index_select(0, voxel.view(-1)).view_as(voxel).sub_(y)
-        # The square and the place in one number: its least is found several times faster than by argmin.
-        key = dx.mul_(dx).add_(dy.mul_(dy)).long().mul_(16).add_(torch.arange(9, device=x.device)[:, None])
-        return voxel.gather(0, key.amin(0, keepdim=True).bitwise_and_(15))[0]
+        voxel = self.around(sweep, part, place, 1)
+        square = self.place.index_select(1, voxel.view(-1)).view(2, *voxel.shape).sub_(place[:, None]).square_().sum(0)
+        # The square and the place in one number: its least is found several times faster than by argmin. In float64,
+        # which holds these numbers exactly, many times faster than in int64.
+        slot = torch.arange(9, dtype=torch.float64, device=place.device)[:, None]
+        key = torch.add(slot, square.clamp_(max=_FARTHEST), alpha=16)
+        return voxel.gather(0, key.amin(0, keepdim=True).long().bitwise_and_(15))[0]
 
-    def around(self, window: Tensor, step: Tensor, part: Tensor, x: Tensor, y: Tensor, reach: int) -> Tensor:
+    def around(self, sweep: Tensor, part: Tensor, place: Tensor, reach: int) -> Tensor:
         """Voxels of a sweep in the pixels around a place, `reach` pixels each way, and in the slice given.
 
         Args:
-            window, step, part, x, y: as for `nearest`.
+            sweep, part, place: as for `nearest`.
             reach: r, pixels.
 
         Returns:
-            ((2 r + 1)^2, K) int64, in raster order, V = there is none.
+            ((2 r + 1)^2, K) int64, in raster order, V = there is none, also where one of the pixels lies outside.
         """
-        grid = self._sweeps.grid
-        size = torch.full((), grid.pixel_size * UNITS, dtype=torch.float64, device=x.device)
-        offset = torch.arange(-reach, reach + 1, device=x.device)[:, None]
-        row = torch.floor(y / size).long() + offset
-        col = torch.floor(x / size).long() + offset
-        line = ((window * self._sweeps.num_steps + step) * grid.height + row) * grid.width
-        is_row, is_col = (row >= 0) & (row < grid.height), (col >= 0) & (col < grid.width)
-        place = (line[:, None] + col).flatten(0, 1)
-        inside = (is_row[:, None] & is_col).view_as(place)
-        place.masked_fill_(~inside, self._sweeps.image.numel() - 1)
-        pixel = self._sweeps.number_at(place.view(-1)).view_as(place)
-        return self._of_key.index_select(0, pixel.mul_(self._num_slices).add_(part).view(-1)).view_as(place)
+        grid, line = self._sweeps.grid, torch.arange(-reach, reach + 1, device=part.device)
+        size = torch.full((), grid.pixel_size * UNITS, dtype=torch.float64, device=part.device)
+        last = torch.tensor(((grid.width - 1 - reach,), (grid.height - 1 - reach,)), device=part.device)
+        at = torch.floor(place / size).long()
+        inside = ((at >= reach) & (at <= last)).all(0)
+        pixel = sweep * (grid.height * grid.width) + at[1] * grid.width + at[0]
+        pixel = pixel + (line[:, None] * grid.width + line).view(-1, 1)
+        pixel = torch.where(inside, pixel, self._sweeps.image.numel() - 1)
+        rank = self._sweeps.rank.index_select(0, pixel.view(-1)).view_as(pixel)
+        return self._of_key.index_select(0, torch.add(part, rank, alpha=self._num_slices).view(-1)).view_as(pixel)
 
 
 def whole(x: Tensor) -> Tensor:

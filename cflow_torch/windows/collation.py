@@ -63,24 +63,54 @@ class Batch:
     ground: Optional[GroundHeights] = None
     point_times: Optional[Tensor] = None
 
-    def take_steps(self, wanted: Tensor) -> Batch:
-        """The batch of some of the sweeps. Args: wanted: (S,) bool, True for steps 0 and 1."""
-        kept, number = flat_nonzero(wanted), wanted.cumsum(0) - 1
+    def with_twice_the_windows(self) -> Batch:
+        """The batch with empty windows B ... 2 B - 1 behind its own, of the same times and origins."""
+        elapsed, seconds, origin = (torch.cat((of, of)) for of in (self.elapsed, self.seconds, self.origin))
+        return replace(self, num_windows=2 * self.num_windows, elapsed=elapsed, seconds=seconds, origin=origin)
+
+    def both_sides(self) -> Tuple[Batch, Tensor]:
+        """The sweeps up to t+1, and in as many further windows t+1, t and the sweeps after them.
+
+        Returns:
+            The batch: its points, those of later sweeps in window B + w instead of w, then copies of all points of t+1
+            and t; and the points that have copies, (K,) int64.
+        """
+        is_after = (self.elapsed < 0).any(0)
+        num_after = int(is_after.sum())
+        num_past, first = self.num_steps - num_after, self.num_steps - num_after
+        num_steps = max(num_past, num_after + 2)
         window, step = split_index(self.image.long(), self.num_steps)
-        rows = flat_nonzero(wanted.index_select(0, step))  # rows of pc0 stay where they are: newer ones stay as well
-        image = window * kept.numel() + number.index_select(0, step)
-        return replace(
+        copied = flat_nonzero(step < 2)
+        is_later = step >= first
+        window = torch.where(is_later, window + self.num_windows, window)
+        step = torch.where(is_later, step - first + 2, step)
+        image = window * num_steps + step
+        copies = image.index_select(0, copied) + self.num_windows * num_steps
+
+        def sides(values: Tensor) -> Tensor:
+            past, after = (values.new_zeros((self.num_windows, num_steps, *values.shape[2:])) for _ in range(2))
+            past[:, :num_past] = values[:, :first]
+            after[:, : num_after + 2] = torch.cat((values[:, :2], values[:, first:]), 1)
+            return torch.cat((past, after))
+
+        def more(values: Tensor) -> Tensor:
+            return torch.cat((values, values.index_select(0, copied)))
+
+        batch = replace(
             self,
-            positions=self.positions.index_select(1, rows),
-            takes_part=self.takes_part.index_select(0, rows),
-            has_result=self.has_result.index_select(0, rows),
-            image=image.index_select(0, rows).int(),
-            num_steps=kept.numel(),
-            elapsed=self.elapsed.index_select(1, kept),
-            seconds=self.seconds.index_select(1, kept),
-            origin=self.origin.index_select(1, kept),
-            point_times=None if self.point_times is None else self.point_times.index_select(0, rows),
+            positions=torch.cat((self.positions, self.positions.index_select(1, copied)), 1),
+            takes_part=more(self.takes_part),
+            has_result=more(self.has_result),
+            image=torch.cat((image, copies)).int(),
+            num_windows=2 * self.num_windows,
+            num_steps=num_steps,
+            elapsed=sides(self.elapsed),
+            seconds=sides(self.seconds),
+            origin=sides(self.origin),
+            ground=None if self.ground is None else self.ground.twice(),
+            point_times=None if self.point_times is None else more(self.point_times),
         )
+        return batch, copied
 
 
 def make_batch(

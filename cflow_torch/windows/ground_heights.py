@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from typing import Union
 
 import torch
@@ -45,6 +46,12 @@ class GroundHeights:
         height = torch.floor(positions[2] * 100).clamp_(-_HIGHEST, _HIGHEST).long()
         self._heights.view(-1).index_add_(0, block, height)
         self._counts.view(-1).index_add_(0, block, torch.ones_like(height))
+
+    def twice(self) -> GroundHeights:
+        """The same ground for as many windows once more, behind these."""
+        twice = copy(self)
+        twice._heights, twice._counts = (torch.cat((of, of)) for of in (self._heights, self._counts))
+        return twice
 
     def mean(self) -> Tensor:
         """(B, Y, X) int64, centimetres: mean over 3 x 3 blocks, rounded down; far below everything where they hold

@@ -10,13 +10,17 @@ import numpy as np
 import pytest
 import torch
 from oracle.dense import scene_flow_in_1view
-from scenes import same_bits
+from scenes import RANGE, config, same_bits, scene
 
 from cflow_torch import CFlowError
 from cflow_torch.dense import packing
+from cflow_torch.dense.clustering import find_clusters
 from cflow_torch.dense.correlation import best_shifts
-from cflow_torch.dense.templates import Images, TemplatePairs
+from cflow_torch.dense.projection import project
+from cflow_torch.dense.templates import Images, TemplatePairs, make_pairs
 from cflow_torch.windows import memory
+from cflow_torch.windows.bev_grid import Grid
+from cflow_torch.windows.collation import make_batch
 
 ENGINES = ("fft", "conv")
 Pair = Tuple[np.ndarray, int, Optional[float]]  # template, its target, radius
@@ -132,6 +136,26 @@ def test_lines_of_a_gpu_give_the_same(monkeypatch):
     monkeypatch.setattr(packing, "_LINES_CPU", packing._LINES_GPU)
     found = best_shifts(as_pairs(targets, pairs))
     assert torch.equal(found[0], shift) and same_bits(found[1], score)
+
+
+def test_pairs_of_clusters_with_pixel_sizes_of_their_own():
+    """Only the radius depends on the size, which is that of the pair's cluster."""
+    settings, grid = config(num_history=2), Grid(0.25, RANGE[:3], RANGE[3:])
+    windows = [scene(seed, num_history=2) for seed in (1, 2)]
+    batch = make_batch(windows, settings, grid, torch.device("cpu"))
+    clusters, _, _ = find_clusters(project(batch, None, grid), settings)
+    sizes = torch.tensor([0.25, 0.5, 1.0], dtype=torch.float64)
+    of_cluster = sizes[torch.arange(len(clusters.window)) % 3]
+    by_size = [make_pairs(clusters, batch, float(size), 30.0) for size in sizes]
+    mixed = make_pairs(clusters, batch, of_cluster, 30.0)
+    assert mixed.radius is not None and len(mixed.cluster) > len(clusters.window) > 6
+    for pair, cluster in enumerate(mixed.cluster.tolist()):
+        radius = by_size[cluster % 3].radius
+        assert radius is not None and mixed.radius[pair] == radius[pair]
+    same = make_pairs(clusters, batch, torch.full_like(of_cluster, 0.25), 30.0)
+    for name in ("cluster", "source", "size", "radius"):
+        assert torch.equal(getattr(same, name), getattr(by_size[0], name))
+    assert make_pairs(clusters, batch, of_cluster, None).radius is None
 
 
 def test_score_is_that_of_opencv():

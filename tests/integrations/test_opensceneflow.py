@@ -35,12 +35,13 @@ from cflow_torch.integrations.opensceneflow import CFlow, write_null_checkpoint
 from cflow_torch.integrations.opensceneflow.__main__ import main as write_checkpoint
 from cflow_torch.types import Sweep
 
-SMALL = {"pixel_sizes": [0.25], "point_cloud_range": list(RANGE), "max_extent": 5.0}
+SMALL = {"pixel_sizes": [0.25], "point_cloud_range": list(RANGE)}
+KEYS = {"method": "keypoints", "patch_size": 11, "ratio_threshold": 1.0}
 VARIANTS: Dict[str, Dict[str, Any]] = {
-    "dense": {"method": "dense", "num_frames": 6, **SMALL},
+    "dense": {"method": "dense", "num_frames": 6, **SMALL, "max_extent": 5.0},
     # Batches hold no ground, so there is nothing to stand out of.
     "verified": {"preset": "fast", "num_frames": 6, **SMALL, "min_height": None, "significance": 0.0},
-    "keypoints": {"method": "keypoints", "patch_size": 11, "ratio_threshold": 1.0, **SMALL, "pixel_sizes": [0.1]},
+    "keypoints": {**SMALL, **KEYS, "pixel_sizes": [0.1], "max_extent": 5.0},
 }
 EGO_T_LIDAR = np.array([[0.8, -0.6, 0, 1.35], [0.6, 0.8, 0, 0.2], [0, 0, 1, 1.6], [0, 0, 0, 1]])
 AV2_STAMP = 315_966_265_259_836_000  # Argoverse 2 counts from a moment of its own
@@ -234,10 +235,10 @@ def test_settings_of_the_method_and_others() -> None:
     assert CFlow(method="dense", num_frames=4).config == make_config("paper", num_history=2)
     assert CFlow(method="keypoints", num_frames=2).config == make_config("keypoints")
     assert CFlow(pixel_size=0.2, voxel_size=[1], grid_feature_size=[1]).config == make_config(pixel_size=0.2)
-    names = r"num_iters, patch_size, proof; .*'verified' has pixel_size"
+    names = r"labeling, num_iters, patch_size, proof; .*'verified' has pixel_size"
     with pytest.warns(UserWarning, match=names) as said:
-        model = CFlow(num_iters=4, proof=False, patch_size=11, connectivity=4)
-    assert len(said) == 1 and model.config == make_config(connectivity=4)
+        model = CFlow(num_iters=4, proof=False, patch_size=11, labeling="kornia", significance=2.0)
+    assert len(said) == 1 and model.config == make_config(significance=2.0)
     wrong: List[Dict[str, Any]] = [{"output": "half"}, {"num_frames": 1}, {"num_frames": 2.5}, {"ego_T_lidar": "yes"}]
     wrong += [{"method": "keypoints", "num_frames": 6}, {"method": "dense", "preset": "fast"}]
     for settings in (*wrong, {"pixel_sizes": [0.1, 0.2]}, {"ego_T_lidar": [[1, 2], [3, 4]]}):
@@ -311,9 +312,9 @@ def test_configuration_is_found_and_is_the_preset(name: str, tmp_path: Path) -> 
         model = osf.build(cfg, checkpoint)
     assert isinstance(model, CFlow) and model.config == expected and cfg.output == "cflow-e0-val-v1"
     assert min(cfg.model.target.grid_feature_size) >= 1
-    changes = ["pixel_sizes=[0.3]", "connectivity=4", "max_speed=null", "output=valid", "ego_T_lidar=null"]
+    changes = ["pixel_sizes=[0.3]", "sweep_interval=0.2", "max_speed=null", "output=valid", "ego_T_lidar=null"]
     model = osf.build(composed(tmp_path, f"model={name}", *(f"model.target.{text}" for text in changes)), checkpoint)
-    assert model.config == expected.replace(pixel_size=0.3, connectivity=4, max_speed=None)
+    assert model.config == expected.replace(pixel_size=0.3, sweep_interval=0.2, max_speed=None)
     assert model.output == "valid" and model.ego_T_lidar is None
     with pytest.raises(ConfigCompositionException):
         composed(tmp_path, f"model={name}", "model.target.no_such_setting=1")

@@ -14,7 +14,14 @@ from scipy import ndimage
 from scipy.sparse import coo_matrix, csgraph
 
 from cflow_torch.ops import morphology
-from cflow_torch.ops.labeling import connected_components, connected_components_kornia, union_find
+from cflow_torch.ops.labeling import (
+    connected_components,
+    connected_components_kornia,
+    label_blocks,
+    label_together,
+    pad,
+    union_find,
+)
 from cflow_torch.types import CFlowError
 
 STRUCTURE = {4: ndimage.generate_binary_structure(2, 1), 8: np.ones((3, 3), dtype=bool)}
@@ -65,6 +72,28 @@ def test_without_union_find_kornia_says_what_to_do(monkeypatch):
     monkeypatch.delattr(contrib, "connected_components_union_find", raising=False)
     with pytest.raises(CFlowError, match="kornia >= 0.9.*sparse"):
         label(np.ones((1, 3, 3), dtype=bool), 8, 1, "kornia")
+
+
+@pytest.mark.parametrize("connectivity", [4, 8])
+def test_sets_of_images_that_are_labelled_together_equal_each_set_alone(connectivity):
+    """Several sizes and reaches, one set is empty; the components of a set follow those of the set before."""
+    rng = np.random.default_rng(connectivity)
+    shapes = [((3, 9, 14), 3), ((3, 18, 28), 1), ((1, 5, 5), 1), ((3, 18, 28), 3), ((3, 40, 25), 1)]
+    for density in ([0.3, 0.1, 0.0, 0.2, 0.4], [0.0] * 5, [1.0] * 5):
+        drawn = [torch.from_numpy(rng.random(shape) < part) for (shape, _), part in zip(shapes, density)]
+        sets = [(pad([images]), reach) for images, (_, reach) in zip(drawn, shapes)]
+        for some in (sets, sets[:1], sets[2:3], sets[3:]):
+            found, before = label_together(some, connectivity), 0
+            for (padded, reach), together in zip(some, found):
+                window, row, col = padded.nonzero().t()
+                row = row + window * padded.shape[1]
+                alone = label_blocks(padded, connectivity, reach)
+                component, expected = together.of_pixel(row, col), alone.of_pixel(row, col)
+                assert together.first == before and together.num_components == found[0].num_components
+                assert (component - together.first).tolist() == expected.tolist()
+                assert alone.first == 0 and bool((expected < alone.num_components).all())
+                before += alone.num_components
+            assert before == found[0].num_components, "the names of all sets follow each other"
 
 
 # ------------------------------------------------------------------------------------------------------ hard shapes

@@ -1,11 +1,10 @@
-"""Medians of segments and divisions of indices, against NumPy."""
+"""Medians of segments, against NumPy."""
 
 from __future__ import annotations
 
 import numpy as np
 import torch
 
-from cflow_torch.ops.indices import divide, split_index
 from cflow_torch.ops.segments import masked_median, segment_median
 
 
@@ -22,11 +21,3 @@ def test_medians_are_numpys():
         assert median.tolist() == [float(np.median(m)) if len(m) else 0.0 for m in members]
     nothing = torch.zeros(0, dtype=torch.float64)
     assert segment_median(nothing, nothing.long(), 3).tolist() == [0, 0, 0]
-
-
-def test_division_of_indices():
-    index = torch.tensor([0, 1, 6, 7, 8, 2**40, 2**62 + 5])
-    for width in (1, 2, 7, 701, 2**31 + 1):
-        row, col = split_index(index, width)
-        assert [tuple(pair) for pair in zip(row.tolist(), col.tolist())] == [divmod(i, width) for i in index.tolist()]
-    assert divide(torch.tensor(7), 2) == 3 and divide(torch.tensor(7), 2).shape == ()

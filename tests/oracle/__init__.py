@@ -8,9 +8,8 @@ Order of reading: reference_flow, here -> `dense` (Alg. general_correlation_flow
 CorrelationFlow-Keypoints) or `verified` (ours). What they use: `sweeps` (ego motion), `pixels` (Eq. 3d_to_bev),
 `clustering` (Alg. clustering), `history` (Sec. leverage_past_pcs), `matching` (key points).
 
-Parts of the verified method, in its order: `height_slices`, `ground_residue`, `component_tree`, `long_vehicles`,
-`candidates`, `paired_test`, `aperture`, `offline`, `local_motion` (with `visibility`), `refinement` (`slow_motion`,
-`subpixel_shift`, `rigid_registration`, `deskewing`), `confidence`; then `layers` and all of it once more.
+Parts of the verified method, in its order: `height_slices`, `changed_pixels`, `component_tree`, `overhangs`,
+`candidates`, `paired_test`, `aperture`, `subpixel_motion`, `registration` (with `voxels`), `confidence`.
 """
 
 from __future__ import annotations

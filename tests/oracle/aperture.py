@@ -1,11 +1,13 @@
-"""The aperture problem: a line that seems to slide along itself has most likely not moved."""
+"""The aperture problem: lines that seem to slide along themselves, and long vehicles that really do."""
 
 from __future__ import annotations
 
 import math
 from typing import List, Sequence, Tuple
 
-from oracle.height_slices import Pixel, SlicedSweeps, Vector
+from oracle.height_slices import Cell, Pixel, SlicedSweeps, Vector, count
+
+LEAST_TRAVEL = 1.2  # metres
 
 
 def slides_along_itself(sweeps: SlicedSweeps, members: Sequence[Pixel], candidates: Sequence[Vector]) -> List[bool]:
@@ -13,49 +15,69 @@ def slides_along_itself(sweeps: SlicedSweeps, members: Sequence[Pixel], candidat
 
     Returns:
         Of each candidate, whether the component is a line at t+1, the motion points along it and leads at least 1.2 m
-        over the window, and the other sweeps see something all along it, or t+1 all along where it was.
+        over the window, and the other sweeps have something all along it, or t+1 all along where it was.
     """
-    is_line, axis_y, axis_x = principal_axis([(r, c) for m, r, c in members if m == 0], sweeps.pixel_size)
+    is_line, axis_y, axis_x = principal_axis([(r, c) for m, r, c in members if m == 0], sweeps.size)
     stays = is_line and is_covered(sweeps, members)
     result = []
     for y, x in candidates:
         across, square = axis_y * x - axis_x * y, y * y + x * x
         # The sine of the angle between the two is at most 0.2.
         is_along = across * across <= 0.04 * square * (axis_y * axis_y + axis_x * axis_x)
-        is_far = square * (max(sweeps.elapsed) - min(sweeps.elapsed)) ** 2 >= (1.2 / sweeps.pixel_size) ** 2
+        is_far = square * (max(sweeps.elapsed) - min(sweeps.elapsed)) ** 2 >= (LEAST_TRAVEL / sweeps.size) ** 2
         result.append(stays and is_along and is_far)
     return result
 
 
-def principal_axis(pixels: Sequence[Tuple[int, int]], pixel_size: float) -> Tuple[bool, float, float]:
+def principal_axis(cells: Sequence[Cell], size: float) -> Tuple[bool, float, float]:
     """Whether pixels lie along a line, and its direction (y, x), of any length.
 
     Convention: second moments; standard deviation at most 0.3 m across and at least 1 m along.
     """
-    if not pixels:
+    if not cells:
         return False, 0.0, 0.0
-    n, top, left = len(pixels), min(r for r, _ in pixels), min(c for _, c in pixels)
-    y, x = [r - top for r, _ in pixels], [c - left for _, c in pixels]
+    n, top, left = len(cells), min(r for r, _ in cells), min(c for _, c in cells)
+    y, x = [r - top for r, _ in cells], [c - left for _, c in cells]
     var_y = (n * sum(a * a for a in y) - sum(y) ** 2) / (n * n)
     var_x = (n * sum(a * a for a in x) - sum(x) ** 2) / (n * n)
     cov = (n * sum(a * b for a, b in zip(y, x)) - sum(y) * sum(x)) / (n * n)
     # Eigenvalues of the 2 x 2 matrix of moments; of its eigenvectors the one of the larger.
     mean, half = (var_y + var_x) / 2, (var_y - var_x) / 2
     root = math.sqrt(half * half + cov * cov)
-    is_line = mean - root <= (0.3 / pixel_size) ** 2 and mean + root >= (1.0 / pixel_size) ** 2
+    is_line = mean - root <= (0.3 / size) ** 2 and mean + root >= (1.0 / size) ** 2
     return (is_line, cov, mean + root - var_y) if var_y < var_x else (is_line, mean + root - var_x, cov)
 
 
 def is_covered(sweeps: SlicedSweeps, members: Sequence[Pixel]) -> bool:
-    """At least 88 % of looks find something: of those from t+1 into all other sweeps, or of those from them into t+1.
+    """At least 88 % of comparisons find something: of those of t+1 with all other sweeps, or of those with t+1.
 
-    Convention: a look finds what lies in the same cell of about 0.4 m a side (whole pixels) or in one beside it.
+    Convention: they find what lies in the same cell of about 0.4 m a side (whole pixels) or in one beside it.
     """
-    side = max(1, round(0.4 / sweeps.pixel_size))
+    side = max(1, round(0.4 / sweeps.size))
     cells = {(m, r // side, c // side) for m, r, c in sweeps.pixels()}
     forward, backward = [], []
     for m, r, c in members:
-        for other in [0] if m > 0 else range(1, len(sweeps.images)):
+        for other in sweeps.others(m):
             finds = any((other, r // side + dy, c // side + dx) in cells for dy in (-1, 0, 1) for dx in (-1, 0, 1))
             (forward if m > 0 else backward).append(finds)
-    return any(sum(looks) * 100 >= len(looks) * 88 for looks in (forward, backward) if looks)
+    return any(sum(finds) * 100 >= len(finds) * 88 for finds in (forward, backward) if finds)
+
+
+def both_ends_move(sweeps: SlicedSweeps, members: Sequence[Pixel]) -> bool:
+    """Whether both ends of a component have gone the same way along it since the sweep that is farthest from t+1.
+
+    Convention: at least 1.2 m, alike to a tenth of their sum; and the pixels at t+1 have two height slices on average.
+        Ends are those of the projections on the principal axis at t+1. Of sweeps equally far the first.
+    """
+    newest = [(r, c) for m, r, c in members if m == 0]
+    _, axis_y, axis_x = principal_axis(newest, sweeps.size)
+    farthest = max(range(len(sweeps.images)), key=lambda m: abs(sweeps.elapsed[m]))
+    oldest = [(r, c) for m, r, c in members if m == farthest]
+    if not oldest:
+        return False
+    now, then = ([r * axis_y + c * axis_x for r, c in cells] for cells in (newest, oldest))
+    low, high = min(now) - min(then), max(now) - max(then)
+    both, least = low + high, 2 * LEAST_TRAVEL / sweeps.size
+    is_far = both * both >= (least * least) * (axis_y * axis_y + axis_x * axis_x)
+    is_tall = sum(count(sweeps.at(0, *cell)) for cell in newest) >= 2 * len(newest)
+    return is_tall and is_far and abs(low - high) <= 0.1 * abs(both)

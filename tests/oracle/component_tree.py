@@ -1,113 +1,170 @@
-"""The component tree: components of the finest pixels at several pixel sizes, and which of them are objects."""
+"""The component tree: components at several scales, those of them that may move, and the cut that selects objects."""
 
 from __future__ import annotations
 
-from typing import List, NamedTuple, Optional, Sequence, Tuple
-
-import numpy as np
+from itertools import product
+from typing import Any, Dict, Iterable, List, NamedTuple, Optional, Sequence, Set, Tuple
 
 from cflow_torch.config import VerifiedConfig
-from oracle.clustering import cluster
-from oracle.height_slices import Pixel, SlicedSweeps, coarsen
-from oracle.long_vehicles import ends_travel
+from oracle.aperture import both_ends_move
+from oracle.changed_pixels import Change
+from oracle.height_slices import Pixel, SlicedSweeps
+
+PRICE = 16 * 4  # what every part costs, sixteenths of a slice
+
+Cells = Tuple[Pixel, ...]
 
 
-class Level(NamedTuple):
-    """What a window looks like at one pixel size.
+class Node(NamedTuple):
+    """A component that may move.
 
     Attributes:
-        block: k, finest pixels a side of a pixel of this level; those at the far ends may be cut off.
-        images: (H', W') uint8 of each sweep, slices of each coarse pixel.
-        component: of each occupied finest pixel, -1 = none.
-        members: of each component, its finest pixels.
-        too_long: of each component, whether it is longer at t+1 than other objects, and is not seen to travel.
-        travels: of each component, whether it is as long and both of its ends are seen to travel.
+        members: its pixels, sorted.
+        level: 0 ... L - 1 in the tree, coarse to fine; L = changed pixels, L + 1 = under an overhang.
+        parent: number of the next coarser node around it; None = there is none.
+        travels: it is longer than other objects, and both of its ends move.
+        sweeps: where its pixels are: the window, or the copies of what lies under something.
     """
 
-    block: int
-    images: List[np.ndarray]
-    component: List[int]
-    members: List[List[Pixel]]
-    too_long: List[bool]
-    travels: List[bool]
+    members: Cells
+    level: int
+    parent: Optional[int]
+    travels: bool
+    sweeps: SlicedSweeps
 
 
-def find_components(sweeps: SlicedSweeps, block: int, is_undilated: bool, config: VerifiedConfig) -> Level:
-    """Components at pixels of `block` x `block` finest ones: of Alg. clustering, or plain ones."""
-    images, reach = [coarsen(image, block) for image in sweeps.images], 1 if is_undilated else 3
-    labels = cluster(
-        [i > 0 for i in images], sweeps.pixel_size * block, config.max_extent, config.connectivity, reach=reach
-    )
-    members: List[List[Pixel]] = [[] for _ in range(int(labels.max(initial=-1)) + 1)]
-    component = []
-    for m, r, c in sweeps.pixels():
-        label = int(labels[r // block, c // block])
-        component.append(label)
-        if label >= 0:
-            members[label].append((m, r, c))
-    is_long = []
-    for pixels in members:
-        rows, cols = zip(*[(r, c) for m, r, c in pixels if m == 0])
-        side = max(max(rows) - min(rows), max(cols) - min(cols)) + 1
-        is_long.append(config.max_object is not None and side * sweeps.pixel_size > config.max_object)
-    travels = [long and ends_travel(sweeps, pixels) for long, pixels in zip(is_long, members)]
-    too_long = [long and not travel for long, travel in zip(is_long, travels)]
-    return Level(block, images, component, members, too_long, travels)
+class Tree(NamedTuple):
+    """What is found in a window.
 
-
-def parents(component: Sequence[int], above: Sequence[int]) -> List[int]:
-    """The component of the coarser level that holds each component.
-
-    Args:
-        component, above: component of each pixel at a level and at the next coarser one, -1 = none.
-
-    Returns:
-        Of each component, by its number: that of the first of its pixels that has one; -1 if none of them has.
+    Attributes:
+        levels: components of each level; dilated ones coarse to fine, then plain ones.
+        nodes: coarse to fine, then those of changed pixels.
+        may_move: pixels of the finest dilated components that may move, long ones included.
     """
-    result = [-1] * (max(component, default=-1) + 1)
-    for part, whole in zip(component, above):
-        if part >= 0 and result[part] < 0:
-            result[part] = whole
+
+    levels: List[List[Cells]]
+    nodes: List[Node]
+    may_move: Set[Pixel]
+
+
+def join(cells: Iterable[Tuple[int, ...]], reach: int) -> Dict[Any, int]:
+    """Component of each cell; cells join whose indices differ by at most `reach`. Numbered by their first cells."""
+    remaining, result, number = set(cells), {}, 0  # type: ignore[var-annotated]
+    for seed in sorted(remaining):
+        stack = [seed] if seed in remaining else []
+        number += len(stack)
+        remaining -= {seed}
+        while stack:
+            cell = stack.pop()
+            result[cell] = number - 1
+            for step in product(range(-reach, reach + 1), repeat=len(cell)):
+                near = tuple(a + b for a, b in zip(cell, step))
+                if near in remaining:
+                    remaining.remove(near)
+                    stack.append(near)
     return result
 
 
-def equals_parent(component: Sequence[int], above: Sequence[int]) -> List[bool]:
-    """Of each component, whether it has the same pixels as its parent; arguments as for `parents`."""
-    return [
-        whole >= 0 and [one == part for one in component] == [one == whole for one in above]
-        for part, whole in enumerate(parents(component, above))
-    ]
+def components(pixels: Sequence[Pixel], block: int, reach: int) -> List[Cells]:
+    """Components of pixels of all sweeps together, at pixels of `block` x `block` finest ones.
+
+    Dilation by a 3 x 3 square is reach 3: two dilated squares touch if their pixels are at most three apart.
+    """
+    component = join({(r // block, c // block) for _, r, c in pixels}, reach)
+    found: Dict[int, List[Pixel]] = {}
+    for m, r, c in sorted(pixels):
+        found.setdefault(component[r // block, c // block], []).append((m, r, c))
+    return [tuple(members) for members in found.values()]
 
 
-def winners(levels: Sequence[Sequence[int]], evidence: Sequence[Sequence[int]]) -> List[Optional[Tuple[int, int]]]:
-    """The component whose motion each pixel takes.
+def is_linked(members: Cells) -> bool:
+    """Has it pixels at t+1 and in another sweep?"""
+    return members[0][0] == 0 < members[-1][0]
+
+
+def grow(sweeps: SlicedSweeps, change: Change, config: VerifiedConfig) -> Tree:
+    """Components of all scales, and which of them may move.
+
+    Convention: in windows with history more than 5 % of the pixels of what may move are missing. A plain component that
+        equals the dilated one around it is not in the list a second time. Lengths are those at t+1.
+    """
+    pixels, longest = sweeps.pixels(), config.max_object
+    scales = [(round(size / sweeps.size), 3) for size in config.pixel_sizes]
+    levels = [components(pixels, block, reach) for block, reach in [*scales, (1, 1)]]
+    tree, node_of = Tree(levels, [], set()), {}  # type: ignore[var-annotated]
+    for level, found in enumerate([*levels, components(list(change.has_changed), 1, 1)]):
+        in_tree = level < len(levels)
+        known = set(levels[level - 1]) if level == len(levels) - 1 else set()
+        first = len(tree.nodes)
+        for members in found:
+            num_missing = sum(pixel in change.is_missing for pixel in members)
+            if not is_linked(members) or (len(sweeps.images) > 2 and 20 * num_missing <= len(members)):
+                continue
+            if level == len(scales) - 1:
+                tree.may_move.update(members)
+            is_long = in_tree and longest is not None and length(members) * sweeps.size > longest
+            travels = is_long and both_ends_move(sweeps, members)
+            if members not in known and (travels or not is_long):
+                parent = node_of.get(members[0]) if in_tree else None
+                tree.nodes.append(Node(members, level, parent, travels, sweeps))
+        for i in range(first, len(tree.nodes)):
+            node_of.update(dict.fromkeys(tree.nodes[i].members, i))
+    return tree
+
+
+def length(members: Cells) -> int:
+    """Longer side, in pixels, of the box of those at t+1; 0 without any."""
+    cells = [(r, c) for m, r, c in members if m == 0]
+    return max((max(line) - min(line) + 1 for line in zip(*cells)), default=0)
+
+
+def cut(nodes: Sequence[Node], evidence: Sequence[int]) -> List[Optional[int]]:
+    """The node whose motion each node takes, None = it has none.
+
+    A node wins if it has more evidence than its parts together; the coarsest winner around a node counts. A part counts
+    with its evidence, or with that of its own parts if that is more, less `PRICE`, at least 0.
+    """
+    parts = [0] * len(nodes)
+    for i in reversed(range(len(nodes))):
+        parent = nodes[i].parent
+        if parent is not None:
+            parts[parent] += max(max(evidence[i], parts[i]) - PRICE, 0)
+    winner: List[Optional[int]] = []
+    for i, node in enumerate(nodes):
+        around = None if node.parent is None else winner[node.parent]
+        winner.append(around if around is not None else i if evidence[i] > parts[i] else None)
+    return winner
+
+
+def select_objects(
+    nodes: Sequence[Node], evidence: Sequence[int], num_levels: int, plain: Sequence[Cells], sweeps: SlicedSweeps
+) -> Tuple[Dict[Pixel, int], List[Optional[int]]]:
+    """What moves together or is static together, among the pixels of a window or of its copies.
 
     Args:
-        levels: coarse to fine: component of each pixel, -1 = none.
-        evidence: of each component of each level, at least 0.
+        nodes, evidence: all of them.
+        num_levels: of the tree.
+        plain: plain components of the finest pixels; none for copies.
+        sweeps: the window, or the copies.
 
     Returns:
-        Of each pixel (level, component): the coarsest of its components that has more evidence than its parts together;
-        if there is none, its finest one; None if it has no finest one.
+        Object of each pixel that has one, numbered by their first pixels; node of each object, None = it has none.
 
-    Convention: the parts of a component are the components of the next finer level whose parent it is. Parts count with
-        what their own parts sum up to, or with their own evidence if that is more.
+    A pixel moves with the winner of its finest node in the tree; else with its node out of the tree, if that has any
+    evidence; else it is static with its plain component, if that is linked.
     """
-    finest = len(levels) - 1
-    parent = [parents(level, above) for level, above in zip(levels[1:], levels)]  # of the components of level 1, 2, ...
-
-    def sum_of_parts(level: int, component: int) -> int:
-        if level == finest:
-            return 0
-        parts = [part for part, whole in enumerate(parent[level]) if whole == component]
-        return sum(max(evidence[level + 1][part], sum_of_parts(level + 1, part)) for part in parts)
-
-    result: List[Optional[Tuple[int, int]]] = []
-    for components in zip(*levels):
-        winner = None if components[finest] < 0 else (finest, components[finest])
-        for level in reversed(range(finest)):
-            component = components[level]
-            if component >= 0 and evidence[level][component] > sum_of_parts(level, component):
-                winner = level, component
-        result.append(winner)
-    return result
+    winner = cut(nodes, evidence)
+    of_finest: Dict[Pixel, Optional[int]] = {}
+    number_of = {node.members: i for i, node in enumerate(nodes) if node.level == num_levels - 1}
+    name: Dict[Pixel, Any] = {}
+    for members in filter(is_linked, plain):
+        name.update(dict.fromkeys(members, number_of.get(members, members)))
+    for i, node in enumerate(nodes):
+        if node.sweeps is sweeps and node.level < num_levels:
+            of_finest.update(dict.fromkeys(node.members, winner[i]))
+        elif node.sweeps is sweeps and evidence[i] > 0:
+            name.update(dict.fromkeys(node.members, i))
+    name.update({pixel: i for pixel, i in of_finest.items() if i is not None})
+    number: Dict[Any, int] = {}
+    object_of = {pixel: number.setdefault(name[pixel], len(number)) for pixel in sorted(name)}
+    return object_of, [own if isinstance(own, int) else None for own in number]

@@ -1,61 +1,91 @@
-"""Height-sliced sweeps: which of four layers of the scene a BEV pixel of each sweep has points in."""
+"""Height-sliced sweeps: which of four slices of height each BEV pixel has points in; ground residue is left out."""
 
 from __future__ import annotations
 
 import math
-from typing import List, NamedTuple, Sequence, Tuple
+from itertools import product
+from typing import Dict, Iterable, List, NamedTuple, Sequence, Tuple
 
 import numpy as np
 
 from cflow_torch.config import VerifiedConfig
-from oracle.pixels import bev_dims, project_bev
+from oracle.pixels import bev_dims, in_range
 
-NUM_SLICES = 4
-SLICE_HEIGHT = 0.5  # metres
+NUM_SLICES, SLICE_HEIGHT = 4, 0.5  # metres
+GROUND_BLOCK = 2.0  # metres
 
+Cell = Tuple[int, int]  # row, column
 Pixel = Tuple[int, int, int]  # sweep (0 = t+1, 1 = t, ...), row, column
 Vector = Tuple[float, float]
 
 
+class Place(NamedTuple):
+    """A point: metres in the frame of t+1, and sweep intervals from the instant of its sweep."""
+
+    x: float
+    y: float
+    z: float
+    time: float = 0.0
+
+
 class SlicedSweeps(NamedTuple):
-    """One window as the verified method sees it.
+    """One window as the verified method sees it, sweep by sweep: t+1, t, t-1, ..., then t+2, ...
 
     Attributes:
-        images: (H, W) uint8 of t+1, t, t-1, ... at the finest pixels; bit c = a point of slice c lies there.
-        elapsed: sweep intervals from each sweep to t+1, 0 for t+1.
-        seconds: the same in seconds.
-        pixel_size: s, metres.
+        clouds: the points that are drawn.
+        images: slices of the occupied pixels, bit c = a point of slice c lies there.
+        elapsed, seconds: from each sweep to t+1, in sweep intervals and in seconds.
+        size: s, metres.
         lower: (x, y), metres, corner of the region.
+        shape: rows and columns.
     """
 
-    images: List[np.ndarray]
+    clouds: List[List[Place]]
+    images: List[Dict[Cell, int]]
     elapsed: List[float]
     seconds: List[float]
-    pixel_size: float
+    size: float
     lower: Vector
+    shape: Cell
+
+    def pixel(self, x: float, y: float) -> Cell:
+        """Eq. 3d_to_bev."""
+        return math.floor((y - self.lower[1]) / self.size), math.floor((x - self.lower[0]) / self.size)
+
+    def drawn(self, clouds: List[List[Place]]) -> SlicedSweeps:
+        """The same window with other points."""
+        images: List[Dict[Cell, int]] = [{} for _ in clouds]
+        for image, cloud in zip(images, clouds):
+            for x, y, z, _ in cloud:
+                cell = self.pixel(x, y)
+                image[cell] = image.get(cell, 0) | 1 << slice_of(z)
+        return self._replace(clouds=clouds, images=images)
 
     def pixels(self) -> List[Pixel]:
         """The occupied pixels, sweep by sweep, in raster order."""
-        return [(m, r, c) for m, image in enumerate(self.images) for r, c in np.argwhere(image).tolist()]
+        return [(m, *cell) for m, image in enumerate(self.images) for cell in sorted(image)]
+
+    def others(self, m: int) -> Iterable[int]:
+        """The sweeps that a sweep is compared with: t+1 with all others, the others with t+1."""
+        return [0] if m > 0 else range(1, len(self.images))
 
     def at(self, m: int, row: int, col: int) -> int:
         """The slices of a pixel; none outside the image."""
-        height, width = self.images[m].shape
-        return int(self.images[m][row, col]) if 0 <= row < height and 0 <= col < width else 0
+        return self.images[m].get((row, col), 0)
+
+    def around(self, m: int, row: int, col: int) -> int:
+        """The slices that any of the 3 x 3 pixels around a place has; none if the place lies outside the image."""
+        slices = 0
+        if 0 <= row < self.shape[0] and 0 <= col < self.shape[1]:
+            for cell in product((row - 1, row, row + 1), (col - 1, col, col + 1)):
+                slices |= self.at(m, *cell)
+        return slices
 
 
-def slice_image(points: np.ndarray, config: VerifiedConfig) -> np.ndarray:
-    """(H, W) uint8: image of one sweep, four bits a pixel: bit c is set if a point of slice c lies there.
-
-    Args:
-        points: (N, 3) float64, metres, frame of t+1, all of them inside the range.
-        config: for the finest pixels.
-    """
-    size = config.pixel_sizes[-1]
-    image = np.zeros(bev_dims(config, size), dtype=np.uint8)
-    for (r, c), z in zip(project_bev(points, config, size).tolist(), points[:, 2].tolist()):
-        image[r, c] |= 1 << slice_of(z)
-    return image
+def empty_sweeps(elapsed: List[float], seconds: List[float], config: VerifiedConfig) -> SlicedSweeps:
+    """A window without points."""
+    size, (x0, y0) = config.pixel_sizes[-1], config.point_cloud_range[:2]
+    return SlicedSweeps([], [], elapsed, seconds, size, (x0, y0), bev_dims(config, size))
 
 
 def slice_of(z: float, height: float = SLICE_HEIGHT, num_slices: int = NUM_SLICES) -> int:
@@ -63,26 +93,57 @@ def slice_of(z: float, height: float = SLICE_HEIGHT, num_slices: int = NUM_SLICE
     return math.floor(z / height) % num_slices
 
 
-def coarsen(image: np.ndarray, block: int) -> np.ndarray:
-    """The image at pixels of `block` x `block` finest ones, which have the slices of all of those."""
-    height, width = image.shape
-    coarse = np.zeros((-(-height // block), -(-width // block)), dtype=np.uint8)
-    for r, c in np.argwhere(image).tolist():
-        coarse[r // block, c // block] |= image[r, c]
-    return coarse
-
-
 def count(slices: int) -> int:
     """How many slices are set."""
     return bin(slices).count("1")
 
 
-def shared(sweeps: SlicedSweeps, pixels: Sequence[Pixel], other: int, dy: int, dx: int) -> int:
-    """Slices of some pixels that another sweep has dy rows and dx columns away."""
-    return sum(count(sweeps.at(m, r, c) & sweeps.at(other, r + dy, c + dx)) for m, r, c in pixels)
+def shift(motion: Vector, intervals: float) -> Cell:
+    """Whole pixels that a motion leads in some intervals, halves up."""
+    return math.floor(motion[0] * intervals + 0.5), math.floor(motion[1] * intervals + 0.5)
 
 
 def vertex(low: float, middle: float, high: float) -> float:
     """Where the parabola through three counts, one step apart, is largest: at most half a step from the middle one."""
     curve = 2 * middle - low - high
     return min(max((high - low) / (2 * curve), -0.5), 0.5) if curve > 0 else 0.0
+
+
+def ground_heights(ground: Sequence[np.ndarray], config: VerifiedConfig) -> Dict[Cell, int]:
+    """Mean height, centimetres, of the ground around each block of 2 m x 2 m, from ground points of some sweeps.
+
+    Convention: heights of the points of a block and of the eight around it are rounded down, then their mean is rounded
+        down. Blocks with less than five such points are missing.
+    """
+    heights: Dict[Cell, List[int]] = {}
+    for points in ground:
+        for x, y, z in points[in_range(points, config)].tolist():
+            heights.setdefault(_block(x, y, config), []).append(math.floor(z * 100))
+    means = {}
+    for row, col in {(r + dr, c + dc) for r, c in heights for dr, dc in product((-1, 0, 1), repeat=2)}:
+        near = [h for dr, dc in product((-1, 0, 1), repeat=2) for h in heights.get((row + dr, col + dc), [])]
+        if len(near) >= 5:
+            means[row, col] = sum(near) // len(near)
+    return means
+
+
+def is_residue(points: np.ndarray, means: Dict[Cell, int], config: VerifiedConfig) -> np.ndarray:
+    """(N,) bool: which of the points (N, 3) of a sweep stand on pixels that are ground.
+
+    Convention: a pixel is not ground if a point of it, or of a pixel at most two rows and two columns away, lies
+        `min_height` or more above the ground of its own block, or if no ground is known there.
+    """
+    assert config.min_height is not None
+    sweeps = empty_sweeps([], [], config)
+    tall = set()
+    for x, y, z in points.tolist():
+        block = _block(x, y, config)
+        if block not in means or math.floor(z * 100) - means[block] >= round(100 * config.min_height):
+            tall.add(sweeps.pixel(x, y))
+    near = {(r + dr, c + dc) for r, c in tall for dr, dc in product(range(-2, 3), repeat=2)}
+    return np.array([sweeps.pixel(x, y) not in near for x, y, _ in points.tolist()], dtype=bool)
+
+
+def _block(x: float, y: float, config: VerifiedConfig) -> Cell:
+    x0, y0 = config.point_cloud_range[:2]
+    return math.floor((y - y0) / GROUND_BLOCK), math.floor((x - x0) / GROUND_BLOCK)

@@ -1,67 +1,73 @@
-"""The verified method: components at several pixel sizes, motion candidates, the paired test, registration.
+"""The verified method: a tree of components at several pixel sizes, motion candidates, the paired test, refinement.
 
-Order of reading: verified_flow -> estimate -> look -> verify_level -> `candidates`, `paired_test`; then `refinement`.
+Order of reading: verified_flow -> estimate -> `height_slices`, `changed_pixels`, `component_tree`, `overhangs`;
+verify -> `candidates`, `paired_test`, `aperture`; settle -> `subpixel_motion`, `registration`, `confidence`.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Dict, List, NamedTuple, Optional, Sequence, Tuple
+from itertools import product
+from typing import Dict, List, NamedTuple, Sequence, Tuple
 
 import numpy as np
 
 from cflow_torch.config import VerifiedConfig
 from oracle.aperture import slides_along_itself
-from oracle.candidates import find_peak, keypoint_motion, keypoint_shifts, list_motions
-from oracle.component_tree import Level, equals_parent, find_components, parents, winners
-from oracle.confidence import confidences, margin
-from oracle.ground_residue import ground_heights, is_residue
-from oracle.height_slices import Pixel, SlicedSweeps, Vector, slice_image
-from oracle.layers import points_of_lower_layers
-from oracle.local_motion import find_local_motion
-from oracle.offline import Estimate, best_nearby, by_side
-from oracle.paired_test import best_candidate, count_wins, evidence_of, is_found_where_it_stands
-from oracle.pixels import in_range, project_bev
-from oracle.refinement import settle
-from oracle.relinking import relink
-from oracle.rigid_registration import RigidMotion
+from oracle.candidates import propose
+from oracle.changed_pixels import find_changed
+from oracle.component_tree import Node, grow, length, select_objects
+from oracle.confidence import TABLE, confidences, margin
+from oracle.height_slices import Pixel, Place, SlicedSweeps, Vector, count, empty_sweeps, ground_heights, is_residue
+from oracle.overhangs import find_overhung
+from oracle.paired_test import best_candidate, count_wins, evidence_of
+from oracle.pixels import in_range
+from oracle.registration import RigidMotion, register, register_deskewed
+from oracle.subpixel_motion import subpixel_motion
 from oracle.sweeps import Cloud, PointMotion
+from oracle.voxels import points_of_objects
+
+CHANGED_Z, CHANGED_SLICES = 4.0, 3  # what moves by its changed pixels alone: standard deviations, slices
 
 
-class VerifiedLevel(NamedTuple):
-    """Components at one pixel size and the best motion of each.
+class Part(NamedTuple):
+    """What is found of the pixels of a window, or of its copies of what lies under something.
 
     Attributes:
-        level: the components.
-        motions: of each component (y, x), finest pixels per sweep interval.
-        evidence: of each component.
-        scores: of each occupied pixel, NCC of the finest component so far that was looked for.
+        sweeps: the pixels.
+        object_of: object of each pixel that has one.
+        rigid, scores: of each object.
+        is_weak: of each object, whether it is that of changed pixels.
+        trust: of each pixel of t.
     """
 
-    level: Level
-    motions: List[Vector]
-    evidence: List[int]
+    sweeps: SlicedSweeps
+    object_of: Dict[Pixel, int]
+    rigid: List[RigidMotion]
     scores: List[float]
+    is_weak: List[bool]
+    trust: Dict[Pixel, float]
+
+    def moves(self, pixel: Pixel, surely: bool = False) -> bool:
+        """Has it an object that moves, surely = and that is not weak?"""
+        owner = self.object_of.get(pixel)
+        if owner is None or (surely and self.is_weak[owner]):
+            return False
+        return any(self.rigid[owner].flow) or self.rigid[owner].turn != 0
 
 
 class Found(NamedTuple):
-    """What a look at some points finds.
+    """What is found of the points by the sweeps of one side.
 
     Attributes:
-        owners: of each sweep, t+1 first, (N,) int64, object of each point, -1 = none.
-        rigid: motion of each object.
-        scores: of sweep t, (N,) float64, as in `VerifiedLevel`; 0 without an object.
-        confidence: of sweep t, (N,) float64.
+        parts: the window and its copies.
+        drawn: of each sweep (N,) bool, points that are drawn.
+        which: of each sweep, part and pixel of each point that is drawn.
     """
 
-    owners: List[np.ndarray]
-    rigid: List[RigidMotion]
-    scores: np.ndarray
-    confidence: np.ndarray
-
-    def moves(self, m: int) -> np.ndarray:
-        """(N,) bool, points of a sweep whose object moves."""
-        return np.array([i >= 0 and any(self.rigid[i].flow) for i in self.owners[m].tolist()], dtype=bool)
+    parts: Tuple[Part, Part]
+    drawn: List[np.ndarray]
+    which: List[List[Tuple[int, Pixel]]]
 
 
 def verified_flow(
@@ -73,193 +79,152 @@ def verified_flow(
         clouds: sweeps m = t, t-1, ... nearest first, then t+2, t+3, ...
         cloud1: sweep t+1.
         ground: (N, 3) float64, metres, frame of t+1, ground points of t and t+1 where they are known.
+
+    Convention: where sweeps after t+1 may be given, points go by them if they show their object more than twice as
+        often as those before t do. Ids: objects of both windows, then of both copies.
     """
     is_inside = in_range(clouds[0].points, config)
-    config = with_margin(config)
-    past = [cloud for cloud in clouds if cloud.intervals > 0]
-    before = estimate([cloud1, *past], ground, is_inside, config)
-    if len(past) == len(clouds):
-        return before.motion
-    future = [cloud for cloud in clouds if cloud.intervals < 0]
-    return by_side(before, estimate([cloud1, clouds[0], *future], ground, is_inside, config))
-
-
-def estimate(
-    clouds: Sequence[Cloud], ground: Sequence[np.ndarray], is_inside: np.ndarray, config: VerifiedConfig
-) -> Estimate:
-    """The motion of every point of sweep t by some sweeps, t+1 first; points of t that are not inside have none.
-
-    With thorough settings the lower layers of what is at rest are looked at once more; what that moves goes by it.
-
-    Convention: ids of the second look go on after those of the first that points of any sweep have.
-    """
-    size = config.pixel_sizes[-1]
-    seen = [cloud.takes_part & in_range(cloud.points, config) for cloud in clouds]
-    drawn = [keep.copy() for keep in seen]
-    if config.min_height is not None:
-        means = ground_heights(ground, config)
-        for cloud, keep in zip(clouds, drawn):
-            keep[keep] = ~is_residue(cloud.points[keep], means, config.min_height, config)
-    scales = [(round(s / size), False) for s in config.pixel_sizes] + [(1, True)] * config.thorough
-    found = look(clouds, drawn, seen, scales, config)
-    first = has_result(found, is_inside)
-    owners, takes_second, second = first.owners, np.zeros(len(is_inside), dtype=bool), None
-    if config.thorough:
-        at_rest = [keep & ~found.moves(m) for m, keep in enumerate(drawn)]
-        lower = [np.zeros_like(keep) for keep in drawn]
-        of_drawn = points_of_lower_layers(
-            [cloud.points[keep] for cloud, keep in zip(clouds, drawn)],
-            [rest[keep].tolist() for rest, keep in zip(at_rest, drawn)],
-            config,
-        )
-        for keep, of_sweep, wanted in zip(drawn, lower, of_drawn):
-            of_sweep[keep] = wanted
-        second = has_result(look(clouds, lower, None, [(1, False)], config), is_inside)
-        num_ids = 1 + max(own.max(initial=-1) for own in owners)
-        owners = [np.where(second.moves(m), num_ids + second.owners[m], own) for m, own in enumerate(owners)]
-        takes_second = second.moves(1)
-
-    of_t, flow = clouds[1].points, np.zeros((len(is_inside), 3))
-    for i in np.flatnonzero(owners[1] >= 0).tolist():
-        chosen = second if second is not None and takes_second[i] else first
-        flow[i, :2] = chosen.rigid[chosen.owners[1][i]].flow_at(*of_t[i, :2].tolist())
-    scores, confidence = first.scores, first.confidence
-    if second is not None:
-        scores = np.where(takes_second, second.scores, scores)
-        confidence = np.where(takes_second, second.confidence, confidence)
-    shows = [set(own.tolist()) for own in owners[2:]]
-    shown = [sum(own in of_sweep for of_sweep in shows) if own >= 0 else 0 for own in owners[1].tolist()]
-    ids = max(own.max(initial=-1) for own in owners[:2])
-    return Estimate(PointMotion([flow], owners[1], scores, confidence), shown, 1 + int(ids))
-
-
-def has_result(found: Found, is_inside: np.ndarray) -> Found:
-    """The same for the points of t that are inside; the others have no object."""
-    newest, of_t, *others = found.owners
-    of_t = np.where(is_inside, of_t, -1)
-    return found._replace(owners=[newest, of_t, *others], scores=np.where(of_t >= 0, found.scores, 0.0))
-
-
-def look(
-    clouds: Sequence[Cloud],
-    drawn: Sequence[np.ndarray],
-    seen: Optional[Sequence[np.ndarray]],
-    scales: Sequence[Tuple[int, bool]],
-    config: VerifiedConfig,
-) -> Found:
-    """What some points do, found at some scales. What could as well be displaced stands still.
-
-    Args:
-        clouds: of the sweeps, t+1 first.
-        drawn: of each sweep (N,) bool, the points.
-        seen: of each sweep (N,) bool, the same with the ground's residue; None = neither key points nor local motion
-            are asked, as in a second look.
-        scales: of each level finest pixels a side, and whether its components are undilated.
-    """
-    size = config.pixel_sizes[-1]
-    points = [cloud.points[keep] for cloud, keep in zip(clouds, drawn)]
-    times = None
-    if clouds[0].times is not None:
-        times = [cloud.times[keep] for cloud, keep in zip(clouds, drawn)]  # type: ignore[index]
-    sweeps = SlicedSweeps(
-        [slice_image(of_sweep, config) for of_sweep in points],
-        [cloud.intervals for cloud in clouds],
-        [cloud.seconds for cloud in clouds],
-        size,
-        config.point_cloud_range[:2],  # type: ignore[arg-type]
-    )
-    shifts = keypoint_shifts(sweeps, config) if config.thorough and seen is not None else None
-    levels: List[VerifiedLevel] = []
-    for block, is_undilated in scales:
-        level = find_components(sweeps, block, is_undilated, config)
-        levels.append(verify_level(sweeps, level, is_undilated, levels[-1] if levels else None, shifts, config))
-
-    # Objects, numbered by their first pixel: sweep by sweep, t+1 first, in raster order.
-    won = winners([verified.level.component for verified in levels], [verified.evidence for verified in levels])
-    chosen = list(dict.fromkeys(winner for winner in won if winner is not None))
-    object_of = {pixel: chosen.index(winner) for pixel, winner in zip(sweeps.pixels(), won) if winner is not None}
-    motions = [levels[level].motions[component] for level, component in chosen]
-    may_creep = [not levels[level].level.too_long[component] for level, component in chosen]
-    if any(time < 0 for time in sweeps.elapsed):
-        motions = [
-            best_nearby(sweeps, [pixel for pixel, owner in object_of.items() if owner == i], motion, config)
-            for i, motion in enumerate(motions)
-        ]
-    doubt: Dict[Pixel, float] = {}
-    if config.thorough and seen is not None and len(clouds) > 2:  # with history nothing creeps
-        in_sight = [cloud.points[keep] for cloud, keep in zip(clouds, seen)]
-        origins = [cloud.origin for cloud in clouds]
-        object_of, motions, doubt = find_local_motion(sweeps, object_of, motions, points, in_sight, origins, config)
-        object_of, motions = relink(sweeps, object_of, motions, config)
-        may_creep = [False] * len(motions)
-    rigid, shown = settle(sweeps, motions, may_creep, object_of, points, config, times)
-    trust, of_left_out = confidences(sweeps, object_of, [motion.flow for motion in shown], doubt)
-    for i, motion in enumerate(shown if config.thorough else []):
-        members = [pixel for pixel, owner in object_of.items() if owner == i]
-        if not margin(sweeps, members, (motion.flow[1] / size, motion.flow[0] / size))[1]:
-            rigid[i] = rigid[i]._replace(flow=(0.0, 0.0), turn=0.0)
-
-    owners = [np.full(len(cloud.points), -1, dtype=np.int64) for cloud in clouds]
-    score_of = dict(zip(sweeps.pixels(), levels[-1].scores))
-    scores, confidence = np.zeros(len(owners[1])), np.full(len(owners[1]), of_left_out)
-    for m, (cloud, keep) in enumerate(zip(clouds, drawn)):
-        rows = np.flatnonzero(keep)
-        for i, (r, c) in zip(rows.tolist(), project_bev(cloud.points[rows], config, size).tolist()):
-            owners[m][i] = object_of.get((m, r, c), -1)
-            if m == 1:
-                scores[i], confidence[i] = score_of[1, r, c], trust[1, r, c]
-    return Found(owners, rigid, scores, confidence)
-
-
-def with_margin(config: VerifiedConfig) -> VerifiedConfig:
-    """The settings with the region that is looked at: all around larger by whole coarsest pixels, at least 4 m."""
     wide = math.ceil(4.0 / config.pixel_sizes[0]) * config.pixel_sizes[0]
     x0, y0, z0, x1, y1, z1 = config.point_cloud_range
-    return config.replace(point_cloud_range=(x0 - wide, y0 - wide, z0, x1 + wide, y1 + wide, z1))
+    config = config.replace(point_cloud_range=(x0 - wide, y0 - wide, z0, x1 + wide, y1 + wide, z1))
+    past = [cloud for cloud in clouds if cloud.intervals > 0]
+    sides = [estimate([cloud1, *past], ground, config)]
+    if config.num_future > 0:
+        future = [cloud for cloud in clouds if cloud.intervals < 0]
+        sides.append(estimate([cloud1, clouds[0], *future], ground, config))
+    before, after = sides[0], sides[-1]
+    shown = [number_shown(side) for side in sides]
+    first_id, start = {}, 0
+    for part in (0, 1):
+        for side in range(len(sides)):
+            first_id[side, part] = start
+            start += len(sides[side].parts[part].rigid)
+
+    num_points = len(is_inside)
+    flow, ids = np.zeros((num_points, 3)), np.full(num_points, -1, dtype=np.int64)
+    scores, trust = np.zeros(num_points), np.full(num_points, TABLE["probabilities"][0])
+    for row, i in enumerate(np.flatnonzero(before.drawn[1]).tolist()):
+        if is_inside[i]:
+            side = int(after is not before and shown[-1][row] > 2 * shown[0][row])
+            which, pixel = sides[side].which[1][row]
+            part = sides[side].parts[which]
+            owner = part.object_of.get(pixel)
+            trust[i] = part.trust[pixel]
+            if owner is not None:
+                flow[i, :2] = part.rigid[owner].flow_at(*clouds[0].points[i, :2].tolist())
+                ids[i], scores[i] = first_id[side, which] + owner, part.scores[owner]
+    return PointMotion([flow], ids, scores, trust)
 
 
-def verify_level(
+def number_shown(found: Found) -> List[int]:
+    """Of each point of t that is drawn, how many sweeps beside t and t+1 show its object; 0 without one."""
+    objects = [[(part, found.parts[part].object_of.get(pixel)) for part, pixel in of_sweep] for of_sweep in found.which]
+    shows = [set(of_sweep) for of_sweep in objects[2:]]
+    return [sum(own in of_sweep for of_sweep in shows) if own[1] is not None else 0 for own in objects[1]]
+
+
+def estimate(every: Sequence[Cloud], ground: Sequence[np.ndarray], config: VerifiedConfig) -> Found:
+    """What is found by some sweeps, t+1 and t first."""
+    in_sight = [cloud.takes_part & in_range(cloud.points, config) for cloud in every]
+    drawn = [keep.copy() for keep in in_sight]
+    if config.min_height is not None:
+        means = ground_heights(ground, config)
+        for cloud, keep in zip(every, drawn):
+            keep[keep] = ~is_residue(cloud.points[keep], means, config)
+    places: List[List[Place]] = []
+    for cloud, keep in zip(every, drawn):
+        times = np.zeros(len(keep)) if cloud.times is None else cloud.times
+        places.append([Place(*row) for row in np.column_stack([cloud.points, times])[keep].tolist()])
+    elapsed, seconds = [cloud.intervals for cloud in every], [cloud.seconds for cloud in every]
+    sweeps = empty_sweeps(elapsed, seconds, config).drawn(places)
+    seen = [cloud.points[keep] for cloud, keep in zip(every, in_sight)]
+    tree = grow(sweeps, find_changed(sweeps, seen, [cloud.origin for cloud in every]), config)
+    num_levels = len(tree.levels)
+    copies, overhung = find_overhung(sweeps, tree.may_move, num_levels + 1)
+    nodes = [*tree.nodes, *overhung]
+    candidates, scores = propose(nodes, config)
+    proven = [verify(node, motions, num_levels, config) for node, motions in zip(nodes, candidates)]
+
+    parts = []
+    for of_part, plain in ((sweeps, tree.levels[-1]), (copies, [])):
+        object_of, chosen = select_objects(nodes, [found[1] for found in proven], num_levels, plain, of_part)
+        motions = [(0.0, 0.0) if i is None else proven[i][0] for i in chosen]
+        if min(elapsed) < 0:
+            motions = [best_nearby(of_part, object_of, owner, *at, config) for owner, at in enumerate(motions)]
+        rigid, trust = settle(of_part, object_of, motions, every[0].times is not None, config)
+        of_objects = [0.0 if i is None else scores[i] for i in chosen]
+        is_weak = [i is not None and nodes[i].level == num_levels for i in chosen]
+        parts.append(Part(of_part, object_of, rigid, of_objects, is_weak, trust))
+    home, copied = parts
+    which = []
+    for m, of_sweep in enumerate(places):
+        under = set(copies.clouds[m])
+        pixels = [(place, (m, *sweeps.pixel(place.x, place.y))) for place in of_sweep]
+        which.append([(int(p in under and copied.moves(at) and not home.moves(at, True)), at) for p, at in pixels])
+    return Found((home, copied), drawn, which)
+
+
+def verify(node: Node, candidates: Sequence[Vector], num_levels: int, config: VerifiedConfig) -> Tuple[Vector, int]:
+    """The candidate of most evidence, and its evidence. What moves by its changed pixels alone needs more standard
+    deviations, and several slices."""
+    z, slices = config.significance, 0
+    for pixel in node.members:
+        slices |= node.sweeps.at(*pixel)
+    slides = [False] * len(candidates)
+    if not node.travels:
+        slides = slides_along_itself(node.sweeps, node.members, candidates)
+    if node.level == num_levels:
+        z = CHANGED_Z
+        slides = [slid or count(slices) < CHANGED_SLICES for slid in slides]
+    counts = [count_wins(node.sweeps, node.members, motion) for motion in candidates]
+    return best_candidate([0 if slid else evidence_of(*own, z) for own, slid in zip(counts, slides)], candidates)
+
+
+def best_nearby(
+    sweeps: SlicedSweeps, object_of: Dict[Pixel, int], owner: int, y: float, x: float, config: VerifiedConfig
+) -> Vector:
+    """The motion of most evidence within two pixels of that of an object; of equals the nearest, then the first."""
+    offsets = sorted(product(range(-2, 3), repeat=2), key=lambda offset: offset[0] ** 2 + offset[1] ** 2)
+    found = [(y + dy, x + dx) for dy, dx in offsets] if y or x else [(y, x)]
+    members = [pixel for pixel, own in object_of.items() if own == owner]
+    counts = [count_wins(sweeps, members, motion) for motion in found]
+    best, most = best_candidate([evidence_of(*of_motion, config.significance) for of_motion in counts], found)
+    return best if most > 0 else (y, x)
+
+
+def settle(
     sweeps: SlicedSweeps,
-    level: Level,
-    is_undilated: bool,
-    above: Optional[VerifiedLevel],
-    shifts: Optional[Dict[Pixel, Vector]],
+    object_of: Dict[Pixel, int],
+    motions: Sequence[Vector],
+    has_times: bool,
     config: VerifiedConfig,
-) -> VerifiedLevel:
-    """The best motion of every component at one pixel size.
+) -> Tuple[List[RigidMotion], Dict[Pixel, float]]:
+    """The final motion of each object, and how far pixels of t can be trusted.
 
-    Undilated components are not looked for if they are all of their parent `above`, at the next coarser level. `shifts`
-    are those of key points, None = they are not asked.
+    Args:
+        sweeps: the pixels.
+        object_of: object of each pixel that has one.
+        motions: of each object, (y, x) finest pixels per interval.
+        has_times: whether points have times.
+        config: settings.
     """
-    is_known, parent = [False] * len(level.members), [-1] * len(level.members)
-    if above is not None:
-        parent = parents(level.component, above.level.component)
-        is_known = equals_parent(level.component, above.level.component) if is_undilated else is_known
-    scores = dict(zip(sweeps.pixels(), [0.0] * len(level.component) if above is None else above.scores))
-    motions: List[Vector] = []
-    evidence: List[int] = []
-    for i, members in enumerate(level.members):
-        estimates: List[Optional[Vector]] = [None] * (len(sweeps.images) - 1)
-        if not level.too_long[i] and not is_known[i]:
-            peaks = [find_peak(sweeps, level, members, m, config) for m in range(1, len(sweeps.images))]
-            estimates = [None if peak is None else peak[0] for peak in peaks]
-            newest = [score for _, score in filter(None, peaks)][0]
-            scores.update(dict.fromkeys(members, newest))
-        others = []
-        if above is not None:
-            others.append(above.motions[parent[i]] if parent[i] >= 0 else (0.0, 0.0))
-        if shifts is not None:
-            others.append(keypoint_motion(members, shifts))
-        found = list_motions(estimates, sweeps.elapsed[1:], others)
-        values = [0] * len(found)
-        if not level.too_long[i]:
-            values = [evidence_of(*count_wins(sweeps, members, motion), config.significance) for motion in found]
-        if config.thorough and not level.travels[i]:
-            slides = slides_along_itself(sweeps, members, found)
-            values = [0 if slid else value for slid, value in zip(slides, values)]
-        motion, most = best_candidate(values, found)
-        if is_found_where_it_stands(sweeps, members, motion):
-            motion, most = (0.0, 0.0), 0
-        motions.append(motion)
-        evidence.append(most)
-    return VerifiedLevel(level, motions, evidence, list(scores.values()))
+    size, longest = sweeps.size, config.max_object
+    members: List[List[Pixel]] = [[] for _ in motions]
+    for pixel, owner in object_of.items():
+        members[owner].append(pixel)
+    start = [(x * size, y * size) for y, x in motions]
+    if len(sweeps.images) == 2:
+        may_be_slow = [longest is None or length(tuple(own)) * size <= longest for own in members]
+        start = subpixel_motion(sweeps, object_of, motions, may_be_slow)
+    moves = [any(motion) for motion in motions]
+    points = points_of_objects(sweeps, object_of, moves)
+    given = [flow if of_object else (0.0, 0.0) for flow, of_object in zip(start, moves)]
+    apparent = [
+        motion if of_object else motion._replace(flow=flow)
+        for motion, of_object, flow in zip(register(points, given, sweeps), moves, start)
+    ]
+    rigid = register_deskewed(points, start, apparent, sweeps, config) if has_times else list(apparent)
+    shown = [(motion.flow[1] / size, motion.flow[0] / size) for motion in apparent]
+    margins = [margin(sweeps, own, motion) for own, motion in zip(members, shown)]
+    rigid = [m if is_dynamic else m._replace(flow=(0.0, 0.0), turn=0.0) for m, (_, is_dynamic) in zip(rigid, margins)]
+    return rigid, confidences(sweeps, object_of, shown, [z for z, _ in margins])

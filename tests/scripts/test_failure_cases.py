@@ -16,7 +16,7 @@ MENDED = {
     "vertical": (0.17, 0.02),
     "fast": (4.0, 0.012),
     "ground_left_in": (1.1, 0.03),
-    "wrong_frame": (0.07, 0.0005),
+    "wrong_frame": (0.05, 0.0005),
 }
 
 

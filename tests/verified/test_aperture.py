@@ -1,4 +1,4 @@
-"""The aperture rule: the oracle's answers on random lines, known ones by hand."""
+"""The aperture problem: the oracle's answers on random lines and long things, known ones by hand; trams and walls."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import torch
 from moving_scenes import for_oracle, from_images
 from oracle import aperture as oracle
 
-from cflow_torch.verified.aperture import slides_along_itself
+from cflow_torch import Sweep, VerifiedFlow, Window, make_config
+from cflow_torch.verified.aperture import both_ends_move, slides_along_itself
 
 HEIGHT, WIDTH = 61, 83
 Pixels = Set[Tuple[int, int]]
@@ -72,9 +73,10 @@ def answers(scenes: Sequence[Scene], size: float = 0.1) -> List[List[bool]]:
                     image[window, m, r, c], owner[window, m, r, c] = 1 + (r + c) % 15, number
             number += 1
     sweeps = from_images(image, size, elapsed)
-    owners = torch.from_numpy(owner.ravel())[sweeps.pixel]
+    owners = torch.from_numpy(owner.ravel())[sweeps.pixels.index]
     candidates = torch.from_numpy(np.concatenate([scene.candidates for scene in scenes]))
-    found = slides_along_itself(sweeps, owners, candidates).tolist()
+    kept = owners < number
+    found = slides_along_itself(sweeps, sweeps.pixels.take(kept.nonzero()[:, 0]), owners[kept], candidates).tolist()
     expected = []
     for window, scene in enumerate(scenes):
         for component, motions in zip(scene.components, scene.candidates.tolist()):
@@ -127,3 +129,75 @@ def test_the_share_that_must_be_covered():
     # A cell has four pixels. One way in time, 7 of 59 looks find nothing in theirs or beside it, then 7 of 58.
     assert slides({0: rail(0, 59), 1: rail(12, 71)}, (0, 13))
     assert not slides({0: rail(0, 58), 1: rail(13, 71)}, (0, 13))
+
+
+# ---------------------------------------------------------------------------------------------------- long vehicles
+
+
+def long_things(seed: int) -> Tuple[np.ndarray, np.ndarray]:
+    """(3, 4, H, W) slices and owners of nine long things, some of which move, and some of which end anywhere."""
+    rng, (height, width) = np.random.default_rng(seed), (90, 110)
+    image, owner = np.zeros((3, 4, height, width), dtype=np.uint8), np.full((3, 4, height, width), 9)
+    for number in range(9):
+        direction, length = rng.choice([0.0, 0.3, -0.4]), rng.uniform(10, 60)
+        start, speed = rng.uniform((5, 15), (25, 30)) + [30 * (number // 3), 0], rng.choice([0, 3, 5])
+        slices = rng.choice([1, 3, 5, 6, 7, 15], 200, p=[0.1, 0.3, 0.2, 0.2, 0.1, 0.1])
+        for m in range(4 if rng.random() < 0.9 else 3):
+            along = rng.uniform(0, length, 200) - m * speed + rng.choice([0, rng.normal(0, 2)])
+            r = (start[0] + along * np.sin(direction)).astype(int).clip(0, height - 1)
+            c = (start[1] + along * np.cos(direction)).astype(int).clip(0, width - 1)
+            image[number % 3, m, r, c], owner[number % 3, m, r, c] = slices, number
+    return image, owner
+
+
+def test_ends_equal_the_oracle():
+    moved = stayed = 0
+    for seed in range(12):
+        image, owner = long_things(seed)
+        sweeps, is_long = from_images(image), np.random.default_rng(seed).random(9) < 0.9
+        roots = torch.from_numpy(owner.ravel())[sweeps.pixels.index]
+        # Two levels: things by themselves, and all in one.
+        found = both_ends_move(sweeps, torch.stack((torch.full_like(roots, 9), roots)), torch.tensor([*is_long, False]))
+        assert not found[9]
+        for number, answer in enumerate(found[:9].tolist()):
+            window = int(sweeps.pixels.window[roots == number][0])
+            members = [tuple(place) for place in np.argwhere((owner[window] == number) & (image[window] > 0)).tolist()]
+            assert answer == (bool(is_long[number]) and oracle.both_ends_move(for_oracle(sweeps, window), members))
+            moved, stayed = moved + answer, stayed + (not answer)
+    assert moved > 10 and stayed > 10
+
+
+LENGTH, SPEED = 30.0, 0.8
+TALL, LOW = (-1.5, 1.5), (-1.4, -1.2)
+
+
+def side(ends: Tuple[float, float], heights: Tuple[float, float], seed: int) -> Sweep:
+    """The side of something long, sampled anew each time."""
+    rng = np.random.default_rng(seed)
+    x = np.concatenate((ends, rng.uniform(*ends, 3000)))
+    z = rng.choice(np.arange(heights[0], heights[1] + 0.1, 0.4), len(x))
+    return Sweep(np.column_stack((x, 5 + rng.normal(0, 0.02, len(x)), z)).astype(np.float32))
+
+
+def mean_flow(low_speed: float, high_speed: float, heights=TALL) -> float:
+    """Mean flow along x of what has these speeds at its ends, metres per sweep."""
+    ends = [(-15 - low_speed * k, -15 + LENGTH - high_speed * k) for k in range(-1, 5)]
+    newest, own, *older = (side(end, heights, 50 + k) for k, end in enumerate(ends))
+    region = (-25.0, -5.0, -np.inf, 25.0, 15.0, np.inf)
+    (result,) = VerifiedFlow(make_config("default", point_cloud_range=region))([Window(own, newest, tuple(older))])
+    assert not result.residual_flow[:, 1].abs().max() > 0.1
+    return float(result.residual_flow[:, 0].mean())
+
+
+def test_a_tram_moves():
+    assert abs(mean_flow(SPEED, SPEED) - SPEED) < 0.05
+    assert abs(mean_flow(-SPEED, -SPEED) + SPEED) < 0.05
+
+
+def test_a_wall_whose_ends_do_not_go_together_is_static():
+    for low, high in ((0.0, 0.0), (SPEED, 0.0), (0.0, SPEED), (SPEED, -SPEED), (SPEED, 0.5 * SPEED)):
+        assert mean_flow(low, high) == 0.0
+
+
+def test_a_rail_that_seems_to_keep_pace_is_static():
+    assert mean_flow(SPEED, SPEED, LOW) == 0.0

@@ -1,42 +1,60 @@
-"""Motion candidates: the oracle's peaks and list of motions; sweeps that a window lacks change no choice."""
+"""Motion candidates: the oracle's peaks and motions; sweeps that a window lacks change no choice."""
 
 from __future__ import annotations
+
+from typing import Dict, List, Sequence, Tuple
 
 import numpy as np
 import pytest
 import torch
 from moving_scenes import for_oracle
 from oracle import candidates as oracle
-from oracle.component_tree import find_components as oracle_components
+from oracle.changed_pixels import Change
+from oracle.component_tree import grow
 from scenes import config, scene, sweeps_of
 
-from cflow_torch.verified.candidates import _find_peaks, list_motions
-from cflow_torch.verified.component_tree import find_components
+from cflow_torch.verified import candidates as fast
+from cflow_torch.verified.changed_pixels import ChangedPixels
+from cflow_torch.verified.component_tree import find_components, movable_nodes
 
 
-@pytest.mark.parametrize("block", [1, 2])
-def test_peaks_equal_the_oracle(block):
-    settings, moved = config("verified", num_history=2, max_speed=8.0, pixel_size=0.12), 0
-    windows = [scene(seed, num_history=seed % 3) for seed in range(4)]
-    sweeps = sweeps_of(windows, settings)
-    level = find_components(sweeps, block, False, settings)
-    wanted = torch.arange(level.num_components) % 5 > 0
-    estimates, scores, available = _find_peaks(level, wanted, sweeps, settings)
-    assert not available[~wanted].any() and not estimates[~available].any()
-    start = 0
+def distinct(motions: Sequence[Sequence[float]]) -> List[float]:
+    """Motions in the order in which ties are decided, flat; without those of 0, which stand for what is not known."""
+    rounded = [(round(y, 6) + 0.0, round(x, 6) + 0.0) for y, x in motions]
+    return [value for motion in dict.fromkeys(rounded) if any(motion) for value in motion]
+
+
+@pytest.mark.parametrize("largest", [1 << 12, 60])
+def test_candidates_and_scores_equal_the_oracle_in_a_batch(largest, monkeypatch):
+    for module, name in ((fast, "_LARGEST_BOX"), (oracle, "LARGEST_BOX")):
+        monkeypatch.setattr(module, name, largest)
+    settings = config("verified", num_history=2, max_speed=8.0, pixel_sizes=(0.36, 0.12))
+    sweeps, moved, coarse = sweeps_of([scene(seed, num_history=seed % 3) for seed in range(4)], settings), 0, 0
+    every = torch.ones(sweeps.num_pixels, dtype=torch.bool)
+    has_changed = every & (sweeps.pixels.col % 3 > 0) & sweeps.has_history[sweeps.pixels.window]
+    components = find_components(sweeps, ChangedPixels(every, has_changed), (3, 1))
+    nodes = movable_nodes(sweeps, components, None)
+    found = fast.propose(nodes, components, sweeps, settings)
+    assert not (torch.signbit(found.motion) & (found.motion == 0)).any()
+    numbers: Dict[Tuple[int, ...], int] = {}
+    of_pixels = (nodes.members.step, nodes.members.row, nodes.members.col)
+    columns = (nodes.node, nodes.window[nodes.node], nodes.level[nodes.node], *of_pixels)
+    for number, *name in zip(*(values.tolist() for values in columns)):
+        numbers.setdefault(tuple(name), number)
+    checked = 0
     for window in range(4):
-        of_window = for_oracle(sweeps, window)
-        expected = oracle_components(of_window, block, False, settings)
-        for i, members in enumerate(expected.members, start):
-            for m in range(1, len(of_window.images) if wanted[i] else 1):
-                peak = oracle.find_peak(of_window, expected, members, m, settings)
-                assert available[i, m - 1] == (peak is not None)
-                if peak is not None:
-                    assert estimates[i, m - 1].tolist() == pytest.approx(peak[0], abs=1e-9)
-                    assert float(scores[i, m - 1]) == pytest.approx(peak[1], abs=1e-6)
-                    moved += int(any(peak[0]))
-        start += len(expected.members)
-    assert moved > 10
+        drawn = for_oracle(sweeps, window)
+        changed = {p for p in drawn.pixels() if p[2] % 3 > 0 and len(drawn.images) > 2}
+        tree = grow(drawn, Change(set(drawn.pixels()), changed), settings.replace(max_object=None))
+        motions, scores = oracle.propose(tree.nodes, settings)
+        for node, of_node, score in zip(tree.nodes, motions, scores):
+            number = numbers[(window, node.level, *node.members[0])]
+            mine, expected = (distinct(motions) for motions in (found.motion[number].tolist(), of_node))
+            assert mine == pytest.approx(expected, abs=2e-6)
+            assert float(found.score[number]) == pytest.approx(score, abs=1e-6)
+            moved, checked = moved + len(mine), checked + 1
+            coarse += oracle.block_of(node, settings) > (3, 1)[min(node.level, 1)]
+    assert checked == nodes.count and moved > 100 and (coarse > 5) == (largest == 60)
 
 
 def random_estimates(seed: int, num_sweeps: int):
@@ -48,15 +66,15 @@ def random_estimates(seed: int, num_sweeps: int):
     available = rng.random((count, num_sweeps)) < 0.7
     intervals = np.where(rng.random((count, 1)) < 0.7, 1.0, 1.0625) * np.arange(1, num_sweeps + 1)
     given[~available], intervals[~available] = np.nan, 0.0  # must not be looked at
-    return tuple(map(torch.from_numpy, (given, available, intervals, rng.normal(0, 2, (count, 2)))))
+    return tuple(map(torch.from_numpy, (given, available, intervals)))
 
 
 @pytest.mark.parametrize("num_sweeps", [1, 2, 3, 5])
 def test_motions_equal_the_oracle(num_sweeps):
-    given, available, intervals, other = random_estimates(num_sweeps, num_sweeps)
-    found = list_motions(given, available, intervals, [other])
-    assert found.shape == (300, num_sweeps + 1 + (num_sweeps > 1), 2)
+    given, available, intervals = random_estimates(num_sweeps, num_sweeps)
+    found = fast.list_motions(given, available, intervals)
+    assert found.shape == (300, num_sweeps + (num_sweeps > 1), 2)
     assert not (torch.signbit(found) & (found == 0)).any()
-    for mine, f, known, k, parent in zip(*(v.tolist() for v in (found, given, available, intervals, other))):
+    for mine, f, known, k in zip(*(v.tolist() for v in (found, given, available, intervals))):
         estimates = [tuple(v) if is_known else None for v, is_known in zip(f, known)]
-        np.testing.assert_allclose(mine, oracle.list_motions(estimates, k, [tuple(parent)]), atol=1e-9)
+        np.testing.assert_allclose(mine, oracle.list_motions(estimates, k), atol=1e-9)

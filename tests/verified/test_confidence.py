@@ -27,26 +27,26 @@ def numbered(monkeypatch):
 def test_the_table_is_monotone_and_the_oracle_reads_it():
     assert oracle.TABLE == confidence.TABLE
     table, start, rows = confidence.TABLE, 1, []
-    for bounds in ("crowd", "share", "doubt", *4 * ("margin",)):
-        length = len(table[bounds]) + (bounds != "doubt")
+    for bounds in ("crowd", "share", *4 * ("margin",)):
+        length = len(table[bounds]) + 1
         rows.append(table["probabilities"][start : start + length])
         start += length
     assert start == len(table["probabilities"]) and all(0 < p < 1 for p in table["probabilities"])
-    unlinked, still, doubt, *moving = rows
-    assert all(row == sorted(row, reverse=True) and row[0] > row[-1] for row in (unlinked, doubt))
-    assert all(row == sorted(row) and row[0] < row[-1] for row in (still, *moving))
+    unlinked, static, *moving = rows
+    assert unlinked == sorted(unlinked, reverse=True) and unlinked[0] > unlinked[-1]
+    assert all(row == sorted(row) and row[0] < row[-1] for row in (static, *moving))
 
 
 def test_every_bin_equals_the_oracle(numbered):
     seen = set()
     for seed in range(16):
-        settings = config("verified", num_history=seed % 3, min_height=0.3, thorough=seed % 2 > 0, pixel_size=0.2)
+        settings = config("verified", num_history=seed % 3, min_height=0.3, pixel_size=0.2)
         settings = settings.replace(max_object=4.0)
         window = scene(500 + seed, num_history=seed % 3, poses=seed % 5 > 0, stamps=seed % 2 > 0)
         result = flow_as_oracle(window, settings)
         seen |= {round(64 * value) for value in result.confidence[result.is_valid].tolist()}
     kinds = [sum(low <= place < high for place in seen) for low, high in ((1, 6), (6, 11), (11, 23), (23, 35))]
-    assert min(kinds) >= 2, (kinds, seen)  # of every kind: not linked, still, moving in pairs, moving with history
+    assert min(kinds) >= 2, (kinds, seen)  # of every kind: not linked, static, moving in pairs, moving with history
 
 
 def test_far_begins_where_the_table_says(numbered, monkeypatch):
@@ -71,15 +71,15 @@ def test_zero_for_what_took_no_part_and_none_of_the_other_methods():
     assert not result.confidence[~result.is_valid].any() and (result.confidence[result.is_valid] > 0).all()
 
 
-def test_a_wall_is_trusted_less_than_a_car():
+def test_a_wall_is_trusted_less_than_a_car(monkeypatch):
     # Nothing but its ends tells how far a wall slid along itself; the car has two sides.
     rng = np.random.default_rng(0)
     wall = np.stack((rng.uniform(-3, 3, 600), np.full(600, 4.05), rng.uniform(-1, 1, 600)), 1)
     long_side = np.stack((rng.uniform(-2, 2, 300), np.full(300, -3.05), rng.uniform(-1, 1, 300)), 1)
     car = np.concatenate((long_side, np.stack((np.full(300, -2.05), rng.uniform(-5, -3, 300), long_side[:, 2]), 1)))
     points = np.concatenate((wall, car))
-    settings = MODEL.replace(thorough=False)  # without the aperture test
-    (result,) = VerifiedFlow(settings)([Window(Sweep(points), Sweep(points + (0.3, 0.0, 0.0)))])
+    monkeypatch.setattr(confidence, "_Z", 0.0)  # both are dynamic
+    (result,) = VerifiedFlow(MODEL)([Window(Sweep(points), Sweep(points + (0.3, 0.0, 0.0)))])
     assert result.residual_flow[:, 0].min() > 0.2
     assert result.confidence[:600].max() < result.confidence[600:].min()
 

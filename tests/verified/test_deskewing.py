@@ -9,14 +9,13 @@ import numpy as np
 import pytest
 import torch
 from moving_scenes import Scene, moving_scene, one_object
-from oracle import deskewing as oracle
-from oracle import rigid_registration
+from oracle import registration as oracle
 from preset_windows import changed
 from scenes import assert_same_bits, flow_as_oracle
 from turning_car import MODEL, turning_car
 
 from cflow_torch import CFlowError, FlowResult, Sweep, VerifiedFlow, Window
-from cflow_torch.verified.deskewing import deskew, register_deskewed
+from cflow_torch.verified.refinement import deskew, register_deskewed
 from cflow_torch.verified.rigid_registration import register
 
 HISTORY = MODEL.replace(num_history=3)
@@ -59,11 +58,11 @@ def test_motion_and_points_equal_the_oracle(num_past, num_future):
     found = register_deskewed(points, scene.sweeps, scene.flow, seen)
     sharp, drawn = deskew(points, scene.sweeps, seen)
     assert len(sharp.owner) < len(points.owner), "some leave the region or meet another object"
-    expected: List[rigid_registration.RigidMotion] = []
+    expected: List[oracle.RigidMotion] = []
     places: List[Tuple[int, ...]] = []
     stretched = 0
     for number, window in enumerate(scene.windows()):
-        of_window = rigid_registration.register(window.points(), window.flow, window.sweeps)
+        of_window = oracle.register(window.points(), window.flow, window.sweeps)
         stretch = oracle.stretch_of(window.points(), of_window, window.sweeps)
         stretched += sum(s not in (0.0, 1.0) for s in stretch)
         moved = oracle.deskew(window.points(), of_window, window.sweeps, window.config)
@@ -73,9 +72,11 @@ def test_motion_and_points_equal_the_oracle(num_past, num_future):
     x, y = (torch.round(1e6 * values).long().tolist() for values in sharp.position)
     names = zip(sharp.window.tolist(), sharp.step.tolist(), sharp.owner.tolist(), sharp.part.tolist(), x, y)
     assert sorted(names) == sorted(places)
-    image = drawn.window * num_steps + drawn.step
-    place = (image * drawn.grid.height + drawn.row) * drawn.grid.width + drawn.col
-    assert torch.equal(place, drawn.pixel) and torch.equal(drawn.number[drawn.pixel], torch.arange(len(drawn.pixel)))
+    image = drawn.pixels.window * num_steps + drawn.pixels.step
+    place = (image * drawn.grid.height + drawn.pixels.row) * drawn.grid.width + drawn.pixels.col
+    assert torch.equal(place, drawn.pixels.index)
+    assert torch.equal(drawn.rank[place], torch.arange(1, len(place) + 1).int())
+    assert int((drawn.rank > 0).sum()) == len(place)
     for name in ("flow", "turn", "centre"):
         values = np.array([getattr(motion, name) for motion in expected])
         np.testing.assert_allclose(getattr(found, name), values.reshape(getattr(found, name).shape), atol=1e-6)
@@ -146,12 +147,6 @@ def test_times_of_zero_and_times_of_some_sweeps_change_no_bit(num_history):
     assert_same_bits(model([at_once(window)])[0], expected)
     some = late(window, 1)
     assert_same_bits(model([replace(some, pc1=replace(some.pc1, point_times=None))])[0], expected)
-
-
-def test_what_is_not_thorough_does_not_look_at_them():
-    window, model = turning_car(4, 1), VerifiedFlow(MODEL.replace(num_history=1, thorough=False))
-    expected, found = (model([w])[0] for w in (window, late(window, 1)))
-    assert_same_bits(found, expected)
 
 
 # ------------------------------------------------------------------------------------------------------- what is given

@@ -1,58 +1,68 @@
-"""Height-sliced sweeps: the oracle's images, coarse ones as well, slices by hand."""
+"""Height-sliced sweeps: the oracle's pixels and ground residue on random scenes, slices and neighbourhoods by hand."""
 
 from __future__ import annotations
 
 import math
-from typing import List
 
 import numpy as np
 import pytest
 import torch
-from moving_scenes import from_images
-from oracle import compensate, in_range
-from oracle.height_slices import coarsen, slice_image, slice_of
-from scenes import config, same_bits, scene, sweeps_of
+from moving_scenes import for_oracle, from_images
+from oracle.height_slices import NUM_SLICES, empty_sweeps, ground_heights, is_residue, slice_of
+from oracle.sweeps import compensate, ground_points
+from scenes import RANGE, config, same_bits, scene, sweeps_of
 
-from cflow_torch import Window
+from cflow_torch import Sweep, Window
 from cflow_torch.verified import height_slices as fast
-from cflow_torch.verified.height_slices import HeightSlicedSweeps, count_slices
+from cflow_torch.windows.bev_grid import Grid
+from cflow_torch.windows.ground_heights import GroundHeights
 
+SIZE = 0.25
 PLAIN = config("verified", min_height=None, num_history=3)
+SETTINGS = config("verified", min_height=0.4, num_history=1)
+LOW, HIGH = np.array(RANGE[:3]), np.array(RANGE[3:])
 
 
-def images_of(sweeps: HeightSlicedSweeps) -> np.ndarray:
-    """(B, S, H, W)"""
-    shape = (sweeps.num_windows, sweeps.num_steps, sweeps.grid.height, sweeps.grid.width)
-    return sweeps.image[:-1].view(shape).numpy()
-
-
-def expected_images(window: Window) -> List[np.ndarray]:
-    clouds, cloud1 = compensate(window, PLAIN)
-    inside = [c.points[c.takes_part & in_range(c.points, PLAIN)] for c in (cloud1, *clouds)]
-    return [slice_image(points, PLAIN) for points in inside]
-
-
-def test_images_equal_the_oracle_in_a_batch():
+def test_pixels_equal_the_oracle_in_a_batch():
     windows = [scene(seed, num_history=seed % 4) for seed in range(6)]
-    found = images_of(sweeps_of(windows, PLAIN))
-    assert found.shape[1] == 5
-    for images, window in zip(found, windows):
-        expected = expected_images(window)
-        assert np.array_equal(images[: len(expected)], expected) and not images[len(expected) :].any()
-    assert set(found.ravel().tolist()) == set(range(16))
+    sweeps, found = sweeps_of(windows, PLAIN), set()
+    for window, given in enumerate(windows):
+        drawn, (clouds, cloud1) = for_oracle(sweeps, window), compensate(given, PLAIN)
+        assert len(drawn.images) == len(clouds) + 1
+        for image, cloud in zip(drawn.images, (cloud1, *clouds)):
+            inside = cloud.takes_part & ((cloud.points >= LOW) & (cloud.points <= HIGH)).all(1)
+            points = [(*row, 0.0) for row in cloud.points[inside].tolist()]
+            assert image == empty_sweeps([], [], PLAIN).drawn([points]).images[0]
+            found |= set(image.values())
+    assert found == set(range(1, 16))
 
 
-@pytest.mark.parametrize("block", [1, 2, 3])
-def test_coarse_pixels_have_the_slices_of_all_their_pixels(block):
-    rng = np.random.default_rng(block)
-    images = (rng.integers(0, 16, (2, 3, 11, 14)) * (rng.random((2, 3, 11, 14)) < 0.2)).astype(np.uint8)
+def test_upper_bits_hold_the_slices_around_and_rows_do_not_touch():
+    images = np.zeros((2, 2, 9, 11), dtype=np.uint8)
+    images[0, 0, 0, 10], images[0, 0, 1, 0], images[1, 1, 4, 5], images[1, 1, 5, 6] = 1, 2, 4, 8
     sweeps = from_images(images)
-    coarse, column = sweeps.coarsen(block)
-    for window in range(2):
-        assert np.array_equal(coarse[window], [coarsen(image, block) for image in images[window]])
-    height, width = coarse.shape[2:]
-    assert same_bits(column, (sweeps.window * height + sweeps.row // block) * width + sweeps.col // block)
-    assert same_bits(sweeps.slices_at(sweeps.window, sweeps.step, sweeps.row, sweeps.col), sweeps.slices)
+    drawn = sweeps.image[: images.size].view(images.shape).numpy()
+    assert np.array_equal(drawn & fast.OWN, images)
+    for window, step, row, col in np.ndindex(*images.shape):
+        around = images[window, step, max(row - 1, 0) : row + 2, max(col - 1, 0) : col + 2]
+        assert drawn[window, step, row, col] >> NUM_SLICES == np.bitwise_or.reduce(around, axis=None)
+    assert not sweeps.image[images.size :].any()
+
+
+def test_copies_are_images_of_their_own():
+    sweeps = sweeps_of([scene(0), scene(1)], PLAIN)
+    before, rows = sweeps.image[: sweeps.image.numel() // 2].clone(), torch.arange(0, 400, 7)
+    rows = rows[sweeps.pixel_of_point[rows] < sweeps.num_pixels]
+    copies = sweeps.with_copies(rows)
+    assert same_bits(copies.image[: len(before)], before)
+    of_copy = copies.pixels.take(copies.pixel_of_point[len(sweeps.pixel_of_point) :])
+    own = copies.pixels.take(sweeps.pixel_of_point[rows])
+    assert torch.equal(of_copy.window, own.window + 2)
+    assert all(torch.equal(getattr(of_copy, name), getattr(own, name)) for name in ("step", "row", "col"))
+    slices = copies.image[of_copy.index] & fast.OWN
+    assert torch.equal(slices, of_copy.slices) and bool((slices & ~own.slices == 0).all())
+    points = fast.slice_of(sweeps.batch.positions[2, rows], fast.SLICE_HEIGHT).long()
+    assert bool(((slices.long() >> points) & 1).all()) and (slices != own.slices).any()
 
 
 def test_slices_by_hand():
@@ -62,4 +72,63 @@ def test_slices_by_hand():
     infinite = torch.tensor([math.inf, -math.inf, math.nan], dtype=torch.float64)
     assert fast.slice_of(infinite, 0.5).tolist() == [0, 0, 0]
     every = torch.arange(16, dtype=torch.uint8)
-    assert count_slices(every).tolist() == [bin(value).count("1") for value in range(16)]
+    assert fast.count_slices(every).tolist() == [bin(value).count("1") for value in range(16)]
+
+
+# ------------------------------------------------------------------------------------------------ ground residue
+
+
+def random_window(seed: int) -> Window:
+    """Sloped ground with a mask, remnants of it without, some posts; every third has no masks."""
+    rng = np.random.default_rng(seed)
+    slope, sweeps = rng.normal(0, 0.05, 2), []
+
+    def on_ground(count: int, noise: float) -> np.ndarray:
+        xy = rng.uniform(LOW[:2] - 1, HIGH[:2] + 1, (count, 2))
+        return np.column_stack([xy, xy @ slope - 1 + rng.normal(0, noise, count)])
+
+    for _ in range(3):
+        ground, remnants = on_ground(int(rng.integers(0, 150)), 0.05), on_ground(int(rng.integers(0, 120)), 0.3)
+        ground[:3] = np.array([[np.nan], [np.inf], [-np.inf]])[: len(ground)]
+        posts = on_ground(int(rng.integers(1, 12)), 0.1).repeat(6, 0)
+        posts += rng.uniform(-0.3, 0.3, posts.shape) + [0, 0, 0.4]
+        mask = np.repeat([True, False], [len(ground), len(remnants) + len(posts)])
+        sweeps.append(Sweep(np.concatenate([ground, remnants, posts]), None if seed % 3 == 2 else mask))
+    return Window(sweeps[0], sweeps[1], (sweeps[2],))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_ground_residue_equals_the_oracle_in_a_batch(seed):
+    windows, dropped = [random_window(4 * seed + i) for i in range(4)], 0
+    sweeps = sweeps_of(windows, SETTINGS)
+    batch, is_drawn = sweeps.batch, sweeps.pixel_of_point < sweeps.num_pixels
+    for number, window in enumerate(windows):
+        clouds, cloud1 = compensate(window, SETTINGS)
+        means = ground_heights([ground_points(window.pc0, clouds[0]), ground_points(window.pc1, cloud1)], SETTINGS)
+        for step, cloud in enumerate((cloud1, *clouds)):
+            inside = cloud.takes_part & ((cloud.points >= LOW) & (cloud.points <= HIGH)).all(1)
+            expected = ~is_residue(cloud.points[inside], means, SETTINGS)
+            rows = (batch.image == number * batch.num_steps + step) & batch.takes_part
+            assert is_drawn[rows].tolist() == expected.tolist()
+            dropped += int((~expected).sum())
+    assert dropped > 20
+
+
+def test_ground_heights_do_not_depend_on_the_order_of_points_nor_overflow():
+    rng, grid = np.random.default_rng(5), Grid(SIZE, RANGE[:3], RANGE[3:])
+    points = torch.from_numpy(rng.uniform(RANGE[:3], RANGE[3:], (400, 3)).T.copy())
+    sums = [GroundHeights(1, grid, torch.device("cpu")) for _ in range(3)]
+    sums[0].add(0, points)
+    for part in points[:, torch.from_numpy(rng.permutation(400))].split(70, 1):
+        sums[1].add(0, part)
+    assert same_bits(sums[0].mean(), sums[1].mean())
+    sums[2].add(0, torch.tensor([[1.0] * 6, [2.0] * 6, [1e300] * 6], dtype=torch.float64))
+    assert sums[2].mean().max() == 10**10
+
+
+def test_ground_counts_of_the_newest_pair_only():
+    one, other = random_window(0), random_window(1)
+    heights = sweeps_of([one, other], SETTINGS).batch.ground
+    pairs = [Window(window.pc0, window.pc1) for window in (one, other)]
+    assert same_bits(heights.mean(), sweeps_of(pairs, SETTINGS).batch.ground.mean())
+    assert sweeps_of([one], config("verified", min_height=None, num_history=1)).batch.ground is None

@@ -68,7 +68,6 @@ def test_equals_the_oracle_on_random_scenes(seed):
         max_speed=(None, 6.0)[seed % 3 == 0],
         max_object=(None, 4.0)[seed % 3 > 0],
         min_height=(None, 0.3)[seed % 5 > 0],
-        thorough=seed % 4 != 1,
     )
     window = scene(700 + seed, num_history=past, num_future=future, poses=seed % 5 > 0, stamps=seed % 2 > 0)
     result, (without,) = flow_as_oracle(window, settings), make_model(settings)([replace(window, pcf=())])

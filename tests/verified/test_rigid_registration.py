@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from moving_scenes import Scene, moving_scene, one_object
-from oracle import rigid_registration as oracle
+from oracle import registration as oracle
 
 from cflow_torch.verified.rigid_motion import RigidMotion
 from cflow_torch.verified.rigid_registration import register

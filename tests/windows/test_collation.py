@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 import torch
 from preset_windows import PRESETS, changed, num_moving, small, windows_for
-from scenes import RANGE, assert_same_bits, assert_zeros, config, flow_as_oracle, pose, rows_of, scene
+from scenes import RANGE, assert_same_bits, assert_zeros, config, flow_as_oracle, pose, rows_of, same_bits, scene
 
 from cflow_torch import FlowResult, Sweep, Window, make_model
 from cflow_torch.config import Config
 from cflow_torch.windows import memory
 from cflow_torch.windows.bev_grid import Grid
+from cflow_torch.windows.collation import Batch, make_batch
 from cflow_torch.windows.memory import split_windows
 
 CPU = torch.device("cpu")
@@ -134,6 +135,43 @@ def test_windows_are_grouped_by_memory(monkeypatch):
     assert sum(sizes(1_000_000)) == 5 and 1 < len(sizes(1_000_000)) < 5
     monkeypatch.setattr(memory, "_BYTES_ON_CPU", 1)
     assert sizes() == [1] * 5 and split_windows([], grid, CPU, 160, None) == []
+
+
+def test_a_batch_of_twice_the_windows_holds_the_same_points():
+    settings = small("default")
+    windows = windows_for(settings, 2)
+    batch = make_batch(windows, settings, Grid(0.5, RANGE[:3], RANGE[3:]), CPU, 3, needs_times=True)
+    twice = batch.with_twice_the_windows()
+    assert (twice.num_windows, twice.num_steps) == (4, batch.num_steps) and twice.positions is batch.positions
+    assert twice.image is batch.image and twice.rows == batch.rows, "no point lies in a window that was added"
+    for name in ("elapsed", "seconds", "origin"):
+        before, after = getattr(batch, name), getattr(twice, name)
+        assert torch.equal(after[:2], before) and torch.equal(after[2:], before)
+
+
+def points_of(batch: Batch, window: int, step: int) -> torch.Tensor:
+    return batch.positions[:, batch.image == (window * batch.num_steps + step if step < batch.num_steps else -1)]
+
+
+def test_both_sides_are_the_windows_without_later_and_without_older_sweeps():
+    settings, grid = config("verified", num_history=3, num_future=3), Grid(0.25, RANGE[:3], RANGE[3:])
+    sides = ((3, 1), (0, 2), (1, 0))
+    windows = [scene(seed, num_history=h, num_future=f) for seed, (h, f) in enumerate(sides)]
+    batch = make_batch(windows, settings, grid, CPU, 3, needs_times=True)
+    both, copied = batch.both_sides()
+    assert both.num_windows == 6 and len(both.image) == len(batch.image) + len(copied)
+    assert same_bits(both.positions[:, -len(copied) :], batch.positions[:, copied]), "copies are behind all points"
+    assert bool((batch.image[copied] % batch.num_steps < 2).all())
+    for number, window in enumerate(windows):
+        past, after = (replace(window, **left_out) for left_out in ({"pcf": ()}, {"pch": ()}))
+        for place, side in ((number, past), (3 + number, after)):
+            alone = make_batch([side], settings, grid, CPU, 3, needs_times=True)
+            for step in range(both.num_steps):
+                expected = points_of(alone, 0, step)  # none where the window has no such step
+                assert same_bits(points_of(both, place, step), expected)
+            for name in ("elapsed", "seconds", "origin"):
+                found, expected = getattr(both, name)[place], getattr(alone, name)[0]
+                assert torch.equal(found[: alone.num_steps], expected) and not found[alone.num_steps :].any()
 
 
 # ---------------------------------------------------------------------------------------------- forms of arrays

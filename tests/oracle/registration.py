@@ -1,4 +1,4 @@
-"""Rigid registration: a few Gauss-Newton steps on the voxel centroids of objects.
+"""Rigid registration: a few Gauss-Newton steps on the voxel centroids of objects; de-skewing.
 
 An object turns about a centre and moves on, both in proportion to the time that passes. Lengths are units of 1/1024 m
 from the lower corner of the region; the turn is the tangent of half the angle.
@@ -8,17 +8,18 @@ from __future__ import annotations
 
 from typing import List, NamedTuple, Sequence, Tuple
 
+from cflow_torch.config import VerifiedConfig
 from oracle.height_slices import SlicedSweeps, Vector
-from oracle.voxel_centroids import UNITS, Point, Voxel, Voxels, centroids, meeting_weight, nearest, whole
+from oracle.voxels import UNITS, Point, Voxel, Voxels, centroids, meeting_weight, nearest, whole
 
 SIGMA = 0.15  # metres, of the weight of a pair of voxels
 MOST_TIME = 2.5  # sweep intervals: older sweeps are not looked at
-NUM_STEPS = 4
-LONGEST_WAY = 0.15  # metres per interval, in x and in y, from the given flow
+NUM_STEPS = 6
+LONGEST_WAY = 0.15 * UNITS  # per interval, in x and in y, from the given flow
 LARGEST_TURN = 0.1  # tangent of half the angle per interval
-HELD = 150.0  # perfect pairs of voxels that the given translation is worth
-HELD_SHARE = 0.2  # and, besides, this share of the pairs that were found
+HELD, HELD_SHARE = 150.0, 0.2  # perfect pairs that the given translation is worth, and besides a share of those found
 HELD_TURN = 20.0  # perfect pairs at a distance of 1 m that no turn is worth
+LEAST_STRETCH = 0.75  # where the time between points is a smaller share of that between sweeps, it is not believed
 
 
 class RigidMotion(NamedTuple):
@@ -47,15 +48,7 @@ class Pair(NamedTuple):
 
 
 def register(points: Sequence[Point], flow: Sequence[Vector], sweeps: SlicedSweeps) -> List[RigidMotion]:
-    """Refine the motion of every object.
-
-    Args:
-        points: of all objects, all sweeps; the points of a pixel have one object.
-        flow: of each object, (x, y) metres per sweep interval, to start from.
-        sweeps: the window.
-
-    Returns:
-        Of each object. One without points at t keeps its flow; its centre is the lower corner.
+    """Refine the motion of every object, from (x, y) metres per interval. One without points at t keeps its flow.
 
     Convention: of the start and the steps that follow, the one whose pairs weigh most counts, of equals the first.
     """
@@ -70,17 +63,17 @@ def register(points: Sequence[Point], flow: Sequence[Vector], sweeps: SlicedSwee
         centre = (sum(v.x for v in at_t) // len(at_t), sum(v.y for v in at_t) // len(at_t))
         given = (start[0] * UNITS, start[1] * UNITS)
         way, turn, most = given, 0.0, -1.0
-        best_way, best_turn = way, turn
+        best = way, turn
         for _ in range(NUM_STEPS + 1):
             found = find_pairs(members, voxels, sweeps, centre, way, turn)
             weight = sum(pair.weight for pair in found)
             if weight > most:
-                best_way, best_turn, most = way, turn, weight
+                best, most = (way, turn), weight
             dx, dy, angle = gauss_newton(found, given, way, turn)
-            way = (limit(way[0] + dx, given[0]), limit(way[1] + dy, given[1]))
-            turn = min(max(turn + angle / 2, -LARGEST_TURN), LARGEST_TURN)
+            way = (limit(way[0] + dx, given[0], LONGEST_WAY), limit(way[1] + dy, given[1], LONGEST_WAY))
+            turn = limit(turn + angle / 2, 0.0, LARGEST_TURN)
         corner = (centre[0] / UNITS + lower[0], centre[1] / UNITS + lower[1])
-        result.append(RigidMotion((best_way[0] / UNITS, best_way[1] / UNITS), best_turn, corner))
+        result.append(RigidMotion((best[0][0] / UNITS, best[0][1] / UNITS), best[1], corner))
     return result
 
 
@@ -103,7 +96,7 @@ def find_pairs(
                 x, y = whole(x + centre[0]), whole(y + centre[1])
             else:  # on to t+1
                 x, y = moved(voxel, centre, way, turn, time)
-            partner = nearest(voxels, step if voxel.step == 0 else 0, voxel.part, x, y, sweeps.pixel_size)
+            partner = nearest(voxels, step if voxel.step == 0 else 0, voxel.part, x, y, sweeps)
             if partner is None or partner.owner != voxel.owner:
                 continue
             earlier, later = (partner, voxel) if voxel.step == 0 else (voxel, partner)
@@ -154,6 +147,63 @@ def gauss_newton(found: Sequence[Pair], given: Vector, way: Vector, turn: float)
     return (b_x - a_y * angle) / a, (b_y - a_x * angle) / a, angle
 
 
-def limit(value: float, given: float) -> float:
-    """At most `LONGEST_WAY` from the given one."""
-    return min(max(value, given - LONGEST_WAY * UNITS), given + LONGEST_WAY * UNITS)
+def limit(value: float, middle: float, most: float) -> float:
+    """At most `most` from the middle."""
+    return min(max(value, middle - most), middle + most)
+
+
+def register_deskewed(
+    points: Sequence[Point],
+    start: Sequence[Vector],
+    seen: Sequence[RigidMotion],
+    sweeps: SlicedSweeps,
+    config: VerifiedConfig,
+) -> List[RigidMotion]:
+    """The motion of every object per interval: `seen`, which `register` found from `start`, divided by how much longer
+    the time between its points is than that between the sweeps; with more than two sweeps registered once more."""
+    stretch = stretch_of(points, seen, sweeps)
+    divided = [m._replace(flow=(m.flow[0] / s, m.flow[1] / s)) for m, s in zip(seen, stretch)]
+    if len(sweeps.images) == 2:
+        return divided
+    sharp = deskew(points, divided, sweeps, config)
+    again = register(sharp, [(x / s, y / s) for (x, y), s in zip(start, stretch)], sweeps)
+    present = {point.owner for point in points}
+    return [again[owner] if owner in present else motion for owner, motion in enumerate(divided)]
+
+
+def stretch_of(points: Sequence[Point], seen: Sequence[RigidMotion], sweeps: SlicedSweeps) -> List[float]:
+    """Of each object: sum of w k (k + late) over the sum of w k^2, over its pairs of voxels; 1 without any."""
+    voxels, (x0, y0) = centroids(points, sweeps), sweeps.lower
+    result = []
+    for owner, motion in enumerate(seen):
+        members = [voxel for voxel in voxels.values() if voxel.owner == owner]
+        members = members if any(voxel.step == 1 for voxel in members) else []
+        centre = (round((motion.centre[0] - x0) * UNITS), round((motion.centre[1] - y0) * UNITS))
+        way = (motion.flow[0] * UNITS, motion.flow[1] * UNITS)
+        total = late = 0.0
+        for pair in find_pairs(members, voxels, sweeps, centre, way, motion.turn):
+            k = whole(pair.time * 16) / 16
+            total, late = total + pair.weight * k * k, late + pair.weight * k * pair.late
+        stretch = 1 + late / total if total > 0 else 1.0
+        result.append(stretch if stretch >= LEAST_STRETCH else 1.0)
+    return result
+
+
+def deskew(
+    points: Sequence[Point], motions: Sequence[RigidMotion], sweeps: SlicedSweeps, config: VerifiedConfig
+) -> List[Point]:
+    """Points where they were at the instant of their sweep; of those in one pixel, those of the first object."""
+    x0, y0, _, x1, y1, _ = config.point_cloud_range
+    moved, owner_of = [], {}  # type: ignore[var-annotated]
+    for point in points:
+        (f_x, f_y), turn, (c_x, c_y) = motions[point.owner]
+        since_t = sweeps.elapsed[1] - sweeps.elapsed[point.step]
+        x, y = point.x - f_x * point.time, point.y - f_y * point.time
+        arm_x, arm_y = x - c_x - f_x * since_t, y - c_y - f_y * since_t
+        turned_x, turned_y = rotate(-point.time * turn, arm_x, arm_y)
+        x, y = x + (turned_x - arm_x), y + (turned_y - arm_y)
+        if x0 <= x <= x1 and y0 <= y <= y1:
+            pixel = (point.step, *sweeps.pixel(x, y))
+            owner_of[pixel] = min(owner_of.get(pixel, point.owner), point.owner)
+            moved.append((pixel, point._replace(x=x, y=y)))
+    return [point for pixel, point in moved if owner_of[pixel] == point.owner]

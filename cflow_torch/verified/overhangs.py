@@ -1,0 +1,154 @@
+"""Objects under overhangs: a car under the crown of a tree shares its bird's-eye component with the crown.
+
+In space the two are apart. We join the cells of components that may move in three dimensions. A component that lies
+under another one and above none is drawn once more, by itself, as an image of the same batch. It is a node like any
+other.
+"""
+
+from __future__ import annotations
+
+import itertools
+from functools import lru_cache
+from typing import Tuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from cflow_torch.ops.chunks import chunks
+from cflow_torch.ops.indices import divide, flat_nonzero, gather, lazy_empty, lazy_zeros, lookup, renumber, split_index
+from cflow_torch.ops.labeling import union_find
+from cflow_torch.ops.segments import segment_amin, segment_ends
+from cflow_torch.verified.component_tree import Components, Nodes
+from cflow_torch.verified.height_slices import SLICE_HEIGHT, HeightSlicedSweeps
+
+_CELL = 0.4  # metres, side of a cell; it is as high as a slice
+_NUM_SLICES = 64  # from the lowest cell of a window on; what lies higher counts as the highest one
+_GROUND = 4.0  # metres: the lowest cell of the nine squares of this side around stands on the ground
+_GAP = 3  # slices, at least, from a cell to the next one above it: less lies between the body of a car and its roof
+# A vehicle or a person, in slices: begins at most this far above the ground, and is neither flat nor taller than a bus.
+_HIGHEST_FOOT, _SMALLEST, _LARGEST = 2, 1, 10
+
+
+def add_overhung(sweeps: HeightSlicedSweeps, components: Components, nodes: Nodes) -> Tuple[HeightSlicedSweeps, Nodes]:
+    """Nodes for what lies under something else.
+
+    Args:
+        sweeps: images, and the points.
+        components: we search the points of those that may move, dilated at the finest pixels.
+        nodes: those of all levels.
+
+    Returns:
+        The sweeps with copies of the points that lie under something, and the nodes with theirs behind them.
+
+    Convention:
+        Cells of 0.4 m x 0.4 m x 0.5 m join with their 26 neighbours. A component lies under another one where that has
+        the next occupied cell above it in any column, with two empty ones at least between. Of two components in one
+        pixel of a sweep the one whose first cell is the first has it.
+
+    Cost: linear in the points that may move; 13 look-ups for each cell, a few rounds of union-find.
+    """
+    level, num_own, num_points = components.num_levels - 2, sweeps.num_pixels, sweeps.batch.image.numel()
+    may_move = components.may_move.index_select(0, components.roots[level])
+    rows = flat_nonzero(lookup(may_move, sweeps.pixel_of_point))
+    component, num_names = _components_under(sweeps, rows)
+    under = flat_nonzero(component < num_names)
+    rows, component = gather(under, rows, component)
+    if len(rows) == 0:
+        return sweeps, nodes
+    sweeps = sweeps.with_copies(rows)
+    num_copies = sweeps.num_pixels - num_own
+    component = segment_amin(component, sweeps.pixel_of_point[num_points:] - num_own, num_copies, num_names)
+    copies = sweeps.pixels.take(torch.arange(num_own, sweeps.num_pixels, device=rows.device))
+    seen = torch.zeros(2 * num_names, dtype=torch.bool, device=rows.device)
+    seen.index_fill_(0, component + num_names * (copies.step > 0), True)
+    name = flat_nonzero(seen[:num_names] & seen[num_names:])  # at t+1 and before
+    node = renumber(name, num_names).index_select(0, component)
+    kept = flat_nonzero(node < len(name))
+    node, members = node.index_select(0, kept), copies.take(kept)
+    count = nodes.count + len(name)
+    none = torch.full_like(name, count)
+    return (
+        sweeps,
+        Nodes(
+            component=torch.cat(
+                (nodes.component, components.count + torch.arange(nodes.count, count, device=name.device))
+            ),
+            level=torch.cat((nodes.level, torch.full_like(name, components.num_levels + 1))),
+            parent=torch.cat((nodes.parent.masked_fill(nodes.parent == nodes.count, count), none)),
+            window=torch.cat((nodes.window, torch.zeros_like(name).scatter_(0, node, members.window))),
+            travels=F.pad(nodes.travels, (0, len(name))),
+            pixel=torch.cat((nodes.pixel, kept + num_own)),
+            node=torch.cat((nodes.node, node + nodes.count)),
+            members=nodes.members.followed_by(members),
+        ),
+    )
+
+
+def _components_under(sweeps: HeightSlicedSweeps, rows: Tensor) -> Tuple[Tensor, int]:
+    """Component in space of some points, (K,) int64: its first cell, V for what does not lie on the ground under
+    something else; and V."""
+    batch, grid = sweeps.batch, sweeps.grid
+    # A free margin all around: neighbours need no bounds check.
+    num_rows, num_cols = (int((grid.upper[axis] - grid.lower[axis]) / _CELL) + 3 for axis in (1, 0))
+    place = torch.empty_like(rows)
+    lowest = torch.full((batch.num_windows,), 1 << 41, device=rows.device)
+    height = torch.empty_like(rows)
+    size = torch.full((), _CELL, dtype=torch.float64, device=rows.device)  # see `Grid.pixel`
+    for some in chunks(0, len(rows), rows.device):
+        x, y, z = batch.positions.index_select(1, rows[some]).unbind(0)
+        window = divide(batch.image.index_select(0, rows[some]).long(), batch.num_steps)
+        row, col = ((at - low).div_(size).long().add_(1) for at, low in ((y, grid.lower[1]), (x, grid.lower[0])))
+        place[some] = torch.add(row, window, alpha=num_rows).mul_(num_cols).add_(col)
+        height[some] = (z / SLICE_HEIGHT).floor_().clamp_(-(2.0**40), 2.0**40).long()
+        lowest.scatter_reduce_(0, window, height[some], "amin")
+    window = divide(place, num_rows * num_cols)
+    height = height.sub_(lowest.index_select(0, window)).clamp_(max=_NUM_SLICES - 3).add_(1)
+    place = place.mul_(_NUM_SLICES).add_(height)
+
+    shape = batch.num_windows * num_rows * num_cols * _NUM_SLICES
+    is_occupied = lazy_zeros(shape, torch.bool, rows.device).index_fill_(0, place, True)
+    cells = flat_nonzero(is_occupied)
+    count = cells.numel()
+    number = lazy_empty(shape, torch.int32, rows.device)
+    number.scatter_(0, cells, torch.arange(count, dtype=torch.int32, device=rows.device))
+    near = cells[:, None] + _half_neighbours(num_cols, rows.device)
+    links = flat_nonzero(is_occupied.index_select(0, near.view(-1)))
+    targets = number.index_select(0, near.view(-1).index_select(0, links)).long()
+    component = union_find(count, divide(links, near.shape[1]), targets)
+
+    column, height = split_index(cells, _NUM_SLICES)
+    is_above = (height[1:] - height[:-1] >= _GAP) & (component[1:] != component[:-1]) & (column[1:] == column[:-1])
+    pair = flat_nonzero(is_above)
+    is_under, is_over = (
+        torch.zeros(count, dtype=torch.bool, device=rows.device).index_fill_(0, component.index_select(0, at), True)
+        for at in (pair, pair + 1)
+    )
+    foot, top = segment_ends(height, component, count)
+    rise = segment_amin(height - _ground(column, height, batch.num_windows, num_rows, num_cols), component, count, 64)
+    is_object = (rise <= _HIGHEST_FOOT) & (top - foot >= _SMALLEST) & (top - foot <= _LARGEST)
+    wanted = (is_under & ~is_over & is_object).index_select(0, component)
+    return torch.where(wanted, component, count).index_select(0, number.index_select(0, place).long()), count
+
+
+@lru_cache(maxsize=64)
+def _half_neighbours(num_cols: int, device: torch.device) -> Tensor:
+    """(13,) int64, offsets of half of the 26 neighbours of a cell; the other half are the same links from their other
+    ends."""
+    steps = itertools.product((0, 1), (-1, 0, 1), (-1, 0, 1))
+    offsets = [
+        (down * num_cols + right) * _NUM_SLICES + up for down, right, up in steps if (down, right, up) > (0, 0, 0)
+    ]
+    return torch.tensor(offsets, device=device)
+
+
+def _ground(column: Tensor, height: Tensor, num_windows: int, num_rows: int, num_cols: int) -> Tensor:
+    """(V,) int64, slice of the ground around each cell: the lowest cell of the nine squares around."""
+    side = round(_GROUND / _CELL)
+    line, col = split_index(column, num_cols)
+    window, row = split_index(line, num_rows)
+    rows, cols = num_rows // side + 1, num_cols // side + 1
+    square = (window * rows + divide(row, side)) * cols + divide(col, side)
+    lowest = segment_amin(height, square, num_windows * rows * cols, _NUM_SLICES).view(-1, 1, rows, cols)
+    around = -F.max_pool2d(-F.pad(lowest, (1, 1, 1, 1), value=_NUM_SLICES).float(), 3, 1)
+    return around.view(-1).long().index_select(0, square)

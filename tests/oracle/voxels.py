@@ -1,0 +1,95 @@
+"""Voxels (pixels by height slices of every sweep) of objects, and the centroids of their points."""
+
+from __future__ import annotations
+
+import math
+from itertools import product
+from typing import Dict, List, NamedTuple, Optional, Sequence, Tuple, Union
+
+from oracle.height_slices import NUM_SLICES, SLICE_HEIGHT, Pixel, SlicedSweeps, slice_of
+
+UNITS = 1024  # of a metre: centroids are whole numbers of them
+
+
+class Point(NamedTuple):
+    """A point of an object: sweep, slice, object, metres, sweep intervals since the instant of the sweep."""
+
+    step: int
+    part: int
+    owner: int
+    x: float
+    y: float
+    time: float
+
+
+class Voxel(NamedTuple):
+    """Sweep, slice and object of some points of a pixel, their centroid in units from the lower corner, mean time."""
+
+    step: int
+    part: int
+    owner: int
+    x: int
+    y: int
+    time: float
+
+
+Voxels = Dict[Tuple[int, int, int, int], Voxel]  # by step, row, column, slice
+
+
+def points_of_objects(
+    sweeps: SlicedSweeps,
+    object_of: Dict[Pixel, int],
+    wanted: Sequence[bool],
+    heights: Union[float, Sequence[float]] = SLICE_HEIGHT,
+    num_slices: int = NUM_SLICES,
+) -> List[Point]:
+    """Points of the objects wanted, in all sweeps; slices are so many metres high, the same for all or by object."""
+    points = []
+    for m, cloud in enumerate(sweeps.clouds):
+        for x, y, z, time in cloud:
+            owner = object_of.get((m, *sweeps.pixel(x, y)), -1)
+            if owner >= 0 and wanted[owner]:
+                height = heights if isinstance(heights, float) else heights[owner]
+                points.append(Point(m, slice_of(z, height, num_slices), owner, x, y, time))
+    return points
+
+
+def centroids(points: Sequence[Point], sweeps: SlicedSweeps) -> Voxels:
+    """Voxels that hold points: each coordinate rounded to the nearest unit, their mean down to a whole one."""
+    (x0, y0), inside = sweeps.lower, {}  # type: ignore[var-annotated]
+    for p in points:
+        inside.setdefault((p.step, *sweeps.pixel(p.x, p.y), p.part), []).append(p)
+    voxels = {}
+    for place, own in inside.items():
+        x = sum(whole((p.x - x0) * UNITS) for p in own) // len(own)
+        y = sum(whole((p.y - y0) * UNITS) for p in own) // len(own)
+        time = sum(p.time for p in own) / len(own)
+        voxels[place] = Voxel(own[0].step, own[0].part, own[0].owner, x, y, time)
+    return voxels
+
+
+def around(voxels: Voxels, step: int, part: int, x: float, y: float, sweeps: SlicedSweeps, reach: int) -> List[Voxel]:
+    """Voxels of a sweep and slice in the pixels around a place in units, `reach` each way, in raster order; none if any
+    of the pixels lies outside the image."""
+    row, col = math.floor(y / (sweeps.size * UNITS)), math.floor(x / (sweeps.size * UNITS))
+    if not all(reach <= at < length - reach for at, length in zip((row, col), sweeps.shape)):
+        return []
+    places = [(step, row + dy, col + dx, part) for dy, dx in product(range(-reach, reach + 1), repeat=2)]
+    return [voxels[place] for place in places if place in voxels]
+
+
+def nearest(voxels: Voxels, step: int, part: int, x: float, y: float, sweeps: SlicedSweeps) -> Optional[Voxel]:
+    """The nearest of the voxels in the 3 x 3 pixels around a place; of equals the first in raster order."""
+    found = around(voxels, step, part, x, y, sweeps, 1)
+    return min(found, key=lambda voxel: (voxel.x - x) ** 2 + (voxel.y - y) ** 2, default=None)
+
+
+def meeting_weight(squared_distance: float, sigma: float) -> float:
+    """exp(-d^2 / 2 sigma^2) of two centroids, in 256ths, of d^2 in steps of 64 square units of which 2048 count."""
+    step = squared_distance // 64
+    return whole(256 * math.exp(-(64 * step + 32) / (2 * (sigma * UNITS) ** 2))) / 256 if step < 2048 else 0.0
+
+
+def whole(x: float) -> int:
+    """Nearest whole number, halves up."""
+    return math.floor(x + 0.5)

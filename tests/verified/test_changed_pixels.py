@@ -1,0 +1,126 @@
+"""Changed pixels: the oracle's on random scenes; what is missing, seen or hidden, by hand."""
+
+from __future__ import annotations
+
+from typing import List, Sequence, Tuple
+
+import numpy as np
+import torch
+from moving_scenes import for_oracle
+from oracle import changed_pixels as oracle
+from scenes import config, pose, scene, sweeps_of
+
+from cflow_torch import Sweep, Window
+from cflow_torch.config import VerifiedConfig
+from cflow_torch.verified.changed_pixels import RangeImages, find_changed
+
+REGION = (-20.0, -20.0, -3.0, 20.0, 20.0, 5.0)
+SETTINGS = VerifiedConfig(pixel_sizes=(0.25,), point_cloud_range=REGION, num_history=3, num_future=2, min_height=None)
+
+
+def test_pixels_equal_the_oracle_in_a_batch():
+    """Windows of other lengths side by side, one with ground residue that is seen but not drawn, some without poses."""
+    settings, counts = config("verified", num_history=3, num_future=2, min_height=0.3), np.zeros(3, dtype=int)
+    for seed in range(4):
+        windows = [
+            scene(70 + 5 * seed + i, num_history=(seed + i) % 4, num_future=2 * (i == 1), poses=seed % 4 > 0)
+            for i in range(1 + seed % 3)
+        ]
+        sweeps = sweeps_of(windows, settings)
+        found, batch = find_changed(sweeps), sweeps.batch
+        for window in range(len(windows)):
+            steps = [step for step, k in enumerate(batch.elapsed[window].tolist()) if step == 0 or k != 0]
+            rows = [(batch.image == window * batch.num_steps + step) & batch.takes_part for step in steps]
+            clouds = [batch.positions[:, row].T.numpy() for row in rows]
+            drawn, origins = for_oracle(sweeps, window), batch.origin[window, steps].tolist()
+            expected, mine = oracle.find_changed(drawn, clouds, origins), sweeps.pixels.window == window
+            for values, truth in zip(found, expected):
+                assert values[mine].tolist() == [pixel in truth for pixel in drawn.pixels()]
+            counts += (len(drawn.pixels()), len(expected.is_missing), len(expected.has_changed))
+    assert counts[0] > 1.2 * counts[1] and counts[1] > 1.2 * counts[2] and counts[2] > 100
+
+
+# --------------------------------------------------------------------------------------------------- hand-made truth
+
+
+def screen(distance: float, half: float = 2.0, top: float = 0.0) -> np.ndarray:
+    """Wide and dense, so far before a sensor that stands 1.6 m over the ground, which is at z = -2."""
+    y, z = np.meshgrid(np.arange(-half, half, 0.02), np.arange(-2, top, 0.05))
+    return np.stack((np.full(y.size, distance), y.ravel(), z.ravel()), 1)
+
+
+def floor() -> np.ndarray:
+    """Of 5 m, behind the sensor; so the lowest points tell how high the sensor is."""
+    return np.stack((np.linspace(-10, -5, 500), np.zeros(500), np.full(500, -2.0)), 1)
+
+
+def farther(clouds: Sequence[np.ndarray], places: Sequence[Sequence[float]], way: float) -> List[List[float]]:
+    """Of t+1 and of t, when the sensor was `way` metres further left: by how much farther each sees than a place."""
+    T_world_ego = pose(0.0, way, 0.0)
+    pc1, pc0 = (np.concatenate((cloud, floor())) for cloud in clouds)
+    window = Window(Sweep(pc0 - T_world_ego[:3, 3], pose=T_world_ego), Sweep(pc1, pose=np.eye(4)))
+    images = RangeImages(sweeps_of([window], SETTINGS))
+    columns = torch.from_numpy(np.array(places, dtype=np.float64)).T
+    return [images.farther(torch.full((len(places),), step), *columns).tolist() for step in (0, 1)]
+
+
+def test_places_before_a_screen_are_seen_and_those_behind_are_hidden():
+    seen, hidden, unknown = [(4, 0, -1), (4.9, 1, -1)], [(10, 0, -1), (10, 3.5, -1), (10, 0, 0.3)], [(10, 4.5, -1)]
+    unknown += [(10, 0, 1.0), (0, 9, 0)]  # beside the screen, over its top, which rises from the sensor, to the left
+    for values in farther([screen(5.0)] * 2, [*seen, *hidden, *unknown], 0.0):
+        assert min(values[:2]) > 0 and max(values[2:5]) < -4 and min(values[2:5]) > -7
+        assert values[5:] == [-np.inf] * 3
+
+
+def test_shadows_are_cast_from_where_the_sensor_was():
+    # From 3 m further left the screen hides what is further right.
+    left, right = (10.0, 3.5, -1.0), (10.0, -6.0, -1.0)
+    newest, older = farther([screen(5.0)] * 2, [left, right], 3.0)
+    assert -6 < newest[0] < -4 and newest[1] == -np.inf and older[0] == -np.inf and -7 < older[1] < -4
+
+
+def block(x: float, y: float) -> np.ndarray:
+    """1.5 m high, of 0.5 m sides, dense."""
+    places = np.stack(np.meshgrid(np.arange(x, x + 0.5, 0.1), np.arange(y, y + 0.5, 0.1), np.arange(-2, -0.5, 0.1)), -1)
+    return places.reshape(-1, 3)
+
+
+def shares(sweeps: Sequence[np.ndarray], rows: Tuple[float, float]) -> Tuple[float, float]:
+    """Share of the pixels at t with x in a range that are missing, and that have changed, in t+1, t, t-1."""
+    pc1, pc0, older = (Sweep(np.concatenate((cloud, floor()))) for cloud in sweeps)
+    images = sweeps_of([Window(pc0, pc1, (older,))], SETTINGS)
+    found, x = find_changed(images), (images.pixels.col.double() + 0.5) * 0.25 - 20
+    mine = (images.pixels.step == 1) & (x > rows[0]) & (x < rows[1])
+    assert mine.sum() > 3
+    return tuple(float(values[mine].double().mean()) for values in found)  # type: ignore[return-value]
+
+
+def test_a_walker_before_a_wall_has_changed_and_the_wall_has_not():
+    walk = [np.concatenate((block(6.0, y), screen(8.0, 6.0, 0.5))) for y in (1.0, 0.0, -1.0)]
+    assert shares(walk, (5.9, 6.6)) == (1.0, 1.0)
+    assert shares(walk, (7.9, 8.3)) == (0.0, 0.0)
+
+
+def test_what_a_car_hides_has_not_changed_but_what_is_seen_through_it_has():
+    # The walker is gone at t+1: behind the car nobody can tell; through its windows the wall shows.
+    wall, car = screen(8.0, 6.0, 0.5), screen(3.0, 2.0, -0.1)
+    hidden = [np.concatenate((car, wall)), np.concatenate((block(6.0, 0.0), wall)), np.concatenate((car, wall))]
+    visible = wall[np.abs(wall[:, 1]) > 5.6]  # what the car does not hide
+    hidden[0] = hidden[2] = np.concatenate((car, visible))
+    assert shares(hidden, (5.9, 6.6)) == (0.0, 0.0)
+    through = [np.concatenate((car, wall)), hidden[1], np.concatenate((car, wall))]
+    assert min(shares(through, (5.9, 6.6))) > 0.5
+
+
+def test_where_nothing_returns_pixels_are_missing_but_have_not_changed():
+    alone = [screen(5.0, 0.5), np.concatenate((block(6.0, 4.0), screen(5.0, 0.5))), screen(5.0, 0.5)]
+    assert shares(alone, (5.9, 6.6)) == (1.0, 0.0)
+
+
+def test_nothing_has_changed_in_a_pair_or_in_an_empty_window():
+    empty = Window(*[Sweep(np.zeros((0, 3), np.float32))] * 2, (Sweep(np.full((3, 3), np.nan)),))
+    windows = [scene(3), empty, scene(4, num_history=1)]
+    sweeps = sweeps_of(windows, SETTINGS)
+    for values in find_changed(sweeps):
+        assert not values[sweeps.pixels.window == 0].any() and values.any()
+    assert not any(values.any() for values in find_changed(sweeps_of(windows[:1], SETTINGS)))
