@@ -93,14 +93,14 @@ def _sums(result: FlowResult, item: Item, num_bins: int) -> np.ndarray:
 def fit(sums: np.ndarray) -> List[float]:
     """Probability of each bin: share of right points, made monotone along each row of the table."""
     table = confidence.TABLE
-    sizes = [1, 1 + len(table["crowd"]), 1 + len(table["share"]), len(table["doubt"])] + 4 * [1 + len(table["margin"])]
+    sizes = [1, 1 + len(table["crowd"]), 1 + len(table["share"])] + 4 * [1 + len(table["margin"])]
     starts = np.cumsum([0, *sizes])
     result: List[float] = []
     for row, (start, end) in enumerate(zip(starts, starts[1:])):
         points, right = sums[start:end, POINTS], sums[start:end, RIGHT_ONES]
         prior = right.sum() / max(points.sum(), 1)
         share = (right + prior) / (points + 1)
-        is_falling = row in (1, 3)  # the more is unlinked, or speaks for a local motion, the worse
+        is_falling = row == 1  # the more is unlinked, the worse
         rising = isotonic_regression(-share if is_falling else share, sample_weight=points + 1)
         result += [min(round(abs(float(value)), 4), 0.9999) for value in rising]  # nothing is certain
     return result

@@ -142,7 +142,7 @@ CASES: Dict[str, Tuple[Callable[[int], Staged], Sequence[Way], Optional[int]]] =
     "gantry": (drives.gantry, _DEFAULT, None),
     "crowd": (drives.crowd, _HISTORY_OR_NOT, None),
     "touching": (drives.touching, _PAPER_AND_DEFAULT, 0),
-    "turning": (drives.turning, (by("default", thorough=False), *_HISTORY_OR_NOT), 4),
+    "turning": (drives.turning, (by("paper", num_history=4), *_HISTORY_OR_NOT), 4),
     "abreast": (drives.abreast, _DEFAULT, None),
     "vertical": (drives.vertical, _SECTIONAL_VIEW, None),
     "fast": (drives.fast, (by("default", max_speed=40), by("default")), 2),

@@ -1,0 +1,143 @@
+#!/usr/bin/env python3
+"""The steps of the verified method (docs/verified.md), drawn from two small simulated drives (drives.py).
+
+python scripts/figures/verified_steps.py                        docs/pictures/verified_steps.png
+python scripts/figures/verified_steps.py --folder FOLDER        the same picture elsewhere
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any, List, Tuple
+
+import drives
+import numpy as np
+import torch
+from matplotlib.patches import Rectangle
+
+from cflow_torch import VerifiedFlow
+from cflow_torch.data.log import window
+from cflow_torch.ops.indices import lookup
+from cflow_torch.verified.candidates import propose
+from cflow_torch.verified.changed_pixels import find_changed
+from cflow_torch.verified.component_tree import find_components, movable_nodes, select_objects
+from cflow_torch.verified.height_slices import HeightSlicedSweeps, count_slices
+from cflow_torch.verified.overhangs import add_overhung
+from cflow_torch.verified.paired_test import verify
+from cflow_torch.viz import save_picture, style
+from cflow_torch.viz.clusters import PALETTE, cluster_colors
+from cflow_torch.viz.panel import ARROW_STEPS, MOVING, group_medians
+from cflow_torch.viz.wheel import flow_to_rgb, wheel_image
+from cflow_torch.windows.collation import make_batch
+
+FOLDER = Path(__file__).resolve().parents[2] / "docs" / "pictures"
+# What each row shows, its drive, and the lower left corner and the width of its view, metres, frame of t+1.
+ROWS = (
+    ("a car under a tree crown", drives.tree(4), (0.6, 0.3), 13.6),
+    ("walkers 0.3 m from a wall", drives.walkers(2, gap=0.3), (2.3, 3.1), 8.7),
+)
+COLUMNS = (
+    ("1  pixels", "Sweep t from above. A darker\npixel has more height slices."),
+    ("2  changed pixels", "All sweeps. Red pixels are missing\nin a sweep that saw their place."),
+    ("3  components", "A colour is a finest component that\nmay move. Boxes: solid = coarser,\n"
+     "dotted = group of changed pixels,\ndashed = lies under an overhang."),
+    ("4  cut", "A colour is an object selected to\nmove. Grey stays static. A striped\nobject lies under an overhang."),
+    ("5  flow", f"Sweep t, after refinement. Grey\nmoves at most {MOVING:g} m per sweep.\n"
+     f"An arrow is the way in {ARROW_STEPS} sweeps."),
+)  # fmt: skip
+STATIC, PALE, SHADES = (172, 179, 187), (214, 219, 224), np.array([[225], [190], [145], [95], [25]]).repeat(3, 1)
+WIDE, HIGH, GAP, LEFT, FOOT, HEAD = 2.6, 1.8, 0.11, 0.4, 1.0, 0.4  # inches
+
+
+def take_steps(drive: Any) -> Tuple[Any, ...]:
+    """Sweeps, changed pixels, components, nodes, objects, which of them move, and the flow, of the pair of a drive."""
+    model = VerifiedFlow.from_preset("default", num_history=4)
+    config, given = model.config, [window(drive, drives.PAIR, 4)]
+    grid = model.grid(config.pixel_sizes[-1])
+    batch = make_batch(given, config, grid, torch.device("cpu"), 3, model.needs_ground, model.needs_times)
+    sweeps = HeightSlicedSweeps.of(batch, grid, config.min_height)
+    change = find_changed(sweeps)
+    components = find_components(sweeps, change, [round(size / config.pixel_sizes[-1]) for size in config.pixel_sizes])
+    sweeps, nodes = add_overhung(sweeps, components, movable_nodes(sweeps, components, config.max_object))
+    candidates = propose(nodes, components, sweeps, config)
+    motion, evidence = verify(sweeps, nodes, candidates.motion, components.num_levels, config.significance)
+    objects, node = select_objects(nodes, components, evidence, sweeps.num_pixels)
+    return sweeps, change, components, nodes, objects, lookup(motion, node).any(1), model(given)[0]
+
+
+def draw_row(panels: List[Any], drive: Any, low: Tuple[float, float], width: float) -> None:
+    """One drive: a step in each panel, and what the view of `width` metres from the corner `low` on shows of it."""
+    sweeps, change, components, nodes, objects, moves, result = take_steps(drive)
+    pixels, size, own, levels = sweeps.pixels, sweeps.grid.pixel_size, components.roots.shape[1], components.num_levels
+    high = np.array(low) + (width, width * HIGH / WIDE)
+    place = np.stack((pixels.col, pixels.row), 1) * size + sweeps.grid.lower[:2]  # lower left corners
+
+    def paint(axes: Any, *layers: Tuple[torch.Tensor, Any]) -> None:
+        image = np.full((sweeps.grid.height, sweeps.grid.width, 3), 255, np.uint8)
+        for pixel, rgb in layers:
+            image[pixels.row[pixel], pixels.col[pixel]] = rgb
+        left, bottom = sweeps.grid.lower[:2]
+        extent = (left, left + image.shape[1] * size, bottom, bottom + image.shape[0] * size)
+        axes.imshow(image, extent=extent, origin="lower", interpolation="nearest")
+        style.set_view(axes, np.array(low), high)
+
+    def colours(pixel: torch.Tensor, group: torch.Tensor) -> Tuple[torch.Tensor, np.ndarray]:
+        return pixel, cluster_colors(place[pixel], group.numpy(), STATIC)
+
+    every, now = torch.arange(own), torch.where(pixels.step[:own] == 1)[0]
+    paint(panels[0], (now, SHADES[count_slices(pixels.slices[now]).long()]))
+    paint(panels[1], (every, PALE), (torch.where(change.has_changed)[0], PALETTE[0]))
+    scales = torch.tensor((levels - 2, levels - 1))  # the finest, dilated and plain
+    fine = torch.where(torch.isin(nodes.level[nodes.node], scales))[0].flip(0)  # dilated ones hide the plain ones
+    paint(panels[2], (every, PALE), colours(nodes.pixel[fine], nodes.node[fine]))
+    for number, level in enumerate(nodes.level.tolist()):
+        if level not in (levels - 2, levels - 1):
+            inside = place[nodes.pixel[nodes.node == number]]
+            corner, far = inside.min(0) - 0.5 * size, inside.max(0) + 1.5 * size
+            line = {levels: (":", 1.3), levels + 1: ("--", 1.6)}.get(level, ("-", 1.0))
+            panels[2].add_patch(Rectangle(corner, *(far - corner), fill=False, linestyle=line[0], linewidth=line[1]))
+    chosen = torch.where(lookup(moves, objects.of_pixel))[0]
+    chosen, rgb = colours(chosen, objects.of_pixel[chosen])
+    rgb[(chosen >= own) & ((pixels.row[chosen] + pixels.col[chosen]) % 6 < 2)] = 255
+    paint(panels[3], (every, PALE), (chosen, rgb))
+
+    flow, rows = result.residual_flow.numpy(), sweeps.batch.rows[0]
+    pixel, points = sweeps.pixel_of_point[rows], sweeps.batch.positions[:2, rows].T.numpy()
+    fast = np.linalg.norm(flow, axis=1) > MOVING
+    fast &= ((points >= low) & (points <= high)).all(1)
+    longest = np.ceil(20 * np.linalg.norm(flow[fast], axis=1).max()) / 20
+    paint(panels[4], (now, STATIC), (pixel[fast], flow_to_rgb(flow[fast], longest)))
+    _, arrows, count = group_medians(result.cluster_id.numpy()[fast], np.hstack((points, flow[:, :2]))[fast])
+    look: Any = {"angles": "xy", "scale_units": "xy", "scale": 1 / ARROW_STEPS, "width": 0.012, "edgecolor": "white"}
+    panels[4].quiver(*arrows[count > 8].T, color=style.INK, linewidth=0.6, zorder=6, **look)
+    wheel = panels[4].inset_axes((0.8, 0.05, 0.18, 0.26))
+    wheel.imshow(wheel_image(128))
+    wheel.set_axis_off()
+    panels[4].text(0.79, 0.06, f"rim: {longest:.2f} m per sweep", transform=panels[4].transAxes, fontsize=8, ha="right")
+    style.draw_scale(panels[0])
+
+
+def main() -> None:
+    """Draw the picture."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--folder", type=Path, default=FOLDER)
+    folder = parser.parse_args().folder
+    torch.set_num_threads(1)
+    figure = style.blank_figure((LEFT + 5 * (WIDE + GAP), FOOT + HEAD + 2 * (HIGH + GAP)), 100)
+    for row, (name, staged, low, width) in enumerate(ROWS):
+        bottom = FOOT + (1 - row) * (HIGH + GAP)
+        panels = [style.add_panel(figure, LEFT + i * (WIDE + GAP), bottom, WIDE, HIGH) for i in range(5)]
+        draw_row(panels, staged.drive, low, width)
+        panels[0].set_ylabel(name, fontsize=10, color=style.INK)
+        for axes, (title, caption) in zip(panels, COLUMNS):
+            if row == 0:
+                axes.set_title(title, fontsize=14, color=style.INK, pad=6)
+            else:
+                look = {"fontsize": 10.5, "color": style.FAINT, "linespacing": 1.3, "va": "top"}
+                axes.text(0, -0.05, caption, transform=axes.transAxes, **look)
+    save_picture(figure, folder / "verified_steps.png")
+
+
+if __name__ == "__main__":
+    main()
