@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import asdict, dataclass, field, fields, replace
 from numbers import Integral, Real
-from typing import Any, Dict, Optional, Tuple, Type, TypeVar
+from typing import Any, TypeVar
 
 from cflow_torch.types import CFlowError
 
@@ -21,7 +21,7 @@ def setting(
     low: float = -math.inf,
     above: float = -math.inf,
     high: float = math.inf,
-    choices: Tuple[Any, ...] = (),
+    choices: tuple[Any, ...] = (),
 ) -> Any:
     """A field of a `Config`.
 
@@ -47,19 +47,19 @@ class Config:
     """
 
     method: str = _method("")
-    pixel_sizes: Tuple[float, ...] = setting(
+    pixel_sizes: tuple[float, ...] = setting(
         (0.1,), "side s of a BEV pixel, metres, one per scale, coarse to fine (Eq. 3d_to_bev)"
     )
-    point_cloud_range: Tuple[float, ...] = setting(
+    point_cloud_range: tuple[float, ...] = setting(
         (-35.0, -35.0, -math.inf, 35.0, 35.0, math.inf),
         "(x0, y0, z0, x1, y1, z1), metres, both ends included, frame of t+1; only z may be infinite",
     )
-    ego_box: Optional[Tuple[float, ...]] = setting(
+    ego_box: tuple[float, ...] | None = setting(
         None,
         "(x0, y0, x1, y1), metres, both ends included, frame of each sweep: the method ignores the points in this box, "
         "which are returns of the vehicle itself. None = it ignores none",
     )
-    max_speed: Optional[float] = setting(
+    max_speed: float | None = setting(
         None,
         "m/s: the search ends at displacements of max_speed * elapsed time + one pixel. None = the paper's search "
         "range, half of the cluster's bounding box",
@@ -68,7 +68,7 @@ class Config:
     sweep_interval: float = setting(
         0.1, "seconds between consecutive sweeps where time stamps are missing", low=1e-6, high=1e6
     )
-    max_memory: Optional[float] = setting(
+    max_memory: float | None = setting(
         None, "bytes of working memory that the method may plan with. None = no limit", above=0, high=float(_MOST)
     )
 
@@ -96,7 +96,7 @@ class Config:
         """A copy with some fields changed; an unknown field raises `CFlowError` that lists the fields."""
         return replace(self, **_known(type(self), overrides))
 
-    def as_dict(self) -> Dict[str, Any]:
+    def as_dict(self) -> dict[str, Any]:
         """Plain dictionary, field by field, ready for YAML or JSON; `config_from` reads it."""
         return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self).items()}
 
@@ -180,7 +180,7 @@ class VerifiedConfig(_WithHistory):
         "often as the sweeps before t do. The method then takes twice the time",
         low=0,
     )
-    max_object: Optional[float] = setting(
+    max_object: float | None = setting(
         25.0,
         "metres: a component that is longer than this at t+1 moves only if both of its ends move (trams, trains). "
         "None = a component of any length may move",
@@ -192,7 +192,7 @@ class VerifiedConfig(_WithHistory):
         low=0,
         high=1000,
     )
-    min_height: Optional[float] = setting(
+    min_height: float | None = setting(
         0.4,
         "metres: where the ground is known, the method ignores pixels that rise less than this above the ground around "
         "them, unless a taller pixel is near. None = it ignores none",
@@ -212,7 +212,7 @@ class VerifiedConfig(_WithHistory):
 
 WINDOW = ("num_history", "num_future")  # settings that say which sweeps a window has
 
-CONFIGS: Dict[str, Type[Config]] = {"dense": DenseConfig, "keypoints": KeypointsConfig, "verified": VerifiedConfig}
+CONFIGS: dict[str, type[Config]] = {"dense": DenseConfig, "keypoints": KeypointsConfig, "verified": VerifiedConfig}
 
 _REGION = (-76.8, -76.8, -math.inf, 76.8, 76.8, math.inf)
 _HARNESS_REGION = (-51.2, -51.2, -math.inf, 51.2, 51.2, math.inf)
@@ -223,7 +223,7 @@ _DEFAULT = {
     "max_speed": 60.0,
 }
 # The method of each preset, and what it changes in the method's defaults.
-PRESETS: Dict[str, Tuple[str, Dict[str, Any]]] = {
+PRESETS: dict[str, tuple[str, dict[str, Any]]] = {
     "default": ("verified", _DEFAULT),
     "fast": ("verified", {"num_history": 2, "point_cloud_range": _REGION, "max_speed": 60.0}),
     "offline": ("verified", {**_DEFAULT, "num_future": 4}),
@@ -255,7 +255,7 @@ REMOVED = {
 }
 
 
-def make_config(preset: Optional[str] = None, method: Optional[str] = None, **overrides: Any) -> Config:
+def make_config(preset: str | None = None, method: str | None = None, **overrides: Any) -> Config:
     """The settings of a preset with some fields replaced.
 
     Args:
@@ -286,7 +286,7 @@ def make_config(preset: Optional[str] = None, method: Optional[str] = None, **ov
     return CONFIGS[own](**changes).replace(**overrides)
 
 
-def config_from(settings: Dict[str, Any]) -> Config:
+def config_from(settings: dict[str, Any]) -> Config:
     """The settings of a dictionary such as `Config.as_dict` gives it; those not given are the method's defaults.
 
     Raises:
@@ -304,7 +304,7 @@ def describe(f: Any) -> str:
     return _allowed(str(f.type), low, above, high, choices)
 
 
-def _known(kind: Type[Config], overrides: Dict[str, Any]) -> Dict[str, Any]:
+def _known(kind: type[Config], overrides: dict[str, Any]) -> dict[str, Any]:
     overrides = dict(overrides)
     if "pixel_size" in overrides:
         if "pixel_sizes" in overrides:
@@ -333,9 +333,9 @@ def _checked(name: str, value: Any, kind: str, bounds: Any) -> Any:
         CFlowError: it is of another type, or out of its bounds.
     """
     low, above, high, choices = (bounds[key] for key in ("low", "above", "high", "choices"))
-    if value is None and kind.startswith("Optional"):
+    if value is None and kind.endswith("| None"):
         return None
-    if "Tuple" in kind:
+    if "tuple" in kind:
         try:
             return tuple(float(v) for v in value)
         except (TypeError, ValueError, OverflowError):
@@ -351,10 +351,10 @@ def _checked(name: str, value: Any, kind: str, bounds: Any) -> Any:
     return int(value) if wanted is Integral else float(value) if wanted is Real else value
 
 
-def _allowed(kind: str, low: float, above: float, high: float, choices: Tuple[Any, ...]) -> str:
+def _allowed(kind: str, low: float, above: float, high: float, choices: tuple[Any, ...]) -> str:
     if choices:
         return f"one of {', '.join(map(repr, choices))}"
-    if "Tuple" in kind:
+    if "tuple" in kind:
         what = "a list of numbers"
     elif kind == "bool":
         what = "True or False"
@@ -363,10 +363,10 @@ def _allowed(kind: str, low: float, above: float, high: float, choices: Tuple[An
         what += f" of at least {low:g}" if low > -math.inf else ""
         what += f" above {above:g}" if above > -math.inf else ""
         what += f"{' and' if max(low, above) > -math.inf else ''} of at most {high:g}" if high < math.inf else ""
-    return what + (", or None" if kind.startswith("Optional") else "")
+    return what + (", or None" if kind.endswith("| None") else "")
 
 
-def _check_space(sizes: Tuple[float, ...], box: Tuple[float, ...], own: Optional[Tuple[float, ...]]) -> None:
+def _check_space(sizes: tuple[float, ...], box: tuple[float, ...], own: tuple[float, ...] | None) -> None:
     if not sizes or any(not 0 < s < math.inf for s in sizes) or any(a <= b for a, b in zip(sizes, sizes[1:])):
         raise CFlowError(
             f"pixel_sizes={sizes}: give at least one positive size in metres, strictly coarse to fine, "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import replace
-from typing import Any, Iterator, Optional, Sequence, Tuple
+from typing import Any, Iterator, Sequence
 
 import numpy as np
 
@@ -24,23 +24,23 @@ def estimate_flow(
     pc0: Array,  # (N0, 3+), metres, ego frame of sweep t
     pc1: Array,  # (N1, 3+), metres, ego frame of sweep t+1
     *,
-    T_ego1_ego0: Optional[Array] = None,  # (4, 4)
-    gm0: Optional[Array] = None,  # (N0,) bool
-    gm1: Optional[Array] = None,  # (N1,) bool
+    T_ego1_ego0: Array | None = None,  # (4, 4)
+    gm0: Array | None = None,  # (N0,) bool
+    gm1: Array | None = None,  # (N1,) bool
     pch: Sequence[Array] = (),  # (Nh, 3+) each, nearest first
-    T_ego1_egoh: Sequence[Optional[Array]] = (),
-    gmh: Sequence[Optional[Array]] = (),
-    dt0: Optional[Array] = None,  # (N0,), seconds
-    dt1: Optional[Array] = None,  # (N1,), seconds
-    dth: Sequence[Optional[Array]] = (),
+    T_ego1_egoh: Sequence[Array | None] = (),
+    gmh: Sequence[Array | None] = (),
+    dt0: Array | None = None,  # (N0,), seconds
+    dt1: Array | None = None,  # (N1,), seconds
+    dth: Sequence[Array | None] = (),
     pcf: Sequence[Array] = (),  # (Nf, 3+) each, nearest first
-    T_ego1_egof: Sequence[Optional[Array]] = (),
-    gmf: Sequence[Optional[Array]] = (),
-    dtf: Sequence[Optional[Array]] = (),
-    method: Optional[str] = None,
-    preset: Optional[str] = None,
-    config: Optional[Config] = None,
-    ground: Optional[str] = None,
+    T_ego1_egof: Sequence[Array | None] = (),
+    gmf: Sequence[Array | None] = (),
+    dtf: Sequence[Array | None] = (),
+    method: str | None = None,
+    preset: str | None = None,
+    config: Config | None = None,
+    ground: str | None = None,
     device: Any = "auto",
     **overrides: Any,
 ) -> FlowResult:
@@ -109,7 +109,7 @@ def estimate_flow(
             )
     frame1 = np.eye(4) if moved else None  # the world is the ego frame at t+1, so T_ego1_ego is the pose
 
-    def sweep(points: Array, is_ground: Any, transform: Optional[Array], times: Optional[Array]) -> Sweep:
+    def sweep(points: Array, is_ground: Any, transform: Array | None, times: Array | None) -> Sweep:
         return Sweep(points, is_ground, frame1 if transform is None else transform, point_times=times)
 
     window = Window(
@@ -141,7 +141,7 @@ def make_model(config: Config, device: Any = "auto") -> SceneFlowModel:
     return methods[config.method](config, device)
 
 
-def _find_ground(window: Window, ground: Optional[str], device: Any) -> Window:
+def _find_ground(window: Window, ground: str | None, device: Any) -> Window:
     """The window with the masks that it lacks; the same window, and maybe a warning, if none are asked for."""
     chosen = choose_device([window], device)
     sweeps = [window.pc0, window.pc1, *window.pch, *window.pcf]
@@ -184,7 +184,7 @@ def _warn_if_nothing_takes_part(result: FlowResult, window: Window, config: Conf
     )
 
 
-def _parts(side: str, clouds: Sequence[Array], **others: Sequence[Any]) -> Iterator[Tuple[Any, ...]]:
+def _parts(side: str, clouds: Sequence[Array], **others: Sequence[Any]) -> Iterator[tuple[Any, ...]]:
     """Points and what else is known of each sweep of one side, "h" or "f"; None where nothing is given."""
     for name, values in others.items():
         if len(values) not in (0, len(clouds)):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, List, Optional, Sequence, Type
+from typing import Any, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -37,8 +37,8 @@ class Motion:
     flow: Tensor
     cluster_id: Tensor
     score: Tensor
-    confidence: Optional[Tensor] = None
-    before: Optional[Tensor] = None
+    confidence: Tensor | None = None
+    before: Tensor | None = None
 
     def cluster(self, points: slice) -> Tensor:
         """Cluster of each of some points, M = none."""
@@ -98,7 +98,7 @@ class SceneFlowModel(nn.Module):
         self.device = device
 
     @classmethod
-    def from_preset(cls: Type[Any], preset: Optional[str] = None, device: Any = "auto", **overrides: Any) -> Any:
+    def from_preset(cls: type[Any], preset: str | None = None, device: Any = "auto", **overrides: Any) -> Any:
         """The method with the settings of a preset, some fields replaced.
 
         Args:
@@ -126,7 +126,7 @@ class SceneFlowModel(nn.Module):
 
     @torch.no_grad()
     @one_thread()
-    def forward(self, windows: Sequence[Window]) -> List[FlowResult]:
+    def forward(self, windows: Sequence[Window]) -> list[FlowResult]:
         """Flow t -> t+1 for the points of every window's pc0.
 
         Args:
@@ -142,7 +142,7 @@ class SceneFlowModel(nn.Module):
         """
         check_windows(windows, self.config)
         grid, device = self.grid(self.config.pixel_sizes[-1]), choose_device(windows, self.device)
-        results: List[FlowResult] = []
+        results: list[FlowResult] = []
         with torch.autocast(device.type, enabled=False):  # counts would lose bits
             for part in split_windows(windows, grid, device, self.bytes_per_point, self.config.max_memory):
                 with torch.inference_mode():  # a tenth faster than no_grad: the work is many small operations
@@ -156,7 +156,7 @@ class SceneFlowModel(nn.Module):
         return results
 
 
-def _results(batch: Batch, motion: Motion) -> List[FlowResult]:
+def _results(batch: Batch, motion: Motion) -> list[FlowResult]:
     """One full-length result per window, for all rows of its pc0; those that took no part have residual flow 0. The
     results of a batch lie in the same memory, one behind the other."""
     points = slice(batch.rows[0].start, batch.rows[-1].stop)

@@ -6,7 +6,7 @@ import statistics
 import threading
 import time
 from contextlib import contextmanager
-from typing import Any, Dict, Iterator, List, Protocol, Sequence, Tuple
+from typing import Any, Iterator, Protocol, Sequence
 
 import torch
 from torch.profiler import record_function
@@ -29,7 +29,7 @@ def stage(name: str) -> Iterator[None]:
 
 
 @contextmanager
-def stage_seconds() -> Iterator[Dict[str, float]]:
+def stage_seconds() -> Iterator[dict[str, float]]:
     """Collects seconds of each stage by the host's clock (on a GPU: the time to queue its work) while it is open."""
     before, _watched.seconds = getattr(_watched, "seconds", None), {}
     try:
@@ -43,7 +43,7 @@ class FlowModel(Protocol):
 
     config: Config
 
-    def __call__(self, windows: Sequence[Window]) -> List[FlowResult]:
+    def __call__(self, windows: Sequence[Window]) -> list[FlowResult]:
         """One result per window."""
 
 
@@ -59,9 +59,9 @@ class StopWatch:
 
     def __init__(self, model: FlowModel) -> None:
         self.model, self.config = model, model.config
-        self.pairs: List[Tuple[float, Dict[str, float]]] = []  # seconds, and those of the stages
+        self.pairs: list[tuple[float, dict[str, float]]] = []  # seconds, and those of the stages
 
-    def __call__(self, windows: Sequence[Window]) -> List[FlowResult]:
+    def __call__(self, windows: Sequence[Window]) -> list[FlowResult]:
         """What the method gives."""
         with stage_seconds() as stages:
             start = time.perf_counter()
@@ -71,7 +71,7 @@ class StopWatch:
             self.pairs.append((time.perf_counter() - start, stages))
         return results
 
-    def report(self) -> Dict[str, Any]:
+    def report(self) -> dict[str, Any]:
         """Seconds per pair: "median", "min", "max", "pairs" that were timed, "stages" (median of each)."""
         if not self.pairs:
             return {"pairs": 0}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import zipfile
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, Dict, Optional, Sequence, Tuple, Union
+from typing import Any, Sequence, Union
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ _OBJECT = np.dtype("i8, 3f8, 3f8, 3f8, f8, i8, f8")
 _OBJECT.names = ("id", "centre", "size", "velocity", "heading", "num_points", "confidence")
 
 
-def as_numpy(value: Array, dtype: Optional[Any] = None) -> np.ndarray:
+def as_numpy(value: Array, dtype: Any | None = None) -> np.ndarray:
     """NumPy array of an array or of a tensor on any device; bfloat16, which NumPy lacks, becomes float32."""
     if isinstance(value, Tensor):
         value = value.detach().cpu()
@@ -50,10 +50,10 @@ class Sweep:
     """
 
     points: Array
-    is_ground: Optional[Array] = None
-    pose: Optional[Array] = None
-    timestamp_ns: Optional[int] = None
-    point_times: Optional[Array] = None
+    is_ground: Array | None = None
+    pose: Array | None = None
+    timestamp_ns: int | None = None
+    point_times: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -69,8 +69,8 @@ class Window:
 
     pc0: Sweep
     pc1: Sweep
-    pch: Tuple[Sweep, ...] = ()
-    pcf: Tuple[Sweep, ...] = ()
+    pch: tuple[Sweep, ...] = ()
+    pcf: tuple[Sweep, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ class FlowResult:
     cluster_id: Tensor
     score: Tensor
     is_valid: Tensor
-    confidence: Optional[Tensor] = None
+    confidence: Tensor | None = None
 
     def to(self, device: Any) -> FlowResult:
         """The same result on another device."""
@@ -110,7 +110,7 @@ class FlowResult:
         """Every field that is not None as a NumPy array, by name."""
         return {name: value.detach().cpu().numpy() for name, value in self._given().items()}
 
-    def columns(self) -> Dict[str, np.ndarray]:
+    def columns(self) -> dict[str, np.ndarray]:
         """A column for each number of a row, as flow files have them: flow_tx_m ... pose_tz_m, cluster_id, ..."""
         columns = {}
         for name, values in self.numpy().items():
@@ -118,7 +118,7 @@ class FlowResult:
             columns.update({name: values} if short is None else dict(zip(vector_columns(short), values.T)))
         return columns
 
-    def to_pandas(self, points: Optional[Array] = None) -> Any:
+    def to_pandas(self, points: Array | None = None) -> Any:
         """A `pandas.DataFrame` with a row per point and the columns of `columns`; before them x, y, z, if given.
 
         Args:
@@ -191,13 +191,13 @@ class FlowResult:
         objects["size"] = high - low
         return objects[np.linalg.norm(objects["velocity"], axis=1) >= min_speed]
 
-    def save(self, path: Union[str, Path]) -> None:
+    def save(self, path: str | Path) -> None:
         """Write every field that is not None to one .npz file."""
         with open(path, "wb") as file:
             np.savez(file, **self.numpy())
 
     @classmethod
-    def load(cls, path: Union[str, Path]) -> FlowResult:
+    def load(cls, path: str | Path) -> FlowResult:
         """Read what `save` wrote; nothing in the file is executed.
 
         Raises:
@@ -210,9 +210,9 @@ class FlowResult:
             raise CFlowError(f"{path} is no result ({error}): give a file that FlowResult.save wrote") from error
 
     @classmethod
-    def of(cls, fields_given: Dict[str, Tensor]) -> FlowResult:
+    def of(cls, fields_given: dict[str, Tensor]) -> FlowResult:
         """A result of some of the fields, by name; the others are None, whatever their type says."""
-        values: Dict[str, Any] = {**dict.fromkeys(f.name for f in fields(cls)), **fields_given}
+        values: dict[str, Any] = {**dict.fromkeys(f.name for f in fields(cls)), **fields_given}
         return cls(**values)
 
     def _positions(self, points: Array) -> np.ndarray:
@@ -224,7 +224,7 @@ class FlowResult:
             )
         return positions[:, :3]
 
-    def _given(self) -> Dict[str, Tensor]:
+    def _given(self) -> dict[str, Tensor]:
         values = {f.name: getattr(self, f.name) for f in fields(self)}
         return {name: value for name, value in values.items() if value is not None}
 

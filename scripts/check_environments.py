@@ -22,7 +22,7 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
-from typing import Dict, Optional, Sequence
+from typing import Sequence
 
 ROOT = Path(__file__).resolve().parents[1]
 INSTALL = {
@@ -40,7 +40,7 @@ for module in (cflow_torch, cflow_torch.configs):
 """
 
 
-def main(arguments: Optional[Sequence[str]] = None) -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Check one environment; returns the exit status of the tests."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("name", choices=sorted(INSTALL))
@@ -82,14 +82,14 @@ def install(name: str, base: str, home: Path, wheel: Path) -> Path:
     return python
 
 
-def environment() -> Dict[str, str]:
+def environment() -> dict[str, str]:
     """This process's variables without those by which another cflow_torch could be imported."""
     kept = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV")}
     data = Path(os.environ.get("CFLOW_DATA") or ROOT.parent / "shared" / "data").resolve()
     return {"OMP_NUM_THREADS": "1", **kept, "PYTHONNOUSERSITE": "1", "CFLOW_DATA": str(data)}
 
 
-def run(*command: object, cwd: Optional[Path] = None) -> None:
+def run(*command: object, cwd: Path | None = None) -> None:
     """A command that must succeed; its output is shown."""
     print("$", *command, flush=True)
     subprocess.run([str(part) for part in command], check=True, cwd=cwd, env=environment())

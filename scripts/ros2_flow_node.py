@@ -11,7 +11,7 @@ come from KISS-ICP (extra `odometry`). Nobody has run it on a robot yet.
 from __future__ import annotations
 
 import time
-from typing import Any, Dict, Optional
+from typing import Any
 
 import numpy as np
 import rclpy
@@ -34,12 +34,12 @@ class FlowNode(Node):  # type: ignore[misc]
 
     def __init__(self) -> None:
         super().__init__("cflow")
-        names: Dict[str, str] = {
+        names: dict[str, str] = {
             name: self.declare_parameter(name, default).value
             for name, default in {"cloud": "/points", "odometry": "", "preset": "fast", "ground": "auto"}.items()
         }
         self._stream = FlowStream(names["preset"], ground=names["ground"] or None)
-        self._poses: Optional[Dict[int, np.ndarray]] = {} if names["odometry"] else None
+        self._poses: dict[int, np.ndarray] | None = {} if names["odometry"] else None
         self._publisher = self.create_publisher(PointCloud2, f"{names['cloud']}/flow", 1)
         self.create_subscription(PointCloud2, names["cloud"], self.on_cloud, qos_profile_sensor_data)
         if names["odometry"]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Optional, Tuple
+from typing import Any
 
 import numpy as np
 import pytest
@@ -47,7 +47,7 @@ class BagWriter:
         number = (0,) if self.ros1 else ()
         return self.make("std_msgs/msg/Header", *number, time, frame)
 
-    def pose(self, T: np.ndarray, names: Tuple[str, str, str] = ("Point", "Quaternion", "Pose")) -> Any:
+    def pose(self, T: np.ndarray, names: tuple[str, str, str] = ("Point", "Quaternion", "Pose")) -> Any:
         w, x, y, z = to_quaternions(T[None, :3, :3])[0]
         kinds = [f"geometry_msgs/msg/{name}" for name in names]
         return self.make(kinds[2], self.make(kinds[0], *T[:3, 3]), self.make(kinds[1], x, y, z, w))
@@ -63,7 +63,7 @@ class BagWriter:
         serialize = self.types.serialize_ros1 if self.ros1 else self.types.serialize_cdr
         self.bag.write(self.topics[topic], stamp + 40_000_000, serialize(message, kind))  # arrives later
 
-    def cloud(self, stamp: int, points: np.ndarray, times: Optional[np.ndarray], order: str = "<") -> Any:
+    def cloud(self, stamp: int, points: np.ndarray, times: np.ndarray | None, order: str = "<") -> Any:
         """Fields of a cloud of two rows: padded points and rows, one missing return."""
         names, kinds, offsets = ["ring", "y", "x", "z"], ["u2", "f4", "f4", "f8"], [1, 4, 8, 16]
         if times is not None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Dict, List, NamedTuple, Optional, Sequence, Tuple
+from typing import NamedTuple, Sequence
 
 import numpy as np
 import torch
@@ -37,7 +37,7 @@ class Scene(NamedTuple):
         """Of all objects."""
         return points_of_objects(self.sweeps, self.objects, torch.ones(len(self.flow), dtype=torch.bool))
 
-    def windows(self) -> List[OracleWindow]:
+    def windows(self) -> list[OracleWindow]:
         """The same for the oracle, window by window."""
         return [OracleWindow(self, window) for window in range(self.sweeps.batch.num_windows)]
 
@@ -52,17 +52,17 @@ class OracleWindow:
         self.sweeps = for_oracle(sweeps, window)
         owners = objects.of_pixel[sweeps.pixels.window == window] - int((~mine).cumprod(0).sum())
         self.num_objects = int(mine.sum())
-        self.object_of: Dict[Pixel, int] = {
+        self.object_of: dict[Pixel, int] = {
             pixel: owner for pixel, owner in zip(self.sweeps.pixels(), owners.tolist()) if 0 <= owner < self.num_objects
         }
-        self.flow: List[Vector] = [(x, y) for x, y in scene.flow[mine].tolist()]
+        self.flow: list[Vector] = [(x, y) for x, y in scene.flow[mine].tolist()]
         self.config = VerifiedConfig(pixel_sizes=(size,), point_cloud_range=(*grid.lower, *grid.upper))
 
-    def members(self) -> List[List[Pixel]]:
+    def members(self) -> list[list[Pixel]]:
         """Pixels of each object."""
         return [[pixel for pixel, own in self.object_of.items() if own == i] for i in range(self.num_objects)]
 
-    def points(self) -> List[Point]:
+    def points(self) -> list[Point]:
         """Of all objects."""
         return listed_points(self.sweeps, self.object_of, [True] * self.num_objects)
 
@@ -87,9 +87,7 @@ def for_oracle(sweeps: HeightSlicedSweeps, window: int) -> SlicedSweeps:
     return SlicedSweeps(clouds, images, *given, grid.pixel_size, grid.lower[:2], shape)
 
 
-def from_images(
-    images: np.ndarray, pixel_size: float = 0.25, elapsed: Optional[np.ndarray] = None
-) -> HeightSlicedSweeps:
+def from_images(images: np.ndarray, pixel_size: float = 0.25, elapsed: np.ndarray | None = None) -> HeightSlicedSweeps:
     """Sweeps with a point in the middle of every slice that is set.
 
     Args:
@@ -114,7 +112,7 @@ def moving_scene(
     snap: float = 0.0,
     num_points: int = 40,
     speed: float = 0.4,
-    size: Tuple[float, float] = (0.2, 1.5),
+    size: tuple[float, float] = (0.2, 1.5),
     num_future: int = 0,
 ) -> Scene:
     """Objects that translate and turn, seen anew in every sweep, some at the border, some missing in some sweeps.
@@ -131,16 +129,16 @@ def moving_scene(
     """
     places = np.array([*range(num_past), *range(-1, -1 - num_future, -1)])
     num_steps = len(places)
-    clouds: List[List[np.ndarray]] = []
-    owners: List[List[np.ndarray]] = []
-    flows: List[np.ndarray] = []
+    clouds: list[list[np.ndarray]] = []
+    owners: list[list[np.ndarray]] = []
+    flows: list[np.ndarray] = []
     elapsed = []
     for seed in seeds:
         rng = np.random.default_rng(seed)
         times = places * (1.0 if rng.random() < 0.5 else rng.uniform(0.8, 1.2))
         elapsed.append(times)
-        parts: List[List[np.ndarray]] = [[] for _ in range(num_steps)]
-        of_parts: List[List[np.ndarray]] = [[] for _ in range(num_steps)]
+        parts: list[list[np.ndarray]] = [[] for _ in range(num_steps)]
+        of_parts: list[list[np.ndarray]] = [[] for _ in range(num_steps)]
         for _ in range(int(rng.integers(1, 5))):
             centre = rng.uniform(LOWER, UPPER)[:2] * 0.9
             sides, angle, velocity = rng.uniform(*size, 2), rng.uniform(-0.1, 0.1), rng.normal(0, speed, 2)
@@ -160,7 +158,7 @@ def moving_scene(
     return _draw(clouds, owners, flows, elapsed, pixel_size)
 
 
-def one_object(clouds: Sequence[np.ndarray], flow: Sequence[float], elapsed: Optional[Sequence[float]] = None) -> Scene:
+def one_object(clouds: Sequence[np.ndarray], flow: Sequence[float], elapsed: Sequence[float] | None = None) -> Scene:
     """One object, (N, 3) points in every sweep, t+1 first, and the motion to start from; sweeps `elapsed` before t+1,
     None = 0, 1, 2, ... intervals."""
     times = np.arange(len(clouds)) if elapsed is None else np.array(elapsed)
@@ -169,10 +167,10 @@ def one_object(clouds: Sequence[np.ndarray], flow: Sequence[float], elapsed: Opt
 
 
 def _draw(
-    clouds: List[List[np.ndarray]],
-    owners: List[List[np.ndarray]],
-    flows: List[np.ndarray],
-    elapsed: List[np.ndarray],
+    clouds: list[list[np.ndarray]],
+    owners: list[list[np.ndarray]],
+    flows: list[np.ndarray],
+    elapsed: list[np.ndarray],
     pixel_size: float,
 ) -> Scene:
     grid, num_steps = Grid(pixel_size, LOWER, UPPER), len(elapsed[0])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Callable, Dict, List
+from typing import Any, Callable
 
 from scenes import RANGE, scene
 
@@ -13,7 +13,7 @@ PRESETS = ("default", "fast", "offline", "paper", "keypoints")
 
 def small(preset: str, **overrides: Any) -> Config:
     """A preset on 16 m x 14 m with pixels of 0.25 m, two older sweeps where it takes any."""
-    given: Dict[str, Any] = {"pixel_sizes": (0.5, 0.25) if preset in ("default", "offline") else (0.25,)}
+    given: dict[str, Any] = {"pixel_sizes": (0.5, 0.25) if preset in ("default", "offline") else (0.25,)}
     if preset in ("paper", "keypoints"):
         given["max_extent"] = 5.0
     if preset != "keypoints":
@@ -21,7 +21,7 @@ def small(preset: str, **overrides: Any) -> Config:
     return make_config(preset, **{"point_cloud_range": RANGE, **given, **overrides})
 
 
-def windows_for(config: Config, number: int = 1) -> List[Window]:
+def windows_for(config: Config, number: int = 1) -> list[Window]:
     """Windows in which every preset finds motion; the last of several is a pair."""
     seeds = (12, 11, 3, 8)[:number]
     return [

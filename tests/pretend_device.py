@@ -5,7 +5,7 @@ As on a GPU, tensors of two devices in one operation raise, and some operations 
 
 from __future__ import annotations
 
-from typing import Any, Callable, Tuple
+from typing import Any, Callable
 
 import torch
 from torch import Tensor
@@ -66,7 +66,7 @@ class PretendDevice(TorchDispatchMode):
         self._constructors = _Constructors(self)
         self._inference_mode = torch.inference_mode
 
-    def count(self, run: Callable[[], Any]) -> Tuple[int, int]:
+    def count(self, run: Callable[[], Any]) -> tuple[int, int]:
         """Kernels that a call launches on the device; how often the host waits for it, or sends it values."""
         self._launches = self._waits = 0
         run()

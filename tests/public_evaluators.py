@@ -6,7 +6,7 @@ import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Dict, Iterable, List, Sequence, Tuple
+from typing import Any, Dict, Iterable, Sequence, Tuple
 
 import numpy as np
 import pyarrow as pa
@@ -25,7 +25,7 @@ EDGES = np.linspace(0, 2, 51)  # of the speed buckets
 Comparison = Dict[str, Tuple[float, float]]
 
 
-def score(definition: Any, frames: Iterable[EvalFrame]) -> Dict[str, Any]:
+def score(definition: Any, frames: Iterable[EvalFrame]) -> dict[str, Any]:
     metrics = SceneFlowMetrics(definition)
     for frame in frames:
         metrics.update(frame)
@@ -75,7 +75,7 @@ def read_pair(folder: Path) -> Pair:
     )
 
 
-def predictions(pair: Pair) -> Dict[str, np.ndarray]:
+def predictions(pair: Pair) -> dict[str, np.ndarray]:
     """Residuals in the axes of t+1."""
     residual = pair.labels.flow - ego_motion_flow(pair.points, pair.T_float32)
     noise = np.random.default_rng(0).normal(0, 0.05, pair.points.shape).astype(np.float32)
@@ -119,7 +119,7 @@ def write_table(file: Path, **columns: np.ndarray) -> None:
     feather.write_feather(pa.table(columns), str(file))
 
 
-def write_bsfe_truth(root: Path, truths: Sequence[Tuple[np.ndarray, np.ndarray, np.ndarray]]) -> Path:
+def write_bsfe_truth(root: Path, truths: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> Path:
     """Truth as its loader wants it: residual in the axes of t, category one lower than Argoverse 2's, valid rows."""
     for number, (residual, category, is_valid) in enumerate(truths):
         columns = dict(zip(FLOW, np.ascontiguousarray(residual.T)))
@@ -131,7 +131,7 @@ def write_bsfe_truth(root: Path, truths: Sequence[Tuple[np.ndarray, np.ndarray, 
 def write_log(root: Path, made: Sequence[MadeUp]) -> Path:
     """Raw log of made-up frames, and of the first one again: some ground on a raster, poses that chain the T."""
     folder, pose = root / LOG, np.eye(4)
-    rows: List[List[float]] = []
+    rows: list[list[float]] = []
     for number, frame in enumerate([*made, made[0]]):
         lidar = folder / "sensors" / "lidar" / f"{TIME + number}.feather"
         write_table(lidar, **dict(zip("xyz", frame.points.T.copy())))
@@ -151,7 +151,7 @@ def write_log(root: Path, made: Sequence[MadeUp]) -> Path:
 # ---------------------------------------------------------------------------------------------- BucketedSceneFlowEval
 
 
-def bucket_numbers(ours: Dict[str, Any], evaluator: Any, output: Path, distance: float = 35) -> Comparison:
+def bucket_numbers(ours: dict[str, Any], evaluator: Any, output: Path, distance: float = 35) -> Comparison:
     """Per class, the mean over classes, and per bucket: points, mean error, mean speed."""
     from bucketed_scene_flow_eval.eval.base_per_frame_sceneflow_eval import PerFrameSceneFlowEvaluator
 
@@ -180,7 +180,7 @@ def bucket_numbers(ours: Dict[str, Any], evaluator: Any, output: Path, distance:
     }
 
 
-def three_way_numbers(ours: Dict[str, Any], classes: Dict[str, Any]) -> Comparison:
+def three_way_numbers(ours: dict[str, Any], classes: dict[str, Any]) -> Comparison:
     assert set(classes) == {"BACKGROUND", "FOREGROUND"}
     numbers = {
         f"{name} {motion}": (ours["breakdown"][name.lower()][motion]["all"]["epe"], value)

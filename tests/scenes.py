@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
-from typing import Iterator, List, Tuple
+from typing import Iterator
 
 import numpy as np
 import pytest
@@ -65,7 +65,7 @@ def scene(
     points. Some objects are missing in some sweeps, so clusters with gaps in their history occur.
     """
     rng = np.random.default_rng(seed)
-    objects: List[Tuple[str, np.ndarray, float, np.ndarray, np.ndarray]] = []
+    objects: list[tuple[str, np.ndarray, float, np.ndarray, np.ndarray]] = []
     for i in range(num_objects):
         size = rng.uniform((0.3, 0.3, 0.5), (4.5, 2.0, 2.0))
         velocity = np.array([*rng.normal(0, 0.35, 2), rng.normal(0, 0.1)]) * (rng.random() < 0.7)
@@ -97,7 +97,7 @@ def scene(
     return Window(sweeps[1], sweeps[0], tuple(sweeps[2:first_future]), tuple(sweeps[first_future:]))
 
 
-def sweeps_of(windows: List[Window], settings: VerifiedConfig) -> HeightSlicedSweeps:
+def sweeps_of(windows: list[Window], settings: VerifiedConfig) -> HeightSlicedSweeps:
     """Windows as the verified method sees them."""
     box = settings.point_cloud_range
     grid = Grid(settings.pixel_sizes[-1], box[:3], box[3:])
@@ -105,7 +105,7 @@ def sweeps_of(windows: List[Window], settings: VerifiedConfig) -> HeightSlicedSw
     return HeightSlicedSweeps.of(batch, grid, settings.min_height)
 
 
-def reordered(window: Window, seed: int = 0) -> Tuple[Window, np.ndarray]:
+def reordered(window: Window, seed: int = 0) -> tuple[Window, np.ndarray]:
     """Points of every sweep in another order, and the order of those of pc0."""
     rng = np.random.default_rng(seed)
     sweeps = [window.pc0, window.pc1, *window.pch, *window.pcf]
@@ -149,7 +149,7 @@ def assert_same_bits(a: FlowResult, b: FlowResult) -> None:
         assert same_bits(left, right), f"{name} differs in {int((left != right).sum())} places"
 
 
-def _pairs(a: FlowResult, b: FlowResult) -> Iterator[Tuple[str, torch.Tensor, torch.Tensor]]:
+def _pairs(a: FlowResult, b: FlowResult) -> Iterator[tuple[str, torch.Tensor, torch.Tensor]]:
     """Name and both values of every field, on the CPU, of the same type and shape."""
     for field in fields(FlowResult):
         left, right = getattr(a, field.name), getattr(b, field.name)

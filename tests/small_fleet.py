@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Dict, List
+from typing import Any
 
 from command_line import cflow
 
@@ -34,7 +34,7 @@ def write_fleet(root: Path) -> Path:
 
 def make_job(output: Path, **settings: Any) -> Job:
     """A run of `CONFIG` on Argoverse 2 logs."""
-    values: Dict[str, Any] = {"config": CONFIG, "settings": {"check": False}, "batch": 2, **settings}
+    values: dict[str, Any] = {"config": CONFIG, "settings": {"check": False}, "batch": 2, **settings}
     hashed = make_identity(values["config"], "av2", values["settings"])["hash"]
     return Job(identity=hashed, reader="av2", output=str(output), **values)
 
@@ -47,9 +47,9 @@ def run(
     engine: str = "local",
     resume: bool = True,
     overwrite: bool = False,
-    settings: Dict[str, Any] = {},  # noqa: B006 (read only)
+    settings: dict[str, Any] = {},  # noqa: B006 (read only)
     **engine_settings: Any,
-) -> Dict[str, Any]:
+) -> dict[str, Any]:
     """`cflow flow` without the command line; the report. `settings` are the job's, in place of those of `make_job`."""
     job = make_job(output, batch=layout.batch, redo=overwrite, **settings)
     identity = make_identity(job.config, "av2", job.settings, job.contents)
@@ -62,17 +62,17 @@ def command(*arguments: Any) -> int:
     return cflow(*COMMAND, "engine.workers=1", *arguments)
 
 
-def tree(output: Path) -> Dict[str, bytes]:
+def tree(output: Path) -> dict[str, bytes]:
     """Every file, hidden ones too, but reports, which tell times, and config.yaml, which tells where the data lies."""
     files = [f for f in output.rglob("*") if f.is_file() and "reports" not in f.parts and f.name != "config.yaml"]
     return {str(file.relative_to(output)): file.read_bytes() for file in files}
 
 
-def flow_files(output: Path) -> Dict[str, bytes]:
+def flow_files(output: Path) -> dict[str, bytes]:
     """Those of `tree` that hold flow."""
     return {name: content for name, content in tree(output).items() if name.endswith(".feather")}
 
 
-def frames(output: Path) -> List[Path]:
+def frames(output: Path) -> list[Path]:
     """Flow files, in order."""
     return sorted(output.glob("*/*.feather"))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Dict, Tuple
 
 import numpy as np
 import pretend_device
@@ -18,7 +17,7 @@ pytestmark = pytest.mark.skipif(not pretend_device.IS_THERE, reason="torch befor
 
 SCALES = (0.8, 0.4, 0.3, 0.2, 0.1)
 # Launches and waits of one window, launches of sixteen: what was counted, and 15 % more.
-BOUNDS: Dict[str, Tuple[Config, int, int, int]] = {
+BOUNDS: dict[str, tuple[Config, int, int, int]] = {
     "paper": (small("paper", num_history=0), 633, 35, 755),
     "paper, h = 4, 5 scales": (small("paper", num_history=4, pixel_sizes=SCALES), 3692, 146, 4016),
     "keypoints": (small("keypoints"), 917, 34, 1045),

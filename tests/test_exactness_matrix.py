@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from dataclasses import replace
 from functools import lru_cache
-from typing import Callable, Dict, List, Tuple
+from typing import Callable, List
 
 import numpy as np
 import pytest
@@ -20,23 +20,23 @@ Way = Callable[[Config, List[Window]], Results]
 EMPTY = Sweep(np.zeros((0, 3), dtype=np.float32))
 
 
-def plainly(config: Config, windows: List[Window]) -> Results:
+def plainly(config: Config, windows: list[Window]) -> Results:
     """Window by window: what all others are held to."""
     return [make_model(config, "cpu")([window])[0] for window in windows]
 
 
-def together(config: Config, windows: List[Window]) -> Results:
+def together(config: Config, windows: list[Window]) -> Results:
     return make_model(config, "cpu")(windows)
 
 
-def backwards_and_again(config: Config, windows: List[Window]) -> Results:
+def backwards_and_again(config: Config, windows: list[Window]) -> Results:
     """The other way round, each three times, by a model that has run before."""
     model = make_model(config, "cpu")
     model(windows)
     return model((windows * 3)[::-1])[: len(windows)][::-1]
 
 
-def among_others(config: Config, windows: List[Window]) -> Results:
+def among_others(config: Config, windows: list[Window]) -> Results:
     """Between windows without points, without one sweep, of a few points."""
     bare = [replace(sweep, pose=None, timestamp_ns=None) for sweep in (windows[0].pc0, windows[0].pc1)]
     few = replace(bare[0], points=bare[0].points[:9], is_ground=bare[0].is_ground[:9])
@@ -45,7 +45,7 @@ def among_others(config: Config, windows: List[Window]) -> Results:
     return make_model(config, "cpu")(batch)[1::2]
 
 
-def in_pieces(config: Config, windows: List[Window]) -> Results:
+def in_pieces(config: Config, windows: list[Window]) -> Results:
     """Little memory; points, images, look-ups and key points in pieces of other sizes."""
     pieces = {
         "ops.chunks.CHUNK_ON_CPU": 997,
@@ -66,14 +66,14 @@ def in_pieces(config: Config, windows: List[Window]) -> Results:
         return together(config.replace(max_memory=500_000), windows)
 
 
-def shuffled(config: Config, windows: List[Window]) -> Results:
+def shuffled(config: Config, windows: list[Window]) -> Results:
     """Points of every sweep in another order; results put back into the old one."""
     mixed, orders = zip(*(reordered(window) for window in windows))
     results = together(config, list(mixed))
     return [rows_of(result, np.argsort(order)) for result, order in zip(results, orders)]
 
 
-def while_training(config: Config, windows: List[Window]) -> Results:
+def while_training(config: Config, windows: list[Window]) -> Results:
     """Another default dtype, autocast, matrix products in bfloat16 where torch may, no oneDNN."""
     precision = torch.get_float32_matmul_precision()
     torch.set_default_dtype(torch.float64)
@@ -88,7 +88,7 @@ def while_training(config: Config, windows: List[Window]) -> Results:
         torch.set_default_dtype(torch.float32)
 
 
-WAYS: Dict[str, Way] = {
+WAYS: dict[str, Way] = {
     way.__name__: way
     for way in (
         backwards_and_again,
@@ -101,7 +101,7 @@ WAYS: Dict[str, Way] = {
 
 
 @lru_cache(maxsize=None)
-def expected(preset: str) -> Tuple[Config, List[Window], Results]:
+def expected(preset: str) -> tuple[Config, list[Window], Results]:
     config = small(preset)
     windows = windows_for(config, 2)
     return config, windows, plainly(config, windows)

@@ -7,7 +7,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any, Dict, List
+from typing import Any
 
 import pytest
 
@@ -38,7 +38,7 @@ finally:
 sys.exit(code)
 """
 STREET = ("data.num_sweeps=2", "model=fast")
-COMMANDS: Dict[str, List[str]] = {
+COMMANDS: dict[str, list[str]] = {
     "demo": ["demo", "data.num_sweeps=5", "output=made/out", "data.cache=made/cache"],
     "flow": ["flow", *STREET, "engine.workers=1", "output=made/out", "data.cache=made/cache"],
     "eval": ["eval", *STREET, "output=made/out", "data.cache=made/cache"],
@@ -50,7 +50,7 @@ COMMANDS: Dict[str, List[str]] = {
 def test_a_command_stays_in_its_folders(name: str, tmp_path: Path) -> None:
     for folder in ("home", "work", "temporary"):
         (tmp_path / folder).mkdir()
-    environment: Dict[str, Any] = {
+    environment: dict[str, Any] = {
         **os.environ,
         "HOME": str(tmp_path / "home"),
         "TMPDIR": str(tmp_path / "temporary"),

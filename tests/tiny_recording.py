@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import List, Sequence, Tuple
+from typing import Sequence
 
 import numpy as np
 
@@ -42,10 +42,10 @@ class TinyRecording:
 
     def __init__(
         self,
-        names: Tuple[str, ...] = ("LIDAR_LEFT", "LIDAR_RIGHT"),
+        names: tuple[str, ...] = ("LIDAR_LEFT", "LIDAR_RIGHT"),
         num_sweeps: int = 6,
         interval_ns: int = 100_000_000,
-        origin: Tuple[float, float, float] = (1000.0, 500.0, 0.0),
+        origin: tuple[float, float, float] = (1000.0, 500.0, 0.0),
         log_id: str = "tiny",
     ) -> None:
         self.log_id = log_id
@@ -92,7 +92,7 @@ class TinyRecording:
     def is_on_car(self) -> np.ndarray:
         return np.tile(np.arange(NUM_STATIC + NUM_ON_CAR) >= NUM_STATIC, len(self.mounts))
 
-    def units(self, index: int) -> List[UnitReturns]:
+    def units(self, index: int) -> list[UnitReturns]:
         world = self.world(index).reshape(len(self.mounts), -1, 3)
         result = []
         for unit, (name, mount) in enumerate(self.mounts.items()):

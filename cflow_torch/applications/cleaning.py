@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any, Callable, Dict, List, Optional
+from typing import Any, Callable
 
 import numpy as np
 import torch
@@ -49,8 +49,8 @@ class CleanLog(Log):
     def __init__(
         self,
         log: Log,
-        model: Optional[SceneFlowModel] = None,
-        flow: Optional[Callable[[int], FlowResult]] = None,
+        model: SceneFlowModel | None = None,
+        flow: Callable[[int], FlowResult] | None = None,
         standing: bool = False,
     ) -> None:
         self.log_id, self.timestamps = log.log_id, log.timestamps
@@ -60,7 +60,7 @@ class CleanLog(Log):
             model = make_model(make_config("offline"))
         self._log = RecentSweeps(log, 2 if model is None else model.config.num_sweeps)
         self._flow: Any = lru_cache(2)(flow if flow is not None else lambda index: self._estimate(model, index))
-        self._standing: Optional[List[np.ndarray]] = None
+        self._standing: list[np.ndarray] | None = None
         self._follows = standing
 
     def sweep(self, index: int) -> Sweep:
@@ -117,7 +117,7 @@ class CleanLog(Log):
         centre, size = boxes(torch.from_numpy(at + step), torch.from_numpy(group), heading)
         return _inside(sweep, centre, size, heading)
 
-    def _follow(self) -> List[np.ndarray]:
+    def _follow(self) -> list[np.ndarray]:
         """Packed bits of `moving` for every sweep: what moves, what a track says has stopped, what has yet to start."""
         tracker, tables, bits = Tracker(), [], []
         for index in range(len(self.timestamps)):
@@ -161,7 +161,7 @@ def static_map(log: Log, voxel_size: float = 0.1) -> np.ndarray:
     if not voxel_size > 0:
         raise CFlowError(f"voxel_size={voxel_size}: give a positive length in metres")
     known: Any = np.zeros(0, np.int64)
-    parts: List[Any] = [np.zeros((0, 3))]
+    parts: list[Any] = [np.zeros((0, 3))]
     origin: Any = None
     for index in range(len(log.timestamps)):
         sweep = log.sweep(index)
@@ -181,7 +181,7 @@ def static_map(log: Log, voxel_size: float = 0.1) -> np.ndarray:
     return np.concatenate(parts)
 
 
-def _first_rows(table: Dict[str, np.ndarray]) -> Dict[str, np.ndarray]:
+def _first_rows(table: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The first row of each track."""
     first = np.unique(table["id"], return_index=True)[1]
     return {name: values[first] for name, values in table.items()}

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Callable, Dict, Iterable, Iterator, List, NamedTuple, Sequence, Tuple, Union
+from typing import Any, Callable, Iterable, Iterator, NamedTuple, Sequence
 
 import numpy as np
 
@@ -48,7 +48,7 @@ class Movers(NamedTuple):
     seconds: float
 
 
-def label_scene(file: Union[str, Path], model: FlowModel, find_ground: str = "grid", overwrite: bool = False) -> int:
+def label_scene(file: str | Path, model: FlowModel, find_ground: str = "grid", overwrite: bool = False) -> int:
     """Estimate the flow of a scene, and write its labels.
 
     Args:
@@ -70,7 +70,7 @@ def label_scene(file: Union[str, Path], model: FlowModel, find_ground: str = "gr
 
 def find_labels(
     log: Log, flows: Iterable[FlowResult], model: FlowModel, workers: int = 1
-) -> Iterator[Tuple[int, Dict[str, np.ndarray]]]:
+) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
     """The labels of every sweep of a log.
 
     Args:
@@ -98,8 +98,8 @@ def find_labels(
     Cost: reads the log twice; two searches of nearest neighbours a sweep, one of all points, one of what moves.
     """
     tree, log = _import_tree(), RecentSweeps(log, 3)
-    movers: List[Movers] = []
-    groups: List[np.ndarray] = []
+    movers: list[Movers] = []
+    groups: list[np.ndarray] = []
     for index, result in enumerate(_with_last(log, flows, model)):
         sweep, other = log.sweep(index), log.sweep(_neighbour(log, index))
         if result.confidence is None or len(result.cluster_id) != len(sweep.points):

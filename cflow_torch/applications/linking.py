@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Tuple
-
 import torch
 from torch import Tensor
 
@@ -12,7 +10,7 @@ from cflow_torch.ops.segments import first_of_segment
 VOXEL = (0.3, 0.3, 0.9)  # metres; high, because beams meet an object at other heights in each sweep
 
 
-def link(points0: Tensor, group0: Tensor, points1: Tensor, group1: Tensor, least: float) -> Tuple[Tensor, Tensor]:
+def link(points0: Tensor, group0: Tensor, points1: Tensor, group1: Tensor, least: float) -> tuple[Tensor, Tensor]:
     """Pairs of groups that overlap, one to one.
 
     Args:
@@ -76,7 +74,7 @@ def box_of_point(points: Tensor, centre: Tensor, size: Tensor, heading: Tensor) 
     return torch.where(inside.any(0), inside.to(torch.uint8).argmax(0), found)
 
 
-def boxes(points: Tensor, group: Tensor, heading: Tensor) -> Tuple[Tensor, Tensor]:
+def boxes(points: Tensor, group: Tensor, heading: Tensor) -> tuple[Tensor, Tensor]:
     """Centre and size, (K, 3) float64 each, of the upright boxes along `heading` (K,) that hold groups (N,) of points.
 
     No group may be empty.
@@ -90,13 +88,13 @@ def boxes(points: Tensor, group: Tensor, heading: Tensor) -> Tuple[Tensor, Tenso
     return torch.stack([*turned(middle[:, 0], middle[:, 1], heading), middle[:, 2]], 1), high - low
 
 
-def turned(x: Tensor, y: Tensor, angle: Tensor) -> Tuple[Tensor, Tensor]:
+def turned(x: Tensor, y: Tensor, angle: Tensor) -> tuple[Tensor, Tensor]:
     """x, y after a turn by `angle` radians to the left."""
     cos, sin = angle.cos(), angle.sin()
     return cos * x - sin * y, sin * x + cos * y
 
 
-def _voxels(points0: Tensor, points1: Tensor) -> Tuple[Tensor, Tensor]:
+def _voxels(points0: Tensor, points1: Tensor) -> tuple[Tensor, Tensor]:
     """(N0,), (N1,) int64: number of the voxel of each point, the same in both."""
     both = torch.cat([points0, points1])
     voxel = (both / both.new_tensor(VOXEL)).floor().long()
@@ -104,7 +102,7 @@ def _voxels(points0: Tensor, points1: Tensor) -> Tuple[Tensor, Tensor]:
     return number[: len(points0)], number[len(points0) :]
 
 
-def _distinct(group: Tensor, voxel: Tensor) -> Tuple[Tensor, Tensor]:
+def _distinct(group: Tensor, voxel: Tensor) -> tuple[Tensor, Tensor]:
     """(2, V) int64 (group, voxel) without repetition, sorted; number of voxels of each group."""
     own = torch.unique(torch.stack([group, voxel]), dim=1)
     return own, torch.bincount(own[0])

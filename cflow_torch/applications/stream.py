@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections import deque
 from dataclasses import replace
-from typing import Any, Deque, Optional, Union
+from typing import Any
 
 import torch
 
@@ -56,11 +56,11 @@ class FlowStream:
 
     def __init__(
         self,
-        preset: Optional[str] = None,
+        preset: str | None = None,
         *,
-        config: Optional[Config] = None,
+        config: Config | None = None,
         device: Any = "auto",
-        ground: Optional[str] = None,
+        ground: str | None = None,
         max_gap: float = 0.5,
         **overrides: Any,
     ) -> None:
@@ -75,9 +75,9 @@ class FlowStream:
                 "num_future=0"
             )
         self._model, self._ground, self._max_gap = make_model(config, device), ground, max_gap
-        self._sweeps: Deque[Sweep] = deque(maxlen=config.num_history + 1)
-        self._odometry: Optional[Odometry] = None
-        self.window: Optional[Window] = None
+        self._sweeps: deque[Sweep] = deque(maxlen=config.num_history + 1)
+        self._odometry: Odometry | None = None
+        self.window: Window | None = None
 
     @property
     def config(self) -> Config:
@@ -92,11 +92,11 @@ class FlowStream:
     def push(
         self,
         points: Array,
-        pose: Optional[Array] = None,
-        time: Optional[Union[int, float]] = None,
-        is_ground: Optional[Array] = None,
-        point_times: Optional[Array] = None,
-    ) -> Optional[FlowResult]:
+        pose: Array | None = None,
+        time: int | float | None = None,
+        is_ground: Array | None = None,
+        point_times: Array | None = None,
+    ) -> FlowResult | None:
         """Take the sweep t+1; give the flow of the sweep before it.
 
         Args:
@@ -132,7 +132,7 @@ class FlowStream:
         self._sweeps.appendleft(sweep)
         return result
 
-    def _is_next(self, stamp: Optional[int]) -> bool:
+    def _is_next(self, stamp: int | None) -> bool:
         """Whether a sweep follows the newest one; begins anew where it follows none."""
         newest = self._sweeps[0].timestamp_ns if self._sweeps else None
         if stamp is None or newest is None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Dict, Iterable, NamedTuple, Optional, Tuple
+from typing import Dict, Iterable, NamedTuple
 
 import numpy as np
 import torch
@@ -54,7 +54,7 @@ class Tracked(NamedTuple):
         track_id: (N,) int64 for every point of the sweep, -1 = of no track.
     """
 
-    table: Dict[str, np.ndarray]
+    table: dict[str, np.ndarray]
     track_id: np.ndarray
 
 
@@ -78,7 +78,7 @@ class Tracker:
         if not sweep_interval > 0:
             raise CFlowError(f"sweep_interval={sweep_interval}: give the seconds from one sweep to the next")
         self._interval = sweep_interval
-        self._clock: Optional[Tuple[float, float]] = None  # of the last sweep, and when its flow ends
+        self._clock: tuple[float, float] | None = None  # of the last sweep, and when its flow ends
         self._num_sweeps, self._num_tracks = 0, 0
         self._tracks: _Tracks = {}
         self._points, self._owner = torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, dtype=torch.int64)
@@ -125,7 +125,7 @@ class Tracker:
         self._num_sweeps += 1
         return Tracked(table, track_id.cpu().numpy())
 
-    def _predicted(self, device: torch.device, elapsed: float, late: float) -> Tuple[_Tracks, Tensor, Tensor]:
+    def _predicted(self, device: torch.device, elapsed: float, late: float) -> tuple[_Tracks, Tensor, Tensor]:
         """Tracks, and their points with the numbers of their tracks, where they are expected now.
 
         Boxes and points are where the last flow brings them, and go on by `late` seconds if that was for too short.
@@ -139,7 +139,7 @@ class Tracker:
     @staticmethod
     def _found(
         tracks: _Tracks, points: Tensor, owner: Tensor, seen: MovingGroups
-    ) -> Tuple[Tensor, Tensor, Tuple[Tensor, Tensor], Tensor]:
+    ) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor], Tensor]:
         """Tracks and the groups that they are linked to; tracks that stand, with how many points; and of each point
         that does not move, the track whose box it is in, -1 = none."""
         moves = seen.group >= 0
@@ -159,10 +159,10 @@ class Tracker:
         tracks: _Tracks,
         seen: MovingGroups,
         flow: Tensor,
-        links: Tuple[Tensor, Tensor],
-        stands: Tuple[Tensor, Tensor],
-        times: Tuple[float, float],
-    ) -> Tuple[_Tracks, Tensor]:
+        links: tuple[Tensor, Tensor],
+        stands: tuple[Tensor, Tensor],
+        times: tuple[float, float],
+    ) -> tuple[_Tracks, Tensor]:
         """The tracks after this sweep, new ones last, and the track of each group."""
         (linked, group), (now, interval), num_old = links, times, len(tracks["id"])
         heading = torch.atan2(flow[:, 1], flow[:, 0])
@@ -210,7 +210,7 @@ class Tracker:
             tracks[name][both] = values
         return tracks, of_group
 
-    def _times(self, sweeps: Window) -> Tuple[float, float, float, float]:
+    def _times(self, sweeps: Window) -> tuple[float, float, float, float]:
         """Seconds: of t; from t to t+1; from the sweep before to t; of these, what its flow does not span."""
         begin, end = sweeps.pc0.timestamp_ns, sweeps.pc1.timestamp_ns
         has_times = begin is not None and end is not None
@@ -224,7 +224,7 @@ class Tracker:
             raise CFlowError(f"a sweep {last - now:.3f} s before the last one: push sweeps in the order of time")
         return now, interval, now - last, now - due
 
-    def _table(self, tracks: _Tracks, now: float, stamp: Optional[int]) -> Dict[str, np.ndarray]:
+    def _table(self, tracks: _Tracks, now: float, stamp: int | None) -> dict[str, np.ndarray]:
         part = {name: values[tracks["missed"] == 0].cpu().numpy() for name, values in tracks.items()}
         count = len(part["id"])
         axes = {"": part["position"], "v": part["velocity"]}
@@ -255,8 +255,8 @@ class Tracker:
 
 
 def track(
-    log: Log, results: Optional[Iterable[Tuple[int, FlowResult]]] = None, sweep_interval: float = 0.1
-) -> Dict[str, np.ndarray]:
+    log: Log, results: Iterable[tuple[int, FlowResult]] | None = None, sweep_interval: float = 0.1
+) -> dict[str, np.ndarray]:
     """The moving objects of a drive, each with one id.
 
     Args:

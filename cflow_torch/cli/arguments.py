@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from typing import List
 
 # Settings that name a file, a folder or a log: text, whatever they look like.
 _NAMES = ("output", "log", "flow", "archive", "frames", "masks", "result_name", "data.root", "data.cache")
@@ -14,7 +13,7 @@ _WITH_VALUE = ("-c", "--cfg", "-p", "--package", "-i", "--info", "-cd", "--confi
 _GRAMMAR = re.compile(r"['\"\[{]|(choice|glob|range|shuffle|sort|str|tag)\(|.*\$\{")  # what Hydra gives a meaning
 
 
-def for_hydra(arguments: List[str]) -> List[str]:
+def for_hydra(arguments: list[str]) -> list[str]:
     """Settings before options, since Hydra's parser does not take `-m` between two settings; names in quotes.
 
     Args:

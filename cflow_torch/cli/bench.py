@@ -12,7 +12,7 @@ examples:
 from __future__ import annotations
 
 import json
-from typing import Any, Dict, List, Sequence
+from typing import Any, Sequence
 
 import torch
 from omegaconf import DictConfig
@@ -45,7 +45,7 @@ def task(cfg: DictConfig) -> None:
     print(f"written to {output / 'bench.json'}")
 
 
-def measure(model: FlowModel, windows: Sequence[Window], repeats: int, batches: Sequence[int] = ()) -> Dict[str, Any]:
+def measure(model: FlowModel, windows: Sequence[Window], repeats: int, batches: Sequence[int] = ()) -> dict[str, Any]:
     """Seconds and memory of a method.
 
     Args:
@@ -85,7 +85,7 @@ def measure(model: FlowModel, windows: Sequence[Window], repeats: int, batches: 
     }
 
 
-def format_report(report: Dict[str, Any]) -> str:
+def format_report(report: dict[str, Any]) -> str:
     """What `cflow bench` prints, as Markdown."""
     seconds, model = report["seconds"], report["model"]
     peak = "not known" if report["peak_bytes"] is None else f"{report['peak_bytes'] / 1e6:.0f} MB"
@@ -108,7 +108,7 @@ def format_report(report: Dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _windows(log: Log, count: int, config: Config) -> List[Window]:
+def _windows(log: Log, count: int, config: Config) -> list[Window]:
     """So many windows, spread evenly over those with all sweeps before and after; without such, the last ones."""
     end = len(log.timestamps) - 2
     first = min(config.num_history, end)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from difflib import get_close_matches
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Dict, Iterable, List
+from typing import Any, Iterable
 
 from omegaconf import OmegaConf
 
@@ -17,19 +17,19 @@ CONFIGS = Path(cflow_torch.configs.__path__[0])
 SETTERS = ("experiment", "row")  # groups that set what others bring
 
 
-def groups(command: str) -> Dict[str, List[str]]:
+def groups(command: str) -> dict[str, list[str]]:
     """The groups of a command, each with its choices: {"model": ["default", ...], ...}."""
     entries = OmegaConf.load(CONFIGS / f"{command}.yaml").defaults
     names = [str(name) for entry in entries if not isinstance(entry, str) for name in entry]
     return {name: list(PRESETS) if name == "model" else [file.stem for file in files(name)] for name in names}
 
 
-def files(group: str) -> List[Path]:
+def files(group: str) -> list[Path]:
     """The YAML files of a group, sorted by name."""
     return sorted((CONFIGS / group).glob("*.yaml"))
 
 
-def settings(command: str) -> Dict[str, Any]:
+def settings(command: str) -> dict[str, Any]:
     """Every setting of a command in dotted form, with its value in one of the choices of its group."""
     found = dict(own_settings(CONFIGS / f"{command}.yaml"))
     for preset in PRESETS:
@@ -43,9 +43,9 @@ def settings(command: str) -> Dict[str, Any]:
 
 
 @lru_cache(maxsize=None)  # commands share the files of groups
-def own_settings(file: Path) -> Dict[str, Any]:
+def own_settings(file: Path) -> dict[str, Any]:
     """The settings that a YAML file gives, in dotted form."""
-    values: Dict[str, Any] = OmegaConf.to_container(OmegaConf.load(file))  # type: ignore[assignment]
+    values: dict[str, Any] = OmegaConf.to_container(OmegaConf.load(file))  # type: ignore[assignment]
     return flat({key: value for key, value in values.items() if key not in ("defaults", "hydra")})
 
 

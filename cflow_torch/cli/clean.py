@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import Any, Callable, Optional
+from typing import Any, Callable
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -46,7 +46,7 @@ def task(cfg: DictConfig) -> None:
     _claim(cfg, ready_folder(output))
     for log in logs:
         folder, file = output / log.log_id, output / f"{log.log_id}.ply"
-        flow: Optional[Callable[[int], FlowResult]] = None if stored is None else partial(stored, log)
+        flow: Callable[[int], FlowResult] | None = None if stored is None else partial(stored, log)
         with run.reported(failures, log.log_id):
             if not folder.exists():
                 clean = CleanLog(log, model, flow, cfg.standing)

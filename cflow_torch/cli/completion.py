@@ -10,8 +10,6 @@ examples:
 
 from __future__ import annotations
 
-from typing import List
-
 from cflow_torch.cli.choices import CONFIGS, groups, settings
 from cflow_torch.types import CFlowError
 
@@ -54,7 +52,7 @@ _SHELLS = {
 }
 
 
-def task(arguments: List[str]) -> None:
+def task(arguments: list[str]) -> None:
     """Run `cflow completion`."""
     if len(arguments) != 1 or arguments[0] not in _SHELLS:
         given = " ".join(arguments) or "nothing"
@@ -71,7 +69,7 @@ def script(shell: str) -> str:
     return f"# cflow completion {shell}\n{template}".replace("COMMANDS", " ".join(COMMANDS)).replace("CASES", cases)
 
 
-def candidates(command: str) -> List[str]:
+def candidates(command: str) -> list[str]:
     """What can stand behind a command: settings end in =, choices are whole."""
     if not (CONFIGS / f"{command}.yaml").exists():
         return [*(_SHELLS if command == "completion" else ()), "--help"]

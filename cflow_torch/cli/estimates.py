@@ -11,7 +11,7 @@ import signal
 from collections import deque
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from typing import Any, Callable, Deque, Iterator, Sequence, Tuple, TypeVar
+from typing import Any, Callable, Iterator, Sequence, Tuple, TypeVar
 
 import torch
 
@@ -28,7 +28,7 @@ Item = TypeVar("Item")
 Answer = Callable[[], Tuple[Window, FlowResult]]
 
 
-def estimates(model: StopWatch, items: Sequence[Item], read: Callable[[Item], Window]) -> Iterator[Tuple[Item, Answer]]:
+def estimates(model: StopWatch, items: Sequence[Item], read: Callable[[Item], Window]) -> Iterator[tuple[Item, Answer]]:
     """Flow of many pairs; it does not depend on the number of processes.
 
     Args:
@@ -46,7 +46,7 @@ def estimates(model: StopWatch, items: Sequence[Item], read: Callable[[Item], Wi
         for item in frames(items):
             yield item, lambda item=item: _here(model, read(item))  # type: ignore[misc]
         return
-    waiting: Deque[Tuple[Item, Answer]] = deque()
+    waiting: deque[tuple[Item, Answer]] = deque()
     context = multiprocessing.get_context("spawn")  # fork and threads do not go together
     with ProcessPoolExecutor(count, context, initializer=_begin, initargs=(method,)) as pool:
         for item in frames(items):
@@ -56,7 +56,7 @@ def estimates(model: StopWatch, items: Sequence[Item], read: Callable[[Item], Wi
         yield from waiting
 
 
-def _here(model: StopWatch, sweeps: Window) -> Tuple[Window, FlowResult]:
+def _here(model: StopWatch, sweeps: Window) -> tuple[Window, FlowResult]:
     return sweeps, model([sweeps])[0]
 
 
@@ -69,7 +69,7 @@ def _there(model: StopWatch, pool: ProcessPoolExecutor, item: Item, read: Callab
     except (CFlowError, OSError, BrokenProcessPool) as error:
         future.set_exception(error)
 
-    def answer() -> Tuple[Window, FlowResult]:
+    def answer() -> tuple[Window, FlowResult]:
         try:
             arrays, seconds = future.result()
         except BrokenProcessPool:
@@ -91,7 +91,7 @@ def _begin(method: SceneFlowModel) -> None:
     _model = StopWatch(method)
 
 
-def _compute(sweeps: Window) -> Tuple[Any, ...]:
+def _compute(sweeps: Window) -> tuple[Any, ...]:
     """Arrays, because tensors would go through shared memory, of which containers have little; and seconds."""
     (result,) = _model([sweeps])
     return result.numpy(), _model.pairs.pop()

@@ -30,7 +30,7 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
-from typing import Any, Callable, Dict, NamedTuple, Optional, Sequence, Tuple
+from typing import Any, Callable, NamedTuple, Sequence
 
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
@@ -61,7 +61,7 @@ class FlowRun(NamedTuple):
 
     sources: Sources
     job: Job
-    report: Dict[str, Any]
+    report: dict[str, Any]
 
 
 def task(cfg: DictConfig) -> None:
@@ -82,8 +82,8 @@ def task(cfg: DictConfig) -> None:
 
 
 def compute(
-    cfg: DictConfig, shard: Shard, contents: Tuple[str, ...], check: Optional[Callable[[Job, Sources], None]] = None
-) -> Optional[FlowRun]:
+    cfg: DictConfig, shard: Shard, contents: tuple[str, ...], check: Callable[[Job, Sources], None] | None = None
+) -> FlowRun | None:
     """Estimate the flow of all logs of a shard into files, or say what would be done.
 
     Args:
@@ -99,7 +99,7 @@ def compute(
         CFlowError: a setting, the logs or the output folder are refused.
     """
     output = run.output_folder(cfg)
-    settings: Dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
+    settings: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
     engine = dict(settings["engine"])
     name, workers, batch = (engine.pop(key) for key in ("name", "workers", "batch"))
     layout = choose_layout(cfg.device, workers, batch, os.environ)
@@ -168,7 +168,7 @@ def _check_results(cfg: DictConfig, shard: Shard) -> None:
     check_result_name(cfg.result_name)
 
 
-def _contents(cfg: DictConfig, has_confidence: bool) -> Tuple[str, ...]:
+def _contents(cfg: DictConfig, has_confidence: bool) -> tuple[str, ...]:
     given = list(cfg.contents) if OmegaConf.is_list(cfg.contents) else [cfg.contents]
     allowed = (*CONTENTS, *ON_REQUEST)
     if not given or set(given) - set(allowed):

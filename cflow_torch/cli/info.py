@@ -12,7 +12,6 @@ from __future__ import annotations
 import re
 from importlib import import_module, metadata
 from pathlib import Path
-from typing import List
 
 from torch.utils.collect_env import get_pretty_env_info
 
@@ -36,7 +35,7 @@ _NATIVE = ("kornia-rs", "pillow")  # what packages load, and fail with
 _DEVELOPMENT = re.compile(r"extra\s*==\s*['\"](test|dev|notebooks)")  # extras that no command needs
 
 
-def task(arguments: List[str]) -> None:
+def task(arguments: list[str]) -> None:
     """Run `cflow info`."""
     if arguments:
         raise CFlowError(f"info takes no settings, got {' '.join(arguments)}: cflow info")

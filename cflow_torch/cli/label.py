@@ -20,7 +20,6 @@ from __future__ import annotations
 import os
 from contextlib import suppress
 from pathlib import Path
-from typing import Optional
 
 from omegaconf import DictConfig
 from tqdm import tqdm
@@ -88,7 +87,7 @@ def _label(done: FlowRun, shard: Shard, cfg: DictConfig) -> Failures:
     return failures
 
 
-def _check_maker(scene: Path, maker: Optional[str], job: Job) -> None:
+def _check_maker(scene: Path, maker: str | None, job: Job) -> None:
     """Refuse a scene with labels that are not this run's, unless they are to be replaced."""
     if maker not in (None, job.identity) and not job.redo:
         raise CFlowError(

@@ -8,7 +8,7 @@ import traceback
 from contextlib import suppress
 from difflib import get_close_matches
 from importlib import import_module
-from typing import Any, List, Optional
+from typing import Any
 
 from cflow_torch import __version__
 
@@ -53,7 +53,7 @@ more examples:
 """
 
 
-def main(argv: Optional[List[str]] = None) -> None:
+def main(argv: list[str] | None = None) -> None:
     """Run one command. Ends the process with status 1 if anything failed, 2 if the call was wrong, 130 after Ctrl-C."""
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:  # closed: cflow ... >&-
@@ -72,7 +72,7 @@ def main(argv: Optional[List[str]] = None) -> None:
         raise SystemExit(128 + 2) from None  # as if SIGINT had ended it
 
 
-def _run(arguments: List[str]) -> None:
+def _run(arguments: list[str]) -> None:
     if arguments[:1] == ["help"]:  # cflow help eval
         arguments = [*arguments[1:], "--help"]
     command, *rest = arguments or ["--help"]
@@ -100,7 +100,7 @@ def _run(arguments: List[str]) -> None:
         return _end_wrong(error)
 
 
-def _run_with_settings(command: str, run: Any, rest: List[str]) -> None:
+def _run_with_settings(command: str, run: Any, rest: list[str]) -> None:
     import hydra
     from hydra.core.hydra_config import HydraConfig
     from omegaconf import OmegaConf

@@ -22,7 +22,7 @@ from __future__ import annotations
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Callable, Dict, List, Optional
+from typing import Any, Callable
 
 import numpy as np
 from omegaconf import DictConfig
@@ -97,7 +97,7 @@ def _from_above(cfg: DictConfig, model: SceneFlowModel, log: Log, sweeps: Window
     points, (result,) = sweeps.pc0.points, model([sweeps])
     if cfg.deskew:
         points = deskew(sweeps, result).cpu()
-    view: Dict[str, Any] = {
+    view: dict[str, Any] = {
         "is_ground": sweeps.pc0.is_ground,
         "point_cloud_range": model.config.point_cloud_range,
         "title": f"{log.log_id}, sweep {log.timestamps[cfg.pair]}",
@@ -107,7 +107,7 @@ def _from_above(cfg: DictConfig, model: SceneFlowModel, log: Log, sweeps: Window
     return plot_flow(points, result, max_flow=cfg.max_flow, truth=_truth(cfg, log, result), **view)
 
 
-def _truth(cfg: DictConfig, log: Log, result: FlowResult) -> Optional[np.ndarray]:
+def _truth(cfg: DictConfig, log: Log, result: FlowResult) -> np.ndarray | None:
     """(N, 3) true residual flow, NaN where unknown; None = it is not drawn."""
     if cfg.truth not in (True, False, "auto"):
         raise CFlowError(f"truth={cfg.truth}: give true, false or auto")
@@ -120,7 +120,7 @@ def _truth(cfg: DictConfig, log: Log, result: FlowResult) -> Optional[np.ndarray
     return np.where(labels.is_valid[:, None], truth, np.nan)
 
 
-PICTURES: Dict[str, Callable[[DictConfig, SceneFlowModel, Log, Window], Any]] = {
+PICTURES: dict[str, Callable[[DictConfig, SceneFlowModel, Log, Window], Any]] = {
     "flow": _from_above,
     "clusters": _from_above,
     "keypoints": lambda cfg, model, log, sweeps: plot_keypoints(sweeps, model.config),
@@ -139,7 +139,7 @@ def _animate(cfg: DictConfig, model: SceneFlowModel, output: Path) -> Path:
     if not pairs:
         raise CFlowError(f"first={cfg.first}: log {log.log_id} has pairs 0 to {len(log.timestamps) - 2}")
     ready_folder(output)
-    frames: List[Frame] = []
+    frames: list[Frame] = []
     for pair in counted(pairs):
         sweeps = window(recent, pair, model.config.num_history, model.config.num_future)
         (result,) = model([sweeps])

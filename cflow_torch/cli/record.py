@@ -7,7 +7,7 @@ import json
 from dataclasses import asdict
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any, Dict, Optional, Sequence
+from typing import Any, Sequence
 
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
@@ -44,7 +44,7 @@ class Scores:
         for values in (sweeps.pc0.points, labels.flow, labels.category, labels.is_valid):
             self._digest.update(np.ascontiguousarray(values).tobytes())
 
-    def report(self, folder: Path, logs: Sequence[Log], seconds: Dict[str, Any], failures: Failures) -> Dict[str, Any]:
+    def report(self, folder: Path, logs: Sequence[Log], seconds: dict[str, Any], failures: Failures) -> dict[str, Any]:
         """Print the scores, write `folder/results.json` and `folder/config.yaml`, each whole or not at all.
 
         Args:
@@ -81,7 +81,7 @@ class Scores:
         return results
 
 
-def finished_results(cfg: DictConfig, folder: Path) -> Optional[Dict[str, Any]]:
+def finished_results(cfg: DictConfig, folder: Path) -> dict[str, Any] | None:
     """The record of an earlier run with the same settings, versions and data settings; None where there is none.
 
     Raises:
@@ -91,7 +91,7 @@ def finished_results(cfg: DictConfig, folder: Path) -> Optional[Dict[str, Any]]:
     if cfg.overwrite or not file.exists():
         return None
     try:
-        record: Dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+        record: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
         objective(record["results"])
         before = {"versions": record["versions"], "generator": record["data"]["generator"], "config": record["config"]}
     except (ValueError, KeyError, TypeError) as error:
@@ -105,7 +105,7 @@ def finished_results(cfg: DictConfig, folder: Path) -> Optional[Dict[str, Any]]:
     return record
 
 
-def objective(results: Dict[str, Any]) -> float:
+def objective(results: dict[str, Any]) -> float:
     """The one number that a sweep minimises: the mean dynamic error, of the ranges if the definition has them; else the
     three-way end-point error in metres. NaN where there is nothing to score."""
     if "bucketed_by_range" in results:
@@ -117,7 +117,7 @@ def objective(results: Dict[str, Any]) -> float:
     return float("nan") if value is None else float(value)
 
 
-def _generator(cfg: DictConfig) -> Optional[str]:
+def _generator(cfg: DictConfig) -> str | None:
     return generator_key() if cfg.data.get("name") == "benchmark" else None
 
 

@@ -7,7 +7,7 @@ import platform
 import sys
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Callable, Dict, Iterator, List, NamedTuple, Sequence, Tuple
+from typing import Any, Callable, Iterator, List, NamedTuple, Sequence, Tuple
 
 import numpy as np
 import torch
@@ -41,7 +41,7 @@ class UnfinishedJob(RuntimeError):
     """A job that left something undone, and has said what; the other jobs of a sweep run all the same."""
 
 
-def versions() -> Dict[str, str]:
+def versions() -> dict[str, str]:
     """Versions that a result depends on."""
     return {
         "cflow_torch": __version__,
@@ -51,7 +51,7 @@ def versions() -> Dict[str, str]:
     }
 
 
-def machine() -> Dict[str, Any]:
+def machine() -> dict[str, Any]:
     """What times depend on besides the code: "platform", "cpu", "cores", "threads" (of torch)."""
     try:
         with open("/proc/cpuinfo", encoding="utf-8") as file:
@@ -68,7 +68,7 @@ def make_model(cfg: DictConfig) -> SceneFlowModel:
     Raises:
         CFlowError: an unknown or invalid setting.
     """
-    settings: Dict[str, Any] = OmegaConf.to_container(cfg.model, resolve=True)  # type: ignore[assignment]
+    settings: dict[str, Any] = OmegaConf.to_container(cfg.model, resolve=True)  # type: ignore[assignment]
     return estimate.make_model(config_from(settings), cfg.device)
 
 
@@ -149,8 +149,8 @@ class Sources(NamedTuple):
     """Logs that are not open yet: name of their data set, settings of its reader, what `open_log` takes for each."""
 
     reader: str
-    settings: Dict[str, Any]
-    logs: List[Any]
+    settings: dict[str, Any]
+    logs: list[Any]
 
     def open(self, source: Any) -> Log:
         """One of the logs, see `open_log`."""
@@ -164,7 +164,7 @@ def find_logs(cfg: DictConfig) -> Sources:
         CFlowError: no log at all.
     """
     data = cfg.data
-    given: Dict[str, Any] = OmegaConf.to_container(data, resolve=True)  # type: ignore[assignment]
+    given: dict[str, Any] = OmegaConf.to_container(data, resolve=True)  # type: ignore[assignment]
     settings = {str(key): value for key, value in given.items() if key not in _NOT_THE_READERS}
     if "_target_" in data:
         target = settings.pop("_target_")
@@ -185,14 +185,14 @@ def find_logs(cfg: DictConfig) -> Sources:
     return Sources(name, settings, list(find_sources(name, root)))
 
 
-def open_logs(cfg: DictConfig) -> Tuple[List[Log], Failures]:
+def open_logs(cfg: DictConfig) -> tuple[list[Log], Failures]:
     """The logs of `cfg.data`; those that cannot be opened are reported, not fatal.
 
     Raises:
         CFlowError: no log at all.
     """
     sources = find_logs(cfg)
-    logs: List[Log] = []
+    logs: list[Log] = []
     failures: Failures = []
     for source in sources.logs:
         with reported(failures, source.name):
@@ -251,7 +251,7 @@ def for_each_pair(logs: Sequence[Log], model: StopWatch, use: UseResult, pairs: 
     recent = [RecentSweeps(log, config.num_sweeps) for log in logs]
     indices = [(log, index) for log in recent for index in pairs(log)]
 
-    def read(pair: Tuple[RecentSweeps, int]) -> Window:
+    def read(pair: tuple[RecentSweeps, int]) -> Window:
         return window(*pair, config.num_history, config.num_future)
 
     for (log, index), answer in estimates(model, indices, read):
@@ -278,5 +278,5 @@ def finish(failures: Failures) -> None:
 
 def write_config(cfg: DictConfig, folder: Path) -> None:
     """Write the resolved settings and versions to `folder/config.yaml`."""
-    settings: Dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
+    settings: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
     write_text(folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create({**settings, "versions": versions()})))

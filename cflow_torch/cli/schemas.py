@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from dataclasses import make_dataclass
 from pathlib import Path
-from typing import Any, Dict, List, Optional
+from typing import Any, List, Optional
 
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, OmegaConf
@@ -23,7 +23,7 @@ from cflow_torch.config import CONFIGS as METHODS
 from cflow_torch.config import PRESETS, Config, make_config
 
 # A setting has the type of its default in configs/; one whose default is null or auto takes any value, but for these.
-_TYPES: Dict[str, Any] = {
+_TYPES: dict[str, Any] = {
     "batches": List[int],
     "cluster": Optional[int],
     "experiment_name": Optional[str],

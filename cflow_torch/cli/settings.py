@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, Dict, Iterator, List
+from typing import Any, Iterator
 
 import yaml  # type: ignore[import-untyped]
 
@@ -47,7 +47,7 @@ target:
 _Z = 1000.0  # metres; the harness computes with the region, so its bounds are finite, and z is wide open
 
 
-def task(arguments: List[str]) -> None:
+def task(arguments: list[str]) -> None:
     """Run `cflow settings`."""
     if not arguments:
         print("\n\n".join(_page()))
@@ -60,7 +60,7 @@ def task(arguments: List[str]) -> None:
         raise CFlowError(f"settings takes nothing, or --opensceneflow FOLDER, got {' '.join(arguments)}")
 
 
-def harness_models() -> Dict[str, str]:
+def harness_models() -> dict[str, str]:
     """Name -> YAML of each preset as a model of OpenSceneFlow, which gives no sweeps after t+1."""
     models = {}
     for preset, config in ((preset, make_config(preset)) for preset in PRESETS):

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import json
 import time
-from typing import Any, Dict, List
+from typing import Any
 
 import numpy as np
 from omegaconf import DictConfig
@@ -43,7 +43,7 @@ def task(cfg: DictConfig) -> None:
     print(f"written to {output / 'stream.json'}")
 
 
-def play(stream: FlowStream, log: Log, pace: Any = None, count: Any = None) -> Dict[str, Any]:
+def play(stream: FlowStream, log: Log, pace: Any = None, count: Any = None) -> dict[str, Any]:
     """Push the sweeps of a log.
 
     Args:
@@ -59,7 +59,7 @@ def play(stream: FlowStream, log: Log, pace: Any = None, count: Any = None) -> D
     """
     stamps = np.array(log.timestamps[:count], dtype=np.int64)
     due = None if pace is None else (stamps - stamps[0]) / 1e9 / pace
-    latencies: List[float] = []
+    latencies: list[float] = []
     begin = time.perf_counter()
     progress = tqdm(range(len(stamps)), desc=f"stream {log.log_id}", unit="sweep", disable=None)
     for index in progress:
@@ -84,7 +84,7 @@ def play(stream: FlowStream, log: Log, pace: Any = None, count: Any = None) -> D
     }
 
 
-def format_report(report: Dict[str, Any]) -> str:
+def format_report(report: dict[str, Any]) -> str:
     """What `cflow stream` prints."""
     p50, p99 = (1000 * report["latency"][name] for name in ("p50", "p99"))
     lines = [

@@ -15,7 +15,7 @@ from __future__ import annotations
 import shutil
 import sys
 from pathlib import Path
-from typing import Any, Dict, List, Mapping, Optional, Sequence, Tuple
+from typing import Any, List, Mapping, Optional, Sequence, Tuple
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -79,7 +79,7 @@ def task(cfg: DictConfig) -> None:
 
 def _claim(cfg: DictConfig, output: Path, folder: Path, file: Path) -> None:
     """Take the output folder for these settings; files of other settings are never mixed in."""
-    settings: Dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
+    settings: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
     identity = strict({**{name: settings[name] for name in _SETTINGS}, "cflow_torch": __version__})
     ready_folder(output)
     if cfg.overwrite:
@@ -89,7 +89,7 @@ def _claim(cfg: DictConfig, output: Path, folder: Path, file: Path) -> None:
     run.write_config(cfg, output)
 
 
-def _plan(logs: Sequence[Log], version: SubmissionVersion, listed: _Listed, masks: _Masks) -> Tuple[Plan, Failures]:
+def _plan(logs: Sequence[Log], version: SubmissionVersion, listed: _Listed, masks: _Masks) -> tuple[Plan, Failures]:
     """The frames that are needed, with their rows; those whose sweep cannot be read are reported."""
     require_logs(logs, listed)
     frames = [frame for log in logs for frame in plan_log(log, version, listed)]
@@ -113,7 +113,7 @@ def _write(
     rounding, config = Rounding(), model.config
     todo = [pair for pair in plan if not is_complete(folder, pair[1], version)]
 
-    def read(pair: Tuple[PlannedFrame, Frame]) -> Window:
+    def read(pair: tuple[PlannedFrame, Frame]) -> Window:
         return window(pair[0].log, pair[0].index, config.num_history, config.num_future)
 
     for (planned, frame), estimate in estimates(model, todo, read):

@@ -18,7 +18,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any, Callable, Iterator, List, Tuple
+from typing import Any, Callable, Iterator
 
 from omegaconf import DictConfig
 
@@ -45,7 +45,7 @@ def task(cfg: DictConfig) -> None:
     flow, num_sweeps = _flow(cfg)
     logs, failures = run.open_logs(cfg)
     run.write_config(cfg, ready_folder(output))
-    files: List[Path] = []
+    files: list[Path] = []
     for log in logs:
         recent: Any = RecentSweeps(log, num_sweeps)
         file = output / f"{log.log_id}.rrd"
@@ -66,7 +66,7 @@ def task(cfg: DictConfig) -> None:
     run.finish(failures)
 
 
-def _flow(cfg: DictConfig) -> Tuple[Callable[[Log, int], FlowResult], int]:
+def _flow(cfg: DictConfig) -> tuple[Callable[[Log, int], FlowResult], int]:
     """(What gives the flow of a pair, how many sweeps that takes)."""
     if cfg.flow is not None:
         return run.stored_flow(cfg.flow, ("residual_flow", "pose_flow", "cluster_id", "is_valid")), 2
@@ -82,7 +82,7 @@ def _flow(cfg: DictConfig) -> Tuple[Callable[[Log, int], FlowResult], int]:
 
 def _results(
     log: Log, pairs: range, flow: Callable[[Log, int], FlowResult], failures: Failures
-) -> Iterator[Tuple[int, FlowResult]]:
+) -> Iterator[tuple[int, FlowResult]]:
     """The flow of each pair; a bad frame is reported and the rest goes on."""
     for index in counted(pairs, log.log_id):
         result = None

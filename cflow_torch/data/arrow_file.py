@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, List, Optional, Sequence
+from typing import Any, Sequence
 
 import numpy as np
 import pyarrow as pa
@@ -40,13 +40,13 @@ class FeatherFile:
         CFlowError: the file is missing, cannot be reached, or is damaged.
     """
 
-    def __init__(self, file: Any, data: Optional[bytes] = None) -> None:
+    def __init__(self, file: Any, data: bytes | None = None) -> None:
         with file_errors(file, "copy it from the data set"):
             source = read_bytes(file) if data is None else data
             self._table = pa.ipc.open_file(source, options=pa.ipc.IpcReadOptions(use_threads=False)).read_all()
             self._table.validate(full=True)
         self.file = file
-        self.names: List[str] = self._table.column_names
+        self.names: list[str] = self._table.column_names
         self.num_rows: int = self._table.num_rows
 
     def read(self, columns: Sequence[str]) -> pa.Table:
@@ -89,13 +89,13 @@ def bools(table: pa.Table, column: str, file: Any) -> np.ndarray:
     return _column(table, column, file, "bool", pa.types.is_boolean).to_numpy().astype(bool)
 
 
-def texts(table: pa.Table, column: str, file: Any) -> List[str]:
+def texts(table: pa.Table, column: str, file: Any) -> list[str]:
     """Text of every row, also of a dictionary.
 
     Raises:
         CFlowError: another type, or empty entries.
     """
-    found: List[str] = _column(table, column, file, "text", _is_text).to_pylist()
+    found: list[str] = _column(table, column, file, "text", _is_text).to_pylist()
     return found
 
 

@@ -10,7 +10,7 @@ import socket
 import tempfile
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO, Any, Collection, Iterator, List, Optional
+from typing import IO, Any, Collection, Iterator
 
 from cflow_torch.data.paths import Place, as_path, forget_listings, is_remote, remote_errors
 from cflow_torch.types import CFlowError
@@ -125,7 +125,7 @@ def atomic_folder(folder: Place) -> Iterator[Path]:
         _remove(scratch, folder)
 
 
-def remove_stale(folder: Place, targets: Optional[Collection[str]] = None) -> List[str]:
+def remove_stale(folder: Place, targets: Collection[str] | None = None) -> list[str]:
     """Remove what writers that were killed have left in a folder.
 
     Args:

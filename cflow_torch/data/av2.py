@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Dict, List, Optional, Sequence, Union
+from typing import Sequence
 
 import numpy as np
 import pyarrow as pa
@@ -28,7 +28,7 @@ _SIZE = ("length_m", "width_m", "height_m")
 _FLOW = ("flow_tx_m", "flow_ty_m", "flow_tz_m")
 
 
-def find_av2_logs(root: Place) -> List[Path]:
+def find_av2_logs(root: Place) -> list[Path]:
     """Sorted folders of all logs: those that hold `sensors/lidar`.
 
     Args:
@@ -60,12 +60,12 @@ class AV2Log(NumberedSweeps):
             the wrong type, poses that are no rigid motion or do not cover a sweep.
     """
 
-    def __init__(self, folder: Place, ground: Optional[str] = "av2-api") -> None:
+    def __init__(self, folder: Place, ground: str | None = "av2-api") -> None:
         self.folder = as_path(folder)
         if not _is_log(self.folder):
             raise CFlowError(f"{self.folder} is no Argoverse 2 log: it holds no folder sensors/lidar")
         self.log_id = self.folder.resolve().name
-        self._files: Dict[int, Path] = {
+        self._files: dict[int, Path] = {
             int(file.stem): file
             for file in (self.folder / "sensors" / "lidar").glob("*.feather")
             if is_stamp(file.stem)
@@ -91,7 +91,7 @@ class AV2Log(NumberedSweeps):
             is_ground = self._raster.is_ground(moved(points, pose), self._rule)
         return Sweep(points=points, is_ground=is_ground, pose=pose.copy(), timestamp_ns=timestamp, point_times=times)
 
-    def labels(self, index: int) -> Optional[FlowLabels]:
+    def labels(self, index: int) -> FlowLabels | None:
         """Truth of the pair (index, index + 1).
 
         Taken from the first of these that the log has: `flow_labels/<ns of sweep t>.feather` (if that folder exists,
@@ -119,7 +119,7 @@ class AV2Log(NumberedSweeps):
         file = self._files[timestamp]
         return floats(FeatherFile(file).read("xyz"), "xyz", file, np.float32)
 
-    def _read_poses(self) -> Dict[int, np.ndarray]:
+    def _read_poses(self) -> dict[int, np.ndarray]:
         """Sweep time -> (4, 4) float64 T_world_ego."""
         file = self.folder / "city_SE3_egovehicle.feather"
         table = FeatherFile(file).read(("timestamp_ns", *_POSE))
@@ -146,7 +146,7 @@ class AV2Log(NumberedSweeps):
             is_valid = bools(stored.read(["is_valid"]), "is_valid", file)
         return FlowLabels(floats(table, _FLOW, file, np.float32), category.astype(np.uint8), is_valid)
 
-    def _labels_from_annotations(self, file: Path, timestamp0: int, timestamp1: int) -> Optional[FlowLabels]:
+    def _labels_from_annotations(self, file: Path, timestamp0: int, timestamp1: int) -> FlowLabels | None:
         stored = FeatherFile(file)
         table = stored.read(("timestamp_ns", "track_uuid", "category", *_SIZE, *_POSE))
         times = integers(table, "timestamp_ns", file)
@@ -167,7 +167,7 @@ def _is_log(folder: Path) -> bool:
     return (folder / "sensors" / "lidar").is_dir()
 
 
-def _poses(table: pa.Table, file: Path, names: Sequence[Union[int, str]]) -> np.ndarray:
+def _poses(table: pa.Table, file: Path, names: Sequence[int | str]) -> np.ndarray:
     """(K, 4, 4) float64."""
     values = floats(table, _POSE, file)
     return poses_from_quaternions(values[:, 4:], values[:, :4], lambda row: f"{file}: the pose of {names[row]}")

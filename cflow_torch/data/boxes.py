@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
-from typing import Any, List, Mapping, Sequence
+from typing import Any, Mapping, Sequence
 
 import numpy as np
 
@@ -49,7 +49,7 @@ def make_boxes(track_id: Sequence[str], category: Sequence[int], size: Any, pose
     return Boxes(track_id, np.array(category, dtype=np.uint8), sizes.reshape(-1, 3), poses.reshape(-1, 4, 4))
 
 
-def category_indices(names: Sequence[Any], known: Mapping[Any, str]) -> List[int]:
+def category_indices(names: Sequence[Any], known: Mapping[Any, str]) -> list[int]:
     """Argoverse 2 indices of K boxes.
 
     Args:

@@ -6,7 +6,7 @@ import inspect
 import logging
 from dataclasses import dataclass, replace
 from importlib import import_module
-from typing import Any, Dict, List, Mapping, Sequence
+from typing import Any, Mapping, Sequence
 
 from cflow_torch.data.log import ChangedLog, Log
 from cflow_torch.data.log_check import check_log
@@ -38,7 +38,7 @@ class DataSet:
     what: str
 
 
-DATA_SETS: Dict[str, DataSet] = {
+DATA_SETS: dict[str, DataSet] = {
     "av2": DataSet("av2", "find_av2_logs", "AV2Log", "Argoverse 2 log (a folder with sensors/lidar)"),
     "hdf5": DataSet("hdf5", "find_hdf5_scenes", "HDF5Log", "scene (a file *.h5)"),
     "nuscenes": DataSet("nuscenes", "find_nuscenes_scenes", "NuScenesLog", "nuScenes scene (a folder with v1.0-*)"),
@@ -116,7 +116,7 @@ def _has_logs(name: str, root: Any) -> bool:
         return False
 
 
-def find_user_sources(target: str, settings: Mapping[str, Any]) -> List[UserSource]:
+def find_user_sources(target: str, settings: Mapping[str, Any]) -> list[UserSource]:
     """What `open_log` takes, one source per log that a user's own reader returns.
 
     Args:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Dict, Tuple
-
 import numpy as np
 
 from cflow_torch.types import CFlowError
 
-CATEGORIES: Tuple[str, ...] = (
+CATEGORIES: tuple[str, ...] = (
     "NONE",
     "ANIMAL",
     "ARTICULATED_BUS",
@@ -43,9 +41,9 @@ CATEGORIES: Tuple[str, ...] = (
 )
 """Name of every category; the position is the index that labels store (0 = background)."""
 
-CATEGORY_INDEX: Dict[str, int] = {name: index for index, name in enumerate(CATEGORIES)}
+CATEGORY_INDEX: dict[str, int] = {name: index for index, name in enumerate(CATEGORIES)}
 
-META_CLASSES: Dict[str, Tuple[str, ...]] = {
+META_CLASSES: dict[str, tuple[str, ...]] = {
     "BACKGROUND": ("NONE",),
     "CAR": ("REGULAR_VEHICLE",),
     "OTHER_VEHICLES": (
@@ -64,7 +62,7 @@ META_CLASSES: Dict[str, Tuple[str, ...]] = {
 }
 """Meta class -> its categories. Signs, cones, trailers of signs and animals belong to none and are not scored."""
 
-META_NAMES: Tuple[str, ...] = tuple(META_CLASSES)
+META_NAMES: tuple[str, ...] = tuple(META_CLASSES)
 
 
 def _meta_lookup() -> np.ndarray:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Callable, List
+from typing import Callable
 
 from cflow_torch.types import CFlowError
 
 Test = Callable[[Path], bool]
 
 
-def find_folders(root: Path, is_log: Test, depth: int, what: str, is_passed: Test = lambda folder: True) -> List[Path]:
+def find_folders(root: Path, is_log: Test, depth: int, what: str, is_passed: Test = lambda folder: True) -> list[Path]:
     """Folders that are a log, `root` among them. Nothing below a log is looked at.
 
     Args:
@@ -28,7 +28,7 @@ def find_folders(root: Path, is_log: Test, depth: int, what: str, is_passed: Tes
     """
     if not root.is_dir():
         raise CFlowError(f"{root} is no folder; give {what}")
-    found: List[Path] = []
+    found: list[Path] = []
     level = [root]
     for _ in range(depth + 1):
         logs = {folder for folder in level if is_log(folder)}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Callable, Dict, Optional, Tuple
+from typing import Any, Callable
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from cflow_torch.types import CFlowError
 
 # Rule -> metres that a point of the ground is away from the surface at most, and raster coordinate to cell: towards
 # zero, or half to even.
-GROUND_RULES: Dict[str, Tuple[float, Callable[[np.ndarray], Any]]] = {
+GROUND_RULES: dict[str, tuple[float, Callable[[np.ndarray], Any]]] = {
     "av2-api": (0.3, np.trunc),
     "bsfe": (0.4, np.round),
 }
@@ -63,7 +63,7 @@ class GroundRaster:
             return (np.abs(above) <= threshold) | (above < 0)
 
 
-def read_ground_raster(map_folder: Path) -> Optional[GroundRaster]:
+def read_ground_raster(map_folder: Path) -> GroundRaster | None:
     """Read the raster of a log.
 
     Args:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any, Callable, Dict, Optional
+from typing import Any, Callable
 
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.paths import read_bytes
@@ -23,7 +23,7 @@ def read_json(file: Path) -> Any:
     return parse_json(read_bytes(file), file)
 
 
-def parse_json(data: bytes, file: Any, use: Optional[Callable[[Dict[str, Any]], Any]] = None) -> Any:
+def parse_json(data: bytes, file: Any, use: Callable[[dict[str, Any]], Any] | None = None) -> Any:
     """What a text says.
 
     Args:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
-from typing import Any, Iterator, List, Optional
+from typing import Any, Iterator
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from cflow_torch.windows.ego_motion import rigid_transform
 _OTHERS = {"rosbag": "bags", "mcap": "bags"}  # loaders that go forward only: our reader
 
 
-def find_kiss_icp(root: Place) -> List[Path]:
+def find_kiss_icp(root: Place) -> list[Path]:
     """The place itself: what lies there, only the loader knows."""
     return [as_path(root)]
 
@@ -42,7 +42,7 @@ class KissICPLog(NumberedSweeps):
         CFlowError: KISS-ICP is missing, or what its loader needs; no such loader; nothing that it can read.
     """
 
-    def __init__(self, root: Place, loader: str, sequence: Optional[str] = None) -> None:
+    def __init__(self, root: Place, loader: str, sequence: str | None = None) -> None:
         self.root = as_path(root)
         try:
             from kiss_icp.datasets import available_dataloaders, dataset_factory
@@ -73,7 +73,7 @@ class KissICPLog(NumberedSweeps):
         pose = None if self._poses is None else rigid_transform(self._poses[index], f"{self._what}: pose {index}")
         return Sweep(points, None, pose)
 
-    def labels(self, index: int) -> Optional[FlowLabels]:
+    def labels(self, index: int) -> FlowLabels | None:
         """None: these data sets have no truth of motion."""
         self._timestamp(index)
         return None

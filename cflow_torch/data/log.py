@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Iterator, List, Optional, Protocol, Sequence, Union
+from typing import Any, Iterator, Protocol, Sequence
 
 import numpy as np
 from torch.utils.data import Dataset
@@ -48,7 +48,7 @@ class Log(Protocol):
         """Sweep number `index` with float32 points, float64 pose `T_world_ego`, ground mask, time."""
         raise NotImplementedError
 
-    def labels(self, index: int) -> Optional[FlowLabels]:
+    def labels(self, index: int) -> FlowLabels | None:
         """Truth of the pair (index, index + 1), None where the log has none."""
         return None
 
@@ -106,11 +106,11 @@ class WindowDataset(Dataset):  # type: ignore[type-arg]
         ...     results = model(batch)
     """
 
-    def __init__(self, logs: Union[Log, Sequence[Log]], num_history: int = 0, num_future: int = 0) -> None:
+    def __init__(self, logs: Log | Sequence[Log], num_history: int = 0, num_future: int = 0) -> None:
         several: Any = [logs] if hasattr(logs, "timestamps") else logs
         self._pairs = [(log, index) for log in several for index in range(len(log.timestamps) - 1)]
         self._num_history, self._num_future = num_history, num_future
-        self._recent: Optional[RecentSweeps] = None
+        self._recent: RecentSweeps | None = None
 
     def __len__(self) -> int:
         return len(self._pairs)
@@ -122,7 +122,7 @@ class WindowDataset(Dataset):  # type: ignore[type-arg]
         return window(self._recent, index, self._num_history, self._num_future)
 
     @staticmethod
-    def collate(windows: Sequence[Window]) -> List[Window]:
+    def collate(windows: Sequence[Window]) -> list[Window]:
         """A batch, as models take it: sweeps differ in their numbers of points, so nothing is stacked."""
         return list(windows)
 
@@ -152,7 +152,7 @@ class ChangedLog(Log):
     def __init__(self, log: Log) -> None:
         self.log, self.log_id, self.timestamps = log, log.log_id, log.timestamps
 
-    def labels(self, index: int) -> Optional[FlowLabels]:
+    def labels(self, index: int) -> FlowLabels | None:
         """The log's labels."""
         return self.log.labels(index)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, List, Sequence
+from typing import Any, Sequence
 
 import numpy as np
 from tqdm import tqdm
@@ -49,7 +49,7 @@ def poses_from_odometry(log: Log) -> np.ndarray:
     return np.stack(start + [onwards @ pose for pose in forward[turn + 1 :]])
 
 
-def _register(log: Log, order: Sequence[int]) -> List[np.ndarray]:
+def _register(log: Log, order: Sequence[int]) -> list[np.ndarray]:
     """Poses of sweeps in the order given, the world being that of the first of them."""
     odometry = Odometry()
     return [

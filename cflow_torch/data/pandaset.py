@@ -5,7 +5,7 @@ from __future__ import annotations
 import gzip
 import io
 from pathlib import Path
-from typing import Dict, List, Optional, Sequence, Tuple
+from typing import Sequence
 
 import numpy as np
 
@@ -42,11 +42,11 @@ _LABELS = {
     "VEHICULAR_TRAILER": ("Towed Object",),
     "WHEELED_DEVICE": ("Motorized Scooter", "Other Vehicle - Pedicab", "Personal Mobility Device"),
 }
-CATEGORY_NAME: Dict[str, str] = {label: name for name, labels in _LABELS.items() for label in labels}
+CATEGORY_NAME: dict[str, str] = {label: name for name, labels in _LABELS.items() for label in labels}
 """Label of a cuboid -> Argoverse 2 name. The data set publishes no such map: this one is cflow_torch's."""
 
 
-def find_pandaset_sequences(root: Place) -> List[Path]:
+def find_pandaset_sequences(root: Place) -> list[Path]:
     """Folders of all sequences under a folder, sorted.
 
     Args:
@@ -101,7 +101,7 @@ class PandaSetLog(NumberedSweeps):
         points, shots, _ = self._cloud(index)
         return Sweep(points, None, self._poses[index].copy(), time, shots - time * 1e-9)
 
-    def labels(self, index: int) -> Optional[FlowLabels]:
+    def labels(self, index: int) -> FlowLabels | None:
         """Truth of the pair (index, index + 1); None for the last sweep, and where either has no cuboids."""
         self._timestamp(index)
         if index == len(self) - 1:
@@ -122,7 +122,7 @@ class PandaSetLog(NumberedSweeps):
             flow[rows], category[rows], is_valid[rows] = part.flow, part.category, part.is_valid
         return FlowLabels(flow, category, is_valid)
 
-    def _cloud(self, index: int) -> Tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _cloud(self, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(N, 3) float32 points in the frame of the pose, (N,) float64 unix times in seconds, (N,) which LiDAR."""
         names = ("x", "y", "z", "t", "d")
         columns = _columns(self._files[index], names)
@@ -131,7 +131,7 @@ class PandaSetLog(NumberedSweeps):
         points = moved(table[:3].T, np.linalg.inv(self._poses[index]))
         return points.astype(np.float32), table[3], table[4]
 
-    def _boxes(self, cuboids: Dict[str, np.ndarray], file: Path, index: int, lidar: int) -> Boxes:
+    def _boxes(self, cuboids: dict[str, np.ndarray], file: Path, index: int, lidar: int) -> Boxes:
         """Cuboids for the points of a LiDAR, in the frame of sweep `index`. Yaw 0 is the world's y axis."""
         with file_errors(file):
             rows = np.flatnonzero(np.isin(cuboids["cuboids.sensor_id"], (_EVERY_LIDAR, lidar)))
@@ -145,7 +145,7 @@ class PandaSetLog(NumberedSweeps):
             )
 
 
-def _columns(file: Path, names: Sequence[str]) -> Dict[str, np.ndarray]:
+def _columns(file: Path, names: Sequence[str]) -> dict[str, np.ndarray]:
     """Columns of a pickled data frame."""
     with file_errors(file):
         columns = load_columns(io.BytesIO(gzip.decompress(read_bytes(file))))

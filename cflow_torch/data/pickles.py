@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import pickle
-from typing import IO, Any, Dict, FrozenSet, Tuple
+from typing import IO, Any, Tuple
 
 import numpy as np
 
 Name = Tuple[str, str]  # module, name in it
 _NUMPY = (("multiarray", "_reconstruct"), ("multiarray", "scalar"), ("numeric", "_frombuffer"))
-NUMPY_ARRAYS: FrozenSet[Name] = frozenset(
+NUMPY_ARRAYS: frozenset[Name] = frozenset(
     [("numpy", "ndarray"), ("numpy", "dtype")]
     + [(f"numpy.{core}.{module}", name) for core in ("core", "_core") for module, name in _NUMPY]
 )
 """What the pickle of a NumPy array names."""
-DATA_FRAMES: FrozenSet[Name] = NUMPY_ARRAYS | {
+DATA_FRAMES: frozenset[Name] = NUMPY_ARRAYS | {
     ("builtins", "slice"),
     ("pandas._libs.internals", "_unpickle_block"),
     ("pandas.core.frame", "DataFrame"),
@@ -35,7 +35,7 @@ class StandIn:
         state: what its `__setstate__` would get; None = nothing.
     """
 
-    parts: Tuple[Any, ...]
+    parts: tuple[Any, ...]
     state: Any = None
 
     def __new__(cls, *parts: Any) -> StandIn:  # the one that every way of building calls
@@ -50,7 +50,7 @@ class StandIn:
 class _Unpickler(pickle.Unpickler):
     """Makes plain values (numbers, texts, lists, tuples and the like), and stand-ins for names that are allowed."""
 
-    def __init__(self, stream: IO[bytes], allowed: FrozenSet[Name]) -> None:
+    def __init__(self, stream: IO[bytes], allowed: frozenset[Name]) -> None:
         super().__init__(stream, encoding="ascii")
         self._allowed = allowed
 
@@ -60,7 +60,7 @@ class _Unpickler(pickle.Unpickler):
         raise pickle.UnpicklingError(f"it asks for {module}.{name}, which is never run")
 
 
-def load_plain(stream: IO[bytes], allowed: FrozenSet[Name] = frozenset()) -> Any:
+def load_plain(stream: IO[bytes], allowed: frozenset[Name] = frozenset()) -> Any:
     """What a pickle holds.
 
     Args:
@@ -89,7 +89,7 @@ def array_of(stand_in: StandIn) -> np.ndarray:
     return values.reshape(shape, order=order)
 
 
-def load_columns(stream: IO[bytes]) -> Dict[str, np.ndarray]:
+def load_columns(stream: IO[bytes]) -> dict[str, np.ndarray]:
     """Columns of a data frame that pandas pickled, by name; without pandas.
 
     Raises:
@@ -103,7 +103,7 @@ def load_columns(stream: IO[bytes]) -> Dict[str, np.ndarray]:
         layout = manager.state[3]["0.14.1"]
         blocks, axes = [(block["values"], block["mgr_locs"]) for block in layout["blocks"]], layout["axes"]
     names = array_of(axes[0].parts[1]["data"])
-    columns: Dict[str, np.ndarray] = {}
+    columns: dict[str, np.ndarray] = {}
     for values, place in blocks:
         is_slice = place.state is None and len(place.parts) == 3
         chosen = slice(*place.parts) if is_slice else array_of(place)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any, Dict, List
+from typing import Any
 
 from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.file_errors import shortened
@@ -30,11 +30,11 @@ def strict(value: Any) -> Any:
     return value
 
 
-def flat(value: Any, name: str = "") -> Dict[str, Any]:
+def flat(value: Any, name: str = "") -> dict[str, Any]:
     """Nested dictionaries as one, keys joined by dots; lists are values."""
     if not isinstance(value, dict):
         return {name: value}
-    parts: List[Dict[str, Any]] = [flat(part, f"{name}.{key}" if name else str(key)) for key, part in value.items()]
+    parts: list[dict[str, Any]] = [flat(part, f"{name}.{key}" if name else str(key)) for key, part in value.items()]
     return {key: leaf for part in parts for key, leaf in part.items()}
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from typing import Any, List, Optional, Tuple
+from typing import Any
 
 import numpy as np
 
@@ -123,7 +123,7 @@ def static_world_residual(log: Log, index: int, baseline: int = BASELINE) -> Sta
     return StaticResidual(index, index + baseline, shift, turn, agreement, aligned, verdict)
 
 
-def check_static_world(log: Log) -> List[StaticResidual]:
+def check_static_world(log: Log) -> list[StaticResidual]:
     """Warn if the static world does not stay put in two pairs of sweeps of a log.
 
     Args:
@@ -153,15 +153,15 @@ def check_static_world(log: Log) -> List[StaticResidual]:
     return found
 
 
-def _choose(log: Any, baseline: int) -> List[int]:
+def _choose(log: Any, baseline: int) -> list[int]:
     """First sweeps of pairs that do not overlap, those with the largest turn first."""
     last = len(log.timestamps) - 1 - baseline
-    poses: Optional[np.ndarray] = getattr(log, "poses", None)
+    poses: np.ndarray | None = getattr(log, "poses", None)
     if poses is None:
         return sorted({0, last})
     relative = np.linalg.inv(poses[baseline:]) @ poses[:-baseline]
     order = np.argsort(-np.abs(np.arctan2(relative[:, 1, 0], relative[:, 0, 0])), kind="stable")
-    chosen: List[int] = []
+    chosen: list[int] = []
     for index in order.tolist():
         if len(chosen) < _PAIRS and all(abs(index - other) >= baseline for other in chosen):
             chosen.append(index)
@@ -212,7 +212,7 @@ class _Patches:
         distance = np.einsum("ni,nij,nj->n", offset, precision, offset)
         return float(np.exp(-distance / 2).sum() / max(len(xy), 1))
 
-    def fit(self, xy: np.ndarray) -> Tuple[np.ndarray, float, float]:
+    def fit(self, xy: np.ndarray) -> tuple[np.ndarray, float, float]:
         """(shift, turn, agreement after them) that bring points onto the patches."""
         x, y, turn = 0.0, 0.0, 0.0
         for _ in range(_STEPS):
@@ -229,7 +229,7 @@ class _Patches:
             x, y, turn = np.array([x, y, turn]) - np.linalg.solve(hessian, gradient)
         return np.array([x, y]), float(turn), self.agreement(_turned(xy, turn) + (x, y))
 
-    def _pairs(self, xy: np.ndarray) -> Tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _pairs(self, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Which points fall on a patch, their offsets from its middle (M, 2), and its precision (M, 2, 2)."""
         if not len(self.cell):
             return np.zeros(len(xy), bool), np.zeros((0, 2)), np.zeros((0, 2, 2))

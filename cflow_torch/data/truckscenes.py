@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import ClassVar, List, Mapping, Optional, Sequence, Tuple
+from typing import ClassVar, Mapping, Sequence
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from cflow_torch.data.paths import Place
 from cflow_torch.types import CFlowError
 
 
-def find_truckscenes_scenes(root: Place) -> List[SceneSource]:
+def find_truckscenes_scenes(root: Place) -> list[SceneSource]:
     """All scenes under a folder, see `nuscenes.tables.find_scenes`."""
     return find_scenes(root, ("log", "map"), "TruckScenes")
 
@@ -54,14 +54,14 @@ class TruckScenesLog(NuScenesLog):
         self,
         source: SceneSource,
         sweep_step: int = 1,
-        lidars: Optional[Sequence[str]] = None,
-        own_vehicle: Optional[Footprint] = OWN_VEHICLE,
+        lidars: Sequence[str] | None = None,
+        own_vehicle: Footprint | None = OWN_VEHICLE,
         deskew: bool = True,
     ) -> None:
         super().__init__(source, sweep_step, lidars, own_vehicle)
         self._deskew = deskew
 
-    def _points_of(self, content: bytes, file: Path) -> Tuple[np.ndarray, Optional[np.ndarray]]:
+    def _points_of(self, content: bytes, file: Path) -> tuple[np.ndarray, np.ndarray | None]:
         fields = pcd_fields(content, file)
         needed = ("x", "y", "z", "timestamp") if self._deskew else ("x", "y", "z")
         missing = [name for name in needed if name not in fields or fields[name].ndim != 1]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import reduce
-from typing import NamedTuple, Tuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -79,7 +79,7 @@ class Columns(NamedTuple):
     cluster: Tensor
 
 
-def find_clusters(sweeps: ProjectedSweeps, config: ClusteringConfig) -> Tuple[Clusters, Tensor, Tensor]:
+def find_clusters(sweeps: ProjectedSweeps, config: ClusteringConfig) -> tuple[Clusters, Tensor, Tensor]:
     """Alg. clustering, from the projection of the aggregated sweeps on: dilate, label, validate by size.
 
     Args:
@@ -105,7 +105,7 @@ def find_clusters(sweeps: ProjectedSweeps, config: ClusteringConfig) -> Tuple[Cl
     return clusters, of_place, sweeps.pixel
 
 
-def cluster_images(images: Tensor, pixel_size: float, config: ClusteringConfig) -> Tuple[Clusters, Columns]:
+def cluster_images(images: Tensor, pixel_size: float, config: ClusteringConfig) -> tuple[Clusters, Columns]:
     """The clusters of images, and where they are.
 
     Args:
@@ -156,7 +156,7 @@ def cluster_images(images: Tensor, pixel_size: float, config: ClusteringConfig) 
 
 def keep_live(
     component: Tensor, num_components: int, window: Tensor, step: Tensor, row: Tensor, col: Tensor
-) -> Tuple[Clusters, Tensor]:
+) -> tuple[Clusters, Tensor]:
     """The components that can move: a pixel at t+1 and a pixel before.
 
     Args:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Optional
 
 import torch
 from torch import Tensor
@@ -36,7 +35,7 @@ class CoarseToFine(SceneFlowModel):
         raise NotImplementedError
 
 
-def _flow_so_far(batch: Batch, flow: Optional[Tensor], motion: Motion) -> Tensor:
+def _flow_so_far(batch: Batch, flow: Tensor | None, motion: Motion) -> Tensor:
     """(A, P) float64, metres per sweep interval: the sum over the scales, of every point before t+1."""
     total = torch.empty_like(batch.positions) if flow is None else flow
     for points in chunks(batch.num_newest, len(batch.image), batch.image.device):

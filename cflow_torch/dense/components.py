@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Tuple
 
 import torch
 from torch import Tensor
@@ -54,7 +53,7 @@ def label_components(image: Tensor, pixels: Tensor, pixel_size: float, config: C
 
 def components_by_size(
     padded: Tensor, height: int, width: int, places: Places, pixel_size: float, config: ClusteringConfig
-) -> Tuple[Tensor, int]:
+) -> tuple[Tensor, int]:
     """Component, under any name, of the set pixels of padded images of height x width, and more than the largest.
 
     All oversized components are eroded together: components of a dilated image do not share a 3 x 3 neighbourhood
@@ -82,7 +81,7 @@ def components_by_size(
     return torch.where(oversized, part.add_(count), component), count + num_parts
 
 
-def _components(padded: Tensor, places: Places, reach: int, config: ClusteringConfig) -> Tuple[Tensor, int]:
+def _components(padded: Tensor, places: Places, reach: int, config: ClusteringConfig) -> tuple[Tensor, int]:
     """Component of pixels of padded images (kornia: dilated ones if `reach` is 3), and more than the largest."""
     if config.labeling == "kornia":
         return connected_components_kornia(padded, places.pixel, config.connectivity), places.pixel.numel()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Iterator, List, Optional, Tuple
+from typing import Iterator
 
 import torch
 from torch import Tensor
@@ -77,7 +77,7 @@ def correlate(clusters: Clusters, sweeps: ProjectedSweeps, config: DenseConfig) 
     return Estimates(displacement, scores, available, batch.elapsed[clusters.window, 1:])
 
 
-def best_shifts(pairs: TemplatePairs, engine: str = "fft", max_memory: Optional[float] = None) -> Tuple[Tensor, Tensor]:
+def best_shifts(pairs: TemplatePairs, engine: str = "fft", max_memory: float | None = None) -> tuple[Tensor, Tensor]:
     """The shift of each template that maximises the normalised cross-correlation with its target.
 
     Args:
@@ -122,8 +122,8 @@ def best_shifts(pairs: TemplatePairs, engine: str = "fft", max_memory: Optional[
 
 
 def _correlated(
-    packing: Packing, engine: str, max_memory: Optional[float]
-) -> Iterator[Tuple[slice, Tensor, List[Tensor]]]:
+    packing: Packing, engine: str, max_memory: float | None
+) -> Iterator[tuple[slice, Tensor, list[Tensor]]]:
     """Runs of packed pairs, their searched counts, one pair after the other, and the same as (n, searched) pieces.
 
     The counts of a run are overwritten by those of the next.
@@ -136,7 +136,7 @@ def _correlated(
     size = min(size, sum(found.templates * found.searched for found in classes))
     dtype = torch.float32 if max(found.most for found in classes) < 1 << 24 else torch.float64
     samples = torch.empty(size, dtype=dtype, device=device)
-    pieces: List[Tensor] = []
+    pieces: list[Tensor] = []
     first_pair = last_pair = used = 0
     for block, found, step in zip(blocks, classes, steps):
         images = block.view(-1, found.height, found.width)
@@ -159,7 +159,7 @@ def _correlated(
     yield slice(first_pair, last_pair), samples[:used], pieces
 
 
-def _samples_at_once(device: torch.device, max_memory: Optional[float]) -> Tuple[int, int]:
+def _samples_at_once(device: torch.device, max_memory: float | None) -> tuple[int, int]:
     """Samples of templates that are correlated together, and of correlations that are looked through together."""
     at_once, in_part = (_AT_ONCE_CPU, _IN_PART_CPU) if device.type == "cpu" else (_AT_ONCE_GPU, _IN_PART_GPU)
     if max_memory is not None:
@@ -171,10 +171,10 @@ def _samples_at_once(device: torch.device, max_memory: Optional[float]) -> Tuple
 def _candidates(
     part: slice,
     samples: Tensor,
-    pieces: List[Tensor],
+    pieces: list[Tensor],
     search: Search,
     target_energy: Tensor,
-    radius: Optional[Tensor],
+    radius: Tensor | None,
 ) -> Tensor:
     """Shifts that may be the best of their pair: (4, K) int64, packed pair, dy, dx, count.
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Tuple
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -15,7 +13,7 @@ from cflow_torch.ops.segments import segment_amin
 from cflow_torch.types import CFlowError
 
 
-def find_dense_clusters(sweeps: ProjectedSweeps, config: DenseConfig) -> Tuple[Clusters, Tensor, Tensor]:
+def find_dense_clusters(sweeps: ProjectedSweeps, config: DenseConfig) -> tuple[Clusters, Tensor, Tensor]:
     """Spatio-temporal clusters of the aggregated points (t+1, t, t-1, ...) by HDBSCAN on x, y, z.
 
     Args:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import List, NamedTuple, Sequence
+from typing import NamedTuple, Sequence
 
 import numpy as np
 import torch
@@ -84,7 +84,7 @@ class Packing:
     """
 
     samples: Tensor
-    classes: List[SizeClass]
+    classes: list[SizeClass]
     own: Tensor
     own_on_host: np.ndarray
     search: Search

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Optional
 
 import torch
 from torch import Tensor
@@ -27,7 +26,7 @@ class ProjectedSweeps:
 
     batch: Batch
     grid: Grid
-    flow: Optional[Tensor]
+    flow: Tensor | None
     occupancy: Tensor
     pixel: Tensor
 
@@ -39,7 +38,7 @@ class ProjectedSweeps:
         return torch.cat((self.batch.positions[:, : before.start], _warp(self.batch, self.flow, before)), 1)
 
 
-def project(batch: Batch, flow: Optional[Tensor], grid: Grid) -> ProjectedSweeps:
+def project(batch: Batch, flow: Tensor | None, grid: Grid) -> ProjectedSweeps:
     """Warp every sweep m by (t+1-m) times its flow so far and draw it.
 
     Args:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Tuple
 
 import torch
 from torch import Tensor
@@ -80,14 +79,14 @@ def add_sectional_view(
     return replace(estimates, displacement=displacement.view_as(estimates.displacement))
 
 
-def _project(positions: Tensor, heading: Tensor, pixel_size: float) -> Tuple[Tensor, Tensor]:
+def _project(positions: Tensor, heading: Tensor, pixel_size: float) -> tuple[Tensor, Tensor]:
     """(row, col) of points in the X-Z view: rotation by minus the heading, then Eq. 3d_to_bev on (x', z)."""
     size = torch.full((), pixel_size, dtype=positions.dtype, device=positions.device)
     along = heading[0] * positions[0] + heading[1] * positions[1]
     return torch.floor(positions[2] / size).long(), torch.floor(along / size).long()
 
 
-def _copies(cluster_of_point: Tensor, cluster_of_pair: Tensor, pairs_of_cluster: Tensor) -> Tuple[Tensor, Tensor]:
+def _copies(cluster_of_point: Tensor, cluster_of_pair: Tensor, pairs_of_cluster: Tensor) -> tuple[Tensor, Tensor]:
     """Each point once for every pair of its cluster: (point, pair), where pairs are sorted by cluster."""
     repeats = pairs_of_cluster[cluster_of_point]
     point = torch.repeat_interleave(torch.arange(repeats.numel(), device=repeats.device), repeats)
@@ -96,7 +95,7 @@ def _copies(cluster_of_point: Tensor, cluster_of_pair: Tensor, pairs_of_cluster:
     return point, start[point] + place
 
 
-def _distinct(pair: Tensor, row: Tensor, col: Tensor, size: Tensor) -> Tuple[Tensor, Tensor, Tensor]:
+def _distinct(pair: Tensor, row: Tensor, col: Tensor, size: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Pixels that are hit at least once, each once."""
     area = size[:, 0] * size[:, 1]
     end = area.cumsum(0)

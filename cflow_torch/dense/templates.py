@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Optional, Union
 
 import torch
 from torch import Tensor
@@ -55,12 +54,10 @@ class TemplatePairs:
     cluster: Tensor
     source: Tensor
     size: Tensor
-    radius: Optional[Tensor] = None
+    radius: Tensor | None = None
 
 
-def make_pairs(
-    clusters: Clusters, batch: Batch, pixel_size: Union[float, Tensor], max_speed: Optional[float]
-) -> TemplatePairs:
+def make_pairs(clusters: Clusters, batch: Batch, pixel_size: float | Tensor, max_speed: float | None) -> TemplatePairs:
     """All pairs of some clusters.
 
     Args:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Sequence, Tuple, Union
+from typing import Sequence
 
 import numpy as np
 
@@ -23,20 +23,20 @@ class Accumulator(ABC):
         sums: float64, one array of the same shape per quantity.
     """
 
-    totals: Tuple[str, ...] = ("count", "sums")  # attributes that add up over frames
+    totals: tuple[str, ...] = ("count", "sums")  # attributes that add up over frames
     num_quantities = 2  # of each point
 
-    def __init__(self, definition: Union[str, Definition] = "opensceneflow") -> None:
+    def __init__(self, definition: str | Definition = "opensceneflow") -> None:
         self.definition = get_definition(definition)
         self.count = np.zeros(self.shape(), dtype=np.int64)
         self.sums = np.zeros((self.num_quantities, *self.shape()), dtype=np.float64)
 
     @abstractmethod
-    def shape(self) -> Tuple[int, ...]:
+    def shape(self) -> tuple[int, ...]:
         """Numbers of cells along each axis."""
 
     @abstractmethod
-    def cells(self, scored: ScoredPoints) -> Tuple[np.ndarray, Sequence[np.ndarray]]:
+    def cells(self, scored: ScoredPoints) -> tuple[np.ndarray, Sequence[np.ndarray]]:
         """(K,) int64 flat cell of the points that count, and their quantities, (K,) float64 each."""
 
     def update_points(self, scored: ScoredPoints) -> None:

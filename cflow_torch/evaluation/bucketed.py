@@ -5,7 +5,7 @@ And the plain end-point error of static and dynamic points by distance from the 
 
 from __future__ import annotations
 
-from typing import Any, Dict, Sequence, Tuple
+from typing import Any, Sequence
 
 import numpy as np
 
@@ -23,7 +23,7 @@ def mean_of_present(values: np.ndarray) -> float:
     return float(np.nansum(values) / count) if count else float("nan")
 
 
-def bucket_cells(scored: ScoredPoints, definition: Definition) -> Tuple[np.ndarray, np.ndarray]:
+def bucket_cells(scored: ScoredPoints, definition: Definition) -> tuple[np.ndarray, np.ndarray]:
     """Class and speed bucket of each point.
 
     Returns:
@@ -35,7 +35,7 @@ def bucket_cells(scored: ScoredPoints, definition: Definition) -> Tuple[np.ndarr
     return meta * (len(definition.speed_edges) - 1) + bucket, (meta >= 0) & (bucket >= 0)
 
 
-def bucket_scores(count: np.ndarray, error_sum: np.ndarray, speed_sum: np.ndarray) -> Dict[str, Any]:
+def bucket_scores(count: np.ndarray, error_sum: np.ndarray, speed_sum: np.ndarray) -> dict[str, Any]:
     """Scores of (classes, buckets) sums: the "classes" and "mean" that `BucketedEPE.compute` returns."""
     with np.errstate(divide="ignore", invalid="ignore"):
         epe = error_sum / count
@@ -71,17 +71,17 @@ class BucketedEPE(Accumulator):
     mean over classes.
     """
 
-    def shape(self) -> Tuple[int, ...]:
+    def shape(self) -> tuple[int, ...]:
         """(classes, buckets)."""
         return len(META_NAMES), len(self.definition.speed_edges) - 1
 
-    def cells(self, scored: ScoredPoints) -> Tuple[np.ndarray, Sequence[np.ndarray]]:
+    def cells(self, scored: ScoredPoints) -> tuple[np.ndarray, Sequence[np.ndarray]]:
         """Class and bucket; error and speed."""
         cell, keep = bucket_cells(scored, self.definition)
         keep &= scored.in_region
         return cell[keep], (scored.error[keep], scored.speed[keep])
 
-    def compute(self) -> Dict[str, Any]:
+    def compute(self) -> dict[str, Any]:
         """Scores so far.
 
         Returns:
@@ -102,18 +102,18 @@ class BucketedByRange(Accumulator):
     Convention: each point is in one range at most; a range's scores are those of a `BucketedEPE` of its points.
     """
 
-    def shape(self) -> Tuple[int, ...]:
+    def shape(self) -> tuple[int, ...]:
         """(ranges, classes, buckets)."""
         return len(self.definition.region_edges) - 1, len(META_NAMES), len(self.definition.speed_edges) - 1
 
-    def cells(self, scored: ScoredPoints) -> Tuple[np.ndarray, Sequence[np.ndarray]]:
+    def cells(self, scored: ScoredPoints) -> tuple[np.ndarray, Sequence[np.ndarray]]:
         """Range, class and bucket; error and speed."""
         cell, keep = bucket_cells(scored, self.definition)
         number = interval_of(scored.reach, self.definition.region_edges, self.definition.closed)
         keep &= number >= 0
         return (number * self.count[0].size + cell)[keep], (scored.error[keep], scored.speed[keep])
 
-    def compute(self) -> Dict[str, Any]:
+    def compute(self) -> dict[str, Any]:
         """Scores so far.
 
         Returns:
@@ -135,11 +135,11 @@ class RangeWiseEPE(Accumulator):
 
     num_quantities = 1
 
-    def shape(self) -> Tuple[int, ...]:
+    def shape(self) -> tuple[int, ...]:
         """(ranges, static / dynamic)."""
         return len(self.definition.range_edges) - 1, 2
 
-    def cells(self, scored: ScoredPoints) -> Tuple[np.ndarray, Sequence[np.ndarray]]:
+    def cells(self, scored: ScoredPoints) -> tuple[np.ndarray, Sequence[np.ndarray]]:
         """Range and motion; error."""
         number = interval_of(scored.distance, self.definition.range_edges)
         # speed times rate, not divided by the interval: the product is what the harness compares
@@ -147,11 +147,11 @@ class RangeWiseEPE(Accumulator):
         keep = number >= 0
         return (2 * number + dynamic)[keep], (scored.error[keep],)
 
-    def compute(self) -> Dict[str, Any]:
+    def compute(self) -> dict[str, Any]:
         """Per range ("0-35", ...) `static_epe`, `dynamic_epe` in metres, `num_static`, `num_dynamic`; and "mean"."""
         with np.errstate(divide="ignore", invalid="ignore"):
             epe = self.sums[0] / self.count
-        result: Dict[str, Any] = {
+        result: dict[str, Any] = {
             name: {
                 "static_epe": float(epe[row, 0]),
                 "dynamic_epe": float(epe[row, 1]),

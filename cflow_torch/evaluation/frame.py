@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Optional, Tuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -52,12 +52,12 @@ class EvalFrame:
 
     points: Array
     labels: FlowLabels
-    residual_flow: Optional[Array] = None
-    flow: Optional[Array] = None
-    pose_flow: Optional[Array] = None
-    T_ego1_ego0: Optional[Array] = None
-    is_ground: Optional[Array] = None
-    eval_mask: Optional[Array] = None
+    residual_flow: Array | None = None
+    flow: Array | None = None
+    pose_flow: Array | None = None
+    T_ego1_ego0: Array | None = None
+    is_ground: Array | None = None
+    eval_mask: Array | None = None
     residual_axes: str = "t+1"
 
     def __post_init__(self) -> None:
@@ -92,7 +92,7 @@ class EvalFrame:
         window: Window,
         result: FlowResult,
         labels: FlowLabels,
-        stored_motion: Optional[StoredMotion] = None,
+        stored_motion: StoredMotion | None = None,
         **parts: Any,
     ) -> EvalFrame:
         """Frame of a window and the flow that was estimated for it.
@@ -134,7 +134,7 @@ class EvalFrame:
         object.__setattr__(self, name, value)
 
 
-def _checked(name: str, value: Any, dtype: Any, shape: Tuple[int, ...]) -> Any:
+def _checked(name: str, value: Any, dtype: Any, shape: tuple[int, ...]) -> Any:
     """The array in its type; None stays None."""
     if value is None:
         return None

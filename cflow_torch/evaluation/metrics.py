@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Callable, Dict, Union
+from typing import Any, Callable
 
 from cflow_torch.evaluation.accumulator import Accumulator
 from cflow_torch.evaluation.bucketed import BucketedByRange, BucketedEPE, RangeWiseEPE
@@ -11,7 +11,7 @@ from cflow_torch.evaluation.frame import EvalFrame
 from cflow_torch.evaluation.masks import score_points
 from cflow_torch.evaluation.threeway import ThreeWayEPE
 
-_ACCUMULATORS: Dict[str, Callable[..., Accumulator]] = {
+_ACCUMULATORS: dict[str, Callable[..., Accumulator]] = {
     "bucketed": BucketedEPE,
     "bucketed_by_range": BucketedByRange,
     "three_way": ThreeWayEPE,
@@ -29,9 +29,9 @@ class SceneFlowMetrics:
     Convention: frames in any order; `merge` joins parts that were scored apart.
     """
 
-    def __init__(self, definition: Union[str, Definition] = "opensceneflow") -> None:
+    def __init__(self, definition: str | Definition = "opensceneflow") -> None:
         self.definition = get_definition(definition)
-        self.parts: Dict[str, Any] = {name: _ACCUMULATORS[name](self.definition) for name in self.definition.metrics}
+        self.parts: dict[str, Any] = {name: _ACCUMULATORS[name](self.definition) for name in self.definition.metrics}
         self.num_frames = 0
         self.num_points = 0
         self.num_nan = 0
@@ -61,7 +61,7 @@ class SceneFlowMetrics:
         self.num_points += other.num_points
         self.num_nan += other.num_nan
 
-    def compute(self) -> Dict[str, Any]:
+    def compute(self) -> dict[str, Any]:
         """Nested dictionary of plain numbers: "definition", `num_frames`, `num_points`, `num_nan`, and each metric."""
         return {
             "definition": self.definition.name,

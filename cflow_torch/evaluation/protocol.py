@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from statistics import fmean
-from typing import Any, Dict, List, Mapping, Optional, Sequence, Tuple
+from typing import Any, Mapping, Sequence
 
 from cflow_torch.types import CFlowError
 
-CHALLENGE_DATA_SETS: Tuple[str, ...] = ("AEVA", "AV2", "nuScenes", "TruckScenes", "Waymo")
-CHALLENGE_RANGES: Tuple[str, ...] = ("0-35", "35-70")
+CHALLENGE_DATA_SETS: tuple[str, ...] = ("AEVA", "AV2", "nuScenes", "TruckScenes", "Waymo")
+CHALLENGE_RANGES: tuple[str, ...] = ("0-35", "35-70")
 
 
 @dataclass(frozen=True)
@@ -25,12 +25,12 @@ class ProtocolScores:
     """
 
     overall: float
-    data_sets: Dict[str, float]
-    ranges: Dict[str, float]
-    missing: Tuple[str, ...]
+    data_sets: dict[str, float]
+    ranges: dict[str, float]
+    missing: tuple[str, ...]
 
 
-def errors_by_range(results: Mapping[str, Any]) -> Dict[str, float]:
+def errors_by_range(results: Mapping[str, Any]) -> dict[str, float]:
     """Dynamic bucket-normalised error of each range, mean over classes, of what `SceneFlowMetrics.compute` returned.
 
     Args:
@@ -49,9 +49,9 @@ def errors_by_range(results: Mapping[str, Any]) -> Dict[str, float]:
 
 
 def score_data_sets(
-    results: Mapping[str, Mapping[str, Optional[float]]],
-    data_sets: Optional[Sequence[str]] = None,
-    ranges: Optional[Sequence[str]] = None,
+    results: Mapping[str, Mapping[str, float | None]],
+    data_sets: Sequence[str] | None = None,
+    ranges: Sequence[str] | None = None,
 ) -> ProtocolScores:
     """Combine the errors of several data sets.
 
@@ -75,8 +75,8 @@ def score_data_sets(
     unknown = [name for name in (*results, *given) if name not in (*set_names, *range_names)]
     if unknown:
         raise CFlowError(f"{unknown} given, but only {set_names}, {range_names} asked for; leave out or ask for all")
-    reasons: List[str] = []
-    table: Dict[str, List[float]] = {}
+    reasons: list[str] = []
+    table: dict[str, list[float]] = {}
     for set_name in set_names:
         row = results.get(set_name, {})
         table[set_name] = [_number(row.get(name)) for name in range_names]
@@ -89,5 +89,5 @@ def score_data_sets(
     return ProtocolScores(fmean(per_set.values()), per_set, per_range, tuple(reasons))
 
 
-def _number(value: Optional[float]) -> float:
+def _number(value: float | None) -> float:
     return math.nan if value is None else float(value)

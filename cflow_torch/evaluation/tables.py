@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Callable, Dict, List, Sequence, Tuple
+from typing import Any, Callable, List, Sequence, Tuple
 
 Table = Tuple[List[str], List[List[Any]]]
 
 
-def format_table(results: Dict[str, Any]) -> str:
+def format_table(results: dict[str, Any]) -> str:
     """Tables of the bucketed (also by range), three-way and range-wise scores that `SceneFlowMetrics.compute` returned.
 
     Args:
@@ -27,16 +27,16 @@ def format_table(results: Dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _bucketed(scores: Dict[str, Any]) -> Table:
+def _bucketed(scores: dict[str, Any]) -> Table:
     return _static_and_dynamic("class", "dynamic error", "dynamic_error", scores["classes"], scores["mean"])
 
 
-def _range_wise(scores: Dict[str, Any]) -> Table:
+def _range_wise(scores: dict[str, Any]) -> Table:
     ranges = {name: row for name, row in scores.items() if name != "mean"}
     return _static_and_dynamic("range [m]", "dynamic EPE [m]", "dynamic_epe", ranges, scores["mean"])
 
 
-def _static_and_dynamic(of: str, title: str, key: str, scores: Dict[str, Any], mean: Dict[str, float]) -> Table:
+def _static_and_dynamic(of: str, title: str, key: str, scores: dict[str, Any], mean: dict[str, float]) -> Table:
     rows = [
         [name, _number(row["static_epe"]), _number(row[key]), row["num_static"], row["num_dynamic"]]
         for name, row in scores.items()
@@ -45,7 +45,7 @@ def _static_and_dynamic(of: str, title: str, key: str, scores: Dict[str, Any], m
     return [of, "static EPE [m]", title, "static points", "dynamic points"], rows
 
 
-def _by_range(scores: Dict[str, Any]) -> Table:
+def _by_range(scores: dict[str, Any]) -> Table:
     classes = next(iter(scores["ranges"].values()))["classes"]
     moving = [name for name in classes if name != "BACKGROUND"]
     rows = []
@@ -56,13 +56,13 @@ def _by_range(scores: Dict[str, Any]) -> Table:
     return ["dynamic error, range [m]", *moving, "mean"], rows
 
 
-def _three_way(scores: Dict[str, Any]) -> Table:
+def _three_way(scores: dict[str, Any]) -> Table:
     keys = ("epe_3way", "epe_fd", "epe_fs", "epe_bs", "dynamic_iou")
     titles = ["EPE 3-way [m]", "EPE FD [m]", "EPE FS [m]", "EPE BS [m]", "dynamic IoU"]
     return titles, [[_number(scores[key]) for key in keys]]
 
 
-_TABLES: Dict[str, Callable[[Dict[str, Any]], Table]] = {
+_TABLES: dict[str, Callable[[dict[str, Any]], Table]] = {
     "bucketed": _bucketed,
     "bucketed_by_range": _by_range,
     "three_way": _three_way,
@@ -74,7 +74,7 @@ def _number(value: float) -> str:
     return "-" if math.isnan(value) else f"{value:.4f}"
 
 
-def _markdown(header: Sequence[object], rows: Sequence[Sequence[object]]) -> List[str]:
+def _markdown(header: Sequence[object], rows: Sequence[Sequence[object]]) -> list[str]:
     """Lines of a Markdown table, first column flush left, others flush right."""
     cells = [[str(cell) for cell in row] for row in (header, *rows)]
     first, *others = [max(len(cell) for cell in column) for column in zip(*cells)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Dict, Sequence, Tuple, Union
+from typing import Any, Sequence
 
 import numpy as np
 
@@ -20,9 +20,9 @@ FRAME_COUNT_EPS, FRAME_IOU_EPS = 1e-8, 1e-6  # of OpenSceneFlow's per-frame valu
 
 # The three sets of the score as (categories, motion).
 _FOREGROUND = slice(1, None)
-_SETS: Dict[str, Tuple[Any, int]] = {"epe_fd": (_FOREGROUND, 1), "epe_fs": (_FOREGROUND, 0), "epe_bs": (0, 0)}
-_GROUPS: Dict[str, Any] = {"background": slice(0, 1), "foreground": _FOREGROUND}
-_META_GROUPS: Dict[str, Any] = {name: [CATEGORY_INDEX[c] for c in members] for name, members in META_CLASSES.items()}
+_SETS: dict[str, tuple[Any, int]] = {"epe_fd": (_FOREGROUND, 1), "epe_fs": (_FOREGROUND, 0), "epe_bs": (0, 0)}
+_GROUPS: dict[str, Any] = {"background": slice(0, 1), "foreground": _FOREGROUND}
+_META_GROUPS: dict[str, Any] = {name: [CATEGORY_INDEX[c] for c in members] for name, members in META_CLASSES.items()}
 
 
 def point_quantities(predicted: np.ndarray, true: np.ndarray, sweep_interval: float) -> np.ndarray:
@@ -62,16 +62,16 @@ class ThreeWayEPE(Accumulator):
     totals = ("count", "sums", "num_frames", "frame_sums")
     num_quantities = len(QUANTITIES) + 1  # the last one: 1 where a point is predicted as dynamic
 
-    def __init__(self, definition: Union[str, Definition] = "opensceneflow") -> None:
+    def __init__(self, definition: str | Definition = "opensceneflow") -> None:
         super().__init__(definition)
         self.num_frames = 0
         self.frame_sums = np.zeros(len(_SETS) + 1, dtype=np.float64)  # per-frame values of the sets and the IoU
 
-    def shape(self) -> Tuple[int, ...]:
+    def shape(self) -> tuple[int, ...]:
         """(categories, motions, distances)."""
         return len(CATEGORIES), len(MOTIONS), len(DISTANCES)
 
-    def cells(self, scored: ScoredPoints) -> Tuple[np.ndarray, Sequence[np.ndarray]]:
+    def cells(self, scored: ScoredPoints) -> tuple[np.ndarray, Sequence[np.ndarray]]:
         """Category, motion and distance; `QUANTITIES`, predicted as dynamic."""
         keep, meta = scored.in_region, meta_class(scored.category)
         if self.definition.foreground == "meta":
@@ -86,7 +86,7 @@ class ThreeWayEPE(Accumulator):
         self.num_frames += 1
         self.frame_sums += _values(count, sums, FRAME_COUNT_EPS, FRAME_IOU_EPS)
 
-    def compute(self) -> Dict[str, Any]:
+    def compute(self) -> dict[str, Any]:
         """Scores so far.
 
         Returns:
@@ -107,10 +107,10 @@ class ThreeWayEPE(Accumulator):
             "by_class": {name: self._group(place) for name, place in _META_GROUPS.items()},
         }
 
-    def _group(self, categories: Any) -> Dict[str, Dict[str, Dict[str, float]]]:
+    def _group(self, categories: Any) -> dict[str, dict[str, dict[str, float]]]:
         """Motion -> distance -> means over a group of categories."""
         count, sums = self.count[categories].sum(axis=0), self.sums[:, categories].sum(axis=1)
-        places: Dict[str, Any] = {"all": slice(None), **{name: [place] for place, name in enumerate(DISTANCES)}}
+        places: dict[str, Any] = {"all": slice(None), **{name: [place] for place, name in enumerate(DISTANCES)}}
         return {
             motion: {
                 name: _means(count[row, place].sum(), sums[:, row, place].sum(axis=1)) for name, place in places.items()
@@ -127,6 +127,6 @@ def _values(count: np.ndarray, sums: np.ndarray, count_eps: float = 0.0, iou_eps
         return np.array([*means, predicted[:, 1].sum() / (true + predicted[:, 0].sum() + iou_eps)])
 
 
-def _means(count: np.integer, sums: np.ndarray) -> Dict[str, float]:
+def _means(count: np.integer, sums: np.ndarray) -> dict[str, float]:
     means = {key: float(total / count) if count else float("nan") for key, total in zip(QUANTITIES, sums)}
     return {"count": int(count), "num_predicted": int(sums[-1]), **means}

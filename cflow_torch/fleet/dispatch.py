@@ -7,7 +7,7 @@ import time
 from collections import Counter, deque
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import replace
-from typing import Any, Callable, Deque, Iterator, Optional, Protocol, Sequence, Set
+from typing import Any, Callable, Iterator, Protocol, Sequence
 
 from cflow_torch.fleet.job import Event, Failed, Opened, Unit
 from cflow_torch.fleet.progress import say
@@ -49,12 +49,12 @@ class _Worker:
     def __init__(self, handle: Handle) -> None:
         self.handle = handle
         self.is_ready = False
-        self.unit: Optional[Unit] = None
-        self.opened: Optional[Opened] = None
-        self.left: Set[int] = set()  # time stamps of the unit's frames that are not settled, once it is opened
-        self.call: Optional[Future] = None
+        self.unit: Unit | None = None
+        self.opened: Opened | None = None
+        self.left: set[int] = set()  # time stamps of the unit's frames that are not settled, once it is opened
+        self.call: Future | None = None
 
-    def take(self, unit: Optional[Unit]) -> None:
+    def take(self, unit: Unit | None) -> None:
         """Have a unit in hand, or none."""
         self.unit, self.opened, self.left = unit, None, set()
 
@@ -99,14 +99,14 @@ class _Run:
         self, handles: Sequence[Handle], units: Sequence[Unit], stop: Callable[[], bool], retries: int
     ) -> None:
         self._workers = [_Worker(handle) for handle in handles]
-        self._queue: Deque[Unit] = deque(units)
+        self._queue: deque[Unit] = deque(units)
         self._stop, self._retries = stop, retries
         self._failed_starts = 0  # in a row
         self._deaths: Counter[int] = Counter()  # unit number -> workers that died on it or its frames
 
     def events(self) -> Iterator[Event]:
         """See `dispatch`."""
-        told: Optional[float] = None
+        told: float | None = None
         while True:
             if self._stop() and told is None:
                 told = time.monotonic()

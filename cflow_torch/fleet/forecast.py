@@ -7,7 +7,7 @@ import tempfile
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Dict, Iterator, Sequence, Tuple
+from typing import Iterator, Sequence
 
 from tqdm import tqdm
 
@@ -54,7 +54,7 @@ def forecast(job: Job, units: Sequence[Unit], layout: Layout) -> str:
     return "\n".join(lines)
 
 
-def _try(job: Job, unit: Unit, layout: Layout) -> Tuple[Dict[str, float], int]:
+def _try(job: Job, unit: Unit, layout: Layout) -> tuple[dict[str, float], int]:
     """Read, compute and write two batches, as a worker would. The first warms up, if there is a second.
 
     Returns:
@@ -70,7 +70,7 @@ def _try(job: Job, unit: Unit, layout: Layout) -> Tuple[Dict[str, float], int]:
     return {stage: sum(event.seconds[stage] for event in timed) / len(timed) for stage in stages}, frame_bytes
 
 
-def _costs(job: Job, layout: Layout, todo: int, seconds: Dict[str, float], frame_bytes: int) -> Iterator[str]:
+def _costs(job: Job, layout: Layout, todo: int, seconds: dict[str, float], frame_bytes: int) -> Iterator[str]:
     """Time, room and memory for the frames that are to be done."""
     workers, output = len(layout.devices), as_path(job.output)
     stages = ", ".join(f"{name} {1e3 * value:.1f}" for name, value in seconds.items())

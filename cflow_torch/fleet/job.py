@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from typing import Any, Dict, FrozenSet, List, Mapping, Optional, Sequence, Tuple, Union
+from typing import Any, Mapping, Sequence, Union
 
 from cflow_torch.config import Config
 from cflow_torch.data.flow_file import CONTENTS
@@ -34,9 +34,9 @@ class Job:
     config: Config
     identity: str
     reader: str
-    settings: Dict[str, Any]
+    settings: dict[str, Any]
     output: str
-    contents: Tuple[str, ...] = CONTENTS
+    contents: tuple[str, ...] = CONTENTS
     batch: int = 1
     redo: bool = False
 
@@ -58,7 +58,7 @@ class Unit:
     source: Any
     first: Fraction = Fraction(0)
     last: Fraction = Fraction(1)
-    only: Optional[FrozenSet[int]] = None
+    only: frozenset[int] | None = None
     deaths: int = 0
 
     def frames(self, num_pairs: int) -> range:
@@ -72,8 +72,8 @@ class Opened:
 
     unit: int
     log_id: str
-    frames: Tuple[int, ...]
-    todo: Tuple[int, ...]
+    frames: tuple[int, ...]
+    todo: tuple[int, ...]
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class Done:
 
     unit: int
     timestamp: int
-    seconds: Dict[str, float]
+    seconds: dict[str, float]
 
 
 @dataclass(frozen=True)
@@ -92,13 +92,13 @@ class Failed:
     unit: int
     name: str
     message: str
-    timestamp: Optional[int] = None
+    timestamp: int | None = None
 
 
 Event = Union[Opened, Done, Failed]
 
 
-def split(units: Sequence[Unit], workers: int) -> List[Unit]:
+def split(units: Sequence[Unit], workers: int) -> list[Unit]:
     """The same frames in enough units to keep all workers busy, numbered from 0."""
     parts = -(-_UNITS_PER_WORKER * workers // max(1, len(units))) if workers > 1 else 1
     pieces = []
@@ -123,14 +123,14 @@ class Shard:
                 "index of 0 ... count - 1"
             )
 
-    def units(self, sources: Sequence[Any]) -> List[Unit]:
+    def units(self, sources: Sequence[Any]) -> list[Unit]:
         """This shard's part of the logs.
 
         The logs, one after the other, are one line that is cut into `count` pieces of equal length; so a shard opens
         its own logs only, and shares at most its first and its last with a neighbour.
         """
         begin, end = (Fraction(edge * len(sources), self.count) for edge in (self.index, self.index + 1))
-        units: List[Unit] = []
+        units: list[Unit] = []
         for number, source in enumerate(sources):
             first, last = max(begin - number, Fraction(0)), min(end - number, Fraction(1))
             if first < last:
@@ -162,7 +162,7 @@ def find_shard(index: Any, count: Any, environ: Mapping[str, str]) -> Shard:
     return found or Shard()
 
 
-def _from_environment(environ: Mapping[str, str]) -> Optional[Shard]:
+def _from_environment(environ: Mapping[str, str]) -> Shard | None:
     """What torchrun or SLURM gives this process; None if neither does.
 
     A SLURM batch script is no task of its step: only `srun` sets SLURM_STEP_NUM_TASKS, so that `--ntasks=8` without

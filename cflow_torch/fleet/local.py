@@ -6,7 +6,7 @@ import multiprocessing
 import signal
 from concurrent.futures import Future, TimeoutError
 from concurrent.futures.process import BrokenProcessPool
-from typing import Any, Callable, Iterator, Optional, Sequence
+from typing import Any, Callable, Iterator, Sequence
 
 from pebble import ProcessExpired, ProcessPool
 
@@ -27,7 +27,7 @@ def run_local(
     stop: Callable[[], bool],
     *,
     timeout: float = 600.0,
-    memory: Optional[float] = None,
+    memory: float | None = None,
 ) -> Iterator[Event]:
     """Do all units.
 
@@ -78,7 +78,7 @@ class _Process:
 
     def __init__(self, arguments: Sequence[Any], timeout: float) -> None:
         self._arguments, self._timeout = arguments, timeout
-        self._pool: Optional[ProcessPool] = None
+        self._pool: ProcessPool | None = None
 
     def begin(self) -> Future:
         if self._pool is None:
@@ -119,7 +119,7 @@ class _Process:
 _process: WorkerProcess  # of a worker process
 
 
-def _begin(job: Job, device: str, memory: Optional[float]) -> None:
+def _begin(job: Job, device: str, memory: float | None) -> None:
     """A worker process begins. Signals are the business of the parent, which says when to stop."""
     global _process
     for number in SIGNALS:
@@ -135,7 +135,7 @@ def _step(unit: Unit, stop: bool) -> Step:
     return _process.step(unit, stop)
 
 
-def _how(status: Optional[int]) -> str:
+def _how(status: int | None) -> str:
     """A worker died."""
     if status is None or status >= 0:
         return f"with status {status}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, List, Mapping, Tuple
+from typing import Any, Mapping
 
 import torch
 
@@ -30,7 +30,7 @@ class Layout:
         batch: windows that are computed together.
     """
 
-    devices: Tuple[str, ...]
+    devices: tuple[str, ...]
     batch: int
 
 
@@ -60,7 +60,7 @@ def choose_layout(device: str, workers: Any, batch: Any, environ: Mapping[str, s
     return Layout(devices, size)
 
 
-def _gpus(device: str, environ: Mapping[str, str]) -> List[str]:
+def _gpus(device: str, environ: Mapping[str, str]) -> list[str]:
     """The GPUs that this process may use; none for the CPU."""
     name = str(device)
     if name == "cpu" or (name == AUTO and not torch.cuda.is_available()):

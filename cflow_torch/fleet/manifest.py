@@ -15,7 +15,7 @@ import re
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Dict, Mapping, Optional, Sequence, Set
+from typing import Any, Mapping, Sequence
 
 import numpy as np
 import torch
@@ -39,7 +39,7 @@ _REMEDY = "give output=FOLDER, or overwrite=true"
 
 def make_identity(
     config: Config, reader: str, settings: Mapping[str, Any], contents: Sequence[str] = CONTENTS
-) -> Dict[str, Any]:
+) -> dict[str, Any]:
     """What decides the bytes of a result, besides the sweeps: method (not its `max_memory`), data settings, what is
     written, versions.
 
@@ -82,7 +82,7 @@ def claim_folder(output: Path, identity: Mapping[str, Any], resume: bool, overwr
         write_text(output / MANIFEST, _text(identity))
 
 
-def find_conflict(output: Path, identity: Mapping[str, Any], resume: bool) -> Optional[str]:
+def find_conflict(output: Path, identity: Mapping[str, Any], resume: bool) -> str | None:
     """Why results of this identity must not join those in the folder, to follow a noun; None if they may."""
     before = _read(output / MANIFEST)
     if before is None:
@@ -116,7 +116,7 @@ def claim_log(folder: Path, log: Log, run: str) -> None:
         )
 
 
-def _describe_log(log: Log, run: str) -> Dict[str, Any]:
+def _describe_log(log: Log, run: str) -> dict[str, Any]:
     """Manifest of a log. A sweep that cannot be read has no digest; its frames will say why."""
     stamps = [int(stamp) for stamp in log.timestamps]
     digests = {}
@@ -126,7 +126,7 @@ def _describe_log(log: Log, run: str) -> Dict[str, Any]:
     return {"run": run, "log_id": log.log_id, "timestamps": stamps, "sweeps": digests}
 
 
-def complete_frames(folder: Path) -> Set[int]:
+def complete_frames(folder: Path) -> set[int]:
     """Time stamps whose flow is in a log's folder, whichever worker put it there.
 
     None where the log's manifest is gone, for nobody knows then what they were made from; and none whose file does not
@@ -182,7 +182,7 @@ def _clear(output: Path) -> None:
             folder.rmdir()
 
 
-def _read(file: Path) -> Optional[Dict[str, Any]]:
+def _read(file: Path) -> dict[str, Any] | None:
     try:
         content = read_json(file)
         if not isinstance(content, dict):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from contextlib import suppress
-from typing import Any, Iterable, Iterator, Optional, Sized
+from typing import Any, Iterable, Iterator, Sized
 
 from tqdm import tqdm
 
@@ -53,7 +53,7 @@ class Progress(tqdm):  # type: ignore[type-arg]
     Convention: on stderr. Frames per second are those of the last while, not of the whole run.
     """
 
-    def __init__(self, total: Optional[int] = None, name: str = "") -> None:
+    def __init__(self, total: int | None = None, name: str = "") -> None:
         settings = {"total": total, "unit": " frames", "smoothing": 0.05, "desc": f"{name}: " if name else ""}
         if sys.stderr.isatty():
             super().__init__(file=_STDERR, bar_format=_BAR, **settings)

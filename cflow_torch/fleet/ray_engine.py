@@ -11,7 +11,7 @@ from concurrent.futures import Future
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from types import ModuleType
-from typing import Any, Callable, Dict, Iterator, Optional, Sequence
+from typing import Any, Callable, Iterator, Sequence
 
 from cflow_torch.data.paths import as_path, is_remote
 from cflow_torch.fleet.dispatch import WorkerDied, dispatch
@@ -32,7 +32,7 @@ def run_ray(
     layout: Layout,
     stop: Callable[[], bool],
     *,
-    address: Optional[str] = None,
+    address: str | None = None,
     num_cpus: Any = AUTO,
     num_gpus: Any = AUTO,
     retries: int = 1,
@@ -151,13 +151,13 @@ class _Handle:
 
 @contextmanager
 def _cluster(
-    ray: ModuleType, address: Optional[str], workers: int, needs: Dict[str, float], num_gpus: int
+    ray: ModuleType, address: str | None, workers: int, needs: dict[str, float], num_gpus: int
 ) -> Iterator[None]:
     """Connected to a cluster. `ray.init` takes SIGTERM for itself; it is given back."""
     if ray.is_initialized():
         yield
         return
-    settings: Dict[str, Any] = {"address": address}
+    settings: dict[str, Any] = {"address": address}
     if address is None:
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nobody is told
         settings = {
@@ -182,7 +182,7 @@ def _cluster(
         ray.shutdown()  # also ends a cluster of this process
 
 
-def _check_room(ray: ModuleType, needs: Dict[str, float]) -> None:
+def _check_room(ray: ModuleType, needs: dict[str, float]) -> None:
     """Some node could have a worker, once others leave it room."""
     nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
     if not any(all(node.get(name, 0.0) >= need for name, need in needs.items()) for node in nodes):

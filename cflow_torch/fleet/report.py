@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import platform
 from collections import Counter
-from typing import Any, Dict, List, Sequence, Tuple
+from typing import Any, Sequence
 
 from cflow_torch.fleet.job import Done, Event, Opened, Shard, Unit
 from cflow_torch.fleet.machine import Layout
@@ -21,9 +21,9 @@ class Counters:
     """
 
     def __init__(self, units: Sequence[Unit]) -> None:
-        self.failures: List[Tuple[str, str]] = []  # (frame or log, message)
-        self._log_ids: Dict[int, str] = {}  # of units that were opened
-        self._states: Dict[Tuple[int, int], str] = {}  # (unit number, time stamp) -> state
+        self.failures: list[tuple[str, str]] = []  # (frame or log, message)
+        self._log_ids: dict[int, str] = {}  # of units that were opened
+        self._states: dict[tuple[int, int], str] = {}  # (unit number, time stamp) -> state
         self._unopened = {unit.number for unit in units}
         self._seconds: Counter[str] = Counter()  # by stage, of all workers together
 
@@ -38,7 +38,7 @@ class Counters:
         return len(self._log_ids)
 
     @property
-    def waiting(self) -> List[str]:
+    def waiting(self) -> list[str]:
         """Frames of opened units that are neither on disk nor failed, in order."""
         waiting = sorted(key for key, state in self._states.items() if state == _WAITING)
         return [f"{self._log_ids[unit]}/{stamp}" for unit, stamp in waiting]
@@ -67,7 +67,7 @@ class Counters:
         self._states.update({(unit, stamp): state for stamp, state in unsettled.items()})
         return sum(state != _WAITING for state in unsettled.values())
 
-    def report(self, seconds: float, layout: Layout, shard: Shard, engine: str, signal_name: str) -> Dict[str, Any]:
+    def report(self, seconds: float, layout: Layout, shard: Shard, engine: str, signal_name: str) -> dict[str, Any]:
         """All figures of a run.
 
         Args:
@@ -110,7 +110,7 @@ class Counters:
         }
 
 
-def format_report(report: Dict[str, Any]) -> str:
+def format_report(report: dict[str, Any]) -> str:
     """The table."""
     frames, shard, devices = report["frames"], report["shard"], report["devices"]
     workers = f"workers: {len(devices)} on {', '.join(sorted(set(devices)))}"
@@ -136,9 +136,9 @@ def format_report(report: Dict[str, Any]) -> str:
     return "\n".join(f"{name:{width}}  {value}".rstrip() for name, value in rows)
 
 
-def format_missing(report: Dict[str, Any]) -> str:
+def format_missing(report: dict[str, Any]) -> str:
     """What is not there, a line each; "" if nothing is missing."""
-    lines: List[str] = list(dict.fromkeys(f"  {name}: {message}" for name, message in report["failures"]))  # of parts
+    lines: list[str] = list(dict.fromkeys(f"  {name}: {message}" for name, message in report["failures"]))  # of parts
     lines += [f"  {name}: not done" for name in report["waiting"]]
     if len(lines) > _SHOWN:
         lines[_SHOWN:] = [f"  and {len(lines) - _SHOWN} more, all of them in the report"]

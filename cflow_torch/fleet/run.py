@@ -8,7 +8,7 @@ import signal
 import threading
 import time
 from contextlib import closing, suppress
-from typing import Any, Dict, Iterator, Optional, Sequence
+from typing import Any, Iterator, Sequence
 
 from cflow_torch.data.atomic import remove_stale
 from cflow_torch.data.paths import as_path
@@ -22,7 +22,7 @@ from cflow_torch.fleet.ray_engine import run_ray
 from cflow_torch.fleet.report import Counters
 from cflow_torch.types import CFlowError
 
-ENGINES: Dict[str, Any] = {"local": run_local, "ray": run_ray}
+ENGINES: dict[str, Any] = {"local": run_local, "ray": run_ray}
 
 
 def run_fleet(
@@ -31,9 +31,9 @@ def run_fleet(
     layout: Layout,
     shard: Shard,
     engine: str = "local",
-    about: Dict[str, Any] = {},  # noqa: B006 (read only)
+    about: dict[str, Any] = {},  # noqa: B006 (read only)
     **engine_settings: Any,
-) -> Dict[str, Any]:
+) -> dict[str, Any]:
     """Compute what is not complete yet, and report.
 
     Args:
@@ -104,8 +104,8 @@ class StopSignal:
     """
 
     def __init__(self) -> None:
-        self.received: Optional[int] = None
-        self._before: Dict[int, Any] = {}
+        self.received: int | None = None
+        self._before: dict[int, Any] = {}
 
     def __enter__(self) -> StopSignal:
         if threading.current_thread() is threading.main_thread():

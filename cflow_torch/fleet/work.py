@@ -8,7 +8,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Callable, Deque, Dict, Iterator, List, Optional, Sequence, Tuple, Union
+from typing import Any, Callable, Iterator, Sequence
 
 import torch
 
@@ -38,8 +38,8 @@ class _Frame:
     """A frame on its way through a worker."""
 
     timestamp: int
-    content: Union[Window, FlowResult, Exception, None] = None
-    seconds: Dict[str, float] = field(default_factory=dict)
+    content: Window | FlowResult | Exception | None = None
+    seconds: dict[str, float] = field(default_factory=dict)
 
 
 class Worker:
@@ -54,14 +54,14 @@ class Worker:
         CFlowError: there is no such device, or it cannot be used.
     """
 
-    def __init__(self, job: Job, device: str, model: Optional[FlowModel] = None) -> None:
+    def __init__(self, job: Job, device: str, model: FlowModel | None = None) -> None:
         try:
             torch.zeros(1, device=device)  # now, rather than frame by frame
         except (RuntimeError, AssertionError) as error:
             raise CFlowError(f"no worker can begin on {device}: {describe(error)}") from error
         self._job, self._device, self._ahead = job, device, _AHEAD
         self._model: FlowModel = make_model(job.config, device) if model is None else model
-        self._log: Tuple[Any, Optional[Log]] = (None, None)
+        self._log: tuple[Any, Log | None] = (None, None)
         self._reader, self._writer = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
 
     def run(self, unit: Unit, stop: Callable[[], bool] = lambda: False) -> Iterator[Event]:
@@ -127,8 +127,8 @@ class Worker:
         """Frames through the reading thread, this thread and the writing thread."""
         size = self._job.batch
         batches = iter([todo[i : i + size] for i in range(0, len(todo), size)])
-        reading: Deque[Future[List[_Frame]]] = deque()
-        writing: Deque[Future[_Frame]] = deque()
+        reading: deque[Future[list[_Frame]]] = deque()
+        writing: deque[Future[_Frame]] = deque()
         while True:
             while len(reading) <= self._ahead and not stop():
                 batch = next(batches, None)
@@ -146,7 +146,7 @@ class Worker:
             while writing and (len(writing) > most or writing[0].done()):
                 yield writing.popleft().result()
 
-    def _read(self, log: Log, batch: Sequence[int]) -> List[_Frame]:
+    def _read(self, log: Log, batch: Sequence[int]) -> list[_Frame]:
         return [self._read_one(log, index) for index in batch]
 
     def _read_one(self, log: Log, index: int) -> _Frame:
@@ -155,7 +155,7 @@ class Worker:
             frame.content = window(log, index, self._job.config.num_history, self._job.config.num_future)
         return frame
 
-    def _compute(self, frames: List[_Frame]) -> None:
+    def _compute(self, frames: list[_Frame]) -> None:
         """Windows to results, together; if that fails, each by itself, so that one bad frame spoils no other."""
         good = [frame for frame in frames if isinstance(frame.content, Window)]
         if not good:

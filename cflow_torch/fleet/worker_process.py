@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from typing import Iterator, List, NamedTuple, Optional
+from typing import Iterator, NamedTuple
 
 import pyarrow
 import torch
@@ -20,7 +20,7 @@ _ENDED = 70  # exit status
 class Step(NamedTuple):
     """What happened to a unit since the last call; `has_ended`: nothing more follows."""
 
-    events: List[Event]
+    events: list[Event]
     has_ended: bool
 
 
@@ -40,7 +40,7 @@ class WorkerProcess(Worker):
             torch.set_num_threads(1)
             pyarrow.set_cpu_count(1)
         super().__init__(job, device)
-        self._events: Optional[Iterator[Event]] = None  # of the unit in hand
+        self._events: Iterator[Event] | None = None  # of the unit in hand
         self._is_told_to_stop = False
 
     def step(self, unit: Unit, stop: bool) -> Step:
@@ -52,7 +52,7 @@ class WorkerProcess(Worker):
         """
         self._is_told_to_stop = stop
         running, self._events = self._events or self.run(unit, lambda: self._is_told_to_stop), None
-        events: List[Event] = []
+        events: list[Event] = []
         until = time.monotonic() + _REPORT_EVERY_S
         try:
             for event in running:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, List, NamedTuple, Optional, Sequence
+from typing import Any, NamedTuple, Sequence
 
 import numpy as np
 
@@ -22,12 +22,10 @@ class CorrelationFlowEstimator:
         CFlowError: an unknown setting or an invalid value.
     """
 
-    def __init__(
-        self, preset: Optional[str] = None, device: Any = "auto", ground: Optional[str] = None, **settings: Any
-    ):
+    def __init__(self, preset: str | None = None, device: Any = "auto", ground: str | None = None, **settings: Any):
         self.sequence_flow = SequenceFlow(preset, device, ground, **settings)
 
-    def __call__(self, frames: Sequence[Any]) -> List[Any]:
+    def __call__(self, frames: Sequence[Any]) -> list[Any]:
         """Flow of every frame but the last.
 
         Args:
@@ -70,7 +68,7 @@ class CorrelationFlowEstimator:
         """
         evaluator = dataset.evaluator()
         is_causal = dataset.loader_type().name == "CAUSAL"
-        known: List[_LogFrame] = []
+        known: list[_LogFrame] = []
         for number in range(len(dataset)):
             item = dataset[number]
             frames = _read_frames(item)
@@ -81,7 +79,7 @@ class CorrelationFlowEstimator:
                 evaluator.eval(flow, frame)
         return evaluator
 
-    def _flows(self, frames: Sequence[_LogFrame], first: int) -> List[Any]:
+    def _flows(self, frames: Sequence[_LogFrame], first: int) -> list[Any]:
         how = "pip install 'bucketed-scene-flow-eval>=2.0.25' (it needs Python 3.10 and open3d)"
         flow_class = import_from("bucketed_scene_flow_eval.datastructures", "EgoLidarFlow", how)
         (flows,) = self.sequence_flow([[frame.sweep for frame in frames]], [first])
@@ -100,7 +98,7 @@ class _LogFrame(NamedTuple):
     mask: np.ndarray
 
 
-def _read_frames(frames: Any) -> List[_LogFrame]:
+def _read_frames(frames: Any) -> list[_LogFrame]:
     """Checked frames of one log; their fields matter, not their classes."""
     if not isinstance(frames, (list, tuple)) or len(frames) < 2:
         raise CFlowError("frames: give a list of at least two frames of one log, in order of time")
@@ -126,7 +124,7 @@ def _read_frame(name: str, frame: Any, data: Any) -> _LogFrame:
     return _LogFrame(frame.log_id, frame.log_idx, Frame(points, takes_part, T_ego_sensor, T_global_ego), mask)
 
 
-def _earlier(known: Sequence[_LogFrame], first: _LogFrame, num_history: int) -> List[_LogFrame]:
+def _earlier(known: Sequence[_LogFrame], first: _LogFrame, num_history: int) -> list[_LogFrame]:
     """Known frames before `first`, at most `num_history`, with poses in the global frame that `first` has."""
     same = [frame for frame in known if (frame.log_id, frame.log_idx) == (first.log_id, first.log_idx)]
     if not same:  # another log, or items that do not overlap: their global frames have nothing in common

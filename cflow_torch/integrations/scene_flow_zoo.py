@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, List, Optional, Tuple
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -29,13 +29,11 @@ class CorrelationFlowModel(nn.Module):
         CFlowError: an unknown setting or an invalid value.
     """
 
-    def __init__(
-        self, preset: Optional[str] = None, device: Any = "auto", ground: Optional[str] = None, **settings: Any
-    ):
+    def __init__(self, preset: str | None = None, device: Any = "auto", ground: str | None = None, **settings: Any):
         super().__init__()
         self.sequence_flow = SequenceFlow(preset, device, ground, **settings)
 
-    def forward(self, forward_mode: Any, batched_sequence: Any, logger: Any = None) -> List[Any]:
+    def forward(self, forward_mode: Any, batched_sequence: Any, logger: Any = None) -> list[Any]:
         """Flow of a batch of sequences.
 
         Args:
@@ -83,7 +81,7 @@ def register(name: str = "CorrelationFlow") -> None:
     import_from("models", "name_to_class_lookup", _HOW)[name.lower()] = CorrelationFlowModel
 
 
-def _read_sequence(sequence: Any, name: str) -> Tuple[List[Frame], int, Tensor]:
+def _read_sequence(sequence: Any, name: str) -> tuple[list[Frame], int, Tensor]:
     """Sweeps without padding, first sweep that a flow is asked for, (K, PadN) mask: 1, 0, in padding rows NaN."""
     for field in ("full_pc", "full_pc_mask", *_POSES):
         if not isinstance(getattr(sequence, field, None), Tensor):

@@ -8,7 +8,7 @@ from __future__ import annotations
 import importlib
 import warnings
 from dataclasses import dataclass
-from typing import Any, List, Optional, Sequence, Tuple
+from typing import Any, Sequence
 
 import numpy as np
 import torch
@@ -38,7 +38,7 @@ class Frame:
     takes_part: Array
     sensor_to_ego: np.ndarray
     ego_to_global: np.ndarray
-    timestamp_ns: Optional[int] = None
+    timestamp_ns: int | None = None
 
     def ego_points(self) -> Array:
         """(N, 3) points in the ego frame of this sweep, float64 where the sensor has a frame of its own."""
@@ -63,9 +63,7 @@ class SequenceFlow(nn.Module):
         CFlowError: an unknown setting or an invalid value.
     """
 
-    def __init__(
-        self, preset: Optional[str] = None, device: Any = "auto", ground: Optional[str] = None, **settings: Any
-    ):
+    def __init__(self, preset: str | None = None, device: Any = "auto", ground: str | None = None, **settings: Any):
         super().__init__()
         if ground not in GROUND:
             raise CFlowError(f"ground={ground!r}: give one of {', '.join(map(repr, GROUND))}")
@@ -75,7 +73,7 @@ class SequenceFlow(nn.Module):
         self._looked_for_ground = False
 
     @torch.no_grad()
-    def forward(self, sequences: Sequence[Sequence[Frame]], firsts: Sequence[int]) -> List[List[Tensor]]:
+    def forward(self, sequences: Sequence[Sequence[Frame]], firsts: Sequence[int]) -> list[list[Tensor]]:
         """Residual flow of the pairs (i, i + 1) of several sequences.
 
         Args:
@@ -95,7 +93,7 @@ class SequenceFlow(nn.Module):
             CFlowError: bad input, see `cflow_torch.windows.collation.make_batch`.
         """
         windows = [self._windows(frames, first) for frames, first in zip(sequences, firsts)]
-        flows: List[List[Tensor]] = [[] for _ in sequences]
+        flows: list[list[Tensor]] = [[] for _ in sequences]
         for step in range(max(map(len, windows), default=0)):
             members = [index for index, own in enumerate(windows) if step < len(own)]
             for index, result in zip(members, self.model([windows[index][step] for index in members])):
@@ -103,7 +101,7 @@ class SequenceFlow(nn.Module):
                 flows[index].append(in_axes_of_points(result.residual_flow, now, following))
         return flows
 
-    def _windows(self, frames: Sequence[Frame], first: int) -> List[Window]:
+    def _windows(self, frames: Sequence[Frame], first: int) -> list[Window]:
         oldest = max(first - self.num_history, 0)
         sweeps = self._sweeps(frames[oldest:])
         return [
@@ -116,7 +114,7 @@ class SequenceFlow(nn.Module):
             for i in range(first - oldest, len(sweeps) - 1)
         ]
 
-    def _sweeps(self, frames: Sequence[Frame]) -> List[Sweep]:
+    def _sweeps(self, frames: Sequence[Frame]) -> list[Sweep]:
         points = [frame.ego_points() for frame in frames]
         left_out = [~frame.takes_part for frame in frames]
         if self.ground is not None:
@@ -166,7 +164,7 @@ def import_from(module: str, name: str, how: str) -> Any:
         raise CFlowError(f"{module}.{name} cannot be used ({error}): {how}") from None
 
 
-def times_in_ns(stamps: Sequence[Any]) -> Tuple[Optional[int], ...]:
+def times_in_ns(stamps: Sequence[Any]) -> tuple[int | None, ...]:
     """Time stamps of sweeps, None for each if they are no nanoseconds: some data sets put numbers 0, 1, ... there."""
     shortest = min((int(b) - int(a) for a, b in zip(stamps, stamps[1:])), default=0)
     return tuple(int(stamp) if shortest >= 1_000_000 else None for stamp in stamps)

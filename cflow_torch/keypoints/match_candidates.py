@@ -8,7 +8,7 @@ times all key points.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Iterator, Optional, Tuple
+from typing import Iterator
 
 import torch
 from torch import Tensor
@@ -78,13 +78,13 @@ def pair(source: KeyPoints, target: KeyPoints, reach: Tensor) -> Pairing:
     return Pairing(member, candidate, first, count, limit)
 
 
-def pairs_at_once(device: torch.device, max_memory: Optional[float]) -> int:
+def pairs_at_once(device: torch.device, max_memory: float | None) -> int:
     """Number of pairs (key point, candidate) that are looked at together."""
     number = _PAIRS_AT_ONCE_CPU if device.type == "cpu" else _PAIRS_AT_ONCE_GPU
     return number if max_memory is None else min(number, int(max_memory) // _BYTES_PER_PAIR)
 
 
-def chunks(pairing: Pairing, num_pairs: int) -> Iterator[Tuple[slice, int]]:
+def chunks(pairing: Pairing, num_pairs: int) -> Iterator[tuple[slice, int]]:
     """Groups that are looked at together, and the length that their lists of candidates are padded to."""
     counts = pairing.count.tolist()
     begin = 0
@@ -108,7 +108,7 @@ def _group(points: KeyPoints) -> Tensor:
     return member
 
 
-def _candidates(source: KeyPoints, member: Tensor, target: KeyPoints, reach: Tensor) -> Tuple[Tensor, Tensor, Tensor]:
+def _candidates(source: KeyPoints, member: Tensor, target: KeyPoints, reach: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """For every group the key points that may lie within reach of its members (all that do, and a few more)."""
     key, order = _band_key(target.window, target.row // _BAND, target.col).sort()
     some = member[:, :1]

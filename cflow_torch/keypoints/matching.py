@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import reduce
-from typing import Iterable, Iterator, List, Sequence, Tuple
+from typing import Iterable, Iterator, Sequence
 
 import torch
 import torch.nn.functional as F
@@ -130,7 +130,7 @@ def _best_candidates(source: KeyPoints, target: KeyPoints, reach: Tensor, config
 
 def _contenders(
     source: KeyPoints, target: KeyPoints, reach: Tensor, share: float, num_pairs: int
-) -> Iterator[Tuple[Tensor, ...]]:
+) -> Iterator[tuple[Tensor, ...]]:
     """Pairs that come near the best of their key point; the others need no exact look.
 
     Args:
@@ -176,9 +176,9 @@ def _contenders(
         yield member.flatten().index_select(0, of_member), candidate.index_select(0, of_candidate), count
 
 
-def _together(parts: Iterable[Tuple[Tensor, ...]], enough: int) -> Iterator[Tuple[Tensor, ...]]:
+def _together(parts: Iterable[tuple[Tensor, ...]], enough: int) -> Iterator[tuple[Tensor, ...]]:
     """The same, joined until there are enough."""
-    waiting: List[Tuple[Tensor, ...]] = []
+    waiting: list[tuple[Tensor, ...]] = []
     for part in parts:
         waiting.append(part)
         if sum(values[0].numel() for values in waiting) >= enough:
@@ -193,7 +193,7 @@ def _padded(values: Tensor, value: int) -> Tensor:
     return F.pad(values, (0, 1), value=value)
 
 
-def _pack(patch: Tensor, swapped: bool) -> Tuple[Tensor, ...]:
+def _pack(patch: Tensor, swapped: bool) -> tuple[Tensor, ...]:
     """(K, L^2) zeros and ones -> strips of them, (K + 1, N) uint8 each, two pixels in a number; the last row has none.
 
     Args:

@@ -7,7 +7,6 @@ result; engines, devices and batch sizes then agree to the last bit.
 from __future__ import annotations
 
 import math
-from typing import Optional, Tuple
 
 import torch
 import torch.nn.functional as F
@@ -22,7 +21,7 @@ FAST_LENGTHS = tuple(sorted(n << k for k in range(14) for n in (8, 9, 10, 12, 15
 
 
 def cross_correlate(
-    images: Tensor, num_templates: int, own: Tensor, engine: str = "fft", most: Optional[int] = None
+    images: Tensor, num_templates: int, own: Tensor, engine: str = "fft", most: int | None = None
 ) -> Tensor:
     """Number of coinciding pixels for shifts of templates over targets (numerator of Eq. norm_correlation).
 
@@ -53,7 +52,7 @@ def cross_correlate(
     return torch.fft.irfft2(product, s=(height, width))
 
 
-def _fft_dtype(images: Tensor, most: Optional[int]) -> torch.dtype:
+def _fft_dtype(images: Tensor, most: int | None) -> torch.dtype:
     # The number of samples bounds the norms without looking at the images (no synchronisation).
     samples = math.prod(images.shape[1:])
     error = _FFT_ERROR_MARGIN * torch.finfo(torch.float32).eps * math.log2(samples)
@@ -72,7 +71,7 @@ def _by_conv(images: Tensor, num_templates: int, own: Tensor) -> Tensor:
     return F.pad(counts, (0, images.shape[2] - cols, 0, images.shape[1] - rows))
 
 
-def _extent(images: Tensor) -> Tuple[int, int]:
+def _extent(images: Tensor) -> tuple[int, int]:
     """Rows and columns up to the last one in which any image has a pixel, at least 1."""
     used = images.amax(0)
     places = (used.amax(1 - dim).nonzero() for dim in (0, 1))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Optional, Tuple
-
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -27,7 +25,7 @@ def flat_nonzero(mask: Tensor) -> Tensor:
     return mask.flatten().nonzero()[:, 0]
 
 
-def gather(index: Tensor, *tensors: Tensor) -> Tuple[Tensor, ...]:
+def gather(index: Tensor, *tensors: Tensor) -> tuple[Tensor, ...]:
     """The elements of several tensors at the same indices.
 
     Args:
@@ -55,7 +53,7 @@ def lookup(table: Tensor, index: Tensor, missing: float = 0) -> Tensor:
     return F.pad(table, padding, value=missing).index_select(0, index)
 
 
-def scatter_count(index: Tensor, size: int, weights: Optional[Tensor] = None) -> Tensor:
+def scatter_count(index: Tensor, size: int, weights: Tensor | None = None) -> Tensor:
     """How often each index occurs, or the sum of its weights.
 
     Args:
@@ -159,7 +157,7 @@ def divide(index: Tensor, divisor: int) -> Tensor:
     return torch.div(index, divisor, rounding_mode="floor")
 
 
-def split_index(index: Tensor, width: int) -> Tuple[Tensor, Tensor]:
+def split_index(index: Tensor, width: int) -> tuple[Tensor, Tensor]:
     """Quotient and remainder of a division by a positive number: (row, col) of a pixel in raster order.
 
     Args:

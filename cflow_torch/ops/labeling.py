@@ -15,7 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
-from typing import List, Sequence, Tuple
+from typing import Sequence
 
 import torch
 import torch.nn.functional as F
@@ -110,7 +110,7 @@ def label_blocks(padded: Tensor, connectivity: int, reach: int) -> Blocks:
     return label_together([(padded, reach)], connectivity)[0]
 
 
-def label_together(images: Sequence[Tuple[Tensor, int]], connectivity: int = 8) -> List[Blocks]:
+def label_together(images: Sequence[tuple[Tensor, int]], connectivity: int = 8) -> list[Blocks]:
     """Components of several sets of padded images by one union-find.
 
     Args:
@@ -255,8 +255,8 @@ def connected_components_kornia(occupancy: Tensor, pixels: Tensor, connectivity:
 
 @lru_cache(maxsize=256)
 def _neighbourhoods(
-    sides: Tuple[int, ...], cols: Tuple[int, ...], connectivity: int, reaches: Tuple[int, ...], device: torch.device
-) -> Tuple[Tensor, Tensor]:
+    sides: tuple[int, ...], cols: tuple[int, ...], connectivity: int, reaches: tuple[int, ...], device: torch.device
+) -> tuple[Tensor, Tensor]:
     """(sets, 4) int64, how far away the neighbours of a block are; (512 sets, 4) int32, `_reachable` of each set."""
     offsets = torch.tensor([[down * width + right for down, right in _NEIGHBOURS] for width in cols], device=device)
     tables = [_reachable(side, connectivity, reach, device) for side, reach in zip(sides, reaches)]

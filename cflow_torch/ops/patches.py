@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Tuple
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 
-def gather_patches(images: Tensor, image: Tensor, row: Tensor, col: Tensor, size: int) -> Tuple[Tensor, Tensor]:
+def gather_patches(images: Tensor, image: Tensor, row: Tensor, col: Tensor, size: int) -> tuple[Tensor, Tensor]:
     """The size x size patch centred at each pixel, zero outside the image.
 
     Args:

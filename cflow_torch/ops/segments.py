@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Tuple
-
 import torch
 from torch import Tensor
 
@@ -26,7 +24,7 @@ def segment_amin(values: Tensor, index: Tensor, num_segments: int, empty: float)
     return values.new_full((num_segments,), empty).scatter_reduce_(0, index, values, "amin")
 
 
-def segment_ends(values: Tensor, index: Tensor, num_segments: int) -> Tuple[Tensor, Tensor]:
+def segment_ends(values: Tensor, index: Tensor, num_segments: int) -> tuple[Tensor, Tensor]:
     """Smallest and largest value of each segment.
 
     Args:
@@ -54,7 +52,7 @@ def first_of_segment(index: Tensor, num_segments: int) -> Tensor:
     return segment_amin(position, index, num_segments, index.numel()).index_select(0, index)
 
 
-def bounding_boxes(rows: Tensor, cols: Tensor, index: Tensor, num_segments: int) -> Tuple[Tensor, Tensor]:
+def bounding_boxes(rows: Tensor, cols: Tensor, index: Tensor, num_segments: int) -> tuple[Tensor, Tensor]:
     """Bounding box of the pixels of each segment.
 
     Args:

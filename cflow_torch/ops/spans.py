@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Optional
-
 import torch
 from torch import Tensor
 
 
-def spans(start: Tensor, count: Tensor, total: Optional[int] = None) -> Tensor:
+def spans(start: Tensor, count: Tensor, total: int | None = None) -> Tensor:
     """start[0], start[0] + 1, ... (count[0] of them), start[1], start[1] + 1, ...
 
     Args:

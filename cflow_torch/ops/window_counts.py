@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Tuple
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -38,7 +36,7 @@ class WindowCounts:
         table = torch.zeros(int(area.sum()), dtype=torch.int32, device=image.device)
         self._table = table.index_fill_(0, stride.mul_(row).add_(start).add_(col).add_(1), 1).cumsum(0)
 
-    def bounds(self, image: Tensor, shift: Tensor) -> Tuple[Tensor, Tensor]:
+    def bounds(self, image: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
         """(K,) int64 each, `count` is at least the first and at most the second. Args as for `count`."""
         size, first = take_columns(self._numbers[:4], image).view(2, 2, -1)
         begin, end = shift.clamp(min=0), torch.minimum(size, size + shift)

@@ -14,7 +14,7 @@ import tempfile
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Callable, Dict, List, Mapping, Sequence, Union
+from typing import Any, Callable, Mapping, Sequence
 
 from tqdm import tqdm
 
@@ -44,7 +44,7 @@ class Format:
 
 # Sets without a ground mask get one; nuScenes is read at 10 Hz, as the challenge does.
 _NO_MASK = {"find_ground": "grid"}
-FORMATS: Dict[str, Format] = {
+FORMATS: dict[str, Format] = {
     "av2": Format("av2", "write_av2_log", "av2"),
     "nuscenes": Format("nuscenes", "write_nuscenes", "nuscenes", {**_NO_MASK, "sweep_step": 2}),
     "truckscenes": Format("truckscenes", "write_truckscenes", "truckscenes", _NO_MASK),
@@ -67,8 +67,8 @@ def generator_key() -> str:
 
 
 def benchmark_logs(
-    cache: Union[str, Path], profile: str, seeds: Sequence[int], num_sweeps: int, scenes: Sequence[str] = ("street",)
-) -> List[Any]:
+    cache: str | Path, profile: str, seeds: Sequence[int], num_sweeps: int, scenes: Sequence[str] = ("street",)
+) -> list[Any]:
     """The benchmark's drives of one sensor, as sources for `catalog.open_log`; those not in the cache are made.
 
     Args:
@@ -96,7 +96,7 @@ def benchmark_logs(
     write: Callable[[Drive, Path], Path] = getattr(
         import_module(f"cflow_torch.simulator.writers.{chosen.module}"), chosen.function
     )
-    found: List[Any] = []
+    found: list[Any] = []
     for number, seed in enumerate(tqdm(seeds, unit="drive", desc=profile, disable=None, file=sys.stderr)):
         # Cheap: sweeps are scanned when they are written.
         drive = make_drive(seed, num_simulated, profile, scenes[number % len(scenes)])

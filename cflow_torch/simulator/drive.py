@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import uuid
 from collections import OrderedDict
-from typing import Dict, List, Optional
 
 import numpy as np
 import torch
@@ -53,7 +52,7 @@ class Drive(Log):
         self.log_id = log_id
         self.timestamps = tuple(_FIRST_STAMP_NS + i * profile.sweep_interval_ns for i in range(num_sweeps))
         self.scene = scene
-        self.calibration: Dict[str, np.ndarray] = {unit.name: unit.T_ego_sensor for unit in profile.units}
+        self.calibration: dict[str, np.ndarray] = {unit.name: unit.T_ego_sensor for unit in profile.units}
         self._profile, self._seed = profile, seed
         self._seconds = np.arange(num_sweeps) * (profile.sweep_interval_ns * 1e-9)
         self._motion = Motion(scene, profile, self._seconds)
@@ -81,7 +80,7 @@ class Drive(Log):
             point_times=returns.offset_ns.numpy() * 1e-9 if self._profile.is_rolling else None,
         )
 
-    def labels(self, index: int) -> Optional[FlowLabels]:
+    def labels(self, index: int) -> FlowLabels | None:
         """Truth of the pair (index, index + 1), None for the last sweep.
 
         A point belongs to the body its ray hit and moves with the body's track from the time stamp of the one sweep to
@@ -127,12 +126,12 @@ class Drive(Log):
             num_points=np.bincount(self._body_of(returns), minlength=len(self.scene.bodies) + 1)[chosen],
         )
 
-    def channels(self, index: int) -> Dict[str, np.ndarray]:
+    def channels(self, index: int) -> dict[str, np.ndarray]:
         """Intensity, laser and firing time of every point of sweep `index`."""
         returns = self.returns(index)
         return {name: getattr(returns, name).numpy() for name in ("intensity", "laser_number", "offset_ns")}
 
-    def units(self, index: int) -> List[UnitReturns]:
+    def units(self, index: int) -> list[UnitReturns]:
         """What each LiDAR received in sweep `index`; together, in this order, the rows of `sweep(index)`."""
         returns = self.returns(index)
         velocity = self._motion.radial_velocity(self._seconds[index], returns)

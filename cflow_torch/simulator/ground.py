@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Tuple
 
 import numpy as np
 import torch
@@ -28,10 +27,10 @@ class Ground:
         corner_radius: of the kerbs at the crossing, metres.
     """
 
-    slope: Tuple[float, float]
+    slope: tuple[float, float]
     curvature: float
     kerb: float = 0.13
-    half_widths: Tuple[float, float] = (8.5, 6.5)
+    half_widths: tuple[float, float] = (8.5, 6.5)
     crossing_x: float = 20.0
     corner_radius: float = 4.0
 
@@ -86,7 +85,7 @@ class Ground:
         pose[..., 3, 3] = 1
         return pose
 
-    def cast(self, origin: Tensor, directions: Tensor) -> Tuple[Tensor, Tensor]:
+    def cast(self, origin: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
         """Where rays meet the ground.
 
         Args:
@@ -102,7 +101,7 @@ class Ground:
         b = directions[2] - slope_x * directions[0] - self.slope[1] * directions[1]
         c = -0.5 * self.curvature * directions[0] ** 2
 
-        def meet(lift: float) -> Tuple[Tensor, Tensor]:
+        def meet(lift: float) -> tuple[Tensor, Tensor]:
             a = torch.from_numpy(np.asarray(z - self.road_height(x, y) - lift)).to(directions.dtype)
             root = (b * b - 4 * a * c).sqrt()  # NaN: the ray passes over the crest
             t = 2 * a / (root - b)  # the form without cancellation

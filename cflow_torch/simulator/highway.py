@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Iterator, Tuple
+from typing import Iterator
 
 import numpy as np
 
@@ -88,7 +88,7 @@ def _rail(x: float, y: float) -> Body:
     return Body(solids, Route(x, y))
 
 
-def _bridge(x: float) -> Tuple[Body, ...]:
+def _bridge(x: float) -> tuple[Body, ...]:
     """A road that crosses overhead, on piers."""
     deck = Body([objects.box(-4, 4, -45, 45, 5.6, 6.8, 0.5)], Route(x, 0.0))
     return (deck, *(objects.wall(x, y, 1.2, 0.6, 6.0) for y in (-EDGE - 2.0, 0.0, EDGE + 2.0)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
-from typing import Callable, List, Tuple, Union
+from typing import Callable
 
 import torch
 from torch import Tensor
@@ -62,9 +62,9 @@ class EgoMotion:
     """
 
     T_world_ego: Tensor
-    T_world_unit: List[Tensor]
-    seconds: List[Tensor]
-    speed: Tuple[float, float]
+    T_world_unit: list[Tensor]
+    seconds: list[Tensor]
+    speed: tuple[float, float]
 
 
 def scan(
@@ -164,10 +164,10 @@ def _measure(
     image: RangeImage,
     unit: SpinningLidar,
     profile: LidarProfile,
-    solids: Union[Solids, MovingSolids],
+    solids: Solids | MovingSolids,
     cosine_at: Callable[[Tensor], Tensor],
     generator: torch.Generator,
-) -> Tuple[Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor]:
     """Noise along the ray; returns that are too near, too far, too weak or unlucky are lost.
 
     Args:
@@ -210,7 +210,7 @@ def _returns(
     hit: Tensor,
     reflected: Tensor,
     unit: SpinningLidar,
-    numbers: Tuple[int, int],
+    numbers: tuple[int, int],
     column: Tensor,
     offset_ns: Tensor,
 ) -> Returns:
@@ -230,5 +230,5 @@ def _returns(
     )
 
 
-def _together(parts: List[Returns]) -> Returns:
+def _together(parts: list[Returns]) -> Returns:
     return Returns(*(torch.cat([getattr(part, column.name) for part in parts]) for column in fields(Returns)))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Tuple
 
 import numpy as np
 import torch
@@ -120,7 +119,7 @@ class Motion:
 
     def _ray_ends(
         self, seconds: float, shot: np.ndarray, returns: Returns, rows: np.ndarray
-    ) -> Tuple[np.ndarray, np.ndarray]:
+    ) -> tuple[np.ndarray, np.ndarray]:
         """(n, 3) float64 world position of the LiDAR at each shot, and of what it hit."""
         profile, stamped = self._profile, self.ego_poses(np.array([seconds]))[0]
         unit = returns.unit.numpy()[rows]

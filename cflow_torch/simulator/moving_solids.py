@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Tuple
 
 import torch
 from torch import Tensor
@@ -38,7 +37,7 @@ class MovingSolids:
     row: Tensor
     moving: Tensor
 
-    def at(self, solid: Tensor, seconds: Tensor) -> Tuple[Tensor, Tensor]:
+    def at(self, solid: Tensor, seconds: Tensor) -> tuple[Tensor, Tensor]:
         """World to solid, and how it changes.
 
         Args:
@@ -55,7 +54,7 @@ class MovingSolids:
             place[chosen], change[chosen] = self.moving_at(take(row, chosen), take(seconds, chosen))
         return place, change
 
-    def moving_at(self, row: Tensor, seconds: Tensor) -> Tuple[Tensor, Tensor]:
+    def moving_at(self, row: Tensor, seconds: Tensor) -> tuple[Tensor, Tensor]:
         """As `at`, by rows (E,) int64 of `moving`."""
         step = float(self.knots[1] - self.knots[0])
         after = seconds - self.knots[0]
@@ -77,7 +76,7 @@ class MovingSolids:
         return 0.5 * (self.knots[0] + self.knots[-1])
 
     @cached_property
-    def centres(self) -> Tuple[Tensor, Tensor]:
+    def centres(self) -> tuple[Tensor, Tensor]:
         """(P, 3) float64 where the solids are at `middle`; (P,) m/s that no part of them exceeds."""
         number = len(self.kind)
         place, _ = self.at(torch.arange(number), self.middle.expand(number))

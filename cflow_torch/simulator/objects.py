@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import List, NamedTuple, Optional, Sequence, Tuple, Union
+from typing import NamedTuple, Sequence, Tuple
 
 import numpy as np
 
@@ -155,8 +155,8 @@ class Body:
     """
 
     solids: Sequence[Solid]
-    way: Union[Route, Towed]
-    category: Optional[str] = None
+    way: Route | Towed
+    category: str | None = None
     size: Vector = (0.0, 0.0, 0.0)
 
     @property
@@ -171,7 +171,7 @@ def box(x0: float, x1: float, y0: float, y1: float, z0: float, z1: float, albedo
     return Solid(BOX, centre, ((x1 - x0) / 2, (y1 - y0) / 2, (z1 - z0) / 2), albedo=albedo)
 
 
-def _wheels(xs: Sequence[float], y: float, radius: float) -> List[Solid]:
+def _wheels(xs: Sequence[float], y: float, radius: float) -> list[Solid]:
     return [
         Solid(CYLINDER, (x, side * (y - 0.12), radius), (radius, radius, 0.12), roll=math.pi / 2, albedo=0.15)
         for x in xs
@@ -198,7 +198,7 @@ def bus(way: Route) -> Body:
     return Body(solids, way, "BUS", (12.0, 2.54, 3.1))
 
 
-def articulated_truck(way: Route) -> List[Body]:
+def articulated_truck(way: Route) -> list[Body]:
     """A tractor with a driver's cab, and a trailer that swings in behind it: two tracks."""
     cab = [
         box(0.4, 2.8, -1.2, 1.2, 0.5, 3.3, 0.7),
@@ -224,7 +224,7 @@ def van(rng: np.random.Generator, way: Route) -> Body:
     return Body(solids, way, "REGULAR_VEHICLE", (5.8, 2.0, 2.5))
 
 
-def own_truck(way: Route) -> List[Body]:
+def own_truck(way: Route) -> list[Body]:
     """The recording truck itself, a cab and a trailer that its LiDARs stand around. `way` is that of its rear axle."""
     cab = [box(2.6, 5.0, -1.25, 1.25, 0.4, 3.1, 0.5), box(-1.0, 2.6, -0.6, 0.6, 0.3, 0.9, 0.3)]
     trailer = [box(-6.3, 6.0, -1.25, 1.25, 1.1, 4.0, 0.7), *_wheels((-4.4, -3.1, -1.8), 1.25, 0.5)]
@@ -305,8 +305,8 @@ def bush(rng: np.random.Generator, x: float, y: float, num_leaves: int = 40) -> 
 
 
 def _foliage(
-    rng: np.random.Generator, radii: Vector, height: float, number: int, leaf: Tuple[float, float]
-) -> List[Solid]:
+    rng: np.random.Generator, radii: Vector, height: float, number: int, leaf: tuple[float, float]
+) -> list[Solid]:
     """Balls spread evenly through an ellipsoid."""
     towards = rng.normal(size=(number, 3))
     towards *= rng.uniform(size=(number, 1)) ** (1 / 3) / np.linalg.norm(towards, axis=1, keepdims=True)

@@ -6,7 +6,6 @@ What no source tells is this project's own choice and is marked "chosen".
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Dict, Tuple
 
 import numpy as np
 
@@ -15,7 +14,7 @@ from cflow_torch.simulator.sensors import LidarProfile, SpinningLidar
 from cflow_torch.types import CFlowError
 
 
-def _uniform(lowest: float, highest: float, number: int) -> Tuple[float, ...]:
+def _uniform(lowest: float, highest: float, number: int) -> tuple[float, ...]:
     return tuple(float(e) for e in np.linspace(lowest, highest, number))
 
 
@@ -54,7 +53,7 @@ def _truckscenes() -> LidarProfile:
         place = ((4.9, side * 1.5, 2.2), side * 45.0)
         return SpinningLidar(name, PANDAR_64, 1800, *place, seen=(225, 1575), reach=500.0)
 
-    def wide(name: str, position: Tuple[float, float, float], yaw: float, pitch: float) -> SpinningLidar:
+    def wide(name: str, position: tuple[float, float, float], yaw: float, pitch: float) -> SpinningLidar:
         return SpinningLidar(
             *(name, _uniform(-45, 45, 32), 1024, position, yaw),
             pitch=pitch,
@@ -81,7 +80,7 @@ def _waymo() -> LidarProfile:
     """
     rows = _uniform(-89.7, 29.7, 200)  # middles of 200 rows from -90 to 30 degrees
 
-    def small(name: str, position: Tuple[float, float, float], yaw: float) -> SpinningLidar:
+    def small(name: str, position: tuple[float, float, float], yaw: float) -> SpinningLidar:
         ahead = round(300 - yaw / 0.6)  # column 0 lies behind the vehicle
         return SpinningLidar(
             *(name, rows, 600, position, yaw),
@@ -109,10 +108,10 @@ def _aevascenes() -> LidarProfile:
 
     def fan(
         name: str,
-        position: Tuple[float, float, float],
+        position: tuple[float, float, float],
         yaw: float,
-        azimuth: Tuple[float, float],
-        elevation: Tuple[float, float],
+        azimuth: tuple[float, float],
+        elevation: tuple[float, float],
         max_range: float,
     ) -> SpinningLidar:
         width = azimuth[1] - azimuth[0]
@@ -136,7 +135,7 @@ def _aevascenes() -> LidarProfile:
     return LidarProfile(units, max_range=512.0, is_rolling=True, velocity_noise=0.1)
 
 
-PROFILES: Dict[str, LidarProfile] = {
+PROFILES: dict[str, LidarProfile] = {
     "av2": _AV2,
     "av2_rolling": replace(_AV2, is_rolling=True),
     "demo": _DEMO,
@@ -147,7 +146,7 @@ PROFILES: Dict[str, LidarProfile] = {
 }
 
 # How much light weather takes per metre, and how many returns it costs whatever they hit.
-WEATHER: Dict[str, Tuple[float, float]] = {
+WEATHER: dict[str, tuple[float, float]] = {
     "clear": (0.0, 0.0),
     "rain": (0.004, 0.06),
     "snow": (0.008, 0.15),

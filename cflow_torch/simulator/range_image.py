@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Callable, Tuple
+from typing import Callable
 
 import torch
 from torch import Tensor
@@ -63,7 +63,7 @@ def cast_unit(
 
 def cast_shots(
     shots: Shots, solids: MovingSolids, ground: Ground, max_range: float
-) -> Tuple[RangeImage, Callable[[Tensor], Tensor]]:
+) -> tuple[RangeImage, Callable[[Tensor], Tensor]]:
     """The true range image of one unit, column after column.
 
     Returns:

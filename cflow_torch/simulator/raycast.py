@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Callable, NamedTuple, Tuple
+from typing import Callable, NamedTuple
 
 import torch
 from torch import Tensor
@@ -79,7 +79,7 @@ def cast_solids(
     azimuth: Tensor,
     elevation: Tensor,
     max_range: float,
-) -> Tuple[Tensor, Tensor]:
+) -> tuple[Tensor, Tensor]:
     """Nearest solid along every ray of a range image.
 
     Args:
@@ -117,7 +117,7 @@ def nearest_hits(
     rays_at: Callable[[Tensor, Tensor], UnitRays],
     num_columns: int,
     elevation: Tensor,
-) -> Tuple[Tensor, Tensor]:
+) -> tuple[Tensor, Tensor]:
     """Nearest solid along every ray of a range image, from the blocks of rays that may meet each solid.
 
     Args:
@@ -161,7 +161,7 @@ def nearest_hits(
     return distance, (best & 0xFFFFFFFF).masked_fill(missed, -1)
 
 
-def _expand(counts: Tensor) -> Tuple[Tensor, Tensor]:
+def _expand(counts: Tensor) -> tuple[Tensor, Tensor]:
     """Row i repeated counts[i] times: the row numbers, and 0 ... counts[i] - 1 within each row."""
     row = torch.repeat_interleave(torch.arange(len(counts), device=counts.device), counts)
     return row, torch.arange(len(row), device=counts.device) - take(counts.cumsum(0) - counts, row)
@@ -228,7 +228,7 @@ def _hit_ball(origin: Tensor, direction: Tensor) -> Tensor:
     return torch.where(enter > 0, enter, torch.inf)
 
 
-def _chord(origin: Tensor, direction: Tensor) -> Tuple[Tensor, Tensor]:
+def _chord(origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
     """Ranges at which rays enter and leave |x| <= 1 (circle or ball); NaN where they pass by."""
     a = (direction * direction).sum(0)
     to_nearest = -(origin * direction).sum(0) / a

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Mapping, Protocol, Sequence, Tuple
+from typing import Mapping, Protocol, Sequence
 
 import numpy as np
 
@@ -22,8 +22,8 @@ class Boxes:
         num_points: (M,) int64 LiDAR points on the object.
     """
 
-    track_id: Tuple[str, ...]
-    category: Tuple[str, ...]
+    track_id: tuple[str, ...]
+    category: tuple[str, ...]
     size: np.ndarray
     pose: np.ndarray
     num_points: np.ndarray
@@ -40,7 +40,7 @@ class GroundRaster:
     """
 
     height: np.ndarray
-    origin: Tuple[float, float]
+    origin: tuple[float, float]
     step: float
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Tuple
 
 import torch
 from torch import Tensor
@@ -31,10 +30,10 @@ class Shots:
     seconds: Tensor
     T_world_sensor: Tensor
     elevation: Tensor
-    speed: Tuple[float, float]
+    speed: tuple[float, float]
 
     @property
-    def directions(self) -> Tuple[Tensor, Tensor]:
+    def directions(self) -> tuple[Tensor, Tensor]:
         """(3, C, 1) float32 world parts of the directions: sideways * cos(elevation) + up * sin(elevation)."""
         R = self.T_world_sensor[:, :3, :3]
         sideways = R[:, :, 0] * self.azimuth.cos()[:, None] + R[:, :, 1] * self.azimuth.sin()[:, None]

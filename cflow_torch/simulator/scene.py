@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Sequence, Tuple
+from typing import Sequence
 
 import numpy as np
 import torch
@@ -35,7 +35,7 @@ class SolidTable:
     phase: np.ndarray
 
     @classmethod
-    def of(cls, bodies: Tuple[Body, ...]) -> SolidTable:
+    def of(cls, bodies: tuple[Body, ...]) -> SolidTable:
         """Solids in the order of the bodies."""
         body = np.repeat(np.arange(len(bodies)), [len(b.solids) for b in bodies])
         return cls(body, *(np.array(column) for column in zip(*(solid for b in bodies for solid in b.solids))))
@@ -55,7 +55,7 @@ class Scene:
 
     ground: Ground
     ego: Route
-    bodies: Tuple[Body, ...]
+    bodies: tuple[Body, ...]
     table: SolidTable
     num_own: int = 0
 
@@ -69,7 +69,7 @@ class Scene:
         ways = np.stack([body.way(seconds) for body in self.bodies], 1)
         return self.ground.pose(ways[..., 0], ways[..., 1], ways[..., 2])
 
-    def movers(self) -> Tuple[Scene, np.ndarray]:
+    def movers(self) -> tuple[Scene, np.ndarray]:
         """The scene with nothing but what moves, and (P',) int64 the number in this scene of each of its solids."""
         bodies = np.array([not body.stands for body in self.bodies])
         chosen = tuple(body for body, moves in zip(self.bodies, bodies) if moves)

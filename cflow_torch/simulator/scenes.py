@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Callable, Dict
+from typing import Callable
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from cflow_torch.simulator.scene import Scene
 from cflow_torch.simulator.street import build_street
 from cflow_torch.types import CFlowError
 
-SCENES: Dict[str, Callable[[np.random.Generator], Scene]] = {
+SCENES: dict[str, Callable[[np.random.Generator], Scene]] = {
     "street": build_street,
     "highway": build_highway,
     "crossing": build_crossing,

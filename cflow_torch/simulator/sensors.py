@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Optional, Tuple
 
 import numpy as np
 
@@ -31,20 +30,20 @@ class SpinningLidar:
     """
 
     name: str
-    elevations: Tuple[float, ...]
+    elevations: tuple[float, ...]
     num_columns: int
-    position: Tuple[float, float, float]
+    position: tuple[float, float, float]
     yaw: float = 0.0
     upside_down: bool = False
     pitch: float = 0.0
     start: float = 180.0
     span: float = -360.0
-    seen: Optional[Tuple[int, int]] = None
+    seen: tuple[int, int] | None = None
     has_jitter: bool = True
     is_virtual: bool = False
-    max_range: Optional[float] = None
-    reach: Optional[float] = None
-    dropout: Optional[float] = None
+    max_range: float | None = None
+    reach: float | None = None
+    dropout: float | None = None
 
     @property
     def T_ego_sensor(self) -> np.ndarray:
@@ -77,7 +76,7 @@ class LidarProfile:
         extinction: share of the light that air takes per metre.
     """
 
-    units: Tuple[SpinningLidar, ...]
+    units: tuple[SpinningLidar, ...]
     min_range: float = 1.0
     max_range: float = 200.0
     range_noise: float = 0.015

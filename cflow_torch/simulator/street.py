@@ -7,7 +7,7 @@ car comes along the main street and turns left. Traffic is laid out so that it d
 from __future__ import annotations
 
 import math
-from typing import Iterator, Tuple
+from typing import Iterator
 
 import numpy as np
 
@@ -132,7 +132,7 @@ def houses(rng: np.random.Generator, ground: Ground) -> Iterator[Body]:
     (main, cross), crossing = ground.half_widths, ground.crossing_x
     main_front, cross_front, depth = main + PAVEMENT, cross + PAVEMENT, 8.0
 
-    def row(begin: float, end: float) -> Iterator[Tuple[float, float, float]]:
+    def row(begin: float, end: float) -> Iterator[tuple[float, float, float]]:
         """(middle, width, set-back) of house after house."""
         while begin < end:
             width = rng.uniform(6, 12)

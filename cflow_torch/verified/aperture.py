@@ -13,7 +13,6 @@ few beams meet it at places that are fixed in the vehicle's frame; but no vehicl
 from __future__ import annotations
 
 import math
-from typing import Tuple
 
 import torch
 from torch import Tensor
@@ -80,7 +79,7 @@ def slides_along_itself(sweeps: HeightSlicedSweeps, members: Pixels, owner: Tens
 
 def principal_axes(
     component: Tensor, row: Tensor, col: Tensor, num_components: int, pixel_size: float
-) -> Tuple[Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor]:
     """Whether each component is a line, (A,) bool, and y and x of its direction, (A,) float64, of any length.
 
     Args:
@@ -186,7 +185,7 @@ def both_ends_move(sweeps: HeightSlicedSweeps, roots: Tensor, is_long: Tensor) -
     return torch.zeros_like(is_long).index_copy_(0, name, moves)
 
 
-def _ends(place: Tensor, owner: Tensor, count: int) -> Tuple[Tensor, Tensor]:
+def _ends(place: Tensor, owner: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Least and largest of the places (K,) float64 of each component, (M,) float64; infinite where there are none."""
     infinite = place.new_full((count,), math.inf)
     return infinite.scatter_reduce(0, owner, place, "amin"), (-infinite).scatter_reduce(0, owner, place, "amax")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import List, NamedTuple, Sequence, Tuple
+from typing import NamedTuple, Sequence
 
 import torch
 import torch.nn.functional as F
@@ -82,7 +82,7 @@ def list_motions(estimates: Tensor, available: Tensor, intervals: Tensor) -> Ten
     is_known = available[:, :, None]
     divisor = torch.where(available, intervals, torch.ones_like(intervals))
     per_interval = torch.where(is_known, estimates, torch.zeros_like(estimates)) / divisor[:, :, None]
-    found: List[Tensor] = [per_interval]
+    found: list[Tensor] = [per_interval]
     if estimates.shape[1] > 1:
         found.insert(0, pool(F.pad(per_interval, (0, 1)), available)[:, None, :2])  # without any estimate: 0
     return torch.cat(found, 1) + 0.0  # turns -0.0 into 0.0
@@ -90,7 +90,7 @@ def list_motions(estimates: Tensor, available: Tensor, intervals: Tensor) -> Ten
 
 def _find_peaks(
     nodes: Nodes, components: Components, sweeps: HeightSlicedSweeps, config: VerifiedConfig
-) -> Tuple[Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor]:
     """Displacement m -> t+1 of nodes for every other sweep m, to parts of a pixel.
 
     Args:

@@ -7,7 +7,7 @@ that is missing counts only where the other sweep saw through: a return in the s
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, Tuple
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -66,14 +66,14 @@ def find_changed(sweeps: HeightSlicedSweeps) -> ChangedPixels:
     return ChangedPixels(is_missing, has_changed)
 
 
-def _bits(missing: Tensor) -> Tuple[Tensor, Tensor]:
+def _bits(missing: Tensor) -> tuple[Tensor, Tensor]:
     """The set bits of (P, S) uint8 masks: flat index of the mask and number of the bit, (K,) int64 each."""
     some = flat_nonzero(missing.bool())
     entry, bit = slice_bits(missing.view(-1).index_select(0, some))
     return some.index_select(0, entry), bit
 
 
-def _centre(sweeps: HeightSlicedSweeps, pixel: Tensor, part: Tensor) -> Tuple[Tensor, Tensor, Tensor]:
+def _centre(sweeps: HeightSlicedSweeps, pixel: Tensor, part: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """x, y and z, (K,) float64, metres, of the middle of slices, (K,) int64, of pixels, (K,) int64."""
     row, col, lowest = gather(pixel, sweeps.pixels.row, sweeps.pixels.col, sweeps.lowest)
     size, (x, y) = sweeps.grid.pixel_size, sweeps.grid.lower[:2]
@@ -116,7 +116,7 @@ class RangeImages:
         direction, distance = self._direction(image, x, y, z)
         return self._farthest.index_select(0, direction).sub_(distance)
 
-    def _direction(self, image: Tensor, x: Tensor, y: Tensor, z: Tensor) -> Tuple[Tensor, Tensor]:
+    def _direction(self, image: Tensor, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
         """Bin of the range images, (K,) int64, and distance over ground, (K,) float32, metres."""
         x, y, z = (a.sub(o.index_select(0, image)).float() for a, o in zip((x, y, z), self._origin))
         distance, sum_of_sides = torch.sqrt(x * x + y * y), x.abs().add_(y.abs()).clamp_(min=1e-3)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Optional, Sequence, Tuple
+from typing import Sequence
 
 import torch
 import torch.nn.functional as F
@@ -49,12 +49,12 @@ class Components:
     roots: Tensor
     changed: Tensor
     changed_root: Tensor
-    firsts: Tuple[int, ...]
+    firsts: tuple[int, ...]
     parent: Tensor
     size: Tensor
     is_linked: Tensor
     may_move: Tensor
-    blocks: Tuple[int, ...]
+    blocks: tuple[int, ...]
 
     @property
     def count(self) -> int:
@@ -179,7 +179,7 @@ def _draw(row: Tensor, col: Tensor, num_windows: int, height: int, width: int) -
     return image.index_fill_(0, torch.add(col, row, alpha=shape[2]), True).view(shape)
 
 
-def movable_nodes(sweeps: HeightSlicedSweeps, components: Components, longest: Optional[float]) -> Nodes:
+def movable_nodes(sweeps: HeightSlicedSweeps, components: Components, longest: float | None) -> Nodes:
     """The components that may move, as a list.
 
     Args:
@@ -235,7 +235,7 @@ def _length(sweeps: HeightSlicedSweeps, components: Components) -> Tensor:
     return bounding_boxes(row, col, root, components.count)[1].amax(1).double()
 
 
-def select_objects(nodes: Nodes, components: Components, evidence: Tensor, num_pixels: int) -> Tuple[Objects, Tensor]:
+def select_objects(nodes: Nodes, components: Components, evidence: Tensor, num_pixels: int) -> tuple[Objects, Tensor]:
     """Cut the tree from below: a component wins where its one motion has more evidence than its parts together.
 
     Args:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import NamedTuple, Tuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -110,7 +110,7 @@ def _bin(values: Tensor, bounds: list[float]) -> Tensor:
     return torch.bucketize(values, torch.tensor(bounds, dtype=values.dtype, device=values.device), right=True)
 
 
-def _neighbourhood(sweeps: HeightSlicedSweeps, motion: Tensor) -> Tuple[Tensor, Tensor]:
+def _neighbourhood(sweeps: HeightSlicedSweeps, motion: Tensor) -> tuple[Tensor, Tensor]:
     """Slices of t in the block around each pixel, and how many of them t+1 has where they move to.
 
     Args:

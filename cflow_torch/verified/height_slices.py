@@ -10,7 +10,6 @@ import itertools
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Optional, Tuple, Union
 
 import torch
 from torch import Tensor
@@ -64,7 +63,7 @@ class Pixels:
         """These pixels, then the others."""
         return Pixels(*(torch.cat(both) for both in zip(self._columns(), others._columns())))
 
-    def _columns(self) -> Tuple[Tensor, ...]:
+    def _columns(self) -> tuple[Tensor, ...]:
         return self.index, self.window, self.step, self.row, self.col, self.slices
 
 
@@ -94,7 +93,7 @@ class HeightSlicedSweeps:
     copied: Tensor
 
     @classmethod
-    def of(cls, batch: Batch, grid: Grid, min_height: Optional[float] = None) -> HeightSlicedSweeps:
+    def of(cls, batch: Batch, grid: Grid, min_height: float | None = None) -> HeightSlicedSweeps:
         """Draw every sweep of a batch with its height slices.
 
         Args:
@@ -228,7 +227,7 @@ class HeightSlicedSweeps:
         return segment_amin(self.batch.positions[2], self.pixel_of_point, self.num_pixels + 1, math.inf)[:-1]
 
 
-def slice_of(z: Tensor, slice_height: Union[float, Tensor], num_slices: int = NUM_SLICES) -> Tensor:
+def slice_of(z: Tensor, slice_height: float | Tensor, num_slices: int = NUM_SLICES) -> Tensor:
     """(N,) uint8: slice of heights (N,) float64, metres, floor(z / slice_height) mod n; 0 for NaN. n: a power of 2, at
     most 16. Slice heights: one, or (N,) float64."""
     if not isinstance(slice_height, Tensor):
@@ -244,7 +243,7 @@ def count_slices(slices: Tensor) -> Tensor:
     return (pairs & 3) + (pairs >> 2)
 
 
-def slice_bits(slices: Tensor) -> Tuple[Tensor, Tensor]:
+def slice_bits(slices: Tensor) -> tuple[Tensor, Tensor]:
     """The set bits of (K,) uint8 masks of slices: position of the mask and number of the bit, (L,) int64 each."""
     bits = (slices[:, None] >> torch.arange(NUM_SLICES, dtype=torch.uint8, device=slices.device)) & 1
     return split_index(flat_nonzero(bits.bool()), NUM_SLICES)

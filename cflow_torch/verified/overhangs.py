@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import itertools
 from functools import lru_cache
-from typing import Tuple
 
 import torch
 import torch.nn.functional as F
@@ -30,7 +29,7 @@ _GAP = 3  # slices, at least, from a cell to the next one above it: less lies be
 _HIGHEST_FOOT, _SMALLEST, _LARGEST = 2, 1, 10
 
 
-def add_overhung(sweeps: HeightSlicedSweeps, components: Components, nodes: Nodes) -> Tuple[HeightSlicedSweeps, Nodes]:
+def add_overhung(sweeps: HeightSlicedSweeps, components: Components, nodes: Nodes) -> tuple[HeightSlicedSweeps, Nodes]:
     """Nodes for what lies under something else.
 
     Args:
@@ -85,7 +84,7 @@ def add_overhung(sweeps: HeightSlicedSweeps, components: Components, nodes: Node
     )
 
 
-def _components_under(sweeps: HeightSlicedSweeps, rows: Tensor) -> Tuple[Tensor, int]:
+def _components_under(sweeps: HeightSlicedSweeps, rows: Tensor) -> tuple[Tensor, int]:
     """Component in space of some points, (K,) int64: its first cell, V for what does not lie on the ground under
     something else; and V."""
     batch, grid = sweeps.batch, sweeps.grid

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, Tuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -20,7 +20,7 @@ _CHANGED_Z, _CHANGED_SLICES = 4.0, 3
 
 def verify(
     sweeps: HeightSlicedSweeps, nodes: Nodes, candidates: Tensor, num_levels: int, significance: float
-) -> Tuple[Tensor, Tensor]:
+) -> tuple[Tensor, Tensor]:
     """The candidate of each node that explains the sweeps best, if it does so significantly.
 
     Args:
@@ -175,7 +175,7 @@ class Moves(NamedTuple):
         return self.sweeps.index(window[:, None], to[:, None], row[:, None] + down, col[:, None] + right)
 
 
-def comparisons(step: Tensor, num_steps: int) -> Tuple[Tensor, Tensor]:
+def comparisons(step: Tensor, num_steps: int) -> tuple[Tensor, Tensor]:
     """All comparisons of pixels with other sweeps: those of every other sweep with t+1, those of t+1 with every other.
 
     Args:
@@ -212,7 +212,7 @@ def evidence_of(won: Tensor, lost: Tensor, z: float) -> Tensor:
     return (16 * (surplus - z * noise)).floor_().long().clamp_(min=0)
 
 
-def best_candidate(evidence: Tensor, candidates: Tensor) -> Tuple[Tensor, Tensor]:
+def best_candidate(evidence: Tensor, candidates: Tensor) -> tuple[Tensor, Tensor]:
     """The motion of each component that has most evidence.
 
     Args:

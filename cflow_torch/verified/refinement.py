@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Optional, Tuple
 
 import torch
 from torch import Tensor
@@ -20,8 +19,8 @@ from cflow_torch.verified.voxel_centroids import ObjectPoints, points_of_objects
 
 
 def refine(
-    sweeps: HeightSlicedSweeps, objects: Objects, motion: Tensor, longest: Optional[float]
-) -> Tuple[RigidMotion, RigidMotion]:
+    sweeps: HeightSlicedSweeps, objects: Objects, motion: Tensor, longest: float | None
+) -> tuple[RigidMotion, RigidMotion]:
     """The final motion of objects.
 
     Args:
@@ -81,7 +80,7 @@ def register_deskewed(
 
 def deskew(
     points: ObjectPoints, sweeps: HeightSlicedSweeps, rigid: RigidMotion
-) -> Tuple[ObjectPoints, HeightSlicedSweeps]:
+) -> tuple[ObjectPoints, HeightSlicedSweeps]:
     """Points of objects where they were at the instant of their sweep.
 
     Args:

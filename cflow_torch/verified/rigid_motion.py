@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Tuple
 
 import torch
 import torch.nn.functional as F
@@ -43,7 +42,7 @@ class RigidMotion:
         """The motion of some objects, (G,) bool; the others stand still."""
         return RigidMotion(self.flow.masked_fill(~moves[:, None], 0.0), self.turn.masked_fill(~moves, 0.0), self.centre)
 
-    def flow_at(self, which: Tensor, x: Tensor, y: Tensor) -> Tuple[Tensor, Tensor]:
+    def flow_at(self, which: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         """x and y of the flow, metres per interval, of points of t (K,), by their object and their place in metres."""
         (c_x, c_y), (v_x, v_y) = (values.index_select(0, which).unbind(1) for values in (self.centre, self.flow))
         x, y = x - c_x, y - c_y

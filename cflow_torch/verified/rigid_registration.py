@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Tuple
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -107,7 +105,7 @@ class _VoxelPairs:
         self._is_back, self._part = to > 0, voxels.part.index_select(0, self._voxel)
         self._weight = meeting_weights(_SIGMA, time.device)
 
-    def normal_equations(self, translation: Tensor, rotation: Tensor) -> Tuple[Tensor, Tensor]:
+    def normal_equations(self, translation: Tensor, rotation: Tensor) -> tuple[Tensor, Tensor]:
         """Total weight of the pairs under a motion, (G,) float64, and sums over them, (7 or 8, G) float64.
 
         The sums are those of w k^2, w k (r x e), w k^2 |r|^2, of w k^2 r, of w k e, and, where there are times, of
@@ -153,7 +151,7 @@ class _VoxelPairs:
         return torch.cat(terms)
 
 
-def _solve(given: Tensor, translation: Tensor, rotation: Tensor, sums: Tensor) -> Tuple[Tensor, Tensor]:
+def _solve(given: Tensor, translation: Tensor, rotation: Tensor, sums: Tensor) -> tuple[Tensor, Tensor]:
     """The motion after a Gauss-Newton step; the equations are solved by elimination.
 
     Args:

@@ -10,7 +10,6 @@ the rings of beams on its hood would hold lower ones back.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Tuple
 
 import torch
 from torch import Tensor
@@ -87,7 +86,7 @@ def _shifts(device: torch.device) -> Tensor:
     return torch.cartesian_prod(line, line).flip(1)
 
 
-def _best_shift(gain: Tensor, square: Tensor, count: Tensor, slow: Tensor) -> Tuple[Tensor, Tensor]:
+def _best_shift(gain: Tensor, square: Tensor, count: Tensor, slow: Tensor) -> tuple[Tensor, Tensor]:
     """The best shift of each object, (G,) int64, and whether it counts, (G,) bool: a slow object must gain
     significantly.
 
@@ -186,7 +185,7 @@ class _Cells:
         """(G,) int64, cells of each object."""
         return scatter_count(self.owner, self.num_objects)
 
-    def gains(self) -> Tuple[Tensor, Tensor]:
+    def gains(self) -> tuple[Tensor, Tensor]:
         """(G, 49) float64 each: weight that cells gain by each shift, and its square, summed over each object.
 
         Convention: a cell of t that is moved by the shift meets the nearest one of t+1, one of t+1 that is moved back

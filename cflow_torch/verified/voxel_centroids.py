@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Optional, Union
 
 import torch
 import torch.nn.functional as F
@@ -38,7 +37,7 @@ class ObjectPoints:
     pixel: Tensor
     part: Tensor
     position: Tensor
-    time: Optional[Tensor] = None
+    time: Tensor | None = None
 
     def take(self, wanted: Tensor) -> ObjectPoints:
         """Some of them, (N,) bool."""
@@ -57,7 +56,7 @@ def points_of_objects(
     sweeps: HeightSlicedSweeps,
     objects: Objects,
     wanted: Tensor,
-    slice_height: Union[float, Tensor] = SLICE_HEIGHT,
+    slice_height: float | Tensor = SLICE_HEIGHT,
     num_slices: int = NUM_SLICES,
 ) -> ObjectPoints:
     """The points of some objects in all sweeps, in the order of the batch.
@@ -117,7 +116,7 @@ class Voxels:
         first = torch.zeros_like(key).scatter_(0, voxel, torch.arange(len(voxel), device=key.device))
         self.owner, self.window, self.step = gather(first, points.owner, points.window, points.step)
         self.part = key & (num_slices - 1)
-        self.time: Optional[Tensor] = None
+        self.time: Tensor | None = None
         if points.time is not None:
             self.time = torch.zeros_like(count, dtype=torch.float64).index_add_(0, voxel, points.time.double()) / count
 

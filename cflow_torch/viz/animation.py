@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Iterable, Iterator, Union
+from typing import TYPE_CHECKING, Iterable, Iterator
 
 import numpy as np
 
@@ -20,7 +20,7 @@ _SHORTEST = 2  # hundredths of a second; viewers show shorter frames of a .gif s
 _WHEEL_SIDE = 200  # pixels
 
 
-def save_animation(figures: Iterable[Figure], path: Union[str, Path], *, frames_per_second: float = 5.0) -> Path:
+def save_animation(figures: Iterable[Figure], path: str | Path, *, frames_per_second: float = 5.0) -> Path:
     """Writes figures as an animation that begins anew at its end. The file appears complete or not at all.
 
     Args:

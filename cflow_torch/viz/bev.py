@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Optional, Sequence, Tuple, Union
+from typing import TYPE_CHECKING, Sequence
 
 import numpy as np
 
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 
 def plot_flow(
     points: Array,
-    result_or_residual: Union[FlowResult, Array],
+    result_or_residual: FlowResult | Array,
     *,
-    is_ground: Optional[Array] = None,
-    point_cloud_range: Optional[Sequence[float]] = None,
-    max_flow: Optional[float] = None,
-    title: Optional[str] = None,
-    truth: Optional[Array] = None,
-    legend: Optional[str] = None,
+    is_ground: Array | None = None,
+    point_cloud_range: Sequence[float] | None = None,
+    max_flow: float | None = None,
+    title: str | None = None,
+    truth: Array | None = None,
+    legend: str | None = None,
 ) -> Figure:
     """Bird's-eye view of sweep t with the motion of its objects until t+1.
 
@@ -85,7 +85,7 @@ def plot_flow(
     return figure
 
 
-def save_picture(figure: Figure, path: Union[str, Path]) -> Path:
+def save_picture(figure: Figure, path: str | Path) -> Path:
     """Writes a figure as PNG. The file appears complete or not at all; an older one is replaced.
 
     Args:
@@ -107,7 +107,7 @@ def save_picture(figure: Figure, path: Union[str, Path]) -> Path:
     return path
 
 
-def point_rows(name: str, values: Array, count: Optional[int] = None) -> np.ndarray:
+def point_rows(name: str, values: Array, count: int | None = None) -> np.ndarray:
     """(N, 3) float64; N is the count, or any number."""
     array = as_numpy(values)
     if array.ndim != 2 or array.shape[1] < 3 or (count is not None and len(array) != count):
@@ -116,8 +116,8 @@ def point_rows(name: str, values: Array, count: Optional[int] = None) -> np.ndar
 
 
 def split_sweep(
-    points: Array, is_ground: Optional[Array], point_cloud_range: Optional[Sequence[float]]
-) -> Tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    points: Array, is_ground: Array | None, point_cloud_range: Sequence[float] | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """The view as in `view_of`, positions (N, 3) float64, and (N,) bool each: ground in view, other points in view."""
     position = point_rows("points", points)
     ground = np.zeros(len(position), bool) if is_ground is None else as_numpy(is_ground).astype(bool)
@@ -127,7 +127,7 @@ def split_sweep(
     return view, position, is_inside & ground, is_inside & ~ground
 
 
-def view_of(position: np.ndarray, point_cloud_range: Optional[Sequence[float]]) -> Tuple[np.ndarray, np.ndarray]:
+def view_of(position: np.ndarray, point_cloud_range: Sequence[float] | None) -> tuple[np.ndarray, np.ndarray]:
     """((2, 2) low and high corner of the view, (N,) bool is inside)."""
     default = DenseConfig().point_cloud_range
     bounds = np.asarray(default if point_cloud_range is None else point_cloud_range, np.float64)

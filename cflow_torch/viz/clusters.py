@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Optional, Sequence, Union
+from typing import TYPE_CHECKING, Sequence
 
 import numpy as np
 
@@ -24,11 +24,11 @@ _CAPTION = "colour: a cluster, neighbours in different colours   grey: in no clu
 
 def plot_clusters(
     points: Array,
-    result_or_cluster_id: Union[FlowResult, Array],
+    result_or_cluster_id: FlowResult | Array,
     *,
-    is_ground: Optional[Array] = None,
-    point_cloud_range: Optional[Sequence[float]] = None,
-    title: Optional[str] = None,
+    is_ground: Array | None = None,
+    point_cloud_range: Sequence[float] | None = None,
+    title: str | None = None,
 ) -> Figure:
     """Bird's-eye view of sweep t, its points coloured by cluster.
 

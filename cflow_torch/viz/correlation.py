@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, List, Optional, Tuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,7 +22,7 @@ _PEAK = "#e6194b"
 _MOST_LINES = 160  # of the surface, a side
 
 
-def plot_correlation(window: Window, config: Optional[Config] = None, *, cluster_id: Optional[int] = None) -> Figure:
+def plot_correlation(window: Window, config: Config | None = None, *, cluster_id: int | None = None) -> Figure:
     """How one cluster's motion is found: its pixels at t and t+1, and their normalised cross-correlation.
 
     Args:
@@ -72,7 +72,7 @@ def _title(found: ClusterCorrelation, config: Config) -> str:
     return f"{title}; with {' and '.join(others)} {_pair(*found.flow[:2])} m" if others else title
 
 
-def _lay_out(shape: Tuple[int, int]) -> Tuple[Figure, List[Any]]:
+def _lay_out(shape: tuple[int, int]) -> tuple[Figure, list[Any]]:
     """The figure and its axes: four images, colour bar, surface."""
     left, right = 0.7, 5.25
     # Square pixels, unless the box is so long and thin that nothing could be seen.
@@ -146,7 +146,7 @@ def _draw_surface(axes: Any, found: ClusterCorrelation) -> None:
     axes.tick_params(labelsize=9, labelcolor=style.INK)
 
 
-def _shift_names(found: ClusterCorrelation) -> List[str]:
+def _shift_names(found: ClusterCorrelation) -> list[str]:
     return [f"shift in {axis}, pixels of {found.images.pixel_size:g} m" for axis in "xy"]
 
 

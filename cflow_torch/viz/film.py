@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Iterator, Optional, Sequence
+from typing import TYPE_CHECKING, Iterator, Sequence
 
 import numpy as np
 
@@ -27,15 +27,15 @@ class Frame:
 
     points: Array
     result: FlowResult
-    is_ground: Optional[Array] = None
-    title: Optional[str] = None
+    is_ground: Array | None = None
+    title: str | None = None
 
 
 def flow_figures(
     frames: Sequence[Frame],
     *,
-    point_cloud_range: Optional[Sequence[float]] = None,
-    max_flow: Optional[float] = None,
+    point_cloud_range: Sequence[float] | None = None,
+    max_flow: float | None = None,
     legend: str = "upper right",
     width: int = 1000,
 ) -> Iterator[Figure]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Optional, Tuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -27,7 +27,7 @@ _ALONG = 9  # places of a line that a legend may hide
 _FADE = 0.72  # of the pixels behind the matches
 
 
-def plot_keypoints(window: Window, config: Optional[Config] = None) -> Figure:
+def plot_keypoints(window: Window, config: Config | None = None) -> Figure:
     """Key points of a pair of sweeps and their matches, close up where most of them move.
 
     Args:
@@ -64,7 +64,7 @@ def plot_keypoints(window: Window, config: Optional[Config] = None) -> Figure:
     return figure
 
 
-def busiest(start: np.ndarray, end: np.ndarray) -> Tuple[np.ndarray, np.ndarray]:
+def busiest(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Low and high corner of the view: round the cell whose matches go farthest in sum, or the ego vehicle.
 
     Convention: vectors are summed, so matches that agree count and those that cross do not.

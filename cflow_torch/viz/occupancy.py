@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, List
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -39,7 +39,7 @@ def occupancy_rgb(images: Occupancy, fade: float = 0.0) -> np.ndarray:
     return image
 
 
-def sweep_marks() -> List[Any]:
+def sweep_marks() -> list[Any]:
     """For a legend: what the colours of the pixels are."""
     from matplotlib.lines import Line2D
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, List, Optional, Sequence, Tuple
+from typing import TYPE_CHECKING, Any, Sequence
 
 import numpy as np
 import torch
@@ -33,8 +33,8 @@ _SLATE = (80 / 255, 90 / 255, 110 / 255)  # behind errors: black (none) and whit
 
 
 def new_figure(
-    names: Sequence[str], view: np.ndarray, title: Optional[str], caption: str = FLOW_CAPTION
-) -> Tuple[Figure, List[Axes]]:
+    names: Sequence[str], view: np.ndarray, title: str | None, caption: str = FLOW_CAPTION
+) -> tuple[Figure, list[Axes]]:
     """An empty figure with one framed panel per name, in a row, and range rings around the ego vehicle.
 
     Args:
@@ -80,9 +80,7 @@ def draw_ground(axes: Axes, position: np.ndarray) -> None:
     axes.scatter(position[:, 0], position[:, 1], s=dot_area(axes), color=style.GROUND, linewidths=0, zorder=1)
 
 
-def draw_flow(
-    axes: Axes, position: np.ndarray, flow: np.ndarray, cluster: Optional[np.ndarray], max_flow: float
-) -> None:
+def draw_flow(axes: Axes, position: np.ndarray, flow: np.ndarray, cluster: np.ndarray | None, max_flow: float) -> None:
     """Static points in grey, movers in colour with a dark rim, one arrow per moving cluster, the ego vehicle.
 
     Args:
@@ -154,7 +152,7 @@ def draw_error(axes: Axes, position: np.ndarray, flow: np.ndarray, truth: np.nda
     draw_ego(axes, "white", _SLATE)
 
 
-def group_medians(group: np.ndarray, values: np.ndarray) -> Tuple[np.ndarray, np.ndarray, np.ndarray]:
+def group_medians(group: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Median of each column within each group.
 
     Args:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import uuid
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Iterable, List, Mapping, Optional, Tuple, Union
+from typing import TYPE_CHECKING, Any, Iterable, Mapping
 
 import numpy as np
 
@@ -34,11 +34,11 @@ _CALENDAR = 10**17  # nanoseconds; later ones are a date (1973 and on), earlier 
 
 def record_log(
     log: Log,
-    results: Iterable[Tuple[int, FlowResult]],
-    path: Union[str, Path],
+    results: Iterable[tuple[int, FlowResult]],
+    path: str | Path,
     *,
     max_flow: float = MAX_FLOW,
-    tracks: Optional[Mapping[str, np.ndarray]] = None,
+    tracks: Mapping[str, np.ndarray] | None = None,
 ) -> int:
     """Writes a drive as .rrd, the format of the viewer rerun. The file appears complete or not at all.
 
@@ -117,10 +117,10 @@ class _Drive:
         self.rr, self.stream, self.max_flow = rr, stream, max_flow
         self.count = 0
         self.has_truth = False
-        self.first_pose: Optional[np.ndarray] = None
-        self.trajectory: List[np.ndarray] = []
+        self.first_pose: np.ndarray | None = None
+        self.trajectory: list[np.ndarray] = []
 
-    def add(self, index: int, pc0: Sweep, pc1: Sweep, result: FlowResult, labels: Optional[FlowLabels]) -> None:
+    def add(self, index: int, pc0: Sweep, pc1: Sweep, result: FlowResult, labels: FlowLabels | None) -> None:
         """Log one pair."""
         rr = self.rr
         points, rows = as_numpy(pc0.points, np.float64)[:, :3], len(result.residual_flow)
@@ -193,7 +193,7 @@ class _Drive:
             self.stream.log("world/trajectory", way, static=True, strict=True)
         self.stream.send_blueprint(self._layout())
 
-    def _set_time(self, index: int, timestamp_ns: Optional[int]) -> None:
+    def _set_time(self, index: int, timestamp_ns: int | None) -> None:
         self.stream.set_time("sweep", sequence=index)
         if timestamp_ns is not None and timestamp_ns >= _CALENDAR:
             self.stream.set_time("time", timestamp=np.datetime64(int(timestamp_ns), "ns"))

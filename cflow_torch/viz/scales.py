@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, List, Optional, Tuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,7 +24,7 @@ _SMALLEST = 4.0  # metres, half a side
 _MIN_POINTS = 30  # of the object that is shown
 
 
-def plot_scales(window: Window, config: Optional[Config] = None) -> Figure:
+def plot_scales(window: Window, config: Config | None = None) -> Figure:
     """Coarse to fine, one column per pixel size.
 
     Args:
@@ -95,7 +95,7 @@ def _shown(result: FlowResult, alone: FlowResult) -> np.ndarray:
     return cluster == number[np.where(count >= min(_MIN_POINTS, count.max()), median[:, 0], -1).argmax()]
 
 
-def _square(position: np.ndarray) -> Tuple[np.ndarray, np.ndarray]:
+def _square(position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Low and high corner of a square round some points and a margin."""
     ends = position[:, :2] if len(position) else np.zeros((1, 2))
     middle = (ends.min(axis=0) + ends.max(axis=0)) / 2
@@ -104,7 +104,7 @@ def _square(position: np.ndarray) -> Tuple[np.ndarray, np.ndarray]:
 
 
 def _draw_near(
-    panels: List[Axes], position: np.ndarray, found: List[Scale], result: FlowResult, alone: FlowResult
+    panels: list[Axes], position: np.ndarray, found: list[Scale], result: FlowResult, alone: FlowResult
 ) -> None:
     """What each scale sees of one object, and in the last panel where it ends."""
     shown = _shown(result, alone)
@@ -124,10 +124,10 @@ def _draw_near(
 
 
 def _draw_flows(
-    panels: List[Axes],
+    panels: list[Axes],
     config: Config,
     position: np.ndarray,
-    found: List[Scale],
+    found: list[Scale],
     result: FlowResult,
     alone: FlowResult,
 ) -> float:

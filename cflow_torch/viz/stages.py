@@ -7,7 +7,7 @@ again. The presets default and fast weigh the motions of all scales at once and 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, List, Optional, Tuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -110,7 +110,7 @@ class KeyPointMatches:
     end: np.ndarray
 
 
-def scales(window: Window, config: Config) -> Tuple[List[Scale], FlowResult]:
+def scales(window: Window, config: Config) -> tuple[list[Scale], FlowResult]:
     """Every scale of a run on the CPU, coarse to fine, and the run's result.
 
     Raises:
@@ -120,7 +120,7 @@ def scales(window: Window, config: Config) -> Tuple[List[Scale], FlowResult]:
         raise _absent(config, "scales one after the other", "paper")
     model: Any = make_model(config, "cpu")
     motion_at_scale = model.motion_at_scale
-    seen: List[Tuple[ProjectedSweeps, Motion]] = []
+    seen: list[tuple[ProjectedSweeps, Motion]] = []
 
     def watched(sweeps: ProjectedSweeps) -> Motion:
         motion = motion_at_scale(sweeps)
@@ -137,7 +137,7 @@ def scales(window: Window, config: Config) -> Tuple[List[Scale], FlowResult]:
 
 
 @torch.inference_mode()
-def cluster_correlation(window: Window, config: Config, cluster_id: Optional[int] = None) -> ClusterCorrelation:
+def cluster_correlation(window: Window, config: Config, cluster_id: int | None = None) -> ClusterCorrelation:
     """The correlation of one cluster of a dense run.
 
     Args:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, Optional, Tuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,7 +21,7 @@ WHEEL_INCHES = (1.6, 1.82)  # width and height of the legend
 _TITLE = 7.2  # characters of a heading per inch
 
 
-def blank_figure(inches: Tuple[float, float], dpi: int) -> Figure:
+def blank_figure(inches: tuple[float, float], dpi: int) -> Figure:
     """An empty white figure of that size; no pyplot state is touched.
 
     Raises:
@@ -98,7 +98,7 @@ def inches_of(axes: Axes) -> np.ndarray:
 
 
 def draw_wheel(
-    axes: Axes, position: np.ndarray, is_mover: np.ndarray, max_flow: float, corner: Optional[str] = None
+    axes: Axes, position: np.ndarray, is_mover: np.ndarray, max_flow: float, corner: str | None = None
 ) -> None:
     """The colour wheel, in a corner of the panel where it hides little, or in one of `CORNERS`."""
     fill_wheel(legend_box(axes, position, is_mover, WHEEL_INCHES, corner), max_flow)
@@ -129,8 +129,8 @@ def legend_box(
     axes: Axes,
     position: np.ndarray,
     is_loud: np.ndarray,
-    inches: Tuple[float, float],
-    corner: Optional[str] = None,
+    inches: tuple[float, float],
+    corner: str | None = None,
 ) -> Axes:
     """An empty white box of that size in the corner where it hides the fewest points; loud ones count twenty-fold.
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Optional
-
 import numpy as np
 
 from cflow_torch.types import Array, CFlowError, as_numpy
@@ -16,7 +14,7 @@ PRIMARIES = np.array(
 _POSITION = np.cumsum((0, *TRANSITIONS))  # of each primary on the wheel
 
 
-def flow_to_rgb(flow: Array, max_flow: Optional[float] = None) -> np.ndarray:
+def flow_to_rgb(flow: Array, max_flow: float | None = None) -> np.ndarray:
     """Direction of flow as hue, length as saturation; zero flow is white.
 
     Args:

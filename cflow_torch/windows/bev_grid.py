@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Optional, Tuple
 
 import torch
 from torch import Tensor
@@ -28,8 +27,8 @@ class Grid:
     """
 
     pixel_size: float
-    lower: Tuple[float, ...]
-    upper: Tuple[float, ...]
+    lower: tuple[float, ...]
+    upper: tuple[float, ...]
 
     def __post_init__(self) -> None:
         # Not `height` and `width`: a side may be too long for any whole number.
@@ -91,7 +90,7 @@ class Grid:
         return col.add_(row, alpha=self.width)
 
     def pixel_of_image(
-        self, positions: Tensor, image: Tensor, num_images: int, takes_part: Optional[Tensor] = None
+        self, positions: Tensor, image: Tensor, num_images: int, takes_part: Tensor | None = None
     ) -> Tensor:
         """The pixel of every point in a stack of images.
 

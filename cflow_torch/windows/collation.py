@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import accumulate
-from typing import Optional, Sequence, Tuple, Union
+from typing import Sequence
 
 import torch
 from torch import Tensor
@@ -58,17 +58,17 @@ class Batch:
     elapsed: Tensor
     seconds: Tensor
     origin: Tensor
-    rows: Tuple[slice, ...]
+    rows: tuple[slice, ...]
     pose_flow: Tensor
-    ground: Optional[GroundHeights] = None
-    point_times: Optional[Tensor] = None
+    ground: GroundHeights | None = None
+    point_times: Tensor | None = None
 
     def with_twice_the_windows(self) -> Batch:
         """The batch with empty windows B ... 2 B - 1 behind its own, of the same times and origins."""
         elapsed, seconds, origin = (torch.cat((of, of)) for of in (self.elapsed, self.seconds, self.origin))
         return replace(self, num_windows=2 * self.num_windows, elapsed=elapsed, seconds=seconds, origin=origin)
 
-    def both_sides(self) -> Tuple[Batch, Tensor]:
+    def both_sides(self) -> tuple[Batch, Tensor]:
         """The sweeps up to t+1, and in as many further windows t+1, t and the sweeps after them.
 
         Returns:
@@ -203,7 +203,7 @@ def make_batch(
     )
 
 
-def _take(values: Union[int, Tensor], row: Optional[Tensor]) -> Union[int, Tensor]:
+def _take(values: int | Tensor, row: Tensor | None) -> int | Tensor:
     """Values of some points, None = of all; a number stands for the same value everywhere."""
     return values if row is None or not isinstance(values, Tensor) else values.index_select(0, row)
 

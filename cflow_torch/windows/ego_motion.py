@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Optional, Sequence
+from typing import Any, Sequence
 
 import numpy as np
 import torch
@@ -85,7 +85,7 @@ def relative_transform(pose1: Any, pose: Any, name: str = "pose") -> np.ndarray:
     return np.linalg.inv(rigid_transform(pose1, "pose1")) @ rigid_transform(pose, name)
 
 
-def compensate(positions: Tensor, T_ego1_ego: Optional[Array], num_axes: int = 3) -> Tensor:
+def compensate(positions: Tensor, T_ego1_ego: Array | None, num_axes: int = 3) -> Tensor:
     """Positions in the frame of t+1.
 
     Args:

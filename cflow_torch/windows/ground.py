@@ -10,7 +10,7 @@ All of it is arithmetic on whole millimetres: the same bits in any batch, in any
 
 from __future__ import annotations
 
-from typing import Any, List, Sequence, Tuple
+from typing import Any, Sequence
 
 import numpy as np
 import torch
@@ -61,7 +61,7 @@ def find_ground(points: Array, method: str = "grid", threshold: float = THRESHOL
 @one_thread()
 def find_ground_batch(
     clouds: Sequence[Array], method: str = "grid", threshold: float = THRESHOLD, device: Any = "auto"
-) -> List[Array]:
+) -> list[Array]:
     """Ground points of several sweeps at once; each result is that of `find_ground`.
 
     Args:
@@ -95,7 +95,7 @@ def find_ground_batch(
 
 
 @one_thread()
-def has_ground(clouds: Sequence[Array], most_points: int = 30_000, device: Any = "auto") -> List[bool]:
+def has_ground(clouds: Sequence[Array], most_points: int = 30_000, device: Any = "auto") -> list[bool]:
     """Whether there is ground in each of several sweeps, from a part of their points.
 
     Args:
@@ -146,7 +146,7 @@ def ground_points(positions: Tensor, sweep: Tensor, num_sweeps: int, threshold: 
     return (above <= surface + threshold).logical_and_(inside).logical_and_(plane.is_there.index_select(0, sweep))
 
 
-def _stack(clouds: Sequence[Array], device: Any) -> Tuple[Tensor, Tensor]:
+def _stack(clouds: Sequence[Array], device: Any) -> tuple[Tensor, Tensor]:
     """(3, N) float64 positions of all clouds and (N,) int64 cloud of each, on one device."""
     for number, cloud in enumerate(clouds):
         check_points(cloud, f"points of sweep {number}")

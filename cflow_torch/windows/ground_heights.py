@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from copy import copy
-from typing import Union
 
 import torch
 import torch.nn.functional as F
@@ -35,7 +34,7 @@ class GroundHeights:
         self._heights = torch.zeros((num_windows, *shape), dtype=torch.int64, device=device)
         self._counts = torch.zeros_like(self._heights)
 
-    def add(self, window: Union[int, Tensor], positions: Tensor) -> None:
+    def add(self, window: int | Tensor, positions: Tensor) -> None:
         """Count ground points.
 
         Args:

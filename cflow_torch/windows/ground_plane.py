@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Tuple
 
 import torch
 from torch import Tensor
@@ -81,7 +80,7 @@ def near_plane(points: Tensor, sweep: Tensor, counts: Tensor, num_sweeps: int) -
     return Plane(is_there, step_x, step_y, torch.where(is_there, height, 0))
 
 
-def order_statistics(cell: Tensor, height: Tensor, num_cells: int) -> Tuple[Tensor, Tensor, Tensor]:
+def order_statistics(cell: Tensor, height: Tensor, num_cells: int) -> tuple[Tensor, Tensor, Tensor]:
     """Low end (a tenth cut off), median and number of the heights of each cell.
 
     Args:
@@ -106,7 +105,7 @@ def order_statistics(cell: Tensor, height: Tensor, num_cells: int) -> Tuple[Tens
     return low, middle, count
 
 
-def _median_step(here: Tensor, there: Tensor, is_pair: Tensor) -> Tuple[Tensor, Tensor]:
+def _median_step(here: Tensor, there: Tensor, is_pair: Tensor) -> tuple[Tensor, Tensor]:
     """(B,) int64: median of there - here over the pairs that are no steeper than allowed; number of such pairs."""
     step = there - here
     counts = is_pair & (step.abs() <= _MAX_STEP)
@@ -116,7 +115,7 @@ def _median_step(here: Tensor, there: Tensor, is_pair: Tensor) -> Tuple[Tensor, 
     return torch.where(number > 0, median, 0), number
 
 
-def millimetres(positions: Tensor) -> Tuple[Tensor, Tensor]:
+def millimetres(positions: Tensor) -> tuple[Tensor, Tensor]:
     """(3, N) int64 mm, and (N,) bool: the point is finite and on the grid; the others are moved to the origin."""
     x, y, z = positions.abs()
     # A millimetre inside: rounding must not lead off the grid.

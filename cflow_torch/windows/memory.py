@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from contextlib import suppress
 from pathlib import Path
-from typing import List, Mapping, Optional, Sequence
+from typing import Mapping, Sequence
 
 import torch
 
@@ -37,7 +37,7 @@ def require_memory(num_bytes: int, device: torch.device, what: str, remedy: str)
         return
     if device.type == "cuda":
         cached = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
-        free: Optional[int] = torch.cuda.mem_get_info(device)[0] + cached
+        free: int | None = torch.cuda.mem_get_info(device)[0] + cached
     else:
         free = available_memory({})
     if free is not None and num_bytes > free:
@@ -47,7 +47,7 @@ def require_memory(num_bytes: int, device: torch.device, what: str, remedy: str)
         )
 
 
-def available_memory(environ: Mapping[str, str]) -> Optional[int]:
+def available_memory(environ: Mapping[str, str]) -> int | None:
     """Bytes that this process may still take: what is free, limits of its control groups, its share of a torchrun job.
     None where the system does not tell."""
     free = []
@@ -61,7 +61,7 @@ def available_memory(environ: Mapping[str, str]) -> Optional[int]:
     return min(free) // int(environ.get("LOCAL_WORLD_SIZE", 1)) if free else None
 
 
-def peak_memory() -> Optional[int]:
+def peak_memory() -> int | None:
     """Bytes that this process held at most since it began; None where the system does not say."""
     try:
         import resource
@@ -71,7 +71,7 @@ def peak_memory() -> Optional[int]:
     return most if sys.platform == "darwin" else 1024 * most
 
 
-def control_groups() -> List[Path]:
+def control_groups() -> list[Path]:
     """Control groups (version 2) of this process, the innermost first; empty where there are none."""
     with suppress(OSError, StopIteration):
         lines = Path("/proc/self/cgroup").read_text().splitlines()
@@ -81,8 +81,8 @@ def control_groups() -> List[Path]:
 
 
 def split_windows(
-    windows: Sequence[Window], grid: Grid, device: torch.device, bytes_per_point: int, max_memory: Optional[float]
-) -> List[List[Window]]:
+    windows: Sequence[Window], grid: Grid, device: torch.device, bytes_per_point: int, max_memory: float | None
+) -> list[list[Window]]:
     """Windows in groups that fit the memory, in order. The result of a window does not depend on its group.
 
     Args:
@@ -98,7 +98,7 @@ def split_windows(
     Raises:
         CFlowError: a window alone needs more memory than there is.
     """
-    groups: List[List[Window]] = []
+    groups: list[list[Window]] = []
     if max_memory is None and device.type == "cpu":
         max_memory = _BYTES_ON_CPU
     used = 0

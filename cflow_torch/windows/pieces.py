@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import groupby
-from typing import Iterator, List, Optional, Sequence, Union
+from typing import Iterator, Sequence
 
 import numpy as np
 import torch
@@ -33,16 +33,16 @@ class Piece:
         times: (N,) float64, sweep intervals; None = they do not count.
     """
 
-    window: Union[int, Tensor]
-    step: Union[int, Tensor]
+    window: int | Tensor
+    step: int | Tensor
     raw: Tensor
     moved: Tensor
     takes_part: Tensor
-    is_ground: Optional[Tensor]
-    times: Optional[Tensor]
+    is_ground: Tensor | None
+    times: Tensor | None
 
 
-def groups_of(entries: Sequence[Entry], device: torch.device) -> List[List[Entry]]:
+def groups_of(entries: Sequence[Entry], device: torch.device) -> list[list[Entry]]:
     """Sweeps that are read at once: on a CPU each alone, elsewhere all of t+1, all of t, all others, since a GPU waits
     for operations rather than for memory."""
     if device.type == "cpu":
@@ -63,9 +63,9 @@ def read_pieces(
     sizes = [entry.sweep.points.shape[0] for entry in group]
     ground, times = _ground(group, sizes, device), _times(group, sizes, device)
     matrices = [entry.T_ego1_ego for entry in group]
-    matrix: Optional[Tensor] = None
-    window: Union[int, Tensor] = group[0].window
-    step: Union[int, Tensor] = group[0].step
+    matrix: Tensor | None = None
+    window: int | Tensor = group[0].window
+    step: int | Tensor = group[0].step
     if any(T is not None for T in matrices):
         given = np.stack([np.eye(4) if T is None else T for T in matrices], 2)[:3]  # the last row is known
         matrix = torch.as_tensor(given, device=device)
@@ -92,7 +92,7 @@ def read_pieces(
         yield Piece(window, step, raw, moved, takes_part, is_ground, None if times is None else times[rows])
 
 
-def _ground(group: Sequence[Entry], sizes: Sequence[int], device: torch.device) -> Optional[Tensor]:
+def _ground(group: Sequence[Entry], sizes: Sequence[int], device: torch.device) -> Tensor | None:
     """(N,) bool of all points, False in sweeps without a mask; None = no sweep has one."""
     if all(entry.sweep.is_ground is None for entry in group):
         return None
@@ -105,7 +105,7 @@ def _ground(group: Sequence[Entry], sizes: Sequence[int], device: torch.device) 
     return masks[0] if len(masks) == 1 else torch.cat(masks)
 
 
-def _times(group: Sequence[Entry], sizes: Sequence[int], device: torch.device) -> Optional[Tensor]:
+def _times(group: Sequence[Entry], sizes: Sequence[int], device: torch.device) -> Tensor | None:
     """(N,) float64 sweep intervals of all points, 0 in sweeps whose times do not count; None = those of none do."""
     if all(entry.interval is None for entry in group):
         return None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Sequence, Tuple
+from typing import Sequence
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ _LONGEST = 10.0
 _TICKS = 1 << 20
 
 
-def has_point_times(window: Window, sources: Sequence[Tuple[str, Sweep, int]]) -> bool:
+def has_point_times(window: Window, sources: Sequence[tuple[str, Sweep, int]]) -> bool:
     """Whether t+1 and every source sweep, before t+1 or after it, have them: one without would seem to be measured at
     other times."""
     return all(sweep.point_times is not None for sweep in (window.pc1, *(sweep for _, sweep, _ in sources)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import List, Optional, Sequence
+from typing import Sequence
 
 import numpy as np
 
@@ -32,8 +32,8 @@ class Entry:
     window: int
     name: str
     sweep: Sweep
-    T_ego1_ego: Optional[np.ndarray]
-    interval: Optional[float]
+    T_ego1_ego: np.ndarray | None
+    interval: float | None
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Timeline:
         table: (5, B, S) float64: `elapsed`, `seconds` and x, y, z of `origin`, as in `Batch`.
     """
 
-    entries: List[Entry]
+    entries: list[Entry]
     table: np.ndarray
 
     @staticmethod
@@ -58,7 +58,7 @@ class Timeline:
         num_steps = first_future + max(num_future)
         table = np.zeros((5, len(windows), num_steps))
         farthest = max(map(abs, (*grid.lower[:2], *grid.upper[:2])))
-        entries: List[Entry] = []
+        entries: list[Entry] = []
         for index, (window, sources, count) in enumerate(zip(windows, kept, num_future)):
             steps = [*range(1, 1 + len(sources) - count), *range(first_future, first_future + count)]
             times = elapsed_times(window, sources, config)

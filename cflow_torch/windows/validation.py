@@ -6,7 +6,7 @@ import logging
 import math
 from contextlib import suppress
 from dataclasses import replace
-from typing import Any, List, Optional, Sequence, Tuple
+from typing import Any, Sequence
 
 import numpy as np
 import torch
@@ -25,7 +25,7 @@ _MOST_COLUMNS = 1000
 _log = logging.getLogger(__name__)
 
 
-def check_windows(windows: Any, config: Optional[Config] = None) -> None:
+def check_windows(windows: Any, config: Config | None = None) -> None:
     """Refuse what is not a list of windows of sweeps of arrays.
 
     Args:
@@ -61,7 +61,7 @@ def keep_nearest(window: Window, num_history: int) -> Window:
     return replace(window, pch=window.pch[:num_history])
 
 
-def source_sweeps(window: Window, config: Config) -> List[Tuple[str, Sweep, int]]:
+def source_sweeps(window: Window, config: Config) -> list[tuple[str, Sweep, int]]:
     """(name, sweep, steps to t+1) of pc0, the history and what comes after t+1, repeated sweeps left out.
 
     Steps are 1 for pc0, 2, 3, ... for the history, and -1, -2, ... for t+2, t+3, ..., which stand last.
@@ -78,7 +78,7 @@ def source_sweeps(window: Window, config: Config) -> List[Tuple[str, Sweep, int]
             "some sweeps of the window have a pose and some have none: give the pose of every sweep, or of none "
             "(then all points must already lie in the frame of t+1)"
         )
-    sources: List[Tuple[str, Sweep, int]] = []
+    sources: list[tuple[str, Sweep, int]] = []
     num_past = 1 + len(window.pch)
     for step, (name, sweep) in enumerate(_named_sweeps(window)[1:], 1):
         is_future = step > num_past
@@ -88,7 +88,7 @@ def source_sweeps(window: Window, config: Config) -> List[Tuple[str, Sweep, int]
     return sources
 
 
-def _named_sweeps(window: Window) -> List[Tuple[str, Sweep]]:
+def _named_sweeps(window: Window) -> list[tuple[str, Sweep]]:
     """Every sweep under its name: t+1, then t, t-1, ... from newest to oldest, then t+2, t+3, ..."""
     others = [(f"pc{side}{i}", sweep) for side in "hf" for i, sweep in enumerate(getattr(window, f"pc{side}"), 1)]
     return [("pc1", window.pc1), ("pc0", window.pc0), *others]
@@ -162,8 +162,8 @@ def _same(a: Sweep, b: Sweep) -> bool:
 
 
 def elapsed_times(
-    window: Window, sources: Sequence[Tuple[str, Sweep, int]], config: Config
-) -> Sequence[Tuple[float, float]]:
+    window: Window, sources: Sequence[tuple[str, Sweep, int]], config: Config
+) -> Sequence[tuple[float, float]]:
     """(sweep intervals, seconds) from each source sweep to t+1, by time stamps where every sweep has one.
 
     Both are negative for sweeps after t+1.

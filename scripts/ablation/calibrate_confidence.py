@@ -18,7 +18,7 @@ import math
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Dict, Iterable, Iterator, List, Optional, Sequence, Tuple
+from typing import Iterable, Iterator, Sequence
 
 import numpy as np
 import sets
@@ -90,12 +90,12 @@ def _sums(result: FlowResult, item: Item, num_bins: int) -> np.ndarray:
     return np.stack([np.bincount(place, column, num_bins) for column in columns], 1)
 
 
-def fit(sums: np.ndarray) -> List[float]:
+def fit(sums: np.ndarray) -> list[float]:
     """Probability of each bin: share of right points, made monotone along each row of the table."""
     table = confidence.TABLE
     sizes = [1, 1 + len(table["crowd"]), 1 + len(table["share"])] + 4 * [1 + len(table["margin"])]
     starts = np.cumsum([0, *sizes])
-    result: List[float] = []
+    result: list[float] = []
     for row, (start, end) in enumerate(zip(starts, starts[1:])):
         points, right = sums[start:end, POINTS], sums[start:end, RIGHT_ONES]
         prior = right.sum() / max(points.sum(), 1)
@@ -106,7 +106,7 @@ def fit(sums: np.ndarray) -> List[float]:
     return result
 
 
-def reliability(sums: np.ndarray, dynamic: bool = False) -> Tuple[List[Tuple[float, float, int]], float]:
+def reliability(sums: np.ndarray, dynamic: bool = False) -> tuple[list[tuple[float, float, int]], float]:
     """Mean confidence, share of right ones and number of points by tenths of confidence; expected calibration error."""
     told = np.array(confidence.TABLE["probabilities"])
     points, right = sums[:, [DYNAMIC, RIGHT_DYNAMIC] if dynamic else [POINTS, RIGHT_ONES]].T
@@ -121,7 +121,7 @@ def reliability(sums: np.ndarray, dynamic: bool = False) -> Tuple[List[Tuple[flo
     return rows, gap / max(points.sum(), 1)
 
 
-def sparsification(sums: np.ndarray, dynamic: bool, shares: Sequence[float]) -> List[float]:
+def sparsification(sums: np.ndarray, dynamic: bool, shares: Sequence[float]) -> list[float]:
     """Mean error of what is left when a share is dropped, the least confident first; of equals all alike.
 
     Args:
@@ -154,7 +154,7 @@ def report(name: str, sums: np.ndarray) -> None:
         print(f"| {kind} EPE, m | {' | '.join(f'{value:.4f}' for value in values)} |")
 
 
-def draw(sums_of: Dict[str, np.ndarray], path: Path) -> None:
+def draw(sums_of: dict[str, np.ndarray], path: Path) -> None:
     """Reliability and error over the share that is dropped, a line per set."""
     from matplotlib.figure import Figure
 
@@ -178,7 +178,7 @@ def draw(sums_of: Dict[str, np.ndarray], path: Path) -> None:
     figure.savefig(path, dpi=110)
 
 
-def main(arguments: Optional[Sequence[str]] = None) -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("task", choices=("fit", "evaluate"))
     parser.add_argument("cache", type=Path, nargs="?", help="folder of the simulated drives")
@@ -192,7 +192,7 @@ def main(arguments: Optional[Sequence[str]] = None) -> None:
         table = {**confidence.TABLE, "probabilities": fit(sums)}
         TABLE_FILE.write_text(json.dumps(table) + "\n", encoding="utf-8")
         return
-    sums_of: Dict[str, np.ndarray] = {}
+    sums_of: dict[str, np.ndarray] = {}
     for h in (0, sets.HISTORY) if args.cache is not None else ():
         sums_of[f"simulated, h = {h}"] = statistics(simulated(args.cache, args.seeds), (h,))
     if args.real:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import List, NamedTuple, Sequence, Tuple
+from typing import NamedTuple, Sequence, Tuple
 
 import numpy as np
 from scipy import ndimage
@@ -24,7 +24,7 @@ MOVES = 0.05  # metres per sweep
 SQUARE = np.ones((3, 3), bool)
 
 
-def chain_flow(pairs: Sequence[Labelled], pose_flow: np.ndarray) -> Tuple[np.ndarray, np.ndarray]:
+def chain_flow(pairs: Sequence[Labelled], pose_flow: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Flow over several sweeps from the labels of the pairs between.
 
     Args:
@@ -62,7 +62,7 @@ class Component(NamedTuple):
 
 def paste_static(
     pair: Window, labels: FlowLabels, instance: np.ndarray, scored: np.ndarray, number: int
-) -> Tuple[Window, FlowLabels]:
+) -> tuple[Window, FlowLabels]:
     """A pair in which every mover has a static component of the same pair beside it.
 
     Args:
@@ -86,7 +86,7 @@ def paste_static(
     is_dynamic = counted & (np.linalg.norm(residual, axis=1) >= MOVES)
     static = counted & ~is_dynamic & (instance == 0)
     components = find_components(points0, pair, static, instance)
-    added: List[Component] = []
+    added: list[Component] = []
     for mover in np.unique(instance[instance > 0]):
         rows = (instance == mover) & is_dynamic
         if rows.sum() >= MOVER_POINTS and components:
@@ -103,7 +103,7 @@ def paste_static(
     )
 
 
-def find_components(points0: np.ndarray, pair: Window, static: np.ndarray, instance: np.ndarray) -> List[Component]:
+def find_components(points0: np.ndarray, pair: Window, static: np.ndarray, instance: np.ndarray) -> list[Component]:
     """Dilated components of both sweeps that hold no object and are large enough, but not too large, in raster order.
 
     Args:

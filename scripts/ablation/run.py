@@ -28,7 +28,7 @@ import os
 import re
 import sys
 from pathlib import Path
-from typing import Any, Dict, List, Optional, Sequence, Tuple
+from typing import Any, Sequence
 
 import torch
 from omegaconf import OmegaConf
@@ -42,14 +42,14 @@ from cflow_torch.types import CFlowError
 COLUMNS = ("dynamic", "pedestrian", "static", "stands", "near", "far", "missed", "flagged", "at 1 %", "moving")
 
 
-def main(arguments: Optional[Sequence[str]] = None) -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Print the table, row by row; returns the exit status."""
     given = parse(arguments)
     torch.set_num_threads(given.threads)
     changed = [OmegaConf.to_container(OmegaConf.from_dotlist(changes)) for changes in given.set or [[]]]
     settings = [(preset, changes) for preset in given.presets for changes in changed]
-    scores: Dict[str, Dict[str, Figures]] = {}  # by set, then by setting
-    sensors: Dict[str, List[str]] = {}
+    scores: dict[str, dict[str, Figures]] = {}  # by set, then by setting
+    sensors: dict[str, list[str]] = {}
     try:
         sets = make_sets(given.sets, given.seeds, given.cache)
         print(line(("set", "setting", *COLUMNS)) + line(["---"] * (2 + len(COLUMNS))), end="", flush=True)
@@ -72,9 +72,9 @@ def main(arguments: Optional[Sequence[str]] = None) -> int:
     return 0
 
 
-def config_for(scored: ScoredSet, preset: str, changes: Dict[str, Any]) -> Config:
+def config_for(scored: ScoredSet, preset: str, changes: dict[str, Any]) -> Config:
     """A preset with the history and the region of a set, so that presets compare at equal ones; changes win."""
-    of_set: Dict[str, Any] = {"num_history": scored.history}
+    of_set: dict[str, Any] = {"num_history": scored.history}
     if scored.half_side is not None:
         half = scored.half_side
         of_set["point_cloud_range"] = (-half, -half, -math.inf, half, half, math.inf)
@@ -93,7 +93,7 @@ def line(texts: Sequence[str]) -> str:
     return f"| {' | '.join(texts)} |\n"
 
 
-def parse(arguments: Optional[Sequence[str]]) -> argparse.Namespace:
+def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Arguments of the command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--presets", nargs="+", default=["default"])
@@ -107,7 +107,7 @@ def parse(arguments: Optional[Sequence[str]]) -> argparse.Namespace:
     return parser.parse_args(arguments)
 
 
-def seed_range(text: str) -> Tuple[int, int]:
+def seed_range(text: str) -> tuple[int, int]:
     """First and last seed of "100-103"."""
     match = re.fullmatch(r"(\d+)-(\d+)", text)
     if match is None or int(match[1]) > int(match[2]):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Dict, List, Sequence
+from typing import Dict, Sequence
 
 import numpy as np
 from made import MOVES
@@ -71,11 +71,11 @@ def pooled_figures(
         dynamic_threshold=MOVES * step,
     )
     three_way = ThreeWayEPE(definition)
-    of_pedestrians: List[np.ndarray] = []
-    of_standing: List[np.ndarray] = []
-    is_missed: List[np.ndarray] = []
-    of_missed: List[np.ndarray] = []
-    at_rest: List[np.ndarray] = []
+    of_pedestrians: list[np.ndarray] = []
+    of_standing: list[np.ndarray] = []
+    is_missed: list[np.ndarray] = []
+    of_missed: list[np.ndarray] = []
+    at_rest: list[np.ndarray] = []
     for frame, confidence in zip(frames, confidences):
         points = score_points(frame, definition)
         three_way.update_points(points)

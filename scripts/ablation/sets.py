@@ -1,7 +1,7 @@
 """The scored windows behind the figures of the ablation: real data, sets made of it, simulated drives, small ones too.
 
-Settings were chosen on the groups "real", "merged", "scenes" and "sim" with seeds 100 ... 103; up to 0.3.0 not on "odd",
-the other windows of KITTI, nor on other seeds.
+We chose settings on the groups "real", "merged", "scenes" and "sim" with seeds 100 ... 103. Up to 0.3.0 we did not
+look at "odd", the other windows of KITTI, nor at other seeds.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import sys
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, Callable, Dict, List, Optional, Sequence, Tuple
+from typing import Any, Callable, Sequence
 
 import numpy as np
 from made import MOVES, chain_flow, paste_static
@@ -55,7 +55,7 @@ class Item:
     window: Window
     labels: FlowLabels
     pose_flow: np.ndarray
-    eval_mask: Optional[np.ndarray] = None
+    eval_mask: np.ndarray | None = None
 
     def frame(self, residual_flow: Any) -> EvalFrame:
         """What the metrics take, for (N, 3) estimated residual flow."""
@@ -88,18 +88,18 @@ class ScoredSet:
     name: str
     group: str
     history: int
-    half_side: Optional[float]
-    load: Callable[[], List[Item]]
+    half_side: float | None
+    load: Callable[[], list[Item]]
     step: int = 1
     reach: float = NEAR
     mean: str = ""
 
-    def items(self) -> List[Item]:
+    def items(self) -> list[Item]:
         """The windows with as much history as is used."""
         return [replace(i, window=replace(i.window, pch=i.window.pch[: self.history])) for i in self.load()]
 
 
-def make_sets(names: Sequence[str], seeds: Sequence[Tuple[int, int]], cache: Path) -> List[ScoredSet]:
+def make_sets(names: Sequence[str], seeds: Sequence[tuple[int, int]], cache: Path) -> list[ScoredSet]:
     """The sets of some names; those of "sim" once per range of seeds.
 
     Args:
@@ -135,7 +135,7 @@ def between(start: Sweep, end: Sweep) -> np.ndarray:
     return np.linalg.inv(T_world_end) @ T_world_start
 
 
-def make_item(scored: Window, labels: FlowLabels, eval_mask: Optional[np.ndarray] = None) -> Item:
+def make_item(scored: Window, labels: FlowLabels, eval_mask: np.ndarray | None = None) -> Item:
     """An item whose ego motion is that of the poses."""
     pose_flow = ego_motion_flow(as_numpy(scored.pc0.points)[:, :3], between(scored.pc0, scored.pc1))
     return Item(scored, labels, pose_flow, eval_mask)
@@ -158,7 +158,7 @@ def data_root() -> Path:
 
 
 @lru_cache(maxsize=None)
-def av2_pair() -> List[Item]:
+def av2_pair() -> list[Item]:
     """The real Argoverse 2 pair; ego motion as its labels have it, 0.8 mm off the poses."""
     folder = data_root() / AV2
     log = AV2Log(folder)
@@ -169,26 +169,26 @@ def av2_pair() -> List[Item]:
 
 
 @lru_cache(maxsize=None)
-def _scene(path: Path) -> Tuple[HDF5Log, RecentSweeps]:
+def _scene(path: Path) -> tuple[HDF5Log, RecentSweeps]:
     log = HDF5Log(data_root() / path)
     return log, RecentSweeps(log, len(log.timestamps))
 
 
 @lru_cache(maxsize=None)
-def kitti(path: Path = KITTI) -> List[Item]:
+def kitti(path: Path = KITTI) -> list[Item]:
     """Every labelled pair of a part of KITTI 0000, or of another scene of that layout."""
     log, sweeps = _scene(path)
     pairs = range(len(log.timestamps) - 1)
     return [make_item(window(sweeps, i, HISTORY, FUTURE), log.labels(i), log.eval_mask(i)) for i in pairs]
 
 
-def whole_history(path: Path) -> List[Item]:
+def whole_history(path: Path) -> list[Item]:
     """The labelled pairs of a scene that have `HISTORY` older sweeps."""
     return kitti(path)[HISTORY:]
 
 
 @lru_cache(maxsize=None)
-def kitti_steps(step: int) -> List[Item]:
+def kitti_steps(step: int) -> list[Item]:
     """Pairs (t, t + step) of KITTI 0000; the labels of the pairs between, chained object by object."""
     log, sweeps = _scene(KITTI)
     items = []
@@ -207,7 +207,7 @@ def kitti_steps(step: int) -> List[Item]:
 
 
 @lru_cache(maxsize=None)
-def merged() -> List[Item]:
+def merged() -> list[Item]:
     """The pairs of KITTI 0000, every mover with something static pasted beside it."""
     log, _ = _scene(KITTI)
     items = []
@@ -221,7 +221,7 @@ def merged() -> List[Item]:
 
 
 @lru_cache(maxsize=None)
-def simulated(profile: str, seeds: Sequence[int], cache: Path) -> List[Item]:
+def simulated(profile: str, seeds: Sequence[int], cache: Path) -> list[Item]:
     """Windows of the simulated drives of one sensor, read as that data set is."""
     chosen = format_of(profile)
     items = []
@@ -237,7 +237,7 @@ def simulated(profile: str, seeds: Sequence[int], cache: Path) -> List[Item]:
 
 
 @lru_cache(maxsize=None)
-def staged(stage: Callable[[int], drives.Staged]) -> List[Item]:
+def staged(stage: Callable[[int], drives.Staged]) -> list[Item]:
     """The pair of a small drive, once per seed. What moves but is not looked at does not count; what stands does."""
     items = []
     for seed in SCENE_SEEDS:
@@ -249,13 +249,13 @@ def staged(stage: Callable[[int], drives.Staged]) -> List[Item]:
     return items
 
 
-def _every_second(load: Callable[[], List[Item]], start: int) -> Callable[[], List[Item]]:
+def _every_second(load: Callable[[], list[Item]], start: int) -> Callable[[], list[Item]]:
     return lambda: load()[start::2]
 
 
 _STEPS = {step: partial(kitti_steps, step) for step in (3, 5)}
 # Name, group, history, windows, step. At h = 4 only windows with the whole history.
-_REAL: Tuple[Tuple[str, str, int, Callable[[], List[Item]], int], ...] = (
+_REAL: tuple[tuple[str, str, int, Callable[[], list[Item]], int], ...] = (
     ("av2 pair h=0", "real", 0, av2_pair, 1),
     ("kitti h=0", "real", 0, kitti, 1),
     ("kitti h=4", "real", 4, _every_second(kitti, 4), 1),
@@ -269,7 +269,7 @@ _REAL: Tuple[Tuple[str, str, int, Callable[[], List[Item]], int], ...] = (
     ("later kitti h=4", "merged", 4, _every_second(partial(kitti, KITTI_LATER), 4), 1),
     *((f"pandaset {part} h=4", "pandaset", 4, partial(whole_history, path), 1) for part, path in PANDASET.items()),
 )
-_SCENES: Dict[str, Callable[[int], drives.Staged]] = {
+_SCENES: dict[str, Callable[[int], drives.Staged]] = {
     "hedge": drives.hedge,
     "crowd": drives.crowd,
     "tram": drives.tram,

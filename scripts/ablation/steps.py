@@ -15,7 +15,7 @@ import os
 import sys
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Callable, Dict, List
+from typing import Any, Callable
 from unittest.mock import patch
 
 import torch
@@ -43,7 +43,7 @@ def _nothing_slides(sweeps: Any, members: Any, owner: Any, candidates: Any) -> A
 
 
 # Names of what is put in place of what, by step.
-STEPS: Dict[str, List[Callable[[], Any]]] = {
+STEPS: dict[str, list[Callable[[], Any]]] = {
     "all steps": [],
     "no changed pixels": [lambda: patch.object(method, "find_changed", _without_changed)],
     "no static test": [lambda: patch.object(component_tree, "_MISSING", 1 << 40)],
@@ -58,7 +58,7 @@ STEPS: Dict[str, List[Callable[[], Any]]] = {
         lambda: patch.object(component_tree, "both_ends_move", lambda sweeps, roots, is_long: torch.zeros_like(is_long))
     ],
 }
-SETTINGS: Dict[str, Dict[str, Any]] = {
+SETTINGS: dict[str, dict[str, Any]] = {
     "no scale of 0.4 m": {"pixel_sizes": (0.2, 0.1)},
     "no scale of 0.2 m": {"pixel_sizes": (0.4, 0.1)},
 }

@@ -22,7 +22,7 @@ import json
 import math
 import time
 from pathlib import Path
-from typing import Any, Dict, Iterator, List, Tuple
+from typing import Any, Iterator
 
 import numpy as np
 import torch
@@ -46,7 +46,7 @@ from cflow_torch.simulator.scene import Scene, SolidTable
 DUFO = {"d_p 2": (0.1, 0.2, 2), "d_p 1": (0.1, 0.2, 1)}
 
 
-def truths(log: Any) -> Iterator[Tuple[np.ndarray, np.ndarray, np.ndarray]]:
+def truths(log: Any) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """For each sweep but the last, of each point: does it count, does it move, does it move at some time?"""
     for index in range(len(log.timestamps) - 1):
         sweep = log.sweep(index)
@@ -81,7 +81,7 @@ def light(num_sweeps: int) -> SimulatedLog:
     return log
 
 
-def by_dufomap(log: Log, T_ego_lidar: np.ndarray, settings: Tuple[float, float, int]) -> Tuple[List[np.ndarray], float]:
+def by_dufomap(log: Log, T_ego_lidar: np.ndarray, settings: tuple[float, float, int]) -> tuple[list[np.ndarray], float]:
     """Points that DUFOMap calls dynamic in each sweep, and seconds per sweep."""
     begin = time.process_time()
     sweeps, to_lidar = list(log), np.linalg.inv(T_ego_lidar)
@@ -91,7 +91,7 @@ def by_dufomap(log: Log, T_ego_lidar: np.ndarray, settings: Tuple[float, float, 
     return labels, (time.process_time() - begin) / len(sweeps)
 
 
-def scores(name: str, removed: List[np.ndarray], truth: List[Any], seconds: float) -> Dict[str, Any]:
+def scores(name: str, removed: list[np.ndarray], truth: list[Any], seconds: float) -> dict[str, Any]:
     """A line of the table."""
     total = np.zeros((3, 2))
     for gone, (counts, moves, ever) in zip(removed, truth):
@@ -124,7 +124,7 @@ def main() -> None:
     given = parser.parse_args()
     torch.set_num_threads(1)
     model = make_model(make_config(given.model), "auto")
-    cases: List[Tuple[str, Any, Log, np.ndarray]] = []
+    cases: list[tuple[str, Any, Log, np.ndarray]] = []
     for sensor in given.only:
         is_light = sensor == "light"
         made = light(given.num_sweeps) if is_light else SimulatedLog(sensor, given.seed, given.scene, given.num_sweeps)

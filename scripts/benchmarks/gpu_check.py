@@ -18,7 +18,7 @@ import sys
 import time
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any, Callable, Dict, List, Sequence, Tuple
+from typing import Any, Callable, Dict, List, Sequence
 
 import numpy as np
 import torch
@@ -39,7 +39,7 @@ PAPER, KEYS, DEFAULT = make_config("paper"), make_config("paper", method="keypoi
 TWO = PAPER.replace(num_history=2, pixel_sizes=(0.4, 0.1))
 LITTLE = 30_000_000  # bytes: less than a batch needs
 # name -> (settings, number of windows in a batch)
-VARIANTS: Dict[str, Tuple[Config, int]] = {
+VARIANTS: dict[str, tuple[Config, int]] = {
     "dense, h = 0": (PAPER, 1),
     "dense, h = 0, +-70 m": (PAPER.replace(point_cloud_range=(-70.0, -70.0, -3.0, 70.0, 70.0, 5.0)), 1),
     "dense, h = 0, connectivity 4": (PAPER.replace(connectivity=4), 1),
@@ -61,7 +61,7 @@ VARIANTS: Dict[str, Tuple[Config, int]] = {
     "preset default, max_memory 30 MB": (DEFAULT.replace(max_memory=LITTLE), 3),
     "preset fast": (make_config("fast"), 3),
 }
-MEASURED: Dict[str, Config] = {
+MEASURED: dict[str, Config] = {
     "dense, h = 4, 5 scales": VARIANTS["dense, h = 4, 5 scales"][0],
     "dense, h = 0": PAPER,
     "key points": KEYS,
@@ -72,16 +72,16 @@ LAUNCHES = ("cudaLaunchKernel", "cuLaunchKernel")
 WAITS = ("cudaStreamSynchronize", "cudaDeviceSynchronize", "cudaEventSynchronize")
 COPIES = ("cudaMemcpy", "cudaMemset")
 SEEDS, SWEEPS = (7, 8, 9), 6  # t + 1, t, and a history of four
-STREETS: List[Window] = []  # filled by `main`
+STREETS: list[Window] = []  # filled by `main`
 Rows = List[Dict[str, Any]]
 
 
-def make_streets() -> List[Window]:
+def make_streets() -> list[Window]:
     """Simulated windows."""
     return [window(make_drive(seed=seed, num_sweeps=SWEEPS), SWEEPS - 2, SWEEPS - 2) for seed in SEEDS]
 
 
-def windows_for(config: Config, number: int) -> List[Window]:
+def windows_for(config: Config, number: int) -> list[Window]:
     """Different windows with the history that a config takes; after the third, the same again."""
     chosen = [STREETS[i % len(STREETS)] for i in range(number)]
     return [replace(sweeps, pch=sweeps.pch[: config.num_history]) for sweeps in chosen]
@@ -97,9 +97,9 @@ def check_equality(device: str) -> Rows:
     return rows
 
 
-def compare(there: Sequence[FlowResult], here: Sequence[FlowResult]) -> Dict[str, Any]:
+def compare(there: Sequence[FlowResult], here: Sequence[FlowResult]) -> dict[str, Any]:
     """Points, points that differ in each field, the largest difference of a float, and the verdict."""
-    row: Dict[str, Any] = {"points": sum(len(result.flow) for result in here)}
+    row: dict[str, Any] = {"points": sum(len(result.flow) for result in here)}
     largest = 0.0
     for field in fields(FlowResult):
         row[field.name] = 0
@@ -155,7 +155,7 @@ def count_launches(device: str) -> Rows:
     return rows or [{"work": "none: tests/test_devices.py counts on a pretend accelerator"}]
 
 
-def by_profiler(run: Callable[[], Any]) -> Dict[str, Any]:
+def by_profiler(run: Callable[[], Any]) -> dict[str, Any]:
     """Launches, waits and copies that CUDA saw, and milliseconds of its kernels."""
     with stage_seconds() as stages:
         run()
@@ -206,7 +206,7 @@ def run_tests(_: str) -> Rows:
     return [{"tests": line, "same": done.returncode in (0, 5)} for line in [lines[-1], *failed]]
 
 
-PARTS: Dict[str, Callable[[str], Rows]] = {
+PARTS: dict[str, Callable[[str], Rows]] = {
     "equality": check_equality,
     "speed": measure_speed,
     "launches": count_launches,
@@ -224,9 +224,9 @@ def main() -> None:
     given = parser.parse_args()
     STREETS.extend(make_streets())
     name = torch.cuda.get_device_name() if given.device == "cuda" else "no GPU: the CPU is compared with itself"
-    report: Dict[str, Any] = {"device": name, "platform": platform.platform(), "torch": torch.__version__}
+    report: dict[str, Any] = {"device": name, "platform": platform.platform(), "torch": torch.__version__}
     print(json.dumps(report))
-    wrong: List[str] = []
+    wrong: list[str] = []
     for title, part in PARTS.items():
         if title in given.skip:
             continue

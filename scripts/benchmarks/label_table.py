@@ -19,7 +19,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from typing import Any, Dict, List, Sequence
+from typing import Any, Sequence
 
 import numpy as np
 import torch
@@ -40,7 +40,7 @@ SCENES = ("street", "crossing")
 SEEDS = (300, 301, 302, 303)  # settings were chosen on 100 to 103
 
 
-def ours(file: Path, preset: str) -> Dict[str, Any]:
+def ours(file: Path, preset: str) -> dict[str, Any]:
     """Labels of a scene by a preset: counts, and seconds a sweep."""
     model, log = make_model(make_config(preset), "cpu"), HDF5Log(file)
     held = RecentSweeps(log, len(log))
@@ -67,7 +67,7 @@ def theirs(file: Path, python: str, scratch: str) -> Any:
         return {**json.loads(done.stdout.splitlines()[-1]), "counts": counts(log, found)}
 
 
-def counts(log: Any, labels: Sequence[np.ndarray]) -> List[int]:
+def counts(log: Any, labels: Sequence[np.ndarray]) -> list[int]:
     """Points that move and are found, are not and are found, move and are missed."""
     total = np.zeros(3, np.int64)
     for index, found in enumerate(labels):
@@ -81,9 +81,9 @@ def counts(log: Any, labels: Sequence[np.ndarray]) -> List[int]:
     return [int(each) for each in total]
 
 
-def simulated(folder: Path, num_sweeps: int) -> Dict[str, List[Path]]:
+def simulated(folder: Path, num_sweeps: int) -> dict[str, list[Path]]:
     """Scenes of drives of each sensor."""
-    rows: Dict[str, List[Path]] = {}
+    rows: dict[str, list[Path]] = {}
     for sensor, made in FORMATS.items():
         for seed in SEEDS if sensor == "av2" else SEEDS[:2]:
             scene = ("street", "highway", "crossing", "narrow")[seed % 4] if sensor == "av2" else SCENES[seed % 2]
@@ -95,15 +95,15 @@ def simulated(folder: Path, num_sweeps: int) -> Dict[str, List[Path]]:
     return rows
 
 
-def score(parts: Sequence[Dict[str, Any]]) -> str:
+def score(parts: Sequence[dict[str, Any]]) -> str:
     """Precision and recall over some scenes."""
     found, false, missed = np.sum([part["counts"] for part in parts], 0)
     return f"{found / max(found + false, 1):.3f}, {found / max(found + missed, 1):.3f}"
 
 
-def table_row(name: str, scenes: List[Dict[str, Any]], presets: Sequence[str]) -> Dict[str, Any]:
+def table_row(name: str, scenes: list[dict[str, Any]], presets: Sequence[str]) -> dict[str, Any]:
     """A line of the table."""
-    row: Dict[str, Any] = {"precision, recall": f"{name} ({len(scenes)})"}
+    row: dict[str, Any] = {"precision, recall": f"{name} ({len(scenes)})"}
     seconds = {preset: statistics.median(each[preset]["seconds"] for each in scenes) for preset in presets}
     for preset in presets:
         row[preset], row[f"{preset}, s"] = score([each[preset] for each in scenes]), f"{seconds[preset]:.2f}"
@@ -127,7 +127,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     chosen = parser.parse_args()
     torch.set_num_threads(1)
-    results: Dict[str, List[Dict[str, Any]]] = {}
+    results: dict[str, list[dict[str, Any]]] = {}
     with tempfile.TemporaryDirectory() as scratch:
         rows = {} if chosen.no_simulated else simulated(chosen.folder or Path(scratch), chosen.num_sweeps)
         for place in chosen.scenes:

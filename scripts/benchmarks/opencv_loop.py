@@ -8,7 +8,7 @@ fall otherwise.
 
 from __future__ import annotations
 
-from typing import Any, List, NamedTuple, Sequence, Tuple
+from typing import Any, NamedTuple, Sequence
 
 import numpy as np
 import torch
@@ -45,7 +45,7 @@ class Clusters(NamedTuple):
     """
 
     number: np.ndarray
-    boxes: List[List[int]]
+    boxes: list[list[int]]
 
 
 def opencv() -> Any:
@@ -87,7 +87,7 @@ def opencv_flow(window: Window, config: Config) -> FlowResult:
     points0, moved0 = _compensate(window.pc0, window.pc1)
     clouds = _clouds(window, moved0, config)
     cloud1 = _cloud(window.pc1, _columns(window.pc1), 0.0, config)
-    flows: List[np.ndarray] = []
+    flows: list[np.ndarray] = []
     for pixel_size in config.pixel_sizes:
         warped = [cloud._replace(xy=cloud.xy + cloud.steps * flow) for cloud, flow in zip(clouds, flows)] or clouds
         found, number, score = motion_at_scale(warped, cloud1, pixel_size, config)
@@ -114,7 +114,7 @@ def opencv_flow(window: Window, config: Config) -> FlowResult:
 
 def motion_at_scale(
     clouds: Sequence[Cloud], cloud1: Cloud, pixel_size: float, config: Config
-) -> Tuple[List[np.ndarray], np.ndarray, np.ndarray]:
+) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
     """One scale: project, cluster, correlate, pool.
 
     Args:
@@ -137,7 +137,7 @@ def motion_at_scale(
     return [motion.take(number, 1) for number in numbers], numbers[0], np.append(scores, np.float32(0))[numbers[0]]
 
 
-def project(xy: np.ndarray, pixel_size: float, config: Config) -> Tuple[np.ndarray, np.ndarray]:
+def project(xy: np.ndarray, pixel_size: float, config: Config) -> tuple[np.ndarray, np.ndarray]:
     """(H, W) uint8 image of the occupied pixels and (N,) int64 raster index of every point, -1 outside the region."""
     x0, y0, _, x1, y1, _ = config.point_cloud_range
     width, height = int(np.floor((x1 - x0) / pixel_size)) + 1, int(np.floor((y1 - y0) / pixel_size)) + 1
@@ -197,7 +197,7 @@ def find_clusters(images: Sequence[np.ndarray], pixel_size: float, config: Confi
     return Clusters(number, np.stack([group.top, group.left, *sizes], 1)[by_raster].tolist())
 
 
-def dilate_and_label(aggregated: np.ndarray, connectivity: int) -> Tuple[np.ndarray, int, np.ndarray]:
+def dilate_and_label(aggregated: np.ndarray, connectivity: int) -> tuple[np.ndarray, int, np.ndarray]:
     """The two bare calls: (H, W) uint8 dilated image, number of labels, (H, W) int32 labels."""
     cv2 = opencv()
     dilated = cv2.dilate(aggregated, _SQUARE)
@@ -228,7 +228,7 @@ def _grouped(pixel: np.ndarray, label: np.ndarray, width: int) -> Groups:
 
 def _correlate(
     clusters: Clusters, images: Sequence[np.ndarray], num_clouds: int, pixel_size: float
-) -> Tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The loop. Shifts (2, M, K) in metres, scores (M,) of the newest sweep, and which (M, K) sweeps had pixels."""
     cv2 = opencv()
     num_clusters = len(clusters.boxes)
@@ -279,13 +279,13 @@ def _pool(estimates: np.ndarray, seen: np.ndarray) -> np.ndarray:
     return np.where(seen.sum(1) == 1, single, (low + high) / 2 * direction)
 
 
-def _middle(mask: np.ndarray) -> Tuple[np.ndarray, np.ndarray]:
+def _middle(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Places (M, 1) of the middle one or two among the sorted masked entries of each row."""
     count = mask.sum(1, keepdims=True)
     return np.maximum(count - 1, 0) // 2, np.minimum(count // 2, mask.shape[1] - 1)
 
 
-def _clouds(window: Window, moved0: np.ndarray, config: Config) -> List[Cloud]:
+def _clouds(window: Window, moved0: np.ndarray, config: Config) -> list[Cloud]:
     """Sweeps t, t-1, ... in the frame of t+1."""
     older = window.pch[: config.num_history]
     clouds = [_cloud(window.pc0, moved0, 1.0, config)]
@@ -305,7 +305,7 @@ def _cloud(sweep: Sweep, moved: np.ndarray, steps: float, config: Config) -> Clo
     return Cloud(moved[:2].take(rows, 1), steps, rows)
 
 
-def _compensate(sweep: Sweep, sweep1: Sweep) -> Tuple[np.ndarray, np.ndarray]:
+def _compensate(sweep: Sweep, sweep1: Sweep) -> tuple[np.ndarray, np.ndarray]:
     """All points (3, N) float64, in the frame of their sweep and in the frame of t+1."""
     points = _columns(sweep)
     if sweep.pose is None:

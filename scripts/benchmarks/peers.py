@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import sys
 import time
-from typing import Dict, List, Sequence, Tuple
+from typing import Sequence
 
 import numpy as np
 
@@ -19,8 +19,8 @@ RANGE = 50.0  # metres
 
 
 def dufomap_labels(
-    points: Sequence[np.ndarray], poses: Sequence[np.ndarray], settings: Tuple[float, float, int]
-) -> List[np.ndarray]:
+    points: Sequence[np.ndarray], poses: Sequence[np.ndarray], settings: tuple[float, float, int]
+) -> list[np.ndarray]:
     """What moves, by DUFOMap with clusters and propagation.
 
     Args:
@@ -42,7 +42,7 @@ def dufomap_labels(
     return [np.asarray(found.segment(sweep, pose, cloud_transform=True)) > 0 for sweep, pose in zip(points, poses)]
 
 
-def label_scene(file: str, labels: str) -> Dict[str, float]:
+def label_scene(file: str, labels: str) -> dict[str, float]:
     """DUFOMap and HDBSCAN on a scene: labels to a file, seconds a sweep of each."""
     import h5py
     from hdbscan import HDBSCAN

@@ -22,7 +22,7 @@ import tempfile
 import time
 from functools import partial
 from pathlib import Path
-from typing import Any, Callable, Dict, Iterator, List, Sequence, Tuple
+from typing import Any, Callable, Dict, Iterator, Sequence
 
 import numpy as np
 from table import markdown
@@ -30,7 +30,7 @@ from table import markdown
 ROOT = Path(__file__).resolve().parents[2]
 HISTORY = 4
 SCALES = (0.8, 0.4, 0.3, 0.2, 0.1)  # the paper's figure benefit_multiscale
-PAPER: Dict[str, Any] = {"preset": "paper"}
+PAPER: dict[str, Any] = {"preset": "paper"}
 FULL = {**PAPER, "num_history": HISTORY, "pixel_sizes": SCALES}
 KEYS = {"preset": "keypoints"}
 REST_S = 0.02  # threads of what ran before spin for some milliseconds
@@ -38,7 +38,7 @@ FLOW_PAIRS, FLOW_LOGS = 40, 5
 Rows = Iterator[Dict[str, Any]]
 
 
-def like_default(**more: Any) -> Dict[str, Any]:
+def like_default(**more: Any) -> dict[str, Any]:
     """`paper` with the region of `default`."""
     from cflow_torch import make_config
 
@@ -57,12 +57,12 @@ def serve(file: str) -> None:
     clouds = pickle.loads(Path(file).read_bytes())  # of this run
     (p0, T, g0), (p1, _, g1), *past = clouds
 
-    def ours(options: Dict[str, Any]) -> Any:
+    def ours(options: dict[str, Any]) -> Any:
         older = past[: options.get("num_history", make_config(options["preset"]).as_dict().get("num_history", 0))]
         history = {"pch": [c[0] for c in older], "T_ego1_egoh": [c[1] for c in older], "gmh": [c[2] for c in older]}
         return estimate_flow(p0, p1, T_ego1_ego0=T, gm0=g0, gm1=g1, device="cpu", **history, **options)
 
-    def loop(options: Dict[str, Any]) -> Any:
+    def loop(options: dict[str, Any]) -> Any:
         import cv2
         from opencv_loop import opencv_flow
 
@@ -98,7 +98,7 @@ class Measurer:
         self._process = subprocess.Popen(call, cwd=checkout, env=environ, text=True, **pipes)  # type: ignore
         self.answer()
 
-    def ask(self, options: Dict[str, Any], repeats: int = 2, of: str = "ours") -> None:
+    def ask(self, options: dict[str, Any], repeats: int = 2, of: str = "ours") -> None:
         """Begin to time a call."""
         self._process.stdin.write(json.dumps({"of": of, "options": options, "repeats": repeats}) + "\n")  # type: ignore
         self._process.stdin.flush()  # type: ignore[union-attr]
@@ -113,9 +113,9 @@ class Measurer:
         self._process.wait()
 
 
-def in_turn(calls: Sequence[Tuple[Measurer, Dict[str, Any], str]], repeats: int) -> List[List[float]]:
+def in_turn(calls: Sequence[tuple[Measurer, dict[str, Any], str]], repeats: int) -> list[list[float]]:
     """Seconds of each call, one after the other; of the two runs of a call the second counts."""
-    times: List[List[float]] = [[] for _ in calls]
+    times: list[list[float]] = [[] for _ in calls]
     for repeat in range(-1, repeats):
         for (measurer, options, of), seconds in zip(calls, times):
             time.sleep(REST_S)
@@ -134,7 +134,7 @@ def ratio(over: Sequence[float], under: Sequence[float]) -> float:
 # The rows
 
 
-def latencies(versions: Dict[str, Measurer], repeats: int) -> Rows:
+def latencies(versions: dict[str, Measurer], repeats: int) -> Rows:
     """One thread a window; "is" is the time of the second over that of the first, or the other way round."""
     now = versions["now"]
     four = {"num_history": HISTORY}
@@ -151,7 +151,7 @@ def latencies(versions: Dict[str, Measurer], repeats: int) -> Rows:
     ):
         calls = [(version, options, "ours") for version in versions.values()]
         *ours, theirs = in_turn([*calls, (now, other, of)], repeats)
-        row: Dict[str, Any] = {"what": name, "target": target}
+        row: dict[str, Any] = {"what": name, "target": target}
         row["is"] = ratio(theirs, ours[0]) if of == "loop" else ratio(ours[0], theirs)
         row["ms"] = "{:.1f} and {:.1f}".format(*(1000 * statistics.median(seconds) for seconds in (ours[0], theirs)))
         for old in ours[1:]:
@@ -163,8 +163,8 @@ def two_processes(start: Callable[[], Measurer], repeats: int) -> Rows:
     """`paper` and `default` on a pair at once, torch's own number of threads, against each alone."""
     calls = ({**PAPER, "num_history": 0}, {"preset": "default", "num_history": 0})
     both = [start(), start()]
-    alone: List[List[float]] = [[], []]
-    beside: List[List[float]] = [[], []]
+    alone: list[list[float]] = [[], []]
+    beside: list[list[float]] = [[], []]
     for repeat in range(-1, repeats):
         seconds = []
         for measurer, options in zip(both, calls):
@@ -193,7 +193,7 @@ def flow_on_cores(folder: Path, preset: str, repeats: int) -> Rows:
         if not (folder / "logs" / f"log-{number}").exists():  # a link to the folder would be one log, seen five times
             shutil.copytree(drive, folder / "logs" / f"log-{number}", copy_function=os.link)
     cores = sorted(os.sched_getaffinity(0))[:2]
-    rates: Dict[int, List[float]] = {1: [], 2: []}
+    rates: dict[int, list[float]] = {1: [], 2: []}
     for _ in range(repeats):
         for count, values in rates.items():
             with tempfile.TemporaryDirectory(dir=folder) as output:
@@ -232,7 +232,7 @@ def counts(clouds: Sequence[Any]) -> Rows:
         yield {"what": f"launches of 16 windows / one, {name}", "target": "<= 1.3", "is": sixteen[0] / one[0]}
 
 
-def load(data_set: str, root: str) -> List[Any]:
+def load(data_set: str, root: str) -> list[Any]:
     """Points, T_ego1_ego and ground of t, t+1, t-1, ... of a simulated street or of the first log below a folder."""
     from cflow_torch.data.catalog import find_sources, open_log
     from cflow_torch.data.log import window

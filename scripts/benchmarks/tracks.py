@@ -18,7 +18,7 @@ import argparse
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Dict, Iterator, List, Optional, Tuple
+from typing import Any, Dict, Iterator
 
 import numpy as np
 import torch
@@ -52,11 +52,11 @@ class SimulatedLog(Log):
         sweep = self.drive.sweep(index * self.step)
         return sweep if self._has_masks else replace(sweep, is_ground=None)
 
-    def labels(self, index: int) -> Optional[FlowLabels]:
+    def labels(self, index: int) -> FlowLabels | None:
         """None: `truth` says more."""
         return None
 
-    def truth(self, index: int) -> Tuple[np.ndarray, np.ndarray]:
+    def truth(self, index: int) -> tuple[np.ndarray, np.ndarray]:
         """(N,) number of the body that each point lies on, the last = ground; (bodies + 1, 3) m/s over ground."""
         times = (np.array(self.timestamps[index : index + 2]) - self.timestamps[0]) * 1e-9
         now, then = self.drive.scene.body_poses(times)[:, :, :3, 3]
@@ -69,7 +69,7 @@ class SimulatedLog(Log):
         return self if self._has_masks else GroundFoundLog(self, "grid")
 
 
-def score(log: SimulatedLog, pairs: Iterator[Tuple[int, Window, FlowResult]]) -> Row:
+def score(log: SimulatedLog, pairs: Iterator[tuple[int, Window, FlowResult]]) -> Row:
     """Counts and errors of a drive, to be summed."""
     tracker, tables, sweeps = Tracker(), [], []
     for index, given, result in pairs:
@@ -79,7 +79,7 @@ def score(log: SimulatedLog, pairs: Iterator[Tuple[int, Window, FlowResult]]) ->
     kept = confirmed(join_tables(tables))
     counts: Row = dict.fromkeys(("objects", "grouped", "tracked", "switches", "groups", "false_groups"), 0)
     counts.update(rows=len(kept["id"]), false_rows=0, raw=[], filtered=[])
-    last: Dict[int, int] = {}
+    last: dict[int, int] = {}
     for index, flow, given, track_id in sweeps:
         body, velocity = log.truth(index)
         takes_part, ground = flow["is_valid"], len(velocity) - 1
@@ -118,13 +118,13 @@ def score(log: SimulatedLog, pairs: Iterator[Tuple[int, Window, FlowResult]]) ->
     return counts
 
 
-def _most(numbers: np.ndarray) -> Optional[int]:
+def _most(numbers: np.ndarray) -> int | None:
     """The number that occurs most often; None of none."""
     values, count = np.unique(numbers, return_counts=True)
     return int(values[count.argmax()]) if len(values) else None
 
 
-def _owners(number: np.ndarray, chosen: np.ndarray, body: np.ndarray) -> Iterator[Tuple[int, int]]:
+def _owners(number: np.ndarray, chosen: np.ndarray, body: np.ndarray) -> Iterator[tuple[int, int]]:
     """Each number that occurs five times or more among the chosen points, and the body that most of them lie on."""
     for value, count in zip(*np.unique(number[chosen], return_counts=True)):
         owner = _most(body[chosen & (number == value)])
@@ -132,7 +132,7 @@ def _owners(number: np.ndarray, chosen: np.ndarray, body: np.ndarray) -> Iterato
             yield int(value), owner
 
 
-def summary(sensor: str, parts: List[Row]) -> Row:
+def summary(sensor: str, parts: list[Row]) -> Row:
     """A line of the table."""
     total = {name: sum((part[name] for part in parts[1:]), parts[0][name]) for name in parts[0]}
     raw, filtered = (total[name] or [float("nan")] for name in ("raw", "filtered"))
@@ -167,7 +167,7 @@ def main() -> None:
     torch.set_num_threads(1)
     model = make_model(make_config(given.model), "auto")
 
-    def pairs(log: Log) -> Iterator[Tuple[int, Window, FlowResult]]:
+    def pairs(log: Log) -> Iterator[tuple[int, Window, FlowResult]]:
         recent = RecentSweeps(log, model.config.num_sweeps)
         for index in range(len(log.timestamps) - 1):
             sweeps = window(recent, index, model.config.num_history, model.config.num_future)

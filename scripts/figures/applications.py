@@ -12,7 +12,7 @@ import tempfile
 import time
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Callable, Dict, List, Sequence, Tuple
+from typing import Any, Callable, Sequence
 
 import drives
 import matplotlib
@@ -42,7 +42,7 @@ STREAMED, INTERVAL = 40, 0.1  # sweeps; seconds between them
 
 
 @lru_cache(maxsize=None)
-def crossing() -> Tuple[Log, List[FlowResult]]:
+def crossing() -> tuple[Log, list[FlowResult]]:
     """A simulated crossing and its flow."""
     log = make_drive(301, CROSSING_SWEEPS, "av2", "crossing")
     model = make_model(make_config("offline"))
@@ -62,7 +62,7 @@ def tracks(file: Path) -> None:
     figure.savefig(file, bbox_inches="tight")
 
 
-def draw_tracks(axes: Any, points: np.ndarray, table: Dict[str, np.ndarray], index: int) -> None:
+def draw_tracks(axes: Any, points: np.ndarray, table: dict[str, np.ndarray], index: int) -> None:
     """Boxes and ids at a sweep, and the way of each track until then, over the points of the sweep."""
     axes.scatter(points[:, 0], points[:, 1], s=0.15, c=STANDING, linewidths=0)
     for row in np.flatnonzero(table["sweep"] == index):
@@ -150,7 +150,7 @@ def stream(file: Path) -> None:
     figure.savefig(file, dpi=110)
 
 
-def latencies(flows: FlowStream, sweeps: Sequence[Sweep]) -> List[float]:
+def latencies(flows: FlowStream, sweeps: Sequence[Sweep]) -> list[float]:
     """Seconds from each sweep but the first to the flow of the one before it."""
     seconds = []
     for sweep in sweeps:
@@ -176,7 +176,7 @@ def deskewed(file: Path) -> None:
     figure.savefig(file, dpi=110)
 
 
-DRAWN: Tuple[Callable[[Path], None], ...] = (tracks, clean, labels, stream, deskewed)
+DRAWN: tuple[Callable[[Path], None], ...] = (tracks, clean, labels, stream, deskewed)
 PICTURES = {each.__name__: each for each in DRAWN}
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any, List, NamedTuple, Sequence, Tuple
+from typing import Any, NamedTuple, Sequence, Tuple
 
 import numpy as np
 
@@ -287,7 +287,7 @@ def border(seed: int) -> Staged:
     return Staged(drive, "the region's border", "cars and buses", list(range(len(movers))), (-82, -82, 82, 82))
 
 
-def _fronts(rng: np.random.Generator, front: float) -> List[Body]:
+def _fronts(rng: np.random.Generator, front: float) -> list[Body]:
     """House after house along y = `front`: with pilasters, window sills, doorsteps and drain pipes."""
     houses, begin, side = [], -50.0, math.copysign(1.0, front)
     while begin < 65:

@@ -19,7 +19,7 @@ import warnings
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Callable, Dict, Iterator, List, NamedTuple, Optional, Sequence, Tuple
+from typing import Any, Callable, Iterator, NamedTuple, Sequence
 
 import drives
 import numpy as np
@@ -48,7 +48,7 @@ class Attempt(NamedTuple):
 
     name: str
     residual: np.ndarray
-    confidence: Optional[np.ndarray]
+    confidence: np.ndarray | None
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Case:
     """
 
     staged: Staged
-    attempts: List[Attempt]
+    attempts: list[Attempt]
 
     @property
     def truth(self) -> np.ndarray:
@@ -73,12 +73,12 @@ class Case:
         """(N,) bool, points that the error is of."""
         return np.isin(body_of(self.staged.drive), list(self.staged.bodies))
 
-    def errors(self) -> List[float]:
+    def errors(self) -> list[float]:
         """Mean end-point error of the points concerned, metres per sweep, of each attempt."""
         lengths = (np.linalg.norm(attempt.residual - self.truth, axis=1) for attempt in self.attempts)
         return [float(length[self.concerned].mean()) for length in lengths]
 
-    def confidences(self) -> List[float]:
+    def confidences(self) -> list[float]:
         """Mean confidence of the points concerned, of each attempt; NaN where it has none."""
         given = (attempt.confidence for attempt in self.attempts)
         return [math.nan if one is None else float(one[self.concerned].mean()) for one in given]
@@ -135,7 +135,7 @@ _GROUND = (
 _WRONG_FRAME = (by("default", "`default`, wrong frame", MisplacedPoses), by("default", "`default`, right frame"))
 _WIDE = by("default", "`default`, point_cloud_range=±100 m", point_cloud_range=WIDE)
 # The drive, the settings it is tried with (the one that fails first), and the seed that is drawn.
-CASES: Dict[str, Tuple[Callable[[int], Staged], Sequence[Way], Optional[int]]] = {
+CASES: dict[str, tuple[Callable[[int], Staged], Sequence[Way], int | None]] = {
     "long_side": (drives.tram, _LONG_SIDE, 0),
     "rail": (drives.rail, _PAPER_AND_DEFAULT, 0),
     "bridge": (drives.bridge, _DEFAULT, 0),
@@ -216,7 +216,7 @@ def table(names: Sequence[str], seeds: Sequence[int]) -> Iterator[str]:
             yield f"| {' | '.join((*heading, attempt.name, error, trust))} |"
 
 
-def main(arguments: Optional[Sequence[str]] = None) -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Print the table, draw the pictures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="+", choices=tuple(CASES), default=tuple(CASES), metavar="CASE")

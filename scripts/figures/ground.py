@@ -14,7 +14,7 @@ import os
 import statistics
 import time
 from pathlib import Path
-from typing import Dict, Iterator, List, Tuple
+from typing import Iterator, Tuple
 
 import numpy as np
 import torch
@@ -71,7 +71,7 @@ def real(root: Path) -> Iterator[Case]:
                 yield "KITTI, stored mask (Patchwork++ + 0.2 m)", points, truth, np.ones(len(points), bool)
 
 
-def scores(mask: np.ndarray, truth: np.ndarray, counts: np.ndarray) -> Tuple[float, float, float]:
+def scores(mask: np.ndarray, truth: np.ndarray, counts: np.ndarray) -> tuple[float, float, float]:
     """Intersection over union, precision, recall."""
     mask, truth = mask & counts, truth & counts
     both = (mask & truth).sum()
@@ -92,7 +92,7 @@ def main() -> None:
     """Print the tables."""
     torch.set_num_threads(1)
     root = Path(os.environ.get("CFLOW_DATA") or Path(__file__).resolve().parents[3] / "shared" / "data")
-    methods: List[str] = []
+    methods: list[str] = []
     for method in METHODS:
         try:
             find_ground(np.zeros((1, 3)), method=method)
@@ -101,7 +101,7 @@ def main() -> None:
             print(f"left out: {error}\n")
     print("| sweeps | " + " | ".join(f"{m}: IoU | precision | recall" for m in methods) + " |")
     print("|---" * (1 + 3 * len(methods)) + "|")
-    table: Dict[str, List[List[Tuple[float, float, float]]]] = {}
+    table: dict[str, list[list[tuple[float, float, float]]]] = {}
     for cases in (simulated(), real(root)):
         for name, points, truth, counts in cases:
             rows = table.setdefault(name, [[] for _ in methods])

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any, List, Tuple
+from typing import Any
 
 import drives
 import numpy as np
@@ -50,7 +50,7 @@ STATIC, PALE, SHADES = (172, 179, 187), (214, 219, 224), np.array([[225], [190],
 WIDE, HIGH, GAP, LEFT, FOOT, HEAD = 2.6, 1.8, 0.11, 0.4, 1.0, 0.4  # inches
 
 
-def take_steps(drive: Any) -> Tuple[Any, ...]:
+def take_steps(drive: Any) -> tuple[Any, ...]:
     """Sweeps, changed pixels, components, nodes, objects, which of them move, and the flow, of the pair of a drive."""
     model = VerifiedFlow.from_preset("default", num_history=4)
     config, given = model.config, [window(drive, drives.PAIR, 4)]
@@ -66,14 +66,14 @@ def take_steps(drive: Any) -> Tuple[Any, ...]:
     return sweeps, change, components, nodes, objects, lookup(motion, node).any(1), model(given)[0]
 
 
-def draw_row(panels: List[Any], drive: Any, low: Tuple[float, float], width: float) -> None:
+def draw_row(panels: list[Any], drive: Any, low: tuple[float, float], width: float) -> None:
     """One drive: a step in each panel, and what the view of `width` metres from the corner `low` on shows of it."""
     sweeps, change, components, nodes, objects, moves, result = take_steps(drive)
     pixels, size, own, levels = sweeps.pixels, sweeps.grid.pixel_size, components.roots.shape[1], components.num_levels
     high = np.array(low) + (width, width * HIGH / WIDE)
     place = np.stack((pixels.col, pixels.row), 1) * size + sweeps.grid.lower[:2]  # lower left corners
 
-    def paint(axes: Any, *layers: Tuple[torch.Tensor, Any]) -> None:
+    def paint(axes: Any, *layers: tuple[torch.Tensor, Any]) -> None:
         image = np.full((sweeps.grid.height, sweeps.grid.width, 3), 255, np.uint8)
         for pixel, rgb in layers:
             image[pixels.row[pixel], pixels.col[pixel]] = rgb
@@ -82,7 +82,7 @@ def draw_row(panels: List[Any], drive: Any, low: Tuple[float, float], width: flo
         axes.imshow(image, extent=extent, origin="lower", interpolation="nearest")
         style.set_view(axes, np.array(low), high)
 
-    def colours(pixel: torch.Tensor, group: torch.Tensor) -> Tuple[torch.Tensor, np.ndarray]:
+    def colours(pixel: torch.Tensor, group: torch.Tensor) -> tuple[torch.Tensor, np.ndarray]:
         return pixel, cluster_colors(place[pixel], group.numpy(), STATIC)
 
     every, now = torch.arange(own), torch.where(pixels.step[:own] == 1)[0]

@@ -12,7 +12,7 @@ import io
 import math
 import sys
 from pathlib import Path
-from typing import Any, Dict, List
+from typing import Any, List
 
 from results import CLASSES, METHODS, RANGES, Ours, Runs, load_paper, load_runs, protocol, range_errors
 
@@ -28,7 +28,7 @@ compared is which way a change goes, not the numbers. Commands, and what each ex
 Cells = List[List[str]]
 
 
-def class_cells(paper: Dict[str, Any], ours: Ours) -> Cells:
+def class_cells(paper: dict[str, Any], ours: Ours) -> Cells:
     """Header and rows of a table with a column per class: for each row the paper's numbers, then those of each set.
 
     Rows that the paper does not have come last.
@@ -49,7 +49,7 @@ def class_cells(paper: Dict[str, Any], ours: Ours) -> Cells:
     return cells
 
 
-def set_cells(paper: Dict[str, Any], ours: Ours) -> Cells:
+def set_cells(paper: dict[str, Any], ours: Ours) -> Cells:
     """Header and rows of a table with a column per data set (and range): the paper's methods, then ours."""
     scores = protocol(ours)
     if "bars" in paper:
@@ -78,7 +78,7 @@ def mean_cells(cells: Cells) -> Cells:
 
     Rows: the paper and each data set, once for each h where points are named by h and scales.
     """
-    lines: Dict[str, Dict[str, str]] = {}
+    lines: dict[str, dict[str, str]] = {}
     for point, origin, *_, mean, _seconds in cells[1:]:
         line, _, column = point.rpartition(", ")
         lines.setdefault(f"{line}, {origin}" if line else origin, {})[column] = mean
@@ -92,7 +92,7 @@ def number(value: float, signed: bool = False) -> str:
     return "-" if math.isnan(value) else f"{value:+.4f}" if signed else f"{value:.4f}"
 
 
-def missing_runs(paper: Dict[str, Any], runs: Runs) -> List[str]:
+def missing_runs(paper: dict[str, Any], runs: Runs) -> list[str]:
     """One line for each run that a table or figure still needs."""
     lines = []
     for name, about in paper.items():
@@ -104,7 +104,7 @@ def missing_runs(paper: Dict[str, Any], runs: Runs) -> List[str]:
     return lines
 
 
-def about_runs(ours: Ours) -> List[str]:
+def about_runs(ours: Ours) -> list[str]:
     """Which data, versions and days our numbers are from, one line per data set."""
     lines = []
     for data_set, rows in ours.items():
@@ -156,8 +156,8 @@ def write_pages(results: Path, output: Path) -> None:
     except ImportError as error:
         draw = None
         remarks.append(f"no pictures: {error}")
-    page: List[str] = [INTRODUCTION]
-    told: List[str] = []
+    page: list[str] = [INTRODUCTION]
+    told: list[str] = []
     for name, about in paper.items():
         ours = runs.get(name, {})
         cells = (set_cells if name in PER_SET else class_cells)(about, ours)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Dict, List, Mapping, Sequence
+from typing import Any, Mapping, Sequence
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -35,7 +35,7 @@ METHOD_STYLE = {
 PAPER_SET = "paper, Argoverse 2 val"
 
 
-def draw(name: str, paper: Dict[str, Any], ours: Ours) -> Figure:
+def draw(name: str, paper: dict[str, Any], ours: Ours) -> Figure:
     """The figure of an experiment.
 
     Args:
@@ -48,13 +48,13 @@ def draw(name: str, paper: Dict[str, Any], ours: Ours) -> Figure:
     )
 
 
-def _of_class(runs: Mapping[str, Run], rows: Sequence[str], which: str) -> List[float]:
+def _of_class(runs: Mapping[str, Run], rows: Sequence[str], which: str) -> list[float]:
     """Error of one class in some rows, NaN where a run is missing."""
     at = list(CLASSES).index(which)
     return [runs[row].values()[at] if row in runs else math.nan for row in rows]
 
 
-def _history(paper: Dict[str, Any], ours: Ours) -> Figure:
+def _history(paper: dict[str, Any], ours: Ours) -> Figure:
     """Error over h, one line per class; the paper's panel, then one per data set."""
     figure = Figure(figsize=(5.2 * (1 + len(ours)), 4.0), layout="constrained")
     panels = figure.subplots(1, 1 + len(ours), sharey=True, squeeze=False)[0]
@@ -73,7 +73,7 @@ def _history(paper: Dict[str, Any], ours: Ours) -> Figure:
     return figure
 
 
-def _scales(paper: Dict[str, Any], ours: Ours) -> Figure:
+def _scales(paper: dict[str, Any], ours: Ours) -> Figure:
     """Error over the number of scales: a row of four classes for the paper, one for each data set; a line per h."""
     figure = Figure(figsize=(13, 3.3 * (1 + len(ours))), layout="constrained")
     grid = figure.subplots(1 + len(ours), 4, squeeze=False)
@@ -95,7 +95,7 @@ def _scales(paper: Dict[str, Any], ours: Ours) -> Figure:
     return figure
 
 
-def _datasets(paper: Dict[str, Any], ours: Ours) -> Figure:
+def _datasets(paper: dict[str, Any], ours: Ours) -> Figure:
     """Bars: a group per data set, a bar per method; below, our two variants on our data sets."""
     scores = protocol(ours)
     rows = 2 if scores else 1
@@ -127,7 +127,7 @@ def _bars(axes: Axes, groups: Sequence[str], bars: Mapping[str, Sequence[float]]
     axes.set_axisbelow(True)
 
 
-def _range_split(paper: Dict[str, Any], ours: Ours) -> Figure:
+def _range_split(paper: dict[str, Any], ours: Ours) -> Figure:
     """Error at short and long range: the paper's 2 x 2 panels, ours in further columns."""
     panels = [(f"{name} (paper)", lines) for name, lines in paper["panels"].items()]
     for data_set, runs in ours.items():

@@ -6,7 +6,7 @@ import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Dict, List, Mapping, Tuple
+from typing import Any, Dict, Mapping
 
 from omegaconf import OmegaConf
 
@@ -41,9 +41,9 @@ class Run:
     experiment: str
     data_set: str
     row: str
-    record: Dict[str, Any]
+    record: dict[str, Any]
 
-    def values(self) -> List[float]:
+    def values(self) -> list[float]:
         """Dynamic bucket-normalised error of CAR, OTHER, PED, VRU, and their mean; NaN = no moving points."""
         scores = self.record["results"]["bucketed"]
         classes = [scores["classes"][name]["dynamic_error"] for name in CLASSES.values()]
@@ -60,9 +60,9 @@ Ours = Mapping[str, Mapping[str, Run]]  # data set -> row
 Runs = Dict[str, Dict[str, Dict[str, Run]]]  # experiment -> data set -> row
 
 
-def load_paper() -> Dict[str, Any]:
+def load_paper() -> dict[str, Any]:
     """What the paper prints, by experiment; figures of classes have `rows` as the tables do."""
-    paper: Dict[str, Any] = OmegaConf.to_container(OmegaConf.load(PAPER_FILE))  # type: ignore[assignment]
+    paper: dict[str, Any] = OmegaConf.to_container(OmegaConf.load(PAPER_FILE))  # type: ignore[assignment]
     for name in ("history", "scales"):
         figure, rows = paper[name], {}
         for at, x in enumerate(figure["at"]):
@@ -74,7 +74,7 @@ def load_paper() -> Dict[str, Any]:
     return paper
 
 
-def row_of(experiment: str, model: Dict[str, Any]) -> str:
+def row_of(experiment: str, model: dict[str, Any]) -> str:
     """The row of a table that a run's settings belong to."""
     sizes, h = model["pixel_sizes"], model.get("num_history", 0)
     if experiment == "pixel_size":
@@ -95,10 +95,10 @@ def row_of(experiment: str, model: Dict[str, Any]) -> str:
     return METHODS[model["method"]]
 
 
-def load_runs(folder: Path) -> Tuple[Runs, List[str]]:
+def load_runs(folder: Path) -> tuple[Runs, list[str]]:
     """All runs of experiments below a folder, and remarks on files that were not used."""
     runs: Runs = {}
-    remarks: List[str] = []
+    remarks: list[str] = []
     for file in sorted(folder.rglob("results.json")):
         try:
             record = json.loads(file.read_text(encoding="utf-8"))
@@ -121,13 +121,13 @@ def load_runs(folder: Path) -> Tuple[Runs, List[str]]:
     return runs, remarks
 
 
-def range_errors(run: Run) -> List[float]:
+def range_errors(run: Run) -> list[float]:
     """Error of a run of `datasets` or `range_split` at short and long range; NaN = no moving points."""
     errors = errors_by_range(run.record["results"])
     return [errors[name] for name in RANGES]
 
 
-def protocol(ours: Ours) -> Dict[str, ProtocolScores]:
+def protocol(ours: Ours) -> dict[str, ProtocolScores]:
     """Our variants over our data sets, as the challenge combines them: method -> scores."""
     result = {}
     for method in METHODS.values():

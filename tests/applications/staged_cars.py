@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, List, Sequence, Tuple
+from typing import Any, Sequence
 
 import numpy as np
 import torch
@@ -27,7 +27,7 @@ class Staged(Log):
         self.ways, self.poses, self.log_id = np.asarray(ways, float), poses, "staged"
         self.timestamps = [INTERVAL_NS * (1 + index) for index in range(self.ways.shape[1])]
 
-    def world(self, index: int) -> Tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def world(self, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Points, their residual flow in the world, their car (-1 = the wall)."""
         points, flow, car = [_WALL], [np.zeros_like(_WALL)], [np.full(len(_WALL), -1)]
         for number, way in enumerate(self.ways):
@@ -54,7 +54,7 @@ class Staged(Log):
         values["is_valid"] = torch.ones(len(car), dtype=torch.bool)
         return FlowResult.of({**values, "confidence": torch.full((len(car),), confidence)})
 
-    def results(self) -> List[Tuple[int, FlowResult]]:
+    def results(self) -> list[tuple[int, FlowResult]]:
         return [(index, self.result(index)) for index in range(len(self) - 1)]
 
 

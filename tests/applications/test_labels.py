@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any, Dict, List
+from typing import Any
 
 import numpy as np
 import pytest
@@ -51,7 +51,7 @@ def labelled(drives: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return file
 
 
-def stored(file: Path) -> List[Dict[str, Any]]:
+def stored(file: Path) -> list[dict[str, Any]]:
     """Every value of every sweep."""
     with h5py.File(file, "r") as scene:
         return [{key: scene[stamp][key][()] for key in scene[stamp]} for stamp in sorted(scene, key=int)]

@@ -8,7 +8,7 @@ import weakref
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, List, Optional
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,18 +22,18 @@ from cflow_torch.simulator import make_drive
 
 
 @pytest.fixture(scope="module")
-def sweeps() -> List[Sweep]:
+def sweeps() -> list[Sweep]:
     """Seven sweeps of a vehicle that drives and turns, oldest first, 0.08 to 0.1 s apart, with ground."""
     window = scene(12, num_history=5, stamps=True, num_points=90)
     return [*window.pch[::-1], window.pc0, window.pc1]
 
 
-def push(stream: FlowStream, sweep: Sweep, **changes: Any) -> Optional[FlowResult]:
+def push(stream: FlowStream, sweep: Sweep, **changes: Any) -> FlowResult | None:
     sweep = replace(sweep, **changes)
     return stream.push(sweep.points, sweep.pose, sweep.timestamp_ns, sweep.is_ground, sweep.point_times)
 
 
-def expected(sweeps: List[Sweep], index: int, settings: Any) -> FlowResult:
+def expected(sweeps: list[Sweep], index: int, settings: Any) -> FlowResult:
     """Flow of sweep `index` with all the history that there is."""
     oldest = max(index - settings.num_history, 0)
     (result,) = make_model(settings, "cpu")(
@@ -43,7 +43,7 @@ def expected(sweeps: List[Sweep], index: int, settings: Any) -> FlowResult:
 
 
 @pytest.mark.parametrize("preset", ["default", "paper", "keypoints"])
-def test_results_are_those_of_windows(preset: str, sweeps: List[Sweep]) -> None:
+def test_results_are_those_of_windows(preset: str, sweeps: list[Sweep]) -> None:
     settings = small(preset)
     timed = [replace(s, point_times=np.linspace(0, 0.09, len(s.points))) for s in sweeps]
     stream = FlowStream(config=settings, device="cpu")
@@ -55,7 +55,7 @@ def test_results_are_those_of_windows(preset: str, sweeps: List[Sweep]) -> None:
         assert np.array_equal(stream.window.pc0.points, timed[index].points, equal_nan=True)
 
 
-def test_only_what_is_needed_is_kept_and_buffers_may_be_reused(sweeps: List[Sweep]) -> None:
+def test_only_what_is_needed_is_kept_and_buffers_may_be_reused(sweeps: list[Sweep]) -> None:
     settings, buffer = small("paper", num_history=1), np.empty((2000, 3), np.float32)
     stream, seen = FlowStream(config=settings), []
     for index, sweep in enumerate(sweeps):
@@ -70,7 +70,7 @@ def test_only_what_is_needed_is_kept_and_buffers_may_be_reused(sweeps: List[Swee
     assert [reference() is not None for reference in seen] == [False] * 4 + [True, True]
 
 
-def test_gaps_late_and_repeated_sweeps(sweeps: List[Sweep], caplog: pytest.LogCaptureFixture) -> None:
+def test_gaps_late_and_repeated_sweeps(sweeps: list[Sweep], caplog: pytest.LogCaptureFixture) -> None:
     settings = small("fast", num_history=2)
     stream = FlowStream(config=settings, max_gap=0.5)
     for sweep in sweeps[:3]:
@@ -88,7 +88,7 @@ def test_gaps_late_and_repeated_sweeps(sweeps: List[Sweep], caplog: pytest.LogCa
     assert push(stream, sweeps[5]) is None
 
 
-def test_seconds_are_times_and_none_is_an_interval(sweeps: List[Sweep]) -> None:
+def test_seconds_are_times_and_none_is_an_interval(sweeps: list[Sweep]) -> None:
     settings = small("fast", num_history=2, max_speed=8.0)
     regular = [replace(sweep, timestamp_ns=None) for sweep in sweeps]
     stream, by_second = FlowStream(config=settings), FlowStream(config=settings)
@@ -111,7 +111,7 @@ BAD = [
 
 @pytest.mark.parametrize("bad, message, first", [*BAD, *(case[:2] + (False,) for case in BAD[:3])])
 def test_a_bad_sweep_is_refused_and_the_stream_goes_on(
-    bad: dict, message: str, first: bool, sweeps: List[Sweep]
+    bad: dict, message: str, first: bool, sweeps: list[Sweep]
 ) -> None:
     settings = small("fast", num_history=2)
     stream = FlowStream(config=settings)

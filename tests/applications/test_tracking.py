@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Dict, List
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ from cflow_torch.applications.linking import box_of_point, boxes, link
 from cflow_torch.applications.track_table import join_tables, read_tracks, write_tracks
 
 
-def ids_of(log: Staged, table: Dict[str, np.ndarray], car: int) -> List[int]:
+def ids_of(log: Staged, table: dict[str, np.ndarray], car: int) -> list[int]:
     """Ids of the rows that lie on a car, in order."""
     ids = []
     for index in range(len(log) - 1):
@@ -152,7 +152,7 @@ def test_links_are_those_of_plain_loops() -> None:
             for j, b in enumerate(voxels[1])
             if a & b and len(a & b) / len(a | b) >= 0.05
         ]
-        expected: Dict[int, int] = {}
+        expected: dict[int, int] = {}
         for _, i, j in sorted(shares):
             if i not in expected and j not in expected.values():
                 expected[i] = j

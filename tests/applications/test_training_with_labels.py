@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Dict, List
+from typing import Dict
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ TRUNCATED = 2.0  # metres; a point further from all others has no partner
 Pair = Dict[str, Tensor]
 
 
-def pairs_of(file: Path) -> List[Pair]:
+def pairs_of(file: Path) -> list[Pair]:
     """Points of t after ego motion and of t+1 without ground, labels of both, true residual flow of t."""
     with HDF5Log(file) as log:
         return [_pair(log, index) for index in range(len(log) - 1)]
@@ -49,7 +49,7 @@ class TinyNetwork(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        layers: List[nn.Module] = []
+        layers: list[nn.Module] = []
         for number, dilation in enumerate((1, 1, 2, 4)):
             layers += [nn.Conv2d(24 if number else 2, 24, 3, padding=dilation, dilation=dilation), nn.ReLU()]
         self.layers = nn.Sequential(*layers, nn.Conv2d(24, 2, 1))
@@ -102,7 +102,7 @@ def seflow_loss(pair: Pair, flow: Tensor) -> Tensor:
     return loss + torch.cat(terms).mean()
 
 
-def errors(network: nn.Module, pairs: List[Pair]) -> List[float]:
+def errors(network: nn.Module, pairs: list[Pair]) -> list[float]:
     """Mean end-point error of points that truly move, and of those that stand, metres."""
     with torch.no_grad():
         error = torch.cat([(network(pair) - pair["truth"]).norm(dim=1) for pair in pairs])

@@ -6,7 +6,7 @@ import json
 import shutil
 import sys
 from pathlib import Path
-from typing import Any, Callable, Dict
+from typing import Any, Callable
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ Cflow = Callable[..., int]
 SMALL = "model.point_cloud_range=[-20,-20,-inf,20,20,inf]"
 
 
-def results_of(folder: Path) -> Dict[str, Any]:
+def results_of(folder: Path) -> dict[str, Any]:
     """results.json as strict JSON."""
 
     def refuse(constant: str) -> None:

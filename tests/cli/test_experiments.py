@@ -7,7 +7,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any, Callable, Dict, List, Tuple
+from typing import Any, Callable
 
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -21,7 +21,7 @@ Cflow = Callable[..., int]
 Compose = Callable[..., Any]
 SCALES = (0.8, 0.4, 0.3, 0.2, 0.1)
 # How many jobs an experiment has, and what the first and the last one are.
-JOBS: Dict[str, Tuple[int, Dict[str, Any], Dict[str, Any]]] = {
+JOBS: dict[str, tuple[int, dict[str, Any], dict[str, Any]]] = {
     "pixel_size": (4, {"pixel_sizes": (0.05,)}, {"pixel_sizes": (0.4,)}),
     "views": (2, {"sectional_view": False}, {"sectional_view": True}),
     "clustering": (2, {"clustering": "components"}, {"clustering": "hdbscan"}),
@@ -33,7 +33,7 @@ JOBS: Dict[str, Tuple[int, Dict[str, Any], Dict[str, Any]]] = {
 JOBS["range_split"] = JOBS["datasets"]
 
 
-def jobs_of(compose: Compose, experiment: str) -> List[Tuple[str, ...]]:
+def jobs_of(compose: Compose, experiment: str) -> list[tuple[str, ...]]:
     """What every job of an experiment's sweep overrides."""
     whole = compose("eval", f"experiment={experiment}")
     assert str(whole.hydra.mode) == "RunMode.MULTIRUN"

@@ -10,7 +10,7 @@ import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Callable, Dict, List
+from typing import Any, Callable
 
 import hydra
 import pytest
@@ -147,7 +147,7 @@ def test_output_may_be_closed_unread_or_full(arguments: str, printed: str) -> No
 # ---------------------------------------------------------------- completion
 
 
-LINES: Dict[str, List[str]] = {
+LINES: dict[str, list[str]] = {
     "cflow ": [*COMMANDS, "--help", "--version"],
     "cflow eval mod": ["model=", "model."],
     "cflow eval model=p": ["paper"],
@@ -193,7 +193,7 @@ def test_the_script_has_no_fault(shell: str, tmp_path: Path) -> None:
 def test_information_names_every_package_that_is_asked_for(
     monkeypatch: pytest.MonkeyPatch, cflow: Cflow, capsys: pytest.CaptureFixture
 ) -> None:
-    imported: List[str] = []
+    imported: list[str] = []
     monkeypatch.setattr(info, "import_module", imported.append)  # loading all of them takes long
     assert cflow("info") == 0
     text = capsys.readouterr().out

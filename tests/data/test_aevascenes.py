@@ -8,7 +8,7 @@ import math
 import pickle
 import zipfile
 from pathlib import Path
-from typing import Any, Dict
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,12 +24,12 @@ from cflow_torch.types import CFlowError
 STAMPS = (1_700_000_000_000_000_000, 1_700_000_000_100_000_000, 1_700_000_000_200_000_000)
 
 
-def pose(yaw: float = 0.0, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Dict[str, Any]:
+def pose(yaw: float = 0.0, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> dict[str, Any]:
     rotation = {"w": math.cos(yaw / 2), "x": 0.0, "y": 0.0, "z": math.sin(yaw / 2)}
     return {"translation": {"x": x, "y": y, "z": z}, "rotation": rotation}
 
 
-def box(track: str, kind: str, x: float) -> Dict[str, Any]:
+def box(track: str, kind: str, x: float) -> dict[str, Any]:
     size = {"x": 4.0, "y": 2.0, "z": 2.0}
     return {"id": track, "class": kind, "reference_frame": "VEHICLE", "dimensions": size, "pose": pose(x=x)}
 
@@ -44,7 +44,7 @@ def folder(tmp_path: Path) -> Path:
     """Three frames, two LiDARs; version 2 with both clouds."""
     folder, frames = tmp_path / "seq", []
     for i, stamp in enumerate(STAMPS):
-        clouds: Dict[str, Any] = {}
+        clouds: dict[str, Any] = {}
         for lidar in ("left_lidar", "rear_lidar"):
             clouds[lidar] = {}
             for kind, shift in (("compensated", 0.0), ("raw", 0.5)):

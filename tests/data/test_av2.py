@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import Any, Dict, Sequence
+from typing import Any, Sequence
 
 import numpy as np
 import pyarrow as pa
@@ -24,7 +24,7 @@ POINTS = np.array([[1, 2, 3], [10, 0, 0.5], [-4, 0, 0]], dtype=np.float16)
 YAW = math.radians(90)
 
 
-def write(file: Path, columns: Dict[str, Any]) -> None:
+def write(file: Path, columns: dict[str, Any]) -> None:
     file.parent.mkdir(parents=True, exist_ok=True)
     feather.write_feather(pa.table(columns), str(file))
 
@@ -33,29 +33,29 @@ def write_sweep(folder: Path, time: int, points: np.ndarray = POINTS) -> None:
     write(folder / "sensors" / "lidar" / f"{time}.feather", {name: points[:, i] for i, name in enumerate("xyz")})
 
 
-def pose_columns(times: Sequence[int] = TIMES) -> Dict[str, Any]:
+def pose_columns(times: Sequence[int] = TIMES) -> dict[str, Any]:
     """Sweep k stands at x = 1000 + k, turned left by 90 degrees."""
     n = len(times)
-    columns: Dict[str, Any] = {name: np.zeros(n) for name in ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")}
+    columns: dict[str, Any] = {name: np.zeros(n) for name in ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")}
     columns.update(qw=np.full(n, math.cos(YAW / 2)), qz=np.full(n, math.sin(YAW / 2)), tx_m=1000.0 + np.arange(n))
     return {"timestamp_ns": np.array(times, dtype=np.int64), **columns}
 
 
 def box_columns(
     time: int, x: float, track: str = "a", category: str = "REGULAR_VEHICLE", inside: int = 1
-) -> Dict[str, Any]:
-    row: Dict[str, Any] = dict.fromkeys(("qx", "qy", "qz", "ty_m"), 0.0)
+) -> dict[str, Any]:
+    row: dict[str, Any] = dict.fromkeys(("qx", "qy", "qz", "ty_m"), 0.0)
     row.update(timestamp_ns=time, track_uuid=track, category=category, num_interior_pts=inside)
     row.update(length_m=4.0, width_m=2.0, height_m=1.5, qw=1.0, tx_m=x, tz_m=0.5)
     return row
 
 
-def annotate(folder: Path, *rows: Dict[str, Any]) -> None:
+def annotate(folder: Path, *rows: dict[str, Any]) -> None:
     write(folder / "annotations.feather", {key: [row[key] for row in rows] for key in rows[0]})
 
 
-def label_columns(rows: int = 3, **changes: Any) -> Dict[str, Any]:
-    columns: Dict[str, Any] = {f"flow_t{axis}_m": np.arange(rows, dtype=np.float32) for axis in "xyz"}
+def label_columns(rows: int = 3, **changes: Any) -> dict[str, Any]:
+    columns: dict[str, Any] = {f"flow_t{axis}_m": np.arange(rows, dtype=np.float32) for axis in "xyz"}
     columns.update(classes=np.full(rows, 19, dtype=np.uint8), dynamic=np.ones(rows, dtype=bool))
     return {**columns, **changes}
 
@@ -189,7 +189,7 @@ SWEEP, POSES, LABELS = "sensors/lidar/100.feather", "city_SE3_egovehicle.feather
         (LABELS, label_columns(is_valid=np.ones(3)), "is_valid must be bool"),
     ],
 )
-def test_bad_columns_are_refused(folder: Path, file: str, columns: Dict[str, Any], message: str) -> None:
+def test_bad_columns_are_refused(folder: Path, file: str, columns: dict[str, Any], message: str) -> None:
     write(folder / file, columns)
     with pytest.raises(CFlowError, match=message) as error:
         log = AV2Log(folder)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import pickle
 from pathlib import Path
-from typing import Any, Dict, List
+from typing import Any
 
 import numpy as np
 import pytest
@@ -68,7 +68,7 @@ def test_ground_is_found_where_there_is_no_mask(drive: Drive, arrays: Path) -> N
         ("arrays", {"times": 5}, "5' is no place"),
     ],
 )
-def test_wrong_calls(arrays: Path, name: str, settings: Dict[str, Any], complaint: str) -> None:
+def test_wrong_calls(arrays: Path, name: str, settings: dict[str, Any], complaint: str) -> None:
     with pytest.raises(CFlowError, match=complaint):
         open_log(name, arrays, **settings)
 
@@ -103,7 +103,7 @@ def test_logs_are_found_below_and_at_a_folder(name: str, log: str, tmp_path: Pat
         ("arrays", ["1.bin", "2.bin"]),
     ],
 )
-def test_pointers_of_git_are_no_data(name: str, files: List[str], tmp_path: Path) -> None:
+def test_pointers_of_git_are_no_data(name: str, files: list[str], tmp_path: Path) -> None:
     """A clone without git-lfs has them in place of large files. These are as long as ten points of a `.bin`."""
     if name == "bags":
         pytest.importorskip("rosbags")

@@ -6,7 +6,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any, Dict
+from typing import Any
 
 import numpy as np
 import pytest
@@ -30,7 +30,7 @@ def flow_of(index: int, value: float = 1.0) -> np.ndarray:
     return np.full((50 + index, 3), value, np.float32)
 
 
-def contents(file: Path) -> Dict[str, Any]:
+def contents(file: Path) -> dict[str, Any]:
     """Every value of a scene."""
     with h5py.File(file, "r") as scene:
         return {f"{stamp}/{key}": scene[stamp][key][()] for stamp in scene for key in scene[stamp]}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import pickle
 from pathlib import Path
-from typing import Any, Iterator, Tuple
+from typing import Any, Iterator
 
 import numpy as np
 import pytest
@@ -34,7 +34,7 @@ def marker(tmp_path: Path) -> Iterator[Path]:
     assert not (tmp_path / "marker").exists(), "something ran"
 
 
-def objects(marker: Path, shape: Tuple[int, ...] = (1,)) -> np.ndarray:
+def objects(marker: Path, shape: tuple[int, ...] = (1,)) -> np.ndarray:
     values = np.empty(shape, dtype=object)
     values.fill(Payload(marker))
     return values

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any, Callable, Dict, List
+from typing import Any, Callable
 
 import numpy as np
 import pytest
@@ -38,7 +38,7 @@ def exact_boxes(recording: Any, index: int) -> Boxes:
     return Boxes(boxes.track_id, np.array(category, np.uint8), boxes.size, boxes.pose)
 
 
-def edit(folder: Path, table: str, change: Callable[[List[Dict[str, Any]]], Any]) -> Path:
+def edit(folder: Path, table: str, change: Callable[[list[dict[str, Any]]], Any]) -> Path:
     file = folder / VERSION / f"{table}.json"
     rows = json.loads(file.read_text())
     rows = change(rows) or rows

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Dict
 
 import numpy as np
 import pytest
@@ -18,7 +17,7 @@ DTYPES = ("f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8")
 pypcd4 = pytest.importorskip("pypcd4", reason="needs the extra clouds: pip install pypcd4")
 
 
-def write_as(path: Path, fields: Dict[str, np.ndarray], data: str) -> None:
+def write_as(path: Path, fields: dict[str, np.ndarray], data: str) -> None:
     """As other programs do."""
     kinds = [values.dtype for values in fields.values()]
     cloud = pypcd4.PointCloud.from_points(list(fields.values()), list(fields), kinds)

@@ -11,7 +11,7 @@ import sys
 import uuid
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Callable, Iterator, Tuple
+from typing import Any, Callable, Iterator
 
 import numpy as np
 import pytest
@@ -111,7 +111,7 @@ def assert_same_logs(one: Any, other: Any) -> None:
         assert a is None or all(np.array_equal(getattr(a, n), getattr(b, n)) for n in ("flow", "category", "is_valid"))
 
 
-def names(folder: Any) -> Tuple[str, ...]:
+def names(folder: Any) -> tuple[str, ...]:
     return tuple(sorted(path.name for path in folder.iterdir())) if folder.is_dir() else ()
 
 

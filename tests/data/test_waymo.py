@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from pathlib import Path
-from typing import Any, List, Sequence
+from typing import Any, Sequence
 
 import numpy as np
 import pyarrow as pa
@@ -60,7 +60,7 @@ class GridRecording:
     def elevations(self, unit: str) -> np.ndarray:
         return self.table[unit]
 
-    def units(self, index: int) -> List[UnitReturns]:
+    def units(self, index: int) -> list[UnitReturns]:
         units = []
         for number, name in enumerate(self.table):
             rng = np.random.default_rng([index, number])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import List, Optional, Tuple
+from typing import Optional, Tuple
 
 import cv2
 import numpy as np
@@ -26,14 +26,14 @@ ENGINES = ("fft", "conv")
 Pair = Tuple[np.ndarray, int, Optional[float]]  # template, its target, radius
 
 
-def as_images(images: List[np.ndarray]) -> Images:
+def as_images(images: list[np.ndarray]) -> Images:
     """Set pixels of all images, in random order."""
     parts = [np.column_stack([np.full(image.sum(), i), np.argwhere(image)]) for i, image in enumerate(images)]
     pixels = np.random.default_rng(0).permutation(np.concatenate(parts).astype(np.int64))
     return Images(*torch.from_numpy(pixels).t().contiguous())
 
 
-def as_pairs(targets: List[np.ndarray], pairs: List[Pair]) -> TemplatePairs:
+def as_pairs(targets: list[np.ndarray], pairs: list[Pair]) -> TemplatePairs:
     """Pairs in the order of their targets."""
     radius = None if pairs[0][2] is None else torch.tensor([pair[2] for pair in pairs], dtype=torch.float64)
     return TemplatePairs(
@@ -46,7 +46,7 @@ def as_pairs(targets: List[np.ndarray], pairs: List[Pair]) -> TemplatePairs:
     )
 
 
-def assert_equals_oracle(targets: List[np.ndarray], pairs: List[Pair], engine: str = "fft") -> None:
+def assert_equals_oracle(targets: list[np.ndarray], pairs: list[Pair], engine: str = "fft") -> None:
     shift, score = best_shifts(as_pairs(targets, pairs), engine)
     assert shift.dtype == torch.int64 and score.dtype == torch.float32
     expected = [scene_flow_in_1view(template, targets[own], 1.0, radius) for template, own, radius in pairs]
@@ -60,9 +60,9 @@ def random_image(rng, shape, density=None) -> np.ndarray:
     return image
 
 
-def random_pairs(rng, sizes, num_pairs, with_radius) -> Tuple[List[np.ndarray], List[Pair]]:
+def random_pairs(rng, sizes, num_pairs, with_radius) -> tuple[list[np.ndarray], list[Pair]]:
     targets = [random_image(rng, size) for size in sizes]
-    pairs: List[Pair] = []
+    pairs: list[Pair] = []
     for own in sorted([*range(len(sizes)), *rng.integers(0, len(sizes), num_pairs).tolist()]):
         moved = np.roll(targets[own], rng.integers(-2, 3, 2), (0, 1)) & (rng.random(sizes[own]) < 0.8)
         template = moved if moved.any() and rng.random() < 0.6 else random_image(rng, sizes[own])
@@ -103,7 +103,7 @@ def test_every_small_image_equals_the_oracle():
     assert_equals_oracle(images, [(template, own, None) for own in range(len(images)) for template in images[::3]])
 
 
-def shift_of(template: List[Tuple[int, int]], target: List[Tuple[int, int]], shape, radius=None) -> Tuple[list, float]:
+def shift_of(template: list[tuple[int, int]], target: list[tuple[int, int]], shape, radius=None) -> tuple[list, float]:
     image, other = np.zeros((2, *shape), dtype=bool)
     for pixels, drawn in ((template, image), (target, other)):
         for pixel in pixels:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
-from typing import List, Set
 from urllib.parse import unquote
 
 import pytest
@@ -25,13 +24,13 @@ def text_of(page: Path) -> str:
     return text
 
 
-def anchors(page: Path) -> Set[str]:
+def anchors(page: Path) -> set[str]:
     """What GitHub calls the headings of a page; of equal ones, the first."""
     titles = re.findall(r"^#{1,6} +(.+?) *$", re.sub(r"^```.*?^```", "", text_of(page), flags=re.M | re.S), re.M)
     return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
 
 
-def broken(page: Path) -> List[str]:
+def broken(page: Path) -> list[str]:
     """Links of a page that lead nowhere in this repository."""
     wrong = []
     for parts in LINK.findall(CODE.sub("", text_of(page))):

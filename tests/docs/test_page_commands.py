@@ -10,7 +10,7 @@ import runpy
 import shlex
 import sys
 from pathlib import Path
-from typing import Any, Dict, List, Tuple
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,9 +25,9 @@ DATA = re.compile(r"/data|/path|experiment=")
 FOREIGN = re.compile(r"# \w+\.py\n|from bucketed_scene_flow_eval")  # how Python of other repositories begins
 
 
-def parts(page: str) -> List[Tuple[str, Any]]:
+def parts(page: str) -> list[tuple[str, Any]]:
     """A page in its order: ("python", text) of a block, ("cflow", words) of a command, ("module", words) of -m."""
-    found: List[Tuple[str, Any]] = []
+    found: list[tuple[str, Any]] = []
     for language, text in BLOCK.findall((ROOT / page).read_text(encoding="utf-8")):
         if language == "python":
             found.append((language, text))
@@ -42,7 +42,7 @@ def parts(page: str) -> List[Tuple[str, Any]]:
 COMMANDS = {" ".join(words) for page in PAGES for kind, words in parts(page) if kind == "cflow"}
 
 
-def run(kind: str, part: Any, names: Dict[str, Any]) -> None:
+def run(kind: str, part: Any, names: dict[str, Any]) -> None:
     """Run one part of a page in this process, unless it is one of those left out."""
     if kind == "python":
         if not FOREIGN.match(part):
@@ -55,7 +55,7 @@ def run(kind: str, part: Any, names: Dict[str, Any]) -> None:
 
 
 @pytest.fixture
-def names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Dict[str, Any]:
+def names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """In an empty folder, the arrays that README begins with."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", list(sys.argv))
@@ -65,18 +65,18 @@ def names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Dict[str, Any]:
 
 
 @pytest.mark.parametrize("command", sorted(filter(DATA.search, COMMANDS)))
-def test_settings_of_commands_with_data_exist(command: str, names: Dict[str, Any]) -> None:
+def test_settings_of_commands_with_data_exist(command: str, names: dict[str, Any]) -> None:
     assert cflow(*command.replace(" -m ", " ").split(), "--cfg", "job") == 0
 
 
 @pytest.mark.parametrize("page", PAGES[:2])
-def test_python_runs(page: str, names: Dict[str, Any]) -> None:
+def test_python_runs(page: str, names: dict[str, Any]) -> None:
     for part in (part for part in parts(page) if part[0] == "python"):
         run(*part, names)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES)
-def test_commands_and_python_run_in_the_order_of_the_page(page: str, names: Dict[str, Any]) -> None:
+def test_commands_and_python_run_in_the_order_of_the_page(page: str, names: dict[str, Any]) -> None:
     for part in parts(page):
         run(*part, names)

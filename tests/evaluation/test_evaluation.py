@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
-from typing import Any, Dict, List
+from typing import Any
 
 import numpy as np
 import pytest
@@ -38,21 +38,21 @@ def frame(
     return EvalFrame(labels=FlowLabels(truth, category, is_valid), **{**given, **parts})
 
 
-def scores(definition: Any, *frames: EvalFrame) -> Dict[str, Any]:
+def scores(definition: Any, *frames: EvalFrame) -> dict[str, Any]:
     return score(definition, frames)
 
 
-def counts(results: Dict[str, Any], name: str = "CAR") -> Dict[int, int]:
+def counts(results: dict[str, Any], name: str = "CAR") -> dict[int, int]:
     """Bucket -> points, of the buckets that have any."""
     buckets = results["bucketed"]["classes"][name]["buckets"]["count"]
     return {bucket: count for bucket, count in enumerate(buckets) if count}
 
 
-def dynamic_foreground(results: Dict[str, Any]) -> Dict[str, float]:
+def dynamic_foreground(results: dict[str, Any]) -> dict[str, float]:
     return results["three_way"]["breakdown"]["foreground"]["dynamic"]["all"]
 
 
-def flat(value: Any) -> List[float]:
+def flat(value: Any) -> list[float]:
     """Every number, in the order of sorted names."""
     if isinstance(value, dict):
         return [number for key in sorted(value) for number in flat(value[key])]
@@ -65,7 +65,7 @@ def close_to(value: Any) -> Any:
     return pytest.approx(flat(value), rel=1e-12, abs=1e-12, nan_ok=True)
 
 
-def random_frames(count: int, size: int = 200) -> List[EvalFrame]:
+def random_frames(count: int, size: int = 200) -> list[EvalFrame]:
     rng = np.random.default_rng(7)
     made = []
     for _ in range(count):
@@ -251,7 +251,7 @@ def test_residual_total_and_axes_agree(definition: str) -> None:
     residual, predicted = rng.normal(0, 1, (2, 50, 3)).astype(np.float32)
     pose_flow = ego_motion_flow(points, T)
     labels = FlowLabels(pose_flow + residual, np.full(50, CAR, dtype=np.uint8), np.ones(50, dtype=bool))
-    ways: List[Dict[str, Any]] = [
+    ways: list[dict[str, Any]] = [
         {"residual_flow": predicted},
         {"flow": pose_flow + predicted},
         {"residual_flow": predicted @ T[:3, :3], "residual_axes": "t"},
@@ -267,7 +267,7 @@ def test_residual_total_and_axes_agree(definition: str) -> None:
 def test_frames_that_do_not_add_up_are_refused() -> None:
     good = frame([[1, 0, 0]] * 2)
     parts = {name: getattr(good, name) for name in ("points", "labels", "residual_flow", "T_ego1_ego0")}
-    bad: List[Any] = [
+    bad: list[Any] = [
         ({"residual_flow": None}, "exactly one"),
         ({"flow": np.zeros((2, 3))}, "exactly one"),
         ({"T_ego1_ego0": None}, "pose_flow or T_ego1_ego0"),
@@ -291,7 +291,7 @@ def test_frames_that_do_not_add_up_are_refused() -> None:
 @pytest.mark.parametrize("definition", NAMES)
 @settings(max_examples=8, deadline=None)
 @given(order=st.permutations(range(5)), cut=st.integers(0, 5))
-def test_order_and_merging_do_not_matter(definition: str, order: List[int], cut: int) -> None:
+def test_order_and_merging_do_not_matter(definition: str, order: list[int], cut: int) -> None:
     frames = random_frames(5, size=60)
     first, second = SceneFlowMetrics(definition), SceneFlowMetrics(definition)
     for place, index in enumerate(order):
@@ -310,7 +310,7 @@ def test_scores_merge_only_with_their_kind() -> None:
 # ---------------------------------------------------------------------------------------------- tables
 
 
-def cells(text: str) -> List[List[str]]:
+def cells(text: str) -> list[list[str]]:
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines()]
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Dict, Sequence
+from typing import Any, Sequence
 
 import numpy as np
 import pytest
@@ -29,9 +29,9 @@ def pair(av2_folder: Path) -> Pair:
     return read_pair(av2_folder)
 
 
-def scores(pair: Pair, definition: Any, **parts: Any) -> Dict[str, Any]:
+def scores(pair: Pair, definition: Any, **parts: Any) -> dict[str, Any]:
     """Scores of the prediction "nothing but ego motion", unless `parts` say otherwise."""
-    defaults: Dict[str, Any] = {
+    defaults: dict[str, Any] = {
         "labels": pair.labels,
         "T_ego1_ego0": pair.T_float32,
         "is_ground": pair.is_ground,
@@ -58,12 +58,12 @@ def from_boxes(av2_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Fl
     return labels
 
 
-def check_three_way(results: Dict[str, Any], **expected: float) -> None:
+def check_three_way(results: dict[str, Any], **expected: float) -> None:
     measured = {key: results["three_way"][key] for key in expected}
     assert measured == pytest.approx(expected, abs=TOLERANCE, rel=0)
 
 
-def check_classes(results: Dict[str, Any], static: Sequence[float], dynamic: Sequence[float]) -> None:
+def check_classes(results: dict[str, Any], static: Sequence[float], dynamic: Sequence[float]) -> None:
     """Static error in metres and dynamic error of `CLASSES`."""
     rows = {**results["bucketed"]["classes"], "mean": results["bucketed"]["mean"]}
     for key, expected in (("static_epe", static), ("dynamic_error", dynamic)):
@@ -71,7 +71,7 @@ def check_classes(results: Dict[str, Any], static: Sequence[float], dynamic: Seq
         assert found == pytest.approx(expected, abs=TOLERANCE, rel=0, nan_ok=True), key
 
 
-def filled(results: Dict[str, Any], name: str, key: str) -> Dict[int, Any]:
+def filled(results: dict[str, Any], name: str, key: str) -> dict[int, Any]:
     """Bucket number -> value, of the buckets that have points."""
     buckets = results["bucketed"]["classes"][name]["buckets"]
     return {i: value for i, (value, count) in enumerate(zip(buckets[key], buckets["count"])) if count}

@@ -12,7 +12,7 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Dict, Sequence
+from typing import Any, Sequence
 
 import numpy as np
 import pytest
@@ -57,7 +57,7 @@ def pair(av2_folder: Path) -> Pair:
 
 
 @pytest.fixture(scope="module")
-def residuals(pair: Pair) -> Dict[str, np.ndarray]:
+def residuals(pair: Pair) -> dict[str, np.ndarray]:
     """Predictions in the axes of t+1."""
     (result,) = CorrelationFlow.from_preset("paper")([window(AV2Log(pair.folder), 0)])
     return {**predictions(pair), "paper": result.residual_flow.numpy()}
@@ -77,7 +77,7 @@ METRIC_KEYS = {
 }
 
 
-def compare_av2(ours: Dict[str, Any], table: Any, totals: Dict[str, float]) -> Comparison:
+def compare_av2(ours: dict[str, Any], table: Any, totals: dict[str, float]) -> Comparison:
     """Every number of `evaluate_directories` (counts, hits and misses per subset) and of `results_to_dict`."""
     numbers: Comparison = {}
     for (name, motion, distance), rows in table.groupby(["Class", "Motion", "Distance"]):
@@ -103,7 +103,7 @@ def compare_av2(ours: Dict[str, Any], table: Any, totals: Dict[str, float]) -> C
     return numbers
 
 
-def run_av2(av2_eval: ModuleType, truths: Sequence[Dict[str, Any]], predictions: Sequence[Dict[str, Any]]) -> Any:
+def run_av2(av2_eval: ModuleType, truths: Sequence[dict[str, Any]], predictions: Sequence[dict[str, Any]]) -> Any:
     """Write the files of the challenge with av2's own writers and evaluate them: per-frame table, totals."""
     from av2.evaluation.scene_flow.make_annotation_files import write_annotation
     from av2.evaluation.scene_flow.utils import write_output_file
@@ -132,7 +132,7 @@ def av2_mask(av2_eval: ModuleType, pair: Pair, tmp_path_factory: pytest.TempPath
     return get_eval_point_mask((LOG, TIME), root / "masks.zip").numpy()
 
 
-def truth_for_av2(points: np.ndarray, labels: FlowLabels, is_dynamic: np.ndarray, mask: np.ndarray) -> Dict[str, Any]:
+def truth_for_av2(points: np.ndarray, labels: FlowLabels, is_dynamic: np.ndarray, mask: np.ndarray) -> dict[str, Any]:
     return {
         "category_indices": labels.category[mask],
         "is_close": (np.abs(points[mask, :2]) <= 35).all(axis=1),
@@ -145,7 +145,7 @@ def truth_for_av2(points: np.ndarray, labels: FlowLabels, is_dynamic: np.ndarray
 @pytest.mark.parametrize("name", PREDICTIONS)
 @pytest.mark.parametrize("ego_motion", ["T_float32", "T_float64"])
 def test_av2_on_the_real_pair(
-    av2_eval: ModuleType, pair: Pair, residuals: Dict[str, Any], av2_mask: np.ndarray, name: str, ego_motion: str
+    av2_eval: ModuleType, pair: Pair, residuals: dict[str, Any], av2_mask: np.ndarray, name: str, ego_motion: str
 ) -> None:
     T = getattr(pair, ego_motion)
     pose_flow = ego_motion_flow(pair.points, T)
@@ -255,7 +255,7 @@ def check_bsfe(
 
 @pytest.mark.parametrize("name", PREDICTIONS)
 def test_bsfe_on_the_real_pair(
-    bsfe: ModuleType, pair: Pair, residuals: Dict[str, Any], tmp_path: Path, name: str
+    bsfe: ModuleType, pair: Pair, residuals: dict[str, Any], tmp_path: Path, name: str
 ) -> None:
     T, labels = pair.T_float64, pair.labels
     truth = write_bsfe_truth(tmp_path / "truth", [(residual_at_t(pair), labels.category, labels.is_valid)])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Dict
+from typing import Any
 
 import numpy as np
 import pytest
@@ -45,7 +45,7 @@ WHOLE = {"0-35": 0.25, "35-70": 0.5}
         ({"A": WHOLE, "B": {"0-35": 0.25, "35-70": None}}, "no moving points", 1),
     ],
 )
-def test_holes_are_listed_and_no_mean_is_over_fewer(results: Dict[str, Any], reason: str, holes: int) -> None:
+def test_holes_are_listed_and_no_mean_is_over_fewer(results: dict[str, Any], reason: str, holes: int) -> None:
     scores = score_data_sets(results, ("A", "B"), CHALLENGE_RANGES)
     assert len(scores.missing) == holes and reason in scores.missing[0]
     assert scores.data_sets["A"] == 0.375

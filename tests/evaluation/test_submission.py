@@ -48,7 +48,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> AV2Log:
 
 
 @pytest.fixture(scope="module")
-def estimated(log: AV2Log) -> Dict[int, Any]:
+def estimated(log: AV2Log) -> dict[int, Any]:
     """Windows and results of the submitted pairs."""
     model = CorrelationFlow.from_preset("paper")
     windows = {index: window(log, index) for index in (0, 5)}
@@ -56,7 +56,7 @@ def estimated(log: AV2Log) -> Dict[int, Any]:
 
 
 @pytest.fixture(scope="module")
-def archives(log: AV2Log, estimated: Dict[int, Any], tmp_path_factory: pytest.TempPathFactory) -> Dict[int, Any]:
+def archives(log: AV2Log, estimated: dict[int, Any], tmp_path_factory: pytest.TempPathFactory) -> dict[int, Any]:
     """Version -> folder, zip, expected frames."""
     result = {}
     for number in (1, 2, 3):
@@ -73,19 +73,19 @@ def archives(log: AV2Log, estimated: Dict[int, Any], tmp_path_factory: pytest.Te
     return result
 
 
-def read(file: Path) -> Dict[str, np.ndarray]:
+def read(file: Path) -> dict[str, np.ndarray]:
     table = feather.read_table(str(file), memory_map=False)
     return {name: table[name].to_numpy() for name in table.column_names}
 
 
-def flow_of(columns: Dict[str, np.ndarray]) -> np.ndarray:
+def flow_of(columns: dict[str, np.ndarray]) -> np.ndarray:
     return np.stack([columns[name] for name in FLOW], 1)
 
 
 # ---- what is written
 
 
-def test_version_1_is_total_flow_of_the_mask(log: AV2Log, estimated: Dict[int, Any], archives: Dict[int, Any]) -> None:
+def test_version_1_is_total_flow_of_the_mask(log: AV2Log, estimated: dict[int, Any], archives: dict[int, Any]) -> None:
     for index, (sweeps, flow) in estimated.items():
         columns = read(archives[1][0] / log.log_id / f"{log.timestamps[index]}.feather")
         assert list(columns) == [*FLOW, "is_dynamic"] and flow_of(columns).dtype == np.float16
@@ -101,7 +101,7 @@ def test_version_1_is_total_flow_of_the_mask(log: AV2Log, estimated: Dict[int, A
 
 @pytest.mark.parametrize("number", [2, 3])
 def test_versions_2_and_3_are_residual_flow_of_all_points(
-    number: int, log: AV2Log, estimated: Dict[int, Any], archives: Dict[int, Any]
+    number: int, log: AV2Log, estimated: dict[int, Any], archives: dict[int, Any]
 ) -> None:
     for index, (sweeps, flow) in estimated.items():
         name = f"{index:010d}" if number == 2 else str(log.timestamps[index])
@@ -115,7 +115,7 @@ def test_versions_2_and_3_are_residual_flow_of_all_points(
         assert not values[sweeps.pc0.is_ground].any() and values[~sweeps.pc0.is_ground].all(), "ground is 0 in any case"
 
 
-def test_residual_in_axes_of_t(estimated: Dict[int, Any]) -> None:
+def test_residual_in_axes_of_t(estimated: dict[int, Any]) -> None:
     # Where the point ends, seen from t, minus where it started: T^-1 (p + flow) - p.
     sweeps, flow = estimated[5]
     turn = pose(0, 0, np.deg2rad(3.0))
@@ -129,7 +129,7 @@ def test_residual_in_axes_of_t(estimated: Dict[int, Any]) -> None:
     assert np.abs(got - flow.residual_flow.numpy()).max() > 0.01, "the turn is seen"
 
 
-def test_what_cannot_be_written_is_refused(estimated: Dict[int, Any]) -> None:
+def test_what_cannot_be_written_is_refused(estimated: dict[int, Any]) -> None:
     sweeps, flow = estimated[0]
     mask = np.ones(len(sweeps.pc0.points), bool)
     for number, given, message in (
@@ -147,7 +147,7 @@ def test_what_cannot_be_written_is_refused(estimated: Dict[int, Any]) -> None:
         get_version(4)
 
 
-def test_the_same_files_make_the_same_zip(archives: Dict[int, Any], tmp_path: Path) -> None:
+def test_the_same_files_make_the_same_zip(archives: dict[int, Any], tmp_path: Path) -> None:
     folder, good, frames = archives[2]
     shutil.copytree(folder, tmp_path / "copy")
     pack(tmp_path / "copy", [frame.name for frame in reversed(frames)], tmp_path / "again.zip", get_version(2))
@@ -181,7 +181,7 @@ def with_value(value: Any) -> Callable[[np.ndarray], Any]:
     return lambda values: [*values[:7], value, *values[8:]] if value is None else np.r_[values[:-1], np.float16(value)]
 
 
-SPOILED: Dict[str, Any] = {
+SPOILED: dict[str, Any] = {
     "row missing": (3, in_table(lambda t: t.slice(1)), "rows, expected"),
     "NaN": (3, column("flow_ty_m", with_value(np.nan)), "flow_ty_m has 1 values that are NaN"),
     "empty value": (3, column("flow_tx_m", with_value(None)), "flow_tx_m has 1 empty"),
@@ -210,7 +210,7 @@ def rezip(files: Files, file: Path) -> Path:
 
 
 @pytest.mark.parametrize("kind", SPOILED)
-def test_a_spoiled_file_is_named(kind: str, archives: Dict[int, Any], tmp_path: Path) -> None:
+def test_a_spoiled_file_is_named(kind: str, archives: dict[int, Any], tmp_path: Path) -> None:
     number, spoil, words = SPOILED[kind]
     _, good, frames = archives[number]
     files = unzip(good)
@@ -219,7 +219,7 @@ def test_a_spoiled_file_is_named(kind: str, archives: Dict[int, Any], tmp_path: 
     assert problem.startswith(f"{frames[1].name}: ") and words in problem and "\n" not in problem
 
 
-def test_every_problem_of_an_archive_is_listed(archives: Dict[int, Any], tmp_path: Path) -> None:
+def test_every_problem_of_an_archive_is_listed(archives: dict[int, Any], tmp_path: Path) -> None:
     _, good, frames = archives[2]
     files = {**unzip(good), "notes.txt": b"", "metadata.json": b"{"}
     del files[frames[0].name]
@@ -228,7 +228,7 @@ def test_every_problem_of_an_archive_is_listed(archives: Dict[int, Any], tmp_pat
     assert metadata.startswith("metadata.json: cannot be read")
 
 
-def test_archives_that_are_none(archives: Dict[int, Any], tmp_path: Path) -> None:
+def test_archives_that_are_none(archives: dict[int, Any], tmp_path: Path) -> None:
     _, good, frames = archives[3]
     whole = good.read_bytes()
     (tmp_path / "half.zip").write_bytes(whole[: len(whole) // 2])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Dict
 
 import pytest
 from small_fleet import run, tree, write_fleet
@@ -26,6 +25,6 @@ def single_run(fleet: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def single(single_run: Path) -> Dict[str, bytes]:
+def single(single_run: Path) -> dict[str, bytes]:
     """Its files: name -> content."""
     return tree(single_run)

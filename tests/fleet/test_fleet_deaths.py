@@ -6,7 +6,7 @@ import os
 import signal
 import sys
 from pathlib import Path
-from typing import Any, Callable, Dict
+from typing import Any, Callable
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ DEADLY = "CFLOW_TEST_DEADLY"  # folder of files log.time stamp, each of which ho
 REAL_BEGIN = local._begin
 LIMIT = 12e9  # bytes, of a worker's address space
 
-WAYS: Dict[str, Callable[[], Any]] = {
+WAYS: dict[str, Callable[[], Any]] = {
     "SIGKILL": lambda: os.kill(os.getpid(), signal.SIGKILL),
     "SIGSEGV": lambda: os.kill(os.getpid(), signal.SIGSEGV),
     "SystemExit": lambda: sys.exit("out"),
@@ -63,7 +63,7 @@ def deadly(fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Call
 
 @pytest.mark.slow
 def test_workers_that_die_once_lose_nothing_and_one_without_memory_its_frame(
-    fleet: Path, single: Dict[str, bytes], tmp_path: Path, deadly: Any
+    fleet: Path, single: dict[str, bytes], tmp_path: Path, deadly: Any
 ) -> None:
     deadly(0, 2, "SIGKILL", 1)
     deadly(1, 4, "hang", 1)
@@ -78,7 +78,7 @@ def test_workers_that_die_once_lose_nothing_and_one_without_memory_its_frame(
 @pytest.mark.slow
 @pytest.mark.parametrize("way", [way for way in WAYS if way not in ("hang", "memory")])
 def test_a_frame_that_always_kills_takes_no_other_with_it(
-    fleet: Path, single: Dict[str, bytes], tmp_path: Path, deadly: Any, way: str
+    fleet: Path, single: dict[str, bytes], tmp_path: Path, deadly: Any, way: str
 ) -> None:
     name = deadly(1, 3, way, 1000)
     report = run(fleet, tmp_path / "out", TWO)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import errno
 import os
 from pathlib import Path
-from typing import Any, Dict
+from typing import Any
 
 import pytest
 from small_fleet import command, run, tree
@@ -30,7 +30,7 @@ def fill(patch: pytest.MonkeyPatch, target: str) -> None:
     "target", ["/.manifest.json.", "demo-0001/.manifest.json.", ".feather.", "/.shard-0-of-1.json."]
 )
 def test_a_disk_that_is_full_for_a_while(
-    fleet: Path, single: Dict[str, bytes], tmp_path: Path, capsys: pytest.CaptureFixture, target: str
+    fleet: Path, single: dict[str, bytes], tmp_path: Path, capsys: pytest.CaptureFixture, target: str
 ) -> None:
     name = target.split("/")[-1].strip(".")
     with pytest.MonkeyPatch.context() as patch:

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Callable, Dict, List, Optional
+from typing import Callable
 
 import pytest
 from small_fleet import COMMAND, command, frames, tree
@@ -33,7 +33,7 @@ def many(fleet: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def expected(fleet: Path, single: Dict[str, bytes]) -> Dict[str, bytes]:
+def expected(fleet: Path, single: dict[str, bytes]) -> dict[str, bytes]:
     """Flow files of a run on `many` that nothing disturbed."""
     of_log = {Path(name).name: c for name, c in single.items() if name.startswith(sorted(fleet.iterdir())[1].name)}
     names = [name for name in of_log if name.endswith(".feather")]
@@ -53,30 +53,30 @@ def start(root: Path, output: Path, *more: str) -> subprocess.Popen:
     )
 
 
-def wait_for(condition: Callable[[], bool], process: Optional[subprocess.Popen] = None) -> None:
+def wait_for(condition: Callable[[], bool], process: subprocess.Popen | None = None) -> None:
     """Wait until something is so, or the process has ended, or for two minutes."""
     deadline = time.monotonic() + 120
     while not condition() and (process is None or process.poll() is None) and time.monotonic() < deadline:
         time.sleep(0.01)
 
 
-def workers(process: subprocess.Popen) -> List[int]:
+def workers(process: subprocess.Popen) -> list[int]:
     """Worker processes of a run."""
     children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
     return [int(child) for child in children if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes()]
 
 
-def live(processes: List[int]) -> bool:
+def live(processes: list[int]) -> bool:
     """Whether any of them does."""
     return any(Path(f"/proc/{process}").exists() for process in processes)
 
 
-def flow_of(output: Path) -> Dict[str, bytes]:
+def flow_of(output: Path) -> dict[str, bytes]:
     """All files but manifests and hidden ones."""
     return {n: content for n, content in tree(output).items() if not n.endswith("manifest.json") and "/." not in n}
 
 
-def test_a_killed_run_is_resumed_and_its_workers_end(many: Path, expected: Dict[str, bytes], tmp_path: Path) -> None:
+def test_a_killed_run_is_resumed_and_its_workers_end(many: Path, expected: dict[str, bytes], tmp_path: Path) -> None:
     process = start(many, tmp_path, "engine.workers=2")
     wait_for(lambda: len(frames(tmp_path)) > 3, process)
     orphans = workers(process)
@@ -91,7 +91,7 @@ def test_a_killed_run_is_resumed_and_its_workers_end(many: Path, expected: Dict[
 
 
 @pytest.mark.slow
-def test_kills_lose_nothing_and_leave_nothing(many: Path, expected: Dict[str, bytes], tmp_path: Path) -> None:
+def test_kills_lose_nothing_and_leave_nothing(many: Path, expected: dict[str, bytes], tmp_path: Path) -> None:
     chance, seen = random.Random(9), []
     for number in range(KILLS):
         who, name = HOW[number % len(HOW)].split()

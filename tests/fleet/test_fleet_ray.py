@@ -6,7 +6,7 @@ import os
 import signal
 import sys
 from pathlib import Path
-from typing import Any, Callable, Dict, Iterator
+from typing import Any, Callable, Iterator
 
 import pytest
 from small_fleet import PAIRS, TWO, make_job, run, tree
@@ -22,7 +22,7 @@ pytest.importorskip("ray", reason="Ray is not installed: pip install ray")
 
 
 @pytest.mark.slow
-def test_equals_the_local_engine_byte_for_byte(fleet: Path, single: Dict[str, bytes], tmp_path: Path) -> None:
+def test_equals_the_local_engine_byte_for_byte(fleet: Path, single: dict[str, bytes], tmp_path: Path) -> None:
     before = signal.getsignal(signal.SIGTERM)
     report = run(fleet, tmp_path, TWO, engine="ray")
     assert (report["exit_status"], report["frames"]["computed"]) == (0, PAIRS)
@@ -81,7 +81,7 @@ def kills(fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Itera
 
 @pytest.mark.slow
 def test_a_killed_worker_is_replaced_and_a_frame_that_always_kills_is_reported(
-    fleet: Path, single: Dict[str, bytes], tmp_path: Path, kills: Any
+    fleet: Path, single: dict[str, bytes], tmp_path: Path, kills: Any
 ) -> None:
     once, always = kills(1, 1), kills(3, 1000)
     report = run(fleet, tmp_path / "out", TWO, engine="ray", retries=1)
@@ -103,7 +103,7 @@ def begin(layout: Layout, **settings: Any) -> None:
         (Layout(("cuda:1",), 1), {}, "CUDA_VISIBLE_DEVICES"),
     ],
 )
-def test_bad_settings(layout: Layout, settings: Dict[str, Any], message: str) -> None:
+def test_bad_settings(layout: Layout, settings: dict[str, Any], message: str) -> None:
     with pytest.raises(CFlowError, match=message):
         begin(layout, **settings)
 

@@ -8,7 +8,7 @@ import re
 import shutil
 import signal
 from pathlib import Path
-from typing import Any, Callable, Dict
+from typing import Any, Callable
 
 import numpy as np
 import pytest
@@ -49,7 +49,7 @@ def test_files_hold_the_results_of_the_method_and_their_origin(fleet: Path, sing
     assert len(frames(single_run)) == PAIRS
 
 
-def test_a_batch_changes_no_byte(fleet: Path, single: Dict[str, bytes], tmp_path: Path) -> None:
+def test_a_batch_changes_no_byte(fleet: Path, single: dict[str, bytes], tmp_path: Path) -> None:
     report = run(fleet, tmp_path, Layout(("cpu",), batch=4))
     assert tree(tmp_path) == single
     assert (report["status"], report["exit_status"]) == ("complete", 0)
@@ -72,7 +72,7 @@ def test_a_file_has_only_the_contents_asked_for(fleet: Path, single_run: Path, t
 # Resuming
 
 
-def test_a_second_run_does_only_what_is_missing(fleet: Path, single: Dict[str, bytes], out: Path) -> None:
+def test_a_second_run_does_only_what_is_missing(fleet: Path, single: dict[str, bytes], out: Path) -> None:
     gone = frames(out)[2::3]
     for file in gone:
         file.unlink()
@@ -83,7 +83,7 @@ def test_a_second_run_does_only_what_is_missing(fleet: Path, single: Dict[str, b
     assert all(file.stat().st_mtime_ns == time for file, time in times.items()), "complete files are left alone"
 
 
-def test_files_that_a_power_cut_spoiled_are_done_again(fleet: Path, single: Dict[str, bytes], out: Path) -> None:
+def test_files_that_a_power_cut_spoiled_are_done_again(fleet: Path, single: dict[str, bytes], out: Path) -> None:
     for number, file in enumerate(frames(out)[::2]):
         whole = file.read_bytes()
         file.write_bytes(b"" if number == 0 else whole[: len(whole) // 2] + bytes(len(whole) - len(whole) // 2))
@@ -91,7 +91,7 @@ def test_files_that_a_power_cut_spoiled_are_done_again(fleet: Path, single: Dict
     assert tree(out) == single
 
 
-def test_other_settings_are_refused_by_name(fleet: Path, single: Dict[str, bytes], out: Path) -> None:
+def test_other_settings_are_refused_by_name(fleet: Path, single: dict[str, bytes], out: Path) -> None:
     with pytest.raises(CFlowError, match=re.escape("method.pixel_sizes was [0.4], is [0.8]") + ".*overwrite=true"):
         run(fleet, out, settings=OTHER)
     with pytest.raises(CFlowError, match="find_ground was None, is grid"):
@@ -126,7 +126,7 @@ def test_memory_limit_and_place_are_no_other_settings(fleet: Path, out: Path, tm
 
 
 def test_a_log_that_has_changed_is_refused_and_the_others_go_on(
-    fleet: Path, single: Dict[str, bytes], out: Path, tmp_path: Path
+    fleet: Path, single: dict[str, bytes], out: Path, tmp_path: Path
 ) -> None:
     root = Path(shutil.copytree(fleet, tmp_path / "root"))
     first, second, _ = sorted(folder.name for folder in root.iterdir())
@@ -158,7 +158,7 @@ def test_results_may_lie_where_fsspec_reaches(fleet: Path, single_run: Path, tmp
 # Shards
 
 
-def test_shards_together_are_the_single_run(fleet: Path, single: Dict[str, bytes], tmp_path: Path) -> None:
+def test_shards_together_are_the_single_run(fleet: Path, single: dict[str, bytes], tmp_path: Path) -> None:
     for index in (2, 0, 1):
         shard = find_shard("auto", "auto", {"RANK": str(index), "WORLD_SIZE": "3"})  # as torchrun says
         assert run(fleet, tmp_path, shard=shard)["shard"] == {"index": index, "count": 3}
@@ -176,7 +176,7 @@ def test_a_sweep_over_shards_shares_one_folder(fleet: Path, single_run: Path, tm
 
 
 def test_a_sweep_that_cannot_be_read_costs_its_frames_only(
-    fleet: Path, single: Dict[str, bytes], tmp_path: Path, capsys: pytest.CaptureFixture
+    fleet: Path, single: dict[str, bytes], tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     root, out = Path(shutil.copytree(fleet, tmp_path / "root")), tmp_path / "out"
     log = sorted(root.iterdir())[1]
@@ -193,7 +193,7 @@ def test_a_sweep_that_cannot_be_read_costs_its_frames_only(
     assert tree(out).keys() == single.keys()
 
 
-def test_a_log_that_cannot_be_opened_costs_no_other(fleet: Path, single: Dict[str, bytes], tmp_path: Path) -> None:
+def test_a_log_that_cannot_be_opened_costs_no_other(fleet: Path, single: dict[str, bytes], tmp_path: Path) -> None:
     root, out = Path(shutil.copytree(fleet, tmp_path / "root")), tmp_path / "out"
     first = sorted(root.iterdir())[0]
     poses = first / "city_SE3_egovehicle.feather"
@@ -223,7 +223,7 @@ def during(patch: pytest.MonkeyPatch, number: int, act: Callable[[], Any]) -> No
 
 
 def test_a_signal_ends_a_run_in_order(
-    fleet: Path, single: Dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    fleet: Path, single: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     during(monkeypatch, 2, lambda: os.kill(os.getpid(), signal.SIGTERM))
     report = run(fleet, tmp_path, Layout(("cpu",), 1))

@@ -7,7 +7,7 @@ import signal
 import sys
 import time
 from fractions import Fraction
-from typing import Any, Dict, List, Tuple
+from typing import Any
 
 import pytest
 import torch
@@ -30,8 +30,8 @@ from cflow_torch.fleet.run import StopSignal
     count=st.integers(1, 20),
     workers=st.integers(1, 5),
 )
-def test_shards_and_units_cover_every_frame_once(lengths: List[int], count: int, workers: int) -> None:
-    seen: List[Tuple[int, int]] = []
+def test_shards_and_units_cover_every_frame_once(lengths: list[int], count: int, workers: int) -> None:
+    seen: list[tuple[int, int]] = []
     for index in range(count):
         units = split(Shard(index, count).units(list(range(len(lengths)))), workers)
         assert [unit.number for unit in units] == list(range(len(units)))
@@ -67,7 +67,7 @@ TORCHRUN = {"RANK": "5", "WORLD_SIZE": "8"}
         (("auto", "auto"), {"SLURM_NTASKS": "8", "SLURM_PROCID": "0", "SLURM_JOB_ID": "1"}, Shard(0, 1)),
     ],
 )
-def test_the_shard_comes_from_settings_or_surroundings(given_: Any, environ: Dict[str, str], expected: Shard) -> None:
+def test_the_shard_comes_from_settings_or_surroundings(given_: Any, environ: dict[str, str], expected: Shard) -> None:
     assert find_shard(*given_, environ) == expected
 
 
@@ -84,7 +84,7 @@ def test_the_shard_comes_from_settings_or_surroundings(given_: Any, environ: Dic
         (("auto", "auto"), {**ARRAY, "SLURM_ARRAY_TASK_COUNT": "1"}, "give shard.index"),  # one task is done again
     ],
 )
-def test_a_shard_that_makes_no_sense_is_refused(given_: Any, environ: Dict[str, str], message: str) -> None:
+def test_a_shard_that_makes_no_sense_is_refused(given_: Any, environ: dict[str, str], message: str) -> None:
     with pytest.raises(CFlowError, match=message):
         find_shard(*given_, environ)
 

@@ -6,7 +6,7 @@ import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Callable, Dict, Iterator, List, Optional, Sequence
+from typing import Any, Callable, Iterator, Sequence
 
 import pytest
 from small_fleet import CONFIG, PAIRS, flow_files, make_job, tree
@@ -41,7 +41,7 @@ class Stumbling:
         self.model = make_model(CONFIG, "cpu")
         self.config, self.bad, self._error = self.model.config, bad, error
 
-    def __call__(self, windows: Sequence[Window]) -> List[FlowResult]:
+    def __call__(self, windows: Sequence[Window]) -> list[FlowResult]:
         if any(w.pc0.timestamp_ns in self.bad for w in windows):
             raise self._error()
         return self.model(windows)
@@ -52,7 +52,7 @@ class Stumbling:
 
 @pytest.mark.parametrize("error", [CFlowError("too odd"), MemoryError(), RuntimeError("CUDA: no memory"), KeyError(3)])
 def test_a_bad_frame_spoils_no_other_of_its_batch(
-    source: Path, single: Dict[str, bytes], tmp_path: Path, error: Exception
+    source: Path, single: dict[str, bytes], tmp_path: Path, error: Exception
 ) -> None:
     stamps = AV2Log(source).timestamps
     model = Stumbling([stamps[1], stamps[3]], lambda: error)
@@ -71,12 +71,12 @@ def test_a_batch_that_failed_is_let_go_before_its_frames_are_tried_alone(source:
     class Big:
         pass
 
-    alive: List[bool] = []
+    alive: list[bool] = []
 
     class Hungry(Stumbling):
         taken: Any = None
 
-        def __call__(self, windows: Sequence[Window]) -> List[FlowResult]:
+        def __call__(self, windows: Sequence[Window]) -> list[FlowResult]:
             if len(windows) > 1:
                 big = Big()
                 self.taken = weakref.ref(big)
@@ -101,7 +101,7 @@ def test_a_gpu_that_is_lost_ends_its_worker(source: Path, tmp_path: Path, monkey
 
 
 def test_an_error_outside_of_frames_costs_the_unit_only(
-    fleet: Path, single: Dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    fleet: Path, single: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """There is no memory for another thread, say."""
     first, *others = sorted(fleet.iterdir())
@@ -136,7 +136,7 @@ class Thread:
         stillborn: so many workers die before they begin.
     """
 
-    def __init__(self, job: Job, deadly: Optional[Dict[str, int]] = None, stillborn: int = 0) -> None:
+    def __init__(self, job: Job, deadly: dict[str, int] | None = None, stillborn: int = 0) -> None:
         self.job, self.deadly, self.stillborn = job, {} if deadly is None else deadly, stillborn
         self.started = 0
         self.is_closed = False
@@ -189,7 +189,7 @@ def follow(events: Iterator[Event], units: Sequence[Unit]) -> Counters:
     return counters
 
 
-def test_a_unit_is_done_again_then_its_frames_one_by_one(fleet: Path, single: Dict[str, bytes], tmp_path: Path) -> None:
+def test_a_unit_is_done_again_then_its_frames_one_by_one(fleet: Path, single: dict[str, bytes], tmp_path: Path) -> None:
     sources = sorted(fleet.iterdir())
     names = [f"{sources[1].name}/{stamp}" for stamp in AV2Log(sources[1]).timestamps]
     units = [Unit(n, source) for n, source in enumerate(sources)]
@@ -206,7 +206,7 @@ def test_a_unit_is_done_again_then_its_frames_one_by_one(fleet: Path, single: Di
     assert all(handle.is_closed for handle in handles)
 
 
-def test_a_unit_that_kills_worker_after_worker_is_left(fleet: Path, single: Dict[str, bytes], tmp_path: Path) -> None:
+def test_a_unit_that_kills_worker_after_worker_is_left(fleet: Path, single: dict[str, bytes], tmp_path: Path) -> None:
     sources = sorted(fleet.iterdir())
     units = [Unit(n, source) for n, source in enumerate(sources[:2])]
     deadly = {f"{sources[1].name}/{stamp}": 1000 for stamp in AV2Log(sources[1]).timestamps}

@@ -11,7 +11,7 @@ from __future__ import annotations
 import pickle
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Callable, Dict, Iterator, List, Tuple
+from typing import Any, Callable, Dict, Iterator
 
 import h5py
 import numpy as np
@@ -48,11 +48,11 @@ class SceneDataset:
         if eval:
             has_eval = (self.folder / "index_eval.pkl").is_file()
             self.frames = self._index("eval" if has_eval else "flow")
-        self.bounds: Dict[str, Tuple[int, int]] = {}  # first and last row of each scene in the index
+        self.bounds: dict[str, tuple[int, int]] = {}  # first and last row of each scene in the index
         for row, (scene, _) in enumerate(self.total):
             self.bounds[scene] = (self.bounds.get(scene, (row, row))[0], row)
 
-    def _index(self, name: str) -> List[List[str]]:
+    def _index(self, name: str) -> list[list[str]]:
         with open(self.folder / f"index_{name}.pkl", "rb") as file:
             return pickle.load(file)
 
@@ -109,11 +109,11 @@ def path_a(batch: Batch) -> Batch:
     return {**batch, "origin_pc0": batch["pc0"].clone(), **_without_ground(batch, ["0", "1"])}
 
 
-def _without_ground(batch: Batch, ends: List[str]) -> Batch:
+def _without_ground(batch: Batch, ends: list[str]) -> Batch:
     return {f"pc{end}": batch[f"pc{end}"][~batch[f"gm{end}"]][None] for end in ends}
 
 
-def collate_for_training(items: List[Batch]) -> Batch:
+def collate_for_training(items: list[Batch]) -> Batch:
     """Items of several frames as training sees them: no ground, points padded with NaN, labels with 0, poses in lists;
     no masks, no time stamps."""
     batch: Batch = {"scene_id": [item["scene_id"] for item in items]}
@@ -139,7 +139,7 @@ class Outcome:
     batch: Batch
     final_flow: Tensor
     pose_flow: Tensor
-    answer: Dict[str, Any]
+    answer: dict[str, Any]
 
 
 def relative_pose(pose0: Tensor, pose1: Tensor) -> Tensor:
@@ -201,7 +201,7 @@ def outcomes(
                 yield run(model, path_b(batch, top_num_frames))
 
 
-def evaluate(model: Any, folder: Path, **layout: Any) -> Dict[str, Any]:
+def evaluate(model: Any, folder: Path, **layout: Any) -> dict[str, Any]:
     """`eval.py data_mode=val`: scores of all frames to evaluate; `layout` as for `outcomes`."""
     metrics = SceneFlowMetrics("opensceneflow")
     for outcome in outcomes(model, folder, **layout):

@@ -7,7 +7,7 @@ import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
-from typing import Any, Dict, List, Sequence, Tuple
+from typing import Any, List, Sequence
 
 import numpy as np
 import pytest
@@ -63,7 +63,7 @@ def make_frame(number: int, sweep: Sweep, ego_to_global: np.ndarray, sensor_to_e
     return SimpleNamespace(pc=pc, log_id="log", log_idx=number, log_timestamp=sweep.timestamp_ns)
 
 
-def make_frames(sweeps: Sequence[Sweep], origin: int = -1) -> List[SimpleNamespace]:
+def make_frames(sweeps: Sequence[Sweep], origin: int = -1) -> list[SimpleNamespace]:
     poses = relative_to(list(sweeps), origin)
     return [make_frame(number, sweep, own) for number, (sweep, own) in enumerate(zip(sweeps, poses))]
 
@@ -140,7 +140,7 @@ class DataSet(List[List[SimpleNamespace]]):
         return SimpleNamespace(name=self.loader)
 
     def evaluator(self) -> Any:
-        taken: Dict[Tuple[str, int], Flow] = {}
+        taken: dict[tuple[str, int], Flow] = {}
         store = lambda flow, frame: taken.__setitem__((frame.log_id, frame.log_idx), flow)  # noqa: E731
         return SimpleNamespace(taken=taken, eval=store)
 
@@ -210,7 +210,7 @@ def make_data_set(bsfe: ModuleType, raw: Path, truth: Path, kind: str = "buckete
     )
 
 
-def check_scores(bsfe: ModuleType, estimate: Any, raw: Path, truth: Path, frames: List[EvalFrame]) -> None:
+def check_scores(bsfe: ModuleType, estimate: Any, raw: Path, truth: Path, frames: list[EvalFrame]) -> None:
     """Their evaluator over their data set with our estimator, against our evaluation of our frames."""
     ours = score("bucketed_scene_flow_eval", frames)
     evaluator = estimate.evaluate(make_data_set(bsfe, raw, truth))

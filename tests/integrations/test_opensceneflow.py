@@ -10,7 +10,7 @@ import json
 import sys
 import warnings
 from pathlib import Path
-from typing import Any, Dict, List, Optional
+from typing import Any
 
 import numpy as np
 import pytest
@@ -37,7 +37,7 @@ from cflow_torch.types import Sweep
 
 SMALL = {"pixel_sizes": [0.25], "point_cloud_range": list(RANGE)}
 KEYS = {"method": "keypoints", "patch_size": 11, "ratio_threshold": 1.0}
-VARIANTS: Dict[str, Dict[str, Any]] = {
+VARIANTS: dict[str, dict[str, Any]] = {
     "dense": {"method": "dense", "num_frames": 6, **SMALL, "max_extent": 5.0},
     # Batches hold no ground, so there is nothing to stand out of.
     "verified": {"preset": "fast", "num_frames": 6, **SMALL, "min_height": None, "significance": 0.0},
@@ -65,7 +65,7 @@ class SmallDrive:
     def sweep(self, index: int) -> Sweep:
         return self._sweeps[index]
 
-    def labels(self, index: int) -> Optional[FlowLabels]:
+    def labels(self, index: int) -> FlowLabels | None:
         """Some truth, which no method reads."""
         if index == len(self._sweeps) - 1:
             return None
@@ -95,7 +95,7 @@ def _same_argv(monkeypatch: pytest.MonkeyPatch) -> None:
 # ---------------------------------------------------------------------------------------------- the module: same flow
 
 
-def answer(model: nn.Module, batch: osf.Batch) -> Dict[str, List[Tensor]]:
+def answer(model: nn.Module, batch: osf.Batch) -> dict[str, list[Tensor]]:
     with torch.inference_mode():
         return model(batch)
 
@@ -206,7 +206,7 @@ def test_less_history_than_asked_for_is_said_once(small: Path) -> None:
     assert same_bits(found, core(small, "dense", 5, 2)) and same_bits(again, found)
 
 
-BAD: Dict[str, Any] = {
+BAD: dict[str, Any] = {
     "missing": (None, ["pc0", "pose0", "poseh4"]),
     "NaN": (lambda t: t * float("nan"), ["pose1", "poseh3"]),
     "one dimension too few": (lambda t: t[0], ["pc0", "pose0", "gm0"]),
@@ -239,7 +239,7 @@ def test_settings_of_the_method_and_others() -> None:
     with pytest.warns(UserWarning, match=names) as said:
         model = CFlow(num_iters=4, proof=False, patch_size=11, labeling="kornia", significance=2.0)
     assert len(said) == 1 and model.config == make_config(significance=2.0)
-    wrong: List[Dict[str, Any]] = [{"output": "half"}, {"num_frames": 1}, {"num_frames": 2.5}, {"ego_T_lidar": "yes"}]
+    wrong: list[dict[str, Any]] = [{"output": "half"}, {"num_frames": 1}, {"num_frames": 2.5}, {"ego_T_lidar": "yes"}]
     wrong += [{"method": "keypoints", "num_frames": 6}, {"method": "dense", "preset": "fast"}]
     for settings in (*wrong, {"pixel_sizes": [0.1, 0.2]}, {"ego_T_lidar": [[1, 2], [3, 4]]}):
         with pytest.raises(CFlowError):

@@ -14,7 +14,7 @@ import shutil
 import sys
 import zipfile
 from pathlib import Path
-from typing import Any, Dict, Iterator, List
+from typing import Any, Iterator
 
 import numpy as np
 import pytest
@@ -86,12 +86,12 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def scores(harness: Harness, checkpoint: Path, data: Path) -> List[Dict[str, float]]:
+def scores(harness: Harness, checkpoint: Path, data: Path) -> list[dict[str, float]]:
     """What eval.py prints for the drive."""
     return read_scores(harness.run("val", "eval.py", "model=cflow", *places(checkpoint, data), TARGET_PIXELS))
 
 
-def places(checkpoint: Path, data: Path) -> List[str]:
+def places(checkpoint: Path, data: Path) -> list[str]:
     return [f"checkpoint={checkpoint}", f"dataset_path={data}"]
 
 
@@ -100,13 +100,13 @@ def module(preset: str = "default", num_frames: int = 6, **settings: Any) -> CFl
     return CFlow(preset=preset, **settings, num_frames=num_frames, ego_T_lidar="auto")
 
 
-def replayed(folder: Path, model: CFlow) -> Dict[str, float]:
+def replayed(folder: Path, model: CFlow) -> dict[str, float]:
     """Scores by the miniature harness, as they would be printed."""
     frames = model.config.num_history + 2
     return printed(osf.evaluate(model, folder / "val", num_frames=frames, top_num_frames=frames))
 
 
-def approximately(scores: Dict[str, float]) -> Any:
+def approximately(scores: dict[str, float]) -> Any:
     return pytest.approx(scores, rel=1e-5, abs=1e-9, nan_ok=True)  # the last digit may be rounded the other way
 
 
@@ -114,7 +114,7 @@ def approximately(scores: Dict[str, float]) -> Any:
 
 
 @pytest.mark.slow
-def test_eval_prints_what_the_replay_computes(scores: List[Dict[str, float]], data: Path) -> None:
+def test_eval_prints_what_the_replay_computes(scores: list[dict[str, float]], data: Path) -> None:
     assert scores == [approximately(replayed(data, module(pixel_sizes=PIXELS)))]
 
 
@@ -132,14 +132,14 @@ def test_eval_of_the_real_pair(harness: Harness, checkpoint: Path, av2_folder: P
 
 
 @pytest.mark.slow
-def test_runner_without_checkpoint(harness: Harness, data: Path, scores: List[Dict[str, float]]) -> None:
+def test_runner_without_checkpoint(harness: Harness, data: Path, scores: list[dict[str, float]]) -> None:
     """The second path: history comes with its ground. The same flow, so the same digits."""
     overrides = ["model=cflow", "model.iter_only=true", f"dataset_path={data}", "num_frames=6", "+num_workers=0"]
     text = harness.run("runner", "eval.py", *overrides, TARGET_PIXELS, runner=True)
     assert read_scores(text) == [approximately(scores[0])]
 
 
-def replayed_outcomes(folder: Path, eval: bool) -> Dict[str, osf.Outcome]:
+def replayed_outcomes(folder: Path, eval: bool) -> dict[str, osf.Outcome]:
     """Time stamp -> what the miniature harness makes of our flow."""
     found = osf.outcomes(module(pixel_sizes=PIXELS), folder, num_frames=6, top_num_frames=6, eval=eval)
     return {outcome.batch["timestamp"]: outcome for outcome in found}

@@ -6,7 +6,7 @@ import sys
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from types import ModuleType
-from typing import Any, Dict, List, Sequence
+from typing import Any, Sequence
 
 import numpy as np
 import pytest
@@ -54,7 +54,7 @@ class TorchFullFrameOutputSequence:
 
 
 @pytest.fixture(autouse=True)
-def zoo(monkeypatch: pytest.MonkeyPatch) -> Dict[str, Any]:
+def zoo(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """A checkout's packages `dataloaders` and `models`; returns the table by which a config finds a model."""
     dataloaders, models = ModuleType("dataloaders"), ModuleType("models")
     dataloaders.TorchFullFrameOutputSequence = TorchFullFrameOutputSequence  # type: ignore[attr-defined]
@@ -76,7 +76,7 @@ def make_sequence(sweeps: Sequence[Sweep], loader: LoaderType = LoaderType.CAUSA
     return TorchFullFrameInputSequence(points, mask, torch.tensor(sensor).float(), torch.tensor(poses).float(), loader)
 
 
-def run(sequences: Any, num_history: int = 0, **settings: Any) -> List[TorchFullFrameOutputSequence]:
+def run(sequences: Any, num_history: int = 0, **settings: Any) -> list[TorchFullFrameOutputSequence]:
     return CorrelationFlowModel(**{**SETTINGS, "num_history": num_history, **settings})("val", sequences, None)
 
 
@@ -119,7 +119,7 @@ def test_a_batch_of_sequences_of_any_length_and_kind() -> None:
         np.testing.assert_array_equal(output.valid_flow_mask.numpy(), alone.valid_flow_mask.numpy())
 
 
-def test_a_config_finds_it_once_it_is_registered(zoo: Dict[str, Any]) -> None:
+def test_a_config_finds_it_once_it_is_registered(zoo: dict[str, Any]) -> None:
     register()
     model = zoo["correlationflow"](preset="fast", max_speed=30.0, device="cpu")
     assert model.sequence_flow.model.config.max_speed == 30.0 and model.sequence_flow.num_history == 2
@@ -146,7 +146,7 @@ def test_outside_of_a_checkout(monkeypatch: pytest.MonkeyPatch) -> None:
         ({"loader_type": "causal"}, r"loader_type is None: give LoaderType\.CAUSAL"),
     ],
 )
-def test_bad_sequences_are_refused_by_the_name_of_the_field(changes: Dict[str, Any], complaint: str) -> None:
+def test_bad_sequences_are_refused_by_the_name_of_the_field(changes: dict[str, Any], complaint: str) -> None:
     good = make_sequence(drive(2))
     with pytest.raises(CFlowError, match=complaint):
         run([good, replace(good, **changes)])

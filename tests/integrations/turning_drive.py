@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Dict, List
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,10 +11,10 @@ from scenes import RANGE, box, pose
 from cflow_torch import CorrelationFlow, Sweep, Window, make_config
 
 YAW_STEP = 0.1  # rad, 5.7 degrees between two sweeps
-SETTINGS: Dict[str, Any] = {"preset": "paper", "pixel_sizes": (0.25,), "point_cloud_range": RANGE, "max_extent": 5.0}
+SETTINGS: dict[str, Any] = {"preset": "paper", "pixel_sizes": (0.25,), "point_cloud_range": RANGE, "max_extent": 5.0}
 
 
-def drive(num_sweeps: int, velocity: float = 0.5, yaw_step: float = YAW_STEP, noise: float = 0.02) -> List[Sweep]:
+def drive(num_sweeps: int, velocity: float = 0.5, yaw_step: float = YAW_STEP, noise: float = 0.02) -> list[Sweep]:
     """Sweeps, oldest first. Numbers of points differ, order is shuffled, a tenth is ground, one row is NaN."""
     rng = np.random.default_rng(7)
     wall = np.stack([np.linspace(-8, 8, 200), np.full(200, 5.0), rng.uniform(0, 2, 200)], 1)
@@ -34,7 +34,7 @@ def drive(num_sweeps: int, velocity: float = 0.5, yaw_step: float = YAW_STEP, no
     return sweeps
 
 
-def expected(sweeps: List[Sweep], index: int, num_history: int) -> np.ndarray:
+def expected(sweeps: list[Sweep], index: int, num_history: int) -> np.ndarray:
     """(N, 3) float64: the package's own residual of sweep `index`, turned by R^T into the axes of t."""
     window = Window(sweeps[index], sweeps[index + 1], tuple(sweeps[max(index - num_history, 0) : index][::-1]))
     settings = {key: value for key, value in SETTINGS.items() if key != "preset"}
@@ -44,7 +44,7 @@ def expected(sweeps: List[Sweep], index: int, num_history: int) -> np.ndarray:
     return np.stack([T_ego1_ego0[:3, :3].T @ row for row in residual])
 
 
-def relative_to(sweeps: List[Sweep], index: int) -> List[np.ndarray]:
+def relative_to(sweeps: list[Sweep], index: int) -> list[np.ndarray]:
     """Poses of the sweeps, the ego frame of one of them taken as the global frame."""
     return [np.linalg.inv(np.asarray(sweeps[index].pose)) @ np.asarray(sweep.pose) for sweep in sweeps]
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Dict, List, Tuple
-
 import numpy as np
 import pytest
 import torch
@@ -23,14 +21,14 @@ def matched(images: np.ndarray, images1: np.ndarray, reach: float, **overrides) 
 # ---------------------------------------------------------------------------------------------------------- by hand
 
 
-def hand_made(places: List[List[int]], ones: List[int]) -> KeyPoints:
+def hand_made(places: list[list[int]], ones: list[int]) -> KeyPoints:
     """Key points whose 11 x 11 descriptors have their first pixels set."""
     row, col = torch.tensor(places, dtype=torch.int64).reshape(-1, 2).unbind(1)
     patch = torch.tensor([[1] * n + [0] * (121 - n) for n in ones], dtype=torch.uint8).reshape(-1, 121)
     return KeyPoints(row * 40_000 + col, torch.zeros_like(row), row, col, patch, patch.sum(1))
 
 
-def shifts(pc0: KeyPoints, pc1: KeyPoints, reach: float = 10.0, ratio: float = 1.1) -> Dict[int, Tuple[int, int]]:
+def shifts(pc0: KeyPoints, pc1: KeyPoints, reach: float = 10.0, ratio: float = 1.1) -> dict[int, tuple[int, int]]:
     settings = config("keypoints", patch_size=11, ratio_threshold=ratio)
     found = match(pc0, pc1, torch.tensor([reach], dtype=torch.float64), settings)
     return dict(zip(found.source.tolist(), map(tuple, found.shift.tolist())))

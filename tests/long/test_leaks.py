@@ -12,7 +12,7 @@ import threading
 import warnings
 from functools import _lru_cache_wrapper
 from pathlib import Path
-from typing import Any, Callable, Dict, Iterator, List
+from typing import Any, Callable, Iterator
 
 import numpy as np
 import pytest
@@ -96,7 +96,7 @@ def logs(root: Path) -> Iterator[None]:
                 read_flow(broken)
 
 
-def held() -> Dict[str, float]:
+def held() -> dict[str, float]:
     """What this process holds now."""
     gc.collect()
     objects = gc.get_objects()
@@ -110,9 +110,9 @@ def held() -> Dict[str, float]:
     }
 
 
-def grown(windows: Iterator[None]) -> List[str]:
+def grown(windows: Iterator[None]) -> list[str]:
     """Names of what grew between a fifth of the windows and their end."""
-    early: Dict[str, float] = {}
+    early: dict[str, float] = {}
     for number in range(WINDOWS):
         next(windows)
         if number == WINDOWS // 5:
@@ -123,9 +123,9 @@ def grown(windows: Iterator[None]) -> List[str]:
 
 
 @pytest.fixture()
-def unclosed(monkeypatch: pytest.MonkeyPatch) -> Iterator[List[str]]:
+def unclosed(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
     """Files that nobody closed but the collector."""
-    found: List[str] = []
+    found: list[str] = []
     monkeypatch.setattr(sys, "unraisablehook", lambda told: found.append(str(told.exc_value)))
     with warnings.catch_warnings():
         warnings.simplefilter("error", ResourceWarning)
@@ -137,12 +137,12 @@ def test_estimates_pile_up_nothing(preset: str) -> None:
     assert grown(estimates(preset)) == []
 
 
-def test_logs_pile_up_nothing(tmp_path: Path, unclosed: List[str]) -> None:
+def test_logs_pile_up_nothing(tmp_path: Path, unclosed: list[str]) -> None:
     assert grown(logs(tmp_path)) == [] and unclosed == []
 
 
 @pytest.mark.parametrize("profile", ["av2", "nuscenes", "truckscenes", "waymo", "aevascenes"])
-def test_every_reader_closes_its_files(tmp_path: Path, profile: str, unclosed: List[str]) -> None:
+def test_every_reader_closes_its_files(tmp_path: Path, profile: str, unclosed: list[str]) -> None:
     """Also those that turn out to be broken, one file after the other."""
     from cflow_torch.simulator.benchmark import benchmark_logs, format_of
 
@@ -166,7 +166,7 @@ def test_every_reader_closes_its_files(tmp_path: Path, profile: str, unclosed: L
     assert unclosed == []
 
 
-def read_all(data_set: str, root: Path, settings: Dict[str, Any]) -> None:
+def read_all(data_set: str, root: Path, settings: dict[str, Any]) -> None:
     """Open every log, read a window and labels; what is broken may refuse."""
     try:
         for source in find_sources(data_set, root):

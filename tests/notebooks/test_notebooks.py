@@ -6,7 +6,7 @@ import json
 import re
 import tempfile
 from pathlib import Path
-from typing import Any, Dict, List
+from typing import Any
 
 import pytest
 
@@ -16,7 +16,7 @@ SLOW = ("05_evaluation", "06_own_sensor")  # call the command line, which starts
 MACHINE_PATHS = re.compile(r"/home/|/root/|/Users/|/work/|/tmp/|[A-Z]:\\\\")
 
 
-def cells(name: str) -> List[Dict[str, Any]]:
+def cells(name: str) -> list[dict[str, Any]]:
     """Its cells, their source as one text."""
     notebook = json.loads((FOLDER / f"{name}.ipynb").read_text(encoding="utf-8"))
     return [{**cell, "source": "".join(cell["source"])} for cell in notebook["cells"]]
@@ -42,7 +42,7 @@ def test_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd:
     monkeypatch.chdir(here)
     monkeypatch.setenv("CFLOW_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    variables: Dict[str, Any] = {"__name__": "__main__"}
+    variables: dict[str, Any] = {"__name__": "__main__"}
     for number, cell in enumerate(cells(name)):
         if cell["cell_type"] == "code":
             source = cell["source"].replace("%matplotlib inline\n", "")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Callable, Dict
+from typing import Callable
 
 import numpy as np
 import pytest
@@ -126,7 +126,7 @@ def percolation(size: int) -> np.ndarray:
     return np.random.default_rng(0).random((size, size)) < 0.593
 
 
-SHAPES: Dict[str, Callable[[int], np.ndarray]] = {shape.__name__: shape for shape in (spiral, serpentine, percolation)}
+SHAPES: dict[str, Callable[[int], np.ndarray]] = {shape.__name__: shape for shape in (spiral, serpentine, percolation)}
 
 
 @pytest.mark.parametrize("shape", SHAPES)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import List, Sequence, Tuple
+from typing import Sequence
 
 from oracle.height_slices import Cell, Pixel, SlicedSweeps, Vector, count
 
 LEAST_TRAVEL = 1.2  # metres
 
 
-def slides_along_itself(sweeps: SlicedSweeps, members: Sequence[Pixel], candidates: Sequence[Vector]) -> List[bool]:
+def slides_along_itself(sweeps: SlicedSweeps, members: Sequence[Pixel], candidates: Sequence[Vector]) -> list[bool]:
     """Which motions of a component are explained by a line that stays where it is.
 
     Returns:
@@ -29,7 +29,7 @@ def slides_along_itself(sweeps: SlicedSweeps, members: Sequence[Pixel], candidat
     return result
 
 
-def principal_axis(cells: Sequence[Cell], size: float) -> Tuple[bool, float, float]:
+def principal_axis(cells: Sequence[Cell], size: float) -> tuple[bool, float, float]:
     """Whether pixels lie along a line, and its direction (y, x), of any length.
 
     Convention: second moments; standard deviation at most 0.3 m across and at least 1 m along.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Dict, List, Optional, Sequence, Tuple
+from typing import Sequence
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from oracle.pixels import bounding_box, occupancy, search_radius
 LARGEST_BOX = 1 << 12  # pixels: a node whose box is larger is correlated at a coarser scale
 
 
-def propose(nodes: Sequence[Node], config: VerifiedConfig) -> Tuple[List[List[Vector]], List[float]]:
+def propose(nodes: Sequence[Node], config: VerifiedConfig) -> tuple[list[list[Vector]], list[float]]:
     """What each node may have done, (y, x) finest pixels per interval, in the order in which ties are decided; and the
     NCC of each with the nearest sweep that has it."""
     own, scores = [], []
@@ -34,7 +34,7 @@ def propose(nodes: Sequence[Node], config: VerifiedConfig) -> Tuple[List[List[Ve
     return candidates, scores
 
 
-def list_motions(estimates: Sequence[Optional[Vector]], intervals: Sequence[float]) -> List[Vector]:
+def list_motions(estimates: Sequence[Vector | None], intervals: Sequence[float]) -> list[Vector]:
     """The pool of all estimates (Sec. leverage_past_pcs), if there is more than one sweep; each one by its intervals.
 
     Args:
@@ -66,13 +66,13 @@ def block_of(node: Node, config: VerifiedConfig) -> int:
     return next((block for block in reversed(blocks) if area(block) <= LARGEST_BOX), blocks[0])
 
 
-def find_peak(node: Node, block: int, m: int, config: VerifiedConfig) -> Optional[Tuple[Vector, float]]:
+def find_peak(node: Node, block: int, m: int, config: VerifiedConfig) -> tuple[Vector, float] | None:
     """Displacement (y, x) of a node from sweep m to t+1, finest pixels, and its NCC; None without pixels at m.
 
     Convention: a parabola through the counts of slices that the pixels of the node share gives the part of a pixel;
         coarse pixels have all slices. A peak at no shift stays there.
     """
-    images: List[Dict[Cell, int]] = [{} for _ in node.sweeps.images]
+    images: list[dict[Cell, int]] = [{} for _ in node.sweeps.images]
     for step, r, c in node.members:
         images[step][r // block, c // block] = node.sweeps.at(step, r, c) if block == 1 else (1 << NUM_SLICES) - 1
     if not images[m]:

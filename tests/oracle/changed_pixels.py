@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Dict, List, NamedTuple, Sequence, Set, Tuple
+from typing import NamedTuple, Sequence
 
 import numpy as np
 
@@ -17,8 +17,8 @@ class Change(NamedTuple):
     """Pixels of which a slice is missing in another sweep and not hidden there, and those of which one is missing in
     another sweep that saw its place."""
 
-    is_missing: Set[Pixel]
-    has_changed: Set[Pixel]
+    is_missing: set[Pixel]
+    has_changed: set[Pixel]
 
 
 def find_changed(sweeps: SlicedSweeps, in_sight: Sequence[np.ndarray], origins: Sequence[Sequence[float]]) -> Change:
@@ -32,7 +32,7 @@ def find_changed(sweeps: SlicedSweeps, in_sight: Sequence[np.ndarray], origins: 
     change = Change(set(), set())
     if len(sweeps.images) == 2:
         return change
-    lowest: Dict[Pixel, float] = {}
+    lowest: dict[Pixel, float] = {}
     for m, cloud in enumerate(sweeps.clouds):
         for x, y, z, _ in cloud:
             pixel = (m, *sweeps.pixel(x, y))
@@ -40,15 +40,15 @@ def find_changed(sweeps: SlicedSweeps, in_sight: Sequence[np.ndarray], origins: 
     height = sensor_height(in_sight[0])
     for other, (cloud, origin) in enumerate(zip(in_sight, origins)):
         sensor = np.array([*origin]) + (0, 0, height)
-        pixels: List[Pixel] = []
-        places: List[Tuple[float, float, float]] = []
+        pixels: list[Pixel] = []
+        places: list[tuple[float, float, float]] = []
         for pixel in sweeps.pixels():
             missing = sweeps.at(*pixel) & ~sweeps.around(other, *pixel[1:])
             for part in range(NUM_SLICES):
                 if missing >> part & 1:
                     pixels.append(pixel)
                     places.append(middle_of(sweeps, pixel, part, lowest[pixel]))
-        farthest: Dict[Cell, float] = {}
+        farthest: dict[Cell, float] = {}
         for direction, distance in zip(*directions(cloud, sensor)):
             farthest[direction] = max(distance, farthest.get(direction, 0.0))
         for pixel, direction, distance in zip(pixels, *directions(np.array(places).reshape(-1, 3), sensor)):
@@ -60,7 +60,7 @@ def find_changed(sweeps: SlicedSweeps, in_sight: Sequence[np.ndarray], origins: 
     return change
 
 
-def middle_of(sweeps: SlicedSweeps, pixel: Pixel, part: int, lowest: float) -> Tuple[float, float, float]:
+def middle_of(sweeps: SlicedSweeps, pixel: Pixel, part: int, lowest: float) -> tuple[float, float, float]:
     """x, y, z of the middle of a slice, the first one at or above the lowest point of its pixel."""
     _, row, col = pixel
     first = math.floor(lowest / SLICE_HEIGHT)
@@ -69,7 +69,7 @@ def middle_of(sweeps: SlicedSweeps, pixel: Pixel, part: int, lowest: float) -> T
     return x, y, height * SLICE_HEIGHT
 
 
-def directions(places: np.ndarray, sensor: np.ndarray) -> Tuple[List[Cell], List[float]]:
+def directions(places: np.ndarray, sensor: np.ndarray) -> tuple[list[Cell], list[float]]:
     """Bin of the range image and distance over ground of places (N, 3), as a sensor sees them; in float32.
 
     Convention: azimuth is y / (|x| + |y|), elevation is height over distance.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from typing import Dict, List, Sequence, Tuple
+from typing import Sequence
 
 import numpy as np
 
@@ -30,7 +30,7 @@ def erode(image: np.ndarray) -> np.ndarray:
     return result
 
 
-def connected_components(image: np.ndarray, connectivity: int) -> Tuple[np.ndarray, int]:
+def connected_components(image: np.ndarray, connectivity: int) -> tuple[np.ndarray, int]:
     """Breadth-first labelling of a binary image.
 
     Args:
@@ -98,7 +98,7 @@ def cluster(
     # Number the components that can move: a pixel at t+1 and a pixel before.
     at_t1 = set(labels[images[0]].tolist())
     before = {label for image in images[1:] for label in labels[image].tolist()}
-    numbers: Dict[int, int] = {}
+    numbers: dict[int, int] = {}
     result = np.full(labels.shape, -1, dtype=np.int64)
     for r, c in np.argwhere(aggregated).tolist():
         label = int(labels[r, c])
@@ -109,7 +109,7 @@ def cluster(
 
 def cluster_hdbscan(
     points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], config: DenseConfig
-) -> List[np.ndarray]:
+) -> list[np.ndarray]:
     """HDBSCAN of the aggregated points in place of Alg. clustering (Table which_clustering_method).
 
     Args:

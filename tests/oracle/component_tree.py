@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from itertools import product
-from typing import Any, Dict, Iterable, List, NamedTuple, Optional, Sequence, Set, Tuple
+from typing import Any, Iterable, NamedTuple, Sequence, Tuple
 
 from cflow_torch.config import VerifiedConfig
 from oracle.aperture import both_ends_move
@@ -28,7 +28,7 @@ class Node(NamedTuple):
 
     members: Cells
     level: int
-    parent: Optional[int]
+    parent: int | None
     travels: bool
     sweeps: SlicedSweeps
 
@@ -42,12 +42,12 @@ class Tree(NamedTuple):
         may_move: pixels of the finest dilated components that may move, long ones included.
     """
 
-    levels: List[List[Cells]]
-    nodes: List[Node]
-    may_move: Set[Pixel]
+    levels: list[list[Cells]]
+    nodes: list[Node]
+    may_move: set[Pixel]
 
 
-def join(cells: Iterable[Tuple[int, ...]], reach: int) -> Dict[Any, int]:
+def join(cells: Iterable[tuple[int, ...]], reach: int) -> dict[Any, int]:
     """Component of each cell; cells join whose indices differ by at most `reach`. Numbered by their first cells."""
     remaining, result, number = set(cells), {}, 0  # type: ignore[var-annotated]
     for seed in sorted(remaining):
@@ -65,13 +65,13 @@ def join(cells: Iterable[Tuple[int, ...]], reach: int) -> Dict[Any, int]:
     return result
 
 
-def components(pixels: Sequence[Pixel], block: int, reach: int) -> List[Cells]:
+def components(pixels: Sequence[Pixel], block: int, reach: int) -> list[Cells]:
     """Components of pixels of all sweeps together, at pixels of `block` x `block` finest ones.
 
     Dilation by a 3 x 3 square is reach 3: two dilated squares touch if their pixels are at most three apart.
     """
     component = join({(r // block, c // block) for _, r, c in pixels}, reach)
-    found: Dict[int, List[Pixel]] = {}
+    found: dict[int, list[Pixel]] = {}
     for m, r, c in sorted(pixels):
         found.setdefault(component[r // block, c // block], []).append((m, r, c))
     return [tuple(members) for members in found.values()]
@@ -118,7 +118,7 @@ def length(members: Cells) -> int:
     return max((max(line) - min(line) + 1 for line in zip(*cells)), default=0)
 
 
-def cut(nodes: Sequence[Node], evidence: Sequence[int]) -> List[Optional[int]]:
+def cut(nodes: Sequence[Node], evidence: Sequence[int]) -> list[int | None]:
     """The node whose motion each node takes, None = it has none.
 
     A node wins if it has more evidence than its parts together; the coarsest winner around a node counts. A part counts
@@ -129,7 +129,7 @@ def cut(nodes: Sequence[Node], evidence: Sequence[int]) -> List[Optional[int]]:
         parent = nodes[i].parent
         if parent is not None:
             parts[parent] += max(max(evidence[i], parts[i]) - PRICE, 0)
-    winner: List[Optional[int]] = []
+    winner: list[int | None] = []
     for i, node in enumerate(nodes):
         around = None if node.parent is None else winner[node.parent]
         winner.append(around if around is not None else i if evidence[i] > parts[i] else None)
@@ -138,7 +138,7 @@ def cut(nodes: Sequence[Node], evidence: Sequence[int]) -> List[Optional[int]]:
 
 def select_objects(
     nodes: Sequence[Node], evidence: Sequence[int], num_levels: int, plain: Sequence[Cells], sweeps: SlicedSweeps
-) -> Tuple[Dict[Pixel, int], List[Optional[int]]]:
+) -> tuple[dict[Pixel, int], list[int | None]]:
     """What moves together or is static together, among the pixels of a window or of its copies.
 
     Args:
@@ -154,9 +154,9 @@ def select_objects(
     evidence; else it is static with its plain component, if that is linked.
     """
     winner = cut(nodes, evidence)
-    of_finest: Dict[Pixel, Optional[int]] = {}
+    of_finest: dict[Pixel, int | None] = {}
     number_of = {node.members: i for i, node in enumerate(nodes) if node.level == num_levels - 1}
-    name: Dict[Pixel, Any] = {}
+    name: dict[Pixel, Any] = {}
     for members in filter(is_linked, plain):
         name.update(dict.fromkeys(members, number_of.get(members, members)))
     for i, node in enumerate(nodes):
@@ -165,6 +165,6 @@ def select_objects(
         elif node.sweeps is sweeps and evidence[i] > 0:
             name.update(dict.fromkeys(node.members, i))
     name.update({pixel: i for pixel, i in of_finest.items() if i is not None})
-    number: Dict[Any, int] = {}
+    number: dict[Any, int] = {}
     object_of = {pixel: number.setdefault(name[pixel], len(number)) for pixel in sorted(name)}
     return object_of, [own if isinstance(own, int) else None for own in number]

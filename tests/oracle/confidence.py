@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import Any, Dict, Sequence, Tuple
+from typing import Any, Sequence
 
 import cflow_torch
 from oracle.aperture import principal_axis
@@ -13,12 +13,12 @@ from oracle.height_slices import Cell, Pixel, SlicedSweeps, Vector, count, shift
 from oracle.paired_test import count_in_place, count_wins
 
 FILE = Path(cflow_torch.__file__).parent / "verified" / "confidence.json"
-TABLE: Dict[str, Any] = json.loads(FILE.read_text(encoding="utf-8"))
+TABLE: dict[str, Any] = json.loads(FILE.read_text(encoding="utf-8"))
 DISPLACEMENT, BLOCK = 0.4, 1.6  # metres per interval; metres
 KINDS = ("left out", "unlinked", "static", "moving")  # in the order of the table; the last has four parts
 
 
-def margin(sweeps: SlicedSweeps, members: Sequence[Pixel], motion: Vector) -> Tuple[float, bool]:
+def margin(sweeps: SlicedSweeps, members: Sequence[Pixel], motion: Vector) -> tuple[float, bool]:
     """What an object's motion loses by being displaced by 0.4 m per interval, the best of four ways, in standard
     deviations of what it finds; and whether it is dynamic. 0 for what is static.
 
@@ -38,8 +38,8 @@ def margin(sweeps: SlicedSweeps, members: Sequence[Pixel], motion: Vector) -> Tu
 
 
 def confidences(
-    sweeps: SlicedSweeps, object_of: Dict[Pixel, int], motions: Sequence[Vector], margins: Sequence[float]
-) -> Dict[Pixel, float]:
+    sweeps: SlicedSweeps, object_of: dict[Pixel, int], motions: Sequence[Vector], margins: Sequence[float]
+) -> dict[Pixel, float]:
     """Probability of every pixel of t.
 
     Args:
@@ -67,9 +67,9 @@ def confidences(
     return result
 
 
-def neighbourhoods(sweeps: SlicedSweeps, motion: Dict[Pixel, Vector]) -> Dict[Cell, Tuple[int, int]]:
+def neighbourhoods(sweeps: SlicedSweeps, motion: dict[Pixel, Vector]) -> dict[Cell, tuple[int, int]]:
     """Of each block of 1.6 m with pixels of t: slices, and how many of them t+1 has where they move to."""
-    sums: Dict[Cell, Tuple[int, int]] = {}
+    sums: dict[Cell, tuple[int, int]] = {}
     for (m, r, c), of_pixel in motion.items():
         dy, dx = shift(of_pixel, sweeps.elapsed[1])
         number, found = sums.get(_block(sweeps, r, c), (0, 0))

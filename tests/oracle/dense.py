@@ -7,7 +7,7 @@ Order of reading: general_correlation_flow -> scene_flow_1obj (Alg. scene_flow_1
 from __future__ import annotations
 
 import math
-from typing import Optional, Sequence, Tuple
+from typing import Sequence
 
 import numpy as np
 
@@ -69,10 +69,10 @@ def scene_flow_1obj(
     points_m: np.ndarray,
     points_1: np.ndarray,
     box: Box,
-    reach: Optional[float],
+    reach: float | None,
     pixel_size: float,
     config: DenseConfig,
-) -> Tuple[np.ndarray, float]:
+) -> tuple[np.ndarray, float]:
     """Alg. scene_flow_1obj: motion of one object from sweep m to sweep t+1.
 
     Args:
@@ -111,8 +111,8 @@ def scene_flow_1obj(
 
 
 def scene_flow_in_1view(
-    template: np.ndarray, target: np.ndarray, pixel_size: float, reach: Optional[float] = None
-) -> Tuple[Tuple[float, float], float]:
+    template: np.ndarray, target: np.ndarray, pixel_size: float, reach: float | None = None
+) -> tuple[tuple[float, float], float]:
     """Alg. scene_flow_1view: the displacement with the highest NCC score, Eq. displacement_in_bev.
 
     Args:
@@ -152,7 +152,7 @@ def ncc_map(template: np.ndarray, target: np.ndarray) -> np.ndarray:
     return scores
 
 
-def overlap_and_energy(template: np.ndarray, target: np.ndarray) -> Tuple[np.ndarray, np.ndarray]:
+def overlap_and_energy(template: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Numerator and right-hand energy of Eq. norm_correlation; both are counts, the images being binary.
 
     Returns:

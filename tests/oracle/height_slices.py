@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from itertools import product
-from typing import Dict, Iterable, List, NamedTuple, Sequence, Tuple
+from typing import Iterable, NamedTuple, Sequence, Tuple
 
 import numpy as np
 
@@ -40,10 +40,10 @@ class SlicedSweeps(NamedTuple):
         shape: rows and columns.
     """
 
-    clouds: List[List[Place]]
-    images: List[Dict[Cell, int]]
-    elapsed: List[float]
-    seconds: List[float]
+    clouds: list[list[Place]]
+    images: list[dict[Cell, int]]
+    elapsed: list[float]
+    seconds: list[float]
     size: float
     lower: Vector
     shape: Cell
@@ -52,16 +52,16 @@ class SlicedSweeps(NamedTuple):
         """Eq. 3d_to_bev."""
         return math.floor((y - self.lower[1]) / self.size), math.floor((x - self.lower[0]) / self.size)
 
-    def drawn(self, clouds: List[List[Place]]) -> SlicedSweeps:
+    def drawn(self, clouds: list[list[Place]]) -> SlicedSweeps:
         """The same window with other points."""
-        images: List[Dict[Cell, int]] = [{} for _ in clouds]
+        images: list[dict[Cell, int]] = [{} for _ in clouds]
         for image, cloud in zip(images, clouds):
             for x, y, z, _ in cloud:
                 cell = self.pixel(x, y)
                 image[cell] = image.get(cell, 0) | 1 << slice_of(z)
         return self._replace(clouds=clouds, images=images)
 
-    def pixels(self) -> List[Pixel]:
+    def pixels(self) -> list[Pixel]:
         """The occupied pixels, sweep by sweep, in raster order."""
         return [(m, *cell) for m, image in enumerate(self.images) for cell in sorted(image)]
 
@@ -82,7 +82,7 @@ class SlicedSweeps(NamedTuple):
         return slices
 
 
-def empty_sweeps(elapsed: List[float], seconds: List[float], config: VerifiedConfig) -> SlicedSweeps:
+def empty_sweeps(elapsed: list[float], seconds: list[float], config: VerifiedConfig) -> SlicedSweeps:
     """A window without points."""
     size, (x0, y0) = config.pixel_sizes[-1], config.point_cloud_range[:2]
     return SlicedSweeps([], [], elapsed, seconds, size, (x0, y0), bev_dims(config, size))
@@ -109,13 +109,13 @@ def vertex(low: float, middle: float, high: float) -> float:
     return min(max((high - low) / (2 * curve), -0.5), 0.5) if curve > 0 else 0.0
 
 
-def ground_heights(ground: Sequence[np.ndarray], config: VerifiedConfig) -> Dict[Cell, int]:
+def ground_heights(ground: Sequence[np.ndarray], config: VerifiedConfig) -> dict[Cell, int]:
     """Mean height, centimetres, of the ground around each block of 2 m x 2 m, from ground points of some sweeps.
 
     Convention: heights of the points of a block and of the eight around it are rounded down, then their mean is rounded
         down. Blocks with less than five such points are missing.
     """
-    heights: Dict[Cell, List[int]] = {}
+    heights: dict[Cell, list[int]] = {}
     for points in ground:
         for x, y, z in points[in_range(points, config)].tolist():
             heights.setdefault(_block(x, y, config), []).append(math.floor(z * 100))
@@ -127,7 +127,7 @@ def ground_heights(ground: Sequence[np.ndarray], config: VerifiedConfig) -> Dict
     return means
 
 
-def is_residue(points: np.ndarray, means: Dict[Cell, int], config: VerifiedConfig) -> np.ndarray:
+def is_residue(points: np.ndarray, means: dict[Cell, int], config: VerifiedConfig) -> np.ndarray:
     """(N,) bool: which of the points (N, 3) of a sweep stand on pixels that are ground.
 
     Convention: a pixel is not ground if a point of it, or of a pixel at most two rows and two columns away, lies

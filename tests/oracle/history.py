@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Sequence, Tuple
+from typing import Sequence
 
 import numpy as np
 
@@ -44,7 +44,7 @@ def median(values: Sequence[float]) -> float:
     return (ordered[middle - 1] + ordered[middle]) / 2
 
 
-def median_direction(directions: Sequence[Tuple[float, float]]) -> Tuple[float, float]:
+def median_direction(directions: Sequence[tuple[float, float]]) -> tuple[float, float]:
     """Angular median of unit vectors about their circular mean; of an even number the bisector of the middle two.
 
     Convention: equal angles keep the given order; middle two that are exactly opposite give the first of them.
@@ -55,7 +55,7 @@ def median_direction(directions: Sequence[Tuple[float, float]]) -> Tuple[float, 
     if mean_x == 0 and mean_y == 0:
         mean_x, mean_y = directions[0]
 
-    def angle(u: Tuple[float, float]) -> float:
+    def angle(u: tuple[float, float]) -> float:
         """From the mean to u, counter-clockwise."""
         return math.atan2(mean_x * u[1] - mean_y * u[0] + 0.0, mean_x * u[0] + mean_y * u[1])
 

@@ -7,7 +7,7 @@ correlation_flow_keypoints multiplies them by s.
 
 from __future__ import annotations
 
-from typing import List, NamedTuple, Sequence, Tuple
+from typing import NamedTuple, Sequence
 
 import numpy as np
 
@@ -77,7 +77,7 @@ def match_radius(config: KeypointsConfig, seconds: float, pixel_size: float) -> 
     return reach if limit is None else min(reach, limit)
 
 
-def median_of_components(ids: np.ndarray, matches: Sequence[Match]) -> List[Shift]:
+def median_of_components(ids: np.ndarray, matches: Sequence[Match]) -> list[Shift]:
     """Sec. From sparse to dense: the median flow of the matched key points of each connected component of I_t.
 
     Args:
@@ -91,7 +91,7 @@ def median_of_components(ids: np.ndarray, matches: Sequence[Match]) -> List[Shif
         Medians of dx, of dy and of the scores, separately; of an even number the mean of the middle two. A
         component without a match has shift 0 and score 0.
     """
-    members: List[List[Match]] = [[] for _ in range(int(ids.max(initial=-1)) + 1)]
+    members: list[list[Match]] = [[] for _ in range(int(ids.max(initial=-1)) + 1)]
     for match in matches:
         members[ids[match.row, match.column]].append(match)
     shifts = []
@@ -104,7 +104,7 @@ def median_of_components(ids: np.ndarray, matches: Sequence[Match]) -> List[Shif
     return shifts
 
 
-def nearest_match(image: np.ndarray, matches: Sequence[Match]) -> Tuple[np.ndarray, List[Shift]]:
+def nearest_match(image: np.ndarray, matches: Sequence[Match]) -> tuple[np.ndarray, list[Shift]]:
     """Every occupied pixel takes the flow of the nearest matched key point (Table keypoint_sparse2dense).
 
     Args:

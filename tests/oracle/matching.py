@@ -6,7 +6,7 @@ Pixels are (row, column), displacements are pixels, t -> t+1.
 from __future__ import annotations
 
 import math
-from typing import List, NamedTuple, Tuple
+from typing import NamedTuple, Tuple
 
 import numpy as np
 
@@ -85,7 +85,7 @@ class Match(NamedTuple):
     score: float
 
 
-def match_keypoints(image: np.ndarray, image1: np.ndarray, reach: float, config: KeypointsConfig) -> List[Match]:
+def match_keypoints(image: np.ndarray, image1: np.ndarray, reach: float, config: KeypointsConfig) -> list[Match]:
     """Sec. Matching keypoints: Eq. best_match of every key point of t, then the ratio test.
 
     Args:
@@ -118,7 +118,7 @@ def match_keypoints(image: np.ndarray, image1: np.ndarray, reach: float, config:
     return matches
 
 
-def rank_candidates(at_t: Keypoints, number: int, at_t1: Keypoints, reach: float) -> List[Candidate]:
+def rank_candidates(at_t: Keypoints, number: int, at_t1: Keypoints, reach: float) -> list[Candidate]:
     """Key points of t+1 within reach of one key point of t, the best match first (Eq. best_match).
 
     Args:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from itertools import product
-from typing import Dict, List, Set, Tuple
 
 from oracle.component_tree import Node, is_linked, join
 from oracle.height_slices import SLICE_HEIGHT, Cell, Pixel, Place, SlicedSweeps
@@ -15,7 +14,7 @@ SQUARE = 10  # cells a side of a square that has one height of the ground
 GAP, HIGHEST_FOOT, SMALLEST, LARGEST = 3, 2, 1, 10  # slices
 
 
-def find_overhung(sweeps: SlicedSweeps, may_move: Set[Pixel], level: int) -> Tuple[SlicedSweeps, List[Node]]:
+def find_overhung(sweeps: SlicedSweeps, may_move: set[Pixel], level: int) -> tuple[SlicedSweeps, list[Node]]:
     """Copies of the points that lie under something, drawn by themselves, and the components that they make.
 
     Args:
@@ -32,8 +31,8 @@ def find_overhung(sweeps: SlicedSweeps, may_move: Set[Pixel], level: int) -> Tup
     cells = cells_of([place for _, place in points], sweeps)
     component = join(cells, 1)
     wanted = components_under(component)
-    copied: List[List[Place]] = [[] for _ in sweeps.clouds]
-    owner: Dict[Pixel, int] = {}
+    copied: list[list[Place]] = [[] for _ in sweeps.clouds]
+    owner: dict[Pixel, int] = {}
     for (m, place), cell in zip(points, cells):
         if component[cell] in wanted:
             pixel = (m, *sweeps.pixel(place.x, place.y))
@@ -44,7 +43,7 @@ def find_overhung(sweeps: SlicedSweeps, may_move: Set[Pixel], level: int) -> Tup
     return copies, [Node(members, level, None, False, copies) for members in parts if is_linked(members)]
 
 
-def cells_of(places: List[Place], sweeps: SlicedSweeps) -> List[Tuple[int, ...]]:
+def cells_of(places: list[Place], sweeps: SlicedSweeps) -> list[tuple[int, ...]]:
     """Row and column, counted from one cell outside the region, and slice above the lowest one, of some points."""
     (x0, y0), heights = sweeps.lower, [math.floor(place.z / SLICE_HEIGHT) for place in places]
     lowest = min(heights, default=0)
@@ -54,9 +53,9 @@ def cells_of(places: List[Place], sweeps: SlicedSweeps) -> List[Tuple[int, ...]]
     ]
 
 
-def components_under(component: Dict[Tuple[int, ...], int]) -> Set[int]:
+def components_under(component: dict[tuple[int, ...], int]) -> set[int]:
     """Components that lie under another one and over none, and are where and as tall as what moves on the ground."""
-    ground: Dict[Cell, int] = {}
+    ground: dict[Cell, int] = {}
     under, over = set(), set()
     cells = sorted(component)
     for row, col, height in cells:

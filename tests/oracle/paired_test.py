@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Iterable, Sequence, Tuple
+from typing import Iterable, Sequence
 
 from oracle.height_slices import Pixel, SlicedSweeps, Vector, count, shift
 
 
-def count_wins(sweeps: SlicedSweeps, members: Iterable[Pixel], motion: Vector) -> Tuple[int, int]:
+def count_wins(sweeps: SlicedSweeps, members: Iterable[Pixel], motion: Vector) -> tuple[int, int]:
     """Paired counts of a component's motion against "static", over all sweeps and in both directions.
 
     Returns:
@@ -46,7 +46,7 @@ def evidence_of(won: int, lost: int, z: float) -> int:
     return max(math.floor(16 * ((won - lost) - z * math.sqrt(won + lost))), 0)
 
 
-def best_candidate(evidence: Sequence[int], candidates: Sequence[Vector]) -> Tuple[Vector, int]:
+def best_candidate(evidence: Sequence[int], candidates: Sequence[Vector]) -> tuple[Vector, int]:
     """The candidate with most evidence, and how much; of equals the first; no motion if none has any."""
     best = evidence.index(max(evidence))
     return (candidates[best], evidence[best]) if evidence[best] > 0 else ((0.0, 0.0), 0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Optional, Sequence, Tuple
+from typing import Sequence, Tuple
 
 import numpy as np
 
@@ -27,7 +27,7 @@ def project_bev(points: np.ndarray, config: Config, pixel_size: float) -> np.nda
     return np.stack([row, column], axis=1).astype(np.int64)
 
 
-def bev_dims(config: Config, pixel_size: float) -> Tuple[int, int]:
+def bev_dims(config: Config, pixel_size: float) -> tuple[int, int]:
     """Eq. bev_dims: (H, W) of the BEV image, with the + 1."""
     x0, y0, _, x1, y1, _ = config.point_cloud_range
     return math.floor((y1 - y0) / pixel_size) + 1, math.floor((x1 - x0) / pixel_size) + 1
@@ -49,7 +49,7 @@ def occupancy(pixels: np.ndarray, box: Box) -> np.ndarray:
     return image
 
 
-def search_radius(config: Config, seconds: float, pixel_size: float) -> Optional[float]:
+def search_radius(config: Config, seconds: float, pixel_size: float) -> float | None:
     """Longest displacement in pixels: max_speed * time / s + one pixel; None = the paper's, half of the box."""
     if config.max_speed is None:
         return None

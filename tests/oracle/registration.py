@@ -6,7 +6,7 @@ from the lower corner of the region; the turn is the tangent of half the angle.
 
 from __future__ import annotations
 
-from typing import List, NamedTuple, Sequence, Tuple
+from typing import NamedTuple, Sequence
 
 from cflow_torch.config import VerifiedConfig
 from oracle.height_slices import SlicedSweeps, Vector
@@ -41,13 +41,13 @@ class Pair(NamedTuple):
     much longer than between the sweeps it is between the points, in intervals."""
 
     time: float
-    arm: Tuple[int, int]
-    error: Tuple[int, int]
+    arm: tuple[int, int]
+    error: tuple[int, int]
     weight: float
     late: float
 
 
-def register(points: Sequence[Point], flow: Sequence[Vector], sweeps: SlicedSweeps) -> List[RigidMotion]:
+def register(points: Sequence[Point], flow: Sequence[Vector], sweeps: SlicedSweeps) -> list[RigidMotion]:
     """Refine the motion of every object, from (x, y) metres per interval. One without points at t keeps its flow.
 
     Convention: of the start and the steps that follow, the one whose pairs weigh most counts, of equals the first.
@@ -78,8 +78,8 @@ def register(points: Sequence[Point], flow: Sequence[Vector], sweeps: SlicedSwee
 
 
 def find_pairs(
-    members: Sequence[Voxel], voxels: Voxels, sweeps: SlicedSweeps, centre: Tuple[int, int], way: Vector, turn: float
-) -> List[Pair]:
+    members: Sequence[Voxel], voxels: Voxels, sweeps: SlicedSweeps, centre: tuple[int, int], way: Vector, turn: float
+) -> list[Pair]:
     """Voxels of an object that find each other under its motion, looked for from both ends.
 
     Every voxel before t+1 looks for the nearest one at t+1, every voxel of t+1 for the nearest one in each earlier
@@ -109,7 +109,7 @@ def find_pairs(
     return found
 
 
-def moved(voxel: Voxel, centre: Tuple[int, int], way: Vector, turn: float, time: float) -> Tuple[int, int]:
+def moved(voxel: Voxel, centre: tuple[int, int], way: Vector, turn: float, time: float) -> tuple[int, int]:
     """Where a voxel is `time` intervals later, in whole units."""
     x, y = rotate(turn * time, voxel.x - centre[0], voxel.y - centre[1])
     return whole(x + centre[0] + time * way[0]), whole(y + centre[1] + time * way[1])
@@ -122,7 +122,7 @@ def rotate(turn: float, x: float, y: float) -> Vector:
     return cos * x - sin * y, sin * x + cos * y
 
 
-def gauss_newton(found: Sequence[Pair], given: Vector, way: Vector, turn: float) -> Tuple[float, float, float]:
+def gauss_newton(found: Sequence[Pair], given: Vector, way: Vector, turn: float) -> tuple[float, float, float]:
     """Least squares: change of the translation (units) and of the angle (radians, small), per interval.
 
     Minimises, over the pairs with times k (in whole 1/16), arms r and errors e,
@@ -158,7 +158,7 @@ def register_deskewed(
     seen: Sequence[RigidMotion],
     sweeps: SlicedSweeps,
     config: VerifiedConfig,
-) -> List[RigidMotion]:
+) -> list[RigidMotion]:
     """The motion of every object per interval: `seen`, which `register` found from `start`, divided by how much longer
     the time between its points is than that between the sweeps; with more than two sweeps registered once more."""
     stretch = stretch_of(points, seen, sweeps)
@@ -171,7 +171,7 @@ def register_deskewed(
     return [again[owner] if owner in present else motion for owner, motion in enumerate(divided)]
 
 
-def stretch_of(points: Sequence[Point], seen: Sequence[RigidMotion], sweeps: SlicedSweeps) -> List[float]:
+def stretch_of(points: Sequence[Point], seen: Sequence[RigidMotion], sweeps: SlicedSweeps) -> list[float]:
     """Of each object: sum of w k (k + late) over the sum of w k^2, over its pairs of voxels; 1 without any."""
     voxels, (x0, y0) = centroids(points, sweeps), sweeps.lower
     result = []
@@ -191,7 +191,7 @@ def stretch_of(points: Sequence[Point], seen: Sequence[RigidMotion], sweeps: Sli
 
 def deskew(
     points: Sequence[Point], motions: Sequence[RigidMotion], sweeps: SlicedSweeps, config: VerifiedConfig
-) -> List[Point]:
+) -> list[Point]:
     """Points where they were at the instant of their sweep; of those in one pixel, those of the first object."""
     x0, y0, _, x1, y1, _ = config.point_cloud_range
     moved, owner_of = [], {}  # type: ignore[var-annotated]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Dict, List, NamedTuple, Optional, Sequence, Tuple
+from typing import NamedTuple, Sequence, Tuple
 
 import numpy as np
 
@@ -29,8 +29,8 @@ class Cube(NamedTuple):
 
 
 def subpixel_motion(
-    sweeps: SlicedSweeps, object_of: Dict[Pixel, int], motions: Sequence[Vector], may_be_slow: Sequence[bool]
-) -> List[Vector]:
+    sweeps: SlicedSweeps, object_of: dict[Pixel, int], motions: Sequence[Vector], may_be_slow: Sequence[bool]
+) -> list[Vector]:
     """The motion of the objects of a pair, (x, y) metres per interval, from (y, x) pixels per interval, 0 = static."""
     flows, elapsed = [(x * sweeps.size, y * sweeps.size) for y, x in motions], sweeps.elapsed[1]
     slow, heights = [], []
@@ -84,7 +84,7 @@ def cube_of(every: Voxels, voxel: Voxel, given: Vector, sweeps: SlicedSweeps) ->
     return Cube((voxel.y // BLOCK, voxel.x // BLOCK), np.array(ways, dtype=np.float32).reshape(-1, 2))
 
 
-def best_shift(cubes: Sequence[Cube], is_slow: bool) -> Optional[Shift]:
+def best_shift(cubes: Sequence[Cube], is_slow: bool) -> Shift | None:
     """The shift of largest gain; of a slow object the most significant one, None = none is.
 
     Ties: the smallest, then raster order.
@@ -102,15 +102,15 @@ def best_shift(cubes: Sequence[Cube], is_slow: bool) -> Optional[Shift]:
     return None if is_slow and values[best] <= 0 else best
 
 
-def moving_parts(cubes: Sequence[Cube], shift: Shift) -> List[Cube]:
+def moving_parts(cubes: Sequence[Cube], shift: Shift) -> list[Cube]:
     """The cubes that lie in blocks that gain by a shift: of an object that moves a part may be static."""
-    total: Dict[Cell, float] = {}
+    total: dict[Cell, float] = {}
     for cube, gain in zip(cubes, gains(cubes, shift)):
         total[cube.block] = total.get(cube.block, 0.0) + gain
     return [cube for cube in cubes if total[cube.block] > 0]
 
 
-def gains(cubes: Sequence[Cube], shift: Shift) -> List[float]:
+def gains(cubes: Sequence[Cube], shift: Shift) -> list[float]:
     """Weight that each cube gains by a shift."""
     return [meet(cube, shift) - meet(cube, (0, 0)) for cube in cubes]
 

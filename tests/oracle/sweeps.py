@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import List, NamedTuple, Optional, Tuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,8 +27,8 @@ class Cloud(NamedTuple):
     takes_part: np.ndarray
     intervals: float
     seconds: float
-    times: Optional[np.ndarray] = None
-    origin: Tuple[float, float, float] = (0.0, 0.0, 0.0)
+    times: np.ndarray | None = None
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 class PointMotion(NamedTuple):
@@ -41,13 +41,13 @@ class PointMotion(NamedTuple):
         confidence: of sweep t, (N,) float64, where points take part; None = the method does not say.
     """
 
-    flow: List[np.ndarray]
+    flow: list[np.ndarray]
     cluster_id: np.ndarray
     score: np.ndarray
-    confidence: Optional[np.ndarray] = None
+    confidence: np.ndarray | None = None
 
 
-def compensate(window: Window, config: Config) -> Tuple[List[Cloud], Cloud]:
+def compensate(window: Window, config: Config) -> tuple[list[Cloud], Cloud]:
     """Eq. def_scene_flow: every sweep in the frame of t+1, by inv(pose1) @ pose.
 
     Returns:
@@ -63,7 +63,7 @@ def compensate(window: Window, config: Config) -> Tuple[List[Cloud], Cloud]:
     past = [window.pc0, *window.pch[: config.num_history]]
     sweeps = [*past, *window.pcf[: config.num_future]]
     stamps = [sweep.timestamp_ns for sweep in (window.pc1, *sweeps)]
-    clouds: List[Cloud] = []
+    clouds: list[Cloud] = []
     is_repeat = [
         any(_is_repeat(sweep, other) for other in [*sweeps[:m], *[window.pc1] * (m >= len(past))])
         for m, sweep in enumerate(sweeps)
@@ -116,7 +116,7 @@ def _in_frame_of(sweep1: Sweep, sweep: Sweep) -> np.ndarray:
     return moved
 
 
-def _origin(sweep1: Sweep, sweep: Sweep) -> Tuple[float, float, float]:
+def _origin(sweep1: Sweep, sweep: Sweep) -> tuple[float, float, float]:
     if sweep.pose is None or sweep1.pose is None:
         return 0.0, 0.0, 0.0
     x, y, z = (np.linalg.inv(as_numpy(sweep1.pose, np.float64)) @ as_numpy(sweep.pose, np.float64))[:3, 3].tolist()

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from itertools import product
-from typing import Dict, List, NamedTuple, Sequence, Tuple
+from typing import NamedTuple, Sequence
 
 import numpy as np
 
@@ -42,11 +42,11 @@ class Part(NamedTuple):
     """
 
     sweeps: SlicedSweeps
-    object_of: Dict[Pixel, int]
-    rigid: List[RigidMotion]
-    scores: List[float]
-    is_weak: List[bool]
-    trust: Dict[Pixel, float]
+    object_of: dict[Pixel, int]
+    rigid: list[RigidMotion]
+    scores: list[float]
+    is_weak: list[bool]
+    trust: dict[Pixel, float]
 
     def moves(self, pixel: Pixel, surely: bool = False) -> bool:
         """Has it an object that moves, surely = and that is not weak?"""
@@ -65,9 +65,9 @@ class Found(NamedTuple):
         which: of each sweep, part and pixel of each point that is drawn.
     """
 
-    parts: Tuple[Part, Part]
-    drawn: List[np.ndarray]
-    which: List[List[Tuple[int, Pixel]]]
+    parts: tuple[Part, Part]
+    drawn: list[np.ndarray]
+    which: list[list[tuple[int, Pixel]]]
 
 
 def verified_flow(
@@ -116,7 +116,7 @@ def verified_flow(
     return PointMotion([flow], ids, scores, trust)
 
 
-def number_shown(found: Found) -> List[int]:
+def number_shown(found: Found) -> list[int]:
     """Of each point of t that is drawn, how many sweeps beside t and t+1 show its object; 0 without one."""
     objects = [[(part, found.parts[part].object_of.get(pixel)) for part, pixel in of_sweep] for of_sweep in found.which]
     shows = [set(of_sweep) for of_sweep in objects[2:]]
@@ -131,7 +131,7 @@ def estimate(every: Sequence[Cloud], ground: Sequence[np.ndarray], config: Verif
         means = ground_heights(ground, config)
         for cloud, keep in zip(every, drawn):
             keep[keep] = ~is_residue(cloud.points[keep], means, config)
-    places: List[List[Place]] = []
+    places: list[list[Place]] = []
     for cloud, keep in zip(every, drawn):
         times = np.zeros(len(keep)) if cloud.times is None else cloud.times
         places.append([Place(*row) for row in np.column_stack([cloud.points, times])[keep].tolist()])
@@ -164,7 +164,7 @@ def estimate(every: Sequence[Cloud], ground: Sequence[np.ndarray], config: Verif
     return Found((home, copied), drawn, which)
 
 
-def verify(node: Node, candidates: Sequence[Vector], num_levels: int, config: VerifiedConfig) -> Tuple[Vector, int]:
+def verify(node: Node, candidates: Sequence[Vector], num_levels: int, config: VerifiedConfig) -> tuple[Vector, int]:
     """The candidate of most evidence, and its evidence. What moves by its changed pixels alone needs more standard
     deviations, and several slices."""
     z, slices = config.significance, 0
@@ -181,7 +181,7 @@ def verify(node: Node, candidates: Sequence[Vector], num_levels: int, config: Ve
 
 
 def best_nearby(
-    sweeps: SlicedSweeps, object_of: Dict[Pixel, int], owner: int, y: float, x: float, config: VerifiedConfig
+    sweeps: SlicedSweeps, object_of: dict[Pixel, int], owner: int, y: float, x: float, config: VerifiedConfig
 ) -> Vector:
     """The motion of most evidence within two pixels of that of an object; of equals the nearest, then the first."""
     offsets = sorted(product(range(-2, 3), repeat=2), key=lambda offset: offset[0] ** 2 + offset[1] ** 2)
@@ -194,11 +194,11 @@ def best_nearby(
 
 def settle(
     sweeps: SlicedSweeps,
-    object_of: Dict[Pixel, int],
+    object_of: dict[Pixel, int],
     motions: Sequence[Vector],
     has_times: bool,
     config: VerifiedConfig,
-) -> Tuple[List[RigidMotion], Dict[Pixel, float]]:
+) -> tuple[list[RigidMotion], dict[Pixel, float]]:
     """The final motion of each object, and how far pixels of t can be trusted.
 
     Args:
@@ -209,7 +209,7 @@ def settle(
         config: settings.
     """
     size, longest = sweeps.size, config.max_object
-    members: List[List[Pixel]] = [[] for _ in motions]
+    members: list[list[Pixel]] = [[] for _ in motions]
     for pixel, owner in object_of.items():
         members[owner].append(pixel)
     start = [(x * size, y * size) for y, x in motions]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from itertools import product
-from typing import Dict, List, NamedTuple, Optional, Sequence, Tuple, Union
+from typing import Dict, NamedTuple, Sequence, Tuple
 
 from oracle.height_slices import NUM_SLICES, SLICE_HEIGHT, Pixel, SlicedSweeps, slice_of
 
@@ -38,11 +38,11 @@ Voxels = Dict[Tuple[int, int, int, int], Voxel]  # by step, row, column, slice
 
 def points_of_objects(
     sweeps: SlicedSweeps,
-    object_of: Dict[Pixel, int],
+    object_of: dict[Pixel, int],
     wanted: Sequence[bool],
-    heights: Union[float, Sequence[float]] = SLICE_HEIGHT,
+    heights: float | Sequence[float] = SLICE_HEIGHT,
     num_slices: int = NUM_SLICES,
-) -> List[Point]:
+) -> list[Point]:
     """Points of the objects wanted, in all sweeps; slices are so many metres high, the same for all or by object."""
     points = []
     for m, cloud in enumerate(sweeps.clouds):
@@ -68,7 +68,7 @@ def centroids(points: Sequence[Point], sweeps: SlicedSweeps) -> Voxels:
     return voxels
 
 
-def around(voxels: Voxels, step: int, part: int, x: float, y: float, sweeps: SlicedSweeps, reach: int) -> List[Voxel]:
+def around(voxels: Voxels, step: int, part: int, x: float, y: float, sweeps: SlicedSweeps, reach: int) -> list[Voxel]:
     """Voxels of a sweep and slice in the pixels around a place in units, `reach` each way, in raster order; none if any
     of the pixels lies outside the image."""
     row, col = math.floor(y / (sweeps.size * UNITS)), math.floor(x / (sweeps.size * UNITS))
@@ -78,7 +78,7 @@ def around(voxels: Voxels, step: int, part: int, x: float, y: float, sweeps: Sli
     return [voxels[place] for place in places if place in voxels]
 
 
-def nearest(voxels: Voxels, step: int, part: int, x: float, y: float, sweeps: SlicedSweeps) -> Optional[Voxel]:
+def nearest(voxels: Voxels, step: int, part: int, x: float, y: float, sweeps: SlicedSweeps) -> Voxel | None:
     """The nearest of the voxels in the 3 x 3 pixels around a place; of equals the first in raster order."""
     found = around(voxels, step, part, x, y, sweeps, 1)
     return min(found, key=lambda voxel: (voxel.x - x) ** 2 + (voxel.y - y) ** 2, default=None)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any, Dict, List
+from typing import Any
 
 import pytest
 
@@ -16,7 +16,7 @@ SCALES = [(0.1,), (0.2, 0.1), (0.4, 0.2, 0.1), (0.8, 0.4, 0.2, 0.1), (0.8, 0.4, 
 PAPER = make_config("paper")
 KEYS = make_config("paper", method="keypoints")
 # The settings of the rows of each table, in the paper's order.
-JOBS: Dict[str, List[Config]] = {
+JOBS: dict[str, list[Config]] = {
     "pixel_size": [PAPER.replace(pixel_size=size) for size in (0.05, 0.1, 0.2, 0.4)],
     "views": [PAPER, PAPER.replace(sectional_view=True)],
     "clustering": [PAPER, PAPER.replace(clustering="hdbscan")],
@@ -57,7 +57,7 @@ def write_run(root: Path, experiment: str, number: int, config: Config) -> None:
     (folder / "results.json").write_text(json.dumps(record))
 
 
-def table(root: Path, name: str) -> List[List[str]]:
+def table(root: Path, name: str) -> list[list[str]]:
     return [line.split(",") for line in (root / "paper" / f"{name}.csv").read_text().splitlines()]
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Dict, List, NamedTuple, Sequence, Set, Tuple
+from typing import NamedTuple, Sequence, Set, Tuple
 
 import numpy as np
 import pytest
@@ -20,8 +20,8 @@ Pixels = Set[Tuple[int, int]]
 class Scene(NamedTuple):
     """A window: per component its pixels by sweep, other pixels by sweep, number of sweeps, candidates (A, C, 2)."""
 
-    components: List[Dict[int, Pixels]]
-    others: Dict[int, Pixels]
+    components: list[dict[int, Pixels]]
+    others: dict[int, Pixels]
     num_sweeps: int
     candidates: np.ndarray
 
@@ -37,7 +37,7 @@ def line(rng: np.random.Generator, start, direction: float, length: float, noise
 
 def random_scene(rng: np.random.Generator, num_sweeps: int) -> Scene:
     """Lines that stand, lines that move, lines that are longer than seen before; some thick, some short."""
-    taken: Dict[int, Pixels] = {m: set() for m in range(num_sweeps)}
+    taken: dict[int, Pixels] = {m: set() for m in range(num_sweeps)}
     components, candidates = [], []
     for _ in range(8):
         start, direction = rng.uniform((0, 0), (HEIGHT, WIDTH)), rng.choice([rng.uniform(0, 7), 0, np.pi / 2])
@@ -56,7 +56,7 @@ def random_scene(rng: np.random.Generator, num_sweeps: int) -> Scene:
     return Scene(components, stray, num_sweeps, np.array(candidates))
 
 
-def answers(scenes: Sequence[Scene], size: float = 0.1) -> List[List[bool]]:
+def answers(scenes: Sequence[Scene], size: float = 0.1) -> list[list[bool]]:
     """Of a batch; they are those of the oracle."""
     num_steps = max(scene.num_sweeps for scene in scenes)
     image = np.zeros((len(scenes), num_steps, HEIGHT, WIDTH), dtype=np.uint8)
@@ -102,7 +102,7 @@ def rail(start: int, stop: int, row: int = 30) -> Pixels:
     return {(row, c) for c in range(start, stop)}
 
 
-def slides(component: Dict[int, Pixels], motion, num_sweeps: int = 2, others=None, size: float = 0.1) -> bool:
+def slides(component: dict[int, Pixels], motion, num_sweeps: int = 2, others=None, size: float = 0.1) -> bool:
     scene = Scene([component], others or {}, num_sweeps, np.array([[motion]], dtype=np.float64))
     return answers([scene], size)[0][0]
 
@@ -134,7 +134,7 @@ def test_the_share_that_must_be_covered():
 # ---------------------------------------------------------------------------------------------------- long vehicles
 
 
-def long_things(seed: int) -> Tuple[np.ndarray, np.ndarray]:
+def long_things(seed: int) -> tuple[np.ndarray, np.ndarray]:
     """(3, 4, H, W) slices and owners of nine long things, some of which move, and some of which end anywhere."""
     rng, (height, width) = np.random.default_rng(seed), (90, 110)
     image, owner = np.zeros((3, 4, height, width), dtype=np.uint8), np.full((3, 4, height, width), 9)
@@ -171,7 +171,7 @@ LENGTH, SPEED = 30.0, 0.8
 TALL, LOW = (-1.5, 1.5), (-1.4, -1.2)
 
 
-def side(ends: Tuple[float, float], heights: Tuple[float, float], seed: int) -> Sweep:
+def side(ends: tuple[float, float], heights: tuple[float, float], seed: int) -> Sweep:
     """The side of something long, sampled anew each time."""
     rng = np.random.default_rng(seed)
     x = np.concatenate((ends, rng.uniform(*ends, 3000)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Dict, List, Sequence, Tuple
+from typing import Sequence
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ from cflow_torch.verified.changed_pixels import ChangedPixels
 from cflow_torch.verified.component_tree import find_components, movable_nodes
 
 
-def distinct(motions: Sequence[Sequence[float]]) -> List[float]:
+def distinct(motions: Sequence[Sequence[float]]) -> list[float]:
     """Motions in the order in which ties are decided, flat; without those of 0, which stand for what is not known."""
     rounded = [(round(y, 6) + 0.0, round(x, 6) + 0.0) for y, x in motions]
     return [value for motion in dict.fromkeys(rounded) if any(motion) for value in motion]
@@ -36,7 +36,7 @@ def test_candidates_and_scores_equal_the_oracle_in_a_batch(largest, monkeypatch)
     nodes = movable_nodes(sweeps, components, None)
     found = fast.propose(nodes, components, sweeps, settings)
     assert not (torch.signbit(found.motion) & (found.motion == 0)).any()
-    numbers: Dict[Tuple[int, ...], int] = {}
+    numbers: dict[tuple[int, ...], int] = {}
     of_pixels = (nodes.members.step, nodes.members.row, nodes.members.col)
     columns = (nodes.node, nodes.window[nodes.node], nodes.level[nodes.node], *of_pixels)
     for number, *name in zip(*(values.tolist() for values in columns)):

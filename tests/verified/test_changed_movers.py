@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Tuple
-
 import numpy as np
 import pytest
 import torch
@@ -16,7 +14,7 @@ from cflow_torch.verified.changed_pixels import ChangedPixels
 MODEL = make_config("default", point_cloud_range=(-10.0, -10.0, -3.0, 10.0, 10.0, 8.0))
 
 
-def beside_a_wall(speed: float, density: float) -> Tuple[Window, np.ndarray]:
+def beside_a_wall(speed: float, density: float) -> tuple[Window, np.ndarray]:
     """A walker 0.2 m before a wall of so many points a square metre, six sweeps, the sensor drives; which points of t
     are the walker's. Its points lie at y < 2.9 m."""
     rng = np.random.default_rng(7)

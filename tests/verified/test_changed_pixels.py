@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import List, Sequence, Tuple
+from typing import Sequence
 
 import numpy as np
 import torch
@@ -54,7 +54,7 @@ def floor() -> np.ndarray:
     return np.stack((np.linspace(-10, -5, 500), np.zeros(500), np.full(500, -2.0)), 1)
 
 
-def farther(clouds: Sequence[np.ndarray], places: Sequence[Sequence[float]], way: float) -> List[List[float]]:
+def farther(clouds: Sequence[np.ndarray], places: Sequence[Sequence[float]], way: float) -> list[list[float]]:
     """Of t+1 and of t, when the sensor was `way` metres further left: by how much farther each sees than a place."""
     T_world_ego = pose(0.0, way, 0.0)
     pc1, pc0 = (np.concatenate((cloud, floor())) for cloud in clouds)
@@ -85,7 +85,7 @@ def block(x: float, y: float) -> np.ndarray:
     return places.reshape(-1, 3)
 
 
-def shares(sweeps: Sequence[np.ndarray], rows: Tuple[float, float]) -> Tuple[float, float]:
+def shares(sweeps: Sequence[np.ndarray], rows: tuple[float, float]) -> tuple[float, float]:
     """Share of the pixels at t with x in a range that are missing, and that have changed, in t+1, t, t-1."""
     pc1, pc0, older = (Sweep(np.concatenate((cloud, floor()))) for cloud in sweeps)
     images = sweeps_of([Window(pc0, pc1, (older,))], SETTINGS)

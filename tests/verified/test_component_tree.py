@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Dict, FrozenSet, List, NamedTuple, Optional, Tuple
+from typing import FrozenSet, NamedTuple, Tuple
 
 import numpy as np
 import pytest
@@ -30,16 +30,16 @@ class Grown(NamedTuple):
     sweeps: HeightSlicedSweeps
     components: Components
     nodes: Nodes
-    windows: List[SlicedSweeps]
-    trees: List[oracle.Tree]
+    windows: list[SlicedSweeps]
+    trees: list[oracle.Tree]
 
-    def names(self, window: int) -> List[Name]:
+    def names(self, window: int) -> list[Name]:
         """Of all nodes of a window, in the order of the oracle's list."""
         return [(frozenset(node.members), node.level) for node in self.trees[window].nodes]
 
-    def fast_names(self) -> List[Name]:
+    def fast_names(self) -> list[Name]:
         """Of all nodes of all windows."""
-        pixels: List[List[Pixel]] = [[] for _ in range(self.nodes.count)]
+        pixels: list[list[Pixel]] = [[] for _ in range(self.nodes.count)]
         members = self.nodes.members
         for node, *place in zip(*(v.tolist() for v in (self.nodes.node, members.step, members.row, members.col))):
             pixels[node].append(tuple(place))
@@ -47,7 +47,7 @@ class Grown(NamedTuple):
 
 
 @lru_cache(maxsize=None)
-def grown(seed: int, longest: Optional[float] = 3.0, blocks=(4, 2, 1), shape=(3, 3, 50, 47), density=0.02) -> Grown:
+def grown(seed: int, longest: float | None = 3.0, blocks=(4, 2, 1), shape=(3, 3, 50, 47), density=0.02) -> Grown:
     rng = np.random.default_rng(seed)
     images = (rng.integers(1, 16, shape) * (rng.random(shape) < density)).astype(np.uint8)
     elapsed = np.tile(np.arange(shape[1], dtype=np.float64), (shape[0], 1))
@@ -78,7 +78,7 @@ def test_components_and_nodes_equal_the_oracle(blocks, longest):
         for window, tree in enumerate(found.trees):
             mine = found.sweeps.pixels.window == window
             for level, roots in enumerate(found.components.roots):
-                component: Dict[int, List[Pixel]] = {}
+                component: dict[int, list[Pixel]] = {}
                 for root, pixel in zip(roots[mine].tolist(), found.windows[window].pixels()):
                     component.setdefault(root, []).append(pixel)
                 assert {tuple(members) for members in component.values()} == set(tree.levels[level])
@@ -109,7 +109,7 @@ def test_scales_are_nested():
 @given(st.integers(0, 5), st.integers(0, 1000))
 def test_the_cut_equals_the_oracle(seed, of_evidence):
     found, rng = grown(seed), np.random.default_rng(of_evidence)
-    evidence_of: Dict[Tuple[int, Name], int] = {}
+    evidence_of: dict[tuple[int, Name], int] = {}
     evidence = torch.from_numpy(rng.choice([0, 0, 5, 63, 64, 65, 70, 130, 300], found.nodes.count))
     names = found.fast_names()
     for window, name, value in zip(found.nodes.window.tolist(), names, evidence.tolist()):

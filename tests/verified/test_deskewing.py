@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import List, Sequence, Tuple
+from typing import Sequence
 
 import numpy as np
 import pytest
@@ -58,8 +58,8 @@ def test_motion_and_points_equal_the_oracle(num_past, num_future):
     found = register_deskewed(points, scene.sweeps, scene.flow, seen)
     sharp, drawn = deskew(points, scene.sweeps, seen)
     assert len(sharp.owner) < len(points.owner), "some leave the region or meet another object"
-    expected: List[oracle.RigidMotion] = []
-    places: List[Tuple[int, ...]] = []
+    expected: list[oracle.RigidMotion] = []
+    places: list[tuple[int, ...]] = []
     stretched = 0
     for number, window in enumerate(scene.windows()):
         of_window = oracle.register(window.points(), window.flow, window.sweeps)
@@ -96,7 +96,7 @@ def test_the_whole_method_equals_the_oracle(num_history):
 
 def seen_box(
     velocity: Sequence[float], times: Sequence[Sequence[float]], elapsed: Sequence[int] = (0, 1, 2)
-) -> Tuple[List[np.ndarray], np.ndarray]:
+) -> tuple[list[np.ndarray], np.ndarray]:
     """A box of points that is met twice a sweep, by two units at the times given, the second 0.5 m higher: clouds of
     the sweeps that are so many intervals before t+1, and times."""
     grid = np.stack(np.meshgrid(np.arange(-0.5, 0.6, 0.23), np.arange(-0.4, 0.5, 0.23), [0.2, 1.2]), -1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import List, Optional, Sequence
+from typing import Sequence
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ def bare(points: np.ndarray, **values) -> Sweep:
 TIMES = (-4, -3, -2, -1, 0, 1, 2, 3, 4, 5)  # of sweeps; t = 0, t+1 = 1
 
 
-def drive(is_hidden: bool, times: Sequence[float] = TIMES, seen: Sequence[int] = range(10)) -> List[Sweep]:
+def drive(is_hidden: bool, times: Sequence[float] = TIMES, seen: Sequence[int] = range(10)) -> list[Sweep]:
     """A car and a post.
 
     Args:
@@ -159,7 +159,7 @@ def test_ground_of_the_future_is_found_too():
 P = np.random.default_rng(0).uniform(-5, 5, (50, 3)).astype(np.float32)
 
 
-def later(offset: float, stamp: Optional[int], pose: Optional[np.ndarray] = None) -> Sweep:
+def later(offset: float, stamp: int | None, pose: np.ndarray | None = None) -> Sweep:
     return Sweep(P + np.float32(offset), pose=pose, timestamp_ns=stamp)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import List
 
 import numpy as np
 import pytest
@@ -63,7 +62,7 @@ def test_the_whole_method_equals_the_oracle():
 
 
 def test_alone_or_in_a_batch_in_any_order_of_points():
-    windows: List[Window] = [rolling_drive(), bare(rolling_drive(0)), rolling_drive(1, 0), rolling_drive(0, 2)]
+    windows: list[Window] = [rolling_drive(), bare(rolling_drive(0)), rolling_drive(1, 0), rolling_drive(0, 2)]
     for window, result in zip(windows, MODEL(windows)):
         assert_same_bits(MODEL([window])[0], result)
         mixed, order = reordered(window)

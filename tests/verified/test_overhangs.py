@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import List, Sequence, Set, Tuple
+from typing import Sequence, Set, Tuple
 
 import numpy as np
 import pytest
@@ -44,7 +44,7 @@ def slabs(seed: int, num_sweeps: int = 2) -> Window:
     return Window(sweeps[1], sweeps[0], tuple(sweeps[2:]))
 
 
-def overhung(windows: Sequence[Window]) -> List[Found]:
+def overhung(windows: Sequence[Window]) -> list[Found]:
     """Of each window, what the oracle finds in it alone: the pixels of its nodes, and the images of the copies."""
     sweeps = sweeps_of(list(windows), SETTINGS)
     # Columns of pixels at one side are missing nowhere, so that some components may not move.

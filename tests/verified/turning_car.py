@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Tuple
-
 import numpy as np
 
 from cflow_torch import Sweep, Window
@@ -24,7 +22,7 @@ def upright_box(centre, size, angle: float, rng: np.random.Generator, num_points
     return np.concatenate((xy, rng.uniform(-1.5, 0.0, (num_points, 1))), 1)
 
 
-def car_of(seed: int) -> Tuple[np.ndarray, np.ndarray, float]:
+def car_of(seed: int) -> tuple[np.ndarray, np.ndarray, float]:
     """Centre at t, velocity and turn of the car, per interval."""
     rng = np.random.default_rng(seed)
     return rng.uniform(-2, 2, 2), rng.uniform(-0.8, 0.8, 2), rng.uniform(-0.05, 0.05)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Any, Iterator, List, Tuple
+from typing import Any, Iterator
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ HUES = flow_to_rgb(DIRECTIONS, 1.0)
 RED, BLUE, WALL = (255, 0, 0), (0, 0, 255), (180, 187, 195)
 
 
-def patch(color: Tuple[int, ...], width: int = 200, height: int = 100, place: int = 0) -> Figure:
+def patch(color: tuple[int, ...], width: int = 200, height: int = 100, place: int = 0) -> Figure:
     """A white figure with a patch of 20 x 20 pixels of one colour, `place` patches from the left, above a wall."""
     figure = Figure(figsize=((width + 0.1) / 50, (height + 0.1) / 50), dpi=50, facecolor="white")
     image = np.full((height, width, 3), 255, np.uint8)
@@ -32,7 +32,7 @@ def patch(color: Tuple[int, ...], width: int = 200, height: int = 100, place: in
     return figure
 
 
-def frames_of(path: Path) -> List[Tuple[np.ndarray, int]]:
+def frames_of(path: Path) -> list[tuple[np.ndarray, int]]:
     """((H, W, 3) int, milliseconds) of each frame of a GIF."""
     frames = []
     with Image.open(path) as gif:

@@ -50,7 +50,7 @@ def pixels(figure: Figure) -> np.ndarray:
     return np.asarray(figure.canvas.buffer_rgba())[..., :3].copy()  # type: ignore[attr-defined]
 
 
-def colors_at(figure: Figure, *places: Tuple[float, float], axes: int = 0) -> np.ndarray:
+def colors_at(figure: Figure, *places: tuple[float, float], axes: int = 0) -> np.ndarray:
     """(K, 3) int, RGB of the picture at positions in metres."""
     image = pixels(figure)
     column, row = np.rint(figure.axes[axes].transData.transform(places)).astype(int).T

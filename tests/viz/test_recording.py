@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Any, Dict, List, Optional, Tuple
+from typing import Any, Dict
 
 import numpy as np
 import pytest
@@ -33,7 +33,7 @@ class Street:
     log_id = "street"
     timestamps = [START + i * 100_000_000 for i in range(3)]
 
-    def __init__(self, has_labels: bool = True, has_poses: bool = True, start: Optional[int] = START) -> None:
+    def __init__(self, has_labels: bool = True, has_poses: bool = True, start: int | None = START) -> None:
         self.has_labels, self.has_poses, self.start = has_labels, has_poses, start
 
     def sweep(self, index: int) -> Sweep:
@@ -45,7 +45,7 @@ class Street:
         where = pose(FAR + STEP * index, FAR, 0.0) if self.has_poses else None
         return Sweep(points, is_ground, where, stamp)
 
-    def labels(self, index: int) -> Optional[FlowLabels]:
+    def labels(self, index: int) -> FlowLabels | None:
         if not self.has_labels or index == 1:
             return None
         result = result_of()
@@ -65,11 +65,11 @@ def result_of(speed: float = 1.0) -> FlowResult:
     )
 
 
-def read(path: Path) -> Tuple[Rows, List[str]]:
+def read(path: Path) -> tuple[Rows, list[str]]:
     """({entity: {sweep, -1 = static: {component: values}}}, names of the timelines)."""
     chunks = pytest.importorskip("rerun.chunk", reason="needs a rerun-sdk that reads recordings")
     rows: Rows = {}
-    timelines: List[str] = []
+    timelines: list[str] = []
     for chunk in chunks.RrdReader(path).stream().to_chunks():
         timelines += chunk.timeline_names
         batch = chunk.to_record_batch()
@@ -80,13 +80,13 @@ def read(path: Path) -> Tuple[Rows, List[str]]:
     return rows, timelines
 
 
-def rgb(colors: List[int]) -> np.ndarray:
+def rgb(colors: list[int]) -> np.ndarray:
     """(N, 3) of packed RGBA."""
     return (np.array(colors, np.int64)[:, None] >> [24, 16, 8]) & 255
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Tuple[Rows, List[str]]:
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Rows, list[str]]:
     path = tmp_path_factory.mktemp("rrd") / "street.rrd"
     assert record_log(Street(), [(0, result_of()), (1, result_of(0.0))], path) == 2
     return read(path)

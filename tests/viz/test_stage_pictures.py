@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, List
+from typing import Any
 
 import numpy as np
 import pytest
@@ -94,7 +94,7 @@ def test_matches_of_one_object_are_its_motion() -> None:
 # --- the pictures
 
 
-def images_of(axes: Any) -> List[np.ndarray]:
+def images_of(axes: Any) -> list[np.ndarray]:
     return [np.asarray(image.get_array()) for image in axes.images]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from dataclasses import replace
-from typing import Any, Callable, Dict
+from typing import Any, Callable
 
 import numpy as np
 import pytest
@@ -183,7 +183,7 @@ def locked(array: np.ndarray) -> np.ndarray:
     return array
 
 
-FORMS: Dict[str, Callable[[np.ndarray], Any]] = {
+FORMS: dict[str, Callable[[np.ndarray], Any]] = {
     "float16": lambda p: p.astype(np.float16),
     "float64": lambda p: p.astype(np.float64),
     "big-endian": lambda p: p.astype(">f8"),

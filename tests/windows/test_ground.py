@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from typing import List, Tuple
+from typing import Tuple
 
 import numpy as np
 import pytest
@@ -40,7 +40,7 @@ def block(low: Point, high: Point, num_points: int, seed: int) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def sweeps() -> List[Sweep]:
+def sweeps() -> list[Sweep]:
     drive = make_drive(seed=SEED, num_sweeps=2, profile="demo")
     return [drive.sweep(i) for i in range(2)]
 
@@ -187,7 +187,7 @@ def test_patchwork():
 
 
 @pytest.fixture(scope="module")
-def street() -> Tuple[np.ndarray, np.ndarray, np.ndarray]:
+def street() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Two bare clouds with ground, a car that moves 0.8 m, parked cars; what each row of pc0 is: 0 = the car, 1, 2."""
     floor, car = rings(1.7, beams=32), block((8, -1, -1.5), (12, 0.8, 0.0), 3000, 6)
     parked = [block((x, y, -1.65), (x + 4, y + 1.8, 0.0), 2000, 7) for x, y in ((-9, 4), (5, 5), (16, 4))]

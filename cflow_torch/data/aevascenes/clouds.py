@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import math
 from pathlib import Path
-from typing import List, Optional
 
 import numpy as np
 from numpy.lib import format as npy
@@ -52,7 +51,7 @@ class Cloud:
             raise CFlowError(f"{self.file}: {key} must be (N, {columns}) floats, got {array.shape} {array.dtype}")
         return array.reshape(-1, columns).astype(np.float32, copy=False)
 
-    def seconds(self, key: str, rows: int) -> Optional[np.ndarray]:
+    def seconds(self, key: str, rows: int) -> np.ndarray | None:
         """(rows,) float64 of an array of whole nanoseconds, one per row; None where there is no such array.
 
         Raises:
@@ -66,7 +65,7 @@ class Cloud:
             raise CFlowError(f"{self.file}: {key} must be ({rows}, 1) integers, got {array.shape} {array.dtype}")
         return array.reshape(rows) * 1e-9
 
-    def names(self, key: str) -> Optional[List[str]]:
+    def names(self, key: str) -> list[str] | None:
         """Texts of an array, however it is shaped; None where there is no such array.
 
         Raises:

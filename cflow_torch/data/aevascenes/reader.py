@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Dict, List, Optional, Sequence
+from typing import Any, Sequence
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from cflow_torch.windows.ego_motion import relative_transform
 SEARCH_DEPTH = 3  # <root>/<data set>/<split>/<sequence>
 _MEND = "give a whole sequence of AevaScenes"
 
-CATEGORY_NAME: Dict[str, str] = {
+CATEGORY_NAME: dict[str, str] = {
     **dict.fromkeys(("unknown", "pole_trunk", "building", "other_structure", "vegetation"), "NONE"),
     "car": "REGULAR_VEHICLE",
     "bus": "BUS",
@@ -49,7 +49,7 @@ CATEGORY_NAME.update(dict.fromkeys(GROUND, "NONE"))
 _PATHS = {"compensated": ("point_cloud_compensated_path", "point_cloud_path"), "raw": ("point_cloud_raw_path",)}
 
 
-def find_aevascenes_sequences(root: Place) -> List[Path]:
+def find_aevascenes_sequences(root: Place) -> list[Path]:
     """Folders of all sequences under a folder, sorted.
 
     Args:
@@ -93,7 +93,7 @@ class AevaScenesLog(NumberedSweeps):
         self,
         folder: Place,
         clouds: str = "compensated",
-        lidars: Optional[Sequence[str]] = None,
+        lidars: Sequence[str] | None = None,
         ground: bool = True,
     ) -> None:
         self.folder = as_path(folder)
@@ -110,7 +110,7 @@ class AevaScenesLog(NumberedSweeps):
             self.lidars: Sequence[str] = tuple(known if lidars is None else lidars)
             if not self.lidars or not set(self.lidars) <= set(known):
                 raise CFlowError(f"{self._file} has the LiDARs {shortened(known)}; got {shortened(list(self.lidars))}")
-            by_time: Dict[int, Dict[str, Any]] = {frame["timestamp_ns"]: frame for frame in content["frames"]}
+            by_time: dict[int, dict[str, Any]] = {frame["timestamp_ns"]: frame for frame in content["frames"]}
             self.timestamps = sorted(by_time)
             self._check_count(self._file)
             self._frames = [by_time[time] for time in self.timestamps]
@@ -140,7 +140,7 @@ class AevaScenesLog(NumberedSweeps):
         """
         return np.concatenate([cloud.numbers("velocity", 1)[:, 0] for cloud in self._clouds_of(index)])
 
-    def labels(self, index: int) -> Optional[FlowLabels]:
+    def labels(self, index: int) -> FlowLabels | None:
         """Truth of the pair (index, index + 1) from box tracks; None for the last sweep and sequences without boxes."""
         self._timestamp(index)
         if index == len(self) - 1 or not self._has_boxes:
@@ -153,14 +153,14 @@ class AevaScenesLog(NumberedSweeps):
         clouds = zip(self._clouds_of(index), self._mounts)
         return np.concatenate([moved(cloud.numbers("xyz", 3), mount) for cloud, mount in clouds]).astype(np.float32)
 
-    def _point_times(self, index: int) -> Optional[np.ndarray]:
+    def _point_times(self, index: int) -> np.ndarray | None:
         """(N,) float64 seconds after the time stamp; None where a cloud does not tell."""
         clouds = self._clouds_of(index)
         times = [cloud.seconds("time_offset_ns", len(cloud.numbers("xyz", 3))) for cloud in clouds]
         known = [of_cloud for of_cloud in times if of_cloud is not None]
         return np.concatenate(known) if len(known) == len(times) else None
 
-    def _open_clouds(self, index: int) -> List[Cloud]:
+    def _open_clouds(self, index: int) -> list[Cloud]:
         where, clouds = f"{self._file}, frame {self._timestamp(index)}", []
         for name in self.lidars:
             with file_errors(where, _MEND):

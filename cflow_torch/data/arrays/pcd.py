@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from typing import Any, Dict, Mapping
+from typing import Any, Mapping
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from cflow_torch.data.paths import Place, as_path, read_bytes
 from cflow_torch.types import CFlowError
 
 
-def read_pcd(path: Place) -> Dict[str, np.ndarray]:
+def read_pcd(path: Place) -> dict[str, np.ndarray]:
     """The fields of a cloud.
 
     Args:
@@ -33,7 +33,7 @@ def read_pcd(path: Place) -> Dict[str, np.ndarray]:
         return pcd_fields(read_bytes(as_path(path)), path)
 
 
-def pcd_fields(content: bytes, path: Place) -> Dict[str, np.ndarray]:
+def pcd_fields(content: bytes, path: Place) -> dict[str, np.ndarray]:
     """As `read_pcd`, of what is in the file."""
     pypcd4 = _pypcd4()
     with file_errors(path, "give a .pcd file of version 0.7"):

@@ -10,7 +10,7 @@ import io
 import re
 import warnings
 from itertools import takewhile
-from typing import Dict, Mapping
+from typing import Mapping
 
 import numpy as np
 
@@ -28,7 +28,7 @@ _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 _LONGEST_HEADER = 65536  # bytes
 
 
-def read_ply(path: Place) -> Dict[str, np.ndarray]:
+def read_ply(path: Place) -> dict[str, np.ndarray]:
     """All properties of the vertices.
 
     Args:

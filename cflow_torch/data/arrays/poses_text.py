@@ -6,7 +6,7 @@ import io
 import warnings
 from dataclasses import dataclass
 from decimal import Decimal
-from typing import Optional, Sequence, Tuple
+from typing import Sequence
 
 import numpy as np
 
@@ -32,7 +32,7 @@ class Trajectory:
     """
 
     poses: np.ndarray
-    times_ns: Optional[np.ndarray]
+    times_ns: np.ndarray | None
     layout: str
 
 
@@ -156,7 +156,7 @@ def poses_at(trajectory: Trajectory, times_ns: Sequence[int], source: str) -> np
     return between(trajectory.poses[before], trajectory.poses[after], share)
 
 
-def _read_table(path: Place) -> Tuple[np.ndarray, np.ndarray]:
+def _read_table(path: Place) -> tuple[np.ndarray, np.ndarray]:
     """(K, C) words of a text file and the finite numbers that they are, K and C at least 1."""
     with file_errors(path, "give lines of as many numbers each"), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # numpy's about a file without lines

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Dict, List, Optional, Sequence, Tuple
+from typing import Any, Sequence
 
 import numpy as np
 
@@ -35,7 +35,7 @@ _STAMP = re.compile("[0-9]{16,18}|[0-8][0-9]{18}")  # such a name is a time: mic
 _FIRST_NANOSECOND = 10**17
 
 
-def find_array_logs(root: Place) -> List[Path]:
+def find_array_logs(root: Place) -> list[Path]:
     """Folders of all logs under a folder, at most four levels down.
 
     Args:
@@ -93,11 +93,11 @@ class ArraysLog(NumberedSweeps):
         folder: Place,
         poses: Any = "auto",
         poses_of: str = "ego",
-        calibration: Optional[Place] = "auto",
-        times: Optional[Place] = "auto",
-        ground: Optional[Place] = "auto",
+        calibration: Place | None = "auto",
+        times: Place | None = "auto",
+        ground: Place | None = "auto",
         ego_T_lidar: Any = None,
-        suffix: Optional[str] = None,
+        suffix: str | None = None,
         bin_columns: int = KITTI_COLUMNS,
     ) -> None:
         self.folder = as_path(folder)
@@ -133,7 +133,7 @@ class ArraysLog(NumberedSweeps):
         time = self.timestamps[index] if self._has_times else None
         return Sweep(points.astype(np.float32, copy=False), is_ground, pose, time)
 
-    def _trajectory(self, poses: Any, calibration: Any) -> Tuple[Optional[Trajectory], str, bool]:
+    def _trajectory(self, poses: Any, calibration: Any) -> tuple[Trajectory | None, str, bool]:
         """The poses given or found, what to call them, and whether a calibration made them the LiDAR's."""
         if is_place(poses):
             kitti = self.folder.resolve().parent.parent / "poses" / f"{self.log_id}.txt"
@@ -151,7 +151,7 @@ class ArraysLog(NumberedSweeps):
             return None, "", False
         return Trajectory(checked_poses(np.asarray(poses), "poses"), None, "matrix"), "poses", False
 
-    def _times(self, times: Any, trajectory: Optional[Trajectory]) -> Optional[List[int]]:
+    def _times(self, times: Any, trajectory: Trajectory | None) -> list[int] | None:
         """Nanoseconds of each sweep, None = unknown."""
         count = len(self.files)
         file = _beside(self.folder, times, ("times.txt",), "times")
@@ -167,7 +167,7 @@ class ArraysLog(NumberedSweeps):
             return trajectory.times_ns.tolist()
         return None
 
-    def _one_each(self, trajectory: Trajectory, source: str, stamps: Optional[List[int]]) -> np.ndarray:
+    def _one_each(self, trajectory: Trajectory, source: str, stamps: list[int] | None) -> np.ndarray:
         """(K, 4, 4) one pose per sweep."""
         if trajectory.times_ns is not None and stamps is not None:
             return poses_at(trajectory, stamps, source)
@@ -179,15 +179,15 @@ class ArraysLog(NumberedSweeps):
         return trajectory.poses
 
 
-def natural_key(name: str) -> Tuple[Any, ...]:
+def natural_key(name: str) -> tuple[Any, ...]:
     """Sorts 2 before 10: the digits of a name count as numbers."""
     return tuple((0, int(part), part) if part.isdecimal() else (1, 0, part) for part in re.findall(r"\d+|\D+", name))
 
 
-def _clouds(folder: Path) -> Tuple[Path, Dict[str, List[Path]]]:
+def _clouds(folder: Path) -> tuple[Path, dict[str, list[Path]]]:
     """Where the clouds of a log lie, and those of each suffix that has two or more."""
     for place in (folder, *(folder / name for name in POINT_FOLDERS)):
-        kinds: Dict[str, List[Path]] = {}
+        kinds: dict[str, list[Path]] = {}
         if place.is_dir():
             for path in place.iterdir():
                 if path.suffix.lower() in SUFFIXES and path.stem.lower() not in _OTHER_STEMS and path.name[0] != ".":
@@ -198,7 +198,7 @@ def _clouds(folder: Path) -> Tuple[Path, Dict[str, List[Path]]]:
     return folder, {}
 
 
-def _one_suffix(folder: Path, suffix: Optional[str]) -> List[Path]:
+def _one_suffix(folder: Path, suffix: str | None) -> list[Path]:
     place, kinds = _clouds(folder)
     if suffix is not None:
         kinds = {kind: files for kind, files in kinds.items() if kind == "." + suffix.lower().lstrip(".")}
@@ -212,9 +212,7 @@ def _one_suffix(folder: Path, suffix: Optional[str]) -> List[Path]:
     return sorted(next(iter(kinds.values())), key=lambda path: natural_key(path.stem))
 
 
-def _beside(
-    folder: Path, setting: Optional[Place], names: Sequence[str], what: str, *elsewhere: Path
-) -> Optional[Path]:
+def _beside(folder: Path, setting: Place | None, names: Sequence[str], what: str, *elsewhere: Path) -> Path | None:
     """The file or folder that a setting means; None = none."""
     if setting is None:
         return None

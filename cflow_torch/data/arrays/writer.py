@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Optional, Union
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from cflow_torch.data.names import safe_name
 from cflow_torch.types import CFlowError
 
 
-def write_array_log(log: Log, root: Union[str, Path], suffix: str = ".npy", poses: Optional[str] = "kitti") -> Path:
+def write_array_log(log: Log, root: str | Path, suffix: str = ".npy", poses: str | None = "kitti") -> Path:
     """Write a log to `root/<log_id>`: `points/000000.npy` ..., `ground/000000.npy` ..., `poses.txt`, `times.txt`.
 
     Args:
@@ -47,7 +46,7 @@ def write_array_log(log: Log, root: Union[str, Path], suffix: str = ".npy", pose
     return folder
 
 
-def _write(log: Log, folder: Path, suffix: str, poses: Optional[str]) -> None:
+def _write(log: Log, folder: Path, suffix: str, poses: str | None) -> None:
     transforms, times, masks = [], [], []
     for index in range(len(log.timestamps)):
         sweep = log.sweep(index)

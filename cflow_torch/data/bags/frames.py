@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Dict, List, Tuple
+from typing import Any, Tuple
 
 import numpy as np
 
@@ -21,7 +21,7 @@ class Frames:
         samples: frame -> `T_parent_frame` over time.
     """
 
-    def __init__(self, parents: Dict[str, str], samples: Dict[str, List[Sample]]) -> None:
+    def __init__(self, parents: dict[str, str], samples: dict[str, list[Sample]]) -> None:
         self._parents = parents
         # A transform that is told again and again is a fixed one.
         self._links = {
@@ -29,7 +29,7 @@ class Frames:
             for child, rows in samples.items()
         }
 
-    def chain(self, frame: str) -> List[str]:
+    def chain(self, frame: str) -> list[str]:
         """The frame, its parent, ... up to the root."""
         chain = [frame]
         while self._parents.get(chain[-1], frame) not in chain:
@@ -71,7 +71,7 @@ def sample(time_ns: int, position: Any, rotation: Any) -> Sample:
     return (time_ns, position.x, position.y, position.z, rotation.w, rotation.x, rotation.y, rotation.z)
 
 
-def sorted_poses(samples: List[Sample], what: str) -> Tuple[np.ndarray, np.ndarray]:
+def sorted_poses(samples: list[Sample], what: str) -> tuple[np.ndarray, np.ndarray]:
     """(K,) int64 ascending times and (K, 4, 4) float64 poses; of two at one time, the first."""
     times, rows = np.unique(np.array([row[0] for row in samples], np.int64), return_index=True)
     numbers = np.array([samples[row][1:] for row in rows], np.float64).reshape(-1, 7)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Optional, Tuple
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +12,7 @@ _UNITS = (1.0, 1e-3, 1e-6, 1e-9)  # seconds
 _SHORTEST, _LONGEST = 0.005, 5.0  # seconds of a sweep: a thousandfold, so that only one unit fits
 
 
-def points_and_times(message: Any, stamp_ns: int) -> Tuple[np.ndarray, Optional[np.ndarray]]:
+def points_and_times(message: Any, stamp_ns: int) -> tuple[np.ndarray, np.ndarray | None]:
     """Points of a cloud, without those that are not finite or at the origin, which mean "no return".
 
     Args:
@@ -44,7 +44,7 @@ def points_and_times(message: Any, stamp_ns: int) -> Tuple[np.ndarray, Optional[
     return points[kept], times
 
 
-def seconds_after(values: np.ndarray, stamp_ns: int) -> Optional[np.ndarray]:
+def seconds_after(values: np.ndarray, stamp_ns: int) -> np.ndarray | None:
     """Times of points as seconds after the stamp of their sweep.
 
     Args:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any, Dict, List, Optional, Tuple
+from typing import Any
 
 import numpy as np
 
@@ -30,7 +30,7 @@ _BASE = "base_link"  # the vehicle, by ROS's REP 105: x ahead, y left, z up
 _SLICE = 1e-4  # seconds for which one pose of the vehicle is good enough: 3 mm at 30 m/s
 
 
-def find_bags(root: Place) -> List[Path]:
+def find_bags(root: Place) -> list[Path]:
     """All bags under a folder, sorted: files `.bag` (ROS 1), `.mcap`, `.db3`, and folders with a metadata.yaml (ROS 2).
 
     Args:
@@ -82,9 +82,9 @@ class BagLog(NumberedSweeps):
     def __init__(
         self,
         path: Place,
-        topic: Optional[str] = None,
-        poses: Optional[str] = "auto",
-        frame: Optional[str] = None,
+        topic: str | None = None,
+        poses: str | None = "auto",
+        frame: str | None = None,
         ego_T_lidar: Any = None,
         deskew: bool = True,
     ) -> None:
@@ -93,8 +93,8 @@ class BagLog(NumberedSweeps):
             raise CFlowError(f"{self.path}: bags are read from this machine only; copy it here")
         self.log_id = self.path.resolve().stem if self.path.is_file() else self.path.resolve().name
         self.deskew = deskew
-        self.poses: Optional[np.ndarray] = None
-        self._opened: Tuple[int, Any] = (0, None)
+        self.poses: np.ndarray | None = None
+        self._opened: tuple[int, Any] = (0, None)
         self._mount = None if ego_T_lidar is None else rigid_transform(ego_T_lidar, "ego_T_lidar")
         with file_errors(f"{self.path}", "is it a whole bag of ROS 1 (.bag), ROS 2 (folder) or MCAP?"):
             topics = {connection.topic: connection.msgtype for connection in self._reader().connections}
@@ -136,7 +136,7 @@ class BagLog(NumberedSweeps):
             points = np.einsum("nij,nj->ni", T[:, :3, :3], points) + T[:, :3, 3]
         return Sweep(points.astype(np.float32), None, self.poses[index].copy(), time, times)
 
-    def labels(self, index: int) -> Optional[FlowLabels]:
+    def labels(self, index: int) -> FlowLabels | None:
         """None: bags have no truth."""
         self._timestamp(index)
         return None
@@ -157,10 +157,10 @@ class BagLog(NumberedSweeps):
             self._opened = (os.getpid(), reader)
         return self._opened[1]
 
-    def __getstate__(self) -> Dict[str, Any]:
+    def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_opened": (0, None)}
 
-    def _chosen(self, topics: Dict[str, str], types: Tuple[str, ...], name: Optional[str], setting: str) -> str:
+    def _chosen(self, topics: dict[str, str], types: tuple[str, ...], name: str | None, setting: str) -> str:
         """The topic of one of these types that is named, or the only one."""
         found = sorted(topic for topic, kind in topics.items() if kind in types and name in (None, topic))
         if len(found) != 1:
@@ -172,14 +172,14 @@ class BagLog(NumberedSweeps):
             )
         return found[0]
 
-    def _scan(self) -> Tuple[Dict[int, int], Dict[str, List[Sample]]]:
+    def _scan(self) -> tuple[dict[int, int], dict[str, list[Sample]]]:
         """Time of each cloud -> of its arrival; samples of poses by topic. The frames are filled."""
         self._lidar = ""
-        self._child: Dict[str, str] = {}
-        arrival: Dict[int, int] = {}
-        parents: Dict[str, str] = {}
-        links: Dict[str, List[Sample]] = {}
-        tracks: Dict[str, List[Sample]] = {}
+        self._child: dict[str, str] = {}
+        arrival: dict[int, int] = {}
+        parents: dict[str, str] = {}
+        links: dict[str, list[Sample]] = {}
+        tracks: dict[str, list[Sample]] = {}
         reader = self._reader()
         wanted = [c for c in reader.connections if c.topic == self.topic or c.msgtype in (*_POSE_TYPES, *_TF_TYPES)]
         for connection, arrived, data in reader.messages(wanted):
@@ -200,7 +200,7 @@ class BagLog(NumberedSweeps):
         self._frames = Frames(parents, links)
         return arrival, tracks
 
-    def _trajectory(self, poses: str, tracks: Dict[str, List[Sample]]) -> Tuple[np.ndarray, np.ndarray]:
+    def _trajectory(self, poses: str, tracks: dict[str, list[Sample]]) -> tuple[np.ndarray, np.ndarray]:
         """(M,) int64 times that transforms or messages tell, and (M, 4, 4) `T_world_ego` at them."""
         if poses == "tf":
             times = self._frames.moves(self.frame)
@@ -236,7 +236,7 @@ def _name(frame: str) -> str:
     return frame.lstrip("/")
 
 
-def _bags_in(folder: Path) -> List[Path]:
+def _bags_in(folder: Path) -> list[Path]:
     if (folder / "metadata.yaml").is_file():
         return [folder]
     return [file for file in folder.iterdir() if file.suffix in SUFFIXES and file.is_file()]

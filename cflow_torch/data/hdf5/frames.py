@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Optional
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -38,7 +38,7 @@ def is_argoverse2(timestamp: int) -> bool:
     return low <= timestamp < high
 
 
-def recognized_extrinsics(timestamp: int, points: np.ndarray, is_ground: Optional[np.ndarray]) -> np.ndarray:
+def recognized_extrinsics(timestamp: int, points: np.ndarray, is_ground: np.ndarray | None) -> np.ndarray:
     """Coordinates of a scene's points to the frame whose poses it stores, by what a sweep looks like.
 
     Args:

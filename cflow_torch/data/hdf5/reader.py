@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import weakref
 from pathlib import Path
-from typing import Any, List, Optional, Sequence, Tuple
+from typing import Any, Sequence
 
 import numpy as np
 
@@ -22,7 +22,7 @@ _LARGEST_CATEGORY = 255
 EXTRINSIC = "ego_T_lidar"  # attribute of a scene that `write_hdf5_scene` leaves
 
 
-def find_hdf5_scenes(root: Place) -> List[Path]:
+def find_hdf5_scenes(root: Place) -> list[Path]:
     """The scene files of a folder, or the one file given, sorted.
 
     Raises:
@@ -99,7 +99,7 @@ class HDF5Log(NumberedSweeps):
         times = self._column(index, "lidar_dt", rows, np.float32)
         return Sweep(points[:, :3], is_ground, pose, nanoseconds, times)
 
-    def labels(self, index: int) -> Optional[FlowLabels]:
+    def labels(self, index: int) -> FlowLabels | None:
         """Truth of the pair (index, index + 1); None where the sweep has no `flow`."""
         rows = self._rows(index)
         flow = self._values(index, "flow", [(rows, 3)], np.float32)
@@ -115,7 +115,7 @@ class HDF5Log(NumberedSweeps):
         # Waymo has int8 and -1 = no label.
         return FlowLabels(flow, category.clip(0).astype(np.uint8), is_valid & (category >= 0))
 
-    def eval_mask(self, index: int) -> Optional[np.ndarray]:
+    def eval_mask(self, index: int) -> np.ndarray | None:
         """(N,) bool points to score, None where the sweep has no `eval_mask`."""
         return self._column(index, "eval_mask", self._rows(index), np.bool_)
 
@@ -130,7 +130,7 @@ class HDF5Log(NumberedSweeps):
             rigid_transform(pose, f"pose of sweep {index} or {index + 1} of {self.file}")
         return StoredMotion(harness_motion(*poses), np.array_equal(self.ego_T_lidar, np.eye(4)))
 
-    def keys(self, index: int) -> Tuple[str, ...]:
+    def keys(self, index: int) -> tuple[str, ...]:
         """Names of everything that sweep `index` has, results included."""
         with scene_errors(self.file):
             return tuple(sorted(self._group(index)))
@@ -172,21 +172,21 @@ class HDF5Log(NumberedSweeps):
         """The group of a sweep."""
         return member(self._scene, str(self._timestamp(index)), self.file)
 
-    def _array(self, index: int, key: str) -> Optional[Any]:
+    def _array(self, index: int, key: str) -> Any | None:
         """What a sweep has under a key, not read yet; None where it is absent."""
         return member(self._group(index), key, f"{self.file}: sweep {self.timestamps[index]}")
 
     def _rows(self, index: int) -> int:
         """Points of a sweep, none of which is read."""
         stored = self._array(index, "lidar")
-        shape: Tuple[int, ...] = () if stored is None else stored.shape
+        shape: tuple[int, ...] = () if stored is None else stored.shape
         if len(shape) != 2 or shape[1] < 3:
             raise CFlowError(f"{self.file}: lidar of sweep {self.timestamps[index]} has shape {shape}, not (N, 3+)")
         return int(shape[0])
 
     def _values(
-        self, index: int, key: str, shapes: Sequence[Tuple[int, ...]] = (), dtype: Any = None
-    ) -> Optional[np.ndarray]:
+        self, index: int, key: str, shapes: Sequence[tuple[int, ...]] = (), dtype: Any = None
+    ) -> np.ndarray | None:
         """Values of a key in one of the given shapes; None where it is absent."""
         stored = self._array(index, key)
         if stored is None:
@@ -198,7 +198,7 @@ class HDF5Log(NumberedSweeps):
             values: np.ndarray = stored[()]
             return values if dtype is None else values.astype(dtype, copy=False)
 
-    def _needed(self, index: int, key: str, shape: Optional[Tuple[int, ...]] = None, dtype: Any = None) -> np.ndarray:
+    def _needed(self, index: int, key: str, shape: tuple[int, ...] | None = None, dtype: Any = None) -> np.ndarray:
         """`_values` of a key that must be there."""
         values = self._values(index, key, [shape] if shape else [], dtype)
         if values is None:
@@ -206,7 +206,7 @@ class HDF5Log(NumberedSweeps):
             raise CFlowError(f"{self.file}: sweep {self.timestamps[index]} has no {key}; it has {has}")
         return values
 
-    def _column(self, index: int, key: str, rows: int, dtype: Any = None) -> Optional[np.ndarray]:
+    def _column(self, index: int, key: str, rows: int, dtype: Any = None) -> np.ndarray | None:
         """(N,) values of a key, also where it is stored as (N, 1); None where it is absent."""
         values = self._values(index, key, [(rows,), (rows, 1)], dtype)
         return None if values is None else values.reshape(rows)

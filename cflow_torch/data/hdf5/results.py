@@ -8,7 +8,7 @@ import shutil
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any, Iterable, Iterator, List, Mapping, Optional, Tuple, Union
+from typing import Any, Iterable, Iterator, Mapping
 
 import numpy as np
 
@@ -47,7 +47,7 @@ def check_result_name(name: str) -> None:
         raise CFlowError(f"{name} is a key of the scenes themselves, choose another name, for example cflow")
 
 
-def check_writable(file: Union[str, Path]) -> None:
+def check_writable(file: str | Path) -> None:
     """Refuse a scene that must not be changed.
 
     Raises:
@@ -61,7 +61,7 @@ def check_writable(file: Union[str, Path]) -> None:
         raise CFlowError(f"{file} or its folder is read-only: copy the scene, or make it writable")
 
 
-def write_hdf5_results(file: Union[str, Path], name: str, results: Iterable[Tuple[int, Array]]) -> int:
+def write_hdf5_results(file: str | Path, name: str, results: Iterable[tuple[int, Array]]) -> int:
     """Write the total flow of sweeps into a scene under a result name.
 
     Args:
@@ -95,8 +95,8 @@ def write_hdf5_results(file: Union[str, Path], name: str, results: Iterable[Tupl
 
 
 def write_hdf5_labels(
-    file: Union[str, Path],
-    labels: Iterable[Tuple[int, Mapping[str, np.ndarray]]],
+    file: str | Path,
+    labels: Iterable[tuple[int, Mapping[str, np.ndarray]]],
     made_by: str = "",
     overwrite: bool = False,
 ) -> int:
@@ -132,7 +132,7 @@ def write_hdf5_labels(
     return count
 
 
-def labelled_by(file: Union[str, Path]) -> Optional[str]:
+def labelled_by(file: str | Path) -> str | None:
     """What made the labels of a scene: `made_by`, "" if that is not known; None if it has no labels.
 
     Raises:
@@ -143,13 +143,13 @@ def labelled_by(file: Union[str, Path]) -> Optional[str]:
         return None if made_by is None else str(made_by)
 
 
-def _labels_in(scene: Any) -> List[str]:
+def _labels_in(scene: Any) -> list[str]:
     """Keys of labels that sweeps of an open scene have."""
     return sorted({key for stamp in scene if is_stamp(stamp) for key in set(scene[stamp]) & set(LABELS)})
 
 
 @contextmanager
-def _changed(file: Union[str, Path]) -> Iterator[Any]:
+def _changed(file: str | Path) -> Iterator[Any]:
     """A copy of a scene, open to be changed, that takes its place when the block ends, and is removed if it raises."""
     h5py = import_h5py()
     check_writable(file)
@@ -166,7 +166,7 @@ def _changed(file: Union[str, Path]) -> Iterator[Any]:
                 scene.close()
 
 
-def _sweep(scene: Any, file: Path, timestamp: str) -> Tuple[Any, int]:
+def _sweep(scene: Any, file: Path, timestamp: str) -> tuple[Any, int]:
     """The group of a sweep and its number of points."""
     sweep = member(scene, timestamp, file)
     points = None if sweep is None else member(sweep, "lidar", f"{file}: sweep {timestamp}")
@@ -204,7 +204,7 @@ def _write_labels(scene: Any, file: Path, timestamp: str, labels: Mapping[str, n
             _store(sweep, key, older, values)
 
 
-def _is_like(stored: Any, shape: Tuple[int, ...], dtype: Any) -> bool:
+def _is_like(stored: Any, shape: tuple[int, ...], dtype: Any) -> bool:
     """Whether a dataset can take such values in its place, and has one name only."""
     return bool(stored.shape == shape and stored.dtype == dtype and import_h5py().h5o.get_info(stored.id).rc == 1)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import Any, Optional
+from typing import Any
 
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.paths import Place, ranged
@@ -38,7 +38,7 @@ def open_scene(file: Path) -> Any:
         return h5py.File(ranged(file), "r")
 
 
-def member(group: Any, name: str, where: Place) -> Optional[Any]:
+def member(group: Any, name: str, where: Place) -> Any | None:
     """What a group of h5py holds under a name, a group or an array of numbers; None where it holds nothing.
 
     Args:

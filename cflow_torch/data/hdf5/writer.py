@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pickle
 from pathlib import Path
-from typing import Any, Dict, List, Union
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from cflow_torch.windows.ego_motion import rigid_transform
 
 def write_hdf5_scene(
     log: Log,
-    file: Union[str, Path],
+    file: str | Path,
     points_frame: str = "ego",
     ego_T_lidar: Any = None,
     store_extrinsics: bool = True,
@@ -65,7 +65,7 @@ def write_hdf5_scene(
     if len(set(log.timestamps)) < len(log.timestamps) or min(log.timestamps, default=0) < 0:
         raise CFlowError(f"log {log.log_id}: time stamps must be different numbers from 0, they name the groups")
     file = Path(file)
-    identity: Dict[str, int] = {}
+    identity: dict[str, int] = {}
     with atomic_name(file) as new, h5py.File(new, "w") as scene:
         if store_extrinsics:
             scene.attrs[EXTRINSIC] = extrinsics
@@ -75,7 +75,7 @@ def write_hdf5_scene(
                 group.create_dataset(key, data=value)
 
 
-def write_index_files(folder: Union[str, Path]) -> None:
+def write_index_files(folder: str | Path) -> None:
     """Write `index_total.pkl`, `index_flow.pkl` and `index_eval.pkl` for all scenes of a folder, taken from the groups.
 
     Convention: each is OpenSceneFlow's pickled list of [scene, time stamp], both strings.
@@ -99,8 +99,8 @@ def write_index_files(folder: Union[str, Path]) -> None:
 
 
 def _sweep(
-    log: Log, index: int, extrinsics: np.ndarray, pose_dtype: str, eval_step: int, identity: Dict[str, int]
-) -> Dict[str, np.ndarray]:
+    log: Log, index: int, extrinsics: np.ndarray, pose_dtype: str, eval_step: int, identity: dict[str, int]
+) -> dict[str, np.ndarray]:
     """Key -> value of one group."""
     sweep, labels = log.sweep(index), log.labels(index)
     if sweep.pose is None:
@@ -109,7 +109,7 @@ def _sweep(
     inverse = np.linalg.inv(extrinsics)
     points = moved(ego_points, inverse)
     pose = np.asarray(sweep.pose, np.float64)
-    values: Dict[str, np.ndarray] = {"lidar": points.astype(np.float32), "pose": pose.astype(pose_dtype)}
+    values: dict[str, np.ndarray] = {"lidar": points.astype(np.float32), "pose": pose.astype(pose_dtype)}
     if sweep.is_ground is not None:
         values["ground_mask"] = np.asarray(sweep.is_ground, bool)
     if index < len(log.timestamps) - 1:
@@ -129,7 +129,7 @@ def _sweep(
     return values
 
 
-def _units(units: List[Any]) -> Dict[str, np.ndarray]:
+def _units(units: list[Any]) -> dict[str, np.ndarray]:
     count = [len(unit.points) for unit in units]
     return {
         "lidar_id": np.repeat(np.arange(1, len(units) + 1, dtype=np.uint8), count),
@@ -138,7 +138,7 @@ def _units(units: List[Any]) -> Dict[str, np.ndarray]:
     }
 
 
-def _instances(boxes: Any, points: np.ndarray, identity: Dict[str, int]) -> np.ndarray:
+def _instances(boxes: Any, points: np.ndarray, identity: dict[str, int]) -> np.ndarray:
     """(N,) int16, the same number for a track in every sweep, 0 = in no box."""
     instance = np.zeros(len(points), np.int16)
     for track, size, pose in zip(boxes.track_id, boxes.size, boxes.pose):

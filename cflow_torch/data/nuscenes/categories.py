@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Dict
-
 OWN_TRAILER = "vehicle.ego_trailer"  # what the recording truck of TruckScenes pulls
 
-NUSCENES_CATEGORIES: Dict[str, str] = {
+NUSCENES_CATEGORIES: dict[str, str] = {
     "animal": "ANIMAL",
     "human.pedestrian.adult": "PEDESTRIAN",
     "human.pedestrian.child": "PEDESTRIAN",
@@ -33,7 +31,7 @@ NUSCENES_CATEGORIES: Dict[str, str] = {
 }
 """Category of a box -> name in Argoverse 2; NONE = background, though its points move as the box does."""
 
-TRUCKSCENES_CATEGORIES: Dict[str, str] = {
+TRUCKSCENES_CATEGORIES: dict[str, str] = {
     **NUSCENES_CATEGORIES,
     "animal": "NONE",
     "static_object.traffic_sign": "SIGN",

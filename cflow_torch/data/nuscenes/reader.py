@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import ClassVar, List, Mapping, NamedTuple, Optional, Sequence, Tuple
+from typing import ClassVar, Mapping, NamedTuple, Sequence
 
 import numpy as np
 
@@ -34,7 +34,7 @@ class Footprint(NamedTuple):
     half_width: float
 
 
-def find_nuscenes_scenes(root: Place) -> List[SceneSource]:
+def find_nuscenes_scenes(root: Place) -> list[SceneSource]:
     """All scenes under a folder, see `nuscenes.tables.find_scenes`."""
     return find_scenes(root, ("ego_motion_cabin", "ego_motion_chassis"), "nuScenes")
 
@@ -71,8 +71,8 @@ class NuScenesLog(NumberedSweeps):
         self,
         source: SceneSource,
         sweep_step: int = 1,
-        lidars: Optional[Sequence[str]] = None,
-        own_vehicle: Optional[Footprint] = OWN_VEHICLE,
+        lidars: Sequence[str] | None = None,
+        own_vehicle: Footprint | None = OWN_VEHICLE,
     ) -> None:
         if sweep_step < 1:
             raise CFlowError(f"sweep_step={sweep_step}: it is 1 for all sweeps, 2 for every second one")
@@ -99,7 +99,7 @@ class NuScenesLog(NumberedSweeps):
         times = lag * 1e-6 if lag.any() else None
         return Sweep(points, None, self._poses[index].copy(), self.timestamps[index] * 1000, times)
 
-    def labels(self, index: int) -> Optional[FlowLabels]:
+    def labels(self, index: int) -> FlowLabels | None:
         """Truth of the pair (index, index + 1), from the boxes at both times.
 
         Boxes are annotated at 2 Hz; between, see `nuscenes.tracks.Tracks.at`. Where an object is annotated at only one
@@ -142,7 +142,7 @@ class NuScenesLog(NumberedSweeps):
             self._T_ego_world[index] @ tracks.pose[rows],
         )
 
-    def _cloud(self, index: int) -> Tuple[np.ndarray, np.ndarray]:
+    def _cloud(self, index: int) -> tuple[np.ndarray, np.ndarray]:
         """(N, 3) float32 points, ego frame of the sweep; (N,) int64 microseconds from its time stamp to each shot, 0
         where the format does not tell."""
         time = self._timestamp(index)
@@ -153,7 +153,7 @@ class NuScenesLog(NumberedSweeps):
                 parts.append(self._unit_points(chain, row, index))
         return np.concatenate([points for points, _ in parts]), np.concatenate([lag for _, lag in parts])
 
-    def _unit_points(self, chain: LidarChain, row: int, index: int) -> Tuple[np.ndarray, np.ndarray]:
+    def _unit_points(self, chain: LidarChain, row: int, index: int) -> tuple[np.ndarray, np.ndarray]:
         """`_cloud` of one sweep of one LiDAR."""
         file = inside(self._root, chain.files[row], f"scene {self.log_id}: the filename in sample_data.json")
         with file_errors(file, f"copy the sensor data of scene {self.log_id} beside the tables"):
@@ -180,7 +180,7 @@ class NuScenesLog(NumberedSweeps):
         points = np.einsum("nij,nj->ni", at[:, :3, :3], points) + at[:, :3, 3]
         return points.astype(np.float32), since
 
-    def _points_of(self, content: bytes, file: Path) -> Tuple[np.ndarray, Optional[np.ndarray]]:
+    def _points_of(self, content: bytes, file: Path) -> tuple[np.ndarray, np.ndarray | None]:
         """(N, 3) points in the frame of the LiDAR; (N,) int64 microseconds, times of the shots, None = all at once."""
         return pcd_bin_points(content, file), None
 

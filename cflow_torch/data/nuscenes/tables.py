@@ -6,7 +6,7 @@ from collections import defaultdict
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Collection, Dict, List, Optional, Sequence, Tuple
+from typing import Any, Collection, Dict, Sequence
 
 import numpy as np
 
@@ -23,7 +23,7 @@ _SENSOR_FOLDERS = ("samples", "sweeps", "maps")  # lie beside the tables and hol
 _COPY = "copy the tables again"
 Row = Dict[str, Any]
 # The fields that are read; every other field of the format may be absent.
-FIELDS: Dict[str, Tuple[str, ...]] = {
+FIELDS: dict[str, tuple[str, ...]] = {
     "scene": ("token", "name"),
     "sample": ("token", "timestamp", "scene_token"),
     "sensor": ("token", "channel", "modality"),
@@ -53,7 +53,7 @@ class SceneSource:
     root: Path
     version: str
     name: str
-    tables: Optional[Tables] = field(default=None, repr=False, compare=False)
+    tables: Tables | None = field(default=None, repr=False, compare=False)
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class LidarChain:
 
     times: np.ndarray
     is_key_frame: np.ndarray
-    files: Tuple[str, ...]
+    files: tuple[str, ...]
     ego: np.ndarray
     mount: np.ndarray
 
@@ -93,7 +93,7 @@ class Annotations:
     pose: np.ndarray
 
 
-def find_scenes(root: Place, foreign: Collection[str], data_set: str) -> List[SceneSource]:
+def find_scenes(root: Place, foreign: Collection[str], data_set: str) -> list[SceneSource]:
     """The scenes of all versions under a folder, by folder and name. Those of one version share their tables.
 
     Args:
@@ -120,7 +120,7 @@ def find_scenes(root: Place, foreign: Collection[str], data_set: str) -> List[Sc
     return found
 
 
-def read_table(folder: Path, table: str, key: str = "", values: Collection[str] = ()) -> List[Row]:
+def read_table(folder: Path, table: str, key: str = "", values: Collection[str] = ()) -> list[Row]:
     """Rows of a table with the fields of `FIELDS`.
 
     Args:
@@ -135,7 +135,7 @@ def read_table(folder: Path, table: str, key: str = "", values: Collection[str] 
     """
     file = folder / f"{table}.json"
 
-    def use(row: Row) -> Optional[Row]:  # called for each row as it is parsed, so that the rest is never held
+    def use(row: Row) -> Row | None:  # called for each row as it is parsed, so that the rest is never held
         chosen = {name: row[name] for name in FIELDS[table]}
         return chosen if not key or row[key] in values else None
 
@@ -146,7 +146,7 @@ def read_table(folder: Path, table: str, key: str = "", values: Collection[str] 
         return [row for row in rows if row is not None]
 
 
-def _by_token(rows: Sequence[Row]) -> Dict[str, Row]:
+def _by_token(rows: Sequence[Row]) -> dict[str, Row]:
     return {row["token"]: row for row in rows}
 
 
@@ -163,11 +163,11 @@ class Tables:
 
     def __init__(self, folder: Place) -> None:
         self.folder = as_path(folder)
-        self._rows: Dict[str, Dict[str, List[Row]]] = {}  # table -> token of the scene -> its rows
-        self._by_token: Dict[str, Dict[str, Row]] = {}
+        self._rows: dict[str, dict[str, list[Row]]] = {}  # table -> token of the scene -> its rows
+        self._by_token: dict[str, dict[str, Row]] = {}
 
     @cached_property
-    def scenes(self) -> Dict[str, str]:
+    def scenes(self) -> dict[str, str]:
         """Name of each scene -> its token, by name.
 
         Raises:
@@ -179,7 +179,7 @@ class Tables:
             raise CFlowError(f"{file} has {len(rows)} scenes, but {len(scenes)} names; {_COPY}")
         return dict(sorted(scenes.items()))
 
-    def scene(self, name: str) -> Tuple[np.ndarray, Dict[str, LidarChain], Annotations]:
+    def scene(self, name: str) -> tuple[np.ndarray, dict[str, LidarChain], Annotations]:
         """All rows of a scene, linked and checked.
 
         Returns:
@@ -196,7 +196,7 @@ class Tables:
                 self._load()
             rows = {table: by_scene[self.scenes[name]] for table, by_scene in self._rows.items()}
             samples = self._ordered("sample", rows["sample"])
-            channels: Dict[str, List[Row]] = {row["channel"]: [] for row in self._by_token["sensor"].values()}
+            channels: dict[str, list[Row]] = {row["channel"]: [] for row in self._by_token["sensor"].values()}
             for row in self._ordered("sample_data", rows["sample_data"], "calibrated_sensor_token"):
                 mount = self._by_token["calibrated_sensor"][row["calibrated_sensor_token"]]
                 channels[self._by_token["sensor"][mount["sensor_token"]]["channel"]].append(row)
@@ -215,13 +215,13 @@ class Tables:
         by_token["ego_pose"] = _by_token(read_table(self.folder, "ego_pose", "token", moments))
         rows = {"sample_data": sweeps, "sample_annotation": read_table(self.folder, "sample_annotation")}
         for table, content in (*rows.items(), ("sample", list(by_token["sample"].values()))):
-            grouped: Dict[str, List[Row]] = defaultdict(list)
+            grouped: dict[str, list[Row]] = defaultdict(list)
             for row in content:
                 sample = row if table == "sample" else by_token["sample"][row["sample_token"]]
                 grouped[sample["scene_token"]].append(row)
             self._rows[table] = grouped
 
-    def _ordered(self, table: str, rows: Sequence[Row], key: str = "scene_token") -> List[Row]:
+    def _ordered(self, table: str, rows: Sequence[Row], key: str = "scene_token") -> list[Row]:
         """Rows in the order of time, no two of which have one time and one `key`."""
         if len({(row["timestamp"], row[key]) for row in rows}) < len(rows):
             raise CFlowError(f"{self.folder / table}.json has two rows of one {key} and one time; {_COPY}")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Dict, List, Optional, Tuple
-
 import numpy as np
 
 from cflow_torch.data.nuscenes.tables import Annotations
@@ -24,11 +22,11 @@ class Tracks:
     def __init__(self, sample_times: np.ndarray, annotations: Annotations) -> None:
         self._times, self._annotations = sample_times, annotations
         self.start, self.end = (int(sample_times[0]), int(sample_times[-1])) if len(sample_times) else (0, 0)
-        self._rows: List[Dict[str, int]] = [{} for _ in sample_times]  # per sample: track -> row
+        self._rows: list[dict[str, int]] = [{} for _ in sample_times]  # per sample: track -> row
         for row, sample in enumerate(np.searchsorted(sample_times, annotations.time)):
             self._rows[int(sample)][annotations.track[row]] = row
 
-    def at(self, time: int) -> Optional[Tuple[Annotations, np.ndarray]]:
+    def at(self, time: int) -> tuple[Annotations, np.ndarray] | None:
         """Boxes at a time; None before the first sample, after the last, and in a scene without annotations.
 
         Returns:
@@ -46,7 +44,7 @@ class Tracks:
         rows = dict(enumerate(self._rows))
         if times[left] == time:
             return self._boxes(time, [(row, row, 0.0, True) for row in rows[left].values()])
-        ends: List[Tuple[int, int, float, bool]] = []  # row at one end, row at the other, how far between, is it known
+        ends: list[tuple[int, int, float, bool]] = []  # row at one end, row at the other, how far between, is it known
         for track, row in {**rows[left], **rows[left + 1], **rows[left]}.items():  # those of `left` come first
             both = [k for k in (left, left - 1, left + 1) if track in rows.get(k, ()) and track in rows.get(k + 1, ())]
             start = both[0] if both else None
@@ -57,7 +55,7 @@ class Tracks:
                 ends.append((rows[start][track], rows[start + 1][track], fraction, start == left))
         return self._boxes(time, sorted(ends, key=lambda end: end[3]))
 
-    def _boxes(self, time: int, ends: List[Tuple[int, int, float, bool]]) -> Tuple[Annotations, np.ndarray]:
+    def _boxes(self, time: int, ends: list[tuple[int, int, float, bool]]) -> tuple[Annotations, np.ndarray]:
         table, rows0, rows1 = self._annotations, [end[0] for end in ends], [end[1] for end in ends]
         fraction = np.array([end[2] for end in ends], dtype=np.float64)
         boxes = Annotations(

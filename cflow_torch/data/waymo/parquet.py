@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Collection, Dict, List, Optional, Sequence, Tuple
+from typing import Any, Collection, Sequence, Tuple
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -42,9 +42,9 @@ class Component:
     def __init__(self, segment: Path, tag: str) -> None:
         self.file = segment.parent.parent / tag / segment.name
         self._mend = f"download component {tag} of this segment"
-        self._numbers: Dict[Key, int] = {}  # of the rows
+        self._numbers: dict[Key, int] = {}  # of the rows
 
-    def rows(self, columns: Sequence[str]) -> List[Dict[str, Any]]:
+    def rows(self, columns: Sequence[str]) -> list[dict[str, Any]]:
         """Rows of the file, of these columns.
 
         Raises:
@@ -53,7 +53,7 @@ class Component:
         with file_errors(self.file, self._mend):
             parquet = pq.ParquetFile(ranged(self.file))
             check_columns(self.file, parquet.schema_arrow.names, columns, self._mend)
-            rows: List[Dict[str, Any]] = parquet.read(list(columns), use_threads=False).to_pylist()
+            rows: list[dict[str, Any]] = parquet.read(list(columns), use_threads=False).to_pylist()
             return rows
 
     def frame_lasers(self) -> Collection[Key]:
@@ -67,7 +67,7 @@ class Component:
             self._numbers = {(row[TIME], row[LASER]): number for number, row in enumerate(rows)}
         return self._numbers
 
-    def images(self, keys: Sequence[Key], column: str, channels: int) -> Dict[Key, Optional[np.ndarray]]:
+    def images(self, keys: Sequence[Key], column: str, channels: int) -> dict[Key, np.ndarray | None]:
         """Range images of some rows.
 
         Args:
@@ -88,7 +88,7 @@ class Component:
             raise CFlowError(f"{self.file} has no row for frame {missing[0][0]}, laser {missing[0][1]}; copy it again")
         wanted = {self._numbers[key]: key for key in keys}
         columns = [f"{column}.values", f"{column}.shape"]
-        images: Dict[Key, Optional[np.ndarray]] = {}
+        images: dict[Key, np.ndarray | None] = {}
         with file_errors(self.file, self._mend):
             parquet, end = pq.ParquetFile(mapped(self.file)), 0
             check_columns(self.file, parquet.schema_arrow.names, columns, self._mend)
@@ -111,7 +111,7 @@ def matrix_of(values: Any, where: str) -> np.ndarray:
     return rigid_transform(np.reshape(values, (4, 4)), where)
 
 
-def _image(values: Any, shape: Any, channels: int) -> Optional[np.ndarray]:
+def _image(values: Any, shape: Any, channels: int) -> np.ndarray | None:
     """(H, W, channels) image of a list cell; None where the cell is null or empty."""
     if not values.is_valid or not shape.is_valid or not len(values.values) or not len(shape.values):
         return None

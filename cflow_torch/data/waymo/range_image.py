@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Optional, Tuple
 
 import numpy as np
 import torch
@@ -31,7 +30,7 @@ class LaserCalibration:
     """
 
     T_ego_sensor: np.ndarray
-    inclinations: Optional[np.ndarray] = None
+    inclinations: np.ndarray | None = None
     low: float = 0.0
     high: float = 0.0
 
@@ -84,9 +83,9 @@ def rotations_from_angles(angles: np.ndarray) -> np.ndarray:
 def range_image_points(
     image: np.ndarray,
     calibration: LaserCalibration,
-    pixel_poses: Optional[np.ndarray] = None,
-    T_world_ego: Optional[np.ndarray] = None,
-) -> Tuple[np.ndarray, np.ndarray]:
+    pixel_poses: np.ndarray | None = None,
+    T_world_ego: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
     """Points of all pixels that have a return.
 
     Args:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from functools import lru_cache
 from pathlib import Path
-from typing import Dict, List, Optional, Sequence, Tuple
+from typing import Sequence
 
 import numpy as np
 
@@ -37,7 +37,7 @@ BOX_CATEGORY = {0: "NONE", 1: "REGULAR_VEHICLE", 2: "PEDESTRIAN", 3: "SIGN", 4: 
 _KEPT_FRAMES = 2  # the labels of a pair are asked for after both of its sweeps
 
 
-def find_waymo_segments(root: Place) -> List[Path]:
+def find_waymo_segments(root: Place) -> list[Path]:
     """The LiDAR files `<split>/lidar/<segment>.parquet` of all segments under a folder, sorted.
 
     Args:
@@ -107,7 +107,7 @@ class WaymoLog(NumberedSweeps):
         self._poses = self._read_poses(times)
         if TOP in self._lasers:
             self._pixel_poses.frame_lasers()
-        self._boxes: Optional[Dict[int, Boxes]] = None
+        self._boxes: dict[int, Boxes] | None = None
         self._frame = lru_cache(_KEPT_FRAMES)(self._read_frame)
 
     def sweep(self, index: int) -> Sweep:
@@ -115,7 +115,7 @@ class WaymoLog(NumberedSweeps):
         time = self._timestamp(index) // 1000
         return Sweep(self._frame(time)[0].copy(), None, self._poses[time].copy(), time * 1000)
 
-    def labels(self, index: int) -> Optional[FlowLabels]:
+    def labels(self, index: int) -> FlowLabels | None:
         """Truth of the pair (index, index + 1) from `lidar_box`; None for the last sweep and segments without boxes."""
         time0 = self._timestamp(index) // 1000
         if index == len(self) - 1:
@@ -135,7 +135,7 @@ class WaymoLog(NumberedSweeps):
         )
         return FlowLabels(labels.flow, labels.category, labels.is_valid & ~in_no_label_zone)
 
-    def _read_frame(self, time: int) -> Tuple[np.ndarray, np.ndarray]:
+    def _read_frame(self, time: int) -> tuple[np.ndarray, np.ndarray]:
         """(N, 3) float32 points in the vehicle frame; (N,) bool whether each lies in a no-label zone."""
         keys = [(time, laser) for laser in self._lasers]
         images = [self._images.images(keys, f"{LIDAR}{number}", 4) for number in self._returns]
@@ -156,7 +156,7 @@ class WaymoLog(NumberedSweeps):
                 zone.append(image.reshape(-1, image.shape[2])[pixels, NO_LABEL_ZONE] == 1)
         return np.concatenate(points).astype(np.float32), np.concatenate(zone)
 
-    def _read_calibration(self) -> Dict[int, LaserCalibration]:
+    def _read_calibration(self) -> dict[int, LaserCalibration]:
         component = Component(self.file, "lidar_calibration")
         names = [f"{CALIBRATION}beam_inclination.{name}" for name in ("values", "min", "max")]
         rows = {row[LASER]: row for row in component.rows((LASER, f"{CALIBRATION}extrinsic.transform", *names))}
@@ -175,7 +175,7 @@ class WaymoLog(NumberedSweeps):
                     calibration[laser] = LaserCalibration(mount, None, float(low), float(high))
         return calibration
 
-    def _read_poses(self, times: Sequence[int]) -> Dict[int, np.ndarray]:
+    def _read_poses(self, times: Sequence[int]) -> dict[int, np.ndarray]:
         """Frame time -> (4, 4) float64 `T_world_ego`."""
         component = Component(self.file, "vehicle_pose")
         stored = {row[TIME]: row[VEHICLE_POSE] for row in component.rows((TIME, VEHICLE_POSE))}
@@ -184,7 +184,7 @@ class WaymoLog(NumberedSweeps):
             raise CFlowError(f"{component.file} has no pose for frame {missing[0]}; copy it again")
         return {time: matrix_of(stored[time], f"{component.file}: the pose of frame {time}") for time in times}
 
-    def _read_boxes(self) -> Dict[int, Boxes]:
+    def _read_boxes(self) -> dict[int, Boxes]:
         """Frame time -> boxes; empty where the segment has no labels (the testing split)."""
         component = Component(self.file, "lidar_box")
         file = component.file

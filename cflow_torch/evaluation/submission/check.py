@@ -6,7 +6,7 @@ import json
 import zipfile
 from functools import partial
 from pathlib import Path
-from typing import Any, Callable, Dict, List, Mapping, Sequence, Union
+from typing import Any, Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from cflow_torch.types import CFlowError
 _DTYPES = {"halffloat": "float16", "float": "float32", "double": "float64"}  # Arrow's names -> NumPy's
 
 
-def check_submission(path: Union[str, Path], version: SubmissionVersion, expected: Sequence[Frame]) -> List[str]:
+def check_submission(path: str | Path, version: SubmissionVersion, expected: Sequence[Frame]) -> list[str]:
     """Compare an archive with what it must hold.
 
     Args:
@@ -52,7 +52,7 @@ def check_submission(path: Union[str, Path], version: SubmissionVersion, expecte
     return problems
 
 
-def open_archive(path: Union[str, Path]) -> Dict[str, Callable[[], bytes]]:
+def open_archive(path: str | Path) -> dict[str, Callable[[], bytes]]:
     """The files of a zip or folder.
 
     Args:
@@ -80,7 +80,7 @@ def open_archive(path: Union[str, Path]) -> Dict[str, Callable[[], bytes]]:
     return {name: partial(archive.read, name) for name in archive.namelist() if not name.endswith("/")}
 
 
-def check_file(name: str, read: Callable[[], bytes], rows: int, version: SubmissionVersion) -> List[str]:
+def check_file(name: str, read: Callable[[], bytes], rows: int, version: SubmissionVersion) -> list[str]:
     """All problems of one frame's file, or of the metadata.
 
     Args:
@@ -101,7 +101,7 @@ def check_file(name: str, read: Callable[[], bytes], rows: int, version: Submiss
     return [f"{name}: {problem}" for problem in problems]
 
 
-def _check_frame(file: FeatherFile, rows: int, version: SubmissionVersion) -> List[str]:
+def _check_frame(file: FeatherFile, rows: int, version: SubmissionVersion) -> list[str]:
     problems = []
     if set(file.names) != set(version.columns):
         problems.append(f"columns are {', '.join(file.names)}, expected {', '.join(version.columns)}")
@@ -113,7 +113,7 @@ def _check_frame(file: FeatherFile, rows: int, version: SubmissionVersion) -> Li
     return problems
 
 
-def _check_values(column: str, values: Any, dtypes: Sequence[str]) -> List[str]:
+def _check_values(column: str, values: Any, dtypes: Sequence[str]) -> list[str]:
     dtype = _DTYPES.get(str(values.type), str(values.type))
     if dtype not in dtypes:
         return [f"column {column} is {dtype}, expected {' or '.join(dtypes)}"]
@@ -123,7 +123,7 @@ def _check_values(column: str, values: Any, dtypes: Sequence[str]) -> List[str]:
     return [f"column {column} has {bad} values that are NaN or infinite"] if bad else []
 
 
-def _check_metadata(values: Any, required: Mapping[str, Any]) -> List[str]:
+def _check_metadata(values: Any, required: Mapping[str, Any]) -> list[str]:
     return [
         f"must hold {json.dumps(key)} as true or false"
         for key, value in required.items()

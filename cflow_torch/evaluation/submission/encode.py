@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Dict, Optional, Tuple
 
 import numpy as np
 
@@ -48,9 +47,9 @@ def encode(
     version: SubmissionVersion,
     sweeps: Window,
     result: FlowResult,
-    mask: Optional[np.ndarray] = None,
+    mask: np.ndarray | None = None,
     residual_axes: str = "t+1",
-) -> Tuple[Dict[str, np.ndarray], Rounding]:
+) -> tuple[dict[str, np.ndarray], Rounding]:
     """Columns of one frame's file.
 
     Args:
@@ -96,7 +95,7 @@ def encode(
     return {name: columns[name] for name in version.columns}, rounding
 
 
-def to_half(flow: np.ndarray) -> Tuple[np.ndarray, Rounding]:
+def to_half(flow: np.ndarray) -> tuple[np.ndarray, Rounding]:
     """(M, 3) flow of any float type in float16, and what was lost.
 
     Raises:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import zipfile
 from pathlib import Path
-from typing import Dict, List, Optional, Union
 
 import numpy as np
 import pyarrow as pa
@@ -32,9 +31,9 @@ class MaskArchive:
         CFlowError: the file is no such zip.
     """
 
-    def __init__(self, file: Union[str, Path]) -> None:
+    def __init__(self, file: str | Path) -> None:
         self.file = Path(file)
-        self.frames: Dict[str, List[int]] = {}
+        self.frames: dict[str, list[int]] = {}
         with file_errors(self.file):
             self._zip = zipfile.ZipFile(self.file)
         for match in map(_MASK.fullmatch, sorted(self._zip.namelist())):
@@ -58,7 +57,7 @@ class MaskArchive:
         return columns[0].to_numpy()
 
 
-def point_mask(log: Log, index: int, sweep: Sweep, masks: Optional[MaskArchive] = None) -> np.ndarray:
+def point_mask(log: Log, index: int, sweep: Sweep, masks: MaskArchive | None = None) -> np.ndarray:
     """Points of a sweep that are evaluated.
 
     Args:
@@ -85,7 +84,7 @@ def point_mask(log: Log, index: int, sweep: Sweep, masks: Optional[MaskArchive] 
     return mask
 
 
-def log_mask(log: Log, index: int) -> Optional[np.ndarray]:
+def log_mask(log: Log, index: int) -> np.ndarray | None:
     """(N,) bool evaluation mask that a log brings itself, None where it has none."""
     read = getattr(log, "eval_mask", None)
     return None if read is None else read(index)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Dict, Iterable, List, Mapping, Optional, Sequence, Union
+from typing import Iterable, Mapping, Sequence
 
 from cflow_torch.data.log import Log
 from cflow_torch.data.names import is_stamp, safe_name
@@ -37,7 +37,7 @@ class PlannedFrame:
     index: int
     name: str
 
-    def expect(self, version: SubmissionVersion, masks: Optional[MaskArchive] = None) -> Frame:
+    def expect(self, version: SubmissionVersion, masks: MaskArchive | None = None) -> Frame:
         """The file this frame becomes; reads the sweep.
 
         Raises:
@@ -50,8 +50,8 @@ class PlannedFrame:
 
 
 def plan_log(
-    log: Log, version: SubmissionVersion, listed: Optional[Mapping[str, Sequence[int]]] = None
-) -> List[PlannedFrame]:
+    log: Log, version: SubmissionVersion, listed: Mapping[str, Sequence[int]] | None = None
+) -> list[PlannedFrame]:
     """Frames of one log that a submission needs, in the order of time.
 
     Args:
@@ -77,7 +77,7 @@ def plan_log(
     return [PlannedFrame(log, i, version.file_name(log.log_id, i, log.timestamps[i])) for i in indices]
 
 
-def read_frame_list(file: Union[str, Path]) -> Dict[str, List[int]]:
+def read_frame_list(file: str | Path) -> dict[str, list[int]]:
     """A list of frames: plain text, one `<log>/<time stamp>` a line, # for comments.
 
     Returns:
@@ -91,7 +91,7 @@ def read_frame_list(file: Union[str, Path]) -> Dict[str, List[int]]:
         lines = read_bytes(file).decode("utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise CFlowError(f"{file} cannot be read as a text file of frames ({error})") from error
-    result: Dict[str, List[int]] = {}
+    result: dict[str, list[int]] = {}
     for number, line in enumerate(lines, 1):
         entry = line.partition("#")[0].strip()
         if not entry:
@@ -103,7 +103,7 @@ def read_frame_list(file: Union[str, Path]) -> Dict[str, List[int]]:
     return result
 
 
-def require_logs(logs: Iterable[Log], listed: Optional[Mapping[str, Sequence[int]]]) -> None:
+def require_logs(logs: Iterable[Log], listed: Mapping[str, Sequence[int]] | None) -> None:
     """Refuse two logs of one name, and a list that names logs which are not there.
 
     Raises:

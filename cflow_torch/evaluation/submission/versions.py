@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Dict, Mapping, Optional, Tuple
+from typing import Any, Mapping
 
 from cflow_torch.types import CFlowError
 
@@ -29,19 +29,19 @@ class SubmissionVersion:
 
     number: int
     server: str
-    columns: Mapping[str, Tuple[str, ...]]
+    columns: Mapping[str, tuple[str, ...]]
     flow: str
     rows: str
     frames: str
     naming: str
-    metadata: Optional[Mapping[str, Any]] = None
+    metadata: Mapping[str, Any] | None = None
 
     def file_name(self, log_id: str, index: int, timestamp: int) -> str:
         """Name of a frame's file inside the archive."""
         return f"{log_id}/{index:010d}.feather" if self.naming == "position" else f"{log_id}/{timestamp}.feather"
 
 
-VERSIONS: Dict[int, SubmissionVersion] = {
+VERSIONS: dict[int, SubmissionVersion] = {
     1: SubmissionVersion(
         number=1,
         server="Argoverse 2 scene flow 2023 (EvalAI challenge 2010, phase 4018)",

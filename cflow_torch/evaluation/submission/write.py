@@ -6,7 +6,7 @@ import json
 import zipfile
 from functools import partial
 from pathlib import Path
-from typing import Iterable, Mapping, Union
+from typing import Iterable, Mapping
 
 import numpy as np
 import pyarrow as pa
@@ -22,7 +22,7 @@ from cflow_torch.evaluation.submission.versions import METADATA_FILE, Submission
 _EARLIEST = (1980, 1, 1, 0, 0, 0)  # the first time that a zip can hold
 
 
-def write_frame(folder: Union[str, Path], name: str, columns: Mapping[str, np.ndarray]) -> None:
+def write_frame(folder: str | Path, name: str, columns: Mapping[str, np.ndarray]) -> None:
     """Write one frame's file atomically.
 
     Args:
@@ -40,19 +40,19 @@ def write_frame(folder: Union[str, Path], name: str, columns: Mapping[str, np.nd
         feather.write_feather(table, stream)
 
 
-def write_metadata(folder: Union[str, Path], version: SubmissionVersion) -> None:
+def write_metadata(folder: str | Path, version: SubmissionVersion) -> None:
     """Write `metadata.json`, for versions that have one."""
     if version.metadata is not None:
         with atomic_file(Path(folder) / METADATA_FILE) as file:
             file.write((json.dumps(dict(version.metadata), indent=4) + "\n").encode())
 
 
-def is_complete(folder: Union[str, Path], frame: Frame, version: SubmissionVersion) -> bool:
+def is_complete(folder: str | Path, frame: Frame, version: SubmissionVersion) -> bool:
     """Whether a frame's file is there already and passes every check."""
     return not check_file(frame.name, partial(read_bytes, Path(folder) / frame.name), frame.rows, version)
 
 
-def pack(folder: Union[str, Path], names: Iterable[str], file: Union[str, Path], version: SubmissionVersion) -> None:
+def pack(folder: str | Path, names: Iterable[str], file: str | Path, version: SubmissionVersion) -> None:
     """Zip the files of a submission folder, atomically.
 
     Args:

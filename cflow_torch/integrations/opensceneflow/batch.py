@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, List, Mapping, Optional, Tuple
+from typing import Any, Mapping
 
 import numpy as np
 import torch
@@ -30,10 +30,10 @@ class Sample:
     rows0: Tensor
     rows1: Tensor
     T_ego1_ego0: np.ndarray
-    T_lidar1_lidar0: Optional[np.ndarray]
+    T_lidar1_lidar0: np.ndarray | None
 
 
-def read_batch(batch: Mapping[str, Any], num_history: int, ego_T_lidar: Any = None) -> List[Sample]:
+def read_batch(batch: Mapping[str, Any], num_history: int, ego_T_lidar: Any = None) -> list[Sample]:
     """Samples of a batch; the batch is not modified.
 
     Args:
@@ -56,7 +56,7 @@ def read_batch(batch: Mapping[str, Any], num_history: int, ego_T_lidar: Any = No
     return [_sample(batch, b, present, ego_T_lidar) for b in range(len(_value(batch, "pose0")))]
 
 
-def _sample(batch: Mapping[str, Any], b: int, history: List[str], ego_T_lidar: Any) -> Sample:
+def _sample(batch: Mapping[str, Any], b: int, history: list[str], ego_T_lidar: Any) -> Sample:
     extrinsics = _extrinsics(batch, b, ego_T_lidar)
     clouds, poses, rows = [], [], []
     for name in ("0", "1", *history):
@@ -71,7 +71,7 @@ def _sample(batch: Mapping[str, Any], b: int, history: List[str], ego_T_lidar: A
     return Sample(Window(sweeps[0], sweeps[1], tuple(sweeps[2:])), rows[0], rows[1], T_ego1_ego0, T_lidar1_lidar0)
 
 
-def _points(batch: Mapping[str, Any], b: int, name: str) -> Tuple[Tensor, Tensor]:
+def _points(batch: Mapping[str, Any], b: int, name: str) -> tuple[Tensor, Tensor]:
     """Points of one sweep that are finite and not ground, and their rows."""
     key = f"pc{name}"
     points = _entry(batch, key, b)
@@ -98,7 +98,7 @@ def _mask(batch: Mapping[str, Any], key: str, b: int) -> Tensor:
     return mask.reshape(-1)
 
 
-def _extrinsics(batch: Mapping[str, Any], b: int, ego_T_lidar: Any) -> Optional[np.ndarray]:
+def _extrinsics(batch: Mapping[str, Any], b: int, ego_T_lidar: Any) -> np.ndarray | None:
     """(4, 4) float64, None = identity."""
     if not isinstance(ego_T_lidar, str):
         return None if ego_T_lidar is None else rigid_transform(ego_T_lidar, "ego_T_lidar")

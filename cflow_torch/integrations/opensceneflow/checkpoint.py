@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Dict, Union
+from typing import Any
 
 import torch
 
@@ -11,7 +11,7 @@ from cflow_torch.data.atomic import atomic_file
 from cflow_torch.types import CFlowError
 
 
-def write_null_checkpoint(file: Union[str, Path], overwrite: bool = False) -> Path:
+def write_null_checkpoint(file: str | Path, overwrite: bool = False) -> Path:
     """Write the checkpoint without weights; its stem becomes the label of the output folder and of printed tables.
 
     Args:
@@ -33,7 +33,7 @@ def write_null_checkpoint(file: Union[str, Path], overwrite: bool = False) -> Pa
     if file.exists() and not overwrite:
         raise CFlowError(f"{file} is there already: give another name, or overwrite (--overwrite)")
     cfg = {"model": {"name": file.stem}, "output": file.stem, "num_frames": 2}
-    contents: Dict[str, Any] = {
+    contents: dict[str, Any] = {
         "epoch": 0,
         "global_step": 0,
         "pytorch-lightning_version": "2.0.1",

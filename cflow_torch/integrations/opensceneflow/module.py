@@ -6,7 +6,7 @@ import warnings
 from contextlib import suppress
 from dataclasses import fields
 from importlib import import_module
-from typing import Any, Dict, List, Mapping, Optional
+from typing import Any, Mapping
 
 import numpy as np
 import torch
@@ -59,14 +59,14 @@ class CFlow(nn.Module):
 
     def __init__(
         self,
-        num_frames: Optional[int] = None,
+        num_frames: int | None = None,
         ego_T_lidar: Any = None,
         output: str = "full",
         device: Any = "auto",
         voxel_size: Any = None,
         grid_feature_size: Any = None,
-        preset: Optional[str] = None,
-        method: Optional[str] = None,
+        preset: str | None = None,
+        method: str | None = None,
         **settings: Any,
     ) -> None:
         super().__init__()
@@ -88,7 +88,7 @@ class CFlow(nn.Module):
             self.timer = import_module("dztimer").Timing()
         self._said_short = False
 
-    def forward(self, batch: Mapping[str, Any]) -> Dict[str, List[Tensor]]:
+    def forward(self, batch: Mapping[str, Any]) -> dict[str, list[Tensor]]:
         """Residual flow of every sample.
 
         Args:
@@ -113,7 +113,7 @@ class CFlow(nn.Module):
             answers = [self._answer(batch, b, *pair) for b, pair in enumerate(zip(samples, results))]
         return {key: [answer[key] for answer in answers] for key in answers[0]}
 
-    def _answer(self, batch: Mapping[str, Any], b: int, sample: Sample, result: FlowResult) -> Dict[str, Tensor]:
+    def _answer(self, batch: Mapping[str, Any], b: int, sample: Sample, result: FlowResult) -> dict[str, Tensor]:
         """The output of one sample."""
         pc0, pc1 = batch["pc0"][b][:, :3], batch["pc1"][b][:, :3]
         residual = result.residual_flow
@@ -136,7 +136,7 @@ class CFlow(nn.Module):
             "pc1_points_lst": pc1.to(device)[rows1],
         }
 
-    def _say_short(self, samples: List[Sample], num_history: int) -> None:
+    def _say_short(self, samples: list[Sample], num_history: int) -> None:
         """Once: the harness gives less history than asked for."""
         given = min(len(sample.window.pch) for sample in samples)
         if given < num_history and not self._said_short:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import uuid
 from pathlib import Path
-from typing import Any, Dict, List, Sequence, Union
+from typing import Any, Sequence
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from cflow_torch.simulator.recording import Boxes, Recording, UnitReturns
 from cflow_torch.simulator.writers.av2 import new_folder
 from cflow_torch.types import CFlowError
 
-CLASS_OF: Dict[str, str] = {
+CLASS_OF: dict[str, str] = {
     **{name: kind for kind, name in CATEGORY_NAME.items() if name != "NONE"},
     **dict.fromkeys(("ARTICULATED_BUS", "SCHOOL_BUS"), "bus"),
     **dict.fromkeys(("BOX_TRUCK", "TRUCK_CAB"), "truck"),
@@ -37,9 +37,7 @@ _PATH_KEY = {"v2": "point_cloud_compensated_path", "v0.1": "point_cloud_path"}
 _XYZ = ("x", "y", "z")
 
 
-def write_aevascenes_sequence(
-    log: Recording, root: Union[str, Path], overwrite: bool = False, layout: str = "v2"
-) -> Path:
+def write_aevascenes_sequence(log: Recording, root: str | Path, overwrite: bool = False, layout: str = "v2") -> Path:
     """Writes `log` to `root/<log_id>`.
 
     Args:
@@ -75,8 +73,8 @@ def _write_sequence(log: Recording, folder: Path, path_key: str) -> None:
     poses = np.asarray(log.poses, np.float64)
     from_first = np.linalg.inv(poses[0]) @ poses
     from_first[0] = np.eye(4)  # but for rounding it is
-    frames: List[Dict[str, Any]] = []
-    mounts: Dict[str, np.ndarray] = {}
+    frames: list[dict[str, Any]] = []
+    mounts: dict[str, np.ndarray] = {}
     for index, stamp in enumerate(log.timestamps):
         units, boxes = log.units(index), log.boxes(index)
         classes = _classes(log, index, boxes)
@@ -150,7 +148,7 @@ def _class_of(category: str) -> str:
     return CLASS_OF[category]
 
 
-def _boxes(boxes: Boxes) -> List[Dict[str, Any]]:
+def _boxes(boxes: Boxes) -> list[dict[str, Any]]:
     """Without velocities."""
     return [
         {
@@ -167,9 +165,9 @@ def _boxes(boxes: Boxes) -> List[Dict[str, Any]]:
     ]
 
 
-def _add_velocities(frames: Sequence[Dict[str, Any]], poses: np.ndarray) -> None:
+def _add_velocities(frames: Sequence[dict[str, Any]], poses: np.ndarray) -> None:
     """Linear velocity, and the turning about z, from the neighbours of each box in its track."""
-    tracks: Dict[str, List[Any]] = {}
+    tracks: dict[str, list[Any]] = {}
     for frame, pose in zip(frames, poses):
         for box in frame["boxes"]:
             tracks.setdefault(box["id"], []).append((frame["timestamp_ns"], pose, box))
@@ -188,6 +186,6 @@ def _add_velocities(frames: Sequence[Dict[str, Any]], poses: np.ndarray) -> None
             box["angular_velocity"]["z"] = float(rate)
 
 
-def _pose(T: np.ndarray) -> Dict[str, Any]:
+def _pose(T: np.ndarray) -> dict[str, Any]:
     rotation = to_quaternions(T[None, :3, :3])[0]
     return {"translation": dict(zip(_XYZ, T[:3, 3].tolist())), "rotation": dict(zip("wxyz", rotation.tolist()))}

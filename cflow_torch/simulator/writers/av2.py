@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Iterator, Mapping, Sequence, Union
+from typing import Iterator, Mapping, Sequence
 
 import numpy as np
 import pyarrow as pa
@@ -21,7 +21,7 @@ CITY = "SYN"  # stands where Argoverse 2 has the code of the city
 _DYNAMIC = 0.05  # metres per sweep from which a point counts as dynamic in Argoverse 2
 
 
-def write_av2_log(log: Recording, root: Union[str, Path], overwrite: bool = False) -> Path:
+def write_av2_log(log: Recording, root: str | Path, overwrite: bool = False) -> Path:
     """Writes `log` to `root/<log_id>` in Argoverse 2's layout.
 
     Args:
@@ -48,7 +48,7 @@ def write_av2_log(log: Recording, root: Union[str, Path], overwrite: bool = Fals
 
 
 @contextmanager
-def new_folder(root: Union[str, Path], log_id: str, overwrite: bool) -> Iterator[Path]:
+def new_folder(root: str | Path, log_id: str, overwrite: bool) -> Iterator[Path]:
     """A folder to fill, which becomes `root/<log_id>` when the block ends and vanishes if the block raises.
 
     Raises:
@@ -131,6 +131,6 @@ def _pose_columns(poses: np.ndarray) -> Mapping[str, np.ndarray]:
     return {name: np.ascontiguousarray(values[:, k]) for k, name in enumerate(names)}
 
 
-def _write_feather(path: Path, columns: Mapping[str, Union[np.ndarray, Sequence[str]]]) -> None:
+def _write_feather(path: Path, columns: Mapping[str, np.ndarray | Sequence[str]]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     feather.write_feather(pa.table({name: pa.array(values) for name, values in columns.items()}), str(path))

@@ -7,7 +7,7 @@ import json
 from base64 import b64decode
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any, Dict, List, Mapping, Sequence, Union
+from typing import Any, Dict, List, Mapping, Sequence
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from cflow_torch.types import CFlowError
 _BLACK_PIXEL = "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAAAAAA6fptVAAAACklEQVR4nGNgAAAAAgABSK+kcQAAAABJRU5ErkJggg=="
 _VISIBILITY = ("v0-40", "v40-60", "v60-80", "v80-100")
 Table = List[Dict[str, Any]]
-NUSCENES_NAMES: Dict[str, str] = {
+NUSCENES_NAMES: dict[str, str] = {
     **{name: own for own, name in reversed(NUSCENES_CATEGORIES.items()) if name != "NONE"},
     **dict.fromkeys(("BICYCLIST", "WHEELED_DEVICE", "WHEELED_RIDER"), "vehicle.bicycle"),
     **dict.fromkeys(("BOX_TRUCK", "TRUCK_CAB"), "vehicle.truck"),
@@ -37,7 +37,7 @@ NUSCENES_NAMES: Dict[str, str] = {
 
 def write_nuscenes(
     recording: Recording,
-    root: Union[str, Path],
+    root: str | Path,
     version: str = "v1.0-mini",
     key_frame_interval: float = 0.5,
     overwrite: bool = False,
@@ -111,7 +111,7 @@ class SceneWriter:
         """32 hex characters, the same for the same thing."""
         return hashlib.md5(repr((self.recording.log_id, *what)).encode()).hexdigest()
 
-    def write(self, file_name: str, write_points: Any, key_frame_interval: float) -> Dict[str, Table]:
+    def write(self, file_name: str, write_points: Any, key_frame_interval: float) -> dict[str, Table]:
         """Writes all sweeps.
 
         Args:
@@ -159,7 +159,7 @@ class SceneWriter:
         self._annotate(keys, tables)
         return tables
 
-    def _key_frames(self, interval: float) -> List[int]:
+    def _key_frames(self, interval: float) -> list[int]:
         step = int(np.median(np.diff(self._stamps))) if len(self._stamps) > 1 else 0
         keys = [0]
         for index, stamp in enumerate(self._stamps):
@@ -168,7 +168,7 @@ class SceneWriter:
         last = len(self._stamps) - 1
         return keys if keys[-1] == last else [*keys, last]
 
-    def _fixed_tables(self, keys: Sequence[int]) -> Dict[str, Table]:
+    def _fixed_tables(self, keys: Sequence[int]) -> dict[str, Table]:
         """Everything but sweeps and boxes."""
         token, scene = self.token, self.token("scene")
         samples = [token("sample", key) for key in keys]
@@ -206,10 +206,10 @@ class SceneWriter:
             **{name: [] for name in ("attribute", "sample_data", "ego_pose")},
         }
 
-    def _annotate(self, keys: Sequence[int], tables: Dict[str, Table]) -> None:
+    def _annotate(self, keys: Sequence[int], tables: dict[str, Table]) -> None:
         """Adds categories, instances and the boxes of the samples."""
-        tracks: Dict[str, Table] = {}  # track -> its boxes
-        category_of: Dict[str, str] = {}
+        tracks: dict[str, Table] = {}  # track -> its boxes
+        category_of: dict[str, str] = {}
         for key in keys:
             boxes = self.recording.boxes(key)
             poses = np.asarray(self.recording.poses[key]) @ boxes.pose
@@ -263,6 +263,6 @@ def write_tables(folder: Path, tables: Mapping[str, Table]) -> None:
         (folder / f"{table}.json").write_text(json.dumps(rows, indent=0, allow_nan=False))
 
 
-def _pose(pose: np.ndarray) -> Dict[str, List[float]]:
+def _pose(pose: np.ndarray) -> dict[str, list[float]]:
     rotation = to_quaternions(pose[None, :3, :3])[0]
     return {"translation": [float(v) for v in pose[:3, 3]], "rotation": rotation.tolist()}

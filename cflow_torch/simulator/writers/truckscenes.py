@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Dict, Union
 
 import numpy as np
 
@@ -15,7 +14,7 @@ from cflow_torch.simulator.writers.nuscenes import NUSCENES_NAMES, SceneWriter, 
 # Tables that the devkit wants besides those of nuScenes; a simulated truck has nothing to put there.
 _VERSION, _KEY_FRAME_INTERVAL = "v1.2-mini", 0.5  # seconds
 _EMPTY = ("ego_motion_cabin", "ego_motion_chassis", "weather_annotation")
-TRUCKSCENES_NAMES: Dict[str, str] = {
+TRUCKSCENES_NAMES: dict[str, str] = {
     **NUSCENES_NAMES,
     "SIGN": "static_object.traffic_sign",
     "STOP_SIGN": "static_object.traffic_sign",
@@ -23,7 +22,7 @@ TRUCKSCENES_NAMES: Dict[str, str] = {
 """Argoverse 2 name of a box -> the nearest category of TruckScenes."""
 
 
-def write_truckscenes(recording: Recording, root: Union[str, Path], overwrite: bool = False) -> Path:
+def write_truckscenes(recording: Recording, root: str | Path, overwrite: bool = False) -> Path:
     """Writes `recording` to `root/<log_id>`, a data root of TruckScenes with one scene of that name.
 
     Args:

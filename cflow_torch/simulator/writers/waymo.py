@@ -7,7 +7,7 @@ import tempfile
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import Any, Dict, List, Sequence, Tuple, Union
+from typing import Any, Sequence
 
 import numpy as np
 import pyarrow as pa
@@ -22,7 +22,7 @@ from cflow_torch.simulator.writers.waymo_encoding import encode_images, poses_of
 from cflow_torch.simulator.writers.waymo_schemas import SCHEMAS
 from cflow_torch.types import CFlowError
 
-BOX_TYPE: Dict[str, int] = {
+BOX_TYPE: dict[str, int] = {
     **dict.fromkeys(META_CLASSES["CAR"] + META_CLASSES["OTHER_VEHICLES"] + ("MOTORCYCLE", "MOTORCYCLIST"), 1),
     **dict.fromkeys(META_CLASSES["PEDESTRIAN"], 2),
     **dict.fromkeys(("SIGN", "STOP_SIGN"), 3),
@@ -34,7 +34,7 @@ del BOX_TYPE["RAILED_VEHICLE"]
 _XYZ = ("x", "y", "z")
 
 
-def write_waymo_segment(log: Recording, root: Union[str, Path], overwrite: bool = False) -> Path:
+def write_waymo_segment(log: Recording, root: str | Path, overwrite: bool = False) -> Path:
     """Writes `log` to `root/<component>/<log_id>.parquet`, one row group per frame.
 
     Args:
@@ -73,7 +73,7 @@ def write_waymo_segment(log: Recording, root: Union[str, Path], overwrite: bool 
     return places["lidar"]
 
 
-def _put_in_place(folder: Path, places: Dict[str, Path]) -> None:
+def _put_in_place(folder: Path, places: dict[str, Path]) -> None:
     """Moves <tag> to its place. The file that readers look for goes first and comes last: none is ever half old."""
     if places["lidar"].exists():
         places["lidar"].unlink()
@@ -91,12 +91,12 @@ def _write_components(log: Recording, folder: Path) -> None:
             tag: stack.enter_context(pq.ParquetWriter(folder / tag, schema, compression="zstd"))
             for tag, schema in SCHEMAS.items()
         }
-        tables: Dict[str, List[Dict[str, Any]]] = {tag: [] for tag in SCHEMAS}  # those of one row group
+        tables: dict[str, list[dict[str, Any]]] = {tag: [] for tag in SCHEMAS}  # those of one row group
         for index, time in enumerate(times):
             key = {SEGMENT: log.log_id, TIME: time}
             pose, units = np.asarray(log.poses[index], np.float64), log.units(index)
             numbers = _laser_numbers([unit.name for unit in units])
-            rows: List[Dict[str, Any]] = []
+            rows: list[dict[str, Any]] = []
             for unit, number in sorted(zip(units, numbers), key=lambda pair: pair[1]):
                 calibration = _calibration(unit, log.elevations(unit.name))
                 shots = poses_of_shots(log, index, unit.offset_ns) if number == TOP else None
@@ -122,7 +122,7 @@ def _write_components(log: Recording, folder: Path) -> None:
             _write_rows(writers[tag], tables[tag])
 
 
-def _laser_numbers(names: Sequence[str]) -> List[int]:
+def _laser_numbers(names: Sequence[str]) -> list[int]:
     if len(names) > len(LASERS):
         raise CFlowError(f"Waymo's vehicles carry up to {len(LASERS)} LiDARs, the recording has {list(names)}")
     if not set(names) & set(LASERS):
@@ -143,16 +143,16 @@ def _calibration(unit: UnitReturns, elevations: np.ndarray) -> LaserCalibration:
     return LaserCalibration(T_ego_sensor, elevations, float(elevations[0]), float(elevations[-1]))
 
 
-def _cells(column: str, image: np.ndarray) -> Dict[str, Any]:
+def _cells(column: str, image: np.ndarray) -> dict[str, Any]:
     return {f"{column}.values": image.astype(np.float32).reshape(-1), f"{column}.shape": list(image.shape)}
 
 
-def _calibration_row(log_id: str, number: int, calibration: LaserCalibration) -> Dict[str, Any]:
+def _calibration_row(log_id: str, number: int, calibration: LaserCalibration) -> dict[str, Any]:
     values = (calibration.T_ego_sensor.reshape(-1), calibration.low, calibration.high, calibration.inclinations)
     return dict(zip(SCHEMAS["lidar_calibration"].names, (log_id, number, *values)))
 
 
-def _box_rows(log: Recording, index: int, key: Dict[str, Any]) -> List[Dict[str, Any]]:
+def _box_rows(log: Recording, index: int, key: dict[str, Any]) -> list[dict[str, Any]]:
     """Rows of one frame, without speeds."""
     boxes, rows = log.boxes(index), []
     for track, category, size, pose, count in zip(
@@ -167,9 +167,9 @@ def _box_rows(log: Recording, index: int, key: Dict[str, Any]) -> List[Dict[str,
     return rows
 
 
-def _add_speeds(rows: Sequence[Dict[str, Any]], poses: Dict[int, np.ndarray]) -> None:
+def _add_speeds(rows: Sequence[dict[str, Any]], poses: dict[int, np.ndarray]) -> None:
     """Velocities over ground in world axes, from the track's centres in the two nearest frames."""
-    tracks: Dict[str, List[Dict[str, Any]]] = {}
+    tracks: dict[str, list[dict[str, Any]]] = {}
     for row in rows:
         tracks.setdefault(row[TRACK], []).append(row)
     for track in tracks.values():
@@ -183,13 +183,13 @@ def _add_speeds(rows: Sequence[Dict[str, Any]], poses: Dict[int, np.ndarray]) ->
             row.update({f"{BOX}speed.{axis}": speed[k] for k, axis in enumerate(_XYZ)})
 
 
-def _stats(boxes: Sequence[Dict[str, Any]]) -> Dict[str, Any]:
+def _stats(boxes: Sequence[dict[str, Any]]) -> dict[str, Any]:
     types, counts = np.unique([row[f"{BOX}type"] for row in boxes], return_counts=True)
-    values: Tuple[Any, ...] = ("Day", "synthetic", "sunny", types.astype(np.int8), counts, [], [])
+    values: tuple[Any, ...] = ("Day", "synthetic", "sunny", types.astype(np.int8), counts, [], [])
     return dict(zip(SCHEMAS["stats"].names[2:], values))
 
 
-def _write_rows(writer: pq.ParquetWriter, rows: Sequence[Dict[str, Any]]) -> None:
+def _write_rows(writer: pq.ParquetWriter, rows: Sequence[dict[str, Any]]) -> None:
     """Adds one row group; a column that a row does not have becomes null."""
     arrays = [pa.array([row.get(field.name) for row in rows], field.type) for field in writer.schema]
     writer.write_table(pa.Table.from_arrays(arrays, schema=writer.schema), row_group_size=max(len(rows), 1))

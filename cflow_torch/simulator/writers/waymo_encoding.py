@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Callable, Dict, Optional
+from typing import Any, Callable
 
 import numpy as np
 
@@ -84,9 +84,9 @@ def encode_images(
     unit: UnitReturns,
     calibration: LaserCalibration,
     where: str,
-    shot_poses: Optional[ShotPoses],
-    true_poses: Optional[Callable[[], ShotPoses]] = None,
-) -> Dict[str, np.ndarray]:
+    shot_poses: ShotPoses | None,
+    true_poses: Callable[[], ShotPoses] | None = None,
+) -> dict[str, np.ndarray]:
     """Range images of both returns (the second is empty) and, given poses of the shots, the image of pixel poses.
 
     Where `shot_poses` are too far off for the pixels, `true_poses` take their place.
@@ -119,7 +119,7 @@ def encode_images(
     if len(np.unique(pixel)) < len(pixel):
         raise CFlowError(f"{where}: {len(pixel) - len(np.unique(pixel))} returns share a pixel with another")
     image = np.full((height, width, 4), -1.0, np.float32)
-    images: Dict[str, np.ndarray] = {"second": image.copy()}
+    images: dict[str, np.ndarray] = {"second": image.copy()}
     image[row, column] = (0.0, 0.0, 0.0, -1.0)
     image[row, column, RANGE], image[row, column, INTENSITY] = distance, unit.intensity
     images["first"] = image

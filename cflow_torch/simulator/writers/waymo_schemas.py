@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Dict, List, Tuple
+from typing import Any
 
 import pyarrow as pa
 
@@ -20,8 +20,8 @@ from cflow_torch.data.waymo.parquet import (
 
 STATS = "[StatsComponent]."
 _IMAGE, _SHAPE, _TRANSFORM = pa.list_(pa.float32()), pa.list_(pa.int32(), 3), pa.list_(pa.float64(), 16)
-_FRAME_KEYS: List[Tuple[str, Any]] = [(SEGMENT, pa.string()), (TIME, pa.int64())]
-SCHEMAS: Dict[str, pa.Schema] = {
+_FRAME_KEYS: list[tuple[str, Any]] = [(SEGMENT, pa.string()), (TIME, pa.int64())]
+SCHEMAS: dict[str, pa.Schema] = {
     "lidar": pa.schema(
         [
             *_FRAME_KEYS,

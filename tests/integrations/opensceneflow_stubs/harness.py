@@ -11,7 +11,7 @@ import re
 import subprocess
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Dict, List
+from typing import Any
 
 LAUNCHER = Path(__file__).with_name("launch.py")
 SEARCHPATH = "hydra.searchpath=[pkg://cflow_torch.configs.opensceneflow]"
@@ -66,7 +66,7 @@ class Harness:
             "HYDRA_FULL_ERROR": "1",
             "OSF_CPU_RUNNER": str(int(cpu)),
         }
-        pipes: Dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "encoding": "utf-8"}
+        pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "encoding": "utf-8"}
         done = subprocess.run([self.python, *arguments], cwd=self.root, env=environment, timeout=600, **pipes)
         return checked_text(done.returncode, done.stdout)
 
@@ -82,7 +82,7 @@ def checked_text(status: int, text: str) -> str:
     return text
 
 
-def read_scores(text: str) -> List[Dict[str, float]]:
+def read_scores(text: str) -> list[dict[str, float]]:
     """Printed scores of each job, by the names of `SCORES`, "static" and "dynamic".
 
     Raises:
@@ -101,7 +101,7 @@ def read_scores(text: str) -> List[Dict[str, float]]:
     return jobs
 
 
-def printed(results: Dict[str, Any]) -> Dict[str, float]:
+def printed(results: dict[str, Any]) -> dict[str, float]:
     """Scores of this package as `read_scores` gives them: six significant digits."""
     mean = results["bucketed"]["mean"]
     values = {name: results["three_way"][ours] for name, ours in SCORES.items()}

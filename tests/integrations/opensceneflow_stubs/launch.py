@@ -12,14 +12,14 @@ import runpy
 import sys
 import tempfile
 import types
-from typing import Any, Callable, Dict, Tuple
+from typing import Any, Callable
 
 
 def _compiled(*arguments: Any, **settings: Any) -> None:
     raise RuntimeError("a stand-in for a compiled extension was called: this run is for CorrelationFlow only")
 
 
-def _stand_ins() -> Dict[str, Dict[str, Any]]:
+def _stand_ins() -> dict[str, dict[str, Any]]:
     """Module -> what the harness takes from it when it is imported."""
     voxels = ("dynamic_voxelize_forward", "hard_voxelize_forward")
     scatter = ("dynamic_point_to_voxel_forward", "dynamic_point_to_voxel_backward")
@@ -66,7 +66,7 @@ def give_runner_the_cpu() -> None:
     sys.path.insert(0, os.getcwd())
     runner = importlib.import_module("src.runner")
 
-    def join_group() -> Tuple[int, int]:
+    def join_group() -> tuple[int, int]:
         file = tempfile.NamedTemporaryFile(prefix="gloo", delete=False).name  # noqa: SIM115
         dist.init_process_group("gloo", init_method=f"file://{file}", rank=0, world_size=1)
         return 0, 1
