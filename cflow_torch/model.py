@@ -23,8 +23,8 @@ class Motion:
     """Clusters of points that share a motion. Entry M stands for "none": motion 0, id -1, score 0.
 
     Args:
-        of_place: (Q,) int32 or int64, cluster of each place where a point can be, M = none.
-        place: (P,) int64, place of every point: of a point that is left out, one that belongs to no cluster.
+        cluster_of_cell: (Q,) int32 or int64, cluster of each cell (a pixel of a sweep, or a point), M = none.
+        cell_of_point: (P,) int64, cell of each point. A point that is ignored has a cell without a cluster.
         flow: (M + 1, 3) float64, metres per sweep interval, axes of ego1.
         cluster_id: (M + 1,) int64, number of the cluster counted from 0 in its window.
         score: (M + 1,) float32.
@@ -32,8 +32,8 @@ class Motion:
         before: (A, P) float64, metres per sweep interval, flow of each point by coarser scales; None = there are none.
     """
 
-    of_place: Tensor
-    place: Tensor
+    cluster_of_cell: Tensor
+    cell_of_point: Tensor
     flow: Tensor
     cluster_id: Tensor
     score: Tensor
@@ -42,7 +42,7 @@ class Motion:
 
     def cluster(self, points: slice) -> Tensor:
         """Cluster of each of some points, M = none."""
-        return self.of_place.index_select(0, self.place[points])
+        return self.cluster_of_cell.index_select(0, self.cell_of_point[points])
 
     def flow_of(self, cluster: Tensor, out: Tensor) -> Tensor:
         """Into `out`, (A, K) float64: x, y (and z) of the flow of points of these K clusters."""

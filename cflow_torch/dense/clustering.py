@@ -88,21 +88,21 @@ def find_clusters(sweeps: ProjectedSweeps, config: ClusteringConfig) -> tuple[Cl
 
     Returns:
         clusters: those of all windows.
-        of_place: (B * S * H * W + 1,) int32, cluster of each occupied pixel of each sweep, M = none; the last entry, M,
-            is for points that are nowhere. Undefined for empty pixels.
-        place: (P,) int64, where each point is looked up in it.
+        cluster_of_cell: (B * S * H * W + 1,) int32, cluster of each occupied pixel of each sweep, M = none. The last
+            entry, M, is for points outside the images. Undefined for empty pixels.
+        cell_of_point: (P,) int64, index of each point into `cluster_of_cell`.
     """
     occupancy = sweeps.occupancy
     _, num_steps, height, width = occupancy.shape
     area = height * width
     clusters, columns = cluster_images(occupancy, sweeps.grid.pixel_size, config)
-    of_place = lazy_empty(occupancy.numel() + 1, torch.int32, occupancy.device)
+    cluster_of_cell = lazy_empty(occupancy.numel() + 1, torch.int32, occupancy.device)
     place = torch.add(columns.pixel, columns.window, alpha=num_steps * area)
     number_of_place = columns.cluster.int()
     for index in range(num_steps):
-        of_place[index * area :].scatter_(0, place, number_of_place)
-    of_place[-1:] = clusters.window.numel()
-    return clusters, of_place, sweeps.pixel
+        cluster_of_cell[index * area :].scatter_(0, place, number_of_place)
+    cluster_of_cell[-1:] = clusters.window.numel()
+    return clusters, cluster_of_cell, sweeps.pixel
 
 
 def cluster_images(images: Tensor, pixel_size: float, config: ClusteringConfig) -> tuple[Clusters, Columns]:

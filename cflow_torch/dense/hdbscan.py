@@ -22,8 +22,8 @@ def find_dense_clusters(sweeps: ProjectedSweeps, config: DenseConfig) -> tuple[C
 
     Returns:
         clusters: those with pixels at t+1 and before. Unlike components, clusters may share pixels.
-        of_place: (P,) int64, cluster of each point, M = none (HDBSCAN's noise included).
-        place: (P,) int64, 0 ... P - 1: every point has a place of its own.
+        cluster_of_cell: (P,) int64, cluster of each point, M = none (HDBSCAN's noise included).
+        cell_of_point: (P,) int64, 0 ... P - 1: every point is a cell of its own.
 
     Raises:
         CFlowError: the extra is not installed.

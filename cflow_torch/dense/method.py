@@ -43,16 +43,18 @@ class CorrelationFlow(CoarseToFine):
         config = self.config
         with stage("cluster"):
             find = find_dense_clusters if config.clustering == "hdbscan" else find_clusters
-            clusters, of_place, place = find(sweeps, config)
+            clusters, cluster_of_cell, cell_of_point = find(sweeps, config)
         with stage("correlate"):
             estimates = correlate(clusters, sweeps, config)
             if config.sectional_view:
-                estimates = add_sectional_view(estimates, of_place.index_select(0, place), sweeps, config)
+                estimates = add_sectional_view(
+                    estimates, cluster_of_cell.index_select(0, cell_of_point), sweeps, config
+                )
         with stage("pool"):
             flow = pool(estimates.per_interval(), estimates.available)
             return Motion(
-                of_place=of_place,
-                place=place,
+                cluster_of_cell=cluster_of_cell,
+                cell_of_point=cell_of_point,
                 flow=F.pad(flow + 0.0, (0, 0, 0, 1)),  # + 0.0 turns -0.0 into 0.0
                 cluster_id=F.pad(clusters.id_in_window(), (0, 1), value=-1),
                 score=F.pad(estimates.newest_score(), (0, 1)),

@@ -58,8 +58,8 @@ class CorrelationFlowKeypoints(CoarseToFine):
             in_occupancy = dense.pixel + (dense.pixel // image_size + 1) * image_size
             of_pixel.scatter_(0, in_occupancy, dense.group.int())
             return Motion(
-                of_place=of_pixel,
-                place=sweeps.pixel,
+                cluster_of_cell=of_pixel,
+                cell_of_point=sweeps.pixel,
                 flow=F.pad(dense.shift.flip(1) * pixel_size + 0.0, (0, 1, 0, 1)),  # (dy, dx) -> (x, y, 0); no -0.0
                 cluster_id=F.pad(dense.number, (0, 1), value=-1),
                 score=F.pad(dense.score.float(), (0, 1)),

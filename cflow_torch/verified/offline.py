@@ -40,8 +40,10 @@ def choose_side(sides: Batch, copied: Tensor, motion: TurningMotion) -> TurningM
     num_points = sides.image.numel() - len(copied)
     shown = _num_shown(sides, motion)
     own, copy = shown.index_select(0, copied), shown[num_points:]
-    pixel = torch.where(copy > _TIMES * own, motion.place[num_points:], motion.place.index_select(0, copied))
-    return replace(motion, place=motion.place.index_copy(0, copied, pixel))
+    pixel = torch.where(
+        copy > _TIMES * own, motion.cell_of_point[num_points:], motion.cell_of_point.index_select(0, copied)
+    )
+    return replace(motion, cell_of_point=motion.cell_of_point.index_copy(0, copied, pixel))
 
 
 def best_nearby(sweeps: HeightSlicedSweeps, objects: Objects, motion: Tensor, significance: float) -> Tensor:

@@ -102,8 +102,8 @@ def motion_by_pixel(
     of_pixel = F.pad(objects.of_pixel, (0, 1), value=objects.count)
     moves = rigid.flow.any(1) | (rigid.turn != 0)
     return TurningMotion(
-        of_place=torch.arange(sweeps.num_pixels + 1, device=home.device),
-        place=_pixel_of_result(sweeps, lookup(moves, of_pixel), lookup(moves & ~is_weak, of_pixel)),
+        cluster_of_cell=torch.arange(sweeps.num_pixels + 1, device=home.device),
+        cell_of_point=_pixel_of_result(sweeps, lookup(moves, of_pixel), lookup(moves & ~is_weak, of_pixel)),
         flow=F.pad(rigid.flow, (0, 1, 0, 1)).index_select(0, of_pixel) + 0.0,  # + 0.0 turns -0.0 into 0.0
         cluster_id=F.pad(ids, (0, 1), value=-1).index_select(0, of_pixel),
         score=lookup(score, of_pixel),
