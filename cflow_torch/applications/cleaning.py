@@ -14,7 +14,7 @@ from cflow_torch.applications.moving_groups import MOVING
 from cflow_torch.applications.track_table import confirmed, join_tables
 from cflow_torch.applications.tracking import Tracker
 from cflow_torch.config import make_config
-from cflow_torch.data.log import Log, RecentSweeps, window
+from cflow_torch.data.log import CachedLog, Log, window
 from cflow_torch.estimate import make_model
 from cflow_torch.model import SceneFlowModel
 from cflow_torch.types import CFlowError, FlowResult, Sweep, as_numpy
@@ -58,7 +58,7 @@ class CleanLog(Log):
             raise CFlowError(f"log {log.log_id} has {len(log.timestamps)} sweeps: motion is seen in two or more")
         if flow is None and model is None:
             model = make_model(make_config("offline"))
-        self._log = RecentSweeps(log, 2 if model is None else model.config.num_sweeps)
+        self._log = CachedLog(log, 2 if model is None else model.config.num_sweeps)
         self._flow: Any = lru_cache(2)(flow if flow is not None else lambda index: self._estimate(model, index))
         self._standing: list[np.ndarray] | None = None
         self._follows = standing

@@ -16,7 +16,7 @@ import numpy as np
 from cflow_torch.applications.moving_groups import MOVING
 from cflow_torch.data.catalog import open_log
 from cflow_torch.data.hdf5.results import write_hdf5_labels
-from cflow_torch.data.log import Log, RecentSweeps, windows
+from cflow_torch.data.log import CachedLog, Log, windows
 from cflow_torch.stages import FlowModel
 from cflow_torch.types import CFlowError, FlowResult, Sweep, Window, as_numpy
 
@@ -97,7 +97,7 @@ def find_labels(
 
     Cost: reads the log twice; two searches of nearest neighbours a sweep, one of all points, one of what moves.
     """
-    tree, log = _import_tree(), RecentSweeps(log, 3)
+    tree, log = _import_tree(), CachedLog(log, 3)
     movers: list[Movers] = []
     groups: list[np.ndarray] = []
     for index, result in enumerate(_with_last(log, flows, model)):

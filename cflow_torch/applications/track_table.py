@@ -10,7 +10,7 @@ from pyarrow import parquet
 
 from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.file_errors import file_errors
-from cflow_torch.data.paths import Place, as_path, read_bytes
+from cflow_torch.data.paths import PathLike, as_path, read_bytes
 from cflow_torch.types import CFlowError
 
 Table = Dict[str, np.ndarray]
@@ -39,13 +39,13 @@ def confirmed(table: Table) -> Table:
     return {name: values[chosen] for name, values in table.items()}
 
 
-def write_tracks(path: Place, table: Table) -> None:
+def write_tracks(path: PathLike, table: Table) -> None:
     """Write the table of `track` as Parquet, atomically."""
     with atomic_file(path) as file:
         parquet.write_table(pa.table(dict(table)), file)
 
 
-def read_tracks(path: Place) -> Table:
+def read_tracks(path: PathLike) -> Table:
     """Read what `write_tracks` wrote.
 
     Raises:

@@ -13,7 +13,7 @@ from cflow_torch.applications.linking import box_of_point, boxes, link
 from cflow_torch.applications.moving_groups import MIN_POINTS, MOVING, MovingGroups
 from cflow_torch.applications.track_table import confirmed, join_tables
 from cflow_torch.config import make_config
-from cflow_torch.data.log import Log, RecentSweeps, window
+from cflow_torch.data.log import CachedLog, Log, window
 from cflow_torch.estimate import make_model
 from cflow_torch.types import CFlowError, FlowResult, Window
 
@@ -281,11 +281,11 @@ def track(
     """
     if results is None:
         model = make_model(make_config("default"))
-        recent = RecentSweeps(log, model.config.num_sweeps)
+        recent = CachedLog(log, model.config.num_sweeps)
         every = (window(recent, index, model.config.num_history) for index in range(len(log.timestamps) - 1))
         results = ((index, model([sweeps])[0]) for index, sweeps in enumerate(every))
     else:
-        recent = RecentSweeps(log, 2)
+        recent = CachedLog(log, 2)
     tracker, tables = Tracker(sweep_interval), []
     for index, result in results:
         table = tracker.push(window(recent, index), result).table

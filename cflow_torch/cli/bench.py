@@ -19,9 +19,9 @@ from omegaconf import DictConfig
 
 from cflow_torch.cli import run
 from cflow_torch.config import Config
-from cflow_torch.data.atomic import ready_folder
+from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.log import Log, window
-from cflow_torch.data.records import strict, write_text
+from cflow_torch.data.records import json_ready, write_text
 from cflow_torch.stages import FlowModel, StopWatch
 from cflow_torch.types import CFlowError, Window
 from cflow_torch.windows.memory import peak_memory
@@ -37,11 +37,11 @@ def task(cfg: DictConfig) -> None:
     sources = run.find_logs(cfg)
     log = sources.open(sources.logs[0])
     windows = _windows(log, num_pairs, model.config)
-    ready_folder(output)
+    ensure_writable(output)
     report = {"log": log.log_id, **measure(model, windows, repeats, cfg.batches), "machine": run.machine()}
     report.update(versions=run.versions(), model=model.config.as_dict())
     print(format_report(report))
-    write_text(output / "bench.json", json.dumps(strict(report), indent=1, allow_nan=False) + "\n")
+    write_text(output / "bench.json", json.dumps(json_ready(report), indent=1, allow_nan=False) + "\n")
     print(f"written to {output / 'bench.json'}")
 
 

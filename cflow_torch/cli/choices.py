@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 
 import cflow_torch.configs
 from cflow_torch.config import PRESETS, make_config
-from cflow_torch.data.records import flat
+from cflow_torch.data.records import flatten
 
 CONFIGS = Path(cflow_torch.configs.__path__[0])
 SETTERS = ("experiment", "row")  # groups that set what others bring
@@ -46,7 +46,7 @@ def settings(command: str) -> dict[str, Any]:
 def own_settings(file: Path) -> dict[str, Any]:
     """The settings that a YAML file gives, in dotted form."""
     values: dict[str, Any] = OmegaConf.to_container(OmegaConf.load(file))  # type: ignore[assignment]
-    return flat({key: value for key, value in values.items() if key not in ("defaults", "hydra")})
+    return flatten({key: value for key, value in values.items() if key not in ("defaults", "hydra")})
 
 
 def near(word: str, known: Iterable[str]) -> str:

@@ -23,10 +23,10 @@ from cflow_torch.applications.cleaning import CleanLog, static_map
 from cflow_torch.cli import run
 from cflow_torch.data.arrays import ArraysLog, write_array_log
 from cflow_torch.data.arrays.cloud_file import SUFFIXES, write_cloud
-from cflow_torch.data.atomic import ready_folder
+from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import is_remote
-from cflow_torch.data.records import changes
+from cflow_torch.data.records import describe_changes
 from cflow_torch.types import CFlowError, FlowResult
 
 
@@ -43,7 +43,7 @@ def task(cfg: DictConfig) -> None:
     stored = None if cfg.flow is None else run.stored_flow(cfg.flow, needed)
     model = None if stored is not None else run.make_model(cfg)
     logs, failures = run.open_logs(cfg)
-    _claim(cfg, ready_folder(output))
+    _claim(cfg, ensure_writable(output))
     for log in logs:
         folder, file = output / log.log_id, output / f"{log.log_id}.ply"
         flow: Callable[[int], FlowResult] | None = None if stored is None else partial(stored, log)
@@ -67,7 +67,7 @@ def _claim(cfg: DictConfig, output: Path) -> None:
         before: Any = OmegaConf.to_container(OmegaConf.load(file))
         settings: Any = OmegaConf.to_container(cfg, resolve=True)
         now = {**settings, "versions": run.versions()}
-        changed = changes(before, now, ("output", "device", "map"))
+        changed = describe_changes(before, now, ("output", "device", "map"))
         if changed:
             raise CFlowError(f"{output} holds logs of another run ({changed}): remove it, or give output=FOLDER")
     run.write_config(cfg, output)

@@ -17,7 +17,7 @@ from omegaconf import DictConfig
 
 from cflow_torch.cli import run
 from cflow_torch.cli.record import Scores
-from cflow_torch.data.atomic import ready_folder, remove_stale
+from cflow_torch.data.atomic import ensure_writable, remove_stale
 from cflow_torch.data.flow_file import write_flow
 from cflow_torch.data.log import Log
 from cflow_torch.data.names import folder_in
@@ -41,7 +41,7 @@ def task(cfg: DictConfig) -> None:
     logs, failures = run.open_logs(cfg)
     if logs:
         run.check_pair(cfg.pair, max(logs, key=lambda log: len(log.timestamps)))
-    ready_folder(output)
+    ensure_writable(output)
 
     def keep(log: Log, index: int, sweeps: Window, result: FlowResult) -> None:
         nonlocal picture

@@ -19,7 +19,7 @@ from omegaconf import DictConfig
 
 from cflow_torch.cli import run
 from cflow_torch.cli.record import Scores, finished_results, objective
-from cflow_torch.data.atomic import ready_folder
+from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.stages import StopWatch
 from cflow_torch.types import CFlowError
 
@@ -35,7 +35,7 @@ def task(cfg: DictConfig) -> float:
     scores = Scores(cfg)
     model = StopWatch(run.make_model(cfg))
     logs, failures = run.open_logs(cfg)
-    ready_folder(output)
+    ensure_writable(output)
     failures += run.for_each_pair(logs, model, scores.add, pairs)
     if scores.metrics.num_frames == 0:
         raise CFlowError("no pair has labels: nothing to score; `cflow flow` estimates the flow without them")

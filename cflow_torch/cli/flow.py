@@ -39,7 +39,7 @@ from cflow_torch.applications.track_table import TRACKS_FILE, write_tracks
 from cflow_torch.applications.tracking import track
 from cflow_torch.cli import run
 from cflow_torch.cli.run import Failures, Sources
-from cflow_torch.data.atomic import ready_folder
+from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.flow_file import CONTENTS, ON_REQUEST, read_flow
 from cflow_torch.data.hdf5.results import check_result_name, check_writable, write_hdf5_results
 from cflow_torch.data.paths import as_path
@@ -125,7 +125,7 @@ def compute(
     if check is not None:
         check(job, sources)
     kept = {**{key: settings.get(key) for key in ("model", "data", "result_name")}, "versions": run.versions()}
-    ready_folder(output)
+    ensure_writable(output)
     claim_folder(output, identity, cfg.resume, cfg.overwrite, shard.count == 1)
     write_text(output / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(kept)))
     about = {"config": settings, "versions": run.versions()}

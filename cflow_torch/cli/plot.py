@@ -30,8 +30,8 @@ from tqdm import tqdm
 
 from cflow_torch.applications.deskewing import deskew
 from cflow_torch.cli import run
-from cflow_torch.data.atomic import ready_folder
-from cflow_torch.data.log import Log, RecentSweeps, window
+from cflow_torch.data.atomic import ensure_writable
+from cflow_torch.data.log import CachedLog, Log, window
 from cflow_torch.data.paths import is_remote
 from cflow_torch.fleet.progress import frames as counted
 from cflow_torch.model import SceneFlowModel
@@ -65,7 +65,7 @@ def task(cfg: DictConfig) -> None:
         pair = cfg.pair
         run.check_pair(pair, log)
         sweeps = window(log, pair, model.config.num_history, model.config.num_future)
-        ready_folder(output)
+        ensure_writable(output)
         figure = PICTURES[cfg.picture](cfg, model, log, sweeps)
         path = save_picture(figure, output / f"{cfg.picture}.png")
         print(f"log {log.log_id}, pair {pair}, sweep {log.timestamps[pair]}")
@@ -134,11 +134,11 @@ def _animate(cfg: DictConfig, model: SceneFlowModel, output: Path) -> Path:
     if cfg.format not in FORMATS:
         raise CFlowError(f"format={cfg.format}: give one of {', '.join(FORMATS)}")
     chosen, log = run.chosen_pairs(cfg), find_log(cfg)
-    recent = RecentSweeps(log, model.config.num_sweeps)
+    recent = CachedLog(log, model.config.num_sweeps)
     pairs = chosen(log)
     if not pairs:
         raise CFlowError(f"first={cfg.first}: log {log.log_id} has pairs 0 to {len(log.timestamps) - 2}")
-    ready_folder(output)
+    ensure_writable(output)
     frames: list[Frame] = []
     for pair in counted(pairs):
         sweeps = window(recent, pair, model.config.num_history, model.config.num_future)

@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from cflow_torch.cli.run import Failures, machine, versions, write_config
 from cflow_torch.data.log import Log
-from cflow_torch.data.records import changes, strict, write_text
+from cflow_torch.data.records import describe_changes, json_ready, write_text
 from cflow_torch.evaluation.frame import EvalFrame
 from cflow_torch.evaluation.metrics import SceneFlowMetrics
 from cflow_torch.evaluation.tables import format_table
@@ -76,7 +76,7 @@ class Scores:
             "results": results,
         }
         write_config(self._cfg, folder)
-        write_text(folder / RESULTS, json.dumps(strict(record), indent=1, allow_nan=False) + "\n")
+        write_text(folder / RESULTS, json.dumps(json_ready(record), indent=1, allow_nan=False) + "\n")
         print(f"{folder}: {format_table(results)}")
         return results
 
@@ -99,7 +99,7 @@ def finished_results(cfg: DictConfig, folder: Path) -> dict[str, Any] | None:
             f"{file} is no results file of this version ({error!r}): give output=FOLDER, or overwrite=true"
         ) from None
     now = {"versions": versions(), "generator": _generator(cfg), "config": _plain(cfg)}
-    changed = changes(before, now, _PLACES)
+    changed = describe_changes(before, now, _PLACES)
     if changed:
         raise CFlowError(f"{folder} holds results of another run ({changed}): give output=FOLDER, or overwrite=true")
     return record
@@ -122,4 +122,4 @@ def _generator(cfg: DictConfig) -> str | None:
 
 
 def _plain(cfg: DictConfig) -> Any:
-    return strict(OmegaConf.to_container(cfg, resolve=True))
+    return json_ready(OmegaConf.to_container(cfg, resolve=True))

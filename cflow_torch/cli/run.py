@@ -21,7 +21,7 @@ from cflow_torch.cli.estimates import estimates
 from cflow_torch.config import config_from
 from cflow_torch.data.catalog import AUTO, find_sources, find_user_sources, open_log, recognise
 from cflow_torch.data.flow_file import read_flow
-from cflow_torch.data.log import Log, RecentSweeps, window
+from cflow_torch.data.log import CachedLog, Log, window
 from cflow_torch.data.paths import as_path
 from cflow_torch.data.records import write_text
 from cflow_torch.fleet.manifest import frame_file
@@ -248,10 +248,10 @@ def for_each_pair(logs: Sequence[Log], model: StopWatch, use: UseResult, pairs: 
     """
     config = model.config
     failures: Failures = []
-    recent = [RecentSweeps(log, config.num_sweeps) for log in logs]
+    recent = [CachedLog(log, config.num_sweeps) for log in logs]
     indices = [(log, index) for log in recent for index in pairs(log)]
 
-    def read(pair: tuple[RecentSweeps, int]) -> Window:
+    def read(pair: tuple[CachedLog, int]) -> Window:
         return window(*pair, config.num_history, config.num_future)
 
     for (log, index), answer in estimates(model, indices, read):

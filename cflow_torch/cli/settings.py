@@ -20,7 +20,7 @@ import yaml  # type: ignore[import-untyped]
 from cflow_torch.cli.choices import CONFIGS, files
 from cflow_torch.config import CONFIGS as METHODS
 from cflow_torch.config import PRESETS, WINDOW, describe, make_config
-from cflow_torch.data.atomic import ready_folder
+from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.records import write_text
 from cflow_torch.types import CFlowError
 
@@ -52,7 +52,7 @@ def task(arguments: list[str]) -> None:
     if not arguments:
         print("\n\n".join(_page()))
     elif len(arguments) == 2 and arguments[0] == "--opensceneflow":
-        folder = ready_folder(Path(arguments[1]))
+        folder = ensure_writable(Path(arguments[1]))
         for name, text in harness_models().items():
             write_text(folder / f"{name}.yaml", text)
             print(folder / f"{name}.yaml")

@@ -21,9 +21,9 @@ from tqdm import tqdm
 
 from cflow_torch.applications.stream import FlowStream
 from cflow_torch.cli import run
-from cflow_torch.data.atomic import ready_folder
+from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.log import Log
-from cflow_torch.data.records import strict, write_text
+from cflow_torch.data.records import json_ready, write_text
 from cflow_torch.types import CFlowError
 
 
@@ -36,10 +36,10 @@ def task(cfg: DictConfig) -> None:
     stream = FlowStream(config=run.make_model(cfg).config, device=cfg.device, max_gap=cfg.max_gap)
     sources = run.find_logs(cfg)
     log = sources.open(sources.logs[0])
-    ready_folder(output)
+    ensure_writable(output)
     report = {"log": log.log_id, **play(stream, log, pace, count), "machine": run.machine(), "versions": run.versions()}
     print(format_report(report))
-    write_text(output / "stream.json", json.dumps(strict(report), indent=1, allow_nan=False) + "\n")
+    write_text(output / "stream.json", json.dumps(json_ready(report), indent=1, allow_nan=False) + "\n")
     print(f"written to {output / 'stream.json'}")
 
 

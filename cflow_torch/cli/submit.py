@@ -23,9 +23,9 @@ from cflow_torch import __version__
 from cflow_torch.cli import run
 from cflow_torch.cli.estimates import estimates
 from cflow_torch.cli.run import Failures
-from cflow_torch.data.atomic import ready_folder
+from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.log import Log, window
-from cflow_torch.data.records import strict
+from cflow_torch.data.records import json_ready
 from cflow_torch.evaluation.submission.check import check_submission
 from cflow_torch.evaluation.submission.encode import RESIDUAL_AXES, Rounding, encode
 from cflow_torch.evaluation.submission.masks import MaskArchive, log_mask, point_mask
@@ -80,8 +80,8 @@ def task(cfg: DictConfig) -> None:
 def _claim(cfg: DictConfig, output: Path, folder: Path, file: Path) -> None:
     """Take the output folder for these settings; files of other settings are never mixed in."""
     settings: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
-    identity = strict({**{name: settings[name] for name in _SETTINGS}, "cflow_torch": __version__})
-    ready_folder(output)
+    identity = json_ready({**{name: settings[name] for name in _SETTINGS}, "cflow_torch": __version__})
+    ensure_writable(output)
     if cfg.overwrite:
         shutil.rmtree(folder, ignore_errors=True)
         file.unlink(missing_ok=True)

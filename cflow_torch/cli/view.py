@@ -25,8 +25,8 @@ from omegaconf import DictConfig
 from cflow_torch.applications.track_table import TRACKS_FILE, read_tracks
 from cflow_torch.cli import run
 from cflow_torch.cli.run import Failures
-from cflow_torch.data.atomic import ready_folder
-from cflow_torch.data.log import Log, RecentSweeps, window
+from cflow_torch.data.atomic import ensure_writable
+from cflow_torch.data.log import CachedLog, Log, window
 from cflow_torch.data.paths import as_path, is_remote
 from cflow_torch.fleet.progress import frames as counted
 from cflow_torch.types import CFlowError, FlowResult
@@ -44,10 +44,10 @@ def task(cfg: DictConfig) -> None:
         raise CFlowError(f"max_flow={cfg.max_flow}: give a positive length in metres per sweep")
     flow, num_sweeps = _flow(cfg)
     logs, failures = run.open_logs(cfg)
-    run.write_config(cfg, ready_folder(output))
+    run.write_config(cfg, ensure_writable(output))
     files: list[Path] = []
     for log in logs:
-        recent: Any = RecentSweeps(log, num_sweeps)
+        recent: Any = CachedLog(log, num_sweeps)
         file = output / f"{log.log_id}.rrd"
         with run.reported(failures, log.log_id):
             if file in files:

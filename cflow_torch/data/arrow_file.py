@@ -12,15 +12,15 @@ from cflow_torch.data.paths import read_bytes
 from cflow_torch.types import CFlowError
 
 
-def check_columns(file: Any, names: Sequence[str], columns: Sequence[str], mend: str = "copy it again") -> None:
+def check_columns(file: Any, names: Sequence[str], columns: Sequence[str], hint: str = "copy it again") -> None:
     """Refuse columns that are asked for and missing, or there several times.
 
     Raises:
-        CFlowError: such a column; `mend` says what to do.
+        CFlowError: such a column; `hint` says what to do.
     """
     missing = [name for name in columns if name not in names]
     if missing:
-        raise CFlowError(f"{file} lacks the columns {missing}; it has {shortened(names)}; {mend}")
+        raise CFlowError(f"{file} lacks the columns {missing}; it has {shortened(names)}; {hint}")
     doubled = [name for name in columns if names.count(name) > 1]
     if doubled:
         raise CFlowError(f"{file} has several columns {doubled}; keep one")
@@ -59,7 +59,7 @@ class FeatherFile:
         return self._table.select(list(columns))
 
 
-def floats(table: pa.Table, columns: Sequence[str], file: Any, dtype: type = np.float64) -> np.ndarray:
+def float_columns(table: pa.Table, columns: Sequence[str], file: Any, dtype: type = np.float64) -> np.ndarray:
     """(rows, K) numbers of K floating-point columns.
 
     Raises:
@@ -71,7 +71,7 @@ def floats(table: pa.Table, columns: Sequence[str], file: Any, dtype: type = np.
     return values
 
 
-def integers(table: pa.Table, column: str, file: Any) -> np.ndarray:
+def integer_column(table: pa.Table, column: str, file: Any) -> np.ndarray:
     """(rows,) int64 numbers of an integer column.
 
     Raises:
@@ -80,7 +80,7 @@ def integers(table: pa.Table, column: str, file: Any) -> np.ndarray:
     return _column(table, column, file, "integer", pa.types.is_integer).to_numpy().astype(np.int64)
 
 
-def bools(table: pa.Table, column: str, file: Any) -> np.ndarray:
+def bool_column(table: pa.Table, column: str, file: Any) -> np.ndarray:
     """(rows,) bool.
 
     Raises:
@@ -89,7 +89,7 @@ def bools(table: pa.Table, column: str, file: Any) -> np.ndarray:
     return _column(table, column, file, "bool", pa.types.is_boolean).to_numpy().astype(bool)
 
 
-def texts(table: pa.Table, column: str, file: Any) -> list[str]:
+def text_column(table: pa.Table, column: str, file: Any) -> list[str]:
     """Text of every row, also of a dictionary.
 
     Raises:

@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any, Collection, Iterator
 
-from cflow_torch.data.paths import Place, as_path, forget_listings, is_remote, remote_errors
+from cflow_torch.data.paths import PathLike, as_path, forget_listings, is_remote, remote_errors
 from cflow_torch.types import CFlowError
 
 # Where a put takes the place of what was there at once, and is seen by nobody before it is complete.
@@ -21,7 +21,7 @@ _TEMPORARY = re.compile(r"\.(?P<target>.+)\.(?P<host>[A-Za-z0-9_-]+)-(?P<process
 
 
 @contextmanager
-def atomic_file(path: Place) -> Iterator[Any]:
+def atomic_file(path: PathLike) -> Iterator[Any]:
     """Open a binary file for writing that takes its name only when everything is written.
 
     Args:
@@ -94,7 +94,7 @@ def _put_file(path: Any) -> Iterator[IO[bytes]]:
 
 
 @contextmanager
-def atomic_folder(folder: Place) -> Iterator[Path]:
+def atomic_folder(folder: PathLike) -> Iterator[Path]:
     """A folder to fill that takes its name only when the block ends, in place of an older one of that name.
 
     Args:
@@ -125,7 +125,7 @@ def atomic_folder(folder: Place) -> Iterator[Path]:
         _remove(scratch, folder)
 
 
-def remove_stale(folder: Place, targets: Collection[str] | None = None) -> list[str]:
+def remove_stale(folder: PathLike, targets: Collection[str] | None = None) -> list[str]:
     """Remove what writers that were killed have left in a folder.
 
     Args:
@@ -170,7 +170,7 @@ def _remove(path: Path, target: Path) -> None:
     shutil.rmtree(path)
 
 
-def ready_folder(folder: Place) -> Path:
+def ensure_writable(folder: PathLike) -> Path:
     """A folder to write into after long work: tried now, and rid of what killed writers have left there.
 
     Args:

@@ -8,16 +8,16 @@ from typing import Sequence
 import numpy as np
 import pyarrow as pa
 
-from cflow_torch.data.arrow_file import FeatherFile, bools, floats, integers, texts
+from cflow_torch.data.arrow_file import FeatherFile, bool_column, float_columns, integer_column, text_column
 from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes, make_boxes
 from cflow_torch.data.categories import CATEGORIES
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.folders import find_folders
 from cflow_torch.data.ground import GROUND_RULES, read_ground_raster
 from cflow_torch.data.log import FlowLabels, NumberedSweeps
-from cflow_torch.data.names import is_stamp
-from cflow_torch.data.paths import Place, as_path, remote_errors
-from cflow_torch.data.rigid_motion import moved, poses_from_quaternions
+from cflow_torch.data.names import is_timestamp
+from cflow_torch.data.paths import PathLike, as_path, remote_errors
+from cflow_torch.data.rigid_motion import poses_from_quaternions, transform_points
 from cflow_torch.types import CFlowError, Sweep
 
 MIN_INTERIOR_POINTS = 1  # av2-api's data loader drops boxes that hold no point, so a track that empties ends
@@ -28,7 +28,7 @@ _SIZE = ("length_m", "width_m", "height_m")
 _FLOW = ("flow_tx_m", "flow_ty_m", "flow_tz_m")
 
 
-def find_av2_logs(root: Place) -> list[Path]:
+def find_av2_logs(root: PathLike) -> list[Path]:
     """Sorted folders of all logs: those that hold `sensors/lidar`.
 
     Args:
@@ -60,7 +60,7 @@ class AV2Log(NumberedSweeps):
             the wrong type, poses that are no rigid motion or do not cover a sweep.
     """
 
-    def __init__(self, folder: Place, ground: str | None = "av2-api") -> None:
+    def __init__(self, folder: PathLike, ground: str | None = "av2-api") -> None:
         self.folder = as_path(folder)
         if not _is_log(self.folder):
             raise CFlowError(f"{self.folder} is no Argoverse 2 log: it holds no folder sensors/lidar")
@@ -68,7 +68,7 @@ class AV2Log(NumberedSweeps):
         self._files: dict[int, Path] = {
             int(file.stem): file
             for file in (self.folder / "sensors" / "lidar").glob("*.feather")
-            if is_stamp(file.stem)
+            if is_timestamp(file.stem)
         }
         self.timestamps = sorted(self._files)
         self._check_count(f"{self.folder}: sensors/lidar/<nanoseconds>.feather")
@@ -86,9 +86,9 @@ class AV2Log(NumberedSweeps):
         is_ground, stored = None, FeatherFile(file)
         times = None  # logs made by others may lack them
         if "offset_ns" in stored.names:
-            times = integers(stored.read(["offset_ns"]), "offset_ns", file) * 1e-9
+            times = integer_column(stored.read(["offset_ns"]), "offset_ns", file) * 1e-9
         if self._raster is not None and self._rule is not None:
-            is_ground = self._raster.is_ground(moved(points, pose), self._rule)
+            is_ground = self._raster.is_ground(transform_points(points, pose), self._rule)
         return Sweep(points=points, is_ground=is_ground, pose=pose.copy(), timestamp_ns=timestamp, point_times=times)
 
     def labels(self, index: int) -> FlowLabels | None:
@@ -117,13 +117,13 @@ class AV2Log(NumberedSweeps):
     def _points(self, timestamp: int) -> np.ndarray:
         """(N, 3) float32."""
         file = self._files[timestamp]
-        return floats(FeatherFile(file).read("xyz"), "xyz", file, np.float32)
+        return float_columns(FeatherFile(file).read("xyz"), "xyz", file, np.float32)
 
     def _read_poses(self) -> dict[int, np.ndarray]:
         """Sweep time -> (4, 4) float64 T_world_ego."""
         file = self.folder / "city_SE3_egovehicle.feather"
         table = FeatherFile(file).read(("timestamp_ns", *_POSE))
-        row_of = {time: row for row, time in enumerate(integers(table, "timestamp_ns", file).tolist())}
+        row_of = {time: row for row, time in enumerate(integer_column(table, "timestamp_ns", file).tolist())}
         missing = [time for time in self.timestamps if time not in row_of]
         if missing:
             raise CFlowError(f"{file} has no pose for sweep {missing[0]}, at exactly its time ({len(missing)} missing)")
@@ -136,25 +136,25 @@ class AV2Log(NumberedSweeps):
         rows = len(self._points(timestamp))
         if table.num_rows != rows:
             raise CFlowError(f"{file} has {table.num_rows} rows but sweep {timestamp} has {rows} points")
-        category = integers(table, "classes", file)
+        category = integer_column(table, "classes", file)
         if category.size and not 0 <= category.min() <= category.max() < len(CATEGORIES):
             raise CFlowError(
                 f"{file}: classes are 0 ... {len(CATEGORIES) - 1}, got {category.min()} ... {category.max()}"
             )
         is_valid = np.ones(rows, dtype=bool)
         if "is_valid" in stored.names:
-            is_valid = bools(stored.read(["is_valid"]), "is_valid", file)
-        return FlowLabels(floats(table, _FLOW, file, np.float32), category.astype(np.uint8), is_valid)
+            is_valid = bool_column(stored.read(["is_valid"]), "is_valid", file)
+        return FlowLabels(float_columns(table, _FLOW, file, np.float32), category.astype(np.uint8), is_valid)
 
     def _labels_from_annotations(self, file: Path, timestamp0: int, timestamp1: int) -> FlowLabels | None:
         stored = FeatherFile(file)
         table = stored.read(("timestamp_ns", "track_uuid", "category", *_SIZE, *_POSE))
-        times = integers(table, "timestamp_ns", file)
+        times = integer_column(table, "timestamp_ns", file)
         if not times.size or timestamp0 < times.min() or timestamp1 > times.max():
             return None
         used: np.ndarray = np.ones(len(times), dtype=bool)
         if "num_interior_pts" in stored.names:
-            points_inside = integers(stored.read(["num_interior_pts"]), "num_interior_pts", file)
+            points_inside = integer_column(stored.read(["num_interior_pts"]), "num_interior_pts", file)
             used = points_inside >= MIN_INTERIOR_POINTS
         boxes0, boxes1 = (
             _boxes(table.filter(pa.array(used & (times == time))), file) for time in (timestamp0, timestamp1)
@@ -169,13 +169,13 @@ def _is_log(folder: Path) -> bool:
 
 def _poses(table: pa.Table, file: Path, names: Sequence[int | str]) -> np.ndarray:
     """(K, 4, 4) float64."""
-    values = floats(table, _POSE, file)
+    values = float_columns(table, _POSE, file)
     return poses_from_quaternions(values[:, 4:], values[:, :4], lambda row: f"{file}: the pose of {names[row]}")
 
 
 def _boxes(table: pa.Table, file: Path) -> Boxes:
     """Boxes of one sweep, in the order of the file."""
-    tracks, names = (texts(table, column, file) for column in ("track_uuid", "category"))
+    tracks, names = (text_column(table, column, file) for column in ("track_uuid", "category"))
     with file_errors(file):
         category = category_indices(names, {name: name for name in CATEGORIES[1:]})
-        return make_boxes(tracks, category, floats(table, _SIZE, file), _poses(table, file, tracks))
+        return make_boxes(tracks, category, float_columns(table, _SIZE, file), _poses(table, file, tracks))

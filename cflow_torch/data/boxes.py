@@ -11,7 +11,7 @@ import numpy as np
 from cflow_torch.data.categories import CATEGORY_INDEX
 from cflow_torch.data.file_errors import shortened
 from cflow_torch.data.log import FlowLabels
-from cflow_torch.data.rigid_motion import moved
+from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.types import CFlowError
 
 _LISTED = 20  # names in a message
@@ -110,7 +110,7 @@ def flow_from_boxes(points: np.ndarray, boxes0: Boxes, boxes1: Boxes, T_ego1_ego
     Source: the recipe of av2-api (torch/structures/flow.py), which rounds the ego motion to float32 first.
     """
     start = np.asarray(points, dtype=np.float64)[:, :3]
-    flow = moved(start, T_ego1_ego0) - start
+    flow = transform_points(start, T_ego1_ego0) - start
     category = np.zeros(len(start), dtype=np.uint8)
     is_valid = np.ones(len(start), dtype=bool)
     successor = {track: row for row, track in enumerate(boxes1.track_id)}
@@ -121,7 +121,7 @@ def flow_from_boxes(points: np.ndarray, boxes0: Boxes, boxes1: Boxes, T_ego1_ego
             is_valid[inside] = False
             continue
         motion = boxes1.pose[successor[track]] @ np.linalg.inv(boxes0.pose[row])
-        flow[inside] = moved(start[inside], motion) - start[inside]
+        flow[inside] = transform_points(start[inside], motion) - start[inside]
     return FlowLabels(flow=flow.astype(np.float32), category=category, is_valid=is_valid)
 
 

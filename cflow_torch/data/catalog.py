@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import Any, Mapping, Sequence
 
-from cflow_torch.data.log import ChangedLog, Log
+from cflow_torch.data.log import Log, LogWrapper
 from cflow_torch.data.log_check import check_log
 from cflow_torch.data.names import safe_name
-from cflow_torch.data.paths import as_path, is_place, remote_errors
+from cflow_torch.data.paths import as_path, is_path_like, remote_errors
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.ground import find_ground as ground_of
 
@@ -200,7 +200,7 @@ def open_log(
 
         log = with_poses(log)
     if find_ground is not None:
-        log = GroundFoundLog(log, find_ground)
+        log = GroundSegmentedLog(log, find_ground)
     if check:
         check_log(log)
     return log
@@ -214,7 +214,7 @@ def _open(name: str, source: Any, settings: Mapping[str, Any]) -> Log:
     if unknown:
         raise CFlowError(f"data set {name} has no setting {', '.join(unknown)}; it has {', '.join(known) or 'none'}")
     try:
-        with remote_errors(source if is_place(source) else source.root):
+        with remote_errors(source if is_path_like(source) else source.root):
             return reader(source, **settings)  # type: ignore[no-any-return]
     except (TypeError, ValueError, AttributeError) as error:
         if isinstance(error, CFlowError) or not settings:
@@ -223,7 +223,7 @@ def _open(name: str, source: Any, settings: Mapping[str, Any]) -> Log:
         raise CFlowError(f"data set {name} cannot be opened with {given}: {error}") from error
 
 
-class GroundFoundLog(ChangedLog):
+class GroundSegmentedLog(LogWrapper):
     """Another log, with the ground of sweeps without a mask found from their points.
 
     Args:

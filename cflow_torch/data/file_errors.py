@@ -11,14 +11,14 @@ _MAX_TEXT = 400  # characters of what a library says; a damaged name can be a mi
 
 
 @contextmanager
-def file_errors(file: Any, mend: str = "copy it again", doing: str = "read") -> Iterator[None]:
+def file_errors(file: Any, hint: str = "copy it again", doing: str = "read") -> Iterator[None]:
     """Turns whatever is raised while a file is read into one `CFlowError` that names the file.
 
     Libraries raise nearly anything for a damaged file (OSError, ValueError, KeyError, struct.error, MemoryError, ...).
 
     Args:
         file: what is read: a path, or a text that begins with one.
-        mend: what to do about it, the end of the message.
+        hint: what to do about it, the end of the message.
         doing: what is done with the file, for the message.
 
     Raises:
@@ -31,11 +31,11 @@ def file_errors(file: Any, mend: str = "copy it again", doing: str = "read") -> 
             raise
         raise CFlowError(f"{file}: {error}") from error
     except FileNotFoundError:
-        raise CFlowError(f"{file} is missing; {mend}") from None
+        raise CFlowError(f"{file} is missing; {hint}") from None
     except Exception as error:
         said = f"{type(error).__name__}: {shortened(error)}"
         guess = "it may be truncated or damaged, " if doing == "read" else ""
-        raise CFlowError(f"cannot {doing} {file} ({said}); {guess}{mend}") from error
+        raise CFlowError(f"cannot {doing} {file} ({said}); {guess}{hint}") from error
 
 
 def shortened(text: Any) -> str:

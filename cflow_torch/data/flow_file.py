@@ -9,16 +9,16 @@ import pyarrow as pa
 import torch
 from pyarrow import feather
 
-from cflow_torch.data.arrow_file import FeatherFile, bools, floats, integers
+from cflow_torch.data.arrow_file import FeatherFile, bool_column, float_columns, integer_column
 from cflow_torch.data.atomic import atomic_file
-from cflow_torch.data.paths import Place, as_path
+from cflow_torch.data.paths import PathLike, as_path
 from cflow_torch.types import VECTORS, CFlowError, FlowResult, vector_columns
 
 CONTENTS = (*VECTORS, "cluster_id", "score", "is_valid")
 ON_REQUEST = ("confidence",)  # what a file has only if it is named
 
 
-def write_flow(path: Place, result: FlowResult, contents: Sequence[str] = CONTENTS) -> None:
+def write_flow(path: PathLike, result: FlowResult, contents: Sequence[str] = CONTENTS) -> None:
     """Write a result to `path`, atomically.
 
     Args:
@@ -43,7 +43,7 @@ def write_flow(path: Place, result: FlowResult, contents: Sequence[str] = CONTEN
         feather.write_feather(pa.table({name: pa.array(columns[name]) for name in names}), file)
 
 
-def read_flow(path: Place) -> FlowResult:
+def read_flow(path: PathLike) -> FlowResult:
     """Read what `write_flow` wrote.
 
     Returns:
@@ -53,7 +53,7 @@ def read_flow(path: Place) -> FlowResult:
         CFlowError: the file is missing, cannot be reached, is truncated, or holds none of the contents.
     """
     path = as_path(path)
-    scalars = {"cluster_id": integers, "is_valid": bools}
+    scalars = {"cluster_id": integer_column, "is_valid": bool_column}
     fields = {}
     try:
         file = FeatherFile(path)
@@ -65,7 +65,7 @@ def read_flow(path: Place) -> FlowResult:
             if name in scalars:
                 fields[name] = scalars[name](table, name, path)
             else:
-                values = floats(table, columns, path, np.float32)
+                values = float_columns(table, columns, path, np.float32)
                 fields[VECTORS.get(name, name)] = values if name in VECTORS else values[:, 0]
         if not fields:
             raise CFlowError(f"its columns are {', '.join(file.names)}")

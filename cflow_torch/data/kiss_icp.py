@@ -11,14 +11,14 @@ import numpy as np
 
 from cflow_torch.data.file_errors import shortened
 from cflow_torch.data.log import FlowLabels, NumberedSweeps
-from cflow_torch.data.paths import Place, as_path
+from cflow_torch.data.paths import PathLike, as_path
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.ego_motion import rigid_transform
 
 _OTHERS = {"rosbag": "bags", "mcap": "bags"}  # loaders that go forward only: our reader
 
 
-def find_kiss_icp(root: Place) -> list[Path]:
+def find_kiss_icp(root: PathLike) -> list[Path]:
     """The place itself: what lies there, only the loader knows."""
     return [as_path(root)]
 
@@ -42,12 +42,12 @@ class KissICPLog(NumberedSweeps):
         CFlowError: KISS-ICP is missing, or what its loader needs; no such loader; nothing that it can read.
     """
 
-    def __init__(self, root: Place, loader: str, sequence: str | None = None) -> None:
+    def __init__(self, root: PathLike, loader: str, sequence: str | None = None) -> None:
         self.root = as_path(root)
         try:
             from kiss_icp.datasets import available_dataloaders, dataset_factory
         except ImportError:
-            raise CFlowError("KISS-ICP's loaders need it: pip install 'cflow_torch[odometry]'") from None
+            raise CFlowError("KISS-ICP's loaders need it: pip install kiss-icp") from None
         names = sorted(set(available_dataloaders()) - set(_OTHERS))
         if loader not in names:
             other = f", or take data={_OTHERS[loader]}" if loader in _OTHERS else ""

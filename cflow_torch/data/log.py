@@ -88,7 +88,7 @@ def windows(log: Log, num_history: int = 0, num_future: int = 0) -> Iterator[Win
     Raises:
         CFlowError: a sweep cannot be read.
     """
-    recent = RecentSweeps(log, num_history + num_future + 2)
+    recent = CachedLog(log, num_history + num_future + 2)
     return (window(recent, index, num_history, num_future) for index in range(len(log.timestamps) - 1))
 
 
@@ -110,7 +110,7 @@ class WindowDataset(Dataset):  # type: ignore[type-arg]
         several: Any = [logs] if hasattr(logs, "timestamps") else logs
         self._pairs = [(log, index) for log in several for index in range(len(log.timestamps) - 1)]
         self._num_history, self._num_future = num_history, num_future
-        self._recent: RecentSweeps | None = None
+        self._recent: CachedLog | None = None
 
     def __len__(self) -> int:
         return len(self._pairs)
@@ -118,7 +118,7 @@ class WindowDataset(Dataset):  # type: ignore[type-arg]
     def __getitem__(self, number: int) -> Window:
         log, index = self._pairs[number]
         if self._recent is None or self._recent.log is not log:
-            self._recent = RecentSweeps(log, self._num_history + self._num_future + 2)
+            self._recent = CachedLog(log, self._num_history + self._num_future + 2)
         return window(self._recent, index, self._num_history, self._num_future)
 
     @staticmethod
@@ -142,7 +142,7 @@ class NumberedSweeps(Log):
             raise CFlowError(f"{where} has {len(self.timestamps)} sweeps; scene flow needs two or more")
 
 
-class ChangedLog(Log):
+class LogWrapper(Log):
     """Another log whose sweeps are changed; everything else is the other's.
 
     Args:
@@ -162,7 +162,7 @@ class ChangedLog(Log):
         return getattr(self.log, name)
 
 
-class RecentSweeps(ChangedLog):
+class CachedLog(LogWrapper):
     """A log that remembers its last sweeps: neighbouring windows share all but one.
 
     Args:
@@ -176,7 +176,7 @@ class RecentSweeps(ChangedLog):
         self._sweep = lru_cache(count)(log.sweep)
 
     def __reduce__(self) -> Any:
-        return RecentSweeps, (self.log, self._count)
+        return CachedLog, (self.log, self._count)
 
     def sweep(self, index: int) -> Sweep:
         """The log's sweep."""

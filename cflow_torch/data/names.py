@@ -42,7 +42,7 @@ def safe_name(name: Any, what: str) -> str:
     return str(name)
 
 
-def inside(folder: Path, relative: Any, what: str) -> Path:
+def path_inside(folder: Path, relative: Any, what: str) -> Path:
     """Where a name from a table lies: below a folder. Links below it are followed: the user laid out the data so.
 
     Args:
@@ -75,6 +75,6 @@ def folder_in(output: Path, name: Any, what: str) -> Path:
     return output / safe_name(name, what)
 
 
-def is_stamp(name: str) -> bool:
+def is_timestamp(name: str) -> bool:
     """Whether a name is a time stamp: digits 0 to 9 that an int64 can hold."""
     return name.isascii() and name.isdigit() and len(name) < 20 and int(name) < 1 << 63

@@ -8,7 +8,7 @@ from typing import Any, Sequence
 import numpy as np
 from tqdm import tqdm
 
-from cflow_torch.data.log import ChangedLog, Log
+from cflow_torch.data.log import Log, LogWrapper
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.ego_motion import rigid_transform
 
@@ -102,7 +102,7 @@ class Odometry:
         return rigid_transform(self._odometry.last_pose, f"the pose that KISS-ICP gives for {name}")
 
 
-class PosedLog(ChangedLog):
+class PosedLog(LogWrapper):
     """Another log with other poses.
 
     Args:

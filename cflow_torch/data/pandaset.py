@@ -14,9 +14,9 @@ from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.folders import find_folders
 from cflow_torch.data.json_file import read_json
 from cflow_torch.data.log import FlowLabels, NumberedSweeps
-from cflow_torch.data.paths import Place, as_path, read_bytes, remote_errors
+from cflow_torch.data.paths import PathLike, as_path, read_bytes, remote_errors
 from cflow_torch.data.pickles import load_columns
-from cflow_torch.data.rigid_motion import moved, poses_of_nodes
+from cflow_torch.data.rigid_motion import poses_from_json, transform_points
 from cflow_torch.types import CFlowError, Sweep
 
 SEARCH_DEPTH = 2  # <root>/<data set>/<sequence>
@@ -46,7 +46,7 @@ CATEGORY_NAME: dict[str, str] = {label: name for name, labels in _LABELS.items()
 """Label of a cuboid -> Argoverse 2 name. The data set publishes no such map: this one is cflow_torch's."""
 
 
-def find_pandaset_sequences(root: Place) -> list[Path]:
+def find_pandaset_sequences(root: PathLike) -> list[Path]:
     """Folders of all sequences under a folder, sorted.
 
     Args:
@@ -80,7 +80,7 @@ class PandaSetLog(NumberedSweeps):
         CFlowError: a file is missing or cannot be read; fewer than two sweeps; another number of poses or times.
     """
 
-    def __init__(self, folder: Place) -> None:
+    def __init__(self, folder: PathLike) -> None:
         self.folder = as_path(folder)
         self.log_id = self.folder.resolve().name
         lidar = self.folder / "lidar"
@@ -89,7 +89,7 @@ class PandaSetLog(NumberedSweeps):
             self.timestamps = [round(float(seconds) * 1e9) for seconds in read_json(lidar / "timestamps.json")]
         with file_errors(lidar / "poses.json"):
             stored = read_json(lidar / "poses.json")
-            self._poses = poses_of_nodes(stored, "position", "heading", f"{lidar / 'poses.json'}: pose")
+            self._poses = poses_from_json(stored, "position", "heading", f"{lidar / 'poses.json'}: pose")
         self._check_count(self.folder)
         if not len(self._files) == len(self._poses) == len(self.timestamps):
             counts = f"{len(self._files)} sweeps, {len(self._poses)} poses and {len(self.timestamps)} time stamps"
@@ -128,7 +128,7 @@ class PandaSetLog(NumberedSweeps):
         columns = _columns(self._files[index], names)
         with file_errors(self._files[index]):
             table = np.stack([columns[name] for name in names]).astype(np.float64)
-        points = moved(table[:3].T, np.linalg.inv(self._poses[index]))
+        points = transform_points(table[:3].T, np.linalg.inv(self._poses[index]))
         return points.astype(np.float32), table[3], table[4]
 
     def _boxes(self, cuboids: dict[str, np.ndarray], file: Path, index: int, lidar: int) -> Boxes:

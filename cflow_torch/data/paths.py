@@ -22,16 +22,16 @@ import pyarrow as pa
 
 from cflow_torch.types import CFlowError
 
-Place = Union[str, Path]
+PathLike = Union[str, Path]
 _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)://")
 _BLOCK = 1 << 20  # bytes; smaller ones make more requests: HDF5's metadata is scattered, its data are long reads
 _KEPT_BLOCKS = 32  # of each open file: 32 MiB
 _COPIED = 8 << 20  # bytes per request while a file is copied
 _POINTER = b"version https://git-lfs.github.com/spec/"  # what git leaves in place of a file that is not fetched
-_KEPT_COPIES = 4  # files of `mapped`: two of a Waymo segment that is read, two of the one before
+_KEPT_COPIES = 4  # files of `source_for_mmap`: two of a Waymo segment that is read, two of the one before
 
 
-def as_path(place: Place) -> Path:
+def as_path(place: PathLike) -> Path:
     """The path that a text names.
 
     Args:
@@ -45,7 +45,7 @@ def as_path(place: Place) -> Path:
         CFlowError: it is no name; the extra `remote` is missing, or the package of the scheme's file system, or fsspec
             does not know the scheme.
     """
-    if not is_place(place) or place == "" or "\0" in str(place):
+    if not is_path_like(place) or place == "" or "\0" in str(place):
         raise CFlowError(f'{str(place)[:80]!r} is no place: give a name, "scheme://..." or a path')
     if not isinstance(place, str):
         return place
@@ -73,7 +73,7 @@ def is_remote(place: Any) -> bool:
     return hasattr(place, "storage_options") and not isinstance(place, (PosixPath, WindowsPath))
 
 
-def is_place(value: Any) -> bool:
+def is_path_like(value: Any) -> bool:
     """Whether a setting names a place."""
     return isinstance(value, (str, Path)) or is_remote(value)
 
@@ -114,7 +114,7 @@ def read_bytes(path: Path) -> bytes:
         return bytes(remote.fs.cat_file(remote.path))  # pathlib's own way asks for the size first
 
 
-def whole(path: Path) -> Any:
+def source_for_full_read(path: Path) -> Any:
     """What to give a library that reads all of a file: its name, or what is in it if it is remote.
 
     Raises:
@@ -125,7 +125,7 @@ def whole(path: Path) -> Any:
     return _check(path)
 
 
-def ranged(path: Path) -> Any:
+def source_for_random_access(path: Path) -> Any:
     """What to give a library that reads parts of a large file: its name, or an open binary file if it is remote.
 
     Cost: one request per block of 1 MiB in which wanted bytes lie; the last 32 of each file are kept.
@@ -138,7 +138,7 @@ def ranged(path: Path) -> Any:
     return _open(path, cache_type="blockcache", block_size=_BLOCK, cache_options={"maxblocks": _KEPT_BLOCKS})
 
 
-def mapped(path: Path) -> Any:
+def source_for_mmap(path: Path) -> Any:
     """What to give pyarrow to read a large file again and again: its name, or a copy on this machine if it is remote.
 
     The last four copies stay in nameless files of the folder for temporary files (TMPDIR), which vanish with the

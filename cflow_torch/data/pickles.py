@@ -27,7 +27,7 @@ DATA_FRAMES: frozenset[Name] = NUMPY_ARRAYS | {
 """What the pickle of a data frame names, as pandas 1 and 2 write it."""
 
 
-class StandIn:
+class Placeholder:
     """Stands for an object that a pickle wants to build: keeps what it would be made of, and does nothing.
 
     Attributes:
@@ -38,7 +38,7 @@ class StandIn:
     parts: tuple[Any, ...]
     state: Any = None
 
-    def __new__(cls, *parts: Any) -> StandIn:  # the one that every way of building calls
+    def __new__(cls, *parts: Any) -> Placeholder:  # the one that every way of building calls
         made = super().__new__(cls)
         made.parts = parts
         return made
@@ -56,7 +56,7 @@ class _Unpickler(pickle.Unpickler):
 
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) in self._allowed:
-            return StandIn
+            return Placeholder
         raise pickle.UnpicklingError(f"it asks for {module}.{name}, which is never run")
 
 
@@ -65,7 +65,7 @@ def load_plain(stream: IO[bytes], allowed: frozenset[Name] = frozenset()) -> Any
 
     Args:
         stream: stands where the pickle begins.
-        allowed: (module, name) pairs that a `StandIn` takes the place of. Every other name is refused.
+        allowed: (module, name) pairs that a `Placeholder` takes the place of. Every other name is refused.
 
     Raises:
         Exception: whatever the unpickler raises for a damaged pickle, or one that names something else.
@@ -73,16 +73,16 @@ def load_plain(stream: IO[bytes], allowed: frozenset[Name] = frozenset()) -> Any
     return _Unpickler(stream, allowed).load()
 
 
-def array_of(stand_in: StandIn) -> np.ndarray:
+def array_of(placeholder: Placeholder) -> np.ndarray:
     """The array that a stand-in is for, of numbers, texts or truth values; one of objects keeps them as they are.
 
     Raises:
         Exception: nearly any, if it stands for something else.
     """
-    if stand_in.state is None:  # `_frombuffer`, of pickles of protocol 5
-        data, dtype, shape, order = stand_in.parts
+    if placeholder.state is None:  # `_frombuffer`, of pickles of protocol 5
+        data, dtype, shape, order = placeholder.parts
     else:
-        _, shape, dtype, is_fortran, data = stand_in.state
+        _, shape, dtype, is_fortran, data = placeholder.state
         order = "F" if is_fortran else "C"
     kind = np.dtype(dtype.state[1] + dtype.parts[0])
     values = np.array(data + [None], object)[:-1] if kind.hasobject else np.frombuffer(data, kind)

@@ -37,7 +37,7 @@ def poses_from_quaternions(translation: Any, quaternion: Any, what: Callable[[in
     return _poses(to_rotations(turn), shift)
 
 
-def poses_of_nodes(nodes: Sequence[Any], translation: str, rotation: str, what: str) -> np.ndarray:
+def poses_from_json(nodes: Sequence[Any], translation: str, rotation: str, what: str) -> np.ndarray:
     """(K, 4, 4) float64 poses of K JSON objects with members {x, y, z} and {w, x, y, z} of these names.
 
     Raises:
@@ -61,10 +61,10 @@ def poses_at(times: np.ndarray, known_times: np.ndarray, poses: np.ndarray) -> n
     """
     left = np.clip(np.searchsorted(known_times, times, side="right") - 1, 0, len(known_times) - 2)
     fraction = (times - known_times[left]) / (known_times[left + 1] - known_times[left])
-    return between(poses[left], poses[left + 1], fraction)
+    return interpolate_poses(poses[left], poses[left + 1], fraction)
 
 
-def between(poses0: np.ndarray, poses1: np.ndarray, fraction: np.ndarray) -> np.ndarray:
+def interpolate_poses(poses0: np.ndarray, poses1: np.ndarray, fraction: np.ndarray) -> np.ndarray:
     """(K, 4, 4) poses on a straight line and at a constant turn rate, the shorter way round, from (K, 4, 4) to others.
 
     Args:
@@ -75,7 +75,7 @@ def between(poses0: np.ndarray, poses1: np.ndarray, fraction: np.ndarray) -> np.
     return _poses(rotation, poses0[:, :3, 3] + fraction[:, None] * (poses1[:, :3, 3] - poses0[:, :3, 3]))
 
 
-def moved(points: np.ndarray, T: np.ndarray) -> np.ndarray:
+def transform_points(points: np.ndarray, T: np.ndarray) -> np.ndarray:
     """(N, 3) float64 points after the rigid motion `T`, (4, 4) float64."""
     return np.asarray(points, dtype=np.float64) @ T[:3, :3].T + T[:3, 3]
 

@@ -11,11 +11,11 @@ from cflow_torch.data.arrays.pcd import pcd_fields
 from cflow_torch.data.nuscenes.categories import TRUCKSCENES_CATEGORIES
 from cflow_torch.data.nuscenes.reader import Footprint, NuScenesLog
 from cflow_torch.data.nuscenes.tables import SceneSource, find_scenes
-from cflow_torch.data.paths import Place
+from cflow_torch.data.paths import PathLike
 from cflow_torch.types import CFlowError
 
 
-def find_truckscenes_scenes(root: Place) -> list[SceneSource]:
+def find_truckscenes_scenes(root: PathLike) -> list[SceneSource]:
     """All scenes under a folder, see `nuscenes.tables.find_scenes`."""
     return find_scenes(root, ("log", "map"), "TruckScenes")
 

@@ -27,7 +27,7 @@ from cflow_torch.data.flow_file import CONTENTS
 from cflow_torch.data.json_file import read_json
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import forget_listings, is_remote, remote_errors
-from cflow_torch.data.records import changes, strict, write_text
+from cflow_torch.data.records import describe_changes, json_ready, write_text
 from cflow_torch.types import CFlowError, as_numpy
 
 MANIFEST = "manifest.json"
@@ -52,7 +52,9 @@ def make_identity(
     }
     data = {"reader": reader, **{key: value for key, value in settings.items() if key != "check"}}
     method = {key: value for key, value in asdict(config).items() if key != "max_memory"}
-    identity = strict({"format": _FORMAT, "method": method, "data": data, "contents": contents, "versions": versions})
+    identity = json_ready(
+        {"format": _FORMAT, "method": method, "data": data, "contents": contents, "versions": versions}
+    )
     return {**identity, "hash": hashlib.sha256(_text(identity).encode()).hexdigest()}
 
 
@@ -87,7 +89,7 @@ def find_conflict(output: Path, identity: Mapping[str, Any], resume: bool) -> st
     before = _read(output / MANIFEST)
     if before is None:
         return None
-    changed = changes(before, identity, ["hash"])
+    changed = describe_changes(before, identity, ["hash"])
     if changed:
         return f" ({changed})"
     return None if resume else " with the same settings (resume=true continues it)"

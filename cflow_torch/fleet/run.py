@@ -12,7 +12,7 @@ from typing import Any, Iterator, Sequence
 
 from cflow_torch.data.atomic import remove_stale
 from cflow_torch.data.paths import as_path
-from cflow_torch.data.records import strict, write_text
+from cflow_torch.data.records import json_ready, write_text
 from cflow_torch.fleet.dispatch import SIGNALS
 from cflow_torch.fleet.job import Event, Failed, Job, Shard, split
 from cflow_torch.fleet.local import run_local
@@ -71,7 +71,7 @@ def run_fleet(
         try:
             file = report_file(job.output, shard)
             remove_stale(file.parent)
-            write_text(file, json.dumps(strict(report), indent=1, allow_nan=False) + "\n")
+            write_text(file, json.dumps(json_ready(report), indent=1, allow_nan=False) + "\n")
         except OSError as error:
             say(f"the report could not be written: {error}")
             report["exit_status"] = report["exit_status"] or 1

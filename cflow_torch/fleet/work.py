@@ -15,7 +15,7 @@ import torch
 from cflow_torch.data.atomic import remove_stale
 from cflow_torch.data.catalog import open_log
 from cflow_torch.data.flow_file import write_flow
-from cflow_torch.data.log import Log, RecentSweeps, window
+from cflow_torch.data.log import CachedLog, Log, window
 from cflow_torch.data.log_check import check_log
 from cflow_torch.data.names import folder_in
 from cflow_torch.data.paths import as_path
@@ -120,7 +120,7 @@ class Worker:
         if self._log[1] is None or self._log[0] != source:
             self._close_log()
             log = open_log(self._job.reader, source, **{**self._job.settings, "check": False})
-            self._log = (source, RecentSweeps(log, self._job.config.num_sweeps))
+            self._log = (source, CachedLog(log, self._job.config.num_sweeps))
         return self._log[1]  # type: ignore[return-value]
 
     def _pass(self, log: Log, folder: Path, todo: Sequence[int], stop: Callable[[], bool]) -> Iterator[_Frame]:

@@ -36,7 +36,7 @@ from score import Figures, mean_figures, score
 from sets import ScoredSet, make_sets
 
 from cflow_torch.config import Config, make_config
-from cflow_torch.data.records import strict, write_text
+from cflow_torch.data.records import json_ready, write_text
 from cflow_torch.types import CFlowError
 
 COLUMNS = ("dynamic", "pedestrian", "static", "stands", "near", "far", "missed", "flagged", "at 1 %", "moving")
@@ -68,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         scores[mean] = {name: mean_figures([scores[part][name] for part in parts]) for name in scores[parts[0]]}
         print("".join(row(mean, name, figures) for name, figures in scores[mean].items()), end="")
     if given.json:
-        write_text(given.json, json.dumps(strict(scores), indent=1))
+        write_text(given.json, json.dumps(json_ready(scores), indent=1))
     return 0
 
 

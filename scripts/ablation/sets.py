@@ -19,7 +19,7 @@ from made import MOVES, chain_flow, paste_static
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.catalog import open_log
 from cflow_torch.data.hdf5 import HDF5Log
-from cflow_torch.data.log import FlowLabels, RecentSweeps, window
+from cflow_torch.data.log import CachedLog, FlowLabels, window
 from cflow_torch.evaluation.frame import EvalFrame, ego_motion_flow
 from cflow_torch.simulator.benchmark import benchmark_logs, format_of
 from cflow_torch.types import CFlowError, Sweep, Window, as_numpy
@@ -169,9 +169,9 @@ def av2_pair() -> list[Item]:
 
 
 @lru_cache(maxsize=None)
-def _scene(path: Path) -> tuple[HDF5Log, RecentSweeps]:
+def _scene(path: Path) -> tuple[HDF5Log, CachedLog]:
     log = HDF5Log(data_root() / path)
-    return log, RecentSweeps(log, len(log.timestamps))
+    return log, CachedLog(log, len(log.timestamps))
 
 
 @lru_cache(maxsize=None)
@@ -227,7 +227,7 @@ def simulated(profile: str, seeds: Sequence[int], cache: Path) -> list[Item]:
     items = []
     for source in benchmark_logs(cache, profile, seeds, SIMULATED_SWEEPS, SCENES):
         log = open_log(chosen.data_set, source, check=False, **dict(chosen.settings))
-        sweeps = RecentSweeps(log, SIMULATED_SWEEPS)
+        sweeps = CachedLog(log, SIMULATED_SWEEPS)
         pairs = range(HISTORY, len(log.timestamps) - 1)
         for wanted in SIMULATED_WINDOWS:  # not every sweep of every data set has labels
             nearest = sorted(pairs, key=lambda i: abs(i - wanted))  # noqa: B023

@@ -34,7 +34,7 @@ from cflow_torch import make_config, make_model
 from cflow_torch.applications.cleaning import CleanLog
 from cflow_torch.applications.moving_groups import MOVING
 from cflow_torch.data.catalog import find_sources, open_log, recognise
-from cflow_torch.data.log import Log, RecentSweeps, window
+from cflow_torch.data.log import CachedLog, Log, window
 from cflow_torch.evaluation.frame import ego_motion_flow
 from cflow_torch.simulator import objects
 from cflow_torch.simulator.drive import Drive
@@ -135,7 +135,7 @@ def main() -> None:
         cases += [(log.log_id, log, log, np.eye(4)) for log in real if not given.logs or log.log_id in given.logs]
     rows = []
     for name, log, opened, T_ego_lidar in cases:
-        recent, pairs = RecentSweeps(opened, model.config.num_sweeps), range(len(opened.timestamps) - 1)
+        recent, pairs = CachedLog(opened, model.config.num_sweeps), range(len(opened.timestamps) - 1)
         truth = list(truths(log))
         for index in pairs:  # simulating and reading is no part of the time
             recent.sweep(index)

@@ -32,7 +32,7 @@ from cflow_torch.applications.labels import find_labels
 from cflow_torch.applications.moving_groups import MOVING
 from cflow_torch.data.catalog import open_log
 from cflow_torch.data.hdf5 import HDF5Log, find_hdf5_scenes, write_hdf5_scene
-from cflow_torch.data.log import RecentSweeps, window, windows
+from cflow_torch.data.log import CachedLog, window, windows
 from cflow_torch.evaluation.frame import ego_motion_flow
 from cflow_torch.simulator.benchmark import FORMATS, benchmark_logs
 
@@ -43,7 +43,7 @@ SEEDS = (300, 301, 302, 303)  # settings were chosen on 100 to 103
 def ours(file: Path, preset: str) -> dict[str, Any]:
     """Labels of a scene by a preset: counts, and seconds a sweep."""
     model, log = make_model(make_config(preset), "cpu"), HDF5Log(file)
-    held = RecentSweeps(log, len(log))
+    held = CachedLog(log, len(log))
     sweeps = list(held)
     model([window(held, 0)])
     start = time.process_time()

@@ -27,8 +27,8 @@ from table import markdown
 from cflow_torch import Tracker, make_config, make_model
 from cflow_torch.applications.moving_groups import MOVING
 from cflow_torch.applications.track_table import confirmed, join_tables
-from cflow_torch.data.catalog import GroundFoundLog
-from cflow_torch.data.log import FlowLabels, Log, RecentSweeps, window
+from cflow_torch.data.catalog import GroundSegmentedLog
+from cflow_torch.data.log import CachedLog, FlowLabels, Log, window
 from cflow_torch.simulator import make_drive
 from cflow_torch.simulator.benchmark import FORMATS
 from cflow_torch.simulator.drive import Drive
@@ -66,7 +66,7 @@ class SimulatedLog(Log):
 
     def opened(self) -> Log:
         """The log with ground."""
-        return self if self._has_masks else GroundFoundLog(self, "grid")
+        return self if self._has_masks else GroundSegmentedLog(self, "grid")
 
 
 def score(log: SimulatedLog, pairs: Iterator[tuple[int, Window, FlowResult]]) -> Row:
@@ -168,7 +168,7 @@ def main() -> None:
     model = make_model(make_config(given.model), "auto")
 
     def pairs(log: Log) -> Iterator[tuple[int, Window, FlowResult]]:
-        recent = RecentSweeps(log, model.config.num_sweeps)
+        recent = CachedLog(log, model.config.num_sweeps)
         for index in range(len(log.timestamps) - 1):
             sweeps = window(recent, index, model.config.num_history, model.config.num_future)
             yield index, sweeps, model([sweeps])[0]

@@ -27,7 +27,7 @@ from drives import PAIR, Staged, body_of
 from PIL import Image
 
 from cflow_torch import FlowResult, Sweep, make_config, make_model
-from cflow_torch.data.catalog import ChangedLog, GroundFoundLog
+from cflow_torch.data.catalog import GroundSegmentedLog, LogWrapper
 from cflow_torch.data.log import window
 from cflow_torch.simulator.drive import Drive
 from cflow_torch.viz import plot_flow
@@ -106,7 +106,7 @@ def by(preset: str, name: str = "", of: Callable[[Drive], Any] = lambda drive: d
     return attempt
 
 
-class MisplacedPoses(ChangedLog):
+class MisplacedPoses(LogWrapper):
     """A log whose poses are those of a place 1.4 m behind the frame of its points."""
 
     def sweep(self, index: int) -> Sweep:
@@ -115,7 +115,7 @@ class MisplacedPoses(ChangedLog):
         return replace(sweep, pose=sweep.pose @ np.array([[1, 0, 0, -1.4], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]))
 
 
-class WithoutMasks(ChangedLog):
+class WithoutMasks(LogWrapper):
     """A log whose sweeps have no ground masks."""
 
     def sweep(self, index: int) -> Sweep:
@@ -130,7 +130,7 @@ _HISTORY_OR_NOT = (by("default"), by("default", num_history=0))
 _LONG_SIDE = (by("default", num_history=0), by("offline", num_history=0), by("default", num_history=4))
 _GROUND = (
     by("default", "`default`, ground=None", WithoutMasks),
-    by("default", "`default`, ground='auto'", lambda drive: GroundFoundLog(WithoutMasks(drive))),
+    by("default", "`default`, ground='auto'", lambda drive: GroundSegmentedLog(WithoutMasks(drive))),
 )
 _WRONG_FRAME = (by("default", "`default`, wrong frame", MisplacedPoses), by("default", "`default`, right frame"))
 _WIDE = by("default", "`default`, point_cloud_range=±100 m", point_cloud_range=WIDE)

@@ -12,7 +12,7 @@ import pytest
 
 from cflow_torch.cli.main import main
 from cflow_torch.data.arrays import write_array_log
-from cflow_torch.data.catalog import GroundFoundLog, find_sources, open_log
+from cflow_torch.data.catalog import GroundSegmentedLog, find_sources, open_log
 from cflow_torch.simulator import Drive, make_drive
 from cflow_torch.simulator.benchmark import FORMATS
 from cflow_torch.types import CFlowError
@@ -54,7 +54,7 @@ def test_ground_is_found_where_there_is_no_mask(drive: Drive, arrays: Path) -> N
     assert found.dtype == np.bool_ and (found & truth).sum() / (found | truth).sum() > 0.9
     assert log.labels(0) is None and log.log_id == drive.log_id and np.array_equal(log.poses, drive.poses)
     assert not hasattr(log, "eval_mask") and pickle.loads(pickle.dumps(log)).files == log.files
-    kept = GroundFoundLog(drive).sweep(0).is_ground
+    kept = GroundSegmentedLog(drive).sweep(0).is_ground
     assert np.array_equal(kept, drive.sweep(0).is_ground), "a mask that is there is kept"
 
 

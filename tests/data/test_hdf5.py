@@ -12,7 +12,7 @@ from cflow_torch import CFlowError
 from cflow_torch.data.hdf5.reader import HDF5Log, find_hdf5_scenes
 from cflow_torch.data.hdf5.writer import write_hdf5_scene
 from cflow_torch.data.log import window
-from cflow_torch.data.rigid_motion import moved
+from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.simulator import make_drive
 
 h5py = pytest.importorskip("h5py")
@@ -136,7 +136,7 @@ def test_round_trip_of_a_simulated_drive(drive, tmp_path, points_frame):
         assert np.array_equal(log.poses, drive.poses @ extrinsics)
         for index in range(3):
             stored, read, units = drive.sweep(index), log.sweep(index), drive.units(index)
-            assert np.abs(moved(read.points, extrinsics) - stored.points).max() <= step
+            assert np.abs(transform_points(read.points, extrinsics) - stored.points).max() <= step
             assert np.array_equal(read.is_ground, stored.is_ground) and read.timestamp_ns == stored.timestamp_ns
             assert np.array_equal(log.values(index, "pose"), drive.poses[index]), "of the ego frame"
             assert log.values(index, "lidar_id").max() == len(units)
@@ -152,7 +152,7 @@ def test_round_trip_of_a_simulated_drive(drive, tmp_path, points_frame):
             assert np.array_equal(log.values(index, "ego_motion"), motion.astype(np.float32))
             assert (log.values(index, "flow_instance_id")[truth.category > 0] > 0).mean() > 0.99
             # In the frame of the points, what stands still moves as the poses say.
-            rigid = moved(read.points, np.linalg.inv(log.sweep(index + 1).pose) @ read.pose) - read.points
+            rigid = transform_points(read.points, np.linalg.inv(log.sweep(index + 1).pose) @ read.pose) - read.points
             assert np.abs(labels.flow - rigid)[truth.category == 0].max() < 1e-4
         assert log.eval_mask(1) is None
         assert np.array_equal(log.eval_mask(0), log.labels(0).is_valid & ~log.sweep(0).is_ground)

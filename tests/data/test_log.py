@@ -12,7 +12,7 @@ from torch.utils.data import DataLoader
 
 from cflow_torch import CFlowError, FlowResult, Window, make_config, make_model
 from cflow_torch.data.flow_file import CONTENTS, ON_REQUEST, read_flow, write_flow
-from cflow_torch.data.log import Log, RecentSweeps, WindowDataset, window, windows
+from cflow_torch.data.log import CachedLog, Log, WindowDataset, window, windows
 from cflow_torch.simulator import Drive, make_drive
 from cflow_torch.types import Sweep
 
@@ -40,12 +40,12 @@ def test_a_log_is_a_sequence_whatever_is_put_round_it(drive: Drive) -> None:
         def sweep(self, index: int) -> Sweep:
             return Sweep(np.full((index, 3), index, np.float32))
 
-    for log in (Mine(), RecentSweeps(Mine(), 2)):
+    for log in (Mine(), CachedLog(Mine(), 2)):
         assert [len(sweep.points) for sweep in log] == [0, 1, 2] and len(log) == 3
         assert len(log[-1].points) == 2 and log.labels(0) is None
         with pytest.raises(IndexError):
             log[3]
-    recent = pickle.loads(pickle.dumps(RecentSweeps(drive, 2)))
+    recent = pickle.loads(pickle.dumps(CachedLog(drive, 2)))
     assert np.array_equal(recent.sweep(1).points, drive.sweep(1).points)
 
 

@@ -11,7 +11,7 @@ from tiny_recording import TinyRecording
 
 from cflow_torch import CFlowError
 from cflow_torch.data.catalog import find_sources, open_log
-from cflow_torch.data.names import folder_in, inside, is_safe_name, is_stamp, safe_name
+from cflow_torch.data.names import folder_in, is_safe_name, is_timestamp, path_inside, safe_name
 from cflow_torch.simulator.writers.nuscenes import write_nuscenes
 
 BAD = (
@@ -41,12 +41,12 @@ def test_names_that_are_taken(tmp_path: Path) -> None:
 
 
 def test_files_that_tables_name_lie_below_the_folder(tmp_path: Path) -> None:
-    assert inside(tmp_path, "samples/LIDAR_TOP/x__1.bin", "f") == tmp_path / "samples" / "LIDAR_TOP" / "x__1.bin"
-    assert inside(tmp_path, "./a//b.npz", "f") == tmp_path / "a" / "b.npz"
+    assert path_inside(tmp_path, "samples/LIDAR_TOP/x__1.bin", "f") == tmp_path / "samples" / "LIDAR_TOP" / "x__1.bin"
+    assert path_inside(tmp_path, "./a//b.npz", "f") == tmp_path / "a" / "b.npz"
     outside = ("/etc/passwd", "../x", "a/../../x", "a/..", "\\\\host\\x", "\\x", "C:/x", ".", "", None, 5)
     for relative in (*outside, *(f"a/{name}" for name in BAD if name not in ("", ".", "/etc/passwd", "a/b"))):
         with pytest.raises(CFlowError, match="f .* is not read: "):
-            inside(tmp_path, relative, "f")
+            path_inside(tmp_path, relative, "f")
 
 
 def test_links_in_the_data_are_followed(tmp_path: Path) -> None:
@@ -54,13 +54,13 @@ def test_links_in_the_data_are_followed(tmp_path: Path) -> None:
     elsewhere.mkdir(), root.mkdir()
     (elsewhere / "x.bin").write_bytes(b"data")
     (root / "data").symlink_to(elsewhere)
-    assert inside(root, "data/x.bin", "f").read_bytes() == b"data", "users link data sets"
+    assert path_inside(root, "data/x.bin", "f").read_bytes() == b"data", "users link data sets"
 
 
 def test_time_stamps_as_names() -> None:
-    assert is_stamp("315966000000000000") and is_stamp("0")
+    assert is_timestamp("315966000000000000") and is_timestamp("0")
     for name in ("", "-1", "²", "\u0663", "1e5", "9" * 19 + "0", "9223372036854775808", " 1"):
-        assert not is_stamp(name), name
+        assert not is_timestamp(name), name
 
 
 def test_names_of_a_data_set_cannot_leave_it(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from cflow_torch.data.log import window
 from cflow_torch.data.nuscenes.reader import Footprint, NuScenesLog, find_nuscenes_scenes, pcd_bin_points
 from cflow_torch.data.nuscenes.tables import Annotations, SceneSource
 from cflow_torch.data.nuscenes.tracks import Tracks
-from cflow_torch.data.rigid_motion import moved, poses_from_quaternions
+from cflow_torch.data.rigid_motion import poses_from_quaternions, transform_points
 from cflow_torch.simulator import make_drive
 from cflow_torch.simulator.writers.nuscenes import write_nuscenes
 from cflow_torch.types import CFlowError
@@ -142,7 +142,7 @@ def test_every_second_sweep_keeps_the_samples(tmp_path):
     thinned = open_log(folder, sweep_step=2, own_vehicle=None)
     assert list(thinned.timestamps) == [stamps[i] for i in (0, 2, 3, 5, 6, 7)]
     points = thinned.sweep(0).points.astype(float)[~recording.is_on_car()]
-    expected = moved(points, np.linalg.inv(recording.poses[2]) @ recording.poses[0]) - points
+    expected = transform_points(points, np.linalg.inv(recording.poses[2]) @ recording.poses[0]) - points
     np.testing.assert_allclose(thinned.labels(0).flow[~recording.is_on_car()], expected, atol=1e-5)
     with pytest.raises(CFlowError, match="sweep_step=0"):
         open_log(folder, sweep_step=0)

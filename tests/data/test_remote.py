@@ -18,7 +18,7 @@ import pytest
 from small_logs import SMALL_LOGS, write_small_log
 
 from cflow_torch.data import paths
-from cflow_torch.data.atomic import atomic_file, atomic_folder, ready_folder, remove_stale
+from cflow_torch.data.atomic import atomic_file, atomic_folder, ensure_writable, remove_stale
 from cflow_torch.data.catalog import find_sources, open_log
 from cflow_torch.data.paths import as_path, is_remote
 from cflow_torch.types import CFlowError
@@ -142,7 +142,7 @@ def test_addresses(tmp_path, monkeypatch):
 
 def test_a_pipe_is_no_file(tmp_path):
     os.mkfifo(tmp_path / "pipe")
-    for read in (paths.read_bytes, paths.whole):
+    for read in (paths.read_bytes, paths.source_for_full_read):
         with pytest.raises(OSError, match="device or a pipe"):
             read(tmp_path / "pipe")
 
@@ -159,14 +159,14 @@ def test_large_files_are_read_in_blocks_that_are_kept(far, tmp_path, monkeypatch
     data = np.random.default_rng(0).bytes(100_000)
     (tmp_path / "a").write_bytes(data)
     monkeypatch.setattr(paths, "_BLOCK", 10_000)
-    file, before = paths.ranged(far(tmp_path / "a")), Far.requests
+    file, before = paths.source_for_random_access(far(tmp_path / "a")), Far.requests
     for at, count in ((5, 10), (9_000, 999), (90_000, 5_000), (95_000, 10_000), (3, 2)):
         assert file.seek(at) == at and file.read(count) == data[at : at + count]
     assert Far.requests - before == 2, "blocks 0 and 9"
-    copies = {paths.mapped(far(tmp_path / "a")).read() for _ in range(3)}
+    copies = {paths.source_for_mmap(far(tmp_path / "a")).read() for _ in range(3)}
     assert copies == {data}
     before = Far.requests
-    assert paths.mapped(far(tmp_path / "a")).read() == data and Far.requests == before
+    assert paths.source_for_mmap(far(tmp_path / "a")).read() == data and Far.requests == before
 
 
 @pytest.mark.parametrize("error", [FileNotFoundError, Unreachable, asyncio.TimeoutError])
@@ -222,7 +222,7 @@ def test_a_put_that_fails_leaves_the_old_file(place, method, monkeypatch):
 
 
 def test_folders_are_made_whole_here_only(place):
-    assert ready_folder(place / "out") == place / "out" and names(place / "out") == ()
+    assert ensure_writable(place / "out") == place / "out" and names(place / "out") == ()
     with pytest.raises(CFlowError, match="write one here"), atomic_folder(place / "log"):
         pass
 

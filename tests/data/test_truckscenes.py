@@ -12,7 +12,7 @@ from tiny_recording import CAR_VELOCITY, TinyRecording
 
 from cflow_torch.data.arrays.pcd import read_pcd, write_pcd
 from cflow_torch.data.nuscenes.reader import find_nuscenes_scenes
-from cflow_torch.data.rigid_motion import moved
+from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.data.truckscenes import TruckScenesLog, find_truckscenes_scenes
 from cflow_torch.simulator.writers.nuscenes import write_nuscenes
 from cflow_torch.simulator.writers.truckscenes import write_truckscenes
@@ -49,7 +49,7 @@ def tiny(recording, tmp_path):
 def test_each_shot_is_moved_with_the_pose_of_its_time(recording, tiny, index):
     """Also after the last pose, where the motion goes on. In the world, numbers of 5e6 m have steps of 1e-9 m."""
     points = open_log(tiny, own_vehicle=None).sweep(index).points
-    assert np.abs(points - moved(recording.world(index), np.linalg.inv(recording.poses[index]))).max() < 2e-5
+    assert np.abs(points - transform_points(recording.world(index), np.linalg.inv(recording.poses[index]))).max() < 2e-5
     raw = open_log(tiny, own_vehicle=None, deskew=False).sweep(index).points
     assert np.abs(raw - recording.sweep(index).points).max() < 2e-5
     assert np.abs(raw - points).max() > 1
@@ -61,7 +61,7 @@ def test_flow_of_raw_sweeps_is_exact_for_constant_motion(recording, tiny):
     for index in (0, 1, 3):
         labels = log.labels(index)
         world = recording.world(index) + np.where(on_car[:, None], 0.1 * CAR_VELOCITY, 0)
-        arrive = moved(world, np.linalg.inv(recording.poses[index + 1]))
+        arrive = transform_points(world, np.linalg.inv(recording.poses[index + 1]))
         assert np.array_equal(labels.category > 0, on_car) and labels.is_valid.all()
         assert np.abs(labels.flow - (arrive - log.sweep(index).points)).max() < 3e-5
     assert log.labels(5) is None
@@ -85,10 +85,10 @@ def test_lidars_with_their_own_times_and_poses(recording, tiny):
     points, here = log.sweep(1).points, recording.sweep(1).points
     late = np.linalg.inv(recording.poses[1]) @ recording.pose_at(recording.timestamps[1] + 20_000_000)
     assert np.abs(points[40:] - here[40:]).max() < 2e-5
-    assert np.abs(points[:40] - moved(here[:40], late)).max() < 3e-5
+    assert np.abs(points[:40] - transform_points(here[:40], late)).max() < 3e-5
     assert np.abs(points[:40] - here[:40]).max() > 0.2
     skewless = open_log(tiny, own_vehicle=None).sweep(1).points  # the shots have their own times: nothing changes
-    assert np.abs(skewless - moved(recording.world(1), np.linalg.inv(recording.poses[1]))).max() < 2e-5
+    assert np.abs(skewless - transform_points(recording.world(1), np.linalg.inv(recording.poses[1]))).max() < 2e-5
 
 
 def test_a_lidar_that_missed_a_turn_is_left_out(recording, tiny):
@@ -110,7 +110,7 @@ def test_truck_and_trailer_are_removed(recording, tiny):
     file = next((tiny / "samples" / "LIDAR_LEFT").glob(f"*_{log.timestamps[0]}.pcd"))
     inside = np.array([[6.9, 1.9, 1], [-6.9, -1.9, 3], [7.1, 0, 1], [0, 2.1, 1], [-20, 12, 1.2], [-20, 16, 1.2]])
     mount = recording.units(0)[1].T_ego_sensor
-    local = moved(inside, np.linalg.inv(mount)).astype(np.float32)
+    local = transform_points(inside, np.linalg.inv(mount)).astype(np.float32)
     local = np.concatenate([local, np.zeros((1, 3)), np.full((1, 3), np.nan)]).astype(np.float32)
     # 99 ms later the truck has moved by 1.5 m, but not against itself.
     times = np.full(len(local), log.timestamps[0] + 99_000, np.uint64)

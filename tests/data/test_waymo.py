@@ -17,7 +17,7 @@ from cflow_torch.data.boxes import Boxes as Tracks
 from cflow_torch.data.boxes import flow_from_boxes
 from cflow_torch.data.categories import CATEGORY_INDEX
 from cflow_torch.data.log import FlowLabels, window
-from cflow_torch.data.rigid_motion import moved
+from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.data.waymo.parquet import LIDAR, TIME, VEHICLE_POSE, Component, matrix_of
 from cflow_torch.data.waymo.range_image import LaserCalibration, rotations_from_angles
 from cflow_torch.data.waymo.reader import BOX_CATEGORY, WaymoLog, find_waymo_segments
@@ -91,7 +91,7 @@ class GridRecording:
         return Boxes(tracks, tuple(names), np.array(sizes), np.stack(poses), np.full(len(names), 5))
 
     def sweep(self, index: int) -> Sweep:
-        points = np.concatenate([moved(unit.points, unit.T_ego_sensor) for unit in self.units(index)])
+        points = np.concatenate([transform_points(unit.points, unit.T_ego_sensor) for unit in self.units(index)])
         return Sweep(points.astype(np.float32), None, self.poses[index], self.timestamps[index])
 
     def labels(self, index: int) -> FlowLabels:

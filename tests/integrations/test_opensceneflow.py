@@ -30,7 +30,7 @@ from cflow_torch.data.hdf5 import HDF5Log, write_hdf5_scene
 from cflow_torch.data.hdf5.frames import recognized_extrinsics
 from cflow_torch.data.hdf5.writer import write_index_files
 from cflow_torch.data.log import FlowLabels, window
-from cflow_torch.data.rigid_motion import moved
+from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.integrations.opensceneflow import CFlow, write_null_checkpoint
 from cflow_torch.integrations.opensceneflow.__main__ import main as write_checkpoint
 from cflow_torch.types import Sweep
@@ -337,9 +337,9 @@ def test_extrinsics_mend_the_harness_s_pose_flow(tmp_path: Path) -> None:
             motions.append(np.linalg.inv(log.sweep(index + 1).pose) @ sweep.pose)
     rows, points = ~sweep.is_ground, sweep.points[~sweep.is_ground].astype(np.float64)
     residual = core(folder, "dense", index, 6, EGO_T_LIDAR).numpy()
-    expected = moved(points, motions[0]) - points + residual
+    expected = transform_points(points, motions[0]) - points + residual
     np.testing.assert_allclose(outcome.final_flow.numpy()[rows], expected, rtol=0, atol=1e-5)
-    correction = moved(points, motions[0]) - moved(points, motions[1])
+    correction = transform_points(points, motions[0]) - transform_points(points, motions[1])
     assert np.abs(correction).max() > 0.02, "without extrinsics the static world would move"
     np.testing.assert_allclose(outcome.answer["flow"].numpy(), residual + correction, rtol=0, atol=3e-4)
 

@@ -22,7 +22,7 @@ from cflow_torch import CFlowError, estimate_flow, make_config, make_model
 from cflow_torch.data.arrays import ArraysLog, write_array_log
 from cflow_torch.data.catalog import find_sources, open_log
 from cflow_torch.data.flow_file import read_flow, write_flow
-from cflow_torch.data.log import FlowLabels, RecentSweeps, window
+from cflow_torch.data.log import CachedLog, FlowLabels, window
 from cflow_torch.evaluation.frame import EvalFrame
 from cflow_torch.evaluation.metrics import SceneFlowMetrics
 from cflow_torch.types import Sweep
@@ -84,7 +84,7 @@ def logs(root: Path) -> Iterator[None]:
     broken.write_bytes(b"ARROW1 half")
     while True:
         for seed, folder in enumerate(folders):
-            metrics, log = SceneFlowMetrics(), RecentSweeps(ArraysLog(folder), 2)
+            metrics, log = SceneFlowMetrics(), CachedLog(ArraysLog(folder), 2)
             for index in range(LOG_SWEEPS - 1):
                 sweeps = window(log, index)
                 write_flow(root / "flow" / f"{index}.feather", model([sweeps])[0])

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from cflow_torch.config import Config, make_config
-from cflow_torch.data.records import strict
+from cflow_torch.data.records import json_ready
 
 CLASSES = ("CAR", "OTHER_VEHICLES", "PEDESTRIAN", "WHEELED_VRU")
 SCALES = [(0.1,), (0.2, 0.1), (0.4, 0.2, 0.1), (0.8, 0.4, 0.2, 0.1), (0.8, 0.4, 0.3, 0.2, 0.1)]
@@ -46,7 +46,7 @@ def write_run(root: Path, experiment: str, number: int, config: Config) -> None:
         "config": {
             "experiment_name": experiment,
             "data": {"name": "av2", "label": "small"},
-            "model": strict(config.as_dict()),
+            "model": json_ready(config.as_dict()),
         },
         "versions": {"cflow_torch": "0.1.0", "torch": "2"},
         "date": "2026-01-02T03:04:05+00:00",

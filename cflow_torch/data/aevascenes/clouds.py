@@ -11,10 +11,10 @@ from numpy.lib import format as npy
 
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.paths import read_bytes
-from cflow_torch.data.pickles import NUMPY_ARRAYS, StandIn, array_of, load_plain
+from cflow_torch.data.pickles import NUMPY_ARRAYS, Placeholder, array_of, load_plain
 from cflow_torch.types import CFlowError
 
-_MEND = "copy it from the data set"
+_HINT = "copy it from the data set"
 
 
 class Cloud:
@@ -29,7 +29,7 @@ class Cloud:
 
     def __init__(self, file: Path) -> None:
         self.file = file
-        with file_errors(file, _MEND):
+        with file_errors(file, _HINT):
             self._arrays = np.load(io.BytesIO(read_bytes(file)), allow_pickle=False)
             self._keys = list(self._arrays.files)
 
@@ -41,7 +41,7 @@ class Cloud:
         """
         if key not in self._keys:
             raise CFlowError(f"{self.file} has no array {key}; it has {self._keys[:20]}")
-        with file_errors(f"{self.file}: {key}", _MEND):
+        with file_errors(f"{self.file}: {key}", _HINT):
             array = self._arrays[key]
         if (
             not np.issubdtype(array.dtype, np.floating)
@@ -59,7 +59,7 @@ class Cloud:
         """
         if key not in self._keys:
             return None
-        with file_errors(f"{self.file}: {key}", _MEND):
+        with file_errors(f"{self.file}: {key}", _HINT):
             array = self._arrays[key]
         if not np.issubdtype(array.dtype, np.integer) or array.shape not in ((rows,), (rows, 1)):
             raise CFlowError(f"{self.file}: {key} must be ({rows}, 1) integers, got {array.shape} {array.dtype}")
@@ -73,18 +73,18 @@ class Cloud:
         """
         if key not in self._keys:
             return None
-        with file_errors(f"{self.file}: {key}", _MEND):
+        with file_errors(f"{self.file}: {key}", _HINT):
             with self._arrays.zip.open(f"{key}.npy") as member:
                 is_first = npy.read_magic(member) == (1, 0)
                 shape, _, dtype = (npy.read_array_header_1_0 if is_first else npy.read_array_header_2_0)(member)
                 stored = array_of(load_plain(member, NUMPY_ARRAYS)) if dtype.hasobject else self._arrays[key]
-            texts = [_text(text) if isinstance(text, StandIn) else text for text in stored.ravel().tolist()]
+            texts = [_text(text) if isinstance(text, Placeholder) else text for text in stored.ravel().tolist()]
             if {type(text) for text in texts} - {str} or len(texts) != math.prod(shape):
                 raise ValueError(f"it must hold {math.prod(shape)} strings")
             return texts
 
 
-def _text(scalar: StandIn) -> str:
+def _text(scalar: Placeholder) -> str:
     """A NumPy string scalar."""
     data: bytes = scalar.parts[1]
     return data.decode("utf-32-le").rstrip("\0")

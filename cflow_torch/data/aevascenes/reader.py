@@ -14,14 +14,14 @@ from cflow_torch.data.file_errors import file_errors, shortened
 from cflow_torch.data.folders import find_folders
 from cflow_torch.data.json_file import read_json
 from cflow_torch.data.log import FlowLabels, NumberedSweeps
-from cflow_torch.data.names import inside
-from cflow_torch.data.paths import Place, as_path
-from cflow_torch.data.rigid_motion import moved, poses_of_nodes
+from cflow_torch.data.names import path_inside
+from cflow_torch.data.paths import PathLike, as_path
+from cflow_torch.data.rigid_motion import poses_from_json, transform_points
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.ego_motion import relative_transform
 
 SEARCH_DEPTH = 3  # <root>/<data set>/<split>/<sequence>
-_MEND = "give a whole sequence of AevaScenes"
+_HINT = "give a whole sequence of AevaScenes"
 
 CATEGORY_NAME: dict[str, str] = {
     **dict.fromkeys(("unknown", "pole_trunk", "building", "other_structure", "vegetation"), "NONE"),
@@ -49,7 +49,7 @@ CATEGORY_NAME.update(dict.fromkeys(GROUND, "NONE"))
 _PATHS = {"compensated": ("point_cloud_compensated_path", "point_cloud_path"), "raw": ("point_cloud_raw_path",)}
 
 
-def find_aevascenes_sequences(root: Place) -> list[Path]:
+def find_aevascenes_sequences(root: PathLike) -> list[Path]:
     """Folders of all sequences under a folder, sorted.
 
     Args:
@@ -91,7 +91,7 @@ class AevaScenesLog(NumberedSweeps):
 
     def __init__(
         self,
-        folder: Place,
+        folder: PathLike,
         clouds: str = "compensated",
         lidars: Sequence[str] | None = None,
         ground: bool = True,
@@ -104,7 +104,7 @@ class AevaScenesLog(NumberedSweeps):
         # Several arrays of a sweep's clouds are read one after the other.
         self._clouds_of = lru_cache(1)(self._open_clouds)
         self._file = self.folder / "sequence.json"
-        with file_errors(self._file, _MEND):
+        with file_errors(self._file, _HINT):
             content = read_json(self._file)
             mounts, known = content["metadata"]["vehicle_to_lidar_extrinsics"], content["metadata"]["sensors"]["lidars"]
             self.lidars: Sequence[str] = tuple(known if lidars is None else lidars)
@@ -150,8 +150,9 @@ class AevaScenesLog(NumberedSweeps):
 
     def _points(self, index: int) -> np.ndarray:
         """(N, 3) float32, vehicle frame."""
-        clouds = zip(self._clouds_of(index), self._mounts)
-        return np.concatenate([moved(cloud.numbers("xyz", 3), mount) for cloud, mount in clouds]).astype(np.float32)
+        pairs = zip(self._clouds_of(index), self._mounts)
+        clouds = [transform_points(cloud.numbers("xyz", 3), mount) for cloud, mount in pairs]
+        return np.concatenate(clouds).astype(np.float32)
 
     def _point_times(self, index: int) -> np.ndarray | None:
         """(N,) float64 seconds after the time stamp; None where a cloud does not tell."""
@@ -163,18 +164,18 @@ class AevaScenesLog(NumberedSweeps):
     def _open_clouds(self, index: int) -> list[Cloud]:
         where, clouds = f"{self._file}, frame {self._timestamp(index)}", []
         for name in self.lidars:
-            with file_errors(where, _MEND):
+            with file_errors(where, _HINT):
                 entry = self._frames[index]["point_cloud"][name]
                 paths = [entry[key] for key in _PATHS[self._clouds] if key in entry]
             if not paths:
                 has = f"no {self._clouds} cloud, only {shortened(entry)}"
                 raise CFlowError(f"{where}, {name}: {has}; raw clouds come with version 2 of the data set")
-            clouds.append(Cloud(inside(self.folder, paths[0], f"{where}, {name}: the path")))
+            clouds.append(Cloud(path_inside(self.folder, paths[0], f"{where}, {name}: the path")))
         return clouds
 
     def _boxes(self, index: int) -> Boxes:
         where = f"{self._file}, frame {self.timestamps[index]}"
-        with file_errors(where, _MEND):
+        with file_errors(where, _HINT):
             boxes = self._frames[index].get("boxes") or []
             boxes = [box for box in boxes if CATEGORY_NAME.get(box["class"]) != "NONE"]
             strange = [box for box in boxes if box.get("reference_frame", "VEHICLE") != "VEHICLE"]
@@ -189,4 +190,4 @@ class AevaScenesLog(NumberedSweeps):
 
     def _poses_of(self, nodes: Sequence[Any], what: str) -> np.ndarray:
         """(K, 4, 4) float64 from objects with translation {x, y, z} and rotation {w, x, y, z}."""
-        return poses_of_nodes(nodes, "translation", "rotation", f"{self._file}: {what}: number")
+        return poses_from_json(nodes, "translation", "rotation", f"{self._file}: {what}: number")

@@ -14,7 +14,7 @@ from cflow_torch.data.arrays.ply import read_ply, write_ply
 from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.npy_file import read_npy
-from cflow_torch.data.paths import Place, as_path, read_bytes, whole
+from cflow_torch.data.paths import PathLike, as_path, read_bytes, source_for_full_read
 from cflow_torch.types import CFlowError
 
 SUFFIXES = (".npy", ".npz", ".bin", ".pcd", ".ply", ".feather", ".parquet")
@@ -23,7 +23,7 @@ _AXES = ("x", "y", "z")
 _CLOUD_KEYS = ("points", "lidar", "xyz", "pc")  # of an .npz file that holds more than one table
 
 
-def read_cloud(path: Place, bin_columns: int = KITTI_COLUMNS) -> np.ndarray:
+def read_cloud(path: PathLike, bin_columns: int = KITTI_COLUMNS) -> np.ndarray:
     """Positions of a point cloud.
 
     Args:
@@ -62,7 +62,7 @@ def read_cloud(path: Place, bin_columns: int = KITTI_COLUMNS) -> np.ndarray:
     return points.astype(points.dtype.newbyteorder("="), copy=False)
 
 
-def write_cloud(path: Place, points: np.ndarray) -> None:
+def write_cloud(path: PathLike, points: np.ndarray) -> None:
     """Write a cloud in the format of the suffix, atomically.
 
     Args:
@@ -105,9 +105,9 @@ def _read_bin(path: Path, columns: int) -> np.ndarray:
 
 
 def _read_numpy(path: Path) -> np.ndarray:
-    mend = "give plain arrays, no file of pickled objects"
+    hint = "give plain arrays, no file of pickled objects"
     if path.suffix.lower() == ".npz":
-        with file_errors(path, mend), np.load(whole(path), allow_pickle=False) as arrays:
+        with file_errors(path, hint), np.load(source_for_full_read(path), allow_pickle=False) as arrays:
             if all(axis in arrays.files for axis in _AXES):
                 return _from_fields(path, {axis: arrays[axis] for axis in _AXES})
             named = [name for name in arrays.files if name in _CLOUD_KEYS]
@@ -118,7 +118,7 @@ def _read_numpy(path: Path) -> np.ndarray:
                 raise CFlowError(f"{path} holds {has}; give x, y, z, or one (N, 3+) array, or name it {_CLOUD_KEYS[0]}")
         (stored,) = tables
     else:
-        stored = read_npy(path, mend)
+        stored = read_npy(path, hint)
     if stored.dtype.names is not None:
         return _from_fields(path, {name: stored[name] for name in stored.dtype.names})
     if stored.ndim != 2 or stored.shape[1] < 3:

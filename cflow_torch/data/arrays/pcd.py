@@ -9,11 +9,11 @@ import numpy as np
 
 from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.file_errors import file_errors
-from cflow_torch.data.paths import Place, as_path, read_bytes
+from cflow_torch.data.paths import PathLike, as_path, read_bytes
 from cflow_torch.types import CFlowError
 
 
-def read_pcd(path: Place) -> dict[str, np.ndarray]:
+def read_pcd(path: PathLike) -> dict[str, np.ndarray]:
     """The fields of a cloud.
 
     Args:
@@ -33,7 +33,7 @@ def read_pcd(path: Place) -> dict[str, np.ndarray]:
         return pcd_fields(read_bytes(as_path(path)), path)
 
 
-def pcd_fields(content: bytes, path: Place) -> dict[str, np.ndarray]:
+def pcd_fields(content: bytes, path: PathLike) -> dict[str, np.ndarray]:
     """As `read_pcd`, of what is in the file."""
     pypcd4 = _pypcd4()
     with file_errors(path, "give a .pcd file of version 0.7"):
@@ -47,7 +47,7 @@ def pcd_fields(content: bytes, path: Place) -> dict[str, np.ndarray]:
     return {name: np.ascontiguousarray(table[name]).reshape(-1) for name in names}
 
 
-def write_pcd(path: Place, fields: Mapping[str, np.ndarray]) -> None:
+def write_pcd(path: PathLike, fields: Mapping[str, np.ndarray]) -> None:
     """Write a binary cloud, atomically.
 
     Args:
@@ -68,5 +68,5 @@ def _pypcd4() -> Any:
     try:
         import pypcd4
     except ImportError:
-        raise CFlowError("PCD files need pypcd4: pip install 'cflow_torch[clouds]'") from None
+        raise CFlowError("PCD files need pypcd4: pip install pypcd4") from None
     return pypcd4

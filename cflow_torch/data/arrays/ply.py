@@ -16,7 +16,7 @@ import numpy as np
 
 from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.file_errors import file_errors
-from cflow_torch.data.paths import Place, as_path, read_bytes
+from cflow_torch.data.paths import PathLike, as_path, read_bytes
 
 _CODES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
 _NAMES = dict(zip(_CODES, ("char", "uchar", "short", "ushort", "int", "uint", "float", "double")))
@@ -28,7 +28,7 @@ _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 _LONGEST_HEADER = 65536  # bytes
 
 
-def read_ply(path: Place) -> dict[str, np.ndarray]:
+def read_ply(path: PathLike) -> dict[str, np.ndarray]:
     """All properties of the vertices.
 
     Args:
@@ -67,7 +67,7 @@ def read_ply(path: Place) -> dict[str, np.ndarray]:
     return {name: table[name].astype(kind[name].newbyteorder("=")) for name in kind.names or ()}
 
 
-def write_ply(path: Place, fields: Mapping[str, np.ndarray]) -> None:
+def write_ply(path: PathLike, fields: Mapping[str, np.ndarray]) -> None:
     """Write vertices in binary, atomically.
 
     Args:

@@ -12,8 +12,8 @@ import numpy as np
 
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.npy_file import read_npy
-from cflow_torch.data.paths import Place, as_path, read_bytes
-from cflow_torch.data.rigid_motion import between, poses_from_quaternions, to_quaternions
+from cflow_torch.data.paths import PathLike, as_path, read_bytes
+from cflow_torch.data.rigid_motion import interpolate_poses, poses_from_quaternions, to_quaternions
 from cflow_torch.types import CFlowError
 from cflow_torch.windows.ego_motion import rigid_transform
 
@@ -36,7 +36,7 @@ class Trajectory:
     layout: str
 
 
-def read_poses(path: Place) -> Trajectory:
+def read_poses(path: PathLike) -> Trajectory:
     """Poses of a file; its number of columns tells the format.
 
     Args:
@@ -82,7 +82,7 @@ def checked_poses(matrices: np.ndarray, source: str) -> np.ndarray:
     return poses
 
 
-def read_calibration(path: Place) -> np.ndarray:
+def read_calibration(path: PathLike) -> np.ndarray:
     """(4, 4) float64 `T_cam0_lidar` of KITTI's `calib.txt`: the line `Tr: ` and 12 numbers.
 
     With it, the poses P of KITTI's camera give those of the LiDAR: inv(T) P T.
@@ -97,7 +97,7 @@ def read_calibration(path: Place) -> np.ndarray:
     return rigid_transform(np.concatenate([matrix, [[0, 0, 0, 1]]]), f"{row[0]} of {path}")
 
 
-def read_times(path: Place) -> np.ndarray:
+def read_times(path: PathLike) -> np.ndarray:
     """(K,) int64 nanoseconds of a file with one time in seconds a line (KITTI's `times.txt`).
 
     Raises:
@@ -109,12 +109,12 @@ def read_times(path: Place) -> np.ndarray:
     return _nanoseconds(path, words[:, 0])
 
 
-def write_kitti_poses(path: Place, poses: np.ndarray) -> None:
+def write_kitti_poses(path: PathLike, poses: np.ndarray) -> None:
     """Write (K, 4, 4) poses as 12 numbers a line, with 17 digits."""
     np.savetxt(path, np.asarray(poses)[:, :3].reshape(-1, 12), "%.17g")
 
 
-def write_tum_poses(path: Place, times_ns: Sequence[int], poses: np.ndarray) -> None:
+def write_tum_poses(path: PathLike, times_ns: Sequence[int], poses: np.ndarray) -> None:
     """Write (K, 4, 4) poses as `t x y z qx qy qz qw`, seconds with 9 decimals, the rest with 17 digits."""
     poses = np.asarray(poses, np.float64)
     numbers = np.concatenate([poses[:, :3, 3], to_quaternions(poses[:, :3, :3])[:, [1, 2, 3, 0]]], axis=1)
@@ -122,7 +122,7 @@ def write_tum_poses(path: Place, times_ns: Sequence[int], poses: np.ndarray) -> 
     np.savetxt(path, lines, "%s")
 
 
-def write_times(path: Place, times_ns: Sequence[int]) -> None:
+def write_times(path: PathLike, times_ns: Sequence[int]) -> None:
     """Write nanoseconds as one time in seconds a line, with 9 decimals."""
     np.savetxt(path, [_seconds(time) for time in times_ns], "%s")
 
@@ -153,10 +153,10 @@ def poses_at(trajectory: Trajectory, times_ns: Sequence[int], source: str) -> np
             "do both count from the same moment?"
         )
     share = (wanted - known[before]) / np.maximum(gap, 1)
-    return between(trajectory.poses[before], trajectory.poses[after], share)
+    return interpolate_poses(trajectory.poses[before], trajectory.poses[after], share)
 
 
-def _read_table(path: Place) -> tuple[np.ndarray, np.ndarray]:
+def _read_table(path: PathLike) -> tuple[np.ndarray, np.ndarray]:
     """(K, C) words of a text file and the finite numbers that they are, K and C at least 1."""
     with file_errors(path, "give lines of as many numbers each"), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # numpy's about a file without lines
@@ -168,7 +168,7 @@ def _read_table(path: Place) -> tuple[np.ndarray, np.ndarray]:
     return words, values
 
 
-def _nanoseconds(path: Place, seconds: np.ndarray) -> np.ndarray:
+def _nanoseconds(path: PathLike, seconds: np.ndarray) -> np.ndarray:
     """(K,) int64 from (K,) words, exactly: unix times need 19 digits, a float has 16."""
     times = [(Decimal(word) * 10**9).to_integral_value() for word in seconds.tolist()]
     if max(map(abs, times)) >= 2**62:

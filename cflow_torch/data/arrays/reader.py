@@ -21,8 +21,8 @@ from cflow_torch.data.arrays.poses_text import (
 from cflow_torch.data.folders import find_folders
 from cflow_torch.data.log import NumberedSweeps
 from cflow_torch.data.npy_file import read_npy
-from cflow_torch.data.paths import Place, as_path, is_place, is_remote
-from cflow_torch.data.rigid_motion import moved
+from cflow_torch.data.paths import PathLike, as_path, is_path_like, is_remote
+from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.ego_motion import rigid_transform
 
@@ -35,7 +35,7 @@ _STAMP = re.compile("[0-9]{16,18}|[0-8][0-9]{18}")  # such a name is a time: mic
 _FIRST_NANOSECOND = 10**17
 
 
-def find_array_logs(root: Place) -> list[Path]:
+def find_array_logs(root: PathLike) -> list[Path]:
     """Folders of all logs under a folder, at most four levels down.
 
     Args:
@@ -90,12 +90,12 @@ class ArraysLog(NumberedSweeps):
 
     def __init__(
         self,
-        folder: Place,
+        folder: PathLike,
         poses: Any = "auto",
         poses_of: str = "ego",
-        calibration: Place | None = "auto",
-        times: Place | None = "auto",
-        ground: Place | None = "auto",
+        calibration: PathLike | None = "auto",
+        times: PathLike | None = "auto",
+        ground: PathLike | None = "auto",
         ego_T_lidar: Any = None,
         suffix: str | None = None,
         bin_columns: int = KITTI_COLUMNS,
@@ -127,7 +127,7 @@ class ArraysLog(NumberedSweeps):
         self._timestamp(index)
         points = read_cloud(self.files[index], self._bin_columns)
         if not np.array_equal(self.ego_T_lidar, np.eye(4)):
-            points = moved(points, self.ego_T_lidar)
+            points = transform_points(points, self.ego_T_lidar)
         is_ground = None if self._ground is None else _read_mask(self._ground, self.files[index].stem, len(points))
         pose = None if self.poses is None else self.poses[index].copy()
         time = self.timestamps[index] if self._has_times else None
@@ -135,7 +135,7 @@ class ArraysLog(NumberedSweeps):
 
     def _trajectory(self, poses: Any, calibration: Any) -> tuple[Trajectory | None, str, bool]:
         """The poses given or found, what to call them, and whether a calibration made them the LiDAR's."""
-        if is_place(poses):
+        if is_path_like(poses):
             kitti = self.folder.resolve().parent.parent / "poses" / f"{self.log_id}.txt"
             file = _beside(self.folder, poses, POSE_FILES, "poses", kitti)
             if file is None:
@@ -212,7 +212,7 @@ def _one_suffix(folder: Path, suffix: str | None) -> list[Path]:
     return sorted(next(iter(kinds.values())), key=lambda path: natural_key(path.stem))
 
 
-def _beside(folder: Path, setting: Place | None, names: Sequence[str], what: str, *elsewhere: Path) -> Path | None:
+def _beside(folder: Path, setting: PathLike | None, names: Sequence[str], what: str, *elsewhere: Path) -> Path | None:
     """The file or folder that a setting means; None = none."""
     if setting is None:
         return None

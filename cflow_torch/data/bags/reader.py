@@ -15,8 +15,8 @@ from cflow_torch.data.bags.point_cloud2 import points_and_times
 from cflow_torch.data.file_errors import file_errors, shortened
 from cflow_torch.data.folders import find_folders
 from cflow_torch.data.log import FlowLabels, NumberedSweeps
-from cflow_torch.data.paths import Place, as_path, is_remote, whole
-from cflow_torch.data.rigid_motion import moved, poses_at
+from cflow_torch.data.paths import PathLike, as_path, is_remote, source_for_full_read
+from cflow_torch.data.rigid_motion import poses_at, transform_points
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.ego_motion import rigid_transform
 
@@ -30,7 +30,7 @@ _BASE = "base_link"  # the vehicle, by ROS's REP 105: x ahead, y left, z up
 _SLICE = 1e-4  # seconds for which one pose of the vehicle is good enough: 3 mm at 30 m/s
 
 
-def find_bags(root: Place) -> list[Path]:
+def find_bags(root: PathLike) -> list[Path]:
     """All bags under a folder, sorted: files `.bag` (ROS 1), `.mcap`, `.db3`, and folders with a metadata.yaml (ROS 2).
 
     Args:
@@ -81,7 +81,7 @@ class BagLog(NumberedSweeps):
 
     def __init__(
         self,
-        path: Place,
+        path: PathLike,
         topic: str | None = None,
         poses: str | None = "auto",
         frame: str | None = None,
@@ -126,7 +126,7 @@ class BagLog(NumberedSweeps):
             mount = self._mount
             if mount is None:
                 mount = self._frames.between(self.frame, self._lidar, np.array([time]))[0]
-            points = moved(points, mount)
+            points = transform_points(points, mount)
         if self.poses is None:
             return Sweep(points.astype(np.float32), None, None, time, times)
         if times is not None and self.deskew:
@@ -148,9 +148,9 @@ class BagLog(NumberedSweeps):
                 from rosbags.highlevel import AnyReader
                 from rosbags.typesys import Stores, get_typestore
             except ImportError:
-                raise CFlowError("bags need rosbags: pip install 'cflow_torch[bags]'") from None
+                raise CFlowError("bags need rosbags: pip install rosbags") from None
             for file in [self.path] if self.path.is_file() else self.path.iterdir():
-                whole(file)
+                source_for_full_read(file)
             # Bags of ROS 2 before Iron do not say how their messages are built; these types never changed.
             reader = AnyReader([self.path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
             reader.open()

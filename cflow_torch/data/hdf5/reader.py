@@ -11,8 +11,8 @@ import numpy as np
 from cflow_torch.data.hdf5.frames import StoredMotion, harness_motion, is_argoverse2, recognized_extrinsics
 from cflow_torch.data.hdf5.stored import member, open_scene, scene_errors
 from cflow_torch.data.log import FlowLabels, NumberedSweeps
-from cflow_torch.data.names import is_stamp
-from cflow_torch.data.paths import Place, as_path
+from cflow_torch.data.names import is_timestamp
+from cflow_torch.data.paths import PathLike, as_path
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.ego_motion import rigid_transform
 
@@ -22,7 +22,7 @@ _LARGEST_CATEGORY = 255
 EXTRINSIC = "ego_T_lidar"  # attribute of a scene that `write_hdf5_scene` leaves
 
 
-def find_hdf5_scenes(root: Place) -> list[Path]:
+def find_hdf5_scenes(root: PathLike) -> list[Path]:
     """The scene files of a folder, or the one file given, sorted.
 
     Raises:
@@ -63,14 +63,14 @@ class HDF5Log(NumberedSweeps):
             rigid motion.
     """
 
-    def __init__(self, file: Place, ego_T_lidar: Any = "auto") -> None:
+    def __init__(self, file: PathLike, ego_T_lidar: Any = "auto") -> None:
         self.file = as_path(file)
         self.log_id = self.file.stem
         self._scene = open_scene(self.file)
         # HDF5 itself closes after the interpreter has gone, which a file read through Python does not survive.
         weakref.finalize(self, self._scene.close)
         with scene_errors(self.file):
-            self.timestamps = sorted(int(name) for name in self._scene if is_stamp(name))
+            self.timestamps = sorted(int(name) for name in self._scene if is_timestamp(name))
         self._check_count(self.file)
         if isinstance(ego_T_lidar, str) and ego_T_lidar == "auto":
             ego_T_lidar = self._stated_extrinsics()

@@ -15,7 +15,7 @@ import numpy as np
 from cflow_torch.data.atomic import atomic_name, remove_stale
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.hdf5.stored import import_h5py, member, open_scene
-from cflow_torch.data.names import is_stamp
+from cflow_torch.data.names import is_timestamp
 from cflow_torch.types import Array, CFlowError, as_numpy
 
 LABELS = ("dufo", "cluster", "dufocluster", "nnd")  # keys of labels for self-supervised training
@@ -29,7 +29,7 @@ RESERVED_KEYS = frozenset(
         *("pc0", "pc1", "gm0", "gm1", "pose0", "pose1"),
     )
 )
-_writing = partial(file_errors, mend="give a complete scene, and make room beside it for a copy", doing="write")
+_writing = partial(file_errors, hint="give a complete scene, and make room beside it for a copy", doing="write")
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_.-]{0,63}")
 
 
@@ -145,7 +145,7 @@ def labelled_by(file: str | Path) -> str | None:
 
 def _labels_in(scene: Any) -> list[str]:
     """Keys of labels that sweeps of an open scene have."""
-    return sorted({key for stamp in scene if is_stamp(stamp) for key in set(scene[stamp]) & set(LABELS)})
+    return sorted({key for stamp in scene if is_timestamp(stamp) for key in set(scene[stamp]) & set(LABELS)})
 
 
 @contextmanager

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from cflow_torch.data.file_errors import file_errors
-from cflow_torch.data.paths import Place, ranged
+from cflow_torch.data.paths import PathLike, source_for_random_access
 from cflow_torch.types import CFlowError
 
-_MEND = "write the scene anew: groups with arrays of plain numbers in the file itself"
-scene_errors = partial(file_errors, mend="copy or write the scene again")
+_HINT = "write the scene anew: groups with arrays of plain numbers in the file itself"
+scene_errors = partial(file_errors, hint="copy or write the scene again")
 
 
 def import_h5py() -> Any:
@@ -35,10 +35,10 @@ def open_scene(file: Path) -> Any:
     """
     h5py = import_h5py()
     with scene_errors(file):
-        return h5py.File(ranged(file), "r")
+        return h5py.File(source_for_random_access(file), "r")
 
 
-def member(group: Any, name: str, where: Place) -> Any | None:
+def member(group: Any, name: str, where: PathLike) -> Any | None:
     """What a group of h5py holds under a name, a group or an array of numbers; None where it holds nothing.
 
     Args:
@@ -61,7 +61,7 @@ def member(group: Any, name: str, where: Place) -> Any | None:
         found: Any = group[name] if is_own else None
         is_array = isinstance(found, h5py.Dataset)
         if not is_own or (is_array and (found.is_virtual or found.external)):
-            raise CFlowError(f"{where}: {name} is a link or lies in other files, which are not read; {_MEND}")
+            raise CFlowError(f"{where}: {name} is a link or lies in other files, which are not read; {_HINT}")
         if is_array and (found.shape is None or found.dtype.kind not in "biuf"):
-            raise CFlowError(f"{where}: {name} is no array of bool, integers or floats; {_MEND}")
+            raise CFlowError(f"{where}: {name} is no array of bool, integers or floats; {_HINT}")
         return found

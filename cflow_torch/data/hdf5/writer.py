@@ -13,7 +13,7 @@ from cflow_torch.data.boxes import points_in_box
 from cflow_torch.data.hdf5.reader import EXTRINSIC, HDF5Log, find_hdf5_scenes
 from cflow_torch.data.hdf5.stored import import_h5py
 from cflow_torch.data.log import Log
-from cflow_torch.data.rigid_motion import moved
+from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.types import CFlowError
 from cflow_torch.windows.ego_motion import rigid_transform
 
@@ -107,7 +107,7 @@ def _sweep(
         raise CFlowError(f"sweep {index} of log {log.log_id} has no pose, which the layout needs")
     ego_points = np.asarray(sweep.points)[:, :3]
     inverse = np.linalg.inv(extrinsics)
-    points = moved(ego_points, inverse)
+    points = transform_points(ego_points, inverse)
     pose = np.asarray(sweep.pose, np.float64)
     values: dict[str, np.ndarray] = {"lidar": points.astype(np.float32), "pose": pose.astype(pose_dtype)}
     if sweep.is_ground is not None:

@@ -10,12 +10,12 @@ import numpy as np
 from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes, make_boxes, points_in_box
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.log import FlowLabels, NumberedSweeps
-from cflow_torch.data.names import inside
+from cflow_torch.data.names import path_inside
 from cflow_torch.data.nuscenes.categories import NUSCENES_CATEGORIES, OWN_TRAILER
 from cflow_torch.data.nuscenes.tables import LidarChain, SceneSource, Tables, find_scenes
 from cflow_torch.data.nuscenes.tracks import Tracks
-from cflow_torch.data.paths import Place, as_path, read_bytes
-from cflow_torch.data.rigid_motion import moved, poses_at
+from cflow_torch.data.paths import PathLike, as_path, read_bytes
+from cflow_torch.data.rigid_motion import poses_at, transform_points
 from cflow_torch.types import CFlowError, Sweep
 
 MAX_UNIT_LAG = 60_000  # microseconds from the sweep of another LiDAR to that of the reference; half a turn and a bit
@@ -34,7 +34,7 @@ class Footprint(NamedTuple):
     half_width: float
 
 
-def find_nuscenes_scenes(root: Place) -> list[SceneSource]:
+def find_nuscenes_scenes(root: PathLike) -> list[SceneSource]:
     """All scenes under a folder, see `nuscenes.tables.find_scenes`."""
     return find_scenes(root, ("ego_motion_cabin", "ego_motion_chassis"), "nuScenes")
 
@@ -155,12 +155,12 @@ class NuScenesLog(NumberedSweeps):
 
     def _unit_points(self, chain: LidarChain, row: int, index: int) -> tuple[np.ndarray, np.ndarray]:
         """`_cloud` of one sweep of one LiDAR."""
-        file = inside(self._root, chain.files[row], f"scene {self.log_id}: the filename in sample_data.json")
+        file = path_inside(self._root, chain.files[row], f"scene {self.log_id}: the filename in sample_data.json")
         with file_errors(file, f"copy the sensor data of scene {self.log_id} beside the tables"):
             content = read_bytes(file)
         local, times = self._points_of(content, file)
         returned = np.isfinite(local).all(axis=1) & (local != 0).any(axis=1)
-        points = moved(local, chain.mount[row])
+        points = transform_points(local, chain.mount[row])
         kept = returned & ~self._is_own(points, index)  # the vehicle moves with its LiDARs, so before compensation
         points = points[kept]
         if times is None:
@@ -199,7 +199,7 @@ class NuScenesLog(NumberedSweeps):
         return own
 
 
-def pcd_bin_points(content: bytes, file: Place) -> np.ndarray:
+def pcd_bin_points(content: bytes, file: PathLike) -> np.ndarray:
     """Points of a nuScenes LiDAR sweep.
 
     Args:

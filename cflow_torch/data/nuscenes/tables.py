@@ -14,7 +14,7 @@ from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.folders import find_folders
 from cflow_torch.data.json_file import parse_json
 from cflow_torch.data.names import safe_name
-from cflow_torch.data.paths import Place, as_path, read_bytes
+from cflow_torch.data.paths import PathLike, as_path, read_bytes
 from cflow_torch.data.rigid_motion import poses_from_quaternions
 from cflow_torch.types import CFlowError
 
@@ -93,7 +93,7 @@ class Annotations:
     pose: np.ndarray
 
 
-def find_scenes(root: Place, foreign: Collection[str], data_set: str) -> list[SceneSource]:
+def find_scenes(root: PathLike, foreign: Collection[str], data_set: str) -> list[SceneSource]:
     """The scenes of all versions under a folder, by folder and name. Those of one version share their tables.
 
     Args:
@@ -161,7 +161,7 @@ class Tables:
     Cost: about 5 s per million rows (measured on one core); rows of cameras and radars are dropped while reading.
     """
 
-    def __init__(self, folder: Place) -> None:
+    def __init__(self, folder: PathLike) -> None:
         self.folder = as_path(folder)
         self._rows: dict[str, dict[str, list[Row]]] = {}  # table -> token of the scene -> its rows
         self._by_token: dict[str, dict[str, Row]] = {}

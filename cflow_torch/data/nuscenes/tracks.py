@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from cflow_torch.data.nuscenes.tables import Annotations
-from cflow_torch.data.rigid_motion import between
+from cflow_torch.data.rigid_motion import interpolate_poses
 
 
 class Tracks:
@@ -63,6 +63,6 @@ class Tracks:
             track=[table.track[row] for row in rows0],
             category=[table.category[row] for row in rows0],
             size=table.size[rows0] + np.clip(fraction, 0, 1)[:, None] * (table.size[rows1] - table.size[rows0]),
-            pose=between(table.pose[rows0], table.pose[rows1], fraction),
+            pose=interpolate_poses(table.pose[rows0], table.pose[rows1], fraction),
         )
         return boxes, np.array([end[3] for end in ends], dtype=bool)

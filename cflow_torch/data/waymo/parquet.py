@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 
 from cflow_torch.data.arrow_file import check_columns
 from cflow_torch.data.file_errors import file_errors
-from cflow_torch.data.paths import mapped, ranged
+from cflow_torch.data.paths import source_for_mmap, source_for_random_access
 from cflow_torch.types import CFlowError
 from cflow_torch.windows.ego_motion import rigid_transform
 
@@ -51,7 +51,7 @@ class Component:
             CFlowError: the file is missing, lacks a column or cannot be read.
         """
         with file_errors(self.file, self._mend):
-            parquet = pq.ParquetFile(ranged(self.file))
+            parquet = pq.ParquetFile(source_for_random_access(self.file))
             check_columns(self.file, parquet.schema_arrow.names, columns, self._mend)
             rows: list[dict[str, Any]] = parquet.read(list(columns), use_threads=False).to_pylist()
             return rows
@@ -90,7 +90,7 @@ class Component:
         columns = [f"{column}.values", f"{column}.shape"]
         images: dict[Key, np.ndarray | None] = {}
         with file_errors(self.file, self._mend):
-            parquet, end = pq.ParquetFile(mapped(self.file)), 0
+            parquet, end = pq.ParquetFile(source_for_mmap(self.file)), 0
             check_columns(self.file, parquet.schema_arrow.names, columns, self._mend)
             for group in range(parquet.num_row_groups):
                 number, end = end, end + parquet.metadata.row_group(group).num_rows

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from cflow_torch.data.rigid_motion import moved
+from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.types import CFlowError
 from cflow_torch.windows.ego_motion import rigid_transform
 
@@ -110,7 +110,7 @@ def range_image_points(
     azimuth, inclination = calibration.column_azimuths(num_columns), calibration.row_inclinations(num_rows)
     distance = image[..., RANGE].reshape(-1)[pixels].astype(np.float64)
     in_laser = distance[:, None] * directions(azimuth[column], inclination[row])
-    points = moved(in_laser, calibration.T_ego_sensor)
+    points = transform_points(in_laser, calibration.T_ego_sensor)
     if pixel_poses is None:
         return points, pixels
     if pixel_poses.shape != (num_rows, num_columns, 6) or T_world_ego is None:
@@ -121,4 +121,4 @@ def range_image_points(
     poses = pixel_poses.reshape(-1, 6)[pixels].astype(np.float64)
     world = np.einsum("nij,nj->ni", rotations_from_angles(poses[:, :3]), points) + poses[:, 3:]
     T_ego_world = np.linalg.inv(rigid_transform(T_world_ego, "T_world_ego"))
-    return moved(world, T_ego_world), pixels
+    return transform_points(world, T_ego_world), pixels

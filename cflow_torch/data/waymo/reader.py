@@ -13,7 +13,7 @@ from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes, mak
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.folders import find_folders
 from cflow_torch.data.log import FlowLabels, NumberedSweeps
-from cflow_torch.data.paths import Place, as_path, remote_errors
+from cflow_torch.data.paths import PathLike, as_path, remote_errors
 from cflow_torch.data.waymo.parquet import (
     BOX,
     CALIBRATION,
@@ -37,7 +37,7 @@ BOX_CATEGORY = {0: "NONE", 1: "REGULAR_VEHICLE", 2: "PEDESTRIAN", 3: "SIGN", 4: 
 _KEPT_FRAMES = 2  # the labels of a pair are asked for after both of its sweeps
 
 
-def find_waymo_segments(root: Place) -> list[Path]:
+def find_waymo_segments(root: PathLike) -> list[Path]:
     """The LiDAR files `<split>/lidar/<segment>.parquet` of all segments under a folder, sorted.
 
     Args:
@@ -86,7 +86,7 @@ class WaymoLog(NumberedSweeps):
         CFlowError: a file is missing, cannot be read or lacks columns; fewer than two frames; a frame without pose.
     """
 
-    def __init__(self, file: Place, lasers: Sequence[str] = tuple(LASERS), both_returns: bool = False) -> None:
+    def __init__(self, file: PathLike, lasers: Sequence[str] = tuple(LASERS), both_returns: bool = False) -> None:
         self.file = as_path(file)
         unknown = sorted(set(lasers) - set(LASERS))
         if unknown or not lasers:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Iterable, Mapping, Sequence
 
 from cflow_torch.data.log import Log
-from cflow_torch.data.names import is_stamp, safe_name
+from cflow_torch.data.names import is_timestamp, safe_name
 from cflow_torch.data.paths import read_bytes
 from cflow_torch.evaluation.submission.masks import MaskArchive, log_mask, point_mask
 from cflow_torch.evaluation.submission.versions import SubmissionVersion
@@ -97,7 +97,7 @@ def read_frame_list(file: str | Path) -> dict[str, list[int]]:
         if not entry:
             continue
         log, _, stamp = entry.rpartition("/")
-        if not log or not is_stamp(stamp):
+        if not log or not is_timestamp(stamp):
             raise CFlowError(f"{file}, line {number}: {entry!r} is no frame; write <log>/<time stamp>")
         result.setdefault(log, []).append(int(stamp))
     return result
