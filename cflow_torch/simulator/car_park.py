@@ -45,14 +45,14 @@ def _cars(rng: np.random.Generator) -> Iterator[Body]:
                 is_in_the_way = -20 < x < 36 if aisle == 0.0 else abs(x - driver) < 15
                 if place in backing and not is_in_the_way:
                     # The boot comes out into the aisle, then the car swings round.
-                    way = Route(x, y + side * 0.3, heading + math.pi, speed=-rng.uniform(0.8, 1.5))
-                    yield objects.car(rng, way)
+                    route = Route(x, y + side * 0.3, heading + math.pi, speed=-rng.uniform(0.8, 1.5))
+                    yield objects.car(rng, route)
                 elif rng.uniform() < 0.8:
                     yield objects.car(rng, Route(x + rng.uniform(-0.1, 0.1), y + rng.uniform(-0.2, 0.2), turned))
         if aisle != 0.0:
             towards, lane = (EAST, -1.0) if number % 2 else (WEST, 1.0)
-            way = Route(driver, aisle + lane, towards, speed=rng.uniform(2, 6))
-            yield objects.car(rng, way)
+            route = Route(driver, aisle + lane, towards, speed=rng.uniform(2, 6))
+            yield objects.car(rng, route)
     yield objects.car(rng, Route(32.0, 1.2, WEST, speed=4.0, acceleration=-1.3))
     yield objects.van(rng, Route(-16.0, -1.0, EAST, speed=3.0))
     turn = {"radius": 5.0, "angle": -math.pi / 2}

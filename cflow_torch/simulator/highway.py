@@ -41,11 +41,11 @@ def _traffic(rng: np.random.Generator, ego_speed: float) -> Iterator[Body]:
                     yield objects.car(rng, Route(x, where * lane + rng.uniform(-0.2, 0.2), towards, speed=speed))
         speed = rng.uniform(21, 24)
         for number, x in enumerate(_gaps(rng, 45, 80)):
-            way = Route(x, side * LANES[2], heading, speed=speed)
+            route = Route(x, side * LANES[2], heading, speed=speed)
             if number % 3 == 0:
-                yield from objects.articulated_truck(way)
+                yield from objects.articulated_truck(route)
             else:
-                yield (objects.bus(way) if number % 7 == 1 else objects.van(rng, way))
+                yield (objects.bus(route) if number % 7 == 1 else objects.van(rng, route))
     # On the shoulder: one who has broken down, and the driver behind the rail.
     x = rng.uniform(40, 90)
     yield objects.car(rng, Route(x, -EDGE + 0.9 - 0.4, EAST))

@@ -37,11 +37,11 @@ def _traffic(rng: np.random.Generator) -> Iterator[Body]:
     yield objects.cyclist(rng, Route(30.0, 0.25, WEST, speed=rng.uniform(3, 5)))
     van = int(rng.integers(3, 6))
     for number, x in enumerate(np.arange(-60, 75, 7.2).tolist()):
-        way = Route(x + rng.uniform(-0.25, 0.25), HALF_WIDTH - 1.08, EAST + rng.uniform(-0.02, 0.02))
+        route = Route(x + rng.uniform(-0.25, 0.25), HALF_WIDTH - 1.08, EAST + rng.uniform(-0.02, 0.02))
         if number % 20 == van + 8:
-            yield objects.van(rng, way)
+            yield objects.van(rng, route)
         elif rng.uniform() < 0.75:
-            yield objects.car(rng, way)
+            yield objects.car(rng, route)
 
 
 def _people(rng: np.random.Generator) -> Iterator[Body]:

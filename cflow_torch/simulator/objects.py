@@ -90,7 +90,7 @@ class Route:
         return np.asarray(self.start + self.speed * seconds + 0.5 * self.acceleration * seconds**2)
 
     @property
-    def stands(self) -> bool:
+    def is_static(self) -> bool:
         """Never moves."""
         return self.speed == 0 and self.acceleration == 0
 
@@ -129,9 +129,9 @@ class Towed:
         # Four wheelbases of straight run-in settle the angle; 5 cm steps follow the true curve to a millimetre.
         begin = min(float(wanted.min()), 0.0) - 4 * self.wheelbase
         distance = np.linspace(begin, float(wanted.max()), 2 + int((float(wanted.max()) - begin) / 0.05))
-        ways = self.tractor.at(distance)
-        heading = np.stack([np.cos(ways[:, 2]), np.sin(ways[:, 2])], -1)
-        hitches = ways[:, :2] - self.hitch * heading
+        poses = self.tractor.at(distance)
+        heading = np.stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])], -1)
+        hitches = poses[:, :2] - self.hitch * heading
         axles = np.empty_like(hitches)
         axles[0] = hitches[0] - self.wheelbase * heading[0]
         for i in range(1, len(hitches)):
@@ -155,14 +155,14 @@ class Body:
     """
 
     solids: Sequence[Solid]
-    way: Route | Towed
+    trajectory: Route | Towed
     category: str | None = None
     size: Vector = (0.0, 0.0, 0.0)
 
     @property
-    def stands(self) -> bool:
+    def is_static(self) -> bool:
         """Never moves."""
-        return isinstance(self.way, Route) and self.way.stands
+        return isinstance(self.trajectory, Route) and self.trajectory.is_static
 
 
 def box(x0: float, x1: float, y0: float, y1: float, z0: float, z1: float, albedo: float) -> Solid:
@@ -179,7 +179,7 @@ def _wheels(xs: Sequence[float], y: float, radius: float) -> list[Solid]:
     ]
 
 
-def car(rng: np.random.Generator, way: Route) -> Body:
+def car(rng: np.random.Generator, route: Route) -> Body:
     """A hull with clearance, a cabin on it, four wheels."""
     length, width, height = rng.uniform(3.8, 5.0), rng.uniform(1.7, 2.0), rng.uniform(1.4, 1.85)
     paint, half = rng.uniform(0.15, 0.9), length / 2
@@ -189,16 +189,16 @@ def car(rng: np.random.Generator, way: Route) -> Body:
         box(rear, half - rng.uniform(1.1, 1.5), -width / 2 + 0.12, width / 2 - 0.12, 0.58 * height, height, 0.3),
         *_wheels((-0.3 * length, 0.3 * length), width / 2, 0.33),
     ]
-    return Body(solids, way, "REGULAR_VEHICLE", (length, width, height))
+    return Body(solids, route, "REGULAR_VEHICLE", (length, width, height))
 
 
-def bus(way: Route) -> Body:
+def bus(route: Route) -> Body:
     """Twelve metres of bus."""
     solids = [box(-6, 6, -1.27, 1.27, 0.35, 3.1, 0.6), *_wheels((-3.2, 3.3), 1.27, 0.48)]
-    return Body(solids, way, "BUS", (12.0, 2.54, 3.1))
+    return Body(solids, route, "BUS", (12.0, 2.54, 3.1))
 
 
-def articulated_truck(way: Route) -> list[Body]:
+def articulated_truck(route: Route) -> list[Body]:
     """A tractor with a driver's cab, and a trailer that swings in behind it: two tracks."""
     cab = [
         box(0.4, 2.8, -1.2, 1.2, 0.5, 3.3, 0.7),
@@ -206,14 +206,14 @@ def articulated_truck(way: Route) -> list[Body]:
         *_wheels((-1.6, 1.9), 1.2, 0.5),
     ]
     trailer = [box(-4.25, 4.25, -1.25, 1.25, 1.15, 3.7, 0.8), *_wheels((-2.9, -1.7), 1.25, 0.5)]
-    tow = Towed(way, hitch=1.4, wheelbase=6.0, middle=3.4)
+    tow = Towed(route, hitch=1.4, wheelbase=6.0, middle=3.4)
     return [
-        Body(cab, way, "TRUCK_CAB", (5.6, 2.4, 3.3)),
+        Body(cab, route, "TRUCK_CAB", (5.6, 2.4, 3.3)),
         Body(trailer, tow, "VEHICULAR_TRAILER", (8.5, 2.5, 3.7)),
     ]
 
 
-def van(rng: np.random.Generator, way: Route) -> Body:
+def van(rng: np.random.Generator, route: Route) -> Body:
     """A delivery van: one tall box behind a short bonnet."""
     paint = rng.uniform(0.3, 0.9)
     solids = [
@@ -221,27 +221,27 @@ def van(rng: np.random.Generator, way: Route) -> Body:
         box(1.9, 2.9, -0.95, 0.95, 0.3, 1.3, paint),
         *_wheels((-1.8, 1.9), 1.0, 0.35),
     ]
-    return Body(solids, way, "REGULAR_VEHICLE", (5.8, 2.0, 2.5))
+    return Body(solids, route, "REGULAR_VEHICLE", (5.8, 2.0, 2.5))
 
 
-def own_truck(way: Route) -> list[Body]:
+def own_truck(route: Route) -> list[Body]:
     """The recording truck itself, a cab and a trailer that its LiDARs stand around. `way` is that of its rear axle."""
     cab = [box(2.6, 5.0, -1.25, 1.25, 0.4, 3.1, 0.5), box(-1.0, 2.6, -0.6, 0.6, 0.3, 0.9, 0.3)]
     trailer = [box(-6.3, 6.0, -1.25, 1.25, 1.1, 4.0, 0.7), *_wheels((-4.4, -3.1, -1.8), 1.25, 0.5)]
-    return [Body(cab, way), Body(trailer, Towed(way, hitch=-0.3, wheelbase=7.6, middle=4.7))]
+    return [Body(cab, route), Body(trailer, Towed(route, hitch=-0.3, wheelbase=7.6, middle=4.7))]
 
 
-def pedestrian(rng: np.random.Generator, way: Route) -> Body:
+def pedestrian(rng: np.random.Generator, route: Route) -> Body:
     """A trunk, a head, two legs that swing if the person walks."""
     scale, cloth = rng.uniform(0.9, 1.1), rng.uniform(0.2, 0.8)
-    swing = 0.0 if way.speed == 0 else 0.45
+    swing = 0.0 if route.speed == 0 else 0.45
     phase = rng.uniform(0, 2 * math.pi)
     legs = [
         Solid(
             *(CYLINDER, (0.0, 0.1 * side, 0.46 * scale), (0.08, 0.08, 0.44 * scale)),
             albedo=cloth,
             swing=swing,
-            stride=0.75 * way.speed,
+            stride=0.75 * route.speed,
             phase=phase + side * math.pi / 2,
         )
         for side in (-1, 1)
@@ -251,10 +251,10 @@ def pedestrian(rng: np.random.Generator, way: Route) -> Body:
         Solid(ELLIPSOID, (0.0, 0.0, 1.63 * scale), (0.11, 0.09, 0.13), albedo=0.5),
         *legs,
     ]
-    return Body(solids, way, "PEDESTRIAN", (0.95, 0.55, 1.76 * scale))
+    return Body(solids, route, "PEDESTRIAN", (0.95, 0.55, 1.76 * scale))
 
 
-def cyclist(rng: np.random.Generator, way: Route) -> Body:
+def cyclist(rng: np.random.Generator, route: Route) -> Body:
     """Two wheels, a frame, and a rider who leans forward and pedals."""
     cloth, phase = rng.uniform(0.3, 0.8), rng.uniform(0, 2 * math.pi)
     solids = [
@@ -274,7 +274,7 @@ def cyclist(rng: np.random.Generator, way: Route) -> Body:
             for side in (-1, 1)
         ],
     ]
-    return Body(solids, way, "BICYCLIST", (1.75, 0.6, 1.8))
+    return Body(solids, route, "BICYCLIST", (1.75, 0.6, 1.8))
 
 
 def wall(x: float, y: float, length: float, depth: float, height: float, albedo: float = 0.45) -> Body:

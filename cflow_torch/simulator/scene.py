@@ -66,12 +66,12 @@ class Scene:
 
     def body_poses(self, seconds: np.ndarray) -> np.ndarray:
         """(T, num_bodies, 4, 4) float64 `T_world_body` at `seconds` (T,)."""
-        ways = np.stack([body.way(seconds) for body in self.bodies], 1)
-        return self.ground.pose(ways[..., 0], ways[..., 1], ways[..., 2])
+        paths = np.stack([body.trajectory(seconds) for body in self.bodies], 1)
+        return self.ground.pose(paths[..., 0], paths[..., 1], paths[..., 2])
 
     def movers(self) -> tuple[Scene, np.ndarray]:
         """The scene with nothing but what moves, and (P',) int64 the number in this scene of each of its solids."""
-        bodies = np.array([not body.stands for body in self.bodies])
+        bodies = np.array([not body.is_static for body in self.bodies])
         chosen = tuple(body for body, moves in zip(self.bodies, bodies) if moves)
         scene = Scene(self.ground, self.ego, chosen, SolidTable.of(chosen))
         return scene, np.flatnonzero(bodies[self.table.body])

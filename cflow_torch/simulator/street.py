@@ -35,8 +35,8 @@ def build_street(rng: np.random.Generator) -> Scene:
 def lane(rng: np.random.Generator, y: float, heading: float, speed: float, *xs: float) -> Iterator[Body]:
     """Cars in a lane along x, all at one speed."""
     for x in xs:
-        way = Route(x + rng.uniform(-1.2, 1.2), y + rng.uniform(-0.12, 0.12), heading, speed=speed)
-        yield objects.car(rng, way)
+        route = Route(x + rng.uniform(-1.2, 1.2), y + rng.uniform(-0.12, 0.12), heading, speed=speed)
+        yield objects.car(rng, route)
 
 
 def _traffic(rng: np.random.Generator, crossing: float) -> Iterator[Body]:
@@ -55,10 +55,10 @@ def _traffic(rng: np.random.Generator, crossing: float) -> Iterator[Body]:
     yield from lane(rng, 4.6, WEST, 0.0, crossing + 14, crossing + 21.5)
     # Out of the cross street: a car turns right (west), an articulated truck turns right (east).
     turn = {"radius": 9.0, "angle": -math.pi / 2}
-    way = Route(crossing - 1.75, 4.6 + 9.0, SOUTH, start=rng.uniform(0, 4), speed=rng.uniform(4, 6), **turn)
-    yield objects.car(rng, way)
-    way = Route(crossing + 1.75, -4.6 - 12, NORTH, rng.uniform(5, 10), rng.uniform(3, 5), 12.0, -math.pi / 2)
-    yield from objects.articulated_truck(way)
+    route = Route(crossing - 1.75, 4.6 + 9.0, SOUTH, start=rng.uniform(0, 4), speed=rng.uniform(4, 6), **turn)
+    yield objects.car(rng, route)
+    route = Route(crossing + 1.75, -4.6 - 12, NORTH, rng.uniform(5, 10), rng.uniform(3, 5), 12.0, -math.pi / 2)
+    yield from objects.articulated_truck(route)
     # Cyclists keep to the edge, a hand's breadth from parked cars.
     for x, y, heading in ((6.0, -6.05, EAST), (crossing + 3.6, 18.0, NORTH), (crossing + 33, -6.05, EAST)):
         yield objects.cyclist(rng, Route(x, y, heading, rng.uniform(-1, 1), rng.uniform(4.5, 7)))

@@ -23,7 +23,7 @@ from typing import Iterable, Iterator, Sequence
 import numpy as np
 import sets
 import torch
-from made import MOVES
+from derived_sets import MOVES
 from sets import Item
 from sklearn.isotonic import isotonic_regression
 

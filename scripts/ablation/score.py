@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Dict, Sequence
 
 import numpy as np
-from made import MOVES
+from derived_sets import MOVES
 from sets import NEAR, ScoredSet
 
 from cflow_torch import make_model

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Callable, Sequence
 
 import numpy as np
-from made import MOVES, chain_flow, paste_static
+from derived_sets import MOVES, chain_flow, paste_static
 
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.catalog import open_log

@@ -54,7 +54,7 @@ def truths(log: Any) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         if hasattr(log, "truth"):
             labels = log.drive.labels(index * log.step)
             body, velocity = log.truth(index)
-            stands = np.array([body.stands for body in log.drive.scene.bodies] + [True])
+            stands = np.array([body.is_static for body in log.drive.scene.bodies] + [True])
             seconds = (log.timestamps[index + 1] - log.timestamps[index]) * 1e-9
             moves, known = (np.linalg.norm(velocity, axis=1) * seconds >= MOVING)[body], labels.is_valid
             ever = ~stands[body]

@@ -93,7 +93,7 @@ def score(log: SimulatedLog, pairs: Iterator[tuple[int, Window, FlowResult]]) ->
             counts["groups"] += 1
             counts["false_groups"] += not is_mover[owner]
         for _, owner in _owners(track_id, track_id >= 0, body):
-            has_moved = is_mover[owner] or (owner < ground and not log.drive.scene.bodies[owner].stands)
+            has_moved = is_mover[owner] or (owner < ground and not log.drive.scene.bodies[owner].is_static)
             counts["false_rows"] += not has_moved
         for mover in np.flatnonzero(is_mover):
             on = takes_part & (body == mover)

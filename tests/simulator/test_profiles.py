@@ -99,7 +99,7 @@ def test_every_shot_is_on_its_ring_its_column_and_its_time(name, drives):
 @pytest.mark.parametrize("name", ["nuscenes", "truckscenes", "waymo"])
 def test_the_static_world_stays_put_after_deskewing_and_only_then(name, drives):
     drive = exact(drives[name])
-    rows, world, _, off = on_boxes(drive, 1, lambda body: body.stands)
+    rows, world, _, off = on_boxes(drive, 1, lambda body: body.is_static)
     assert len(rows) > 500 and np.quantile(off(world), 0.999) < 1e-3
     given = off(transform(drive.poses[1], drive.returns(1).points.numpy().astype(float))[rows])
     # Raw points of a truck at 80 km/h and more.
@@ -111,10 +111,10 @@ def test_what_moves_stays_smeared_and_boxes_hold_it(drives):
     drive = exact(make_drive(seed=3, num_sweeps=2, profile="nuscenes", scene="highway"))
 
     def is_even(body):
-        return body.category == "REGULAR_VEHICLE" and not body.stands and body.way.acceleration == 0
+        return body.category == "REGULAR_VEHICLE" and not body.is_static and body.trajectory.acceleration == 0
 
     rows, world, pose, off = on_boxes(drive, 1, is_even)
-    speed = np.array([getattr(body.way, "speed", 0.0) for body in drive.scene.bodies])
+    speed = np.array([getattr(body.trajectory, "speed", 0.0) for body in drive.scene.bodies])
     along = speed[drive._body_of(drive.returns(1))[rows]] * 1e-9 * drive.returns(1).offset_ns.numpy()[rows]
     assert len(rows) > 300 and np.quantile(off(world), 0.8) > 0.1
     assert np.quantile(off(world - pose[:, :3, 0] * along[:, None]), 0.99) < 5e-3, "speed times time"

@@ -232,7 +232,7 @@ def test_ways_are_continuous_trailers_cut_corners_and_what_brakes_stops():
     bend = np.abs(trailer[:, 2] - way[:, 2])
     assert bend.max() > 0.3 and bend[0] < 1e-6
     brakes = Route(0.0, 0.0, speed=4.0, acceleration=-2.0)
-    assert np.allclose(brakes(np.arange(4.0))[:, 0], [0, 3, 4, 4]) and not brakes.stands
+    assert np.allclose(brakes(np.arange(4.0))[:, 0], [0, 3, 4, 4]) and not brakes.is_static
     starts = Route(0.0, 0.0, speed=2.0, acceleration=1.0)
     assert np.allclose(starts(np.array([-3.0, -2.0, 0.0, 2.0]))[:, 0], [-2, -2, 0, 6])
 
