@@ -1,1 +1,1 @@
-"""What is made of flow: labels, static sweeps, tracks, streams."""
+"""Applications of scene flow: tracks, clean logs and maps, training labels, streams, de-skewed points."""

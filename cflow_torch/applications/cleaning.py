@@ -1,4 +1,4 @@
-"""A log without what moves, and the map of what stands."""
+"""Remove dynamic objects from logs, and build maps of the static world."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ from cflow_torch.estimate import make_model
 from cflow_torch.model import SceneFlowModel
 from cflow_torch.types import CFlowError, FlowResult, Sweep, as_numpy
 
-_MARGIN = 0.2  # metres by which a box is larger than what was seen
-_SLOW = 3.0  # m/s; what is faster when it is first seen has not waited there
-_NEAR = 100.0  # metres from the vehicle that a box may be
-_REACH = 1 << 20  # voxels of a map in each direction from its first sweep
+_MARGIN = 0.2  # metres by which a box is larger than the visible part of its object
+_SLOW = 3.0  # m/s; an object that is faster when it is first seen has not waited there
+_MAX_DISTANCE = 100.0  # metres of a box from the vehicle
+_MAX_VOXELS = 1 << 20  # of a map in each direction from its first sweep
 
 
 class CleanLog(Log):
-    """A log without the points that move: a log again, for every command, writer and loader.
+    """A log without its moving points. Every command, writer and loader takes it like any other log.
 
-    A point moves if its residual flow is 0.05 m a sweep or more. Of the last sweep, which has no successor, what lies
-    in a box that the movers of the sweep before have reached is taken out.
+    A point moves if its residual flow is at least 0.05 m per sweep. The last sweep has no flow: there, points are
+    removed that lie in a box which a moving object of the sweep before has reached.
 
     Args:
-        log: any log. Sweeps are read one after the other, and few are held.
+        log: any log. Sweeps are read one after the other, and only a few are held in memory.
         model: the method; None = preset `offline`.
         flow: index -> flow of that pair, in place of a model; with residual_flow, and cluster_id and is_valid for
             `standing`.
-        standing: also take out what moves at another time of the log and stands now, by its track (a car that waits).
-            The log is gone through once for that before the first sweep is given; a bit per point is kept.
+        standing: also remove objects that have stopped or not yet started, such as cars at a light, by their tracks.
+            This takes a pass over the log before the first sweep is returned, and a bit of memory per point.
 
     Attributes:
         log_id, timestamps: those of the log.
@@ -55,20 +55,20 @@ class CleanLog(Log):
     ) -> None:
         self.log_id, self.timestamps = log.log_id, log.timestamps
         if len(log.timestamps) < 2:
-            raise CFlowError(f"log {log.log_id} has {len(log.timestamps)} sweeps: motion is seen in two or more")
+            raise CFlowError(f"log {log.log_id} has {len(log.timestamps)} sweeps: give a log of at least two")
         if flow is None and model is None:
             model = make_model(make_config("offline"))
         self._log = CachedLog(log, 2 if model is None else model.config.num_sweeps)
         self._flow: Any = lru_cache(2)(flow if flow is not None else lambda index: self._estimate(model, index))
-        self._standing: list[np.ndarray] | None = None
-        self._follows = standing
+        self._bits: list[np.ndarray] | None = None
+        self._tracks_objects = standing
 
     def sweep(self, index: int) -> Sweep:
-        """Sweep number `index` without the rows that `moving` tells; pose, time and ground mask as in the log."""
-        sweep, stays = self._log.sweep(index), ~self.moving(index)
+        """Sweep number `index` without its moving points; pose and time as in the log."""
+        sweep, is_kept = self._log.sweep(index), ~self.moving(index)
 
         def rows(values: Any) -> Any:
-            return None if values is None else as_numpy(values)[stays]
+            return None if values is None else as_numpy(values)[is_kept]
 
         return replace(
             sweep,
@@ -78,24 +78,23 @@ class CleanLog(Log):
         )
 
     def moving(self, index: int) -> np.ndarray:
-        """(N,) bool, True for the points of the log's sweep `index` that are taken out.
+        """(N,) bool, True for the points of the log's sweep `index` that are removed.
 
         Raises:
-            CFlowError: a sweep cannot be read, or its flow has other rows.
+            CFlowError: a sweep cannot be read, or its flow has another number of rows.
         """
-        if not self._follows:
+        if not self._tracks_objects:
             return self._moves(index)
-        if self._standing is None:
-            self._standing = self._follow()
-        sweep = self._log.sweep(index)
-        return np.unpackbits(self._standing[index], count=len(sweep.points)).astype(bool)
+        if self._bits is None:
+            self._bits = self._track()
+        return np.unpackbits(self._bits[index], count=len(self._log.sweep(index).points)).astype(bool)
 
     def _estimate(self, model: Any, index: int) -> FlowResult:
         sweeps = window(self._log, index, model.config.num_history, model.config.num_future)
         return model([sweeps])[0]  # type: ignore[no-any-return]
 
     def _moves(self, index: int) -> np.ndarray:
-        """As `moving`, by flow alone."""
+        """(N,) bool, True for the points that move by their flow."""
         sweep = self._log.sweep(index)
         if index == len(self.timestamps) - 1:
             return self._reached(sweep, index)
@@ -105,35 +104,36 @@ class CleanLog(Log):
         return moves
 
     def _reached(self, sweep: Sweep, index: int) -> np.ndarray:
-        """Of the last sweep: what is in a box that a cluster of the sweep before has moved to."""
+        """(N,) bool, points of the last sweep in a box that a moving cluster of the sweep before has reached."""
         result, moves = self._flow(index - 1), self._moves(index - 1)
-        before = self._log.sweep(index - 1)
-        at = _world(before)[moves]
-        step = as_numpy(result.residual_flow, np.float64)[moves] @ _rotation(sweep).T
-        number, group = np.unique(as_numpy(result.cluster_id)[moves], return_inverse=True)
-        total = np.zeros((len(number), 3))
+        before = _world(self._log.sweep(index - 1))[moves]
+        step = as_numpy(result.residual_flow, np.float64)[moves] @ _pose(sweep)[:3, :3].T
+        clusters, group = np.unique(as_numpy(result.cluster_id)[moves], return_inverse=True)
+        total = np.zeros((len(clusters), 3))
         np.add.at(total, group, step)
         heading = torch.from_numpy(np.arctan2(total[:, 1], total[:, 0]))
-        centre, size = boxes(torch.from_numpy(at + step), torch.from_numpy(group), heading)
+        centre, size = boxes(torch.from_numpy(before + step), torch.from_numpy(group), heading)
         return _inside(sweep, centre, size, heading)
 
-    def _follow(self) -> list[np.ndarray]:
-        """Packed bits of `moving` for every sweep: what moves, what a track says has stopped, what has yet to start."""
+    def _track(self) -> list[np.ndarray]:
+        """Packed bits of `moving` for every sweep: points of objects that move, have stopped, or have yet to start."""
         tracker, tables, bits = Tracker(), [], []
         for index in range(len(self.timestamps)):
-            taken = self._moves(index)
+            removed = self._moves(index)
             if index < len(self.timestamps) - 1:
                 table, track_id = tracker.push(window(self._log, index), self._flow(index))
                 tables.append({**table, "sweep": np.full(len(table["id"]), index)})
                 stopped = table["id"][table["is_confirmed"] & ~table["is_moving"]]
-                taken = taken | np.isin(track_id, stopped)
-            bits.append(np.packbits(taken))
-        start = _first_rows(confirmed(join_tables(tables)))
-        start = {name: values[np.hypot(start["vx"], start["vy"]) < _SLOW] for name, values in start.items()}
+                removed = removed | np.isin(track_id, stopped)
+            bits.append(np.packbits(removed))
+        tracks = confirmed(join_tables(tables))
+        first = np.unique(tracks["id"], return_index=True)[1]  # the first row of each track
+        first = first[np.hypot(tracks["vx"][first], tracks["vy"][first]) < _SLOW]
+        start = {name: values[first] for name, values in tracks.items()}
         for index in range(int(start["sweep"].max(initial=0))):
             sweep = self._log.sweep(index)
-            away = np.hypot(*(start[axis] - _pose(sweep)[k, 3] for k, axis in enumerate("xy")))
-            waits = (start["sweep"] > index) & (away < _NEAR)
+            distance = np.hypot(*(start[axis] - _pose(sweep)[k, 3] for k, axis in enumerate("xy")))
+            waits = (start["sweep"] > index) & (distance < _MAX_DISTANCE)
             centre, size = (
                 torch.from_numpy(np.stack([start[name][waits] for name in names], 1))
                 for names in ("xyz", ("length", "width", "height"))
@@ -144,17 +144,18 @@ class CleanLog(Log):
 
 
 def static_map(log: Log, voxel_size: float = 0.1) -> np.ndarray:
-    """All points of a log in the world, one per voxel.
+    """Accumulate the points of a log in the world, one per voxel.
 
     Args:
-        log: with poses; a `CleanLog` or what was written of one, if the map is to hold what stands.
+        log: with poses. Pass a `CleanLog`, or the files written of one, for a map of the static world.
         voxel_size: metres.
 
     Returns:
         (M, 3) float64, metres in the world: the first point of each voxel, in the order of the sweeps.
 
     Raises:
-        CFlowError: a sweep without pose, a voxel size that is not positive, a map of more than a million voxels across.
+        CFlowError: a sweep has no pose, the voxel size is not positive, or a point is more than a million voxels from
+            the first sweep.
 
     Cost: memory for the map and one sweep; a pass over the map's voxels per sweep.
     """
@@ -166,31 +167,28 @@ def static_map(log: Log, voxel_size: float = 0.1) -> np.ndarray:
     for index in range(len(log.timestamps)):
         sweep = log.sweep(index)
         if sweep.pose is None:
-            raise CFlowError(f"log {log.log_id} has no poses, and a map needs them: data.odometry=true finds some")
+            raise CFlowError(f"log {log.log_id} has no poses, and a map needs them: data.odometry=true estimates them")
         points = _world(sweep)
         points = points[np.isfinite(points).all(1)]
         origin = np.floor(_pose(sweep)[:3, 3] / voxel_size) if origin is None else origin
-        voxel = (np.floor(points / voxel_size) - origin).astype(np.int64) + _REACH
-        if ((voxel < 0) | (voxel >= 2 * _REACH)).any():
-            raise CFlowError(f"the map is more than {_REACH * voxel_size:.0f} m long: give larger voxels, or parts")
+        voxel = (np.floor(points / voxel_size) - origin).astype(np.int64) + _MAX_VOXELS
+        if ((voxel < 0) | (voxel >= 2 * _MAX_VOXELS)).any():
+            raise CFlowError(
+                f"the map reaches more than {_MAX_VOXELS * voxel_size:.0f} m from its first sweep: give larger voxels, "
+                "or parts of the log"
+            )
         key, first = np.unique((voxel[:, 0] << 42) | (voxel[:, 1] << 21) | voxel[:, 2], return_index=True)
-        place: Any = np.searchsorted(known, key)
-        is_new = np.append(known, -1)[place] != key
+        position: Any = np.searchsorted(known, key)
+        is_new = np.append(known, -1)[position] != key
         parts.append(points[np.sort(first[is_new])])
-        known = np.insert(known, place[is_new], key[is_new])
+        known = np.insert(known, position[is_new], key[is_new])
     return np.concatenate(parts)
 
 
-def _first_rows(table: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The first row of each track."""
-    first = np.unique(table["id"], return_index=True)[1]
-    return {name: values[first] for name, values in table.items()}
-
-
 def _inside(sweep: Sweep, centre: torch.Tensor, size: torch.Tensor, heading: torch.Tensor) -> np.ndarray:
-    """(N,) bool, points of a sweep that are no ground and lie in one of some boxes in the world."""
-    found = box_of_point(torch.from_numpy(_world(sweep)), centre, size + _MARGIN, heading).numpy() >= 0
-    return found if sweep.is_ground is None else found & ~as_numpy(sweep.is_ground).astype(bool)
+    """(N,) bool, points of a sweep that are not ground and lie in one of the boxes, which are in the world."""
+    is_inside = box_of_point(torch.from_numpy(_world(sweep)), centre, size + _MARGIN, heading).numpy() >= 0
+    return is_inside if sweep.is_ground is None else is_inside & ~as_numpy(sweep.is_ground).astype(bool)
 
 
 def _world(sweep: Sweep) -> np.ndarray:
@@ -201,7 +199,3 @@ def _world(sweep: Sweep) -> np.ndarray:
 
 def _pose(sweep: Sweep) -> np.ndarray:
     return np.eye(4) if sweep.pose is None else as_numpy(sweep.pose, np.float64)
-
-
-def _rotation(sweep: Sweep) -> np.ndarray:
-    return _pose(sweep)[:3, :3]

@@ -1,6 +1,6 @@
 """A constant-velocity Kalman filter of many objects at once.
 
-Noise is the same along all axes, so a covariance is that of (position, velocity) of one axis, for each of the three.
+The noise is equal along all axes, so one 2x2 covariance of (position, velocity) serves all three.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class States:
-    """K objects.
+    """States of K objects.
 
     Args:
         position, velocity: (K, 3) float64, metres and m/s in the world.
-        covariance: (K, 2, 2) float64 of (position, velocity), the same for each axis.
+        covariance: (K, 2, 2) float64 of (position, velocity), for each axis.
     """
 
     position: Tensor
@@ -25,28 +25,24 @@ class States:
     covariance: Tensor
 
     def predict(self, seconds: float, acceleration: float) -> States:
-        """The states so many seconds later; accelerations of standard deviation `acceleration`, m/s², are constant
-        meanwhile."""
-        over = self.covariance.new_tensor([[1.0, seconds], [0.0, 1.0]])
+        """States after `seconds`, in which each object has a constant random acceleration of the given standard
+        deviation, m/s²."""
+        transition = self.covariance.new_tensor([[1.0, seconds], [0.0, 1.0]])
         push = self.covariance.new_tensor([seconds**2 / 2, seconds]) * acceleration
-        covariance = over @ self.covariance @ over.T + torch.outer(push, push)
+        covariance = transition @ self.covariance @ transition.T + torch.outer(push, push)
         return States(self.position + seconds * self.velocity, self.velocity, covariance)
 
     def update(self, position: Tensor, velocity: Tensor, noise: Tensor) -> States:
-        """The states after a measurement of both.
+        """States after a measurement of position and velocity.
 
         Args:
             position, velocity: (K, 3) float64, measured.
             noise: (K, 2) float64, standard deviations of the two, per axis.
         """
-        off = torch.stack([position - self.position, velocity - self.velocity], 1)  # (K, 2, 3)
+        residual = torch.stack([position - self.position, velocity - self.velocity], 1)  # (K, 2, 3)
         spread = self.covariance + torch.diag_embed(noise**2)
         gain = torch.linalg.solve(spread, self.covariance).transpose(1, 2)  # both are symmetric
-        change = gain @ off
-        left = torch.eye(2, dtype=gain.dtype, device=gain.device) - gain
-        covariance = left @ self.covariance
-        return States(
-            self.position + change[:, 0],
-            self.velocity + change[:, 1],
-            (covariance + covariance.transpose(1, 2)) / 2,
-        )
+        change = gain @ residual
+        covariance = (torch.eye(2, dtype=gain.dtype, device=gain.device) - gain) @ self.covariance
+        covariance = (covariance + covariance.transpose(1, 2)) / 2  # symmetric despite rounding
+        return States(self.position + change[:, 0], self.velocity + change[:, 1], covariance)

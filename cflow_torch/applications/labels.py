@@ -1,8 +1,9 @@
-"""Labels for self-supervised training in OpenSceneFlow's scenes: which points move, what belongs together.
+"""Write labels for self-supervised training into OpenSceneFlow's scenes: moving points, and groups of points.
 
-A group of points moves if its flow is longer than `MOVING` and can be believed: its confidence, 0 ... 1, and the share
-of its points that the flow carries to points which move alike in the sweeps before and after it, 0 ... 1, make at least
-`AGREEMENT` together. What only one window takes for motion (leaves, edges that come into view) rarely passes.
+A group of points counts as moving if its flow is at least `MOVING` long and plausible: the sum of its confidence
+(0 ... 1) and its agreement (0 ... 1) is at least `AGREEMENT`. The agreement is the share of its points that the flow
+carries to points with a similar motion in the sweeps before and after. Motion that a single window reports by mistake
+(leaves, edges that come into view) rarely passes.
 """
 
 from __future__ import annotations
@@ -21,14 +22,14 @@ from cflow_torch.stages import FlowModel
 from cflow_torch.types import CFlowError, FlowResult, Sweep, Window, as_numpy
 
 AGREEMENT = 1.3  # chosen on simulated drives of five sensors, seeds 100 to 103
-_REACH = 0.5  # metres from where the flow leads to the next point that moves
-_ALIKE = (0.1, 0.5)  # two motions are alike if they differ by at most so many metres, or by this part of their length
-_SMALLEST = 20  # points of a group that stands; those of OpenSceneFlow's own recipe have as many
-_MOST = 32_767  # groups that an int16 can number
+_MAX_DISTANCE = 0.5  # metres from where the flow leads to the nearest moving point
+_SIMILAR = (0.1, 0.5)  # two motions agree if they differ by at most so many metres, or by this share of their length
+_MIN_POINTS = 20  # of a static group, as in OpenSceneFlow's own recipe
+_MAX_GROUPS = 32_767  # that an int16 can number
 _NND = (0.14, 4.4)  # metres from a point to the nearest of the next sweep: faster than 5 km/h, slower than 160
 
 
-class Movers(NamedTuple):
+class DynamicPoints(NamedTuple):
     """The M points of a sweep that move by its own flow.
 
     Args:
@@ -49,19 +50,20 @@ class Movers(NamedTuple):
 
 
 def label_scene(file: str | Path, model: FlowModel, find_ground: str = "grid", overwrite: bool = False) -> int:
-    """Estimate the flow of a scene, and write its labels.
+    """Estimate the flow of a scene, and write its labels into the scene.
 
     Args:
         file: `<scene>.h5` in OpenSceneFlow's layout.
-        model: a `VerifiedFlow`, best of the preset `offline`.
-        find_ground: for sweeps without a ground mask, see `cflow_torch.windows.ground.find_ground`.
-        overwrite: replace labels that the scene has.
+        model: a `VerifiedFlow`; the preset `offline` is the most accurate.
+        find_ground: "grid" or "patchwork", how to find the ground of sweeps without a mask.
+        overwrite: replace labels that the scene has already.
 
     Returns:
-        Number of sweeps labelled, all of them.
+        Number of labelled sweeps: all sweeps of the scene.
 
     Raises:
-        CFlowError: as `find_labels` and `write_hdf5_labels`. The scene is then unchanged.
+        CFlowError: the scene cannot be read or written, has labels already, or the model gives no confidence. The scene
+            is then unchanged.
     """
     log = open_log("hdf5", file, find_ground=find_ground)
     flows = (model([each])[0] for each in windows(log, model.config.num_history, model.config.num_future))
@@ -71,34 +73,34 @@ def label_scene(file: str | Path, model: FlowModel, find_ground: str = "grid", o
 def find_labels(
     log: Log, flows: Iterable[FlowResult], model: FlowModel, workers: int = 1
 ) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
-    """The labels of every sweep of a log.
+    """Yield the labels of every sweep of a log.
 
     Args:
         log: its sweeps have ground masks and poses.
         flows: results of all pairs, in order, by the verified method.
-        model: what made them; it also estimates the flow of the last sweep, back to the one before.
-        workers: threads that look for nearest neighbours.
+        model: the method that made them; it also estimates the flow of the last sweep, back to the one before.
+        workers: threads of the nearest-neighbour searches.
 
     Yields:
-        (time stamp, labels), in order. The labels of N points:
+        (time stamp, labels), in order. The labels of N points are:
         `ground_mask` (N,) bool.
-        `dufo` (N,) uint8, 1 = moves at least `MOVING` a sweep and is no ground.
-        `cluster` (N,) int16, groups that move and those of at least 20 points; 0 = ground, no group. Those that move
-        have the first numbers, from 1: `seflowpp_auto` keeps numbers in 8 bits.
-        `dufocluster` (N,) int16, those groups where `dufo` is 1, else 0.
+        `dufo` (N,) uint8, 1 = moves at least `MOVING` per sweep and is not ground.
+        `cluster` (N,) int16, moving groups and groups of at least 20 points; 0 = ground or no group. Moving groups have
+        the first numbers, from 1, because `seflowpp_auto` keeps numbers in 8 bits.
+        `dufocluster` (N,) int16, `cluster` where `dufo` is 1, else 0.
         `nnd` (N,) uint8, 1 = the nearest point of the next sweep is 0.14 m to 4.4 m away after ego motion, ground
         included.
 
-    Convention: the last sweep moves as its flow back to the sweep before says, with time reversed; its `nnd` looks at
-        that sweep. The groups of a sweep after the 32,767th have no number.
+    Convention: the last sweep has no successor. Its flow and its `nnd` are those to the sweep before, with time
+        reversed. Groups of a sweep after the 32,767th are not numbered.
 
     Raises:
-        CFlowError: results without confidence, another number of results or of points, SciPy is missing.
+        CFlowError: results without confidence, another number of results or of points, or SciPy is not installed.
 
-    Cost: reads the log twice; two searches of nearest neighbours a sweep, one of all points, one of what moves.
+    Cost: reads the log twice; two nearest-neighbour searches a sweep, one of all points, one of the moving points.
     """
     tree, log = _import_tree(), CachedLog(log, 3)
-    movers: list[Movers] = []
+    dynamic: list[DynamicPoints] = []
     groups: list[np.ndarray] = []
     for index, result in enumerate(_with_last(log, flows, model)):
         sweep, other = log.sweep(index), log.sweep(_neighbour(log, index))
@@ -108,15 +110,15 @@ def find_labels(
                 "each of its pairs by the preset offline, default or fast"
             )
         groups.append(as_numpy(result.cluster_id, np.int32))
-        movers.append(_movers(sweep, other, result))
-    trees = [tree(each.positions) for each in movers]
+        dynamic.append(_dynamic_points(sweep, other, result))
+    trees = [tree(each.positions) for each in dynamic]
     for index, stamp in enumerate(log.timestamps):
         sweep = log.sweep(index)
         is_ground = as_numpy(sweep.is_ground, bool)  # type: ignore[arg-type]  # they have masks
         moves = np.zeros(len(is_ground), bool)
-        moves[movers[index].rows[_is_confirmed(movers, trees, index)]] = True
+        moves[dynamic[index].rows[_is_confirmed(dynamic, trees, index)]] = True
         moves &= ~is_ground
-        cluster = _numbered(groups[index], moves, is_ground)
+        cluster = _number_groups(groups[index], moves, is_ground)
         yield (
             int(stamp),
             {
@@ -124,17 +126,17 @@ def find_labels(
                 "dufo": moves.astype(np.uint8),
                 "cluster": cluster,
                 "dufocluster": np.where(moves, cluster, np.int16(0)),
-                "nnd": _nearest_is_apart(tree, sweep, log.sweep(_neighbour(log, index)), workers),
+                "nnd": _has_moved_by_nearest(tree, sweep, log.sweep(_neighbour(log, index)), workers),
             },
         )
 
 
 def flow_back(log: Log, model: FlowModel) -> FlowResult:
-    """The flow of the last sweep to the one before it: that of the log played backwards.
+    """Estimate the flow of the last sweep to the one before it, by playing the log backwards.
 
     Args:
         log: two sweeps or more.
-        model: the sweeps further back are its `num_future`.
+        model: the method; the sweeps further back take the place of its `num_future`.
 
     Returns:
         The result, in the axes of the sweep before the last.
@@ -156,27 +158,27 @@ def _with_last(log: Log, flows: Iterable[FlowResult], model: FlowModel) -> Itera
     for count, result in enumerate(flows, 1):  # noqa: B007 (the last one counts)
         yield result
     if count != len(log) - 1:
-        raise CFlowError(f"log {log.log_id} of {len(log)} sweeps has {count} flows: give that of every pair, in order")
+        raise CFlowError(f"log {log.log_id} of {len(log)} sweeps has {count} flows: give one for every pair, in order")
     yield flow_back(log, model)
 
 
 def _neighbour(log: Log, index: int) -> int:
-    """The sweep that a sweep's flow leads to: the next one; of the last the one before."""
+    """Index of the sweep that a sweep's flow leads to: the next one, or the one before for the last."""
     return index + 1 if index < len(log) - 1 else index - 1
 
 
-def _movers(sweep: Sweep, other: Sweep, result: FlowResult) -> Movers:
+def _dynamic_points(sweep: Sweep, other: Sweep, result: FlowResult) -> DynamicPoints:
     residual, group = as_numpy(result.residual_flow, np.float64), as_numpy(result.cluster_id)
     rows = np.flatnonzero((np.linalg.norm(residual, axis=1) >= MOVING) & (group >= 0))
     interval = _seconds(other) - _seconds(sweep)  # negative where the flow leads to the sweep before
     velocity = residual[rows] @ _pose(other)[:3, :3].T / interval
-    confidence = as_numpy(result.confidence, np.float64)[rows]  # type: ignore[arg-type]  # asked for before
-    positions = _moved(sweep, rows, _pose(sweep))
-    return Movers(rows, positions, velocity, group[rows], confidence, _seconds(sweep))
+    confidence = as_numpy(result.confidence, np.float64)[rows]  # type: ignore[arg-type]  # checked before
+    positions = _transform(sweep, rows, _pose(sweep))
+    return DynamicPoints(rows, positions, velocity, group[rows], confidence, _seconds(sweep))
 
 
 def _seconds(sweep: Sweep) -> float:
-    """Time of a sweep of a scene, which has one; to 0.1 microseconds."""
+    """Time of a sweep, to 0.1 microseconds."""
     return float(sweep.timestamp_ns or 0) / 1e9
 
 
@@ -184,52 +186,52 @@ def _pose(sweep: Sweep) -> np.ndarray:
     return as_numpy(sweep.pose, np.float64)  # type: ignore[arg-type]  # HDF5 scenes have them
 
 
-def _moved(sweep: Sweep, rows: Any, transform: Any) -> np.ndarray:
-    """(M, 3) float64: some points by a rigid transform."""
+def _transform(sweep: Sweep, rows: Any, transform: Any) -> np.ndarray:
+    """(M, 3) float64: the points of some rows after a rigid transform."""
     return as_numpy(sweep.points)[rows, :3].astype(np.float64) @ transform[:3, :3].T + transform[:3, 3]
 
 
-def _is_confirmed(movers: Sequence[Movers], trees: Sequence[Any], index: int) -> np.ndarray:
-    """(M,) bool: the points of one sweep whose group is believed to move."""
-    mine = movers[index]
-    if len(mine.rows) == 0:
+def _is_confirmed(dynamic: Sequence[DynamicPoints], trees: Sequence[Any], index: int) -> np.ndarray:
+    """(M,) bool: the dynamic points of one sweep whose group reaches `AGREEMENT`."""
+    own = dynamic[index]
+    if len(own.rows) == 0:
         return np.zeros(0, bool)
-    believed = mine.confidence.copy()
-    neighbours = [other for other in (index - 1, index + 1) if 0 <= other < len(movers)]
+    score = own.confidence.copy()
+    neighbours = [other for other in (index - 1, index + 1) if 0 <= other < len(dynamic)]
     for other in neighbours:
-        if len(movers[other].rows) == 0:
+        if len(dynamic[other].rows) == 0:
             continue
-        interval = movers[other].seconds - mine.seconds
-        distance, nearest = trees[other].query(mine.positions + interval * mine.velocity, distance_upper_bound=_REACH)
+        interval = dynamic[other].seconds - own.seconds
+        target = own.positions + interval * own.velocity
+        distance, nearest = trees[other].query(target, distance_upper_bound=_MAX_DISTANCE)
         is_near = np.isfinite(distance)
-        change = movers[other].velocity[np.where(is_near, nearest, 0)] - mine.velocity
-        difference, length = (abs(interval) * np.linalg.norm(each, axis=1) for each in (change, mine.velocity))
-        believed += (is_near & (difference <= np.maximum(_ALIKE[0], _ALIKE[1] * length))) / len(neighbours)
-    count = np.bincount(mine.group)
-    mean = np.bincount(mine.group, believed) / np.maximum(count, 1)
-    return mean[mine.group] >= AGREEMENT
+        change = dynamic[other].velocity[np.where(is_near, nearest, 0)] - own.velocity
+        difference, length = (abs(interval) * np.linalg.norm(each, axis=1) for each in (change, own.velocity))
+        score += (is_near & (difference <= np.maximum(_SIMILAR[0], _SIMILAR[1] * length))) / len(neighbours)
+    mean = np.bincount(own.group, score) / np.maximum(np.bincount(own.group), 1)
+    return mean[own.group] >= AGREEMENT
 
 
-def _numbered(group: np.ndarray, moves: np.ndarray, is_ground: np.ndarray) -> np.ndarray:
-    """(N,) int16: groups that move, numbered from 1 in their old order, then those that are large enough."""
+def _number_groups(group: np.ndarray, moves: np.ndarray, is_ground: np.ndarray) -> np.ndarray:
+    """(N,) int16: moving groups, numbered from 1 in the order of their ids, then static ones that are large enough."""
     has_group = (group >= 0) & ~is_ground
     count = np.bincount(group[has_group], minlength=1)
-    does_move = np.bincount(group[moves], minlength=len(count)) > 0
-    ids = np.concatenate([np.flatnonzero(does_move), np.flatnonzero(~does_move & (count >= _SMALLEST))])
+    is_moving = np.bincount(group[moves], minlength=len(count)) > 0
+    ids = np.concatenate([np.flatnonzero(is_moving), np.flatnonzero(~is_moving & (count >= _MIN_POINTS))])
     number = np.zeros(len(count), np.int16)
-    number[ids[:_MOST]] = np.arange(1, len(ids[:_MOST]) + 1)
+    number[ids[:_MAX_GROUPS]] = np.arange(1, len(ids[:_MAX_GROUPS]) + 1)
     return np.where(has_group, number[np.where(has_group, group, 0)], np.int16(0))
 
 
-def _nearest_is_apart(tree: Callable[..., Any], sweep: Sweep, other: Sweep, workers: int) -> np.ndarray:
+def _has_moved_by_nearest(tree: Callable[..., Any], sweep: Sweep, other: Sweep, workers: int) -> np.ndarray:
     """(N,) uint8 `nnd`; 0 for points that are not finite."""
-    points = _moved(sweep, slice(None), np.linalg.inv(_pose(other)) @ _pose(sweep))
+    points = _transform(sweep, slice(None), np.linalg.inv(_pose(other)) @ _pose(sweep))
     others = as_numpy(other.points)[:, :3].astype(np.float64)
-    is_finite, found = np.isfinite(points).all(axis=1), np.zeros(len(points), np.uint8)
+    is_finite, nnd = np.isfinite(points).all(axis=1), np.zeros(len(points), np.uint8)
     nearest = tree(others[np.isfinite(others).all(axis=1)])
     distance, _ = nearest.query(points[is_finite], distance_upper_bound=_NND[1], workers=workers)
-    found[is_finite] = (distance >= _NND[0]) & (distance < _NND[1])
-    return found
+    nnd[is_finite] = (distance >= _NND[0]) & (distance < _NND[1])
+    return nnd
 
 
 def _import_tree() -> Callable[..., Any]:

@@ -1,4 +1,4 @@
-"""Which points are which object's: groups of two sweeps that share voxels, one to one; points inside boxes."""
+"""Associate points with objects: one-to-one matches of groups that share voxels, and points inside boxes."""
 
 from __future__ import annotations
 
@@ -7,26 +7,25 @@ from torch import Tensor
 
 from cflow_torch.ops.segments import first_of_segment
 
-VOXEL = (0.3, 0.3, 0.9)  # metres; high, because beams meet an object at other heights in each sweep
+VOXEL = (0.3, 0.3, 0.9)  # metres; tall, because the beams meet an object at other heights in each sweep
 
 
-def link(points0: Tensor, group0: Tensor, points1: Tensor, group1: Tensor, least: float) -> tuple[Tensor, Tensor]:
-    """Pairs of groups that overlap, one to one.
+def link(points0: Tensor, group0: Tensor, points1: Tensor, group1: Tensor, min_share: float) -> tuple[Tensor, Tensor]:
+    """Match groups of two sweeps that overlap, one to one.
 
     Args:
-        points0: (N0, 3) float64, metres: where the points of the earlier groups should be now.
+        points0: (N0, 3) float64, metres: points of the earlier groups, moved to where they should be now.
         group0: (N0,) int64, group of each, from 0.
-        points1, group1: the same of the groups that are there, in the same frame.
-        least: share of common voxels (of those of either group, intersection over union) below which no pair is made.
+        points1, group1: (N1, 3) and (N1,), the groups of the current sweep, in the same frame.
+        min_share: least overlap of a match: common voxels over the voxels of either group (intersection over union).
 
     Returns:
-        (K,) int64 earlier groups and (K,) int64 groups that are there.
+        (K,) int64 earlier groups and (K,) int64 current groups.
 
     Convention:
-        Greedy: the pair of the largest share first; of equals that of the smaller earlier group, then of the smaller
-        other one.
+        Greedy, the largest overlap first. Ties: the smaller earlier group, then the smaller current one.
 
-    Cost: three sorts of the points; rounds until nothing is left, mostly two or three.
+    Cost: three sorts of the points, and as many rounds as it takes to match all groups, mostly two or three.
     """
     voxel0, voxel1 = _voxels(points0, points1)
     own0, size0 = _distinct(group0, voxel0)
@@ -35,27 +34,27 @@ def link(points0: Tensor, group0: Tensor, points1: Tensor, group1: Tensor, least
     begin, end = (torch.searchsorted(own1[1], own0[1].contiguous(), right=right) for right in (False, True))
     count = end - begin
     first = count.cumsum(0) - count
-    at = torch.arange(int(count.sum()), device=count.device) + (begin - first).repeat_interleave(count)
-    pairs = torch.stack([own0[0].repeat_interleave(count), own1[0].index_select(0, at)])
+    row = torch.arange(int(count.sum()), device=count.device) + (begin - first).repeat_interleave(count)
+    pairs = torch.stack([own0[0].repeat_interleave(count), own1[0].index_select(0, row)])
     pairs, shared = torch.unique(pairs, dim=1, return_counts=True)
     share = shared / (size0[pairs[0]] + size1[pairs[1]] - shared)
     order = share.argsort(descending=True, stable=True)
-    earlier, later = pairs[:, order[share[order] >= least]]
-    taken = [pairs[:, :0]]
-    while earlier.numel():
+    earlier, current = pairs[:, order[share[order] >= min_share]]
+    matches = [pairs[:, :0]]
+    while earlier.numel():  # take all pairs that are the best of both their groups, then go on with the other groups
         position = torch.arange(len(earlier), device=earlier.device)
-        best = (first_of_segment(earlier, int(earlier.max()) + 1) == position) & (
-            first_of_segment(later, int(later.max()) + 1) == position
+        is_best = (first_of_segment(earlier, int(earlier.max()) + 1) == position) & (
+            first_of_segment(current, int(current.max()) + 1) == position
         )
-        taken.append(torch.stack([earlier[best], later[best]]))
-        left = ~(torch.isin(earlier, earlier[best]) | torch.isin(later, later[best]))
-        earlier, later = earlier[left], later[left]
-    found = torch.cat(taken, 1)
-    return found[0], found[1]
+        matches.append(torch.stack([earlier[is_best], current[is_best]]))
+        is_left = ~(torch.isin(earlier, earlier[is_best]) | torch.isin(current, current[is_best]))
+        earlier, current = earlier[is_left], current[is_left]
+    matched = torch.cat(matches, 1)
+    return matched[0], matched[1]
 
 
 def box_of_point(points: Tensor, centre: Tensor, size: Tensor, heading: Tensor) -> Tensor:
-    """(N,) int64 number of the first box that holds each point, -1 = none.
+    """(N,) int64 index of the first box that holds each point, -1 = none.
 
     Args:
         points: (N, 3) float64, metres.
@@ -64,45 +63,45 @@ def box_of_point(points: Tensor, centre: Tensor, size: Tensor, heading: Tensor) 
 
     Cost: K * N comparisons.
     """
-    found = torch.full((len(points),), -1, device=points.device)
+    none = torch.full((len(points),), -1, device=points.device)
     if not len(centre) or not len(points):
-        return found
+        return none
     offset = points[None] - centre[:, None]
-    along, across = turned(offset[..., 0], offset[..., 1], -heading[:, None])
-    inside = (along.abs() <= size[:, None, 0] / 2) & (across.abs() <= size[:, None, 1] / 2)
-    inside &= offset[..., 2].abs() <= size[:, None, 2] / 2
-    return torch.where(inside.any(0), inside.to(torch.uint8).argmax(0), found)
+    along, across = rotate(offset[..., 0], offset[..., 1], -heading[:, None])
+    is_inside = (along.abs() <= size[:, None, 0] / 2) & (across.abs() <= size[:, None, 1] / 2)
+    is_inside &= offset[..., 2].abs() <= size[:, None, 2] / 2
+    return torch.where(is_inside.any(0), is_inside.to(torch.uint8).argmax(0), none)
 
 
 def boxes(points: Tensor, group: Tensor, heading: Tensor) -> tuple[Tensor, Tensor]:
-    """Centre and size, (K, 3) float64 each, of the upright boxes along `heading` (K,) that hold groups (N,) of points.
+    """Centre and size, (K, 3) float64 each, of the upright boxes along `heading` (K,) around groups (N,) of points.
 
     No group may be empty.
     """
-    along, across = turned(points[:, 0], points[:, 1], -heading[group])
+    along, across = rotate(points[:, 0], points[:, 1], -heading[group])
     local = torch.stack([along, across, points[:, 2]], 1)
-    index, ends = group[:, None].expand(-1, 3), local.new_zeros(len(heading), 3)
-    low = ends.scatter_reduce(0, index, local, "amin", include_self=False)
-    high = ends.scatter_reduce(0, index, local, "amax", include_self=False)
+    index, extremes = group[:, None].expand(-1, 3), local.new_zeros(len(heading), 3)
+    low = extremes.scatter_reduce(0, index, local, "amin", include_self=False)
+    high = extremes.scatter_reduce(0, index, local, "amax", include_self=False)
     middle = (low + high) / 2
-    return torch.stack([*turned(middle[:, 0], middle[:, 1], heading), middle[:, 2]], 1), high - low
+    return torch.stack([*rotate(middle[:, 0], middle[:, 1], heading), middle[:, 2]], 1), high - low
 
 
-def turned(x: Tensor, y: Tensor, angle: Tensor) -> tuple[Tensor, Tensor]:
-    """x, y after a turn by `angle` radians to the left."""
+def rotate(x: Tensor, y: Tensor, angle: Tensor) -> tuple[Tensor, Tensor]:
+    """x, y rotated by `angle` radians to the left."""
     cos, sin = angle.cos(), angle.sin()
     return cos * x - sin * y, sin * x + cos * y
 
 
 def _voxels(points0: Tensor, points1: Tensor) -> tuple[Tensor, Tensor]:
-    """(N0,), (N1,) int64: number of the voxel of each point, the same in both."""
+    """(N0,), (N1,) int64: index of the voxel of each point, shared by both sets."""
     both = torch.cat([points0, points1])
     voxel = (both / both.new_tensor(VOXEL)).floor().long()
-    number = torch.unique(voxel, dim=0, return_inverse=True)[1]
-    return number[: len(points0)], number[len(points0) :]
+    index = torch.unique(voxel, dim=0, return_inverse=True)[1]
+    return index[: len(points0)], index[len(points0) :]
 
 
 def _distinct(group: Tensor, voxel: Tensor) -> tuple[Tensor, Tensor]:
-    """(2, V) int64 (group, voxel) without repetition, sorted; number of voxels of each group."""
+    """(2, V) int64 distinct pairs (group, voxel), sorted; number of voxels of each group."""
     own = torch.unique(torch.stack([group, voxel]), dim=1)
     return own, torch.bincount(own[0])

@@ -1,4 +1,4 @@
-"""Flow of sweeps as they arrive: `FlowStream`."""
+"""Estimate the flow of sweeps as they arrive: `FlowStream`."""
 
 from __future__ import annotations
 
@@ -21,30 +21,29 @@ _log = logging.getLogger(__name__)
 
 
 class FlowStream:
-    """Sweeps in, one after the other; flow out as soon as the next sweep is there.
+    """Push sweeps one after the other; get the flow of a sweep as soon as the next one arrives.
 
-    It keeps the last `num_history` + 2 sweeps, on the device of the method, and nothing else. A result is that of
-    `make_model(config)([window])` with these sweeps, to the bit.
+    A stream keeps the last `num_history` + 2 sweeps on the device of the method, and nothing else. Results equal those
+    of `make_model(config)([window])` with these sweeps to the bit.
 
     Args:
-        preset: "default", "fast", "keypoints" or "paper", see `make_config`; no preset that asks for later sweeps.
+        preset: "default", "fast", "keypoints" or "paper"; `offline` needs later sweeps and is refused.
         config: settings, from `make_config`, in place of a preset.
-        device: "auto" = that of the tensors given, else a GPU if there is one, else the CPU.
-        ground: None = as the masks say; "auto" or "patchwork" = find the ground of every sweep without a mask, once.
-        max_gap: seconds; sweeps that are further apart are not compared: the stream begins anew.
+        device: "auto" = that of the given tensors, else a GPU if available, else the CPU.
+        ground: None = use the given masks only; "auto" or "patchwork" = find the ground of sweeps without a mask, once.
+        max_gap: seconds; sweeps that are further apart are not compared, and the stream starts again.
         **overrides: any field of the settings.
 
     Attributes:
-        window: the sweeps of the last result, None = there is none. `window.pc0` is what its rows belong to.
+        window: the sweeps of the last result, None before the first one. Rows of the result belong to `window.pc0`.
 
     Convention:
-        Time stamps decide what happens. A repeated one and one that is older by up to `max_gap` (a late packet) are
-        left out, with a note in the log. One that is older by more means that the clock was set back, one that is newer
-        by more that sweeps were lost: the stream begins anew. Sweeps of a stream without time stamps follow each other
-        by `sweep_interval`.
+        A repeated time stamp, and one that is older by up to `max_gap` (a late packet), are skipped with a warning. If
+        the time stamp is older by more (the clock was set back) or newer by more (sweeps were lost), the stream starts
+        again. Without time stamps, sweeps are `sweep_interval` apart.
 
     Raises:
-        CFlowError: an unknown setting; settings that ask for sweeps after t+1.
+        CFlowError: a setting is unknown, or asks for sweeps after t+1.
 
     Example:
         >>> stream = FlowStream("fast", sweep_interval=0.1)
@@ -70,10 +69,7 @@ class FlowStream:
             raise CFlowError(f"max_gap={max_gap}: give seconds above 0")
         config = (config or make_config(preset)).replace(**overrides)
         if config.num_future > 0:
-            raise CFlowError(
-                f"num_future={config.num_future}: a stream does not know later sweeps; give another preset, or "
-                "num_future=0"
-            )
+            raise CFlowError(f"num_future={config.num_future}: a stream does not know later sweeps; give num_future=0")
         self._model, self._ground, self._max_gap = make_model(config, device), ground, max_gap
         self._sweeps: deque[Sweep] = deque(maxlen=config.num_history + 1)
         self._odometry: Odometry | None = None
@@ -85,7 +81,7 @@ class FlowStream:
         return self._model.config  # type: ignore[no-any-return]
 
     def reset(self) -> None:
-        """Forget all sweeps, and the world of the odometry."""
+        """Start again: forget all sweeps and the poses of the odometry."""
         self._sweeps.clear()
         self._odometry = self.window = None
 
@@ -97,33 +93,35 @@ class FlowStream:
         is_ground: Array | None = None,
         point_times: Array | None = None,
     ) -> FlowResult | None:
-        """Take the sweep t+1; give the flow of the sweep before it.
+        """Add the sweep t+1 and return the flow of sweep t.
 
         Args:
             points: (N, 3+) float, metres, ego frame of this sweep; copied.
-            pose: (4, 4) `T_world_ego`; None = from KISS-ICP (extra `odometry`), for all sweeps of the stream or none.
-            time: nanoseconds (whole number) or seconds (float); None = not known, for all sweeps or none.
-            is_ground, point_times: see `Sweep`.
+            pose: (4, 4) `T_world_ego`; None = estimate it by KISS-ICP (extra `odometry`). Give poses for all sweeps of
+                the stream, or for none.
+            time: nanoseconds (int) or seconds (float); None = unknown. Give times for all sweeps, or for none.
+            is_ground: (N,) bool ground mask; None = unknown.
+            point_times: (N,) float, seconds of each point after the time stamp; None = unknown.
 
         Returns:
-            Flow t -> t+1 of the points of the sweep before; None = there is no such sweep, or this one is left out.
+            Flow t -> t+1 of the points of the sweep before; None if there is no such sweep, or this one is skipped.
 
         Raises:
-            CFlowError: bad input, see `make_batch`; the sweep is then left out and the stream goes on.
+            CFlowError: the input is not valid. The sweep is then skipped, and you can push the next one.
 
-        Cost: that of the method for one window, and of finding ground and pose of one sweep where asked for.
+        Cost: the method for one window and, where needed, the ground and pose of one sweep.
         """
         stamp = None if time is None else round(time * 1e9) if isinstance(time, float) else int(time)
-        if not self._is_next(stamp):
+        if not self._accepts(stamp):
             return None
-        sweep = self._ready(Sweep(points, is_ground, pose, stamp, point_times))
+        sweep = self._prepare(Sweep(points, is_ground, pose, stamp, point_times))
         if self._sweeps:
             before, *history = self._sweeps
             window = Window(before, sweep, tuple(history))
             (result,) = self._model([window])
             self.window = window
         else:
-            alone = replace(sweep, timestamp_ns=None)  # what is wrong with it is said now, not at the next sweep
+            alone = replace(sweep, timestamp_ns=None)  # check it now, so that errors do not wait for the next sweep
             grid = self._model.grid(self.config.pixel_sizes[-1])
             make_batch(
                 [Window(alone, alone)], self.config, grid, torch.as_tensor(sweep.points).device, needs_times=True
@@ -132,30 +130,28 @@ class FlowStream:
         self._sweeps.appendleft(sweep)
         return result
 
-    def _is_next(self, stamp: int | None) -> bool:
-        """Whether a sweep follows the newest one; begins anew where it follows none."""
+    def _accepts(self, stamp: int | None) -> bool:
+        """Return False for late and repeated sweeps; start again after a gap."""
         newest = self._sweeps[0].timestamp_ns if self._sweeps else None
         if stamp is None or newest is None:
             return True
         gap = (stamp - newest) / 1e9
         if -self._max_gap <= gap <= 0:
-            _log.warning("a sweep is left out: its time is %g s before that of the newest", -gap)
+            _log.warning("skipped a sweep: its time is %g s before that of the newest one", -gap)
             return False
         if abs(gap) > self._max_gap:
-            _log.warning("the stream begins anew: %g s from one sweep to the next (max_gap)", gap)
+            _log.warning("the stream starts again: %g s from one sweep to the next, more than max_gap", gap)
             self.reset()
         return True
 
-    def _ready(self, sweep: Sweep) -> Sweep:
-        """A copy of a sweep on the device, with ground and pose."""
+    def _prepare(self, sweep: Sweep) -> Sweep:
+        """Copy a sweep to the device, with ground and pose."""
         check_windows([Window(sweep, sweep)], self.config)
         for newest in list(self._sweeps)[:1]:
             poses = (None if self._odometry else newest.pose, sweep.pose)
             for name, (known, given) in {"pose": poses, "time": (newest.timestamp_ns, sweep.timestamp_ns)}.items():
                 if (known is None) != (given is None):
-                    raise CFlowError(
-                        f"some sweeps of the stream have a {name} and some have none: give it for all, or none"
-                    )
+                    raise CFlowError(f"some sweeps of the stream have no {name}: give it for all sweeps, or for none")
         device = choose_device([Window(sweep, sweep)], self._model.device)
         points = read_positions(sweep, device).t()
         is_ground, pose, times = sweep.is_ground, sweep.pose, sweep.point_times

@@ -1,4 +1,4 @@
-"""Tables of tracks: joined, sifted, and on disk as Parquet."""
+"""Tables of tracks: join them, filter them, write and read them as Parquet."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from cflow_torch.data.paths import PathLike, as_path, read_bytes
 from cflow_torch.types import CFlowError
 
 Table = Dict[str, np.ndarray]
-TRACKS_FILE = "tracks.parquet"  # beside the flow files of a log
-_WHOLE = ("sweep", "timestamp_ns", "id", "num_moving", "cluster_id", "num_points")
-_REAL = ("x", "y", "z", "vx", "vy", "vz", "velocity_std", "length", "width", "height", "heading", "age", "confidence")
+TRACKS_FILE = "tracks.parquet"  # next to the flow files of a log
+_INTEGERS = ("sweep", "timestamp_ns", "id", "num_moving", "cluster_id", "num_points")
+_FLOATS = ("x", "y", "z", "vx", "vy", "vz", "velocity_std", "length", "width", "height", "heading", "age", "confidence")
 COLUMNS = {
-    **dict.fromkeys(_WHOLE, np.int64),
-    **dict.fromkeys(_REAL, np.float64),
+    **dict.fromkeys(_INTEGERS, np.int64),
+    **dict.fromkeys(_FLOATS, np.float64),
     "is_moving": np.bool_,
     "is_confirmed": np.bool_,
 }
 
 
 def join_tables(tables: Sequence[Table]) -> Table:
-    """Tables one below the other; of none, all columns without rows."""
+    """Concatenate tables. Without tables, all columns are empty."""
     return {
-        name: np.concatenate([np.zeros(0, kind), *(table[name] for table in tables)]).astype(kind)
-        for name, kind in COLUMNS.items()
+        name: np.concatenate([np.zeros(0, dtype), *(table[name] for table in tables)]).astype(dtype)
+        for name, dtype in COLUMNS.items()
     }
 
 
 def confirmed(table: Table) -> Table:
-    """The rows of tracks that are confirmed at some time, also their rows before."""
-    chosen = np.isin(table["id"], table["id"][table["is_confirmed"]])
-    return {name: values[chosen] for name, values in table.items()}
+    """Keep all rows of tracks that are confirmed at some time, including the rows before."""
+    is_kept = np.isin(table["id"], table["id"][table["is_confirmed"]])
+    return {name: values[is_kept] for name, values in table.items()}
 
 
 def write_tracks(path: PathLike, table: Table) -> None:
@@ -46,15 +46,15 @@ def write_tracks(path: PathLike, table: Table) -> None:
 
 
 def read_tracks(path: PathLike) -> Table:
-    """Read what `write_tracks` wrote.
+    """Read a table that `write_tracks` wrote.
 
     Raises:
-        CFlowError: no such file, or no table of tracks.
+        CFlowError: the file does not exist, or is not a table of tracks.
     """
     path = as_path(path)
     with file_errors(path, "give a table that `cflow flow tracks=true` wrote"):
         table = parquet.read_table(pa.BufferReader(read_bytes(path)), use_threads=False)
-    lacking = sorted(COLUMNS.keys() - set(table.column_names))
-    if lacking:
-        raise CFlowError(f"{path} lacks {', '.join(lacking)}: give a table that `cflow flow tracks=true` wrote")
-    return {name: table.column(name).to_numpy().astype(kind) for name, kind in COLUMNS.items()}
+    missing = sorted(COLUMNS.keys() - set(table.column_names))
+    if missing:
+        raise CFlowError(f"{path} lacks {', '.join(missing)}: give a table that `cflow flow tracks=true` wrote")
+    return {name: table.column(name).to_numpy().astype(dtype) for name, dtype in COLUMNS.items()}

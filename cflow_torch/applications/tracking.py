@@ -1,8 +1,8 @@
-"""Objects through time: the moving groups of each sweep, linked by their own flow, and filtered in the world frame."""
+"""Track moving objects: match the moving groups of consecutive sweeps by their flow, and filter them in the world."""
 
 from __future__ import annotations
 
-from typing import Dict, Iterable, NamedTuple
+from typing import Any, Callable, Iterable, NamedTuple
 
 import numpy as np
 import torch
@@ -15,42 +15,125 @@ from cflow_torch.applications.track_table import confirmed, join_tables
 from cflow_torch.config import make_config
 from cflow_torch.data.log import CachedLog, Log, window
 from cflow_torch.estimate import make_model
+from cflow_torch.ops.indices import lookup
 from cflow_torch.types import CFlowError, FlowResult, Window
 
-# A track is confirmed by what it has shown while it moved: most groups that do not last are noise of what stands.
+# A track is confirmed by the motion that it has shown: most groups that do not last are noise of the static world.
 _MIN_MOVING = 3  # sweeps
 _MIN_EVIDENCE = 2.0  # sum of the log-odds of its confidence
-_NO_CONFIDENCE = 0.7  # log-odds, of methods without
+_NO_CONFIDENCE = 0.7  # log-odds of a method without confidence
 _THIN = 0.12  # metres; a narrower box is no evidence: posts, and slices of fronts along which a shadow glides
-_MIN_WAY = (0.5, 0.5)  # metres that its box must have gone the way of its flow, and their share of that way
-_MIN_SHARE = 0.1  # of voxels that two groups have in common, for a link
-_STANDS = 0.3  # share of a track's points that must be found in its box where it is said to stand
+_MIN_TRAVEL = 0.5  # metres that its box must have travelled along its flow
+_MIN_TRAVEL_SHARE = 0.5  # of the distance that its flow predicts, which the box must have travelled, too
+_MIN_SHARE = 0.1  # of common voxels, for a match of two groups
+_MIN_STOPPED_SHARE = 0.3  # of a track's points, which must lie in its box for the object to have stopped there
 _MARGIN = 0.2  # metres by which that box is larger
 _MAX_MISSED = 3  # sweeps that a track survives unseen
 _ACCELERATION = 3.0  # m/s², standard deviation
-_NOISE = (0.4, 0.02)  # standard deviations: metres of a box's centre, metres per sweep of a group's flow
+_BOX_NOISE, _FLOW_NOISE = 0.4, 0.02  # standard deviations: metres of a box's centre, metres per sweep of a group's flow
 
 
-# Of K tracks, by name: states; the measured box; where the next sweep should have it (place), where it was first
-# (start), and the sum of its flow since (way); when that was (begin, seconds).
-_Tracks = Dict[str, Tensor]
-_NO_TRACKS: _Tracks = {
-    **{
-        name: torch.zeros(0, 3, dtype=torch.float64)
-        for name in ("position", "velocity", "place", "size", "start", "way")
-    },
-    **{name: torch.zeros(0, dtype=torch.float64) for name in ("heading", "begin", "confidence", "evidence")},
-    **{name: torch.zeros(0, dtype=torch.int64) for name in ("id", "num_points", "cluster", "num_moving", "missed")},
-    **{name: torch.zeros(0, dtype=torch.bool) for name in ("is_moving", "is_confirmed")},
-    "covariance": torch.zeros(0, 2, 2, dtype=torch.float64),
-}
+class _Tracks(NamedTuple):
+    """K tracks in the world frame; float64 unless another type is named.
+
+    Args:
+        id: (K,) int64.
+        position, velocity, covariance: (K, 3), (K, 3), (K, 2, 2), the filtered `States`.
+        box, size: (K, 3) centre of the box and its length, width, height. After a sweep, the centre is predicted for
+            the next one.
+        heading: (K,) of the box, radians.
+        begin, start: (K,) seconds and (K, 3) box centre when the track was first seen.
+        travel: (K, 3) sum of its flow since then, metres.
+        confidence, evidence: (K,) of the flow when it last moved; sum of the log-odds.
+        num_points, num_moving, missed, cluster: (K,) int64 points, sweeps in which it moved, sweeps since it was last
+            seen, cluster_id.
+        is_moving, is_confirmed: (K,) bool.
+    """
+
+    id: Tensor
+    position: Tensor
+    velocity: Tensor
+    covariance: Tensor
+    box: Tensor
+    size: Tensor
+    heading: Tensor
+    begin: Tensor
+    start: Tensor
+    travel: Tensor
+    confidence: Tensor
+    evidence: Tensor
+    num_points: Tensor
+    num_moving: Tensor
+    missed: Tensor
+    cluster: Tensor
+    is_moving: Tensor
+    is_confirmed: Tensor
+
+    @classmethod
+    def none(cls, device: torch.device) -> _Tracks:
+        """No tracks."""
+        scalar = torch.zeros(0, dtype=torch.float64, device=device)
+        vector, flag = scalar.new_zeros(0, 3), torch.zeros(0, dtype=torch.bool, device=device)
+        number = torch.zeros(0, dtype=torch.int64, device=device)
+        states = (vector, vector, scalar.new_zeros(0, 2, 2))
+        boxes = (vector, vector, scalar, scalar, vector, vector)
+        return cls(number, *states, *boxes, scalar, scalar, number, number, number, number, flag, flag)
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> _Tracks:
+        """The tracks with a function applied to each tensor."""
+        return _Tracks(*map(function, self))
+
+    def take(self, index: Tensor) -> _Tracks:
+        """The tracks of an index or mask."""
+        return self.map(lambda values: values[index])
+
+    def write(self, index: Tensor, **columns: Any) -> None:
+        """Overwrite columns of the indexed tracks in place."""
+        for name, values in columns.items():
+            getattr(self, name)[index] = values
+
+    def states(self) -> States:
+        """Their filtered states."""
+        return States(self.position, self.velocity, self.covariance)
+
+
+class _Matches(NamedTuple):
+    """How the tracks explain a sweep.
+
+    Args:
+        track, group: (M,) int64 each: track i continues in moving group i.
+        stopped, num_points: (S,) int64 tracks that have stopped, and how many points lie in their boxes.
+        track_of_static: (P,) int64 for each static point the stopped track whose box holds it, -1 = none.
+    """
+
+    track: Tensor
+    group: Tensor
+    stopped: Tensor
+    num_points: Tensor
+    track_of_static: Tensor
+
+
+class _Times(NamedTuple):
+    """Seconds.
+
+    Args:
+        now: time of sweep t.
+        interval: from t to t+1.
+        elapsed: from the sweep before to t.
+        late: part of `elapsed` that the flow of the sweep before does not span.
+    """
+
+    now: float
+    interval: float
+    elapsed: float
+    late: float
 
 
 class Tracked(NamedTuple):
-    """What a `Tracker` says about one sweep.
+    """Tracks of one sweep.
 
     Args:
-        table: a row for each track that is seen in the sweep, see `track`.
+        table: a row for each track that is seen in the sweep; `track` describes the columns.
         track_id: (N,) int64 for every point of the sweep, -1 = of no track.
     """
 
@@ -59,11 +142,11 @@ class Tracked(NamedTuple):
 
 
 class Tracker:
-    """Links moving groups over the sweeps of a drive, sweep by sweep.
+    """Track moving objects sweep by sweep.
 
-    A group's points, moved by its flow, overlap with the points of one group of the next sweep. What stops is followed
-    as long as there are points in its box; what is not seen for up to three sweeps is expected where its velocity takes
-    it. Memory: the points of the tracks that are alive.
+    The flow moves the points of a group to the next sweep. The group there that shares most voxels with them is the
+    same object. An object that stops is tracked as long as there are points in its box. An object that is not seen for
+    up to three sweeps is expected where its velocity takes it. Memory: the points of the current tracks.
 
     Args:
         sweep_interval: seconds from sweep to sweep where sweeps have no time stamps.
@@ -78,140 +161,58 @@ class Tracker:
         if not sweep_interval > 0:
             raise CFlowError(f"sweep_interval={sweep_interval}: give the seconds from one sweep to the next")
         self._interval = sweep_interval
-        self._clock: tuple[float, float] | None = None  # of the last sweep, and when its flow ends
+        self._clock: tuple[float, float] | None = None  # time of the last sweep, and of the end of its flow
         self._num_sweeps, self._num_tracks = 0, 0
-        self._tracks: _Tracks = {}
+        self._tracks = _Tracks.none(torch.device("cpu"))
+        # Points of the tracks, where the next sweep should have them, and the track of each.
         self._points, self._owner = torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, dtype=torch.int64)
 
     def push(self, sweeps: Window, result: FlowResult) -> Tracked:
-        """Go on by one sweep.
+        """Continue the tracks by one sweep.
 
         Args:
-            sweeps: the window of the pair t, t+1; its pc0, the poses and the time stamps are looked at.
-            result: its flow; residual_flow, cluster_id, is_valid and, if there, confidence.
+            sweeps: the window of the pair t, t+1; its pc0, the poses and the time stamps are used.
+            result: its flow; residual_flow, cluster_id, is_valid and, if present, confidence.
 
         Returns:
-            The tracks at t. Those that are not `is_confirmed` (yet) are mostly noise of what stands.
+            The tracks at t. Tracks that are not (yet) `is_confirmed` are mostly noise of the static world.
 
         Raises:
-            CFlowError: a sweep that is not later than the one before, a result of another sweep, or without what is
-                needed.
+            CFlowError: the sweep is not later than the one before, or the result belongs to another sweep or lacks a
+                field.
         """
         if any(getattr(result, name) is None for name in ("residual_flow", "cluster_id", "is_valid")):
             raise CFlowError("tracks need residual flow, cluster_id and is_valid: `cflow flow` writes them by default")
-        now, interval, elapsed, late = self._times(sweeps)
-        seen = MovingGroups.of(sweeps, result)
-        tracks, points, owner = self._predicted(seen.point.device, elapsed, late)
-        linked, group, stands, boxed = self._found(tracks, points, owner, seen)
-        flow = seen.mean(seen.step)
-        tracks, of_group = self._measured(tracks, seen, flow, (linked, group), stands, (now, interval))
+        times = self._times(sweeps)
+        groups = MovingGroups.of(sweeps, result)
+        tracks, points, owner = self._predict(groups.point.device, times)
+        matches = _match(tracks, points, owner, groups)
+        flow = groups.mean(groups.step)
+        tracks, track_of_group = self._update(tracks, groups, flow, matches, times)
 
-        # Which track each point is of, and where the next sweep should have it.
-        moves = seen.group >= 0
-        point_track = torch.full_like(seen.group, -1)
-        point_track[moves] = of_group[seen.group[moves]]
-        point_track[~moves] = boxed
-        has = point_track >= 0
+        moves = groups.group >= 0
+        track_of_point = torch.full_like(groups.group, -1)
+        track_of_point[moves] = track_of_group[groups.group[moves]]
+        track_of_point[~moves] = matches.track_of_static
+        has_track = track_of_point >= 0
+        track_of_point = track_of_point[has_track]
         track_id = torch.full((len(result.residual_flow),), -1, device=owner.device)
-        track_id[seen.row[has]] = tracks["id"][point_track[has]]
-        onward = tracks["velocity"] * interval
-        onward[of_group] = flow
-        tracks["place"] = tracks["place"] + onward
-        missing = tracks["missed"][owner] > 0
-        moved = seen.point[has] + torch.where(moves[has, None], seen.step[has], onward[point_track[has]])
-        points = torch.cat([points[missing] + onward[owner[missing]], moved])
-        table = self._table(tracks, now, sweeps.pc0.timestamp_ns)
-        self._keep(tracks, points, torch.cat([owner[missing], point_track[has]]))
+        track_id[groups.row[has_track]] = tracks.id[track_of_point]
+
+        # Move everything to the next sweep: moving points by their own flow, all others by the velocity of their track.
+        step = tracks.velocity * times.interval
+        step[track_of_group] = flow
+        is_missing = tracks.missed[owner] > 0
+        missing = points[is_missing] + step[owner[is_missing]]
+        seen = groups.point[has_track]
+        seen = seen + torch.where(moves[has_track, None], groups.step[has_track], step[track_of_point])
+        table = self._table(tracks, times.now, sweeps.pc0.timestamp_ns)
+        owner = torch.cat([owner[is_missing], track_of_point])
+        self._keep(tracks._replace(box=tracks.box + step), torch.cat([missing, seen]), owner)
         self._num_sweeps += 1
         return Tracked(table, track_id.cpu().numpy())
 
-    def _predicted(self, device: torch.device, elapsed: float, late: float) -> tuple[_Tracks, Tensor, Tensor]:
-        """Tracks, and their points with the numbers of their tracks, where they are expected now.
-
-        Boxes and points are where the last flow brings them, and go on by `late` seconds if that was for too short.
-        """
-        tracks = {name: values.to(device) for name, values in (self._tracks or _NO_TRACKS).items()}
-        points, owner = self._points.to(device), self._owner.to(device)
-        tracks["place"] = tracks["place"] + late * tracks["velocity"]
-        tracks.update(vars(_states(tracks).predict(elapsed, _ACCELERATION)))
-        return tracks, points + late * tracks["velocity"][owner], owner
-
-    @staticmethod
-    def _found(
-        tracks: _Tracks, points: Tensor, owner: Tensor, seen: MovingGroups
-    ) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor], Tensor]:
-        """Tracks and the groups that they are linked to; tracks that stand, with how many points; and of each point
-        that does not move, the track whose box it is in, -1 = none."""
-        moves = seen.group >= 0
-        linked, group = link(points, owner, seen.point[moves], seen.group[moves], _MIN_SHARE)
-        may_stand = tracks["is_confirmed"].clone()
-        may_stand[linked] = False
-        waiting = may_stand.nonzero()[:, 0]
-        size = tracks["size"][waiting] + _MARGIN
-        boxed = box_of_point(seen.point[~moves], tracks["place"][waiting], size, tracks["heading"][waiting])
-        count = torch.bincount(boxed[boxed >= 0], minlength=len(waiting))
-        is_there = count >= (_STANDS * tracks["num_points"][waiting]).clamp(min=MIN_POINTS)
-        of_box = torch.cat([torch.where(is_there, waiting, -1), waiting.new_full((1,), -1)])
-        return linked, group, (waiting[is_there], count[is_there]), of_box[boxed]
-
-    def _measured(
-        self,
-        tracks: _Tracks,
-        seen: MovingGroups,
-        flow: Tensor,
-        links: tuple[Tensor, Tensor],
-        stands: tuple[Tensor, Tensor],
-        times: tuple[float, float],
-    ) -> tuple[_Tracks, Tensor]:
-        """The tracks after this sweep, new ones last, and the track of each group."""
-        (linked, group), (now, interval), num_old = links, times, len(tracks["id"])
-        heading = torch.atan2(flow[:, 1], flow[:, 0])
-        velocity = tracks["velocity"][linked]
-        is_fast = velocity[:, :2].norm(dim=1) >= MOVING / interval
-        heading[group] = torch.where(is_fast, torch.atan2(velocity[:, 1], velocity[:, 0]), heading[group])
-        moves = seen.group >= 0
-        centre, size = boxes(seen.point[moves], seen.group[moves], heading)
-        is_new = torch.ones_like(seen.count, dtype=torch.bool)
-        is_new[group] = False
-        of_group = num_old + is_new.cumsum(0) - 1
-        of_group[group] = linked
-        noise = centre.new_tensor([_NOISE[0], _NOISE[1] / interval])
-
-        count = int(is_new.sum())
-        fresh = {name: values.new_zeros(count, *values.shape[1:]) for name, values in tracks.items()}
-        fresh["id"] += self._num_tracks + torch.arange(count, device=centre.device)
-        fresh["covariance"] += torch.diag(noise**2)
-        fresh["begin"] += now
-        fresh.update(start=centre[is_new], position=centre[is_new], velocity=flow[is_new] / interval)
-        self._num_tracks += count
-        tracks = {name: torch.cat([values, fresh[name]]) for name, values in tracks.items()}
-
-        tracks["missed"] += 1
-        tracks["is_moving"][:] = False
-        tracks["cluster"][:] = -1
-        measured = {"place": centre, "size": size, "heading": heading, "num_points": seen.count}
-        measured.update(cluster=seen.cluster, confidence=seen.confidence)
-        measured.update(is_moving=torch.ones_like(is_new), missed=torch.zeros_like(seen.count))
-        for name, values in measured.items():
-            tracks[name][of_group] = values
-        tracks["missed"][stands[0]] = 0
-        tracks["num_points"][stands[0]] = torch.maximum(stands[1], tracks["num_points"][stands[0]])
-        tracks["num_moving"][of_group] += 1
-        odds = torch.logit(seen.confidence, 0.01).nan_to_num(_NO_CONFIDENCE)
-        tracks["evidence"][of_group] += odds * (size[:, :2].amin(1) >= _THIN)
-        _confirm(tracks)
-        tracks["way"][of_group] += flow  # to the next sweep
-
-        both, step = torch.cat([linked, stands[0]]), torch.zeros_like(tracks["place"])
-        step[of_group] = flow
-        old = _states({name: values[both] for name, values in tracks.items()})
-        better = old.update(tracks["place"][both], step[both] / interval, noise.expand(len(both), 2))
-        for name, values in vars(better).items():
-            tracks[name][both] = values
-        return tracks, of_group
-
-    def _times(self, sweeps: Window) -> tuple[float, float, float, float]:
-        """Seconds: of t; from t to t+1; from the sweep before to t; of these, what its flow does not span."""
+    def _times(self, sweeps: Window) -> _Times:
         begin, end = sweeps.pc0.timestamp_ns, sweeps.pc1.timestamp_ns
         has_times = begin is not None and end is not None
         interval = (end - begin) * 1e-9 if has_times else self._interval  # type: ignore[operator]
@@ -219,65 +220,133 @@ class Tracker:
         now = begin * 1e-9 if has_times else 0.0 if due is None else due  # type: ignore[operator]
         self._clock = now, now + interval
         if last is None or due is None:
-            return now, interval, interval, 0.0
+            return _Times(now, interval, interval, 0.0)
         if now <= last:
             raise CFlowError(f"a sweep {last - now:.3f} s before the last one: push sweeps in the order of time")
-        return now, interval, now - last, now - due
+        return _Times(now, interval, now - last, now - due)
+
+    def _predict(self, device: torch.device, times: _Times) -> tuple[_Tracks, Tensor, Tensor]:
+        """Tracks, their points and the track of each point, as expected now.
+
+        Boxes and points are already where the last flow brings them. If the sweep is late, they move on by velocity.
+        """
+        tracks = self._tracks.map(lambda values: values.to(device))
+        points, owner = self._points.to(device), self._owner.to(device)
+        points = points + times.late * tracks.velocity[owner]
+        states = tracks.states().predict(times.elapsed, _ACCELERATION)
+        return tracks._replace(box=tracks.box + times.late * tracks.velocity, **vars(states)), points, owner
+
+    def _update(
+        self, tracks: _Tracks, groups: MovingGroups, flow: Tensor, matches: _Matches, times: _Times
+    ) -> tuple[_Tracks, Tensor]:
+        """Begin tracks for groups without a match, and update all tracks with this sweep.
+
+        Args:
+            flow: (G, 3) mean of each group, metres per sweep.
+
+        Returns:
+            The tracks, new ones last; (G,) int64 track of each group.
+        """
+        interval, stopped = times.interval, matches.stopped
+        velocity = tracks.velocity[matches.track]
+        is_fast = velocity[:, :2].norm(dim=1) >= MOVING / interval
+        heading = torch.atan2(flow[:, 1], flow[:, 0])
+        of_track = torch.atan2(velocity[:, 1], velocity[:, 0])
+        heading[matches.group] = torch.where(is_fast, of_track, heading[matches.group])
+        moves = groups.group >= 0
+        box, size = boxes(groups.point[moves], groups.group[moves], heading)
+        noise = box.new_tensor([_BOX_NOISE, _FLOW_NOISE / interval])
+
+        is_new = torch.ones_like(groups.count, dtype=torch.bool)
+        is_new[matches.group] = False
+        track_of_group = len(tracks.id) + is_new.cumsum(0) - 1
+        track_of_group[matches.group] = matches.track
+        num_new = int(is_new.sum())
+        new = tracks.map(lambda values: values.new_zeros(num_new, *values.shape[1:]))
+        new.id.add_(self._num_tracks + torch.arange(num_new, device=box.device))
+        new.covariance.add_(torch.diag(noise**2))
+        new.begin.add_(times.now)
+        new = new._replace(start=box[is_new], position=box[is_new], velocity=flow[is_new] / interval)
+        self._num_tracks += num_new
+        tracks = _Tracks(*map(torch.cat, zip(tracks, new)))
+
+        tracks.missed.add_(1)
+        tracks.is_moving.fill_(False)
+        tracks.cluster.fill_(-1)
+        tracks.write(track_of_group, box=box, size=size, heading=heading, is_moving=True, missed=0)
+        tracks.write(track_of_group, num_points=groups.count, cluster=groups.cluster, confidence=groups.confidence)
+        tracks.write(stopped, missed=0, num_points=torch.maximum(matches.num_points, tracks.num_points[stopped]))
+        tracks.num_moving[track_of_group] += 1
+        odds = torch.logit(groups.confidence, 0.01).nan_to_num(_NO_CONFIDENCE)
+        tracks.evidence[track_of_group] += odds * (size[:, :2].amin(1) >= _THIN)
+        tracks.is_confirmed.logical_or_(_has_shown_motion(tracks))
+        tracks.travel[track_of_group] += flow  # to the next sweep
+
+        measured, step = torch.cat([matches.track, stopped]), torch.zeros_like(tracks.box)
+        step[track_of_group] = flow
+        states = tracks.take(measured).states()
+        states = states.update(tracks.box[measured], step[measured] / interval, noise.expand(len(measured), 2))
+        tracks.write(measured, **vars(states))
+        return tracks, track_of_group
 
     def _table(self, tracks: _Tracks, now: float, stamp: int | None) -> dict[str, np.ndarray]:
-        part = {name: values[tracks["missed"] == 0].cpu().numpy() for name, values in tracks.items()}
-        count = len(part["id"])
-        axes = {"": part["position"], "v": part["velocity"]}
+        seen = tracks.take(tracks.missed == 0).map(lambda values: values.cpu())
+        rows = _Tracks(*(values.numpy() for values in seen))  # type: ignore[arg-type]  # the same fields, as arrays
+        axes = {"": rows.position, "v": rows.velocity}
         columns = {f"{name}{axis}": values[:, k] for name, values in axes.items() for k, axis in enumerate("xyz")}
         return {
-            "sweep": np.full(count, self._num_sweeps),
-            "timestamp_ns": np.full(count, self._num_sweeps if stamp is None else stamp),
-            "id": part["id"],
+            "sweep": np.full(len(rows.id), self._num_sweeps),
+            "timestamp_ns": np.full(len(rows.id), self._num_sweeps if stamp is None else stamp),
+            "id": rows.id,
             **columns,
-            "velocity_std": np.sqrt(part["covariance"][:, 1, 1]),
-            **dict(zip(("length", "width", "height"), part["size"].T)),
-            "heading": part["heading"],
-            "age": now - part["begin"],
-            "num_moving": part["num_moving"],
-            "is_moving": part["is_moving"],
-            "is_confirmed": part["is_confirmed"],
-            "cluster_id": part["cluster"],
-            "num_points": part["num_points"],
-            "confidence": part["confidence"],
+            "velocity_std": np.sqrt(rows.covariance[:, 1, 1]),
+            **dict(zip(("length", "width", "height"), rows.size.T)),
+            "heading": rows.heading,
+            "age": now - rows.begin,
+            "num_moving": rows.num_moving,
+            "is_moving": rows.is_moving,
+            "is_confirmed": rows.is_confirmed,
+            "cluster_id": rows.cluster,
+            "num_points": rows.num_points,
+            "confidence": rows.confidence,
         }
 
     def _keep(self, tracks: _Tracks, points: Tensor, owner: Tensor) -> None:
-        """Forget tracks that have not been seen for too long."""
-        lives = tracks["missed"] <= _MAX_MISSED
-        number = torch.where(lives, lives.cumsum(0) - 1, -1)[owner]
-        self._tracks = {name: values[lives] for name, values in tracks.items()}
-        self._points, self._owner = points[number >= 0], number[number >= 0]
+        """Store the tracks, without those that have not been seen for too long."""
+        is_kept = tracks.missed <= _MAX_MISSED
+        owner = torch.where(is_kept, is_kept.cumsum(0) - 1, -1)[owner]
+        self._tracks = tracks.take(is_kept)
+        self._points, self._owner = points[owner >= 0], owner[owner >= 0]
 
 
 def track(
     log: Log, results: Iterable[tuple[int, FlowResult]] | None = None, sweep_interval: float = 0.1
 ) -> dict[str, np.ndarray]:
-    """The moving objects of a drive, each with one id.
+    """Track the moving objects of a drive, each with one id.
 
     Args:
-        log: the drive. Without poses, all sweeps lie in one frame, which is then the world.
+        log: the drive. Without poses, all sweeps are taken to lie in one frame, which is then the world.
         results: (index, flow of sweep `index` to `index + 1`), ascending; sweeps without a result are bridged. None =
-            flow of the preset `default`, estimated now.
+            estimate the flow with the preset `default`.
         sweep_interval: seconds from sweep to sweep where sweeps have no time stamps.
 
     Returns:
-        Column -> (R,) array, a row per track and sweep in which it is seen, sorted by sweep, then id: `sweep`,
-        `timestamp_ns`, `id`; x, y, z middle of the box, filtered, metres in the world; vx, vy, vz m/s over ground,
-        filtered; `velocity_std` m/s, standard deviation of each of the three (errors are taken to be independent);
-        length (along the heading), width, height metres, of what is seen of it; `heading` radians in the world from +x
-        to the left; `age` seconds since it was first seen; `num_moving` sweeps so far in which it moved; `is_moving`,
-        False = it has moved and stands now; `cluster_id` of this sweep's flow, -1 where it stands; `num_points`;
-        `confidence` of the flow when it last moved, NaN where the method has none.
-        `pandas.DataFrame(table)` takes it. `is_confirmed` is True from the sweep on in which enough has been seen of
-        its motion: three sweeps, half a metre, and confidence; tracks that never get there are left out.
+        Column -> (R,) array, which `pandas.DataFrame(table)` takes. There is a row for each track and sweep in which it
+        is seen, sorted by sweep, then id. The columns are:
+        `sweep`, `timestamp_ns`, `id`;
+        x, y, z: filtered centre of the box, metres in the world; vx, vy, vz: filtered velocity over ground, m/s;
+        `velocity_std`: m/s, standard deviation of each of the three, if errors are independent;
+        length (along the heading), width, height: metres, of the visible part of the object;
+        `heading`: radians in the world from +x to the left;
+        `age`: seconds since the track was first seen; `num_moving`: sweeps so far in which it moved;
+        `is_moving`: False = it has moved, and is static now;
+        `cluster_id`: of this sweep's flow, -1 while it is static; `num_points`;
+        `confidence`: of the flow when it last moved, NaN where the method has none;
+        `is_confirmed`: True from the sweep on in which the track has shown enough motion: three sweeps, half a metre,
+        and confidence. Tracks that are never confirmed are left out.
 
     Raises:
-        CFlowError: see `Tracker.push`; a sweep cannot be read.
+        CFlowError: a sweep cannot be read, or a result does not belong to its sweep.
     """
     if results is None:
         model = make_model(make_config("default"))
@@ -294,15 +363,25 @@ def track(
     return confirmed(join_tables(tables))
 
 
-def _confirm(tracks: _Tracks) -> None:
-    """Say of each track whether it has shown by now that it moves: by evidence, and by the way that its box has gone
-    beside the way that its flow tells."""
-    way = tracks["way"].norm(dim=1)
-    along = ((tracks["place"] - tracks["start"]) * tracks["way"]).sum(1) / way.clamp(min=1e-9)
-    has_gone = tracks["is_moving"] & (along >= (_MIN_WAY[1] * way).clamp(min=_MIN_WAY[0]))
-    is_evident = (tracks["num_moving"] >= _MIN_MOVING) & (tracks["evidence"] >= _MIN_EVIDENCE)
-    tracks["is_confirmed"] |= has_gone & is_evident
+def _match(tracks: _Tracks, points: Tensor, owner: Tensor, groups: MovingGroups) -> _Matches:
+    """Match tracks, with (P, 3) points and the track of each, to the moving groups and static points of a sweep."""
+    moves = groups.group >= 0
+    track, group = link(points, owner, groups.point[moves], groups.group[moves], _MIN_SHARE)
+    may_have_stopped = tracks.is_confirmed.clone()
+    may_have_stopped[track] = False
+    candidate = may_have_stopped.nonzero()[:, 0]
+    static = groups.point[~moves]
+    box = box_of_point(static, tracks.box[candidate], tracks.size[candidate] + _MARGIN, tracks.heading[candidate])
+    count = torch.bincount(box[box >= 0], minlength=len(candidate))
+    has_stopped = count >= (_MIN_STOPPED_SHARE * tracks.num_points[candidate]).clamp(min=MIN_POINTS)
+    track_of_box = torch.where(has_stopped, candidate, -1)
+    track_of_static = lookup(track_of_box, torch.where(box < 0, len(candidate), box), -1)
+    return _Matches(track, group, candidate[has_stopped], count[has_stopped], track_of_static)
 
 
-def _states(tracks: _Tracks) -> States:
-    return States(tracks["position"], tracks["velocity"], tracks["covariance"])
+def _has_shown_motion(tracks: _Tracks) -> Tensor:
+    """(K,) bool: the evidence suffices, and the box has travelled a fair share of what the flow predicts."""
+    predicted = tracks.travel.norm(dim=1)
+    travelled = ((tracks.box - tracks.start) * tracks.travel).sum(1) / predicted.clamp(min=1e-9)
+    has_travelled = tracks.is_moving & (travelled >= (_MIN_TRAVEL_SHARE * predicted).clamp(min=_MIN_TRAVEL))
+    return has_travelled & (tracks.num_moving >= _MIN_MOVING) & (tracks.evidence >= _MIN_EVIDENCE)

@@ -120,20 +120,20 @@ def test_nnd_is_the_nearest_point_of_the_next_sweep(labelled: Path) -> None:
 def test_motion_that_neighbouring_sweeps_deny_is_not_believed() -> None:
     """Of three groups one keeps its motion, one reverses it, one is not there in the other sweeps."""
 
-    def movers(index: int) -> labels.Movers:
+    def dynamic_points(index: int) -> labels.DynamicPoints:
         shape = np.stack(np.meshgrid(*[np.arange(5) * 0.2] * 3), -1).reshape(-1, 3)
         steady, reverses, once = shape + [index, 0, 0], shape + [0, 9, 0], shape + [0, 30, 9 * index]
         velocity = np.repeat([[10.0, 0, 0], [10.0 * (-1) ** index, 0, 0], [0, 10, 0]], len(shape), 0)
         count = len(velocity)
         positions = np.concatenate([steady, reverses, once])
-        return labels.Movers(
+        return labels.DynamicPoints(
             np.arange(count), positions, velocity, np.arange(count) // len(shape), np.full(count, 0.7), 0.1 * index
         )
 
-    three = [movers(index) for index in range(3)]
-    believed = labels._is_confirmed(three, [spatial.cKDTree(each.positions) for each in three], 1)
-    assert believed.reshape(3, -1).tolist() == [[True] * 125, [False] * 125, [False] * 125]
-    none = three[1]._replace(**{name: getattr(three[1], name)[:0] for name in labels.Movers._fields[:-1]})
+    three = [dynamic_points(index) for index in range(3)]
+    confirmed = labels._is_confirmed(three, [spatial.cKDTree(each.positions) for each in three], 1)
+    assert confirmed.reshape(3, -1).tolist() == [[True] * 125, [False] * 125, [False] * 125]
+    none = three[1]._replace(**{name: getattr(three[1], name)[:0] for name in labels.DynamicPoints._fields[:-1]})
     assert len(labels._is_confirmed([none, none], [None, None], 0)) == 0
 
 
