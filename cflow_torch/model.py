@@ -161,7 +161,7 @@ def _results(batch: Batch, motion: Motion) -> list[FlowResult]:
     results of a batch lie in the same memory, one behind the other."""
     points = slice(batch.rows[0].start, batch.rows[-1].stop)
     cluster, is_valid = motion.cluster(points), batch.has_result[points].clone()
-    residual = motion.residual_flow(points, batch.positions[:, points])
+    residual = motion.residual_flow(points, batch.positions[:, points]).add_(0.0)  # turns -0.0 into 0.0
     cluster_id, score = (values.index_select(0, cluster) for values in (motion.cluster_id, motion.score))
     confidence = motion.confidence
     if confidence is not None:

@@ -1,4 +1,4 @@
-"""Coarse to fine (the paper's multi-scale strategy): estimate, warp the points by the flow so far, repeat finer."""
+"""Coarse to fine (the paper's multi-scale strategy): estimate, warp the points by the flow so far, refine."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from cflow_torch.windows.collation import Batch
 
 
 class CoarseToFine(SceneFlowModel):
-    """What the paper's two methods share. A method writes `motion_at_scale`."""
+    """Base of the paper's two methods. A method implements `motion_at_scale`."""
 
     def motion(self, batch: Batch) -> Motion:
-        """The sum of what all `pixel_sizes` find, coarse to fine."""
+        """Add up the motion of all `pixel_sizes`, coarse to fine."""
         flow, motion = None, None
         for pixel_size in self.config.pixel_sizes:
             if motion is not None:
@@ -31,12 +31,12 @@ class CoarseToFine(SceneFlowModel):
         return replace(motion, before=flow)
 
     def motion_at_scale(self, sweeps: ProjectedSweeps) -> Motion:
-        """What one scale adds to the flow that the sweeps were warped by."""
+        """Estimate the motion that remains after the sweeps were warped by the flow so far."""
         raise NotImplementedError
 
 
 def _flow_so_far(batch: Batch, flow: Tensor | None, motion: Motion) -> Tensor:
-    """(A, P) float64, metres per sweep interval: the sum over the scales, of every point before t+1."""
+    """(A, P) float64, metres per sweep interval: sum of the flow over the scales, for every point before t+1."""
     total = torch.empty_like(batch.positions) if flow is None else flow
     for points in chunks(batch.num_newest, len(batch.image), batch.image.device):
         part, cluster = total[:, points], motion.cluster(points)

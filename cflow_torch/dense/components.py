@@ -1,4 +1,4 @@
-"""Components of binary images: dilated and validated by size (Alg. clustering)."""
+"""Components of binary images: dilated, measured, and split where they are too long (Alg. clustering)."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from cflow_torch.ops.segments import first_of_segment, segment_ends
 
 
 @dataclass(frozen=True)
-class Places:
-    """Where the set pixels of padded images are.
+class PixelIndices:
+    """Set pixels of padded images.
 
     Args:
-        pixel: (P,) int64, flat index.
-        padded_row: (P,) int64, row, counted through all images.
+        pixel: (P,) int64, flat index into the padded images.
+        padded_row: (P,) int64, row of the padded images, counted through all of them.
         row, col: (P,) int64, row and column in the image.
     """
 
@@ -31,11 +31,11 @@ class Places:
 
 
 def label_components(image: Tensor, pixels: Tensor, pixel_size: float, config: ClusteringConfig) -> Tensor:
-    """Components of a dilated image, the oversized ones eroded and labelled again (Alg. clustering).
+    """Label the components of dilated images; erode and label again those that are too long (Alg. clustering).
 
     Args:
         image: (B, H, W) bool.
-        pixels: (P,) int64, flat indices of its set pixels, ascending.
+        pixels: (P,) int64, flat indices of the set pixels, ascending.
         pixel_size: s, metres.
         config: `connectivity`, `max_extent` (d^max), `labeling`.
 
@@ -47,23 +47,22 @@ def label_components(image: Tensor, pixels: Tensor, pixel_size: float, config: C
     image_row, col = split_index(pixels, width)
     window, row = split_index(image_row, height)
     padded_row = torch.add(row, window, alpha=padded.shape[1])
-    places = Places(torch.add(col, padded_row, alpha=padded.shape[2]), padded_row, row, col)
-    return first_of_segment(*components_by_size(padded, height, width, places, pixel_size, config))
+    indices = PixelIndices(torch.add(col, padded_row, alpha=padded.shape[2]), padded_row, row, col)
+    return first_of_segment(*components_by_size(padded, height, width, indices, pixel_size, config))
 
 
 def components_by_size(
-    padded: Tensor, height: int, width: int, places: Places, pixel_size: float, config: ClusteringConfig
+    padded: Tensor, height: int, width: int, indices: PixelIndices, pixel_size: float, config: ClusteringConfig
 ) -> tuple[Tensor, int]:
-    """Component, under any name, of the set pixels of padded images of height x width, and more than the largest.
+    """Component of each set pixel of padded images of height x width, and a number above the largest component.
 
-    All oversized components are eroded together: components of a dilated image do not share a 3 x 3 neighbourhood
-    that lies in their union, so none sees another.
+    We erode all oversized components together. Components of a dilated image do not share a 3 x 3 neighbourhood that
+    lies in their union, so none affects another.
     """
-    dilated = dilate_3x3_kornia(padded) if config.labeling == "kornia" else padded
-    component, count = _components(dilated, places, 3, config)
-    top, bottom = segment_ends(places.row, component, count)
-    left, right = segment_ends(places.col, component, count)
-    # The dilation adds a pixel on every side, cut off at the border.
+    component, count = _components(padded, indices, 3, config)
+    top, bottom = segment_ends(indices.row, component, count)
+    left, right = segment_ends(indices.col, component, count)
+    # The dilation adds a pixel on every side, except at the border of the image.
     num_rows = bottom.clamp_(max=height - 2).sub_(top.clamp_(min=1))
     num_cols = right.clamp_(max=width - 2).sub_(left.clamp_(min=1))
     extent = torch.maximum(num_rows, num_cols).add_(3)
@@ -72,18 +71,19 @@ def components_by_size(
         return component, count
 
     oversized = is_oversized.index_select(0, component)
-    alone = torch.zeros_like(padded).view(-1).scatter_(0, places.pixel, oversized).view_as(padded)
+    alone = torch.zeros_like(padded).view(-1).scatter_(0, indices.pixel, oversized).view_as(padded)
     if config.labeling == "kornia":
         closed = pad([erode_3x3_kornia(dilate_3x3_kornia(alone[:, :height, :width]))])
     else:
         closed = close_3x3(alone, height, width)
-    part, num_parts = _components(closed, places, 1, config)
+    part, num_parts = _components(closed, indices, 1, config)
     return torch.where(oversized, part.add_(count), component), count + num_parts
 
 
-def _components(padded: Tensor, places: Places, reach: int, config: ClusteringConfig) -> tuple[Tensor, int]:
-    """Component of pixels of padded images (kornia: dilated ones if `reach` is 3), and more than the largest."""
+def _components(padded: Tensor, indices: PixelIndices, reach: int, config: ClusteringConfig) -> tuple[Tensor, int]:
+    """Component of each pixel, dilated first if `reach` is 3, and a number above the largest component."""
     if config.labeling == "kornia":
-        return connected_components_kornia(padded, places.pixel, config.connectivity), places.pixel.numel()
+        dilated = dilate_3x3_kornia(padded) if reach == 3 else padded
+        return connected_components_kornia(dilated, indices.pixel, config.connectivity), indices.pixel.numel()
     blocks = label_blocks(padded, config.connectivity, reach)
-    return blocks.of_pixel(places.padded_row, places.col), blocks.num_components
+    return blocks.of_pixel(indices.padded_row, indices.col), blocks.num_components

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Iterator
+from typing import Iterator, NamedTuple
 
 import torch
 from torch import Tensor
@@ -19,22 +19,22 @@ from cflow_torch.ops.indices import flat_nonzero, largest_of_rows, take_columns
 from cflow_torch.ops.segments import segment_amin
 from cflow_torch.ops.window_counts import WindowCounts
 
-# Working memory of a pair per sample of its class: spectra, counts, and what is looked up in them.
+# Working memory of a pair per sample of its class: spectra, counts and tables.
 _BYTES_PER_SAMPLE = 48
-# Samples of templates that are correlated together, and of correlations that are looked through together. On a CPU they
-# are to stay in the cache (2^14 ... 2^26 were tried); a GPU wants few launches.
-_AT_ONCE_CPU, _IN_PART_CPU = 1 << 18, 1 << 21
-_AT_ONCE_GPU, _IN_PART_GPU = 1 << 26, 1 << 26
+# Samples of templates in one call of the correlation, and samples of counts in one run. On a CPU both must stay in the
+# cache (we tried 2^14 ... 2^26); a GPU needs few launches.
+_PER_CALL_CPU, _PER_RUN_CPU = 1 << 18, 1 << 21
+_PER_CALL_GPU, _PER_RUN_GPU = 1 << 26, 1 << 26
 
 
 @dataclass(frozen=True)
 class Estimates:
-    """What every earlier sweep says of the motion of M clusters, nearest sweep first.
+    """Motion of M clusters as estimated from each of K earlier sweeps, nearest sweep first.
 
     Args:
         displacement: (M, K, 3) float64, metres m -> t+1.
         score: (M, K) float32, NCC at the peak.
-        available: (M, K) bool, False = the cluster has no pixel in that sweep; both above are 0 there.
+        available: (M, K) bool, False = the cluster has no pixel in that sweep; displacement and score are 0 there.
         intervals: (M, K) float64, sweep intervals from m to t+1.
     """
 
@@ -48,17 +48,17 @@ class Estimates:
         return self.displacement / self.intervals.clamp(min=1)[:, :, None]
 
     def newest_score(self) -> Tensor:
-        """(M,) float32, that of the nearest sweep with the cluster."""
+        """(M,) float32, score with the nearest sweep that has the cluster."""
         newest = self.available.int().argmax(1, keepdim=True)
         return self.score.gather(1, newest)[:, 0]
 
 
 def correlate(clusters: Clusters, sweeps: ProjectedSweeps, config: DenseConfig) -> Estimates:
-    """Displacement m -> t+1 of every cluster for every earlier sweep m (Alg. scene_flow_1view, view = BEV).
+    """Estimate the displacement m -> t+1 of every cluster from every earlier sweep m (Alg. scene_flow_1view, BEV).
 
     Args:
-        clusters: of the sweeps.
-        sweeps: for the elapsed time of each sweep and the pixel size.
+        clusters: clusters of the sweeps.
+        sweeps: give the elapsed time of each sweep and the pixel size.
         config: `max_speed`, `correlation`, `max_memory`.
 
     Returns:
@@ -78,24 +78,25 @@ def correlate(clusters: Clusters, sweeps: ProjectedSweeps, config: DenseConfig) 
 
 
 def best_shifts(pairs: TemplatePairs, engine: str = "fft", max_memory: float | None = None) -> tuple[Tensor, Tensor]:
-    """The shift of each template that maximises the normalised cross-correlation with its target.
+    """Find the shift of each template that maximises the normalised cross-correlation with its target.
 
     Args:
-        pairs: J of them.
-        engine: "fft" or "conv"; the same result.
-        max_memory: bytes of working memory to plan with; more pairs than fit are processed in turn, with the same
-            result. None = all at once.
+        pairs: J pairs.
+        engine: "fft" or "conv"; the result is identical.
+        max_memory: bytes of working memory to plan with. We process the pairs in runs that fit; the result is
+            identical. None = no limit.
 
     Returns:
         shift: (J, 2) int64, (dy, dx), pixels.
         score: (J,) float32, NCC at that shift, 0 ... 1.
 
     Convention:
-        Searched are dy in [-(H // 2), H - 1 - H // 2] and dx likewise (u in [0, W) x [0, H) of Alg. scene_flow_1view).
-        Ties: smallest |shift|, then smallest dy, then smallest dx. No overlap at all: shift 0, score 0.
-        Counts are integers; they are compared as count^2 / energy in float64, so no device rounds differently.
+        The search range is dy in [-(H // 2), H - 1 - H // 2] and dx in [-(W // 2), W - 1 - W // 2], which is u in
+        [0, W) x [0, H) of Alg. scene_flow_1view. Ties: smallest |shift|, then smallest dy, then smallest dx. Without
+        any overlap the shift is 0 and the score 0. Counts are integers; we compare them as count^2 / energy in
+        float64, so all devices agree.
 
-    Cost: about area log(area) per pair, area as searched; the only Python loop is over size classes.
+    Cost: about area log(area) per pair, with the area that is searched; the only Python loop is over size classes.
     Source: Eq. norm_correlation, displacement_in_bev, Alg. scene_flow_1view.
     """
     num_pairs, device = pairs.cluster.numel(), pairs.size.device
@@ -104,15 +105,13 @@ def best_shifts(pairs: TemplatePairs, engine: str = "fft", max_memory: float | N
     packing = pack(pairs)
     radius = None if pairs.radius is None else pairs.radius.index_select(0, packing.pairs)
     target_energy = packing.energy.index_select(0, packing.clusters + num_pairs)
-    found = [
-        _candidates(*run, packing.search, target_energy, radius) for run in _correlated(packing, engine, max_memory)
-    ]
-    place, dy, dx, count = torch.cat(found, 1)
+    runs = _correlation_runs(packing, engine, max_memory)
+    packed, dy, dx, count = torch.cat([_candidates(run, packing.search, target_energy, radius) for run in runs], 1)
     target = pairs.target
     dy, dx, count, energy = _best_of_each_pair(
         WindowCounts(target.image, target.row, target.col, packing.size),
-        packing.pairs.index_select(0, place),
-        packing.clusters.index_select(0, place),
+        packing.pairs.index_select(0, packed),
+        packing.clusters.index_select(0, packed),
         torch.stack((dy, dx)),
         count,
         num_pairs,
@@ -121,113 +120,108 @@ def best_shifts(pairs: TemplatePairs, engine: str = "fft", max_memory: float | N
     return torch.stack((dy, dx), 1), (count.double() / torch.sqrt(energies.double())).float()
 
 
-def _correlated(
-    packing: Packing, engine: str, max_memory: float | None
-) -> Iterator[tuple[slice, Tensor, list[Tensor]]]:
-    """Runs of packed pairs, their searched counts, one pair after the other, and the same as (n, searched) pieces.
-
-    The counts of a run are overwritten by those of the next.
-    """
-    device, classes = packing.samples.device, packing.classes
-    blocks = packing.samples.split([(found.templates + found.targets) * found.area for found in classes])
-    at_once, in_part = _samples_at_once(device, max_memory)
-    steps = [min(found.templates, max(1, at_once // found.area)) for found in classes]
-    size = max(in_part, *(step * found.searched for step, found in zip(steps, classes)))
-    size = min(size, sum(found.templates * found.searched for found in classes))
-    dtype = torch.float32 if max(found.most for found in classes) < 1 << 24 else torch.float64
-    samples = torch.empty(size, dtype=dtype, device=device)
-    pieces: list[Tensor] = []
-    first_pair = last_pair = used = 0
-    for block, found, step in zip(blocks, classes, steps):
-        images = block.view(-1, found.height, found.width)
-        own = packing.own_on_host[last_pair : last_pair + found.templates]
-        for begin in range(0, found.templates, step):
-            end = min(begin + step, found.templates)
-            wanted, some, stop = own[begin:end], images, used + (end - begin) * found.searched
-            if stop > len(samples):
-                yield slice(first_pair, last_pair), samples[:used], pieces
-                pieces, first_pair, used, stop = [], last_pair, 0, stop - used
-            target = packing.own[last_pair : last_pair + end - begin]
-            # A run of pairs needs a run of targets: both are in the order of clusters.
-            if end - begin < found.templates:
-                targets = images[found.templates + wanted[0] : found.templates + wanted[-1] + 1]
-                target, some = target - int(wanted[0]), torch.cat((images[begin:end], targets))
-            counts = cross_correlate(some.view(torch.uint8).float(), end - begin, target, engine, found.most)
-            piece = samples[used:stop].view(end - begin, -1)
-            pieces.append(piece.copy_(counts.flatten(1)[:, : found.searched]).round_())
-            last_pair, used = last_pair + end - begin, stop
-    yield slice(first_pair, last_pair), samples[:used], pieces
-
-
-def _samples_at_once(device: torch.device, max_memory: float | None) -> tuple[int, int]:
-    """Samples of templates that are correlated together, and of correlations that are looked through together."""
-    at_once, in_part = (_AT_ONCE_CPU, _IN_PART_CPU) if device.type == "cpu" else (_AT_ONCE_GPU, _IN_PART_GPU)
-    if max_memory is not None:
-        most = int(max_memory) // _BYTES_PER_SAMPLE
-        at_once, in_part = min(at_once, most), min(in_part, most)
-    return at_once, in_part
-
-
-def _candidates(
-    part: slice,
-    samples: Tensor,
-    pieces: list[Tensor],
-    search: Search,
-    target_energy: Tensor,
-    radius: Tensor | None,
-) -> Tensor:
-    """Shifts that may be the best of their pair: (4, K) int64, packed pair, dy, dx, count.
-
-    A window holds at least the pixels that coincide and at most all of the target's, so count^2 / energy lies between
-    count^2 / target energy and count. What is below the largest of the lower bounds need not be looked at.
+class _Run(NamedTuple):
+    """Correlation counts of consecutive packed pairs.
 
     Args:
-        part: the pairs that are looked at.
-        samples, pieces: of these pairs, as `_correlated` gives them; samples outside the search are ignored.
-        search: of each packed pair.
+        pairs: the packed pairs.
+        counts: (A,) float, counts of all pairs, one pair after the other; the next run overwrites them.
+        pieces: views of the counts, (pairs, searched samples), one for each call of the correlation.
+    """
+
+    pairs: slice
+    counts: Tensor
+    pieces: list[Tensor]
+
+
+def _correlation_runs(packing: Packing, engine: str, max_memory: float | None) -> Iterator[_Run]:
+    """Correlate all packed pairs, in runs that fit the cache or the memory."""
+    device, classes = packing.samples.device, packing.classes
+    per_call, per_run = (_PER_CALL_CPU, _PER_RUN_CPU) if device.type == "cpu" else (_PER_CALL_GPU, _PER_RUN_GPU)
+    if max_memory is not None:
+        per_call, per_run = (min(size, int(max_memory) // _BYTES_PER_SAMPLE) for size in (per_call, per_run))
+    steps = [min(shape.templates, max(1, per_call // shape.area)) for shape in classes]
+    size = max(per_run, *(step * shape.searched for step, shape in zip(steps, classes)))
+    size = min(size, sum(shape.templates * shape.searched for shape in classes))
+    dtype = torch.float32 if max(shape.max_energy for shape in classes) < 1 << 24 else torch.float64
+    buffer = torch.empty(size, dtype=dtype, device=device)
+    pieces: list[Tensor] = []
+    first = pair = used = 0  # first pair of the run, next pair, samples used by the run
+    blocks = packing.samples.split([(shape.templates + shape.targets) * shape.area for shape in classes])
+    for block, shape, step in zip(blocks, classes, steps):
+        images = block.view(-1, shape.height, shape.width)
+        for begin in range(0, shape.templates, step):
+            num_pairs = min(step, shape.templates - begin)
+            stop = used + num_pairs * shape.searched
+            if stop > len(buffer):
+                yield _Run(slice(first, pair), buffer[:used], pieces)
+                pieces, first, used, stop = [], pair, 0, stop - used
+            called, target = images, packing.target[pair : pair + num_pairs]
+            if num_pairs < shape.templates:  # pairs are in order of targets, so they need a range of targets
+                low, high = packing.target_on_host[[pair, pair + num_pairs - 1]].tolist()
+                targets = images[shape.templates + low : shape.templates + high + 1]
+                called, target = torch.cat((images[begin : begin + num_pairs], targets)), target - low
+            counts = cross_correlate(called.view(torch.uint8).float(), num_pairs, target, engine, shape.max_energy)
+            piece = buffer[used:stop].view(num_pairs, -1)
+            pieces.append(piece.copy_(counts.flatten(1)[:, : shape.searched]).round_())
+            pair, used = pair + num_pairs, stop
+    yield _Run(slice(first, pair), buffer[:used], pieces)
+
+
+def _candidates(run: _Run, search: Search, target_energy: Tensor, radius: Tensor | None) -> Tensor:
+    """Find the shifts that may be the best of their pair: (4, K) int64, packed pair, dy, dx, count.
+
+    The energy of a window is at least the count and at most the energy of the target, so count^2 / energy lies between
+    count^2 / target energy and count. A shift whose count is below the largest of these lower bounds cannot win.
+
+    Args:
+        run: counts; samples outside the search range are ignored.
+        search: search range of each packed pair.
         target_energy: (J,) int64, pixels of each pair's target.
         radius: (J,) float64, pixels; None = no limit.
     """
-    low, high, stride = search.low[:, part], search.high[:, part], search.stride[part]
-    searched = search.searched[part]
+    low, high, stride = search.low[:, run.pairs], search.high[:, run.pairs], search.stride[run.pairs]
+    searched = search.searched[run.pairs]
     end = searched.cumsum(0)
-    # Two samples for a lower bound: no shift, and the largest count, moved into the search if it stands outside.
-    middle, largest = low[0] * stride + low[1], torch.cat([largest_of_rows(piece) for piece in pieces])
+    # Two samples give a lower bound: no shift, and the largest count, moved into the search range if it lies outside.
+    middle, largest = low[0] * stride + low[1], torch.cat([largest_of_rows(piece) for piece in run.pieces])
     dy, dx = torch.minimum(Search(low, high, stride, searched).shift(largest), high)
     probe = middle + dy * stride + dx
     if radius is not None:
-        square = (radius[part] * radius[part]).floor()
+        square = (radius[run.pairs] * radius[run.pairs]).floor()
         probe = torch.where(dy * dy + dx * dx <= square, probe, middle)
     start = end - searched
-    bound = torch.maximum(samples.index_select(0, start + middle), samples.index_select(0, start + probe))
-    # 1 less, because the quotient is rounded; counts of 0 are never better than no shift at all.
-    needed = (bound * bound / target_energy[part] - 1).clamp_(min=0.5)[:, None].split([len(piece) for piece in pieces])
-    place = flat_nonzero(torch.cat([(piece > least).view(-1) for piece, least in zip(pieces, needed)]))
-    pair = torch.searchsorted(end, place, right=True)
-    found = take_columns(torch.cat((low, high, stride[None], start[None])), pair)
-    shift = Search(found[:2], found[2:4], found[4], found[5]).shift(place - found[5])
-    is_searched = (shift <= found[2:4]).all(0)
+    bound = torch.maximum(run.counts.index_select(0, start + middle), run.counts.index_select(0, start + probe))
+    # We subtract 1, because the quotient is rounded; a count of 0 is never better than no shift.
+    needed = (bound * bound / target_energy[run.pairs] - 1).clamp_(min=0.5)[:, None]
+    needed_of_piece = needed.split([len(piece) for piece in run.pieces])
+    sample = flat_nonzero(torch.cat([(piece > least).view(-1) for piece, least in zip(run.pieces, needed_of_piece)]))
+    pair = torch.searchsorted(end, sample, right=True)
+    table = take_columns(torch.cat((low, high, stride[None], start[None])), pair)
+    shift = Search(table[:2], table[2:4], table[4], table[5]).shift(sample - table[5])
+    is_searched = (shift <= table[2:4]).all(0)
     if radius is not None:
         is_searched &= (shift * shift).sum(0) <= square.index_select(0, pair)
-    found = torch.stack((pair + part.start, *shift, samples.index_select(0, place).long()))
+    found = torch.stack((pair + run.pairs.start, *shift, run.counts.index_select(0, sample).long()))
     return take_columns(found, flat_nonzero(is_searched))
 
 
 def _best_of_each_pair(
     windows: WindowCounts, pair: Tensor, target: Tensor, shift: Tensor, count: Tensor, num_pairs: int
 ) -> Tensor:
-    """The best candidate of each pair: (4, J) int64, dy, dx, count, energy, all 0 without any; ties as in
-    `best_shifts`.
+    """Choose the best candidate of each pair: (4, J) int64, dy, dx, count, energy, all 0 for a pair without candidates.
 
     Args:
-        windows: the targets; the energy of a shift (denominator of Eq. norm_correlation) is their pixels under the
-            H x W window at that shift.
-        pair, target, count: (K,) int64, candidates.
-        shift: (2, K) int64, their dy and dx.
+        windows: the targets. The energy of a shift (denominator of Eq. norm_correlation) is the number of target pixels
+            under the H x W window at that shift.
+        pair, target, count: (K,) int64, of each candidate.
+        shift: (2, K) int64, dy and dx of each candidate.
         num_pairs: J.
+
+    Convention: ties as in `best_shifts`.
     """
-    # Bounds of the energy, cheap and close, leave few candidates. Division rounds monotonically: no winner is lost.
-    parts = [windows.bounds(target[some], shift[:, some]) for some in chunks(0, len(pair), pair.device, 16)]
+    # Cheap bounds of the energy leave few candidates. Division rounds monotonically, so no winner is lost.
+    parts = [windows.bounds(target[part], shift[:, part]) for part in chunks(0, len(pair), pair.device, 16)]
     least, most = (torch.cat(bounds) for bounds in zip(*parts)) if parts else (count, count)
     square = (count * count).double()
     bound = square.new_zeros(num_pairs).scatter_reduce_(0, pair, square / most, "amax")
@@ -236,11 +230,11 @@ def _best_of_each_pair(
     energy = windows.count(target, torch.stack((dy, dx)))
     value = square.index_select(0, kept) / energy
     best_value = value.new_zeros(num_pairs).scatter_reduce_(0, pair, value, "amax")
-    # One number that orders shifts: length, then dy, then dx. It fits: images have at most 2^15 pixels a side.
+    # One number orders shifts by length, then dy, then dx. It fits, as images have at most 2^15 pixels a side.
     span, last = 1 << 16, torch.iinfo(torch.int64).max
     order = ((dy * dy + dx * dx) * span + dy + span // 2) * span + dx + span // 2
     order.masked_fill_(value < best_value.index_select(0, pair), last)
     first = segment_amin(order, pair, num_pairs, last)
-    best = torch.zeros((4, num_pairs + 1), dtype=torch.int64, device=pair.device)  # the last one is for the others
+    best = torch.zeros((4, num_pairs + 1), dtype=torch.int64, device=pair.device)  # the last column takes the losers
     best[:, torch.where(order == first.index_select(0, pair), pair, num_pairs)] = torch.stack((dy, dx, count, energy))
     return best[:, :num_pairs]

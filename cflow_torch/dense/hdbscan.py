@@ -1,4 +1,4 @@
-"""Clusters by HDBSCAN in place of connected components (Table which_clustering_method); the rest is unchanged."""
+"""Clusters by HDBSCAN in place of connected components (Table which_clustering_method)."""
 
 from __future__ import annotations
 
@@ -7,21 +7,22 @@ import torch
 from torch import Tensor
 
 from cflow_torch.config import DenseConfig
-from cflow_torch.dense.clustering import Clusters, keep_live
+from cflow_torch.dense.clustering import Clusters, Pixels
 from cflow_torch.dense.projection import ProjectedSweeps
-from cflow_torch.ops.segments import segment_amin
+from cflow_torch.ops.indices import renumber
+from cflow_torch.ops.segments import bounding_boxes, segment_amin
 from cflow_torch.types import CFlowError
 
 
 def find_dense_clusters(sweeps: ProjectedSweeps, config: DenseConfig) -> tuple[Clusters, Tensor, Tensor]:
-    """Spatio-temporal clusters of the aggregated points (t+1, t, t-1, ...) by HDBSCAN on x, y, z.
+    """Cluster the points of all sweeps of each window (t+1, t, t-1, ...) by HDBSCAN on x, y, z.
 
     Args:
-        sweeps: whose points have three axes.
+        sweeps: points with three axes.
         config: `min_cluster_size`.
 
     Returns:
-        clusters: those with pixels at t+1 and before. Unlike components, clusters may share pixels.
+        clusters: M clusters, each with pixels at t+1 and before. Unlike components, clusters may share pixels.
         cluster_of_cell: (P,) int64, cluster of each point, M = none (HDBSCAN's noise included).
         cell_of_point: (P,) int64, 0 ... P - 1: every point is a cell of its own.
 
@@ -29,47 +30,44 @@ def find_dense_clusters(sweeps: ProjectedSweeps, config: DenseConfig) -> tuple[C
         CFlowError: the extra is not installed.
 
     Convention:
-        Numbered by window, then by first pixel in raster order, then by HDBSCAN's label.
+        Clusters are in order of window, then of first pixel in raster order, then of HDBSCAN's label.
 
-    Cost: N log N in points, on the CPU, window by window: a library's work, seconds for a full sweep pair.
+    Cost: N log N in points, on the CPU, window by window; seconds for a full pair of sweeps.
     """
     batch, grid, pixel, positions = sweeps.batch, sweeps.grid, sweeps.pixel, sweeps.positions()
+    area, num_cells = grid.height * grid.width, sweeps.occupancy.numel()
     window = batch.image // batch.num_steps
-    num_pixels = batch.num_windows * batch.num_steps * grid.height * grid.width
     label = torch.full_like(pixel, -1)
     num_labels = 0
     for index in range(batch.num_windows):
-        points = ((pixel < num_pixels) & (window == index)).nonzero()[:, 0]
+        points = ((pixel < num_cells) & (window == index)).nonzero()[:, 0]
         found = torch.from_numpy(hdbscan_labels(positions[:, points].t().cpu().numpy(), config.min_cluster_size))
         label[points] = torch.where(found >= 0, found + num_labels, found).to(label.device)
         num_labels += int(found.max()) + 1 if found.numel() else 0
 
-    # Occupied pixels, once per cluster and sweep.
+    # Occupied pixels, once per label and sweep.
     member = (label >= 0).nonzero()[:, 0]
-    key = torch.unique(label[member] * num_pixels + pixel[member])
-    owner, place = key // num_pixels, key % num_pixels
-    image, raster = place // (grid.height * grid.width), place % (grid.height * grid.width)
+    key = torch.unique(label[member] * num_cells + pixel[member])
+    owner, image, raster = key // num_cells, key % num_cells // area, key % area
+    step = image % batch.num_steps
+    steps_seen = torch.zeros((num_labels, batch.num_steps), dtype=torch.bool, device=key.device)
+    steps_seen[owner, step] = True
+    kept = (steps_seen[:, 0] & steps_seen[:, 1:].any(1)).nonzero()[:, 0]
+    # Labels ascend with the window.
+    first = segment_amin(raster + image // batch.num_steps * area, owner, num_labels, num_cells)
+    kept = kept[first[kept].argsort(stable=True)]
+    cluster_of_label = renumber(kept, num_labels)
 
-    # Name components by window (labels ascend with it), then by first pixel.
-    first = segment_amin(raster, owner, num_labels, grid.height * grid.width)
-    of_window = segment_amin(image // batch.num_steps, owner, num_labels, batch.num_windows)
-    order = torch.sort(of_window * (grid.height * grid.width + 1) + first, stable=True).indices
-    component = torch.empty_like(order).index_copy_(0, order, torch.arange(num_labels, device=order.device))
-    clusters, number = keep_live(
-        component[owner],
-        num_labels,
-        image // batch.num_steps,
-        image % batch.num_steps,
-        raster // grid.width,
-        raster % grid.width,
-    )
-    of_point = torch.full_like(label, clusters.window.numel())
-    of_point[member] = number[component[label[member]]]
-    return clusters, of_point, torch.arange(of_point.numel(), device=of_point.device)
+    is_kept = cluster_of_label[owner] < len(kept)
+    owner, step, raster = cluster_of_label[owner[is_kept]], step[is_kept], raster[is_kept]
+    pixels = Pixels(owner, step, raster // grid.width, raster % grid.width)
+    boxes = bounding_boxes(pixels.row, pixels.col, owner, len(kept))
+    clusters = Clusters(first[kept] // area, *boxes, pixels)
+    return clusters, cluster_of_label[label], torch.arange(len(label), device=label.device)
 
 
 def hdbscan_labels(points: np.ndarray, min_cluster_size: int) -> np.ndarray:
-    """HDBSCAN label of each point.
+    """Label each point by HDBSCAN.
 
     Args:
         points: (N, 3) float64, metres.
@@ -81,7 +79,7 @@ def hdbscan_labels(points: np.ndarray, min_cluster_size: int) -> np.ndarray:
     Raises:
         CFlowError: the extra is not installed.
     """
-    if len(points) <= min_cluster_size:  # too few for the library to build its tree
+    if len(points) <= min_cluster_size:  # the library cannot build its tree from so few points
         return np.full(len(points), -1, dtype=np.int64)
     try:
         from hdbscan import HDBSCAN

@@ -1,4 +1,4 @@
-"""Many estimates of a cluster's motion -> one (Sec. leverage_past_pcs)."""
+"""Pool the estimates from several earlier sweeps into one motion per cluster (Sec. leverage_past_pcs)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from cflow_torch.ops.segments import masked_median
 
 
 def pool(estimates: Tensor, available: Tensor) -> Tensor:
-    """Median of the magnitudes and of the orientations of several estimates, separately.
+    """Combine the median magnitude and the median orientation of several estimates.
 
     Args:
         estimates: (M, K, 3) float64, metres per sweep interval, nearest sweep first; z is pooled on its own.
@@ -19,12 +19,12 @@ def pool(estimates: Tensor, available: Tensor) -> Tensor:
         (M, 3) float64.
 
     Convention:
-        A single estimate is returned as it is. Even counts: mean of the middle two (for orientations: the direction
+        A single estimate is returned unchanged. Even counts: mean of the middle two (for orientations: the direction
         half-way between them). Orientations are ordered by their angle from the circular mean; an estimate of
-        length zero has a magnitude but no orientation. No trigonometric function is used: additions, products,
-        divisions and square roots round the same way on every device.
+        length zero has a magnitude but no orientation. We use no trigonometric function, because additions, products,
+        divisions and square roots round identically on every device.
 
-    Source: Sec. leverage_past_pcs; the paper leaves the even count and the angular median open.
+    Source: Sec. leverage_past_pcs; the paper does not define the even count and the angular median.
     """
     num_estimates = estimates.shape[1]
     first = available.int().argmax(1)
@@ -43,10 +43,10 @@ def pool(estimates: Tensor, available: Tensor) -> Tensor:
 
 
 def _angular_median(unit: Tensor, oriented: Tensor) -> Tensor:
-    """(M, 2) direction in the middle of (M, K, 2) unit vectors, of which only the `oriented` count; 0 if none does."""
+    """(M, 2) median direction of the `oriented` ones among (M, K, 2) unit vectors; 0 if there is none."""
     rows = torch.arange(len(unit), device=unit.device)
     mean = torch.zeros_like(unit[:, 0])
-    for step in range(unit.shape[1]):  # one after the other: the order of a float sum is part of the result
+    for step in range(unit.shape[1]):  # one after the other, because the order of a float sum changes its last bits
         mean = mean + unit[:, step]
     nearest = unit[rows, oriented.int().argmax(1)]
     mean = torch.where((mean == 0).all(1, keepdim=True), nearest, mean)
@@ -56,7 +56,7 @@ def _angular_median(unit: Tensor, oriented: Tensor) -> Tensor:
     total = along.abs() + across.abs()
     slope = torch.where(total > 0, across / torch.where(total > 0, total, torch.ones_like(total)), total)
     behind = torch.where(across >= 0, 2 - slope, -2 - slope)
-    angle = torch.where(along >= 0, slope, behind)  # grows with the angle from the mean, -2 ... 2
+    angle = torch.where(along >= 0, slope, behind)  # -2 ... 2, grows with the angle from the mean
     order = angle.masked_fill(~oriented, float("inf")).sort(dim=1, stable=True).indices
     count = oriented.sum(1)
     low = unit[rows, order[rows, (count - 1).clamp(min=0) // 2]]

@@ -1,4 +1,4 @@
-"""CorrelationFlow, dense (Alg. general_correlation_flow): compensate, project, cluster, correlate, pool, spread."""
+"""CorrelationFlow, the paper's dense method (Alg. general_correlation_flow): project, cluster, correlate, pool."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from cflow_torch.stages import stage
 
 
 class CorrelationFlow(CoarseToFine):
-    """The paper's dense method: windows in, flow out. No parameters, no buffers, no state.
+    """The paper's dense method: windows in, flow out. It has no parameters, no buffers and no state.
 
     Args:
-        config: a `DenseConfig`; `CorrelationFlow.from_preset` makes it from a preset.
+        config: a `DenseConfig`. `CorrelationFlow.from_preset` makes one from a preset.
 
     Example:
         >>> from cflow_torch import CorrelationFlow, Sweep, Window
@@ -35,11 +35,11 @@ class CorrelationFlow(CoarseToFine):
 
     @property
     def num_axes(self) -> int:  # type: ignore[override]
-        """Coordinates of points that are asked for."""
+        """Number of point coordinates that the settings need: 2 (x, y) or 3."""
         return 3 if self.config.sectional_view or self.config.clustering == "hdbscan" else 2
 
     def motion_at_scale(self, sweeps: ProjectedSweeps) -> Motion:
-        """One pass of Alg. general_correlation_flow over sweeps that are compensated, warped and projected."""
+        """Estimate the motion of every cluster at one pixel size."""
         config = self.config
         with stage("cluster"):
             find = find_dense_clusters if config.clustering == "hdbscan" else find_clusters
@@ -47,15 +47,13 @@ class CorrelationFlow(CoarseToFine):
         with stage("correlate"):
             estimates = correlate(clusters, sweeps, config)
             if config.sectional_view:
-                estimates = add_sectional_view(
-                    estimates, cluster_of_cell.index_select(0, cell_of_point), sweeps, config
-                )
+                cluster_of_point = cluster_of_cell.index_select(0, cell_of_point)
+                estimates = add_sectional_view(estimates, cluster_of_point, sweeps, config)
         with stage("pool"):
-            flow = pool(estimates.per_interval(), estimates.available)
             return Motion(
                 cluster_of_cell=cluster_of_cell,
                 cell_of_point=cell_of_point,
-                flow=F.pad(flow + 0.0, (0, 0, 0, 1)),  # + 0.0 turns -0.0 into 0.0
+                flow=F.pad(pool(estimates.per_interval(), estimates.available), (0, 0, 0, 1)),
                 cluster_id=F.pad(clusters.id_in_window(), (0, 1), value=-1),
                 score=F.pad(estimates.newest_score(), (0, 1)),
             )

@@ -1,4 +1,4 @@
-"""Sweeps as images: every sweep warped by the flow so far and projected to the bird's-eye view (Eq. 3d_to_bev)."""
+"""Project all sweeps, warped by the flow so far, to occupancy images of the bird's-eye view (Eq. 3d_to_bev)."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ class ProjectedSweeps:
 
     Args:
         batch: points of all windows.
-        grid: the BEV.
-        flow: (A, P) float64, metres per sweep interval, flow so far of every point before t+1; None = none yet.
+        grid: pixels of the bird's-eye view.
+        flow: (A, P) float64, metres per sweep interval, flow so far of every point before t+1. None = no flow yet.
         occupancy: (B, S, H, W) bool; index 0 of S is sweep t+1.
-        pixel: (P,) int64, flat index into `occupancy`; its size for points that do not take part.
+        pixel: (P,) int64, flat index into `occupancy`; its size for ignored points.
     """
 
     batch: Batch
@@ -31,7 +31,7 @@ class ProjectedSweeps:
     pixel: Tensor
 
     def positions(self) -> Tensor:
-        """(A, P) float64, metres, frame of t+1: the points where they were projected."""
+        """(A, P) float64, metres, frame of t+1: the warped positions of all points."""
         if self.flow is None:
             return self.batch.positions
         before = slice(self.batch.num_newest, None)
@@ -43,10 +43,10 @@ def project(batch: Batch, flow: Tensor | None, grid: Grid) -> ProjectedSweeps:
 
     Args:
         batch: points of all windows.
-        flow: as in `ProjectedSweeps`.
-        grid: the BEV.
+        flow: (A, P) float64, metres per sweep interval, or None, see `ProjectedSweeps`.
+        grid: pixels of the bird's-eye view.
 
-    Convention: points that are warped out of the region do not take part at this scale.
+    Convention: points that are warped out of the region are ignored at this scale.
 
     Cost: linear in points.
     """
@@ -65,6 +65,6 @@ def project(batch: Batch, flow: Tensor | None, grid: Grid) -> ProjectedSweeps:
 
 
 def _warp(batch: Batch, flow: Tensor, points: slice) -> Tensor:
-    """(A, K) float64, metres: some points before t+1, moved by the flow so far."""
+    """(A, K) float64, metres: points before t+1, each moved by the flow so far times its interval to t+1."""
     intervals = batch.elapsed.flatten().index_select(0, batch.image[points])
     return (flow[:, points] * intervals).add_(batch.positions[:, points])

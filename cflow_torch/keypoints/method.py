@@ -60,7 +60,7 @@ class CorrelationFlowKeypoints(CoarseToFine):
             return Motion(
                 cluster_of_cell=of_pixel,
                 cell_of_point=sweeps.pixel,
-                flow=F.pad(dense.shift.flip(1) * pixel_size + 0.0, (0, 1, 0, 1)),  # (dy, dx) -> (x, y, 0); no -0.0
+                flow=F.pad(dense.shift.flip(1) * pixel_size, (0, 1, 0, 1)),  # (dy, dx) -> (x, y, 0)
                 cluster_id=F.pad(dense.number, (0, 1), value=-1),
                 score=F.pad(dense.score.float(), (0, 1)),
             )

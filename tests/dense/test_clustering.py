@@ -55,6 +55,7 @@ def test_a_cluster_needs_pixels_at_t1_and_before():
     images[0, 0, 2, [1, 12, 20]] = True  # t+1
     images[0, 1, 2, [6, 12]] = True  # t
     images[0, 2, 2, 22] = True  # t-1: together with the last one of t+1
-    clusters, columns = cluster_images(torch.from_numpy(images), 0.25, config())
+    clusters, cluster_of_cell = cluster_images(torch.from_numpy(images), 0.25, config())
     assert clusters.first.tolist() == [[2, 12], [2, 20]]
-    assert dict(zip((columns.pixel - 60).tolist(), columns.cluster.tolist())) == {1: 2, 6: 2, 12: 0, 20: 1, 22: 1}
+    row = cluster_of_cell[:-1].view(3, 5, 30)[:, 2]
+    assert row[0, [1, 12, 20]].tolist() == [2, 0, 1] and row[1, [6, 12]].tolist() == [2, 0] and row[2, 22] == 1
