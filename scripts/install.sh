@@ -5,7 +5,7 @@
 set -euo pipefail
 ROOT="$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)"
 PYTHON="$ROOT/.venv/bin/python"
-WANTED="$(cat "$ROOT/scripts/constraints.txt" "$ROOT/pyproject.toml" | cksum)"
+WANTED="$(cat "$ROOT"/scripts/{constraints,evaluators}.txt "$ROOT/pyproject.toml" | cksum)"
 
 if [ "$(cat "$ROOT/.venv/installed-$STAMP" 2>/dev/null || true)" != "$WANTED" ]; then
   if [ ! -x "$PYTHON" ]; then
@@ -30,6 +30,9 @@ if [ "$(cat "$ROOT/.venv/installed-$STAMP" 2>/dev/null || true)" != "$WANTED" ];
   # Where pip finds a CPU build of the pinned torch, it takes that one, which spares gigabytes. What has no wheel, and the
   # package itself, is built with the setuptools of the line above.
   (cd "$ROOT" && "${install[@]}" --no-build-isolation --editable ".[$EXTRAS]")
+  if [ "$STAMP" = test ]; then
+    "${install[@]}" --no-deps --requirement "$ROOT/scripts/evaluators.txt"
+  fi
   echo "$WANTED" >"$ROOT/.venv/installed-$STAMP"
   if [ "$STAMP" = test ]; then
     echo "$WANTED" >"$ROOT/.venv/installed-demo"  # part of it

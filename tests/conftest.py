@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import os
 import sys
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 from typing import Iterator
 from unittest.mock import MagicMock
 
 import pytest
-
-WHY_SKIPPED = "the public evaluator is not installed: see docs/evaluation.md"
 
 
 @pytest.fixture(scope="session")
@@ -42,14 +42,32 @@ def kitti_file(data_root: Path) -> Path:
     return file
 
 
+@contextmanager
+def public_evaluator(module: str, drawing: str) -> Iterator[ModuleType]:
+    """Import a public evaluator, with a mock of the package that it only draws with if that is not installed."""
+    if importlib.util.find_spec(module.partition(".")[0]) is None:
+        pytest.skip(f"{module} is not installed: see docs/evaluation.md")
+    is_mocked = drawing not in sys.modules and importlib.util.find_spec(drawing) is None
+    if is_mocked:
+        sys.modules[drawing] = MagicMock()
+    try:
+        yield importlib.import_module(module)
+    finally:
+        if is_mocked:
+            del sys.modules[drawing]
+
+
+@pytest.fixture(scope="module")
+def av2_tools() -> Iterator[ModuleType]:
+    """`av2.evaluation.scene_flow`, with the modules that the tests use."""
+    with public_evaluator("av2.evaluation.scene_flow", "numba") as package:
+        for name in ("eval", "make_annotation_files", "make_submission_archive", "utils"):
+            importlib.import_module(f"{package.__name__}.{name}")
+        yield package
+
+
 @pytest.fixture(scope="module")
 def bsfe() -> Iterator[ModuleType]:
-    """bucketed_scene_flow_eval.datasets; open3d, which it imports for its viewer alone, is replaced by a mock."""
-    if importlib.util.find_spec("bucketed_scene_flow_eval") is None:
-        pytest.skip(WHY_SKIPPED)
-    mocked = "open3d" not in sys.modules and importlib.util.find_spec("open3d") is None
-    if mocked:
-        sys.modules["open3d"] = MagicMock()
-    yield pytest.importorskip("bucketed_scene_flow_eval.datasets", reason=WHY_SKIPPED)
-    if mocked:
-        del sys.modules["open3d"]
+    """`bucketed_scene_flow_eval.datasets`."""
+    with public_evaluator("bucketed_scene_flow_eval.datasets", "open3d") as package:
+        yield package

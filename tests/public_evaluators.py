@@ -1,4 +1,4 @@
-"""Frames and logs for the public evaluators, and their numbers beside ours."""
+"""Frames and logs for the public evaluators, and the comparison of their numbers with ours."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def score(definition: Any, frames: Iterable[EvalFrame]) -> dict[str, Any]:
 
 
 def check(label: str, numbers: Comparison) -> None:
-    """No number of ours differs from theirs by more than the tolerance; NaN where theirs is NaN."""
+    """Assert that no number of ours differs from theirs by more than the tolerance; NaN equals NaN."""
     ours, theirs = np.array(list(numbers.values()), dtype=np.float64).T
     difference = np.where(np.isnan(ours) & np.isnan(theirs), 0.0, np.abs(ours - theirs))
     difference[np.isnan(difference)] = np.inf
@@ -73,6 +73,11 @@ def read_pair(folder: Path) -> Pair:
         T_float32=np.load(folder / "ego_motion.npz")["ego_motion"][0].astype(np.float64),
         T_float64=np.linalg.inv(following.pose) @ now.pose,
     )
+
+
+def official_mask(pair: Pair) -> np.ndarray:
+    """Points that the challenge of 2023 scores."""
+    return ~pair.is_ground & (np.abs(pair.points[:, :2]) <= 50).all(axis=1)
 
 
 def predictions(pair: Pair) -> dict[str, np.ndarray]:
@@ -120,7 +125,7 @@ def write_table(file: Path, **columns: np.ndarray) -> None:
 
 
 def write_bsfe_truth(root: Path, truths: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> Path:
-    """Truth as its loader wants it: residual in the axes of t, category one lower than Argoverse 2's, valid rows."""
+    """Write truth for its loader: residual in the axes of t, category one lower than Argoverse 2's, valid rows."""
     for number, (residual, category, is_valid) in enumerate(truths):
         columns = dict(zip(FLOW, np.ascontiguousarray(residual.T)))
         classes = category.astype(np.int8) - np.int8(1)
@@ -129,7 +134,7 @@ def write_bsfe_truth(root: Path, truths: Sequence[tuple[np.ndarray, np.ndarray, 
 
 
 def write_log(root: Path, made: Sequence[MadeUp]) -> Path:
-    """Raw log of made-up frames, and of the first one again: some ground on a raster, poses that chain the T."""
+    """Write a raw log of made-up frames and the first one again: a ground raster, and poses that chain the T."""
     folder, pose = root / LOG, np.eye(4)
     rows: list[list[float]] = []
     for number, frame in enumerate([*made, made[0]]):
@@ -152,7 +157,7 @@ def write_log(root: Path, made: Sequence[MadeUp]) -> Path:
 
 
 def bucket_numbers(ours: dict[str, Any], evaluator: Any, output: Path, distance: float = 35) -> Comparison:
-    """Per class, the mean over classes, and per bucket: points, mean error, mean speed."""
+    """Numbers per class, their means over classes, and points, mean error and mean speed per bucket."""
     from bucketed_scene_flow_eval.eval.base_per_frame_sceneflow_eval import PerFrameSceneFlowEvaluator
 
     numbers: Comparison = {}

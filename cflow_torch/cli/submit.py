@@ -1,13 +1,15 @@
-"""Archive for a public leaderboard: OUTPUT/v<version>.zip, made of the files in OUTPUT/v<version>/, checked before it
-is left there. The same command again resumes. OUTPUT/config.yaml holds settings and versions.
+"""Write the archive for a public leaderboard: OUTPUT/v<version>.zip, from the files in OUTPUT/v<version>/.
 
-version=1: total flow of the points of the evaluation masks, 2023; version=2: residual flow of all points, 2024;
+The archive is checked and stays only if it passes. The same command again resumes. OUTPUT/config.yaml contains the
+settings and versions.
+
+version=1: Argoverse 2 scene flow 2023, total flow of the points of the evaluation masks.
 version=3: the multi-dataset challenge of 2026, residual flow of all points.
 
 examples:
   cflow submit data=hdf5 data.root=/data/challenge_public/test version=3
   cflow submit data=av2 data.root=/data/av2/test version=1 masks=/data/av2/test-masks.zip
-  cflow submit data=hdf5 data.root=/data/challenge_public/test version=3 archive=mine.zip    checks, changes nothing
+  cflow submit data=hdf5 data.root=/data/challenge_public/test version=3 archive=mine.zip    only checks
 """
 
 from __future__ import annotations
@@ -26,12 +28,18 @@ from cflow_torch.cli.run import Failures
 from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.log import Log, window
 from cflow_torch.data.records import json_ready
-from cflow_torch.evaluation.submission.check import check_submission
-from cflow_torch.evaluation.submission.encode import RESIDUAL_AXES, Rounding, encode
-from cflow_torch.evaluation.submission.masks import MaskArchive, log_mask, point_mask
-from cflow_torch.evaluation.submission.plan import Frame, PlannedFrame, plan_log, read_frame_list, require_logs
-from cflow_torch.evaluation.submission.versions import SubmissionVersion, get_version
-from cflow_torch.evaluation.submission.write import is_complete, pack, write_frame, write_metadata
+from cflow_torch.evaluation.submission.archive import check_submission, is_complete, pack, write_frame
+from cflow_torch.evaluation.submission.formats import Rounding, SubmissionVersion, encode, get_version
+from cflow_torch.evaluation.submission.frames import (
+    Frame,
+    MaskArchive,
+    PlannedFrame,
+    log_mask,
+    plan_log,
+    point_mask,
+    read_frame_list,
+    require_logs,
+)
 from cflow_torch.fleet.manifest import claim_folder
 from cflow_torch.fleet.progress import frames as counted
 from cflow_torch.stages import StopWatch
@@ -40,18 +48,16 @@ from cflow_torch.types import CFlowError, Window
 Plan = List[Tuple[PlannedFrame, Frame]]
 _Masks = Optional[MaskArchive]
 _Listed = Optional[Mapping[str, Sequence[int]]]
-_SETTINGS = ("version", "model", "data", "frames", "masks", "residual_axes")  # a file depends on these, and no others
+_SETTINGS = ("version", "model", "data", "frames", "masks")  # a file depends on these only
 
 
 def task(cfg: DictConfig) -> None:
     """Run `cflow submit`."""
     version, output = get_version(cfg.version), run.output_folder(cfg)
-    if cfg.residual_axes not in RESIDUAL_AXES:
-        raise CFlowError(f"residual_axes is one of {', '.join(RESIDUAL_AXES)}, got {cfg.residual_axes!r}")
-    if cfg.masks is not None and version.rows != "masked":
-        raise CFlowError(f"version {version.number} takes every point: masks= is for version 1 alone")
+    if cfg.masks is not None and not version.is_masked:
+        raise CFlowError(f"version {version.number} contains every point: masks= is only for version 1")
     if cfg.masks is not None and cfg.frames is not None:
-        raise CFlowError("masks= says which frames are evaluated: leave frames= out")
+        raise CFlowError("masks= already lists the frames that are evaluated: leave frames= out")
     masks = None if cfg.masks is None else MaskArchive(cfg.masks)
     listed = read_frame_list(cfg.frames) if cfg.frames is not None else None if masks is None else masks.frames
     model = StopWatch(run.make_model(cfg))
@@ -59,16 +65,15 @@ def task(cfg: DictConfig) -> None:
     plan, unreadable = _plan(logs, version, listed, masks)
     failures += unreadable
     if cfg.archive is not None:
-        run.finish(failures)  # a log that cannot be read leaves open what the archive must hold
+        run.finish(failures)  # what the archive must contain is unknown if a log cannot be read
         _check(cfg.archive, version, plan)
         return
     folder, file = output / f"v{version.number}", output / f"v{version.number}.zip"
     _claim(cfg, output, folder, file)
     failures += _write(cfg, plan, model, version, masks, folder)
     run.finish(failures)
-    write_metadata(folder, version)
     _check(folder, version, plan)
-    pack(folder, [frame.name for _, frame in plan], file, version)
+    pack(folder, [frame.name for _, frame in plan], file)
     try:
         _check(file, version, plan)
     except SystemExit:  # the archive stays only if it passes
@@ -78,7 +83,7 @@ def task(cfg: DictConfig) -> None:
 
 
 def _claim(cfg: DictConfig, output: Path, folder: Path, file: Path) -> None:
-    """Take the output folder for these settings; files of other settings are never mixed in."""
+    """Claim the output folder for these settings, so that files of other settings are never mixed in."""
     settings: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
     identity = json_ready({**{name: settings[name] for name in _SETTINGS}, "cflow_torch": __version__})
     ensure_writable(output)
@@ -90,13 +95,13 @@ def _claim(cfg: DictConfig, output: Path, folder: Path, file: Path) -> None:
 
 
 def _plan(logs: Sequence[Log], version: SubmissionVersion, listed: _Listed, masks: _Masks) -> tuple[Plan, Failures]:
-    """The frames that are needed, with their rows; those whose sweep cannot be read are reported."""
+    """List the frames that are needed, with their rows; collect those whose sweep cannot be read."""
     require_logs(logs, listed)
-    frames = [frame for log in logs for frame in plan_log(log, version, listed)]
+    frames = [frame for log in logs for frame in plan_log(log, listed)]
     if not frames:
-        raise CFlowError("no frame to submit: the logs are too short, or the list names none of their sweeps")
-    if version.rows == "masked" and masks is None and any(log_mask(f.log, f.index) is None for f in frames):
-        print("no masks given: the official rule, computed here, can differ by a point from the server's masks")
+        raise CFlowError("there is no frame to submit: the logs are too short, or the list names none of their sweeps")
+    if version.is_masked and masks is None and any(log_mask(f.log, f.index) is None for f in frames):
+        print("no masks given: the official rule is applied, which can differ by a point from the server's masks")
     plan: Plan = []
     failures: Failures = []
     for frame in counted(frames, "rows"):
@@ -108,7 +113,7 @@ def _plan(logs: Sequence[Log], version: SubmissionVersion, listed: _Listed, mask
 def _write(
     cfg: DictConfig, plan: Plan, model: StopWatch, version: SubmissionVersion, masks: _Masks, folder: Path
 ) -> Failures:
-    """Estimate and write the frames that are not there yet."""
+    """Estimate and write the frames that do not exist yet."""
     failures: Failures = []
     rounding, config = Rounding(), model.config
     todo = [pair for pair in plan if not is_complete(folder, pair[1], version)]
@@ -119,8 +124,8 @@ def _write(
     for (planned, frame), estimate in estimates(model, todo, read):
         with run.reported(failures, frame.name):
             sweeps, result = estimate()
-            mask = point_mask(planned.log, planned.index, sweeps.pc0, masks) if version.rows == "masked" else None
-            columns, lost = encode(version, sweeps, result, mask, cfg.residual_axes)
+            mask = point_mask(planned.log, planned.index, sweeps.pc0, masks) if version.is_masked else None
+            columns, lost = encode(version, result, sweeps.pc0.is_ground, mask)
             write_frame(folder, frame.name, columns)
             rounding.add(lost)
     print(f"frames written: {len(todo) - len(failures)}, already there: {len(plan) - len(todo)}")
@@ -130,10 +135,10 @@ def _write(
 
 
 def _check(path: Any, version: SubmissionVersion, plan: Plan) -> None:
-    """Print what was checked; list every problem and end the process with status 1 if there is one."""
+    """Print what was checked. If there are problems, list them all and exit with status 1."""
     problems = check_submission(path, version, [frame for _, frame in plan])
     if problems:
-        print(f"{path} is no version {version.number} submission for this data:", file=sys.stderr)
+        print(f"{path} is not a valid version {version.number} submission for this data:", file=sys.stderr)
         for problem in problems:
             print(f"  {problem}", file=sys.stderr)
         print(f"problems: {len(problems)}", file=sys.stderr)

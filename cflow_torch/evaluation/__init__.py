@@ -2,8 +2,7 @@
 
 from cflow_torch.evaluation.definitions import DEFINITIONS, Definition
 from cflow_torch.evaluation.frame import EvalFrame
-from cflow_torch.evaluation.metrics import SceneFlowMetrics
-from cflow_torch.evaluation.protocol import ProtocolScores, errors_by_range, score_data_sets
+from cflow_torch.evaluation.metrics import ProtocolScores, SceneFlowMetrics, errors_by_range, score_data_sets
 from cflow_torch.evaluation.tables import format_table
 
 __all__ = [

@@ -1,4 +1,4 @@
-"""What every metric shares: scored points go into cells frame by frame, parts that were scored apart are merged."""
+"""The base class of all metrics: sums per cell, added frame by frame, that can be merged."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from typing import Sequence
 import numpy as np
 
 from cflow_torch.evaluation.definitions import Definition, get_definition
-from cflow_torch.evaluation.masks import ScoredPoints
+from cflow_torch.evaluation.scored_points import ScoredPoints
 from cflow_torch.types import CFlowError
 
 
 class Accumulator(ABC):
-    """Points counted, and their values summed up, per cell; frames in any order.
+    """Counts points and sums their values per cell; frames come in any order.
 
     Args:
         definition: name or `Definition`.
 
     Attributes:
-        count: int64, points of each cell.
-        sums: float64, one array of the same shape per quantity.
+        count: int64, number of points of each cell.
+        sums: float64, one array of the shape of `count` per quantity.
     """
 
     totals: tuple[str, ...] = ("count", "sums")  # attributes that add up over frames
@@ -33,11 +33,11 @@ class Accumulator(ABC):
 
     @abstractmethod
     def shape(self) -> tuple[int, ...]:
-        """Numbers of cells along each axis."""
+        """Number of cells along each axis."""
 
     @abstractmethod
     def cells(self, scored: ScoredPoints) -> tuple[np.ndarray, Sequence[np.ndarray]]:
-        """(K,) int64 flat cell of the points that count, and their quantities, (K,) float64 each."""
+        """Flat cell of each scored point, (K,) int64, and its quantities, (K,) float64 each."""
 
     def update_points(self, scored: ScoredPoints) -> None:
         """Add the scored points of one frame."""
@@ -47,12 +47,12 @@ class Accumulator(ABC):
         self._add(np.bincount(cell, minlength=size).reshape(self.count.shape), sums.reshape(self.sums.shape))
 
     def _add(self, count: np.ndarray, sums: np.ndarray) -> None:
-        """Add what one frame has in each cell."""
+        """Add the cells of one frame."""
         self.count += count
         self.sums += sums
 
     def merge(self, other: Accumulator) -> None:
-        """Add what another accumulator of the same kind and definition has seen.
+        """Add the frames of another accumulator of the same kind and definition.
 
         Raises:
             CFlowError: the kinds or definitions differ.

@@ -1,6 +1,7 @@
-"""Dynamic bucket-normalised end-point error: error divided by speed, averaged over speed buckets, per class or range.
+"""Dynamic bucket-normalised end-point error, per class or range, and the range-wise end-point error of SSF.
 
-And the plain end-point error of static and dynamic points by distance from the sensor (the metric of SSF).
+The first divides the error by the speed and averages over speed buckets. The second is the mean error in metres of
+static and dynamic points, by distance from the sensor.
 """
 
 from __future__ import annotations
@@ -12,22 +13,22 @@ import numpy as np
 from cflow_torch.data.categories import META_NAMES, meta_class
 from cflow_torch.evaluation.accumulator import Accumulator
 from cflow_torch.evaluation.definitions import Definition, interval_of, range_names
-from cflow_torch.evaluation.masks import ScoredPoints
+from cflow_torch.evaluation.scored_points import ScoredPoints
 
 _MEANS = ("static_epe", "dynamic_error")
 
 
 def mean_of_present(values: np.ndarray) -> float:
-    """Mean of the values that are not NaN; NaN where there are none."""
+    """Average the values that are not NaN; NaN if there are none."""
     count = (~np.isnan(values)).sum()
     return float(np.nansum(values) / count) if count else float("nan")
 
 
 def bucket_cells(scored: ScoredPoints, definition: Definition) -> tuple[np.ndarray, np.ndarray]:
-    """Class and speed bucket of each point.
+    """Compute the cell (class and speed bucket) of each point.
 
     Returns:
-        (M,) int64, cell = class * number of buckets + bucket; (M,) bool, False where a point has no cell.
+        (M,) int64 cell = class * number of buckets + bucket, and (M,) bool, False where a point has no cell.
     """
     meta, bucket = meta_class(scored.category), interval_of(scored.speed, definition.speed_edges)
     if definition.background == "static":
@@ -36,7 +37,7 @@ def bucket_cells(scored: ScoredPoints, definition: Definition) -> tuple[np.ndarr
 
 
 def bucket_scores(count: np.ndarray, error_sum: np.ndarray, speed_sum: np.ndarray) -> dict[str, Any]:
-    """Scores of (classes, buckets) sums: the "classes" and "mean" that `BucketedEPE.compute` returns."""
+    """Compute "classes" and "mean" of `BucketedEPE.compute` from sums of shape (classes, buckets)."""
     with np.errstate(divide="ignore", invalid="ignore"):
         epe = error_sum / count
         speed = speed_sum / count
@@ -63,12 +64,12 @@ def bucket_scores(count: np.ndarray, error_sum: np.ndarray, speed_sum: np.ndarra
 class BucketedEPE(Accumulator):
     """Streaming dynamic bucket-normalised EPE.
 
-    With e and v the mean end-point error and mean true speed of all points of a class in a bucket, over all frames:
-    `static_epe` = e of the first bucket in metres; `dynamic_error` = mean of e / v over the other buckets that have
-    points, each bucket with the same weight. A prediction of "nothing moves" has a dynamic error of exactly 1.
+    Let e and v be the mean end-point error and the mean true speed of all points of a class in a bucket, over all
+    frames. `static_epe` is e of the first bucket, in metres. `dynamic_error` is the mean of e / v over the other
+    buckets that have points, each bucket with the same weight. It is exactly 1 if every residual is predicted as 0.
 
-    Convention: a bucket holds its lower edge, not its upper one; classes without points are NaN and do not enter the
-    mean over classes.
+    Convention: a bucket contains its lower edge, not its upper one. Classes without points are NaN and are not part of
+    the mean over classes.
     """
 
     def shape(self) -> tuple[int, ...]:
@@ -76,13 +77,13 @@ class BucketedEPE(Accumulator):
         return len(META_NAMES), len(self.definition.speed_edges) - 1
 
     def cells(self, scored: ScoredPoints) -> tuple[np.ndarray, Sequence[np.ndarray]]:
-        """Class and bucket; error and speed."""
+        """Cells are class and bucket; quantities are error and speed."""
         cell, keep = bucket_cells(scored, self.definition)
         keep &= scored.in_region
         return cell[keep], (scored.error[keep], scored.speed[keep])
 
     def compute(self) -> dict[str, Any]:
-        """Scores so far.
+        """Return the scores so far.
 
         Returns:
             "classes": per meta class `static_epe` (metres), `dynamic_error` (ratio), `num_static`, `num_dynamic`
@@ -96,10 +97,10 @@ class BucketedByRange(Accumulator):
     """Streaming `BucketedEPE` of every range between the definition's `region_edges`, in one pass.
 
     Args:
-        definition: name or `Definition`; its `region` ("box" or "disc"), `region_axes` and `closed` tell how a range is
-            measured, its `max_range` does not apply.
+        definition: name or `Definition`. Its `region` ("box" or "disc"), `region_axes` and `closed` define how a range
+            is measured; its `max_range` does not apply.
 
-    Convention: each point is in one range at most; a range's scores are those of a `BucketedEPE` of its points.
+    Convention: each point is in at most one range. The scores of a range are those of a `BucketedEPE` of its points.
     """
 
     def shape(self) -> tuple[int, ...]:
@@ -107,18 +108,18 @@ class BucketedByRange(Accumulator):
         return len(self.definition.region_edges) - 1, len(META_NAMES), len(self.definition.speed_edges) - 1
 
     def cells(self, scored: ScoredPoints) -> tuple[np.ndarray, Sequence[np.ndarray]]:
-        """Range, class and bucket; error and speed."""
+        """Cells are range, class and bucket; quantities are error and speed."""
         cell, keep = bucket_cells(scored, self.definition)
-        number = interval_of(scored.reach, self.definition.region_edges, self.definition.closed)
-        keep &= number >= 0
-        return (number * self.count[0].size + cell)[keep], (scored.error[keep], scored.speed[keep])
+        ring = interval_of(scored.reach, self.definition.region_edges, self.definition.closed)
+        keep &= ring >= 0
+        return (ring * self.count[0].size + cell)[keep], (scored.error[keep], scored.speed[keep])
 
     def compute(self) -> dict[str, Any]:
-        """Scores so far.
+        """Return the scores so far.
 
         Returns:
-            "ranges": "0-35", ... -> "classes" and "mean" as `BucketedEPE` gives them; "mean": `static_epe`,
-            `dynamic_error`, mean over all ranges, NaN if a range has no points to score; "speed_edges".
+            "ranges": "0-35", ... -> "classes" and "mean" as of `BucketedEPE`; "mean": `static_epe` and `dynamic_error`,
+            means over all ranges, NaN if a range has no points to score; "speed_edges".
         """
         names = range_names(self.definition.region_edges)
         ranges = {name: bucket_scores(*sums) for name, *sums in zip(names, self.count, *self.sums)}
@@ -127,10 +128,10 @@ class BucketedByRange(Accumulator):
 
 
 class RangeWiseEPE(Accumulator):
-    """Streaming range-wise EPE; the definition's region does not apply, every category counts.
+    """Streaming range-wise EPE of all categories. The definition's region does not apply.
 
-    Convention: distance includes height; a range holds its lower edge, not its upper one; means are over all points
-    of all frames; "mean" weighs every range that has points the same.
+    Convention: distance includes height. A range contains its lower edge, not its upper one. Means are over all points
+    of all frames; "mean" gives every range that has points the same weight.
     """
 
     num_quantities = 1
@@ -140,15 +141,15 @@ class RangeWiseEPE(Accumulator):
         return len(self.definition.range_edges) - 1, 2
 
     def cells(self, scored: ScoredPoints) -> tuple[np.ndarray, Sequence[np.ndarray]]:
-        """Range and motion; error."""
-        number = interval_of(scored.distance, self.definition.range_edges)
-        # speed times rate, not divided by the interval: the product is what the harness compares
+        """Cells are range and motion; the quantity is the error."""
+        ring = interval_of(scored.distance, self.definition.range_edges)
+        # We multiply by the rate, as OpenSceneFlow does: a division rounds differently at the threshold.
         dynamic = scored.speed * (1.0 / self.definition.sweep_interval) >= self.definition.range_dynamic_speed
-        keep = number >= 0
-        return (2 * number + dynamic)[keep], (scored.error[keep],)
+        keep = ring >= 0
+        return (2 * ring + dynamic)[keep], (scored.error[keep],)
 
     def compute(self) -> dict[str, Any]:
-        """Per range ("0-35", ...) `static_epe`, `dynamic_epe` in metres, `num_static`, `num_dynamic`; and "mean"."""
+        """Return `static_epe`, `dynamic_epe` (metres), `num_static`, `num_dynamic` of each range, and their "mean"."""
         with np.errstate(divide="ignore", invalid="ignore"):
             epe = self.sums[0] / self.count
         result: dict[str, Any] = {

@@ -1,4 +1,4 @@
-"""What exactly is scored: the choices in which the public evaluators differ, as one frozen dataclass."""
+"""Definitions of evaluations: the choices in which the public evaluators differ, as one frozen dataclass."""
 
 from __future__ import annotations
 
@@ -19,38 +19,38 @@ REGION_EDGES: Tuple[float, ...] = (0.0, 35.0, 70.0)
 
 @dataclass(frozen=True)
 class Definition:
-    """Choices of an evaluation. `dataclasses.replace(definition, ...)` changes single ones.
+    """Choices of an evaluation. `dataclasses.replace(definition, ...)` changes single choices.
 
     Args:
-        name: label that goes with every number.
+        name: label of the results.
         metrics: which of `METRICS` are computed.
-        ego_motion: whose motion is taken out of the flow: "points": that of the frame of the points; "stored": by the
-            poses as the data has them, also where those are of another frame (OpenSceneFlow's Argoverse 2 scenes).
-        region: points scored by "bucketed" and "three_way": "box" max(|x|, |y|), "disc" sqrt(x^2 + y^2), "all".
-            "bucketed_by_range" measures by the box if it is the region, else by the disc.
+        ego_motion: ego motion that is removed from the flow. "points": that of the frame of the points. "stored": that
+            of the stored poses, even where they belong to another frame (OpenSceneFlow's Argoverse 2 scenes).
+        region: points that "bucketed" and "three_way" score: "box" max(|x|, |y|), "disc" sqrt(x^2 + y^2), or "all".
+            "bucketed_by_range" measures ranges by the box if it is the region, else by the disc.
         max_range: metres, outer bound of the region.
-        closed: True: a point at exactly `max_range` counts (<=), False: it does not (<). The same for the upper edge of
-            each range of "bucketed_by_range"; the point that one range leaves out belongs to the next one.
+        closed: whether a point at exactly `max_range` is scored (<= or <). The same holds for the upper edge of each
+            range of "bucketed_by_range"; a point that one range leaves out belongs to the next one.
         region_edges: metres, ascending edges of the ranges that "bucketed_by_range" scores one by one.
         region_axes: ego frame in which the region is measured.
         point_cloud_range: (x0, y0, z0, x1, y1, z1) metres, open interval, in `region_axes`; None = no crop.
-        mask_box: metres; where a frame has no evaluation mask, only points with |x|, |y| <= this (frame of t)
-            are scored; None = all.
-        exclude_ground: leave ground points out.
+        mask_box: metres; in a frame without an evaluation mask, only points with |x|, |y| <= this (frame of t) are
+            scored; None = all.
+        exclude_ground: whether ground points are ignored.
         residual_axes: axes in which residuals are compared.
-        three_way_flow: flow that the three-way scores compare. Moves accuracy and angle, not the end-point error.
-        half_precision: three-way scores see truth and prediction rounded to float16 (the files of the 2023 challenge).
-        foreground: "all": every category but background; "meta": the four meta classes, others are left out.
-        background: "static": background points of any true speed go to bucket 0; "bucketed": by their speed.
-        average: three-way end-point errors and IoU: "points": over all points of all frames, NaN where there are
-            none; "frames": mean over frames of per-frame values, absent sets count as 0.
-        nan_rows: "drop": a point with NaN in position, truth or prediction is not scored (which flatters a method
-            that gives NaN; `num_nan` tells how many); "error": refuse it.
-        norm_dtype: precision in which lengths of residuals are taken.
-        dynamic_threshold: metres per frame; true or predicted residual at least this long = dynamic (three-way).
-        speed_edges: metres per frame, ascending bucket edges, lower one included; the first bucket is "static".
+        three_way_flow: flow that the three-way scores compare. It affects accuracy and angle, not the end-point error.
+        half_precision: round truth and prediction of the three-way scores to float16 (the files of the 2023 challenge).
+        foreground: "all": every category but background; "meta": only the four meta classes, others are ignored.
+        background: "static": background points of any true speed are in bucket 0; "bucketed": in that of their speed.
+        average: average of the three-way end-point errors and IoU. "points": over all points of all frames, NaN where
+            there are none. "frames": over frames, where a frame without points of a set counts as 0.
+        nan_rows: "drop": a point with NaN in position, truth or prediction is not scored, which flatters a method that
+            returns NaN (`num_nan` counts them). "error": such a point is an error.
+        norm_dtype: precision in which lengths of residuals are computed.
+        dynamic_threshold: metres per frame; true or predicted residual from which a point is dynamic (three-way).
+        speed_edges: metres per frame, ascending edges of the speed buckets, lower one included; the first is "static".
         range_edges: metres, ascending edges of the range-wise metric, lower one included.
-        range_dynamic_speed: m/s, from which a point counts as dynamic in the range-wise metric.
+        range_dynamic_speed: m/s, from which a point is dynamic in the range-wise metric.
         sweep_interval: seconds between the sweeps of a pair (angle error, range-wise speed).
 
     Raises:
@@ -86,20 +86,20 @@ class Definition:
         for field, kind in get_type_hints(Definition).items():
             value, choices = getattr(self, field), get_args(kind)
             if get_origin(kind) is Literal and value not in choices:
-                raise CFlowError(f"definition {self.name}: {field} is one of {choices}, got {value!r}")
+                raise CFlowError(f"definition {self.name}: {field}={value!r}, give one of {choices}")
         if not set(self.metrics) <= set(METRICS):
-            raise CFlowError(f"definition {self.name}: metrics are some of {METRICS}, got {self.metrics}")
+            raise CFlowError(f"definition {self.name}: metrics={self.metrics}, give some of {METRICS}")
         for field in ("speed_edges", "range_edges", "region_edges"):
             edges = getattr(self, field)
             if len(edges) < 2 or not all(a < b for a, b in zip(edges, edges[1:])):
-                raise CFlowError(f"definition {self.name}: {field} must be two ascending values or more, got {edges}")
+                raise CFlowError(f"definition {self.name}: {field}={edges}, give at least two ascending values")
 
 
 DEFINITIONS: Dict[str, Definition] = {
     # KTH-RPL/OpenSceneFlow: eval.py and its functions evaluate_leaderboard, _v2, evaluate_ssf.
     "opensceneflow": Definition(name="opensceneflow", average="frames", ego_motion="stored"),
     # kylevedder/BucketedSceneFlowEval with_ground=False, evaluators bucketed_epe and threeway_epe. Its ground is the
-    # map raster rule "bsfe" (0.4 m), which the reader applies: see cflow_torch.data.ground.
+    # map raster rule "bsfe" (0.4 m), which the reader applies (cflow_torch.data.ground).
     "bucketed_scene_flow_eval": Definition(
         name="bucketed_scene_flow_eval",
         metrics=("bucketed", "three_way"),
@@ -114,7 +114,7 @@ DEFINITIONS: Dict[str, Definition] = {
         nan_rows="error",
         norm_dtype="float32",
     ),
-    # argoverse/av2-api: av2.evaluation.scene_flow.eval. No cut at 35 m except in the close / far breakdown.
+    # argoverse/av2-api: av2.evaluation.scene_flow.eval. It has no limit of 35 m except in the close / far breakdown.
     "av2": Definition(
         name="av2",
         metrics=("three_way",),
@@ -124,7 +124,7 @@ DEFINITIONS: Dict[str, Definition] = {
         nan_rows="error",
     ),
     # The two ranges of the 2026 multi-data-set challenge, scored in one pass with the rules of opensceneflow. The
-    # challenge's own code is not public: whether it measures a disc or a box is unknown, so there is one of each.
+    # challenge's own code is not public. We do not know whether it measures a disc or a box, so there is one of each.
     "challenge_2026": Definition(name="challenge_2026", metrics=METRICS, average="frames", ego_motion="stored"),
     "challenge_2026_box": Definition(
         name="challenge_2026_box", metrics=METRICS, average="frames", ego_motion="stored", region="box"
@@ -133,7 +133,7 @@ DEFINITIONS: Dict[str, Definition] = {
 
 
 def get_definition(definition: Union[str, Definition]) -> Definition:
-    """A definition by name, or the one given.
+    """Return the definition of this name. A `Definition` is returned as it is.
 
     Raises:
         CFlowError: no definition has this name.
@@ -141,25 +141,25 @@ def get_definition(definition: Union[str, Definition]) -> Definition:
     if isinstance(definition, Definition):
         return definition
     if definition not in DEFINITIONS:
-        raise CFlowError(f"evaluation definitions are {sorted(DEFINITIONS)}, got {definition!r}")
+        raise CFlowError(f"definition={definition!r}: give one of {sorted(DEFINITIONS)}")
     return DEFINITIONS[definition]
 
 
 def interval_of(values: np.ndarray, edges: Sequence[float], closed: bool = False) -> np.ndarray:
-    """Which of the intervals between ascending edges each value lies in.
+    """Return the index of the interval between ascending edges that each value lies in.
 
     Args:
         values: (M,) float.
         edges: ascending.
-        closed: False: an interval holds its lower edge, True: its upper one, and the first one also 0.
+        closed: False: an interval contains its lower edge. True: its upper edge, and the first interval also 0.
 
     Returns:
-        (M,) int64, -1 = in none.
+        (M,) int64; -1 = outside all intervals.
     """
-    number = np.searchsorted(np.asarray(edges), values, side="left" if closed else "right") - 1
+    index = np.searchsorted(np.asarray(edges), values, side="left" if closed else "right") - 1
     if closed and edges[0] == 0:
-        number = np.maximum(number, 0)
-    return np.where(number < len(edges) - 1, number, -1)
+        index = np.maximum(index, 0)
+    return np.where(index < len(edges) - 1, index, -1)
 
 
 def range_names(edges: Sequence[float]) -> List[str]:

@@ -1,4 +1,4 @@
-"""One frame to score: points, prediction, truth."""
+"""One frame to score: points, prediction and truth."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from cflow_torch.types import Array, CFlowError, FlowResult, Window, as_numpy
 
 
 def ego_motion_flow(points: np.ndarray, T_ego1_ego0: np.ndarray) -> np.ndarray:
-    """Flow that ego motion alone causes, T p - p.
+    """Compute the flow of a static world, T p - p.
 
     Args:
         points: (N, 3) float, metres, ego frame of t.
         T_ego1_ego0: (4, 4), ego coordinates of t to those of t+1.
 
     Returns:
-        (N, 3) float32, metres, axes of ego1; computed in float64 and rounded once, because the difference of two
-        float32 positions at 100 m carries 1e-5 m of noise.
+        (N, 3) float32, metres, axes of ego1. It is computed in float64 and rounded once, because the difference of two
+        float32 positions at 100 m has 1e-5 m of noise.
     """
     start, transform = np.asarray(points, dtype=np.float64), np.asarray(T_ego1_ego0, dtype=np.float64)
     return (start @ transform[:3, :3].T + transform[:3, 3] - start).astype(np.float32)
@@ -30,21 +30,21 @@ def ego_motion_flow(points: np.ndarray, T_ego1_ego0: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class EvalFrame:
-    """What is needed to score one pair of sweeps. Arrays or tensors; rows in the order of sweep t, ground included.
+    """One pair of sweeps with prediction and truth. Arrays or tensors; rows in the order of sweep t, ground included.
 
     Args:
         points: (N, 3+) float, metres, ego frame of t.
         labels: truth of the pair (total flow, categories, valid rows).
         residual_flow: (N, 3) float, predicted residual, metres per frame. Give this or `flow`, not both.
         flow: (N, 3) float, predicted total flow, axes of ego1.
-        pose_flow: (N, 3) float, T_ego1_ego0 p - p. Computed from `T_ego1_ego0` where missing; give at least one.
+        pose_flow: (N, 3) float, T_ego1_ego0 p - p; None = computed from `T_ego1_ego0`. Give at least one of the two.
         T_ego1_ego0: (4, 4) float, ego coordinates of t to those of t+1. Definitions that measure ranges or residuals
             in another frame need it.
         is_ground: (N,) bool, True = ground; None = no point is ground.
         eval_mask: (N,) bool, True = scored; None = all.
-        residual_axes: "t+1" or "t", axes that `residual_flow` is given in. This package predicts in "t+1".
+        residual_axes: axes of `residual_flow`, "t+1" or "t". This package predicts in "t+1".
 
-    Convention: everything is checked and turned to NumPy when the frame is made.
+    Convention: everything is checked and converted to NumPy in the constructor.
 
     Raises:
         CFlowError: missing or contradictory parts, shapes that do not agree.
@@ -62,25 +62,27 @@ class EvalFrame:
 
     def __post_init__(self) -> None:
         if (self.residual_flow is None) == (self.flow is None):
-            raise CFlowError("an evaluation frame takes exactly one of residual_flow and flow (total)")
+            raise CFlowError("give an evaluation frame exactly one of residual_flow and flow (total)")
         if self.pose_flow is None and self.T_ego1_ego0 is None:
-            raise CFlowError("an evaluation frame needs pose_flow or T_ego1_ego0 to tell ego motion from object motion")
+            raise CFlowError(
+                "give an evaluation frame pose_flow or T_ego1_ego0, to separate ego motion and object motion"
+            )
         if self.residual_axes not in ("t", "t+1"):
-            raise CFlowError(f"residual_axes is 't' or 't+1', got {self.residual_axes!r}")
+            raise CFlowError(f"residual_axes={self.residual_axes!r}: give 't' or 't+1'")
         points, labels = as_numpy(self.points), self.labels
         if points.ndim != 2 or points.shape[1] < 3:
-            raise CFlowError(f"points must be (N, 3) or wider, got shape {points.shape}")
+            raise CFlowError(f"points must have shape (N, 3) or more columns, got {points.shape}")
         rows = len(points)
         self._set("points", _checked("points", points[:, :3], np.float32, (rows, 3)))
-        for name in ("residual_flow", "flow", "pose_flow"):
-            self._set(name, _checked(name, getattr(self, name), np.float32, (rows, 3)))
-        for name in ("is_ground", "eval_mask"):
-            self._set(name, _checked(name, getattr(self, name), np.bool_, (rows,)))
-        self._set("T_ego1_ego0", _checked("T_ego1_ego0", self.T_ego1_ego0, np.float64, (4, 4)))
+        for name, dtype, shape in (
+            *((name, np.float32, (rows, 3)) for name in ("residual_flow", "flow", "pose_flow")),
+            *((name, np.bool_, (rows,)) for name in ("is_ground", "eval_mask")),
+            ("T_ego1_ego0", np.float64, (4, 4)),
+        ):
+            self._set(name, _checked(name, getattr(self, name), dtype, shape))
         truth = {
-            "flow": _checked("labels.flow", labels.flow, np.float32, (rows, 3)),
-            "category": _checked("labels.category", labels.category, np.int64, (rows,)),
-            "is_valid": _checked("labels.is_valid", labels.is_valid, np.bool_, (rows,)),
+            name: _checked(f"labels.{name}", getattr(labels, name), dtype, (rows, *tail))
+            for name, dtype, *tail in (("flow", np.float32, 3), ("category", np.int64), ("is_valid", np.bool_))
         }
         self._set("labels", FlowLabels(**truth))
         if self.pose_flow is None:
@@ -95,15 +97,15 @@ class EvalFrame:
         stored_motion: StoredMotion | None = None,
         **parts: Any,
     ) -> EvalFrame:
-        """Frame of a window and the flow that was estimated for it.
+        """Make the frame of a window and the flow that was estimated for it.
 
         Args:
-            window: needs the poses of pc0 and pc1, or neither.
+            window: with the poses of both pc0 and pc1, or of neither.
             result: flow of `window.pc0`.
             labels: truth of the pair.
-            stored_motion: ego motion as OpenSceneFlow has it (`HDF5Log.stored_motion`): taken out of truth and
-                prediction as it does that, to the bit. None = motion of the window.
-            **parts: further fields, for example `eval_mask`; they win over what the window gives.
+            stored_motion: ego motion as OpenSceneFlow stores it (`HDF5Log.stored_motion`), removed from truth and
+                prediction with the same bits as there. None = motion of the window.
+            **parts: further fields, for example `eval_mask`. They take precedence over those of the window.
         """
         pose0, pose1 = window.pc0.pose, window.pc1.pose
         if pose0 is not None and pose1 is not None:
@@ -121,7 +123,7 @@ class EvalFrame:
         return cls(points=window.pc0.points, labels=labels, **parts)
 
     def transform(self) -> np.ndarray:
-        """(4, 4) float64 T_ego1_ego0.
+        """Return T_ego1_ego0, (4, 4) float64.
 
         Raises:
             CFlowError: the frame has only `pose_flow`.
@@ -135,7 +137,7 @@ class EvalFrame:
 
 
 def _checked(name: str, value: Any, dtype: Any, shape: tuple[int, ...]) -> Any:
-    """The array in its type; None stays None."""
+    """Convert an array to its dtype and check its shape; None stays None."""
     if value is None:
         return None
     array = as_numpy(value)

@@ -1,15 +1,22 @@
-"""All metrics of one definition, fed frame by frame."""
+"""All metrics of one definition, frame by frame, and the combined score of several data sets."""
 
 from __future__ import annotations
 
-from typing import Any, Callable
+import math
+from dataclasses import dataclass
+from statistics import fmean
+from typing import Any, Callable, Mapping, Sequence
 
 from cflow_torch.evaluation.accumulator import Accumulator
 from cflow_torch.evaluation.bucketed import BucketedByRange, BucketedEPE, RangeWiseEPE
 from cflow_torch.evaluation.definitions import Definition, get_definition
 from cflow_torch.evaluation.frame import EvalFrame
-from cflow_torch.evaluation.masks import score_points
-from cflow_torch.evaluation.threeway import ThreeWayEPE
+from cflow_torch.evaluation.scored_points import score_points
+from cflow_torch.evaluation.three_way import ThreeWayEPE
+from cflow_torch.types import CFlowError
+
+CHALLENGE_DATA_SETS: tuple[str, ...] = ("AEVA", "AV2", "nuScenes", "TruckScenes", "Waymo")
+CHALLENGE_RANGES: tuple[str, ...] = ("0-35", "35-70")
 
 _ACCUMULATORS: dict[str, Callable[..., Accumulator]] = {
     "bucketed": BucketedEPE,
@@ -20,13 +27,13 @@ _ACCUMULATORS: dict[str, Callable[..., Accumulator]] = {
 
 
 class SceneFlowMetrics:
-    """Every metric that a definition names, as one accumulator.
+    """All metrics of a definition as one accumulator.
 
     Args:
         definition: a name in `DEFINITIONS` ("opensceneflow", "bucketed_scene_flow_eval", "av2", ...) or a
             `Definition`.
 
-    Convention: frames in any order; `merge` joins parts that were scored apart.
+    Convention: frames come in any order. `merge` combines parts that were scored separately.
     """
 
     def __init__(self, definition: str | Definition = "opensceneflow") -> None:
@@ -40,7 +47,8 @@ class SceneFlowMetrics:
         """Add one frame.
 
         Raises:
-            CFlowError: NaN where the definition refuses it; the frame lacks `T_ego1_ego0` and the definition needs it.
+            CFlowError: NaN where the definition does not allow it; the definition needs `T_ego1_ego0` and the frame
+                has none.
         """
         scored = score_points(frame, self.definition)
         for part in self.parts.values():
@@ -50,7 +58,7 @@ class SceneFlowMetrics:
         self.num_nan += scored.num_nan
 
     def merge(self, other: SceneFlowMetrics) -> None:
-        """Add what another accumulator of the same definition has seen.
+        """Add the frames of another accumulator of the same definition.
 
         Raises:
             CFlowError: the definitions differ.
@@ -62,7 +70,7 @@ class SceneFlowMetrics:
         self.num_nan += other.num_nan
 
     def compute(self) -> dict[str, Any]:
-        """Nested dictionary of plain numbers: "definition", `num_frames`, `num_points`, `num_nan`, and each metric."""
+        """Return plain numbers: "definition", `num_frames`, `num_points`, `num_nan`, and a dictionary per metric."""
         return {
             "definition": self.definition.name,
             "num_frames": self.num_frames,
@@ -70,3 +78,83 @@ class SceneFlowMetrics:
             "num_nan": self.num_nan,
             **{name: part.compute() for name, part in self.parts.items()},
         }
+
+
+@dataclass(frozen=True)
+class ProtocolScores:
+    """Combined scores of several data sets.
+
+    Args:
+        overall: unweighted mean over data sets; NaN if anything is missing.
+        data_sets: data set -> mean of its ranges; NaN if one of them is missing.
+        ranges: range -> unweighted mean over data sets; NaN if one of them is missing.
+        missing: one sentence for each range of a data set without a value; empty if there are none.
+    """
+
+    overall: float
+    data_sets: dict[str, float]
+    ranges: dict[str, float]
+    missing: tuple[str, ...]
+
+
+def errors_by_range(results: Mapping[str, Any]) -> dict[str, float]:
+    """Return the dynamic bucket-normalised error of each range, a mean over classes.
+
+    Args:
+        results: from `SceneFlowMetrics.compute`, or results.json, with the metric "bucketed_by_range".
+
+    Returns:
+        Range ("0-35", ...) -> error; NaN where the range has no dynamic points.
+
+    Raises:
+        CFlowError: the metric is not among the results.
+    """
+    if "bucketed_by_range" not in results:
+        raise CFlowError("the results have no 'bucketed_by_range': use definition='challenge_2026'")
+    ranges = results["bucketed_by_range"]["ranges"]
+    return {name: _number(scores["mean"]["dynamic_error"]) for name, scores in ranges.items()}
+
+
+def score_data_sets(
+    results: Mapping[str, Mapping[str, float | None]],
+    data_sets: Sequence[str] | None = None,
+    ranges: Sequence[str] | None = None,
+) -> ProtocolScores:
+    """Combine the errors of several data sets: the mean over ranges, then the unweighted mean over data sets.
+
+    Args:
+        results: data set -> range -> error, for example `{"AV2": errors_by_range(scores)}`; NaN or None = no value.
+        data_sets: required data sets, for example `CHALLENGE_DATA_SETS`; None = those of `results`.
+        ranges: ranges that every data set must have; None = every range of any data set.
+
+    Returns:
+        Scores overall, per data set and per range. A mean over fewer data sets or ranges than required is NaN; the
+        reasons are in `missing`.
+
+    Raises:
+        CFlowError: data sets or ranges that are not among the required ones; there is nothing to combine.
+    """
+    given = list(dict.fromkeys(name for row in results.values() for name in row))
+    set_names = list(results if data_sets is None else data_sets)
+    range_names = list(given if ranges is None else ranges)
+    if not set_names or not range_names:
+        raise CFlowError(f"there is nothing to combine: data sets {set_names}, ranges {range_names}")
+    unknown = [name for name in (*results, *given) if name not in (*set_names, *range_names)]
+    if unknown:
+        raise CFlowError(f"{unknown} given, but only {set_names}, {range_names} required: leave out, or require all")
+    reasons: list[str] = []
+    table: dict[str, list[float]] = {}
+    for set_name in set_names:
+        row = results.get(set_name, {})
+        table[set_name] = [_number(row.get(name)) for name in range_names]
+        for name, value in zip(range_names, table[set_name]):
+            if math.isnan(value):
+                why = "no dynamic points (NaN)" if name in row else "no result"
+                reasons.append(f"data set {set_name}, range {name}: {why}")
+    per_set = {name: fmean(row) for name, row in table.items()}  # NaN if any is NaN
+    per_range = {name: fmean([row[i] for row in table.values()]) for i, name in enumerate(range_names)}
+    return ProtocolScores(fmean(per_set.values()), per_set, per_range, tuple(reasons))
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else float(value)

@@ -1,4 +1,4 @@
-"""Scores as text that reads well in a terminal and renders as Markdown."""
+"""Scores as Markdown tables, aligned for a terminal."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ Table = Tuple[List[str], List[List[Any]]]
 
 
 def format_table(results: dict[str, Any]) -> str:
-    """Tables of the bucketed (also by range), three-way and range-wise scores that `SceneFlowMetrics.compute` returned.
+    """Format scores as one Markdown table per metric.
 
     Args:
-        results: what `compute` returned; metrics that the definition lacks are left out.
+        results: from `SceneFlowMetrics.compute`. Metrics that the definition lacks have no table.
 
     Returns:
-        Markdown, one table per metric; "-" where there are no points.
+        Markdown; "-" where there are no points.
     """
     frames, points, num_nan = (results[key] for key in ("num_frames", "num_points", "num_nan"))
-    scored = f"{frames} frames, {points} points scored, {num_nan} left out for NaN"
+    scored = f"{frames} frames, {points} points scored, {num_nan} ignored because of NaN"
     lines = [f"definition {results['definition']}: {scored}"]
     for metric, table in _TABLES.items():
         if metric in results:
@@ -75,7 +75,7 @@ def _number(value: float) -> str:
 
 
 def _markdown(header: Sequence[object], rows: Sequence[Sequence[object]]) -> list[str]:
-    """Lines of a Markdown table, first column flush left, others flush right."""
+    """Lines of a Markdown table, the first column left-aligned, the others right-aligned."""
     cells = [[str(cell) for cell in row] for row in (header, *rows)]
     first, *others = [max(len(cell) for cell in column) for column in zip(*cells)]
     lines = [[row[0].ljust(first), *(cell.rjust(width) for cell, width in zip(row[1:], others))] for row in cells]

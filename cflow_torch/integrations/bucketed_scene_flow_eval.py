@@ -117,6 +117,8 @@ def _read_frame(name: str, frame: Any, data: Any) -> _LogFrame:
     points = np.asarray(getattr(frame.pc.full_pc, "points", frame.pc.full_pc))
     if points.ndim != 2 or points.shape[1] != 3:
         raise CFlowError(f"{name}.pc.full_pc has shape {points.shape}: give (N, 3) metres")
+    if points.dtype == np.float16:  # the files of Argoverse 2, which our own reader converts as well
+        points = points.astype(np.float32)
     takes_part = mask = _mask(frame.pc.mask, f"{name}.pc.mask", len(points))
     if data is not None:
         takes_part = mask & ~_mask(data.is_ground_points, f"{name}[1].is_ground_points", len(points))

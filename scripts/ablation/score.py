@@ -16,9 +16,9 @@ from cflow_torch.data.categories import CATEGORY_INDEX
 from cflow_torch.evaluation.bucketed import mean_of_present
 from cflow_torch.evaluation.definitions import Definition
 from cflow_torch.evaluation.frame import EvalFrame
-from cflow_torch.evaluation.masks import score_points
 from cflow_torch.evaluation.metrics import SceneFlowMetrics
-from cflow_torch.evaluation.threeway import ThreeWayEPE
+from cflow_torch.evaluation.scored_points import score_points
+from cflow_torch.evaluation.three_way import ThreeWayEPE
 from cflow_torch.types import as_numpy
 
 Figures = Dict[str, float]

@@ -11,7 +11,7 @@ from typing import Any, Dict, Mapping
 from omegaconf import OmegaConf
 
 from cflow_torch.config import PRESETS
-from cflow_torch.evaluation.protocol import ProtocolScores, errors_by_range, score_data_sets
+from cflow_torch.evaluation.metrics import ProtocolScores, errors_by_range, score_data_sets
 
 PAPER_FILE = Path(__file__).resolve().with_name("figures.yaml")
 # The paper's name of a class -> that of the evaluation.

@@ -1,4 +1,4 @@
-"""Metrics on small made-up frames: masks, edges, empty sets, averages, merging, tables."""
+"""Metrics on small made-up frames: masks, edges, empty sets, averages, merging, tables, several data sets."""
 
 from __future__ import annotations
 
@@ -17,8 +17,16 @@ from scenes import pose
 
 from cflow_torch.data.categories import CATEGORY_INDEX
 from cflow_torch.data.log import FlowLabels
-from cflow_torch.evaluation import DEFINITIONS, EvalFrame, SceneFlowMetrics, format_table
+from cflow_torch.evaluation import (
+    DEFINITIONS,
+    EvalFrame,
+    SceneFlowMetrics,
+    errors_by_range,
+    format_table,
+    score_data_sets,
+)
 from cflow_torch.evaluation.frame import ego_motion_flow
+from cflow_torch.evaluation.metrics import CHALLENGE_DATA_SETS, CHALLENGE_RANGES
 from cflow_torch.types import CFlowError
 
 CAR, PEDESTRIAN, SIGN = CATEGORY_INDEX["REGULAR_VEHICLE"], CATEGORY_INDEX["PEDESTRIAN"], CATEGORY_INDEX["SIGN"]
@@ -30,7 +38,7 @@ BY_POINTS = replace(DEFINITIONS[OSF], average="points")
 def frame(
     true: Any, predicted: Any = 0.0, category: Any = CAR, points: Any = 1.0, is_valid: Any = True, **parts: Any
 ) -> EvalFrame:
-    """Frame without ego motion: truth and prediction are residuals; prediction 0 and points near the ego by default."""
+    """Make a frame without ego motion from true and predicted residuals, by default with points near the ego."""
     truth = np.asarray(true, dtype=np.float32).reshape(-1, 3)
     n = len(truth)
     category, is_valid = (np.full(n, value, kind) for value, kind in ((category, np.uint8), (is_valid, bool)))
@@ -43,7 +51,7 @@ def scores(definition: Any, *frames: EvalFrame) -> dict[str, Any]:
 
 
 def counts(results: dict[str, Any], name: str = "CAR") -> dict[int, int]:
-    """Bucket -> points, of the buckets that have any."""
+    """Bucket -> number of points, for buckets that have any."""
     buckets = results["bucketed"]["classes"][name]["buckets"]["count"]
     return {bucket: count for bucket, count in enumerate(buckets) if count}
 
@@ -79,30 +87,25 @@ def random_frames(count: int, size: int = 200) -> list[EvalFrame]:
 # ---------------------------------------------------------------------------------------------- buckets
 
 
-def test_buckets_hold_their_lower_edge() -> None:
+def test_buckets_contain_their_lower_edge() -> None:
     below_one, below_two = (np.nextafter(np.float32(edge), np.float32(0)) for edge in (1, 2))
     speeds = [0.0, below_one, 1.0, below_two, 2.0, 7.5]
     for definition in (OSF, BSFE):
-        assert counts(scores(definition, frame([[speed, 0, 0] for speed in speeds]))) == {
-            0: 1,
-            24: 1,
-            25: 1,
-            49: 1,
-            50: 2,
-        }
-    # 0.04 is stored as 0.03999999910593033 in float32; edges are compared in float64: just static.
+        found = counts(scores(definition, frame([[speed, 0, 0] for speed in speeds])))
+        assert found == {0: 1, 24: 1, 25: 1, 49: 1, 50: 2}
+    # 0.04 is 0.03999999910593033 in float32. Edges are compared in float64, so it is just static.
     assert counts(scores(OSF, frame([[0.04, 0, 0]]))) == {0: 1}
     finer = replace(DEFINITIONS[OSF], speed_edges=(*np.linspace(0, 4, 101).tolist(), math.inf))
     assert counts(scores(finer, frame([[3, 0, 0]]))) == {75: 1}
 
 
-def test_a_bucket_weighs_the_same_whatever_its_points_and_standing_still_scores_one() -> None:
+def test_buckets_have_equal_weight_and_a_residual_of_zero_scores_one() -> None:
     # 3 points at 1 m with error 0.5, one at 2.5 m with error 2.5: (0.5 + 1) / 2, not a mean over points.
     true = [[1, 0, 0]] * 3 + [[2.5, 0, 0]]
     car = scores(OSF, frame(true, [[0.5, 0, 0]] * 3 + [[0, 0, 0]]))["bucketed"]["classes"]["CAR"]
     assert car["dynamic_error"] == pytest.approx(0.75, abs=1e-12)
-    still = scores(OSF, frame([[0.3, 0, 0], [0.9, 0.1, 0], [3, 0, 0]]))
-    assert still["bucketed"]["classes"]["CAR"]["dynamic_error"] == 1.0
+    static = scores(OSF, frame([[0.3, 0, 0], [0.9, 0.1, 0], [3, 0, 0]]))
+    assert static["bucketed"]["classes"]["CAR"]["dynamic_error"] == 1.0
 
 
 def test_moving_background_is_static_or_bucketed() -> None:
@@ -115,19 +118,19 @@ def test_moving_background_is_static_or_bucketed() -> None:
 # ---------------------------------------------------------------------------------------------- masks and regions
 
 
-def test_where_regions_end() -> None:
+def test_edges_of_regions() -> None:
     on_edge, corner = (frame([[1, 0, 0]], points=[point]) for point in ([35, 0, 0], [30, 30, 0]))
     assert counts(scores(OSF, on_edge)) == {25: 1} and counts(scores(OSF, corner)) == {}  # disc, closed
     assert counts(scores(BSFE, on_edge)) == {} and counts(scores(BSFE, corner)) == {25: 1}  # box, open
     assert counts(scores(replace(DEFINITIONS[OSF], region="box"), corner)) == {25: 1}
     assert scores(AV2, on_edge)["three_way"]["breakdown"]["foreground"]["dynamic"]["close"]["count"] == 1
     heights = frame([[1, 0, 0]] * 3, points=[[1, 1, 2.5], [1, 1, 2.4], [1, 1, -2.5]])
-    assert counts(scores(BSFE, heights)) == {25: 1}, "its crop is open"
+    assert counts(scores(BSFE, heights)) == {25: 1}, "its crop is an open interval"
 
 
 @pytest.mark.parametrize("region", ["disc", "box"])
 @pytest.mark.parametrize("closed", [True, False])
-def test_ranges_in_one_pass_equal_their_points_alone(region: str, closed: bool) -> None:
+def test_ranges_in_one_pass_equal_separate_scores_of_their_points(region: str, closed: bool) -> None:
     edges = (0.0, 10.0, 35.0, 70.0)
     rings = replace(DEFINITIONS["challenge_2026"], region=region, closed=closed, region_edges=edges)
     on_edges = [[10, 0, 0], [0, -35, 0], [70, 0, 0], [0, 0, 0], [35, 35, 0]]
@@ -151,7 +154,7 @@ def test_ground_mask_and_evaluation_mask() -> None:
     item = frame([[1, 0, 0]] * 4, **masks)
     assert counts(scores(OSF, item)) == {25: 2}
     assert counts(scores(replace(DEFINITIONS[OSF], exclude_ground=False), item)) == {25: 3}
-    far = frame([[1, 0, 0]] * 2, points=[[50, -50, 0], [50.1, 0, 0]])  # without a mask av2 scores 50 m
+    far = frame([[1, 0, 0]] * 2, points=[[50, -50, 0], [50.1, 0, 0]])  # without a mask, av2 scores points within 50 m
     assert scores(AV2, far)["num_points"] == 1
     assert scores(AV2, replace(far, eval_mask=np.array([True, True])))["num_points"] == 2
 
@@ -167,11 +170,11 @@ def test_nothing_to_score(definition: str) -> None:
     assert isinstance(format_table(SceneFlowMetrics(definition).compute()), str)
 
 
-def test_nan_predictions_are_dropped_or_refused() -> None:
+def test_nan_predictions_are_ignored_or_an_error() -> None:
     item = frame([[1, 0, 0]] * 2, [[math.nan, 0, 0], [1, 0, 0]])
     results = scores(OSF, item)
     assert results["num_nan"] == 1
-    assert results["bucketed"]["classes"]["CAR"]["dynamic_error"] == 0.0  # the point without an answer costs nothing
+    assert results["bucketed"]["classes"]["CAR"]["dynamic_error"] == 0.0  # the point with NaN has no effect
     for definition in (BSFE, AV2):
         with pytest.raises(CFlowError, match="1 scored points have NaN"):
             scores(definition, item)
@@ -197,13 +200,13 @@ def test_three_way_by_hand() -> None:
     assert results["breakdown"]["background"]["dynamic"]["all"]["count"] == 1
 
 
-def test_accuracy_is_absolute_or_relative_and_the_angle_in_space_time() -> None:
+def test_accuracy_is_absolute_or_relative_and_the_angle_is_in_space_time() -> None:
     item = frame([[2, 0, 0], [0.2, 0, 0], [2, 0, 0]], [[2.09, 0, 0], [0.29, 0, 0], [2.19, 0, 0]])
     cell = dynamic_foreground(scores(OSF, item))
     assert cell["accuracy_strict"] == pytest.approx(1 / 3)  # 4.5 % of 2 m
     assert cell["accuracy_relax"] == 1.0  # 9 cm; 9.5 %
-    turned = scores(OSF, frame([[0.1, 0, 0]], [[0, 0, 0]]))  # (0.1 m, 0.1 s) against (0, 0.1 s): 45 degrees
-    assert dynamic_foreground(turned)["angle_error"] == pytest.approx(math.pi / 4, abs=1e-6)
+    rotated = scores(OSF, frame([[0.1, 0, 0]], [[0, 0, 0]]))  # (0.1 m, 0.1 s) against (0, 0.1 s): 45 degrees
+    assert dynamic_foreground(rotated)["angle_error"] == pytest.approx(math.pi / 4, abs=1e-6)
 
 
 @pytest.mark.parametrize("definition", NAMES)
@@ -215,12 +218,12 @@ def test_dynamic_from_exactly_five_centimetres(definition: str) -> None:
 
 
 def test_average_over_frames_or_points() -> None:
-    moving, still, found = frame([[1, 0, 0]]), frame([[0, 0, 0]]), frame([[1, 0, 0]] * 3, [[1, 0, 0]] * 3)
-    by_frames, by_points = (scores(definition, moving, still)["three_way"] for definition in (OSF, BY_POINTS))
+    moving, static, correct = frame([[1, 0, 0]]), frame([[0, 0, 0]]), frame([[1, 0, 0]] * 3, [[1, 0, 0]] * 3)
+    by_frames, by_points = (scores(definition, moving, static)["three_way"] for definition in (OSF, BY_POINTS))
     assert by_frames["epe_fd"] == pytest.approx(0.5, abs=1e-7) and by_frames["epe_bs"] == 0.0  # absent counts as 0
     assert by_points["epe_fd"] == 1.0 and math.isnan(by_points["epe_bs"])
-    assert scores(OSF, moving, found)["three_way"]["epe_fd"] == pytest.approx(0.5, abs=1e-7)
-    assert scores(BY_POINTS, moving, found)["three_way"]["epe_fd"] == 0.25
+    assert scores(OSF, moving, correct)["three_way"]["epe_fd"] == pytest.approx(0.5, abs=1e-7)
+    assert scores(BY_POINTS, moving, correct)["three_way"]["epe_fd"] == 0.25
 
 
 def test_av2_rounds_to_float16() -> None:
@@ -251,20 +254,20 @@ def test_residual_total_and_axes_agree(definition: str) -> None:
     residual, predicted = rng.normal(0, 1, (2, 50, 3)).astype(np.float32)
     pose_flow = ego_motion_flow(points, T)
     labels = FlowLabels(pose_flow + residual, np.full(50, CAR, dtype=np.uint8), np.ones(50, dtype=bool))
-    ways: list[dict[str, Any]] = [
+    forms: list[dict[str, Any]] = [
         {"residual_flow": predicted},
         {"flow": pose_flow + predicted},
         {"residual_flow": predicted @ T[:3, :3], "residual_axes": "t"},
         {"residual_flow": torch.from_numpy(predicted), "pose_flow": torch.from_numpy(pose_flow)},
     ]
-    frames = [EvalFrame(points=points, labels=labels, T_ego1_ego0=T, **way) for way in ways]
+    frames = [EvalFrame(points=points, labels=labels, T_ego1_ego0=T, **form) for form in forms]
     measured = [scores(definition, item)["three_way"]["epe_fd"] for item in frames]
-    assert measured == pytest.approx([measured[0]] * len(ways), abs=2e-6 if definition != AV2 else 2e-5)
+    assert measured == pytest.approx([measured[0]] * len(forms), abs=2e-6 if definition != AV2 else 2e-5)
     direct = np.linalg.norm(predicted - residual, axis=1).mean()
     assert measured[0] == pytest.approx(direct, abs=1e-6 if definition != AV2 else 1e-3)
 
 
-def test_frames_that_do_not_add_up_are_refused() -> None:
+def test_contradictory_frames_are_an_error() -> None:
     good = frame([[1, 0, 0]] * 2)
     parts = {name: getattr(good, name) for name in ("points", "labels", "residual_flow", "T_ego1_ego0")}
     bad: list[Any] = [
@@ -294,14 +297,14 @@ def test_frames_that_do_not_add_up_are_refused() -> None:
 def test_order_and_merging_do_not_matter(definition: str, order: list[int], cut: int) -> None:
     frames = random_frames(5, size=60)
     first, second = SceneFlowMetrics(definition), SceneFlowMetrics(definition)
-    for place, index in enumerate(order):
-        (first if place < cut else second).update(frames[index])
+    for position, index in enumerate(order):
+        (first if position < cut else second).update(frames[index])
     first.merge(second)
     assert flat(first.compute()) == close_to(scores(definition, *frames))
     assert json.loads(json.dumps(first.compute()))["num_frames"] == 5, "plain numbers"
 
 
-def test_scores_merge_only_with_their_kind() -> None:
+def test_only_scores_of_one_definition_can_be_merged() -> None:
     for other in (replace(DEFINITIONS[OSF], max_range=50.0), AV2):
         with pytest.raises(CFlowError, match="cannot merge"):
             SceneFlowMetrics(OSF).merge(SceneFlowMetrics(other))
@@ -323,3 +326,65 @@ def test_tables() -> None:
     item = frame([[1, 0, 0]] * 2, [[0, 0, 0], [0.5, 0, 0]], points=[[10, 0, 0], [50, 0, 0]])
     table = cells(format_table(scores("challenge_2026", item)))
     assert ["35-70", "0.5000", "-", "-", "-", "0.5000"] in table and ["**mean**", "", "", "", "", "0.7500"] in table
+
+
+# ---------------------------------------------------------------------------------------------- several data sets
+
+
+def test_figures_of_the_paper() -> None:
+    """The score of a data set is the mean of its ranges (figure "performance_evolution_2x2", without nuScenes), the
+    overall score the mean of data sets (figure "experiment_av2challenge_across_dataset", rounded in another order).
+    """
+    printed = dict(zip(CHALLENGE_DATA_SETS, (0.4216, 0.3587, 0.6449, 0.45395, 0.34085)))
+    pairs = {
+        "AEVA": (0.3603, 0.4829),
+        "AV2": (0.2106, 0.5068),
+        "TruckScenes": (0.3043, 0.6036),
+        "Waymo": (0.2141, 0.4676),
+    }
+    ranges = {name: dict(zip(CHALLENGE_RANGES, pair)) for name, pair in pairs.items()}
+    for name, value in score_data_sets(ranges).data_sets.items():
+        assert value == pytest.approx(printed[name], abs=1e-9), name
+    whole = score_data_sets({name: {"0-70": value} for name, value in printed.items()}, CHALLENGE_DATA_SETS)
+    assert whole.overall == pytest.approx(0.444, abs=5e-5, rel=0)
+
+
+WHOLE = {"0-35": 0.25, "35-70": 0.5}
+
+
+@pytest.mark.parametrize(
+    ("results", "reason", "holes"),
+    [
+        ({"A": WHOLE}, "data set B, range 0-35: no result", 2),
+        ({"A": WHOLE, "B": {"0-35": 0.25}}, "data set B, range 35-70: no result", 1),
+        ({"A": WHOLE, "B": {"0-35": 0.25, "35-70": None}}, "no dynamic points", 1),
+    ],
+)
+def test_a_missing_result_makes_its_means_nan(results: dict[str, Any], reason: str, holes: int) -> None:
+    combined = score_data_sets(results, ("A", "B"), CHALLENGE_RANGES)
+    assert len(combined.missing) == holes and reason in combined.missing[0]
+    assert combined.data_sets["A"] == 0.375
+    assert all(math.isnan(mean) for mean in (combined.data_sets["B"], combined.overall, combined.ranges["35-70"]))
+
+
+def test_data_sets_and_ranges_that_are_not_required_are_an_error() -> None:
+    for results, required, message in (
+        ({"A": WHOLE, "B": WHOLE}, {"data_sets": ("A",)}, r"\['B'\] given"),
+        ({"A": WHOLE}, {"ranges": ("0-35",)}, r"\['35-70'\] given"),
+        ({}, {}, "nothing to combine"),
+    ):
+        with pytest.raises(CFlowError, match=message):
+            score_data_sets(results, **required)
+
+
+def test_overall_score_from_frames() -> None:
+    """One car point at 10 m is missed, one at 50 m has half of its motion, one at 90 m is in no range."""
+    points = [[10, 0, 0], [0, 50, 0], [90, 0, 0]]
+    results = scores("challenge_2026", frame([[1, 0, 0]] * 3, [[0, 0, 0], [0.5, 0, 0], [1, 0, 0]], points=points))
+    errors = errors_by_range(results)
+    assert errors == {"0-35": 1.0, "35-70": 0.5}
+    combined = score_data_sets({"A": errors})
+    assert (combined.overall, combined.ranges, combined.missing) == (0.75, errors, ())
+    assert results["bucketed_by_range"]["mean"]["dynamic_error"] == 0.75
+    with pytest.raises(CFlowError, match="challenge_2026"):
+        errors_by_range({"bucketed": {}})

@@ -1,4 +1,4 @@
-"""Scores of the real Argoverse 2 pair against numbers that the public evaluators printed for it.
+"""Scores of the real Argoverse 2 pair compared with the numbers that the public evaluators printed for it.
 
 The numbers were measured with av2 0.3.6, OpenSceneFlow 848bf86 and bucketed-scene-flow-eval 2.0.25. "npz" is the ego
 motion that the test log stores in float32 (0.8 mm off the float64 poses, which moves 23 points across a bucket edge).
@@ -12,7 +12,7 @@ from typing import Any, Sequence
 
 import numpy as np
 import pytest
-from public_evaluators import TOLERANCE, Pair, predictions, read_pair, score
+from public_evaluators import TOLERANCE, Pair, official_mask, predictions, read_pair, score
 
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.log import FlowLabels
@@ -21,7 +21,7 @@ from cflow_torch.evaluation.frame import ego_motion_flow
 
 CLASSES = ("BACKGROUND", "CAR", "PEDESTRIAN", "WHEELED_VRU", "OTHER_VEHICLES", "mean")
 NAN = float("nan")
-STILL = [NAN, 1.0, 1.0, NAN, NAN, 1.0]  # dynamic errors of "nothing moves": no cyclist and no other vehicle moves
+STATIC = [NAN, 1.0, 1.0, NAN, NAN, 1.0]  # dynamic errors of a residual of 0; no cyclist or other vehicle is dynamic
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +30,7 @@ def pair(av2_folder: Path) -> Pair:
 
 
 def scores(pair: Pair, definition: Any, **parts: Any) -> dict[str, Any]:
-    """Scores of the prediction "nothing but ego motion", unless `parts` say otherwise."""
+    """Scores of a residual flow of 0, unless `parts` has another prediction."""
     defaults: dict[str, Any] = {
         "labels": pair.labels,
         "T_ego1_ego0": pair.T_float32,
@@ -41,13 +41,9 @@ def scores(pair: Pair, definition: Any, **parts: Any) -> dict[str, Any]:
     return score(definition, [EvalFrame(pair.points, **{**defaults, **parts})])
 
 
-def official_mask(pair: Pair) -> np.ndarray:
-    return ~pair.is_ground & (np.abs(pair.points[:, :2]) <= 50).all(axis=1)
-
-
 @pytest.fixture(scope="module")
 def from_boxes(av2_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> FlowLabels:
-    """Truth made from the boxes and the float64 poses, as BucketedSceneFlowEval makes its own."""
+    """Truth from the boxes and the float64 poses, as BucketedSceneFlowEval computes it."""
     folder = tmp_path_factory.mktemp("log") / "without_labels"
     folder.mkdir()
     for entry in av2_folder.iterdir():
@@ -64,7 +60,7 @@ def check_three_way(results: dict[str, Any], **expected: float) -> None:
 
 
 def check_classes(results: dict[str, Any], static: Sequence[float], dynamic: Sequence[float]) -> None:
-    """Static error in metres and dynamic error of `CLASSES`."""
+    """Compare the static error in metres and the dynamic error of `CLASSES`."""
     rows = {**results["bucketed"]["classes"], "mean": results["bucketed"]["mean"]}
     for key, expected in (("static_epe", static), ("dynamic_error", dynamic)):
         found = [rows[name][key] for name in CLASSES]
@@ -78,7 +74,7 @@ def filled(results: dict[str, Any], name: str, key: str) -> dict[int, Any]:
 
 
 def test_av2_three_way(pair: Pair) -> None:
-    # The official prediction is, bit for bit, the ego motion flow that the labels give to the background.
+    # The official prediction is, bit for bit, the flow by ego motion that the labels store for the background.
     background = (pair.labels.category == 0)[:, None]
     pose_flow = np.where(background, pair.labels.flow, ego_motion_flow(pair.points, pair.T_float32))
     expected = {"epe_fd": 0.6737204147, "epe_fs": 0.0062440348, "epe_bs": 0.0, "epe_3way": 0.2266548165}
@@ -90,7 +86,7 @@ def test_opensceneflow_npz(pair: Pair) -> None:
     check_three_way(
         results, epe_fd=0.6737206772, epe_fs=0.0062896596, epe_bs=6.2128e-07, epe_3way=0.2266703194, dynamic_iou=0.0
     )
-    check_classes(results, [6.21e-07, 0.00620734, 0.00582801, 0.00385737, NAN, 0.00397334], STILL)
+    check_classes(results, [6.21e-07, 0.00620734, 0.00582801, 0.00385737, NAN, 0.00397334], STATIC)
     assert filled(results, "CAR", "count") == {0: 6051, 1: 24, 3: 208, 11: 239, 20: 1117, 26: 161}
     speeds = {0: 0.0062073, 1: 0.0491397, 3: 0.1400945, 11: 0.4419174, 20: 0.8175343, 26: 1.0444958}
     assert filled(results, "CAR", "speed") == pytest.approx(speeds, abs=TOLERANCE, rel=0)
@@ -115,7 +111,7 @@ def test_bucketed_scene_flow_eval(pair: Pair, from_boxes: FlowLabels) -> None:
     parts = {"labels": from_boxes, "T_ego1_ego0": pair.T_float64, "is_ground": pair.bsfe_ground, "eval_mask": None}
     results = scores(pair, "bucketed_scene_flow_eval", **parts)
     check_three_way(results, epe_fd=0.664467, epe_fs=0.005682, epe_bs=0.0)
-    check_classes(results, [0.0, 0.005598, 0.005120, 0.003867, NAN, 0.003646], STILL)
+    check_classes(results, [0.0, 0.005598, 0.005120, 0.003867, NAN, 0.003646], STATIC)
     assert filled(results, "CAR", "count") == {0: 5729, 1: 21, 3: 208, 10: 21, 11: 216, 20: 1032, 26: 142}
     assert filled(results, "PEDESTRIAN", "count") == {0: 152, 2: 90}
     assert filled(results, "WHEELED_VRU", "count") == {0: 183}

@@ -1,8 +1,8 @@
-"""Our scores against the public evaluators themselves: av2 0.3.6 and bucketed-scene-flow-eval 2.0.25.
+"""Our scores compared with those of the public evaluators: av2 0.3.6 and bucketed-scene-flow-eval 2.0.25.
 
-Skipped where these packages are not installed; docs/evaluation.md says how to install them. Every number that an
-evaluator gives has a counterpart here. Where the two sides could differ for another reason than arithmetic, both get
-the same: truth, evaluation mask or ground, ego motion T.
+The tests are skipped where these packages are not installed; docs/evaluation.md has the commands. We compare every
+number that an evaluator returns. Both sides get the same truth, evaluation mask or ground, and ego motion T, so that
+they can differ by arithmetic only.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from public_evaluators import (
     Pair,
     bucket_numbers,
     check,
+    official_mask,
     predictions,
     read_pair,
     residual_at_t,
@@ -43,12 +44,6 @@ from cflow_torch.evaluation import DEFINITIONS, EvalFrame
 from cflow_torch.evaluation.frame import ego_motion_flow
 
 PREDICTIONS = ("zero", "half", "noise", "paper")
-
-
-@pytest.fixture(scope="module")
-def av2_eval() -> ModuleType:
-    """av2.evaluation.scene_flow.eval."""
-    return pytest.importorskip("av2.evaluation.scene_flow.eval", reason="docs/evaluation.md says how to install it")
 
 
 @pytest.fixture(scope="module")
@@ -103,33 +98,18 @@ def compare_av2(ours: dict[str, Any], table: Any, totals: dict[str, float]) -> C
     return numbers
 
 
-def run_av2(av2_eval: ModuleType, truths: Sequence[dict[str, Any]], predictions: Sequence[dict[str, Any]]) -> Any:
+def run_av2(av2: Any, truths: Sequence[dict[str, Any]], predictions: Sequence[dict[str, Any]]) -> Any:
     """Write the files of the challenge with av2's own writers and evaluate them: per-frame table, totals."""
-    from av2.evaluation.scene_flow.make_annotation_files import write_annotation
-    from av2.evaluation.scene_flow.utils import write_output_file
-
     with tempfile.TemporaryDirectory() as root:
         folders = Path(root) / "truth", Path(root) / "prediction"
         for folder in folders:
             folder.mkdir()
         for number, (truth, prediction) in enumerate(zip(truths, predictions)):
-            write_annotation(**truth, sweep_uuid=(LOG, TIME + number), output_dir=folders[0])
-            write_output_file(**prediction, sweep_uuid=(LOG, TIME + number), output_dir=folders[1])
-        table = av2_eval.evaluate_directories(*folders)
-    return table, av2_eval.results_to_dict(table)
-
-
-@pytest.fixture(scope="module")
-def av2_mask(av2_eval: ModuleType, pair: Pair, tmp_path_factory: pytest.TempPathFactory) -> np.ndarray:
-    """Points that the challenge scores, from av2's own mask file of the log."""
-    from av2.evaluation.scene_flow.make_mask_files import make_mask_files
-    from av2.evaluation.scene_flow.utils import get_eval_point_mask
-
-    root = tmp_path_factory.mktemp("av2")
-    (root / "av2" / "sensor").mkdir(parents=True)
-    (root / "av2" / "sensor" / "val").symlink_to(pair.folder.parent)
-    make_mask_files(str(root / "masks.zip"), str(root), "av2", "val")
-    return get_eval_point_mask((LOG, TIME), root / "masks.zip").numpy()
+            sweep = {"sweep_uuid": (LOG, TIME + number)}
+            av2.make_annotation_files.write_annotation(**truth, **sweep, output_dir=folders[0])
+            av2.utils.write_output_file(**prediction, **sweep, output_dir=folders[1])
+        table = av2.eval.evaluate_directories(*folders)
+    return table, av2.eval.results_to_dict(table)
 
 
 def truth_for_av2(points: np.ndarray, labels: FlowLabels, is_dynamic: np.ndarray, mask: np.ndarray) -> dict[str, Any]:
@@ -145,15 +125,15 @@ def truth_for_av2(points: np.ndarray, labels: FlowLabels, is_dynamic: np.ndarray
 @pytest.mark.parametrize("name", PREDICTIONS)
 @pytest.mark.parametrize("ego_motion", ["T_float32", "T_float64"])
 def test_av2_on_the_real_pair(
-    av2_eval: ModuleType, pair: Pair, residuals: dict[str, Any], av2_mask: np.ndarray, name: str, ego_motion: str
+    av2_tools: ModuleType, pair: Pair, residuals: dict[str, Any], name: str, ego_motion: str
 ) -> None:
-    T = getattr(pair, ego_motion)
+    T, av2_mask = getattr(pair, ego_motion), official_mask(pair)
     pose_flow = ego_motion_flow(pair.points, T)
     total = pose_flow + residuals[name]
     prediction = {"flow": total[av2_mask], "is_dynamic": is_long(total - pose_flow)[av2_mask]}
     truth = truth_for_av2(pair.points, pair.labels, pair.is_dynamic, av2_mask)
     frame = EvalFrame(pair.points, pair.labels, flow=total, T_ego1_ego0=T, eval_mask=av2_mask)
-    numbers = compare_av2(score("av2", [frame])["three_way"], *run_av2(av2_eval, [truth], [prediction]))
+    numbers = compare_av2(score("av2", [frame])["three_way"], *run_av2(av2_tools, [truth], [prediction]))
     check(f"av2, {name}, {ego_motion}", numbers)
     assert len(numbers) == 8 * 5 + 4 * 9 + 2 + 3
 
@@ -164,10 +144,10 @@ KINDS = ("edges", "random", "nothing valid", "all ground", "only static", "movin
 
 
 def made_up(kind: str, seed: int) -> MadeUp:
-    """A frame of one kind of corner case.
+    """Make a frame of one kind of corner case.
 
-    "edges" has no ego motion, so that limits are hit exactly. It comes first in a log, where both poses are the
-    identity: the product of two other equal poses is not exactly the identity.
+    "edges" has no ego motion, so that values lie exactly on limits. It is the first frame of a log, where both poses
+    are the identity, because the product of two other equal poses is not exactly the identity.
     """
     rng = np.random.default_rng(seed)
     n = 0 if kind == "no points" else int(rng.integers(50, 250))
@@ -185,7 +165,7 @@ def made_up(kind: str, seed: int) -> MadeUp:
         true *= 0.001 if kind == "only static" else 1
         angle, x = rng.uniform(-0.05, 0.05), rng.uniform(-3, 0)
         T = pose(x, 0.1, angle, 0.01)
-        # A total flow in float32 carries 1e-7 m, so keep clear of the limits that such an error would cross.
+        # Total flow in float32 has errors of 1e-7 m, so speeds keep a distance from the limits.
         speed = np.linalg.norm(true, axis=1, keepdims=True)
         near = np.abs(speed - np.append(EDGES[1:], 0.05)).min(axis=1, keepdims=True) < 1e-5
         true = np.where(near, true * 1.001, true)
@@ -201,7 +181,7 @@ def made_up(kind: str, seed: int) -> MadeUp:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_av2_on_made_up_frames(av2_eval: ModuleType, seed: int) -> None:
+def test_av2_on_made_up_frames(av2_tools: ModuleType, seed: int) -> None:
     truths, predicted, frames = [], [], []
     for number, kind in enumerate(KINDS):
         made = made_up(kind, 100 * seed + number)
@@ -211,7 +191,7 @@ def test_av2_on_made_up_frames(av2_eval: ModuleType, seed: int) -> None:
         truths.append(truth_for_av2(made.points, labels, is_long(labels.flow - pose_flow), mask))
         predicted.append({"flow": total[mask], "is_dynamic": is_long(total - pose_flow)[mask]})
         frames.append(EvalFrame(made.points, labels, flow=total, T_ego1_ego0=made.T, is_ground=made.is_ground))
-    numbers = compare_av2(score("av2", frames)["three_way"], *run_av2(av2_eval, truths, predicted))
+    numbers = compare_av2(score("av2", frames)["three_way"], *run_av2(av2_tools, truths, predicted))
     check(f"av2, made up {seed}", numbers)
 
 
@@ -221,7 +201,7 @@ def test_av2_on_made_up_frames(av2_eval: ModuleType, seed: int) -> None:
 def run_bsfe(
     bsfe: ModuleType, kind: str, raw: Path, truth: Path, predictions: Sequence[np.ndarray], output: Path, ground: bool
 ) -> Any:
-    """Its evaluator, fed with a log."""
+    """Score the predictions of a log with its evaluator."""
     from bucketed_scene_flow_eval.datastructures import EgoLidarFlow
 
     settings = {"with_ground": ground, "use_gt_flow": True, "cache_root": output, "use_cache": False}
@@ -238,7 +218,7 @@ def run_bsfe(
 def check_bsfe(
     bsfe: ModuleType, label: str, raw: Path, truth: Path, predictions: Sequence[np.ndarray], frames: Sequence[EvalFrame]
 ) -> None:
-    """Both metrics, inside 35 m and in the whole crop, without and with ground."""
+    """Compare both metrics, inside 35 m and in the whole crop, without and with ground."""
     for ground in (False, True):
         output = Path(tempfile.mkdtemp(dir=truth.parent))
         run = [
@@ -253,7 +233,7 @@ def check_bsfe(
             check(f"bsfe three-way, {where}", three_way_numbers(ours["three_way"], found))
 
 
-@pytest.mark.parametrize("name", PREDICTIONS)
+@pytest.mark.parametrize("name", ["noise", "paper"])
 def test_bsfe_on_the_real_pair(
     bsfe: ModuleType, pair: Pair, residuals: dict[str, Any], tmp_path: Path, name: str
 ) -> None:
@@ -264,7 +244,7 @@ def test_bsfe_on_the_real_pair(
     check_bsfe(bsfe, name, pair.folder.parent, truth, [predicted], [frame])
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_bsfe_on_made_up_frames(bsfe: ModuleType, tmp_path: Path, seed: int) -> None:
     kinds = [kind for kind in KINDS if kind not in ("no points", "all ground")]
     made = [made_up(kind, 100 * seed + number) for number, kind in enumerate(kinds)]

@@ -1,9 +1,8 @@
-"""Submission archives: what is written, that it passes, and that what a leaderboard would refuse is refused by name."""
+"""Submission archives: their contents, their checks, and the frames and points that they must contain."""
 
 from __future__ import annotations
 
 import io
-import json
 import shutil
 import zipfile
 from pathlib import Path
@@ -14,9 +13,8 @@ import pyarrow as pa
 import pytest
 from command_line import cflow
 from hdf5_scene import write_scene
-from public_evaluators import FLOW, LOG, TIME, read_pair
+from public_evaluators import FLOW, LOG, TIME, official_mask, read_pair
 from pyarrow import feather
-from scenes import pose
 
 from cflow_torch import CFlowError, CorrelationFlow
 from cflow_torch.data.av2 import AV2Log
@@ -29,14 +27,11 @@ from cflow_torch.evaluation.submission import (
     pack,
     plan_log,
     write_frame,
-    write_metadata,
 )
-from cflow_torch.evaluation.submission.encode import to_half
-from cflow_torch.evaluation.submission.masks import MaskArchive, point_mask
-from cflow_torch.evaluation.submission.plan import read_frame_list, require_logs
+from cflow_torch.evaluation.submission.formats import to_half
+from cflow_torch.evaluation.submission.frames import MaskArchive, point_mask, read_frame_list, require_logs
 from cflow_torch.simulator import make_drive
 from cflow_torch.simulator.writers.av2 import write_av2_log
-from cflow_torch.windows.ego_motion import relative_transform
 
 Files = Dict[str, bytes]
 
@@ -59,16 +54,15 @@ def estimated(log: AV2Log) -> dict[int, Any]:
 def archives(log: AV2Log, estimated: dict[int, Any], tmp_path_factory: pytest.TempPathFactory) -> dict[int, Any]:
     """Version -> folder, zip, expected frames."""
     result = {}
-    for number in (1, 2, 3):
+    for number in (1, 3):
         version, folder = get_version(number), tmp_path_factory.mktemp(f"v{number}") / "files"
         frames = []
-        for planned in plan_log(log, version):
+        for planned in plan_log(log):
             sweeps, flow = estimated[planned.index]
-            mask = point_mask(log, planned.index, sweeps.pc0) if version.rows == "masked" else None
-            write_frame(folder, planned.name, encode(version, sweeps, flow, mask)[0])
+            mask = point_mask(log, planned.index, sweeps.pc0) if version.is_masked else None
+            write_frame(folder, planned.name, encode(version, flow, sweeps.pc0.is_ground, mask)[0])
             frames.append(planned.expect(version))
-        write_metadata(folder, version)
-        pack(folder, [frame.name for frame in frames], folder.parent / "a.zip", version)
+        pack(folder, [frame.name for frame in frames], folder.parent / "a.zip")
         result[number] = (folder, folder.parent / "a.zip", frames)
     return result
 
@@ -99,69 +93,42 @@ def test_version_1_is_total_flow_of_the_mask(log: AV2Log, estimated: dict[int, A
         assert columns["is_dynamic"].any() and not columns["is_dynamic"].all()
 
 
-@pytest.mark.parametrize("number", [2, 3])
-def test_versions_2_and_3_are_residual_flow_of_all_points(
-    number: int, log: AV2Log, estimated: dict[int, Any], archives: dict[int, Any]
-) -> None:
+def test_version_3_is_residual_flow_of_all_points(log: AV2Log, estimated: dict[int, Any], archives: Any) -> None:
     for index, (sweeps, flow) in estimated.items():
-        name = f"{index:010d}" if number == 2 else str(log.timestamps[index])
-        columns = read(archives[number][0] / log.log_id / f"{name}.feather")
-        assert list(columns) == (["is_valid", *FLOW] if number == 2 else list(FLOW))
-        assert number == 3 or (columns["is_valid"].dtype == bool and columns["is_valid"].all())
+        columns = read(archives[3][0] / log.log_id / f"{log.timestamps[index]}.feather")
+        assert list(columns) == list(FLOW)
         assert flow_of(columns).dtype == np.float16 and flow_of(columns).any()
         np.testing.assert_array_equal(flow_of(columns), flow.residual_flow.numpy().astype(np.float16))
         loud = type(flow)(**{**vars(flow), "residual_flow": flow.residual_flow + 50})
-        values = flow_of(encode(get_version(number), sweeps, loud)[0])
-        assert not values[sweeps.pc0.is_ground].any() and values[~sweeps.pc0.is_ground].all(), "ground is 0 in any case"
+        values = flow_of(encode(get_version(3), loud, sweeps.pc0.is_ground)[0])
+        assert not values[sweeps.pc0.is_ground].any() and values[~sweeps.pc0.is_ground].all(), "ground is always 0"
 
 
-def test_residual_in_axes_of_t(estimated: dict[int, Any]) -> None:
-    # Where the point ends, seen from t, minus where it started: T^-1 (p + flow) - p.
-    sweeps, flow = estimated[5]
-    turn = pose(0, 0, np.deg2rad(3.0))
-    pc1 = type(sweeps.pc1)(**{**vars(sweeps.pc1), "pose": sweeps.pc1.pose @ turn})
-    T, start = relative_transform(pc1.pose, sweeps.pc0.pose), np.asarray(sweeps.pc0.points, np.float64)
-    end = start @ T[:3, :3].T + T[:3, 3] + flow.residual_flow.numpy()
-    expected = (end - T[:3, 3]) @ T[:3, :3] - start
-    got = flow_of(encode(get_version(2), type(sweeps)(sweeps.pc0, pc1), flow, residual_axes="t")[0]).astype(np.float64)
-    moved = flow.residual_flow.numpy().any(1)
-    np.testing.assert_allclose(got[moved], expected[moved], atol=2e-3)
-    assert np.abs(got - flow.residual_flow.numpy()).max() > 0.01, "the turn is seen"
-
-
-def test_what_cannot_be_written_is_refused(estimated: dict[int, Any]) -> None:
+def test_unsuitable_masks_values_and_versions_are_refused(estimated: dict[int, Any]) -> None:
     sweeps, flow = estimated[0]
-    mask = np.ones(len(sweeps.pc0.points), bool)
-    for number, given, message in (
-        (1, {}, "mask"),
-        (2, {"mask": mask}, "mask"),
-        (1, {"mask": mask, "residual_axes": "t"}, "residual_axes of version 1"),
-        (2, {"residual_axes": "t0"}, "t0"),
-    ):
-        with pytest.raises(CFlowError, match=message):
-            encode(get_version(number), sweeps, flow, **given)
+    for number, mask in ((1, None), (3, np.ones(len(sweeps.pc0.points), bool))):
+        with pytest.raises(CFlowError, match="mask"):
+            encode(get_version(number), flow, mask=mask)
     for value, message in ((np.nan, "NaN"), (np.inf, "infinite"), (65505.0, "beyond float16")):
         with pytest.raises(CFlowError, match=message):
             to_half(np.array([[0, 0, 0], [0, value, 0]], np.float32))
-    with pytest.raises(CFlowError, match="1, 2, 3"):
-        get_version(4)
+    for number, message in ((2, "closed"), (4, "1, 3")):
+        with pytest.raises(CFlowError, match=message):
+            get_version(number)
 
 
 def test_the_same_files_make_the_same_zip(archives: dict[int, Any], tmp_path: Path) -> None:
-    folder, good, frames = archives[2]
+    folder, good, frames = archives[1]
     shutil.copytree(folder, tmp_path / "copy")
-    pack(tmp_path / "copy", [frame.name for frame in reversed(frames)], tmp_path / "again.zip", get_version(2))
+    pack(tmp_path / "copy", [frame.name for frame in reversed(frames)], tmp_path / "again.zip")
     assert (tmp_path / "again.zip").read_bytes() == good.read_bytes()
-    with zipfile.ZipFile(good) as archive:
-        assert archive.namelist() == ["metadata.json", *(frame.name for frame in frames)], "sorted"
-        assert json.loads(archive.read("metadata.json")) == {"Is Supervised?": False}
     (tmp_path / "copy" / frames[0].name).unlink()
     with pytest.raises(OSError, match=frames[0].name):
-        pack(tmp_path / "copy", [frame.name for frame in frames], tmp_path / "never.zip", get_version(2))
+        pack(tmp_path / "copy", [frame.name for frame in frames], tmp_path / "never.zip")
     assert not (tmp_path / "never.zip").exists()
 
 
-# ---- spoiled archives: (what to do to one file of a good one) -> words that one line must hold
+# ---- damaged archives: version, change of one file of a valid archive, words of the one problem
 
 
 def in_table(change: Callable[[pa.Table], pa.Table]) -> Callable[[bytes], bytes]:
@@ -187,11 +154,7 @@ SPOILED: dict[str, Any] = {
     "empty value": (3, column("flow_tx_m", with_value(None)), "flow_tx_m has 1 empty"),
     "float64": (3, column("flow_tz_m", lambda v: v.astype(np.float64)), "flow_tz_m is float64, expected float16"),
     "dynamic as number": (1, column("is_dynamic", lambda v: v.astype(np.uint8)), "is_dynamic is uint8, expected bool"),
-    "column missing": (
-        2,
-        in_table(lambda t: t.drop(["is_valid"])),
-        "expected is_valid, flow",
-    ),
+    "column missing": (1, in_table(lambda t: t.drop(["is_dynamic"])), "flow_tz_m, is_dynamic"),
     "foreign column": (3, in_table(lambda t: t.append_column("score", t["flow_tx_m"])), "flow_tz_m, score, expected"),
     "truncated": (3, lambda data: data[: len(data) // 2], "cannot be read"),
 }
@@ -210,7 +173,7 @@ def rezip(files: Files, file: Path) -> Path:
 
 
 @pytest.mark.parametrize("kind", SPOILED)
-def test_a_spoiled_file_is_named(kind: str, archives: dict[int, Any], tmp_path: Path) -> None:
+def test_a_damaged_file_is_one_line_with_its_name(kind: str, archives: dict[int, Any], tmp_path: Path) -> None:
     number, spoil, words = SPOILED[kind]
     _, good, frames = archives[number]
     files = unzip(good)
@@ -220,15 +183,14 @@ def test_a_spoiled_file_is_named(kind: str, archives: dict[int, Any], tmp_path: 
 
 
 def test_every_problem_of_an_archive_is_listed(archives: dict[int, Any], tmp_path: Path) -> None:
-    _, good, frames = archives[2]
-    files = {**unzip(good), "notes.txt": b"", "metadata.json": b"{"}
+    _, good, frames = archives[3]
+    files = {**unzip(good), "notes.txt": b""}
     del files[frames[0].name]
-    foreign, metadata, missing = check_submission(rezip(files, tmp_path / "a.zip"), get_version(2), frames)
+    foreign, missing = check_submission(rezip(files, tmp_path / "a.zip"), get_version(3), frames)
     assert "notes.txt" in foreign and missing == f"{frames[0].name}: missing"
-    assert metadata.startswith("metadata.json: cannot be read")
 
 
-def test_archives_that_are_none(archives: dict[int, Any], tmp_path: Path) -> None:
+def test_damaged_zips_are_one_problem(archives: dict[int, Any], tmp_path: Path) -> None:
     _, good, frames = archives[3]
     whole = good.read_bytes()
     (tmp_path / "half.zip").write_bytes(whole[: len(whole) // 2])
@@ -247,19 +209,18 @@ def test_archives_that_are_none(archives: dict[int, Any], tmp_path: Path) -> Non
 
 def test_frames_go_by_the_masks_of_the_scene(tmp_path: Path) -> None:
     with HDF5Log(write_scene(tmp_path / "scene.h5", range(8), 1, [2, 3, 7])) as log:
-        for number in (1, 3):
-            plan = plan_log(log, get_version(number))
-            assert [frame.name for frame in plan] == [f"scene/{log.timestamps[i]}.feather" for i in (2, 3)], "7 is last"
-            assert plan[0].expect(get_version(number)).rows == (log.eval_mask(2).sum() if number == 1 else 52)
-        assert [f.name for f in plan_log(log, get_version(2))] == [f"scene/{i:010d}.feather" for i in (0, 5)]
+        plan = plan_log(log)
+        assert [frame.name for frame in plan] == [f"scene/{log.timestamps[i]}.feather" for i in (2, 3)], "7 is the last"
+        for number, rows in ((1, log.eval_mask(2).sum()), (3, 52)):
+            assert plan[0].expect(get_version(number)).rows == rows
     with HDF5Log(write_scene(tmp_path / "plain.h5", range(8), 1, [])) as log:
-        assert [frame.index for frame in plan_log(log, get_version(3))] == [0, 5]
+        assert [frame.index for frame in plan_log(log)] == [0, 5]
         for stamp in (log.timestamps[-1], 17):
-            with pytest.raises(CFlowError, match="is no sweep of the log, or its last"):
-                plan_log(log, get_version(3), {"plain": [stamp]})
+            with pytest.raises(CFlowError, match="is not a sweep of the log or is its last one"):
+                plan_log(log, {"plain": [stamp]})
         listed = {"plain": [log.timestamps[4], log.timestamps[1]]}
-        assert [frame.index for frame in plan_log(log, get_version(2), listed)] == [1, 4]
-        assert plan_log(log, get_version(3), {"another": [1]}) == []
+        assert [frame.index for frame in plan_log(log, listed)] == [1, 4]
+        assert plan_log(log, {"another": [1]}) == []
         with pytest.raises(CFlowError, match="another"):
             require_logs([log], {"another": [1], "plain": [2]})
         with pytest.raises(CFlowError, match="several"):
@@ -270,7 +231,7 @@ def test_a_list_of_frames_is_text(tmp_path: Path) -> None:
     file = tmp_path / "frames.txt"
     file.write_text("a/5\n\n a/7 # the second\nb/6")
     assert read_frame_list(file) == {"a": [5, 7], "b": [6]}
-    for content, message in ((b"a/5\nseven", "line 2: 'seven' is no frame"), (b"\x80\x04", "text")):
+    for content, message in ((b"a/5\nseven", "line 2: 'seven' is not a frame"), (b"\x80\x04", "text")):
         file.write_bytes(content)
         with pytest.raises(CFlowError, match=message):
             read_frame_list(file)
@@ -283,12 +244,12 @@ def write_masks(file: Path, log_id: str, timestamp: int, mask: np.ndarray) -> Pa
     return rezip({f"{log_id}/{timestamp}.feather": sink.getvalue()}, file)
 
 
-def test_official_masks_win(log: AV2Log, tmp_path: Path) -> None:
+def test_official_masks_take_precedence(log: AV2Log, tmp_path: Path) -> None:
     sweep, stamp = log.sweep(3), log.timestamps[3]
     mask = np.arange(len(sweep.points)) % 3 == 0
     masks = MaskArchive(write_masks(tmp_path / "masks.zip", log.log_id, stamp, mask))
     assert masks.frames == {log.log_id: [stamp]}
-    (planned,) = plan_log(log, get_version(1), masks.frames)
+    (planned,) = plan_log(log, masks.frames)
     assert planned.index == 3 and planned.expect(get_version(1), masks).rows == mask.sum()
     np.testing.assert_array_equal(point_mask(log, 3, sweep, masks), mask)
     short = MaskArchive(write_masks(tmp_path / "short.zip", log.log_id, stamp, mask[1:]))
@@ -325,7 +286,7 @@ def test_command_makes_checks_resumes(log: AV2Log, tmp_path: Path, capsys: pytes
     error = capsys.readouterr().err
     assert f"{two.name}: missing" in error and "problems: 1" in error
     (tmp_path / "v3" / "notes.txt").write_text("mine")
-    assert cflow(*call) == 1, "a foreign file is not packed silently"
+    assert cflow(*call) == 1, "an unknown file is reported"
     assert "notes.txt" in capsys.readouterr().err
     assert cflow(*call, "overwrite=true", "model.connectivity=4") == 0
 
@@ -334,19 +295,17 @@ def test_command_makes_checks_resumes(log: AV2Log, tmp_path: Path, capsys: pytes
 
 
 def submit_pair(av2_folder: Path, tmp_path: Path) -> Path:
-    """Writes tmp_path/v1 by the official masks, which it returns."""
-    pair = read_pair(av2_folder)
-    official = (np.abs(pair.points[:, :2]) <= 50).all(1) & ~pair.is_ground
-    masks = write_masks(tmp_path / "masks.zip", LOG, TIME, official)
+    """Write tmp_path/v1 with the official masks, and return their file."""
+    masks = write_masks(tmp_path / "masks.zip", LOG, TIME, official_mask(read_pair(av2_folder)))
     call = ["submit", "data=av2", f"data.root={av2_folder}", "version=1", "model=paper", f"masks={masks}"]
     assert cflow(*call, f"output={tmp_path}") == 0
     return masks
 
 
 def test_the_real_pair_with_its_masks(av2_folder: Path, tmp_path: Path) -> None:
-    """Point 31058 lies 0.4 mm before a border of the ground raster (city x 5242.499975, column 566.9986): av2's float32
-    coordinates (5242.500488) put it in the next cell, where it is ground; float64 does not. So official masks have one
-    point less than the rule computed here, and they are what a submission goes by."""
+    """Point 31058 is 0.4 mm from the edge of a cell of the ground raster (city x 5242.499975, column 566.9986). av2's
+    float32 coordinates (5242.500488) put it into the next cell, where it is ground; float64 does not. So the official
+    mask has one point less than the rule computed here, and the submission uses the official mask."""
     masks, log = MaskArchive(submit_pair(av2_folder, tmp_path)), AV2Log(av2_folder)
     columns = read(tmp_path / "v1" / LOG / f"{TIME}.feather")
     assert {len(values) for values in columns.values()} == {78_506}
@@ -354,10 +313,10 @@ def test_the_real_pair_with_its_masks(av2_folder: Path, tmp_path: Path) -> None:
     assert np.flatnonzero(own != official).tolist() == [31058]
 
 
-def test_av2_accepts_the_real_pair(av2_folder: Path, tmp_path: Path) -> None:
-    tools = pytest.importorskip("av2.evaluation.scene_flow.make_submission_archive", reason="av2 is not installed")
+def test_av2_accepts_the_real_pair(av2_tools: Any, av2_folder: Path, tmp_path: Path) -> None:
+    tools = av2_tools.make_submission_archive
     masks = submit_pair(av2_folder, tmp_path)
-    tools.validate(tmp_path / "v1", masks)  # raises if it does not like a file
+    tools.validate(tmp_path / "v1", masks)  # raises if it does not accept a file
     file = tmp_path / "v1" / LOG / f"{TIME}.feather"
     file.write_bytes(in_table(lambda t: t.slice(1))(file.read_bytes()))
     with pytest.raises(ValueError, match="rows"):

@@ -1,10 +1,8 @@
-"""Archives for the public leaderboards, versions 1, 2 and 3: written, packed and checked."""
+"""Archives for the public leaderboards, versions 1 and 3: written, packed and checked."""
 
-from cflow_torch.evaluation.submission.check import check_submission
-from cflow_torch.evaluation.submission.encode import encode
-from cflow_torch.evaluation.submission.plan import Frame, plan_log
-from cflow_torch.evaluation.submission.versions import SubmissionVersion, get_version
-from cflow_torch.evaluation.submission.write import is_complete, pack, write_frame, write_metadata
+from cflow_torch.evaluation.submission.archive import check_submission, is_complete, pack, write_frame
+from cflow_torch.evaluation.submission.formats import SubmissionVersion, encode, get_version
+from cflow_torch.evaluation.submission.frames import Frame, plan_log
 
 __all__ = [
     "Frame",
@@ -16,5 +14,4 @@ __all__ = [
     "pack",
     "plan_log",
     "write_frame",
-    "write_metadata",
 ]

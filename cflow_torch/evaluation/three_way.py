@@ -9,13 +9,13 @@ import numpy as np
 from cflow_torch.data.categories import CATEGORIES, CATEGORY_INDEX, META_CLASSES, meta_class
 from cflow_torch.evaluation.accumulator import Accumulator
 from cflow_torch.evaluation.definitions import Definition
-from cflow_torch.evaluation.masks import ScoredPoints
+from cflow_torch.evaluation.scored_points import ScoredPoints
 
 MOTIONS = ("static", "dynamic")
 DISTANCES = ("close", "far")
 QUANTITIES = ("epe", "accuracy_strict", "accuracy_relax", "angle_error")
-ACCURACY_STRICT, ACCURACY_RELAX = 0.05, 0.1  # metres, and share of the true flow
-ACCURACY_EPS = 1e-10  # metres, keeps the share finite
+ACCURACY_STRICT, ACCURACY_RELAX = 0.05, 0.1  # metres, and fraction of the true flow
+ACCURACY_EPS = 1e-10  # metres, keeps the fraction finite
 FRAME_COUNT_EPS, FRAME_IOU_EPS = 1e-8, 1e-6  # of OpenSceneFlow's per-frame values
 
 # The three sets of the score as (categories, motion).
@@ -26,15 +26,15 @@ _META_GROUPS: dict[str, Any] = {name: [CATEGORY_INDEX[c] for c in members] for n
 
 
 def point_quantities(predicted: np.ndarray, true: np.ndarray, sweep_interval: float) -> np.ndarray:
-    """Error measures of each point.
+    """Compute the error measures of each point.
 
     Args:
         predicted, true: (M, 3) float64, metres per frame.
-        sweep_interval: seconds; fourth component that makes the angle one between space-time vectors.
+        sweep_interval: seconds, fourth component of the space-time vectors whose angle is measured.
 
     Returns:
-        (4, M) float64, rows as in `QUANTITIES`: end-point error in metres; 1 where error or error / true length is
-        below 0.05, below 0.1; angle in radians.
+        (4, M) float64, rows as in `QUANTITIES`: end-point error in metres; 1 where the error or error / true length is
+        below 0.05; the same below 0.1; angle in radians.
     """
     error = np.linalg.norm(predicted - true, axis=1)
     share = error / (np.linalg.norm(true, axis=1) + ACCURACY_EPS)
@@ -54,8 +54,8 @@ class ThreeWayEPE(Accumulator):
         definition: name or `Definition`.
 
     Convention: a point is dynamic if its true residual is at least `dynamic_threshold`. With average "points" all
-    means are over all points and a set without points is NaN; with "frames" the three errors and the IoU are means
-    over frames, where an absent set counts as 0, so that frames without movers pull `epe_fd` and the IoU down. The
+    means are over all points, and a set without points is NaN. With "frames" the three errors and the IoU are means
+    over frames, where an absent set counts as 0; so frames without dynamic points lower `epe_fd` and the IoU. The
     breakdowns are over points in both cases.
     """
 
@@ -72,7 +72,7 @@ class ThreeWayEPE(Accumulator):
         return len(CATEGORIES), len(MOTIONS), len(DISTANCES)
 
     def cells(self, scored: ScoredPoints) -> tuple[np.ndarray, Sequence[np.ndarray]]:
-        """Category, motion and distance; `QUANTITIES`, predicted as dynamic."""
+        """Cells are category, motion and distance; quantities are `QUANTITIES` and whether predicted as dynamic."""
         keep, meta = scored.in_region, meta_class(scored.category)
         if self.definition.foreground == "meta":
             keep = keep & (meta >= 0)
@@ -87,7 +87,7 @@ class ThreeWayEPE(Accumulator):
         self.frame_sums += _values(count, sums, FRAME_COUNT_EPS, FRAME_IOU_EPS)
 
     def compute(self) -> dict[str, Any]:
-        """Scores so far.
+        """Return the scores so far.
 
         Returns:
             `epe_fd`, `epe_fs`, `epe_bs`, `epe_3way` in metres, `dynamic_iou`, `num_frames`, and "breakdown":
@@ -103,17 +103,18 @@ class ThreeWayEPE(Accumulator):
             "epe_3way": float(np.mean(values[:-1])),
             "dynamic_iou": float(values[-1]),
             "num_frames": self.num_frames,
-            "breakdown": {name: self._group(place) for name, place in _GROUPS.items()},
-            "by_class": {name: self._group(place) for name, place in _META_GROUPS.items()},
+            "breakdown": {name: self._group(members) for name, members in _GROUPS.items()},
+            "by_class": {name: self._group(members) for name, members in _META_GROUPS.items()},
         }
 
     def _group(self, categories: Any) -> dict[str, dict[str, dict[str, float]]]:
-        """Motion -> distance -> means over a group of categories."""
+        """Compute motion -> distance -> means over a group of categories."""
         count, sums = self.count[categories].sum(axis=0), self.sums[:, categories].sum(axis=1)
-        places: dict[str, Any] = {"all": slice(None), **{name: [place] for place, name in enumerate(DISTANCES)}}
+        columns: dict[str, Any] = {"all": slice(None), **{name: [column] for column, name in enumerate(DISTANCES)}}
         return {
             motion: {
-                name: _means(count[row, place].sum(), sums[:, row, place].sum(axis=1)) for name, place in places.items()
+                name: _means(count[row, column].sum(), sums[:, row, column].sum(axis=1))
+                for name, column in columns.items()
             }
             for row, motion in enumerate(MOTIONS)
         }
@@ -123,7 +124,7 @@ def _values(count: np.ndarray, sums: np.ndarray, count_eps: float = 0.0, iou_eps
     """(4,) float64: mean error of each of `_SETS`, and the IoU of true and predicted dynamic points."""
     predicted, true = sums[-1], count[:, 1].sum()
     with np.errstate(divide="ignore", invalid="ignore"):
-        means = [sums[0][place].sum() / (count[place].sum() + count_eps) for place in _SETS.values()]
+        means = [sums[0][cells].sum() / (count[cells].sum() + count_eps) for cells in _SETS.values()]
         return np.array([*means, predicted[:, 1].sum() / (true + predicted[:, 0].sum() + iou_eps)])
 
 

@@ -1,4 +1,4 @@
-"""Which points of a frame are scored, and the quantities every metric draws on."""
+"""Selection of the points of a frame that are scored, and the quantities that the metrics use."""
 
 from __future__ import annotations
 
@@ -21,13 +21,15 @@ class ScoredPoints:
         error: (M,) float64, metres, length of predicted minus true residual.
         speed: (M,) float64, metres per frame, length of the true residual.
         category: (M,) int64, Argoverse 2 index.
-        in_region: (M,) bool, inside the definition's region.
-        reach: (M,) float64, metres, distance that regions are measured by: max(|x|, |y|) for a box, else the radius.
+        in_region: (M,) bool, inside the region of the definition.
+        reach: (M,) float64, metres, distance by which regions are measured: max(|x|, |y|) for a box, else the radius.
         is_close: (M,) bool, inside the 70 m x 70 m square around the ego at t.
-        distance: (M,) float64, metres, from the origin at t, height included.
-        true_flow, predicted_flow: (M, 3) float64, the flow that the three-way scores compare.
-        is_dynamic, predicted_dynamic: (M,) bool.
-        num_nan: points left out because of NaN.
+        distance: (M,) float64, metres, from the origin at t, including height.
+        true_flow: (M, 3) float64, metres, true flow that the three-way scores compare.
+        predicted_flow: (M, 3) float64, metres, predicted flow that the three-way scores compare.
+        is_dynamic: (M,) bool, whether the true residual reaches the dynamic threshold.
+        predicted_dynamic: (M,) bool, whether the predicted residual does.
+        num_nan: number of points that are ignored because of NaN.
     """
 
     error: np.ndarray
@@ -45,14 +47,14 @@ class ScoredPoints:
 
 
 def score_points(frame: EvalFrame, definition: Definition) -> ScoredPoints:
-    """Select the points of a frame that a definition scores and compare prediction and truth there.
+    """Select the points of a frame that a definition scores, and compare prediction and truth there.
 
-    Convention: rounding follows the evaluator that the definition is named after. Totals and residuals are float32; a
-    predicted residual goes the way of the harnesses (add pose flow, take it off again); lengths are taken in
-    `norm_dtype`. Rows whose label is not valid are never looked at.
+    Convention: rounding follows the evaluator that the definition is named after. Totals and residuals are float32. A
+    predicted residual is processed as the harnesses do: pose flow is added and subtracted again. Lengths are computed
+    in `norm_dtype`. Rows without a valid label are never read.
 
     Raises:
-        CFlowError: NaN where the definition refuses it; `T_ego1_ego0` is missing where it is needed.
+        CFlowError: NaN where the definition does not allow it; `T_ego1_ego0` is missing where it is needed.
     """
     points, true_total = as_numpy(frame.points), frame.labels.flow
     pose_flow = as_numpy(frame.pose_flow)  # type: ignore[arg-type]
@@ -62,8 +64,8 @@ def score_points(frame: EvalFrame, definition: Definition) -> ScoredPoints:
     num_nan = int((keep & has_nan).sum())
     if num_nan and definition.nan_rows == "error":
         raise CFlowError(
-            f"{num_nan} scored points have NaN in position, truth or prediction; definition {definition.name} refuses "
-            f"them: predict 0 for points without an estimate, or use nan_rows='drop'"
+            f"{num_nan} scored points have NaN in position, truth or prediction, which definition {definition.name} "
+            f"does not allow: predict 0 for points without an estimate, or use nan_rows='drop'"
         )
     keep &= ~has_nan
     points, pose_flow, total, true_total = (values[keep] for values in (points, pose_flow, total, true_total))
@@ -73,7 +75,7 @@ def score_points(frame: EvalFrame, definition: Definition) -> ScoredPoints:
     if definition.residual_axes == "t":
         T = frame.transform()
         residual, true_residual = _residual_at_t(points, total, T), _residual_at_t(points, true_total, T)
-        if frame.residual_flow is not None:  # given as a residual: it is only turned
+        if frame.residual_flow is not None:  # a residual that was given needs a rotation only
             given = as_numpy(frame.residual_flow)[keep]
             residual = given if frame.residual_axes == "t" else (given @ T[:3, :3]).astype(np.float32)
     is_total = definition.three_way_flow == "total"
@@ -113,7 +115,7 @@ def _predicted_total(frame: EvalFrame) -> np.ndarray:
 
 
 def _residual_at_t(points: np.ndarray, total: np.ndarray, T_ego1_ego0: np.ndarray) -> np.ndarray:
-    """(M, 3) float32 residual in the axes of t: where the point ends, seen from t, minus where it started."""
+    """(M, 3) float32 residual in the axes of t: end point in coordinates of t, minus the start point."""
     start = points.astype(np.float64)
     rotation, translation = T_ego1_ego0[:3, :3], T_ego1_ego0[:3, 3]
     return ((start + total - translation) @ rotation - start).astype(np.float32)
@@ -135,7 +137,7 @@ def _candidates(frame: EvalFrame, definition: Definition, position: np.ndarray) 
 
 
 def _position(frame: EvalFrame, definition: Definition) -> np.ndarray:
-    """(N, 3) points in the frame that ranges are measured in: float32 at t, float64 at t+1."""
+    """(N, 3) points in the frame in which ranges are measured: float32 at t, float64 at t+1."""
     points = as_numpy(frame.points)
     if definition.region_axes == "t":
         return points

@@ -1,0 +1,206 @@
+"""Which frames and which points an archive must contain: frame lists, evaluation masks, and the official rules."""
+
+from __future__ import annotations
+
+import re
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Iterable, Mapping, Sequence
+
+import numpy as np
+import pyarrow as pa
+
+from cflow_torch.data.arrow_file import FeatherFile
+from cflow_torch.data.file_errors import file_errors
+from cflow_torch.data.log import Log
+from cflow_torch.data.names import is_timestamp, safe_name
+from cflow_torch.data.paths import read_bytes
+from cflow_torch.evaluation.submission.formats import SubmissionVersion
+from cflow_torch.types import CFlowError, Sweep, as_numpy
+
+STRIDE = 5  # without masks, every fifth pair of a log is evaluated
+_MASK = re.compile(r"(?P<log>.+)/(?P<stamp>0|[1-9][0-9]{0,18})\.feather", re.ASCII)
+_HALF_SIDE = 50.0  # metres; the official masks contain the points that are not ground with |x|, |y| <= 50
+
+
+class MaskArchive:
+    """The official evaluation masks: a zip of `<log>/<time stamp>.feather`, each with one bool column.
+
+    Args:
+        file: the zip.
+
+    Attributes:
+        frames: log id -> time stamps that are evaluated.
+
+    Raises:
+        CFlowError: the file is not a zip, or contains no masks.
+    """
+
+    def __init__(self, file: str | Path) -> None:
+        self.file = Path(file)
+        self.frames: dict[str, list[int]] = {}
+        with file_errors(self.file):
+            self._zip = zipfile.ZipFile(self.file)
+        for match in map(_MASK.fullmatch, sorted(self._zip.namelist())):
+            if match is not None:
+                self.frames.setdefault(match["log"], []).append(int(match["stamp"]))
+        if not self.frames:
+            raise CFlowError(f"{self.file} contains no masks: give a zip of <log>/<time stamp>.feather")
+
+    def mask(self, log_id: str, timestamp: int) -> np.ndarray:
+        """Read the (N,) bool mask of a sweep.
+
+        Raises:
+            CFlowError: there is no mask for this sweep, or it cannot be read.
+        """
+        name = f"{log_id}/{timestamp}.feather"
+        with file_errors(f"{self.file}: {name}"):
+            file = FeatherFile(name, self._zip.read(name))
+            columns = file.read(file.names).columns
+        if len(columns) != 1 or not pa.types.is_boolean(columns[0].type) or columns[0].null_count:
+            raise CFlowError(f"{self.file}: {name} must have one bool column without empty values")
+        return columns[0].to_numpy()
+
+
+def log_mask(log: Log, index: int) -> np.ndarray | None:
+    """Read the (N,) bool evaluation mask that a log stores itself; None where it has none."""
+    read = getattr(log, "eval_mask", None)
+    return None if read is None else read(index)
+
+
+def point_mask(log: Log, index: int, sweep: Sweep, masks: MaskArchive | None = None) -> np.ndarray:
+    """Select the points of a sweep that are evaluated.
+
+    Args:
+        log: may have a method `eval_mask(index)` that returns (N,) bool or None, as `HDF5Log` has.
+        index: number of the sweep in the log.
+        sweep: the sweep.
+        masks: official masks. They take precedence.
+
+    Returns:
+        (N,) bool: the official mask, else the log's own, else the official rule (not ground, |x| and |y| <= 50 m).
+
+    Raises:
+        CFlowError: the number of rows differs from that of the sweep; neither a mask nor the ground is known.
+    """
+    points = as_numpy(sweep.points)
+    mask = log_mask(log, index) if masks is None else masks.mask(log.log_id, log.timestamps[index])
+    if mask is None:
+        if sweep.is_ground is None:
+            raise CFlowError(f"log {log.log_id} has neither masks nor ground: give the official masks, or its map")
+        return (np.abs(points[:, :2]) <= _HALF_SIDE).all(axis=1) & ~as_numpy(sweep.is_ground)
+    if mask.shape != (len(points),):
+        name = f"{log.log_id}/{log.timestamps[index]}"
+        raise CFlowError(f"evaluation mask of {name} has {len(mask)} rows, the sweep has {len(points)}")
+    return mask
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One file that an archive must contain.
+
+    Args:
+        name: inside the archive, `<log>/<time stamp>.feather`.
+        rows: number of its rows.
+    """
+
+    name: str
+    rows: int
+
+
+@dataclass(frozen=True)
+class PlannedFrame:
+    """A frame to submit: the pair (index, index + 1) of a log."""
+
+    log: Log
+    index: int
+
+    @property
+    def name(self) -> str:
+        """Name of its file inside the archive."""
+        return f"{self.log.log_id}/{self.log.timestamps[self.index]}.feather"
+
+    def expect(self, version: SubmissionVersion, masks: MaskArchive | None = None) -> Frame:
+        """Count the rows of its file. Reads the sweep.
+
+        Raises:
+            CFlowError: the sweep or its mask cannot be read.
+        """
+        sweep = self.log.sweep(self.index)
+        if version.is_masked:
+            return Frame(self.name, int(point_mask(self.log, self.index, sweep, masks).sum()))
+        return Frame(self.name, len(sweep.points))
+
+
+def plan_log(log: Log, listed: Mapping[str, Sequence[int]] | None = None) -> list[PlannedFrame]:
+    """List the frames of one log that a submission needs, in the order of time.
+
+    Args:
+        log: one drive.
+        listed: log id -> time stamps of exactly the frames to submit (a frame list, or `frames` of a mask archive).
+
+    Convention:
+        Without a list: the sweeps that have an evaluation mask if the log has any, else the pairs 0, 5, 10 ... The last
+        sweep is left out, because it has no successor; OpenSceneFlow writes no file for it either.
+
+    Raises:
+        CFlowError: a listed time stamp is not in the log, or is its last; the log's name cannot be a folder's.
+    """
+    safe_name(log.log_id, "the log")
+    pairs = range(len(log.timestamps) - 1)
+    if listed is not None:
+        indices = [_index_of(log, stamp) for stamp in sorted(set(listed.get(log.log_id, ())))]
+    else:
+        indices = [i for i in pairs if log_mask(log, i) is not None] or list(pairs[::STRIDE])
+    return [PlannedFrame(log, i) for i in indices]
+
+
+def read_frame_list(file: str | Path) -> dict[str, list[int]]:
+    """Read a list of frames: plain text, one `<log>/<time stamp>` a line, # for comments.
+
+    Returns:
+        Log id -> time stamps.
+
+    Raises:
+        CFlowError: the file is not text, cannot be read, or has a line that is not a frame.
+    """
+    file = Path(file)
+    try:
+        lines = read_bytes(file).decode("utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise CFlowError(f"{file} cannot be read as a text file of frames ({error})") from error
+    result: dict[str, list[int]] = {}
+    for number, line in enumerate(lines, 1):
+        entry = line.partition("#")[0].strip()
+        if not entry:
+            continue
+        log, _, stamp = entry.rpartition("/")
+        if not log or not is_timestamp(stamp):
+            raise CFlowError(f"{file}, line {number}: {entry!r} is not a frame; write <log>/<time stamp>")
+        result.setdefault(log, []).append(int(stamp))
+    return result
+
+
+def require_logs(logs: Iterable[Log], listed: Mapping[str, Sequence[int]] | None) -> None:
+    """Check that the names of logs are unique and that every listed log exists.
+
+    Raises:
+        CFlowError: two logs have one name, or a listed log is not in the data.
+    """
+    names = [log.log_id for log in logs]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise CFlowError(f"several logs are called {', '.join(twice)}: their files would overwrite each other")
+    missing = sorted(set(listed or ()) - set(names))
+    if missing:
+        raise CFlowError(f"{len(missing)} listed logs are not in the data: {', '.join(missing[:5])}")
+
+
+def _index_of(log: Log, timestamp: int) -> int:
+    stamps = list(log.timestamps)
+    if timestamp not in stamps[:-1]:
+        raise CFlowError(
+            f"{log.log_id}/{timestamp} is listed, but is not a sweep of the log or is its last one, which has no flow"
+        )
+    return stamps.index(timestamp)
