@@ -35,8 +35,8 @@ class CleanLog(Log):
         log: any log. Sweeps are read one after the other, and only a few are held in memory.
         model: the method; None = preset `offline`.
         flow: index -> flow of that pair, in place of a model; with residual_flow, and cluster_id and is_valid for
-            `standing`.
-        standing: also remove objects that have stopped or not yet started, such as cars at a light, by their tracks.
+            `remove_stopped`.
+        remove_stopped: also remove objects that have stopped or not yet started, such as cars at a light, by their tracks.
             This takes a pass over the log before the first sweep is returned, and a bit of memory per point.
 
     Attributes:
@@ -51,8 +51,11 @@ class CleanLog(Log):
         log: Log,
         model: SceneFlowModel | None = None,
         flow: Callable[[int], FlowResult] | None = None,
-        standing: bool = False,
+        remove_stopped: bool = False,
+        standing: None = None,
     ) -> None:
+        if standing is not None:
+            raise CFlowError("standing= is now remove_stopped=")
         self.log_id, self.timestamps = log.log_id, log.timestamps
         if len(log.timestamps) < 2:
             raise CFlowError(f"log {log.log_id} has {len(log.timestamps)} sweeps: give a log of at least two")
@@ -61,7 +64,7 @@ class CleanLog(Log):
         self._log = CachedLog(log, 2 if model is None else model.config.num_sweeps)
         self._flow: Any = lru_cache(2)(flow if flow is not None else lambda index: self._estimate(model, index))
         self._bits: list[np.ndarray] | None = None
-        self._tracks_objects = standing
+        self._tracks_objects = remove_stopped
 
     def sweep(self, index: int) -> Sweep:
         """Sweep number `index` without its moving points; pose and time as in the log."""

@@ -1,13 +1,13 @@
 """Logs without what moves: OUTPUT/<log id>, a folder of point clouds with poses, times and ground as data=arrays reads.
 
-A point moves if its residual flow is 0.05 m a sweep or more. standing=true goes by tracks and takes out as well what
+A point moves if its residual flow is 0.05 m a sweep or more. remove_stopped=true goes by tracks and takes out as well what
 moves at another time of the log, such as a car that waits. map=true writes OUTPUT/<log id>.ply, what stands in the
 world, one point per voxel. Only x, y, z are kept. A log is written whole or not at all; the same command again does
 those that are missing. OUTPUT/config.yaml holds the resolved settings and versions.
 
 examples:
   cflow clean /data/drive map=true voxel_size=0.2            any format that is recognised, bags as well
-  cflow clean data=av2 data.root=/data/av2/val standing=true
+  cflow clean data=av2 data.root=/data/av2/val remove_stopped=true
   cflow clean /data/drive flow=outputs/flow                  by the flow that `cflow flow` left there
 """
 
@@ -47,9 +47,9 @@ def task(cfg: DictConfig) -> None:
     for log in logs:
         folder, file = output / log.log_id, output / f"{log.log_id}.ply"
         flow: Callable[[int], FlowResult] | None = None if stored is None else partial(stored, log)
-        with run.reported(failures, log.log_id):
+        with run.collect_failures(failures, log.log_id):
             if not folder.exists():
-                clean = CleanLog(log, model, flow, cfg.standing)
+                clean = CleanLog(log, model, flow, cfg.remove_stopped)
                 poses = None if log.sweep(0).pose is None else "kitti"
                 write_array_log(clean, output, cfg.suffix or _own_suffix(log), poses)
             print(f"{folder}: {len(log.timestamps)} sweeps")

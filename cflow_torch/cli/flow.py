@@ -187,7 +187,7 @@ def _write_tracks(sources: run.Sources, shard: Shard, output: Path) -> Failures:
     failures: Failures = []
     flow = run.stored_flow(output, ())
     for unit in tqdm(shard.units(sources.logs), desc="tracks", unit="log", disable=None):
-        with run.reported(failures, source_name(unit.source)):
+        with run.collect_failures(failures, source_name(unit.source)):
             log = sources.open(unit.source)
             folder = output / log.log_id
             stamps = [int(stamp) for stamp in log.timestamps[:-1]]
@@ -204,7 +204,7 @@ def _into_scenes(name: str, scenes: Sequence[Path], output: Path) -> Failures:
     for scene in tqdm(scenes, desc=name, unit="scene", disable=None):
         folder = output / scene.stem
         stamps = sorted(complete_frames(folder))
-        with run.reported(failures, scene.stem):
+        with run.collect_failures(failures, scene.stem):
             count += write_hdf5_results(scene, name, ((t, read_flow(frame_file(folder, t)).flow) for t in stamps))
     print(f"sweeps that now have a key {name} in their scene: {count} (the last sweep of a scene has no flow)")
     return failures

@@ -69,7 +69,7 @@ def _label(done: FlowRun, shard: Shard, cfg: DictConfig) -> Failures:
     scenes = [unit.source for unit in shard.units(done.sources.logs)]
     for scene in tqdm(scenes, desc="labels", unit="scene", disable=None):
         folder = as_path(done.job.output) / scene.stem
-        with run.reported(failures, scene.stem):
+        with run.collect_failures(failures, scene.stem):
             maker = labelled_by(scene)
             _check_maker(scene, maker, done.job)
             if maker == done.job.identity and not done.job.redo:

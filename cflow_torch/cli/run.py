@@ -25,7 +25,7 @@ from cflow_torch.data.log import CachedLog, Log, window
 from cflow_torch.data.paths import as_path
 from cflow_torch.data.records import write_text
 from cflow_torch.fleet.manifest import frame_file
-from cflow_torch.fleet.progress import say
+from cflow_torch.fleet.progress import log_line
 from cflow_torch.model import SceneFlowModel
 from cflow_torch.simulator.benchmark import benchmark_logs, format_of
 from cflow_torch.stages import StopWatch
@@ -195,7 +195,7 @@ def open_logs(cfg: DictConfig) -> tuple[list[Log], Failures]:
     logs: list[Log] = []
     failures: Failures = []
     for source in sources.logs:
-        with reported(failures, source.name):
+        with collect_failures(failures, source.name):
             logs.append(sources.open(source))
     return logs, failures
 
@@ -225,13 +225,13 @@ def stored_flow(folder: Any, needed: Sequence[str]) -> Callable[[Log, int], Flow
 
 
 @contextmanager
-def reported(failures: Failures, name: str) -> Iterator[None]:
+def collect_failures(failures: Failures, name: str) -> Iterator[None]:
     """A step for one frame or log: if it fails, that is said and noted, and the rest goes on."""
     try:
         yield
     except (CFlowError, OSError) as error:
         failures.append((name, str(error)))
-        say(f"failed: {name}: {error}")
+        log_line(f"failed: {name}: {error}")
 
 
 def for_each_pair(logs: Sequence[Log], model: StopWatch, use: UseResult, pairs: Callable[[Log], range]) -> Failures:
@@ -255,7 +255,7 @@ def for_each_pair(logs: Sequence[Log], model: StopWatch, use: UseResult, pairs: 
         return window(*pair, config.num_history, config.num_future)
 
     for (log, index), answer in estimates(model, indices, read):
-        with reported(failures, f"{log.log_id}/{log.timestamps[index]}"):
+        with collect_failures(failures, f"{log.log_id}/{log.timestamps[index]}"):
             use(log.log, index, *answer())
     return failures
 

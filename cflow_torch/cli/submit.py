@@ -105,7 +105,7 @@ def _plan(logs: Sequence[Log], version: SubmissionVersion, listed: _Listed, mask
     plan: Plan = []
     failures: Failures = []
     for frame in counted(frames, "rows"):
-        with run.reported(failures, frame.name):
+        with run.collect_failures(failures, frame.name):
             plan.append((frame, frame.expect(version, masks)))
     return plan, failures
 
@@ -122,7 +122,7 @@ def _write(
         return window(pair[0].log, pair[0].index, config.num_history, config.num_future)
 
     for (planned, frame), estimate in estimates(model, todo, read):
-        with run.reported(failures, frame.name):
+        with run.collect_failures(failures, frame.name):
             sweeps, result = estimate()
             mask = point_mask(planned.log, planned.index, sweeps.pc0, masks) if version.is_masked else None
             columns, lost = encode(version, result, sweeps.pc0.is_ground, mask)

@@ -49,7 +49,7 @@ def task(cfg: DictConfig) -> None:
     for log in logs:
         recent: Any = CachedLog(log, num_sweeps)
         file = output / f"{log.log_id}.rrd"
-        with run.reported(failures, log.log_id):
+        with run.collect_failures(failures, log.log_id):
             if file in files:
                 raise CFlowError(f"{file} is of another log of this name: give data.root=PATH more narrowly")
             results = _results(recent, chosen(log), flow, failures)
@@ -86,7 +86,7 @@ def _results(
     """The flow of each pair; a bad frame is reported and the rest goes on."""
     for index in counted(pairs, log.log_id):
         result = None
-        with run.reported(failures, f"{log.log_id}/{log.timestamps[index]}"):
+        with run.collect_failures(failures, f"{log.log_id}/{log.timestamps[index]}"):
             window(log, index)  # both sweeps, which are kept for the recording
             log.labels(index)
             result = flow(log, index)

@@ -10,7 +10,7 @@ from dataclasses import replace
 from typing import Any, Callable, Iterator, Protocol, Sequence
 
 from cflow_torch.fleet.job import Event, Failed, Opened, Unit
-from cflow_torch.fleet.progress import say
+from cflow_torch.fleet.progress import log_line
 from cflow_torch.fleet.work import describe, source_name
 from cflow_torch.types import CFlowError
 
@@ -195,4 +195,4 @@ class _Run:
         self._workers.remove(worker)
         if not self._workers:
             raise CFlowError(why)
-        say(f"{why}; going on with {len(self._workers)} workers")
+        log_line(f"{why}; going on with {len(self._workers)} workers")

@@ -61,7 +61,7 @@ class Progress(tqdm):  # type: ignore[type-arg]
             super().__init__(file=_Lines(), bar_format=_LINE, mininterval=EVERY, miniters=1, delay=EVERY, **settings)
 
 
-def say(text: str) -> None:
+def log_line(text: str) -> None:
     """A line on stderr, above the bar; the work goes on even if nobody hears it."""
     tqdm.write(text, file=_STDERR)
 

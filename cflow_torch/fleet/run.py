@@ -17,7 +17,7 @@ from cflow_torch.fleet.dispatch import SIGNALS
 from cflow_torch.fleet.job import Event, Failed, Job, Shard, split
 from cflow_torch.fleet.local import run_local
 from cflow_torch.fleet.machine import Layout
-from cflow_torch.fleet.progress import Progress, say
+from cflow_torch.fleet.progress import Progress, log_line
 from cflow_torch.fleet.ray_engine import run_ray
 from cflow_torch.fleet.report import Counters
 from cflow_torch.types import CFlowError
@@ -63,7 +63,7 @@ def run_fleet(
         except CFlowError as error:  # no worker is left
             if not counters.total:
                 raise
-            say(f"ended early: {error}")
+            log_line(f"ended early: {error}")
         ended_by = 0 if counters.is_complete else stop.received or 0
         name = signal.Signals(ended_by).name if ended_by else ""
         report = {**counters.report(time.perf_counter() - start, layout, shard, engine, name), **about}
@@ -73,7 +73,7 @@ def run_fleet(
             remove_stale(file.parent)
             write_text(file, json.dumps(json_ready(report), indent=1, allow_nan=False) + "\n")
         except OSError as error:
-            say(f"the report could not be written: {error}")
+            log_line(f"the report could not be written: {error}")
             report["exit_status"] = report["exit_status"] or 1
     return report
 
@@ -91,7 +91,7 @@ def _follow(events: Iterator[Event], counters: Counters, num_units: int) -> None
             if counters.num_opened:
                 progress.total = round(counters.total * max(1, num_units / counters.num_opened))
             if isinstance(event, Failed):
-                say(f"failed: {event.name}: {event.message}")
+                log_line(f"failed: {event.name}: {event.message}")
             progress.update(settled)
         progress.total = progress.n
 

@@ -10,7 +10,7 @@ import pyarrow
 import torch
 
 from cflow_torch.fleet.job import Event, Job, Opened, Unit
-from cflow_torch.fleet.progress import say
+from cflow_torch.fleet.progress import log_line
 from cflow_torch.fleet.work import DeviceLost, Worker, describe
 
 _REPORT_EVERY_S = 0.5  # a call and its answer cost a millisecond or two
@@ -62,6 +62,6 @@ class WorkerProcess(Worker):
                     self._events = running
                     return Step(events, has_ended=False)
         except (DeviceLost, SystemExit) as error:  # a new process may have more luck
-            say(f"a worker ends: {describe(error)}")
+            log_line(f"a worker ends: {describe(error)}")
             os._exit(_ENDED)
         return Step(events, has_ended=True)

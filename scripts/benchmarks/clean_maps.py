@@ -145,9 +145,9 @@ def main() -> None:
             begin = time.process_time()
             flow.append(model([sweeps])[0])
             seconds += time.process_time() - begin
-        for label, standing in (("cflow", False), ("cflow, standing", True)):
+        for label, remove_stopped in (("cflow", False), ("cflow, stopped", True)):
             begin = time.process_time()
-            clean = CleanLog(opened, flow=flow.__getitem__, standing=standing)
+            clean = CleanLog(opened, flow=flow.__getitem__, remove_stopped=remove_stopped)
             removed = [clean.moving(index) for index in pairs]
             spent = (seconds + time.process_time() - begin) / len(flow)
             rows.append(scores(f"{name}: {label}", removed, truth, spent))

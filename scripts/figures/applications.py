@@ -84,7 +84,7 @@ def clean(file: Path) -> None:
     """The map of the crossing, with and without what moves; from above, darker where it is higher."""
     log, flow = crossing()
     figure, both = square_panels(2)
-    cleaned = CleanLog(log, flow=flow.__getitem__, standing=True)
+    cleaned = CleanLog(log, flow=flow.__getitem__, remove_stopped=True)
     for axes, each, title in zip(both, (log, cleaned), ("all points of the drive", "without what moves")):
         x, y, z = static_map(each, 0.15).T
         order = z.argsort()

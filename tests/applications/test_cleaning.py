@@ -38,7 +38,7 @@ def waiting() -> Staged:
 
 def test_what_waits_is_taken_out_by_its_track_and_what_is_parked_stays() -> None:
     log = waiting()
-    by_flow, by_tracks = cleaned(log), cleaned(log, standing=True)
+    by_flow, by_tracks = cleaned(log), cleaned(log, remove_stopped=True)
     for index in range(len(log) - 1):
         car = log.world(index)[2]
         assert np.array_equal(by_tracks.moving(index), (car == 0) | (car == 1)), index
@@ -78,8 +78,8 @@ def test_empty_sweeps_are_no_error() -> None:
         def sweep(self, index: int) -> Sweep:
             return Sweep(np.zeros((0, 3), np.float32), None, np.eye(4), 10**8 * index)
 
-    for standing in (False, True):
-        clean = CleanLog(Nothing(), standing=standing)
+    for remove_stopped in (False, True):
+        clean = CleanLog(Nothing(), remove_stopped=remove_stopped)
         assert [len(sweep.points) for sweep in clean] == [0, 0, 0]
     assert static_map(clean).shape == (0, 3)
 
@@ -92,6 +92,8 @@ def test_what_cannot_be_done_is_said() -> None:
         static_map(log, 0.0)
     with pytest.raises(CFlowError, match="rows"):
         CleanLog(log, flow=lambda index: Staged(log.ways[:, :, :] * np.nan).result(index)).moving(0)
+    with pytest.raises(CFlowError, match="is now remove_stopped="):
+        CleanLog(log, standing=True)
     log.poses = np.tile(np.eye(4), (12, 1, 1))
     with pytest.raises(CFlowError, match="larger voxels"):
         static_map(log, 1e-5)
@@ -108,5 +110,5 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     file.unlink()
     assert call("clean", "clean", *settings) == 0 and file.read_bytes() == before, "only what is missing is done"
     capsys.readouterr()
-    assert call("clean", "clean", "model=fast", "standing=true") == 2 and "standing" in capsys.readouterr().err
+    assert call("clean", "clean", "model=fast", "remove_stopped=true") == 2 and "remove_stopped" in capsys.readouterr().err
     assert call("clean", "other", "suffix=.xyz") == 2 and ".ply" in capsys.readouterr().err

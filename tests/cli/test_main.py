@@ -77,6 +77,7 @@ def test_version_and_help_come_without_torch(cflow: Cflow, capsys: pytest.Captur
         ("flow data=av2 data.root=/no/such/folder", "/no/such/folder"),
         ("flow contents=[confidence] model=paper", "confidence is there with model=default and model=fast only"),
         ("completion", "one of bash, zsh, fish, got nothing"),
+        ("clean standing=true", "setting 'standing' is now 'remove_stopped'"),
     ],
 )
 def test_a_wrong_call_gets_one_line_that_says_what_to_do(

@@ -18,7 +18,7 @@ from cflow_torch import CFlowError
 from cflow_torch.fleet import machine, progress
 from cflow_torch.fleet.job import Shard, find_shard, split
 from cflow_torch.fleet.machine import Layout, choose_layout, usable_cores
-from cflow_torch.fleet.progress import Progress, say
+from cflow_torch.fleet.progress import Progress, log_line
 from cflow_torch.fleet.run import StopSignal
 
 # Shares of the work
@@ -183,7 +183,7 @@ def test_work_goes_on_if_nobody_hears(monkeypatch: pytest.MonkeyPatch, is_termin
     monkeypatch.setattr(Gone, "isatty", lambda self: is_terminal)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "stderr", Gone())
-        say("a frame failed")
+        log_line("a frame failed")
         with Progress(3) as bar:
             bar.update(2)
             bar.update(1)
