@@ -1,4 +1,4 @@
-"""Sparse matches -> one shift for every occupied pixel (Sec. From sparse scene flow to dense scene flow)."""
+"""Spread sparse matches to one shift for every occupied pixel (Sec. From sparse scene flow to dense scene flow)."""
 
 from __future__ import annotations
 
@@ -18,37 +18,40 @@ from cflow_torch.ops.segments import segment_median
 
 @dataclass(frozen=True)
 class DenseShift:
-    """Groups of pixels that share a shift, numbered by window, then by first pixel (or key point) in raster order.
+    """Groups of pixels with a common shift, in order of window, then of first pixel (or key point) in raster order.
 
     Args:
         pixel: (P,) int64, flat indices of the occupied pixels, ascending.
-        group: (P,) int64, group of each, G = none.
+        group: (P,) int64, group of each pixel, G = none.
         shift: (G, 2) float64, (dy, dx) pixels; 0 for a group without a match.
-        number: (G,) int64, number of the group counted from 0 in its window.
+        id_in_window: (G,) int64, index of each group among those of its window.
         score: (G,) float64, NCC; 0 for a group without a match.
     """
 
     pixel: Tensor
     group: Tensor
     shift: Tensor
-    number: Tensor
+    id_in_window: Tensor
     score: Tensor
 
 
-def densify(images: Tensor, place: Tensor, matches: Matches, pixel_size: float, config: KeypointsConfig) -> DenseShift:
-    """Shift of every occupied pixel of sweep t.
+def densify(
+    images: Tensor, matched: Tensor, matches: Matches, pixel_size: float, config: KeypointsConfig
+) -> DenseShift:
+    """Find the shift of every occupied pixel of sweep t.
 
     Args:
         images: (B, H, W) bool, occupancy of sweep t.
-        place: (M,) int64, flat indices into `images` of the matched key points, ascending.
-        matches: their shifts and scores.
+        matched: (M,) int64, flat indices into `images` of the matched key points, ascending.
+        matches: shift and score of each matched key point.
         pixel_size: s, metres.
         config: `densify`, `connectivity`, `labeling`, `max_extent`.
 
     Returns:
-        "components": a group is a connected component of the image as it is; its shift is the median of dy and that of
-        dx over its matched key points, its score the median of theirs. "clusters": the same for the components that
-        Alg. clustering finds in sweep t alone. "nearest": a group is a matched key point and the pixels nearest to it.
+        With "components", a group is a connected component of the image. Its shift is the median of dy and the median
+        of dx over its matched key points, and its score is the median of their scores. With "clusters", a group is a
+        component of Alg. clustering on sweep t alone, with the same medians. With "nearest", a group is a matched key
+        point and the pixels nearest to it.
 
     Convention:
         Medians of an even number are the mean of the middle two. Ties of the nearest key point: first in raster order.
@@ -59,10 +62,10 @@ def densify(images: Tensor, place: Tensor, matches: Matches, pixel_size: float, 
     image_size = images.shape[1] * images.shape[2]
     shift, score = matches.shift.double(), matches.score
     if config.densify == "nearest":
-        seeds = torch.zeros_like(images).view(-1).index_fill_(0, place, True).view_as(images)
+        seeds = torch.zeros_like(images).view(-1).index_fill_(0, matched, True).view_as(images)
         nearest = nearest_set_pixel(seeds, pixel)
-        group = torch.where(nearest < 0, place.numel(), torch.searchsorted(place, nearest))
-        return DenseShift(pixel, group, shift, _count_from_zero(place // image_size), score)
+        group = torch.where(nearest < 0, matched.numel(), torch.searchsorted(matched, nearest))
+        return DenseShift(pixel, group, shift, _id_in_window(matched // image_size), score)
     if config.densify == "clusters":
         component = label_components(images, pixel, pixel_size, config)
     else:
@@ -71,12 +74,12 @@ def densify(images: Tensor, place: Tensor, matches: Matches, pixel_size: float, 
     is_first = component == torch.arange(pixel.numel(), device=pixel.device)
     group = (is_first.cumsum(0) - 1).index_select(0, component)
     first = flat_nonzero(is_first)
-    of_match = group.index_select(0, torch.searchsorted(pixel, place))
-    dy, dx, ncc = (segment_median(values, of_match, first.numel()) for values in (*shift.unbind(1), score))
-    number = _count_from_zero(pixel.index_select(0, first) // image_size)
-    return DenseShift(pixel, group, torch.stack((dy, dx), 1), number, ncc)
+    group_of_match = group.index_select(0, torch.searchsorted(pixel, matched))
+    dy, dx, ncc = (segment_median(values, group_of_match, first.numel()) for values in (*shift.unbind(1), score))
+    window = pixel.index_select(0, first) // image_size
+    return DenseShift(pixel, group, torch.stack((dy, dx), 1), _id_in_window(window), ncc)
 
 
-def _count_from_zero(window: Tensor) -> Tensor:
-    """(G,) ascending windows -> number of each group counted from 0 in its window."""
+def _id_in_window(window: Tensor) -> Tensor:
+    """(G,) int64, index of each group among those of its window; windows are ascending."""
     return torch.arange(window.numel(), device=window.device) - torch.searchsorted(window, window)

@@ -16,13 +16,13 @@ class KeyPoints:
     """Key points of one sweep of every window, in order of window, row and column.
 
     Args:
-        place: (K,) int64, flat indices into the images, ascending.
-        window, row, col: (K,) int64, the same apart.
+        pixel: (K,) int64, flat indices into the images, ascending.
+        window, row, col: (K,) int64, the window and the row and column in its image.
         patch: (K, L * L) uint8, zeros and ones.
         energy: (K,) int64, number of ones, at least 1.
     """
 
-    place: Tensor
+    pixel: Tensor
     window: Tensor
     row: Tensor
     col: Tensor
@@ -31,7 +31,7 @@ class KeyPoints:
 
 
 def detect(occupancy: Tensor) -> Tensor:
-    """Key points: occupied pixels at distance 1 from the background (Sec. Keypoints).
+    """Find the key points: occupied pixels at distance 1 from the background (Sec. Keypoints).
 
     Args:
         occupancy: (..., H, W) bool.
@@ -39,13 +39,14 @@ def detect(occupancy: Tensor) -> Tensor:
     Returns:
         (..., H, W) bool.
 
-    Convention: the distance is Euclidean, so one of the four neighbours is free; outside the image all is free.
+    Convention: the distance is Euclidean, so a key point has a free pixel among its four neighbours. The outside of the
+        image is background.
     """
     return occupancy & ~erode_cross(occupancy)
 
 
 def describe(images: Tensor, patch_size: int) -> KeyPoints:
-    """Key points of one sweep and their descriptors (Sec. Descriptor).
+    """Find the key points of one sweep and describe each by the pixels around it (Sec. Descriptor).
 
     Args:
         images: (B, H, W) bool, occupancy of the sweep of every window.
@@ -56,7 +57,7 @@ def describe(images: Tensor, patch_size: int) -> KeyPoints:
 
     Cost: memory K L^2 bytes; the images are not unfolded.
     """
-    place = flat_nonzero(detect(images))
-    line, col = split_index(place, images.shape[2])
+    pixel = flat_nonzero(detect(images))
+    line, col = split_index(pixel, images.shape[2])
     window, row = split_index(line, images.shape[1])
-    return KeyPoints(place, window, row, col, *gather_patches(images, window, row, col, patch_size))
+    return KeyPoints(pixel, window, row, col, *gather_patches(images, window, row, col, patch_size))

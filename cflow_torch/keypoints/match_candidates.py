@@ -1,7 +1,7 @@
-"""Match candidates: which key points of t and t+1 may match, those within a radius of each other.
+"""Match candidates: the key points of t+1 that lie within a radius of a key point of t.
 
-Key points of t are grouped by small tiles of the image. The key points of t+1 that can lie within the radius of a group
-stand in a few runs of a list that is sorted by band of rows, then by column. Nothing is ever as large as all key points
+We group the key points of t by small tiles of the image. The key points of t+1 are sorted by band of rows, then by
+column, so those within the radius of a group are a few ranges of that list. Nothing is ever as large as all key points
 times all key points.
 """
 
@@ -15,28 +15,30 @@ from torch import Tensor
 
 from cflow_torch.config import KeypointsConfig
 from cflow_torch.keypoints.descriptors import KeyPoints
+from cflow_torch.ops.indices import gather
+from cflow_torch.ops.spans import spans
 from cflow_torch.windows.collation import Batch
 
-# Rows and columns of a tile, rows of a band, key points in a group: of the settings that were counted for groups of 16
-# those with the fewest pairs (key point, candidate), on the AV2 pair 1.55 for one within the radius. Groups of 8 have
-# fewer pairs but fetch twice as many descriptors for each.
+# Rows and columns of a tile, rows of a band, key points in a group. Of the settings that we counted for groups of 16,
+# these have the fewest pairs (key point, candidate): on the AV2 pair 1.55 for each pair within the radius. Groups of 8
+# have fewer pairs, but fetch twice as many descriptors for each.
 _TILE_ROWS, _TILE_COLS = 12, 64
 _BAND = 4
 _GROUP = 16
-# Pairs that are looked at together: a CPU wants them in its cache, a GPU wants many.
+# Pairs that are compared together: they should fit the cache of a CPU; a GPU needs many.
 _PAIRS_AT_ONCE_CPU = 1 << 17
 _PAIRS_AT_ONCE_GPU = 1 << 26
 _BYTES_PER_PAIR = 64
-# Lists of candidates are padded to a multiple of this, and to the longest of those that are looked at together.
+# Lists of candidates that are compared together are padded to the longest of them, rounded up to a multiple of this.
 _LENGTH_STEP = 8
-# `gate_radius` is the distance that a match may cover in this time.
+# `gate_radius` is the longest distance of a match in this time.
 _GATE_SECONDS = 0.1
 
 
 def match_radius(batch: Batch, pixel_size: float, config: KeypointsConfig) -> Tensor:
-    """(B,) float64, pixels: farthest match of each window, speed times the time from t to t+1."""
+    """(B,) float64, pixels: longest distance of a match in each window, which is speed times the time from t to t+1."""
     seconds = batch.seconds[:, 1]
-    size = torch.full_like(seconds, pixel_size)  # a GPU would multiply by the reciprocal of a plain number
+    size = torch.full_like(seconds, pixel_size)  # a GPU would multiply by the reciprocal of a Python number
     reach = config.gate_radius * (seconds / torch.full_like(seconds, _GATE_SECONDS)) / size
     if config.max_speed is not None:
         reach = torch.minimum(reach, config.max_speed * seconds / size + 1)
@@ -45,12 +47,12 @@ def match_radius(batch: Batch, pixel_size: float, config: KeypointsConfig) -> Te
 
 @dataclass(frozen=True)
 class Pairing:
-    """Groups of key points and what they may match, the longest lists of candidates first.
+    """Groups of key points and their match candidates, in order of falling number of candidates.
 
     Args:
-        member: (G, S) int64, key points of each group; padded with their number.
-        candidate: (C,) int64, candidates of all groups one after the other.
-        first, count: (G,) int64, which of them belong to a group.
+        member: (G, S) int64, key points of each group, padded with the number of key points.
+        candidate: (C,) int64, candidates of all groups, one group after the other.
+        first, count: (G,) int64, the range of `candidate` that belongs to each group.
         limit: (G,) int32, largest squared distance of a match, pixels.
     """
 
@@ -62,7 +64,7 @@ class Pairing:
 
 
 def pair(source: KeyPoints, target: KeyPoints, reach: Tensor) -> Pairing:
-    """Candidates among `target` of groups of `source`: all within reach of a group, and a few more.
+    """Find the candidates among `target` of groups of `source`: all within reach of a group, and a few more.
 
     Args:
         source, target: key points of the same windows, at least one each.
@@ -74,21 +76,21 @@ def pair(source: KeyPoints, target: KeyPoints, reach: Tensor) -> Pairing:
     candidate, count, limit = _candidates(source, member, target, reach)
     first = count.cumsum(0) - count
     count, order = count.sort(descending=True)
-    member, first, limit = (values.index_select(0, order) for values in (member, first, limit))
+    member, first, limit = gather(order, member, first, limit)
     return Pairing(member, candidate, first, count, limit)
 
 
 def pairs_at_once(device: torch.device, max_memory: float | None) -> int:
-    """Number of pairs (key point, candidate) that are looked at together."""
+    """Number of pairs (key point, candidate) that are compared together."""
     number = _PAIRS_AT_ONCE_CPU if device.type == "cpu" else _PAIRS_AT_ONCE_GPU
     return number if max_memory is None else min(number, int(max_memory) // _BYTES_PER_PAIR)
 
 
 def chunks(pairing: Pairing, num_pairs: int) -> Iterator[tuple[slice, int]]:
-    """Groups that are looked at together, and the length that their lists of candidates are padded to."""
+    """Groups that are compared together, and the length that their lists of candidates are padded to."""
     counts = pairing.count.tolist()
     begin = 0
-    while begin < len(counts) and counts[begin] > 0:  # the others have no candidate
+    while begin < len(counts) and counts[begin] > 0:  # the remaining groups have no candidate
         length = -(-counts[begin] // _LENGTH_STEP) * _LENGTH_STEP
         end = begin + max(1, num_pairs // (length * _GROUP))
         yield slice(begin, end), length
@@ -96,7 +98,7 @@ def chunks(pairing: Pairing, num_pairs: int) -> Iterator[tuple[slice, int]]:
 
 
 def _group(points: KeyPoints) -> Tensor:
-    """Groups of up to `_GROUP` key points of the same tile, side by side, (G, _GROUP) int64; padded with K."""
+    """(G, _GROUP) int64, groups of key points of the same tile, in order of columns; padded with K."""
     tile = (points.window << 24) + (points.row // _TILE_ROWS << 12) + points.col // _TILE_COLS
     tile, order = ((tile << 16) + points.col).sort(stable=True)
     tile >>= 16
@@ -109,11 +111,11 @@ def _group(points: KeyPoints) -> Tensor:
 
 
 def _candidates(source: KeyPoints, member: Tensor, target: KeyPoints, reach: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """For every group the key points that may lie within reach of its members (all that do, and a few more)."""
+    """Candidates of all groups, one group after the other, their number, and `Pairing.limit` of each group."""
     key, order = _band_key(target.window, target.row // _BAND, target.col).sort()
-    some = member[:, :1]
-    window = source.window.take(some)
-    member = torch.where(member == source.row.numel(), some, member)
+    first = member[:, :1]
+    window = source.window.take(first)
+    member = torch.where(member == source.row.numel(), first, member)
     (top, bottom), (left, right) = (
         values.take(member).aminmax(dim=1, keepdim=True) for values in (source.row, source.col)
     )
@@ -126,12 +128,9 @@ def _candidates(source: KeyPoints, member: Tensor, target: KeyPoints, reach: Ten
     start = torch.searchsorted(key, _band_key(window, band, (left - half_width).clamp(min=0)))
     end = torch.searchsorted(key, _band_key(window, band, right + half_width + 1))
     length = (end - start).mul_(square >= 0)
-    count = length.sum(1)
-    start, length = start.flatten(), length.flatten()
-    place = torch.repeat_interleave(start - (length.cumsum(0) - length), length)
-    candidate = order.index_select(0, place.add_(torch.arange(place.numel(), device=place.device)))
+    candidate = order.index_select(0, spans(start.flatten(), length.flatten()))
     limit = (reach * reach).floor().clamp(max=torch.iinfo(torch.int32).max - 1).int()
-    return candidate, count, limit[:, 0]
+    return candidate, length.sum(1), limit[:, 0]
 
 
 def _band_key(window: Tensor, band: Tensor, col: Tensor) -> Tensor:

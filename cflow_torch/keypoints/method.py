@@ -16,14 +16,14 @@ from cflow_torch.stages import stage
 
 
 class CorrelationFlowKeypoints(CoarseToFine):
-    """The paper's key-point variant: windows of one pair of sweeps in, flow out. No parameters, no buffers, no state.
+    """The paper's key-point variant: windows of two sweeps in, flow out. It has no parameters, no buffers and no state.
 
     Args:
-        config: a `KeypointsConfig`; `CorrelationFlowKeypoints.from_preset` makes it from a preset.
+        config: a `KeypointsConfig`. `CorrelationFlowKeypoints.from_preset` makes one from a preset.
 
     Convention:
-        The paper matches one pair of sweeps at one scale. Several `pixel_sizes` work as in the dense method (an
-        extension).
+        The paper matches one pair of sweeps at one scale. Several `pixel_sizes` work as in the dense method; this is
+        our extension.
 
     Example:
         >>> from cflow_torch import CorrelationFlowKeypoints, Sweep, Window
@@ -39,28 +39,27 @@ class CorrelationFlowKeypoints(CoarseToFine):
 
     @property
     def bytes_per_point(self) -> int:  # type: ignore[override]
-        """Working memory: two copies of a descriptor for at most half of the points as well."""
+        """Working memory per point, including two copies of a descriptor for at most half of the points."""
         return int(super().bytes_per_point) + int(self.config.patch_size) ** 2
 
     def motion_at_scale(self, sweeps: ProjectedSweeps) -> Motion:
-        """Sec. CorrelationFlow-Keypoints at one pixel size, over sweeps that are warped and projected."""
+        """Match the key points of t and t+1 at one pixel size and spread the matches to all points of t."""
         config, occupancy, pixel_size = self.config, sweeps.occupancy, sweeps.grid.pixel_size
         with stage("describe"):
             pc1, pc0 = (describe(occupancy[:, step], config.patch_size) for step in (0, 1))
         with stage("match"):
             matches = match(pc0, pc1, match_radius(sweeps.batch, pixel_size, config), config)
         with stage("densify"):
-            dense = densify(occupancy[:, 1], pc0.place.index_select(0, matches.source), matches, pixel_size, config)
+            dense = densify(occupancy[:, 1], pc0.pixel.index_select(0, matches.source), matches, pixel_size, config)
             size = occupancy.numel() + 1
-            of_pixel = torch.full((size,), len(dense.shift), dtype=torch.int32, device=occupancy.device)
-            # Image b of sweep t is image 2 b + 1 of the occupancy.
+            cluster_of_cell = torch.full((size,), len(dense.shift), dtype=torch.int32, device=occupancy.device)
+            # Sweep t of window b is image 2 b + 1 of the occupancy.
             image_size = occupancy[0, 0].numel()
             in_occupancy = dense.pixel + (dense.pixel // image_size + 1) * image_size
-            of_pixel.scatter_(0, in_occupancy, dense.group.int())
             return Motion(
-                cluster_of_cell=of_pixel,
+                cluster_of_cell=cluster_of_cell.scatter_(0, in_occupancy, dense.group.int()),
                 cell_of_point=sweeps.pixel,
                 flow=F.pad(dense.shift.flip(1) * pixel_size, (0, 1, 0, 1)),  # (dy, dx) -> (x, y, 0)
-                cluster_id=F.pad(dense.number, (0, 1), value=-1),
+                cluster_id=F.pad(dense.id_in_window, (0, 1), value=-1),
                 score=F.pad(dense.score.float(), (0, 1)),
             )
