@@ -36,8 +36,8 @@ class CleanLog(Log):
         model: the method; None = preset `offline`.
         flow: index -> flow of that pair, in place of a model; with residual_flow, and cluster_id and is_valid for
             `remove_stopped`.
-        remove_stopped: also remove objects that have stopped or not yet started, such as cars at a light, by their tracks.
-            This takes a pass over the log before the first sweep is returned, and a bit of memory per point.
+        remove_stopped: also remove objects that have stopped or not yet started, such as cars at a light, by their
+            tracks. This takes a pass over the log before the first sweep is returned, and a bit of memory per point.
 
     Attributes:
         log_id, timestamps: those of the log.

@@ -1,9 +1,9 @@
-"""Logs without what moves: OUTPUT/<log id>, a folder of point clouds with poses, times and ground as data=arrays reads.
+"""Writes logs without dynamic objects: OUTPUT/<log id>, a folder of point clouds, poses, times and ground masks.
 
-A point moves if its residual flow is 0.05 m a sweep or more. remove_stopped=true goes by tracks and takes out as well what
-moves at another time of the log, such as a car that waits. map=true writes OUTPUT/<log id>.ply, what stands in the
-world, one point per voxel. Only x, y, z are kept. A log is written whole or not at all; the same command again does
-those that are missing. OUTPUT/config.yaml holds the resolved settings and versions.
+data=arrays reads such a folder. A point is dynamic if its residual flow is at least 0.05 m per sweep.
+remove_stopped=true follows objects and also removes those that move at another time, such as a waiting car. map=true
+also writes OUTPUT/<log id>.ply, the static points in the world, one per voxel. Only x, y, z are kept. A log is written
+as a whole or not at all. Repeat the command to write the missing logs. OUTPUT/config.yaml holds settings and versions.
 
 examples:
   cflow clean /data/drive map=true voxel_size=0.2            any format that is recognised, bags as well
