@@ -19,22 +19,22 @@ class Staged(Log):
     """Box-shaped cars with exact flow, before a wall.
 
     Args:
-        ways: (K, T, 2) x, y of the corner of each car at each sweep; NaN = hidden.
+        paths: (K, T, 2) x, y of the corner of each car at each sweep; NaN = hidden.
         poses: (T, 4, 4) of the vehicle, None = no poses.
     """
 
-    def __init__(self, ways: Any, poses: Any = None) -> None:
-        self.ways, self.poses, self.log_id = np.asarray(ways, float), poses, "staged"
-        self.timestamps = [INTERVAL_NS * (1 + index) for index in range(self.ways.shape[1])]
+    def __init__(self, paths: Any, poses: Any = None) -> None:
+        self.paths, self.poses, self.log_id = np.asarray(paths, float), poses, "staged"
+        self.timestamps = [INTERVAL_NS * (1 + index) for index in range(self.paths.shape[1])]
 
     def world(self, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Points, their residual flow in the world, their car (-1 = the wall)."""
         points, flow, car = [_WALL], [np.zeros_like(_WALL)], [np.full(len(_WALL), -1)]
-        for number, way in enumerate(self.ways):
-            if np.isfinite(way[index]).all():
-                points.append(_BODY + [*way[index], 0])
-                after = way[min(index + 1, len(way) - 1)]
-                step = np.nan_to_num(after - way[index]) if np.isfinite(after).all() else way[index] - way[index - 1]
+        for number, path in enumerate(self.paths):
+            if np.isfinite(path[index]).all():
+                points.append(_BODY + [*path[index], 0])
+                after = path[min(index + 1, len(path) - 1)]
+                step = np.nan_to_num(after - path[index]) if np.isfinite(after).all() else path[index] - path[index - 1]
                 flow.append(np.zeros_like(_BODY) + [*step, 0])
                 car.append(np.full(len(_BODY), number))
         return np.concatenate(points), np.concatenate(flow), np.concatenate(car)

@@ -1,4 +1,4 @@
-"""What moves is taken out, also where it waits; logs come back from disk; the map has one point per voxel."""
+"""Moving objects are removed, also while they wait; logs come back from disk; the map has one point per voxel."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def cleaned(log: Staged, **more: Any) -> CleanLog:
     return CleanLog(log, flow=log.result, **more)
 
 
-def test_the_wall_stays_and_the_cars_go_in_every_sweep() -> None:
+def test_moving_cars_are_removed_from_every_sweep_and_the_wall_stays() -> None:
     log = Staged([straight((0, 0), (0.9, 0.0)), straight((20, 5), (-1.0, 0.0))])
     clean = cleaned(log)
     for index in range(len(log)):  # the last one has no flow of its own
@@ -29,14 +29,13 @@ def test_the_wall_stays_and_the_cars_go_in_every_sweep() -> None:
 
 
 def waiting() -> Staged:
-    """A car that waits for eight sweeps and starts, one that stops, one that is parked and never moves."""
+    """A car that waits for eight sweeps and starts, a car that stops, and a parked car that never moves."""
     start = np.cumsum([0.0] * 8 + [0.1, 0.2, 0.4, 0.7, 1.0, 1.0, 1.0, 1.0])
     stop = np.cumsum([1.0, 1.0, 1.0, 1.0, 0.7, 0.4, 0.2, 0.1] + [0.0] * 8)
-    ways = [np.stack([start, 0 * start], 1), np.stack([stop, 0 * stop + 5], 1), straight((25, 0), (0, 0), 16)]
-    return Staged(ways)
+    return Staged([np.stack([start, 0 * start], 1), np.stack([stop, 0 * stop + 5], 1), straight((25, 0), (0, 0), 16)])
 
 
-def test_what_waits_is_taken_out_by_its_track_and_what_is_parked_stays() -> None:
+def test_waiting_cars_are_removed_by_their_tracks_and_parked_cars_stay() -> None:
     log = waiting()
     by_flow, by_tracks = cleaned(log), cleaned(log, remove_stopped=True)
     for index in range(len(log) - 1):
@@ -45,7 +44,7 @@ def test_what_waits_is_taken_out_by_its_track_and_what_is_parked_stays() -> None
     assert not by_flow.moving(2)[log.world(2)[2] == 0].any() and not by_flow.moving(12)[log.world(12)[2] == 1].any()
 
 
-def test_ground_and_times_of_points_go_with_their_rows() -> None:
+def test_ground_and_point_times_stay_with_their_rows() -> None:
     class Whole(Staged):
         def sweep(self, index: int) -> Sweep:
             points = super().sweep(index).points
@@ -57,7 +56,7 @@ def test_ground_and_times_of_points_go_with_their_rows() -> None:
     assert np.array_equal(sweep.is_ground, stays % 7 == 0) and np.allclose(sweep.point_times, stays * 1e-6)
 
 
-def test_a_clean_log_is_written_and_read_as_any_other(tmp_path: Path) -> None:
+def test_a_clean_log_is_written_and_read_like_any_log(tmp_path: Path) -> None:
     poses = np.tile(np.eye(4), (12, 1, 1))
     poses[:, 0, 3] = np.arange(12)
     log = Staged([straight((0, 0), (0.9, 0.0))], poses)
@@ -67,31 +66,31 @@ def test_a_clean_log_is_written_and_read_as_any_other(tmp_path: Path) -> None:
     points = static_map(back, 0.4)
     wall = log.world(0)[0][log.world(0)[2] < 0]
     voxels = np.unique(np.floor(points / 0.4), axis=0)
-    assert len(voxels) == len(points), "one of each voxel"
+    assert len(voxels) == len(points), "one point of each voxel"
     assert np.array_equal(voxels, np.unique(np.floor(wall.astype(np.float32).astype(float) / 0.4), axis=0))
 
 
-def test_empty_sweeps_are_no_error() -> None:
-    class Nothing(Log):
-        log_id, timestamps = "nothing", (1, 2, 3)
+def test_empty_sweeps_give_empty_sweeps_and_an_empty_map() -> None:
+    class Empty(Log):
+        log_id, timestamps = "empty", (1, 2, 3)
 
         def sweep(self, index: int) -> Sweep:
             return Sweep(np.zeros((0, 3), np.float32), None, np.eye(4), 10**8 * index)
 
     for remove_stopped in (False, True):
-        clean = CleanLog(Nothing(), remove_stopped=remove_stopped)
+        clean = CleanLog(Empty(), remove_stopped=remove_stopped)
         assert [len(sweep.points) for sweep in clean] == [0, 0, 0]
     assert static_map(clean).shape == (0, 3)
 
 
-def test_what_cannot_be_done_is_said() -> None:
+def test_wrong_inputs_are_one_clear_error() -> None:
     log = Staged([straight((0, 0), (0.9, 0.0))])
     with pytest.raises(CFlowError, match="odometry"):
         static_map(cleaned(log))
     with pytest.raises(CFlowError, match="voxel_size"):
         static_map(log, 0.0)
     with pytest.raises(CFlowError, match="rows"):
-        CleanLog(log, flow=lambda index: Staged(log.ways[:, :, :] * np.nan).result(index)).moving(0)
+        CleanLog(log, flow=lambda index: Staged(log.paths * np.nan).result(index)).moving(0)
     with pytest.raises(CFlowError, match="is now remove_stopped="):
         CleanLog(log, standing=True)
     log.poses = np.tile(np.eye(4), (12, 1, 1))
@@ -99,7 +98,7 @@ def test_what_cannot_be_done_is_said() -> None:
         static_map(log, 1e-5)
 
 
-def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_the_command_resumes_and_refuses_changed_settings(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     call = calls_on_a_drive(tmp_path)
     settings = ("model=fast", "map=true", "voxel_size=0.5", "suffix=.ply")
     assert call("clean", "clean", *settings) == 0
@@ -108,7 +107,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     assert len(log) == 4 and len(log[0].points) > 1000 and log[0].is_ground is not None
     before = file.read_bytes()
     file.unlink()
-    assert call("clean", "clean", *settings) == 0 and file.read_bytes() == before, "only what is missing is done"
+    assert call("clean", "clean", *settings) == 0 and file.read_bytes() == before
     capsys.readouterr()
     assert call("clean", "clean", "model=fast", "remove_stopped=true") == 2
     assert "remove_stopped was" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""De-skewed points: what was torn by its motion is whole again."""
+"""De-skewing puts a car together again that its motion has torn apart."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ LENGTH, STEP = 4.5, 2.0  # metres, metres per sweep
 
 
 def torn_car(yaw: float) -> Window:
-    """A car that two units meet half a sweep apart, and a wall; the vehicle turns by `yaw` a sweep."""
+    """A car that two LiDARs measure half a sweep apart, and a wall; the vehicle rotates by `yaw` a sweep."""
     rng = np.random.default_rng(0)
     sweeps = []
     for k in range(4):  # t+1, t, t-1, t-2
@@ -37,22 +37,22 @@ def in_world(points: np.ndarray, sweep: Sweep) -> np.ndarray:
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.1])
-def test_a_torn_car_is_whole(yaw: float) -> None:
+def test_a_torn_car_is_put_together(yaw: float) -> None:
     window = torn_car(yaw)
     (result,) = VerifiedFlow.from_preset("default", device="cpu")([window])
     whole = in_world(deskew(window, result).numpy(), window.pc0)
     given = in_world(window.pc0.points, window.pc0)
     assert np.ptp(given[:800, 0]) > LENGTH + 0.9 and abs(np.ptp(whole[:800, 0]) - LENGTH) < 0.1
-    assert abs(whole[:800, 0].min() + STEP) < 0.05, "where it was at the instant of the sweep"
+    assert abs(whole[:800, 0].min() + STEP) < 0.05, "its position at the time stamp of the sweep"
     assert np.array_equal(whole[800:], given[800:])
 
 
-def test_each_point_goes_back_by_its_part_of_the_flow() -> None:
+def test_each_point_moves_back_by_its_share_of_the_flow() -> None:
     window = torn_car(0.3)
     flow = torch.rand(1600, 3, generator=torch.Generator().manual_seed(0))
     moved = deskew(window, FlowResult.of({"residual_flow": flow})).numpy() - window.pc0.points
-    turn = window.pc0.pose[:3, :3].T @ window.pc1.pose[:3, :3]
-    assert np.allclose(moved, -(flow.numpy() @ turn.T) * (window.pc0.point_times / 0.1)[:, None], atol=1e-12)
+    rotation = window.pc0.pose[:3, :3].T @ window.pc1.pose[:3, :3]
+    assert np.allclose(moved, -(flow.numpy() @ rotation.T) * (window.pc0.point_times / 0.1)[:, None], atol=1e-12)
     still = replace(window, pc0=replace(window.pc0, point_times=np.zeros(1600)))
     assert np.array_equal(deskew(still, FlowResult.of({"residual_flow": flow})), window.pc0.points)
 
@@ -65,7 +65,7 @@ def test_each_point_goes_back_by_its_part_of_the_flow() -> None:
         ({"timestamp_ns": 2 * 10**9}, 1600, "in order"),
     ],
 )
-def test_what_it_cannot_use(change: dict, rows: int, message: str) -> None:
+def test_unusable_inputs_are_refused(change: dict, rows: int, message: str) -> None:
     window = torn_car(0.0)
     window = replace(window, pc0=replace(window.pc0, **change))
     with pytest.raises(CFlowError, match=message):

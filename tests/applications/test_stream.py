@@ -1,4 +1,4 @@
-"""Streams: the flow of windows to the bit; gaps, late, repeated and bad sweeps, reused buffers, bounded memory."""
+"""Streams give the flow of windows to the bit, through gaps and late, repeated or bad sweeps, in bounded memory."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def push(stream: FlowStream, sweep: Sweep, **changes: Any) -> FlowResult | None:
 
 
 def expected(sweeps: list[Sweep], index: int, settings: Any) -> FlowResult:
-    """Flow of sweep `index` with all the history that there is."""
+    """Flow of sweep `index` with all available history."""
     oldest = max(index - settings.num_history, 0)
     (result,) = make_model(settings, "cpu")(
         [Window(sweeps[index], sweeps[index + 1], tuple(sweeps[oldest:index][::-1]))]
@@ -43,7 +43,7 @@ def expected(sweeps: list[Sweep], index: int, settings: Any) -> FlowResult:
 
 
 @pytest.mark.parametrize("preset", ["default", "paper", "keypoints"])
-def test_results_are_those_of_windows(preset: str, sweeps: list[Sweep]) -> None:
+def test_results_equal_those_of_windows(preset: str, sweeps: list[Sweep]) -> None:
     settings = small(preset)
     timed = [replace(s, point_times=np.linspace(0, 0.09, len(s.points))) for s in sweeps]
     stream = FlowStream(config=settings, device="cpu")
@@ -55,7 +55,7 @@ def test_results_are_those_of_windows(preset: str, sweeps: list[Sweep]) -> None:
         assert np.array_equal(stream.window.pc0.points, timed[index].points, equal_nan=True)
 
 
-def test_only_what_is_needed_is_kept_and_buffers_may_be_reused(sweeps: list[Sweep]) -> None:
+def test_few_sweeps_are_kept_and_buffers_may_be_reused(sweeps: list[Sweep]) -> None:
     settings, buffer = small("paper", num_history=1), np.empty((2000, 3), np.float32)
     stream, seen = FlowStream(config=settings), []
     for index, sweep in enumerate(sweeps):
@@ -70,7 +70,9 @@ def test_only_what_is_needed_is_kept_and_buffers_may_be_reused(sweeps: list[Swee
     assert [reference() is not None for reference in seen] == [False] * 4 + [True, True]
 
 
-def test_gaps_late_and_repeated_sweeps(sweeps: list[Sweep], caplog: pytest.LogCaptureFixture) -> None:
+def test_late_and_repeated_sweeps_are_skipped_and_gaps_start_again(
+    sweeps: list[Sweep], caplog: pytest.LogCaptureFixture
+) -> None:
     settings = small("fast", num_history=2)
     stream = FlowStream(config=settings, max_gap=0.5)
     for sweep in sweeps[:3]:
@@ -88,7 +90,7 @@ def test_gaps_late_and_repeated_sweeps(sweeps: list[Sweep], caplog: pytest.LogCa
     assert push(stream, sweeps[5]) is None
 
 
-def test_seconds_are_times_and_none_is_an_interval(sweeps: list[Sweep]) -> None:
+def test_times_in_seconds_and_missing_times_give_the_same_flow(sweeps: list[Sweep]) -> None:
     settings = small("fast", num_history=2, max_speed=8.0)
     regular = [replace(sweep, timestamp_ns=None) for sweep in sweeps]
     stream, by_second = FlowStream(config=settings), FlowStream(config=settings)
@@ -133,12 +135,12 @@ def test_a_bad_sweep_is_refused_and_the_stream_goes_on(
         ({"max_gap": 0}, "max_gap"),
     ],
 )
-def test_settings_that_a_stream_cannot_have(settings: dict, message: str) -> None:
+def test_settings_that_a_stream_cannot_have_are_refused(settings: dict, message: str) -> None:
     with pytest.raises(CFlowError, match=message):
         FlowStream(**settings)
 
 
-def test_ground_is_found_once_and_poses_by_odometry() -> None:
+def test_missing_ground_and_poses_are_estimated() -> None:
     drive = make_drive(seed=2, num_sweeps=4, profile="demo")
     stream = FlowStream("fast", ground="auto")
     if find_spec("kiss_icp") is None:
@@ -154,7 +156,7 @@ def test_ground_is_found_once_and_poses_by_odometry() -> None:
     assert np.abs(moved - true).max() < 0.2 and result.residual_flow.any()
 
 
-def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_the_command_reports_latency(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     data = ("data.num_sweeps=4", f"data.cache={tmp_path / 'cache'}")
     assert cflow("stream", *data, "model=fast", "pace=null", f"output={tmp_path / 'out'}") == 0
     report = json.loads((tmp_path / "out" / "stream.json").read_text())

@@ -1,4 +1,4 @@
-"""Ids of what moves: through crossings, occlusions, waiting, empty sweeps; the filter and links by hand; files."""
+"""Tracks keep their ids through crossings, occlusions, stops and empty sweeps; filter and matches equal plain loops."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def ids_of(log: Staged, table: dict[str, np.ndarray], car: int) -> list[int]:
     """Ids of the rows that lie on a car, in order."""
     ids = []
     for index in range(len(log) - 1):
-        centre = log.ways[car, index] + [1.9, 0.7]
+        centre = log.paths[car, index] + [1.9, 0.7]
         here = table["sweep"] == index
         near = np.hypot(table["x"] - centre[0], table["y"] - centre[1]) < 1.0
         ids += table["id"][here & near].tolist()
@@ -31,7 +31,7 @@ def test_two_crossing_cars_keep_their_ids_and_velocities() -> None:
     table = track(log, log.results())
     first, second = ids_of(log, table, 0), ids_of(log, table, 1)
     assert len(set(first)) == len(set(second)) == 1 and first[0] != second[0]
-    assert len(first) == len(second) == 11 and len(table["id"]) == 22, "and nothing else"
+    assert len(first) == len(second) == 11 and len(table["id"]) == 22
     last = table["sweep"] == 10
     velocity = np.stack([table["vx"], table["vy"]], 1)[last & (table["id"] == second[0])][0]
     assert np.allclose(velocity, (8, -8), atol=0.01)
@@ -41,58 +41,57 @@ def test_two_crossing_cars_keep_their_ids_and_velocities() -> None:
 
 @pytest.mark.parametrize("gap", [2, 3])
 def test_an_occlusion_is_bridged(gap: int) -> None:
-    way = straight((0, 0), (0.9, 0.0))
-    way[5 : 5 + gap] = np.nan
-    log = Staged([way])
+    path = straight((0, 0), (0.9, 0.0))
+    path[5 : 5 + gap] = np.nan
+    log = Staged([path])
     table = track(log, log.results())
     assert len(set(table["id"])) == 1 and len(table["id"]) == 11 - gap
     assert not np.isin(table["sweep"], range(5, 5 + gap)).any()
 
 
-def test_what_is_hidden_for_long_is_another_track() -> None:
-    way = straight((0, 0), (0.9, 0.0), 20)
-    way[5:12] = np.nan
-    log = Staged([way])
+def test_a_long_occlusion_starts_another_track() -> None:
+    path = straight((0, 0), (0.9, 0.0), 20)
+    path[5:12] = np.nan
+    log = Staged([path])
     assert len(set(track(log, log.results())["id"])) == 2
 
 
-def test_a_car_that_waits_keeps_its_id() -> None:
+def test_a_car_that_stops_keeps_its_id() -> None:
     steps = [1.0] * 6 + [0.7, 0.4, 0.2] + [0.0] * 8 + [0.2, 0.5, 0.8, 1.0]
-    way = np.stack([np.cumsum([0.0, *steps]), np.zeros(len(steps) + 1)], 1)
-    log = Staged([way])
+    log = Staged([np.stack([np.cumsum([0.0, *steps]), np.zeros(len(steps) + 1)], 1)])
     table = track(log, log.results())
     assert set(table["id"]) == {table["id"][0]} and len(table["id"]) == len(steps)
-    stands = np.isin(table["sweep"], range(9, 17))
-    assert np.array_equal(~table["is_moving"], stands) and np.all(table["cluster_id"][stands] == -1)
+    is_static = np.isin(table["sweep"], range(9, 17))
+    assert np.array_equal(~table["is_moving"], is_static) and np.all(table["cluster_id"][is_static] == -1)
     assert np.hypot(table["vx"], table["vy"])[table["sweep"] == 16] < 0.1
-    assert np.allclose(table["heading"][stands], 0, atol=0.01), "which way it faced"
+    assert np.allclose(table["heading"][is_static], 0, atol=0.01), "the heading it had before"
 
 
-def test_poses_take_the_vehicle_out_and_turn_the_flow() -> None:
+def test_tracks_do_not_depend_on_the_motion_of_the_vehicle() -> None:
     poses = np.tile(np.eye(4), (12, 1, 1))
     for index, pose in enumerate(poses):
-        turn = 0.05 * index
-        pose[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+        yaw = 0.05 * index
+        pose[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
         pose[:3, 3] = (100 + 0.7 * index, -50, 3)
-    ways = [straight((105, -50), (0.8, 0.3))]
-    moved, still = Staged(ways, poses), Staged(ways)
-    here, there = track(moved, moved.results()), track(still, still.results())
+    paths = [straight((105, -50), (0.8, 0.3))]
+    driving, parked = Staged(paths, poses), Staged(paths)
+    moved, static = track(driving, driving.results()), track(parked, parked.results())
     for name in ("x", "y", "z", "vx", "vy", "vz", "heading", "length"):
-        assert np.allclose(here[name], there[name], atol=1e-3), name
-    assert np.array_equal(here["id"], there["id"])
+        assert np.allclose(moved[name], static[name], atol=1e-3), name
+    assert np.array_equal(moved["id"], static["id"])
 
 
-def test_what_moves_for_a_moment_or_in_its_place_only_is_no_track() -> None:
+def test_flicker_that_goes_nowhere_is_not_a_track() -> None:
     log = Staged([straight((0, 0), (0.0, 0.0)), straight((15, 0), (0.9, 0.0))])
     results = log.results()
     for index, result in results:
         flicker = result.cluster_id == 1
         result.residual_flow[flicker] = torch.tensor([0.15, 0.0, 0.0]) * (1.0 if index < 6 else 0.0)
     table = track(log, results)
-    assert len(set(table["id"])) == 1 and np.all(table["x"] > 12), "the box of the first never went anywhere"
+    assert len(set(table["id"])) == 1 and np.all(table["x"] > 12)
 
 
-def test_without_confidence_three_sweeps_are_enough_and_noise_is_not() -> None:
+def test_low_confidence_confirms_no_track_and_missing_confidence_does() -> None:
     log = Staged([straight((0, 0), (0.9, 0.0))])
     unsure = [(index, log.result(index, 0.5)) for index in range(11)]
     assert len(track(log, unsure)["id"]) == 0
@@ -102,7 +101,7 @@ def test_without_confidence_three_sweeps_are_enough_and_noise_is_not() -> None:
     assert len(table["id"]) == 11 and np.isnan(table["confidence"]).all() and table["is_confirmed"].sum() == 9
 
 
-def test_empty_sweeps_and_missing_frames() -> None:
+def test_ids_survive_empty_sweeps_and_missing_frames() -> None:
     log = Staged([straight((0, 0), (0.9, 0.0))])
     empty = FlowResult.of(
         {
@@ -113,9 +112,9 @@ def test_empty_sweeps_and_missing_frames() -> None:
     )
     tracker, ids = Tracker(), []
     for index in range(11):
-        nothing = Sweep(np.zeros((0, 3), np.float32), None, None, log.timestamps[index])
+        no_points = Sweep(np.zeros((0, 3), np.float32), None, None, log.timestamps[index])
         is_empty = index in (0, 6)
-        sweeps = Window(nothing if is_empty else log.sweep(index), log.sweep(index + 1))
+        sweeps = Window(no_points if is_empty else log.sweep(index), log.sweep(index + 1))
         table, track_id = tracker.push(sweeps, empty if is_empty else log.result(index))
         assert len(track_id) == len(sweeps.pc0.points) and len(table["id"]) == (not is_empty)
         ids += table["id"].tolist()
@@ -125,7 +124,7 @@ def test_empty_sweeps_and_missing_frames() -> None:
     assert all(len(values) == 0 for values in track(log, []).values())
 
 
-def test_what_is_wrong_is_said() -> None:
+def test_wrong_inputs_are_one_clear_error() -> None:
     log = Staged([straight((0, 0), (0.9, 0.0))])
     tracker = Tracker()
     tracker.push(Window(log.sweep(3), log.sweep(4)), log.result(3))
@@ -137,7 +136,7 @@ def test_what_is_wrong_is_said() -> None:
         Tracker().push(Window(log.sweep(2), log.sweep(3)), FlowResult.of({"residual_flow": torch.zeros(5, 3)}))
 
 
-def test_links_are_those_of_plain_loops() -> None:
+def test_matches_equal_those_of_plain_loops() -> None:
     generator = np.random.default_rng(0)
     for _ in range(20):
         clouds = [generator.uniform(0, 3, (60, 3)) for _ in range(2)]
@@ -161,7 +160,7 @@ def test_links_are_those_of_plain_loops() -> None:
         assert dict(zip(earlier.tolist(), later.tolist())) == expected
 
 
-def test_boxes_hold_their_points() -> None:
+def test_boxes_are_tight_around_their_points() -> None:
     generator = np.random.default_rng(1)
     points, group = torch.from_numpy(generator.normal(size=(80, 3))), torch.arange(80) % 4
     heading = torch.tensor([0.0, 0.5, 2.0, -3.0], dtype=torch.float64)
@@ -174,7 +173,7 @@ def test_boxes_hold_their_points() -> None:
         assert (inside[group == number] == -1).sum() >= 4, "points on the faces"
 
 
-def test_the_filter_is_the_textbook_one() -> None:
+def test_the_filter_equals_the_textbook_equations() -> None:
     one = torch.ones(1, 3, dtype=torch.float64)
     before = States(0 * one, 5 * one, torch.tensor([[[0.2, 0.05], [0.05, 0.1]]], dtype=torch.float64))
     after = before.predict(0.1, 2.0).update(0.55 * one, 5.1 * one, torch.tensor([[0.3, 0.2]], dtype=torch.float64))

@@ -1,4 +1,4 @@
-"""`cflow flow tracks=true`: a table once a log is complete, the same after a run that was cut off and in shards."""
+"""`cflow flow tracks=true` writes a table once a log is complete, also in shards and after an interrupted run."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SMALL = "model.point_cloud_range=[-20,-20,-inf,20,20,inf]"
 
 
 def calls_on_a_drive(folder: Path, num_sweeps: int = 4) -> Callable[..., int]:
-    """A call of a command on a small simulated drive, (command, folder of its output, settings) -> exit status."""
+    """Write a small simulated drive; returns (command, folder of its output, settings) -> exit status."""
     write_av2_log(make_drive(seed=3, num_sweeps=num_sweeps, profile="demo"), folder / "data")
     data = ("data=av2", f"data.root={folder / 'data'}", SMALL)
     return lambda command, output, *settings: cflow(command, *data, f"output={folder / output}", *settings)
@@ -25,14 +25,13 @@ def calls_on_a_drive(folder: Path, num_sweeps: int = 4) -> Callable[..., int]:
 
 def test_resumed_and_sharded_runs_write_the_same_table(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     call = calls_on_a_drive(tmp_path, 7)
-    run = ("model=fast", "tracks=true", "engine.workers=1")
+    run = ("model=fast", "engine.workers=1", "tracks=true")
     assert call("flow", "whole", *run) == 0
     (file,) = (tmp_path / "whole").glob("*/tracks.parquet")
     whole = read_tracks(file)
     assert len(whole["id"]) > 5 and set(whole["sweep"]) <= set(range(6))
     for index in (0, 1):
-        there = list((tmp_path / "shards").glob("*/tracks.parquet"))
-        assert not there, "half of the frames are no log"
+        assert not list((tmp_path / "shards").glob("*/tracks.parquet")), "half of the frames are not a whole log"
         assert call("flow", "shards", *run, f"shard.index={index}", "shard.count=2") == 0
     (other,) = (tmp_path / "shards").glob("*/tracks.parquet")
     assert other.read_bytes() == file.read_bytes()
@@ -41,12 +40,12 @@ def test_resumed_and_sharded_runs_write_the_same_table(tmp_path: Path, capsys: p
     file.unlink()
     sorted(file.parent.glob("*.feather"))[2].unlink()
     assert call("flow", "whole", *run) == 0 and file.read_bytes() == before
-    assert call("flow", "whole", *run[:1], "overwrite=true") == 0 and not file.exists(), "of another run"
+    assert call("flow", "whole", *run[:2], "overwrite=true") == 0 and not file.exists(), "tracks of another run"
     capsys.readouterr()
     assert call("flow", "small", *run, "contents=[residual]") == 2 and "cluster_id" in capsys.readouterr().err
 
 
-def test_the_viewer_shows_the_boxes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_viewer_shows_all_tracks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("rerun")
     from cflow_torch.viz import recording
 
