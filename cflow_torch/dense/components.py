@@ -9,8 +9,9 @@ from torch import Tensor
 
 from cflow_torch.config import ClusteringConfig
 from cflow_torch.ops.indices import split_index
-from cflow_torch.ops.labeling import connected_components_kornia, label_blocks, pad
-from cflow_torch.ops.morphology import close_3x3, dilate_3x3_kornia, erode_3x3_kornia
+from cflow_torch.ops.kornia_engine import close_3x3_kornia, connected_components_kornia
+from cflow_torch.ops.labeling import label_blocks, pad
+from cflow_torch.ops.morphology import close_3x3
 from cflow_torch.ops.segments import first_of_segment, segment_ends
 
 
@@ -73,7 +74,7 @@ def components_by_size(
     oversized = is_oversized.index_select(0, component)
     alone = torch.zeros_like(padded).view(-1).scatter_(0, indices.pixel, oversized).view_as(padded)
     if config.labeling == "kornia":
-        closed = pad([erode_3x3_kornia(dilate_3x3_kornia(alone[:, :height, :width]))])
+        closed = pad([close_3x3_kornia(alone[:, :height, :width])])
     else:
         closed = close_3x3(alone, height, width)
     part, num_parts = _components(closed, indices, 1, config)
@@ -83,7 +84,7 @@ def components_by_size(
 def _components(padded: Tensor, indices: PixelIndices, reach: int, config: ClusteringConfig) -> tuple[Tensor, int]:
     """Component of each pixel, dilated first if `reach` is 3, and a number above the largest component."""
     if config.labeling == "kornia":
-        dilated = dilate_3x3_kornia(padded) if reach == 3 else padded
-        return connected_components_kornia(dilated, indices.pixel, config.connectivity), indices.pixel.numel()
+        component = connected_components_kornia(padded, indices.pixel, config.connectivity, reach)
+        return component, indices.pixel.numel()
     blocks = label_blocks(padded, config.connectivity, reach)
     return blocks.of_pixel(indices.padded_row, indices.col), blocks.num_components

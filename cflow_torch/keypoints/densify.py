@@ -11,7 +11,8 @@ from cflow_torch.config import KeypointsConfig
 from cflow_torch.dense.components import label_components
 from cflow_torch.keypoints.matching import Matches
 from cflow_torch.ops.indices import flat_nonzero
-from cflow_torch.ops.labeling import connected_components, connected_components_kornia
+from cflow_torch.ops.kornia_engine import connected_components_kornia
+from cflow_torch.ops.labeling import connected_components
 from cflow_torch.ops.nearest import nearest_set_pixel
 from cflow_torch.ops.segments import segment_median
 

@@ -23,7 +23,6 @@ from torch import Tensor
 
 from cflow_torch.ops.indices import divide, flat_nonzero, split_index
 from cflow_torch.ops.segments import first_of_segment
-from cflow_torch.types import CFlowError
 
 # Half of the eight neighbours of a block; the other half is the same links seen from the other side.
 _NEIGHBOURS = ((0, 1), (1, 0), (1, 1), (1, -1))
@@ -215,42 +214,6 @@ def union_find(num_nodes: int, sources: Tensor, targets: Tensor) -> Tensor:
             low, high = parent.index_select(0, sources), parent.index_select(0, targets)
         if torch.equal(low, high):
             return parent
-
-
-def connected_components_kornia(occupancy: Tensor, pixels: Tensor, connectivity: int = 8) -> Tensor:
-    """`connected_components` with reach 1 by kornia's exact union-find on the dense images.
-
-    Args, Returns: as `connected_components`.
-
-    Raises:
-        CFlowError: kornia older than 0.9, which has no exact labelling (its iterative one splits long components).
-
-    Convention:
-        kornia labels with 8-connectivity. Connectivity 4 labels an image of twice the size, in which a link pixel
-        stands between two set pixels that share a side; there the two connectivities agree.
-
-    Cost: linear in B * H * W.
-    """
-    try:
-        from kornia.contrib import connected_components_union_find
-    except ImportError:
-        from kornia import __version__ as version
-
-        raise CFlowError(
-            f"labeling='kornia' needs kornia >= 0.9 (exact union-find labelling), found {version}: "
-            "upgrade kornia or use labeling='sparse', which gives the same result"
-        ) from None
-    image = occupancy
-    if connectivity == 4:
-        num_images, height, width = occupancy.shape
-        image = occupancy.new_zeros((num_images, 2 * height, 2 * width))
-        image[:, ::2, ::2] = occupancy
-        image[:, 1:-1:2, ::2] = occupancy[:, 1:] & occupancy[:, :-1]
-        image[:, ::2, 1:-1:2] = occupancy[:, :, 1:] & occupancy[:, :, :-1]
-    labels = connected_components_union_find(image[:, None])[:, 0]
-    if connectivity == 4:
-        labels = labels[:, ::2, ::2]
-    return first_of_segment(labels.reshape(-1)[pixels], image.numel() + 1)
 
 
 @lru_cache(maxsize=256)

@@ -64,31 +64,3 @@ def erode_cross(image: Tensor) -> Tensor:
     middle &= image[..., 1:-1, :-2]
     inner[..., 1:-1, 1:-1] = middle.logical_and_(image[..., 1:-1, 2:])
     return inner
-
-
-def dilate_3x3_kornia(image: Tensor) -> Tensor:
-    """Dilation with a 3 x 3 square of ones, by `kornia.morphology.dilation`; float images inside.
-
-    Args:
-        image: (B, H, W) bool.
-
-    Returns:
-        (B, H, W) bool: a pixel is set if any of its 3 x 3 neighbourhood is; what lies outside is background.
-    """
-    from kornia.morphology import dilation
-
-    return dilation(image[:, None].float(), torch.ones(3, 3, dtype=torch.float32, device=image.device))[:, 0] > 0.5
-
-
-def erode_3x3_kornia(image: Tensor) -> Tensor:
-    """Erosion with a 3 x 3 square of ones, by `kornia.morphology.erosion`; float images inside.
-
-    Args:
-        image: (B, H, W) bool.
-
-    Returns:
-        (B, H, W) bool: a pixel stays if all of its 3 x 3 neighbourhood is set; what lies outside is foreground.
-    """
-    from kornia.morphology import erosion
-
-    return erosion(image[:, None].float(), torch.ones(3, 3, dtype=torch.float32, device=image.device))[:, 0] > 0.5

@@ -13,15 +13,8 @@ from scenes import LABELINGS
 from scipy import ndimage
 from scipy.sparse import coo_matrix, csgraph
 
-from cflow_torch.ops import morphology
-from cflow_torch.ops.labeling import (
-    connected_components,
-    connected_components_kornia,
-    label_blocks,
-    label_together,
-    pad,
-    union_find,
-)
+from cflow_torch.ops.kornia_engine import connected_components_kornia
+from cflow_torch.ops.labeling import connected_components, label_blocks, label_together, pad, union_find
 from cflow_torch.types import CFlowError
 
 STRUCTURE = {4: ndimage.generate_binary_structure(2, 1), 8: np.ones((3, 3), dtype=bool)}
@@ -41,10 +34,8 @@ def by_scipy(images: np.ndarray, connectivity: int, reach: int) -> np.ndarray:
 def label(images: np.ndarray, connectivity: int, reach: int, engine: str = "sparse") -> np.ndarray:
     occupancy = torch.from_numpy(images)
     pixels = occupancy.flatten().nonzero()[:, 0]
-    if engine == "sparse":
-        return connected_components(occupancy, pixels, connectivity, reach).numpy()
-    dense = morphology.dilate_3x3_kornia(occupancy) if reach == 3 else occupancy
-    return connected_components_kornia(dense, pixels, connectivity).numpy()
+    components = connected_components if engine == "sparse" else connected_components_kornia
+    return components(occupancy, pixels, connectivity, reach).numpy()
 
 
 @pytest.mark.parametrize("engine", LABELINGS)

@@ -1,0 +1,70 @@
+"""Morphology and labelling by kornia on dense images (`labeling=kornia`), identical to the sparse engine's results."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from cflow_torch.ops.segments import first_of_segment
+from cflow_torch.types import CFlowError
+
+
+def close_3x3_kornia(image: Tensor) -> Tensor:
+    """Dilate, then erode, with a 3 x 3 square of ones.
+
+    Args:
+        image: (B, H, W) bool.
+
+    Returns:
+        (B, H, W) bool. Pixels outside the image are ignored, so no pixel is lost at the border.
+    """
+    from kornia.morphology import closing
+
+    return closing(image[:, None].float(), torch.ones(3, 3, device=image.device))[:, 0] > 0.5
+
+
+def connected_components_kornia(occupancy: Tensor, pixels: Tensor, connectivity: int = 8, reach: int = 1) -> Tensor:
+    """Label the set pixels by kornia's union-find.
+
+    Args:
+        occupancy: (B, H, W) bool images.
+        pixels: (P,) int64, flat indices into `occupancy` of the set pixels, ascending.
+        connectivity: 4 or 8.
+        reach: 1 (plain) or 3 (after a 3 x 3 dilation).
+
+    Returns:
+        (P,) int64: the position in `pixels` of the first (in raster order) pixel of the same component.
+
+    Raises:
+        CFlowError: kornia is older than 0.9 and has no exact labelling (its iterative one splits long components).
+
+    Convention:
+        kornia labels with 8-connectivity. For connectivity 4 we label an image of twice the size, in which a link pixel
+        lies between two set pixels that share a side; there the two connectivities agree.
+
+    Cost: linear in B * H * W.
+    """
+    from kornia.morphology import dilation
+
+    try:
+        from kornia.contrib import connected_components_union_find
+    except ImportError:
+        from kornia import __version__ as version
+
+        raise CFlowError(
+            f"labeling='kornia' needs kornia >= 0.9 (exact union-find labelling), found {version}: "
+            "upgrade kornia or use labeling='sparse', which gives the same result"
+        ) from None
+    image = occupancy
+    if reach == 3:
+        image = dilation(image[:, None].float(), torch.ones(3, 3, device=image.device))[:, 0] > 0.5
+    if connectivity == 8:
+        labels = connected_components_union_find(image[:, None])
+    else:
+        num_images, height, width = image.shape
+        linked = image.new_zeros((num_images, 2 * height, 2 * width))
+        linked[:, ::2, ::2] = image
+        linked[:, 1:-1:2, ::2] = image[:, 1:] & image[:, :-1]
+        linked[:, ::2, 1:-1:2] = image[:, :, 1:] & image[:, :, :-1]
+        labels = connected_components_union_find(linked[:, None])[..., ::2, ::2]
+    return first_of_segment(labels.flatten()[pixels], 4 * image.numel() + 1)
