@@ -9,7 +9,7 @@ import pyarrow as pa
 from pyarrow import parquet
 
 from cflow_torch.data.atomic import atomic_file
-from cflow_torch.data.file_errors import file_errors
+from cflow_torch.data.files import file_errors
 from cflow_torch.data.paths import PathLike, as_path, read_bytes
 from cflow_torch.types import CFlowError
 

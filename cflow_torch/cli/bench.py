@@ -11,7 +11,6 @@ examples:
 
 from __future__ import annotations
 
-import json
 from typing import Any, Sequence
 
 import torch
@@ -20,8 +19,8 @@ from omegaconf import DictConfig
 from cflow_torch.cli import run
 from cflow_torch.config import Config
 from cflow_torch.data.atomic import ensure_writable
+from cflow_torch.data.json_file import write_json
 from cflow_torch.data.log import Log, window
-from cflow_torch.data.records import json_ready, write_text
 from cflow_torch.stages import FlowModel, StopWatch
 from cflow_torch.types import CFlowError, Window
 from cflow_torch.windows.memory import peak_memory
@@ -41,7 +40,7 @@ def task(cfg: DictConfig) -> None:
     report = {"log": log.log_id, **measure(model, windows, repeats, cfg.batches), "machine": run.machine()}
     report.update(versions=run.versions(), model=model.config.as_dict())
     print(format_report(report))
-    write_text(output / "bench.json", json.dumps(json_ready(report), indent=1, allow_nan=False) + "\n")
+    write_json(output / "bench.json", report)
     print(f"written to {output / 'bench.json'}")
 
 

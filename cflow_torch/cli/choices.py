@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 
 import cflow_torch.configs
 from cflow_torch.config import PRESETS, make_config
-from cflow_torch.data.records import flatten
+from cflow_torch.data.json_file import flatten
 
 CONFIGS = Path(cflow_torch.configs.__path__[0])
 SETTERS = ("experiment", "row")  # groups that set what others bring

@@ -24,9 +24,9 @@ from cflow_torch.cli import run
 from cflow_torch.data.arrays import ArraysLog, write_array_log
 from cflow_torch.data.arrays.cloud_file import SUFFIXES, write_cloud
 from cflow_torch.data.atomic import ensure_writable
+from cflow_torch.data.json_file import describe_changes
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import is_remote
-from cflow_torch.data.records import describe_changes
 from cflow_torch.types import CFlowError, FlowResult
 
 
@@ -74,8 +74,6 @@ def _claim(cfg: DictConfig, output: Path) -> None:
 
 
 def _own_suffix(log: Log) -> str:
-    """Of the clouds of a log that consists of such, whatever it is wrapped in."""
-    inner: Any = log
-    while inner is not None and not isinstance(inner, ArraysLog):
-        inner = getattr(inner, "log", None)
-    return ".npy" if inner is None else str(inner.files[0].suffix.lower())
+    """Suffix of the log's own point clouds; ".npy" if it does not consist of such."""
+    inner = log.unwrapped
+    return str(inner.files[0].suffix.lower()) if isinstance(inner, ArraysLog) else ".npy"

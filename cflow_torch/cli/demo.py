@@ -20,7 +20,7 @@ from cflow_torch.cli.record import Scores
 from cflow_torch.data.atomic import ensure_writable, remove_stale
 from cflow_torch.data.flow_file import write_flow
 from cflow_torch.data.log import Log
-from cflow_torch.data.names import folder_in
+from cflow_torch.data.names import safe_name
 from cflow_torch.stages import StopWatch
 from cflow_torch.types import CFlowError, FlowResult, Window
 from cflow_torch.viz.bev import plot_flow, save_picture
@@ -45,7 +45,7 @@ def task(cfg: DictConfig) -> None:
 
     def keep(log: Log, index: int, sweeps: Window, result: FlowResult) -> None:
         nonlocal picture
-        write_flow(folder_in(output, log.log_id, "the log") / f"{log.timestamps[index]}.feather", result)
+        write_flow(output / safe_name(log.log_id, "the log") / f"{log.timestamps[index]}.feather", result)
         scores.add(log, index, sweeps, result)
         if draws and index == cfg.pair:
             picture = _draw(log, model, sweeps, result, output)

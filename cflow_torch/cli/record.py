@@ -13,8 +13,8 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from cflow_torch.cli.run import Failures, machine, versions, write_config
+from cflow_torch.data.json_file import describe_changes, json_ready, write_json
 from cflow_torch.data.log import Log
-from cflow_torch.data.records import describe_changes, json_ready, write_text
 from cflow_torch.evaluation.frame import EvalFrame
 from cflow_torch.evaluation.metrics import SceneFlowMetrics
 from cflow_torch.evaluation.tables import format_table
@@ -76,7 +76,7 @@ class Scores:
             "results": results,
         }
         write_config(self._cfg, folder)
-        write_text(folder / RESULTS, json.dumps(json_ready(record), indent=1, allow_nan=False) + "\n")
+        write_json(folder / RESULTS, record)
         print(f"{folder}: {format_table(results)}")
         return results
 

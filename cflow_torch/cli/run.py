@@ -19,11 +19,11 @@ from cflow_torch import __version__, estimate
 from cflow_torch.cli.choices import CONFIGS, own_settings
 from cflow_torch.cli.estimates import estimates
 from cflow_torch.config import config_from
+from cflow_torch.data.atomic import write_text
 from cflow_torch.data.catalog import AUTO, find_sources, find_user_sources, open_log, recognise
 from cflow_torch.data.flow_file import read_flow
 from cflow_torch.data.log import CachedLog, Log, window
 from cflow_torch.data.paths import as_path
-from cflow_torch.data.records import write_text
 from cflow_torch.fleet.manifest import frame_file
 from cflow_torch.fleet.progress import log_line
 from cflow_torch.model import SceneFlowModel

@@ -20,8 +20,7 @@ import yaml  # type: ignore[import-untyped]
 from cflow_torch.cli.choices import CONFIGS, files
 from cflow_torch.config import CONFIGS as METHODS
 from cflow_torch.config import PRESETS, WINDOW, describe, make_config
-from cflow_torch.data.atomic import ensure_writable
-from cflow_torch.data.records import write_text
+from cflow_torch.data.atomic import ensure_writable, write_text
 from cflow_torch.types import CFlowError
 
 _PAGE = """# Settings

@@ -11,7 +11,6 @@ examples:
 
 from __future__ import annotations
 
-import json
 import time
 from typing import Any
 
@@ -22,8 +21,8 @@ from tqdm import tqdm
 from cflow_torch.applications.stream import FlowStream
 from cflow_torch.cli import run
 from cflow_torch.data.atomic import ensure_writable
+from cflow_torch.data.json_file import write_json
 from cflow_torch.data.log import Log
-from cflow_torch.data.records import json_ready, write_text
 from cflow_torch.types import CFlowError
 
 
@@ -39,7 +38,7 @@ def task(cfg: DictConfig) -> None:
     ensure_writable(output)
     report = {"log": log.log_id, **play(stream, log, pace, count), "machine": run.machine(), "versions": run.versions()}
     print(format_report(report))
-    write_text(output / "stream.json", json.dumps(json_ready(report), indent=1, allow_nan=False) + "\n")
+    write_json(output / "stream.json", report)
     print(f"written to {output / 'stream.json'}")
 
 

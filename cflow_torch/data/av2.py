@@ -11,10 +11,9 @@ import pyarrow as pa
 from cflow_torch.data.arrow_file import FeatherFile, bool_column, float_columns, integer_column, text_column
 from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes, make_boxes
 from cflow_torch.data.categories import CATEGORIES
-from cflow_torch.data.file_errors import file_errors
-from cflow_torch.data.folders import find_folders
+from cflow_torch.data.files import file_errors, find_folders
 from cflow_torch.data.ground import GROUND_RULES, read_ground_raster
-from cflow_torch.data.log import FlowLabels, NumberedSweeps
+from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.data.names import is_timestamp
 from cflow_torch.data.paths import PathLike, as_path, remote_errors
 from cflow_torch.data.rigid_motion import poses_from_quaternions, transform_points
@@ -40,7 +39,7 @@ def find_av2_logs(root: PathLike) -> list[Path]:
     return find_folders(as_path(root), _is_log, SEARCH_DEPTH, "a log, or a folder of logs")
 
 
-class AV2Log(NumberedSweeps):
+class AV2Log(Log):
     """One Argoverse 2 sensor log; implements the `Log` protocol.
 
     Args:

@@ -209,7 +209,7 @@ def open_log(
 def _open(name: str, source: Any, settings: Mapping[str, Any]) -> Log:
     data_set = _data_set(name)
     reader = getattr(import_module(f"cflow_torch.data.{data_set.module}"), data_set.log)
-    known = list(inspect.signature(reader.__init__).parameters)[2:]  # of the class, Python 3.8 sees those of Protocol
+    known = list(inspect.signature(reader.__init__).parameters)[2:]  # of the class, Python 3.8 returns Protocol's
     unknown = sorted(set(settings) - set(known))
     if unknown:
         raise CFlowError(f"data set {name} has no setting {', '.join(unknown)}; it has {', '.join(known) or 'none'}")

@@ -8,9 +8,8 @@ from typing import Any, Callable
 
 import numpy as np
 
-from cflow_torch.data.file_errors import file_errors
+from cflow_torch.data.files import file_errors, read_npy
 from cflow_torch.data.json_file import read_json
-from cflow_torch.data.npy_file import read_npy
 from cflow_torch.types import CFlowError
 
 # Rule -> metres that a point of the ground is away from the surface at most, and raster coordinate to cell: towards

@@ -1,38 +1,79 @@
-"""JSON documents, with one error for what is wrong with them."""
+"""JSON: read documents of data sets, write records next to results, and compare the settings in them."""
 
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any, Callable
 
-from cflow_torch.data.file_errors import file_errors
-from cflow_torch.data.paths import read_bytes
+from cflow_torch.data.atomic import write_text
+from cflow_torch.data.files import file_errors, shortened
+from cflow_torch.data.paths import PathLike, read_bytes
+
+_SHOWN = 5  # differences that a message lists
 
 
 def read_json(file: Path) -> Any:
-    """What is in a JSON file.
+    """Read a JSON file.
 
-    Convention: UTF-8, with or without a byte order mark. NaN and Infinity are numbers, as Python writes them: whoever
-        needs finite ones checks, since 1e999 is infinite too.
+    Convention: UTF-8, with or without a byte order mark. NaN and Infinity are accepted, as Python writes them; check
+        the numbers where they must be finite (1e999 is infinite, too).
 
     Raises:
-        CFlowError: not UTF-8, or no JSON.
+        CFlowError: the file is not UTF-8 or not JSON.
         OSError: as `read_bytes`.
     """
     return parse_json(read_bytes(file), file)
 
 
 def parse_json(data: bytes, file: Any, use: Callable[[dict[str, Any]], Any] | None = None) -> Any:
-    """What a text says.
+    """Parse the bytes of a JSON document.
 
     Args:
-        data: the text.
-        file: where it is from, for the message.
-        use: called with each object, inner ones first; what it returns takes the object's place.
+        data: the document.
+        file: where it comes from, for the message.
+        use: called with each object, inner ones first; its result replaces the object.
 
     Raises:
-        CFlowError: not UTF-8, or no JSON; and what `use` raises.
+        CFlowError: the document is not UTF-8 or not JSON, or `use` raises.
     """
     with file_errors(f"{file} as JSON"):
         return json.loads(data.decode("utf-8-sig"), object_hook=use)
+
+
+def write_json(path: PathLike, value: Any) -> None:
+    """Write a JSON file atomically; for what JSON cannot hold see `json_ready`."""
+    write_text(path, json.dumps(json_ready(value), indent=1, allow_nan=False) + "\n")
+
+
+def json_ready(value: Any) -> Any:
+    """Replace what JSON cannot hold: tuples by lists, NaN (no points) by null, infinity by text."""
+    if isinstance(value, dict):
+        return {str(key): json_ready(part) for key, part in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [json_ready(part) for part in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None if math.isnan(value) else str(value)
+    return value
+
+
+def flatten(value: Any, name: str = "") -> dict[str, Any]:
+    """Flatten nested dictionaries into one, with keys joined by dots; lists are values."""
+    if not isinstance(value, dict):
+        return {name: value}
+    parts: list[dict[str, Any]] = [flatten(part, f"{name}.{key}" if name else str(key)) for key, part in value.items()]
+    return {key: leaf for part in parts for key, leaf in part.items()}
+
+
+def describe_changes(before: Any, now: Any, ignored: Any = ()) -> str:
+    """List the settings that differ, as "key was A, is B; ..."; "" if none does.
+
+    Args:
+        before, now: nested dictionaries.
+        ignored: joined keys that may differ.
+    """
+    old, new = flatten(before), flatten(now)
+    changed = sorted(key for key in {*old, *new} - set(ignored) if old.get(key) != new.get(key))
+    shown = "; ".join(f"{key} was {shortened(old.get(key))}, is {shortened(new.get(key))}" for key in changed[:_SHOWN])
+    return shown + (f" and {len(changed) - _SHOWN} more" if len(changed) > _SHOWN else "")

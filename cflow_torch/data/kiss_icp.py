@@ -9,8 +9,8 @@ from typing import Any, Iterator
 
 import numpy as np
 
-from cflow_torch.data.file_errors import shortened
-from cflow_torch.data.log import FlowLabels, NumberedSweeps
+from cflow_torch.data.files import shortened
+from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.data.paths import PathLike, as_path
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.ego_motion import rigid_transform
@@ -23,7 +23,7 @@ def find_kiss_icp(root: PathLike) -> list[Path]:
     return [as_path(root)]
 
 
-class KissICPLog(NumberedSweeps):
+class KissICPLog(Log):
     """One sequence; implements the `Log` protocol.
 
     Args:

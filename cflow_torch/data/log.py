@@ -1,15 +1,17 @@
-"""The protocol every reader speaks: a log is an ordered, lazy set of sweeps; windows slide over it."""
+"""A log is an ordered sequence of sweeps that are read when asked for; every reader is one. Windows slide over it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Iterator, Protocol, Sequence
+from typing import Any, Iterator, Protocol, Sequence, TypeVar
 
 import numpy as np
 from torch.utils.data import Dataset
 
 from cflow_torch.types import CFlowError, Sweep, Window
+
+_Log = TypeVar("_Log", bound="Log")
 
 
 @dataclass(frozen=True)
@@ -28,29 +30,45 @@ class FlowLabels:
 
 
 class Log(Protocol):
-    """One drive: a sequence of sweeps. `len(log)`, `log[-1]` and `for sweep in log` work.
+    """One drive, a sequence of sweeps: `len(log)`, `log[-1]`, `for sweep in log` and `with log` work.
 
-    A reader of one's own is a class that inherits from this one, sets `log_id` and `timestamps`, and has `sweep`.
+    To write your own reader, inherit from this class, set `log_id` and `timestamps`, and implement `sweep`.
 
     Attributes:
-        log_id: name, safe as a folder name.
+        log_id: name of the log, safe as a folder name.
         timestamps: sweep times, ascending.
 
     Raises:
-        CFlowError: from `sweep` and `labels`: there is no sweep of this number, or a file of it is missing, damaged, or
-            of another size than what belongs to it. Other sweeps can be read then.
+        CFlowError: `sweep` and `labels` raise it if the index does not exist, or if a file of the sweep is missing,
+            damaged or of another size than the files that belong to it. Other sweeps can still be read.
     """
 
     log_id: str
     timestamps: Sequence[int]
 
     def sweep(self, index: int) -> Sweep:
-        """Sweep number `index` with float32 points, float64 pose `T_world_ego`, ground mask, time."""
+        """Read sweep `index`: float32 points, float64 pose `T_world_ego`, ground mask, time."""
         raise NotImplementedError
 
     def labels(self, index: int) -> FlowLabels | None:
-        """Truth of the pair (index, index + 1), None where the log has none."""
+        """Read the truth of the pair (index, index + 1); None where the log has none."""
+        self._timestamp(index)
         return None
+
+    def close(self) -> None:
+        """Close the files that the log holds open."""
+        return
+
+    @property
+    def unwrapped(self) -> Log:
+        """The log without its wrappers (ground, poses, cache)."""
+        return self
+
+    def __enter__(self: _Log) -> _Log:
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self.close()
 
     def __len__(self) -> int:
         return len(self.timestamps)
@@ -61,12 +79,23 @@ class Log(Protocol):
     def __iter__(self) -> Iterator[Sweep]:
         return map(self.sweep, range(len(self)))
 
+    def _timestamp(self, index: int) -> int:
+        """Return the time stamp of sweep `index`; an index out of range is a `CFlowError`."""
+        if not 0 <= index < len(self.timestamps):
+            raise CFlowError(f"log {self.log_id} has sweeps 0 ... {len(self) - 1}, you asked for {index}")
+        return self.timestamps[index]
+
+    def _check_count(self, where: Any) -> None:
+        """Refuse a log without a pair of sweeps; `where` begins the message."""
+        if len(self.timestamps) < 2:
+            raise CFlowError(f"{where} has {len(self.timestamps)} sweeps; scene flow needs two or more")
+
 
 def window(log: Log, index: int, num_history: int = 0, num_future: int = 0) -> Window:
-    """The window whose flow is that of sweep `index` to sweep `index + 1`.
+    """Read the window whose flow is that from sweep `index` to sweep `index + 1`.
 
-    At the start of a log fewer than `num_history` sweeps exist before it, at its end fewer than `num_future` after
-    `index + 1`; the window is then shorter.
+    The window is shorter near the start of the log, where fewer than `num_history` sweeps precede it, and near its
+    end, where fewer than `num_future` follow `index + 1`.
 
     Raises:
         CFlowError: `index` has no successor, or a sweep cannot be read.
@@ -83,20 +112,20 @@ def window(log: Log, index: int, num_history: int = 0, num_future: int = 0) -> W
 
 
 def windows(log: Log, num_history: int = 0, num_future: int = 0) -> Iterator[Window]:
-    """The window of every pair of a log, in order; each sweep is read once.
+    """Iterate over the windows of all pairs of a log, in order; each sweep is read once.
 
     Raises:
         CFlowError: a sweep cannot be read.
     """
-    recent = CachedLog(log, num_history + num_future + 2)
-    return (window(recent, index, num_history, num_future) for index in range(len(log.timestamps) - 1))
+    cached = CachedLog(log, num_history + num_future + 2)
+    return (window(cached, index, num_history, num_future) for index in range(len(log.timestamps) - 1))
 
 
 class WindowDataset(Dataset):  # type: ignore[type-arg]
-    """The windows of some logs, for a `torch.utils.data.DataLoader`, whose workers then read the files.
+    """The windows of one or more logs, for a `torch.utils.data.DataLoader`, whose workers then read the files.
 
     Args:
-        logs: one or any number; each must be one that can be pickled, where the workers do not begin as forks.
+        logs: one log or a sequence of logs. They must be picklable if the workers are not forked.
         num_history, num_future: as in `window`.
 
     Example:
@@ -110,40 +139,25 @@ class WindowDataset(Dataset):  # type: ignore[type-arg]
         several: Any = [logs] if hasattr(logs, "timestamps") else logs
         self._pairs = [(log, index) for log in several for index in range(len(log.timestamps) - 1)]
         self._num_history, self._num_future = num_history, num_future
-        self._recent: CachedLog | None = None
+        self._cached: CachedLog | None = None
 
     def __len__(self) -> int:
         return len(self._pairs)
 
     def __getitem__(self, number: int) -> Window:
         log, index = self._pairs[number]
-        if self._recent is None or self._recent.log is not log:
-            self._recent = CachedLog(log, self._num_history + self._num_future + 2)
-        return window(self._recent, index, self._num_history, self._num_future)
+        if self._cached is None or self._cached.log is not log:
+            self._cached = CachedLog(log, self._num_history + self._num_future + 2)
+        return window(self._cached, index, self._num_history, self._num_future)
 
     @staticmethod
     def collate(windows: Sequence[Window]) -> list[Window]:
-        """A batch, as models take it: sweeps differ in their numbers of points, so nothing is stacked."""
+        """Return the windows as a list; sweeps have different numbers of points and cannot be stacked."""
         return list(windows)
 
 
-class NumberedSweeps(Log):
-    """What readers share: sweeps are asked for by number."""
-
-    def _timestamp(self, index: int) -> int:
-        """Time stamp of sweep `index`; refuses a number that no sweep has."""
-        if not 0 <= index < len(self.timestamps):
-            raise CFlowError(f"log {self.log_id} has sweeps 0 ... {len(self) - 1}, asked for {index}")
-        return self.timestamps[index]
-
-    def _check_count(self, where: Any) -> None:
-        """Refuse a log without a pair of sweeps; `where` begins the message."""
-        if len(self.timestamps) < 2:
-            raise CFlowError(f"{where} has {len(self.timestamps)} sweeps; scene flow needs two or more")
-
-
 class LogWrapper(Log):
-    """Another log whose sweeps are changed; everything else is the other's.
+    """Base class of logs that change the sweeps of another log; every other attribute is that of the other log.
 
     Args:
         log: any log.
@@ -153,21 +167,30 @@ class LogWrapper(Log):
         self.log, self.log_id, self.timestamps = log, log.log_id, log.timestamps
 
     def labels(self, index: int) -> FlowLabels | None:
-        """The log's labels."""
+        """Read the labels of the wrapped log."""
         return self.log.labels(index)
 
+    def close(self) -> None:
+        """Close the wrapped log."""
+        self.log.close()
+
+    @property
+    def unwrapped(self) -> Log:
+        """The innermost log."""
+        return self.log.unwrapped
+
     def __getattr__(self, name: str) -> Any:
-        if name == "log" or name.startswith("__"):  # it is being unpickled; what Python asks of a class
+        if name == "log" or name.startswith("__"):  # while unpickling `log` is not set, and Python asks for its hooks
             raise AttributeError(name)
         return getattr(self.log, name)
 
 
 class CachedLog(LogWrapper):
-    """A log that remembers its last sweeps: neighbouring windows share all but one.
+    """A log that keeps its last sweeps in memory, because neighbouring windows share all sweeps but one.
 
     Args:
         log: any log.
-        count: sweeps to remember.
+        count: number of sweeps to keep.
     """
 
     def __init__(self, log: Log, count: int) -> None:
@@ -179,5 +202,5 @@ class CachedLog(LogWrapper):
         return CachedLog, (self.log, self._count)
 
     def sweep(self, index: int) -> Sweep:
-        """The log's sweep."""
+        """Read a sweep of the wrapped log, or return the one in memory."""
         return self._sweep(index)

@@ -10,10 +10,9 @@ from typing import Sequence
 import numpy as np
 
 from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes, make_boxes, upright_poses
-from cflow_torch.data.file_errors import file_errors
-from cflow_torch.data.folders import find_folders
+from cflow_torch.data.files import file_errors, find_folders
 from cflow_torch.data.json_file import read_json
-from cflow_torch.data.log import FlowLabels, NumberedSweeps
+from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.data.paths import PathLike, as_path, read_bytes, remote_errors
 from cflow_torch.data.pickles import load_columns
 from cflow_torch.data.rigid_motion import poses_from_json, transform_points
@@ -59,7 +58,7 @@ def find_pandaset_sequences(root: PathLike) -> list[Path]:
     return find_folders(as_path(root), lambda folder: (folder / "lidar" / "poses.json").is_file(), SEARCH_DEPTH, what)
 
 
-class PandaSetLog(NumberedSweeps):
+class PandaSetLog(Log):
     """One sequence; implements the `Log` protocol.
 
     Args:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import threading
@@ -11,8 +10,8 @@ from contextlib import closing, suppress
 from typing import Any, Iterator, Sequence
 
 from cflow_torch.data.atomic import remove_stale
+from cflow_torch.data.json_file import write_json
 from cflow_torch.data.paths import as_path
-from cflow_torch.data.records import json_ready, write_text
 from cflow_torch.fleet.dispatch import SIGNALS
 from cflow_torch.fleet.job import Event, Failed, Job, Shard, split
 from cflow_torch.fleet.local import run_local
@@ -70,8 +69,8 @@ def run_fleet(
         report["exit_status"] = 128 + ended_by if ended_by else 0 if counters.is_complete else 1
         try:
             file = report_file(job.output, shard)
-            remove_stale(file.parent)
-            write_text(file, json.dumps(json_ready(report), indent=1, allow_nan=False) + "\n")
+            remove_stale(file.parent, {file.name})
+            write_json(file, report)
         except OSError as error:
             log_line(f"the report could not be written: {error}")
             report["exit_status"] = report["exit_status"] or 1

@@ -17,7 +17,7 @@ from cflow_torch.data.catalog import open_log
 from cflow_torch.data.flow_file import write_flow
 from cflow_torch.data.log import CachedLog, Log, window
 from cflow_torch.data.log_check import check_log
-from cflow_torch.data.names import folder_in
+from cflow_torch.data.names import safe_name
 from cflow_torch.data.paths import as_path
 from cflow_torch.estimate import make_model
 from cflow_torch.fleet.job import Done, Event, Failed, Job, Opened, Unit
@@ -79,7 +79,7 @@ class Worker:
         """
         try:
             log = self._open(unit.source)
-            folder = folder_in(as_path(self._job.output), log.log_id, "the log")
+            folder = as_path(self._job.output) / safe_name(log.log_id, "the log")
             stamps = {i: int(log.timestamps[i]) for i in unit.frames(len(log.timestamps) - 1)}
             if unit.only is not None:
                 stamps = {i: stamp for i, stamp in stamps.items() if stamp in unit.only}
@@ -87,8 +87,7 @@ class Worker:
             todo = {i: stamp for i, stamp in stamps.items() if stamp not in complete}
             if todo or complete:
                 claim_log(folder, log, self._job.identity)
-            remove_stale(folder)
-            remove_stale(folder, {frame_file(folder, stamp).name for stamp in todo.values()})  # ours now
+            remove_stale(folder, {frame_file(folder, stamp).name for stamp in todo.values()})
         except Exception as error:
             yield Failed(unit.number, source_name(unit.source), describe(error))
             return
@@ -111,10 +110,8 @@ class Worker:
 
     def _close_log(self) -> None:
         log, self._log = self._log[1], (None, None)
-        while log is not None:  # what is put round a log (recent sweeps, ground, poses) holds it as `log`
-            if hasattr(log, "__exit__"):  # an open file
-                log.__exit__(None, None, None)
-            log = getattr(log, "log", None)
+        if log is not None:
+            log.close()
 
     def _open(self, source: Any) -> Log:
         if self._log[1] is None or self._log[0] != source:

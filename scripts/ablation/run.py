@@ -22,7 +22,6 @@ what stands is below. moving: number of moving points. The JSON file has near an
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import os
 import re
@@ -36,7 +35,7 @@ from score import Figures, mean_figures, score
 from sets import ScoredSet, make_sets
 
 from cflow_torch.config import Config, make_config
-from cflow_torch.data.records import json_ready, write_text
+from cflow_torch.data.json_file import write_json
 from cflow_torch.types import CFlowError
 
 COLUMNS = ("dynamic", "pedestrian", "static", "stands", "near", "far", "missed", "flagged", "at 1 %", "moving")
@@ -68,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         scores[mean] = {name: mean_figures([scores[part][name] for part in parts]) for name in scores[parts[0]]}
         print("".join(row(mean, name, figures) for name, figures in scores[mean].items()), end="")
     if given.json:
-        write_text(given.json, json.dumps(json_ready(scores), indent=1))
+        write_json(given.json, scores)
     return 0
 
 

@@ -16,8 +16,7 @@ from typing import Any, List
 
 from results import CLASSES, METHODS, RANGES, Ours, Runs, load_paper, load_runs, protocol, range_errors
 
-from cflow_torch.data.atomic import atomic_file
-from cflow_torch.data.records import write_text
+from cflow_torch.data.atomic import atomic_file, write_text
 
 PER_SET = ("datasets", "range_split")  # experiments whose columns are data sets, not classes
 INTRODUCTION = """# The paper's tables beside ours

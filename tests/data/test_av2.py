@@ -163,7 +163,7 @@ def test_bad_logs_are_refused(folder: Path, tmp_path: Path) -> None:
         AV2Log(tmp_path)
     for ask in (AV2Log(folder).sweep, AV2Log(folder).labels):
         for index in (3, -1):
-            with pytest.raises(CFlowError, match=f"sweeps 0 ... 2, asked for {index}"):
+            with pytest.raises(CFlowError, match=f"sweeps 0 ... 2, you asked for {index}"):
                 ask(index)
     with pytest.raises(CFlowError, match="ground rules are"):
         AV2Log(folder, ground="patchwork")

@@ -84,7 +84,7 @@ def test_logs_are_found_below_and_at_a_folder(name: str, log: str, tmp_path: Pat
             (tmp_path / place / file).write_bytes(b"")
     assert find_sources(name, tmp_path) == [tmp_path / "a" / "x", tmp_path / "b"]
     assert find_sources(name, tmp_path / "b") == [tmp_path / "b"]
-    with pytest.raises(CFlowError, match="nowhere is no folder"):
+    with pytest.raises(CFlowError, match="nowhere is not a folder"):
         find_sources(name, tmp_path / "nowhere")
 
 

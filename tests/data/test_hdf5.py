@@ -59,7 +59,7 @@ def test_a_bad_sweep_is_named(tmp_path, replaced, complaint):
         with pytest.raises(CFlowError, match=f"a.h5.*{complaint}"):
             log.sweep(0), log.labels(0)
         assert len(log.sweep(1).points) == 50
-        with pytest.raises(CFlowError, match="sweeps 0 ... 2, asked for 3"):
+        with pytest.raises(CFlowError, match="sweeps 0 ... 2, you asked for 3"):
             log.sweep(3)
 
 

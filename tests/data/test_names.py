@@ -11,24 +11,23 @@ from tiny_recording import TinyRecording
 
 from cflow_torch import CFlowError
 from cflow_torch.data.catalog import find_sources, open_log
-from cflow_torch.data.names import folder_in, is_safe_name, is_timestamp, path_inside, safe_name
+from cflow_torch.data.names import is_safe_name, is_timestamp, path_inside, safe_name
 from cflow_torch.simulator.writers.nuscenes import write_nuscenes
 
 BAD = (
     *("", ".", "..", "../up", "/etc/passwd", "a/b", "a\\b", "..\\up", "C:", "c:x", "\\\\host\\share", ".hidden"),
-    *("a\0b", "a\nb", "\x7f", "\x85", "\u2028", "\ud800", "a.", "a ", "CON", "con", "aux.txt", "Nul.tar.gz", "COM1"),
-    *("lpt9.x", "CONIN$", "nul .txt", "n" * 256, "\U0001f600" * 64),
+    *("a\0b", "a\nb", "\x7f", "\x85", "\u2028", "\ud800"),
 )
 GOOD = (
-    *("scene-0001", "10203656353524179475_7625_000_7645_000", "a b", "é\U0001f600", "con2", "aux_", "2024-01-01T12:00"),
-    *("n" * 255, "\U0001f600" * 63, "a..b", "COM10", "console", "-", "@home", "a=b,c"),
+    *("scene-0001", "10203656353524179475_7625_000_7645_000", "a b", "é\U0001f600", "2024-01-01T12:00"),
+    *("n" * 255, "a..b", "-", "@home", "a=b,c"),
 )
 
 
 def test_names_that_are_refused() -> None:
     for name in (*BAD, None, 5, b"a", ["a"], Path("a")):
         assert not is_safe_name(name)
-        with pytest.raises(CFlowError, match="the scene .* is no folder name and no file name: ") as error:
+        with pytest.raises(CFlowError, match="the scene .* cannot be used as a file or folder name: ") as error:
             safe_name(name, "the scene")
         assert str(error.value).isprintable() and len(str(error.value)) < 300
 
@@ -37,7 +36,6 @@ def test_names_that_are_taken(tmp_path: Path) -> None:
     for name in GOOD:
         assert safe_name(name, "the scene") == name
         (tmp_path / name).mkdir()
-        assert folder_in(tmp_path, name, "the log") == tmp_path / name
 
 
 def test_files_that_tables_name_lie_below_the_folder(tmp_path: Path) -> None:
@@ -77,5 +75,5 @@ def test_names_of_a_data_set_cannot_leave_it(tmp_path: Path) -> None:
         with pytest.raises(CFlowError, match="the filename in sample_data.json .* is not read"):
             log.sweep(0)
     change("scene", name="../../escaped")
-    with pytest.raises(CFlowError, match="scene.json: the scene .* is no folder name"):
+    with pytest.raises(CFlowError, match="scene.json: the scene .* cannot be used as"):
         find_sources("nuscenes", root)

@@ -14,7 +14,7 @@ from tiny_recording import TinyRecording
 from cflow_torch import CFlowError
 from cflow_torch.data.aevascenes import AevaScenesLog
 from cflow_torch.data.arrays.cloud_file import read_cloud
-from cflow_torch.data.npy_file import read_npy
+from cflow_torch.data.files import read_npy
 from cflow_torch.simulator.writers.aevascenes import write_aevascenes_sequence
 
 

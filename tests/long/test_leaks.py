@@ -173,7 +173,6 @@ def read_all(data_set: str, root: Path, settings: dict[str, Any]) -> None:
             log = open_log(data_set, source, **settings)
             window(log, 0)
             log.labels(0)
-            if hasattr(log, "__exit__"):
-                log.__exit__(None, None, None)
+            log.close()
     except (CFlowError, OSError):
         pass

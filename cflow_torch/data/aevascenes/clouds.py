@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.lib import format as npy
 
-from cflow_torch.data.file_errors import file_errors
+from cflow_torch.data.files import file_errors
 from cflow_torch.data.paths import read_bytes
 from cflow_torch.data.pickles import NUMPY_ARRAYS, Placeholder, array_of, load_plain
 from cflow_torch.types import CFlowError

@@ -10,10 +10,9 @@ import numpy as np
 
 from cflow_torch.data.aevascenes.clouds import Cloud
 from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes, make_boxes
-from cflow_torch.data.file_errors import file_errors, shortened
-from cflow_torch.data.folders import find_folders
+from cflow_torch.data.files import file_errors, find_folders, shortened
 from cflow_torch.data.json_file import read_json
-from cflow_torch.data.log import FlowLabels, NumberedSweeps
+from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.data.names import path_inside
 from cflow_torch.data.paths import PathLike, as_path
 from cflow_torch.data.rigid_motion import poses_from_json, transform_points
@@ -62,7 +61,7 @@ def find_aevascenes_sequences(root: PathLike) -> list[Path]:
     return find_folders(as_path(root), lambda folder: (folder / "sequence.json").is_file(), SEARCH_DEPTH, what)
 
 
-class AevaScenesLog(NumberedSweeps):
+class AevaScenesLog(Log):
     """One sequence, of the layout of version 0.1, 0.2 or 2; implements the `Log` protocol.
 
     Args:

@@ -12,8 +12,7 @@ from pyarrow import feather, parquet
 from cflow_torch.data.arrays.pcd import read_pcd, write_pcd
 from cflow_torch.data.arrays.ply import read_ply, write_ply
 from cflow_torch.data.atomic import atomic_file
-from cflow_torch.data.file_errors import file_errors
-from cflow_torch.data.npy_file import read_npy
+from cflow_torch.data.files import file_errors, read_npy
 from cflow_torch.data.paths import PathLike, as_path, read_bytes, source_for_full_read
 from cflow_torch.types import CFlowError
 

@@ -15,7 +15,7 @@ from typing import Mapping
 import numpy as np
 
 from cflow_torch.data.atomic import atomic_file
-from cflow_torch.data.file_errors import file_errors
+from cflow_torch.data.files import file_errors
 from cflow_torch.data.paths import PathLike, as_path, read_bytes
 
 _CODES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")

@@ -18,9 +18,8 @@ from cflow_torch.data.arrays.poses_text import (
     read_poses,
     read_times,
 )
-from cflow_torch.data.folders import find_folders
-from cflow_torch.data.log import NumberedSweeps
-from cflow_torch.data.npy_file import read_npy
+from cflow_torch.data.files import find_folders, read_npy
+from cflow_torch.data.log import Log
 from cflow_torch.data.paths import PathLike, as_path, is_path_like, is_remote
 from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.types import CFlowError, Sweep
@@ -53,7 +52,7 @@ def find_array_logs(root: PathLike) -> list[Path]:
     return find_folders(as_path(root), is_log, SEARCH_DEPTH, what, is_passed)
 
 
-class ArraysLog(NumberedSweeps):
+class ArraysLog(Log):
     """A folder of point clouds; implements the `Log` protocol.
 
     Args:

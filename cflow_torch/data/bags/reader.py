@@ -12,9 +12,8 @@ from cflow_torch.data.arrays.poses_text import Trajectory
 from cflow_torch.data.arrays.poses_text import poses_at as covered_poses
 from cflow_torch.data.bags.frames import Frames, Sample, sample, sorted_poses
 from cflow_torch.data.bags.point_cloud2 import points_and_times
-from cflow_torch.data.file_errors import file_errors, shortened
-from cflow_torch.data.folders import find_folders
-from cflow_torch.data.log import FlowLabels, NumberedSweeps
+from cflow_torch.data.files import file_errors, find_folders, shortened
+from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.data.paths import PathLike, as_path, is_remote, source_for_full_read
 from cflow_torch.data.rigid_motion import poses_at, transform_points
 from cflow_torch.types import CFlowError, Sweep
@@ -46,7 +45,7 @@ def find_bags(root: PathLike) -> list[Path]:
     return sorted(bag for folder in folders for bag in _bags_in(folder))
 
 
-class BagLog(NumberedSweeps):
+class BagLog(Log):
     """One bag; implements the `Log` protocol.
 
     Args:

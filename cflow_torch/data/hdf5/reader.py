@@ -10,7 +10,7 @@ import numpy as np
 
 from cflow_torch.data.hdf5.frames import StoredMotion, harness_motion, is_argoverse2, recognized_extrinsics
 from cflow_torch.data.hdf5.stored import member, open_scene, scene_errors
-from cflow_torch.data.log import FlowLabels, NumberedSweeps
+from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.data.names import is_timestamp
 from cflow_torch.data.paths import PathLike, as_path
 from cflow_torch.types import CFlowError, Sweep
@@ -36,7 +36,7 @@ def find_hdf5_scenes(root: PathLike) -> list[Path]:
     return sorted(root.glob("*.h5"))
 
 
-class HDF5Log(NumberedSweeps):
+class HDF5Log(Log):
     """One scene; implements the `Log` protocol. Needs h5py (`pip install h5py`).
 
     Args:
@@ -81,10 +81,8 @@ class HDF5Log(NumberedSweeps):
     def __reduce__(self) -> Any:
         return HDF5Log, (self.file, self.ego_T_lidar)  # another process opens the file itself
 
-    def __enter__(self) -> HDF5Log:
-        return self
-
-    def __exit__(self, *_: Any) -> None:
+    def close(self) -> None:
+        """Close the scene's file."""
         self._scene.close()
 
     def sweep(self, index: int) -> Sweep:

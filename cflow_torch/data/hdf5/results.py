@@ -13,7 +13,7 @@ from typing import Any, Iterable, Iterator, Mapping
 import numpy as np
 
 from cflow_torch.data.atomic import atomic_name, remove_stale
-from cflow_torch.data.file_errors import file_errors
+from cflow_torch.data.files import file_errors
 from cflow_torch.data.hdf5.stored import import_h5py, member, open_scene
 from cflow_torch.data.names import is_timestamp
 from cflow_torch.types import Array, CFlowError, as_numpy
@@ -154,7 +154,7 @@ def _changed(file: str | Path) -> Iterator[Any]:
     h5py = import_h5py()
     check_writable(file)
     file = Path(file).resolve()  # a link stays a link
-    remove_stale(file.parent)  # copies of writers that were killed
+    remove_stale(file.parent, {file.name})  # the copy of a writer that was killed
     with atomic_name(file) as copy:
         shutil.copy(file, copy)
         with _writing(file):

@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from cflow_torch.data.file_errors import file_errors
+from cflow_torch.data.files import file_errors
 from cflow_torch.data.paths import PathLike, source_for_random_access
 from cflow_torch.types import CFlowError
 

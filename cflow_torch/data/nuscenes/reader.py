@@ -8,8 +8,8 @@ from typing import ClassVar, Mapping, NamedTuple, Sequence
 import numpy as np
 
 from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes, make_boxes, points_in_box
-from cflow_torch.data.file_errors import file_errors
-from cflow_torch.data.log import FlowLabels, NumberedSweeps
+from cflow_torch.data.files import file_errors
+from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.data.names import path_inside
 from cflow_torch.data.nuscenes.categories import NUSCENES_CATEGORIES, OWN_TRAILER
 from cflow_torch.data.nuscenes.tables import LidarChain, SceneSource, Tables, find_scenes
@@ -39,7 +39,7 @@ def find_nuscenes_scenes(root: PathLike) -> list[SceneSource]:
     return find_scenes(root, ("ego_motion_cabin", "ego_motion_chassis"), "nuScenes")
 
 
-class NuScenesLog(NumberedSweeps):
+class NuScenesLog(Log):
     """One nuScenes scene; implements the `Log` protocol.
 
     Args:

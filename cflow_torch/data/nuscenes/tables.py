@@ -10,8 +10,7 @@ from typing import Any, Collection, Dict, Sequence
 
 import numpy as np
 
-from cflow_torch.data.file_errors import file_errors
-from cflow_torch.data.folders import find_folders
+from cflow_torch.data.files import file_errors, find_folders
 from cflow_torch.data.json_file import parse_json
 from cflow_torch.data.names import safe_name
 from cflow_torch.data.paths import PathLike, as_path, read_bytes

@@ -10,9 +10,8 @@ from typing import Sequence
 import numpy as np
 
 from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes, make_boxes, upright_poses
-from cflow_torch.data.file_errors import file_errors
-from cflow_torch.data.folders import find_folders
-from cflow_torch.data.log import FlowLabels, NumberedSweeps
+from cflow_torch.data.files import file_errors, find_folders
+from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.data.paths import PathLike, as_path, remote_errors
 from cflow_torch.data.waymo.parquet import (
     BOX,
@@ -60,7 +59,7 @@ def find_waymo_segments(root: PathLike) -> list[Path]:
     return sorted(file for split in splits for file in (split / "lidar").glob("*.parquet"))
 
 
-class WaymoLog(NumberedSweeps):
+class WaymoLog(Log):
     """One segment; implements the `Log` protocol.
 
     Args:

@@ -13,8 +13,8 @@ from pyarrow import feather
 
 from cflow_torch.data.arrow_file import FeatherFile
 from cflow_torch.data.atomic import atomic_file
-from cflow_torch.data.file_errors import file_errors, shortened
-from cflow_torch.data.names import folder_in
+from cflow_torch.data.files import file_errors, shortened
+from cflow_torch.data.names import safe_name
 from cflow_torch.data.paths import read_bytes
 from cflow_torch.evaluation.submission.formats import SubmissionVersion
 from cflow_torch.evaluation.submission.frames import Frame
@@ -36,7 +36,7 @@ def write_frame(folder: str | Path, name: str, columns: Mapping[str, np.ndarray]
         CFlowError: the log's name cannot be a folder's.
     """
     log_id, _, stem = name.rpartition("/")
-    file = folder_in(Path(folder), log_id, "the log") / stem
+    file = Path(folder) / safe_name(log_id, "the log") / stem
     table = pa.table({key: pa.array(values) for key, values in columns.items()})
     with atomic_file(file) as stream:
         feather.write_feather(table, stream)

@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 
 from cflow_torch.data.arrow_file import FeatherFile
-from cflow_torch.data.file_errors import file_errors
+from cflow_torch.data.files import file_errors
 from cflow_torch.data.log import Log
 from cflow_torch.data.names import is_timestamp, safe_name
 from cflow_torch.data.paths import read_bytes
