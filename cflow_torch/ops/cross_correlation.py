@@ -62,18 +62,9 @@ def _fft_dtype(images: Tensor, most: int | None) -> torch.dtype:
 
 
 def _by_conv(images: Tensor, num_templates: int, own: Tensor) -> Tensor:
-    templates, targets = images[:num_templates], images[num_templates:]
-    height, width = _extent(templates)
-    rows, cols = _extent(targets)
-    padded = F.pad(targets[:, :rows, :cols], (0, width - 1, 0, height - 1))[own]
-    # One group per template. Sums of products of zeros and ones: exact in float32 up to 2^24, also with TF32.
-    counts = F.conv2d(padded[None], templates[:, None, :height, :width], groups=num_templates)[0]
-    return F.pad(counts, (0, images.shape[2] - cols, 0, images.shape[1] - rows))
-
-
-def _extent(images: Tensor) -> tuple[int, int]:
-    """Rows and columns up to the last one in which any image has a pixel, at least 1."""
-    used = images.amax(0)
-    places = (used.amax(1 - dim).nonzero() for dim in (0, 1))
-    height, width = (int(place.max()) + 1 if place.numel() else 1 for place in places)
-    return height, width
+    height, width = (images.amax(0).nonzero().amax(0) + 1).tolist()  # the rest of all images is empty
+    templates, targets = images[:num_templates, :height, :width], images[num_templates:, :height, :width]
+    padded = F.pad(targets, (0, width - 1, 0, height - 1)).index_select(0, own)
+    # One group per template. Sums of products of zeros and ones are exact in float32 up to 2^24, also with TF32.
+    counts = F.conv2d(padded[None], templates[:, None], groups=num_templates)[0]
+    return F.pad(counts, (0, images.shape[2] - width, 0, images.shape[1] - height))
