@@ -180,7 +180,7 @@ class VerifiedConfig(_WithHistory):
         "often as the sweeps before t do. The method then takes twice the time",
         low=0,
     )
-    max_object: float | None = setting(
+    max_object_length: float | None = setting(
         25.0,
         "metres: a component that is longer than this at t+1 moves only if both of its ends move (trams, trains). "
         "None = a component of any length may move",
@@ -248,6 +248,7 @@ REMOVED = {
     "proof": "the method says so now: preset default or fast (method='verified'), or paper (method='dense')",
     "proof_z": "its name is significance",
     "clearance": "its name is min_height",
+    "max_object": "its name is max_object_length",
     "use_timestamps": "time stamps count wherever every sweep of a window has one",
     **dict.fromkeys(("children", "aperture", "yaw", "slow"), "leave it out, this step is always on"),
     **dict.fromkeys(("relocate", "keypoint_block", "nudge", "zero_test", "subpixel"), "leave it out"),

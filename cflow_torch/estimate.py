@@ -121,7 +121,7 @@ def estimate_flow(
     check_windows([window])
     window = _find_ground(keep_nearest(window, config.num_history), ground, device)
     (result,) = make_model(config, device)([window])
-    _warn_if_nothing_takes_part(result, window, config)
+    _warn_if_nothing_is_active(result, window, config)
     return result
 
 
@@ -164,7 +164,7 @@ def _find_ground(window: Window, ground: str | None, device: Any) -> Window:
     return Window(sweeps[0], sweeps[1], tuple(sweeps[2:first_future]), tuple(sweeps[first_future:]))
 
 
-def _warn_if_nothing_takes_part(result: FlowResult, window: Window, config: Config) -> None:
+def _warn_if_nothing_is_active(result: FlowResult, window: Window, config: Config) -> None:
     """Points in millimetres, of another place or all of them ground are legal, and rarely meant."""
     count = len(result.is_valid)
     if count == 0 or bool(result.is_valid.any()):

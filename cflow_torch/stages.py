@@ -47,7 +47,7 @@ class FlowModel(Protocol):
         """One result per window."""
 
 
-class StopWatch:
+class TimedModel:
     """A method that is timed; stands in for it.
 
     Args:

@@ -200,7 +200,7 @@ def _draw(
 def _batch(positions: torch.Tensor, image: torch.Tensor, elapsed: torch.Tensor) -> Batch:
     return Batch(
         positions=positions,
-        takes_part=torch.ones(image.numel(), dtype=torch.bool),
+        is_active=torch.ones(image.numel(), dtype=torch.bool),
         has_result=torch.ones(image.numel(), dtype=torch.bool),
         image=image.int(),
         num_newest=0,

@@ -20,7 +20,7 @@ from cflow_torch import (
     make_config,
     make_model,
 )
-from cflow_torch.stages import StopWatch
+from cflow_torch.stages import TimedModel
 
 RNG = np.random.default_rng(0)
 P0, P1 = RNG.uniform(-5, 5, (50, 3)).astype(np.float32), RNG.uniform(-5, 5, (40, 3)).astype(np.float32)
@@ -90,7 +90,7 @@ def test_everything_ground_and_single_points():
     ],
     ids=["millimetres", "nothing finite"],
 )
-def test_a_warning_if_no_point_takes_part(points, seen):
+def test_a_warning_if_no_point_is_active(points, seen):
     with pytest.warns(UserWarning, match=f"none of the .* points of pc0 takes part.*{seen}"):
         assert not estimate_flow(points, P1).is_valid.any()
     with warnings.catch_warnings():
@@ -126,7 +126,7 @@ def test_results_are_ordinary_tensors_that_a_training_loop_may_use():
 
 
 def test_a_stop_watch_stands_in_for_the_method_and_knows_its_stages():
-    watch, window = StopWatch(make_model(config("verified"))), scene(0)
+    watch, window = TimedModel(make_model(config("verified"))), scene(0)
     assert watch.report() == {"pairs": 0}
     results = [watch([window])[0] for _ in range(3)]
     assert_same_bits(results[0], make_model(watch.config)([window])[0])

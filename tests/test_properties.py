@@ -92,7 +92,7 @@ def test_dense_equals_the_oracle(window, overrides):
 @settings(PROFILE, max_examples=40)
 @given(windows(), verified, st.sampled_from([None, 2 * S, 1.0]))
 def test_verified_equals_the_oracle(window, overrides, longest):
-    flow_as_oracle(window, small("verified", max_object=longest, **overrides))
+    flow_as_oracle(window, small("verified", max_object_length=longest, **overrides))
 
 
 @settings(PROFILE, max_examples=30)

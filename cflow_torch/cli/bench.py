@@ -21,7 +21,7 @@ from cflow_torch.config import Config
 from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.json_file import write_json
 from cflow_torch.data.log import Log, window
-from cflow_torch.stages import FlowModel, StopWatch
+from cflow_torch.stages import FlowModel, TimedModel
 from cflow_torch.types import CFlowError, Window
 from cflow_torch.windows.memory import peak_memory
 
@@ -55,10 +55,10 @@ def measure(model: FlowModel, windows: Sequence[Window], repeats: int, batches: 
 
     Returns:
         "points" (mean number per sweep), "windows", "repeats", "device"; "seconds": of one window, see
-        `StopWatch.report`; "batches": size -> "median" (seconds of a batch), "windows_per_s"; "peak_bytes": on a GPU
+        `TimedModel.report`; "batches": size -> "median" (seconds of a batch), "windows_per_s"; "peak_bytes": on a GPU
         the most that was allocated there at once, else the most that the process ever held, None = not known.
     """
-    watch = StopWatch(model)
+    watch = TimedModel(model)
     device = watch(windows[:1])[0].flow.device
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
@@ -67,7 +67,7 @@ def measure(model: FlowModel, windows: Sequence[Window], repeats: int, batches: 
             watch([each])
     throughput = {}
     for size in batches:
-        of_batch = StopWatch(model)
+        of_batch = TimedModel(model)
         for _ in range(1 + repeats):
             of_batch([windows[i % len(windows)] for i in range(size)])
         median = of_batch.report()["median"]

@@ -21,7 +21,7 @@ from cflow_torch.data.atomic import ensure_writable, remove_stale
 from cflow_torch.data.flow_file import write_flow
 from cflow_torch.data.log import Log
 from cflow_torch.data.names import safe_name
-from cflow_torch.stages import StopWatch
+from cflow_torch.stages import TimedModel
 from cflow_torch.types import CFlowError, FlowResult, Window
 from cflow_torch.viz.bev import plot_flow, save_picture
 from cflow_torch.viz.style import blank_figure
@@ -37,7 +37,7 @@ def task(cfg: DictConfig) -> None:
         draws = False
         print(f"no picture ({error}); flow, scores and settings come all the same")
     scores = Scores(cfg)
-    model = StopWatch(run.make_model(cfg))
+    model = TimedModel(run.make_model(cfg))
     logs, failures = run.open_logs(cfg)
     if logs:
         run.check_pair(cfg.pair, max(logs, key=lambda log: len(log.timestamps)))
@@ -59,7 +59,7 @@ def task(cfg: DictConfig) -> None:
     run.finish(failures)
 
 
-def _draw(log: Log, model: StopWatch, sweeps: Window, result: FlowResult, output: Path) -> str:
+def _draw(log: Log, model: TimedModel, sweeps: Window, result: FlowResult, output: Path) -> str:
     """The file of the picture."""
     figure = plot_flow(
         sweeps.pc0.points,

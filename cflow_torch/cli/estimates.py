@@ -18,7 +18,7 @@ import torch
 from cflow_torch.fleet.machine import AUTO, choose_layout
 from cflow_torch.fleet.progress import frames
 from cflow_torch.model import SceneFlowModel
-from cflow_torch.stages import StopWatch
+from cflow_torch.stages import TimedModel
 from cflow_torch.types import CFlowError, FlowResult, Window
 
 _PAIRS_PER_WORKER = 50  # at least: a process takes as long to start as some 30 windows
@@ -28,7 +28,9 @@ Item = TypeVar("Item")
 Answer = Callable[[], Tuple[Window, FlowResult]]
 
 
-def estimates(model: StopWatch, items: Sequence[Item], read: Callable[[Item], Window]) -> Iterator[tuple[Item, Answer]]:
+def estimates(
+    model: TimedModel, items: Sequence[Item], read: Callable[[Item], Window]
+) -> Iterator[tuple[Item, Answer]]:
     """Flow of many pairs; it does not depend on the number of processes.
 
     Args:
@@ -56,11 +58,11 @@ def estimates(model: StopWatch, items: Sequence[Item], read: Callable[[Item], Wi
         yield from waiting
 
 
-def _here(model: StopWatch, sweeps: Window) -> tuple[Window, FlowResult]:
+def _here(model: TimedModel, sweeps: Window) -> tuple[Window, FlowResult]:
     return sweeps, model([sweeps])[0]
 
 
-def _there(model: StopWatch, pool: ProcessPoolExecutor, item: Item, read: Callable[[Item], Window]) -> Answer:
+def _there(model: TimedModel, pool: ProcessPoolExecutor, item: Item, read: Callable[[Item], Window]) -> Answer:
     """Read a window and give it to a worker; the answer waits for it."""
     future: Future = Future()
     try:
@@ -80,7 +82,7 @@ def _there(model: StopWatch, pool: ProcessPoolExecutor, item: Item, read: Callab
     return answer
 
 
-_model: StopWatch  # of a worker process
+_model: TimedModel  # of a worker process
 
 
 def _begin(method: SceneFlowModel) -> None:
@@ -88,7 +90,7 @@ def _begin(method: SceneFlowModel) -> None:
     global _model
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     torch.set_num_threads(1)
-    _model = StopWatch(method)
+    _model = TimedModel(method)
 
 
 def _compute(sweeps: Window) -> tuple[Any, ...]:

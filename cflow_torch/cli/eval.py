@@ -20,7 +20,7 @@ from omegaconf import DictConfig
 from cflow_torch.cli import run
 from cflow_torch.cli.record import Scores, finished_results, objective
 from cflow_torch.data.atomic import ensure_writable
-from cflow_torch.stages import StopWatch
+from cflow_torch.stages import TimedModel
 from cflow_torch.types import CFlowError
 
 
@@ -33,7 +33,7 @@ def task(cfg: DictConfig) -> float:
         print(f"skipped, done before: {output}")
         return objective(record["results"])
     scores = Scores(cfg)
-    model = StopWatch(run.make_model(cfg))
+    model = TimedModel(run.make_model(cfg))
     logs, failures = run.open_logs(cfg)
     ensure_writable(output)
     failures += run.for_each_pair(logs, model, scores.add, pairs)

@@ -50,7 +50,7 @@ class Scores:
         Args:
             folder: made if absent.
             logs: that were scored.
-            seconds: what `StopWatch.report` returned.
+            seconds: what `TimedModel.report` returned.
             failures: pairs and logs that could not be used.
 
         Returns:

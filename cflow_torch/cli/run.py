@@ -28,7 +28,7 @@ from cflow_torch.fleet.manifest import frame_file
 from cflow_torch.fleet.progress import log_line
 from cflow_torch.model import SceneFlowModel
 from cflow_torch.simulator.benchmark import benchmark_logs, format_of
-from cflow_torch.stages import StopWatch
+from cflow_torch.stages import TimedModel
 from cflow_torch.types import CFlowError, FlowResult, Window
 
 Failures = List[Tuple[str, str]]
@@ -234,7 +234,7 @@ def collect_failures(failures: Failures, name: str) -> Iterator[None]:
         log_line(f"failed: {name}: {error}")
 
 
-def for_each_pair(logs: Sequence[Log], model: StopWatch, use: UseResult, pairs: Callable[[Log], range]) -> Failures:
+def for_each_pair(logs: Sequence[Log], model: TimedModel, use: UseResult, pairs: Callable[[Log], range]) -> Failures:
     """Estimate the flow of the pairs of every log and hand it on; a bad frame is reported and the rest goes on.
 
     Args:

@@ -42,7 +42,7 @@ from cflow_torch.evaluation.submission.frames import (
 )
 from cflow_torch.fleet.manifest import claim_folder
 from cflow_torch.fleet.progress import frames as counted
-from cflow_torch.stages import StopWatch
+from cflow_torch.stages import TimedModel
 from cflow_torch.types import CFlowError, Window
 
 Plan = List[Tuple[PlannedFrame, Frame]]
@@ -60,7 +60,7 @@ def task(cfg: DictConfig) -> None:
         raise CFlowError("masks= already lists the frames that are evaluated: leave frames= out")
     masks = None if cfg.masks is None else MaskArchive(cfg.masks)
     listed = read_frame_list(cfg.frames) if cfg.frames is not None else None if masks is None else masks.frames
-    model = StopWatch(run.make_model(cfg))
+    model = TimedModel(run.make_model(cfg))
     logs, failures = run.open_logs(cfg)
     plan, unreadable = _plan(logs, version, listed, masks)
     failures += unreadable
@@ -111,7 +111,7 @@ def _plan(logs: Sequence[Log], version: SubmissionVersion, listed: _Listed, mask
 
 
 def _write(
-    cfg: DictConfig, plan: Plan, model: StopWatch, version: SubmissionVersion, masks: _Masks, folder: Path
+    cfg: DictConfig, plan: Plan, model: TimedModel, version: SubmissionVersion, masks: _Masks, folder: Path
 ) -> Failures:
     """Estimate and write the frames that do not exist yet."""
     failures: Failures = []

@@ -11,9 +11,9 @@ from torch import Tensor
 from cflow_torch.config import ClusteringConfig
 from cflow_torch.dense.components import PixelIndices, components_by_size
 from cflow_torch.dense.projection import ProjectedSweeps
-from cflow_torch.ops.indices import divide, flat_nonzero, gather, lazy_empty, renumber, split_index
+from cflow_torch.ops.indices import flat_nonzero, floor_divide, gather, lazy_empty, renumber, split_index
 from cflow_torch.ops.labeling import pad
-from cflow_torch.ops.segments import segment_ends
+from cflow_torch.ops.segments import segment_minmax
 
 
 @dataclass(frozen=True)
@@ -102,11 +102,11 @@ def cluster_images(images: Tensor, pixel_size: float, config: ClusteringConfig) 
     flat = images.flatten()
     occupied = torch.stack([flat[m * area :].index_select(0, cell) for m in range(num_steps)])
     kept = flat_nonzero(_can_move(component, num_components, occupied))
-    first, last = gather(kept, *segment_ends(pixels, component, num_components))
+    first, last = gather(kept, *segment_minmax(pixels, component, num_components))
     first, order = first.sort()
     kept, last = gather(order, kept, last)
-    left, right = gather(kept, *segment_ends(col, component, num_components))
-    top, bottom = divide(first, aggregated.shape[2]), divide(last, aggregated.shape[2])
+    left, right = gather(kept, *segment_minmax(col, component, num_components))
+    top, bottom = floor_divide(first, aggregated.shape[2]), floor_divide(last, aggregated.shape[2])
     window_of_cluster, top_in_window = split_index(top, aggregated.shape[1])
     cluster = renumber(kept, num_components).index_select(0, component)
 

@@ -12,7 +12,7 @@ from cflow_torch.ops.indices import split_index
 from cflow_torch.ops.kornia_engine import close_3x3_kornia, connected_components_kornia
 from cflow_torch.ops.labeling import label_blocks, pad
 from cflow_torch.ops.morphology import close_3x3
-from cflow_torch.ops.segments import first_of_segment, segment_ends
+from cflow_torch.ops.segments import first_of_segment, segment_minmax
 
 
 @dataclass(frozen=True)
@@ -61,8 +61,8 @@ def components_by_size(
     lies in their union, so none affects another.
     """
     component, count = _components(padded, indices, 3, config)
-    top, bottom = segment_ends(indices.row, component, count)
-    left, right = segment_ends(indices.col, component, count)
+    top, bottom = segment_minmax(indices.row, component, count)
+    left, right = segment_minmax(indices.col, component, count)
     # The dilation adds a pixel on every side, except at the border of the image.
     num_rows = bottom.clamp_(max=height - 2).sub_(top.clamp_(min=1))
     num_cols = right.clamp_(max=width - 2).sub_(left.clamp_(min=1))

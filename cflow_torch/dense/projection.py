@@ -55,11 +55,11 @@ def project(batch: Batch, flow: Tensor | None, grid: Grid) -> ProjectedSweeps:
     for points in chunks(0, batch.num_newest, pixel.device):
         pixel[points] = grid.pixel_of_image(batch.positions[:, points], batch.image[points], num_images)
     for points in chunks(batch.num_newest, num_points, pixel.device):
-        positions, takes_part = batch.positions[:, points], batch.takes_part[points]
+        positions, is_active = batch.positions[:, points], batch.is_active[points]
         if flow is not None:
             positions = _warp(batch, flow, points)
-            takes_part = grid.contains(positions).logical_and_(takes_part)
-        pixel[points] = grid.pixel_of_image(positions, batch.image[points], num_images, takes_part)
+            is_active = grid.contains(positions).logical_and_(is_active)
+        pixel[points] = grid.pixel_of_image(positions, batch.image[points], num_images, is_active)
     occupancy = grid.draw(pixel, num_images).unflatten(0, (batch.num_windows, batch.num_steps))
     return ProjectedSweeps(batch, grid, flow, occupancy, pixel)
 

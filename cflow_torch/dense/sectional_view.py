@@ -13,7 +13,7 @@ from cflow_torch.dense.projection import ProjectedSweeps
 from cflow_torch.dense.templates import Images, TemplatePairs
 from cflow_torch.ops.indices import renumber
 from cflow_torch.ops.segments import bounding_boxes
-from cflow_torch.ops.spans import spans
+from cflow_torch.ops.spans import concat_ranges
 
 
 def add_sectional_view(
@@ -57,7 +57,7 @@ def add_sectional_view(
     # Each pair rotates the target of its cluster by its own heading, so every pair needs its own copy of the points.
     copies = available.sum(1)[cluster[newest]]
     target = positions[:, newest.repeat_interleave(copies)]
-    target_pair = spans(torch.searchsorted(slots // num_sources, cluster[newest]), copies)
+    target_pair = concat_ranges(torch.searchsorted(slots // num_sources, cluster[newest]), copies)
 
     pair = torch.cat((template_pair, target_pair))
     row, col = _project(torch.cat((moved, target), 1), heading[:, pair], pixel_size)

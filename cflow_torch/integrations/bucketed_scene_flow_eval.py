@@ -119,11 +119,11 @@ def _read_frame(name: str, frame: Any, data: Any) -> _LogFrame:
         raise CFlowError(f"{name}.pc.full_pc has shape {points.shape}: give (N, 3) metres")
     if points.dtype == np.float16:  # the files of Argoverse 2, which our own reader converts as well
         points = points.astype(np.float32)
-    takes_part = mask = _mask(frame.pc.mask, f"{name}.pc.mask", len(points))
+    is_active = mask = _mask(frame.pc.mask, f"{name}.pc.mask", len(points))
     if data is not None:
-        takes_part = mask & ~_mask(data.is_ground_points, f"{name}[1].is_ground_points", len(points))
+        is_active = mask & ~_mask(data.is_ground_points, f"{name}[1].is_ground_points", len(points))
     T_ego_sensor, T_global_ego = (_pose(frame.pc.pose, name, side) for side in ("sensor_to_ego", "ego_to_global"))
-    return _LogFrame(frame.log_id, frame.log_idx, Frame(points, takes_part, T_ego_sensor, T_global_ego), mask)
+    return _LogFrame(frame.log_id, frame.log_idx, Frame(points, is_active, T_ego_sensor, T_global_ego), mask)
 
 
 def _earlier(known: Sequence[_LogFrame], first: _LogFrame, num_history: int) -> list[_LogFrame]:

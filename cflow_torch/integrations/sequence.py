@@ -28,14 +28,14 @@ class Frame:
 
     Args:
         points: (N, 3) float, metres, in the frame of the sensor.
-        takes_part: (N,) bool, False = ground, or outside the range of the data set.
+        is_active: (N,) bool, False = ground, or outside the range of the data set.
         sensor_to_ego: (4, 4) float64, `T_ego_sensor` of this sweep.
         ego_to_global: (4, 4) float64, `T_global_ego`; "global" is any frame, the same for all sweeps of a sequence.
         timestamp_ns: nanoseconds, None = unknown.
     """
 
     points: Array
-    takes_part: Array
+    is_active: Array
     sensor_to_ego: np.ndarray
     ego_to_global: np.ndarray
     timestamp_ns: int | None = None
@@ -116,14 +116,14 @@ class SequenceFlow(nn.Module):
 
     def _sweeps(self, frames: Sequence[Frame]) -> list[Sweep]:
         points = [frame.ego_points() for frame in frames]
-        left_out = [~frame.takes_part for frame in frames]
+        left_out = [~frame.is_active for frame in frames]
         if self.ground is not None:
             method = "grid" if self.ground == "auto" else self.ground
             found = [find_ground_batch([cloud], method)[0] for cloud in points]  # one by one: sequences may be long
             left_out = [a | b for a, b in zip(left_out, found)]
         elif not self._looked_for_ground:
             self._looked_for_ground = True
-            if any(has_ground([points[-2][frames[-2].takes_part]])):
+            if any(has_ground([points[-2][frames[-2].is_active]])):
                 warnings.warn(
                     "there is ground among the points that take part, which joins what stands on it, so that moving "
                     "objects are missed. Load the data set with with_ground=False, or pass ground='auto'",

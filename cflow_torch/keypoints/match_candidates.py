@@ -16,7 +16,7 @@ from torch import Tensor
 from cflow_torch.config import KeypointsConfig
 from cflow_torch.keypoints.descriptors import KeyPoints
 from cflow_torch.ops.indices import gather
-from cflow_torch.ops.spans import spans
+from cflow_torch.ops.spans import concat_ranges
 from cflow_torch.windows.collation import Batch
 
 # Rows and columns of a tile, rows of a band, key points in a group. Of the settings that we counted for groups of 16,
@@ -128,7 +128,7 @@ def _candidates(source: KeyPoints, member: Tensor, target: KeyPoints, reach: Ten
     start = torch.searchsorted(key, _band_key(window, band, (left - half_width).clamp(min=0)))
     end = torch.searchsorted(key, _band_key(window, band, right + half_width + 1))
     length = (end - start).mul_(square >= 0)
-    candidate = order.index_select(0, spans(start.flatten(), length.flatten()))
+    candidate = order.index_select(0, concat_ranges(start.flatten(), length.flatten()))
     limit = (reach * reach).floor().clamp(max=torch.iinfo(torch.int32).max - 1).int()
     return candidate, length.sum(1), limit[:, 0]
 

@@ -140,7 +140,7 @@ def occupied(image: Tensor) -> Tensor:
     return index.index_select(0, flat_nonzero(image.index_select(0, index).bool()))
 
 
-def divide(index: Tensor, divisor: int) -> Tensor:
+def floor_divide(index: Tensor, divisor: int) -> Tensor:
     """Floor division of indices by a positive number: `index // divisor`.
 
     Args:
@@ -167,5 +167,5 @@ def split_index(index: Tensor, width: int) -> tuple[Tensor, Tensor]:
     Returns:
         row, col: (...) int64.
     """
-    row = divide(index, width)
+    row = floor_divide(index, width)
     return row, torch.sub(index, row, alpha=width)

@@ -21,7 +21,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from cflow_torch.ops.indices import divide, flat_nonzero, split_index
+from cflow_torch.ops.indices import flat_nonzero, floor_divide, split_index
 from cflow_torch.ops.segments import first_of_segment
 
 # Half of the eight neighbours of a block; the other half is the same links seen from the other side.
@@ -57,7 +57,7 @@ class Blocks:
     def of_pixel(self, row: Tensor, col: Tensor) -> Tensor:
         """(P,) int64, component of pixels at (row, col) of the padded images, rows counted through all of them."""
         if self.side == 3:
-            row, col = divide(row, 3), divide(col, 3)
+            row, col = floor_divide(row, 3), floor_divide(col, 3)
         else:
             row, col = row >> self.side // 2, col >> self.side // 2  # 1, 2, 4 -> 0, 1, 2
         return self.component.index_select(0, torch.add(col, row, alpha=self.cols))
@@ -186,7 +186,7 @@ def connected_components(occupancy: Tensor, pixels: Tensor, connectivity: int = 
     blocks = label_blocks(pad([occupancy]), connectivity, reach)
     row, col = split_index(pixels, occupancy.shape[2])
     height = occupancy.shape[1]
-    row = torch.add(row, divide(row, height), alpha=padded_size(height) - height)
+    row = torch.add(row, floor_divide(row, height), alpha=padded_size(height) - height)
     component = blocks.of_pixel(row, col)
     return first_of_segment(component, blocks.num_components)
 

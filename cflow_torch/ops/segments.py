@@ -24,7 +24,7 @@ def segment_amin(values: Tensor, index: Tensor, num_segments: int, empty: float)
     return values.new_full((num_segments,), empty).scatter_reduce_(0, index, values, "amin")
 
 
-def segment_ends(values: Tensor, index: Tensor, num_segments: int) -> tuple[Tensor, Tensor]:
+def segment_minmax(values: Tensor, index: Tensor, num_segments: int) -> tuple[Tensor, Tensor]:
     """Smallest and largest value of each segment.
 
     Args:
@@ -65,8 +65,8 @@ def bounding_boxes(rows: Tensor, cols: Tensor, index: Tensor, num_segments: int)
         size: (S, 2) int64, height and width; negative for a segment without pixels.
     """
     # One value at a time: reducing rows of several values takes longer than that.
-    top, bottom = segment_ends(rows, index, num_segments)
-    left, right = segment_ends(cols, index, num_segments)
+    top, bottom = segment_minmax(rows, index, num_segments)
+    left, right = segment_minmax(cols, index, num_segments)
     return torch.stack((top, left), 1), torch.stack((bottom - top, right - left), 1).add_(1)
 
 

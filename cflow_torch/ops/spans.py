@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 
-def spans(start: Tensor, count: Tensor, total: int | None = None) -> Tensor:
+def concat_ranges(start: Tensor, count: Tensor, total: int | None = None) -> Tensor:
     """start[0], start[0] + 1, ... (count[0] of them), start[1], start[1] + 1, ...
 
     Args:

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from cflow_torch.ops.indices import take_columns
-from cflow_torch.ops.spans import spans
+from cflow_torch.ops.spans import concat_ranges
 
 
 class WindowCounts:
@@ -57,7 +57,7 @@ class WindowCounts:
         height, width, _, _, start, stride = take_columns(self._numbers, image)
         (top, left), (down, right) = shift.clamp(min=0), shift.abs()
         num_rows = height - down
-        row = spans(top, num_rows)
+        row = concat_ranges(top, num_rows)
         window = torch.repeat_interleave(num_rows, output_size=row.numel())
         start, stride, width = take_columns(torch.stack((start + left, stride, width - right)), window)
         start += row.mul_(stride)

@@ -17,7 +17,7 @@ import math
 import torch
 from torch import Tensor
 
-from cflow_torch.ops.indices import divide, flat_nonzero, gather, renumber, scatter_count, split_index
+from cflow_torch.ops.indices import flat_nonzero, floor_divide, gather, renumber, scatter_count, split_index
 from cflow_torch.ops.segments import segment_amin
 from cflow_torch.verified.height_slices import HeightSlicedSweeps, Pixels, count_slices
 
@@ -119,8 +119,8 @@ def _is_covered(sweeps: HeightSlicedSweeps, members: Pixels, owner: Tensor, coun
     height, width = -(-grid.height // side) + 2, -(-grid.width // side) + 2
 
     def cell(of: Pixels, step: Tensor) -> Tensor:
-        place = torch.add(divide(of.row, side), torch.add(step, of.window, alpha=num_steps), alpha=height)
-        return torch.add(divide(of.col, side), place, alpha=width).add_(width + 1)
+        place = torch.add(floor_divide(of.row, side), torch.add(step, of.window, alpha=num_steps), alpha=height)
+        return torch.add(floor_divide(of.col, side), place, alpha=width).add_(width + 1)
 
     size = sweeps.batch.num_windows * num_steps * height * width
     is_occupied = torch.zeros(size, dtype=torch.bool, device=owner.device)

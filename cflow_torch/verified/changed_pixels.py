@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.ops.chunks import chunks
-from cflow_torch.ops.indices import divide, flat_nonzero, gather, split_index
+from cflow_torch.ops.indices import flat_nonzero, floor_divide, gather, split_index
 from cflow_torch.verified.height_slices import NUM_SLICES, SLICE_HEIGHT, HeightSlicedSweeps, slice_bits
 
 # Range images: bins of about half a degree around, and of one degree up and down, half of them below level.
@@ -101,7 +101,7 @@ class RangeImages:
         farthest = torch.full((size,), -math.inf, dtype=torch.float32, device=device)
         for points in chunks(0, batch.image.numel(), device):
             direction, distance = self._direction(batch.image[points].long(), *batch.positions[:, points].unbind(0))
-            distance.masked_fill_(~batch.takes_part[points], -math.inf)
+            distance.masked_fill_(~batch.is_active[points], -math.inf)
             farthest.scatter_reduce_(0, direction, distance, "amax")
         self._farthest = farthest
 
@@ -133,13 +133,13 @@ class RangeImages:
         batch = sweeps.batch
         window, step = split_index(batch.image.long(), batch.num_steps)
         x, y, z = batch.positions.unbind(0)
-        near = flat_nonzero((step == 0) & (x * x + y * y <= _NEAR**2) & batch.takes_part)
+        near = flat_nonzero((step == 0) & (x * x + y * y <= _NEAR**2) & batch.is_active)
         window = window.index_select(0, near)
         height, by_height = z.index_select(0, near).sort()
         window, by_window = window.index_select(0, by_height).sort(stable=True)
         first = torch.searchsorted(window, torch.arange(batch.num_windows + 1, device=window.device))
         count = first[1:] - first[:-1]
         height = F.pad(height.index_select(0, by_window), (0, 1), value=-_ABOVE_LOWEST)
-        chosen = first[:-1] + divide(count, _OUTLIERS)
+        chosen = first[:-1] + floor_divide(count, _OUTLIERS)
         # Without near points it is 0.
         return height.index_select(0, torch.where(count > 0, chosen, near.numel())) + _ABOVE_LOWEST

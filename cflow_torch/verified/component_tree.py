@@ -15,7 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from cflow_torch.ops.indices import divide, flat_nonzero, gather, lazy_zeros, lookup, renumber, scatter_count
+from cflow_torch.ops.indices import flat_nonzero, floor_divide, gather, lazy_zeros, lookup, renumber, scatter_count
 from cflow_torch.ops.labeling import label_together, padded_size
 from cflow_torch.ops.segments import bounding_boxes, segment_amin
 from cflow_torch.verified.aperture import both_ends_move
@@ -135,7 +135,9 @@ def find_components(sweeps: HeightSlicedSweeps, change: ChangedPixels, blocks: S
     images, places = [], []
     for block in blocks:
         height, width = -(-grid.height // block), -(-grid.width // block)
-        row, col = (divide(pixels.row, block), divide(pixels.col, block)) if block > 1 else (pixels.row, pixels.col)
+        row, col = pixels.row, pixels.col
+        if block > 1:
+            row, col = floor_divide(row, block), floor_divide(col, block)
         places.append((torch.add(row, pixels.window, alpha=padded_size(height)), col))
         images.append((_draw(places[-1][0], places[-1][1], num_windows, height, width), 3))
     images.append((images[-1][0], 1))

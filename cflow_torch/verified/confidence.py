@@ -17,7 +17,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from cflow_torch.ops.indices import divide, flat_nonzero, gather, lookup, scatter_count
+from cflow_torch.ops.indices import flat_nonzero, floor_divide, gather, lookup, scatter_count
 from cflow_torch.verified.aperture import principal_axes
 from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import HeightSlicedSweeps, count_slices
@@ -122,7 +122,7 @@ def _neighbourhood(sweeps: HeightSlicedSweeps, motion: Tensor) -> tuple[Tensor, 
     """
     pixels, side = sweeps.pixels, max(1, round(_BLOCK / sweeps.grid.pixel_size))
     height, width = -(-sweeps.grid.height // side), -(-sweeps.grid.width // side)
-    block = (pixels.window * height + divide(pixels.row, side)) * width + divide(pixels.col, side)
+    block = (pixels.window * height + floor_divide(pixels.row, side)) * width + floor_divide(pixels.col, side)
     source = flat_nonzero(pixels.step == 1)
     of_t, block_of_t = pixels.take(source), block.index_select(0, source)
     elapsed = sweeps.elapsed[:, 1].index_select(0, of_t.window)

@@ -16,8 +16,8 @@ from torch import Tensor
 
 from cflow_torch.ops.chunks import chunks
 from cflow_torch.ops.indices import (
-    divide,
     flat_nonzero,
+    floor_divide,
     gather,
     lazy_zeros,
     lookup,
@@ -116,12 +116,12 @@ class HeightSlicedSweeps:
         ground = None if min_height is None or batch.ground is None else batch.ground.mean()
         for points in chunks(0, num_points, device):
             positions = batch.positions[:, points]
-            at = grid.pixel_of_image(positions, batch.image[points], num_images, batch.takes_part[points]).long()
+            at = grid.pixel_of_image(positions, batch.image[points], num_images, batch.is_active[points]).long()
             image.index_fill_(0, at, 1)
             place[points] = at
             part[points] = slice_of(positions[2], SLICE_HEIGHT)
             if ground is not None and batch.ground is not None and min_height is not None:
-                window = divide(batch.image[points].long(), batch.num_steps)
+                window = floor_divide(batch.image[points].long(), batch.num_steps)
                 height = batch.ground.below(positions, window, ground)
                 is_tall[points] = positions[2] * 100 >= height + round(100 * min_height)
         if ground is not None:  # after all points are drawn: a tall one makes its pixel tall whatever else lies there

@@ -86,7 +86,7 @@ class VerifiedFlow(SceneFlowModel):
             change = find_changed(sweeps)
         with stage("tree"):
             components = find_components(sweeps, change, blocks)
-            nodes = movable_nodes(sweeps, components, config.max_object)
+            nodes = movable_nodes(sweeps, components, config.max_object_length)
             sweeps, nodes = add_overhung(sweeps, components, nodes)
         with stage("propose"):
             candidates = propose(nodes, components, sweeps, config)
@@ -98,7 +98,7 @@ class VerifiedFlow(SceneFlowModel):
             if config.num_future > 0:
                 motion = best_nearby(sweeps, objects, motion, config.significance)
         with stage("refine"):
-            rigid, apparent = refine(sweeps, objects, motion, config.max_object)
+            rigid, apparent = refine(sweeps, objects, motion, config.max_object_length)
             margin = motion_margin(sweeps, objects, apparent)
         with stage("confidence"):
             confidence = confidence_of(sweeps, objects, apparent, margin.z)

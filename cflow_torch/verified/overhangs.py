@@ -15,9 +15,18 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.ops.chunks import chunks
-from cflow_torch.ops.indices import divide, flat_nonzero, gather, lazy_empty, lazy_zeros, lookup, renumber, split_index
+from cflow_torch.ops.indices import (
+    flat_nonzero,
+    floor_divide,
+    gather,
+    lazy_empty,
+    lazy_zeros,
+    lookup,
+    renumber,
+    split_index,
+)
 from cflow_torch.ops.labeling import union_find
-from cflow_torch.ops.segments import segment_amin, segment_ends
+from cflow_torch.ops.segments import segment_amin, segment_minmax
 from cflow_torch.verified.component_tree import Components, Nodes
 from cflow_torch.verified.height_slices import SLICE_HEIGHT, HeightSlicedSweeps
 
@@ -96,12 +105,12 @@ def _components_under(sweeps: HeightSlicedSweeps, rows: Tensor) -> tuple[Tensor,
     size = torch.full((), _CELL, dtype=torch.float64, device=rows.device)  # see `Grid.pixel`
     for some in chunks(0, len(rows), rows.device):
         x, y, z = batch.positions.index_select(1, rows[some]).unbind(0)
-        window = divide(batch.image.index_select(0, rows[some]).long(), batch.num_steps)
+        window = floor_divide(batch.image.index_select(0, rows[some]).long(), batch.num_steps)
         row, col = ((at - low).div_(size).long().add_(1) for at, low in ((y, grid.lower[1]), (x, grid.lower[0])))
         place[some] = torch.add(row, window, alpha=num_rows).mul_(num_cols).add_(col)
         height[some] = (z / SLICE_HEIGHT).floor_().clamp_(-(2.0**40), 2.0**40).long()
         lowest.scatter_reduce_(0, window, height[some], "amin")
-    window = divide(place, num_rows * num_cols)
+    window = floor_divide(place, num_rows * num_cols)
     height = height.sub_(lowest.index_select(0, window)).clamp_(max=_NUM_SLICES - 3).add_(1)
     place = place.mul_(_NUM_SLICES).add_(height)
 
@@ -114,7 +123,7 @@ def _components_under(sweeps: HeightSlicedSweeps, rows: Tensor) -> tuple[Tensor,
     near = cells[:, None] + _half_neighbours(num_cols, rows.device)
     links = flat_nonzero(is_occupied.index_select(0, near.view(-1)))
     targets = number.index_select(0, near.view(-1).index_select(0, links)).long()
-    component = union_find(count, divide(links, near.shape[1]), targets)
+    component = union_find(count, floor_divide(links, near.shape[1]), targets)
 
     column, height = split_index(cells, _NUM_SLICES)
     is_above = (height[1:] - height[:-1] >= _GAP) & (component[1:] != component[:-1]) & (column[1:] == column[:-1])
@@ -123,7 +132,7 @@ def _components_under(sweeps: HeightSlicedSweeps, rows: Tensor) -> tuple[Tensor,
         torch.zeros(count, dtype=torch.bool, device=rows.device).index_fill_(0, component.index_select(0, at), True)
         for at in (pair, pair + 1)
     )
-    foot, top = segment_ends(height, component, count)
+    foot, top = segment_minmax(height, component, count)
     rise = segment_amin(height - _ground(column, height, batch.num_windows, num_rows, num_cols), component, count, 64)
     is_object = (rise <= _HIGHEST_FOOT) & (top - foot >= _SMALLEST) & (top - foot <= _LARGEST)
     wanted = (is_under & ~is_over & is_object).index_select(0, component)
@@ -147,7 +156,7 @@ def _ground(column: Tensor, height: Tensor, num_windows: int, num_rows: int, num
     line, col = split_index(column, num_cols)
     window, row = split_index(line, num_rows)
     rows, cols = num_rows // side + 1, num_cols // side + 1
-    square = (window * rows + divide(row, side)) * cols + divide(col, side)
+    square = (window * rows + floor_divide(row, side)) * cols + floor_divide(col, side)
     lowest = segment_amin(height, square, num_windows * rows * cols, _NUM_SLICES).view(-1, 1, rows, cols)
     around = -F.max_pool2d(-F.pad(lowest, (1, 1, 1, 1), value=_NUM_SLICES).float(), 3, 1)
     return around.view(-1).long().index_select(0, square)

@@ -90,7 +90,7 @@ class Grid:
         return col.add_(row, alpha=self.width)
 
     def pixel_of_image(
-        self, positions: Tensor, image: Tensor, num_images: int, takes_part: Tensor | None = None
+        self, positions: Tensor, image: Tensor, num_images: int, is_active: Tensor | None = None
     ) -> Tensor:
         """The pixel of every point in a stack of images.
 
@@ -98,7 +98,7 @@ class Grid:
             positions: (2, N) or (3, N) float64, metres, frame of t+1.
             image: (N,) int32 or int64, image of each point.
             num_images: B.
-            takes_part: (N,) bool, False = the point is left out; it must be False outside the region. None = all points
+            is_active: (N,) bool, False = the point is left out; it must be False outside the region. None = all points
                 are inside and take part.
 
         Returns:
@@ -110,8 +110,8 @@ class Grid:
         if num_pixels > torch.iinfo(torch.int32).max:
             pixel = pixel.long()
         pixel.add_(image, alpha=self.height * self.width)
-        if takes_part is not None:  # a product: masked_fill_ would take four times as long
-            pixel.sub_(num_pixels).mul_(takes_part.to(pixel.dtype)).add_(num_pixels)
+        if is_active is not None:  # a product: masked_fill_ would take four times as long
+            pixel.sub_(num_pixels).mul_(is_active.to(pixel.dtype)).add_(num_pixels)
         return pixel
 
     def draw(self, pixel: Tensor, num_images: int) -> Tensor:

@@ -30,7 +30,7 @@ class Batch:
     Args:
         positions: (A, P) float64, metres, frame of t+1 of the point's window; A = 2, x and y, where nothing asks for z,
             else 3.
-        takes_part: (P,) bool, False = a row of pc0 that does not take part; its position means nothing.
+        is_active: (P,) bool, False = a row of pc0 that does not take part; its position means nothing.
         has_result: (P,) bool, False = a row of pc0 that does not take part, or lies outside the region.
         image: (P,) int32, window * num_steps + step of each point; step 0 = sweep t+1, 1 = t, 2 = t-1, ...,
             steps of sweeps after t+1 stand behind those of the longest history.
@@ -49,7 +49,7 @@ class Batch:
     """
 
     positions: Tensor
-    takes_part: Tensor
+    is_active: Tensor
     has_result: Tensor
     image: Tensor
     num_newest: int
@@ -99,7 +99,7 @@ class Batch:
         batch = replace(
             self,
             positions=torch.cat((self.positions, self.positions.index_select(1, copied)), 1),
-            takes_part=more(self.takes_part),
+            is_active=more(self.is_active),
             has_result=more(self.has_result),
             image=torch.cat((image, copies)).int(),
             num_windows=2 * self.num_windows,
@@ -148,9 +148,9 @@ def make_batch(
     ground = GroundHeights(len(windows), grid, device) if needs_ground else None
     most, num_steps = sum(entry.sweep.points.shape[0] for entry in timeline.entries), timeline.table.shape[2]
     positions = torch.empty((num_axes, most), dtype=torch.float64, device=device)
-    takes_part = torch.ones(most, dtype=torch.bool, device=device)
+    is_active = torch.ones(most, dtype=torch.bool, device=device)
     region = Grid(grid.pixel_size, config.point_cloud_range[:3], config.point_cloud_range[3:])
-    has_result = takes_part if region == grid else torch.ones_like(takes_part)
+    has_result = is_active if region == grid else torch.ones_like(is_active)
     image = torch.empty(most, dtype=torch.int32, device=device)
     has_times = any(entry.interval is not None for entry in timeline.entries)
     point_times = torch.zeros(most, dtype=torch.float32, device=device) if has_times else None
@@ -165,14 +165,14 @@ def make_batch(
                 found = flat_nonzero(piece.is_ground)
                 ground.add(_take(piece.window, found), piece.moved.index_select(1, found))
             if first_step == 1:  # all rows
-                points = slice(stop, stop + piece.takes_part.numel())
+                points = slice(stop, stop + piece.is_active.numel())
                 positions[:, points] = piece.moved[:num_axes]
-                takes_part[points] = piece.takes_part
-                if has_result is not takes_part:
-                    torch.logical_and(piece.takes_part, region.contains(piece.moved), out=has_result[points])
+                is_active[points] = piece.is_active
+                if has_result is not is_active:
+                    torch.logical_and(piece.is_active, region.contains(piece.moved), out=has_result[points])
                 row = None
             else:
-                row = flat_nonzero(piece.takes_part)
+                row = flat_nonzero(piece.is_active)
                 points = slice(stop, stop + row.numel())
                 for values, of_axis in zip(positions[:, points].unbind(0), piece.moved.unbind(0)):
                     torch.index_select(of_axis, 0, row, out=values)
@@ -187,7 +187,7 @@ def make_batch(
     starts = [num_newest, *(num_newest + last for last in accumulate(num_rows))]
     return Batch(
         positions=positions[:, :stop],
-        takes_part=takes_part[:stop],
+        is_active=is_active[:stop],
         has_result=has_result[:stop],
         image=image[:stop],
         num_newest=num_newest,

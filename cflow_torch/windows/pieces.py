@@ -28,7 +28,7 @@ class Piece:
         window, step: of each point, (N,) int64, or one number for all.
         raw: (3, N) float64, metres, as given.
         moved: (A or 3, N) float64, metres, frame of t+1; `raw` itself where no sweep has a transform.
-        takes_part: (N,) bool.
+        is_active: (N,) bool.
         is_ground: (N,) bool, ground inside the images; None = not known.
         times: (N,) float64, sweep intervals; None = they do not count.
     """
@@ -37,7 +37,7 @@ class Piece:
     step: int | Tensor
     raw: Tensor
     moved: Tensor
-    takes_part: Tensor
+    is_active: Tensor
     is_ground: Tensor | None
     times: Tensor | None
 
@@ -82,14 +82,14 @@ def read_pieces(
         sweeps = [entry.sweep for entry in group]
         raw = read_positions(sweeps[0], device, rows) if len(sweeps) == 1 else join_positions(sweeps, device)
         moved = raw if matrix is None else compensate(raw, matrix, max(num_axes, checked_axes))
-        takes_part, is_ground = grid.contains(moved[:checked_axes]), None
+        is_active, is_ground = grid.contains(moved[:checked_axes]), None
         if ground is not None:
-            is_ground = takes_part & ground[rows]
-            takes_part &= ~ground[rows]
+            is_ground = is_active & ground[rows]
+            is_active &= ~ground[rows]
         if config.ego_box is not None:
             x0, y0, x1, y1 = config.ego_box
-            takes_part &= (raw[0] < x0) | (raw[0] > x1) | (raw[1] < y0) | (raw[1] > y1)
-        yield Piece(window, step, raw, moved, takes_part, is_ground, None if times is None else times[rows])
+            is_active &= (raw[0] < x0) | (raw[0] > x1) | (raw[1] < y0) | (raw[1] > y1)
+        yield Piece(window, step, raw, moved, is_active, is_ground, None if times is None else times[rows])
 
 
 def _ground(group: Sequence[Entry], sizes: Sequence[int], device: torch.device) -> Tensor | None:

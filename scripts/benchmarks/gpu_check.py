@@ -28,7 +28,7 @@ from torch.profiler import ProfilerActivity, profile
 from cflow_torch import Config, FlowResult, Sweep, Window, make_config, make_model
 from cflow_torch.data.log import window
 from cflow_torch.simulator import make_drive
-from cflow_torch.stages import StopWatch, stage_seconds
+from cflow_torch.stages import TimedModel, stage_seconds
 
 ROOT = Path(__file__).resolve().parents[2]
 TEST_SECONDS = 150.0
@@ -123,7 +123,7 @@ def measure_speed(device: str) -> Rows:
         for size in (1, 8, 32) if device == "cuda" else (1, 2):
             host = windows_for(config, size)
             for kind, windows in (("arrays", host), (device, [on_device(each, device) for each in host])):
-                watch, end = StopWatch(make_model(config, device)), time.monotonic() + 2
+                watch, end = TimedModel(make_model(config, device)), time.monotonic() + 2
                 for run in range(30):
                     if run < 3 or time.monotonic() < end:
                         watch(windows)

@@ -298,10 +298,10 @@ def _cloud(sweep: Sweep, moved: np.ndarray, steps: float, config: Config) -> Clo
     """The points of a sweep that are finite, not ground and inside the region; `moved` (3, N) in the frame of t+1."""
     x0, y0, z0, x1, y1, z1 = config.point_cloud_range
     x, y, z = moved
-    takes_part = (x >= x0) & (x <= x1) & (y >= y0) & (y <= y1) & (z >= z0) & (z <= z1) & np.isfinite(z)
+    is_active = (x >= x0) & (x <= x1) & (y >= y0) & (y <= y1) & (z >= z0) & (z <= z1) & np.isfinite(z)
     if sweep.is_ground is not None:
-        takes_part &= ~_numpy(sweep.is_ground)
-    rows = np.flatnonzero(takes_part)
+        is_active &= ~_numpy(sweep.is_ground)
+    rows = np.flatnonzero(is_active)
     return Cloud(moved[:2].take(rows, 1), steps, rows)
 
 

@@ -82,7 +82,7 @@ def score(log: SimulatedLog, pairs: Iterator[tuple[int, Window, FlowResult]]) ->
     last: dict[int, int] = {}
     for index, flow, given, track_id in sweeps:
         body, velocity = log.truth(index)
-        takes_part, ground = flow["is_valid"], len(velocity) - 1
+        is_active, ground = flow["is_valid"], len(velocity) - 1
         seconds = (log.timestamps[index + 1] - log.timestamps[index]) * 1e-9
         moves = (np.linalg.norm(flow["residual_flow"], axis=1) >= MOVING) & (flow["cluster_id"] >= 0)
         rotation = np.asarray(given.pc1.pose)[:3, :3]
@@ -96,7 +96,7 @@ def score(log: SimulatedLog, pairs: Iterator[tuple[int, Window, FlowResult]]) ->
             has_moved = is_mover[owner] or (owner < ground and not log.drive.scene.bodies[owner].is_static)
             counts["false_rows"] += not has_moved
         for mover in np.flatnonzero(is_mover):
-            on = takes_part & (body == mover)
+            on = is_active & (body == mover)
             if on.sum() < POINTS:
                 continue
             counts["objects"] += 1

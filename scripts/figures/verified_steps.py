@@ -59,7 +59,7 @@ def take_steps(drive: Any) -> tuple[Any, ...]:
     sweeps = HeightSlicedSweeps.of(batch, grid, config.min_height)
     change = find_changed(sweeps)
     components = find_components(sweeps, change, [round(size / config.pixel_sizes[-1]) for size in config.pixel_sizes])
-    sweeps, nodes = add_overhung(sweeps, components, movable_nodes(sweeps, components, config.max_object))
+    sweeps, nodes = add_overhung(sweeps, components, movable_nodes(sweeps, components, config.max_object_length))
     candidates = propose(nodes, components, sweeps, config)
     motion, evidence = verify(sweeps, nodes, candidates.motion, components.num_levels, config.significance)
     objects, node = select_objects(nodes, components, evidence, sweeps.num_pixels)

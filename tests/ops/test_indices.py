@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from cflow_torch.ops.indices import (
-    divide,
+    floor_divide,
     gather,
     lazy_empty,
     lazy_zeros,
@@ -26,7 +26,7 @@ def test_division_of_indices():
     for width in (1, 2, 7, 701, 2**31 + 1):
         row, col = split_index(index, width)
         assert [tuple(pair) for pair in zip(row.tolist(), col.tolist())] == [divmod(i, width) for i in index.tolist()]
-    assert divide(torch.tensor(7), 2) == 3 and divide(torch.tensor(7), 2).shape == ()
+    assert floor_divide(torch.tensor(7), 2) == 3 and floor_divide(torch.tensor(7), 2).shape == ()
 
 
 def test_gather_takes_the_same_elements_of_several_tensors():

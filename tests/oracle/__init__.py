@@ -50,7 +50,7 @@ def reference_flow(window: Window, config: Config) -> FlowResult:
         found = verified_flow(clouds, cloud1, ground, config)  # type: ignore[arg-type]
     else:
         found = coarse_to_fine(clouds, cloud1, config)
-    is_valid = clouds[0].takes_part & in_range(clouds[0].points, config)
+    is_valid = clouds[0].is_active & in_range(clouds[0].points, config)
     # Points that are not finite are NaN in p' and get 0, as do those that float32 does not hold.
     with np.errstate(over="ignore"):
         pose_flow = (clouds[0].points - xyz(window.pc0)).astype(np.float32)

@@ -88,7 +88,7 @@ def grow(sweeps: SlicedSweeps, change: Change, config: VerifiedConfig) -> Tree:
     Convention: in windows with history more than 5 % of the pixels of what may move are missing. A plain component that
         equals the dilated one around it is not in the list a second time. Lengths are those at t+1.
     """
-    pixels, longest = sweeps.pixels(), config.max_object
+    pixels, longest = sweeps.pixels(), config.max_object_length
     scales = [(round(size / sweeps.size), 3) for size in config.pixel_sizes]
     levels = [components(pixels, block, reach) for block, reach in [*scales, (1, 1)]]
     tree, node_of = Tree(levels, [], set()), {}  # type: ignore[var-annotated]

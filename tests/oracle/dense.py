@@ -31,7 +31,7 @@ def general_correlation_flow(
     # Partition the aggregation of all sweeps into clusters.
     sweeps = [cloud1, *clouds]
     height, width = bev_dims(config, pixel_size)
-    inside = [cloud.takes_part & in_range(cloud.points, config) for cloud in sweeps]
+    inside = [cloud.is_active & in_range(cloud.points, config) for cloud in sweeps]
     pixels = [project_bev(cloud.points[keep], config, pixel_size) for cloud, keep in zip(sweeps, inside)]
     if config.clustering == "hdbscan":
         members = cluster_hdbscan([cloud.points[keep] for cloud, keep in zip(sweeps, inside)], pixels, config)

@@ -43,7 +43,7 @@ def correlation_flow_keypoints(
     """
     (cloud,) = clouds
     height, width = bev_dims(config, pixel_size)
-    inside, inside1 = (c.takes_part & in_range(c.points, config) for c in (cloud, cloud1))
+    inside, inside1 = (c.is_active & in_range(c.points, config) for c in (cloud, cloud1))
     pixels = project_bev(cloud.points[inside], config, pixel_size)
     pixels1 = project_bev(cloud1.points[inside1], config, pixel_size)
     image, image1 = (occupancy(p, (0, 0, height, width)) for p in (pixels, pixels1))

@@ -15,7 +15,7 @@ class Cloud(NamedTuple):
 
     Attributes:
         points: (N, 3) float64, metres, frame of t+1; NaN for a point that was not finite.
-        takes_part: (N,) bool, finite, neither ground nor of the vehicle itself.
+        is_active: (N,) bool, finite, neither ground nor of the vehicle itself.
         intervals: k, sweep intervals to t+1: 1 for t, 2 for t-1, -1 for t+2 ..., or by time stamps; 0 for t+1 itself.
         seconds: the same in seconds.
         times: (N,) float64, sweep intervals from the instant of the sweep to each point, whole 2^-20; None = a sweep of
@@ -24,7 +24,7 @@ class Cloud(NamedTuple):
     """
 
     points: np.ndarray
-    takes_part: np.ndarray
+    is_active: np.ndarray
     intervals: float
     seconds: float
     times: np.ndarray | None = None
@@ -80,10 +80,10 @@ def compensate(window: Window, config: Config) -> tuple[list[Cloud], Cloud]:
             gap, first_gap = stamps[0] - stamps[m + 1], stamps[0] - stamps[1]  # type: ignore[operator]
             intervals, seconds = gap / first_gap, gap / 1e9
         times = _point_times(sweep, interval) if has_times else None
-        moved, keeps = _in_frame_of(window.pc1, sweep), _takes_part(sweep, config)
+        moved, keeps = _in_frame_of(window.pc1, sweep), _is_active(sweep, config)
         clouds.append(Cloud(moved, keeps, intervals, seconds, times, _origin(window.pc1, sweep)))
     times = _point_times(window.pc1, interval) if has_times else None
-    return clouds, Cloud(xyz(window.pc1), _takes_part(window.pc1, config), 0.0, 0.0, times)
+    return clouds, Cloud(xyz(window.pc1), _is_active(window.pc1, config), 0.0, 0.0, times)
 
 
 def _point_times(sweep: Sweep, interval: float) -> np.ndarray:
@@ -130,7 +130,7 @@ def _is_repeat(sweep: Sweep, newer: Sweep) -> bool:
     return same_pose and np.array_equal(as_numpy(sweep.points), as_numpy(newer.points), equal_nan=True)
 
 
-def _takes_part(sweep: Sweep, config: Config) -> np.ndarray:
+def _is_active(sweep: Sweep, config: Config) -> np.ndarray:
     points = xyz(sweep)
     keeps = np.isfinite(points).all(axis=1)
     if config.ego_box is not None:

@@ -125,7 +125,7 @@ def number_shown(found: Found) -> list[int]:
 
 def estimate(every: Sequence[Cloud], ground: Sequence[np.ndarray], config: VerifiedConfig) -> Found:
     """What is found by some sweeps, t+1 and t first."""
-    in_sight = [cloud.takes_part & in_range(cloud.points, config) for cloud in every]
+    in_sight = [cloud.is_active & in_range(cloud.points, config) for cloud in every]
     drawn = [keep.copy() for keep in in_sight]
     if config.min_height is not None:
         means = ground_heights(ground, config)
@@ -208,7 +208,7 @@ def settle(
         has_times: whether points have times.
         config: settings.
     """
-    size, longest = sweeps.size, config.max_object
+    size, longest = sweeps.size, config.max_object_length
     members: list[list[Pixel]] = [[] for _ in motions]
     for pixel, owner in object_of.items():
         members[owner].append(pixel)

@@ -45,7 +45,7 @@ def test_candidates_and_scores_equal_the_oracle_in_a_batch(largest, monkeypatch)
     for window in range(4):
         drawn = for_oracle(sweeps, window)
         changed = {p for p in drawn.pixels() if p[2] % 3 > 0 and len(drawn.images) > 2}
-        tree = grow(drawn, Change(set(drawn.pixels()), changed), settings.replace(max_object=None))
+        tree = grow(drawn, Change(set(drawn.pixels()), changed), settings.replace(max_object_length=None))
         motions, scores = oracle.propose(tree.nodes, settings)
         for node, of_node, score in zip(tree.nodes, motions, scores):
             number = numbers[(window, node.level, *node.members[0])]

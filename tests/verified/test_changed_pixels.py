@@ -30,7 +30,7 @@ def test_pixels_equal_the_oracle_in_a_batch():
         found, batch = find_changed(sweeps), sweeps.batch
         for window in range(len(windows)):
             steps = [step for step, k in enumerate(batch.elapsed[window].tolist()) if step == 0 or k != 0]
-            rows = [(batch.image == window * batch.num_steps + step) & batch.takes_part for step in steps]
+            rows = [(batch.image == window * batch.num_steps + step) & batch.is_active for step in steps]
             clouds = [batch.positions[:, row].T.numpy() for row in rows]
             drawn, origins = for_oracle(sweeps, window), batch.origin[window, steps].tolist()
             expected, mine = oracle.find_changed(drawn, clouds, origins), sweeps.pixels.window == window

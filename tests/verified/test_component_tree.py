@@ -57,7 +57,7 @@ def grown(seed: int, longest: float | None = 3.0, blocks=(4, 2, 1), shape=(3, 3,
     odds = np.choose(sweeps.pixels.col.numpy() // 6 % 4, (0.0, 0.15, 0.1, 0.95))
     is_missing = torch.from_numpy(rng.random(sweeps.num_pixels) < odds) & sweeps.has_history[sweeps.pixels.window]
     change = ChangedPixels(is_missing, is_missing & torch.from_numpy(rng.random(sweeps.num_pixels) < 0.8))
-    config = VerifiedConfig(pixel_sizes=tuple(SIZE * block for block in blocks), max_object=longest)
+    config = VerifiedConfig(pixel_sizes=tuple(SIZE * block for block in blocks), max_object_length=longest)
     windows, trees = [for_oracle(sweeps, window) for window in range(shape[0])], []
     for window, drawn in enumerate(windows):
         mine = (sweeps.pixels.window == window).nonzero()[:, 0]

@@ -41,7 +41,7 @@ def test_every_bin_equals_the_oracle(numbered):
     seen = set()
     for seed in range(16):
         settings = config("verified", num_history=seed % 3, min_height=0.3, pixel_size=0.2)
-        settings = settings.replace(max_object=4.0)
+        settings = settings.replace(max_object_length=4.0)
         window = scene(500 + seed, num_history=seed % 3, poses=seed % 5 > 0, stamps=seed % 2 > 0)
         result = flow_as_oracle(window, settings)
         seen |= {round(64 * value) for value in result.confidence[result.is_valid].tolist()}

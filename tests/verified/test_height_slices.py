@@ -30,7 +30,7 @@ def test_pixels_equal_the_oracle_in_a_batch():
         drawn, (clouds, cloud1) = for_oracle(sweeps, window), compensate(given, PLAIN)
         assert len(drawn.images) == len(clouds) + 1
         for image, cloud in zip(drawn.images, (cloud1, *clouds)):
-            inside = cloud.takes_part & ((cloud.points >= LOW) & (cloud.points <= HIGH)).all(1)
+            inside = cloud.is_active & ((cloud.points >= LOW) & (cloud.points <= HIGH)).all(1)
             points = [(*row, 0.0) for row in cloud.points[inside].tolist()]
             assert image == empty_sweeps([], [], PLAIN).drawn([points]).images[0]
             found |= set(image.values())
@@ -106,9 +106,9 @@ def test_ground_residue_equals_the_oracle_in_a_batch(seed):
         clouds, cloud1 = compensate(window, SETTINGS)
         means = ground_heights([ground_points(window.pc0, clouds[0]), ground_points(window.pc1, cloud1)], SETTINGS)
         for step, cloud in enumerate((cloud1, *clouds)):
-            inside = cloud.takes_part & ((cloud.points >= LOW) & (cloud.points <= HIGH)).all(1)
+            inside = cloud.is_active & ((cloud.points >= LOW) & (cloud.points <= HIGH)).all(1)
             expected = ~is_residue(cloud.points[inside], means, SETTINGS)
-            rows = (batch.image == number * batch.num_steps + step) & batch.takes_part
+            rows = (batch.image == number * batch.num_steps + step) & batch.is_active
             assert is_drawn[rows].tolist() == expected.tolist()
             dropped += int((~expected).sum())
     assert dropped > 20

@@ -66,7 +66,7 @@ def test_equals_the_oracle_on_random_scenes(seed):
         num_future=future,
         pixel_sizes=((0.25,), (0.5, 0.25))[seed % 2],
         max_speed=(None, 6.0)[seed % 3 == 0],
-        max_object=(None, 4.0)[seed % 3 > 0],
+        max_object_length=(None, 4.0)[seed % 3 > 0],
         min_height=(None, 0.3)[seed % 5 > 0],
     )
     window = scene(700 + seed, num_history=past, num_future=future, poses=seed % 5 > 0, stamps=seed % 2 > 0)

@@ -57,7 +57,9 @@ def overhung(windows: Sequence[Window]) -> list[Found]:
     result = []
     for window in range(len(windows)):
         alone = for_oracle(sweeps, window)
-        tree = grow(alone, Change({p for p in alone.pixels() if p[2] > 12}, set()), SETTINGS.replace(max_object=3.0))
+        tree = grow(
+            alone, Change({p for p in alone.pixels() if p[2] > 12}, set()), SETTINGS.replace(max_object_length=3.0)
+        )
         copies, expected = oracle.find_overhung(alone, tree.may_move, len(tree.levels) + 1)
         found: Found = set()
         for node in range(tree_nodes.count, nodes.count):

@@ -32,7 +32,7 @@ def test_equals_the_oracle_on_random_scenes(seed):
         pixel_sizes=((0.25,), (0.5, 0.25), (0.45, 0.15))[seed % 3],
         max_speed=(None, 6.0)[seed % 5 == 0],
         significance=(0.0, 1.0, 2.0)[seed % 3],
-        max_object=(None, 4.0)[seed % 3 > 0],
+        max_object_length=(None, 4.0)[seed % 3 > 0],
         min_height=(None, 0.3)[seed % 7 > 0],
     )
     flow_as_oracle(scene(300 + seed, num_history=seed % 4, poses=seed % 5 > 0, stamps=seed % 2 > 0), settings)
@@ -46,7 +46,7 @@ def test_presets_equal_the_oracle(preset):
 
 @pytest.mark.parametrize("preset", ["default", "fast"])
 def test_a_part_of_the_real_pair_equals_the_oracle(av2_folder, preset):
-    settings = make_config(preset, point_cloud_range=NEAR, max_object=6.0)
+    settings = make_config(preset, point_cloud_range=NEAR, max_object_length=6.0)
     result = flow_as_oracle(window_of(AV2Log(av2_folder), 0), settings)
     assert (result.residual_flow.norm(dim=1) >= 0.05).sum() > 500  # there is something to find
 
@@ -101,9 +101,9 @@ def test_what_is_longer_than_the_limit_does_not_move():
     long_side = np.stack((np.full(900, 0.05), rng.uniform(0.0, 5.999, 900), rng.uniform(-1, 1, 900)), 1)
     ell = np.concatenate((long_side, long_side[:, [1, 0, 2]] * (5 / 6, 1, 1)))
     window = Window(Sweep(ell - (0.5, 0.25, 0.0)), Sweep(ell))
-    settings = MODEL.replace(pixel_sizes=(0.25,), max_object=6.0)
+    settings = MODEL.replace(pixel_sizes=(0.25,), max_object_length=6.0)
     assert (flow_as_oracle(window, settings).residual_flow - torch.tensor([0.5, 0.25, 0])).norm(dim=1).max() < 0.05
-    assert not flow_as_oracle(window, settings.replace(max_object=5.9)).residual_flow.any()
+    assert not flow_as_oracle(window, settings.replace(max_object_length=5.9)).residual_flow.any()
 
 
 def test_speed_is_bounded_at_every_pixel_size():

@@ -8,7 +8,7 @@ from cflow_torch import Sweep, Window
 from cflow_torch.config import VerifiedConfig
 
 REGION = (-8.0, -8.0, -3.0, 8.0, 8.0, 5.0)
-MODEL = VerifiedConfig(pixel_sizes=(0.4, 0.2, 0.1), point_cloud_range=REGION, max_speed=40.0, max_object=10.0)
+MODEL = VerifiedConfig(pixel_sizes=(0.4, 0.2, 0.1), point_cloud_range=REGION, max_speed=40.0, max_object_length=10.0)
 
 
 def upright_box(centre, size, angle: float, rng: np.random.Generator, num_points: int = 250) -> np.ndarray:

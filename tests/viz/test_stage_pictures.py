@@ -54,7 +54,7 @@ def test_scales_are_those_of_the_run(settings: Config) -> None:
         for images, flow in ((scale.seen(), before), (scale.result(), scale.flow)):
             moved = clouds[0].points + flow
             for image, points, cloud in ((images.t, moved, clouds[0]), (images.t1, cloud1.points, cloud1)):
-                kept = points[cloud.takes_part & in_range(points, settings)]
+                kept = points[cloud.is_active & in_range(points, settings)]
                 assert (image == occupancy(project_bev(kept, settings, size), (0, 0, *image.shape))).all()
         before = scale.flow
 

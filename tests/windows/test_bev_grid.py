@@ -43,8 +43,8 @@ def test_the_region_includes_both_ends_and_no_nan():
 def test_occupancy_of_the_points_that_take_part():
     grid = Grid(1.0, (0.0, 0.0, -INF), (3.0, 2.0, INF))  # 3 rows, 4 columns
     positions = torch.tensor([[0.5, 3.0, 2.2, 0.5, np.nan], [0.5, 2.0, 1.9, 0.7, 0.0], [0.0] * 5], dtype=torch.float64)
-    takes_part = torch.tensor([True, True, False, True, False])
-    pixel = grid.pixel_of_image(positions, torch.tensor([0, 1, 1, 0, 1]), 2, takes_part).long()
+    is_active = torch.tensor([True, True, False, True, False])
+    pixel = grid.pixel_of_image(positions, torch.tensor([0, 1, 1, 0, 1]), 2, is_active).long()
     occupancy = grid.draw(pixel, 2)
     assert occupancy.shape == (2, 3, 4)
     assert occupancy.nonzero().tolist() == [[0, 0, 0], [1, 2, 3]]
