@@ -1,4 +1,4 @@
-"""Simulated drives for the demo, tests and benchmarks: scenes, ray-casting LiDARs, exact flow, and their writers."""
+"""Simulated drives for the demo, tests and benchmarks: scenes, ray-casting LiDARs, exact flow, and writers."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""The fixed synthetic benchmark: simulated drives from fixed seeds, made once and kept in each sensor's own format.
+"""The fixed simulated benchmark: drives from fixed seeds, written once in the format of each sensor's data set.
 
-Seeds 300 and above are for scores; 100 ... 103, 200 ... 209 and 400 ... 409 were used to choose settings and must not
-be scored.
+Seeds 300 and above are for scores. Seeds 100 ... 103, 200 ... 209 and 400 ... 409 were used to choose settings and must
+not be scored.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from cflow_torch.simulator.drive import Drive, make_drive
 from cflow_torch.types import CFlowError
 
 _HERE = Path(__file__).parent
-_MOST = 100_000  # sweeps of a drive (three hours), and drives: more is a slip
+_MAX_COUNT = 100_000  # of sweeps per drive (three hours), and of drives; more is a typing error
 
 
 @dataclass(frozen=True)
 class Format:
-    """How the drives of a sensor are written and read back.
+    """The writer and reader of a sensor's drives.
 
     Args:
         module, function: the writer (drive, root) -> path, in `writers`.
         data_set: the reader, a name in `catalog.DATA_SETS`.
-        settings: of the reader; the same for every drive, whatever it shows.
+        settings: of the reader, for every drive.
     """
 
     module: str
@@ -42,7 +42,7 @@ class Format:
     settings: Mapping[str, Any] = field(default_factory=dict)
 
 
-# Sets without a ground mask get one; nuScenes is read at 10 Hz, as the challenge does.
+# Sets without a ground mask get one. nuScenes is read at 10 Hz, as in the challenge.
 _NO_MASK = {"find_ground": "grid"}
 FORMATS: dict[str, Format] = {
     "av2": Format("av2", "write_av2_log", "av2"),
@@ -54,12 +54,12 @@ FORMATS: dict[str, Format] = {
 
 
 def format_of(profile: str) -> Format:
-    """Format of a simulated sensor; Argoverse 2's for those that are no data set's."""
+    """Format of a simulated sensor; that of Argoverse 2 for sensors without a data set."""
     return FORMATS.get(profile, FORMATS["av2"])
 
 
 def generator_key() -> str:
-    """Digest of the code that makes the drives. Any change of it makes cached drives unusable."""
+    """Digest of the code that makes the drives. Cached drives of other code are not used."""
     digest = hashlib.sha256()
     for file in sorted(_HERE.rglob("*.py")):
         digest.update(file.name.encode() + b"\0" + file.read_bytes() + b"\0")
@@ -69,14 +69,14 @@ def generator_key() -> str:
 def benchmark_logs(
     cache: str | Path, profile: str, seeds: Sequence[int], num_sweeps: int, scenes: Sequence[str] = ("street",)
 ) -> list[Any]:
-    """The benchmark's drives of one sensor, as sources for `catalog.open_log`; those not in the cache are made.
+    """Return the benchmark's drives of one sensor as sources for `catalog.open_log`; make drives that are not cached.
 
     Args:
         cache: folder for the drives: `cache/<generator key>-<sweeps>/<log id>`.
         profile: a sensor, a name in `profiles.PROFILES`.
         seeds: one drive each.
         num_sweeps: sweeps per drive, as they are read.
-        scenes: kinds of scene, taken in turn.
+        scenes: kinds of scene, assigned to the seeds in rotation.
 
     Returns:
         One source per drive.
@@ -84,12 +84,12 @@ def benchmark_logs(
     Convention: a drive appears in the cache whole or not at all, also when several processes make it at once.
 
     Raises:
-        CFlowError: no such profile, scene or seed, or number of sweeps out of range.
+        CFlowError: a profile, scene or seed does not exist, or there are too many drives or sweeps.
 
     Cost: about 2 s and 40 MB per drive of 20 sweeps of 100,000 points, once.
     """
-    if len(seeds) > _MOST or num_sweeps > _MOST:
-        raise CFlowError(f"{len(seeds)} drives of {num_sweeps} sweeps: give at most {_MOST} of each")
+    if len(seeds) > _MAX_COUNT or num_sweeps > _MAX_COUNT:
+        raise CFlowError(f"{len(seeds)} drives of {num_sweeps} sweeps: give at most {_MAX_COUNT} of each")
     folder = Path(cache) / f"{generator_key()}-{num_sweeps}"
     chosen = format_of(profile)
     num_simulated = num_sweeps * int(chosen.settings.get("sweep_step", 1))
@@ -98,7 +98,7 @@ def benchmark_logs(
     )
     found: list[Any] = []
     for number, seed in enumerate(tqdm(seeds, unit="drive", desc=profile, disable=None, file=sys.stderr)):
-        # Cheap: sweeps are scanned when they are written.
+        # This is cheap: sweeps are simulated when they are written.
         drive = make_drive(seed, num_simulated, profile, scenes[number % len(scenes)])
         target = folder / drive.log_id
         if not target.is_dir():
@@ -108,7 +108,7 @@ def benchmark_logs(
                 write(drive, scratch)
                 os.rename(scratch, target)
             except OSError:
-                if not target.is_dir():  # else another process was faster; its drive is the same
+                if not target.is_dir():  # else another process was faster, and made the same drive
                     raise
             finally:
                 shutil.rmtree(scratch, ignore_errors=True)

@@ -1,4 +1,4 @@
-"""A crossing without lights on: traffic from all four sides, turning, stopping and starting, people on the zebras."""
+"""A crossing without lights: traffic from all four sides that turns, stops and starts, and people on the zebras."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ STOP = HALF_WIDTH + 5.5  # of the stop lines from the middle, metres
 
 
 def build_crossing(rng: np.random.Generator) -> Scene:
-    """A scene drawn from `rng`."""
+    """Draw a scene from `rng`."""
     bend = float(rng.choice((-1, 1)) * rng.uniform(1e-4, 4e-4))
     slope = (rng.uniform(-0.02, 0.02), rng.uniform(-0.02, 0.02))
     ground = Ground(slope, bend, half_widths=(HALF_WIDTH, HALF_WIDTH), crossing_x=0.0, corner_radius=5.0)
@@ -33,7 +33,7 @@ def build_crossing(rng: np.random.Generator) -> Scene:
 
 
 def _traffic(rng: np.random.Generator) -> Iterator[Body]:
-    """What crosses has passed the ego lane at time 0, or comes late; what waits stands before its stop line."""
+    """Vehicles. Crossing ones are clear of the ego lane for the first seconds, waiting ones are at their stop line."""
     # Ahead of the ego car, behind it, and towards it.
     yield from lane(rng, -1.75, EAST, rng.uniform(9, 14), 14, 27, 45)
     yield objects.car(rng, Route(-27.0, -1.75, EAST, speed=6.0, acceleration=-1.2))
@@ -41,8 +41,7 @@ def _traffic(rng: np.random.Generator) -> Iterator[Body]:
     yield objects.car(rng, Route(34.0, 1.75, WEST, speed=12.0, acceleration=-3.5))
     yield objects.van(rng, Route(55.0, 1.75, WEST, speed=10.0, acceleration=-1.0))
     # One turns left across the oncoming lane, a truck swings out of the street to the north.
-    way = {"radius": 11.0, "angle": math.pi / 2}
-    yield objects.car(rng, Route(9.0, 5.1, WEST, rng.uniform(4, 7), rng.uniform(4, 6), **way))
+    yield objects.car(rng, Route(9.0, 5.1, WEST, rng.uniform(4, 7), rng.uniform(4, 6), 11.0, math.pi / 2))
     truck = Route(-1.75 - 12 - 3.5, HALF_WIDTH + 20.0, SOUTH, speed=0.0)
     yield from objects.articulated_truck(truck)
     # Cross street, northbound and southbound.

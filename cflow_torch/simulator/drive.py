@@ -1,48 +1,61 @@
-"""A simulated drive that speaks the `Log` protocol, with exact poses, ground mask and flow."""
+"""A simulated drive: a `Log` with exact poses, ground masks and flow."""
 
 from __future__ import annotations
 
 import uuid
 from collections import OrderedDict
+from typing import Callable, Mapping, TypeVar
 
 import numpy as np
 import torch
 
 from cflow_torch.data.log import FlowLabels, Log
+from cflow_torch.simulator.car_park import build_car_park
+from cflow_torch.simulator.crossing import build_crossing
+from cflow_torch.simulator.highway import build_highway
 from cflow_torch.simulator.lidar import Returns, scan, scan_rolling
 from cflow_torch.simulator.motion import Motion
+from cflow_torch.simulator.narrow import build_narrow
 from cflow_torch.simulator.objects import CATEGORIES, own_truck
-from cflow_torch.simulator.profiles import get_profile, in_weather
+from cflow_torch.simulator.profiles import PROFILES, WEATHER, in_weather
 from cflow_torch.simulator.recording import Boxes, GroundRaster, UnitReturns
 from cflow_torch.simulator.scene import Scene
-from cflow_torch.simulator.scenes import get_scene
 from cflow_torch.simulator.sensors import LidarProfile
+from cflow_torch.simulator.street import build_street
 from cflow_torch.types import CFlowError, Sweep
 
+SCENES: dict[str, Callable[[np.random.Generator], Scene]] = {
+    "street": build_street,
+    "highway": build_highway,
+    "crossing": build_crossing,
+    "narrow": build_narrow,
+    "car_park": build_car_park,
+}
 _FIRST_STAMP_NS = 315_970_000_000_000_000
 _CACHED_SWEEPS = 8  # a window of five and its neighbours; a sweep of 100,000 points takes 3 MB
-_BOX_SLACK = 0.1  # annotation boxes are that much larger than the body, so that range noise stays inside, metres
-_ROUNDING = 1e-4  # boxes hold their points also after those are rounded to float32, metres
+_BOX_SLACK = 0.1  # metres by which annotation boxes are larger than bodies, so that range noise stays inside
+_ROUNDING = 1e-4  # metres, so that boxes hold their points after rounding to float32
 _RASTER_STEP = 0.3  # metres per cell of the ground raster, as in Argoverse 2
+T = TypeVar("T")
 
 
 class Drive(Log):
-    """A drive through a synthetic scene. Sweeps are simulated when asked for, each from its own random stream, so they
-    do not depend on the order of the calls. It is a `recording.Recording`.
+    """A drive through a simulated scene. Writers take it as a `recording.Recording`.
 
-    In the profiles av2 and demo a sweep is instantaneous: nothing moves while the LiDAR turns. In the others every shot
-    has its own time; where the data set moves points to the time stamp by the motion of the ego car, so does the drive,
-    and what moves stays smeared. There boxes are as long as it takes to hold the smeared points.
+    Each sweep is simulated on demand from its own random stream, so sweeps do not depend on the order of the calls. In
+    the profiles av2 and demo a sweep is instantaneous. In the others every shot has its own time. Where the data set
+    compensates the ego motion within a sweep, we do so, too; moving objects stay distorted, and their boxes are
+    enlarged to hold the distorted points.
 
     Args:
-        scene: place, traffic and the way of the ego car.
+        scene: ground, bodies and the route of the recording vehicle.
         profile: the LiDARs.
         seed: of the noise.
         num_sweeps: at the rate of the profile.
         log_id: name of the log.
 
     Attributes:
-        log_id, timestamps: see `cflow_torch.data.log.Log`.
+        log_id, timestamps: name and sweep times in nanoseconds.
         poses: (num_sweeps, 4, 4) float64 `T_world_ego`.
         calibration: sensor name -> (4, 4) float64 `T_ego_sensor`.
         track_ids: one UUID per body of the scene; only bodies with a category are annotated.
@@ -69,8 +82,8 @@ class Drive(Log):
         return self._motion.ego_poses(self._seconds[index] + 1e-9 * np.asarray(offset_ns, np.float64))
 
     def sweep(self, index: int) -> Sweep:
-        """Sweep `index`: (N, 3) float32 points in its ego frame, exact ground mask, float64 pose, time; the times of
-        points where shots have their own."""
+        """Sweep `index`: (N, 3) float32 points in its ego frame, exact ground mask, float64 pose, time stamp, and point
+        times in rolling profiles."""
         returns = self.returns(index)
         return Sweep(
             points=returns.points.numpy().copy(),
@@ -81,12 +94,12 @@ class Drive(Log):
         )
 
     def labels(self, index: int) -> FlowLabels | None:
-        """Truth of the pair (index, index + 1), None for the last sweep.
+        """Ground truth of the pair (index, index + 1), None for the last sweep.
 
-        A point belongs to the body its ray hit and moves with the body's track from the time stamp of the one sweep to
-        that of the other, also if it was measured before or after it; legs do not swing in the truth. Points
-        of a body that is not annotated in both sweeps (its middle is beyond the LiDAR's range) are invalid, and of
-        category 0 if it is not annotated at `index`.
+        A point belongs to the body that its ray hit. It moves with the body's track from one time stamp to the next,
+        also if it was measured before or after the time stamp; legs do not swing in the truth. Points of a body that is
+        not annotated in both sweeps (its middle is beyond the LiDAR's range) are invalid. They have category 0 if it
+        is not annotated at `index`.
 
         Source: p' = inv(pose1) B1 inv(B0) pose0 p with the body's poses B0, B1 in the world, in float64.
         """
@@ -98,7 +111,7 @@ class Drive(Log):
         moved = world_ego @ self._body_poses[index + 1] @ np.linalg.inv(self._body_poses[index]) @ self.poses[index]
         is_background = self._category == 0
         moved[is_background] = static
-        motions = np.concatenate([moved, static[None]])  # the last row is the ground's
+        motions = np.concatenate([moved, static[None]])  # the last row is for the ground
 
         body = self._body_of(returns)
         points = returns.points.numpy().astype(np.float64)
@@ -127,12 +140,12 @@ class Drive(Log):
         )
 
     def channels(self, index: int) -> dict[str, np.ndarray]:
-        """Intensity, laser and firing time of every point of sweep `index`."""
+        """Intensity, laser number and firing time of every point of sweep `index`."""
         returns = self.returns(index)
         return {name: getattr(returns, name).numpy() for name in ("intensity", "laser_number", "offset_ns")}
 
     def units(self, index: int) -> list[UnitReturns]:
-        """What each LiDAR received in sweep `index`; together, in this order, the rows of `sweep(index)`."""
+        """Returns of each LiDAR in sweep `index`. In this order, their rows are those of `sweep(index)`."""
         returns = self.returns(index)
         velocity = self._motion.radial_velocity(self._seconds[index], returns)
         if self._profile.velocity_noise:
@@ -163,7 +176,7 @@ class Drive(Log):
         """(num_rings,) float64 radians, elevation of each ring of a unit, lowest first.
 
         Raises:
-            CFlowError: there is no such unit.
+            CFlowError: there is no unit of that name.
         """
         for candidate in self._profile.units:
             if candidate.name == unit:
@@ -171,7 +184,7 @@ class Drive(Log):
         raise CFlowError(f"log {self.log_id} has no LiDAR {unit!r}; it has {', '.join(self.calibration)}")
 
     def ground_raster(self) -> GroundRaster:
-        """Ground height of the area that the LiDAR can reach."""
+        """Ground height of the area within the LiDARs' range."""
         reach = self._profile.max_range + 1
         low = np.floor(self.poses[:, :2, 3].min(0) - reach)
         count = np.ceil((self.poses[:, :2, 3].max(0) + reach - low) / _RASTER_STEP).astype(int)
@@ -180,10 +193,10 @@ class Drive(Log):
         return GroundRaster(height, (float(low[0]), float(low[1])), _RASTER_STEP)
 
     def returns(self, index: int) -> Returns:
-        """Everything the LiDARs received in sweep `index`.
+        """Returns of all LiDARs in sweep `index`.
 
         Raises:
-            CFlowError: there is no such sweep.
+            CFlowError: there is no sweep of this index.
         """
         if not 0 <= index < len(self.timestamps):
             raise CFlowError(f"log {self.log_id} has sweeps 0 ... {len(self.timestamps) - 1}, got index {index}")
@@ -205,7 +218,7 @@ class Drive(Log):
         return scan(self._profile, solids_now, ground, pose, generator)
 
     def _extent(self, index: int, returns: Returns) -> np.ndarray:
-        """(num_bodies, 3) float64 size of the smallest upright box about a body's axis that holds its points."""
+        """(num_bodies, 3) float64 size of the smallest upright box, centred on a body's axis, that holds its points."""
         points = returns.points.numpy().astype(np.float64)
         if not self._profile.is_deskewed:
             moved = np.linalg.inv(self.poses[index]) @ self.poses_at(index, returns.offset_ns.numpy())
@@ -220,11 +233,11 @@ class Drive(Log):
         return extent + _ROUNDING
 
     def _body_of(self, returns: Returns) -> np.ndarray:
-        """(N,) int64 body of each point; number of bodies = the ground."""
+        """(N,) int64 index of each point's body; the number of bodies = the ground."""
         return np.append(self.scene.table.body, len(self.scene.bodies))[returns.solid.numpy()]
 
     def _annotated(self, scene: Scene) -> np.ndarray:
-        """(num_sweeps, num_bodies) bool: near enough for an annotator to see; background always."""
+        """(num_sweeps, num_bodies) bool: within range, so that an annotator would see it; background always."""
         offset = self._body_poses[:, :, :2, 3] - self.poses[:, None, :2, 3]
         is_background = np.array([body.category is None for body in scene.bodies])
         return is_background | (np.hypot(offset[..., 0], offset[..., 1]) < self._profile.max_range)
@@ -233,21 +246,21 @@ class Drive(Log):
 def make_drive(
     seed: int = 0, num_sweeps: int = 20, profile: str = "av2", scene: str = "street", weather: str = "clear"
 ) -> Drive:
-    """A simulated drive past houses, trees, parked and moving traffic and people.
+    """Simulate a drive past houses, trees, traffic and people.
 
     Args:
         seed: >= 0; the same seed gives the same bytes on the same machine.
-        num_sweeps: >= 1, at the rate of the profile. After the first seconds, vehicles may pass through each other.
-        profile: a name in `profiles.PROFILES`: one of the five data sets `av2`, `nuscenes`, `truckscenes`, `waymo`,
-            `aevascenes`; `demo` (28,800 rays); `av2_rolling` (av2, with a time for every shot).
-        scene: a name in `scenes.SCENES`: `street`, `highway`, `crossing`, `narrow`, `car_park`.
-        weather: a name in `profiles.WEATHER`: `clear`, `rain`, `snow`, `fog`.
+        num_sweeps: >= 1, at the rate of the profile. After the first seconds, vehicles may drive through each other.
+        profile: LiDARs of one of five data sets: `av2`, `nuscenes`, `truckscenes`, `waymo`, `aevascenes`; or `demo`
+            (28,800 rays), `av2_rolling` (av2 with a time for every shot).
+        scene: `street`, `highway`, `crossing`, `narrow`, `car_park`.
+        weather: `clear`, `rain`, `snow`, `fog`.
 
     Returns:
-        Drive, a `Log` and a `Recording`.
+        The drive, a `Log`.
 
     Raises:
-        CFlowError: an argument is out of range or there is no such profile, scene or weather.
+        CFlowError: an argument is out of range, or there is no profile, scene or weather of that name.
 
     Example:
         >>> drive = make_drive(seed=1, num_sweeps=2, profile="demo")
@@ -256,9 +269,15 @@ def make_drive(
     """
     if seed < 0 or num_sweeps < 1:
         raise CFlowError(f"seed must be >= 0 and num_sweeps >= 1, got seed {seed} and num_sweeps {num_sweeps}")
-    lidars = in_weather(get_profile(profile), weather)
-    place = get_scene(scene)(np.random.default_rng([seed, 0]))
+    lidars = in_weather(_choose("sensor profile", profile, PROFILES), *_choose("weather", weather, WEATHER))
+    world = _choose("scene", scene, SCENES)(np.random.default_rng([seed, 0]))
     if lidars.has_trailer:
-        place = place.with_own(own_truck(place.ego))
+        world = world.with_own(own_truck(world.ego))
     parts = [profile, *([scene] if scene != "street" else []), *([weather] if weather != "clear" else [])]
-    return Drive(place, lidars, seed, num_sweeps, f"synthetic-{'-'.join(parts)}-{seed:04d}")
+    return Drive(world, lidars, seed, num_sweeps, f"synthetic-{'-'.join(parts)}-{seed:04d}")
+
+
+def _choose(kind: str, name: str, options: Mapping[str, T]) -> T:
+    if name not in options:
+        raise CFlowError(f"{kind} {name!r} does not exist; choose one of {', '.join(sorted(options))}")
+    return options[name]

@@ -1,4 +1,4 @@
-"""The ground of the synthetic street: a gently curved road surface and kerbs up to raised pavements."""
+"""The ground of a simulated scene: a gently curved road surface, kerbs, and raised pavements."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-_BISECTIONS = 12  # halvings of the way between pavement level and road level: a kerb face to the millimetre
+_BISECTIONS = 12  # between pavement level and road level: they find a kerb face to the millimetre
 
 
 @dataclass(frozen=True)
 class Ground:
-    """Height field z(x, y) in the world: two streets that cross, kerbs, pavements.
+    """Height field z(x, y) in the world: two streets that cross, with kerbs and pavements.
 
-    The road is `z = slope . (x, y) + curvature / 2 * x**2`; the pavement lies `kerb` above it. One street runs along x
-    (centre y = 0), the other along y (centre x = crossing_x).
+    The road is `z = slope . (x, y) + curvature / 2 * x**2`, and the pavement is `kerb` above it. One street runs along
+    x (centre y = 0), the other along y (centre x = crossing_x).
 
     Args:
         slope: rise per metre along x and y.
@@ -39,12 +39,12 @@ class Ground:
         return self.slope[0] * x + self.slope[1] * y + 0.5 * self.curvature * x * x
 
     def height(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Height of what a wheel or a foot stands on at world (x, y), float64 metres."""
+        """Height of road or pavement at world (x, y), float64 metres."""
         on_pavement = self.is_pavement(torch.from_numpy(x), torch.from_numpy(y)).numpy()
         return self.road_height(x, y) + self.kerb * on_pavement
 
     def pavement_depth(self, x: Tensor, y: Tensor) -> Tensor:
-        """How far inside the pavement (x, y) lies: 0 at the kerb, negative on the road, metres."""
+        """Distance of (x, y) from the kerb: positive on the pavement, negative on the road, metres."""
         u = y.abs() - self.half_widths[0]
         v = (x - self.crossing_x).abs() - self.half_widths[1]
         radius = self.corner_radius
@@ -63,7 +63,7 @@ class Ground:
         return raised
 
     def pose(self, x: np.ndarray, y: np.ndarray, yaw: np.ndarray) -> np.ndarray:
-        """Frames that stand on the ground and tilt with it.
+        """Poses of frames on the ground, tilted with it.
 
         Args:
             x, y: (...,) world position, metres.
@@ -71,7 +71,7 @@ class Ground:
 
         Returns:
             (..., 4, 4) float64 `T_world_body`: x axis ahead, z axis normal to the ground, origin on the ground. Across
-            a kerb the height changes over half a metre, as legs and tyres do, not in one step.
+            a kerb the height changes over half a metre instead of in one step, as for legs and tyres.
         """
         slope_x, slope_y = self.slope[0] + self.curvature * x, np.broadcast_to(self.slope[1], x.shape)
         depth = self.pavement_depth(torch.from_numpy(x), torch.from_numpy(y)).numpy()
@@ -86,14 +86,15 @@ class Ground:
         return pose
 
     def cast(self, origin: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """Where rays meet the ground.
+        """Intersect rays with the ground.
 
         Args:
             origin: (3,) or (3, R) float64, world metres, above the ground.
             directions: (3, R) unit vectors, world axes.
 
         Returns:
-            (R,) range in metres, inf = never; (R,) cosine of the angle of incidence; both of the type of `directions`.
+            (R,) range in metres, inf = no intersection; (R,) cosine of the angle of incidence; both in the dtype of
+            `directions`.
         """
         x, y, z = (value.numpy() for value in origin)
         slope_x = torch.from_numpy(np.asarray(self.slope[0] + self.curvature * x)).to(directions.dtype)
@@ -103,15 +104,15 @@ class Ground:
 
         def meet(lift: float) -> tuple[Tensor, Tensor]:
             a = torch.from_numpy(np.asarray(z - self.road_height(x, y) - lift)).to(directions.dtype)
-            root = (b * b - 4 * a * c).sqrt()  # NaN: the ray passes over the crest
-            t = 2 * a / (root - b)  # the form without cancellation
+            root = (b * b - 4 * a * c).sqrt()  # NaN if the ray passes over the crest
+            t = 2 * a / (root - b)  # this form avoids cancellation
             return torch.where(t > 0, t, torch.inf), root
 
         raised, _ = meet(self.kerb)
         low, root = meet(0.0)
         cosine = root.nan_to_num()
         hits_pavement = self._is_pavement_along(origin, directions, raised)
-        # A ray that is above the road at pavement height and under the pavement at road height hit the kerb between.
+        # A ray that is above the road at pavement height and below the pavement at road height hits the kerb between.
         hits_kerb = ~hits_pavement & self._is_pavement_along(origin, directions, low)
         if bool(hits_kerb.any()):
             rays = directions[:, hits_kerb]

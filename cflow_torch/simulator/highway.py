@@ -1,4 +1,4 @@
-"""A highway: three lanes a side, speeds up to 35 m/s, guard rails, a bridge, trees behind."""
+"""A highway: three lanes a side, speeds up to 35 m/s, guard rails, a bridge, trees."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ NOWHERE = 1e5  # where the other street of the ground is, metres
 
 
 def build_highway(rng: np.random.Generator) -> Scene:
-    """A scene drawn from `rng`."""
+    """Draw a scene from `rng`."""
     bend = float(rng.choice((-1, 1)) * rng.uniform(1e-5, 4e-5))
     slope = (rng.uniform(-0.02, 0.02), rng.uniform(-0.015, 0.015))
     ground = Ground(slope, bend, kerb=0.08, half_widths=(EDGE, 1.0), crossing_x=NOWHERE)
@@ -30,15 +30,14 @@ def build_highway(rng: np.random.Generator) -> Scene:
 
 
 def _traffic(rng: np.random.Generator, ego_speed: float) -> Iterator[Body]:
-    """Lanes in which all drive alike, but for one who brakes far ahead and one who speeds up behind."""
+    """Lanes of constant speed, a breakdown on the shoulder, and cars that brake and accelerate on a ramp."""
     for side, heading in ((-1, EAST), (1, WEST)):
-        ways = (heading, side, LANES[0]), (heading, side, LANES[1])
-        for (towards, where, lane), (low, high) in zip(ways, ((29, 35), (23, 29))):
+        for lane, (low, high) in zip(LANES, ((29, 35), (23, 29))):
             is_ego_lane = side < 0 and lane == LANES[1]
             speed = ego_speed if is_ego_lane else rng.uniform(low, high)
             for x in _gaps(rng, 28, 70):
                 if not (is_ego_lane and abs(x) < 20):
-                    yield objects.car(rng, Route(x, where * lane + rng.uniform(-0.2, 0.2), towards, speed=speed))
+                    yield objects.car(rng, Route(x, side * lane + rng.uniform(-0.2, 0.2), heading, speed=speed))
         speed = rng.uniform(21, 24)
         for number, x in enumerate(_gaps(rng, 45, 80)):
             route = Route(x, side * LANES[2], heading, speed=speed)
@@ -46,17 +45,17 @@ def _traffic(rng: np.random.Generator, ego_speed: float) -> Iterator[Body]:
                 yield from objects.articulated_truck(route)
             else:
                 yield (objects.bus(route) if number % 7 == 1 else objects.van(rng, route))
-    # On the shoulder: one who has broken down, and the driver behind the rail.
+    # On the shoulder: a car that has broken down, and its driver behind the rail.
     x = rng.uniform(40, 90)
     yield objects.car(rng, Route(x, -EDGE + 0.9 - 0.4, EAST))
     yield objects.pedestrian(rng, Route(x - 6, -EDGE - 1.6, EAST, speed=1.2))
-    # On the exit ramp beyond the rail: braking and speeding up.
+    # On a ramp beyond the rail: one car brakes, one accelerates.
     yield objects.car(rng, Route(rng.uniform(15, 40), -EDGE - 5.0, EAST, speed=26, acceleration=-4.0))
     yield objects.car(rng, Route(rng.uniform(-60, -30), -EDGE - 5.0, EAST, speed=12, acceleration=2.5))
 
 
 def _gaps(rng: np.random.Generator, low: float, high: float) -> Iterator[float]:
-    """Places along a lane."""
+    """Positions of vehicles along a lane."""
     x = -220 + rng.uniform(0, high)
     while x < 300:
         yield float(x)
@@ -64,7 +63,7 @@ def _gaps(rng: np.random.Generator, low: float, high: float) -> Iterator[float]:
 
 
 def _fixed(rng: np.random.Generator) -> Iterator[Body]:
-    """Rails (short pieces, so that they follow the road up and down), posts, signs, a bridge, noise walls, trees."""
+    """Rails (short pieces that follow the road up and down), posts, signs, a bridge, noise walls, trees."""
     for x in np.arange(-REACH, REACH, 20.0).tolist():
         for y in (-EDGE - 0.5, -0.7, 0.7, EDGE + 0.5):
             yield _rail(x, y)

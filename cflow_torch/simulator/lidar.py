@@ -1,4 +1,4 @@
-"""Multi-beam LiDARs that measure a scene: geometry from ray casting, then noise and lost returns."""
+"""Multi-beam LiDARs: ray casting, range noise and lost returns."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ from cflow_torch.simulator.rolling import Shots
 from cflow_torch.simulator.sensors import LidarProfile, SpinningLidar
 
 GROUND_ALBEDO = 0.25
-FOLIAGE_RETURN = 0.75  # share of the shots at a leaf that come back: leaves flutter
+FOLIAGE_RETURN = 0.75  # share of the shots at foliage that return, because leaves flutter
 
 
 @dataclass(frozen=True)
 class Returns:
-    """What a vehicle's LiDARs received in one sweep, N returns, unit by unit.
+    """The N returns of a vehicle's LiDARs in one sweep, unit by unit.
 
     Args:
         points: (N, 3) float32, metres, ego frame, after the motion compensation of the data set.
-        solid: (N,) int64, the solid that was hit; -1 = the ground.
+        solid: (N,) int64, index of the solid that was hit; -1 = the ground.
         intensity: (N,) uint8.
-        laser_number: (N,) uint8, running on from unit to unit (modulo 256).
-        offset_ns: (N,) int32, time of the shot after the time stamp; 0 where the world stands still meanwhile.
-        unit: (N,) int64, number of the unit that received it; ascending.
+        laser_number: (N,) uint8, which continues from unit to unit (modulo 256).
+        offset_ns: (N,) int32, time of the shot after the time stamp; 0 in instantaneous sweeps.
+        unit: (N,) int64, index of the unit; ascending.
         local: (N, 3) float32, metres, the points in the frame of their unit.
-        ring: (N,) int32, number of the beam, lowest first.
-        column: (N,) int32, number of the azimuth step in the order of time.
+        ring: (N,) int32, index of the beam, lowest first.
+        column: (N,) int32, index of the azimuth step in the order of time.
 
-    Convention: in a profile that rolls, the rows of a unit are in the order of time, in one that does not, in the order
-    of azimuth; those of one column from the lowest beam up.
+    Convention: the rows of a unit are in the order of time in rolling profiles, else in the order of azimuth; within a
+    column from the lowest beam up.
     """
 
     points: Tensor
@@ -52,13 +52,13 @@ class Returns:
 
 @dataclass(frozen=True)
 class EgoMotion:
-    """How the vehicle moves while it measures.
+    """Motion of the vehicle during a sweep.
 
     Args:
         T_world_ego: (4, 4) float64 at the time stamp.
-        T_world_unit: one per unit: (C, 4, 4) float64, where the unit is when it fires the columns it has.
-        seconds: one per unit: (C,) float64, when that is.
-        speed: (2,) m/s and rad/s that it does not exceed.
+        T_world_unit: for each unit (C, 4, 4) float64, its poses when it fires its columns.
+        seconds: for each unit (C,) float64, the times of its columns.
+        speed: (2,) upper bounds, m/s and rad/s.
     """
 
     T_world_ego: Tensor
@@ -70,14 +70,14 @@ class EgoMotion:
 def scan(
     profile: LidarProfile, solids: Solids, ground: Ground, T_world_ego: Tensor, generator: torch.Generator
 ) -> Returns:
-    """One sweep of all units of a vehicle in a world that stands still meanwhile: all shots at the time stamp.
+    """Simulate an instantaneous sweep of all units of a vehicle: all shots are taken at the time stamp.
 
     Args:
         profile: the units and their quality.
-        solids: everything but the ground, in the world.
+        solids: everything except the ground, in the world.
         ground: the ground, in the world.
         T_world_ego: (4, 4) float64.
-        generator: noise, drop-out and the azimuth at which the turn starts are drawn from it.
+        generator: source of noise, drop-out and the azimuth at which the sweep begins.
     """
     parts, first_laser = [], 0
     T_solid_ego = torch.linalg.inv(solids.pose) @ T_world_ego
@@ -96,24 +96,24 @@ def scan(
         T_ego_sensor = torch.from_numpy(unit.T_ego_sensor).float()
         points = T_ego_sensor[:3, :3] @ local + T_ego_sensor[:3, 3:]
         column = hit // len(unit.elevations)
-        turned = column if unit.span > 0 else unit.num_columns - 1 - column
-        offset_ns = torch.zeros_like(turned)
-        parts.append(_returns(points, local, image, hit, reflected, unit, (number, first_laser), turned, offset_ns))
+        column = column if unit.span > 0 else unit.num_columns - 1 - column
+        offset_ns = torch.zeros_like(column)
+        parts.append(_returns(points, local, image, hit, reflected, unit, (number, first_laser), column, offset_ns))
         first_laser += len(unit.elevations)
-    return _together(parts)
+    return _concatenate(parts)
 
 
 def scan_rolling(
     profile: LidarProfile, solids: MovingSolids, ground: Ground, ego: EgoMotion, generator: torch.Generator
 ) -> Returns:
-    """One sweep of all units of a vehicle; everything moves while they turn.
+    """Simulate a sweep of all units of a vehicle in which every shot has its own time.
 
     Args:
         profile: the units and their quality.
-        solids: everything but the ground.
+        solids: everything except the ground.
         ground: the ground, in the world.
         ego: motion of the vehicle.
-        generator: noise, drop-out and the azimuth at which the sweep starts are drawn from it.
+        generator: source of noise, drop-out and the azimuth at which the sweep begins.
     """
     parts, first_laser = [], 0
     for number, unit in enumerate(profile.units):
@@ -138,12 +138,12 @@ def scan_rolling(
         T_ego_sensor = torch.from_numpy(unit.T_ego_sensor).float()
         R, t = T_ego_sensor[:3, :3], T_ego_sensor[:3, 3:]
         if profile.is_deskewed and not unit.is_virtual:
-            # To where the ray ended in the world, and from there to the frames at the time stamp.
+            # From the end of the ray in the world to the frames at the time stamp.
             T_ego_world = torch.linalg.inv(ego.T_world_ego)
             T_ego_world[:3, 3] += T_ego_world[:3, :3] @ solids.origin
             origins = T_world_unit[:, :3, 3].T.float().contiguous()
-            ended = origins.index_select(1, column) + image.rays.index_select(1, hit) * distance
-            points = T_ego_world[:3, :3].float() @ ended + T_ego_world[:3, 3:].float()
+            world = origins.index_select(1, column) + image.rays.index_select(1, hit) * distance
+            points = T_ego_world[:3, :3].float() @ world + T_ego_world[:3, 3:].float()
             local = R.T @ (points - t)
         else:
             azimuth, elevation = shots.azimuth.float()[column], shots.elevation.float()[hit % len(unit.elevations)]
@@ -157,7 +157,7 @@ def scan_rolling(
             _returns(points, local, image, hit, reflected, unit, (number, first_laser), image_column, offset_ns)
         )
         first_laser += len(unit.elevations)
-    return _together(parts)
+    return _concatenate(parts)
 
 
 def _measure(
@@ -168,13 +168,13 @@ def _measure(
     cosine_at: Callable[[Tensor], Tensor],
     generator: torch.Generator,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Noise along the ray; returns that are too near, too far, too weak or unlucky are lost.
+    """Add noise along the ray, and drop returns that are too near, too far, too weak, or lost at random.
 
     Args:
-        cosine_at: rays (n,) that met solids to the cosines of the angles of incidence.
+        cosine_at: returns the cosines of the angles of incidence for rays (n,) that hit solids.
 
     Returns:
-        (N,) int64 rays that came back; (N,) float32 measured range; (N,) float32 share of the light reflected.
+        (N,) int64 rays that returned; (N,) float32 measured range; (N,) float32 share of the light reflected.
     """
     max_range = min(unit.max_range or profile.max_range, profile.max_range)
     hit = ((image.distance > profile.min_range) & (image.distance < max_range)).nonzero()[:, 0]
@@ -187,18 +187,18 @@ def _measure(
     distance, solid, cosine = (values.index_select(0, hit) for values in (image.distance, image.solid, image.cosine))
     on_solid = (solid >= 0).nonzero()[:, 0]
     cosine[on_solid] = cosine_at(hit.index_select(0, on_solid))
-    # Solid number -1, the ground, reads the last row.
+    # Solid -1, the ground, reads the last row.
     albedo = torch.cat([solids.albedo, torch.tensor([GROUND_ALBEDO])]).take(solid)
     is_foliage = torch.cat([solids.is_foliage, torch.tensor([False])]).take(solid)
     reflected = cosine * albedo
-    # Light comes back as 1 / range^2; the threshold is soft.
+    # The light decreases with 1 / range^2; the threshold is soft.
     margin = reflected * ((unit.reach or profile.reach) / distance) ** 2
     if profile.extinction:
         margin = margin * torch.exp(-2 * profile.extinction * distance)
     chance = (1 - dropout) * torch.sigmoid(4 * margin.clamp(min=1e-12).log())
     chance = torch.where(is_foliage, FOLIAGE_RETURN * chance, chance)
     if isinstance(solids, MovingSolids):
-        chance = chance.masked_fill(torch.cat([solids.is_hidden, torch.tensor([False])]).take(solid), 0.0)
+        chance = chance.masked_fill(torch.cat([solids.is_own, torch.tensor([False])]).take(solid), 0.0)
     kept = (luck < chance).nonzero()[:, 0]
     return hit[kept], (distance + noise)[kept], reflected[kept]
 
@@ -214,7 +214,7 @@ def _returns(
     column: Tensor,
     offset_ns: Tensor,
 ) -> Returns:
-    """Returns of one unit; `numbers` are its own and that of its first laser."""
+    """Returns of one unit; `numbers` are its index and the number of its first laser."""
     laser = torch.tensor(unit.elevations, dtype=torch.float64).sort().indices
     beam = hit % len(unit.elevations)
     return Returns(
@@ -230,5 +230,5 @@ def _returns(
     )
 
 
-def _together(parts: list[Returns]) -> Returns:
+def _concatenate(parts: list[Returns]) -> Returns:
     return Returns(*(torch.cat([getattr(part, column.name) for part in parts]) for column in fields(Returns)))

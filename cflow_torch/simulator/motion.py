@@ -1,4 +1,4 @@
-"""Where everything is at every moment of a sweep: the ego vehicle, its LiDARs, and all solids."""
+"""Poses at every moment of a sweep: of the ego vehicle, its LiDARs, and all solids."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from cflow_torch.simulator.moving_solids import MovingSolids
 from cflow_torch.simulator.scene import Scene
 from cflow_torch.simulator.sensors import LidarProfile
 
-_NUM_STRETCHES = 4  # of a sweep, over which elements of poses are interpolated: a leg's swing to 0.3 mm
+_NUM_INTERVALS = 4  # of a sweep, in which poses are interpolated element by element: a leg's swing to 0.3 mm
 _DERIVATIVE_STEP = 1e-3  # seconds, of central differences
 
 
@@ -20,21 +20,20 @@ class Motion:
     """Motion of a scene, sweep by sweep.
 
     Args:
-        scene: what moves.
-        profile: the LiDARs; their places and the times of their shots.
+        scene: ground, ego vehicle and bodies.
+        profile: the LiDARs: their mountings and the times of their shots.
         stamps: (S,) float64 seconds, time stamps of the sweeps.
     """
 
     def __init__(self, scene: Scene, profile: LidarProfile, stamps: np.ndarray) -> None:
         self._scene, self._profile, self._stamps = scene, profile, stamps
-        self._movers, self._moving = scene.movers()
+        self._dynamic, solids = scene.dynamic_part()
         table = scene.table
         self._row = np.full(len(table.body), -1)
-        self._row[self._moving] = np.arange(len(self._moving))
-        now = np.zeros(1)
-        self._still = scene.solids(0.0, scene.body_poses(now)[0])
-        self._T_still_world = _inverse(self._still.pose.numpy())
-        self._is_hidden = torch.from_numpy(table.body >= len(scene.bodies) - scene.num_own)
+        self._row[solids] = np.arange(len(solids))
+        self._static = scene.solids(0.0, scene.body_poses(np.zeros(1))[0])
+        self._T_static_world = _inverse(self._static.pose.numpy())
+        self._is_own = torch.from_numpy(table.body >= len(scene.bodies) - scene.num_own)
 
     def ego_poses(self, seconds: np.ndarray) -> np.ndarray:
         """(T, 4, 4) float64 `T_world_ego` at `seconds` (T,)."""
@@ -43,73 +42,74 @@ class Motion:
         return poses
 
     def ego_motion(self, seconds: float) -> EgoMotion:
-        """The LiDARs during the sweep that is stamped `seconds`."""
+        """Motion of the LiDARs during the sweep with time stamp `seconds`."""
         profile = self._profile
         interval = profile.sweep_interval_ns * 1e-9
         stamped = self.ego_poses(np.array([seconds]))[0]
-        places, times = [], []
+        poses, times = [], []
         for unit in profile.units:
             columns = np.arange(*(unit.seen or (0, unit.num_columns)))
             shots = seconds + interval * (columns / unit.num_columns - profile.reference)
             ego = np.broadcast_to(stamped, (len(shots), 4, 4)) if unit.is_virtual else self.ego_poses(shots)
-            places.append(torch.from_numpy(ego @ unit.T_ego_sensor))
+            poses.append(torch.from_numpy(ego @ unit.T_ego_sensor))
             times.append(torch.from_numpy(shots))
         route = self._scene.ego
-        # Braking and starting up change the speed by little within a sweep.
+        # Acceleration changes the speed by little within a sweep.
         speed = abs(route.speed) + abs(route.acceleration) * (seconds + 1)
-        turning = speed * (1 / route.radius + abs(self._scene.ground.curvature))
-        return EgoMotion(torch.from_numpy(stamped), places, times, (1.1 * speed + 6 * turning, 1.1 * turning))
+        yaw_rate = speed * (1 / route.radius + abs(self._scene.ground.curvature))
+        return EgoMotion(torch.from_numpy(stamped), poses, times, (1.1 * speed + 6 * yaw_rate, 1.1 * yaw_rate))
 
     @cached_property
-    def _mover_poses(self) -> np.ndarray:
-        """(S, K + 1, M, 4, 4) float64 poses of the moving bodies at the knots of all sweeps: once, as it is slow."""
+    def _dynamic_poses(self) -> np.ndarray:
+        """(S, K + 1, M, 4, 4) float64 poses of the dynamic bodies at the knots of all sweeps; slow, so done once."""
         knots = np.stack([self._knots(stamp) for stamp in self._stamps.tolist()])
-        poses = self._movers.body_poses(knots.ravel())
+        poses = self._dynamic.body_poses(knots.ravel())
         return poses.reshape(*knots.shape, *poses.shape[1:])
 
     def solids(self, index: int) -> MovingSolids:
         """All solids during sweep `index`."""
-        seconds, poses = float(self._stamps[index]), self._mover_poses[index]
+        seconds, poses = float(self._stamps[index]), self._dynamic_poses[index]
         knots = self._knots(seconds)
         origin = self.ego_poses(np.array([seconds]))[0, :3, 3]
-        moving = np.stack([_inverse(self._movers.solids(t, p).pose.numpy()) for t, p in zip(knots.tolist(), poses)])
-        still = self._still
+        dynamic = np.stack([_inverse(self._dynamic.solids(t, p).pose.numpy()) for t, p in zip(knots.tolist(), poses)])
+        static = self._static
         return MovingSolids(
-            kind=still.kind,
-            half_size=still.half_size,
-            albedo=still.albedo,
-            is_foliage=still.is_foliage,
-            is_hidden=self._is_hidden,
+            kind=static.kind,
+            half_size=static.half_size,
+            albedo=static.albedo,
+            is_foliage=static.is_foliage,
+            is_own=self._is_own,
             origin=torch.from_numpy(origin),
             knots=torch.from_numpy(knots),
-            still=torch.from_numpy(_from(self._T_still_world, origin)),
+            static=torch.from_numpy(_from(self._T_static_world, origin)),
             row=torch.from_numpy(self._row),
-            moving=torch.from_numpy(_from(moving, origin)),
+            dynamic=torch.from_numpy(_from(dynamic, origin)),
         )
 
     def radial_velocity(self, seconds: float, returns: Returns) -> np.ndarray:
-        """(N,) float32 m/s of what was hit, over ground, along the ray, positive = receding."""
-        mover = np.append(self._row, -1)[returns.solid.numpy()]
-        velocity = np.zeros(len(mover), np.float32)
-        rows = np.flatnonzero(mover >= 0)
+        """(N,) float32 m/s of the surfaces that were hit, over ground, along the ray, positive = receding."""
+        row_of_hit = np.append(self._row, -1)[returns.solid.numpy()]
+        velocity = np.zeros(len(row_of_hit), np.float32)
+        rows = np.flatnonzero(row_of_hit >= 0)
         if not len(rows):
             return velocity
         knots = self._knots(seconds) if self._profile.is_rolling else np.array([seconds])
-        # The velocity of a point of the world that is fixed to a mover is a linear function of where it is.
+        # The velocity of a point that is fixed to a dynamic solid is a linear function of its position in the world.
         spread = np.add.outer(knots, (-_DERIVATIVE_STEP, 0.0, _DERIVATIVE_STEP))
-        bodies = self._movers.body_poses(spread.ravel())
-        poses = np.stack([self._movers.solids(t, p).pose.numpy() for t, p in zip(spread.ravel().tolist(), bodies)])
+        bodies = self._dynamic.body_poses(spread.ravel())
+        poses = np.stack([self._dynamic.solids(t, p).pose.numpy() for t, p in zip(spread.ravel().tolist(), bodies)])
         before, now, after = poses.reshape(len(knots), 3, *poses.shape[1:]).swapaxes(0, 1)
         change = (after - before)[..., :3, :] / (2 * _DERIVATIVE_STEP) @ np.linalg.inv(now)  # (K + 1, M, 3, 4)
 
         shot = seconds + 1e-9 * returns.offset_ns.numpy()[rows].astype(np.float64)
+        row_of_hit = row_of_hit[rows]
         if len(knots) > 1:
-            at = (shot - knots[0]) / (knots[1] - knots[0])
-            first = np.clip(np.floor(at).astype(int), 0, len(knots) - 2)
-            part = (at - first)[:, None, None]
-            slope = (1 - part) * change[first, mover[rows]] + part * change[first + 1, mover[rows]]
+            position = (shot - knots[0]) / (knots[1] - knots[0])
+            first = np.clip(np.floor(position).astype(int), 0, len(knots) - 2)
+            weight = (position - first)[:, None, None]
+            slope = (1 - weight) * change[first, row_of_hit] + weight * change[first + 1, row_of_hit]
         else:
-            slope = change[0, mover[rows]]
+            slope = change[0, row_of_hit]
             shot = np.full(len(rows), seconds)
         sensor, point = self._ray_ends(seconds, shot, returns, rows)
         ray = (point - sensor) / np.linalg.norm(point - sensor, axis=1, keepdims=True)
@@ -120,7 +120,7 @@ class Motion:
     def _ray_ends(
         self, seconds: float, shot: np.ndarray, returns: Returns, rows: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """(n, 3) float64 world position of the LiDAR at each shot, and of what it hit."""
+        """(n, 3) float64 world position of the LiDAR at each shot, and of the point that it hit."""
         profile, stamped = self._profile, self.ego_poses(np.array([seconds]))[0]
         unit = returns.unit.numpy()[rows]
         is_virtual = np.array([u.is_virtual for u in profile.units])[unit]
@@ -135,13 +135,13 @@ class Motion:
 
     def _knots(self, seconds: float) -> np.ndarray:
         interval = self._profile.sweep_interval_ns * 1e-9
-        return seconds + interval * (np.linspace(0, 1, _NUM_STRETCHES + 1) - self._profile.reference)
+        return seconds + interval * (np.linspace(0, 1, _NUM_INTERVALS + 1) - self._profile.reference)
 
 
 def _inverse(poses: np.ndarray) -> np.ndarray:
     """(..., 3, 4) inverse of rigid transforms (..., 4, 4)."""
-    turned = np.swapaxes(poses[..., :3, :3], -1, -2)
-    return np.concatenate([turned, -turned @ poses[..., :3, 3:]], -1)
+    rotation = np.swapaxes(poses[..., :3, :3], -1, -2)
+    return np.concatenate([rotation, -rotation @ poses[..., :3, 3:]], -1)
 
 
 def _from(transforms: np.ndarray, origin: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Where every solid of a scene is during a sweep."""
+"""Poses of all solids of a scene during a sweep."""
 
 from __future__ import annotations
 
@@ -13,56 +13,57 @@ from cflow_torch.simulator.raycast import ELLIPSOID, take
 
 @dataclass(frozen=True)
 class MovingSolids:
-    """P solids over a stretch of time. Coordinates are relative to `origin`, so that float32 keeps micrometres.
+    """P solids during an interval of time. Coordinates are relative to `origin`, so that float32 resolves micrometres.
 
     Args:
         kind: (P,) int64.
         half_size: (P, 3) float64, metres.
-        albedo: (P,) float32; is_foliage: (P,) bool; is_hidden: (P,) bool, parts of the recording vehicle.
+        albedo, is_foliage, is_own: (P,) float32, (P,) bool, (P,) bool = part of the recording vehicle.
         origin: (3,) float64, world metres.
         knots: (K + 1,) float64 seconds, evenly spaced, K >= 1.
-        still: (P, 3, 4) float64, world (relative to `origin`) to solid, at the first knot.
-        row: (P,) int64, row of `moving` of each solid, -1 = stands still.
-        moving: (K + 1, M, 3, 4) float64, world to solid at the knots; the elements are interpolated between them.
+        static: (P, 3, 4) float64, world (relative to `origin`) to solid, at the first knot.
+        row: (P,) int64, row of `dynamic` of each solid, -1 = static.
+        dynamic: (K + 1, M, 3, 4) float64, world to solid at the knots; elements are interpolated in between.
     """
 
     kind: Tensor
     half_size: Tensor
     albedo: Tensor
     is_foliage: Tensor
-    is_hidden: Tensor
+    is_own: Tensor
     origin: Tensor
     knots: Tensor
-    still: Tensor
+    static: Tensor
     row: Tensor
-    moving: Tensor
+    dynamic: Tensor
 
     def at(self, solid: Tensor, seconds: Tensor) -> tuple[Tensor, Tensor]:
-        """World to solid, and how it changes.
+        """Transforms from the world to solids, and their derivatives.
 
         Args:
-            solid: (E,) int64; seconds: (E,) float64.
+            solid: (E,) int64.
+            seconds: (E,) float64.
 
         Returns:
             (E, 3, 4) float64 transform; (E, 3, 4) float64 its derivative, per second.
         """
-        place = self.still.index_select(0, solid)
-        change = torch.zeros_like(place)
+        transform = self.static.index_select(0, solid)
+        change = torch.zeros_like(transform)
         row = take(self.row, solid)
         chosen = (row >= 0).nonzero()[:, 0]
         if len(chosen):
-            place[chosen], change[chosen] = self.moving_at(take(row, chosen), take(seconds, chosen))
-        return place, change
+            transform[chosen], change[chosen] = self.dynamic_at(take(row, chosen), take(seconds, chosen))
+        return transform, change
 
-    def moving_at(self, row: Tensor, seconds: Tensor) -> tuple[Tensor, Tensor]:
-        """As `at`, by rows (E,) int64 of `moving`."""
+    def dynamic_at(self, row: Tensor, seconds: Tensor) -> tuple[Tensor, Tensor]:
+        """Transforms from the world to rows (E,) int64 of `dynamic`, and their derivatives: (E, 3, 4) float64 each."""
         step = float(self.knots[1] - self.knots[0])
         after = seconds - self.knots[0]
         first = (after / step).floor().long().clamp(0, len(self.knots) - 2)
-        number = first * self.moving.shape[1] + row
-        flat = self.moving.flatten(0, 1)
-        begin = flat.index_select(0, number)
-        slope = (flat.index_select(0, number + self.moving.shape[1]) - begin) / step
+        index = first * self.dynamic.shape[1] + row
+        flat = self.dynamic.flatten(0, 1)
+        begin = flat.index_select(0, index)
+        slope = (flat.index_select(0, index + self.dynamic.shape[1]) - begin) / step
         return begin + (after - first * step)[:, None, None] * slope, slope
 
     @cached_property
@@ -72,23 +73,23 @@ class MovingSolids:
 
     @property
     def middle(self) -> Tensor:
-        """() float64 seconds, half way from the first to the last knot."""
+        """() float64 seconds, the middle between the first and the last knot."""
         return 0.5 * (self.knots[0] + self.knots[-1])
 
     @cached_property
     def centres(self) -> tuple[Tensor, Tensor]:
-        """(P, 3) float64 where the solids are at `middle`; (P,) m/s that no part of them exceeds."""
-        number = len(self.kind)
-        place, _ = self.at(torch.arange(number), self.middle.expand(number))
-        centre = rotate(place[:, :, :3].transpose(1, 2), -place[:, :, 3])
-        speed = torch.zeros(number, dtype=torch.float64)
-        movers = (self.row >= 0).nonzero()[:, 0]
-        arm = self.half_size[movers].norm(dim=1)
-        for knot in self.knots[:-1]:  # legs swing, so every stretch counts
-            _, change = self.moving_at(self.row[movers], knot.expand(len(movers)))
-            at_centre = rotate(change[:, :, :3], centre[movers]) + change[:, :, 3]
-            turning = change[:, :, :3].flatten(1).norm(dim=1) * arm
-            speed[movers] = torch.maximum(speed[movers], at_centre.norm(dim=1) + turning)
+        """(P, 3) float64 centres of the solids at `middle`; (P,) upper bound of the speed of any part of them, m/s."""
+        count = len(self.kind)
+        transform, _ = self.at(torch.arange(count), self.middle.expand(count))
+        centre = rotate(transform[:, :, :3].transpose(1, 2), -transform[:, :, 3])
+        speed = torch.zeros(count, dtype=torch.float64)
+        moving = (self.row >= 0).nonzero()[:, 0]
+        arm = self.half_size[moving].norm(dim=1)
+        for knot in self.knots[:-1]:  # every interval, because legs swing
+            _, change = self.dynamic_at(self.row[moving], knot.expand(len(moving)))
+            at_centre = rotate(change[:, :, :3], centre[moving]) + change[:, :, 3]
+            rotation = change[:, :, :3].flatten(1).norm(dim=1) * arm
+            speed[moving] = torch.maximum(speed[moving], at_centre.norm(dim=1) + rotation)
         return centre, 1.1 * speed
 
 

@@ -1,4 +1,4 @@
-"""A narrow street: house fronts near at hand, parked cars along one kerb, people at walls and between the cars."""
+"""A narrow street: house fronts close to the road, parked cars along one kerb, people at walls and between cars."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ NOWHERE = 1e5  # where the other street of the ground is, metres
 
 
 def build_narrow(rng: np.random.Generator) -> Scene:
-    """A scene drawn from `rng`."""
+    """Draw a scene from `rng`."""
     bend = float(rng.choice((-1, 1)) * rng.uniform(2e-4, 6e-4))
     slope = (rng.uniform(-0.04, 0.04), rng.uniform(-0.01, 0.01))
     ground = Ground(slope, bend, kerb=0.1, half_widths=(HALF_WIDTH, 1.0), crossing_x=NOWHERE)
@@ -29,7 +29,7 @@ def build_narrow(rng: np.random.Generator) -> Scene:
 
 
 def _traffic(rng: np.random.Generator) -> Iterator[Body]:
-    """Cars ahead and behind in the one free lane, cyclists both ways, parked cars with gaps, a van that unloads."""
+    """Cars ahead and behind in the one free lane, cyclists in both directions, parked cars with gaps, a parked van."""
     yield objects.car(rng, Route(13.0, -1.3, EAST, speed=7.0, acceleration=-1.5))
     yield objects.van(rng, Route(36.0, -1.3, EAST, speed=5.0))
     yield objects.car(rng, Route(-11.0, -1.3, EAST, speed=5.0, acceleration=-0.5))
@@ -45,21 +45,21 @@ def _traffic(rng: np.random.Generator) -> Iterator[Body]:
 
 
 def _people(rng: np.random.Generator) -> Iterator[Body]:
-    """A hand's breadth from the walls, in doorways, and out from behind parked cars."""
+    """People close to the walls, in doorways, and people who step out from behind parked cars."""
     front = HALF_WIDTH + PAVEMENT
     for side in (-1, 1):
         for x in rng.uniform(-30, 60, size=7).tolist():
             y = side * (front - rng.uniform(0.38, 0.6))
             speed = float(rng.choice((0.0, 1.0, 1.4, 1.8)))
             yield objects.pedestrian(rng, Route(x, y, float(rng.choice((EAST, WEST))), speed=speed))
-    # Hidden by the parked cars at first; they step into the road one after the other, far enough ahead.
+    # Occluded by the parked cars at first; they step into the road one after the other, far enough ahead.
     for x in (15.6, 22.8, 44.4):
         yield objects.pedestrian(rng, Route(x, HALF_WIDTH + rng.uniform(0.4, 1.6), SOUTH, speed=rng.uniform(1.1, 1.8)))
     yield objects.pedestrian(rng, Route(29.0, -front + 0.7, NORTH, speed=0.7))
 
 
 def _fixed(rng: np.random.Generator) -> Iterator[Body]:
-    """House after house without gaps but for gateways, posts, dustbins."""
+    """Houses without gaps except gateways, posts, dustbins."""
     front, depth = HALF_WIDTH + PAVEMENT, 7.0
     for side in (-1, 1):
         x = -REACH

@@ -1,6 +1,6 @@
-"""What stands and moves in the street: shapes made of a few solids, and the ways they travel.
+"""Objects of a scene: shapes made of a few solids, and the trajectories along which they move.
 
-A body frame stands on the ground: x ahead, y left, z up, origin below the middle of the body.
+The origin of a body frame is on the ground below the middle of the body: x ahead, y left, z up.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ class Solid(NamedTuple):
         kind: BOX, CYLINDER or ELLIPSOID.
         centre: metres, body frame.
         half: half size along its own axes, metres.
-        pitch, roll: radians about y, then x: how the solid is turned in the body.
-        albedo: share of the light that comes back.
-        is_foliage: flickers from sweep to sweep.
+        pitch, roll: radians about y, then x: rotation of the solid in the body.
+        albedo: share of the light that is reflected.
+        is_foliage: returns flicker from sweep to sweep.
         swing: amplitude of a leg's swing about the hip's y axis, radians.
         stride: steps per second; phase: radians at time 0.
     """
@@ -55,16 +55,16 @@ class Solid(NamedTuple):
 
 @dataclass(frozen=True)
 class Route:
-    """A way made of a straight, an arc and a straight, driven at constant speed or with constant acceleration.
+    """A trajectory of a straight, an arc and a straight, at constant speed or acceleration.
 
     Args:
-        x, y: where the arc begins (anywhere, if angle is 0), world metres.
+        x, y: beginning of the arc (any point, if angle is 0), world metres.
         yaw: heading there, radians.
-        start: distance along the way at time 0, negative = before the arc, metres.
+        start: position along the route at time 0, metres from the beginning of the arc; negative = before it.
         speed: m/s at time 0; negative = in reverse.
         radius: of the arc, metres.
         angle: of the arc, radians, positive = left.
-        acceleration: m/s^2; what brakes to a standstill stays there.
+        acceleration: m/s^2; a body that brakes to a standstill stays there.
     """
 
     x: float
@@ -85,34 +85,33 @@ class Route:
         if self.acceleration == 0:
             return np.asarray(self.start + self.speed * seconds)
         stop = -self.speed / self.acceleration
-        # One that brakes halts there; one that starts up at a time before 0 stood until then.
+        # A braking body stays at its stop; one that starts up before time 0 was static until then.
         seconds = np.minimum(seconds, stop) if self.speed * self.acceleration < 0 else np.maximum(seconds, stop)
         return np.asarray(self.start + self.speed * seconds + 0.5 * self.acceleration * seconds**2)
 
     @property
     def is_static(self) -> bool:
-        """Never moves."""
+        """Whether the body never moves."""
         return self.speed == 0 and self.acceleration == 0
 
     def at(self, distance: np.ndarray) -> np.ndarray:
         """(T, 3) float64 world x, y, yaw after `distance` (T,) metres from the beginning of the arc."""
         side = math.copysign(1.0, self.angle)
-        turned = np.clip(distance / self.radius, 0, abs(self.angle))
+        angle = np.clip(distance / self.radius, 0, abs(self.angle))
         beyond = np.maximum(distance - self.radius * abs(self.angle), 0)
-        ahead = np.minimum(distance, 0) + self.radius * np.sin(turned) + beyond * math.cos(self.angle)
-        left = side * self.radius * (1 - np.cos(turned)) + beyond * math.sin(self.angle)
+        ahead = np.minimum(distance, 0) + self.radius * np.sin(angle) + beyond * math.cos(self.angle)
+        left = side * self.radius * (1 - np.cos(angle)) + beyond * math.sin(self.angle)
         cos, sin = math.cos(self.yaw), math.sin(self.yaw)
-        return np.stack(
-            [self.x + cos * ahead - sin * left, self.y + sin * ahead + cos * left, self.yaw + side * turned], -1
-        )
+        x, y = self.x + cos * ahead - sin * left, self.y + sin * ahead + cos * left
+        return np.stack([x, y, self.yaw + side * angle], -1)
 
 
 @dataclass(frozen=True)
 class Towed:
-    """The way of a trailer: its axle follows the hitch like a tractrix.
+    """The trajectory of a trailer: its axle follows the hitch along a tractrix.
 
     Args:
-        tractor: way of the tractor's middle.
+        tractor: route of the tractor's middle.
         hitch: how far behind that middle the hitch is, metres.
         wheelbase: hitch to axle, metres.
         middle: hitch to the trailer's middle, metres.
@@ -145,11 +144,11 @@ class Towed:
 
 @dataclass(frozen=True)
 class Body:
-    """A thing of the scene.
+    """An object or a piece of background.
 
     Args:
         solids: its shape.
-        way: (T,) seconds to (T, 3) world x, y, yaw.
+        trajectory: a function of (T,) seconds that returns (T, 3) world x, y, yaw.
         category: Argoverse 2 category name, None = background (never labelled, never moves).
         size: length, width, height, from the ground up, metres.
     """
@@ -161,7 +160,7 @@ class Body:
 
     @property
     def is_static(self) -> bool:
-        """Never moves."""
+        """Whether the body never moves."""
         return isinstance(self.trajectory, Route) and self.trajectory.is_static
 
 
@@ -180,10 +179,10 @@ def _wheels(xs: Sequence[float], y: float, radius: float) -> list[Solid]:
 
 
 def car(rng: np.random.Generator, route: Route) -> Body:
-    """A hull with clearance, a cabin on it, four wheels."""
+    """A hull with ground clearance, a cabin and four wheels."""
     length, width, height = rng.uniform(3.8, 5.0), rng.uniform(1.7, 2.0), rng.uniform(1.4, 1.85)
     paint, half = rng.uniform(0.15, 0.9), length / 2
-    rear = -half + rng.uniform(0.05, 0.7)  # estate ... saloon
+    rear = -half + rng.uniform(0.05, 0.7)  # from estate to saloon
     solids = [
         box(-half, half, -width / 2, width / 2, 0.25, 0.58 * height, paint),
         box(rear, half - rng.uniform(1.1, 1.5), -width / 2 + 0.12, width / 2 - 0.12, 0.58 * height, height, 0.3),
@@ -199,7 +198,7 @@ def bus(route: Route) -> Body:
 
 
 def articulated_truck(route: Route) -> list[Body]:
-    """A tractor with a driver's cab, and a trailer that swings in behind it: two tracks."""
+    """A tractor and a trailer, which are two tracks."""
     cab = [
         box(0.4, 2.8, -1.2, 1.2, 0.5, 3.3, 0.7),
         box(-2.8, 0.4, -0.6, 0.6, 0.6, 1.0, 0.3),
@@ -225,14 +224,14 @@ def van(rng: np.random.Generator, route: Route) -> Body:
 
 
 def own_truck(route: Route) -> list[Body]:
-    """The recording truck itself, a cab and a trailer that its LiDARs stand around. `way` is that of its rear axle."""
+    """The recording truck itself: a cab and a trailer between its LiDARs. `route` is that of its rear axle."""
     cab = [box(2.6, 5.0, -1.25, 1.25, 0.4, 3.1, 0.5), box(-1.0, 2.6, -0.6, 0.6, 0.3, 0.9, 0.3)]
     trailer = [box(-6.3, 6.0, -1.25, 1.25, 1.1, 4.0, 0.7), *_wheels((-4.4, -3.1, -1.8), 1.25, 0.5)]
     return [Body(cab, route), Body(trailer, Towed(route, hitch=-0.3, wheelbase=7.6, middle=4.7))]
 
 
 def pedestrian(rng: np.random.Generator, route: Route) -> Body:
-    """A trunk, a head, two legs that swing if the person walks."""
+    """A torso, a head, and two legs that swing if the person walks."""
     scale, cloth = rng.uniform(0.9, 1.1), rng.uniform(0.2, 0.8)
     swing = 0.0 if route.speed == 0 else 0.45
     phase = rng.uniform(0, 2 * math.pi)
@@ -278,7 +277,7 @@ def cyclist(rng: np.random.Generator, route: Route) -> Body:
 
 
 def wall(x: float, y: float, length: float, depth: float, height: float, albedo: float = 0.45) -> Body:
-    """A box along the world axes: building, garden wall or hoarding; it reaches a metre into the ground."""
+    """A box along the world axes (building, garden wall or hoarding), which reaches a metre into the ground."""
     return Body([box(-length / 2, length / 2, -depth / 2, depth / 2, -1.0, height, albedo)], Route(x, y))
 
 
@@ -291,7 +290,7 @@ def pole(x: float, y: float, height: float, radius: float, sign: float = 0.0) ->
 
 
 def tree(rng: np.random.Generator, x: float, y: float, num_leaves: int = 110) -> Body:
-    """A trunk and a crown of balls of leaves."""
+    """A trunk, and a crown of ellipsoids for leaves."""
     spread, bottom = rng.uniform(1.3, 2.1), rng.uniform(2.0, 2.8)
     trunk = Solid(CYLINDER, (0, 0, bottom / 2 + 0.5), (0.14, 0.14, bottom / 2 + 0.5), albedo=0.3)
     crown = _foliage(rng, (spread, spread, 1.3 * spread), bottom + 1.2 * spread, num_leaves, (0.12, 0.35))
@@ -307,10 +306,10 @@ def bush(rng: np.random.Generator, x: float, y: float, num_leaves: int = 40) -> 
 def _foliage(
     rng: np.random.Generator, radii: Vector, height: float, number: int, leaf: tuple[float, float]
 ) -> list[Solid]:
-    """Balls spread evenly through an ellipsoid."""
-    towards = rng.normal(size=(number, 3))
-    towards *= rng.uniform(size=(number, 1)) ** (1 / 3) / np.linalg.norm(towards, axis=1, keepdims=True)
-    centres = towards * radii + (0, 0, height)
+    """Small ellipsoids, spread evenly through a large one."""
+    offsets = rng.normal(size=(number, 3))
+    offsets *= rng.uniform(size=(number, 1)) ** (1 / 3) / np.linalg.norm(offsets, axis=1, keepdims=True)
+    centres = offsets * radii + (0, 0, height)
     sizes = rng.uniform(*leaf, size=number)
     return [
         Solid(ELLIPSOID, (cx, cy, cz), (r, r, 0.7 * r), albedo=0.35, is_foliage=True)

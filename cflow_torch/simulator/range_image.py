@@ -1,4 +1,4 @@
-"""What the rays of a LiDAR meet first, the ground or a solid."""
+"""True range images of a LiDAR: the first intersection of each ray with the ground or a solid."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from cflow_torch.simulator.sensors import SpinningLidar
 
 @dataclass(frozen=True)
 class RangeImage:
-    """What the C * B rays of a unit meet, before the sensor measures it. Ray number = column * B + beam.
+    """First intersections of the C * B rays of a unit, without measurement noise. Ray index = column * B + beam.
 
     Args:
-        rays: (3, C * B) float32 unit vectors, sensor frame; of shots, axes of the world.
-        distance: (C * B,) float32 true range, metres, inf = nothing.
-        solid: (C * B,) int64 the solid that is met, -1 = the ground or nothing.
-        cosine: (C * B,) float32 cosine of the angle of incidence, where the ground is met.
+        rays: (3, C * B) float32 unit vectors, in the sensor frame (instantaneous sweeps) or world axes (rolling ones).
+        distance: (C * B,) float32 true range, metres, inf = no hit.
+        solid: (C * B,) int64 index of the solid, -1 = the ground or no hit.
+        cosine: (C * B,) float32 cosine of the angle of incidence, where the ray hits the ground.
     """
 
     rays: Tensor
@@ -42,7 +42,7 @@ def cast_unit(
     T_world_ego: Tensor,
     max_range: float,
 ) -> RangeImage:
-    """The true range image of one unit.
+    """Cast the rays of one unit in an instantaneous sweep.
 
     Args:
         phase: azimuth of the first column, radians.
@@ -64,18 +64,18 @@ def cast_unit(
 def cast_shots(
     shots: Shots, solids: MovingSolids, ground: Ground, max_range: float
 ) -> tuple[RangeImage, Callable[[Tensor], Tensor]]:
-    """The true range image of one unit, column after column.
+    """Cast the rays of one unit in a rolling sweep, in which every column has its own time.
 
     Returns:
-        The image, its rays in world axes; what gives the cosines of the angles of incidence of rays (n,) that met
-        solids.
+        The image, with rays in world axes; a function that returns the cosines of the angles of incidence for rays (n,)
+        that hit solids.
     """
     num_beams = len(shots.elevation)
     blocks = covered_blocks(solids, shots, max_range)
     rays_at = RollingRays(solids, shots, blocks)
     distance, block = nearest_hits(solids.kind, blocks, rays_at, len(shots.azimuth), shots.elevation)
-    sideways, up = shots.directions
-    directions = sideways * shots.elevation.cos().float() + up * shots.elevation.sin().float()  # (3, C, B)
+    level, up = shots.directions
+    directions = level * shots.elevation.cos().float() + up * shots.elevation.sin().float()  # (3, C, B)
     origin = (shots.T_world_sensor[:, :3, 3] + solids.origin).T[..., None]
     ground_distance, cosine = (values.flatten() for values in ground.cast(origin, directions))
     solid = torch.cat([blocks.solid, torch.tensor([-1])]).take(block)  # block -1 reads the last row

@@ -1,8 +1,8 @@
-"""Ray casting: every ray of a range image against every solid of the scene, without a Python loop over either.
+"""Ray casting: intersect all rays of a range image with all solids of a scene, without a Python loop over either.
 
-A solid is an affine image of the unit cube, the unit cylinder or the unit ball. Seen from the sensor it covers a block
-of columns (azimuth) and beams (elevation) of the range image; only the rays of that block are tested against it.
-Occlusion falls out: the nearest hit of a ray wins.
+A solid is an affine image of the unit cube, the unit cylinder or the unit ball. As seen from the sensor, it covers a
+block of columns (azimuth) and beams (elevation) of the range image, and only the rays of that block are tested. The
+nearest hit of a ray counts, which gives occlusion.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Solids:
         kind: (P,) int64, BOX, CYLINDER or ELLIPSOID.
         pose: (P, 4, 4) float64, solid to world.
         half_size: (P, 3) float64, metres: the unit solid is scaled by it.
-        albedo: (P,) float32 in (0, 1], share of the light that comes back.
+        albedo: (P,) float32 in (0, 1], share of the light that is reflected.
         is_foliage: (P,) bool.
     """
 
@@ -40,11 +40,11 @@ class Solids:
 
 
 class Blocks(NamedTuple):
-    """E blocks of a range image, each holding all rays that can meet one solid (a solid may have several).
+    """E blocks of a range image. Each holds all rays that can meet one solid; a solid may have several blocks.
 
     Args:
         solid: (E,) int64.
-        first_column, num_columns: (E,) int64, columns [first, first + number), counted round the image.
+        first_column, num_columns: (E,) int64, columns [first, first + number), modulo the width of the image.
         first_beam, end_beam: (E,) int64, beams [first, end).
     """
 
@@ -57,15 +57,15 @@ class Blocks(NamedTuple):
 
 class UnitRays(NamedTuple):
     """M columns of rays in unit coordinates of a solid: (3, M) float32 origins, and the two parts of the directions,
-    sideways * cos(elevation) + up * sin(elevation)."""
+    level * cos(elevation) + up * sin(elevation)."""
 
     origin: Tensor
-    sideways: Tensor
+    level: Tensor
     up: Tensor
 
 
 def ray_directions(azimuth: Tensor, elevation: Tensor) -> Tensor:
-    """Unit vectors of a range image, sensor frame: (3, C * B), ray number column * B + beam."""
+    """Unit vectors of a range image, sensor frame: (3, C * B), ray index column * B + beam."""
     horizontal, vertical = elevation.cos(), elevation.sin()
     x = azimuth.cos()[:, None] * horizontal
     y = azimuth.sin()[:, None] * horizontal
@@ -80,20 +80,20 @@ def cast_solids(
     elevation: Tensor,
     max_range: float,
 ) -> tuple[Tensor, Tensor]:
-    """Nearest solid along every ray of a range image.
+    """Find the nearest solid along every ray of a range image.
 
     Args:
         kind: (P,) int64.
         T_solid_sensor: (P, 4, 4) float64, rigid, sensor coordinates to the solid's.
         half_size: (P, 3) float64, metres.
-        azimuth: (C,) float64 radians, evenly spaced over one full turn, ascending.
+        azimuth: (C,) float64 radians, evenly spaced over one full revolution, ascending.
         elevation: (B,) float64 radians, ascending.
         max_range: solids that begin beyond it may be skipped, metres.
 
     Returns:
-        (C * B,) float32 range in metres, inf = no hit; (C * B,) int64 solid, -1 = no hit. Ray number column * B + beam.
+        (C * B,) float32 range in metres, inf = no hit; (C * B,) int64 solid, -1 = no hit. Ray index column * B + beam.
 
-    Convention: the sensor does not stand inside a solid (such a solid is not hit); equal ranges: the lower number wins.
+    Convention: solids around the sensor are not hit. Ties: the first solid.
 
     Cost: time and memory grow with the sum, over the solids, of the rays in the block that each one covers.
     """
@@ -104,9 +104,9 @@ def cast_solids(
     cos_azimuth, sin_azimuth = azimuth.cos().float(), azimuth.sin().float()
 
     def rays_at(solid: Tensor, column: Tensor) -> UnitRays:
-        sideways = take(matrix[:, 0], solid) * take(cos_azimuth, column)
-        sideways += take(matrix[:, 1], solid) * take(sin_azimuth, column)
-        return UnitRays(take(origin, solid), sideways, take(matrix[:, 2], solid))
+        level = take(matrix[:, 0], solid) * take(cos_azimuth, column)
+        level += take(matrix[:, 1], solid) * take(sin_azimuth, column)
+        return UnitRays(take(origin, solid), level, take(matrix[:, 2], solid))
 
     return nearest_hits(kind, blocks, rays_at, len(azimuth), elevation)  # block = solid
 
@@ -118,18 +118,18 @@ def nearest_hits(
     num_columns: int,
     elevation: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Nearest solid along every ray of a range image, from the blocks of rays that may meet each solid.
+    """Find the nearest solid along every ray of a range image, given the blocks of rays that may meet each solid.
 
     Args:
         kind: (P,) int64.
         blocks: E blocks.
-        rays_at: (M,) block number and (M,) column to the rays of that column as the solid of the block sees them.
+        rays_at: maps (M,) blocks and (M,) columns to the rays of that column, in unit coordinates of the block's solid.
         num_columns: C, columns of the range image.
         elevation: (B,) float64 radians, ascending.
 
     Returns:
         (C * B,) float32 range in metres, inf = no hit; (C * B,) int64 block of the solid that was hit, -1 = no hit. Ray
-        number column * B + beam. Equal ranges: the lower block wins.
+        index column * B + beam. Ties: the first block.
     """
     num_beams = len(elevation)
     best = torch.full((num_columns * num_beams,), _NO_HIT, device=elevation.device)
@@ -148,10 +148,10 @@ def nearest_hits(
             ray = column * num_beams + take(blocks.first_beam, block)
             pair, offset = _expand(take(height, block))
             beam = take(blocks.first_beam, take(block, pair)) + offset
-            direction = take(rays.sideways, pair) * take(cos_elevation, beam)
+            direction = take(rays.level, pair) * take(cos_elevation, beam)
             direction += take(rays.up, pair) * take(sin_elevation, beam)
             t = intersect(take(rays.origin, pair), direction)
-            # Range (positive floats sort like their bits) and solid in one integer: one exact, order-free minimum.
+            # Range (positive floats sort like their bits) and block in one integer give one exact minimum in any order.
             hit = (t < torch.inf).nonzero()[:, 0]
             pair, offset = take(pair, hit), take(offset, hit)
             key = (take(t, hit).view(torch.int32).long() << 32) | take(block, pair)
@@ -162,7 +162,7 @@ def nearest_hits(
 
 
 def _expand(counts: Tensor) -> tuple[Tensor, Tensor]:
-    """Row i repeated counts[i] times: the row numbers, and 0 ... counts[i] - 1 within each row."""
+    """Repeat row i counts[i] times: the row indices, and 0 ... counts[i] - 1 within each row."""
     row = torch.repeat_interleave(torch.arange(len(counts), device=counts.device), counts)
     return row, torch.arange(len(row), device=counts.device) - take(counts.cumsum(0) - counts, row)
 
@@ -175,7 +175,7 @@ def take(values: Tensor, index: Tensor) -> Tensor:
 def _covered_blocks(
     T_solid_sensor: Tensor, half_size: Tensor, azimuth: Tensor, elevation: Tensor, max_range: float
 ) -> Blocks:
-    """One block per solid, outside which no ray can meet its bounding box."""
+    """One block per solid, which holds all rays that can meet its bounding box."""
     signs = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0], dtype=torch.float64, device=azimuth.device)] * 3)
     corners = signs * half_size[:, None] - T_solid_sensor[:, None, :3, 3]
     x, y, z = (corners @ T_solid_sensor[:, :3, :3]).unbind(-1)  # (P, 8) each, sensor frame
@@ -191,7 +191,7 @@ def _covered_blocks(
     low, high = (((middle + s - azimuth[0]) / step) for s in (side.amin(1), side.amax(1)))
     first_column = (low - 1e-6).ceil().long()
     num_columns = (high + 1e-6).floor().long() - first_column + 1
-    # Corners spread over half a turn or more: the sensor's axis passes through the solid, all columns see it.
+    # If the corners span half a revolution, the sensor's axis passes through the solid, and every column can meet it.
     around = (high - low) * step > math.pi - 1e-6
     num_columns = torch.where(around, len(azimuth), num_columns).clamp(0, len(azimuth))
     num_columns = num_columns.masked_fill(nearest > max_range, 0)
@@ -206,7 +206,7 @@ def _covered_blocks(
 
 
 def _hit_cube(origin: Tensor, direction: Tensor) -> Tensor:
-    """(M,) range at which rays (3, M) enter the cube |x|, |y|, |z| <= 1, inf = never."""
+    """(M,) range at which rays (3, M) enter the cube |x|, |y|, |z| <= 1, inf = no hit."""
     inverse = direction.reciprocal()
     centre, half = -origin * inverse, inverse.abs()
     enter, leave = (centre - half).amax(0), (centre + half).amin(0)
@@ -214,7 +214,7 @@ def _hit_cube(origin: Tensor, direction: Tensor) -> Tensor:
 
 
 def _hit_cylinder(origin: Tensor, direction: Tensor) -> Tensor:
-    """(M,) range at which rays (3, M) enter the cylinder x^2 + y^2 <= 1, |z| <= 1, inf = never."""
+    """(M,) range at which rays (3, M) enter the cylinder x^2 + y^2 <= 1, |z| <= 1, inf = no hit."""
     enter, leave = _chord(origin[:2], direction[:2])
     inverse = direction[2].reciprocal()
     centre, half = -origin[2] * inverse, inverse.abs()
@@ -223,7 +223,7 @@ def _hit_cylinder(origin: Tensor, direction: Tensor) -> Tensor:
 
 
 def _hit_ball(origin: Tensor, direction: Tensor) -> Tensor:
-    """(M,) range at which rays (3, M) enter the unit ball, inf = never."""
+    """(M,) range at which rays (3, M) enter the unit ball, inf = no hit."""
     enter, _ = _chord(origin, direction)
     return torch.where(enter > 0, enter, torch.inf)
 
@@ -232,18 +232,18 @@ def _chord(origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
     """Ranges at which rays enter and leave |x| <= 1 (circle or ball); NaN where they pass by."""
     a = (direction * direction).sum(0)
     to_nearest = -(origin * direction).sum(0) / a
-    # Via the nearest point, not the discriminant: exact in float32 even for a small ball far away.
+    # The nearest point, unlike the discriminant, is accurate in float32 even for a small ball far away.
     nearest = origin + to_nearest * direction
     half = ((1 - (nearest * nearest).sum(0)) / a).sqrt()
     return to_nearest - half, to_nearest + half
 
 
 def incidence(solids: Solids, T_solid_sensor: Tensor, solid: Tensor, rays: Tensor, distance: Tensor) -> Tensor:
-    """Cosine of the angle between rays and the normals of what they hit.
+    """Cosine of the angle between rays and the normals of the surfaces that they hit.
 
     Args:
         T_solid_sensor: (P, 4, 4) float64, sensor coordinates to the solid's.
-        solid: (N,) int64, what was hit.
+        solid: (N,) int64, the solid that was hit.
         rays: (3, N) float32 unit vectors, sensor frame.
         distance: (N,) float32 range of the hit, metres.
 
@@ -263,7 +263,7 @@ def cosine_of_incidence(kind: Tensor, at: Tensor, direction: Tensor, inverse_hal
 
     Args:
         kind: (N,) int64, of the solid.
-        at: (3, N) float32, where it was hit, unit coordinates of the solid.
+        at: (3, N) float32, the point that was hit, unit coordinates of the solid.
         direction: (3, N) float32 unit vectors, axes of the solid.
         inverse_half: (3, N) float32, 1 / half size of the solid.
 
@@ -273,6 +273,6 @@ def cosine_of_incidence(kind: Tensor, at: Tensor, direction: Tensor, inverse_hal
     magnitude = at.abs()
     face = (magnitude == magnitude.amax(0)) * at  # normal of the cube
     is_cap = magnitude[2] * magnitude[2] > at[0] * at[0] + at[1] * at[1]
-    sideways = torch.stack([~is_cap, ~is_cap, is_cap]) * at
-    normal = torch.where(kind == BOX, face, torch.where(kind == CYLINDER, sideways, at)) * inverse_half
+    side_or_cap = torch.stack([~is_cap, ~is_cap, is_cap]) * at
+    normal = torch.where(kind == BOX, face, torch.where(kind == CYLINDER, side_or_cap, at)) * inverse_half
     return (normal * direction).sum(0).abs() / (normal * normal).sum(0).clamp(min=1e-12).sqrt()

@@ -1,4 +1,4 @@
-"""What a writer of a format needs of a drive: all that its LiDARs, its odometry and its annotators saw."""
+"""The interface between simulated drives and the writers of data formats."""
 
 from __future__ import annotations
 
@@ -46,17 +46,17 @@ class GroundRaster:
 
 @dataclass(frozen=True)
 class UnitReturns:
-    """What one LiDAR of the vehicle received in one sweep: N returns, shot by shot.
+    """The N returns of one LiDAR of the vehicle in one sweep, shot by shot.
 
     Args:
         name: the unit's name in the data set, for example "LIDAR_TOP".
         T_ego_sensor: (4, 4) float64, coordinates of the unit to those of the ego frame.
-        points: (N, 3) float32, metres, frame of the UNIT, after whatever motion compensation the data set does.
+        points: (N, 3) float32, metres, frame of the UNIT, after the motion compensation of the data set.
         ring: (N,) int32, row of the unit's table of elevations; row 0 is the lowest beam.
-        column: (N,) int32, number of the azimuth step in the order of time.
+        column: (N,) int32, index of the azimuth step in the order of time.
         offset_ns: (N,) int64, time of the shot after the sweep's time stamp; may be negative.
         intensity: (N,) uint8.
-        radial_velocity: (N,) float32, m/s, of the thing that was hit, over ground, along the ray; positive = receding.
+        radial_velocity: (N,) float32, m/s, of the surface that was hit, over ground along the ray; positive = receding.
         num_rings, num_columns: size of the unit's range image.
     """
 
@@ -73,7 +73,7 @@ class UnitReturns:
 
 
 class Recording(Log, Protocol):
-    """A drive as a writer sees it: a log with exact ground masks and truth, and what follows."""
+    """A log with all data that writers need: ground masks, truth, calibration, returns per LiDAR, and boxes."""
 
     poses: np.ndarray
     """(num_sweeps, 4, 4) float64 `T_world_ego` at each time stamp."""
@@ -81,8 +81,8 @@ class Recording(Log, Protocol):
     """Sensor name -> (4, 4) float64 `T_ego_sensor`."""
 
     def units(self, index: int) -> Sequence[UnitReturns]:
-        """The LiDARs of sweep `index`. Their points, moved to the ego frame and put one after the other in this order,
-        are the rows of `sweep(index)` and of `labels(index)`."""
+        """Returns of each LiDAR in sweep `index`. Their points, transformed to the ego frame and concatenated in this
+        order, are the rows of `sweep(index)` and of `labels(index)`."""
 
     def elevations(self, unit: str) -> np.ndarray:
         """(num_rings,) float64 radians, elevation of each ring of a unit, lowest first."""
@@ -91,7 +91,7 @@ class Recording(Log, Protocol):
         """Annotation boxes of sweep `index`, ego frame, category by Argoverse 2 name."""
 
     def channels(self, index: int) -> Mapping[str, np.ndarray]:
-        """(N,) uint8 intensity, uint8 laser_number, int32 offset_ns of every point; Argoverse 2 alone stores them."""
+        """(N,) uint8 intensity, uint8 laser_number, int32 offset_ns of every point; only Argoverse 2 stores them."""
 
     def ground_raster(self) -> GroundRaster:
-        """Ground height of the whole drive, likewise."""
+        """Ground height of the whole drive; only Argoverse 2 stores it."""

@@ -1,4 +1,4 @@
-"""Rays of a LiDAR that turns while its vehicle and all the others move: every column has its own time."""
+"""Rays of a LiDAR in a rolling sweep: every column has its own time, and vehicle and bodies move during the sweep."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from torch import Tensor
 from cflow_torch.simulator.moving_solids import MovingSolids, rotate
 from cflow_torch.simulator.raycast import ELLIPSOID, Blocks, UnitRays, cosine_of_incidence, take
 
-_ROUNDS = 2  # of "when is the solid swept?", "where is it then?": each divides the error by 6 or more
+_ROUNDS = 2  # that find the column which meets a solid, and the solid's pose then; each divides the error by 6 or more
 
 
 @dataclass(frozen=True)
 class Shots:
-    """The columns that a unit fires in one sweep.
+    """The columns of shots of a unit in one sweep.
 
     Args:
         azimuth: (C,) float64 radians, evenly spaced in the order of time, sensor frame.
         seconds: (C,) float64, evenly spaced.
         T_world_sensor: (C, 4, 4) float64, relative to the `origin` of the solids.
         elevation: (B,) float64 radians, ascending.
-        speed: (2,) m/s and rad/s that the unit does not exceed.
+        speed: (2,) upper bounds of the unit's motion, m/s and rad/s.
     """
 
     azimuth: Tensor
@@ -34,22 +34,22 @@ class Shots:
 
     @property
     def directions(self) -> tuple[Tensor, Tensor]:
-        """(3, C, 1) float32 world parts of the directions: sideways * cos(elevation) + up * sin(elevation)."""
+        """`level` and `up`, (3, C, 1) float32, world axes. Directions: level * cos(elevation) + up * sin(elevation)."""
         R = self.T_world_sensor[:, :3, :3]
-        sideways = R[:, :, 0] * self.azimuth.cos()[:, None] + R[:, :, 1] * self.azimuth.sin()[:, None]
-        return sideways.T.float()[..., None], R[:, :, 2].T.float()[..., None]
+        level = R[:, :, 0] * self.azimuth.cos()[:, None] + R[:, :, 1] * self.azimuth.sin()[:, None]
+        return level.T.float()[..., None], R[:, :, 2].T.float()[..., None]
 
 
 def covered_blocks(solids: MovingSolids, shots: Shots, max_range: float) -> Blocks:
-    """Blocks of the range image outside which no ray can meet a solid's bounding box (a ball's bounding sphere).
+    """Blocks of the range image that hold all rays which can meet a solid's bounding box (bounding sphere of a ball).
 
     Convention: a solid near the azimuth at which the sweep begins has a block at the beginning and one at the end.
     """
     num_columns = len(shots.azimuth)
     step = float(shots.azimuth[1] - shots.azimuth[0])
     interval = float(shots.seconds[1] - shots.seconds[0])
-    whole_turn = 2 * math.pi / abs(step)
-    # Where the solid's bounding sphere is in mid-sweep, and how far that may be wrong at the time of a shot.
+    revolution = 2 * math.pi / abs(step)
+    # The bounding sphere of the solid in mid-sweep, and how far it may have moved at the time of a shot.
     middle = num_columns // 2
     centre, speed = solids.centres
     late = abs(float(shots.seconds[middle] - solids.middle)) + 0.5 * interval * num_columns
@@ -63,12 +63,12 @@ def covered_blocks(solids: MovingSolids, shots: Shots, max_range: float) -> Bloc
     slack = (travel / distance).clamp(max=1).asin() + late * shots.speed[1]
     height = torch.atan2(z, rho)
     is_seen = (height + slack > shots.elevation[0]) & (height - slack < shots.elevation[-1])
-    column = ((torch.atan2(y, x) - shots.azimuth[0]) / step) % whole_turn
-    # Near the sensor's axis the azimuth means little.
+    column = ((torch.atan2(y, x) - shots.azimuth[0]) / step) % revolution
+    # The azimuth is not reliable near the sensor's axis.
     slack = torch.where(rho < 2 * travel, math.pi, 2 * slack).clamp(max=math.pi) / abs(step)
     solid, guess = [], []
-    for turn in (-1, 0, 1):
-        shifted = column + turn * whole_turn
+    for shift in (-revolution, 0, revolution):
+        shifted = column + shift
         chosen = (is_seen & (shifted + slack >= 0) & (shifted - slack < num_columns)).nonzero()[:, 0]
         solid.append(near[chosen])
         guess.append(shifted[chosen])
@@ -78,24 +78,25 @@ def covered_blocks(solids: MovingSolids, shots: Shots, max_range: float) -> Bloc
 def _blocks_near(
     solids: MovingSolids, shots: Shots, solid: Tensor, guess: Tensor, speed: Tensor, max_range: float
 ) -> Blocks:
-    """Blocks of `solid` (E,) that are swept about column `guess` (E,)."""
+    """Blocks of `solid` (E,), which the unit meets near column `guess` (E,)."""
     num_columns = len(shots.azimuth)
     step = float(shots.azimuth[1] - shots.azimuth[0])
     interval = float(shots.seconds[1] - shots.seconds[0])
     num_around = 2 * math.pi / abs(step)
     half = solids.half_size[solid]
     for _ in range(_ROUNDS):
-        at = guess.round().long().clamp(0, num_columns - 1)
-        T_world_sensor = shots.T_world_sensor.index_select(0, at)
-        place, _ = solids.at(solid, take(shots.seconds, at))
-        rotation = place[:, :, :3] @ T_world_sensor[:, :3, :3]  # sensor axes to the solid's
-        centre = rotate(rotation.transpose(1, 2), -(rotate(place[:, :, :3], T_world_sensor[:, :3, 3]) + place[..., 3]))
+        column = guess.round().long().clamp(0, num_columns - 1)
+        T_world_sensor = shots.T_world_sensor.index_select(0, column)
+        to_solid, _ = solids.at(solid, take(shots.seconds, column))
+        rotation = to_solid[:, :, :3] @ T_world_sensor[:, :3, :3]  # sensor axes to the solid's
+        origin = rotate(to_solid[:, :, :3], T_world_sensor[:, :3, 3]) + to_solid[..., 3]  # of the sensor, in the solid
+        centre = rotate(rotation.transpose(1, 2), -origin)
         azimuth = torch.atan2(centre[:, 1], centre[:, 0])
         expected = shots.azimuth[0] + step * guess
         guess = guess + torch.remainder((azimuth - expected) / step + 0.5 * num_around, num_around) - 0.5 * num_around
 
     rho = torch.hypot(centre[:, 0], centre[:, 1])
-    spread = half.amax(1)  # of a ball about its middle, horizontally; corners of the others below
+    spread = half.amax(1)  # horizontal radius of a ball; that of boxes and cylinders follows from their corners
     low, high, side = centre[:, 2] - spread, centre[:, 2] + spread, (spread / rho.clamp(min=1e-6)).clamp(max=1).asin()
     side = torch.stack([-side, side])
     cornered = (solids.kind[solid] != ELLIPSOID).nonzero()[:, 0]
@@ -109,7 +110,7 @@ def _blocks_near(
         corner_side = torch.atan2(y * cos - x * sin, x * cos + y * sin)
         side[:, cornered] = torch.stack([corner_side.amin(1), corner_side.amax(1)])
 
-    # The solid moves while it is swept, by no more than `drift` from where it was in the middle of that time.
+    # While its block is measured, the solid moves by at most `drift` from its position in the middle of that time.
     width = (side[1] - side[0]).clamp(max=2 * math.pi)
     relative = speed[solid] + shots.speed[0] + shots.speed[1] * centre.norm(dim=1)
     drift = relative * interval * (0.6 * width / abs(step) + 2)
@@ -124,7 +125,7 @@ def _blocks_near(
     end = torch.where(around, num_columns, end).clamp(0, num_columns)
     count = (end - first).clamp(min=0).masked_fill(nearest > max_range, 0)
 
-    # A solid that is seen all around can come nearer by all that it moves in a sweep.
+    # A solid around the sensor's axis can come nearer by its motion during the whole sweep.
     whole = torch.where(around, relative * interval * num_columns, drift)
     nearest = torch.where(around, 1e-6, nearest)
     bottom, top = low - whole, high + whole
@@ -136,49 +137,49 @@ def _blocks_near(
 
 
 class RollingRays:
-    """The rays of a sweep as the solids of its blocks see them: `rays_at` of `raycast.nearest_hits`."""
+    """The rays of a sweep in unit coordinates of the solids of its blocks: `rays_at` of `raycast.nearest_hits`."""
 
     def __init__(self, solids: MovingSolids, shots: Shots, blocks: Blocks) -> None:
         middle = blocks.first_column + blocks.num_columns // 2
         seconds = shots.seconds[middle.clamp(0, len(shots.seconds) - 1)]
-        place, change = solids.at(blocks.solid, seconds)
+        to_solid, change = solids.at(blocks.solid, seconds)
         half = solids.half_size[blocks.solid][..., None]
-        # A block is swept in milliseconds: what moves, moves evenly.
-        self._to_unit = (place / half).flatten(1).T.float().contiguous()  # (12, E)
+        # A block is measured within milliseconds, in which the velocity is constant.
+        self._to_unit = (to_solid / half).flatten(1).T.float().contiguous()  # (12, E)
         self._change = (change / half).flatten(1).T.float().contiguous()
         self._moves = solids.row[blocks.solid] >= 0
         self._kind = solids.kind[blocks.solid]
         self._inverse_half = solids.half_size[blocks.solid].reciprocal().T.float().contiguous()
         self._cos_elevation, self._sin_elevation = shots.elevation.cos().float(), shots.elevation.sin().float()
         self._seconds, self._block_seconds = shots.seconds, seconds
-        sideways, up = shots.directions
-        self._columns = torch.cat([shots.T_world_sensor[:, :3, 3].T.float(), sideways[..., 0], up[..., 0]])  # (9, C)
+        level, up = shots.directions
+        self._columns = torch.cat([shots.T_world_sensor[:, :3, 3].T.float(), level[..., 0], up[..., 0]])  # (9, C)
 
     def __call__(self, block: Tensor, column: Tensor) -> UnitRays:
         matrix = take(self._to_unit, block)
         moving = take(self._moves, block).nonzero()[:, 0]
         if len(moving):
-            swept = take(block, moving)
-            lag = (take(self._seconds, take(column, moving)) - take(self._block_seconds, swept)).float()
-            matrix.index_add_(1, moving, take(self._change, swept) * lag)
+            of_moving = take(block, moving)
+            lag = (take(self._seconds, take(column, moving)) - take(self._block_seconds, of_moving)).float()
+            matrix.index_add_(1, moving, take(self._change, of_moving) * lag)
         matrix = matrix.view(3, 4, -1)
-        columns = take(self._columns, column).view(3, 3, -1)  # origin, sideways, up
-        origin, sideways, up = (
+        columns = take(self._columns, column).view(3, 3, -1)  # origin, level, up
+        origin, level, up = (
             matrix[:, 0] * column[0] + matrix[:, 1] * column[1] + matrix[:, 2] * column[2] for column in columns
         )
-        return UnitRays(origin + matrix[:, 3], sideways, up)
+        return UnitRays(origin + matrix[:, 3], level, up)
 
     def incidence(self, block: Tensor, column: Tensor, beam: Tensor, distance: Tensor) -> Tensor:
-        """Cosine of the angle between rays and the normals of what they hit.
+        """Cosine of the angle between rays and the normals of the surfaces that they hit.
 
         Args:
-            block, column, beam: (N,) int64, the block of what was hit, and the ray that did.
+            block, column, beam: (N,) int64, the block of the solid that was hit, and the ray.
             distance: (N,) float32 range of the hit, metres.
 
         Returns:
             (N,) float32 in [0, 1].
         """
         rays, inverse_half = self(block, column), take(self._inverse_half, block)
-        direction = rays.sideways * take(self._cos_elevation, beam) + rays.up * take(self._sin_elevation, beam)
+        direction = rays.level * take(self._cos_elevation, beam) + rays.up * take(self._sin_elevation, beam)
         at = rays.origin + direction * distance
         return cosine_of_incidence(take(self._kind, block), at, direction / inverse_half, inverse_half)

@@ -1,4 +1,4 @@
-"""A scene: ground, ego way and bodies; and where every solid is at any time."""
+"""A scene: the ground, the route of the recording vehicle, bodies, and the poses of all solids at any time."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class SolidTable:
     """The solids of all bodies, one row each; columns as in `objects.Solid`.
 
     Args:
-        body: (P,) int64, the body a solid belongs to.
+        body: (P,) int64, index of the body that a solid belongs to.
     """
 
     body: np.ndarray
@@ -36,7 +36,7 @@ class SolidTable:
 
     @classmethod
     def of(cls, bodies: tuple[Body, ...]) -> SolidTable:
-        """Solids in the order of the bodies."""
+        """List the solids in the order of the bodies."""
         body = np.repeat(np.arange(len(bodies)), [len(b.solids) for b in bodies])
         return cls(body, *(np.array(column) for column in zip(*(solid for b in bodies for solid in b.solids))))
 
@@ -46,11 +46,12 @@ class Scene:
     """A street with traffic.
 
     Args:
-        ground: what everything stands on.
-        ego: way of the recording car's rear axle.
+        ground: the ground.
+        ego: route of the recording vehicle's rear axle.
         bodies: everything else.
         table: the solids of the bodies.
-        num_own: so many of the last bodies are the recording vehicle itself: they hide things but return no light.
+        num_own: number of bodies, the last ones, that are the recording vehicle itself. They occlude other bodies, but
+            have no returns.
     """
 
     ground: Ground
@@ -60,7 +61,7 @@ class Scene:
     num_own: int = 0
 
     def with_own(self, own: Sequence[Body]) -> Scene:
-        """The scene with the recording vehicle in it."""
+        """The scene with the recording vehicle added."""
         bodies = (*self.bodies, *own)
         return Scene(self.ground, self.ego, bodies, SolidTable.of(bodies), len(own))
 
@@ -69,47 +70,48 @@ class Scene:
         paths = np.stack([body.trajectory(seconds) for body in self.bodies], 1)
         return self.ground.pose(paths[..., 0], paths[..., 1], paths[..., 2])
 
-    def movers(self) -> tuple[Scene, np.ndarray]:
-        """The scene with nothing but what moves, and (P',) int64 the number in this scene of each of its solids."""
-        bodies = np.array([not body.is_static for body in self.bodies])
-        chosen = tuple(body for body, moves in zip(self.bodies, bodies) if moves)
+    def dynamic_part(self) -> tuple[Scene, np.ndarray]:
+        """The scene reduced to its moving bodies, and (P',) int64 index in this scene of each of its solids."""
+        is_dynamic = np.array([not body.is_static for body in self.bodies])
+        chosen = tuple(body for body, moves in zip(self.bodies, is_dynamic) if moves)
         scene = Scene(self.ground, self.ego, chosen, SolidTable.of(chosen))
-        return scene, np.flatnonzero(bodies[self.table.body])
+        return scene, np.flatnonzero(is_dynamic[self.table.body])
 
     def solids(self, seconds: float, body_poses: np.ndarray) -> Solids:
         """All solids at one time.
 
         Args:
-            seconds: time, moves the legs.
+            seconds: time, which moves the legs.
             body_poses: (num_bodies, 4, 4) float64 `T_world_body` at that time.
         """
         table = self.table
-        # In the body: turn about x, about y, move to the place; a leg then swings about the y axis through the hip.
+        # In the body: rotate about x, about y, move to the centre; a leg then swings about the y axis through the hip.
         angle = table.swing * np.sin(2 * math.pi * table.stride * seconds + table.phase)
-        place = _turn_y(table.pitch) @ _turn_x(table.roll)
-        place[:, :3, 3] = table.centre - np.where(angle[:, None] == 0, 0, (0, 0, HIP))
-        place = _turn_y(angle) @ place
-        place[:, :3, 3] += np.where(angle[:, None] == 0, 0, (0, 0, HIP))
+        hip = np.where(angle[:, None] == 0, 0, (0, 0, HIP))
+        pose = _rotation_y(table.pitch) @ _rotation_x(table.roll)
+        pose[:, :3, 3] = table.centre - hip
+        pose = _rotation_y(angle) @ pose
+        pose[:, :3, 3] += hip
         return Solids(
             torch.from_numpy(table.kind),
-            torch.from_numpy(body_poses[table.body] @ place),
+            torch.from_numpy(body_poses[table.body] @ pose),
             torch.from_numpy(table.half),
             torch.from_numpy(table.albedo).float(),
             torch.from_numpy(table.is_foliage),
         )
 
 
-def _turn_x(angle: np.ndarray) -> np.ndarray:
-    turn = np.tile(np.eye(4), (len(angle), 1, 1))
-    turn[:, 1, 1] = turn[:, 2, 2] = np.cos(angle)
-    turn[:, 2, 1] = np.sin(angle)
-    turn[:, 1, 2] = -turn[:, 2, 1]
-    return turn
+def _rotation_x(angle: np.ndarray) -> np.ndarray:
+    rotation = np.tile(np.eye(4), (len(angle), 1, 1))
+    rotation[:, 1, 1] = rotation[:, 2, 2] = np.cos(angle)
+    rotation[:, 2, 1] = np.sin(angle)
+    rotation[:, 1, 2] = -rotation[:, 2, 1]
+    return rotation
 
 
-def _turn_y(angle: np.ndarray) -> np.ndarray:
-    turn = np.tile(np.eye(4), (len(angle), 1, 1))
-    turn[:, 0, 0] = turn[:, 2, 2] = np.cos(angle)
-    turn[:, 0, 2] = np.sin(angle)
-    turn[:, 2, 0] = -turn[:, 0, 2]
-    return turn
+def _rotation_y(angle: np.ndarray) -> np.ndarray:
+    rotation = np.tile(np.eye(4), (len(angle), 1, 1))
+    rotation[:, 0, 0] = rotation[:, 2, 2] = np.cos(angle)
+    rotation[:, 0, 2] = np.sin(angle)
+    rotation[:, 2, 0] = -rotation[:, 0, 2]
+    return rotation

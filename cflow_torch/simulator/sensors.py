@@ -1,4 +1,4 @@
-"""What a sensor profile says: which beams a LiDAR has, where it sits, when it fires and how well it measures."""
+"""Sensor profiles: the beams of a LiDAR, its mounting, its firing times, and the quality of its measurements."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ import numpy as np
 
 @dataclass(frozen=True)
 class SpinningLidar:
-    """One unit that sweeps a column of beams about its z axis, all round or over a fan.
+    """One unit that sweeps a column of beams about its z axis, over a full revolution or over a fan.
 
     Args:
-        name: sensor name, as a log's calibration table has it.
+        name: sensor name, as in a log's calibration table.
         elevations: (B,) degrees above the sensor's xy plane, by laser number.
         num_columns: firings per sweep, evenly spaced in azimuth and time.
         position: (3,) metres in the ego frame.
         yaw: degrees about z of the ego frame.
-        upside_down: turned by 180 degrees about its x axis before pitch and yaw.
-        pitch: degrees about y before the yaw, positive = looking down.
+        upside_down: rotated by 180 degrees about its x axis before pitch and yaw.
+        pitch: degrees about y before the yaw, positive = downwards.
         start: azimuth in the sensor frame at which a sweep begins, degrees: the outer edge of the first column.
         span: degrees of azimuth per sweep, positive = counter-clockwise about the sensor's z axis.
-        seen: first column that fires and the one after the last; None = all. The image keeps its `num_columns`; columns
-            below 0 are those at its end, but fire before column 0.
-        has_jitter: each sweep begins up to a column early, as a free-running motor does; else on a fixed grid.
-        is_virtual: the shots are given as if the vehicle had stood still at the time stamp (Waymo's small LiDARs).
-        max_range, reach, dropout: as in `LidarProfile`, where the unit differs from it.
+        seen: first column that fires and the one after the last; None = all. The image keeps its `num_columns`.
+            Negative columns are those at its end, but they fire before column 0.
+        has_jitter: each sweep begins up to a column early, like a free-running motor; False = on a fixed grid.
+        is_virtual: the shots are given as if the vehicle had been static at the time stamp (Waymo's small LiDARs).
+        max_range, reach, dropout: values of this unit, None = those of the `LidarProfile`.
     """
 
     name: str
@@ -58,22 +58,23 @@ class SpinningLidar:
 
 @dataclass(frozen=True)
 class LidarProfile:
-    """All LiDARs of a vehicle and their common quality.
+    """All LiDARs of a vehicle, and their common quality.
 
     Args:
-        units: the sensors; laser numbers run on from unit to unit.
+        units: the sensors; laser numbers continue from unit to unit.
         min_range, max_range: metres; returns outside are lost.
         range_noise: standard deviation along the ray, metres.
         dropout: probability that a return is lost, whatever it hit.
-        reach: metres at which a white surface that faces the sensor is still seen half of the time.
-        sweep_interval_ns: time from sweep to sweep, and how long one takes.
-        is_rolling: every shot has its own time, and all moves meanwhile; else the world freezes at the time stamp.
-        reference: where in the sweep its time stamp lies: 0 = first shot, 1 = one column after the last.
+        reach: metres at which a white surface that faces the sensor is detected half of the time.
+        sweep_interval_ns: time from sweep to sweep, and duration of a sweep.
+        is_rolling: every shot has its own time, and the scene moves during the sweep. False = all shots are taken at
+            the time stamp.
+        reference: position of the time stamp in the sweep: 0 = first shot, 1 = one column after the last.
         is_deskewed: points are moved by the motion of the ego vehicle from the time of their shot to the time stamp.
         ego_height: of the ego frame's origin above the ground, metres.
-        has_trailer: the vehicle is an articulated truck; what hits the truck itself is lost.
+        has_trailer: the vehicle is an articulated truck; returns from the truck itself are lost.
         velocity_noise: standard deviation of the radial velocity, m/s.
-        extinction: share of the light that air takes per metre.
+        extinction: share of the light that the air absorbs per metre.
     """
 
     units: tuple[SpinningLidar, ...]

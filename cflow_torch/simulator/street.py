@@ -1,7 +1,7 @@
-"""The layout: two streets that cross, their fixed things and their traffic, drawn at random from one generator.
+"""Two streets that cross, with buildings, trees and traffic, drawn at random from one generator.
 
 The main street runs along x (right-hand traffic, two lanes a side), the cross street along y at `crossing_x`. The ego
-car comes along the main street and turns left. Traffic is laid out so that it does not collide for the first seconds.
+car comes along the main street and turns left. Vehicles do not collide during the first seconds.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ REACH = 110.0  # how far the streets are furnished, metres
 
 
 def build_street(rng: np.random.Generator) -> Scene:
-    """A scene drawn from `rng`."""
+    """Draw a scene from `rng`."""
     bend = float(rng.choice((-1, 1)) * rng.uniform(2e-4, 7e-4))
     ground = Ground(slope=(rng.uniform(-0.03, 0.03), rng.uniform(-0.02, 0.02)), curvature=bend)
     crossing = ground.crossing_x
@@ -33,7 +33,7 @@ def build_street(rng: np.random.Generator) -> Scene:
 
 
 def lane(rng: np.random.Generator, y: float, heading: float, speed: float, *xs: float) -> Iterator[Body]:
-    """Cars in a lane along x, all at one speed."""
+    """Cars in a lane along x, all at the same speed."""
     for x in xs:
         route = Route(x + rng.uniform(-1.2, 1.2), y + rng.uniform(-0.12, 0.12), heading, speed=speed)
         yield objects.car(rng, route)
@@ -41,14 +41,14 @@ def lane(rng: np.random.Generator, y: float, heading: float, speed: float, *xs: 
 
 def _traffic(rng: np.random.Generator, crossing: float) -> Iterator[Body]:
     """Cars, a bus, an articulated truck and cyclists on the road."""
-    # Eastbound: fast cars ahead and far, one behind the ego car, a bus and a car in the outer lane.
+    # Eastbound: fast cars far ahead, one behind the ego car, a bus and a car in the outer lane.
     yield from lane(rng, -1.6, EAST, rng.uniform(15, 20), crossing + 14, crossing + 29, crossing + 45)
     yield from lane(rng, -1.6, EAST, 4.5, -14)
     yield from lane(rng, -4.6, EAST, rng.uniform(9, 14), crossing + 35, crossing + 50)
     bus_speed = rng.uniform(3, 6)
     yield objects.bus(Route(-11.0, -4.6, EAST, speed=bus_speed))
     yield from lane(rng, -4.6, EAST, bus_speed, -26, -38)
-    # Westbound: beyond the crossing on their way out, before it waiting.
+    # Westbound: cars that leave beyond the crossing, and cars that wait before it.
     yield from lane(rng, 1.6, WEST, rng.uniform(8, 13), 5, -14, -31, -52)
     yield from lane(rng, 4.6, WEST, rng.uniform(6, 10), -6, -24, -42)
     yield from lane(rng, 1.6, WEST, 0.0, crossing + 14, crossing + 21.5, crossing + 29)
@@ -59,13 +59,13 @@ def _traffic(rng: np.random.Generator, crossing: float) -> Iterator[Body]:
     yield objects.car(rng, route)
     route = Route(crossing + 1.75, -4.6 - 12, NORTH, rng.uniform(5, 10), rng.uniform(3, 5), 12.0, -math.pi / 2)
     yield from objects.articulated_truck(route)
-    # Cyclists keep to the edge, a hand's breadth from parked cars.
+    # Cyclists keep to the edge, close to parked cars.
     for x, y, heading in ((6.0, -6.05, EAST), (crossing + 3.6, 18.0, NORTH), (crossing + 33, -6.05, EAST)):
         yield objects.cyclist(rng, Route(x, y, heading, rng.uniform(-1, 1), rng.uniform(4.5, 7)))
 
 
 def _people(rng: np.random.Generator, crossing: float) -> Iterator[Body]:
-    """Pedestrians: along the houses, in a group, across the street; some stand."""
+    """Pedestrians along the houses, in a group, and across the street; some do not move."""
     for side in (-1, 1):
         for x in rng.uniform(-35, 65, size=7):
             if abs(x - crossing) > 8:
@@ -87,13 +87,13 @@ def _parked(rng: np.random.Generator, ground: Ground) -> Iterator[Body]:
     (main, cross), crossing = ground.half_widths, ground.crossing_x
     for along in np.arange(-60, 85, 6.4).tolist():
         for side in (-1, 1):
-            way = (along + rng.uniform(-0.4, 0.4), side * (main - 1.05), EAST + rng.uniform(-0.02, 0.02))
+            pose = (along + rng.uniform(-0.4, 0.4), side * (main - 1.05), EAST + rng.uniform(-0.02, 0.02))
             behind_hoarding = side > 0 and -36 < along < -12
             if rng.uniform() < 0.6 and abs(along - crossing) > 17 and not behind_hoarding:
-                yield objects.car(rng, Route(*way))
-            way = (crossing + side * (cross - 1.1), along + rng.uniform(-0.4, 0.4), NORTH + rng.uniform(-0.02, 0.02))
+                yield objects.car(rng, Route(*pose))
+            pose = (crossing + side * (cross - 1.1), along + rng.uniform(-0.4, 0.4), NORTH + rng.uniform(-0.02, 0.02))
             if rng.uniform() < 0.6 and abs(along) > 19:
-                yield objects.car(rng, Route(*way))
+                yield objects.car(rng, Route(*pose))
 
 
 def _fixed(rng: np.random.Generator, ground: Ground) -> Iterator[Body]:
@@ -128,12 +128,12 @@ def furniture(rng: np.random.Generator, ground: Ground) -> Iterator[Body]:
 
 
 def houses(rng: np.random.Generator, ground: Ground) -> Iterator[Body]:
-    """Rows of fronts behind the pavements, with gaps and set-backs."""
+    """Rows of houses behind the pavements, with gaps and set-backs."""
     (main, cross), crossing = ground.half_widths, ground.crossing_x
     main_front, cross_front, depth = main + PAVEMENT, cross + PAVEMENT, 8.0
 
     def row(begin: float, end: float) -> Iterator[tuple[float, float, float]]:
-        """(middle, width, set-back) of house after house."""
+        """(middle, width, set-back) of each house of a row."""
         while begin < end:
             width = rng.uniform(6, 12)
             if rng.uniform() < 0.85:

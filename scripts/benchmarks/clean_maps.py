@@ -40,7 +40,7 @@ from cflow_torch.simulator import objects
 from cflow_torch.simulator.drive import Drive
 from cflow_torch.simulator.ground import Ground
 from cflow_torch.simulator.objects import Route
-from cflow_torch.simulator.profiles import get_profile
+from cflow_torch.simulator.profiles import PROFILES
 from cflow_torch.simulator.scene import Scene, SolidTable
 
 DUFO = {"d_p 2": (0.1, 0.2, 2), "d_p 1": (0.1, 0.2, 1)}
@@ -77,7 +77,7 @@ def light(num_sweeps: int) -> SimulatedLog:
     bodies = (*(objects.car(rng, way) for way in ways), objects.wall(10, 12, 60, 6, 8), objects.wall(10, -12, 60, 6, 8))
     scene = Scene(Ground((0.0, 0.0), 0.0), Route(-6, 0, speed=2), bodies, SolidTable.of(bodies))
     log = SimulatedLog("av2", 0, "street", num_sweeps)
-    log.drive = Drive(scene, get_profile("av2"), 0, num_sweeps, "light")
+    log.drive = Drive(scene, PROFILES["av2"], 0, num_sweeps, "light")
     return log
 
 

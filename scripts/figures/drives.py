@@ -15,7 +15,7 @@ from cflow_torch.simulator import objects
 from cflow_torch.simulator.drive import Drive
 from cflow_torch.simulator.ground import Ground
 from cflow_torch.simulator.objects import Body, Route, Solid, box
-from cflow_torch.simulator.profiles import get_profile
+from cflow_torch.simulator.profiles import PROFILES
 from cflow_torch.simulator.raycast import CYLINDER
 from cflow_torch.simulator.scene import Scene, SolidTable
 
@@ -50,7 +50,7 @@ def drive_past(
 ) -> Drive:
     """A drive past bodies, straight on if `way` does not say otherwise."""
     scene = Scene(ground, Route(0, 0, speed=speed, **way), tuple(bodies), SolidTable.of(tuple(bodies)))
-    return Drive(scene, get_profile(profile), seed, NUM_SWEEPS, "failure")
+    return Drive(scene, PROFILES[profile], seed, NUM_SWEEPS, "failure")
 
 
 def body_of(drive: Drive) -> np.ndarray:

@@ -13,7 +13,7 @@ from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.hdf5 import HDF5Log, write_hdf5_scene
 from cflow_torch.data.truckscenes import TruckScenesLog, find_truckscenes_scenes
 from cflow_torch.simulator.drive import Drive, make_drive
-from cflow_torch.simulator.profiles import get_profile
+from cflow_torch.simulator.profiles import PROFILES
 from cflow_torch.simulator.writers.aevascenes import write_aevascenes_sequence
 from cflow_torch.simulator.writers.av2 import write_av2_log
 from cflow_torch.simulator.writers.truckscenes import write_truckscenes
@@ -22,7 +22,7 @@ from cflow_torch.simulator.writers.truckscenes import write_truckscenes
 @pytest.fixture(scope="module")
 def drive():
     scene = make_drive(seed=1, num_sweeps=2, profile="demo").scene
-    return Drive(scene, replace(get_profile("demo"), is_rolling=True), 1, 2, "rolling")
+    return Drive(scene, replace(PROFILES["demo"], is_rolling=True), 1, 2, "rolling")
 
 
 def as_hdf5(drive, folder):

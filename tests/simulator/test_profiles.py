@@ -10,10 +10,9 @@ import pytest
 from test_synthetic import transform
 
 from cflow_torch.simulator import make_drive
-from cflow_torch.simulator.drive import Drive
+from cflow_torch.simulator.drive import SCENES, Drive
 from cflow_torch.simulator.profiles import PROFILES
 from cflow_torch.simulator.raycast import BOX
-from cflow_torch.simulator.scenes import SCENES
 
 KIND = {"nuscenes": "crossing", "truckscenes": "highway", "aevascenes": "highway"}
 
