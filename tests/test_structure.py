@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -47,6 +48,21 @@ def test_importing_loads_nothing_heavy_and_changes_nothing():
     assert done.returncode == 0, done.stderr
     assert "cflow_torch" in done.stdout.split()
     assert not set(done.stdout.split()) & set(HEAVY)
+
+
+# Phrases of a private dialect, see "Style" in CONTRIBUTING.md.
+PHRASES = re.compile(
+    r"\b(what (stands|moves)|of equals|says? nothing|at hand|whoever|is no|mend(s|ed|ing)?|creep|doubt)\b", re.I
+)
+
+
+def test_prose_uses_the_words_of_the_field():
+    root = PACKAGE.parent
+    pages = [root / "README.md", *(root / "docs").glob("*.md")]
+    found = [
+        f"{page.name}: {hit.group()}" for page in pages for hit in PHRASES.finditer(page.read_text(encoding="utf-8"))
+    ]
+    assert not found
 
 
 def test_a_model_has_no_state():

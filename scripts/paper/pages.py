@@ -1,4 +1,4 @@
-"""The tables and figures of the paper from results files, the paper's numbers beside ours.
+"""Draw the tables and figures of the paper from results files, the paper's numbers next to ours.
 
 Per table or figure NAME.md and NAME.csv, for figures NAME.png too (needs matplotlib). Of figures the page has the
 means, NAME.md the classes; across data sets the page has CorrelationFlow, NAME.md every method. Missing runs are listed
@@ -19,10 +19,10 @@ from results import CLASSES, METHODS, RANGES, Ours, Runs, load_paper, load_runs,
 from cflow_torch.data.atomic import atomic_file, write_text
 
 PER_SET = ("datasets", "range_split")  # experiments whose columns are data sets, not classes
-INTRODUCTION = """# The paper's tables beside ours
+INTRODUCTION = """# The paper's tables next to ours
 
-Dynamic bucket-normalised EPE, lower is better. The paper's rows are of Argoverse 2 val, ours of other data: what can be
-compared is which way a change goes, not the numbers. Commands, and what each experiment varies: docs/settings.md.
+The score is the dynamic bucket-normalised EPE; lower is better. The paper's rows are of Argoverse 2 val, ours of other
+data. You can compare whether a change helps, but not the numbers. docs/settings.md has the commands.
 """
 Cells = List[List[str]]
 
@@ -170,11 +170,11 @@ def write_pages(results: Path, output: Path) -> None:
             shown = mean_cells(cells)
         page += [f"## {about['title']} ({about['label']})", "", markdown(shown)]
         runs_told = about_runs(ours)
-        notes = ["runs as above"] if runs_told and runs_told == told else list(runs_told)
+        notes = ["same runs as above"] if runs_told and runs_told == told else list(runs_told)
         notes += [about["note"]] if "note" in about else []
         told = runs_told or told
         if name in PER_SET:
-            notes.append("the paper's other methods: in the picture, numbers in scripts/paper/figures.yaml")
+            notes.append("the picture shows the paper's other methods, with numbers in scripts/paper/figures.yaml")
             notes += [f"{method}: {reason}" for method, score in protocol(ours).items() for reason in score.missing]
         page += [f"- {line}" for line in notes]
         if draw is not None and is_figure:

@@ -1,4 +1,4 @@
-"""Links of the pages and notebooks: files, pictures and headings are there."""
+"""Links of the pages and notebooks point to existing files, pictures and headings."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ LINK = re.compile(r"\]\(\s*<?([^)\s>]+)|<(?:img|a)\b[^>]*?\b(?:src|href)=\"([^\"
 
 
 def text_of(page: Path) -> str:
-    """Markdown of a page, or of the cells of a notebook that hold text."""
+    """Return the Markdown of a page, or of the text cells of a notebook."""
     text = page.read_text(encoding="utf-8")
     if page.suffix == ".ipynb":
         cells = json.loads(text)["cells"]
@@ -25,25 +25,25 @@ def text_of(page: Path) -> str:
 
 
 def anchors(page: Path) -> set[str]:
-    """What GitHub calls the headings of a page; of equal ones, the first."""
+    """Return the anchors that GitHub gives the headings of a page."""
     titles = re.findall(r"^#{1,6} +(.+?) *$", re.sub(r"^```.*?^```", "", text_of(page), flags=re.M | re.S), re.M)
     return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
 
 
-def broken(page: Path) -> list[str]:
-    """Links of a page that lead nowhere in this repository."""
+def broken_links(page: Path) -> list[str]:
+    """Return the links of a page without a target in this repository."""
     wrong = []
     for parts in LINK.findall(CODE.sub("", text_of(page))):
         target = unquote("".join(parts))
         path, _, anchor = target.partition("#")
-        place = (page.parent / path).resolve() if path else page
+        file = (page.parent / path).resolve() if path else page
         if re.match(r"https?:|mailto:", target):
             continue
-        if not place.exists() or ROOT not in (place, *place.parents) or (anchor and anchor not in anchors(place)):
+        if not file.exists() or ROOT not in (file, *file.parents) or (anchor and anchor not in anchors(file)):
             wrong.append(target)
     return wrong
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_links_lead_somewhere(page: Path) -> None:
-    assert not broken(page)
+def test_links_have_targets(page: Path) -> None:
+    assert not broken_links(page)

@@ -1,6 +1,6 @@
-"""What README, the quick start and the page of the harnesses show runs as it stands.
+"""The commands and Python blocks of README, the quick start and the page on harnesses run.
 
-Left out is what needs data, the network or another repository; of `cflow` commands with data, settings are composed.
+We skip those that need data, the network or another repository. Of `cflow` commands with data we compose the settings.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ ROOT = Path(__file__).resolve().parents[2]
 PAGES = ("README.md", "docs/quick_start.md", "docs/harness.md")
 BLOCK = re.compile(r"^```(bash|python)\n(.*?)^```", re.M | re.S)
 DATA = re.compile(r"/data|/path|experiment=")
-FOREIGN = re.compile(r"# \w+\.py\n|from bucketed_scene_flow_eval")  # how Python of other repositories begins
+FOREIGN = re.compile(r"# \w+\.py\n|from bucketed_scene_flow_eval")  # Python for other repositories begins with this
 
 
 def parts(page: str) -> list[tuple[str, Any]]:
-    """A page in its order: ("python", text) of a block, ("cflow", words) of a command, ("module", words) of -m."""
+    """Return the parts of a page in order: ("python", text), ("cflow", words), or ("module", words) of python -m."""
     found: list[tuple[str, Any]] = []
     for language, text in BLOCK.findall((ROOT / page).read_text(encoding="utf-8")):
         if language == "python":
@@ -43,7 +43,7 @@ COMMANDS = {" ".join(words) for page in PAGES for kind, words in parts(page) if 
 
 
 def run(kind: str, part: Any, names: dict[str, Any]) -> None:
-    """Run one part of a page in this process, unless it is one of those left out."""
+    """Run one part of a page in this process, unless it is skipped."""
     if kind == "python":
         if not FOREIGN.match(part):
             exec(compile(part, "page", "exec"), names)
@@ -56,7 +56,7 @@ def run(kind: str, part: Any, names: dict[str, Any]) -> None:
 
 @pytest.fixture
 def names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
-    """In an empty folder, the arrays that README begins with."""
+    """Return the arrays that README uses, in an empty working folder."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", list(sys.argv))
     drive = make_drive(seed=1, num_sweeps=2, profile="demo")
@@ -65,7 +65,7 @@ def names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("command", sorted(filter(DATA.search, COMMANDS)))
-def test_settings_of_commands_with_data_exist(command: str, names: dict[str, Any]) -> None:
+def test_commands_with_data_have_valid_settings(command: str, names: dict[str, Any]) -> None:
     assert cflow(*command.replace(" -m ", " ").split(), "--cfg", "job") == 0
 
 
