@@ -36,11 +36,10 @@ from cflow_torch.data.paths import is_remote
 from cflow_torch.fleet.progress import frames as counted
 from cflow_torch.model import SceneFlowModel
 from cflow_torch.types import CFlowError, FlowResult, Window
-from cflow_torch.viz.animation import save_animation
+from cflow_torch.viz.animation import Frame, flow_figures, save_animation
 from cflow_torch.viz.bev import plot_flow, save_picture
 from cflow_torch.viz.clusters import plot_clusters
 from cflow_torch.viz.correlation import plot_correlation
-from cflow_torch.viz.film import Frame, flow_figures
 from cflow_torch.viz.keypoints import plot_keypoints
 from cflow_torch.viz.scales import plot_scales
 from cflow_torch.viz.style import blank_figure

@@ -1,6 +1,6 @@
 """Pictures of a flow and of every stage on the way to it. Needs `pip install matplotlib`."""
 
-from cflow_torch.viz.animation import save_animation
+from cflow_torch.viz.animation import Frame, flow_figures, save_animation
 from cflow_torch.viz.bev import plot_flow, save_picture
 from cflow_torch.viz.clusters import plot_clusters
 from cflow_torch.viz.correlation import plot_correlation
@@ -10,6 +10,8 @@ from cflow_torch.viz.scales import plot_scales
 from cflow_torch.viz.wheel import flow_to_rgb, wheel_image
 
 __all__ = [
+    "Frame",
+    "flow_figures",
     "flow_to_rgb",
     "plot_clusters",
     "plot_correlation",

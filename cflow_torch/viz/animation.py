@@ -1,45 +1,107 @@
-"""Pictures one after the other: `.gif` (Pillow, which matplotlib brings) and `.mp4` (extra `video`)."""
+"""Animations: flow pictures of several pairs with one view and one colour scale, saved as `.gif` or `.mp4`."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Iterable, Iterator
+from typing import TYPE_CHECKING, Any, Iterable, Iterator, Sequence
 
 import numpy as np
 
 from cflow_torch.data.atomic import atomic_name
-from cflow_torch.types import CFlowError
+from cflow_torch.types import Array, CFlowError, FlowResult
+from cflow_torch.viz.bev import longest_flow, plot_flow, point_rows, split_sweep
 from cflow_torch.viz.wheel import wheel_image
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-    from PIL.Image import Image as Picture
 
-_SHORTEST = 2  # hundredths of a second; viewers show shorter frames of a .gif slowly
-_WHEEL_SIDE = 200  # pixels
+_SHORTEST = 2  # hundredths of a second; viewers slow down a .gif with shorter frames
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One pair of an animation.
+
+    Args:
+        points: (N, 3+), metres, ego frame of sweep t.
+        result: flow of these points. Only the residual flow and the clusters are drawn.
+        is_ground: (N,) bool; None = no point is ground.
+        title: one line above the picture.
+    """
+
+    points: Array
+    result: FlowResult
+    is_ground: Array | None = None
+    title: str | None = None
+
+
+def flow_figures(
+    frames: Sequence[Frame],
+    *,
+    point_cloud_range: Sequence[float] | None = None,
+    max_flow: float | None = None,
+    legend: str = "upper right",
+    width: int = 1000,
+) -> Iterator[Figure]:
+    """Draw each pair with `plot_flow`, all with the same view, colours and legend.
+
+    Args:
+        frames: at least one pair, in order.
+        point_cloud_range: as for `plot_flow`; open sides end where the points of all frames end.
+        max_flow: residual flow at the rim of the colour wheel, metres per sweep; None = the longest of all frames.
+        legend: corner of the colour wheel, see `plot_flow`.
+        width: of a picture, pixels, 200 ... 4000.
+
+    Yields:
+        Figures of one size, one at a time, for `save_animation`.
+
+    Raises:
+        CFlowError: the width is not allowed, or as `plot_flow`.
+    """
+    if not 200 <= width <= 4000:
+        raise CFlowError(f"width={width}: give 200 ... 4000 pixels")
+    corners, longest = [], []
+    for frame in frames:
+        view, position, _, drawn = split_sweep(frame.points, frame.is_ground, point_cloud_range)
+        corners.append(view)
+        longest.append(longest_flow(point_rows("residual flow", frame.result.residual_flow, len(position))[drawn]))
+    low, high = np.min(corners, axis=0)[0], np.max(corners, axis=0)[1]
+    heights = (-np.inf, np.inf) if point_cloud_range is None else (point_cloud_range[2], point_cloud_range[5])
+    for frame in frames:
+        figure = plot_flow(
+            frame.points,
+            frame.result,
+            is_ground=frame.is_ground,
+            point_cloud_range=(*low, heights[0], *high, heights[1]),
+            max_flow=max(longest) if max_flow is None else max_flow,
+            title=frame.title,
+            legend=legend,
+        )
+        figure.set_dpi(width / figure.get_figwidth())
+        yield figure
 
 
 def save_animation(figures: Iterable[Figure], path: str | Path, *, frames_per_second: float = 5.0) -> Path:
-    """Writes figures as an animation that begins anew at its end. The file appears complete or not at all.
+    """Save figures as an animation that repeats. The file appears complete or not at all.
 
     Args:
-        figures: at least one, each of the same size in pixels (size in inches times dpi) on an opaque background;
-            drawn one at a time, so a generator needs the memory of one.
-        path: ends in .gif or .mp4; its folder is made if absent. An older file is replaced.
+        figures: at least one, all of one size in pixels (inches times dpi) on an opaque background. They are drawn one
+            at a time, so a generator needs the memory of one figure.
+        path: ends in .gif or .mp4. Its folder is created if it does not exist; an older file is replaced.
         frames_per_second: pictures per second. A .gif counts in hundredths of a second and shows at most 50.
 
     Returns:
         The path.
 
     Convention:
-        A .gif has 256 colours, which cover the first picture and the wheel. They are the same for all pictures, so that
-        what stands still does not flicker.
-        A .mp4 is H.264, yuv420p; an odd side gets one more white pixel.
+        A .gif has 256 colours, chosen from the first picture and the colour wheel. All pictures share them, so static
+        parts do not flicker. A .mp4 is H.264, yuv420p; its sides are rounded down to even numbers.
 
     Raises:
-        CFlowError: no figure, figures of several sizes, another ending, a rate that cannot be, or a missing package.
-        OSError: the file cannot be written. What a generator of figures raises stays as it is, too.
+        CFlowError: there is no figure, sizes differ, the ending or the rate is not allowed, or a package is missing.
+        OSError: the file cannot be written. An error of a generator of figures is passed on.
 
     Cost: a .gif keeps one byte per pixel and picture until the end, a .mp4 nothing.
     """
@@ -50,83 +112,57 @@ def save_animation(figures: Iterable[Figure], path: str | Path, *, frames_per_se
         raise CFlowError(f"{path} does not end in .gif or .mp4: give a file that does")
     write = _write_gif if path.suffix.lower() == ".gif" else _write_mp4
     with atomic_name(path) as temporary:
-        write(temporary, _pictures(figures), frames_per_second)
+        write(temporary, _of_one_size(figures), frames_per_second)
     return path
 
 
-def _pictures(figures: Iterable[Figure]) -> Iterator[Picture]:
-    """RGB images."""
+def _of_one_size(figures: Iterable[Figure]) -> Iterator[Figure]:
+    """Yield the figures, each with a canvas, after their sizes are checked."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from PIL import Image
 
-    size = None
+    first = None
     for number, figure in enumerate(figures):
-        canvas = FigureCanvasAgg(figure)
-        canvas.draw()
-        picture = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
-        size = size or picture.size
-        if picture.size != size:
-            raise CFlowError(f"picture {number} has {picture.size} pixels, the first one {size}: give one size")
-        yield picture
-    if size is None:
+        size = FigureCanvasAgg(figure).get_width_height()
+        first = first or size
+        if size != first:
+            raise CFlowError(f"picture {number} has {size} pixels, the first one {first}: give one size")
+        yield figure
+    if first is None:
         raise CFlowError("no picture: an animation needs at least one figure")
 
 
-def _write_gif(path: Path, pictures: Iterator[Picture], frames_per_second: float) -> None:
+def _write_gif(path: Path, figures: Iterator[Figure], frames_per_second: float) -> None:
     from PIL import Image
 
-    palette, frames = None, []
-    for picture in pictures:
-        palette = palette or _palette(picture)
-        frames.append(picture.quantize(palette=palette, dither=Image.Dither.NONE))
+    def draw(figure: Figure) -> Image.Image:
+        figure.canvas.draw()
+        return Image.fromarray(np.asarray(figure.canvas.buffer_rgba())[..., :3])  # type: ignore[attr-defined]
+
+    pictures = map(draw, figures)
+    first = next(pictures)
+    sample, wheel = first.copy(), Image.fromarray(wheel_image(min(first.size) // 2))
+    sample.paste(wheel, (0, 0), wheel)
+    # Median cut, Pillow's default, drops the colours of small moving objects.
+    palette = sample.quantize(256, method=Image.Quantize.MAXCOVERAGE, kmeans=1)
+    frames = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in chain([first], pictures)]
     duration = 10 * max(_SHORTEST, round(100 / frames_per_second))  # milliseconds
-    frames[0].save(
-        path,
-        format="GIF",
-        save_all=True,
-        append_images=frames[1:],
-        duration=duration,
-        loop=0,
-        optimize=True,
-        disposal=1,
-    )
+    frames[0].save(path, format="GIF", save_all=True, append_images=frames[1:], duration=duration, loop=0)
 
 
-def _palette(picture: Picture) -> Picture:
-    """An image with 256 colours for all pictures: those of the first one and of the wheel, for any flow to come."""
-    from PIL import Image
+def _write_mp4(path: Path, figures: Iterator[Figure], frames_per_second: float) -> None:
+    from matplotlib import rc_context
+    from matplotlib.animation import FFMpegWriter
 
-    wheel = Image.fromarray(wheel_image(_WHEEL_SIDE))
-    sample = Image.new("RGB", (max(picture.width, _WHEEL_SIDE), picture.height + _WHEEL_SIDE), "white")
-    sample.paste(picture, (0, 0))
-    sample.paste(wheel, (0, picture.height), wheel)
-    # Median cut counts pixels and would drop the few of a small mover. A round of k-means moves each colour into the
-    # middle of those that it stands for.
-    return sample.quantize(256, method=Image.Quantize.MAXCOVERAGE, kmeans=1)
-
-
-def _write_mp4(path: Path, pictures: Iterator[Picture], frames_per_second: float) -> None:
     try:
         import imageio_ffmpeg
     except ImportError as error:
         raise CFlowError(".mp4 needs imageio-ffmpeg: pip install imageio-ffmpeg, or save a .gif") from error
-
-    first = next(pictures)
-    even = "pad=ceil(iw/2)*2:ceil(ih/2)*2:color=white"  # yuv420p holds colours of two by two pixels
-    writer = imageio_ffmpeg.write_frames(
-        str(path),
-        first.size,
-        fps=frames_per_second,
-        codec="libx264",
-        pix_fmt_out="yuv420p",
-        quality=None,
-        macro_block_size=1,
-        ffmpeg_log_level="error",
-        output_params=["-vf", even, "-crf", "18", "-movflags", "+faststart", "-f", "mp4"],
-    )
-    try:
-        writer.send(None)
-        for picture in chain([first], pictures):
-            writer.send(picture.tobytes())
-    finally:
-        writer.close()
+    first = next(figures)
+    options = "-pix_fmt yuv420p -crf 18 -movflags +faststart -f mp4"
+    rate: Any = frames_per_second  # not only int
+    writer = FFMpegWriter(rate, "h264", extra_args=options.split())
+    program = rc_context({"animation.ffmpeg_path": imageio_ffmpeg.get_ffmpeg_exe()})
+    with program, writer.saving(first, str(path), first.dpi):
+        for figure in chain([first], figures):
+            writer.fig = figure
+            writer.grab_frame()

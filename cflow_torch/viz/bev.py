@@ -1,4 +1,4 @@
-"""Bird's-eye pictures of a flow: what is drawn (`plot_flow`) and how it reaches the disk (`save_picture`)."""
+"""Bird's-eye pictures of a flow (`plot_flow`), and how a picture is saved (`save_picture`)."""
 
 from __future__ import annotations
 
@@ -28,38 +28,38 @@ def plot_flow(
     truth: Array | None = None,
     legend: str | None = None,
 ) -> Figure:
-    """Bird's-eye view of sweep t with the motion of its objects until t+1.
+    """Draw sweep t from above, with the motion of its objects until t+1.
 
     Args:
         points: (N, 3+), metres, ego frame of sweep t.
         result_or_residual: the `FlowResult` of these points, or their residual flow (N, 3), metres per sweep.
-        is_ground: (N,) bool; ground is drawn very faintly. None = nothing is ground.
-        point_cloud_range: (x0, y0, z0, x1, y1, z1), metres; what lies outside is not drawn. None = that of `Config`.
+        is_ground: (N,) bool; ground is drawn very faintly. None = no point is ground.
+        point_cloud_range: (x0, y0, z0, x1, y1, z1), metres; points outside are not drawn. None = that of `Config`.
         max_flow: residual flow at the rim of the colour wheel, metres per sweep; None = the longest one drawn, rounded
             up to 0.1 m.
         title: one line above the picture.
-        truth: (N, 3) true RESIDUAL flow, metres per sweep, NaN where unknown (total flow minus `pose_flow`). Adds a
-            panel with it and one with the error of every point whose truth is known.
-        legend: corner of the colour wheel, "upper right", "lower right" or "upper left"; None = where it hides least.
+        truth: (N, 3) true RESIDUAL flow (total flow minus `pose_flow`), metres per sweep, NaN where unknown. Adds a
+            panel with the truth and one with the error of every point whose truth is known.
+        legend: corner of the colour wheel, "upper right", "lower right" or "upper left"; None = where it covers least.
 
     Returns:
-        Figure, 1000 pixels wide at its own dpi (1792 with truth), for `save_picture`. No pyplot state is touched.
+        Figure, 1000 pixels wide at its own dpi (1792 with truth), for `save_picture`. It does not touch pyplot's state.
 
     Convention:
-        x (forward) to the right, y (left) up, equal scales; a long thin view gets empty space along its sides. Points
-        whose residual flow is longer than `panel.MOVING` are movers. An arrow starts at the median position of a
-        cluster's movers and is `panel.ARROW_STEPS` times their median flow long; where no clusters are given, movers
-        near each other are one.
+        x (forward) points right, y (left) up, with equal scales; a long thin view gets empty space along its sides. A
+        point is moving if its residual flow is longer than `panel.MOVING`. An arrow starts at the median position of a
+        cluster's moving points and is `panel.ARROW_STEPS` times their median flow long. Without clusters, moving points
+        near each other form one.
 
     Raises:
-        CFlowError: matplotlib is absent, or an argument has the wrong shape or value.
+        CFlowError: matplotlib is not installed, or an argument has the wrong shape or value.
 
     Cost: linear in the points; about a second for 100,000.
     """
     view, position, is_floor, rest = split_sweep(points, is_ground, point_cloud_range)
     given = result_or_residual.residual_flow if isinstance(result_or_residual, FlowResult) else result_or_residual
     residual = point_rows("residual flow", given, len(position))
-    true_flow = None if truth is None else point_rows("truth", truth, len(position))
+    true_flow = None if truth is None else point_rows("truth", truth, len(position))[rest]
     if legend is not None and legend not in style.CORNERS:
         raise CFlowError(f"legend={legend!r}: give None or one of {', '.join(style.CORNERS)}")
 
@@ -67,8 +67,6 @@ def plot_flow(
     cluster = None
     if isinstance(result_or_residual, FlowResult):
         cluster = as_numpy(result_or_residual.cluster_id)[rest]
-    if true_flow is not None:
-        true_flow = true_flow[rest]
     if max_flow is None:
         max_flow = longest_flow(residual if true_flow is None else np.concatenate([residual, true_flow]))
 
@@ -86,17 +84,17 @@ def plot_flow(
 
 
 def save_picture(figure: Figure, path: str | Path) -> Path:
-    """Writes a figure as PNG. The file appears complete or not at all; an older one is replaced.
+    """Save a figure as PNG. The file appears complete or not at all; an older one is replaced.
 
     Args:
-        figure: from `plot_flow`.
-        path: ends in .png; its folder is made if absent.
+        figure: from a `plot_...` function.
+        path: ends in .png; its folder is created if it does not exist.
 
     Returns:
         The path.
 
     Raises:
-        CFlowError: another ending.
+        CFlowError: the path does not end in .png.
         OSError: the file cannot be written.
     """
     path = Path(path)
@@ -108,7 +106,7 @@ def save_picture(figure: Figure, path: str | Path) -> Path:
 
 
 def point_rows(name: str, values: Array, count: int | None = None) -> np.ndarray:
-    """(N, 3) float64; N is the count, or any number."""
+    """Check an array of one row per point and return (N, 3) float64; N is the count, or any number."""
     array = as_numpy(values)
     if array.ndim != 2 or array.shape[1] < 3 or (count is not None and len(array) != count):
         raise CFlowError(f"{name} has shape {array.shape}: give (N, 3), one row per point")
@@ -128,7 +126,7 @@ def split_sweep(
 
 
 def view_of(position: np.ndarray, point_cloud_range: Sequence[float] | None) -> tuple[np.ndarray, np.ndarray]:
-    """((2, 2) low and high corner of the view, (N,) bool is inside)."""
+    """The view, (2, 2) low and high corner (x, y), and (N,) bool, the points inside the range."""
     default = DenseConfig().point_cloud_range
     bounds = np.asarray(default if point_cloud_range is None else point_cloud_range, np.float64)
     if bounds.shape != (6,) or not (bounds[:3] < bounds[3:]).all():
@@ -145,6 +143,6 @@ def view_of(position: np.ndarray, point_cloud_range: Sequence[float] | None) -> 
 
 
 def longest_flow(flow: np.ndarray) -> float:
-    """Longest flow in the plane, rounded up to 0.1 m, at least 0.1 m."""
+    """Length of the longest flow in the plane, rounded up to 0.1 m, at least 0.1 m."""
     length = np.hypot(flow[:, 0], flow[:, 1])
     return max(float(np.ceil(length[np.isfinite(length)].max(initial=0) * 10 - 1e-3)) / 10, 0.1)

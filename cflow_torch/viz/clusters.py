@@ -1,8 +1,8 @@
-"""Picture of the clusters of a sweep."""
+"""Pictures of the clusters of a sweep."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Sequence
+from typing import TYPE_CHECKING, Any, Sequence
 
 import numpy as np
 
@@ -30,22 +30,22 @@ def plot_clusters(
     point_cloud_range: Sequence[float] | None = None,
     title: str | None = None,
 ) -> Figure:
-    """Bird's-eye view of sweep t, its points coloured by cluster.
+    """Draw sweep t from above, coloured by cluster.
 
     Args:
         points: (N, 3+), metres, ego frame of sweep t.
         result_or_cluster_id: the `FlowResult` of these points, or their clusters (N,), integers, negative = none.
-        is_ground: (N,) bool; ground is drawn very faintly. None = nothing is ground.
-        point_cloud_range: (x0, y0, z0, x1, y1, z1), metres; what lies outside is not drawn. None = that of `Config`.
+        is_ground: (N,) bool; ground is drawn very faintly. None = no point is ground.
+        point_cloud_range: (x0, y0, z0, x1, y1, z1), metres; points outside are not drawn. None = that of `Config`.
         title: one line above the picture.
 
     Returns:
         Figure, 1000 pixels wide at its own dpi, for `save_picture`.
 
-    Convention: view as in `plot_flow`. A colour names no cluster: it only tells neighbours apart.
+    Convention: view as in `plot_flow`. A colour does not identify a cluster; it only distinguishes neighbours.
 
     Raises:
-        CFlowError: matplotlib is absent, or an argument has the wrong shape or value.
+        CFlowError: matplotlib is not installed, or an argument has the wrong shape or value.
     """
     view, position, is_floor, rest = split_sweep(points, is_ground, point_cloud_range)
     given = result_or_cluster_id
@@ -71,7 +71,7 @@ def plot_clusters(
 
 
 def cluster_colors(position: np.ndarray, cluster_id: np.ndarray, no_cluster: Sequence[int]) -> np.ndarray:
-    """The colour of each point's cluster.
+    """Choose a colour for each cluster, so that neighbours differ.
 
     Args:
         position: (N, 2+) float64, metres, finite; x and y count.
@@ -81,10 +81,10 @@ def cluster_colors(position: np.ndarray, cluster_id: np.ndarray, no_cluster: Seq
     Returns:
         (N, 3) uint8 RGB.
 
-    Convention: clusters are taken largest first. Each gets the colour of `PALETTE` whose nearest bearer is farthest
-        away, measured between bounding boxes; of equally far ones the one that fewest clusters have.
+    Convention: the largest cluster is coloured first. Each cluster gets the colour of `PALETTE` whose nearest cluster
+        is farthest away, measured between bounding boxes. Ties: the colour that fewest clusters have.
 
-    Cost: square of the number of clusters, some 0.1 s for a thousand.
+    Cost: quadratic in the number of clusters, about 0.1 s for a thousand.
     """
     colors = np.tile(np.array(no_cluster, np.uint8), (len(cluster_id), 1))
     has_one = cluster_id >= 0
@@ -92,27 +92,25 @@ def cluster_colors(position: np.ndarray, cluster_id: np.ndarray, no_cluster: Seq
     low, high = np.full((len(size), 2), np.inf), np.full((len(size), 2), -np.inf)
     np.minimum.at(low, group, position[has_one, :2])
     np.maximum.at(high, group, position[has_one, :2])
-    nearest = np.full((len(size), len(PALETTE)), np.inf)  # of each cluster, to a bearer of each colour
-    number, bearers = np.zeros(len(size), np.int64), np.zeros(len(PALETTE), np.int64)
-    for chosen in np.argsort(-size, kind="stable"):
-        color = np.lexsort((bearers, -nearest[chosen]))[0]
-        number[chosen] = color
-        bearers[color] += 1
-        gap = np.maximum(low - high[chosen], low[chosen] - high).max(axis=1).clip(min=0)
-        nearest[:, color] = np.minimum(nearest[:, color], gap)
-    colors[has_one] = PALETTE[number[group]]
+    distance = np.full((len(size), len(PALETTE)), np.inf)  # from each cluster to the nearest one of each colour
+    color_of, uses = np.zeros(len(size), np.int64), np.zeros(len(PALETTE), np.int64)
+    for cluster in np.argsort(-size, kind="stable"):
+        color = np.lexsort((uses, -distance[cluster]))[0]
+        color_of[cluster] = color
+        uses[color] += 1
+        gap = np.maximum(low - high[cluster], low[cluster] - high).max(axis=1).clip(min=0)
+        distance[:, color] = np.minimum(distance[:, color], gap)
+    colors[has_one] = PALETTE[color_of[group]]
     return colors
 
 
 def _draw_sizes(axes: Axes, position: np.ndarray, has_one: np.ndarray, size: np.ndarray) -> None:
-    """How many clusters of which size there are, as a small table in a corner."""
+    """Draw a small table in a corner: the number of clusters by size."""
     box = style.legend_box(axes, position, has_one, (2.3, 1.5))
     bounds = (1, 10, 100, 1000, np.inf)
     words = ("under 10", "10 to 99", "100 to 999", "1000 or more")
     counts, _ = np.histogram(size, bounds)
     columns = (("points in view", *words, "all"), ("clusters", *map(str, counts), str(len(size))))
+    look: Any = {"fontsize": 11, "color": style.INK, "va": "center", "linespacing": 1.5, "transform": box.transAxes}
     for x, side, column in zip((0.06, 0.94), ("left", "right"), columns):
-        text = "\n".join(column)
-        box.text(
-            x, 0.5, text, fontsize=11, color=style.INK, ha=side, va="center", linespacing=1.5, transform=box.transAxes
-        )
+        box.text(x, 0.5, "\n".join(column), ha=side, **look)

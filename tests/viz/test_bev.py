@@ -13,8 +13,8 @@ from matplotlib.image import imread
 
 from cflow_torch import CFlowError, FlowResult
 from cflow_torch.viz import flow_to_rgb, panel, plot_clusters, plot_flow, save_picture
+from cflow_torch.viz.animation import Frame, flow_figures
 from cflow_torch.viz.clusters import PALETTE, cluster_colors
-from cflow_torch.viz.film import Frame, flow_figures
 
 CAR_FLOW = np.array([-0.6, 0.0, 0.0])
 VAN_FLOW = np.array([0.0, -0.3, 0.0])
