@@ -1,4 +1,4 @@
-"""data=benchmark: drives that are made once, and kept under a digest of their generator."""
+"""data=benchmark: drives are made once and cached under a digest of the code that makes them."""
 
 from __future__ import annotations
 

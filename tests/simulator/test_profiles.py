@@ -1,4 +1,4 @@
-"""Sensor profiles and scenes: the shots of every LiDAR, what moves while they turn, and truth under all that."""
+"""Sensor profiles and scenes: the shots of every LiDAR, motion during a sweep, and the truth."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ def drives():
 
 
 def exact(drive):
-    """The drive without noise of any kind."""
+    """The drive without noise."""
     profile = replace(drive._profile, range_noise=0.0, velocity_noise=0.0)
     return Drive(drive.scene, profile, 0, len(drive.timestamps), "exact")
 
 
 def at_shot(drive, index, unit):
-    """(n, 3) float64 points of a unit in its own frame when it fired, whatever the data set did to them since."""
+    """(n, 3) float64 points of a unit in its own frame at the time of their shots, before any compensation."""
     points = unit.points.astype(float)
     spec = next(u for u in drive._profile.units if u.name == unit.name)
     if spec.is_virtual or not (drive._profile.is_rolling and drive._profile.is_deskewed):
@@ -40,7 +40,7 @@ def at_shot(drive, index, unit):
     return np.einsum("nij,nj->ni", T[:, :3, :3], world) + T[:, :3, 3]
 
 
-def where_it_was(drive, index, returns):
+def world_at_shot(drive, index, returns):
     """(n, 3) float64 world points of a sweep at the time of their shots."""
     points = returns.points.numpy().astype(float)
     if drive._profile.is_deskewed:
@@ -50,19 +50,19 @@ def where_it_was(drive, index, returns):
 
 
 def on_boxes(drive, index, is_chosen):
-    """World points of a sweep that hit boxes of chosen bodies, the solids hit, and how far off these they are, posed
-    as at the time stamp: a function of points."""
+    """Returns on boxes of the chosen bodies: rows, world points at the time of the shot, poses of the boxes at the time
+    stamp, and a function that returns the distances of points from the faces of these boxes."""
     returns = drive.returns(index)
     solid, table = returns.solid.numpy(), drive.scene.table
     chosen = np.array([is_chosen(body) for body in drive.scene.bodies])[table.body] & (table.kind == BOX)
     rows = np.flatnonzero((solid >= 0) & np.append(chosen, False)[solid])
     pose = drive.scene.solids(drive._seconds[index], drive._body_poses[index]).pose.numpy()[solid[rows]]
 
-    def off(world):
+    def distance(world):
         local = np.einsum("nji,nj->ni", pose[:, :3, :3], world - pose[:, :3, 3])
         return np.abs((np.abs(local) - table.half[solid[rows]]).max(1))
 
-    return rows, where_it_was(drive, index, returns)[rows], pose, off
+    return rows, world_at_shot(drive, index, returns)[rows], pose, distance
 
 
 @pytest.mark.parametrize("name", PROFILES)
@@ -81,10 +81,10 @@ def test_every_shot_is_on_its_ring_its_column_and_its_time(name, drives):
         distance = np.sqrt(x * x + y * y + z * z)
         assert np.abs(np.arcsin(z / distance) - drive.elevations(unit.name)[unit.ring]).max() < 1e-4
         sure = np.hypot(x, y) > 0.3 * distance
-        turned = np.degrees(np.arctan2(y, x))[sure] - spec.span / spec.num_columns * (unit.column[sure] + 0.5)
-        start = spec.start if is_rolling and not spec.has_jitter else turned[0]  # one start for all columns
-        assert np.abs(turned - start - 360 * np.round((turned - start) / 360)).max() < 0.01
-        if not is_rolling:  # all at once
+        starts = np.degrees(np.arctan2(y, x))[sure] - spec.span / spec.num_columns * (unit.column[sure] + 0.5)
+        start = spec.start if is_rolling and not spec.has_jitter else starts[0]  # one start for all columns
+        assert np.abs(starts - start - 360 * np.round((starts - start) / 360)).max() < 0.01
+        if not is_rolling:
             assert not unit.offset_ns.any() and sweep.point_times is None
             continue
         phase = unit.offset_ns - unit.column * (interval / unit.num_columns) + drive._profile.reference * interval
@@ -96,30 +96,30 @@ def test_every_shot_is_on_its_ring_its_column_and_its_time(name, drives):
 
 
 @pytest.mark.parametrize("name", ["nuscenes", "truckscenes", "waymo"])
-def test_the_static_world_stays_put_after_deskewing_and_only_then(name, drives):
+def test_static_boxes_are_undistorted_after_deskewing_and_distorted_without(name, drives):
     drive = exact(drives[name])
-    rows, world, _, off = on_boxes(drive, 1, lambda body: body.is_static)
-    assert len(rows) > 500 and np.quantile(off(world), 0.999) < 1e-3
-    given = off(transform(drive.poses[1], drive.returns(1).points.numpy().astype(float))[rows])
-    # Raw points of a truck at 80 km/h and more.
+    rows, world, _, distance = on_boxes(drive, 1, lambda body: body.is_static)
+    assert len(rows) > 500 and np.quantile(distance(world), 0.999) < 1e-3
+    given = distance(transform(drive.poses[1], drive.returns(1).points.numpy().astype(float))[rows])
+    # The points of the truck, which drives at 80 km/h or more, are not compensated.
     assert np.quantile(given, 0.9) > 0.3 if name == "truckscenes" else np.quantile(given, 0.999) < 1e-3
 
 
-def test_what_moves_stays_smeared_and_boxes_hold_it(drives):
-    """On a highway a car is where it was when it was hit, metres from where it is at the time stamp."""
+def test_moving_objects_stay_distorted_and_boxes_hold_their_points(drives):
+    """On a highway, the points of a car may be metres from its position at the time stamp."""
     drive = exact(make_drive(seed=3, num_sweeps=2, profile="nuscenes", scene="highway"))
 
     def is_even(body):
         return body.category == "REGULAR_VEHICLE" and not body.is_static and body.trajectory.acceleration == 0
 
-    rows, world, pose, off = on_boxes(drive, 1, is_even)
+    rows, world, pose, distance = on_boxes(drive, 1, is_even)
     speed = np.array([getattr(body.trajectory, "speed", 0.0) for body in drive.scene.bodies])
     along = speed[drive._body_of(drive.returns(1))[rows]] * 1e-9 * drive.returns(1).offset_ns.numpy()[rows]
-    assert len(rows) > 300 and np.quantile(off(world), 0.8) > 0.1
-    assert np.quantile(off(world - pose[:, :3, 0] * along[:, None]), 0.99) < 5e-3, "speed times time"
+    assert len(rows) > 300 and np.quantile(distance(world), 0.8) > 0.1
+    assert np.quantile(distance(world - pose[:, :3, 0] * along[:, None]), 0.99) < 5e-3, "speed times time"
     for drive in drives.values():
         boxes, body = drive.boxes(1), drive._body_of(drive.returns(1))
-        points = transform(np.linalg.inv(drive.poses[1]), where_it_was(drive, 1, drive.returns(1)))
+        points = transform(np.linalg.inv(drive.poses[1]), world_at_shot(drive, 1, drive.returns(1)))
         number_of = {track: b for b, track in enumerate(drive.track_ids)}
         for track, pose, size, number in zip(boxes.track_id, boxes.pose, boxes.size, boxes.num_points):
             local = transform(np.linalg.inv(pose), points[body == number_of[track]])
@@ -129,10 +129,10 @@ def test_what_moves_stays_smeared_and_boxes_hold_it(drives):
 
 @pytest.mark.parametrize("name", ["av2", "nuscenes"])
 def test_radial_velocity_is_the_derivative_of_the_range(name, drives):
-    """A mark on the thing that was hit, seen from where the LiDAR was: its range before and after."""
+    """Fix a mark to the object that was hit, and measure its range from the LiDAR before and after the shot."""
     drive = exact(drives[name])
     returns, velocity = drive.returns(1), np.concatenate([unit.radial_velocity for unit in drive.units(1)])
-    solid, world = returns.solid.numpy(), where_it_was(drive, 1, returns)
+    solid, world = returns.solid.numpy(), world_at_shot(drive, 1, returns)
     assert (velocity[solid < 0] == 0).all() and np.abs(velocity).max() > 5
     offset = returns.offset_ns.numpy() * drive._profile.is_rolling
     for row in np.random.default_rng(0).choice(np.flatnonzero(velocity != 0), 10):
@@ -146,7 +146,7 @@ def test_radial_velocity_is_the_derivative_of_the_range(name, drives):
         assert velocity[row] == pytest.approx((after - before) / 2e-3, abs=0.02)
 
 
-def test_the_truck_does_not_see_itself_and_its_trailer_hides_things(drives):
+def test_the_truck_has_no_returns_of_itself_and_its_trailer_occludes(drives):
     drive = drives["truckscenes"]
     returns, points = drive.returns(0), drive.sweep(0).points
     hidden = drive.scene.table.body >= len(drive.scene.bodies) - drive.scene.num_own
@@ -158,7 +158,7 @@ def test_the_truck_does_not_see_itself_and_its_trailer_hides_things(drives):
     assert math.degrees(math.asin(-down[2])) == pytest.approx(56.0)
 
 
-def test_weather_takes_returns_the_far_ones_first():
+def test_weather_removes_distant_returns_first():
     distance = [
         np.linalg.norm(make_drive(1, 1, "nuscenes", weather=name).sweep(0).points, axis=1)
         for name in ("clear", "rain", "fog")

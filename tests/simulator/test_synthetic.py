@@ -1,4 +1,4 @@
-"""Simulated drives: rays against brute force, truth against the next sweep, seeds, ways."""
+"""Simulated drives: rays equal brute force, truth agrees with the next sweep, seeds are reproducible."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def brute_force(solids, origin, directions):
 
 
 def random_solids(rng, number):
-    """Solids of all kinds, turned any way, none around the origin; one long wall, one beam overhead."""
+    """Solids of all kinds with random rotations, none around the origin; one long wall, one beam overhead."""
     pose = np.tile(np.eye(4), (number, 1, 1))
     pose[:, :3, :3] = np.linalg.qr(rng.normal(size=(number, 3, 3)))[0]
     pose[:, :3, :3] *= np.linalg.det(pose[:, :3, :3])[:, None, None]
@@ -79,7 +79,7 @@ def test_cast_solids_equals_brute_force(max_candidates, monkeypatch):
     distance, solid = cast_solids(solids.kind, T_solid_sensor, solids.half_size, azimuth, elevation, 200.0)
     expected = brute_force(solids, np.zeros(3), ray_directions(azimuth, elevation).numpy())
     nearest = expected.min(0)
-    # A ray that grazes an edge may be decided either way in float32; there are a few in 4,320.
+    # Rays that graze an edge, a few in 4,320, may hit or miss in float32.
     agree = np.isclose(distance.numpy(), nearest, rtol=0, atol=1e-3)  # inf is close to inf only
     assert agree.mean() > 0.999 and 0.2 < np.isfinite(nearest).mean() < 0.95
     hit = agree & np.isfinite(nearest)
@@ -89,7 +89,7 @@ def test_cast_solids_equals_brute_force(max_candidates, monkeypatch):
 
 @pytest.mark.parametrize("name", ["av2_rolling", "aevascenes", "waymo"])
 def test_rolling_shots_equal_brute_force(name):
-    """Every ray at its own time, from where its LiDAR then is, against every solid where that then is."""
+    """Test every ray at its own time against every solid, with the poses of LiDAR and solids at that time."""
     street = SCENES["street"](np.random.default_rng([3, 0]))
     bodies = tuple(body for body in street.bodies if body.category or len(body.solids) < 5)[:90]
     scene = Scene(street.ground, street.ego, bodies, SolidTable.of(bodies))
@@ -139,15 +139,15 @@ def test_ground_rays_end_on_the_first_surface_they_meet():
     on_face = (np.abs(depth) < 0.01) & (above_road > -1e-9) & (above_road < ground.kerb + 1e-9)
     assert ((on_road & (depth <= 0)) | (on_pavement & (depth > 0)) | on_face).all()
     assert on_road.sum() > 20 and on_pavement.sum() > 20 and (on_face & ~on_road & ~on_pavement).sum() >= 3
-    for part in np.linspace(0, 0.999, 200):  # nothing was passed on the way
+    for part in np.linspace(0, 0.999, 200):  # the ray is above the ground before
         x, y, z = (origin[:, None] + rays * t * part).numpy()
         assert (z > ground.height(x, y) - 1e-9).all()
     assert ((cosine > 0) & (cosine <= 1)).all()
     assert ground.cast(origin, torch.tensor([[0.0], [0.0], [1.0]], dtype=torch.float64))[0].isinf().all()
 
 
-def test_nothing_is_seen_behind_a_wall():
-    """A wall at x = 10 hides the box behind it; a box beside it is seen."""
+def test_a_wall_occludes_a_box_behind_it():
+    """A wall at x = 10 occludes the box behind it, but not the box to its left."""
     pose = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
     pose[:, :3, 3] = torch.tensor([[10.0, 0, 1], [20.0, 0, 1], [20.0, 30, 1]])
     half = torch.tensor([[0.1, 8, 3], [1, 1, 1], [1, 1, 1]], dtype=torch.float64)
@@ -158,13 +158,13 @@ def test_nothing_is_seen_behind_a_wall():
     assert (solid == 0).sum() > 1000 and (solid == 2).sum() > 20 and not (solid == 1).any()
     assert not ((points[:, 0] > 10.2) & (np.abs(points[:, 1]) < 0.7 * points[:, 0]) & (points[:, 2] < 1.0)).any()
     assert ((solid < 0) & (points[:, 0] > 5) & (points[:, 0] < 9) & (np.abs(points[:, 1]) < 5)).any()
-    # Range noise: 1.5 cm on a plane that most rays meet nearly head on.
+    # Range noise: 1.5 cm on a plane that most rays hit at a right angle.
     front = points[(solid == 0) & (np.abs(points[:, 1]) < 2)]
     assert abs(front[:, 0].mean() - 9.9) < 2e-3 and 0.012 < front[:, 0].std() < 0.018
 
 
 @pytest.mark.parametrize("name", ["demo", "nuscenes"])
-def test_same_seed_same_bytes_in_any_order(name):
+def test_sweeps_depend_on_the_seed_only_not_on_the_order_of_calls(name):
     first, second = (make_drive(seed=7, num_sweeps=2, profile=name, scene="narrow") for _ in range(2))
     ahead = [first.sweep(i).points.tobytes() for i in (0, 1)]
     first.sweep(0).points[:] = 0  # a caller's changes do not reach the drive
@@ -173,7 +173,7 @@ def test_same_seed_same_bytes_in_any_order(name):
     assert make_drive(seed=8, num_sweeps=1, profile=name, scene="narrow").sweep(0).points.tobytes() != ahead[0]
 
 
-def test_the_static_world_moves_with_the_ego_car_and_the_ground_is_the_ground(drive):
+def test_static_flow_is_ego_motion_and_the_ground_mask_is_exact(drive):
     for i in range(4):
         sweep, labels = drive.sweep(i), drive.labels(i)
         static, points = labels.category == 0, sweep.points.astype(float)
@@ -189,25 +189,25 @@ def test_the_static_world_moves_with_the_ego_car_and_the_ground_is_the_ground(dr
 
 
 def test_flow_moves_points_onto_the_same_object_in_the_next_sweep(drive):
-    """Boxy objects with enough returns; movers must land, and would not without their own motion."""
+    """Objects of boxes with enough returns: their points must land on them, and would not by ego motion alone."""
     body, points = zip(*((drive._body_of(drive.returns(i)), drive.sweep(i).points.astype(float)) for i in (1, 2)))
     static = transform(np.linalg.inv(drive.poses[2]) @ drive.poses[1], points[0])
     landed_at, checked, missed_without = points[0] + drive.labels(1).flow, [], 0
-    for b, thing in enumerate(drive.scene.bodies):
+    for b, category in enumerate(each.category for each in drive.scene.bodies):
         rows, target = body[0] == b, body[1] == b
-        if thing.category in (None, "PEDESTRIAN", "BICYCLIST") or rows.sum() < 300 or target.sum() < 300:
+        if category in (None, "PEDESTRIAN", "BICYCLIST") or rows.sum() < 300 or target.sum() < 300:
             continue
         tree = cKDTree(points[1][target])
         landed = np.median(tree.query(landed_at[rows])[0])
-        assert landed < 0.1, thing.category
-        checked.append(thing.category)
+        assert landed < 0.1, category
+        checked.append(category)
         if np.linalg.norm((landed_at - static)[rows], axis=1).mean() > 0.4:
             missed_without += np.median(tree.query(static[rows])[0]) > landed
     assert set(checked) >= {"REGULAR_VEHICLE", "BUS", "TRUCK_CAB", "VEHICULAR_TRAILER"} and missed_without >= 2
 
 
 def test_labels_of_bodies_that_leave_the_annotated_range_are_invalid():
-    """Nobody annotates beyond the LiDAR's reach: here a car crosses that border between two sweeps."""
+    """Objects beyond the LiDAR's range are not annotated; here a car crosses that border between two sweeps."""
     drive = make_drive(seed=0, num_sweeps=2, profile="demo")
     body = drive._body_of(drive.returns(0))
     seen = next(b for b in np.unique(body[body < len(drive.scene.bodies)]) if drive._category[b])
@@ -219,16 +219,16 @@ def test_labels_of_bodies_that_leave_the_annotated_range_are_invalid():
     assert (drive.labels(0).category[body == seen] == 0).all()
 
 
-def test_ways_are_continuous_trailers_cut_corners_and_what_brakes_stops():
+def test_routes_are_continuous_trailers_cut_corners_and_braking_cars_stop():
     route = Route(1.0, 2.0, 0.3, start=-5, speed=4, radius=9, angle=-1.2)
     seconds = np.arange(0, 8, 0.01)
-    way = route(seconds)
-    assert np.allclose(np.hypot(*np.diff(way[:, :2], axis=0).T), 0.04, atol=1e-6)
-    assert way[-1, 2] == pytest.approx(0.3 - 1.2) and np.abs(np.diff(way[:, 2])).max() < 0.005
+    path = route(seconds)
+    assert np.allclose(np.hypot(*np.diff(path[:, :2], axis=0).T), 0.04, atol=1e-6)
+    assert path[-1, 2] == pytest.approx(0.3 - 1.2) and np.abs(np.diff(path[:, 2])).max() < 0.005
     trailer = Towed(route, hitch=1.0, wheelbase=6.0, middle=3.0)(seconds)
-    hitch = way[:, :2] - np.stack([np.cos(way[:, 2]), np.sin(way[:, 2])], -1)
+    hitch = path[:, :2] - np.stack([np.cos(path[:, 2]), np.sin(path[:, 2])], -1)
     assert np.allclose(np.hypot(*(hitch - trailer[:, :2]).T), 3.0, atol=0.01)
-    bend = np.abs(trailer[:, 2] - way[:, 2])
+    bend = np.abs(trailer[:, 2] - path[:, 2])
     assert bend.max() > 0.3 and bend[0] < 1e-6
     brakes = Route(0.0, 0.0, speed=4.0, acceleration=-2.0)
     assert np.allclose(brakes(np.arange(4.0))[:, 0], [0, 3, 4, 4]) and not brakes.is_static

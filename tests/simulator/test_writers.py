@@ -1,4 +1,4 @@
-"""The Argoverse 2 writer, read with pyarrow alone, and what Waymo's has to do where a turn begins."""
+"""The Argoverse 2 writer, read back with pyarrow, and the Waymo writer where a turn begins."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_labels_come_back_row_by_row_and_boxes_explain_them(drive, folder):
 def test_raster_finds_the_ground(drive, folder):
     sweep, found = drive.sweep(0), AV2Log(folder).sweep(0).is_ground
     city = sweep.points.astype(float) @ drive.poses[0, :3, :3].T + drive.poses[0, :3, 3]
-    # The rule of Argoverse 2 also takes the foot of every object: nothing that stands clear of the ground.
+    # With Argoverse 2's rule, the lowest part of every object counts as ground, but nothing above.
     true_height = drive.scene.ground.height(city[:, 0].copy(), city[:, 1].copy())
     clear = city[:, 2] > true_height + 0.3 + drive.scene.ground.kerb + 0.02
     assert found[sweep.is_ground].all() and clear.sum() > 30_000 and not found[clear].any()
@@ -90,8 +90,8 @@ def test_an_existing_log_is_only_replaced_on_request(tmp_path):
     assert len(list((folder / "sensors" / "lidar").iterdir())) == 2 and os.listdir(tmp_path) == [folder.name]
 
 
-def test_waymo_takes_true_poses_where_a_turn_begins(tmp_path, monkeypatch):
-    """Between sweeps the vehicle's pose is interpolated, and off by more than a metre at 75 m there."""
+def test_waymo_writes_true_poses_where_a_turn_begins(tmp_path, monkeypatch):
+    """There, interpolated poses of the vehicle are wrong by more than a metre at a range of 75 m."""
     turning, used = make_drive(316, 8, "waymo", "crossing"), []
     true_poses = waymo_encoding.true_poses_of_shots
     monkeypatch.setattr(
@@ -101,7 +101,7 @@ def test_waymo_takes_true_poses_where_a_turn_begins(tmp_path, monkeypatch):
     profile = replace(turning._profile, units=(replace(turning._profile.units[0], num_columns=530),))
     drive = Drive(turning.scene, profile, 0, 8, "turning")
     log = WaymoLog(write_waymo_segment(drive, tmp_path))
-    assert used, "else this drive is no test"
+    assert used, "this drive tests nothing if interpolation suffices"
     for index in used:
         stored, read = drive.sweep(index).points, log.sweep(index).points
         assert len(stored) == len(read) and cKDTree(read).query(stored)[0].max() < 1e-4

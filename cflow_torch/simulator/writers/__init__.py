@@ -1,4 +1,4 @@
-"""Simulated drives on disk, in the layouts of the data sets, so that readers have something to read.
+"""Write simulated drives in the layouts of the data sets, so that readers can be tested and drives cached.
 
-What a writer makes takes its name when all of it is on disk; if it fails, what was there before stays.
+A log appears under its name when all of it is on disk. If a writer fails, an earlier log of that name stays.
 """

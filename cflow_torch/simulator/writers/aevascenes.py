@@ -1,4 +1,4 @@
-"""Writes a recording in the layout of AevaScenes: `sequence.json` and one npz per LiDAR and frame."""
+"""Write a recording in the layout of AevaScenes: `sequence.json` and one npz per LiDAR and frame."""
 
 from __future__ import annotations
 
@@ -28,21 +28,21 @@ CLASS_OF: dict[str, str] = {
     **dict.fromkeys(("MOBILE_PEDESTRIAN_CROSSING_SIGN", "STOP_SIGN"), "traffic_sign"),
     "DOG": "animal",
 }
-"""Argoverse 2 name -> class of AevaScenes."""
+"""Argoverse 2 category -> class of AevaScenes."""
 
 _BACKGROUND, _ON_GROUND = "other_structure", GROUND[0]
-_CLASSES = tuple(CATEGORY_NAME)  # the position is the index written; the real data's table is not published
+_CLASSES = tuple(CATEGORY_NAME)  # the position is the written index; the table of the real data is not published
 _FOLDER = "pointcloud_compensated"
 _PATH_KEY = {"v2": "point_cloud_compensated_path", "v0.1": "point_cloud_path"}
 _XYZ = ("x", "y", "z")
 
 
 def write_aevascenes_sequence(log: Recording, root: str | Path, overwrite: bool = False, layout: str = "v2") -> Path:
-    """Writes `log` to `root/<log_id>`.
+    """Write `log` to `root/<log_id>`.
 
     Args:
-        log: what to write.
-        root: folder of the split, made if absent.
+        log: the recording.
+        root: folder of the split, made if it does not exist.
         overwrite: replace a sequence of that name.
         layout: "v2", or "v0.1" with its older key for the paths of the clouds.
 
@@ -50,19 +50,19 @@ def write_aevascenes_sequence(log: Recording, root: str | Path, overwrite: bool 
         The sequence folder, which `AevaScenesLog` takes.
 
     Convention:
-        - Points stay the float32 of the unit; poses and boxes are JSON numbers, exact float64. Poses are written as
-          quaternions, in the frame of the first one.
-        - Only the compensated clouds exist: a recording knows no others.
-        - Every point has a class name: "road" on the ground, that of the box it lies in, else "other_structure".
+        - Points are float32 in the frame of their unit. Poses and boxes are JSON numbers, exact float64. Poses are
+          quaternions, relative to the first pose.
+        - Only the compensated clouds are written, because a recording has no others.
+        - Every point has a class name: "road" on the ground, the class of the box that holds it, or "other_structure".
           `semantic_labels_idx` is the position of the name in `CATEGORY_NAME`, which is not Aeva's table.
         - Box velocities are over ground in axes of the vehicle, from the track's poses in the two nearest frames.
 
     Raises:
-        CFlowError: the sequence exists; no such folder name or layout; a shot before its sweep's time stamp or more
-            than 4 s after it; a category without a class.
+        CFlowError: the sequence exists already, the folder name or the layout is not valid, a shot is before its
+            sweep's time stamp or more than 4 s after it, or a category has no class.
     """
     if layout not in _PATH_KEY:
-        raise CFlowError(f"layout is one of {', '.join(_PATH_KEY)}; got {layout!r}")
+        raise CFlowError(f"layout={layout!r}: give one of {', '.join(_PATH_KEY)}")
     with new_folder(root, log.log_id, overwrite) as folder:
         (folder / _FOLDER).mkdir()
         _write_sequence(log, folder, _PATH_KEY[layout])
@@ -72,7 +72,7 @@ def write_aevascenes_sequence(log: Recording, root: str | Path, overwrite: bool 
 def _write_sequence(log: Recording, folder: Path, path_key: str) -> None:
     poses = np.asarray(log.poses, np.float64)
     from_first = np.linalg.inv(poses[0]) @ poses
-    from_first[0] = np.eye(4)  # but for rounding it is
+    from_first[0] = np.eye(4)  # without rounding errors
     frames: list[dict[str, Any]] = []
     mounts: dict[str, np.ndarray] = {}
     for index, stamp in enumerate(log.timestamps):
@@ -129,7 +129,7 @@ def _write_cloud(path: Path, unit: UnitReturns, classes: np.ndarray, where: str)
 
 
 def _classes(log: Recording, index: int, boxes: Boxes) -> np.ndarray:
-    """(N,) int64, position in `_CLASSES` of the class of every point of a sweep."""
+    """(N,) int64, index in `_CLASSES` of the class of every point of a sweep."""
     sweep = log.sweep(index)
     points = np.asarray(sweep.points)[:, :3]
     classes = np.full(len(points), _CLASSES.index(_BACKGROUND), np.int64)
@@ -149,7 +149,7 @@ def _class_of(category: str) -> str:
 
 
 def _boxes(boxes: Boxes) -> list[dict[str, Any]]:
-    """Without velocities."""
+    """The boxes of a frame, without velocities."""
     return [
         {
             "id": track,
@@ -166,7 +166,7 @@ def _boxes(boxes: Boxes) -> list[dict[str, Any]]:
 
 
 def _add_velocities(frames: Sequence[dict[str, Any]], poses: np.ndarray) -> None:
-    """Linear velocity, and the turning about z, from the neighbours of each box in its track."""
+    """Add linear velocities and yaw rates, from the two nearest boxes of the same track."""
     tracks: dict[str, list[Any]] = {}
     for frame, pose in zip(frames, poses):
         for box in frame["boxes"]:
@@ -180,8 +180,8 @@ def _add_velocities(frames: Sequence[dict[str, Any]], poses: np.ndarray) -> None
         )
         q = np.array([list(box["pose"]["rotation"].values()) for _, _, box in track])
         yaw = 2 * np.arctan2(q[:, 3], q[:, 0]) + [np.arctan2(pose[1, 0], pose[0, 0]) for _, pose, _ in track]
-        speeds, turning = np.gradient(centres, seconds, axis=0), np.gradient(np.unwrap(yaw), seconds)
-        for (_, pose, box), speed, rate in zip(track, speeds, turning):
+        speeds, yaw_rates = np.gradient(centres, seconds, axis=0), np.gradient(np.unwrap(yaw), seconds)
+        for (_, pose, box), speed, rate in zip(track, speeds, yaw_rates):
             box["linear_velocity"] = dict(zip(_XYZ, (pose[:3, :3].T @ speed).tolist()))
             box["angular_velocity"]["z"] = float(rate)
 

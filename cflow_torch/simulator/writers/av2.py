@@ -1,4 +1,4 @@
-"""Writes a log in the on-disk layout of Argoverse 2, so that every tool for that data set can read it."""
+"""Write a recording in the layout of Argoverse 2, which every tool for that data set can read."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from cflow_torch.data.rigid_motion import to_quaternions
 from cflow_torch.simulator.recording import Boxes, GroundRaster, Recording
 from cflow_torch.types import CFlowError
 
-CITY = "SYN"  # stands where Argoverse 2 has the code of the city
+CITY = "SYN"  # in place of Argoverse 2's code of the city
 _DYNAMIC = 0.05  # metres per sweep from which a point counts as dynamic in Argoverse 2
 
 
 def write_av2_log(log: Recording, root: str | Path, overwrite: bool = False) -> Path:
-    """Writes `log` to `root/<log_id>` in Argoverse 2's layout.
+    """Write `log` to `root/<log_id>` in Argoverse 2's layout.
 
     Args:
-        log: what to write.
-        root: folder of the split, made if absent.
+        log: the recording.
+        root: folder of the split, made if it does not exist.
         overwrite: replace a log of that name.
 
     Returns:
@@ -36,11 +36,11 @@ def write_av2_log(log: Recording, root: str | Path, overwrite: bool = False) -> 
         - Points are rounded to float16, as in Argoverse 2: steps of 8 mm at 8-16 m, 31 mm at 32-64 m.
         - Beyond Argoverse 2: `flow_labels/<ns>.feather` per pair, rows in the order of the points of sweep t, columns
           of Argoverse 2's flow labels (total flow, axes of ego1) and `is_valid`.
-        - `is_ground_0` is the log's own ground mask. The raster holds the true height; read with Argoverse 2's rule
-          (|z - h| <= 0.3 m or below), the lowest 0.3 m of every object is ground as well.
+        - `is_ground_0` is the log's own ground mask. The raster holds the true height. With Argoverse 2's rule
+          (|z - h| <= 0.3 m or below), the lowest 0.3 m of every object counts as ground, too.
 
     Raises:
-        CFlowError: the log exists, or its name is no folder's.
+        CFlowError: the log exists already, or its name cannot be used as a folder name.
     """
     with new_folder(root, log.log_id, overwrite) as folder:
         _write_log(log, folder)
@@ -49,10 +49,10 @@ def write_av2_log(log: Recording, root: str | Path, overwrite: bool = False) -> 
 
 @contextmanager
 def new_folder(root: str | Path, log_id: str, overwrite: bool) -> Iterator[Path]:
-    """A folder to fill, which becomes `root/<log_id>` when the block ends and vanishes if the block raises.
+    """A folder to fill, which becomes `root/<log_id>` when the block ends and is deleted if the block raises.
 
     Raises:
-        CFlowError: `log_id` is no folder name, or the folder exists and `overwrite` is False.
+        CFlowError: `log_id` cannot be used as a folder name, or the folder exists and `overwrite` is False.
     """
     folder = Path(root) / safe_name(log_id, "log_id")
     if folder.exists() and not overwrite:
@@ -106,7 +106,7 @@ def _annotations(stamp: int, boxes: Boxes) -> Mapping[str, np.ndarray]:
 
 
 def _write_map(folder: Path, log_id: str, raster: GroundRaster) -> None:
-    """The ground raster, how to index it, and a vector map with nothing but the raster's outline as drivable area."""
+    """Write the ground raster, its transform, and a vector map with the raster's outline as drivable area."""
     (x0, y0), step = raster.origin, raster.step
     rows, columns = raster.height.shape
     folder.mkdir()

@@ -1,4 +1,4 @@
-"""Writes a recording in the on-disk layout of nuScenes: JSON tables and `.pcd.bin` sweeps."""
+"""Write a recording in the layout of nuScenes: JSON tables and `.pcd.bin` sweeps."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from cflow_torch.simulator.recording import Recording, UnitReturns
 from cflow_torch.simulator.writers.av2 import new_folder
 from cflow_torch.types import CFlowError
 
-# A PNG of one pixel: the devkit wants a map file, which it opens only to draw it.
+# A PNG of one pixel: the devkit requires a map file, which it opens only to draw it.
 _BLACK_PIXEL = "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAAAAAA6fptVAAAACklEQVR4nGNgAAAAAgABSK+kcQAAAABJRU5ErkJggg=="
 _VISIBILITY = ("v0-40", "v40-60", "v60-80", "v80-100")
 Table = List[Dict[str, Any]]
@@ -32,7 +32,7 @@ NUSCENES_NAMES: dict[str, str] = {
     "OFFICIAL_SIGNALER": "human.pedestrian.police_officer",
     "SCHOOL_BUS": "vehicle.bus.rigid",
 }
-"""Argoverse 2 name of a box -> the nearest category of nuScenes, of the same meta class."""
+"""Argoverse 2 category -> the nearest category of nuScenes in the same meta class."""
 
 
 def write_nuscenes(
@@ -42,28 +42,28 @@ def write_nuscenes(
     key_frame_interval: float = 0.5,
     overwrite: bool = False,
 ) -> Path:
-    """Writes `recording` to `root/<log_id>`, a data root of nuScenes with one scene of that name.
+    """Write `recording` to `root/<log_id>`, a data root of nuScenes with one scene of that name.
 
     Args:
-        recording: what to write. If none of its LiDARs is called LIDAR_TOP, the first one is in the file.
-        root: folder, made if absent.
+        recording: the recording. If none of its LiDARs is called LIDAR_TOP, the first one gets that name.
+        root: folder, made if it does not exist.
         version: name of the folder of the tables.
-        key_frame_interval: seconds between samples, which alone have boxes. First and last sweep are samples too, so
-            that there is truth for every pair.
+        key_frame_interval: seconds between samples; only samples have boxes. The first and the last sweep are samples,
+            so that every pair has truth.
         overwrite: replace a scene of that name.
 
     Returns:
         The data root.
 
     Convention:
-        - All 13 tables, complete enough for the official devkit; `attribute` is empty, visibility always the highest.
+        - All 13 tables are complete enough for the official devkit; `attribute` is empty, visibility is the highest.
         - Points are float32 in the frame of their LiDAR, with intensity and ring, in the order of the recording.
-        - Time stamps are cut to microseconds. Poses keep the height that they have (the real data set has z = 0).
-        - Ground mask and flow have no place in the format.
+        - Time stamps are truncated to microseconds. Poses keep their height (the real data set has z = 0).
+        - The format has no ground mask and no flow.
 
     Raises:
-        CFlowError: the scene exists, the log_id is no folder name, a category has no counterpart, the LiDARs change
-            from sweep to sweep, or time stamps do not ascend by a microsecond or more.
+        CFlowError: the scene exists already, the log_id cannot be used as a folder name, a category has no counterpart,
+            the LiDARs change from sweep to sweep, or time stamps do not increase by a microsecond or more.
     """
 
     def write_points(file: Path, unit: UnitReturns, stamp_ns: int) -> None:
@@ -88,13 +88,13 @@ def write_nuscenes(
 
 
 class SceneWriter:
-    """Sweeps and tables that nuScenes and TruckScenes have in common.
+    """Write the sweeps and tables that nuScenes and TruckScenes have in common.
 
     Args:
-        recording: what to write.
+        recording: the recording.
         folder: data root.
-        reference: channel that the first LiDAR gets, unless another one has that name.
-        names: Argoverse 2 name of a box -> category of the format.
+        reference: channel of the first LiDAR, unless another one has that name.
+        names: Argoverse 2 category -> category of the format.
     """
 
     def __init__(self, recording: Recording, folder: Path, reference: str, names: Mapping[str, str]) -> None:
@@ -108,15 +108,15 @@ class SceneWriter:
             raise CFlowError(f"log {recording.log_id}: time stamps must ascend by a microsecond or more")
 
     def token(self, *what: object) -> str:
-        """32 hex characters, the same for the same thing."""
+        """Token of 32 hex characters, which depends on the log and on `what` only."""
         return hashlib.md5(repr((self.recording.log_id, *what)).encode()).hexdigest()
 
     def write(self, file_name: str, write_points: Any, key_frame_interval: float) -> dict[str, Table]:
-        """Writes all sweeps.
+        """Write all sweeps.
 
         Args:
             file_name: pattern with {name} of the log, {channel}, {stamp} in microseconds.
-            write_points: called with file, unit and its sweep's time stamp in nanoseconds.
+            write_points: called with file, unit and the time stamp of its sweep in nanoseconds.
             key_frame_interval: seconds.
 
         Returns:
@@ -129,7 +129,7 @@ class SceneWriter:
             units = self.recording.units(index)
             if [unit.name for unit in units] != [unit.name for unit in self._units]:
                 raise CFlowError(f"log {self.recording.log_id}: sweep {index} has other LiDARs than the first sweep")
-            sample = next(key for key in keys if key >= index)  # a sweep belongs to the sample that follows it
+            sample = next(key for key in keys if key >= index)  # a sweep belongs to the next sample
             for channel, unit in zip(self._channels, units):
                 kind = "samples" if index == sample else "sweeps"
                 name = file_name.format(name=self.recording.log_id, channel=channel, stamp=stamp)
@@ -169,7 +169,7 @@ class SceneWriter:
         return keys if keys[-1] == last else [*keys, last]
 
     def _fixed_tables(self, keys: Sequence[int]) -> dict[str, Table]:
-        """Everything but sweeps and boxes."""
+        """All tables except those of sweeps and boxes."""
         token, scene = self.token, self.token("scene")
         samples = [token("sample", key) for key in keys]
         links = zip(samples, keys, ["", *samples[:-1]], [*samples[1:], ""])
@@ -207,7 +207,7 @@ class SceneWriter:
         }
 
     def _annotate(self, keys: Sequence[int], tables: dict[str, Table]) -> None:
-        """Adds categories, instances and the boxes of the samples."""
+        """Add categories, instances and the boxes of the samples."""
         tracks: dict[str, Table] = {}  # track -> its boxes
         category_of: dict[str, str] = {}
         for key in keys:
@@ -216,8 +216,8 @@ class SceneWriter:
             for row, (track, name) in enumerate(zip(boxes.track_id, boxes.category)):
                 if name not in self._names:
                     raise CFlowError(
-                        f"log {self.recording.log_id} has a box of category {name!r}, for which the format has no "
-                        f"name; it can hold {sorted(self._names)}"
+                        f"log {self.recording.log_id} has a box of category {name!r}, which the format does not have; "
+                        f"give one of {sorted(self._names)}"
                     )
                 category_of[track] = self._names[name]
                 length, width, height = (float(side) for side in boxes.size[row])
@@ -257,7 +257,7 @@ class SceneWriter:
 
 
 def write_tables(folder: Path, tables: Mapping[str, Table]) -> None:
-    """One JSON file per table."""
+    """Write one JSON file per table."""
     folder.mkdir()
     for table, rows in tables.items():
         (folder / f"{table}.json").write_text(json.dumps(rows, indent=0, allow_nan=False))

@@ -1,4 +1,4 @@
-"""Writes a recording in the on-disk layout of MAN TruckScenes: JSON tables and PCD sweeps with a time per point."""
+"""Write a recording in the layout of MAN TruckScenes: JSON tables and PCD sweeps with a time per point."""
 
 from __future__ import annotations
 
@@ -11,36 +11,37 @@ from cflow_torch.simulator.recording import Recording, UnitReturns
 from cflow_torch.simulator.writers.av2 import new_folder
 from cflow_torch.simulator.writers.nuscenes import NUSCENES_NAMES, SceneWriter, write_tables
 
-# Tables that the devkit wants besides those of nuScenes; a simulated truck has nothing to put there.
 _VERSION, _KEY_FRAME_INTERVAL = "v1.2-mini", 0.5  # seconds
+# Tables that the devkit requires in addition to those of nuScenes; a simulated truck has no data for them.
 _EMPTY = ("ego_motion_cabin", "ego_motion_chassis", "weather_annotation")
 TRUCKSCENES_NAMES: dict[str, str] = {
     **NUSCENES_NAMES,
     "SIGN": "static_object.traffic_sign",
     "STOP_SIGN": "static_object.traffic_sign",
 }
-"""Argoverse 2 name of a box -> the nearest category of TruckScenes."""
+"""Argoverse 2 category -> the nearest category of TruckScenes."""
 
 
 def write_truckscenes(recording: Recording, root: str | Path, overwrite: bool = False) -> Path:
-    """Writes `recording` to `root/<log_id>`, a data root of TruckScenes with one scene of that name.
+    """Write `recording` to `root/<log_id>`, a data root of TruckScenes with one scene of that name.
 
     Args:
-        recording: what to write. If none of its LiDARs is called LIDAR_LEFT, the first one is in the file.
-        root: folder, made if absent.
+        recording: the recording. If none of its LiDARs is called LIDAR_LEFT, the first one gets that name.
+        root: folder, made if it does not exist.
         overwrite: replace a scene of that name.
 
     Returns:
         The data root.
 
     Convention:
-        - All 14 tables, complete enough for the official devkit; cabin and chassis motion and weather are empty.
-        - Fields of a sweep: x, y, z, intensity float32, timestamp uint64, microseconds since 1970 of each shot (cut).
-        - Points stay in the frame of their LiDAR, in the order of the recording; nothing is compensated here.
-        - Ground mask and flow have no place in the format.
+        - All 14 tables are complete enough for the official devkit; cabin and chassis motion and weather are empty.
+        - Fields of a sweep: x, y, z, intensity float32; timestamp uint64, microseconds of each shot since 1970.
+        - Points are in the frame of their LiDAR, in the order of the recording, without motion compensation.
+        - The format has no ground mask and no flow.
 
     Raises:
-        CFlowError: as `write_nuscenes`.
+        CFlowError: the scene exists already, the log_id cannot be used as a folder name, a category has no counterpart,
+            the LiDARs change from sweep to sweep, or time stamps do not increase by a microsecond or more.
     """
 
     def write_points(file: Path, unit: UnitReturns, stamp_ns: int) -> None:

@@ -1,4 +1,4 @@
-"""Writes a recording in the layout of the Waymo Open Dataset, version 2: six parquet files per segment."""
+"""Write a recording in the layout of the Waymo Open Dataset, version 2: six parquet files per segment."""
 
 from __future__ import annotations
 
@@ -28,70 +28,66 @@ BOX_TYPE: dict[str, int] = {
     **dict.fromkeys(("SIGN", "STOP_SIGN"), 3),
     **dict.fromkeys(("BICYCLE", "BICYCLIST", "WHEELED_DEVICE", "WHEELED_RIDER"), 4),
 }
-"""Argoverse 2 name -> Waymo's box type. Motorcycles are vehicles; what has no type, and trains, are not labelled."""
+"""Argoverse 2 category -> Waymo's box type. Motorcycles are vehicles; trains and untyped categories are left out."""
 del BOX_TYPE["RAILED_VEHICLE"]
 
 _XYZ = ("x", "y", "z")
 
 
 def write_waymo_segment(log: Recording, root: str | Path, overwrite: bool = False) -> Path:
-    """Writes `log` to `root/<component>/<log_id>.parquet`, one row group per frame.
+    """Write `log` to `root/<component>/<log_id>.parquet`, one row group per frame.
 
     Args:
-        log: what to write. Units called as in `waymo_range_image.LASERS` become these; if none is, they become TOP,
-            FRONT, ... in their order.
-        root: folder of the split, made if absent.
+        log: the recording. Units with a name of `LASERS` keep it. If no unit has one, they become TOP, FRONT, ... in
+            their order.
+        root: folder of the split, made if it does not exist.
         overwrite: replace a segment of that name.
 
     Returns:
         The file of the component `lidar`, which `WaymoLog` takes.
 
     Convention:
-        - TOP: each pixel has the vehicle's pose at the time of its shot, interpolated between the poses of the sweeps
-          (or, where that is too far off, the recording's own, if it knows poses between sweeps), and moved so that its
-          point lies exactly where the recording has it. What is left is the rounding of those
-          poses and of ranges to float32: 5e-5 m up to 1 km from the world's origin.
-        - The others: range images of the vehicle at the pose of the frame, without poses of pixels. Returns whose rays
-          are those of the pixels come back to float32, 5e-6 m at 75 m; others are moved onto the ray, by up to 5 mm.
-        - Times are rounded to microseconds. Boxes keep heading only: roll and pitch of a box are lost.
-        - No second returns, no elongation, no no-label zones, no accelerations: the files say so.
+        - TOP: each pixel has the vehicle's pose at the time of its shot, interpolated between the poses of the sweeps.
+          Where that is too inaccurate, it is the recording's own pose, if it has poses between sweeps. The pose is
+          shifted so that its point is exactly where the recording has it, except for the rounding of poses and ranges
+          to float32: 5e-5 m up to 1 km from the world's origin.
+        - Other lasers: range images of the vehicle at the pose of the frame, without poses of pixels. Returns on the
+          rays of their pixels keep float32 accuracy, 5e-6 m at 75 m; others are moved onto the ray, by up to 5 mm.
+        - Times are rounded to microseconds. Boxes keep their heading only, without roll and pitch.
+        - There are no second returns, no elongation, no no-label zones and no accelerations.
 
     Raises:
-        CFlowError: the segment exists; no such folder name; more than five units; a return off its pixel's ray, or two
-            in one pixel; time stamps that are not microseconds apart.
+        CFlowError: the segment exists already, its name cannot be used for a file, there are more than five units, a
+            return is off its pixel's ray, two returns share a pixel, or time stamps are less than a microsecond apart.
     """
     root = Path(root)
     name = safe_name(f"{log.log_id}.parquet", "the file of log_id")
-    places = {tag: root / tag / name for tag in SCHEMAS}
-    present = [str(place) for place in places.values() if place.exists()]
+    files = {tag: root / tag / name for tag in SCHEMAS}
+    present = [str(file) for file in files.values() if file.exists()]
     if present and not overwrite:
         raise CFlowError(f"{present[0]} exists; give overwrite=True to replace the segment")
     root.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{log.log_id}-", dir=root) as folder:
         _write_components(log, Path(folder))
-        _put_in_place(Path(folder), places)
-    return places["lidar"]
-
-
-def _put_in_place(folder: Path, places: dict[str, Path]) -> None:
-    """Moves <tag> to its place. The file that readers look for goes first and comes last: none is ever half old."""
-    if places["lidar"].exists():
-        places["lidar"].unlink()
-    for tag in sorted(places, key=lambda tag: tag == "lidar"):
-        places[tag].parent.mkdir(exist_ok=True)
-        os.replace(folder / tag, places[tag])
+        # Readers search for the file `lidar`: remove it first and add it last, so that they never find a mixed segment.
+        if files["lidar"].exists():
+            files["lidar"].unlink()
+        for tag in sorted(files, key=lambda tag: tag == "lidar"):
+            files[tag].parent.mkdir(exist_ok=True)
+            os.replace(Path(folder) / tag, files[tag])
+    return files["lidar"]
 
 
 def _write_components(log: Recording, folder: Path) -> None:
     times = [(stamp + 500) // 1000 for stamp in log.timestamps]
     if len(set(times)) < len(times):
-        raise CFlowError(f"log {log.log_id} has sweeps less than a microsecond apart; Waymo cannot tell them apart")
+        raise CFlowError(f"log {log.log_id} has sweeps less than a microsecond apart, which Waymo's files cannot store")
     with ExitStack() as stack:
         writers = {
             tag: stack.enter_context(pq.ParquetWriter(folder / tag, schema, compression="zstd"))
             for tag, schema in SCHEMAS.items()
         }
-        tables: dict[str, list[dict[str, Any]]] = {tag: [] for tag in SCHEMAS}  # those of one row group
+        tables: dict[str, list[dict[str, Any]]] = {tag: [] for tag in SCHEMAS}  # written as one row group
         for index, time in enumerate(times):
             key = {SEGMENT: log.log_id, TIME: time}
             pose, units = np.asarray(log.poses[index], np.float64), log.units(index)
@@ -129,12 +125,12 @@ def _laser_numbers(names: Sequence[str]) -> list[int]:
         return list(LASERS.values())[: len(names)]
     unknown = sorted(set(names) - set(LASERS))
     if unknown:
-        raise CFlowError(f"units {unknown} are none of Waymo's ({', '.join(LASERS)}) although others are; rename them")
+        raise CFlowError(f"units {unknown} are not Waymo's, but others are; rename all to {', '.join(LASERS)}")
     return [LASERS[name] for name in names]
 
 
 def _calibration(unit: UnitReturns, elevations: np.ndarray) -> LaserCalibration:
-    """Evenly spaced beams are stored by their outer edges, as Waymo does for its side lasers."""
+    """Calibration of a unit. Evenly spaced beams are stored by their outer edges, as in Waymo's side lasers."""
     T_ego_sensor, elevations = np.asarray(unit.T_ego_sensor, np.float64), np.asarray(elevations, np.float64)
     steps = np.diff(elevations)
     if len(steps) and np.ptp(steps) < 1e-12 and unit.name != "TOP":
@@ -153,7 +149,7 @@ def _calibration_row(log_id: str, number: int, calibration: LaserCalibration) ->
 
 
 def _box_rows(log: Recording, index: int, key: dict[str, Any]) -> list[dict[str, Any]]:
-    """Rows of one frame, without speeds."""
+    """Boxes of one frame, without speeds."""
     boxes, rows = log.boxes(index), []
     for track, category, size, pose, count in zip(
         boxes.track_id, boxes.category, boxes.size, boxes.pose, boxes.num_points
@@ -168,7 +164,7 @@ def _box_rows(log: Recording, index: int, key: dict[str, Any]) -> list[dict[str,
 
 
 def _add_speeds(rows: Sequence[dict[str, Any]], poses: dict[int, np.ndarray]) -> None:
-    """Velocities over ground in world axes, from the track's centres in the two nearest frames."""
+    """Add velocities over ground in world axes, from the track's centres in the two nearest frames."""
     tracks: dict[str, list[dict[str, Any]]] = {}
     for row in rows:
         tracks.setdefault(row[TRACK], []).append(row)
@@ -190,6 +186,6 @@ def _stats(boxes: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _write_rows(writer: pq.ParquetWriter, rows: Sequence[dict[str, Any]]) -> None:
-    """Adds one row group; a column that a row does not have becomes null."""
+    """Add one row group; missing columns become null."""
     arrays = [pa.array([row.get(field.name) for row in rows], field.type) for field in writer.schema]
     writer.write_table(pa.Table.from_arrays(arrays, schema=writer.schema), row_group_size=max(len(rows), 1))

@@ -1,4 +1,4 @@
-"""From returns to Waymo's range images: pixels, ranges and, for the laser on the roof, poses of the pixels."""
+"""Encode returns as Waymo's range images: pixels, ranges and, for the laser on the roof, poses of the pixels."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from cflow_torch.simulator.recording import Recording, UnitReturns
 from cflow_torch.types import CFlowError
 
 _NODES = 4  # sweeps whose poses are interpolated: a cubic is exact for constant jerk
-# Metres, of a pixel's pose from the interpolated one. Where a car begins to turn, the cubic is off by 0.3 m at 75 m in
-# the street (0.4 rad/s), by 1.5 m at the crossing (0.8 rad/s), and by more at the ends of a drive.
+# Metres of a pixel's pose from the interpolated one. Where a car begins to turn, the cubic is off by 0.3 m at 75 m
+# in the street (0.4 rad/s), by 1.5 m at the crossing (0.8 rad/s), and by more at the ends of a drive.
 _MAX_POSE_SHIFT = 1.0
-_MAX_SHIFT = 0.005  # metres, of the returns of the other lasers, whose pixels have no poses
+_MAX_SHIFT = 0.005  # metres of the returns of the other lasers, whose pixels have no poses
 
 
 @dataclass(frozen=True)
 class ShotPoses:
-    """Where the vehicle was at each of N shots.
+    """Poses of the vehicle at N shots.
 
     Args:
-        of_shot: (N, 6) roll, pitch, yaw, x, y, z of `T_world_ego`; the angles are float32 numbers already.
-        of_frame: (6,) that of the frame.
+        of_shot: (N, 6) roll, pitch, yaw, x, y, z of `T_world_ego`; the angles are rounded to float32.
+        of_frame: (6,) those of the frame.
         T_world_ego: (4, 4) float64 pose of the frame.
     """
 
@@ -39,16 +39,16 @@ class ShotPoses:
     T_world_ego: np.ndarray
 
     def to_shot(self, points: np.ndarray, T_ego_sensor: np.ndarray) -> np.ndarray:
-        """Points (N, 3) of the laser's frame at the pose of the frame, seen from it at the moment of the shot."""
+        """Transform points (N, 3) in the laser's frame from the pose of the frame to the pose of their shot."""
         world = self._world(points, T_ego_sensor)
         ego = np.einsum("nji,nj->ni", rotations_from_angles(self.of_shot[:, :3]), world - self.of_shot[:, 3:])
         return (ego - T_ego_sensor[:3, 3]) @ T_ego_sensor[:3, :3]
 
-    def that_give(self, points: np.ndarray, on_rays: np.ndarray, T_ego_sensor: np.ndarray) -> np.ndarray:
-        """The poses, moved so that (N, 3) points on the rays of their pixels come to lie where the true ones are."""
+    def shifted_to(self, points: np.ndarray, on_rays: np.ndarray, T_ego_sensor: np.ndarray) -> np.ndarray:
+        """(N, 6) poses of the shots, shifted so that they map `on_rays` (N, 3) to the true points (N, 3)."""
         ego = on_rays @ T_ego_sensor[:3, :3].T + T_ego_sensor[:3, 3]
-        turned = np.einsum("nij,nj->ni", rotations_from_angles(self.of_shot[:, :3]), ego)
-        return np.concatenate([self.of_shot[:, :3], self._world(points, T_ego_sensor) - turned], axis=1)
+        rotated = np.einsum("nij,nj->ni", rotations_from_angles(self.of_shot[:, :3]), ego)
+        return np.concatenate([self.of_shot[:, :3], self._world(points, T_ego_sensor) - rotated], axis=1)
 
     def _world(self, points: np.ndarray, T_ego_sensor: np.ndarray) -> np.ndarray:
         T = self.T_world_ego @ T_ego_sensor
@@ -56,17 +56,17 @@ class ShotPoses:
 
 
 def poses_of_shots(log: Recording, index: int, offset_ns: np.ndarray) -> ShotPoses:
-    """Poses at the times of shots: the polynomial through the angles and positions of the four nearest sweeps."""
+    """Interpolate poses at the times of shots by a cubic through angles and positions of the four nearest sweeps."""
     first = min(max(index - 1, 0), max(len(log.timestamps) - _NODES, 0))
     nodes = range(first, min(first + _NODES, len(log.timestamps)))
     values = np.stack([pose_angles(np.asarray(log.poses[node], np.float64)) for node in nodes])
     values[:, :3] = np.unwrap(values[:, :3], axis=0)
     seconds = np.array([(log.timestamps[node] - log.timestamps[index]) * 1e-9 for node in nodes])
-    at = np.asarray(offset_ns, np.float64) * 1e-9
-    weights = np.ones((len(at), len(nodes)))
+    shots = np.asarray(offset_ns, np.float64) * 1e-9
+    weights = np.ones((len(shots), len(nodes)))
     for k, own in enumerate(seconds):
         for other in np.delete(seconds, k):
-            weights[:, k] *= (at - other) / (own - other)
+            weights[:, k] *= (shots - other) / (own - other)
     of_shot = weights @ values
     of_shot[:, :3] = of_shot[:, :3].astype(np.float32)
     T_world_ego = np.asarray(log.poses[index], np.float64)
@@ -74,7 +74,7 @@ def poses_of_shots(log: Recording, index: int, offset_ns: np.ndarray) -> ShotPos
 
 
 def true_poses_of_shots(log: Any, index: int, offset_ns: np.ndarray) -> ShotPoses:
-    """Poses at the times of shots, from a recording that knows them between its sweeps (`Drive.poses_at`)."""
+    """Poses at the times of shots, from a recording with poses between its sweeps (`Drive.poses_at`)."""
     of_shot = pose_angles(log.poses_at(index, offset_ns))
     of_shot[:, :3] = of_shot[:, :3].astype(np.float32)
     return ShotPoses(of_shot, pose_angles(log.poses[index]), log.poses[index])
@@ -89,19 +89,19 @@ def encode_images(
 ) -> dict[str, np.ndarray]:
     """Range images of both returns (the second is empty) and, given poses of the shots, the image of pixel poses.
 
-    Where `shot_poses` are too far off for the pixels, `true_poses` take their place.
+    `true_poses` are used where `shot_poses` are too inaccurate for the pixels.
     """
     height, width = unit.num_rings, unit.num_columns
     points = np.asarray(unit.points, np.float64)  # laser frame, at the pose of the frame
     seen = points if shot_poses is None else shot_poses.to_shot(points, calibration.T_ego_sensor)
     distance = np.linalg.norm(seen, axis=1).astype(np.float32)
     row = height - 1 - np.asarray(unit.ring, np.int64)
-    # Column j looks to azimuth a_0 - 2 pi j / W.
+    # Column j has azimuth a_0 - 2 pi j / W.
     azimuths = calibration.column_azimuths(width)
-    turned = (azimuths[0] - np.arctan2(seen[:, 1], seen[:, 0])) / (2 * np.pi) * width
-    column = np.rint(turned).astype(np.int64) % width
+    column = (azimuths[0] - np.arctan2(seen[:, 1], seen[:, 0])) / (2 * np.pi) * width
+    column = np.rint(column).astype(np.int64) % width
     if shot_poses is not None and len(column):
-        # Interpolated poses may err by a pixel. The recording counts columns as the image does, from another first one.
+        # Interpolated poses may be wrong by a pixel. The recording's columns differ from the image's by an offset only.
         start = np.bincount((column - unit.column) % width).argmax()
         column = (np.asarray(unit.column, np.int64) + start) % width
     rays = directions(azimuths[column], calibration.row_inclinations(height)[row])
@@ -125,7 +125,7 @@ def encode_images(
     images["first"] = image
     if shot_poses is not None:
         images["poses"] = np.tile(shot_poses.of_frame, (height, width, 1)).astype(np.float32)
-        images["poses"][row, column] = shot_poses.that_give(points, on_rays, calibration.T_ego_sensor)
+        images["poses"][row, column] = shot_poses.shifted_to(points, on_rays, calibration.T_ego_sensor)
     return images
 
 

@@ -1,4 +1,4 @@
-"""The columns of Waymo's parquet files, as the official classes print them."""
+"""The columns of Waymo's parquet files, as printed by the official classes."""
 
 from __future__ import annotations
 
