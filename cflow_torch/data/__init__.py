@@ -1,3 +1,3 @@
-"""Readers, writers, simulated drives: everything that touches files."""
+"""Readers and writers of data sets, and everything else that touches files."""
 
 from __future__ import annotations

@@ -13,28 +13,26 @@ from cflow_torch.types import CFlowError
 
 
 def check_columns(file: Any, names: Sequence[str], columns: Sequence[str], hint: str = "copy it again") -> None:
-    """Refuse columns that are asked for and missing, or there several times.
-
-    Raises:
-        CFlowError: such a column; `hint` says what to do.
-    """
+    """Raise a `CFlowError` if a needed column is missing or occurs several times; `hint` ends the message."""
     missing = [name for name in columns if name not in names]
     if missing:
         raise CFlowError(f"{file} lacks the columns {missing}; it has {shortened(names)}; {hint}")
-    doubled = [name for name in columns if names.count(name) > 1]
-    if doubled:
-        raise CFlowError(f"{file} has several columns {doubled}; keep one")
+    repeated = [name for name in columns if names.count(name) > 1]
+    if repeated:
+        raise CFlowError(f"{file} has several columns {repeated}; keep one of each")
 
 
 class FeatherFile:
-    """A feather file, in memory.
+    """A feather file in memory.
 
     Args:
-        file: where it is, a path; with `data` just its name in messages.
-        data: its contents; None = they are read, all at once: a file that shrinks meanwhile does no harm.
+        file: its path; if you pass `data`, only its name in messages.
+        data: its contents; None = read them from `file`, all at once, so that a file that shrinks meanwhile does no
+            harm.
 
     Attributes:
-        names, num_rows: of the columns, of the table.
+        names: names of the columns.
+        num_rows: rows of the table.
 
     Raises:
         CFlowError: the file is missing, cannot be reached, or is damaged.
@@ -50,7 +48,7 @@ class FeatherFile:
         self.num_rows: int = self._table.num_rows
 
     def read(self, columns: Sequence[str]) -> pa.Table:
-        """Some columns, in the order that is asked for.
+        """Return some columns, in the given order.
 
         Raises:
             CFlowError: a column is missing or occurs twice.
@@ -60,43 +58,26 @@ class FeatherFile:
 
 
 def float_columns(table: pa.Table, columns: Sequence[str], file: Any, dtype: type = np.float64) -> np.ndarray:
-    """(rows, K) numbers of K floating-point columns.
-
-    Raises:
-        CFlowError: a column of another type, or with empty entries.
-    """
+    """Return K floating-point columns as (rows, K); another type or an empty entry is a `CFlowError`."""
     values = np.empty((table.num_rows, len(columns)), dtype)
-    for number, name in enumerate(columns):
-        values[:, number] = _column(table, name, file, "floating point", pa.types.is_floating).to_numpy()
+    for position, name in enumerate(columns):
+        values[:, position] = _column(table, name, file, "floating point", pa.types.is_floating).to_numpy()
     return values
 
 
 def integer_column(table: pa.Table, column: str, file: Any) -> np.ndarray:
-    """(rows,) int64 numbers of an integer column.
-
-    Raises:
-        CFlowError: another type, or empty entries.
-    """
+    """Return an integer column as (rows,) int64; another type or an empty entry is a `CFlowError`."""
     return _column(table, column, file, "integer", pa.types.is_integer).to_numpy().astype(np.int64)
 
 
 def bool_column(table: pa.Table, column: str, file: Any) -> np.ndarray:
-    """(rows,) bool.
-
-    Raises:
-        CFlowError: another type, or empty entries.
-    """
+    """Return a column as (rows,) bool; another type or an empty entry is a `CFlowError`."""
     return _column(table, column, file, "bool", pa.types.is_boolean).to_numpy().astype(bool)
 
 
 def text_column(table: pa.Table, column: str, file: Any) -> list[str]:
-    """Text of every row, also of a dictionary.
-
-    Raises:
-        CFlowError: another type, or empty entries.
-    """
-    found: list[str] = _column(table, column, file, "text", _is_text).to_pylist()
-    return found
+    """Return the text of every row, also of a dictionary column; another type or an empty entry is a `CFlowError`."""
+    return list(_column(table, column, file, "text", _is_text).to_pylist())
 
 
 def _column(table: pa.Table, column: str, file: Any, kind: str, is_kind: Any) -> pa.ChunkedArray:

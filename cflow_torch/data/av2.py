@@ -19,7 +19,7 @@ from cflow_torch.data.paths import PathLike, as_path, remote_errors
 from cflow_torch.data.rigid_motion import poses_from_quaternions, transform_points
 from cflow_torch.types import CFlowError, Sweep
 
-MIN_INTERIOR_POINTS = 1  # av2-api's data loader drops boxes that hold no point, so a track that empties ends
+MIN_INTERIOR_POINTS = 1  # av2-api's data loader drops boxes that hold no point, so their track ends
 SEARCH_DEPTH = 4  # <root>/<data set>/sensor/<split>/<log>, the deepest layout in use
 
 _POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
@@ -28,41 +28,41 @@ _FLOW = ("flow_tx_m", "flow_ty_m", "flow_tz_m")
 
 
 def find_av2_logs(root: PathLike) -> list[Path]:
-    """Sorted folders of all logs: those that hold `sensors/lidar`.
+    """Find the folders of all logs, which hold `sensors/lidar`, sorted.
 
     Args:
         root: a log, a split (holds logs), or a folder of splits, at most four levels above the logs.
 
     Raises:
-        CFlowError: `root` is no folder.
+        CFlowError: `root` is not a folder.
     """
     return find_folders(as_path(root), _is_log, SEARCH_DEPTH, "a log, or a folder of logs")
 
 
 class AV2Log(Log):
-    """One Argoverse 2 sensor log; implements the `Log` protocol.
+    """One Argoverse 2 sensor log.
 
     Args:
         folder: log folder with `sensors/lidar/<ns>.feather` and `city_SE3_egovehicle.feather`.
-        ground: rule for the map raster, "av2-api" or "bsfe" (`cflow_torch.data.ground`); None = no ground masks. A log
-            whose map has no raster has none either.
+        ground: rule for the map's ground raster, "av2-api" or "bsfe" (`cflow_torch.data.ground`); None = no ground
+            masks. A log whose map has no raster has no ground masks either.
 
     Attributes:
         log_id: name of the folder.
         timestamps: sweep times in nanoseconds, ascending.
 
     Convention: points are float32 in the ego frame of their sweep (stored as float16); poses are float64
-    `T_world_ego`, world = city. Poses are read and checked when the log is opened, sweeps when asked for.
+    `T_world_ego`, world = city. Poses are read and checked when the log is opened, sweeps when you ask for them.
 
     Raises:
-        CFlowError: no such folder, fewer than two sweeps, a file that cannot be read, columns that are missing or of
-            the wrong type, poses that are no rigid motion or do not cover a sweep.
+        CFlowError: no such folder, fewer than two sweeps, a file that cannot be read, columns that are missing or have
+            the wrong type, poses that are not rigid motions or do not cover a sweep.
     """
 
     def __init__(self, folder: PathLike, ground: str | None = "av2-api") -> None:
         self.folder = as_path(folder)
         if not _is_log(self.folder):
-            raise CFlowError(f"{self.folder} is no Argoverse 2 log: it holds no folder sensors/lidar")
+            raise CFlowError(f"{self.folder} is not an Argoverse 2 log: it has no folder sensors/lidar")
         self.log_id = self.folder.resolve().name
         self._files: dict[int, Path] = {
             int(file.stem): file
@@ -79,11 +79,11 @@ class AV2Log(Log):
             self._raster = read_ground_raster(self.folder / "map")
 
     def sweep(self, index: int) -> Sweep:
-        """Sweep number `index`, with ground where the log has a raster."""
+        """Read sweep `index`, with a ground mask if the log has a raster."""
         timestamp = self._timestamp(index)
         points, pose, file = self._points(timestamp), self._poses[timestamp], self._files[timestamp]
         is_ground, stored = None, FeatherFile(file)
-        times = None  # logs made by others may lack them
+        times = None  # logs of other writers may lack them
         if "offset_ns" in stored.names:
             times = integer_column(stored.read(["offset_ns"]), "offset_ns", file) * 1e-9
         if self._raster is not None and self._rule is not None:
@@ -91,12 +91,14 @@ class AV2Log(Log):
         return Sweep(points=points, is_ground=is_ground, pose=pose.copy(), timestamp_ns=timestamp, point_times=times)
 
     def labels(self, index: int) -> FlowLabels | None:
-        """Truth of the pair (index, index + 1).
+        """Read the truth of the pair (index, index + 1) from the first of these sources that the log has.
 
-        Taken from the first of these that the log has: `flow_labels/<ns of sweep t>.feather` (if that folder exists,
-        a pair without a file has no truth); `flow_labels.feather` for the first pair; `annotations.feather` by the
-        recipe of av2-api (boxes that hold no point count as absent), for pairs inside the annotated time. None where
-        the log has none, as for its last sweep.
+        - `flow_labels/<ns of sweep t>.feather`: if that folder exists, a pair without a file has no truth.
+        - `flow_labels.feather`, for the first pair.
+        - `annotations.feather`, by the recipe of av2-api (boxes that hold no point count as absent), for pairs inside
+          the annotated time.
+
+        None where the log has no truth, as for its last sweep.
         """
         timestamp = self._timestamp(index)
         if index == len(self) - 1:
@@ -125,7 +127,7 @@ class AV2Log(Log):
         row_of = {time: row for row, time in enumerate(integer_column(table, "timestamp_ns", file).tolist())}
         missing = [time for time in self.timestamps if time not in row_of]
         if missing:
-            raise CFlowError(f"{file} has no pose for sweep {missing[0]}, at exactly its time ({len(missing)} missing)")
+            raise CFlowError(f"{file} has no pose at exactly the time of sweep {missing[0]} ({len(missing)} missing)")
         rows = [row_of[time] for time in self.timestamps]
         return dict(zip(self.timestamps, _poses(table.take(rows), file, self.timestamps)))
 
@@ -151,12 +153,12 @@ class AV2Log(Log):
         times = integer_column(table, "timestamp_ns", file)
         if not times.size or timestamp0 < times.min() or timestamp1 > times.max():
             return None
-        used: np.ndarray = np.ones(len(times), dtype=bool)
+        is_used: np.ndarray = np.ones(len(times), dtype=bool)
         if "num_interior_pts" in stored.names:
             points_inside = integer_column(stored.read(["num_interior_pts"]), "num_interior_pts", file)
-            used = points_inside >= MIN_INTERIOR_POINTS
+            is_used = points_inside >= MIN_INTERIOR_POINTS
         boxes0, boxes1 = (
-            _boxes(table.filter(pa.array(used & (times == time))), file) for time in (timestamp0, timestamp1)
+            _boxes(table.filter(pa.array(is_used & (times == time))), file) for time in (timestamp0, timestamp1)
         )
         T_ego1_ego0 = np.linalg.inv(self._poses[timestamp1]) @ self._poses[timestamp0]
         return flow_from_boxes(self._points(timestamp0), boxes0, boxes1, T_ego1_ego0)

@@ -1,4 +1,4 @@
-"""Flow truth from tracked boxes: a point in a box moves as its box does, every other point stands still."""
+"""Flow truth from tracked boxes: a point in a box moves with the box, every other point is static."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.types import CFlowError
 
 _LISTED = 20  # names in a message
-# Metres added to length, width and height of the boxes of t: annotated boxes are a little tight.
+# Metres added to length, width and height of the boxes of t, because annotated boxes are a little too tight.
 _MARGIN = (0.2, 0.2, 0.0)
 
 
@@ -24,10 +24,10 @@ class Boxes:
     """The K oriented boxes of one sweep.
 
     Args:
-        track_id: K names, one object keeps its name over time, no name twice.
+        track_id: K names; an object keeps its name over time, and no name occurs twice.
         category: (K,) uint8, Argoverse 2 index.
         size: (K, 3) float64, metres: length (x), width (y), height (z).
-        pose: (K, 4, 4) float64 `T_ego_box`, box coordinates (origin in the middle) to the ego frame of the sweep.
+        pose: (K, 4, 4) float64 `T_ego_box`, box coordinates (origin at the centre) to the ego frame of the sweep.
     """
 
     track_id: Sequence[str]
@@ -37,36 +37,36 @@ class Boxes:
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.size).all() and np.isfinite(self.pose).all()):
-            raise CFlowError("a box holds numbers that are not finite; copy the annotations again")
+            raise CFlowError("a box has numbers that are not finite; copy the annotations again")
         if len(set(self.track_id)) < len(self.track_id):
             twice = sorted(name for name, times in Counter(self.track_id).items() if times > 1)
-            raise CFlowError(f"a track may have one box per sweep; named twice: {twice[:_LISTED]}")
+            raise CFlowError(f"a track may have only one box per sweep; these have more: {twice[:_LISTED]}")
 
 
 def make_boxes(track_id: Sequence[str], category: Sequence[int], size: Any, pose: Any) -> Boxes:
-    """`Boxes` from lists of K values each, also of none."""
+    """Build `Boxes` from lists of K values each; K may be 0."""
     sizes, poses = np.array(size, dtype=np.float64), np.array(pose, dtype=np.float64)
     return Boxes(track_id, np.array(category, dtype=np.uint8), sizes.reshape(-1, 3), poses.reshape(-1, 4, 4))
 
 
 def category_indices(names: Sequence[Any], known: Mapping[Any, str]) -> list[int]:
-    """Argoverse 2 indices of K boxes.
+    """Return the Argoverse 2 indices of K boxes.
 
     Args:
-        names: of their categories, as the data set has them.
-        known: such a name -> that of Argoverse 2.
+        names: their categories in the words of the data set.
+        known: category of the data set -> category of Argoverse 2.
 
     Raises:
-        CFlowError: a name is not known; the message lists those that are.
+        CFlowError: a name is unknown; the message lists the known ones.
     """
     unknown = sorted(set(names) - set(known))
     if unknown:
-        raise CFlowError(f"unknown categories {shortened(unknown[:_LISTED])}; the known ones are {list(known)}")
+        raise CFlowError(f"the categories {shortened(unknown[:_LISTED])} are unknown; known are {list(known)}")
     return [CATEGORY_INDEX[known[name]] for name in names]
 
 
 def upright_poses(heading_centre: Any) -> np.ndarray:
-    """(K, 4, 4) float64 poses of boxes that turn about z only, from heading (radians) and x, y, z (metres) of each."""
+    """Return (K, 4, 4) float64 poses of upright boxes, from rows of heading (radians about z) and x, y, z (metres)."""
     values = np.array(heading_centre, dtype=np.float64).reshape(-1, 4)
     pose = np.tile(np.eye(4), (len(values), 1, 1))
     cos, sin = np.cos(values[:, 0]), np.sin(values[:, 0])
@@ -76,7 +76,7 @@ def upright_poses(heading_centre: Any) -> np.ndarray:
 
 
 def points_in_box(points: np.ndarray, size: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Points inside an oriented box, faces included.
+    """Tell which points lie inside an oriented box, faces included.
 
     Args:
         points: (N, 3) float, metres.
@@ -91,7 +91,7 @@ def points_in_box(points: np.ndarray, size: np.ndarray, pose: np.ndarray) -> np.
 
 
 def flow_from_boxes(points: np.ndarray, boxes0: Boxes, boxes1: Boxes, T_ego1_ego0: np.ndarray) -> FlowLabels:
-    """Truth of a pair of sweeps from the boxes of both.
+    """Compute the truth of a pair of sweeps from the boxes of both.
 
     Args:
         points: (N, 3) float, metres, ego frame of t.
@@ -99,11 +99,11 @@ def flow_from_boxes(points: np.ndarray, boxes0: Boxes, boxes1: Boxes, T_ego1_ego
         T_ego1_ego0: (4, 4) float64, ego coordinates of t to those of t+1.
 
     Returns:
-        Labels: TOTAL flow, rounded to float32 once at the end. Points in a box whose track ends have the category of
-        the box, the flow of ego motion and `is_valid` False.
+        Labels with TOTAL flow, rounded to float32 once at the end. Points in a box whose track ends have the category
+        of the box, the flow of ego motion and `is_valid` False.
 
-    Convention: computed in float64. A point in several boxes takes flow and category of the last one, and is valid
-    only if no box that holds it ends.
+    Convention: computed in float64. A point in several boxes takes the flow and category of the last one, and is valid
+    only if the tracks of all these boxes continue.
 
     Cost: time O(N K), for most points two comparisons per box.
 
@@ -126,7 +126,7 @@ def flow_from_boxes(points: np.ndarray, boxes0: Boxes, boxes1: Boxes, T_ego1_ego
 
 
 def _rows_in_box(points: np.ndarray, size: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """(M,) int64 rows of the points inside a box; those outside of its bounding circle are not looked at closely."""
+    """Return the (M,) int64 rows of points inside a box; a bounding square rules out most points first."""
     radius = np.linalg.norm(size) / 2 + 1e-6
     near = np.abs(points[:, 0] - pose[0, 3]) <= radius
     near &= np.abs(points[:, 1] - pose[1, 3]) <= radius

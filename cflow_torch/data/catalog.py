@@ -1,4 +1,4 @@
-"""Every data set by name: how it is recognised, how its logs are found and opened; and logs of a user's own reader."""
+"""Every data set by name: how to recognise it, find its logs and open them; also logs of your own reader."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.ground import find_ground as ground_of
 
 GROUND_METHODS = ("grid", "patchwork")
-_OF_ALL = ("find_ground", "odometry", "check")  # settings that every data set has
-AUTO = "auto"  # the name of the data set that is to be recognised
+_OF_ALL = ("find_ground", "odometry", "check")  # settings of every data set
+AUTO = "auto"  # recognise the data set
 _log = logging.getLogger(__name__)
 
 
@@ -26,10 +26,10 @@ class DataSet:
     """One format.
 
     Args:
-        module: where its reader is; imported when it is needed.
+        module: module of its reader, imported when it is needed.
         find: name of the function root -> sources.
         log: name of the class source -> `Log`.
-        what: what one log is, for error messages.
+        what: description of one log, for error messages.
     """
 
     module: str
@@ -58,7 +58,7 @@ DATA_SETS: dict[str, DataSet] = {
 }
 
 
-# The ends of paths that tell a format. Folders of point clouds are what is left.
+# The ends of paths by which we recognise a format. Everything else is a folder of point clouds.
 _MARKS = {
     "av2": ("sensors/lidar",),
     "hdf5": ("*.h5",),
@@ -69,43 +69,43 @@ _MARKS = {
     "aevascenes": ("sequence.json",),
     "bags": ("*.bag", "*.mcap", "*.db3"),
 }
-_DEEPEST = 6  # levels below a place at which a mark is looked for
+_DEEPEST = 6  # levels below the root that are searched for a mark
 
 
 @dataclass(frozen=True)
 class UserSource:
-    """A log of a user's own reader: which one of those that it returns."""
+    """One of the logs that your own reader returns."""
 
     name: str
     number: int
 
 
 def recognise(root: Any) -> str:
-    """The name of the data set whose logs lie at a place, by what is there; nothing is opened.
+    """Return the name of the data set whose logs lie at a path, without opening a file.
 
     Args:
-        root: as for `find_sources`. What lies nearest to it counts.
+        root: as for `find_sources`. The format closest to the root counts.
 
     Raises:
-        CFlowError: nothing is there, or no format fits, or several do.
-        OSError: a remote place cannot be reached.
+        CFlowError: the path does not exist, or no format fits, or several do.
+        OSError: a remote path cannot be reached.
     """
-    place = as_path(root)
-    with remote_errors(place):
-        if not place.exists():
-            raise CFlowError(f"{root}: no file and no folder of this name; settings are NAME=VALUE")
-        level, fitting = [place], set()
+    top = as_path(root)
+    with remote_errors(top):
+        if not top.exists():
+            raise CFlowError(f"{root}: there is no such file or folder; settings are NAME=VALUE")
+        level, fitting = [top], set()
         for _ in range(_DEEPEST):
             fitting = {name for name, marks in _MARKS.items() for path in level if any(map(path.match, marks))}
             if fitting:
                 break
             level = [path for folder in level if folder.is_dir() for path in folder.iterdir() if path.name[0] != "."]
     found = [name for name in DATA_SETS if name in fitting] or ["arrays"]
-    if len(found) > 1 or not fitting:  # nuScenes and TruckScenes look alike from outside
+    if len(found) > 1 or not fitting:  # nuScenes and TruckScenes have the same file names
         found = [name for name in found if _has_logs(name, root)]
     if len(found) != 1:
-        why = f"several formats fit, {' and '.join(found)}" if found else "no format fits what lies there"
-        raise CFlowError(f"{root}: {why}; give one of data={'|'.join(DATA_SETS)}")
+        why = f"several formats fit, {' and '.join(found)}" if found else "no format fits its contents"
+        raise CFlowError(f"{root}: {why}; choose one with data={'|'.join(DATA_SETS)}")
     return found[0]
 
 
@@ -117,15 +117,15 @@ def _has_logs(name: str, root: Any) -> bool:
 
 
 def find_user_sources(target: str, settings: Mapping[str, Any]) -> list[UserSource]:
-    """What `open_log` takes, one source per log that a user's own reader returns.
+    """Return one source per log that your own reader returns, for `open_log`.
 
     Args:
         target: name of a class or function, as "package.module.name". It returns a log (`cflow_torch.data.log.Log`), or
-            a sequence of logs, which may open them when they are asked for.
+            a sequence of logs, which may open them lazily.
         settings: its keyword arguments, and those of `open_log`.
 
     Raises:
-        CFlowError: there is no such thing, it fails, or it returns no log.
+        CFlowError: the target does not exist, fails, or returns no log.
     """
     logs = _user_logs(target, {key: value for key, value in settings.items() if key not in _OF_ALL})
     if len(logs) == 0:
@@ -143,11 +143,12 @@ def _user_logs(target: str, settings: Mapping[str, Any]) -> Sequence[Log]:
         cause = error.__cause__ or error
         if isinstance(cause, CFlowError):
             raise cause from None
-        if not isinstance(cause, ImportError):  # its author wants to see where
-            _log.error("the reader %s fails", target, exc_info=cause)
-        place = "" if not isinstance(cause, ImportError) else "; put its module beside the configuration, or install it"
+        hint = "; put its module next to the configuration, or install it"
+        if not isinstance(cause, ImportError):
+            _log.error("the reader %s fails", target, exc_info=cause)  # shows its author the line
+            hint = ""
         raise CFlowError(
-            f"the reader {target} fails: {type(cause).__name__}: {' '.join(str(cause).split())}{place}"
+            f"the reader {target} fails: {type(cause).__name__}: {' '.join(str(cause).split())}{hint}"
         ) from error
     if hasattr(made, "sweep"):
         return [made]
@@ -155,17 +156,17 @@ def _user_logs(target: str, settings: Mapping[str, Any]) -> Sequence[Log]:
 
 
 def find_sources(name: str, root: Any) -> Sequence[Any]:
-    """What `open_log` takes, one source per log under a folder.
+    """Return one source per log under a path, for `open_log`.
 
     Raises:
-        CFlowError: no such data set; nothing of its format there.
-        OSError: a remote place cannot be reached.
+        CFlowError: no such data set, or nothing of its format at the path.
+        OSError: a remote path cannot be reached.
     """
     data_set = _data_set(name)
     find = getattr(import_module(f"cflow_torch.data.{data_set.module}"), data_set.find)
-    place = as_path(root)
-    with remote_errors(place):
-        sources = find(place)
+    top = as_path(root)
+    with remote_errors(top):
+        sources = find(top)
     if not sources:
         raise CFlowError(f"no {data_set.what} in {root}")
     return list(sources)
@@ -180,21 +181,18 @@ def open_log(
         name: a key of `DATA_SETS`, or the target of `find_user_sources`.
         source: from `find_sources` or `find_user_sources`.
         find_ground: None, or a method of `cflow_torch.windows.ground.find_ground` for sweeps without a ground mask.
-        odometry: find poses with kiss-icp if the log has none.
-        check: warn if ground is left in, or if the static world does not stay put, see `check_log`.
+        odometry: estimate poses with kiss-icp if the log has none.
+        check: warn if ground is left in, or if the static world is not static, see `check_log`.
         **settings: keyword arguments of the reader.
-
-    Returns:
-        The log.
 
     Raises:
         CFlowError: a log that cannot be read, or whose name cannot be a folder's; a setting that the reader does not
             have (the message lists its own) or cannot use.
     """
     if find_ground is not None and find_ground not in GROUND_METHODS:
-        raise CFlowError(f"find_ground={find_ground!r}: give null or one of {', '.join(GROUND_METHODS)}")
+        raise CFlowError(f"find_ground={find_ground!r}: choose null or one of {', '.join(GROUND_METHODS)}")
     log = _user_logs(name, settings)[source.number] if isinstance(source, UserSource) else _open(name, source, settings)
-    safe_name(log.log_id, f"{source}: the log")  # results get that name
+    safe_name(log.log_id, f"{source}: the log")  # names the folder of its results
     if odometry:
         from cflow_torch.data.odometry import with_poses
 
@@ -224,15 +222,13 @@ def _open(name: str, source: Any, settings: Mapping[str, Any]) -> Log:
 
 
 class GroundSegmentedLog(LogWrapper):
-    """Another log, with the ground of sweeps without a mask found from their points.
+    """A log with a ground mask for every sweep: its own where it has one, otherwise found from the points.
 
     Args:
         log: any log.
         method: as for `cflow_torch.windows.ground.find_ground`.
 
-    Convention: a mask that the log has is kept.
-
-    Cost: one call of `find_ground` per sweep that is read.
+    Cost: one call of `find_ground` per sweep without a mask.
     """
 
     def __init__(self, log: Log, method: str = "grid") -> None:
@@ -240,7 +236,6 @@ class GroundSegmentedLog(LogWrapper):
         self.method = method
 
     def sweep(self, index: int) -> Sweep:
-        """The log's sweep with a ground mask."""
         sweep = self.log.sweep(index)
         if sweep.is_ground is not None:
             return sweep
@@ -250,5 +245,5 @@ class GroundSegmentedLog(LogWrapper):
 
 def _data_set(name: str) -> DataSet:
     if name not in DATA_SETS:
-        raise CFlowError(f"data set {name!r}: give one of {', '.join(DATA_SETS)}")
+        raise CFlowError(f"data set {name!r}: choose one of {', '.join(DATA_SETS)}")
     return DATA_SETS[name]

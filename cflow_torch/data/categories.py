@@ -1,4 +1,4 @@
-"""The object categories of Argoverse 2 and the five meta classes that scores are given for."""
+"""The object categories of Argoverse 2, and the five meta classes of its scores."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ CATEGORIES: tuple[str, ...] = (
     "WHEELED_DEVICE",
     "WHEELED_RIDER",
 )
-"""Name of every category; the position is the index that labels store (0 = background)."""
+"""Names of the categories, in the order of their indices in labels (0 = background)."""
 
 CATEGORY_INDEX: dict[str, int] = {name: index for index, name in enumerate(CATEGORIES)}
 
@@ -60,15 +60,15 @@ META_CLASSES: dict[str, tuple[str, ...]] = {
     "PEDESTRIAN": ("OFFICIAL_SIGNALER", "PEDESTRIAN", "STROLLER", "WHEELCHAIR"),
     "WHEELED_VRU": ("BICYCLE", "BICYCLIST", "MOTORCYCLE", "MOTORCYCLIST", "WHEELED_DEVICE", "WHEELED_RIDER"),
 }
-"""Meta class -> its categories. Signs, cones, trailers of signs and animals belong to none and are not scored."""
+"""Meta class -> its categories. Signs, cones, trailers of signs and animals have none and are not scored."""
 
 META_NAMES: tuple[str, ...] = tuple(META_CLASSES)
 
 
 def _meta_lookup() -> np.ndarray:
     lookup = np.full(len(CATEGORIES), -1, dtype=np.int64)
-    for number, members in enumerate(META_CLASSES.values()):
-        lookup[[CATEGORY_INDEX[name] for name in members]] = number
+    for index, members in enumerate(META_CLASSES.values()):
+        lookup[[CATEGORY_INDEX[name] for name in members]] = index
     return lookup
 
 
@@ -76,13 +76,13 @@ _META_OF_CATEGORY = _meta_lookup()
 
 
 def meta_class(category: np.ndarray) -> np.ndarray:
-    """Meta class of each point.
+    """Return the meta class of each point.
 
     Args:
         category: (N,) integer, Argoverse 2 index 0 ... 30.
 
     Returns:
-        (N,) int64, position in `META_NAMES`; -1 = category of no meta class.
+        (N,) int64 index into `META_NAMES`; -1 = the category has no meta class.
 
     Raises:
         CFlowError: an index outside 0 ... 30.

@@ -1,4 +1,4 @@
-"""One flow result per file: feather columns, rows in the order of sweep t."""
+"""One flow result per file, as feather columns with rows in the order of sweep t."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from cflow_torch.data.paths import PathLike, as_path
 from cflow_torch.types import VECTORS, CFlowError, FlowResult, vector_columns
 
 CONTENTS = (*VECTORS, "cluster_id", "score", "is_valid")
-ON_REQUEST = ("confidence",)  # what a file has only if it is named
+ON_REQUEST = ("confidence",)  # written only if you name it
 
 
 def write_flow(path: PathLike, result: FlowResult, contents: Sequence[str] = CONTENTS) -> None:
@@ -24,30 +24,27 @@ def write_flow(path: PathLike, result: FlowResult, contents: Sequence[str] = CON
     Args:
         path: file name, by convention `<log id>/<time stamp of sweep t>.feather`.
         result: flow of one window.
-        contents: what of it, names of `CONTENTS` and `ON_REQUEST`. The pose flow, and with it the total flow, follow
-            from the poses; without these two a file has about a seventeenth of the size.
+        contents: which parts to write, names of `CONTENTS` and `ON_REQUEST`. The pose flow, and with it the total flow,
+            follow from the poses; without these two a file has about a seventeenth of the size.
 
     Convention:
         Columns flow_t{x,y,z}_m (total), residual_t{x,y,z}_m, pose_t{x,y,z}_m float32 in metres and in the axes of
         ego1, cluster_id int64, score and confidence float32, is_valid bool.
 
     Raises:
-        CFlowError: the result has no confidence, and it was asked for.
+        CFlowError: you asked for the confidence, but the result has none.
     """
     columns = result.columns()
     names = [column for name in contents for column in (vector_columns(name) if name in VECTORS else [name])]
     if not columns.keys() >= set(names):
         lacking = ", ".join(sorted(set(names) - columns.keys()))
-        raise CFlowError(f"{lacking}: asked for, but this result has none: estimate it with preset default or fast")
+        raise CFlowError(f"this result has no {lacking}: estimate it with preset default or fast, or do not ask for it")
     with atomic_file(path) as file:
         feather.write_feather(pa.table({name: pa.array(columns[name]) for name in names}), file)
 
 
 def read_flow(path: PathLike) -> FlowResult:
-    """Read what `write_flow` wrote.
-
-    Returns:
-        The result; fields that the file does not hold are None.
+    """Read a result that `write_flow` wrote; fields that the file does not hold are None.
 
     Raises:
         CFlowError: the file is missing, cannot be reached, is truncated, or holds none of the contents.
@@ -70,5 +67,5 @@ def read_flow(path: PathLike) -> FlowResult:
         if not fields:
             raise CFlowError(f"its columns are {', '.join(file.names)}")
     except CFlowError as error:
-        raise CFlowError(f"{path} is no flow file ({error}): give one that `cflow flow` wrote") from error
+        raise CFlowError(f"{path} is not a flow file ({error}): pass one that `cflow flow` wrote") from error
     return FlowResult.of({name: torch.from_numpy(np.array(array)) for name, array in fields.items()})

@@ -12,8 +12,8 @@ from cflow_torch.data.files import file_errors, read_npy
 from cflow_torch.data.json_file import read_json
 from cflow_torch.types import CFlowError
 
-# Rule -> metres that a point of the ground is away from the surface at most, and raster coordinate to cell: towards
-# zero, or half to even.
+# Rule -> largest distance of a ground point from the surface, metres; rounding of grid positions to cells (towards
+# zero, or half to even).
 GROUND_RULES: dict[str, tuple[float, Callable[[np.ndarray], Any]]] = {
     "av2-api": (0.3, np.trunc),
     "bsfe": (0.4, np.round),
@@ -22,12 +22,13 @@ GROUND_RULES: dict[str, tuple[float, Callable[[np.ndarray], Any]]] = {
 
 @dataclass(frozen=True)
 class GroundRaster:
-    """Height of the ground on a grid of the city.
+    """Ground height on a grid of the city.
 
     Args:
         heights: (H, W) float64, metres, row from y, column from x; NaN = unknown.
-        rotation: (2, 2) float64, translation: (2,) float64, scale: cells per metre. The grid position of a city
-            point is scale * (rotation @ xy + translation).
+        rotation: (2, 2) float64.
+        translation: (2,) float64.
+        scale: cells per metre. The grid position of a city point is scale * (rotation @ xy + translation).
 
     Source: layout of the Argoverse 2 map folder, `*_ground_height_surface____*.npy` and `*___img_Sim2_city.json`.
     """
@@ -38,22 +39,21 @@ class GroundRaster:
     scale: float
 
     def is_ground(self, points: np.ndarray, rule: str = "av2-api") -> np.ndarray:
-        """Tell which points lie on or under the ground.
+        """Tell which points lie on or below the ground.
 
         Args:
             points: (N, 3) float, metres, CITY frame.
             rule: name in `GROUND_RULES`.
 
         Returns:
-            (N,) bool: within the threshold of the surface (limit included) or below it.
-
-        Convention: outside the raster and where its height is NaN a point is not ground.
+            (N,) bool: within the threshold of the surface (limit included) or below it. False outside the raster and
+            where its height is NaN.
         """
-        threshold, rounded = GROUND_RULES[rule]
+        threshold, to_cell = GROUND_RULES[rule]
         xyz: np.ndarray = np.asarray(points, dtype=np.float64)
         inside = np.isfinite(xyz[:, :2]).all(axis=1)
         position = (np.where(inside[:, None], xyz[:, :2], 0.0) @ self.rotation.T + self.translation) * self.scale
-        cell = rounded(position).astype(np.int64)
+        cell = to_cell(position).astype(np.int64)
         inside &= (cell >= 0).all(axis=1) & (cell < self.heights.shape[::-1]).all(axis=1)
         height = np.full(len(xyz), np.nan)
         height[inside] = self.heights[cell[inside, 1], cell[inside, 0]]
@@ -63,16 +63,10 @@ class GroundRaster:
 
 
 def read_ground_raster(map_folder: Path) -> GroundRaster | None:
-    """Read the raster of a log.
-
-    Args:
-        map_folder: the folder `map` of a log.
-
-    Returns:
-        The raster; None where the folder or its raster is missing.
+    """Read the raster of a log from its folder `map`; None if the folder or its raster is missing.
 
     Raises:
-        CFlowError: the raster is ambiguous, its Sim(2) file is missing, or either cannot be read.
+        CFlowError: there are several rasters, the Sim(2) file is missing, or either file cannot be read.
     """
     rasters = sorted(map_folder.glob("*_ground_height_surface____*.npy"))
     if not rasters:
@@ -95,5 +89,5 @@ def read_ground_raster(map_folder: Path) -> GroundRaster | None:
             scale=float(alignment["s"]),
         )
     if not all(np.isfinite(value).all() for value in (raster.rotation, raster.translation, raster.scale)):
-        raise CFlowError(f"{alignments[0]} holds numbers that are not finite; copy the map folder again")
+        raise CFlowError(f"{alignments[0]} has numbers that are not finite; copy the map folder again")
     return raster

@@ -1,4 +1,4 @@
-"""What KISS-ICP's own loaders read, as logs (extra `odometry`): HeLiPR, MulRan, NCLT, Boreas and others."""
+"""Experimental: data sets that KISS-ICP's own loaders read (extra `odometry`), such as HeLiPR, MulRan, NCLT, Boreas."""
 
 from __future__ import annotations
 
@@ -10,36 +10,36 @@ from typing import Any, Iterator
 import numpy as np
 
 from cflow_torch.data.files import shortened
-from cflow_torch.data.log import FlowLabels, Log
+from cflow_torch.data.log import Log
 from cflow_torch.data.paths import PathLike, as_path
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.ego_motion import rigid_transform
 
-_OTHERS = {"rosbag": "bags", "mcap": "bags"}  # loaders that go forward only: our reader
+_OTHERS = {"rosbag": "bags", "mcap": "bags"}  # loaders without random access -> our own reader
 
 
 def find_kiss_icp(root: PathLike) -> list[Path]:
-    """The place itself: what lies there, only the loader knows."""
+    """Return the path itself; only the loader knows its contents."""
     return [as_path(root)]
 
 
 class KissICPLog(Log):
-    """One sequence; implements the `Log` protocol.
+    """One sequence. Experimental: we tested the loaders on small made-up files only.
 
     Args:
-        root: file or folder that the loader takes.
+        root: file or folder for the loader.
         loader: its name: kitti, kitti_raw, helipr, mulran, ncd, nclt, boreas, apollo, ouster, generic, ...
-        sequence: of the data set, for loaders that want one: "00".
+        sequence: of the data set, for loaders that need one: "00".
 
     Attributes:
         log_id: name of the file or folder, and the sequence.
-        timestamps: 0, 1, 2, ...: the loaders tell no times that all of them share; 0.1 s between sweeps is assumed.
+        timestamps: 0, 1, 2, ..., because the loaders have no common way to return times; 0.1 s per sweep is assumed.
 
-    Convention: points and poses are as the loader gives them, in the frame of the LiDAR; poses are the data set's own
-    (`gt_poses`), None where it has none. `is_ground` and times of points are None.
+    Convention: points and poses are those of the loader, in the frame of the LiDAR; poses are the data set's own
+    (`gt_poses`), None if it has none. `is_ground` and times of points are None.
 
     Raises:
-        CFlowError: KISS-ICP is missing, or what its loader needs; no such loader; nothing that it can read.
+        CFlowError: KISS-ICP or a package that its loader needs is missing; no such loader; nothing that it can read.
     """
 
     def __init__(self, root: PathLike, loader: str, sequence: str | None = None) -> None:
@@ -50,13 +50,13 @@ class KissICPLog(Log):
             raise CFlowError("KISS-ICP's loaders need it: pip install kiss-icp") from None
         names = sorted(set(available_dataloaders()) - set(_OTHERS))
         if loader not in names:
-            other = f", or take data={_OTHERS[loader]}" if loader in _OTHERS else ""
-            raise CFlowError(f"loader={loader}: give one of {', '.join(names)}{other}")
+            other = f", or use data={_OTHERS[loader]}" if loader in _OTHERS else ""
+            raise CFlowError(f"loader={loader}: choose one of {', '.join(names)}{other}")
         self.log_id = "-".join([self.root.resolve().name, *([str(sequence)] if sequence is not None else [])])
         self._what = f"{self.root}, KISS-ICP's loader {loader}"
         with _loader_errors(self._what):
-            given = {} if sequence is None else {"sequence": str(sequence)}
-            self._dataset = dataset_factory(loader, self.root, **given)
+            settings = {} if sequence is None else {"sequence": str(sequence)}
+            self._dataset = dataset_factory(loader, self.root, **settings)
             self.timestamps = range(len(self._dataset))
             poses = getattr(self._dataset, "gt_poses", None)
         self._check_count(self._what)
@@ -65,7 +65,7 @@ class KissICPLog(Log):
             raise CFlowError(f"{self._what}: {len(self._poses)} poses for {len(self)} sweeps; copy the data set again")
 
     def sweep(self, index: int) -> Sweep:
-        """Sweep number `index`: points, and the pose where the data set has it."""
+        """Read sweep `index`: points, and the pose if the data set has it."""
         self._timestamp(index)
         with _loader_errors(f"{self._what}, sweep {index}"):
             found = self._dataset[index]
@@ -73,18 +73,13 @@ class KissICPLog(Log):
         pose = None if self._poses is None else rigid_transform(self._poses[index], f"{self._what}: pose {index}")
         return Sweep(points, None, pose)
 
-    def labels(self, index: int) -> FlowLabels | None:
-        """None: these data sets have no truth of motion."""
-        self._timestamp(index)
-        return None
-
 
 @contextmanager
 def _loader_errors(what: str) -> Iterator[None]:
-    """The loaders print what they miss, and leave the program."""
-    said: Any = io.StringIO()
+    """Turn what a loader prints before it ends the program into a `CFlowError`."""
+    printed: Any = io.StringIO()
     try:
-        with redirect_stdout(said):
+        with redirect_stdout(printed):
             yield
     except (Exception, SystemExit) as error:
-        raise CFlowError(f"{what} fails: {shortened(said.getvalue())} {type(error).__name__}: {error}") from error
+        raise CFlowError(f"{what} fails: {shortened(printed.getvalue())} {type(error).__name__}: {error}") from error

@@ -1,4 +1,4 @@
-"""What is looked at when a log is opened: is its ground marked, does its static world stay put?"""
+"""Checks when a log is opened: is its ground masked, are its sweeps de-skewed, is its static world static?"""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from cflow_torch.windows.ground import has_ground
 
 
 class GroundWarning(UserWarning):
-    """There are ground points in a log without ground masks."""
+    """A log has ground points but no ground masks."""
 
 
 class SkewWarning(UserWarning):
-    """Sweeps that the reader de-skews have no times of points."""
+    """A reader should de-skew sweeps that have no times of points."""
 
 
 def check_log(log: Log) -> None:
-    """Warn of mistakes that no sweep alone would show as an error.
+    """Warn of mistakes that do not show as an error in any single sweep.
 
     Args:
-        log: any log. A sweep that cannot be read is passed over: it is reported when its turn comes.
+        log: any log. A sweep that cannot be read is skipped here; reading it later raises the error.
 
     Warns:
-        GroundWarning: the first sweep has ground points, but no mask that says so.
-        SkewWarning: the first sweep should be de-skewed by the times of its points, and has none.
+        GroundWarning: the first sweep has ground points but no mask.
+        SkewWarning: the first sweep should be de-skewed by the times of its points, but has none.
         StaticWorldWarning: see `check_static_world`.
 
     Cost: reads up to six sweeps; about 0.3 s.
@@ -41,9 +41,9 @@ def _check_ground(log: Log) -> None:
     sweep = log.sweep(0)
     if sweep.is_ground is None and has_ground([sweep.points])[0]:
         warnings.warn(
-            f"log {log.log_id}: there are ground points, and no masks. The ground joins what stands on it into one "
-            "cluster, so that moving objects are missed. Give data.find_ground=grid (in Python find_ground='grid'), or "
-            "data.check=false if this is no ground",
+            f"log {log.log_id} has ground points but no ground masks. The ground connects all objects into one "
+            "cluster, so moving objects are missed. Set data.find_ground=grid (in Python find_ground='grid'), or "
+            "data.check=false if this is not ground",
             GroundWarning,
             stacklevel=2,
         )
@@ -55,8 +55,8 @@ def _check_skew(log: Log) -> None:
     sweep = log.sweep(0)
     if sweep.pose is not None and sweep.point_times is None:
         warnings.warn(
-            f"log {log.log_id}: no times of points were found, so its sweeps are not de-skewed, and what stands still "
-            "is smeared as the vehicle moves. If the clouds are compensated already, give data.deskew=false",
+            f"log {log.log_id} has no times of points, so its sweeps are not de-skewed, and static objects are smeared "
+            "while the vehicle moves. If the clouds are already compensated, set data.deskew=false",
             SkewWarning,
             stacklevel=2,
         )

@@ -1,4 +1,4 @@
-"""Ego motion from the points themselves, for logs without poses, by KISS-ICP (extra `odometry`)."""
+"""Ego motion estimated from the points by KISS-ICP (extra `odometry`), for logs without poses."""
 
 from __future__ import annotations
 
@@ -12,45 +12,45 @@ from cflow_torch.data.log import Log, LogWrapper
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.ego_motion import rigid_transform
 
-# KISS-ICP starts as if the vehicle stood still: its first steps miss by up to 14 cm at 6 m/s, later ones by 1 to 3 cm.
+# KISS-ICP starts with a static vehicle: its first steps are off by up to 14 cm at 6 m/s, later ones by 1 to 3 cm.
 _RUN_IN = 5  # sweeps
 _FEWEST_POINTS = 100
-_MAX_RANGE = 100.0  # metres; KISS-ICP's own default, from which it takes its voxel size (a hundredth)
+_MAX_RANGE = 100.0  # metres; KISS-ICP's own default, which also sets its voxel size (a hundredth)
 
 
 def poses_from_odometry(log: Log) -> np.ndarray:
-    """`T_world_ego` of every sweep; the world is the ego frame of the first.
+    """Estimate `T_world_ego` of every sweep; the world is the ego frame of the first.
 
     Args:
-        log: its sweeps' poses are not looked at; ground points are used too, they hold height and tilt.
+        log: poses of its sweeps are ignored. Ground points are used, because they constrain height and tilt.
 
     Returns:
-        (K, 4, 4) float64, in the frame that the points are in.
+        (K, 4, 4) float64, in the frame of the points.
 
     Convention:
-        KISS-ICP with its own settings, without de-skewing (sweeps have no time per point), on one thread, so that the
-        poses do not depend on the number of threads. It needs a few sweeps to pick up speed, so the first five steps
-        are taken from a second run, backwards from the eleventh sweep.
+        KISS-ICP runs with its own settings, without de-skewing, on one thread, so that the poses do not depend on the
+        number of threads. It needs a few sweeps to adapt to the speed, so we take the first five steps from a second
+        run, backwards from the eleventh sweep.
 
     Raises:
-        CFlowError: KISS-ICP is not installed, a sweep has fewer than 100 finite points in range, or the result is no
+        CFlowError: KISS-ICP is not installed, a sweep has fewer than 100 finite points in range, or the result is not a
             rigid motion.
 
-    Cost: one registration a sweep and eleven more, 0.13 s each for 120,000 points; reads as many sweeps.
+    Cost: one registration per sweep and eleven more, 0.13 s each for 120,000 points; reads as many sweeps.
 
     Source: Vizzo et al., "KISS-ICP: In Defense of Point-to-Point ICP", RA-L 2023.
     """
     last = len(log.timestamps) - 1
-    turn = min(_RUN_IN, last // 2)
+    joint = min(_RUN_IN, last // 2)  # the sweep at which both runs are joined
     forward = _register(log, range(last + 1))
-    backward = _register(log, range(min(2 * turn, last), -1, -1))[::-1]
-    start = [np.eye(4)] + [np.linalg.inv(backward[0]) @ pose for pose in backward[1 : turn + 1]]
-    onwards = start[turn] @ np.linalg.inv(forward[turn])
-    return np.stack(start + [onwards @ pose for pose in forward[turn + 1 :]])
+    backward = _register(log, range(min(2 * joint, last), -1, -1))[::-1]
+    start = [np.eye(4)] + [np.linalg.inv(backward[0]) @ pose for pose in backward[1 : joint + 1]]
+    to_world = start[joint] @ np.linalg.inv(forward[joint])
+    return np.stack(start + [to_world @ pose for pose in forward[joint + 1 :]])
 
 
 def _register(log: Log, order: Sequence[int]) -> list[np.ndarray]:
-    """Poses of sweeps in the order given, the world being that of the first of them."""
+    """Return the poses of sweeps in the given order; the world is the frame of the first of them."""
     odometry = Odometry()
     return [
         odometry.next_pose(np.asarray(log.sweep(index).points), f"sweep {index} of log {log.log_id}")
@@ -59,11 +59,7 @@ def _register(log: Log, order: Sequence[int]) -> list[np.ndarray]:
 
 
 class Odometry:
-    """KISS-ICP with the settings of `poses_from_odometry`, sweep after sweep.
-
-    Raises:
-        CFlowError: KISS-ICP is not installed.
-    """
+    """KISS-ICP with the settings of `poses_from_odometry`, sweep by sweep; a missing package is a `CFlowError`."""
 
     def __init__(self) -> None:
         try:
@@ -72,7 +68,7 @@ class Odometry:
         except ImportError:
             raise CFlowError(
                 "there are no poses, and estimating them needs KISS-ICP: pip install kiss-icp, "
-                "or give poses (for bare arrays T_ego1_ego0, for a folder poses.txt)"
+                "or pass poses (for arrays T_ego1_ego0, for a folder poses.txt)"
             ) from None
         config = load_config(None)
         config.data.deskew = False
@@ -82,28 +78,28 @@ class Odometry:
         self._odometry = KissICP(config)
 
     def next_pose(self, points: np.ndarray, name: str) -> np.ndarray:
-        """`T_world_ego` of the next sweep; the world is the ego frame of the first.
+        """Return `T_world_ego` of the next sweep; the world is the ego frame of the first.
 
         Args:
             points: (N, 3+) float, metres.
-            name: what to call the sweep in an error.
+            name: of the sweep, for an error.
 
         Returns:
             (4, 4) float64.
 
         Raises:
-            CFlowError: fewer than 100 finite points in range, or the result is no rigid motion.
+            CFlowError: fewer than 100 finite points in range, or the result is not a rigid motion.
         """
         points = points[:, :3].astype(np.float64)
         points = points[np.isfinite(points).all(1)]
         if (np.linalg.norm(points, axis=1) < _MAX_RANGE).sum() < _FEWEST_POINTS:
             raise CFlowError(f"{name} has fewer than {_FEWEST_POINTS} points within {_MAX_RANGE} m")
         self._odometry.register_frame(np.ascontiguousarray(points), np.zeros(len(points)))
-        return rigid_transform(self._odometry.last_pose, f"the pose that KISS-ICP gives for {name}")
+        return rigid_transform(self._odometry.last_pose, f"the pose that KISS-ICP estimates for {name}")
 
 
 class PosedLog(LogWrapper):
-    """Another log with other poses.
+    """A log with other poses.
 
     Args:
         log: any log.
@@ -113,23 +109,22 @@ class PosedLog(LogWrapper):
         poses: (K, 4, 4) float64.
 
     Raises:
-        CFlowError: not one rigid motion per sweep.
+        CFlowError: `poses` is not one rigid motion per sweep.
     """
 
     def __init__(self, log: Log, poses: Any) -> None:
         super().__init__(log)
         if len(poses) != len(log.timestamps):
-            raise CFlowError(f"{len(poses)} poses for {len(log.timestamps)} sweeps of log {log.log_id}: give one each")
+            raise CFlowError(f"{len(poses)} poses for {len(log.timestamps)} sweeps of log {log.log_id}: pass one each")
         self.poses = np.stack([rigid_transform(pose, f"poses[{index}]") for index, pose in enumerate(poses)])
 
     def sweep(self, index: int) -> Sweep:
-        """The log's sweep with the pose from here."""
-        sweep = self.log.sweep(index)
-        return replace(sweep, pose=self.poses[index].copy())
+        """Read the log's sweep and replace its pose."""
+        return replace(self.log.sweep(index), pose=self.poses[index].copy())
 
 
 def with_poses(log: Log) -> Log:
-    """The log itself if its first sweep has a pose, else the log with poses from odometry.
+    """Return the log itself if its first sweep has a pose, else the log with poses from odometry.
 
     Raises:
         CFlowError: as `poses_from_odometry`.

@@ -1,4 +1,4 @@
-"""Reader of PandaSet: data frames that pandas pickled, read without pandas; nothing that a pickle names is run."""
+"""Reader of PandaSet: pickled pandas data frames, read without pandas and without executing what a pickle names."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from cflow_torch.data.rigid_motion import poses_from_json, transform_points
 from cflow_torch.types import CFlowError, Sweep
 
 SEARCH_DEPTH = 2  # <root>/<data set>/<sequence>
-_LIDARS = (0, 1)  # Pandar64, which turns, and PandarGT, which looks ahead
-_EVERY_LIDAR = -1  # of a cuboid; an object that both LiDARs see apart has a cuboid for each
+_LIDARS = (0, 1)  # Pandar64, which rotates, and PandarGT, which looks forward
+_EVERY_LIDAR = -1  # of a cuboid; an object at different positions for both LiDARs has a cuboid for each
 _POSITION, _SIZE = (
     tuple(f"{what}.{axis}" for axis in axes) for what, axes in (("position", "xyz"), ("dimensions", "yxz"))
 )
@@ -42,24 +42,24 @@ _LABELS = {
     "WHEELED_DEVICE": ("Motorized Scooter", "Other Vehicle - Pedicab", "Personal Mobility Device"),
 }
 CATEGORY_NAME: dict[str, str] = {label: name for name, labels in _LABELS.items() for label in labels}
-"""Label of a cuboid -> Argoverse 2 name. The data set publishes no such map: this one is cflow_torch's."""
+"""Label of a cuboid -> Argoverse 2 name. The data set publishes no such map; this one is ours."""
 
 
 def find_pandaset_sequences(root: PathLike) -> list[Path]:
-    """Folders of all sequences under a folder, sorted.
+    """Find the folders of all sequences, sorted.
 
     Args:
         root: a sequence (holds `lidar/poses.json`), or a folder at most two levels above the sequences.
 
     Raises:
-        CFlowError: `root` is no folder.
+        CFlowError: `root` is not a folder.
     """
     what = "a sequence (it holds lidar/poses.json), or a folder of sequences"
     return find_folders(as_path(root), lambda folder: (folder / "lidar" / "poses.json").is_file(), SEARCH_DEPTH, what)
 
 
 class PandaSetLog(Log):
-    """One sequence; implements the `Log` protocol.
+    """One sequence.
 
     Args:
         folder: sequence folder with `lidar/00.pkl.gz` ..., `lidar/poses.json` and `lidar/timestamps.json`.
@@ -69,14 +69,14 @@ class PandaSetLog(Log):
         timestamps: sweep times in nanoseconds, ascending.
 
     Convention:
-        - Points are stored in the world, compensated for ego motion. Here they are float32 in the frame of the LiDAR's
-          pose at the sweep's time (x to the right, y ahead, z up), those of both LiDARs in the order of the file.
+        - Points are stored in the world, compensated for ego motion. We return them as float32 in the frame of the
+          LiDAR's pose at the sweep's time (x right, y forward, z up), those of both LiDARs in the order of the file.
         - The data set has no ground masks: `is_ground` is None.
-        - Truth comes from the tracked cuboids of `annotations/cuboids`; each LiDAR's points from the cuboids that are
-          meant for it.
+        - Truth comes from the tracked cuboids of `annotations/cuboids`; each LiDAR's points from its own cuboids.
 
     Raises:
-        CFlowError: a file is missing or cannot be read; fewer than two sweeps; another number of poses or times.
+        CFlowError: a file is missing or cannot be read; fewer than two sweeps; the numbers of sweeps, poses and times
+            differ.
     """
 
     def __init__(self, folder: PathLike) -> None:
@@ -92,16 +92,15 @@ class PandaSetLog(Log):
         self._check_count(self.folder)
         if not len(self._files) == len(self._poses) == len(self.timestamps):
             counts = f"{len(self._files)} sweeps, {len(self._poses)} poses and {len(self.timestamps)} time stamps"
-            raise CFlowError(f"{lidar} holds {counts}; copy it again")
+            raise CFlowError(f"{lidar} has {counts}; copy it again")
 
     def sweep(self, index: int) -> Sweep:
-        """Sweep number `index`, without ground mask."""
         time = self._timestamp(index)
         points, shots, _ = self._cloud(index)
         return Sweep(points, None, self._poses[index].copy(), time, shots - time * 1e-9)
 
     def labels(self, index: int) -> FlowLabels | None:
-        """Truth of the pair (index, index + 1); None for the last sweep, and where either has no cuboids."""
+        """Read the truth of the pair (index, index + 1); None for the last sweep and without cuboids."""
         self._timestamp(index)
         if index == len(self) - 1:
             return None
@@ -122,7 +121,7 @@ class PandaSetLog(Log):
         return FlowLabels(flow, category, is_valid)
 
     def _cloud(self, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(N, 3) float32 points in the frame of the pose, (N,) float64 unix times in seconds, (N,) which LiDAR."""
+        """Read (N, 3) float32 points in the frame of the pose, (N,) float64 unix times in seconds, (N,) LiDAR index."""
         names = ("x", "y", "z", "t", "d")
         columns = _columns(self._files[index], names)
         with file_errors(self._files[index]):
@@ -131,7 +130,7 @@ class PandaSetLog(Log):
         return points.astype(np.float32), table[3], table[4]
 
     def _boxes(self, cuboids: dict[str, np.ndarray], file: Path, index: int, lidar: int) -> Boxes:
-        """Cuboids for the points of a LiDAR, in the frame of sweep `index`. Yaw 0 is the world's y axis."""
+        """Return the cuboids for the points of a LiDAR, in the frame of sweep `index`. Yaw 0 is the world's y axis."""
         with file_errors(file):
             rows = np.flatnonzero(np.isin(cuboids["cuboids.sensor_id"], (_EVERY_LIDAR, lidar)))
             heading_centre = np.stack([cuboids[name][rows] for name in ("yaw", *_POSITION)], axis=1)
@@ -145,7 +144,7 @@ class PandaSetLog(Log):
 
 
 def _columns(file: Path, names: Sequence[str]) -> dict[str, np.ndarray]:
-    """Columns of a pickled data frame."""
+    """Read columns of a pickled data frame."""
     with file_errors(file):
         columns = load_columns(io.BytesIO(gzip.decompress(read_bytes(file))))
         missing = [name for name in names if name not in columns]

@@ -1,7 +1,7 @@
-"""Names of places, on this machine or wherever fsspec reaches, and how the readers open what is there.
+"""Paths on this machine or wherever fsspec reaches, and how the readers open what they find there.
 
-A place is text ("/data/av2", "s3://bucket/av2"), a `pathlib.Path` or a `upath.UPath`. The readers use nothing of it but
-pathlib's interface and the functions below.
+A path is a text ("/data/av2", "s3://bucket/av2"), a `pathlib.Path` or a `upath.UPath`. The readers use only pathlib's
+interface and the functions below.
 """
 
 from __future__ import annotations
@@ -24,29 +24,29 @@ from cflow_torch.types import CFlowError
 
 PathLike = Union[str, Path]
 _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)://")
-_BLOCK = 1 << 20  # bytes; smaller ones make more requests: HDF5's metadata is scattered, its data are long reads
+_BLOCK = 1 << 20  # bytes; smaller blocks need more requests, as HDF5's metadata is scattered and its data are long
 _KEPT_BLOCKS = 32  # of each open file: 32 MiB
 _COPIED = 8 << 20  # bytes per request while a file is copied
-_POINTER = b"version https://git-lfs.github.com/spec/"  # what git leaves in place of a file that is not fetched
-_KEPT_COPIES = 4  # files of `source_for_mmap`: two of a Waymo segment that is read, two of the one before
+_POINTER = b"version https://git-lfs.github.com/spec/"  # begins the file that git-lfs stores before data are fetched
+_KEPT_COPIES = 4  # files of `source_for_mmap`: two of the current Waymo segment, two of the previous one
 
 
 def as_path(place: PathLike) -> Path:
-    """The path that a text names.
+    """Convert a text to a path.
 
     Args:
-        place: "scheme://..." for what fsspec reaches, else a name on this machine; "file://..." is one too. Paths of
-            pathlib and of universal_pathlib (with storage options of their own, say) stay as they are.
+        place: "scheme://..." for a file system of fsspec; "file://..." and everything else is a path on this machine.
+            Paths of pathlib and of universal_pathlib (for example with storage options of their own) stay unchanged.
 
     Returns:
         A `pathlib.Path`, or a `upath.UPath`, which has the same interface.
 
     Raises:
-        CFlowError: it is no name; the extra `remote` is missing, or the package of the scheme's file system, or fsspec
-            does not know the scheme.
+        CFlowError: it is not a path; the extra `remote` or the package of the scheme's file system is missing; or
+            fsspec does not know the scheme.
     """
     if not is_path_like(place) or place == "" or "\0" in str(place):
-        raise CFlowError(f'{str(place)[:80]!r} is no place: give a name, "scheme://..." or a path')
+        raise CFlowError(f"{str(place)[:80]!r} is not a valid path: pass a string, a Path or 'scheme://...'")
     if not isinstance(place, str):
         return place
     match = _SCHEME.match(place)
@@ -59,28 +59,30 @@ def as_path(place: PathLike) -> Path:
         import fsspec
         from upath import UPath
     except ImportError:
-        raise CFlowError(f"{place} is not on this machine, which needs: pip install universal_pathlib fsspec") from None
+        raise CFlowError(f"{place} is remote, which needs: pip install universal_pathlib fsspec") from None
     try:
         fsspec.get_filesystem_class(scheme)
-    except (ImportError, ValueError) as error:  # it names the package
-        raise CFlowError(f"fsspec has no file system {scheme}:// ({error}): {place}; is it written right?") from error
+    except (ImportError, ValueError) as error:  # it names the missing package
+        raise CFlowError(
+            f"fsspec has no file system {scheme}:// ({error}): {place}; is it spelled correctly?"
+        ) from error
     path: Any = UPath(f"{scheme}://{place[match.end() :].rstrip('/')}")
     return path  # type: ignore[no-any-return]
 
 
 def is_remote(place: Any) -> bool:
-    """Whether a path is one of fsspec's, which `open` and memory mapping know nothing of."""
+    """Whether a path is one of fsspec's, which `open` and memory mapping do not support."""
     return hasattr(place, "storage_options") and not isinstance(place, (PosixPath, WindowsPath))
 
 
 def is_path_like(value: Any) -> bool:
-    """Whether a setting names a place."""
+    """Whether a setting is a path."""
     return isinstance(value, (str, Path)) or is_remote(value)
 
 
 @contextmanager
 def remote_errors(path: Path) -> Iterator[None]:
-    """Turns whatever the far side's own library raises (no credentials, no connection, a timeout) into an OSError."""
+    """Turn every exception of a remote file system (no credentials, no connection, a timeout) into an OSError."""
     try:
         yield
     except (CFlowError, OSError):
@@ -92,33 +94,31 @@ def remote_errors(path: Path) -> Iterator[None]:
 
 
 def forget_listings(path: Any) -> None:
-    """Look anew at what others may have written: fsspec remembers the listings of folders, for `is_file` too."""
+    """Drop fsspec's cached folder listings, which also answer `is_file`, because others may have written since."""
     if is_remote(path):
         path.fs.invalidate_cache()
 
 
 def read_bytes(path: Path) -> bytes:
-    """All of a file, in one request if it is remote.
-
-    Args:
-        path: of a regular file. Reading a device or a pipe, which an unpacked archive can hold, would never end.
+    """Read a file, in one request if it is remote.
 
     Raises:
-        OSError: as for a local file, and if the far side cannot be reached.
+        OSError: as for a local file, and if the remote file system cannot be reached. A device or a pipe, which an
+            unpacked archive can contain, is refused, because reading it might never end.
     """
     if not is_remote(path):
         _check(path)
         return path.read_bytes()
     remote: Any = path
     with remote_errors(path):
-        return bytes(remote.fs.cat_file(remote.path))  # pathlib's own way asks for the size first
+        return bytes(remote.fs.cat_file(remote.path))  # pathlib's interface would ask for the size first
 
 
 def source_for_full_read(path: Path) -> Any:
-    """What to give a library that reads all of a file: its name, or what is in it if it is remote.
+    """Return what a library that reads all of a file should open: its name, or the contents if it is remote.
 
     Raises:
-        OSError: a remote file cannot be read, there is none on this machine, or it is a device or a pipe.
+        OSError: as `read_bytes`.
     """
     if is_remote(path):
         return io.BytesIO(read_bytes(path))
@@ -126,9 +126,9 @@ def source_for_full_read(path: Path) -> Any:
 
 
 def source_for_random_access(path: Path) -> Any:
-    """What to give a library that reads parts of a large file: its name, or an open binary file if it is remote.
+    """Return what a library that reads parts of a large file should open: its name, or an open file if it is remote.
 
-    Cost: one request per block of 1 MiB in which wanted bytes lie; the last 32 of each file are kept.
+    Cost: one request per block of 1 MiB that holds wanted bytes; the last 32 blocks of each file are kept.
 
     Raises:
         OSError: a remote file cannot be opened; later, that it cannot be read.
@@ -139,13 +139,13 @@ def source_for_random_access(path: Path) -> Any:
 
 
 def source_for_mmap(path: Path) -> Any:
-    """What to give pyarrow to read a large file again and again: its name, or a copy on this machine if it is remote.
+    """Return what pyarrow should open to read a large file repeatedly: its name, or a local copy if it is remote.
 
-    The last four copies stay in nameless files of the folder for temporary files (TMPDIR), which vanish with the
+    The last four copies stay in unnamed files of the folder for temporary files (TMPDIR), which vanish with the
     process however it ends.
 
     Raises:
-        OSError: a remote file cannot be read, or there is no room for the copy.
+        OSError: a remote file cannot be read, or there is no space for the copy.
     """
     return pa.BufferReader(_copy(path)) if is_remote(path) else _check(path)
 
@@ -165,10 +165,10 @@ def _open(path: Any, **settings: Any) -> Any:
 
 
 def _check(path: Path) -> str:
-    """Name of a file on this machine, which must be one, with data in it."""
+    """Return the name of a local file, which must be a regular file or a folder, and not a git-lfs pointer."""
     mode = path.stat().st_mode
     if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
-        raise OSError(errno.EINVAL, "is a device or a pipe, no file", str(path))
+        raise OSError(errno.EINVAL, "is a device or a pipe, not a file", str(path))
     if stat.S_ISREG(mode):
         with open(path, "rb") as file:
             if file.read(len(_POINTER)) == _POINTER:

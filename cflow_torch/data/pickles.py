@@ -1,4 +1,4 @@
-"""Pickles of plain values, read without importing, calling or building anything that they name."""
+"""Read pickles of plain values without importing, calling or building anything that they name."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ NUMPY_ARRAYS: frozenset[Name] = frozenset(
     [("numpy", "ndarray"), ("numpy", "dtype")]
     + [(f"numpy.{core}.{module}", name) for core in ("core", "_core") for module, name in _NUMPY]
 )
-"""What the pickle of a NumPy array names."""
+"""Names in the pickle of a NumPy array."""
 DATA_FRAMES: frozenset[Name] = NUMPY_ARRAYS | {
     ("builtins", "slice"),
     ("pandas._libs.internals", "_unpickle_block"),
@@ -24,21 +24,21 @@ DATA_FRAMES: frozenset[Name] = NUMPY_ARRAYS | {
     ("pandas.core.indexes.range", "RangeIndex"),
     ("pandas.core.internals.managers", "BlockManager"),
 }
-"""What the pickle of a data frame names, as pandas 1 and 2 write it."""
+"""Names in the pickle of a data frame, as pandas 1 and 2 write it."""
 
 
 class Placeholder:
-    """Stands for an object that a pickle wants to build: keeps what it would be made of, and does nothing.
+    """Stands for an object that a pickle wants to build: it keeps what the object would be made of, and does nothing.
 
     Attributes:
         parts: arguments of the call.
-        state: what its `__setstate__` would get; None = nothing.
+        state: argument of `__setstate__`; None = none.
     """
 
     parts: tuple[Any, ...]
     state: Any = None
 
-    def __new__(cls, *parts: Any) -> Placeholder:  # the one that every way of building calls
+    def __new__(cls, *parts: Any) -> Placeholder:  # called however a pickle builds an object
         made = super().__new__(cls)
         made.parts = parts
         return made
@@ -48,7 +48,7 @@ class Placeholder:
 
 
 class _Unpickler(pickle.Unpickler):
-    """Makes plain values (numbers, texts, lists, tuples and the like), and stand-ins for names that are allowed."""
+    """Builds plain values (numbers, texts, lists, tuples and the like), and placeholders for allowed names."""
 
     def __init__(self, stream: IO[bytes], allowed: frozenset[Name]) -> None:
         super().__init__(stream, encoding="ascii")
@@ -57,24 +57,24 @@ class _Unpickler(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) in self._allowed:
             return Placeholder
-        raise pickle.UnpicklingError(f"it asks for {module}.{name}, which is never run")
+        raise pickle.UnpicklingError(f"it names {module}.{name}, which is never executed")
 
 
 def load_plain(stream: IO[bytes], allowed: frozenset[Name] = frozenset()) -> Any:
-    """What a pickle holds.
+    """Load a pickle.
 
     Args:
-        stream: stands where the pickle begins.
-        allowed: (module, name) pairs that a `Placeholder` takes the place of. Every other name is refused.
+        stream: positioned where the pickle begins.
+        allowed: (module, name) pairs that a `Placeholder` replaces. Every other name is refused.
 
     Raises:
-        Exception: whatever the unpickler raises for a damaged pickle, or one that names something else.
+        Exception: whatever the unpickler raises for a damaged pickle, or for one that names something else.
     """
     return _Unpickler(stream, allowed).load()
 
 
 def array_of(placeholder: Placeholder) -> np.ndarray:
-    """The array that a stand-in is for, of numbers, texts or truth values; one of objects keeps them as they are.
+    """Return the array that a placeholder stands for, of numbers, texts, truth values or objects.
 
     Raises:
         Exception: nearly any, if it stands for something else.
@@ -90,7 +90,7 @@ def array_of(placeholder: Placeholder) -> np.ndarray:
 
 
 def load_columns(stream: IO[bytes]) -> dict[str, np.ndarray]:
-    """Columns of a data frame that pandas pickled, by name; without pandas.
+    """Load the columns of a data frame that pandas pickled, by name, without pandas.
 
     Raises:
         Exception: as `load_plain` and `array_of`.
@@ -104,8 +104,8 @@ def load_columns(stream: IO[bytes]) -> dict[str, np.ndarray]:
         blocks, axes = [(block["values"], block["mgr_locs"]) for block in layout["blocks"]], layout["axes"]
     names = array_of(axes[0].parts[1]["data"])
     columns: dict[str, np.ndarray] = {}
-    for values, place in blocks:
-        is_slice = place.state is None and len(place.parts) == 3
-        chosen = slice(*place.parts) if is_slice else array_of(place)
+    for values, index in blocks:
+        is_slice = index.state is None and len(index.parts) == 3
+        chosen = slice(*index.parts) if is_slice else array_of(index)
         columns.update(zip(names[chosen].tolist(), array_of(values)))
     return columns

@@ -1,4 +1,4 @@
-"""Rotations and rigid motions: quaternions (by kornia), motion between two times, applied to points. All float64."""
+"""Rigid motions in float64: poses from quaternions (by kornia), interpolation in time, transformation of points."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ import torch
 
 from cflow_torch.types import CFlowError
 
-QUATERNION_TOLERANCE = 1e-3  # a quaternion is a rotation only if its length is 1; stored values are within 1e-6
+QUATERNION_TOLERANCE = 1e-3  # only quaternions of length 1 are rotations; those of data sets are within 1e-6
 
 
 def poses_from_quaternions(translation: Any, quaternion: Any, what: Callable[[int], str]) -> np.ndarray:
-    """Poses as files store them.
+    """Build poses from translations and quaternions, as files store them.
 
     Args:
         translation: (K, 3) numbers, metres; an empty list is K = 0.
         quaternion: (K, 4) numbers, scalar first (w, x, y, z), of length 1 within `QUATERNION_TOLERANCE`.
-        what: number of a row -> where it is from, for the message.
+        what: row -> where it comes from, for the message.
 
     Returns:
         (K, 4, 4) float64.
@@ -27,29 +27,29 @@ def poses_from_quaternions(translation: Any, quaternion: Any, what: Callable[[in
         CFlowError: a row is not finite, or its quaternion has another length.
     """
     shift = np.asarray(translation, dtype=np.float64).reshape(-1, 3)
-    turn = np.asarray(quaternion, dtype=np.float64).reshape(-1, 4)
-    is_right = np.isfinite(shift).all(axis=1) & (np.abs(np.linalg.norm(turn, axis=1) - 1) <= QUATERNION_TOLERANCE)
-    for row in np.flatnonzero(~is_right):
+    rotation = np.asarray(quaternion, dtype=np.float64).reshape(-1, 4)
+    is_unit = np.abs(np.linalg.norm(rotation, axis=1) - 1) <= QUATERNION_TOLERANCE
+    for row in np.flatnonzero(~(np.isfinite(shift).all(axis=1) & is_unit)):
         raise CFlowError(
-            f"{what(int(row))} is no rigid motion: quaternion (w, x, y, z) and translation must be finite, the "
-            f"quaternion of length 1, got {turn[row].tolist()}, {shift[row].tolist()}; copy the file again"
+            f"{what(int(row))} is not a rigid motion: quaternion (w, x, y, z) and translation must be finite, the "
+            f"quaternion of length 1, got {rotation[row].tolist()}, {shift[row].tolist()}; copy the file again"
         )
-    return _poses(to_rotations(turn), shift)
+    return _poses(to_rotations(rotation), shift)
 
 
 def poses_from_json(nodes: Sequence[Any], translation: str, rotation: str, what: str) -> np.ndarray:
-    """(K, 4, 4) float64 poses of K JSON objects with members {x, y, z} and {w, x, y, z} of these names.
+    """Build (K, 4, 4) float64 poses from K JSON objects with members {x, y, z} and {w, x, y, z} of the given names.
 
     Raises:
         CFlowError: as `poses_from_quaternions`.
     """
     shifts = [[node[translation][axis] for axis in "xyz"] for node in nodes]
-    turns = [[node[rotation][axis] for axis in "wxyz"] for node in nodes]
-    return poses_from_quaternions(shifts, turns, lambda row: f"{what} {row}")
+    quaternions = [[node[rotation][axis] for axis in "wxyz"] for node in nodes]
+    return poses_from_quaternions(shifts, quaternions, lambda row: f"{what} {row}")
 
 
 def poses_at(times: np.ndarray, known_times: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    """Poses at any times, from those around each; before the first and after the last the motion goes on.
+    """Interpolate poses at any times; before the first and after the last pose the motion continues at a constant rate.
 
     Args:
         times: (K,) int64.
@@ -65,23 +65,26 @@ def poses_at(times: np.ndarray, known_times: np.ndarray, poses: np.ndarray) -> n
 
 
 def interpolate_poses(poses0: np.ndarray, poses1: np.ndarray, fraction: np.ndarray) -> np.ndarray:
-    """(K, 4, 4) poses on a straight line and at a constant turn rate, the shorter way round, from (K, 4, 4) to others.
+    """Interpolate between pairs of poses: positions linearly, rotations at a constant rate along the shorter arc.
 
     Args:
         poses0, poses1: (K, 4, 4) float64.
-        fraction: (K,) float64, 0 = the first, 1 = the second; beyond, the motion goes on.
+        fraction: (K,) float64, 0 = the first pose, 1 = the second; other values extrapolate.
+
+    Returns:
+        (K, 4, 4) float64.
     """
     rotation = _rotations_between(poses0[:, :3, :3], poses1[:, :3, :3], fraction)
     return _poses(rotation, poses0[:, :3, 3] + fraction[:, None] * (poses1[:, :3, 3] - poses0[:, :3, 3]))
 
 
 def transform_points(points: np.ndarray, T: np.ndarray) -> np.ndarray:
-    """(N, 3) float64 points after the rigid motion `T`, (4, 4) float64."""
+    """Return (N, 3) float64 points transformed by the rigid motion `T`, (4, 4) float64."""
     return np.asarray(points, dtype=np.float64) @ T[:3, :3].T + T[:3, 3]
 
 
 def to_quaternions(rotations: np.ndarray) -> np.ndarray:
-    """Unit quaternions (M, 4) float64, scalar first and not negative, of rotation matrices (M, 3, 3)."""
+    """Convert rotation matrices (M, 3, 3) to unit quaternions (M, 4) float64, scalar first and not negative."""
     from kornia.geometry.conversions import rotation_matrix_to_quaternion
 
     matrices = torch.from_numpy(np.array(rotations, np.float64))
@@ -91,19 +94,19 @@ def to_quaternions(rotations: np.ndarray) -> np.ndarray:
 
 
 def to_rotations(quaternions: np.ndarray) -> np.ndarray:
-    """Rotation matrices (M, 3, 3) float64 of quaternions (M, 4), scalar first, of any length but 0."""
+    """Convert quaternions (M, 4), scalar first, of any length but 0, to rotation matrices (M, 3, 3) float64."""
     from kornia.geometry.conversions import quaternion_to_rotation_matrix
 
     return quaternion_to_rotation_matrix(torch.from_numpy(np.array(quaternions, np.float64))).numpy()
 
 
 def _rotations_between(first: np.ndarray, last: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """(M, 3, 3) rotations on the shorter way from one to another, at constant turn rate."""
-    # Not kornia's `Quaternion.slerp`: before kornia 0.8 it may take the longer way, and gives NaN for equal rotations.
+    """Interpolate (M, 3, 3) rotations at a constant rate along the shorter arc."""
+    # Not kornia's `Quaternion.slerp`: before kornia 0.8 it may take the longer arc, and gives NaN for equal rotations.
     from kornia.geometry.conversions import axis_angle_to_quaternion, quaternion_to_axis_angle
 
-    turn = quaternion_to_axis_angle(torch.from_numpy(to_quaternions(np.swapaxes(first, 1, 2) @ last)))
-    part = axis_angle_to_quaternion(turn * torch.from_numpy(np.asarray(share, np.float64))[:, None])
+    axis_angle = quaternion_to_axis_angle(torch.from_numpy(to_quaternions(np.swapaxes(first, 1, 2) @ last)))
+    part = axis_angle_to_quaternion(axis_angle * torch.from_numpy(np.asarray(share, np.float64))[:, None])
     return np.asarray(first, np.float64) @ to_rotations(part.numpy())
 
 

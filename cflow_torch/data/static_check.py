@@ -1,4 +1,4 @@
-"""Does the static world stay put? A check of poses and frames against the points themselves."""
+"""Check poses and frames against the points: is the static world static?"""
 
 from __future__ import annotations
 
@@ -12,49 +12,49 @@ from cflow_torch.data.log import Log
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.ego_motion import rigid_transform
 
-BASELINE = 5  # sweeps between the two that are compared: a wrong frame shows by how far the vehicle turned
-_PAIRS = 2  # that are looked at in a log
+BASELINE = 5  # sweeps between the two that are compared: the error of a wrong frame grows with the vehicle's rotation
+_PAIRS = 2  # compared per log
 _NEAREST, _FARTHEST = 2.5, 50.0  # metres from the origin: without the own car, and near enough for dense structure
-_CELL = 1.0  # metres, side of the cells whose points are taken as one patch of a wall
+_CELL = 1.0  # metres, side of the cells whose points form one patch of a wall
 _FEWEST = 6  # points in a cell
-_BLUR = 0.03  # metres, the least thickness of a patch: range noise and calibration
+_BLUR = 0.03  # metres, smallest thickness of a patch: range noise and calibration
 _CLEARANCE = 0.4  # metres above the lowest point of a cell, below which a point may be ground
 _MOST_POINTS = 8000
 _STEPS = 10
-_PRIOR = np.diag([1.0, 1.0, 100.0])  # 1 / (m^2, m^2, rad^2), against what the scene does not show (a long wall)
-_FEWEST_IN_PLACE = 150  # agreement times points; fewer show nothing
-# What is still no mistake. Correct poses gave at most 13 mm on a real drive without de-skewing and 7 mm on simulated
-# ones; sweeps taken while the vehicle begins to turn, not de-skewed, 58 mm together with 0.7 degrees.
+_PRIOR = np.diag([1.0, 1.0, 100.0])  # 1 / (m^2, m^2, rad^2), for directions that the scene leaves open (a long wall)
+_FEWEST_IN_PLACE = 150  # smallest agreement times points that we judge
+# Tolerances. Correct poses gave at most 13 mm on a real drive without de-skewing and 7 mm on simulated ones; sweeps
+# at the beginning of a turn, not de-skewed, 58 mm together with 0.7 degrees.
 _SHIFT, _SHIFT_PER_METRE, _SHIFT_PER_RADIAN = 0.03, 0.01, 10.0
-_TURN = np.radians(1.5)
-_BETTER, _GOOD = 2.0, 0.15  # how much better, and how good at least, other poses fit before they are suggested
+_ROTATION = np.radians(1.5)
+_BETTER, _GOOD = 2.0, 0.15  # factor by which other poses must fit better, and their least agreement, to be suggested
 _HOPELESS = 0.2  # share of `own`; correct poses gave 0.27 (the case above) or more than 0.5
-_ALIGNED = 0.5  # share of `own` from which a fit has found its place; a LiDAR at a wrong place gave 0.7 and more
+_ALIGNED = 0.5  # share of `own` from which a fit has converged; a LiDAR at a wrong position gave 0.7 and more
 
 
 class StaticWorldWarning(UserWarning):
-    """The static world does not stay put under the poses of a log."""
+    """The static world moves under the poses of a log."""
 
 
 @dataclass(frozen=True)
 class StaticResidual:
-    """What is left of the motion of the static world after ego motion is taken out.
+    """Motion of the static world that remains after ego motion is removed.
 
     Args:
         index, later: the two sweeps.
-        shift: (2,) float64 metres, by which structure of `index`, moved by the poses, misses that of `later`; x, y of
+        shift: (2,) float64 metres by which structure of `index`, moved by the poses, misses that of `later`; x, y of
             the later sweep's frame.
-        turn: radians about z, likewise.
-        agreement: 0 ... 1, how well the structure of both coincides under the poses; of two sweeps of a street 0.3 to
-            0.5. NaN where too little can be compared.
-        aligned: agreement after `shift` and `turn` are taken out.
-        verdict: what is likely wrong, "" = nothing.
+        rotation: radians about z, likewise.
+        agreement: 0 ... 1, how well the structure of both coincides under the poses; 0.3 to 0.5 for two sweeps of a
+            street. NaN if too little can be compared.
+        aligned: agreement after `shift` and `rotation` are removed.
+        verdict: the likely mistake, "" = none.
     """
 
     index: int
     later: int
     shift: np.ndarray
-    turn: float
+    rotation: float
     agreement: float
     aligned: float
     verdict: str
@@ -64,17 +64,16 @@ def static_world_residual(log: Log, index: int, baseline: int = BASELINE) -> Sta
     """Compare two sweeps of a log in one frame.
 
     Args:
-        log: without poses the sensor is taken to stand still; without ground masks, low points are left out by a
-            simple rule.
+        log: without poses the sensor is assumed to be static; without ground masks, a simple rule removes low points.
         index: the older sweep.
-        baseline: sweeps to the later one.
+        baseline: sweeps between the two.
 
     Convention:
-        Only the horizontal plane is looked at: the points of the later sweep above ground, 2.5 to 50 m away, become
-        Gaussian patches in cells of 1 m; a Gauss-Newton fit with weights that forget outliers (movers) finds the shift
-        and turn that bring the older sweep onto them. Along a wall without any corner nothing can be seen and nothing
-        is reported. A LiDAR that is not where the poses say shows only where the vehicle turns: by its distance times
-        the turn, 12 cm for 1.35 m and 5 degrees.
+        Only the horizontal plane is compared. The points of the later sweep above ground, 2.5 to 50 m away, become
+        Gaussian patches in cells of 1 m. A Gauss-Newton fit with robust weights (for moving objects) finds the shift
+        and rotation that align the older sweep with them. Along a wall without corners no shift is detected. A LiDAR at
+        another position than the poses state shows only when the vehicle turns: by its distance times the rotation, 12
+        cm for 1.35 m and 5 degrees.
 
     Raises:
         CFlowError: no such pair of sweeps.
@@ -94,48 +93,48 @@ def static_world_residual(log: Log, index: int, baseline: int = BASELINE) -> Sta
     patches = _Patches(target)
     source = source[np.random.default_rng(0).permutation(len(source))[:_MOST_POINTS]]
     moved = _move(source, T_1_0)
-    agreement, (shift, turn, aligned) = patches.agreement(moved), patches.fit(moved)
-    own = patches.agreement(target)  # more than any other sweep can have
+    agreement, (shift, rotation, aligned) = patches.agreement(moved), patches.fit(moved)
+    own = patches.agreement(target)  # an upper bound for other sweeps
     if own * min(len(source), len(target)) < _FEWEST_IN_PLACE:
-        return StaticResidual(index, index + baseline, shift, turn, float("nan"), float("nan"), "")
+        return StaticResidual(index, index + baseline, shift, rotation, float("nan"), float("nan"), "")
     inverted = patches.agreement(_move(source, pose1 @ np.linalg.inv(pose0)))
     still = patches.agreement(source[:, :2])
     size, distance = float(np.linalg.norm(shift)), float(np.linalg.norm(T_1_0[:3, 3]))
     verdict = ""
     if inverted > max(_BETTER * agreement, _GOOD, still):
-        verdict = "The poses seem to be inverted: they must map ego coordinates to the world (T_world_ego)."
+        verdict = "The poses seem to be inverted. They must map ego coordinates to the world (T_world_ego)."
     elif still > max(_BETTER * agreement, _GOOD) or max(agreement / _HOPELESS, aligned / _ALIGNED) < own:
         verdict = (
-            "It does not fit: are the poses of another log, of other axes (a camera's), times or units, or do the "
-            "points lie in one common frame already (then pass no poses)?"
+            "The sweeps do not fit. Do the poses have another log, other axes (a camera's), times or units? Or are the "
+            "points already in one common frame (then pass no poses)?"
         )
-    elif abs(turn) > _TURN or size > _SHIFT + _SHIFT_PER_METRE * distance + _SHIFT_PER_RADIAN * abs(turn):
+    elif abs(rotation) > _ROTATION or size > _SHIFT + _SHIFT_PER_METRE * distance + _SHIFT_PER_RADIAN * abs(rotation):
         verdict = (
-            f"It is off by {100 * size:.0f} cm and {np.degrees(abs(turn)):.1f} degrees. Points in the frame of the "
-            "LiDAR with poses of the vehicle do this in turns: pass ego_T_lidar. Other causes: axes or times of the "
+            f"It is off by {100 * size:.0f} cm and {np.degrees(abs(rotation)):.1f} degrees. Points in the frame of the "
+            "LiDAR with poses of the vehicle cause this in turns: pass ego_T_lidar. Other causes: axes or times of the "
             "poses, sweeps that are not de-skewed."
         )
     if verdict and not has_poses:
         verdict = (
-            "There are no poses, and the sensor seems to move: give poses, or data.odometry=true (in Python "
+            "There are no poses, but the sensor seems to move. Pass poses, or set data.odometry=true (in Python "
             "`with_poses` of cflow_torch.data.odometry)."
         )
-    return StaticResidual(index, index + baseline, shift, turn, agreement, aligned, verdict)
+    return StaticResidual(index, index + baseline, shift, rotation, agreement, aligned, verdict)
 
 
 def check_static_world(log: Log) -> list[StaticResidual]:
-    """Warn if the static world does not stay put in two pairs of sweeps of a log.
+    """Warn if the static world moves between two sweeps of a log.
 
     Args:
-        log: any log. The pairs are those over which the vehicle turns most, if it has `poses`, else first and last.
+        log: any log. We compare the two pairs over which the vehicle turns most if it has `poses`, else first and last.
 
     Returns:
-        What was found; empty for a log of one sweep.
+        The residuals; empty for a log of one sweep.
 
     Warns:
         StaticWorldWarning: once, with the verdict on the worst pair.
 
-    Cost: reads two sweeps a pair; 0.15 s each.
+    Cost: reads two sweeps per pair; 0.15 s each.
     """
     baseline = min(BASELINE, len(log.timestamps) - 1)
     if baseline < 1:
@@ -145,7 +144,7 @@ def check_static_world(log: Log) -> list[StaticResidual]:
     if bad:
         worst = max(bad, key=lambda residual: float(np.linalg.norm(residual.shift)))
         warnings.warn(
-            f"log {log.log_id}, sweeps {worst.index} and {worst.later}: the static world does not stay put. "
+            f"log {log.log_id}, sweeps {worst.index} and {worst.later}: the static world is not static. "
             + worst.verdict,
             StaticWorldWarning,
             stacklevel=2,
@@ -154,7 +153,7 @@ def check_static_world(log: Log) -> list[StaticResidual]:
 
 
 def _choose(log: Any, baseline: int) -> list[int]:
-    """First sweeps of pairs that do not overlap, those with the largest turn first."""
+    """Return the first sweeps of pairs that do not overlap, largest rotation first."""
     last = len(log.timestamps) - 1 - baseline
     poses: np.ndarray | None = getattr(log, "poses", None)
     if poses is None:
@@ -169,7 +168,7 @@ def _choose(log: Any, baseline: int) -> list[int]:
 
 
 def _structure(sweep: Sweep) -> np.ndarray:
-    """(N, 3) float64, points above ground, neither too near nor too far."""
+    """Return (N, 3) float64 points above ground, neither too near nor too far."""
     points = np.asarray(sweep.points)[:, :3].astype(np.float64)
     reach = np.hypot(points[:, 0], points[:, 1])
     keep = np.isfinite(points).all(1) & (reach > _NEAREST) & (reach < _FARTHEST)
@@ -183,18 +182,18 @@ def _structure(sweep: Sweep) -> np.ndarray:
 
 
 def _cells(xy: np.ndarray, size: float) -> np.ndarray:
-    """(N,) int64, one number per cell; coordinates are within 10 km after any pose that is worth a look."""
+    """Return (N,) int64 cell indices; coordinates are within 10 km under all but hopeless poses."""
     column, row = np.floor(np.clip(xy, -1e4, 1e4) / size).astype(np.int64).T
     return row * 100_003 + column
 
 
 def _move(points: np.ndarray, transform: np.ndarray) -> np.ndarray:
-    """(N, 2) float64, x and y after a transform."""
+    """Return (N, 2) float64, x and y after a transform."""
     return points @ transform[:2, :3].T + transform[:2, 3]
 
 
 class _Patches:
-    """Gaussian patches of structure seen from above."""
+    """Gaussian patches of structure in the bird's-eye view."""
 
     def __init__(self, xy: np.ndarray) -> None:
         self.cell, member, count = np.unique(_cells(xy, _CELL), return_inverse=True, return_counts=True)
@@ -207,16 +206,16 @@ class _Patches:
         self.usable = count >= _FEWEST
 
     def agreement(self, xy: np.ndarray) -> float:
-        """Mean over points of exp(-d^2 / 2), d = Mahalanobis distance to the patch of the cell; 0 where none is."""
+        """Mean over points of exp(-d^2 / 2), d = Mahalanobis distance to the patch of the cell; 0 without a patch."""
         _, offset, precision = self._pairs(xy)
         distance = np.einsum("ni,nij,nj->n", offset, precision, offset)
         return float(np.exp(-distance / 2).sum() / max(len(xy), 1))
 
     def fit(self, xy: np.ndarray) -> tuple[np.ndarray, float, float]:
-        """(shift, turn, agreement after them) that bring points onto the patches."""
-        x, y, turn = 0.0, 0.0, 0.0
+        """Return the shift and rotation that move points onto the patches, and the agreement after them."""
+        x, y, rotation = 0.0, 0.0, 0.0
         for _ in range(_STEPS):
-            moved = _turned(xy, turn) + (x, y)
+            moved = _rotated(xy, rotation) + (x, y)
             hit, offset, precision = self._pairs(moved)
             pull = np.einsum("nij,nj->ni", precision, offset)
             weight = 1 / (1 + (offset * pull).sum(1) / 4) ** 2
@@ -225,20 +224,20 @@ class _Patches:
             jacobian[:, 0, 2], jacobian[:, 1, 2] = -(moved[hit, 1] - y), moved[hit, 0] - x
             weighted = jacobian * weight[:, None, None]
             hessian = np.einsum("nia,nij,njb->ab", weighted, precision, jacobian) / max(len(xy), 1) + _PRIOR
-            gradient = np.einsum("nia,ni->a", weighted, pull) / max(len(xy), 1) + _PRIOR @ (x, y, turn)
-            x, y, turn = np.array([x, y, turn]) - np.linalg.solve(hessian, gradient)
-        return np.array([x, y]), float(turn), self.agreement(_turned(xy, turn) + (x, y))
+            gradient = np.einsum("nia,ni->a", weighted, pull) / max(len(xy), 1) + _PRIOR @ (x, y, rotation)
+            x, y, rotation = np.array([x, y, rotation]) - np.linalg.solve(hessian, gradient)
+        return np.array([x, y]), float(rotation), self.agreement(_rotated(xy, rotation) + (x, y))
 
     def _pairs(self, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Which points fall on a patch, their offsets from its middle (M, 2), and its precision (M, 2, 2)."""
+        """Return which points fall on a patch, their offsets from its mean (M, 2), and its precision (M, 2, 2)."""
         if not len(self.cell):
             return np.zeros(len(xy), bool), np.zeros((0, 2)), np.zeros((0, 2, 2))
         key = _cells(xy, _CELL)
-        place = np.searchsorted(self.cell, key).clip(0, len(self.cell) - 1)
-        hit = (self.cell[place] == key) & self.usable[place]
-        return hit, xy[hit] - self.mean[place[hit]], self.precision[place[hit]]
+        patch = np.searchsorted(self.cell, key).clip(0, len(self.cell) - 1)
+        hit = (self.cell[patch] == key) & self.usable[patch]
+        return hit, xy[hit] - self.mean[patch[hit]], self.precision[patch[hit]]
 
 
-def _turned(xy: np.ndarray, turn: float) -> np.ndarray:
-    cos, sin = np.cos(turn), np.sin(turn)
+def _rotated(xy: np.ndarray, angle: float) -> np.ndarray:
+    cos, sin = np.cos(angle), np.sin(angle)
     return xy @ np.array([[cos, sin], [-sin, cos]])

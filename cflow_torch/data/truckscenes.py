@@ -1,4 +1,4 @@
-"""Reader of raw MAN TruckScenes: nuScenes' tables, six LiDARs with sweeps as PCD, not compensated for ego motion."""
+"""Experimental reader of raw MAN TruckScenes: tables as in nuScenes, six LiDARs with PCD sweeps, not compensated."""
 
 from __future__ import annotations
 
@@ -16,30 +16,30 @@ from cflow_torch.types import CFlowError
 
 
 def find_truckscenes_scenes(root: PathLike) -> list[SceneSource]:
-    """All scenes under a folder, see `nuscenes.tables.find_scenes`."""
+    """Find all scenes under a folder, see `nuscenes.tables.find_scenes`."""
     return find_scenes(root, ("log", "map"), "TruckScenes")
 
 
 class TruckScenesLog(NuScenesLog):
-    """One TruckScenes scene; implements the `Log` protocol.
+    """One TruckScenes scene. Experimental: tested on simulated scenes only.
 
     Args:
         source: the scene, from `find_truckscenes_scenes`.
         sweep_step: 1 = all sweeps (10 Hz); n = every n-th after each key frame, and every key frame.
         lidars: channels to merge; None = every LiDAR of the scene (six).
-        own_vehicle: points above it are removed, as are those in a box of `vehicle.ego_trailer` (which is known where
+        own_vehicle: points above it are removed, as are those in a box of `vehicle.ego_trailer` (which is known if
             there are annotations); None = keep both.
-        deskew: move each point with the pose that the vehicle had when it was measured; False: with the pose that its
-            LiDAR's sweep has.
+        deskew: move each point with the pose that the vehicle had when it was measured; False: with the pose of its
+            LiDAR's sweep.
 
     Attributes:
         log_id: name of the scene.
         timestamps: times of the reference LiDAR's sweeps (LIDAR_LEFT, else the first), in microseconds.
 
-    Convention: points are float32 in the ego frame at the reference's time stamp (x ahead, y left, z up, origin on the
-        ground). Of every other LiDAR the sweep next in time is taken; none if that is more than 60 ms off. Poses are
-        float64 `T_world_ego`, world = UTM, numbers of 1e6 m. Between the reference's sweeps, poses are interpolated.
-        `is_ground` is None: TruckScenes has no ground mask.
+    Convention: points are float32 in the ego frame at the reference's time stamp (x forward, y left, z up, origin on
+        the ground). From every other LiDAR we take the sweep closest in time; none if it is more than 60 ms off. Poses
+        are float64 `T_world_ego`, world = UTM, numbers of 1e6 m. Between the reference's sweeps, poses are
+        interpolated. `is_ground` is None: TruckScenes has no ground mask.
 
     Raises:
         CFlowError: as `NuScenesLog`.
@@ -47,7 +47,7 @@ class TruckScenesLog(NuScenesLog):
 
     _categories: ClassVar[Mapping[str, str]] = TRUCKSCENES_CATEGORIES
     _reference: ClassVar[str] = "LIDAR_LEFT"
-    # |x| < 7 m and |y| < 2 m, as OpenSceneFlow has it.
+    # |x| < 7 m and |y| < 2 m, as in OpenSceneFlow.
     OWN_VEHICLE: ClassVar[Footprint] = Footprint(rear=-7.0, front=7.0, half_width=2.0)
 
     def __init__(

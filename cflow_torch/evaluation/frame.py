@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from cflow_torch.data.hdf5.frames import StoredMotion, beside_harness, harness_pose_flow
+from cflow_torch.data.hdf5.frames import StoredMotion, harness_pose_flow, residual_for_harness
 from cflow_torch.data.log import FlowLabels
 from cflow_torch.types import Array, CFlowError, FlowResult, Window, as_numpy
 
@@ -114,7 +114,7 @@ class EvalFrame:
         if stored_motion is not None:
             points, residual = torch.as_tensor(as_numpy(window.pc0.points)[:, :3]), result.residual_flow.cpu()
             if not stored_motion.of_points:
-                residual = beside_harness(residual, points, stored_motion.T_ego1_ego0, parts["T_ego1_ego0"])
+                residual = residual_for_harness(residual, points, stored_motion.T_ego1_ego0, parts["T_ego1_ego0"])
             pose_flow = harness_pose_flow(points, stored_motion.T_ego1_ego0)
             parts.update(T_ego1_ego0=stored_motion.T_ego1_ego0, pose_flow=pose_flow, flow=pose_flow + residual)
             return cls(points=points, labels=labels, **parts)

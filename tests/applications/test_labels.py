@@ -162,7 +162,7 @@ def test_existing_labels_are_replaced_only_with_overwrite(scenes: Path, tmp_path
         for name in scene:
             scene[name]["dufo"] = np.full(len(scene[name]["lidar"]), 7, np.int64)
     before = file.read_bytes()
-    with pytest.raises(CFlowError, match="has dufo already: overwrite=true"):
+    with pytest.raises(CFlowError, match="already has dufo: overwrite=true"):
         label_scene(file, make_model(make_config("fast"), "cpu"))
     assert label(scenes, output) == 2
     error = capsys.readouterr().err

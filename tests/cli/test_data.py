@@ -32,8 +32,8 @@ def test_a_path_is_enough(name: str, tmp_path: Path, cflow: Cflow, capsys: pytes
 
 def test_what_is_not_recognised_is_an_error_that_says_so(tmp_path: Path) -> None:
     for place, message in (
-        ("absent", "no file and no folder"),
-        ("empty", "no format fits what lies"),
+        ("absent", "no such file or folder"),
+        ("empty", "no format fits its contents"),
     ):
         (tmp_path / "empty").mkdir(exist_ok=True)
         with pytest.raises(CFlowError, match=message):

@@ -73,7 +73,7 @@ def test_version_and_help_come_without_torch(cflow: Cflow, capsys: pytest.Captur
         ("plot pair=1.5", "pair=1.5: Value '1.5' of type 'float' could not be converted to Integer"),
         ("plot picture=animation width=abc", "width=abc: Value 'abc'"),
         ("flow data=av2", "where is the data? give data.root=PATH"),
-        ("flow fast", "fast: no file and no folder of this name; settings are NAME=VALUE"),
+        ("flow fast", "fast: there is no such file or folder; settings are NAME=VALUE"),
         ("flow data=av2 data.root=/no/such/folder", "/no/such/folder"),
         ("flow contents=[confidence] model=paper", "confidence is there with model=default and model=fast only"),
         ("completion", "one of bash, zsh, fish, got nothing"),

@@ -110,7 +110,7 @@ def test_what_a_log_lacks_is_not_written(tmp_path, folder):
     with pytest.raises(CFlowError, match="poses=None"):
         write_array_log(SmallLog(poses=False), tmp_path / "b")
     assert not list((tmp_path / "b").iterdir()), "nothing half-written"
-    with pytest.raises(CFlowError, match="exists already"):
+    with pytest.raises(CFlowError, match="already exists"):
         write_array_log(SmallLog(), tmp_path)
 
 
@@ -213,7 +213,7 @@ def test_poses_at_a_rate_of_their_own(tmp_path):
         at = 0.1 * k - 0.007
         assert np.abs(pose - scenes.pose(10 * at, 0, 0.5 * at)).max() < 1e-12
     write_times(folder / "times.txt", [time + 10**12 for time in SmallLog().timestamps])
-    with pytest.raises(CFlowError, match="same moment"):
+    with pytest.raises(CFlowError, match="same time"):
         ArraysLog(folder)
     gap = Trajectory(truth[:2], np.array([0, 10**9]), "tum")
     assert np.array_equal(poses_at(gap, [0, 10**9], "x"), gap.poses), "a pose at its time stays as it is"
@@ -253,15 +253,15 @@ def test_points_and_poses_of_a_lidar_are_moved_to_the_ego_frame(folder):
     ("file", "content", "settings", "complaint"),
     [
         ("poses.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n", {}, "1 poses for 3 sweeps"),
-        ("poses.txt", "1 2 3\n", {}, "numbers a line"),
+        ("poses.txt", "1 2 3\n", {}, "numbers per line"),
         ("poses.txt", "2 0 0 0 0 1 0 0 0 0 1 0\n" * 3, {}, "not rigid"),
-        ("poses.txt", "0 0 0 0 0 0 0 2\n", {}, "pose 0 is no rigid motion"),
+        ("poses.txt", "0 0 0 0 0 0 0 2\n", {}, "pose 0 is not a rigid motion"),
         ("poses.txt", "1 0 0 0 0 0 0 1\n0 0 0 0 0 0 0 1\n", {}, "ascend"),
         ("times.txt", "1700000000123456789\n" * 3, {}, "nanoseconds"),
         ("poses.npy", np.eye(4), {}, "several"),
         ("poses.npy", np.eye(4), {"poses": "poses.npy"}, "shape"),
         ("points/a.ply", np.ones((1, 3)), {}, "several kinds of clouds"),
-        ("", None, {"poses": "gone.txt"}, "names nothing"),
+        ("", None, {"poses": "gone.txt"}, "does not exist"),
         ("", None, {"ego_T_lidar": np.ones((4, 4))}, "ego_T_lidar"),
         ("", None, {"poses_of": "camera"}, "poses_of"),
     ],

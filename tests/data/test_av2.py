@@ -159,7 +159,7 @@ def test_labels_from_boxes(folder: Path) -> None:
 
 
 def test_bad_logs_are_refused(folder: Path, tmp_path: Path) -> None:
-    with pytest.raises(CFlowError, match="holds no folder sensors/lidar"):
+    with pytest.raises(CFlowError, match="has no folder sensors/lidar"):
         AV2Log(tmp_path)
     for ask in (AV2Log(folder).sweep, AV2Log(folder).labels):
         for index in (3, -1):
@@ -179,8 +179,8 @@ SWEEP, POSES, LABELS = "sensors/lidar/100.feather", "city_SE3_egovehicle.feather
 @pytest.mark.parametrize(
     ("file", "columns", "message"),
     [
-        (POSES, pose_columns((100, 300)), "no pose for sweep 200"),
-        (POSES, {**pose_columns(), "qw": np.full(3, 0.9)}, "the pose of 100 is no rigid motion"),
+        (POSES, pose_columns((100, 300)), "no pose at exactly the time of sweep 200"),
+        (POSES, {**pose_columns(), "qw": np.full(3, 0.9)}, "the pose of 100 is not a rigid motion"),
         (POSES, {**pose_columns(), "timestamp_ns": np.array(TIMES, dtype=np.float64)}, "timestamp_ns must be integer"),
         (POSES, {key: value for key, value in pose_columns().items() if key != "qz"}, r"lacks the columns \['qz'\]"),
         (SWEEP, {"x": [1.0, None], "y": [1.0, 2.0], "z": [1.0, 2.0]}, "1 empty entries in x"),

@@ -65,7 +65,7 @@ def test_ground_is_found_where_there_is_no_mask(drive: Drive, arrays: Path) -> N
         ("arrays", {"clouds": "raw"}, "no setting clouds; it has poses"),
         ("arrays", {"find_ground": "magic"}, "find_ground='magic'"),
         ("arrays", {"suffix": 5}, "arrays cannot be opened with suffix=5"),
-        ("arrays", {"times": 5}, "5' is no place"),
+        ("arrays", {"times": 5}, "5' is not a valid path"),
     ],
 )
 def test_wrong_calls(arrays: Path, name: str, settings: dict[str, Any], complaint: str) -> None:

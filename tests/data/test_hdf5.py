@@ -47,7 +47,7 @@ def test_another_process_opens_the_file_itself(tmp_path):
         ({"lidar": None}, "lidar"),
         ({"pose": None}, "no pose"),
         ({"lidar": np.zeros((50, 2), np.float32)}, "lidar.*N, 3"),
-        ({"lidar": ["a", "b"]}, "lidar is no array of bool, integers or floats"),
+        ({"lidar": ["a", "b"]}, "lidar is not an array of bool, integers or floats"),
         ({"ground_mask": np.zeros(49, bool)}, "ground_mask.*shape"),
         ({"flow_is_valid": None}, "flow_is_valid"),
         ({"flow_category_indices": np.zeros(3, np.uint8)}, "flow_category_indices"),

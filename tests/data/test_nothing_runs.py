@@ -50,7 +50,7 @@ def test_arrays_of_objects(marker: Path, tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", points=objects(marker, (4, 3)))
     with pytest.raises(CFlowError, match="a.npy.*copy it"):
         read_npy(tmp_path / "a.npy", "copy it")
-    with pytest.raises(CFlowError, match="a.npz.*give plain arrays"):
+    with pytest.raises(CFlowError, match="a.npz.*pass plain arrays"):
         read_cloud(tmp_path / "a.npz")
 
 

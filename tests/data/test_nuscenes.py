@@ -191,8 +191,8 @@ def test_missing_truncated_and_foreign_tables(tiny, table):
     for content, complaint in [
         (whole[: len(whole) // 2], "cannot read .* truncated"),
         (b"", "cannot read .* truncated"),
-        (b'{"token": "a"}', "cannot read .*KeyError|no list of rows"),
-        (b"[1, 2]", "no list of rows"),
+        (b'{"token": "a"}', "cannot read .*KeyError|not a list of rows"),
+        (b"[1, 2]", "not a list of rows"),
         (b'[{"a": 1}]', "cannot read .*KeyError"),
     ]:
         file.write_bytes(content)
@@ -210,8 +210,8 @@ def test_missing_truncated_and_foreign_tables(tiny, table):
         ("sample_data", {"ego_pose_token": "x"}, "cannot read .*tiny .KeyError: 'x'"),
         ("sample_data", {"timestamp": 1_533_279_682_100_000}, "sample_data.json has two rows .*one time"),
         ("sample_data", {"timestamp": "noon"}, "cannot read .*tiny"),
-        ("ego_pose", {"rotation": [0.9, 0, 0, 0]}, "ego_pose.json: .* is no rigid motion"),
-        ("ego_pose", {"translation": [1, 2, float("nan")]}, "ego_pose.json: .* is no rigid motion"),
+        ("ego_pose", {"rotation": [0.9, 0, 0, 0]}, "ego_pose.json: .* is not a rigid motion"),
+        ("ego_pose", {"translation": [1, 2, float("nan")]}, "ego_pose.json: .* is not a rigid motion"),
         ("sample_annotation", {"size": ["a", 1, 1]}, "cannot read .*tiny"),
         ("sensor", {"modality": "camera"}, "has no LiDAR"),
     ],
@@ -228,7 +228,7 @@ def test_what_a_scene_does_not_have(tiny, tmp_path):
     with pytest.raises(CFlowError, match="no scene 'scene-0061'"):
         NuScenesLog(SceneSource(tiny, VERSION, "scene-0061"))
     edit(tiny, "category", lambda rows: [{**row, "name": "vehicle.spaceship"} for row in rows])
-    with pytest.raises(CFlowError, match="category.json: unknown categories .*spaceship"):
+    with pytest.raises(CFlowError, match="category.json: the categories .*spaceship.* are unknown"):
         open_log(tiny)
 
 
@@ -236,7 +236,7 @@ def test_bad_sweeps(tiny):
     file = min((tiny / "samples" / "LIDAR_TOP").iterdir())
     whole, log = file.read_bytes(), open_log(tiny)
     kitti = np.random.default_rng(0).uniform(-50, 50, (100, 4)).astype("<f4").tobytes()  # four columns: 1600 bytes
-    for content, complaint in [(whole[:-1], "whole number of rows"), (b"", "0 bytes"), (kitti, "no ring 0 ... 255")]:
+    for content, complaint in [(whole[:-1], "not a multiple of a row"), (b"", "0 bytes"), (kitti, "not a ring index")]:
         file.write_bytes(content)
         with pytest.raises(CFlowError, match=f"{file.name}.*{complaint}"):
             log.sweep(0)

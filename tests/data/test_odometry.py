@@ -94,7 +94,7 @@ def test_its_own_loaders(drive, tmp_path):
         read.dtype == np.float32 and (np.linalg.norm(read - given, axis=1) < 0.01 * np.linalg.norm(given, axis=1)).all()
     )
     for settings, message in (
-        ({"loader": "mcap"}, "give one of apollo.*or take data=bags"),
+        ({"loader": "mcap"}, "choose one of apollo.*or use data=bags"),
         ({"loader": "kitti"}, "loader kitti fails: .*sequence"),
         ({"loader": "apollo"}, "fails: .*open3d"),
     ):

@@ -1,4 +1,4 @@
-"""PandaSet: a recording written as the data set has it, by pandas, comes back; pickles are never run."""
+"""PandaSet: a recording written as the data set has it, by pandas, comes back; pickles are never executed."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def test_frames_of_old_pandas() -> None:
     ("content", "message"),
     [
         (pickle.dumps(["no frame"]), "cannot read"),
-        (pickle.dumps(Path("a")), "never run"),
+        (pickle.dumps(Path("a")), "never executed"),
         (b"", "cannot read"),
     ],
 )

@@ -121,7 +121,7 @@ def test_what_is_no_address_is_a_local_name(tmp_path):
     assert as_path(f"file://{tmp_path}") == tmp_path and not is_remote(tmp_path)
     assert as_path(tmp_path) is tmp_path
     for wrong in ("", "a\0b", 5, None):
-        with pytest.raises(CFlowError, match="is no place"):
+        with pytest.raises(CFlowError, match="is not a valid path"):
             as_path(wrong)
 
 

@@ -89,7 +89,7 @@ def test_the_shift_is_the_one_of_the_lever_arm(drive):
     lever = (np.eye(3) - T_1_0[:3, :3]) @ to_sensor[:3, 3]
     assert np.linalg.norm(miss) > 0.1 and np.allclose(miss, lever[:2], atol=1e-9)
     assert np.linalg.norm(residual.shift - miss) < 0.01
-    assert residual.aligned > 2 * residual.agreement and abs(residual.turn) < np.radians(0.05)
+    assert residual.aligned > 2 * residual.agreement and abs(residual.rotation) < np.radians(0.05)
 
 
 def test_real_drives(av2_folder, kitti_file):

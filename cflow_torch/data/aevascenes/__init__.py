@@ -1,4 +1,4 @@
-"""AevaScenes: reader."""
+"""AevaScenes reader (experimental)."""
 
 from cflow_torch.data.aevascenes.reader import AevaScenesLog, find_aevascenes_sequences
 

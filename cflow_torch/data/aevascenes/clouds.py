@@ -1,4 +1,4 @@
-"""The npz of one LiDAR and frame: arrays of numbers, and class names that may be stored as pickled strings."""
+"""The .npz file of one LiDAR and frame: arrays of numbers, and class names that may be stored as pickled strings."""
 
 from __future__ import annotations
 
@@ -18,13 +18,9 @@ _HINT = "copy it from the data set"
 
 
 class Cloud:
-    """One npz in memory; arrays are unpacked when asked for.
+    """One .npz file in memory; arrays are unpacked when you ask for them.
 
-    Args:
-        file: where it is.
-
-    Raises:
-        CFlowError: no such file, or no npz.
+    A missing or damaged file, or an array of another type or shape, is a `CFlowError`.
     """
 
     def __init__(self, file: Path) -> None:
@@ -34,11 +30,7 @@ class Cloud:
             self._keys = list(self._arrays.files)
 
     def numbers(self, key: str, columns: int) -> np.ndarray:
-        """(N, columns) float32 values of an array.
-
-        Raises:
-            CFlowError: there is no such array, it has another type or shape, or is damaged.
-        """
+        """Return an array as (N, columns) float32."""
         if key not in self._keys:
             raise CFlowError(f"{self.file} has no array {key}; it has {self._keys[:20]}")
         with file_errors(f"{self.file}: {key}", _HINT):
@@ -52,11 +44,7 @@ class Cloud:
         return array.reshape(-1, columns).astype(np.float32, copy=False)
 
     def seconds(self, key: str, rows: int) -> np.ndarray | None:
-        """(rows,) float64 of an array of whole nanoseconds, one per row; None where there is no such array.
-
-        Raises:
-            CFlowError: it has another type or shape, or is damaged.
-        """
+        """Return an array of integer nanoseconds as (rows,) float64 seconds; None if there is no such array."""
         if key not in self._keys:
             return None
         with file_errors(f"{self.file}: {key}", _HINT):
@@ -66,11 +54,7 @@ class Cloud:
         return array.reshape(rows) * 1e-9
 
     def names(self, key: str) -> list[str] | None:
-        """Texts of an array, however it is shaped; None where there is no such array.
-
-        Raises:
-            CFlowError: it holds anything but text, or is damaged. Nothing that a pickle names is run.
-        """
+        """Return the texts of an array of any shape, executing nothing; None if there is no such array."""
         if key not in self._keys:
             return None
         with file_errors(f"{self.file}: {key}", _HINT):
@@ -85,6 +69,6 @@ class Cloud:
 
 
 def _text(scalar: Placeholder) -> str:
-    """A NumPy string scalar."""
+    """Decode a NumPy string scalar."""
     data: bytes = scalar.parts[1]
     return data.decode("utf-32-le").rstrip("\0")

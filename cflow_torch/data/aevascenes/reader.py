@@ -1,4 +1,4 @@
-"""Reader of AevaScenes: FMCW LiDARs, one `sequence.json` and one npz per LiDAR and frame."""
+"""Experimental reader of AevaScenes: FMCW LiDARs, one `sequence.json`, and one .npz file per LiDAR and frame."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.ego_motion import relative_transform
 
 SEARCH_DEPTH = 3  # <root>/<data set>/<split>/<sequence>
-_HINT = "give a whole sequence of AevaScenes"
+_HINT = "pass a complete sequence of AevaScenes"
 
 CATEGORY_NAME: dict[str, str] = {
     **dict.fromkeys(("unknown", "pole_trunk", "building", "other_structure", "vegetation"), "NONE"),
@@ -39,34 +39,34 @@ CATEGORY_NAME: dict[str, str] = {
     "traffic_item": "CONSTRUCTION_CONE",
     "traffic_sign": "SIGN",
 }
-"""Class of AevaScenes -> Argoverse 2 name. The data set publishes no such map: this one is cflow_torch's."""
+"""Class of AevaScenes -> Argoverse 2 name. The data set publishes no such map; this one is ours."""
 
 GROUND = ("road", "lane_boundary", "road_marking", "reflective_marker", "sidewalk", "other_ground")
-"""Classes that are ground."""
+"""Classes of ground points."""
 CATEGORY_NAME.update(dict.fromkeys(GROUND, "NONE"))
 
 _PATHS = {"compensated": ("point_cloud_compensated_path", "point_cloud_path"), "raw": ("point_cloud_raw_path",)}
 
 
 def find_aevascenes_sequences(root: PathLike) -> list[Path]:
-    """Folders of all sequences under a folder, sorted.
+    """Find the folders of all sequences, sorted.
 
     Args:
         root: a sequence (holds `sequence.json`), a split, or a folder at most three levels above the sequences.
 
     Raises:
-        CFlowError: `root` is no folder.
+        CFlowError: `root` is not a folder.
     """
     what = "a sequence (it holds sequence.json), or a folder of sequences"
     return find_folders(as_path(root), lambda folder: (folder / "sequence.json").is_file(), SEARCH_DEPTH, what)
 
 
 class AevaScenesLog(Log):
-    """One sequence, of the layout of version 0.1, 0.2 or 2; implements the `Log` protocol.
+    """One sequence in the layout of version 0.1, 0.2 or 2. Experimental: tested on simulated sequences only.
 
     Args:
         folder: sequence folder with `sequence.json`.
-        clouds: "compensated", or "raw" (version 2 only; what is raw in it is not documented).
+        clouds: "compensated", or "raw" (version 2 only, where the data set does not document what raw means).
         lidars: names of the LiDARs to merge; None = all of the sequence, in its order.
         ground: make ground masks from the stored class names, where every cloud of a sweep has them.
 
@@ -76,15 +76,16 @@ class AevaScenesLog(Log):
         lidars: names of the LiDARs that are merged.
 
     Convention:
-        - Points are float32 in the vehicle frame (x forward, y left, z up, origin at the rear axle), LiDAR by LiDAR,
-          moved there in float64 by `vehicle_to_lidar_extrinsics`, which despite its name is `T_vehicle_lidar`.
+        - Points are float32 in the vehicle frame (x forward, y left, z up, origin at the rear axle), one LiDAR after
+          the other, transformed in float64 by `vehicle_to_lidar_extrinsics`, which despite its name is
+          `T_vehicle_lidar`.
         - `T_world_ego` is `ego_pose`, world = vehicle at the first frame.
-        - Truth comes from box tracks. Boxes of classes that are background (poles for the greater part) are not used.
-        - Class names are stored as pickled strings: they are decoded by a reader that makes nothing but strings.
-          `semantic_labels_idx` is not used: its table is not published.
+        - Truth comes from box tracks. Boxes of background classes (mostly poles) are not used.
+        - Class names are stored as pickled strings, which are decoded without executing anything.
+          `semantic_labels_idx` is not used, because its table is not published.
 
     Raises:
-        CFlowError: no such folder or setting; `sequence.json` is missing, no JSON, or lacks something; fewer than two
+        CFlowError: no such folder or setting; `sequence.json` is missing, not JSON, or incomplete; fewer than two
             frames.
     """
 
@@ -98,17 +99,17 @@ class AevaScenesLog(Log):
         self.folder = as_path(folder)
         self.log_id = self.folder.resolve().name
         if clouds not in _PATHS:
-            raise CFlowError(f"clouds is one of {', '.join(_PATHS)}; got {clouds!r}")
+            raise CFlowError(f"clouds={clouds!r}: choose one of {', '.join(_PATHS)}")
         self._clouds, self._ground = clouds, ground
-        # Several arrays of a sweep's clouds are read one after the other.
-        self._clouds_of = lru_cache(1)(self._open_clouds)
+        self._clouds_of = lru_cache(1)(self._open_clouds)  # several arrays of a sweep's clouds are read in turn
         self._file = self.folder / "sequence.json"
         with file_errors(self._file, _HINT):
             content = read_json(self._file)
             mounts, known = content["metadata"]["vehicle_to_lidar_extrinsics"], content["metadata"]["sensors"]["lidars"]
             self.lidars: Sequence[str] = tuple(known if lidars is None else lidars)
             if not self.lidars or not set(self.lidars) <= set(known):
-                raise CFlowError(f"{self._file} has the LiDARs {shortened(known)}; got {shortened(list(self.lidars))}")
+                wanted = shortened(list(self.lidars))
+                raise CFlowError(f"{self._file} has the LiDARs {shortened(known)}, you asked for {wanted}")
             by_time: dict[int, dict[str, Any]] = {frame["timestamp_ns"]: frame for frame in content["frames"]}
             self.timestamps = sorted(by_time)
             self._check_count(self._file)
@@ -118,21 +119,21 @@ class AevaScenesLog(Log):
             self._has_boxes = any(frame.get("boxes") for frame in self._frames)
 
     def sweep(self, index: int) -> Sweep:
-        """Sweep number `index`; `is_ground` is None where a cloud of it has no class names."""
+        """Read sweep `index`; `is_ground` is None if one of its clouds has no class names."""
         points, is_ground = self._points(index), None
         names = [cloud.names("semantic_labels") for cloud in self._clouds_of(index)] if self._ground else [None]
         if None not in names:
             is_ground = np.array([name in GROUND for of_cloud in names for name in of_cloud or ()], dtype=bool)
             if len(is_ground) != len(points):
                 file = self._clouds_of(index)[0].file
-                raise CFlowError(f"{file} and its neighbours: {len(points)} points but {len(is_ground)} class names")
+                raise CFlowError(f"{file} and the other LiDARs: {len(points)} points but {len(is_ground)} class names")
         return Sweep(points, is_ground, self._poses[index].copy(), self.timestamps[index], self._point_times(index))
 
     def radial_velocity(self, index: int) -> np.ndarray:
-        """(N,) float32 m/s along the ray of each point of sweep `index`, positive = receding from its LiDAR.
+        """Read the (N,) float32 radial velocities of sweep `index`, m/s, positive = moving away from the LiDAR.
 
-        In compensated clouds the motion of the vehicle is taken out: what stands has about 0. The sign is measured by
-        third parties and contradicts a comment of the SDK.
+        In compensated clouds the motion of the vehicle is removed, so static points have about 0. Third parties
+        measured the sign, which contradicts a comment in the SDK.
 
         Raises:
             CFlowError: no such sweep, or a cloud is missing or cannot be read.
@@ -140,7 +141,7 @@ class AevaScenesLog(Log):
         return np.concatenate([cloud.numbers("velocity", 1)[:, 0] for cloud in self._clouds_of(index)])
 
     def labels(self, index: int) -> FlowLabels | None:
-        """Truth of the pair (index, index + 1) from box tracks; None for the last sweep and sequences without boxes."""
+        """Read the truth of the pair (index, index + 1) from box tracks; None for the last sweep and without boxes."""
         self._timestamp(index)
         if index == len(self) - 1 or not self._has_boxes:
             return None
@@ -148,13 +149,13 @@ class AevaScenesLog(Log):
         return flow_from_boxes(self._points(index), self._boxes(index), self._boxes(index + 1), T_ego1_ego0)
 
     def _points(self, index: int) -> np.ndarray:
-        """(N, 3) float32, vehicle frame."""
+        """Read the (N, 3) float32 points in the vehicle frame."""
         pairs = zip(self._clouds_of(index), self._mounts)
         clouds = [transform_points(cloud.numbers("xyz", 3), mount) for cloud, mount in pairs]
         return np.concatenate(clouds).astype(np.float32)
 
     def _point_times(self, index: int) -> np.ndarray | None:
-        """(N,) float64 seconds after the time stamp; None where a cloud does not tell."""
+        """Read the (N,) float64 seconds after the time stamp; None if a cloud has no times."""
         clouds = self._clouds_of(index)
         times = [cloud.seconds("time_offset_ns", len(cloud.numbers("xyz", 3))) for cloud in clouds]
         known = [of_cloud for of_cloud in times if of_cloud is not None]
@@ -167,8 +168,8 @@ class AevaScenesLog(Log):
                 entry = self._frames[index]["point_cloud"][name]
                 paths = [entry[key] for key in _PATHS[self._clouds] if key in entry]
             if not paths:
-                has = f"no {self._clouds} cloud, only {shortened(entry)}"
-                raise CFlowError(f"{where}, {name}: {has}; raw clouds come with version 2 of the data set")
+                has = f"there is no {self._clouds} cloud, only {shortened(entry)}"
+                raise CFlowError(f"{where}, {name}: {has}; only version 2 of the data set has raw clouds")
             clouds.append(Cloud(path_inside(self.folder, paths[0], f"{where}, {name}: the path")))
         return clouds
 
@@ -177,9 +178,9 @@ class AevaScenesLog(Log):
         with file_errors(where, _HINT):
             boxes = self._frames[index].get("boxes") or []
             boxes = [box for box in boxes if CATEGORY_NAME.get(box["class"]) != "NONE"]
-            strange = [box for box in boxes if box.get("reference_frame", "VEHICLE") != "VEHICLE"]
-            if strange:
-                raise CFlowError(f"boxes are in VEHICLE, got {shortened(repr(strange[0]['reference_frame']))}")
+            frames = [box.get("reference_frame", "VEHICLE") for box in boxes]
+            if set(frames) - {"VEHICLE"}:
+                raise CFlowError(f"boxes must be in VEHICLE, got {shortened(sorted(set(frames)))}")
             return make_boxes(
                 [str(box["id"]) for box in boxes],
                 category_indices([box["class"] for box in boxes], CATEGORY_NAME),
@@ -188,5 +189,5 @@ class AevaScenesLog(Log):
             )
 
     def _poses_of(self, nodes: Sequence[Any], what: str) -> np.ndarray:
-        """(K, 4, 4) float64 from objects with translation {x, y, z} and rotation {w, x, y, z}."""
+        """Build (K, 4, 4) float64 poses from objects with translation {x, y, z} and rotation {w, x, y, z}."""
         return poses_from_json(nodes, "translation", "rotation", f"{self._file}: {what}: number")

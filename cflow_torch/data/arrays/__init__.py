@@ -1,4 +1,4 @@
-"""Your own files, one point cloud per sweep: reader and writer, file formats, poses."""
+"""Folders of point clouds: reader and writer."""
 
 from cflow_torch.data.arrays.reader import ArraysLog, find_array_logs
 from cflow_torch.data.arrays.writer import write_array_log

@@ -1,4 +1,4 @@
-"""One point cloud per file, whatever the suffix: what is read are x, y, z in metres."""
+"""Point clouds in one file each, in the format of the suffix; only x, y, z in metres are read."""
 
 from __future__ import annotations
 
@@ -19,29 +19,29 @@ from cflow_torch.types import CFlowError
 SUFFIXES = (".npy", ".npz", ".bin", ".pcd", ".ply", ".feather", ".parquet")
 KITTI_COLUMNS = 4  # x, y, z, reflectance
 _AXES = ("x", "y", "z")
-_CLOUD_KEYS = ("points", "lidar", "xyz", "pc")  # of an .npz file that holds more than one table
+_CLOUD_KEYS = ("points", "lidar", "xyz", "pc")  # of an .npz file with more than one table
 
 
 def read_cloud(path: PathLike, bin_columns: int = KITTI_COLUMNS) -> np.ndarray:
-    """Positions of a point cloud.
+    """Read the positions of a point cloud.
 
     Args:
-        path: the file; its suffix says what it is (see Convention).
+        path: the file; its suffix tells the format (see Convention).
         bin_columns: float32 numbers per point of a `.bin` file: 4 in KITTI, 5 in nuScenes.
 
     Returns:
-        (N, 3) in the file's own precision: float32 or float64; float16 becomes float32.
+        (N, 3) in the precision of the file: float32 or float64; float16 becomes float32.
 
     Convention:
         - `.npy`: (N, 3+) floats, columns x, y, z first; or a structured array with fields x, y, z.
         - `.npz`: arrays x, y, z; or one (N, 3+) array, called points, lidar, xyz or pc if there are several.
         - `.bin`: little-endian float32, `bin_columns` per point.
         - `.pcd` (extra `clouds`), `.ply`: fields x, y, z.
-        - `.feather`, `.parquet`: columns x, y, z; where there are none of these names, the first three.
-        Anything else in the file is ignored. Nothing is unpickled.
+        - `.feather`, `.parquet`: columns x, y, z; without these names, the first three.
+        Everything else in the file is ignored. Nothing is unpickled.
 
     Raises:
-        CFlowError: no such file, an unknown suffix, a file that is truncated or holds something else.
+        CFlowError: no such file, an unknown suffix, or a file that is truncated or has other contents.
     """
     path = as_path(path)
     suffix = path.suffix.lower()
@@ -56,7 +56,7 @@ def read_cloud(path: PathLike, bin_columns: int = KITTI_COLUMNS) -> np.ndarray:
     else:
         points = _read_numpy(path)
     if points.dtype.kind != "f":
-        raise CFlowError(f"{path} holds {points.dtype} coordinates; give floating-point metres")
+        raise CFlowError(f"{path} has {points.dtype} coordinates; they must be floating-point metres")
     points = points[:, :3].astype(np.float32 if points.dtype.itemsize < 8 else np.float64, copy=False)
     return points.astype(points.dtype.newbyteorder("="), copy=False)
 
@@ -66,7 +66,7 @@ def write_cloud(path: PathLike, points: np.ndarray) -> None:
 
     Args:
         path: file name with one of `SUFFIXES`.
-        points: (N, 3) float32 or float64, metres. `.bin` files are float32 whatever is given, with a reflectance of 0.
+        points: (N, 3) float32 or float64, metres. `.bin` files are always float32, with a reflectance of 0.
 
     Raises:
         CFlowError: an unknown suffix, or points of another shape.
@@ -76,7 +76,7 @@ def write_cloud(path: PathLike, points: np.ndarray) -> None:
     if suffix not in SUFFIXES:
         raise CFlowError(f"{path} has suffix {suffix!r}; clouds are {', '.join(SUFFIXES)}")
     if points.ndim != 2 or points.shape[1] != 3 or points.dtype not in (np.float32, np.float64):
-        raise CFlowError(f"points have shape {points.shape} and dtype {points.dtype}; give (N, 3) float32 or float64")
+        raise CFlowError(f"points have shape {points.shape} and dtype {points.dtype}; pass (N, 3) float32 or float64")
     fields = {axis: np.ascontiguousarray(points[:, k]) for k, axis in enumerate(_AXES)}
     if suffix in (".pcd", ".ply"):
         (write_pcd if suffix == ".pcd" else write_ply)(path, fields)
@@ -97,14 +97,14 @@ def _read_bin(path: Path, columns: int) -> np.ndarray:
         data = read_bytes(path)
     if len(data) % (4 * columns):
         raise CFlowError(
-            f"{path} has {len(data)} bytes, no multiple of {4 * columns} ({columns} float32 a point): it is truncated, "
-            "or has another number of columns (bin_columns: 4 in KITTI, 5 in nuScenes)"
+            f"{path} has {len(data)} bytes, not a multiple of {4 * columns} ({columns} float32 per point): it is "
+            "truncated, or has another number of columns (bin_columns: 4 in KITTI, 5 in nuScenes)"
         )
     return np.frombuffer(data, "<f4").reshape(-1, columns)
 
 
 def _read_numpy(path: Path) -> np.ndarray:
-    hint = "give plain arrays, no file of pickled objects"
+    hint = "pass plain arrays, not pickled objects"
     if path.suffix.lower() == ".npz":
         with file_errors(path, hint), np.load(source_for_full_read(path), allow_pickle=False) as arrays:
             if all(axis in arrays.files for axis in _AXES):
@@ -114,14 +114,15 @@ def _read_numpy(path: Path) -> np.ndarray:
             tables = [array for array in found if array.ndim == 2 and array.shape[1] >= 3]
             if len(tables) != 1:
                 has = ", ".join(arrays.files)[:200]
-                raise CFlowError(f"{path} holds {has}; give x, y, z, or one (N, 3+) array, or name it {_CLOUD_KEYS[0]}")
+                need = f"x, y, z, or one (N, 3+) array, named {_CLOUD_KEYS[0]} if there are several"
+                raise CFlowError(f"{path} has the arrays {has}; it needs {need}")
         (stored,) = tables
     else:
         stored = read_npy(path, hint)
     if stored.dtype.names is not None:
         return _from_fields(path, {name: stored[name] for name in stored.dtype.names})
     if stored.ndim != 2 or stored.shape[1] < 3:
-        raise CFlowError(f"{path} holds an array of shape {stored.shape}; give (N, 3+), columns x, y, z first")
+        raise CFlowError(f"{path} has an array of shape {stored.shape}; it must be (N, 3+), columns x, y, z first")
     return stored
 
 
@@ -145,7 +146,7 @@ def _from_fields(path: Path, fields: Mapping[str, np.ndarray]) -> np.ndarray:
     if len(columns) < 3:
         raise CFlowError(f"{path} has the fields {list(fields)}; it needs x, y, z")
     if len({column.shape for column in columns}) > 1 or columns[0].ndim != 1:
-        raise CFlowError(f"{path}: x, y, z have shapes {[column.shape for column in columns]}; give (N,) each")
+        raise CFlowError(f"{path}: x, y, z have shapes {[column.shape for column in columns]}; each must be (N,)")
     if any(column.dtype.kind not in "fiu" for column in columns):
-        raise CFlowError(f"{path}: x, y, z have dtypes {[str(column.dtype) for column in columns]}; give numbers")
+        raise CFlowError(f"{path}: x, y, z have dtypes {[str(column.dtype) for column in columns]}, not numbers")
     return np.stack(columns, axis=1)

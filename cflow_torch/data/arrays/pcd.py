@@ -1,4 +1,4 @@
-"""Point clouds in the PCD format, by pypcd4 (extra `clouds`): named fields, as text, binary, or compressed with LZF."""
+"""Point clouds in the PCD format, read and written by pypcd4 (extra `clouds`)."""
 
 from __future__ import annotations
 
@@ -12,38 +12,40 @@ from cflow_torch.data.files import file_errors
 from cflow_torch.data.paths import PathLike, as_path, read_bytes
 from cflow_torch.types import CFlowError
 
+_HINT = "pass a .pcd file of version 0.7"
+
 
 def read_pcd(path: PathLike) -> dict[str, np.ndarray]:
-    """The fields of a cloud.
+    """Read the fields of a text, binary or compressed cloud.
 
     Args:
         path: a `.pcd` file.
 
     Returns:
-        Field name -> (N,) array, in the file's order. The dtype is that of SIZE and TYPE.
+        Field name -> (N,) array of the dtype that SIZE and TYPE state, in the order of the file.
 
     Convention:
-        Organised clouds (HEIGHT above 1) become flat, row by row. Padding and fields of several values (COUNT above 1)
-        are left out. VIEWPOINT is not applied: points stay in the frame that they are stored in. NaN points stay.
+        Organised clouds (HEIGHT above 1) are flattened row by row. Padding and fields of several values (COUNT above 1)
+        are left out. VIEWPOINT is not applied, so points stay in their stored frame. NaN points stay.
 
     Raises:
-        CFlowError: pypcd4 is missing; no such file, no PCD file of version 0.7, or less data than its header says.
+        CFlowError: pypcd4 is missing; no such file; not a PCD file of version 0.7; or less data than its header states.
     """
-    with file_errors(path, "give a .pcd file of version 0.7"):
+    with file_errors(path, _HINT):
         return pcd_fields(read_bytes(as_path(path)), path)
 
 
 def pcd_fields(content: bytes, path: PathLike) -> dict[str, np.ndarray]:
-    """As `read_pcd`, of what is in the file."""
+    """Read the fields of a cloud from the contents of its file, see `read_pcd`."""
     pypcd4 = _pypcd4()
-    with file_errors(path, "give a .pcd file of version 0.7"):
+    with file_errors(path, _HINT):
         cloud = pypcd4.PointCloud.from_fileobj(io.BytesIO(content))
         header, table = cloud.metadata, np.atleast_1d(cloud.pc_data)
         if len(table) != header.width * header.height:
-            raise ValueError(f"it holds {len(table)} points, its header says {header.width} x {header.height}")
-    # pypcd4 calls padding "#..." and splits fields of several values, of which it mixes up the compressed ones.
+            raise ValueError(f"it has {len(table)} points, but its header states {header.width} x {header.height}")
+    # pypcd4 names padding "#...", splits fields of several values, and mixes up those of compressed files.
     names = [name for name, count in zip(header.fields, header.count) if count == 1 and name[0] != "#"]
-    # Of a cloud without points, pypcd4 1.4 makes a table of two dimensions.
+    # pypcd4 1.4 makes a two-dimensional table of a cloud without points.
     return {name: np.ascontiguousarray(table[name]).reshape(-1) for name in names}
 
 

@@ -1,7 +1,7 @@
 """Point clouds in the PLY format: the properties of the element `vertex`, as text or binary.
 
-No library reads all that is needed: meshio 5.3.5 knows no `float64`, `short` and `ushort` in binary files (PDAL writes
-such), takes `uchar` for signed, and does not notice that points are missing; plyfile has the GPL.
+No library reads all that we need. meshio 5.3.5 does not know `float64`, `short` and `ushort` in binary files (PDAL
+writes such), takes `uchar` for signed, and does not notice missing points. plyfile has the GPL.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _LONGEST_HEADER = 65536  # bytes
 
 
 def read_ply(path: PathLike) -> dict[str, np.ndarray]:
-    """All properties of the vertices.
+    """Read all properties of the vertices.
 
     Args:
         path: a `.ply` file whose first element is `vertex`; further elements, such as faces, are not read.
@@ -38,7 +38,7 @@ def read_ply(path: PathLike) -> dict[str, np.ndarray]:
         Property name -> (N,) array of the type that the header states, in the byte order of the machine.
 
     Raises:
-        CFlowError: no such file, no PLY file, a header that cannot be followed, or fewer data than it says.
+        CFlowError: no such file, not a PLY file, an invalid header, or less data than it states.
 
     Source: G. Turk, "The PLY Polygon File Format".
     """
@@ -57,13 +57,13 @@ def read_ply(path: PathLike) -> dict[str, np.ndarray]:
         body = content[header.end() :]
         if order == "ascii":
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # numpy's about no points
-                warnings.simplefilter("error", DeprecationWarning)  # and about 256 in a byte
+                warnings.simplefilter("ignore")  # NumPy warns if there are no points
+                warnings.simplefilter("error", DeprecationWarning)  # NumPy warns if 256 is stored in a byte
                 table = np.loadtxt(io.BytesIO(body), kind, max_rows=int(count), ndmin=1)
         else:
             table = np.frombuffer(body, kind, int(count))
         if len(table) < int(count):
-            raise ValueError(f"it holds {len(table)} of {count} vertices")
+            raise ValueError(f"it has {len(table)} of {count} vertices")
     return {name: table[name].astype(kind[name].newbyteorder("=")) for name in kind.names or ()}
 
 

@@ -17,7 +17,7 @@ from cflow_torch.types import CFlowError
 from cflow_torch.windows.ego_motion import rigid_transform
 
 CALIBRATION_KEYS = ("Tr", "Tr_velo_to_cam", "Tr_velo_cam")  # KITTI's odometry, raw and tracking sets
-_LONGEST_GAP_NS = 500_000_000  # between two poses, over which an interpolation is still a guess worth making
+_LONGEST_GAP_NS = 500_000_000  # longest gap between two poses that we interpolate
 
 
 @dataclass(frozen=True)
@@ -25,8 +25,8 @@ class Trajectory:
     """K poses.
 
     Args:
-        poses: (K, 4, 4) float64 `T_world_frame`; which frame, the file does not say.
-        times_ns: (K,) int64 nanoseconds, ascending; None where the format has no times.
+        poses: (K, 4, 4) float64 `T_world_frame`; the file does not say which frame.
+        times_ns: (K,) int64 nanoseconds, ascending; None if the format has no times.
         layout: "kitti", "tum" or "matrix".
     """
 
@@ -36,26 +36,26 @@ class Trajectory:
 
 
 def read_poses(path: PathLike) -> Trajectory:
-    """Poses of a file; its number of columns tells the format.
+    """Read the poses of a file; its number of columns tells the format.
 
     Args:
-        path: text with 12 numbers a line (KITTI: upper three rows of the matrix), 8 (TUM: time in seconds, tx ty tz,
-            qx qy qz qw, the scalar LAST), or 16 (the whole matrix by rows); or `.npy` of (K, 4, 4) or (K, 3, 4).
+        path: text with 12 numbers per line (KITTI: upper three rows of the matrix), 8 (TUM: time in seconds, tx ty tz,
+            qx qy qz qw, the scalar LAST), or 16 (the matrix by rows); or `.npy` with (K, 4, 4) or (K, 3, 4).
 
     Returns:
-        The poses, orthogonal to rounding. Lines that are empty or begin with `#` are skipped.
+        The poses, orthogonal up to rounding. Lines that are empty or begin with `#` are skipped.
 
     Raises:
-        CFlowError: no such file, another number of columns, no numbers, no rigid motions, times that do not ascend.
+        CFlowError: no such file, another number of columns, not numbers, not rigid motions, times that do not ascend.
     """
     path, times_ns, layout = as_path(path), None, "matrix"
     if path.suffix == ".npy":
-        matrices = read_npy(path, "give a .npy file of (K, 4, 4) numbers")
+        matrices = read_npy(path, "pass a .npy file of (K, 4, 4) numbers")
     else:
         words, values = _read_table(path)
         layout = {8: "tum", 12: "kitti", 16: "matrix"}.get(values.shape[1], "")
         if not layout:
-            raise CFlowError(f"{path} has {values.shape[1]} numbers a line; poses have 12 (KITTI), 8 (TUM) or 16")
+            raise CFlowError(f"{path} has {values.shape[1]} numbers per line; poses have 12 (KITTI), 8 (TUM) or 16")
         if layout == "tum":
             times_ns = _nanoseconds(path, words[:, 0])
             matrices = poses_from_quaternions(
@@ -67,13 +67,13 @@ def read_poses(path: PathLike) -> Trajectory:
 
 
 def checked_poses(matrices: np.ndarray, source: str) -> np.ndarray:
-    """(K, 4, 4) float64 of (K, 4, 4) or (K, 3, 4) numbers.
+    """Return (K, 4, 4) or (K, 3, 4) numbers as (K, 4, 4) float64.
 
     Raises:
-        CFlowError: another shape, no numbers, or no rigid motions; `source` is what to call them.
+        CFlowError: another shape, not numbers, or not rigid motions; the message names the `source`.
     """
     if matrices.ndim != 3 or matrices.shape[1:] not in ((3, 4), (4, 4)) or matrices.dtype.kind not in "fiu":
-        raise CFlowError(f"{source} has shape {matrices.shape} and dtype {matrices.dtype}; give (K, 4, 4) numbers")
+        raise CFlowError(f"{source} has shape {matrices.shape} and dtype {matrices.dtype}; pass (K, 4, 4) numbers")
     poses = np.tile(np.eye(4), (len(matrices), 1, 1))
     poses[:, : matrices.shape[1]] = matrices
     for row, pose in enumerate(poses):
@@ -82,14 +82,14 @@ def checked_poses(matrices: np.ndarray, source: str) -> np.ndarray:
 
 
 def read_calibration(path: PathLike) -> np.ndarray:
-    """(4, 4) float64 `T_cam0_lidar` of KITTI's `calib.txt`: the line `Tr: ` and 12 numbers.
+    """Read the (4, 4) float64 `T_cam0_lidar` of KITTI's `calib.txt`: the line `Tr: ` and 12 numbers.
 
-    With it, the poses P of KITTI's camera give those of the LiDAR: inv(T) P T.
+    It converts the poses P of KITTI's camera to poses of the LiDAR: inv(T) P T.
 
     Raises:
-        CFlowError: no such file, no such line, no rigid motion.
+        CFlowError: no such file, no such line, or not a rigid motion.
     """
-    with file_errors(path, f"give a file with a line {' or '.join(CALIBRATION_KEYS)} and 12 numbers"):
+    with file_errors(path, f"pass a file with a line {' or '.join(CALIBRATION_KEYS)} and 12 numbers"):
         lines = [line.replace(":", " ").split() for line in read_bytes(as_path(path)).decode("utf-8").splitlines()]
         row = next((words for words in lines if words and words[0] in CALIBRATION_KEYS), ["no line Tr"])
         matrix = np.array(row[1:], np.float64).reshape(3, 4)
@@ -97,19 +97,19 @@ def read_calibration(path: PathLike) -> np.ndarray:
 
 
 def read_times(path: PathLike) -> np.ndarray:
-    """(K,) int64 nanoseconds of a file with one time in seconds a line (KITTI's `times.txt`).
+    """Read a file with one time in seconds per line (KITTI's `times.txt`) as (K,) int64 nanoseconds.
 
     Raises:
-        CFlowError: no such file, no numbers, or times that do not ascend.
+        CFlowError: no such file, not numbers, or times that do not ascend.
     """
     words, _ = _read_table(path)
     if words.shape[1] != 1:
-        raise CFlowError(f"{path} must have one time in seconds a line")
+        raise CFlowError(f"{path} must have one time in seconds per line")
     return _nanoseconds(path, words[:, 0])
 
 
 def write_kitti_poses(path: PathLike, poses: np.ndarray) -> None:
-    """Write (K, 4, 4) poses as 12 numbers a line, with 17 digits."""
+    """Write (K, 4, 4) poses as 12 numbers per line, with 17 digits."""
     np.savetxt(path, np.asarray(poses)[:, :3].reshape(-1, 12), "%.17g")
 
 
@@ -122,20 +122,20 @@ def write_tum_poses(path: PathLike, times_ns: Sequence[int], poses: np.ndarray) 
 
 
 def write_times(path: PathLike, times_ns: Sequence[int]) -> None:
-    """Write nanoseconds as one time in seconds a line, with 9 decimals."""
+    """Write nanoseconds as one time in seconds per line, with 9 decimals."""
     np.savetxt(path, [_seconds(time) for time in times_ns], "%s")
 
 
 def poses_at(trajectory: Trajectory, times_ns: Sequence[int], source: str) -> np.ndarray:
-    """Poses at given times: linear in position, constant turn rate between two poses.
+    """Interpolate poses at given times: positions linearly, rotations at a constant rate.
 
     Args:
         trajectory: with times.
         times_ns: (M,) nanoseconds.
-        source: what to call the trajectory in an error.
+        source: name of the trajectory in an error.
 
     Returns:
-        (M, 4, 4) float64; a pose at exactly its time stays as it is.
+        (M, 4, 4) float64; a pose at exactly its time is returned unchanged.
 
     Raises:
         CFlowError: a time before the first or after the last pose, or in a gap of more than half a second.
@@ -149,16 +149,16 @@ def poses_at(trajectory: Trajectory, times_ns: Sequence[int], source: str) -> np
         row = int(bad.argmax())
         raise CFlowError(
             f"{source} covers {known[0]} ... {known[-1]} ns and has no pose near sweep {row} at {wanted[row]} ns; "
-            "do both count from the same moment?"
+            "do both count from the same time?"
         )
     share = (wanted - known[before]) / np.maximum(gap, 1)
     return interpolate_poses(trajectory.poses[before], trajectory.poses[after], share)
 
 
 def _read_table(path: PathLike) -> tuple[np.ndarray, np.ndarray]:
-    """(K, C) words of a text file and the finite numbers that they are, K and C at least 1."""
-    with file_errors(path, "give lines of as many numbers each"), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # numpy's about a file without lines
+    """Read a text file as (K, C) words and the finite numbers that they are, K and C at least 1."""
+    with file_errors(path, "every line must have the same number of numbers"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # NumPy warns about a file without lines
         text = read_bytes(as_path(path)).decode("utf-8").replace(",", " ")
         words = np.loadtxt(io.StringIO(text), str, ndmin=2)
         values = words.astype(np.float64)
@@ -168,7 +168,7 @@ def _read_table(path: PathLike) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _nanoseconds(path: PathLike, seconds: np.ndarray) -> np.ndarray:
-    """(K,) int64 from (K,) words, exactly: unix times need 19 digits, a float has 16."""
+    """Convert (K,) words to (K,) int64 exactly: unix times need 19 digits, and a float has 16."""
     times = [(Decimal(word) * 10**9).to_integral_value() for word in seconds.tolist()]
     if max(map(abs, times)) >= 2**62:
         raise CFlowError(f"{path} has {max(times)} ns: times in seconds go up to 4.6e9; are they nanoseconds?")

@@ -1,4 +1,4 @@
-"""Any sensor: a folder with one point cloud per file, and text files with poses and times beside it."""
+"""Reader for any sensor: a folder with one point cloud per file, and text files with poses and times next to it."""
 
 from __future__ import annotations
 
@@ -30,22 +30,17 @@ POSE_FILES = ("poses.txt", "poses.npy", "trajectory.txt")
 GROUND_FOLDER = "ground"
 SEARCH_DEPTH = 4
 _OTHER_STEMS = {"poses", "trajectory", "times", "timestamps", "calib"}
-_STAMP = re.compile("[0-9]{16,18}|[0-8][0-9]{18}")  # such a name is a time: microseconds, or 18 or 19 of nanoseconds
+_STAMP = re.compile("[0-9]{16,18}|[0-8][0-9]{18}")  # file names that are times: 16 digits = microseconds, more = ns
 _FIRST_NANOSECOND = 10**17
 
 
 def find_array_logs(root: PathLike) -> list[Path]:
-    """Folders of all logs under a folder, at most four levels down.
+    """Find the folders of all logs, at most four levels down, sorted.
 
-    Args:
-        root: a log, or a folder of logs.
-
-    Returns:
-        Sorted folders with two or more clouds, in the folder itself or in its subfolder points, lidar, velodyne or
-        clouds.
+    A log has two or more clouds, in the folder itself or in its subfolder points, lidar, velodyne or clouds.
 
     Raises:
-        CFlowError: `root` is no folder.
+        CFlowError: `root` is not a folder.
     """
     what = "a folder with one point cloud per file, or a folder of such"
     is_log, is_passed = (lambda folder: bool(_clouds(folder)[1])), (lambda child: child.name != GROUND_FOLDER)
@@ -53,21 +48,21 @@ def find_array_logs(root: PathLike) -> list[Path]:
 
 
 class ArraysLog(Log):
-    """A folder of point clouds; implements the `Log` protocol.
+    """A folder of point clouds.
 
     Args:
         folder: holds two or more clouds of one suffix (`cloud_file.SUFFIXES`), or has a subfolder points, lidar,
-            velodyne or clouds that does. They are taken in natural order: 2 before 10.
+            velodyne or clouds that does. Clouds are sorted naturally: 2 before 10.
         poses: "auto" = poses.txt, poses.npy or trajectory.txt in the folder, or KITTI's ../../poses/<name>.txt, if
             there is one; None = no poses; or a file (see `read_poses`), or a (K, 4, 4) array.
-        poses_of: "ego" or "lidar": whose poses they are.
+        poses_of: "ego" or "lidar", the frame whose poses they are.
         calibration: "auto" = `calib.txt` in the folder, if the poses are KITTI's 12 numbers; None = none; or a file. It
-            turns poses of KITTI's camera into poses of the LiDAR, so `poses_of` is "lidar" then.
+            converts poses of KITTI's camera to poses of the LiDAR, so `poses_of` is "lidar" then.
         times: "auto" = times.txt in the folder; None = none; or a file with one time in seconds per sweep.
-        ground: "auto" = the subfolder `ground`, if there is one; None = no masks; or a folder. It has one .npy of (N,)
-            bool or 0 and 1 per cloud, of the same name.
+        ground: "auto" = the subfolder `ground`, if there is one; None = no masks; or a folder. It has one .npy file per
+            cloud, of the same name, with (N,) bool or 0 and 1.
         ego_T_lidar: (4, 4), coordinates of the stored points to the ego frame; None = they are the same.
-        suffix: which clouds, where a folder has several kinds.
+        suffix: the clouds to read, if a folder has several kinds.
         bin_columns: numbers per point of `.bin` files: 4 in KITTI, 5 in nuScenes.
 
     Attributes:
@@ -78,13 +73,14 @@ class ArraysLog(Log):
         poses: (K, 4, 4) float64 `T_world_ego` of every sweep; None = unknown.
 
     Convention:
-        Sweeps are in the ego frame: points are moved by `ego_T_lidar` in float64, then rounded to float32. Poses with
-        times of their own (TUM) are interpolated at the sweeps' times where these are known; otherwise there must be
-        one pose per sweep. The frame should have z up: the method looks from above.
+        Sweeps are in the ego frame: points are transformed by `ego_T_lidar` in float64, then rounded to float32. Poses
+            with
+        times of their own (TUM) are interpolated at the times of the sweeps where these are known; otherwise there must
+        be one pose per sweep. The frame should have z up, because the method works in the bird's-eye view.
 
     Raises:
-        CFlowError: fewer than two clouds, clouds of several suffixes, poses or times that do not fit, a setting that
-            names nothing.
+        CFlowError: fewer than two clouds, clouds of several suffixes, poses or times that do not fit, or a setting that
+            names a missing file.
     """
 
     def __init__(
@@ -101,9 +97,9 @@ class ArraysLog(Log):
     ) -> None:
         self.folder = as_path(folder)
         if poses_of not in ("ego", "lidar"):
-            raise CFlowError(f"poses_of={poses_of!r}: give 'ego' or 'lidar'")
+            raise CFlowError(f"poses_of={poses_of!r}: pass 'ego' or 'lidar'")
         if type(bin_columns) is not int or bin_columns < 3:
-            raise CFlowError(f"bin_columns={bin_columns!r}: give a whole number, 3 or more")
+            raise CFlowError(f"bin_columns={bin_columns!r}: pass an integer of at least 3")
         self.log_id = self.folder.resolve().name
         self.files = _one_suffix(self.folder, suffix)
         self._bin_columns = bin_columns
@@ -118,11 +114,7 @@ class ArraysLog(Log):
             self.poses = self.poses @ np.linalg.inv(self.ego_T_lidar)
 
     def sweep(self, index: int) -> Sweep:
-        """Sweep number `index`: (N, 3) float32 in the ego frame, pose, ground mask and time where they are known.
-
-        Raises:
-            CFlowError: no such sweep, or its files cannot be read.
-        """
+        """Read sweep `index`: (N, 3) float32 in the ego frame; pose, ground mask and time where they are known."""
         self._timestamp(index)
         points = read_cloud(self.files[index], self._bin_columns)
         if not np.array_equal(self.ego_T_lidar, np.eye(4)):
@@ -133,7 +125,7 @@ class ArraysLog(Log):
         return Sweep(points.astype(np.float32, copy=False), is_ground, pose, time)
 
     def _trajectory(self, poses: Any, calibration: Any) -> tuple[Trajectory | None, str, bool]:
-        """The poses given or found, what to call them, and whether a calibration made them the LiDAR's."""
+        """Return the poses, their name for messages, and whether a calibration converted them to the LiDAR's."""
         if is_path_like(poses):
             kitti = self.folder.resolve().parent.parent / "poses" / f"{self.log_id}.txt"
             file = _beside(self.folder, poses, POSE_FILES, "poses", kitti)
@@ -151,7 +143,7 @@ class ArraysLog(Log):
         return Trajectory(checked_poses(np.asarray(poses), "poses"), None, "matrix"), "poses", False
 
     def _times(self, times: Any, trajectory: Trajectory | None) -> list[int] | None:
-        """Nanoseconds of each sweep, None = unknown."""
+        """Return the nanoseconds of each sweep; None = unknown."""
         count = len(self.files)
         file = _beside(self.folder, times, ("times.txt",), "times")
         if file is not None:
@@ -167,24 +159,24 @@ class ArraysLog(Log):
         return None
 
     def _one_each(self, trajectory: Trajectory, source: str, stamps: list[int] | None) -> np.ndarray:
-        """(K, 4, 4) one pose per sweep."""
+        """Return (K, 4, 4), one pose per sweep."""
         if trajectory.times_ns is not None and stamps is not None:
             return poses_at(trajectory, stamps, source)
         if len(trajectory.poses) != len(self.files):
             raise CFlowError(
-                f"{source} has {len(trajectory.poses)} poses for {len(self.files)} sweeps: give one each, or poses "
-                "with times (TUM) and times.txt with those of the sweeps"
+                f"{source} has {len(trajectory.poses)} poses for {len(self.files)} sweeps: pass one each, or poses "
+                "with times (TUM) and the times of the sweeps in times.txt"
             )
         return trajectory.poses
 
 
 def natural_key(name: str) -> tuple[Any, ...]:
-    """Sorts 2 before 10: the digits of a name count as numbers."""
+    """Sort key that compares the digits of a name as numbers: 2 before 10."""
     return tuple((0, int(part), part) if part.isdecimal() else (1, 0, part) for part in re.findall(r"\d+|\D+", name))
 
 
 def _clouds(folder: Path) -> tuple[Path, dict[str, list[Path]]]:
-    """Where the clouds of a log lie, and those of each suffix that has two or more."""
+    """Return the folder of a log's clouds, and those of each suffix that has two or more."""
     for place in (folder, *(folder / name for name in POINT_FOLDERS)):
         kinds: dict[str, list[Path]] = {}
         if place.is_dir():
@@ -203,8 +195,8 @@ def _one_suffix(folder: Path, suffix: str | None) -> list[Path]:
         kinds = {kind: files for kind, files in kinds.items() if kind == "." + suffix.lower().lstrip(".")}
     if not kinds:
         raise CFlowError(
-            f"{folder} has fewer than two point clouds ({suffix or ', '.join(SUFFIXES)}), in itself or in "
-            f"{', '.join(POINT_FOLDERS)}; scene flow needs two or more"
+            f"{folder} and its subfolders {', '.join(POINT_FOLDERS)} have fewer than two point clouds "
+            f"({suffix or ', '.join(SUFFIXES)}); scene flow needs two or more"
         )
     if len(kinds) > 1:
         raise CFlowError(f"{place} has several kinds of clouds, {', '.join(sorted(kinds))}: choose one with suffix=...")
@@ -212,7 +204,7 @@ def _one_suffix(folder: Path, suffix: str | None) -> list[Path]:
 
 
 def _beside(folder: Path, setting: PathLike | None, names: Sequence[str], what: str, *elsewhere: Path) -> Path | None:
-    """The file or folder that a setting means; None = none."""
+    """Return the file or folder that a setting names; None = none."""
     if setting is None:
         return None
     if setting == "auto":
@@ -223,7 +215,7 @@ def _beside(folder: Path, setting: PathLike | None, names: Sequence[str], what: 
     path = as_path(setting)
     path = path if is_remote(path) or path.is_absolute() or path.exists() else folder / path
     if not path.exists():
-        raise CFlowError(f"{what}={str(setting)!r} names nothing, neither here nor in {folder}")
+        raise CFlowError(f"{what}={str(setting)!r} does not exist, neither here nor in {folder}")
     return path
 
 
@@ -231,7 +223,5 @@ def _read_mask(folder: Path, stem: str, rows: int) -> np.ndarray:
     file = folder / f"{stem}.npy"
     mask = read_npy(file, "every sweep needs its ground mask, or pass ground=None")
     if mask.shape not in ((rows,), (rows, 1)) or mask.dtype.kind not in "biu" or not np.isin(mask, (0, 1)).all():
-        raise CFlowError(
-            f"{file} has shape {mask.shape} and dtype {mask.dtype} for {rows} points; give (N,) bool, True = ground"
-        )
+        raise CFlowError(f"{file} has shape {mask.shape} and dtype {mask.dtype} for {rows} points; masks are (N,) bool")
     return mask.reshape(rows).astype(bool)

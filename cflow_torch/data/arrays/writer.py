@@ -1,4 +1,4 @@
-"""Writes any log as a folder of point clouds with poses, times and ground masks, as `ArraysLog` reads them."""
+"""Write any log as a folder of point clouds with poses, times and ground masks, which `ArraysLog` reads."""
 
 from __future__ import annotations
 
@@ -20,27 +20,27 @@ def write_array_log(log: Log, root: str | Path, suffix: str = ".npy", poses: str
 
     Args:
         log: any log.
-        root: folder above, made if absent.
+        root: parent folder, created if it does not exist.
         suffix: of the clouds, one of `cloud_file.SUFFIXES`.
-        poses: "kitti" (12 numbers a line), "tum" (with times), "npy" ((K, 4, 4) float64), None = none.
+        poses: "kitti" (12 numbers per line), "tum" (with times), "npy" ((K, 4, 4) float64), None = none.
 
     Returns:
         The folder.
 
     Convention:
-        Everything appears at once or not at all. Points are in the log's ego frame, poses `T_world_ego`. Masks and
-        times are written where every sweep has them.
+        The folder appears complete or not at all. Points are in the log's ego frame, poses `T_world_ego`. Masks and
+        times are written if every sweep has them.
 
     Raises:
-        CFlowError: an unknown suffix or format, poses asked for and not there, or the folder exists.
+        CFlowError: an unknown suffix or format, poses requested but missing, or the folder exists.
     """
     if suffix not in SUFFIXES or poses not in ("kitti", "tum", "npy", None):
         raise CFlowError(
-            f"suffix={suffix!r}, poses={poses!r}: give one of {SUFFIXES} and 'kitti', 'tum', 'npy' or None"
+            f"suffix={suffix!r}, poses={poses!r}: pass one of {SUFFIXES} and 'kitti', 'tum', 'npy' or None"
         )
     folder = Path(root) / safe_name(log.log_id, "log_id")
     if folder.exists():
-        raise CFlowError(f"{folder} exists already: remove it, or choose another root")
+        raise CFlowError(f"{folder} already exists: remove it, or choose another root")
     with atomic_folder(folder) as new:
         _write(log, new, suffix, poses)
     return folder

@@ -1,4 +1,4 @@
-"""ROS 1, ROS 2 and MCAP bags, without ROS: reader."""
+"""Reader of ROS 1, ROS 2 and MCAP bags, without ROS (experimental)."""
 
 from __future__ import annotations
 

@@ -9,11 +9,11 @@ import numpy as np
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # PointField.datatype
 _TIME_FIELDS = ("t", "time", "timestamp", "offset_time", "time_stamp")
 _UNITS = (1.0, 1e-3, 1e-6, 1e-9)  # seconds
-_SHORTEST, _LONGEST = 0.005, 5.0  # seconds of a sweep: a thousandfold, so that only one unit fits
+_SHORTEST, _LONGEST = 0.005, 5.0  # duration of a sweep in seconds: a factor of 1000, so that only one unit fits
 
 
 def points_and_times(message: Any, stamp_ns: int) -> tuple[np.ndarray, np.ndarray | None]:
-    """Points of a cloud, without those that are not finite or at the origin, which mean "no return".
+    """Return the points of a cloud, without "no return" points, which are not finite or at the origin.
 
     Args:
         message: PointCloud2 as rosbags reads it.
@@ -21,10 +21,10 @@ def points_and_times(message: Any, stamp_ns: int) -> tuple[np.ndarray, np.ndarra
 
     Returns:
         (N, 3) float64 metres in the frame of the message; (N,) float64 seconds after the stamp, see `seconds_after`,
-        None = not known.
+        None = unknown.
 
     Raises:
-        ValueError: no fields x, y, z, an unknown type, or fewer data than the message says.
+        ValueError: no fields x, y, z, an unknown type, or less data than the message states.
     """
     fields = {field.name: field for field in message.fields}
     names = [*"xyz", *[name for name in _TIME_FIELDS if name in fields][:1]]
@@ -45,18 +45,18 @@ def points_and_times(message: Any, stamp_ns: int) -> tuple[np.ndarray, np.ndarra
 
 
 def seconds_after(values: np.ndarray, stamp_ns: int) -> np.ndarray | None:
-    """Times of points as seconds after the stamp of their sweep.
+    """Convert the times of points to seconds after the stamp of their sweep.
 
     Args:
         values: (N,) as stored, of any unit.
         stamp_ns: time of the sweep.
 
     Returns:
-        (N,) float64; None if they are all the same, or span what no sweep lasts in any unit.
+        (N,) float64; None if they are all equal, or if no unit gives the duration of a sweep.
 
-    Convention: the unit, from seconds to nanoseconds, is that in which they span 5 ms to 5 s. Values of at most 5 s
-    count from the stamp, larger ones from 1970; if that is more than 5 s off the stamp, they are of a clock of their
-    own, of which the first shot is taken for the stamp.
+    Convention: the unit, from seconds to nanoseconds, is the one in which they span 5 ms to 5 s. Values of at most 5 s
+    count from the stamp, larger ones from 1970. If the latter are more than 5 s away from the stamp, they come from
+    another clock, and we assume that the first shot was at the stamp.
     """
     if not len(values):
         return None

@@ -1,4 +1,4 @@
-"""Reader of ROS 1, ROS 2 and MCAP bags, by rosbags (extra `bags`): clouds of one topic, poses of another or of TF."""
+"""Experimental reader of ROS 1, ROS 2 and MCAP bags, by rosbags (extra `bags`)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from cflow_torch.data.arrays.poses_text import poses_at as covered_poses
 from cflow_torch.data.bags.frames import Frames, Sample, sample, sorted_poses
 from cflow_torch.data.bags.point_cloud2 import points_and_times
 from cflow_torch.data.files import file_errors, find_folders, shortened
-from cflow_torch.data.log import FlowLabels, Log
+from cflow_torch.data.log import Log
 from cflow_torch.data.paths import PathLike, as_path, is_remote, source_for_full_read
 from cflow_torch.data.rigid_motion import poses_at, transform_points
 from cflow_torch.types import CFlowError, Sweep
@@ -25,15 +25,15 @@ _CLOUD = "sensor_msgs/msg/PointCloud2"
 _POSES = tuple(f"{name}Stamped" for name in ("geometry_msgs/msg/Pose", "geometry_msgs/msg/PoseWithCovariance"))
 _POSE_TYPES = ("nav_msgs/msg/Odometry", *_POSES)
 _TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
-_BASE = "base_link"  # the vehicle, by ROS's REP 105: x ahead, y left, z up
-_SLICE = 1e-4  # seconds for which one pose of the vehicle is good enough: 3 mm at 30 m/s
+_BASE = "base_link"  # the vehicle, by ROS's REP 105: x forward, y left, z up
+_SLICE = 1e-4  # seconds during which we use one pose of the vehicle: 3 mm at 30 m/s
 
 
 def find_bags(root: PathLike) -> list[Path]:
-    """All bags under a folder, sorted: files `.bag` (ROS 1), `.mcap`, `.db3`, and folders with a metadata.yaml (ROS 2).
+    """Find all bags, sorted: files `.bag` (ROS 1), `.mcap`, `.db3`, and folders with a metadata.yaml (ROS 2).
 
     Args:
-        root: a bag, or a folder at most three levels above them.
+        root: a bag, or a folder at most three levels above the bags.
 
     Raises:
         CFlowError: `root` does not exist.
@@ -46,36 +46,36 @@ def find_bags(root: PathLike) -> list[Path]:
 
 
 class BagLog(Log):
-    """One bag; implements the `Log` protocol.
+    """One bag. Experimental: tested on bags that rosbags wrote, never on a recorded one.
 
     Args:
         path: a file, or the folder of a ROS 2 bag, on this machine.
         topic: of the clouds (sensor_msgs/PointCloud2); None = the only such topic.
         poses: "tf" = from the transforms; a topic of nav_msgs/Odometry, geometry_msgs/PoseStamped or
-            PoseWithCovarianceStamped; None = no poses; "auto" = the first of these that there is: transforms in which
-            the ego frame moves, the only topic of such a type, none.
-        frame: name of the ego frame; None = base_link where transforms join it to the LiDAR, else the LiDAR's own.
-        ego_T_lidar: (4, 4), coordinates of the clouds to the ego frame; None = what the transforms say.
-        deskew: move each point with the pose that the vehicle had when it was measured, where poses and times of points
-            are known; False: the clouds are compensated already.
+            PoseWithCovarianceStamped; None = no poses; "auto" = the first available of: transforms in which the ego
+            frame moves, the only topic of such a type, none.
+        frame: name of the ego frame; None = base_link if transforms connect it to the LiDAR, else the LiDAR's own.
+        ego_T_lidar: (4, 4), coordinates of the clouds to the ego frame; None = from the transforms.
+        deskew: move each point with the pose that the vehicle had when it was measured, if poses and times of points
+            are known; False: the clouds are already compensated.
 
     Attributes:
         log_id: name of the file or folder, without its suffix.
         poses: (K, 4, 4) float64 `T_world_ego` of every sweep; None = unknown.
-        timestamps: nanoseconds, of the clouds' headers (where they are 0: of their arrival). Clouds before the first
+        timestamps: nanoseconds of the clouds' headers (where they are 0: of their arrival). Clouds before the first
             or after the last pose are left out.
-        topic, frame, deskew: those in use.
+        topic, frame, deskew: the settings in use.
 
-    Convention: points are float32 in the ego frame; poses are float64 `T_world_ego`, the world being the root of the
-        transforms, or that of the topic, interpolated at the time of the cloud. A topic's poses are those of its
-        `child_frame_id`, if transforms join it to the ego frame, else of the ego frame itself. `is_ground` is None.
+    Convention: points are float32 in the ego frame. Poses are float64 `T_world_ego`, interpolated at the time of the
+        cloud; the world is the root of the transforms, or that of the topic. A topic's poses are those of its
+        `child_frame_id`, if transforms connect it to the ego frame, else of the ego frame itself. `is_ground` is None.
         Times of points: see `point_cloud2.seconds_after`.
 
-    Cost: opening reads all clouds, poses and transforms of the bag once.
+    Cost: opening a bag reads all its clouds, poses and transforms once.
 
     Raises:
-        CFlowError: rosbags is missing; no bag; no such topic, or several and none chosen; fewer than two sweeps;
-            frames that nothing joins.
+        CFlowError: rosbags is missing; not a bag; no such topic, or several and none chosen; fewer than two sweeps;
+            frames that no transforms connect.
     """
 
     def __init__(
@@ -89,13 +89,13 @@ class BagLog(Log):
     ) -> None:
         self.path = as_path(path)
         if is_remote(self.path):
-            raise CFlowError(f"{self.path}: bags are read from this machine only; copy it here")
+            raise CFlowError(f"{self.path} is remote: bags are read from this machine only; copy it here")
         self.log_id = self.path.resolve().stem if self.path.is_file() else self.path.resolve().name
         self.deskew = deskew
         self.poses: np.ndarray | None = None
         self._opened: tuple[int, Any] = (0, None)
         self._mount = None if ego_T_lidar is None else rigid_transform(ego_T_lidar, "ego_T_lidar")
-        with file_errors(f"{self.path}", "is it a whole bag of ROS 1 (.bag), ROS 2 (folder) or MCAP?"):
+        with file_errors(f"{self.path}", "is it a complete bag of ROS 1 (.bag), ROS 2 (folder) or MCAP?"):
             topics = {connection.topic: connection.msgtype for connection in self._reader().connections}
             self.topic = self._chosen(topics, (_CLOUD,), topic, "topic")
             self._arrival, tracks = self._scan()
@@ -118,7 +118,6 @@ class BagLog(Log):
                 self._frames.between(self.frame, self._lidar, np.array(self.timestamps[:1]))
 
     def sweep(self, index: int) -> Sweep:
-        """Sweep number `index`, without ground mask."""
         time = self._timestamp(index)
         with file_errors(f"{self.path}, {self.topic} at {time} ns"):
             points, times = points_and_times(self._cloud(time), time)
@@ -135,13 +134,8 @@ class BagLog(Log):
             points = np.einsum("nij,nj->ni", T[:, :3, :3], points) + T[:, :3, 3]
         return Sweep(points.astype(np.float32), None, self.poses[index].copy(), time, times)
 
-    def labels(self, index: int) -> FlowLabels | None:
-        """None: bags have no truth."""
-        self._timestamp(index)
-        return None
-
     def _reader(self) -> Any:
-        """The open bag, of this process: one that is forked or unpickled opens it anew."""
+        """Return the bag, opened by this process: after a fork or unpickling it is opened again."""
         if self._opened[0] != os.getpid():
             try:
                 from rosbags.highlevel import AnyReader
@@ -150,7 +144,7 @@ class BagLog(Log):
                 raise CFlowError("bags need rosbags: pip install rosbags") from None
             for file in [self.path] if self.path.is_file() else self.path.iterdir():
                 source_for_full_read(file)
-            # Bags of ROS 2 before Iron do not say how their messages are built; these types never changed.
+            # Bags of ROS 2 before Iron do not describe their messages; these types never changed.
             reader = AnyReader([self.path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
             reader.open()
             self._opened = (os.getpid(), reader)
@@ -160,19 +154,19 @@ class BagLog(Log):
         return {**self.__dict__, "_opened": (0, None)}
 
     def _chosen(self, topics: dict[str, str], types: tuple[str, ...], name: str | None, setting: str) -> str:
-        """The topic of one of these types that is named, or the only one."""
+        """Return the topic of one of these types that is named, or the only one."""
         found = sorted(topic for topic, kind in topics.items() if kind in types and name in (None, topic))
         if len(found) != 1:
-            there = shortened(", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items())))
+            available = shortened(", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items())))
             what = f"{setting}={name}" if name else f"{len(found)} topics"
             raise CFlowError(
                 f"{what} of type {' or '.join(types)}: choose one with {setting}=NAME, "
-                f"in commands data.{setting}=NAME; the bag has {there}"
+                f"in commands data.{setting}=NAME; the bag has {available}"
             )
         return found[0]
 
     def _scan(self) -> tuple[dict[int, int], dict[str, list[Sample]]]:
-        """Time of each cloud -> of its arrival; samples of poses by topic. The frames are filled."""
+        """Read the arrival time of each cloud and the pose samples of each topic, and set the frames."""
         self._lidar = ""
         self._child: dict[str, str] = {}
         arrival: dict[int, int] = {}
@@ -200,7 +194,7 @@ class BagLog(Log):
         return arrival, tracks
 
     def _trajectory(self, poses: str, tracks: dict[str, list[Sample]]) -> tuple[np.ndarray, np.ndarray]:
-        """(M,) int64 times that transforms or messages tell, and (M, 4, 4) `T_world_ego` at them."""
+        """Return (M,) int64 times of transforms or messages, and (M, 4, 4) `T_world_ego` at these times."""
         if poses == "tf":
             times = self._frames.moves(self.frame)
             matrices = self._frames.in_root(self.frame, times)
@@ -210,28 +204,28 @@ class BagLog(Log):
             if child and self._frames.are_joined(child, self.frame):
                 matrices = matrices @ self._frames.between(child, self.frame, times)
         if len(times) < 2:
-            raise CFlowError(f"poses={poses}: fewer than two poses of {self.frame}; give another, or poses=null")
+            raise CFlowError(f"poses={poses}: fewer than two poses of {self.frame}; choose others, or poses=null")
         return times, matrices
 
     def _cloud(self, time: int) -> Any:
-        """The message of a sweep."""
+        """Read the message of a sweep."""
         reader, arrived = self._reader(), self._arrival[time]
         clouds = [connection for connection in reader.connections if connection.topic == self.topic]
         for connection, _, data in reader.messages(clouds, start=arrived, stop=arrived + 1):
             message = reader.deserialize(data, connection.msgtype)
             if _stamp(message, arrived) == time:
                 return message
-        raise CFlowError("the cloud is not there any more; was the bag changed?")
+        raise CFlowError("the cloud is gone; was the bag changed?")
 
 
 def _stamp(message: Any, arrived: int) -> int:
-    """Nanoseconds of a header; where it is 0, when the message came."""
+    """Return the nanoseconds of a header; where it is 0, the time of arrival."""
     stamp = message.header.stamp
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec) or arrived
 
 
 def _name(frame: str) -> str:
-    """Without the slash in front that ROS 1 allows."""
+    """Remove the leading slash that ROS 1 allows."""
     return frame.lstrip("/")
 
 

@@ -1,4 +1,4 @@
-"""Frames in scenes of OpenSceneFlow's layout: where the LiDAR sits, and what the harness takes for the ego motion."""
+"""Coordinate frames in OpenSceneFlow's scenes: the mounting of the LiDAR, and the ego motion that the harness uses."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from torch import Tensor
 
 from cflow_torch.windows.ego_motion import compensate
 
-# Argoverse 2 counts nanoseconds from a moment of its own: all sweeps of the data set lie in here, no other set's do.
+# Argoverse 2 counts nanoseconds from its own epoch: all its sweeps lie in this range, and those of no other data set.
 _ARGOVERSE2_STAMPS = (315_900_000_000_000_000, 316_000_000_000_000_000)
-# Its up_lidar sits 2 m above the road, its ego frame 0.35 m: ground lower than this is seen from the sensor.
+# Its up_lidar is 2 m above the road, its ego frame 0.35 m: if the ground is lower than this, points are the sensor's.
 _ARGOVERSE2_SENSOR_GROUND = -1.2
-# Extrinsics of up_lidar in one log of the set (7fab2350), yaw -0.58 degrees. Each log has its own, the scenes none.
+# Extrinsics of up_lidar in one log of the set (7fab2350), yaw -0.58 degrees. Every log has its own, scenes have none.
 _ARGOVERSE2_EGO_T_UP_LIDAR = np.array(
     [[0.9999483, 0.0101698, 0, 1.35018], [-0.0101698, 0.9999483, 0, 0], [0, 0, 1, 1.64042], [0, 0, 0, 1]]
 )
 
 
 class StoredMotion(NamedTuple):
-    """What the harness takes for the ego motion of a pair of sweeps.
+    """The ego motion that the harness uses for a pair of sweeps.
 
     Args:
         T_ego1_ego0: (4, 4) float32, from `harness_motion`.
-        of_points: the poses are those of the frame of the points; False = `ego_T_lidar` lies between.
+        of_points: whether the poses are those of the frame of the points; False = `ego_T_lidar` lies between.
     """
 
     T_ego1_ego0: np.ndarray
@@ -33,13 +33,13 @@ class StoredMotion(NamedTuple):
 
 
 def is_argoverse2(timestamp: int) -> bool:
-    """Whether a sweep's time stamp is one of Argoverse 2."""
+    """Whether the time stamp of a sweep is one of Argoverse 2."""
     low, high = _ARGOVERSE2_STAMPS
     return low <= timestamp < high
 
 
 def recognized_extrinsics(timestamp: int, points: np.ndarray, is_ground: np.ndarray | None) -> np.ndarray:
-    """Coordinates of a scene's points to the frame whose poses it stores, by what a sweep looks like.
+    """Recognise the frame of a scene's points from one of its sweeps.
 
     Args:
         timestamp: name of the sweep.
@@ -47,12 +47,13 @@ def recognized_extrinsics(timestamp: int, points: np.ndarray, is_ground: np.ndar
         is_ground: (N,) bool, True = ground; None = unknown.
 
     Returns:
-        (4, 4) float64 ego_T_lidar.
+        (4, 4) float64 ego_T_lidar, which maps the points to the frame whose poses the scene stores.
 
     Convention:
-        A sweep with a time stamp of Argoverse 2 whose ground lies lower than 1.2 m below the origin has points in the
-        frame of up_lidar and the pose of the ego frame: the extrinsics of one log of that set. Those of the scene's own
-        log are not in its file: take them from `calibration/egovehicle_SE3_sensor.feather`. All other sets: the
+        Argoverse 2 sweeps (by their time stamp) with ground more than 1.2 m below the origin have points in the frame
+        of up_lidar and poses of the ego frame. We return the extrinsics of one log of that set. Those of the scene's
+        own log are not in its file: take them from `calibration/egovehicle_SE3_sensor.feather`. For all other sets we
+            return the
         identity (nuScenes and ZOD have poses of the sensor, Waymo and TruckScenes points in the ego frame).
     """
     if not is_argoverse2(timestamp) or is_ground is None:
@@ -65,7 +66,7 @@ def recognized_extrinsics(timestamp: int, points: np.ndarray, is_ground: np.ndar
 
 
 def harness_motion(pose0: Any, pose1: Any) -> np.ndarray:
-    """T_ego1_ego0 as the harness computes it from two stored poses.
+    """Compute T_ego1_ego0 from two stored poses as the harness does.
 
     Args:
         pose0, pose1: (4, 4) T_world_ego of t and t+1, arrays or tensors, float32 or float64.
@@ -75,7 +76,7 @@ def harness_motion(pose0: Any, pose1: Any) -> np.ndarray:
 
     Convention:
         The inverse of a rotation is its transpose, and the translation of the inverse is summed in the precision of the
-        poses: with float32 and coordinates of kilometres that is off by up to half a millimetre. So are its scores.
+        poses. With float32 and coordinates of kilometres this is off by up to half a millimetre, and so are its scores.
     """
     start, end = (torch.as_tensor(pose).detach().cpu() for pose in (pose0, pose1))
     inverse = torch.eye(4, dtype=torch.float64)
@@ -85,7 +86,7 @@ def harness_motion(pose0: Any, pose1: Any) -> np.ndarray:
 
 
 def harness_pose_flow(points: Tensor, T_ego1_ego0: np.ndarray) -> Tensor:
-    """The flow that the harness adds to a model's, and takes out of the truth: (N, 3) float32.
+    """Return the (N, 3) float32 flow that the harness adds to a model's flow and subtracts from the truth.
 
     Args:
         points: (N, 3) float32, metres.
@@ -95,8 +96,10 @@ def harness_pose_flow(points: Tensor, T_ego1_ego0: np.ndarray) -> Tensor:
     return points @ transform[:3, :3].t() + transform[:3, 3] - points
 
 
-def beside_harness(residual: Tensor, points: Tensor, T_ego1_ego0: np.ndarray, T_lidar1_lidar0: np.ndarray) -> Tensor:
-    """What to hand to the harness so that its total is right although its poses are of another frame than the points.
+def residual_for_harness(
+    residual: Tensor, points: Tensor, T_ego1_ego0: np.ndarray, T_lidar1_lidar0: np.ndarray
+) -> Tensor:
+    """Return the residual to pass to the harness so that its total is right if its poses are of another frame.
 
     Args:
         residual: (N, 3) float32, metres, motion of objects.

@@ -1,4 +1,4 @@
-"""OpenSceneFlow's HDF5 scenes: one file per scene, one group per sweep, named by its time stamp."""
+"""Reader of OpenSceneFlow's HDF5 scenes: one file per scene, one group per sweep, named by its time stamp."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from cflow_torch.data.paths import PathLike, as_path
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.ego_motion import rigid_transform
 
-# Time stamps count from 1970 or 1980: below this they are microseconds (16 digits), above it nanoseconds (18 or 19).
+# Time stamps count from 1970 or 1980: smaller ones are microseconds (16 digits), others nanoseconds (18 or 19).
 _FIRST_NANOSECOND = 10**17
 _LARGEST_CATEGORY = 255
-EXTRINSIC = "ego_T_lidar"  # attribute of a scene that `write_hdf5_scene` leaves
+EXTRINSIC = "ego_T_lidar"  # attribute of a scene that `write_hdf5_scene` stores
 
 
 def find_hdf5_scenes(root: PathLike) -> list[Path]:
-    """The scene files of a folder, or the one file given, sorted.
+    """Return the scene files of a folder, sorted, or the given file.
 
     Raises:
         CFlowError: `root` does not exist.
@@ -32,42 +32,42 @@ def find_hdf5_scenes(root: PathLike) -> list[Path]:
     if root.is_file():
         return [root]
     if not root.is_dir():
-        raise CFlowError(f"{root} is neither a file nor a folder; give a scene (.h5) or a folder of scenes")
+        raise CFlowError(f"{root} is neither a file nor a folder; pass a scene (.h5) or a folder of scenes")
     return sorted(root.glob("*.h5"))
 
 
 class HDF5Log(Log):
-    """One scene; implements the `Log` protocol. Needs h5py (`pip install h5py`).
+    """One scene. Needs h5py (`pip install h5py`).
 
     Args:
         file: `<scene>.h5`.
         ego_T_lidar: (4, 4), coordinates of the stored points to the frame whose poses are stored; None = the same
-            frame; "auto" = as the scene says (see Convention).
+            frame; "auto" = recognise it (see Convention).
 
     Attributes:
-        log_id: file name without its ending.
+        log_id: file name without its suffix.
         timestamps: names of the groups as integers, ascending, in nanoseconds or microseconds as the data set has
-            them; the sweeps' `timestamp_ns` are nanoseconds.
+            them; the `timestamp_ns` of sweeps are nanoseconds.
         ego_T_lidar: (4, 4) float64, the one in use.
 
     Convention:
         - Points, labels and results stay in the frame of the file, that of the LiDAR. A sweep's `pose` is the LiDAR's:
-          the stored pose times `ego_T_lidar`. So the static world stays put also where the file has points in the
-          sensor frame and poses of the ego vehicle.
-        - "auto": the file's attribute `ego_T_lidar` if it has one (our writer's do), otherwise what the first sweep
-          looks like, see `recognized_extrinsics`.
-        - Index files beside a scene are pickles: they are never opened.
+          the stored pose times `ego_T_lidar`. So the static world is static even if the file combines points in the
+          sensor frame with poses of the ego vehicle.
+        - "auto" uses the file's attribute `ego_T_lidar` if it has one (our writer's files do), otherwise
+          `recognized_extrinsics` of the first sweep.
+        - Index files next to a scene are pickles: they are never opened.
 
     Raises:
-        CFlowError: h5py is missing, the file is no HDF5 file, it holds fewer than two sweeps, or `ego_T_lidar` is no
-            rigid motion.
+        CFlowError: h5py is missing, the file is not an HDF5 file, it has fewer than two sweeps, or `ego_T_lidar` is not
+            a rigid motion.
     """
 
     def __init__(self, file: PathLike, ego_T_lidar: Any = "auto") -> None:
         self.file = as_path(file)
         self.log_id = self.file.stem
         self._scene = open_scene(self.file)
-        # HDF5 itself closes after the interpreter has gone, which a file read through Python does not survive.
+        # HDF5 closes its files after the interpreter has ended, which crashes if Python reads the file.
         weakref.finalize(self, self._scene.close)
         with scene_errors(self.file):
             self.timestamps = sorted(int(name) for name in self._scene if is_timestamp(name))
@@ -86,7 +86,7 @@ class HDF5Log(Log):
         self._scene.close()
 
     def sweep(self, index: int) -> Sweep:
-        """Sweep number `index`: float32 points, float64 pose of their frame, ground mask where the scene has one."""
+        """Read sweep `index`: float32 points, float64 pose of their frame; ground mask and times if stored."""
         rows, timestamp = self._rows(index), self.timestamps[index]
         points = self._needed(index, "lidar", dtype=np.float32)
         is_ground = self._column(index, "ground_mask", rows, np.bool_)
@@ -98,7 +98,7 @@ class HDF5Log(Log):
         return Sweep(points[:, :3], is_ground, pose, nanoseconds, times)
 
     def labels(self, index: int) -> FlowLabels | None:
-        """Truth of the pair (index, index + 1); None where the sweep has no `flow`."""
+        """Read the truth of the pair (index, index + 1); None if the sweep has no `flow`."""
         rows = self._rows(index)
         flow = self._values(index, "flow", [(rows, 3)], np.float32)
         if flow is None:
@@ -110,18 +110,18 @@ class HDF5Log(Log):
             raise CFlowError(f"{where} has flow without flow_category_indices or flow_is_valid")
         if category.dtype.kind not in "iu" or category.max(initial=0) > _LARGEST_CATEGORY:
             raise CFlowError(f"{where}: flow_category_indices must be integers up to {_LARGEST_CATEGORY}")
-        # Waymo has int8 and -1 = no label.
+        # Waymo's scenes have int8, and -1 = no label.
         return FlowLabels(flow, category.clip(0).astype(np.uint8), is_valid & (category >= 0))
 
     def eval_mask(self, index: int) -> np.ndarray | None:
-        """(N,) bool points to score, None where the sweep has no `eval_mask`."""
+        """Read which points are scored, (N,) bool; None if the sweep has no `eval_mask`."""
         return self._column(index, "eval_mask", self._rows(index), np.bool_)
 
     def stored_motion(self, index: int) -> StoredMotion:
-        """Ego motion of the pair (index, index + 1) as the harness has it, by the poses as they are in the file.
+        """Compute the ego motion of the pair (index, index + 1) that the harness uses, from the stored poses.
 
         Raises:
-            CFlowError: no such pair, or a pose that cannot be read or is no rigid motion.
+            CFlowError: no such pair, or a pose that cannot be read or is not a rigid motion.
         """
         poses = [self._needed(k, "pose", (4, 4)) for k in (index, index + 1)]
         for pose in poses:
@@ -129,15 +129,15 @@ class HDF5Log(Log):
         return StoredMotion(harness_motion(*poses), np.array_equal(self.ego_T_lidar, np.eye(4)))
 
     def keys(self, index: int) -> tuple[str, ...]:
-        """Names of everything that sweep `index` has, results included."""
+        """Return the names of all that sweep `index` contains, results included."""
         with scene_errors(self.file):
             return tuple(sorted(self._group(index)))
 
     def values(self, index: int, key: str) -> np.ndarray:
-        """What a sweep has under a key, as it is stored; (N, 1) columns become (N,).
+        """Read what a sweep stores under a key; (N, 1) columns become (N,).
 
         Args:
-            index: number of the sweep.
+            index: of the sweep.
             key: for example `lidar` (N, 3+), `ego_motion` (4, 4) to the next sweep as stored (of the ego frame),
                 `flow_instance_id` (N,) 0 = background, `lidar_id` (N,), `lidar_dt` (N,) seconds, `lidar_center`
                 (L, 4, 4) ego_T_sensor, `dufo`, `cluster`, or the name of a result, (N, 3) total flow.
@@ -156,7 +156,7 @@ class HDF5Log(Log):
             return stored @ self.ego_T_lidar
 
     def _stated_extrinsics(self) -> np.ndarray:
-        """What the scene says about where its LiDAR sits."""
+        """Return the extrinsics of the scene's attribute, otherwise the recognised ones."""
         with scene_errors(f"{self.file}: attribute {EXTRINSIC}"):
             if EXTRINSIC in self._scene.attrs:
                 return np.asarray(self._scene.attrs[EXTRINSIC], np.float64)
@@ -167,15 +167,14 @@ class HDF5Log(Log):
         return recognized_extrinsics(self.timestamps[0], points, is_ground)
 
     def _group(self, index: int) -> Any:
-        """The group of a sweep."""
         return member(self._scene, str(self._timestamp(index)), self.file)
 
     def _array(self, index: int, key: str) -> Any | None:
-        """What a sweep has under a key, not read yet; None where it is absent."""
+        """Return the array of a key without reading it; None if there is none."""
         return member(self._group(index), key, f"{self.file}: sweep {self.timestamps[index]}")
 
     def _rows(self, index: int) -> int:
-        """Points of a sweep, none of which is read."""
+        """Return the number of points of a sweep without reading them."""
         stored = self._array(index, "lidar")
         shape: tuple[int, ...] = () if stored is None else stored.shape
         if len(shape) != 2 or shape[1] < 3:
@@ -185,19 +184,19 @@ class HDF5Log(Log):
     def _values(
         self, index: int, key: str, shapes: Sequence[tuple[int, ...]] = (), dtype: Any = None
     ) -> np.ndarray | None:
-        """Values of a key in one of the given shapes; None where it is absent."""
+        """Read the values of a key in one of the given shapes; None if there are none."""
         stored = self._array(index, key)
         if stored is None:
             return None
         what = f"{self.file}: {key} of sweep {self.timestamps[index]}"
-        with scene_errors(what), np.errstate(over="ignore"):  # float64 beyond float32 becomes infinite: no point
+        with scene_errors(what), np.errstate(over="ignore"):  # float64 beyond float32 becomes infinite, "no return"
             if shapes and stored.shape not in shapes:
                 raise CFlowError(f"{what} has shape {stored.shape}, expected {shapes[0]}")
             values: np.ndarray = stored[()]
             return values if dtype is None else values.astype(dtype, copy=False)
 
     def _needed(self, index: int, key: str, shape: tuple[int, ...] | None = None, dtype: Any = None) -> np.ndarray:
-        """`_values` of a key that must be there."""
+        """Read the values of a key that must exist."""
         values = self._values(index, key, [shape] if shape else [], dtype)
         if values is None:
             has = ", ".join(self.keys(index))
@@ -205,6 +204,6 @@ class HDF5Log(Log):
         return values
 
     def _column(self, index: int, key: str, rows: int, dtype: Any = None) -> np.ndarray | None:
-        """(N,) values of a key, also where it is stored as (N, 1); None where it is absent."""
+        """Read the (N,) values of a key that is stored as (N,) or (N, 1); None if there are none."""
         values = self._values(index, key, [(rows,), (rows, 1)], dtype)
         return None if values is None else values.reshape(rows)

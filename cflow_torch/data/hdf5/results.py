@@ -1,4 +1,4 @@
-"""What is written into OpenSceneFlow's HDF5 scenes: a method's flow, labels for self-supervised training."""
+"""Write into OpenSceneFlow's HDF5 scenes: a method's flow, and labels for self-supervised training."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from cflow_torch.types import Array, CFlowError, as_numpy
 
 LABELS = ("dufo", "cluster", "dufocluster", "nnd")  # keys of labels for self-supervised training
 LABELLED = "cflow_labels"  # attribute of a scene that has ours
-# Keys that scenes bring, and names that the viewers give a meaning of their own.
+# Keys of the scenes themselves, and names that have a special meaning in the viewers.
 RESERVED_KEYS = frozenset(
     (
         *("lidar", "lidar_id", "lidar_dt", "lidar_center", "ground_mask", "pose", "ego_motion", "eval_mask"),
@@ -29,34 +29,26 @@ RESERVED_KEYS = frozenset(
         *("pc0", "pc1", "gm0", "gm1", "pose0", "pose1"),
     )
 )
-_writing = partial(file_errors, hint="give a complete scene, and make room beside it for a copy", doing="write")
+_writing = partial(file_errors, hint="pass a complete scene, and free space for a copy of it", doing="write")
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_.-]{0,63}")
 
 
 def check_result_name(name: str) -> None:
-    """Refuse names that are taken or that a viewer's command line cannot carry.
-
-    Raises:
-        CFlowError: as said.
-    """
+    """Raise a `CFlowError` for a result name that is taken or that a viewer's command line cannot carry."""
     if not isinstance(name, str) or _NAME.fullmatch(name) is None:
         raise CFlowError(
-            f"{name!r} is no result name: begin with a letter, then letters, digits, '_', '-', '.', at most 64"
+            f"{name!r} is not a result name: begin with a letter, then use letters, digits, '_', '-', '.', at most 64"
         )
     if name in RESERVED_KEYS:
-        raise CFlowError(f"{name} is a key of the scenes themselves, choose another name, for example cflow")
+        raise CFlowError(f"{name} is a key of the scenes themselves; choose another name, for example cflow")
 
 
 def check_writable(file: str | Path) -> None:
-    """Refuse a scene that must not be changed.
-
-    Raises:
-        CFlowError: no such file, or it or its folder is read-only.
-    """
+    """Raise a `CFlowError` if a scene does not exist, or if it or its folder is read-only."""
     file = Path(file).resolve()
     if not file.is_file():
-        raise CFlowError(f"{file} does not exist; give a scene (.h5)")
-    # The mode as well as the right: the superuser may write everything, but a file marked read-only is meant to be.
+        raise CFlowError(f"{file} does not exist; pass a scene (.h5)")
+    # Check the mode, too: the superuser may write everything, but a file marked read-only must not be changed.
     if not file.stat().st_mode & 0o222 or not os.access(file, os.W_OK) or not os.access(file.parent, os.W_OK):
         raise CFlowError(f"{file} or its folder is read-only: copy the scene, or make it writable")
 
@@ -68,20 +60,19 @@ def write_hdf5_results(file: str | Path, name: str, results: Iterable[tuple[int,
         file: `<scene>.h5`; every other key keeps its contents.
         name: of the result; a result of that name is replaced.
         results: (time stamp of sweep t, (N, 3) TOTAL flow) pairs, metres until the next sweep, axes of ego1, one row
-            per point of the sweep, ground included; taken one by one.
+            per point of the sweep, ground included; consumed one by one.
 
     Returns:
         Number of sweeps written.
 
     Convention:
         float32, neither chunked nor compressed, as the harness stores it. NaN rows are kept (viewers show them white).
-        All results go into a copy beside the file, which takes its place at the end: whatever happens on the way, the
-        scene is the old one or the new one. Readers that have it open go on with the old one. Two writers at once: the
-        later one wins, the results of the other are lost.
+        All results go into a copy next to the file, which replaces it at the end, so the scene is always the old or the
+        new one. Readers that have it open continue with the old one. Only one process may write into a scene at a time.
 
     Raises:
-        CFlowError: h5py is missing; the name is taken; the file is read-only or no scene; a sweep is not in it; rows do
-            not agree. The scene is then unchanged.
+        CFlowError: h5py is missing; the name is taken; the file is read-only or not a scene; a sweep is not in it; or
+            the numbers of rows differ. The scene is then unchanged.
 
     Cost: one copy of the scene, in time and, until the end, in space.
     """
@@ -105,17 +96,17 @@ def write_hdf5_labels(
     Args:
         file: `<scene>.h5`; every other key keeps its contents.
         labels: (time stamp, {key: (N,) values}) of sweeps, keys of `LABELS` and `ground_mask`, which is only written
-            where the sweep has none; taken one by one.
-        made_by: what they were made by, kept as the attribute `LABELLED` of the scene.
-        overwrite: replace labels that are there.
+            if the sweep has none; consumed one by one.
+        made_by: description of the method, stored as the attribute `LABELLED` of the scene.
+        overwrite: replace existing labels.
 
     Returns:
         Number of sweeps written.
 
-    Convention: as `write_hdf5_results`: the scene is the old one or the new one.
+    Convention: as for `write_hdf5_results`, the scene is always the old or the new one.
 
     Raises:
-        CFlowError: as there; or the scene has labels, and `overwrite` is False.
+        CFlowError: see `write_hdf5_results`; or the scene has labels, and `overwrite` is False.
 
     Cost: one copy of the scene.
     """
@@ -124,7 +115,7 @@ def write_hdf5_labels(
         with _writing(file):
             found = [] if overwrite else _labels_in(scene)
         if found:
-            raise CFlowError(f"{file} has {', '.join(found)} already: overwrite=true replaces them, or label a copy")
+            raise CFlowError(f"{file} already has {', '.join(found)}: overwrite=true replaces them, or label a copy")
         for timestamp, values in labels:
             _write_labels(scene, Path(file), str(timestamp), values)
             count += 1
@@ -133,10 +124,10 @@ def write_hdf5_labels(
 
 
 def labelled_by(file: str | Path) -> str | None:
-    """What made the labels of a scene: `made_by`, "" if that is not known; None if it has no labels.
+    """Return `made_by` of a scene's labels, "" if it is unknown, None if the scene has no labels.
 
     Raises:
-        CFlowError: it cannot be read.
+        CFlowError: the scene cannot be read.
     """
     with open_scene(Path(file)) as scene, file_errors(file):
         made_by = scene.attrs.get(LABELLED, "" if _labels_in(scene) else None)
@@ -144,13 +135,13 @@ def labelled_by(file: str | Path) -> str | None:
 
 
 def _labels_in(scene: Any) -> list[str]:
-    """Keys of labels that sweeps of an open scene have."""
+    """Return the keys of labels in an open scene."""
     return sorted({key for stamp in scene if is_timestamp(stamp) for key in set(scene[stamp]) & set(LABELS)})
 
 
 @contextmanager
 def _changed(file: str | Path) -> Iterator[Any]:
-    """A copy of a scene, open to be changed, that takes its place when the block ends, and is removed if it raises."""
+    """Open a copy of a scene that replaces it when the block ends, and is removed if the block raises."""
     h5py = import_h5py()
     check_writable(file)
     file = Path(file).resolve()  # a link stays a link
@@ -167,7 +158,7 @@ def _changed(file: str | Path) -> Iterator[Any]:
 
 
 def _sweep(scene: Any, file: Path, timestamp: str) -> tuple[Any, int]:
-    """The group of a sweep and its number of points."""
+    """Return the group of a sweep and its number of points."""
     sweep = member(scene, timestamp, file)
     points = None if sweep is None else member(sweep, "lidar", f"{file}: sweep {timestamp}")
     if sweep is None or points is None:
@@ -182,9 +173,9 @@ def _write_flow(scene: Any, file: Path, timestamp: str, name: str, flow: np.ndar
         if flow.shape != (rows, 3):
             raise CFlowError(f"{file}: the flow of sweep {timestamp} has shape {flow.shape}, expected ({rows}, 3)")
         older = member(sweep, name, where)
-        # Two names of one dataset: another key would change as well.
+        # A dataset with two names is not replaced, because the other key would change as well.
         if older is not None and not _is_like(older, (rows, 3), np.float32):
-            raise CFlowError(f"{file}: {name} of sweep {timestamp} is no flow result, it is not replaced")
+            raise CFlowError(f"{file}: {name} of sweep {timestamp} is not a flow result, so it is not replaced")
         _store(sweep, name, older, flow.astype(np.float32))
 
 
@@ -205,7 +196,7 @@ def _write_labels(scene: Any, file: Path, timestamp: str, labels: Mapping[str, n
 
 
 def _is_like(stored: Any, shape: tuple[int, ...], dtype: Any) -> bool:
-    """Whether a dataset can take such values in its place, and has one name only."""
+    """Whether a dataset has the shape and dtype, and only one name."""
     return bool(stored.shape == shape and stored.dtype == dtype and import_h5py().h5o.get_info(stored.id).rc == 1)
 
 
@@ -213,4 +204,4 @@ def _store(sweep: Any, key: str, older: Any, values: np.ndarray) -> None:
     if older is None:
         sweep.create_dataset(key, data=values)
     else:
-        older[...] = values  # in its old place: deleting would leave a hole that HDF5 never gives back
+        older[...] = values  # in place, because HDF5 never frees the space of a deleted dataset

@@ -1,4 +1,4 @@
-"""What lies in the scene's own file. HDF5 lets a file name data of other files; a scene of OpenSceneFlow never does."""
+"""Access to the contents of a scene's own file. HDF5 allows links to other files; scenes of OpenSceneFlow have none."""
 
 from __future__ import annotations
 
@@ -10,16 +10,12 @@ from cflow_torch.data.files import file_errors
 from cflow_torch.data.paths import PathLike, source_for_random_access
 from cflow_torch.types import CFlowError
 
-_HINT = "write the scene anew: groups with arrays of plain numbers in the file itself"
+_HINT = "write the scene again, as groups with arrays of plain numbers in the file itself"
 scene_errors = partial(file_errors, hint="copy or write the scene again")
 
 
 def import_h5py() -> Any:
-    """The package h5py.
-
-    Raises:
-        CFlowError: it is missing.
-    """
+    """Import h5py; a missing package is a `CFlowError`."""
     try:
         import h5py
     except ImportError:
@@ -28,18 +24,14 @@ def import_h5py() -> Any:
 
 
 def open_scene(file: Path) -> Any:
-    """A scene, open for reading.
-
-    Raises:
-        CFlowError: h5py is missing; no such file, or no HDF5.
-    """
+    """Open a scene for reading; a missing package or file, or a file that is not HDF5, is a `CFlowError`."""
     h5py = import_h5py()
     with scene_errors(file):
         return h5py.File(source_for_random_access(file), "r")
 
 
 def member(group: Any, name: str, where: PathLike) -> Any | None:
-    """What a group of h5py holds under a name, a group or an array of numbers; None where it holds nothing.
+    """Return a group or an array of numbers from a group of h5py; None if there is nothing of that name.
 
     Args:
         group: the group, or the file.
@@ -47,8 +39,8 @@ def member(group: Any, name: str, where: PathLike) -> Any | None:
         where: begins the message.
 
     Raises:
-        CFlowError: it is a link or lies in another file, none of which is ever opened; it is no array of plain
-            numbers; or it cannot be opened.
+        CFlowError: it is a link or lies in another file, which is never opened; it is not an array of plain numbers; or
+            it cannot be opened.
     """
     h5py = import_h5py()
     if not name or "/" in name or name == ".":
@@ -57,11 +49,11 @@ def member(group: Any, name: str, where: PathLike) -> Any | None:
         link = group.get(name, getlink=True)
         if link is None:
             return None
-        is_own = isinstance(link, h5py.HardLink)  # else `group[name]` opens what it names, be it a file elsewhere
+        is_own = isinstance(link, h5py.HardLink)  # `group[name]` of another kind could open a file elsewhere
         found: Any = group[name] if is_own else None
         is_array = isinstance(found, h5py.Dataset)
         if not is_own or (is_array and (found.is_virtual or found.external)):
             raise CFlowError(f"{where}: {name} is a link or lies in other files, which are not read; {_HINT}")
         if is_array and (found.shape is None or found.dtype.kind not in "biuf"):
-            raise CFlowError(f"{where}: {name} is no array of bool, integers or floats; {_HINT}")
+            raise CFlowError(f"{where}: {name} is not an array of bool, integers or floats; {_HINT}")
         return found

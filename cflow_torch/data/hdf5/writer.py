@@ -1,4 +1,4 @@
-"""Writes any log as a scene in OpenSceneFlow's HDF5 layout, and the index files beside the scenes."""
+"""Write any log as a scene in OpenSceneFlow's HDF5 layout, and the index files next to the scenes."""
 
 from __future__ import annotations
 
@@ -30,40 +30,40 @@ def write_hdf5_scene(
     """Write a log as one scene: one group per sweep, named by its time stamp.
 
     Args:
-        log: any log with poses; a `Recording` gives lidar_id, lidar_dt, lidar_center and flow_instance_id as well.
+        log: any log with poses; a `Recording` also provides lidar_id, lidar_dt, lidar_center and flow_instance_id.
         file: `<scene>.h5`.
         points_frame: "ego", or "sensor" = points and flow in the LiDAR's frame while poses and ego_motion stay those of
-            the ego frame, as OpenSceneFlow's Argoverse 2 scenes have it.
+            the ego frame, as in OpenSceneFlow's Argoverse 2 scenes.
         ego_T_lidar: (4, 4) for "sensor"; None = that of a recording's first unit.
-        store_extrinsics: leave `ego_T_lidar` as an attribute of the scene, where `HDF5Log` looks; the harness's own
+        store_extrinsics: store `ego_T_lidar` as an attribute of the scene, which `HDF5Log` reads; the harness's own
             files have none.
         pose_dtype: "float64" (Waymo, nuScenes, TruckScenes) or "float32" (Argoverse 2, ZOD).
-        eval_step: every how many labelled sweeps get an `eval_mask`: valid and not ground. 0 = none.
+        eval_step: every how many labelled sweeps get an `eval_mask` (valid and not ground); 0 = none.
 
     Convention:
         lidar, flow, ego_motion, lidar_dt, lidar_center are float32, masks bool, flow_category_indices and lidar_id
-        uint8, flow_instance_id int16. eval_mask is (N, 1). The last sweep has no flow and no ego_motion. Neither
-        chunked nor compressed. The file appears whole or not at all.
+        uint8, flow_instance_id int16. eval_mask is (N, 1). The last sweep has no flow and no ego_motion. Arrays are
+        neither chunked nor compressed. The file appears complete or not at all.
 
     Raises:
         CFlowError: h5py is missing, a sweep has no pose, there is no extrinsic for "sensor", a setting that does not
-            exist, or time stamps that are not different numbers.
+            exist, or time stamps that are not distinct numbers.
     """
     h5py = import_h5py()
     if points_frame not in ("ego", "sensor") or pose_dtype not in ("float32", "float64") or eval_step < 0:
         raise CFlowError(
-            f"points_frame={points_frame!r}, pose_dtype={pose_dtype!r}, eval_step={eval_step}: give 'ego' or 'sensor', "
-            "'float32' or 'float64', and a step of 0 or more"
+            f"points_frame={points_frame!r}, pose_dtype={pose_dtype!r}, eval_step={eval_step}: pass 'ego' or 'sensor', "
+            "'float32' or 'float64', and a step of at least 0"
         )
     extrinsics = np.eye(4)
     if points_frame == "sensor":
         if ego_T_lidar is None and hasattr(log, "units"):
             ego_T_lidar = log.units(0)[0].T_ego_sensor
         if ego_T_lidar is None:
-            raise CFlowError(f"points_frame='sensor' needs ego_T_lidar: log {log.log_id} does not know its own")
+            raise CFlowError(f"points_frame='sensor' needs ego_T_lidar, because log {log.log_id} does not have it")
         extrinsics = rigid_transform(ego_T_lidar, "ego_T_lidar")
     if len(set(log.timestamps)) < len(log.timestamps) or min(log.timestamps, default=0) < 0:
-        raise CFlowError(f"log {log.log_id}: time stamps must be different numbers from 0, they name the groups")
+        raise CFlowError(f"log {log.log_id}: time stamps must be distinct and at least 0, because they name the groups")
     file = Path(file)
     identity: dict[str, int] = {}
     with atomic_name(file) as new, h5py.File(new, "w") as scene:
@@ -76,7 +76,7 @@ def write_hdf5_scene(
 
 
 def write_index_files(folder: str | Path) -> None:
-    """Write `index_total.pkl`, `index_flow.pkl` and `index_eval.pkl` for all scenes of a folder, taken from the groups.
+    """Write `index_total.pkl`, `index_flow.pkl` and `index_eval.pkl` for all scenes of a folder.
 
     Convention: each is OpenSceneFlow's pickled list of [scene, time stamp], both strings.
 
@@ -101,7 +101,7 @@ def write_index_files(folder: str | Path) -> None:
 def _sweep(
     log: Log, index: int, extrinsics: np.ndarray, pose_dtype: str, eval_step: int, identity: dict[str, int]
 ) -> dict[str, np.ndarray]:
-    """Key -> value of one group."""
+    """Return the keys and values of one group."""
     sweep, labels = log.sweep(index), log.labels(index)
     if sweep.pose is None:
         raise CFlowError(f"sweep {index} of log {log.log_id} has no pose, which the layout needs")
@@ -139,7 +139,7 @@ def _units(units: list[Any]) -> dict[str, np.ndarray]:
 
 
 def _instances(boxes: Any, points: np.ndarray, identity: dict[str, int]) -> np.ndarray:
-    """(N,) int16, the same number for a track in every sweep, 0 = in no box."""
+    """Return (N,) int16 object ids, the same for a track in every sweep; 0 = in no box."""
     instance = np.zeros(len(points), np.int16)
     for track, size, pose in zip(boxes.track_id, boxes.size, boxes.pose):
         instance[points_in_box(points, size, pose)] = identity.setdefault(track, len(identity) + 1)

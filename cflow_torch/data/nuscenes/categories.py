@@ -1,8 +1,8 @@
-"""What nuScenes and TruckScenes call things, in the names of Argoverse 2."""
+"""Categories of nuScenes and TruckScenes as those of Argoverse 2."""
 
 from __future__ import annotations
 
-OWN_TRAILER = "vehicle.ego_trailer"  # what the recording truck of TruckScenes pulls
+OWN_TRAILER = "vehicle.ego_trailer"  # the trailer of the recording truck of TruckScenes
 
 NUSCENES_CATEGORIES: dict[str, str] = {
     "animal": "ANIMAL",
@@ -29,7 +29,7 @@ NUSCENES_CATEGORIES: dict[str, str] = {
     "vehicle.trailer": "VEHICULAR_TRAILER",
     "vehicle.truck": "TRUCK",
 }
-"""Category of a box -> name in Argoverse 2; NONE = background, though its points move as the box does."""
+"""Category of a box -> name in Argoverse 2; NONE = background, although its points move with the box."""
 
 TRUCKSCENES_CATEGORIES: dict[str, str] = {
     **NUSCENES_CATEGORIES,

@@ -18,16 +18,15 @@ from cflow_torch.data.paths import PathLike, as_path, read_bytes
 from cflow_torch.data.rigid_motion import poses_at, transform_points
 from cflow_torch.types import CFlowError, Sweep
 
-MAX_UNIT_LAG = 60_000  # microseconds from the sweep of another LiDAR to that of the reference; half a turn and a bit
-_TIME_SLICE = 10_000  # microseconds for which one place of a moving box is good enough: 0.15 m off at most at 30 m/s
-MAX_SHOT_LAG = 1_000_000  # microseconds from a shot to its sweep; beyond it, the times are not what they should be
+MAX_UNIT_LAG = 60_000  # microseconds from another LiDAR's sweep to the reference's: a bit more than half a revolution
+_TIME_SLICE = 10_000  # microseconds during which we use one position of a moving box: 0.15 m off at most at 30 m/s
+MAX_SHOT_LAG = 1_000_000  # microseconds from a shot to its sweep; larger values mean another unit or clock
 _ROW = np.dtype("<f4")
 _COLUMNS = 5  # x, y, z, intensity, ring
 
 
 class Footprint(NamedTuple):
-    """The ground that the recording vehicle stands on, metres in the ego frame: x from `rear` to `front`, y to both
-    sides."""
+    """The area of the recording vehicle, metres in the ego frame: x from `rear` to `front`, |y| up to `half_width`."""
 
     rear: float
     front: float
@@ -35,12 +34,12 @@ class Footprint(NamedTuple):
 
 
 def find_nuscenes_scenes(root: PathLike) -> list[SceneSource]:
-    """All scenes under a folder, see `nuscenes.tables.find_scenes`."""
+    """Find all scenes under a folder, see `nuscenes.tables.find_scenes`."""
     return find_scenes(root, ("ego_motion_cabin", "ego_motion_chassis"), "nuScenes")
 
 
 class NuScenesLog(Log):
-    """One nuScenes scene; implements the `Log` protocol.
+    """One nuScenes scene.
 
     Args:
         source: the scene, from `find_nuscenes_scenes`.
@@ -52,11 +51,11 @@ class NuScenesLog(Log):
 
     Attributes:
         log_id: name of the scene.
-        timestamps: sweep times as the data set has them, in microseconds; `Sweep.timestamp_ns` is in nanoseconds.
+        timestamps: sweep times of the data set, in microseconds; `Sweep.timestamp_ns` is in nanoseconds.
 
-    Convention: points are float32 in the ego frame at the sweep's time stamp (x ahead, y left, z up, origin below the
-        rear axle on the ground), which nuScenes itself compensated for ego motion; poses are float64 `T_world_ego`.
-        Points are read when asked for. `is_ground` is None: nuScenes has no ground mask.
+    Convention: points are float32 in the ego frame at the sweep's time stamp (x forward, y left, z up, origin on the
+        ground below the rear axle); nuScenes itself has compensated ego motion. Poses are float64 `T_world_ego`.
+        Points are read when you ask for them. `is_ground` is None: nuScenes has no ground mask.
 
     Raises:
         CFlowError: see `nuscenes.tables.Tables.scene`; fewer than two sweeps, an unknown category, no such LiDAR.
@@ -75,7 +74,7 @@ class NuScenesLog(Log):
         own_vehicle: Footprint | None = OWN_VEHICLE,
     ) -> None:
         if sweep_step < 1:
-            raise CFlowError(f"sweep_step={sweep_step}: it is 1 for all sweeps, 2 for every second one")
+            raise CFlowError(f"sweep_step={sweep_step}: pass 1 for all sweeps, 2 for every second one")
         self.log_id, self._root, self._own_vehicle = source.name, as_path(source.root), own_vehicle
         folder = self._root / source.version
         sample_times, known, annotations = (source.tables or Tables(folder)).scene(source.name)
@@ -94,17 +93,17 @@ class NuScenesLog(Log):
         self._tracks = Tracks(sample_times, annotations)
 
     def sweep(self, index: int) -> Sweep:
-        """Sweep number `index`: LiDAR after LiDAR, in the order of sensor.json, moved to one ego frame."""
+        """Read sweep `index`: all LiDARs in one ego frame, one after the other in the order of sensor.json."""
         points, lag = self._cloud(index)
         times = lag * 1e-6 if lag.any() else None
         return Sweep(points, None, self._poses[index].copy(), self.timestamps[index] * 1000, times)
 
     def labels(self, index: int) -> FlowLabels | None:
-        """Truth of the pair (index, index + 1), from the boxes at both times.
+        """Read the truth of the pair (index, index + 1), from the boxes at both times.
 
-        Boxes are annotated at 2 Hz; between, see `nuscenes.tracks.Tracks.at`. Where an object is annotated at only one
-        of the two samples around either sweep, its points are not valid. None for the last sweep, outside the annotated
-        time, and where the data set has no annotations.
+        Boxes are annotated at 2 Hz and interpolated by `nuscenes.tracks.Tracks.at`. If an object is annotated at only
+        one of the two samples around either sweep, its points are not valid. None for the last sweep, outside the
+        annotated time, and if the data set has no annotations.
         """
         time0 = self._timestamp(index)
         if index == len(self) - 1:
@@ -115,23 +114,23 @@ class NuScenesLog(Log):
         points, lag = self._cloud(index)
         flow = np.zeros((len(points), 3), dtype=np.float32)
         category, is_valid = np.zeros(len(points), dtype=np.uint8), np.zeros(len(points), dtype=bool)
-        # An object is where its box was when the shot hit it: boxes of both ends are taken as much later.
+        # A shot hits an object where its box is at that time, so the boxes of both ends are shifted by the same lag.
         slices, group = np.unique(lag // _TIME_SLICE, return_inverse=True)
-        for number, middle in enumerate(slices * _TIME_SLICE + (_TIME_SLICE // 2 if lag.any() else 0)):
-            rows = np.flatnonzero(group == number)
+        for position, middle in enumerate(slices * _TIME_SLICE + (_TIME_SLICE // 2 if lag.any() else 0)):
+            rows = np.flatnonzero(group == position)
             part = self._labels_of(points[rows], index, int(middle))
             flow[rows], category[rows], is_valid[rows] = part.flow, part.category, part.is_valid
         return FlowLabels(flow, category, is_valid)
 
     def _labels_of(self, points: np.ndarray, index: int, lag: int) -> FlowLabels:
-        """Labels of points that were measured `lag` microseconds after the time stamp of sweep `index`."""
+        """Compute the labels of points that were measured `lag` microseconds after the time stamp of sweep `index`."""
         time0, time1 = self.timestamps[index], self.timestamps[index + 1]
         lag = int(np.clip(lag, self._tracks.start - time0, self._tracks.end - time1))
         boxes0, boxes1 = self._boxes(time0 + lag, index), self._boxes(time1 + lag, index + 1)
         return flow_from_boxes(points, boxes0, boxes1, self._T_ego_world[index + 1] @ self._poses[index])
 
     def _boxes(self, time: int, index: int) -> Boxes:
-        """Boxes at a time in the ego frame of sweep `index`. A guessed one gets a name of its own: its track ends."""
+        """Return the boxes at a time in the ego frame of sweep `index`; a guessed box is renamed, so its track ends."""
         tracks, is_known = self._tracks.at(time) or (None, None)
         assert tracks is not None and is_known is not None
         rows = [row for row, name in enumerate(tracks.category) if name != OWN_TRAILER]
@@ -143,8 +142,10 @@ class NuScenesLog(Log):
         )
 
     def _cloud(self, index: int) -> tuple[np.ndarray, np.ndarray]:
-        """(N, 3) float32 points, ego frame of the sweep; (N,) int64 microseconds from its time stamp to each shot, 0
-        where the format does not tell."""
+        """Read (N, 3) float32 points in the ego frame of the sweep, and (N,) int64 microseconds from its time stamp.
+
+        The latter are 0 if the format does not store them.
+        """
         time = self._timestamp(index)
         parts = []
         for chain in self._lidars.values():
@@ -154,14 +155,14 @@ class NuScenesLog(Log):
         return np.concatenate([points for points, _ in parts]), np.concatenate([lag for _, lag in parts])
 
     def _unit_points(self, chain: LidarChain, row: int, index: int) -> tuple[np.ndarray, np.ndarray]:
-        """`_cloud` of one sweep of one LiDAR."""
+        """Read one sweep of one LiDAR, see `_cloud`."""
         file = path_inside(self._root, chain.files[row], f"scene {self.log_id}: the filename in sample_data.json")
-        with file_errors(file, f"copy the sensor data of scene {self.log_id} beside the tables"):
+        with file_errors(file, f"copy the sensor data of scene {self.log_id} next to the tables"):
             content = read_bytes(file)
         local, times = self._points_of(content, file)
         returned = np.isfinite(local).all(axis=1) & (local != 0).any(axis=1)
         points = transform_points(local, chain.mount[row])
-        kept = returned & ~self._is_own(points, index)  # the vehicle moves with its LiDARs, so before compensation
+        kept = returned & ~self._is_own(points, index)  # before compensation, because the vehicle moves with its LiDARs
         points = points[kept]
         if times is None:
             at = np.broadcast_to(self._T_ego_world[index] @ chain.ego[row], (len(points), 4, 4))
@@ -171,8 +172,8 @@ class NuScenesLog(Log):
             lag = np.abs(times - float(chain.times[row])).max(initial=0)
             if lag > MAX_SHOT_LAG:
                 raise CFlowError(
-                    f"{file}: timestamps of points lie up to {lag:.0f} microseconds off the sweep's; they must be "
-                    "microseconds since 1970. Open the log with deskew=False to do without"
+                    f"{file}: time stamps of points differ by up to {lag:.0f} microseconds from the sweep's; they must "
+                    "be microseconds since 1970. Pass deskew=False to ignore them"
                 )
             distinct, group = np.unique(times, return_inverse=True)
             at = (self._T_ego_world[index] @ poses_at(distinct, *self._odometry))[group]
@@ -181,11 +182,11 @@ class NuScenesLog(Log):
         return points.astype(np.float32), since
 
     def _points_of(self, content: bytes, file: Path) -> tuple[np.ndarray, np.ndarray | None]:
-        """(N, 3) points in the frame of the LiDAR; (N,) int64 microseconds, times of the shots, None = all at once."""
+        """Return (N, 3) points in the frame of the LiDAR, and the (N,) int64 microseconds of shots; None = unknown."""
         return pcd_bin_points(content, file), None
 
     def _is_own(self, points: np.ndarray, index: int) -> np.ndarray:
-        """(N,) bool, above the recording vehicle or in the box of its trailer; points in the ego frame."""
+        """Return (N,) bool: above the recording vehicle or in the box of its trailer; points in the ego frame."""
         own = np.zeros(len(points), dtype=bool)
         if self._own_vehicle is None:
             return own
@@ -200,31 +201,28 @@ class NuScenesLog(Log):
 
 
 def pcd_bin_points(content: bytes, file: PathLike) -> np.ndarray:
-    """Points of a nuScenes LiDAR sweep.
+    """Return the (N, 3) float32 points of a nuScenes LiDAR sweep.
 
     Args:
         content: of a `.pcd.bin`: rows of little-endian float32 x, y, z (metres, frame of the LiDAR), intensity, ring.
         file: name, for messages.
 
-    Returns:
-        (N, 3) float32.
-
     Raises:
-        CFlowError: it is empty, has no whole number of rows, or its last column holds no ring numbers.
+        CFlowError: it is empty, is not a whole number of rows, or its last column is not a ring index.
     """
     if not content or len(content) % (_COLUMNS * _ROW.itemsize):
         raise CFlowError(
-            f"{file} has {len(content)} bytes, no whole number of rows of five float32: it is truncated; copy it again"
+            f"{file} has {len(content)} bytes, not a multiple of a row of five float32: it is truncated; copy it again"
         )
     rows = np.frombuffer(content, dtype=_ROW).reshape(-1, _COLUMNS)
     ring = rows[:, 4]
     if not (np.isfinite(ring) & (ring >= 0) & (ring < 256) & (ring == np.floor(ring))).all():
-        raise CFlowError(f"{file}: the fifth number of a point is no ring 0 ... 255; is it a .pcd.bin of nuScenes?")
+        raise CFlowError(f"{file}: column 5 is not a ring index (0 ... 255); is it a .pcd.bin of nuScenes?")
     return rows[:, :3].astype(np.float32)
 
 
 def _is_kept(is_key_frame: np.ndarray, step: int) -> np.ndarray:
-    """(M,) bool: key frames, and every `step`-th sweep counted from the last one."""
+    """Return (M,) bool: key frames, and every `step`-th sweep counted from the last key frame."""
     row = np.arange(len(is_key_frame))
     last_key = np.maximum.accumulate(np.where(is_key_frame, row, 0))
     return (row - last_key) % step == 0

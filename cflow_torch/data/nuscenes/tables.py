@@ -1,4 +1,4 @@
-"""The tables of nuScenes and of MAN TruckScenes: JSON lists of flat rows that name each other by tokens."""
+"""The tables of nuScenes and of MAN TruckScenes: JSON lists of flat rows that refer to each other by tokens."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from cflow_torch.data.paths import PathLike, as_path, read_bytes
 from cflow_torch.data.rigid_motion import poses_from_quaternions
 from cflow_torch.types import CFlowError
 
-SEARCH_DEPTH = 3  # levels of folders below the one that is searched, to one that holds a scene.json
-_SENSOR_FOLDERS = ("samples", "sweeps", "maps")  # lie beside the tables and hold very many files
+SEARCH_DEPTH = 3  # levels of folders that are searched for a scene.json
+_SENSOR_FOLDERS = ("samples", "sweeps", "maps")  # next to the tables, with very many files
 _COPY = "copy the tables again"
 Row = Dict[str, Any]
-# The fields that are read; every other field of the format may be absent.
+# The fields that we read; every other field of the format may be missing.
 FIELDS: dict[str, tuple[str, ...]] = {
     "scene": ("token", "name"),
     "sample": ("token", "timestamp", "scene_token"),
@@ -40,13 +40,13 @@ FIELDS: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class SceneSource:
-    """Where a scene is.
+    """The location of a scene.
 
     Args:
         root: data root, which `sample_data.filename` is relative to.
         version: folder of the tables, for example "v1.0-mini".
         name: of the scene.
-        tables: the tables of that version, shared by its scenes so that they are read once; None = read them anew.
+        tables: the tables of that version, shared by its scenes so that they are read once; None = read them again.
     """
 
     root: Path
@@ -57,7 +57,7 @@ class SceneSource:
 
 @dataclass(frozen=True)
 class LidarChain:
-    """The M sweeps of one LiDAR in one scene, in the order of time.
+    """The M sweeps of one LiDAR in one scene, ordered by time.
 
     Args:
         times: (M,) int64, microseconds.
@@ -93,7 +93,7 @@ class Annotations:
 
 
 def find_scenes(root: PathLike, foreign: Collection[str], data_set: str) -> list[SceneSource]:
-    """The scenes of all versions under a folder, by folder and name. Those of one version share their tables.
+    """Find the scenes of all versions under a folder, by folder and name. Those of one version share their tables.
 
     Args:
         root: data root (it holds `v1.0-mini` or the like), the folder of one version, or a folder up to two levels
@@ -102,7 +102,7 @@ def find_scenes(root: PathLike, foreign: Collection[str], data_set: str) -> list
         data_set: its name.
 
     Raises:
-        CFlowError: `root` is no folder, a scene.json cannot be read, or all that is there is of the other data set.
+        CFlowError: `root` is not a folder, a scene.json cannot be read, or all versions are of the other data set.
     """
     what = "the data root, which holds v1.0-mini or the like"
     versions = find_folders(
@@ -120,28 +120,28 @@ def find_scenes(root: PathLike, foreign: Collection[str], data_set: str) -> list
 
 
 def read_table(folder: Path, table: str, key: str = "", values: Collection[str] = ()) -> list[Row]:
-    """Rows of a table with the fields of `FIELDS`.
+    """Read the rows of a table with the fields of `FIELDS`.
 
     Args:
         folder: of the version.
         table: name in `FIELDS`.
-        key, values: only rows whose field `key` is one of `values`; no key = all rows.
+        key, values: keep only rows whose field `key` is one of `values`; no key = all rows.
 
     Cost: memory of twice the file, and of the rows that are kept.
 
     Raises:
-        CFlowError: the file is missing, truncated, no list of rows, or a row lacks a field.
+        CFlowError: the file is missing, truncated, not a list of rows, or a row lacks a field.
     """
     file = folder / f"{table}.json"
 
-    def use(row: Row) -> Row | None:  # called for each row as it is parsed, so that the rest is never held
+    def use(row: Row) -> Row | None:  # called for each row as it is parsed, so that the rest never needs memory
         chosen = {name: row[name] for name in FIELDS[table]}
         return chosen if not key or row[key] in values else None
 
     with file_errors(file, "copy all tables of the version"):
         rows = parse_json(read_bytes(file), file, use)
         if not isinstance(rows, list) or not all(row is None or type(row) is dict for row in rows):
-            raise ValueError("it is no list of rows")
+            raise ValueError("it is not a list of rows")
         return [row for row in rows if row is not None]
 
 
@@ -150,12 +150,10 @@ def _by_token(rows: Sequence[Row]) -> dict[str, Row]:
 
 
 class Tables:
-    """The tables of one version.
+    """The tables of one version, each read once when it is needed. Only rows of LiDARs are kept.
 
     Args:
         folder: `<data root>/<version>`.
-
-    Convention: nothing is read before it is asked for, each table once. Only rows of LiDARs are kept.
 
     Cost: about 5 s per million rows (measured on one core); rows of cameras and radars are dropped while reading.
     """
@@ -167,26 +165,26 @@ class Tables:
 
     @cached_property
     def scenes(self) -> dict[str, str]:
-        """Name of each scene -> its token, by name.
+        """Name of each scene -> its token, sorted by name.
 
         Raises:
-            CFlowError: scene.json cannot be read, has two scenes of one name, or a name that no folder can have.
+            CFlowError: scene.json cannot be read, has two scenes of one name, or a name that cannot be a folder's.
         """
         rows, file = read_table(self.folder, "scene"), self.folder / "scene.json"
         scenes = {safe_name(row["name"], f"{file}: the scene"): row["token"] for row in rows}
         if len(scenes) < len(rows):
-            raise CFlowError(f"{file} has {len(rows)} scenes, but {len(scenes)} names; {_COPY}")
+            raise CFlowError(f"{file} has {len(rows)} scenes but {len(scenes)} names; {_COPY}")
         return dict(sorted(scenes.items()))
 
     def scene(self, name: str) -> tuple[np.ndarray, dict[str, LidarChain], Annotations]:
-        """All rows of a scene, linked and checked.
+        """Return all rows of a scene, linked and checked.
 
         Returns:
             Sample times (ascending int64, microseconds), LiDARs by channel in the order of sensor.json, boxes.
 
         Raises:
-            CFlowError: no such scene; a table that is missing, truncated, or no table of this format; a row that names
-                another one which does not exist; two sweeps of a LiDAR, or two samples, at one time.
+            CFlowError: no such scene; a table that is missing, truncated, or not of this format; a row that refers to
+                one that does not exist; two sweeps of a LiDAR, or two samples, at one time.
         """
         if name not in self.scenes:
             raise CFlowError(f"{self.folder / 'scene.json'} has no scene {name!r}; it has {list(self.scenes)[:5]} ...")
@@ -210,8 +208,8 @@ class Tables:
         mounts = _by_token(read_table(self.folder, "calibrated_sensor", "sensor_token", lidars))
         by_token["calibrated_sensor"] = mounts
         sweeps = read_table(self.folder, "sample_data", "calibrated_sensor_token", mounts)
-        moments = {row["ego_pose_token"] for row in sweeps}
-        by_token["ego_pose"] = _by_token(read_table(self.folder, "ego_pose", "token", moments))
+        poses = {row["ego_pose_token"] for row in sweeps}
+        by_token["ego_pose"] = _by_token(read_table(self.folder, "ego_pose", "token", poses))
         rows = {"sample_data": sweeps, "sample_annotation": read_table(self.folder, "sample_annotation")}
         for table, content in (*rows.items(), ("sample", list(by_token["sample"].values()))):
             grouped: dict[str, list[Row]] = defaultdict(list)
@@ -221,7 +219,7 @@ class Tables:
             self._rows[table] = grouped
 
     def _ordered(self, table: str, rows: Sequence[Row], key: str = "scene_token") -> list[Row]:
-        """Rows in the order of time, no two of which have one time and one `key`."""
+        """Sort rows by time; two rows of one time and one `key` are an error."""
         if len({(row["timestamp"], row[key]) for row in rows}) < len(rows):
             raise CFlowError(f"{self.folder / table}.json has two rows of one {key} and one time; {_COPY}")
         return sorted(rows, key=lambda row: row["timestamp"])
@@ -248,11 +246,11 @@ class Tables:
         )
 
     def _poses(self, table: str, rows: Sequence[Row]) -> np.ndarray:
-        """(K, 4, 4) float64."""
+        """Return (K, 4, 4) float64."""
         translation, rotation = ([row[key] for row in rows] for key in ("translation", "rotation"))
         return poses_from_quaternions(translation, rotation, lambda _: f"{self.folder / table}.json: a pose")
 
 
 def _times(rows: Sequence[Row]) -> np.ndarray:
-    """(K,) int64, microseconds."""
+    """Return (K,) int64, microseconds."""
     return np.array([row["timestamp"] for row in rows], dtype=np.int64)

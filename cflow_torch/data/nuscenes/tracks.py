@@ -1,4 +1,4 @@
-"""Annotated boxes between the times at which they are known."""
+"""Annotated boxes, interpolated between the samples at which they are known."""
 
 from __future__ import annotations
 
@@ -27,15 +27,16 @@ class Tracks:
             self._rows[int(sample)][annotations.track[row]] = row
 
     def at(self, time: int) -> tuple[Annotations, np.ndarray] | None:
-        """Boxes at a time; None before the first sample, after the last, and in a scene without annotations.
+        """Return the boxes at a time; None before the first sample, after the last, and without annotations.
 
         Returns:
-            The K boxes, and (K,) bool whether each is known: False where the time lies between two samples of which
-            only one has the object: the box is then a guess. Guesses come first.
+            The K boxes, and (K,) bool whether each is known. A box between two samples of which only one has the object
+            is a guess. Guesses come first.
 
-        Convention: at a sample its own boxes. Between two samples the centre moves on a straight line, the rotation at
-        a constant rate, the size changes linearly. An object that only one of the two samples has goes on as between
-        that sample and the next one beyond; if that lacks it too, it stays where it is.
+        Convention: at a sample, its own boxes. Between two samples the centre and the size change linearly, the
+            rotation at a
+        constant rate. An object that only one of the two samples has continues its motion between that sample and the
+        next one beyond; if that one lacks it too, the object stays where it is.
         """
         times = self._times
         if not len(self._annotations.time) or not times[0] <= time <= times[-1]:
@@ -44,7 +45,7 @@ class Tracks:
         rows = dict(enumerate(self._rows))
         if times[left] == time:
             return self._boxes(time, [(row, row, 0.0, True) for row in rows[left].values()])
-        ends: list[tuple[int, int, float, bool]] = []  # row at one end, row at the other, how far between, is it known
+        ends: list[tuple[int, int, float, bool]] = []  # row at one end, row at the other, fraction, whether it is known
         for track, row in {**rows[left], **rows[left + 1], **rows[left]}.items():  # those of `left` come first
             both = [k for k in (left, left - 1, left + 1) if track in rows.get(k, ()) and track in rows.get(k + 1, ())]
             start = both[0] if both else None

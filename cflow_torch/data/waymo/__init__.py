@@ -1,4 +1,4 @@
-"""Waymo Open, version 2: reader."""
+"""Waymo Open Dataset, version 2: reader (experimental)."""
 
 from cflow_torch.data.waymo.reader import WaymoLog, find_waymo_segments
 

@@ -22,14 +22,14 @@ SEGMENT, TIME, LASER, TRACK = (
 LIDAR, PIXEL_POSE = "[LiDARComponent].range_image_return", "[LiDARPoseComponent].range_image_return1"
 CALIBRATION, BOX = "[LiDARCalibrationComponent].", "[LiDARBoxComponent]."
 VEHICLE_POSE = "[VehiclePoseComponent].world_from_vehicle.transform"
-"""Beginnings of the columns that are read, and one whole name."""
+"""Prefixes of the columns that we read, and one complete name."""
 
-_BATCH = 8  # rows of range images held at once while looking for one
+_BATCH = 8  # rows of range images in memory at once during the search for one
 Key = Tuple[int, int]  # frame time in microseconds, laser
 
 
 class Component:
-    """One of the parquet files of a segment; opened when something of it is asked for.
+    """One of the parquet files of a segment, opened when it is needed.
 
     Args:
         segment: `<split>/lidar/<segment>.parquet`.
@@ -41,34 +41,28 @@ class Component:
 
     def __init__(self, segment: Path, tag: str) -> None:
         self.file = segment.parent.parent / tag / segment.name
-        self._mend = f"download component {tag} of this segment"
-        self._numbers: dict[Key, int] = {}  # of the rows
+        self._hint = f"download component {tag} of this segment"
+        self._row_of: dict[Key, int] = {}
 
     def rows(self, columns: Sequence[str]) -> list[dict[str, Any]]:
-        """Rows of the file, of these columns.
+        """Read some columns of all rows.
 
         Raises:
             CFlowError: the file is missing, lacks a column or cannot be read.
         """
-        with file_errors(self.file, self._mend):
+        with file_errors(self.file, self._hint):
             parquet = pq.ParquetFile(source_for_random_access(self.file))
-            check_columns(self.file, parquet.schema_arrow.names, columns, self._mend)
-            rows: list[dict[str, Any]] = parquet.read(list(columns), use_threads=False).to_pylist()
-            return rows
+            check_columns(self.file, parquet.schema_arrow.names, columns, self._hint)
+            return list(parquet.read(list(columns), use_threads=False).to_pylist())
 
     def frame_lasers(self) -> Collection[Key]:
-        """Frame time (microseconds) and laser of every row.
-
-        Raises:
-            CFlowError: as `rows`.
-        """
-        if not self._numbers:
-            rows = self.rows((TIME, LASER))
-            self._numbers = {(row[TIME], row[LASER]): number for number, row in enumerate(rows)}
-        return self._numbers
+        """Return the frame time (microseconds) and laser of every row."""
+        if not self._row_of:
+            self._row_of = {(row[TIME], row[LASER]): index for index, row in enumerate(self.rows((TIME, LASER)))}
+        return self._row_of
 
     def images(self, keys: Sequence[Key], column: str, channels: int) -> dict[Key, np.ndarray | None]:
-        """Range images of some rows.
+        """Read the range images of some rows.
 
         Args:
             keys: frame times and lasers.
@@ -76,47 +70,46 @@ class Component:
             channels: of each image.
 
         Returns:
-            Key -> (H, W, channels) image, None where the file has a null.
+            Key -> (H, W, channels) image, None if the file has a null.
 
         Cost: decodes every row group that holds a wanted row, a few rows at a time.
 
         Raises:
-            CFlowError: there is no such row, the file cannot be read, or a cell is no image.
+            CFlowError: there is no such row, the file cannot be read, or a cell is not an image.
         """
         missing = [key for key in keys if key not in self.frame_lasers()]
         if missing:
             raise CFlowError(f"{self.file} has no row for frame {missing[0][0]}, laser {missing[0][1]}; copy it again")
-        wanted = {self._numbers[key]: key for key in keys}
+        wanted = {self._row_of[key]: key for key in keys}
         columns = [f"{column}.values", f"{column}.shape"]
         images: dict[Key, np.ndarray | None] = {}
-        with file_errors(self.file, self._mend):
+        with file_errors(self.file, self._hint):
             parquet, end = pq.ParquetFile(source_for_mmap(self.file)), 0
-            check_columns(self.file, parquet.schema_arrow.names, columns, self._mend)
+            check_columns(self.file, parquet.schema_arrow.names, columns, self._hint)
             for group in range(parquet.num_row_groups):
-                number, end = end, end + parquet.metadata.row_group(group).num_rows
-                if not any(number <= row < end for row in wanted):
+                row, end = end, end + parquet.metadata.row_group(group).num_rows
+                if not any(row <= index < end for index in wanted):
                     continue
                 for batch in parquet.iter_batches(_BATCH, [group], columns, use_threads=False):
                     for values, shape in zip(*(batch.column(name) for name in columns)):
-                        if number in wanted:
-                            images[wanted[number]] = _image(values, shape, channels)
-                        number += 1
+                        if row in wanted:
+                            images[wanted[row]] = _image(values, shape, channels)
+                        row += 1
         return images
 
 
 def matrix_of(values: Any, where: str) -> np.ndarray:
-    """(4, 4) float64 rigid motion from 16 numbers, row by row."""
+    """Return a (4, 4) float64 rigid motion from 16 numbers, row by row."""
     if values is None or len(values) != 16:
-        raise CFlowError(f"{where} must be 16 numbers, row by row, got {0 if values is None else len(values)}")
+        raise CFlowError(f"{where} must have 16 numbers, row by row, got {0 if values is None else len(values)}")
     return rigid_transform(np.reshape(values, (4, 4)), where)
 
 
 def _image(values: Any, shape: Any, channels: int) -> np.ndarray | None:
-    """(H, W, channels) image of a list cell; None where the cell is null or empty."""
+    """Return the (H, W, channels) image of a list cell; None if the cell is null or empty."""
     if not values.is_valid or not shape.is_valid or not len(values.values) or not len(shape.values):
         return None
     size, flat = shape.as_py(), values.values
     if len(size) != 3 or size[2] != channels or flat.null_count:
-        raise ValueError(f"a range image of shape (H, W, {channels}) was expected, got {size}, {flat.null_count} empty")
-    image: np.ndarray = flat.to_numpy().reshape(size)
-    return image
+        raise ValueError(f"a range image must be (H, W, {channels}) without nulls, got {size}, {flat.null_count} nulls")
+    return np.asarray(flat.to_numpy().reshape(size))

@@ -1,4 +1,4 @@
-"""Waymo's range images: which ray a pixel is, and where its return lies in the vehicle frame."""
+"""Waymo's range images: the ray of each pixel, and the position of its return in the vehicle frame."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from cflow_torch.types import CFlowError
 from cflow_torch.windows.ego_motion import rigid_transform
 
 LASERS = {"TOP": 1, "FRONT": 2, "SIDE_LEFT": 3, "SIDE_RIGHT": 4, "REAR": 5}
-"""Laser name -> the number that files store; 0 is unknown."""
+"""Laser name -> number in the files; 0 is unknown."""
 
 TOP = LASERS["TOP"]
 RANGE, INTENSITY, ELONGATION, NO_LABEL_ZONE = range(4)
-"""Channels of a range image. Range is in metres, > 0 where there is a return; the zone is 1 inside, else not."""
+"""Channels of a range image. Range is in metres, > 0 where there is a return; the zone is 1 inside, else outside."""
 
 
 @dataclass(frozen=True)
 class LaserCalibration:
-    """Where one laser is mounted and which way its rows look.
+    """Mounting of one laser and the inclinations of its rows.
 
     Args:
         T_ego_sensor: (4, 4) float64, laser coordinates to the vehicle's.
         inclinations: (H,) float64 radians, ascending; None = evenly spaced between `low` and `high`.
-        low, high: radians, outer edges of the lowest and the highest row, used where `inclinations` is None.
+        low, high: radians, outer edges of the lowest and the highest row, used if `inclinations` is None.
     """
 
     T_ego_sensor: np.ndarray
@@ -35,43 +35,36 @@ class LaserCalibration:
     high: float = 0.0
 
     def row_inclinations(self, num_rows: int) -> np.ndarray:
-        """(H,) float64 radians above the laser's xy plane; row 0 is the highest.
+        """Return (H,) float64 radians above the laser's xy plane; row 0 is the highest.
 
         Raises:
-            CFlowError: the table has another number of rows than the image, or an entry that is not finite.
+            CFlowError: the calibration has another number of rows than the image, or an entry that is not finite.
         """
         ascending = self.inclinations
         if ascending is None:
             ascending = self.low + (np.arange(num_rows) + 0.5) / num_rows * (self.high - self.low)
         if ascending.shape != (num_rows,) or not np.isfinite(ascending).all():
             raise CFlowError(
-                f"a range image of {num_rows} rows needs {num_rows} finite beam inclinations, the calibration has "
+                f"a range image of {num_rows} rows needs {num_rows} finite beam inclinations, but the calibration has "
                 f"{np.isfinite(ascending).sum()}; take both files from the same segment"
             )
         return ascending[::-1]
 
     def column_azimuths(self, num_columns: int) -> np.ndarray:
-        """(W,) float64 radians about the laser's z axis, falling: column 0 looks to the rear of the vehicle."""
+        """Return (W,) float64 radians about the laser's z axis, descending; column 0 points backwards."""
         yaw = np.arctan2(self.T_ego_sensor[1, 0], self.T_ego_sensor[0, 0])
         share = (num_columns - np.arange(num_columns) - 0.5) / num_columns
         return (2 * share - 1) * np.pi - yaw
 
 
 def directions(azimuth: np.ndarray, inclination: np.ndarray) -> np.ndarray:
-    """(..., 3) float64 unit vectors, laser frame."""
+    """Return (..., 3) float64 unit vectors in the laser frame."""
     flat = np.cos(inclination)
     return np.stack([np.cos(azimuth) * flat, np.sin(azimuth) * flat, np.sin(inclination)], axis=-1)
 
 
 def rotations_from_angles(angles: np.ndarray) -> np.ndarray:
-    """Rotation matrices Rz(yaw) Ry(pitch) Rx(roll).
-
-    Args:
-        angles: (N, 3) roll, pitch, yaw, radians.
-
-    Returns:
-        (N, 3, 3) float64.
-    """
+    """Return the (N, 3, 3) float64 rotations Rz(yaw) Ry(pitch) Rx(roll) of (N, 3) roll, pitch, yaw in radians."""
     from kornia.geometry.conversions import quaternion_from_euler, quaternion_to_rotation_matrix
 
     roll, pitch, yaw = torch.from_numpy(np.asarray(angles, dtype=np.float64)).unbind(1)
@@ -86,20 +79,20 @@ def range_image_points(
     pixel_poses: np.ndarray | None = None,
     T_world_ego: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points of all pixels that have a return.
+    """Return the points of all pixels that have a return.
 
     Args:
         image: (H, W, 4) float: range (metres), intensity, elongation, no-label-zone flag.
         calibration: of the laser.
-        pixel_poses: (H, W, 6) roll, pitch, yaw, x, y, z of `T_world_ego` at the moment of each pixel. Only the TOP
-            laser has them; the images of the others are made for the vehicle pose of the frame.
+        pixel_poses: (H, W, 6) roll, pitch, yaw, x, y, z of `T_world_ego` at the time of each pixel. Only the TOP laser
+            has them; the images of the others are made for the vehicle pose of the frame.
         T_world_ego: (4, 4) float64 vehicle pose of the frame; needed with `pixel_poses`.
 
     Returns:
         points: (N, 3) float64, metres, vehicle frame of the frame.
         pixels: (N,) int64, row * W + column, ascending.
 
-    Convention: float64 throughout: world coordinates are about 10 km, where float32 has steps of 1 mm.
+    Convention: float64 throughout, because world coordinates are about 10 km, where float32 has steps of 1 mm.
 
     Raises:
         CFlowError: shapes that do not fit, or a frame pose that is missing or not rigid.
@@ -115,8 +108,8 @@ def range_image_points(
         return points, pixels
     if pixel_poses.shape != (num_rows, num_columns, 6) or T_world_ego is None:
         raise CFlowError(
-            f"pixel poses of a {num_rows} x {num_columns} image have shape ({num_rows}, {num_columns}, 6) and need the "
-            f"pose of the frame, got {pixel_poses.shape}"
+            f"pixel poses have shape {pixel_poses.shape}, they must have ({num_rows}, {num_columns}, 6), and need the "
+            "pose of the frame"
         )
     poses = pixel_poses.reshape(-1, 6)[pixels].astype(np.float64)
     world = np.einsum("nij,nj->ni", rotations_from_angles(poses[:, :3]), points) + poses[:, 3:]

@@ -1,4 +1,4 @@
-"""Reader of the Waymo Open Dataset, version 2 (parquet), with pyarrow alone."""
+"""Experimental reader of the Waymo Open Dataset, version 2 (parquet), with pyarrow alone."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ from cflow_torch.windows.ego_motion import relative_transform
 
 SEARCH_DEPTH = 2  # <root>/<data set>/<split>
 BOX_CATEGORY = {0: "NONE", 1: "REGULAR_VEHICLE", 2: "PEDESTRIAN", 3: "SIGN", 4: "BICYCLIST"}
-"""Waymo's box type -> Argoverse 2 name. Trucks, buses and motorcycles are of type 1 too; 0 is unknown."""
+"""Waymo's box type -> Argoverse 2 name. Trucks, buses and motorcycles have type 1, too; 0 is unknown."""
 
-_KEPT_FRAMES = 2  # the labels of a pair are asked for after both of its sweeps
+_KEPT_FRAMES = 2  # the labels of a pair are read after both of its sweeps
 
 
 def find_waymo_segments(root: PathLike) -> list[Path]:
-    """The LiDAR files `<split>/lidar/<segment>.parquet` of all segments under a folder, sorted.
+    """Find the LiDAR files `<split>/lidar/<segment>.parquet` of all segments, sorted.
 
     Args:
         root: such a file, a folder `lidar`, a split (holds `lidar`), or a folder at most three levels above `lidar`.
@@ -52,20 +52,20 @@ def find_waymo_segments(root: PathLike) -> list[Path]:
     root = root.parent if root.name == "lidar" else root
     if root.suffix == ".tfrecord" or next(root.glob("*.tfrecord"), None):
         raise CFlowError(
-            f"{root}: .tfrecord is version 1 of the Waymo Open Dataset, which is not read; download the parquet files "
-            "of version 2, which has the same drives: lidar, lidar_pose, lidar_calibration, vehicle_pose, lidar_box"
+            f"{root}: .tfrecord is version 1 of the Waymo Open Dataset, which we do not read; download the parquet "
+            "files of version 2 (same drives): lidar, lidar_pose, lidar_calibration, vehicle_pose, lidar_box"
         )
     splits = find_folders(root, lambda folder: (folder / "lidar").is_dir(), SEARCH_DEPTH, what)
     return sorted(file for split in splits for file in (split / "lidar").glob("*.parquet"))
 
 
 class WaymoLog(Log):
-    """One segment; implements the `Log` protocol.
+    """One segment. Experimental: of the released files we could test only the poses, no range images.
 
     Args:
-        file: `<split>/lidar/<segment>.parquet`; the other components lie beside that folder, under the same name.
-        lasers: which LiDARs, names in `waymo.range_image.LASERS`. Those that the segment does not have are left out.
-        both_returns: also the second return of each pixel, after all first returns of its laser.
+        file: `<split>/lidar/<segment>.parquet`; the other components lie next to that folder, under the same name.
+        lasers: names in `waymo.range_image.LASERS`. Those that the segment does not have are left out.
+        both_returns: also read the second return of each pixel, after all first returns of its laser.
 
     Attributes:
         log_id: name of the segment.
@@ -73,7 +73,7 @@ class WaymoLog(Log):
 
     Convention:
         - Points are float32 in the vehicle frame of their frame (x forward, y left, z up, origin at the rear axle),
-          computed in float64: laser by laser, in each row by row of the range image.
+          computed in float64: laser by laser, and row by row of the range image.
         - `T_world_ego` is `world_from_vehicle`, about the middle of the TOP scan.
         - The data set has no ground masks: `is_ground` is None.
         - Truth comes from box tracks. Points in a no-label zone are invalid; boxes of unknown type are background.
@@ -89,9 +89,9 @@ class WaymoLog(Log):
         self.file = as_path(file)
         unknown = sorted(set(lasers) - set(LASERS))
         if unknown or not lasers:
-            raise CFlowError(f"lasers are some of {', '.join(LASERS)}; got {list(lasers)}")
+            raise CFlowError(f"lasers={list(lasers)}: choose some of {', '.join(LASERS)}")
         if self.file.parent.name != "lidar":
-            raise CFlowError(f"{self.file} does not lie in a folder lidar; give <split>/lidar/<segment>.parquet")
+            raise CFlowError(f"{self.file} is not in a folder lidar; pass <split>/lidar/<segment>.parquet")
         self.log_id = self.file.stem
         self._returns = (1, 2) if both_returns else (1,)
         self._images, self._pixel_poses = Component(self.file, "lidar"), Component(self.file, "lidar_pose")
@@ -110,12 +110,11 @@ class WaymoLog(Log):
         self._frame = lru_cache(_KEPT_FRAMES)(self._read_frame)
 
     def sweep(self, index: int) -> Sweep:
-        """Sweep number `index`, without ground mask."""
         time = self._timestamp(index) // 1000
         return Sweep(self._frame(time)[0].copy(), None, self._poses[time].copy(), time * 1000)
 
     def labels(self, index: int) -> FlowLabels | None:
-        """Truth of the pair (index, index + 1) from `lidar_box`; None for the last sweep and segments without boxes."""
+        """Read the truth of the pair (index, index + 1) from `lidar_box`; None for the last sweep and without boxes."""
         time0 = self._timestamp(index) // 1000
         if index == len(self) - 1:
             return None
@@ -125,24 +124,20 @@ class WaymoLog(Log):
             return None
         time1 = self._timestamp(index + 1) // 1000
         points, in_no_label_zone = self._frame(time0)
-        nobody = make_boxes([], [], [], [])
-        labels = flow_from_boxes(
-            points,
-            self._boxes.get(time0, nobody),
-            self._boxes.get(time1, nobody),
-            relative_transform(self._poses[time1], self._poses[time0]),
-        )
+        boxes0, boxes1 = (self._boxes.get(time, make_boxes([], [], [], [])) for time in (time0, time1))
+        T_ego1_ego0 = relative_transform(self._poses[time1], self._poses[time0])
+        labels = flow_from_boxes(points, boxes0, boxes1, T_ego1_ego0)
         return FlowLabels(labels.flow, labels.category, labels.is_valid & ~in_no_label_zone)
 
     def _read_frame(self, time: int) -> tuple[np.ndarray, np.ndarray]:
-        """(N, 3) float32 points in the vehicle frame; (N,) bool whether each lies in a no-label zone."""
+        """Read the (N, 3) float32 points in the vehicle frame, and (N,) bool whether each lies in a no-label zone."""
         keys = [(time, laser) for laser in self._lasers]
         images = [self._images.images(keys, f"{LIDAR}{number}", 4) for number in self._returns]
         pixel_pose = None
         if TOP in self._lasers:
             pixel_pose = self._pixel_poses.images([(time, TOP)], PIXEL_POSE, 6)[time, TOP]
             if pixel_pose is None:
-                raise CFlowError(f"{self._pixel_poses.file}: the pixel poses of frame {time} are empty; copy it again")
+                raise CFlowError(f"{self._pixel_poses.file} has no pixel poses of frame {time}; copy it again")
         points, zone = [np.zeros((0, 3))], [np.zeros(0, dtype=bool)]
         for key in keys:
             for image in (of_return[key] for of_return in images):
@@ -150,8 +145,8 @@ class WaymoLog(Log):
                     continue
                 poses = pixel_pose if key[1] == TOP else None
                 with file_errors(f"{self.file}, frame {time}, laser {key[1]}"):
-                    there, pixels = range_image_points(image, self._calibration[key[1]], poses, self._poses[time])
-                points.append(there)
+                    found, pixels = range_image_points(image, self._calibration[key[1]], poses, self._poses[time])
+                points.append(found)
                 zone.append(image.reshape(-1, image.shape[2])[pixels, NO_LABEL_ZONE] == 1)
         return np.concatenate(points).astype(np.float32), np.concatenate(zone)
 
@@ -175,7 +170,7 @@ class WaymoLog(Log):
         return calibration
 
     def _read_poses(self, times: Sequence[int]) -> dict[int, np.ndarray]:
-        """Frame time -> (4, 4) float64 `T_world_ego`."""
+        """Read frame time -> (4, 4) float64 `T_world_ego`."""
         component = Component(self.file, "vehicle_pose")
         stored = {row[TIME]: row[VEHICLE_POSE] for row in component.rows((TIME, VEHICLE_POSE))}
         missing = [time for time in times if time not in stored]
@@ -184,7 +179,7 @@ class WaymoLog(Log):
         return {time: matrix_of(stored[time], f"{component.file}: the pose of frame {time}") for time in times}
 
     def _read_boxes(self) -> dict[int, Boxes]:
-        """Frame time -> boxes; empty where the segment has no labels (the testing split)."""
+        """Read frame time -> boxes; empty if the segment has no labels (the testing split)."""
         component = Component(self.file, "lidar_box")
         file = component.file
         with remote_errors(file):

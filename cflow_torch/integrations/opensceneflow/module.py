@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from cflow_torch.config import WINDOW, Config, make_config
-from cflow_torch.data.hdf5.frames import beside_harness, harness_pose_flow
+from cflow_torch.data.hdf5.frames import harness_pose_flow, residual_for_harness
 from cflow_torch.estimate import make_model
 from cflow_torch.integrations.opensceneflow.batch import Sample, read_batch
 from cflow_torch.types import CFlowError, FlowResult
@@ -120,7 +120,7 @@ class CFlow(nn.Module):
         device = residual.device
         points, rows = pc0.detach().to(device).float(), sample.rows0.to(device)
         if sample.T_lidar1_lidar0 is not None:
-            residual = beside_harness(residual, points[rows], sample.T_ego1_ego0, sample.T_lidar1_lidar0)
+            residual = residual_for_harness(residual, points[rows], sample.T_ego1_ego0, sample.T_lidar1_lidar0)
         flow = torch.zeros_like(points).index_copy_(0, rows, residual)
         if self.output == "valid":
             rows = rows[result.is_valid]
