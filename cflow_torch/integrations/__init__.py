@@ -1,1 +1,1 @@
-"""CorrelationFlow inside other code bases: OpenSceneFlow, BucketedSceneFlowEval, SceneFlowZoo."""
+"""The methods as models of other code bases: OpenSceneFlow, BucketedSceneFlowEval and SceneFlowZoo."""

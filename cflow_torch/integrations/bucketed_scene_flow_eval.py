@@ -1,4 +1,4 @@
-"""CorrelationFlow as an estimator for BucketedSceneFlowEval: its frames in, its `EgoLidarFlow` out."""
+"""An estimator for BucketedSceneFlowEval: its frames in, its `EgoLidarFlow` out."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from cflow_torch.windows.ego_motion import rigid_transform
 
 
 class CorrelationFlowEstimator:
-    """Flow for the frames that a data set of BucketedSceneFlowEval (2.0.25) yields.
+    """Estimates flow for the frames of a data set of BucketedSceneFlowEval (2.0.25).
 
     Args:
         preset, device, ground, **settings: as for `SequenceFlow`, for example `num_history=2`.
@@ -26,45 +26,48 @@ class CorrelationFlowEstimator:
         self.sequence_flow = SequenceFlow(preset, device, ground, **settings)
 
     def __call__(self, frames: Sequence[Any]) -> list[Any]:
-        """Flow of every frame but the last.
+        """Estimate the flow of every frame but the last.
 
         Args:
-            frames: K >= 2 `TimeSyncedSceneFlowFrame` (or raw frames) of one log, consecutive, in order of time: an item
-                of a data set; or pairs (frame, `TimeSyncedAVLidarData`), as a sequence's `load_frame_list` gives them.
+            frames: K >= 2 consecutive `TimeSyncedSceneFlowFrame` (or raw frames) of one log, in order of time, such as
+                an item of a data set; or pairs (frame, `TimeSyncedAVLidarData`), as `load_frame_list` returns them.
 
         Returns:
-            K - 1 `EgoLidarFlow`: flow i is for all points of `frames[i].pc.full_pc`, in their order.
+            K - 1 `EgoLidarFlow`. Flow i has a row for each point of `frames[i].pc.full_pc`, in their order.
 
         Convention:
-            full_flow: (N, 3) float32, metres until frame i + 1, residual (ego motion taken out), axes of frame i's
-                points. 0 for points that take no part (ground, outside `point_cloud_range`).
-            mask: the frame's own `pc.mask`. A 0 outside the method's range is a prediction like any other.
-            Frames before i are its history, as many as there are, at most `num_history`.
-            A point takes part if `pc.mask` is True (not ground, in the data set's range); of a pair (frame, data), if
-                also `is_ground_points` is False. `in_range_mask` of a pair is not used.
+            full_flow: (N, 3) float32, metres until frame i + 1, residual (ego motion removed), in the axes of the
+                points of frame i. 0 for inactive points and outside `point_cloud_range`.
+            mask: the frame's own `pc.mask`. A flow of 0 outside the method's range is scored like any other.
+            The history of frame i is the frames before it, at most `num_history`.
+            A point is active if `pc.mask` is True (not ground, in the range of the data set) and, in a pair
+                (frame, data), `is_ground_points` is False. `in_range_mask` of a pair is ignored.
 
         Raises:
-            CFlowError: by the name of the field, for example "frames[1].pc.mask"; the package is not installed.
+            CFlowError: a bad field, which the message names ("frames[1].pc.mask"); the package is not installed.
         """
         return self._flows(_read_frames(frames), 0)
 
     def last(self, frames: Sequence[Any]) -> Any:
-        """The `EgoLidarFlow` of `frames[-2]`: what a causal data set scores. Frames and errors as for `__call__`."""
+        """Estimate the `EgoLidarFlow` of `frames[-2]`, which a causal data set scores; arguments as for a call."""
         return self._flows(_read_frames(frames), len(frames) - 2)[0]
 
     def evaluate(self, dataset: Any) -> Any:
-        """Estimate and score all that a data set scores.
+        """Estimate and score all frames that a data set scores.
 
         Args:
-            dataset: an `AbstractDataset`. Causal: the frame before the last of each item is scored; non-causal: every
-                frame but the last.
+            dataset: an `AbstractDataset`. A causal one scores the frame before the last of each item, a non-causal one
+                every frame but the last.
 
         Returns:
-            `dataset.evaluator()`, fed; `compute_results()` is yours to call. Errors as for `__call__`.
+            `dataset.evaluator()` with all flows added. Call its `compute_results()`.
 
         Convention:
-            Items that overlap (a causal data set, step 1) lend each other their history: with `subsequence_length=2`
-            every frame of a log but its last is scored, the first ones with a shorter history.
+            Items that overlap (a causal data set, step 1) share their history. With `subsequence_length=2`, every frame
+            of a log but its last is scored, the first ones with a shorter history.
+
+        Raises:
+            CFlowError: as for a call.
         """
         evaluator = dataset.evaluator()
         is_causal = dataset.loader_type().name == "CAUSAL"
@@ -84,13 +87,13 @@ class CorrelationFlowEstimator:
         flow_class = import_from("bucketed_scene_flow_eval.datastructures", "EgoLidarFlow", how)
         (flows,) = self.sequence_flow([[frame.sweep for frame in frames]], [first])
         return [
-            flow_class(full_flow=flow.cpu().numpy(), mask=frame.mask.copy())  # its evaluator overwrites masks
+            flow_class(full_flow=flow.cpu().numpy(), mask=frame.mask.copy())  # the evaluator overwrites masks
             for flow, frame in zip(flows, frames[first:])
         ]
 
 
 class _LogFrame(NamedTuple):
-    """A frame, its place (log, number of the sweep in it) and (N,) bool `pc.mask`."""
+    """A frame with its log, its index there, and (N,) bool `pc.mask`."""
 
     log_id: str
     log_idx: int
@@ -99,25 +102,25 @@ class _LogFrame(NamedTuple):
 
 
 def _read_frames(frames: Any) -> list[_LogFrame]:
-    """Checked frames of one log; their fields matter, not their classes."""
+    """Read and check the frames of one log. Any class with the same fields is accepted."""
     if not isinstance(frames, (list, tuple)) or len(frames) < 2:
         raise CFlowError("frames: give a list of at least two frames of one log, in order of time")
     pairs = [frame if isinstance(frame, tuple) and len(frame) == 2 else (frame, None) for frame in frames]
     read = [_read_frame(f"frames[{i}]", *pair) for i, pair in enumerate(pairs)]
     for i, (old, new) in enumerate(zip(read, read[1:]), 1):
         if (new.log_id, new.log_idx) != (old.log_id, old.log_idx + 1):
-            places = f"{new.log_id!r}, {new.log_idx} after {old.log_id!r}, {old.log_idx}"
-            raise CFlowError(f"frames[{i}].log_id, log_idx: {places}; give consecutive frames of one log")
+            found = f"{new.log_id!r}, {new.log_idx} after {old.log_id!r}, {old.log_idx}"
+            raise CFlowError(f"frames[{i}].log_id, log_idx: {found}; give consecutive frames of one log")
     stamps = times_in_ns([frame.log_timestamp for frame, _ in pairs])
     return [frame._replace(sweep=replace(frame.sweep, timestamp_ns=t)) for frame, t in zip(read, stamps)]
 
 
 def _read_frame(name: str, frame: Any, data: Any) -> _LogFrame:
-    """A frame without its time; `data` is its `TimeSyncedAVLidarData`, or None."""
+    """Read a frame without its time; `data` is its `TimeSyncedAVLidarData`, or None."""
     points = np.asarray(getattr(frame.pc.full_pc, "points", frame.pc.full_pc))
     if points.ndim != 2 or points.shape[1] != 3:
         raise CFlowError(f"{name}.pc.full_pc has shape {points.shape}: give (N, 3) metres")
-    if points.dtype == np.float16:  # the files of Argoverse 2, which our own reader converts as well
+    if points.dtype == np.float16:  # of the files of Argoverse 2; our own reader converts them as well
         points = points.astype(np.float32)
     is_active = mask = _mask(frame.pc.mask, f"{name}.pc.mask", len(points))
     if data is not None:
@@ -127,9 +130,9 @@ def _read_frame(name: str, frame: Any, data: Any) -> _LogFrame:
 
 
 def _earlier(known: Sequence[_LogFrame], first: _LogFrame, num_history: int) -> list[_LogFrame]:
-    """Known frames before `first`, at most `num_history`, with poses in the global frame that `first` has."""
+    """Known frames before `first`, at most `num_history`, with poses in the global frame of `first`."""
     same = [frame for frame in known if (frame.log_id, frame.log_idx) == (first.log_id, first.log_idx)]
-    if not same:  # another log, or items that do not overlap: their global frames have nothing in common
+    if not same:  # another log, or items that do not overlap, whose global frames are unrelated
         return []
     shift = first.sweep.ego_to_global @ np.linalg.inv(same[0].sweep.ego_to_global)
     older = [frame for frame in known if frame.log_idx < first.log_idx]

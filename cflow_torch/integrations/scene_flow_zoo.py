@@ -1,4 +1,4 @@
-"""CorrelationFlow as a model of SceneFlowZoo: `TorchFullFrameInputSequence` in, `TorchFullFrameOutputSequence` out."""
+"""A model of SceneFlowZoo: `TorchFullFrameInputSequence` in, `TorchFullFrameOutputSequence` out."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from cflow_torch.types import CFlowError
 from cflow_torch.windows.ego_motion import rigid_transform
 
 _HOW = (
-    "SceneFlowZoo is no package; clone github.com/kylevedder/SceneFlowZoo, install its requirements, and run from its "
-    "root folder or put that on PYTHONPATH"
+    "SceneFlowZoo is not a package: clone github.com/kylevedder/SceneFlowZoo, install its requirements, and run from "
+    "its root folder or add that to PYTHONPATH"
 )
 _POSES = ("pc_poses_sensor_to_ego", "pc_poses_ego_to_global")
 
 
 class CorrelationFlowModel(nn.Module):
-    """What SceneFlowZoo's `ModelWrapper` asks of a model. No parameters, no buffers, nothing to train.
+    """A method with the interface that SceneFlowZoo's `ModelWrapper` expects. There is nothing to train.
 
     Args:
         preset, ground, **settings: as for `SequenceFlow`, for example `num_history=3`.
-        device: "auto" = that of the sequence; another one only computes there, the output comes back.
+        device: device for the computation; "auto" = that of the sequence. The output is on that of the sequence.
 
     Raises:
         CFlowError: an unknown setting or an invalid value.
@@ -34,27 +34,29 @@ class CorrelationFlowModel(nn.Module):
         self.sequence_flow = SequenceFlow(preset, device, ground, **settings)
 
     def forward(self, forward_mode: Any, batched_sequence: Any, logger: Any = None) -> list[Any]:
-        """Flow of a batch of sequences.
+        """Estimate the flow of a batch of sequences.
 
         Args:
-            forward_mode: not used: there is no other way to run in training.
-            batched_sequence: B `TorchFullFrameInputSequence`, K >= 2 sweeps each. Used are full_pc (K, PadN, 3),
-                full_pc_mask (K, PadN), pc_poses_sensor_to_ego and pc_poses_ego_to_global (K, 4, 4), loader_type.
-            logger: not used.
+            forward_mode: ignored, because training runs no differently.
+            batched_sequence: B `TorchFullFrameInputSequence`, K >= 2 sweeps each. We use full_pc (K, PadN, 3),
+                full_pc_mask (K, PadN), pc_poses_sensor_to_ego and pc_poses_ego_to_global (K, 4, 4), and loader_type.
+            logger: ignored.
 
         Returns:
-            B `TorchFullFrameOutputSequence`, on the device of their input. Causal loader: one flow, of sweep K - 2;
-            the sweeps before it are history. Non-causal loader: K - 1 flows; the sweeps before i are history of i.
+            B `TorchFullFrameOutputSequence`, on the device of their input. A causal loader gets one flow, of sweep
+            K - 2, with the sweeps before it as history. A non-causal loader gets K - 1 flows; the sweeps before i are
+            the history of i.
 
         Convention:
-            ego_flows: (1 or K - 1, PadN, 3) float32, metres until the next sweep, residual (ego motion taken out), axes
-                of the sweep's own points; 0 for points that take no part, NaN in padding rows.
-            valid_flow_mask: float32 like the loader's masks: `full_pc_mask` as 0 and 1, NaN in padding rows. A 0
-                outside the method's range is a prediction like any other.
+            ego_flows: (1 or K - 1, PadN, 3) float32, metres until the next sweep, residual (ego motion removed), in the
+                axes of the sweep's own points; 0 for inactive points, NaN in padding rows.
+            valid_flow_mask: float32 like the loader's masks: `full_pc_mask` as 0 and 1, NaN in padding rows. A flow of
+                0 outside the method's range is scored like any other.
             Padding rows are those with NaN in `full_pc_mask`.
 
         Raises:
-            CFlowError: by the name of the field, for example "batched_sequence[0].full_pc_mask"; no SceneFlowZoo.
+            CFlowError: a bad field, which the message names ("batched_sequence[0].full_pc_mask"); SceneFlowZoo is
+                missing.
         """
         output_class = import_from("dataloaders", "TorchFullFrameOutputSequence", _HOW)
         read = [_read_sequence(sequence, f"batched_sequence[{i}]") for i, sequence in enumerate(batched_sequence)]
@@ -68,24 +70,24 @@ class CorrelationFlowModel(nn.Module):
         return outputs
 
     def loss_fn(self, input_batch: Any, model_res: Any) -> Any:
-        """There is none: always a `CFlowError`."""
-        raise CFlowError("there is nothing to train: set is_trainable = False in the config and run test_pl.py")
+        """Raise a `CFlowError`, because there is no loss."""
+        raise CFlowError("this model cannot be trained: set is_trainable = False in the config and run test_pl.py")
 
 
 def register(name: str = "CorrelationFlow") -> None:
-    """Make the model known to the checkout's `models.construct_model`, by the name that a config may then give.
+    """Register the model with `models.construct_model` of the checkout, so that a config can name it.
 
     Raises:
-        CFlowError: no SceneFlowZoo on the path.
+        CFlowError: SceneFlowZoo is not on the path.
     """
     import_from("models", "name_to_class_lookup", _HOW)[name.lower()] = CorrelationFlowModel
 
 
 def _read_sequence(sequence: Any, name: str) -> tuple[list[Frame], int, Tensor]:
-    """Sweeps without padding, first sweep that a flow is asked for, (K, PadN) mask: 1, 0, in padding rows NaN."""
+    """Return sweeps without padding, the first one whose flow is needed, and the (K, PadN) mask (1, 0, NaN)."""
     for field in ("full_pc", "full_pc_mask", *_POSES):
         if not isinstance(getattr(sequence, field, None), Tensor):
-            raise CFlowError(f"{name}.{field} is no tensor: give a TorchFullFrameInputSequence")
+            raise CFlowError(f"{name}.{field} is not a tensor: give a TorchFullFrameInputSequence")
     points, mask = sequence.full_pc, sequence.full_pc_mask
     if points.ndim != 3 or points.shape[2] != 3 or points.shape[0] < 2:
         raise CFlowError(f"{name}.full_pc has shape {tuple(points.shape)}: give (K, PadN, 3) metres, K of at least 2")
@@ -97,7 +99,7 @@ def _read_sequence(sequence: Any, name: str) -> tuple[list[Frame], int, Tensor]:
     for side in _POSES:
         pose = getattr(sequence, side).detach().cpu()
         if pose.shape != (len(points), 4, 4):
-            raise CFlowError(f"{name}.{side} has shape {tuple(pose.shape)}: give ({len(points)}, 4, 4), one a sweep")
+            raise CFlowError(f"{name}.{side} has shape {tuple(pose.shape)}: give ({len(points)}, 4, 4), one per sweep")
         poses.append([rigid_transform(matrix, f"{name}.{side}[{k}]") for k, matrix in enumerate(pose)])
     frames = [
         Frame(cloud[rows], part[rows] > 0, sensor_to_ego, ego_to_global)

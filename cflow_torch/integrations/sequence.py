@@ -1,6 +1,6 @@
-"""A sequence of sweeps as BucketedSceneFlowEval holds them -> residual flow of its pairs, in the axes of the points.
+"""Residual flow of sequences of sweeps, in the axes of the points.
 
-Two harnesses share these data: BucketedSceneFlowEval, and SceneFlowZoo, which is built upon it.
+BucketedSceneFlowEval and SceneFlowZoo, which builds on it, both pass such sequences.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class Frame:
         points: (N, 3) float, metres, in the frame of the sensor.
         is_active: (N,) bool, False = ground, or outside the range of the data set.
         sensor_to_ego: (4, 4) float64, `T_ego_sensor` of this sweep.
-        ego_to_global: (4, 4) float64, `T_global_ego`; "global" is any frame, the same for all sweeps of a sequence.
+        ego_to_global: (4, 4) float64, `T_global_ego`; "global" is any frame that all sweeps of a sequence share.
         timestamp_ns: nanoseconds, None = unknown.
     """
 
@@ -41,7 +41,7 @@ class Frame:
     timestamp_ns: int | None = None
 
     def ego_points(self) -> Array:
-        """(N, 3) points in the ego frame of this sweep, float64 where the sensor has a frame of its own."""
+        """Return (N, 3) points in the ego frame of this sweep, float64 if the sensor has a frame of its own."""
         if np.array_equal(self.sensor_to_ego, np.eye(4)):
             return self.points
         device = self.points.device if isinstance(self.points, Tensor) else torch.device("cpu")
@@ -50,14 +50,14 @@ class Frame:
 
 
 class SequenceFlow(nn.Module):
-    """Frames in, residual flow out. No parameters, no buffers.
+    """Estimates residual flow from frames. It has no parameters and no buffers.
 
     Args:
-        preset: "default", "fast", "offline", "keypoints" or "paper", see `make_config`.
-        device: "auto" = that of the tensors given, else a GPU if there is one, else the CPU.
-        ground: None = ground is what the masks of the frames leave out (`with_ground=False`); "auto" or "patchwork" =
-            find it in every sweep as well.
-        **settings: `method`, or any field of the method's settings.
+        preset: "default", "fast", "offline", "keypoints" or "paper" (`make_config`).
+        device: "auto" = that of the given tensors, else a GPU if there is one, else the CPU.
+        ground: None = the masks of the frames exclude the ground (`with_ground=False`). "auto" or "patchwork" = also
+            find it in every sweep.
+        **settings: `method`, or any setting of the method.
 
     Raises:
         CFlowError: an unknown setting or an invalid value.
@@ -70,27 +70,27 @@ class SequenceFlow(nn.Module):
         self.model = make_model(make_config(preset, **settings), device)
         self.num_history: int = self.model.config.num_history
         self.ground = ground
-        self._looked_for_ground = False
+        self._has_checked_ground = False
 
     @torch.no_grad()
     def forward(self, sequences: Sequence[Sequence[Frame]], firsts: Sequence[int]) -> list[list[Tensor]]:
-        """Residual flow of the pairs (i, i + 1) of several sequences.
+        """Estimate the residual flow of the pairs (i, i + 1) of several sequences.
 
         Args:
             sequences: B sequences of at least two frames each, in order of time.
-            firsts: of each sequence, the first i that a flow is asked for. The frames before it are history only.
+            firsts: the first i of each sequence whose flow is returned. The frames before it are history only.
 
         Returns:
-            Of each sequence, for i = firsts ... K - 2: (N, 3) float32, metres until frame i + 1, ego motion taken out,
-            in the axes of frame i's points. Rows that take no part are 0.
+            For each sequence and i = firsts ... K - 2: (N, 3) float32, metres until frame i + 1, ego motion removed,
+            in the axes of the points of frame i. Inactive rows are 0.
 
         Convention:
-            Frame i has frames i - 1, i - 2, ... as history, as many as there are, at most `num_history`, and likewise
-            frames i + 2, i + 3, ... as future (preset "offline"): every pair gets a flow. The i-th windows of all
+            The history of frame i is frames i - 1, i - 2, ..., at most `num_history`. Its future (preset "offline") is
+            frames i + 2, i + 3, ... Both may be shorter, so that every pair has a flow. The i-th windows of all
             sequences are computed together.
 
         Raises:
-            CFlowError: bad input, see `cflow_torch.windows.collation.make_batch`.
+            CFlowError: bad input; the message names it.
         """
         windows = [self._windows(frames, first) for frames, first in zip(sequences, firsts)]
         flows: list[list[Tensor]] = [[] for _ in sequences]
@@ -116,47 +116,47 @@ class SequenceFlow(nn.Module):
 
     def _sweeps(self, frames: Sequence[Frame]) -> list[Sweep]:
         points = [frame.ego_points() for frame in frames]
-        left_out = [~frame.is_active for frame in frames]
+        ignored = [~frame.is_active for frame in frames]
         if self.ground is not None:
             method = "grid" if self.ground == "auto" else self.ground
-            found = [find_ground_batch([cloud], method)[0] for cloud in points]  # one by one: sequences may be long
-            left_out = [a | b for a, b in zip(left_out, found)]
-        elif not self._looked_for_ground:
-            self._looked_for_ground = True
+            found = [find_ground_batch([cloud], method)[0] for cloud in points]  # separately, as sequences may be long
+            ignored = [a | b for a, b in zip(ignored, found)]
+        elif not self._has_checked_ground:
+            self._has_checked_ground = True
             if any(has_ground([points[-2][frames[-2].is_active]])):
                 warnings.warn(
-                    "there is ground among the points that take part, which joins what stands on it, so that moving "
-                    "objects are missed. Load the data set with with_ground=False, or pass ground='auto'",
+                    "the active points contain ground, which connects the objects on it, so that moving ones are "
+                    "missed. Load the data set with with_ground=False, or pass ground='auto'",
                     stacklevel=4,
                 )
         return [
             Sweep(cloud, mask, frame.ego_to_global, frame.timestamp_ns)
-            for cloud, mask, frame in zip(points, left_out, frames)
+            for cloud, mask, frame in zip(points, ignored, frames)
         ]
 
 
 def in_axes_of_points(residual_flow: Tensor, now: Frame, following: Frame) -> Tensor:
-    """Residual flow turned from the axes of ego1 into those of the points of t.
+    """Rotate residual flow from the axes of ego1 to those of the points of t.
 
     Args:
         residual_flow: (N, 3) float, metres, axes of ego1.
         now, following: frames t and t+1.
 
     Returns:
-        (N, 3) float32, times (R_global_ego0 R_ego_sensor)^T R_global_ego1 in float64: no translation, because a flow is
-        a difference of positions.
+        (N, 3) float32, rotated by (R_global_ego0 R_ego_sensor)^T R_global_ego1 in float64. There is no translation,
+        because a flow is a difference of positions.
     """
-    turn = np.eye(4)
-    to_global = now.ego_to_global[:3, :3] @ now.sensor_to_ego[:3, :3]
-    turn[:3, :3] = to_global.T @ following.ego_to_global[:3, :3]
-    return compensate(residual_flow.double().t(), turn).t().float().contiguous()
+    rotation = np.eye(4)
+    global_R_sensor = now.ego_to_global[:3, :3] @ now.sensor_to_ego[:3, :3]
+    rotation[:3, :3] = global_R_sensor.T @ following.ego_to_global[:3, :3]
+    return compensate(residual_flow.double().t(), rotation).t().float().contiguous()
 
 
 def import_from(module: str, name: str, how: str) -> Any:
-    """What a harness's module defines, imported when it is needed.
+    """Import a name from a module of a harness.
 
     Raises:
-        CFlowError: there is no such module, or another one of that name; `how` says what to install.
+        CFlowError: the module is missing, or is another one of that name. The message contains `how` to install it.
     """
     try:
         return getattr(importlib.import_module(module), name)
@@ -165,6 +165,6 @@ def import_from(module: str, name: str, how: str) -> Any:
 
 
 def times_in_ns(stamps: Sequence[Any]) -> tuple[int | None, ...]:
-    """Time stamps of sweeps, None for each if they are no nanoseconds: some data sets put numbers 0, 1, ... there."""
+    """Time stamps of sweeps; None for each if they are not nanoseconds, because some data sets number their sweeps."""
     shortest = min((int(b) - int(a) for a, b in zip(stamps, stamps[1:])), default=0)
     return tuple(int(stamp) if shortest >= 1_000_000 else None for stamp in stamps)

@@ -23,7 +23,7 @@ def _not_available(*arguments: Any, **settings: Any) -> None:
 
 
 def _chamfer(pc0: Tensor, pc1: Tensor, distance0: Tensor, distance1: Tensor, index0: Tensor, index1: Tensor) -> None:
-    """Squared distance from each point to the nearest one of the other cloud, and its index; written into the outputs."""
+    """Write the squared distance from each point to the nearest one of the other cloud, and its index."""
     for start, target, distance, index in ((pc0, pc1, distance0, index0), (pc1, pc0, distance1, index1)):
         for rows in torch.arange(len(start)).split(1024):
             nearest = torch.cdist(start[rows], target).min(dim=1)
@@ -33,7 +33,7 @@ def _chamfer(pc0: Tensor, pc1: Tensor, distance0: Tensor, distance1: Tensor, ind
 def _chamfer_gradient(
     pc0: Tensor, pc1: Tensor, index0: Tensor, index1: Tensor, out0: Tensor, out1: Tensor, grad0: Tensor, grad1: Tensor
 ) -> None:
-    """Gradient of `_chamfer`; written into the last two arguments."""
+    """Write the gradient of `_chamfer` into the last two arguments."""
     for start, target, index, out, own, other in (
         (pc0, pc1, index0.long(), out0, grad0, grad1),
         (pc1, pc0, index1.long(), out1, grad1, grad0),

@@ -1,4 +1,4 @@
-"""CorrelationFlowEstimator: on frames of our own with the package's fields, and live on bucketed-scene-flow-eval."""
+"""CorrelationFlowEstimator on our own frames with the package's fields, and on bucketed-scene-flow-eval itself."""
 
 from __future__ import annotations
 
@@ -30,20 +30,20 @@ from cflow_torch.data.log import window
 from cflow_torch.evaluation import EvalFrame
 from cflow_torch.integrations.bucketed_scene_flow_eval import CorrelationFlowEstimator
 
-# ------------------------------------------------------------------------------ frames with the same fields, no package
+# ------------------------------------------------------------------------------------------- without the package
 
 
 @dataclass
 class Flow:
-    """Stands for `EgoLidarFlow`."""
+    """Replacement of `EgoLidarFlow`."""
 
     full_flow: np.ndarray
     mask: np.ndarray
 
 
 @pytest.fixture
-def stand_in(monkeypatch: pytest.MonkeyPatch) -> None:
-    """`bucketed_scene_flow_eval.datastructures` with the one class that is returned."""
+def package(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Replace `bucketed_scene_flow_eval.datastructures` by a module with the class that is returned."""
     module = ModuleType("bucketed_scene_flow_eval.datastructures")
     module.EgoLidarFlow = Flow  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "bucketed_scene_flow_eval", ModuleType("bucketed_scene_flow_eval"))
@@ -72,34 +72,34 @@ def estimator(num_history: int = 0, **settings: Any) -> CorrelationFlowEstimator
     return CorrelationFlowEstimator(**{**SETTINGS, "num_history": num_history, **settings})
 
 
-def check_flow(flow: Any, turned: np.ndarray) -> None:
-    np.testing.assert_allclose(flow.full_flow, turned, rtol=0, atol=1e-6)
+def check_flow(flow: Any, rotated: np.ndarray) -> None:
+    np.testing.assert_allclose(flow.full_flow, rotated, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("origin", [-1, 0, 1])
-def test_flow_is_in_the_axes_of_t(stand_in: None, origin: int) -> None:
-    """Whatever sweep the poses are relative to: a causal loader takes the last, a non-causal one that in the middle."""
+def test_flow_is_in_the_axes_of_t(package: None, origin: int) -> None:
+    """Poses may be relative to any sweep: a causal loader takes the last, a non-causal one that in the middle."""
     sweeps = drive(3)
     frames = make_frames(sweeps, origin)
     flows = estimator()(frames)
     assert len(flows) == 2
     for number, flow in enumerate(flows):
-        turned = expected(sweeps, number, 0)
+        rotated = expected(sweeps, number, 0)
         assert flow.full_flow.dtype == np.float32 and np.isfinite(flow.full_flow).all()
-        check_flow(flow, turned)
+        check_flow(flow, rotated)
         # The moving box: 0.5 m in the world's axes, to one pixel.
-        moves = speeds(turned) > 0.3
-        assert 100 < moves.sum() <= 150
-        world = flow.full_flow[moves] @ pose(0, 0, YAW_STEP * number)[:3, :3].T
+        moving = speeds(rotated) > 0.3
+        assert 100 < moving.sum() <= 150
+        world = flow.full_flow[moving] @ pose(0, 0, YAW_STEP * number)[:3, :3].T
         assert np.linalg.norm(np.median(world, axis=0) - [0.3, 0.4, 0]) < 0.25
-        # What the axes of t + 1 would give: the difference that this test is for.
-        assert np.abs(turned[moves] @ pose(0, 0, -YAW_STEP)[:3, :3].T - turned[moves]).max() > 0.03
+        # In the axes of t + 1 the flow would differ.
+        assert np.abs(rotated[moving] @ pose(0, 0, -YAW_STEP)[:3, :3].T - rotated[moving]).max() > 0.03
         np.testing.assert_array_equal(flow.mask, frames[number].pc.mask)
         assert flow.mask is not frames[number].pc.mask  # the evaluator writes into masks
         assert np.isnan(frames[number].pc.full_pc.points).any() and not flow.full_flow[~flow.mask].any()
 
 
-def test_earlier_frames_are_history_nearest_first_and_every_frame_gets_a_flow(stand_in: None) -> None:
+def test_earlier_frames_are_the_history(package: None) -> None:
     sweeps = drive(5)
     flows = estimator(2)(make_frames(sweeps))
     assert len(flows) == 4
@@ -109,8 +109,8 @@ def test_earlier_frames_are_history_nearest_first_and_every_frame_gets_a_flow(st
     np.testing.assert_array_equal(estimator(2).last(make_frames(sweeps)).full_flow, flows[3].full_flow)
 
 
-def test_a_sensor_with_a_frame_of_its_own(stand_in: None) -> None:
-    """nuScenes: points, and the truth of the flow, are in the axes of the sensor."""
+def test_a_sensor_with_a_frame_of_its_own(package: None) -> None:
+    """In nuScenes, points and true flow are in the axes of the sensor."""
     sweeps = drive(2)
     sensor_to_ego = pose(1.0, 0.2, math.radians(-90), 1.8)
     inverse = np.linalg.inv(sensor_to_ego)
@@ -125,7 +125,7 @@ def test_a_sensor_with_a_frame_of_its_own(stand_in: None) -> None:
 
 
 class DataSet(List[List[SimpleNamespace]]):
-    """Stands for a causal or non-causal data set over one or more logs."""
+    """Replacement of a causal or non-causal data set of several logs."""
 
     def __init__(self, logs: Sequence[Sequence[Sweep]], length: int, loader: str, step: int = 1) -> None:
         super().__init__()
@@ -140,22 +140,22 @@ class DataSet(List[List[SimpleNamespace]]):
         return SimpleNamespace(name=self.loader)
 
     def evaluator(self) -> Any:
-        taken: dict[tuple[str, int], Flow] = {}
-        store = lambda flow, frame: taken.__setitem__((frame.log_id, frame.log_idx), flow)  # noqa: E731
-        return SimpleNamespace(taken=taken, eval=store)
+        flows: dict[tuple[str, int], Flow] = {}
+        store = lambda flow, frame: flows.__setitem__((frame.log_id, frame.log_idx), flow)  # noqa: E731
+        return SimpleNamespace(flows=flows, eval=store)
 
 
 @pytest.mark.parametrize("length", [2, 3])
-def test_overlapping_items_lend_each_other_history(stand_in: None, length: int) -> None:
+def test_overlapping_items_share_their_history(package: None, length: int) -> None:
     logs = [drive(5), drive(4, velocity=0.7)]
-    taken = estimator(2).evaluate(DataSet(logs, length, "CAUSAL")).taken
-    assert sorted(taken) == [(f"log {n}", i) for n, log in enumerate(logs) for i in range(length - 2, len(log) - 1)]
-    for (name, index), flow in taken.items():
+    flows = estimator(2).evaluate(DataSet(logs, length, "CAUSAL")).flows
+    assert sorted(flows) == [(f"log {n}", i) for n, log in enumerate(logs) for i in range(length - 2, len(log) - 1)]
+    for (name, index), flow in flows.items():
         check_flow(flow, expected(logs[int(name[-1])], index, 2))
 
 
-def test_ground_that_the_data_set_left_in(stand_in: None) -> None:
-    """with_ground=True: the masks do not tell. Said once; ground='auto' finds it."""
+def test_one_warning_about_ground_which_can_be_found(package: None) -> None:
+    """With with_ground=True the masks do not mark the ground."""
     rng = np.random.default_rng(0)
     ground = np.concatenate([rng.uniform(-30, 30, (20000, 2)), 0.02 * rng.standard_normal((20000, 1))], 1)
     car, no_mask = rng.uniform((4, 2, 0.5), (8, 4, 1.8), (2000, 3)), np.zeros(22000, dtype=bool)
@@ -165,7 +165,7 @@ def test_ground_that_the_data_set_left_in(stand_in: None) -> None:
     with pytest.warns(UserWarning, match="ground='auto'") as caught:
         (joined,) = plain(frames)
         plain(frames)
-    assert len(caught) == 1 and joined.full_flow[:-2000].any()  # ground that moves with the car
+    assert len(caught) == 1 and joined.full_flow[:-2000].any()  # the ground moves with the car
     (flow,) = CorrelationFlowEstimator("paper", ground="auto")(frames)
     np.testing.assert_allclose(np.median(flow.full_flow[-2000:], axis=0), [1, 0, 0], atol=0.051)
     assert not flow.full_flow[:-2000].any() and flow.mask.all()
@@ -180,7 +180,7 @@ def test_ground_that_the_data_set_left_in(stand_in: None) -> None:
         ("log_idx", 2, r"frames\[1\]\.log_id, log_idx.* 2 after 'log', 0"),
     ],
 )
-def test_bad_frames_are_refused_by_the_name_of_the_field(stand_in: None, path: str, value: Any, complaint: str) -> None:
+def test_the_error_names_the_bad_field_of_a_frame(package: None, path: str, value: Any, complaint: str) -> None:
     frames = make_frames(drive(2))
     *holders, last = path.split(".")
     holder: Any = frames[1]
@@ -193,7 +193,7 @@ def test_bad_frames_are_refused_by_the_name_of_the_field(stand_in: None, path: s
         estimator()(frames[:1])
 
 
-# ------------------------------------------------------------------------------------------------------------ live
+# ---------------------------------------------------------------------------------------------- with the package
 
 
 def make_data_set(bsfe: ModuleType, raw: Path, truth: Path, kind: str = "bucketed_epe", length: int = 2) -> Any:
@@ -211,7 +211,7 @@ def make_data_set(bsfe: ModuleType, raw: Path, truth: Path, kind: str = "buckete
 
 
 def check_scores(bsfe: ModuleType, estimate: Any, raw: Path, truth: Path, frames: list[EvalFrame]) -> None:
-    """Their evaluator over their data set with our estimator, against our evaluation of our frames."""
+    """Compare their evaluator on their data set with our estimator, and our evaluation of our frames."""
     ours = score("bucketed_scene_flow_eval", frames)
     evaluator = estimate.evaluate(make_data_set(bsfe, raw, truth))
     assert len(evaluator) == len(frames)
@@ -222,7 +222,7 @@ def check_scores(bsfe: ModuleType, estimate: Any, raw: Path, truth: Path, frames
 
 @pytest.mark.parametrize("preset", ["paper", "default", "keypoints"])
 def test_real_pair_through_their_evaluator(bsfe: ModuleType, av2_folder: Path, tmp_path: Path, preset: str) -> None:
-    """Items of their data set: our evaluation gets the flow of the same points, in our own axes."""
+    """Our evaluation gets the flow of the same points as their data set's items, in our own axes."""
     pair, raw, stored = read_pair(av2_folder), av2_folder.parent, window(AV2Log(av2_folder, ground="bsfe"), 0)
     sweeps = Window(*(replace(sweep, point_times=None) for sweep in (stored.pc0, stored.pc1)))  # frames have no times
     T, labels = pair.T_float64, pair.labels
@@ -231,16 +231,16 @@ def test_real_pair_through_their_evaluator(bsfe: ModuleType, av2_folder: Path, t
     cropped = [replace(sweep, is_ground=~frame.pc.mask) for sweep, frame in zip((sweeps.pc0, sweeps.pc1), item)]
     estimate = CorrelationFlowEstimator(preset)
     (result,) = estimate.sequence_flow.model([Window(*cropped)])
-    turned = result.residual_flow.double().numpy() @ T[:3, :3]
+    rotated = result.residual_flow.double().numpy() @ T[:3, :3]
     (flow,) = estimate(item)
-    check_flow(flow, turned)
-    assert speeds(turned).max() > 0.5 and np.abs(turned - result.residual_flow.numpy()).max() > 1e-3
-    # Points, masks and ground of the two readers are the same.
+    check_flow(flow, rotated)
+    assert speeds(rotated).max() > 0.5 and np.abs(rotated - result.residual_flow.numpy()).max() > 1e-3
+    # Both readers have the same points, masks and ground.
     np.testing.assert_array_equal(item[0].pc.full_pc.points.astype(np.float32), pair.points)
     assert not (item[0].pc.mask & pair.bsfe_ground).any() and (flow.mask == item[0].pc.mask).all()
     parts = {"residual_flow": result.residual_flow, "T_ego1_ego0": T, "is_ground": pair.bsfe_ground}
     check_scores(bsfe, estimate, raw, truth, [EvalFrame(pair.points, labels, **parts)])
-    # `load_frame_list`: ground is known, nothing is cropped: the flow is that of `cflow eval` on the same log.
+    # In `load_frame_list` the ground is known and nothing is cropped, so the flow is that of the method on our window.
     pairs = make_data_set(bsfe, raw, truth).sequence_loader.load_sequence(LOG).load_frame_list(relative_to_idx=0)
     (whole,), (result,) = estimate(pairs), estimate.sequence_flow.model([sweeps])
     check_flow(whole, result.residual_flow.double().numpy() @ T[:3, :3])

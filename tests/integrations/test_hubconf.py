@@ -27,7 +27,7 @@ def hubconf() -> ModuleType:
     return module
 
 
-def test_it_is_the_model_of_the_preset():
+def test_hub_loads_the_model_of_the_preset():
     window = scene(0, num_history=1)
     model = torch.hub.load(ROOT, "cflow", source="local", preset="fast", device="cpu", num_history=1)
     assert model.config == make_config("fast", num_history=1)
@@ -35,8 +35,8 @@ def test_it_is_the_model_of_the_preset():
     assert_same(model([window])[0], make_model(make_config("fast", num_history=1))([window])[0])
 
 
-def test_dependencies_are_what_loading_needs(hubconf, tmp_path):
-    # In a process of its own, which finds nothing but the checkout and the dependencies that are named.
+def test_hub_needs_no_other_dependencies(hubconf, tmp_path):
+    # In a process that finds only the checkout and the named dependencies.
     others = {"kornia", "pyarrow", "hydra", "omegaconf", "tqdm", "matplotlib", "h5py", "scipy", "cv2", "pandas"}
     code = (
         "import sys\n"

@@ -1,6 +1,6 @@
-"""CorrelationFlow inside OpenSceneFlow, by a replay of that harness (`miniature_opensceneflow`).
+"""`CFlow`, the model of OpenSceneFlow, on batches as that harness makes them.
 
-The module `CFlow` in every layout that the replay makes.
+tests/integrations/test_opensceneflow_end_to_end.py runs the harness itself.
 """
 
 from __future__ import annotations
@@ -10,132 +10,135 @@ import json
 import sys
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import Any, Dict, Sequence
 
 import numpy as np
 import pytest
 import torch
-from torch import Tensor, nn
-from torch.utils.data import default_collate
-
-pytest.importorskip("h5py")
-
-import miniature_opensceneflow as osf
 from scenes import RANGE, pose, same_bits, scene
+from torch import Tensor, nn
+from torch.nn.utils.rnn import pad_sequence
 
-from cflow_torch import CFlowError, make_config, make_model
-from cflow_torch.cli.main import main
-from cflow_torch.data.av2 import AV2Log
-from cflow_torch.data.hdf5 import HDF5Log, write_hdf5_scene
-from cflow_torch.data.hdf5.frames import recognized_extrinsics
-from cflow_torch.data.hdf5.writer import write_index_files
-from cflow_torch.data.log import FlowLabels, window
+from cflow_torch import CFlowError, Sweep, Window, make_config, make_model
+from cflow_torch.data.hdf5.frames import harness_motion, harness_pose_flow, recognized_extrinsics
 from cflow_torch.data.rigid_motion import transform_points
-from cflow_torch.integrations.opensceneflow import CFlow, write_null_checkpoint
-from cflow_torch.integrations.opensceneflow.__main__ import main as write_checkpoint
-from cflow_torch.types import Sweep
+from cflow_torch.integrations.opensceneflow import CFlow
+from cflow_torch.integrations.opensceneflow.checkpoint import main as write_checkpoint
 
+Batch = Dict[str, Any]
 SMALL = {"pixel_sizes": [0.25], "point_cloud_range": list(RANGE)}
-KEYS = {"method": "keypoints", "patch_size": 11, "ratio_threshold": 1.0}
 VARIANTS: dict[str, dict[str, Any]] = {
     "dense": {"method": "dense", "num_frames": 6, **SMALL, "max_extent": 5.0},
-    # Batches hold no ground, so there is nothing to stand out of.
+    # Batches contain no ground, so no height above ground is known.
     "verified": {"preset": "fast", "num_frames": 6, **SMALL, "min_height": None, "significance": 0.0},
-    "keypoints": {**SMALL, **KEYS, "pixel_sizes": [0.1], "max_extent": 5.0},
+    "keypoints": {**SMALL, "method": "keypoints", "patch_size": 11, "ratio_threshold": 1.0, "pixel_sizes": [0.1]},
 }
 EGO_T_LIDAR = np.array([[0.8, -0.6, 0, 1.35], [0.6, 0.8, 0, 0.2], [0, 0, 1, 1.6], [0, 0, 0, 1]])
-AV2_STAMP = 315_966_265_259_836_000  # Argoverse 2 counts from a moment of its own
+AV2_STAMP = 315_966_265_259_836_000  # Argoverse 2 has an epoch of its own
 PLACE = pose(5400.0, -1200.0, 0.7, 12.0)  # city coordinates are far from the origin
 
 
-class SmallDrive:
-    """Seven sweeps of `scenes.scene`, without its NaN and infinite points, as a log far from the world's origin."""
-
-    def __init__(self, seed: int = 0, first_stamp: int = AV2_STAMP, raised: float = 0.0) -> None:
-        made = scene(seed, num_history=5)
-        self.log_id = f"drive-{seed}"
-        self._sweeps = []
-        for index, sweep in enumerate((*made.pch[::-1], made.pc0, made.pc1)):
-            finite = np.isfinite(sweep.points).all(axis=1)
-            finite[: index + 10 * seed] = False  # every sweep has another number of points
-            points = (sweep.points + np.float32([0, 0, raised]))[finite]
-            self._sweeps.append(Sweep(points, sweep.is_ground[finite], PLACE @ sweep.pose))
-        self.timestamps = [first_stamp + k * 100_000_000 for k in range(len(self._sweeps))]
-
-    def sweep(self, index: int) -> Sweep:
-        return self._sweeps[index]
-
-    def labels(self, index: int) -> FlowLabels | None:
-        """Some truth, which no method reads."""
-        if index == len(self._sweeps) - 1:
-            return None
-        n = len(self._sweeps[index].points)
-        return FlowLabels(np.full((n, 3), 0.5, np.float32), np.full(n, 19, np.uint8), np.ones(n, bool))
+def small_drive(seed: int = 0, raised: float = 0.0) -> list[Sweep]:
+    """Seven sweeps, oldest first, of `scenes.scene` without NaN and infinite points, far from the world's origin."""
+    made = scene(seed, num_history=5)
+    sweeps = []
+    for index, sweep in enumerate((*made.pch[::-1], made.pc0, made.pc1)):
+        finite = np.isfinite(sweep.points).all(axis=1)
+        finite[: index + 10 * seed] = False  # every sweep has a different number of points
+        points = (sweep.points + np.float32([0, 0, raised]))[finite]
+        sweeps.append(Sweep(points, sweep.is_ground[finite], (PLACE @ sweep.pose).astype(np.float32)))
+    return sweeps
 
 
-def store(folder: Path, *drives: Any, **settings: Any) -> Path:
-    """A folder of scenes with its index files."""
-    for drive in drives:
-        write_hdf5_scene(drive, folder / f"{drive.log_id}.h5", **{"pose_dtype": "float32", "eval_step": 1, **settings})
-    write_index_files(folder)
-    return folder
+def make_batch(sweeps: Sequence[Sweep], index: int, num_frames: int = 6, filtered: Any = 0, stamp: int = 0) -> Batch:
+    """A batch of one as eval.py passes it to a model.
+
+    pc0, pc1 and the first `filtered` history sweeps have no ground any more; all masks keep their full length. Before
+    the first sweep of the scene, the first sweep is repeated.
+    """
+    ends = {"0": index, "1": index + 1, **{f"h{i}": max(index - i, 0) for i in range(1, num_frames - 1)}}
+    batch: Batch = {"scene_id": ["drive"], "timestamp": [str(stamp)], "eval_flag": torch.tensor([True])}
+    for name, source in ends.items():
+        sweep = sweeps[source]
+        points, is_ground = torch.from_numpy(sweep.points), torch.from_numpy(sweep.is_ground)
+        is_filtered = name in "01" or int(name[1:]) <= filtered
+        batch[f"pc{name}"] = (points[~is_ground] if is_filtered else points)[None]
+        batch[f"gm{name}"], batch[f"pose{name}"] = is_ground[None], torch.from_numpy(sweep.pose)[None]
+    truth = torch.full_like(batch["pc0"], float("nan"))  # which no method may read
+    return {**batch, "origin_pc0": torch.from_numpy(sweeps[index].points)[None], "flow": truth}
 
 
-@pytest.fixture(scope="module")
-def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two scenes of seven sweeps, points and poses of the ego frame."""
-    return store(tmp_path_factory.mktemp("small"), SmallDrive(0), SmallDrive(1))
+def make_training_batch(drives: Sequence[Sequence[Sweep]], index: int, num_frames: int = 6) -> Batch:
+    """Frames of several drives as train.py collates them: no ground, no masks, padding with NaN, lists of poses."""
+    single = [make_batch(sweeps, index, num_frames, filtered=num_frames) for sweeps in drives]
+    batch: Batch = {}
+    for key in single[0]:
+        values = [one[key][0] for one in single]
+        if key.startswith("pose"):
+            batch[key] = values
+        elif key.startswith("pc"):
+            batch[key] = pad_sequence(values, batch_first=True, padding_value=float("nan"))
+    return batch
 
 
-@pytest.fixture(autouse=True)
-def _same_argv(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "argv", list(sys.argv))
-
-
-# ---------------------------------------------------------------------------------------------- the module: same flow
-
-
-def answer(model: nn.Module, batch: osf.Batch) -> dict[str, list[Tensor]]:
+def estimate(model: nn.Module, batch: Batch) -> dict[str, list[Tensor]]:
     with torch.inference_mode():
         return model(batch)
 
 
-def core(folder: Path, variant: str, index: int, num_frames: int, ego_T_lidar: Any = None) -> Tensor:
-    """(N', 3) residual of the points that are not ground, by the method itself on the scene as our reader reads it."""
+def total_flow(model: nn.Module, batch: Batch) -> Tensor:
+    """(N, 3) total flow as eval.py assembles it: its own pose flow, plus what the model returns off the ground."""
+    found = estimate(model, batch)
+    total = harness_pose_flow(batch["origin_pc0"][0], harness_motion(batch["pose0"][0], batch["pose1"][0]))
+    rows = (~batch["gm0"][0]).nonzero()[:, 0][found["pc0_valid_point_idxes"][0]]
+    total[rows] += found["flow"][0]
+    return total
+
+
+def residual_of_method(
+    sweeps: Sequence[Sweep], variant: str, index: int, num_frames: int, ego_T_lidar: np.ndarray | None = None
+) -> Tensor:
+    """(N', 3) residual flow of the points that are not ground, by the method itself."""
     settings = {key: value for key, value in VARIANTS[variant].items() if key != "num_frames"}
     history = {} if variant == "keypoints" else {"num_history": num_frames - 2}
-    config = make_config(**settings, **history)
-    with HDF5Log(folder / "drive-0.h5", ego_T_lidar=ego_T_lidar) as log:
-        sweeps = window(log, index, config.num_history)
-    (result,) = make_model(config)([sweeps])
-    return result.residual_flow[torch.from_numpy(~sweeps.pc0.is_ground)]
+    extrinsics = np.eye(4) if ego_T_lidar is None else ego_T_lidar
+    own = [Sweep(s.points[~s.is_ground], None, s.pose.astype(np.float64) @ extrinsics) for s in sweeps]
+    pch = tuple(own[max(index + 2 - num_frames, 0) : index][::-1])
+    (result,) = make_model(make_config(**settings, **history))([Window(own[index], own[index + 1], pch)])
+    return result.residual_flow
 
 
-CASES = [("dense", 2), ("dense", 4), ("dense", 6), ("verified", 6), ("keypoints", 2)]
+@pytest.fixture(scope="module")
+def drive() -> list[Sweep]:
+    return small_drive()
 
 
-@pytest.mark.parametrize(("variant", "num_frames"), CASES)
-@pytest.mark.parametrize("index", [5, 2, 0])  # 2, 0: the harness repeats the first sweep, the core has a shorter window
-def test_every_layout_gives_the_method_s_flow(variant: str, num_frames: int, index: int, small: Path) -> None:
-    expected = core(small, variant, index, num_frames)
-    if (variant, index) != ("verified", 0):  # two sweeps of so few points prove no motion
+# ------------------------------------------------------------------------------------------------ layouts of batches
+
+
+@pytest.mark.parametrize(
+    ("variant", "num_frames"), [("dense", 2), ("dense", 4), ("dense", 6), ("verified", 6), ("keypoints", 2)]
+)
+@pytest.mark.parametrize("index", [5, 2, 0])  # 2 and 0: the harness repeats the first sweep
+def test_every_layout_gives_the_flow_of_the_method(
+    variant: str, num_frames: int, index: int, drive: list[Sweep]
+) -> None:
+    expected = residual_of_method(drive, variant, index, num_frames)
+    if (variant, index) != ("verified", 0):  # two sweeps with so few points are no evidence of motion
         assert (expected.norm(dim=1) > 0.05).sum() > 50, "there is motion to find"
     model = CFlow(**{**VARIANTS[variant], "num_frames": num_frames})
-    raw = osf.load(small, index, num_frames)
-    full = osf.path_b(raw)
+    full = make_batch(drive, index, num_frames)
     layouts = {
         "history with ground": full,
-        "history without ground": osf.path_b(raw, num_frames),
-        "part of it": osf.path_b(raw, 3 if num_frames > 2 else 2),
-        "second path": osf.path_a(raw),
+        "history without ground": make_batch(drive, index, num_frames, filtered=4),
+        "part of the history without ground": make_batch(drive, index, num_frames, filtered=1),
         "float64": {k: v.double() if k.startswith(("pc", "pose")) else v for k, v in full.items()},
         "lists": {k: list(v) if k.startswith(("pc", "pose", "gm")) else v for k, v in full.items()},
-        "training": osf.collate_for_training([osf.SceneDataset(small, num_frames)[index]]),
-        "no truth": {k: v for k, v in full.items() if not k.startswith(("flow", "eval", "ego", "lidar"))},
+        "training": make_training_batch([drive], index, num_frames),
     }
     for name, batch in layouts.items():
         before = copy.deepcopy(batch)
-        found = answer(model, batch)
+        found = estimate(model, batch)
         assert same_bits(found["flow"][0], expected), name
         assert found["pc0_valid_point_idxes"][0].tolist() == list(range(len(expected))), name
         assert list(before) == list(batch), "the batch has the same keys"
@@ -143,91 +146,87 @@ def test_every_layout_gives_the_method_s_flow(variant: str, num_frames: int, ind
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_padding_changes_nothing(variant: str, small: Path) -> None:
+def test_padding_changes_nothing(variant: str, drive: list[Sweep]) -> None:
     model = CFlow(**VARIANTS[variant], output="valid")
-    dataset = osf.SceneDataset(small, 6)
-    items = [dataset[5], dataset[8]]
-    together = osf.collate_for_training(items)
-    found = answer(model, together)
+    drives = [drive, small_drive(1)]
+    together = make_training_batch(drives, 5)
+    found = estimate(model, together)
     assert len({len(flow) for flow in found["flow"]}) == 2
-    for b, item in enumerate(items):
-        alone = answer(model, osf.collate_for_training([item]))
+    for b, sweeps in enumerate(drives):
+        alone = estimate(model, make_training_batch([sweeps], 5))
         for key in ("flow", "pc0_valid_point_idxes", "pc0_points_lst", "pc1_points_lst"):
             assert same_bits(found[key][b], alone[key][0]), key
-        assert same_bits(found["flow"][b], answer(model, osf.path_b(default_collate([item])))["flow"][0])
+        assert same_bits(found["flow"][b], estimate(model, make_batch(sweeps, 5))["flow"][0])
         rows = found["pc0_valid_point_idxes"][b]
         assert found["pose_flow"][b].shape == together["pc0"][b].shape
-        T = osf.relative_pose(together["pose0"][b], together["pose1"][b])
-        true_pose_flow = osf.pose_flow_of(together["pc0"][b], T)[rows]
-        assert (found["pose_flow"][b][rows] - true_pose_flow).abs().max() < 1e-5
+        T = harness_motion(together["pose0"][b], together["pose1"][b])
+        pose_flow = harness_pose_flow(together["pc0"][b], T)[rows]
+        assert (found["pose_flow"][b][rows] - pose_flow).abs().max() < 1e-5
         assert same_bits(found["pc0_points_lst"][b], together["pc0"][b][rows])
 
 
 @pytest.mark.parametrize("ego_T_lidar", [None, EGO_T_LIDAR], ids=["same-frame", "extrinsics"])
-def test_full_and_valid_output_mean_the_same(ego_T_lidar: Any, small: Path) -> None:
-    batch = osf.path_b(osf.load(small, 5, 6))
+def test_full_and_valid_output_give_the_same_total_flow(ego_T_lidar: Any, drive: list[Sweep]) -> None:
+    batch = make_batch(drive, 5)
     full, valid = (CFlow(**VARIANTS["dense"], output=output, ego_T_lidar=ego_T_lidar) for output in ("full", "valid"))
-    with torch.inference_mode():
-        first, second = osf.run(full, batch), osf.run(valid, batch)
-    assert 0 < len(second.answer["flow"]) < len(first.answer["flow"]) == batch["pc0"].shape[1]
-    in_range = torch.zeros(len(first.final_flow), dtype=torch.bool)
-    in_range[(~first.batch["gm0"]).nonzero()[:, 0][second.answer["pc0_valid_point_idxes"]]] = True
-    assert same_bits(first.final_flow[in_range], second.final_flow[in_range])
+    first, second = total_flow(full, batch), total_flow(valid, batch)
+    rows = estimate(valid, batch)["pc0_valid_point_idxes"][0]
+    assert 0 < len(rows) < batch["pc0"].shape[1]
+    is_valid = torch.zeros(len(first), dtype=torch.bool)
+    is_valid[(~batch["gm0"][0]).nonzero()[:, 0][rows]] = True
+    assert same_bits(first[is_valid], second[is_valid])
+    pose_flow = harness_pose_flow(batch["origin_pc0"][0], harness_motion(batch["pose0"][0], batch["pose1"][0]))
     if ego_T_lidar is None:
-        assert same_bits(first.final_flow, second.final_flow)
-    else:  # rows that are left out keep the harness's own pose flow, which is that of another frame
-        assert same_bits(second.final_flow[~in_range], second.pose_flow[~in_range])
-    ground = first.batch["gm0"]
-    assert same_bits(first.final_flow[ground], first.pose_flow[ground])
+        assert same_bits(first, second)
+    else:  # rows that are missing keep the harness's own pose flow, which is that of another frame
+        assert same_bits(second[~is_valid], pose_flow[~is_valid])
+    assert same_bits(first[batch["gm0"][0]], pose_flow[batch["gm0"][0]])
 
 
-def test_rows_of_nan_beside_a_mask(small: Path) -> None:
-    """Some data sets store NaN for no return: such rows are no points, and every other row has its flow."""
-    model, batch = CFlow(**VARIANTS["dense"]), osf.path_b(osf.load(small, 5, 6), top_num_frames=6)
-    expected = answer(model, batch)["flow"][0]
+def test_rows_of_nan_in_a_batch_with_masks_are_ignored(drive: list[Sweep]) -> None:
+    """Some data sets store NaN where a beam has no return."""
+    model, batch = CFlow(**VARIANTS["dense"]), make_batch(drive, 5, filtered=4)
+    expected = total_flow(model, batch)
     nan, no_ground = torch.full((1, 3, 3), float("nan")), torch.zeros(1, 3, dtype=torch.bool)
-    holed = dict(batch)
     for end in ("0", "1", "h1"):
-        holed[f"pc{end}"] = torch.cat([nan, batch[f"pc{end}"]], dim=1)
-        holed[f"gm{end}"] = torch.cat([no_ground, batch[f"gm{end}"]], dim=1)
-    holed["origin_pc0"] = torch.cat([nan, batch["origin_pc0"]], dim=1)
-    with torch.inference_mode():
-        outcome = osf.run(model, holed)
-    flow = outcome.answer["flow"]
-    assert same_bits(flow[3:], expected) and not flow[:3].any()
-    assert outcome.final_flow[:3].isnan().all() and not outcome.final_flow[3:].isnan().any()
+        batch[f"pc{end}"] = torch.cat([nan, batch[f"pc{end}"]], dim=1)
+        batch[f"gm{end}"] = torch.cat([no_ground, batch[f"gm{end}"]], dim=1)
+    batch["origin_pc0"] = torch.cat([nan, batch["origin_pc0"]], dim=1)
+    assert not estimate(model, batch)["flow"][0][:3].any()
+    total = total_flow(model, batch)
+    assert same_bits(total[3:], expected) and total[:3].isnan().all()
 
 
-def test_less_history_than_asked_for_is_said_once(small: Path) -> None:
-    model, batch = CFlow(**VARIANTS["dense"]), osf.path_a(osf.load(small, 5, 2))
-    with pytest.warns(UserWarning, match="num_frames") as said:
-        found, again = (answer(model, batch)["flow"][0] for _ in range(2))
-    assert len(said) == 1
-    assert same_bits(found, core(small, "dense", 5, 2)) and same_bits(again, found)
+def test_one_warning_about_less_history_than_num_frames(drive: list[Sweep]) -> None:
+    model, batch = CFlow(**VARIANTS["dense"]), make_batch(drive, 5, num_frames=2)
+    with pytest.warns(UserWarning, match="num_frames") as caught:
+        found, again = (estimate(model, batch)["flow"][0] for _ in range(2))
+    assert len(caught) == 1
+    assert same_bits(found, residual_of_method(drive, "dense", 5, 2)) and same_bits(again, found)
 
 
 BAD: dict[str, Any] = {
     "missing": (None, ["pc0", "pose0", "poseh4"]),
-    "NaN": (lambda t: t * float("nan"), ["pose1", "poseh3"]),
+    "NaN": (lambda t: t * float("nan"), ["pose1"]),
     "one dimension too few": (lambda t: t[0], ["pc0", "pose0", "gm0"]),
     "not rigid": (lambda t: 2 * t, ["poseh4"]),
-    "no samples": (lambda t: t[:0], ["pc1", "pose1", "gmh1"]),
+    "no samples": (lambda t: t[:0], ["pc1", "gmh1"]),
     "of another sweep": (lambda t: t[:, :-7], ["gm0", "gmh4"]),
     "nothing": (lambda t: None, ["pose1", "gm0"]),
 }
 
 
 @pytest.mark.parametrize(("what", "key"), [(what, key) for what, (_, keys) in BAD.items() for key in keys])
-def test_a_bad_batch_is_named(what: str, key: str, small: Path) -> None:
-    batch, change = osf.path_b(osf.load(small, 5, 6)), BAD[what][0]
+def test_the_error_names_the_bad_key_of_a_batch(what: str, key: str, drive: list[Sweep]) -> None:
+    batch, change = make_batch(drive, 5), BAD[what][0]
     old = batch.pop(key)
     if change is not None:
         batch[key] = change(old.clone())
     with pytest.raises(CFlowError, match=f"['\"]{key}['\"]"):
-        answer(CFlow(**VARIANTS["dense"]), batch)
+        estimate(CFlow(**VARIANTS["dense"]), batch)
 
 
-# ---------------------------------------------------------------------------------------------- the module: as a module
+# ------------------------------------------------------------------------------------------------ settings, checkpoint
 
 
 def test_settings_of_the_method_and_others() -> None:
@@ -236,17 +235,14 @@ def test_settings_of_the_method_and_others() -> None:
     assert CFlow(method="keypoints", num_frames=2).config == make_config("keypoints")
     assert CFlow(pixel_size=0.2, voxel_size=[1], grid_feature_size=[1]).config == make_config(pixel_size=0.2)
     names = r"labeling, num_iters, patch_size, proof; .*'verified' has pixel_size"
-    with pytest.warns(UserWarning, match=names) as said:
+    with pytest.warns(UserWarning, match=names) as caught:
         model = CFlow(num_iters=4, proof=False, patch_size=11, labeling="kornia", significance=2.0)
-    assert len(said) == 1 and model.config == make_config(significance=2.0)
+    assert len(caught) == 1 and model.config == make_config(significance=2.0)
     wrong: list[dict[str, Any]] = [{"output": "half"}, {"num_frames": 1}, {"num_frames": 2.5}, {"ego_T_lidar": "yes"}]
     wrong += [{"method": "keypoints", "num_frames": 6}, {"method": "dense", "preset": "fast"}]
     for settings in (*wrong, {"pixel_sizes": [0.1, 0.2]}, {"ego_T_lidar": [[1, 2], [3, 4]]}):
         with pytest.raises(CFlowError):
             CFlow(**settings)
-
-
-# ---------------------------------------------------------------------------------------------- the harness's scripts
 
 
 def test_checkpoint_without_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
@@ -256,131 +252,83 @@ def test_checkpoint_without_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert str(file) in capsys.readouterr().out
     stored = torch.load(file, weights_only=True)
     assert stored.pop("pytorch-lightning_version").count(".") == 2
-    cfg = {"model": {"name": "mine"}, "output": "mine", "num_frames": 2}  # no target: the YAML's stays
+    cfg = {"model": {"name": "mine"}, "output": "mine", "num_frames": 2}  # without a target, that of the YAML counts
     expected = {"epoch": 0, "global_step": 0, "state_dict": {}, "hyper_parameters": {"cfg": cfg, "eval": True}}
     assert stored == expected and json.loads(json.dumps(stored)) == expected, "plain containers"
-    with pytest.raises(SystemExit, match="error: .*mine.ckpt is there already.*overwrite"):
+    with pytest.raises(SystemExit, match="error: .*mine.ckpt exists already.*overwrite"):
         write_checkpoint()
 
 
-EVAL_YAML = """
-dataset_path: ???
-checkpoint: ???
-data_mode: val
-leaderboard_version: 1
-num_frames: 2
-slurm_id: 00000
-output: ${model.name}-${slurm_id}
-defaults:
-  - model: deflow
-"""
 PRESETS = {"cflow": "default", "cflow_fast": "fast", "cflow_paper": "paper", "cflow_keypoints": "keypoints"}
 
 
-def composed(folder: Path, *overrides: str) -> Any:
-    """A stand-in for the harness's `conf`, a model and `eval.yaml`, composed with ours on the search path."""
-    from hydra import compose, initialize_config_dir
-
-    (folder / "conf" / "model").mkdir(parents=True, exist_ok=True)
-    (folder / "conf" / "eval.yaml").write_text(EVAL_YAML)
-    (folder / "conf" / "model" / "deflow.yaml").write_text("name: deflow\ntarget:\n  _target_: builtins.dict\n")
-    search = "hydra.searchpath=[pkg://cflow_torch.configs.opensceneflow]"
-    with initialize_config_dir(str(folder / "conf"), version_base=None):
-        return compose("eval", [search, "dataset_path=data", "checkpoint=x.ckpt", *overrides])
-
-
 @pytest.mark.parametrize("name", PRESETS)
-def test_configuration_is_found_and_is_the_preset(name: str, tmp_path: Path) -> None:
+def test_configuration_has_every_setting_of_the_preset(name: str) -> None:
+    from hydra import compose, initialize_config_module
     from hydra.errors import ConfigCompositionException
+    from hydra.utils import instantiate
     from omegaconf import OmegaConf
 
-    checkpoint = write_null_checkpoint(tmp_path / "cflow.ckpt")
-    cfg = composed(tmp_path, f"model={name}")
-    assert cfg.model.name == name and not cfg.model.get("iter_only", False)
-    target = OmegaConf.to_container(cfg.model.target, resolve=False)
+    changes = ["pixel_sizes=[0.3]", "sweep_interval=0.2", "max_speed=null", "output=valid", "ego_T_lidar=null"]
+    with initialize_config_module("cflow_torch.configs.opensceneflow", version_base=None):
+        cfg = compose(f"model/{name}").model
+        changed = compose(f"model/{name}", [f"model.target.{text}" for text in changes]).model
+        with pytest.raises(ConfigCompositionException):
+            compose(f"model/{name}", ["model.target.no_such_setting=1"])
+    assert cfg.name == name and not cfg.iter_only
+    target = OmegaConf.to_container(cfg.target, resolve=False)
     assert "${" not in json.dumps(target), "eval.yaml and save.yaml have nothing to refer to"
     expected = make_config(PRESETS[name])
     ours = {"_target_", "voxel_size", "num_frames", "ego_T_lidar", "output", "device"}
-    assert set(target) == ours | (set(expected.as_dict()) - {"num_history", "num_future"}), (
-        "every setting, so that no + is needed"
-    )
-    box = target["point_cloud_range"]
-    expected = expected.replace(point_cloud_range=box)
-    assert np.isfinite(box).all(), "the harness computes with it"
+    assert set(target) == ours | (set(expected.as_dict()) - {"num_history", "num_future"}), "overrides need no +"
+    assert np.isfinite(target["point_cloud_range"]).all(), "the harness computes its number of voxels"
+    expected = expected.replace(point_cloud_range=target["point_cloud_range"])
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        model = osf.build(cfg, checkpoint)
-    assert isinstance(model, CFlow) and model.config == expected and cfg.output == "cflow-e0-val-v1"
-    assert min(cfg.model.target.grid_feature_size) >= 1
-    changes = ["pixel_sizes=[0.3]", "sweep_interval=0.2", "max_speed=null", "output=valid", "ego_T_lidar=null"]
-    model = osf.build(composed(tmp_path, f"model={name}", *(f"model.target.{text}" for text in changes)), checkpoint)
+        model = instantiate(cfg.target, grid_feature_size=[512, 512, 1])
+    assert isinstance(model, CFlow) and model.config == expected and not model.state_dict()
+    model = instantiate(changed.target)
     assert model.config == expected.replace(pixel_size=0.3, sweep_interval=0.2, max_speed=None)
     assert model.output == "valid" and model.ego_T_lidar is None
-    with pytest.raises(ConfigCompositionException):
-        composed(tmp_path, f"model={name}", "model.target.no_such_setting=1")
 
 
-# ---------------------------------------------------------------------------------------------- ego_T_lidar
+# ------------------------------------------------------------------------------------------------ ego_T_lidar
 
 
-def test_extrinsics_mend_the_harness_s_pose_flow(tmp_path: Path) -> None:
-    """A scene with points in the sensor frame and poses of the ego frame, which the file does not tell."""
-    layout = {"points_frame": "sensor", "ego_T_lidar": EGO_T_LIDAR, "store_extrinsics": False}
-    folder, index = store(tmp_path, SmallDrive(0), **layout), 5
+def test_extrinsics_correct_the_pose_flow_of_the_harness(drive: list[Sweep]) -> None:
+    """The points are those of the sensor and the poses those of the vehicle, which no key of the batch tells."""
+    index, inverse = 5, np.linalg.inv(EGO_T_LIDAR)
+    seen = [Sweep(transform_points(s.points, inverse).astype(np.float32), s.is_ground, s.pose) for s in drive]
     model = CFlow(**VARIANTS["dense"], ego_T_lidar=EGO_T_LIDAR.tolist())
-    with torch.inference_mode():
-        outcome = osf.run(model, osf.path_b(osf.load(folder, index, 6)))
-    motions = []
-    for ego_T_lidar in (EGO_T_LIDAR, None):
-        with HDF5Log(folder / "drive-0.h5", ego_T_lidar=ego_T_lidar) as log:
-            sweep = log.sweep(index)
-            motions.append(np.linalg.inv(log.sweep(index + 1).pose) @ sweep.pose)
-    rows, points = ~sweep.is_ground, sweep.points[~sweep.is_ground].astype(np.float64)
-    residual = core(folder, "dense", index, 6, EGO_T_LIDAR).numpy()
-    expected = transform_points(points, motions[0]) - points + residual
-    np.testing.assert_allclose(outcome.final_flow.numpy()[rows], expected, rtol=0, atol=1e-5)
-    correction = transform_points(points, motions[0]) - transform_points(points, motions[1])
+    batch = make_batch(seen, index)
+    total, found = total_flow(model, batch).numpy(), estimate(model, batch)["flow"][0].numpy()
+    poses = [seen[i].pose.astype(np.float64) for i in (index, index + 1)]
+    T_ego1_ego0 = np.linalg.inv(poses[1]) @ poses[0]
+    T_lidar1_lidar0 = inverse @ T_ego1_ego0 @ EGO_T_LIDAR
+    rows = ~seen[index].is_ground
+    points = seen[index].points[rows].astype(np.float64)
+    residual = residual_of_method(seen, "dense", index, 6, EGO_T_LIDAR).numpy()
+    expected = transform_points(points, T_lidar1_lidar0) - points + residual
+    np.testing.assert_allclose(total[rows], expected, rtol=0, atol=1e-5)
+    correction = transform_points(points, T_lidar1_lidar0) - transform_points(points, T_ego1_ego0)
     assert np.abs(correction).max() > 0.02, "without extrinsics the static world would move"
-    np.testing.assert_allclose(outcome.answer["flow"].numpy(), residual + correction, rtol=0, atol=3e-4)
+    np.testing.assert_allclose(found, residual + correction, rtol=0, atol=3e-4)
 
 
 @pytest.mark.parametrize(
-    ("height", "first_stamp", "recognized"),
+    ("height", "stamp", "is_recognized"),
     [(-1.6, AV2_STAMP, True), (0.0, AV2_STAMP, False), (-1.6, 10**18, False)],
     ids=["av2-sensor", "av2-ego", "another-set"],
 )
-def test_auto_recognizes_argoverse(height: float, first_stamp: int, recognized: bool, tmp_path: Path) -> None:
-    store(tmp_path, SmallDrive(0, first_stamp, height))
+def test_auto_recognizes_argoverse(height: float, stamp: int, is_recognized: bool) -> None:
+    sweeps = small_drive(raised=height)
     settings = {**VARIANTS["dense"], "point_cloud_range": [-8, -7, -10, 8, 7, 10]}
-    raw = osf.load(tmp_path, 5, 6)
-    extrinsics = recognized_extrinsics(first_stamp, raw["pc0"][0].numpy(), raw["gm0"][0].numpy())
-    assert np.array_equal(extrinsics, np.eye(4)) != recognized
-    models = [CFlow(**settings, ego_T_lidar=given) for given in ("auto", extrinsics if recognized else None, None)]
-    stamp = torch.tensor([int(raw["timestamp"][0])])
-    for batch in (osf.path_a(raw), osf.path_b(raw), {**osf.path_b(raw), "timestamp": stamp}):
-        auto, explicit, without = (answer(model, batch)["flow"][0] for model in models)
-        assert same_bits(auto, explicit) and same_bits(auto, without) != recognized
+    extrinsics = recognized_extrinsics(stamp, sweeps[5].points, sweeps[5].is_ground)
+    assert np.array_equal(extrinsics, np.eye(4)) != is_recognized
+    models = [CFlow(**settings, ego_T_lidar=given) for given in ("auto", extrinsics if is_recognized else None, None)]
+    batch = make_batch(sweeps, 5, stamp=stamp)
+    for given in (batch, {**batch, "timestamp": torch.tensor([stamp])}):
+        auto, explicit, without = (estimate(model, given)["flow"][0] for model in models)
+        assert same_bits(auto, explicit) and same_bits(auto, without) != is_recognized
     no_height = np.full((4, 3), np.nan, np.float32)
-    assert np.array_equal(recognized_extrinsics(first_stamp, no_height, np.ones(4, bool)), np.eye(4))
-
-
-# ---------------------------------------------------------------------------------------------- the real pair
-
-
-@pytest.mark.parametrize(("preset", "points_frame"), [("fast", "sensor"), ("keypoints", "ego")])
-def test_real_pair_scores_as_cflow_eval(preset: str, points_frame: str, av2_folder: Path, tmp_path: Path) -> None:
-    """Batches do not tell the time of t+1, so that the gate of the key points is the one for 0.1 s; the pair's
-    0.100196 s make a gate of 2 m a little wider. A gate of 2.03 m and the wider one hold the same pixels. Nor do they
-    hold ground, so `min_height` has nothing to go by."""
-    settings = {"gate_radius": 2.03} if preset == "keypoints" else {"min_height": None}
-    extrinsics = osf.up_lidar(av2_folder) if points_frame == "sensor" else None
-    folder = store(tmp_path / "scenes", AV2Log(av2_folder), points_frame=points_frame, ego_T_lidar=extrinsics)
-    out = tmp_path / "out"
-    call = ["eval", "data=hdf5", f"data.root={folder}", f"model={preset}", "definition=opensceneflow", f"output={out}"]
-    main([*call, *(f"model.{key}={json.dumps(value)}" for key, value in settings.items())])
-    expected = json.loads((out / "results.json").read_text())["results"]
-    module = CFlow(preset=preset, **settings, ego_T_lidar=extrinsics)
-    frames = module.config.num_history + 2
-    for path in ("A", "B"):
-        results = osf.evaluate(module, folder, num_frames=frames, top_num_frames=frames, path=path)
-        assert json.loads(json.dumps(results).replace("NaN", "null").replace("Infinity", '"inf"')) == expected
+    assert np.array_equal(recognized_extrinsics(stamp, no_height, np.ones(4, bool)), np.eye(4))

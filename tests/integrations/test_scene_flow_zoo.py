@@ -1,4 +1,4 @@
-"""CorrelationFlowModel by SceneFlowZoo's forward contract. That is no package: its data classes have stand-ins here."""
+"""CorrelationFlowModel with SceneFlowZoo's inputs. That is not a package, so we replace its data classes."""
 
 from __future__ import annotations
 
@@ -28,19 +28,19 @@ class LoaderType(Enum):
 
 @dataclass
 class TorchFullFrameInputSequence:
-    """Stands for the class of that name: fields that a model for point clouds can see, all of them float32 there."""
+    """Replacement of the class of this name, with the fields that a model for point clouds can read (float32)."""
 
     full_pc: Tensor  # (K, PadN, 3), NaN in padding rows
     full_pc_mask: Tensor  # (K, PadN), 1 and 0, NaN in padding rows
     pc_poses_sensor_to_ego: Tensor  # (K, 4, 4)
     pc_poses_ego_to_global: Tensor  # (K, 4, 4)
     loader_type: Any = LoaderType.CAUSAL
-    full_pc_gt_flowed: Tensor = field(default_factory=lambda: torch.tensor(NAN))  # never to be read by a method
+    full_pc_gt_flowed: Tensor = field(default_factory=lambda: torch.tensor(NAN))  # truth, which no method may read
 
 
 @dataclass
 class TorchFullFrameOutputSequence:
-    """Stands for the class of that name. The evaluation there tells rows from padding by the NaN of the mask."""
+    """Replacement of the class of this name. Its evaluation recognises padding by the NaN of the mask."""
 
     ego_flows: Tensor
     valid_flow_mask: Tensor
@@ -55,7 +55,7 @@ class TorchFullFrameOutputSequence:
 
 @pytest.fixture(autouse=True)
 def zoo(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
-    """A checkout's packages `dataloaders` and `models`; returns the table by which a config finds a model."""
+    """Replace the packages `dataloaders` and `models`; return the table of models that a config can name."""
     dataloaders, models = ModuleType("dataloaders"), ModuleType("models")
     dataloaders.TorchFullFrameOutputSequence = TorchFullFrameOutputSequence  # type: ignore[attr-defined]
     models.name_to_class_lookup = {}  # type: ignore[attr-defined]
@@ -65,7 +65,7 @@ def zoo(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
 
 
 def make_sequence(sweeps: Sequence[Sweep], loader: LoaderType = LoaderType.CAUSAL) -> TorchFullFrameInputSequence:
-    """As the loaders there do it: poses relative to the last sweep (causal), to that after the middle (non-causal)."""
+    """Make the input as its loaders do: poses relative to the last sweep, or (non-causal) to that after the middle."""
     origin = len(sweeps) - 1 if loader is LoaderType.CAUSAL else (len(sweeps) - 1) // 2 + 1
     poses = np.stack(relative_to(list(sweeps), origin))
     sensor = np.broadcast_to(np.eye(4), poses.shape).copy()
@@ -80,17 +80,17 @@ def run(sequences: Any, num_history: int = 0, **settings: Any) -> list[TorchFull
     return CorrelationFlowModel(**{**SETTINGS, "num_history": num_history, **settings})("val", sequences, None)
 
 
-def test_causal_one_flow_in_the_axes_of_t_and_nan_in_padding_rows_alone() -> None:
-    """Rows are told by the mask: a point that is NaN in itself keeps its row, as it does in the truth there."""
+def test_causal_gives_one_flow_in_the_axes_of_t_with_nan_in_padding_rows() -> None:
+    """The mask marks padding. A point that is NaN keeps its row, as it does in the truth."""
     sweeps = drive(2)
     sequence, rows = make_sequence(sweeps), len(sweeps[0].points)
     (output,) = run([sequence])
     assert output.ego_flows.shape == (1, 640, 3) and output.ego_flows.dtype == torch.float32
-    turned = expected(sweeps, 0, 0)
-    np.testing.assert_allclose(output.flow(0), turned, rtol=0, atol=1e-6)
-    moves = speeds(turned) > 0.3
-    assert 100 < moves.sum() <= 150
-    assert np.abs(turned[moves] @ pose(0, 0, -YAW_STEP)[:3, :3].T - turned[moves]).max() > 0.03
+    rotated = expected(sweeps, 0, 0)
+    np.testing.assert_allclose(output.flow(0), rotated, rtol=0, atol=1e-6)
+    moving = speeds(rotated) > 0.3
+    assert 100 < moving.sum() <= 150
+    assert np.abs(rotated[moving] @ pose(0, 0, -YAW_STEP)[:3, :3].T - rotated[moving]).max() > 0.03
     assert torch.isnan(sequence.full_pc[0, :rows]).any() and torch.isfinite(output.ego_flows[0, :rows]).all()
     assert torch.isnan(output.ego_flows[0, rows:]).all() and torch.isnan(output.valid_flow_mask[0, rows:]).all()
     np.testing.assert_array_equal(output.mask(0), ~np.asarray(sweeps[0].is_ground))
@@ -98,7 +98,7 @@ def test_causal_one_flow_in_the_axes_of_t_and_nan_in_padding_rows_alone() -> Non
     assert output.valid_flow_mask.data_ptr() != sequence.full_pc_mask.data_ptr()
 
 
-def test_non_causal_a_flow_for_every_sweep_but_the_last() -> None:
+def test_non_causal_gives_a_flow_for_every_sweep_but_the_last() -> None:
     sweeps = drive(5)
     (output,) = run([make_sequence(sweeps, LoaderType.NON_CAUSAL)], num_history=2)
     assert output.ego_flows.shape == (4, 640, 3)
@@ -106,7 +106,7 @@ def test_non_causal_a_flow_for_every_sweep_but_the_last() -> None:
         np.testing.assert_allclose(output.flow(index), expected(sweeps, index, 2), rtol=0, atol=1e-6)
 
 
-def test_a_batch_of_sequences_of_any_length_and_kind() -> None:
+def test_sequences_of_a_batch_may_differ_in_length_and_kind() -> None:
     sweeps = drive(4)
     others = make_sequence(drive(3, velocity=0.7), LoaderType.NON_CAUSAL), make_sequence(drive(2, yaw_step=-0.05))
     batch = [make_sequence(sweeps), *others]
@@ -119,7 +119,7 @@ def test_a_batch_of_sequences_of_any_length_and_kind() -> None:
         np.testing.assert_array_equal(output.valid_flow_mask.numpy(), alone.valid_flow_mask.numpy())
 
 
-def test_a_config_finds_it_once_it_is_registered(zoo: dict[str, Any]) -> None:
+def test_a_config_can_name_the_registered_model(zoo: dict[str, Any]) -> None:
     register()
     model = zoo["correlationflow"](preset="fast", max_speed=30.0, device="cpu")
     assert model.sequence_flow.model.config.max_speed == 30.0 and model.sequence_flow.num_history == 2
@@ -127,7 +127,7 @@ def test_a_config_finds_it_once_it_is_registered(zoo: dict[str, Any]) -> None:
         zoo["correlationflow"](voxel=0.1)
 
 
-def test_outside_of_a_checkout(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_error_outside_of_a_checkout_has_the_fix(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("dataloaders", "models"):
         monkeypatch.setitem(sys.modules, name, None)
     for call in (lambda: run([make_sequence(drive(2))]), register):
@@ -138,7 +138,7 @@ def test_outside_of_a_checkout(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("changes", "complaint"),
     [
-        ({"full_pc": None}, r"batched_sequence\[1\]\.full_pc is no tensor"),
+        ({"full_pc": None}, r"batched_sequence\[1\]\.full_pc is not a tensor"),
         ({"full_pc": torch.zeros(1, 640, 3)}, r"full_pc has shape \(1, 640, 3\).*at least 2"),
         ({"full_pc_mask": torch.zeros(2, 7)}, r"full_pc_mask has shape \(2, 7\).*give \(2, 640\)"),
         ({"pc_poses_ego_to_global": torch.full((2, 4, 4), NAN)}, r"pc_poses_ego_to_global\[0\] holds NaN"),
@@ -146,7 +146,7 @@ def test_outside_of_a_checkout(monkeypatch: pytest.MonkeyPatch) -> None:
         ({"loader_type": "causal"}, r"loader_type is None: give LoaderType\.CAUSAL"),
     ],
 )
-def test_bad_sequences_are_refused_by_the_name_of_the_field(changes: dict[str, Any], complaint: str) -> None:
+def test_the_error_names_the_bad_field_of_a_sequence(changes: dict[str, Any], complaint: str) -> None:
     good = make_sequence(drive(2))
     with pytest.raises(CFlowError, match=complaint):
         run([good, replace(good, **changes)])
@@ -157,9 +157,9 @@ def test_bad_sequences_are_refused_by_the_name_of_the_field(changes: dict[str, A
 def test_the_output_is_on_the_device_of_the_input() -> None:
     sequence = make_sequence(drive(3))
     tensors = {name: value.cuda() for name, value in vars(sequence).items() if isinstance(value, Tensor)}
-    (here,) = run([sequence], num_history=1)
-    (there,) = run([replace(sequence, **tensors)], num_history=1)
-    (lent,) = run([sequence], num_history=1, device="cuda")
-    assert there.ego_flows.is_cuda and there.valid_flow_mask.is_cuda and not lent.ego_flows.is_cuda
-    np.testing.assert_array_equal(there.ego_flows.cpu().numpy(), here.ego_flows.numpy())
-    np.testing.assert_array_equal(lent.ego_flows.numpy(), here.ego_flows.numpy())
+    (on_cpu,) = run([sequence], num_history=1)
+    (on_gpu,) = run([replace(sequence, **tensors)], num_history=1)
+    (computed_on_gpu,) = run([sequence], num_history=1, device="cuda")
+    assert on_gpu.ego_flows.is_cuda and on_gpu.valid_flow_mask.is_cuda and not computed_on_gpu.ego_flows.is_cuda
+    np.testing.assert_array_equal(on_gpu.ego_flows.cpu().numpy(), on_cpu.ego_flows.numpy())
+    np.testing.assert_array_equal(computed_on_gpu.ego_flows.numpy(), on_cpu.ego_flows.numpy())

@@ -1,4 +1,4 @@
-"""A turning vehicle, a wall, a parked and a moving box: sweeps for the tests of harnesses, and what they must give."""
+"""Sweeps with a turning vehicle, a wall, a parked and a moving box, and the flow that a harness must get."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def drive(num_sweeps: int, velocity: float = 0.5, yaw_step: float = YAW_STEP, no
 
 
 def expected(sweeps: list[Sweep], index: int, num_history: int) -> np.ndarray:
-    """(N, 3) float64: the package's own residual of sweep `index`, turned by R^T into the axes of t."""
+    """(N, 3) float64 residual of sweep `index` by the method itself, rotated by R^T into the axes of t."""
     window = Window(sweeps[index], sweeps[index + 1], tuple(sweeps[max(index - num_history, 0) : index][::-1]))
     settings = {key: value for key, value in SETTINGS.items() if key != "preset"}
     model = CorrelationFlow(make_config("paper", num_history=num_history, **settings))
@@ -45,7 +45,7 @@ def expected(sweeps: list[Sweep], index: int, num_history: int) -> np.ndarray:
 
 
 def relative_to(sweeps: list[Sweep], index: int) -> list[np.ndarray]:
-    """Poses of the sweeps, the ego frame of one of them taken as the global frame."""
+    """Poses of the sweeps in the ego frame of one of them."""
     return [np.linalg.inv(np.asarray(sweeps[index].pose)) @ np.asarray(sweep.pose) for sweep in sweeps]
 
 

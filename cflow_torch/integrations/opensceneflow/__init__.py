@@ -1,6 +1,6 @@
-"""CorrelationFlow as a model of OpenSceneFlow (SeFlow, DeltaFlow and their forks): no change in the checkout.
+"""A model of OpenSceneFlow (SeFlow, DeltaFlow and their forks) that needs no change in the checkout.
 
-`python -m cflow_torch.integrations.opensceneflow FILE` writes the checkpoint without weights that its scripts ask for.
+`python -m cflow_torch.integrations.opensceneflow FILE` writes the checkpoint without weights that its scripts require.
 """
 
 from cflow_torch.integrations.opensceneflow.checkpoint import write_null_checkpoint

@@ -1,25 +1,6 @@
 """python -m cflow_torch.integrations.opensceneflow FILE: write the checkpoint without weights."""
 
-from __future__ import annotations
-
-import argparse
-import sys
-
-from cflow_torch.integrations.opensceneflow.checkpoint import write_null_checkpoint
-from cflow_torch.types import CFlowError
-
-
-def main() -> None:
-    """Write the file; where that fails, end with status 1 and one line on stderr."""
-    parser = argparse.ArgumentParser(prog="python -m cflow_torch.integrations.opensceneflow", description=__doc__)
-    parser.add_argument("file", metavar="FILE", help="for example cflow.ckpt; its stem is the default name of results")
-    parser.add_argument("--overwrite", action="store_true", help="replace a file that is there")
-    arguments = parser.parse_args()
-    try:
-        print(f"wrote {write_null_checkpoint(arguments.file, overwrite=arguments.overwrite)}")
-    except (CFlowError, OSError) as error:
-        sys.exit(f"error: {error}")
-
+from cflow_torch.integrations.opensceneflow.checkpoint import main
 
 if __name__ == "__main__":
     main()

@@ -1,4 +1,4 @@
-"""The harness's batches -> windows: every layout that its scripts produce, checked key by key."""
+"""Windows from the batches of OpenSceneFlow, in every layout that its scripts produce, checked key by key."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ class Sample:
     """One pair of sweeps of a batch, with its history.
 
     Args:
-        window: points that are finite and not ground; poses are those of the frame of the points.
+        window: points that are finite and not ground, with the poses of the frame of the points.
         rows0: (K,) int64, rows of batch["pc0"] that are in `window.pc0`.
-        rows1: (K1,) int64, the same for pc1.
-        T_ego1_ego0: (4, 4) float32, what the harness computes from the poses and adds itself.
-        T_lidar1_lidar0: (4, 4) float64, motion of the frame of the points; None = the same, `ego_T_lidar` is not used.
+        rows1: (K1,) int64, rows of batch["pc1"] that are in `window.pc1`.
+        T_ego1_ego0: (4, 4) float32, motion that the harness computes from the poses and adds itself.
+        T_lidar1_lidar0: (4, 4) float64, motion of the frame of the points; None = `T_ego1_ego0` is that motion.
     """
 
     window: Window
@@ -34,22 +34,22 @@ class Sample:
 
 
 def read_batch(batch: Mapping[str, Any], num_history: int, ego_T_lidar: Any = None) -> list[Sample]:
-    """Samples of a batch; the batch is not modified.
+    """Read the samples of a batch. The batch is not modified.
 
     Args:
         batch: as the harness collates it. For each sweep i of 0 and 1: "pc{i}" (B, N, 3) or a list of B (N, 3),
             "pose{i}" (B, 4, 4) or a list of B (4, 4), optionally "gm{i}" (B, N), True = ground. For history, nearest
-            first: "pch1", "poseh1", "gmh1", "pch2", ... Of other keys, "auto" looks at "timestamp" and "origin_pc0".
-        num_history: most history sweeps to take; fewer in the batch are fine.
-        ego_T_lidar: (4, 4), None = identity, "auto" = `recognized_extrinsics` of the sweep.
+            first: "pch1", "poseh1", "gmh1", "pch2", ... "auto" also reads "timestamp" and "origin_pc0".
+        num_history: maximum number of history sweeps; the batch may have fewer.
+        ego_T_lidar: (4, 4); None = identity; "auto" = `recognized_extrinsics` of the sweep.
 
     Convention:
-        A ground mask of the length of its points is applied; one whose rows that are not ground are as many as the
-        points was applied before (the harness does so for pc0 and pc1, and for some or all of the history). Rows with
-        NaN are padding, or no return, and left out. "flow" and other truth is never read.
+        A ground mask of the length of its points is applied. If instead the number of its rows that are not ground
+        equals the number of points, the harness has already applied it (to pc0, pc1 and some or all of the history).
+        Rows with NaN are ignored: they are padding, or beams without a return. "flow" and other truth is never read.
 
     Raises:
-        CFlowError: a missing key, a wrong shape, a pose that is no finite rigid motion; the message names the key.
+        CFlowError: a missing key, a wrong shape, a pose that is not a finite rigid motion; the message names the key.
     """
     history = [f"h{i}" for i in range(1, num_history + 1)]
     present = [name for name in history if f"pc{name}" in batch]
@@ -72,21 +72,21 @@ def _sample(batch: Mapping[str, Any], b: int, history: list[str], ego_T_lidar: A
 
 
 def _points(batch: Mapping[str, Any], b: int, name: str) -> tuple[Tensor, Tensor]:
-    """Points of one sweep that are finite and not ground, and their rows."""
+    """Select the points of one sweep that are finite and not ground; return them and their rows."""
     key = f"pc{name}"
     points = _entry(batch, key, b)
     if not isinstance(points, Tensor) or points.ndim != 2 or points.shape[1] < 3:
         raise CFlowError(f"batch['{key}'][{b}] is {_described(points)}: give a tensor of shape (N, 3)")
-    wanted = points[:, :3].isfinite().all(dim=1)
+    keep = points[:, :3].isfinite().all(dim=1)
     mask_key = f"gm{name}"
     if mask_key in batch:
         is_ground = _mask(batch, mask_key, b)
         if is_ground.numel() == points.shape[0]:
-            wanted = wanted & ~is_ground.to(points.device)
+            keep = keep & ~is_ground.to(points.device)
         elif int((~is_ground).sum()) != points.shape[0]:
-            found = f"{is_ground.numel()} rows, {int((~is_ground).sum())} not ground"
-            raise CFlowError(f"batch['{mask_key}'][{b}] has {found}, but {key} {len(points)} points: give its own mask")
-    rows = wanted.nonzero()[:, 0]
+            found = f"{is_ground.numel()} rows, {int((~is_ground).sum())} of them not ground"
+            raise CFlowError(f"batch['{mask_key}'][{b}] has {found}, but {key} has {len(points)} points")
+    rows = keep.nonzero()[:, 0]
     return points[:, :3].index_select(0, rows), rows
 
 
@@ -99,11 +99,11 @@ def _mask(batch: Mapping[str, Any], key: str, b: int) -> Tensor:
 
 
 def _extrinsics(batch: Mapping[str, Any], b: int, ego_T_lidar: Any) -> np.ndarray | None:
-    """(4, 4) float64, None = identity."""
+    """(4, 4) float64 ego_T_lidar of a sample; None = identity."""
     if not isinstance(ego_T_lidar, str):
         return None if ego_T_lidar is None else rigid_transform(ego_T_lidar, "ego_T_lidar")
     if "timestamp" not in batch or "gm0" not in batch:
-        return None  # training batches have neither ground nor its mask
+        return None  # training batches have no ground and no masks
     is_ground = _mask(batch, "gm0", b)
     points = _entry(batch, "origin_pc0" if "origin_pc0" in batch else "pc0", b)
     stamp = _entry(batch, "timestamp", b)
@@ -121,7 +121,7 @@ def _value(batch: Mapping[str, Any], key: str) -> Any:
 
 
 def _entry(batch: Mapping[str, Any], key: str, b: int) -> Any:
-    """Sample b of what a key holds, a tensor with a batch dimension or a list."""
+    """Sample b of a key, whose value is a tensor with a batch dimension or a list."""
     value = _value(batch, key)
     try:
         return value[b]

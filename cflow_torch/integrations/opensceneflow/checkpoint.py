@@ -1,7 +1,9 @@
-"""The checkpoint without weights: what lets the harness's Lightning path run a method that has nothing to load."""
+"""The checkpoint without weights. It lets OpenSceneFlow's Lightning scripts run a method that has nothing to load."""
 
 from __future__ import annotations
 
+import argparse
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -12,26 +14,28 @@ from cflow_torch.types import CFlowError
 
 
 def write_null_checkpoint(file: str | Path, overwrite: bool = False) -> Path:
-    """Write the checkpoint without weights; its stem becomes the label of the output folder and of printed tables.
+    """Write the checkpoint without weights.
 
     Args:
-        file: for example `cflow.ckpt`. The harness's save.py names its results by the stem.
-        overwrite: replace a file that is there.
+        file: for example `cflow.ckpt`. Its stem labels the output folder and the printed tables, and save.py stores
+            its results under this name.
+        overwrite: replace an existing file.
 
     Returns:
         The file.
 
     Convention:
-        Plain containers only, so that `torch.load(weights_only=True)` takes it. `model.target` is left out, because the
-        harness lets a checkpoint's settings win over those of the command line: overrides and sweeps have an effect.
+        It contains plain containers only, so that `torch.load(weights_only=True)` reads it. It has no `model.target`,
+        because the harness prefers the settings of a checkpoint to those of the command line: so overrides and sweeps
+        work.
 
     Raises:
-        CFlowError: the file is there already (it might hold weights).
+        CFlowError: the file exists already (it might contain weights).
         OSError: it cannot be written.
     """
     file = Path(file)
     if file.exists() and not overwrite:
-        raise CFlowError(f"{file} is there already: give another name, or overwrite (--overwrite)")
+        raise CFlowError(f"{file} exists already: give another name, or overwrite it (--overwrite)")
     cfg = {"model": {"name": file.stem}, "output": file.stem, "num_frames": 2}
     contents: dict[str, Any] = {
         "epoch": 0,
@@ -43,3 +47,17 @@ def write_null_checkpoint(file: str | Path, overwrite: bool = False) -> Path:
     with atomic_file(file) as new:
         torch.save(contents, new)
     return file
+
+
+def main() -> None:
+    """Run `python -m cflow_torch.integrations.opensceneflow`; an error exits with status 1 and one line on stderr."""
+    parser = argparse.ArgumentParser(
+        prog="python -m cflow_torch.integrations.opensceneflow", description="Write the checkpoint without weights."
+    )
+    parser.add_argument("file", metavar="FILE", help="for example cflow.ckpt; its stem is the default name of results")
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing file")
+    arguments = parser.parse_args()
+    try:
+        print(f"wrote {write_null_checkpoint(arguments.file, overwrite=arguments.overwrite)}")
+    except (CFlowError, OSError) as error:
+        sys.exit(f"error: {error}")
