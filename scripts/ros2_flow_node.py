@@ -1,11 +1,11 @@
-"""An example node for ROS 2: flow of a PointCloud2 topic as it arrives. Needs a sourced ROS 2 beside this package.
+"""An example node for ROS 2: estimate the flow of a PointCloud2 topic as it arrives. Needs a sourced ROS 2.
 
     python scripts/ros2_flow_node.py --ros-args -p cloud:=/points -p odometry:=/odom -p preset:=fast
 
-It publishes <cloud>/flow: the points of the sweep before, with vx, vy, vz over ground (m/s) and the number of their
-object, in the axes of the newest sweep, and logs its latency. Clouds must be in the frame of the vehicle or the sensor,
-and the odometry that of the same frame; of its poses the one nearest in time is taken. Without an odometry topic poses
-come from KISS-ICP (extra `odometry`). Nobody has run it on a robot yet.
+The node publishes <cloud>/flow: the points of the sweep before, with vx, vy, vz over ground (m/s) and their object id,
+in the axes of the newest sweep. It logs its latency. Clouds and odometry must both be in the frame of the vehicle, or
+both in that of the sensor. The node uses the pose nearest in time. Without an odometry topic, KISS-ICP estimates poses
+(extra `odometry`). Nobody has run the node on a robot yet.
 """
 
 from __future__ import annotations
@@ -46,16 +46,16 @@ class FlowNode(Node):  # type: ignore[misc]
             self.create_subscription(Odometry, names["odometry"], self.on_odometry, 50)
 
     def on_odometry(self, message: Any) -> None:
-        """Keep the last hundred poses."""
+        """Store a pose; keep the last hundred."""
         pose, stamp = message.pose.pose, message.header.stamp
         rotation = (pose.orientation.w, pose.orientation.x, pose.orientation.y, pose.orientation.z)
-        place = (pose.position.x, pose.position.y, pose.position.z)
-        (self._poses[_nanoseconds(stamp)],) = poses_from_quaternions([place], [rotation], lambda _: "a pose")
+        position = (pose.position.x, pose.position.y, pose.position.z)
+        (self._poses[_nanoseconds(stamp)],) = poses_from_quaternions([position], [rotation], lambda _: "a pose")
         while len(self._poses) > 100:
             del self._poses[min(self._poses)]
 
     def on_cloud(self, message: Any) -> None:
-        """Push a sweep, publish the flow of the one before it."""
+        """Push a sweep, and publish the flow of the one before it."""
         begin, stamp, pose = time.perf_counter(), _nanoseconds(message.header.stamp), None
         if self._poses is not None:
             if not self._poses:

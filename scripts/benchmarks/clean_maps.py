@@ -1,18 +1,18 @@
-"""How well moving points are taken out: `CleanLog` beside DUFOMap, on simulated drives and on real scenes.
+"""Compare `CleanLog` with DUFOMap in removing moving points, on simulated drives and on real scenes.
 
 python scripts/benchmarks/clean_maps.py
 python scripts/benchmarks/clean_maps.py --only --root data/kitti-0000 --logs kitti-0000-c2
 
-Scores of DynamicMap_Benchmark, by point: static accuracy SA (share of the points that stand and are kept), dynamic
-accuracy DA (share of the points that move and are removed), AA = sqrt(SA DA); per cent.
-A point moves by a true residual flow of 0.05 m a sweep. Waiting: share removed of the points of things that stand now
-and move elsewhere in the drive; they count neither for SA nor for DA. Ground counts. Points within 50 m, all sweeps but
-the last; in real scenes those with labels. Seconds of processor time per sweep, one thread, flow included.
+Scores per point, in per cent, as in DynamicMap_Benchmark: static accuracy SA (share of the static points that are
+kept), dynamic accuracy DA (share of the moving points that are removed), AA = sqrt(SA DA). A point moves if its true
+residual flow is at least 0.05 m per sweep. "Waiting" is the share of removed points of objects that are static now and
+move elsewhere in the drive; SA and DA leave them out. Ground is scored. We score points within 50 m in all sweeps but
+the last, in real scenes those with labels. Times are processor seconds per sweep, one thread, flow included.
 
-DUFOMap: pip install dufomap; 0.1 m, d_s 0.2, d_p 2 and 1, clusters and propagation, rays from the LiDAR (the first one
-of several), points of 2 ... 50 m (with others it finds nothing on KITTI). Without it its rows are left out.
+DUFOMap (pip install dufomap; optional): 0.1 m, d_s 0.2, d_p 2 and 1, clusters and propagation, rays from the LiDAR (the
+first one of several), points of 2 ... 50 m (with others it finds nothing on KITTI).
 
-The case "light": a car that brakes and stops, one that starts up; av2.
+The case "light" has a car that brakes and stops, and a car that starts up; its sensor is av2.
 """
 
 from __future__ import annotations
@@ -47,34 +47,35 @@ DUFO = {"d_p 2": (0.1, 0.2, 2), "d_p 1": (0.1, 0.2, 1)}
 
 
 def truths(log: Any) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """For each sweep but the last, of each point: does it count, does it move, does it move at some time?"""
+    """For each sweep but the last, three masks of its points: scored, moving now, moving at some time."""
     for index in range(len(log.timestamps) - 1):
         sweep = log.sweep(index)
         points = np.asarray(sweep.points, np.float64)[:, :3]
         if hasattr(log, "truth"):
             labels = log.drive.labels(index * log.step)
             body, velocity = log.truth(index)
-            stands = np.array([body.is_static for body in log.drive.scene.bodies] + [True])
+            is_static = np.array([body.is_static for body in log.drive.scene.bodies] + [True])
             seconds = (log.timestamps[index + 1] - log.timestamps[index]) * 1e-9
             moves, known = (np.linalg.norm(velocity, axis=1) * seconds >= MOVING)[body], labels.is_valid
-            ever = ~stands[body]
+            ever = ~is_static[body]
         else:
             labels = log.labels(index)
-            still = ego_motion_flow(points, np.linalg.inv(log.sweep(index + 1).pose) @ sweep.pose)
-            moves = np.linalg.norm(labels.flow - still, axis=1) >= MOVING
+            pose_flow = ego_motion_flow(points, np.linalg.inv(log.sweep(index + 1).pose) @ sweep.pose)
+            moves = np.linalg.norm(labels.flow - pose_flow, axis=1) >= MOVING
             ever, known = moves, labels.is_valid
         yield known & (np.hypot(points[:, 0], points[:, 1]) < RANGE), moves, ever
 
 
 def light(num_sweeps: int) -> SimulatedLog:
-    """A car that stops after half of the sweeps, one that starts up then, a parked one, houses."""
+    """A car that stops after half of the sweeps, a car that starts up then, a parked car, houses."""
     rng, half = np.random.default_rng(0), 0.05 * num_sweeps
-    ways = (
+    routes = (
         Route(16, 3.5, math.pi, speed=3 * half, acceleration=-3),
         Route(8, -3.5, speed=-3 * half, acceleration=3),
         Route(4, 6, speed=0),
     )
-    bodies = (*(objects.car(rng, way) for way in ways), objects.wall(10, 12, 60, 6, 8), objects.wall(10, -12, 60, 6, 8))
+    walls = (objects.wall(10, y, 60, 6, 8) for y in (12, -12))
+    bodies = (*(objects.car(rng, route) for route in routes), *walls)
     scene = Scene(Ground((0.0, 0.0), 0.0), Route(-6, 0, speed=2), bodies, SolidTable.of(bodies))
     log = SimulatedLog("av2", 0, "street", num_sweeps)
     log.drive = Drive(scene, PROFILES["av2"], 0, num_sweeps, "light")
@@ -82,7 +83,7 @@ def light(num_sweeps: int) -> SimulatedLog:
 
 
 def by_dufomap(log: Log, T_ego_lidar: np.ndarray, settings: tuple[float, float, int]) -> tuple[list[np.ndarray], float]:
-    """Points that DUFOMap calls dynamic in each sweep, and seconds per sweep."""
+    """Dynamic points of each sweep by DUFOMap, and seconds per sweep."""
     begin = time.process_time()
     sweeps, to_lidar = list(log), np.linalg.inv(T_ego_lidar)
     to_first = np.linalg.inv(np.asarray(sweeps[0].pose))
@@ -92,19 +93,18 @@ def by_dufomap(log: Log, T_ego_lidar: np.ndarray, settings: tuple[float, float, 
 
 
 def scores(name: str, removed: list[np.ndarray], truth: list[Any], seconds: float) -> dict[str, Any]:
-    """A line of the table."""
+    """A row of the table."""
     total = np.zeros((3, 2))
-    for gone, (counts, moves, ever) in zip(removed, truth):
-        for row, chosen in enumerate((counts & ~moves & ~ever, counts & moves, counts & ~moves & ever)):
-            total[row] += (gone & chosen).sum(), chosen.sum()
-    standing, moving, waiting = 100 * total[:, 0] / np.maximum(total[:, 1], 1)
-    kept = float(100 - standing)
-    moving = float(moving)
+    for is_removed, (is_scored, moves, ever) in zip(removed, truth):
+        for row, chosen in enumerate((is_scored & ~moves & ~ever, is_scored & moves, is_scored & ~moves & ever)):
+            total[row] += (is_removed & chosen).sum(), chosen.sum()
+    static, dynamic, waiting = (100 * total[:, 0] / np.maximum(total[:, 1], 1)).tolist()
+    kept = 100 - static
     return {
         "what": name,
         "SA": kept,
-        "DA": moving,
-        "AA": float(np.sqrt(kept * moving)),
+        "DA": dynamic,
+        "AA": float(np.sqrt(kept * dynamic)),
         "waiting": float(waiting) if total[2, 1] else "",
         "seconds": seconds,
     }
@@ -137,7 +137,7 @@ def main() -> None:
     for name, log, opened, T_ego_lidar in cases:
         recent, pairs = CachedLog(opened, model.config.num_sweeps), range(len(opened.timestamps) - 1)
         truth = list(truths(log))
-        for index in pairs:  # simulating and reading is no part of the time
+        for index in pairs:  # simulation and reading are not timed
             recent.sweep(index)
         flow, seconds = [], 0.0
         for index in pairs:

@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""Labels of moving points beside DUFOMap and HDBSCAN: precision, recall, processor time, in one run, in turn.
+"""Compare labels of moving points with DUFOMap and HDBSCAN: precision, recall and processor time.
 
   python scripts/benchmarks/label_table.py                                     simulated drives of five sensors
   python scripts/benchmarks/label_table.py --peer-python VENV/bin/python --scenes DATA/kitti-0000 --json FILE
 
-Scored: labelled points within 50 m that are no ground; those with a true residual of at least 0.05 m a sweep move. The
-peers compute in a process of their own (peers.py). Ours includes `nnd`, theirs has none. Seconds: of the processor, a
-sweep, read and written data excluded, median over scenes of a row.
+We score labelled points within 50 m that are not ground. A point moves if its true residual flow is at least 0.05 m per
+sweep. DUFOMap and HDBSCAN run in a separate process (peers.py). Our time includes `nnd`, which they do not compute.
+Times are processor seconds per sweep without reading and writing, medians over the scenes of a row.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from typing import Any, Sequence
 import numpy as np
 import torch
 from peers import RANGE
-from scipy import spatial  # noqa: F401 (not to be timed)
+from scipy import spatial  # noqa: F401 (its import is not timed)
 from table import markdown
 
 from cflow_torch import make_config, make_model
@@ -41,19 +41,19 @@ SEEDS = (300, 301, 302, 303)  # settings were chosen on 100 to 103
 
 
 def ours(file: Path, preset: str) -> dict[str, Any]:
-    """Labels of a scene by a preset: counts, and seconds a sweep."""
+    """Label a scene by a preset; returns the counts, and seconds per sweep."""
     model, log = make_model(make_config(preset), "cpu"), HDF5Log(file)
-    held = CachedLog(log, len(log))
-    sweeps = list(held)
-    model([window(held, 0)])
+    cached = CachedLog(log, len(log))
+    sweeps = list(cached)  # read before the clock starts
+    model([window(cached, 0)])
     start = time.process_time()
-    flows = (model([w])[0] for w in windows(held, model.config.num_history, model.config.num_future))
-    labels = [each["dufo"] > 0 for _, each in find_labels(held, flows, model)]
+    flows = (model([w])[0] for w in windows(cached, model.config.num_history, model.config.num_future))
+    labels = [each["dufo"] > 0 for _, each in find_labels(cached, flows, model)]
     return {"seconds": (time.process_time() - start) / len(sweeps), "counts": counts(log, labels)}
 
 
 def theirs(file: Path, python: str, scratch: str) -> Any:
-    """The same by DUFOMap, and its seconds and HDBSCAN's; None if they are not installed."""
+    """Label a scene by DUFOMap; returns the counts, and seconds of DUFOMap and HDBSCAN. None if not installed."""
     labels = Path(scratch) / "labels.npz"
     call = [python, Path(__file__).with_name("peers.py"), file, labels]
     done = subprocess.run(list(map(str, call)), capture_output=True, text=True)
@@ -68,21 +68,21 @@ def theirs(file: Path, python: str, scratch: str) -> Any:
 
 
 def counts(log: Any, labels: Sequence[np.ndarray]) -> list[int]:
-    """Points that move and are found, are not and are found, move and are missed."""
+    """Numbers of true positive, false positive and false negative points."""
     total = np.zeros(3, np.int64)
     for index, found in enumerate(labels):
         sweep, truth = log.sweep(index), log.labels(index)
         if truth is None:
             continue
-        still = ego_motion_flow(sweep.points, np.linalg.inv(log.sweep(index + 1).pose) @ sweep.pose)
-        counts_here = truth.is_valid & ~sweep.is_ground & (np.linalg.norm(sweep.points[:, :2], axis=1) <= RANGE)
-        moves = np.linalg.norm(truth.flow - still, axis=1) >= MOVING
-        total += [(counts_here & a & b).sum() for a, b in ((found, moves), (found, ~moves), (~found, moves))]
+        pose_flow = ego_motion_flow(sweep.points, np.linalg.inv(log.sweep(index + 1).pose) @ sweep.pose)
+        is_scored = truth.is_valid & ~sweep.is_ground & (np.linalg.norm(sweep.points[:, :2], axis=1) <= RANGE)
+        moves = np.linalg.norm(truth.flow - pose_flow, axis=1) >= MOVING
+        total += [(is_scored & a & b).sum() for a, b in ((found, moves), (found, ~moves), (~found, moves))]
     return [int(each) for each in total]
 
 
 def simulated(folder: Path, num_sweeps: int) -> dict[str, list[Path]]:
-    """Scenes of drives of each sensor."""
+    """Write scenes of simulated drives of each sensor."""
     rows: dict[str, list[Path]] = {}
     for sensor, made in FORMATS.items():
         for seed in SEEDS if sensor == "av2" else SEEDS[:2]:
@@ -96,13 +96,13 @@ def simulated(folder: Path, num_sweeps: int) -> dict[str, list[Path]]:
 
 
 def score(parts: Sequence[dict[str, Any]]) -> str:
-    """Precision and recall over some scenes."""
+    """Precision and recall over several scenes."""
     found, false, missed = np.sum([part["counts"] for part in parts], 0)
     return f"{found / max(found + false, 1):.3f}, {found / max(found + missed, 1):.3f}"
 
 
 def table_row(name: str, scenes: list[dict[str, Any]], presets: Sequence[str]) -> dict[str, Any]:
-    """A line of the table."""
+    """A row of the table."""
     row: dict[str, Any] = {"precision, recall": f"{name} ({len(scenes)})"}
     seconds = {preset: statistics.median(each[preset]["seconds"] for each in scenes) for preset in presets}
     for preset in presets:
@@ -130,8 +130,8 @@ def main() -> None:
     results: dict[str, list[dict[str, Any]]] = {}
     with tempfile.TemporaryDirectory() as scratch:
         rows = {} if chosen.no_simulated else simulated(chosen.folder or Path(scratch), chosen.num_sweeps)
-        for place in chosen.scenes:
-            rows.update({file.stem: [file] for file in find_hdf5_scenes(place)})
+        for path in chosen.scenes:
+            rows.update({file.stem: [file] for file in find_hdf5_scenes(path)})
         for row, files in rows.items():
             for file in files:
                 result = {"file": file.name, **{preset: ours(file, preset) for preset in chosen.presets}}

@@ -32,9 +32,8 @@ from cflow_torch.simulator import make_drive
 
 HISTORY = 4
 PAPER, KEYS, DEFAULT = make_config("paper"), make_config("keypoints"), make_config("default")
-FULL = PAPER.replace(
-    num_history=HISTORY, pixel_sizes=(0.8, 0.4, 0.3, 0.2, 0.1)
-)  # the paper's figure benefit_multiscale
+# The settings of the paper's figure benefit_multiscale.
+FULL = PAPER.replace(num_history=HISTORY, pixel_sizes=(0.8, 0.4, 0.3, 0.2, 0.1))
 WIDE = PAPER.replace(point_cloud_range=DEFAULT.point_cloud_range)
 WIDE_HISTORY = WIDE.replace(num_history=HISTORY)
 WIDE_SCALES = WIDE_HISTORY.replace(pixel_sizes=DEFAULT.pixel_sizes)

@@ -1,15 +1,15 @@
-"""Tracks of simulated drives of five sensors beside what single sweeps give: `FlowResult.objects` and their velocities.
+"""Compare tracks with the moving groups of single sweeps, on simulated drives of five sensors.
 
 python scripts/benchmarks/tracks.py                        a drive of 20 sweeps per sensor and scene
 python scripts/benchmarks/tracks.py --model fast --only av2
 
-Drives of seeds 300 and above; settings of the tracker were chosen on seeds 400 and 401. Ground masks are exact where
-the data set has masks and found by grid elsewhere; nuScenes is read at 10 Hz. An object counts in a sweep if it moves
-at 0.5 m/s or more and at least 20 of its points take part.
+Drives have seeds 300 and above; settings of the tracker were chosen on seeds 400 and 401. Ground masks are exact where
+the data set has masks, and estimated by grid elsewhere. nuScenes is read at 10 Hz. We score an object in a sweep if it
+moves at 0.5 m/s or more and has at least 20 active points.
 
-columns: object-sweeps; share that a group that moves / a track covers (recall); id switches per 100 object-sweeps with
-a track; error of the horizontal velocity, m/s, mean and median over the same object-sweeps: of single sweeps, of
-tracks; rows of static things per 100 rows, of single sweeps' groups and of tracks.
+Columns: number of scored objects over all sweeps; the share of them with a moving group, and with a track (recall); id
+switches per 100 objects with a track; error of the horizontal velocity of groups and of tracks over the same objects,
+m/s, mean and median; share of groups and of table rows that are static objects.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ from cflow_torch.simulator.drive import Drive
 from cflow_torch.types import FlowResult, Sweep, Window
 
 WITH_MASKS = ("av2", "aevascenes")
-SPEED, POINTS = 0.5, 20  # m/s and points of an object that counts
+SPEED, POINTS = 0.5, 20  # m/s and points, least of a scored object
 Row = Dict[str, Any]
 
 
 class SimulatedLog(Log):
-    """A simulated drive as its data set gives it: every so many sweeps, masks or none; with the truth."""
+    """A simulated drive with the sweep rate and ground masks of its data set, and with the truth."""
 
     def __init__(self, profile: str, seed: int, scene: str, num_sweeps: int) -> None:
         self.step, self._has_masks = 2 if profile == "nuscenes" else 1, profile in WITH_MASKS
@@ -48,16 +48,16 @@ class SimulatedLog(Log):
         self.log_id, self.timestamps = self.drive.log_id, self.drive.timestamps[:: self.step]
 
     def sweep(self, index: int) -> Sweep:
-        """As the drive's."""
+        """Sweep of the drive, without its mask if the data set has none."""
         sweep = self.drive.sweep(index * self.step)
         return sweep if self._has_masks else replace(sweep, is_ground=None)
 
     def labels(self, index: int) -> FlowLabels | None:
-        """None: `truth` says more."""
+        """None, because `truth` has more."""
         return None
 
     def truth(self, index: int) -> tuple[np.ndarray, np.ndarray]:
-        """(N,) number of the body that each point lies on, the last = ground; (bodies + 1, 3) m/s over ground."""
+        """(N,) index of each point's body, the last = ground; (bodies + 1, 3) velocities over ground, m/s."""
         times = (np.array(self.timestamps[index : index + 2]) - self.timestamps[0]) * 1e-9
         now, then = self.drive.scene.body_poses(times)[:, :, :3, 3]
         velocity = np.concatenate([(then - now) / (times[1] - times[0]), np.zeros((1, 3))])
@@ -65,7 +65,7 @@ class SimulatedLog(Log):
         return np.append(table.body, len(now))[solid], velocity
 
     def opened(self) -> Log:
-        """The log with ground."""
+        """The log with ground masks."""
         return self if self._has_masks else GroundSegmentedLog(self, "grid")
 
 
@@ -82,58 +82,58 @@ def score(log: SimulatedLog, pairs: Iterator[tuple[int, Window, FlowResult]]) ->
     last: dict[int, int] = {}
     for index, flow, given, track_id in sweeps:
         body, velocity = log.truth(index)
-        is_active, ground = flow["is_valid"], len(velocity) - 1
+        ground = len(velocity) - 1
         seconds = (log.timestamps[index + 1] - log.timestamps[index]) * 1e-9
         moves = (np.linalg.norm(flow["residual_flow"], axis=1) >= MOVING) & (flow["cluster_id"] >= 0)
         rotation = np.asarray(given.pc1.pose)[:3, :3]
-        here = {name: values[kept["sweep"] == index] for name, values in kept.items()}
-        track_id = np.where(np.isin(track_id, here["id"]), track_id, -1)
-        is_mover = np.linalg.norm(velocity, axis=1) >= SPEED
-        for _, owner in _owners(flow["cluster_id"], moves, body):
+        rows = {name: values[kept["sweep"] == index] for name, values in kept.items()}
+        track_id = np.where(np.isin(track_id, rows["id"]), track_id, -1)
+        is_dynamic = np.linalg.norm(velocity, axis=1) >= SPEED
+        for owner in _bodies_of(flow["cluster_id"], moves, body):
             counts["groups"] += 1
-            counts["false_groups"] += not is_mover[owner]
-        for _, owner in _owners(track_id, track_id >= 0, body):
-            has_moved = is_mover[owner] or (owner < ground and not log.drive.scene.bodies[owner].is_static)
+            counts["false_groups"] += not is_dynamic[owner]
+        for owner in _bodies_of(track_id, track_id >= 0, body):
+            has_moved = is_dynamic[owner] or (owner < ground and not log.drive.scene.bodies[owner].is_static)
             counts["false_rows"] += not has_moved
-        for mover in np.flatnonzero(is_mover):
-            on = is_active & (body == mover)
-            if on.sum() < POINTS:
+        for dynamic in np.flatnonzero(is_dynamic):
+            on_body = flow["is_valid"] & (body == dynamic)
+            if on_body.sum() < POINTS:
                 continue
             counts["objects"] += 1
-            group = _most(flow["cluster_id"][on & moves])
-            number = _most(track_id[on & (track_id >= 0)])
+            group = _most_frequent(flow["cluster_id"][on_body & moves])
+            of_track = _most_frequent(track_id[on_body & (track_id >= 0)])
             counts["grouped"] += group is not None
-            if number is None:
+            if of_track is None:
                 continue
             counts["tracked"] += 1
-            counts["switches"] += last.get(mover, number) != number
-            last[mover] = number
+            counts["switches"] += last.get(dynamic, of_track) != of_track
+            last[dynamic] = of_track
             if group is None:
                 continue
             raw = rotation @ flow["residual_flow"][moves & (flow["cluster_id"] == group)].mean(0) / seconds
-            row = np.flatnonzero(here["id"] == number)[0]
-            filtered = np.array([here[name][row] for name in ("vx", "vy")])
-            counts["raw"].append(float(np.linalg.norm((raw - velocity[mover])[:2])))
-            counts["filtered"].append(float(np.linalg.norm(filtered - velocity[mover, :2])))
+            row = np.flatnonzero(rows["id"] == of_track)[0]
+            filtered = np.array([rows[name][row] for name in ("vx", "vy")])
+            counts["raw"].append(float(np.linalg.norm((raw - velocity[dynamic])[:2])))
+            counts["filtered"].append(float(np.linalg.norm(filtered - velocity[dynamic, :2])))
     return counts
 
 
-def _most(numbers: np.ndarray) -> int | None:
-    """The number that occurs most often; None of none."""
+def _most_frequent(numbers: np.ndarray) -> int | None:
+    """The most frequent number, None without numbers."""
     values, count = np.unique(numbers, return_counts=True)
     return int(values[count.argmax()]) if len(values) else None
 
 
-def _owners(number: np.ndarray, chosen: np.ndarray, body: np.ndarray) -> Iterator[tuple[int, int]]:
-    """Each number that occurs five times or more among the chosen points, and the body that most of them lie on."""
-    for value, count in zip(*np.unique(number[chosen], return_counts=True)):
-        owner = _most(body[chosen & (number == value)])
+def _bodies_of(group: np.ndarray, chosen: np.ndarray, body: np.ndarray) -> Iterator[int]:
+    """For each group with at least five chosen points, the body that most of them belong to."""
+    for value, count in zip(*np.unique(group[chosen], return_counts=True)):
+        owner = _most_frequent(body[chosen & (group == value)])
         if count >= 5 and owner is not None:
-            yield int(value), owner
+            yield owner
 
 
 def summary(sensor: str, parts: list[Row]) -> Row:
-    """A line of the table."""
+    """A row of the table."""
     total = {name: sum((part[name] for part in parts[1:]), parts[0][name]) for name in parts[0]}
     raw, filtered = (total[name] or [float("nan")] for name in ("raw", "filtered"))
 

@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
-"""The pictures of docs/applications.md, of simulated drives.
+"""Draw the pictures of docs/applications.md from simulated drives.
 
 python scripts/figures/applications.py                    all of them: docs/pictures/tracks.png, clean.png, ...
-python scripts/figures/applications.py --only stream      one; of the stream, its latencies too
+python scripts/figures/applications.py --only stream      one of them; for the stream, also print its latencies
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ import matplotlib.pyplot as plt  # noqa: E402
 
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "pictures"
 CROSSING_SWEEPS = 16
-VIEW = 32.0  # metres each way from the middle of the crossing
-STANDING = "#9aa0a6"
+VIEW = 32.0  # metres from the middle of the crossing to each side
+BACKGROUND = "#9aa0a6"
 LABELLED, REACH = 4, (-30, 40, -18, 18)  # the sweep; metres shown: x, y
 COLOURS = np.array(["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#882255", "#117733"])
 STREAMED, INTERVAL = 40, 0.1  # sweeps; seconds between them
@@ -58,13 +58,13 @@ def tracks(file: Path) -> None:
     points = sweep.points[~sweep.is_ground].astype(float) @ sweep.pose[:3, :3].T + sweep.pose[:3, 3]
     figure, (axes,) = square_panels(1)
     draw_tracks(axes, points, track(log, enumerate(flow)), last)
-    axes.set_title(f"tracks after {last + 1} sweeps: id, speed in m/s; lines: the way so far", fontsize=9)
+    axes.set_title(f"tracks after {last + 1} sweeps: id, speed in m/s; lines: the path so far", fontsize=9)
     figure.savefig(file, bbox_inches="tight")
 
 
 def draw_tracks(axes: Any, points: np.ndarray, table: dict[str, np.ndarray], index: int) -> None:
-    """Boxes and ids at a sweep, and the way of each track until then, over the points of the sweep."""
-    axes.scatter(points[:, 0], points[:, 1], s=0.15, c=STANDING, linewidths=0)
+    """Boxes and ids at a sweep, and the path of each track until then, over the points of the sweep."""
+    axes.scatter(points[:, 0], points[:, 1], s=0.15, c=BACKGROUND, linewidths=0)
     for row in np.flatnonzero(table["sweep"] == index):
         number = table["id"][row]
         colour = PALETTE[number % len(PALETTE)] / 255
@@ -81,11 +81,11 @@ def draw_tracks(axes: Any, points: np.ndarray, table: dict[str, np.ndarray], ind
 
 
 def clean(file: Path) -> None:
-    """The map of the crossing, with and without what moves; from above, darker where it is higher."""
+    """The map of the crossing from above, with and without dynamic objects; higher points are darker."""
     log, flow = crossing()
     figure, both = square_panels(2)
     cleaned = CleanLog(log, flow=flow.__getitem__, remove_stopped=True)
-    for axes, each, title in zip(both, (log, cleaned), ("all points of the drive", "without what moves")):
+    for axes, each, title in zip(both, (log, cleaned), ("all points of the drive", "without dynamic objects")):
         x, y, z = static_map(each, 0.15).T
         order = z.argsort()
         axes.scatter(x[order], y[order], s=0.12, c=z[order], cmap="viridis_r", vmin=-0.5, vmax=4, linewidths=0)
@@ -102,7 +102,7 @@ def square_panels(count: int) -> Any:
 
 
 def labels(file: Path) -> None:
-    """What `cflow label` writes for a sweep, beside the truth."""
+    """The labels of `cflow label` for a sweep, next to the truth."""
     with tempfile.TemporaryDirectory() as folder:
         scene = Path(folder) / "drive.h5"
         write_hdf5_scene(make_drive(seed=300, num_sweeps=9, profile="av2", scene="crossing"), scene)
@@ -115,8 +115,8 @@ def labels(file: Path) -> None:
     residual = values["flow"] - (points @ T[:3, :3].T + T[:3, 3] - points)
     moves = np.linalg.norm(residual, axis=1) >= MOVING
     shown = [
-        ("truth: points that move, by object", moves * values["flow_instance_id"] + 0),
-        ("dufo and dufocluster: what moves, by group", values["dufocluster"]),
+        ("truth: moving points, by object", moves * values["flow_instance_id"] + 0),
+        ("dufo and dufocluster: moving points, by group", values["dufocluster"]),
         ("cluster: all groups", values["cluster"]),
         ("nnd: the next sweep has nothing within 0.14 m", values["nnd"] * 2),
     ]
@@ -136,7 +136,7 @@ def labels(file: Path) -> None:
 
 
 def stream(file: Path) -> None:
-    """Latency of each sweep of a drive; prints the medians."""
+    """Latency of each sweep of a drive; also print the medians."""
     sweeps = list(make_drive(seed=0, num_sweeps=STREAMED, profile="av2"))
     figure, axes = plt.subplots(figsize=(7.0, 2.6), layout="constrained")
     for preset in ("fast", "paper", "default"):
@@ -162,7 +162,7 @@ def latencies(flows: FlowStream, sweeps: Sequence[Sweep]) -> list[float]:
 
 
 def deskewed(file: Path) -> None:
-    """Cars met by two rotating LiDARs, as measured and de-skewed."""
+    """Cars measured by two spinning LiDARs, before and after de-skewing."""
     model = make_model(make_config("default"), "cpu")
     sweeps = window(drives.rolling_shutter(0).drive, drives.PAIR, model.config.num_history)
     (result,) = model([sweeps])
@@ -172,7 +172,7 @@ def deskewed(file: Path) -> None:
     for panel, points, title in zip(axes, (given, deskew(sweeps, result).numpy()), ("as measured", "de-skewed")):
         dots = panel.scatter(*points[shown, :2].T, s=1.5, c=1000 * times[shown], cmap="viridis", linewidths=0)
         panel.set(title=title, aspect="equal", xlim=(-30, 26), ylim=(-7, 7))
-    figure.colorbar(dots, ax=axes, label="measured, ms after the instant of the sweep", shrink=0.8)
+    figure.colorbar(dots, ax=axes, label="measured, ms after the time stamp of the sweep", shrink=0.8)
     figure.savefig(file, dpi=110)
 
 
@@ -181,7 +181,7 @@ PICTURES = {each.__name__: each for each in DRAWN}
 
 
 def main() -> None:
-    """Draw them."""
+    """Draw the pictures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="+", choices=tuple(PICTURES), default=tuple(PICTURES))
     parser.add_argument("--folder", type=Path, default=FOLDER)

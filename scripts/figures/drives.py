@@ -1,6 +1,6 @@
-"""Small simulated drives that are hard: those of docs/limits.md, and what a bird's-eye view merges.
+"""Small simulated drives that are difficult: the cases of docs/limits.md, and objects that merge in a bird's-eye view.
 
-The vehicle is at the origin, heading along x, at the sweep that counts.
+At sweep t of the scored pair, the vehicle is at the origin and heads along x.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ PAIR, NUM_SWEEPS = 5, 11  # sweep t, so that four older ones exist, and four aft
 FLAT = Ground((0.0, 0.0), 0.0, kerb=0.0, half_widths=(1e4, 1.0), crossing_x=1e5)
 EAST, NORTH, WEST = 0.0, math.pi / 2, math.pi
 BORDERS = (51.2, 76.8)  # metres, half sides of regions
-SECONDS = 0.1 * PAIR  # from the first sweep to the one that counts
+SECONDS = 0.1 * PAIR  # from the first sweep to sweep t
 View = Tuple[float, float, float, float]
 
 
 class Staged(NamedTuple):
-    """A drive, and what of it is looked at.
+    """A drive, and the part of it that is scored and drawn.
 
     Args:
-        drive: the pair that counts is (PAIR, PAIR + 1).
-        title: what is hard, a line.
-        whose: the points that the error is of.
-        bodies: their numbers in the scene.
-        view: (x0, y0, x1, y1) metres, frame of t, what a picture shows.
+        drive: the scored pair is (PAIR, PAIR + 1).
+        title: the difficulty, a line.
+        whose: names of the scored objects.
+        bodies: their indices in the scene.
+        view: (x0, y0, x1, y1) metres, frame of t, region of the picture.
     """
 
     drive: Drive
@@ -46,34 +46,34 @@ class Staged(NamedTuple):
 
 
 def drive_past(
-    bodies: Sequence[Body], seed: int, *, ground: Ground = FLAT, profile: str = "av2", speed: float = 5, **way: float
+    bodies: Sequence[Body], seed: int, *, ground: Ground = FLAT, profile: str = "av2", speed: float = 5, **route: float
 ) -> Drive:
-    """A drive past bodies, straight on if `way` does not say otherwise."""
-    scene = Scene(ground, Route(0, 0, speed=speed, **way), tuple(bodies), SolidTable.of(tuple(bodies)))
+    """A drive past bodies, straight ahead unless `route` has other arguments of `Route`."""
+    scene = Scene(ground, Route(0, 0, speed=speed, **route), tuple(bodies), SolidTable.of(tuple(bodies)))
     return Drive(scene, PROFILES[profile], seed, NUM_SWEEPS, "failure")
 
 
 def body_of(drive: Drive) -> np.ndarray:
-    """(N,) number of the body that each point of sweep t lies on, -1 = ground."""
+    """(N,) index of the body that each point of sweep t was measured on, -1 = ground."""
     return np.append(drive.scene.table.body, -1)[drive.returns(PAIR).solid.numpy()]
 
 
 def hedge(seed: int) -> Staged:
-    """People who walk along a hedge, within its component."""
+    """People who walk along a hedge and are in its component."""
     rng = np.random.default_rng(seed)
     leaves = [objects.bush(rng, x, 5.5 + rng.uniform(-0.2, 0.2), 60) for x in np.arange(4, 14, 1.2).tolist()]
     people = [Route(8, 4.7, EAST, start=-0.6, speed=1.2), Route(12, 4.6, WEST, start=-0.5, speed=1.0)]
-    drive = drive_past([*leaves, *(objects.pedestrian(rng, way) for way in people)], seed)
+    drive = drive_past([*leaves, *(objects.pedestrian(rng, route) for route in people)], seed)
     return Staged(drive, "slow people in a hedge", "two people, 1.1 m/s", [len(leaves), len(leaves) + 1])
 
 
 def crowd(seed: int) -> Staged:
-    """Somebody who walks through a group that stands."""
+    """A person who walks through a static group."""
     rng = np.random.default_rng(seed)
     people = [objects.pedestrian(rng, Route(8, 4.5, EAST, start=-0.5, speed=1.2))]
     for x, y in ((x, y) for x in (6.5, 7.2, 7.9, 8.6, 9.3) for y in (3.9, 5.1)):
         people.append(objects.pedestrian(rng, Route(x + rng.uniform(-0.1, 0.1), y + rng.uniform(-0.1, 0.1))))
-    return Staged(drive_past(people, seed), "a person in a crowd", "who walks, 1.2 m/s", [0])
+    return Staged(drive_past(people, seed), "a person in a crowd", "one person, 1.2 m/s", [0])
 
 
 def tram(seed: int) -> Staged:
@@ -84,7 +84,7 @@ def tram(seed: int) -> Staged:
 
 
 def appearing(seed: int, later: int = 0) -> Staged:
-    """A car that comes out from behind a van, so many sweeps later than that it is first seen."""
+    """A car that comes out from behind a van, `later` sweeps after it is first visible."""
     rng = np.random.default_rng(seed)
     hidden = objects.car(rng, Route(13.9 - 0.9 * (PAIR + later) + 4.5, 7, WEST, speed=9))
     drive = drive_past([hidden, objects.van(rng, Route(8, 3.5)), objects.wall(10, 14, 30, 0.5, 4)], seed, speed=0)
@@ -93,7 +93,7 @@ def appearing(seed: int, later: int = 0) -> Staged:
 
 
 def rolling_shutter(seed: int, profile: str = "av2_rolling") -> Staged:
-    """Oncoming traffic under a sensor that turns while the world moves."""
+    """Oncoming traffic, measured by a LiDAR whose shots have different times."""
     rng = np.random.default_rng(seed)
     bodies = [objects.car(rng, Route(x, 4, WEST, speed=27)) for x in (18, 30)]
     bodies += [objects.car(rng, Route(x, -4, EAST, speed=27)) for x in (-20, 22)]
@@ -103,18 +103,18 @@ def rolling_shutter(seed: int, profile: str = "av2_rolling") -> Staged:
 
 
 def rail(seed: int) -> Staged:
-    """Guard rails, whose seen part travels with the vehicle."""
+    """Guard rails, whose visible part moves with the vehicle."""
     posts = [box(x - 0.05, x + 0.05, -0.03, 0.03, -0.3, 0.45, 0.5) for x in (-8, -4, 0, 4, 8)]
     beam = box(-10, 10, -0.04, 0.04, 0.45, 0.76, 0.6)
     rails = [Body([beam, *posts], Route(x, y)) for x in range(-100, 140, 20) for y in (-3.2, 9.0)]
     rng = np.random.default_rng(seed)
     cars = [objects.car(rng, Route(20, 0, speed=27)), objects.car(rng, Route(-12, 4, speed=31))]
     drive, rows = drive_past([*rails, *cars], seed, speed=27), range(len(rails))
-    return Staged(drive, "guard rails at speed", "rails, which stand still", rows, (-22, -25, 30, 13))
+    return Staged(drive, "guard rails at speed", "static rails", rows, (-22, -25, 30, 13))
 
 
 def touching(seed: int) -> Staged:
-    """A car that passes a parked one a hand's breadth away."""
+    """A car that passes close to a parked one."""
     rng = np.random.default_rng(seed)
     bodies = [objects.car(rng, Route(6, 3.0, EAST, speed=9)), objects.car(rng, Route(11, 5.05))]
     drive = drive_past([*bodies, objects.wall(10, 8, 40, 0.5, 3)], seed)
@@ -129,7 +129,7 @@ def turning(seed: int) -> Staged:
 
 
 def vertical(seed: int) -> Staged:
-    """A car that climbs what rises by 15 % before it."""
+    """A car that drives uphill, on a road that rises by 15 %."""
     bodies = [objects.car(np.random.default_rng(seed), Route(22, -3, EAST, speed=12)), objects.wall(25, 8, 30, 0.5, 4)]
     drive = drive_past(bodies, seed, speed=3, ground=replace(FLAT, curvature=0.006))
     return Staged(drive, "vertical motion", "car that rises by 0.18 m a sweep", [0], (10, -12, 38, 6))
@@ -144,7 +144,7 @@ def fast(seed: int) -> Staged:
 
 
 def far(seed: int) -> Staged:
-    """Cars and people within `point_cloud_range` and outside of it."""
+    """Cars and people inside and outside of `point_cloud_range`."""
     rng, bodies = np.random.default_rng(seed), []
     for x in (20, 40, 82, 90):
         bodies.append(objects.car(rng, Route(x, 3.5, WEST, speed=9)))
@@ -166,14 +166,14 @@ def street(seed: int) -> Staged:
 
 
 def turn(seed: int) -> Staged:
-    """A turn past one car that drives, and walls, parked cars and posts."""
+    """A turn past a moving car, walls, parked cars and posts."""
     rng = np.random.default_rng(seed)
     bodies = [objects.car(rng, Route(12, 4, WEST, speed=9))]
     bodies += [objects.wall(20, 12, 40, 0.5, 4), objects.wall(20, -12, 40, 0.5, 4), objects.wall(45, 0, 0.5, 24, 4)]
     bodies += [objects.car(rng, Route(x, -7)) for x in (0, 7, 14, 22)]
     bodies += [objects.pole(x, 8, 5, 0.12) for x in (0, 10, 20)]
     drive, title = drive_past(bodies, seed, speed=6, radius=12, angle=1.2), "points and poses of different frames"
-    return Staged(drive, title, "what stands still", range(1, 11), (-4, -16, 40, 16))
+    return Staged(drive, title, "the static world", range(1, 11), (-4, -16, 40, 16))
 
 
 def tree(seed: int) -> Staged:
@@ -204,8 +204,8 @@ def gantry(seed: int) -> Staged:
 
 def _below(seed: int, above: Body, title: str) -> Staged:
     rng = np.random.default_rng(seed)
-    ways = (_at(16, 4, WEST, 16), _at(15, -3.5, EAST, 14), _at(18, 7, WEST, 22))
-    cars = [objects.car(rng, way) for way in ways]
+    routes = (_at(16, 4, WEST, 16), _at(15, -3.5, EAST, 14), _at(18, 7, WEST, 22))
+    cars = [objects.car(rng, route) for route in routes]
     return Staged(_past([*cars, above], seed, 12), title, "three cars, 14-22 m/s", [0, 1, 2], (-6, -16, 34, 16))
 
 
@@ -221,7 +221,7 @@ def wires(seed: int) -> Staged:
 
 
 def walkers(seed: int, gap: float = 0.3) -> Staged:
-    """Two people who walk along house fronts, one each way.
+    """Two people who walk along house fronts in opposite directions.
 
     Args:
         seed: of the people, the street and the noise.
@@ -229,8 +229,8 @@ def walkers(seed: int, gap: float = 0.3) -> Staged:
     """
     rng = np.random.default_rng(seed)
     y = 6.0 - gap - 0.25
-    ways = [_at(x + rng.uniform(-0.5, 0.5), y, to, speed) for x, to, speed in ((4, EAST, 1.2), (10, WEST, 1.4))]
-    people = [objects.pedestrian(rng, way) for way in ways]
+    routes = [_at(x + rng.uniform(-0.5, 0.5), y, to, speed) for x, to, speed in ((4, EAST, 1.2), (10, WEST, 1.4))]
+    people = [objects.pedestrian(rng, route) for route in routes]
     fronts = [objects.wall(x, 10, 9.7, 8, rng.uniform(5, 9)) for x in (-24, -14, -4, 6, 16, 26)]
     pipes = [objects.pole(x, 5.95, 5, 0.05) for x in (-19, -9, 1, 11, 21)]
     drive = _past([*people, *fronts, *pipes], seed, 3)
@@ -238,11 +238,11 @@ def walkers(seed: int, gap: float = 0.3) -> Staged:
 
 
 def facade(seed: int, step: float = 0.55, profile: str = "av2") -> Staged:
-    """Houses along the road behind parked cars, whose shadows glide over the fronts as the vehicle passes.
+    """Houses behind parked cars, whose shadows move over the fronts as the vehicle passes.
 
     Args:
         seed: of the street and of the noise.
-        step: metres that the vehicle drives in a sweep of 0.1 s.
+        step: metres of the vehicle per sweep of 0.1 s.
         profile: of the sensors.
     """
     rng = np.random.default_rng(seed)
@@ -259,36 +259,32 @@ def facade(seed: int, step: float = 0.55, profile: str = "av2") -> Staged:
 
 
 def abreast(seed: int) -> Staged:
-    """Two cars side by side at different speeds, and one close along a wall."""
+    """Two cars side by side at different speeds, and a car close to a wall."""
     rng = np.random.default_rng(seed)
-    ways = (_at(8, 3.2, EAST, 9), _at(9, 5.2, EAST, 13), _at(12, -4.0, WEST, 10))
-    drive = _past([*(objects.car(rng, way) for way in ways), objects.wall(10, -5.4, 50, 0.5, 2.5)], seed, 6)
+    routes = (_at(8, 3.2, EAST, 9), _at(9, 5.2, EAST, 13), _at(12, -4.0, WEST, 10))
+    drive = _past([*(objects.car(rng, route) for route in routes), objects.wall(10, -5.4, 50, 0.5, 2.5)], seed, 6)
     return Staged(drive, "cars abreast, a car along a wall", "three cars, 9-13 m/s", [0, 1, 2], (-6, -8, 26, 10))
 
 
 def border(seed: int) -> Staged:
-    """What stands on the borders of two regions, and what crosses them: cars, a bus, a wall."""
+    """Static objects on the borders of two regions, and moving cars and buses that cross them."""
     rng = np.random.default_rng(seed)
-    movers, fixed = [], []
+    moving, static = [], []
     for edge in BORDERS:
         out, back, aside, *at_edge = rng.uniform(0, 1, 6).tolist()
-        # The side that is seen lies within a metre of the border: 2.2 m off a car's middle, 6 m off a bus's.
-        movers += [
-            objects.car(rng, _at(edge + 2.2 - out, 3, EAST, 14)),
-            objects.bus(_at(2, edge + 6 - aside, NORTH, 9)),
-        ]
-        movers += [
-            objects.car(rng, _at(edge + 2.2 + back, -3, WEST, 12)),
-            objects.car(rng, _at(-edge - 1.7, -3, WEST, 10)),
-        ]
-        fixed += [objects.car(rng, Route(-edge - 2.7 + x, y)) for x, y in zip(at_edge, (6, 9))]
-        fixed += [objects.wall(edge, 8, 12, 0.3, 3), objects.car(rng, Route(7, -edge - 1.4 + at_edge[2]))]
-    drive = _past([*movers, *fixed], seed, 5)
-    return Staged(drive, "the region's border", "cars and buses", list(range(len(movers))), (-82, -82, 82, 82))
+        # The visible side is within a metre of the border: 2.2 m from the middle of a car, 6 m from that of a bus.
+        moving.append(objects.car(rng, _at(edge + 2.2 - out, 3, EAST, 14)))
+        moving.append(objects.bus(_at(2, edge + 6 - aside, NORTH, 9)))
+        moving.append(objects.car(rng, _at(edge + 2.2 + back, -3, WEST, 12)))
+        moving.append(objects.car(rng, _at(-edge - 1.7, -3, WEST, 10)))
+        static += [objects.car(rng, Route(-edge - 2.7 + x, y)) for x, y in zip(at_edge, (6, 9))]
+        static += [objects.wall(edge, 8, 12, 0.3, 3), objects.car(rng, Route(7, -edge - 1.4 + at_edge[2]))]
+    drive = _past([*moving, *static], seed, 5)
+    return Staged(drive, "the region's border", "cars and buses", list(range(len(moving))), (-82, -82, 82, 82))
 
 
 def _fronts(rng: np.random.Generator, front: float) -> list[Body]:
-    """House after house along y = `front`: with pilasters, window sills, doorsteps and drain pipes."""
+    """A row of houses along y = `front` with pilasters, window sills, doorsteps and drain pipes."""
     houses, begin, side = [], -50.0, math.copysign(1.0, front)
     while begin < 65:
         width, back, pitch = rng.uniform(8, 14), rng.choice((0.0, 0.0, 0.3)), rng.uniform(1.8, 2.6)
@@ -306,18 +302,18 @@ def _fronts(rng: np.random.Generator, front: float) -> list[Body]:
 
 
 def _crown(rng: np.random.Generator, x: float, y: float, lift: float) -> Body:
-    """The crown of a tree without its trunk, `lift` metres higher than it would be."""
+    """The crown of a tree without its trunk, lifted by `lift` metres."""
     leaves = objects.tree(rng, x, y, 90).solids[1:]
     return Body([leaf._replace(centre=(*leaf.centre[:2], leaf.centre[2] + lift)) for leaf in leaves], Route(x, y))
 
 
 def _wire(x: float, y: float, z: float, length: float, across: bool = False) -> Solid:
-    turn = {"roll": math.pi / 2} if across else {"pitch": math.pi / 2}
-    return Solid(CYLINDER, (x, y, z), (0.02, 0.02, length / 2), albedo=0.4, **turn)
+    rotation = {"roll": math.pi / 2} if across else {"pitch": math.pi / 2}
+    return Solid(CYLINDER, (x, y, z), (0.02, 0.02, length / 2), albedo=0.4, **rotation)
 
 
 def _at(x: float, y: float, heading: float, speed: float) -> Route:
-    """Straight on through a place at the sweep that counts."""
+    """A straight route that is at (x, y) at sweep t."""
     return Route(x, y, heading, start=-speed * SECONDS, speed=speed)
 
 

@@ -1,13 +1,13 @@
 #!/usr/bin/env python3
-"""The failures of docs/limits.md: its pictures and its table, from small simulated drives (drives.py).
+"""Draw the pictures of docs/limits.md and print its table of failures, from small simulated drives (drives.py).
 
   python scripts/figures/failure_cases.py                         docs/pictures/limit_*.png, and the table
-  python scripts/figures/failure_cases.py --only rail fast        some of them
-  python scripts/figures/failure_cases.py --pictures ""           the table alone
+  python scripts/figures/failure_cases.py --only rail fast        some cases
+  python scripts/figures/failure_cases.py --pictures ""           the table only
 
-Each row is the mean over the seeds of the mean end-point error of the points named, metres per sweep, smallest and
-largest in brackets, and their mean confidence (docs/verified.md). Pictures show one seed: the first
-setting above the last, each with estimate, truth and error.
+A row of the table has the mean end-point error of the named objects, in metres per sweep: its mean over the seeds, with
+the smallest and the largest in brackets, and the mean confidence. A picture shows one seed: the first setting above the
+last, each with estimate, truth and error.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ import numpy as np
 from drives import PAIR, Staged, body_of
 from PIL import Image
 
-from cflow_torch import FlowResult, Sweep, make_config, make_model
+from cflow_torch import Sweep, make_config, make_model
 from cflow_torch.data.catalog import GroundSegmentedLog, LogWrapper
 from cflow_torch.data.log import window
 from cflow_torch.simulator.drive import Drive
@@ -38,12 +38,12 @@ WIDE = (-100.0, -100.0, -math.inf, 100.0, 100.0, math.inf)
 
 
 class Attempt(NamedTuple):
-    """One setting.
+    """The result of one setting.
 
     Args:
-        name: preset and what is changed of it.
-        residual: (N, 3) what it says, total flow less the flow of the TRUE ego motion, metres per sweep.
-        confidence: (N,) 0 ... 1, None where the setting has none.
+        name: preset and overrides.
+        residual: (N, 3) estimated total flow minus the flow of the TRUE ego motion, metres per sweep.
+        confidence: (N,) 0 ... 1, None if the method has none.
     """
 
     name: str
@@ -56,8 +56,8 @@ class Case:
     """A failure.
 
     Args:
-        staged: the drive, and what of it is looked at.
-        attempts: the one that fails first.
+        staged: the drive, and its scored objects.
+        attempts: results by several settings. The first one fails.
     """
 
     staged: Staged
@@ -69,45 +69,46 @@ class Case:
         return self.staged.drive.labels(PAIR).flow - _pose_flow(self.staged.drive)
 
     @property
-    def concerned(self) -> np.ndarray:
-        """(N,) bool, points that the error is of."""
+    def is_scored(self) -> np.ndarray:
+        """(N,) bool, points of the scored objects."""
         return np.isin(body_of(self.staged.drive), list(self.staged.bodies))
 
     def errors(self) -> list[float]:
-        """Mean end-point error of the points concerned, metres per sweep, of each attempt."""
+        """Mean end-point error of the scored objects, metres per sweep, of each attempt."""
         lengths = (np.linalg.norm(attempt.residual - self.truth, axis=1) for attempt in self.attempts)
-        return [float(length[self.concerned].mean()) for length in lengths]
+        return [float(length[self.is_scored].mean()) for length in lengths]
 
     def confidences(self) -> list[float]:
-        """Mean confidence of the points concerned, of each attempt; NaN where it has none."""
+        """Mean confidence of the scored objects, of each attempt; NaN if it has none."""
         given = (attempt.confidence for attempt in self.attempts)
-        return [math.nan if one is None else float(one[self.concerned].mean()) for one in given]
+        return [math.nan if one is None else float(one[self.is_scored].mean()) for one in given]
 
 
-Way = Callable[[Drive], Attempt]
+Setting = Callable[[Drive], Attempt]
 
 
-def by(preset: str, name: str = "", of: Callable[[Drive], Any] = lambda drive: drive, **overrides: Any) -> Way:
-    """The flow of the pair by a preset.
+def by(preset: str, name: str = "", of: Callable[[Drive], Any] = lambda drive: drive, **overrides: Any) -> Setting:
+    """A setting: estimates the flow of the scored pair of a drive.
 
     Args:
-        preset: see `make_config`.
-        name: what the table calls it; "" = the preset and the overrides.
-        of: log of a drive, if its poses or points shall be others.
+        preset: "default", "paper" and so on.
+        name: its name in the table; "" = the preset and the overrides.
+        of: function that changes the poses or points of a drive; returns a log.
         **overrides: of the preset's settings.
     """
 
     def attempt(drive: Drive) -> Attempt:
         config = make_config(preset, **overrides)
         (result,) = make_model(config)([window(of(drive), PAIR, config.num_history, config.num_future)])
-        told = ", ".join([f"`{preset}`", *(f"{k}={v}" for k, v in overrides.items())])
-        return _attempt(drive, name or told, result)
+        described = ", ".join([f"`{preset}`", *(f"{k}={v}" for k, v in overrides.items())])
+        confidence = None if result.confidence is None else result.confidence.numpy()
+        return Attempt(name or described, result.flow.numpy() - _pose_flow(drive), confidence)
 
     return attempt
 
 
 class MisplacedPoses(LogWrapper):
-    """A log whose poses are those of a place 1.4 m behind the frame of its points."""
+    """A log whose poses belong to a frame 1.4 m behind the frame of its points."""
 
     def sweep(self, index: int) -> Sweep:
         """The sweep with the wrong pose."""
@@ -134,8 +135,8 @@ _GROUND = (
 )
 _WRONG_FRAME = (by("default", "`default`, wrong frame", MisplacedPoses), by("default", "`default`, right frame"))
 _WIDE = by("default", "`default`, point_cloud_range=±100 m", point_cloud_range=WIDE)
-# The drive, the settings it is tried with (the one that fails first), and the seed that is drawn.
-CASES: dict[str, tuple[Callable[[int], Staged], Sequence[Way], int | None]] = {
+# The drive, the settings (the first one fails), and the seed of the picture.
+CASES: dict[str, tuple[Callable[[int], Staged], Sequence[Setting], int | None]] = {
     "long_side": (drives.tram, _LONG_SIDE, 0),
     "rail": (drives.rail, _PAPER_AND_DEFAULT, 0),
     "bridge": (drives.bridge, _DEFAULT, 0),
@@ -157,15 +158,10 @@ CASES: dict[str, tuple[Callable[[int], Staged], Sequence[Way], int | None]] = {
 
 
 def make_case(name: str, seed: int) -> Case:
-    """A drive, and the flow of its pair by each setting."""
-    stage, ways, _ = CASES[name]
+    """Simulate a drive, and estimate the flow of its pair with each setting."""
+    stage, settings, _ = CASES[name]
     staged = stage(seed)
-    return Case(staged, [way(staged.drive) for way in ways])
-
-
-def _attempt(drive: Drive, name: str, result: FlowResult) -> Attempt:
-    confidence = None if result.confidence is None else result.confidence.numpy()
-    return Attempt(name, result.flow.numpy() - _pose_flow(drive), confidence)
+    return Case(staged, [setting(staged.drive) for setting in settings])
 
 
 def _pose_flow(drive: Drive) -> np.ndarray:
@@ -176,7 +172,7 @@ def _pose_flow(drive: Drive) -> np.ndarray:
 
 
 def draw(case: Case) -> Image.Image:
-    """A row of estimate, truth and error for the first and the last setting, on one scale of colours."""
+    """A row of estimate, truth and error for the first and the last setting, with the same colours."""
     low, high = case.staged.view[:2], case.staged.view[2:]
     sweep, truth = case.staged.drive.sweep(PAIR), case.truth
     kept = ~sweep.is_ground
@@ -197,13 +193,11 @@ def draw(case: Case) -> Image.Image:
         figure.savefig(buffer, format="png", dpi=figure.dpi)
         rows.append(np.asarray(Image.open(buffer).convert("RGB")))
     picture = Image.fromarray(np.concatenate(rows))
-    return picture.quantize(
-        palette=picture.quantize(256)
-    )  # half of the bytes; dithered, so that the wheel stays smooth
+    return picture.quantize(palette=picture.quantize(256))  # half the bytes; dithering keeps the colour wheel smooth
 
 
 def table(names: Sequence[str], seeds: Sequence[int]) -> Iterator[str]:
-    """Lines of Markdown."""
+    """Lines of the Markdown table."""
     yield "| | of | setting | error, m | confidence |"
     yield "|---|---|---|---|---|"
     for name in names:
@@ -223,7 +217,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seeds", nargs="+", type=int, default=SEEDS)
     parser.add_argument("--pictures", default=str(FOLDER), metavar="FOLDER", help='"" = none')
     given = parser.parse_args(arguments)
-    warnings.simplefilter("ignore", UserWarning)  # that ground was left in, which is one of the cases
+    warnings.simplefilter("ignore", UserWarning)  # one of the cases leaves the ground in
     print("\n".join(table(given.only, given.seeds)))
     for name in given.only if given.pictures else ():
         *_, seed = CASES[name]

@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
-"""Accuracy and time of ground finding: simulated drives, the Argoverse 2 pair against its map, KITTI's stored mask.
+"""Accuracy and time of ground finding: simulated drives, the Argoverse 2 pair and its map, KITTI's stored mask.
 
-  python scripts/figures/ground.py                          the table; a method or data set that is absent is left out
-  CFLOW_DATA=FOLDER python scripts/figures/ground.py        where the real data lies (else ../shared/data)
+  python scripts/figures/ground.py                          the table, without methods and data that are not available
+  CFLOW_DATA=FOLDER python scripts/figures/ground.py        folder of the real data (default: ../shared/data)
 
-Prints Markdown, and a line per call from Patchwork++ (`| grep '^|'` drops it). In simulated drives ground is what lies
-at most 0.3 m above the true surface, or below it. Processor times are the median of 15 calls for one sweep.
+Prints Markdown, and a line per call of Patchwork++ (`| grep '^|'` removes it). In simulated drives, points below or at
+most 0.3 m above the true surface are ground. Processor times are medians of 15 calls for one sweep.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ SEEDS = (410, 411, 412)  # the settings were tuned on 400 ... 409
 AV2 = Path("av2-7fab2350", "val", "7fab2350-7eaf-3b7e-a39d-6937a4c1bede")
 METHODS = ("grid", "patchwork")
 CALLS = 15
-Case = Tuple[str, np.ndarray, np.ndarray, np.ndarray]  # name, points, true mask, points that count
+Case = Tuple[str, np.ndarray, np.ndarray, np.ndarray]  # name, points, true mask, mask of scored points
 
 
 def simulated() -> Iterator[Case]:
-    """Every sensor profile; for one also hills."""
+    """A sweep of every sensor profile; for one of them also on hills."""
     for profile in PROFILES:
         for seed in SEEDS:
             drive = make_drive(seed=seed, num_sweeps=1, profile=profile)
@@ -51,7 +51,7 @@ def simulated() -> Iterator[Case]:
 
 
 def real(root: Path) -> Iterator[Case]:
-    """Sweeps of the real sets, if they are there."""
+    """Sweeps of the available real data."""
     raster = read_ground_raster(root / AV2 / "map") if (root / AV2).is_dir() else None
     if raster is not None:
         log = AV2Log(root / AV2)
@@ -60,7 +60,7 @@ def real(root: Path) -> Iterator[Case]:
             points, truth = np.asarray(sweep.points), np.asarray(sweep.is_ground)
             city = points.astype(np.float64) @ sweep.pose[:3, :3].T + sweep.pose[:3, 3]
             deep = np.concatenate([city[:, :2], np.full((len(city), 1), -1e6)], 1)
-            on_raster = raster.is_ground(deep)  # what lies deep below is ground wherever the height is known
+            on_raster = raster.is_ground(deep)  # points far below the surface are ground wherever the height is known
             yield "Argoverse 2 pair, on the raster", points, truth, on_raster
     file = root / "kitti-0000" / "kitti-0000-a.h5"
     if file.is_file():
@@ -71,9 +71,9 @@ def real(root: Path) -> Iterator[Case]:
                 yield "KITTI, stored mask (Patchwork++ + 0.2 m)", points, truth, np.ones(len(points), bool)
 
 
-def scores(mask: np.ndarray, truth: np.ndarray, counts: np.ndarray) -> tuple[float, float, float]:
+def scores(mask: np.ndarray, truth: np.ndarray, is_scored: np.ndarray) -> tuple[float, float, float]:
     """Intersection over union, precision, recall."""
-    mask, truth = mask & counts, truth & counts
+    mask, truth = mask & is_scored, truth & is_scored
     both = (mask & truth).sum()
     return both / (mask | truth).sum(), both / max(mask.sum(), 1), both / truth.sum()
 
@@ -98,15 +98,15 @@ def main() -> None:
             find_ground(np.zeros((1, 3)), method=method)
             methods.append(method)
         except CFlowError as error:
-            print(f"left out: {error}\n")
+            print(f"{method} is left out: {error}\n")
     print("| sweeps | " + " | ".join(f"{m}: IoU | precision | recall" for m in methods) + " |")
     print("|---" * (1 + 3 * len(methods)) + "|")
     table: dict[str, list[list[tuple[float, float, float]]]] = {}
     for cases in (simulated(), real(root)):
-        for name, points, truth, counts in cases:
+        for name, points, truth, is_scored in cases:
             rows = table.setdefault(name, [[] for _ in methods])
             for row, method in zip(rows, methods):
-                row.append(scores(find_ground(points, method=method), truth, counts))
+                row.append(scores(find_ground(points, method=method), truth, is_scored))
     for name, rows in table.items():
         cells = [f"{value:.3f}" for row in rows for value in np.mean(row, 0)]
         print(f"| {name} ({len(rows[0])}) | " + " | ".join(cells) + " |")

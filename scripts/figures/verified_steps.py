@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
-"""The steps of the verified method (docs/verified.md), drawn from two small simulated drives (drives.py).
+"""Draw the steps of the verified method (docs/verified.md) on two small simulated drives (drives.py).
 
 python scripts/figures/verified_steps.py                        docs/pictures/verified_steps.png
-python scripts/figures/verified_steps.py --folder FOLDER        the same picture elsewhere
+python scripts/figures/verified_steps.py --folder FOLDER        in another folder
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from cflow_torch.viz.wheel import flow_to_rgb, wheel_image
 from cflow_torch.windows.collation import make_batch
 
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "pictures"
-# What each row shows, its drive, and the lower left corner and the width of its view, metres, frame of t+1.
+# Title of each row, its drive, and the lower left corner and the width of its view, metres, frame of t+1.
 ROWS = (
     ("a car under a tree crown", drives.tree(4), (0.6, 0.3), 13.6),
     ("walkers 0.3 m from a wall", drives.walkers(2, gap=0.3), (2.3, 3.1), 8.7),
@@ -67,11 +67,11 @@ def take_steps(drive: Any) -> tuple[Any, ...]:
 
 
 def draw_row(panels: list[Any], drive: Any, low: tuple[float, float], width: float) -> None:
-    """One drive: a step in each panel, and what the view of `width` metres from the corner `low` on shows of it."""
+    """Draw one drive, a step in each panel. The view is `width` metres wide and begins at the corner `low`."""
     sweeps, change, components, nodes, objects, moves, result = take_steps(drive)
     pixels, size, own, levels = sweeps.pixels, sweeps.grid.pixel_size, components.roots.shape[1], components.num_levels
     high = np.array(low) + (width, width * HIGH / WIDE)
-    place = np.stack((pixels.col, pixels.row), 1) * size + sweeps.grid.lower[:2]  # lower left corners
+    corners = np.stack((pixels.col, pixels.row), 1) * size + sweeps.grid.lower[:2]  # lower left ones
 
     def paint(axes: Any, *layers: tuple[torch.Tensor, Any]) -> None:
         image = np.full((sweeps.grid.height, sweeps.grid.width, 3), 255, np.uint8)
@@ -83,17 +83,17 @@ def draw_row(panels: list[Any], drive: Any, low: tuple[float, float], width: flo
         style.set_view(axes, np.array(low), high)
 
     def colours(pixel: torch.Tensor, group: torch.Tensor) -> tuple[torch.Tensor, np.ndarray]:
-        return pixel, cluster_colors(place[pixel], group.numpy(), STATIC)
+        return pixel, cluster_colors(corners[pixel], group.numpy(), STATIC)
 
     every, now = torch.arange(own), torch.where(pixels.step[:own] == 1)[0]
     paint(panels[0], (now, SHADES[count_slices(pixels.slices[now]).long()]))
     paint(panels[1], (every, PALE), (torch.where(change.has_changed)[0], PALETTE[0]))
     scales = torch.tensor((levels - 2, levels - 1))  # the finest, dilated and plain
-    fine = torch.where(torch.isin(nodes.level[nodes.node], scales))[0].flip(0)  # dilated ones hide the plain ones
+    fine = torch.where(torch.isin(nodes.level[nodes.node], scales))[0].flip(0)  # dilated ones are drawn over plain ones
     paint(panels[2], (every, PALE), colours(nodes.pixel[fine], nodes.node[fine]))
     for number, level in enumerate(nodes.level.tolist()):
         if level not in (levels - 2, levels - 1):
-            inside = place[nodes.pixel[nodes.node == number]]
+            inside = corners[nodes.pixel[nodes.node == number]]
             corner, far = inside.min(0) - 0.5 * size, inside.max(0) + 1.5 * size
             line = {levels: (":", 1.3), levels + 1: ("--", 1.6)}.get(level, ("-", 1.0))
             panels[2].add_patch(Rectangle(corner, *(far - corner), fill=False, linestyle=line[0], linewidth=line[1]))
@@ -109,8 +109,8 @@ def draw_row(panels: list[Any], drive: Any, low: tuple[float, float], width: flo
     longest = np.ceil(20 * np.linalg.norm(flow[fast], axis=1).max()) / 20
     paint(panels[4], (now, STATIC), (pixel[fast], flow_to_rgb(flow[fast], longest)))
     _, arrows, count = group_medians(result.cluster_id.numpy()[fast], np.hstack((points, flow[:, :2]))[fast])
-    look: Any = {"angles": "xy", "scale_units": "xy", "scale": 1 / ARROW_STEPS, "width": 0.012, "edgecolor": "white"}
-    panels[4].quiver(*arrows[count > 8].T, color=style.INK, linewidth=0.6, zorder=6, **look)
+    arrow: Any = {"angles": "xy", "scale_units": "xy", "scale": 1 / ARROW_STEPS, "width": 0.012, "edgecolor": "white"}
+    panels[4].quiver(*arrows[count > 8].T, color=style.INK, linewidth=0.6, zorder=6, **arrow)
     wheel = panels[4].inset_axes((0.8, 0.05, 0.18, 0.26))
     wheel.imshow(wheel_image(128))
     wheel.set_axis_off()
@@ -134,8 +134,8 @@ def main() -> None:
             if row == 0:
                 axes.set_title(title, fontsize=14, color=style.INK, pad=6)
             else:
-                look = {"fontsize": 10.5, "color": style.FAINT, "linespacing": 1.3, "va": "top"}
-                axes.text(0, -0.05, caption, transform=axes.transAxes, **look)
+                font = {"fontsize": 10.5, "color": style.FAINT, "linespacing": 1.3, "va": "top"}
+                axes.text(0, -0.05, caption, transform=axes.transAxes, **font)
     save_picture(figure, folder / "verified_steps.png")
 
 

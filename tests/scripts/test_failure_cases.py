@@ -1,4 +1,4 @@
-"""docs/limits.md: each failure is there, and what is said to help helps."""
+"""docs/limits.md: each failure occurs, and the fix that the page names works."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-# Case: error of the first setting at least, of the last one at most, metres per sweep.
-MENDED = {
+# Case: least error of the first setting, largest error of the last one, metres per sweep.
+FIXED = {
     "long_side": (0.7, 0.045),
     "rail": (1.8, 0.03),
     "touching": (0.4, 0.005),
@@ -29,24 +29,24 @@ QUICK = ("touching", "wrong_frame")
 
 
 @pytest.mark.filterwarnings("ignore:there are ground points")
-@pytest.mark.parametrize("name", [pytest.param(n, marks=[] if n in QUICK else pytest.mark.slow) for n in MENDED])
-def test_the_failure_is_there_and_the_setting_mends_it(failures: Any, name: str) -> None:
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[] if n in QUICK else pytest.mark.slow) for n in FIXED])
+def test_the_failure_occurs_and_the_last_setting_fixes_it(failures: Any, name: str) -> None:
     case = failures.make_case(name, 0)
-    assert case.concerned.sum() > 50
-    fails, mended = MENDED[name]
+    assert case.is_scored.sum() > 50
+    fails, fixed = FIXED[name]
     errors = case.errors()
-    assert errors[0] >= fails and errors[-1] <= mended
+    assert errors[0] >= fails and errors[-1] <= fixed
 
 
 @pytest.mark.slow
-def test_what_appears_is_wrong_at_first(failures: Any) -> None:
+def test_an_appearing_car_is_wrong_at_first(failures: Any) -> None:
     first, later = failures.make_case("appearing", 0), failures.make_case("appeared", 0)
     assert first.errors()[0] > 0.8 and later.errors()[0] < 0.01
     assert later.confidences()[0] > 0.8
 
 
-def test_sweeps_after_t1_mend_what_appears(failures: Any) -> None:
-    for seed in range(3):  # in the second a van stands near, so that the car is a part of its coarse component
+def test_later_sweeps_fix_an_appearing_car(failures: Any) -> None:
+    for seed in range(3):  # with the second seed, the car is part of the coarse component of a parked van
         online, offline = failures.make_case("appearing", seed).errors()
         assert online > 0.5 and offline < 0.09 and offline < online / 6
 
