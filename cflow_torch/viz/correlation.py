@@ -10,7 +10,6 @@ import numpy as np
 from cflow_torch.config import Config, make_config
 from cflow_torch.types import Window
 from cflow_torch.viz import style
-from cflow_torch.viz.occupancy import draw_occupancy
 from cflow_torch.viz.stages import ClusterCorrelation, cluster_correlation
 
 if TYPE_CHECKING:
@@ -23,20 +22,20 @@ _MOST_LINES = 160  # of the surface, a side
 
 
 def plot_correlation(window: Window, config: Config | None = None, *, cluster_id: int | None = None) -> Figure:
-    """How one cluster's motion is found: its pixels at t and t+1, and their normalised cross-correlation.
+    """Draw the pixels of one cluster at t and t+1 and their normalised cross-correlation.
 
     Args:
         window: sweeps.
-        config: of the dense method, clusters by components; None = the preset "paper", which leaves older sweeps out.
-        cluster_id: as in `FlowResult`; None = the most conspicuous mover, see `stages.cluster_correlation`.
+        config: of the dense method, clusters by components; None = the preset "paper", without older sweeps.
+        cluster_id: as in `FlowResult`; None = the cluster with the largest number of points times metres of flow.
 
     Returns:
-        Figure, 1600 pixels wide: the cluster at t, at t+1, both with t moved by the shift that the method takes, in
-        metres, frame of t+1; the map of scores as an image and as a surface, in pixels, that shift marked in both.
+        Figure, 1600 pixels wide: the cluster at t, at t+1, and both with t moved by the chosen shift, in metres, frame
+        of t+1; the scores of all shifts as an image and as a surface, in pixels, with the chosen shift marked in both.
 
     Raises:
-        CFlowError: matplotlib is absent, no such cluster, or the method has no such map (key points, HDBSCAN, presets
-            default and fast).
+        CFlowError: matplotlib is not installed, there is no such cluster, or the method has no such map (key points,
+            HDBSCAN, presets default and fast).
 
     Source: the paper's figures of one car and of its NCC map; Eq. norm_correlation, displacement_in_bev.
     """
@@ -47,16 +46,16 @@ def plot_correlation(window: Window, config: Config | None = None, *, cluster_id
     style.add_heading(figure, 0.35, _title(found, config))
     images, nothing = found.images, np.zeros_like(found.images.t)
     height, width = nothing.shape
-    # A shift is shorter than the box: what leaves it does not come back from the other side.
-    around = np.pad(images.t, ((0, height), (0, width)))
-    moved = np.roll(around, tuple(found.shift), (0, 1))[:height, :width]
+    # A shift is shorter than the box, so with this margin pixels that leave the box do not wrap around.
+    padded = np.pad(images.t, ((0, height), (0, width)))
+    moved = np.roll(padded, tuple(found.shift), (0, 1))[:height, :width]
     names = (
         "template: t moved by the coarser scales" if len(config.pixel_sizes) > 1 else "template: sweep t",
         "target: sweep t+1",
-        "t moved by the shift taken, and t+1",
+        "t moved by the chosen shift, and t+1",
     )
     for axes, name, t, t1 in zip(panels, names, (images.t, nothing, moved), (nothing, images.t1, images.t1)):
-        draw_occupancy(axes, replace(images, t=t, t1=t1), aspect="auto")
+        replace(images, t=t, t1=t1).draw(axes, aspect="auto")
         _name(axes, name, "x, m", "y, m")
     _draw_map(panels[3], panels[4], found)
     _draw_surface(panels[5], found)
@@ -73,9 +72,9 @@ def _title(found: ClusterCorrelation, config: Config) -> str:
 
 
 def _lay_out(shape: tuple[int, int]) -> tuple[Figure, list[Any]]:
-    """The figure and its axes: four images, colour bar, surface."""
+    """Create the figure and its axes: four images, colour bar, surface."""
     left, right = 0.7, 5.25
-    # Square pixels, unless the box is so long and thin that nothing could be seen.
+    # Pixels are square, unless the box is so long and thin that nothing would be visible.
     height, width = np.maximum(3.35 * np.array(shape) / max(shape), 1.2)
     total = max(2 * height + 2.9, 6.4)
     lower = 0.65 + (total - 2 * height - 2.9) / 2
@@ -95,34 +94,27 @@ def _name(axes: Axes, title: str, x: str, y: str) -> None:
     style.thin_frame(axes)
 
 
-def _draw_map(axes: Axes, beside: Axes, found: ClusterCorrelation) -> None:
-    """The map as an image, shifts in pixels, what was not searched in grey; and its colours."""
+def _draw_map(axes: Axes, colors: Axes, found: ClusterCorrelation) -> None:
+    """Draw the scores as an image with its colour bar; shifts in pixels, those outside the search range in grey."""
     height, width = found.ncc.shape
     low_y, low_x = -(height // 2) - 0.5, -(width // 2) - 0.5
     axes.set_facecolor("#d5d9de")
-    image = axes.imshow(
-        found.ncc,
-        extent=(low_x, low_x + width, low_y, low_y + height),
-        origin="lower",
-        interpolation="nearest",
-        cmap=_COLORMAP,
-        vmin=0,
-        aspect="auto",
-    )
+    extent = (low_x, low_x + width, low_y, low_y + height)
+    look: Any = {"origin": "lower", "interpolation": "nearest", "aspect": "auto"}
+    image = axes.imshow(found.ncc, extent=extent, cmap=_COLORMAP, vmin=0, **look)
     dy, dx = found.shift
     axes.plot(0, 0, "+", color="white", markersize=9, markeredgewidth=1.2)
     axes.plot(dx, dy, "o", markersize=13, markeredgewidth=2.2, markerfacecolor="none", markeredgecolor=_PEAK)
     _name(axes, "score of every shift (+: no shift)", *_shift_names(found))
-    bar = axes.figure.colorbar(image, cax=beside)
+    bar: Any = axes.figure.colorbar(image, cax=colors)
     bar.ax.tick_params(labelsize=9, labelcolor=style.INK, color=style.INK, length=2)
-    outline: Any = bar.outline  # whose type is known wrongly
-    outline.set_visible(False)
+    bar.outline.set_visible(False)
 
 
 def _draw_surface(axes: Any, found: ClusterCorrelation) -> None:
-    """The same map as a surface. Args: axes: three-dimensional."""
-    axes.patch.set_visible(False)  # it would hide the numbers beside it
-    # What is beyond the map is put round it: a line is no surface.
+    """Draw the scores as a surface. Args: axes: three-dimensional."""
+    axes.patch.set_visible(False)  # it would cover the numbers next to it
+    # A margin of zeros makes a surface of a map that has a single row or column.
     scores = np.pad(np.nan_to_num(found.ncc), 1)
     y, x = (np.arange(n) - 1 - (n - 2) // 2 for n in scores.shape)
     axes.plot_surface(
@@ -151,5 +143,5 @@ def _shift_names(found: ClusterCorrelation) -> list[str]:
 
 
 def _pair(x: float, y: float) -> str:
-    """Signed, to three digits."""
+    """Two numbers with their signs, to three digits."""
     return "({}, {})".format(*(f"{value:+.3g}" if abs(value) > 1e-9 else "0" for value in (x, y)))

@@ -11,7 +11,7 @@ from cflow_torch.config import Config, make_config
 from cflow_torch.types import Window
 from cflow_torch.viz import style
 from cflow_torch.viz.bev import longest_flow
-from cflow_torch.viz.occupancy import draw_occupancy, sweep_marks
+from cflow_torch.viz.occupancy import sweep_marks
 from cflow_torch.viz.panel import MOVING
 from cflow_torch.viz.stages import KeyPointMatches, keypoint_matches
 from cflow_torch.viz.wheel import flow_to_rgb
@@ -20,43 +20,43 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_HALF_VIEW = np.array((5.0, 3.6))  # metres, half width and height of what is shown
-_CELL = 4.0  # metres, in which matches are counted to find the place that is shown
+_HALF_VIEW = np.array((5.0, 3.6))  # metres, half width and height of the view
+_CELL = 4.0  # metres, side of the cells in which matches are added up to choose the view
 _POINT_COLOR = "#ffb000"
-_ALONG = 9  # places of a line that a legend may hide
+_ALONG = 9  # points of a line that a legend should not cover
 _FADE = 0.72  # of the pixels behind the matches
 
 
 def plot_keypoints(window: Window, config: Config | None = None) -> Figure:
-    """Key points of a pair of sweeps and their matches, close up where most of them move.
+    """Draw key points of a pair of sweeps and their matches, close up where most of them move.
 
     Args:
         window: sweeps.
-        config: of the key-point method; None = the preset "keypoints", which leaves older sweeps out.
+        config: of the key-point method; None = the preset "keypoints", without older sweeps.
 
     Returns:
-        Figure, 1600 pixels wide. Left: the pixels of both sweeps, the key points of t as dots. Right: a line from every
-        matched key point of t to its match of t+1, in the colours of the wheel.
+        Figure, 1600 pixels wide. Left: the pixels of both sweeps, and the key points of t as dots. Right: a line from
+        every matched key point of t to its match at t+1, in the colours of the wheel.
 
     Convention: metres, frame of t+1; a key point lies in the middle of its pixel.
 
     Raises:
-        CFlowError: matplotlib is absent, another method, or bad input.
+        CFlowError: matplotlib is not installed, it is another method, or the input is invalid.
     """
     figure = style.blank_figure((16.0, 6.9), 100)
     if config is None:
         config, window = make_config("keypoints"), replace(window, pch=(), pcf=())
     found = keypoint_matches(window, config)
-    low, high = busiest(found.start, found.end)
-    title = f"{len(found.key_points)} key points at t, {len(found.start)} of them matched; shown is a part"
+    low, high = _busiest_view(found.start, found.end)
+    title = f"{len(found.key_points)} key points at t, {len(found.start)} of them matched; the view shows a part"
     style.add_heading(figure, 0.31, title)
     panels = [style.add_panel(figure, left, 0.9, 7.12, 5.1) for left in (0.64, 8.56)]
     for axes, fade, name in zip(panels, (0.0, _FADE), ("occupancy and key points", "matches")):
-        draw_occupancy(axes, found.images, fade)
+        found.images.draw(axes, fade)
         style.set_view(axes, low, high, has_ticks=True)
         axes.set_title(name, fontsize=14, color=style.INK, pad=7)
         style.name_axes(axes, "x, m (forward)", "y, m (left)" if axes is panels[0] else "", 10)
-    pixel = 72 * 7.12 * found.images.pixel_size / (2 * _HALF_VIEW[0])  # points of print
+    pixel = 72 * 7.12 * found.images.pixel_size / (2 * _HALF_VIEW[0])  # in typographic points
     dot = max(0.45 * pixel, 1.5)
     panels[0].plot(*found.key_points.T, "o", color=_POINT_COLOR, markersize=dot, markeredgewidth=0, zorder=3)
     _draw_matches(panels[1], found, low, high)
@@ -64,10 +64,10 @@ def plot_keypoints(window: Window, config: Config | None = None) -> Figure:
     return figure
 
 
-def busiest(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Low and high corner of the view: round the cell whose matches go farthest in sum, or the ego vehicle.
+def _busiest_view(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Low and high corner of the view around the cell whose matches have the largest sum, or around the ego vehicle.
 
-    Convention: vectors are summed, so matches that agree count and those that cross do not.
+    Matches are added as vectors, so those that agree count and those that cross cancel.
     """
     flow = end - start
     middle = np.zeros(2)
@@ -89,8 +89,7 @@ def _draw_matches(axes: Axes, found: KeyPointMatches, low: np.ndarray, high: np.
     max_flow = longest_flow(flow)
     color = flow_to_rgb(flow, max_flow) / 255
     moves = np.linalg.norm(flow, axis=1) > MOVING
-    still = start[~moves]
-    axes.plot(*still.T, "o", color=style.FAINT, markersize=2.5, markeredgewidth=0, zorder=3)
+    axes.plot(*start[~moves].T, "o", color=style.FAINT, markersize=2.5, markeredgewidth=0, zorder=3)
     lines = np.stack([start, end], axis=1)[moves]
     axes.add_collection(LineCollection(lines, colors=style.INK, linewidths=1.9, alpha=0.5, zorder=4))
     axes.add_collection(LineCollection(lines, colors=color[moves], linewidths=1.1, zorder=5))
@@ -100,11 +99,11 @@ def _draw_matches(axes: Axes, found: KeyPointMatches, low: np.ndarray, high: np.
 
 
 def _draw_legend(figure: Figure) -> None:
-    """What the marks are, one line below the panels."""
+    """Explain the marks, one line below the panels."""
     from matplotlib.lines import Line2D
 
     marks = sweep_marks()
     marks.append(Line2D([], [], marker="o", linestyle="", markersize=7, color=_POINT_COLOR, label="key point of t"))
-    marks.append(Line2D([], [], linewidth=2.5, color="#00a0b0", label="match that moves, dot at t+1"))
-    marks.append(Line2D([], [], marker="o", linestyle="", markersize=4, color=style.FAINT, label="match that stays"))
+    marks.append(Line2D([], [], linewidth=2.5, color="#00a0b0", label="moving match, dot at t+1"))
+    marks.append(Line2D([], [], marker="o", linestyle="", markersize=4, color=style.FAINT, label="static match"))
     figure.legend(handles=marks, loc="lower center", ncol=len(marks), frameon=False, fontsize=11, labelcolor=style.INK)

@@ -1,4 +1,4 @@
-"""Layers of a bird's-eye panel: ground, static points, movers, arrows, errors, the ego vehicle."""
+"""Layers of a bird's-eye panel: ground, static points, moving points, arrows, errors, the ego vehicle."""
 
 from __future__ import annotations
 
@@ -15,37 +15,37 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-MOVING = 0.08  # metres per sweep; the field's viewers leave slower points white
-MIN_ERROR, MAX_ERROR = 0.05, 0.35  # metres, ends of the viewers' error colours: below counts as none
-ARROW_STEPS = 5  # an arrow is so many sweeps long
-MIN_ARROW_POINTS = 8  # smaller clusters get no arrow
-OBJECT_PIXEL = 0.5  # metres; movers in touching pixels are one object where no clusters are given
-_MAX_PIXELS = 2048  # a side; movers spread wider get larger pixels
+MOVING = 0.08  # metres per sweep; the field's viewers draw slower points in white
+MIN_ERROR, MAX_ERROR = 0.05, 0.35  # metres, ends of the viewers' error colours; a smaller error is drawn as none
+ARROW_STEPS = 5  # length of an arrow, sweeps
+MIN_ARROW_POINTS = 8  # a cluster with fewer moving points gets no arrow
+OBJECT_PIXEL = 0.5  # metres; without clusters, moving points in touching pixels are one object
+_MAX_PIXELS = 2048  # a side; larger scenes get larger pixels
 FLOW_CAPTION = (
     f"grey: static   colour: moves more than {MOVING:g} m per sweep   "
     f"arrow: motion over {ARROW_STEPS} sweeps ({ARROW_STEPS / style.SWEEP_RATE:g} s at {style.SWEEP_RATE} Hz)"
 )
-_RING, _MOST_RINGS = 10.0, 20  # metres between two rings; wider views get wider steps
-_HIGHEST = 2.0  # widths, height of a panel at most; at least it is that of two wheels
+_RING, _MOST_RINGS = 10.0, 20  # metres between two rings; a view with more rings gets wider steps
+_HIGHEST = 2.0  # largest height of a panel, in widths; the smallest is the height of two wheels
 
 _SLOW_RIM, _FAST_RIM = np.array((0.62, 0.66, 0.70)), np.array((0.10, 0.12, 0.15))
-_SLATE = (80 / 255, 90 / 255, 110 / 255)  # behind errors: black (none) and white (large) both show on it
+_SLATE = (80 / 255, 90 / 255, 110 / 255)  # background of errors: black (none) and white (large) are visible on it
 
 
 def new_figure(
     names: Sequence[str], view: np.ndarray, title: str | None, caption: str = FLOW_CAPTION
 ) -> tuple[Figure, list[Axes]]:
-    """An empty figure with one framed panel per name, in a row, and range rings around the ego vehicle.
+    """Create a figure with one framed panel per name, in a row, and range rings around the ego vehicle.
 
     Args:
         names: headings of the panels, "" = none.
-        view: (2, 2) float64, metres, low and high corner (x, y). What is longer and thinner than a panel may be gets
+        view: (2, 2) float64, metres, low and high corner (x, y). A view that is too long and thin for a panel gets
             empty space along its long sides.
         title: heading of the figure, None = none.
-        caption: one line below the panels: what the colours are. How far apart the rings are is added.
+        caption: one line below the panels that explains the colours. The distance of the rings is added.
 
     Raises:
-        CFlowError: matplotlib is absent.
+        CFlowError: matplotlib is not installed.
     """
     gap, foot = 0.2, 0.42
     full, dpi = (10.0, 100) if len(names) == 1 else (16.0, 112)
@@ -59,7 +59,7 @@ def new_figure(
     from matplotlib.patches import Circle
 
     farthest = float(np.abs(view).max())
-    step = max(_RING, style.round_length(farthest / (0.4 * _MOST_RINGS)))  # rounding takes up to three fifths away
+    step = max(_RING, style.round_length(farthest / (0.4 * _MOST_RINGS)))  # rounding removes up to three fifths
     panels = []
     for i, name in enumerate(names):
         axes = style.add_panel(figure, gap + i * (width + gap), foot, width, height)
@@ -76,63 +76,59 @@ def new_figure(
 
 
 def draw_ground(axes: Axes, position: np.ndarray) -> None:
-    """Ground points, hardly there."""
+    """Draw the ground points, very faintly."""
     axes.scatter(position[:, 0], position[:, 1], s=dot_area(axes), color=style.GROUND, linewidths=0, zorder=1)
 
 
 def draw_flow(axes: Axes, position: np.ndarray, flow: np.ndarray, cluster: np.ndarray | None, max_flow: float) -> None:
-    """Static points in grey, movers in colour with a dark rim, one arrow per moving cluster, the ego vehicle.
+    """Draw static points in grey, moving points in colour, one arrow per moving cluster, and the ego vehicle.
 
     Args:
         axes: a panel.
         position: (N, 3) float64, metres.
         flow: (N, 3) float64 residual flow, metres per sweep; NaN is drawn as static.
-        cluster: (N,) int64, -1 = none; None = groups of movers near each other.
+        cluster: (N,) int64, -1 = none; None = groups of moving points near each other.
         max_flow: metres per sweep, full colour.
     """
-    is_mover = np.linalg.norm(flow, axis=1) > MOVING  # False for NaN
+    moves = np.linalg.norm(flow, axis=1) > MOVING  # False for NaN
     dot = dot_area(axes)
-    still = position[~is_mover]
-    axes.scatter(still[:, 0], still[:, 1], s=dot, color=style.STATIC, linewidths=0, zorder=2)
-    position, flow, cluster = position[is_mover], flow[is_mover], None if cluster is None else cluster[is_mover]
-    # A dark rim keeps yellow visible on white; that of slow, pale movers is lighter, so that fast ones stand out.
+    static = position[~moves]
+    axes.scatter(static[:, 0], static[:, 1], s=dot, color=style.STATIC, linewidths=0, zorder=2)
+    position, flow, cluster = position[moves], flow[moves], None if cluster is None else cluster[moves]
+    # A dark rim makes yellow visible on white. The rim of slow, pale points is lighter, so that fast ones stand out.
     speed = np.minimum(np.hypot(flow[:, 0], flow[:, 1]) / max_flow, 1)
     rim = _SLOW_RIM + (_FAST_RIM - _SLOW_RIM) * np.sqrt(speed)[:, None]
     order = np.argsort(speed, kind="stable")
     x, y = position[order, 0], position[order, 1]
     axes.scatter(x, y, s=9 * dot, c=rim[order], linewidths=0, zorder=3)
-    color = flow_to_rgb(flow[order], max_flow) / 255
-    axes.scatter(x, y, s=4 * dot, c=color, linewidths=0, zorder=4)
+    axes.scatter(x, y, s=4 * dot, c=flow_to_rgb(flow[order], max_flow) / 255, linewidths=0, zorder=4)
 
     group = _objects(position) if cluster is None else cluster
     _, middle, count = group_medians(group, np.concatenate([position[:, :2], flow[:, :2]], axis=1))
+    shape: Any = {"width": 0.0047, "headwidth": 3.6, "headlength": 4.5, "headaxislength": 4, "minlength": 0.5}
     axes.quiver(
         *middle[count >= MIN_ARROW_POINTS].T,
         angles="xy",
         scale_units="xy",
         scale=1 / ARROW_STEPS,
         units="width",
-        width=0.0047,
-        headwidth=3.6,
-        headlength=4.5,
-        headaxislength=4,
-        minlength=0.5,
         color=style.INK,
         edgecolor="white",
         linewidth=0.7,
         zorder=6,
+        **shape,
     )
     draw_ego(axes)
 
 
 def draw_error(axes: Axes, position: np.ndarray, flow: np.ndarray, truth: np.ndarray) -> None:
-    """End-point error of every point with known truth, on the field's scale from black (none) to white.
+    """Draw the end-point error of every point with known truth, on the field's scale from black (none) to white.
 
     Args:
         axes: a panel.
         position: (N, 3) float64, metres.
         flow: (N, 3) float64 residual flow, metres per sweep.
-        truth: (N, 3) float64, the same, NaN = unknown.
+        truth: (N, 3) float64 true residual flow, NaN = unknown.
     """
     error = np.linalg.norm(flow - truth, axis=1)
     is_known = np.isfinite(error)
@@ -140,9 +136,9 @@ def draw_error(axes: Axes, position: np.ndarray, flow: np.ndarray, truth: np.nda
     error[error < MIN_ERROR] = 0
     order = np.argsort(error, kind="stable")  # the largest on top
     position, error = position[order], error[order]
-    x, y = position[:, 0], position[:, 1]
     size = dot_area(axes) * np.where(error > 0, 4, 1)
     axes.set_facecolor(_SLATE)
+    x, y = position[:, 0], position[:, 1]
     dots = axes.scatter(x, y, s=size, c=error, cmap="hot", vmin=0, vmax=MAX_ERROR, linewidths=0, zorder=2)
     box = style.legend_box(axes, position, error > 0, (1.8, 0.66))
     bar = axes.figure.colorbar(dots, cax=box.inset_axes((0.1, 0.7, 0.8, 0.18)), orientation="horizontal")
@@ -160,9 +156,9 @@ def group_medians(group: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np
         values: (N, C) float64.
 
     Returns:
-        number: (G,) int64, groups, ascending.
+        number: (G,) int64, the groups, ascending.
         median: (G, C) float64, the upper one of an even count.
-        count: (G,) int64, rows.
+        count: (G,) int64, rows of each group.
 
     Cost: one sort per column.
     """
@@ -173,7 +169,7 @@ def group_medians(group: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np
 
 
 def _objects(position: np.ndarray) -> np.ndarray:
-    """(N,) int64 group of each mover: movers in touching pixels belong together."""
+    """(N,) int64, object of each moving point: points in touching pixels belong together."""
     if not len(position):
         return np.zeros(0, np.int64)
     low = position[:, :2].min(axis=0)
@@ -182,13 +178,13 @@ def _objects(position: np.ndarray) -> np.ndarray:
     occupancy = torch.zeros(1, int(row.max()) + 1, int(column.max()) + 1, dtype=torch.bool)
     occupancy[0, row, column] = True
     pixels = occupancy.flatten().nonzero()[:, 0]
-    of_pixel = torch.zeros(occupancy.numel(), dtype=torch.int64)
-    of_pixel[pixels] = connected_components(occupancy, pixels)
-    return of_pixel.reshape(occupancy.shape)[0, row, column].numpy()
+    object_at = torch.zeros(occupancy.shape, dtype=torch.int64)
+    object_at[occupancy] = connected_components(occupancy, pixels)
+    return object_at[0, row, column].numpy()
 
 
 def draw_ego(axes: Axes, color: str = style.INK, halo: Any = "white") -> None:
-    """The ego vehicle: an arrow head of a car's length at the origin, pointing to +x."""
+    """Draw the ego vehicle at the origin: an arrow head of a car's length that points to +x."""
     from matplotlib.patheffects import withStroke
 
     (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
@@ -196,13 +192,13 @@ def draw_ego(axes: Axes, color: str = style.INK, halo: Any = "white") -> None:
         return
     effects = [withStroke(linewidth=3, foreground=halo)]
     axes.fill([2.4, -1.9, -1.0, -1.9], [0, 1.15, 0, -1.15], color=color, linewidth=0, zorder=9, path_effects=effects)
-    # The name stands behind the vehicle, where no lane is, unless the view ends there.
+    # The name is behind the vehicle, where it covers no lane, unless the view ends there.
     x, side = (-2.3, "right") if left < -0.1 * (right - left) else (2.8, "left")
     size = 12 if style.inches_of(axes)[0] > 4 else 9
     axes.text(x, 0, "ego", fontsize=size, color=color, ha=side, va="center_baseline", zorder=9, path_effects=effects)
 
 
 def dot_area(axes: Axes) -> float:
-    """Area of a static point in square points: about 0.2 m, never less than a fine dot."""
+    """Area of a static point in square points: that of a dot of about 0.2 m, but at least 0.5."""
     points_per_metre = 72 * style.inches_of(axes)[0] / float(np.diff(axes.get_xlim())[0])
     return max((0.2 * points_per_metre) ** 2, 0.5)

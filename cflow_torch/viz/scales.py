@@ -1,4 +1,4 @@
-"""Picture of coarse to fine: what every pixel size sees, and the flow so far."""
+"""Picture of coarse to fine: the input of every scale, and the flow so far."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from cflow_torch.config import Config, make_config
 from cflow_torch.types import FlowResult, Window
 from cflow_torch.viz import style
 from cflow_torch.viz.bev import longest_flow, point_rows, view_of
-from cflow_torch.viz.occupancy import draw_occupancy, sweep_marks
+from cflow_torch.viz.occupancy import sweep_marks
 from cflow_torch.viz.panel import FLOW_CAPTION, draw_flow, group_medians
 from cflow_torch.viz.stages import Scale, scales
 
@@ -19,29 +19,29 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_MARGIN = 2.0  # metres round the object that is shown
-_SMALLEST = 4.0  # metres, half a side
-_MIN_POINTS = 30  # of the object that is shown
+_MARGIN = 2.0  # metres around the object in the close-up
+_SMALLEST = 4.0  # metres, half a side of the close-up
+_MIN_POINTS = 30  # of the object in the close-up
 
 
 def plot_scales(window: Window, config: Config | None = None) -> Figure:
-    """Coarse to fine, one column per pixel size.
+    """Draw coarse to fine, one column per pixel size.
 
     Args:
         window: sweeps.
-        config: of one of the paper's methods; None = the preset "paper" with pixels of 0.4, 0.2 and 0.1 m, which
-            leaves older sweeps out.
+        config: of one of the paper's methods; None = the preset "paper" with pixels of 0.4, 0.2 and 0.1 m, without
+            older sweeps.
 
     Returns:
-        Figure, 1600 pixels wide. Above, close up on the object where this changes most: sweep t moved by the flow of
-        the coarser scales, and t+1; last, t moved by the whole flow. Below: the flow so far, in the colours of the
-        wheel; last, what the finest pixels find on their own.
+        Figure, 1600 pixels wide. Above, close up on the object that coarse to fine changes most: sweep t moved by the
+        flow of the coarser scales, and t+1; in the last column t moved by the whole flow. Below: the flow so far, in
+        the colours of the wheel; in the last column the flow of the finest pixels alone.
 
     Convention: metres, frame of t+1.
 
     Raises:
-        CFlowError: matplotlib is absent, the method has no scales one after the other (presets default and fast), or
-            bad input.
+        CFlowError: matplotlib is not installed, the method does not process one scale after the other (presets default
+            and fast), or the input is invalid.
 
     Source: the paper's multi-scale strategy and its figure.
     """
@@ -62,7 +62,7 @@ def plot_scales(window: Window, config: Config | None = None) -> Figure:
     )
     style.add_heading(figure, 0.32, "coarse to fine: " + " → ".join(f"{size:g} m" for size in config.pixel_sizes))
     position = point_rows("points", window.pc0.points) + result.pose_flow.numpy()
-    _draw_near(above, position, found, result, alone)
+    _draw_close_up(above, position, found, _changed_object(result, alone))
     max_flow = _draw_flows(below, config, position, found, result, alone)
     for axes in (*above, *below):
         name = axes.get_title().replace(": ", ":\n", lines - 1)
@@ -79,11 +79,11 @@ def plot_scales(window: Window, config: Config | None = None) -> Figure:
     return figure
 
 
-def _shown(result: FlowResult, alone: FlowResult) -> np.ndarray:
-    """(N,) bool, points of the mover whose flow coarse to fine changes most against the finest pixels alone.
+def _changed_object(result: FlowResult, alone: FlowResult) -> np.ndarray:
+    """(N,) bool, points of the object whose flow differs most between coarse to fine and the finest pixels alone.
 
-    Convention: of the larger clusters, by median change, at most the flow itself, times the score of the match. If
-        nothing changes, the fastest.
+    Convention: among the larger clusters, the largest median change, at most the flow itself, times the score of the
+        match. If nothing changes, the fastest cluster.
     """
     cluster, flow = result.cluster_id.numpy(), result.residual_flow.numpy()
     change = np.linalg.norm(flow - alone.residual_flow.numpy(), axis=1)
@@ -96,27 +96,24 @@ def _shown(result: FlowResult, alone: FlowResult) -> np.ndarray:
 
 
 def _square(position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Low and high corner of a square round some points and a margin."""
+    """Low and high corner of a square around points and a margin."""
     ends = position[:, :2] if len(position) else np.zeros((1, 2))
     middle = (ends.min(axis=0) + ends.max(axis=0)) / 2
     half = max(float(np.ptp(ends, axis=0).max()) / 2 + _MARGIN, _SMALLEST)
     return middle - half, middle + half
 
 
-def _draw_near(
-    panels: list[Axes], position: np.ndarray, found: list[Scale], result: FlowResult, alone: FlowResult
-) -> None:
-    """What each scale sees of one object, and in the last panel where it ends."""
-    shown = _shown(result, alone)
+def _draw_close_up(panels: list[Axes], position: np.ndarray, found: list[Scale], shown: np.ndarray) -> None:
+    """Draw one object in the input of each scale, and in the last panel in the result. Args: shown: (N,) bool."""
     low, high = _square(np.concatenate([position[shown], (position + found[-1].flow)[shown]]))
     images = [scale.seen() for scale in found] + [found[-1].result()]
-    moved = ["as it is"]
+    moved = ["not moved"]
     for scale in found:
         flow = np.median(scale.flow[shown], axis=0) if shown.any() else 0.0
         moved.append(f"moved by {np.linalg.norm(flow):.2f} m")
-    names = [f"{one.pixel_size:g} m pixels" for one in images[:-1]] + ["result"]
-    for axes, one, name, words in zip(panels, images, names, moved):
-        draw_occupancy(axes, one)
+    names = [f"{image.pixel_size:g} m pixels" for image in images[:-1]] + ["result"]
+    for axes, image, name, words in zip(panels, images, names, moved):
+        image.draw(axes)
         style.set_view(axes, low, high, has_ticks=True)
         axes.set_title(f"{name}: t {words}")
         style.name_axes(axes, "x, m", "y, m" if axes is panels[0] else "")
@@ -131,7 +128,7 @@ def _draw_flows(
     result: FlowResult,
     alone: FlowResult,
 ) -> float:
-    """The flow so far after each scale, and in the last panel that of the finest one alone.
+    """Draw the flow so far after each scale, and in the last panel that of the finest scale alone.
 
     Returns:
         Metres per sweep, full colour.

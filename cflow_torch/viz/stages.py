@@ -1,7 +1,7 @@
-"""What the paper's methods see on their way, as plain arrays: scales, the correlation of one cluster, key points.
+"""Intermediate results of the paper's methods as plain arrays: scales, the correlation of one cluster, key points.
 
-A run of the model is watched from scale to scale; what it does within the finest one, the same functions are asked
-again. The presets default and fast weigh the motions of all scales at once and have none of these.
+We record a run of the model from scale to scale, and call the functions of the finest scale once more. The presets
+default and fast weigh the motions of all scales together, so they have none of these.
 """
 
 from __future__ import annotations
@@ -27,33 +27,18 @@ from cflow_torch.model import Motion
 from cflow_torch.ops.cross_correlation import cross_correlate
 from cflow_torch.ops.indices import flat_nonzero
 from cflow_torch.types import CFlowError, FlowResult, Window
+from cflow_torch.viz.occupancy import Occupancy
 from cflow_torch.viz.panel import group_medians
 
 
 @dataclass(frozen=True)
-class Occupancy:
-    """BEV images of a pair of sweeps.
-
-    Args:
-        t, t1: (H, W) bool, sweep t moved by the flow so far, and sweep t+1; row from y, column from x.
-        lower: (2,) float64, metres, corner (x, y) of pixel (0, 0), frame of t+1.
-        pixel_size: metres.
-    """
-
-    t: np.ndarray
-    t1: np.ndarray
-    lower: np.ndarray
-    pixel_size: float
-
-
-@dataclass(frozen=True)
 class Scale:
-    """One step from coarse to fine.
+    """One scale of a coarse-to-fine run.
 
     Args:
-        sweeps: what this scale was given: the one window, warped by the flow of the coarser scales.
-        motion: what it added.
-        flow: (N, 3) float64, residual flow of the rows of pc0 with this scale's, metres per sweep interval.
+        sweeps: the input of this scale: the one window, warped by the flow of the coarser scales.
+        motion: the motion that this scale added.
+        flow: (N, 3) float64, residual flow of the rows of pc0 after this scale, metres per sweep interval.
     """
 
     sweeps: ProjectedSweeps
@@ -61,11 +46,11 @@ class Scale:
     flow: np.ndarray
 
     def seen(self) -> Occupancy:
-        """The pair that this scale was given: sweep t moved by the flow of the coarser ones."""
+        """The input of this scale: sweep t is moved by the flow of the coarser scales."""
         return _pair(self.sweeps)
 
     def result(self) -> Occupancy:
-        """The same pixels with sweep t moved by `flow`."""
+        """The result of this scale: sweep t is moved by `flow`."""
         batch = self.sweeps.batch
         flow = torch.zeros_like(batch.positions)
         flow[:, batch.rows[0]] = torch.from_numpy(self.flow).T[: len(flow)]
@@ -80,10 +65,10 @@ class ClusterCorrelation:
         cluster_id: as in `FlowResult`.
         images: template (t) and target (t+1): the pixels of the cluster in its box.
         ncc: (H, W) float64 of each shift (dy, dx) at [dy + H // 2, dx + W // 2], 0 ... 1; NaN = not searched.
-        shift: (2,) int64, (dy, dx) that the method takes, pixels.
+        shift: (2,) int64, (dy, dx) that the method chooses, pixels.
         score: NCC at that shift.
         flow: (3,) float64, residual flow of the cluster, metres per sweep interval: the shift times the pixel size,
-            with what coarser scales and older sweeps say.
+            combined with the estimates from coarser scales and older sweeps.
     """
 
     cluster_id: int
@@ -99,9 +84,9 @@ class KeyPointMatches:
     """Key points of sweep t and the matches that the ratio test accepts, at the finest scale.
 
     Args:
-        images: occupancy.
-        key_points: (K, 2) float64, (x, y), metres, frame of t+1: the middle of each one's pixel.
-        start, end: (M, 2) float64, likewise, the key point of t and that of t+1 of each match.
+        images: occupancy of both sweeps.
+        key_points: (K, 2) float64, (x, y), metres, frame of t+1: the middle of the pixel of each key point.
+        start, end: (M, 2) float64, (x, y), metres, frame of t+1: key points of t and of t+1 of each match.
     """
 
     images: Occupancy
@@ -111,24 +96,24 @@ class KeyPointMatches:
 
 
 def scales(window: Window, config: Config) -> tuple[list[Scale], FlowResult]:
-    """Every scale of a run on the CPU, coarse to fine, and the run's result.
+    """Run the method on the CPU and return every scale, coarse to fine, and the result.
 
     Raises:
-        CFlowError: the method has no scales one after the other, or bad input.
+        CFlowError: the method does not process one scale after the other, or the input is invalid.
     """
     if config.method == "verified":
-        raise _absent(config, "scales one after the other", "paper")
+        raise _not_drawable(config, "scales one after the other", "paper")
     model: Any = make_model(config, "cpu")
     motion_at_scale = model.motion_at_scale
     seen: list[tuple[ProjectedSweeps, Motion]] = []
 
-    def watched(sweeps: ProjectedSweeps) -> Motion:
+    def record(sweeps: ProjectedSweeps) -> Motion:
         motion = motion_at_scale(sweeps)
-        flow = None if sweeps.flow is None else sweeps.flow.clone()  # the run adds to it
+        flow = None if sweeps.flow is None else sweeps.flow.clone()  # the run adds to it in place
         seen.append((replace(sweeps, flow=flow), motion))
         return motion
 
-    model.motion_at_scale = watched
+    model.motion_at_scale = record
     (result,) = model([window])
     points = seen[0][0].batch.rows[0]
     so_far = [sweeps.flow for sweeps, _ in seen if sweeps.flow is not None]
@@ -138,18 +123,18 @@ def scales(window: Window, config: Config) -> tuple[list[Scale], FlowResult]:
 
 @torch.inference_mode()
 def cluster_correlation(window: Window, config: Config, cluster_id: int | None = None) -> ClusterCorrelation:
-    """The correlation of one cluster of a dense run.
+    """Run the dense method and return the correlation of one cluster.
 
     Args:
         window: sweeps.
         config: a `DenseConfig`, clusters by components.
-        cluster_id: as in `FlowResult`; None = the most conspicuous mover: most points times metres of flow.
+        cluster_id: as in `FlowResult`; None = the cluster with the largest number of points times metres of flow.
 
     Raises:
-        CFlowError: a method without such a map, no such cluster, or bad input.
+        CFlowError: the method has no such map, there is no such cluster, or the input is invalid.
     """
     if not isinstance(config, DenseConfig) or config.clustering != "components":
-        raise _absent(config, "correlation map per cluster", "paper")
+        raise _not_drawable(config, "correlation map per cluster", "paper")
     (*_, last), result = scales(window, config)
     numbers, flow, count = group_medians(result.cluster_id.numpy(), last.flow)
     if not len(numbers):
@@ -182,13 +167,13 @@ def cluster_correlation(window: Window, config: Config, cluster_id: int | None =
 
 @torch.inference_mode()
 def keypoint_matches(window: Window, config: Config) -> KeyPointMatches:
-    """Key points and matches of a run.
+    """Run the key-point method and return its key points and matches.
 
     Raises:
-        CFlowError: another method, or bad input.
+        CFlowError: it is another method, or the input is invalid.
     """
     if not isinstance(config, KeypointsConfig):
-        raise _absent(config, "key points", "keypoints")
+        raise _not_drawable(config, "key points", "keypoints")
     (*_, last), _ = scales(window, config)
     sweeps = last.sweeps
     pc1, pc0 = (describe(sweeps.occupancy[:, step], config.patch_size) for step in (0, 1))
@@ -199,8 +184,7 @@ def keypoint_matches(window: Window, config: Config) -> KeyPointMatches:
     return KeyPointMatches(images, key_points, start, start + matches.shift.flip(1).numpy() * size)
 
 
-def _absent(config: Config, what: str, preset: str) -> CFlowError:
-    """The error of a method that has no such thing to draw."""
+def _not_drawable(config: Config, what: str, preset: str) -> CFlowError:
     return CFlowError(f'method={config.method} has no {what}: give make_config("{preset}"), or model={preset}')
 
 
@@ -218,12 +202,12 @@ def _image(images: Images, number: int, size: Tensor) -> Tensor:
 
 
 def _ncc_map(template: Tensor, target: Tensor) -> Tensor:
-    """(H, W) float64, as `ClusterCorrelation.ncc`. A window of ones over the target counts its pixels."""
+    """(H, W) float64, as `ClusterCorrelation.ncc`. The energies are the correlation of the target with ones."""
     height, width = template.shape
     images = torch.zeros(3, 2 * height, 2 * width)
     images[:, :height, :width] = torch.stack((template, torch.ones_like(template), target))
     counts = cross_correlate(images, 2, torch.zeros(2, dtype=torch.int64)).round().double()
-    # It wraps round, and half of the images is free: negative shifts stand at the far end.
+    # The correlation wraps around, and half of each image is empty, so negative shifts are at the far end.
     dy, dx = ((torch.arange(n) - n // 2) % (2 * n) for n in (height, width))
     overlap, in_window = counts[:, dy[:, None], dx]
     energies = in_window * template.double().sum()

@@ -1,4 +1,4 @@
-"""What all pictures share: colours of lines and texts, an empty figure, panels, legends, the scale bar."""
+"""Style that all pictures share: colours of lines and texts, empty figures, panels, legends, the scale bar."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ if TYPE_CHECKING:
 
 INK, FAINT, STATIC, GROUND, FRAME = "#20262e", "#5b6570", "#b4bbc3", "#eff1f3", "#c9ced4"
 SWEEP_RATE = 10  # Hz
-CORNERS = ("upper right", "lower right", "upper left")  # where a legend may stand; the scale bar has the other
+CORNERS = ("upper right", "lower right", "upper left")  # corners for a legend; the fourth has the scale bar
 WHEEL_INCHES = (1.6, 1.82)  # width and height of the legend
 _TITLE = 7.2  # characters of a heading per inch
 
 
 def blank_figure(inches: tuple[float, float], dpi: int) -> Figure:
-    """An empty white figure of that size; no pyplot state is touched.
+    """Create an empty white figure without touching pyplot's state.
 
     Raises:
-        CFlowError: matplotlib is absent.
+        CFlowError: matplotlib is not installed.
     """
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -38,27 +38,27 @@ def blank_figure(inches: tuple[float, float], dpi: int) -> Figure:
 
 
 def add_panel(figure: Figure, left: float, bottom: float, width: float, height: float, **settings: Any) -> Any:
-    """Axes at a place in inches. Args: settings: of `Figure.add_axes`."""
+    """Add axes, measured in inches. Args: settings: of `Figure.add_axes`."""
     across, up = figure.get_size_inches()
     return figure.add_axes((left / across, bottom / up, width / across, height / up), **settings)
 
 
 def add_heading(figure: Figure, inches: float, title: str) -> None:
-    """One line, its middle so far below the upper edge; a long one is written smaller."""
+    """Write one line, its middle `inches` below the upper edge; a long line is smaller."""
     size = 17 * min(1, _TITLE * figure.get_figwidth() / max(len(title), 1))
     height = 1 - inches / figure.get_figheight()
-    # The name of a log is no formula.
+    # A log's name may contain "$", which is not a formula.
     figure.text(0.5, height, title, fontsize=size, color=INK, ha="center", va="center", parse_math=False)
 
 
 def add_caption(figure: Figure, caption: str) -> None:
-    """One line at the lower edge: what the colours are."""
+    """Write one line at the lower edge that explains the colours."""
     height = 0.2 / figure.get_figheight()
     figure.text(0.5, height, caption, fontsize=11, color=FAINT, ha="center", va="center")
 
 
 def set_view(axes: Axes, low: np.ndarray, high: np.ndarray, has_ticks: bool = False) -> None:
-    """Limits, equal scales and a thin frame. Args: low, high: (2,) float64, metres, corners (x, y)."""
+    """Set limits, equal scales and a thin frame. Args: low, high: (2,) float64, metres, corners (x, y)."""
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
     if has_ticks:
         thin_ticks(axes)
@@ -69,25 +69,25 @@ def set_view(axes: Axes, low: np.ndarray, high: np.ndarray, has_ticks: bool = Fa
 
 
 def thin_frame(axes: Axes) -> None:
-    """The frame of every panel and legend."""
+    """Draw the frame of a panel or legend thinly."""
     for spine in axes.spines.values():
         spine.set(color=FRAME, linewidth=0.8)
 
 
 def thin_ticks(axes: Axes) -> None:
-    """Few ticks, which do not catch the eye."""
+    """Draw few, faint ticks."""
     axes.locator_params(nbins=6, min_n_ticks=2)
     axes.tick_params(labelsize=10, labelcolor=INK, color=FRAME, length=3)
 
 
 def name_axes(axes: Axes, x: str, y: str, size: int = 9) -> None:
-    """Labels of the two axes."""
+    """Label the two axes."""
     axes.set_xlabel(x, fontsize=size, color=INK, labelpad=2)
     axes.set_ylabel(y, fontsize=size, color=INK, labelpad=2)
 
 
 def round_length(most: float) -> float:
-    """The longest of ... 1, 2, 5, 10, 20, 50 ... that is no longer than `most`, > 0."""
+    """The largest of ... 1, 2, 5, 10, 20, 50 ... that is at most `most`, > 0."""
     power = 10.0 ** math.floor(math.log10(most))
     return max(power * digit for digit in (1, 2, 5) if power * digit <= most * (1 + 1e-9))
 
@@ -97,15 +97,13 @@ def inches_of(axes: Axes) -> np.ndarray:
     return np.array([axes.bbox.width, axes.bbox.height]) / axes.figure.dpi
 
 
-def draw_wheel(
-    axes: Axes, position: np.ndarray, is_mover: np.ndarray, max_flow: float, corner: str | None = None
-) -> None:
-    """The colour wheel, in a corner of the panel where it hides little, or in one of `CORNERS`."""
-    fill_wheel(legend_box(axes, position, is_mover, WHEEL_INCHES, corner), max_flow)
+def draw_wheel(axes: Axes, position: np.ndarray, moves: np.ndarray, max_flow: float, corner: str | None = None) -> None:
+    """Draw the colour wheel in a corner of the panel, see `legend_box`. Moving points count as loud."""
+    fill_wheel(legend_box(axes, position, moves, WHEEL_INCHES, corner), max_flow)
 
 
 def fill_wheel(box: Axes, max_flow: float) -> None:
-    """The colour wheel and what its rim means. Args: box: of `WHEEL_INCHES`; max_flow: metres per sweep at the rim."""
+    """Draw the colour wheel and its scale. Args: box: of `WHEEL_INCHES`; max_flow: metres per sweep at the rim."""
     box.imshow(wheel_image(256), extent=(-1, 1, -1, 1), interpolation="bilinear")
     box.set(xlim=(-1.3, 1.3), ylim=(-1.77, 1.194))
     rim = f"rim: {max_flow:.4g} m per sweep\n{max_flow * SWEEP_RATE:.4g} m/s at {SWEEP_RATE} Hz"
@@ -113,7 +111,7 @@ def fill_wheel(box: Axes, max_flow: float) -> None:
 
 
 def draw_scale(axes: Axes) -> None:
-    """A bar of a round length, at most a sixth of the panel (10 m in views of 60 to 120 m), bottom left."""
+    """Draw a scale bar of a round length, at most a sixth of the panel (10 m in views of 60 to 120 m), bottom left."""
     from matplotlib.patheffects import withStroke
 
     inches, metres = inches_of(axes), np.diff([axes.get_xlim(), axes.get_ylim()])[:, 0]
@@ -126,22 +124,16 @@ def draw_scale(axes: Axes) -> None:
 
 
 def legend_box(
-    axes: Axes,
-    position: np.ndarray,
-    is_loud: np.ndarray,
-    inches: tuple[float, float],
-    corner: str | None = None,
+    axes: Axes, position: np.ndarray, is_loud: np.ndarray, inches: tuple[float, float], corner: str | None = None
 ) -> Axes:
-    """An empty white box of that size in the corner where it hides the fewest points; loud ones count twenty-fold.
+    """Add an empty white box in the corner where it covers the fewest points; a loud point counts twenty-fold.
 
     Args:
         axes: a panel.
         position: (N, 3) float64, metres.
         is_loud: (N,) bool.
         inches: width and height.
-        corner: one of `CORNERS`; None = the one that hides the fewest.
-
-    Convention: not in the lower left corner, which is the scale bar's.
+        corner: one of `CORNERS`; None = the one that covers the fewest.
     """
     panel = inches_of(axes)
     size, margin = np.minimum(np.array(inches) / panel, 0.5), 0.1 / panel
@@ -149,8 +141,8 @@ def legend_box(
     fraction = (position[:, :2] - low) / (high - low)
     far = 1 - margin - size
     corners = np.array([(far[0], far[1]), (far[0], margin[1]), (margin[0], far[1])])
-    is_hidden = ((fraction >= corners[:, None]) & (fraction <= corners[:, None] + size)).all(axis=2)
-    best = int(np.argmin(is_hidden @ np.where(is_loud, 20, 1)))
+    is_covered = ((fraction >= corners[:, None]) & (fraction <= corners[:, None] + size)).all(axis=2)
+    best = int(np.argmin(is_covered @ np.where(is_loud, 20, 1)))
     x, y = corners[best if corner is None else CORNERS.index(corner)]
     box = axes.inset_axes((x, y, size[0], size[1]), zorder=7)
     box.set(xticks=[], yticks=[], facecolor="white")

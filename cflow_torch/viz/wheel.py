@@ -1,4 +1,4 @@
-"""Flow as colour: the Middlebury wheel that the field's viewers use."""
+"""Colours of flow: the Middlebury colour wheel, which the field's viewers use."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ _POSITION = np.cumsum((0, *TRANSITIONS))  # of each primary on the wheel
 
 
 def flow_to_rgb(flow: Array, max_flow: float | None = None) -> np.ndarray:
-    """Direction of flow as hue, length as saturation; zero flow is white.
+    """Convert flow to colours: direction to hue, length to saturation; zero flow is white.
 
     Args:
-        flow: (..., 2+) float, metres; x and y count, further columns are ignored.
-        max_flow: length in metres that gets the full hue; None = the longest flow given.
+        flow: (..., 2+) float, metres; columns after x and y are ignored.
+        max_flow: length in metres that gets the full hue; None = the longest flow.
 
     Returns:
         (..., 3) uint8 RGB.
 
     Convention:
         +x is red, then counter-clockwise yellow, green, cyan, blue, magenta. The angle in [0, 2 pi) is spread over 54
-        of the 55 steps, as the viewers do, so +y is (255, 230, 0), -x (0, 209, 255), -y (88, 0, 255). Flow longer than
-        `max_flow` gets darker. NaN and infinite flow is white.
+        of the 55 steps, as in the viewers, so +y is (255, 230, 0), -x (0, 209, 255), -y (88, 0, 255). Flow longer than
+        `max_flow` is darker. NaN and infinite flow is white.
 
     Raises:
         CFlowError: `max_flow` is not positive.
@@ -54,7 +54,7 @@ def flow_to_rgb(flow: Array, max_flow: float | None = None) -> np.ndarray:
 
 
 def wheel_image(size: int) -> np.ndarray:
-    """The wheel itself, for legends: +x to the right, +y up, zero flow in the middle, `max_flow` at the rim.
+    """Draw the wheel for a legend: +x to the right, +y up, zero flow in the middle, `max_flow` at the rim.
 
     Args:
         size: side of the image in pixels.
@@ -65,7 +65,7 @@ def wheel_image(size: int) -> np.ndarray:
     axis = (np.arange(size) + 0.5) * (2 / size) - 1
     flow = np.stack(np.meshgrid(axis, -axis), axis=-1)
     distance = np.hypot(flow[..., 0], flow[..., 1])
-    # One pixel of fading makes the rim smooth.
+    # The rim fades over one pixel, so it looks smooth.
     alpha = np.clip((1 - distance) * (size / 2), 0, 1) * 255
     rgb = flow_to_rgb(flow / np.maximum(distance, 1)[..., None], 1.0)
     return np.concatenate([rgb, alpha[..., None].astype(np.uint8)], axis=-1)

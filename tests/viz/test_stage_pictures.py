@@ -12,7 +12,6 @@ from scenes import RANGE, ell, scene
 
 from cflow_torch import CFlowError, Config, Sweep, Window, make_config, make_model
 from cflow_torch.viz import plot_correlation, plot_keypoints, plot_scales, stages
-from cflow_torch.viz.occupancy import occupancy_rgb
 
 SIZE = 0.25
 TWO_SIZES = {"pixel_sizes": (0.5, 0.25)}
@@ -104,7 +103,7 @@ def test_scales_and_correlation_draw_the_stages() -> None:
     panels = plot_scales(sweeps, settings).axes
     for axes, images in zip(panels, (coarse.seen(), fine.seen(), fine.result())):
         (drawn,) = images_of(axes)
-        assert np.array_equal(drawn, occupancy_rgb(images))
+        assert np.array_equal(drawn, images.rgb())
         assert np.allclose(axes.images[0].get_extent()[::2], images.lower)
     one = stages.cluster_correlation(sweeps, settings)
     figure = plot_correlation(sweeps, settings)
