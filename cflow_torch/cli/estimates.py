@@ -1,27 +1,26 @@
-"""Flow of many pairs, a window at a time: on a CPU in worker processes, one per core.
+"""Flow of many pairs, one window at a time; on a CPU in worker processes, one per core.
 
-Not in threads: a window is thousands of small operations, which take turns at the interpreter.
+Threads would not help: a window is thousands of small operations, and only one thread at a time runs the interpreter.
 """
 
 from __future__ import annotations
 
-import multiprocessing
 import os
-import signal
 from collections import deque
-from concurrent.futures import Future, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import Future, ThreadPoolExecutor
+from queue import SimpleQueue
 from typing import Any, Callable, Iterator, Sequence, Tuple, TypeVar
 
 import torch
 
 from cflow_torch.fleet.machine import AUTO, choose_layout
+from cflow_torch.fleet.processes import ChildProcess, WorkerDied
 from cflow_torch.fleet.progress import frames
 from cflow_torch.model import SceneFlowModel
 from cflow_torch.stages import TimedModel
 from cflow_torch.types import CFlowError, FlowResult, Window
 
-_PAIRS_PER_WORKER = 50  # at least: a process takes as long to start as some 30 windows
+_PAIRS_PER_WORKER = 50  # at least; a process takes as long to start as about 30 windows
 _AHEAD = 2  # windows per worker that are read ahead
 
 Item = TypeVar("Item")
@@ -31,69 +30,85 @@ Answer = Callable[[], Tuple[Window, FlowResult]]
 def estimates(
     model: TimedModel, items: Sequence[Item], read: Callable[[Item], Window]
 ) -> Iterator[tuple[Item, Answer]]:
-    """Flow of many pairs; it does not depend on the number of processes.
+    """Estimate the flow of many pairs. Results do not depend on the number of processes.
 
     Args:
-        model: the method; its times are those of the pairs, wherever they are computed.
+        model: the method; it receives the times of all pairs.
         items: the pairs.
-        read: gives the window of one, in this process.
+        read: returns the window of a pair; called in this process.
 
     Yields:
-        Each item, in order, and a call that gives its window and flow, or raises what went wrong with it.
+        Each item, in order, and a function that returns its window and flow, or raises the error of that pair.
     """
     method: Any = model.model
     devices = choose_layout(method.device, AUTO, AUTO, os.environ).devices
     count = min(len(devices), len(items) // _PAIRS_PER_WORKER) if devices[0] == "cpu" else 1
     if count < 2:
         for item in frames(items):
-            yield item, lambda item=item: _here(model, read(item))  # type: ignore[misc]
+            yield item, lambda item=item: _estimate(model, read(item))  # type: ignore[misc]
         return
-    waiting: deque[tuple[Item, Answer]] = deque()
-    context = multiprocessing.get_context("spawn")  # fork and threads do not go together
-    with ProcessPoolExecutor(count, context, initializer=_begin, initargs=(method,)) as pool:
-        for item in frames(items):
-            waiting.append((item, _there(model, pool, item, read)))
-            if len(waiting) > _AHEAD * count:
-                yield waiting.popleft()
-        yield from waiting
+    processes = [ChildProcess(_make_estimate, method) for _ in range(count)]
+    idle: SimpleQueue[ChildProcess] = SimpleQueue()
+    for process in processes:
+        idle.put(process)
+    waiting: deque[tuple[Item, Future[Any]]] = deque()
+    with ThreadPoolExecutor(count) as threads:
+        try:
+            for item in frames(items):
+                waiting.append((item, _submit(threads, idle, item, read)))
+                if len(waiting) > _AHEAD * count:
+                    yield _answer(model, *waiting.popleft())
+            while waiting:
+                yield _answer(model, *waiting.popleft())
+        finally:
+            for _, future in waiting:
+                future.cancel()
+            for process in processes:
+                process.close()
 
 
-def _here(model: TimedModel, sweeps: Window) -> tuple[Window, FlowResult]:
+def _estimate(model: TimedModel, sweeps: Window) -> tuple[Window, FlowResult]:
     return sweeps, model([sweeps])[0]
 
 
-def _there(model: TimedModel, pool: ProcessPoolExecutor, item: Item, read: Callable[[Item], Window]) -> Answer:
-    """Read a window and give it to a worker; the answer waits for it."""
-    future: Future = Future()
+def _submit(
+    threads: ThreadPoolExecutor, idle: SimpleQueue[ChildProcess], item: Item, read: Callable[[Item], Window]
+) -> Future[Any]:
+    """Read a window and pass it to the next idle process."""
+    future: Future[Any] = Future()
     try:
-        sweeps = read(item)
-        future = pool.submit(_compute, sweeps)
-    except (CFlowError, OSError, BrokenProcessPool) as error:
+        future = threads.submit(_call, idle, read(item))
+    except (CFlowError, OSError) as error:
         future.set_exception(error)
+    return future
 
+
+def _call(idle: SimpleQueue[ChildProcess], sweeps: Window) -> tuple[Window, dict[str, Any], Any]:
+    process = idle.get()
+    try:
+        return (sweeps, *process.call(sweeps))
+    except WorkerDied as death:
+        raise CFlowError(f"a worker process died on it {death}") from None
+    finally:
+        idle.put(process)
+
+
+def _answer(model: TimedModel, item: Item, future: Future[Any]) -> tuple[Item, Answer]:
     def answer() -> tuple[Window, FlowResult]:
-        try:
-            arrays, seconds = future.result()
-        except BrokenProcessPool:
-            raise CFlowError("a worker process died: out of memory?") from None
+        sweeps, arrays, seconds = future.result()
         model.pairs.append(seconds)
         return sweeps, FlowResult(**{name: torch.from_numpy(array) for name, array in arrays.items()})
 
-    return answer
+    return item, answer
 
 
-_model: TimedModel  # of a worker process
-
-
-def _begin(method: SceneFlowModel) -> None:
-    """A worker process begins. Ctrl-C is the business of its parent."""
-    global _model
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+def _make_estimate(method: SceneFlowModel) -> Callable[[Window], tuple[dict[str, Any], Any]]:
+    """Make the function that a worker process calls: window -> arrays and seconds."""
     torch.set_num_threads(1)
-    _model = TimedModel(method)
+    model = TimedModel(method)
 
+    def estimate(sweeps: Window) -> tuple[dict[str, Any], Any]:
+        (result,) = model([sweeps])
+        return result.numpy(), model.pairs.pop()  # tensors would take shared memory, of which containers have little
 
-def _compute(sweeps: Window) -> tuple[Any, ...]:
-    """Arrays, because tensors would go through shared memory, of which containers have little; and seconds."""
-    (result,) = _model([sweeps])
-    return result.numpy(), _model.pairs.pop()
+    return estimate

@@ -16,7 +16,7 @@ are there: a row per object and sweep with id, box, velocity. With shards, which
 
 examples:
   cflow flow data=av2 data.root=/data/av2/val output=outputs/val
-  cflow flow data=av2 data.root=/data/av2/val dry_run=true        frames, outputs, time, memory, disk
+  cflow flow data=av2 data.root=/data/av2/val dry_run=true        counts the frames
   cflow flow model=paper model.pixel_sizes=[0.2] engine.workers=8
   cflow flow shard.index=2 shard.count=16 ...                     one of 16 processes, on any machine
   cflow flow engine=ray engine.address=auto ...                   on a Ray cluster
@@ -43,11 +43,10 @@ from cflow_torch.data.atomic import ensure_writable, write_text
 from cflow_torch.data.flow_file import CONTENTS, ON_REQUEST, read_flow
 from cflow_torch.data.hdf5.results import check_result_name, check_writable, write_hdf5_results
 from cflow_torch.data.paths import as_path
-from cflow_torch.fleet.forecast import forecast
 from cflow_torch.fleet.job import Job, Shard, find_shard
 from cflow_torch.fleet.machine import choose_layout
 from cflow_torch.fleet.manifest import claim_folder, complete_frames, find_conflict, frame_file, make_identity
-from cflow_torch.fleet.report import format_missing, format_report
+from cflow_torch.fleet.report import forecast, format_missing, format_report
 from cflow_torch.fleet.run import report_file, run_fleet
 from cflow_torch.fleet.work import source_name
 from cflow_torch.types import CFlowError
@@ -117,7 +116,7 @@ def compute(
     )
     if cfg.dry_run:
         conflict = find_conflict(output, identity, cfg.resume or cfg.overwrite)
-        print(forecast(job, shard.units(sources.logs), layout))
+        print(forecast(job, shard.units(sources.logs)))
         if conflict is not None:
             print(f"{output} holds results of another run{conflict}; overwrite=true would replace them")
         return None

@@ -10,7 +10,7 @@ With shards, the process that finishes a scene's flow labels it. It ends with th
 
 examples:
   cflow label /data/scenes/train
-  cflow label /data/scenes/train dry_run=true                 frames, time, memory, disk
+  cflow label /data/scenes/train dry_run=true                 counts the frames
   cflow label /data/scenes/train model=fast                   four to seven times faster, finds less
   cflow label /data/scenes/train shard.index=2 shard.count=16
 """

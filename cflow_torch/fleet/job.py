@@ -1,24 +1,24 @@
-"""What is to be done: a run, the share of this process, its pieces; and what comes back."""
+"""A run, the share of this process, its pieces, and the events that workers report."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from typing import Any, Mapping, Sequence, Union
+from typing import Any, Mapping, NamedTuple, Sequence, Union
 
 from cflow_torch.config import Config
 from cflow_torch.data.flow_file import CONTENTS
 from cflow_torch.fleet.machine import AUTO
 from cflow_torch.types import CFlowError
 
-# Units per worker, so that the last one does not keep the others waiting long. A log is cut only if there are too few
-# logs: each piece reads h + 1 sweeps that its neighbour reads as well.
+# Units per worker, so that the last unit does not keep the other workers waiting for long. A log is divided only if
+# there are too few logs, because each piece reads h + 1 sweeps that its neighbour reads as well.
 _UNITS_PER_WORKER = 2
 
 
 @dataclass(frozen=True)
 class Job:
-    """One run. Everything a worker needs besides its units.
+    """What a worker needs to know besides its units.
 
     Args:
         config: settings of the method.
@@ -28,7 +28,7 @@ class Job:
         output: folder of the results; a path, or the address of an object store.
         contents: of a flow file, names of `flow_file.CONTENTS` and `ON_REQUEST`.
         batch: windows that are computed together.
-        redo: compute frames that are there already.
+        redo: compute frames that exist already.
     """
 
     config: Config
@@ -43,15 +43,15 @@ class Job:
 
 @dataclass(frozen=True)
 class Unit:
-    """A span of consecutive frames of one log: what one worker does at a time.
+    """Consecutive frames of one log, which one worker does at a time.
 
     Args:
-        number: position among the units of a run.
+        number: index among the units of a run.
         source: one of `catalog.find_sources`.
-        first: share of the log's pairs that lies before the span, 0 ... 1.
-        last: share that lies before its end.
-        only: time stamps of the frames of the span that are to be done; None = all of them.
-        deaths: workers that have died on it.
+        first: share of the log's pairs before the first frame, 0 ... 1.
+        last: share before the end.
+        only: time stamps of the frames to do; None = all of them.
+        deaths: number of workers that have died on it.
     """
 
     number: int
@@ -62,7 +62,7 @@ class Unit:
     deaths: int = 0
 
     def frames(self, num_pairs: int) -> range:
-        """Numbers of the sweeps t of the span, in a log of so many pairs."""
+        """Indices of the sweeps t, in a log of `num_pairs` pairs."""
         return range(int(self.first * num_pairs), int(self.last * num_pairs))
 
 
@@ -78,7 +78,7 @@ class Opened:
 
 @dataclass(frozen=True)
 class Done:
-    """A frame is on disk under its name. `seconds` by stage, of this frame's share of its batch."""
+    """A frame is on disk. `seconds` by stage are those of its batch, divided by the number of frames."""
 
     unit: int
     timestamp: int
@@ -87,7 +87,7 @@ class Done:
 
 @dataclass(frozen=True)
 class Failed:
-    """A frame that has no result and why; `timestamp` None: the whole unit."""
+    """A frame has no result; `timestamp` None: the whole unit has none."""
 
     unit: int
     name: str
@@ -98,8 +98,15 @@ class Failed:
 Event = Union[Opened, Done, Failed]
 
 
+class Step(NamedTuple):
+    """Events of a unit since the last call of its worker. `has_ended`: none will follow."""
+
+    events: list[Event]
+    has_ended: bool
+
+
 def split(units: Sequence[Unit], workers: int) -> list[Unit]:
-    """The same frames in enough units to keep all workers busy, numbered from 0."""
+    """Split units until there are enough of them for all workers, and number them from 0."""
     parts = -(-_UNITS_PER_WORKER * workers // max(1, len(units))) if workers > 1 else 1
     pieces = []
     for unit in units:
@@ -126,8 +133,8 @@ class Shard:
     def units(self, sources: Sequence[Any]) -> list[Unit]:
         """This shard's part of the logs.
 
-        The logs, one after the other, are one line that is cut into `count` pieces of equal length; so a shard opens
-        its own logs only, and shares at most its first and its last with a neighbour.
+        The sequence of all logs is divided into `count` parts of equal length. So a shard opens only its own logs, and
+        shares at most the first and the last of them with a neighbour.
         """
         begin, end = (Fraction(edge * len(sources), self.count) for edge in (self.index, self.index + 1))
         units: list[Unit] = []
@@ -144,29 +151,29 @@ def find_shard(index: Any, count: Any, environ: Mapping[str, str]) -> Shard:
     Args:
         index: from 0, or "auto".
         count: number of shards, or "auto".
-        environ: environment variables. "auto" is torchrun's RANK and WORLD_SIZE, else the task of an `srun` step, times
-            the task of a SLURM array, whichever there are; else the only shard.
+        environ: environment variables. "auto" takes RANK and WORLD_SIZE of torchrun, or the task of an `srun` step,
+            combined with the task of a SLURM array if there is one. Without any of them this is the only shard.
 
     Raises:
-        CFlowError: not numbers, out of range, an index without a count, a count that the environment contradicts.
+        CFlowError: not a number, out of range, an index without a count, or a count that the environment contradicts.
     """
     if index != AUTO and count == AUTO:
-        raise CFlowError(f"shard.index={index} of how many? give shard.count as well")
+        raise CFlowError(f"shard.index={index} is given without shard.count: give both")
     if index != AUTO:
         return Shard(_number("shard.index", index), _number("shard.count", count))
     found = _from_environment(environ)
     wanted = None if count == AUTO else _number("shard.count", count)
     if wanted not in (None, found.count if found else 1):
-        told = f"tells of {found.count} tasks" if found else "tells no number of tasks"
-        raise CFlowError(f"shard.count={wanted}, but the environment {told}: give shard.index as well")
+        tasks = f"{found.count} tasks" if found else "no number of tasks"
+        raise CFlowError(f"shard.count={wanted}, but the environment sets {tasks}: give shard.index as well")
     return found or Shard()
 
 
 def _from_environment(environ: Mapping[str, str]) -> Shard | None:
-    """What torchrun or SLURM gives this process; None if neither does.
+    """The shard that torchrun or SLURM gives this process; None if neither does.
 
-    A SLURM batch script is no task of its step: only `srun` sets SLURM_STEP_NUM_TASKS, so that `--ntasks=8` without
-    `srun` does not silently compute one eighth.
+    A SLURM batch script is not a task of a step: only `srun` sets SLURM_STEP_NUM_TASKS. Without `srun`, a script with
+    `--ntasks=8` must not compute one eighth.
     """
 
     def value(name: str, default: Any = None) -> int:

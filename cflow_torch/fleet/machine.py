@@ -1,4 +1,4 @@
-"""How many workers and devices this machine gives a run, and how large its batches are."""
+"""The number of workers, their devices, and the batch size on this machine."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from cflow_torch.types import CFlowError
 from cflow_torch.windows.memory import available_memory, control_groups
 
 AUTO = "auto"
-_MOST = 100_000  # workers or windows; more is a slip
-# Bytes that one worker may come to hold: nearly twice the most that `default` was seen to take, see docs/fleet.md.
+_MOST = 100_000  # workers or windows; more is a typing error
+# Bytes of one worker: nearly twice the most that we measured with `default`, see docs/fleet.md.
 WORKER_MEMORY = 1_500_000_000
-# Windows that are computed together. A CPU gains up to 4 (fewer small operations), then loses (cold memory). That for a
-# GPU is not measured.
+# Windows that are computed together. On a CPU up to 4 are faster (fewer small operations), more are slower (caches). We
+# have not measured the number for a GPU.
 CPU_BATCH, GPU_BATCH = 4, 32
 
 
@@ -35,17 +35,17 @@ class Layout:
 
 
 def choose_layout(device: str, workers: Any, batch: Any, environ: Mapping[str, str]) -> Layout:
-    """Fill in what is "auto".
+    """Replace "auto" by numbers and devices.
 
     Args:
         device: "auto", "cpu", "cuda" or "cuda:2".
-        workers: processes, or "auto": on a CPU one per core (as far as memory goes), on GPUs one per GPU.
+        workers: processes; "auto" = on a CPU one per core, as far as memory allows, on GPUs one per GPU.
         batch: windows, or "auto".
-        environ: LOCAL_RANK or SLURM_LOCALID choose the GPU where several processes share a machine;
-            LOCAL_WORLD_SIZE and SLURM_CPUS_PER_TASK bound the cores.
+        environ: environment variables. LOCAL_RANK or SLURM_LOCALID choose the GPU where several processes share a
+            machine; LOCAL_WORLD_SIZE and SLURM_CPUS_PER_TASK limit the cores.
 
     Raises:
-        CFlowError: not a whole number of at least 1; a GPU where there is none.
+        CFlowError: not a whole number of at least 1, or a GPU that does not exist.
     """
     gpus = _gpus(device, environ)
     if workers != AUTO:
@@ -61,7 +61,7 @@ def choose_layout(device: str, workers: Any, batch: Any, environ: Mapping[str, s
 
 
 def _gpus(device: str, environ: Mapping[str, str]) -> list[str]:
-    """The GPUs that this process may use; none for the CPU."""
+    """GPUs of this process; empty on a CPU."""
     name = str(device)
     if name == "cpu" or (name == AUTO and not torch.cuda.is_available()):
         return []
@@ -69,18 +69,18 @@ def _gpus(device: str, environ: Mapping[str, str]) -> list[str]:
         return [name]
     found = torch.cuda.device_count()
     if found == 0:
-        raise CFlowError(f"device={name}: this machine has no GPU that torch can use; give device=cpu or device=auto")
+        raise CFlowError(f"device={name}: torch finds no GPU on this machine; give device=cpu or device=auto")
     rank = environ.get("LOCAL_RANK", environ.get("SLURM_LOCALID"))
     return [f"cuda:{k}" for k in range(found)] if rank is None else [f"cuda:{int(rank) % found}"]
 
 
 def usable_cores(environ: Mapping[str, str]) -> int:
-    """Cores that this process may use: its affinity, its container's quota, its share of a SLURM or torchrun job."""
+    """Cores of this process: limited by its affinity, its container's quota, its share of a SLURM or torchrun job."""
     counts = [os.cpu_count() or 1]
     with suppress(AttributeError):  # not on every system
         counts.append(len(os.sched_getaffinity(0)))
     for group in control_groups():
-        with suppress(OSError, ValueError):  # "max" is no number
+        with suppress(OSError, ValueError):  # "max" is not a number
             quota, period = (group / "cpu.max").read_text().split()
             counts.append(int(quota) // int(period))
     with suppress(KeyError, ValueError):

@@ -1,8 +1,7 @@
-"""How far a run is: a bar on a terminal; elsewhere, in a log file say, a line now and then."""
+"""The progress of a run: a bar on a terminal; elsewhere, for example in a log file, a line now and then."""
 
 from __future__ import annotations
 
-import os
 import sys
 from contextlib import suppress
 from typing import Any, Iterable, Iterator, Sized
@@ -15,59 +14,51 @@ _LINE = "{desc}{n_fmt} of {total_fmt} frames, {rate_noinv_fmt}, {remaining} left
 
 
 class _Stderr:
-    """What is said may be lost: a terminal that was closed, a full disk, a `tee` that Ctrl-C ended."""
+    """Standard error that may be gone, such as a closed terminal: the run goes on, and the text is lost."""
 
     def write(self, text: str) -> None:
-        try:
+        with suppress(OSError):
             sys.stderr.write(text)
             sys.stderr.flush()
-        except OSError:
-            with suppress(OSError):
-                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())  # else the rest is tried at the end
 
     def flush(self) -> None:
-        """It is flushed."""
+        pass
 
     def __getattr__(self, name: str) -> Any:
         return getattr(sys.stderr, name)
 
 
 class _Lines(_Stderr):
-    """What a bar writes, a line each time."""
+    """Standard error that is not a terminal: each text of a bar is a line of its own."""
 
     def write(self, text: str) -> None:
         if text.strip():
             super().write(text.strip() + "\n")
 
 
-_STDERR = _Stderr()
-
-
 class Progress(tqdm):  # type: ignore[type-arg]
-    """Counts frames; a context manager, as every bar of tqdm.
+    """Counts frames and shows the count on stderr. It is a context manager, as every bar of tqdm.
 
     Args:
-        total: frames in all, None = not known yet; may be set later.
-        name: what is done to them, "" = nothing to say.
-
-    Convention: on stderr. Frames per second are those of the last while, not of the whole run.
+        total: number of frames; None = not known yet. It may be set later.
+        name: of the work, shown before the count; "" = none.
     """
 
     def __init__(self, total: int | None = None, name: str = "") -> None:
         settings = {"total": total, "unit": " frames", "smoothing": 0.05, "desc": f"{name}: " if name else ""}
         if sys.stderr.isatty():
-            super().__init__(file=_STDERR, bar_format=_BAR, **settings)
-        else:  # a short run says nothing
+            super().__init__(file=_Stderr(), bar_format=_BAR, **settings)
+        else:  # a short run prints nothing
             super().__init__(file=_Lines(), bar_format=_LINE, mininterval=EVERY, miniters=1, delay=EVERY, **settings)
 
 
 def log_line(text: str) -> None:
-    """A line on stderr, above the bar; the work goes on even if nobody hears it."""
-    tqdm.write(text, file=_STDERR)
+    """Print a line on stderr, above the bar."""
+    tqdm.write(text, file=_Stderr())
 
 
 def frames(items: Iterable[Any], name: str = "") -> Iterator[Any]:
-    """The items, a frame each, with progress."""
+    """Yield the items, a frame each, and show the progress."""
     with Progress(len(items) if isinstance(items, Sized) else None, name) as progress:
         for item in items:
             yield item

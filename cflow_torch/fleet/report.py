@@ -1,4 +1,4 @@
-"""What a run has done: counted from the events of its workers, then as a table and as JSON."""
+"""Counts of a run: what it would do, and what it has done, as a table and as JSON."""
 
 from __future__ import annotations
 
@@ -6,85 +6,98 @@ import platform
 from collections import Counter
 from typing import Any, Sequence
 
-from cflow_torch.fleet.job import Done, Event, Opened, Shard, Unit
+from cflow_torch.data.catalog import open_log
+from cflow_torch.data.paths import as_path
+from cflow_torch.fleet.job import Done, Event, Job, Opened, Shard, Unit
 from cflow_torch.fleet.machine import Layout
+from cflow_torch.fleet.manifest import complete_frames
+from cflow_torch.fleet.work import describe, source_name
 
 _SHOWN = 20  # failures that the table lists; JSON has them all
-_WAITING, _BEFORE, _COMPUTED, _FAILED = "waiting", "complete_before", "computed", "failed"  # states of a frame
+
+
+def forecast(job: Job, units: Sequence[Unit]) -> str:
+    """Count the frames that a run would compute: a table with a row per log.
+
+    Cost: opens all logs and lists the files in the output. Nothing is written.
+    """
+    lines = ["  frames    to do  log"]
+    total = left = 0
+    for unit in units:
+        try:
+            log = open_log(job.reader, unit.source, **{**job.settings, "check": False})
+            stamps = [int(log.timestamps[i]) for i in unit.frames(len(log.timestamps) - 1)]
+            complete = set() if job.redo else complete_frames(as_path(job.output) / log.log_id)
+        except Exception as error:
+            lines.append(f"{'?':>8} {'?':>8}  {source_name(unit.source)}: cannot be opened: {describe(error)}")
+            continue
+        todo = len(set(stamps) - complete)
+        total, left = total + len(stamps), left + todo
+        lines.append(f"{len(stamps):8} {todo:8}  {log.log_id}")
+    return "\n".join([*lines, f"{total:8} {left:8}  in total; dry run: nothing was written to {job.output}"])
 
 
 class Counters:
-    """Counts frames, each once, however often its unit was begun.
+    """Counts the frames of a run.
 
     Args:
-        units: what was asked for.
+        units: all units of the run.
     """
 
     def __init__(self, units: Sequence[Unit]) -> None:
         self.failures: list[tuple[str, str]] = []  # (frame or log, message)
-        self._log_ids: dict[int, str] = {}  # of units that were opened
-        self._states: dict[tuple[int, int], str] = {}  # (unit number, time stamp) -> state
+        self.num_opened = self.total = self.num_before = self.num_failed = 0  # units; frames
+        self._waiting: dict[tuple[int, int], str] = {}  # (unit number, time stamp) -> frame, neither on disk nor failed
         self._unopened = {unit.number for unit in units}
         self._seconds: Counter[str] = Counter()  # by stage, of all workers together
 
     @property
-    def total(self) -> int:
-        """Frames of the units that were opened."""
-        return len(self._states)
-
-    @property
-    def num_opened(self) -> int:
-        """Units that were begun."""
-        return len(self._log_ids)
-
-    @property
     def waiting(self) -> list[str]:
         """Frames of opened units that are neither on disk nor failed, in order."""
-        waiting = sorted(key for key, state in self._states.items() if state == _WAITING)
-        return [f"{self._log_ids[unit]}/{stamp}" for unit, stamp in waiting]
+        return [self._waiting[key] for key in sorted(self._waiting)]
 
     @property
     def is_complete(self) -> bool:
-        """Every frame is on disk."""
-        return not (self.failures or self._unopened or self.waiting)
+        """True if every frame is on disk."""
+        return not (self.failures or self._unopened or self._waiting)
 
     def add(self, event: Event) -> int:
-        """Count an event in; returns the number of frames that it settles (on disk, or failed)."""
-        unit, states = event.unit, {}
-        self._unopened.discard(unit)
+        """Count an event. Returns the number of frames that it settles: they are on disk, or have failed."""
+        self._unopened.discard(event.unit)
         if isinstance(event, Opened):
-            # A unit is opened again after its worker died: what is no longer to be done got its name before.
-            complete = _COMPUTED if unit in self._log_ids else _BEFORE
-            self._log_ids[unit] = event.log_id
-            states = {**dict.fromkeys(event.frames, complete), **dict.fromkeys(event.todo, _WAITING)}
-        elif isinstance(event, Done):
-            states = {event.timestamp: _COMPUTED}
+            num_before = len(event.frames) - len(event.todo)
+            self.num_opened += 1
+            self.total += len(event.frames)
+            self.num_before += num_before
+            self._waiting.update({(event.unit, stamp): f"{event.log_id}/{stamp}" for stamp in event.todo})
+            return num_before
+        if isinstance(event, Done):
             self._seconds.update(event.seconds)
         else:
             self.failures.append((event.name, event.message))
-            states = {} if event.timestamp is None else {event.timestamp: _FAILED}
-        unsettled = {stamp: s for stamp, s in states.items() if self._states.get((unit, stamp), _WAITING) == _WAITING}
-        self._states.update({(unit, stamp): state for stamp, state in unsettled.items()})
-        return sum(state != _WAITING for state in unsettled.values())
+            self.num_failed += event.timestamp is not None
+        if event.timestamp is None:
+            return 0
+        self._waiting.pop((event.unit, event.timestamp), None)
+        return 1
 
     def report(self, seconds: float, layout: Layout, shard: Shard, engine: str, signal_name: str) -> dict[str, Any]:
         """All figures of a run.
 
         Args:
             seconds: from the start of the engine to its end.
-            layout: what it ran on.
-            shard: which share of the work it was.
+            layout: workers and batch size.
+            shard: the share of the work.
             engine: "local" or "ray".
-            signal_name: what stopped it, "" if nothing did.
+            signal_name: of the signal that stopped the run, "" = none.
 
         Returns:
             "status": "complete", "incomplete" (something failed or is missing) or "interrupted"; "frames": "total",
-            "complete_before", "computed", "failed", "failed_logs" (or parts of logs), "waiting" (of begun logs) and
+            "complete_before", "computed", "failed", "failed_logs" (or parts of logs), "waiting" (of opened logs) and
             "unopened_units"; "frames_per_s" of those computed; "stages": seconds per computed frame, summed over the
             workers, that overlap in time; "failures", "waiting".
         """
-        counts = Counter(self._states.values())
-        computed, failed = counts[_COMPUTED], counts[_FAILED]
+        computed = self.total - self.num_before - self.num_failed - len(self._waiting)
         return {
             "status": "interrupted" if signal_name else "complete" if self.is_complete else "incomplete",
             "stopped_by": signal_name or None,
@@ -95,11 +108,11 @@ class Counters:
             "machine": platform.platform(),
             "frames": {
                 "total": self.total,
-                "complete_before": counts[_BEFORE],
+                "complete_before": self.num_before,
                 "computed": computed,
-                "failed": failed,
-                "failed_logs": len(self.failures) - failed,
-                "waiting": counts[_WAITING],
+                "failed": self.num_failed,
+                "failed_logs": len(self.failures) - self.num_failed,
+                "waiting": len(self._waiting),
                 "unopened_units": len(self._unopened),
             },
             "seconds": seconds,
@@ -111,7 +124,7 @@ class Counters:
 
 
 def format_report(report: dict[str, Any]) -> str:
-    """The table."""
+    """The report as a table."""
     frames, shard, devices = report["frames"], report["shard"], report["devices"]
     workers = f"workers: {len(devices)} on {', '.join(sorted(set(devices)))}"
     rows = [
@@ -137,9 +150,9 @@ def format_report(report: dict[str, Any]) -> str:
 
 
 def format_missing(report: dict[str, Any]) -> str:
-    """What is not there, a line each; "" if nothing is missing."""
-    lines: list[str] = list(dict.fromkeys(f"  {name}: {message}" for name, message in report["failures"]))  # of parts
-    lines += [f"  {name}: not done" for name in report["waiting"]]
+    """What is missing, a line each; "" if nothing is."""
+    failures = [f"  {name}: {message}" for name, message in report["failures"]]
+    lines = [*dict.fromkeys(failures), *(f"  {name}: not done" for name in report["waiting"])]  # parts of a log repeat
     if len(lines) > _SHOWN:
         lines[_SHOWN:] = [f"  and {len(lines) - _SHOWN} more, all of them in the report"]
     if report["frames"]["unopened_units"]:

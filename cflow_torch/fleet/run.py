@@ -1,4 +1,4 @@
-"""A whole run: starts the engine, counts, listens to signals, reports."""
+"""A whole run: start the engine, count its events, react to signals, write the report."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from typing import Any, Iterator, Sequence
 from cflow_torch.data.atomic import remove_stale
 from cflow_torch.data.json_file import write_json
 from cflow_torch.data.paths import as_path
-from cflow_torch.fleet.dispatch import SIGNALS
 from cflow_torch.fleet.job import Event, Failed, Job, Shard, split
 from cflow_torch.fleet.local import run_local
 from cflow_torch.fleet.machine import Layout
+from cflow_torch.fleet.processes import SIGNALS
 from cflow_torch.fleet.progress import Progress, log_line
 from cflow_torch.fleet.ray_engine import run_ray
 from cflow_torch.fleet.report import Counters
@@ -30,10 +30,10 @@ def run_fleet(
     layout: Layout,
     shard: Shard,
     engine: str = "local",
-    about: dict[str, Any] = {},  # noqa: B006 (read only)
+    about: dict[str, Any] | None = None,
     **engine_settings: Any,
 ) -> dict[str, Any]:
-    """Compute what is not complete yet, and report.
+    """Compute the frames that are not complete, and write a report.
 
     Args:
         job: the run; its folder is claimed already (`manifest.claim_folder`).
@@ -41,13 +41,13 @@ def run_fleet(
         layout: workers of this machine.
         shard: which share of the logs to do.
         engine: "local" or "ray".
-        about: more to keep in the report.
+        about: more entries of the report.
         **engine_settings: of the engine.
 
     Returns:
-        As `Counters.report`, which is also in OUTPUT/reports/<shard>.json. "exit_status" is 0 if every frame of the
-        shard is on disk, 1 if not or if the report could not be written, 130, 143 or 129 if Ctrl-C, SIGTERM or SIGHUP
-        came first.
+        The report of `Counters.report`, which is also in OUTPUT/reports/<shard>.json. "exit_status" is 0 if every frame
+        of the shard is on disk, 1 if not or if the report could not be written, 130, 143 or 129 if Ctrl-C, SIGTERM or
+        SIGHUP came first.
     """
     if engine not in ENGINES:
         raise CFlowError(f"engine={engine!r}: give one of {', '.join(ENGINES)}")
@@ -65,7 +65,7 @@ def run_fleet(
             log_line(f"ended early: {error}")
         ended_by = 0 if counters.is_complete else stop.received or 0
         name = signal.Signals(ended_by).name if ended_by else ""
-        report = {**counters.report(time.perf_counter() - start, layout, shard, engine, name), **about}
+        report = {**counters.report(time.perf_counter() - start, layout, shard, engine, name), **(about or {})}
         report["exit_status"] = 128 + ended_by if ended_by else 0 if counters.is_complete else 1
         try:
             file = report_file(job.output, shard)
@@ -78,12 +78,12 @@ def run_fleet(
 
 
 def report_file(output: str, shard: Shard) -> Any:
-    """Where a shard's report lies."""
+    """The path of a shard's report."""
     return as_path(output) / "reports" / f"shard-{shard.index}-of-{shard.count}.json"
 
 
 def _follow(events: Iterator[Event], counters: Counters, num_units: int) -> None:
-    """Count events in, and show how far it is: the total grows as logs are opened."""
+    """Count the events and show the progress. The total is an estimate until all logs are open."""
     with Progress() as progress:
         for event in events:
             settled = counters.add(event)
@@ -96,10 +96,10 @@ def _follow(events: Iterator[Event], counters: Counters, num_units: int) -> None
 
 
 class StopSignal:
-    """While it is open, the first of `SIGNALS` only sets `received`; the second raises KeyboardInterrupt.
+    """A context in which the first of `SIGNALS` only sets `received`, and the second one raises KeyboardInterrupt.
 
-    Schedulers send SIGTERM some seconds before they kill (preemption, time limit). Outside the main thread, where
-    Python cannot catch signals, it does nothing.
+    Schedulers send SIGTERM some seconds before they kill (preemption, time limit). Python handles signals in the main
+    thread only; in other threads this does nothing.
     """
 
     def __init__(self) -> None:
@@ -109,7 +109,7 @@ class StopSignal:
     def __enter__(self) -> StopSignal:
         if threading.current_thread() is threading.main_thread():
             for number in SIGNALS:
-                if number == signal.SIGINT or signal.getsignal(number) is not signal.SIG_IGN:  # nohup stays nohup
+                if number == signal.SIGINT or signal.getsignal(number) is not signal.SIG_IGN:  # nohup ignores SIGHUP
                     self._before[number] = signal.signal(number, self._receive)
         return self
 
@@ -118,7 +118,7 @@ class StopSignal:
             signal.signal(number, handler)
 
     def __call__(self) -> bool:
-        """Whether to stop."""
+        """True if a signal has come."""
         return self.received is not None
 
     def _receive(self, number: int, _: Any) -> None:
@@ -126,6 +126,5 @@ class StopSignal:
             raise KeyboardInterrupt
         self.received = number
         name = signal.Signals(number).name
-        # Not print: the signal may have come in the middle of one. Nobody may read it any more (`| head`).
-        with suppress(OSError):
-            os.write(2, f"\n{name}: finishing the frames in hand; once more to end at once\n".encode())
+        with suppress(OSError):  # `print` is not safe here: the signal may interrupt another one
+            os.write(2, f"\n{name}: finishing the frames in hand; repeat the signal to end at once\n".encode())

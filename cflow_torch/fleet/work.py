@@ -1,7 +1,8 @@
-"""One worker: reads, computes and writes the frames of a unit, the three at the same time."""
+"""A worker: it reads, computes and writes the frames of a unit, all three at the same time."""
 
 from __future__ import annotations
 
+import os
 import time
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -10,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Callable, Iterator, Sequence
 
+import pyarrow
 import torch
 
 from cflow_torch.data.atomic import remove_stale
@@ -20,17 +22,19 @@ from cflow_torch.data.log_check import check_log
 from cflow_torch.data.names import safe_name
 from cflow_torch.data.paths import as_path
 from cflow_torch.estimate import make_model
-from cflow_torch.fleet.job import Done, Event, Failed, Job, Opened, Unit
+from cflow_torch.fleet.job import Done, Event, Failed, Job, Opened, Step, Unit
 from cflow_torch.fleet.manifest import claim_log, complete_frames, frame_file
+from cflow_torch.fleet.progress import log_line
 from cflow_torch.stages import FlowModel, stage_seconds
 from cflow_torch.types import CFlowError, FlowResult, Window
 
-# Batches that are read ahead, and that wait to be written: enough to even out, little enough for flat memory.
-_AHEAD = 2
+_AHEAD = 2  # batches that are read ahead, and that wait to be written
+_REPORT_EVERY_S = 0.5  # a call of a worker process and its answer take a millisecond or two
+_LOST_DEVICE = 70  # exit status
 
 
 class DeviceLost(CFlowError):
-    """The GPU cannot be used any more by this process."""
+    """This process can no longer use the GPU."""
 
 
 @dataclass
@@ -43,39 +47,40 @@ class _Frame:
 
 
 class Worker:
-    """Holds the method and the log in hand.
+    """Computes units with one method and keeps the log of the last one open.
 
     Args:
         job: the run.
         device: where to compute.
-        model: stands in for the method (tests).
+        model: the method; None = that of the job.
 
     Raises:
-        CFlowError: there is no such device, or it cannot be used.
+        CFlowError: the device does not exist or cannot be used.
     """
 
     def __init__(self, job: Job, device: str, model: FlowModel | None = None) -> None:
         try:
-            torch.zeros(1, device=device)  # now, rather than frame by frame
+            torch.zeros(1, device=device)  # fails now, not at every frame
         except (RuntimeError, AssertionError) as error:
-            raise CFlowError(f"no worker can begin on {device}: {describe(error)}") from error
+            raise CFlowError(f"no worker can start on {device}: {describe(error)}") from error
         self._job, self._device, self._ahead = job, device, _AHEAD
         self._model: FlowModel = make_model(job.config, device) if model is None else model
-        self._log: tuple[Any, Log | None] = (None, None)
+        self._source: Any = None
+        self._log: Any = None
         self._reader, self._writer = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
 
     def run(self, unit: Unit, stop: Callable[[], bool] = lambda: False) -> Iterator[Event]:
-        """Do a unit's frames that are not complete.
+        """Do those frames of a unit that are not complete.
 
         Args:
             unit: what to do.
-            stop: asked before each batch; from True on, what is computed is written and nothing new is begun.
+            stop: called before each batch. Once it returns True, computed frames are written and no others begin.
 
         Yields:
-            What happens: `Opened` once, then `Done` and `Failed`, in the order of the log.
+            `Opened` once, then `Done` and `Failed` in the order of the log.
 
         Raises:
-            DeviceLost: the GPU cannot be used any more.
+            DeviceLost: the GPU can no longer be used.
         """
         try:
             log = self._open(unit.source)
@@ -93,7 +98,7 @@ class Worker:
             return
         yield Opened(unit.number, log.log_id, tuple(stamps.values()), tuple(todo.values()))
         if todo and self._job.settings.get("check", True) and unit.first == 0:
-            with suppress(Exception):  # a sweep that cannot be read is reported when its turn comes
+            with suppress(Exception):  # the frames of a sweep that cannot be read will fail
                 check_log(log)
         for frame in self._pass(log, folder, list(todo), stop):
             if isinstance(frame.content, Exception):
@@ -103,25 +108,25 @@ class Worker:
                 yield Done(unit.number, frame.timestamp, frame.seconds)
 
     def close(self) -> None:
-        """Let go of the log in hand. Calls that hang in a file system are not waited for."""
+        """Close the log. Reads and writes that hang are not waited for."""
         self._reader.shutdown(wait=False)
         self._writer.shutdown(wait=False)
         self._close_log()
 
     def _close_log(self) -> None:
-        log, self._log = self._log[1], (None, None)
+        log, self._log = self._log, None
         if log is not None:
             log.close()
 
     def _open(self, source: Any) -> Log:
-        if self._log[1] is None or self._log[0] != source:
+        if self._log is None or self._source != source:
             self._close_log()
             log = open_log(self._job.reader, source, **{**self._job.settings, "check": False})
-            self._log = (source, CachedLog(log, self._job.config.num_sweeps))
-        return self._log[1]  # type: ignore[return-value]
+            self._source, self._log = source, CachedLog(log, self._job.config.num_sweeps)
+        return self._log  # type: ignore[no-any-return]
 
     def _pass(self, log: Log, folder: Path, todo: Sequence[int], stop: Callable[[], bool]) -> Iterator[_Frame]:
-        """Frames through the reading thread, this thread and the writing thread."""
+        """Pass frames through the reading thread, this thread and the writing thread."""
         size = self._job.batch
         batches = iter([todo[i : i + size] for i in range(0, len(todo), size)])
         reading: deque[Future[list[_Frame]]] = deque()
@@ -138,7 +143,7 @@ class Worker:
                 writing.extend(self._writer.submit(self._write, folder, frame) for frame in frames)
             elif not writing:
                 break
-            # Only so many results are held; at the end, or to stop, all are waited for.
+            # This bounds the results in memory. At the end, and after a stop, all of them are waited for.
             most = self._ahead * size if reading and not stop() else 0
             while writing and (len(writing) > most or writing[0].done()):
                 yield writing.popleft().result()
@@ -153,7 +158,7 @@ class Worker:
         return frame
 
     def _compute(self, frames: list[_Frame]) -> None:
-        """Windows to results, together; if that fails, each by itself, so that one bad frame spoils no other."""
+        """Turn windows into results, as a batch. If that fails, compute them one by one, so that only bad ones fail."""
         good = [frame for frame in frames if isinstance(frame.content, Window)]
         if not good:
             return
@@ -166,7 +171,7 @@ class Worker:
                 good[0].content = error.with_traceback(None)
                 self._check_device()
         if results is None:
-            # Only here, where the error is forgotten: its traceback holds all that the batch had in the GPU's memory.
+            # Only now, after the except block: until then the traceback keeps the memory of the batch on the GPU.
             for frame in good if len(good) > 1 else []:
                 self._compute([frame])
             return
@@ -176,11 +181,11 @@ class Worker:
             frame.seconds.update({name: value / len(good) for name, value in seconds.items()})
 
     def _check_device(self) -> None:
-        """After an error of a kernel, CUDA refuses all that follows in the same process: only a new one can go on."""
+        """Find out if CUDA still works: after an error inside a kernel it refuses all later work of the process."""
         try:
             torch.zeros(1, device=self._device).item()
         except RuntimeError as error:
-            raise DeviceLost(f"{self._device} cannot be used any more: {describe(error)}") from error
+            raise DeviceLost(f"{self._device} can no longer be used: {describe(error)}") from error
 
     def _write(self, folder: Path, frame: _Frame) -> _Frame:
         if isinstance(frame.content, FlowResult):
@@ -191,9 +196,54 @@ class Worker:
         return frame
 
 
+class WorkerProcess(Worker):
+    """A worker that has a process of its own and does some frames at each call of its parent.
+
+    Args:
+        job: the run.
+        device: where to compute. On a CPU the process computes on one thread: other workers use the other cores.
+
+    Raises:
+        CFlowError: the device does not exist or cannot be used.
+    """
+
+    def __init__(self, job: Job, device: str) -> None:
+        if device == "cpu":
+            torch.set_num_threads(1)
+            pyarrow.set_cpu_count(1)
+        super().__init__(job, device)
+        self._events: Iterator[Event] | None = None  # of the current unit
+        self._stops = False
+
+    def step(self, unit: Unit, stop: bool) -> Step:
+        """Begin a unit, or continue it for a while.
+
+        Args:
+            unit: the same at each call until the unit has ended.
+            stop: finish the frames in hand and begin no others.
+        """
+        self._stops = stop
+        running, self._events = self._events or self.run(unit, lambda: self._stops), None
+        events: list[Event] = []
+        until = time.monotonic() + _REPORT_EVERY_S
+        try:
+            for event in running:
+                events.append(event)
+                # The parent must know the frames of a unit before one of them can kill this process.
+                if isinstance(event, Opened) or time.monotonic() > until:
+                    self._events = running
+                    return Step(events, has_ended=False)
+        except DeviceLost as error:  # a new process can use the GPU again
+            log_line(f"a worker ends: {error}")
+            os._exit(_LOST_DEVICE)
+        except Exception as error:
+            events.append(Failed(unit.number, source_name(unit.source), describe(error)))
+        return Step(events, has_ended=True)
+
+
 @contextmanager
 def _stage(frame: _Frame, name: str) -> Iterator[None]:
-    """Times a block as a stage of a frame; what it raises becomes the frame's content."""
+    """Time a block as a stage of a frame. An error in the block becomes the frame's content."""
     start = time.perf_counter()
     try:
         yield
@@ -203,11 +253,11 @@ def _stage(frame: _Frame, name: str) -> Iterator[None]:
 
 
 def describe(error: BaseException) -> str:
-    """An error in one line; those that are not the package's own or the system's, with their kind."""
+    """An error in one line. The kind is named if it is neither the package's own nor the system's."""
     text = " ".join(str(error).split()) or "no message"
     return text if isinstance(error, (CFlowError, OSError)) else f"{type(error).__name__}: {text}"
 
 
 def source_name(source: Any) -> str:
-    """What messages call a log that could not be opened."""
+    """The name of a log that is not open."""
     return str(getattr(source, "scene", None) or getattr(source, "stem", None) or source)

@@ -16,7 +16,7 @@ from cflow_torch.data.av2 import AV2Log
 from cflow_torch.fleet import local, work
 
 DEADLY = "CFLOW_TEST_DEADLY"  # folder of files log.time stamp, each of which holds a name of `WAYS` and how often
-REAL_BEGIN = local._begin
+REAL_MAKE = local._make_worker
 LIMIT = 12e9  # bytes, of a worker's address space
 
 WAYS: dict[str, Callable[[], Any]] = {
@@ -28,9 +28,9 @@ WAYS: dict[str, Callable[[], Any]] = {
 }
 
 
-def deadly_begin(*arguments: Any) -> None:
+def deadly_make(*arguments: Any) -> Any:
     """A worker process that dies when it reads a frame of `DEADLY`."""
-    REAL_BEGIN(*arguments)
+    step = REAL_MAKE(*arguments)
     read = work.window
 
     def deadly_read(log: Any, index: int, *num_sweeps: int) -> Any:
@@ -43,6 +43,7 @@ def deadly_begin(*arguments: Any) -> None:
         return read(log, index, *num_sweeps)
 
     work.window = deadly_read
+    return step
 
 
 @pytest.fixture
@@ -51,7 +52,7 @@ def deadly(fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Call
     folder = tmp_path / "deadly"
     folder.mkdir()
     monkeypatch.setenv(DEADLY, str(folder))
-    monkeypatch.setattr(local, "_begin", deadly_begin)
+    monkeypatch.setattr(local, "_make_worker", deadly_make)
 
     def mark(number: int, index: int, way: str, count: int) -> str:
         log = AV2Log(sorted(fleet.iterdir())[number])

@@ -41,8 +41,8 @@ class LethalActor:
         self._folder = Path(job.output).parent / "kills"
         self._actor = ray_engine._Actor(folder, job, *more)  # in the worker process, where it is the real one
 
-    def begin(self) -> None:
-        self._actor.begin()
+    def start(self) -> None:
+        self._actor.start()
         read = self._actor._process._read_one
 
         def lethal_read(log: Any, index: int) -> Any:
@@ -92,7 +92,7 @@ def test_a_killed_worker_is_replaced_and_a_frame_that_always_kills_is_reported(
     assert tree(tmp_path / "out") == {file: c for file, c in single.items() if file != f"{name}.feather"}
 
 
-def begin(layout: Layout, **settings: Any) -> None:
+def start(layout: Layout, **settings: Any) -> None:
     next(run_ray(make_job(Path("nowhere")), [Unit(0, "nothing")], layout, lambda: False, **settings))
 
 
@@ -105,12 +105,12 @@ def begin(layout: Layout, **settings: Any) -> None:
 )
 def test_bad_settings(layout: Layout, settings: dict[str, Any], message: str) -> None:
     with pytest.raises(CFlowError, match=message):
-        begin(layout, **settings)
+        start(layout, **settings)
 
 
 @pytest.mark.slow
 def test_a_cluster_without_room_and_a_node_that_does_not_see_the_output() -> None:
     with pytest.raises(CFlowError, match="no node of the Ray cluster has room for a worker of 0 CPU, 3 GPU"):
-        begin(Layout(("cuda:0",), 1), num_gpus=3)
-    with pytest.raises(CFlowError, match="does not see .*nowhere: the output must be reachable everywhere"):
-        begin(TWO)
+        start(Layout(("cuda:0",), 1), num_gpus=3)
+    with pytest.raises(CFlowError, match="does not see .*nowhere: all nodes must reach the output"):
+        start(TWO)
