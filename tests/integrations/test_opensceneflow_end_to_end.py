@@ -118,7 +118,8 @@ def harness(tmp_path_factory: pytest.TempPathFactory) -> Harness:
     root = Path(os.environ.get("OPENSCENEFLOW") or ROOT.parent / "shared" / "opensceneflow")
     if not (root / "eval.py").is_file():
         pytest.skip(f"no checkout of OpenSceneFlow at {root}; set OPENSCENEFLOW to its folder")
-    if "OPENSCENEFLOW_PYTHON" not in os.environ and importlib.util.find_spec("lightning") is None:
+    packages = ("av2", "lightning")
+    if "OPENSCENEFLOW_PYTHON" not in os.environ and not all(map(importlib.util.find_spec, packages)):
         pytest.skip("OpenSceneFlow's packages are missing: pip install --no-deps -r scripts/evaluators.txt")
     return Harness(root, tmp_path_factory.mktemp("runs"))
 
