@@ -33,7 +33,6 @@ from cflow_torch.evaluation.submission.formats import Rounding, SubmissionVersio
 from cflow_torch.evaluation.submission.frames import (
     Frame,
     MaskArchive,
-    PlannedFrame,
     log_mask,
     plan_log,
     point_mask,
@@ -45,7 +44,7 @@ from cflow_torch.fleet.progress import frames as counted
 from cflow_torch.stages import TimedModel
 from cflow_torch.types import CFlowError, Window
 
-Plan = List[Tuple[PlannedFrame, Frame]]
+Plan = List[Tuple[Frame, int]]  # with the number of rows
 _Masks = Optional[MaskArchive]
 _Listed = Optional[Mapping[str, Sequence[int]]]
 _SETTINGS = ("version", "model", "data", "frames", "masks")  # a file depends on these only
@@ -73,7 +72,7 @@ def task(cfg: DictConfig) -> None:
     failures += _write(cfg, plan, model, version, masks, folder)
     run.finish(failures)
     _check(folder, version, plan)
-    pack(folder, [frame.name for _, frame in plan], file)
+    pack(folder, [frame.name for frame, _ in plan], file)
     try:
         _check(file, version, plan)
     except SystemExit:  # the archive stays only if it passes
@@ -106,7 +105,7 @@ def _plan(logs: Sequence[Log], version: SubmissionVersion, listed: _Listed, mask
     failures: Failures = []
     for frame in counted(frames, "rows"):
         with run.collect_failures(failures, frame.name):
-            plan.append((frame, frame.expect(version, masks)))
+            plan.append((frame, frame.count_rows(version, masks)))
     return plan, failures
 
 
@@ -116,15 +115,15 @@ def _write(
     """Estimate and write the frames that do not exist yet."""
     failures: Failures = []
     rounding, config = Rounding(), model.config
-    todo = [pair for pair in plan if not is_complete(folder, pair[1], version)]
+    todo = [frame for frame, rows in plan if not is_complete(folder, frame.name, rows, version)]
 
-    def read(pair: tuple[PlannedFrame, Frame]) -> Window:
-        return window(pair[0].log, pair[0].index, config.num_history, config.num_future)
+    def read(frame: Frame) -> Window:
+        return window(frame.log, frame.index, config.num_history, config.num_future)
 
-    for (planned, frame), estimate in estimates(model, todo, read):
+    for frame, estimate in estimates(model, todo, read):
         with run.collect_failures(failures, frame.name):
             sweeps, result = estimate()
-            mask = point_mask(planned.log, planned.index, sweeps.pc0, masks) if version.is_masked else None
+            mask = point_mask(frame.log, frame.index, sweeps.pc0, masks) if version.is_masked else None
             columns, lost = encode(version, result, sweeps.pc0.is_ground, mask)
             write_frame(folder, frame.name, columns)
             rounding.add(lost)
@@ -136,12 +135,12 @@ def _write(
 
 def _check(path: Any, version: SubmissionVersion, plan: Plan) -> None:
     """Print what was checked. If there are problems, list them all and exit with status 1."""
-    problems = check_submission(path, version, [frame for _, frame in plan])
+    problems = check_submission(path, version, {frame.name: rows for frame, rows in plan})
     if problems:
         print(f"{path} is not a valid version {version.number} submission for this data:", file=sys.stderr)
         for problem in problems:
             print(f"  {problem}", file=sys.stderr)
         print(f"problems: {len(problems)}", file=sys.stderr)
         raise SystemExit(1)
-    rows = sum(frame.rows for _, frame in plan)
+    rows = sum(rows for _, rows in plan)
     print(f"{path}: passes as version {version.number}, frames: {len(plan)}, rows: {rows:,}")

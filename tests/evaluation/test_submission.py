@@ -52,18 +52,18 @@ def estimated(log: AV2Log) -> dict[int, Any]:
 
 @pytest.fixture(scope="module")
 def archives(log: AV2Log, estimated: dict[int, Any], tmp_path_factory: pytest.TempPathFactory) -> dict[int, Any]:
-    """Version -> folder, zip, expected frames."""
+    """Version -> folder, zip, expected files with their rows."""
     result = {}
     for number in (1, 3):
         version, folder = get_version(number), tmp_path_factory.mktemp(f"v{number}") / "files"
-        frames = []
-        for planned in plan_log(log):
-            sweeps, flow = estimated[planned.index]
-            mask = point_mask(log, planned.index, sweeps.pc0) if version.is_masked else None
-            write_frame(folder, planned.name, encode(version, flow, sweeps.pc0.is_ground, mask)[0])
-            frames.append(planned.expect(version))
-        pack(folder, [frame.name for frame in frames], folder.parent / "a.zip")
-        result[number] = (folder, folder.parent / "a.zip", frames)
+        expected = {}
+        for frame in plan_log(log):
+            sweeps, flow = estimated[frame.index]
+            mask = point_mask(log, frame.index, sweeps.pc0) if version.is_masked else None
+            write_frame(folder, frame.name, encode(version, flow, sweeps.pc0.is_ground, mask)[0])
+            expected[frame.name] = frame.count_rows(version)
+        pack(folder, expected, folder.parent / "a.zip")
+        result[number] = (folder, folder.parent / "a.zip", expected)
     return result
 
 
@@ -118,13 +118,14 @@ def test_unsuitable_masks_values_and_versions_are_refused(estimated: dict[int, A
 
 
 def test_the_same_files_make_the_same_zip(archives: dict[int, Any], tmp_path: Path) -> None:
-    folder, good, frames = archives[1]
+    folder, good, expected = archives[1]
     shutil.copytree(folder, tmp_path / "copy")
-    pack(tmp_path / "copy", [frame.name for frame in reversed(frames)], tmp_path / "again.zip")
+    pack(tmp_path / "copy", reversed(list(expected)), tmp_path / "again.zip")
     assert (tmp_path / "again.zip").read_bytes() == good.read_bytes()
-    (tmp_path / "copy" / frames[0].name).unlink()
-    with pytest.raises(OSError, match=frames[0].name):
-        pack(tmp_path / "copy", [frame.name for frame in frames], tmp_path / "never.zip")
+    first = min(expected)
+    (tmp_path / "copy" / first).unlink()
+    with pytest.raises(OSError, match=first):
+        pack(tmp_path / "copy", expected, tmp_path / "never.zip")
     assert not (tmp_path / "never.zip").exists()
 
 
@@ -175,33 +176,33 @@ def rezip(files: Files, file: Path) -> Path:
 @pytest.mark.parametrize("kind", SPOILED)
 def test_a_damaged_file_is_one_line_with_its_name(kind: str, archives: dict[int, Any], tmp_path: Path) -> None:
     number, spoil, words = SPOILED[kind]
-    _, good, frames = archives[number]
-    files = unzip(good)
-    files[frames[1].name] = spoil(files[frames[1].name])
-    (problem,) = check_submission(rezip(files, tmp_path / "a.zip"), get_version(number), frames)
-    assert problem.startswith(f"{frames[1].name}: ") and words in problem and "\n" not in problem
+    _, good, expected = archives[number]
+    files, name = unzip(good), max(expected)
+    files[name] = spoil(files[name])
+    (problem,) = check_submission(rezip(files, tmp_path / "a.zip"), get_version(number), expected)
+    assert problem.startswith(f"{name}: ") and words in problem and "\n" not in problem
 
 
 def test_every_problem_of_an_archive_is_listed(archives: dict[int, Any], tmp_path: Path) -> None:
-    _, good, frames = archives[3]
-    files = {**unzip(good), "notes.txt": b""}
-    del files[frames[0].name]
-    foreign, missing = check_submission(rezip(files, tmp_path / "a.zip"), get_version(3), frames)
-    assert "notes.txt" in foreign and missing == f"{frames[0].name}: missing"
+    _, good, expected = archives[3]
+    files, name = {**unzip(good), "notes.txt": b""}, min(expected)
+    del files[name]
+    foreign, missing = check_submission(rezip(files, tmp_path / "a.zip"), get_version(3), expected)
+    assert "notes.txt" in foreign and missing == f"{name}: missing"
 
 
 def test_damaged_zips_are_one_problem(archives: dict[int, Any], tmp_path: Path) -> None:
-    _, good, frames = archives[3]
+    _, good, expected = archives[3]
     whole = good.read_bytes()
     (tmp_path / "half.zip").write_bytes(whole[: len(whole) // 2])
     for name, words in (("half.zip", "zip"), ("missing.zip", "does not exist")):
-        (problem,) = check_submission(tmp_path / name, get_version(3), frames)
+        (problem,) = check_submission(tmp_path / name, get_version(3), expected)
         assert name in problem and words in problem
     damaged = bytearray(whole)
     damaged[200:260] = bytes(60)  # inside the first entry's data
     (tmp_path / "damaged.zip").write_bytes(damaged)
-    (problem,) = check_submission(tmp_path / "damaged.zip", get_version(3), frames)
-    assert problem.startswith(frames[0].name) and "cannot be read" in problem
+    (problem,) = check_submission(tmp_path / "damaged.zip", get_version(3), expected)
+    assert problem.startswith(min(expected)) and "cannot be read" in problem
 
 
 # ---- which frames, which points
@@ -212,7 +213,7 @@ def test_frames_go_by_the_masks_of_the_scene(tmp_path: Path) -> None:
         plan = plan_log(log)
         assert [frame.name for frame in plan] == [f"scene/{log.timestamps[i]}.feather" for i in (2, 3)], "7 is the last"
         for number, rows in ((1, log.eval_mask(2).sum()), (3, 52)):
-            assert plan[0].expect(get_version(number)).rows == rows
+            assert plan[0].count_rows(get_version(number)) == rows
     with HDF5Log(write_scene(tmp_path / "plain.h5", range(8), 1, [])) as log:
         assert [frame.index for frame in plan_log(log)] == [0, 5]
         for stamp in (log.timestamps[-1], 17):
@@ -250,7 +251,7 @@ def test_official_masks_take_precedence(log: AV2Log, tmp_path: Path) -> None:
     masks = MaskArchive(write_masks(tmp_path / "masks.zip", log.log_id, stamp, mask))
     assert masks.frames == {log.log_id: [stamp]}
     (planned,) = plan_log(log, masks.frames)
-    assert planned.index == 3 and planned.expect(get_version(1), masks).rows == mask.sum()
+    assert planned.index == 3 and planned.count_rows(get_version(1), masks) == mask.sum()
     np.testing.assert_array_equal(point_mask(log, 3, sweep, masks), mask)
     short = MaskArchive(write_masks(tmp_path / "short.zip", log.log_id, stamp, mask[1:]))
     numbers = MaskArchive(write_masks(tmp_path / "numbers.zip", log.log_id, stamp, mask.astype(np.int8)))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import zipfile
 from functools import partial
 from pathlib import Path
-from typing import Any, Callable, Iterable, Mapping, Sequence
+from typing import Any, Callable, Iterable, Mapping
 
 import numpy as np
 import pyarrow as pa
@@ -17,7 +17,6 @@ from cflow_torch.data.files import file_errors, shortened
 from cflow_torch.data.names import safe_name
 from cflow_torch.data.paths import read_bytes
 from cflow_torch.evaluation.submission.formats import SubmissionVersion
-from cflow_torch.evaluation.submission.frames import Frame
 from cflow_torch.types import CFlowError
 
 _EARLIEST = (1980, 1, 1, 0, 0, 0)  # the first time that a zip can store
@@ -42,9 +41,9 @@ def write_frame(folder: str | Path, name: str, columns: Mapping[str, np.ndarray]
         feather.write_feather(table, stream)
 
 
-def is_complete(folder: str | Path, frame: Frame, version: SubmissionVersion) -> bool:
-    """Check that the file of a frame exists already and passes every check."""
-    return not _check_file(frame, partial(read_bytes, Path(folder) / frame.name), version)
+def is_complete(folder: str | Path, name: str, rows: int, version: SubmissionVersion) -> bool:
+    """Check that the file of a frame exists already, has this number of rows, and passes every other check."""
+    return not _check_file(name, partial(read_bytes, Path(folder) / name), rows, version)
 
 
 def pack(folder: str | Path, names: Iterable[str], file: str | Path) -> None:
@@ -69,14 +68,14 @@ def pack(folder: str | Path, names: Iterable[str], file: str | Path) -> None:
             archive.writestr(entry, (Path(folder) / name).read_bytes())
 
 
-def check_submission(path: str | Path, version: SubmissionVersion, expected: Sequence[Frame]) -> list[str]:
+def check_submission(path: str | Path, version: SubmissionVersion, expected: Mapping[str, int]) -> list[str]:
     """Compare an archive with what it must contain. Nothing is extracted.
 
     Args:
         path: a zip, or the folder that it is made from. Hidden files of a folder are skipped: an interrupted writer
             leaves some, and `pack` takes none.
         version: the format.
-        expected: every frame that the archive must contain, and no other.
+        expected: name -> number of rows of every file that the archive must contain. It may contain no other.
 
     Returns:
         All problems, one line each, with the name of the file and what is wrong; empty if there are none.
@@ -88,10 +87,9 @@ def check_submission(path: str | Path, version: SubmissionVersion, expected: Seq
         files = _open_archive(Path(path))
     except CFlowError as error:
         return [str(error)]
-    frames = {frame.name: frame for frame in expected}
-    problems = [f"{name!r}: does not belong in this archive" for name in sorted(set(files) - set(frames))]
-    for name, frame in sorted(frames.items()):
-        problems += _check_file(frame, files[name], version) if name in files else [f"{name}: missing"]
+    problems = [f"{name!r}: does not belong in this archive" for name in sorted(set(files) - set(expected))]
+    for name, rows in sorted(expected.items()):
+        problems += _check_file(name, files[name], rows, version) if name in files else [f"{name}: missing"]
     return problems
 
 
@@ -111,14 +109,14 @@ def _open_archive(path: Path) -> dict[str, Callable[[], bytes]]:
     return {name: partial(archive.read, name) for name in archive.namelist() if not name.endswith("/")}
 
 
-def _check_file(frame: Frame, read: Callable[[], bytes], version: SubmissionVersion) -> list[str]:
+def _check_file(name: str, read: Callable[[], bytes], rows: int, version: SubmissionVersion) -> list[str]:
     """All problems of the file of one frame, one line each."""
     try:
-        with file_errors(frame.name):  # a damaged zip makes zipfile raise nearly anything
-            problems = _check_table(FeatherFile(frame.name, read()), frame.rows, version)
+        with file_errors(name):  # a damaged zip makes zipfile raise nearly anything
+            problems = _check_table(FeatherFile(name, read()), rows, version)
     except CFlowError as error:
         problems = [f"cannot be read ({shortened(error)})"]
-    return [f"{frame.name}: {problem}" for problem in problems]
+    return [f"{name}: {problem}" for problem in problems]
 
 
 def _check_table(file: FeatherFile, rows: int, version: SubmissionVersion) -> list[str]:

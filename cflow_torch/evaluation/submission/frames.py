@@ -98,19 +98,6 @@ def point_mask(log: Log, index: int, sweep: Sweep, masks: MaskArchive | None = N
 
 @dataclass(frozen=True)
 class Frame:
-    """One file that an archive must contain.
-
-    Args:
-        name: inside the archive, `<log>/<time stamp>.feather`.
-        rows: number of its rows.
-    """
-
-    name: str
-    rows: int
-
-
-@dataclass(frozen=True)
-class PlannedFrame:
     """A frame to submit: the pair (index, index + 1) of a log."""
 
     log: Log
@@ -121,19 +108,17 @@ class PlannedFrame:
         """Name of its file inside the archive."""
         return f"{self.log.log_id}/{self.log.timestamps[self.index]}.feather"
 
-    def expect(self, version: SubmissionVersion, masks: MaskArchive | None = None) -> Frame:
+    def count_rows(self, version: SubmissionVersion, masks: MaskArchive | None = None) -> int:
         """Count the rows of its file. Reads the sweep.
 
         Raises:
             CFlowError: the sweep or its mask cannot be read.
         """
         sweep = self.log.sweep(self.index)
-        if version.is_masked:
-            return Frame(self.name, int(point_mask(self.log, self.index, sweep, masks).sum()))
-        return Frame(self.name, len(sweep.points))
+        return int(point_mask(self.log, self.index, sweep, masks).sum()) if version.is_masked else len(sweep.points)
 
 
-def plan_log(log: Log, listed: Mapping[str, Sequence[int]] | None = None) -> list[PlannedFrame]:
+def plan_log(log: Log, listed: Mapping[str, Sequence[int]] | None = None) -> list[Frame]:
     """List the frames of one log that a submission needs, in the order of time.
 
     Args:
@@ -153,7 +138,7 @@ def plan_log(log: Log, listed: Mapping[str, Sequence[int]] | None = None) -> lis
         indices = [_index_of(log, stamp) for stamp in sorted(set(listed.get(log.log_id, ())))]
     else:
         indices = [i for i in pairs if log_mask(log, i) is not None] or list(pairs[::STRIDE])
-    return [PlannedFrame(log, i) for i in indices]
+    return [Frame(log, i) for i in indices]
 
 
 def read_frame_list(file: str | Path) -> dict[str, list[int]]:
