@@ -1,16 +1,16 @@
 #!/usr/bin/env python3
-"""Does the wheel work in the oldest and in the newest environment? Builds it, installs it there, runs the tests.
+"""Build the wheel of the last commit, install it in the oldest or the newest environment, and run the tests there.
 
   python scripts/check_environments.py old --python /path/to/python3.8
   PYTHON_NEW=/path/to/python3.13 python scripts/check_environments.py new -k dense
 
-old: the versions of constraints_old.txt (torch 2.0.1, numpy 1.24, kornia 0.7.3), meant for Python 3.8.
-new: the newest of everything that pip finds, meant for Python 3.13.
+old: the versions of constraints_old.txt (torch 2.0.1, numpy 1.24, kornia 0.7.3), for Python 3.8.
+new: the newest versions that pip finds, for Python 3.13.
 
-The interpreter is that of --python, else of $PYTHON_OLD or $PYTHON_NEW. What is tested is the last commit. The
-tests that are not slow run in a folder without the package, so that only the wheel can be imported; real data is taken
-from $CFLOW_DATA, else from ../shared/data beside the checkout. Each needs about 6 GB: pip may find torch with CUDA
-only. The exit status is that of pytest; FOLDER/NAME/freeze.txt has the versions.
+The interpreter is that of --python, else of $PYTHON_OLD or $PYTHON_NEW. The tests that are not slow run in a folder
+without the package, so that only the wheel can be imported. Real data is read from $CFLOW_DATA, else from the folder
+../shared/data next to the checkout. An environment needs about 6 GB, because pip may find torch with CUDA only. The
+exit status is that of pytest. FOLDER/NAME/freeze.txt lists the installed versions.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ INSTALL = {
 }
 PACKAGE = ("cflow_torch", "configs")
 NEED_PACKAGE = ("tests/test_distribution.py", "tests/integrations/test_hubconf.py")  # these look at the checkout
-# The wheel of this Python, nothing else, is what is imported.
+# Only the wheel of this Python may be imported.
 INSTALLED = """
 import pathlib, sysconfig, cflow_torch, cflow_torch.configs
 site = pathlib.Path(sysconfig.get_paths()["purelib"]).resolve()
@@ -69,7 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def install(name: str, base: str, home: Path, wheel: Path) -> Path:
-    """Make the virtual environment if it is not there and install the wheel; returns the interpreter."""
+    """Make the virtual environment if it does not exist, and install the wheel; returns the interpreter."""
     python = home / "venv" / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
     if not python.is_file():
         run(base, "-m", "venv", home / "venv")
@@ -83,14 +83,14 @@ def install(name: str, base: str, home: Path, wheel: Path) -> Path:
 
 
 def environment() -> dict[str, str]:
-    """This process's variables without those by which another cflow_torch could be imported."""
+    """The variables of this process without those that could import another cflow_torch."""
     kept = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV")}
     data = Path(os.environ.get("CFLOW_DATA") or ROOT.parent / "shared" / "data").resolve()
     return {"OMP_NUM_THREADS": "1", **kept, "PYTHONNOUSERSITE": "1", "CFLOW_DATA": str(data)}
 
 
 def run(*command: object, cwd: Path | None = None) -> None:
-    """A command that must succeed; its output is shown."""
+    """Run a command that must succeed, and show its output."""
     print("$", *command, flush=True)
     subprocess.run([str(part) for part in command], check=True, cwd=cwd, env=environment())
 

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# The flow of a simulated street, with a picture: outputs/demo/flow.png. Arguments go to `cflow demo`.
+# Estimate the flow of a simulated street, and draw it: outputs/demo/flow.png. Arguments go to `cflow demo`.
 set -euo pipefail
 STAMP=demo EXTRAS=viz,hdf5
 . "$(dirname "${BASH_SOURCE[0]}")/install.sh"

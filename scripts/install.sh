@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
-# Make .venv in the checkout and install the package into it, in the versions that constraints.txt names. Does nothing if
-# that was done: each list of extras leaves a stamp. Sourced by demo.sh and test.sh, which say in $EXTRAS what they need
-# and in $STAMP its name; leaves the interpreter's path in $PYTHON.
+# Make .venv in the checkout, and install the package with the versions of constraints.txt. A stamp for each list of
+# extras avoids doing it twice. demo.sh and test.sh source this script: $EXTRAS are the extras, $STAMP names them. The path
+# of the interpreter is then in $PYTHON.
 set -euo pipefail
 ROOT="$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)"
 PYTHON="$ROOT/.venv/bin/python"
@@ -27,14 +27,14 @@ if [ "$(cat "$ROOT/.venv/installed-$STAMP" 2>/dev/null || true)" != "$WANTED" ];
   # --no-compile: Python compiles what it imports, which is a fraction of what torch brings.
   install=("$PYTHON" -m pip install --quiet --no-compile --constraint "$ROOT/scripts/constraints.txt")
   "${install[@]}" setuptools wheel
-  # Where pip finds a CPU build of the pinned torch, it takes that one, which spares gigabytes. What has no wheel, and the
-  # package itself, is built with the setuptools of the line above.
+  # Where pip finds a CPU build of the pinned torch, it installs that one, which saves gigabytes. The package itself, and
+  # dependencies without a wheel, are built with the setuptools of the line above.
   (cd "$ROOT" && "${install[@]}" --no-build-isolation --editable ".[$EXTRAS]")
   if [ "$STAMP" = test ]; then
     "${install[@]}" --no-deps --requirement "$ROOT/scripts/evaluators.txt"
   fi
   echo "$WANTED" >"$ROOT/.venv/installed-$STAMP"
   if [ "$STAMP" = test ]; then
-    echo "$WANTED" >"$ROOT/.venv/installed-demo"  # part of it
+    echo "$WANTED" >"$ROOT/.venv/installed-demo"  # its extras are installed, too
   fi
 fi

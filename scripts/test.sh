@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
-# The tests. Arguments go to pytest; without any, the slow ones are left out and several processes share the rest.
+# Run the tests. Arguments go to pytest. Without arguments, the tests that are not slow run in several processes.
 set -euo pipefail
 STAMP=test EXTRAS=dev,ray,rerun,video
 . "$(dirname "${BASH_SOURCE[0]}")/install.sh"
 cd "$ROOT"
 if [ $# -eq 0 ]; then
-  # One thread each: threads of several processes on the same cores wait for each other more than they work.
+  # One thread each, because threads of several processes on the same cores mostly wait for each other.
   export OMP_NUM_THREADS="${OMP_NUM_THREADS:-1}"
   # Files in the order of their names: by their number of tests, the notebooks would come last and keep one core waiting.
   set -- -m "not slow" --dist loadfile --no-loadscope-reorder -n "$("$PYTHON" -c 'import os; print(min(4, os.cpu_count() or 1))')"

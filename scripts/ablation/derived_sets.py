@@ -1,4 +1,4 @@
-"""Sets made of a real one: longer steps by chained labels, movers with something static pasted beside them."""
+"""Derive sets from a real one: longer steps with chained labels, static components pasted next to moving objects."""
 
 from __future__ import annotations
 
@@ -15,46 +15,46 @@ from cflow_torch.types import Sweep, Window
 
 # Points (N, 3), instance (N,) with 0 = background, total flow (N, 3), usable (N,) bool; all of one sweep.
 Labelled = Tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-FEWEST_POINTS = 6  # that a motion of an object is fitted to
-GAP = 0.22  # metres between a mover and what is pasted: within one component at pixels of 0.1 m
-MOVER_POINTS, STATIC_POINTS = 20, 80  # fewest of a mover; of a component that is pasted, per sweep
-LONGER_SIDE = (0.6, 4.0)  # metres, of a component that is pasted
-REACH, PIXEL = 34.0, 0.1  # metres: half side of the square that components are looked for in; side of its pixels
-MOVES = 0.05  # metres per sweep
+MIN_POINTS = 6  # to fit the motion of an object
+GAP = 0.22  # metres between an object and the pasted component: one component at pixels of 0.1 m
+DYNAMIC_POINTS, STATIC_POINTS = 20, 80  # least of a moving object; of a pasted component, per sweep
+LONGER_SIDE = (0.6, 4.0)  # metres, of a pasted component
+REACH, PIXEL = 34.0, 0.1  # metres: half side of the square in which we search components; side of its pixels
+MOVES = 0.05  # metres per sweep, least motion of a dynamic point
 SQUARE = np.ones((3, 3), bool)
 
 
 def chain_flow(pairs: Sequence[Labelled], pose_flow: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Flow over several sweeps from the labels of the pairs between.
+    """Chain the labels of consecutive pairs to the flow over several sweeps.
 
     Args:
-        pairs: of sweeps t, t + 1, ... t + k - 1 in turn; flow is that to the next sweep.
-        pose_flow: (N, 3) metres, flow t -> t + k of what does not move, axes of t + k.
+        pairs: of sweeps t, t + 1, ... t + k - 1; their flow leads to the next sweep.
+        pose_flow: (N, 3) metres, flow t -> t + k of static points, axes of t + k.
 
     Returns:
-        (N, 3) float32 total flow t -> t + k of the points of t: every object moves by its rigid motions one after the
-        other, the background by `pose_flow`; (N,) bool, False for objects that some sweep between has too little of.
+        (N, 3) float32 total flow t -> t + k of the points of t. Objects move by the product of their rigid motions, the
+        background by `pose_flow`. (N,) bool, False for objects with too few points in one of the sweeps.
     """
     points, instance = pairs[0][0].astype(np.float64), pairs[0][1]
     flow, is_known = pose_flow.astype(np.float64), np.ones(len(points), bool)
     for number in np.unique(instance[instance > 0]):
         rows = instance == number
         chosen = [(of == number) & usable for _, of, _, usable in pairs]
-        if min(map(np.count_nonzero, chosen)) < FEWEST_POINTS:
+        if min(map(np.count_nonzero, chosen)) < MIN_POINTS:
             is_known[rows] = False
             continue
         moved = points[rows]
-        for (at, _, step, _), of_object in zip(pairs, chosen):
-            start = at[of_object].astype(np.float64)
+        for (positions, _, step, _), of_object in zip(pairs, chosen):
+            start = positions[of_object].astype(np.float64)
             end = start + step[of_object]
-            turn, _ = Rotation.align_vectors(end - end.mean(0), start - start.mean(0))
-            moved = turn.apply(moved - start.mean(0)) + end.mean(0)
+            rotation, _ = Rotation.align_vectors(end - end.mean(0), start - start.mean(0))
+            moved = rotation.apply(moved - start.mean(0)) + end.mean(0)
         flow[rows] = moved - points[rows]
     return flow.astype(np.float32), is_known
 
 
 class Component(NamedTuple):
-    """Something static: its points at t and at t+1, (N, 3) float64 each, frame of t+1."""
+    """A static component: its points at t and at t+1, (N, 3) float64 each, frame of t+1."""
 
     at0: np.ndarray
     at1: np.ndarray
@@ -63,20 +63,20 @@ class Component(NamedTuple):
 def paste_static(
     pair: Window, labels: FlowLabels, instance: np.ndarray, scored: np.ndarray, number: int
 ) -> tuple[Window, FlowLabels]:
-    """A pair in which every mover has a static component of the same pair beside it.
+    """Paste a static component of the pair next to every moving object.
 
     Args:
         pair: sweeps with poses and ground masks.
         labels: truth.
         instance: (N,) object of each point of t, 0 = background.
-        scored: (N,) bool, points whose truth counts.
-        number: of the pair; pairs differ in which component goes to which mover.
+        scored: (N,) bool, points with valid truth.
+        number: index of the pair; it varies which component is pasted next to which object.
 
     Returns:
         The pair with the points of the components appended to both sweeps, and the labels of all points of t.
 
-    Convention: a component stands `GAP` beside the lane that the mover needs from t to t+1, on the side away from the
-        sensor, where it does not shade it, and in both sweeps at the same place of the world.
+    Convention: the component is `GAP` away from the area that the object covers from t to t+1, on the far side from
+        the sensor, where it does not occlude the object. It has the same position in the world in both sweeps.
     """
     pc0, pc1 = pair.pc0, pair.pc1
     T_ego1_ego0 = np.linalg.inv(pc1.pose) @ pc0.pose
@@ -87,11 +87,11 @@ def paste_static(
     static = counted & ~is_dynamic & (instance == 0)
     components = find_components(points0, pair, static, instance)
     added: list[Component] = []
-    for mover in np.unique(instance[instance > 0]):
-        rows = (instance == mover) & is_dynamic
-        if rows.sum() >= MOVER_POINTS and components:
-            chosen = components[(number + int(mover)) % len(components)]
-            added.append(beside(chosen, points0[rows], residual[rows]))
+    for moving in np.unique(instance[instance > 0]):
+        rows = (instance == moving) & is_dynamic
+        if rows.sum() >= DYNAMIC_POINTS and components:
+            chosen = components[(number + int(moving)) % len(components)]
+            added.append(shift_next_to(chosen, points0[rows], residual[rows]))
     if not added:
         return pair, labels
     more0, more1 = (np.concatenate(parts) for parts in zip(*added))
@@ -104,12 +104,12 @@ def paste_static(
 
 
 def find_components(points0: np.ndarray, pair: Window, static: np.ndarray, instance: np.ndarray) -> list[Component]:
-    """Dilated components of both sweeps that hold no object and are large enough, but not too large, in raster order.
+    """Find dilated components of both sweeps of suitable size and without objects, in raster order.
 
     Args:
         points0: (N, 3) float64, points of t in the frame of t+1.
         pair: sweeps.
-        static: (N,) bool, points that are known to be static.
+        static: (N,) bool, points that are static according to the labels.
         instance: (N,) object of each point of t, 0 = background.
     """
     points1 = pair.pc1.points.astype(np.float64)
@@ -120,7 +120,7 @@ def find_components(points0: np.ndarray, pair: Window, static: np.ndarray, insta
     image = np.zeros([int(2 * (REACH + 1) / PIXEL) + 1] * 2, bool)
     for row_and_col in pixels:
         image[tuple(row_and_col)] = True
-    image[0, 0] = False  # all that lies outside, and the ground
+    image[0, 0] = False  # points outside, and the ground
     labels, _ = ndimage.label(ndimage.binary_dilation(image, SQUARE), SQUARE)
     label0, label1 = (labels[tuple(row_and_col)] for row_and_col in pixels)
     found = []
@@ -132,20 +132,20 @@ def find_components(points0: np.ndarray, pair: Window, static: np.ndarray, insta
     return found
 
 
-def beside(component: Component, mover: np.ndarray, residual: np.ndarray) -> Component:
-    """The component, shifted to stand `GAP` beside the lane of a mover (N, 3) with residual flow (N, 3)."""
+def shift_next_to(component: Component, points: np.ndarray, residual: np.ndarray) -> Component:
+    """Shift the component next to the path of an object with (N, 3) points and residual flow."""
     along = np.median(residual[:, :2], axis=0)
     along = along / np.linalg.norm(along)
     across = np.array([-along[1], along[0]])
-    if across @ mover[:, :2].mean(0) < 0:  # away from the sensor
+    if across @ points[:, :2].mean(0) < 0:  # away from the sensor
         across = -across
-    lane, own = (np.concatenate(parts)[:, :2] for parts in ((mover, mover + residual), component))
+    lane, own = (np.concatenate(parts)[:, :2] for parts in ((points, points + residual), component))
     shift = ((lane @ across).max() + GAP - (own @ across).min()) * across
     shift += ((lane @ along).mean() - (own @ along).mean()) * along
-    return Component(*(points + np.append(shift, 0.0) for points in component))
+    return Component(*(each + np.append(shift, 0.0) for each in component))
 
 
 def _append(sweep: Sweep, points: np.ndarray) -> Sweep:
-    """A sweep with more points that are not ground."""
+    """Append points that are not ground."""
     is_ground = np.concatenate([sweep.is_ground, np.zeros(len(points), bool)])
     return replace(sweep, points=np.concatenate([sweep.points, points.astype(np.float32)]), is_ground=is_ground)

@@ -1,4 +1,4 @@
-"""Figures of a setting on a set of windows."""
+"""Score a setting on a set of windows."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from cflow_torch.types import as_numpy
 Figures = Dict[str, float]
 CLASSES = ("CAR", "OTHER_VEHICLES", "PEDESTRIAN", "WHEELED_VRU")
 RANGES = {"near": "0-35", "far": "35-70"}
-LOW = 0.5  # a confidence below it is a warning
+LOW = 0.5  # confidences below are a warning
 
 
 def score(scored: ScoredSet, config: Config) -> Figures:
-    """Figures of a setting on a set: see `pooled_figures`; of simulated sensors those of `range_figures` too.
+    """Score a setting on a set: `pooled_figures`, and for simulated sensors also `range_figures`.
 
-    Convention: of small drives the mean over the drives, as in docs/limits.md.
+    Convention: small drives are scored one by one and averaged, as in docs/limits.md.
     """
     model, frames, confidences = make_model(config), [], []
     for item in scored.items():
@@ -48,7 +48,7 @@ def score(scored: ScoredSet, config: Config) -> Figures:
 def pooled_figures(
     frames: Sequence[EvalFrame], confidences: Sequence[np.ndarray], step: int = 1, reach: float = NEAR
 ) -> Figures:
-    """Means over all points of a set in a square box around the sensor.
+    """Errors over all points of a set in a square box around the sensor.
 
     Args:
         frames: windows with estimates.
@@ -57,11 +57,11 @@ def pooled_figures(
         reach: metres, half side of the box.
 
     Returns:
-        "dynamic", "static": EPE in metres of dynamic objects, of the static background; "stands": of all that does not
-        move, parked cars too; "pedestrian": mean of error divided by speed of dynamic pedestrians; "missed": share of
-        dynamic objects whose flow is less than half of the true one; "flagged": share of these with a confidence below
-        0.5; "at 1 %": with one that at most 1 % of what does not move is below; "moving": points of dynamic objects.
-        NaN where there is nothing.
+        "dynamic", "static": EPE in metres of dynamic objects and of the static background; "all static": that of all
+        static points, including parked cars; "pedestrian": mean of error divided by speed of dynamic pedestrians;
+        "missed": share of points of dynamic objects whose flow is less than half of the true one; "flagged": share of
+        these with a confidence below 0.5; "at 1 %": share of these with a confidence below that of 99 % of the static
+        points; "moving": number of points of dynamic objects. NaN without such points.
     """
     definition = Definition(
         name="pooled",
@@ -72,35 +72,35 @@ def pooled_figures(
     )
     three_way = ThreeWayEPE(definition)
     of_pedestrians: list[np.ndarray] = []
-    of_standing: list[np.ndarray] = []
+    of_static: list[np.ndarray] = []
     is_missed: list[np.ndarray] = []
-    of_missed: list[np.ndarray] = []
-    at_rest: list[np.ndarray] = []
+    confidence_of_missed: list[np.ndarray] = []
+    confidence_of_static: list[np.ndarray] = []
     for frame, confidence in zip(frames, confidences):
         points = score_points(frame, definition)
         three_way.update_points(points)
         walks = points.in_region & points.is_dynamic & (points.category == CATEGORY_INDEX["PEDESTRIAN"])
         of_pedestrians.append(points.error[walks] / points.speed[walks])
-        of_standing.append(points.error[points.in_region & ~points.is_dynamic])
+        of_static.append(points.error[points.in_region & ~points.is_dynamic])
         truth, estimate = frame.labels.flow - frame.pose_flow, as_numpy(frame.residual_flow)
         speed = np.linalg.norm(truth, axis=1)
         counts = is_scored(frame, reach)
         moves = counts & (speed >= MOVES * step) & (frame.labels.category > 0)
         missed = np.linalg.norm(estimate, axis=1) < 0.5 * speed
         is_missed.append(missed[moves])
-        of_missed.append(confidence[moves & missed])
-        at_rest.append(confidence[counts & (speed < MOVES * step)])
+        confidence_of_missed.append(confidence[moves & missed])
+        confidence_of_static.append(confidence[counts & (speed < MOVES * step)])
     means = three_way.compute()
-    warned, resting = np.concatenate(of_missed), np.sort(np.concatenate(at_rest))
-    rare = resting[len(resting) // 100] if len(resting) else math.nan
+    flagged, static = np.concatenate(confidence_of_missed), np.sort(np.concatenate(confidence_of_static))
+    percentile = static[len(static) // 100] if len(static) else math.nan
     return {
         "dynamic": means["epe_fd"],
         "static": means["epe_bs"],
-        "stands": mean_of_present(np.concatenate(of_standing)),
+        "all static": mean_of_present(np.concatenate(of_static)),
         "pedestrian": mean_of_present(np.concatenate(of_pedestrians)),
         "missed": mean_of_present(np.concatenate(is_missed)),
-        "flagged": _share_below(warned, LOW),
-        "at 1 %": _share_below(warned, rare),
+        "flagged": _share_below(flagged, LOW),
+        "at 1 %": _share_below(flagged, percentile),
         "moving": float(sum(map(len, is_missed))),
     }
 
@@ -119,7 +119,7 @@ def is_scored(frame: EvalFrame, reach: float) -> np.ndarray:
 
 
 def range_figures(frames: Sequence[EvalFrame]) -> Figures:
-    """Dynamic bucket-normalised errors within 35 m, "near", and at 35-70 m, "far"; of each class, "near CAR", too."""
+    """Dynamic bucket-normalised errors within 35 m, "near", and at 35-70 m, "far"; also of each class, "near CAR"."""
     metrics = SceneFlowMetrics("challenge_2026_box")
     for frame in frames:
         metrics.update(frame)
@@ -131,5 +131,5 @@ def range_figures(frames: Sequence[EvalFrame]) -> Figures:
 
 
 def mean_figures(parts: Sequence[Figures]) -> Figures:
-    """Each figure's mean over several drives or sensors, those left out that have none."""
+    """Mean of each figure over several drives or sensors, without those that do not have it."""
     return {key: mean_of_present(np.array([part[key] for part in parts])) for key in parts[0]}

@@ -1,7 +1,7 @@
-"""The scored windows behind the figures of the ablation: real data, sets made of it, simulated drives, small ones too.
+"""Windows for the ablation: real data, sets derived from it, simulated drives, small simulated drives.
 
-We chose settings on the groups "real", "merged", "scenes" and "sim" with seeds 100 ... 103. Up to 0.3.0 we did not
-look at "odd", the other windows of KITTI, nor at other seeds.
+We chose settings on the groups "real", "merged", "scenes" and "sim" with seeds 100 ... 103. Up to 0.3.0 we did not use
+"odd", the other windows of KITTI, nor other seeds.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ sys.path.append(str(Path(__file__).resolve().parents[1] / "figures"))
 import drives  # noqa: E402
 
 HISTORY = FUTURE = 4
-NEAR, REGION = 35.0, 70.0  # metres, half sides: what is scored of real data; what simulated drives are estimated in
+NEAR, REGION = 35.0, 70.0  # metres, half sides: scored box of real data; region of simulated drives
 PROFILES = ("av2", "nuscenes", "truckscenes", "waymo", "aevascenes")
 SCENES = ("street", "highway", "crossing", "narrow")
 SIMULATED_SWEEPS, SIMULATED_WINDOWS = 15, (9, 12)  # per drive
@@ -58,7 +58,7 @@ class Item:
     eval_mask: np.ndarray | None = None
 
     def frame(self, residual_flow: Any) -> EvalFrame:
-        """What the metrics take, for (N, 3) estimated residual flow."""
+        """The input of the metrics, for (N, 3) estimated residual flow."""
         return EvalFrame(
             points=self.window.pc0.points,
             labels=self.labels,
@@ -72,17 +72,17 @@ class Item:
 
 @dataclass(frozen=True)
 class ScoredSet:
-    """Windows that one figure is the mean of.
+    """A set of windows that are scored together.
 
     Args:
         name: for example "kitti h=4" or "sim waymo 100-103 h=4"; unique.
         group: one of `GROUPS`.
-        history: older sweeps that are used.
-        half_side: metres, of the region that flow is estimated in; None = that of the preset.
-        load: makes the windows.
+        history: number of older sweeps.
+        half_side: metres, of the region of the estimate; None = that of the preset.
+        load: function that returns the windows.
         step: sweeps of the recording from t to t+1.
-        reach: metres, half side of the box that is scored.
-        mean: name of the mean over the sensors that it is a part of, "" = none.
+        reach: metres, half side of the scored box.
+        mean: name of the mean over the sensors to which the set belongs, "" = none.
     """
 
     name: str
@@ -95,20 +95,20 @@ class ScoredSet:
     mean: str = ""
 
     def items(self) -> list[Item]:
-        """The windows with as much history as is used."""
+        """The windows, with `history` older sweeps."""
         return [replace(i, window=replace(i.window, pch=i.window.pch[: self.history])) for i in self.load()]
 
 
 def make_sets(names: Sequence[str], seeds: Sequence[tuple[int, int]], cache: Path) -> list[ScoredSet]:
-    """The sets of some names; those of "sim" once per range of seeds.
+    """Return the sets of some names. Sets of "sim" are returned once per range of seeds.
 
     Args:
-        names: of groups or of single sets; "walkers" stands for "walkers-0.1" and so on.
-        seeds: first and last seed of each range, a multiple of four seeds for an even mix of scenes.
-        cache: folder for simulated drives, made where they are absent.
+        names: of groups or of single sets; "walkers" selects "walkers-0.1" and so on.
+        seeds: first and last seed of each range; four seeds, or a multiple, have an even mix of scenes.
+        cache: folder for simulated drives, which are made if they do not exist.
 
     Raises:
-        CFlowError: there is no such set.
+        CFlowError: there is no set of that name.
     """
     sets = [ScoredSet(name, group, history, NEAR, load, step) for name, group, history, load, step in _REAL]
     for name, stage in _SCENES.items():
@@ -136,16 +136,16 @@ def between(start: Sweep, end: Sweep) -> np.ndarray:
 
 
 def make_item(scored: Window, labels: FlowLabels, eval_mask: np.ndarray | None = None) -> Item:
-    """An item whose ego motion is that of the poses."""
+    """An item with the ego motion of the poses."""
     pose_flow = ego_motion_flow(as_numpy(scored.pc0.points)[:, :3], between(scored.pc0, scored.pc1))
     return Item(scored, labels, pose_flow, eval_mask)
 
 
 def data_root() -> Path:
-    """Folder of the real data: $CFLOW_DATA, else ../shared/data beside the checkout.
+    """Folder of the real data: $CFLOW_DATA, else ../shared/data next to the checkout.
 
     Raises:
-        CFlowError: it is not there.
+        CFlowError: the folder lacks the data.
     """
     root = Path(os.environ.get("CFLOW_DATA") or Path(__file__).resolve().parents[3] / "shared" / "data")
     for part in (AV2, KITTI):
@@ -159,7 +159,7 @@ def data_root() -> Path:
 
 @lru_cache(maxsize=None)
 def av2_pair() -> list[Item]:
-    """The real Argoverse 2 pair; ego motion as its labels have it, 0.8 mm off the poses."""
+    """The real Argoverse 2 pair, with the ego motion of its labels, which differs from the poses by 0.8 mm."""
     folder = data_root() / AV2
     log = AV2Log(folder)
     item = make_item(window(log, 0), log.labels(0))
@@ -176,7 +176,7 @@ def _scene(path: Path) -> tuple[HDF5Log, CachedLog]:
 
 @lru_cache(maxsize=None)
 def kitti(path: Path = KITTI) -> list[Item]:
-    """Every labelled pair of a part of KITTI 0000, or of another scene of that layout."""
+    """All labelled pairs of a part of KITTI 0000, or of another scene in that layout."""
     log, sweeps = _scene(path)
     pairs = range(len(log.timestamps) - 1)
     return [make_item(window(sweeps, i, HISTORY, FUTURE), log.labels(i), log.eval_mask(i)) for i in pairs]
@@ -189,7 +189,7 @@ def whole_history(path: Path) -> list[Item]:
 
 @lru_cache(maxsize=None)
 def kitti_steps(step: int) -> list[Item]:
-    """Pairs (t, t + step) of KITTI 0000; the labels of the pairs between, chained object by object."""
+    """Pairs (t, t + step) of KITTI 0000, with the labels of the pairs in between chained object by object."""
     log, sweeps = _scene(KITTI)
     items = []
     for start in range(len(log.timestamps) - step):
@@ -208,7 +208,7 @@ def kitti_steps(step: int) -> list[Item]:
 
 @lru_cache(maxsize=None)
 def merged() -> list[Item]:
-    """The pairs of KITTI 0000, every mover with something static pasted beside it."""
+    """The pairs of KITTI 0000, with a static component pasted next to every moving object."""
     log, _ = _scene(KITTI)
     items = []
     for number, item in enumerate(kitti()):
@@ -222,7 +222,7 @@ def merged() -> list[Item]:
 
 @lru_cache(maxsize=None)
 def simulated(profile: str, seeds: Sequence[int], cache: Path) -> list[Item]:
-    """Windows of the simulated drives of one sensor, read as that data set is."""
+    """Windows of the simulated drives of one sensor, read with the reader of its data set."""
     chosen = format_of(profile)
     items = []
     for source in benchmark_logs(cache, profile, seeds, SIMULATED_SWEEPS, SCENES):
@@ -238,7 +238,7 @@ def simulated(profile: str, seeds: Sequence[int], cache: Path) -> list[Item]:
 
 @lru_cache(maxsize=None)
 def staged(stage: Callable[[int], drives.Staged]) -> list[Item]:
-    """The pair of a small drive, once per seed. What moves but is not looked at does not count; what stands does."""
+    """The pair of a small drive, once per seed. Scored are its objects and all static points, no other moving ones."""
     items = []
     for seed in SCENE_SEEDS:
         drive, _, _, bodies, _ = stage(seed)
@@ -254,7 +254,7 @@ def _every_second(load: Callable[[], list[Item]], start: int) -> Callable[[], li
 
 
 _STEPS = {step: partial(kitti_steps, step) for step in (3, 5)}
-# Name, group, history, windows, step. At h = 4 only windows with the whole history.
+# Name, group, history, windows, step. With h = 4, only windows with the whole history.
 _REAL: tuple[tuple[str, str, int, Callable[[], list[Item]], int], ...] = (
     ("av2 pair h=0", "real", 0, av2_pair, 1),
     ("kitti h=0", "real", 0, kitti, 1),

@@ -1,9 +1,9 @@
-"""The dense method as one would write it by hand with OpenCV and NumPy: a loop over clusters, one thread of thought.
+"""The dense method with OpenCV and NumPy and a loop over clusters, as you might write it by hand.
 
-The competitor of the benchmark. It does the same work as `CorrelationFlow` (history and scales included, no sectional
-view, no `max_speed`) and is written to be fast: points in column-major order, one label image, pixels sorted by label
-once, crops in float32. What differs is rounding: `cv2.matchTemplate` computes float32 scores, so ties of the argmax
-fall otherwise.
+The benchmark compares this loop with `CorrelationFlow`. It does the same work, with history and scales but without
+sectional view and `max_speed`. It is written to be fast: points in column-major order, one label image, pixels sorted
+by label once, crops in float32. Results differ by rounding: `cv2.matchTemplate` computes float32 scores, which decide
+ties of the argmax in another way.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ _SMALLEST_SCORE = 1e-5
 
 
 class Cloud(NamedTuple):
-    """Points of one sweep that take part.
+    """Active points of one sweep.
 
     Args:
         xy: (2, N) float64, metres, frame of t+1.
         steps: k, sweep intervals to t+1.
-        rows: (N,) int64, rows of the sweep that these points are.
+        rows: (N,) int64, rows of these points in the sweep.
     """
 
     xy: np.ndarray
@@ -37,10 +37,10 @@ class Cloud(NamedTuple):
 
 
 class Clusters(NamedTuple):
-    """Clusters with pixels at t+1 and before.
+    """Clusters with pixels both at t+1 and before.
 
     Args:
-        number: (H, W) int32, cluster of every occupied pixel, -1 elsewhere and in other components.
+        number: (H, W) int32, cluster of every occupied pixel; -1 elsewhere and in other components.
         boxes: M times (top, left, height, width), pixels.
     """
 
@@ -49,7 +49,7 @@ class Clusters(NamedTuple):
 
 
 def opencv() -> Any:
-    """The module cv2.
+    """Import cv2.
 
     Raises:
         CFlowError: OpenCV is not installed.
@@ -62,24 +62,24 @@ def opencv() -> Any:
 
 
 def opencv_flow(window: Window, config: Config) -> FlowResult:
-    """Flow of every point of `window.pc0`.
+    """Estimate the flow of every point of `window.pc0`.
 
     Args:
-        window: sweeps t-h ... t+1 at equal intervals, taken as valid.
-        config: settings; the fields that choose engines mean nothing here.
+        window: valid sweeps t-h ... t+1 at equal intervals.
+        config: settings; those that choose engines are ignored.
 
     Returns:
         `FlowResult` of CPU tensors, rows in the order of pc0.
 
     Convention:
-        As `CorrelationFlow`, but ties between shifts are decided by the rounding of `cv2.matchTemplate`.
+        Ties between shifts depend on the rounding of `cv2.matchTemplate`; all else equals `CorrelationFlow`.
 
     Raises:
-        CFlowError: OpenCV is not installed; a method, clustering or view that the loop does not have.
+        CFlowError: OpenCV is not installed, or the loop does not have the method, clustering or view.
 
     Cost: one `cv2.matchTemplate` per cluster, sweep and scale.
     """
-    opencv()  # absent: say so before anything else
+    opencv()  # raise first if it is not installed
     if not isinstance(config, DenseConfig) or config.clustering != "components":
         raise CFlowError("the OpenCV loop has method='dense', clustering='components' only")
     if config.sectional_view or config.max_speed is not None:
@@ -97,7 +97,7 @@ def opencv_flow(window: Window, config: Config) -> FlowResult:
     residual_flow = np.zeros((num_points, 3), np.float32)
     residual_flow[rows, :2] = flows[0].T
     pose_flow = np.empty((num_points, 3), np.float32)
-    with np.errstate(invalid="ignore"):  # points that are not finite
+    with np.errstate(invalid="ignore"):  # for points that are not finite
         np.subtract(moved0.T, points0.T, out=pose_flow, casting="same_kind")
     finite = np.isfinite(pose_flow)
     if not finite.all():
@@ -118,20 +118,20 @@ def motion_at_scale(
     """One scale: project, cluster, correlate, pool.
 
     Args:
-        clouds: sweeps t, t-1, ..., warped by the flow so far.
+        clouds: sweeps t, t-1, ..., moved by the flow so far.
         cloud1: sweep t+1.
         pixel_size: s, metres.
         config: settings.
 
     Returns:
-        flow: each (2, N) float64, metres per sweep interval, of the points of every one of `clouds`.
+        flow: for each of `clouds` (2, N) float64, metres per sweep interval.
         cluster_id: (N,) int32 of the points of sweep t, -1 = none.
         score: (N,) float32 of the points of sweep t.
     """
     images, pixels = zip(*(project(cloud.xy, pixel_size, config) for cloud in (cloud1, *clouds)))
     clusters = find_clusters(images, pixel_size, config)
     estimates, scores, seen = _correlate(clusters, images, len(clouds), pixel_size)
-    motion = np.zeros((2, len(scores) + 1))  # the last column is for points in no cluster, number -1
+    motion = np.zeros((2, len(scores) + 1))  # the last column is for points without cluster, number -1
     motion[:, :-1] = _pool(estimates / np.array([cloud.steps for cloud in clouds]), seen)
     numbers = [np.where(pixel >= 0, clusters.number.ravel().take(pixel), -1) for pixel in pixels[1:]]
     return [motion.take(number, 1) for number in numbers], numbers[0], np.append(scores, np.float32(0))[numbers[0]]
@@ -154,13 +154,13 @@ def project(xy: np.ndarray, pixel_size: float, config: Config) -> tuple[np.ndarr
 
 
 def find_clusters(images: Sequence[np.ndarray], pixel_size: float, config: Config) -> Clusters:
-    """Alg. clustering on (H, W) uint8 images, t+1 first: dilate, label, erode and label again what is too large."""
+    """Alg. clustering on (H, W) uint8 images, t+1 first: dilate and label; erode too large clusters and label again."""
     cv2 = opencv()
     aggregated = images[0].copy()
     for image in images[1:]:
         aggregated |= image
     height, width = aggregated.shape
-    # Boxes come from the occupied pixels: connectedComponentsWithStats takes six times as long as labelling alone.
+    # We find boxes from the occupied pixels, because connectedComponentsWithStats is six times slower than labelling.
     dilated, count, labels = dilate_and_label(aggregated, config.connectivity)
     pixel = np.flatnonzero(aggregated.view(bool))
     label = labels.ravel()[pixel]
@@ -170,7 +170,7 @@ def find_clusters(images: Sequence[np.ndarray], pixel_size: float, config: Confi
     too_large = np.zeros(count, bool)
     too_large[label[group.first]] = np.maximum(down, right) * pixel_size > config.max_extent
     if too_large.any():
-        # A 3 x 3 square of foreground lies in one component, so all may be eroded together.
+        # A 3 x 3 square of foreground is in one component, so all components can be eroded together.
         parts, part = cv2.connectedComponents(cv2.erode(dilated, _SQUARE), connectivity=config.connectivity)
         label = np.where(too_large[label], count + part.ravel()[pixel], label)
         count += parts
@@ -198,14 +198,14 @@ def find_clusters(images: Sequence[np.ndarray], pixel_size: float, config: Confi
 
 
 def dilate_and_label(aggregated: np.ndarray, connectivity: int) -> tuple[np.ndarray, int, np.ndarray]:
-    """The two bare calls: (H, W) uint8 dilated image, number of labels, (H, W) int32 labels."""
+    """(H, W) uint8 dilated image, number of labels, (H, W) int32 labels."""
     cv2 = opencv()
     dilated = cv2.dilate(aggregated, _SQUARE)
     return (dilated, *cv2.connectedComponents(dilated, connectivity=connectivity))
 
 
 class Groups(NamedTuple):
-    """Groups of pixels with the same label: position of the first pixel in the given order, and the box; (G,) each."""
+    """Groups of pixels with the same label: index of the first pixel in the given order, and the box; (G,) each."""
 
     first: np.ndarray
     top: np.ndarray
@@ -215,7 +215,7 @@ class Groups(NamedTuple):
 
 
 def _grouped(pixel: np.ndarray, label: np.ndarray, width: int) -> Groups:
-    """Sort raster indices by label once; a group is then a slice."""
+    """Group raster indices by label: sort once, so that a group is a slice."""
     order = np.argsort(label, kind="stable")
     row, col = np.divmod(pixel[order], width)
     start = np.flatnonzero(np.diff(label[order], prepend=-1))
@@ -229,7 +229,7 @@ def _grouped(pixel: np.ndarray, label: np.ndarray, width: int) -> Groups:
 def _correlate(
     clusters: Clusters, images: Sequence[np.ndarray], num_clouds: int, pixel_size: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The loop. Shifts (2, M, K) in metres, scores (M,) of the newest sweep, and which (M, K) sweeps had pixels."""
+    """The loop: shifts (2, M, K) in metres, scores (M,) of the newest sweep, and mask (M, K) of sweeps with pixels."""
     cv2 = opencv()
     num_clusters = len(clusters.boxes)
     shifts = np.zeros((2, num_clusters, num_clouds))
@@ -257,7 +257,7 @@ def _correlate(
 
 
 def _pool(estimates: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Sec. leverage_past_pcs: (2, M, K) estimates, nearest sweep first, of which the `seen` (M, K) count -> (2, M)."""
+    """Sec. leverage_past_pcs: pool (2, M, K) estimates, nearest sweep first, where `seen` (M, K) is True -> (2, M)."""
     single = np.take_along_axis(estimates, seen.argmax(1)[None, :, None], 2)[..., 0]
     if seen.shape[1] == 1:
         return single
@@ -280,7 +280,7 @@ def _pool(estimates: np.ndarray, seen: np.ndarray) -> np.ndarray:
 
 
 def _middle(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Places (M, 1) of the middle one or two among the sorted masked entries of each row."""
+    """Indices (M, 1) of the middle one or two among the sorted masked entries of each row."""
     count = mask.sum(1, keepdims=True)
     return np.maximum(count - 1, 0) // 2, np.minimum(count // 2, mask.shape[1] - 1)
 
@@ -312,8 +312,8 @@ def _compensate(sweep: Sweep, sweep1: Sweep) -> tuple[np.ndarray, np.ndarray]:
         return points, points
     matrix = np.linalg.inv(_numpy(sweep1.pose)) @ _numpy(sweep.pose)
     rotation, translation = matrix[:3, :3, None], matrix[:3, 3:]
-    with np.errstate(invalid="ignore"):  # points that are not finite
-        # No product of large matrices: the threads of the BLAS behind it go on spinning for tens of milliseconds.
+    with np.errstate(invalid="ignore"):  # for points that are not finite
+        # We avoid a product of large matrices, after which the threads of BLAS spin for tens of milliseconds.
         moved = rotation[:, 0] * points[0]
         moved += rotation[:, 1] * points[1]
         moved += rotation[:, 2] * points[2]

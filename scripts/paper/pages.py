@@ -1,8 +1,8 @@
-"""Draw the tables and figures of the paper from results files, the paper's numbers next to ours.
+"""Write the paper's tables and figures from results files, with the paper's numbers next to ours.
 
-Per table or figure NAME.md and NAME.csv, for figures NAME.png too (needs matplotlib). Of figures the page has the
-means, NAME.md the classes; across data sets the page has CorrelationFlow, NAME.md every method. Missing runs are listed
-on the page and on the screen, "-" in the tables.
+Each table or figure is written to NAME.md and NAME.csv, figures also to NAME.png (needs matplotlib). For figures, the
+page has the means over the classes and NAME.md has the classes. Across data sets, the page has CorrelationFlow and
+NAME.md has all methods. Missing runs are "-" in the tables, and are listed on the page and on the screen.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ Cells = List[List[str]]
 
 
 def class_cells(paper: dict[str, Any], ours: Ours) -> Cells:
-    """Header and rows of a table with a column per class: for each row the paper's numbers, then those of each set.
+    """Header and rows of a table with a column per class: for each row the paper's numbers, then ours of each set.
 
-    Rows that the paper does not have come last.
+    Rows that the paper does not have are last.
     """
     base = paper.get("difference_to")
     cells = [[paper["row"], "from", *CLASSES, "mean", paper.get("time", "time [s]")]]
@@ -49,7 +49,7 @@ def class_cells(paper: dict[str, Any], ours: Ours) -> Cells:
 
 
 def set_cells(paper: dict[str, Any], ours: Ours) -> Cells:
-    """Header and rows of a table with a column per data set (and range): the paper's methods, then ours."""
+    """Header and rows of a table with a column per data set (and range): first the paper's methods, then ours."""
     scores = protocol(ours)
     if "bars" in paper:
         cells = [["method", "from", *paper["at"], *ours]]
@@ -73,9 +73,10 @@ def set_cells(paper: dict[str, Any], ours: Ours) -> Cells:
 
 
 def mean_cells(cells: Cells) -> Cells:
-    """Of a figure's `class_cells` the means: a column per point, for "h=0, 2 scales" per number of scales.
+    """Means over the classes from a figure's `class_cells`, with a column per point of the figure.
 
-    Rows: the paper and each data set, once for each h where points are named by h and scales.
+    Points such as "h=0, 2 scales" give a column per number of scales, and rows for each h. Otherwise, the rows are the
+    paper and each data set.
     """
     lines: dict[str, dict[str, str]] = {}
     for point, origin, *_, mean, _seconds in cells[1:]:
@@ -92,7 +93,7 @@ def number(value: float, signed: bool = False) -> str:
 
 
 def missing_runs(paper: dict[str, Any], runs: Runs) -> list[str]:
-    """One line for each run that a table or figure still needs."""
+    """A line for each table or figure whose runs are not complete."""
     lines = []
     for name, about in paper.items():
         wanted = list(METHODS.values()) if name in PER_SET else list(about["rows"])
@@ -104,7 +105,7 @@ def missing_runs(paper: dict[str, Any], runs: Runs) -> list[str]:
 
 
 def about_runs(ours: Ours) -> list[str]:
-    """Which data, versions and days our numbers are from, one line per data set."""
+    """A line per data set with the data, versions and dates of our numbers."""
     lines = []
     for data_set, rows in ours.items():
         records = [run.record for run in rows.values()]
@@ -142,10 +143,10 @@ def comma_separated(cells: Cells) -> str:
 
 
 def write_pages(results: Path, output: Path) -> None:
-    """Write the page OUTPUT.md, and to OUTPUT the tables and figures one by one.
+    """Write the page OUTPUT.md, and its tables and figures to the folder OUTPUT.
 
     Args:
-        results: folder that holds results.json files of `cflow eval -m experiment=...`, at any depth.
+        results: folder with results.json files of `cflow eval -m experiment=...`, at any depth.
         output: folder.
     """
     paper = load_paper()
@@ -156,7 +157,7 @@ def write_pages(results: Path, output: Path) -> None:
         draw = None
         remarks.append(f"no pictures: {error}")
     page: list[str] = [INTRODUCTION]
-    told: list[str] = []
+    last_described: list[str] = []
     for name, about in paper.items():
         ours = runs.get(name, {})
         cells = (set_cells if name in PER_SET else class_cells)(about, ours)
@@ -169,10 +170,10 @@ def write_pages(results: Path, output: Path) -> None:
         elif is_figure:
             shown = mean_cells(cells)
         page += [f"## {about['title']} ({about['label']})", "", markdown(shown)]
-        runs_told = about_runs(ours)
-        notes = ["same runs as above"] if runs_told and runs_told == told else list(runs_told)
+        described = about_runs(ours)
+        notes = ["same runs as above"] if described and described == last_described else list(described)
         notes += [about["note"]] if "note" in about else []
-        told = runs_told or told
+        last_described = described or last_described
         if name in PER_SET:
             notes.append("the picture shows the paper's other methods, with numbers in scripts/paper/figures.yaml")
             notes += [f"{method}: {reason}" for method, score in protocol(ours).items() for reason in score.missing]

@@ -1,4 +1,4 @@
-"""The paper's figures drawn again, ours beside them, in the paper's colours and markers."""
+"""Draw the paper's figures and ours next to them, in the paper's colours and markers."""
 
 from __future__ import annotations
 
@@ -36,16 +36,15 @@ PAPER_SET = "paper, Argoverse 2 val"
 
 
 def draw(name: str, paper: dict[str, Any], ours: Ours) -> Figure:
-    """The figure of an experiment.
+    """Draw the figure of an experiment.
 
     Args:
         name: history, scales, datasets or range_split.
-        paper: what the paper has, an entry of figures.yaml.
+        paper: the paper's numbers, an entry of figures.yaml.
         ours: data set -> row -> run; may be empty or have gaps.
     """
-    return {"history": _history, "scales": _scales, "datasets": _datasets, "range_split": _range_split}[name](
-        paper, ours
-    )
+    figures = {"history": _history, "scales": _scales, "datasets": _datasets, "range_split": _range_split}
+    return figures[name](paper, ours)
 
 
 def _of_class(runs: Mapping[str, Run], rows: Sequence[str], which: str) -> list[float]:
@@ -55,7 +54,7 @@ def _of_class(runs: Mapping[str, Run], rows: Sequence[str], which: str) -> list[
 
 
 def _history(paper: dict[str, Any], ours: Ours) -> Figure:
-    """Error over h, one line per class; the paper's panel, then one per data set."""
+    """Error over h with a line per class: the paper's panel, then a panel per data set."""
     figure = Figure(figsize=(5.2 * (1 + len(ours)), 4.0), layout="constrained")
     panels = figure.subplots(1, 1 + len(ours), sharey=True, squeeze=False)[0]
     rows = [f"h={h}" for h in paper["at"]]
@@ -74,7 +73,7 @@ def _history(paper: dict[str, Any], ours: Ours) -> Figure:
 
 
 def _scales(paper: dict[str, Any], ours: Ours) -> Figure:
-    """Error over the number of scales: a row of four classes for the paper, one for each data set; a line per h."""
+    """Error over the number of scales with a line per h: a row of four classes for the paper and for each data set."""
     figure = Figure(figsize=(13, 3.3 * (1 + len(ours))), layout="constrained")
     grid = figure.subplots(1 + len(ours), 4, squeeze=False)
     for panels, (title, runs) in zip(grid, [(PAPER_SET, {}), *ours.items()]):
@@ -96,7 +95,7 @@ def _scales(paper: dict[str, Any], ours: Ours) -> Figure:
 
 
 def _datasets(paper: dict[str, Any], ours: Ours) -> Figure:
-    """Bars: a group per data set, a bar per method; below, our two variants on our data sets."""
+    """Bars with a group per data set and a bar per method; below, our two variants on our data sets."""
     scores = protocol(ours)
     rows = 2 if scores else 1
     figure = Figure(figsize=(12, 3.9 * rows), layout="constrained")
@@ -108,7 +107,7 @@ def _datasets(paper: dict[str, Any], ours: Ours) -> Figure:
         groups = ["Overall", *ours]
         _bars(panels[1], groups, {m: [s.overall, *(s.data_sets[d] for d in ours)] for m, s in scores.items()})
         panels[1].set_title("this package", fontsize=9)
-        panels[1].set_xlim(panels[0].get_xlim() if len(groups) <= len(paper["at"]) else None)  # bars of one width
+        panels[1].set_xlim(panels[0].get_xlim() if len(groups) <= len(paper["at"]) else None)  # bars of equal width
     return figure
 
 
@@ -116,8 +115,8 @@ def _bars(axes: Axes, groups: Sequence[str], bars: Mapping[str, Sequence[float]]
     width = 0.1
     for number, (method, values) in enumerate(bars.items()):
         shift = (number - (len(bars) - 1) / 2) * width
-        places = [group + shift for group in range(len(groups))]
-        axes.bar(places, values, width * 0.95, label=method, color=METHOD_STYLE[method]["color"])
+        positions = [group + shift for group in range(len(groups))]
+        axes.bar(positions, values, width * 0.95, label=method, color=METHOD_STYLE[method]["color"])
     axes.set(xticks=range(len(groups)), xticklabels=groups, ylabel=ERROR, xlim=(-0.6, len(groups) - 0.4))
     highest = max((v for values in bars.values() for v in values if not math.isnan(v)), default=0.0)
     axes.set_ylim(0.1, max(0.92, highest * 1.05))  # from 0.1, as in the paper
@@ -128,16 +127,16 @@ def _bars(axes: Axes, groups: Sequence[str], bars: Mapping[str, Sequence[float]]
 
 
 def _range_split(paper: dict[str, Any], ours: Ours) -> Figure:
-    """Error at short and long range: the paper's 2 x 2 panels, ours in further columns."""
+    """Error at short and long range: the paper's 2 x 2 panels, and ours in further columns."""
     panels = [(f"{name} (paper)", lines) for name, lines in paper["panels"].items()]
     for data_set, runs in ours.items():
         panels.append((data_set, {m: range_errors(runs[m]) for m in METHODS.values() if m in runs}))
     columns = 2 + math.ceil(len(ours) / 2)
     figure = Figure(figsize=(4.2 * columns, 7.5), layout="constrained")
     grid = figure.subplots(2, columns, squeeze=False)
-    places = [grid[row, column] for row in range(2) for column in range(2)]  # AEVA, AV2 above TruckScene, Waymo
-    places += [grid[row, column] for column in range(2, columns) for row in range(2)]
-    for axes, (title, lines) in zip(places, panels):
+    all_axes = [grid[row, column] for row in range(2) for column in range(2)]  # AEVA, AV2 above TruckScene, Waymo
+    all_axes += [grid[row, column] for column in range(2, columns) for row in range(2)]
+    for axes, (title, lines) in zip(all_axes, panels):
         for method, values in lines.items():
             style = dict(METHOD_STYLE[method])
             if method == "SeFlow++":
@@ -145,11 +144,11 @@ def _range_split(paper: dict[str, Any], ours: Ours) -> Figure:
             axes.plot([0, 1], values, label=method, markersize=8, **style)
         axes.set(title=title, xticks=[0, 1], xticklabels=[f"{name}m" for name in paper["at"]], xlim=(-0.1, 1.1))
         _error_axis([axes], bottom=0.1, top=0.9)
-    for axes in places[len(panels) :]:
+    for axes in all_axes[len(panels) :]:
         axes.set_axis_off()
     for axes in grid[:, 0]:
         axes.set_ylabel(ERROR)
-    figure.legend(*places[0].get_legend_handles_labels(), ncols=4, loc="outside upper center", fontsize=9)
+    figure.legend(*all_axes[0].get_legend_handles_labels(), ncols=4, loc="outside upper center", fontsize=9)
     return figure
 
 
@@ -158,9 +157,9 @@ def _grid(axes: Axes) -> None:
 
 
 def _error_axis(panels: Sequence[Axes], top: float, bottom: float = 0.0) -> None:
-    """One range of errors for all panels: the paper's, wider only where a value would fall outside."""
-    ends = [axes.dataLim.intervaly for axes in panels]
-    high = max([top, *(end[1] * 1.05 for end in ends if math.isfinite(end[1]))])
-    low = min([bottom, *(end[0] * 0.95 for end in ends if math.isfinite(end[0]))])
+    """Set one range of errors for all panels: the paper's range, extended where a value would be outside."""
+    limits = [axes.dataLim.intervaly for axes in panels]
+    high = max([top, *(limit[1] * 1.05 for limit in limits if math.isfinite(limit[1]))])
+    low = min([bottom, *(limit[0] * 0.95 for limit in limits if math.isfinite(limit[0]))])
     for axes in panels:
         axes.set_ylim(low, high)

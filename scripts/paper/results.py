@@ -1,4 +1,4 @@
-"""What the paper prints, and what our results files hold: both by experiment and row."""
+"""Load the paper's numbers and our results files, both by experiment and row."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from cflow_torch.config import PRESETS
 from cflow_torch.evaluation.metrics import ProtocolScores, errors_by_range, score_data_sets
 
 PAPER_FILE = Path(__file__).resolve().with_name("figures.yaml")
-# The paper's name of a class -> that of the evaluation.
+# The paper's name of a class -> its name in the evaluation.
 CLASSES = {"CAR": "CAR", "OTHER": "OTHER_VEHICLES", "PED": "PEDESTRIAN", "VRU": "WHEELED_VRU"}
 METHODS = {"dense": "CorrelationFlow", "keypoints": "CorrelationFlow-Keypoint"}
 RANGES = ("0-35", "35-70")
@@ -24,7 +24,7 @@ DENSIFIED = {
     "clusters": "Clusters (not in the paper)",
 }
 PRESET = "Preset keypoints (not in the paper)"
-STAGES = {"views": ("correlate", "pool"), "clustering": ("cluster",)}  # what the paper's time column holds
+STAGES = {"views": ("correlate", "pool"), "clustering": ("cluster",)}  # stages in the paper's time column
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Run:
 
     Args:
         experiment: name of the table or figure.
-        data_set: what was scored, as tables call it.
+        data_set: its name in the tables.
         row: row of the table, or point of the figure.
         record: content of results.json.
     """
@@ -50,7 +50,7 @@ class Run:
         return [math.nan if value is None else value for value in (*classes, scores["mean"]["dynamic_error"])]
 
     def seconds(self) -> float:
-        """Median seconds per pair of what the paper's time column holds."""
+        """Median seconds per pair of the stages in the paper's time column."""
         times = self.record["seconds_per_pair"]
         stages = STAGES.get(self.experiment)
         return float(times["median"] if stages is None else sum(times["stages"].get(name, 0.0) for name in stages))
@@ -61,21 +61,21 @@ Runs = Dict[str, Dict[str, Dict[str, Run]]]  # experiment -> data set -> row
 
 
 def load_paper() -> dict[str, Any]:
-    """What the paper prints, by experiment; figures of classes have `rows` as the tables do."""
+    """Load the paper's numbers by experiment. Figures of classes get `rows` like tables."""
     paper: dict[str, Any] = OmegaConf.to_container(OmegaConf.load(PAPER_FILE))  # type: ignore[assignment]
     for name in ("history", "scales"):
         figure, rows = paper[name], {}
-        for at, x in enumerate(figure["at"]):
+        for index, x in enumerate(figure["at"]):
             for h in ("",) if name == "history" else ("h=0", "h=2", "h=4"):
                 lines = {c: figure["lines"][c] if name == "history" else figure["panels"][c][h] for c in CLASSES}
-                values = [lines[c][at] for c in CLASSES]
+                values = [lines[c][index] for c in CLASSES]
                 rows[f"h={x}" if name == "history" else f"{h}, {x} scales"] = [*values, sum(values) / len(values)]
         figure["rows"], figure["row"] = dict(sorted(rows.items(), key=lambda row: row[0].split(",")[0])), "setting"
     return paper
 
 
 def row_of(experiment: str, model: dict[str, Any]) -> str:
-    """The row of a table that a run's settings belong to."""
+    """The row of a table to which the settings of a run belong."""
     sizes, h = model["pixel_sizes"], model.get("num_history", 0)
     if experiment == "pixel_size":
         return ", ".join(f"{size:g}" for size in sizes)
@@ -90,13 +90,13 @@ def row_of(experiment: str, model: dict[str, Any]) -> str:
     if experiment == "keypoints":
         if model["method"] == "dense":
             return f"CorrelationFlow (h={h})"
-        same = model["densify"] == "clusters" and model["patch_size"] == PRESETS["keypoints"][1]["patch_size"]
-        return PRESET if same else DENSIFIED[model["densify"]]
+        is_preset = model["densify"] == "clusters" and model["patch_size"] == PRESETS["keypoints"][1]["patch_size"]
+        return PRESET if is_preset else DENSIFIED[model["densify"]]
     return METHODS[model["method"]]
 
 
 def load_runs(folder: Path) -> tuple[Runs, list[str]]:
-    """All runs of experiments below a folder, and remarks on files that were not used."""
+    """Load all runs of experiments below a folder; also returns remarks on files that were not used."""
     runs: Runs = {}
     remarks: list[str] = []
     for file in sorted(folder.rglob("results.json")):
@@ -105,7 +105,7 @@ def load_runs(folder: Path) -> tuple[Runs, list[str]]:
             config = record["config"]
             experiment = config.get("experiment_name")
         except (ValueError, KeyError, TypeError) as error:
-            remarks.append(f"{file} is no results file of this version ({error!r})")
+            remarks.append(f"{file} is not a results file of this version ({error!r})")
             continue
         if experiment is None:
             continue
@@ -128,7 +128,7 @@ def range_errors(run: Run) -> list[float]:
 
 
 def protocol(ours: Ours) -> dict[str, ProtocolScores]:
-    """Our variants over our data sets, as the challenge combines them: method -> scores."""
+    """Scores of our variants over our data sets, combined as in the challenge: method -> scores."""
     result = {}
     for method in METHODS.values():
         errors = {name: dict(zip(RANGES, range_errors(runs[method]))) for name, runs in ours.items() if method in runs}

@@ -1,15 +1,15 @@
 #!/usr/bin/env python3
-"""Every table and figure of the paper: runs all experiments, then makes the pages.
+"""Run the experiments of the paper, then write a page with every table and figure.
 
-  python scripts/paper/tables.py                                   the whole synthetic benchmark
+  python scripts/paper/tables.py                                   the whole simulated benchmark
   python scripts/paper/tables.py data=benchmark_small              20 windows, a few minutes
   python scripts/paper/tables.py data=av2 data.root=/data/av2/val output=outputs/av2val
-  python scripts/paper/tables.py --only history scales             some of them
-  python scripts/paper/tables.py --only --page docs/paper          none: the page of what outputs/paper holds
+  python scripts/paper/tables.py --only history scales             some experiments
+  python scripts/paper/tables.py --only --page docs/paper          no experiments, only the page of outputs/paper
 
-Arguments with "=" are Hydra overrides and go to every `cflow eval -m experiment=...`. Runs that are done are skipped:
-call it again to resume after an interruption. output=FOLDER (default outputs/paper) gets the results; --page (default
-FOLDER/paper) the tables and figures, and the page beside it, FOLDER/paper.md.
+Arguments with "=" are Hydra overrides and go to every `cflow eval -m experiment=...`. Completed runs are skipped, so
+call the script again after an interruption. Results are written to output=FOLDER (default outputs/paper), tables and
+figures to --page (default FOLDER/paper), and the page next to them (FOLDER/paper.md).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from typing import Sequence
 
 from pages import write_pages
 
-# Those that need the most time, or an extra, last.
+# Experiments that take most time, or need an extra, are last.
 EXPERIMENTS = ("pixel_size", "views", "history", "scales", "keypoints", "datasets", "range_split", "clustering")
 
 
@@ -36,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = parser.parse_intermixed_args(arguments)
     wrong = [text for text in given.overrides if "=" not in text]
     if wrong:
-        print(f"error: {wrong} are no settings: give NAME=VALUE", file=sys.stderr)
+        print(f"error: {wrong} are not settings: give NAME=VALUE", file=sys.stderr)
         return 2
     outputs = [text.partition("=")[2] for text in given.overrides if text.startswith("output=")]
     output = Path(outputs[-1] if outputs else "outputs/paper")

@@ -1,4 +1,4 @@
-"""Modules of the folders below scripts/, by name."""
+"""Import modules from the folders below scripts/."""
 
 from __future__ import annotations
 

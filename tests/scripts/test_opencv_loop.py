@@ -1,4 +1,4 @@
-"""The OpenCV loop, the competitor of the benchmark, computes the same flow as the paper's method."""
+"""The OpenCV loop of the benchmark computes the flow of the paper's method."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from cflow_torch.data.log import window
 
 pytest.importorskip("cv2")
 S = 0.25  # pixel of the small scenes
-# (row, col, height, width) and the shift per sweep (rows, cols): apart by more than the shifts of three sweeps.
+# (row, col, height, width) and the shift per sweep (rows, cols); objects do not touch within three sweeps.
 OBJECTS = [((5, 5, 9, 6), (0, 1)), ((5, 30, 5, 9), (1, -1)), ((32, 8, 7, 7), (-1, 0)), ((35, 40, 12, 8), (0, 0))]
 
 
@@ -66,7 +66,7 @@ def assert_same(result: FlowResult, expected: FlowResult) -> None:
     ],
     ids=str,
 )
-def test_it_finds_objects_moved_by_whole_pixels(loop: Any, overrides: dict) -> None:
+def test_the_loop_finds_shifts_by_whole_pixels(loop: Any, overrides: dict) -> None:
     settings = config(**overrides)
     sweeps = moving_ells(settings.num_history)
     result = loop.opencv_flow(sweeps, settings)
@@ -75,7 +75,7 @@ def test_it_finds_objects_moved_by_whole_pixels(loop: Any, overrides: dict) -> N
         np.testing.assert_allclose(result.residual_flow, true_flow(), rtol=0, atol=1e-6)
 
 
-def test_it_agrees_on_the_real_pair(loop: Any, av2_folder: Any) -> None:
+def test_the_loop_agrees_on_the_real_pair(loop: Any, av2_folder: Any) -> None:
     settings, sweeps = make_config("paper"), window(AV2Log(av2_folder), 0)
     result, (expected,) = loop.opencv_flow(sweeps, settings), CorrelationFlow(settings, "cpu")([sweeps])
     assert torch.equal(result.cluster_id, expected.cluster_id)

@@ -1,4 +1,4 @@
-"""Tables and figures hold the paper's numbers and ours beside them."""
+"""Tables and figures have the paper's numbers next to ours."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ CLASSES = ("CAR", "OTHER_VEHICLES", "PEDESTRIAN", "WHEELED_VRU")
 SCALES = [(0.1,), (0.2, 0.1), (0.4, 0.2, 0.1), (0.8, 0.4, 0.2, 0.1), (0.8, 0.4, 0.3, 0.2, 0.1)]
 PAPER = make_config("paper")
 KEYS = make_config("paper", method="keypoints")
-# The settings of the rows of each table, in the paper's order.
+# Settings of the rows of each table, in the paper's order.
 JOBS: dict[str, list[Config]] = {
     "pixel_size": [PAPER.replace(pixel_size=size) for size in (0.05, 0.1, 0.2, 0.4)],
     "views": [PAPER, PAPER.replace(sectional_view=True)],
@@ -29,7 +29,7 @@ JOBS: dict[str, list[Config]] = {
 
 
 def write_run(root: Path, experiment: str, number: int, config: Config) -> None:
-    """A results file in which all errors are around (number + 1) / 10."""
+    """Write a results file in which all errors are around (number + 1) / 10."""
     error = 0.1 * (number + 1)
     scores = {name: {"dynamic_error": error + 0.01 * k} for k, name in enumerate(CLASSES)}
     ranges = {name: {"mean": {"dynamic_error": error + 0.2 * k}} for k, name in enumerate(("0-35", "35-70"))}
@@ -61,7 +61,7 @@ def table(root: Path, name: str) -> list[list[str]]:
     return [line.split(",") for line in (root / "paper" / f"{name}.csv").read_text().splitlines()]
 
 
-def test_tables_have_the_papers_numbers_beside_ours(tmp_path: Path, script: Any, capsys: Any) -> None:
+def test_tables_have_the_papers_numbers_next_to_ours(tmp_path: Path, script: Any, capsys: Any) -> None:
     pytest.importorskip("matplotlib")
     for experiment, configs in JOBS.items():
         for number, config in enumerate(configs):
