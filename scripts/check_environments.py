@@ -30,7 +30,7 @@ INSTALL = {
     "new": ["--upgrade", "--upgrade-strategy", "eager"],
 }
 PACKAGE = ("cflow_torch", "configs")
-NEED_PACKAGE = ("tests/test_distribution.py", "tests/integrations/test_hubconf.py")  # these look at the checkout
+NEED_PACKAGE = ("tests/test_distribution.py", "tests/integrations/test_hubconf.py")  # these read the checkout
 # Only the wheel of this Python may be imported.
 INSTALLED = """
 import pathlib, sysconfig, cflow_torch, cflow_torch.configs

@@ -117,7 +117,7 @@ def scan_rolling(
     """
     parts, first_laser = [], 0
     for number, unit in enumerate(profile.units):
-        first, end = unit.seen or (0, unit.num_columns)
+        first, end = unit.active_columns or (0, unit.num_columns)
         step = math.radians(unit.span) / unit.num_columns
         early = torch.rand((), generator=generator, dtype=torch.float64).item() if unit.has_jitter else 0.5
         columns = torch.arange(first, end)

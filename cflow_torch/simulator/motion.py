@@ -48,7 +48,7 @@ class Motion:
         stamped = self.ego_poses(np.array([seconds]))[0]
         poses, times = [], []
         for unit in profile.units:
-            columns = np.arange(*(unit.seen or (0, unit.num_columns)))
+            columns = np.arange(*(unit.active_columns or (0, unit.num_columns)))
             shots = seconds + interval * (columns / unit.num_columns - profile.reference)
             ego = np.broadcast_to(stamped, (len(shots), 4, 4)) if unit.is_virtual else self.ego_poses(shots)
             poses.append(torch.from_numpy(ego @ unit.T_ego_sensor))

@@ -74,13 +74,13 @@ def _truckscenes() -> LidarProfile:
 
     def corner(name: str, side: int) -> SpinningLidar:
         mounting = ((4.9, side * 1.5, 2.2), side * 45.0)
-        return SpinningLidar(name, _PANDAR_64, 1800, *mounting, seen=(225, 1575), reach=500.0)
+        return SpinningLidar(name, _PANDAR_64, 1800, *mounting, active_columns=(225, 1575), reach=500.0)
 
     def wide(name: str, position: tuple[float, float, float], yaw: float, pitch: float) -> SpinningLidar:
         return SpinningLidar(
             *(name, _uniform(-45, 45, 32), 1024, position, yaw),
             pitch=pitch,
-            seen=(256, 768),
+            active_columns=(256, 768),
             max_range=60.0,
             reach=110.0,
         )
@@ -108,7 +108,7 @@ def _waymo() -> LidarProfile:
         return SpinningLidar(
             *(name, rows, 600, position, yaw),
             start=180.0 - yaw,
-            seen=(ahead - 75, ahead + 75),
+            active_columns=(ahead - 75, ahead + 75),
             has_jitter=False,
             is_virtual=True,
             max_range=20.0,

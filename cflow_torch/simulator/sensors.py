@@ -22,7 +22,7 @@ class SpinningLidar:
         pitch: degrees about y before the yaw, positive = downwards.
         start: azimuth in the sensor frame at which a sweep begins, degrees: the outer edge of the first column.
         span: degrees of azimuth per sweep, positive = counter-clockwise about the sensor's z axis.
-        seen: first column that fires and the one after the last; None = all. The image keeps its `num_columns`.
+        active_columns: first column that fires, and the one after the last; None = all. The image has all columns.
             Negative columns are those at its end, but they fire before column 0.
         has_jitter: each sweep begins up to a column early, like a free-running motor; False = on a fixed grid.
         is_virtual: the shots are given as if the vehicle had been static at the time stamp (Waymo's small LiDARs).
@@ -38,7 +38,7 @@ class SpinningLidar:
     pitch: float = 0.0
     start: float = 180.0
     span: float = -360.0
-    seen: tuple[int, int] | None = None
+    active_columns: tuple[int, int] | None = None
     has_jitter: bool = True
     is_virtual: bool = False
     max_range: float | None = None

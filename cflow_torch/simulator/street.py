@@ -100,7 +100,7 @@ def _fixed(rng: np.random.Generator, ground: Ground) -> Iterator[Body]:
     """Houses, walls, poles, trees, bushes."""
     yield from houses(rng, ground)
     main, crossing = ground.half_widths[0], ground.crossing_x
-    # A hoarding beside moving cars (gap 0.2-0.4 m), a garden wall that parked cars almost touch.
+    # A hoarding next to moving cars (gap 0.2-0.4 m), a garden wall that parked cars almost touch.
     yield objects.wall(-24.0, 5.95, 20.0, 0.1, 2.0, albedo=0.7)
     yield objects.wall(crossing + 36.0, -main - 0.1, 24.0, 0.15, 1.1)
     yield from furniture(rng, ground)

@@ -121,7 +121,7 @@ def make_sets(names: Sequence[str], seeds: Sequence[tuple[int, int]], cache: Pat
             sets.append(ScoredSet(name, "sim", HISTORY, REGION, load, mean=mean))
     for name in names:
         if not any(_is_of(scored, name) for scored in sets):
-            raise CFlowError(f"there is no set {name!r}; give {', '.join((*GROUPS, *(s.name for s in sets)))}")
+            raise CFlowError(f"set {name!r} does not exist; give {', '.join((*GROUPS, *(s.name for s in sets)))}")
     return [scored for scored in sets if any(_is_of(scored, name) for name in names)]
 
 

@@ -10,7 +10,7 @@ move elsewhere in the drive; SA and DA leave them out. Ground is scored. We scor
 the last, in real scenes those with labels. Times are processor seconds per sweep, one thread, flow included.
 
 DUFOMap (pip install dufomap; optional): 0.1 m, d_s 0.2, d_p 2 and 1, clusters and propagation, rays from the LiDAR (the
-first one of several), points of 2 ... 50 m (with others it finds nothing on KITTI).
+first one of several), points of 2 ... 50 m (with others it finds no moving point on KITTI).
 
 The case "light" has a car that brakes and stops, and a car that starts up; its sensor is av2.
 """

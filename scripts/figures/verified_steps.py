@@ -39,12 +39,12 @@ ROWS = (
 )
 COLUMNS = (
     ("1  pixels", "Sweep t from above. A darker\npixel has more height slices."),
-    ("2  changed pixels", "All sweeps. Red pixels are missing\nin a sweep that saw their place."),
+    ("2  changed pixels", "All sweeps. Red pixels are missing\nin a sweep that saw their cell."),
     ("3  components", "A colour is a finest component that\nmay move. Boxes: solid = coarser,\n"
      "dotted = group of changed pixels,\ndashed = lies under an overhang."),
     ("4  cut", "A colour is an object selected to\nmove. Grey stays static. A striped\nobject lies under an overhang."),
     ("5  flow", f"Sweep t, after refinement. Grey\nmoves at most {MOVING:g} m per sweep.\n"
-     f"An arrow is the way in {ARROW_STEPS} sweeps."),
+     f"Arrows: displacement in {ARROW_STEPS} sweeps."),
 )  # fmt: skip
 STATIC, PALE, SHADES = (172, 179, 187), (214, 219, 224), np.array([[225], [190], [145], [95], [25]]).repeat(3, 1)
 WIDE, HIGH, GAP, LEFT, FOOT, HEAD = 2.6, 1.8, 0.11, 0.4, 1.0, 0.4  # inches

@@ -99,7 +99,7 @@ def test_rolling_shots_equal_brute_force(name):
     checked = wrong = wrong_solid = 0
     for number in (0, 1):
         unit = drive._profile.units[number]
-        first, end = unit.seen or (0, unit.num_columns)
+        first, end = unit.active_columns or (0, unit.num_columns)
         chosen = np.linspace(0, end - first - 1, 12).astype(int)
         T_world_sensor = ego.T_world_unit[number].clone()
         T_world_sensor[:, :3, 3] -= solids.origin
