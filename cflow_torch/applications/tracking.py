@@ -34,40 +34,26 @@ _BOX_NOISE, _FLOW_NOISE = 0.4, 0.02  # standard deviations: metres of a box's ce
 
 
 class _Tracks(NamedTuple):
-    """K tracks in the world frame; float64 unless another type is named.
+    """K tracks in the world frame; float64 unless another type is named."""
 
-    Args:
-        id: (K,) int64.
-        position, velocity, covariance: (K, 3), (K, 3), (K, 2, 2), the filtered `States`.
-        box, size: (K, 3) centre of the box and its length, width, height. After a sweep, the centre is predicted for
-            the next one.
-        heading: (K,) of the box, radians.
-        begin, start: (K,) seconds and (K, 3) box centre when the track was first seen.
-        travel: (K, 3) sum of its flow since then, metres.
-        confidence, evidence: (K,) of the flow when it last moved; sum of the log-odds.
-        num_points, num_moving, missed, cluster: (K,) int64 points, sweeps in which it moved, sweeps since it was last
-            seen, cluster_id.
-        is_moving, is_confirmed: (K,) bool.
-    """
-
-    id: Tensor
-    position: Tensor
-    velocity: Tensor
-    covariance: Tensor
-    box: Tensor
-    size: Tensor
-    heading: Tensor
-    begin: Tensor
-    start: Tensor
-    travel: Tensor
-    confidence: Tensor
-    evidence: Tensor
-    num_points: Tensor
-    num_moving: Tensor
-    missed: Tensor
-    cluster: Tensor
-    is_moving: Tensor
-    is_confirmed: Tensor
+    id: Tensor  # (K,) int64
+    position: Tensor  # (K, 3) metres, filtered
+    velocity: Tensor  # (K, 3) m/s, filtered
+    covariance: Tensor  # (K, 2, 2) of position and velocity
+    box: Tensor  # (K, 3) centre of the box; after a sweep, predicted for the next one
+    size: Tensor  # (K, 3) length, width, height of the box
+    heading: Tensor  # (K,) radians, of the box
+    begin: Tensor  # (K,) seconds, time of the first sweep
+    start: Tensor  # (K, 3) centre of the box in the first sweep
+    travel: Tensor  # (K, 3) metres, sum of the flow since then
+    confidence: Tensor  # (K,) of the flow when it last moved
+    evidence: Tensor  # (K,) sum of the log-odds of the confidence
+    num_points: Tensor  # (K,) int64
+    num_moving: Tensor  # (K,) int64 sweeps in which it moved
+    missed: Tensor  # (K,) int64 sweeps since it was last seen
+    cluster: Tensor  # (K,) int64 cluster_id, -1 = static
+    is_moving: Tensor  # (K,) bool
+    is_confirmed: Tensor  # (K,) bool
 
     @classmethod
     def none(cls, device: torch.device) -> _Tracks:
@@ -98,35 +84,22 @@ class _Tracks(NamedTuple):
 
 
 class _Matches(NamedTuple):
-    """How the tracks explain a sweep.
+    """Tracks that explain a sweep: track i continues in moving group i, or has stopped."""
 
-    Args:
-        track, group: (M,) int64 each: track i continues in moving group i.
-        stopped, num_points: (S,) int64 tracks that have stopped, and how many points lie in their boxes.
-        track_of_static: (P,) int64 for each static point the stopped track whose box holds it, -1 = none.
-    """
-
-    track: Tensor
-    group: Tensor
-    stopped: Tensor
-    num_points: Tensor
-    track_of_static: Tensor
+    track: Tensor  # (M,) int64
+    group: Tensor  # (M,) int64
+    stopped: Tensor  # (S,) int64 tracks
+    num_points: Tensor  # (S,) int64 points in the boxes of the stopped tracks
+    track_of_static: Tensor  # (P,) int64 for each static point the stopped track whose box holds it, -1 = none
 
 
 class _Times(NamedTuple):
-    """Seconds.
+    """Seconds."""
 
-    Args:
-        now: time of sweep t.
-        interval: from t to t+1.
-        elapsed: from the sweep before to t.
-        late: part of `elapsed` that the flow of the sweep before does not span.
-    """
-
-    now: float
-    interval: float
-    elapsed: float
-    late: float
+    now: float  # time of sweep t
+    interval: float  # from t to t+1
+    elapsed: float  # from the sweep before to t
+    late: float  # part of `elapsed` that the flow of the sweep before does not span
 
 
 class Tracked(NamedTuple):
