@@ -6,7 +6,7 @@ import inspect
 import logging
 from dataclasses import dataclass, replace
 from importlib import import_module
-from typing import Any, Mapping, Sequence
+from typing import Any, Mapping, NamedTuple, Sequence
 
 from cflow_torch.data.log import Log, LogWrapper
 from cflow_torch.data.log_check import check_log
@@ -21,53 +21,28 @@ AUTO = "auto"  # recognise the data set
 _log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class DataSet:
-    """One format.
+class DataSet(NamedTuple):
+    """One format: its reader's function root -> sources, its class source -> `Log`, what one log is, and the ends of
+    paths by which we recognise it."""
 
-    Args:
-        module: module of its reader, imported when it is needed.
-        find: name of the function root -> sources.
-        log: name of the class source -> `Log`.
-        what: description of one log, for error messages.
-    """
-
-    module: str
     find: str
     log: str
     what: str
+    marks: tuple[str, ...] = ()
 
 
+# The key is also the module of the reader, which is imported when it is needed.
 DATA_SETS: dict[str, DataSet] = {
-    "av2": DataSet("av2", "find_av2_logs", "AV2Log", "Argoverse 2 log (a folder with sensors/lidar)"),
-    "hdf5": DataSet("hdf5", "find_hdf5_scenes", "HDF5Log", "scene (a file *.h5)"),
-    "nuscenes": DataSet("nuscenes", "find_nuscenes_scenes", "NuScenesLog", "nuScenes scene (a folder with v1.0-*)"),
-    "truckscenes": DataSet(
-        "truckscenes", "find_truckscenes_scenes", "TruckScenesLog", "TruckScenes scene (a folder with v1.*)"
-    ),
-    "waymo": DataSet("waymo", "find_waymo_segments", "WaymoLog", "Waymo segment (a file lidar/*.parquet)"),
-    "pandaset": DataSet(
-        "pandaset", "find_pandaset_sequences", "PandaSetLog", "PandaSet sequence (a folder with lidar/poses.json)"
-    ),
-    "aevascenes": DataSet(
-        "aevascenes", "find_aevascenes_sequences", "AevaScenesLog", "AevaScenes sequence (a folder with sequence.json)"
-    ),
-    "bags": DataSet("bags", "find_bags", "BagLog", "bag (.bag, .mcap, or the folder of a ROS 2 bag)"),
-    "kiss_icp": DataSet("kiss_icp", "find_kiss_icp", "KissICPLog", "data for a loader of KISS-ICP"),
-    "arrays": DataSet("arrays", "find_array_logs", "ArraysLog", "folder of point clouds"),
-}
-
-
-# The ends of paths by which we recognise a format. Everything else is a folder of point clouds.
-_MARKS = {
-    "av2": ("sensors/lidar",),
-    "hdf5": ("*.h5",),
-    "nuscenes": ("v1.*/scene.json",),
-    "truckscenes": ("v1.*/scene.json",),
-    "waymo": ("lidar/*.parquet",),
-    "pandaset": ("lidar/poses.json",),
-    "aevascenes": ("sequence.json",),
-    "bags": ("*.bag", "*.mcap", "*.db3"),
+    "av2": DataSet("find_av2_logs", "AV2Log", "Argoverse 2 log", ("sensors/lidar",)),
+    "hdf5": DataSet("find_hdf5_scenes", "HDF5Log", "scene", ("*.h5",)),
+    "nuscenes": DataSet("find_nuscenes_scenes", "NuScenesLog", "nuScenes scene", ("v1.*/scene.json",)),
+    "truckscenes": DataSet("find_truckscenes_scenes", "TruckScenesLog", "TruckScenes scene", ("v1.*/scene.json",)),
+    "waymo": DataSet("find_waymo_segments", "WaymoLog", "Waymo segment", ("lidar/*.parquet",)),
+    "pandaset": DataSet("find_pandaset_sequences", "PandaSetLog", "PandaSet sequence", ("lidar/poses.json",)),
+    "aevascenes": DataSet("find_aevascenes_sequences", "AevaScenesLog", "AevaScenes sequence", ("sequence.json",)),
+    "bags": DataSet("find_bags", "BagLog", "bag", ("*.bag", "*.mcap", "*.db3")),
+    "kiss_icp": DataSet("find_kiss_icp", "KissICPLog", "data for a loader of KISS-ICP"),
+    "arrays": DataSet("find_array_logs", "ArraysLog", "folder of point clouds"),  # everything without a mark
 }
 _DEEPEST = 6  # levels below the root that are searched for a mark
 
@@ -96,7 +71,7 @@ def recognise(root: Any) -> str:
             raise CFlowError(f"{root}: there is no such file or folder; settings are NAME=VALUE")
         level, fitting = [top], set()
         for _ in range(_DEEPEST):
-            fitting = {name for name, marks in _MARKS.items() for path in level if any(map(path.match, marks))}
+            fitting = {name for name, one in DATA_SETS.items() for path in level if any(map(path.match, one.marks))}
             if fitting:
                 break
             level = [path for folder in level if folder.is_dir() for path in folder.iterdir() if path.name[0] != "."]
@@ -162,13 +137,13 @@ def find_sources(name: str, root: Any) -> Sequence[Any]:
         CFlowError: no such data set, or nothing of its format at the path.
         OSError: a remote path cannot be reached.
     """
-    data_set = _data_set(name)
-    find = getattr(import_module(f"cflow_torch.data.{data_set.module}"), data_set.find)
     top = as_path(root)
+    find = _import(name, "find")
     with remote_errors(top):
         sources = find(top)
     if not sources:
-        raise CFlowError(f"no {data_set.what} in {root}")
+        marks = " or ".join(DATA_SETS[name].marks)
+        raise CFlowError(f"no {DATA_SETS[name].what} in {root}" + (f": there is no {marks}" if marks else ""))
     return list(sources)
 
 
@@ -205,8 +180,7 @@ def open_log(
 
 
 def _open(name: str, source: Any, settings: Mapping[str, Any]) -> Log:
-    data_set = _data_set(name)
-    reader = getattr(import_module(f"cflow_torch.data.{data_set.module}"), data_set.log)
+    reader = _import(name, "log")
     known = list(inspect.signature(reader.__init__).parameters)[2:]  # of the class, Python 3.8 returns Protocol's
     unknown = sorted(set(settings) - set(known))
     if unknown:
@@ -243,7 +217,8 @@ class GroundSegmentedLog(LogWrapper):
         return replace(sweep, is_ground=is_ground)
 
 
-def _data_set(name: str) -> DataSet:
+def _import(name: str, part: str) -> Any:
+    """Import the function `find` or the class `log` of a data set."""
     if name not in DATA_SETS:
         raise CFlowError(f"data set {name!r}: choose one of {', '.join(DATA_SETS)}")
-    return DATA_SETS[name]
+    return getattr(import_module(f"cflow_torch.data.{name}"), getattr(DATA_SETS[name], part))

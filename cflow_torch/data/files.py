@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import io
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Callable, Iterator
 
 import numpy as np
 
-from cflow_torch.data.paths import source_for_full_read
+from cflow_torch.data.paths import read_bytes
 from cflow_torch.types import CFlowError
 
 Test = Callable[[Path], bool]
@@ -60,7 +61,7 @@ def read_npy(path: Path, hint: str) -> np.ndarray:
         CFlowError: the file is missing, truncated, not a .npy file, or holds an array of objects.
     """
     with file_errors(path, hint):
-        array = np.load(source_for_full_read(path), allow_pickle=False)
+        array = np.load(io.BytesIO(read_bytes(path)), allow_pickle=False)
         if not isinstance(array, np.ndarray):
             raise ValueError("it is an archive, not a .npy file")
         return array

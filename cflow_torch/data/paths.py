@@ -7,7 +7,6 @@ interface and the functions below.
 from __future__ import annotations
 
 import errno
-import io
 import mmap
 import re
 import shutil
@@ -107,22 +106,11 @@ def read_bytes(path: Path) -> bytes:
             unpacked archive can contain, is refused, because reading it might never end.
     """
     if not is_remote(path):
-        _check(path)
+        check_file(path)
         return path.read_bytes()
     remote: Any = path
     with remote_errors(path):
         return bytes(remote.fs.cat_file(remote.path))  # pathlib's interface would ask for the size first
-
-
-def source_for_full_read(path: Path) -> Any:
-    """Return what a library that reads all of a file should open: its name, or the contents if it is remote.
-
-    Raises:
-        OSError: as `read_bytes`.
-    """
-    if is_remote(path):
-        return io.BytesIO(read_bytes(path))
-    return _check(path)
 
 
 def source_for_random_access(path: Path) -> Any:
@@ -134,7 +122,7 @@ def source_for_random_access(path: Path) -> Any:
         OSError: a remote file cannot be opened; later, that it cannot be read.
     """
     if not is_remote(path):
-        return _check(path)
+        return check_file(path)
     return _open(path, cache_type="blockcache", block_size=_BLOCK, cache_options={"maxblocks": _KEPT_BLOCKS})
 
 
@@ -147,7 +135,7 @@ def source_for_mmap(path: Path) -> Any:
     Raises:
         OSError: a remote file cannot be read, or there is no space for the copy.
     """
-    return pa.BufferReader(_copy(path)) if is_remote(path) else _check(path)
+    return pa.BufferReader(_copy(path)) if is_remote(path) else check_file(path)
 
 
 @lru_cache(maxsize=_KEPT_COPIES)
@@ -164,7 +152,7 @@ def _open(path: Any, **settings: Any) -> Any:
         return path.fs.open(path.path, "rb", **settings)
 
 
-def _check(path: Path) -> str:
+def check_file(path: Path) -> str:
     """Return the name of a local file, which must be a regular file or a folder, and not a git-lfs pointer."""
     mode = path.stat().st_mode
     if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):

@@ -225,7 +225,7 @@ def test_broken_scenes_are_reported_and_the_others_labelled(scenes: Path, tmp_pa
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        ("{}", "no scene (a file *.h5) in {}"),
+        ("{}", "no scene in {}"),
         ("{}/nowhere", "nowhere is neither a file nor a folder"),
         ("data=av2 data.root={}", "labels are for HDF5 scenes of OpenSceneFlow"),
         ("{} model=paper", "give model=offline, default or fast"),

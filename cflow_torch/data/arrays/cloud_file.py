@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Mapping
 
@@ -13,7 +14,7 @@ from cflow_torch.data.arrays.pcd import read_pcd, write_pcd
 from cflow_torch.data.arrays.ply import read_ply, write_ply
 from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.files import file_errors, read_npy
-from cflow_torch.data.paths import PathLike, as_path, read_bytes, source_for_full_read
+from cflow_torch.data.paths import PathLike, as_path, read_bytes
 from cflow_torch.types import CFlowError
 
 SUFFIXES = (".npy", ".npz", ".bin", ".pcd", ".ply", ".feather", ".parquet")
@@ -106,7 +107,7 @@ def _read_bin(path: Path, columns: int) -> np.ndarray:
 def _read_numpy(path: Path) -> np.ndarray:
     hint = "pass plain arrays, not pickled objects"
     if path.suffix.lower() == ".npz":
-        with file_errors(path, hint), np.load(source_for_full_read(path), allow_pickle=False) as arrays:
+        with file_errors(path, hint), np.load(io.BytesIO(read_bytes(path)), allow_pickle=False) as arrays:
             if all(axis in arrays.files for axis in _AXES):
                 return _from_fields(path, {axis: arrays[axis] for axis in _AXES})
             named = [name for name in arrays.files if name in _CLOUD_KEYS]

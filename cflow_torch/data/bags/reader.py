@@ -14,7 +14,7 @@ from cflow_torch.data.bags.frames import Frames, Sample, sample, sorted_poses
 from cflow_torch.data.bags.point_cloud2 import points_and_times
 from cflow_torch.data.files import file_errors, find_folders, shortened
 from cflow_torch.data.log import Log
-from cflow_torch.data.paths import PathLike, as_path, is_remote, source_for_full_read
+from cflow_torch.data.paths import PathLike, as_path, check_file, is_remote
 from cflow_torch.data.rigid_motion import poses_at, transform_points
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.ego_motion import rigid_transform
@@ -143,7 +143,7 @@ class BagLog(Log):
             except ImportError:
                 raise CFlowError("bags need rosbags: pip install rosbags") from None
             for file in [self.path] if self.path.is_file() else self.path.iterdir():
-                source_for_full_read(file)
+                check_file(file)
             # Bags of ROS 2 before Iron do not describe their messages; these types never changed.
             reader = AnyReader([self.path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
             reader.open()
