@@ -141,7 +141,7 @@ def test_round_trip_of_a_simulated_drive(drive, tmp_path, points_frame):
             assert np.array_equal(log.values(index, "pose"), drive.poses[index]), "of the ego frame"
             assert log.values(index, "lidar_id").max() == len(units)
             assert np.array_equal(log.values(index, "lidar_center")[0], units[0].T_ego_sensor.astype(np.float32))
-            assert np.allclose(log.values(index, "lidar_dt") * 1e9, units[0].offset_ns, atol=10)
+            assert np.allclose(read.point_times * 1e9, units[0].offset_ns, atol=10)
             truth, labels = drive.labels(index), log.labels(index)
             if index == 2:
                 assert truth is labels is None and "ego_motion" not in log.keys(2)

@@ -55,6 +55,14 @@ def test_each_shot_is_moved_with_the_pose_of_its_time(recording, tiny, index):
     assert np.abs(raw - points).max() > 1
 
 
+def test_times_of_points_count_from_the_stamp_of_the_sweep(recording, tiny):
+    """Also those of LiDARs whose own sweeps have another stamp; the files have whole microseconds since 1970."""
+    expected = np.concatenate([unit.offset_ns for unit in recording.units(2)]) * 1e-9
+    times = open_log(tiny, own_vehicle=None).sweep(2).point_times
+    assert np.abs(times - expected).max() < 2e-6 and np.ptp(expected) > 0.01
+    assert open_log(tiny, own_vehicle=None, deskew=False).sweep(2).point_times is None
+
+
 def test_flow_of_raw_sweeps_is_exact_for_constant_motion(recording, tiny):
     """An object is found where its box was when the shot hit it, up to 2 m from where it is at the time stamp."""
     log, on_car = open_log(tiny, own_vehicle=None), recording.is_on_car()
