@@ -197,23 +197,6 @@ def test_bad_columns_are_refused(folder: Path, file: str, columns: dict[str, Any
     assert file in str(error.value)
 
 
-def test_truncated_and_missing_files_are_refused_when_they_are_read(folder: Path) -> None:
-    opened = AV2Log(folder)
-    for name in (SWEEP, POSES):
-        file = folder / name
-        whole = file.read_bytes()
-        for keep in (0, 10, len(whole) // 2, len(whole) - 8):
-            file.write_bytes(whole[:keep])
-            with pytest.raises(CFlowError, match=f"cannot read .*{name}"):
-                AV2Log(folder).sweep(0)
-        file.unlink()
-        with pytest.raises(CFlowError, match=f"{name} is missing; copy it"):
-            (opened if name == SWEEP else AV2Log(folder)).sweep(0)
-        assert len(opened.sweep(1).points) == 3
-        file.write_bytes(whole)
-    AV2Log(folder).sweep(0)
-
-
 def test_margin_overlap_and_end_of_track() -> None:
     points = np.array([[2.05, 0, 0], [0, 1.05, 0], [0, 0, 0.8], [1.9, 0, 0]])
     boxes0 = Boxes(

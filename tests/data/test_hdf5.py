@@ -83,16 +83,10 @@ def test_data_of_other_files_are_never_read(tmp_path):
 
 
 def test_files_that_are_no_scene(tmp_path):
-    whole = write_scene(tmp_path / "whole.h5").read_bytes()
-    (tmp_path / "half.h5").write_bytes(whole[: len(whole) // 2])
-    (tmp_path / "empty.h5").write_bytes(b"")
     write_scene(tmp_path / "one.h5", STAMPS[:1])
-    for name in ("half", "empty", "one", "missing"):
+    for name in ("one", "missing"):
         with pytest.raises(CFlowError, match=f"{name}.h5"):
             HDF5Log(tmp_path / f"{name}.h5")
-    (tmp_path / "bad.h5").write_bytes(b"a poem" * 1000)
-    with pytest.raises(CFlowError, match="cannot read .*bad.h5"):
-        HDF5Log(tmp_path / "bad.h5")
     with pytest.raises(CFlowError, match="nowhere"):
         find_hdf5_scenes(tmp_path / "nowhere")
 

@@ -155,27 +155,11 @@ def test_finding_scenes_and_reading_their_tables_once(tiny, tmp_path):
     assert (first.log_id, len(first), log.log_id, len(log)) == ("tiny", 6, "second", 4)
 
 
-TABLES = ("scene", "sample", "sensor", "calibrated_sensor", "sample_data", "ego_pose", "category", "instance")
-
-
-@pytest.mark.parametrize("table", [*TABLES, "sample_annotation"])
-def test_missing_truncated_and_foreign_tables(tiny, table):
-    file = tiny / VERSION / f"{table}.json"
-    whole = file.read_bytes()
-    for content, complaint in [
-        (whole[: len(whole) // 2], "cannot read .* truncated"),
-        (b"", "cannot read .* truncated"),
-        (b'{"token": "a"}', "cannot read .*KeyError|not a list of rows"),
-        (b"[1, 2]", "not a list of rows"),
-        (b'[{"a": 1}]', "cannot read .*KeyError"),
-    ]:
-        file.write_bytes(content)
-        with pytest.raises(CFlowError, match=complaint) as error:
-            open_log(tiny)
-        assert file.name in str(error.value)
-    file.unlink()
-    with pytest.raises(CFlowError, match=f"{file.name} is missing"):
-        NuScenesLog(SceneSource(tiny, VERSION, "tiny"))
+@pytest.mark.parametrize("content", [b'{"token": "a"}', b"[1, 2]", b'[{"a": 1}]'])
+def test_foreign_tables(tiny, content):
+    (tiny / VERSION / "sample_data.json").write_bytes(content)
+    with pytest.raises(CFlowError, match="cannot read .*sample_data.json .*(KeyError|not a list of rows)"):
+        open_log(tiny)
 
 
 @pytest.mark.parametrize(
@@ -210,7 +194,7 @@ def test_bad_sweeps(tiny):
     file = min((tiny / "samples" / "LIDAR_TOP").iterdir())
     whole, log = file.read_bytes(), open_log(tiny)
     kitti = np.random.default_rng(0).uniform(-50, 50, (100, 4)).astype("<f4").tobytes()  # four columns: 1600 bytes
-    for content, complaint in [(whole[:-1], "not a multiple of a row"), (b"", "0 bytes"), (kitti, "not a ring index")]:
+    for content, complaint in [(whole[:-1], "not a multiple of a row"), (kitti, "not a ring index")]:
         file.write_bytes(content)
         with pytest.raises(CFlowError, match=f"{file.name}.*{complaint}"):
             log.sweep(0)

@@ -138,11 +138,7 @@ def test_truck_and_trailer_are_removed(recording, tiny):
 def test_bad_sweeps(recording, tiny):
     log = open_log(tiny)
     file = next((tiny / "samples" / "LIDAR_LEFT").glob(f"*_{log.timestamps[0]}.pcd"))
-    whole, fields = file.read_bytes(), read_pcd(file)
-    for content in (whole[: len(whole) // 2], b""):
-        file.write_bytes(content)
-        with pytest.raises(CFlowError, match=f"{file.name}"):
-            log.sweep(0)
+    fields = read_pcd(file)
     for change, complaint in [
         ({"timestamp": None}, r"lacks the fields \['timestamp'\]"),
         ({"timestamp": fields["timestamp"] - fields["timestamp"].min()}, "microseconds since 1970.* deskew=False"),
