@@ -1,4 +1,4 @@
-"""A drive for the viewer rerun (extra `rerun`): points, flow, clusters, truth and ego motion on a timeline."""
+"""Recordings for the viewer rerun (extra `rerun`): points, flow, clusters, truth and ego motion on a timeline."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ CLUSTERS, ARROWS = f"{EGO}/lidar/clusters", f"{EGO}/arrows"
 TRACKS = "world/tracks"
 GROUND, NEXT_SWEEP = f"{EGO}/lidar/ground", f"{EGO}/lidar/next_sweep"
 MAX_FLOW = 1.5  # metres per sweep: 15 m/s at 10 Hz
-_DOT, _FINE_DOT = -1.5, -0.8  # negative: pixels of the screen
+_DOT, _FINE_DOT = -1.5, -0.8  # negative radii are pixels of the screen
 _STATIC, _GROUND_COLOR, _NEXT_COLOR = (132, 138, 147), (70, 74, 81), (60, 110, 130)
 _EGO_COLOR = (255, 255, 255)
 _NO_CLUSTER = (100, 105, 112)
 _BACKGROUND = (22, 25, 30)
-_CALENDAR = 10**17  # nanoseconds; later ones are a date (1973 and on), earlier ones a duration
+_CALENDAR = 10**17  # nanoseconds; a larger time stamp is a date (1973 or later), a smaller one a duration
 
 
 def record_log(
@@ -40,34 +40,34 @@ def record_log(
     max_flow: float = MAX_FLOW,
     tracks: Mapping[str, np.ndarray] | None = None,
 ) -> int:
-    """Writes a drive as .rrd, the format of the viewer rerun. The file appears complete or not at all.
+    """Save a drive as .rrd for the viewer rerun. The file appears complete or not at all.
 
     Args:
-        log: the drive; its sweeps are read again, and its labels where it has any.
-        results: (index, flow of sweep `index` to `index + 1`) in ascending order. Taken one by one, so a generator that
-            estimates them needs the memory of one.
-        path: ends in .rrd; its folder is made if absent, an older file is replaced.
-        max_flow: residual flow with the full colour, metres per sweep; the same for the whole drive. Faster is paler.
-        tracks: table of `cflow_torch.track`; its boxes at sweep t are shown with ids and speeds.
+        log: the drive. We read its sweeps again, and its labels if it has any.
+        results: (index, flow of sweep `index` to `index + 1`) in ascending order. They are taken one by one, so a
+            generator that estimates them needs the memory of one.
+        path: ends in .rrd. Its folder is created if it does not exist; an older file is replaced.
+        max_flow: residual flow with the full colour, metres per sweep, for the whole drive. Faster flow is darker.
+        tracks: table of `cflow_torch.track`; the boxes at sweep t are shown with ids and speeds.
 
     Returns:
         Number of pairs in the recording.
 
     Convention:
-        Entities: world/ego_vehicle moves through the world, whose origin is where the ego vehicle is at the end of the
-        first pair; in its frame, which is that of t+1: lidar/cflow (points of t, moved by the ego motion, coloured by
-        residual flow; up to `panel.MOVING` grey), lidar/clusters, lidar/ground,
-        lidar/next_sweep (points of t+1), lidar/ground_truth (coloured by the true residual flow, where there are
-        labels), arrows (one per moving cluster, `panel.ARROW_STEPS` sweeps long). world/trajectory is the way driven,
-        world/tracks the boxes of `tracks`.
-        Timelines: `sweep`, the index; `time`, where sweeps have times.
+        The origin of the world is the ego vehicle at the end of the first pair. world/ego_vehicle moves through it,
+        world/trajectory is its path, and world/tracks has the boxes of `tracks`. The frame of world/ego_vehicle is that
+        of t+1. It holds arrows (one per moving cluster, `panel.ARROW_STEPS` sweeps long) and these points:
+        - lidar/cflow: points of t, moved by the ego motion and coloured by residual flow, grey up to `panel.MOVING`
+        - lidar/ground_truth: points of t with known truth, coloured by the true residual flow
+        - lidar/clusters, lidar/ground: points of t; lidar/next_sweep: points of t+1
+        Timelines: `sweep`, the index; `time`, if sweeps have time stamps.
 
     Raises:
-        CFlowError: rerun-sdk is absent, another ending, a `max_flow` that is not positive, no result at all,
-            or a result with other rows than its sweep.
-        OSError: the log cannot be read, or the file not be written. What `results` raises stays as it is, too.
+        CFlowError: rerun-sdk is not installed, the path does not end in .rrd, `max_flow` is not positive, there is no
+            result, or a result and its sweep differ in length.
+        OSError: the log cannot be read, or the file cannot be written. An error of `results` is passed on.
 
-    Cost: about 20 bytes per point and pair on disk for each entity that shows it.
+    Cost: on disk about 20 bytes per point and pair for each entity that shows the point.
     """
     path = Path(path)
     if not 0 < max_flow < np.inf:
@@ -92,10 +92,10 @@ def record_log(
 
 
 def load_rerun() -> Any:
-    """The package.
+    """Import rerun.
 
     Raises:
-        CFlowError: it is absent.
+        CFlowError: rerun-sdk is not installed.
     """
     try:
         import rerun as rr
@@ -105,11 +105,11 @@ def load_rerun() -> Any:
 
 
 class _Drive:
-    """What has been logged so far.
+    """Log of one drive to a stream of rerun.
 
     Args:
         rr: the package.
-        stream: where to log to.
+        stream: the stream to log to.
         max_flow: metres per sweep, full colour.
     """
 
@@ -140,7 +140,7 @@ class _Drive:
         self._points(GROUND, position[is_known & ground], _GROUND_COLOR, _FINE_DOT)
         after = as_numpy(pc1.points)[:, :3]
         self._points(NEXT_SWEEP, after[np.isfinite(after).all(axis=1)], _NEXT_COLOR, _FINE_DOT)
-        if labels is not None or self.has_truth:  # a pair without labels must not keep those of an earlier one
+        if labels is not None or self.has_truth:  # no points clear the truth of an earlier pair
             self.has_truth = True
             flow = np.full((rows, 3), np.nan) if labels is None else labels.flow - pose_flow
             has = shown & np.isfinite(flow).all(axis=1) & (labels is not None and labels.is_valid)
@@ -164,33 +164,33 @@ class _Drive:
         self.count += 1
 
     def add_tracks(self, rows: Mapping[str, np.ndarray]) -> None:
-        """Boxes of the pair that was added last, at sweep t, in the world."""
+        """Log the boxes of the last pair, at sweep t, in the world."""
         T_shown_world = np.eye(4) if self.first_pose is None else np.linalg.inv(self.first_pose)
         centre = np.stack([rows[axis] for axis in "xyz"], 1) @ T_shown_world[:3, :3].T + T_shown_world[:3, 3]
         heading = rows["heading"] + np.arctan2(T_shown_world[1, 0], T_shown_world[0, 0])
-        turn = np.zeros((len(heading), 4))  # quaternions x, y, z, w
-        turn[:, 2], turn[:, 3] = np.sin(heading / 2), np.cos(heading / 2)
+        rotation = np.zeros((len(heading), 4))  # quaternions x, y, z, w
+        rotation[:, 2], rotation[:, 3] = np.sin(heading / 2), np.cos(heading / 2)
         boxes = self.rr.Boxes3D(
             centers=centre,
             half_sizes=np.stack([rows[name] for name in ("length", "width", "height")], 1) / 2,
-            quaternions=turn,
+            quaternions=rotation,
             colors=cluster_colors(centre, rows["id"], _NO_CLUSTER),
             labels=[f"{n}: {np.hypot(x, y):.1f} m/s" for n, x, y in zip(rows["id"], rows["vx"], rows["vy"])],
         )
         self.stream.log(TRACKS, boxes, strict=True)
 
     def end(self, log_id: str) -> None:
-        """Log what is known only now, and how the viewer lays it out."""
+        """Log the trajectory and the layout of the viewer."""
         if not self.count:
-            raise CFlowError(f"{log_id}: no pair, nothing to record")
+            raise CFlowError(f"{log_id}: there is no pair to record")
         rr = self.rr
         self.stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True, strict=True)
         outline = [(2.4, 0, 0), (-1.9, 1.15, 0), (-1.0, 0, 0), (-1.9, -1.15, 0), (2.4, 0, 0)]  # as in `panel`
         vehicle = rr.LineStrips3D([outline], colors=_EGO_COLOR, radii=0.05)
         self.stream.log(f"{EGO}/outline", vehicle, static=True, strict=True)
         if len(self.trajectory) > 1:
-            way = rr.LineStrips3D([np.stack(self.trajectory)], colors=_GROUND_COLOR, radii=0.05)
-            self.stream.log("world/trajectory", way, static=True, strict=True)
+            path = rr.LineStrips3D([np.stack(self.trajectory)], colors=_GROUND_COLOR, radii=0.05)
+            self.stream.log("world/trajectory", path, static=True, strict=True)
         self.stream.send_blueprint(self._layout())
 
     def _set_time(self, index: int, timestamp_ns: int | None) -> None:
@@ -201,7 +201,7 @@ class _Drive:
             self.stream.set_time("time", duration=np.timedelta64(int(timestamp_ns), "ns"))
 
     def _move(self, pose: Any) -> None:
-        """Ego frame of t+1 in the world, whose origin is near: the viewer counts in float32."""
+        """Log the ego frame of t+1 in the world. The origin must be near, because the viewer uses float32."""
         if pose is None:
             return
         T_world_ego = as_numpy(pose, np.float64)
@@ -222,7 +222,7 @@ class _Drive:
         return color
 
     def _layout(self) -> Any:
-        """The estimate to the left, truth and clusters to the right."""
+        """Lay out the viewer: the estimate on the left, truth and clusters on the right."""
         import rerun.blueprint as rrb
 
         def view(name: str, *hidden: str) -> Any:
@@ -231,8 +231,8 @@ class _Drive:
 
         estimate = view("estimate", TRUTH, CLUSTERS, NEXT_SWEEP)
         over_next = view("estimate and sweep t+1", TRUTH, CLUSTERS, GROUND)
-        beside = [view("clusters", ESTIMATE, TRUTH, NEXT_SWEEP, ARROWS)]
+        right = [view("clusters", ESTIMATE, TRUTH, NEXT_SWEEP, ARROWS)]
         if self.has_truth:
-            beside.insert(0, view("ground truth", ESTIMATE, CLUSTERS, NEXT_SWEEP, ARROWS))
-        parts = rrb.Horizontal(rrb.Tabs(estimate, over_next), rrb.Vertical(*beside), column_shares=[2, 1])
+            right.insert(0, view("ground truth", ESTIMATE, CLUSTERS, NEXT_SWEEP, ARROWS))
+        parts = rrb.Horizontal(rrb.Tabs(estimate, over_next), rrb.Vertical(*right), column_shares=[2, 1])
         return rrb.Blueprint(parts, collapse_panels=True)

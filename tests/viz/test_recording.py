@@ -166,7 +166,7 @@ def test_a_recording_that_breaks_off_leaves_nothing(tmp_path: Path, monkeypatch:
     with pytest.raises(OSError, match="disk read") as caught:
         record_log(log, [(0, result_of())], path)
     assert caught.value is error
-    with pytest.raises(CFlowError, match="nothing to record"):
+    with pytest.raises(CFlowError, match="no pair to record"):
         record_log(Street(), [], path)
     short = FlowResult(*[values[:7] for values in result_of()._given().values()])
     with pytest.raises(CFlowError, match="pair 0: the flow has 7 rows, its sweep 51 points"):
