@@ -1,4 +1,4 @@
-"""Bird's-eye pictures of flow and clusters: what they show, where, and how they are saved."""
+"""Bird's-eye pictures of flow and clusters: positions, colours, legends, and the saved file."""
 
 from __future__ import annotations
 
@@ -50,10 +50,10 @@ def pixels(figure: Figure) -> np.ndarray:
     return np.asarray(figure.canvas.buffer_rgba())[..., :3].copy()  # type: ignore[attr-defined]
 
 
-def colors_at(figure: Figure, *places: tuple[float, float], axes: int = 0) -> np.ndarray:
+def colors_at(figure: Figure, *positions: tuple[float, float], axes: int = 0) -> np.ndarray:
     """(K, 3) int, RGB of the picture at positions in metres."""
     image = pixels(figure)
-    column, row = np.rint(figure.axes[axes].transData.transform(places)).astype(int).T
+    column, row = np.rint(figure.axes[axes].transData.transform(positions)).astype(int).T
     return image[len(image) - 1 - row, column].astype(int)
 
 
@@ -137,9 +137,6 @@ def test_plot_flow_refuses(changed: dict, message: str) -> None:
         plot_flow(**{"points": np.zeros((5, 3)), "result_or_residual": np.zeros((5, 3)), **changed})
 
 
-# --- clusters
-
-
 def test_colours_of_clusters_lie_where_their_points_are() -> None:
     points = np.concatenate([block(12, 12), block(12, -8), block(-13, 2)])
     cluster = np.repeat([5, 2, -1], len(points) // 3)
@@ -158,15 +155,12 @@ def test_clusters_next_to_each_other_differ_in_colour() -> None:
     away = np.abs(corner[:, None] - corner).max(axis=2)
     one, other = np.nonzero((away < 3.0) & (away > 0))
     assert len(one) > 50 and (of_cluster[one] != of_cluster[other]).any(axis=1).all()
-    assert (colors.reshape(120, 30, 3) == colors[::30, None]).all(), "one colour a cluster"
+    assert (colors.reshape(120, 30, 3) == colors[::30, None]).all(), "one colour per cluster"
     none = cluster_colors(np.zeros((2, 2)), np.array([-1, -1]), (1, 2, 3))
     assert none.tolist() == [[1, 2, 3]] * 2
 
 
-# --- several pairs
-
-
-def test_frames_of_a_film_share_view_and_colours(scene: Scene) -> None:
+def test_frames_of_an_animation_share_view_and_colours(scene: Scene) -> None:
     points, flow, cluster = scene
     frames = [Frame(points, result_of(flow, cluster)), Frame(1.2 * points, result_of(0.5 * flow, cluster), cluster < 1)]
     for box in (None, OPEN):
@@ -180,9 +174,6 @@ def test_frames_of_a_film_share_view_and_colours(scene: Scene) -> None:
         assert views[0] == views[1] and rims[0] == rims[1] and rims[0][0].startswith("rim: 0.6 m")
     with pytest.raises(CFlowError, match="width=10"):
         list(flow_figures(frames, width=10))
-
-
-# --- the file
 
 
 def test_a_saved_picture_is_the_picture(scene: Scene, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""`cflow plot` draws every picture, `cflow view` records a drive; what cannot be drawn is told and leaves nothing."""
+"""`cflow plot` draws every picture and `cflow view` records a drive; a failure is reported and leaves no file."""
 
 from __future__ import annotations
 
@@ -77,8 +77,8 @@ def test_an_animation_has_a_picture_for_every_pair(
 ) -> None:
     assert cflow("plot", "picture=animation", "model=paper", "width=300", "first=1", SMALL) == 0
     assert "2 pairs from 1 to 2" in capsys.readouterr().out
-    with Image.open(tmp_path / "out" / "animation.gif") as film:
-        assert film.n_frames == 2 and film.size[0] == 300
+    with Image.open(tmp_path / "out" / "animation.gif") as gif:
+        assert gif.n_frames == 2 and gif.size[0] == 300
 
 
 @pytest.mark.parametrize(
@@ -93,7 +93,7 @@ def test_an_animation_has_a_picture_for_every_pair(
         (["picture=animation", "legend=middle", "count=1", "model=paper"], "legend"),
     ],
 )
-def test_a_picture_that_cannot_be_drawn_is_told(
+def test_a_picture_that_cannot_be_drawn_is_reported(
     arguments: list, message: str, cflow: Callable, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     assert cflow("plot", "pair=0", *arguments) == 2
@@ -102,7 +102,7 @@ def test_a_picture_that_cannot_be_drawn_is_told(
     assert not [file for file in tmp_path.rglob("*") if file.is_file()]
 
 
-def test_matplotlib_is_missed_before_the_work(
+def test_missing_matplotlib_is_reported_before_the_work(
     cflow: Callable, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     for name in ("matplotlib", "matplotlib.figure", "matplotlib.backends.backend_agg"):
@@ -111,7 +111,7 @@ def test_matplotlib_is_missed_before_the_work(
     assert cflow("plot") == 2 and "pip install matplotlib" in capsys.readouterr().err
 
 
-def test_a_recording_of_what_is_estimated_and_of_what_lies_in_a_folder(
+def test_a_recording_of_estimated_and_of_stored_flow(
     cflow: Callable, drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     pytest.importorskip("rerun")
