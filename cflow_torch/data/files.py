@@ -1,4 +1,4 @@
-"""What the readers share: one error for every file that cannot be read, .npy files, and the search for logs."""
+"""Shared by the readers: one error for every file that cannot be read, .npy files, and the search for logs."""
 
 from __future__ import annotations
 

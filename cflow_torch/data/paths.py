@@ -1,4 +1,4 @@
-"""Paths on this machine or wherever fsspec reaches, and how the readers open what they find there.
+"""Local and remote paths (by fsspec), and how the readers open their files.
 
 A path is a text ("/data/av2", "s3://bucket/av2"), a `pathlib.Path` or a `upath.UPath`. The readers use only pathlib's
 interface and the functions below.
@@ -30,11 +30,11 @@ _POINTER = b"version https://git-lfs.github.com/spec/"  # begins the file that g
 _KEPT_COPIES = 4  # files of `source_for_mmap`: two of the current Waymo segment, two of the previous one
 
 
-def as_path(place: PathLike) -> Path:
+def as_path(path: PathLike) -> Path:
     """Convert a text to a path.
 
     Args:
-        place: "scheme://..." for a file system of fsspec; "file://..." and everything else is a path on this machine.
+        path: "scheme://..." for a file system of fsspec; "file://..." and everything else is a path on this machine.
             Paths of pathlib and of universal_pathlib (for example with storage options of their own) stay unchanged.
 
     Returns:
@@ -44,34 +44,34 @@ def as_path(place: PathLike) -> Path:
         CFlowError: it is not a path; the extra `remote` or the package of the scheme's file system is missing; or
             fsspec does not know the scheme.
     """
-    if not is_path_like(place) or place == "" or "\0" in str(place):
-        raise CFlowError(f"{str(place)[:80]!r} is not a valid path: pass a string, a Path or 'scheme://...'")
-    if not isinstance(place, str):
-        return place
-    match = _SCHEME.match(place)
+    if not is_path_like(path) or path == "" or "\0" in str(path):
+        raise CFlowError(f"{str(path)[:80]!r} is not a valid path: pass a string, a Path or 'scheme://...'")
+    if not isinstance(path, str):
+        return path
+    match = _SCHEME.match(path)
     if match is None:
-        return Path(place)
+        return Path(path)
     scheme = match.group(1).lower()
     if scheme == "file":
-        return Path(place[match.end() :])
+        return Path(path[match.end() :])
     try:
         import fsspec
         from upath import UPath
     except ImportError:
-        raise CFlowError(f"{place} is remote, which needs: pip install universal_pathlib fsspec") from None
+        raise CFlowError(f"{path} is remote, which needs: pip install universal_pathlib fsspec") from None
     try:
         fsspec.get_filesystem_class(scheme)
     except (ImportError, ValueError) as error:  # it names the missing package
         raise CFlowError(
-            f"fsspec has no file system {scheme}:// ({error}): {place}; is it spelled correctly?"
+            f"fsspec has no file system {scheme}:// ({error}): {path}; is it spelled correctly?"
         ) from error
-    path: Any = UPath(f"{scheme}://{place[match.end() :].rstrip('/')}")
-    return path  # type: ignore[no-any-return]
+    found: Any = UPath(f"{scheme}://{path[match.end() :].rstrip('/')}")
+    return found  # type: ignore[no-any-return]
 
 
-def is_remote(place: Any) -> bool:
+def is_remote(path: Any) -> bool:
     """Whether a path is one of fsspec's, which `open` and memory mapping do not support."""
-    return hasattr(place, "storage_options") and not isinstance(place, (PosixPath, WindowsPath))
+    return hasattr(path, "storage_options") and not isinstance(path, (PosixPath, WindowsPath))
 
 
 def is_path_like(value: Any) -> bool:

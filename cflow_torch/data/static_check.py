@@ -44,7 +44,7 @@ class StaticResidual:
         index, later: the two sweeps.
         shift: (2,) float64 metres by which structure of `index`, moved by the poses, misses that of `later`; x, y of
             the later sweep's frame.
-        rotation: radians about z, likewise.
+        rotation: radians about z by which it is rotated.
         agreement: 0 ... 1, how well the structure of both coincides under the poses; 0.3 to 0.5 for two sweeps of a
             street. NaN if too little can be compared.
         aligned: agreement after `shift` and `rotation` are removed.
@@ -98,12 +98,12 @@ def static_world_residual(log: Log, index: int, baseline: int = BASELINE) -> Sta
     if own * min(len(source), len(target)) < _FEWEST_IN_PLACE:
         return StaticResidual(index, index + baseline, shift, rotation, float("nan"), float("nan"), "")
     inverted = patches.agreement(_move(source, pose1 @ np.linalg.inv(pose0)))
-    still = patches.agreement(source[:, :2])
+    unmoved = patches.agreement(source[:, :2])
     size, distance = float(np.linalg.norm(shift)), float(np.linalg.norm(T_1_0[:3, 3]))
     verdict = ""
-    if inverted > max(_BETTER * agreement, _GOOD, still):
+    if inverted > max(_BETTER * agreement, _GOOD, unmoved):
         verdict = "The poses seem to be inverted. They must map ego coordinates to the world (T_world_ego)."
-    elif still > max(_BETTER * agreement, _GOOD) or max(agreement / _HOPELESS, aligned / _ALIGNED) < own:
+    elif unmoved > max(_BETTER * agreement, _GOOD) or max(agreement / _HOPELESS, aligned / _ALIGNED) < own:
         verdict = (
             "The sweeps do not fit. Do the poses have another log, other axes (a camera's), times or units? Or are the "
             "points already in one common frame (then pass no poses)?"

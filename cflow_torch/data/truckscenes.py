@@ -8,11 +8,20 @@ from typing import ClassVar, Mapping, Sequence
 import numpy as np
 
 from cflow_torch.data.arrays.pcd import pcd_fields
-from cflow_torch.data.nuscenes.categories import TRUCKSCENES_CATEGORIES
-from cflow_torch.data.nuscenes.reader import Footprint, NuScenesLog
+from cflow_torch.data.nuscenes.reader import NUSCENES_CATEGORIES, OWN_TRAILER, Footprint, NuScenesLog
 from cflow_torch.data.nuscenes.tables import SceneSource, find_scenes
 from cflow_torch.data.paths import PathLike
 from cflow_torch.types import CFlowError
+
+TRUCKSCENES_CATEGORIES: dict[str, str] = {
+    **NUSCENES_CATEGORIES,
+    "animal": "NONE",
+    "static_object.traffic_sign": "SIGN",
+    "vehicle.other": "NONE",
+    "vehicle.train": "NONE",
+    OWN_TRAILER: "NONE",
+}
+"""Category of a box -> name in Argoverse 2, as for nuScenes."""
 
 
 def find_truckscenes_scenes(root: PathLike) -> list[SceneSource]:

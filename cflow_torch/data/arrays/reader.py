@@ -103,7 +103,7 @@ class ArraysLog(Log):
         self.log_id = self.folder.resolve().name
         self.files = _one_suffix(self.folder, suffix)
         self._bin_columns = bin_columns
-        self._ground = _beside(self.folder, ground, (GROUND_FOLDER,), "ground")
+        self._ground = _resolve(self.folder, ground, (GROUND_FOLDER,), "ground")
         self.ego_T_lidar = np.eye(4) if ego_T_lidar is None else rigid_transform(ego_T_lidar, "ego_T_lidar")
         trajectory, source, in_lidar = self._trajectory(poses, calibration)
         stamps = self._times(times, trajectory)
@@ -128,11 +128,11 @@ class ArraysLog(Log):
         """Return the poses, their name for messages, and whether a calibration converted them to the LiDAR's."""
         if is_path_like(poses):
             kitti = self.folder.resolve().parent.parent / "poses" / f"{self.log_id}.txt"
-            file = _beside(self.folder, poses, POSE_FILES, "poses", kitti)
+            file = _resolve(self.folder, poses, POSE_FILES, "poses", kitti)
             if file is None:
                 return None, "", False
             trajectory = read_poses(file)
-            chosen = _beside(self.folder, calibration, ("calib.txt",), "calibration")
+            chosen = _resolve(self.folder, calibration, ("calib.txt",), "calibration")
             if chosen is None or (calibration == "auto" and trajectory.layout != "kitti"):
                 return trajectory, str(file), False
             T_cam_lidar = read_calibration(chosen)
@@ -145,7 +145,7 @@ class ArraysLog(Log):
     def _times(self, times: Any, trajectory: Trajectory | None) -> list[int] | None:
         """Return the nanoseconds of each sweep; None = unknown."""
         count = len(self.files)
-        file = _beside(self.folder, times, ("times.txt",), "times")
+        file = _resolve(self.folder, times, ("times.txt",), "times")
         if file is not None:
             stamps = read_times(file).tolist()
             if len(stamps) != count:
@@ -177,20 +177,20 @@ def natural_key(name: str) -> tuple[Any, ...]:
 
 def _clouds(folder: Path) -> tuple[Path, dict[str, list[Path]]]:
     """Return the folder of a log's clouds, and those of each suffix that has two or more."""
-    for place in (folder, *(folder / name for name in POINT_FOLDERS)):
+    for parent in (folder, *(folder / name for name in POINT_FOLDERS)):
         kinds: dict[str, list[Path]] = {}
-        if place.is_dir():
-            for path in place.iterdir():
+        if parent.is_dir():
+            for path in parent.iterdir():
                 if path.suffix.lower() in SUFFIXES and path.stem.lower() not in _OTHER_STEMS and path.name[0] != ".":
                     kinds.setdefault(path.suffix.lower(), []).append(path)
         kinds = {suffix: files for suffix, files in kinds.items() if len(files) > 1}
         if kinds:
-            return place, kinds
+            return parent, kinds
     return folder, {}
 
 
 def _one_suffix(folder: Path, suffix: str | None) -> list[Path]:
-    place, kinds = _clouds(folder)
+    parent, kinds = _clouds(folder)
     if suffix is not None:
         kinds = {kind: files for kind, files in kinds.items() if kind == "." + suffix.lower().lstrip(".")}
     if not kinds:
@@ -199,16 +199,16 @@ def _one_suffix(folder: Path, suffix: str | None) -> list[Path]:
             f"({suffix or ', '.join(SUFFIXES)}); scene flow needs two or more"
         )
     if len(kinds) > 1:
-        raise CFlowError(f"{place} has several kinds of clouds, {', '.join(sorted(kinds))}: choose one with suffix=...")
+        raise CFlowError(f"{parent} has several kinds of clouds, {', '.join(sorted(kinds))}: choose one by suffix=...")
     return sorted(next(iter(kinds.values())), key=lambda path: natural_key(path.stem))
 
 
-def _beside(folder: Path, setting: PathLike | None, names: Sequence[str], what: str, *elsewhere: Path) -> Path | None:
+def _resolve(folder: Path, setting: PathLike | None, names: Sequence[str], what: str, *elsewhere: Path) -> Path | None:
     """Return the file or folder that a setting names; None = none."""
     if setting is None:
         return None
     if setting == "auto":
-        found = [place for place in (*(folder / name for name in names), *elsewhere) if place.exists()]
+        found = [parent for parent in (*(folder / name for name in names), *elsewhere) if parent.exists()]
         if len(found) > 1:
             raise CFlowError(f"{folder} has several: {', '.join(p.name for p in found)}; choose one with {what}=...")
         return found[0] if found else None

@@ -40,7 +40,7 @@ class Frames:
         """Whether transforms connect the two frames."""
         return self.chain(frame)[-1] == self.chain(other)[-1]
 
-    def moves(self, frame: str) -> np.ndarray:
+    def change_times(self, frame: str) -> np.ndarray:
         """Return (K,) int64 nanoseconds, ascending, at which changing transforms from the root to a frame are known."""
         times = [self._links[child][0] for child in self.chain(frame)[:-1]]
         return np.unique(np.concatenate([np.zeros(0, np.int64), *(t for t in times if len(t) > 1)]))

@@ -101,7 +101,7 @@ class BagLog(Log):
             self._arrival, tracks = self._scan()
             self.frame = frame or (_BASE if self._frames.are_joined(_BASE, self._lidar) else self._lidar)
             if poses == "auto":
-                has_tf = len(self._frames.moves(self.frame)) > 1
+                has_tf = len(self._frames.change_times(self.frame)) > 1
                 poses = "tf" if has_tf else self._chosen(topics, _POSE_TYPES, None, "poses") if tracks else None
             elif poses not in (None, "tf"):
                 poses = self._chosen(topics, _POSE_TYPES, poses, "poses")
@@ -196,7 +196,7 @@ class BagLog(Log):
     def _trajectory(self, poses: str, tracks: dict[str, list[Sample]]) -> tuple[np.ndarray, np.ndarray]:
         """Return (M,) int64 times of transforms or messages, and (M, 4, 4) `T_world_ego` at these times."""
         if poses == "tf":
-            times = self._frames.moves(self.frame)
+            times = self._frames.change_times(self.frame)
             matrices = self._frames.in_root(self.frame, times)
         else:
             times, matrices = sorted_poses(tracks.get(poses, []), poses)

@@ -11,7 +11,6 @@ from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes, mak
 from cflow_torch.data.files import file_errors
 from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.data.names import path_inside
-from cflow_torch.data.nuscenes.categories import NUSCENES_CATEGORIES, OWN_TRAILER
 from cflow_torch.data.nuscenes.tables import LidarChain, SceneSource, Tables, find_scenes
 from cflow_torch.data.nuscenes.tracks import Tracks
 from cflow_torch.data.paths import PathLike, as_path, read_bytes
@@ -23,6 +22,34 @@ _TIME_SLICE = 10_000  # microseconds during which we use one position of a movin
 MAX_SHOT_LAG = 1_000_000  # microseconds from a shot to its sweep; larger values mean another unit or clock
 _ROW = np.dtype("<f4")
 _COLUMNS = 5  # x, y, z, intensity, ring
+OWN_TRAILER = "vehicle.ego_trailer"  # the trailer of the recording truck of TruckScenes
+
+NUSCENES_CATEGORIES: dict[str, str] = {
+    "animal": "ANIMAL",
+    "human.pedestrian.adult": "PEDESTRIAN",
+    "human.pedestrian.child": "PEDESTRIAN",
+    "human.pedestrian.construction_worker": "PEDESTRIAN",
+    "human.pedestrian.personal_mobility": "PEDESTRIAN",
+    "human.pedestrian.police_officer": "PEDESTRIAN",
+    "human.pedestrian.stroller": "STROLLER",
+    "human.pedestrian.wheelchair": "WHEELCHAIR",
+    "movable_object.barrier": "NONE",
+    "movable_object.debris": "NONE",
+    "movable_object.pushable_pullable": "NONE",
+    "movable_object.trafficcone": "CONSTRUCTION_CONE",
+    "static_object.bicycle_rack": "NONE",
+    "vehicle.bicycle": "BICYCLE",
+    "vehicle.bus.bendy": "ARTICULATED_BUS",
+    "vehicle.bus.rigid": "BUS",
+    "vehicle.car": "REGULAR_VEHICLE",
+    "vehicle.construction": "LARGE_VEHICLE",
+    "vehicle.emergency.ambulance": "LARGE_VEHICLE",
+    "vehicle.emergency.police": "REGULAR_VEHICLE",
+    "vehicle.motorcycle": "MOTORCYCLE",
+    "vehicle.trailer": "VEHICULAR_TRAILER",
+    "vehicle.truck": "TRUCK",
+}
+"""Category of a box -> name in Argoverse 2; NONE = background, although its points move with the box."""
 
 
 class Footprint(NamedTuple):

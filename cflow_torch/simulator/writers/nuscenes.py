@@ -12,7 +12,7 @@ from typing import Any, Dict, List, Mapping, Sequence
 import numpy as np
 
 from cflow_torch.data.names import safe_name
-from cflow_torch.data.nuscenes.categories import NUSCENES_CATEGORIES
+from cflow_torch.data.nuscenes.reader import NUSCENES_CATEGORIES
 from cflow_torch.data.rigid_motion import to_quaternions
 from cflow_torch.simulator.recording import Recording, UnitReturns
 from cflow_torch.simulator.writers.av2 import new_folder
