@@ -49,8 +49,8 @@ def in_pieces(config: Config, windows: list[Window]) -> Results:
     """Little memory; points, images, look-ups and key points in pieces of other sizes."""
     pieces = {
         "ops.chunks.CHUNK_ON_CPU": 997,
-        "dense.correlation._AT_ONCE_CPU": 600,
-        "dense.correlation._IN_PART_CPU": 900,
+        "dense.correlation._PER_CALL_CPU": 600,
+        "dense.correlation._PER_RUN_CPU": 900,
         "verified.paired_test._AT_ONCE_CPU": 500,
         "keypoints.match_candidates._PAIRS_AT_ONCE_CPU": 5000,
         "keypoints.match_candidates._TILE_ROWS": 3,

@@ -53,4 +53,4 @@ def deskew(window: Window, result: FlowResult, sweep_interval: float = 0.1) -> T
         rotation[:3, :3] = relative_transform(before.pose, after.pose)[:3, :3]
         flow = compensate(flow, rotation)
     times = torch.as_tensor(before.point_times).to(flow.device, torch.float64)
-    return (read_positions(before, flow.device) - flow * (times / interval)).t()
+    return (read_positions([before], flow.device) - flow * (times / interval)).t()

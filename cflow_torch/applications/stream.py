@@ -153,10 +153,10 @@ class FlowStream:
                 if (known is None) != (given is None):
                     raise CFlowError(f"some sweeps of the stream have no {name}: give it for all sweeps, or for none")
         device = choose_device([Window(sweep, sweep)], self._model.device)
-        points = read_positions(sweep, device).t()
+        points = read_positions([sweep], device).t()
         is_ground, pose, times = sweep.is_ground, sweep.pose, sweep.point_times
         if is_ground is not None:
-            is_ground = read_ground(sweep, "the sweep", len(points), device).clone()
+            is_ground = read_ground(sweep, "the sweep", device).clone()
         elif self._ground is not None:
             is_ground = find_ground_batch([points], "grid" if self._ground == "auto" else self._ground)[0]
         if times is not None:

@@ -45,7 +45,7 @@ class Frame:
         if np.array_equal(self.sensor_to_ego, np.eye(4)):
             return self.points
         device = self.points.device if isinstance(self.points, Tensor) else torch.device("cpu")
-        points = compensate(read_positions(Sweep(self.points), device), self.sensor_to_ego).t()
+        points = compensate(read_positions([Sweep(self.points)], device), self.sensor_to_ego).t()
         return points if isinstance(self.points, Tensor) else points.numpy()
 
 

@@ -122,7 +122,7 @@ class HeightSlicedSweeps:
             part[points] = slice_of(positions[2], SLICE_HEIGHT)
             if ground is not None and batch.ground is not None and min_height is not None:
                 window = floor_divide(batch.image[points].long(), batch.num_steps)
-                height = batch.ground.below(positions, window, ground)
+                height = batch.ground.at(positions, window, ground)
                 is_tall[points] = positions[2] * 100 >= height + round(100 * min_height)
         if ground is not None:  # after all points are drawn: a tall one makes its pixel tall whatever else lies there
             image.index_fill_(0, torch.where(is_tall, place, num_places), 2)
@@ -166,7 +166,7 @@ class HeightSlicedSweeps:
         rank = torch.arange(count + 1, count + 1 + len(pixel), dtype=torch.int32, device=rows.device)
         of_point = self.pixel_of_point + (self.pixel_of_point == count) * len(pixel)  # "none" is a larger number now
         return HeightSlicedSweeps(
-            self.batch.with_twice_the_windows(),
+            self.batch.with_empty_windows(),
             self.grid,
             self.image,
             self.rank.scatter_(0, place, rank),

@@ -73,7 +73,7 @@ class VerifiedFlow(SceneFlowModel):
         """Motion of everything in a batch, by occupied pixel; ids number what is static or moves together."""
         if self.config.num_future == 0:
             return self.estimate(batch)
-        sides, copied = batch.both_sides()
+        sides, copied = batch.split_past_and_future()
         return choose_side(sides, copied, self.estimate(sides))
 
     def estimate(self, batch: Batch) -> TurningMotion:

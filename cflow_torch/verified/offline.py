@@ -30,7 +30,8 @@ def choose_side(sides: Batch, copied: Tensor, motion: TurningMotion) -> TurningM
     """The motion of each point by the past or by the future.
 
     Args:
-        sides: what `Batch.both_sides` gives: points, then the copies of those of t+1 and t in windows of the future.
+        sides: the result of `Batch.split_past_and_future`: points, then copies of those of t+1 and t in windows of the
+            future.
         copied: (K,) int64, the points that have copies.
         motion: of all of them.
 

@@ -1,1 +1,1 @@
-"""What comes in: sweeps of windows, checked, in the frame of t+1, on one BEV grid."""
+"""Input: check the sweeps of windows, bring them into the frame of t+1, find the ground, collate batches."""

@@ -1,4 +1,4 @@
-"""Points <-> pixels: the bird's-eye-view grid and its occupancy images (Eq. 3d_to_bev, bev_dims)."""
+"""The bird's-eye-view grid: map points to pixels and draw occupancy images (Eq. 3d_to_bev, bev_dims)."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from torch import Tensor
 
 from cflow_torch.types import CFlowError
 
-# Pixel keys and labels of all images of a batch are int64, but nobody wants to wait for more pixels than this.
+# int64 indices allow more pixels, but images of this size already take minutes.
 _MOST_PIXELS = 2**30
-# Shifts of longer images would not fit the one number that orders them (ties of the correlation).
+# The correlation packs a shift into one number to break ties; shifts of longer images would not fit.
 LONGEST_SIDE = 2**15
 
 
@@ -31,7 +31,7 @@ class Grid:
     upper: tuple[float, ...]
 
     def __post_init__(self) -> None:
-        # Not `height` and `width`: a side may be too long for any whole number.
+        # `height` and `width` would raise here: a side may be infinite.
         rows, cols = ((self.upper[axis] - self.lower[axis]) / self.pixel_size + 1 for axis in (1, 0))
         if not (max(rows, cols) < LONGEST_SIDE + 1 and self.height * self.width <= _MOST_PIXELS):
             raise CFlowError(
@@ -51,16 +51,16 @@ class Grid:
         return math.floor((self.upper[0] - self.lower[0]) / self.pixel_size) + 1
 
     def contains(self, positions: Tensor) -> Tensor:
-        """Which positions are finite and inside the region, both ends included.
+        """Test whether positions are finite and inside the region, both ends included.
 
         Args:
-            positions: (2, N) or (3, N) float64, metres, frame of t+1; without z every finite height is taken as inside.
+            positions: (2, N) or (3, N) float64, metres, frame of t+1; without z every height is inside.
 
         Returns:
             (N,) bool.
         """
-        # NaN equals nothing, and infinity is not the largest finite number. The answer is written in place as ones and
-        # zeros: on the CPU two comparisons that write bools take almost twice as long.
+        # A value is inside if clamping keeps it; NaN and infinity fail. eq_ writes ones and zeros in place: on the CPU
+        # two comparisons that write bools take almost twice as long.
         largest = torch.finfo(positions.dtype).max
         inside, *others = (
             values.clamp(max(lower, -largest), min(upper, largest)).eq_(values)
@@ -77,14 +77,14 @@ class Grid:
             positions: (2, N) or (3, N) float64, metres, frame of t+1.
 
         Returns:
-            (N,) int32; means nothing for positions outside the region.
+            (N,) int32; undefined for positions outside the region.
 
         Convention:
-            floor((p - p_lower) / s) with a true division in float64: the divisor is a tensor because a GPU
-            multiplies by the reciprocal of a plain number, which rounds differently.
+            floor((p - p_lower) / s) with a true division in float64. The divisor is a tensor, because a GPU multiplies
+            by the reciprocal of a plain number, which rounds differently.
         """
         size = torch.full((), self.pixel_size, dtype=positions.dtype, device=positions.device)
-        # Nothing inside is below the lower end: there, cutting the fraction off is the floor.
+        # Inside the region nothing is below the lower end, so int() rounds down.
         col = (positions[0] - self.lower[0]).div_(size).int()
         row = (positions[1] - self.lower[1]).div_(size).int()
         return col.add_(row, alpha=self.width)
@@ -92,14 +92,14 @@ class Grid:
     def pixel_of_image(
         self, positions: Tensor, image: Tensor, num_images: int, is_active: Tensor | None = None
     ) -> Tensor:
-        """The pixel of every point in a stack of images.
+        """Pixel of every point in a stack of images.
 
         Args:
             positions: (2, N) or (3, N) float64, metres, frame of t+1.
             image: (N,) int32 or int64, image of each point.
             num_images: B.
-            is_active: (N,) bool, False = the point is left out; it must be False outside the region. None = all points
-                are inside and take part.
+            is_active: (N,) bool, False = leave the point out; it must be False outside the region. None = all points
+                are active and inside.
 
         Returns:
             (N,) int32, or int64 where int32 is too small: flat index into B x H x W pixels; B * H * W for points that
@@ -115,7 +115,7 @@ class Grid:
         return pixel
 
     def draw(self, pixel: Tensor, num_images: int) -> Tensor:
-        """(B, H, W) bool: the images that are set at these (N,) int64 pixels, as `pixel_of_image` numbers them."""
+        """(B, H, W) bool images, set at (N,) int64 pixels from `pixel_of_image`."""
         num_pixels = num_images * self.height * self.width
         occupancy = torch.zeros(num_pixels + 1, dtype=torch.bool, device=pixel.device).index_fill_(0, pixel, True)
         return occupancy[:-1].view(num_images, self.height, self.width)

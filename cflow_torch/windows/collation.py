@@ -1,4 +1,4 @@
-"""Collation: windows of arrays or tensors -> one checked batch of tensors in the frame of t+1."""
+"""Collate windows of arrays or tensors into one checked batch of tensors in the frame of t+1."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from cflow_torch.ops.indices import flat_nonzero, split_index
 from cflow_torch.types import Window
 from cflow_torch.windows.bev_grid import Grid
 from cflow_torch.windows.ground_heights import GroundHeights
-from cflow_torch.windows.pieces import groups_of, read_pieces
+from cflow_torch.windows.pieces import PieceReader
 from cflow_torch.windows.timeline import Timeline
 
 
@@ -23,29 +23,30 @@ class Batch:
     """Points of all sweeps of all windows, sweep by sweep: t+1 of every window, then t of every window, then t-1, ...,
     then t+2, t+3, ...
 
-    Points that do not take part (not finite, ground, the vehicle's own, outside the images) are left out, but for those
-    of pc0: all its rows are here, so that results are read off without being scattered. The images may be larger than
-    the region: what lies in their margin takes part, but has no result.
+    The batch holds the active points: finite, not ground, not of the vehicle itself, inside the images. Of pc0 it holds
+    every row, so that results are read off in the order of the input. The images may be larger than the region: points
+    in the margin are active, but have no result.
 
     Args:
-        positions: (A, P) float64, metres, frame of t+1 of the point's window; A = 2, x and y, where nothing asks for z,
-            else 3.
-        is_active: (P,) bool, False = a row of pc0 that does not take part; its position means nothing.
-        has_result: (P,) bool, False = a row of pc0 that does not take part, or lies outside the region.
-        image: (P,) int32, window * num_steps + step of each point; step 0 = sweep t+1, 1 = t, 2 = t-1, ...,
-            steps of sweeps after t+1 stand behind those of the longest history.
+        positions: (A, P) float64, metres, frame of t+1 of the point's window. A = 2, x and y, for methods that do not
+            need z, else 3.
+        is_active: (P,) bool, False = a row of pc0 that is not active; its position is undefined.
+        has_result: (P,) bool, False = a row of pc0 that is not active or lies outside the region.
+        image: (P,) int32, window * num_steps + step of each point; step 0 = sweep t+1, 1 = t, 2 = t-1, .... Steps of
+            sweeps after t+1 follow those of the longest history.
         num_newest: number of points of t+1, the first ones; they are never warped.
         num_windows: B.
         num_steps: S, 1 + the longest list of sweeps up to t + the longest list of sweeps after t+1.
-        elapsed: (B, S) float64, sweep intervals from the sweep to t+1: the k that divides an estimate and
-            scales a warp (0 for step 0 and for sweeps that a window lacks, negative for sweeps after t+1).
-        seconds: (B, S) float64, the same in seconds, for `max_speed`.
-        origin: (B, S, 3) float64, metres, frame of t+1: where the ego frame of each sweep has its origin.
-        rows: of each window, where the rows of its pc0 are among the P points; they follow each other.
+        elapsed: (B, S) float64, sweep intervals from the sweep to t+1, the k that divides an estimate and scales a
+            warp. 0 for step 0 and for sweeps that a window lacks, negative for sweeps after t+1.
+        seconds: (B, S) float64, `elapsed` in seconds, for `max_speed`.
+        origin: (B, S, 3) float64, metres, frame of t+1: origin of the ego frame of each sweep.
+        rows: for each window the slice of the P points that holds its pc0.
         pose_flow: (N, 3) float32, metres, T_ego1_ego0 p - p of all rows of pc0; 0 for points that are not finite.
-        ground: of the ground points of t and t+1; None = nothing asks.
-        point_times: (P,) float32, sweep intervals from the instant of its sweep to the measurement of each point, whole
-            2^-20; 0 in windows of which a sweep has none. None = no window has them, or nothing asks.
+        ground: heights of the ground points of t and t+1; None = the method does not need them.
+        point_times: (P,) float32, sweep intervals from the instant of its sweep to the measurement of each point,
+            multiples of 2^-20; 0 in windows of which a sweep has no times. None = no window has them, or the method
+            does not need them.
     """
 
     positions: Tensor
@@ -63,52 +64,50 @@ class Batch:
     ground: GroundHeights | None = None
     point_times: Tensor | None = None
 
-    def with_twice_the_windows(self) -> Batch:
-        """The batch with empty windows B ... 2 B - 1 behind its own, of the same times and origins."""
+    def with_empty_windows(self) -> Batch:
+        """Append as many windows without points, with the times and origins of the given ones."""
         elapsed, seconds, origin = (torch.cat((of, of)) for of in (self.elapsed, self.seconds, self.origin))
         return replace(self, num_windows=2 * self.num_windows, elapsed=elapsed, seconds=seconds, origin=origin)
 
-    def both_sides(self) -> tuple[Batch, Tensor]:
-        """The sweeps up to t+1, and in as many further windows t+1, t and the sweeps after them.
+    def split_past_and_future(self) -> tuple[Batch, Tensor]:
+        """Give the sweeps after t+1 windows of their own.
 
         Returns:
-            The batch: its points, those of later sweeps in window B + w instead of w, then copies of all points of t+1
-            and t; and the points that have copies, (K,) int64.
+            A batch of 2 B windows: window w has the sweeps up to t+1, window B + w has t+1, t and the sweeps after t+1.
+            Its points are those of this batch, then copies of all points of t+1 and t for the windows B ... 2 B - 1.
+            Second, the points that have copies, (K,) int64.
         """
-        is_after = (self.elapsed < 0).any(0)
-        num_after = int(is_after.sum())
-        num_past, first = self.num_steps - num_after, self.num_steps - num_after
-        num_steps = max(num_past, num_after + 2)
+        num_future = int((self.elapsed < 0).any(0).sum())
+        num_past = self.num_steps - num_future
+        num_steps = max(num_past, num_future + 2)
         window, step = split_index(self.image.long(), self.num_steps)
-        copied = flat_nonzero(step < 2)
-        is_later = step >= first
-        window = torch.where(is_later, window + self.num_windows, window)
-        step = torch.where(is_later, step - first + 2, step)
-        image = window * num_steps + step
+        copied, is_future = flat_nonzero(step < 2), step >= num_past
+        window = torch.where(is_future, window + self.num_windows, window)
+        image = window * num_steps + torch.where(is_future, step - num_past + 2, step)
         copies = image.index_select(0, copied) + self.num_windows * num_steps
 
-        def sides(values: Tensor) -> Tensor:
-            past, after = (values.new_zeros((self.num_windows, num_steps, *values.shape[2:])) for _ in range(2))
-            past[:, :num_past] = values[:, :first]
-            after[:, : num_after + 2] = torch.cat((values[:, :2], values[:, first:]), 1)
-            return torch.cat((past, after))
+        def of_windows(values: Tensor) -> Tensor:
+            past, future = (values.new_zeros((self.num_windows, num_steps, *values.shape[2:])) for _ in range(2))
+            past[:, :num_past] = values[:, :num_past]
+            future[:, : num_future + 2] = torch.cat((values[:, :2], values[:, num_past:]), 1)
+            return torch.cat((past, future))
 
-        def more(values: Tensor) -> Tensor:
+        def with_copies(values: Tensor) -> Tensor:
             return torch.cat((values, values.index_select(0, copied)))
 
         batch = replace(
             self,
             positions=torch.cat((self.positions, self.positions.index_select(1, copied)), 1),
-            is_active=more(self.is_active),
-            has_result=more(self.has_result),
+            is_active=with_copies(self.is_active),
+            has_result=with_copies(self.has_result),
             image=torch.cat((image, copies)).int(),
             num_windows=2 * self.num_windows,
             num_steps=num_steps,
-            elapsed=sides(self.elapsed),
-            seconds=sides(self.seconds),
-            origin=sides(self.origin),
-            ground=None if self.ground is None else self.ground.twice(),
-            point_times=None if self.point_times is None else more(self.point_times),
+            elapsed=of_windows(self.elapsed),
+            seconds=of_windows(self.seconds),
+            origin=of_windows(self.origin),
+            ground=None if self.ground is None else self.ground.repeated(),
+            point_times=None if self.point_times is None else with_copies(self.point_times),
         )
         return batch, copied
 
@@ -122,95 +121,49 @@ def make_batch(
     needs_ground: bool = False,
     needs_times: bool = False,
 ) -> Batch:
-    """Check windows, bring every sweep into the frame of its t+1, keep what takes part.
+    """Check windows, bring every sweep into the frame of its t+1, and keep the active points.
 
     Args:
         windows: B windows, at least one.
-        config: `ego_box`, `sweep_interval`, `point_cloud_range`; the nearest `num_history` older
-            sweeps are used; `num_future` bounds what is accepted.
-        grid: the images, which hold the region; which of the scales they belong to does not matter here.
-        device: where the batch is to lie.
-        num_axes: coordinates that are kept, 2 or 3.
-        needs_ground: whether heights of the ground are kept as well.
-        needs_times: whether the times of points are kept as well.
+        config: `ego_box`, `sweep_interval`, `point_cloud_range`, `num_history` and `num_future` are used. Of a longer
+            history the nearest sweeps are taken.
+        grid: the images of any scale; they contain the region.
+        device: device of the batch.
+        num_axes: coordinates to keep, 2 or 3.
+        needs_ground: keep the heights of the ground as well.
+        needs_times: keep the times of the points as well.
 
     Returns:
-        The batch, on one device.
+        The batch.
 
     Raises:
-        CFlowError: wrong shape or dtype, a transform that is not rigid, mixed devices, poses for some sweeps
-            only, more sweeps after t+1 than `num_future`, time stamps out of order, poses too far apart.
+        CFlowError: wrong shape or dtype, a transform that is not rigid, tensors on several devices, poses for some
+            sweeps only, more sweeps after t+1 than `num_future`, time stamps out of order, poses too far apart.
 
-    Cost: linear in points; the only Python loops over sweeps, because they arrive as lists; on a GPU each
-        is read by itself, and what follows is done for all at once.
+    Cost: linear in points. The only Python loops are over sweeps, because these arrive as lists.
     """
     timeline = Timeline.of(windows, config, grid, needs_times)
     ground = GroundHeights(len(windows), grid, device) if needs_ground else None
-    most, num_steps = sum(entry.sweep.points.shape[0] for entry in timeline.entries), timeline.table.shape[2]
-    positions = torch.empty((num_axes, most), dtype=torch.float64, device=device)
-    is_active = torch.ones(most, dtype=torch.bool, device=device)
-    region = Grid(grid.pixel_size, config.point_cloud_range[:3], config.point_cloud_range[3:])
-    has_result = is_active if region == grid else torch.ones_like(is_active)
-    image = torch.empty(most, dtype=torch.int32, device=device)
-    has_times = any(entry.interval is not None for entry in timeline.entries)
-    point_times = torch.zeros(most, dtype=torch.float32, device=device) if has_times else None
-    num_rows = [window.pc0.points.shape[0] for window in windows]
+    pieces = list(PieceReader(timeline, config, grid, device, num_axes, ground).pieces())
     with torch.inference_mode(False):  # becomes part of the results
-        pose_flow = torch.zeros((sum(num_rows), 3), dtype=torch.float32, device=device)
-    stop = num_newest = 0
-    for group in groups_of(timeline.entries, device):
-        first_step = group[0].step
-        for piece in read_pieces(group, 3 if first_step == 1 else num_axes, grid, config, device):
-            if ground is not None and piece.is_ground is not None and first_step <= 1:
-                found = flat_nonzero(piece.is_ground)
-                ground.add(_take(piece.window, found), piece.moved.index_select(1, found))
-            if first_step == 1:  # all rows
-                points = slice(stop, stop + piece.is_active.numel())
-                positions[:, points] = piece.moved[:num_axes]
-                is_active[points] = piece.is_active
-                if has_result is not is_active:
-                    torch.logical_and(piece.is_active, region.contains(piece.moved), out=has_result[points])
-                row = None
-            else:
-                row = flat_nonzero(piece.is_active)
-                points = slice(stop, stop + row.numel())
-                for values, of_axis in zip(positions[:, points].unbind(0), piece.moved.unbind(0)):
-                    torch.index_select(of_axis, 0, row, out=values)
-            image[points] = _take(piece.window * num_steps + piece.step, row)
-            if point_times is not None and piece.times is not None:
-                point_times[points] = _take(piece.times, row)
-            if first_step == 1 and piece.moved is not piece.raw:
-                _write_pose_flow(pose_flow[stop - num_newest : points.stop - num_newest], piece.raw, piece.moved)
-            stop = points.stop
-        num_newest = stop if first_step == 0 else num_newest
+        pose_flow = torch.cat([piece.pose_flow for piece in pieces if piece.pose_flow is not None])
+    point_times = [piece.point_times for piece in pieces if piece.point_times is not None]
+    num_newest = sum(piece.image.numel() for piece in pieces if piece.step == 0)
+    starts = list(accumulate([num_newest, *(window.pc0.points.shape[0] for window in windows)]))
     elapsed, seconds, *origin = torch.as_tensor(timeline.table, device=device).unbind(0)
-    starts = [num_newest, *(num_newest + last for last in accumulate(num_rows))]
     return Batch(
-        positions=positions[:, :stop],
-        is_active=is_active[:stop],
-        has_result=has_result[:stop],
-        image=image[:stop],
+        positions=torch.cat([piece.positions for piece in pieces], 1),
+        is_active=torch.cat([piece.is_active for piece in pieces]),
+        has_result=torch.cat([piece.has_result for piece in pieces]),
+        image=torch.cat([piece.image for piece in pieces]),
         num_newest=num_newest,
         num_windows=len(windows),
-        num_steps=num_steps,
+        num_steps=timeline.table.shape[2],
         elapsed=elapsed,
         seconds=seconds,
         origin=torch.stack(origin, 2),
         rows=tuple(slice(*ends) for ends in zip(starts, starts[1:])),
         pose_flow=pose_flow,
         ground=ground,
-        point_times=None if point_times is None else point_times[:stop],
+        point_times=torch.cat(point_times) if point_times else None,
     )
-
-
-def _take(values: int | Tensor, row: Tensor | None) -> int | Tensor:
-    """Values of some points, None = of all; a number stands for the same value everywhere."""
-    return values if row is None or not isinstance(values, Tensor) else values.index_select(0, row)
-
-
-def _write_pose_flow(pose_flow: Tensor, raw: Tensor, moved: Tensor) -> None:
-    """(N, 3) float32 T p - p; 0 for points that are not finite. Overwrites `raw`."""
-    for of_axis, difference in zip(pose_flow.unbind(1), torch.sub(moved, raw, out=raw).unbind(0)):
-        of_axis.copy_(difference)
-    # A point that is not finite has no finite coordinate after the transform.
-    pose_flow.nan_to_num_(0.0, 0.0, 0.0)

@@ -1,4 +1,4 @@
-"""Ego motion: poses -> everything in the frame of t+1 (Eq. def_scene_flow). Float64 throughout."""
+"""Ego motion compensation: bring sweeps into the frame of t+1 with their poses (Eq. def_scene_flow), in float64."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from torch import Tensor
 from cflow_torch.types import Array, CFlowError, as_numpy
 from cflow_torch.windows.validation import resolution
 
-# A pose moves all points: its type must hold it to so many metres.
+# A pose moves all points, so its type must resolve this distance, metres.
 _COARSEST_POSE = 0.01
-# How far R R^T may be from the identity. Poses stored in float32 are within 1e-6.
+# Largest allowed |R R^T - I|. Poses stored in float32 are within 1e-6.
 _ORTHOGONALITY = 1e-3
 
 
 def rigid_transform(matrix: Any, name: str, reach: float = 0.0) -> np.ndarray:
-    """A checked 4 x 4 rigid transform in float64.
+    """Check a rigid transform and convert it to float64.
 
     Args:
         matrix: (4, 4) array or tensor.
-        name: what to call it in an error, for example "T_ego1_ego0".
-        reach: metres from the origin up to which points are transformed.
+        name: its name in errors, for example "T_ego1_ego0".
+        reach: largest distance of a point from the origin, metres.
 
     Returns:
         (4, 4) float64.
 
     Raises:
-        CFlowError: wrong shape, not finite, not a rotation with a translation, or of a type that does not hold it to a
+        CFlowError: wrong shape, not finite, not a rotation with a translation, or a type that does not resolve a
             centimetre.
     """
     dtype = getattr(matrix, "dtype", None)
@@ -40,7 +40,7 @@ def rigid_transform(matrix: Any, name: str, reach: float = 0.0) -> np.ndarray:
         raise CFlowError(f"{name} is {type(matrix).__name__}: give a (4, 4) matrix of numbers") from None
     if result.shape != (4, 4):
         raise CFlowError(f"{name} has shape {result.shape}: give one (4, 4) matrix (no batch dimension)")
-    # Plain numbers: NumPy's way to ask the same of sixteen takes ten times as long, once per sweep.
+    # Plain numbers: for sixteen of them NumPy takes ten times as long, once per sweep.
     rows = result.tolist()
     if not all(math.isfinite(value) for row in rows for value in row):
         raise CFlowError(f"{name} holds NaN or infinite values: give a finite rigid transform")
@@ -74,7 +74,7 @@ def relative_transform(pose1: Any, pose: Any, name: str = "pose") -> np.ndarray:
     Args:
         pose1: (4, 4) `T_world_ego1`, pose of sweep t+1.
         pose: (4, 4) `T_world_ego`, pose of another sweep.
-        name: what to call `pose` in an error.
+        name: name of `pose` in errors.
 
     Returns:
         (4, 4) float64.
@@ -86,20 +86,19 @@ def relative_transform(pose1: Any, pose: Any, name: str = "pose") -> np.ndarray:
 
 
 def compensate(positions: Tensor, T_ego1_ego: Array | None, num_axes: int = 3) -> Tensor:
-    """Positions in the frame of t+1.
+    """Transform positions to the frame of t+1.
 
     Args:
         positions: (3, N) float64, metres, in the ego frame of their sweep; rows x, y, z.
-        T_ego1_ego: (4, 4) float64, array or tensor, or (3, 4, N), that of each point; None = already in the frame of
-            t+1.
-        num_axes: A, how many coordinates are asked for: 2 = x and y only.
+        T_ego1_ego: (4, 4) float64, array or tensor, or (3, 4, N), one per point; None = already in the frame of t+1.
+        num_axes: A, number of coordinates; 2 = x and y only.
 
     Returns:
         (A, N) float64. A point that is not finite has no finite coordinate after a transform.
 
     Convention:
-        ((R0 x + R1 y) + R2 z) + t with one rounding per operation, no matrix product: the same bits
-        on every device.
+        ((R0 x + R1 y) + R2 z) + t with one rounding per operation instead of a matrix product: the same bits on every
+        device.
 
     Source: Eq. def_scene_flow.
     """

@@ -1,11 +1,11 @@
-"""Ground points without a map, for any mounting height, many sweeps at once.
+"""Segment the ground without a map, for any mounting height, many sweeps at once.
 
-Idea: (1) The ground near the vehicle is the height on which most flat spots lie, once the tilt is taken out: a plane.
-(2) Heights above that plane fall into a grid; of each cell the lowest counts. (3) The ground is the highest surface of
-limited slope below all of those: what stands on it is steeper. Done twice, first with slopes as steep as hills, then,
-about the smoothed result, with gentle ones. (4) A point is ground if it lies less than a threshold above the surface.
+Idea: (1) Near the vehicle, most flat spots lie on one plane. (2) We grid the heights above that plane and keep the
+lowest of each cell. (3) The ground is the highest surface of limited slope below these heights, because objects on the
+ground are steeper. We fit it twice: first with slopes as steep as hills, then with gentle ones about the smoothed
+result. (4) A point is ground if it lies less than a threshold above the surface.
 
-All of it is arithmetic on whole millimetres: the same bits in any batch, in any order of the points, on any device.
+All arithmetic is in whole millimetres, so the bits do not depend on the batch, the order of points or the device.
 """
 
 from __future__ import annotations
@@ -25,29 +25,29 @@ from cflow_torch.windows.validation import check_points, choose_device, read_pos
 METHODS = ("grid", "patchwork")
 THRESHOLD = 0.3  # metres above the surface; the rule of the Argoverse 2 raster
 
-# A cell is a power of two of a millimetre: floor division is a shift, also of negative numbers.
+# Cells are powers of two of a millimetre, so floor division is a shift, also for negative numbers.
 _CELL_BITS, _CELLS = 10, 256  # 1.024 m
 
-_HIGHEST = 1 << 28  # heights are cut off there, mm
-_PATCHWORK_HEIGHT = 1.723  # metres, sensor height that Patchwork++'s other settings are made for
+_HIGHEST = 1 << 28  # heights are clamped to this, mm
+_PATCHWORK_HEIGHT = 1.723  # metres, sensor height that Patchwork++'s default settings assume
 
 
 def find_ground(points: Array, method: str = "grid", threshold: float = THRESHOLD, device: Any = "auto") -> Array:
-    """Ground points of one sweep.
+    """Segment the ground points of one sweep.
 
     Args:
         points: (N, 3+) float, metres, array or tensor; z roughly up, origin on, in or above the vehicle, at any height
             (sensor frame or ego frame). Columns after z are ignored.
         method: "grid" or "patchwork" (Patchwork++, `pip install pypatchworkpp`).
-        threshold: metres; points up to that far above the surface, and all points below it, are ground. "grid" only.
-        device: "auto" = that of a tensor given, else a GPU if there is one, else the CPU; the result is the same.
+        threshold: metres, "grid" only; points up to this height above the surface, and all points below it, are ground.
+        device: "auto" = the device of a tensor, else a GPU if there is one, else the CPU. The result is the same.
 
     Returns:
-        (N,) bool, True = ground; an array for an array, a tensor on the same device for a tensor.
+        (N,) bool, True = ground. An array for an array, a tensor on the same device for a tensor.
 
     Convention:
-        All False where there is no ground: fewer than 20 pairs of flat spots (2 m x 2 m) 4 m apart within 32 m.
-        NaN and infinite points and points with |x| or |y| >= 131 m are not ground. Order of points, other sweeps of
+        All False if there is no ground: fewer than 20 pairs of flat spots (2 m x 2 m) 4 m apart within 32 m. NaN and
+        infinite points and points with |x| or |y| >= 131 m are not ground. The order of points, the other sweeps of
         the batch and shifts by whole millimetres in z do not change the result.
 
     Raises:
@@ -62,14 +62,14 @@ def find_ground(points: Array, method: str = "grid", threshold: float = THRESHOL
 def find_ground_batch(
     clouds: Sequence[Array], method: str = "grid", threshold: float = THRESHOLD, device: Any = "auto"
 ) -> list[Array]:
-    """Ground points of several sweeps at once; each result is that of `find_ground`.
+    """Segment the ground points of several sweeps at once. The results equal those of `find_ground`.
 
     Args:
-        clouds: B clouds, (N, 3+) each; tensors must lie on one device.
+        clouds: B clouds, (N, 3+) each; tensors must be on one device.
         method, threshold, device: as in `find_ground`.
 
     Returns:
-        B masks, (N,) bool each, array or tensor as the cloud.
+        B masks, (N,) bool each, array or tensor like the cloud.
 
     Raises:
         CFlowError: as `find_ground`, or tensors on several devices.
@@ -96,15 +96,15 @@ def find_ground_batch(
 
 @one_thread()
 def has_ground(clouds: Sequence[Array], most_points: int = 30_000, device: Any = "auto") -> list[bool]:
-    """Whether there is ground in each of several sweeps, from a part of their points.
+    """Test whether each of several sweeps contains ground, on a part of its points.
 
     Args:
-        clouds: B clouds, (N, 3+) each; tensors must lie on one device.
-        most_points: of a cloud with more, every second, third, ... point is looked at.
+        clouds: B clouds, (N, 3+) each; tensors must be on one device.
+        most_points: larger clouds are thinned to every second, third, ... point.
         device: as in `find_ground`.
 
     Returns:
-        B answers.
+        B bools.
 
     Raises:
         CFlowError: wrong shape or dtype, tensors on several devices.
@@ -122,7 +122,7 @@ def has_ground(clouds: Sequence[Array], most_points: int = 30_000, device: Any =
 
 
 def ground_points(positions: Tensor, sweep: Tensor, num_sweeps: int, threshold: int) -> Tensor:
-    """Method "grid" on tensors.
+    """Segment the ground by method "grid".
 
     Args:
         positions: (3, N) float64, metres.
@@ -147,20 +147,19 @@ def ground_points(positions: Tensor, sweep: Tensor, num_sweeps: int, threshold: 
 
 
 def _stack(clouds: Sequence[Array], device: Any) -> tuple[Tensor, Tensor]:
-    """(3, N) float64 positions of all clouds and (N,) int64 cloud of each, on one device."""
+    """(3, N) float64 positions of all clouds, and (N,) int64, the cloud of each point, on one device."""
     for number, cloud in enumerate(clouds):
         check_points(cloud, f"points of sweep {number}")
     sweeps = [Sweep(cloud) for cloud in clouds]
     chosen = choose_device([Window(sweep, sweep) for sweep in sweeps], device)
-    positions = [read_positions(sweep, chosen) for sweep in sweeps]
-    together = positions[0] if len(positions) == 1 else torch.cat(positions, 1)
-    count = torch.tensor([part.shape[1] for part in positions], device=chosen)
-    of_point = torch.arange(len(clouds), device=chosen).repeat_interleave(count, output_size=together.shape[1])
-    return together, of_point
+    count = torch.tensor([cloud.shape[0] for cloud in clouds], device=chosen)
+    positions = read_positions(sweeps, chosen)
+    of_point = torch.arange(len(clouds), device=chosen).repeat_interleave(count, output_size=positions.shape[1])
+    return positions, of_point
 
 
 def _patchwork(positions: Tensor, sweep: Tensor, num_sweeps: int) -> Tensor:
-    """Method "patchwork": Patchwork++ with its own defaults, the cloud lifted to the sensor height that they suit."""
+    """(N,) bool by Patchwork++ with its default settings. We lift the cloud to the sensor height that they assume."""
     try:
         import pypatchworkpp
     except ImportError:
@@ -168,7 +167,7 @@ def _patchwork(positions: Tensor, sweep: Tensor, num_sweeps: int) -> Tensor:
     points, inside = millimetres(positions)
     plane = near_plane(points, sweep, inside, num_sweeps)
     result = np.zeros(positions.shape[1], dtype=bool)
-    for number in range(num_sweeps):  # a foreign library that takes one cloud at a time
+    for number in range(num_sweeps):  # the library takes one cloud at a time
         mine = (inside & (sweep == number)).cpu().numpy().nonzero()[0]
         if not bool(plane.is_there[number]):
             continue

@@ -1,4 +1,4 @@
-"""Height of the ground around each place, from the ground points of a window."""
+"""Height of the ground around a point, from the ground points of its window."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from torch import Tensor
 
 from cflow_torch.windows.bev_grid import Grid
 
-# Side of the blocks in which heights are averaged, metres; with the eight blocks around, 6 m x 6 m.
+# Side of the blocks in which heights are averaged, metres; with the eight blocks around it, 6 m x 6 m.
 _BLOCK = 2.0
-# Fewer ground points than this in 6 m x 6 m say nothing.
-_LEAST_POINTS = 5
-# Heights are whole centimetres, bounded so that no sum overflows; unknown ground lies deeper than any point.
+# With fewer ground points than this in 6 m x 6 m the height is unknown.
+_FEWEST_POINTS = 5
+# Heights are whole centimetres, bounded so that no sum overflows; unknown ground lies below every point.
 _HIGHEST = 10**10
 _UNKNOWN = -(1 << 40)
 
 
 class GroundHeights:
-    """Sums over blocks of 2 m x 2 m. Sums of integers: neither the order of the points nor that of the pieces matters.
+    """Sums of heights in blocks of 2 m x 2 m. Integers, so the order of points and pieces does not matter.
 
     Args:
         num_windows: B.
         grid: the region.
-        device: where the sums lie.
+        device: device of the sums.
     """
 
     def __init__(self, num_windows: int, grid: Grid, device: torch.device) -> None:
@@ -38,7 +38,7 @@ class GroundHeights:
         """Count ground points.
 
         Args:
-            window: (N,) int64, or one for all.
+            window: (N,) int64, or one number for all points.
             positions: (3, N) float64, metres, frame of t+1, inside the region.
         """
         block = self._block(positions).long() + window * self._heights[0].numel()
@@ -46,35 +46,35 @@ class GroundHeights:
         self._heights.view(-1).index_add_(0, block, height)
         self._counts.view(-1).index_add_(0, block, torch.ones_like(height))
 
-    def twice(self) -> GroundHeights:
-        """The same ground for as many windows once more, behind these."""
-        twice = copy(self)
-        twice._heights, twice._counts = (torch.cat((of, of)) for of in (self._heights, self._counts))
-        return twice
+    def repeated(self) -> GroundHeights:
+        """The ground of 2 B windows: windows B ... 2 B - 1 have that of windows 0 ... B - 1."""
+        both = copy(self)
+        both._heights, both._counts = (torch.cat((of, of)) for of in (self._heights, self._counts))
+        return both
 
     def mean(self) -> Tensor:
-        """(B, Y, X) int64, centimetres: mean over 3 x 3 blocks, rounded down; far below everything where they hold
-        fewer than five points."""
+        """(B, Y, X) int64, centimetres: mean over 3 x 3 blocks, rounded down; where they hold fewer than five points,
+        a height far below every point."""
         _, rows, cols = self._heights.shape
         sums = F.pad(torch.stack((self._heights, self._counts)), (1, 1, 1, 1))
         around = [sums[:, :, down : down + rows, right : right + cols] for down in range(3) for right in range(3)]
         height, count = torch.stack(around).sum(0)
         mean = torch.div(height, count.clamp(min=1), rounding_mode="floor")
-        return torch.where(count >= _LEAST_POINTS, mean, torch.full_like(mean, _UNKNOWN))
+        return mean.masked_fill_(count < _FEWEST_POINTS, _UNKNOWN)
 
-    def below(self, positions: Tensor, window: Tensor, mean: Tensor) -> Tensor:
-        """(N,) float64, centimetres: height of the ground around points.
+    def at(self, positions: Tensor, window: Tensor, mean: Tensor) -> Tensor:
+        """(N,) float64, centimetres: height of the ground around points; undefined outside the region.
 
         Args:
-            positions: (3, N) float64, metres; of points outside the region the answer means nothing.
+            positions: (3, N) float64, metres.
             window: (N,) int64.
-            mean: as `mean` gives it.
+            mean: the result of `mean`.
         """
         block = torch.add(self._block(positions), window, alpha=mean.shape[1] * mean.shape[2])
         return mean.view(-1).double().index_select(0, block.clamp_(0, mean.numel() - 1))
 
     def _block(self, positions: Tensor) -> Tensor:
-        """(N,) int32 block of positions inside the region; nothing there is below the lower end."""
+        """(N,) int32 block of positions inside the region, where int() rounds down."""
         row = (positions[1] - self._lower[1]).div_(_BLOCK).int()
         col = (positions[0] - self._lower[0]).div_(_BLOCK).int()
         return col.add_(row, alpha=self._heights.shape[2])

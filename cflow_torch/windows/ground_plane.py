@@ -9,17 +9,17 @@ from torch import Tensor
 
 from cflow_torch.ops.lower_surface import UNKNOWN
 
-REACH = 131.072  # metres; points with |x| or |y| beyond are not looked at
-# Cells are powers of two of a millimetre: floor division is a shift, also of negative numbers.
+REACH = 131.072  # metres; points with larger |x| or |y| are ignored
+# Cells are powers of two of a millimetre, so floor division is a shift, also for negative numbers.
 _NEAR_BITS, _NEAR_CELLS = 11, 32  # 2.048 m, |x|, |y| < 32.768 m
-_STEP, _STEP_BITS = 2, 12  # tilt is the median step of flat cells 4.096 m apart ...
-_MAX_STEP = 1024  # ... of at most 25 %
-_FARTHEST_HEIGHT = 1e7  # metres; still fits the sort key
-_TRIM = 10  # the lowest tenth of the points of a cell does not count: multipath
-_FLAT, _FLAT_POINTS = 250, 4  # a near cell is flat if half of its points, at least 4 in all, lie in that layer, mm
-_LAYER = 300  # flat cells of the ground differ by at most that (kerbs), mm
-# There is ground if there are so many pairs of flat cells that are level enough, and a sixth as many as near cells.
-# Simulated drives (seeds 400-409) have at least three times as many; with their ground removed at most a tenth.
+_STEP, _STEP_BITS = 2, 12  # the tilt is the median step between flat cells 4.096 m apart
+_MAX_STEP = 1024  # steeper steps than 25 % are ignored
+_FARTHEST_HEIGHT = 1e7  # metres; the largest that fits the sort key
+_TRIM = 10  # the lowest tenth of the points of a cell is ignored, because of multipath
+_FLAT, _FLAT_POINTS = 250, 4  # a cell of at least 4 points is flat if half of them lie in a layer of 250 mm
+_LAYER = 300  # flat cells of the ground differ by at most this (kerbs), mm
+# There is ground if at least 20 pairs of flat cells are level enough, and at least a sixth as many as occupied cells.
+# Simulated drives (seeds 400-409) have at least three times as many, and at most a tenth without their ground.
 _FEWEST_PAIRS, _SMALLEST_SHARE = 20, 6
 
 
@@ -28,7 +28,7 @@ class Plane:
     """The ground near the vehicle, one plane per sweep.
 
     Args:
-        is_there: (B,) bool, False = no ground was found; then the rest means nothing.
+        is_there: (B,) bool, False = no ground was found; then the rest is undefined.
         step_x, step_y: (B,) int64, rise in mm per 4096 mm.
         height: (B,) int64, mm, at the origin.
     """
@@ -44,20 +44,20 @@ class Plane:
         return (rise >> _STEP_BITS).add_(self.height.index_select(0, sweep))
 
 
-def near_plane(points: Tensor, sweep: Tensor, counts: Tensor, num_sweeps: int) -> Plane:
-    """The plane on which most flat spots near the vehicle lie.
+def near_plane(points: Tensor, sweep: Tensor, is_active: Tensor, num_sweeps: int) -> Plane:
+    """Fit the plane on which most flat spots near the vehicle lie.
 
     Args:
         points: (3, N) int64, mm.
         sweep: (N,) int64, sweep of each point.
-        counts: (N,) bool, False = leave the point out.
+        is_active: (N,) bool, False = leave the point out.
         num_sweeps: B.
 
-    Convention: ties go to the lowest height.
+    Convention: ties: the lowest height.
     """
     size, num_cells = _NEAR_CELLS, num_sweeps * _NEAR_CELLS * _NEAR_CELLS
     col, row = (points[:2] >> _NEAR_BITS).add_(size // 2)
-    is_near = (((col | row) & -size) == 0).logical_and_(counts)  # both in 0 ... size - 1
+    is_near = (((col | row) & -size) == 0).logical_and_(is_active)  # both in 0 ... size - 1
     cell = (sweep * size).add_(row).mul_(size).add_(col).masked_fill_(~is_near, num_cells)
     low, middle, count = (v.view(num_sweeps, size, size) for v in order_statistics(cell, points[2], num_cells))
     is_seen = count >= _FLAT_POINTS
@@ -69,26 +69,26 @@ def near_plane(points: Tensor, sweep: Tensor, counts: Tensor, num_sweeps: int) -
 
     centre = ((torch.arange(size, device=low.device) - size // 2) << _NEAR_BITS) + (1 << (_NEAR_BITS - 1))
     rise = (step_x[:, None, None] * centre + step_y[:, None, None] * centre[:, None]) >> _STEP_BITS
-    nothing = torch.iinfo(torch.int64).max // 2
-    heights = (low - rise).masked_fill_(~is_flat, nothing).flatten(1).sort(1).values
-    place = torch.arange(heights.shape[1], device=low.device)
-    in_layer = torch.searchsorted(heights, heights + _LAYER, right=True) - place  # counted from each cell upwards
-    in_layer.masked_fill_(heights == nothing, 0)
+    unknown = torch.iinfo(torch.int64).max // 2
+    heights = (low - rise).masked_fill_(~is_flat, unknown).flatten(1).sort(1).values
+    rank = torch.arange(heights.shape[1], device=low.device)
+    in_layer = torch.searchsorted(heights, heights + _LAYER, right=True) - rank  # cells at most a layer above each
+    in_layer.masked_fill_(heights == unknown, 0)
     most = in_layer.amax(1)
-    first = torch.where(in_layer == most[:, None], place, heights.shape[1]).amin(1)
+    first = torch.where(in_layer == most[:, None], rank, heights.shape[1]).amin(1)
     height = heights.gather(1, (first + most // 2)[:, None].clamp_(max=heights.shape[1] - 1))[:, 0]
     return Plane(is_there, step_x, step_y, torch.where(is_there, height, 0))
 
 
 def order_statistics(cell: Tensor, height: Tensor, num_cells: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Low end (a tenth cut off), median and number of the heights of each cell.
+    """Tenth percentile, median and number of the heights of each cell.
 
     Args:
         cell: (N,) int64, 0 ... num_cells; those in cell num_cells are left out.
         height: (N,) int64, mm, |height| < 2^36.
 
     Returns:
-        Three times (num_cells,) int64; the first two mean nothing where the number is 0.
+        Three times (num_cells,) int64; the first two are undefined where the number is 0.
     """
     offset, bits = 1 << 36, 37
     key = (cell << bits).add_(height).add_(offset).sort().values  # by cell, then by height
@@ -105,19 +105,19 @@ def order_statistics(cell: Tensor, height: Tensor, num_cells: int) -> tuple[Tens
     return low, middle, count
 
 
-def _median_step(here: Tensor, there: Tensor, is_pair: Tensor) -> tuple[Tensor, Tensor]:
-    """(B,) int64: median of there - here over the pairs that are no steeper than allowed; number of such pairs."""
-    step = there - here
-    counts = is_pair & (step.abs() <= _MAX_STEP)
-    ordered = step.masked_fill(~counts, UNKNOWN).flatten(1).sort(1).values
-    number = counts.flatten(1).sum(1)
+def _median_step(first: Tensor, second: Tensor, is_pair: Tensor) -> tuple[Tensor, Tensor]:
+    """(B,) int64: median of second - first over the pairs that are not too steep, and the number of these pairs."""
+    step = second - first
+    is_level = is_pair & (step.abs() <= _MAX_STEP)
+    ordered = step.masked_fill(~is_level, UNKNOWN).flatten(1).sort(1).values
+    number = is_level.flatten(1).sum(1)
     median = ordered.gather(1, (number // 2)[:, None].clamp_(max=ordered.shape[1] - 1))[:, 0]
     return torch.where(number > 0, median, 0), number
 
 
 def millimetres(positions: Tensor) -> tuple[Tensor, Tensor]:
-    """(3, N) int64 mm, and (N,) bool: the point is finite and on the grid; the others are moved to the origin."""
+    """(3, N) int64 mm, and (N,) bool: the point is finite and on the grid. The others are moved to the origin."""
     x, y, z = positions.abs()
-    # A millimetre inside: rounding must not lead off the grid.
+    # A millimetre less than the reach, because rounding must not leave the grid.
     inside = (x < REACH - 0.001).logical_and_(y < REACH - 0.001).logical_and_(z < _FARTHEST_HEIGHT)
     return (positions * 1000).masked_fill_(~inside, 0).round_().long(), inside

@@ -1,4 +1,4 @@
-"""How much memory a process may still take, the refusal of what needs more, and groups of windows that fit it."""
+"""Estimate free memory, refuse work that does not fit, and split windows into groups that do."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ import torch
 from cflow_torch.types import CFlowError, Window
 from cflow_torch.windows.bev_grid import Grid
 
-_MUCH = 1 << 30  # less than this is not worth a look at the machine
+_MUCH = 1 << 30  # bytes; smaller requests are not checked
 _CGROUP = Path("/sys/fs/cgroup")
-# Working memory of a pixel of every sweep (occupancy and cluster) before the clusters of a window are known.
+# Working memory of a pixel of every sweep (occupancy and cluster) before the clusters are known.
 _BYTES_PER_PIXEL = 10
-# What windows of a group may take on a CPU where `max_memory` says nothing: about 9 of a pair, 4 of six sweeps. Fresh
-# pages of larger arrays cost more than the operations that larger groups save.
+# Memory of a group on a CPU without `max_memory`: about 9 windows of a pair, or 4 of six sweeps. In larger groups the
+# fresh pages cost more than the operations that they save.
 _BYTES_ON_CPU = 1 << 29
 
 
 def require_memory(num_bytes: int, device: torch.device, what: str, remedy: str) -> None:
-    """Refuse what does not fit before it is allocated: a system that runs out of memory kills the process.
+    """Raise before an allocation that does not fit, because a system that runs out of memory kills the process.
 
     Args:
-        num_bytes: that are planned with.
-        device: whose memory.
-        what: "a window of ..., " to begin the message with.
-        remedy: what to do about it.
+        num_bytes: needed memory.
+        device: CPU or GPU.
+        what: subject of the message, for example "a window of ...".
+        remedy: end of the message, what to do.
 
     Raises:
-        CFlowError: more is needed than there is.
+        CFlowError: more is needed than is free.
     """
     if num_bytes <= _MUCH:
         return
@@ -48,21 +48,21 @@ def require_memory(num_bytes: int, device: torch.device, what: str, remedy: str)
 
 
 def available_memory(environ: Mapping[str, str]) -> int | None:
-    """Bytes that this process may still take: what is free, limits of its control groups, its share of a torchrun job.
-    None where the system does not tell."""
+    """Bytes that this process may still allocate: free memory, within its control groups and its share of a torchrun
+    job. None if the system does not report it."""
     free = []
     with suppress(OSError, StopIteration, ValueError):
         lines = Path("/proc/meminfo").read_text().splitlines()
         free.append(1024 * int(next(line for line in lines if line.startswith("MemAvailable")).split()[1]))
     for group in control_groups():
-        with suppress(OSError, ValueError):  # "max" is no number
+        with suppress(OSError, ValueError):  # a limit of "max" is not a number
             limit, used = (int((group / name).read_text()) for name in ("memory.max", "memory.current"))
             free.append(limit - used)
     return min(free) // int(environ.get("LOCAL_WORLD_SIZE", 1)) if free else None
 
 
 def peak_memory() -> int | None:
-    """Bytes that this process held at most since it began; None where the system does not say."""
+    """Largest resident memory of this process, bytes; None if the system does not report it."""
     try:
         import resource
     except ImportError:  # Windows
@@ -72,7 +72,7 @@ def peak_memory() -> int | None:
 
 
 def control_groups() -> list[Path]:
-    """Control groups (version 2) of this process, the innermost first; empty where there are none."""
+    """Folders of the control groups (version 2) of this process, innermost first."""
     with suppress(OSError, StopIteration):
         lines = Path("/proc/self/cgroup").read_text().splitlines()
         group = _CGROUP / next(line[3:] for line in lines if line.startswith("0::")).lstrip("/")
@@ -83,20 +83,20 @@ def control_groups() -> list[Path]:
 def split_windows(
     windows: Sequence[Window], grid: Grid, device: torch.device, bytes_per_point: int, max_memory: float | None
 ) -> list[list[Window]]:
-    """Windows in groups that fit the memory, in order. The result of a window does not depend on its group.
+    """Split windows into groups that fit into memory, in order. Results do not depend on the grouping.
 
     Args:
-        windows: B windows, checked; an empty list gives no group.
+        windows: B windows, checked.
         grid: the finest scale, whose images are the largest.
-        device: where the work is done; on a CPU large groups only cost more.
-        bytes_per_point: what a method plans with for each point.
-        max_memory: bytes; None = one group, or groups of `_BYTES_ON_CPU`.
+        device: on a CPU large groups are slower.
+        bytes_per_point: working memory of a method per point.
+        max_memory: bytes; None = no limit on a GPU, 512 MiB per group on a CPU.
 
     Returns:
-        Groups of at least one window.
+        Groups of at least one window; an empty list for no windows.
 
     Raises:
-        CFlowError: a window alone needs more memory than there is.
+        CFlowError: a single window does not fit.
     """
     groups: list[list[Window]] = []
     if max_memory is None and device.type == "cpu":

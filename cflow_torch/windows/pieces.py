@@ -1,11 +1,11 @@
-"""Points of sweeps, read and brought into the frame of t+1 piece by piece."""
+"""Read the points of sweeps and bring them into the frame of t+1, piece by piece."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
 from itertools import groupby
-from typing import Iterator, Sequence
+from typing import Any, Iterable, Iterator, NamedTuple, Sequence
 
 import numpy as np
 import torch
@@ -13,106 +13,134 @@ from torch import Tensor
 
 from cflow_torch.config import Config
 from cflow_torch.ops.chunks import chunks
+from cflow_torch.ops.indices import flat_nonzero
 from cflow_torch.windows.bev_grid import Grid
 from cflow_torch.windows.ego_motion import compensate
-from cflow_torch.windows.point_times import read_point_times
-from cflow_torch.windows.timeline import Entry
-from cflow_torch.windows.validation import join_positions, read_ground, read_positions
+from cflow_torch.windows.ground_heights import GroundHeights
+from cflow_torch.windows.timeline import Entry, Timeline
+from cflow_torch.windows.validation import read_ground, read_point_times, read_positions
+
+
+class Piece(NamedTuple):
+    """Points of one sweep, or of all sweeps of a kind: the K active points, or all K points of sweep t.
+
+    Args:
+        step: smallest step of the sweeps.
+        positions, is_active, has_result, image, point_times: as in `Batch`.
+        pose_flow: (K, 3) float32, metres, T_ego1_ego0 p - p of sweep t, 0 for points that are not finite; None for
+            other sweeps.
+    """
+
+    step: int
+    positions: Tensor
+    is_active: Tensor
+    has_result: Tensor
+    image: Tensor
+    point_times: Tensor | None
+    pose_flow: Tensor | None
 
 
 @dataclass(frozen=True)
-class Piece:
-    """N points of one sweep, or of all sweeps of a kind: t+1, t, or others.
+class PieceReader:
+    """Reads the points of all sweeps of a timeline.
 
     Args:
-        window, step: of each point, (N,) int64, or one number for all.
-        raw: (3, N) float64, metres, as given.
-        moved: (A or 3, N) float64, metres, frame of t+1; `raw` itself where no sweep has a transform.
-        is_active: (N,) bool.
-        is_ground: (N,) bool, ground inside the images; None = not known.
-        times: (N,) float64, sweep intervals; None = they do not count.
+        timeline: the sweeps.
+        config, grid, device, num_axes: as for `make_batch`.
+        ground: where the ground points of t and t+1 are counted; None = nowhere.
     """
 
-    window: int | Tensor
-    step: int | Tensor
-    raw: Tensor
-    moved: Tensor
-    is_active: Tensor
-    is_ground: Tensor | None
-    times: Tensor | None
+    timeline: Timeline
+    config: Config
+    grid: Grid
+    device: torch.device
+    num_axes: int
+    ground: GroundHeights | None
 
+    def pieces(self) -> Iterator[Piece]:
+        """Yield the pieces in the order of the timeline.
 
-def groups_of(entries: Sequence[Entry], device: torch.device) -> list[list[Entry]]:
-    """Sweeps that are read at once: on a CPU each alone, elsewhere all of t+1, all of t, all others, since a GPU waits
-    for operations rather than for memory."""
-    if device.type == "cpu":
-        return [[entry] for entry in entries]
-    return [list(group) for _, group in groupby(entries, lambda entry: min(entry.step, 2))]
+        A CPU reads each sweep alone, in pieces that fit its cache. A GPU waits for operations rather than for memory,
+        so it reads all sweeps t+1 at once, then all sweeps t, then all others.
+        """
+        if self.device.type == "cpu":
+            for entry in self.timeline.entries:
+                num_points = entry.sweep.points.shape[0]
+                yield from self._read([entry], chunks(0, max(num_points, 1), self.device))  # an empty sweep is a piece
+        else:
+            for _, group in groupby(self.timeline.entries, lambda entry: min(entry.step, 2)):
+                yield from self._read(list(group), [slice(None)])
 
-
-def read_pieces(
-    group: Sequence[Entry], num_axes: int, grid: Grid, config: Config, device: torch.device
-) -> Iterator[Piece]:
-    """The points of some sweeps: of one sweep in pieces that fit a CPU's cache, of several at once.
-
-    Args:
-        group: as `groups_of` gives it.
-        num_axes: A, coordinates that are asked for.
-        grid, config, device: as for `make_batch`.
-    """
-    sizes = [entry.sweep.points.shape[0] for entry in group]
-    ground, times = _ground(group, sizes, device), _times(group, sizes, device)
-    matrices = [entry.T_ego1_ego for entry in group]
-    matrix: Tensor | None = None
-    window: int | Tensor = group[0].window
-    step: int | Tensor = group[0].step
-    if any(T is not None for T in matrices):
-        given = np.stack([np.eye(4) if T is None else T for T in matrices], 2)[:3]  # the last row is known
-        matrix = torch.as_tensor(given, device=device)
-    if len(group) > 1:
-        count = torch.as_tensor(sizes, device=device)
-        of_point = torch.arange(len(sizes), device=device).repeat_interleave(count, output_size=sum(sizes))
-        known = torch.as_tensor([(entry.window, entry.step) for entry in group], device=device)
-        window, step = known.index_select(0, of_point).unbind(1)
-        matrix = None if matrix is None else matrix.index_select(2, of_point)
-    # z matters where the region bounds it. After a transform, a z that is not finite has spoiled x and y as well.
-    is_flat = matrix is not None and math.isinf(grid.lower[2]) and math.isinf(grid.upper[2])
-    checked_axes = 2 if is_flat else 3
-    for rows in chunks(0, sizes[0], device) if len(group) == 1 else [slice(None)]:
+    def _read(self, group: Sequence[Entry], parts: Iterable[slice]) -> Iterator[Piece]:
+        """Yield the given rows of a group of sweeps, counted through all of them."""
+        step, grid, num_axes = group[0].step, self.grid, self.num_axes
         sweeps = [entry.sweep for entry in group]
-        raw = read_positions(sweeps[0], device, rows) if len(sweeps) == 1 else join_positions(sweeps, device)
-        moved = raw if matrix is None else compensate(raw, matrix, max(num_axes, checked_axes))
-        is_active, is_ground = grid.contains(moved[:checked_axes]), None
-        if ground is not None:
-            is_ground = is_active & ground[rows]
-            is_active &= ~ground[rows]
-        if config.ego_box is not None:
-            x0, y0, x1, y1 = config.ego_box
-            is_active &= (raw[0] < x0) | (raw[0] > x1) | (raw[1] < y0) | (raw[1] > y1)
-        yield Piece(window, step, raw, moved, is_active, is_ground, None if times is None else times[rows])
+        window, image, matrix = self._of_points(group)
+        ground, times = self._ground(group), self._times(group)
+        region = Grid(grid.pixel_size, self.config.point_cloud_range[:3], self.config.point_cloud_range[3:])
+        # z matters where the region bounds it. A transform spreads a z that is not finite to x and y.
+        is_flat = matrix is not None and math.isinf(grid.lower[2]) and math.isinf(grid.upper[2])
+        checked_axes = 2 if is_flat else 3
+        for rows in parts:
+            raw = read_positions(sweeps, self.device, rows)
+            moved = raw if matrix is None else compensate(raw, matrix, 3 if step == 1 else max(num_axes, checked_axes))
+            is_active, pose_flow, row = grid.contains(moved[:checked_axes]), None, None
+            if ground is not None:
+                if self.ground is not None and step <= 1:
+                    found = flat_nonzero(is_active & ground[rows])
+                    self.ground.add(_select(window, found), moved.index_select(1, found))
+                is_active &= ~ground[rows]
+            if self.config.ego_box is not None:
+                x0, y0, x1, y1 = self.config.ego_box
+                is_active &= (raw[0] < x0) | (raw[0] > x1) | (raw[1] < y0) | (raw[1] > y1)
+            if step == 1:
+                has_result = is_active if region == grid else is_active & region.contains(moved)
+                pose_flow = _pose_flow(raw, moved)
+                positions = moved[:num_axes]
+            else:
+                row = flat_nonzero(is_active)
+                is_active = has_result = torch.ones_like(row, dtype=torch.bool)
+                positions = torch.stack([axis.index_select(0, row) for axis in moved[:num_axes].unbind(0)])
+            of_point = _select(image, row) + torch.zeros_like(is_active, dtype=torch.int32)
+            point_times = None if times is None else _select(times[rows], row).float()
+            yield Piece(step, positions, is_active, has_result, of_point, point_times, pose_flow)
+
+    def _of_points(self, group: Sequence[Entry]) -> tuple[int | Tensor, int | Tensor, Tensor | None]:
+        """Window and image of each point, (N,) or one number for all, and its transform, (3, 4, N) or (3, 4, 1)."""
+        num_steps, matrix = self.timeline.table.shape[2], None
+        if any(entry.T_ego1_ego is not None for entry in group):
+            given = [np.eye(4) if entry.T_ego1_ego is None else entry.T_ego1_ego for entry in group]
+            matrix = torch.as_tensor(np.stack(given, 2)[:3], device=self.device)  # the last row is known
+        if len(group) == 1:
+            return group[0].window, group[0].window * num_steps + group[0].step, matrix
+        sizes = [entry.sweep.points.shape[0] for entry in group]
+        count = torch.as_tensor(sizes, device=self.device)
+        entry_of_point = torch.arange(len(sizes), device=self.device).repeat_interleave(count, output_size=sum(sizes))
+        known = torch.as_tensor([(e.window, e.window * num_steps + e.step) for e in group], device=self.device)
+        window, image = known.index_select(0, entry_of_point).unbind(1)
+        return window, image.int(), None if matrix is None else matrix.index_select(2, entry_of_point)
+
+    def _ground(self, group: Sequence[Entry]) -> Tensor | None:
+        """(N,) bool, False in sweeps without a mask; None = no sweep has one."""
+        if all(entry.sweep.is_ground is None for entry in group):
+            return None
+        return torch.cat([read_ground(entry.sweep, entry.name, self.device) for entry in group])
+
+    def _times(self, group: Sequence[Entry]) -> Tensor | None:
+        """(N,) float64 sweep intervals, 0 in windows whose times are not used; None = no window uses them."""
+        if all(entry.interval is None for entry in self.timeline.entries):
+            return None
+        return torch.cat([read_point_times(entry.sweep, entry.name, entry.interval, self.device) for entry in group])
 
 
-def _ground(group: Sequence[Entry], sizes: Sequence[int], device: torch.device) -> Tensor | None:
-    """(N,) bool of all points, False in sweeps without a mask; None = no sweep has one."""
-    if all(entry.sweep.is_ground is None for entry in group):
-        return None
-    masks = [
-        torch.zeros(size, dtype=torch.bool, device=device)
-        if entry.sweep.is_ground is None
-        else read_ground(entry.sweep, entry.name, size, device)
-        for entry, size in zip(group, sizes)
-    ]
-    return masks[0] if len(masks) == 1 else torch.cat(masks)
+def _select(values: Any, row: Tensor | None) -> Any:
+    """The values of some points, None = of all. A number is the value of every point."""
+    return values if row is None or not isinstance(values, Tensor) else values.index_select(0, row)
 
 
-def _times(group: Sequence[Entry], sizes: Sequence[int], device: torch.device) -> Tensor | None:
-    """(N,) float64 sweep intervals of all points, 0 in sweeps whose times do not count; None = those of none do."""
-    if all(entry.interval is None for entry in group):
-        return None
-    times = [
-        torch.zeros(size, dtype=torch.float64, device=device)
-        if entry.interval is None
-        else read_point_times(entry.sweep, entry.name, entry.interval, device)
-        for entry, size in zip(group, sizes)
-    ]
-    return times[0] if len(times) == 1 else torch.cat(times)
+def _pose_flow(raw: Tensor, moved: Tensor) -> Tensor:
+    """(N, 3) float32 T p - p; 0 for points that are not finite. Overwrites `raw`."""
+    if moved is raw:
+        return torch.zeros((raw.shape[1], 3), dtype=torch.float32, device=raw.device)
+    # A point that is not finite has no finite coordinate after the transform.
+    return torch.sub(moved, raw, out=raw).float().t().nan_to_num_(0.0, 0.0, 0.0)

@@ -1,31 +1,50 @@
-"""The sweeps of a batch in order: their steps, times and transforms. Plain numbers, no points."""
+"""List the sweeps of a batch in order, with their steps, times and transforms. Points are not touched here."""
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import Sequence
+from typing import NamedTuple, Sequence
 
 import numpy as np
 
 from cflow_torch.config import Config
-from cflow_torch.types import Sweep, Window
+from cflow_torch.types import CFlowError, Sweep, Window, as_numpy
 from cflow_torch.windows.bev_grid import Grid
 from cflow_torch.windows.ego_motion import rigid_transform
-from cflow_torch.windows.point_times import has_point_times
-from cflow_torch.windows.validation import check_distance, elapsed_times, keep_nearest, source_sweeps
+from cflow_torch.windows.validation import keep_nearest, named_sweeps
+
+# Largest plausible distance between two poses of a window, metres: 2 s at 50 m/s.
+_FARTHEST_POSE = 100.0
+# Sweeps that differ at all differ in their first points, so we compare those before the whole clouds.
+_FIRST_POINTS = 64
 
 
-@dataclass(frozen=True)
-class Entry:
+class Source(NamedTuple):
+    """A sweep other than t+1 that the flow is estimated from.
+
+    Args:
+        name: as users know it, for errors.
+        sweep: the sweep.
+        intervals: sweep intervals from it to t+1, counted by its position in the window: 1 for t, 2 for t-1, ..., and
+            -1 for t+2, -2 for t+3, ...
+    """
+
+    name: str
+    sweep: Sweep
+    intervals: int
+
+
+class Entry(NamedTuple):
     """One sweep of one window.
 
     Args:
         step: 0 = t+1, 1 = t, 2 = t-1, ..., then t+2, t+3, ...
-        window: which.
+        window: index of the window.
         name: as users know it, for errors.
         sweep: the sweep.
         T_ego1_ego: (4, 4) float64; None = its points lie in the frame of t+1.
-        interval: seconds from t to t+1; None = the times of its points do not count.
+        interval: seconds from t to t+1; None = the times of its points are not used.
     """
 
     step: int
@@ -50,28 +69,102 @@ class Timeline:
 
     @staticmethod
     def of(windows: Sequence[Window], config: Config, grid: Grid, needs_times: bool) -> Timeline:
-        """The timeline of windows; all but their points is checked here. Arguments and errors as in `make_batch`."""
+        """Check everything but the points, and list the sweeps. Arguments and errors as in `make_batch`."""
         windows = [keep_nearest(window, config.num_history) for window in windows]
-        kept = [source_sweeps(window, config) for window in windows]
-        num_future = [sum(way < 0 for _, _, way in sources) for sources in kept]
-        first_future = 1 + max(len(sources) - count for sources, count in zip(kept, num_future))
-        num_steps = first_future + max(num_future)
+        sources = [source_sweeps(window, config) for window in windows]
+        num_past = [sum(source.intervals > 0 for source in of_window) for of_window in sources]
+        first_future = 1 + max(num_past)
+        num_steps = first_future + max(len(of_window) - past for of_window, past in zip(sources, num_past))
         table = np.zeros((5, len(windows), num_steps))
         farthest = max(map(abs, (*grid.lower[:2], *grid.upper[:2])))
         entries: list[Entry] = []
-        for index, (window, sources, count) in enumerate(zip(windows, kept, num_future)):
-            steps = [*range(1, 1 + len(sources) - count), *range(first_future, first_future + count)]
-            times = elapsed_times(window, sources, config)
+        for index, (window, of_window, past) in enumerate(zip(windows, sources, num_past)):
+            steps = [*range(1, 1 + past), *range(first_future, first_future + len(of_window) - past)]
+            times = elapsed_times(window, of_window, config)
             table[:2, index, steps] = np.transpose(times)
-            has_times = needs_times and has_point_times(window, sources)
-            interval = times[0][1] / times[0][0] if has_times else None
+            # A sweep without point times would seem to be measured at other times than the rest.
+            has_times = all(s.point_times is not None for s in (window.pc1, *(source.sweep for source in of_window)))
+            interval = times[0][1] / times[0][0] if needs_times and has_times else None
             pose1, transform = window.pc1.pose, None
             T_ego1_world = None if pose1 is None else np.linalg.inv(rigid_transform(pose1, "pose1", farthest))
             entries.append(Entry(0, index, "pc1", window.pc1, None, interval))
-            for step, (name, sweep, _) in zip(steps, sources):
+            for step, (name, sweep, _) in zip(steps, of_window):
                 if T_ego1_world is not None:
                     transform = T_ego1_world @ rigid_transform(sweep.pose, f"pose of {name}", farthest)
-                    check_distance(transform, name)
+                    _check_distance(transform, name)
                     table[2:, index, step] = transform[:3, 3]
                 entries.append(Entry(step, index, name, sweep, transform, interval))
         return Timeline(sorted(entries, key=lambda entry: entry.step), table)
+
+
+def source_sweeps(window: Window, config: Config) -> list[Source]:
+    """pc0, the history and then the sweeps after t+1, without repeated sweeps."""
+    if len(window.pcf) > config.num_future:
+        raise CFlowError(
+            f"the window has {len(window.pcf)} future sweeps but num_future={config.num_future}: raise num_future, or "
+            "pass fewer sweeps"
+        )
+    has_pose = [sweep.pose is not None for _, sweep in named_sweeps(window)]
+    if any(has_pose) and not all(has_pose):
+        raise CFlowError(
+            "some sweeps of the window have a pose and some do not: give the pose of every sweep, or of none "
+            "(then all points must already lie in the frame of t+1)"
+        )
+    sources: list[Source] = []
+    num_past = 1 + len(window.pch)
+    for step, (name, sweep) in enumerate(named_sweeps(window)[1:], 1):
+        is_future = step > num_past
+        earlier = [source.sweep for source in sources] + ([window.pc1] if is_future else [])
+        if not any(_is_same(sweep, other) for other in earlier):
+            sources.append(Source(name, sweep, num_past - step if is_future else step))
+    return sources
+
+
+def _is_same(a: Sweep, b: Sweep) -> bool:
+    """Compare points and poses. Harnesses repeat the first sweep of a scene where the history is missing."""
+    if a is b:
+        return True
+    if a.points.shape != b.points.shape or (a.pose is None) != (b.pose is None):
+        return False
+    if a.pose is not None and b.pose is not None and not np.array_equal(as_numpy(a.pose), as_numpy(b.pose)):
+        return False
+    parts = (slice(_FIRST_POINTS), slice(None))
+    return all(np.array_equal(as_numpy(a.points[rows]), as_numpy(b.points[rows]), equal_nan=True) for rows in parts)
+
+
+def elapsed_times(window: Window, sources: Sequence[Source], config: Config) -> list[tuple[float, float]]:
+    """(sweep intervals, seconds) from each source sweep to t+1, by time stamps if every sweep has one.
+
+    Both are negative for sweeps after t+1.
+    """
+    if any(sweep.timestamp_ns is None for _, sweep in named_sweeps(window)):
+        return [(float(source.intervals), source.intervals * config.sweep_interval) for source in sources]
+    newest = _nanoseconds(window.pc1, "pc1")
+    gaps = [newest - _nanoseconds(source.sweep, source.name) for source in sources]
+    past, future = ([sign * gap for gap, s in zip(gaps, sources) if sign * s.intervals > 0] for sign in (1, -1))
+    if min(later - earlier for gaps_of in (past, future) for earlier, later in zip([0, *gaps_of], gaps_of)) <= 0:
+        raise CFlowError(
+            f"time stamps of the window are out of order (nanoseconds before t+1: {gaps}): "
+            "give pc1, pc0, pch1, ... from newest to oldest, and pcf1, ... after pc1 from oldest to newest"
+        )
+    return [(gap / gaps[0], gap / 1e9) for gap in gaps]
+
+
+def _nanoseconds(sweep: Sweep, name: str) -> int:
+    with suppress(TypeError, ValueError, OverflowError, RuntimeError):
+        stamp = int(sweep.timestamp_ns)  # type: ignore[arg-type]
+        if abs(stamp) < 1 << 63:
+            return stamp
+    raise CFlowError(
+        f"timestamp_ns of {name} is {sweep.timestamp_ns!r}: give whole nanoseconds that fit an int64, or None for "
+        "every sweep of the window"
+    )
+
+
+def _check_distance(T_ego1_ego: np.ndarray, name: str) -> None:
+    distance = float(np.linalg.norm(T_ego1_ego[:3, 3]))
+    if distance > _FARTHEST_POSE:
+        raise CFlowError(
+            f"the ego vehicle moves {distance:.0f} m between {name} and pc1 (at most {_FARTHEST_POSE:.0f} m): "
+            "are the poses from another log, or not in metres?"
+        )

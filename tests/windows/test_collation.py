@@ -141,7 +141,7 @@ def test_a_batch_of_twice_the_windows_holds_the_same_points():
     settings = small("default")
     windows = windows_for(settings, 2)
     batch = make_batch(windows, settings, Grid(0.5, RANGE[:3], RANGE[3:]), CPU, 3, needs_times=True)
-    twice = batch.with_twice_the_windows()
+    twice = batch.with_empty_windows()
     assert (twice.num_windows, twice.num_steps) == (4, batch.num_steps) and twice.positions is batch.positions
     assert twice.image is batch.image and twice.rows == batch.rows, "no point lies in a window that was added"
     for name in ("elapsed", "seconds", "origin"):
@@ -158,7 +158,7 @@ def test_both_sides_are_the_windows_without_later_and_without_older_sweeps():
     sides = ((3, 1), (0, 2), (1, 0))
     windows = [scene(seed, num_history=h, num_future=f) for seed, (h, f) in enumerate(sides)]
     batch = make_batch(windows, settings, grid, CPU, 3, needs_times=True)
-    both, copied = batch.both_sides()
+    both, copied = batch.split_past_and_future()
     assert both.num_windows == 6 and len(both.image) == len(batch.image) + len(copied)
     assert same_bits(both.positions[:, -len(copied) :], batch.positions[:, copied]), "copies are behind all points"
     assert bool((batch.image[copied] % batch.num_steps < 2).all())
