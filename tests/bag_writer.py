@@ -1,4 +1,4 @@
-"""Bags of ROS, written by `rosbags` itself."""
+"""Write ROS bags with `rosbags`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MAP_T_ODOM = rigid(turn_z(-0.7), (30.0, -4.0, 1.0))
 
 
 class BagWriter:
-    """Messages into a bag of a format: ros1, ros2 (SQLite) or mcap."""
+    """Write messages into a bag of a format: ros1, ros2 (SQLite) or mcap."""
 
     def __init__(self, folder: Path, form: str) -> None:
         ros1, store = form == "ros1", typesys.Stores
@@ -64,7 +64,7 @@ class BagWriter:
         self.bag.write(self.topics[topic], stamp + 40_000_000, serialize(message, kind))  # arrives later
 
     def cloud(self, stamp: int, points: np.ndarray, times: np.ndarray | None, order: str = "<") -> Any:
-        """Fields of a cloud of two rows: padded points and rows, one missing return."""
+        """Return the fields of a cloud of two rows, with padded points and rows and one missing return."""
         names, kinds, offsets = ["ring", "y", "x", "z"], ["u2", "f4", "f4", "f8"], [1, 4, 8, 16]
         if times is not None:
             names, kinds, offsets = [*names, "t"], [*kinds, times.dtype.str[1:]], [*offsets, 24]
@@ -88,7 +88,7 @@ class BagWriter:
 
 
 def write_bag(folder: Path, form: str, recording: TinyRecording, poses: str = "tf", order: str = "<") -> Path:
-    """The first LiDAR of a recording; the second as /other with poses="two"."""
+    """Write the first LiDAR of a recording; with poses="two" also the second, as /other."""
     writer = BagWriter(folder, form)
     start, end = recording.timestamps[0] - 10_000_000, recording.timestamps[-1] + 200_000_000
     link = "tf2_msgs/msg/TFMessage"

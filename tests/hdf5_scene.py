@@ -1,4 +1,4 @@
-"""Scenes in OpenSceneFlow's HDF5 layout with random points."""
+"""Write scenes with random points in OpenSceneFlow's HDF5 layout."""
 
 from __future__ import annotations
 
@@ -18,8 +18,10 @@ def write_scene(
     masked: Any = None,
     **replaced: Any,
 ) -> Path:
-    """Sweeps of 50 points, each of `growth` more than the one before; the last one has no flow. The sweeps `masked`
-    have an evaluation mask, None = all but the last. `replaced` values go into sweep 0, None = left out."""
+    """Write sweeps of 50 points, each with `growth` more than the one before; the last one has no flow.
+
+    The sweeps `masked` have an evaluation mask, None = all but the last. `replaced` values go into sweep 0, None = left
+    out."""
     h5py = pytest.importorskip("h5py")
     rng, last = np.random.default_rng(0), len(stamps) - 1
     with h5py.File(file, "w") as scene:

@@ -1,4 +1,4 @@
-"""A small log of each data set, as simulated drives and tiny recordings are written."""
+"""Write a small log of each data set."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SMALL_LOGS = (*SIMULATED, "arrays", "bags", "hdf5", "nuscenes", "truckscenes", "
 
 
 def write_small_log(name: str, folder: Path) -> Path:
-    """Three sweeps or more; the folder."""
+    """Write three sweeps or more and return the folder."""
     drive = make_drive(seed=3, num_sweeps=3, profile="demo")
     if name in SIMULATED:
         SIMULATED[name](drive, folder)

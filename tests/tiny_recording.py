@@ -1,4 +1,4 @@
-"""A recording of a few points whose every number is known: what readers of recorded formats are tested with."""
+"""A recording of a few points with known numbers, for tests of readers."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def rigid(rotation: np.ndarray, translation: Sequence[float]) -> np.ndarray:
 
 
 class TinyRecording:
-    """Ego and one car move at constant velocity, the ego turns at a constant rate; a second car stands still.
+    """Ego and one car move at constant velocity, the ego yaws at a constant rate; a second car is parked.
 
     Every shot has its own time, up to 99 ms after the sweep's time stamp, and is not compensated for any motion.
 
@@ -79,7 +79,7 @@ class TinyRecording:
         return rigid(turn_z(-0.4), self._origin + [-20.0, 12.0, 1.0])
 
     def world(self, index: int) -> np.ndarray:
-        """(units * 40, 3) where each shot hit, in the world: 30 static points of each unit, then 10 on the car."""
+        """(units * 40, 3) hit points in the world: per unit 30 static points, then 10 on the car."""
         parts = []
         for unit in range(len(self.mounts)):
             moved = [

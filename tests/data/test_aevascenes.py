@@ -1,4 +1,4 @@
-"""AevaScenes: frames by hand, pickled strings, broken files."""
+"""AevaScenes: frames with known numbers, pickled strings, broken files."""
 
 from __future__ import annotations
 
@@ -60,17 +60,17 @@ def folder(tmp_path: Path) -> Path:
 
 
 def edit(folder: Path, change: Any) -> None:
-    """Changes the parsed content of sequence.json; frames[1] is the first in time."""
+    """Change the parsed content of sequence.json; frames[1] is the first in time."""
     content = json.loads((folder / "sequence.json").read_text())
     change(content)
     (folder / "sequence.json").write_text(json.dumps(content))
 
 
-def test_frames_by_hand(folder: Path) -> None:
+def test_lidars_are_mounted_and_merged(folder: Path) -> None:
     log = AevaScenesLog(folder)
     assert (log.log_id, tuple(log.timestamps), log.lidars) == ("seq", STAMPS, ("left_lidar", "rear_lidar"))
     sweep = log.sweep(1)
-    # The left one looks along +y from (0, 1, 0), the rear one along -x from (-1, 0, 2).
+    # The left LiDAR points along +y from (0, 1, 0), the rear one along -x from (-1, 0, 2).
     np.testing.assert_allclose(sweep.points, [[0, 2, 0], [0, 11, 0], [-2, 0, 2], [-11, 0, 2]], atol=1e-6)
     assert sweep.points.dtype == np.float32 and sweep.timestamp_ns == STAMPS[1]
     assert sweep.is_ground.tolist() == [True, False, True, False]
@@ -81,13 +81,13 @@ def test_frames_by_hand(folder: Path) -> None:
     assert rear.is_ground is None
 
 
-def test_truth_by_hand(folder: Path) -> None:
-    """The box of the car moves 1 m ahead in the vehicle's frame, the world 1 m back; a pole never moves."""
+def test_boxes_become_flow(folder: Path) -> None:
+    """In the vehicle frame, the box of the car moves 1 m forward and the world 1 m back; poles are static."""
     for lidar in ("left_lidar", "rear_lidar"):
         file = folder / "pointcloud_compensated" / f"{lidar}_{STAMPS[0]}.npz"
         save(file, xyz=np.array([[0, 0, 0], [0, -2.5, 0.0]], np.float32), velocity=np.zeros((2, 1), np.float32))
     labels = AevaScenesLog(folder).labels(0)
-    # Vehicle frame: left (0, 1, 0), (2.5, 1, 0); rear (-1, 0, 2), (-1, 2.5, 2). The car reaches from x = 0 to 4.
+    # Vehicle frame: left (0, 1, 0), (2.5, 1, 0); rear (-1, 0, 2), (-1, 2.5, 2). The car extends from x = 0 to 4.
     np.testing.assert_array_equal(labels.category, [19, 19, 0, 0])
     np.testing.assert_allclose(labels.flow, [[1, 0, 0], [1, 0, 0], [-1, 0, 0], [-1, 0, 0]], atol=1e-6)
     assert labels.is_valid.all() and AevaScenesLog(folder).labels(2) is None
@@ -108,7 +108,7 @@ def npz_with_pickle(file: Path, pickled: bytes) -> Path:
 
 
 @pytest.mark.parametrize("protocol", [3, 4, 5])
-def test_strings_of_every_kind(tmp_path: Path, protocol: int) -> None:
+def test_class_names_of_every_pickle_protocol_are_read(tmp_path: Path, protocol: int) -> None:
     names = np.array([["car"], ["Straße"]], dtype=object)
     scalars = np.array([[np.str_("car")], [np.str_("Straße")]], dtype=object)
     for array in (names, np.asfortranarray(names), scalars):
@@ -129,7 +129,7 @@ def test_strings_of_every_kind(tmp_path: Path, protocol: int) -> None:
         (lambda file: save(file, xyz=np.zeros((3, 3)), semantic_labels=np.array(["car"] * 4)), "5 points but 6"),
     ],
 )
-def test_damaged_cloud(folder: Path, damage: Any, message: str) -> None:
+def test_a_bad_cloud_costs_one_sweep(folder: Path, damage: Any, message: str) -> None:
     log, file = AevaScenesLog(folder), folder / "pointcloud_compensated" / f"left_lidar_{STAMPS[0]}.npz"
     damage(file)
     with pytest.raises(CFlowError, match=message) as error:
@@ -149,7 +149,7 @@ def test_damaged_cloud(folder: Path, damage: Any, message: str) -> None:
         (lambda c: c["frames"][1].update(boxes=[box("a", "car", 0.0)] * 2), "only one box per sweep"),
     ],
 )
-def test_damaged_sequence(folder: Path, change: Any, message: str) -> None:
+def test_a_bad_sequence_is_refused(folder: Path, change: Any, message: str) -> None:
     edit(folder, change)
     with pytest.raises(CFlowError, match=message) as error:
         AevaScenesLog(folder).labels(0)

@@ -1,4 +1,4 @@
-"""Folders of point clouds: every suffix, every pose format, and what goes wrong with them."""
+"""Folders of point clouds: every suffix, every pose format, and files that do not fit."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def test_poses_and_times_come_back_from_every_format(tmp_path, poses):
     assert list(ArraysLog(folder).timestamps) == (small.timestamps if poses == "tum" else [0, 1, 2])
 
 
-def test_what_a_log_lacks_is_not_written(tmp_path, folder):
+def test_missing_poses_times_and_masks_are_not_written(tmp_path, folder):
     bare = write_array_log(SmallLog(poses=False, times=False, ground=False), tmp_path / "a", poses=None)
     assert [path.name for path in bare.iterdir()] == ["points"]
     log = ArraysLog(bare)
@@ -114,7 +114,7 @@ def test_what_a_log_lacks_is_not_written(tmp_path, folder):
         write_array_log(SmallLog(), tmp_path)
 
 
-def test_columns_by_name_or_by_place(tmp_path):
+def test_columns_are_found_by_name_or_position(tmp_path):
     rng = np.random.default_rng(0)
     points = rng.normal(size=(20, 3)).astype(np.float32)
     x, y, z = points.T
@@ -133,7 +133,7 @@ def test_columns_by_name_or_by_place(tmp_path):
         assert np.array_equal(read_cloud(file, 5), points), file.name
 
 
-def test_files_that_hold_something_else(tmp_path):
+def test_files_with_other_contents_are_refused(tmp_path):
     np.save(tmp_path / "flat.npy", np.zeros(9))
     np.save(tmp_path / "whole.npy", np.zeros((9, 3), np.int32))
     np.save(tmp_path / "pickle.npy", np.array([{}, 1], dtype=object), allow_pickle=True)
@@ -149,7 +149,7 @@ def test_files_that_hold_something_else(tmp_path):
 
 
 @pytest.mark.parametrize("order", "<>")
-def test_ply_of_every_type(tmp_path, order):
+def test_ply_reads_every_number_type(tmp_path, order):
     names = ("char", "uint8", "int16", "ushort", "int", "uint", "float32", "float64")  # PDAL, Open3D, CloudCompare
     kinds = [(f"p{code}", order + code) for code in ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")]
     rows = np.frombuffer(np.random.default_rng(0).bytes(9 * 26), kinds)
@@ -165,7 +165,7 @@ def test_ply_of_every_type(tmp_path, order):
             assert values.dtype == rows.dtype[name].newbyteorder("=") and np.array_equal(values, rows[name], True)
 
 
-def test_ply_as_text(tmp_path):
+def test_ply_reads_text(tmp_path):
     text = (
         "ply\nformat ascii 1.0\ncomment by hand\nobj_info nothing\nelement vertex 2\nproperty float32 x\n"
         "property double y\nproperty uint8 red\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
@@ -187,7 +187,7 @@ def test_ply_as_text(tmp_path):
             read_ply(file)
 
 
-def test_natural_order_and_times_from_names(tmp_path):
+def test_names_are_sorted_naturally_and_read_as_times(tmp_path):
     names = ["10", "9", "a2", "a10", "a1b", "a1", "007", "7"]
     assert sorted(names, key=natural_key) == ["007", "7", "9", "10", "a1", "a1b", "a2", "a10"]
     for place, factor in (("ns", 1), ("us", 1000)):
@@ -203,8 +203,8 @@ def test_natural_order_and_times_from_names(tmp_path):
     assert read_poses(tmp_path / "m.txt").poses[0, :3, 3].tolist() == [5, 6, 7]
 
 
-def test_poses_at_a_rate_of_their_own(tmp_path):
-    """A trajectory at 50 Hz: constant speed and turn rate are met between its poses."""
+def test_poses_of_another_rate_are_interpolated(tmp_path):
+    """Constant speed and yaw rate are reproduced between the poses of a 50 Hz trajectory."""
     folder = write_array_log(SmallLog(), tmp_path, poses=None)
     seconds = np.arange(-1, 14) * 0.02
     truth = np.stack([scenes.pose(10 * s, 0, 0.5 * s) for s in seconds])
@@ -221,7 +221,7 @@ def test_poses_at_a_rate_of_their_own(tmp_path):
         poses_at(gap, [5 * 10**8], "x")
 
 
-def test_kitti_calibration_and_tree(tmp_path, folder):
+def test_kitti_camera_poses_become_lidar_poses(tmp_path, folder):
     """Camera poses and Tr give the LiDAR's motion: inv(Tr) P Tr."""
     camera_T_lidar = np.array([[0, -1, 0, 0.1], [0, 0, -1, -0.2], [1, 0, 0, -0.3], [0, 0, 0, 1.0]])
     lidar = np.stack([scenes.pose(k, 0.1 * k, 0.05 * k) for k in range(3)])
@@ -240,7 +240,7 @@ def test_kitti_calibration_and_tree(tmp_path, folder):
     assert np.abs(ArraysLog(tree).poses - lidar).max() < 1e-12
 
 
-def test_points_and_poses_of_a_lidar_are_moved_to_the_ego_frame(folder):
+def test_points_and_poses_of_a_lidar_are_transformed_to_the_ego_frame(folder):
     ego_T_lidar, plain = scenes.pose(1.3, 0.2, 0.4, 1.6), ArraysLog(folder)
     ego, lidar = (ArraysLog(folder, ego_T_lidar=ego_T_lidar, poses_of=of) for of in ("ego", "lidar"))
     assert np.array_equal(ego.poses, plain.poses) and np.abs(lidar.poses @ ego_T_lidar - plain.poses).max() < 1e-12
@@ -266,7 +266,7 @@ def test_points_and_poses_of_a_lidar_are_moved_to_the_ego_frame(folder):
         ("", None, {"poses_of": "camera"}, "poses_of"),
     ],
 )
-def test_a_log_that_does_not_fit(folder, file, content, settings, complaint):
+def test_a_log_whose_files_do_not_fit_is_refused(folder, file, content, settings, complaint):
     if isinstance(content, str):
         (folder / file).write_text(content)
     elif file.endswith(".npy"):
@@ -278,7 +278,7 @@ def test_a_log_that_does_not_fit(folder, file, content, settings, complaint):
         ArraysLog(folder, **settings)
 
 
-def test_a_sweep_that_does_not_fit(folder):
+def test_a_sweep_whose_mask_does_not_fit_is_refused(folder):
     log = ArraysLog(folder)
     for mask in (np.zeros(39, bool), np.zeros(40), np.full(40, 2)):
         np.save(folder / "ground" / "000001.npy", mask)

@@ -34,7 +34,7 @@ def write_sweep(folder: Path, time: int, points: np.ndarray = POINTS) -> None:
 
 
 def pose_columns(times: Sequence[int] = TIMES) -> dict[str, Any]:
-    """Sweep k stands at x = 1000 + k, turned left by 90 degrees."""
+    """Sweep k is at x = 1000 + k, rotated to the left by 90 degrees."""
     n = len(times)
     columns: dict[str, Any] = {name: np.zeros(n) for name in ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")}
     columns.update(qw=np.full(n, math.cos(YAW / 2)), qz=np.full(n, math.sin(YAW / 2)), tx_m=1000.0 + np.arange(n))
@@ -70,7 +70,7 @@ def folder(tmp_path: Path) -> Path:
     return log
 
 
-def test_real_log(av2_folder: Path, data_root: Path) -> None:
+def test_the_real_log_is_read(av2_folder: Path, data_root: Path) -> None:
     assert av2_folder in find_av2_logs(data_root)
     log = AV2Log(av2_folder)
     assert log.log_id == av2_folder.name
@@ -87,7 +87,7 @@ def test_real_log(av2_folder: Path, data_root: Path) -> None:
     assert log.labels(1) is None
 
 
-def test_real_ground_differs_in_one_point(av2_folder: Path) -> None:
+def test_real_ground_differs_from_the_stored_one_in_one_point(av2_folder: Path) -> None:
     # The stored mask was made with city coordinates in float32 (steps of 0.5 mm at 5 km). There one point, 0.4 mm from
     # the border of a raster cell, falls into the next cell.
     stored = feather.read_table(str(av2_folder / "flow_labels.feather"))["is_ground_0"].to_numpy()
@@ -112,11 +112,11 @@ def test_real_box_truth_equals_the_stored_one(av2_folder: Path, tmp_path: Path) 
     distance = np.linalg.norm(made.flow - stored.flow, axis=1)
     assert distance.max() < 1e-3  # 0.8 mm: the stored flow has the float32 ego motion
     ends = np.flatnonzero(~made.is_valid)
-    assert len(ends) == 9  # boxes that hold no point at t+1; stored as ego motion, without a mark
+    assert len(ends) == 9  # boxes that hold no point at t+1; stored as ego motion, without a flag
     assert (stored.category[ends] > 0).all()
 
 
-def test_sweeps_and_poses(folder: Path) -> None:
+def test_sweeps_have_points_and_poses(folder: Path) -> None:
     log = AV2Log(folder)
     assert (log.log_id, list(log.timestamps), len(log)) == ("some-log", [100, 200, 300], 3)
     sweep = log.sweep(1)
@@ -127,7 +127,7 @@ def test_sweeps_and_poses(folder: Path) -> None:
     assert log.labels(0) is None
 
 
-def test_stored_labels_come_before_boxes(folder: Path) -> None:
+def test_stored_labels_take_precedence_over_boxes(folder: Path) -> None:
     annotate(folder, box_columns(100, 10.0), box_columns(200, 10.0), box_columns(300, 13.0))
     write(folder / "flow_labels.feather", label_columns(flow_tx_m=np.zeros(3, dtype=np.float32)))
     first, second = (AV2Log(folder).labels(index) for index in (0, 1))
@@ -143,7 +143,7 @@ def test_stored_labels_come_before_boxes(folder: Path) -> None:
     assert log.labels(1) is None and log.labels(2) is None  # the folder has no file for this pair; no pair
 
 
-def test_labels_from_boxes(folder: Path) -> None:
+def test_boxes_become_flow(folder: Path) -> None:
     annotate(folder, box_columns(100, 10.0), box_columns(200, 12.0), box_columns(200, -4.0, "b", "DOG"))
     log = AV2Log(folder)
     labels = log.labels(0)
@@ -154,7 +154,7 @@ def test_labels_from_boxes(folder: Path) -> None:
     assert labels.is_valid.all()
     assert log.labels(1) is None  # sweep 300 lies after the last annotation
     annotate(folder, box_columns(100, 10.0), box_columns(200, 12.0, inside=0), box_columns(300, 12.0, "b"))
-    labels = AV2Log(folder).labels(0)  # a track that empties
+    labels = AV2Log(folder).labels(0)  # a track whose box becomes empty
     assert labels.is_valid.tolist() == [True, False, True] and labels.category[1] == 19
 
 
@@ -197,7 +197,7 @@ def test_bad_columns_are_refused(folder: Path, file: str, columns: dict[str, Any
     assert file in str(error.value)
 
 
-def test_margin_overlap_and_end_of_track() -> None:
+def test_boxes_have_a_margin_and_the_last_one_wins() -> None:
     points = np.array([[2.05, 0, 0], [0, 1.05, 0], [0, 0, 0.8], [1.9, 0, 0]])
     boxes0 = Boxes(
         track_id=["ends", "stays"],
@@ -207,7 +207,7 @@ def test_margin_overlap_and_end_of_track() -> None:
     )
     boxes1 = Boxes(["stays"], np.array([17], np.uint8), boxes0.size[1:], pose(2.4, 0, 0)[None])
     labels = flow_from_boxes(points, boxes0, boxes1, np.eye(4))
-    # 10 cm more per side in length and width, none in height; the last box wins, an ended one leaves its mark
+    # 10 cm more per side in length and width, none in height; the last box wins, but an ended track stays invalid
     np.testing.assert_array_equal(labels.category, [17, 4, 0, 17])
     np.testing.assert_array_equal(labels.is_valid, [False, False, True, False])
     np.testing.assert_allclose(labels.flow[[0, 3], 0], 0.5, atol=1e-6)
@@ -217,20 +217,20 @@ def raster(heights: Sequence[Sequence[float]]) -> GroundRaster:
     return GroundRaster(np.array(heights, dtype=np.float64), np.eye(2), np.array([-100.0, -50.0]), 2.0)
 
 
-def test_ground_limits() -> None:
+def test_ground_rules_differ_in_threshold_and_rounding() -> None:
     flat = raster([[0.0, np.nan], [0.0, 30.0]])
     # half a metre per cell: cell (0, 0) holds x 100 ... 100.5, y 50 ... 50.5
     z = np.array([0.3, 0.3 + 1e-9, 0.0, -0.3, -20.0, 0.4])
     points = np.column_stack([np.full(6, 100.2), np.full(6, 50.2), z])
     np.testing.assert_array_equal(flat.is_ground(points), [True, False, True, True, True, False])
     np.testing.assert_array_equal(flat.is_ground(points, "bsfe"), [True] * 6)
-    # Unknown height; outside; no number; cell 0.6, 0.6, which one rule truncates and the other rounds.
+    # Unknown height; outside; not a number; cell 0.6, 0.6, which one rule truncates and the other rounds.
     others = np.array([[100.6, 50.1, -5.0], [500, 50, -5.0], [np.nan, 50, 0], [100.3, 50.3, 9.0]])
     np.testing.assert_array_equal(flat.is_ground(others), [False, False, False, False])
     np.testing.assert_array_equal(flat.is_ground(others, "bsfe"), [False, False, False, True])
 
 
-def test_map_of_a_log(folder: Path) -> None:
+def test_a_map_gives_ground_masks(folder: Path) -> None:
     maps = folder / "map"
     maps.mkdir()
     assert read_ground_raster(maps) is None

@@ -1,4 +1,4 @@
-"""Bags: a recording written by rosbags' own writers comes back, whatever the format, the layout and the poses."""
+"""Bags: a recording written by rosbags' own writers comes back, for every format, layout and source of poses."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def world_of(sweep: Any) -> np.ndarray:
 
 @pytest.mark.parametrize(("form", "order"), [("ros1", "<"), ("ros2", ">"), ("mcap", "<")])
 def test_a_bag_comes_back(form: str, order: str, recording: TinyRecording, tmp_path: Path) -> None:
-    """Poses and the place of the LiDAR are from TF: every shot is put where it hit the world."""
+    """Poses and the mounting of the LiDAR come from TF, so every shot returns to the point that it hit."""
     path = write_bag(tmp_path, form, recording, order=order)
     assert find_sources("bags", tmp_path) == [path] == find_sources("bags", path)
     log: Any = open_log("bags", path, check=False)
@@ -54,14 +54,14 @@ def test_a_bag_comes_back(form: str, order: str, recording: TinyRecording, tmp_p
 
 @pytest.mark.parametrize("form", ["ros1", "mcap"])
 @pytest.mark.parametrize(("poses", "frame"), [("odometry", "base_link"), ("pose", "velodyne")])
-def test_poses_of_a_topic(form: str, poses: str, frame: str, recording: TinyRecording, tmp_path: Path) -> None:
+def test_poses_come_from_a_topic(form: str, poses: str, frame: str, recording: TinyRecording, tmp_path: Path) -> None:
     log = BagLog(write_bag(tmp_path, form, recording, poses))
     assert log.frame == frame
     sweep, to_map = log.sweep(3), MAP_T_ODOM
     assert np.allclose(world_of(sweep) @ to_map[:3, :3].T + to_map[:3, 3], recording.world(3)[:40], atol=5e-3)
 
 
-def test_without_poses(recording: TinyRecording, tmp_path: Path) -> None:
+def test_a_bag_without_poses_is_read(recording: TinyRecording, tmp_path: Path) -> None:
     path = write_bag(tmp_path, "mcap", recording, "none")
     sweep = BagLog(next(path.glob("*.mcap")), ego_T_lidar=MOUNT).sweep(0)
     assert sweep.pose is None and sweep.point_times is not None
@@ -69,7 +69,7 @@ def test_without_poses(recording: TinyRecording, tmp_path: Path) -> None:
     assert np.allclose(sweep.points, expected, atol=1e-4)
 
 
-def test_a_field_of_times_that_is_not_known_is_told(recording: TinyRecording, tmp_path: Path) -> None:
+def test_missing_times_of_points_are_warned_of(recording: TinyRecording, tmp_path: Path) -> None:
     path = write_bag(tmp_path, "ros1", recording)
     log = BagLog(path)
     with warnings.catch_warnings():
@@ -91,14 +91,14 @@ def test_a_field_of_times_that_is_not_known_is_told(recording: TinyRecording, tm
         ({"topic": "/other", "poses": "tf"}, "fewer than two poses"),
     ],
 )
-def test_wrong_choices(settings: Any, message: str, recording: TinyRecording, tmp_path: Path) -> None:
+def test_wrong_topics_are_refused(settings: Any, message: str, recording: TinyRecording, tmp_path: Path) -> None:
     path = write_bag(tmp_path, "ros2", recording, "two")
     with pytest.raises(CFlowError, match=message) as error:
         BagLog(path, **settings)
     assert str(path) in str(error.value)
 
 
-def test_broken_bags(recording: TinyRecording, tmp_path: Path) -> None:
+def test_broken_bags_are_refused(recording: TinyRecording, tmp_path: Path) -> None:
     path = write_bag(tmp_path, "ros1", recording)
     whole = path.read_bytes()
     for content in (b"", b"#ROSBAG V2.0\n", whole[: len(whole) // 2]):
@@ -130,10 +130,10 @@ STAMP = 1_700_000_000_123_456_789
         (np.array([7e17, 7e17 + 5e7, 7e17 + 1e8]), 0.0),  # Livox without a common clock
     ],
 )
-def test_times_of_any_unit(values: np.ndarray, first: float) -> None:
+def test_the_unit_of_times_is_recognised(values: np.ndarray, first: float) -> None:
     assert np.allclose(seconds_after(values, STAMP), first + np.array([0, 0.05, 0.1]), atol=1e-6)
 
 
-def test_times_that_say_nothing() -> None:
+def test_times_without_a_plausible_duration_are_ignored() -> None:
     for values in (np.zeros(3), np.zeros(0), np.array([0.0, 1e-4]), np.array([0, 1 << 63], np.uint64)):
         assert seconds_after(values, STAMP) is None

@@ -42,8 +42,8 @@ def test_a_simulated_drive_of_every_sensor_is_scored_from_its_own_format(profile
     )
     record = json.loads((tmp_path / "out" / "results.json").read_text())
     assert record["num_pairs"] >= 2 and not record["failures"]
-    moving, standing = record["results"]["three_way"]["epe_fd"], record["results"]["three_way"]["epe_bs"]
-    assert moving < 0.9 and standing < 0.2, "most of what moves is found, and what stands still stays"
+    dynamic, static = record["results"]["three_way"]["epe_fd"], record["results"]["three_way"]["epe_bs"]
+    assert dynamic < 0.9 and static < 0.2, "most moving objects are found, and static points stay"
 
 
 def test_ground_is_found_where_there_is_no_mask(drive: Drive, arrays: Path) -> None:
@@ -55,7 +55,7 @@ def test_ground_is_found_where_there_is_no_mask(drive: Drive, arrays: Path) -> N
     assert log.labels(0) is None and log.log_id == drive.log_id and np.array_equal(log.poses, drive.poses)
     assert not hasattr(log, "eval_mask") and pickle.loads(pickle.dumps(log)).files == log.files
     kept = GroundSegmentedLog(drive).sweep(0).is_ground
-    assert np.array_equal(kept, drive.sweep(0).is_ground), "a mask that is there is kept"
+    assert np.array_equal(kept, drive.sweep(0).is_ground), "an existing mask is kept"
 
 
 @pytest.mark.parametrize(
@@ -68,7 +68,7 @@ def test_ground_is_found_where_there_is_no_mask(drive: Drive, arrays: Path) -> N
         ("arrays", {"times": 5}, "5' is not a valid path"),
     ],
 )
-def test_wrong_calls(arrays: Path, name: str, settings: dict[str, Any], complaint: str) -> None:
+def test_wrong_settings_are_refused(arrays: Path, name: str, settings: dict[str, Any], complaint: str) -> None:
     with pytest.raises(CFlowError, match=complaint):
         open_log(name, arrays, **settings)
 
@@ -77,7 +77,7 @@ def test_wrong_calls(arrays: Path, name: str, settings: dict[str, Any], complain
     "name, log", [("av2", "sensors/lidar/1.npy"), ("aevascenes", "sequence.json"), ("arrays", "1.npy")]
 )
 def test_logs_are_found_below_and_at_a_folder(name: str, log: str, tmp_path: Path) -> None:
-    """Nothing is looked at below a log, in hidden folders, or further down than the layouts go."""
+    """Folders below a log, hidden folders and folders deeper than the layouts are not searched."""
     for place in ("b", "a/x", "b/points/y", ".hidden", "1/2/3/4/5"):
         for file in (log, log.replace("1", "2")):
             (tmp_path / place / file).parent.mkdir(parents=True, exist_ok=True)
@@ -103,8 +103,8 @@ def test_logs_are_found_below_and_at_a_folder(name: str, log: str, tmp_path: Pat
         ("arrays", ["1.bin", "2.bin"]),
     ],
 )
-def test_pointers_of_git_are_no_data(name: str, files: list[str], tmp_path: Path) -> None:
-    """A clone without git-lfs has them in place of large files. These are as long as ten points of a `.bin`."""
+def test_git_lfs_pointers_are_refused(name: str, files: list[str], tmp_path: Path) -> None:
+    """A clone without git-lfs has pointers instead of large files. These are as long as ten points of a `.bin`."""
     if name == "bags":
         pytest.importorskip("rosbags")
     pointer = f"version https://git-lfs.github.com/spec/v1\noid sha256:{64 * '0'}\nsize 1234\n".ljust(128 + 32)

@@ -1,4 +1,4 @@
-"""The reader of OpenSceneFlow's HDF5 scenes, on a scene made here and on the real one."""
+"""The reader of OpenSceneFlow's HDF5 scenes, on a scene of random points and on a simulated drive."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from cflow_torch.simulator import make_drive
 h5py = pytest.importorskip("h5py")
 
 
-def test_what_is_stored_is_read(tmp_path):
+def test_a_scene_is_read(tmp_path):
     file = write_scene(tmp_path / "scene.h5")
     with h5py.File(file) as scene, HDF5Log(file) as log:
         assert log.log_id == "scene" and list(log.timestamps) == list(STAMPS)
@@ -64,7 +64,7 @@ def test_a_bad_sweep_is_named(tmp_path, replaced, complaint):
 
 
 def test_data_of_other_files_are_never_read(tmp_path):
-    """Links, external storage and virtual datasets name other files, which need not be scenes at all."""
+    """Links, external storage and virtual datasets refer to other files, which may be any file."""
     other, secret = write_scene(tmp_path / "other.h5"), tmp_path / "secret"
     secret.write_bytes(np.ones((50, 4), np.float32).tobytes())
     layout = h5py.VirtualLayout((50, 4), np.float32)
@@ -82,7 +82,7 @@ def test_data_of_other_files_are_never_read(tmp_path):
             log.sweep(0)
 
 
-def test_files_that_are_no_scene(tmp_path):
+def test_other_files_are_refused(tmp_path):
     write_scene(tmp_path / "one.h5", STAMPS[:1])
     for name in ("one", "missing"):
         with pytest.raises(CFlowError, match=f"{name}.h5"):
@@ -91,7 +91,7 @@ def test_files_that_are_no_scene(tmp_path):
         find_hdf5_scenes(tmp_path / "nowhere")
 
 
-def test_every_key_is_read_as_stored(tmp_path):
+def test_every_key_is_read_in_its_own_type(tmp_path):
     """float32 poses, (N, 3) points, int8 categories with -1 = no label, eval_mask (N,) are variants that occur."""
     extra = {
         "pose": np.eye(4, dtype=np.float32),
@@ -120,7 +120,7 @@ def drive():
 
 
 @pytest.mark.parametrize("points_frame", ["ego", "sensor"])
-def test_round_trip_of_a_simulated_drive(drive, tmp_path, points_frame):
+def test_a_simulated_drive_comes_back(drive, tmp_path, points_frame):
     file = tmp_path / "scene.h5"
     write_hdf5_scene(drive, file, points_frame, eval_step=2)
     extrinsics = drive.units(0)[0].T_ego_sensor if points_frame == "sensor" else np.eye(4)
@@ -145,7 +145,7 @@ def test_round_trip_of_a_simulated_drive(drive, tmp_path, points_frame):
             motion = np.linalg.inv(drive.poses[index + 1]) @ drive.poses[index]
             assert np.array_equal(log.values(index, "ego_motion"), motion.astype(np.float32))
             assert (log.values(index, "flow_instance_id")[truth.category > 0] > 0).mean() > 0.99
-            # In the frame of the points, what stands still moves as the poses say.
+            # In the frame of the points, static points move as the poses say.
             rigid = transform_points(read.points, np.linalg.inv(log.sweep(index + 1).pose) @ read.pose) - read.points
             assert np.abs(labels.flow - rigid)[truth.category == 0].max() < 1e-4
         assert log.eval_mask(1) is None

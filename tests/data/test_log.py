@@ -24,7 +24,7 @@ def drive() -> Drive:
 
 @pytest.fixture(scope="module")
 def result(drive: Drive) -> FlowResult:
-    """Flow of the last pair but one by the default preset."""
+    """Flow of the second-last pair by the default preset."""
     (result,) = make_model(make_config())([window(drive, 3, 3)])
     return result
 
@@ -33,7 +33,7 @@ def points_of(windows: Sequence[Window]) -> list:
     return [[sweep.points for sweep in (w.pc0, w.pc1, *w.pch, *w.pcf)] for w in windows]
 
 
-def test_a_log_is_a_sequence_whatever_is_put_round_it(drive: Drive) -> None:
+def test_logs_and_wrappers_are_sequences(drive: Drive) -> None:
     class Mine(Log):
         log_id, timestamps = "mine", (0, 1, 2)
 
@@ -49,7 +49,7 @@ def test_a_log_is_a_sequence_whatever_is_put_round_it(drive: Drive) -> None:
     assert np.array_equal(recent.sweep(1).points, drive.sweep(1).points)
 
 
-def test_windows_are_those_of_each_pair_and_read_a_sweep_once(drive: Drive) -> None:
+def test_windows_read_each_sweep_once(drive: Drive) -> None:
     class Counted(Log):
         log_id, timestamps, read = drive.log_id, drive.timestamps, []  # noqa: RUF012
 
@@ -74,14 +74,14 @@ def test_a_data_loader_with_workers_equals_the_loop(drive: Drive) -> None:
         assert all(np.array_equal(values, other.numpy()[name]) for name, values in one.numpy().items())
 
 
-def test_one_log_is_a_data_set_as_well(drive: Drive) -> None:
+def test_a_single_log_is_a_data_set(drive: Drive) -> None:
     assert len(WindowDataset(drive)) == len(WindowDataset([drive])) == len(drive.timestamps) - 1
 
 
 # ---------------------------------------------------------------- results
 
 
-def test_a_result_is_the_same_from_its_file(result: FlowResult, tmp_path: Path) -> None:
+def test_a_result_is_saved_and_loaded(result: FlowResult, tmp_path: Path) -> None:
     result.save(tmp_path / "a.npz")
     again = FlowResult.load(tmp_path / "a.npz").numpy()
     assert again.keys() == result.numpy().keys() and "confidence" in again
@@ -121,8 +121,8 @@ def test_a_data_frame_has_a_row_per_point(drive: Drive, result: FlowResult, monk
         result.to_pandas()
 
 
-def test_objects_are_the_movers_of_the_simulator(drive: Drive, result: FlowResult) -> None:
-    """Of everything that is seen with 50 points or more; the lorry with its trailer turns, and is no rigid body."""
+def test_objects_are_the_moving_objects_of_the_simulator(drive: Drive, result: FlowResult) -> None:
+    """Objects with 50 points or more; the articulated lorry is left out because it is not a rigid body."""
     objects = result.objects(drive.sweep(3).points)
     assert (
         len(objects)
@@ -130,7 +130,7 @@ def test_objects_are_the_movers_of_the_simulator(drive: Drive, result: FlowResul
         and (np.linalg.norm(objects["velocity"], axis=1) >= 0.5).all()
     )
     T, before, after = np.linalg.inv(drive.poses[4]) @ drive.poses[3], drive.boxes(3), drive.boxes(4)
-    num_movers, num_missed, is_found = 0, 0, np.zeros(len(objects), bool)
+    num_moving, num_missed, is_found = 0, 0, np.zeros(len(objects), bool)
     for track, pose0, count, category in zip(before.track_id, before.pose, before.num_points, before.category):
         number = after.track_id.index(track)
         pose, size = after.pose[number], after.size[number]
@@ -141,7 +141,7 @@ def test_objects_are_the_movers_of_the_simulator(drive: Drive, result: FlowResul
         is_found |= within
         if count < 50 or category in ("TRUCK_CAB", "VEHICULAR_TRAILER"):
             continue
-        num_movers += 1
+        num_moving += 1
         if not within.any():
             num_missed += 1
             continue
@@ -150,7 +150,7 @@ def test_objects_are_the_movers_of_the_simulator(drive: Drive, result: FlowResul
         assert 0.7 * count < row["num_points"] <= count and (row["size"] < size + 0.6).all(), category
         difference = np.angle(np.exp(1j * (row["heading"] - np.arctan2(pose[1, 0], pose[0, 0]))))
         assert abs(difference) < 0.4, category
-    assert num_movers >= 6 and num_missed <= 1 and is_found[objects["confidence"] > 0.7].mean() > 0.8
+    assert num_moving >= 6 and num_missed <= 1 and is_found[objects["confidence"] > 0.7].mean() > 0.8
     with pytest.raises(CFlowError, match="without"):
         FlowResult.of({"flow": result.flow}).objects(drive.sweep(3).points)
     empty = result.objects(drive.sweep(3).points, min_speed=1e3)

@@ -1,4 +1,4 @@
-"""One rule for names out of data: they become folders and files of their own, and lie where they should."""
+"""Names from data cannot leave their folder."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ GOOD = (
 )
 
 
-def test_names_that_are_refused() -> None:
+def test_unsafe_names_are_refused() -> None:
     for name in (*BAD, None, 5, b"a", ["a"], Path("a")):
         assert not is_safe_name(name)
         with pytest.raises(CFlowError, match="the scene .* cannot be used as a file or folder name: ") as error:
@@ -32,13 +32,13 @@ def test_names_that_are_refused() -> None:
         assert str(error.value).isprintable() and len(str(error.value)) < 300
 
 
-def test_names_that_are_taken(tmp_path: Path) -> None:
+def test_safe_names_are_accepted(tmp_path: Path) -> None:
     for name in GOOD:
         assert safe_name(name, "the scene") == name
         (tmp_path / name).mkdir()
 
 
-def test_files_that_tables_name_lie_below_the_folder(tmp_path: Path) -> None:
+def test_paths_in_tables_cannot_leave_the_folder(tmp_path: Path) -> None:
     assert path_inside(tmp_path, "samples/LIDAR_TOP/x__1.bin", "f") == tmp_path / "samples" / "LIDAR_TOP" / "x__1.bin"
     assert path_inside(tmp_path, "./a//b.npz", "f") == tmp_path / "a" / "b.npz"
     outside = ("/etc/passwd", "../x", "a/../../x", "a/..", "\\\\host\\x", "\\x", "C:/x", ".", "", None, 5)
@@ -55,7 +55,7 @@ def test_links_in_the_data_are_followed(tmp_path: Path) -> None:
     assert path_inside(root, "data/x.bin", "f").read_bytes() == b"data", "users link data sets"
 
 
-def test_time_stamps_as_names() -> None:
+def test_time_stamps_are_recognised() -> None:
     assert is_timestamp("315966000000000000") and is_timestamp("0")
     for name in ("", "-1", "²", "\u0663", "1e5", "9" * 19 + "0", "9223372036854775808", " 1"):
         assert not is_timestamp(name), name

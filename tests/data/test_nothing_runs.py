@@ -1,4 +1,4 @@
-"""Nothing that a file says is ever run: files that try are refused, and what they would have done was not done."""
+"""Nothing from a file is executed: files with pickled code are refused, and their code did not run."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from cflow_torch.simulator.writers.aevascenes import write_aevascenes_sequence
 
 
 class Payload:
-    """Unpickled, it makes a folder."""
+    """Creates a folder when it is unpickled."""
 
     def __init__(self, marker: Path) -> None:
         self.marker = str(marker)
@@ -45,7 +45,7 @@ def test_the_payload_works(tmp_path: Path) -> None:
     assert (tmp_path / "marker").is_dir()
 
 
-def test_arrays_of_objects(marker: Path, tmp_path: Path) -> None:
+def test_arrays_of_objects_are_refused(marker: Path, tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", objects(marker, (4, 3)))
     np.savez(tmp_path / "a.npz", points=objects(marker, (4, 3)))
     with pytest.raises(CFlowError, match="a.npy.*copy it"):
@@ -55,8 +55,8 @@ def test_arrays_of_objects(marker: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("key", ["semantic_labels", "xyz", "velocity"])
-def test_clouds_with_strings(key: str, marker: Path, tmp_path: Path) -> None:
-    """The one array that may hold pickled text."""
+def test_pickled_strings_run_nothing(key: str, marker: Path, tmp_path: Path) -> None:
+    """The labels may be pickled text, but nothing else."""
     folder = write_aevascenes_sequence(TinyRecording(("front",), num_sweeps=2), tmp_path / "data")
     for file in folder.rglob("*.npz"):
         with np.load(file, allow_pickle=True) as stored:  # our own

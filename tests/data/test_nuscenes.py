@@ -53,8 +53,8 @@ def test_two_lidars_are_merged(tmp_path):
     assert np.abs(points - several.sweep(1).points).max() < 2e-5
 
 
-def test_labels_between_samples(drive, tmp_path):
-    """Samples at 2 Hz: boxes between them are near to what each ray really hit."""
+def test_labels_between_samples_are_near_the_truth(drive, tmp_path):
+    """Boxes interpolated between samples at 2 Hz are close to the objects that the rays hit."""
     log = open_log(write_nuscenes(drive, tmp_path), own_vehicle=None)
     index = 3
     labels, true = log.labels(index), drive.labels(index)
@@ -75,7 +75,7 @@ def tracks_of(*boxes: Any) -> Tracks:
 
 def test_a_box_moves_turns_and_grows_between_samples():
     found, is_known = tracks_of((0, "a", 10.0, 3.0, 4.0), (1, "a", 20.0, -3.0, 5.0)).at(100_000)
-    yaw = 3.0 + 0.2 * (2 * np.pi - 6.0)  # the shorter way, through pi
+    yaw = 3.0 + 0.2 * (2 * np.pi - 6.0)  # the shorter arc, through pi
     np.testing.assert_allclose(found.pose[0, :3, 0], [np.cos(yaw), np.sin(yaw), 0], atol=1e-12)
     np.testing.assert_allclose(found.pose[0, :3, 3], [12, 0, 0], atol=1e-12)
     assert is_known.all() and found.size[0, 0] == pytest.approx(4.2)
@@ -85,9 +85,9 @@ def test_an_object_that_one_sample_lacks_is_a_guess():
     tracks = tracks_of((0, "a", 0.0, 0, 4), (1, "a", 5.0, 0, 4), (2, "b", 1.0, 0, 4), (3, "b", 3.0, 0, 4))
     found, is_known = tracks.at(750_000)
     assert found.track == ["a", "b"] and not is_known.any()
-    np.testing.assert_allclose(found.pose[:, 0, 3], [7.5, 0.0])  # each goes on as on its other side
+    np.testing.assert_allclose(found.pose[:, 0, 3], [7.5, 0.0])  # each continues its motion of the other interval
     alone, _ = tracks_of((1, "a", 5.0, 0, 4), (2, "b", 1.0, 0, 4)).at(750_000)
-    np.testing.assert_allclose(alone.pose[:, 0, 3], [5.0, 1.0])  # nothing tells how they move
+    np.testing.assert_allclose(alone.pose[:, 0, 3], [5.0, 1.0])  # their motion is unknown
     assert tracks.at(500_000)[0].track == ["a"] and tracks.at(500_000)[1].all()
     assert tracks.at(-1) is None and tracks.at(1_500_001) is None and tracks_of().at(0) is None
 
@@ -122,11 +122,11 @@ def test_every_second_sweep_keeps_the_samples(tmp_path):
         open_log(folder, sweep_step=0)
 
 
-def test_own_vehicle_and_shots_without_return_are_removed(tiny):
+def test_own_vehicle_and_missing_returns_are_removed(tiny):
     file = min((tiny / "samples" / "LIDAR_TOP").iterdir())
     edit(tiny, "calibrated_sensor", lambda rows: rows[0].update(translation=[0.9, 0, 1.8], rotation=[1, 0, 0, 0]))
     rows = np.zeros((6, 5), "<f4")
-    # Bonnet, boot, beside the car, ahead of it, no return, no number.
+    # Bonnet, boot, next to the car, in front of it, no return, not a number.
     rows[:, :3] = [[1, 0.5, -1], [-1.9, 0, -1], [0, 0.9, -1], [2.5, 0, -1], [0, 0, 0], [np.nan, 1, 1]]
     rows.tofile(file)
     kept = open_log(tiny).sweep(0).points
@@ -137,7 +137,7 @@ def test_own_vehicle_and_shots_without_return_are_removed(tiny):
         open_log(tiny, lidars=["THIRD"])
 
 
-def test_finding_scenes_and_reading_their_tables_once(tiny, tmp_path):
+def test_scenes_of_a_version_share_their_tables(tiny, tmp_path):
     second = write_nuscenes(TinyRecording(("LIDAR_TOP",), num_sweeps=4, log_id="second"), tmp_path / "data")
     assert [source.name for source in find_nuscenes_scenes(tmp_path)] == ["second", "tiny"]
     for file in (second / VERSION).iterdir():  # two scenes of one version, as in the real data set
@@ -156,7 +156,7 @@ def test_finding_scenes_and_reading_their_tables_once(tiny, tmp_path):
 
 
 @pytest.mark.parametrize("content", [b'{"token": "a"}', b"[1, 2]", b'[{"a": 1}]'])
-def test_foreign_tables(tiny, content):
+def test_tables_of_another_layout_are_refused(tiny, content):
     (tiny / VERSION / "sample_data.json").write_bytes(content)
     with pytest.raises(CFlowError, match="cannot read .*sample_data.json .*(KeyError|not a list of rows)"):
         open_log(tiny)
@@ -174,13 +174,13 @@ def test_foreign_tables(tiny, content):
         ("sensor", {"modality": "camera"}, "has no LiDAR"),
     ],
 )
-def test_rows_that_contradict_each_other(tiny, table, change, complaint):
+def test_inconsistent_rows_are_refused(tiny, table, change, complaint):
     edit(tiny, table, lambda rows: rows[0].update(change))
     with pytest.raises(CFlowError, match=complaint):
         open_log(tiny)
 
 
-def test_what_a_scene_does_not_have(tiny, tmp_path):
+def test_missing_scenes_and_unknown_categories_are_refused(tiny, tmp_path):
     with pytest.raises(CFlowError, match="has 1 sweeps"):
         open_log(write_nuscenes(TinyRecording(("LIDAR_TOP",), num_sweeps=1), tmp_path / "one"))
     with pytest.raises(CFlowError, match="no scene 'scene-0061'"):
@@ -190,7 +190,7 @@ def test_what_a_scene_does_not_have(tiny, tmp_path):
         open_log(tiny)
 
 
-def test_bad_sweeps(tiny):
+def test_a_bad_sweep_costs_no_other(tiny):
     file = min((tiny / "samples" / "LIDAR_TOP").iterdir())
     whole, log = file.read_bytes(), open_log(tiny)
     kitti = np.random.default_rng(0).uniform(-50, 50, (100, 4)).astype("<f4").tobytes()  # four columns: 1600 bytes
@@ -204,7 +204,7 @@ def test_bad_sweeps(tiny):
         log.sweep(0)
 
 
-def test_a_real_sweep(data_root: Path, tmp_path: Path) -> None:
+def test_a_real_sweep_is_read(data_root: Path, tmp_path: Path) -> None:
     folder = data_root / "real-files" / "nuscenes"
     if not folder.is_dir():
         pytest.skip(f"no real sweep at {folder}")
@@ -214,9 +214,9 @@ def test_a_real_sweep(data_root: Path, tmp_path: Path) -> None:
     elevation = np.degrees(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])))
     far = np.linalg.norm(points, axis=1) > 2.5
     assert -31 < elevation[far].min() < -29 and 10 < elevation[far].max() < 11  # HDL-32E
-    # A quarter lies on the vehicle itself. The reader leaves out this and nothing else: the next return is 3 m off.
+    # A quarter of the points lies on the vehicle itself. Only these are removed: the next return is 3 m away.
     recording = TinyRecording(("LIDAR_TOP",))
-    recording.mounts["LIDAR_TOP"] = rigid(turn_z(-np.pi / 2), (0.943713, 0.0, 1.84023))  # as the data set has it
+    recording.mounts["LIDAR_TOP"] = rigid(turn_z(-np.pi / 2), (0.943713, 0.0, 1.84023))  # as in the data set
     data = write_nuscenes(recording, tmp_path / "data", key_frame_interval=0.1)
     min((data / "samples" / "LIDAR_TOP").iterdir()).write_bytes(file.read_bytes())
     kept = open_log(data).sweep(0).points

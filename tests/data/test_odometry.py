@@ -1,4 +1,4 @@
-"""Poses for logs without any: KISS-ICP where it is installed, one clear message where it is not."""
+"""Poses estimated by KISS-ICP for logs without poses, and its own loaders."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ needs_kiss_icp = pytest.mark.skipif(find_spec("kiss_icp") is None, reason="needs
 
 
 class NoPoses:
-    """A log whose poses are lost, and perhaps its points."""
+    """A log without poses, and optionally without points."""
 
     def __init__(self, log, is_empty=False) -> None:
         self.log, self.log_id, self.timestamps, self.labels = log, log.log_id, log.timestamps, log.labels
@@ -37,17 +37,17 @@ def drive():
 
 
 def drift(poses: np.ndarray, truth: np.ndarray):
-    """(metres, degrees) by which the last sweep is off, seen from the first."""
+    """Return the error of the last pose relative to the first, in metres and degrees."""
     difference = np.linalg.inv(np.linalg.inv(truth[0]) @ truth[-1]) @ np.linalg.inv(poses[0]) @ poses[-1]
     angle = np.degrees(np.arccos(np.clip((np.trace(difference[:3, :3]) - 1) / 2, -1, 1)))
     return np.linalg.norm(difference[:3, 3]), angle
 
 
 @needs_kiss_icp
-def test_a_simulated_drive(drive):
+def test_poses_of_a_simulated_drive_are_estimated(drive):
     poses = poses_from_odometry(NoPoses(drive))
     assert np.array_equal(poses[0], np.eye(4))
-    for index in range(7):  # the first steps too, where KISS-ICP alone misses by 14 cm
+    for index in range(7):  # including the first steps, where KISS-ICP alone is off by 14 cm
         metres, degrees = drift(poses[index : index + 2], drive.poses[index : index + 2])
         assert metres < 0.05 and degrees < 0.2, index
     assert np.array_equal(poses, poses_from_odometry(NoPoses(drive))), "the same again"
@@ -56,7 +56,7 @@ def test_a_simulated_drive(drive):
 
 
 @needs_kiss_icp
-def test_the_real_drive(kitti_file):
+def test_poses_of_the_real_drive_are_estimated(kitti_file):
     hdf5 = pytest.importorskip("cflow_torch.data.hdf5")
     with hdf5.HDF5Log(kitti_file) as log:
         poses = poses_from_odometry(NoPoses(log))
@@ -65,7 +65,7 @@ def test_the_real_drive(kitti_file):
         assert not any(residual.verdict for residual in check_static_world(PosedLog(log, poses)))
 
 
-def test_without_kiss_icp_the_message_says_what_to_do(drive, monkeypatch):
+def test_without_kiss_icp_the_message_names_the_fix(drive, monkeypatch):
     for name in [name for name in sys.modules if name.split(".")[0] == "kiss_icp"]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "kiss_icp", None)
@@ -76,7 +76,7 @@ def test_without_kiss_icp_the_message_says_what_to_do(drive, monkeypatch):
 
 
 @needs_kiss_icp
-def test_its_own_loaders(drive, tmp_path):
+def test_loaders_of_kiss_icp_are_logs(drive, tmp_path):
     """KITTI's layout, whose scans the loader corrects by a fifth of a degree."""
     folder = tmp_path / "sequences" / "03"
     (folder / "velodyne").mkdir(parents=True)

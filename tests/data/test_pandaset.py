@@ -1,4 +1,4 @@
-"""PandaSet: a recording written as the data set has it, by pandas, comes back; pickles are never executed."""
+"""PandaSet: a recording written by pandas in the layout of the data set comes back; pickles are never executed."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from cflow_torch.data.catalog import find_sources, open_log
 from cflow_torch.data.pandaset import PandaSetLog
 from cflow_torch.data.pickles import load_columns
 
-# Two points (x, y, d, label) by pandas 1.0.5 in protocol 4: the layout of its time, which the released files are of.
+# Two points (x, y, d, label) by pandas 1.0.5 in protocol 4, the layout of the released files.
 OLD_FRAME = (
     "H4sIAAAAAAAC/5VTUWsTQRDO5u5qrBZbsGhfij6o0YfDgg8KYktTBD08oe/l2Eu22eDdJezu2QQN6EOqhXnr+A/9Af4Dnd27QKJRcB9u5mbn"
     "m29mduaT/+2713AHtka86HEddodKhKeK5wLh6hE3/KXTL/HhZ5xiG4KkR0aE3UX/QWGEKnimw5wXvC+URrh+mA27795U/xW+fUIBbi8De2Is"
@@ -88,10 +88,10 @@ def test_cuboids_become_flow(sequence: Path) -> None:
     assert labels is not None and labels.is_valid.all() and log.labels(2) is None
     stamps, poses = recording.timestamps, recording.poses
     moved = recording.car_at(stamps[2]) @ np.linalg.inv(recording.car_at(stamps[1]))
-    # Shots of up to 99 ms later miss the front of the cuboid: those inside are judged.
+    # Shots up to 99 ms later miss the front of the cuboid, so we judge those inside.
     local = np.c_[recording.world(1), np.ones(len(points))] @ np.linalg.inv(recording.car_at(stamps[1])).T
     inside = (np.abs(local[:, :3]) <= CAR_SIZE / 2 + [0.1, 0.1, 0]).all(1)
-    assert inside[:40].any() and inside[40:].any(), "both LiDARs see the car"
+    assert inside[:40].any() and inside[40:].any(), "both LiDARs hit the car"
     for rows, motion, category in ((inside, moved, 19), (~inside, np.eye(4), 0)):
         T = np.linalg.inv(poses[2]) @ motion @ poses[1]
         expected = points @ T[:3, :3].T + T[:3, 3] - points
@@ -99,7 +99,7 @@ def test_cuboids_become_flow(sequence: Path) -> None:
         assert (labels.category[rows] == category).all()
 
 
-def test_frames_of_old_pandas() -> None:
+def test_data_frames_of_old_pandas_are_read() -> None:
     columns = load_columns(io.BytesIO(gzip.decompress(base64.b64decode(OLD_FRAME))))
     assert {name: values.tolist() for name, values in columns.items()} == {
         "x": [1.0, 3.0],

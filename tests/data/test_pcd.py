@@ -1,4 +1,4 @@
-"""PCD files: what is written is read, files of other programs are understood, broken files are one clear error."""
+"""PCD files: all types, files of other programs, truncated files."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ pypcd4 = pytest.importorskip("pypcd4", reason="needs the extra clouds: pip insta
 
 
 def write_as(path: Path, fields: dict[str, np.ndarray], data: str) -> None:
-    """As other programs do."""
+    """Write a file as other programs do."""
     kinds = [values.dtype for values in fields.values()]
     cloud = pypcd4.PointCloud.from_points(list(fields.values()), list(fields), kinds)
     cloud.save(path, pypcd4.Encoding(data))
@@ -31,7 +31,7 @@ def test_every_type_comes_back(tmp_path, data, rows):
     fields = {
         kind: rng.integers(np.iinfo(kind).min, np.iinfo(kind).max, rows, kind, True)
         if kind[0] in "iu"
-        else rng.integers(-(2**20), 2**20, rows).astype(kind) / 1024  # which ten decimals hold
+        else rng.integers(-(2**20), 2**20, rows).astype(kind) / 1024  # exact in ten decimals
         for kind in DTYPES
     }
     write_as(tmp_path / "a.pcd", fields, data)
@@ -41,7 +41,7 @@ def test_every_type_comes_back(tmp_path, data, rows):
         assert again[name].dtype == values.dtype and np.array_equal(again[name], values), name
 
 
-def test_padding_and_fields_of_several_values_are_left_out(tmp_path):
+def test_padding_and_vector_fields_are_left_out(tmp_path):
     rows = np.zeros(2, [("x", "<f4"), ("pad", "V4"), ("normal", "<f4", 3), ("t", "<u8")])
     rows["x"], rows["normal"], rows["t"] = (1.5, np.nan), 7, (3, 2**60 + 1)
     header = b"VERSION 0.7\nFIELDS x _ normal t\nSIZE 4 1 4 8\nTYPE F U F U\nCOUNT 1 4 3 1\nWIDTH 2\nHEIGHT 1\n"
@@ -52,7 +52,7 @@ def test_padding_and_fields_of_several_values_are_left_out(tmp_path):
 
 
 @pytest.mark.parametrize("data", DATA)
-def test_every_truncation_is_noticed(tmp_path, data):
+def test_every_truncation_is_detected(tmp_path, data):
     file = tmp_path / "a.pcd"
     write_as(file, {"x": np.arange(20, dtype=np.float32), "t": np.arange(20, dtype=np.uint64)}, data)
     whole = file.read_bytes()
@@ -63,7 +63,7 @@ def test_every_truncation_is_noticed(tmp_path, data):
             read_pcd(file)
 
 
-def test_without_pypcd4_the_message_names_the_extra(tmp_path, monkeypatch):
+def test_without_pypcd4_the_message_names_it(tmp_path, monkeypatch):
     write_pcd(tmp_path / "a.pcd", {"x": np.zeros(2, np.float32)})
     monkeypatch.setitem(sys.modules, "pypcd4", None)
     with pytest.raises(CFlowError, match=r"pip install pypcd4"):

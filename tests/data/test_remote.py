@@ -1,4 +1,4 @@
-"""Places that fsspec reaches: every data set read as from a local folder; files written whole or not at all."""
+"""Remote paths: every data set is read as from a local folder, and files are written completely or not at all."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import asyncio
 import os
 import pickle
 import signal
-import subprocess
 import sys
 import uuid
 from dataclasses import replace
@@ -31,18 +30,18 @@ REMOTE = [name for name in SMALL_LOGS if name != "bags"]
 
 
 class Unreachable(Exception):
-    """As the errors of the stores' own libraries: no OSError."""
+    """Like the errors of the stores' own libraries, it is not an OSError."""
 
 
 class FarFile(fsspec.spec.AbstractBufferedFile):
-    """A file of `Far`: every range is a request."""
+    """A file of `Far`, where every range is a request."""
 
     def _fetch_range(self, start: int, end: int) -> bytes:
         return bytes(self.fs.cat_file(self.path, start, end))
 
 
 class Far(LocalFileSystem):
-    """Folders of this machine as a store far away: requests are counted, and can fail."""
+    """Local folders as a remote store whose requests are counted and can fail."""
 
     protocol, cachable, requests, error = "far", False, 0, None
 
@@ -53,7 +52,7 @@ class Far(LocalFileSystem):
     def _asked(self, name: str, *arguments: Any, **settings: Any) -> Any:
         Far.requests += 1
         if Far.error is not None:
-            raise Far.error("the far side is away")
+            raise Far.error("the store is unreachable")
         return getattr(super(), name)(*arguments, **settings)
 
     def info(self, path: Any, **settings: Any) -> Any:
@@ -75,7 +74,7 @@ fsspec.register_implementation("far", Far, clobber=True)
 
 @pytest.fixture
 def far(monkeypatch: Any) -> Iterator[Callable[[Path], Any]]:
-    """Makes an address of `Far` from a local folder."""
+    """Convert a local folder to a path of `Far`."""
     paths._copy.cache_clear()
     monkeypatch.setattr(Far, "error", None)
     yield lambda folder: upath.UPath(f"far://{folder}")
@@ -84,14 +83,14 @@ def far(monkeypatch: Any) -> Iterator[Callable[[Path], Any]]:
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: Any) -> Callable[[str], Path]:
-    """Data set -> local folder with one small log of it, made when it is first asked for."""
+    """Data set -> local folder with one small log, written on the first call."""
     folder = tmp_path_factory.mktemp("local")
     return lambda name: folder / name if (folder / name).is_dir() else write_small_log(name, folder / name)
 
 
 @pytest.fixture(params=["memory", "file"])
-def place(request: Any, tmp_path: Path) -> Iterator[Any]:
-    """An empty folder of a file system of fsspec: one whose puts are whole, one that needs a move."""
+def remote(request: Any, tmp_path: Path) -> Iterator[Any]:
+    """An empty folder of two file systems of fsspec: one has atomic puts, one needs a move."""
     name = f"{uuid.uuid4().hex}/deep"
     folder = upath.UPath(f"memory://{name}" if request.param == "memory" else f"file://{tmp_path}/{name}")
     yield folder
@@ -115,7 +114,7 @@ def names(folder: Any) -> tuple[str, ...]:
     return tuple(sorted(path.name for path in folder.iterdir())) if folder.is_dir() else ()
 
 
-def test_what_is_no_address_is_a_local_name(tmp_path):
+def test_plain_strings_are_local_paths(tmp_path):
     for text in ("data/av2", str(tmp_path), "C:\\data", "a:b", "./x://y"):
         assert as_path(text) == Path(text) and not is_remote(as_path(text))
     assert as_path(f"file://{tmp_path}") == tmp_path and not is_remote(tmp_path)
@@ -125,11 +124,11 @@ def test_what_is_no_address_is_a_local_name(tmp_path):
             as_path(wrong)
 
 
-def test_addresses(tmp_path, monkeypatch):
+def test_urls_are_remote_paths(tmp_path, monkeypatch):
     path = as_path("memory://bucket/val/")
     assert path == upath.UPath("memory://bucket/val") and path.name == "val" and is_remote(path)
     assert pickle.loads(pickle.dumps(path)) == path and as_path(path) is path
-    assert not is_remote(upath.UPath(str(tmp_path)))  # a path of this machine all the same
+    assert not is_remote(upath.UPath(str(tmp_path)))  # it is a local path, too
     with pytest.raises(CFlowError, match="no file system s33://"):
         as_path("s33://bucket/val")
     monkeypatch.setitem(sys.modules, "adlfs", None)
@@ -140,21 +139,21 @@ def test_addresses(tmp_path, monkeypatch):
         as_path("s3://bucket/val")
 
 
-def test_a_pipe_is_no_file(tmp_path):
+def test_pipes_are_refused(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(OSError, match="device or a pipe"):
         paths.read_bytes(tmp_path / "pipe")
 
 
 @pytest.mark.parametrize("name", REMOTE)
-def test_every_data_set_is_read_as_from_a_local_folder(written, far, name):
+def test_every_data_set_is_read_from_remote_as_from_local(written, far, name):
     (expected,) = find_sources(name, written(name))
     (source,) = pickle.loads(pickle.dumps(find_sources(name, far(written(name)))))
     assert is_remote(source if is_remote(source) else source.root)
     assert_same_logs(open_log(name, source, check=False), open_log(name, expected, check=False))
 
 
-def test_large_files_are_read_in_blocks_that_are_kept(far, tmp_path, monkeypatch):
+def test_large_files_are_read_in_cached_blocks(far, tmp_path, monkeypatch):
     data = np.random.default_rng(0).bytes(100_000)
     (tmp_path / "a").write_bytes(data)
     monkeypatch.setattr(paths, "_BLOCK", 10_000)
@@ -170,7 +169,7 @@ def test_large_files_are_read_in_blocks_that_are_kept(far, tmp_path, monkeypatch
 
 @pytest.mark.parametrize("error", [FileNotFoundError, Unreachable, asyncio.TimeoutError])
 @pytest.mark.parametrize("name", REMOTE)
-def test_errors_of_the_far_side_are_one_frames(written, far, name, error, monkeypatch):
+def test_a_remote_error_costs_one_call(written, far, name, error, monkeypatch):
     monkeypatch.setattr(paths, "_BLOCK", 1000)
     monkeypatch.setattr(paths, "_KEPT_BLOCKS", 1)
     root = far(written(name))
@@ -184,49 +183,49 @@ def test_errors_of_the_far_side_are_one_frames(written, far, name, error, monkey
         with pytest.raises((CFlowError, OSError)):
             read()
     monkeypatch.setattr(Far, "error", None)
-    assert np.array_equal(log.sweep(0).points, expected)  # it is back
+    assert np.array_equal(log.sweep(0).points, expected)  # the store is back
 
 
 @pytest.mark.parametrize("error", [Unreachable, KeyboardInterrupt])
-def test_a_file_is_there_when_its_block_is_done_and_an_older_one_until_then(place, error):
-    with atomic_file(place / "deep" / "a") as file:
+def test_a_file_appears_complete_when_its_block_ends(remote, error):
+    with atomic_file(remote / "deep" / "a") as file:
         file.write(b"old")
-    assert (place / "deep" / "a").read_bytes() == b"old"
+    assert (remote / "deep" / "a").read_bytes() == b"old"
     for name in ("a", "b"):
-        with pytest.raises(error), atomic_file(place / "deep" / name) as file:
+        with pytest.raises(error), atomic_file(remote / "deep" / name) as file:
             file.write(b"new")
             file.flush()
-            assert names(place / "deep") == ("a",)
+            assert names(remote / "deep") == ("a",)
             raise error
-    assert (place / "deep" / "a").read_bytes() == b"old" and names(place / "deep") == ("a",)
-    with atomic_file(place / "deep" / "a") as file:
+    assert (remote / "deep" / "a").read_bytes() == b"old" and names(remote / "deep") == ("a",)
+    with atomic_file(remote / "deep" / "a") as file:
         file.write(b"new")
-    assert (place / "deep" / "a").read_bytes() == b"new" and names(place / "deep") == ("a",)
+    assert (remote / "deep" / "a").read_bytes() == b"new" and names(remote / "deep") == ("a",)
 
 
 @pytest.mark.parametrize("method", ["put_file", "mv"])
-def test_a_put_that_fails_leaves_the_old_file(place, method, monkeypatch):
-    with atomic_file(place / "a") as file:
+def test_a_failed_put_leaves_the_old_file(remote, method, monkeypatch):
+    with atomic_file(remote / "a") as file:
         file.write(b"old" * 100)
 
     def fail(*_: Any, **__: Any) -> None:
-        raise Unreachable("the far side is away")
+        raise Unreachable("the store is unreachable")
 
-    monkeypatch.setattr(type(place.fs), method, fail)
-    if method == "mv" and place.protocol == "memory":
-        return  # a store that needs no move
-    with pytest.raises(OSError, match="far side is away"), atomic_file(place / "a") as file:
+    monkeypatch.setattr(type(remote.fs), method, fail)
+    if method == "mv" and remote.protocol == "memory":
+        return  # this store needs no move
+    with pytest.raises(OSError, match="store is unreachable"), atomic_file(remote / "a") as file:
         file.write(b"new" * 100)
-    assert (place / "a").read_bytes() == b"old" * 100 and names(place) == ("a",)
+    assert (remote / "a").read_bytes() == b"old" * 100 and names(remote) == ("a",)
 
 
-def test_folders_are_made_whole_here_only(place):
-    assert ensure_writable(place / "out") == place / "out" and names(place / "out") == ()
-    with pytest.raises(CFlowError, match="write the folder on this machine"), atomic_folder(place / "log"):
+def test_atomic_folders_are_local(remote):
+    assert ensure_writable(remote / "out") == remote / "out" and names(remote / "out") == ()
+    with pytest.raises(CFlowError, match="write the folder on this machine"), atomic_folder(remote / "log"):
         pass
 
 
-def test_a_local_folder_appears_whole_in_place_of_an_older_one(tmp_path):
+def test_a_folder_appears_complete_and_replaces_an_older_one(tmp_path):
     for content in (b"old", b"new"):
         with atomic_folder(tmp_path / "log") as folder:
             (folder / "deep").mkdir()
@@ -238,7 +237,7 @@ def test_a_local_folder_appears_whole_in_place_of_an_older_one(tmp_path):
     assert (tmp_path / "log" / "deep" / "a").read_bytes() == b"new" and names(tmp_path) == ("log",)
 
 
-def test_a_local_file_has_the_usual_rights_and_is_on_disk(tmp_path, monkeypatch):
+def test_a_file_has_the_usual_mode_and_is_synced(tmp_path, monkeypatch):
     synced, real = [], os.fsync
     monkeypatch.setattr(os, "fsync", lambda at: (synced.append(os.fstat(at).st_ino), real(at)))
     with atomic_file(tmp_path / "a" / "b") as file:
@@ -248,20 +247,15 @@ def test_a_local_file_has_the_usual_rights_and_is_on_disk(tmp_path, monkeypatch)
     assert (tmp_path / "a" / "b").stat().st_mode == (tmp_path / "plain").stat().st_mode
 
 
-WRITER = """
-import os, signal, sys
-from cflow_torch.data.atomic import atomic_file, atomic_folder
-with atomic_file(sys.argv[1]) as file, atomic_folder(sys.argv[2]) as folder:
-    file.write(b"half"); file.flush(); (folder / "a").write_bytes(b"half")
-    os.kill(os.getpid(), signal.SIGKILL)
-"""
-
-
-@pytest.mark.skipif(os.name != "posix", reason="needs SIGKILL")
-def test_what_a_killed_process_leaves_is_removed(tmp_path):
-    arguments = [sys.executable, "-c", WRITER, str(tmp_path / "1.feather"), str(tmp_path / "log")]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    assert subprocess.run(arguments, env=environment).returncode == -signal.SIGKILL
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")  # it is multi-threaded; the child only writes
+def test_leftovers_of_a_killed_process_are_removed(tmp_path):
+    child = os.fork()
+    if child == 0:
+        with atomic_file(tmp_path / "1.feather") as file, atomic_folder(tmp_path / "log") as folder:
+            file.write(b"half"), file.flush(), (folder / "a").write_bytes(b"half")
+            os.kill(os.getpid(), signal.SIGKILL)
+    assert os.waitpid(child, 0)[1] == signal.SIGKILL
     of_file, of_log = names(tmp_path)
     assert of_file.endswith(".tmp") and of_log.endswith(".tmp"), "nothing under a final name"
     (tmp_path / ".1.feather.tmp").write_bytes(b"")  # not ours

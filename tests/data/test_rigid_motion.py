@@ -1,4 +1,4 @@
-"""Quaternions are scalar first: against scipy."""
+"""Quaternions are scalar first; compared with scipy."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from cflow_torch.data.rigid_motion import poses_from_quaternions, to_quaternions, to_rotations
 
 
-@pytest.mark.parametrize("count", [0, 1, 3, 4, 50])  # old kornia crosses along the wrong axis where there are three
-def test_rotations_are_those_of_scipy(count: int) -> None:
+@pytest.mark.parametrize("count", [0, 1, 3, 4, 50])  # old kornia mixes up axes if there are three
+def test_rotations_equal_those_of_scipy(count: int) -> None:
     rng = np.random.default_rng(count)
     quaternion = rng.normal(size=(count, 4))
     quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
@@ -22,8 +22,8 @@ def test_rotations_are_those_of_scipy(count: int) -> None:
         assert np.abs(poses[:, :3, :3] - expected).max() < 1e-14 and np.array_equal(poses[:, :3, 3], shift)
 
 
-def test_quaternions_of_any_rotation_and_of_half_turns() -> None:
-    """Half turns about each axis are where naive formulas divide by zero."""
+def test_quaternions_of_half_turns_are_exact() -> None:
+    """Naive formulas divide by zero at half turns about an axis."""
     q = np.concatenate([np.eye(4), np.random.default_rng(0).normal(size=(200, 4))])
     matrices = Rotation.from_quat(q[:, [1, 2, 3, 0]]).as_matrix()
     found = to_quaternions(matrices)

@@ -1,4 +1,4 @@
-"""What is said of a log when it is opened: the static world stays put under right poses, and ground is not left in."""
+"""Warnings when a log is opened: wrong poses or frames, and ground without masks."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from cflow_torch.simulator import make_drive
 
 
 class Changed:
-    """A log whose poses, ground masks or points are replaced; of a broken one no sweep can be read."""
+    """A log with other poses, ground masks or points; of a broken one no sweep can be read."""
 
     def __init__(self, log, pose=lambda pose: pose, masks=True, ground=True, points=None, is_broken=False):
         self.log, self.log_id, self.timestamps, self.labels = log, log.log_id, log.timestamps, log.labels
@@ -42,7 +42,7 @@ def without_rotation(pose):
 
 
 def verdict(log) -> str:
-    """What the check warns of, "" = nothing."""
+    """Return the warning of the check, "" = none."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         found = check_static_world(log)
@@ -54,20 +54,20 @@ def verdict(log) -> str:
 
 @pytest.fixture(scope="module")
 def drive():
-    """It begins to turn in its first second."""
+    """A drive that begins to turn in its first second."""
     return make_drive(seed=2, num_sweeps=8, profile="demo")
 
 
 @pytest.mark.parametrize("profile", ["av2", "nuscenes", "waymo", "truckscenes"])
-def test_right_poses_are_let_through(profile):
-    """Truck scenes are not de-skewed, which in the onset of a turn is no mistake of frames."""
+def test_correct_poses_raise_no_warning(profile):
+    """Truck scenes are not de-skewed, which must not look like a wrong frame at the beginning of a turn."""
     log = make_drive(seed=1, num_sweeps=6, profile=profile)
     assert verdict(log) == "" and verdict(Changed(log, masks=False)) == ""
 
 
-def test_mistakes_are_named(drive):
+def test_mistakes_are_recognised(drive):
     points = drive.sweep(0).points
-    assert verdict(Changed(drive, lambda pose: np.eye(4), points=points)) == "", "a standing car"
+    assert verdict(Changed(drive, lambda pose: np.eye(4), points=points)) == "", "a static car"
     assert "inverted" in verdict(Changed(drive, np.linalg.inv))
     mixed = verdict(Changed(drive, lambda pose: pose @ np.linalg.inv(drive.units(0)[0].T_ego_sensor)))
     assert "ego_T_lidar" in mixed and drive.log_id in mixed
@@ -76,11 +76,11 @@ def test_mistakes_are_named(drive):
         assert verdict(Changed(drive, change))
     assert "common frame" in verdict(Changed(drive, points=points))
     assert "no poses" in verdict(Changed(drive, pose=None))
-    assert verdict(Changed(drive, pose=None, points=points)) == "", "a standing sensor needs none"
+    assert verdict(Changed(drive, pose=None, points=points)) == "", "a static sensor needs no poses"
 
 
-def test_the_shift_is_the_one_of_the_lever_arm(drive):
-    """Sensor points with ego poses miss by (R - 1) t, t = where the sensor sits."""
+def test_the_shift_equals_the_lever_arm(drive):
+    """Sensor points with ego poses are off by (R - 1) t, where t is the mounting position."""
     to_sensor = np.linalg.inv(drive.units(0)[0].T_ego_sensor)
     log = Changed(drive, lambda pose: pose @ to_sensor)
     residual = static_world_residual(log, 1, 5)
@@ -92,7 +92,7 @@ def test_the_shift_is_the_one_of_the_lever_arm(drive):
     assert residual.aligned > 2 * residual.agreement and abs(residual.rotation) < np.radians(0.05)
 
 
-def test_real_drives(av2_folder, kitti_file):
+def test_real_drives_are_judged_correctly(av2_folder, kitti_file):
     hdf5 = pytest.importorskip("cflow_torch.data.hdf5")
     log = AV2Log(av2_folder)
     assert verdict(log) == "" and "inverted" in verdict(Changed(log, np.linalg.inv))
@@ -106,7 +106,7 @@ def test_real_drives(av2_folder, kitti_file):
         assert np.linalg.norm(residual.shift) < 0.02 and residual.agreement > 0.4
 
 
-def test_too_little_to_see_and_wrong_calls(drive):
+def test_too_few_points_raise_no_warning(drive):
     for points in (np.zeros((0, 3), np.float32), np.ones((50, 3), np.float32), np.full((9, 3), np.nan, np.float32)):
         log = Changed(drive, np.linalg.inv, points=points)
         assert verdict(log) == "" and np.isnan(static_world_residual(log, 0).agreement)
@@ -115,7 +115,7 @@ def test_too_little_to_see_and_wrong_calls(drive):
             static_world_residual(drive, index, baseline)
 
 
-def test_both_checks_are_made_of_a_log_that_is_opened(drive):
+def test_opening_a_log_checks_ground_and_poses(drive):
     with pytest.warns(UserWarning) as caught:
         check_log(Changed(drive, lambda pose: np.eye(4), masks=False))
     assert {warning.category for warning in caught} == {GroundWarning, StaticWorldWarning}

@@ -1,4 +1,4 @@
-"""TruckScenes: several LiDARs with times of their own, motion compensation, the truck itself, broken files."""
+"""TruckScenes: several LiDARs with their own times, motion compensation, the truck itself, broken files."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from cflow_torch.simulator.writers.truckscenes import write_truckscenes
 from cflow_torch.types import CFlowError
 
 VERSION = "v1.2-mini"
-UTM = (692_345.678, 5_336_789.012, 0.0)  # the world of the data set has numbers of this size
+UTM = (692_345.678, 5_336_789.012, 0.0)  # the world coordinates of the data set are of this size
 
 
 def open_log(folder: Path, **settings: Any) -> TruckScenesLog:
@@ -47,7 +47,7 @@ def tiny(recording, tmp_path):
 
 @pytest.mark.parametrize("index", [0, 2, 5])
 def test_each_shot_is_moved_with_the_pose_of_its_time(recording, tiny, index):
-    """Also after the last pose, where the motion goes on. In the world, numbers of 5e6 m have steps of 1e-9 m."""
+    """After the last pose the motion continues. World coordinates of 5e6 m have steps of 1e-9 m."""
     points = open_log(tiny, own_vehicle=None).sweep(index).points
     assert np.abs(points - transform_points(recording.world(index), np.linalg.inv(recording.poses[index]))).max() < 2e-5
     raw = open_log(tiny, own_vehicle=None, deskew=False).sweep(index).points
@@ -64,7 +64,7 @@ def test_times_of_points_count_from_the_stamp_of_the_sweep(recording, tiny):
 
 
 def test_flow_of_raw_sweeps_is_exact_for_constant_motion(recording, tiny):
-    """An object is found where its box was when the shot hit it, up to 2 m from where it is at the time stamp."""
+    """A shot hits an object where its box is at that time, up to 2 m from its position at the time stamp."""
     log, on_car = open_log(tiny, own_vehicle=None), recording.is_on_car()
     for index in (0, 1, 3):
         labels = log.labels(index)
@@ -75,8 +75,8 @@ def test_flow_of_raw_sweeps_is_exact_for_constant_motion(recording, tiny):
     assert log.labels(5) is None
 
 
-def test_lidars_with_their_own_times_and_poses(recording, tiny):
-    """The unit of the right is triggered 20 ms later, with the ego pose of then, as in the data set."""
+def test_lidars_have_their_own_times_and_poses(recording, tiny):
+    """The right LiDAR is triggered 20 ms later, with the ego pose of that time, as in the data set."""
     right = [row["token"] for row in read(tiny, "calibrated_sensor")][0]
     sweeps, poses = read(tiny, "sample_data"), {row["token"]: row for row in read(tiny, "ego_pose")}
     for row in sweeps:
@@ -95,12 +95,12 @@ def test_lidars_with_their_own_times_and_poses(recording, tiny):
     assert np.abs(points[40:] - here[40:]).max() < 2e-5
     assert np.abs(points[:40] - transform_points(here[:40], late)).max() < 3e-5
     assert np.abs(points[:40] - here[:40]).max() > 0.2
-    skewless = open_log(tiny, own_vehicle=None).sweep(1).points  # the shots have their own times: nothing changes
+    skewless = open_log(tiny, own_vehicle=None).sweep(1).points  # the same points, because shots have their own times
     assert np.abs(skewless - transform_points(recording.world(1), np.linalg.inv(recording.poses[1]))).max() < 2e-5
 
 
-def test_a_lidar_that_missed_a_turn_is_left_out(recording, tiny):
-    """Its neighbours in time are 100 ms off: not taken, in particular not twice."""
+def test_a_lidar_without_a_sweep_in_time_is_left_out(recording, tiny):
+    """Its neighbouring sweeps are 100 ms away, so we do not use them."""
     sweeps = read(tiny, "sample_data")
     rear = read(tiny, "calibrated_sensor")[2]["token"]
     chain = [row for row in sweeps if row["calibrated_sensor_token"] == rear]
@@ -120,7 +120,7 @@ def test_truck_and_trailer_are_removed(recording, tiny):
     mount = recording.units(0)[1].T_ego_sensor
     local = transform_points(inside, np.linalg.inv(mount)).astype(np.float32)
     local = np.concatenate([local, np.zeros((1, 3)), np.full((1, 3), np.nan)]).astype(np.float32)
-    # 99 ms later the truck has moved by 1.5 m, but not against itself.
+    # 99 ms later the truck has moved by 1.5 m, but not relative to itself.
     times = np.full(len(local), log.timestamps[0] + 99_000, np.uint64)
     fields = {axis: local[:, k] for k, axis in enumerate("xyz")}
     write_pcd(file, {**fields, "intensity": np.zeros(len(local), np.float32), "timestamp": times})
@@ -128,14 +128,14 @@ def test_truck_and_trailer_are_removed(recording, tiny):
     assert len(open_log(tiny, lidars=["LIDAR_LEFT"], own_vehicle=None).sweep(0).points) == 6
     names = read(tiny, "category")
     for row in names:
-        row["name"] = row["name"].replace("vehicle.truck", "vehicle.ego_trailer")  # what stands at (-20, 12)
+        row["name"] = row["name"].replace("vehicle.truck", "vehicle.ego_trailer")  # the parked one at (-20, 12)
     save(tiny, "category", names)
     masked = open_log(tiny, lidars=["LIDAR_LEFT"])
     assert len(masked.sweep(0).points) == 3 and len(masked.labels(0).flow) == 3
     assert len(open_log(tiny, lidars=["LIDAR_LEFT"], own_vehicle=None).sweep(0).points) == 6
 
 
-def test_bad_sweeps(recording, tiny):
+def test_a_bad_sweep_costs_no_other(recording, tiny):
     log = open_log(tiny)
     file = next((tiny / "samples" / "LIDAR_LEFT").glob(f"*_{log.timestamps[0]}.pcd"))
     fields = read_pcd(file)
@@ -150,7 +150,7 @@ def test_bad_sweeps(recording, tiny):
     assert len(log.sweep(1).points) > 0
 
 
-def test_the_other_data_set_is_refused_or_passed_over(tiny, tmp_path):
+def test_the_other_data_set_is_refused_or_skipped(tiny, tmp_path):
     with pytest.raises(CFlowError, match="is not nuScenes: .* choose the other reader"):
         find_nuscenes_scenes(tiny)
     other = write_nuscenes(TinyRecording(), tmp_path / "other")

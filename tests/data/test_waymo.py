@@ -1,4 +1,4 @@
-"""Waymo, version 2: geometry by hand, what files may vary in, broken files, a real component."""
+"""Waymo, version 2: known geometry, variants of files, broken files, a real component."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def component(segment: Path, tag: str) -> Path:
 
 
 def rewrite(file: Path, change: Any) -> None:
-    """Passes the table of a file through `change`."""
+    """Replace the table of a file by `change(table)`."""
     pq.write_table(change(pq.ParquetFile(file).read()), file)
 
 
@@ -57,8 +57,8 @@ def with_column(table: pa.Table, name: str, values: Any) -> pa.Table:
     return table.set_column(table.column_names.index(name), name, values)
 
 
-def test_rows_columns_and_angles_by_hand() -> None:
-    """Of a laser without a table of inclinations; the columns go round from behind the vehicle by its left."""
+def test_rows_columns_and_angles_are_those_of_the_format() -> None:
+    """A laser without a table of inclinations; columns go from behind the vehicle via its left."""
     even = LaserCalibration(np.eye(4), None, math.radians(-90), math.radians(30))
     np.testing.assert_allclose(np.degrees(even.row_inclinations(4)), [15, -15, -45, -75], atol=1e-12)
     np.testing.assert_allclose(np.degrees(even.column_azimuths(4)), [135, 45, -45, -135], atol=1e-12)
@@ -68,7 +68,7 @@ def test_rows_columns_and_angles_by_hand() -> None:
 
 
 def test_world_coordinates_of_kilometres_keep_millimetres() -> None:
-    """In float32 they have steps of 1 mm."""
+    """In float32, world coordinates would have steps of 1 mm."""
     image, poses, T = np.full((2, 4, 4), 30.0), np.zeros((2, 4, 6), np.float32), np.eye(4)
     poses[..., 3:] = T[:3, 3] = 11_000, -9_000, 50
     laser = LaserCalibration(np.eye(4), None, -0.3, 0.1)
@@ -76,7 +76,7 @@ def test_world_coordinates_of_kilometres_keep_millimetres() -> None:
     assert np.abs(far - plain).max() < 1e-9 and len(far) == 8
 
 
-def test_second_returns_zones_and_lasers(drive: Drive, segment: Path) -> None:
+def test_second_returns_zones_and_lasers_can_be_chosen(drive: Drive, segment: Path) -> None:
     points, units = WaymoLog(segment).sweep(1).points, drive.units(1)
     top, second = len(WaymoLog(segment, lasers=("TOP",)).sweep(1).points), units[1].name
 
@@ -95,7 +95,7 @@ def test_second_returns_zones_and_lasers(drive: Drive, segment: Path) -> None:
     assert np.array_equal(log.sweep(1).points, points)
     parts = zip((points[:top], points[top:]), units)
     ranges = np.concatenate([np.linalg.norm(part - unit.T_ego_sensor[:3, 3], axis=1) for part, unit in parts])
-    sure = np.abs(ranges - 40) > 2  # the car moves while TOP rotates, so its ranges differ a little
+    sure = np.abs(ranges - 40) > 2  # the vehicle moves while TOP rotates, so ranges differ a little
     assert np.array_equal(log.labels(1).is_valid[sure], ranges[sure] < 40)
     assert len(both) == 2 * len(points) and np.array_equal(both[:top], points[:top])
     apart = np.linalg.norm(both[top : 2 * top].astype(float) - points[:top], axis=1)  # further along the ray
@@ -106,7 +106,7 @@ def test_second_returns_zones_and_lasers(drive: Drive, segment: Path) -> None:
             WaymoLog(segment, lasers=lasers)
 
 
-def test_what_released_files_vary_in(segment: Path) -> None:
+def test_order_and_optional_parts_do_not_matter(segment: Path) -> None:
     """Unsorted rows in one row group, an extra column, boxes of unknown type."""
     before = WaymoLog(segment)
     sweep, labels = before.sweep(1), before.labels(1)
@@ -129,7 +129,7 @@ def test_what_released_files_vary_in(segment: Path) -> None:
 
 
 def filled(column: Any, value: Any, kind: Any = None) -> Any:
-    """A change that gives a column, by name or number, the same value in every row."""
+    """Return a change that sets a column, by name or index, to one value."""
 
     def change(table: pa.Table) -> pa.Table:
         name = table.column_names[column] if isinstance(column, int) else column
@@ -154,7 +154,7 @@ def filled(column: Any, value: Any, kind: Any = None) -> Any:
         ("lidar_pose", filled(4, [7, 60, 9]), "a range image must be"),
     ],
 )  # fmt: skip
-def test_contradictory_component(segment: Path, tag: str, change: Any, message: str) -> None:
+def test_an_inconsistent_component_is_refused(segment: Path, tag: str, change: Any, message: str) -> None:
     rewrite(component(segment, tag), change)
     with pytest.raises(CFlowError, match=message) as error:
         log = WaymoLog(segment)
@@ -163,8 +163,8 @@ def test_contradictory_component(segment: Path, tag: str, change: Any, message: 
     assert f"{tag}{os.sep}{segment.name}" in str(error.value)
 
 
-def test_a_real_component(data_root: Path, tmp_path: Path) -> None:
-    """Its transforms are float32, which only the official classes' test data are."""
+def test_a_real_component_is_read(data_root: Path, tmp_path: Path) -> None:
+    """Its transforms are float32."""
     files = list((data_root / "real-files" / "waymo").glob("vehicle_pose_*.parquet"))
     if not files:
         pytest.skip(f"no real component in {data_root}/real-files/waymo")
