@@ -48,11 +48,6 @@ class Clusters:
     size: Tensor
     pixels: Pixels
 
-    def id_in_window(self) -> Tensor:
-        """(M,) int64, index of each cluster among those of its window."""
-        start = torch.searchsorted(self.window, self.window)  # first cluster of the same window
-        return torch.arange(self.window.numel(), device=start.device) - start
-
 
 def find_clusters(sweeps: ProjectedSweeps, config: ClusteringConfig) -> tuple[Clusters, Tensor, Tensor]:
     """Find the clusters of all windows from their images.

@@ -12,6 +12,7 @@ from cflow_torch.dense.history import pool
 from cflow_torch.dense.projection import ProjectedSweeps
 from cflow_torch.dense.sectional_view import add_sectional_view
 from cflow_torch.model import Motion
+from cflow_torch.ops.indices import index_in_group
 from cflow_torch.stages import stage
 
 
@@ -54,6 +55,6 @@ class CorrelationFlow(CoarseToFine):
                 cluster_of_cell=cluster_of_cell,
                 cell_of_point=cell_of_point,
                 flow=F.pad(pool(estimates.per_interval(), estimates.available), (0, 0, 0, 1)),
-                cluster_id=F.pad(clusters.id_in_window(), (0, 1), value=-1),
+                cluster_id=F.pad(index_in_group(clusters.window), (0, 1), value=-1),
                 score=F.pad(estimates.newest_score(), (0, 1)),
             )

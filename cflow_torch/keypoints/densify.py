@@ -10,7 +10,7 @@ from torch import Tensor
 from cflow_torch.config import KeypointsConfig
 from cflow_torch.dense.components import label_components
 from cflow_torch.keypoints.matching import Matches
-from cflow_torch.ops.indices import flat_nonzero
+from cflow_torch.ops.indices import flat_nonzero, index_in_group
 from cflow_torch.ops.kornia_engine import connected_components_kornia
 from cflow_torch.ops.labeling import connected_components
 from cflow_torch.ops.nearest import nearest_set_pixel
@@ -66,7 +66,7 @@ def densify(
         seeds = torch.zeros_like(images).view(-1).index_fill_(0, matched, True).view_as(images)
         nearest = nearest_set_pixel(seeds, pixel)
         group = torch.where(nearest < 0, matched.numel(), torch.searchsorted(matched, nearest))
-        return DenseShift(pixel, group, shift, _id_in_window(matched // image_size), score)
+        return DenseShift(pixel, group, shift, index_in_group(matched // image_size), score)
     if config.densify == "clusters":
         component = label_components(images, pixel, pixel_size, config)
     else:
@@ -78,9 +78,4 @@ def densify(
     group_of_match = group.index_select(0, torch.searchsorted(pixel, matched))
     dy, dx, ncc = (segment_median(values, group_of_match, first.numel()) for values in (*shift.unbind(1), score))
     window = pixel.index_select(0, first) // image_size
-    return DenseShift(pixel, group, torch.stack((dy, dx), 1), _id_in_window(window), ncc)
-
-
-def _id_in_window(window: Tensor) -> Tensor:
-    """(G,) int64, index of each group among those of its window; windows are ascending."""
-    return torch.arange(window.numel(), device=window.device) - torch.searchsorted(window, window)
+    return DenseShift(pixel, group, torch.stack((dy, dx), 1), index_in_group(window), ncc)

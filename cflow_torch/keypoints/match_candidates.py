@@ -15,7 +15,7 @@ from torch import Tensor
 
 from cflow_torch.config import KeypointsConfig
 from cflow_torch.keypoints.descriptors import KeyPoints
-from cflow_torch.ops.indices import gather
+from cflow_torch.ops.indices import gather, index_in_group
 from cflow_torch.ops.spans import concat_ranges
 from cflow_torch.windows.collation import Batch
 
@@ -102,8 +102,7 @@ def _group(points: KeyPoints) -> Tensor:
     tile = (points.window << 24) + (points.row // _TILE_ROWS << 12) + points.col // _TILE_COLS
     tile, order = ((tile << 16) + points.col).sort(stable=True)
     tile >>= 16
-    rank = torch.arange(tile.numel(), device=tile.device) - torch.searchsorted(tile, tile)
-    slot = rank % _GROUP
+    slot = index_in_group(tile) % _GROUP
     group = (slot == 0).cumsum(0) - 1
     member = torch.full((int(group[-1]) + 1, _GROUP), tile.numel(), dtype=torch.int64, device=tile.device)
     member.view(-1).scatter_(0, group * _GROUP + slot, order)

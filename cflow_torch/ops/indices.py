@@ -89,6 +89,11 @@ def renumber(index: Tensor, size: int) -> Tensor:
     return number.scatter_(0, index, torch.arange(index.numel(), device=index.device))
 
 
+def index_in_group(group: Tensor) -> Tensor:
+    """(N,) int64, index of each element among the elements of its group, from groups (N,) in ascending order."""
+    return torch.arange(group.numel(), device=group.device) - torch.searchsorted(group, group)
+
+
 def lazy_zeros(size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     """(size,) zeros, of which only a small part will be written or read.
 
