@@ -120,6 +120,8 @@ def atomic_folder(folder: PathLike) -> Iterator[Path]:
             os.replace(folder, old)
         os.replace(new, folder)
     finally:
+        if old.exists() and not folder.exists():  # the second rename failed
+            os.replace(old, folder)
         for path in (new, old):
             shutil.rmtree(path, ignore_errors=True)
 
@@ -146,9 +148,10 @@ def remove_stale(folder: PathLike, names: Collection[str] = ()) -> list[str]:
             if match is None or not (match["target"] in names or _is_abandoned(path)):
                 continue
             if path.is_dir():
-                shutil.rmtree(path)
+                shutil.rmtree(path, ignore_errors=True)
             else:
-                path.unlink()
+                with suppress(FileNotFoundError):  # another process was quicker
+                    path.unlink()
             removed.append(path.name)
     return sorted(removed)
 

@@ -104,7 +104,10 @@ def test_a_killed_process_changes_nothing(scene: Path) -> None:
 
     before, child = scene.read_bytes(), os.fork()
     if child == 0:
-        write_hdf5_results(scene, "cflow", results())
+        try:
+            write_hdf5_results(scene, "cflow", results())
+        finally:
+            os._exit(1)
     assert os.waitpid(child, 0)[1] == signal.SIGKILL
     assert scene.read_bytes() == before
     assert find_hdf5_scenes(scene.parent) == [scene], "what it left is not taken for a scene"

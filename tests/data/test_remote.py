@@ -252,9 +252,12 @@ def test_a_file_has_the_usual_mode_and_is_synced(tmp_path, monkeypatch):
 def test_leftovers_of_a_killed_process_are_removed(tmp_path):
     child = os.fork()
     if child == 0:
-        with atomic_file(tmp_path / "1.feather") as file, atomic_folder(tmp_path / "log") as folder:
-            file.write(b"half"), file.flush(), (folder / "a").write_bytes(b"half")
-            os.kill(os.getpid(), signal.SIGKILL)
+        try:
+            with atomic_file(tmp_path / "1.feather") as file, atomic_folder(tmp_path / "log") as folder:
+                file.write(b"half"), file.flush(), (folder / "a").write_bytes(b"half")
+                os.kill(os.getpid(), signal.SIGKILL)
+        finally:
+            os._exit(1)
     assert os.waitpid(child, 0)[1] == signal.SIGKILL
     of_file, of_log = names(tmp_path)
     assert of_file.endswith(".tmp") and of_log.endswith(".tmp"), "nothing under a final name"
