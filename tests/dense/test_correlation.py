@@ -1,4 +1,4 @@
-"""The best shift of each template, against the oracle's loop over all shifts and OpenCV."""
+"""The best shift of each template, compared with the oracle's loop over all shifts and with OpenCV."""
 
 from __future__ import annotations
 
@@ -112,17 +112,17 @@ def shift_of(template: list[tuple[int, int]], target: list[tuple[int, int]], sha
     return shift[0].tolist(), float(score)
 
 
-def test_what_is_searched():
+def test_the_search_range():
     assert shift_of([(0, 0)], [(8, 8)], (9, 9)) == ([0, 0], 0.0)  # a shift of 8 is out of reach: no overlap at all
     assert shift_of([(0, 0)], [(8, 8), (4, 4)], (9, 9))[0] == [4, 4]
     assert shift_of([(0, 0)], [(8, 8), (4, 4)], (9, 9), 3.0) == ([0, 0], 0.0)
     assert shift_of([(3, 3)], [(6, 7)], (11, 11), 5.0)[0] == [3, 4]  # the radius itself
     assert shift_of([(3, 3)], [(6, 7)], (11, 11), float(np.nextafter(5, 0)))[0] == [0, 0]
-    # Of even sizes one shift less on the far side.
+    # Even sizes have one shift less on the far side.
     assert shift_of([(0, 0)], [(0, 4)], (1, 8))[0] == [0, 0] and shift_of([(0, 4)], [(0, 0)], (1, 8))[0] == [0, -4]
 
 
-def test_company_does_not_matter():
+def test_a_pair_alone_equals_the_pair_in_a_batch():
     targets, pairs = random_pairs(np.random.default_rng(12), [(5, 6), (20, 20), (9, 33), (70, 3)], 10, False)
     shift, score = best_shifts(as_pairs(targets, pairs))
     for i, (template, own, _) in enumerate(pairs):
@@ -130,7 +130,7 @@ def test_company_does_not_matter():
         assert torch.equal(alone[0][0], shift[i]) and same_bits(alone[1][0], score[i])
 
 
-def test_lines_of_a_gpu_give_the_same(monkeypatch):
+def test_the_layout_for_a_gpu_gives_equal_shifts(monkeypatch):
     targets, pairs = random_pairs(np.random.default_rng(3), [(5, 6), (300, 290), (40, 41)], 4, False)
     shift, score = best_shifts(as_pairs(targets, pairs))
     monkeypatch.setattr(packing, "_LINES_CPU", packing._LINES_GPU)
@@ -138,8 +138,8 @@ def test_lines_of_a_gpu_give_the_same(monkeypatch):
     assert torch.equal(found[0], shift) and same_bits(found[1], score)
 
 
-def test_pairs_of_clusters_with_pixel_sizes_of_their_own():
-    """Only the radius depends on the size, which is that of the pair's cluster."""
+def test_clusters_may_have_different_pixel_sizes():
+    """Only the radius depends on the pixel size of the cluster."""
     settings, grid = config(num_history=2), Grid(0.25, RANGE[:3], RANGE[3:])
     windows = [scene(seed, num_history=2) for seed in (1, 2)]
     batch = make_batch(windows, settings, grid, torch.device("cpu"))
@@ -158,7 +158,7 @@ def test_pairs_of_clusters_with_pixel_sizes_of_their_own():
     assert make_pairs(clusters, batch, of_cluster, None).radius is None
 
 
-def test_score_is_that_of_opencv():
+def test_the_score_equals_opencvs():
     """cv2.TM_CCORR_NORMED is Eq. norm_correlation; OpenCV works in float32."""
     targets, pairs = random_pairs(np.random.default_rng(5), [(9, 9), (12, 20), (31, 17), (5, 40)], 20, False)
     shift, score = best_shifts(as_pairs(targets, pairs))
@@ -173,7 +173,7 @@ def test_score_is_that_of_opencv():
         assert value >= scores.max() - 2e-6
 
 
-def test_clusters_too_large_are_refused(monkeypatch):
+def test_a_cluster_that_is_too_large_is_refused(monkeypatch):
     ends = [np.zeros((1, 40_000), dtype=bool)]
     ends[0][0, [0, -1]] = True
     with pytest.raises(CFlowError, match="40000 pixels long.*finite z bounds"):

@@ -1,4 +1,4 @@
-"""The dense method: equal to the oracle on random scenes and real drives; truths known beforehand."""
+"""The dense method equals the oracle on random scenes and real drives, and finds known motions."""
 
 from __future__ import annotations
 
@@ -80,16 +80,16 @@ def test_cuda_equals_cpu(num_history, pixel_sizes):
             assert_same(gpu, cpu, atol=1e-4)
 
 
-# --------------------------------------------------------------------------------------- truths known beforehand
+# ------------------------------------------------------------------------------------------------- known motions
 
 WIDE = (-8, -8, -1, 8, 8, 3)
 PAPER = {"preset": "paper", "pixel_size": 0.25, "point_cloud_range": WIDE}
 
 
 def street(seed: int) -> list:
-    """Three boxes, at places where they do not touch."""
-    rng, places = np.random.default_rng(seed), [(-5.0, -4.0, 0.0), (0.5, 2.5, 0.0), (4.0, -3.0, 0.0)]
-    return [box(rng, 2.5, 1.5, 1.5, 400) + place for place in places]
+    """Three boxes that do not touch."""
+    rng, positions = np.random.default_rng(seed), [(-5.0, -4.0, 0.0), (0.5, 2.5, 0.0), (4.0, -3.0, 0.0)]
+    return [box(rng, 2.5, 1.5, 1.5, 400) + position for position in positions]
 
 
 def test_every_object_gets_its_own_motion():
@@ -101,7 +101,7 @@ def test_every_object_gets_its_own_motion():
     assert result.cluster_id.tolist() == [0] * 400 + [2] * 400 + [1] * 400  # raster order: rows of y first
 
 
-def test_a_still_world_seen_from_a_moving_sensor():
+def test_a_static_world_does_not_move_when_the_sensor_does():
     pc_world = np.concatenate(street(1))
     T_ego1_ego0 = np.linalg.inv(pose(0.9, 0.1, 0.05))
     pc1 = pc_world @ T_ego1_ego0[:3, :3].T + T_ego1_ego0[:3, 3]
@@ -117,7 +117,7 @@ def test_a_still_world_seen_from_a_moving_sensor():
 
 
 def test_flow_has_the_axes_of_t1():
-    """The vehicle turns left by 90 degrees: what drives ahead at t goes to the right at t+1."""
+    """The vehicle rotates to the left by 90 degrees: a car that drives ahead at t drives to the right at t+1."""
     T_ego1_ego0, car = np.linalg.inv(pose(0.0, 0.0, math.pi / 2)), street(2)[1]
     result = estimate_flow(car, (car + [0.5, 0, 0]) @ T_ego1_ego0[:3, :3].T, T_ego1_ego0=T_ego1_ego0, **PAPER)
     np.testing.assert_allclose(result.residual_flow, [[0, -0.5, 0]] * 400, atol=1e-6)
@@ -143,13 +143,13 @@ def test_ground_never_moves_and_joins_nothing():
     assert (result.cluster_id[400:] == -1).all() and not result.score[400:].any()
     with pytest.warns(UserWarning, match="ground"):
         joined = estimate_flow(pc0, pc1, **PAPER)
-    assert joined.is_valid.all() and (joined.residual_flow[:400, 0] != 0.5).all()  # the mask did it
+    assert joined.is_valid.all() and (joined.residual_flow[:400, 0] != 0.5).all()  # the mask was necessary
 
 
 # ---------------------------------------------------------------------------------- history and scales, by hand
 
 METRE = config(pixel_size=1.0, point_cloud_range=(0.0, 0.0, -math.inf, 40.0, 40.0, math.inf), max_extent=1000.0)
-# (row, column) pixels of a long L: half of its bounding box holds the whole way since t-2.
+# (row, column) pixels of a long L: half of its bounding box holds the whole displacement since t-2.
 LONG_ELL = [(r, 10) for r in range(10, 16)] + [(15, c) for c in range(11, 30)]
 
 
@@ -163,7 +163,7 @@ def flow_x(pc1: Sweep, pc0: Sweep, *pch: Sweep, **overrides) -> float:
     return flow
 
 
-def test_history_divides_by_the_steps():
+def test_history_divides_by_the_number_of_steps():
     older = [ell_at(-4), ell_at(-7)]
     found = [flow_x(ell_at(2), ell_at(0), *older[:h], num_history=h) for h in (0, 1, 2)]
     assert found == [2.0, 2.5, 3.0]  # 2, 6 / 2, 9 / 3
@@ -174,7 +174,7 @@ def test_history_skips_a_sweep_without_the_cluster():
     assert flow_x(ell_at(2), ell_at(0), gap, ell_at(-6), num_history=2) == pytest.approx((2 + 8 / 3) / 2)
 
 
-def test_a_repeated_sweep_is_dropped_and_places_still_count():
+def test_a_repeated_sweep_is_dropped_and_the_others_keep_their_steps():
     pc1, pc0, older = ell_at(2), ell_at(0), ell_at(-4)  # the repeat would vote 2 / 2; the older one has k = 3
     for history, expected in [((pc0,), 2.0), ((pc0, older), 2.0), ((older,), 2.5), ((ell_at(0), pc0, older), 1.75)]:
         assert flow_x(pc1, pc0, *history, num_history=3) == pytest.approx(expected)
@@ -198,7 +198,7 @@ def test_score_is_that_of_the_newest_sweep():
 
 
 def row_of_dots(start: float, count: int = 5) -> Sweep:
-    """Points 8 m apart along x: one object with 4 m pixels, strangers with 1 m pixels."""
+    """Points 8 m apart along x: one object with 4 m pixels, separate objects with 1 m pixels."""
     return Sweep(np.array([[start + 8.0 * i, 4.5, 0.5] for i in range(count)]))
 
 
@@ -215,7 +215,7 @@ def test_scales_are_added():
     assert coarse.residual_flow[:, 0].tolist() == [8.0] * 5 and coarse.cluster_id.tolist() == [0] * 5
 
 
-def test_a_point_warped_out_of_range_gets_no_more():
+def test_a_point_warped_out_of_range_is_ignored_at_finer_scales():
     settings = TWO_SCALES.replace(point_cloud_range=(0.0, 0.0, -math.inf, 43.0, 16.0, math.inf))
     result = flow_as_oracle(Window(row_of_dots(3.5), row_of_dots(10.5)), settings)
     assert result.residual_flow[:, 0].tolist() == [7.0] * 4 + [8.0]  # the last point went to 43.5

@@ -1,4 +1,4 @@
-"""HDBSCAN in place of components: equal to the oracle, and what a user without the extra is told."""
+"""HDBSCAN in place of components equals the oracle; without the extra the message says what to install."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ def test_equals_the_oracle_in_a_batch(overrides):
         assert_same(result, reference_flow(window, settings))
 
 
-def test_fewer_points_than_a_cluster_needs():
+def test_too_few_points_form_no_cluster():
     few = Sweep(np.random.default_rng(0).uniform(0, 1, (8, 3)))
     (result,) = CorrelationFlow(config(clustering="hdbscan"))([Window(few, few)])
     assert (result.cluster_id == -1).all() and result.is_valid.all()
 
 
-def test_without_the_extra(monkeypatch):
+def test_a_missing_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "hdbscan", None)
     with pytest.raises(CFlowError, match=r"pip install hdbscan"):
         CorrelationFlow(config(clustering="hdbscan"))([scene(0)])

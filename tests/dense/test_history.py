@@ -1,4 +1,4 @@
-"""Pooling of several estimates (Sec. leverage_past_pcs): known answers, the oracle's as well."""
+"""Pooling of several estimates (Sec. leverage_past_pcs): known answers, which the oracle gives as well."""
 
 from __future__ import annotations
 

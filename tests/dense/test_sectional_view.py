@@ -1,4 +1,4 @@
-"""Vertical motion from the sectional view: known answers, the oracle agrees."""
+"""Vertical motion from the sectional view: known answers, which the oracle gives as well."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_motion_along_the_heading_is_corrected():
     assert not flow_as_oracle(before, after, settings.replace(sectional_view=False)).residual_flow.any()
 
 
-def test_a_point_far_above_is_named():
+def test_a_point_far_above_is_refused_with_a_hint():
     car = np.random.default_rng(0).uniform((5, 5, 0), (9, 7, 1.5), (300, 3))
     car[7, 2] = 1e5
     with pytest.raises(CFlowError, match="finite z bounds"):

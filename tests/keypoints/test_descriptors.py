@@ -1,4 +1,4 @@
-"""Key points and their descriptors: distance transform, patches, the oracle, by hand."""
+"""Key points compared with a distance transform."""
 
 from __future__ import annotations
 

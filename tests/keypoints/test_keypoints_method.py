@@ -1,4 +1,4 @@
-"""The key-point method: equal to the oracle on random scenes and real drives; truths known beforehand."""
+"""The key-point method equals the oracle on random scenes and real drives, and finds known motions."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_cuda_equals_cpu(densify):
         assert_same(one, other, atol=1e-4)
 
 
-# --------------------------------------------------------------------------------------- truths known beforehand
+# ------------------------------------------------------------------------------------------------- known motions
 
 METRE = config(
     "keypoints", pixel_size=1.0, point_cloud_range=(0.0, 0.0, -math.inf, 40.0, 40.0, math.inf), max_extent=1000.0
@@ -79,7 +79,7 @@ def sweep(pixels, move=(0.0, 0.0, 0.0), **fields) -> Sweep:
     return Sweep(np.array([(c + 0.5, r + 0.5, 0.5) for r, c in pixels]).reshape(-1, 3) + np.array(move), **fields)
 
 
-def test_an_ell_is_found_and_what_has_no_match_keeps_its_number():
+def test_an_ell_is_matched_and_components_without_a_match_keep_their_ids():
     window, n = Window(sweep([*ELL, (2, 30), (30, 5)]), sweep(ELL, (2, 1, 0))), len(ELL)
     result = flow_as_oracle(window, METRE.replace(gate_radius=4.0))
     assert result.residual_flow.tolist() == [[2.0, 1.0, 0.0]] * n + [[0.0, 0.0, 0.0]] * 2
@@ -92,15 +92,15 @@ def test_an_ell_is_found_and_what_has_no_match_keeps_its_number():
     assert torch.equal(scaled.residual_flow, result.residual_flow * 0.25)
 
 
-def test_a_median_of_half_a_pixel_is_not_minus_zero():
-    # Two pixels of one component, matched one to the left and one to the right: the median is +0.
+def test_opposite_matches_have_a_median_of_zero():
+    # Two pixels of one component, matched one to the left and one to the right.
     window = Window(sweep([(5, 5), (5, 6)]), sweep([(5, 4), (5, 7)]))
     result = flow_as_oracle(window, METRE.replace(patch_size=1, gate_radius=1.0))
     assert result.score.tolist() == [1.0, 1.0]
     assert not result.residual_flow.any() and not torch.signbit(result.residual_flow).any()
 
 
-def test_clusters_are_those_of_the_dense_method_in_sweep_t():
+def test_densify_clusters_dilates_and_components_does_not():
     # Two pixels apart: one cluster after the dilation, two components without.
     window = Window(sweep([(5, 5), (5, 7), (5, 12)]), sweep([(6, 5), (6, 12)]))
     together = METRE.replace(patch_size=1, gate_radius=1.0, densify="clusters")
@@ -110,7 +110,7 @@ def test_clusters_are_those_of_the_dense_method_in_sweep_t():
     assert apart.cluster_id.tolist() == [0, 1, 2] and apart.score.tolist() == [1.0, 0.0, 1.0]
 
 
-def test_the_radius_of_matches():
+def test_the_radius_of_matches_follows_time_and_speed():
     assert match_radius(METRE.replace(gate_radius=3.0), 0.1, 0.5) == 6.0
     assert match_radius(METRE.replace(gate_radius=3.0), 0.05, 0.5) == 3.0  # metres per 0.1 s
     assert match_radius(METRE.replace(gate_radius=3.0, max_speed=20.0), 0.1, 0.5) == 5.0  # 2 m and one pixel
@@ -122,7 +122,7 @@ def test_the_radius_of_matches():
 
 def test_whole_pixel_shifts_of_boxes_are_found():
     rng = np.random.default_rng(3)
-    boxes = [box(rng, 3.0, 1.5, 1.5, 4000) + place for place in ([-5.0, -4.0, 0], [1.0, 3.0, 0], [4.0, -3.0, 0])]
+    boxes = [box(rng, 3.0, 1.5, 1.5, 4000) + position for position in ([-5.0, -4.0, 0], [1.0, 3.0, 0], [4.0, -3.0, 0])]
     shifts = ([0.5, 0.25, 0], [-0.75, 0, 0], [0, 0, 0])
     moved = [points + shift for points, shift in zip(boxes, shifts)]
     result = estimate_flow(

@@ -1,4 +1,4 @@
-"""Matching of key points: fractions, the ratio test and ties by hand, exact products."""
+"""Matching of key points: the ratio test and ties by hand, exact products."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ def matched(images: np.ndarray, images1: np.ndarray, reach: float, **overrides) 
 # ---------------------------------------------------------------------------------------------------------- by hand
 
 
-def hand_made(places: list[list[int]], ones: list[int]) -> KeyPoints:
+def hand_made(pixels: list[list[int]], ones: list[int]) -> KeyPoints:
     """Key points whose 11 x 11 descriptors have their first pixels set."""
-    row, col = torch.tensor(places, dtype=torch.int64).reshape(-1, 2).unbind(1)
+    row, col = torch.tensor(pixels, dtype=torch.int64).reshape(-1, 2).unbind(1)
     patch = torch.tensor([[1] * n + [0] * (121 - n) for n in ones], dtype=torch.uint8).reshape(-1, 121)
     return KeyPoints(row * 40_000 + col, torch.zeros_like(row), row, col, patch, patch.sum(1))
 
@@ -45,19 +45,19 @@ def test_the_ratio_test_is_strict_and_exact():
     assert shifts(pc0, pc1, ratio=1.2) == {} and shifts(pc0, pc1, ratio=1.1999) == {0: (0, 1)}
 
 
-def test_a_single_candidate_has_no_rival_and_equal_ones_are_none():
+def test_a_single_candidate_is_accepted_and_a_tie_is_rejected():
     assert shifts(hand_made([[5, 5]], [9]), hand_made([[4, 3]], [1]), ratio=2.0) == {0: (-1, -2)}
     assert shifts(hand_made([[5, 5]], [9]), hand_made([[4, 3], [9, 9]], [9, 9]), ratio=1.0) == {}
 
 
 def test_the_energy_of_the_candidate_counts():
-    # One pixel, two candidates with E = 2 near by and one with E = 1 farther off: c = 1 in all.
+    # One pixel, two near candidates with E = 2 and a farther one with E = 1; c = 1 for all.
     image, image1 = np.zeros((2, 1, 12, 12), dtype=bool)
     image[0, 5, 5] = image1[0, 5, 6] = image1[0, 5, 7] = image1[0, 5, 1] = True
     assert matched(image, image1, 10.0, patch_size=3).shift.tolist() == [[0, -4]]
 
 
-def test_the_radius_is_closed():
+def test_a_match_at_the_radius_is_allowed():
     for corner in (50, 32_700):  # near the corner of the image and far from it
         pc0 = hand_made([[corner, corner]], [9])
         for (dy, dx), reach, inside in (((3, 4), 5.0, True), ((3, 4), 4.999, False), ((0, 0), 0.5, True)):
@@ -65,12 +65,12 @@ def test_the_radius_is_closed():
     assert shifts(hand_made([[0, 0]], [9]), hand_made([[32_700, 32_700]], [9]), 1e9) == {0: (32_700, 32_700)}
 
 
-def test_no_key_points():
+def test_without_key_points_there_are_no_matches():
     none, one = hand_made([], []), hand_made([[5, 5]], [9])
     assert all(shifts(*pair) == {} for pair in ((none, one), (one, none), (none, none)))
 
 
-# ------------------------------------------------------------------------------------------ what must not matter
+# ---------------------------------------------------------------------------------------------- parts of the search
 
 
 def test_all_within_the_radius_are_candidates():
@@ -109,8 +109,8 @@ def test_the_products_count_exactly(patch_size, precision):
     assert torch.equal(found[:7, :9], expected.int()) and not found[7].any() and not found[:, 9].any()  # padding
 
 
-def test_different_values_are_told_apart_or_both_looked_at():
-    # count^2 / energy of the largest descriptors, twice as close as any two can be: float32 takes them for equal.
+def test_values_that_float32_cannot_separate_are_both_contenders():
+    # float32 rounds two close values of count^2 / energy to one number. The margin keeps the next smaller one, too.
     share = 1 - matching._ROUNDING
     for count, energy in ((2601, 2601), (2600, 2599), (51, 2601), (1, 2601)):
         value = torch.tensor(float(count * count)) / energy

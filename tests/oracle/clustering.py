@@ -1,4 +1,4 @@
-"""Sec. clustering: morphology, labelling, Alg. clustering, and HDBSCAN in its place."""
+"""Oracle of Sec. clustering: morphology, labelling, Alg. clustering, and HDBSCAN in its place."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from oracle.pixels import bounding_box
 
 
 def dilate(image: np.ndarray) -> np.ndarray:
-    """Dilation with a 3 x 3 square of ones, clipped at the border: every foreground pixel paints its square."""
+    """Dilate with a 3 x 3 square of ones, clipped at the border: every foreground pixel paints its square."""
     result = np.zeros_like(image)
     for r, c in np.argwhere(image).tolist():
         result[max(r - 1, 0) : r + 2, max(c - 1, 0) : c + 2] = True
@@ -20,7 +20,7 @@ def dilate(image: np.ndarray) -> np.ndarray:
 
 
 def erode(image: np.ndarray) -> np.ndarray:
-    """Erosion with a 3 x 3 square of ones: a pixel stays if its whole square is foreground.
+    """Erode with a 3 x 3 square of ones: a pixel stays if its whole square is foreground.
 
     Convention: pixels outside the image are ignored; the border itself does not erode.
     """
@@ -31,7 +31,7 @@ def erode(image: np.ndarray) -> np.ndarray:
 
 
 def connected_components(image: np.ndarray, connectivity: int) -> tuple[np.ndarray, int]:
-    """Breadth-first labelling of a binary image.
+    """Label a binary image, breadth first.
 
     Args:
         image: (H, W) bool.
@@ -62,17 +62,14 @@ def connected_components(image: np.ndarray, connectivity: int) -> tuple[np.ndarr
     return labels, count
 
 
-def cluster(
-    images: Sequence[np.ndarray], pixel_size: float, max_extent: float, connectivity: int, reach: int = 3
-) -> np.ndarray:
-    """Alg. clustering: spatio-temporal clusters as connected components of the aggregated image.
+def cluster(images: Sequence[np.ndarray], pixel_size: float, max_extent: float, connectivity: int) -> np.ndarray:
+    """Find spatio-temporal clusters as connected components of the aggregated image (Alg. clustering).
 
     Args:
         images: occupancy (H, W) bool of sweep t+1, then of sweeps t, t-1, ...
         pixel_size: s in metres.
         max_extent: d^max in metres.
         connectivity: 4 or 8.
-        reach: 3 = Alg. clustering; 1 = plain components: neither dilated nor validated by size.
 
     Returns:
         (H, W) int64: cluster of every pixel that some sweep occupies, -1 elsewhere and in clusters without a pixel
@@ -82,11 +79,11 @@ def cluster(
         not too large. An oversized component is eroded and labelled again once, whatever size results.
     """
     aggregated = np.logical_or.reduce(images)
-    labels, count = connected_components(aggregated if reach == 1 else dilate(aggregated), connectivity)
+    labels, count = connected_components(dilate(aggregated), connectivity)
 
     # Validation of the connected components.
     total = count
-    for component in range(1, 1 + total) if reach == 3 else ():
+    for component in range(1, 1 + total):
         _, _, height, width = bounding_box([np.argwhere(labels == component)])
         if max(height, width) * pixel_size > max_extent:
             eroded = erode(labels == component)
@@ -110,7 +107,7 @@ def cluster(
 def cluster_hdbscan(
     points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], config: DenseConfig
 ) -> list[np.ndarray]:
-    """HDBSCAN of the aggregated points in place of Alg. clustering (Table which_clustering_method).
+    """Cluster the aggregated points by HDBSCAN in place of Alg. clustering (Table which_clustering_method).
 
     Args:
         points: (N, 3) float64 of sweep t+1, then of sweeps t, t-1, ...

@@ -1,4 +1,4 @@
-"""CorrelationFlow at one scale: the motion of every cluster (Alg. general_correlation_flow).
+"""Oracle of CorrelationFlow at one scale: the motion of every cluster (Alg. general_correlation_flow).
 
 Order of reading: general_correlation_flow -> scene_flow_1obj (Alg. scene_flow_1obj) -> scene_flow_in_1view
 (Alg. scene_flow_1view) -> overlap_and_energy (Eq. norm_correlation).
@@ -21,7 +21,7 @@ from oracle.sweeps import Cloud, PointMotion
 def general_correlation_flow(
     clouds: Sequence[Cloud], cloud1: Cloud, pixel_size: float, config: DenseConfig
 ) -> PointMotion:
-    """Alg. general_correlation_flow: cluster, find the motion of each cluster, assign it to the cluster's points.
+    """Cluster, find the motion of each cluster, assign it to the cluster's points (Alg. general_correlation_flow).
 
     Args:
         clouds: sweeps m = t, t-1, ... nearest first.
@@ -73,7 +73,7 @@ def scene_flow_1obj(
     pixel_size: float,
     config: DenseConfig,
 ) -> tuple[np.ndarray, float]:
-    """Alg. scene_flow_1obj: motion of one object from sweep m to sweep t+1.
+    """Find the motion of one object from sweep m to sweep t+1 (Alg. scene_flow_1obj).
 
     Args:
         points_m: (N, 3) float64, the object at m, frame of t+1.
@@ -87,9 +87,8 @@ def scene_flow_1obj(
         f_{m -> t+1} (3,) float64 in metres (z = 0 without the sectional view), and the NCC score of the BEV.
 
     Convention:
-        The heading is (f_x, f_y) / norm, which are cos and sin of theta; (1, 0) for an object that stands still. The
-        pixels of the sectional view start at the origin of the frame of t+1, its image is the box of both sweeps, its
-        row comes from z.
+        The heading is (f_x, f_y) / norm, which are cos and sin of theta; (1, 0) for a static object. The pixels of the
+        sectional view start at the origin of the frame of t+1. Its image is the box of both sweeps; rows come from z.
     """
     template, target = (occupancy(project_bev(points, config, pixel_size), box) for points in (points_m, points_1))
     (f_x, f_y), score = scene_flow_in_1view(template, target, pixel_size, reach)
@@ -113,7 +112,7 @@ def scene_flow_1obj(
 def scene_flow_in_1view(
     template: np.ndarray, target: np.ndarray, pixel_size: float, reach: float | None = None
 ) -> tuple[tuple[float, float], float]:
-    """Alg. scene_flow_1view: the displacement with the highest NCC score, Eq. displacement_in_bev.
+    """Find the displacement with the highest NCC score (Alg. scene_flow_1view, Eq. displacement_in_bev).
 
     Args:
         template: (H, W) bool, image of sweep m, at least one pixel.
@@ -144,7 +143,7 @@ def scene_flow_in_1view(
 
 
 def ncc_map(template: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Eq. norm_correlation: R[u_y, u_x] for every pixel u, (H, W) float64 in [0, 1], 0 for an empty neighbourhood."""
+    """R[u_y, u_x] of Eq. norm_correlation for every pixel u, (H, W) float64 in [0, 1]; 0 for an empty neighbourhood."""
     overlap, window_energy = overlap_and_energy(template, target)
     energy = template.sum() * window_energy
     scores = np.zeros(energy.shape)
@@ -153,12 +152,12 @@ def ncc_map(template: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def overlap_and_energy(template: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Numerator and right-hand energy of Eq. norm_correlation; both are counts, the images being binary.
+    """Count the numerator and the right-hand energy of Eq. norm_correlation; the images are binary.
 
     Returns:
         Two (H, W) int64 maps over u: the number of template pixels that fall on a target pixel when the template's
-        corner lies at u - floor(size / 2), and the number of target pixels in that H x W neighbourhood. What lies
-        outside the target is 0.
+        corner lies at u - floor(size / 2), and the number of target pixels in that H x W neighbourhood. Pixels outside
+        the target are 0.
     """
     height, width = template.shape
     half_h, half_w = height // 2, width // 2

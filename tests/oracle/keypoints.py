@@ -1,4 +1,4 @@
-"""CorrelationFlow-Keypoints at one scale: match boundary pixels of I_t and I_{t+1}, then spread their flow.
+"""Oracle of CorrelationFlow-Keypoints at one scale: match boundary pixels of I_t and I_{t+1}, then spread their flow.
 
 Order of reading: correlation_flow_keypoints -> `matching` (Sec. Keypoints, Descriptor, Matching keypoints) ->
 median_of_components or nearest_match (Sec. From sparse to dense). Displacements are pixels until the last step of
@@ -20,7 +20,7 @@ from oracle.sweeps import Cloud, PointMotion
 
 
 class Shift(NamedTuple):
-    """What the points of one component, or of one match, are given: displacement in pixels, and NCC score."""
+    """Displacement in pixels and NCC score of the points of one component, or of one match."""
 
     dx: float
     dy: float
@@ -30,7 +30,7 @@ class Shift(NamedTuple):
 def correlation_flow_keypoints(
     clouds: Sequence[Cloud], cloud1: Cloud, pixel_size: float, config: KeypointsConfig
 ) -> PointMotion:
-    """Sec. CorrelationFlow-Keypoints: detect, describe, match, and spread the matches over the points of t.
+    """Detect, describe, match, and spread the matches over the points of t (Sec. CorrelationFlow-Keypoints).
 
     Args:
         clouds: sweep t alone; this method takes no older sweep.
@@ -38,8 +38,8 @@ def correlation_flow_keypoints(
         pixel_size: s in metres.
 
     Convention:
-        With `densify="components"` the id is the component of I_t as it is, with "clusters" that of Alg. clustering on
-        I_t alone, also of one without a match; with "nearest" it is the number of the match.
+        The id is the component of I_t with `densify="components"`, the component of Alg. clustering on I_t alone with
+        "clusters" (in both cases also without a match), and the index of the match with "nearest".
     """
     (cloud,) = clouds
     height, width = bev_dims(config, pixel_size)
@@ -53,7 +53,7 @@ def correlation_flow_keypoints(
         ids, shifts = nearest_match(image, matches)
     else:
         if config.densify == "clusters":
-            # Alg. clustering keeps what is there before and at t+1: with I_t for both, everything
+            # Alg. clustering keeps components that are there before and at t+1; with I_t for both it keeps all.
             ids = cluster([image, image], pixel_size, config.max_extent, config.connectivity)
         else:
             ids = connected_components(image, config.connectivity)[0] - 1
@@ -71,14 +71,14 @@ def correlation_flow_keypoints(
 
 
 def match_radius(config: KeypointsConfig, seconds: float, pixel_size: float) -> float:
-    """Longest displacement of a match in pixels (not in the paper): `gate_radius` metres per 0.1 s, and `max_speed`."""
+    """Longest displacement of a match in pixels (not in the paper), from `gate_radius` (per 0.1 s) and `max_speed`."""
     reach = config.gate_radius * (seconds / 0.1) / pixel_size
     limit = search_radius(config, seconds, pixel_size)
     return reach if limit is None else min(reach, limit)
 
 
 def median_of_components(ids: np.ndarray, matches: Sequence[Match]) -> list[Shift]:
-    """Sec. From sparse to dense: the median flow of the matched key points of each connected component of I_t.
+    """Median flow of the matched key points of each connected component of I_t (Sec. From sparse to dense).
 
     Args:
         ids: (H, W) int64, component of every occupied pixel, 0 ... in raster order of its first pixel, -1 elsewhere.
@@ -105,7 +105,7 @@ def median_of_components(ids: np.ndarray, matches: Sequence[Match]) -> list[Shif
 
 
 def nearest_match(image: np.ndarray, matches: Sequence[Match]) -> tuple[np.ndarray, list[Shift]]:
-    """Every occupied pixel takes the flow of the nearest matched key point (Table keypoint_sparse2dense).
+    """Give every occupied pixel the flow of the nearest matched key point (Table keypoint_sparse2dense).
 
     Args:
         image: (H, W) bool, I_t.
@@ -116,12 +116,12 @@ def nearest_match(image: np.ndarray, matches: Sequence[Match]) -> tuple[np.ndarr
         and the shift of each match.
 
     Convention:
-        Equally near: the first in raster order, that is smallest row, then smallest column.
+        Ties: the first in raster order, that is smallest row, then smallest column.
     """
     ids = np.full(image.shape, -1, dtype=np.int64)
     if matches:
         rows, columns = np.array([(match.row, match.column) for match in matches]).T
         for r, c in np.argwhere(image).tolist():
-            # argmin gives the first of equals
+            # argmin returns the first of several minima
             ids[r, c] = np.argmin((rows - r) * (rows - r) + (columns - c) * (columns - c))
     return ids, [Shift(match.dx, match.dy, match.score) for match in matches]

@@ -1,4 +1,4 @@
-"""Key points of two images, their descriptors and their matches (Sec. CorrelationFlow-Keypoints).
+"""Oracle of key points, their descriptors and their matches (Sec. CorrelationFlow-Keypoints).
 
 Pixels are (row, column), displacements are pixels, t -> t+1.
 """
@@ -29,7 +29,7 @@ def described_keypoints(image: np.ndarray, patch_size: int) -> Keypoints:
 
 
 def detect_keypoints(image: np.ndarray) -> np.ndarray:
-    """Sec. Keypoints: the foreground pixels whose distance to the background is 1.
+    """Find the foreground pixels whose distance to the background is 1 (Sec. Keypoints).
 
     Args:
         image: (H, W) bool.
@@ -38,7 +38,7 @@ def detect_keypoints(image: np.ndarray) -> np.ndarray:
         (K, 2) int64, row and column, in raster order.
 
     Convention:
-        Distance 1 means that one of the 4 orthogonal neighbours is background. What lies outside the image is
+        Distance 1 means that one of the 4 orthogonal neighbours is background. Pixels outside the image are
         background, as in the zero padding of the descriptors.
     """
     padded = np.pad(image, 1)
@@ -53,7 +53,7 @@ def detect_keypoints(image: np.ndarray) -> np.ndarray:
 
 
 def describe(image: np.ndarray, keypoints: np.ndarray, patch_size: int) -> np.ndarray:
-    """Sec. Descriptor: the L x L patch of the occupancy image around each key point, flattened; 0 outside the image.
+    """Flatten the L x L patch of the occupancy image around each key point, 0 outside the image (Sec. Descriptor).
 
     Args:
         image: (H, W) bool.
@@ -86,7 +86,7 @@ class Match(NamedTuple):
 
 
 def match_keypoints(image: np.ndarray, image1: np.ndarray, reach: float, config: KeypointsConfig) -> list[Match]:
-    """Sec. Matching keypoints: Eq. best_match of every key point of t, then the ratio test.
+    """Find Eq. best_match of every key point of t, then apply the ratio test (Sec. Matching keypoints).
 
     Args:
         image: (H, W) bool, I_t.
@@ -119,7 +119,7 @@ def match_keypoints(image: np.ndarray, image1: np.ndarray, reach: float, config:
 
 
 def rank_candidates(at_t: Keypoints, number: int, at_t1: Keypoints, reach: float) -> list[Candidate]:
-    """Key points of t+1 within reach of one key point of t, the best match first (Eq. best_match).
+    """Sort the key points of t+1 within reach of one key point of t, the best match first (Eq. best_match).
 
     Args:
         at_t: key points of t.
@@ -128,9 +128,9 @@ def rank_candidates(at_t: Keypoints, number: int, at_t1: Keypoints, reach: float
         reach: longest displacement in pixels, itself allowed.
 
     Convention:
-        Eq. descriptor_ncc is c / sqrt(E E_other); E is the viewer's own, so c^2 / E_other ranks its candidates. The
-        float64 quotient ranks as the exact rational does: counts are at most 51^2 = 2601, so equal rationals are
-        rounded alike, and different ones differ by at least 1 / 2601^2 > 1e-7, at values of at most 2601, where
+        Eq. descriptor_ncc is c / sqrt(E E_other). E is equal for all candidates of a key point, so c^2 / E_other ranks
+        them. The float64 quotient ranks as the exact rational does. Counts are at most 51^2 = 2601, so equal rationals
+        are rounded alike, and different ones differ by at least 1 / 2601^2 > 1e-7, at values of at most 2601, where
         rounding changes less than 1e-12.
     """
     dy, dx = (at_t1.pixels - at_t.pixels[number]).T
@@ -143,7 +143,7 @@ def rank_candidates(at_t: Keypoints, number: int, at_t1: Keypoints, reach: float
 
 
 def passes_ratio_test(overlap: int, energy: int, second_overlap: int, second_energy: int, ratio: float) -> bool:
-    """R_best > rho R_second (Sec. Matching keypoints), in whole numbers.
+    """Test R_best > rho R_second in whole numbers (Sec. Matching keypoints).
 
     Args:
         overlap, energy: c and E of the best match.
@@ -151,8 +151,8 @@ def passes_ratio_test(overlap: int, energy: int, second_overlap: int, second_ene
         ratio: rho, at least 1, used to four decimals.
 
     Convention:
-        Both sides of c1 / sqrt(E1) > rho c2 / sqrt(E2) are squared and freed of fractions; rho = P / 10^4. Exactly
-        rho times as good is not enough, so where the two rank the same there is no match, whatever rho >= 1.
+        We square c1 / sqrt(E1) > rho c2 / sqrt(E2) and clear the fractions; rho = P / 10^4. A match that is exactly
+        rho times as good is rejected, and so is a tie, for every rho >= 1.
     """
     p = round(ratio * 10_000)
     return overlap * overlap * second_energy * 10_000**2 > p * p * second_overlap * second_overlap * energy
