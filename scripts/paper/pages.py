@@ -22,7 +22,8 @@ PER_SET = ("datasets", "range_split")  # experiments whose columns are data sets
 INTRODUCTION = """# The paper's tables next to ours
 
 The score is the dynamic bucket-normalised EPE; lower is better. The paper's rows are of Argoverse 2 val, ours of other
-data. You can compare whether a change helps, but not the numbers. docs/settings.md has the commands.
+data. You can compare whether a change helps, but not the numbers. The page has the means over the classes, and the CSV
+files next to the pictures have each class. docs/settings.md has the commands.
 """
 Cells = List[List[str]]
 
@@ -169,6 +170,8 @@ def write_pages(results: Path, output: Path) -> None:
             shown = [row for row in cells if row is cells[0] or row[0] in METHODS.values()]
         elif is_figure:
             shown = mean_cells(cells)
+        else:
+            shown = [[*row[:2], *row[-2:]] for row in cells]
         page += [f"## {about['title']} ({about['label']})", "", markdown(shown)]
         described = about_runs(ours)
         notes = ["same runs as above"] if described and described == last_described else list(described)
