@@ -1,4 +1,4 @@
-"""CorrelationFlow: training-free LiDAR scene flow as batched PyTorch."""
+"""Training-free LiDAR scene flow in batched PyTorch: CorrelationFlow and VerifiedFlow."""
 
 from __future__ import annotations
 
@@ -6,39 +6,26 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from cflow_torch.applications.cleaning import CleanLog, static_map
-    from cflow_torch.applications.stream import FlowStream
-    from cflow_torch.applications.tracking import Tracker, track
-    from cflow_torch.config import Config, make_config
-    from cflow_torch.dense.method import CorrelationFlow
-    from cflow_torch.estimate import estimate_flow, make_model
-    from cflow_torch.keypoints.method import CorrelationFlowKeypoints
-    from cflow_torch.types import CFlowError, FlowResult, Sweep, Window
-    from cflow_torch.verified.method import VerifiedFlow
+    from cflow_torch.applications.cleaning import CleanLog as CleanLog
+    from cflow_torch.applications.cleaning import static_map as static_map
+    from cflow_torch.applications.stream import FlowStream as FlowStream
+    from cflow_torch.applications.tracking import Tracker as Tracker
+    from cflow_torch.applications.tracking import track as track
+    from cflow_torch.config import Config as Config
+    from cflow_torch.config import make_config as make_config
+    from cflow_torch.dense.method import CorrelationFlow as CorrelationFlow
+    from cflow_torch.estimate import estimate_flow as estimate_flow
+    from cflow_torch.estimate import make_model as make_model
+    from cflow_torch.keypoints.method import CorrelationFlowKeypoints as CorrelationFlowKeypoints
+    from cflow_torch.types import CFlowError as CFlowError
+    from cflow_torch.types import FlowResult as FlowResult
+    from cflow_torch.types import Sweep as Sweep
+    from cflow_torch.types import Window as Window
+    from cflow_torch.verified.method import VerifiedFlow as VerifiedFlow
 
 __version__ = "0.3.0"
 
-__all__ = [
-    "CFlowError",
-    "CleanLog",
-    "Config",
-    "CorrelationFlow",
-    "CorrelationFlowKeypoints",
-    "FlowResult",
-    "FlowStream",
-    "Sweep",
-    "Tracker",
-    "VerifiedFlow",
-    "Window",
-    "estimate_flow",
-    "make_config",
-    "make_model",
-    "static_map",
-    "track",
-    "__version__",
-]
-
-# Where each name is. It is imported when it is first asked for: torch takes seconds, which `cflow --version` need not.
+# The module of each name. We import it on first use, because torch takes seconds that `cflow --version` does not need.
 _MODULES = {
     "CFlowError": "types",
     "CleanLog": "applications.cleaning",
@@ -57,6 +44,7 @@ _MODULES = {
     "static_map": "applications.cleaning",
     "track": "applications.tracking",
 }
+__all__ = [*_MODULES, "__version__"]
 
 
 def __getattr__(name: str) -> Any:

@@ -1,8 +1,9 @@
-"""All settings, each with its default, its bounds and its help. A preset lists only the settings that it changes."""
+"""All settings with their defaults, bounds and help, and the presets, which list only the settings that they change."""
 
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields, replace
 from numbers import Integral, Real
 from typing import Any, TypeVar
@@ -10,14 +11,18 @@ from typing import Any, TypeVar
 from cflow_torch.types import CFlowError
 
 Kind = TypeVar("Kind", bound="Config")
-# Whole numbers stay below this: they are compared with tensors of int64 and of float64.
+# Whole numbers stay below this, because they are compared with tensors of int64 and of float64.
 _MOST = 2**53
+# Names of the types of values in error messages.
+_NAMES = {int: "a whole number", float: "a number", bool: "True or False", tuple: "a list of numbers"}
 
 
 def setting(
     default: Any,
     help: str,
     *,
+    kind: type | None = None,
+    optional: bool = False,
     low: float = -math.inf,
     above: float = -math.inf,
     high: float = math.inf,
@@ -26,13 +31,16 @@ def setting(
     """A field of a `Config`.
 
     Args:
-        default: its value if you give none.
-        help: what it does, with its unit.
+        default: its default value.
+        help: its meaning and unit.
+        kind: int, float, bool, str or tuple (of floats); None = the type of the default.
+        optional: None is a value as well.
         low, high: smallest and largest value, both allowed.
         above: largest value that is not allowed.
         choices: all values, if they can be listed.
     """
-    return field(default=default, metadata={"help": help, "low": low, "above": above, "high": high, "choices": choices})
+    limits = {"kind": kind or type(default), "optional": optional, "low": low, "above": above, "high": high}
+    return field(default=default, metadata={"help": help, "choices": choices, **limits})
 
 
 def _method(name: str) -> Any:
@@ -41,9 +49,9 @@ def _method(name: str) -> Any:
 
 @dataclass(frozen=True)
 class Config:
-    """Settings that all methods have; each method adds its own, see `CONFIGS`. Made by `make_config`.
+    """Settings that all methods have. Each method adds its own, see `CONFIGS`. `make_config` makes one from a preset.
 
-    Checked when made: an invalid value raises `CFlowError`. `describe` lists what each field means and may be.
+    An invalid value raises `CFlowError`. `cflow settings` lists the meaning and the bounds of every field.
     """
 
     method: str = _method("")
@@ -58,52 +66,61 @@ class Config:
         None,
         "(x0, y0, x1, y1), metres, both ends included, frame of each sweep: the method ignores the points in this box, "
         "which are returns of the vehicle itself. None = it ignores none",
+        kind=tuple,
+        optional=True,
     )
     max_speed: float | None = setting(
         None,
         "m/s: the search ends at displacements of max_speed * elapsed time + one pixel. None = the paper's search "
         "range, half of the cluster's bounding box",
+        kind=float,
+        optional=True,
         above=0,
     )
     sweep_interval: float = setting(
         0.1, "seconds between consecutive sweeps where time stamps are missing", low=1e-6, high=1e6
     )
     max_memory: float | None = setting(
-        None, "bytes of working memory that the method may plan with. None = no limit", above=0, high=float(_MOST)
+        None,
+        "bytes of working memory that the method may plan with. None = no limit",
+        kind=float,
+        optional=True,
+        above=0,
+        high=float(_MOST),
     )
 
     def __post_init__(self) -> None:
         for f in fields(self):
-            object.__setattr__(self, f.name, _checked(f.name, getattr(self, f.name), str(f.type), f.metadata))
+            object.__setattr__(self, f.name, _checked(f, getattr(self, f.name)))
         _check_space(self.pixel_sizes, self.point_cloud_range, self.ego_box)
 
     @property
     def num_history(self) -> int:
-        """h, sweeps before t that are used."""
+        """h, number of sweeps before t."""
         return 0
 
     @property
     def num_future(self) -> int:
-        """Sweeps after t+1 that are used."""
+        """Number of sweeps after t+1."""
         return 0
 
     @property
     def num_sweeps(self) -> int:
-        """Sweeps of a whole window: the history, t, t+1 and the sweeps after it."""
+        """Number of sweeps of a window: the history, t, t+1 and the sweeps after it."""
         return self.num_history + 2 + self.num_future
 
     def replace(self: Kind, **overrides: Any) -> Kind:
-        """A copy with some fields changed; an unknown field raises `CFlowError` that lists the fields."""
+        """Copy the settings with some fields changed. An unknown field raises `CFlowError`, which lists the fields."""
         return replace(self, **_known(type(self), overrides))
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain dictionary, field by field, ready for YAML or JSON; `config_from` reads it."""
+        """Plain dictionary for YAML or JSON. `config_from` reads it."""
         return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self).items()}
 
 
 @dataclass(frozen=True)
 class ClusteringConfig(Config):
-    """Settings of the paper's clustering (Alg. clustering), which its two methods share."""
+    """Settings of the paper's clustering (Alg. clustering), for the dense and the key-point method."""
 
     connectivity: int = setting(
         8, "4: pixels join along their sides, 8: also across their corners (Sec. clustering)", choices=(4, 8)
@@ -124,7 +141,7 @@ class ClusteringConfig(Config):
 @dataclass(frozen=True)
 class _WithHistory(Config):
     num_history: int = setting(  # type: ignore[assignment]
-        0, "h, sweeps before t that are used (Sec. leverage_past_pcs)", low=0
+        0, "h, number of sweeps before t (Sec. leverage_past_pcs)", low=0
     )
     correlation: str = setting(
         "fft", "engine of the correlation: fft or conv (conv2d); the same result", choices=("fft", "conv")
@@ -152,11 +169,11 @@ class KeypointsConfig(ClusteringConfig):
     method: str = _method("keypoints")
     densify: str = setting(
         "components",
-        "where a point takes its flow from: components (median of the matches in its connected component of I_t), "
-        "clusters (the same, components of Alg. clustering) or nearest (nearest match)",
+        "source of the flow of a point: components (median of the matches in its connected component of I_t), "
+        "clusters (median of the matches in its cluster of Alg. clustering) or nearest (nearest match)",
         choices=("components", "clusters", "nearest"),
     )
-    # The ratio test compares products of counts: 51^6 * (2 * 10^4)^2 still fits an int64.
+    # The ratio test compares products of counts, and 51^6 * (2 * 10^4)^2 still fits an int64.
     patch_size: int = setting(11, "side L of a descriptor, odd number of pixels", low=1, high=51)
     ratio_threshold: float = setting(1.1, "rho of the ratio test, used to four decimals", low=1, high=2)
     gate_radius: float = setting(
@@ -176,14 +193,15 @@ class VerifiedConfig(_WithHistory):
     method: str = _method("verified")
     num_future: int = setting(  # type: ignore[assignment]
         0,
-        "sweeps after t+1 that are used, offline: they decide the motion of objects that they show more than twice as "
-        "often as the sweeps before t do. The method then takes twice the time",
+        "number of sweeps after t+1, for recordings: they decide the motion of objects that they show more than twice "
+        "as often as the sweeps before t do. The method then takes twice the time",
         low=0,
     )
     max_object_length: float | None = setting(
         25.0,
         "metres: a component that is longer than this at t+1 moves only if both of its ends move (trams, trains). "
         "None = a component of any length may move",
+        optional=True,
         above=0,
     )
     significance: float = setting(
@@ -196,6 +214,7 @@ class VerifiedConfig(_WithHistory):
         0.4,
         "metres: where the ground is known, the method ignores pixels that rise less than this above the ground around "
         "them, unless a taller pixel is near. None = it ignores none",
+        optional=True,
         above=0,
         high=1000,
     )
@@ -205,12 +224,12 @@ class VerifiedConfig(_WithHistory):
         blocks = [size / self.pixel_sizes[-1] for size in self.pixel_sizes]
         if any(math.isinf(block) or abs(block - round(block)) > 1e-6 for block in blocks):
             raise CFlowError(
-                f"pixel_sizes={self.pixel_sizes}: the verified method (presets default and fast) takes whole multiples "
-                "of the finest one, for example (0.4, 0.2, 0.1)"
+                f"pixel_sizes={self.pixel_sizes}: the verified method (presets default, fast and offline) takes whole "
+                "multiples of the finest size: give for example (0.4, 0.2, 0.1)"
             )
 
 
-WINDOW = ("num_history", "num_future")  # settings that say which sweeps a window has
+WINDOW = ("num_history", "num_future")  # the settings that choose the sweeps of a window
 
 CONFIGS: dict[str, type[Config]] = {"dense": DenseConfig, "keypoints": KeypointsConfig, "verified": VerifiedConfig}
 
@@ -222,7 +241,7 @@ _DEFAULT = {
     "point_cloud_range": _REGION,
     "max_speed": 60.0,
 }
-# The method of each preset, and what it changes in the method's defaults.
+# The method of each preset, and its changes to the defaults of the method.
 PRESETS: dict[str, tuple[str, dict[str, Any]]] = {
     "default": ("verified", _DEFAULT),
     "fast": ("verified", {"num_history": 2, "point_cloud_range": _REGION, "max_speed": 60.0}),
@@ -242,36 +261,28 @@ PRESETS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 _PRESET_OF_METHOD = {"dense": "paper", "keypoints": "keypoints", "verified": "default"}
 
-# Settings of earlier versions, and what to do without them.
+# Settings of the version before this one, and their replacement.
 REMOVED = {
     "thorough": "leave it out, every step of the method is always on; preset fast has one scale and less history",
-    "proof": "the method says so now: preset default or fast (method='verified'), or paper (method='dense')",
-    "proof_z": "its name is significance",
-    "clearance": "its name is min_height",
-    "max_object": "its name is max_object_length",
-    "use_timestamps": "time stamps count wherever every sweep of a window has one",
-    **dict.fromkeys(("children", "aperture", "yaw", "slow"), "leave it out, this step is always on"),
-    **dict.fromkeys(("relocate", "keypoint_block", "nudge", "zero_test", "subpixel"), "leave it out"),
-    **dict.fromkeys(("height_slices", "slice_height", "mutual_check", "second_best_distance"), "leave it out"),
+    "max_object": "use max_object_length",
 }
 
 
 def make_config(preset: str | None = None, method: str | None = None, **overrides: Any) -> Config:
-    """The settings of a preset with some fields replaced.
+    """Make the settings of a preset, with some fields replaced.
 
     Args:
-        preset: "default", "fast", "offline", "paper" or "keypoints"; None = the preset of the method, "default" if none
-            is given.
+        preset: "default", "fast", "offline", "paper" or "keypoints"; None = the preset of the method, or "default".
         method: "dense" (preset "paper"), "keypoints" or "verified" (presets "default", "fast", "offline"); None = the
-            preset's. "keypoints" with preset "paper" are the paper's key points.
+            method of the preset. "keypoints" with preset "paper" gives the paper's key-point settings.
         **overrides: any field of the method's settings; `pixel_size=0.1` is short for `pixel_sizes=(0.1,)`.
 
     Returns:
         A checked `DenseConfig`, `KeypointsConfig` or `VerifiedConfig`.
 
     Raises:
-        CFlowError: unknown preset, unknown field (the message lists the fields), invalid value, or a preset that is of
-            another method.
+        CFlowError: an unknown preset or field (the message lists the fields), an invalid value, or a preset of another
+            method.
     """
     if method is not None and method not in CONFIGS:
         raise CFlowError(f"method={method!r}: give one of {', '.join(map(repr, CONFIGS))}")
@@ -283,15 +294,15 @@ def make_config(preset: str | None = None, method: str | None = None, **override
     if method == "keypoints" and preset == "paper":
         own, changes = method, {}
     if method not in (None, own):
-        raise CFlowError(f"preset={preset!r} is of method={own!r}, method={method!r} was given: leave one of them out")
+        raise CFlowError(f"preset={preset!r} is of method={own!r}, not of method={method!r}: leave one of them out")
     return CONFIGS[own](**changes).replace(**overrides)
 
 
 def config_from(settings: dict[str, Any]) -> Config:
-    """The settings of a dictionary such as `Config.as_dict` gives it; those not given are the method's defaults.
+    """Make the settings of a dictionary from `Config.as_dict`; missing fields have the method's defaults.
 
     Raises:
-        CFlowError: no or an unknown method, an unknown field, an invalid value.
+        CFlowError: a missing or unknown method, an unknown field, an invalid value.
     """
     method = settings.get("method")
     if method not in CONFIGS:
@@ -300,9 +311,16 @@ def config_from(settings: dict[str, Any]) -> Config:
 
 
 def describe(f: Any) -> str:
-    """What a field of a `Config` may be, in words: "a number from 1 to 2, or None"."""
-    low, above, high, choices = (f.metadata[key] for key in ("low", "above", "high", "choices"))
-    return _allowed(str(f.type), low, above, high, choices)
+    """The allowed values of a field of a `Config` in words: "a number of at least 1 and of at most 2, or None"."""
+    limits = f.metadata
+    low, above, high = limits["low"], limits["above"], limits["high"]
+    if limits["choices"]:
+        return f"one of {', '.join(map(repr, limits['choices']))}"
+    text = _NAMES[limits["kind"]]
+    text += f" of at least {low:g}" if low > -math.inf else ""
+    text += f" above {above:g}" if above > -math.inf else ""
+    text += f"{' and' if max(low, above) > -math.inf else ''} of at most {high:g}" if high < math.inf else ""
+    return text + (", or None" if limits["optional"] else "")
 
 
 def _known(kind: type[Config], overrides: dict[str, Any]) -> dict[str, Any]:
@@ -327,44 +345,26 @@ def _known(kind: type[Config], overrides: dict[str, Any]) -> dict[str, Any]:
     return overrides
 
 
-def _checked(name: str, value: Any, kind: str, bounds: Any) -> Any:
-    """The value in its plain type.
-
-    Raises:
-        CFlowError: it is of another type, or out of its bounds.
-    """
-    low, above, high, choices = (bounds[key] for key in ("low", "above", "high", "choices"))
-    if value is None and kind.endswith("| None"):
+def _checked(f: Any, value: Any) -> Any:
+    """The value of a field in its plain type; `CFlowError` if it is not allowed."""
+    limits = f.metadata
+    kind, choices = limits["kind"], limits["choices"]
+    if value is None and limits["optional"]:
         return None
-    if "tuple" in kind:
-        try:
+    if kind is tuple:
+        with suppress(TypeError, ValueError, OverflowError):
             return tuple(float(v) for v in value)
-        except (TypeError, ValueError, OverflowError):
-            raise CFlowError(f"{name}={value!r}: give a list of numbers") from None
-    wanted = {"bool": bool, "str": str, "int": Integral}.get(kind, Real)
-    is_kind = isinstance(value, wanted) and (wanted is bool or not isinstance(value, bool))
-    if is_kind and choices:
-        is_kind = value in choices
-    elif is_kind and kind not in ("bool", "str"):
-        is_kind = low <= value <= high and value > above and (isinstance(value, float) or abs(value) < _MOST)
-    if not is_kind:
-        raise CFlowError(f"{name}={value!r}: give {_allowed(kind, low, above, high, choices)}")
-    return int(value) if wanted is Integral else float(value) if wanted is Real else value
-
-
-def _allowed(kind: str, low: float, above: float, high: float, choices: tuple[Any, ...]) -> str:
-    if choices:
-        return f"one of {', '.join(map(repr, choices))}"
-    if "tuple" in kind:
-        what = "a list of numbers"
-    elif kind == "bool":
-        what = "True or False"
-    else:
-        what = "a whole number" if kind == "int" else "a number"
-        what += f" of at least {low:g}" if low > -math.inf else ""
-        what += f" above {above:g}" if above > -math.inf else ""
-        what += f"{' and' if max(low, above) > -math.inf else ''} of at most {high:g}" if high < math.inf else ""
-    return what + (", or None" if kind.endswith("| None") else "")
+        raise CFlowError(f"{f.name}={value!r}: give {describe(f)}")
+    wanted = {int: Integral, float: Real}.get(kind, kind)
+    is_allowed = isinstance(value, wanted) and (kind is bool or not isinstance(value, bool))
+    if is_allowed and choices:
+        is_allowed = value in choices
+    elif is_allowed and kind in (int, float):
+        is_in_bounds = limits["low"] <= value <= limits["high"] and value > limits["above"]
+        is_allowed = is_in_bounds and (isinstance(value, float) or abs(value) < _MOST)
+    if not is_allowed:
+        raise CFlowError(f"{f.name}={value!r}: give {describe(f)}")
+    return kind(value)
 
 
 def _check_space(sizes: tuple[float, ...], box: tuple[float, ...], own: tuple[float, ...] | None) -> None:

@@ -1,10 +1,10 @@
-"""The one call: two point clouds in, flow out."""
+"""Estimate flow with one call: two point clouds in, flow out."""
 
 from __future__ import annotations
 
 import warnings
 from dataclasses import replace
-from typing import Any, Iterator, Sequence
+from typing import Any, Sequence
 
 import numpy as np
 
@@ -44,41 +44,39 @@ def estimate_flow(
     device: Any = "auto",
     **overrides: Any,
 ) -> FlowResult:
-    """Scene flow from sweep t to sweep t+1.
+    """Estimate the scene flow from sweep t to sweep t+1.
 
     Args:
-        pc0: points of sweep t, (N0, 3+) float of any width, array or tensor; columns after z are ignored.
+        pc0: points of sweep t, (N0, 3+) float of any width, array or tensor. Columns after z are ignored.
         pc1: points of sweep t+1, (N1, 3+).
-        T_ego1_ego0: (4, 4), maps coordinates of the ego frame at t to the one at t+1 (pose1^-1 pose0);
-            None = pc0 already lies in the frame of t+1.
+        T_ego1_ego0: (4, 4), maps coordinates of the ego frame at t to the one at t+1 (pose1^-1 pose0). None = pc0 is
+            already in the frame of t+1.
         gm0, gm1: ground masks, True = ground; None = nothing is ground, unless `ground` says otherwise.
         pch: older sweeps t-1, t-2, ...; the nearest `num_history` of them are used.
-        T_ego1_egoh: (4, 4) of each of `pch`; may be left out only if `T_ego1_ego0` is left out too.
+        T_ego1_egoh: (4, 4) for each of `pch`; may be left out only if `T_ego1_ego0` is left out too.
         gmh: ground mask of each of `pch`; empty = nothing is ground.
-        dt0, dt1: times of points, seconds after the instant of their sweep, see `Sweep.point_times`. The presets
-            `default` and `offline` use them if every sweep has them.
-        dth: those of each of `pch`.
-        pcf, T_ego1_egof, gmf, dtf: the same for sweeps t+2, t+3, ..., at most `num_future`; preset "offline" takes
-            them.
-        method: "dense", "keypoints" or "verified"; None = the preset's.
-        preset: "default", "fast", "offline", "keypoints" or "paper"; None = "default", or that of the method, see
-            `make_config`.
-        config: settings, from `make_config`, in place of `method` and `preset`.
-        ground: None = as the masks say; "auto" = find the ground of every sweep without a mask (`find_ground`);
-            "patchwork" = the same by Patchwork++ (`pip install pypatchworkpp`).
-        device: "auto" = that of the tensors given, else a GPU if there is one, else the CPU.
+        dt0, dt1: times of the points, seconds after the instant of their sweep, see `Sweep.point_times`. The presets
+            `default`, `fast` and `offline` use them if every sweep has them.
+        dth: times of the points of each of `pch`.
+        pcf, T_ego1_egof, gmf, dtf: sweeps t+2, t+3, ..., at most `num_future`, with their transforms, masks and times;
+            for the preset "offline".
+        method: "dense", "keypoints" or "verified"; None = the method of the preset.
+        preset: "default", "fast", "offline", "keypoints" or "paper"; None = the preset of the method, or "default".
+        config: settings from `make_config`, instead of `method` and `preset`.
+        ground: None = only the masks count; "auto" = find the ground of every sweep without a mask (`find_ground`);
+            "patchwork" = find it with Patchwork++ (`pip install pypatchworkpp`).
+        device: "auto" = the device of the tensors, else a GPU if there is one, else the CPU.
         **overrides: any field of `Config`, for example `pixel_sizes=(0.4, 0.2, 0.1)`.
 
     Returns:
-        Flow for every row of pc0, in the axes of the ego frame at t+1, on the device used.
+        Flow for every row of pc0, in the axes of the ego frame at t+1, on the device of the computation.
 
     Convention:
-        NaN and infinite points, ground and points outside `point_cloud_range` get residual flow 0, cluster -1,
+        NaN and infinite points, ground and points outside `point_cloud_range` get residual flow 0, cluster -1 and
         `is_valid` False. Empty sweeps give an empty or all-zero result.
 
     Warns:
-        UserWarning: there is ground in a sweep without a mask, and `ground` is None; or no point of pc0 takes part. The
-            result is not changed by it.
+        UserWarning: a sweep without a mask contains ground, and `ground` is None; or no point of pc0 is active.
 
     Raises:
         CFlowError: wrong shape or dtype, a transform that is not rigid, mixed devices, an unknown setting.
@@ -96,27 +94,17 @@ def estimate_flow(
     if config is None:
         config = make_config(preset, method, **overrides)
     elif not isinstance(config, Config) or (preset, method) != (None, None):
-        raise CFlowError("config is the result of make_config, and stands in place of preset and method")
+        raise CFlowError("config is the result of make_config, and replaces preset and method: leave these out")
     elif overrides:
         config = config.replace(**overrides)
-    moved = any(transform is not None for transform in (T_ego1_ego0, *T_ego1_egoh, *T_ego1_egof))
-    for side, clouds, given in (("h", pch, T_ego1_egoh), ("f", pcf, T_ego1_egof)):
-        if moved and len(clouds) > 0 and len(given) == 0:
-            other = "another transform" if T_ego1_ego0 is None else "T_ego1_ego0"
-            raise CFlowError(
-                f"{other} is given but T_ego1_ego{side} is not: give one transform per sweep of pc{side} "
-                "(None for a sweep that already lies in the frame of t+1)"
-            )
-    frame1 = np.eye(4) if moved else None  # the world is the ego frame at t+1, so T_ego1_ego is the pose
-
-    def sweep(points: Array, is_ground: Any, transform: Array | None, times: Array | None) -> Sweep:
-        return Sweep(points, is_ground, frame1 if transform is None else transform, point_times=times)
-
+    moved = None if T_ego1_ego0 is None else "T_ego1_ego0"  # the transform that is given
+    if moved is None and any(transform is not None for transform in (*T_ego1_egoh, *T_ego1_egof)):
+        moved = "another transform"
     window = Window(
-        pc0=sweep(pc0, gm0, T_ego1_ego0, dt0),
-        pc1=sweep(pc1, gm1, None, dt1),
-        pch=tuple(sweep(*parts) for parts in _parts("h", pch, gm=gmh, T_ego1_ego=T_ego1_egoh, dt=dth)),
-        pcf=tuple(sweep(*parts) for parts in _parts("f", pcf, gm=gmf, T_ego1_ego=T_ego1_egof, dt=dtf)),
+        pc0=_sweep(moved, pc0, gm0, T_ego1_ego0, dt0),
+        pc1=_sweep(moved, pc1, gm1, None, dt1),
+        pch=_sweeps(moved, "h", pch, gm=gmh, T_ego1_ego=T_ego1_egoh, dt=dth),
+        pcf=_sweeps(moved, "f", pcf, gm=gmf, T_ego1_ego=T_ego1_egof, dt=dtf),
     )
     check_windows([window])
     window = _find_ground(keep_nearest(window, config.num_history), ground, device)
@@ -126,7 +114,7 @@ def estimate_flow(
 
 
 def make_model(config: Config, device: Any = "auto") -> SceneFlowModel:
-    """The method that some settings are for.
+    """Make the method of some settings.
 
     Args:
         config: settings, see `make_config`.
@@ -142,7 +130,7 @@ def make_model(config: Config, device: Any = "auto") -> SceneFlowModel:
 
 
 def _find_ground(window: Window, ground: str | None, device: Any) -> Window:
-    """The window with the masks that it lacks; the same window, and maybe a warning, if none are asked for."""
+    """Add the missing ground masks, or warn if there is ground and `ground` is None."""
     chosen = choose_device([window], device)
     sweeps = [window.pc0, window.pc1, *window.pch, *window.pcf]
     bare = [index for index, sweep in enumerate(sweeps) if sweep.is_ground is None]
@@ -150,9 +138,9 @@ def _find_ground(window: Window, ground: str | None, device: Any) -> Window:
     if ground is None:
         if any(has_ground(clouds, device=chosen)):
             warnings.warn(
-                "there are ground points in a sweep without a ground mask: the ground joins what stands on it into one "
-                "cluster, so that moving objects are missed. Pass ground='auto', or masks gm0 and gm1 (gmh, gmf) "
-                "(all False if this is no ground)",
+                "a sweep without a ground mask contains ground, which joins the objects on it into one cluster, so "
+                "moving objects are missed: pass ground='auto', or masks gm0 and gm1 (gmh, gmf), all False if this is "
+                "not ground",
                 UserWarning,
                 stacklevel=3,
             )
@@ -165,30 +153,41 @@ def _find_ground(window: Window, ground: str | None, device: Any) -> Window:
 
 
 def _warn_if_nothing_is_active(result: FlowResult, window: Window, config: Config) -> None:
-    """Points in millimetres, of another place or all of them ground are legal, and rarely meant."""
-    count = len(result.is_valid)
-    if count == 0 or bool(result.is_valid.any()):
+    """Warn about points in millimetres, in another place or all on the ground: legal, but rarely meant."""
+    if len(result.is_valid) == 0 or bool(result.is_valid.any()):
         return
     positions = as_numpy(window.pc0.points)[:, :3]
     finite = positions[np.isfinite(positions).all(axis=1)]
     seen = "all are NaN or infinite"
     if len(finite):
         low, high = finite.min(axis=0), finite.max(axis=0)
-        spans = ", ".join(f"{axis} {a:.6g} to {b:.6g}" for axis, a, b in zip("xyz", low, high))
-        seen = f"they span {spans} in their own frame"
+        extent = ", ".join(f"{axis} {a:.6g} to {b:.6g}" for axis, a, b in zip("xyz", low, high))
+        seen = f"they span {extent} in their own frame"
     warnings.warn(
-        f"none of the {count} points of pc0 takes part ({seen}): are they metres, near the ego vehicle, and not all of "
-        f"them ground? point_cloud_range={config.point_cloud_range}, in the ego frame at t+1",
+        f"none of the {len(positions)} points of pc0 is active ({seen}): are they metres, near the ego vehicle, and "
+        f"not all of them ground? point_cloud_range={config.point_cloud_range}, in the ego frame at t+1",
         UserWarning,
         stacklevel=3,
     )
 
 
-def _parts(side: str, clouds: Sequence[Array], **others: Sequence[Any]) -> Iterator[tuple[Any, ...]]:
-    """Points and what else is known of each sweep of one side, "h" or "f"; None where nothing is given."""
+def _sweep(moved: str | None, points: Array, is_ground: Any, transform: Array | None, times: Array | None) -> Sweep:
+    """A sweep whose world is the ego frame at t+1, so its pose is T_ego1_ego. No sweep has a pose if none is moved."""
+    pose = None if moved is None else np.eye(4) if transform is None else transform
+    return Sweep(points, is_ground, pose, point_times=times)
+
+
+def _sweeps(moved: str | None, side: str, clouds: Sequence[Array], **others: Sequence[Any]) -> tuple[Sweep, ...]:
+    """The sweeps of one side, "h" (history) or "f" (future), from lists with one entry per sweep, or none."""
+    if moved is not None and len(clouds) > 0 and len(others["T_ego1_ego"]) == 0:
+        raise CFlowError(
+            f"{moved} is given but T_ego1_ego{side} is not: give one transform per sweep of pc{side} "
+            "(None for a sweep that is already in the frame of t+1)"
+        )
     for name, values in others.items():
         if len(values) not in (0, len(clouds)):
             raise CFlowError(
                 f"{name}{side} has {len(values)} entries for {len(clouds)} sweeps of pc{side}: give one per sweep"
             )
-    return zip(clouds, *(values if len(values) > 0 else [None] * len(clouds) for values in others.values()))
+    columns = (values if len(values) > 0 else [None] * len(clouds) for values in others.values())
+    return tuple(_sweep(moved, *row) for row in zip(clouds, *columns))

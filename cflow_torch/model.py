@@ -1,4 +1,4 @@
-"""The module that all methods share: windows in, one batch in the frame of t+1, motion of its points, results out."""
+"""The class that all methods share: collate windows, estimate the motion of their points, return results."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from cflow_torch.windows.validation import check_windows, choose_device
 
 @dataclass(frozen=True)
 class Motion:
-    """Clusters of points that share a motion. Entry M stands for "none": motion 0, id -1, score 0.
+    """Motion of M clusters of points. Entry M stands for "no cluster": motion 0, id -1, score 0.
 
     Args:
         cluster_of_cell: (Q,) int32 or int64, cluster of each cell (a pixel of a sweep, or a point), M = none.
-        cell_of_point: (P,) int64, cell of each point. A point that is ignored has a cell without a cluster.
+        cell_of_point: (P,) int64, cell of each point; ignored points have a cell without a cluster.
         flow: (M + 1, 3) float64, metres per sweep interval, axes of ego1.
-        cluster_id: (M + 1,) int64, number of the cluster counted from 0 in its window.
+        cluster_id: (M + 1,) int64, counted from 0 in each window.
         score: (M + 1,) float32.
-        confidence: (M + 1,) float32, see `FlowResult`; None = the method does not say.
-        before: (A, P) float64, metres per sweep interval, flow of each point by coarser scales; None = there are none.
+        confidence: (M + 1,) float32, see `FlowResult`; None = the method does not estimate it.
+        before: (A, P) float64, metres per sweep interval, flow of each point from coarser scales; None = no such scale.
     """
 
     cluster_of_cell: Tensor
@@ -45,7 +45,7 @@ class Motion:
         return self.cluster_of_cell.index_select(0, self.cell_of_point[points])
 
     def flow_of(self, cluster: Tensor, out: Tensor) -> Tensor:
-        """Into `out`, (A, K) float64: x, y (and z) of the flow of points of these K clusters."""
+        """Write x, y (and z) of the flow of K clusters to `out`, (A, K) float64."""
         for values, of_cluster in zip(out.unbind(0), self.flow.unbind(1)):
             torch.index_select(of_cluster, 0, cluster, out=values)
         return out
@@ -54,8 +54,8 @@ class Motion:
         """(K, 3) float32 flow of some points.
 
         Args:
-            points: which.
-            positions: (A, K) float64, metres, frame of t+1, where they lie; A method whose clusters turn needs it.
+            points: slice of the batch.
+            positions: (A, K) float64, metres, frame of t+1; used by methods whose clusters rotate.
         """
         cluster = self.cluster(points)
         if self.before is None:
@@ -69,20 +69,20 @@ class Motion:
 
 
 class SceneFlowModel(nn.Module):
-    """Windows in, flow out. A method sets what stands first and writes `motion`. No parameters, no buffers, no state.
+    """Base class of the methods. They set the class attributes and implement `motion`. No parameters, no state.
 
     Args:
         config: settings of the method; `from_preset` makes them from a preset.
-        device: "auto" = that of the tensors given, else a GPU if there is one, else the CPU.
+        device: "auto" = the device of the tensors, else a GPU if there is one, else the CPU.
 
     Raises:
-        CFlowError: not settings, or those of another method.
+        CFlowError: not settings, or settings of another method.
     """
 
     method = ""
-    num_axes = 2  # coordinates of points that are asked for; 2 = x and y
-    needs_ground = False  # whether the heights of ground points are asked for
-    needs_times = False  # whether the times of points are asked for
+    num_axes = 2  # coordinates of points that the method needs; 2 = x and y
+    needs_ground = False  # the method needs the heights of ground points
+    needs_times = False  # the method needs the times of points
     bytes_per_point = 160  # working memory before clusters are known: positions, pixels, temporaries
 
     def __init__(self, config: Config, device: Any = "auto") -> None:
@@ -93,21 +93,23 @@ class SceneFlowModel(nn.Module):
                 f"config is {type(config).__name__}: give the result of make_config, or {name}.from_preset"
             )
         if not isinstance(config, CONFIGS[self.method]):
-            raise CFlowError(f"{name} does method={self.method!r}, the config says {config.method!r}: use make_model")
+            raise CFlowError(
+                f"{name} is method={self.method!r}, but the config is for {config.method!r}: use make_model"
+            )
         self.config: Any = config
         self.device = device
 
     @classmethod
     def from_preset(cls: type[Any], preset: str | None = None, device: Any = "auto", **overrides: Any) -> Any:
-        """The method with the settings of a preset, some fields replaced.
+        """Make the method with the settings of a preset, with some fields replaced.
 
         Args:
-            preset: one of the method's; None = its first.
+            preset: a preset of the method; None = its first.
             device: see above.
             **overrides: any field of its settings.
 
         Raises:
-            CFlowError: unknown preset or field, a preset of another method, invalid value.
+            CFlowError: an unknown preset or field, a preset of another method, or an invalid value.
         """
         return cls(make_config(preset, cls.method, **overrides), device)
 
@@ -116,26 +118,26 @@ class SceneFlowModel(nn.Module):
         return ", ".join(f"{name}={value!r}" for name, value in vars(self.config).items())
 
     def motion(self, batch: Batch) -> Motion:
-        """Motion t -> t+1 of all points of a batch: the page of each method."""
+        """Estimate the motion t -> t+1 of all points of a batch. Each method implements this."""
         raise NotImplementedError
 
     def grid(self, pixel_size: float) -> Grid:
-        """The BEV at a pixel size, metres. It holds `point_cloud_range`; only what lies there has results."""
+        """The BEV grid of a pixel size, metres. It contains `point_cloud_range`; only points there have results."""
         bounds = self.config.point_cloud_range
         return Grid(pixel_size, bounds[:3], bounds[3:])
 
     @torch.no_grad()
     @one_thread()
     def forward(self, windows: Sequence[Window]) -> list[FlowResult]:
-        """Flow t -> t+1 for the points of every window's pc0.
+        """Estimate the flow t -> t+1 of the points of every window's pc0.
 
         Args:
-            windows: B windows; numbers of points, sweeps and extents may differ.
+            windows: B windows, of any numbers of points and sweeps.
 
         Returns:
-            B results, each independent of the other windows.
+            B results. Each depends only on its window and the settings.
 
-        Cost: one thread of the CPU, whatever torch is set to; it is set back afterwards. More cores: more processes.
+        Cost: one CPU thread, whatever torch is set to; the setting is restored. For more cores start more processes.
 
         Raises:
             CFlowError: bad input, see `make_batch`.
@@ -157,8 +159,7 @@ class SceneFlowModel(nn.Module):
 
 
 def _results(batch: Batch, motion: Motion) -> list[FlowResult]:
-    """One full-length result per window, for all rows of its pc0; those that took no part have residual flow 0. The
-    results of a batch lie in the same memory, one behind the other."""
+    """One result per window, for all rows of its pc0. Inactive rows have residual flow 0. The results share memory."""
     points = slice(batch.rows[0].start, batch.rows[-1].stop)
     cluster, is_valid = motion.cluster(points), batch.has_result[points].clone()
     residual = motion.residual_flow(points, batch.positions[:, points]).add_(0.0)  # turns -0.0 into 0.0

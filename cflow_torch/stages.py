@@ -1,4 +1,4 @@
-"""Named stages of a method: blocks that torch's profiler shows and that a stop watch times."""
+"""Named stages of a method, for torch's profiler and for timing."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _watched = threading.local()
 
 @contextmanager
 def stage(name: str) -> Iterator[None]:
-    """A block of work; its seconds are added to those of `stage_seconds`, if that is open in this thread."""
+    """Name a block of work, and add its seconds to an open `stage_seconds` of this thread."""
     with record_function(name):
         start = time.perf_counter()
         yield
@@ -30,7 +30,7 @@ def stage(name: str) -> Iterator[None]:
 
 @contextmanager
 def stage_seconds() -> Iterator[dict[str, float]]:
-    """Collects seconds of each stage by the host's clock (on a GPU: the time to queue its work) while it is open."""
+    """Collect the seconds of each stage by the host's clock. On a GPU this is the time to queue the work."""
     before, _watched.seconds = getattr(_watched, "seconds", None), {}
     try:
         yield _watched.seconds
@@ -39,7 +39,7 @@ def stage_seconds() -> Iterator[dict[str, float]]:
 
 
 class FlowModel(Protocol):
-    """What runs and clocks need of a method."""
+    """A method, or a wrapper of one."""
 
     config: Config
 
@@ -48,21 +48,21 @@ class FlowModel(Protocol):
 
 
 class TimedModel:
-    """A method that is timed; stands in for it.
+    """Wrap a method and time every call.
 
     Args:
         model: the method.
 
-    Convention: a pair's time starts with the window in memory and ends with the result on the device. The first pair
-    warms up and does not count, if there are more.
+    Convention: the time of a pair starts with the window in memory and ends with the result on the device. The first
+    pair is a warm-up and does not count, unless it is the only one.
     """
 
     def __init__(self, model: FlowModel) -> None:
         self.model, self.config = model, model.config
-        self.pairs: list[tuple[float, dict[str, float]]] = []  # seconds, and those of the stages
+        self.pairs: list[tuple[float, dict[str, float]]] = []  # seconds of each call, and of its stages
 
     def __call__(self, windows: Sequence[Window]) -> list[FlowResult]:
-        """What the method gives."""
+        """The results of the method."""
         with stage_seconds() as stages:
             start = time.perf_counter()
             results = self.model(windows)
@@ -72,7 +72,7 @@ class TimedModel:
         return results
 
     def report(self) -> dict[str, Any]:
-        """Seconds per pair: "median", "min", "max", "pairs" that were timed, "stages" (median of each)."""
+        """Seconds per pair: "median", "min" and "max", the number of "pairs", and "stages" (median of each)."""
         if not self.pairs:
             return {"pairs": 0}
         counted, stages = zip(*(self.pairs[1:] or self.pairs))

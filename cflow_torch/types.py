@@ -1,4 +1,4 @@
-"""What goes in and what comes out: `Sweep`, `Window`, `FlowResult`, and the one error class."""
+"""The input and output types, `Sweep`, `Window` and `FlowResult`, and the error class of the package."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _OBJECT.names = ("id", "centre", "size", "velocity", "heading", "num_points", "c
 
 
 def as_numpy(value: Array, dtype: Any | None = None) -> np.ndarray:
-    """NumPy array of an array or of a tensor on any device; bfloat16, which NumPy lacks, becomes float32."""
+    """Convert an array or a tensor on any device to NumPy; bfloat16, which NumPy lacks, becomes float32."""
     if isinstance(value, Tensor):
         value = value.detach().cpu()
         value = (value.float() if value.dtype == torch.bfloat16 else value).numpy()
@@ -27,9 +27,9 @@ def as_numpy(value: Array, dtype: Any | None = None) -> np.ndarray:
 
 
 class CFlowError(ValueError):
-    """The only error this package raises for bad input, bad files and bad settings.
+    """The only error that this package raises for bad input, bad files and bad settings.
 
-    The message says what was given, what is allowed, and how to put it right.
+    The message says what you passed, what is allowed, and what to do.
     """
 
 
@@ -40,13 +40,13 @@ class Sweep:
     Args:
         points: (N, 3+) float, metres, in the ego frame of this sweep; columns after z are ignored.
         is_ground: (N,) bool, True = ground; None = no point is ground.
-        pose: (4, 4) float64 `T_world_ego`, ego coordinates to world; None = the points already lie in
-            the frame of t+1 (then no sweep of the window may have a pose).
-        timestamp_ns: time of the sweep in nanoseconds, None = unknown.
+        pose: (4, 4) float64 `T_world_ego`, ego coordinates to world. None = the points are already in the frame of t+1;
+            then no sweep of the window may have a pose.
+        timestamp_ns: time of the sweep in nanoseconds; None = unknown.
         point_times: (N,) float, seconds from the instant of the sweep to the measurement of each point, negative =
-            before it; None = all at once. That instant is the one that `timestamp_ns` and `pose` belong to and to which
-            the motion of the vehicle has been compensated. The verified method uses them where every sweep of a window
-            has them.
+            before it; None = all points at that instant. `timestamp_ns` and `pose` belong to this instant, and the
+            points are compensated for the motion of the vehicle to it. The verified method uses the times if every
+            sweep of a window has them.
     """
 
     points: Array
@@ -58,11 +58,11 @@ class Sweep:
 
 @dataclass(frozen=True)
 class Window:
-    """The sweeps that one flow is estimated from: t-h ... t+1 and, offline, some after t+1.
+    """The sweeps of one estimate: t-h ... t+1 and, for recordings, some after t+1.
 
     Args:
-        pc0: sweep t; the flow is given for its points.
-        pc1: sweep t+1; its ego frame is the frame of the flow.
+        pc0: sweep t, whose points get flow.
+        pc1: sweep t+1, whose ego frame is the frame of the flow.
         pch: sweeps t-1, t-2, ... t-h, nearest first; may be shorter than `num_history`.
         pcf: sweeps t+2, t+3, ..., nearest first; may be shorter than `num_future`.
     """
@@ -77,21 +77,21 @@ class Window:
 class FlowResult:
     """Flow t -> t+1 of every point of pc0, rows in pc0's order (ground and out-of-range rows included).
 
-    It is the displacement of the thing that a point lies on, from the instant of sweep t to that of sweep t+1; for a
-    point with a time of its own, over one sweep interval, from the place where it was measured.
+    The flow of a point is the displacement of its object from the instant of sweep t to that of sweep t+1. For a point
+    with a time of its own it is the displacement over one sweep interval, from the position of the measurement.
 
     Args:
         residual_flow: (N, 3) float32, metres per sweep interval, axes of ego1: motion of objects.
-        pose_flow: (N, 3) float32, T_ego1_ego0 p - p: motion that the moving sensor causes.
-        flow: (N, 3) float32, the sum of the two (total flow).
-        cluster_id: (N,) int64, 0 ... M-1 in raster order of each cluster's first pixel; -1 = in no cluster
-            that has points both before and at t+1.
+        pose_flow: (N, 3) float32, metres, T_ego1_ego0 p - p: apparent motion from the motion of the sensor.
+        flow: (N, 3) float32, metres, total flow, the sum of the two.
+        cluster_id: (N,) int64, 0 ... M-1 in raster order of each cluster's first pixel; -1 = not in a cluster that has
+            points both before and at t+1.
         score: (N,) float32 in [0, 1], NCC at the peak (t -> t+1, finest scale); 0 where cluster_id is -1.
-        is_valid: (N,) bool, True for the rows that took part: finite, neither ground nor of the
-            vehicle itself (`Config.ego_box`), inside the range.
+        is_valid: (N,) bool, True for active points: finite, neither ground nor of the vehicle itself
+            (`Config.ego_box`), inside the region.
         confidence: (N,) float32 in [0, 1] by the verified method, else None: estimated probability that the end-point
-            error of the residual flow (of a point that moves or stands still) is below 0.1 m per sweep interval; 0
-            where is_valid is False. From a table fitted on simulated drives, see docs/verified.md.
+            error of the residual flow is below 0.1 m per sweep interval, for static and dynamic points; 0 where
+            is_valid is False. It comes from a table fitted on simulated drives, see docs/verified.md.
     """
 
     residual_flow: Tensor
@@ -103,78 +103,79 @@ class FlowResult:
     confidence: Tensor | None = None
 
     def to(self, device: Any) -> FlowResult:
-        """The same result on another device."""
-        return FlowResult(**{name: value.to(device) for name, value in self._given().items()})
+        """Copy the result to another device."""
+        return FlowResult.of({name: value.to(device) for name, value in self._given().items()})
 
     def numpy(self) -> dict:
-        """Every field that is not None as a NumPy array, by name."""
+        """Every field that is not None, by name, as a NumPy array."""
         return {name: value.detach().cpu().numpy() for name, value in self._given().items()}
 
     def columns(self) -> dict[str, np.ndarray]:
-        """A column for each number of a row, as flow files have them: flow_tx_m ... pose_tz_m, cluster_id, ..."""
-        columns = {}
+        """One array per number of a row, with the names of flow files: flow_tx_m ... pose_tz_m, cluster_id, ..."""
+        vectors = {field: name for name, field in VECTORS.items()}
+        columns: dict[str, np.ndarray] = {}
         for name, values in self.numpy().items():
-            short = {field: short for short, field in VECTORS.items()}.get(name)
-            columns.update({name: values} if short is None else dict(zip(vector_columns(short), values.T)))
+            is_vector = name in vectors
+            columns.update(zip(vector_columns(vectors[name]), values.T) if is_vector else {name: values})
         return columns
 
     def to_pandas(self, points: Array | None = None) -> Any:
-        """A `pandas.DataFrame` with a row per point and the columns of `columns`; before them x, y, z, if given.
+        """A `pandas.DataFrame` with a row per point: x, y, z, if you pass the points, then `columns`.
 
         Args:
             points: (N, 3+) of pc0.
 
         Raises:
-            CFlowError: pandas is not installed, or another number of points.
+            CFlowError: pandas is not installed, or the number of points differs.
         """
         try:
             import pandas
         except ImportError:
-            raise CFlowError("to_pandas needs pandas: pip install pandas; columns() gives the same as arrays") from None
+            raise CFlowError(
+                "to_pandas needs pandas: pip install pandas; columns() returns the same as arrays"
+            ) from None
         positions = {} if points is None else dict(zip("xyz", self._positions(points).T))
         return pandas.DataFrame({**positions, **self.columns()})
 
     def objects(self, points: Array, sweep_interval: float = 0.1, min_speed: float = 0.5) -> np.ndarray:
-        """The moving objects, as they stand at t+1.
+        """List the moving objects at t+1.
 
         Args:
-            points: (N, 3+) of pc0, metres, as they were given.
+            points: (N, 3+) of pc0, metres, as you passed them.
             sweep_interval: seconds from sweep t to sweep t+1.
-            min_speed: m/s; clusters that are slower on average are not listed.
+            min_speed: m/s; slower clusters are left out.
 
         Returns:
-            (K,) structured array, sorted by id. Everything in the ego frame at t+1:
-            `id` cluster_id; `centre` (3,) metres, middle of the box; `size` (3,) metres, length along the heading,
-            width, height; `velocity` (3,) m/s over ground, mean of the points; `heading` radians from +x to the left,
-            direction of the velocity; `num_points`; `confidence` mean of the points, NaN where the method has none.
+            (K,) structured array, sorted by id, in the ego frame at t+1. `id`: cluster_id. `centre`: (3,) metres, of
+            the box. `size`: (3,) metres, length along the heading, width, height. `velocity`: (3,) m/s over ground,
+            mean of the points. `heading`: radians from +x to the left, direction of the velocity. `num_points`.
+            `confidence`: mean of the points, NaN if the method has none.
 
         Convention:
-            The box holds the points of sweep t, moved by their flow, and nothing else: of an object that is seen from
-            one side it holds that side. On simulated drives objects of 50 points and more have their middle inside the
-            true box and their velocity within 0.75 m/s, but for an articulated lorry that turns (4 m/s). Two thirds of
-            all rows are small parts of the static world, with a confidence below 0.7: drop those if that matters.
+            The box encloses the points of sweep t, moved by their flow. If only one side of an object is visible, the
+            box encloses that side. On simulated drives, objects of 50 points and more have their centre inside the true
+            box and their velocity within 0.75 m/s, except for a turning articulated lorry (4 m/s). Two thirds of all
+            rows are small parts of the static world with a confidence below 0.7; drop those if that matters.
 
         Raises:
-            CFlowError: another number of points; a result that was read from a file without flow or clusters.
+            CFlowError: the number of points differs, or the result is from a file without flow or clusters.
         """
         if any(getattr(self, name) is None for name in ("flow", "residual_flow", "cluster_id")):
-            raise CFlowError("objects needs flow, residual flow and clusters: this result comes from a file without")
+            raise CFlowError(
+                "objects() needs flow, residual_flow and cluster_id: this result is from a file without them"
+            )
         if not sweep_interval > 0:
-            raise CFlowError(f"sweep_interval={sweep_interval}: give the seconds from one sweep to the next")
+            raise CFlowError(f"sweep_interval={sweep_interval}: give the seconds between two sweeps, for example 0.1")
         given, cluster = self.numpy(), as_numpy(self.cluster_id)
         order = np.argsort(cluster, kind="stable")
         order = order[np.searchsorted(cluster[order], 0) :]
-        ids, first, inverse, count = np.unique(
-            cluster[order], return_index=True, return_inverse=True, return_counts=True
-        )
+        ids, first, inverse, count = np.unique(cluster[order], True, True, True)
         objects = np.zeros(len(ids), _OBJECT)
         if len(ids) == 0:
             return objects
 
         def mean(values: np.ndarray) -> np.ndarray:
-            return np.add.reduceat(values[order].astype(np.float64), first) / count.reshape(
-                -1, *[1] * (values.ndim - 1)
-            )
+            return (np.add.reduceat(values[order].astype(np.float64), first).T / count).T
 
         objects["id"], objects["num_points"] = ids, count
         objects["velocity"] = mean(given["residual_flow"]) / sweep_interval
@@ -198,20 +199,20 @@ class FlowResult:
 
     @classmethod
     def load(cls, path: str | Path) -> FlowResult:
-        """Read what `save` wrote; nothing in the file is executed.
+        """Read a file of `save`. Nothing in the file is executed.
 
         Raises:
-            CFlowError: the file is missing, damaged, or no result.
+            CFlowError: the file is missing, damaged, or not a result.
         """
         try:
             with np.load(path, allow_pickle=False) as file:
                 return cls.of({name: torch.from_numpy(file[name]) for name in file.files})
         except (OSError, ValueError, TypeError, AttributeError, zipfile.BadZipFile, EOFError) as error:
-            raise CFlowError(f"{path} is no result ({error}): give a file that FlowResult.save wrote") from error
+            raise CFlowError(f"{path} is not a result ({error}): give a file that FlowResult.save wrote") from error
 
     @classmethod
     def of(cls, fields_given: dict[str, Tensor]) -> FlowResult:
-        """A result of some of the fields, by name; the others are None, whatever their type says."""
+        """Make a result of some of the fields, by name. The others are None."""
         values: dict[str, Any] = {**dict.fromkeys(f.name for f in fields(cls)), **fields_given}
         return cls(**values)
 
@@ -220,7 +221,7 @@ class FlowResult:
         positions = as_numpy(points, np.float64)
         if positions.ndim != 2 or positions.shape[1] < 3 or len(positions) != len(next(iter(self._given().values()))):
             raise CFlowError(
-                f"points have shape {positions.shape}: give (N, 3+), those of pc0, a row per row of the flow"
+                f"points have shape {positions.shape}: give the (N, 3+) points of pc0, one row per row of the flow"
             )
         return positions[:, :3]
 
@@ -230,5 +231,5 @@ class FlowResult:
 
 
 def vector_columns(name: str) -> Sequence[str]:
-    """Columns of one of `VECTORS`: flow -> flow_tx_m, flow_ty_m, flow_tz_m."""
+    """The columns of one of `VECTORS`, for example flow_tx_m, flow_ty_m, flow_tz_m."""
     return [f"{name}_t{axis}_m" for axis in "xyz"]

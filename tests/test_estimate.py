@@ -31,7 +31,7 @@ EYE = np.eye(4)
     "arguments, complaint",
     [
         ({"pcf": [P1, P0], "preset": "paper"}, "2 future sweeps.*num_future=0"),
-        ({"config": make_config("paper"), "method": "dense"}, "in place of preset and method"),
+        ({"config": make_config("paper"), "method": "dense"}, "replaces preset and method"),
         ({"pch": [P1], "gmh": [None, None]}, "gmh has 2 entries for 1"),
         ({"pch": [P1], "T_ego1_egoh": [EYE, EYE]}, "T_ego1_egoh has 2 entries for 1"),
         ({"pch": [P1], "T_ego1_ego0": EYE}, "T_ego1_ego0 is given but T_ego1_egoh is not"),
@@ -91,7 +91,7 @@ def test_everything_ground_and_single_points():
     ids=["millimetres", "nothing finite"],
 )
 def test_a_warning_if_no_point_is_active(points, seen):
-    with pytest.warns(UserWarning, match=f"none of the .* points of pc0 takes part.*{seen}"):
+    with pytest.warns(UserWarning, match=f"none of the .* points of pc0 is active.*{seen}"):
         assert not estimate_flow(points, P1).is_valid.any()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -107,7 +107,7 @@ def test_a_class_refuses_the_settings_of_another_method():
     for method, kind in classes.items():
         assert type(make_model(config(method))) is kind and kind.from_preset().config == make_config(method=method)
         for other in set(classes) - {method}:
-            with pytest.raises(CFlowError, match=f"{kind.__name__} does method='{method}', the config says '{other}'"):
+            with pytest.raises(CFlowError, match=f"{kind.__name__} is .*'{method}', but the config is for '{other}'"):
                 kind(config(other))
     for wrong in (None, {"pixel_sizes": (0.1,)}, "paper"):
         with pytest.raises(CFlowError, match="give the result of make_config"):

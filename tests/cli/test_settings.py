@@ -82,10 +82,9 @@ def test_a_preset_of_one_s_own_says_only_what_it_changes(
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("defaults: [base_verified, _self_]\nuse_timestamps: true\n", REMOVED["use_timestamps"]),
         ("defaults: [base_dense, _self_]\nsignificance: 2\n", "significance is a setting of method verified"),
         ("defaults: [base_verified, _self_]\nthorough: false\n", REMOVED["thorough"]),
-        ("method: dense\nproof: true\n", REMOVED["proof"]),  # a file of version 0.1
+        ("method: verified\nmax_object: 20\n", REMOVED["max_object"]),
         ("defaults: [base_dense, _self_]\nnum_history: many\n", "could not be converted to Integer"),
         ("num_history: 3\n", "method=None: give one of"),
     ],
@@ -98,7 +97,7 @@ def test_a_preset_of_one_s_own_that_is_wrong(
     assert error.startswith("error: ") and message in error and error.count("\n") == 1
 
 
-@pytest.mark.parametrize("setting", ["model.proof", "++model.proof", "model.thorough", "+model.keypoint_block"])
+@pytest.mark.parametrize("setting", ["model.max_object", "++model.max_object", "model.thorough", "+model.thorough"])
 def test_a_setting_that_went_says_what_to_do(setting: str, cflow: Cflow, capsys: pytest.CaptureFixture) -> None:
     name = setting.rpartition(".")[2]
     assert cflow("eval", f"{setting}=1") == 2

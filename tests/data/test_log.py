@@ -90,7 +90,7 @@ def test_a_result_is_saved_and_loaded(result: FlowResult, tmp_path: Path) -> Non
     np.savez(tmp_path / "other.npz", points=np.zeros(3))
     (tmp_path / "short.npz").write_bytes((tmp_path / "a.npz").read_bytes()[:1000])
     for name in ("objects", "other", "short", "absent"):
-        with pytest.raises(CFlowError, match=f"{name}.npz is no result"):
+        with pytest.raises(CFlowError, match=f"{name}.npz is not a result"):
             FlowResult.load(tmp_path / f"{name}.npz")
 
 
@@ -114,7 +114,7 @@ def test_a_data_frame_has_a_row_per_point(drive: Drive, result: FlowResult, monk
     frame = result.to_pandas(points)
     assert isinstance(frame, pandas.DataFrame) and list(frame.columns[:4]) == ["x", "y", "z", "residual_tx_m"]
     assert np.array_equal(frame[["flow_tx_m", "flow_ty_m", "flow_tz_m"]], result.flow) and len(frame) == len(points)
-    with pytest.raises(CFlowError, match="a row per row"):
+    with pytest.raises(CFlowError, match="one row per row"):
         result.to_pandas(points[1:])
     monkeypatch.setitem(__import__("sys").modules, "pandas", None)
     with pytest.raises(CFlowError, match="pip install pandas"):

@@ -28,7 +28,7 @@ def failures(script: Any) -> Any:
 QUICK = ("touching", "wrong_frame")
 
 
-@pytest.mark.filterwarnings("ignore:there are ground points")
+@pytest.mark.filterwarnings("ignore:a sweep without a ground mask")
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[] if n in QUICK else pytest.mark.slow) for n in FIXED])
 def test_the_failure_occurs_and_the_last_setting_fixes_it(failures: Any, name: str) -> None:
     case = failures.make_case(name, 0)
