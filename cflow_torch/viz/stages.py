@@ -23,7 +23,6 @@ from cflow_torch.estimate import make_model
 from cflow_torch.keypoints.descriptors import describe
 from cflow_torch.keypoints.match_candidates import match_radius
 from cflow_torch.keypoints.matching import match
-from cflow_torch.model import Motion
 from cflow_torch.ops.cross_correlation import cross_correlate
 from cflow_torch.ops.indices import flat_nonzero
 from cflow_torch.types import CFlowError, FlowResult, Window
@@ -37,12 +36,10 @@ class Scale:
 
     Args:
         sweeps: the input of this scale: the one window, warped by the flow of the coarser scales.
-        motion: the motion that this scale added.
         flow: (N, 3) float64, residual flow of the rows of pc0 after this scale, metres per sweep interval.
     """
 
     sweeps: ProjectedSweeps
-    motion: Motion
     flow: np.ndarray
 
     def seen(self) -> Occupancy:
@@ -105,20 +102,19 @@ def scales(window: Window, config: Config) -> tuple[list[Scale], FlowResult]:
         raise _not_drawable(config, "scales one after the other", "paper")
     model: Any = make_model(config, "cpu")
     motion_at_scale = model.motion_at_scale
-    seen: list[tuple[ProjectedSweeps, Motion]] = []
+    seen: list[ProjectedSweeps] = []
 
-    def record(sweeps: ProjectedSweeps) -> Motion:
-        motion = motion_at_scale(sweeps)
+    def record(sweeps: ProjectedSweeps) -> Any:
         flow = None if sweeps.flow is None else sweeps.flow.clone()  # the run adds to it in place
-        seen.append((replace(sweeps, flow=flow), motion))
-        return motion
+        seen.append(replace(sweeps, flow=flow))
+        return motion_at_scale(sweeps)
 
     model.motion_at_scale = record
     (result,) = model([window])
-    points = seen[0][0].batch.rows[0]
-    so_far = [sweeps.flow for sweeps, _ in seen if sweeps.flow is not None]
+    points = seen[0].batch.rows[0]
+    so_far = [sweeps.flow for sweeps in seen if sweeps.flow is not None]
     flows = [F.pad(flow[:, points].T, (0, 3 - len(flow))) for flow in so_far] + [result.residual_flow.double()]
-    return [Scale(*given, flow.numpy()) for given, flow in zip(seen, flows)], result
+    return [Scale(sweeps, flow.numpy()) for sweeps, flow in zip(seen, flows)], result
 
 
 @torch.inference_mode()

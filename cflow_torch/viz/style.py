@@ -98,7 +98,7 @@ def inches_of(axes: Axes) -> np.ndarray:
 
 
 def draw_wheel(axes: Axes, position: np.ndarray, moves: np.ndarray, max_flow: float, corner: str | None = None) -> None:
-    """Draw the colour wheel in a corner of the panel, see `legend_box`. Moving points count as loud."""
+    """Draw the colour wheel in a corner of the panel, see `legend_box`. Moving points are important."""
     fill_wheel(legend_box(axes, position, moves, WHEEL_INCHES, corner), max_flow)
 
 
@@ -124,14 +124,14 @@ def draw_scale(axes: Axes) -> None:
 
 
 def legend_box(
-    axes: Axes, position: np.ndarray, is_loud: np.ndarray, inches: tuple[float, float], corner: str | None = None
+    axes: Axes, position: np.ndarray, is_important: np.ndarray, inches: tuple[float, float], corner: str | None = None
 ) -> Axes:
-    """Add an empty white box in the corner where it covers the fewest points; a loud point counts twenty-fold.
+    """Add an empty white box in the corner where it covers the fewest points; an important point counts twenty-fold.
 
     Args:
         axes: a panel.
         position: (N, 3) float64, metres.
-        is_loud: (N,) bool.
+        is_important: (N,) bool.
         inches: width and height.
         corner: one of `CORNERS`; None = the one that covers the fewest.
     """
@@ -142,7 +142,7 @@ def legend_box(
     far = 1 - margin - size
     corners = np.array([(far[0], far[1]), (far[0], margin[1]), (margin[0], far[1])])
     is_covered = ((fraction >= corners[:, None]) & (fraction <= corners[:, None] + size)).all(axis=2)
-    best = int(np.argmin(is_covered @ np.where(is_loud, 20, 1)))
+    best = int(np.argmin(is_covered @ np.where(is_important, 20, 1)))
     x, y = corners[best if corner is None else CORNERS.index(corner)]
     box = axes.inset_axes((x, y, size[0], size[1]), zorder=7)
     box.set(xticks=[], yticks=[], facecolor="white")
