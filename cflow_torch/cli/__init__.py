@@ -1,3 +1,3 @@
-"""The `cflow` command; one module per sub-command."""
+"""The `cflow` command, one module per sub-command."""
 
 from __future__ import annotations

@@ -1,25 +1,24 @@
-"""What is typed behind a command, put in the form that Hydra's parser takes."""
+"""Translate the arguments of a command into the syntax of Hydra's parser."""
 
 from __future__ import annotations
 
 import re
 
-# Settings that name a file, a folder or a log: text, whatever they look like.
+# Settings that name a file, a folder or a log. Their values are text, even if they look like a number.
 _NAMES = ("output", "log", "flow", "archive", "frames", "masks", "result_name", "data.root", "data.cache")
-# What Hydra would read as a number or a truth value: 1e5, 2024_11_22, true.
-_NO_TEXT = re.compile(r"[+-]?[._]*\d[\d._]*(e[+-]?[\d_]+)?|true|false", re.IGNORECASE)
+# Hydra reads these values as numbers or booleans: 1e5, 2024_11_22, true.
+_NOT_TEXT = re.compile(r"[+-]?[._]*\d[\d._]*(e[+-]?[\d_]+)?|true|false", re.IGNORECASE)
 _READABLE = re.compile(r"[\w./\\:+%@?|*$ -]*", re.ASCII)  # without quotes
 _WITH_VALUE = ("-c", "--cfg", "-p", "--package", "-i", "--info", "-cd", "--config-dir", "-cn", "--config-name", "-cp")
-_GRAMMAR = re.compile(r"['\"\[{]|(choice|glob|range|shuffle|sort|str|tag)\(|.*\$\{")  # what Hydra gives a meaning
+_GRAMMAR = re.compile(r"['\"\[{]|(choice|glob|range|shuffle|sort|str|tag)\(|.*\$\{")  # Hydra's own syntax
 
 
 def for_hydra(arguments: list[str]) -> list[str]:
-    """Settings before options, since Hydra's parser does not take `-m` between two settings; names in quotes.
+    """Put settings before options, because Hydra does not accept `-m` between two settings, and quote names.
 
     Args:
-        arguments: behind the command. A path by itself is data.root. A Waymo segment,
-            log=10203656353524179475_7625_000_7645_000, is a whole number to Hydra, which leaves its underscores out,
-            and output=Ausgänge an error.
+        arguments: of a command. A path by itself means data.root. Without quotes, Hydra would read the Waymo segment
+            log=10203656353524179475_7625_000_7645_000 as a whole number, and reject output=Ausgänge.
     """
     overrides, options = [], []
     for before, word in zip(["", *arguments], arguments):
@@ -37,10 +36,8 @@ def _quoted(override: str) -> str:
     if key.lstrip("+") not in _NAMES or _GRAMMAR.match(value):
         return override
     values = value.split(",")  # of a sweep
-    for number, one in enumerate(values):
-        if _NO_TEXT.fullmatch(one.strip()) or not _READABLE.fullmatch(one):
-            values[number] = _text(one)
-    return f"{key}={','.join(values)}"
+    is_quoted = [_NOT_TEXT.fullmatch(one.strip()) or not _READABLE.fullmatch(one) for one in values]
+    return f"{key}={','.join(_text(one) if quoted else one for one, quoted in zip(values, is_quoted))}"
 
 
 def _text(value: str) -> str:

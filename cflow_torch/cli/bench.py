@@ -1,7 +1,7 @@
-"""Times the method on your data: total and stages, windows per second, memory; a table and OUTPUT/bench.json.
+"""Measures the run time of the method and of its stages, windows per second, and memory: a table and OUTPUT/bench.json.
 
-Pairs of the first log, spread evenly over it, one at a time and in batches. Times start with the points in memory and
-end with the flow on the device. Other work on the machine spoils the figures.
+The pairs are spread evenly over the first log and run one at a time and in batches. Times start with the points in
+memory and end with the flow on the device. Other work on the machine distorts them.
 
 examples:
   cflow bench                                                    a simulated street
@@ -45,18 +45,18 @@ def task(cfg: DictConfig) -> None:
 
 
 def measure(model: FlowModel, windows: Sequence[Window], repeats: int, batches: Sequence[int] = ()) -> dict[str, Any]:
-    """Seconds and memory of a method.
+    """Measure the seconds and the memory of a method.
 
     Args:
         model: the method.
-        windows: at least one; a batch that is larger takes them again from the first.
-        repeats: timed runs of each window, and of each batch; one before them warms up.
-        batches: numbers of windows in a batch.
+        windows: at least one; a larger batch repeats them.
+        repeats: timed runs of each window and of each batch, after one that warms up.
+        batches: batch sizes.
 
     Returns:
         "points" (mean number per sweep), "windows", "repeats", "device"; "seconds": of one window, see
         `TimedModel.report`; "batches": size -> "median" (seconds of a batch), "windows_per_s"; "peak_bytes": on a GPU
-        the most that was allocated there at once, else the most that the process ever held, None = not known.
+        the most that was allocated at once, on a CPU the most that the process ever used, None = not known.
     """
     watch = TimedModel(model)
     device = watch(windows[:1])[0].flow.device
@@ -85,16 +85,16 @@ def measure(model: FlowModel, windows: Sequence[Window], repeats: int, batches: 
 
 
 def format_report(report: dict[str, Any]) -> str:
-    """What `cflow bench` prints, as Markdown."""
+    """The report as Markdown."""
     seconds, model = report["seconds"], report["model"]
-    peak = "not known" if report["peak_bytes"] is None else f"{report['peak_bytes'] / 1e6:.0f} MB"
-    rows = {"total, median": seconds["median"], "least": seconds["min"], "most": seconds["max"], **seconds["stages"]}
+    peak = "unknown" if report["peak_bytes"] is None else f"{report['peak_bytes'] / 1e6:.0f} MB"
+    rows = {"total, median": seconds["median"], "min": seconds["min"], "max": seconds["max"], **seconds["stages"]}
     lines = [
         f"method {model['method']}, num_history {model.get('num_history', 0)}, pixel_sizes {model['pixel_sizes']}",
         f"device {report['device']}; {report['machine']['cpu']}, one thread",
-        f"log {report['log']}: {report['windows']} pairs, {report['points']:.0f} points a sweep, each "
+        f"log {report['log']}: {report['windows']} pairs, {report['points']:.0f} points per sweep, each "
         f"{report['repeats']} times; torch {report['versions']['torch']}",
-        f"most memory (CPU: of the process, GPU: allocated there): {peak}",
+        f"peak memory (CPU: of the process, GPU: allocated): {peak}",
         "",
         "| one window | ms |",
         "|---|---:|",
@@ -108,7 +108,7 @@ def format_report(report: dict[str, Any]) -> str:
 
 
 def _windows(log: Log, count: int, config: Config) -> list[Window]:
-    """So many windows, spread evenly over those with all sweeps before and after; without such, the last ones."""
+    """`count` windows, spread evenly over those with all sweeps before and after; without such, the last ones."""
     end = len(log.timestamps) - 2
     first = min(config.num_history, end)
     last = max(end - config.num_future, first)

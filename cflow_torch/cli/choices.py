@@ -1,7 +1,9 @@
-"""What can stand behind a command: its groups with their choices, and the names of all settings."""
+"""The groups of a command with their choices, and the names of all its settings."""
 
 from __future__ import annotations
 
+import json
+import re
 from difflib import get_close_matches
 from functools import lru_cache
 from pathlib import Path
@@ -14,11 +16,11 @@ from cflow_torch.config import PRESETS, make_config
 from cflow_torch.data.json_file import flatten
 
 CONFIGS = Path(cflow_torch.configs.__path__[0])
-SETTERS = ("experiment", "row")  # groups that set what others bring
+SETTERS = ("experiment", "row")  # groups that only change settings of others
 
 
 def groups(command: str) -> dict[str, list[str]]:
-    """The groups of a command, each with its choices: {"model": ["default", ...], ...}."""
+    """Groups of a command and their choices: {"model": ["default", ...], ...}."""
     entries = OmegaConf.load(CONFIGS / f"{command}.yaml").defaults
     names = [str(name) for entry in entries if not isinstance(entry, str) for name in entry]
     return {name: list(PRESETS) if name == "model" else [file.stem for file in files(name)] for name in names}
@@ -30,7 +32,7 @@ def files(group: str) -> list[Path]:
 
 
 def settings(command: str) -> dict[str, Any]:
-    """Every setting of a command in dotted form, with its value in one of the choices of its group."""
+    """All settings of a command in dotted form, each with a value from one of the choices of its group."""
     found = dict(own_settings(CONFIGS / f"{command}.yaml"))
     for preset in PRESETS:
         found.update({f"model.{name}": value for name, value in make_config(preset).as_dict().items()})
@@ -42,15 +44,15 @@ def settings(command: str) -> dict[str, Any]:
     return found
 
 
-@lru_cache(maxsize=None)  # commands share the files of groups
+@lru_cache(maxsize=None)  # commands share files
 def own_settings(file: Path) -> dict[str, Any]:
-    """The settings that a YAML file gives, in dotted form."""
+    """The settings in a YAML file, in dotted form."""
     values: dict[str, Any] = OmegaConf.to_container(OmegaConf.load(file))  # type: ignore[assignment]
     return flatten({key: value for key, value in values.items() if key not in ("defaults", "hydra")})
 
 
 def near(word: str, known: Iterable[str]) -> str:
-    """ " (did you mean X?)" for the most similar known word; "" if none is similar."""
+    """The hint " (did you mean X?)" with the most similar known word; "" if none is similar."""
     names = list(known)
     found = get_close_matches(word, names, 1)
     if not found:  # `pixel_sizes` instead of `model.pixel_sizes`
@@ -60,7 +62,13 @@ def near(word: str, known: Iterable[str]) -> str:
 
 
 def settings_help(command: str) -> str:
-    """The settings of a command with their defaults and comments, and the choices of its groups, for its help."""
-    own = (CONFIGS / f"{command}.yaml").read_text(encoding="utf-8").partition("\n\n")[2].splitlines()
-    grouped = [f"{group}={'|'.join(names)}" for group, names in groups(command).items()]
-    return "\n  ".join(["\nsettings:", *own, *grouped, "data.NAME, model.NAME, ...: see `cflow settings`"]) + "\n"
+    """The settings of a command with their meaning and default, and the choices of its groups, for its help."""
+    file = CONFIGS / f"{command}.yaml"
+    meaning = dict(re.findall(r"^ *(\w+):[^#\n]*# (.*)$", file.read_text(encoding="utf-8"), re.MULTILINE))
+    lines = ["\nsettings:"]
+    for name, value in own_settings(file).items():
+        what = meaning.get(name.rpartition(".")[2], meaning.get(name.partition(".")[0], ""))
+        default = json.dumps(value).replace('"', "")
+        lines.append(f"{name:15} {what}; default {default}")
+    lines += [f"{group}={'|'.join(names)}" for group, names in groups(command).items()]
+    return "\n  ".join([*lines, "data.NAME, model.NAME, ...: `cflow settings` lists them"]) + "\n"

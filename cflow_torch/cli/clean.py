@@ -6,9 +6,9 @@ also writes OUTPUT/<log id>.ply, the static points in the world, one per voxel. 
 as a whole or not at all. Repeat the command to write the missing logs. OUTPUT/config.yaml holds settings and versions.
 
 examples:
-  cflow clean /data/drive map=true voxel_size=0.2            any format that is recognised, bags as well
+  cflow clean /data/drive map=true voxel_size=0.2            any recognised format, also bags
   cflow clean data=av2 data.root=/data/av2/val remove_stopped=true
-  cflow clean /data/drive flow=outputs/flow                  by the flow that `cflow flow` left there
+  cflow clean /data/drive flow=outputs/flow                  with the output of `cflow flow`
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def task(cfg: DictConfig) -> None:
     """Run `cflow clean`."""
     output = run.output_folder(cfg)
     if is_remote(output):
-        raise CFlowError(f"{output}: logs are written whole on this machine only; give output=FOLDER and copy them")
+        raise CFlowError(f"output={output}: give a folder of this machine, and copy the logs from there")
     if cfg.suffix is not None and cfg.suffix not in SUFFIXES:
         raise CFlowError(f"suffix={cfg.suffix}: give one of {', '.join(SUFFIXES)}")
     if not cfg.voxel_size > 0:
@@ -61,7 +61,7 @@ def task(cfg: DictConfig) -> None:
 
 
 def _claim(cfg: DictConfig, output: Path) -> None:
-    """Refuse a folder with logs of other settings."""
+    """Reject a folder with logs of other settings."""
     file = output / "config.yaml"
     if file.exists():
         before: Any = OmegaConf.to_container(OmegaConf.load(file))

@@ -1,11 +1,11 @@
-"""A script that completes commands, groups with their choices (data=, model=, ...) and every setting.
+"""Prints a script for TAB completion of commands, groups with their choices (data=, model=, ...) and all settings.
 
-Prints it; leaves nothing. It holds all names, so that completing starts no Python: print it again after an update.
+The script contains all names, so that completion does not start Python. Print it again after an update.
 
 examples:
-  cflow completion bash    for this shell: eval "$(cflow completion bash)"; or into a file that ~/.bashrc reads
-  cflow completion zsh     likewise in ~/.zshrc, behind compinit
-  cflow completion fish    into ~/.config/fish/completions/cflow.fish
+  cflow completion bash    for this shell: eval "$(cflow completion bash)"; or write it to a file that ~/.bashrc reads
+  cflow completion zsh     the same for ~/.zshrc, after compinit
+  cflow completion fish    write it to ~/.config/fish/completions/cflow.fish
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from __future__ import annotations
 from cflow_torch.cli.choices import CONFIGS, groups, settings
 from cflow_torch.types import CFlowError
 
-# Offered is what begins with the word so far, up to its next dot or equals sign: data, then data. and data=, then ...
-# bash takes what stands behind = for a word of its own.
+# The script offers names that begin with the current word, up to the next dot or equals sign: data, then data. and
+# data=, and so on. For bash, the text after = is a word of its own.
 _BASH = r"""
 _cflow() {
   local line="${COMP_LINE:0:$COMP_POINT}" all word rest head cur
@@ -56,12 +56,12 @@ def task(arguments: list[str]) -> None:
     """Run `cflow completion`."""
     if len(arguments) != 1 or arguments[0] not in _SHELLS:
         given = " ".join(arguments) or "nothing"
-        raise CFlowError(f"completion is for one of {', '.join(_SHELLS)}, got {given}: cflow completion bash")
+        raise CFlowError(f"completion takes one of {', '.join(_SHELLS)}, got {given}: cflow completion bash")
     print(script(arguments[0]))
 
 
 def script(shell: str) -> str:
-    """The script for a shell."""
+    """The completion script for a shell."""
     from cflow_torch.cli.main import COMMANDS
 
     template, case = _SHELLS[shell]
@@ -70,12 +70,12 @@ def script(shell: str) -> str:
 
 
 def candidates(command: str) -> list[str]:
-    """What can stand behind a command: settings end in =, choices are whole."""
+    """Completions of a command: settings end in =, choices are complete."""
     if not (CONFIGS / f"{command}.yaml").exists():
         return [*(_SHELLS if command == "completion" else ()), "--help"]
     choices = groups(command)
     found = [f"{group}={name}" for group, names in choices.items() for name in names]
     for key, value in settings(command).items():
-        if key not in choices:  # picture=flow also sets picture to its own name
+        if key not in choices:  # `picture` is both a group and a setting
             found += [f"{key}=true", f"{key}=false"] if isinstance(value, bool) else [f"{key}="]
     return list(dict.fromkeys([*found, "--help", "--cfg", "--multirun"]))

@@ -1,12 +1,12 @@
-"""No data needed: a simulated drive goes through reader, method, evaluation and picture like a real log.
+"""Simulates a drive, estimates its flow, scores it and draws it. You need no data.
 
-Leaves in OUTPUT (outputs/demo): <log id>/ one flow file per pair, flow.png the picture, results.json the scores,
-config.yaml the resolved settings and versions; in outputs/cache the drive in Argoverse 2's format.
+The drive is written in Argoverse 2's format to outputs/cache and read from there like a real log. OUTPUT (outputs/demo)
+gets <log id>/ with one flow file per pair, flow.png, results.json with the scores, and config.yaml with the settings.
 
 examples:
-  cflow demo                                              no data needed
-  cflow demo data.seed=7 pair=2 output=outputs/another    another street, drawn at another moment
-  cflow demo model=paper                                  with the method of the paper
+  cflow demo
+  cflow demo data.seed=7 pair=2 output=outputs/another    another street, another pair in the picture
+  cflow demo model=paper                                  the method of the paper
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def task(cfg: DictConfig) -> None:
         blank_figure((1, 1), 100)
     except CFlowError as error:  # matplotlib is an extra
         draws = False
-        print(f"no picture ({error}); flow, scores and settings come all the same")
+        print(f"no picture ({error}); flow, scores and settings are written without it")
     scores = Scores(cfg)
     model = TimedModel(run.make_model(cfg))
     logs, failures = run.open_logs(cfg)
@@ -60,7 +60,7 @@ def task(cfg: DictConfig) -> None:
 
 
 def _draw(log: Log, model: TimedModel, sweeps: Window, result: FlowResult, output: Path) -> str:
-    """The file of the picture."""
+    """Draw the flow of a pair; returns the file."""
     figure = plot_flow(
         sweeps.pc0.points,
         result,

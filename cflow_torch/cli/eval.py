@@ -1,11 +1,11 @@
-"""Flow and scores of every labelled pair: a table on the screen, OUTPUT/results.json, OUTPUT/config.yaml.
+"""Estimates and scores all labelled pairs: a table on the screen, OUTPUT/results.json and OUTPUT/config.yaml.
 
-A run whose results are there already is skipped; overwrite=true redoes it. The jobs of a sweep write to folders below
-OUTPUT that are named by what was overridden; the score that a sweeper sees is the mean dynamic error.
+A run whose results exist is skipped; overwrite=true repeats it. Each job of a sweep (-m) writes to a folder below
+OUTPUT that is named after its overrides. A sweeper minimises the mean dynamic error.
 
 examples:
   cflow eval data=av2 data.root=/data/av2/val model=paper
-  cflow eval data=hdf5 data.root=/data/scenes model=fast     a cheaper method
+  cflow eval data=hdf5 data.root=/data/scenes model=fast     a faster method
   cflow eval definition=av2                    scores as another public evaluator defines them
   cflow eval -m model.connectivity=4,8         a sweep: outputs/eval/model.connectivity=4/results.json, ...
   cflow eval -m experiment=pixel_size          a table or figure of the paper, see docs/settings.md
@@ -25,12 +25,12 @@ from cflow_torch.types import CFlowError
 
 
 def task(cfg: DictConfig) -> float:
-    """Run `cflow eval`; returns the score of a sweep, see `objective`."""
+    """Run `cflow eval`; returns the score that a sweeper minimises, see `objective`."""
     output = run.output_folder(cfg)
     pairs = run.chosen_pairs(cfg, "data.")
     record = finished_results(cfg, output)
     if record is not None:
-        print(f"skipped, done before: {output}")
+        print(f"skipped, its results exist: {output}")
         return objective(record["results"])
     scores = Scores(cfg)
     model = TimedModel(run.make_model(cfg))
@@ -38,8 +38,8 @@ def task(cfg: DictConfig) -> float:
     ensure_writable(output)
     failures += run.for_each_pair(logs, model, scores.add, pairs)
     if scores.metrics.num_frames == 0:
-        raise CFlowError("no pair has labels: nothing to score; `cflow flow` estimates the flow without them")
+        raise CFlowError("no pair has labels, so there is nothing to score; `cflow flow` needs no labels")
     results = scores.report(output, logs, model.report(), failures)
-    with suppress(run.UnfinishedJob):  # a job of a sweep has a score all the same; a run on its own ends with status 1
+    with suppress(run.UnfinishedJob):  # a job of a sweep returns its score; a single run exits with status 1
         run.finish(failures)
     return objective(results)

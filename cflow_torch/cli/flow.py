@@ -1,18 +1,17 @@
-"""One flow file per pair of consecutive sweeps: OUTPUT/<log id>/<time stamp of sweep t>.feather.
+"""Estimates the flow of every pair of sweeps: OUTPUT/<log id>/<time stamp of sweep t>.feather.
 
-Columns: flow_t{x,y,z}_m total flow, residual_t{x,y,z}_m motion of objects, pose_t{x,y,z}_m ego motion (float32,
-metres until the next sweep, axes of the ego frame at t+1), cluster_id, score, is_valid; one row per point of sweep t.
-contents=[residual,is_valid] writes these columns only: the others follow from the poses, and take most of the room.
-contents=[residual,is_valid,confidence] also tells how far each point can be trusted (not model=paper, keypoints).
-OUTPUT/config.yaml holds the resolved settings and versions, OUTPUT/reports what was done. The same command again
-resumes. Ctrl-C, SIGTERM and SIGHUP let the frames in hand be finished. The status is 0 if every frame is there, 1 if
-one is missing, 2 if the call was wrong, 128 and its number after a signal.
+Each file has one row per point of sweep t. Columns: flow_t{x,y,z}_m total flow, residual_t{x,y,z}_m motion of objects,
+pose_t{x,y,z}_m ego motion (float32, metres until the next sweep, in the ego frame at t+1), cluster_id, score, is_valid.
+contents=[residual,is_valid] writes only these columns: files are much smaller, and the others follow from the poses.
+contents=[residual,is_valid,confidence] adds the confidence of each point (not with model=paper or keypoints).
 
-result_name=NAME (HDF5 scenes) also writes the total flow into the scenes themselves, as key NAME of every sweep, where
-the viewers of OpenSceneFlow find it.
+OUTPUT/config.yaml contains the settings and versions, OUTPUT/reports what was done. Run the command again to resume.
+After Ctrl-C, SIGTERM or SIGHUP the frames in hand are finished. The exit status is 0 if every frame is complete, 1 if
+one is missing, 2 if the call was wrong, and 128 plus its number after a signal.
 
-tracks=true also writes OUTPUT/<log id>/tracks.parquet, the moving objects of a log through time, when all of its frames
-are there: a row per object and sweep with id, box, velocity. With shards, whichever ends last does it.
+result_name=NAME also writes the total flow into the HDF5 scenes, as key NAME of every sweep, where the viewers of
+OpenSceneFlow read it. tracks=true also writes OUTPUT/<log id>/tracks.parquet when all frames of a log are complete: one
+row per moving object and sweep, with id, box and velocity.
 
 examples:
   cflow flow data=av2 data.root=/data/av2/val output=outputs/val
@@ -55,7 +54,7 @@ _FOR_TRACKS = {"residual", "cluster_id", "is_valid"}  # contents
 
 
 class FlowRun(NamedTuple):
-    """A run that has ended: its logs, its job, its report."""
+    """The logs, the job and the report of a run."""
 
     sources: Sources
     job: Job
@@ -72,7 +71,7 @@ def task(cfg: DictConfig) -> None:
     if done is None:
         return
     failures: Failures = []
-    if cfg.result_name is not None and done.report["stopped_by"] is None:  # a signal leaves no time for it
+    if cfg.result_name is not None and done.report["stopped_by"] is None:  # a signal leaves no time for this
         failures = _into_scenes(cfg.result_name, done.sources.logs, as_path(done.job.output))
     if cfg.tracks and done.report["stopped_by"] is None:
         failures += _write_tracks(done.sources, shard, as_path(done.job.output))
@@ -82,19 +81,19 @@ def task(cfg: DictConfig) -> None:
 def compute(
     cfg: DictConfig, shard: Shard, contents: tuple[str, ...], check: Callable[[Job, Sources], None] | None = None
 ) -> FlowRun | None:
-    """Estimate the flow of all logs of a shard into files, or say what would be done.
+    """Estimate the flow of all logs of a shard into files, or count the frames.
 
     Args:
-        cfg: settings; those of `cflow flow`.
-        shard: which share of the logs.
-        contents: of a flow file.
-        check: refuses logs before anything is computed.
+        cfg: settings of `cflow flow`.
+        shard: which share of the logs to do.
+        contents: columns of a flow file.
+        check: raises an error if the logs are not usable; called before anything is computed.
 
     Returns:
-        What was done; None with dry_run=true.
+        The run; None with dry_run=true.
 
     Raises:
-        CFlowError: a setting, the logs or the output folder are refused.
+        CFlowError: a setting, the logs or the output folder cannot be used.
     """
     output = run.output_folder(cfg)
     settings: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
@@ -131,16 +130,16 @@ def compute(
 
 
 def finish(done: FlowRun, shard: Shard, failures: Failures) -> None:
-    """Print what was done, and end the process with another status than 0 if something is missing.
+    """Print the report, and exit with its status if something is missing.
 
     Args:
         done: the run.
         shard: its share.
-        failures: what failed after it.
+        failures: of later steps, such as tracks.
 
     Raises:
         SystemExit: something is missing.
-        UnfinishedJob: the same in a job of a sweep.
+        UnfinishedJob: something is missing, in a job of a sweep.
     """
     report, file = done.report, report_file(done.job.output, shard)
     status = report["exit_status"] or int(bool(failures))
@@ -148,8 +147,8 @@ def finish(done: FlowRun, shard: Shard, failures: Failures) -> None:
     if status:
         missing = format_missing(report) + "".join(f"\n  {scene}: {message}" for scene, message in failures)
         print(f"missing:\n{missing}", file=sys.stderr)
-        if run.is_sweep():  # Hydra lets the other jobs run before it ends with status 1
-            raise run.UnfinishedJob(f"not every frame is there: see {file}")
+        if run.is_sweep():  # Hydra runs the other jobs before it exits with status 1
+            raise run.UnfinishedJob(f"some frames are missing: see {file}")
         raise SystemExit(status)
 
 
@@ -160,9 +159,9 @@ def _check_scenes(job: Job, sources: Sources) -> None:
 
 def _check_results(cfg: DictConfig, shard: Shard) -> None:
     if cfg.data.get("name") != "hdf5":
-        raise CFlowError("result_name writes into HDF5 scenes: it needs data=hdf5")
+        raise CFlowError("result_name= writes into HDF5 scenes: give data=hdf5")
     if shard.count > 1:
-        raise CFlowError("result_name writes into whole scenes: give it to a last run without shards")
+        raise CFlowError("result_name= needs the flow of whole scenes: give it in a last run without shards")
     check_result_name(cfg.result_name)
 
 
@@ -172,16 +171,16 @@ def _contents(cfg: DictConfig, has_confidence: bool) -> tuple[str, ...]:
     if not given or set(given) - set(allowed):
         raise CFlowError(f"contents={given}: give some of {', '.join(allowed)}")
     if "confidence" in given and not has_confidence:
-        raise CFlowError(f"contents={given}: confidence is there with model=default and model=fast only")
+        raise CFlowError(f"contents={given}: only model=default, fast and offline have a confidence")
     if cfg.result_name is not None and not set(given) >= set(CONTENTS):
-        raise CFlowError("result_name reads the flow files again: it needs all contents")
+        raise CFlowError("result_name= reads the flow files: it needs all contents")
     if cfg.tracks and not set(given) >= _FOR_TRACKS:
-        raise CFlowError(f"tracks=true reads the flow files again: contents needs {', '.join(sorted(_FOR_TRACKS))}")
+        raise CFlowError(f"tracks=true reads the flow files: contents needs {', '.join(sorted(_FOR_TRACKS))}")
     return tuple(name for name in allowed if name in given)
 
 
 def _write_tracks(sources: run.Sources, shard: Shard, output: Path) -> Failures:
-    """The tracks of each log of this shard whose frames are all there, whoever computed them."""
+    """Write the tracks of each log of this shard whose frames are all complete, also those of other shards."""
     failures: Failures = []
     flow = run.stored_flow(output, ())
     for unit in tqdm(shard.units(sources.logs), desc="tracks", unit="log", disable=None):
@@ -196,7 +195,7 @@ def _write_tracks(sources: run.Sources, shard: Shard, output: Path) -> Failures:
 
 
 def _into_scenes(name: str, scenes: Sequence[Path], output: Path) -> Failures:
-    """Copy the flow files into their scenes; a scene that refuses is reported and left as it was."""
+    """Copy the flow files into their scenes. A scene that cannot be written stays as it was and is reported."""
     failures: Failures = []
     count = 0
     for scene in tqdm(scenes, desc=name, unit="scene", disable=None):
@@ -204,5 +203,5 @@ def _into_scenes(name: str, scenes: Sequence[Path], output: Path) -> Failures:
         stamps = sorted(complete_frames(folder))
         with run.collect_failures(failures, scene.stem):
             count += write_hdf5_results(scene, name, ((t, read_flow(frame_file(folder, t)).flow) for t in stamps))
-    print(f"sweeps that now have a key {name} in their scene: {count} (the last sweep of a scene has no flow)")
+    print(f"sweeps with a key {name} written into their scene: {count} (the last sweep of a scene has no flow)")
     return failures

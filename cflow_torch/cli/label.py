@@ -1,12 +1,11 @@
-"""Labels for self-supervised training, into OpenSceneFlow's HDF5 scenes: what SeFlow, SeFlow++ and TeFlow train with.
+"""Writes pseudo-labels into OpenSceneFlow's HDF5 scenes, with which SeFlow, SeFlow++ and TeFlow train.
 
-Each sweep gets dufo (moves), dufocluster, cluster and nnd, and a ground_mask where it has none, in the types and
-meanings of the harness's own recipe. They follow from flow, which is estimated first, as `cflow flow` does, into
-OUTPUT; by the preset offline, that is with sweeps before and after. Then each scene is copied, labelled and replaced:
-it is the old one or the new one at any time. The same command again resumes; scenes that are labelled are left alone.
-OUTPUT may be removed when all scenes are.
-
-With shards, the process that finishes a scene's flow labels it. It ends with the statuses of `cflow flow`.
+Each sweep gets the keys dufo (dynamic), dufocluster, cluster and nnd, and ground_mask if it has none, with the types
+and meanings of the harness's own scripts. The flow that they follow from is estimated first, as by `cflow flow`, with
+the preset offline: sweeps before and after. Then each scene is copied, labelled and replaced, so a killed run leaves
+the old scene or the new one. Run the command again to resume; labelled scenes are skipped. You can delete OUTPUT when
+all scenes are labelled. With shards, the process that completes the flow of a scene labels it. The exit statuses are
+those of `cflow flow`.
 
 examples:
   cflow label /data/scenes/train
@@ -43,16 +42,16 @@ _CONTENTS = ("residual", "cluster_id", "confidence")
 def task(cfg: DictConfig) -> None:
     """Run `cflow label`."""
     if cfg.data.get("name") != "hdf5":
-        raise CFlowError("labels are for HDF5 scenes of OpenSceneFlow: give their folder, and no data=")
+        raise CFlowError("labels are written into HDF5 scenes of OpenSceneFlow: give their folder, and leave data= out")
     if cfg.model.method != "verified":
-        raise CFlowError("labels need the confidence of a flow: give model=offline, default or fast")
+        raise CFlowError("labels need the confidence of the flow: give model=offline, default or fast")
     shard = find_shard(cfg.shard.index, cfg.shard.count, os.environ)
 
     def check(job: Job, sources: Sources) -> None:
         for scene in sources.logs:
             check_writable(scene)
             maker = None
-            with suppress(CFlowError):  # a scene that cannot be read is reported when its turn comes
+            with suppress(CFlowError):  # a scene that cannot be read is reported later
                 maker = labelled_by(scene)
             _check_maker(scene, maker, job)
 
@@ -62,7 +61,7 @@ def task(cfg: DictConfig) -> None:
 
 
 def _label(done: FlowRun, shard: Shard, cfg: DictConfig) -> Failures:
-    """Label the scenes of a shard whose flow is complete; one that refuses is reported and left as it was."""
+    """Label the scenes of a shard whose flow is complete. If one cannot be written, it stays as it was."""
     failures: Failures = []
     model, count, waiting = make_model(done.job.config, cfg.device), 0, 0
     workers = len(choose_layout(cfg.device, cfg.engine.workers, 1, os.environ).devices)
@@ -77,19 +76,19 @@ def _label(done: FlowRun, shard: Shard, cfg: DictConfig) -> Failures:
             log = done.sources.open(scene)
             stamps = log.timestamps[:-1]
             if not set(stamps) <= complete_frames(folder):
-                waiting += 1  # frames that failed are in the report; others belong to another shard
+                waiting += 1  # failed frames are in the report; others belong to another shard
                 continue
             flows = (read_flow(frame_file(folder, stamp)) for stamp in stamps)
             labels = find_labels(log, flows, model, workers)
             write_hdf5_labels(scene, labels, done.job.identity, overwrite=done.job.redo)
             count += 1
-    print(f"scenes labelled: {count}, left to other shards or without complete flow: {waiting}")
+    print(f"scenes labelled: {count}, scenes without complete flow yet: {waiting}")
     return failures
 
 
 def _check_maker(scene: Path, maker: str | None, job: Job) -> None:
-    """Refuse a scene with labels that are not this run's, unless they are to be replaced."""
+    """Reject a scene with labels of another run, unless overwrite=true replaces them."""
     if maker not in (None, job.identity) and not job.redo:
         raise CFlowError(
-            f"{scene} has labels of other settings or of another program: overwrite=true replaces them, or label a copy"
+            f"{scene} has labels of other settings or of another program: give overwrite=true, or label a copy"
         )

@@ -1,11 +1,10 @@
-"""The `cflow` command: one of `COMMANDS`, then settings as Hydra overrides."""
+"""The `cflow` command: the name of a sub-command, then settings as Hydra overrides."""
 
 from __future__ import annotations
 
 import os
 import sys
 import traceback
-from contextlib import suppress
 from difflib import get_close_matches
 from importlib import import_module
 from typing import Any
@@ -14,18 +13,18 @@ from cflow_torch import __version__
 
 COMMANDS = {
     "demo": "simulate a drive, estimate its flow, score it and draw it",
-    "flow": "estimate the flow of every pair of sweeps of one log or a fleet; shards, resumes, Ray",
-    "label": "labels for self-supervised training, into OpenSceneFlow's scenes",
-    "eval": "estimate and score every labelled pair of a data set",
+    "flow": "estimate the flow of every pair of sweeps: resumable, parallel, on many machines",
+    "label": "write pseudo-labels for self-supervised training into OpenSceneFlow's scenes",
+    "eval": "estimate and score all labelled pairs of a data set",
     "submit": "write and check an archive for a public leaderboard",
-    "plot": "pictures of the flow and of every stage, ground truth beside it, animations",
-    "view": "a recording of a drive for the viewer rerun: flow, clusters, truth, on a timeline",
-    "stream": "play a log as if it were live: flow as sweeps arrive, its latency",
-    "clean": "logs without what moves, and maps of what stands",
-    "bench": "time the method and its stages on your data; memory, windows per second",
-    "settings": "every setting with its default and its meaning; model files for OpenSceneFlow",
-    "info": "packages, machine, devices: to paste into a bug report",
-    "completion": "a script that makes a shell complete commands and settings",
+    "plot": "draw flow, clusters, key points, correlation, scales or an animation",
+    "view": "write a recording for the rerun viewer",
+    "stream": "replay a log in real time and measure the latency",
+    "clean": "remove dynamic objects from logs, and build static maps",
+    "bench": "measure run time and memory on your data",
+    "settings": "list all settings with defaults and explanations",
+    "info": "print the versions and the environment for a bug report",
+    "completion": "print a script that completes commands and settings in your shell",
 }
 
 _WITHOUT_SETTINGS = ("settings", "info", "completion")
@@ -34,39 +33,33 @@ HELP = f"""cflow: training-free LiDAR scene flow
 
 usage: cflow COMMAND [SETTING=VALUE ...]
 
-what most people do:
-  cflow demo                    a simulated street: a picture in outputs/demo, no data needed
-  cflow flow /data/av2/val      the flow of your data, one file per pair of sweeps; the format is recognised
-  cflow eval /data/av2/val      its scores, where the data has labels
+first steps:
+  cflow demo                    simulate a street and draw its flow: outputs/demo/flow.png
+  cflow flow /data/av2/val      estimate the flow of your data, one file per pair of sweeps
+  cflow eval /data/av2/val      score the flow, if the data has labels
 
 commands:
 {chr(10).join(f"  {name:10}  {text}" for name, text in COMMANDS.items())}
 
 more examples:
-  cflow flow data=arrays data.root=/data/drive data.find_ground=grid    a format and its settings by name
-  cflow eval model=paper model.pixel_sizes=[0.4,0.2,0.1]                any field of the method, see `cflow settings`
-  cflow eval -m model.num_history=0,2,4                                 a sweep
-  cflow plot picture=correlation pair=2                                 how one object was found
-  cflow submit data=hdf5 data.root=/data/test version=3
+  cflow flow data=arrays data.root=/data/drive data.find_ground=grid    choose a format and its settings
+  cflow eval model=paper model.pixel_sizes=[0.4,0.2,0.1]                change a setting of the method
+  cflow eval -m model.num_history=0,2,4                                 run a sweep over values
+  cflow plot picture=correlation pair=2                                 draw the correlation of one object
+  cflow submit data=hdf5 data.root=/data/test version=3                 write a leaderboard submission
 
-`cflow COMMAND --help` says more; `cflow COMMAND --cfg job` prints every setting and its value; `cflow --version`.
+`cflow COMMAND --help` explains a command. `cflow COMMAND --cfg job` prints all its settings.
 """
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Run one command. Ends the process with status 1 if anything failed, 2 if the call was wrong, 130 after Ctrl-C."""
-    for name in ("stdout", "stderr"):
-        if getattr(sys, name) is None:  # closed: cflow ... >&-
-            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115
+    """Run one command. Exit with status 1 if something failed, 2 if the call was wrong, 130 after Ctrl-C."""
     try:
-        try:
-            _run(list(sys.argv[1:] if argv is None else argv))
-        finally:
-            sys.stdout.flush()
+        _run(list(sys.argv[1:] if argv is None else argv))
+        sys.stdout.flush()
     except OSError as error:
-        if error.errno is None:
-            raise
-        _end_refused(error)
+        _exit_if_refused(error)
+        raise
     except KeyboardInterrupt:
         print("stopped by Ctrl-C", file=sys.stderr)
         raise SystemExit(128 + 2) from None  # as if SIGINT had ended it
@@ -83,7 +76,7 @@ def _run(arguments: list[str]) -> None:
     if command not in COMMANDS:
         near = get_close_matches(command, COMMANDS, 1)
         hint = f" (did you mean {near[0]}?)" if near else ""
-        _end_wrong(f"unknown command {command!r}{hint}: give one of {', '.join(COMMANDS)}")
+        _exit_wrong(f"unknown command {command!r}{hint}: give one of {', '.join(COMMANDS)}")
     module = import_module(f"cflow_torch.cli.{command}")
     if "-h" in rest or "--help" in rest:
         from cflow_torch.cli.choices import settings_help
@@ -97,7 +90,7 @@ def _run(arguments: list[str]) -> None:
     try:
         return module.task(rest)  # type: ignore[no-any-return]
     except CFlowError as error:
-        return _end_wrong(error)
+        return _exit_wrong(error)
 
 
 def _run_with_settings(command: str, run: Any, rest: list[str]) -> None:
@@ -116,57 +109,45 @@ def _run_with_settings(command: str, run: Any, rest: list[str]) -> None:
         try:
             OmegaConf.resolve(cfg)
             for source in HydraConfig.get().runtime.config_sources:
-                if source.schema == "file" and source.path not in sys.path:  # where a user's own reader may lie
+                if source.schema == "file" and source.path not in sys.path:  # the folder of a user's own reader
                     sys.path.append(source.path)
             cfg.data = complete_data(cfg.data)
             return run(cfg)
         except (CFlowError, OmegaConfBaseException) as error:
-            _end_wrong(explain(error, command))
-        except UnfinishedJob:
-            raise
+            _exit_wrong(explain(error, command))
         except Exception as error:
-            if isinstance(error, OSError) and error.errno is not None:
-                _end_refused(error)
+            if isinstance(error, UnfinishedJob):
+                raise
+            _exit_if_refused(error)
             traceback.print_exc()
-            report = "this is a fault of cflow, not of the call: report it with the lines above and `cflow info`"
-            raise UnfinishedJob(report) from None
+            message = "this is a bug of cflow: please report it with the lines above and the output of `cflow info`"
+            raise UnfinishedJob(message) from None
 
     sys.argv = [f"cflow {command}", *for_hydra(rest)]
-    os.environ["HYDRA_FULL_ERROR"] = "1"  # else Hydra prints errors itself, and a closed pipe as one
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them
     try:
         hydra.main(version_base="1.3", config_path="pkg://cflow_torch.configs", config_name=command)(task)()
     except UnfinishedJob as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(1) from None
-    except BrokenPipeError:  # of Hydra's own printing
-        raise
     except Exception as error:
-        _end_wrong(explain(error, command))
+        _exit_if_refused(error)
+        _exit_wrong(explain(error, command))
 
 
-def _end_wrong(message: object) -> None:
-    """End after a wrong call."""
+def _exit_wrong(message: object) -> None:
+    """Exit after a wrong call."""
     print(f"error: {message}", file=sys.stderr)
     raise SystemExit(2) from None
 
 
-def _end_refused(error: OSError) -> None:
-    """End after the system refused a file, or something that has no name: mostly to print, to a reader who left.
-
-    What cannot be printed is given up: else it would be tried once more.
-    """
-    if error.filename is not None:
-        reason = error.strerror or error
-        _end_wrong(f"{error.filename}: {reason}; give places that can be read (data.root=) and written (output=)")
-    is_unread = isinstance(error, BrokenPipeError)  # `cflow info | head`: commands end without a word
-    if not is_unread:
-        with suppress(OSError):
-            print(f"error: {error}: no file is named, so it is mostly what this command prints to", file=sys.stderr)
-    try:
-        sys.stdout.flush()
-    except OSError:
+def _exit_if_refused(error: Exception) -> None:
+    """Exit after an error that is not a bug: a file that the system refused, or a pipe whose reader has ended."""
+    if isinstance(error, BrokenPipeError):  # as in `cflow info | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    raise SystemExit(128 + 13 if is_unread else 1) from None  # as if SIGPIPE had ended it
+        raise SystemExit(128 + 13) from None  # as if SIGPIPE had ended it
+    if isinstance(error, OSError) and error.filename is not None:
+        _exit_wrong(f"{error.filename}: {error.strerror or error}; check data.root= (read) and output= (written)")
 
 
 if __name__ == "__main__":

@@ -1,12 +1,12 @@
-"""A picture of one pair of sweeps, or an animation of a log: OUTPUT/<picture>.png (animation: .gif or .mp4).
+"""Draws one pair of sweeps, or an animation of a log: OUTPUT/<picture>.png (animation: .gif or .mp4).
 
 log=ID pair=N choose the pair; without log= it is one of the first log.
 
-picture=flow         the flow from above; truth=true|false|auto puts the ground truth and the error beside it
+picture=flow         the flow from above; truth=true|false|auto adds the ground truth and the error
 picture=clusters     the points by cluster
-picture=keypoints    key points of both sweeps and their matches (model=keypoints)
+picture=keypoints    the key points of both sweeps and their matches (model=keypoints)
 picture=correlation  one cluster and the correlation of all its shifts (model=paper); cluster=ID chooses it
-picture=scales       coarse to fine, a column per pixel size (model=paper with three sizes)
+picture=scales       coarse to fine, one column per pixel size (model=paper with three sizes)
 picture=animation    the flow of many pairs: first= step= count= format=gif|mp4 frames_per_second= width=
 
 examples:
@@ -45,15 +45,15 @@ from cflow_torch.viz.scales import plot_scales
 from cflow_torch.viz.style import blank_figure
 
 FORMATS = ("gif", "mp4")
-_PAIR = 3  # that is drawn if none is named: with some history before it
+_PAIR = 3  # default; some history precedes it
 
 
 def task(cfg: DictConfig) -> None:
     """Run `cflow plot`."""
     output = run.output_folder(cfg)
     if is_remote(output):
-        raise CFlowError(f"output={cfg.output}: pictures are written to a folder of this machine")
-    blank_figure((1, 1), 100)  # without matplotlib: now, not after the work
+        raise CFlowError(f"output={cfg.output}: give a folder of this machine, and copy the picture from there")
+    blank_figure((1, 1), 100)  # fails now if matplotlib is missing, not after the work
     model = run.make_model(cfg)
     if cfg.picture == "animation":
         path = _animate(cfg, model, output)
@@ -72,15 +72,15 @@ def task(cfg: DictConfig) -> None:
 
 
 def find_log(cfg: DictConfig) -> Log:
-    """The log of `cfg.data` that `cfg.log` names, or the first one.
+    """Open the log `cfg.log` of `cfg.data`, or the first one.
 
     Raises:
-        CFlowError: no log of that name, or it cannot be opened.
+        CFlowError: there is no such log, or it cannot be opened.
     """
     sources = run.find_logs(cfg)
     if cfg.log is None:
         return sources.open(sources.logs[0])
-    # A log mostly has the name of its file or folder: then no other one is opened.
+    # Most logs are named after their file or folder. Then we open no other one.
     names = [getattr(source, "stem", source.name) for source in sources.logs]
     chosen = [source for source, name in zip(sources.logs, names) if name == cfg.log]
     for source in chosen or sources.logs:
@@ -88,11 +88,11 @@ def find_log(cfg: DictConfig) -> Log:
             log = sources.open(source)
             if log.log_id == cfg.log:
                 return log
-    raise CFlowError(f"log={cfg.log}: there is no such log; there are {', '.join(sorted(names))}")
+    raise CFlowError(f"log={cfg.log}: there is no such log; give one of {', '.join(sorted(names))}")
 
 
 def _from_above(cfg: DictConfig, model: SceneFlowModel, log: Log, sweeps: Window) -> Any:
-    """picture=flow and picture=clusters."""
+    """Draw picture=flow or picture=clusters."""
     points, (result,) = sweeps.pc0.points, model([sweeps])
     if cfg.deskew:
         points = deskew(sweeps, result).cpu()
@@ -107,7 +107,7 @@ def _from_above(cfg: DictConfig, model: SceneFlowModel, log: Log, sweeps: Window
 
 
 def _truth(cfg: DictConfig, log: Log, result: FlowResult) -> np.ndarray | None:
-    """(N, 3) true residual flow, NaN where unknown; None = it is not drawn."""
+    """(N, 3) true residual flow, NaN where unknown; None = not drawn."""
     if cfg.truth not in (True, False, "auto"):
         raise CFlowError(f"truth={cfg.truth}: give true, false or auto")
     labels = None if cfg.truth is False else log.labels(cfg.pair)
@@ -129,7 +129,7 @@ PICTURES: dict[str, Callable[[DictConfig, SceneFlowModel, Log, Window], Any]] = 
 
 
 def _animate(cfg: DictConfig, model: SceneFlowModel, output: Path) -> Path:
-    """Flow of several pairs, then their pictures; nothing is written if one of them fails."""
+    """Estimate the flow of several pairs, then draw them. Nothing is written if one of them fails."""
     if cfg.format not in FORMATS:
         raise CFlowError(f"format={cfg.format}: give one of {', '.join(FORMATS)}")
     chosen, log = run.chosen_pairs(cfg), find_log(cfg)
@@ -143,7 +143,7 @@ def _animate(cfg: DictConfig, model: SceneFlowModel, output: Path) -> Path:
         sweeps = window(recent, pair, model.config.num_history, model.config.num_future)
         (result,) = model([sweeps])
         flow = result.residual_flow
-        result = replace(result, pose_flow=flow, flow=flow)  # many frames are kept: let go of what is not drawn
+        result = replace(result, pose_flow=flow, flow=flow)  # frees the flow that is not drawn
         title = f"{log.log_id}, {(log.timestamps[pair] - log.timestamps[pairs[0]]) / 1e9:.1f} s"
         frames.append(Frame(sweeps.pc0.points, result, sweeps.pc0.is_ground, title))
     figures = flow_figures(

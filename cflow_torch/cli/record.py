@@ -1,4 +1,4 @@
-"""results.json: what is in it, how it is written, and whether a run is already done."""
+"""results.json: its content, how it is written, and how a finished run is recognised."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from cflow_torch.simulator.benchmark import generator_key
 from cflow_torch.types import CFlowError, FlowResult, Window
 
 RESULTS = "results.json"
-# Settings that say where things lie, not what is computed.
-_PLACES = ("config.output", "config.overwrite", "config.data.cache")
+# Settings that do not change the results.
+_PATHS = ("config.output", "config.overwrite", "config.data.cache")
 
 
 class Scores:
-    """Scores of a run by `cfg.definition`, and a digest of all scored points and labels."""
+    """Computes the scores of a run by `cfg.definition`, and a digest of all scored points and labels."""
 
     def __init__(self, cfg: DictConfig) -> None:
         self.metrics = SceneFlowMetrics(cfg.definition)
         self._cfg, self._digest = cfg, hashlib.sha256()
 
     def add(self, log: Log, index: int, sweeps: Window, result: FlowResult) -> None:
-        """Count in the flow of one pair, if the pair has labels."""
+        """Add the flow of one pair, if the pair has labels."""
         labels = log.labels(index)
         if labels is None:
             return
@@ -45,16 +45,16 @@ class Scores:
             self._digest.update(np.ascontiguousarray(values).tobytes())
 
     def report(self, folder: Path, logs: Sequence[Log], seconds: dict[str, Any], failures: Failures) -> dict[str, Any]:
-        """Print the scores, write `folder/results.json` and `folder/config.yaml`, each whole or not at all.
+        """Print the scores, and write `folder/results.json` and `folder/config.yaml`.
 
         Args:
-            folder: made if absent.
-            logs: that were scored.
-            seconds: what `TimedModel.report` returned.
+            folder: created if missing.
+            logs: the scored logs.
+            seconds: returned by `TimedModel.report`.
             failures: pairs and logs that could not be used.
 
         Returns:
-            What `metrics.compute` returned.
+            The scores, see `SceneFlowMetrics.compute`.
         """
         results = self.metrics.compute()
         data = {
@@ -82,10 +82,10 @@ class Scores:
 
 
 def finished_results(cfg: DictConfig, folder: Path) -> dict[str, Any] | None:
-    """The record of an earlier run with the same settings, versions and data settings; None where there is none.
+    """The record of an earlier run with the same settings and versions; None if there is none.
 
     Raises:
-        CFlowError: the folder holds the results of a run with other settings, and `overwrite` is not set.
+        CFlowError: the folder has results of other settings, and `overwrite` is not set.
     """
     file = folder / RESULTS
     if cfg.overwrite or not file.exists():
@@ -96,18 +96,18 @@ def finished_results(cfg: DictConfig, folder: Path) -> dict[str, Any] | None:
         before = {"versions": record["versions"], "generator": record["data"]["generator"], "config": record["config"]}
     except (ValueError, KeyError, TypeError) as error:
         raise CFlowError(
-            f"{file} is no results file of this version ({error!r}): give output=FOLDER, or overwrite=true"
+            f"{file} is not a results file of this version ({error!r}): give output=FOLDER, or overwrite=true"
         ) from None
     now = {"versions": versions(), "generator": _generator(cfg), "config": _plain(cfg)}
-    changed = describe_changes(before, now, _PLACES)
+    changed = describe_changes(before, now, _PATHS)
     if changed:
-        raise CFlowError(f"{folder} holds results of another run ({changed}): give output=FOLDER, or overwrite=true")
+        raise CFlowError(f"{folder} has results of another run ({changed}): give output=FOLDER, or overwrite=true")
     return record
 
 
 def objective(results: dict[str, Any]) -> float:
-    """The one number that a sweep minimises: the mean dynamic error, of the ranges if the definition has them; else the
-    three-way end-point error in metres. NaN where there is nothing to score."""
+    """The number that a sweeper minimises: the mean dynamic error, over ranges if the definition has them, else the
+    three-way end-point error in metres. NaN without scored points."""
     if "bucketed_by_range" in results:
         value = results["bucketed_by_range"]["mean"]["dynamic_error"]
     elif "bucketed" in results:

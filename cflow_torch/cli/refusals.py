@@ -1,4 +1,4 @@
-"""What Hydra refuses, in one line with what to do next. Its own message stands wherever it says enough."""
+"""Explain in one line what Hydra rejects and what to do."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ _PLUGINS = "hydra-joblib-launcher hydra-submitit-launcher hydra-optuna-sweeper"
 
 
 def explain(error: Exception, command: str) -> str:
-    """The message for a call that Hydra, or a command, refuses."""
+    """The message for a call that Hydra or a command rejects."""
     if isinstance(error, CFlowError):
         return str(error)
     if isinstance(error, MissingConfigException) and error.options:
         group, _, name = str(error.missing_cfg_file).rpartition("/")
         if group.startswith("hydra/"):
-            return f"no {group} {name!r} here: joblib, submitit and optuna come with pip install {_PLUGINS}"
+            return f"there is no {group} {name!r}: joblib, submitit and optuna need pip install {_PLUGINS}"
         known = [option for option in error.options if not option.startswith("base_")]
         return f"{group}={name}{near(name, known)}: give one of {', '.join(known)}"
     if isinstance(error, OverrideParseException):
@@ -35,7 +35,7 @@ def explain(error: Exception, command: str) -> str:
 
 
 def _unknown(key: str, kind: str, command: str) -> str:
-    """The message for a setting that is not there: of another method or picture, gone, or mistyped."""
+    """The message for an unknown setting: it belongs to another method or picture, was removed, or is mistyped."""
     group, _, name = key.rpartition(".")
     method = {config.__name__: config for config in CONFIGS.values()}.get(kind)
     if group == "model" and method is not None and name != "pixel_size":
@@ -46,10 +46,10 @@ def _unknown(key: str, kind: str, command: str) -> str:
                 return str(error)
     owners = [f"picture={file.stem}" for file in files("picture") if key in own_settings(file)]
     if command == "plot" and owners:
-        return f"setting {key!r} belongs to {' or '.join(owners)}: give that as well, or leave it out"
+        return f"setting {key!r} belongs to {' or '.join(owners)}: give that as well, or leave the setting out"
     if name in _RENAMED:
         return f"setting {key!r} is now {_RENAMED[name]!r}"
     known = [*groups(command), *settings(command)]
-    if key in known:  # of other data sets, or of all of ours
+    if key in known:  # for example of another data set
         return f"the chosen configuration has no setting {key!r}: give +{key}=VALUE to add it, or leave it out"
-    return f"unknown setting {key!r}{near(key, known)}: `cflow {command} --cfg job` prints every one"
+    return f"unknown setting {key!r}{near(key, known)}: `cflow {command} --cfg job` prints all settings"

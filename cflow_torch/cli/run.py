@@ -1,4 +1,4 @@
-"""What the commands share: settings, logs, the loop over pairs that survives bad frames."""
+"""Shared by the commands: settings, logs, the loop over pairs that skips bad frames."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ from cflow_torch.types import CFlowError, FlowResult, Window
 
 Failures = List[Tuple[str, str]]
 UseResult = Callable[[Log, int, Window, FlowResult], None]
-# Settings of `data` that are not the reader's.
-_NOT_THE_READERS = ("label", "first", "step")
+# Settings of `data` that are not passed to the reader.
+_NOT_OF_READER = ("label", "first", "step")
 
 
 class UnfinishedJob(RuntimeError):
-    """A job that left something undone, and has said what; the other jobs of a sweep run all the same."""
+    """Something is missing, and a message says what. The other jobs of a sweep still run."""
 
 
 def versions() -> dict[str, str]:
@@ -52,7 +52,7 @@ def versions() -> dict[str, str]:
 
 
 def machine() -> dict[str, Any]:
-    """What times depend on besides the code: "platform", "cpu", "cores", "threads" (of torch)."""
+    """The machine, on which times depend: "platform", "cpu", "cores", "threads" (of torch)."""
     try:
         with open("/proc/cpuinfo", encoding="utf-8") as file:
             models = [line.split(":", 1)[1].strip() for line in file if line.startswith("model name")]
@@ -73,14 +73,14 @@ def make_model(cfg: DictConfig) -> SceneFlowModel:
 
 
 def is_sweep() -> bool:
-    """Whether this is a job of a sweep (`-m`)."""
+    """True in a job of a sweep (`-m`)."""
     return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
 
 
 def output_folder(cfg: DictConfig) -> Path:
-    """Where a run writes: `cfg.output`; for a job of a sweep the folder below it that Hydra names, see hydra.yaml.
+    """The output folder of a run: `cfg.output`, or for a job of a sweep the folder below it that Hydra names.
 
-    A sweep over shards is one run in pieces: its jobs share `cfg.output` itself.
+    The jobs of a sweep over shards are parts of one run, so they share `cfg.output`.
     """
     folder = as_path(cfg.output)
     if not is_sweep() or any(override.startswith("shard.index=") for override in HydraConfig.get().overrides.task):
@@ -89,7 +89,7 @@ def output_folder(cfg: DictConfig) -> Path:
 
 
 def complete_data(data: DictConfig) -> DictConfig:
-    """Settings of the data set that data=auto stands for, which is said; those that a user's own reader may leave out.
+    """Replace data=auto by the settings of the recognised format, which is printed, and add defaults for own readers.
 
     Raises:
         CFlowError: the format is not recognised.
@@ -112,14 +112,14 @@ def complete_data(data: DictConfig) -> DictConfig:
 
 
 def chosen_pairs(cfg: DictConfig, group: str = "") -> Callable[[Log], range]:
-    """Log -> indices of the pairs that the settings `first`, `step` and, if there is one, `count` choose.
+    """Function log -> indices of the pairs that the settings `first`, `step` and, if it exists, `count` choose.
 
     Args:
         cfg: resolved settings.
-        group: what stands before the names of the first two: "" or "data.".
+        group: prefix of the names of the first two: "" or "data.".
 
     Raises:
-        CFlowError: one of them is no whole number or too small.
+        CFlowError: one of them is not a whole number, or too small.
     """
     first, step = whole_number(cfg, f"{group}first", 0), whole_number(cfg, f"{group}step", 1)
     count = None if OmegaConf.select(cfg, "count") is None else whole_number(cfg, "count", 1)
@@ -127,10 +127,10 @@ def chosen_pairs(cfg: DictConfig, group: str = "") -> Callable[[Log], range]:
 
 
 def whole_number(cfg: DictConfig, key: str, least: int) -> int:
-    """A setting, by its dotted name, that is at least so much.
+    """The setting of a dotted name, checked.
 
     Raises:
-        CFlowError: it is no whole number, or too small.
+        CFlowError: it is not a whole number of at least `least`.
     """
     value = OmegaConf.select(cfg, key)
     if type(value) is not int or value < least:
@@ -139,33 +139,33 @@ def whole_number(cfg: DictConfig, key: str, least: int) -> int:
 
 
 def check_pair(pair: int, log: Log) -> None:
-    """Refuse the number of a pair that the log does not have."""
+    """Reject the index of a pair that the log does not have."""
     last = len(log.timestamps) - 2
     if not 0 <= pair <= last:
         raise CFlowError(f"pair={pair}: log {log.log_id} has pairs 0 to {last}")
 
 
 class Sources(NamedTuple):
-    """Logs that are not open yet: name of their data set, settings of its reader, what `open_log` takes for each."""
+    """Logs that are not open yet: name of their data set, settings of its reader, one source per log."""
 
     reader: str
     settings: dict[str, Any]
     logs: list[Any]
 
     def open(self, source: Any) -> Log:
-        """One of the logs, see `open_log`."""
+        """Open one of the logs, see `open_log`."""
         return open_log(self.reader, source, **self.settings)
 
 
 def find_logs(cfg: DictConfig) -> Sources:
-    """The logs of `cfg.data`; simulated ones are made first, if they are not in the cache.
+    """Find the logs of `cfg.data`. Simulated ones are generated first, if they are not in the cache.
 
     Raises:
-        CFlowError: no log at all.
+        CFlowError: there is no log.
     """
     data = cfg.data
     given: dict[str, Any] = OmegaConf.to_container(data, resolve=True)  # type: ignore[assignment]
-    settings = {str(key): value for key, value in given.items() if key not in _NOT_THE_READERS}
+    settings = {str(key): value for key, value in given.items() if key not in _NOT_OF_READER}
     if "_target_" in data:
         target = settings.pop("_target_")
         return Sources(target, settings, find_user_sources(target, settings))
@@ -180,16 +180,16 @@ def find_logs(cfg: DictConfig) -> Sources:
         logs = benchmark_logs(data.cache, data.profile, seeds, num_sweeps, data.scenes)
         return Sources(chosen.data_set, {"check": False, **chosen.settings}, logs)
     if OmegaConf.is_missing(data, "root"):
-        raise CFlowError("where is the data? give data.root=PATH, or the path alone")
+        raise CFlowError("the data is missing: give data.root=PATH, or only the path")
     name, root = settings.pop("name"), settings.pop("root")
     return Sources(name, settings, list(find_sources(name, root)))
 
 
 def open_logs(cfg: DictConfig) -> tuple[list[Log], Failures]:
-    """The logs of `cfg.data`; those that cannot be opened are reported, not fatal.
+    """Open the logs of `cfg.data`. Those that cannot be opened are reported and skipped.
 
     Raises:
-        CFlowError: no log at all.
+        CFlowError: there is no log.
     """
     sources = find_logs(cfg)
     logs: list[Log] = []
@@ -201,24 +201,25 @@ def open_logs(cfg: DictConfig) -> tuple[list[Log], Failures]:
 
 
 def stored_flow(folder: Any, needed: Sequence[str]) -> Callable[[Log, int], FlowResult]:
-    """What gives the flow of a pair as `cflow flow` left it.
+    """Function that reads the flow of a pair from the output of `cflow flow`.
 
     Args:
-        folder: its output.
-        needed: fields of `FlowResult` that each file must hold.
+        folder: the output.
+        needed: fields of `FlowResult` that each file must contain.
 
     Raises:
-        CFlowError: there is no such folder; from the call, a file that is missing, or holds too little.
+        CFlowError: the folder does not exist; from the function, a file is missing or lacks a field.
     """
-    place = as_path(folder)
-    if not place.is_dir():
-        raise CFlowError(f"flow={folder} is no folder: give one that `cflow flow` left")
+    output = as_path(folder)
+    if not output.is_dir():
+        raise CFlowError(f"flow={folder} is not a folder: give the output of `cflow flow`")
 
     def read(log: Log, index: int) -> FlowResult:
-        file = frame_file(place / log.log_id, log.timestamps[index])
+        file = frame_file(output / log.log_id, log.timestamps[index])
         result = read_flow(file)
-        if any(getattr(result, name) is None for name in needed):
-            raise CFlowError(f"{file} holds too little for this: run `cflow flow` with all contents")
+        missing = [name for name in needed if getattr(result, name) is None]
+        if missing:
+            raise CFlowError(f"{file} lacks {', '.join(missing)}: run `cflow flow` with all contents")
         return result
 
     return read
@@ -226,7 +227,7 @@ def stored_flow(folder: Any, needed: Sequence[str]) -> Callable[[Log, int], Flow
 
 @contextmanager
 def collect_failures(failures: Failures, name: str) -> Iterator[None]:
-    """A step for one frame or log: if it fails, that is said and noted, and the rest goes on."""
+    """A step for one frame or log. If it fails, the error is printed and appended, and the program continues."""
     try:
         yield
     except (CFlowError, OSError) as error:
@@ -235,13 +236,13 @@ def collect_failures(failures: Failures, name: str) -> Iterator[None]:
 
 
 def for_each_pair(logs: Sequence[Log], model: TimedModel, use: UseResult, pairs: Callable[[Log], range]) -> Failures:
-    """Estimate the flow of the pairs of every log and hand it on; a bad frame is reported and the rest goes on.
+    """Estimate the flow of the pairs of every log, and call a function with each. A bad frame is reported and skipped.
 
     Args:
-        logs: logs of at least two sweeps.
+        logs: of at least two sweeps.
         model: the method.
-        use: what to do with a result.
-        pairs: which ones of a log, by index.
+        use: called with the log, the index of the pair, its window and its result.
+        pairs: function log -> indices of its pairs.
 
     Returns:
         (frame, message) of every pair that failed.
@@ -261,18 +262,18 @@ def for_each_pair(logs: Sequence[Log], model: TimedModel, use: UseResult, pairs:
 
 
 def finish(failures: Failures) -> None:
-    """List what failed, and end the process with status 1 if anything did.
+    """Print the failures, and exit with status 1 if there are any.
 
     Raises:
         SystemExit: something failed.
-        UnfinishedJob: something failed in a job of a sweep; Hydra lets the others run before it ends with status 1.
+        UnfinishedJob: something failed in a job of a sweep. Hydra runs the other jobs before it exits with status 1.
     """
     if failures:
         print(f"{len(failures)} failed:", file=sys.stderr)
         for frame, message in failures:
             print(f"  {frame}: {message}", file=sys.stderr)
         if is_sweep():
-            raise UnfinishedJob(f"a job left {len(failures)} undone, listed above")
+            raise UnfinishedJob(f"{len(failures)} failed in a job, listed above")
         raise SystemExit(1)
 
 

@@ -1,12 +1,10 @@
-"""What Hydra checks of the settings: presets and schemas of the group `model`, and the types of what commands take.
+"""Register the presets and the types of all settings with Hydra, when this module is imported.
 
-Importing this module registers them. A default and its help stand in cflow_torch/config.py (the method) or in a file of
-configs/ (all else); here are types only. A preset of a user's own is a file model/mine.yaml in a folder of his own:
+Defaults and explanations are in cflow_torch/config.py (settings of the method) and in configs/ (all others). Your own
+preset is a file FOLDER/model/mine.yaml, used by `cflow eval --config-dir FOLDER model=mine`:
 
     defaults: [base_verified, _self_]  # or base_dense, base_keypoints
-    num_history: 3                     # what it changes
-
-and `cflow eval --config-dir FOLDER model=mine` takes it.
+    num_history: 3                     # the changes
 """
 
 from __future__ import annotations
@@ -22,7 +20,7 @@ from cflow_torch.cli.choices import CONFIGS, SETTERS, files, groups, own_setting
 from cflow_torch.config import CONFIGS as METHODS
 from cflow_torch.config import PRESETS, Config, make_config
 
-# A setting has the type of its default in configs/; one whose default is null or auto takes any value, but for these.
+# A setting has the type of its default in configs/. If that is null, auto or a list, it takes any value, except these.
 _TYPES: dict[str, Any] = {
     "batches": List[int],
     "cluster": Optional[int],
@@ -46,7 +44,7 @@ def _type(name: str, value: Any) -> Any:
 
 
 def _node(config: Config) -> Any:
-    """A node whose fields can be overridden, unlike those of a frozen dataclass."""
+    """A node of a frozen dataclass whose fields can be overridden."""
     node = OmegaConf.structured(config)
     OmegaConf.set_readonly(node, None)
     return node

@@ -1,7 +1,7 @@
-"""Every setting: of the methods, with default, presets, what it may be and what it does; then of commands and groups.
+"""Prints all settings as a Markdown page: of the methods, then of the commands, data sets and other groups.
 
-Prints one Markdown page. --opensceneflow FOLDER writes the models of OpenSceneFlow's configuration instead: cflow.yaml
-(preset default), cflow_fast.yaml, cflow_paper.yaml and cflow_keypoints.yaml, as they come with the package.
+--opensceneflow FOLDER writes the model files of OpenSceneFlow's configuration instead: cflow.yaml (preset default),
+cflow_fast.yaml, cflow_paper.yaml and cflow_keypoints.yaml. They are those of the package.
 
 examples:
   cflow settings > settings.md
@@ -25,10 +25,10 @@ from cflow_torch.types import CFlowError
 
 _PAGE = """# Settings
 
-The same names hold everywhere: `make_config("fast", max_speed=30.0)` in Python, `model=fast model.max_speed=30` behind
-a command, `-m model.num_history=0,2,4` for a sweep. null is None in Python. Words such as Alg. clustering are labels of
-the paper. A wrong name or value is refused with a message that says what is allowed."""
-# Literals only: the harness's eval.yaml and save.yaml have nothing to refer to.
+Settings have the same names in Python, `make_config("fast", max_speed=30.0)`, on the command line, `model=fast
+model.max_speed=30`, and in a sweep, `-m model.num_history=0,2,4`. null is None in Python. Words such as Alg. clustering
+are labels of the paper. If a name or a value is wrong, the error message lists what is allowed."""
+# The values are literals, because the harness's eval.yaml and save.yaml define nothing to refer to.
 _HARNESS = """\
 # CorrelationFlow, preset {preset}: hydra.searchpath=[pkg://cflow_torch.configs.opensceneflow] model={name}
 # For OpenSceneFlow. Written by `cflow settings --opensceneflow FOLDER`; `cflow settings` says what each setting does.
@@ -43,7 +43,7 @@ target:
   device: auto  # auto = that of the batch
   voxel_size: [0.1, 0.1, 2000.0]  # the harness asks for it; without effect, pixel_sizes counts
 """
-_Z = 1000.0  # metres; the harness computes with the region, so its bounds are finite, and z is wide open
+_Z = 1000.0  # metres; the harness computes with the region, so infinite bounds of z are replaced by this one
 
 
 def task(arguments: list[str]) -> None:
@@ -56,11 +56,11 @@ def task(arguments: list[str]) -> None:
             write_text(folder / f"{name}.yaml", text)
             print(folder / f"{name}.yaml")
     else:
-        raise CFlowError(f"settings takes nothing, or --opensceneflow FOLDER, got {' '.join(arguments)}")
+        raise CFlowError(f"settings takes no arguments or --opensceneflow FOLDER, got {' '.join(arguments)}")
 
 
 def harness_models() -> dict[str, str]:
-    """Name -> YAML of each preset as a model of OpenSceneFlow, which gives no sweeps after t+1."""
+    """Name -> YAML of each preset as a model of OpenSceneFlow, except offline: the harness has no sweeps after t+1."""
     models = {}
     for preset, config in ((preset, make_config(preset)) for preset in PRESETS):
         if config.num_future > 0:
@@ -70,7 +70,7 @@ def harness_models() -> dict[str, str]:
         region = [min(max(bound, -_Z), _Z) for bound in config.point_cloud_range]
         for f in fields(config):
             value = region if f.name == "point_cloud_range" else getattr(config, f.name)
-            if f.name not in WINDOW:  # num_frames says it
+            if f.name not in WINDOW:  # num_frames replaces it
                 text += f"  {f.name}: {_yaml(value)}  # {describe(f)}\n"
         models[name] = text
     return models
@@ -80,7 +80,7 @@ def _page() -> Iterator[str]:
     yield _PAGE
     for method, kind in METHODS.items():
         presets = {preset: make_config(preset) for preset, (of, _) in PRESETS.items() if of == method}
-        rows = ["| setting | default | presets | may be | meaning |", "|---|---|---|---|---|"]
+        rows = ["| setting | default | presets | allowed | meaning |", "|---|---|---|---|---|"]
         for f in fields(kind):
             values = {preset: getattr(config, f.name) for preset, config in presets.items()}
             changed = ", ".join(f"{p} `{_yaml(v)}`" for p, v in values.items() if v != f.default)

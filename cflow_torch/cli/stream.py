@@ -1,11 +1,11 @@
-"""Plays a log as if it were live: each sweep is pushed when it was recorded, its flow is timed. OUTPUT/stream.json.
+"""Replays the first log of the data in real time and measures the latency: a summary and OUTPUT/stream.json.
 
-The first log of the data. Latency counts from the moment a sweep is there to the flow of the sweep before it; what is
-late delays what follows. Sweeps without poses get them from KISS-ICP (extra odometry), within that time.
+Latency is the time from the arrival of sweep t+1 to the flow of sweep t. A late result delays the next one. If sweeps
+have no poses, KISS-ICP (extra odometry) estimates them, within that time.
 
 examples:
-  cflow stream drive.bag                          in the time of the recording
-  cflow stream /data/av2/val/LOG pace=null        as fast as it goes
+  cflow stream drive.bag                          at the speed of the recording
+  cflow stream /data/av2/val/LOG pace=null        as fast as possible
   cflow stream drive.bag model=fast device=cuda
 """
 
@@ -30,7 +30,7 @@ def task(cfg: DictConfig) -> None:
     """Run `cflow stream`."""
     output, pace = run.output_folder(cfg), cfg.pace
     if pace is not None and not (isinstance(pace, (int, float)) and pace > 0):
-        raise CFlowError(f"pace={pace}: give a number above 0, 1 = as recorded, or null = as fast as it goes")
+        raise CFlowError(f"pace={pace}: give a number above 0, 1 = as recorded, or null = as fast as possible")
     count = None if cfg.count is None else run.whole_number(cfg, "count", 2)
     stream = FlowStream(config=run.make_model(cfg).config, device=cfg.device, max_gap=cfg.max_gap)
     sources = run.find_logs(cfg)
@@ -46,15 +46,15 @@ def play(stream: FlowStream, log: Log, pace: Any = None, count: Any = None) -> d
     """Push the sweeps of a log.
 
     Args:
-        stream: where to.
+        stream: receives the sweeps.
         log: the sweeps.
-        pace: how many times faster than recorded; None = each as soon as the one before it is done.
-        count: so many sweeps; None = all.
+        pace: factor on the speed of the recording; None = each sweep as soon as the previous one is done.
+        count: number of sweeps; None = all.
 
     Returns:
-        "sweeps", "results"; "latency": "p50" and "p99", seconds from the moment a sweep is due to the flow of the one
-        before it, so that what is late delays what follows; "interval": median seconds between sweeps, None where
-        `pace` is; "in_time": share of results that were there before the next sweep; "rate": sweeps per second.
+        "sweeps", "results"; "latency": "p50" and "p99", seconds from the time a sweep is due to the flow of the sweep
+        before; "interval": median seconds between sweeps, None without `pace`; "in_time": share of results that were
+        ready before the next sweep; "rate": sweeps per second.
     """
     stamps = np.array(log.timestamps[:count], dtype=np.int64)
     due = None if pace is None else (stamps - stamps[0]) / 1e9 / pace
@@ -67,7 +67,7 @@ def play(stream: FlowStream, log: Log, pace: Any = None, count: Any = None) -> d
         time.sleep(max(arrival - time.perf_counter(), 0.0))
         result = stream.push(sweep.points, sweep.pose, sweep.timestamp_ns, sweep.is_ground, sweep.point_times)
         if result is not None:
-            result.is_valid.any().item()  # a GPU answers before it is done
+            result.is_valid.any().item()  # waits for the GPU
             latencies.append(time.perf_counter() - arrival)
             progress.set_postfix_str(f"latency {1000 * latencies[-1]:.0f} ms")
     seconds = time.perf_counter() - begin
@@ -84,7 +84,7 @@ def play(stream: FlowStream, log: Log, pace: Any = None, count: Any = None) -> d
 
 
 def format_report(report: dict[str, Any]) -> str:
-    """What `cflow stream` prints."""
+    """The report as text."""
     p50, p99 = (1000 * report["latency"][name] for name in ("p50", "p99"))
     lines = [
         f"log {report['log']}: {report['sweeps']} sweeps, {report['results']} results, {report['rate']:.1f} sweeps/s",
@@ -92,5 +92,5 @@ def format_report(report: dict[str, Any]) -> str:
     ]
     if report["interval"] is not None:
         share, interval = 100 * report["in_time"], 1000 * report["interval"]
-        lines.append(f"{share:.0f} % of the results were there before the next sweep (every {interval:.0f} ms)")
+        lines.append(f"{share:.0f} % of the results were ready before the next sweep (every {interval:.0f} ms)")
     return "\n".join(lines)

@@ -166,7 +166,7 @@ def test_existing_labels_are_replaced_only_with_overwrite(scenes: Path, tmp_path
         label_scene(file, make_model(make_config("fast"), "cpu"))
     assert label(scenes, output) == 2
     error = capsys.readouterr().err
-    assert "scene-2.h5 has labels of other settings or of another program: overwrite=true" in error
+    assert "scene-2.h5 has labels of other settings or of another program: give overwrite=true" in error
     assert error.count("\n") == 1
     assert file.read_bytes() == before and not list(tmp_path.glob("out/*/*.feather"))
     assert label(scenes, output, "overwrite=true") == 0
@@ -227,7 +227,7 @@ def test_broken_scenes_are_reported_and_the_others_labelled(scenes: Path, tmp_pa
     [
         ("{}", "no scene in {}"),
         ("{}/nowhere", "nowhere is neither a file nor a folder"),
-        ("data=av2 data.root={}", "labels are for HDF5 scenes of OpenSceneFlow"),
+        ("data=av2 data.root={}", "labels are written into HDF5 scenes of OpenSceneFlow"),
         ("{} model=paper", "give model=offline, default or fast"),
     ],
 )

@@ -1,4 +1,4 @@
-"""demo, flow and eval as a user runs them: what they leave, and what they do when something is wrong."""
+"""demo, flow and eval as a user runs them: their output, and their errors."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def results_of(folder: Path) -> dict[str, Any]:
     """results.json as strict JSON."""
 
     def refuse(constant: str) -> None:
-        raise AssertionError(f"{constant} is no JSON")
+        raise AssertionError(f"{constant} is not JSON")
 
     return json.loads((folder / "results.json").read_text(), parse_constant=refuse)
 
@@ -39,7 +39,7 @@ def evaluate(cflow: Cflow, log_folder: Path, tmp_path: Path) -> Cflow:
     return lambda *arguments: cflow(*call, *arguments)
 
 
-def test_demo_leaves_everything(tmp_path: Path, cache: Path, cflow: Cflow, capsys: pytest.CaptureFixture) -> None:
+def test_demo_writes_all_its_files(tmp_path: Path, cache: Path, cflow: Cflow, capsys: pytest.CaptureFixture) -> None:
     pytest.importorskip("matplotlib")
     assert cflow("demo", f"output={tmp_path}", "data.num_sweeps=2", "pair=0", "model=fast", SMALL) == 0
     (log,) = (AV2Log(folder) for folder in cache.glob("*-2/*/*"))
@@ -55,7 +55,7 @@ def test_demo_leaves_everything(tmp_path: Path, cache: Path, cflow: Cflow, capsy
     assert not list(tmp_path.rglob(".*")), "no temporary file is left"
 
 
-def test_demo_without_matplotlib_lacks_the_picture_only(
+def test_demo_without_matplotlib_lacks_only_the_picture(
     tmp_path: Path, cflow: Cflow, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     for name in ("matplotlib", "matplotlib.figure", "matplotlib.backends.backend_agg"):
@@ -66,7 +66,7 @@ def test_demo_without_matplotlib_lacks_the_picture_only(
     assert results_of(tmp_path)["num_pairs"] == 1 and not list(tmp_path.glob("*.png"))
 
 
-def test_a_results_file_says_everything(log_folder: Path, tmp_path: Path, evaluate: Cflow) -> None:
+def test_the_results_file_is_complete(log_folder: Path, tmp_path: Path, evaluate: Cflow) -> None:
     assert evaluate("data.first=1") == 0
     record = results_of(tmp_path)
     assert record["num_pairs"] == record["results"]["num_frames"] == 2  # pairs 1 and 2
@@ -84,7 +84,7 @@ def test_a_results_file_says_everything(log_folder: Path, tmp_path: Path, evalua
     assert results_of(tmp_path)["data"]["digest"] != record["data"]["digest"], "of what was scored"
 
 
-def test_a_folder_of_another_run_is_an_error_that_says_so(
+def test_a_folder_of_another_run_is_an_error_that_names_the_difference(
     tmp_path: Path, evaluate: Cflow, capsys: pytest.CaptureFixture
 ) -> None:
     file = tmp_path / "results.json"
@@ -97,16 +97,16 @@ def test_a_folder_of_another_run_is_an_error_that_says_so(
     assert evaluate("data.step=3") == 2 and "versions.torch" in capsys.readouterr().err
     for broken in (first[:1000], b"{}", first.replace(b'"bucketed"', b'"a"').replace(b'"three_way"', b'"b"')):
         file.write_bytes(broken)
-        assert evaluate("data.step=3") == 2 and "no results file" in capsys.readouterr().err
+        assert evaluate("data.step=3") == 2 and "is not a results file" in capsys.readouterr().err
     assert evaluate("data.step=3", "overwrite=true") == 0
     capsys.readouterr()
-    (tmp_path / "there").mkdir()
-    file.rename(tmp_path / "there" / "results.json")
-    assert evaluate("data.step=3", f"output={tmp_path / 'there'}") == 0
-    assert "skipped" in capsys.readouterr().out, "where a run lies does not matter"
+    (tmp_path / "moved").mkdir()
+    file.rename(tmp_path / "moved" / "results.json")
+    assert evaluate("data.step=3", f"output={tmp_path / 'moved'}") == 0
+    assert "skipped" in capsys.readouterr().out, "the folder is not a setting"
 
 
-def test_bad_frames_and_bad_logs_are_reported_and_the_rest_goes_on(
+def test_bad_frames_and_bad_logs_are_reported_and_skipped(
     log_folder: Path, tmp_path: Path, evaluate: Cflow, capsys: pytest.CaptureFixture
 ) -> None:
     root = tmp_path / "root"
@@ -121,7 +121,7 @@ def test_bad_frames_and_bad_logs_are_reported_and_the_rest_goes_on(
     assert record["num_pairs"] == 2 + 3 and [name for name, _ in record["failures"]] == ["no-poses", frame]
 
 
-def test_a_failure_ends_a_run_and_leaves_a_sweep_going(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failure_ends_a_run_but_not_a_sweep(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(run, "is_sweep", lambda: False)
     with pytest.raises(SystemExit, match="1"):
         run.finish([("a", "bad")])
@@ -131,7 +131,7 @@ def test_a_failure_ends_a_run_and_leaves_a_sweep_going(monkeypatch: pytest.Monke
         run.finish([("a", "bad")])
 
 
-def test_the_score_of_a_sweep() -> None:
+def test_a_sweeper_minimises_the_mean_dynamic_error() -> None:
     mean = {"mean": {"dynamic_error": 0.25}}
     assert objective({"bucketed": mean, "three_way": {"epe_3way": 1.0}}) == 0.25
     assert objective({"bucketed": mean, "bucketed_by_range": {"mean": {"dynamic_error": 0.5}}}) == 0.5
@@ -139,13 +139,13 @@ def test_the_score_of_a_sweep() -> None:
     assert np.isnan(objective({"bucketed": {"mean": {"dynamic_error": None}}}))
 
 
-def test_worker_processes_give_what_one_process_gives(
+def test_worker_processes_give_the_results_of_one_process(
     log_folder: Path, tmp_path: Path, evaluate: Cflow, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
-    """Scores, times of all pairs, and a bad frame that is reported while the rest goes on."""
+    """Scores, times of all pairs, and a bad frame that is reported and skipped."""
     root = tmp_path / "data" / "log"
     shutil.copytree(log_folder, root)
-    sorted(root.glob("sensors/lidar/*"))[0].write_bytes(b"no feather")
+    sorted(root.glob("sensors/lidar/*"))[0].write_bytes(b"broken")
     records = []
     for name, least in (("one", 50), ("two", 1)):
         monkeypatch.setattr(estimates, "_PAIRS_PER_WORKER", least)

@@ -1,4 +1,4 @@
-"""A path is enough; a data set of one's own by configuration alone."""
+"""A path is enough; your own reader by configuration only."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_a_path_is_enough(name: str, tmp_path: Path, cflow: Cflow, capsys: pytes
     assert f"complete before  {len(files)}" in capsys.readouterr().out.replace("  complete", "complete"), "the same run"
 
 
-def test_what_is_not_recognised_is_an_error_that_says_so(tmp_path: Path) -> None:
+def test_an_unknown_or_ambiguous_format_is_an_error(tmp_path: Path) -> None:
     for place, message in (
         ("absent", "no such file or folder"),
         ("empty", "no format fits its contents"),
@@ -49,12 +49,12 @@ def test_what_is_not_recognised_is_an_error_that_says_so(tmp_path: Path) -> None
     assert {name for name, one in DATA_SETS.items() if not one.marks} <= {"arrays", "kiss_icp"}
 
 
-def test_a_path_among_settings_and_options() -> None:
+def test_a_path_by_itself_is_the_data_root() -> None:
     call = ["-m", "/a b/c", "model=paper,fast", "--config-dir", "conf", "-p", "model"]
     assert for_hydra(call) == ['data.root="/a b/c"', "model=paper,fast", "-m", "--config-dir", "conf", "-p", "model"]
 
 
-# ---------------------------------------------------------------- a reader of one's own
+# ---------------------------------------------------------------- your own reader
 
 READER = """
 import numpy as np
@@ -83,7 +83,7 @@ def several(folder, speed):
 
 @pytest.fixture
 def mine(tmp_path: Path) -> Path:
-    """A user's folder: a reader, a data set that names it, a file that it reads."""
+    """A user's folder with a reader, a data set that names it, and a file that it reads."""
     (tmp_path / "my" / "data").mkdir(parents=True)
     (tmp_path / "my" / "reader_of_mine.py").write_text(READER)
     text = f"_target_: reader_of_mine.several\nfolder: {tmp_path}\nspeed: 10.0\n"
@@ -94,7 +94,7 @@ def mine(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("workers", [pytest.param(1, marks=pytest.mark.slow), 2])
-def test_a_reader_of_one_s_own_by_configuration_alone(
+def test_your_own_reader_by_configuration_only(
     workers: int, mine: Path, cflow: Cflow, capsys: pytest.CaptureFixture
 ) -> None:
     pytest.importorskip("matplotlib")
@@ -127,7 +127,9 @@ def test_a_reader_of_one_s_own_by_configuration_alone(
         ("_target_: builtins.list\n", "builtins.list returned no log"),
     ],
 )
-def test_a_reader_that_fails(text: str, message: str, mine: Path, cflow: Cflow, capsys: pytest.CaptureFixture) -> None:
+def test_a_broken_reader_is_one_line(
+    text: str, message: str, mine: Path, cflow: Cflow, capsys: pytest.CaptureFixture
+) -> None:
     (mine / "my" / "data" / "mine.yaml").write_text(text)
     assert cflow("eval", "--config-dir", mine / "my", "data=mine", f"output={mine / 'out'}") == 2
     error = capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""Experiments: one command per table and figure of the paper, a folder per job, resumable; launchers and sweepers."""
+"""Experiments: one command per table or figure of the paper, one folder per job; launchers and sweepers."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from cflow_torch.cli.run import make_model
 Cflow = Callable[..., int]
 Compose = Callable[..., Any]
 SCALES = (0.8, 0.4, 0.3, 0.2, 0.1)
-# How many jobs an experiment has, and what the first and the last one are.
+# Number of jobs of an experiment, and settings of the first and the last one.
 JOBS: dict[str, tuple[int, dict[str, Any], dict[str, Any]]] = {
     "pixel_size": (4, {"pixel_sizes": (0.05,)}, {"pixel_sizes": (0.4,)}),
     "views": (2, {"sectional_view": False}, {"sectional_view": True}),
@@ -34,7 +34,7 @@ JOBS["range_split"] = JOBS["datasets"]
 
 
 def jobs_of(compose: Compose, experiment: str) -> list[tuple[str, ...]]:
-    """What every job of an experiment's sweep overrides."""
+    """Overrides of every job of an experiment."""
     whole = compose("eval", f"experiment={experiment}")
     assert str(whole.hydra.mode) == "RunMode.MULTIRUN"
     params = [f"{key}={value}" for key, value in whole.hydra.sweeper.params.items()]
@@ -80,7 +80,7 @@ def test_a_sweep_keeps_every_result_and_resumes(
     before = {file: file.stat().st_mtime_ns for file in files}
     files[1].unlink()  # as if it had been stopped there
     assert cflow(*call) == 0
-    assert capsys.readouterr().out.count("skipped, done before") == 1
+    assert capsys.readouterr().out.count("skipped, its results exist") == 1
     assert files[0].stat().st_mtime_ns == before[files[0]] and files[1].exists()
     assert cflow(*call, "overwrite=true") == 0
     assert files[0].stat().st_mtime_ns > before[files[0]]

@@ -1,4 +1,4 @@
-"""The command line itself: help, wrong calls, faults, closed outputs, completion, information."""
+"""The command line itself: help, wrong calls, bugs, pipes, completion, information."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import hydra
 import pytest
 
 import cflow_torch
-from cflow_torch.cli import completion, info
+from cflow_torch.cli import completion
 from cflow_torch.cli.choices import CONFIGS
 from cflow_torch.cli.main import COMMANDS
 
@@ -26,14 +26,14 @@ needs_posix = pytest.mark.skipif(sys.platform == "win32", reason="needs a POSIX 
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_says_what_it_does_and_shows_how(
+def test_help_explains_a_command_with_examples_and_settings(
     command: str, cflow: Cflow, capsys: pytest.CaptureFixture
 ) -> None:
     assert cflow(command, "--help") == 0
     text = capsys.readouterr().out
     assert text.startswith(f"cflow {command}: {COMMANDS[command]}") and f"\nexamples:\n  cflow {command}" in text
     if (CONFIGS / f"{command}.yaml").exists():
-        assert "\n  output: outputs/" in text and "\n  model=default|fast|offline|paper|keypoints\n" in text
+        assert "; default outputs/" in text and "\n  model=default|fast|offline|paper|keypoints\n" in text
     assert cflow("help", command) == 0
     assert capsys.readouterr().out == text
 
@@ -72,15 +72,15 @@ def test_version_and_help_come_without_torch(cflow: Cflow, capsys: pytest.Captur
         ("plot log=1e5 data.num_sweeps=2", "log=1e5: there is no such log"),
         ("plot pair=1.5", "pair=1.5: Value '1.5' of type 'float' could not be converted to Integer"),
         ("plot picture=animation width=abc", "width=abc: Value 'abc'"),
-        ("flow data=av2", "where is the data? give data.root=PATH"),
+        ("flow data=av2", "the data is missing: give data.root=PATH"),
         ("flow fast", "fast: there is no such file or folder; settings are NAME=VALUE"),
         ("flow data=av2 data.root=/no/such/folder", "/no/such/folder"),
-        ("flow contents=[confidence] model=paper", "confidence is there with model=default and model=fast only"),
+        ("flow contents=[confidence] model=paper", "only model=default, fast and offline have a confidence"),
         ("completion", "one of bash, zsh, fish, got nothing"),
         ("clean standing=true", "setting 'standing' is now 'remove_stopped'"),
     ],
 )
-def test_a_wrong_call_gets_one_line_that_says_what_to_do(
+def test_a_wrong_call_is_one_line_with_a_hint(
     call: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cflow: Cflow, capsys: Any
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -100,18 +100,18 @@ def bench_that_raises(error: BaseException, monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setitem(sys.modules, "cflow_torch.cli.bench", module)
 
 
-@pytest.mark.parametrize("error", [KeyError("of ours"), OSError("of ours")])
-def test_a_fault_of_ours_asks_for_a_report(
+@pytest.mark.parametrize("error", [KeyError("ours"), OSError("ours")])
+def test_a_bug_asks_for_a_report(
     error: Exception, monkeypatch: pytest.MonkeyPatch, cflow: Cflow, capsys: pytest.CaptureFixture
 ) -> None:
     bench_that_raises(error, monkeypatch)
     assert cflow("bench") == 1
-    told = capsys.readouterr().err
-    assert f"{type(error).__name__}: " in told and "of ours" in told and "`cflow info`" in told
-    assert os.path.dirname(hydra.__file__) not in told, "no frames of Hydra"
+    error_text = capsys.readouterr().err
+    assert f"{type(error).__name__}: " in error_text and "ours" in error_text and "`cflow info`" in error_text
+    assert os.path.dirname(hydra.__file__) not in error_text, "no frames of Hydra"
 
 
-def test_what_is_no_fault_of_ours_is_one_line(
+def test_ctrl_c_and_a_refused_file_are_one_line(
     monkeypatch: pytest.MonkeyPatch, cflow: Cflow, capsys: pytest.CaptureFixture
 ) -> None:
     bench_that_raises(KeyboardInterrupt(), monkeypatch)
@@ -119,30 +119,20 @@ def test_what_is_no_fault_of_ours_is_one_line(
     bench_that_raises(PermissionError(13, "Permission denied", "there"), monkeypatch)
     assert cflow("bench") == 2
     error = capsys.readouterr().err
-    assert error.startswith("error: there: Permission denied; give places") and error.count("\n") == 1
-    # A launcher such as joblib's runs the tasks elsewhere, and raises here what they raised.
+    assert error.startswith("error: there: Permission denied; check data.root=") and error.count("\n") == 1
+    # A launcher such as joblib's runs tasks in other processes and raises their errors here.
     monkeypatch.setattr(hydra, "main", lambda **settings: lambda task: lambda: sys.exit(2))
     assert cflow("bench") == 2 and capsys.readouterr().err == ""
 
 
 @needs_posix
 @pytest.mark.parametrize(
-    ("arguments", "printed"),
-    [
-        ("--help >&-", "0"),
-        ("--help 2>&-", "0"),
-        ("--help | true", "141 0"),
-        pytest.param("eval --cfg job | true", "141 0", marks=pytest.mark.slow),  # Hydra prints
-        ("--version > /dev/full", "1"),
-    ],
-)
-def test_output_may_be_closed_unread_or_full(arguments: str, printed: str) -> None:
-    command = f'{shlex.join(MAIN)} {arguments}; echo "status ${{PIPESTATUS[*]}}" >&2'
-    if "/dev/full" in arguments and not Path("/dev/full").exists():
-        pytest.skip("no /dev/full on this system")
+    "arguments", ["--help", pytest.param("eval --cfg job", marks=pytest.mark.slow)]
+)  # Hydra prints
+def test_a_reader_that_leaves_ends_a_command_quietly(arguments: str) -> None:
+    command = f"{shlex.join(MAIN)} {arguments} | true; echo ${{PIPESTATUS[*]}}"
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=120)
-    told, status = done.stderr.split("status ")
-    assert status == f"{printed}\n" and ("Errno 28" in told and told.count("\n") == 1 if printed == "1" else not told)
+    assert (done.stdout, done.stderr) == ("141 0\n", "")
 
 
 # ---------------------------------------------------------------- completion
@@ -178,11 +168,11 @@ def test_bash_completes(tmp_path: Path, cflow: Cflow, capsys: pytest.CaptureFixt
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_the_script_has_no_fault(shell: str, tmp_path: Path) -> None:
+def test_the_shell_accepts_its_script(shell: str, tmp_path: Path) -> None:
     text = completion.script(shell)
     assert "data=av2" in text and "model.pixel_sizes=" in text and "CASES" not in text and "COMMANDS" not in text
     if shutil.which(shell) is None:
-        pytest.skip(f"no {shell} here")
+        pytest.skip(f"{shell} is not installed")
     (tmp_path / "script").write_text(text)
     done = subprocess.run([shell, "-n", str(tmp_path / "script")], capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stderr) == (0, "")
@@ -191,14 +181,9 @@ def test_the_script_has_no_fault(shell: str, tmp_path: Path) -> None:
 # ---------------------------------------------------------------- information
 
 
-def test_information_names_every_package_that_is_asked_for(
-    monkeypatch: pytest.MonkeyPatch, cflow: Cflow, capsys: pytest.CaptureFixture
-) -> None:
-    imported: list[str] = []
-    monkeypatch.setattr(info, "import_module", imported.append)  # loading all of them takes long
+def test_info_lists_every_required_package(cflow: Cflow, capsys: pytest.CaptureFixture) -> None:
     assert cflow("info") == 0
     text = capsys.readouterr().out
     assert text.startswith(f"cflow_torch {cflow_torch.__version__} in ") and "\nPython version: " in text
-    assert {"torch", "hydra", "yaml", "h5py"} <= set(imported)
-    for name in ("torch", "pyyaml", "h5py", "hydra-submitit-launcher"):
+    for name in ("torch", "PyYAML", "h5py", "hydra-submitit-launcher"):
         assert re.search(rf"^{name} (\d|not installed)", text, re.M), name

@@ -1,4 +1,4 @@
-"""What can stand behind a command: presets, groups, types, names, and the pages made of them."""
+"""Settings of the commands: presets, groups, types, names, and the pages that list them."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_every_choice_of_every_group_composes(command: str, compose: Compose) ->
         make_model(cfg)
 
 
-def test_every_setting_of_an_example_is_there() -> None:
+def test_examples_use_existing_settings_and_choices() -> None:
     texts = [HELP, *((Path(settings.__file__).parent / f"{command}.py").read_text() for command in WITH_SETTINGS)]
     lines = [line for text in texts for line in text.splitlines() if line.startswith("  cflow ")]
     assert len(lines) > 30
@@ -54,7 +54,7 @@ def test_every_setting_of_an_example_is_there() -> None:
             assert value in choices.get(key, [value]), (command, key, value)
 
 
-# ---------------------------------------------------------------- a user's own preset, and settings that went
+# ---------------------------------------------------------------- your own preset, and removed settings
 
 
 @pytest.fixture
@@ -69,7 +69,7 @@ def mine(tmp_path: Path) -> Callable[[str], Path]:
     return write
 
 
-def test_a_preset_of_one_s_own_says_only_what_it_changes(
+def test_your_own_preset_contains_only_its_changes(
     mine: Callable[[str], Path], cflow: Cflow, capsys: pytest.CaptureFixture
 ) -> None:
     folder = mine("defaults: [base_verified, _self_]\nnum_history: 3\n")
@@ -89,7 +89,7 @@ def test_a_preset_of_one_s_own_says_only_what_it_changes(
         ("num_history: 3\n", "method=None: give one of"),
     ],
 )
-def test_a_preset_of_one_s_own_that_is_wrong(
+def test_a_wrong_preset_is_one_line(
     text: str, message: str, mine: Callable[[str], Path], cflow: Cflow, capsys: pytest.CaptureFixture
 ) -> None:
     assert cflow("eval", "--config-dir", mine(text), "model=mine", "data.num_sweeps=2") == 2
@@ -98,7 +98,7 @@ def test_a_preset_of_one_s_own_that_is_wrong(
 
 
 @pytest.mark.parametrize("setting", ["model.max_object", "++model.max_object", "model.thorough", "+model.thorough"])
-def test_a_setting_that_went_says_what_to_do(setting: str, cflow: Cflow, capsys: pytest.CaptureFixture) -> None:
+def test_a_removed_setting_is_explained(setting: str, cflow: Cflow, capsys: pytest.CaptureFixture) -> None:
     name = setting.rpartition(".")[2]
     assert cflow("eval", f"{setting}=1") == 2
     assert capsys.readouterr().err == f"error: setting {name} was removed: {REMOVED[name]}\n"
@@ -112,12 +112,12 @@ def test_a_setting_that_went_says_what_to_do(setting: str, cflow: Cflow, capsys:
     ["10203656353524179475_7625_000_7645_000", "1e5", "2024_11_22", "-1.5", "true", "a_1", "Ausgänge/東京", 'it\'s "ü"']
     + ["a (1)", "x=y", "s3://bucket/a", "C:\\data", "50%", "a#b"],
 )
-def test_names_are_text_whatever_they_look_like(name: str) -> None:
+def test_names_are_text_even_if_they_look_like_numbers(name: str) -> None:
     read = OverridesParser.create().parse_overrides(for_hydra([f"log={name}", f"+data.root={name}", "pair=1"]))
     assert [override.value() for override in read] == [name, name, 1]
 
 
-def test_what_hydra_gives_a_meaning_keeps_it(compose: Compose) -> None:
+def test_hydra_syntax_in_names_keeps_its_meaning(compose: Compose) -> None:
     cfg = compose("plot", *for_hydra(["log=null", "output=${device}"]))
     assert cfg.log is None and cfg.output == "auto"
     assert for_hydra(["-m", "log=1_0,b,2_0", "pair=1,2"]) == ['log="1_0",b,"2_0"', "pair=1,2", "-m"]
@@ -127,7 +127,7 @@ def test_what_hydra_gives_a_meaning_keeps_it(compose: Compose) -> None:
 # ---------------------------------------------------------------- cflow settings
 
 
-def test_the_page_has_every_setting(cflow: Cflow, capsys: pytest.CaptureFixture) -> None:
+def test_the_page_lists_every_setting(cflow: Cflow, capsys: pytest.CaptureFixture) -> None:
     assert cflow("settings") == 0
     page = capsys.readouterr().out
     rows = [line[2:-2].split(" | ") for line in page.splitlines() if line.startswith("| `model.")]
@@ -137,12 +137,12 @@ def test_the_page_has_every_setting(cflow: Cflow, capsys: pytest.CaptureFixture)
         cells[:3] == ["`0`", "default `4`, fast `2`, offline `4`", "a whole number of at least 0"]
         and "sweeps" in cells[3]
     )
-    assert "dense \\| keypoints" in page, "cells end at bars"
+    assert "dense \\| keypoints" in page, "bars in cells are escaped"
     for file in CONFIGS.glob("data/*.yaml"):
         assert f"\n## data={file.stem}\n" in page and file.read_text().strip() in page
 
 
-def test_the_harness_s_models_are_those_of_the_package(tmp_path: Path, cflow: Cflow) -> None:
+def test_the_harness_models_are_those_in_the_package(tmp_path: Path, cflow: Cflow) -> None:
     assert cflow("settings", "--opensceneflow", tmp_path / "model") == 0
     committed = {file.name: file.read_text() for file in (CONFIGS / "opensceneflow" / "model").glob("*.yaml")}
     assert committed == {file.name: file.read_text() for file in (tmp_path / "model").iterdir()}
