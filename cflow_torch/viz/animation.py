@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
+from subprocess import CalledProcessError
 from typing import TYPE_CHECKING, Any, Iterable, Iterator, Sequence
 
 import numpy as np
@@ -162,7 +163,10 @@ def _write_mp4(path: Path, figures: Iterator[Figure], frames_per_second: float) 
     rate: Any = frames_per_second  # not only int
     writer = FFMpegWriter(rate, "h264", extra_args=options.split())
     program = rc_context({"animation.ffmpeg_path": imageio_ffmpeg.get_ffmpeg_exe()})
-    with program, writer.saving(first, str(path), first.dpi):
-        for figure in chain([first], figures):
-            writer.fig = figure
-            writer.grab_frame()
+    try:
+        with program, writer.saving(first, str(path), first.dpi):
+            for figure in chain([first], figures):
+                writer.fig = figure
+                writer.grab_frame()
+    except CalledProcessError as error:
+        raise OSError(f"ffmpeg did not write the video: {error.stderr}") from error
