@@ -10,7 +10,7 @@ from torch import Tensor
 from cflow_torch.config import ClusteringConfig
 from cflow_torch.ops.indices import split_index
 from cflow_torch.ops.kornia_engine import close_3x3_kornia, connected_components_kornia
-from cflow_torch.ops.labeling import label_blocks, pad
+from cflow_torch.ops.labeling import label_together, pad
 from cflow_torch.ops.morphology import close_3x3
 from cflow_torch.ops.segments import first_of_segment, segment_minmax
 
@@ -86,5 +86,5 @@ def _components(padded: Tensor, indices: PixelIndices, reach: int, config: Clust
     if config.labeling == "kornia":
         component = connected_components_kornia(padded, indices.pixel, config.connectivity, reach)
         return component, indices.pixel.numel()
-    blocks = label_blocks(padded, config.connectivity, reach)
+    (blocks,) = label_together([(padded, reach)], config.connectivity)
     return blocks.of_pixel(indices.padded_row, indices.col), blocks.num_components

@@ -15,8 +15,7 @@ from torch import Tensor
 
 from cflow_torch.config import KeypointsConfig
 from cflow_torch.keypoints.descriptors import KeyPoints
-from cflow_torch.ops.indices import gather, index_in_group
-from cflow_torch.ops.spans import concat_ranges
+from cflow_torch.ops.indices import concat_ranges, gather, index_in_group
 from cflow_torch.windows.collation import Batch
 
 # Rows and columns of a tile, rows of a band, key points in a group. Of the settings that we counted for groups of 16,

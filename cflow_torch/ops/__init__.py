@@ -1,1 +1,1 @@
-"""Batched tensor operations that know nothing of LiDAR."""
+"""Batched tensor operations, independent of LiDAR."""

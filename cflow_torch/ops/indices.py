@@ -1,4 +1,4 @@
-"""Named words for what is done with index tensors: select, look up, count, renumber, divide."""
+"""Operations on index tensors: select, look up, count, renumber, divide."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ def flat_nonzero(mask: Tensor) -> Tensor:
     Returns:
         (K,) int64.
 
-    Cost: one pass and, on a GPU, one synchronisation. On the CPU NumPy finds them about five times faster than torch
-    does in a sparse mask of half a million pixels.
+    Cost: one pass and, on a GPU, one synchronisation. On the CPU NumPy is about five times faster than torch for
+    a sparse mask of half a million pixels.
     """
     if mask.device.type == "cpu":
         return torch.from_numpy(np.flatnonzero(mask.numpy()))
@@ -26,7 +26,7 @@ def flat_nonzero(mask: Tensor) -> Tensor:
 
 
 def gather(index: Tensor, *tensors: Tensor) -> tuple[Tensor, ...]:
-    """The elements of several tensors at the same indices.
+    """Select the same elements of several tensors.
 
     Args:
         index: (K,) int64.
@@ -39,12 +39,12 @@ def gather(index: Tensor, *tensors: Tensor) -> tuple[Tensor, ...]:
 
 
 def lookup(table: Tensor, index: Tensor, missing: float = 0) -> Tensor:
-    """Entries of a table, with a default for the index behind its end.
+    """Select entries of a table, with a default for index N.
 
     Args:
         table: (N, ...).
         index: (K,) int64, 0 ... N; N stands for "none".
-        missing: what N gives.
+        missing: the entry of index N.
 
     Returns:
         (K, ...), dtype of the table.
@@ -54,7 +54,7 @@ def lookup(table: Tensor, index: Tensor, missing: float = 0) -> Tensor:
 
 
 def scatter_count(index: Tensor, size: int, weights: Tensor | None = None) -> Tensor:
-    """How often each index occurs, or the sum of its weights.
+    """Count how often each index occurs, or sum its weights.
 
     Args:
         index: (N,) int64, 0 ... size - 1.
@@ -71,22 +71,22 @@ def scatter_count(index: Tensor, size: int, weights: Tensor | None = None) -> Te
         return weights.new_zeros(size).index_add_(0, index, weights)
     num_rows = len(weights)
     row = torch.arange(num_rows, device=index.device) * size
-    # On the CPU sums along a second dimension are many times slower than sums of one dimension.
+    # On the CPU index_add_ in one dimension is many times faster than in two.
     return scatter_count((index + row[:, None]).view(-1), num_rows * size, weights.flatten()).view(num_rows, size)
 
 
 def renumber(index: Tensor, size: int) -> Tensor:
-    """Position of each number in a list.
+    """Invert a list of indices.
 
     Args:
-        index: (K,) int64, different numbers below S.
+        index: (K,) int64, distinct, below S.
         size: S.
 
     Returns:
-        (S + 1,) int64; K for numbers that are not in the list, and for S, which stands for "none".
+        (S + 1,) int64, position of each number in the list; K for numbers that are not in it, and for S ("none").
     """
-    number = torch.full((size + 1,), index.numel(), dtype=torch.int64, device=index.device)
-    return number.scatter_(0, index, torch.arange(index.numel(), device=index.device))
+    position = torch.full((size + 1,), index.numel(), dtype=torch.int64, device=index.device)
+    return position.scatter_(0, index, torch.arange(index.numel(), device=index.device))
 
 
 def index_in_group(group: Tensor) -> Tensor:
@@ -94,11 +94,26 @@ def index_in_group(group: Tensor) -> Tensor:
     return torch.arange(group.numel(), device=group.device) - torch.searchsorted(group, group)
 
 
+def concat_ranges(start: Tensor, count: Tensor, total: int | None = None) -> Tensor:
+    """Concatenate ranges: start[0], start[0] + 1, ... (count[0] of them), start[1], start[1] + 1, ...
+
+    Args:
+        start: (R,) int64.
+        count: (R,) int64, not negative.
+        total: sum of `count`, if the host knows it; saves a synchronisation.
+
+    Returns:
+        (total,) int64.
+    """
+    offset = torch.repeat_interleave(start + count - count.cumsum(0), count, output_size=total)
+    return offset.add_(torch.arange(offset.numel(), device=offset.device))
+
+
 def lazy_zeros(size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     """(size,) zeros, of which only a small part will be written or read.
 
-    Cost: on the CPU that of the pages that are touched. NumPy asks the system for zeroed pages, and for large ones:
-    several times faster than `torch.zeros` for tens of megabytes.
+    Cost: on the CPU that of the touched pages. NumPy requests large, zeroed pages from the system, which is several
+    times faster than `torch.zeros` for tens of megabytes.
     """
     if device.type == "cpu":
         return torch.from_numpy(np.zeros(size, torch.empty(0, dtype=dtype).numpy().dtype))
@@ -106,29 +121,26 @@ def lazy_zeros(size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
 
 
 def lazy_empty(size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """(size,) of anything, of which only a small part will be written. Cost: as for `lazy_zeros`."""
+    """(size,) undefined values, of which only a small part will be written. Cost: as for `lazy_zeros`."""
     if device.type == "cpu":
         return torch.from_numpy(np.empty(size, torch.empty(0, dtype=dtype).numpy().dtype))
     return torch.empty(size, dtype=dtype, device=device)
 
 
 def take_columns(table: Tensor, index: Tensor) -> Tensor:
-    """`table[:, index]`, (R, K), of (R, C) values; on the CPU three times as fast as `index_select`."""
+    """`table[:, index]`, (R, K), of an (R, C) table; on the CPU three times as fast as `index_select`."""
     return table.gather(1, index.expand(len(table), -1))
 
 
 def largest_of_rows(values: Tensor) -> Tensor:
-    """Where the largest value of each row stands: `values.argmax(1)`, (R,) int64, of (R, C) numbers.
-
-    Cost: one pass. On the CPU NumPy finds them four times faster than torch.
-    """
+    """`values.argmax(1)`, (R,) int64, of (R, C) numbers; on the CPU NumPy is four times as fast as torch."""
     if values.device.type == "cpu":
         return torch.from_numpy(values.numpy().argmax(1))
     return values.argmax(1)
 
 
 def occupied(image: Tensor) -> Tensor:
-    """Flat indices of the elements that are not 0, ascending.
+    """Indices of the elements that are not 0, ascending.
 
     Args:
         image: (N,) uint8, mostly 0.
@@ -146,31 +158,16 @@ def occupied(image: Tensor) -> Tensor:
 
 
 def floor_divide(index: Tensor, divisor: int) -> Tensor:
-    """Floor division of indices by a positive number: `index // divisor`.
+    """`index // divisor`, (...) int64, of (...) int64 and a number of at least 1.
 
-    Args:
-        index: (...) int64.
-        divisor: at least 1.
-
-    Returns:
-        (...) int64.
-
-    Cost: one pass. On the CPU NumPy divides by one number four times faster than torch: it multiplies and shifts.
+    Cost: one pass. On the CPU NumPy is four times as fast as torch, because it multiplies and shifts.
     """
     if index.device.type == "cpu":
-        return torch.from_numpy(np.asarray(index.numpy() // divisor))  # asarray: of no dimension it would be a number
+        return torch.from_numpy(np.asarray(index.numpy() // divisor))  # asarray, because 0-d arrays become numbers
     return torch.div(index, divisor, rounding_mode="floor")
 
 
 def split_index(index: Tensor, width: int) -> tuple[Tensor, Tensor]:
-    """Quotient and remainder of a division by a positive number: (row, col) of a pixel in raster order.
-
-    Args:
-        index: (...) int64.
-        width: at least 1.
-
-    Returns:
-        row, col: (...) int64.
-    """
+    """Quotient and remainder, (...) int64 each: (row, col) of a pixel in raster order."""
     row = floor_divide(index, width)
     return row, torch.sub(index, row, alpha=width)

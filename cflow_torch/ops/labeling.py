@@ -1,13 +1,12 @@
-"""Connected components of sparse binary images, many images at once, in a handful of tensor operations.
+"""Label the connected components of sparse binary images, many images at once, in a handful of tensor operations.
 
-Two pixels are linked if they lie within `reach` of each other (Chebyshev distance); with connectivity 4 the
-corner offsets |dx| = |dy| = reach do not link. `reach=1` is plain labelling. `reach=3` labels the pixels as if the
-image had been dilated with a 3 x 3 square first: two dilated squares touch exactly at those offsets. No dilated
-image is needed.
+Two pixels are linked if they are within `reach` of each other (Chebyshev distance). With connectivity 4 the corner
+offsets |dx| = |dy| = reach do not link. `reach=1` is plain labelling. `reach=3` gives the labels of an image that was
+dilated with a 3 x 3 square first, because two dilated squares touch exactly at these offsets. We need no dilated image.
 
-Idea: in a block of `reach + 1` pixels a side (`reach` for connectivity 4) every two pixels are linked, so a block is
-one node of a graph and only adjacent blocks can be linked. Whether they are is one table look-up on the blocks' bit
-masks. Union-find then works on a few thousand blocks instead of pixels.
+Idea: in a block with sides of `reach + 1` pixels (`reach` for connectivity 4) all pixels are linked. So a block is one
+node of a graph, and only adjacent blocks can be linked. One table lookup on the bit masks of two blocks tells whether
+they are. Union-find then works on a few thousand blocks instead of pixels.
 """
 
 from __future__ import annotations
@@ -24,15 +23,15 @@ from torch import Tensor
 from cflow_torch.ops.indices import flat_nonzero, floor_divide, split_index
 from cflow_torch.ops.segments import first_of_segment
 
-# Half of the eight neighbours of a block; the other half is the same links seen from the other side.
+# Half of the eight neighbours of a block. The links to the other half are those of the other block.
 _NEIGHBOURS = ((0, 1), (1, 0), (1, 1), (1, -1))
-# Images are padded so that blocks of every side (1 ... 4) fill them and leave a free row and column of blocks: then a
-# neighbour needs no bounds check.
+# We pad images so that blocks of every side (1 ... 4) fill them and leave an empty row and column of blocks. Then
+# neighbours need no bounds checks.
 _GRAIN, _FREE = 12, 4
-# One row of a block is read as one number; three pixels get an empty fourth.
+# We read one row of a block as one number; rows of three pixels get an empty fourth.
 _WORD = {1: torch.int8, 2: torch.int16, 3: torch.int32, 4: torch.int32}
-# Rounds of union-find between two looks whether it is done, and jumps in each: four of five LiDAR images are labelled
-# after three rounds, and a round costs less than a look of a GPU's host.
+# Rounds of union-find before each test for convergence, and jumps per round. Four of five LiDAR images are labelled
+# after three rounds, and on a GPU a round costs less than a test.
 _ROUNDS, _JUMPS = 3, 3
 
 
@@ -41,10 +40,10 @@ class Blocks:
     """Component of every block of padded images.
 
     Args:
-        side: pixels a side.
+        side: pixels per side of a block.
         cols: blocks per row.
-        first: smallest name that a component of these images may have.
-        num_components: V, more than the largest component.
+        first: smallest possible component of these images.
+        num_components: V, larger than every component.
         component: (all blocks,) int64, 0 ... V - 1; undefined for blocks without set pixels.
     """
 
@@ -64,10 +63,10 @@ class Blocks:
 
 
 def pad(images: Sequence[Tensor]) -> Tensor:
-    """Where any of some sets of images is set, with the free margin, right and below, that `label_blocks` needs.
+    """Combine sets of images with OR, and add the margin to the right and below that `label_together` needs.
 
     Args:
-        images: (B, H, W) bool each, or uint8 that is 0 where nothing is set.
+        images: (B, H, W) bool each, or uint8, 0 = not set.
 
     Returns:
         (B, H', W') bool.
@@ -92,35 +91,21 @@ def padded_size(size: int) -> int:
     return -(-(size + _FREE) // _GRAIN) * _GRAIN
 
 
-def label_blocks(padded: Tensor, connectivity: int, reach: int) -> Blocks:
-    """Components of padded images, block by block.
-
-    Args:
-        padded: (B, H', W') bool, as made by `pad`, margin empty.
-        connectivity: 4 or 8.
-        reach: 1 (plain) or 3 (as after a 3 x 3 dilation).
-
-    Returns:
-        Components; each is named by one of its blocks, not by its first pixel.
-
-    Cost: one pass over the image, a few rounds of union-find over its blocks, and some host synchronisations.
-    Source: Sec. clustering; contraction of blocks as in block-based labelling (bolelli2022connected).
-    """
-    return label_together([(padded, reach)], connectivity)[0]
-
-
 def label_together(images: Sequence[tuple[Tensor, int]], connectivity: int = 8) -> list[Blocks]:
-    """Components of several sets of padded images by one union-find.
+    """Label several sets of padded images with one union-find.
 
     Args:
-        images: of each set the padded images and the reach, as `label_blocks` takes them.
+        images: for each set (padded, reach): (B, H', W') bool from `pad`; 1 (plain) or 3 (as after a 3 x 3 dilation).
         connectivity: 4 or 8.
 
     Returns:
-        The components of each set. All sets count their components together: `num_components` is that of all, and the
-        components of a set follow those of the set before.
+        The components of each set. A component is named by one of its blocks, not by its first pixel. `num_components`
+        is the same for all sets, and the components of a set follow those of the set before.
 
-    Cost: as `label_blocks`; the number of operations hardly grows with the number of sets.
+    Cost: one pass over the images, a few rounds of union-find over their blocks, and some host synchronisations. The
+    number of operations hardly grows with the number of sets.
+
+    Source: Sec. clustering; contraction of blocks as in block-based labelling (bolelli2022connected).
     """
     device, num_sets = images[0][0].device, len(images)
     sides = [reach + 1 if connectivity == 8 else reach for _, reach in images]
@@ -131,7 +116,7 @@ def label_together(images: Sequence[tuple[Tensor, int]], connectivity: int = 8) 
     node_of_block = torch.empty(masks.shape, dtype=torch.int64, device=device)
     node_of_block.scatter_(0, nodes, torch.arange(nodes.numel(), device=device))
 
-    # Four look-ups per block: which of its neighbours hold a pixel that one of its own pixels reaches?
+    # Four lookups per block tell which pixels of its neighbours it reaches.
     own = masks.index_select(0, nodes).int()
     own |= own >> 4  # two columns of at most four bits in a byte
     offsets, tables = _neighbourhoods(tuple(sides), tuple(cols), connectivity, tuple(r for _, r in images), device)
@@ -167,7 +152,7 @@ def _block_masks(padded: Tensor, side: int) -> Tensor:
 
 
 def connected_components(occupancy: Tensor, pixels: Tensor, connectivity: int = 8, reach: int = 1) -> Tensor:
-    """Component of every set pixel.
+    """Label every set pixel.
 
     Args:
         occupancy: (B, H, W) bool images.
@@ -181,9 +166,9 @@ def connected_components(occupancy: Tensor, pixels: Tensor, connectivity: int = 
     Convention:
         Components never join across images. The result does not depend on thread count or device.
 
-    Cost: as `label_blocks`.
+    Cost: as `label_together`.
     """
-    blocks = label_blocks(pad([occupancy]), connectivity, reach)
+    (blocks,) = label_together([(pad([occupancy]), reach)], connectivity)
     row, col = split_index(pixels, occupancy.shape[2])
     height = occupancy.shape[1]
     row = torch.add(row, floor_divide(row, height), alpha=padded_size(height) - height)
@@ -192,7 +177,7 @@ def connected_components(occupancy: Tensor, pixels: Tensor, connectivity: int = 
 
 
 def union_find(num_nodes: int, sources: Tensor, targets: Tensor) -> Tensor:
-    """Connected components of a graph by hooking and pointer jumping.
+    """Find the connected components of a graph by hooking and pointer jumping.
 
     Args:
         num_nodes: V.
@@ -201,8 +186,8 @@ def union_find(num_nodes: int, sources: Tensor, targets: Tensor) -> Tensor:
     Returns:
         (V,) int64: the smallest node of the same component.
 
-    Cost: a few rounds (about log V), each linear in V + E, with one host synchronisation per three of them. A node only
-    ever moves to a smaller node of its component; once both ends of every edge have the same parent, that is its root.
+    Cost: a few rounds (about log V), each linear in V + E, with one host synchronisation per three rounds. A node only
+    moves to smaller nodes of its component. Once both ends of every edge have the same parent, this is the root.
     """
     parent = torch.arange(num_nodes, device=sources.device)
     low, high = sources, targets
@@ -220,7 +205,7 @@ def union_find(num_nodes: int, sources: Tensor, targets: Tensor) -> Tensor:
 def _neighbourhoods(
     sides: tuple[int, ...], cols: tuple[int, ...], connectivity: int, reaches: tuple[int, ...], device: torch.device
 ) -> tuple[Tensor, Tensor]:
-    """(sets, 4) int64, how far away the neighbours of a block are; (512 sets, 4) int32, `_reachable` of each set."""
+    """(sets, 4) int64 offsets of the neighbours of a block, and (512 sets, 4) int32 tables `_reachable`."""
     offsets = torch.tensor([[down * width + right for down, right in _NEIGHBOURS] for width in cols], device=device)
     tables = [_reachable(side, connectivity, reach, device) for side, reach in zip(sides, reaches)]
     return offsets, torch.cat(tables)
@@ -228,9 +213,9 @@ def _neighbourhoods(
 
 @lru_cache(maxsize=32)
 def _reachable(side: int, connectivity: int, reach: int, device: torch.device) -> Tensor:
-    """(512, 4) int32: which pixels of each neighbour are linked to a block, by the first two columns of its mask.
+    """(512, 4) int32: mask of the pixels of each neighbour that are linked to a block.
 
-    The first two columns are the lower 256 rows, the last two columns the others; a column is four bits.
+    Rows 0 ... 255 are for the first two columns of the block, four bits each, rows 256 ... 511 for the last two.
     """
     half, bits = torch.arange(2)[:, None], torch.arange(1 << 8, dtype=torch.int32)
     tables = []

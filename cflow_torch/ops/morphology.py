@@ -12,21 +12,21 @@ def close_3x3(padded: Tensor, height: int, width: int) -> Tensor:
     """Dilation, then erosion, with a 3 x 3 square of ones.
 
     Args:
-        padded: (B, H', W') bool, images with a free margin to the right and below, at least a pixel wide.
-        height, width: H, W of the images without it.
+        padded: (B, H', W') bool, images with an empty margin to the right and below, at least a pixel wide.
+        height, width: H, W of the images without the margin.
 
     Returns:
         (B, H', W') bool, margin empty.
 
     Convention:
-        Pixels outside the image are ignored: they count as background for the dilation and as foreground for the
-        erosion, so that no pixel is ever lost, at the border neither.
+        Pixels outside the image are background for the dilation and foreground for the erosion, so that no pixel is
+        lost, not even at the border.
 
     Cost: eight passes over the image (the square is separable), no floating-point numbers.
     """
     closed = padded
     for combine, outside in ((torch.bitwise_or, True), (torch.bitwise_and, False)):
-        # The images are one long row of pixels: the margin lies between neighbours that are none.
+        # All images form one long row of pixels. The margin separates pixels that are not neighbours.
         flat = _with_both_neighbours(combine, closed.view(-1), 1)
         closed = _with_both_neighbours(combine, flat, padded.shape[2]).view_as(padded)
         closed[:, height:] = outside
@@ -35,7 +35,7 @@ def close_3x3(padded: Tensor, height: int, width: int) -> Tensor:
 
 
 def _with_both_neighbours(combine: Callable[..., Tensor], values: Tensor, distance: int) -> Tensor:
-    """(N,): each of (N,) values combined with those `distance` before and behind it, as far as there are any."""
+    """(N,): combine each of (N,) values with those `distance` before and after it, if they exist."""
     pairs = combine(values[:-distance], values[distance:])
     result = torch.empty_like(values)
     combine(pairs[:-distance], pairs[distance:], out=result[distance:-distance])
@@ -54,7 +54,7 @@ def erode_cross(image: Tensor) -> Tensor:
         (..., H, W) bool: the pixels whose Euclidean distance to the background is more than 1.
 
     Convention:
-        Pixels outside the image count as background (other than in `close_3x3`): pixels on the border never stay.
+        Pixels outside the image are background, unlike in `close_3x3`, so pixels on the border never stay.
 
     Cost: four passes over the image.
     """

@@ -1,4 +1,4 @@
-"""Nearest set pixel of a binary image, exactly, at the pixels that ask for it."""
+"""Exact nearest set pixel of a binary image, for a list of pixels."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ _COMPARED_AT_ONCE = 1 << 21
 
 
 def nearest_set_pixel(seeds: Tensor, pixels: Tensor) -> Tensor:
-    """For each pixel the nearest seed of the same image.
+    """Find the nearest seed of each pixel in its image.
 
     Args:
         seeds: (B, H, W) bool.
         pixels: (P,) int64, flat indices into `seeds`.
 
     Returns:
-        (P,) int64, flat index into `seeds`; -1 in an image without seeds.
+        (P,) int64, flat indices into `seeds`; -1 in an image without seeds.
 
     Convention:
-        Euclidean distance between pixels; ties: the seed that is first in raster order.
+        Euclidean distance between pixels. Ties: the first in raster order.
 
-    Cost: two passes over the images, then P * W comparisons: the nearest seed of each column is known, so a pixel looks
-    at one seed per column.
+    Cost: two passes over the images to find the nearest seed of every pixel in its column, then P * W comparisons, one
+    seed per column.
     """
     _, height, width = seeds.shape
     rows = torch.arange(height, device=seeds.device)[None, :, None]
@@ -37,10 +37,10 @@ def nearest_set_pixel(seeds: Tensor, pixels: Tensor) -> Tensor:
         col, row = part - line * width, line % height
         seed_row = nearest_row.index_select(0, line)
         squared = (seed_row - row[:, None]) ** 2 + (cols - col[:, None]) ** 2
-        # One number that orders seeds: distance, then place in the image. It fits: 2^31 * 2^30.
+        # One number orders the seeds by distance, then by raster order. It fits: 2^31 * 2^30.
         order = squared * (height * width) + seed_row * width + cols
         order.masked_fill_(seed_row.abs() >= _FAR, torch.iinfo(torch.int64).max)
         best = order.amin(1)
-        place = (line - row) * width + best % (height * width)
-        found.append(torch.where(best == torch.iinfo(torch.int64).max, -1, place))
+        pixel = (line - row) * width + best % (height * width)
+        found.append(torch.where(best == torch.iinfo(torch.int64).max, -1, pixel))
     return torch.cat(found) if found else pixels.clone()

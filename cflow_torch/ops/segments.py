@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-# Ends of a segment without values: beyond any index, near enough to subtract.
+# Minimum of a segment without values: beyond any index, but differences still fit an int64.
 _FAR = 1 << 61
 
 
@@ -32,14 +32,14 @@ def segment_minmax(values: Tensor, index: Tensor, num_segments: int) -> tuple[Te
         index, num_segments: as for `segment_amin`.
 
     Returns:
-        first, last: (S,) int64; of a segment without values the last is far below the first.
+        first, last: (S,) int64; for a segment without values the last is far below the first.
     """
     last = values.new_full((num_segments,), -_FAR).scatter_reduce_(0, index, values, "amax")
     return segment_amin(values, index, num_segments, _FAR), last
 
 
 def first_of_segment(index: Tensor, num_segments: int) -> Tensor:
-    """For each element the position of the first element of the same segment.
+    """Position of the first element of the segment of each element.
 
     Args:
         index: (N,) int64, segment of each element, 0 ... num_segments - 1.
@@ -64,7 +64,7 @@ def bounding_boxes(rows: Tensor, cols: Tensor, index: Tensor, num_segments: int)
         first: (S, 2) int64, smallest (row, col).
         size: (S, 2) int64, height and width; negative for a segment without pixels.
     """
-    # One value at a time: reducing rows of several values takes longer than that.
+    # Reductions of one column each are faster than one of several columns.
     top, bottom = segment_minmax(rows, index, num_segments)
     left, right = segment_minmax(cols, index, num_segments)
     return torch.stack((top, left), 1), torch.stack((bottom - top, right - left), 1).add_(1)
@@ -75,7 +75,7 @@ def masked_median(values: Tensor, mask: Tensor) -> Tensor:
 
     Args:
         values: (M, K) float.
-        mask: (M, K) bool, True = counts.
+        mask: (M, K) bool, False = ignored.
 
     Returns:
         (M,) float; 0 for a row without entries.
@@ -87,8 +87,7 @@ def masked_median(values: Tensor, mask: Tensor) -> Tensor:
     count = mask.sum(dim=1)
     low = ordered.gather(1, ((count - 1).clamp(min=0) // 2)[:, None])[:, 0]
     high = ordered.gather(1, (count // 2).clamp(max=values.shape[1] - 1)[:, None])[:, 0]
-    median = torch.where(count % 2 == 1, low, (low + high) / 2)
-    return torch.where(count > 0, median, torch.zeros_like(median))
+    return _median(low, high, count)
 
 
 def segment_median(values: Tensor, index: Tensor, num_segments: int) -> Tensor:
@@ -114,8 +113,13 @@ def segment_median(values: Tensor, index: Tensor, num_segments: int) -> Tensor:
     ordered = values.index_select(0, order)
     count = torch.bincount(index, minlength=num_segments)
     start = count.cumsum(0) - count
-    last = values.numel() - 1  # only empty segments may point beyond it
+    last = values.numel() - 1  # only empty segments point beyond it
     low = ordered.index_select(0, (start + (count - 1).clamp(min=0) // 2).clamp(max=last))
     high = ordered.index_select(0, (start + count // 2).clamp(max=last))
+    return _median(low, high, count)
+
+
+def _median(low: Tensor, high: Tensor, count: Tensor) -> Tensor:
+    """Median of `count` values from the middle two; 0 without values."""
     median = torch.where(count % 2 == 1, low, (low + high) / 2)
-    return torch.where(count > 0, median, torch.zeros_like(median))
+    return median.masked_fill_(count == 0, 0)

@@ -1,4 +1,4 @@
-"""One thread of torch: threads inside a window gain nothing, and cost much as soon as something else runs."""
+"""Limit torch to one thread. More threads in one window gain nothing, and are slow when other processes run."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import torch
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """One thread of torch while the block lasts, then as many as before; also a decorator of functions.
+    """Use one thread of torch in this block, then as many as before. It is also a decorator.
 
-    Convention: torch keeps a number per thread of Python. One that uses torch for the first time meanwhile starts with
-    one as well.
+    Convention: torch keeps one setting per Python thread. A Python thread that uses torch for the first time in the
+    meantime starts with one thread, too.
     """
     before = torch.get_num_threads()
     torch.set_num_threads(1)

@@ -1,4 +1,4 @@
-"""Set pixels of binary images of different sizes under a window of the image's size that is moved by a shift."""
+"""Count the set pixels of binary images of different sizes under a shifted window of the size of the image."""
 
 from __future__ import annotations
 
@@ -6,16 +6,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cflow_torch.ops.indices import take_columns
-from cflow_torch.ops.spans import concat_ranges
+from cflow_torch.ops.indices import concat_ranges, take_columns
 
 
 class WindowCounts:
-    """Tables of N images given by their set pixels.
+    """Tables of N images from their set pixels.
 
     Args:
-        image, row, col: (P,) int64, which image and where in it; each pixel once.
-        size: (N, 2) int64, height and width H, W of each image; an array, because lengths of tables follow from it.
+        image, row, col: (P,) int64, image and position of each pixel, each pixel once.
+        size: (N, 2) int64, height and width H, W of each image; an array, because the lengths of tables depend on it.
 
     Cost: linear in the area of the images.
     """
@@ -27,17 +26,16 @@ class WindowCounts:
         numbers = np.concatenate((size.T, first_edge, area.cumsum()[None] - area, edges[1:]))
         self._numbers = torch.from_numpy(numbers).to(image.device)
         *edge, start, stride = take_columns(self._numbers[2:], image)
-        # Pixels in the rows above, and in the columns to the left, of every row and column. What lies before a row
-        # (column, image) cancels.
-        place, one = torch.cat((edge[0] + row, edge[1] + col)).add_(1), torch.ones_like(image)
+        # Number of pixels above every row, and to the left of every column. The pixels of earlier images cancel.
+        line, one = torch.cat((edge[0] + row, edge[1] + col)).add_(1), torch.ones_like(image)
         zeros = torch.zeros(int(edges.sum()), dtype=torch.int64, device=image.device)
-        self._before = zeros.index_add_(0, place, one.repeat(2)).cumsum(0)
-        # Running sum over rows of W + 1 samples, the first of them free.
+        self._before = zeros.index_add_(0, line, one.repeat(2)).cumsum(0)
+        # Running sum over rows of W + 1 samples, of which the first is empty.
         table = torch.zeros(int(area.sum()), dtype=torch.int32, device=image.device)
         self._table = table.index_fill_(0, stride.mul_(row).add_(start).add_(col).add_(1), 1).cumsum(0)
 
     def bounds(self, image: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
-        """(K,) int64 each, `count` is at least the first and at most the second. Args as for `count`."""
+        """Lower and upper bounds of `count`, (K,) int64 each. Args as for `count`."""
         size, first = take_columns(self._numbers[:4], image).view(2, 2, -1)
         begin, end = shift.clamp(min=0), torch.minimum(size, size + shift)
         edges = torch.stack((begin, end, torch.zeros_like(size), size)).add_(first)
@@ -46,7 +44,7 @@ class WindowCounts:
         return rows + cols - (last - first)[0], torch.minimum(rows, cols)
 
     def count(self, image: Tensor, shift: Tensor) -> Tensor:
-        """(K,) int64, set pixels in rows dy ... H - 1 + dy and columns dx ... W - 1 + dx.
+        """(K,) int64, number of set pixels in rows dy ... H - 1 + dy and columns dx ... W - 1 + dx.
 
         Args:
             image: (K,) int64.

@@ -14,6 +14,7 @@ from cflow_torch.dense.clustering import Pixels as ClusterPixels
 from cflow_torch.dense.correlation import best_shifts
 from cflow_torch.dense.history import pool
 from cflow_torch.dense.templates import TemplatePairs, make_pairs
+from cflow_torch.ops.cross_correlation import parabola_vertex
 from cflow_torch.ops.indices import (
     flat_nonzero,
     gather,
@@ -23,7 +24,6 @@ from cflow_torch.ops.indices import (
     scatter_count,
     take_columns,
 )
-from cflow_torch.ops.parabola import vertex
 from cflow_torch.ops.segments import bounding_boxes
 from cflow_torch.verified.component_tree import Components, Nodes
 from cflow_torch.verified.height_slices import OWN, HeightSlicedSweeps, count_slices
@@ -199,4 +199,7 @@ def _parabola(images: _NodeImages, pairs: TemplatePairs, shift: Tensor) -> Tenso
     of_beside = pair[:, None] * 5 + torch.arange(5, device=shift.device)
     sums = scatter_count(of_beside.view(-1), len(shift) * 5, meets.view(-1).long()).view(-1, 5)
     middle, above, below, left, right = sums.unbind(1)
-    return torch.stack((vertex(above, middle, below), vertex(left, middle, right)), 1) * is_moved[:, None]
+    return (
+        torch.stack((parabola_vertex(above, middle, below), parabola_vertex(left, middle, right)), 1)
+        * is_moved[:, None]
+    )

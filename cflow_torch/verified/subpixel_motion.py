@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from cflow_torch.ops.chunks import CHUNK_ON_CPU
+from cflow_torch.ops.cross_correlation import parabola_vertex
 from cflow_torch.ops.indices import flat_nonzero, gather, lookup, scatter_count
-from cflow_torch.ops.parabola import vertex
 from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import SLICE_HEIGHT, HeightSlicedSweeps, count_slices
 from cflow_torch.verified.voxel_centroids import UNITS, Voxels, meeting_weights, points_of_objects
@@ -117,7 +117,7 @@ def _vertex(gain: Tensor, best: Tensor, stride: int) -> Tensor:
     line = best if stride == 1 else torch.div(best, stride, rounding_mode="floor")
     at_edge = (line % _SIDE == 0) | (line % _SIDE == _SIDE - 1)
     beside = torch.stack((best - stride, best, best + stride), 1).clamp_(0, _SIDE**2 - 1)
-    return vertex(*gain.gather(1, beside).unbind(1)).masked_fill(at_edge, 0.0)
+    return parabola_vertex(*gain.gather(1, beside).unbind(1)).masked_fill(at_edge, 0.0)
 
 
 def _is_biased(sweeps: HeightSlicedSweeps, objects: Objects, wanted: Tensor) -> Tensor:

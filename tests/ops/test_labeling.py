@@ -14,7 +14,7 @@ from scipy import ndimage
 from scipy.sparse import coo_matrix, csgraph
 
 from cflow_torch.ops.kornia_engine import connected_components_kornia
-from cflow_torch.ops.labeling import connected_components, label_blocks, label_together, pad, union_find
+from cflow_torch.ops.labeling import connected_components, label_together, pad, union_find
 from cflow_torch.types import CFlowError
 
 STRUCTURE = {4: ndimage.generate_binary_structure(2, 1), 8: np.ones((3, 3), dtype=bool)}
@@ -78,7 +78,7 @@ def test_sets_of_images_that_are_labelled_together_equal_each_set_alone(connecti
             for (padded, reach), together in zip(some, found):
                 window, row, col = padded.nonzero().t()
                 row = row + window * padded.shape[1]
-                alone = label_blocks(padded, connectivity, reach)
+                (alone,) = label_together([(padded, reach)], connectivity)
                 component, expected = together.of_pixel(row, col), alone.of_pixel(row, col)
                 assert together.first == before and together.num_components == found[0].num_components
                 assert (component - together.first).tolist() == expected.tolist()
