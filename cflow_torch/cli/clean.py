@@ -69,7 +69,7 @@ def _claim(cfg: DictConfig, output: Path) -> None:
         now = {**settings, "versions": run.versions()}
         changed = describe_changes(before, now, ("output", "device", "map"))
         if changed:
-            raise CFlowError(f"{output} holds logs of another run ({changed}): remove it, or give output=FOLDER")
+            raise CFlowError(f"{output} has logs of another run ({changed}): remove it, or give output=FOLDER")
     run.write_config(cfg, output)
 
 

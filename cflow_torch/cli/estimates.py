@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from queue import SimpleQueue
 from typing import Any, Callable, Iterator, Sequence, Tuple, TypeVar
 
@@ -51,15 +52,39 @@ def estimates(
     idle: SimpleQueue[ChildProcess] = SimpleQueue()
     for process in processes:
         idle.put(process)
+
+    def compute(sweeps: Window) -> tuple[Window, dict[str, Any], Any]:
+        process = idle.get()
+        try:
+            return (sweeps, *process.call(sweeps))
+        except WorkerDied as death:
+            raise CFlowError(f"a worker process died on it {death}") from None
+        finally:
+            idle.put(process)
+
+    def answer(future: Future[Any]) -> tuple[Window, FlowResult]:
+        sweeps, arrays, seconds = future.result()
+        model.pairs.append(seconds)
+        return sweeps, FlowResult(**{name: torch.from_numpy(array) for name, array in arrays.items()})
+
+    def take() -> tuple[Item, Answer]:
+        item, future = waiting.popleft()
+        return item, partial(answer, future)
+
     waiting: deque[tuple[Item, Future[Any]]] = deque()
     with ThreadPoolExecutor(count) as threads:
         try:
             for item in frames(items):
-                waiting.append((item, _submit(threads, idle, item, read)))
+                future: Future[Any] = Future()
+                try:
+                    future = threads.submit(compute, read(item))
+                except (CFlowError, OSError) as error:
+                    future.set_exception(error)
+                waiting.append((item, future))
                 if len(waiting) > _AHEAD * count:
-                    yield _answer(model, *waiting.popleft())
+                    yield take()
             while waiting:
-                yield _answer(model, *waiting.popleft())
+                yield take()
         finally:
             for _, future in waiting:
                 future.cancel()
@@ -69,37 +94,6 @@ def estimates(
 
 def _estimate(model: TimedModel, sweeps: Window) -> tuple[Window, FlowResult]:
     return sweeps, model([sweeps])[0]
-
-
-def _submit(
-    threads: ThreadPoolExecutor, idle: SimpleQueue[ChildProcess], item: Item, read: Callable[[Item], Window]
-) -> Future[Any]:
-    """Read a window and pass it to the next idle process."""
-    future: Future[Any] = Future()
-    try:
-        future = threads.submit(_call, idle, read(item))
-    except (CFlowError, OSError) as error:
-        future.set_exception(error)
-    return future
-
-
-def _call(idle: SimpleQueue[ChildProcess], sweeps: Window) -> tuple[Window, dict[str, Any], Any]:
-    process = idle.get()
-    try:
-        return (sweeps, *process.call(sweeps))
-    except WorkerDied as death:
-        raise CFlowError(f"a worker process died on it {death}") from None
-    finally:
-        idle.put(process)
-
-
-def _answer(model: TimedModel, item: Item, future: Future[Any]) -> tuple[Item, Answer]:
-    def answer() -> tuple[Window, FlowResult]:
-        sweeps, arrays, seconds = future.result()
-        model.pairs.append(seconds)
-        return sweeps, FlowResult(**{name: torch.from_numpy(array) for name, array in arrays.items()})
-
-    return item, answer
 
 
 def _make_estimate(method: SceneFlowModel) -> Callable[[Window], tuple[dict[str, Any], Any]]:

@@ -117,7 +117,7 @@ def compute(
         conflict = find_conflict(output, identity, cfg.resume or cfg.overwrite)
         print(forecast(job, shard.units(sources.logs)))
         if conflict is not None:
-            print(f"{output} holds results of another run{conflict}; overwrite=true would replace them")
+            print(f"{output} has results of another run{conflict}; overwrite=true would replace them")
         return None
     if check is not None:
         check(job, sources)

@@ -1,9 +1,9 @@
-"""What the results in a folder were made from: method, data settings, versions, input. Nothing else may join them.
+"""The files in an output folder, and the manifests that keep results of different settings or inputs apart.
 
-OUTPUT/manifest.json              identity of the run and its hash
-OUTPUT/<log id>/manifest.json     the log: its time stamps, digests of its first, middle and last sweep
-OUTPUT/<log id>/<ns>.feather      a complete frame: files take their names when they are on disk
-OUTPUT/<log id>/tracks.parquet    objects through time, made of all frames of a log when they are complete
+OUTPUT/manifest.json              identity of the run (method, data settings, contents, versions) and its hash
+OUTPUT/<log id>/manifest.json     time stamps of the log, digests of its first, middle and last sweep
+OUTPUT/<log id>/<ns>.feather      a complete frame; a file gets this name when it is on disk
+OUTPUT/<log id>/tracks.parquet    moving objects of a log whose frames are all complete
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from cflow_torch.types import CFlowError, as_numpy
 
 MANIFEST = "manifest.json"
 _FORMAT = 1
-_ENDING = b"ARROW1"  # of every feather file
+_ENDING = b"ARROW1"  # last bytes of a feather file
 _OURS = re.compile(r"[0-9]+\.feather|manifest\.json|tracks\.parquet|\..+\.tmp")
 _REMEDY = "give output=FOLDER, or overwrite=true"
 
@@ -39,10 +39,9 @@ _REMEDY = "give output=FOLDER, or overwrite=true"
 def make_identity(
     config: Config, reader: str, settings: Mapping[str, Any], contents: Sequence[str] = CONTENTS
 ) -> dict[str, Any]:
-    """What decides the bytes of a result, besides the sweeps: method (not its `max_memory`), data settings, what is
-    written, versions.
+    """What determines a result besides the sweeps: method without `max_memory`, data settings, contents, versions.
 
-    A CPU build and a CUDA build of one torch version count as the same.
+    CPU and CUDA builds of one torch version count as the same.
     """
     versions = {
         "cflow_torch": __version__,
@@ -58,24 +57,24 @@ def make_identity(
 
 
 def claim_folder(output: Path, identity: Mapping[str, Any], resume: bool, overwrite: bool, alone: bool) -> None:
-    """Make sure that the folder holds results of this identity only, and say so in its manifest.
+    """Make sure that a folder has results of this identity only, and write its manifest.
 
     Args:
         output: folder of the run.
         identity: of `make_identity`.
-        resume: continue what an earlier run of the same identity left.
-        overwrite: remove what earlier runs left.
+        resume: continue an earlier run of the same identity.
+        overwrite: remove the results of earlier runs.
         alone: no other shard works in this folder.
 
     Raises:
-        CFlowError: it holds results that must not be mixed with these.
+        CFlowError: the folder has results that must not be mixed with these.
     """
     forget_listings(output)
     why = find_conflict(output, identity, resume or overwrite)
     if why is not None and not overwrite:
-        raise CFlowError(f"{output} holds results of another run{why}: {_REMEDY}")
-    if why is not None and not alone:  # shards that begin together cannot agree who removes them
-        raise CFlowError(f"{output} holds results of another run{why}: remove the folder, or give output=FOLDER")
+        raise CFlowError(f"{output} has results of another run{why}: {_REMEDY}")
+    if why is not None and not alone:  # no shard knows whether another one has removed them already
+        raise CFlowError(f"{output} has results of another run{why}: remove the folder, or give output=FOLDER")
     if overwrite and alone and output.is_dir():
         _clear(output)
     remove_stale(output)
@@ -84,7 +83,7 @@ def claim_folder(output: Path, identity: Mapping[str, Any], resume: bool, overwr
 
 
 def find_conflict(output: Path, identity: Mapping[str, Any], resume: bool) -> str | None:
-    """Why results of this identity must not join those in the folder, to follow a noun; None if they may."""
+    """Why results of this identity must not be added to a folder, as a phrase in a message; None if they may."""
     before = _read(output / MANIFEST)
     if before is None:
         return None
@@ -95,7 +94,7 @@ def find_conflict(output: Path, identity: Mapping[str, Any], resume: bool) -> st
 
 
 def claim_log(folder: Path, log: Log, run: str) -> None:
-    """Make sure that the frames in a log's folder were made from this very log, and say so in its manifest.
+    """Make sure that the frames in a log's folder were computed from this log, and write its manifest.
 
     Raises:
         CFlowError: the log has changed since, or another log has its name.
@@ -105,20 +104,20 @@ def claim_log(folder: Path, log: Log, run: str) -> None:
     now = _describe_log(log, run)
     if _read(folder / MANIFEST) is None:
         write_text(folder / MANIFEST, _text(now))
-    before = _read(folder / MANIFEST) or {}  # again: another log of that name may have been quicker
+    before = _read(folder / MANIFEST) or {}  # another process may have been quicker
     if before.get("run") != run:
-        raise CFlowError(f"{folder} holds flow of another run: remove that folder, or give output=FOLDER")
+        raise CFlowError(f"{folder} has flow of another run: remove that folder, or give output=FOLDER")
     is_same = all(before.get(key) == now[key] for key in ("log_id", "timestamps"))
     both = now["sweeps"].keys() & (before.get("sweeps") or {}).keys()
     if not is_same or any(before["sweeps"][key] != now["sweeps"][key] for key in both):
         raise CFlowError(
-            f"{folder} holds flow of other sweeps (the log has changed since, or two logs have one name): "
+            f"{folder} has flow of other sweeps (the log has changed since, or two logs have the same name): "
             "remove that folder, or give output=FOLDER"
         )
 
 
 def _describe_log(log: Log, run: str) -> dict[str, Any]:
-    """Manifest of a log. A sweep that cannot be read has no digest; its frames will say why."""
+    """The manifest of a log. A sweep that cannot be read has no digest, and its frames will fail."""
     stamps = [int(stamp) for stamp in log.timestamps]
     digests = {}
     for index in sorted({0, len(stamps) // 2, len(stamps) - 1} & set(range(len(stamps)))):
@@ -128,12 +127,12 @@ def _describe_log(log: Log, run: str) -> dict[str, Any]:
 
 
 def complete_frames(folder: Path) -> set[int]:
-    """Time stamps whose flow is in a log's folder, whichever worker put it there.
+    """Time stamps whose flow is in a log's folder.
 
-    None where the log's manifest is gone, for nobody knows then what they were made from; and none whose file does not
-    end as it was written (a power cut, a copy that broke off).
+    Files without the log's manifest do not count, because their input is unknown. Neither do incomplete files, for
+    example after a power cut.
 
-    Cost: on this machine, the last bytes of every file are read.
+    Cost: reads the last bytes of every local file.
     """
     forget_listings(folder)
     with remote_errors(folder):
@@ -145,12 +144,12 @@ def complete_frames(folder: Path) -> set[int]:
 
 
 def frame_file(folder: Path, timestamp: int) -> Path:
-    """Where the flow of one frame lies."""
+    """The path of a frame's flow."""
     return folder / f"{timestamp}.feather"
 
 
 def _is_whole(file: Path) -> bool:
-    """Whether a feather file ends as such files do."""
+    """True if a file ends like a complete feather file."""
     with suppress(OSError), open(file, "rb") as opened:
         opened.seek(-len(_ENDING), os.SEEK_END)
         return opened.read() == _ENDING
@@ -158,7 +157,7 @@ def _is_whole(file: Path) -> bool:
 
 
 def _digest(log: Log, index: int) -> str:
-    """Of all that a sweep gives to the method."""
+    """Hash of the parts of a sweep that the method uses."""
     sweep, digest = log.sweep(index), hashlib.sha256()
     for values in (sweep.points, sweep.is_ground, sweep.pose):
         digest.update(b"none" if values is None else as_numpy(values).tobytes())
@@ -166,10 +165,10 @@ def _digest(log: Log, index: int) -> str:
 
 
 def _clear(output: Path) -> None:
-    """Remove the results of a run, and nothing else.
+    """Remove the results of a run and no other files.
 
-    Its manifest goes first: what is left half-way belongs to none. That of a log goes last: it tells whose frames they
-    are.
+    The run's manifest is removed first, so that a killed run leaves no claim, and that of a log last, because it marks
+    the folder as ours.
     """
     logs = [path for path in output.iterdir() if (path / MANIFEST).exists()]
     for name in (MANIFEST, "config.yaml"):
@@ -179,7 +178,7 @@ def _clear(output: Path) -> None:
         for file in sorted(folder.iterdir(), key=lambda file: file.name == MANIFEST):
             if _OURS.fullmatch(file.name):
                 file.unlink()
-        with suppress(OSError):  # something else is left in it; object stores have no folders
+        with suppress(OSError):  # it has other files, or an object store has no folders
             folder.rmdir()
 
 
@@ -187,11 +186,11 @@ def _read(file: Path) -> dict[str, Any] | None:
     try:
         content = read_json(file)
         if not isinstance(content, dict):
-            raise CFlowError("no dictionary")
+            raise CFlowError("not a dictionary")
     except FileNotFoundError:
         return None
     except CFlowError as error:
-        raise CFlowError(f"{file} is no manifest ({error}): remove it, or {_REMEDY}") from None
+        raise CFlowError(f"{file} is not a manifest ({error}): remove it, or {_REMEDY}") from None
     return content
 
 

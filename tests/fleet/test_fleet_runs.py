@@ -101,7 +101,7 @@ def test_other_settings_are_refused_by_name(fleet: Path, single: dict[str, bytes
     with pytest.raises(CFlowError, match="remove the folder"):
         run(fleet, out, shard=Shard(0, 2), overwrite=True, settings=OTHER)
     (out / "manifest.json").write_bytes(b"")
-    with pytest.raises(CFlowError, match=f"{out / 'manifest.json'} is no manifest"):
+    with pytest.raises(CFlowError, match=f"{out / 'manifest.json'} is not a manifest"):
         run(fleet, out)
     (out / "manifest.json").unlink()
     assert run(fleet, out)["frames"]["computed"] == 0

@@ -124,4 +124,4 @@ def test_a_recording_of_estimated_and_of_stored_flow(
     assert cflow("view", f"flow={tmp_path / 'flow'}", "device=no_such_device") == 1, "nothing is estimated"
     printed = capsys.readouterr()
     assert f"{file}: 2 pairs" in printed.out and "1 failed" in printed.err and file.is_file()
-    assert cflow("view", "flow=nowhere") == 2 and "flow=nowhere is no folder" in capsys.readouterr().err
+    assert cflow("view", "flow=nowhere") == 2 and "flow=nowhere is not a folder" in capsys.readouterr().err
