@@ -1,4 +1,4 @@
-"""Windows and settings small enough to run every preset many times, and to hold it to the oracle."""
+"""Small windows and settings, to run every preset many times and to compare it with the oracle."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ PRESETS = ("default", "fast", "offline", "paper", "keypoints")
 
 
 def small(preset: str, **overrides: Any) -> Config:
-    """A preset on 16 m x 14 m with pixels of 0.25 m, two older sweeps where it takes any."""
+    """A preset on 16 m x 14 m with pixels of 0.25 m, and two older sweeps if the method uses history."""
     given: dict[str, Any] = {"pixel_sizes": (0.5, 0.25) if preset in ("default", "offline") else (0.25,)}
     if preset in ("paper", "keypoints"):
         given["max_extent"] = 5.0
@@ -22,7 +22,7 @@ def small(preset: str, **overrides: Any) -> Config:
 
 
 def windows_for(config: Config, number: int = 1) -> list[Window]:
-    """Windows in which every preset finds motion; the last of several is a pair."""
+    """Windows in which every preset finds motion. The last of several is a pair."""
     seeds = (12, 11, 3, 8)[:number]
     return [
         scene(
@@ -36,10 +36,10 @@ def windows_for(config: Config, number: int = 1) -> list[Window]:
 
 
 def changed(window: Window, change: Callable[[Sweep], Sweep]) -> Window:
-    """The same change of every sweep."""
+    """Change every sweep of a window."""
     return Window(*map(change, (window.pc0, window.pc1)), *(tuple(map(change, s)) for s in (window.pch, window.pcf)))
 
 
 def num_moving(result: FlowResult) -> int:
-    """Points with a residual flow."""
+    """Number of points with residual flow."""
     return int(result.residual_flow.any(1).sum())

@@ -1,6 +1,6 @@
-"""A pretend accelerator: the CPU's arithmetic behind tensors that say that they are elsewhere. Needs torch 2.9.
+"""A pretend accelerator: the CPU computes, but the tensors report another device. Needs torch 2.9.
 
-As on a GPU, tensors of two devices in one operation raise, and some operations make the host wait. Both are counted.
+As on a GPU, an operation on tensors of two devices raises. We count the launched kernels and the waits of the host.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten, tree_map
 
 IS_THERE = hasattr(backend_registration, "_setup_privateuseone_for_python_backend")
-# The size or the value of the result decides what the host does next.
+# Operations for whose result the host has to wait.
 _WAITING = {"_local_scalar_dense", "nonzero", "equal", "masked_select", "bincount"}
 _WAITING |= {"_unique2", "unique_dim", "unique_consecutive"}
 _IDLE = {"_unsafe_view", "lift_fresh", "empty", "empty_like", "empty_strided", "new_empty", "new_empty_strided"}
@@ -41,7 +41,7 @@ if IS_THERE:
 
 
 class _Remote(Tensor):
-    """A tensor of the pretend device; `host` holds its values."""
+    """A tensor of the pretend device. `host` holds its values."""
 
     host: Tensor
 
@@ -54,11 +54,11 @@ class _Remote(Tensor):
 
     @classmethod
     def __torch_dispatch__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        raise RuntimeError("tensors of the pretend device can be used inside of `PretendDevice` only")
+        raise RuntimeError("tensors of the pretend device can only be used inside of `PretendDevice`")
 
 
 class PretendDevice(TorchDispatchMode):
-    """While it is open, there is a device `DEVICE`."""
+    """A context in which the device `DEVICE` exists."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -67,13 +67,13 @@ class PretendDevice(TorchDispatchMode):
         self._inference_mode = torch.inference_mode
 
     def count(self, run: Callable[[], Any]) -> tuple[int, int]:
-        """Kernels that a call launches on the device; how often the host waits for it, or sends it values."""
+        """Count the kernels that a call launches, and how often the host waits for the device or sends it values."""
         self._launches = self._waits = 0
         run()
         return self._launches, self._waits
 
     def __enter__(self) -> PretendDevice:
-        torch.inference_mode = lambda *_: torch.no_grad()  # type: ignore  # there wrappers cannot live
+        torch.inference_mode = lambda *_: torch.no_grad()  # type: ignore  # tensor wrappers do not work in inference mode
         self._constructors.__enter__()
         return super().__enter__()  # type: ignore[no-any-return]
 
@@ -112,7 +112,7 @@ class PretendDevice(TorchDispatchMode):
 
 
 class _Constructors(TorchFunctionMode):
-    """Calls that no kernel sees."""
+    """Constructors and `tolist`, which do not reach `__torch_dispatch__`."""
 
     def __init__(self, device: PretendDevice) -> None:
         super().__init__()
@@ -134,12 +134,12 @@ def _host(x: Any) -> Any:
 
 
 def _plain(x: Tensor) -> Tensor:
-    """Without the marks of a conjugate or negative view, which a wrapper does not carry."""
+    """Resolve conjugate and negative views, which a wrapper cannot represent."""
     return x.resolve_conj().resolve_neg()
 
 
 def _is_free(func: Any, name: str) -> bool:
-    """Nothing is computed: another look at the input, or memory only."""
+    """Whether the operation computes nothing: a view of its input, or an allocation."""
     aliases = [value.alias_info for value in func._schema.returns]
     return name in _IDLE or any(alias is not None and not alias.is_write for alias in aliases)
 

@@ -1,4 +1,4 @@
-"""Settings: checked when made, unknown and removed names refused, presets, methods, dictionaries."""
+"""Settings: invalid values, unknown and removed names, presets, methods, dictionaries."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ SPACE = {
 
 
 @pytest.mark.parametrize("field", SPACE)
-def test_pixels_regions_and_boxes_that_are_none(field):
+def test_invalid_pixels_regions_and_boxes_are_refused(field):
     for value in SPACE[field]:
         with pytest.raises(CFlowError, match=f"{field}.*give"):
             DenseConfig(**{field: value})
@@ -74,7 +74,7 @@ def test_an_unknown_setting_lists_the_fields():
 
 
 @pytest.mark.parametrize("name", REMOVED)
-def test_a_removed_setting_says_what_to_do_without_it(name):
+def test_a_removed_setting_names_its_replacement(name):
     assert all(name not in (f.name for f in fields(kind)) for kind in CONFIGS.values())
     with pytest.raises(CFlowError, match=f"setting {name} was removed: ..."):
         make_config(**{name: 1})
@@ -113,7 +113,7 @@ def test_presets_and_methods():
         make_config(method="sparse")
 
 
-def test_the_paper_s_base_row_and_what_presets_change():
+def test_presets_have_the_paper_s_base_row_and_documented_changes():
     paper, default, fast = (make_config(name) for name in ("paper", "default", "fast"))
     assert (paper.pixel_sizes, paper.num_history, paper.sectional_view) == ((0.1,), 0, False)
     assert paper.point_cloud_range == (-35.0, -35.0, -INF, 35.0, 35.0, INF) and paper.max_speed is None
@@ -126,7 +126,7 @@ def test_the_paper_s_base_row_and_what_presets_change():
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-def test_a_dictionary_goes_round(preset):
+def test_settings_survive_a_dictionary(preset):
     config = make_config(preset, point_cloud_range=(-1, -2, -3, 1, 2, 3), ego_box=(-1, -1, 1, 1), max_speed=None)
     plain = json.loads(json.dumps(config.as_dict()))
     assert list(plain) == [f.name for f in fields(config)] and plain["method"] == config.method

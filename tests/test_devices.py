@@ -1,4 +1,4 @@
-"""Any device: the CPU's bits, no tensors of two devices, few launches and few waits. On a pretend accelerator."""
+"""Devices: the bits of the CPU, no mixed devices, few launches and few waits. Runs on a pretend accelerator."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from cflow_torch import Config, make_model
 pytestmark = pytest.mark.skipif(not pretend_device.IS_THERE, reason="torch before 2.9 has no backends in Python")
 
 SCALES = (0.8, 0.4, 0.3, 0.2, 0.1)
-# Launches and waits of one window, launches of sixteen: what was counted, and 15 % more.
+# Launches and waits of one window, and launches of sixteen windows: the counted numbers plus 15 %.
 BOUNDS: dict[str, tuple[Config, int, int, int]] = {
     "paper": (small("paper", num_history=0), 633, 35, 755),
     "paper, h = 4, 5 scales": (small("paper", num_history=4, pixel_sizes=SCALES), 3692, 146, 4016),
@@ -28,7 +28,7 @@ BOUNDS: dict[str, tuple[Config, int, int, int]] = {
 
 
 @pytest.mark.parametrize("name", [*list(BOUNDS)[:-1], pytest.param("offline", marks=pytest.mark.slow)])
-def test_bits_of_the_cpu_and_few_operations(name: str) -> None:
+def test_a_device_gives_the_bits_of_the_cpu_with_few_launches(name: str) -> None:
     config, *bounds = BOUNDS[name]
     windows = windows_for(config, 4)
     with PretendDevice() as device:
@@ -41,8 +41,7 @@ def test_bits_of_the_cpu_and_few_operations(name: str) -> None:
     assert all(number <= bound for number, bound in zip(counted, bounds)), f"counted {counted}, allowed {bounds}"
 
 
-def test_sweeps_that_are_read_together_may_differ() -> None:
-    """Windows with and without poses, masks, times of points and history, in one batch."""
+def test_a_batch_may_mix_windows_with_and_without_poses_masks_and_times() -> None:
     config = small("default")
     moved, plain, timed, _ = windows_for(config, 4)
     plain = changed(plain, lambda sweep: replace(sweep, pose=None, is_ground=None))

@@ -1,4 +1,4 @@
-"""The one call: its arguments, its warnings, and that it is the module. The module: its class, its results."""
+"""`estimate_flow`: its arguments, its warnings, its equality with the module. The module: its class, its results."""
 
 from __future__ import annotations
 
@@ -46,14 +46,14 @@ EYE = np.eye(4)
         ({"pixel_size": 1e-5}, "point_cloud_range"),
     ],
 )
-def test_arguments_that_make_no_sense(arguments, complaint):
+def test_invalid_arguments_are_refused(arguments, complaint):
     with pytest.raises(CFlowError, match=complaint) as caught:
         estimate_flow(P0, P1, **arguments)
     assert isinstance(caught.value, ValueError)
 
 
 @pytest.mark.parametrize("method, num_future", [("dense", 0), ("verified", 2)])
-def test_the_call_is_the_module(method, num_future):
+def test_estimate_flow_equals_the_module(method, num_future):
     """With history, sweeps after t+1 and the times of points."""
     rng, settings = np.random.default_rng(0), config(method, num_history=1)
     settings = settings.replace(num_future=num_future) if num_future else settings

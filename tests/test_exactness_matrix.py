@@ -1,4 +1,4 @@
-"""Every preset, computed in every way that must not matter on one device: the same bits."""
+"""Every preset has the same bits, however it is computed on one device."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from scenes import assert_same_bits, reordered, rows_of
 from cflow_torch import Config, FlowResult, Sweep, Window, make_model
 
 Results = List[FlowResult]
-Way = Callable[[Config, List[Window]], Results]
+Call = Callable[[Config, List[Window]], Results]
 EMPTY = Sweep(np.zeros((0, 3), dtype=np.float32))
 
 
 def plainly(config: Config, windows: list[Window]) -> Results:
-    """Window by window: what all others are held to."""
+    """Window by window, the reference for all others."""
     return [make_model(config, "cpu")([window])[0] for window in windows]
 
 
@@ -30,14 +30,14 @@ def together(config: Config, windows: list[Window]) -> Results:
 
 
 def backwards_and_again(config: Config, windows: list[Window]) -> Results:
-    """The other way round, each three times, by a model that has run before."""
+    """In reverse order, each three times, by a model that has run before."""
     model = make_model(config, "cpu")
     model(windows)
     return model((windows * 3)[::-1])[: len(windows)][::-1]
 
 
 def among_others(config: Config, windows: list[Window]) -> Results:
-    """Between windows without points, without one sweep, of a few points."""
+    """Between windows without points, with one empty sweep, and with a few points."""
     bare = [replace(sweep, pose=None, timestamp_ns=None) for sweep in (windows[0].pc0, windows[0].pc1)]
     few = replace(bare[0], points=bare[0].points[:9], is_ground=bare[0].is_ground[:9])
     others = [Window(EMPTY, EMPTY), Window(few, EMPTY), Window(EMPTY, bare[1])]
@@ -46,7 +46,7 @@ def among_others(config: Config, windows: list[Window]) -> Results:
 
 
 def in_pieces(config: Config, windows: list[Window]) -> Results:
-    """Little memory; points, images, look-ups and key points in pieces of other sizes."""
+    """With little memory, and other chunk sizes for points, images, lookups and key points."""
     pieces = {
         "ops.chunks.CHUNK_ON_CPU": 997,
         "dense.correlation._PER_CALL_CPU": 600,
@@ -67,20 +67,20 @@ def in_pieces(config: Config, windows: list[Window]) -> Results:
 
 
 def shuffled(config: Config, windows: list[Window]) -> Results:
-    """Points of every sweep in another order; results put back into the old one."""
+    """With the points of every sweep in another order; the results are put back into the old one."""
     mixed, orders = zip(*(reordered(window) for window in windows))
     results = together(config, list(mixed))
     return [rows_of(result, np.argsort(order)) for result, order in zip(results, orders)]
 
 
 def while_training(config: Config, windows: list[Window]) -> Results:
-    """Another default dtype, autocast, matrix products in bfloat16 where torch may, no oneDNN."""
+    """With another default dtype, autocast, reduced precision of matrix products, and without oneDNN."""
     precision = torch.get_float32_matmul_precision()
     torch.set_default_dtype(torch.float64)
     torch.set_float32_matmul_precision("medium")
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # torch says which GPUs this machine has not
+            warnings.simplefilter("ignore")  # torch warns about missing GPUs
             with torch.backends.mkldnn.flags(enabled=False), torch.autocast("cpu", dtype=torch.bfloat16):
                 return together(config, windows)
     finally:
@@ -88,9 +88,9 @@ def while_training(config: Config, windows: list[Window]) -> Results:
         torch.set_default_dtype(torch.float32)
 
 
-WAYS: dict[str, Way] = {
-    way.__name__: way
-    for way in (
+CALLS: dict[str, Call] = {
+    call.__name__: call
+    for call in (
         backwards_and_again,
         among_others,
         in_pieces,
@@ -107,12 +107,12 @@ def expected(preset: str) -> tuple[Config, list[Window], Results]:
     return config, windows, plainly(config, windows)
 
 
-@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("call", CALLS)
 @pytest.mark.parametrize("preset", PRESETS)
-def test_no_way_changes_a_bit(preset: str, way: str) -> None:
+def test_results_have_the_same_bits_however_they_are_computed(preset: str, call: str) -> None:
     config, windows, results = expected(preset)
-    assert min(map(num_moving, results)) > 100  # there is something to change
-    found = WAYS[way](config, windows)
+    assert min(map(num_moving, results)) > 100  # the test is not empty
+    found = CALLS[call](config, windows)
     assert len(found) == len(results)
     for one, other in zip(found, results):
         assert_same_bits(one, other)

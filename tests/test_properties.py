@@ -1,4 +1,4 @@
-"""Properties on small windows that hypothesis draws: the oracle's result, shifts, rows, sums."""
+"""Properties on small windows drawn by hypothesis: equality with the oracle, shifts, sums."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def cflow(window: Window, *method: str, **overrides) -> FlowResult:
     return result
 
 
-# A cloud: centres of pixels within 2.5 m, so that shapes touch, split and move.
+# A cloud has points at the centres of pixels within 2.5 m, so that shapes touch, split and move.
 clouds = st.lists(st.tuples(*[st.integers(-10, 9)] * 2, st.integers(-4, 3)), max_size=25).map(
     lambda cells: (np.array(cells, dtype=np.float64).reshape(-1, 3) + 0.5) * S
 )
@@ -39,7 +39,7 @@ clouds = st.lists(st.tuples(*[st.integers(-10, 9)] * 2, st.integers(-4, 3)), max
 
 @st.composite
 def windows(draw, max_history: int = 3) -> Window:
-    """Sweeps that share most of their shape: a cloud, moved and partly replaced."""
+    """Sweeps that share most of their shape: one cloud, moved and partly replaced."""
     base, sweeps = draw(clouds), []
     for _ in range(2 + draw(st.integers(0, max_history))):
         move = np.array(draw(st.tuples(st.integers(-4, 4), st.integers(-4, 4), st.integers(-1, 1)))) * S
@@ -104,7 +104,7 @@ def test_keypoints_equal_the_oracle(window, overrides):
 @PROFILE
 @given(windows(), st.tuples(st.integers(-20, 20), st.integers(-20, 20)), dense)
 def test_a_shift_by_whole_pixels_shifts_the_scene(window, shift, overrides):
-    """Flow, clusters, scores stay with their points wherever in the image they lie."""
+    """Flow, clusters and scores stay with their points, anywhere in the image."""
     overrides = {**overrides, "pixel_sizes": (S,), "sectional_view": False}
     shifted = moved(window, np.array([*shift, 0]) * S)
     assert_same(cflow(shifted, **overrides), cflow(window, **overrides))

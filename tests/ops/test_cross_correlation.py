@@ -1,4 +1,4 @@
-"""Cross-correlation counts, against pairs of pixels one by one."""
+"""Cross-correlation counts, against a loop over pairs of pixels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Look-ups, counts, renumbering and division of index tensors, against NumPy."""
+"""Lookups, counts, renumbering and division of index tensors, against NumPy."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from cflow_torch.ops.indices import (
 CPU = torch.device("cpu")
 
 
-def test_division_of_indices():
+def test_indices_are_divided_like_integers():
     index = torch.tensor([0, 1, 6, 7, 8, 2**40, 2**62 + 5])
     for width in (1, 2, 7, 701, 2**31 + 1):
         row, col = split_index(index, width)

@@ -1,4 +1,4 @@
-"""Connected components of sparse images against SciPy: random images, hard shapes, every size, rounds of union-find."""
+"""Connected components of sparse images against SciPy: random images, hard shapes, sizes, rounds of union-find."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ STRUCTURE = {4: ndimage.generate_binary_structure(2, 1), 8: np.ones((3, 3), dtyp
 
 
 def by_scipy(images: np.ndarray, connectivity: int, reach: int) -> np.ndarray:
-    """What `connected_components` must return, image by image."""
+    """The expected result of `connected_components`, image by image."""
     first = []
     for image in images:
         drawn = ndimage.binary_dilation(image, STRUCTURE[8]) if reach == 3 else image
@@ -51,7 +51,7 @@ def test_random_images_equal_scipy(connectivity, reach, engine):
 @pytest.mark.parametrize("reach", [1, 3])
 @pytest.mark.parametrize("connectivity", [4, 8])
 def test_images_of_every_size_equal_scipy(connectivity, reach):
-    """Blocks and margins fit images of any size: the last row and column are full, so every neighbour is asked for."""
+    """Blocks and margins fit images of any size. Pixels in the last row and column test every neighbour."""
     rng = np.random.default_rng(connectivity + reach)
     for height, width in [(n, 1 + (5 * n) % 26) for n in range(1, 27)]:
         images = rng.random((3, height, width)) < 0.08
@@ -67,7 +67,7 @@ def test_without_union_find_kornia_says_what_to_do(monkeypatch):
 
 @pytest.mark.parametrize("connectivity", [4, 8])
 def test_sets_of_images_that_are_labelled_together_equal_each_set_alone(connectivity):
-    """Several sizes and reaches, one set is empty; the components of a set follow those of the set before."""
+    """Several sizes and reaches, and an empty set. The components of a set follow those of the set before."""
     rng = np.random.default_rng(connectivity)
     shapes = [((3, 9, 14), 3), ((3, 18, 28), 1), ((1, 5, 5), 1), ((3, 18, 28), 3), ((3, 40, 25), 1)]
     for density in ([0.3, 0.1, 0.0, 0.2, 0.4], [0.0] * 5, [1.0] * 5):
@@ -84,7 +84,7 @@ def test_sets_of_images_that_are_labelled_together_equal_each_set_alone(connecti
                 assert (component - together.first).tolist() == expected.tolist()
                 assert alone.first == 0 and bool((expected < alone.num_components).all())
                 before += alone.num_components
-            assert before == found[0].num_components, "the names of all sets follow each other"
+            assert before == found[0].num_components, "the components of all sets are numbered one after the other"
 
 
 # ------------------------------------------------------------------------------------------------------ hard shapes
@@ -94,7 +94,7 @@ def test_sets_of_images_that_are_labelled_together_equal_each_set_alone(connecti
 
 
 def spiral(size: int) -> np.ndarray:
-    """One arm, one pixel wide, that winds inwards; a free pixel between its turns."""
+    """One arm, one pixel wide, that winds inwards, with one free pixel between its windings."""
     image, low, high = np.zeros((size, size), dtype=bool), 0, size - 1
     image[0, 0] = True
     while low <= high:
@@ -105,7 +105,7 @@ def spiral(size: int) -> np.ndarray:
 
 
 def serpentine(size: int) -> np.ndarray:
-    """Rows joined alternately at the right and at the left."""
+    """Rows that are joined alternately at the right and at the left."""
     image = np.zeros((size, size), dtype=bool)
     image[::2] = True
     image[1::4, -1] = image[3::4, 0] = True
@@ -113,7 +113,7 @@ def serpentine(size: int) -> np.ndarray:
 
 
 def percolation(size: int) -> np.ndarray:
-    """At 0.593 4-connected clusters have every size."""
+    """At the density 0.593 the 4-connected clusters have every size."""
     return np.random.default_rng(0).random((size, size)) < 0.593
 
 
@@ -121,8 +121,8 @@ SHAPES: dict[str, Callable[[int], np.ndarray]] = {shape.__name__: shape for shap
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_hard_shapes_equal_scipy(shape):
-    """Turned and mirrored, as one batch."""
+def test_spirals_and_fractals_equal_scipy(shape):
+    """Rotated and mirrored, in one batch."""
     image = SHAPES[shape](63)
     images = np.stack([image, image[::-1], image[:, ::-1].T, np.zeros_like(image)])
     for connectivity, reach in ((4, 1), (8, 1), (8, 3)):

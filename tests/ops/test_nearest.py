@@ -9,7 +9,7 @@ from cflow_torch.ops.lower_surface import UNKNOWN, _cone, lower_surface
 from cflow_torch.ops.nearest import nearest_set_pixel
 
 
-def test_the_nearest_set_pixel_is_the_first_of_the_nearest():
+def test_the_nearest_pixel_is_the_first_in_raster_order_among_ties():
     for seed in range(9):
         rng = np.random.default_rng(seed)
         seeds = rng.random((3, 11, 8)) < (0.0, 0.02, 0.2)[seed % 3]
@@ -17,8 +17,8 @@ def test_the_nearest_set_pixel_is_the_first_of_the_nearest():
         pixels = np.sort(rng.choice(seeds.size, 60, replace=False))
         expected = []
         for image, row, col in zip(*np.unravel_index(pixels, seeds.shape)):
-            places = np.argwhere(seeds[image])  # in raster order: argmin takes the first of equals
-            best = places[((places - (row, col)) ** 2).sum(1).argmin()] if len(places) else None
+            found = np.argwhere(seeds[image])  # in raster order, so argmin breaks ties
+            best = found[((found - (row, col)) ** 2).sum(1).argmin()] if len(found) else None
             expected.append(-1 if best is None else int(np.ravel_multi_index((image, *best), seeds.shape)))
         assert nearest_set_pixel(torch.from_numpy(seeds), torch.from_numpy(pixels)).tolist() == expected
     assert nearest_set_pixel(torch.ones((1, 2, 2), dtype=torch.bool), torch.zeros(0, dtype=torch.int64)).shape == (0,)
@@ -32,7 +32,7 @@ def test_cones_are_the_highest_surfaces_of_limited_slope():
         assert found[b, r, c] == (heights[b].numpy() + 51 * steps).min()
 
 
-def test_the_lower_surface_passes_below_what_stands_on_it():
+def test_the_lower_surface_passes_below_objects():
     slope = 40 * np.arange(40)[:, None] + np.zeros((40, 40))
     low = torch.from_numpy(slope.astype(np.int32))[None]
     ground = low.clone()

@@ -1,4 +1,4 @@
-"""Sec. leverage_past_pcs: one estimate from those of several sweeps, by medians."""
+"""Oracle of Sec. leverage_past_pcs: combine the estimates of several sweeps by medians."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ import numpy as np
 
 
 def pool(estimates: Sequence[np.ndarray]) -> np.ndarray:
-    """Sec. leverage_past_pcs: median of the magnitudes and of the orientations, separately.
+    """Median of the magnitudes and of the orientations, separately (Sec. leverage_past_pcs).
 
     Args:
-        estimates: each (3,) float64, an estimate of f_{t -> t+1}, nearest sweep first; at least one.
+        estimates: at least one estimate of f_{t -> t+1}, (3,) float64 each, nearest sweep first.
 
     Returns:
         (3,) float64; z is the median of the z components.
 
     Convention:
-        One estimate is returned as it is. Even number: the mean of the middle two. Estimates of length 0 count
-        among the magnitudes, but have no orientation; if none has one the result is (0, 0). The median orientation
-        is taken about the circular mean; opposite estimates that cancel it are ordered about the nearest one.
+        One estimate is returned unchanged. Even number: the mean of the middle two. Estimates of length 0 count among
+        the magnitudes, but have no orientation; if all have length 0 the result is (0, 0). The median orientation is
+        taken about the circular mean. If opposite estimates cancel it, it is taken about the nearest one.
     """
     if len(estimates) == 1:
         return np.array(estimates[0], dtype=np.float64)
@@ -36,7 +36,7 @@ def pool(estimates: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def median(values: Sequence[float]) -> float:
-    """Median; of an even number the mean of the middle two."""
+    """Median. Even number: the mean of the middle two."""
     ordered = sorted(values)
     middle = len(ordered) // 2
     if len(ordered) % 2 == 1:
@@ -45,9 +45,9 @@ def median(values: Sequence[float]) -> float:
 
 
 def median_direction(directions: Sequence[tuple[float, float]]) -> tuple[float, float]:
-    """Angular median of unit vectors about their circular mean; of an even number the bisector of the middle two.
+    """Angular median of unit vectors about their circular mean. Even number: the bisector of the middle two.
 
-    Convention: equal angles keep the given order; middle two that are exactly opposite give the first of them.
+    Convention: equal angles keep the given order. If the middle two are exactly opposite, the first of them is taken.
     """
     mean_x, mean_y = 0.0, 0.0
     for u_x, u_y in directions:
@@ -56,7 +56,7 @@ def median_direction(directions: Sequence[tuple[float, float]]) -> tuple[float, 
         mean_x, mean_y = directions[0]
 
     def angle(u: tuple[float, float]) -> float:
-        """From the mean to u, counter-clockwise."""
+        """Angle from the mean to u, counter-clockwise."""
         return math.atan2(mean_x * u[1] - mean_y * u[0] + 0.0, mean_x * u[0] + mean_y * u[1])
 
     ordered = sorted(directions, key=angle)

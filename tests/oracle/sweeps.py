@@ -1,4 +1,4 @@
-"""From a window to clouds in the frame of t+1: ego motion compensation, repeated sweeps, elapsed times."""
+"""Oracle of the input: clouds in the frame of t+1, without repeated sweeps, with elapsed times."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ class Cloud(NamedTuple):
         points: (N, 3) float64, metres, frame of t+1; NaN for a point that was not finite.
         is_active: (N,) bool, finite, neither ground nor of the vehicle itself.
         intervals: k, sweep intervals to t+1: 1 for t, 2 for t-1, -1 for t+2 ..., or by time stamps; 0 for t+1 itself.
-        seconds: the same in seconds.
-        times: (N,) float64, sweep intervals from the instant of the sweep to each point, whole 2^-20; None = a sweep of
-            the window has none.
-        origin: (x, y, z), metres, frame of t+1: where the ego frame of the sweep has its origin.
+        seconds: `intervals` in seconds.
+        times: (N,) float64, sweep intervals from the instant of the sweep to each point, multiples of 2^-20; None = a
+            sweep of the window has none.
+        origin: (x, y, z), metres, frame of t+1: origin of the ego frame of the sweep.
     """
 
     points: np.ndarray
@@ -32,13 +32,13 @@ class Cloud(NamedTuple):
 
 
 class PointMotion(NamedTuple):
-    """What is found; rows in the order of the points.
+    """The result of a method; rows in the order of the points.
 
     Attributes:
-        flow: of each sweep m <= t, nearest first, (N, 3) float64, metres per sweep interval; 0 in no cluster.
-        cluster_id: of sweep t, (N,) int64, -1 in no cluster.
-        score: of sweep t, (N,) float64, NCC at the peak of the newest sweep; 0 in no cluster.
-        confidence: of sweep t, (N,) float64, where points take part; None = the method does not say.
+        flow: of each sweep m <= t, nearest first, (N, 3) float64, metres per sweep interval; 0 without a cluster.
+        cluster_id: of sweep t, (N,) int64, -1 without a cluster.
+        score: of sweep t, (N,) float64, NCC at the peak of the newest sweep; 0 without a cluster.
+        confidence: of sweep t, (N,) float64, for active points; None = the method does not estimate it.
     """
 
     flow: list[np.ndarray]
@@ -55,10 +55,9 @@ def compensate(window: Window, config: Config) -> tuple[list[Cloud], Cloud]:
         `config.num_future`; and sweep t+1.
 
     Convention:
-        A sweep that repeats one before it in this list, or one after t+1 that repeats t+1 (same points, same pose), is
-        dropped; the others keep their place in time.
-        Without poses the points already lie in the frame of t+1. Times are those of the time stamps if all sweeps
-        have one, else places in the window.
+        A sweep that repeats an earlier one of this list is dropped, and so is a sweep after t+1 that repeats t+1 (same
+        points, same pose). The others keep their times. Without poses the points are already in the frame of t+1.
+        Times are from the time stamps if all sweeps have one, else from the positions in the window.
     """
     past = [window.pc0, *window.pch[: config.num_history]]
     sweeps = [*past, *window.pcf[: config.num_future]]
@@ -74,14 +73,14 @@ def compensate(window: Window, config: Config) -> tuple[list[Cloud], Cloud]:
     for m, sweep in enumerate(sweeps):
         if is_repeat[m]:
             continue
-        place = len(past) - 1 - m if m >= len(past) else m + 1
-        intervals, seconds = float(place), place * config.sweep_interval
+        position = len(past) - 1 - m if m >= len(past) else m + 1
+        intervals, seconds = float(position), position * config.sweep_interval
         if None not in stamps:
             gap, first_gap = stamps[0] - stamps[m + 1], stamps[0] - stamps[1]  # type: ignore[operator]
             intervals, seconds = gap / first_gap, gap / 1e9
         times = _point_times(sweep, interval) if has_times else None
-        moved, keeps = _in_frame_of(window.pc1, sweep), _is_active(sweep, config)
-        clouds.append(Cloud(moved, keeps, intervals, seconds, times, _origin(window.pc1, sweep)))
+        moved, is_active = _in_frame_of(window.pc1, sweep), _is_active(sweep, config)
+        clouds.append(Cloud(moved, is_active, intervals, seconds, times, _origin(window.pc1, sweep)))
     times = _point_times(window.pc1, interval) if has_times else None
     return clouds, Cloud(xyz(window.pc1), _is_active(window.pc1, config), 0.0, 0.0, times)
 
@@ -91,12 +90,12 @@ def _point_times(sweep: Sweep, interval: float) -> np.ndarray:
 
 
 def xyz(sweep: Sweep) -> np.ndarray:
-    """(N, 3) float64, metres: the points of a sweep as they were given, without further columns."""
+    """(N, 3) float64, metres: x, y, z of the points of a sweep, in its own frame."""
     return as_numpy(sweep.points, np.float64)[:, :3]
 
 
 def ground_points(sweep: Sweep, cloud: Cloud) -> np.ndarray:
-    """(N, 3) float64, metres, frame of t+1: the ground of a sweep; none where it is not known."""
+    """(N, 3) float64, metres, frame of t+1: the ground of a sweep; empty if it is unknown."""
     if sweep.is_ground is None:
         return np.zeros((0, 3))
     return cloud.points[as_numpy(sweep.is_ground, bool) & np.isfinite(cloud.points).all(axis=1)]
@@ -132,9 +131,9 @@ def _is_repeat(sweep: Sweep, newer: Sweep) -> bool:
 
 def _is_active(sweep: Sweep, config: Config) -> np.ndarray:
     points = xyz(sweep)
-    keeps = np.isfinite(points).all(axis=1)
+    is_active = np.isfinite(points).all(axis=1)
     if config.ego_box is not None:
         x0, y0, x1, y1 = config.ego_box
         x, y = points[:, 0], points[:, 1]
-        keeps &= ~((x0 <= x) & (x <= x1) & (y0 <= y) & (y <= y1))
-    return keeps if sweep.is_ground is None else keeps & ~as_numpy(sweep.is_ground, bool)
+        is_active &= ~((x0 <= x) & (x <= x1) & (y0 <= y) & (y <= y1))
+    return is_active if sweep.is_ground is None else is_active & ~as_numpy(sweep.is_ground, bool)

@@ -1,4 +1,4 @@
-"""The BEV grid: the oracle's pixels where rounding decides, ends of the region, occupancy, sizes that are refused."""
+"""The BEV grid: pixels of the oracle where rounding decides, ends of the region, occupancy, size limits."""
 
 from __future__ import annotations
 
@@ -40,17 +40,6 @@ def test_the_region_includes_both_ends_and_no_nan():
     assert grid.contains(points).tolist() == [True] * 3 + [False] * 10
 
 
-def test_occupancy_of_the_points_that_take_part():
-    grid = Grid(1.0, (0.0, 0.0, -INF), (3.0, 2.0, INF))  # 3 rows, 4 columns
-    positions = torch.tensor([[0.5, 3.0, 2.2, 0.5, np.nan], [0.5, 2.0, 1.9, 0.7, 0.0], [0.0] * 5], dtype=torch.float64)
-    is_active = torch.tensor([True, True, False, True, False])
-    pixel = grid.pixel_of_image(positions, torch.tensor([0, 1, 1, 0, 1]), 2, is_active).long()
-    occupancy = grid.draw(pixel, 2)
-    assert occupancy.shape == (2, 3, 4)
-    assert occupancy.nonzero().tolist() == [[0, 0, 0], [1, 2, 3]]
-    assert pixel.tolist() == [0, 12 + 11, 24, 0, 24]
-
-
 def test_pixel_numbers_of_many_images_do_not_overflow():
     grid, num_images = Grid(0.5, (0.0, 0.0, -1.0), (1000.0, 1000.0, 1.0)), 2**11
     positions = torch.tensor([[0.25, 999.9], [0.25, 999.9]], dtype=torch.float64)
@@ -65,6 +54,6 @@ def test_pixel_numbers_of_many_images_do_not_overflow():
 @pytest.mark.parametrize(
     "size, upper", [(1e-4, 35.0), (0.1, 4000.0), (1e-300, 1.0)], ids=["many pixels", "a long side", "tiny pixels"]
 )
-def test_grids_that_nobody_can_hold_are_refused(size, upper):
+def test_too_large_grids_are_refused(size, upper):
     with pytest.raises(CFlowError, match="too large.*point_cloud_range or larger pixel_sizes"):
         Grid(size, (0.0, 0.0, -INF), (upper, 1.0, INF))

@@ -1,4 +1,4 @@
-"""Windows -> batch: what takes part, repeated sweeps, the vehicle's own returns, pieces, groups, forms of arrays."""
+"""Collation: active points, repeated sweeps, the ego box, groups of windows, forms of arrays."""
 
 from __future__ import annotations
 
@@ -11,13 +11,12 @@ import numpy as np
 import pytest
 import torch
 from preset_windows import PRESETS, changed, num_moving, small, windows_for
-from scenes import RANGE, assert_same_bits, assert_zeros, config, flow_as_oracle, pose, rows_of, same_bits, scene
+from scenes import RANGE, assert_same_bits, assert_zeros, config, flow_as_oracle, pose, rows_of, scene
 
 from cflow_torch import FlowResult, Sweep, Window, make_model
 from cflow_torch.config import Config
 from cflow_torch.windows import memory
 from cflow_torch.windows.bev_grid import Grid
-from cflow_torch.windows.collation import Batch, make_batch
 from cflow_torch.windows.memory import split_windows
 
 CPU = torch.device("cpu")
@@ -30,7 +29,7 @@ def cflow(window: Window, settings: Config) -> FlowResult:
     return result
 
 
-# ------------------------------------------------------------------------------------------------- what takes part
+# ------------------------------------------------------------------------------------------------- active points
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -48,8 +47,8 @@ def cflow(window: Window, settings: Config) -> FlowResult:
         (P0, FAR, (P1,)),
     ],
 )
-def test_nothing_to_find_gives_zeros_of_the_right_shape(pc0, pc1, others, preset):
-    """Sweeps before t, and after t+1 where the preset takes any."""
+def test_sweeps_without_matches_give_zero_flow(pc0, pc1, others, preset):
+    """The others are sweeps before t, and after t+1 if the preset uses any."""
     overrides = {"sectional_view": True, "pixel_sizes": (0.4, 0.2), "max_speed": 5.0} if preset == "paper" else {}
     settings = small(preset, **overrides)
     sweeps, more = ([Sweep(p, pose=pose(1, 2, 0.3)) for p in clouds] for clouds in ((pc0, pc1), others))
@@ -63,7 +62,7 @@ def test_nothing_to_find_gives_zeros_of_the_right_shape(pc0, pc1, others, preset
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_finite_points_beyond_all_bounds_change_nothing(preset):
-    """Squares of them are infinite, their slices and pixels no integers."""
+    """Their squares are infinite, and their height slices and pixels do not fit an integer."""
     settings = small(preset, point_cloud_range=(*RANGE[:2], -math.inf, *RANGE[3:5], math.inf))
     (window,) = windows_for(settings)
     wild = np.array([[1e300, 0, 0], [0, -1e20, 0], [1.0, 2.0, 1e300], [1e300, 1e300, 1e300]])
@@ -76,11 +75,11 @@ def test_finite_points_beyond_all_bounds_change_nothing(preset):
     assert all(torch.isfinite(values.double()).all() for values in vars(result).values() if values is not None)
 
 
-def test_repeated_sweeps_are_dropped_and_the_others_keep_their_place():
+def test_repeated_sweeps_are_dropped_and_the_others_keep_their_times():
     window = scene(3, num_history=3)
-    assert np.isnan(window.pc0.points).any()  # NaN points do not hide that two sweeps are the same
+    assert np.isnan(window.pc0.points).any()  # sweeps with NaN points can be equal, too
     copy = replace(window.pc0, points=window.pc0.points.copy(), pose=window.pc0.pose.copy())
-    other_pose = replace(window.pc0, pose=window.pch[0].pose)  # same points, other pose: not a repetition
+    other_pose = replace(window.pc0, pose=window.pch[0].pose)  # same points, other pose: not repeated
     for pch in [(window.pc0, *window.pch), (window.pch[0], copy, window.pch[1]), (other_pose,), (window.pc1,)]:
         flow_as_oracle(replace(window, pch=pch), config(num_history=4))
     once, thrice = (cflow(replace(window, pch=(window.pc0,) * n), config(num_history=3)) for n in (0, 3))
@@ -93,7 +92,7 @@ BOX = (-1.5, -1.0, 2.5, 1.0)
 
 
 def drive(num_history: int) -> Window:
-    """The vehicle drives 0.8 m a sweep past a wall; hood and mirrors are seen from the sensor."""
+    """The vehicle drives past a wall at 0.8 m per sweep. The sensor sees its hood and mirrors."""
     rng, sweeps = np.random.default_rng(0), []
     wall = rng.uniform((-6, 3.0, -1.0), (6, 3.2, 1.0), (600, 3))
     for k in range(num_history + 2):
@@ -105,7 +104,7 @@ def drive(num_history: int) -> Window:
 
 
 @pytest.mark.parametrize("method, num_history", [("dense", 2), ("keypoints", 0), ("verified", 2)])
-def test_own_returns_move_with_the_sensor_and_a_box_leaves_them_out(method, num_history):
+def test_the_ego_box_removes_returns_of_the_vehicle(method, num_history):
     window, overrides = drive(num_history), {} if method == "keypoints" else {"num_history": num_history}
     without, result = (cflow(window, config(method, ego_box=box, **overrides)) for box in (None, BOX))
     assert without.residual_flow[600:, 0].mean() > 0.6
@@ -114,8 +113,8 @@ def test_own_returns_move_with_the_sensor_and_a_box_leaves_them_out(method, num_
     assert_same_bits(rows_of(result, np.arange(600)), cflow(bare, config(method, **overrides)))
 
 
-def test_the_box_is_that_of_the_sweep_and_holds_its_ends():
-    # At t the post lies in the box of t, not in that of t+1, 5 m ahead; NaN lies nowhere.
+def test_the_ego_box_is_in_the_frame_of_each_sweep_and_includes_its_ends():
+    # At t the post is in the box of t, not in the box of t+1, 5 m ahead. NaN is outside every box.
     points = np.array([[2.5, 1.0, 0], [np.nextafter(2.5, 3), 0, 0], [math.nan, 0, 0], [0, 0, 0], [7.5, 0, 0]])
     window = Window(Sweep(points, pose=np.eye(4)), Sweep(points, pose=pose(5.0, 0.0, 0.0)))
     settings = config(ego_box=BOX, point_cloud_range=(-10, -10, -5, 10, 10, 5))
@@ -135,43 +134,6 @@ def test_windows_are_grouped_by_memory(monkeypatch):
     assert sum(sizes(1_000_000)) == 5 and 1 < len(sizes(1_000_000)) < 5
     monkeypatch.setattr(memory, "_BYTES_ON_CPU", 1)
     assert sizes() == [1] * 5 and split_windows([], grid, CPU, 160, None) == []
-
-
-def test_a_batch_of_twice_the_windows_holds_the_same_points():
-    settings = small("default")
-    windows = windows_for(settings, 2)
-    batch = make_batch(windows, settings, Grid(0.5, RANGE[:3], RANGE[3:]), CPU, 3, needs_times=True)
-    twice = batch.with_empty_windows()
-    assert (twice.num_windows, twice.num_steps) == (4, batch.num_steps) and twice.positions is batch.positions
-    assert twice.image is batch.image and twice.rows == batch.rows, "no point lies in a window that was added"
-    for name in ("elapsed", "seconds", "origin"):
-        before, after = getattr(batch, name), getattr(twice, name)
-        assert torch.equal(after[:2], before) and torch.equal(after[2:], before)
-
-
-def points_of(batch: Batch, window: int, step: int) -> torch.Tensor:
-    return batch.positions[:, batch.image == (window * batch.num_steps + step if step < batch.num_steps else -1)]
-
-
-def test_both_sides_are_the_windows_without_later_and_without_older_sweeps():
-    settings, grid = config("verified", num_history=3, num_future=3), Grid(0.25, RANGE[:3], RANGE[3:])
-    sides = ((3, 1), (0, 2), (1, 0))
-    windows = [scene(seed, num_history=h, num_future=f) for seed, (h, f) in enumerate(sides)]
-    batch = make_batch(windows, settings, grid, CPU, 3, needs_times=True)
-    both, copied = batch.split_past_and_future()
-    assert both.num_windows == 6 and len(both.image) == len(batch.image) + len(copied)
-    assert same_bits(both.positions[:, -len(copied) :], batch.positions[:, copied]), "copies are behind all points"
-    assert bool((batch.image[copied] % batch.num_steps < 2).all())
-    for number, window in enumerate(windows):
-        past, after = (replace(window, **left_out) for left_out in ({"pcf": ()}, {"pch": ()}))
-        for place, side in ((number, past), (3 + number, after)):
-            alone = make_batch([side], settings, grid, CPU, 3, needs_times=True)
-            for step in range(both.num_steps):
-                expected = points_of(alone, 0, step)  # none where the window has no such step
-                assert same_bits(points_of(both, place, step), expected)
-            for name in ("elapsed", "seconds", "origin"):
-                found, expected = getattr(both, name)[place], getattr(alone, name)[0]
-                assert torch.equal(found[: alone.num_steps], expected) and not found[alone.num_steps :].any()
 
 
 # ---------------------------------------------------------------------------------------------- forms of arrays
@@ -209,7 +171,7 @@ def coarse(sweep: Sweep) -> Sweep:
     return Sweep((np.round(points * 16) / 16).astype(np.float32), sweep.is_ground)
 
 
-def test_forms_of_arrays_do_not_matter_and_are_left_alone():
+def test_results_do_not_depend_on_the_form_of_arrays():
     settings = small("paper", num_history=1, sectional_view=True)
     plain = changed(windows_for(settings)[0], coarse)
     expected = cflow(plain, settings)
@@ -225,8 +187,7 @@ def test_forms_of_arrays_do_not_matter_and_are_left_alone():
         assert [as_bytes(sweep.points) for sweep in (given.pc0, given.pc1, *given.pch, *given.pcf)] == before
 
 
-def test_results_do_not_change_with_the_input():
-    """Nothing of a result lies in the memory of what was given."""
+def test_results_share_no_memory_with_the_input():
     settings = small("paper")
     given = changed(windows_for(settings)[0], lambda sweep: Sweep(torch.from_numpy(sweep.points), sweep.is_ground))
     result = cflow(given, settings)

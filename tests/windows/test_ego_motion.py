@@ -1,4 +1,4 @@
-"""Ego motion: transforms in float64 against matrix products, and matrices that are none."""
+"""Ego motion: transforms in float64 against matrix products, and invalid transforms."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def random_transform(rng: np.random.Generator) -> np.ndarray:
     return T
 
 
-def test_points_are_transformed_and_left_alone():
+def test_compensation_equals_the_matrix_product_and_keeps_its_input():
     rng = np.random.default_rng(0)
     T, p = random_transform(rng), rng.normal(0, 60, (3, 1000))
     given = torch.from_numpy(p.copy())
@@ -26,7 +26,7 @@ def test_points_are_transformed_and_left_alone():
     assert (given.numpy() == p).all() and torch.equal(compensate(given, None), given)
 
 
-def test_x_and_y_alone_are_those_of_the_whole_transform():
+def test_two_axes_have_the_bits_of_three():
     rng = np.random.default_rng(3)
     given, T = torch.from_numpy(rng.normal(0, 30, (3, 400))), random_transform(rng)
     broken = torch.tensor([np.nan, np.inf, -np.inf, np.nan] * 10).double()
@@ -34,7 +34,7 @@ def test_x_and_y_alone_are_those_of_the_whole_transform():
     whole, flat = compensate(given, T), compensate(given, torch.from_numpy(T), num_axes=2)
     assert torch.equal(whole[:2].nan_to_num(7.0), flat.nan_to_num(7.0))
     grid = Grid(0.5, (-60.0, -60.0, -np.inf), (60.0, 60.0, np.inf))
-    # What is not finite in z is not finite in x and y either.
+    # A z that is not finite spreads to x and y.
     assert torch.equal(grid.contains(whole), grid.contains(flat)) and 0 < grid.contains(whole).sum() < 400
 
 
@@ -58,7 +58,7 @@ def test_a_relative_transform_maps_through_the_world():
         ([[1, 2], [3]], "T is list"),
     ],
 )
-def test_what_is_no_rigid_transform_is_named(matrix, complaint):
+def test_invalid_transforms_are_named(matrix, complaint):
     with pytest.raises(CFlowError, match=complaint):
         rigid_transform(matrix, "T")
 
@@ -73,7 +73,7 @@ def test_what_is_no_rigid_transform_is_named(matrix, complaint):
         (torch.float64, 1e7, False),
     ],
 )
-def test_types_that_do_not_hold_a_pose_are_refused(dtype, x, refused):
+def test_too_coarse_types_of_poses_are_refused(dtype, x, refused):
     T = pose(x, 1.0, 0.0)
     given = torch.from_numpy(T).to(dtype) if isinstance(dtype, torch.dtype) else T.astype(dtype)
     if not refused:

@@ -1,4 +1,4 @@
-"""Ground without a map: exact properties, scenes by hand, accuracy on simulated and real sweeps, `ground="auto"`."""
+"""Ground without a map: exact properties, hand-made scenes, accuracy on simulated and real sweeps, `ground="auto"`."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def overlap(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def rings(height: float, beams: int = 16, columns: int = 900) -> np.ndarray:
-    """(N, 3) where the beams of a level LiDAR meet a level floor `height` metres below it."""
+    """(N, 3) returns of a level LiDAR from a level floor `height` metres below it."""
     down = np.radians(np.linspace(-25.0, -1.0, beams))
     r = np.repeat(height / np.tan(-down), columns)
     angle = np.tile(np.linspace(-np.pi, np.pi, columns, endpoint=False), beams)
@@ -63,7 +63,7 @@ def test_the_mounting_height_does_not_matter(sweeps):
 
 
 def test_points_that_are_not_finite_or_far_away_are_not_ground(sweeps):
-    points = sweeps[0].points + np.array([0, 0, 0.5], np.float32)  # the origin lies below the ground
+    points = sweeps[0].points + np.array([0, 0, 0.5], np.float32)  # the origin is below the ground
     bad = np.full((8, 3), -0.5, np.float32)
     bad[:5, 0] = (np.nan, np.inf, -np.inf, 131.08, 1e30)
     bad[5:, 2] = (np.nan, np.inf, -np.inf)
@@ -112,14 +112,14 @@ def test_bad_arguments(arguments, complaint):
 
 
 @pytest.mark.parametrize("height", [0.5, 1.73, 3.0])
-def test_a_level_floor_seen_by_sixteen_beams_and_what_stands_on_it(height):
+def test_a_box_on_a_level_floor_is_not_ground(height):
     floor, box = rings(height), block((6, -1, 0.31 - height), (10, 1, 1.5 - height), 2000, 1)
     mask = find_ground(np.concatenate([floor, box]))
     assert mask[: len(floor)].all() and not mask[len(floor) :].any()
 
 
 @pytest.mark.parametrize("slope", [-0.22, 0.22])
-def test_a_tilted_floor(slope):
+def test_a_tilted_floor_is_ground(slope):
     floor, box = rings(1.7), block((6, -1, 0.45 - 1.7), (10, 1, 1.5 - 1.7), 2000, 1)
     for points in (floor, box):
         points[:, 2] += slope * (0.8 * points[:, 0] + 0.6 * points[:, 1])
@@ -131,7 +131,7 @@ def test_kerbs_are_ground_and_walls_bridges_and_roofs_are_not():
     floor, wall = rings(1.7), block((-20, 9, -1.2), (20, 9.1, 3), 5000, 2)
     kerbs = floor + 0.15 * (floor[:, 1:2] > 4) * [0, 0, 1]
     bridge, roof = block((12, -15, 3.2), (20, 15, 3.3), 6000, 3), block((-40, 20, 2.5), (-20, 40, 2.6), 4000, 4)
-    open_road = floor[(floor[:, 0] < 12) | (floor[:, 0] > 20)]  # the bridge hides the road under it
+    open_road = floor[(floor[:, 0] < 12) | (floor[:, 0] > 20)]  # the road under the bridge is occluded
     for ground, others in ((kerbs, wall), (open_road, np.concatenate([bridge, roof]))):
         mask = find_ground(np.concatenate([ground, others]))
         assert mask[: len(ground)].mean() > 0.995 and not mask[len(ground) :].any()
@@ -149,24 +149,24 @@ def test_multipath_points_below_the_ground_do_not_pull_it_down(sweeps):
 # --------------------------------------------------------------------------------------------------------- accuracy
 
 
-def test_a_simulated_drive_and_the_same_bent_into_hills():
+def test_a_simulated_drive_on_flat_ground_and_on_hills():
     drive = make_drive(seed=SEED, num_sweeps=1, profile="av2")
     sweep = drive.sweep(0)
     points = sweep.points.astype(np.float64)
     world = points @ sweep.pose[:3, :3].T + sweep.pose[:3, 3]
     truth = world[:, 2] - drive.scene.ground.height(world[:, 0], world[:, 1]) <= 0.3  # the rule of the raster
     mask = find_ground(sweep.points)
-    assert overlap(mask, truth) > 0.93 and mask[sweep.is_ground].mean() > 0.99  # what rays truly hit the ground
+    assert overlap(mask, truth) > 0.93 and mask[sweep.is_ground].mean() > 0.99  # rays that hit the ground
     points[:, 2] += 1.5 * np.sin(2 * np.pi * points[:, 0] / 80) + 0.1 * points[:, 1]  # 12 % up and down on 10 %
     assert overlap(find_ground(points), truth) > 0.9
     clouds = [sweep.points[~sweep.is_ground], sweep.points[~mask], sweep.points]
     assert has_ground(clouds) == [False, False, True]
 
 
-def test_real_sweeps_against_the_map_and_the_stored_mask(av2_folder, kitti_file):
+def test_real_sweeps_agree_with_the_map_and_the_stored_mask(av2_folder, kitti_file):
     sweep = AV2Log(av2_folder).sweep(0)
     mine = find_ground(sweep.points)
-    assert overlap(mine, sweep.is_ground) > 0.93  # also where the map knows nothing
+    assert overlap(mine, sweep.is_ground) > 0.93  # also outside the map
     sensor = sweep.points - np.array([1.35, 0, 1.64], np.float32)
     assert overlap(find_ground(sensor), sweep.is_ground) > 0.93
     assert has_ground([sweep.points, sweep.points[~sweep.is_ground], sweep.points[~mine]]) == [True, False, False]
@@ -175,7 +175,7 @@ def test_real_sweeps_against_the_map_and_the_stored_mask(av2_folder, kitti_file)
         assert overlap(find_ground(sweep.points), sweep.is_ground) > 0.93
 
 
-def test_patchwork():
+def test_patchwork_finds_the_ground_at_any_height():
     pytest.importorskip("pypatchworkpp")
     sweep = make_drive(seed=SEED, num_sweeps=1, profile="av2").sweep(0)
     for shift in (0.0, 1.7):
@@ -188,14 +188,14 @@ def test_patchwork():
 
 @pytest.fixture(scope="module")
 def street() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Two bare clouds with ground, a car that moves 0.8 m, parked cars; what each row of pc0 is: 0 = the car, 1, 2."""
+    """Two clouds with a car that moves 0.8 m, parked cars and the floor. Kind of each row of pc0: 0, 1 and 2."""
     floor, car = rings(1.7, beams=32), block((8, -1, -1.5), (12, 0.8, 0.0), 3000, 6)
     parked = [block((x, y, -1.65), (x + 4, y + 1.8, 0.0), 2000, 7) for x, y in ((-9, 4), (5, 5), (16, 4))]
     pc0, pc1 = (np.concatenate([car + [0.8 * step, 0, 0], *parked, floor]) for step in (0, 1))
     return pc0, pc1, np.repeat([0, 1, 2], [len(car), 6000, len(floor)])
 
 
-def test_auto_finds_the_moving_car_and_leaves_the_rest_still(street):
+def test_ground_auto_finds_the_moving_car(street):
     pc0, pc1, part = street
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -207,12 +207,12 @@ def test_auto_finds_the_moving_car_and_leaves_the_rest_still(street):
     assert is_valid[(part < 2) & above].all() and not is_valid[part == 2].any()
 
 
-def test_without_masks_there_is_a_warning(street):
+def test_a_missing_mask_gives_a_warning(street):
     pc0, pc1, part = street
     with pytest.warns(UserWarning, match="ground='auto'") as record:
         result = estimate_flow(pc0, pc1, preset="paper")
     assert len(record) == 1 and record[0].filename == __file__
-    assert np.abs(result.residual_flow.numpy()[part == 0] - [0.8, 0, 0]).max() > 0.5  # what the warning is about
+    assert np.abs(result.residual_flow.numpy()[part == 0] - [0.8, 0, 0]).max() > 0.5  # the warning's reason
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         nothing = np.zeros(len(pc0), dtype=bool)
@@ -220,9 +220,9 @@ def test_without_masks_there_is_a_warning(street):
         estimate_flow(pc0[part < 2], pc1[part < 2], preset="paper")
 
 
-def test_auto_keeps_masks_that_are_given_and_masks_the_history_too(street):
+def test_ground_auto_keeps_given_masks_and_adds_those_of_the_history(street):
     pc0, pc1, part = street
-    mine = part == 0  # not ground at all, but it is the user's word
+    mine = part == 0  # not ground, but the user's mask counts
     result = estimate_flow(pc0, pc1, gm0=mine, ground="auto", preset="paper")
     assert not result.is_valid[mine].any() and result.is_valid[part == 1].all()
     older = pc0 - np.where(mine[:, None], [0.8, 0, 0], 0)

@@ -1,4 +1,4 @@
-"""Memory: what the machine says is free, and the refusal of what does not fit before it is asked for."""
+"""Memory: free memory of the machine, and errors before an allocation that does not fit."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ CPU = torch.device("cpu")
 
 
 def highest_resident_kb() -> int:
-    """Most memory that this process ever held."""
+    """Largest resident memory of this process."""
     status = Path("/proc/self/status")
     if not status.exists():
         pytest.skip("no /proc/self/status: resident memory cannot be read")
@@ -25,32 +25,32 @@ def highest_resident_kb() -> int:
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-def test_what_does_not_fit_is_refused_before_it_is_made(preset, monkeypatch):
+def test_too_large_windows_are_refused_before_allocation(preset, monkeypatch):
     monkeypatch.setattr(memory, "available_memory", lambda environ: 4_000_000_000)
     before, car = highest_resident_kb(), np.zeros((100, 3))
     wide = (-1000.0, -1000.0, -3.0, 1000.0, 1000.0, 3.0)
     with pytest.raises(CFlowError, match=r"20(00|08)1 x 20(00|08)1 pixels of 0.1 m.*4.0 GB.*smaller point_cloud_range"):
         estimate_flow(car, car, preset=preset, point_cloud_range=wide)
-    points = np.broadcast_to(np.float32([1.0, 2.0, 0.5]), (10**8, 3))  # takes no memory itself
+    points = np.broadcast_to(np.float32([1.0, 2.0, 0.5]), (10**8, 3))  # a view that takes no memory
     with pytest.raises(CFlowError, match=r"200000000 points in 2 sweeps.*fewer points"):
         make_model(small(preset), "cpu")([Window(Sweep(points), Sweep(points))])
     assert highest_resident_kb() - before < 50_000
 
 
-def test_memory_is_that_of_the_machine():
+def test_requests_are_compared_with_the_free_memory():
     free = memory.available_memory({})
     if free is None:
-        pytest.skip("no /proc/meminfo: nobody says how much memory is free")
+        pytest.skip("no /proc/meminfo: free memory is unknown")
     memory.require_memory(free // 2, CPU, "half of it", "")
-    with pytest.raises(CFlowError, match="all of it needs about .*GB.*cpu has .* left: mend"):
-        memory.require_memory(4 * free + 2**40, CPU, "all of it", "mend")
+    with pytest.raises(CFlowError, match="all of it needs about .*GB.*cpu has .* left: use less"):
+        memory.require_memory(4 * free + 2**40, CPU, "all of it", "use less")
 
 
-def test_a_job_has_a_share_of_the_machine(monkeypatch, tmp_path):
+def test_torchrun_and_control_groups_limit_the_memory(monkeypatch, tmp_path):
     monkeypatch.setattr(memory, "control_groups", list)
     alone = memory.available_memory({})
     if alone is None:
-        pytest.skip("no /proc/meminfo: nobody says how much memory is free")
+        pytest.skip("no /proc/meminfo: free memory is unknown")
     assert memory.available_memory({"LOCAL_WORLD_SIZE": "4"}) <= alone // 3
     (tmp_path / "memory.max").write_text("9000000\n")
     (tmp_path / "memory.current").write_text("2000000\n")

@@ -1,4 +1,4 @@
-"""Input that is refused: one error that names the thing and says what to give."""
+"""Invalid input: one error names it and says what to give."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ MODEL = CorrelationFlow.from_preset("paper", num_history=1, pixel_size=0.25)
 
 
 def refused(*sweeps: Sweep, match: str) -> None:
-    """pc0, pc1 and maybe one of history."""
+    """Pass pc0, pc1 and maybe one older sweep."""
     with pytest.raises(CFlowError, match=match):
         MODEL([Window(sweeps[0], sweeps[1], tuple(sweeps[2:]))])
 
@@ -34,7 +34,7 @@ def refused(*sweeps: Sweep, match: str) -> None:
         (P0.tolist(), "is list"),
     ],
 )
-def test_points_of_the_wrong_kind(points, complaint):
+def test_invalid_points_are_named(points, complaint):
     good = Sweep(P1)
     refused(Sweep(points), good, match="pc0.*" + complaint)
     refused(good, Sweep(points), match="pc1.*" + complaint)
@@ -50,7 +50,7 @@ def test_points_of_the_wrong_kind(points, complaint):
         ([False] * 50, "is list"),
     ],
 )
-def test_ground_masks_of_the_wrong_kind(mask, complaint):
+def test_invalid_ground_masks_are_named(mask, complaint):
     refused(Sweep(P0, mask), Sweep(P1), match="ground mask of pc0.*" + complaint)
     refused(Sweep(P1), Sweep(P0), Sweep(P0 + 1, mask), match="ground mask of pch1.*" + complaint)
 
@@ -60,13 +60,13 @@ def test_ground_masks_of_the_wrong_kind(mask, complaint):
     [None, Window(Sweep(P0), Sweep(P1)), [Sweep(P0)], [P0, P1], [Window(P0, P1)], [Window(Sweep(P0), Sweep(P1), None)]],
     ids=["None", "Window", "Sweep", "arrays", "Window of arrays", "no history"],
 )
-def test_what_is_no_list_of_windows(windows):
+def test_invalid_windows_are_refused(windows):
     with pytest.raises(CFlowError, match="Window|Sweep"):
         MODEL(windows)
 
 
 @pytest.mark.parametrize("given", [(0,), (1,), (0, 1), (1, 2)])
-def test_poses_of_some_sweeps_only(given):
+def test_poses_of_some_sweeps_only_are_refused(given):
     refused(*(Sweep(p, pose=EYE if i in given else None) for i, p in enumerate((P0, P1, P0 + 1))), match="pose")
 
 
@@ -76,24 +76,24 @@ def test_bad_poses_are_named(which, name):
         refused(*(Sweep(p, pose=bad if i == which else EYE) for i, p in enumerate((P0, P1, P0 + 1))), match=name)
 
 
-def test_poses_of_another_log():
+def test_poses_too_far_apart_are_refused():
     refused(Sweep(P0, pose=pose(5000.0, 100.0, 0.0)), Sweep(P1, pose=EYE), match="moves 5001 m between pc0 and pc1")
 
 
 @pytest.mark.parametrize("stamps", [(0, 0, -1), (0, 1, -1), (0, -1, 1), (0, -1, -1)])
-def test_time_stamps_out_of_order(stamps):
+def test_time_stamps_out_of_order_are_refused(stamps):
     pc1, pc0, older = (Sweep(p, timestamp_ns=10**9 + 10**8 * s) for p, s in zip((P1, P0, P0 + 1), stamps))
     refused(pc0, pc1, older, match="time stamps.*out of order.*newest to oldest")
 
 
 @pytest.mark.parametrize("stamp", [float("nan"), "now", 2**63, [1, 2]], ids=str)
-def test_time_stamps_that_are_none_are_named(stamp):
+def test_invalid_time_stamps_are_named(stamp):
     for stamps, name in (((10**9, stamp), "pc1"), ((stamp, 10**9), "pc0")):
         pc0, pc1 = (Sweep(p, timestamp_ns=s) for p, s in zip((P0, P1), stamps))
         refused(pc0, pc1, match=f"timestamp_ns of {name} is .*whole nanoseconds")
 
 
-def test_of_more_history_than_is_asked_for_the_nearest_is_used(caplog):
+def test_a_longer_history_is_cut_to_the_nearest_sweeps(caplog):
     model = CorrelationFlow.from_preset("paper", num_history=1)
     pc0, pc1, *older = map(Sweep, (P0, P1, P0 + 1, P0 + 2))
     with caplog.at_level("INFO", "cflow_torch"):
@@ -113,7 +113,7 @@ def test_of_more_history_than_is_asked_for_the_nearest_is_used(caplog):
         (lambda p: torch.from_numpy(p).bfloat16(), 60.0, True),
     ],
 )
-def test_types_too_coarse_for_pixels_are_refused(points, far, is_refused):
+def test_too_coarse_types_of_points_are_refused(points, far, is_refused):
     model = CorrelationFlow.from_preset(
         "paper", pixel_size=0.25, point_cloud_range=(far - 8, far - 8, -8, far + 8, far + 8, 8)
     )
@@ -125,7 +125,7 @@ def test_types_too_coarse_for_pixels_are_refused(points, far, is_refused):
         model([window])
 
 
-def test_devices():
+def test_unusable_and_mixed_devices_are_refused():
     cpu, other = torch.from_numpy(P0), torch.from_numpy(P1).to("meta")
     for pc0, pc1 in ((cpu, other), (other, cpu)):
         with pytest.raises(CFlowError, match=r"different devices \(cpu, meta\)"):
