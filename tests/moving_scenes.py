@@ -7,6 +7,7 @@ from typing import NamedTuple, Sequence
 import numpy as np
 import torch
 from oracle.height_slices import NUM_SLICES, SLICE_HEIGHT, Pixel, Place, SlicedSweeps, Vector
+from oracle.registration import LAYER_HEIGHT, NUM_LAYERS
 from oracle.voxels import Point
 from oracle.voxels import points_of_objects as listed_points
 
@@ -35,7 +36,8 @@ class Scene(NamedTuple):
 
     def points(self) -> ObjectPoints:
         """Of all objects."""
-        return points_of_objects(self.sweeps, self.objects, torch.ones(len(self.flow), dtype=torch.bool))
+        every = torch.ones(len(self.flow), dtype=torch.bool)
+        return points_of_objects(self.sweeps, self.objects, every, LAYER_HEIGHT, NUM_LAYERS)
 
     def windows(self) -> list[OracleWindow]:
         """The same for the oracle, window by window."""
@@ -64,7 +66,7 @@ class OracleWindow:
 
     def points(self) -> list[Point]:
         """Of all objects."""
-        return listed_points(self.sweeps, self.object_of, [True] * self.num_objects)
+        return listed_points(self.sweeps, self.object_of, [True] * self.num_objects, LAYER_HEIGHT, NUM_LAYERS)
 
 
 def for_oracle(sweeps: HeightSlicedSweeps, window: int) -> SlicedSweeps:

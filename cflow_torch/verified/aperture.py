@@ -18,7 +18,6 @@ import torch
 from torch import Tensor
 
 from cflow_torch.ops.indices import flat_nonzero, floor_divide, gather, renumber, scatter_count, split_index
-from cflow_torch.ops.segments import segment_amin
 from cflow_torch.verified.height_slices import HeightSlicedSweeps, Pixels, count_slices
 
 # A line: largest standard deviation across and smallest along, metres.
@@ -87,17 +86,11 @@ def principal_axes(
         num_components: A.
         pixel_size: s, metres.
     """
-    # Counted from the corner of its box, sums of squares stay exact.
-    top, left = (segment_amin(at, component, num_components, 1 << 61).index_select(0, component) for at in (row, col))
-    y, x = row - top, col - left
-    moments = torch.stack((torch.ones_like(y), y, x, y * y, x * x, y * x))
-    n, sum_y, sum_x, sum_yy, sum_xx, sum_yx = scatter_count(component, num_components, moments).double()
-    n = n.clamp(min=1)
-    square = n * n
-    var_y, var_x, cov = (
-        (n * sums - product) / square
-        for sums, product in ((sum_yy, sum_y * sum_y), (sum_xx, sum_x * sum_x), (sum_yx, sum_y * sum_x))
-    )
+    moments = torch.stack((torch.ones_like(row), row, col, row * row, col * col, row * col))
+    n, y, x, yy, xx, yx = scatter_count(component, num_components, moments)
+    # Differences of large products, exact in whole numbers.
+    square = (n * n).clamp(min=1).double()
+    var_y, var_x, cov = torch.stack((n * yy - y * y, n * xx - x * x, n * yx - y * x)) / square
     # Eigenvalues of the 2 x 2 matrix; of the two ways to write the eigenvector, the one that does not vanish.
     mean, half = (var_y + var_x) / 2, (var_y - var_x) / 2
     root = torch.sqrt(half * half + cov * cov)
@@ -153,9 +146,9 @@ def both_ends_move(sweeps: HeightSlicedSweeps, roots: Tensor, is_long: Tensor) -
         False for all others.
 
     Convention:
-        The component lies along the principal axis of its pixels at t+1; its ends in a sweep are the least and largest
-        projection of its pixels there, elementwise float64 in the written order. Of sweeps equally far in time the
-        first. A component without pixels in that sweep does not move.
+        A component lies along y, x or one of the diagonals: along the one in which its pixels at t+1 reach farthest.
+        Its ends are the first and the last pixel in this direction. Ties: the first direction; of sweeps equally far in
+        time the first. A component without pixels in that sweep does not move.
 
     Cost: some passes over the pixels of long components.
     Source: not in the paper.
@@ -167,25 +160,21 @@ def both_ends_move(sweeps: HeightSlicedSweeps, roots: Tensor, is_long: Tensor) -
     number = renumber(name, is_long.numel()).index_select(0, roots.flatten())
     some = flat_nonzero(number < count)
     pixels, owner = sweeps.pixels.take(some % roots.shape[1]), number.index_select(0, some)
-    newest = flat_nonzero(pixels.step == 0)
-    of_newest, row, col, slices = gather(newest, owner, pixels.row, pixels.col, pixels.slices)
-    _, axis_y, axis_x = principal_axes(of_newest, row, col, count, sweeps.grid.pixel_size)
-    is_tall = scatter_count(of_newest, count, count_slices(slices).long() - _TALL) >= 0
+    is_new = pixels.step == 0
+    num_slices = torch.where(is_new, count_slices(pixels.slices).long() - _TALL, 0)
+    is_tall = scatter_count(owner, count, num_slices) >= 0
 
-    place = pixels.row * axis_y.index_select(0, owner) + pixels.col * axis_x.index_select(0, owner)
+    # Ends in four directions, at t+1 and in the farthest sweep; pixels of other sweeps count for a component behind.
     is_farthest = pixels.step == sweeps.elapsed.abs().argmax(1).index_select(0, pixels.window)
-    (low, high), (low_then, high_then) = (
-        _ends(place.index_select(0, some), owner.index_select(0, some), count)
-        for some in (newest, flat_nonzero(is_farthest))
-    )
-    low, high = low - low_then, high - high_then  # infinite or NaN where one of them is not seen
-    both, least = low + high, 2 * _LEAST_TRAVEL / sweeps.grid.pixel_size
-    is_far = both * both >= (least * least) * (axis_y * axis_y + axis_x * axis_x)
-    moves = is_tall & is_far & ((low - high).abs() <= _ALIKE * both.abs())
+    of_sweep = torch.where(is_new, owner, torch.where(is_farthest, owner + count, 2 * count))
+    along = torch.stack((pixels.row, pixels.col, pixels.row + pixels.col, pixels.row - pixels.col)).double()
+    infinite = along.new_full((4, 2 * count + 1), math.inf)
+    low = infinite.scatter_reduce(1, of_sweep.expand(4, -1), along, "amin")[:, :-1].view(4, 2, count)
+    high = (-infinite).scatter_reduce(1, of_sweep.expand(4, -1), along, "amax")[:, :-1].view(4, 2, count)
+    metres = [scale * sweeps.grid.pixel_size for scale in (1.0, 1.0, math.sqrt(0.5), math.sqrt(0.5))]
+    unit = torch.tensor(metres, dtype=torch.float64, device=along.device)[:, None]
+    direction = ((high[:, 0] - low[:, 0]) * unit).argmax(0)[None]
+    low, high = (((ends[:, 0] - ends[:, 1]) * unit).gather(0, direction)[0] for ends in (low, high))
+    both = (low + high).abs()  # infinite or NaN where the component is not seen
+    moves = is_tall & (both >= 2 * _LEAST_TRAVEL) & ((low - high).abs() <= _ALIKE * both)
     return torch.zeros_like(is_long).index_copy_(0, name, moves)
-
-
-def _ends(place: Tensor, owner: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Least and largest of the places (K,) float64 of each component, (M,) float64; infinite where there are none."""
-    infinite = place.new_full((count,), math.inf)
-    return infinite.scatter_reduce(0, owner, place, "amin"), (-infinite).scatter_reduce(0, owner, place, "amax")

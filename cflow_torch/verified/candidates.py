@@ -5,14 +5,12 @@ from __future__ import annotations
 from typing import NamedTuple, Sequence
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.config import VerifiedConfig
 from cflow_torch.dense.clustering import Clusters
 from cflow_torch.dense.clustering import Pixels as ClusterPixels
 from cflow_torch.dense.correlation import best_shifts
-from cflow_torch.dense.history import pool
 from cflow_torch.dense.templates import TemplatePairs, make_pairs
 from cflow_torch.ops.cross_correlation import parabola_vertex
 from cflow_torch.ops.indices import (
@@ -24,7 +22,7 @@ from cflow_torch.ops.indices import (
     scatter_count,
     take_columns,
 )
-from cflow_torch.ops.segments import bounding_boxes
+from cflow_torch.ops.segments import bounding_boxes, masked_median
 from cflow_torch.verified.component_tree import Components, Nodes
 from cflow_torch.verified.height_slices import OWN, HeightSlicedSweeps, count_slices
 
@@ -66,7 +64,7 @@ def propose(nodes: Nodes, components: Components, sweeps: HeightSlicedSweeps, co
 
 
 def list_motions(estimates: Tensor, available: Tensor, intervals: Tensor) -> Tensor:
-    """(M, C, 2) float64, pixels per sweep interval: the pool of the estimates (where K > 1), then each
+    """(M, C, 2) float64, pixels per sweep interval: the median of the estimates in y and in x (where K > 1), then each
     estimate divided by its interval.
 
     Args:
@@ -75,17 +73,17 @@ def list_motions(estimates: Tensor, available: Tensor, intervals: Tensor) -> Ten
         intervals: (M, K) float64, sweep intervals from m to t+1; not 0 where an estimate is available.
 
     Convention:
-        Of one estimate the pool is the estimate itself, so sweeps that a window lacks change no choice. No -0.0.
+        The median of one estimate is that estimate, so sweeps that a window lacks change no choice. No -0.0.
 
-    Source: pool: Sec. leverage_past_pcs.
+    Source: after Sec. leverage_past_pcs, which takes the median of magnitudes and that of orientations.
     """
-    is_known = available[:, :, None]
     divisor = torch.where(available, intervals, torch.ones_like(intervals))
-    per_interval = torch.where(is_known, estimates, torch.zeros_like(estimates)) / divisor[:, :, None]
-    found: list[Tensor] = [per_interval]
-    if estimates.shape[1] > 1:
-        found.insert(0, pool(F.pad(per_interval, (0, 1)), available)[:, None, :2])  # without any estimate: 0
-    return torch.cat(found, 1) + 0.0  # turns -0.0 into 0.0
+    per_interval = (estimates / divisor[:, :, None]).masked_fill(~available[:, :, None], 0.0)
+    if estimates.shape[1] == 1:
+        return per_interval + 0.0  # turns -0.0 into 0.0
+    by_axis = per_interval.transpose(1, 2).reshape(-1, estimates.shape[1])
+    middle = masked_median(by_axis, available.repeat_interleave(2, 0, output_size=len(by_axis)))
+    return torch.cat((middle.view(-1, 1, 2), per_interval), 1) + 0.0
 
 
 def _find_peaks(

@@ -18,12 +18,12 @@ from cflow_torch.ops.chunks import chunks
 from cflow_torch.ops.indices import (
     flat_nonzero,
     floor_divide,
-    gather,
     lazy_zeros,
     lookup,
     occupied,
     renumber,
     split_index,
+    take_columns,
 )
 from cflow_torch.ops.segments import segment_amin
 from cflow_torch.windows.bev_grid import Grid
@@ -43,28 +43,46 @@ class Pixels:
     """Occupied pixels of sweeps.
 
     Args:
-        index: (K,) int64, flat index into the images.
-        window, step, row, col: (K,) int64, where each of them lies; step 0 is sweep t+1, 1 = t, 2 = t-1, ...
+        table: (5, K) int64: flat index into the images, window, step, row and column of each. Step 0 is sweep t+1, 1 is
+            t, 2 is t-1, ...
         slices: (K,) uint8, its height slices, a bit each.
     """
 
-    index: Tensor
-    window: Tensor
-    step: Tensor
-    row: Tensor
-    col: Tensor
+    table: Tensor
     slices: Tensor
+
+    @property
+    def index(self) -> Tensor:
+        """(K,) int64."""
+        return self.table[0]
+
+    @property
+    def window(self) -> Tensor:
+        """(K,) int64."""
+        return self.table[1]
+
+    @property
+    def step(self) -> Tensor:
+        """(K,) int64."""
+        return self.table[2]
+
+    @property
+    def row(self) -> Tensor:
+        """(K,) int64."""
+        return self.table[3]
+
+    @property
+    def col(self) -> Tensor:
+        """(K,) int64."""
+        return self.table[4]
 
     def take(self, index: Tensor) -> Pixels:
         """Some of them, (L,) int64 positions in the list."""
-        return Pixels(*gather(index, *self._columns()))
+        return Pixels(take_columns(self.table, index), self.slices.index_select(0, index))
 
     def followed_by(self, others: Pixels) -> Pixels:
         """These pixels, then the others."""
-        return Pixels(*(torch.cat(both) for both in zip(self._columns(), others._columns())))
-
-    def _columns(self) -> tuple[Tensor, ...]:
-        return self.index, self.window, self.step, self.row, self.col, self.slices
+        return Pixels(torch.cat((self.table, others.table), 1), torch.cat((self.slices, others.slices)))
 
 
 @dataclass(frozen=True)
@@ -159,9 +177,10 @@ class HeightSlicedSweeps:
         is_copied = torch.zeros(count, dtype=torch.bool, device=rows.device).index_fill_(0, of_row, True)
         pixel = flat_nonzero(is_copied)
         of_copy = renumber(pixel, count).index_select(0, of_row)
-        own, slices = self.pixels.take(pixel), _slices(of_copy, part, len(pixel))
-        place, window = own.index + self.image.numel() // 2, own.window + self.batch.num_windows
-        pixels = Pixels(place, window, own.step, own.row, own.col, slices)
+        # The same pixels, in the second half of the images and of the windows.
+        behind = [self.image.numel() // 2, self.batch.num_windows, 0, 0, 0]
+        table = take_columns(self.pixels.table, pixel) + torch.tensor(behind, device=rows.device)[:, None]
+        pixels = Pixels(table, _slices(of_copy, part, len(pixel)))
         _draw_neighbourhoods(self.image, pixels, self.grid)
         rank = torch.arange(count + 1, count + 1 + len(pixel), dtype=torch.int32, device=rows.device)
         of_point = self.pixel_of_point + (self.pixel_of_point == count) * len(pixel)  # "none" is a larger number now
@@ -169,7 +188,7 @@ class HeightSlicedSweeps:
             self.batch.with_empty_windows(),
             self.grid,
             self.image,
-            self.rank.scatter_(0, place, rank),
+            self.rank.scatter_(0, pixels.index, rank),
             self.pixels.followed_by(pixels),
             torch.cat((of_point, of_copy + count)),
             rows,
@@ -227,12 +246,10 @@ class HeightSlicedSweeps:
         return segment_amin(self.batch.positions[2], self.pixel_of_point, self.num_pixels + 1, math.inf)[:-1]
 
 
-def slice_of(z: Tensor, slice_height: float | Tensor, num_slices: int = NUM_SLICES) -> Tensor:
+def slice_of(z: Tensor, slice_height: float, num_slices: int = NUM_SLICES) -> Tensor:
     """(N,) uint8: slice of heights (N,) float64, metres, floor(z / slice_height) mod n; 0 for NaN. n: a power of 2, at
-    most 16. Slice heights: one, or (N,) float64."""
-    if not isinstance(slice_height, Tensor):
-        slice_height = torch.full((), slice_height, dtype=z.dtype, device=z.device)  # see `Grid.pixel`
-    layer = (z / slice_height).floor_()
+    most 16."""
+    layer = (z / torch.full((), slice_height, dtype=z.dtype, device=z.device)).floor_()  # see `Grid.pixel`
     layer.clamp_(-_HIGHEST_SLICE, _HIGHEST_SLICE).nan_to_num_(0.0)
     return (layer.long() & (num_slices - 1)).to(torch.uint8)
 
@@ -262,7 +279,8 @@ def _slices(of_point: Tensor, part: Tensor, num_pixels: int) -> Tensor:
 def _pixels(pixel: Tensor, slices: Tensor, grid: Grid, num_steps: int) -> Pixels:
     """Pixels by their flat indices."""
     of_image, within = split_index(pixel, grid.height * grid.width)
-    return Pixels(pixel, *split_index(of_image, num_steps), *split_index(within, grid.width), slices)
+    columns = (pixel, *split_index(of_image, num_steps), *split_index(within, grid.width))
+    return Pixels(torch.stack(columns), slices)
 
 
 def _draw_neighbourhoods(image: Tensor, pixels: Pixels, grid: Grid) -> None:

@@ -13,7 +13,7 @@ from cflow_torch.ops.segments import bounding_boxes, segment_amin
 from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import HeightSlicedSweeps, Pixels
 from cflow_torch.verified.rigid_motion import RigidMotion, rotate
-from cflow_torch.verified.rigid_registration import register, stretch_of
+from cflow_torch.verified.rigid_registration import LAYER_HEIGHT, NUM_LAYERS, register, stretch_of
 from cflow_torch.verified.subpixel_motion import subpixel_motion
 from cflow_torch.verified.voxel_centroids import ObjectPoints, points_of_objects
 
@@ -32,14 +32,13 @@ def refine(
     Returns:
         The motion in metres; and the apparent motion, that of the images, which differs where points have times.
     """
-    moves = motion.any(1)
     newest = flat_nonzero((sweeps.pixels.step == 0) & (objects.of_pixel < objects.count))
     row, col, owner = gather(newest, sweeps.pixels.row, sweeps.pixels.col, objects.of_pixel)
     length = bounding_boxes(row, col, owner, objects.count)[1].amax(1).double() * sweeps.grid.pixel_size
     start = subpixel_motion(sweeps, objects, motion, length <= (math.inf if longest is None else longest))
-    points = points_of_objects(sweeps, objects, moves)
-    found = register(points, sweeps, start.masked_fill(~moves[:, None], 0.0))
-    apparent = RigidMotion(torch.where(moves[:, None], found.flow, start), found.turn, found.centre)
+    moves = start.any(1)
+    points = points_of_objects(sweeps, objects, moves, LAYER_HEIGHT, NUM_LAYERS)
+    apparent = register(points, sweeps, start)
     return register_deskewed(points, sweeps, start, apparent), apparent
 
 
@@ -99,12 +98,13 @@ def deskew(
     assert points.time is not None
     grid, num_steps, owner = sweeps.grid, sweeps.num_steps, points.owner
     time, image = points.time.double(), points.window * num_steps + points.step
-    flow, centre = rigid.flow.index_select(0, owner).t(), rigid.centre.index_select(0, owner).t()
+    flow, centre = (torch.view_as_complex(values.index_select(0, owner)) for values in (rigid.flow, rigid.centre))
     # The centre is that of t; at the instant of another sweep it has moved on.
     since_t = (sweeps.elapsed[:, 1:2] - sweeps.elapsed).flatten().index_select(0, image)
-    position = points.position - flow * time
-    arm = position - centre - flow * since_t
-    position = position + (rotate(-time * rigid.turn.index_select(0, owner), arm) - arm)
+    at_instant = torch.complex(*points.position) - flow * time
+    arm = at_instant - centre - flow * since_t
+    at_instant = at_instant + (rotate(-time * rigid.turn.index_select(0, owner), arm) - arm)
+    position = torch.view_as_real(at_instant).t()
 
     inside = flat_nonzero(grid.contains(position))
     position, image = position.index_select(1, inside), image.index_select(0, inside)
@@ -114,8 +114,8 @@ def deskew(
     first = segment_amin(moved.owner, number, pixel.numel(), len(rigid.turn)).index_select(0, number)
     of_image, within = split_index(pixel, grid.height * grid.width)
     window, step = split_index(of_image, num_steps)
-    slices = torch.zeros_like(pixel, dtype=torch.uint8)  # unused downstream
-    pixels = Pixels(pixel, window, step, *split_index(within, grid.width), slices)
+    table = torch.stack((pixel, window, step, *split_index(within, grid.width)))
+    pixels = Pixels(table, torch.zeros_like(pixel, dtype=torch.uint8))  # slices are unused downstream
     rank = lazy_zeros(len(sweeps.rank), torch.int32, pixel.device)
     rank.scatter_(0, pixel, torch.arange(1, len(pixel) + 1, dtype=torch.int32, device=pixel.device))
     drawn = replace(sweeps, pixels=pixels, rank=rank)

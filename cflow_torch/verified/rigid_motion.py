@@ -45,18 +45,15 @@ class RigidMotion:
     def flow_at(self, which: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         """x and y of the flow, metres per interval, of points of t (K,), by their object and their place in metres."""
         (c_x, c_y), (v_x, v_y) = (values.index_select(0, which).unbind(1) for values in (self.centre, self.flow))
-        x, y = x - c_x, y - c_y
-        turned_x, turned_y = rotate(self.turn.index_select(0, which), torch.stack((x, y)))
-        return (turned_x - x) + v_x, (turned_y - y) + v_y
+        arm = torch.complex(x - c_x, y - c_y)
+        shift = rotate(self.turn.index_select(0, which), arm) - arm
+        return shift.real + v_x, shift.imag + v_y
 
 
-def rotate(turn: Tensor, place: Tensor) -> Tensor:
-    """(2, K): places, x and y, rotated about the origin by the angle whose half has the tangent `turn`, (K,)."""
-    square = turn * turn
-    n = 1 + square
-    cos, sin = (1 - square) / n, 2 * turn / n
-    x, y = place
-    return torch.stack((cos * x - sin * y, sin * x + cos * y))
+def rotate(rotation: Tensor, arm: Tensor) -> Tensor:
+    """(K,) complex128: x + iy, rotated about the origin by the angle whose half has the tangent `rotation`, (K,)."""
+    half = torch.complex(torch.ones_like(rotation), rotation)
+    return half / half.conj() * arm
 
 
 @dataclass(frozen=True)

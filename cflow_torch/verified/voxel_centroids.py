@@ -10,7 +10,7 @@ from torch import Tensor
 
 from cflow_torch.ops.indices import flat_nonzero, gather, lookup, scatter_count
 from cflow_torch.verified.component_tree import Objects
-from cflow_torch.verified.height_slices import NUM_SLICES, SLICE_HEIGHT, HeightSlicedSweeps, slice_of
+from cflow_torch.verified.height_slices import HeightSlicedSweeps, slice_of
 
 # Centroids are whole numbers of 1 / UNITS metre: their sums are exact, in any order of the points and on any device.
 UNITS = 1024
@@ -26,7 +26,7 @@ class ObjectPoints:
         owner: (N,) int64, object of each.
         window, step: (N,) int64, which sweep: step 0 = t+1, 1 = t, ...
         pixel: (N,) int64, number of its occupied pixel, 0 ... P - 1.
-        part: (N,) int64, height slice, 0 ... 3 (or as many as `points_of_objects` was asked for).
+        part: (N,) int64, height slice, from 0 on.
         position: (2, N) float64, x and y, metres, frame of t+1; inside the region.
         time: (N,) float32, sweep intervals, `Batch.point_times`; None = there are none.
     """
@@ -56,8 +56,8 @@ def points_of_objects(
     sweeps: HeightSlicedSweeps,
     objects: Objects,
     wanted: Tensor,
-    slice_height: float | Tensor = SLICE_HEIGHT,
-    num_slices: int = NUM_SLICES,
+    slice_height: float,
+    num_slices: int,
 ) -> ObjectPoints:
     """The points of some objects in all sweeps, in the order of the batch.
 
@@ -65,7 +65,7 @@ def points_of_objects(
         sweeps: finest images.
         objects: G of them.
         wanted: (G,) bool.
-        slice_height: metres; one for all, or (G,) float64.
+        slice_height: metres.
         num_slices: a power of 2.
 
     Cost: two look-ups a point, the rest for those that are kept.
@@ -74,8 +74,6 @@ def points_of_objects(
     pixel, rows = sweeps.pixel_of_point.index_select(0, points), sweeps.point(points)
     x, y, z = sweeps.batch.positions.index_select(1, rows).unbind(0)
     window, step, owner = gather(pixel, sweeps.pixels.window, sweeps.pixels.step, objects.of_pixel)
-    if isinstance(slice_height, Tensor):
-        slice_height = slice_height.index_select(0, owner)
     part = slice_of(z, slice_height, num_slices).long()
     times = sweeps.batch.point_times
     time = None if times is None else times.index_select(0, rows)
@@ -92,7 +90,7 @@ class Voxels:
 
     Attributes:
         owner, window, step, part: (V,) int64, as for `ObjectPoints`.
-        place: (2, V + 1) float64, x and y of the centroid, whole units of 1/1024 m from the lower corner of the region;
+        place: (V + 1,) complex128, x + iy of the centroid, whole units of 1/1024 m from the lower corner of the region;
             the last entry, of no voxel, is far away.
         time: (V,) float64, mean of `ObjectPoints.time`; None = there are none.
 
@@ -101,14 +99,14 @@ class Voxels:
     Cost: a sort of the points.
     """
 
-    def __init__(self, points: ObjectPoints, sweeps: HeightSlicedSweeps, num_slices: int = NUM_SLICES) -> None:
+    def __init__(self, points: ObjectPoints, sweeps: HeightSlicedSweeps, num_slices: int) -> None:
         self._sweeps, self._num_slices, self.num_steps = sweeps, num_slices, sweeps.num_steps
         key, voxel, count = torch.unique(
             points.pixel * num_slices + points.part, return_inverse=True, return_counts=True
         )
         corner = torch.tensor(sweeps.grid.lower[:2], dtype=torch.float64, device=key.device)[:, None]
         sums = scatter_count(voxel, key.numel(), whole((points.position - corner) * UNITS))
-        self.place = F.pad(torch.floor(sums / count), (0, 1), value=_BEYOND)
+        self.place = torch.complex(*F.pad(torch.floor(sums / count), (0, 1), value=_BEYOND))
         # The first pixel of the table is "none", as in `HeightSlicedSweeps.rank`.
         self._of_key = torch.full((num_slices * (sweeps.num_pixels + 1),), key.numel(), device=key.device)
         self._of_key.scatter_(0, key + num_slices, torch.arange(key.numel(), device=key.device))
@@ -126,7 +124,7 @@ class Voxels:
         Args:
             sweep: (K,) int64, window * S + step.
             part: (K,) int64.
-            place: (2, K) float64, x and y, units from the lower corner, anywhere.
+            place: (K,) complex128, x + iy, units from the lower corner, anywhere.
 
         Returns:
             (K,) int64, V = there is none.
@@ -134,7 +132,7 @@ class Voxels:
         Cost: nine look-ups each.
         """
         voxel = self.around(sweep, part, place, 1)
-        square = self.place.index_select(1, voxel.view(-1)).view(2, *voxel.shape).sub_(place[:, None]).square_().sum(0)
+        square = square_of(self.place.index_select(0, voxel.view(-1)).view_as(voxel).sub_(place))
         # The square and the place in one number: its least is found several times faster than by argmin. In float64,
         # which holds these numbers exactly, many times faster than in int64.
         slot = torch.arange(9, dtype=torch.float64, device=place.device)[:, None]
@@ -149,27 +147,34 @@ class Voxels:
             reach: r, pixels.
 
         Returns:
-            ((2 r + 1)^2, K) int64, in raster order, V = there is none, also where one of the pixels lies outside.
+            ((2 r + 1)^2, K) int64, in raster order, V = there is none. Near the border and beyond it, the pixels are
+            the outermost ones.
         """
-        grid, line = self._sweeps.grid, torch.arange(-reach, reach + 1, device=part.device)
+        grid = self._sweeps.grid
+        last = torch.tensor((grid.width - 1 - reach, grid.height - 1 - reach), device=part.device)
         size = torch.full((), grid.pixel_size * UNITS, dtype=torch.float64, device=part.device)
-        last = torch.tensor(((grid.width - 1 - reach,), (grid.height - 1 - reach,)), device=part.device)
-        at = torch.floor(place / size).long()
-        inside = ((at >= reach) & (at <= last)).all(0)
-        pixel = sweep * (grid.height * grid.width) + at[1] * grid.width + at[0]
-        pixel = pixel + (line[:, None] * grid.width + line).view(-1, 1)
-        pixel = torch.where(inside, pixel, self._sweeps.image.numel() - 1)
+        at = torch.floor(torch.view_as_real(place) / size).clamp_(torch.full_like(last, reach), last).long()
+        pixel = torch.add(at[:, 0], at[:, 1], alpha=grid.width).add_(sweep, alpha=grid.height * grid.width)
+        line = torch.arange(-reach, reach + 1, device=part.device)
+        pixel = pixel + torch.add(line, line[:, None], alpha=grid.width).view(-1, 1)
         rank = self._sweeps.rank.index_select(0, pixel.view(-1)).view_as(pixel)
         return self._of_key.index_select(0, torch.add(part, rank, alpha=self._num_slices).view(-1)).view_as(pixel)
 
 
 def whole(x: Tensor) -> Tensor:
-    """Nearest whole number, halves up."""
+    """Nearest whole number, halves up; of a complex number, that of each part."""
+    if x.is_complex():
+        return torch.view_as_complex(whole(torch.view_as_real(x)))
     return torch.floor(x + 0.5)
 
 
+def square_of(x: Tensor) -> Tensor:
+    """Squared length of complex numbers."""
+    return torch.view_as_real(x).square().sum(-1)
+
+
 def meeting_weights(sigma: float, device: torch.device) -> Tensor:
-    """(2049,) float64 whole numbers: weights exp(-d^2 / 2 sigma^2) of centroids that miss each other by d, in 256ths.
+    """(2049,) float64: weights exp(-d^2 / 2 sigma^2) of centroids that miss each other by d, whole 256ths.
 
     Args:
         sigma: metres.
@@ -178,4 +183,4 @@ def meeting_weights(sigma: float, device: torch.device) -> Tensor:
     Convention: entry i stands for d^2 from 64 i to 64 (i + 1) square units; the last one, 0, for all that is farther.
     """
     square = 64 * torch.arange(2048, dtype=torch.float64) + 32
-    return F.pad(whole(256 * torch.exp(square / (-2 * (sigma * UNITS) ** 2))), (0, 1)).to(device)
+    return F.pad(whole(256 * torch.exp(square / (-2 * (sigma * UNITS) ** 2))) / 256, (0, 1)).to(device)

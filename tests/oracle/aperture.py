@@ -36,8 +36,7 @@ def principal_axis(cells: Sequence[Cell], size: float) -> tuple[bool, float, flo
     """
     if not cells:
         return False, 0.0, 0.0
-    n, top, left = len(cells), min(r for r, _ in cells), min(c for _, c in cells)
-    y, x = [r - top for r, _ in cells], [c - left for _, c in cells]
+    n, y, x = len(cells), [r for r, _ in cells], [c for _, c in cells]
     var_y = (n * sum(a * a for a in y) - sum(y) ** 2) / (n * n)
     var_x = (n * sum(a * a for a in x) - sum(x) ** 2) / (n * n)
     cov = (n * sum(a * b for a, b in zip(y, x)) - sum(y) * sum(x)) / (n * n)
@@ -67,17 +66,21 @@ def both_ends_move(sweeps: SlicedSweeps, members: Sequence[Pixel]) -> bool:
     """Whether both ends of a component have gone the same way along it since the sweep that is farthest from t+1.
 
     Convention: at least 1.2 m, alike to a tenth of their sum; and the pixels at t+1 have two height slices on average.
-        Ends are those of the projections on the principal axis at t+1. Of sweeps equally far the first.
+        It lies along y, x or a diagonal, the one in which it reaches farthest at t+1; of equals the first, and of
+        sweeps equally far the first.
     """
     newest = [(r, c) for m, r, c in members if m == 0]
-    _, axis_y, axis_x = principal_axis(newest, sweeps.size)
     farthest = max(range(len(sweeps.images)), key=lambda m: abs(sweeps.elapsed[m]))
     oldest = [(r, c) for m, r, c in members if m == farthest]
     if not oldest:
         return False
-    now, then = ([r * axis_y + c * axis_x for r, c in cells] for cells in (newest, oldest))
-    low, high = min(now) - min(then), max(now) - max(then)
-    both, least = low + high, 2 * LEAST_TRAVEL / sweeps.size
-    is_far = both * both >= (least * least) * (axis_y * axis_y + axis_x * axis_x)
+    diagonal = math.sqrt(0.5) * sweeps.size
+    ways = []  # of each direction: how far it reaches at t+1, how far its first and its last pixel have gone
+    for a, b, unit in ((1, 0, sweeps.size), (0, 1, sweeps.size), (1, 1, diagonal), (1, -1, diagonal)):
+        now, then = ([a * r + b * c for r, c in cells] for cells in (newest, oldest))
+        low, high = min(now) - min(then), max(now) - max(then)
+        ways.append(((max(now) - min(now)) * unit, low * unit, high * unit))
+    _, low_way, high_way = max(ways, key=lambda way: way[0])
+    both = abs(low_way + high_way)
     is_tall = sum(count(sweeps.at(0, *cell)) for cell in newest) >= 2 * len(newest)
-    return is_tall and is_far and abs(low - high) <= 0.1 * abs(both)
+    return is_tall and both >= 2 * LEAST_TRAVEL and abs(low_way - high_way) <= 0.1 * both

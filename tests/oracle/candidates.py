@@ -1,4 +1,4 @@
-"""Motion candidates of nodes: peaks of the correlation with each sweep, their pool, the pools of the nodes around."""
+"""Motion candidates of nodes: peaks of the correlation with each sweep, their median, those of the nodes around."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from cflow_torch.config import VerifiedConfig
 from oracle.component_tree import Node
 from oracle.dense import scene_flow_in_1view
 from oracle.height_slices import NUM_SLICES, Cell, Vector, count, vertex
-from oracle.history import pool
+from oracle.history import median
 from oracle.pixels import bounding_box, occupancy, search_radius
 
 LARGEST_BOX = 1 << 12  # pixels: a node whose box is larger is correlated at a coarser scale
@@ -35,7 +35,7 @@ def propose(nodes: Sequence[Node], config: VerifiedConfig) -> tuple[list[list[Ve
 
 
 def list_motions(estimates: Sequence[Vector | None], intervals: Sequence[float]) -> list[Vector]:
-    """The pool of all estimates (Sec. leverage_past_pcs), if there is more than one sweep; each one by its intervals.
+    """The median of all estimates in y and in x, if there is more than one sweep; each one by its intervals.
 
     Args:
         estimates: (y, x) displacement m -> t+1 for every other sweep m, nearest first; None = not known.
@@ -47,9 +47,8 @@ def list_motions(estimates: Sequence[Vector | None], intervals: Sequence[float])
     per_interval = [None if f is None else (f[0] / k, f[1] / k) for f, k in zip(estimates, intervals)]
     found = [(0.0, 0.0) if f is None else f for f in per_interval]
     if len(estimates) > 1:
-        known = [np.array([*f, 0.0]) for f in per_interval if f is not None]
-        y, x, _ = pool(known).tolist() if known else (0.0, 0.0, 0.0)
-        found.insert(0, (y, x))
+        known = [f for f in per_interval if f is not None]
+        found.insert(0, (median([y for y, _ in known]), median([x for _, x in known])) if known else (0.0, 0.0))
     return found
 
 

@@ -12,12 +12,13 @@ from cflow_torch.config import VerifiedConfig
 from oracle.height_slices import SlicedSweeps, Vector
 from oracle.voxels import UNITS, Point, Voxel, Voxels, centroids, meeting_weight, nearest, whole
 
-SIGMA = 0.15  # metres, of the weight of a pair of voxels
+LAYER_HEIGHT, NUM_LAYERS = 0.1, 16  # of voxels, metres; their number, then they repeat
+SIGMA = 0.12  # metres, of the weight of a pair of voxels
 MOST_TIME = 2.5  # sweep intervals: older sweeps are not looked at
-NUM_STEPS = 6
+NUM_STEPS, STEP_LENGTH = 5, 1.6  # steps, as long as so many of Gauss and Newton
 LONGEST_WAY = 0.15 * UNITS  # per interval, in x and in y, from the given flow
 LARGEST_TURN = 0.1  # tangent of half the angle per interval
-HELD, HELD_SHARE = 150.0, 0.2  # perfect pairs that the given translation is worth, and besides a share of those found
+HELD = 40.0  # perfect pairs that the given translation is worth
 HELD_TURN = 20.0  # perfect pairs at a distance of 1 m that no turn is worth
 LEAST_STRETCH = 0.75  # where the time between points is a smaller share of that between sweeps, it is not believed
 
@@ -31,14 +32,14 @@ class RigidMotion(NamedTuple):
 
     def flow_at(self, x: float, y: float) -> Vector:
         """Flow of a point of t, by its place; all in metres."""
-        x, y = x - self.centre[0], y - self.centre[1]
-        turned_x, turned_y = rotate(self.turn, x, y)
-        return (turned_x - x) + self.flow[0], (turned_y - y) + self.flow[1]
+        arm_x, arm_y = x - self.centre[0], y - self.centre[1]
+        turned_x, turned_y = rotate(self.turn, arm_x, arm_y)
+        return (turned_x - arm_x) + self.flow[0], (turned_y - arm_y) + self.flow[1]
 
 
 class Pair(NamedTuple):
-    """A voxel of an earlier sweep and one of t+1: time between, turned arm of the first, what is missing, weight; how
-    much longer than between the sweeps it is between the points, in intervals."""
+    """A voxel and the one that it finds in another sweep: time from one to the other, in whole 1/16; turned arm of the
+    first, what is missing, weight; how much longer than between the sweeps it is between the points, in intervals."""
 
     time: float
     arm: tuple[int, int]
@@ -48,10 +49,7 @@ class Pair(NamedTuple):
 
 
 def register(points: Sequence[Point], flow: Sequence[Vector], sweeps: SlicedSweeps) -> list[RigidMotion]:
-    """Refine the motion of every object, from (x, y) metres per interval. One without points at t keeps its flow.
-
-    Convention: of the start and the steps that follow, the one whose pairs weigh most counts, of equals the first.
-    """
+    """Refine the motion of every object, from (x, y) metres per interval. One without points at t keeps its flow."""
     voxels, lower = centroids(points, sweeps), sweeps.lower
     result = []
     for owner, start in enumerate(flow):
@@ -62,18 +60,14 @@ def register(points: Sequence[Point], flow: Sequence[Vector], sweeps: SlicedSwee
             continue
         centre = (sum(v.x for v in at_t) // len(at_t), sum(v.y for v in at_t) // len(at_t))
         given = (start[0] * UNITS, start[1] * UNITS)
-        way, turn, most = given, 0.0, -1.0
-        best = way, turn
-        for _ in range(NUM_STEPS + 1):
+        way, turn = given, 0.0
+        for _ in range(NUM_STEPS):
             found = find_pairs(members, voxels, sweeps, centre, way, turn)
-            weight = sum(pair.weight for pair in found)
-            if weight > most:
-                best, most = (way, turn), weight
-            dx, dy, angle = gauss_newton(found, given, way, turn)
+            dx, dy, angle = (STEP_LENGTH * change for change in gauss_newton(found, given, way, turn))
             way = (limit(way[0] + dx, given[0], LONGEST_WAY), limit(way[1] + dy, given[1], LONGEST_WAY))
             turn = limit(turn + angle / 2, 0.0, LARGEST_TURN)
         corner = (centre[0] / UNITS + lower[0], centre[1] / UNITS + lower[1])
-        result.append(RigidMotion((best[0][0] / UNITS, best[0][1] / UNITS), best[1], corner))
+        result.append(RigidMotion((way[0] / UNITS, way[1] / UNITS), turn, corner))
     return result
 
 
@@ -82,37 +76,28 @@ def find_pairs(
 ) -> list[Pair]:
     """Voxels of an object that find each other under its motion, looked for from both ends.
 
-    Every voxel before t+1 looks for the nearest one at t+1, every voxel of t+1 for the nearest one in each earlier
+    Every voxel of another sweep looks for the nearest one at t+1, every voxel of t+1 for the nearest one in each other
     sweep. If what is nearest belongs to another object there is no pair; two that choose each other count twice.
     """
     found = []
     for voxel in members:
-        for step, time in enumerate(sweeps.elapsed):
-            if not 0 < abs(time) <= MOST_TIME or voxel.step not in (0, step):
+        others = range(1, len(sweeps.elapsed)) if voxel.step == 0 else [0]
+        for step in others:
+            start, end = (sweeps.elapsed[1] - sweeps.elapsed[m] for m in (voxel.step, step))  # intervals since t
+            if abs(end - start) > MOST_TIME:
                 continue
-            if voxel.step == 0:  # back to sweep `step`
-                x, y = voxel.x - centre[0] - time * way[0], voxel.y - centre[1] - time * way[1]
-                x, y = rotate(-turn * time, x, y)
-                x, y = whole(x + centre[0]), whole(y + centre[1])
-            else:  # on to t+1
-                x, y = moved(voxel, centre, way, turn, time)
-            partner = nearest(voxels, step if voxel.step == 0 else 0, voxel.part, x, y, sweeps)
+            # The centre is that of t; it moves on, and the voxel turns about it.
+            arm_x, arm_y = voxel.x - centre[0] - way[0] * start, voxel.y - centre[1] - way[1] * start
+            arm_x, arm_y = rotate(turn * (end - start), arm_x, arm_y)
+            x, y = whole(centre[0] + way[0] * end + arm_x), whole(centre[1] + way[1] * end + arm_y)
+            partner = nearest(voxels, step, voxel.part, x, y, sweeps)
             if partner is None or partner.owner != voxel.owner:
                 continue
-            earlier, later = (partner, voxel) if voxel.step == 0 else (voxel, partner)
-            x, y = moved(earlier, centre, way, turn, time)
-            error = (later.x - x, later.y - y)
-            r_x, r_y = rotate(turn * time, earlier.x - centre[0], earlier.y - centre[1])
+            error = (partner.x - x, partner.y - y)
             weight = meeting_weight(error[0] ** 2 + error[1] ** 2, SIGMA)
-            late = whole((later.time - earlier.time) * UNITS) / UNITS
-            found.append(Pair(time, (whole(r_x), whole(r_y)), error, weight, late))
+            late = whole((partner.time - voxel.time) * UNITS) / UNITS
+            found.append(Pair(whole((end - start) * 16) / 16, (whole(arm_x), whole(arm_y)), error, weight, late))
     return found
-
-
-def moved(voxel: Voxel, centre: tuple[int, int], way: Vector, turn: float, time: float) -> tuple[int, int]:
-    """Where a voxel is `time` intervals later, in whole units."""
-    x, y = rotate(turn * time, voxel.x - centre[0], voxel.y - centre[1])
-    return whole(x + centre[0] + time * way[0]), whole(y + centre[1] + time * way[1])
 
 
 def rotate(turn: float, x: float, y: float) -> Vector:
@@ -125,13 +110,11 @@ def rotate(turn: float, x: float, y: float) -> Vector:
 def gauss_newton(found: Sequence[Pair], given: Vector, way: Vector, turn: float) -> tuple[float, float, float]:
     """Least squares: change of the translation (units) and of the angle (radians, small), per interval.
 
-    Minimises, over the pairs with times k (in whole 1/16), arms r and errors e,
-    sum w (k (dx - r_y a) - e_x)^2 + w (k (dy + r_x a) - e_y)^2, and the squares that hold on to the given translation
-    and to no turn.
+    Minimises, over the pairs with times k, arms r and errors e, sum w (k (dx - r_y a) - e_x)^2 +
+    w (k (dy + r_x a) - e_y)^2, and the squares that hold on to the given translation and to no turn.
     """
     s = s_x = s_y = s_xy = e_x = e_y = e_a = 0.0
-    for time, (r_x, r_y), (x, y), w, _ in found:
-        k = whole(time * 16) / 16
+    for k, (r_x, r_y), (x, y), w, _ in found:
         s += w * k * k
         s_x += w * k * k * r_x
         s_y += w * k * k * r_y
@@ -139,9 +122,9 @@ def gauss_newton(found: Sequence[Pair], given: Vector, way: Vector, turn: float)
         e_x += w * k * x
         e_y += w * k * y
         e_a += w * k * (r_x * y - r_y * x)
-    held, held_turn = HELD + HELD_SHARE * s, HELD_TURN * UNITS**2
-    a, a_x, a_y, a_xy = s + held, s_x, -s_y, s_xy + held_turn
-    b_x, b_y = e_x + held * (given[0] - way[0]), e_y + held * (given[1] - way[1])
+    held_turn = HELD_TURN * UNITS**2
+    a, a_x, a_y, a_xy = s + HELD, s_x, -s_y, s_xy + held_turn
+    b_x, b_y = e_x + HELD * (given[0] - way[0]), e_y + HELD * (given[1] - way[1])
     b_a = e_a - held_turn * (2 * turn)
     angle = (b_a - (a_y * b_x + a_x * b_y) / a) / (a_xy - (a_y * a_y + a_x * a_x) / a)
     return (b_x - a_y * angle) / a, (b_y - a_x * angle) / a, angle
@@ -181,9 +164,8 @@ def stretch_of(points: Sequence[Point], seen: Sequence[RigidMotion], sweeps: Sli
         centre = (round((motion.centre[0] - x0) * UNITS), round((motion.centre[1] - y0) * UNITS))
         way = (motion.flow[0] * UNITS, motion.flow[1] * UNITS)
         total = late = 0.0
-        for pair in find_pairs(members, voxels, sweeps, centre, way, motion.turn):
-            k = whole(pair.time * 16) / 16
-            total, late = total + pair.weight * k * k, late + pair.weight * k * pair.late
+        for k, _, _, weight, of_pair in find_pairs(members, voxels, sweeps, centre, way, motion.turn):
+            total, late = total + weight * k * k, late + weight * k * of_pair
         stretch = 1 + late / total if total > 0 else 1.0
         result.append(stretch if stretch >= LEAST_STRETCH else 1.0)
     return result

@@ -1,4 +1,4 @@
-"""Sub-pixel motion of pairs: small shifts, tested by how well the centroids of small cubes meet."""
+"""Sub-pixel motion of pairs: slow objects, found by how well the centroids of small cubes meet."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import NamedTuple, Sequence, Tuple
 
 import numpy as np
 
-from oracle.height_slices import SLICE_HEIGHT, Cell, Pixel, SlicedSweeps, Vector, count, vertex
+from oracle.height_slices import Cell, Pixel, SlicedSweeps, Vector, count
 from oracle.voxels import UNITS, Voxel, Voxels, around, centroids, meeting_weight, points_of_objects
 
 SIDES = ((0, 1), (1, -1), (1, 0), (1, 1))  # (dy, dx), a pixel ahead; the opposite is behind
@@ -22,7 +22,7 @@ Shift = Tuple[int, int]  # x, y, units, from t to t+1
 
 
 class Cube(NamedTuple):
-    """Where a cube lies, units, and the ways (N, 2) from where its object's motion takes it to the cubes around."""
+    """Where a cube lies, units, and the ways (N, 2) to the cubes around it."""
 
     block: Cell
     ways: np.ndarray
@@ -31,31 +31,22 @@ class Cube(NamedTuple):
 def subpixel_motion(
     sweeps: SlicedSweeps, object_of: dict[Pixel, int], motions: Sequence[Vector], may_be_slow: Sequence[bool]
 ) -> list[Vector]:
-    """The motion of the objects of a pair, (x, y) metres per interval, from (y, x) pixels per interval, 0 = static."""
-    flows, elapsed = [(x * sweeps.size, y * sweeps.size) for y, x in motions], sweeps.elapsed[1]
-    slow, heights = [], []
+    """The motion of the objects of a pair, (x, y) metres per interval, from (y, x) pixels per interval, 0 = static;
+    what moves keeps its motion."""
+    slow = []
     for owner, motion in enumerate(motions):
         members = [pixel for pixel, own in object_of.items() if own == owner]
         slow.append(may_be_slow[owner] and not any(motion) and is_biased(sweeps, members))
-        heights.append(SLICE_HEIGHT if any(motion) else sweeps.size)
-    wanted = [is_slow or any(motion) for is_slow, motion in zip(slow, motions)]
-    every = centroids(points_of_objects(sweeps, object_of, wanted, heights, NUM_LAYERS), sweeps)
-    result = []
-    for owner, ((x, y), is_slow) in enumerate(zip(flows, slow)):
-        given = x * elapsed * UNITS, y * elapsed * UNITS
-        cubes = [cube_of(every, voxel, given, sweeps) for voxel in every.values() if voxel.owner == owner]
-        best = best_shift(cubes, is_slow) if wanted[owner] else None
-        if is_slow and best is not None:
-            cubes = moving_parts(cubes, best)
-            best = best_shift(cubes, True)
+    every = centroids(points_of_objects(sweeps, object_of, slow, sweeps.size, NUM_LAYERS), sweeps)
+    result = [(x * sweeps.size, y * sweeps.size) for y, x in motions]
+    for owner in [owner for owner, is_slow in enumerate(slow) if is_slow]:
+        cubes = [cube_of(every, voxel, sweeps) for voxel in every.values() if voxel.owner == owner]
+        best = best_shift(cubes)
         if best is not None:
-            beside = [(0, 0), (-STEP, 0), (STEP, 0), (0, -STEP), (0, STEP)]
-            middle, left, right, below, above = (sum(gains(cubes, (best[0] + i, best[1] + j))) for i, j in beside)
-            d_x = vertex(left, middle, right) if abs(best[0]) < REACH * STEP else 0.0  # at the edge there is no peak
-            d_y = vertex(below, middle, above) if abs(best[1]) < REACH * STEP else 0.0
-            x += (best[0] + d_x * STEP) / UNITS / elapsed
-            y += (best[1] + d_y * STEP) / UNITS / elapsed
-        result.append((x, y))
+            best = best_shift(moving_parts(cubes, best))
+        if best is not None:
+            x, y = (way / UNITS / sweeps.elapsed[1] for way in best)
+            result[owner] = (x, y)
     return result
 
 
@@ -74,18 +65,17 @@ def is_biased(sweeps: SlicedSweeps, members: Sequence[Pixel]) -> bool:
     return False
 
 
-def cube_of(every: Voxels, voxel: Voxel, given: Vector, sweeps: SlicedSweeps) -> Cube:
+def cube_of(every: Voxels, voxel: Voxel, sweeps: SlicedSweeps) -> Cube:
     """A cube of an object and what it may meet: the cubes of the other sweep, in its layer, in the 5 x 5 pixels around
-    where the given motion, (x, y) units from t to t+1, takes it. Cubes of t+1 go back. Ways are float32."""
+    it. Cubes of t+1 go back. Ways are float32."""
     sign = 1 if voxel.step == 1 else -1
-    x, y = voxel.x + sign * given[0], voxel.y + sign * given[1]
-    near = around(every, 1 - voxel.step, voxel.part, x, y, sweeps, AROUND)
-    ways = [(sign * (other.x - x), sign * (other.y - y)) for other in near]
+    near = around(every, 1 - voxel.step, voxel.part, voxel.x, voxel.y, sweeps, AROUND)
+    ways = [(sign * (other.x - voxel.x), sign * (other.y - voxel.y)) for other in near]
     return Cube((voxel.y // BLOCK, voxel.x // BLOCK), np.array(ways, dtype=np.float32).reshape(-1, 2))
 
 
-def best_shift(cubes: Sequence[Cube], is_slow: bool) -> Shift | None:
-    """The shift of largest gain; of a slow object the most significant one, None = none is.
+def best_shift(cubes: Sequence[Cube]) -> Shift | None:
+    """The most significant shift, None = none is.
 
     Ties: the smallest, then raster order.
     """
@@ -93,13 +83,11 @@ def best_shift(cubes: Sequence[Cube], is_slow: bool) -> Shift | None:
     values = {}
     for shift in [(x, y) for y in line for x in line]:
         gain = gains(cubes, shift)
-        values[shift] = sum(gain)
-        if is_slow:
-            is_weak = sum(gain) < LEAST_GAIN * len(cubes) or len(cubes) < LEAST_CUBES
-            values[shift] = 0.0 if is_weak else sum(gain) - Z * math.sqrt(sum(g * g for g in gain))
+        is_weak = sum(gain) < LEAST_GAIN * len(cubes) or len(cubes) < LEAST_CUBES
+        values[shift] = 0.0 if is_weak else sum(gain) - Z * math.sqrt(sum(g * g for g in gain))
     by_length = sorted(values, key=lambda shift: shift[0] ** 2 + shift[1] ** 2)
     best = max(by_length, key=lambda shift: values[shift])
-    return None if is_slow and values[best] <= 0 else best
+    return best if values[best] > 0 else None
 
 
 def moving_parts(cubes: Sequence[Cube], shift: Shift) -> list[Cube]:

@@ -22,7 +22,7 @@ from oracle.height_slices import Pixel, Place, SlicedSweeps, Vector, count, empt
 from oracle.overhangs import find_overhung
 from oracle.paired_test import best_candidate, count_wins, evidence_of
 from oracle.pixels import in_range
-from oracle.registration import RigidMotion, register, register_deskewed
+from oracle.registration import LAYER_HEIGHT, NUM_LAYERS, RigidMotion, register, register_deskewed
 from oracle.subpixel_motion import subpixel_motion
 from oracle.sweeps import Cloud, PointMotion
 from oracle.voxels import points_of_objects
@@ -216,13 +216,8 @@ def settle(
     if len(sweeps.images) == 2:
         may_be_slow = [longest is None or length(tuple(own)) * size <= longest for own in members]
         start = subpixel_motion(sweeps, object_of, motions, may_be_slow)
-    moves = [any(motion) for motion in motions]
-    points = points_of_objects(sweeps, object_of, moves)
-    given = [flow if of_object else (0.0, 0.0) for flow, of_object in zip(start, moves)]
-    apparent = [
-        motion if of_object else motion._replace(flow=flow)
-        for motion, of_object, flow in zip(register(points, given, sweeps), moves, start)
-    ]
+    points = points_of_objects(sweeps, object_of, [any(flow) for flow in start], LAYER_HEIGHT, NUM_LAYERS)
+    apparent = register(points, start, sweeps)
     rigid = register_deskewed(points, start, apparent, sweeps, config) if has_times else list(apparent)
     shown = [(motion.flow[1] / size, motion.flow[0] / size) for motion in apparent]
     margins = [margin(sweeps, own, motion) for own, motion in zip(members, shown)]

@@ -6,7 +6,7 @@ import math
 from itertools import product
 from typing import Dict, NamedTuple, Sequence, Tuple
 
-from oracle.height_slices import NUM_SLICES, SLICE_HEIGHT, Pixel, SlicedSweeps, slice_of
+from oracle.height_slices import Pixel, SlicedSweeps, slice_of
 
 UNITS = 1024  # of a metre: centroids are whole numbers of them
 
@@ -40,16 +40,15 @@ def points_of_objects(
     sweeps: SlicedSweeps,
     object_of: dict[Pixel, int],
     wanted: Sequence[bool],
-    heights: float | Sequence[float] = SLICE_HEIGHT,
-    num_slices: int = NUM_SLICES,
+    height: float,
+    num_slices: int,
 ) -> list[Point]:
-    """Points of the objects wanted, in all sweeps; slices are so many metres high, the same for all or by object."""
+    """Points of the objects wanted, in all sweeps; slices are so many metres high."""
     points = []
     for m, cloud in enumerate(sweeps.clouds):
         for x, y, z, time in cloud:
             owner = object_of.get((m, *sweeps.pixel(x, y)), -1)
             if owner >= 0 and wanted[owner]:
-                height = heights if isinstance(heights, float) else heights[owner]
                 points.append(Point(m, slice_of(z, height, num_slices), owner, x, y, time))
     return points
 
@@ -69,11 +68,12 @@ def centroids(points: Sequence[Point], sweeps: SlicedSweeps) -> Voxels:
 
 
 def around(voxels: Voxels, step: int, part: int, x: float, y: float, sweeps: SlicedSweeps, reach: int) -> list[Voxel]:
-    """Voxels of a sweep and slice in the pixels around a place in units, `reach` each way, in raster order; none if any
-    of the pixels lies outside the image."""
-    row, col = math.floor(y / (sweeps.size * UNITS)), math.floor(x / (sweeps.size * UNITS))
-    if not all(reach <= at < length - reach for at, length in zip((row, col), sweeps.shape)):
-        return []
+    """Voxels of a sweep and slice in the pixels around a place in units, `reach` each way, in raster order. At the
+    border and beyond it, they are the outermost pixels."""
+    row, col = (
+        min(max(math.floor(at / (sweeps.size * UNITS)), reach), length - 1 - reach)
+        for at, length in zip((y, x), sweeps.shape)
+    )
     places = [(step, row + dy, col + dx, part) for dy, dx in product(range(-reach, reach + 1), repeat=2)]
     return [voxels[place] for place in places if place in voxels]
 

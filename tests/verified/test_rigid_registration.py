@@ -56,3 +56,26 @@ def test_a_known_motion_is_found():
     old = torch.from_numpy(clouds[1])
     flow = torch.stack(found.flow_at(torch.zeros(len(old), dtype=torch.int64), old[:, 0], old[:, 1]), 1)
     assert (flow - truth).norm(dim=1).mean() < 0.1 * (scene.flow - truth).norm(dim=1).mean()
+
+
+def test_the_motion_of_a_fast_object_is_found_between_the_pixels():
+    rng = np.random.default_rng(0)
+    old = np.concatenate([rng.uniform(-0.5, 0.5, (400, 2)) * (1.6, 0.9), rng.uniform(0, 1.4, (400, 1))], 1)
+    for truth in ((0.23, 0.31), (-0.16, 0.38), (0.125, 0.07)):
+        found = assert_equals_oracle(one_object([old + (*truth, 0.0), old], np.round(np.array(truth), 1)))
+        assert (found.flow[0] - torch.tensor(truth)).abs().max() < 0.02
+
+
+def test_what_meets_nothing_keeps_its_motion():
+    cloud = np.array([[0.05, 0.05, 0.2], [0.15, 0.05, 0.2]])
+    found = assert_equals_oracle(one_object([cloud + (2.0, 0.0, 0.0), cloud], (0.5, 0.0)))
+    assert found.flow.tolist() == [[0.5, 0.0]] and found.turn.tolist() == [0.0]
+
+
+def test_an_object_turns_about_its_centre_which_moves_with_it():
+    """Of sweeps t+1, t and t-1 at a constant turn and speed: all pairs agree."""
+    angle, way = 0.04, (0.4, -0.2)
+    clouds = [scatter(k * angle, k * way[0], k * way[1]) for k in (1, 0, -1)]
+    found = assert_equals_oracle(one_object(clouds, way))
+    assert (found.flow[0] - torch.tensor(way)).abs().max() < 2e-3
+    assert abs(2 * math.atan(float(found.turn[0])) - angle) < 0.1 * angle

@@ -1,4 +1,4 @@
-"""Sub-pixel motion of pairs: the oracle's; slow and fast objects have theirs to centimetres, static ones none."""
+"""Sub-pixel motion of pairs: the oracle's; slow objects have theirs, static ones none, moving ones keep theirs."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ def start(scene: Scene, moves: torch.Tensor) -> torch.Tensor:
     return torch.floor(scene.flow.flip(1) / scene.sweeps.grid.pixel_size + 0.5) * moves[:, None]
 
 
-def found(scene: Scene, moves: bool = False) -> np.ndarray:
-    """(G, 2), metres, from rest or from whole pixels."""
-    every = torch.full((len(scene.flow),), moves)
-    return subpixel_motion(scene.sweeps, scene.objects, start(scene, every), ~every).numpy()
+def found(scene: Scene) -> np.ndarray:
+    """(G, 2), metres, from rest."""
+    every = torch.ones(len(scene.flow), dtype=torch.bool)
+    return subpixel_motion(scene.sweeps, scene.objects, start(scene, ~every), every).numpy()
 
 
 @pytest.mark.parametrize("snap", [0.0, 1 / 16])
@@ -37,7 +37,7 @@ def test_equals_the_oracle(pixel_size, speed, num_windows, snap):
     np.testing.assert_allclose(flow, np.array(expected).reshape(-1, 2), atol=1e-9)
     slow = flow.any(1) & ~moves
     assert int(slow.sum()) < int((~moves).sum()) or speed > 0.1
-    assert not flow[~moves & ~may_be_slow].any() and (flow[moves] != given.flip(1)[moves] * pixel_size).any()
+    assert not flow[~moves & ~may_be_slow].any() and torch.equal(flow[moves], given.flip(1)[moves] * pixel_size)
 
 
 def test_windows_with_history_keep_their_motion():
@@ -68,17 +68,3 @@ def test_a_static_person_stays_static():
     rng = np.random.default_rng(1)
     scenes = [one_object([person((0.03, 0.02), rng), person((0.03, 0.02), rng)], (0.0, 0.0)) for _ in range(30)]
     assert not any(found(scene).any() for scene in scenes)
-
-
-def test_the_motion_of_a_fast_object_is_found_between_the_pixels():
-    rng = np.random.default_rng(0)
-    old = np.concatenate([rng.uniform(-0.5, 0.5, (400, 2)) * (1.6, 0.9), rng.uniform(0, 1.4, (400, 1))], 1)
-    for truth in ((0.23, 0.31), (-0.16, 0.38), (0.125, 0.07)):
-        scene = one_object([old + (*truth, 0.0), old], np.round(np.array(truth), 1))
-        assert np.abs(found(scene, True)[0] - truth).max() < 0.02
-
-
-def test_what_meets_nothing_keeps_its_motion():
-    cloud = np.array([[0.05, 0.05, 0.2], [0.15, 0.05, 0.2]])
-    scene = one_object([cloud + (2.0, 0.0, 0.0), cloud], (0.5, 0.0))
-    np.testing.assert_allclose(found(scene, True), [[0.5, 0.0]], atol=1e-9)
