@@ -1,4 +1,4 @@
-"""A few small logs, runs on them in this process, and what they leave."""
+"""A few small logs, runs on them in this process, and the files of a run."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from cflow_torch.simulator.writers.av2 import write_av2_log
 SWEEPS = (4, 6, 3)  # of the logs
 PAIRS = sum(SWEEPS) - len(SWEEPS)
 CONFIG = make_config("paper", pixel_size=0.4, num_history=1)
-# The command for the same.
+# The same settings for the command.
 COMMAND = ["flow", "data=av2", "model=paper", "model.pixel_sizes=[0.4]", "model.num_history=1", "data.check=false"]
 ONE = Layout(("cpu",), 2)
 TWO = Layout(("cpu", "cpu"), 2)
@@ -33,7 +33,7 @@ def write_fleet(root: Path) -> Path:
 
 
 def make_job(output: Path, **settings: Any) -> Job:
-    """A run of `CONFIG` on Argoverse 2 logs."""
+    """A job with `CONFIG` on Argoverse 2 logs."""
     values: dict[str, Any] = {"config": CONFIG, "settings": {"check": False}, "batch": 2, **settings}
     hashed = make_identity(values["config"], "av2", values["settings"])["hash"]
     return Job(identity=hashed, reader="av2", output=str(output), **values)
@@ -50,7 +50,7 @@ def run(
     settings: dict[str, Any] = {},  # noqa: B006 (read only)
     **engine_settings: Any,
 ) -> dict[str, Any]:
-    """`cflow flow` without the command line; the report. `settings` are the job's, in place of those of `make_job`."""
+    """Run `cflow flow` without the command line; returns the report. `settings` replace those of `make_job`."""
     job = make_job(output, batch=layout.batch, redo=overwrite, **settings)
     identity = make_identity(job.config, "av2", job.settings, job.contents)
     claim_folder(output, identity, resume, overwrite, shard.count == 1)
@@ -63,13 +63,13 @@ def command(*arguments: Any) -> int:
 
 
 def tree(output: Path) -> dict[str, bytes]:
-    """Every file, hidden ones too, but reports, which tell times, and config.yaml, which tells where the data lies."""
+    """All files, also hidden ones, except reports, which contain times, and config.yaml, which contains paths."""
     files = [f for f in output.rglob("*") if f.is_file() and "reports" not in f.parts and f.name != "config.yaml"]
     return {str(file.relative_to(output)): file.read_bytes() for file in files}
 
 
 def flow_files(output: Path) -> dict[str, bytes]:
-    """Those of `tree` that hold flow."""
+    """The flow files of `tree`."""
     return {name: content for name, content in tree(output).items() if name.endswith(".feather")}
 
 

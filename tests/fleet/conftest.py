@@ -1,4 +1,4 @@
-"""The logs of all tests of fleets, and the flow of a run that nothing disturbed."""
+"""The logs of all fleet tests, and the flow of an undisturbed run."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def single_run(fleet: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The output of one worker, one window at a time. Read only."""
+    """The output of one worker, one window at a time; read only."""
     output = tmp_path_factory.mktemp("single") / "flow"
     assert run(fleet, output, Layout(("cpu",), batch=1))["status"] == "complete"
     return output

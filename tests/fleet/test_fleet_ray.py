@@ -1,4 +1,4 @@
-"""Engine `ray`: the same bytes as engine `local`; what a dying worker had in hand is done again, or reported."""
+"""Engine `ray`: it writes the bytes of engine `local` and repeats or reports the frames of a dead worker."""
 
 from __future__ import annotations
 
@@ -32,14 +32,11 @@ def test_equals_the_local_engine_byte_for_byte(fleet: Path, single: dict[str, by
 
 
 class LethalActor:
-    """A worker that is killed when it reads a frame whose name is that of a file, as often as is written there.
-
-    The files lie beside the output.
-    """
+    """A worker that is killed when it reads a frame with a file next to the output. The file contains how often."""
 
     def __init__(self, folder: str, job: Job, *more: Any) -> None:
         self._folder = Path(job.output).parent / "kills"
-        self._actor = ray_engine._Actor(folder, job, *more)  # in the worker process, where it is the real one
+        self._actor = ray_engine._Actor(folder, job, *more)  # the real one, because this runs in the worker process
 
     def start(self) -> None:
         self._actor.start()
@@ -61,7 +58,7 @@ class LethalActor:
 
 @pytest.fixture
 def kills(fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[int, int], Path]]:
-    """Makes a frame of the longest log kill its worker so many times; gives the file that counts down."""
+    """Function (index of a frame, count) that makes a frame of the longest log deadly; returns its file."""
     from ray import cloudpickle
 
     monkeypatch.setattr(ray_engine, "_Actor", LethalActor)
@@ -103,7 +100,7 @@ def start(layout: Layout, **settings: Any) -> None:
         (Layout(("cuda:1",), 1), {}, "CUDA_VISIBLE_DEVICES"),
     ],
 )
-def test_bad_settings(layout: Layout, settings: dict[str, Any], message: str) -> None:
+def test_bad_settings_are_errors(layout: Layout, settings: dict[str, Any], message: str) -> None:
     with pytest.raises(CFlowError, match=message):
         start(layout, **settings)
 

@@ -1,4 +1,4 @@
-"""Whole runs: the same files as one frame after the other, resumed, in shards, with logs that are broken."""
+"""Whole runs: in batches, resumed, in shards, with broken logs; the files are always those of one worker."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ OTHER = {"config": make_config("paper", pixel_size=0.8)}  # settings of another 
 
 @pytest.fixture
 def out(single_run: Path, tmp_path: Path) -> Path:
-    """A copy of a complete run's output."""
+    """A copy of the output of a complete run."""
     return Path(shutil.copytree(single_run, tmp_path / "out"))
 
 
-# What the files hold
+# Content of the files
 
 
-def test_files_hold_the_results_of_the_method_and_their_origin(fleet: Path, single_run: Path) -> None:
+def test_files_contain_the_results_and_their_origin(fleet: Path, single_run: Path) -> None:
     model = make_model(CONFIG)
     for folder in sorted(fleet.iterdir()):
         log = AV2Log(folder)
@@ -72,7 +72,7 @@ def test_a_file_has_only_the_contents_asked_for(fleet: Path, single_run: Path, t
 # Resuming
 
 
-def test_a_second_run_does_only_what_is_missing(fleet: Path, single: dict[str, bytes], out: Path) -> None:
+def test_a_second_run_computes_only_missing_frames(fleet: Path, single: dict[str, bytes], out: Path) -> None:
     gone = frames(out)[2::3]
     for file in gone:
         file.unlink()
@@ -80,10 +80,10 @@ def test_a_second_run_does_only_what_is_missing(fleet: Path, single: dict[str, b
     counted = run(fleet, out)["frames"]
     assert tree(out) == single
     assert (counted["computed"], counted["complete_before"]) == (len(gone), PAIRS - len(gone))
-    assert all(file.stat().st_mtime_ns == time for file, time in times.items()), "complete files are left alone"
+    assert all(file.stat().st_mtime_ns == time for file, time in times.items()), "complete files are kept"
 
 
-def test_files_that_a_power_cut_spoiled_are_done_again(fleet: Path, single: dict[str, bytes], out: Path) -> None:
+def test_incomplete_files_are_computed_again(fleet: Path, single: dict[str, bytes], out: Path) -> None:
     for number, file in enumerate(frames(out)[::2]):
         whole = file.read_bytes()
         file.write_bytes(b"" if number == 0 else whole[: len(whole) // 2] + bytes(len(whole) - len(whole) // 2))
@@ -91,7 +91,7 @@ def test_files_that_a_power_cut_spoiled_are_done_again(fleet: Path, single: dict
     assert tree(out) == single
 
 
-def test_other_settings_are_refused_by_name(fleet: Path, single: dict[str, bytes], out: Path) -> None:
+def test_other_settings_are_rejected_by_name(fleet: Path, single: dict[str, bytes], out: Path) -> None:
     with pytest.raises(CFlowError, match=re.escape("method.pixel_sizes was [0.4], is [0.8]") + ".*overwrite=true"):
         run(fleet, out, settings=OTHER)
     with pytest.raises(CFlowError, match="find_ground was None, is grid"):
@@ -108,7 +108,7 @@ def test_other_settings_are_refused_by_name(fleet: Path, single: dict[str, bytes
     assert tree(out) == single, "nothing was touched"
 
 
-def test_overwrite_leaves_nothing_of_the_other_run(fleet: Path, out: Path, tmp_path: Path) -> None:
+def test_overwrite_removes_the_other_run(fleet: Path, out: Path, tmp_path: Path) -> None:
     shutil.copytree(out / frames(out)[0].parent.name, out / "a-log-of-the-other-run")
     (out / "mine.txt").write_text("not of a run")
     (out / "manifest.json").unlink()  # an earlier attempt was killed in the middle
@@ -119,13 +119,13 @@ def test_overwrite_leaves_nothing_of_the_other_run(fleet: Path, out: Path, tmp_p
     assert run(fleet, out, overwrite=True, settings=OTHER)["frames"]["computed"] == PAIRS, "its own frames, too"
 
 
-def test_memory_limit_and_place_are_no_other_settings(fleet: Path, out: Path, tmp_path: Path) -> None:
+def test_memory_limit_and_paths_may_change(fleet: Path, out: Path, tmp_path: Path) -> None:
     moved = Path(shutil.copytree(fleet, tmp_path / "Straße 東京"))
     report = run(moved, out, settings={"config": CONFIG.replace(max_memory=5e7)})
     assert report["frames"]["computed"] == 0
 
 
-def test_a_log_that_has_changed_is_refused_and_the_others_go_on(
+def test_a_changed_log_is_rejected_and_the_others_are_done(
     fleet: Path, single: dict[str, bytes], out: Path, tmp_path: Path
 ) -> None:
     root = Path(shutil.copytree(fleet, tmp_path / "root"))
@@ -138,7 +138,7 @@ def test_a_log_that_has_changed_is_refused_and_the_others_go_on(
     assert tree(out) == single
 
 
-def test_results_may_lie_where_fsspec_reaches(fleet: Path, single_run: Path, tmp_path: Path) -> None:
+def test_data_and_results_may_be_in_an_object_store(fleet: Path, single_run: Path, tmp_path: Path) -> None:
     fsspec = pytest.importorskip("fsspec", reason="needs the extra remote")
     pytest.importorskip("upath", reason="needs the extra remote")
     memory = fsspec.filesystem("memory")
@@ -172,10 +172,10 @@ def test_a_sweep_over_shards_shares_one_folder(fleet: Path, single_run: Path, tm
     assert flow_files(tmp_path) == flow_files(single_run)
 
 
-# Trouble
+# Errors and signals
 
 
-def test_a_sweep_that_cannot_be_read_costs_its_frames_only(
+def test_a_broken_sweep_fails_only_its_frames(
     fleet: Path, single: dict[str, bytes], tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     root, out = Path(shutil.copytree(fleet, tmp_path / "root")), tmp_path / "out"
@@ -193,7 +193,7 @@ def test_a_sweep_that_cannot_be_read_costs_its_frames_only(
     assert tree(out).keys() == single.keys()
 
 
-def test_a_log_that_cannot_be_opened_costs_no_other(fleet: Path, single: dict[str, bytes], tmp_path: Path) -> None:
+def test_a_log_that_cannot_be_opened_is_skipped(fleet: Path, single: dict[str, bytes], tmp_path: Path) -> None:
     root, out = Path(shutil.copytree(fleet, tmp_path / "root")), tmp_path / "out"
     first = sorted(root.iterdir())[0]
     poses = first / "city_SE3_egovehicle.feather"
@@ -210,7 +210,7 @@ def test_a_log_that_cannot_be_opened_costs_no_other(fleet: Path, single: dict[st
 
 
 def during(patch: pytest.MonkeyPatch, number: int, act: Callable[[], Any]) -> None:
-    """Do something when a run begins to write its so-many-th frame."""
+    """Call `act` when a run begins to write frame `number`, from 1."""
     calls, write = [], work.write_flow
 
     def write_after(*arguments: Any) -> None:
@@ -222,7 +222,7 @@ def during(patch: pytest.MonkeyPatch, number: int, act: Callable[[], Any]) -> No
     patch.setattr(work, "write_flow", write_after)
 
 
-def test_a_signal_ends_a_run_in_order(
+def test_a_signal_lets_frames_in_hand_be_finished(
     fleet: Path, single: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     during(monkeypatch, 2, lambda: os.kill(os.getpid(), signal.SIGTERM))
