@@ -22,7 +22,7 @@ from cflow_torch.types import CFlowError, FlowResult, Window
 _MIN_MOVING = 3  # sweeps
 _MIN_EVIDENCE = 2.0  # sum of the log-odds of its confidence
 _NO_CONFIDENCE = 0.7  # log-odds of a method without confidence
-_THIN = 0.12  # metres; a narrower box is no evidence: posts, and slices of fronts along which a shadow glides
+_THIN = 0.12  # metres; we do not trust narrower boxes: posts, and slices of fronts along which a shadow moves
 _MIN_TRAVEL = 0.5  # metres that its box must have travelled along its flow
 _MIN_TRAVEL_SHARE = 0.5  # of the distance that its flow predicts, which the box must have travelled, too
 _MIN_SHARE = 0.1  # of common voxels, for a match of two groups

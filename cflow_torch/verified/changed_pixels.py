@@ -1,6 +1,6 @@
 """Changed pixels: what is not found in place in another sweep, although that sweep saw the place.
 
-Near objects cast shadows on what stands behind them, and when the sensor moves, the shadows move as well. So a slice
+Near objects cast shadows on the background, and when the sensor moves, the shadows move as well. So a slice
 that is missing counts only where the other sweep saw through: a return in the same direction is at least as far away.
 """
 

@@ -21,7 +21,7 @@ RANGE = 50.0  # metres
 def dufomap_labels(
     points: Sequence[np.ndarray], poses: Sequence[np.ndarray], settings: tuple[float, float, int]
 ) -> list[np.ndarray]:
-    """What moves, by DUFOMap with clusters and propagation.
+    """Return the dynamic points, by DUFOMap with clusters and propagation.
 
     Args:
         points: (N, 3) metres, of each sweep in the frame of its LiDAR. Those of 2 ... 50 m are put in the map.
