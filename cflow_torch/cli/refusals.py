@@ -10,7 +10,8 @@ from cflow_torch.cli.choices import files, groups, near, own_settings, settings
 from cflow_torch.config import CONFIGS
 from cflow_torch.types import CFlowError
 
-_RENAMED = {"standing": "remove_stopped"}  # settings of the last version, and their names now
+# Settings of the last version; those of the methods are in `config.REMOVED`.
+_REMOVED = {"standing": "use remove_stopped", "residual_axes": "leave it out"}
 _PLUGINS = "hydra-joblib-launcher hydra-submitit-launcher hydra-optuna-sweeper"
 
 
@@ -47,8 +48,8 @@ def _unknown(key: str, kind: str, command: str) -> str:
     owners = [f"picture={file.stem}" for file in files("picture") if key in own_settings(file)]
     if command == "plot" and owners:
         return f"setting {key!r} belongs to {' or '.join(owners)}: give that as well, or leave the setting out"
-    if name in _RENAMED:
-        return f"setting {key!r} is now {_RENAMED[name]!r}"
+    if name in _REMOVED:
+        return f"setting {name} was removed: {_REMOVED[name]}"
     known = [*groups(command), *settings(command)]
     if key in known:  # for example of another data set
         return f"the chosen configuration has no setting {key!r}: give +{key}=VALUE to add it, or leave it out"

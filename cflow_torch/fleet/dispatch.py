@@ -98,7 +98,7 @@ def _work(process: Process, todo: Queue[Any], answers: Queue[Any], stop: Callabl
             answers.put(None)
     except Exception as error:
         answers.put(error)
-        if unit is not None:  # what is left of it is reported as not done
+        if unit is not None:  # its missing frames are reported as not done
             answers.put(None)
 
 
@@ -115,44 +115,42 @@ def _start(process: Process) -> None:
 
 
 def _do(process: Process, unit: Unit, stop: Callable[[], bool], retries: int) -> Iterator[Event]:
-    """Do a unit and yield its events. When the process dies, start it again and repeat what is left."""
+    """Do a unit and yield its events. When the process dies, start it again and repeat the frames that are missing."""
     name, is_opened, num_deaths = source_name(unit.source), False, 0
     parts = deque([unit])
     while parts and not stop():
         part = parts.popleft()
-        left = None if part.only is None else set(part.only)  # frames that are not settled; None = not known
+        missing = None if part.only is None else set(part.only)  # frames that are not settled; None = not known
         try:
             for event in _events(process, part, stop):
-                if isinstance(event, Opened):
-                    written = (left or set()).difference(event.todo)  # just before the last process died
-                    if is_opened:
-                        yield from (Done(unit.number, stamp, {}) for stamp in written)
-                    else:
-                        yield event
-                    name, is_opened, left = event.log_id, True, set(event.todo)
-                else:
-                    if left is not None and event.timestamp is not None:
-                        left.discard(event.timestamp)
+                if not isinstance(event, Opened):
+                    (missing or set()).discard(event.timestamp)
                     yield event
+                    continue
+                if is_opened:  # a repetition: the other frames were written just before the last process died
+                    yield from (Done(unit.number, stamp, {}) for stamp in (missing or set()).difference(event.todo))
+                else:
+                    yield event
+                name, is_opened, missing = event.log_id, True, set(event.todo)
             continue
         except WorkerDied as death:
             how = str(death)
         _start(process)
         num_deaths += 1
-        part = replace(part, only=None if left is None else frozenset(left), deaths=part.deaths + 1)
+        stamps = sorted(missing or [])
+        part = replace(part, only=None if missing is None else frozenset(missing), deaths=part.deaths + 1)
         if num_deaths == max(_MAX_DEATHS, 2 * (retries + 1)):
             message = f"{num_deaths} workers died on this part of the log, the last one {how}: the rest is left"
             yield Failed(unit.number, name, message)
             return
         if part.deaths <= retries:
             parts.append(part)
-        elif left is not None and len(left) > 1:
-            parts.extend(replace(part, only=frozenset([stamp]), deaths=0) for stamp in sorted(left))
-        elif left is None or left:
-            (stamp,) = left or [None]
-            frame = name if stamp is None else f"{name}/{stamp}"
-            workers = f"{part.deaths} worker{'s' * (part.deaths > 1)}"
-            yield Failed(unit.number, frame, f"{workers} died on it, the last one {how}", stamp)
+        elif len(stamps) > 1:
+            parts.extend(replace(part, only=frozenset([stamp]), deaths=0) for stamp in stamps)
+        elif stamps or not is_opened:
+            frame = "/".join([name, *map(str, stamps)])
+            message = f"{part.deaths} worker{'s' * (part.deaths > 1)} died on it, the last one {how}"
+            yield Failed(unit.number, frame, message, stamps[0] if stamps else None)
 
 
 def _events(process: Process, unit: Unit, stop: Callable[[], bool]) -> Iterator[Event]:

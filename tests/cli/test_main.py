@@ -77,7 +77,7 @@ def test_version_and_help_come_without_torch(cflow: Cflow, capsys: pytest.Captur
         ("flow data=av2 data.root=/no/such/folder", "/no/such/folder"),
         ("flow contents=[confidence] model=paper", "only model=default, fast and offline have a confidence"),
         ("completion", "one of bash, zsh, fish, got nothing"),
-        ("clean standing=true", "setting 'standing' is now 'remove_stopped'"),
+        ("clean standing=true", "setting standing was removed: use remove_stopped"),
     ],
 )
 def test_a_wrong_call_is_one_line_with_a_hint(
