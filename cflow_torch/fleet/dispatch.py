@@ -124,7 +124,8 @@ def _do(process: Process, unit: Unit, stop: Callable[[], bool], retries: int) ->
         try:
             for event in _events(process, part, stop):
                 if not isinstance(event, Opened):
-                    (missing or set()).discard(event.timestamp)
+                    if missing is not None and event.timestamp is not None:
+                        missing.discard(event.timestamp)
                     yield event
                     continue
                 if is_opened:  # a repetition: the other frames were written just before the last process died
