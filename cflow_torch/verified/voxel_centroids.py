@@ -157,6 +157,7 @@ class Voxels:
         pixel = torch.add(at[:, 0], at[:, 1], alpha=grid.width).add_(sweep, alpha=grid.height * grid.width)
         line = torch.arange(-reach, reach + 1, device=part.device)
         pixel = pixel + torch.add(line, line[:, None], alpha=grid.width).view(-1, 1)
+        pixel.clamp_(0, self._sweeps.rank.numel() - 1)  # a tiny image has fewer rows or columns than are asked for
         rank = self._sweeps.rank.index_select(0, pixel.view(-1)).view_as(pixel)
         return self._of_key.index_select(0, torch.add(part, rank, alpha=self._num_slices).view(-1)).view_as(pixel)
 
