@@ -35,7 +35,7 @@ _TALL = 2
 
 
 def slides_along_itself(sweeps: HeightSlicedSweeps, members: Pixels, owner: Tensor, candidates: Tensor) -> Tensor:
-    """Which motions are explained by a line that stays where it is.
+    """Find the motions that a static line explains.
 
     Args:
         sweeps: images of all windows.
@@ -53,7 +53,7 @@ def slides_along_itself(sweeps: HeightSlicedSweeps, members: Pixels, owner: Tens
         those of the pixels' places, at most 0.3 m across and at least 1 m along. "The same place" is a cell of about
         0.4 m (whole pixels) and its eight neighbours. Zero motion never slides.
 
-    Cost: some passes over the pixels; nine look-ups for each comparison of the few components that are suspect.
+    Cost: some passes over the pixels; nine lookups for each comparison of the few components that are suspect.
     Source: the aperture problem; not in the paper.
     """
     count, pixel_size = len(candidates), sweeps.grid.pixel_size
@@ -79,7 +79,7 @@ def slides_along_itself(sweeps: HeightSlicedSweeps, members: Pixels, owner: Tens
 def principal_axes(
     component: Tensor, row: Tensor, col: Tensor, num_components: int, pixel_size: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Whether each component is a line, (A,) bool, and y and x of its direction, (A,) float64, of any length.
+    """Return whether each component is a line, (A,) bool, and y and x of its direction, (A,) float64, of any length.
 
     Args:
         component, row, col: (Q,) int64, its pixels at t+1.
@@ -133,7 +133,7 @@ def _is_covered(sweeps: HeightSlicedSweeps, members: Pixels, owner: Tensor, coun
 
 
 def both_ends_move(sweeps: HeightSlicedSweeps, roots: Tensor, is_long: Tensor) -> Tensor:
-    """Which long components move from end to end.
+    """Find the long components whose two ends both move.
 
     Args:
         sweeps: P occupied pixels.

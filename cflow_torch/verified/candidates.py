@@ -31,7 +31,7 @@ _LARGEST_BOX = 1 << 12
 
 
 class Candidates(NamedTuple):
-    """What N nodes may have done.
+    """Motion candidates of N nodes.
 
     Args:
         motion: (N, C, 2) float64, (y, x), finest pixels per sweep interval, in the order in which ties are decided; 0

@@ -44,7 +44,7 @@ def find_changed(sweeps: HeightSlicedSweeps) -> ChangedPixels:
         first at or above the lowest point of its pixel. A sweep saw a place if a return in its direction is at least as
         far away; the place is hidden if all returns there are nearer; if there is none, nobody knows.
 
-    Cost: a look-up for each pixel and sweep, and a range image of every sweep.
+    Cost: a lookup for each pixel and sweep, and a range image of every sweep.
     """
     pixels, num_steps = sweeps.pixels, sweeps.num_steps
     nothing = torch.zeros_like(pixels.slices, dtype=torch.bool)

@@ -1,4 +1,4 @@
-"""Which motions are distinctive, and how far you can trust the flow of a point (docs/verified.md).
+"""The margin of motions, and the confidence of the flow of each point (docs/verified.md).
 
 The margin of a motion says how much worse it explains the sweeps when it is displaced. Along a wall that seems to slide
 nothing gets worse, and a trunk of few points fits many places: what fits as well when displaced is static.
@@ -54,7 +54,7 @@ def motion_margin(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMoti
         objects: G of them.
         rigid: their motion. Rotations are ignored: an object counts as if it moved as its centre does.
 
-    Cost: five look-ups for each pixel of the moving objects and each sweep.
+    Cost: five lookups for each pixel of the moving objects and each sweep.
     """
     size, device = sweeps.grid.pixel_size, rigid.flow.device
     motion, off = rigid.pixels_per_interval(size), _DISPLACEMENT / size
@@ -83,7 +83,7 @@ def confidence_of(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMoti
     Returns:
         (P + 1,) float32; entry P is for points whose pixel was left out. Undefined for pixels of other sweeps.
 
-    Cost: one look-up for each pixel of t.
+    Cost: one lookup for each pixel of t.
     """
     pixels, size, device = sweeps.pixels, sweeps.grid.pixel_size, margin.device
     motion = rigid.pixels_per_interval(size)

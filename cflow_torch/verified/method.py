@@ -33,7 +33,7 @@ _AROUND = 4.0
 
 
 class VerifiedFlow(SceneFlowModel):
-    """What the presets `default`, `fast` and `offline` run: windows in, flow out. No parameters, no buffers, no state.
+    """Estimate flow by verified motion candidates: the presets `default`, `fast` and `offline`. It has no parameters.
 
     Args:
         config: a `VerifiedConfig`; `VerifiedFlow.from_preset` makes it from a preset.
@@ -55,7 +55,7 @@ class VerifiedFlow(SceneFlowModel):
 
     @property
     def needs_ground(self) -> bool:  # type: ignore[override]
-        """Whether the heights of ground points are asked for."""
+        """True if the method needs the heights of ground points."""
         return self.config.min_height is not None
 
     @property

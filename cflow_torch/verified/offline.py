@@ -64,7 +64,7 @@ def best_nearby(sweeps: HeightSlicedSweeps, objects: Objects, motion: Tensor, si
 
     Convention: whole pixels in y and in x. Ties: the nearest, of those the first in raster order.
 
-    Cost: 25 look-ups for each pixel and sweep of the moving objects.
+    Cost: 25 lookups for each pixel and sweep of the moving objects.
     """
     line = torch.arange(-_REACH, _REACH + 1, device=motion.device)
     offsets = torch.cartesian_prod(line, line)

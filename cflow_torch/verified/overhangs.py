@@ -54,7 +54,7 @@ def add_overhung(sweeps: HeightSlicedSweeps, components: Components, nodes: Node
         the next occupied cell above it in any column, with two empty ones at least between. Of two components in one
         pixel of a sweep the one whose first cell is the first has it.
 
-    Cost: linear in the points that may move; 13 look-ups for each cell, a few rounds of union-find.
+    Cost: linear in the points that may move; 13 lookups for each cell, a few rounds of union-find.
     """
     level, num_own, num_points = components.num_levels - 2, sweeps.num_pixels, sweeps.batch.image.numel()
     may_move = components.may_move.index_select(0, components.roots[level])

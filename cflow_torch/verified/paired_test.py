@@ -91,7 +91,7 @@ def count_wins(sweeps: HeightSlicedSweeps, members: Pixels, owner: Tensor, candi
         of the pixels around it. Sweeps that a window lacks are empty: no counts.
         Fewer than 2^31 slices of a component may be compared.
 
-    Cost: K (S - 1) C look-ups at most, of the pixels of tested components only.
+    Cost: K (S - 1) C lookups at most, of the pixels of tested components only.
     """
     (count, num_candidates, _), num_steps, device = candidates.shape, sweeps.num_steps, owner.device
     chosen = flat_nonzero(tested)
@@ -193,13 +193,13 @@ def comparisons(step: Tensor, num_steps: int) -> tuple[Tensor, Tensor]:
 
 def _counts_of(device: torch.device) -> Tensor:
     """(256,) int64: set bits of the lower half of a byte times 2^32, plus those of its upper half. Both counts are in
-    one number because sums cost more than look-ups."""
+    one number because sums cost more than lookups."""
     byte = torch.arange(256, dtype=torch.uint8, device=device)
     return (count_slices(byte & OWN).long() << 32) + count_slices(byte >> NUM_SLICES).long()
 
 
 def evidence_of(won: Tensor, lost: Tensor, z: float) -> Tensor:
-    """What each motion explains beyond noise: (won - lost) - z sqrt(won + lost), in sixteenths of a slice.
+    """Return the evidence of each motion, (won - lost) - z sqrt(won + lost), in sixteenths of a slice.
 
     Args:
         won, lost: int64 of one shape, below 2^31.

@@ -45,7 +45,7 @@ def register(points: ObjectPoints, sweeps: HeightSlicedSweeps, flow: Tensor) -> 
     Returns:
         The motion. An object without points at t keeps its flow.
 
-    Cost: nine look-ups a step for each voxel and sweep.
+    Cost: nine lookups a step for each voxel and sweep.
     """
     given = torch.view_as_complex(flow * UNITS)
     pairs = _VoxelPairs(Voxels(points, sweeps, NUM_LAYERS), sweeps, len(flow))
@@ -58,7 +58,7 @@ def register(points: ObjectPoints, sweeps: HeightSlicedSweeps, flow: Tensor) -> 
 
 
 def stretch_of(points: ObjectPoints, sweeps: HeightSlicedSweeps, rigid: RigidMotion) -> Tensor:
-    """By what factor the time between two sightings of an object is longer than that between the sweeps.
+    """Return the ratio of the time between two sightings of an object to the time between the sweeps.
 
     Args:
         points: of the objects that move, with times.

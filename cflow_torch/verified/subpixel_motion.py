@@ -50,7 +50,7 @@ def subpixel_motion(sweeps: HeightSlicedSweeps, objects: Objects, motion: Tensor
         moves, a part may be static, such as a post beside a car: cubes in blocks of 0.4 m that lose by the shift are
         left out, and the rest is tested again.
 
-    Cost: eight look-ups for each pixel of objects that may be slow; for each cube of those that are biased 99 times 25.
+    Cost: eight lookups for each pixel of objects that may be slow; for each cube of those that are biased 99 times 25.
     """
     flow = motion.flip(1) * sweeps.grid.pixel_size
     window = sweeps.pixels.window.index_select(0, objects.first)
@@ -91,7 +91,7 @@ def _best_shift(gain: Tensor, square: Tensor, count: Tensor) -> tuple[Tensor, Te
 
 
 def _is_biased(sweeps: HeightSlicedSweeps, objects: Objects, wanted: Tensor) -> Tensor:
-    """Which objects match more of the other sweep a pixel ahead than a pixel behind, or the other way round.
+    """Find objects that match the other sweep better one pixel ahead than one pixel behind, or one pixel behind.
 
     Args:
         sweeps: of pairs; other steps are ignored.

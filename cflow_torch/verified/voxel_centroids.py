@@ -68,7 +68,7 @@ def points_of_objects(
         slice_height: metres.
         num_slices: a power of 2.
 
-    Cost: two look-ups a point, the rest for those that are kept.
+    Cost: two lookups a point, the rest for those that are kept.
     """
     points = flat_nonzero(lookup(lookup(wanted, objects.of_pixel), sweeps.pixel_of_point))
     pixel, rows = sweeps.pixel_of_point.index_select(0, points), sweeps.point(points)
@@ -129,7 +129,7 @@ class Voxels:
         Returns:
             (K,) int64, V = there is none.
 
-        Cost: nine look-ups each.
+        Cost: nine lookups each.
         """
         voxel = self.around(sweep, part, place, 1)
         square = square_of(self.place.index_select(0, voxel.view(-1)).view_as(voxel).sub_(place))
