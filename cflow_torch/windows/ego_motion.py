@@ -69,19 +69,7 @@ def _dot(a: Sequence[float], b: Sequence[float]) -> float:
 
 
 def relative_transform(pose1: Any, pose: Any, name: str = "pose") -> np.ndarray:
-    """T_ego1_ego = inv(T_world_ego1) T_world_ego.
-
-    Args:
-        pose1: (4, 4) `T_world_ego1`, pose of sweep t+1.
-        pose: (4, 4) `T_world_ego`, pose of another sweep.
-        name: name of `pose` in errors.
-
-    Returns:
-        (4, 4) float64.
-
-    Raises:
-        CFlowError: a pose is not a finite rigid transform.
-    """
+    """T_ego1_ego = inv(T_world_ego1) T_world_ego, (4, 4) float64, of two poses. Errors as in `rigid_transform`."""
     return np.linalg.inv(rigid_transform(pose1, "pose1")) @ rigid_transform(pose, name)
 
 

@@ -85,7 +85,7 @@ def find_ground_batch(
         return []
     positions, sweep = _stack(clouds, device)
     if method == "grid":
-        is_ground = ground_points(positions, sweep, len(clouds), round(threshold * 1000))
+        is_ground = _grid(positions, sweep, len(clouds), round(threshold * 1000))
     else:
         is_ground = _patchwork(positions, sweep, len(clouds))
     masks = is_ground.split([cloud.shape[0] for cloud in clouds])
@@ -121,18 +121,8 @@ def has_ground(clouds: Sequence[Array], most_points: int = 30_000, device: Any =
     return list(near_plane(points, sweep, inside, len(clouds)).is_there.tolist())
 
 
-def ground_points(positions: Tensor, sweep: Tensor, num_sweeps: int, threshold: int) -> Tensor:
-    """Segment the ground by method "grid".
-
-    Args:
-        positions: (3, N) float64, metres.
-        sweep: (N,) int64, sweep of each point.
-        num_sweeps: B.
-        threshold: mm.
-
-    Returns:
-        (N,) bool.
-    """
+def _grid(positions: Tensor, sweep: Tensor, num_sweeps: int, threshold: int) -> Tensor:
+    """(N,) bool ground by method "grid", of (3, N) float64 metres and the sweep of each point. Threshold in mm."""
     points, inside = millimetres(positions)
     plane = near_plane(points, sweep, inside, num_sweeps)
     above = (points[2] - plane.at(points[0], points[1], sweep)).clamp_(-_HIGHEST, _HIGHEST)

@@ -35,12 +35,7 @@ class GroundHeights:
         self._counts = torch.zeros_like(self._heights)
 
     def add(self, window: int | Tensor, positions: Tensor) -> None:
-        """Count ground points.
-
-        Args:
-            window: (N,) int64, or one number for all points.
-            positions: (3, N) float64, metres, frame of t+1, inside the region.
-        """
+        """Count ground points at (3, N) float64 metres in the region, frame of t+1, of one window or (N,) windows."""
         block = self._block(positions).long() + window * self._heights[0].numel()
         height = torch.floor(positions[2] * 100).clamp_(-_HIGHEST, _HIGHEST).long()
         self._heights.view(-1).index_add_(0, block, height)

@@ -108,7 +108,7 @@ def source_sweeps(window: Window, config: Config) -> list[Source]:
     if any(has_pose) and not all(has_pose):
         raise CFlowError(
             "some sweeps of the window have a pose and some do not: give the pose of every sweep, or of none "
-            "(then all points must already lie in the frame of t+1)"
+            "(then all points must already be in the frame of t+1)"
         )
     sources: list[Source] = []
     num_past = 1 + len(window.pch)
