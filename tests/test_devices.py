@@ -18,12 +18,12 @@ pytestmark = pytest.mark.skipif(not pretend_device.IS_THERE, reason="torch befor
 SCALES = (0.8, 0.4, 0.3, 0.2, 0.1)
 # Launches and waits of one window, and launches of sixteen windows: the counted numbers plus 15 %.
 BOUNDS: dict[str, tuple[Config, int, int, int]] = {
-    "paper": (small("paper", num_history=0), 633, 35, 755),
-    "paper, h = 4, 5 scales": (small("paper", num_history=4, pixel_sizes=SCALES), 3692, 146, 4016),
-    "keypoints": (small("keypoints"), 917, 34, 1045),
-    "fast": (small("fast"), 4150, 121, 4317),
-    "default": (small("default"), 4199, 121, 4364),
-    "offline": (small("offline"), 4524, 140, 4828),
+    "paper": (small("paper", num_history=0), 639, 31, 729),
+    "paper, h = 4, 5 scales": (small("paper", num_history=4, pixel_sizes=SCALES), 3711, 137, 3939),
+    "keypoints": (small("keypoints"), 922, 34, 1013),
+    "fast": (small("fast"), 3260, 116, 3424),
+    "default": (small("default"), 3303, 116, 3466),
+    "offline": (small("offline"), 3617, 136, 3918),
 }
 
 
