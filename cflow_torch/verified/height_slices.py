@@ -195,11 +195,6 @@ class HeightSlicedSweeps:
         )
 
     @property
-    def num_home_windows(self) -> int:
-        """Windows that are not copies."""
-        return self.image.numel() // (2 * self.num_steps * self.grid.height * self.grid.width)
-
-    @property
     def num_pixels(self) -> int:
         """P."""
         return len(self.pixels.index)

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.model import Motion
-from cflow_torch.ops.indices import flat_nonzero, lookup
+from cflow_torch.ops.indices import flat_nonzero, index_in_group, lookup
 from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 
@@ -27,12 +27,6 @@ class RigidMotion:
     flow: Tensor
     turn: Tensor
     centre: Tensor
-
-    @classmethod
-    def translation(cls, flow: Tensor) -> RigidMotion:
-        """Objects that do not turn."""
-        still = torch.zeros_like(flow)
-        return cls(flow, still[:, 0], still)
 
     def pixels_per_interval(self, pixel_size: float) -> Tensor:
         """(G, 2) float64, (y, x): the flow at the centre, in pixels of a size in metres."""
@@ -75,7 +69,7 @@ class TurningMotion(Motion):
         turns = flat_nonzero((self.turn != 0).index_select(0, cluster))
         rigid = RigidMotion(self.flow[:, :2], self.turn, self.centre)
         x, y = rigid.flow_at(cluster.index_select(0, turns), *positions[:2].index_select(1, turns).unbind(0))
-        flow[turns, 0], flow[turns, 1] = x + 0.0, y + 0.0  # no -0.0
+        flow[turns, 0], flow[turns, 1] = x, y
         return flow.float()
 
 
@@ -94,14 +88,13 @@ def motion_by_pixel(
     """
     home = sweeps.pixels.window.index_select(0, objects.first) % len(sweeps.batch.rows)
     ordered, order = home.sort(stable=True)
-    position = torch.arange(len(home), device=home.device)
-    ids = torch.empty_like(home).index_copy_(0, order, position - torch.searchsorted(ordered, ordered))
+    ids = torch.empty_like(home).index_copy_(0, order, index_in_group(ordered))
     of_pixel = F.pad(objects.of_pixel, (0, 1), value=objects.count)
     moves = rigid.flow.any(1) | (rigid.turn != 0)
     return TurningMotion(
         cluster_of_cell=torch.arange(sweeps.num_pixels + 1, device=home.device),
         cell_of_point=_pixel_of_result(sweeps, lookup(moves, of_pixel), lookup(moves & ~is_weak, of_pixel)),
-        flow=F.pad(rigid.flow, (0, 1, 0, 1)).index_select(0, of_pixel) + 0.0,  # + 0.0 turns -0.0 into 0.0
+        flow=F.pad(rigid.flow, (0, 1, 0, 1)).index_select(0, of_pixel),
         cluster_id=F.pad(ids, (0, 1), value=-1).index_select(0, of_pixel),
         score=lookup(score, of_pixel),
         confidence=confidence,

@@ -34,8 +34,8 @@ def register(points: ObjectPoints, sweeps: HeightSlicedSweeps, flow: Tensor) -> 
     """Refine the motion of every object by the voxels that meet under it, and estimate its rotation.
 
     Every voxel of another sweep is paired with the nearest one at t+1, every voxel of t+1 with the nearest one in each
-    other sweep. A pair weighs the less the farther its voxels are apart. We minimise squares over translation and
-    angle, with terms that hold on to the given translation and to no rotation; the next step starts from the result.
+    other sweep. A pair weighs less if its voxels are farther apart. Each step minimises the squared errors over
+    translation and angle. Two more terms hold on to the given translation and to no rotation.
 
     Args:
         points: of the objects that move, of all sweeps; static points would take partners away.
@@ -101,7 +101,7 @@ class _VoxelPairs:
         voxel, self._owner, self._start, self._end, to, window = gather(kept, voxel, owner, start, end, to, window)
         self._sweep, self._voxel = window * sweeps.num_steps + to, voxel
         self._time = whole(16 * (self._end - self._start)) / 16
-        self._owner_of = F.pad(voxels.owner, (0, 1), value=-1)
+        self._owner_of_voxel = F.pad(voxels.owner, (0, 1), value=-1)
         self._weight = meeting_weights(_SIGMA, voxel.device)
 
     def normal_equations(self, velocity: Tensor, rotation: Tensor) -> Tensor:
@@ -132,7 +132,7 @@ class _VoxelPairs:
         arm = rotate(rotation.real * (end - start), voxels.place.index_select(0, voxel) - centre - velocity * start)
         target = whole(centre + velocity * end + arm)
         other = voxels.nearest(self._sweep[some], voxels.part.index_select(0, voxel), target)
-        is_pair = self._owner_of.index_select(0, other) == owner
+        is_pair = self._owner_of_voxel.index_select(0, other) == owner
         # Where nothing is met, errors are huge; the weight is 0 there.
         error, arm = (voxels.place.index_select(0, other) - target) * is_pair, whole(arm) * is_pair
         square = square_of(error).div_(64).clamp_(max=2048).long()

@@ -47,7 +47,7 @@ def subpixel_motion(sweeps: HeightSlicedSweeps, objects: Objects, motion: Tensor
 
     Convention:
         Shifts are whole steps within a square. Ties: the smallest shift, then raster order. Of a static object that
-        moves, a part may be static, such as a post beside a car: cubes in blocks of 0.4 m that lose by the shift are
+        moves, a part may be static, such as a post next to a car: cubes in blocks of 0.4 m that lose by the shift are
         left out, and the rest is tested again.
 
     Cost: eight lookups for each pixel of objects that may be slow; for each cube of those that are biased 99 times 25.
