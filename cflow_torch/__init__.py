@@ -14,10 +14,10 @@ if TYPE_CHECKING:
     from cflow_torch.config import Config as Config
     from cflow_torch.config import make_config as make_config
     from cflow_torch.dense.method import CorrelationFlow as CorrelationFlow
+    from cflow_torch.errors import CFlowError as CFlowError
     from cflow_torch.estimate import estimate_flow as estimate_flow
     from cflow_torch.estimate import make_model as make_model
     from cflow_torch.keypoints.method import CorrelationFlowKeypoints as CorrelationFlowKeypoints
-    from cflow_torch.types import CFlowError as CFlowError
     from cflow_torch.types import FlowResult as FlowResult
     from cflow_torch.types import Sweep as Sweep
     from cflow_torch.types import Window as Window
@@ -27,7 +27,7 @@ __version__ = "0.3.0"
 
 # The module of each name. We import it on first use, because torch takes seconds that `cflow --version` does not need.
 _MODULES = {
-    "CFlowError": "types",
+    "CFlowError": "errors",
     "CleanLog": "applications.cleaning",
     "Config": "config",
     "CorrelationFlow": "dense.method",

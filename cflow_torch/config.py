@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from numbers import Integral, Real
 from typing import Any, TypeVar
 
-from cflow_torch.types import CFlowError
+from cflow_torch.errors import CFlowError
 
 Kind = TypeVar("Kind", bound="Config")
 # Whole numbers stay below this, because they are compared with tensors of int64 and of float64.

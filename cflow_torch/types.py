@@ -1,4 +1,4 @@
-"""The input and output types, `Sweep`, `Window` and `FlowResult`, and the error class of the package."""
+"""The input and output types, `Sweep`, `Window` and `FlowResult`."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from typing import Any, Sequence, Union
 import numpy as np
 import torch
 from torch import Tensor
+
+from cflow_torch.errors import CFlowError as CFlowError
 
 Array = Union[np.ndarray, Tensor]
 # Names in flow files and data frames -> fields of `FlowResult`.
@@ -24,13 +26,6 @@ def as_numpy(value: Array, dtype: Any | None = None) -> np.ndarray:
         value = value.detach().cpu()
         value = (value.float() if value.dtype == torch.bfloat16 else value).numpy()
     return np.asarray(value, dtype=dtype)
-
-
-class CFlowError(ValueError):
-    """The only error that this package raises for bad input, bad files and bad settings.
-
-    The message says what you passed, what is allowed, and what to do.
-    """
 
 
 @dataclass(frozen=True)

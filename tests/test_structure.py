@@ -14,7 +14,7 @@ from cflow_torch import CorrelationFlow
 PACKAGE = Path(cflow_torch.__file__).parent
 # A room imports from itself and from rooms that stand before it.
 ROOMS = (
-    *("types", "config", "stages", "ops", "windows", "model", "dense", "keypoints", "verified", "estimate"),
+    *("errors", "types", "config", "stages", "ops", "windows", "model", "dense", "keypoints", "verified", "estimate"),
     *("data", "simulator", "evaluation", "viz", "fleet", "applications", "integrations", "configs", "cli"),
 )
 HEAVY = ("kornia", "matplotlib", "hydra", "omegaconf", "pyarrow", "h5py", "cv2", "sklearn", "ray", "rerun")

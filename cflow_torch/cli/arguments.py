@@ -14,10 +14,16 @@ _GRAMMAR = re.compile(r"['\"\[{]|(choice|glob|range|shuffle|sort|str|tag)\(|.*\$
 
 
 def for_hydra(arguments: list[str]) -> list[str]:
-    """Put settings before options, because Hydra does not accept `-m` between two settings, and quote names.
+    """Put settings before options, because Hydra does not accept `-m` between two settings, and quote names."""
+    overrides, options = split(arguments)
+    return overrides + options
+
+
+def split(arguments: list[str]) -> tuple[list[str], list[str]]:
+    """Split the arguments of a command into settings, with quoted names, and options with their values.
 
     Args:
-        arguments: of a command. A path by itself means data.root. Without quotes, Hydra would read the Waymo segment
+        arguments: a path by itself means data.root. Without quotes, Hydra would read the Waymo segment
             log=10203656353524179475_7625_000_7645_000 as a whole number, and reject output=Ausgänge.
     """
     overrides, options = [], []
@@ -28,7 +34,19 @@ def for_hydra(arguments: list[str]) -> list[str]:
             overrides.append(_quoted(word))
         else:
             overrides.append(f"data.root={_text(word)}")
-    return overrides + options
+    return overrides, options
+
+
+def fixed_settings(overrides: list[str]) -> list[str]:
+    """Names of the settings with one value, by which the jobs of a sweep do not differ."""
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import OverrideParseException
+
+    try:
+        parsed = OverridesParser.create().parse_overrides(overrides)
+    except OverrideParseException:  # Hydra meets the error again and reports it
+        return []
+    return [str(one.key_or_group) for one in parsed if not one.is_sweep_override() and not one.is_hydra_override()]
 
 
 def _quoted(override: str) -> str:

@@ -9,11 +9,10 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, Iterable
 
-from omegaconf import OmegaConf
+import yaml  # type: ignore[import-untyped]
 
 import cflow_torch.configs
 from cflow_torch.config import PRESETS, make_config
-from cflow_torch.data.json_file import flatten
 
 CONFIGS = Path(cflow_torch.configs.__path__[0])
 SETTERS = ("experiment", "row")  # groups that only change settings of others
@@ -21,9 +20,14 @@ SETTERS = ("experiment", "row")  # groups that only change settings of others
 
 def groups(command: str) -> dict[str, list[str]]:
     """Groups of a command and their choices: {"model": ["default", ...], ...}."""
-    entries = OmegaConf.load(CONFIGS / f"{command}.yaml").defaults
-    names = [str(name) for entry in entries if not isinstance(entry, str) for name in entry]
+    names = defaults(command)
     return {name: list(PRESETS) if name == "model" else [file.stem for file in files(name)] for name in names}
+
+
+def defaults(command: str) -> dict[str, Any]:
+    """Groups of a command and their default choices: {"model": "default", ...}."""
+    entries = _load(CONFIGS / f"{command}.yaml")["defaults"]
+    return {name: choice for entry in entries if isinstance(entry, dict) for name, choice in entry.items()}
 
 
 def files(group: str) -> list[Path]:
@@ -44,11 +48,22 @@ def settings(command: str) -> dict[str, Any]:
     return found
 
 
-@lru_cache(maxsize=None)  # commands share files
 def own_settings(file: Path) -> dict[str, Any]:
     """The settings in a YAML file, in dotted form."""
-    values: dict[str, Any] = OmegaConf.to_container(OmegaConf.load(file))  # type: ignore[assignment]
-    return flatten({key: value for key, value in values.items() if key not in ("defaults", "hydra")})
+    found: dict[str, Any] = {}
+    for key, value in _load(file).items():
+        if key not in ("defaults", "hydra"):
+            found.update(
+                {f"{key}.{name}": own for name, own in value.items()} if isinstance(value, dict) else {key: value}
+            )
+    return found
+
+
+@lru_cache(maxsize=None)  # commands share files
+def _load(file: Path) -> dict[str, Any]:
+    """Read a YAML file without Hydra and OmegaConf, which take longer to import than help takes to print."""
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    return yaml.load(file.read_text(encoding="utf-8"), loader) or {}  # type: ignore[no-any-return]
 
 
 def near(word: str, known: Iterable[str]) -> str:

@@ -11,7 +11,7 @@ examples:
 from __future__ import annotations
 
 from cflow_torch.cli.choices import CONFIGS, groups, settings
-from cflow_torch.types import CFlowError
+from cflow_torch.errors import CFlowError
 
 # The script offers names that begin with the current word, up to the next dot or equals sign: data, then data. and
 # data=, and so on. For bash, the text after = is a word of its own.

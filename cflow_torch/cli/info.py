@@ -15,7 +15,7 @@ from pathlib import Path
 from torch.utils.collect_env import get_pretty_env_info
 
 import cflow_torch
-from cflow_torch.types import CFlowError
+from cflow_torch.errors import CFlowError
 
 
 def task(arguments: list[str]) -> None:

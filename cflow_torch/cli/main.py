@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import ast
 import os
 import sys
 import traceback
 from difflib import get_close_matches
 from importlib import import_module
+from importlib.util import find_spec
 from typing import Any
 
 from cflow_torch import __version__
@@ -77,42 +79,52 @@ def _run(arguments: list[str]) -> None:
         near = get_close_matches(command, COMMANDS, 1)
         hint = f" (did you mean {near[0]}?)" if near else ""
         _exit_wrong(f"unknown command {command!r}{hint}: give one of {', '.join(COMMANDS)}")
-    module = import_module(f"cflow_torch.cli.{command}")
+    from cflow_torch.errors import CFlowError
+
+    has_settings = command not in _WITHOUT_SETTINGS
     if "-h" in rest or "--help" in rest:
-        from cflow_torch.cli.choices import settings_help
-
-        more = "" if command in _WITHOUT_SETTINGS else settings_help(command)
-        return print(f"cflow {command}: {COMMANDS[command]}\n\n{module.__doc__}{more}", end="")
-    if command not in _WITHOUT_SETTINGS:
-        return _run_with_settings(command, module.task, rest)
-    from cflow_torch.types import CFlowError
-
+        return print(_help(command, has_settings), end="")
     try:
-        return module.task(rest)  # type: ignore[no-any-return]
+        if not has_settings:
+            return import_module(f"cflow_torch.cli.{command}").task(rest)  # type: ignore[no-any-return]
+        from cflow_torch.cli.precheck import check_call
+
+        check_call(command, rest)
     except CFlowError as error:
-        return _exit_wrong(error)
+        _exit_wrong(error)
+    return _run_with_settings(command, rest)
 
 
-def _run_with_settings(command: str, run: Any, rest: list[str]) -> None:
+def _help(command: str, has_settings: bool) -> str:
+    """The help of a command: the docstring of its module, which is not imported, and its settings."""
+    from cflow_torch.cli.choices import settings_help
+
+    spec: Any = find_spec(f"cflow_torch.cli.{command}")
+    text = ast.get_docstring(ast.parse(spec.loader.get_source(spec.name)))
+    return f"cflow {command}: {COMMANDS[command]}\n\n{text}\n{settings_help(command) if has_settings else ''}"
+
+
+def _run_with_settings(command: str, rest: list[str]) -> None:
     import hydra
     from hydra.core.hydra_config import HydraConfig
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
     from cflow_torch.cli import schemas  # noqa: F401 (registers them)
-    from cflow_torch.cli.arguments import for_hydra
-    from cflow_torch.cli.refusals import explain
-    from cflow_torch.cli.run import UnfinishedJob, complete_data
-    from cflow_torch.types import CFlowError
+    from cflow_torch.cli.arguments import fixed_settings, split
+    from cflow_torch.cli.refusals import UnfinishedJob, explain
+    from cflow_torch.errors import CFlowError
 
     def task(cfg: Any) -> Any:
+        from cflow_torch.cli.run import complete_data  # imports torch, which Hydra's own answers do not need
+
         try:
             OmegaConf.resolve(cfg)
             for source in HydraConfig.get().runtime.config_sources:
                 if source.schema == "file" and source.path not in sys.path:  # the folder of a user's own reader
                     sys.path.append(source.path)
             cfg.data = complete_data(cfg.data)
-            return run(cfg)
+            return import_module(f"cflow_torch.cli.{command}").task(cfg)
         except (CFlowError, OmegaConfBaseException) as error:
             _exit_wrong(explain(error, command))
         except Exception as error:
@@ -123,7 +135,11 @@ def _run_with_settings(command: str, run: Any, rest: list[str]) -> None:
             message = "this is a bug of cflow: please report it with the lines above and the output of `cflow info`"
             raise UnfinishedJob(message) from None
 
-    sys.argv = [f"cflow {command}", *for_hydra(rest)]
+    overrides, options = split(rest)
+    # The folder of a job is named after what is swept, and after what tells sweeps into the same output apart.
+    unnamed = {"output", "overwrite", *fixed_settings(overrides)} - {"experiment", "data.label"}
+    names = f"hydra.job.config.override_dirname.exclude_keys=[{','.join(sorted(unnamed))}]"
+    sys.argv = [f"cflow {command}", *overrides, names, *options]
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them
     try:
         hydra.main(version_base="1.3", config_path="pkg://cflow_torch.configs", config_name=command)(task)()

@@ -1,47 +1,63 @@
-"""Explain in one line what Hydra rejects and what to do."""
+"""Explain in one line what a command or Hydra rejects and what to do. This module does not import Hydra by itself."""
 
 from __future__ import annotations
 
 import re
-
-from hydra.errors import MissingConfigException, OverrideParseException
+from typing import Iterable
 
 from cflow_torch.cli.choices import files, groups, near, own_settings, settings
 from cflow_torch.config import CONFIGS
-from cflow_torch.types import CFlowError
+from cflow_torch.errors import CFlowError
 
 # Settings of the last version; those of the methods are in `config.REMOVED`.
 _REMOVED = {"standing": "use remove_stopped", "residual_axes": "leave it out"}
 _PLUGINS = "hydra-joblib-launcher hydra-submitit-launcher hydra-optuna-sweeper"
 
 
+class UnfinishedJob(RuntimeError):
+    """Something is missing, and a message says what. The other jobs of a sweep still run."""
+
+
 def explain(error: Exception, command: str) -> str:
     """The message for a call that Hydra or a command rejects."""
+    from hydra.errors import MissingConfigException, OverrideParseException
+
     if isinstance(error, CFlowError):
         return str(error)
     if isinstance(error, MissingConfigException) and error.options:
         group, _, name = str(error.missing_cfg_file).rpartition("/")
         if group.startswith("hydra/"):
             return f"there is no {group} {name!r}: joblib, submitit and optuna need pip install {_PLUGINS}"
-        known = [option for option in error.options if not option.startswith("base_")]
-        return f"{group}={name}{near(name, known)}: give one of {', '.join(known)}"
+        return unknown_choice(group, name, [option for option in error.options if not option.startswith("base_")])
     if isinstance(error, OverrideParseException):
         return f"cannot read {error.override!r}: give NAME=VALUE, special characters in quotes: 'NAME=\"VALUE\"'"
     message = " ".join((f"{error}: {error.__cause__}" if error.__cause__ else str(error)).split())
     unknown = re.search(r"Key '.*?' (?:is )?not in .*full_key: (\S+) object_type=(\w+)", message)
     if unknown:
-        return _unknown(unknown[1], unknown[2], command)
+        methods = {config.__name__: method for method, config in CONFIGS.items()}
+        return unknown_setting(unknown[1], methods.get(unknown[2]), command)
     message = message.partition(" full_key:")[0].replace("Error merging override ", "")
     return f"{message}; `cflow {command} --help` has examples"
 
 
-def _unknown(key: str, kind: str, command: str) -> str:
-    """The message for an unknown setting: it belongs to another method or picture, was removed, or is mistyped."""
+def unknown_choice(group: str, name: str, known: Iterable[str]) -> str:
+    """The message for a choice that a group does not have."""
+    names = sorted(known)
+    return f"{group}={name}{near(name, names)}: give one of {', '.join(names)}"
+
+
+def unknown_setting(key: str, method: str | None, command: str) -> str:
+    """The message for an unknown setting: it belongs to another method or picture, was removed, or is mistyped.
+
+    Args:
+        key: the setting, in dotted form.
+        method: the chosen method; None = not known.
+        command: the command.
+    """
     group, _, name = key.rpartition(".")
-    method = {config.__name__: config for config in CONFIGS.values()}.get(kind)
     if group == "model" and method is not None and name != "pixel_size":
         try:
-            method().replace(**{name: None})
+            CONFIGS[method]().replace(**{name: None})
         except CFlowError as error:
             if not str(error).startswith("unknown"):
                 return str(error)

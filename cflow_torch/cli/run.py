@@ -18,6 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from cflow_torch import __version__, estimate
 from cflow_torch.cli.choices import CONFIGS, own_settings
 from cflow_torch.cli.estimates import estimates
+from cflow_torch.cli.refusals import UnfinishedJob as UnfinishedJob
 from cflow_torch.config import config_from
 from cflow_torch.data.atomic import write_text
 from cflow_torch.data.catalog import AUTO, find_sources, find_user_sources, open_log, recognise
@@ -35,10 +36,6 @@ Failures = List[Tuple[str, str]]
 UseResult = Callable[[Log, int, Window, FlowResult], None]
 # Settings of `data` that are not passed to the reader.
 _NOT_OF_READER = ("label", "first", "step")
-
-
-class UnfinishedJob(RuntimeError):
-    """Something is missing, and a message says what. The other jobs of a sweep still run."""
 
 
 def versions() -> dict[str, str]:

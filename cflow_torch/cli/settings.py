@@ -20,8 +20,7 @@ import yaml  # type: ignore[import-untyped]
 from cflow_torch.cli.choices import CONFIGS, files
 from cflow_torch.config import CONFIGS as METHODS
 from cflow_torch.config import PRESETS, WINDOW, describe, make_config
-from cflow_torch.data.atomic import ensure_writable, write_text
-from cflow_torch.types import CFlowError
+from cflow_torch.errors import CFlowError
 
 _PAGE = """# Settings
 
@@ -51,6 +50,8 @@ def task(arguments: list[str]) -> None:
     if not arguments:
         print("\n\n".join(_page()))
     elif len(arguments) == 2 and arguments[0] == "--opensceneflow":
+        from cflow_torch.data.atomic import ensure_writable, write_text
+
         folder = ensure_writable(Path(arguments[1]))
         for name, text in harness_models().items():
             write_text(folder / f"{name}.yaml", text)

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import IO, Any, Collection, Iterator
 
 from cflow_torch.data.paths import PathLike, as_path, forget_listings, is_remote, remote_errors
-from cflow_torch.types import CFlowError
+from cflow_torch.errors import CFlowError
 
 # Object stores, in which a put replaces the older file at once and nobody sees an incomplete one.
 _ATOMIC_PUTS = {"s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "oss", "memory"}

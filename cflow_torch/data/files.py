@@ -10,7 +10,7 @@ from typing import Any, Callable, Iterator
 import numpy as np
 
 from cflow_torch.data.paths import read_bytes
-from cflow_torch.types import CFlowError
+from cflow_torch.errors import CFlowError
 
 Test = Callable[[Path], bool]
 _MAX_TEXT = 400  # characters of a library's message; a damaged name can be a million characters long

@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from cflow_torch.types import CFlowError
+from cflow_torch.errors import CFlowError
 
 _NAME = re.compile(r"(?!\.|[A-Za-z]:)[^/\\]+")  # not hidden, no `..`, no drive, no separator of any system
 _RULE = "a name has no / or \\, no control characters, no dot in front and no drive (C:)"

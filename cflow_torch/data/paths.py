@@ -19,7 +19,7 @@ from typing import Any, Iterator, Union
 
 import pyarrow as pa
 
-from cflow_torch.types import CFlowError
+from cflow_torch.errors import CFlowError
 
 PathLike = Union[str, Path]
 _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)://")
