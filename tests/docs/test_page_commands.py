@@ -1,6 +1,7 @@
 """The commands and Python blocks of README, the quick start and the page on harnesses run.
 
-We skip those that need data, the network or another repository. Of `cflow` commands with data we compose the settings.
+Python that reads /data/my_drive or /data/drive.bag gets a simulated one. We skip commands that need data, the network
+or another repository. Of `cflow` commands with data we compose the settings.
 """
 
 from __future__ import annotations
@@ -14,8 +15,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from bag_writer import BagWriter
 from command_line import cflow
 
+from cflow_torch.data.arrays import write_array_log
+from cflow_torch.data.arrays.cloud_file import read_cloud
 from cflow_torch.simulator import make_drive
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -46,7 +50,7 @@ def run(kind: str, part: Any, names: dict[str, Any]) -> None:
     """Run one part of a page in this process, unless it is skipped."""
     if kind == "python":
         if not FOREIGN.match(part):
-            exec(compile(part, "page", "exec"), names)
+            exec(compile(part.replace('"/data/', '"data/'), "page", "exec"), names)
     elif kind == "module":
         sys.argv = part
         runpy.run_module(part[0], run_name="__main__")
@@ -55,24 +59,47 @@ def run(kind: str, part: Any, names: dict[str, Any]) -> None:
 
 
 @pytest.fixture
-def names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
-    """Return the arrays that README uses, in an empty working folder."""
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return an empty working folder."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", list(sys.argv))
-    drive = make_drive(seed=1, num_sweeps=2, profile="demo")
+    return tmp_path
+
+
+@pytest.fixture
+def names(folder: Path) -> dict[str, Any]:
+    """Return the arrays that README uses, and write the data that the quick start reads."""
+    drive = make_drive(seed=1, num_sweeps=5, profile="demo")
+    write_array_log(drive, "data").rename("data/my_drive")
+    writer = BagWriter(folder / "data", "ros1")
+    for sweep in drive:
+        stamp, cloud = sweep.timestamp_ns, writer.cloud(sweep.timestamp_ns, sweep.points, None)
+        writer.write("/tf", stamp, "tf2_msgs/msg/TFMessage", [writer.transform(stamp, "odom", "velodyne", sweep.pose)])
+        writer.write("/points", stamp, "sensor_msgs/msg/PointCloud2", *cloud)
+    writer.bag.close()
     motion = np.linalg.inv(drive.poses[1]) @ drive.poses[0]
     return {"pc0": drive.sweep(0).points, "pc1": drive.sweep(1).points, "T_ego1_ego0": motion}
 
 
 @pytest.mark.parametrize("command", sorted(filter(DATA.search, COMMANDS)))
-def test_commands_with_data_have_valid_settings(command: str, names: dict[str, Any]) -> None:
+def test_commands_with_data_have_valid_settings(command: str, folder: Path) -> None:
     assert cflow(*command.replace(" -m ", " ").split(), "--cfg", "job") == 0
 
 
-@pytest.mark.parametrize("page", PAGES[:2])
-def test_python_runs(page: str, names: dict[str, Any]) -> None:
-    for part in (part for part in parts(page) if part[0] == "python"):
+def test_python_of_the_readme_runs(names: dict[str, Any]) -> None:
+    for part in (part for part in parts(PAGES[0]) if part[0] == "python"):
         run(*part, names)
+
+
+def test_scripts_of_the_quick_start_run(names: dict[str, Any], capfd: pytest.CaptureFixture) -> None:
+    arrays, tracks, bag, many = (part for part in parts(PAGES[1]) if part[0] == "python")
+    run(*arrays, names)
+    assert re.search(r"object \d+ at \[.*\] m: \d+\.\d m/s", capfd.readouterr().out) and Path("flow.png").is_file()
+    run(*many, names)
+    run(*tracks, {})
+    assert re.search(r"object \d+: .* m/s", capfd.readouterr().out)
+    run(*bag, {})
+    assert 0 < len(read_cloud("clean_map.ply")) < len(read_cloud("map.ply"))
 
 
 @pytest.mark.slow
