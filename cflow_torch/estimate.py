@@ -81,7 +81,7 @@ def estimate_flow(
     Raises:
         CFlowError: wrong shape or dtype, a transform that is not rigid, mixed devices, an unknown setting.
 
-    Example:
+    Examples:
         >>> car = 0.1 * np.stack(np.meshgrid(range(45), range(18), range(15)), -1).reshape(-1, 3) + 5.05  # (12150, 3)
         >>> result = estimate_flow(car, car + [0.5, 0.0, 0.0])
         >>> result.residual_flow[0]  # metres until the next sweep

@@ -1,16 +1,18 @@
 #!/usr/bin/env python3
-"""Build the wheel of the last commit, install it in the oldest or the newest environment, and run the tests there.
+"""Build the wheel of the last commit, install it in an environment, run its commands, and run the tests there.
 
   python scripts/check_environments.py old --python /path/to/python3.8
   PYTHON_NEW=/path/to/python3.13 python scripts/check_environments.py new -k dense
+  python scripts/check_environments.py wheel --python /path/to/python3.11
 
 old: the versions of constraints_old.txt (torch 2.0.1, numpy 1.24, kornia 0.7.3), for Python 3.8.
 new: the newest versions that pip finds, for Python 3.13.
+wheel: an empty environment in which pip installs the wheel and what it needs. Only the commands run, no tests.
 
-The interpreter is that of --python, else of $PYTHON_OLD or $PYTHON_NEW. The tests that are not slow run in a folder
-without the package, so that only the wheel can be imported. Real data is read from $CFLOW_DATA, else from the folder
-../shared/data next to the checkout. An environment needs about 6 GB, because pip may find torch with CUDA only. The
-exit status is that of pytest. FOLDER/NAME/freeze.txt lists the installed versions.
+The interpreter is that of --python, else of $PYTHON_OLD or $PYTHON_NEW. Commands and tests run in folders without the
+package, so that only the wheel can be imported. Real data is read from $CFLOW_DATA, else from the folder ../shared/data
+next to the checkout. An environment needs about 6 GB, because pip may find torch with CUDA only; PIP_CONSTRAINT names
+a file of versions. The exit status is that of pytest. FOLDER/NAME/freeze.txt lists the installed versions.
 """
 
 from __future__ import annotations
@@ -28,7 +30,11 @@ ROOT = Path(__file__).resolve().parents[1]
 INSTALL = {
     "old": ["--constraint", ROOT / "scripts" / "constraints_old.txt"],
     "new": ["--upgrade", "--upgrade-strategy", "eager"],
+    "wheel": [],
 }
+EXTRAS = {"old": "test", "new": "test", "wheel": "viz"}
+COMMANDS = ("--help", "info", "demo", "flow data.num_sweeps=3 engine.workers=1", "plot")
+MADE = ("demo/flow.png", "flow/*/*.feather", "plot/flow.png")  # what they write to outputs
 PACKAGE = ("cflow_torch", "configs")
 NEED_PACKAGE = ("tests/test_distribution.py", "tests/integrations/test_hubconf.py")  # these read the checkout
 # Only the wheel of this Python may be imported.
@@ -56,9 +62,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with tempfile.TemporaryDirectory(prefix="cflow-check-") as temporary:
         source = Path(temporary) / "source"
         run("git", "clone", "--quiet", "--depth", "1", ROOT.as_uri(), source)
-        run(sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", Path(temporary) / "wheel", source)
-        (wheel,) = (Path(temporary) / "wheel").glob("*.whl")
+        run(sys.executable, "-m", "build", "--outdir", Path(temporary) / "dist", source)
+        (wheel,) = (Path(temporary) / "dist").glob("*.whl")
         python = install(given.name, base, home, wheel)
+        run_commands(python, Path(temporary))
+        if given.name == "wheel":
+            return 0
         for name in PACKAGE:
             path = source / name
             (shutil.rmtree if path.is_dir() else os.remove)(path)
@@ -75,11 +84,22 @@ def install(name: str, base: str, home: Path, wheel: Path) -> Path:
         run(base, "-m", "venv", home / "venv")
     pip = (python, "-m", "pip", "--disable-pip-version-check", "-qq")
     run(*pip, "uninstall", "--yes", "cflow_torch")  # pip keeps an installed one of the same version
-    run(*pip, "install", *INSTALL[name], f"{wheel}[test]")
+    run(*pip, "install", *INSTALL[name], f"{wheel}[{EXTRAS[name]}]")
     run(*pip, "check")
     versions = subprocess.check_output([*pip, "freeze", "--all"], text=True, env=environment())
     (home / "freeze.txt").write_text(versions, encoding="utf-8")
     return python
+
+
+def run_commands(python: Path, folder: Path) -> None:
+    """Run the commands of a first visit in an empty folder, and check that each writes its file."""
+    home = folder / "home"
+    home.mkdir()
+    for command in COMMANDS:
+        run(python.with_name("cflow"), *command.split(), cwd=home)
+    missing = [name for name in MADE if not list(home.glob(f"outputs/{name}"))]
+    if missing:
+        sys.exit(f"error: the commands did not write {', '.join(missing)}")
 
 
 def environment() -> dict[str, str]:

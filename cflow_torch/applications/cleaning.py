@@ -42,7 +42,7 @@ class CleanLog(Log):
     Attributes:
         log_id, timestamps: those of the log.
 
-    Example:
+    Examples:
         >>> write_array_log(CleanLog(log), "outputs/clean")
     """
 

@@ -33,7 +33,7 @@ def deskew(window: Window, result: FlowResult, sweep_interval: float = 0.1) -> T
         CFlowError: the sweep has no point times, the times are not in order, or the result has another number of points
             or lacks the residual flow.
 
-    Example:
+    Examples:
         >>> result = VerifiedFlow.from_preset("default")([window])[0]
         >>> points = deskew(window, result)
     """

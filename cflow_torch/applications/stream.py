@@ -45,7 +45,7 @@ class FlowStream:
     Raises:
         CFlowError: a setting is unknown, or asks for sweeps after t+1.
 
-    Example:
+    Examples:
         >>> stream = FlowStream("fast", sweep_interval=0.1)
         >>> for points, pose, time in sensor:
         ...     result = stream.push(points, pose, time)

@@ -124,7 +124,7 @@ class Tracker:
     Args:
         sweep_interval: seconds from sweep to sweep where sweeps have no time stamps.
 
-    Example:
+    Examples:
         >>> tracker = Tracker()
         >>> for window in windows(log, num_history=model.config.num_history):
         ...     table, track_id = tracker.push(window, model([window])[0])

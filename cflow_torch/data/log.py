@@ -128,7 +128,7 @@ class WindowDataset(Dataset):  # type: ignore[type-arg]
         logs: one log or a sequence of logs. They must be picklable if the workers are not forked.
         num_history, num_future: as in `window`.
 
-    Example:
+    Examples:
         >>> data = WindowDataset(logs, num_history=model.config.num_history)
         >>> loader = DataLoader(data, batch_size=4, num_workers=2, collate_fn=data.collate)
         >>> for batch in loader:

@@ -22,7 +22,7 @@ class CorrelationFlow(CoarseToFine):
     Args:
         config: a `DenseConfig`. `CorrelationFlow.from_preset` makes one from a preset.
 
-    Example:
+    Examples:
         >>> from cflow_torch import CorrelationFlow, Sweep, Window
         >>> model = CorrelationFlow.from_preset("paper", pixel_size=0.1)
         >>> car = 0.1 * torch.cartesian_prod(torch.arange(45.0), torch.arange(18.0), torch.arange(15.0)) + 5.05

@@ -25,7 +25,7 @@ class CorrelationFlowKeypoints(CoarseToFine):
         The paper matches one pair of sweeps at one scale. Several `pixel_sizes` work as in the dense method; this is
         our extension.
 
-    Example:
+    Examples:
         >>> from cflow_torch import CorrelationFlowKeypoints, Sweep, Window
         >>> model = CorrelationFlowKeypoints.from_preset("paper")
         >>> car = 0.1 * torch.cartesian_prod(torch.arange(45.0), torch.arange(18.0), torch.arange(15.0)) + 5.05

@@ -262,7 +262,7 @@ def make_drive(
     Raises:
         CFlowError: an argument is out of range, or there is no profile, scene or weather of that name.
 
-    Example:
+    Examples:
         >>> drive = make_drive(seed=1, num_sweeps=2, profile="demo")
         >>> drive.sweep(0).points.shape == drive.labels(0).flow.shape
         True

@@ -38,7 +38,7 @@ class VerifiedFlow(SceneFlowModel):
     Args:
         config: a `VerifiedConfig`; `VerifiedFlow.from_preset` makes it from a preset.
 
-    Example:
+    Examples:
         >>> import torch
         >>> from cflow_torch import Sweep, VerifiedFlow, Window
         >>> model = VerifiedFlow.from_preset("fast")
