@@ -10,6 +10,7 @@ from typing import Sequence
 import numpy as np
 
 from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes, make_boxes, upright_poses
+from cflow_torch.data.categories import CATEGORY_INDEX
 from cflow_torch.data.files import file_errors, find_folders
 from cflow_torch.data.json_file import read_json
 from cflow_torch.data.log import FlowLabels, Log
@@ -42,7 +43,10 @@ _LABELS = {
     "WHEELED_DEVICE": ("Motorized Scooter", "Other Vehicle - Pedicab", "Personal Mobility Device"),
 }
 CATEGORY_NAME: dict[str, str] = {label: name for name, labels in _LABELS.items() for label in labels}
-"""Label of a cuboid -> Argoverse 2 name. The data set publishes no such map; this one is ours."""
+"""Label of a cuboid, class of a point -> Argoverse 2 name. The data set publishes no such map; this one is ours."""
+
+_GROUND = ("Driveway", "Ground", "Lane Line Marking", "Other Road Marking", "Road", "Sidewalk", "Stop Line Marking")
+_WITHOUT_FLOW = ("Exhaust", "Reflection", "Smoke", "Spray or rain")
 
 
 def find_pandaset_sequences(root: PathLike) -> list[Path]:
@@ -71,8 +75,10 @@ class PandaSetLog(Log):
     Convention:
         - Points are stored in the world, compensated for ego motion. We return them as float32 in the frame of the
           LiDAR's pose at the sweep's time (x right, y forward, z up), those of both LiDARs in the order of the file.
-        - The data set has no ground masks: `is_ground` is None.
-        - Truth comes from the tracked cuboids of `annotations/cuboids`; each LiDAR's points from its own cuboids.
+        - Ground masks come from the classes of points in `annotations/semseg`; None for a sequence without them.
+        - Truth comes from the tracked cuboids of `annotations/cuboids`; each LiDAR's points from its own cuboids. If
+          points have classes, these are the categories. A point is then valid only if it is in a cuboid and has the
+          class of an object, or neither; smoke, spray and reflections are not valid.
 
     Raises:
         CFlowError: a file is missing or cannot be read; fewer than two sweeps; the numbers of sweeps, poses and times
@@ -97,7 +103,9 @@ class PandaSetLog(Log):
     def sweep(self, index: int) -> Sweep:
         time = self._timestamp(index)
         points, shots, _ = self._cloud(index)
-        return Sweep(points, None, self._poses[index].copy(), time, shots - time * 1e-9)
+        classes = self._classes(index, len(points))
+        is_ground = None if classes is None else np.isin(classes, _GROUND)
+        return Sweep(points, is_ground, self._poses[index].copy(), time, shots - time * 1e-9)
 
     def labels(self, index: int) -> FlowLabels | None:
         """Read the truth of the pair (index, index + 1); None for the last sweep and without cuboids."""
@@ -118,6 +126,12 @@ class PandaSetLog(Log):
             boxes0, boxes1 = (self._boxes(cuboids[k], files[k], index + k, lidar) for k in (0, 1))
             part = flow_from_boxes(points[rows], boxes0, boxes1, T_ego1_ego0)
             flow[rows], category[rows], is_valid[rows] = part.flow, part.category, part.is_valid
+        classes = self._classes(index, len(points))
+        if classes is not None:
+            names, name_of_point = np.unique(classes, return_inverse=True)
+            index_of = [CATEGORY_INDEX[CATEGORY_NAME.get(name, "NONE")] for name in names.tolist()]
+            in_cuboid, category = category > 0, np.array(index_of, np.uint8)[name_of_point]
+            is_valid &= (in_cuboid == (category > 0)) & ~np.isin(classes, _WITHOUT_FLOW)
         return FlowLabels(flow, category, is_valid)
 
     def _cloud(self, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -128,6 +142,21 @@ class PandaSetLog(Log):
             table = np.stack([columns[name] for name in names]).astype(np.float64)
         points = transform_points(table[:3].T, np.linalg.inv(self._poses[index]))
         return points.astype(np.float32), table[3], table[4]
+
+    def _classes(self, index: int, num_points: int) -> np.ndarray | None:
+        """Read (N,) names of the classes of points; None if the sequence has none."""
+        folder = self.folder / "annotations" / "semseg"
+        file, table = folder / self._files[index].name, folder / "classes.json"
+        with remote_errors(folder):
+            if not (file.exists() and table.exists()):
+                return None
+        classes = _columns(file, ("class",))["class"]
+        with file_errors(table):
+            name_of = {int(number): str(name) for number, name in read_json(table).items()}
+        if classes.shape != (num_points,):
+            raise CFlowError(f"{file} has {len(classes)} classes for {num_points} points; copy the sequence again")
+        numbers, number_of_point = np.unique(classes, return_inverse=True)
+        return np.array([name_of.get(number, "") for number in numbers.tolist()])[number_of_point]
 
     def _boxes(self, cuboids: dict[str, np.ndarray], file: Path, index: int, lidar: int) -> Boxes:
         """Return the cuboids for the points of a LiDAR, in the frame of sweep `index`. Yaw 0 is the world's y axis."""

@@ -99,6 +99,31 @@ def test_cuboids_become_flow(sequence: Path) -> None:
         assert (labels.category[rows] == category).all()
 
 
+def test_classes_of_points_are_ground_and_categories(sequence: Path) -> None:
+    import pandas
+
+    before = PandaSetLog(sequence)
+    assert before.sweep(1).is_ground is None
+    boxed = before.labels(1).category > 0
+    classes = np.where(boxed, 13, 41)
+    classes[np.flatnonzero(~boxed)[:4]] = 7, 11, 13, 4  # road, sidewalk, a car without a cuboid, a reflection
+    classes[np.flatnonzero(boxed)[0]] = 41  # a wall inside a cuboid
+    folder = sequence / "annotations" / "semseg"
+    folder.mkdir()
+    names = {"4": "Reflection", "7": "Road", "11": "Sidewalk", "13": "Car", "41": "Building"}
+    (folder / "classes.json").write_text(json.dumps(names))
+    for index in range(3):
+        pandas.DataFrame({"class": classes}).to_pickle(folder / f"{index:02d}.pkl.gz")
+    labels = PandaSetLog(sequence).labels(1)
+    assert np.array_equal(np.flatnonzero(PandaSetLog(sequence).sweep(1).is_ground), np.flatnonzero(~boxed)[:2])
+    assert np.array_equal(labels.category, np.where(classes == 13, 19, 0))
+    unknown = [*np.flatnonzero(~boxed)[2:4], np.flatnonzero(boxed)[0]]
+    assert np.array_equal(np.flatnonzero(~labels.is_valid), np.sort(unknown))
+    pandas.DataFrame({"class": classes[:5]}).to_pickle(folder / "01.pkl.gz")
+    with pytest.raises(CFlowError, match="01.pkl.gz has 5 classes for"):
+        PandaSetLog(sequence).sweep(1)
+
+
 def test_data_frames_of_old_pandas_are_read() -> None:
     columns = load_columns(io.BytesIO(gzip.decompress(base64.b64decode(OLD_FRAME))))
     assert {name: values.tolist() for name, values in columns.items()} == {
