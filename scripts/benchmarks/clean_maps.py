@@ -26,7 +26,7 @@ from typing import Any, Iterator
 
 import numpy as np
 import torch
-from peers import RANGE, dufomap_labels
+from labels import RANGE, dufomap_labels
 from table import markdown
 from tracks import SimulatedLog
 
@@ -80,16 +80,6 @@ def light(num_sweeps: int) -> SimulatedLog:
     log = SimulatedLog("av2", 0, "street", num_sweeps)
     log.drive = Drive(scene, PROFILES["av2"], 0, num_sweeps, "light")
     return log
-
-
-def by_dufomap(log: Log, T_ego_lidar: np.ndarray, settings: tuple[float, float, int]) -> tuple[list[np.ndarray], float]:
-    """Dynamic points of each sweep by DUFOMap, and seconds per sweep."""
-    begin = time.process_time()
-    sweeps, to_lidar = list(log), np.linalg.inv(T_ego_lidar)
-    to_first = np.linalg.inv(np.asarray(sweeps[0].pose))
-    points = [np.asarray(sweep.points, np.float64)[:, :3] @ to_lidar[:3, :3].T + to_lidar[:3, 3] for sweep in sweeps]
-    labels = dufomap_labels(points, [to_first @ np.asarray(sweep.pose) @ T_ego_lidar for sweep in sweeps], settings)
-    return labels, (time.process_time() - begin) / len(sweeps)
 
 
 def scores(name: str, removed: list[np.ndarray], truth: list[Any], seconds: float) -> dict[str, Any]:
@@ -154,7 +144,9 @@ def main() -> None:
             print(rows[-1], flush=True)
         try:
             for label, settings in DUFO.items():
-                labels, spent = by_dufomap(opened, T_ego_lidar, settings)
+                begin = time.process_time()
+                labels = dufomap_labels(opened, T_ego_lidar, settings)
+                spent = (time.process_time() - begin) / len(labels)
                 rows.append(scores(f"{name}: DUFOMap, {label}", labels, truth, spent))
                 print(rows[-1], flush=True)
         except ImportError as error:

@@ -1,71 +1,347 @@
 #!/usr/bin/env python3
-"""DUFOMap and HDBSCAN, by which OpenSceneFlow labels moving points (`pip install dufomap hdbscan h5py`), on one thread.
+"""Compare scene flow of this package with that of other methods without training: error and processor time.
 
-  python scripts/benchmarks/peers.py SCENE.h5 LABELS.npz      labels of a scene to a file; seconds a sweep, as JSON
+  python scripts/benchmarks/peers.py DATA/*.h5 DATA/av2/val --json ours.json
+  python scripts/benchmarks/peers.py DATA/*.h5 --opensceneflow PATH --methods icpflow-author nsfp --json peers.json
+  python scripts/benchmarks/peers.py --merge peers.json ours.json            prints the table of both
 
-Settings are those of OpenSceneFlow's process.py. Nothing of this package is needed.
+  pip install open3d-cpu hdbscan scipy h5py                             # `nearest`, `clusters`
+  pip install dztimer lightning torchmetrics tabulate                   # OpenSceneFlow's models, also the above
+  pip install --no-build-isolation FastGeodis==1.0.4                    # its FastNSF; compiles
+
+Methods: presets of this package; `zero`; `nearest` (the nearest point of the next sweep); `clusters` (HDBSCAN, and
+Open3D's ICP for each cluster); `icpflow`, `nsfp`, `fastnsf` of a checkout of OpenSceneFlow (848bf86) with the settings
+of its YAML files, on a CPU (opensceneflow_cpu.py). `icpflow-author` has the search radius of the original code: twice
+the greater of 1.67 m and the ego motion. OpenSceneFlow uses 1.67 m. `nsfp-100` has a patience of 100 steps, which the
+YAML file recommends. A method whose package is missing is skipped.
+
+All methods get the same points: both sweeps in the frame of t+1, without ground, within `--reach` metres (a square).
+Our presets get the sweeps with the ground mask and the same region. We score labelled points that are not ground. Each
+set has the windows `--start`, `--start` + `--every`, ... ; with `--history 0 4` our presets also run with four older
+sweeps. Processor time is that of the process, on one thread. `--limit` stops a method after so many seconds.
+
+Columns: mean over the sets of the mean over the windows: end-point error in metres of dynamic objects / that error
+divided by speed / end-point error of the static background in centimetres; processor seconds, mean over the windows.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
+import os
+import signal
 import sys
 import time
-from typing import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Callable, Iterator, NamedTuple, Sequence
 
 import numpy as np
+import torch
+from opensceneflow_cpu import load_models
+from table import markdown
 
-RANGE = 50.0  # metres
+from cflow_torch import make_config, make_model
+from cflow_torch.config import PRESETS
+from cflow_torch.data.catalog import find_sources, open_log, recognise
+from cflow_torch.data.log import window
+from cflow_torch.evaluation.definitions import Definition
+from cflow_torch.evaluation.frame import EvalFrame, ego_motion_flow
+from cflow_torch.evaluation.scored_points import score_points
+from cflow_torch.types import Window, as_numpy
+
+OURS = ("default", "fast", "paper", "keypoints")
+HARNESS = {  # name -> model and its YAML file in the checkout, changed settings
+    "icpflow": ("icpflow", "ICPFlow", {}),
+    "icpflow-author": ("icpflow", "ICPFlow", {}),
+    "fastnsf": ("fastnsf", "FastNSF", {}),
+    "nsfp": ("nsfp", "NSFP", {}),
+    "nsfp-100": ("nsfp", "NSFP", {"early_patience": 100}),
+}
+METHODS = (*OURS, "zero", "nearest", "clusters", *HARNESS)
+RADIUS = 1.67  # metres, least search radius of ICP-Flow
+Method = Callable[["Case"], np.ndarray]
 
 
-def dufomap_labels(
-    points: Sequence[np.ndarray], poses: Sequence[np.ndarray], settings: tuple[float, float, int]
-) -> list[np.ndarray]:
-    """Return the dynamic points, by DUFOMap with clusters and propagation.
+class Case(NamedTuple):
+    """A window, its truth, and what the methods get.
 
     Args:
-        points: (N, 3) metres, of each sweep in the frame of its LiDAR. Those of 2 ... 50 m are put in the map.
-        poses: (4, 4) of each LiDAR in one frame.
-        settings: side of a voxel in metres, d_s in metres, d_p in voxels.
-
-    Returns:
-        (N,) bool of each sweep.
+        name: "SET, window INDEX".
+        window: sweeps with ground masks.
+        frame: function that makes the input of the metrics from (N, 3) residual flow.
+        T_ego1_ego0: (4, 4) float64.
+        rows: (N0',) int64, rows of sweep t that are not ground and within reach.
+        pc0, pc1: (N0', 3), (N1', 3) float32 metres, frame of t+1.
     """
-    from dufomap import dufomap
 
-    found = dufomap(*settings, num_threads=1)
-    found.setCluster(0, 20, 0.2)
-    for sweep, pose in zip(points, poses):
-        distance = np.linalg.norm(sweep, axis=1)
-        found.run(sweep[(distance > 2) & (distance < RANGE)], pose, cloud_transform=True)
-    found.oncePropagateCluster(if_cluster=True, if_propagate=True)
-    return [np.asarray(found.segment(sweep, pose, cloud_transform=True)) > 0 for sweep, pose in zip(points, poses)]
+    name: str
+    window: Window
+    frame: Callable[[np.ndarray], EvalFrame]
+    T_ego1_ego0: np.ndarray
+    rows: np.ndarray
+    pc0: np.ndarray
+    pc1: np.ndarray
 
 
-def label_scene(file: str, labels: str) -> dict[str, float]:
-    """DUFOMap and HDBSCAN on a scene: labels to a file, seconds a sweep of each."""
-    import h5py
+def cases(path: Path, given: argparse.Namespace) -> Iterator[tuple[str, Case]]:
+    """The chosen windows of the logs at a path, with the names of their sets."""
+    data_set = recognise(path)
+    for source in find_sources(data_set, path):
+        log = open_log(data_set, source, check=False)
+        has_history = len(log.timestamps) > given.start + 1
+        chosen = range(given.start, len(log.timestamps) - 1, given.every) if has_history else [0]
+        for index in list(chosen)[: given.windows]:
+            labels = log.labels(index)
+            if labels is None:
+                continue
+            sweeps = window(log, index, max(given.history))
+            eval_mask = log.eval_mask(index) if hasattr(log, "eval_mask") else None
+            yield log.log_id, make_case(f"{log.log_id}, {index}", sweeps, labels, eval_mask, given.reach)
+
+
+def make_case(name: str, sweeps: Window, labels: Any, eval_mask: Any, reach: float) -> Case:
+    """Compensate ego motion, and leave out ground and what is out of reach."""
+    T_ego1_ego0 = np.linalg.inv(as_numpy(sweeps.pc1.pose, np.float64)) @ as_numpy(sweeps.pc0.pose, np.float64)
+    points = [as_numpy(sweep.points)[:, :3].astype(np.float32) for sweep in (sweeps.pc0, sweeps.pc1)]
+    pose_flow = ego_motion_flow(points[0], T_ego1_ego0)
+    moved = (points[0] + pose_flow, points[1])
+    masks = []
+    for sweep, at in zip((sweeps.pc0, sweeps.pc1), moved):
+        ground = np.zeros(len(at), bool) if sweep.is_ground is None else as_numpy(sweep.is_ground)
+        masks.append(~ground & np.isfinite(at).all(1) & (np.abs(at[:, :2]) <= reach).all(1))
+
+    def frame(residual_flow: np.ndarray) -> EvalFrame:
+        of_pair = {"pose_flow": pose_flow, "T_ego1_ego0": T_ego1_ego0, "is_ground": sweeps.pc0.is_ground}
+        return EvalFrame(points[0], labels, residual_flow, eval_mask=eval_mask, **of_pair)
+
+    rows = np.flatnonzero(masks[0])
+    return Case(name, sweeps, frame, T_ego1_ego0, rows, moved[0][rows], moved[1][masks[1]])
+
+
+def scores(case: Case, residual_flow: np.ndarray, reach: float) -> dict[str, float]:
+    """Means over the scored points of a window; NaN without such points."""
+    definition = Definition(name="peers", metrics=("three_way",), region="box", max_range=reach, dynamic_threshold=0.05)
+    points = score_points(case.frame(residual_flow), definition)
+    moves = points.in_region & points.is_dynamic & (points.category > 0)
+    static = points.in_region & ~points.is_dynamic & (points.category == 0)
+    values = {
+        "dynamic": points.error[moves],
+        "ratio": points.error[moves] / points.speed[moves],
+        "static": points.error[static],
+    }
+    return {name: float(each.mean()) if len(each) else float("nan") for name, each in values.items()}
+
+
+# ------------------------------------------------------------------------------------------------ methods
+
+
+def preset(name: str, num_history: int, reach: float) -> Method:
+    """A preset of this package."""
+    low, high = (-reach, -reach, -np.inf), (reach, reach, np.inf)
+    settings = {} if "num_history" not in make_config(name).as_dict() else {"num_history": num_history}
+    model = make_model(make_config(name, point_cloud_range=(*low, *high), **settings), "cpu")
+
+    def method(case: Case) -> np.ndarray:
+        older = case.window.pch[:num_history]
+        return model([replace(case.window, pch=older)])[0].numpy()["residual_flow"]
+
+    return method
+
+
+def on_rows(estimate: Callable[[Case], np.ndarray]) -> Method:
+    """A method that returns the flow of `pc0` only; other points get zero."""
+
+    def method(case: Case) -> np.ndarray:
+        flow = np.zeros((len(as_numpy(case.window.pc0.points)), 3), np.float32)
+        flow[case.rows] = estimate(case)
+        return flow
+
+    return method
+
+
+def nearest(case: Case) -> np.ndarray:
+    """The nearest point of the next sweep."""
+    from scipy.spatial import cKDTree
+
+    return case.pc1[cKDTree(case.pc1).query(case.pc0)[1]] - case.pc0
+
+
+def clusters(case: Case) -> np.ndarray:
+    """Rigid motion of each cluster by point-to-point ICP; without a better fit than without motion, zero."""
+    import open3d
     from hdbscan import HDBSCAN
 
-    with h5py.File(file, "r") as scene:
-        groups = [scene[stamp] for stamp in sorted(scene, key=int)]
-        extrinsics = scene.attrs.get("ego_T_lidar", np.eye(4))
-        points = [group["lidar"][:, :3].astype(np.float32) for group in groups]
-        ground = [group["ground_mask"][()].astype(bool) for group in groups]
-        poses = [group["pose"][()].astype(np.float64) @ extrinsics for group in groups]
-    poses = [np.linalg.inv(poses[0]) @ pose for pose in poses]
-    start = time.process_time()
-    dufo = [moves & ~is_ground for moves, is_ground in zip(dufomap_labels(points, poses, (0.15, 0.2, 1)), ground)]
-    middle = time.process_time()
-    settings = {"min_cluster_size": 20, "cluster_selection_epsilon": 0.7, "core_dist_n_jobs": 1}
-    for sweep, is_ground, moves in zip(points, ground, dufo):
-        HDBSCAN(alpha=1.1, **settings).fit_predict(sweep[~is_ground])
-        if moves.sum() >= 20:
-            HDBSCAN(**settings).fit_predict(sweep[moves])
-    end = time.process_time()
-    np.savez(labels, *dufo)
-    return {"dufomap": (middle - start) / len(points), "hdbscan": (end - middle) / len(points)}
+    def cloud(points: np.ndarray) -> Any:
+        return open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points.astype(np.float64)))
+
+    registration = open3d.pipelines.registration
+    label = HDBSCAN(min_cluster_size=20, core_dist_n_jobs=1).fit_predict(case.pc0)
+    flow = np.zeros_like(case.pc0)
+    for number in range(label.max() + 1):
+        rows = label == number
+        source = case.pc0[rows]
+        near = (np.abs(case.pc1 - np.clip(case.pc1, source.min(0), source.max(0))) <= 2 * RADIUS).all(1)
+        if near.sum() < 20:
+            continue
+        start, end, pose = cloud(source), cloud(case.pc1[near]), np.eye(4)
+        for radius in (RADIUS, 0.5, 0.2):
+            pose = registration.registration_icp(start, end, radius, pose).transformation
+        fits = [registration.evaluate_registration(start, end, 0.2, T) for T in (np.eye(4), pose)]
+        if (fits[1].fitness, -fits[1].inlier_rmse) > (fits[0].fitness, -fits[0].inlier_rmse):
+            flow[rows] = source @ pose[:3, :3].T + pose[:3, 3] - source
+    return flow
+
+
+def of_harness(name: str, root: Path) -> Method:
+    """A model of OpenSceneFlow with the settings of its YAML file."""
+    from omegaconf import OmegaConf
+
+    file, kind, changes = HARNESS[name]
+    models = load_models(root)
+    if not hasattr(models, kind):
+        raise ImportError(f"{kind}: a package of OpenSceneFlow is missing")
+    settings: Any = OmegaConf.to_container(OmegaConf.load(root / "conf" / "model" / f"{file}.yaml").target)
+    del settings["_target_"]
+    model = getattr(models, kind)(**{**settings, **changes})
+
+    def estimate(case: Case) -> np.ndarray:
+        if name == "icpflow-author":
+            model.args.translation_frame = 2 * max(RADIUS, float(np.linalg.norm(case.T_ego1_ego0[:3, 3])))
+        clouds = {"pc0": [torch.from_numpy(case.pc0)], "pc1": [torch.from_numpy(case.pc1)]}  # compensated already
+        return model({**clouds, "pose0": [torch.eye(4)], "pose1": [torch.eye(4)]})["flow"][0].numpy()
+
+    return on_rows(estimate)
+
+
+def make_method(name: str, num_history: int, given: argparse.Namespace) -> Method:
+    """A method by its name.
+
+    Raises:
+        ImportError: a package is missing.
+    """
+    if name in HARNESS:
+        if given.opensceneflow is None:
+            raise ImportError("give --opensceneflow PATH")
+        return of_harness(name, given.opensceneflow)
+    if name in PRESETS:
+        return preset(name, num_history, given.reach)
+    if name == "zero":
+        return on_rows(lambda case: np.zeros_like(case.pc0))
+    if name == "clusters":
+        import hdbscan  # noqa: F401
+        import open3d  # noqa: F401
+    return on_rows({"nearest": nearest, "clusters": clusters}[name])
+
+
+# ------------------------------------------------------------------------------------------------ measuring
+
+
+def _stop(*_: Any) -> None:
+    raise TimeoutError
+
+
+def measure(method: Method, case: Case, seed: int, limit: int, reach: float) -> dict[str, float]:
+    """Errors, processor and wall seconds of a window. Without errors if it was stopped at the limit."""
+    torch.manual_seed(seed)
+    np.random.seed(seed)
+    signal.signal(signal.SIGALRM, _stop)
+    signal.alarm(limit)
+    begin, wall = time.process_time(), time.perf_counter()
+    try:
+        flow = method(case)
+    except TimeoutError:
+        flow = None
+    finally:
+        signal.alarm(0)
+    spent = {"cpu": time.process_time() - begin, "wall": time.perf_counter() - wall}
+    return spent if flow is None else {**scores(case, flow, reach), **spent}
+
+
+def mean_of(rows: Sequence[dict[str, Any]], column: str) -> float:
+    """Mean over the sets of the mean over the windows."""
+    of_sets: dict[str, list[float]] = {}
+    for row in rows:
+        of_sets.setdefault(row["set"], []).append(row[column])
+    return float(np.nanmean([np.nanmean(values) for values in of_sets.values()]))
+
+
+def errors(rows: Sequence[dict[str, Any]]) -> str:
+    """Dynamic error in metres, error over speed, static error in centimetres."""
+    if not rows:
+        return ""
+    dynamic, ratio, static = (mean_of(rows, column) for column in ("dynamic", "ratio", "static"))
+    return f"{dynamic:.3f} / {ratio:.2f} / {100 * static:.1f}"
+
+
+def table(rows: Sequence[dict[str, Any]]) -> str:
+    """A Markdown table: a row per method and history, and next to it `default` on the windows that the method has."""
+    finished = [row for row in rows if "dynamic" in row]
+    older = {row["window"] for row in rows if row["history"] > 0}
+    windows = {row["window"] for row in rows}
+    lines = []
+    for name, history in dict.fromkeys((row["method"], row["history"]) for row in rows):
+        own = [row for row in finished if (row["method"], row["history"]) == (name, history)]
+        run = {row["window"] for row in own}
+        same = [r for r in finished if (r["method"], r["history"]) == ("default", 0) and r["window"] in run]
+        stopped = len([r for r in rows if (r["method"], r["history"]) == (name, history)]) - len(own)
+        lines.append(
+            {
+                "method": name + (f", {history} older sweeps" if history else ""),
+                "windows": f"{len(own)}" + (f", {stopped} stopped" if stopped else ""),
+                "all sets": errors(own) if not history else "",
+                "sets with older sweeps": errors([row for row in own if row["window"] in older]),
+                "`default` on these windows": errors(same) if run < windows and not history else "",
+                "CPU s": f"{np.mean([row['cpu'] for row in own]):.2f}" if own else "",
+            }
+        )
+    return markdown(lines)
+
+
+def main() -> None:
+    """Run, print, merge."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("paths", type=Path, nargs="*", help="labelled scenes, or folders that a reader knows")
+    parser.add_argument("--methods", nargs="+", default=METHODS, choices=METHODS, metavar="NAME")
+    parser.add_argument("--opensceneflow", type=Path, metavar="PATH", help="checkout of OpenSceneFlow")
+    parser.add_argument("--history", type=int, nargs="+", default=(0, 4), help="numbers of older sweeps of our presets")
+    parser.add_argument("--start", type=int, default=4, help="first window of logs that have so many sweeps; else 0")
+    parser.add_argument("--every", type=int, default=8, help="step between windows")
+    parser.add_argument("--windows", type=int, help="at most so many windows of a set")
+    parser.add_argument("--reach", type=float, default=35.0, help="metres, half side of the square")
+    parser.add_argument("--seed", type=int, default=0, help="of torch and NumPy, set before every window")
+    parser.add_argument("--limit", type=int, default=0, help="seconds of wall time for a window; 0 = none")
+    parser.add_argument("--json", type=Path, help="file for the figures of every window")
+    parser.add_argument(
+        "--merge", type=Path, nargs="*", default=[], help="files of earlier runs; new figures replace them"
+    )
+    given = parser.parse_args()
+    torch.set_num_threads(1)
+    rows = {key(row): row for file in given.merge for row in json.loads(file.read_text())}
+    runs = [(name, history) for name in given.methods for history in (given.history if name in OURS[:3] else (0,))]
+    all_cases = [each for path in given.paths for each in cases(path, given)]
+    for name, history in runs:
+        try:
+            method = make_method(name, history, given)
+        except ImportError as error:
+            print(f"skipped {name}: {error}", file=sys.stderr)
+            continue
+        for set_name, case in all_cases:
+            if history and len(case.window.pch) < history:
+                continue
+            of_run = {"set": set_name, "window": case.name, "method": name, "history": history, "seed": given.seed}
+            row = {**of_run, **measure(method, case, given.seed, given.limit, given.reach), "load": os.getloadavg()[0]}
+            rows[key(row)] = row
+            print(json.dumps(row), file=sys.stderr, flush=True)
+            if given.json:
+                given.json.write_text(json.dumps(list(rows.values()), indent=1) + "\n", encoding="utf-8")
+    print(table(sorted(rows.values(), key=lambda row: (METHODS.index(row["method"]), row["history"]))))
+
+
+def key(row: dict[str, Any]) -> tuple[Any, ...]:
+    """What a row measures."""
+    return row["window"], row["method"], row["history"], row["seed"]
 
 
 if __name__ == "__main__":
-    print(json.dumps(label_scene(*sys.argv[1:])))
+    main()
