@@ -168,7 +168,7 @@ def nearest(case: Case) -> np.ndarray:
 
 
 def clusters(case: Case) -> np.ndarray:
-    """Rigid motion of each cluster by point-to-point ICP; without a better fit than without motion, zero."""
+    """Rigid motion of each cluster by point-to-point ICP, if 5 % more of its points match within 0.1 m than without."""
     import open3d
     from hdbscan import HDBSCAN
 
@@ -181,14 +181,15 @@ def clusters(case: Case) -> np.ndarray:
     for number in range(label.max() + 1):
         rows = label == number
         source = case.pc0[rows]
-        near = (np.abs(case.pc1 - np.clip(case.pc1, source.min(0), source.max(0))) <= 2 * RADIUS).all(1)
-        if near.sum() < 20:
+        low, high = source.min(0) - 2 * RADIUS, source.max(0) + 2 * RADIUS
+        target = case.pc1[((case.pc1 >= low) & (case.pc1 <= high)).all(1)]
+        if len(target) < 20:
             continue
-        start, end, pose = cloud(source), cloud(case.pc1[near]), np.eye(4)
+        start, end, pose = cloud(source), cloud(target), np.eye(4)
         for radius in (RADIUS, 0.5, 0.2):
             pose = registration.registration_icp(start, end, radius, pose).transformation
-        fits = [registration.evaluate_registration(start, end, 0.2, T) for T in (np.eye(4), pose)]
-        if (fits[1].fitness, -fits[1].inlier_rmse) > (fits[0].fitness, -fits[0].inlier_rmse):
+        at_rest, moved = (registration.evaluate_registration(start, end, 0.1, T).fitness for T in (np.eye(4), pose))
+        if moved > at_rest + 0.05:
             flow[rows] = source @ pose[:3, :3].T + pose[:3, 3] - source
     return flow
 

@@ -1,7 +1,8 @@
 """Run an unmodified script of OpenSceneFlow without a GPU: python opensceneflow_launcher.py SCRIPT [arguments].
 
-The current folder is the checkout. A module gets a replacement only if it cannot be imported, so in the harness's own
-environment nothing is replaced. train.py and the runner of methods without training ask for CUDA and get the CPU.
+The current folder is the checkout. Compiled extensions that cannot be imported are replaced by those of
+scripts/benchmarks/opensceneflow_cpu.py, so in the harness's own environment nothing is replaced. train.py and the
+runner of methods without training ask for CUDA and get the CPU.
 """
 
 from __future__ import annotations
@@ -11,75 +12,11 @@ import os
 import runpy
 import sys
 import tempfile
-import types
 from typing import Any
 
 import torch
+from opensceneflow_cpu import add_replacements
 from torch import Tensor, nn
-
-
-def _not_available(*arguments: Any, **settings: Any) -> None:
-    raise RuntimeError("this compiled extension is not available in the tests")
-
-
-def _chamfer(pc0: Tensor, pc1: Tensor, distance0: Tensor, distance1: Tensor, index0: Tensor, index1: Tensor) -> None:
-    """Write the squared distance from each point to the nearest one of the other cloud, and its index."""
-    for start, target, distance, index in ((pc0, pc1, distance0, index0), (pc1, pc0, distance1, index1)):
-        for rows in torch.arange(len(start)).split(1024):
-            nearest = torch.cdist(start[rows], target).min(dim=1)
-            distance[rows], index[rows] = nearest.values.square(), nearest.indices.to(index.dtype)
-
-
-def _chamfer_gradient(
-    pc0: Tensor, pc1: Tensor, index0: Tensor, index1: Tensor, out0: Tensor, out1: Tensor, grad0: Tensor, grad1: Tensor
-) -> None:
-    """Write the gradient of `_chamfer` into the last two arguments."""
-    for start, target, index, out, own, other in (
-        (pc0, pc1, index0.long(), out0, grad0, grad1),
-        (pc1, pc0, index1.long(), out1, grad1, grad0),
-    ):
-        pull = 2 * out[:, None] * (start - target[index])
-        own += pull
-        other.index_add_(0, index, -pull)
-
-
-REPLACEMENTS: dict[str, dict[str, Any]] = {  # module -> what the harness imports from it
-    "torchvision": {
-        "transforms": types.SimpleNamespace(Compose=lambda steps: lambda data: _chain(steps, data)),
-    },
-    "wandb": {"finish": lambda: None},
-    "chamfer3D": {"forward": _chamfer, "backward": _chamfer_gradient},
-    "mmcv": {
-        f"{name}_{direction}": _not_available
-        for name, direction in (
-            ("dynamic_voxelize", "forward"),
-            ("hard_voxelize", "forward"),
-            ("dynamic_point_to_voxel", "forward"),
-            ("dynamic_point_to_voxel", "backward"),
-        )
-    },
-}
-
-
-def _chain(steps: Any, data: Any) -> Any:
-    for step in steps:
-        data = step(data)
-    return data
-
-
-def add_replacements() -> None:
-    """Replace every module that cannot be imported. Lightning comes first, because it looks for the real ones."""
-    import lightning.pytorch  # noqa: F401
-    import numpy as np
-
-    if not hasattr(np, "NaN"):  # removed in NumPy 2
-        np.NaN = np.nan
-    for name, contents in REPLACEMENTS.items():
-        try:
-            importlib.import_module(name)
-        except (ImportError, RuntimeError):  # RuntimeError: a torchvision of another torch
-            sys.modules[name] = types.ModuleType(name)
-            sys.modules[name].__dict__.update(contents)
 
 
 class _TorchOnCPU:

@@ -42,6 +42,7 @@ from cflow_torch.simulator import make_drive
 
 ROOT = Path(__file__).resolve().parents[2]
 LAUNCHER = Path(__file__).with_name("opensceneflow_launcher.py")
+FOLDERS = (ROOT, LAUNCHER.parent, ROOT / "scripts" / "benchmarks")  # of what the launcher imports
 SEARCHPATH = "hydra.searchpath=[pkg://cflow_torch.configs.opensceneflow]"
 SCORES = {"EPE_FD": "epe_fd", "EPE_BS": "epe_bs", "EPE_FS": "epe_fs", "IoU": "dynamic_iou", "Three-way": "epe_3way"}
 ROW = re.compile(rf"^({'|'.join(SCORES)}) +(\S+) *$", re.MULTILINE)
@@ -76,7 +77,7 @@ class Harness:
         settings = [*sweep, SEARCHPATH, *folders, *map(str, overrides[len(sweep) :])]
         environment = {
             **os.environ,
-            "PYTHONPATH": os.pathsep.join([str(ROOT), str(LAUNCHER.parent), os.environ.get("PYTHONPATH", "")]),
+            "PYTHONPATH": os.pathsep.join([*map(str, FOLDERS), os.environ.get("PYTHONPATH", "")]),
             "CUDA_VISIBLE_DEVICES": "",  # the harness computes with fewer digits on a GPU
             "COLUMNS": "200",
             "HYDRA_FULL_ERROR": "1",
