@@ -1,7 +1,8 @@
-"""Estimates and scores all labelled pairs: a table on the screen, OUTPUT/results.json and OUTPUT/config.yaml.
+"""Estimates and scores all labelled pairs: tables on the screen, OUTPUT/results.json and OUTPUT/config.yaml.
 
 A run whose results exist is skipped; overwrite=true repeats it. Each job of a sweep (-m) writes to a folder below
-OUTPUT that is named after its overrides. A sweeper minimises the mean dynamic error.
+OUTPUT that is named after its swept settings. At the end of the sweep, a table compares all jobs in OUTPUT; it is also
+written to OUTPUT/comparison.csv. A sweeper minimises the mean dynamic error.
 
 examples:
   cflow eval data=av2 data.root=/data/av2/val model=paper

@@ -7,7 +7,8 @@ contents=[residual,is_valid,confidence] adds the confidence of each point (not w
 
 OUTPUT/config.yaml contains the settings and versions, OUTPUT/reports what was done. Run the command again to resume.
 After Ctrl-C, SIGTERM or SIGHUP the frames in hand are finished. The exit status is 0 if every frame is complete, 1 if
-one is missing, 2 if the call was wrong, and 128 plus its number after a signal.
+one is missing, 2 if the call was wrong, and 128 plus its number after a signal. The report has the time of each stage,
+and verbose=true prints it.
 
 result_name=NAME also writes the total flow into the HDF5 scenes, as key NAME of every sweep, where the viewers of
 OpenSceneFlow read it. tracks=true also writes OUTPUT/<log id>/tracks.parquet when all frames of a log are complete: one
@@ -75,7 +76,7 @@ def task(cfg: DictConfig) -> None:
         failures = _into_scenes(cfg.result_name, done.sources.logs, as_path(done.job.output))
     if cfg.tracks and done.report["stopped_by"] is None:
         failures += _write_tracks(done.sources, shard, as_path(done.job.output))
-    finish(done, shard, failures)
+    finish(done, shard, failures, cfg.verbose)
 
 
 def compute(
@@ -129,13 +130,14 @@ def compute(
     return FlowRun(sources, job, run_fleet(job, sources.logs, layout, shard, name, about, **engine))
 
 
-def finish(done: FlowRun, shard: Shard, failures: Failures) -> None:
+def finish(done: FlowRun, shard: Shard, failures: Failures, verbose: bool) -> None:
     """Print the report, and exit with its status if something is missing.
 
     Args:
         done: the run.
         shard: its share.
         failures: of later steps, such as tracks.
+        verbose: also print the times of the stages.
 
     Raises:
         SystemExit: something is missing.
@@ -143,7 +145,7 @@ def finish(done: FlowRun, shard: Shard, failures: Failures) -> None:
     """
     report, file = done.report, report_file(done.job.output, shard)
     status = report["exit_status"] or int(bool(failures))
-    print(f"{format_report(report)}\nflow files in {done.job.output}, report in {file}")
+    print(f"{format_report(report, verbose)}\nflow files in {done.job.output}, report in {file}")
     if status:
         missing = format_missing(report) + "".join(f"\n  {scene}: {message}" for scene, message in failures)
         print(f"missing:\n{missing}", file=sys.stderr)

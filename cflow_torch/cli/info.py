@@ -1,18 +1,21 @@
-"""Prints the versions of cflow_torch and of the packages that it uses, the system, the processor and the devices.
+"""Prints the versions of cflow_torch and of the packages that it uses, the system, the processor and the GPUs.
+
+--full adds what torch knows about the system, and the optional packages that are not installed.
 
 examples:
-  cflow info         paste the whole output into a bug report
-  cflow --version    prints the version only
+  cflow info            paste the output into a bug report
+  cflow info --full     if you report a bug of the installation or of a GPU
+  cflow --version       prints the version only
 """
 
 from __future__ import annotations
 
+import os
+import platform
 import re
 from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
-
-from torch.utils.collect_env import get_pretty_env_info
 
 import cflow_torch
 from cflow_torch.errors import CFlowError
@@ -20,19 +23,37 @@ from cflow_torch.errors import CFlowError
 
 def task(arguments: list[str]) -> None:
     """Run `cflow info`."""
-    if arguments:
-        raise CFlowError(f"info takes no settings, got {' '.join(arguments)}: cflow info")
+    if arguments not in ([], ["--short"], ["--full"]):
+        raise CFlowError(f"info takes --short (the default) or --full, got {' '.join(arguments)}: cflow info")
+    is_full = arguments == ["--full"]
     print(f"cflow_torch {cflow_torch.__version__} in {Path(cflow_torch.__file__).parent}", flush=True)
-    print(get_pretty_env_info())
-    names = {re.split(r"[^\w.-]", text, maxsplit=1)[0] for text in _requirements()}
-    for name in sorted(names - {"cflow_torch"}):
+    if is_full:
+        from torch.utils.collect_env import get_pretty_env_info  # takes seconds
+
+        print(get_pretty_env_info())
+    print(f"Python {platform.python_version()} on {platform.platform()}")
+    print(f"processor {processor()}, cores {os.cpu_count()}")
+    for file in sorted(Path("/proc/driver/nvidia/gpus").glob("*/information")):  # of NVIDIA's driver for Linux
+        print("GPU", file.read_text().partition("\n")[0].partition(":")[2].strip())
+    for name in sorted(_requirements() - {"cflow_torch"}):
         try:
             print(name, metadata.version(name))
         except metadata.PackageNotFoundError:
-            print(name, "not installed")
+            if is_full:
+                print(name, "not installed")
 
 
-def _requirements() -> list[str]:
-    with suppress(metadata.PackageNotFoundError):  # a checkout that is not installed
-        return metadata.requires("cflow_torch") or []
-    return []
+def processor() -> str:
+    """Name of the processor."""
+    with suppress(OSError), open("/proc/cpuinfo", encoding="utf-8") as file:
+        for line in file:
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    return platform.processor() or "unknown"
+
+
+def _requirements() -> set[str]:
+    """Names of the packages that the core and the extras need; none for a checkout that is not installed."""
+    with suppress(metadata.PackageNotFoundError):
+        return {re.split(r"[^\w.-]", text, maxsplit=1)[0] for text in metadata.requires("cflow_torch") or []}
+    return set()

@@ -57,7 +57,7 @@ def task(cfg: DictConfig) -> None:
 
     done = compute(cfg, shard, _CONTENTS, check)
     if done is not None:
-        finish(done, shard, _label(done, shard, cfg) if done.report["stopped_by"] is None else [])
+        finish(done, shard, _label(done, shard, cfg) if done.report["stopped_by"] is None else [], cfg.verbose)
 
 
 def _label(done: FlowRun, shard: Shard, cfg: DictConfig) -> Failures:

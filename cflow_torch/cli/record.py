@@ -12,6 +12,7 @@ from typing import Any, Sequence
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
+from cflow_torch.cli.comparison import RESULTS, summary
 from cflow_torch.cli.run import Failures, machine, versions, write_config
 from cflow_torch.data.json_file import describe_changes, json_ready, write_json
 from cflow_torch.data.log import Log
@@ -21,7 +22,6 @@ from cflow_torch.evaluation.tables import format_table
 from cflow_torch.simulator.benchmark import generator_key
 from cflow_torch.types import CFlowError, FlowResult, Window
 
-RESULTS = "results.json"
 # Settings that do not change the results.
 _PATHS = ("config.output", "config.overwrite", "config.data.cache")
 
@@ -77,7 +77,7 @@ class Scores:
         }
         write_config(self._cfg, folder)
         write_json(folder / RESULTS, record)
-        print(f"{folder}: {format_table(results)}")
+        print(f"{summary(results, seconds)}\n\n{folder}: {format_table(results)}")
         return results
 
 

@@ -18,6 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from cflow_torch import __version__, estimate
 from cflow_torch.cli.choices import CONFIGS, own_settings
 from cflow_torch.cli.estimates import estimates
+from cflow_torch.cli.info import processor
 from cflow_torch.cli.refusals import UnfinishedJob as UnfinishedJob
 from cflow_torch.config import config_from
 from cflow_torch.data.atomic import write_text
@@ -50,13 +51,12 @@ def versions() -> dict[str, str]:
 
 def machine() -> dict[str, Any]:
     """The machine, on which times depend: "platform", "cpu", "cores", "threads" (of torch)."""
-    try:
-        with open("/proc/cpuinfo", encoding="utf-8") as file:
-            models = [line.split(":", 1)[1].strip() for line in file if line.startswith("model name")]
-    except OSError:
-        models = []
-    cpu = models[0] if models else platform.processor() or "unknown"
-    return {"platform": platform.platform(), "cpu": cpu, "cores": os.cpu_count(), "threads": torch.get_num_threads()}
+    return {
+        "platform": platform.platform(),
+        "cpu": processor(),
+        "cores": os.cpu_count(),
+        "threads": torch.get_num_threads(),
+    }
 
 
 def make_model(cfg: DictConfig) -> SceneFlowModel:

@@ -1,9 +1,15 @@
 """Prints all settings as a Markdown page: of the methods, then of the commands, data sets and other groups.
 
+With names, it prints only these: a setting, a preset, a command, a group or one of its choices.
+
 --opensceneflow FOLDER writes the model files of OpenSceneFlow's configuration instead: cflow.yaml (preset default),
 cflow_fast.yaml, cflow_paper.yaml and cflow_keypoints.yaml. They are those of the package.
 
 examples:
+  cflow settings max_speed          default, allowed values and meaning of a setting
+  cflow settings data.find_ground   a setting of several data sets
+  cflow settings data               the choices of a group
+  cflow settings data=hdf5 eval     all settings of a data set and of a command
   cflow settings > settings.md
   cflow settings --opensceneflow conf/model
 """
@@ -17,7 +23,7 @@ from typing import Any, Iterator
 
 import yaml  # type: ignore[import-untyped]
 
-from cflow_torch.cli.choices import CONFIGS, files
+from cflow_torch.cli.choices import CONFIGS, SETTERS, default_text, files, meanings, near, own_settings
 from cflow_torch.config import CONFIGS as METHODS
 from cflow_torch.config import PRESETS, WINDOW, describe, make_config
 from cflow_torch.errors import CFlowError
@@ -48,7 +54,7 @@ _Z = 1000.0  # metres; the harness computes with the region, so infinite bounds 
 def task(arguments: list[str]) -> None:
     """Run `cflow settings`."""
     if not arguments:
-        print("\n\n".join(_page()))
+        print("\n\n".join([_PAGE, *(text for _, text in _sections())]))
     elif len(arguments) == 2 and arguments[0] == "--opensceneflow":
         from cflow_torch.data.atomic import ensure_writable, write_text
 
@@ -56,8 +62,10 @@ def task(arguments: list[str]) -> None:
         for name, text in harness_models().items():
             write_text(folder / f"{name}.yaml", text)
             print(folder / f"{name}.yaml")
+    elif any(word.startswith("-") for word in arguments):
+        raise CFlowError(f"settings takes names or --opensceneflow FOLDER, got {' '.join(arguments)}")
     else:
-        raise CFlowError(f"settings takes no arguments or --opensceneflow FOLDER, got {' '.join(arguments)}")
+        print("\n\n".join(text for name in arguments for text in _about(name)))
 
 
 def harness_models() -> dict[str, str]:
@@ -77,8 +85,8 @@ def harness_models() -> dict[str, str]:
     return models
 
 
-def _page() -> Iterator[str]:
-    yield _PAGE
+def _sections() -> Iterator[tuple[list[str], str]]:
+    """The sections of the page, and the names of each."""
     for method, kind in METHODS.items():
         presets = {preset: make_config(preset) for preset, (of, _) in PRESETS.items() if of == method}
         rows = ["| setting | default | presets | allowed | meaning |", "|---|---|---|---|---|"]
@@ -87,13 +95,68 @@ def _page() -> Iterator[str]:
             changed = ", ".join(f"{p} `{_yaml(v)}`" for p, v in values.items() if v != f.default)
             cells = [f"`model.{f.name}`", f"`{_yaml(f.default)}`", changed, describe(f), f.metadata["help"]]
             rows.append(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |")
-        yield f"## Method `{method}`: {', '.join(f'model={preset}' for preset in presets)}"
-        yield "\n".join(rows)
+        chosen = [f"model={preset}" for preset in presets]
+        text = "\n".join([f"## Method `{method}`: {', '.join(chosen)}", "", *rows])
+        yield ["model", method, *presets, *chosen], text
+    for file in _files():
+        text = f"```yaml\n{file.read_text(encoding='utf-8').strip()}\n```"
+        yield [_name(file).replace("cflow ", "")], f"## {_name(file)}\n\n{text}"
+
+
+def _files() -> list[Path]:
+    """The YAML files of the commands, then of the groups."""
     commands = [file for file in sorted(CONFIGS.glob("*.yaml")) if file.stem != "hydra"]
-    in_groups = [file for group in sorted(CONFIGS.glob("*/")) for file in files(group.name)]
-    for file in commands + in_groups:
-        yield f"## {f'cflow {file.stem}' if file in commands else f'{file.parent.name}={file.stem}'}"
-        yield f"```yaml\n{file.read_text(encoding='utf-8').strip()}\n```"
+    return commands + [file for group in sorted(CONFIGS.glob("*/")) for file in files(group.name)]
+
+
+def _name(file: Path) -> str:
+    return f"cflow {file.stem}" if file.parent == CONFIGS else f"{file.parent.name}={file.stem}"
+
+
+def _title(file: Path) -> str:
+    """The first line of the comment at the top of a YAML file."""
+    lines = file.read_text(encoding="utf-8").splitlines()
+    return next(line[2:] for line in lines if not line.startswith("# @"))
+
+
+def _about(name: str) -> list[str]:
+    """The sections, the choices of a group and the settings of one name.
+
+    Raises:
+        CFlowError: nothing has this name.
+    """
+    found = [text for names, text in _sections() if name in names]
+    choices = [f"{_name(file):28} {_title(file)}" for file in _files() if file.parent == CONFIGS / name]
+    found += ["\n".join(choices)] if choices else []
+    chosen: dict[str, dict[str, list[str]]] = {}  # setting and meaning -> default -> where
+    for key, meaning, default, where in _entries():
+        if name in (key, key.rpartition(".")[2]):
+            chosen.setdefault(f"{key}: {meaning}", {}).setdefault(default, []).append(where)
+    for head, defaults in chosen.items():
+        lines = [f"  default {default}: {', '.join(places)}" for default, places in defaults.items()]
+        found.append("\n".join([head, *lines]))
+    if not found:
+        known = [key for key, *_ in _entries()] + [one for names, _ in _sections() for one in names]
+        raise CFlowError(f"settings {name}: nothing has this name{near(name, known)}; `cflow settings` lists all")
+    return found
+
+
+def _entries() -> Iterator[tuple[str, str, str, str]]:
+    """Every setting: its dotted name, meaning, default, and where it has this default."""
+    for method, kind in METHODS.items():
+        presets = [(f"model={preset}", make_config(preset)) for preset, (of, _) in PRESETS.items() if of == method]
+        for where, config in [(f"method {method}", kind()), *presets]:
+            for f in fields(kind):
+                value = getattr(config, f.name)
+                if value != f.default or where.startswith("method"):
+                    yield f"model.{f.name}", f"{f.metadata['help']}; {describe(f)}", _yaml(value), where
+    for file in _files():
+        group = file.parent.name
+        if group not in SETTERS:
+            prefix = "" if file.parent == CONFIGS or group == "picture" else f"{group}."
+            for (key, value), meaning in zip(own_settings(file).items(), meanings(file)):
+                if key != group:
+                    yield prefix + key, meaning, default_text(value), _name(file)
 
 
 def _yaml(value: Any) -> str:

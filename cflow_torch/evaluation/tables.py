@@ -23,7 +23,7 @@ def format_table(results: dict[str, Any]) -> str:
     for metric, table in _TABLES.items():
         if metric in results:
             header, rows = table(results[metric])
-            lines += ["", *_markdown(header, rows)]
+            lines += ["", *markdown(header, rows)]
     return "\n".join(lines) + "\n"
 
 
@@ -74,7 +74,7 @@ def _number(value: float) -> str:
     return "-" if math.isnan(value) else f"{value:.4f}"
 
 
-def _markdown(header: Sequence[object], rows: Sequence[Sequence[object]]) -> list[str]:
+def markdown(header: Sequence[object], rows: Sequence[Sequence[object]]) -> list[str]:
     """Lines of a Markdown table, the first column left-aligned, the others right-aligned."""
     cells = [[str(cell) for cell in row] for row in (header, *rows)]
     first, *others = [max(len(cell) for cell in column) for column in zip(*cells)]

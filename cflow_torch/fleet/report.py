@@ -123,8 +123,8 @@ class Counters:
         }
 
 
-def format_report(report: dict[str, Any]) -> str:
-    """The report as a table."""
+def format_report(report: dict[str, Any], verbose: bool = False) -> str:
+    """The report as a table, if `verbose` with the times of the stages."""
     frames, shard, devices = report["frames"], report["shard"], report["devices"]
     workers = f"workers: {len(devices)} on {', '.join(sorted(set(devices)))}"
     rows = [
@@ -142,7 +142,7 @@ def format_report(report: dict[str, Any]) -> str:
         rows.append(("logs or parts of logs not begun", frames["unopened_units"]))
     rows.append(("seconds", f"{report['seconds']:.1f}"))
     rows.append(("frames/s", f"{report['frames_per_s']:.2f}"))
-    if report["stages"]:
+    if verbose and report["stages"]:
         rows.append(("ms per frame and worker (stages overlap)", ""))
         rows += [(f"  {name}", f"{1e3 * seconds:.1f}") for name, seconds in report["stages"].items()]
     width = max(len(name) for name, _ in rows)

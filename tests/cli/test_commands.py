@@ -14,6 +14,7 @@ from omegaconf import OmegaConf
 
 from cflow_torch import make_config
 from cflow_torch.cli import estimates, run
+from cflow_torch.cli.comparison import summary
 from cflow_torch.cli.record import objective
 from cflow_torch.config import config_from
 from cflow_torch.data.av2 import AV2Log
@@ -51,6 +52,7 @@ def test_demo_writes_all_its_files(tmp_path: Path, cache: Path, cflow: Cflow, ca
     assert config_from(left) == make_config("fast", point_cloud_range=region)
     assert (tmp_path / "flow.png").read_bytes().startswith(b"\x89PNG")
     printed = capsys.readouterr().out
+    assert printed.startswith("mean dynamic error 0.")
     assert f"picture: {tmp_path / 'flow.png'}" in printed and "CAR" in printed
     assert not list(tmp_path.rglob(".*")), "no temporary file is left"
 
@@ -129,6 +131,16 @@ def test_a_failure_ends_a_run_but_not_a_sweep(monkeypatch: pytest.MonkeyPatch) -
     run.finish([])
     with pytest.raises(run.UnfinishedJob, match="1"):
         run.finish([("a", "bad")])
+
+
+def test_the_first_line_has_the_scores_and_names_classes_with_few_points() -> None:
+    classes = {"CAR": {"num_dynamic": 5000}, "PEDESTRIAN": {"num_dynamic": 12}, "BACKGROUND": {"num_dynamic": 0}}
+    bucketed = {"mean": {"dynamic_error": 0.25, "static_epe": 0.0125}, "classes": classes}
+    first, second = summary({"bucketed": bucketed, "three_way": {}}, {"median": 0.5}).splitlines()
+    assert first == "mean dynamic error 0.250, static EPE 0.013 m, 0.50 s a frame"
+    assert second.startswith("few dynamic points, ") and second.endswith(": PEDESTRIAN (12)")
+    only = summary({"three_way": {"epe_fd": 0.5, "epe_bs": float("nan")}}, {"median": 0.5})
+    assert only == "EPE FD 0.500 m, EPE BS nan m, 0.50 s a frame"
 
 
 def test_a_sweeper_minimises_the_mean_dynamic_error() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import itertools
 import json
 import subprocess
@@ -14,6 +15,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from cflow_torch.cli.choices import CONFIGS
+from cflow_torch.cli.comparison import compare
 from cflow_torch.cli.record import objective
 from cflow_torch.cli.run import make_model
 
@@ -64,18 +66,23 @@ def test_the_jobs_of_an_experiment_are_the_rows_of_its_table(experiment: str, co
 def test_a_sweep_keeps_every_result_and_resumes(
     log_folder: Path, tmp_path: Path, cflow: Cflow, capsys: pytest.CaptureFixture
 ) -> None:
-    data = ("data=av2", f"data.root={log_folder}", "data.check=false", "data.step=2")
+    data = ("data=av2", log_folder, "data.check=false", "data.step=2")
     call = ("eval", "-m", "experiment=history", *data, f"output={tmp_path}", "model.num_history=0,2")
     assert cflow(*call) == 0
     files = sorted(tmp_path.rglob("results.json"))
-    assert len(files) == 2
-    assert all(f"experiment=history,model.num_history={h}" in file.parent.name for h, file in zip((0, 2), files))
+    names = [f"experiment=history,model.num_history={h}" for h in (0, 2)]
+    assert [str(file.parent.relative_to(tmp_path)) for file in files] == names, "what is swept, without the path"
     records = [json.loads(file.read_text()) for file in files]
     assert [r["config"]["model"]["num_history"] for r in records] == [0, 2]
     assert {r["config"]["experiment_name"] for r in records} == {"history"}
     assert len({r["data"]["digest"] for r in records}) == 1, "all settings see the same windows"
     assert not [file for file in tmp_path.rglob(".*") if file.is_file()], "no temporary file is left"
-    capsys.readouterr()
+    header, *rows = csv.reader((tmp_path / "comparison.csv").read_text().splitlines())
+    assert header[:3] == ["experiment", "model.num_history", "mean dynamic error"]
+    assert [float(row[2]) for row in rows] == [objective(record["results"]) for record in records]
+    assert (
+        capsys.readouterr().out.splitlines()[-4].startswith("| experiment | model.num_history | mean dynamic error |")
+    )
 
     before = {file: file.stat().st_mtime_ns for file in files}
     files[1].unlink()  # as if it had been stopped there
@@ -84,6 +91,26 @@ def test_a_sweep_keeps_every_result_and_resumes(
     assert files[0].stat().st_mtime_ns == before[files[0]] and files[1].exists()
     assert cflow(*call, "overwrite=true") == 0
     assert files[0].stat().st_mtime_ns > before[files[0]]
+
+
+def test_the_comparison_sorts_jobs_by_their_settings_and_names_other_data(tmp_path: Path, capsys: Any) -> None:
+    def write(job: str, digest: str, text: str | None = None) -> None:
+        results = {"bucketed": {"mean": {"dynamic_error": 0.5}}, "three_way": {"epe_fd": 0.25, "epe_bs": None}}
+        record = {"results": results, "seconds_per_pair": {"median": 2.0}, "data": {"digest": digest}}
+        (tmp_path / job).mkdir(parents=True)
+        (tmp_path / job / "results.json").write_text(text or json.dumps(record))
+
+    for job in ("model.num_history=10,model.pixel_sizes=[0.2,0.1]", "model.num_history=2", "data.root=/a/b"):
+        write(job, "x")
+    scores = [0.5, 0.25, "", 2.0]
+    header, rows = compare(tmp_path)
+    assert header[:4] == ["data.root", "model.num_history", "model.pixel_sizes", "mean dynamic error"]
+    assert rows == [["", "2", "", *scores], ["", "10", "[0.2,0.1]", *scores], ["/a/b", "", "", *scores]]
+    write("a_copy", "y")
+    write("old", "y", "{}")
+    header, rows = compare(tmp_path)
+    assert header[0] == "job" and rows[-1][:5] == ["a_copy", "", "", "", "y"] and "scored data" in header
+    assert "old/results.json is not compared" in capsys.readouterr().out
 
 
 # ---------------------------------------------------------------- launchers and sweepers

@@ -38,7 +38,16 @@ def test_help_explains_a_command_with_examples_and_settings(
     assert capsys.readouterr().out == text
 
 
-QUICK = ("--version", "--help", "eval --help", "help clean", "settings", "settings max_speed", "info", "completion bash")
+QUICK = (
+    "--version",
+    "--help",
+    "eval --help",
+    "help clean",
+    "settings",
+    "settings max_speed",
+    "info",
+    "completion bash",
+)
 WRONG = (
     *("fliw", "eval /no/such/path", "flow data=av2 data.root=/no/such/path", "flow data=av2", "eval --bogus"),
     *("eval model=papr", "eval -m model=fast,papr", "eval modle=paper", "eval model.num_history=-1"),
@@ -201,8 +210,13 @@ def test_the_shell_accepts_its_script(shell: str, tmp_path: Path) -> None:
 
 
 def test_info_lists_every_required_package(cflow: Cflow, capsys: pytest.CaptureFixture) -> None:
-    assert cflow("info") == 0
-    text = capsys.readouterr().out
-    assert text.startswith(f"cflow_torch {cflow_torch.__version__} in ") and "\nPython version: " in text
+    texts = []
+    for arguments in ((), ("--full",)):
+        assert cflow("info", *arguments) == 0
+        texts.append(capsys.readouterr().out)
+        assert texts[-1].startswith(f"cflow_torch {cflow_torch.__version__} in ")
+    short, full = texts
     for name in ("torch", "PyYAML", "h5py", "hydra-submitit-launcher"):
-        assert re.search(rf"^{name} (\d|not installed)", text, re.M), name
+        (state,) = re.findall(rf"^{name} (\d|not installed)", full, re.M)
+        assert (f"\n{name} " in short) == (state != "not installed"), name
+    assert "\nPython version: " in full and "\nPython 3" in short and "\nprocessor " in short

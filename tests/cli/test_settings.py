@@ -142,6 +142,27 @@ def test_the_page_lists_every_setting(cflow: Cflow, capsys: pytest.CaptureFixtur
         assert f"\n## data={file.stem}\n" in page and file.read_text().strip() in page
 
 
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        (
+            "max_speed",
+            ["model.max_speed: m/s", "default null: method dense", "default 60.0: model=default"],
+        ),
+        ("shard.index", ["shard.index: index of this process", "default auto: cflow flow, cflow label"]),
+        ("data", ["data=av2 ", "data=hdf5 "]),
+        ("fast", ["## Method `verified`", "| `model.significance` | `1.5` |"]),
+        ("flow", ["## cflow flow", "contents: [flow,", "flow: output folder of `cflow flow`", "null: cflow clean"]),
+    ],
+)
+def test_settings_explains_one_name(name: str, expected: list[str], cflow: Cflow, capsys: Any) -> None:
+    assert cflow("settings", name) == 0
+    text = capsys.readouterr().out
+    assert all(part in text for part in expected) and len(text) < 4500
+    assert cflow("settings", "max_sped") == 2
+    assert "nothing has this name (did you mean model.max_speed?)" in capsys.readouterr().err
+
+
 def test_the_harness_models_are_those_in_the_package(tmp_path: Path, cflow: Cflow) -> None:
     assert cflow("settings", "--opensceneflow", tmp_path / "model") == 0
     committed = {file.name: file.read_text() for file in (CONFIGS / "opensceneflow" / "model").glob("*.yaml")}

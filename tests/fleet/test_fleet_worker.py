@@ -289,7 +289,8 @@ def test_the_report_lists_what_is_missing() -> None:
     missing = format_missing(report).splitlines()
     assert missing[:3] == ["  a/11: odd", "  b: no log", "  a/12: not done"]
     assert missing[-2:] == ["  and 10 more, all of them in the report", "  1 logs or parts of logs: not begun"]
-    assert "interrupted by SIGTERM" in format_report(report)
+    assert "interrupted by SIGTERM" in format_report(report) and "  read" not in format_report(report)
+    assert "  read" in format_report(report, verbose=True)
 
 
 def test_settings_of_the_engine_are_checked(source: Path, tmp_path: Path) -> None:

@@ -1,0 +1,116 @@
+"""The most important scores of a run in one line, and a table that compares the jobs of a sweep."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+from hydra.experimental.callback import Callback
+
+RESULTS = "results.json"
+TABLE = "comparison.csv"
+# A class with fewer dynamic points than about one pedestrian has in ten sweeps.
+_FEW = 1000
+# A setting and its value in the name of a job's folder.
+_SWEPT = re.compile(r"(?:^|,)([^=,]+)=(.*?)(?=,[^=,]+=|$)")
+_SCORES = {
+    "mean dynamic error": "dynamic_error",
+    "EPE FD [m]": "epe_fd",
+    "EPE BS [m]": "epe_bs",
+    "seconds a frame": "seconds",
+}
+
+
+class Comparison(Callback):
+    """At the end of a sweep, print a table of all jobs in OUTPUT, and write it to OUTPUT/comparison.csv."""
+
+    def on_multirun_end(self, config: Any, **kwargs: Any) -> None:
+        """Called by Hydra in the process that started the sweep."""
+        from cflow_torch.data.atomic import write_text
+        from cflow_torch.data.paths import as_path
+        from cflow_torch.evaluation.tables import markdown
+
+        output = as_path(config.output)
+        header, rows = compare(output)
+        if rows:
+            text = io.StringIO()
+            csv.writer(text, lineterminator="\n").writerows([header, *rows])
+            write_text(output / TABLE, text.getvalue())
+            shown = [[f"{cell:.4g}" if isinstance(cell, float) else cell for cell in row] for row in rows]
+            print("\n".join([f"all jobs in {output}, also in {output / TABLE}:", "", *markdown(header, shown)]))
+
+
+def compare(output: Path) -> tuple[list[str], list[list[Any]]]:
+    """Compare all jobs with results below a folder.
+
+    Returns:
+        The header, and a row for each job: the swept settings, the digest of the scored data if the jobs have scored
+        different data, then the scores; "" = no value.
+    """
+    jobs: list[tuple[dict[str, str], list[Any]]] = []
+    for file in sorted(output.glob(f"*/**/{RESULTS}")):
+        try:
+            record = json.loads(file.read_text(encoding="utf-8"))
+            scores = headline(record["results"], record["seconds_per_pair"])
+            digest = record["data"]["digest"]
+        except (ValueError, KeyError, TypeError) as error:
+            print(f"{file} is not compared: it is not a results file of this version ({error!r})")
+            continue
+        name = file.parent.relative_to(output).as_posix()
+        settings = {**(dict(_SWEPT.findall(name)) or {"job": name}), "scored data": digest}
+        jobs.append((settings, ["" if math.isnan(scores[key]) else scores[key] for key in _SCORES.values()]))
+    names = list(dict.fromkeys(name for settings, _ in jobs for name in settings if name != "scored data"))
+    if len({settings["scored data"] for settings, _ in jobs}) > 1:
+        names.append("scored data")
+    rows = [[*(settings.get(name, "") for name in names), *scores] for settings, scores in jobs]
+    rows.sort(key=lambda row: [_order(cell) for cell in row[: len(names)]])
+    return [*names, *_SCORES], rows
+
+
+def _order(cell: str) -> tuple[bool, float, str]:
+    """Numbers by size, and before everything else."""
+    try:
+        return False, float(cell), ""
+    except ValueError:
+        return True, 0.0, cell
+
+
+def headline(results: dict[str, Any], seconds: dict[str, Any]) -> dict[str, float]:
+    """The most important scores; NaN where the definition does not have them or there are no points.
+
+    Args:
+        results: from `SceneFlowMetrics.compute`, or from results.json.
+        seconds: from `TimedModel.report`.
+
+    Returns:
+        "dynamic_error" (mean over classes, and over ranges if the definition has them), "static_epe" (mean over
+        classes), "epe_fd" and "epe_bs" in metres, "seconds" (median per pair).
+    """
+    bucketed, three_way = results.get("bucketed", {}).get("mean", {}), results.get("three_way", {})
+    found = {
+        "dynamic_error": results.get("bucketed_by_range", {}).get("mean", bucketed).get("dynamic_error"),
+        "static_epe": bucketed.get("static_epe"),
+        "epe_fd": three_way.get("epe_fd"),
+        "epe_bs": three_way.get("epe_bs"),
+        "seconds": seconds.get("median"),
+    }
+    return {name: math.nan if value is None else float(value) for name, value in found.items()}
+
+
+def summary(results: dict[str, Any], seconds: dict[str, Any]) -> str:
+    """One line with the most important scores, and one about classes with few dynamic points, if there are any."""
+    scores = headline(results, seconds)
+    dynamic, static = "mean dynamic error {dynamic_error:.3f}", "static EPE {static_epe:.3f} m"
+    if "bucketed" not in results:
+        dynamic, static = "EPE FD {epe_fd:.3f} m", "EPE BS {epe_bs:.3f} m"
+    lines = [f"{dynamic}, {static}, {{seconds:.2f}} s a frame".format(**scores)]
+    classes = results.get("bucketed", {}).get("classes", {})
+    few = [f"{name} ({row['num_dynamic']})" for name, row in classes.items() if 0 < row["num_dynamic"] < _FEW]
+    if few:
+        lines.append(f"few dynamic points, so these classes are uncertain, and the mean with them: {', '.join(few)}")
+    return "\n".join(lines)
