@@ -96,7 +96,7 @@ def run_commands(python: Path, folder: Path) -> None:
     home = folder / "home"
     home.mkdir()
     for command in COMMANDS:
-        run(python.with_name("cflow"), *command.split(), cwd=home)
+        run(shutil.which("cflow", path=str(python.parent)), *command.split(), cwd=home)
     missing = [name for name in MADE if not list(home.glob(f"outputs/{name}"))]
     if missing:
         sys.exit(f"error: the commands did not write {', '.join(missing)}")

@@ -14,7 +14,7 @@ import pytest
 
 pytest.importorskip("build.__main__", reason="the extra dev is not installed")
 pytest.importorskip("setuptools", reason="builds the wheel")
-metadata = pytest.importorskip("packaging.metadata", reason="needs packaging 23.1")
+metadata = pytest.importorskip("packaging.metadata", reason="needs packaging")
 
 ROOT = Path(__file__).resolve().parents[1]
 MADE = ("__pycache__", "*.py[cod]", "*.egg-info", ".*", "outputs", "multirun", "build", "dist")
@@ -48,6 +48,16 @@ def test_the_wheel_holds_the_package_and_nothing_else(wheel: Path) -> None:
     assert names_in(wheel) == expected | {"cflow_torch/py.typed", "cflow_torch/verified/confidence.json"}
     assert wheel.name.endswith("-py3-none-any.whl")
     assert wheel.stat().st_size < 2**20, "under 1 MiB: no picture, no data"
+
+
+def test_the_metadata_is_complete(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        (name,) = (name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
+        given = metadata.Metadata.from_email(archive.read(name))
+    assert given.license_expression == "BSD-3-Clause" and given.license_files == ["LICENSE"]
+    assert str(given.requires_python) == ">=3.8" and given.description_content_type == "text/markdown"
+    assert given.summary and given.keywords and "Typing :: Typed" in given.classifiers
+    assert {"viz", "bags", "all", "docs"} <= set(given.provides_extra)
 
 
 @pytest.mark.slow

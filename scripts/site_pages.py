@@ -11,9 +11,6 @@ import re
 from pathlib import Path
 from typing import Any
 
-from latex2mathml.converter import convert
-from mkdocs.structure.files import File, Files
-
 FORMULA = re.compile(r'<(?P<tag>div|span) class="arithmatex">\\[(\[](?P<latex>.*?)\\[)\]]</(?P=tag)>', re.S)
 # Sections of our docstrings that mkdocstrings takes for paragraphs, and their names of pages.
 SECTION = re.compile(r"<p>(Convention|Cost|Source|Ties|Warns|Example): ")
@@ -23,8 +20,10 @@ STYLE = """.md-grid { max-width: 76rem; }
 """
 
 
-def on_files(files: Files, config: Any) -> Files:
+def on_files(files: Any, config: Any) -> Any:
     """Add the pages of the reference, and replace each notebook by a page with its text, code and outputs."""
+    from mkdocs.structure.files import File
+
     files.append(File.generated(config, "site.css", content=STYLE))
     for name, (title, *names) in config.extra["reference"].items():
         text = "\n\n".join([f"# {title}", *(f"::: {each}" for each in names)])
@@ -44,7 +43,8 @@ def notebook_page(path: Path) -> str:
         source = "".join(cell["source"])
         parts.append(source if cell["cell_type"] == "markdown" else f"```python\n{source}\n```")
         for output in cell.get("outputs", ()):
-            data = {kind: "".join(value) for kind, value in output.get("data", {"text/plain": output.get("text")}).items()}
+            kinds = output.get("data", {"text/plain": output.get("text")})  # printed text has no kinds
+            data = {kind: "".join(value) for kind, value in kinds.items()}
             if "image/png" in data:
                 parts.append(f"![output](data:image/png;base64,{data['image/png'].strip()})")
             elif "text/html" in data:
@@ -68,4 +68,6 @@ def on_page_content(html: str, page: Any, **_: Any) -> str:
 
 
 def _math(found: re.Match[str]) -> str:
+    from latex2mathml.converter import convert
+
     return convert(html.unescape(found["latex"]), display="block" if found["tag"] == "div" else "inline")
