@@ -137,7 +137,7 @@ class SceneFlowModel(nn.Module):
         Returns:
             B results. Each depends only on its window and the settings.
 
-        Cost: one CPU thread, whatever torch is set to; the setting is restored. For more cores start more processes.
+        Cost: one CPU thread, whatever number torch is set to. To use more cores, start more processes.
 
         Raises:
             CFlowError: bad input, see `make_batch`.

@@ -39,9 +39,9 @@ class Sweep:
             then no sweep of the window may have a pose.
         timestamp_ns: time of the sweep in nanoseconds; None = unknown.
         point_times: (N,) float, seconds from the instant of the sweep to the measurement of each point, negative =
-            before it; None = all points at that instant. `timestamp_ns` and `pose` belong to this instant, and the
-            points are compensated for the motion of the vehicle to it. The verified method uses the times if every
-            sweep of a window has them.
+            before it; None = all points at that instant. `timestamp_ns` and `pose` are those of this instant, and the
+            points must already be compensated for the motion of the vehicle until this instant. The verified method
+            uses the times if every sweep of a window has them.
     """
 
     points: Array
@@ -70,7 +70,7 @@ class Window:
 
 @dataclass(frozen=True)
 class FlowResult:
-    """Flow t -> t+1 of every point of pc0, rows in pc0's order (ground and out-of-range rows included).
+    """Flow from t to t+1, with a row for every point of pc0 in its order, also for ground and points out of range.
 
     The flow of a point is the displacement of its object from the instant of sweep t to that of sweep t+1. For a point
     with a time of its own it is the displacement over one sweep interval, from the position of the measurement.
@@ -79,9 +79,10 @@ class FlowResult:
         residual_flow: (N, 3) float32, metres per sweep interval, axes of ego1: motion of objects.
         pose_flow: (N, 3) float32, metres, T_ego1_ego0 p - p: apparent motion from the motion of the sensor.
         flow: (N, 3) float32, metres, total flow, the sum of the two.
-        cluster_id: (N,) int64, 0 ... M-1 in raster order of each cluster's first pixel; -1 = not in a cluster that has
-            points both before and at t+1.
-        score: (N,) float32 in [0, 1], NCC at the peak (t -> t+1, finest scale); 0 where cluster_id is -1.
+        cluster_id: (N,) int64, 0 ... M-1 in raster order of each cluster's first pixel; -1 = in no cluster that has
+            points both at t+1 and before.
+        score: (N,) float32 in [0, 1], how well the cluster at t, moved by its flow, agrees with t+1: its normalised
+            cross-correlation at the peak (finest scale). It is not a probability. 0 where cluster_id is -1.
         is_valid: (N,) bool, True for active points: finite, neither ground nor of the vehicle itself
             (`Config.ego_box`), inside the region.
         confidence: (N,) float32 in [0, 1] by the verified method, else None: estimated probability that the end-point
@@ -143,14 +144,14 @@ class FlowResult:
         Returns:
             (K,) structured array, sorted by id, in the ego frame at t+1. `id`: cluster_id. `centre`: (3,) metres, of
             the box. `size`: (3,) metres, length along the heading, width, height. `velocity`: (3,) m/s over ground,
-            mean of the points. `heading`: radians from +x to the left, direction of the velocity. `num_points`.
-            `confidence`: mean of the points, NaN if the method has none.
+            mean of the points. `heading`: radians from +x to the left, direction of the velocity. `num_points`: number
+            of points. `confidence`: mean of the points, NaN if the method has none.
 
         Convention:
             The box encloses the points of sweep t, moved by their flow. If only one side of an object is visible, the
             box encloses that side. On simulated drives, objects of 50 points and more have their centre inside the true
             box and their velocity within 0.75 m/s, except for a turning articulated lorry (4 m/s). Two thirds of all
-            rows are small parts of the static world with a confidence below 0.7; drop those if that matters.
+            rows are small pieces of the static world; nearly all of these have a confidence below 0.7.
 
         Raises:
             CFlowError: the number of points differs, or the result is from a file without flow or clusters.

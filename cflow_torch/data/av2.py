@@ -95,8 +95,8 @@ class AV2Log(Log):
 
         - `flow_labels/<ns of sweep t>.feather`: if that folder exists, a pair without a file has no truth.
         - `flow_labels.feather`, for the first pair.
-        - `annotations.feather`, by the recipe of av2-api (boxes that hold no point count as absent), for pairs inside
-          the annotated time.
+        - `annotations.feather`, for pairs inside the annotated time. As in av2-api, a box without points
+          counts as absent.
 
         None where the log has no truth, as for its last sweep.
         """

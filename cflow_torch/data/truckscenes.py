@@ -34,10 +34,10 @@ class TruckScenesLog(NuScenesLog):
 
     Args:
         source: the scene, from `find_truckscenes_scenes`.
-        sweep_step: 1 = all sweeps (10 Hz); n = every n-th after each key frame, and every key frame.
+        sweep_step: 1 = all sweeps (10 Hz); n = every key frame, and every n-th sweep after it.
         lidars: channels to merge; None = every LiDAR of the scene (six).
-        own_vehicle: points above it are removed, as are those in a box of `vehicle.ego_trailer` (which is known if
-            there are annotations); None = keep both.
+        own_vehicle: rectangle of the vehicle seen from above. We remove its points, and those in boxes of
+            `vehicle.ego_trailer`, if there are annotations. None = keep both.
         deskew: move each point with the pose that the vehicle had when it was measured; False: with the pose of its
             LiDAR's sweep.
 
@@ -47,8 +47,8 @@ class TruckScenesLog(NuScenesLog):
 
     Convention: points are float32 in the ego frame at the reference's time stamp (x forward, y left, z up, origin on
         the ground). From every other LiDAR we take the sweep closest in time; none if it is more than 60 ms off. Poses
-        are float64 `T_world_ego`, world = UTM, numbers of 1e6 m. Between the reference's sweeps, poses are
-        interpolated. `is_ground` is None: TruckScenes has no ground mask.
+        are float64 `T_world_ego`, world = UTM, with coordinates of some 1e6 m. Between the reference's sweeps, poses
+        are interpolated. `is_ground` is None: TruckScenes has no ground mask.
 
     Raises:
         CFlowError: as `NuScenesLog`.

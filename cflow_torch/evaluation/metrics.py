@@ -27,7 +27,7 @@ _ACCUMULATORS: dict[str, Callable[..., Accumulator]] = {
 
 
 class SceneFlowMetrics:
-    """All metrics of a definition as one accumulator.
+    """Accumulate all metrics of a definition, frame by frame.
 
     Args:
         definition: a name in `DEFINITIONS` ("opensceneflow", "bucketed_scene_flow_eval", "av2", ...) or a
@@ -70,7 +70,10 @@ class SceneFlowMetrics:
         self.num_nan += other.num_nan
 
     def compute(self) -> dict[str, Any]:
-        """Return plain numbers: "definition", `num_frames`, `num_points`, `num_nan`, and a dictionary per metric."""
+        """Return the scores of all frames so far as plain numbers.
+
+        The keys are "definition", `num_frames`, `num_points`, `num_nan`, and one per metric, which has a dictionary.
+        """
         return {
             "definition": self.definition.name,
             "num_frames": self.num_frames,

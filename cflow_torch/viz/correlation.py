@@ -35,7 +35,7 @@ def plot_correlation(window: Window, config: Config | None = None, *, cluster_id
 
     Raises:
         CFlowError: matplotlib is not installed, there is no such cluster, or the method has no such map (key points,
-            HDBSCAN, presets default and fast).
+            HDBSCAN, verified presets).
 
     Source: the paper's figures of one car and of its NCC map; Eq. norm_correlation, displacement_in_bev.
     """

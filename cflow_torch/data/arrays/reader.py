@@ -74,9 +74,8 @@ class ArraysLog(Log):
 
     Convention:
         Sweeps are in the ego frame: points are transformed by `ego_T_lidar` in float64, then rounded to float32. Poses
-            with
-        times of their own (TUM) are interpolated at the times of the sweeps where these are known; otherwise there must
-        be one pose per sweep. The frame should have z up, because the method works in the bird's-eye view.
+        with times of their own (TUM) are interpolated at the times of the sweeps, if these are known. Otherwise there
+        must be one pose per sweep. The frame should have z up, because the method works in the bird's-eye view.
 
     Raises:
         CFlowError: fewer than two clouds, clouds of several suffixes, poses or times that do not fit, or a setting that
