@@ -7,17 +7,34 @@ from torch import Tensor
 
 from cflow_torch.ops.segments import first_of_segment
 
-VOXEL = (0.3, 0.3, 0.9)  # metres; tall, because the beams meet an object at other heights in each sweep
+VOXELS = (0.3, 0.6, 1.2)  # metres; a group of few points shares no small voxel with itself in the next sweep
+_HEIGHT = 3.0  # of a voxel, in sides: the beams meet an object at other heights in each sweep
 
 
 def link(points0: Tensor, group0: Tensor, points1: Tensor, group1: Tensor, min_share: float) -> tuple[Tensor, Tensor]:
-    """Match groups of two sweeps that overlap, one to one.
+    """Match groups of two sweeps that overlap, one to one: in small voxels, and what remains in larger ones.
+
+    Args and Returns: as `link_in_voxels`.
+    """
+    earlier, current = (torch.zeros(0, dtype=torch.int64, device=points0.device) for _ in range(2))
+    for side in VOXELS:
+        rest0, rest1 = ~torch.isin(group0, earlier), ~torch.isin(group1, current)
+        more = link_in_voxels(points0[rest0], group0[rest0], points1[rest1], group1[rest1], min_share, side)
+        earlier, current = torch.cat([earlier, more[0]]), torch.cat([current, more[1]])
+    return earlier, current
+
+
+def link_in_voxels(
+    points0: Tensor, group0: Tensor, points1: Tensor, group1: Tensor, min_share: float, side: float
+) -> tuple[Tensor, Tensor]:
+    """Match groups of two sweeps that share voxels, one to one.
 
     Args:
         points0: (N0, 3) float64, metres: points of the earlier groups, moved to where they should be now.
         group0: (N0,) int64, group of each, from 0.
         points1, group1: (N1, 3) and (N1,), the groups of the current sweep, in the same frame.
         min_share: least overlap of a match: common voxels over the voxels of either group (intersection over union).
+        side: of a voxel, metres.
 
     Returns:
         (K,) int64 earlier groups and (K,) int64 current groups.
@@ -27,7 +44,7 @@ def link(points0: Tensor, group0: Tensor, points1: Tensor, group1: Tensor, min_s
 
     Cost: three sorts of the points, and as many rounds as it takes to match all groups, mostly two or three.
     """
-    voxel0, voxel1 = _voxels(points0, points1)
+    voxel0, voxel1 = _voxels(points0, points1, side)
     own0, size0 = _distinct(group0, voxel0)
     own1, size1 = _distinct(group1, voxel1)
     own1 = own1[:, own1[1].argsort(stable=True)]
@@ -93,10 +110,10 @@ def rotate(x: Tensor, y: Tensor, angle: Tensor) -> tuple[Tensor, Tensor]:
     return cos * x - sin * y, sin * x + cos * y
 
 
-def _voxels(points0: Tensor, points1: Tensor) -> tuple[Tensor, Tensor]:
+def _voxels(points0: Tensor, points1: Tensor, side: float) -> tuple[Tensor, Tensor]:
     """(N0,), (N1,) int64: index of the voxel of each point, shared by both sets."""
     both = torch.cat([points0, points1])
-    voxel = (both / both.new_tensor(VOXEL)).floor().long()
+    voxel = (both / both.new_tensor((side, side, _HEIGHT * side))).floor().long()
     index = torch.unique(voxel, dim=0, return_inverse=True)[1]
     return index[: len(points0)], index[len(points0) :]
 

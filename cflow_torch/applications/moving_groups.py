@@ -61,6 +61,16 @@ class MovingGroups:
         groups = cls(row, point, step, group, cluster[is_large], count[is_large], count)
         return replace(groups, confidence=groups.mean(confidence[row][:, None])[:, 0])
 
+    def divide(self, part: Tensor) -> MovingGroups:
+        """Divide the groups by the index of a part, from 0, of each moving point; parts keep cluster and confidence."""
+        moves = self.group >= 0
+        pairs = torch.stack([self.group[moves], part])
+        (origin, _), index, count = torch.unique(pairs, dim=1, return_inverse=True, return_counts=True)
+        group = self.group.clone()
+        group[moves] = index
+        confidence = self.confidence[origin]
+        return replace(self, group=group, cluster=self.cluster[origin], count=count, confidence=confidence)
+
     def mean(self, values: Tensor) -> Tensor:
         """(G, C) means over the groups, of values (M, C) per point."""
         moves = self.group >= 0

@@ -2,95 +2,25 @@
 
 from __future__ import annotations
 
-from typing import Any, Callable, Iterable, NamedTuple
+from typing import Iterable, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from cflow_torch.applications.kalman import States
-from cflow_torch.applications.linking import box_of_point, boxes, link
-from cflow_torch.applications.moving_groups import MIN_POINTS, MOVING, MovingGroups
+from cflow_torch.applications.association import Matches, divide, match
+from cflow_torch.applications.linking import boxes
+from cflow_torch.applications.moving_groups import MOVING, MovingGroups
+from cflow_torch.applications.track_state import Tracks
 from cflow_torch.applications.track_table import confirmed, join_tables
 from cflow_torch.config import make_config
 from cflow_torch.data.log import CachedLog, Log, window
 from cflow_torch.estimate import make_model
-from cflow_torch.ops.indices import lookup
 from cflow_torch.types import CFlowError, FlowResult, Window
 
-# A track is confirmed by the motion that it has shown: most groups that do not last are noise of the static world.
-_MIN_MOVING = 3  # sweeps
-_MIN_EVIDENCE = 2.0  # sum of the log-odds of its confidence
-_NO_CONFIDENCE = 0.7  # log-odds of a method without confidence
-_THIN = 0.12  # metres; we do not trust narrower boxes: posts, and slices of fronts along which a shadow moves
-_MIN_TRAVEL = 0.5  # metres that its box must have travelled along its flow
-_MIN_TRAVEL_SHARE = 0.5  # of the distance that its flow predicts, which the box must have travelled, too
-_MIN_SHARE = 0.1  # of common voxels, for a match of two groups
-_MIN_STOPPED_SHARE = 0.3  # of a track's points, which must lie in its box for the object to have stopped there
-_MARGIN = 0.2  # metres by which that box is larger
 _MAX_MISSED = 3  # sweeps that a track survives unseen
 _ACCELERATION = 3.0  # m/s², standard deviation
 _BOX_NOISE, _FLOW_NOISE = 0.4, 0.02  # standard deviations: metres of a box's centre, metres per sweep of a group's flow
-
-
-class _Tracks(NamedTuple):
-    """K tracks in the world frame; float64 unless another type is named."""
-
-    id: Tensor  # (K,) int64
-    position: Tensor  # (K, 3) metres, filtered
-    velocity: Tensor  # (K, 3) m/s, filtered
-    covariance: Tensor  # (K, 2, 2) of position and velocity
-    box: Tensor  # (K, 3) centre of the box; after a sweep, predicted for the next one
-    size: Tensor  # (K, 3) length, width, height of the box
-    heading: Tensor  # (K,) radians, of the box
-    begin: Tensor  # (K,) seconds, time of the first sweep
-    start: Tensor  # (K, 3) centre of the box in the first sweep
-    travel: Tensor  # (K, 3) metres, sum of the flow since then
-    confidence: Tensor  # (K,) of the flow when it last moved
-    evidence: Tensor  # (K,) sum of the log-odds of the confidence
-    num_points: Tensor  # (K,) int64
-    num_moving: Tensor  # (K,) int64 sweeps in which it moved
-    missed: Tensor  # (K,) int64 sweeps since it was last seen
-    cluster: Tensor  # (K,) int64 cluster_id, -1 = static
-    is_moving: Tensor  # (K,) bool
-    is_confirmed: Tensor  # (K,) bool
-
-    @classmethod
-    def none(cls, device: torch.device) -> _Tracks:
-        """No tracks."""
-        scalar = torch.zeros(0, dtype=torch.float64, device=device)
-        vector, flag = scalar.new_zeros(0, 3), torch.zeros(0, dtype=torch.bool, device=device)
-        number = torch.zeros(0, dtype=torch.int64, device=device)
-        states = (vector, vector, scalar.new_zeros(0, 2, 2))
-        boxes = (vector, vector, scalar, scalar, vector, vector)
-        return cls(number, *states, *boxes, scalar, scalar, number, number, number, number, flag, flag)
-
-    def map(self, function: Callable[[Tensor], Tensor]) -> _Tracks:
-        """The tracks with a function applied to each tensor."""
-        return _Tracks(*map(function, self))
-
-    def take(self, index: Tensor) -> _Tracks:
-        """The tracks of an index or mask."""
-        return self.map(lambda values: values[index])
-
-    def write(self, index: Tensor, **columns: Any) -> None:
-        """Overwrite columns of the indexed tracks in place."""
-        for name, values in columns.items():
-            getattr(self, name)[index] = values
-
-    def states(self) -> States:
-        """Their filtered states."""
-        return States(self.position, self.velocity, self.covariance)
-
-
-class _Matches(NamedTuple):
-    """Tracks that explain a sweep: track i continues in moving group i, or has stopped."""
-
-    track: Tensor  # (M,) int64
-    group: Tensor  # (M,) int64
-    stopped: Tensor  # (S,) int64 tracks
-    num_points: Tensor  # (S,) int64 points in the boxes of the stopped tracks
-    track_of_static: Tensor  # (P,) int64 for each static point the stopped track whose box holds it, -1 = none
 
 
 class _Times(NamedTuple):
@@ -136,7 +66,7 @@ class Tracker:
         self._interval = sweep_interval
         self._clock: tuple[float, float] | None = None  # time of the last sweep, and of the end of its flow
         self._num_sweeps, self._num_tracks = 0, 0
-        self._tracks = _Tracks.none(torch.device("cpu"))
+        self._tracks = Tracks.none(torch.device("cpu"))
         # Points of the tracks, where the next sweep should have them, and the track of each.
         self._points, self._owner = torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, dtype=torch.int64)
 
@@ -159,7 +89,8 @@ class Tracker:
         times = self._times(sweeps)
         groups = MovingGroups.of(sweeps, result)
         tracks, points, owner = self._predict(groups.point.device, times)
-        matches = _match(tracks, points, owner, groups)
+        groups = divide(groups, tracks)
+        matches = match(tracks, points, owner, groups)
         flow = groups.mean(groups.step)
         tracks, track_of_group = self._update(tracks, groups, flow, matches, times)
 
@@ -198,7 +129,7 @@ class Tracker:
             raise CFlowError(f"a sweep {last - now:.3f} s before the last one: push sweeps in the order of time")
         return _Times(now, interval, now - last, now - due)
 
-    def _predict(self, device: torch.device, times: _Times) -> tuple[_Tracks, Tensor, Tensor]:
+    def _predict(self, device: torch.device, times: _Times) -> tuple[Tracks, Tensor, Tensor]:
         """Tracks, their points and the track of each point, as expected now.
 
         Boxes and points are already where the last flow brings them. If the sweep is late, they move on by velocity.
@@ -210,8 +141,8 @@ class Tracker:
         return tracks._replace(box=tracks.box + times.late * tracks.velocity, **vars(states)), points, owner
 
     def _update(
-        self, tracks: _Tracks, groups: MovingGroups, flow: Tensor, matches: _Matches, times: _Times
-    ) -> tuple[_Tracks, Tensor]:
+        self, tracks: Tracks, groups: MovingGroups, flow: Tensor, matches: Matches, times: _Times
+    ) -> tuple[Tracks, Tensor]:
         """Begin tracks for groups without a match, and update all tracks with this sweep.
 
         Args:
@@ -239,9 +170,10 @@ class Tracker:
         new.id.add_(self._num_tracks + torch.arange(num_new, device=box.device))
         new.covariance.add_(torch.diag(noise**2))
         new.begin.add_(times.now)
-        new = new._replace(start=box[is_new], position=box[is_new], velocity=flow[is_new] / interval)
+        new = new._replace(start=box[is_new], start_length=size[is_new, 0])
+        new = new._replace(position=box[is_new], velocity=flow[is_new] / interval)
         self._num_tracks += num_new
-        tracks = _Tracks(*map(torch.cat, zip(tracks, new)))
+        tracks = Tracks(*map(torch.cat, zip(tracks, new)))
 
         tracks.missed.add_(1)
         tracks.is_moving.fill_(False)
@@ -250,9 +182,8 @@ class Tracker:
         tracks.write(track_of_group, num_points=groups.count, cluster=groups.cluster, confidence=groups.confidence)
         tracks.write(stopped, missed=0, num_points=torch.maximum(matches.num_points, tracks.num_points[stopped]))
         tracks.num_moving[track_of_group] += 1
-        odds = torch.logit(groups.confidence, 0.01).nan_to_num(_NO_CONFIDENCE)
-        tracks.evidence[track_of_group] += odds * (size[:, :2].amin(1) >= _THIN)
-        tracks.is_confirmed.logical_or_(_has_shown_motion(tracks))
+        tracks.add_evidence(track_of_group, groups.confidence)
+        tracks.is_confirmed.logical_or_(tracks.have_shown_motion())
         tracks.travel[track_of_group] += flow  # to the next sweep
 
         measured, step = torch.cat([matches.track, stopped]), torch.zeros_like(tracks.box)
@@ -262,9 +193,9 @@ class Tracker:
         tracks.write(measured, **vars(states))
         return tracks, track_of_group
 
-    def _table(self, tracks: _Tracks, now: float, stamp: int | None) -> dict[str, np.ndarray]:
+    def _table(self, tracks: Tracks, now: float, stamp: int | None) -> dict[str, np.ndarray]:
         seen = tracks.take(tracks.missed == 0).map(lambda values: values.cpu())
-        rows = _Tracks(*(values.numpy() for values in seen))  # type: ignore[arg-type]  # the same fields, as arrays
+        rows = Tracks(*(values.numpy() for values in seen))  # type: ignore[arg-type]  # the same fields, as arrays
         axes = {"": rows.position, "v": rows.velocity}
         columns = {f"{name}{axis}": values[:, k] for name, values in axes.items() for k, axis in enumerate("xyz")}
         return {
@@ -284,7 +215,7 @@ class Tracker:
             "confidence": rows.confidence,
         }
 
-    def _keep(self, tracks: _Tracks, points: Tensor, owner: Tensor) -> None:
+    def _keep(self, tracks: Tracks, points: Tensor, owner: Tensor) -> None:
         """Store the tracks, without those that have not been seen for too long."""
         is_kept = tracks.missed <= _MAX_MISSED
         owner = torch.where(is_kept, is_kept.cumsum(0) - 1, -1)[owner]
@@ -315,8 +246,9 @@ def track(
         `is_moving`: False = it has moved, and is static now;
         `cluster_id`: of this sweep's flow, -1 while it is static; `num_points`;
         `confidence`: of the flow when it last moved, NaN where the method has none;
-        `is_confirmed`: True from the sweep on in which the track has shown enough motion: three sweeps, half a metre,
-        and confidence. Tracks that are never confirmed are left out.
+        `is_confirmed`: True from the sweep on in which the track has shown enough motion: confidence, and a net
+        displacement of both ends of its box that fits the flow, of 0.3 m and a tenth of its length or more. Tracks that
+        are never confirmed are left out.
 
     Raises:
         CFlowError: a sweep cannot be read, or a result does not belong to its sweep.
@@ -334,27 +266,3 @@ def track(
         where = {"sweep": index, "timestamp_ns": int(log.timestamps[index])}
         tables.append({**table, **{name: np.full(len(table["id"]), value) for name, value in where.items()}})
     return confirmed(join_tables(tables))
-
-
-def _match(tracks: _Tracks, points: Tensor, owner: Tensor, groups: MovingGroups) -> _Matches:
-    """Match tracks, with (P, 3) points and the track of each, to the moving groups and static points of a sweep."""
-    moves = groups.group >= 0
-    track, group = link(points, owner, groups.point[moves], groups.group[moves], _MIN_SHARE)
-    may_have_stopped = tracks.is_confirmed.clone()
-    may_have_stopped[track] = False
-    candidate = may_have_stopped.nonzero()[:, 0]
-    static = groups.point[~moves]
-    box = box_of_point(static, tracks.box[candidate], tracks.size[candidate] + _MARGIN, tracks.heading[candidate])
-    count = torch.bincount(box[box >= 0], minlength=len(candidate))
-    has_stopped = count >= (_MIN_STOPPED_SHARE * tracks.num_points[candidate]).clamp(min=MIN_POINTS)
-    track_of_box = torch.where(has_stopped, candidate, -1)
-    track_of_static = lookup(track_of_box, torch.where(box < 0, len(candidate), box), -1)
-    return _Matches(track, group, candidate[has_stopped], count[has_stopped], track_of_static)
-
-
-def _has_shown_motion(tracks: _Tracks) -> Tensor:
-    """(K,) bool: the evidence suffices, and the box has travelled a fair share of what the flow predicts."""
-    predicted = tracks.travel.norm(dim=1)
-    travelled = ((tracks.box - tracks.start) * tracks.travel).sum(1) / predicted.clamp(min=1e-9)
-    has_travelled = tracks.is_moving & (travelled >= (_MIN_TRAVEL_SHARE * predicted).clamp(min=_MIN_TRAVEL))
-    return has_travelled & (tracks.num_moving >= _MIN_MOVING) & (tracks.evidence >= _MIN_EVIDENCE)

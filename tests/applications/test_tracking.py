@@ -11,7 +11,7 @@ from staged_cars import Staged, straight
 
 from cflow_torch import CFlowError, FlowResult, Sweep, Tracker, Window, track
 from cflow_torch.applications.kalman import States
-from cflow_torch.applications.linking import box_of_point, boxes, link
+from cflow_torch.applications.linking import VOXELS, box_of_point, boxes, link
 from cflow_torch.applications.track_table import join_tables, read_tracks, write_tracks
 
 
@@ -91,6 +91,49 @@ def test_flicker_that_goes_nowhere_is_not_a_track() -> None:
     assert len(set(table["id"])) == 1 and np.all(table["x"] > 12)
 
 
+def test_parts_of_a_wall_that_grow_or_jump_are_not_tracks() -> None:
+    class Wall(Staged):
+        """A part of the wall that grows at one end, and one that jumps; both have confident flow along the wall."""
+
+        def result(self, index: int, confidence: float = 0.9) -> FlowResult:
+            result = super().result(index, confidence)
+            x, on_wall = torch.from_numpy(self.world(index)[0][:, 0]), result.cluster_id == 0
+            for number, start, end in ((8, -10, -7 + 0.8 * index), (9, 10 + 3 * index, 12 + 3 * index)):
+                chosen = on_wall & (x >= start) & (x < end)
+                result.cluster_id[chosen] = number
+                result.residual_flow[chosen] = torch.tensor([0.4, 0.0, 0.0])
+            return result
+
+    log = Wall([straight((0, 0), (0.9, 0.0))])
+    table = track(log, log.results())
+    assert len(set(table["id"])) == 1 and np.all(table["y"] < 2)
+
+
+def test_two_cars_in_one_cluster_keep_their_ids() -> None:
+    log = Staged([straight((0, 0), (0.8, 0.0)), straight((0, 2.2), (0.8, 0.0))])
+    results = log.results()
+    for _, result in results[5:7]:
+        result.cluster_id[result.cluster_id == 2] = 1
+    table = track(log, results)
+    assert len(table["id"]) == 22 and len(set(table["id"])) == 2
+    for car in (0, 1):
+        assert len(set(ids_of(log, table, car))) == 1
+    assert np.allclose(table["vx"][table["sweep"] > 5], 8, atol=0.05) and np.allclose(table["width"], 1.4, atol=0.01)
+
+
+def test_a_far_car_of_few_points_has_one_id() -> None:
+    class Sparse(Staged):
+        """Each sweep has some other points of the car."""
+
+        def world(self, index: int) -> Any:
+            kept = np.random.default_rng(index).random(len(super().world(index)[2])) < 0.02
+            return tuple(values[kept] for values in super().world(index))
+
+    log = Sparse([straight((0, 0), (0.9, 0.0), 16)])
+    table = track(log, log.results())
+    assert len(set(table["id"])) == 1 and len(table["id"]) >= 13
+
+
 def test_low_confidence_confirms_no_track_and_missing_confidence_does() -> None:
     log = Staged([straight((0, 0), (0.9, 0.0))])
     unsure = [(index, log.result(index, 0.5)) for index in range(11)]
@@ -141,20 +184,22 @@ def test_matches_equal_those_of_plain_loops() -> None:
     for _ in range(20):
         clouds = [generator.uniform(0, 3, (60, 3)) for _ in range(2)]
         groups = [generator.integers(0, 6, 60) for _ in range(2)]
-        voxels = [
-            [{tuple(v) for v in np.floor(c[g == n] / (0.3, 0.3, 0.9)).astype(int)} for n in range(6)]
-            for c, g in zip(clouds, groups)
-        ]
-        shares = [
-            (-len(a & b) / len(a | b), i, j)
-            for i, a in enumerate(voxels[0])
-            for j, b in enumerate(voxels[1])
-            if a & b and len(a & b) / len(a | b) >= 0.05
-        ]
         expected: dict[int, int] = {}
-        for _, i, j in sorted(shares):
-            if i not in expected and j not in expected.values():
-                expected[i] = j
+        for side in VOXELS:
+            rest = [n for n in range(6) if n not in expected], [n for n in range(6) if n not in expected.values()]
+            voxels = [
+                {n: {tuple(v) for v in np.floor(c[g == n] / (side, side, 3 * side)).astype(int)} for n in numbers}
+                for c, g, numbers in zip(clouds, groups, rest)
+            ]
+            shares = [
+                (-len(a & b) / len(a | b), i, j)
+                for i, a in voxels[0].items()
+                for j, b in voxels[1].items()
+                if a & b and len(a & b) / len(a | b) >= 0.05
+            ]
+            for _, i, j in sorted(shares):
+                if i not in expected and j not in expected.values():
+                    expected[i] = j
         given = [torch.from_numpy(value) for value in (clouds[0], groups[0], clouds[1], groups[1])]
         earlier, later = link(*given, 0.05)
         assert dict(zip(earlier.tolist(), later.tolist())) == expected

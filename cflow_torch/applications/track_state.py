@@ -1,0 +1,85 @@
+"""State of the tracks of a drive."""
+
+from __future__ import annotations
+
+from typing import Any, Callable, NamedTuple
+
+import torch
+from torch import Tensor
+
+from cflow_torch.applications.kalman import States
+
+# A track is confirmed by the motion that it has shown: most groups that do not last are noise of the static world.
+_MIN_EVIDENCE = 2.0  # sum of the log-odds of its confidence
+_NO_CONFIDENCE = 0.7  # log-odds of a method without confidence
+_THIN = 0.12  # metres; we do not trust narrower boxes: posts, and slices of fronts along which a shadow moves
+_MIN_TRAVEL, _MIN_TRAVEL_OF_LENGTH = 0.3, 0.1  # metres, and share of the length of its box: least net displacement
+_TRAVEL_FACTOR = 2.0  # largest factor between the net displacement of its box and that of its flow
+
+
+class Tracks(NamedTuple):
+    """K tracks in the world frame; float64 unless another type is named."""
+
+    id: Tensor  # (K,) int64
+    position: Tensor  # (K, 3) metres, filtered
+    velocity: Tensor  # (K, 3) m/s, filtered
+    covariance: Tensor  # (K, 2, 2) of position and velocity
+    box: Tensor  # (K, 3) centre of the box; after a sweep, predicted for the next one
+    size: Tensor  # (K, 3) length, width, height of the box
+    heading: Tensor  # (K,) radians, of the box
+    begin: Tensor  # (K,) seconds, time of the first sweep
+    start: Tensor  # (K, 3) centre of the box in the first sweep
+    start_length: Tensor  # (K,) length of the box in the first sweep
+    travel: Tensor  # (K, 3) metres, sum of the flow since then
+    confidence: Tensor  # (K,) of the flow when it last moved
+    evidence: Tensor  # (K,) sum of the log-odds of the confidence
+    num_points: Tensor  # (K,) int64
+    num_moving: Tensor  # (K,) int64 sweeps in which it moved
+    missed: Tensor  # (K,) int64 sweeps since it was last seen
+    cluster: Tensor  # (K,) int64 cluster_id, -1 = static
+    is_moving: Tensor  # (K,) bool
+    is_confirmed: Tensor  # (K,) bool
+
+    @classmethod
+    def none(cls, device: torch.device) -> Tracks:
+        """No tracks."""
+        scalar = torch.zeros(0, dtype=torch.float64, device=device)
+        vector, flag = scalar.new_zeros(0, 3), torch.zeros(0, dtype=torch.bool, device=device)
+        number = torch.zeros(0, dtype=torch.int64, device=device)
+        states = (vector, vector, scalar.new_zeros(0, 2, 2))
+        boxes = (vector, vector, scalar, scalar, vector, scalar, vector)
+        return cls(number, *states, *boxes, scalar, scalar, number, number, number, number, flag, flag)
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> Tracks:
+        """The tracks with a function applied to each tensor."""
+        return Tracks(*map(function, self))
+
+    def take(self, index: Tensor) -> Tracks:
+        """The tracks of an index or mask."""
+        return self.map(lambda values: values[index])
+
+    def add_evidence(self, index: Tensor, confidence: Tensor) -> None:
+        """Add the log-odds of the (K,) confidence of this sweep's flow; NaN = the method has none."""
+        odds = torch.logit(confidence, 0.01).nan_to_num(_NO_CONFIDENCE)
+        self.evidence[index] += odds * (self.size[index, :2].amin(1) >= _THIN)
+
+    def write(self, index: Tensor, **columns: Any) -> None:
+        """Overwrite columns of the indexed tracks in place."""
+        for name, values in columns.items():
+            getattr(self, name)[index] = values
+
+    def states(self) -> States:
+        """Their filtered states."""
+        return States(self.position, self.velocity, self.covariance)
+
+    def have_shown_motion(self) -> Tensor:
+        """(K,) bool: the confidence suffices, and both ends of the box have moved about as far as the flow predicts.
+
+        A part of a wall has flow, too, but its box grows, shrinks or jumps.
+        """
+        predicted = self.travel.norm(dim=1)
+        centre = ((self.box - self.start) * self.travel).sum(1) / predicted.clamp(min=1e-9)
+        slower_end = centre - (self.size[:, 0] - self.start_length).abs() / 2
+        least = torch.maximum(_MIN_TRAVEL + _MIN_TRAVEL_OF_LENGTH * self.size[:, 0], predicted / _TRAVEL_FACTOR)
+        has_moved = (slower_end >= least) & (centre <= predicted * _TRAVEL_FACTOR)
+        return self.is_moving & has_moved & (self.evidence >= _MIN_EVIDENCE)
