@@ -2,8 +2,8 @@
 
 Each file has one row per point of sweep t. Columns: flow_t{x,y,z}_m total flow, residual_t{x,y,z}_m motion of objects,
 pose_t{x,y,z}_m ego motion (float32, metres until the next sweep, in the ego frame at t+1), cluster_id, score, is_valid.
-contents=[residual,is_valid] writes only these columns: files are much smaller, and the others follow from the poses.
-contents=[residual,is_valid,confidence] adds the confidence of each point (not with model=paper or keypoints).
+There is also a column confidence, unless model=paper or keypoints. contents=[residual,is_valid] writes only these
+columns: files are much smaller, and the flow and pose follow from the poses.
 
 OUTPUT/config.yaml contains the settings and versions, OUTPUT/reports what was done. Run the command again to resume.
 After Ctrl-C, SIGTERM or SIGHUP the frames in hand are finished. The exit status is 0 if every frame is complete, 1 if
@@ -22,7 +22,7 @@ examples:
   cflow flow engine=ray engine.address=auto ...                   on a Ray cluster
   cflow flow data=av2 data.root=s3://bucket/val output=s3://bucket/flow
   cflow flow data=hdf5 data.root=/data/scenes result_name=cflow
-  cflow flow /data/drive tracks=true 'contents=[residual,cluster_id,is_valid,confidence]'
+  cflow flow /data/drive tracks=true
 """
 
 from __future__ import annotations
@@ -168,16 +168,19 @@ def _check_results(cfg: DictConfig, shard: Shard) -> None:
 
 
 def _contents(cfg: DictConfig, has_confidence: bool) -> tuple[str, ...]:
-    given = list(cfg.contents) if OmegaConf.is_list(cfg.contents) else [cfg.contents]
     allowed = (*CONTENTS, *ON_REQUEST)
+    if cfg.contents == "auto":
+        return allowed if has_confidence else CONTENTS
+    given = list(cfg.contents) if OmegaConf.is_list(cfg.contents) else [cfg.contents]
     if not given or set(given) - set(allowed):
-        raise CFlowError(f"contents={given}: give some of {', '.join(allowed)}")
+        raise CFlowError(f"contents={given}: give auto, or some of {', '.join(allowed)}")
     if "confidence" in given and not has_confidence:
         raise CFlowError(f"contents={given}: only model=default, fast and offline have a confidence")
     if cfg.result_name is not None and not set(given) >= set(CONTENTS):
         raise CFlowError("result_name= reads the flow files: it needs all contents")
-    if cfg.tracks and not set(given) >= _FOR_TRACKS:
-        raise CFlowError(f"tracks=true reads the flow files: contents needs {', '.join(sorted(_FOR_TRACKS))}")
+    needed = _FOR_TRACKS | {"confidence"} if has_confidence else _FOR_TRACKS
+    if cfg.tracks and not set(given) >= needed:
+        raise CFlowError(f"tracks=true reads the flow files: contents needs {', '.join(sorted(needed))}")
     return tuple(name for name in allowed if name in given)
 
 

@@ -9,11 +9,15 @@ import numpy as np
 import pytest
 from command_line import cflow
 
+from cflow_torch import make_config, make_model, track
 from cflow_torch.applications.track_table import read_tracks
+from cflow_torch.data.catalog import find_sources, open_log
+from cflow_torch.data.log import windows
 from cflow_torch.simulator import make_drive
 from cflow_torch.simulator.writers.av2 import write_av2_log
 
 SMALL = "model.point_cloud_range=[-20,-20,-inf,20,20,inf]"
+RANGE = (-20, -20, -float("inf"), 20, 20, float("inf"))
 
 
 def calls_on_a_drive(folder: Path, num_sweeps: int = 4) -> Callable[..., int]:
@@ -29,7 +33,12 @@ def test_resumed_and_sharded_runs_write_the_same_table(tmp_path: Path, capsys: p
     assert call("flow", "whole", *run) == 0
     (file,) = (tmp_path / "whole").glob("*/tracks.parquet")
     whole = read_tracks(file)
-    assert len(whole["id"]) > 5 and set(whole["sweep"]) <= set(range(6))
+    assert len(whole["id"]) > 5 and set(whole["sweep"]) <= set(range(6)) and not np.isnan(whole["confidence"]).any()
+    model, (source,) = make_model(make_config("fast", point_cloud_range=RANGE)), find_sources("av2", tmp_path / "data")
+    log = open_log("av2", source)
+    flow = [model([sweeps])[0] for sweeps in windows(log, model.config.num_history)]
+    expected = track(log, enumerate(flow))
+    assert all(np.array_equal(whole[name], expected[name]) for name in expected)
     for index in (0, 1):
         assert not list((tmp_path / "shards").glob("*/tracks.parquet")), "half of the frames are not a whole log"
         assert call("flow", "shards", *run, f"shard.index={index}", "shard.count=2") == 0
@@ -42,7 +51,8 @@ def test_resumed_and_sharded_runs_write_the_same_table(tmp_path: Path, capsys: p
     assert call("flow", "whole", *run) == 0 and file.read_bytes() == before
     assert call("flow", "whole", *run[:2], "overwrite=true") == 0 and not file.exists(), "tracks of another run"
     capsys.readouterr()
-    assert call("flow", "small", *run, "contents=[residual]") == 2 and "cluster_id" in capsys.readouterr().err
+    assert call("flow", "small", *run, "contents=[residual,cluster_id,is_valid]") == 2
+    assert "contents needs cluster_id, confidence" in capsys.readouterr().err
 
 
 def test_the_viewer_shows_all_tracks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
