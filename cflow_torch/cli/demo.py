@@ -1,7 +1,8 @@
 """Simulates a drive, estimates its flow, scores it and draws it. You need no data.
 
 The drive is written in Argoverse 2's format to outputs/cache and read from there like a real log. OUTPUT (outputs/demo)
-gets <log id>/ with one flow file per pair, flow.png, results.json with the scores, and config.yaml with the settings.
+gets flow.html (a 3-D page for any browser), flow.png, <log id>/ with one flow file per pair, results.json with the
+scores, and config.yaml with the settings.
 
 examples:
   cflow demo
@@ -12,9 +13,11 @@ examples:
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any, Callable
 
 from omegaconf import DictConfig
 
+from cflow_torch.applications.tracking import track
 from cflow_torch.cli import run
 from cflow_torch.cli.record import Scores
 from cflow_torch.data.atomic import ensure_writable, remove_stale
@@ -24,29 +27,28 @@ from cflow_torch.data.names import safe_name
 from cflow_torch.stages import TimedModel
 from cflow_torch.types import CFlowError, FlowResult, Window
 from cflow_torch.viz.bev import plot_flow, save_picture
+from cflow_torch.viz.page import load_k3d, save_page
 from cflow_torch.viz.style import blank_figure
 
 
 def task(cfg: DictConfig) -> None:
     """Run `cflow demo`."""
     output, picture = run.output_folder(cfg), "none"
-    draws = True
-    try:
-        blank_figure((1, 1), 100)
-    except CFlowError as error:  # matplotlib is an extra
-        draws = False
-        print(f"no picture ({error}); flow, scores and settings are written without it")
+    draws = _can("picture", lambda: blank_figure((1, 1), 100))  # matplotlib and k3d are extras
+    shows = _can("page", load_k3d)
     scores = Scores(cfg)
     model = TimedModel(run.make_model(cfg))
     logs, failures = run.open_logs(cfg)
     if logs:
         run.check_pair(cfg.pair, max(logs, key=lambda log: len(log.timestamps)))
     ensure_writable(output)
+    results: list[tuple[int, FlowResult]] = []
 
     def keep(log: Log, index: int, sweeps: Window, result: FlowResult) -> None:
         nonlocal picture
         write_flow(output / safe_name(log.log_id, "the log") / f"{log.timestamps[index]}.feather", result)
         scores.add(log, index, sweeps, result)
+        results.append((index, result))
         if draws and index == cfg.pair:
             picture = _draw(log, model, sweeps, result, output)
 
@@ -55,8 +57,22 @@ def task(cfg: DictConfig) -> None:
     failures += run.for_each_pair(logs, model, keep, lambda log: range(len(log.timestamps) - 1))
     scores.report(output, logs, model.report(), failures)
     print(f"picture: {picture}")
+    if shows and results:
+        page, tracks = output / "flow.html", track(logs[0], results)
+        save_page(logs[0], results, page, tracks=lambda: tracks, preset=run.preset())
+        print(f"3-D page, for any browser: {page}")
     print(f"flow files, scores, settings: {output}")
     run.finish(failures)
+
+
+def _can(name: str, load: Callable[[], Any]) -> bool:
+    """True if the extra for an output is installed. Prints what is left out otherwise."""
+    try:
+        load()
+    except CFlowError as error:
+        print(f"no {name} ({error}); everything else is written")
+        return False
+    return True
 
 
 def _draw(log: Log, model: TimedModel, sweeps: Window, result: FlowResult, output: Path) -> str:

@@ -20,7 +20,7 @@ COMMANDS = {
     "eval": "estimate and score all labelled pairs of a data set",
     "submit": "write and check an archive for a public leaderboard",
     "plot": "draw flow, clusters, key points, correlation, scales or an animation",
-    "view": "write a recording for the rerun viewer",
+    "view": "write a 3-D page for the browser, or a recording for the viewer rerun",
     "stream": "replay a log in real time and measure the latency",
     "clean": "remove dynamic objects from logs, and build static maps",
     "bench": "measure run time and memory on your data",
@@ -36,7 +36,7 @@ HELP = f"""cflow: training-free LiDAR scene flow
 usage: cflow COMMAND [SETTING=VALUE ...]
 
 first steps:
-  cflow demo                    simulate a street and draw its flow: outputs/demo/flow.png
+  cflow demo                    simulate a street and show its flow: outputs/demo/flow.html
   cflow flow /data/av2/val      estimate the flow of your data, one file per pair of sweeps
   cflow eval /data/av2/val      score the flow, if the data has labels
 

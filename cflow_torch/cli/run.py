@@ -74,6 +74,11 @@ def is_sweep() -> bool:
     return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
 
 
+def preset() -> str:
+    """The name of the chosen preset, `model=`."""
+    return str(HydraConfig.get().runtime.choices["model"])
+
+
 def output_folder(cfg: DictConfig) -> Path:
     """The output folder of a run: `cfg.output`, or for a job of a sweep the folder below it that Hydra names.
 

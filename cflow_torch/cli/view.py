@@ -1,28 +1,32 @@
-"""Writes a recording for the rerun viewer per log: OUTPUT/<log id>.rrd. Needs the extra `rerun` (Python 3.9 or newer).
+"""Writes a 3-D page per log, OUTPUT/<log id>.html, that any browser opens without a network. Needs the extra `html`.
 
-A recording shows, along a timeline of sweeps, the points of sweep t coloured by residual flow, an arrow per moving
-cluster, the clusters, sweep t+1, the true flow if the log has labels, and the path of the ego vehicle. flow=FOLDER
-shows the output of `cflow flow` instead of new estimates, and its tracks as boxes with ids. `rerun FILE` opens a
-recording on any machine; show=true does so at the end. OUTPUT/config.yaml contains the settings and versions.
+A page shows, along a timeline of sweeps, the points of sweep t coloured by residual flow, speed, object, confidence
+and, if the log has labels, truth and error; an arrow per moving cluster; boxes, trails, ids and speeds of tracks.
+flow=FOLDER shows the output of `cflow flow`, and its tracks, instead of new estimates. format=rerun writes a recording
+OUTPUT/<log id>.rrd for the viewer rerun instead, with all points and sweep t+1 (extra `rerun`). show=true opens the
+files at the end. OUTPUT/config.yaml contains the settings and versions.
 
 examples:
   cflow view                                                   a simulated street, no data needed
-  cflow view data=av2 data.root=/data/av2/val/LOG              one log
+  cflow view /data/av2/val/LOG                                 one log
   cflow view data=hdf5 data.root=/data/scenes count=20         the first 20 pairs of each scene
   cflow view data.first=2 data.step=2 max_flow=0.5             every second pair; full colour at 0.5 m per sweep
-  cflow view flow=outputs/flow                                 the output of `cflow flow` with the same data= settings
+  cflow view flow=outputs/flow format=rerun                    the output of `cflow flow` with the same data= settings
 """
 
 from __future__ import annotations
 
 import subprocess
 import sys
+import webbrowser
 from pathlib import Path
 from typing import Any, Callable, Iterator
 
+import numpy as np
 from omegaconf import DictConfig
 
-from cflow_torch.applications.track_table import TRACKS_FILE, read_tracks
+from cflow_torch.applications.track_table import TRACKS_FILE, Table, confirmed, join_tables, read_tracks
+from cflow_torch.applications.tracking import Tracker
 from cflow_torch.cli import run
 from cflow_torch.cli.run import Failures
 from cflow_torch.data.atomic import ensure_writable
@@ -30,40 +34,75 @@ from cflow_torch.data.log import CachedLog, Log, window
 from cflow_torch.data.paths import as_path, is_remote
 from cflow_torch.fleet.progress import frames as counted
 from cflow_torch.types import CFlowError, FlowResult
+from cflow_torch.viz.page import load_k3d, save_page
 from cflow_torch.viz.recording import load_rerun, record_log
+
+FORMATS = {"html": ".html", "rerun": ".rrd"}
 
 
 def task(cfg: DictConfig) -> None:
     """Run `cflow view`."""
-    load_rerun()  # fails now if rerun is missing, not after the work
+    if cfg.format not in FORMATS:
+        raise CFlowError(f"format={cfg.format}: give one of {', '.join(FORMATS)}")
+    load_k3d() if cfg.format == "html" else load_rerun()  # fails now if it is missing, not after the work
     output = run.output_folder(cfg)
     if is_remote(output):
-        raise CFlowError(f"output={output}: give a folder of this machine, and copy the recordings from there")
+        raise CFlowError(f"output={output}: give a folder of this machine, and copy the files from there")
     chosen = run.chosen_pairs(cfg, "data.")
-    if cfg.max_flow is None or not 0 < cfg.max_flow < float("inf"):
-        raise CFlowError(f"max_flow={cfg.max_flow}: give a positive length in metres per sweep")
+    for name in ("max_flow", "voxel"):
+        if cfg[name] is None or not 0 < cfg[name] < float("inf"):
+            raise CFlowError(f"{name}={cfg[name]}: give a positive length in metres")
     flow, num_sweeps = _flow(cfg)
     logs, failures = run.open_logs(cfg)
     run.write_config(cfg, ensure_writable(output))
     files: list[Path] = []
     for log in logs:
         recent: Any = CachedLog(log, num_sweeps)
-        file = output / f"{log.log_id}.rrd"
+        file = output / f"{log.log_id}{FORMATS[cfg.format]}"
         with run.collect_failures(failures, log.log_id):
             if file in files:
                 raise CFlowError(f"{file} exists for another log of this name: give a data.root= with one of them")
             results = _results(recent, chosen(log), flow, failures)
-            tracks = None if cfg.flow is None else as_path(cfg.flow) / log.log_id / TRACKS_FILE
-            table = None if tracks is None or not tracks.exists() else read_tracks(tracks)
-            count = record_log(recent, results, file, max_flow=cfg.max_flow, tracks=table)
+            stored = None if cfg.flow is None else as_path(cfg.flow) / log.log_id / TRACKS_FILE
+            table = None if stored is None or not stored.exists() else read_tracks(stored)
+            if cfg.format == "html":
+                count = _save_page(cfg, recent, results, file, table)
+            else:
+                count = record_log(recent, results, file, max_flow=cfg.max_flow, tracks=table)
             files.append(file)
             print(f"{file}: {count} pair{'' if count == 1 else 's'}, {file.stat().st_size / 1e6:,.1f} MB")
     if files and not cfg.show:
-        print(f"open it with: rerun {files[0]}")
-    if files and cfg.show:  # the viewer outlives this command; without --bind it accepts data from anywhere
+        print(f"open it with: {'any browser' if cfg.format == 'html' else f'rerun {files[0]}'}")
+    if files and cfg.show and cfg.format == "html":
+        for file in files:
+            webbrowser.open(file.resolve().as_uri())
+    elif files and cfg.show:  # the viewer outlives this command; without --bind it accepts data from anywhere
         command = [sys.executable, "-m", "rerun", "--bind", "127.0.0.1", *map(str, files)]
         subprocess.Popen(command, start_new_session=True)
     run.finish(failures)
+
+
+def _save_page(
+    cfg: DictConfig, log: Log, results: Iterator[tuple[int, FlowResult]], file: Path, table: Table | None
+) -> int:
+    """Save a page. Without a table of tracks, the results are tracked as they arrive."""
+    tracker, tables = Tracker(), []
+
+    def tracked() -> Iterator[tuple[int, FlowResult]]:
+        for index, result in results:
+            rows = tracker.push(window(log, index), result).table
+            tables.append({**rows, "sweep": np.full(len(rows["id"]), index)})
+            yield index, result
+
+    return save_page(
+        log,
+        results if table is not None else tracked(),
+        file,
+        tracks=lambda: confirmed(join_tables(tables)) if table is None else table,
+        preset=run.preset() if cfg.flow is None else None,
+        max_flow=cfg.max_flow,
+        voxel=cfg.voxel,
+    )
 
 
 def _flow(cfg: DictConfig) -> tuple[Callable[[Log, int], FlowResult], int]:
@@ -87,7 +126,7 @@ def _results(
     for index in counted(pairs, log.log_id):
         result = None
         with run.collect_failures(failures, f"{log.log_id}/{log.timestamps[index]}"):
-            window(log, index)  # reads both sweeps, which the recording needs
+            window(log, index)  # reads both sweeps, which the file needs
             log.labels(index)
             result = flow(log, index)
         if result is not None:

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Any, Iterable, Mapping
 import numpy as np
 
 from cflow_torch.data.atomic import atomic_name
-from cflow_torch.data.log import FlowLabels, Log
+from cflow_torch.data.log import Log
 from cflow_torch.types import CFlowError, FlowResult, Sweep, as_numpy
 from cflow_torch.viz.clusters import cluster_colors
-from cflow_torch.viz.panel import ARROW_STEPS, MIN_ARROW_POINTS, MOVING, group_medians
+from cflow_torch.viz.panel import ARROW_STEPS, MOVING
+from cflow_torch.viz.scene import EGO_OUTLINE, MAX_FLOW, Scene, ViewerFrame
 from cflow_torch.viz.wheel import flow_to_rgb
 
 if TYPE_CHECKING:
@@ -23,7 +24,6 @@ ESTIMATE, TRUTH = f"{EGO}/lidar/cflow", f"{EGO}/lidar/ground_truth"
 CLUSTERS, ARROWS = f"{EGO}/lidar/clusters", f"{EGO}/arrows"
 TRACKS = "world/tracks"
 GROUND, NEXT_SWEEP = f"{EGO}/lidar/ground", f"{EGO}/lidar/next_sweep"
-MAX_FLOW = 1.5  # metres per sweep: 15 m/s at 10 Hz
 _DOT, _FINE_DOT = -1.5, -0.8  # negative radii are pixels of the screen
 _STATIC, _GROUND_COLOR, _NEXT_COLOR = (132, 138, 147), (70, 74, 81), (60, 110, 130)
 _EGO_COLOR = (255, 255, 255)
@@ -81,7 +81,8 @@ def record_log(
         try:
             drive = _Drive(rr, stream, max_flow)
             for i, result in results:
-                drive.add(i, log.sweep(i), log.sweep(i + 1), result, log.labels(i))
+                pc0, pc1 = log.sweep(i), log.sweep(i + 1)
+                drive.add(Scene.of(i, pc0, pc1, result, log.labels(i)), pc1)
                 if tracks is not None:
                     drive.add_tracks({name: values[tracks["sweep"] == i] for name, values in tracks.items()})
             drive.end(log.log_id)
@@ -117,47 +118,33 @@ class _Drive:
         self.rr, self.stream, self.max_flow = rr, stream, max_flow
         self.count = 0
         self.has_truth = False
-        self.first_pose: np.ndarray | None = None
+        self.frame = ViewerFrame()
         self.trajectory: list[np.ndarray] = []
 
-    def add(self, index: int, pc0: Sweep, pc1: Sweep, result: FlowResult, labels: FlowLabels | None) -> None:
-        """Log one pair."""
-        rr = self.rr
-        points, rows = as_numpy(pc0.points, np.float64)[:, :3], len(result.residual_flow)
-        if rows != len(points):
-            raise CFlowError(f"pair {index}: the flow has {rows} rows, its sweep {len(points)} points")
-        residual, pose_flow = as_numpy(result.residual_flow, np.float64), as_numpy(result.pose_flow, np.float64)
-        cluster = as_numpy(result.cluster_id)
-        position = points + pose_flow
-        ground = np.zeros(rows, bool) if pc0.is_ground is None else as_numpy(pc0.is_ground).astype(bool)
-        is_known = np.isfinite(position).all(axis=1)
-        shown = is_known & ~ground
-
-        self._set_time(index, pc0.timestamp_ns)
-        self._move(pc1.pose)
-        self._points(ESTIMATE, position[shown], self._color(residual[shown]))
-        self._points(CLUSTERS, position[shown], cluster_colors(position[shown], cluster[shown], _NO_CLUSTER))
-        self._points(GROUND, position[is_known & ground], _GROUND_COLOR, _FINE_DOT)
+    def add(self, scene: Scene, pc1: Sweep) -> None:
+        """Log one pair. Args: pc1: sweep t+1."""
+        rr, position, is_ground = self.rr, scene.position, scene.is_ground
+        shown = position[~is_ground]
+        self._set_time(scene.index, scene.timestamp_ns)
+        self._move(scene.pose)
+        self._points(ESTIMATE, shown, self._color(scene.residual[~is_ground]))
+        self._points(CLUSTERS, shown, cluster_colors(shown, scene.cluster[~is_ground], _NO_CLUSTER))
+        self._points(GROUND, position[is_ground], _GROUND_COLOR, _FINE_DOT)
         after = as_numpy(pc1.points)[:, :3]
         self._points(NEXT_SWEEP, after[np.isfinite(after).all(axis=1)], _NEXT_COLOR, _FINE_DOT)
-        if labels is not None or self.has_truth:  # no points clear the truth of an earlier pair
+        if scene.truth is not None or self.has_truth:  # no points clear the truth of an earlier pair
             self.has_truth = True
-            flow = np.full((rows, 3), np.nan) if labels is None else labels.flow - pose_flow
-            has = shown & np.isfinite(flow).all(axis=1) & (labels is not None and labels.is_valid)
-            self._points(TRUTH, position[has], self._color(flow[has]))
+            truth = np.full_like(position, np.nan) if scene.truth is None else scene.truth
+            has = ~is_ground & np.isfinite(truth).all(axis=1)
+            self._points(TRUTH, position[has], self._color(truth[has]))
 
-        moving = shown & (np.linalg.norm(residual, axis=1) > MOVING)
-        columns = np.concatenate([position[moving], residual[moving]], axis=1)
-        numbers, middle, count = group_medians(cluster[moving], columns)
-        large = count >= MIN_ARROW_POINTS
-        start, vector = middle[large, :3], middle[large, 3:]
-        names = [f"cluster {n}: {np.linalg.norm(v):.2f} m per sweep" for n, v in zip(numbers[large], vector)]
+        numbers, start, vector = scene.arrows()
         arrows = rr.Arrows3D(
             origins=start,
             vectors=ARROW_STEPS * vector,
             colors=flow_to_rgb(vector, self.max_flow),
             radii=0.12,
-            labels=names,
+            labels=[f"cluster {n}: {np.linalg.norm(v):.2f} m per sweep" for n, v in zip(numbers, vector)],
             show_labels=False,
         )
         self.stream.log(ARROWS, arrows, strict=True)
@@ -165,9 +152,7 @@ class _Drive:
 
     def add_tracks(self, rows: Mapping[str, np.ndarray]) -> None:
         """Log the boxes of the last pair, at sweep t, in the world."""
-        T_shown_world = np.eye(4) if self.first_pose is None else np.linalg.inv(self.first_pose)
-        centre = np.stack([rows[axis] for axis in "xyz"], 1) @ T_shown_world[:3, :3].T + T_shown_world[:3, 3]
-        heading = rows["heading"] + np.arctan2(T_shown_world[1, 0], T_shown_world[0, 0])
+        centre, heading = self.frame.boxes(rows)
         rotation = np.zeros((len(heading), 4))  # quaternions x, y, z, w
         rotation[:, 2], rotation[:, 3] = np.sin(heading / 2), np.cos(heading / 2)
         boxes = self.rr.Boxes3D(
@@ -185,7 +170,7 @@ class _Drive:
             raise CFlowError(f"{log_id}: there is no pair to record")
         rr = self.rr
         self.stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True, strict=True)
-        outline = [(2.4, 0, 0), (-1.9, 1.15, 0), (-1.0, 0, 0), (-1.9, -1.15, 0), (2.4, 0, 0)]  # as in `panel`
+        outline = np.pad(EGO_OUTLINE + EGO_OUTLINE[:1], ((0, 0), (0, 1)))
         vehicle = rr.LineStrips3D([outline], colors=_EGO_COLOR, radii=0.05)
         self.stream.log(f"{EGO}/outline", vehicle, static=True, strict=True)
         if len(self.trajectory) > 1:
@@ -201,13 +186,10 @@ class _Drive:
             self.stream.set_time("time", duration=np.timedelta64(int(timestamp_ns), "ns"))
 
     def _move(self, pose: Any) -> None:
-        """Log the ego frame of t+1 in the world. The origin must be near, because the viewer uses float32."""
+        """Log the ego frame of t+1."""
         if pose is None:
             return
-        T_world_ego = as_numpy(pose, np.float64)
-        if self.first_pose is None:
-            self.first_pose = T_world_ego
-        moved = np.linalg.solve(self.first_pose, T_world_ego)
+        moved = self.frame.move(pose)
         self.trajectory.append(moved[:3, 3])
         transform = self.rr.Transform3D(translation=moved[:3, 3], mat3x3=moved[:3, :3])
         self.stream.log(EGO, transform, strict=True)

@@ -1,0 +1,113 @@
+"""What the viewers show of a pair of sweeps: `recording` and `page` draw the same points, arrows and boxes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Mapping
+
+import numpy as np
+
+from cflow_torch.data.log import FlowLabels
+from cflow_torch.types import CFlowError, FlowResult, Sweep, as_numpy
+from cflow_torch.viz.panel import MIN_ARROW_POINTS, MOVING, group_medians
+from cflow_torch.viz.style import SWEEP_RATE
+
+MAX_FLOW = 1.5  # metres per sweep: 15 m/s at 10 Hz
+EGO_OUTLINE = ((2.4, 0.0), (-1.9, 1.15), (-1.0, 0.0), (-1.9, -1.15))  # metres, as in `panel`
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One pair, without points at infinity.
+
+    Args:
+        index: of sweep t.
+        timestamp_ns: of sweep t, None = unknown.
+        interval: seconds from t to t+1.
+        position: (N, 3) float64, metres, points of t in the ego frame of t+1: moved by the ego motion only.
+        residual: (N, 3) float64, metres per sweep.
+        truth: (N, 3) float64, true residual flow, NaN where unknown; None = the pair has no labels.
+        cluster: (N,) int64, -1 = none.
+        confidence: (N,) float64, or None.
+        is_ground: (N,) bool.
+        pose: (4, 4) float64 `T_world_ego` of t+1, or None.
+    """
+
+    index: int
+    timestamp_ns: int | None
+    interval: float
+    position: np.ndarray
+    residual: np.ndarray
+    truth: np.ndarray | None
+    cluster: np.ndarray
+    confidence: np.ndarray | None
+    is_ground: np.ndarray
+    pose: np.ndarray | None
+
+    @classmethod
+    def of(cls, index: int, pc0: Sweep, pc1: Sweep, result: FlowResult, labels: FlowLabels | None) -> Scene:
+        """Gather the scene of sweeps t and t+1, a flow and, if there are any, labels.
+
+        Raises:
+            CFlowError: the flow and the sweep differ in length.
+        """
+        points, rows = as_numpy(pc0.points, np.float64)[:, :3], len(result.residual_flow)
+        if rows != len(points):
+            raise CFlowError(f"pair {index}: the flow has {rows} rows, its sweep {len(points)} points")
+        pose_flow = as_numpy(result.pose_flow, np.float64)
+        position = points + pose_flow
+        kept = np.isfinite(position).all(axis=1)
+        ground = np.zeros(rows, bool) if pc0.is_ground is None else as_numpy(pc0.is_ground).astype(bool)
+        truth, times = None, (pc0.timestamp_ns, pc1.timestamp_ns)
+        if labels is not None:
+            truth = np.where(as_numpy(labels.is_valid)[:, None], as_numpy(labels.flow) - pose_flow, np.nan)[kept]
+        return cls(
+            index=index,
+            timestamp_ns=times[0],
+            interval=_interval(*times),
+            position=position[kept],
+            residual=as_numpy(result.residual_flow, np.float64)[kept],
+            truth=truth,
+            cluster=as_numpy(result.cluster_id)[kept],
+            confidence=None if result.confidence is None else as_numpy(result.confidence, np.float64)[kept],
+            is_ground=ground[kept],
+            pose=None if pc1.pose is None else as_numpy(pc1.pose, np.float64),
+        )
+
+    def arrows(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Motion of each cluster with enough moving points.
+
+        Returns:
+            cluster_id: (A,) int64, ascending.
+            start: (A, 3) float64, metres, median of its moving points.
+            flow: (A, 3) float64, metres per sweep, median of their residual flow.
+        """
+        moving = ~self.is_ground & (np.linalg.norm(self.residual, axis=1) > MOVING)
+        columns = np.concatenate([self.position[moving], self.residual[moving]], axis=1)
+        cluster, middle, count = group_medians(self.cluster[moving], columns)
+        large = count >= MIN_ARROW_POINTS
+        return cluster[large], middle[large, :3], middle[large, 3:]
+
+
+def _interval(begin: int | None, end: int | None) -> float:
+    return 1 / SWEEP_RATE if begin is None or end is None or end <= begin else (end - begin) * 1e-9
+
+
+class ViewerFrame:
+    """The frame of a viewer: the ego vehicle at the end of the first pair with a pose. Viewers use float32, so the
+    origin must be near."""
+
+    def __init__(self) -> None:
+        self.T_world_viewer: np.ndarray | None = None
+
+    def move(self, pose: np.ndarray) -> np.ndarray:
+        """(4, 4) `T_viewer_ego` of a pose `T_world_ego`."""
+        if self.T_world_viewer is None:
+            self.T_world_viewer = pose
+        return np.linalg.solve(self.T_world_viewer, pose)
+
+    def boxes(self, tracks: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+        """Centres (K, 3), metres, and headings (K,), radians, of rows of a table of `cflow_torch.track`."""
+        T_viewer_world = np.eye(4) if self.T_world_viewer is None else np.linalg.inv(self.T_world_viewer)
+        centre = np.stack([tracks[axis] for axis in "xyz"], 1) @ T_viewer_world[:3, :3].T + T_viewer_world[:3, 3]
+        return centre, tracks["heading"] + np.arctan2(T_viewer_world[1, 0], T_viewer_world[0, 0])
