@@ -1,4 +1,4 @@
-"""Replacements of the compiled, CUDA-only parts of OpenSceneFlow, so that its unmodified files run on a CPU.
+"""Replacements of compiled packages that OpenSceneFlow imports, so that its unmodified files run on a CPU.
 
 A module gets a replacement only if it cannot be imported. We wrote the replacements from the documented behaviour of
 the originals; tests/scripts/test_opensceneflow_cpu.py compares them with dense loops. Nearest neighbours come from a
@@ -145,6 +145,31 @@ def euler_angles(matrix: Tensor, convention: str) -> Tensor:
     return torch.stack([yaw, middle, roll], 1)
 
 
+# ------------------------------------------------------------------------------------------------ FastGeodis
+
+
+def distance_transform(
+    image: Tensor, mask: Tensor, spacing: Any, largest: float, weight: float, iterations: int
+) -> Tensor:
+    """Compute the Euclidean distance to the nearest cell where the mask is 0; FastGeodis approximates it by passes.
+
+    Args:
+        image: ignored, because its weight must be 0.
+        mask: (1, 1, X, Y, Z) float32.
+        spacing: metres, size of a cell in x, y, z.
+        largest, iterations: ignored.
+        weight: of the differences of the image.
+
+    Returns:
+        (1, 1, X, Y, Z) float32 metres.
+    """
+    from scipy.ndimage import distance_transform_edt
+
+    if weight != 0:
+        raise NotImplementedError("this replacement computes distances without an image")
+    return torch.from_numpy(distance_transform_edt(mask[0, 0].numpy() != 0, spacing)).float()[None, None]
+
+
 # ------------------------------------------------------------------------------------------------ modules
 
 
@@ -168,6 +193,7 @@ REPLACEMENTS: dict[str, dict[str, Any]] = {  # module -> what the harness import
     "fire": {},
     "chamfer3D": {"forward": chamfer, "backward": chamfer_gradient},
     "hist": {"hist": histogram},
+    "FastGeodis": {"generalised_geodesic3d": distance_transform},
     "mmcv": dict.fromkeys(_VOXELS, _not_available),
     "pytorch3d": {},
     "pytorch3d.transforms": {"matrix_to_euler_angles": euler_angles},

@@ -7,7 +7,6 @@
 
   pip install open3d-cpu hdbscan scipy h5py                             # `nearest`, `clusters`
   pip install dztimer lightning torchmetrics tabulate                   # OpenSceneFlow's models, also the above
-  pip install --no-build-isolation FastGeodis==1.0.4                    # its FastNSF; compiles
 
 Methods: presets of this package; `zero`; `nearest` (the nearest point of the next sweep); `clusters` (HDBSCAN, and
 Open3D's ICP for each cluster); `icpflow`, `nsfp`, `fastnsf` of a checkout of OpenSceneFlow (848bf86) with the settings

@@ -80,3 +80,13 @@ def test_angles_of_a_rotation(cpu: Any) -> None:
 def test_weighted_mean(cpu: Any) -> None:
     x, weight = torch.arange(12.0).reshape(2, 2, 3), torch.tensor([[1, 3], [0, 0]])
     assert cpu.weighted_mean(x, weight).tolist() == [[[2.25, 3.25, 4.25]], [[0, 0, 0]]]
+
+
+def test_distance_to_the_nearest_occupied_cell(cpu: Any) -> None:
+    mask = torch.ones(1, 1, 7, 5, 4)
+    occupied, spacing = torch.tensor([[0, 1, 2], [6, 4, 0], [3, 3, 3]]), torch.tensor([0.5, 0.25, 1.0])
+    mask[(0, 0, *occupied.T)] = 0
+    cells = torch.cartesian_prod(*(torch.arange(size) for size in mask.shape[2:]))
+    dense = ((cells[:, None] - occupied[None]) * spacing).square().sum(2).min(1).values.sqrt()
+    found = cpu.distance_transform(torch.zeros_like(mask), mask, spacing.tolist(), 1e10, 0.0, 1)
+    torch.testing.assert_close(found.reshape(-1), dense)
