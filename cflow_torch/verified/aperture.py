@@ -1,9 +1,9 @@
 """The aperture problem: long thin things that seem to slide along themselves, and long vehicles that really do.
 
 Walls, hedges and guard rails are sampled by a sensor that moves, so their samples seem to move with it, along the line.
-If t+1 sees something all along where the line was, or the older sweeps all along where it is, the line itself is
-static: one end of it may come into sight or leave it. A car seen from its side is a line as well, but its rear leaves
-the old place, and its front comes to a new one.
+If t+1 has most of the line where it was, or the older sweeps have most of it where it is, the line itself is static:
+one end of it may come into sight or leave it. A car seen from its side is a line as well, but its rear leaves the old
+position, and its front comes to a new one.
 
 What is longer than other objects moves only if both of its ends do, as those of a tram. The ends of a wall do not: one
 stays, or each goes where the view of it ends. The ends of a guard rail may keep pace with the ego vehicle, since its
@@ -17,7 +17,7 @@ import math
 import torch
 from torch import Tensor
 
-from cflow_torch.ops.indices import flat_nonzero, floor_divide, gather, renumber, scatter_count, split_index
+from cflow_torch.ops.indices import flat_nonzero, gather, renumber, scatter_count
 from cflow_torch.verified.height_slices import HeightSlicedSweeps, Pixels, count_slices
 
 # A line: largest standard deviation across and smallest along, metres.
@@ -26,39 +26,38 @@ _THIN, _LONG = 0.3, 1.0
 _ALONG = 0.04
 # Shorter displacements than this over the window, metres, tell nothing.
 _LEAST_TRAVEL = 1.2
-# Side of the cells in which other sweeps are compared, metres, and the share that must hold something, per cent.
-_CELL, _COVERED = 0.4, 88
 # The displacements of two ends that move together differ by at most this share of their sum.
 _ALIKE = 0.1
 # Height slices in a pixel at t+1, on average: guard rails have one or, across a slice's border, two.
 _TALL = 2
 
 
-def slides_along_itself(sweeps: HeightSlicedSweeps, members: Pixels, owner: Tensor, candidates: Tensor) -> Tensor:
+def slides_along_itself(
+    sweeps: HeightSlicedSweeps, members: Pixels, component: Tensor, candidates: Tensor, is_covered: Tensor
+) -> Tensor:
     """Find the motions that a static line explains.
 
     Args:
         sweeps: images of all windows.
         members: K pixels of components.
-        owner: (K,) int64, component of each of them.
+        component: (K,) int64, of each of them.
         candidates: (A, C, 2) float64 (y, x), fine pixels per sweep interval.
+        is_covered: (A,) bool, other sweeps have most of the component where it is, as `Wins` says.
 
     Returns:
-        (A, C) bool: the component is a line at t+1, the motion points along it and leads at least 1.2 m over the
-        window, and at least 88 % of comparisons find something at the same place: of those from its pixels at t+1 with
-        every other sweep, or of those from its older pixels with t+1.
+        (A, C) bool: the component is covered and a line at t+1, and the motion points along it and leads at least 1.2 m
+        over the window.
 
     Convention:
         Moments are sums of integers, everything else elementwise float64 in the written order. Standard deviations are
-        those of the pixels' places, at most 0.3 m across and at least 1 m along. "The same place" is a cell of about
-        0.4 m (whole pixels) and its eight neighbours. Zero motion never slides.
+        those of the positions of the pixels, at most 0.3 m across and at least 1 m along. Zero motion never slides.
 
-    Cost: some passes over the pixels; nine lookups for each comparison of the few components that are suspect.
+    Cost: some passes over the pixels.
     Source: the aperture problem; not in the paper.
     """
     count, pixel_size = len(candidates), sweeps.grid.pixel_size
     newest = flat_nonzero(members.step == 0)
-    component, row, col, window = gather(newest, owner, members.row, members.col, members.window)
+    component, row, col, window = gather(newest, component, members.row, members.col, members.window)
     is_line, axis_y, axis_x = principal_axes(component, row, col, count, pixel_size)
 
     # Its window, of each component; those without pixels at t+1 are no lines.
@@ -68,12 +67,8 @@ def slides_along_itself(sweeps: HeightSlicedSweeps, members: Pixels, owner: Tens
     across = axis_y[:, None] * x - axis_x[:, None] * y
     square = y * y + x * x
     length = (axis_y * axis_y + axis_x * axis_x)[:, None]
-    suspect = is_line[:, None] & (across * across <= _ALONG * square * length)
-    suspect &= square * (intervals * intervals) >= (_LEAST_TRAVEL / pixel_size) ** 2
-    asked = flat_nonzero(suspect.any(1).index_select(0, owner))
-    if asked.numel() == 0:
-        return suspect
-    return suspect & _is_covered(sweeps, members.take(asked), owner.index_select(0, asked), count)[:, None]
+    slides = (is_line & is_covered)[:, None] & (across * across <= _ALONG * square * length)
+    return slides & (square * (intervals * intervals) >= (_LEAST_TRAVEL / pixel_size) ** 2)
 
 
 def principal_axes(
@@ -98,38 +93,6 @@ def principal_axes(
     is_line = (small <= (_THIN / pixel_size) ** 2) & (large >= (_LONG / pixel_size) ** 2)
     is_wide = var_y < var_x
     return is_line, torch.where(is_wide, cov, large - var_x), torch.where(is_wide, large - var_y, cov)
-
-
-def _is_covered(sweeps: HeightSlicedSweeps, members: Pixels, owner: Tensor, count: int) -> Tensor:
-    """(A,) bool: of the comparisons of a component forward or backward in time enough find something.
-
-    Args:
-        members, owner: K pixels of the components that are asked for; the answer of others is False.
-    """
-    num_steps, grid, pixels = sweeps.num_steps, sweeps.grid, sweeps.pixels
-    side = max(1, round(_CELL / grid.pixel_size))
-    # A free margin all around: neighbours need no bounds check.
-    height, width = -(-grid.height // side) + 2, -(-grid.width // side) + 2
-
-    def cell(of: Pixels, step: Tensor) -> Tensor:
-        place = torch.add(floor_divide(of.row, side), torch.add(step, of.window, alpha=num_steps), alpha=height)
-        return torch.add(floor_divide(of.col, side), place, alpha=width).add_(width + 1)
-
-    size = sweeps.batch.num_windows * num_steps * height * width
-    is_occupied = torch.zeros(size, dtype=torch.bool, device=owner.device)
-    is_occupied.index_fill_(0, cell(pixels, pixels.step), True)
-    # From t+1 to all other sweeps of the window, from those to t+1.
-    every = torch.arange(num_steps, device=owner.device)
-    given = (sweeps.elapsed != 0).index_select(0, members.window)
-    others = torch.where((members.step == 0)[:, None], given, every == 0)
-    member, step = split_index(flat_nonzero(others), num_steps)
-    where, owner = cell(members.take(member), step), owner.index_select(0, member)
-    line = torch.arange(-1, 2, device=owner.device)
-    near = (line[:, None] * width + line).view(-1)
-    finds = is_occupied.index_select(0, (where[:, None] + near).view(-1)).view(-1, len(near)).any(1)
-    tally = scatter_count(owner * 2 + (step == 0), 2 * count, 1 + (finds.long() << 32))
-    total, found = tally & 0xFFFFFFFF, tally >> 32
-    return ((total > 0) & (found * 100 >= total * _COVERED)).view(-1, 2).any(1)
 
 
 def both_ends_move(sweeps: HeightSlicedSweeps, roots: Tensor, is_long: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Changed pixels: what is not found in place in another sweep, although that sweep saw the place.
+"""Changed pixels: what is not found in place in another sweep, although that sweep saw the position.
 
 Near objects cast shadows on the background, and when the sensor moves, the shadows move as well. So a slice
 that is missing counts only where the other sweep saw through: a return in the same direction is at least as far away.
@@ -7,14 +7,12 @@ that is missing counts only where the other sweep saw through: a return in the s
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.ops.chunks import chunks
-from cflow_torch.ops.indices import flat_nonzero, floor_divide, gather, split_index
+from cflow_torch.ops.indices import flat_nonzero, floor_divide, gather, scatter_count, split_index
 from cflow_torch.verified.height_slices import NUM_SLICES, SLICE_HEIGHT, HeightSlicedSweeps, slice_bits
 
 # Range images: bins of about half a degree around, and of one degree up and down, half of them below level.
@@ -22,48 +20,33 @@ _AZIMUTHS, _ELEVATIONS, _RISE = 720, 120, 1 / 57.3
 # Sweeps do not tell where the sensor is. We guess: over the origin of the ego frame, so high above the lowest points
 # within 12 m; one near point of fifty may lie lower.
 _ABOVE_LOWEST, _NEAR, _OUTLIERS = 1.6, 12.0, 50
+_PER_METRE, _HIGHEST = 256, 8192  # steps of height, and the largest number of them, up and down
 
 
-class ChangedPixels(NamedTuple):
-    """What P pixels show of change; all False in windows without history, where one other sweep would decide.
-
-    Args:
-        is_missing: (P,) bool, a slice is missing in another sweep, and not hidden there.
-        has_changed: (P,) bool, a slice is missing in another sweep that saw its place.
-    """
-
-    is_missing: Tensor
-    has_changed: Tensor
-
-
-def find_changed(sweeps: HeightSlicedSweeps) -> ChangedPixels:
-    """Compare every pixel in place with every other sweep of its window.
+def find_changed(sweeps: HeightSlicedSweeps) -> Tensor:
+    """(P,) bool: a slice of the pixel is missing in another sweep of its window that saw its position.
 
     Convention:
-        A slice is missing if none of the 3 x 3 pixels around its place has it. Its height is that of its middle, the
-        first at or above the lowest point of its pixel. A sweep saw a place if a return in its direction is at least as
-        far away; the place is hidden if all returns there are nearer; if there is none, nobody knows.
+        All False in windows without history, where one other sweep would decide. A slice is missing if none of the
+        3 x 3 pixels around its position has it. Its height is that of its middle, the first at or above the lowest
+        point of its pixel. A sweep saw a position if a return in its direction is at least as far away.
 
     Cost: a lookup for each pixel and sweep, and a range image of every sweep.
     """
     pixels, num_steps = sweeps.pixels, sweeps.num_steps
-    nothing = torch.zeros_like(pixels.slices, dtype=torch.bool)
+    has_changed = torch.zeros_like(pixels.slices, dtype=torch.bool)
     if num_steps == 2:
-        return ChangedPixels(nothing, nothing)
-    every, area = torch.arange(num_steps, device=nothing.device), sweeps.grid.height * sweeps.grid.width
-    place = torch.add((pixels.index - pixels.step * area)[:, None], every, alpha=area)
-    around = sweeps.image.index_select(0, place.view(-1)).view_as(place) >> NUM_SLICES
+        return has_changed
+    every, area = torch.arange(num_steps, device=has_changed.device), sweeps.grid.height * sweeps.grid.width
+    index = torch.add((pixels.index - pixels.step * area)[:, None], every, alpha=area)
+    around = sweeps.image.index_select(0, index.view(-1)).view_as(index) >> NUM_SLICES
     is_given = ((sweeps.elapsed != 0) | (every == 0)) & sweeps.has_history[:, None]
     missing = (pixels.slices[:, None] & ~around).mul_(is_given.index_select(0, pixels.window))
     comparison, bit = _bits(missing)
     pixel, step = split_index(comparison, num_steps)
-    image = pixels.window.index_select(0, pixel) * num_steps + step
-    farther = RangeImages(sweeps).farther(image, *_centre(sweeps, pixel, bit))
-    is_missing, has_changed = (
-        nothing.index_fill(0, pixel.index_select(0, flat_nonzero(of)), True)
-        for of in ((farther >= 0) | farther.isinf(), farther >= 0)
-    )
-    return ChangedPixels(is_missing, has_changed)
+    sweep = pixels.window.index_select(0, pixel) * num_steps + step
+    is_seen = RangeImages(sweeps).farther(sweep, *_centre(sweeps, pixel, bit)) >= 0
+    return has_changed.index_fill_(0, pixel.index_select(0, flat_nonzero(is_seen)), True)
 
 
 def _bits(missing: Tensor) -> tuple[Tensor, Tensor]:
@@ -73,12 +56,12 @@ def _bits(missing: Tensor) -> tuple[Tensor, Tensor]:
     return some.index_select(0, entry), bit
 
 
-def _centre(sweeps: HeightSlicedSweeps, pixel: Tensor, part: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """x, y and z, (K,) float64, metres, of the middle of slices, (K,) int64, of pixels, (K,) int64."""
+def _centre(sweeps: HeightSlicedSweeps, pixel: Tensor, bit: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """x, y and z, (K,) float64, metres, of the middle of slices, by their pixels and bits, (K,) int64 each."""
     row, col, lowest = gather(pixel, sweeps.pixels.row, sweeps.pixels.col, sweeps.lowest)
     size, (x, y) = sweeps.grid.pixel_size, sweeps.grid.lower[:2]
     first = torch.floor(lowest / SLICE_HEIGHT)
-    height = first + torch.remainder(part - first, NUM_SLICES) + 0.5
+    height = first + torch.remainder(bit - first, NUM_SLICES) + 0.5
     return (col.double() + 0.5) * size + x, (row.double() + 0.5) * size + y, height * SLICE_HEIGHT
 
 
@@ -89,7 +72,7 @@ class RangeImages:
         sweeps: points that are active, without ground.
 
     Convention: angles are measured without trigonometry, so that every device finds the same bins: around by
-    y / (|x| + |y|), which turns bins of .32 to .64 degrees, and up by height over distance. Distances are float32.
+    y / (|x| + |y|), which makes bins of .32 to .64 degrees, and up by height over distance. Distances are float32.
     """
 
     def __init__(self, sweeps: HeightSlicedSweeps) -> None:
@@ -105,41 +88,37 @@ class RangeImages:
             farthest.scatter_reduce_(0, direction, distance, "amax")
         self._farthest = farthest
 
-    def farther(self, image: Tensor, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
-        """(K,) float32, metres: by how much the farthest return in the direction of each place is farther away than the
-        place; -infinity = there is no return.
+    def farther(self, sweep: Tensor, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
+        """(K,) float32, metres: by how much the farthest return in the direction of each position is farther away than
+        the position; -infinity = there is no return.
 
         Args:
-            image: (K,) int64, window * S + step of the sweep.
+            sweep: (K,) int64, window * S + step.
             x, y, z: (K,) float64, metres, frame of t+1.
         """
-        direction, distance = self._direction(image, x, y, z)
+        direction, distance = self._direction(sweep, x, y, z)
         return self._farthest.index_select(0, direction).sub_(distance)
 
-    def _direction(self, image: Tensor, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
+    def _direction(self, sweep: Tensor, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
         """Bin of the range images, (K,) int64, and distance over ground, (K,) float32, metres."""
-        x, y, z = (a.sub(o.index_select(0, image)).float() for a, o in zip((x, y, z), self._origin))
+        x, y, z = (a.sub(o.index_select(0, sweep)).float() for a, o in zip((x, y, z), self._origin))
         distance, sum_of_sides = torch.sqrt(x * x + y * y), x.abs().add_(y.abs()).clamp_(min=1e-3)
-        turn = y.div_(sum_of_sides)
-        turn = torch.where(x >= 0, turn + 1, 3 - turn).nan_to_num_(0.0)  # 0 ... 4
-        azimuth = turn.mul_(_AZIMUTHS / 4).long().clamp_(max=_AZIMUTHS - 1)
+        around = y.div_(sum_of_sides)
+        around = torch.where(x >= 0, around + 1, 3 - around).nan_to_num_(0.0)  # 0 ... 4
+        azimuth = around.mul_(_AZIMUTHS / 4).long().clamp_(max=_AZIMUTHS - 1)
         rise = z.div_(distance.clamp(min=0.1).mul_(_RISE)).add_(_ELEVATIONS // 2).floor_().nan_to_num_(0.0)
         elevation = rise.clamp_(0, _ELEVATIONS - 1).long()
-        return elevation.add_(image, alpha=_ELEVATIONS).mul_(_AZIMUTHS).add_(azimuth), distance
+        return elevation.add_(sweep, alpha=_ELEVATIONS).mul_(_AZIMUTHS).add_(azimuth), distance
 
     @staticmethod
     def _sensor_height(sweeps: HeightSlicedSweeps) -> Tensor:
         """(B,) float64, metres, above the origin of t+1."""
-        batch = sweeps.batch
+        batch, (x, y, z) = sweeps.batch, sweeps.batch.positions.unbind(0)
         window, step = split_index(batch.image.long(), batch.num_steps)
-        x, y, z = batch.positions.unbind(0)
-        near = flat_nonzero((step == 0) & (x * x + y * y <= _NEAR**2) & batch.is_active)
-        window = window.index_select(0, near)
-        height, by_height = z.index_select(0, near).sort()
-        window, by_window = window.index_select(0, by_height).sort(stable=True)
-        first = torch.searchsorted(window, torch.arange(batch.num_windows + 1, device=window.device))
-        count = first[1:] - first[:-1]
-        height = F.pad(height.index_select(0, by_window), (0, 1), value=-_ABOVE_LOWEST)
-        chosen = first[:-1] + floor_divide(count, _OUTLIERS)
+        is_near = (step == 0) & (x * x + y * y <= _NEAR**2) & batch.is_active
+        height = (z * _PER_METRE).floor_().nan_to_num_(0.0).clamp_(-_HIGHEST, _HIGHEST - 1).long().add_(_HIGHEST)
+        height.add_(window, alpha=2 * _HIGHEST)
+        below = scatter_count(height, batch.num_windows * 2 * _HIGHEST, is_near.long()).view(-1, 2 * _HIGHEST).cumsum(1)
+        low = (below <= floor_divide(below[:, -1:], _OUTLIERS)).sum(1)
         # Without near points it is 0.
-        return height.index_select(0, torch.where(count > 0, chosen, near.numel())) + _ABOVE_LOWEST
+        return torch.where(below[:, -1] > 0, (low - _HIGHEST).double() / _PER_METRE + _ABOVE_LOWEST, 0.0)

@@ -19,11 +19,8 @@ from cflow_torch.ops.indices import flat_nonzero, floor_divide, gather, lazy_zer
 from cflow_torch.ops.labeling import label_together, padded_size
 from cflow_torch.ops.segments import bounding_boxes, segment_amin
 from cflow_torch.verified.aperture import both_ends_move
-from cflow_torch.verified.changed_pixels import ChangedPixels
 from cflow_torch.verified.height_slices import HeightSlicedSweeps, Pixels
 
-# The static test: a component may move only if more than one of so many of its pixels is missing somewhere.
-_MISSING = 20
 # Metres: changed pixels that reach farther at t+1 are not those of a person or of a cyclist.
 _LOCAL = 3.0
 # What every object costs, sixteenths of a slice of evidence: parts move on their own only if they explain more by it.
@@ -42,7 +39,6 @@ class Components:
         parent: (V + 1,) int64, component of the next coarser level; V = none.
         size: (V,) int64, number of pixels; 0 = a free name.
         is_linked: (V,) bool, it has pixels at t+1 and before.
-        may_move: (V,) bool, it is linked, and the static test does not rule a motion out.
         blocks: of each scale the finest pixels a side of a pixel of its images.
     """
 
@@ -53,7 +49,6 @@ class Components:
     parent: Tensor
     size: Tensor
     is_linked: Tensor
-    may_move: Tensor
     blocks: tuple[int, ...]
 
     @property
@@ -117,21 +112,19 @@ class Objects:
         return self.component.numel()
 
 
-def find_components(sweeps: HeightSlicedSweeps, change: ChangedPixels, blocks: Sequence[int]) -> Components:
-    """Components of all scales by one union-find, and the static test.
+def find_components(sweeps: HeightSlicedSweeps, has_changed: Tensor, blocks: Sequence[int]) -> Components:
+    """Components of all scales by one union-find.
 
     Args:
         sweeps: P occupied pixels.
-        change: what they show.
+        has_changed: (P,) bool.
         blocks: finest pixels a side of a pixel, coarse to fine, the last one 1. Each scale is dilated as in
             Alg. clustering, but nothing is eroded: so scales are nested. Plain components of the finest pixels follow.
-
-    Convention: the static test holds in windows with history only.
 
     Cost: one pass over the images of each scale, a few rounds of union-find, some passes over the pixels.
     """
     pixels, grid, num_windows = sweeps.pixels, sweeps.grid, sweeps.batch.num_windows
-    changed = flat_nonzero(change.has_changed)
+    changed = flat_nonzero(has_changed)
     images, places = [], []
     for block in blocks:
         height, width = -(-grid.height // block), -(-grid.width // block)
@@ -153,25 +146,17 @@ def find_components(sweeps: HeightSlicedSweeps, change: ChangedPixels, blocks: S
         parent.scatter_(0, fine, coarse)
 
     firsts = tuple(part.first for part in found)
-    root = torch.cat((roots[-1], changed_root))
-    codes = _codes(sweeps, change)
-    sums = scatter_count(root, count + 1, torch.cat((codes, codes.index_select(1, changed)), 1))
+    # One sum counts all pixels and, above 2^32, those at t+1.
+    code = 1 + ((pixels.step == 0).long() << 32)
+    root, code = torch.cat((roots[-1], changed_root)), torch.cat((code, code.index_select(0, changed)))
+    sums = scatter_count(root, count + 1, code)
     # What the components of a level hold adds up to what those of the coarser level hold.
     for level in range(len(roots) - 1, 0, -1):
         names = slice(firsts[level], (*firsts, count)[level + 1])
-        sums += scatter_count(parent[names], count + 1, sums[:, names])
-    (size, num_missing), num_newest = sums[:, :-1] & 0xFFFFFFFF, sums[0, :-1] >> 32
+        sums.index_add_(0, parent[names], sums[names].clone())
+    size, num_newest = sums[:-1] & 0xFFFFFFFF, sums[:-1] >> 32
     is_linked = (num_newest > 0) & (num_newest < size)
-    may_move = is_linked & (num_missing * _MISSING > size)
-    return Components(roots, changed, changed_root, firsts, parent, size, is_linked, may_move, tuple(blocks))
-
-
-def _codes(sweeps: HeightSlicedSweeps, change: ChangedPixels) -> Tensor:
-    """(2, P) int64: 1, plus 2^32 for pixels at t+1, so that one sum counts both; and 1 for pixels that are missing
-    somewhere, or, without history, may be."""
-    pixels = sweeps.pixels
-    may_move = change.is_missing | ~sweeps.has_history.index_select(0, pixels.window)
-    return torch.stack((1 + ((pixels.step == 0).long() << 32), may_move.long()))
+    return Components(roots, changed, changed_root, firsts, parent, size, is_linked, tuple(blocks))
 
 
 def _draw(row: Tensor, col: Tensor, num_windows: int, height: int, width: int) -> Tensor:
@@ -194,7 +179,7 @@ def movable_nodes(sweeps: HeightSlicedSweeps, components: Components, longest: f
 
     Cost: linear in the pixels of the nodes.
     """
-    roots, count, may_move = components.roots, components.count, components.may_move
+    roots, count, may_move = components.roots, components.count, components.is_linked
     length = _length(sweeps, components) * sweeps.grid.pixel_size
     is_long = may_move & (length > (math.inf if longest is None else longest))
     travels = both_ends_move(sweeps, roots, is_long)

@@ -38,8 +38,8 @@ class MotionMargin(NamedTuple):
     Args:
         z: (G,) float64, slices matched by the motion less those matched by the best displaced one, in standard
             deviations of noise; 0 = it is not better, or the object is static.
-        is_dynamic: (G,) bool, it moves: its motion is better by one standard deviation, or is better at all and it has
-            left its old place, and is not a line: a rail seems to leave its place as well.
+        is_dynamic: (G,) bool, it moves: its motion is better by one standard deviation, or is better at all and more
+            of it is matched by the motion than in place, and is not a line: beams meet a rail at positions that move.
     """
 
     z: Tensor
@@ -60,14 +60,13 @@ def motion_margin(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMoti
     motion, off = rigid.pixels_per_interval(size), _DISPLACEMENT / size
     displaced = torch.tensor([(0, 0), (off, 0), (-off, 0), (0, off), (0, -off)], dtype=torch.float64, device=device)
     pixel = flat_nonzero(lookup(motion.any(1), objects.of_pixel))
-    members, owner = sweeps.pixels.take(pixel), objects.of_pixel.index_select(0, pixel)
-    wins = count_wins(sweeps, members, owner, motion[:, None] + displaced, motion.any(1))
+    members, which = sweeps.pixels.take(pixel), objects.of_pixel.index_select(0, pixel)
+    wins = count_wins(sweeps, members, which, motion[:, None] + displaced)
     surplus = wins.won - wins.lost
     gain, matched = (surplus[:, 0] - surplus[:, 1:].amax(1)).clamp(min=0), surplus[:, 0] + wins.in_place
     z = torch.where(gain > 0, gain.double() / matched.double().sqrt(), 0.0)
     newest = flat_nonzero(members.step == 0)
-    owner, row, col = gather(newest, owner, members.row, members.col)
-    is_line, _, _ = principal_axes(owner, row, col, objects.count, size)
+    is_line, _, _ = principal_axes(*gather(newest, which, members.row, members.col), objects.count, size)
     return MotionMargin(z, (z >= _Z) | ((gain > 0) & (surplus[:, 0] > wins.in_place) & ~is_line))
 
 

@@ -6,7 +6,6 @@ an image holds the slices of its pixel, and those of the 3 x 3 pixels around it.
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import dataclass
 from functools import cached_property
@@ -281,14 +280,13 @@ def _pixels(pixel: Tensor, slices: Tensor, grid: Grid, num_steps: int) -> Pixels
 def _draw_neighbourhoods(image: Tensor, pixels: Pixels, grid: Grid) -> None:
     """Write the slices of pixels, and into the upper bits of the 3 x 3 pixels around each what lies there."""
     image.index_copy_(0, pixels.index, pixels.slices)
-    above, outside = pixels.slices << NUM_SLICES, image.numel() - 1
-    is_row = {-1: pixels.row > 0, 0: pixels.row >= 0, 1: pixels.row < grid.height - 1}
-    is_col = {-1: pixels.col > 0, 0: pixels.col >= 0, 1: pixels.col < grid.width - 1}
-    for down, right in itertools.product((-1, 0, 1), repeat=2):
-        # No two pixels have the same place here, but outside: there anything may be written.
-        inside = is_row[down] & is_col[right]
-        place = torch.where(inside, pixels.index + (down * grid.width + right), outside)
-        image.index_copy_(0, place, image.index_select(0, place).bitwise_or_(above))
+    above, outside, line = pixels.slices << NUM_SLICES, image.numel() - 1, torch.arange(-1, 2, device=image.device)
+    row, col = pixels.row + line[:, None], pixels.col + line[:, None]
+    inside = ((row >= 0) & (row < grid.height))[:, None] & ((col >= 0) & (col < grid.width))
+    around = pixels.index + torch.add(line, line[:, None], alpha=grid.width)[..., None]
+    # No two pixels have the same index in a round, but outside: there anything may be written.
+    for index in torch.where(inside, around, outside).view(9, -1).unbind():
+        image.index_copy_(0, index, image.index_select(0, index).bitwise_or_(above))
     image[outside] = 0
 
 

@@ -72,8 +72,7 @@ def best_nearby(sweeps: HeightSlicedSweeps, objects: Objects, motion: Tensor, si
     has_after = (sweeps.elapsed < 0).any(1).index_select(0, sweeps.pixels.window.index_select(0, objects.first))
     asked, candidates = motion.any(1) & has_after, motion[:, None] + offsets
     pixel = flat_nonzero(lookup(asked, objects.of_pixel))
-    members, owner = sweeps.pixels.take(pixel), objects.of_pixel.index_select(0, pixel)
-    wins = count_wins(sweeps, members, owner, candidates, asked)
+    wins = count_wins(sweeps, sweeps.pixels.take(pixel), objects.of_pixel.index_select(0, pixel), candidates)
     best, evidence = best_candidate(evidence_of(wins.won, wins.lost, significance), candidates)
     return torch.where((evidence > 0)[:, None], best, motion)
 

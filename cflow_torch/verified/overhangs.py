@@ -1,6 +1,6 @@
 """Objects under overhangs: a car under the crown of a tree shares its bird's-eye component with the crown.
 
-In space the two are apart. We join the cells of components that may move in three dimensions. A component that lies
+In space the two are apart. We join cells in three dimensions. A component that lies
 under another one and above none is drawn once more, by itself, as an image of the same batch. It is a node like any
 other.
 """
@@ -31,7 +31,7 @@ from cflow_torch.verified.component_tree import Components, Nodes
 from cflow_torch.verified.height_slices import SLICE_HEIGHT, HeightSlicedSweeps
 
 _CELL = 0.4  # metres, side of a cell; it is as high as a slice
-_NUM_SLICES = 64  # from the lowest cell of a window on; what lies higher counts as the highest one
+_NUM_SLICES = 32  # from the lowest cell of a window on; what lies higher counts as the highest one
 _GROUND = 4.0  # metres: the lowest cell of the nine squares of this side around stands on the ground
 _GAP = 3  # slices, at least, from a cell to the next one above it: less lies between the body of a car and its roof
 # A vehicle or a person, in slices: begins at most this far above the ground, and is neither flat nor taller than a bus.
@@ -43,7 +43,8 @@ def add_overhung(sweeps: HeightSlicedSweeps, components: Components, nodes: Node
 
     Args:
         sweeps: images, and the points.
-        components: we search the points of those that may move, dilated at the finest pixels.
+        components: we search the points of those with pixels at t+1 and before, dilated at the finest pixels. With
+            history, one of the pixels must have changed.
         nodes: those of all levels.
 
     Returns:
@@ -54,11 +55,14 @@ def add_overhung(sweeps: HeightSlicedSweeps, components: Components, nodes: Node
         the next occupied cell above it in any column, with two empty ones at least between. Of two components in one
         pixel of a sweep the one whose first cell is the first has it.
 
-    Cost: linear in the points that may move; 13 lookups for each cell, a few rounds of union-find.
+    Cost: linear in the points; 13 lookups for each cell, a few rounds of union-find.
     """
     level, num_own, num_points = components.num_levels - 2, sweeps.num_pixels, sweeps.batch.image.numel()
-    may_move = components.may_move.index_select(0, components.roots[level])
-    rows = flat_nonzero(lookup(may_move, sweeps.pixel_of_point))
+    root, window = components.roots[level], sweeps.pixels.window
+    has_changed = torch.zeros_like(components.is_linked).index_fill_(0, root.index_select(0, components.changed), True)
+    is_searched = has_changed.index_select(0, root) | ~sweeps.has_history.index_select(0, window)
+    is_searched &= components.is_linked.index_select(0, root)
+    rows = flat_nonzero(lookup(is_searched, sweeps.pixel_of_point))
     component, num_names = _components_under(sweeps, rows)
     under = flat_nonzero(component < num_names)
     rows, component = gather(under, rows, component)
@@ -133,7 +137,9 @@ def _components_under(sweeps: HeightSlicedSweeps, rows: Tensor) -> tuple[Tensor,
         for at in (pair, pair + 1)
     )
     foot, top = segment_minmax(height, component, count)
-    rise = segment_amin(height - _ground(column, height, batch.num_windows, num_rows, num_cols), component, count, 64)
+    rise = segment_amin(
+        height - _ground(column, height, batch.num_windows, num_rows, num_cols), component, count, _NUM_SLICES
+    )
     is_object = (rise <= _HIGHEST_FOOT) & (top - foot >= _SMALLEST) & (top - foot <= _LARGEST)
     wanted = (is_under & ~is_over & is_object).index_select(0, component)
     return torch.where(wanted, component, count).index_select(0, number.index_select(0, place).long()), count

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import torch
@@ -10,12 +11,13 @@ from torch import Tensor
 from cflow_torch.ops.indices import flat_nonzero, gather, renumber
 from cflow_torch.verified.aperture import slides_along_itself
 from cflow_torch.verified.component_tree import Nodes
-from cflow_torch.verified.height_slices import NUM_SLICES, OWN, HeightSlicedSweeps, Pixels, count_slices, slice_bits
+from cflow_torch.verified.height_slices import NUM_SLICES, OWN, HeightSlicedSweeps, Pixels, count_slices
 
 # Comparisons (pixel x sweep x candidate) done at once: their temporaries take about 64 bytes each.
 _AT_ONCE_CPU, _AT_ONCE_GPU = 1 << 18, 1 << 24
 _FAR = 2  # pixels, in y or in x
-_CHANGED_Z, _CHANGED_SLICES = 4.0, 3
+_COVERED = 65  # per cent
+_CHANGED_Z = 4.0
 
 
 def verify(
@@ -27,31 +29,27 @@ def verify(
         sweeps: images.
         nodes: N of them.
         candidates: (N, C, 2) float64, (y, x), finest pixels per sweep interval.
-        num_levels: L; nodes of changed pixels, level L, must convince more: they need `_CHANGED_Z` standard deviations
-            and `_CHANGED_SLICES` different slices.
+        num_levels: L; nodes of changed pixels, level L, need `_CHANGED_Z` standard deviations.
         significance: z of all other nodes.
 
     Returns:
         motion: (N, 2) float64, (y, x), finest pixels per sweep interval; 0 = none is significant.
         evidence: (N,) int64, of that motion, sixteenths of a slice.
     """
-    tested = (candidates != 0).any(2).any(1)
-    wins = count_wins(sweeps, nodes.members, nodes.node, candidates, tested)
-    evidence, is_changed = evidence_of(wins.won, wins.lost, significance), nodes.level == num_levels
-    strict = evidence_of(wins.won, wins.lost, _CHANGED_Z) * (_num_slices(nodes, is_changed) >= _CHANGED_SLICES)[:, None]
-    evidence = torch.where(is_changed[:, None], strict, evidence)
-    asked = flat_nonzero((tested & ~nodes.travels).index_select(0, nodes.node))
-    slides = slides_along_itself(sweeps, nodes.members.take(asked), nodes.node.index_select(0, asked), candidates)
-    return best_candidate(evidence.masked_fill(slides, 0), candidates)
-
-
-def _num_slices(nodes: Nodes, wanted: Tensor) -> Tensor:
-    """(N,) int64, different slices of some nodes, (N,) bool; 0 for the others."""
-    some = flat_nonzero(wanted.index_select(0, nodes.node))
-    entry, bit = slice_bits(nodes.members.slices.index_select(0, some))
-    place = nodes.node.index_select(0, some.index_select(0, entry)) * NUM_SLICES + bit
-    has = torch.zeros(nodes.count * NUM_SLICES, dtype=torch.bool, device=place.device).index_fill_(0, place, True)
-    return has.view(-1, NUM_SLICES).sum(1)
+    tested = flat_nonzero((candidates != 0).any(2).any(1))  # other nodes are static and cost nothing
+    node = renumber(tested, nodes.count).index_select(0, nodes.node)
+    some = flat_nonzero(node < len(tested))
+    members, node = nodes.members.take(some), node.index_select(0, some)
+    level, travels, candidates_of = gather(tested, nodes.level, nodes.travels, candidates)
+    wins = count_wins(sweeps, members, node, candidates_of)
+    evidence, strict = (evidence_of(wins.won, wins.lost, z) for z in (significance, _CHANGED_Z))
+    slides = slides_along_itself(sweeps, members, node, candidates_of, wins.is_covered & ~travels)
+    evidence = torch.where((level == num_levels)[:, None], strict, evidence).masked_fill_(slides, 0)
+    motion, evidence = best_candidate(evidence, candidates_of)
+    return (
+        torch.zeros_like(candidates[:, 0]).index_copy_(0, tested, motion),
+        torch.zeros_like(nodes.level).index_copy_(0, tested, evidence),
+    )
 
 
 class Wins(NamedTuple):
@@ -60,76 +58,79 @@ class Wins(NamedTuple):
     Args:
         won, lost: (M, C) int64, slices.
         in_place: (M,) int64, slices that other sweeps have where they are, whatever the motion.
+        is_covered: (M,) bool, all other sweeps have `_COVERED` per cent of its slices at t+1 in the 3 x 3 pixels
+            where they are, or t+1 has as many of its slices in the other sweeps.
     """
 
     won: Tensor
     lost: Tensor
     in_place: Tensor
+    is_covered: Tensor
 
 
-def count_wins(sweeps: HeightSlicedSweeps, members: Pixels, owner: Tensor, candidates: Tensor, tested: Tensor) -> Wins:
+def count_wins(sweeps: HeightSlicedSweeps, members: Pixels, component: Tensor, candidates: Tensor) -> Wins:
     """Paired counts of candidate motions against "static".
 
-    For each slice of a pixel we check another sweep at two places: where the motion would take the pixel, and where it
-    is. The motion wins the slice if it is found only at the first, and loses it if only at the second; slices found at
-    both or at neither are ignored. For motions of two pixels or more, "not found" means absent from the 3 x 3 pixels as
-    well: beams sample a surface at other places in each sweep, and a static side must not look as if it had left.
+    For each slice of a pixel we check another sweep at two positions: where the motion would take the pixel, and where
+    it is. The motion wins the slice if it is found only at the first, and loses it if only at the second; slices found
+    at both or at neither are ignored. For motions of two pixels or more, "not found" means absent from the 3 x 3 pixels
+    as well: beams sample a surface differently in each sweep, and a static side must not seem to have left.
 
     Args:
         sweeps: images.
         members: K pixels of components.
-        owner: (K,) int64, component of each of them, M = none.
+        component: (K,) int64, of each of them.
         candidates: (M, C, 2) float64, (y, x) finest pixels per sweep interval, axes of ego1; C at least 1.
-        tested: (M,) bool, False = its counts are 0 and cost nothing.
 
     Returns:
         The counts, summed over all sweeps m other than t+1: m compared with t+1, and t+1 with m.
 
     Convention:
         A pixel is taken by floor(k f + 0.5) pixels, elementwise float64; k = elapsed intervals, negative from t+1 into
-        the past. What it meets counts whatever component it is of. A place outside the image has nothing, nor has any
-        of the pixels around it. Sweeps that a window lacks are empty: no counts.
+        the past. What it meets counts whatever component it is of. A position outside the image has nothing, nor has
+        any of the pixels around it. Sweeps that a window lacks are empty: no counts.
         Fewer than 2^31 slices of a component may be compared.
 
-    Cost: K (S - 1) C lookups at most, of the pixels of tested components only.
+    Cost: K (S - 1) C lookups at most.
     """
-    (count, num_candidates, _), num_steps, device = candidates.shape, sweeps.num_steps, owner.device
-    chosen = flat_nonzero(tested)
-    number = renumber(chosen, count).index_select(0, owner)
-    some = flat_nonzero(number < len(chosen))
-    members, number = members.take(some), number.index_select(0, some)
-    window = torch.zeros_like(chosen).scatter_(0, number, members.window)
-    moves = Moves.of(sweeps, window, candidates.index_select(0, chosen))
+    (count, num_candidates, _), num_steps, device = candidates.shape, sweeps.num_steps, component.device
+    window = torch.zeros((count,), dtype=torch.int64, device=device).scatter_(0, component, members.window)
+    moves = Moves.of(sweeps, window, candidates)
     counts_of, column = _counts_of(device), torch.arange(num_candidates, device=device)
-    sums = torch.zeros(len(chosen) * num_candidates, dtype=torch.int64, device=device)
-    in_place = torch.zeros(len(chosen), dtype=torch.int64, device=device)
+    sums = torch.zeros(count * num_candidates, dtype=torch.int64, device=device)
+    in_place = torch.zeros(count, dtype=torch.int64, device=device)
+    near_and_all = torch.zeros(2 * count, dtype=torch.int64, device=device)
     border, first = moves.to_border(members), members.index - members.step * moves.area
     pixel, step = comparisons(members.step, num_steps)
     size = max(1, (_AT_ONCE_CPU if device.type == "cpu" else _AT_ONCE_GPU) // num_candidates)
     for at, to in zip(pixel.split(size), step.split(size)):
-        of, start, own, from_step, near_border = gather(at, number, first, members.slices, members.step, border)
+        of, start, own, from_step, near_border = gather(at, component, first, members.slices, members.step, border)
         start.add_(to, alpha=moves.area)
         seen = sweeps.image.index_select(0, start)
         here, near = own & seen, own & (seen >> NUM_SLICES)
         left, left_far = (own & ~here)[:, None], (own & ~near)[:, None]
         which = of * (2 * num_steps) + torch.where(to > 0, to + num_steps, from_step)
-        place = moves.offset.index_select(0, which).add_(start[:, None])
+        index = moves.offset.index_select(0, which).add_(start[:, None])
         leaves = flat_nonzero(near_border < moves.longest.index_select(0, which))
-        place.index_copy_(0, leaves, moves.checked(members, *gather(leaves, at, to, which)))
-        seen, far = sweeps.image.index_select(0, place.view(-1)).view_as(place), moves.is_far.index_select(0, which)
+        index.index_copy_(0, leaves, moves.checked(members, *gather(leaves, at, to, which)))
+        seen, far = sweeps.image.index_select(0, index.view(-1)).view_as(index), moves.is_far.index_select(0, which)
         won = seen & torch.where(far, left_far, left)  # no slice of the neighbourhood is left
         lost = here[:, None] & ~torch.where(far, seen >> NUM_SLICES, seen)
         counts = counts_of.index_select(0, (won | lost << NUM_SLICES).view(-1).int())
         sums.index_add_(0, (of[:, None] * num_candidates + column).view(-1), counts)
         in_place.index_add_(0, of, count_slices(here).long())
-    result = torch.zeros((count, num_candidates + 1), dtype=torch.int64, device=device)
-    result.index_copy_(0, chosen, torch.cat((sums.view(-1, num_candidates), in_place[:, None]), 1))
-    both = result[:, :-1]
-    return Wins(both >> 32, both & 0xFFFFFFFF, result[:, -1])
+        is_given = moves.is_given.index_select(0, which)
+        near_and_all.index_add_(
+            0, of * 2 + (to > 0), counts_of.index_select(0, (near | own << NUM_SLICES).int()) * is_given
+        )
+    sums = sums.view(-1, num_candidates)
+    near, total = near_and_all.view(-1, 2) >> 32, near_and_all.view(-1, 2) & 0xFFFFFFFF
+    is_covered = ((total > 0) & (near * 100 >= total * _COVERED)).any(1)
+    return Wins(sums >> 32, sums & 0xFFFFFFFF, in_place, is_covered)
 
 
 class Moves(NamedTuple):
-    """Where C motions of each of T components lead from each of S sweeps to t+1, then from t+1 to each: 2 S T rows.
+    """Where C motions of T components lead, from each of S sweeps to t+1, then from t+1 to each: 2 S T rows.
 
     Args:
         sweeps: images.
@@ -137,6 +138,7 @@ class Moves(NamedTuple):
         offset: (2 S T, C) int64, the same as an offset of flat indices.
         longest: (2 S T,) int64, longest side of any of the moves of a row, pixels.
         is_far: (2 S T, C) bool, a side is at least two pixels long.
+        is_given: (2 S T,) bool, the window has both sweeps.
     """
 
     sweeps: HeightSlicedSweeps
@@ -145,6 +147,7 @@ class Moves(NamedTuple):
     offset: Tensor
     longest: Tensor
     is_far: Tensor
+    is_given: Tensor
 
     @classmethod
     def of(cls, sweeps: HeightSlicedSweeps, window: Tensor, motion: Tensor) -> Moves:
@@ -155,7 +158,8 @@ class Moves(NamedTuple):
         side = torch.maximum(down.abs(), right.abs())
         # In float64, because the CPU finds the largest of int64 many times slower.
         longest = side.double().amax(1).long()
-        return cls(sweeps, down, right, down * sweeps.grid.width + right, longest, side >= _FAR)
+        offset, is_given = down * sweeps.grid.width + right, (k.flatten(1) != 0).flatten()
+        return cls(sweeps, down, right, offset, longest, side >= _FAR, is_given)
 
     @property
     def area(self) -> int:
@@ -191,6 +195,7 @@ def comparisons(step: Tensor, num_steps: int) -> tuple[Tensor, Tensor]:
     return torch.cat((older, newest.repeat(every.numel()))), torch.cat((torch.zeros_like(older), to))
 
 
+@lru_cache(maxsize=64)
 def _counts_of(device: torch.device) -> Tensor:
     """(256,) int64: set bits of the lower half of a byte times 2^32, plus those of its upper half. Both counts are in
     one number because sums cost more than lookups."""

@@ -24,14 +24,13 @@ from run import config_for, seed_range
 from score import score
 from sets import make_sets
 
-from cflow_torch.verified import changed_pixels, component_tree, confidence, method, paired_test, rigid_registration
+from cflow_torch.verified import component_tree, confidence, method, paired_test, refinement, rigid_registration
 
 COLUMNS = ("dynamic", "pedestrian", "static", "near", "far")
 
 
 def _without_changed(sweeps: Any) -> Any:
-    change = changed_pixels.find_changed(sweeps)
-    return changed_pixels.ChangedPixels(change.is_missing, torch.zeros_like(change.has_changed))
+    return torch.zeros_like(sweeps.pixels.slices, dtype=torch.bool)
 
 
 def _without_margin(*given: Any) -> Any:
@@ -39,15 +38,18 @@ def _without_margin(*given: Any) -> Any:
     return confidence.MotionMargin(margin.z, torch.ones_like(margin.is_dynamic))
 
 
-def _nothing_slides(sweeps: Any, members: Any, owner: Any, candidates: Any) -> Any:
+def _nothing_slides(sweeps: Any, members: Any, component: Any, candidates: Any, is_covered: Any) -> Any:
     return torch.zeros(candidates.shape[:2], dtype=torch.bool, device=candidates.device)
+
+
+def _nothing_is_slow(sweeps: Any, objects: Any, motion: Any, may_be_slow: Any) -> Any:
+    return motion.flip(1) * sweeps.grid.pixel_size
 
 
 # For each step, the function that replaces it.
 STEPS: dict[str, list[Callable[[], Any]]] = {
     "all steps": [],
     "no changed pixels": [lambda: patch.object(method, "find_changed", _without_changed)],
-    "no static test": [lambda: patch.object(component_tree, "_MISSING", 1 << 40)],
     "no objects under overhangs": [
         lambda: patch.object(method, "add_overhung", lambda sweeps, _, nodes: (sweeps, nodes))
     ],
@@ -55,6 +57,7 @@ STEPS: dict[str, list[Callable[[], Any]]] = {
     "no price of an object": [lambda: patch.object(component_tree, "_PRICE", 0)],
     "no margin": [lambda: patch.object(method, "motion_margin", _without_margin)],
     "no registration": [lambda: patch.object(rigid_registration, "_NUM_STEPS", 0)],
+    "no slow objects of pairs": [lambda: patch.object(refinement, "subpixel_motion", _nothing_is_slow)],
     "long vehicles are static": [
         lambda: patch.object(component_tree, "both_ends_move", lambda sweeps, roots, is_long: torch.zeros_like(is_long))
     ],

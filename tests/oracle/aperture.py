@@ -8,6 +8,7 @@ from typing import Sequence
 from oracle.height_slices import Cell, Pixel, SlicedSweeps, Vector, count
 
 LEAST_TRAVEL = 1.2  # metres
+COVERED = 65  # per cent
 
 
 def slides_along_itself(sweeps: SlicedSweeps, members: Sequence[Pixel], candidates: Sequence[Vector]) -> list[bool]:
@@ -15,7 +16,7 @@ def slides_along_itself(sweeps: SlicedSweeps, members: Sequence[Pixel], candidat
 
     Returns:
         Of each candidate, whether the component is a line at t+1, the motion points along it and leads at least 1.2 m
-        over the window, and the other sweeps have something all along it, or t+1 all along where it was.
+        over the window, and it is covered.
     """
     is_line, axis_y, axis_x = principal_axis([(r, c) for m, r, c in members if m == 0], sweeps.size)
     stays = is_line and is_covered(sweeps, members)
@@ -48,18 +49,14 @@ def principal_axis(cells: Sequence[Cell], size: float) -> tuple[bool, float, flo
 
 
 def is_covered(sweeps: SlicedSweeps, members: Sequence[Pixel]) -> bool:
-    """At least 88 % of comparisons find something: of those of t+1 with all other sweeps, or of those with t+1.
-
-    Convention: they find what lies in the same cell of about 0.4 m a side (whole pixels) or in one beside it.
-    """
-    side = max(1, round(0.4 / sweeps.size))
-    cells = {(m, r // side, c // side) for m, r, c in sweeps.pixels()}
-    forward, backward = [], []
+    """Whether slices are in the 3 x 3 pixels where they are, at least `COVERED` per cent: of those of t+1 in all other
+    sweeps, or of those of the other sweeps in t+1."""
+    found, total = [0, 0], [0, 0]
     for m, r, c in members:
         for other in sweeps.others(m):
-            finds = any((other, r // side + dy, c // side + dx) in cells for dy in (-1, 0, 1) for dx in (-1, 0, 1))
-            (forward if m > 0 else backward).append(finds)
-    return any(sum(finds) * 100 >= len(finds) * 88 for finds in (forward, backward) if finds)
+            total[m == 0] += count(sweeps.at(m, r, c))
+            found[m == 0] += count(sweeps.at(m, r, c) & sweeps.around(other, r, c))
+    return any(all_ > 0 and near * 100 >= all_ * COVERED for near, all_ in zip(found, total))
 
 
 def both_ends_move(sweeps: SlicedSweeps, members: Sequence[Pixel]) -> bool:

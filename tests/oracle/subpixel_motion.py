@@ -3,29 +3,22 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, Sequence, Tuple
+from typing import Sequence
 
 import numpy as np
 
-from oracle.height_slices import Cell, Pixel, SlicedSweeps, Vector, count
-from oracle.voxels import UNITS, Voxel, Voxels, around, centroids, meeting_weight, points_of_objects
+from oracle.height_slices import Pixel, SlicedSweeps, Vector, count
+from oracle.voxels import UNITS, Voxel, Voxels, around, centroids, meeting_weight, points_of_objects, whole
 
 SIDES = ((0, 1), (1, -1), (1, 0), (1, 1))  # (dy, dx), a pixel ahead; the opposite is behind
 BIAS_Z, LEAST_BIAS = 3, 10  # standard deviations of noise of a bias; and it must be a 10th of the object's slices
 NUM_LAYERS = 16  # layers of cubes are told apart by this many numbers, then they repeat
 SIGMA = 0.07  # metres, of the weight of two centroids
-STEP, REACH = 51, 3  # units between shifts that are tested; steps each way
+NUM_STEPS, STEP_LENGTH, FARTHEST = 4, 2, 154  # steps to the best shift, their length, its largest side in units
 Z, LEAST_GAIN, LEAST_CUBES = 4.0, 0.05, 6  # significance; gain per cube, as a share of a perfect meeting; cubes
-BLOCK, AROUND = 410, 2  # units, side of the blocks that vote; pixels in which a cube meets others
+AROUND = 2  # pixels in which a cube meets others
 
-Shift = Tuple[int, int]  # x, y, units, from t to t+1
-
-
-class Cube(NamedTuple):
-    """Where a cube lies, units, and the ways (N, 2) to the cubes around it."""
-
-    block: Cell
-    ways: np.ndarray
+Cube = np.ndarray  # (N, 2): where the cubes around it are, seen from it, units, from t to t+1
 
 
 def subpixel_motion(
@@ -41,12 +34,8 @@ def subpixel_motion(
     result = [(x * sweeps.size, y * sweeps.size) for y, x in motions]
     for owner in [owner for owner, is_slow in enumerate(slow) if is_slow]:
         cubes = [cube_of(every, voxel, sweeps) for voxel in every.values() if voxel.owner == owner]
-        best = best_shift(cubes)
-        if best is not None:
-            best = best_shift(moving_parts(cubes, best))
-        if best is not None:
-            x, y = (way / UNITS / sweeps.elapsed[1] for way in best)
-            result[owner] = (x, y)
+        x, y = (way / UNITS / sweeps.elapsed[1] for way in significant_shift(cubes))
+        result[owner] = (x, y)
     return result
 
 
@@ -66,44 +55,41 @@ def is_biased(sweeps: SlicedSweeps, members: Sequence[Pixel]) -> bool:
 
 
 def cube_of(every: Voxels, voxel: Voxel, sweeps: SlicedSweeps) -> Cube:
-    """A cube of an object and what it may meet: the cubes of the other sweep, in its layer, in the 5 x 5 pixels around
-    it. Cubes of t+1 go back. Ways are float32."""
+    """What a cube of an object may meet: the cubes of the other sweep, in its layer, in the 5 x 5 pixels around it."""
     sign = 1 if voxel.step == 1 else -1
     near = around(every, 1 - voxel.step, voxel.part, voxel.x, voxel.y, sweeps, AROUND)
-    ways = [(sign * (other.x - voxel.x), sign * (other.y - voxel.y)) for other in near]
-    return Cube((voxel.y // BLOCK, voxel.x // BLOCK), np.array(ways, dtype=np.float32).reshape(-1, 2))
+    return np.array([(sign * (other.x - voxel.x), sign * (other.y - voxel.y)) for other in near]).reshape(-1, 2)
 
 
-def best_shift(cubes: Sequence[Cube]) -> Shift | None:
-    """The most significant shift, None = none is.
+def significant_shift(cubes: Sequence[Cube]) -> tuple[int, int]:
+    """The shift (x, y) to which a few steps lead from rest, 0 if it is not significant.
 
-    Ties: the smallest, then raster order.
+    A step goes twice as far as cubes miss what they meet, on average, by the weights of the meetings.
     """
-    line = [STEP * i for i in range(-REACH, REACH + 1)]
-    values = {}
-    for shift in [(x, y) for y in line for x in line]:
-        gain = gains(cubes, shift)
-        is_weak = sum(gain) < LEAST_GAIN * len(cubes) or len(cubes) < LEAST_CUBES
-        values[shift] = 0.0 if is_weak else sum(gain) - Z * math.sqrt(sum(g * g for g in gain))
-    by_length = sorted(values, key=lambda shift: shift[0] ** 2 + shift[1] ** 2)
-    best = max(by_length, key=lambda shift: values[shift])
-    return best if values[best] > 0 else None
+    x = y = 0
+    at_rest = met = [meet(cube, x, y) for cube in cubes]
+    for _ in range(NUM_STEPS):
+        total = max(sum(weight for weight, _, _ in met), 1 / 256)
+        x = clamped(x + whole(STEP_LENGTH * (sum(weight * dx for weight, dx, _ in met) / total)))
+        y = clamped(y + whole(STEP_LENGTH * (sum(weight * dy for weight, _, dy in met) / total)))
+        met = [meet(cube, x, y) for cube in cubes]
+    gains = [now[0] - before[0] for now, before in zip(met, at_rest)]
+    is_significant = sum(gains) > Z * math.sqrt(sum(gain * gain for gain in gains))
+    is_much = sum(gains) >= LEAST_GAIN * len(cubes) and len(cubes) >= LEAST_CUBES
+    return (x, y) if is_significant and is_much else (0, 0)
 
 
-def moving_parts(cubes: Sequence[Cube], shift: Shift) -> list[Cube]:
-    """The cubes that lie in blocks that gain by a shift: of an object that moves a part may be static."""
-    total: dict[Cell, float] = {}
-    for cube, gain in zip(cubes, gains(cubes, shift)):
-        total[cube.block] = total.get(cube.block, 0.0) + gain
-    return [cube for cube in cubes if total[cube.block] > 0]
+def meet(cube: Cube, x: int, y: int) -> tuple[float, int, int]:
+    """Weight of what a cube meets under a shift, 1 at most, and by how much it misses it.
+
+    Ties: the first in raster order.
+    """
+    ways = [(dx - x, dy - y) for dx, dy in cube.tolist()]
+    if not ways:
+        return 0.0, 0, 0
+    dx, dy = min(ways, key=lambda way: way[0] ** 2 + way[1] ** 2)
+    return meeting_weight(dx * dx + dy * dy, SIGMA), dx, dy
 
 
-def gains(cubes: Sequence[Cube], shift: Shift) -> list[float]:
-    """Weight that each cube gains by a shift."""
-    return [meet(cube, shift) - meet(cube, (0, 0)) for cube in cubes]
-
-
-def meet(cube: Cube, shift: Shift) -> float:
-    """Weight, 1 at most, of what a cube meets at a shift."""
-    x, y = (cube.ways - np.array(shift, dtype=np.float32)).T
-    return meeting_weight(float((x * x + y * y).min()), SIGMA) if len(x) else 0.0
+def clamped(shift: int) -> int:
+    return max(-FARTHEST, min(shift, FARTHEST))

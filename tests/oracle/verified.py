@@ -18,7 +18,7 @@ from oracle.candidates import propose
 from oracle.changed_pixels import find_changed
 from oracle.component_tree import Node, grow, length, select_objects
 from oracle.confidence import TABLE, confidences, margin
-from oracle.height_slices import Pixel, Place, SlicedSweeps, Vector, count, empty_sweeps, ground_heights, is_residue
+from oracle.height_slices import Pixel, Place, SlicedSweeps, Vector, empty_sweeps, ground_heights, is_residue
 from oracle.overhangs import find_overhung
 from oracle.paired_test import best_candidate, count_wins, evidence_of
 from oracle.pixels import in_range
@@ -27,7 +27,7 @@ from oracle.subpixel_motion import subpixel_motion
 from oracle.sweeps import Cloud, PointMotion
 from oracle.voxels import points_of_objects
 
-CHANGED_Z, CHANGED_SLICES = 4.0, 3  # what moves by its changed pixels alone: standard deviations, slices
+CHANGED_Z = 4.0  # standard deviations for what moves by its changed pixels alone
 
 
 class Part(NamedTuple):
@@ -140,7 +140,7 @@ def estimate(every: Sequence[Cloud], ground: Sequence[np.ndarray], config: Verif
     seen = [cloud.points[keep] for cloud, keep in zip(every, in_sight)]
     tree = grow(sweeps, find_changed(sweeps, seen, [cloud.origin for cloud in every]), config)
     num_levels = len(tree.levels)
-    copies, overhung = find_overhung(sweeps, tree.may_move, num_levels + 1)
+    copies, overhung = find_overhung(sweeps, tree.searched, num_levels + 1)
     nodes = [*tree.nodes, *overhung]
     candidates, scores = propose(nodes, config)
     proven = [verify(node, motions, num_levels, config) for node, motions in zip(nodes, candidates)]
@@ -166,16 +166,11 @@ def estimate(every: Sequence[Cloud], ground: Sequence[np.ndarray], config: Verif
 
 def verify(node: Node, candidates: Sequence[Vector], num_levels: int, config: VerifiedConfig) -> tuple[Vector, int]:
     """The candidate of most evidence, and its evidence. What moves by its changed pixels alone needs more standard
-    deviations, and several slices."""
-    z, slices = config.significance, 0
-    for pixel in node.members:
-        slices |= node.sweeps.at(*pixel)
+    deviations."""
+    z = CHANGED_Z if node.level == num_levels else config.significance
     slides = [False] * len(candidates)
     if not node.travels:
         slides = slides_along_itself(node.sweeps, node.members, candidates)
-    if node.level == num_levels:
-        z = CHANGED_Z
-        slides = [slid or count(slices) < CHANGED_SLICES for slid in slides]
     counts = [count_wins(node.sweeps, node.members, motion) for motion in candidates]
     return best_candidate([0 if slid else evidence_of(*own, z) for own, slid in zip(counts, slides)], candidates)
 
