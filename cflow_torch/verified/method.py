@@ -23,7 +23,7 @@ from cflow_torch.verified.offline import best_nearby, choose_side
 from cflow_torch.verified.overhangs import add_overhung
 from cflow_torch.verified.paired_test import verify
 from cflow_torch.verified.refinement import refine
-from cflow_torch.verified.rigid_motion import TurningMotion, motion_by_pixel
+from cflow_torch.verified.rigid_motion import RotatingMotion, motion_by_pixel
 from cflow_torch.windows.bev_grid import Grid
 from cflow_torch.windows.collation import Batch
 
@@ -51,12 +51,8 @@ class VerifiedFlow(SceneFlowModel):
 
     method = "verified"
     num_axes = 3
+    needs_ground = True
     needs_times = True
-
-    @property
-    def needs_ground(self) -> bool:  # type: ignore[override]
-        """True if the method needs the heights of ground points."""
-        return self.config.min_height is not None
 
     @property
     def bytes_per_point(self) -> int:  # type: ignore[override]
@@ -69,14 +65,14 @@ class VerifiedFlow(SceneFlowModel):
         wide = math.ceil(_AROUND / self.config.pixel_sizes[0]) * self.config.pixel_sizes[0]
         return Grid(pixel_size, (x0 - wide, y0 - wide, z0), (x1 + wide, y1 + wide, z1))
 
-    def motion(self, batch: Batch) -> TurningMotion:
+    def motion(self, batch: Batch) -> RotatingMotion:
         """Motion of everything in a batch, by occupied pixel; ids number what is static or moves together."""
         if self.config.num_future == 0:
             return self.estimate(batch)
         sides, copied = batch.split_past_and_future()
         return choose_side(sides, copied, self.estimate(sides))
 
-    def estimate(self, batch: Batch) -> TurningMotion:
+    def estimate(self, batch: Batch) -> RotatingMotion:
         """The motion by all sweeps of each window, in seven steps."""
         config = self.config
         blocks = [round(size / config.pixel_sizes[-1]) for size in config.pixel_sizes]

@@ -16,7 +16,7 @@ from cflow_torch.ops.indices import flat_nonzero, lookup, split_index
 from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 from cflow_torch.verified.paired_test import best_candidate, count_wins, evidence_of
-from cflow_torch.verified.rigid_motion import TurningMotion
+from cflow_torch.verified.rigid_motion import RotatingMotion
 from cflow_torch.windows.collation import Batch
 
 # How often the future must show an object for each time that the past does. At 1, façades that a moving ego vehicle
@@ -26,7 +26,7 @@ _TIMES = 2
 _REACH = 2
 
 
-def choose_side(sides: Batch, copied: Tensor, motion: TurningMotion) -> TurningMotion:
+def choose_side(sides: Batch, copied: Tensor, motion: RotatingMotion) -> RotatingMotion:
     """The motion of each point by the past or by the future.
 
     Args:
@@ -77,7 +77,7 @@ def best_nearby(sweeps: HeightSlicedSweeps, objects: Objects, motion: Tensor, si
     return torch.where((evidence > 0)[:, None], best, motion)
 
 
-def _num_shown(batch: Batch, motion: TurningMotion) -> Tensor:
+def _num_shown(batch: Batch, motion: RotatingMotion) -> Tensor:
     """(N,) int64: how many sweeps other than t and t+1 show the object of each of the N points; 0 for no object."""
     window, step = split_index(batch.image.long(), batch.num_steps)
     number = 1 + motion.cluster_id.index_select(0, motion.cluster(slice(None)))

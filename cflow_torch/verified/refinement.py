@@ -65,14 +65,14 @@ def register_deskewed(
     if points.time is None:
         return apparent
     stretch = stretch_of(points, sweeps, apparent)[:, None]
-    divided = RigidMotion(apparent.flow / stretch, apparent.turn, apparent.centre)
+    divided = RigidMotion(apparent.flow / stretch, apparent.rotation, apparent.centre)
     is_pair = ~sweeps.has_history
     points = points.take(~is_pair.index_select(0, points.window))
     again = register(*deskew(points, sweeps, divided), start / stretch)
     is_again = torch.bincount(points.owner, minlength=len(start)) > 0
     return RigidMotion(
         torch.where(is_again[:, None], again.flow, divided.flow),
-        torch.where(is_again, again.turn, divided.turn),
+        torch.where(is_again, again.rotation, divided.rotation),
         torch.where(is_again[:, None], again.centre, divided.centre),
     )
 
@@ -103,7 +103,7 @@ def deskew(
     since_t = (sweeps.elapsed[:, 1:2] - sweeps.elapsed).flatten().index_select(0, image)
     at_instant = torch.complex(*points.position) - flow * time
     arm = at_instant - centre - flow * since_t
-    at_instant = at_instant + (rotate(-time * rigid.turn.index_select(0, owner), arm) - arm)
+    at_instant = at_instant + (rotate(-time * rigid.rotation.index_select(0, owner), arm) - arm)
     position = torch.view_as_real(at_instant).t()
 
     inside = flat_nonzero(grid.contains(position))
@@ -111,7 +111,7 @@ def deskew(
     place = grid.pixel_of_image(position, image, sweeps.batch.num_windows * num_steps).long()
     pixel, number = torch.unique(place, return_inverse=True)
     moved = replace(points.at(inside), position=position, pixel=number)
-    first = segment_amin(moved.owner, number, pixel.numel(), len(rigid.turn)).index_select(0, number)
+    first = segment_amin(moved.owner, number, pixel.numel(), len(rigid.rotation)).index_select(0, number)
     of_image, within = split_index(pixel, grid.height * grid.width)
     window, step = split_index(of_image, num_steps)
     table = torch.stack((pixel, window, step, *split_index(within, grid.width)))

@@ -74,7 +74,7 @@ def stretch_of(points: ObjectPoints, sweeps: HeightSlicedSweeps, rigid: RigidMot
     """
     pairs = _VoxelPairs(Voxels(points, sweeps, NUM_LAYERS), sweeps, len(rigid.flow))
     velocity = torch.view_as_complex(rigid.flow.contiguous() * UNITS)
-    squares, *_, late = pairs.normal_equations(velocity, rigid.turn)
+    squares, *_, late = pairs.normal_equations(velocity, rigid.rotation)
     stretch = torch.where(squares > 0, 1 + late / squares, torch.ones_like(squares))
     return torch.where(stretch < _LEAST_STRETCH, torch.ones_like(stretch), stretch)
 

@@ -1,4 +1,4 @@
-"""Height of the ground around a point, from the ground points of its window."""
+"""Height and slope of the ground around a point, from the ground points of its window."""
 
 from __future__ import annotations
 
@@ -14,6 +14,11 @@ from cflow_torch.windows.bev_grid import Grid
 _BLOCK = 2.0
 # With fewer ground points than this in 6 m x 6 m the height is unknown.
 _FEWEST_POINTS = 5
+_FEWEST_BLOCKS = 5  # of a plane
+# Blocks each way that a plane is fitted to, 10 m x 10 m; we fit it three times, without the blocks that are farther than
+# this from it (millimetres), such as a pavement. A steeper plane is not ground.
+_REACH, _NUM_FITS, _FARTHEST = 2, 3, 100
+_STEEPEST = 0.3
 # Heights are whole centimetres, bounded so that no sum overflows; unknown ground lies below every point.
 _HIGHEST = 10**10
 _UNKNOWN = -(1 << 40)
@@ -67,6 +72,47 @@ class GroundHeights:
         """
         block = torch.add(self._block(positions), window, alpha=mean.shape[1] * mean.shape[2])
         return mean.view(-1).double().index_select(0, block.clamp_(0, mean.numel() - 1))
+
+    def slopes(self, centre: Tensor, window: Tensor) -> Tensor:
+        """Slope of the ground around objects: of a plane through the mean heights of the blocks around them.
+
+        Args:
+            centre: (G, 2) float64, x and y, metres, frame of t+1; anywhere.
+            window: (G,) int64; B + w is window w once more, for copies of its points.
+
+        Returns:
+            (G, 2) float64, metres of height per metre in x and in y; 0 where the plane is steeper than 0.3, or where
+            fewer than five blocks are known, or all of them lie nearly on a line.
+
+        Convention: block heights are whole millimetres, rounded down. So all sums are exact.
+        """
+        num_windows, rows, cols = self._heights.shape
+        sums = F.pad(torch.stack((self._heights, self._counts)), (_REACH, _REACH, _REACH, _REACH)).view(2, -1)
+        line = torch.arange(-_REACH, _REACH + 1, device=window.device)
+        dy, dx = torch.cartesian_prod(line, line).unbind(1)
+        last = torch.tensor((cols - 1, rows - 1), device=window.device)
+        lower = torch.tensor(self._lower[:2], dtype=torch.float64, device=window.device)
+        col, row = torch.floor((centre - lower) / _BLOCK).clamp_(torch.zeros_like(last), last).long().unbind(1)
+        line_of_block = (window % num_windows * (rows + 2 * _REACH) + row + _REACH)[:, None] + dy
+        block = line_of_block * (cols + 2 * _REACH) + (col + _REACH)[:, None] + dx
+        height, count = sums.index_select(1, block.view(-1)).view(2, *block.shape)
+        height = torch.div(10 * height, count.clamp(min=1), rounding_mode="floor").double()
+        is_used = is_known = count >= _FEWEST_POINTS
+        dy, dx = dy.double(), dx.double()
+        terms = torch.stack((torch.ones_like(dx), dx, dy, dx * dx, dx * dy, dy * dy), 1)
+        for _ in range(_NUM_FITS):
+            n, x, y, xx, xy, yy = (is_used.double() @ terms).unbind(1)
+            h, hx, hy = ((height * is_used) @ terms[:, :3]).unbind(1)
+            xx, xy, yy, hx, hy = n * xx - x * x, n * xy - x * y, n * yy - y * y, n * hx - h * x, n * hy - h * y
+            det = xx * yy - xy * xy
+            is_flat = (n >= _FEWEST_BLOCKS) & (4 * det >= n * n * n * n)
+            det = torch.where(is_flat, det, torch.ones_like(det))
+            slope_x, slope_y = (hx * yy - hy * xy) / det, (hy * xx - hx * xy) / det
+            middle = (h - slope_x * x - slope_y * y) / n.clamp(min=1)
+            plane = middle[:, None] + slope_x[:, None] * dx + slope_y[:, None] * dy
+            is_used = is_known & ((height - plane).abs() <= _FARTHEST)
+        slope = torch.stack((slope_x, slope_y), 1) / (1000 * _BLOCK)
+        return slope * (is_flat & (slope.square().sum(1) <= _STEEPEST**2))[:, None]
 
     def _block(self, positions: Tensor) -> Tensor:
         """(N,) int32 block of positions inside the region, where int() rounds down."""

@@ -115,16 +115,46 @@ def ground_heights(ground: Sequence[np.ndarray], config: VerifiedConfig) -> dict
     Convention: heights of the points of a block and of the eight around it are rounded down, then their mean is rounded
         down. Blocks with less than five such points are missing.
     """
-    heights: dict[Cell, list[int]] = {}
-    for points in ground:
-        for x, y, z in points[in_range(points, config)].tolist():
-            heights.setdefault(_block(x, y, config), []).append(math.floor(z * 100))
-    means = {}
+    means, heights = {}, _listed_heights(ground, config)
     for row, col in {(r + dr, c + dc) for r, c in heights for dr, dc in product((-1, 0, 1), repeat=2)}:
         near = [h for dr, dc in product((-1, 0, 1), repeat=2) for h in heights.get((row + dr, col + dc), [])]
         if len(near) >= 5:
             means[row, col] = sum(near) // len(near)
     return means
+
+
+def _listed_heights(ground: Sequence[np.ndarray], config: VerifiedConfig) -> dict[Cell, list[int]]:
+    """Heights, centimetres, rounded down, of the ground points of each block."""
+    heights: dict[Cell, list[int]] = {}
+    for points in ground:
+        for x, y, z in points[in_range(points, config)].tolist():
+            heights.setdefault(_block(x, y, config), []).append(math.floor(z * 100))
+    return heights
+
+
+def ground_slope(ground: Sequence[np.ndarray], centre: Vector, config: VerifiedConfig) -> Vector:
+    """Slope in x and y of a plane through the ground of the 5 x 5 blocks around a centre; (0, 0) = not known.
+
+    Convention: a block counts with its mean height, whole millimetres, rounded down, if it has five ground points. The
+        plane is fitted three times, each time without the blocks that are more than 100 mm from the last one. Its
+        variances in x and y must not be small: a determinant of a quarter. A slope of more than 0.3 is not ground.
+    """
+    x0, y0, _, x1, y1, _ = config.point_cloud_range
+    x, y = min(max(centre[0], x0), x1), min(max(centre[1], y0), y1)
+    row, col = _block(x, y, config)
+    known = []
+    for (r, c), heights in _listed_heights(ground, config).items():
+        if abs(r - row) <= 2 and abs(c - col) <= 2 and len(heights) >= 5:
+            known.append((c - col, r - row, 10 * sum(heights) // len(heights)))
+    used = known
+    for _ in range(3):
+        if len(used) < 5 or np.linalg.det(np.cov(np.array(used).T[:2], bias=True)) < 0.25 - 1e-9:
+            return 0.0, 0.0
+        design = np.array([(dx, dy, 1.0) for dx, dy, _ in used])
+        a, b, c = np.linalg.lstsq(design, np.array([h for *_, h in used]), rcond=None)[0]
+        used = [(dx, dy, h) for dx, dy, h in known if abs(h - a * dx - b * dy - c) <= 100]
+    slope = float(a) / 1000 / GROUND_BLOCK, float(b) / 1000 / GROUND_BLOCK
+    return slope if math.hypot(*slope) <= 0.3 else (0.0, 0.0)
 
 
 def is_residue(points: np.ndarray, means: dict[Cell, int], config: VerifiedConfig) -> np.ndarray:

@@ -27,13 +27,13 @@ class RigidMotion(NamedTuple):
     """Motion per sweep interval: (x, y) of the flow at the centre, turn, centre; metres."""
 
     flow: Vector
-    turn: float
+    rotation: float
     centre: Vector
 
     def flow_at(self, x: float, y: float) -> Vector:
         """Flow of a point of t, by its place; all in metres."""
         arm_x, arm_y = x - self.centre[0], y - self.centre[1]
-        turned_x, turned_y = rotate(self.turn, arm_x, arm_y)
+        turned_x, turned_y = rotate(self.rotation, arm_x, arm_y)
         return (turned_x - arm_x) + self.flow[0], (turned_y - arm_y) + self.flow[1]
 
 
@@ -164,7 +164,7 @@ def stretch_of(points: Sequence[Point], seen: Sequence[RigidMotion], sweeps: Sli
         centre = (round((motion.centre[0] - x0) * UNITS), round((motion.centre[1] - y0) * UNITS))
         way = (motion.flow[0] * UNITS, motion.flow[1] * UNITS)
         total = late = 0.0
-        for k, _, _, weight, of_pair in find_pairs(members, voxels, sweeps, centre, way, motion.turn):
+        for k, _, _, weight, of_pair in find_pairs(members, voxels, sweeps, centre, way, motion.rotation):
             total, late = total + weight * k * k, late + weight * k * of_pair
         stretch = 1 + late / total if total > 0 else 1.0
         result.append(stretch if stretch >= LEAST_STRETCH else 1.0)

@@ -18,7 +18,16 @@ from oracle.candidates import propose
 from oracle.changed_pixels import find_changed
 from oracle.component_tree import Node, grow, length, select_objects
 from oracle.confidence import TABLE, confidences, margin
-from oracle.height_slices import Pixel, Place, SlicedSweeps, Vector, empty_sweeps, ground_heights, is_residue
+from oracle.height_slices import (
+    Pixel,
+    Place,
+    SlicedSweeps,
+    Vector,
+    empty_sweeps,
+    ground_heights,
+    ground_slope,
+    is_residue,
+)
 from oracle.overhangs import find_overhung
 from oracle.paired_test import best_candidate, count_wins, evidence_of
 from oracle.pixels import in_range
@@ -53,7 +62,7 @@ class Part(NamedTuple):
         owner = self.object_of.get(pixel)
         if owner is None or (surely and self.is_weak[owner]):
             return False
-        return any(self.rigid[owner].flow) or self.rigid[owner].turn != 0
+        return any(self.rigid[owner].flow) or self.rigid[owner].rotation != 0
 
 
 class Found(NamedTuple):
@@ -100,7 +109,7 @@ def verified_flow(
             first_id[side, part] = start
             start += len(sides[side].parts[part].rigid)
 
-    num_points = len(is_inside)
+    num_points, slopes = len(is_inside), {}  # type: ignore[var-annotated]
     flow, ids = np.zeros((num_points, 3)), np.full(num_points, -1, dtype=np.int64)
     scores, trust = np.zeros(num_points), np.full(num_points, TABLE["probabilities"][0])
     for row, i in enumerate(np.flatnonzero(before.drawn[1]).tolist()):
@@ -111,7 +120,12 @@ def verified_flow(
             owner = part.object_of.get(pixel)
             trust[i] = part.trust[pixel]
             if owner is not None:
-                flow[i, :2] = part.rigid[owner].flow_at(*clouds[0].points[i, :2].tolist())
+                x, y = part.rigid[owner].flow_at(*clouds[0].points[i, :2].tolist())
+                centre = part.rigid[owner].centre
+                if (x or y) and centre not in slopes:
+                    slopes[centre] = ground_slope(ground, centre, config)
+                slope_x, slope_y = slopes.get(centre, (0.0, 0.0))
+                flow[i] = x, y, slope_x * x + slope_y * y
                 ids[i], scores[i] = first_id[side, which] + owner, part.scores[owner]
     return PointMotion([flow], ids, scores, trust)
 
@@ -216,5 +230,7 @@ def settle(
     rigid = register_deskewed(points, start, apparent, sweeps, config) if has_times else list(apparent)
     shown = [(motion.flow[1] / size, motion.flow[0] / size) for motion in apparent]
     margins = [margin(sweeps, own, motion) for own, motion in zip(members, shown)]
-    rigid = [m if is_dynamic else m._replace(flow=(0.0, 0.0), turn=0.0) for m, (_, is_dynamic) in zip(rigid, margins)]
+    rigid = [
+        m if is_dynamic else m._replace(flow=(0.0, 0.0), rotation=0.0) for m, (_, is_dynamic) in zip(rigid, margins)
+    ]
     return rigid, confidences(sweeps, object_of, shown, [z for z, _ in margins])

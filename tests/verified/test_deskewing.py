@@ -77,7 +77,7 @@ def test_motion_and_points_equal_the_oracle(num_past, num_future):
     assert torch.equal(place, drawn.pixels.index)
     assert torch.equal(drawn.rank[place], torch.arange(1, len(place) + 1).int())
     assert int((drawn.rank > 0).sum()) == len(place)
-    for name in ("flow", "turn", "centre"):
+    for name in ("flow", "rotation", "centre"):
         values = np.array([getattr(motion, name) for motion in expected])
         np.testing.assert_allclose(getattr(found, name), values.reshape(getattr(found, name).shape), atol=1e-6)
 
@@ -119,7 +119,7 @@ def test_a_known_motion_under_known_times_is_found(elapsed):
     np.testing.assert_allclose(seen.flow[0], apparent, atol=1e-3)
     found = register_deskewed(points, scene.sweeps, scene.flow, seen)
     np.testing.assert_allclose(found.flow[0], velocity, atol=1e-3)
-    assert abs(float(found.turn)) < 1e-3
+    assert abs(float(found.rotation)) < 1e-3
 
     sharp, _ = deskew(points, scene.sweeps, found)
     for step in range(len(elapsed)):  # the images of both units become one

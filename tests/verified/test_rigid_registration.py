@@ -21,7 +21,7 @@ def registered(scene: Scene) -> RigidMotion:
 def assert_equals_oracle(scene: Scene) -> RigidMotion:
     found = registered(scene)
     expected = [motion for w in scene.windows() for motion in oracle.register(w.points(), w.flow, w.sweeps)]
-    for name in ("flow", "turn", "centre"):
+    for name in ("flow", "rotation", "centre"):
         values = np.array([getattr(motion, name) for motion in expected])
         np.testing.assert_allclose(getattr(found, name), values.reshape(getattr(found, name).shape), atol=1e-6)
     return found
@@ -34,7 +34,7 @@ def test_equals_the_oracle(snap, num_steps):
     for pixel_size in (0.1, 0.2):
         scene = moving_scene(range(8), num_steps, pixel_size, snap)
         found = assert_equals_oracle(scene)
-        moved += int(((found.flow != scene.flow).any(1) & (found.turn != 0)).sum())
+        moved += int(((found.flow != scene.flow).any(1) & (found.rotation != 0)).sum())
     assert moved > 5
 
 
@@ -52,7 +52,7 @@ def test_a_known_motion_is_found():
     truth = torch.from_numpy(clouds[0] - clouds[1])[:, :2]
     scene = one_object(clouds, truth.mean(0).tolist())
     found = assert_equals_oracle(scene)
-    assert abs(2 * math.atan(float(found.turn[0])) - angle) < 0.1 * angle
+    assert abs(2 * math.atan(float(found.rotation[0])) - angle) < 0.1 * angle
     old = torch.from_numpy(clouds[1])
     flow = torch.stack(found.flow_at(torch.zeros(len(old), dtype=torch.int64), old[:, 0], old[:, 1]), 1)
     assert (flow - truth).norm(dim=1).mean() < 0.1 * (scene.flow - truth).norm(dim=1).mean()
@@ -69,7 +69,7 @@ def test_the_motion_of_a_fast_object_is_found_between_the_pixels():
 def test_what_meets_nothing_keeps_its_motion():
     cloud = np.array([[0.05, 0.05, 0.2], [0.15, 0.05, 0.2]])
     found = assert_equals_oracle(one_object([cloud + (2.0, 0.0, 0.0), cloud], (0.5, 0.0)))
-    assert found.flow.tolist() == [[0.5, 0.0]] and found.turn.tolist() == [0.0]
+    assert found.flow.tolist() == [[0.5, 0.0]] and found.rotation.tolist() == [0.0]
 
 
 def test_an_object_turns_about_its_centre_which_moves_with_it():
@@ -78,4 +78,4 @@ def test_an_object_turns_about_its_centre_which_moves_with_it():
     clouds = [scatter(k * angle, k * way[0], k * way[1]) for k in (1, 0, -1)]
     found = assert_equals_oracle(one_object(clouds, way))
     assert (found.flow[0] - torch.tensor(way)).abs().max() < 2e-3
-    assert abs(2 * math.atan(float(found.turn[0])) - angle) < 0.1 * angle
+    assert abs(2 * math.atan(float(found.rotation[0])) - angle) < 0.1 * angle
