@@ -1,16 +1,18 @@
-"""Pictures of a flow and of every stage on the way to it. Needs `pip install matplotlib`."""
+"""Pictures of a flow and of every stage on the way to it (needs matplotlib), and 3-D pages (needs k3d)."""
 
 from cflow_torch.viz.animation import Frame, flow_figures, save_animation
 from cflow_torch.viz.bev import plot_flow, save_picture
 from cflow_torch.viz.clusters import plot_clusters
 from cflow_torch.viz.correlation import plot_correlation
 from cflow_torch.viz.keypoints import plot_keypoints
+from cflow_torch.viz.page import Page, save_page, show
 from cflow_torch.viz.recording import record_log
 from cflow_torch.viz.scales import plot_scales
 from cflow_torch.viz.wheel import flow_to_rgb, wheel_image
 
 __all__ = [
     "Frame",
+    "Page",
     "flow_figures",
     "flow_to_rgb",
     "plot_clusters",
@@ -20,6 +22,8 @@ __all__ = [
     "plot_scales",
     "record_log",
     "save_animation",
+    "save_page",
     "save_picture",
+    "show",
     "wheel_image",
 ]

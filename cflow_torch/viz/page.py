@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import zlib
+from functools import lru_cache
 from html import escape
 from importlib.util import find_spec
 from pathlib import Path
@@ -137,8 +138,8 @@ def save_page(
     return page.num_pairs
 
 
-def load_k3d() -> bytes:
-    """Read the JavaScript of k3d, without importing the package.
+def load_k3d() -> str:
+    """Read the JavaScript of k3d, packed for a page, without importing the package.
 
     Raises:
         CFlowError: k3d is not installed, or too old.
@@ -147,7 +148,12 @@ def load_k3d() -> bytes:
     script = Path(found.origin or "").parent / "static" / "standalone.js" if found else None
     if script is None or not script.is_file():
         raise CFlowError("pages need k3d (Python 3.9 or newer): pip install 'k3d>=3.2', or give format=rerun")
-    return script.read_bytes()
+    return _packed_file(script)
+
+
+@lru_cache(maxsize=1)
+def _packed_file(path: Path) -> str:
+    return _packed(path.read_bytes())
 
 
 def _checked(path: str | Path) -> Path:
@@ -181,7 +187,7 @@ def _page(
     text = _TEMPLATE.read_text(encoding="utf-8")
     # "<" is escaped, so a name in the data cannot end the script that holds it.
     data = json.dumps({**about, **drive.content()}, separators=(",", ":")).replace("<", "\\u003c")
-    for mark, content in {"[TITLE]": escape(title), "[K3D]": _packed(library), "[DATA]": data}.items():
+    for mark, content in {"[TITLE]": escape(title), "[K3D]": library, "[DATA]": data}.items():
         text = text.replace(mark, content)
     return Page(text, len(drive.frames))
 
@@ -270,7 +276,7 @@ class _Drive:
             if any(coloring["name"] in entries for _, entries, _ in self.points)
         ]
         for frame, (units, entries, _) in zip(self.frames, self.points):
-            missing = np.full(len(units), UNKNOWN, np.uint8)
+            missing = np.where(entries["flow"] == GROUND, GROUND, UNKNOWN).astype(np.uint8)
             frame["data"] = _packed(_planes(units, [entries.get(c["name"], missing) for c in colorings]))
         shown, side = sum(frame["count"] for frame in self.frames), self.voxel
         T = self.frame.T_world_viewer

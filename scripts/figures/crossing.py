@@ -1,0 +1,88 @@
+"""Draw docs/pictures/crossing.webp, the animation of the README: a simulated crossing in the page of `cflow view`.
+
+    python scripts/figures/crossing.py outputs/crossing            # estimates the flow (minutes), then draws
+    python scripts/figures/crossing.py outputs/crossing --page OLD.html
+
+Needs the extras `html` and `test`, and Chromium on the path. Five seconds of the drive are shown at half speed. Each
+sweep is in two pictures, because the camera follows the vehicle smoothly.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import shutil
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+from playwright.sync_api import sync_playwright
+
+from cflow_torch import make_config, make_model
+from cflow_torch.applications.tracking import track
+from cflow_torch.data.log import CachedLog, window
+from cflow_torch.simulator import make_drive
+from cflow_torch.viz import save_page
+
+SEED, FIRST, COUNT = 2, 2, 50
+SIZE, MILLISECONDS, QUALITY = {"width": 720, "height": 405}, 100, 30
+BACK, HEIGHT, AHEAD, SWING = 27.0, 17.0, 6.0, 12.0  # metres from the vehicle; degrees to either side
+FLAGS = ("--headless", "--no-sandbox", "--disable-gpu", "--use-gl=angle", "--use-angle=swiftshader")
+DRESS = """
+for (const id of ["top", "time", "rose"]) document.getElementById(id).style.display = "none";
+Object.assign(viewer.state, { follow: false, rings: false, labels: true, size: 1.5 });
+"""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("output", type=Path)
+    parser.add_argument("--page", type=Path, help="a page that this script wrote before")
+    given = parser.parse_args()
+    given.output.mkdir(parents=True, exist_ok=True)
+    page = given.page or given.output / "crossing.html"
+    drive = make_drive(SEED, FIRST + COUNT + 1, "av2", "crossing")
+    if given.page is None:
+        write_page(drive, page)
+    T_viewer_ego = np.linalg.inv(drive.poses[FIRST + 1]) @ drive.poses[FIRST + 1 : FIRST + 2 + COUNT]
+    pictures = take(page, T_viewer_ego[:, :3, 3])
+    file = given.output / "crossing.webp"
+    settings = {"duration": MILLISECONDS, "loop": 0, "quality": QUALITY, "method": 4}
+    pictures[0].save(file, save_all=True, append_images=pictures[1:], **settings)
+    print(f"{file}: {len(pictures)} pictures, {file.stat().st_size / 1e6:.2f} MB")
+
+
+def write_page(drive, page: Path) -> None:
+    """Estimate the flow and the tracks, and save the page."""
+    model = make_model(make_config("default"))
+    log = CachedLog(drive, model.config.num_sweeps)
+    results = []
+    for i in range(FIRST, FIRST + COUNT):
+        results += [(i, model([window(log, i, model.config.num_history, model.config.num_future)])[0])]
+        print(f"\r{i - FIRST + 1} of {COUNT} pairs", end="", flush=True)
+    table = track(drive, results)
+    save_page(log, results, page, tracks=lambda: table, preset="default")
+
+
+def take(page: Path, vehicle: np.ndarray) -> list[Image.Image]:
+    """Two pictures of each sweep, from behind the vehicle. Args: vehicle: (COUNT + 1, 3) its positions in the page."""
+    pictures = []
+    with sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=shutil.which("chromium"), args=list(FLAGS))
+        tab = browser.new_page(viewport=SIZE, color_scheme="dark")
+        tab.goto(page.resolve().as_uri())
+        tab.wait_for_function("window.viewer && viewer.ready", timeout=120_000)
+        tab.evaluate(DRESS)
+        for step in range(2 * COUNT):
+            target = (vehicle[step // 2] + vehicle[(step + 1) // 2]) / 2 + [AHEAD, 0, 0]
+            angle = np.radians(195 + SWING * np.sin(np.pi * step / COUNT))
+            eye = target + [BACK * np.cos(angle), BACK * np.sin(angle), HEIGHT]
+            tab.evaluate("camera => viewer.K3D.setCamera(camera)", [*eye.tolist(), *target.tolist(), 0, 0, 1])
+            tab.evaluate("index => viewer.go(index)", step // 2)
+            pictures.append(Image.open(io.BytesIO(tab.screenshot())).convert("RGB"))
+        browser.close()
+    return pictures
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,273 @@
+"""Pages: their content is read back with plain loops, and a real browser opens, plays and recolours a page."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import re
+import shutil
+import zlib
+from pathlib import Path
+from typing import Any, Iterator
+
+import numpy as np
+import pytest
+from PIL import Image
+from toy_street import CAR, CAR_FLOW, FLOOR, STEP, WALL, Street, result_of
+
+from cflow_torch import CFlowError, make_config, make_model
+from cflow_torch.applications.tracking import track
+from cflow_torch.data.log import window
+from cflow_torch.simulator import make_drive
+from cflow_torch.viz import flow_to_rgb, page, save_page, show
+from cflow_torch.viz.clusters import PALETTE
+
+pytest.importorskip("k3d", reason="needs the extra html")
+STATIC, GROUND, UNKNOWN, FIRST = range(4)
+
+
+def content_of(html: str) -> dict[str, Any]:
+    """The data of a page."""
+    return json.loads(re.search(r'<script id="data"[^>]*>(.*?)</script>', html, re.DOTALL)[1])
+
+
+def points_of(data: dict[str, Any], frame: int) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Positions (N, 3), metres, ego frame of t+1, and the entries of each colouring, decoded as the page does it."""
+    chosen = data["frames"][frame]
+    raw, n = zlib.decompress(base64.b64decode(chosen["data"])), chosen["count"]
+    units, last = np.zeros((n, 3)), [0, 0, 0]
+    for i in range(n):
+        for axis in range(3):
+            step = raw[2 * axis * n + i] | raw[(2 * axis + 1) * n + i] << 8
+            last[axis] = (last[axis] + step + 2**15) % 2**16 - 2**15
+        units[i] = last
+    names = [coloring["name"] for coloring in data["colorings"]]
+    entries = {name: np.frombuffer(raw, np.uint8, n, (6 + k) * n) for k, name in enumerate(names)}
+    assert len(raw) == (6 + len(names)) * n
+    return units * data["unit"], entries
+
+
+def color_of(data: dict[str, Any], name: str, entry: int) -> np.ndarray:
+    """(3,) colour of an entry."""
+    (palette,) = (coloring["palette"] for coloring in data["colorings"] if coloring["name"] == name)
+    return np.array(palette[entry - FIRST])
+
+
+@pytest.fixture(scope="module")
+def street(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    path = tmp_path_factory.mktemp("page") / "street.html"
+    assert save_page(Street(), [(0, result_of()), (1, result_of(0.0))], path, voxel=1e-4) == 2
+    return content_of(path.read_text(encoding="utf-8"))
+
+
+def test_points_keep_their_positions_and_have_the_colours_of_their_flow(street: dict[str, Any]) -> None:
+    given = Street().sweep(0).points[:50] - np.array([STEP, 0, 0], np.float32)  # without NaN
+    position, entries = points_of(street, 0)
+    distance = np.abs(given[:, None] - position[None]).max(axis=2)
+    assert len(position) == 50 and (distance.min(axis=1) <= 0.005 + 1e-6).all(), "rounded to 1 cm"
+    at = distance.argmin(axis=1)
+    flow = entries["flow"][at]
+    assert (flow[WALL] == STATIC).all() and (flow[FLOOR] == GROUND).all() and (flow[CAR] >= FIRST).all()
+    wheel = flow_to_rgb(CAR_FLOW, 1.5).astype(int)
+    assert np.abs(color_of(street, "flow", flow[0]) - wheel).max() < 40, "36 directions and 6 lengths"
+    assert (entries["truth"][at][WALL] == UNKNOWN).all(), "the truth of the wall is unknown"
+    np.testing.assert_array_equal(entries["truth"][at][CAR], flow[CAR])
+    assert (entries["error"][at][CAR] == STATIC).all() and (entries["error"][at][FLOOR] == GROUND).all()
+    car, wall = entries["object"][at][CAR], entries["object"][at][WALL]
+    assert len(set(car)) == len(set(wall)) == 1 and car[0] != wall[0] and min(car[0], wall[0]) >= FIRST
+    assert "confidence" not in entries
+    still, entries = points_of(street, 1)
+    assert (entries["flow"] < FIRST).all() and (entries["truth"] == np.where(entries["flow"], GROUND, UNKNOWN)).all()
+
+
+def test_frames_have_poses_times_and_arrows(street: dict[str, Any]) -> None:
+    first, second = street["frames"]
+    np.testing.assert_allclose(np.reshape(second["pose"], (3, 4))[:, 3], [STEP, 0, 0], atol=1e-5)
+    assert second["time"] - first["time"] == pytest.approx(0.1, abs=1e-4) and first["interval"] == 0.1
+    ((cluster, start, ahead, entry, speed),) = first["arrows"]
+    assert cluster == 3 and speed == 6.7 and not second["arrows"]
+    np.testing.assert_allclose(ahead, 5 * CAR_FLOW, atol=0.01)
+    assert np.abs(color_of(street, "flow", entry) - flow_to_rgb(CAR_FLOW, 1.5)).max() < 40
+    assert street["north"] == pytest.approx(np.pi / 2)
+
+
+def test_the_colours_of_speed_error_and_directions(tmp_path: Path) -> None:
+    """Eight directions and a wrong flow: hue, ramp, and the level of flow that is too fast."""
+    log = Street()
+    for k in range(8):
+        flow = np.array([np.cos(k * np.pi / 4 + 0.02), np.sin(k * np.pi / 4 + 0.02), 0]) * 1.49
+        result = result_of()
+        result.residual_flow[CAR] = torch_row(flow)
+        shown = show(window(log, 0), result, labels=log.labels(0))
+        position, entries = points_of(content_of(shown.html), 0)
+        (entry,) = set(entries["flow"][entries["flow"] >= FIRST])
+        assert np.abs(color_of(content_of(shown.html), "flow", entry) - flow_to_rgb(flow, 1.5)).max() < 50, k
+        error = np.linalg.norm(flow - CAR_FLOW)
+        step = min(int(error / 0.35 * 64), 63)
+        assert set(entries["error"]) <= {STATIC, GROUND, UNKNOWN, FIRST + step} and FIRST + step in entries["error"]
+        assert set(entries["speed"]) == {STATIC, GROUND, FIRST + 63}
+    result.residual_flow[CAR] = torch_row(flow * 2)
+    data = content_of(show(window(log, 0), result).html)
+    (entry,) = set(points_of(data, 0)[1]["flow"]) - {STATIC, GROUND}
+    assert color_of(data, "flow", entry).max() < 220, "darker"
+
+
+def torch_row(flow: np.ndarray) -> Any:
+    import torch
+
+    return torch.from_numpy(flow).float()
+
+
+def test_only_static_points_are_thinned_and_the_page_says_so() -> None:
+    log, result = Street(), result_of()
+    data = content_of(show(window(log, 0), result, voxel=3.0).html)
+    position, entries = points_of(data, 0)
+    given = log.sweep(0).points[:50] - np.array([STEP, 0, 0], np.float32)
+    voxels = {(*np.floor(point / 3), 0) for point in given[WALL]} | {
+        (*np.floor(point / 6), 1) for point in given[FLOOR]
+    }
+    assert (entries["flow"] >= FIRST).sum() == 20 and len(position) == 20 + len(voxels) < 50
+    assert f"{len(position)} of 50 points" in data["thinned"] and "3 m (6 m on the ground)" in data["thinned"]
+
+
+def test_tracks_have_boxes_and_one_colour_in_all_sweeps() -> None:
+    sweeps, results = [window(Street(), i) for i in range(2)], [result_of(), result_of()]
+    columns = ("x", "y", "z", "length", "width", "height", "heading", "vx", "vy")
+    table = {name: np.array([1.0, 2.0]) for name in columns}
+    table.update(id=np.array([47, 47]), sweep=np.array([0, 1]), cluster_id=np.array([3, 3]))
+    data = content_of(show(sweeps, results, tracks=table).html)
+    for frame in range(2):
+        ((number, centre, size, heading, speed),) = data["frames"][frame]["boxes"]
+        assert number == 47 and size == [frame + 1.0] * 3 and speed == round(np.hypot(1, 1) * (frame + 1), 1)
+        entries = points_of(data, frame)[1]
+        assert set(entries["object"][entries["flow"] >= FIRST]) == {FIRST + 47 % len(PALETTE)}
+
+
+def test_a_name_in_the_data_cannot_run_as_a_script() -> None:
+    html = show(window(Street(), 0), result_of(), title="</script><script>alert(1)</script>").html
+    assert "alert(1)</script>" not in html and content_of(html)["title"].startswith("</script>")
+    assert "[DATA]" not in html and "[K3D]" not in html
+
+
+def test_a_wrong_call_says_how_to_fix_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "a.html"
+    path.write_text("as it was")
+    with pytest.raises(CFlowError, match="does not end in .html"):
+        save_page(Street(), [], tmp_path / "a.htm")
+    with pytest.raises(CFlowError, match="there is no pair to show"):
+        save_page(Street(), [], path)
+    with pytest.raises(CFlowError, match="voxel=0"):
+        save_page(Street(), [], path, voxel=0)
+    with pytest.raises(CFlowError, match="2 windows, 1 results, 2 labels"):
+        show([window(Street(), 0)] * 2, [result_of()])
+    monkeypatch.setattr(page, "find_spec", lambda name: None)
+    with pytest.raises(CFlowError, match="pip install 'k3d>=3.2'"):
+        save_page(Street(), [], path)
+    assert path.read_text() == "as it was" and len(list(tmp_path.iterdir())) == 1
+
+
+# ---- in a browser ------------------------------------------------------------------------------------------------
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None)
+FLAGS = [  # software rendering, and no calls home
+    *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync"),
+    *("--disable-background-networking", "--disable-component-update"),
+    *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
+]
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright")
+    if CHROMIUM is None:
+        pytest.skip("needs Chromium: apt-get install chromium")
+    with playwright.sync_playwright() as driver:
+        started = driver.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        yield started
+        started.close()
+
+
+@pytest.fixture(scope="module")
+def drive_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A simulated drive: four sweeps, with labels and tracks."""
+    drive, model = make_drive(seed=3, num_sweeps=4, profile="demo"), make_model(make_config("fast"))
+    results = [(i, model([window(drive, i, model.config.num_history)])[0]) for i in range(3)]
+    table, path = track(drive, results), tmp_path_factory.mktemp("drive") / "drive.html"
+    save_page(drive, results, path, tracks=lambda: table, preset="fast")
+    assert path.stat().st_size < 3e6
+    return path
+
+
+def picture(tab: Any) -> np.ndarray:
+    """(H, W, 3) int64 screenshot."""
+    return np.array(Image.open(io.BytesIO(tab.screenshot())).convert("RGB")).astype(np.int64)
+
+
+def count_of(pixels: np.ndarray, colors: np.ndarray) -> int:
+    """Number of pixels that have one of (C, 3) colours, within 2 levels."""
+    return int((np.abs(pixels[:, :, None] - colors).max(axis=3) <= 2).any(axis=2).sum())
+
+
+def test_a_browser_shows_plays_and_recolours_a_drive(browser: Any, drive_page: Path) -> None:
+    context = browser.new_context(viewport={"width": 720, "height": 480}, color_scheme="dark")
+    tab, requests, errors = context.new_page(), [], []
+    tab.on("request", lambda request: requests.append(request.url))
+    tab.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+    tab.on("pageerror", lambda error: errors.append(str(error)))
+    tab.goto(drive_page.as_uri())
+    tab.wait_for_function("window.viewer && viewer.ready", timeout=60_000)
+    assert tab.locator("h1").inner_text() and "preset fast" in tab.locator("#head").inner_text()
+    assert tab.locator("#labels span:has-text('m/s')").count() > 0
+    for name in ("arrows", "boxes", "trails", "labels", "rings"):  # only points are left
+        tab.locator(f"#show-{name}").uncheck()
+    settled = "viewer.go(viewer.state.frame)"
+    tab.evaluate(settled)
+    assert tab.locator("#labels span").count() == 0
+
+    data = content_of(drive_page.read_text(encoding="utf-8"))
+    entries = points_of(data, 0)[1]
+    colors = np.array([color_of(data, "flow", e) for e in np.unique(entries["flow"]) if e >= FIRST])
+    tab.evaluate("document.querySelectorAll('.panel').forEach(panel => { panel.style.opacity = 0; })")  # not the legend
+    first = picture(tab)
+    assert count_of(first, colors) > 200, "moving objects are drawn in the colours of their flow"
+    tab.locator("#show-ground").uncheck()
+    tab.evaluate(settled)
+    assert (picture(tab) != first).any(axis=2).sum() > 500, "the ground can be hidden"
+
+    tab.locator("#coloring").select_option("object")
+    tab.evaluate(settled)
+    by_object = picture(tab)
+    assert count_of(by_object, colors) < 20 and count_of(by_object, PALETTE.astype(int)) > 1000
+    tab.locator("#slider").fill("2")
+    tab.evaluate("viewer.go(viewer.state.frame)")
+    assert tab.evaluate("viewer.state.frame") == 2 and "3/3" in tab.locator("#now").inner_text()
+    assert (picture(tab) != by_object).any(axis=2).sum() > 500, "the next sweep differs"
+    tab.locator("#play").click()
+    tab.wait_for_function("viewer.state.frame !== 2", timeout=20_000)
+    tab.locator("#play").click()
+    tab.locator("#theme").click()
+    tab.evaluate(settled)
+    assert picture(tab)[300, 2].min() > 200, "a light page"
+    assert requests == [drive_page.as_uri()] and errors == []
+    context.close()
+
+
+def test_a_phone_shows_all_controls(browser: Any, drive_page: Path) -> None:
+    context = browser.new_context(viewport={"width": 390, "height": 700}, has_touch=True, color_scheme="light")
+    tab = context.new_page()
+    tab.goto(drive_page.as_uri())
+    tab.wait_for_function("window.viewer && viewer.ready", timeout=60_000)
+    boxes = [tab.locator(name).bounding_box() for name in ("#head", "#side", "#time")]
+    for box in boxes:
+        assert box["x"] >= 0 and box["x"] + box["width"] <= 390 and box["y"] + box["height"] <= 700
+    head, side, time = boxes
+    assert head["y"] + head["height"] <= side["y"] and side["y"] + side["height"] <= time["y"], "nothing overlaps"
+    context.close()
+
+
+def test_a_notebook_shows_the_page_inline(browser: Any) -> None:
+    tab = browser.new_page()
+    tab.set_content(show(window(Street(), 0), result_of())._repr_html_())
+    tab.frame_locator("iframe").locator("#now:has-text('1/1')").wait_for(timeout=60_000)
+    tab.close()
