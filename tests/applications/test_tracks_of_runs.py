@@ -63,7 +63,7 @@ def test_the_viewer_shows_all_tracks(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert call("flow", "flow", "model=fast", "tracks=true", "engine.workers=1") == 0
     add = recording._Drive.add_tracks
     monkeypatch.setattr(recording._Drive, "add_tracks", lambda self, rows: (shown.append(rows), add(self, rows)))
-    assert call("view", "view", f"flow={tmp_path / 'flow'}") == 0
+    assert call("view", "view", "format=rerun", f"flow={tmp_path / 'flow'}") == 0
     (file,) = (tmp_path / "flow").glob("*/tracks.parquet")
     ids = np.concatenate([rows["id"] for rows in shown])
     assert len(shown) == 5 and np.array_equal(ids, read_tracks(file)["id"]) and len(ids) > 3

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Callable
 
@@ -19,6 +20,7 @@ from cflow_torch.cli.record import objective
 from cflow_torch.config import config_from
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.fleet.machine import Layout
+from cflow_torch.viz import page
 
 Cflow = Callable[..., int]
 SMALL = "model.point_cloud_range=[-20,-20,-inf,20,20,inf]"
@@ -54,18 +56,23 @@ def test_demo_writes_all_its_files(tmp_path: Path, cache: Path, cflow: Cflow, ca
     printed = capsys.readouterr().out
     assert printed.startswith("mean dynamic error 0.")
     assert f"picture: {tmp_path / 'flow.png'}" in printed and "CAR" in printed
+    if find_spec("k3d"):
+        assert f"3-D page, for any browser: {tmp_path / 'flow.html'}" in printed
+        assert '"preset":"fast"' in (tmp_path / "flow.html").read_text(encoding="utf-8")
     assert not list(tmp_path.rglob(".*")), "no temporary file is left"
 
 
-def test_demo_without_matplotlib_lacks_only_the_picture(
+def test_demo_without_the_extras_lacks_only_picture_and_page(
     tmp_path: Path, cflow: Cflow, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     for name in ("matplotlib", "matplotlib.figure", "matplotlib.backends.backend_agg"):
         monkeypatch.setitem(sys.modules, name, None)
+    monkeypatch.setattr(page, "find_spec", lambda name: None)
     assert cflow("demo", f"output={tmp_path}", "data.num_sweeps=2", "pair=0", "model=paper", SMALL) == 0
     printed = capsys.readouterr()
     assert printed.out.startswith("no picture (") and "pip install matplotlib" in printed.out and not printed.err
-    assert results_of(tmp_path)["num_pairs"] == 1 and not list(tmp_path.glob("*.png"))
+    assert results_of(tmp_path)["num_pairs"] == 1 and not list(tmp_path.glob("flow.*"))
+    assert "no page (" in printed.out and "k3d" in printed.out
 
 
 def test_the_results_file_is_complete(log_folder: Path, tmp_path: Path, evaluate: Cflow) -> None:

@@ -1,4 +1,4 @@
-"""`cflow plot` draws every picture and `cflow view` records a drive; a failure is reported and leaves no file."""
+"""`cflow plot` draws every picture and `cflow view` shows a drive; a failure is reported and leaves no file."""
 
 from __future__ import annotations
 
@@ -14,10 +14,12 @@ from PIL import Image
 
 from cflow_torch import CFlowError
 from cflow_torch.cli import plot as plot_command
+from cflow_torch.cli import run
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.log import window
 from cflow_torch.simulator import make_drive
 from cflow_torch.simulator.writers.av2 import write_av2_log
+from cflow_torch.viz import page
 
 NAME = "10203656353524179475_7625_000_7645_000"  # to Hydra, a number
 SMALL = "model.point_cloud_range=[-20,-20,-inf,20,20,inf]"
@@ -111,17 +113,29 @@ def test_missing_matplotlib_is_reported_before_the_work(
     assert cflow("plot") == 2 and "pip install matplotlib" in capsys.readouterr().err
 
 
-def test_a_recording_of_estimated_and_of_stored_flow(
-    cflow: Callable, drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+@pytest.mark.parametrize(("form", "package", "ending"), [("html", "k3d", "html"), ("rerun", "rerun", "rrd")])
+def test_a_view_of_estimated_and_of_stored_flow(
+    form: str, package: str, ending: str, cflow: Callable, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
-    pytest.importorskip("rerun")
-    assert cflow("view", "model=paper", "data.step=2", "count=5", SMALL) == 0
-    file = tmp_path / "out" / f"{NAME}.rrd"
+    pytest.importorskip(package)
+    view = ("view", f"format={form}")
+    assert cflow(*view, "model=paper", "data.step=2", "count=5", SMALL) == 0
+    file = tmp_path / "out" / f"{NAME}.{ending}"
     assert f"{file}: 2 pairs" in capsys.readouterr().out and file.stat().st_size > 1e5
     assert cflow("flow", "model=paper", "engine.workers=1", SMALL, f"output={tmp_path / 'flow'}") == 0
     sorted((tmp_path / "flow" / NAME).iterdir())[1].unlink()
     file.unlink()
-    assert cflow("view", f"flow={tmp_path / 'flow'}", "device=no_such_device") == 1, "nothing is estimated"
+    assert cflow(*view, f"flow={tmp_path / 'flow'}", "device=no_such_device") == 1, "nothing is estimated"
     printed = capsys.readouterr()
     assert f"{file}: 2 pairs" in printed.out and "1 failed" in printed.err and file.is_file()
-    assert cflow("view", "flow=nowhere") == 2 and "flow=nowhere is not a folder" in capsys.readouterr().err
+    assert cflow(*view, "flow=nowhere") == 2 and "flow=nowhere is not a folder" in capsys.readouterr().err
+
+
+def test_a_view_that_cannot_be_made_is_reported_before_the_work(
+    cflow: Callable, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.setattr(run, "open_logs", lambda cfg: pytest.fail("work"))
+    assert cflow("view", "format=pdf") == 2 and "format=pdf: give one of html, rerun" in capsys.readouterr().err
+    assert cflow("view", "voxel=0") == 2 and "voxel=0.0: give a positive length" in capsys.readouterr().err
+    monkeypatch.setattr(page, "find_spec", lambda name: None)
+    assert cflow("view") == 2 and "pip install 'k3d>=3.2'" in capsys.readouterr().err
