@@ -17,7 +17,7 @@ ROOMS = (
     *("errors", "types", "config", "stages", "ops", "windows", "model", "dense", "keypoints", "verified", "estimate"),
     *("data", "simulator", "evaluation", "viz", "fleet", "applications", "integrations", "configs", "cli"),
 )
-HEAVY = ("kornia", "matplotlib", "hydra", "omegaconf", "pyarrow", "h5py", "cv2", "sklearn", "ray", "rerun")
+HEAVY = ("kornia", "matplotlib", "hydra", "omegaconf", "pyarrow", "h5py", "cv2", "sklearn", "ray", "rerun", "k3d")
 
 
 def test_imports_point_one_way():

@@ -55,12 +55,12 @@ def main() -> None:
 def write_page(drive, page: Path) -> None:
     """Estimate the flow and the tracks, and save the page."""
     model = make_model(make_config("default"))
-    log = CachedLog(drive, model.config.num_sweeps)
+    log = CachedLog(drive, FIRST + COUNT + 1)  # a sweep is simulated once
     results = []
     for i in range(FIRST, FIRST + COUNT):
         results += [(i, model([window(log, i, model.config.num_history, model.config.num_future)])[0])]
         print(f"\r{i - FIRST + 1} of {COUNT} pairs", end="", flush=True)
-    table = track(drive, results)
+    table = track(log, results)
     save_page(log, results, page, tracks=lambda: table, preset="default")
 
 
