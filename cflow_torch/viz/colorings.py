@@ -25,7 +25,7 @@ def make_colorings(max_flow: float, interval: float) -> list[dict[str, Any]]:
         interval: seconds from sweep to sweep.
     """
     speed = max_flow / interval
-    rim = f"right: ahead at the start; rim: {max_flow:.4g} m per sweep, {speed:.3g} m/s"
+    rim = f"right: ahead of the vehicle; rim: {max_flow:.4g} m per sweep, {speed:.3g} m/s"
     wheel, ramp, objects = _wheel().tolist(), _ramp().tolist(), PALETTE.tolist()
     likely = "probability of an error below 0.1 m"
     rows = (

@@ -41,7 +41,7 @@ def main() -> None:
     given = parser.parse_args()
     given.output.mkdir(parents=True, exist_ok=True)
     page = given.page or given.output / "crossing.html"
-    drive = make_drive(SEED, FIRST + COUNT + 1, "av2", "crossing")
+    drive = make_drive(SEED, FIRST + COUNT + 2, "av2", "crossing")
     if given.page is None:
         write_page(drive, page)
     T_viewer_ego = np.linalg.inv(drive.poses[FIRST + 1]) @ drive.poses[FIRST + 1 : FIRST + 2 + COUNT]
