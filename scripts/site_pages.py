@@ -16,7 +16,6 @@ FORMULA = re.compile(r'<(?P<tag>div|span) class="arithmatex">\\[(\[](?P<latex>.*
 SECTION = re.compile(r"<p>(Convention|Cost|Source|Ties|Warns|Example): ")
 PAGE = re.compile(r"(?<![\w/\"])docs/(\w+)\.md(?!\")")
 STYLE = """.md-grid { max-width: 76rem; }
-.output { border: 0; width: 100%; height: 32rem; }
 """
 
 
@@ -47,8 +46,8 @@ def notebook_page(path: Path) -> str:
             data = {kind: "".join(value) for kind, value in kinds.items()}
             if "image/png" in data:
                 parts.append(f"![output](data:image/png;base64,{data['image/png'].strip()})")
-            elif "text/html" in data:
-                parts.append(f'<iframe class="output" srcdoc="{html.escape(data["text/html"])}"></iframe>')
+            elif data.get("text/html", "").startswith("<iframe"):  # Markdown ends HTML at an empty line
+                parts.append(data["text/html"].replace("\n", "&#10;"))
             else:
                 parts.append(f"```text\n{data['text/plain'].rstrip()}\n```")
     return "\n\n".join(parts)
