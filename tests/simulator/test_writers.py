@@ -80,14 +80,11 @@ def test_raster_finds_the_ground(drive, folder):
     assert found[sweep.is_ground].all() and clear.sum() > 30_000 and not found[clear].any()
 
 
-def test_an_existing_log_is_only_replaced_on_request(tmp_path):
-    old, new = (make_drive(seed=1, num_sweeps=n, profile="demo") for n in (1, 2))
-    folder = write_av2_log(old, tmp_path)
-    with pytest.raises(CFlowError, match="overwrite=True"):
-        write_av2_log(new, tmp_path)
-    assert len(list((folder / "sensors" / "lidar").iterdir())) == 1
-    assert write_av2_log(new, tmp_path, overwrite=True) == folder
-    assert len(list((folder / "sensors" / "lidar").iterdir())) == 2 and os.listdir(tmp_path) == [folder.name]
+def test_an_existing_log_is_not_replaced(tmp_path):
+    folder = write_av2_log(make_drive(seed=1, num_sweeps=1, profile="demo"), tmp_path)
+    with pytest.raises(CFlowError, match="exists already"):
+        write_av2_log(make_drive(seed=1, num_sweeps=2, profile="demo"), tmp_path)
+    assert len(list((folder / "sensors" / "lidar").iterdir())) == 1 and os.listdir(tmp_path) == [folder.name]
 
 
 def test_waymo_writes_true_poses_where_a_turn_begins(tmp_path, monkeypatch):

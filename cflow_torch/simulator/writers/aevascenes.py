@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import uuid
 from pathlib import Path
-from typing import Any, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -37,13 +37,12 @@ _PATH_KEY = {"v2": "point_cloud_compensated_path", "v0.1": "point_cloud_path"}
 _XYZ = ("x", "y", "z")
 
 
-def write_aevascenes_sequence(log: Recording, root: str | Path, overwrite: bool = False, layout: str = "v2") -> Path:
+def write_aevascenes_sequence(log: Recording, root: str | Path, layout: str = "v2") -> Path:
     """Write `log` to `root/<log_id>`.
 
     Args:
         log: the recording.
         root: folder of the split, made if it does not exist.
-        overwrite: replace a sequence of that name.
         layout: "v2", or "v0.1" with its older key for the paths of the clouds.
 
     Returns:
@@ -55,7 +54,7 @@ def write_aevascenes_sequence(log: Recording, root: str | Path, overwrite: bool 
         - Only the compensated clouds are written, because a recording has no others.
         - Every point has a class name: "road" on the ground, the class of the box that holds it, or "other_structure".
           `semantic_labels_idx` is the position of the name in `CATEGORY_NAME`, which is not Aeva's table.
-        - Box velocities are over ground in axes of the vehicle, from the track's poses in the two nearest frames.
+        - Boxes have no velocities, which the reader does not use.
 
     Raises:
         CFlowError: the sequence exists already, the folder name or the layout is not valid, a shot is before its
@@ -63,7 +62,7 @@ def write_aevascenes_sequence(log: Recording, root: str | Path, overwrite: bool 
     """
     if layout not in _PATH_KEY:
         raise CFlowError(f"layout={layout!r}: give one of {', '.join(_PATH_KEY)}")
-    with new_folder(root, log.log_id, overwrite) as folder:
+    with new_folder(root, log.log_id) as folder:
         (folder / _FOLDER).mkdir()
         _write_sequence(log, folder, _PATH_KEY[layout])
     return Path(root) / log.log_id
@@ -97,7 +96,6 @@ def _write_sequence(log: Recording, folder: Path, path_key: str) -> None:
                 "boxes": _boxes(boxes),
             }
         )
-    _add_velocities(frames, poses)
     metadata = {
         "sequence_uuid": log.log_id,
         "sensors": {"lidars": list(mounts), "cameras": []},
@@ -149,7 +147,7 @@ def _class_of(category: str) -> str:
 
 
 def _boxes(boxes: Boxes) -> list[dict[str, Any]]:
-    """The boxes of a frame, without velocities."""
+    """The boxes of a frame."""
     return [
         {
             "id": track,
@@ -158,32 +156,9 @@ def _boxes(boxes: Boxes) -> list[dict[str, Any]]:
             "reference_frame": "VEHICLE",
             "dimensions": dict(zip(_XYZ, size.tolist())),
             "pose": _pose(pose),
-            "linear_velocity": dict.fromkeys(_XYZ, 0.0),
-            "angular_velocity": dict.fromkeys(_XYZ, 0.0),
         }
         for track, category, size, pose in zip(boxes.track_id, boxes.category, boxes.size, boxes.pose)
     ]
-
-
-def _add_velocities(frames: Sequence[dict[str, Any]], poses: np.ndarray) -> None:
-    """Add linear velocities and yaw rates, from the two nearest boxes of the same track."""
-    tracks: dict[str, list[Any]] = {}
-    for frame, pose in zip(frames, poses):
-        for box in frame["boxes"]:
-            tracks.setdefault(box["id"], []).append((frame["timestamp_ns"], pose, box))
-    for track in tracks.values():
-        if len(track) < 2:
-            continue
-        seconds = np.array([(stamp - track[0][0]) * 1e-9 for stamp, _, _ in track])
-        centres = np.stack(
-            [pose[:3, :3] @ list(box["pose"]["translation"].values()) + pose[:3, 3] for _, pose, box in track]
-        )
-        q = np.array([list(box["pose"]["rotation"].values()) for _, _, box in track])
-        yaw = 2 * np.arctan2(q[:, 3], q[:, 0]) + [np.arctan2(pose[1, 0], pose[0, 0]) for _, pose, _ in track]
-        speeds, yaw_rates = np.gradient(centres, seconds, axis=0), np.gradient(np.unwrap(yaw), seconds)
-        for (_, pose, box), speed, rate in zip(track, speeds, yaw_rates):
-            box["linear_velocity"] = dict(zip(_XYZ, (pose[:3, :3].T @ speed).tolist()))
-            box["angular_velocity"]["z"] = float(rate)
 
 
 def _pose(T: np.ndarray) -> dict[str, Any]:

@@ -21,13 +21,12 @@ CITY = "SYN"  # in place of Argoverse 2's code of the city
 _DYNAMIC = 0.05  # metres per sweep from which a point counts as dynamic in Argoverse 2
 
 
-def write_av2_log(log: Recording, root: str | Path, overwrite: bool = False) -> Path:
+def write_av2_log(log: Recording, root: str | Path) -> Path:
     """Write `log` to `root/<log_id>` in Argoverse 2's layout.
 
     Args:
         log: the recording.
         root: folder of the split, made if it does not exist.
-        overwrite: replace a log of that name.
 
     Returns:
         The log's folder.
@@ -42,21 +41,21 @@ def write_av2_log(log: Recording, root: str | Path, overwrite: bool = False) -> 
     Raises:
         CFlowError: the log exists already, or its name cannot be used as a folder name.
     """
-    with new_folder(root, log.log_id, overwrite) as folder:
+    with new_folder(root, log.log_id) as folder:
         _write_log(log, folder)
     return Path(root) / log.log_id
 
 
 @contextmanager
-def new_folder(root: str | Path, log_id: str, overwrite: bool) -> Iterator[Path]:
+def new_folder(root: str | Path, log_id: str) -> Iterator[Path]:
     """A folder to fill, which becomes `root/<log_id>` when the block ends and is deleted if the block raises.
 
     Raises:
-        CFlowError: `log_id` cannot be used as a folder name, or the folder exists and `overwrite` is False.
+        CFlowError: `log_id` cannot be used as a folder name, or the folder exists.
     """
     folder = Path(root) / safe_name(log_id, "log_id")
-    if folder.exists() and not overwrite:
-        raise CFlowError(f"{folder} exists already; pass overwrite=True to replace it, or choose another root")
+    if folder.exists():
+        raise CFlowError(f"{folder} exists already: delete it, or choose another root")
     with atomic_folder(folder) as new:
         yield new
 

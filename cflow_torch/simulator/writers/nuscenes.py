@@ -40,7 +40,6 @@ def write_nuscenes(
     root: str | Path,
     version: str = "v1.0-mini",
     key_frame_interval: float = 0.5,
-    overwrite: bool = False,
 ) -> Path:
     """Write `recording` to `root/<log_id>`, a data root of nuScenes with one scene of that name.
 
@@ -50,7 +49,6 @@ def write_nuscenes(
         version: name of the folder of the tables.
         key_frame_interval: seconds between samples; only samples have boxes. The first and the last sweep are samples,
             so that every pair has truth.
-        overwrite: replace a scene of that name.
 
     Returns:
         The data root.
@@ -69,7 +67,7 @@ def write_nuscenes(
     def write_points(file: Path, unit: UnitReturns, stamp_ns: int) -> None:
         file.write_bytes(np.column_stack([unit.points, unit.intensity, unit.ring]).astype("<f4").tobytes())
 
-    with new_folder(root, recording.log_id, overwrite) as folder:
+    with new_folder(root, recording.log_id) as folder:
         scene = SceneWriter(recording, folder, "LIDAR_TOP", NUSCENES_NAMES)
         tables = scene.write("{name}__{channel}__{stamp}.pcd.bin", write_points, key_frame_interval)
         log, image = scene.token("log"), f"maps/{recording.log_id}.png"

@@ -22,13 +22,12 @@ TRUCKSCENES_NAMES: dict[str, str] = {
 """Argoverse 2 category -> the nearest category of TruckScenes."""
 
 
-def write_truckscenes(recording: Recording, root: str | Path, overwrite: bool = False) -> Path:
+def write_truckscenes(recording: Recording, root: str | Path) -> Path:
     """Write `recording` to `root/<log_id>`, a data root of TruckScenes with one scene of that name.
 
     Args:
         recording: the recording. If none of its LiDARs is called LIDAR_LEFT, the first one gets that name.
         root: folder, made if it does not exist.
-        overwrite: replace a scene of that name.
 
     Returns:
         The data root.
@@ -50,7 +49,7 @@ def write_truckscenes(recording: Recording, root: str | Path, overwrite: bool = 
         fields = {"x": x, "y": y, "z": z, "intensity": unit.intensity.astype(np.float32), "timestamp": times}
         write_pcd(file, fields)
 
-    with new_folder(root, recording.log_id, overwrite) as folder:
+    with new_folder(root, recording.log_id) as folder:
         scene = SceneWriter(recording, folder, "LIDAR_LEFT", TRUCKSCENES_NAMES)
         tables = scene.write("{channel}_{stamp}.pcd", write_points, _KEY_FRAME_INTERVAL)
         write_tables(folder / _VERSION, {**tables, **{name: [] for name in _EMPTY}})

@@ -34,14 +34,13 @@ del BOX_TYPE["RAILED_VEHICLE"]
 _XYZ = ("x", "y", "z")
 
 
-def write_waymo_segment(log: Recording, root: str | Path, overwrite: bool = False) -> Path:
+def write_waymo_segment(log: Recording, root: str | Path) -> Path:
     """Write `log` to `root/<component>/<log_id>.parquet`, one row group per frame.
 
     Args:
         log: the recording. Units with a name of `LASERS` keep it. If no unit has one, they become TOP, FRONT, ... in
             their order.
         root: folder of the split, made if it does not exist.
-        overwrite: replace a segment of that name.
 
     Returns:
         The file of the component `lidar`, which `WaymoLog` takes.
@@ -64,14 +63,12 @@ def write_waymo_segment(log: Recording, root: str | Path, overwrite: bool = Fals
     name = safe_name(f"{log.log_id}.parquet", "the file of log_id")
     files = {tag: root / tag / name for tag in SCHEMAS}
     present = [str(file) for file in files.values() if file.exists()]
-    if present and not overwrite:
-        raise CFlowError(f"{present[0]} exists; give overwrite=True to replace the segment")
+    if present:
+        raise CFlowError(f"{present[0]} exists already: delete the segment, or choose another root")
     root.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{log.log_id}-", dir=root) as folder:
         _write_components(log, Path(folder))
-        # Readers search for the file `lidar`: remove it first and add it last, so that they never find a mixed segment.
-        if files["lidar"].exists():
-            files["lidar"].unlink()
+        # Readers search for the file `lidar`: add it last, so that they never find half a segment.
         for tag in sorted(files, key=lambda tag: tag == "lidar"):
             files[tag].parent.mkdir(exist_ok=True)
             os.replace(Path(folder) / tag, files[tag])
