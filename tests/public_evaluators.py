@@ -16,7 +16,6 @@ from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.categories import META_CLASSES
 from cflow_torch.data.log import FlowLabels
 from cflow_torch.evaluation import EvalFrame, SceneFlowMetrics
-from cflow_torch.evaluation.frame import ego_motion_flow
 
 TOLERANCE = 1e-6
 LOG, TIME = "7fab2350-7eaf-3b7e-a39d-6937a4c1bede", 315966265259836000  # the real pair
@@ -48,10 +47,8 @@ def check(label: str, numbers: Comparison) -> None:
 class Pair:
     """The real pair of Argoverse 2 with its stored labels and two versions of its ego motion."""
 
-    folder: Path
     points: np.ndarray
     labels: FlowLabels
-    is_dynamic: np.ndarray  # as the label file says
     is_ground: np.ndarray  # as the label file says
     bsfe_ground: np.ndarray
     T_float32: np.ndarray  # of the label file, 0.8 mm off the poses
@@ -64,10 +61,8 @@ def read_pair(folder: Path) -> Pair:
     assert labels is not None
     stored = feather.read_table(str(folder / "flow_labels.feather"))
     return Pair(
-        folder=folder,
         points=now.points,
         labels=labels,
-        is_dynamic=stored["dynamic"].to_numpy(),
         is_ground=stored["is_ground_0"].to_numpy(),
         bsfe_ground=AV2Log(folder, ground="bsfe").sweep(0).is_ground,
         T_float32=np.load(folder / "ego_motion.npz")["ego_motion"][0].astype(np.float64),
@@ -80,11 +75,9 @@ def official_mask(pair: Pair) -> np.ndarray:
     return ~pair.is_ground & (np.abs(pair.points[:, :2]) <= 50).all(axis=1)
 
 
-def predictions(pair: Pair) -> dict[str, np.ndarray]:
-    """Residuals in the axes of t+1."""
-    residual = pair.labels.flow - ego_motion_flow(pair.points, pair.T_float32)
-    noise = np.random.default_rng(0).normal(0, 0.05, pair.points.shape).astype(np.float32)
-    return {"zero": np.zeros_like(noise), "half": 0.5 * residual, "noise": noise}
+def noise(pair: Pair) -> np.ndarray:
+    """A prediction: residuals in the axes of t+1."""
+    return np.random.default_rng(0).normal(0, 0.05, pair.points.shape).astype(np.float32)
 
 
 # ---------------------------------------------------------------------------------------------- made-up frames
@@ -111,12 +104,6 @@ def total_flow(points: np.ndarray, residual: np.ndarray, T: np.ndarray) -> np.nd
     """Total flow of residuals in the axes of t: T (p + r) - p."""
     start = points.astype(np.float64)
     return ((start + residual) @ T[:3, :3].T + T[:3, 3] - start).astype(np.float32)
-
-
-def residual_at_t(pair: Pair) -> np.ndarray:
-    """True residual of the real pair in the axes of t, by the float64 poses."""
-    T, start = pair.T_float64, pair.points.astype(np.float64)
-    return ((start + pair.labels.flow - T[:3, 3]) @ T[:3, :3] - start).astype(np.float32)
 
 
 def write_table(file: Path, **columns: np.ndarray) -> None:

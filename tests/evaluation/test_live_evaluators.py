@@ -1,8 +1,8 @@
 """Our scores compared with those of the public evaluators: av2 0.3.6 and bucketed-scene-flow-eval 2.0.25.
 
 The tests are skipped where these packages are not installed; docs/evaluation.md has the commands. We compare every
-number that an evaluator returns. Both sides get the same truth, evaluation mask or ground, and ego motion T, so that
-they can differ by arithmetic only.
+number that an evaluator returns for made-up frames; test_golden.py has their numbers for a real pair. Both sides get
+the same truth, evaluation mask or ground, and ego motion T, so that they can differ by arithmetic only.
 """
 
 from __future__ import annotations
@@ -22,13 +22,8 @@ from public_evaluators import (
     TIME,
     Comparison,
     MadeUp,
-    Pair,
     bucket_numbers,
     check,
-    official_mask,
-    predictions,
-    read_pair,
-    residual_at_t,
     score,
     three_way_numbers,
     total_flow,
@@ -37,25 +32,10 @@ from public_evaluators import (
 )
 from scenes import pose
 
-from cflow_torch import CorrelationFlow
 from cflow_torch.data.av2 import AV2Log
-from cflow_torch.data.log import FlowLabels, window
+from cflow_torch.data.log import FlowLabels
 from cflow_torch.evaluation import DEFINITIONS, EvalFrame
 from cflow_torch.evaluation.frame import ego_motion_flow
-
-PREDICTIONS = ("zero", "half", "noise", "paper")
-
-
-@pytest.fixture(scope="module")
-def pair(av2_folder: Path) -> Pair:
-    return read_pair(av2_folder)
-
-
-@pytest.fixture(scope="module")
-def residuals(pair: Pair) -> dict[str, np.ndarray]:
-    """Predictions in the axes of t+1."""
-    (result,) = CorrelationFlow.from_preset("paper")([window(AV2Log(pair.folder), 0)])
-    return {**predictions(pair), "paper": result.residual_flow.numpy()}
 
 
 def is_long(flow: np.ndarray) -> np.ndarray:
@@ -120,22 +100,6 @@ def truth_for_av2(points: np.ndarray, labels: FlowLabels, is_dynamic: np.ndarray
         "is_valid": labels.is_valid[mask],
         "flow": labels.flow[mask],
     }
-
-
-@pytest.mark.parametrize("name", PREDICTIONS)
-@pytest.mark.parametrize("ego_motion", ["T_float32", "T_float64"])
-def test_av2_on_the_real_pair(
-    av2_tools: ModuleType, pair: Pair, residuals: dict[str, Any], name: str, ego_motion: str
-) -> None:
-    T, av2_mask = getattr(pair, ego_motion), official_mask(pair)
-    pose_flow = ego_motion_flow(pair.points, T)
-    total = pose_flow + residuals[name]
-    prediction = {"flow": total[av2_mask], "is_dynamic": is_long(total - pose_flow)[av2_mask]}
-    truth = truth_for_av2(pair.points, pair.labels, pair.is_dynamic, av2_mask)
-    frame = EvalFrame(pair.points, pair.labels, flow=total, T_ego1_ego0=T, eval_mask=av2_mask)
-    numbers = compare_av2(score("av2", [frame])["three_way"], *run_av2(av2_tools, [truth], [prediction]))
-    check(f"av2, {name}, {ego_motion}", numbers)
-    assert len(numbers) == 8 * 5 + 4 * 9 + 2 + 3
 
 
 # ---------------------------------------------------------------------------------------------- made-up frames
@@ -231,17 +195,6 @@ def check_bsfe(
             check(f"bsfe buckets, {where}", bucket_numbers(ours["bucketed"], run[0], output, distance))
             found = run[1].compute_results(return_distance_threshold=distance)
             check(f"bsfe three-way, {where}", three_way_numbers(ours["three_way"], found))
-
-
-@pytest.mark.parametrize("name", ["noise", "paper"])
-def test_bsfe_on_the_real_pair(
-    bsfe: ModuleType, pair: Pair, residuals: dict[str, Any], tmp_path: Path, name: str
-) -> None:
-    T, labels = pair.T_float64, pair.labels
-    truth = write_bsfe_truth(tmp_path / "truth", [(residual_at_t(pair), labels.category, labels.is_valid)])
-    predicted = (residuals[name].astype(np.float64) @ T[:3, :3]).astype(np.float32)
-    frame = EvalFrame(pair.points, labels, residual_flow=residuals[name], T_ego1_ego0=T, is_ground=pair.bsfe_ground)
-    check_bsfe(bsfe, name, pair.folder.parent, truth, [predicted], [frame])
 
 
 @pytest.mark.parametrize("seed", range(2))
