@@ -1,4 +1,4 @@
-"""Write a recording in the layout of the Waymo Open Dataset, version 2: six parquet files per segment."""
+"""Write a recording in the layout of the Waymo Open Dataset, version 2: five parquet files per segment."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def write_waymo_segment(log: Recording, root: str | Path) -> Path:
         - Other lasers: range images of the vehicle at the pose of the frame, without poses of pixels. Returns on the
           rays of their pixels keep float32 accuracy, 5e-6 m at 75 m; others are moved onto the ray, by up to 5 mm.
         - Times are rounded to microseconds. Boxes keep their heading only, without roll and pitch.
-        - There are no second returns, no elongation, no no-label zones and no accelerations.
+        - There are no second returns, no elongation, no no-label zones and no speeds of boxes.
 
     Raises:
         CFlowError: the segment exists already, its name cannot be used for a file, there are more than five units, a
@@ -106,12 +106,9 @@ def _write_components(log: Recording, folder: Path) -> None:
                 if index == 0:
                     tables["lidar_calibration"].append(_calibration_row(log.log_id, number, calibration))
             _write_rows(writers["lidar"], rows)
-            boxes = _box_rows(log, index, key)
-            tables["lidar_box"] += boxes
+            tables["lidar_box"] += _box_rows(log, index, key)
             tables["vehicle_pose"].append({**key, VEHICLE_POSE: pose.reshape(-1)})
-            tables["stats"].append({**key, **_stats(boxes)})
-        _add_speeds(tables["lidar_box"], dict(zip(times, np.asarray(log.poses, np.float64))))
-        for tag in ("lidar_calibration", "lidar_box", "vehicle_pose", "stats"):
+        for tag in ("lidar_calibration", "lidar_box", "vehicle_pose"):
             _write_rows(writers[tag], tables[tag])
 
 
@@ -146,7 +143,7 @@ def _calibration_row(log_id: str, number: int, calibration: LaserCalibration) ->
 
 
 def _box_rows(log: Recording, index: int, key: dict[str, Any]) -> list[dict[str, Any]]:
-    """Boxes of one frame, without speeds."""
+    """Boxes of one frame."""
     boxes, rows = log.boxes(index), []
     for track, category, size, pose, count in zip(
         boxes.track_id, boxes.category, boxes.size, boxes.pose, boxes.num_points
@@ -158,28 +155,6 @@ def _box_rows(log: Recording, index: int, key: dict[str, Any]) -> list[dict[str,
             kind = {f"{BOX}type": BOX_TYPE[category], f"{BOX}num_lidar_points_in_box": int(count)}
             rows.append({**key, TRACK: track, **numbers, **kind})
     return rows
-
-
-def _add_speeds(rows: Sequence[dict[str, Any]], poses: dict[int, np.ndarray]) -> None:
-    """Add velocities over ground in world axes, from the track's centres in the two nearest frames."""
-    tracks: dict[str, list[dict[str, Any]]] = {}
-    for row in rows:
-        tracks.setdefault(row[TRACK], []).append(row)
-    for track in tracks.values():
-        if len(track) < 2:
-            continue
-        seconds = np.array([row[TIME] - track[0][TIME] for row in track]) * 1e-6
-        local = np.array([[row[f"{BOX}box.center.{axis}"] for axis in _XYZ] for row in track])
-        pose = np.stack([poses[row[TIME]] for row in track])
-        centres = np.einsum("nij,nj->ni", pose[:, :3, :3], local) + pose[:, :3, 3]
-        for row, speed in zip(track, np.gradient(centres, seconds, axis=0)):
-            row.update({f"{BOX}speed.{axis}": speed[k] for k, axis in enumerate(_XYZ)})
-
-
-def _stats(boxes: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    types, counts = np.unique([row[f"{BOX}type"] for row in boxes], return_counts=True)
-    values: tuple[Any, ...] = ("Day", "synthetic", "sunny", types.astype(np.int8), counts, [], [])
-    return dict(zip(SCHEMAS["stats"].names[2:], values))
 
 
 def _write_rows(writer: pq.ParquetWriter, rows: Sequence[dict[str, Any]]) -> None:

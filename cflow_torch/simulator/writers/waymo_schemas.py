@@ -1,4 +1,4 @@
-"""The columns of Waymo's parquet files, as printed by the official classes."""
+"""The columns of Waymo's parquet files that the reader reads, as printed by the official classes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ from cflow_torch.data.waymo.parquet import (
     VEHICLE_POSE,
 )
 
-STATS = "[StatsComponent]."
 _IMAGE, _SHAPE, _TRANSFORM = pa.list_(pa.float32()), pa.list_(pa.int32(), 3), pa.list_(pa.float64(), 16)
 _FRAME_KEYS: list[tuple[str, Any]] = [(SEGMENT, pa.string()), (TIME, pa.int64())]
 SCHEMAS: dict[str, pa.Schema] = {
@@ -51,21 +50,6 @@ SCHEMAS: dict[str, pa.Schema] = {
             (f"{BOX}box.heading", pa.float64()),
             (f"{BOX}type", pa.int8()),
             (f"{BOX}num_lidar_points_in_box", pa.int64()),
-            (f"{BOX}num_top_lidar_points_in_box", pa.int64()),
-            *((f"{BOX}{part}.{axis}", pa.float64()) for part in ("speed", "acceleration") for axis in "xyz"),
-            (f"{BOX}difficulty_level.detection", pa.int8()),
-            (f"{BOX}difficulty_level.tracking", pa.int8()),
-        ]
-    ),
-    "stats": pa.schema(
-        [
-            *_FRAME_KEYS,
-            *((STATS + name, pa.string()) for name in ("time_of_day", "location", "weather")),
-            *(
-                (f"{STATS}{sensor}_object_counts.{part}", pa.list_(kind))
-                for sensor in ("lidar", "camera")
-                for part, kind in (("types", pa.int8()), ("counts", pa.int32()))
-            ),
         ]
     ),
 }
