@@ -21,19 +21,19 @@ GROUND = (None, "auto", "patchwork")
 
 
 def estimate_flow(
-    pc0: Array,  # (N0, 3+), metres, ego frame of sweep t
-    pc1: Array,  # (N1, 3+), metres, ego frame of sweep t+1
+    pc0: Array | Sweep,  # (N0, 3+), metres, ego frame of sweep t
+    pc1: Array | Sweep,  # (N1, 3+), metres, ego frame of sweep t+1
     *,
     T_ego1_ego0: Array | None = None,  # (4, 4)
     gm0: Array | None = None,  # (N0,) bool
     gm1: Array | None = None,  # (N1,) bool
-    pch: Sequence[Array] = (),  # (Nh, 3+) each, nearest first
+    pch: Sequence[Array | Sweep] = (),  # (Nh, 3+) each, nearest first
     T_ego1_egoh: Sequence[Array | None] = (),
     gmh: Sequence[Array | None] = (),
     dt0: Array | None = None,  # (N0,), seconds
     dt1: Array | None = None,  # (N1,), seconds
     dth: Sequence[Array | None] = (),
-    pcf: Sequence[Array] = (),  # (Nf, 3+) each, nearest first
+    pcf: Sequence[Array | Sweep] = (),  # (Nf, 3+) each, nearest first
     T_ego1_egof: Sequence[Array | None] = (),
     gmf: Sequence[Array | None] = (),
     dtf: Sequence[Array | None] = (),
@@ -47,7 +47,8 @@ def estimate_flow(
     """Estimate the scene flow from sweep t to sweep t+1.
 
     Args:
-        pc0: points of sweep t, (N0, 3+) float of any width, array or tensor. Columns after z are ignored.
+        pc0: points of sweep t, (N0, 3+) float of any width, array or tensor. Columns after z are ignored. Or a `Sweep`,
+            which also contains mask, pose and times; then all of `pc0`, `pc1`, `pch` and `pcf` are sweeps.
         pc1: points of sweep t+1, (N1, 3+).
         T_ego1_ego0: (4, 4), maps coordinates of the ego frame at t to the one at t+1 (pose1^-1 pose0). None = pc0 is
             already in the frame of t+1.
@@ -100,12 +101,27 @@ def estimate_flow(
     moved = None if T_ego1_ego0 is None else "T_ego1_ego0"  # the transform that is given
     if moved is None and any(transform is not None for transform in (*T_ego1_egoh, *T_ego1_egof)):
         moved = "another transform"
-    window = Window(
-        pc0=_sweep(moved, pc0, gm0, T_ego1_ego0, dt0),
-        pc1=_sweep(moved, pc1, gm1, None, dt1),
-        pch=_sweeps(moved, "h", pch, gm=gmh, T_ego1_ego=T_ego1_egoh, dt=dth),
-        pcf=_sweeps(moved, "f", pcf, gm=gmf, T_ego1_ego=T_ego1_egof, dt=dtf),
-    )
+    if isinstance(pc0, Sweep) or isinstance(pc1, Sweep):
+        one = {"T_ego1_ego0": T_ego1_ego0, "gm0": gm0, "gm1": gm1, "dt0": dt0, "dt1": dt1}
+        several = {
+            "T_ego1_egoh": T_ego1_egoh,
+            "gmh": gmh,
+            "dth": dth,
+            "T_ego1_egof": T_ego1_egof,
+            "gmf": gmf,
+            "dtf": dtf,
+        }
+        extra = [name for name, value in {**one, **several}.items() if value is not None and len(value) > 0]
+        if extra:
+            raise CFlowError(f"{', '.join(extra)} and a Sweep are given: put masks, poses and times into the Sweep")
+        window = Window(pc0, pc1, tuple(pch), tuple(pcf))  # type: ignore[arg-type]  # check_windows finds arrays
+    else:
+        window = Window(
+            pc0=_sweep(moved, pc0, gm0, T_ego1_ego0, dt0),
+            pc1=_sweep(moved, pc1, gm1, None, dt1),
+            pch=_sweeps(moved, "h", pch, gm=gmh, T_ego1_ego=T_ego1_egoh, dt=dth),
+            pcf=_sweeps(moved, "f", pcf, gm=gmf, T_ego1_ego=T_ego1_egof, dt=dtf),
+        )
     check_windows([window])
     window = _find_ground(keep_nearest(window, config.num_history), ground, device)
     (result,) = make_model(config, device)([window])
@@ -177,7 +193,7 @@ def _sweep(moved: str | None, points: Array, is_ground: Any, transform: Array | 
     return Sweep(points, is_ground, pose, point_times=times)
 
 
-def _sweeps(moved: str | None, side: str, clouds: Sequence[Array], **others: Sequence[Any]) -> tuple[Sweep, ...]:
+def _sweeps(moved: str | None, side: str, clouds: Sequence[Any], **others: Sequence[Any]) -> tuple[Sweep, ...]:
     """The sweeps of one side, "h" (history) or "f" (future), from lists with one entry per sweep, or none."""
     if moved is not None and len(clouds) > 0 and len(others["T_ego1_ego"]) == 0:
         raise CFlowError(

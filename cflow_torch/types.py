@@ -133,13 +133,38 @@ class FlowResult:
         positions = {} if points is None else dict(zip("xyz", self._positions(points).T))
         return pandas.DataFrame({**positions, **self.columns()})
 
-    def objects(self, points: Array, sweep_interval: float = 0.1, min_speed: float = 0.5) -> np.ndarray:
+    def to_open3d(self, points: Array) -> Any:
+        """An `open3d.t.geometry.PointCloud` of pc0 with an attribute for every field that is not None.
+
+        Args:
+            points: (N, 3+) of pc0.
+
+        Raises:
+            CFlowError: Open3D is not installed, or the number of points differs.
+
+        Example:
+            >>> cloud = result.to_open3d(points)
+            >>> cloud.point.colors = flow_to_rgb(result.residual_flow.numpy(), 1.0)  # of cflow_torch.viz
+        """
+        try:
+            from open3d.t.geometry import PointCloud
+        except ImportError:
+            raise CFlowError("to_open3d needs Open3D: pip install open3d; numpy() returns the same as arrays") from None
+        cloud = PointCloud(np.ascontiguousarray(self._positions(points), np.float32))
+        for name, values in self.numpy().items():
+            cloud.point[name] = values.reshape(len(values), -1)
+        return cloud
+
+    def objects(
+        self, points: Array, sweep_interval: float = 0.1, min_speed: float = 0.5, min_points: int = 10
+    ) -> np.ndarray:
         """List the moving objects at t+1.
 
         Args:
             points: (N, 3+) of pc0, metres, as you passed them.
             sweep_interval: seconds from sweep t to sweep t+1.
             min_speed: m/s; slower clusters are left out.
+            min_points: clusters with fewer points are left out; most of them are small parts of the static world.
 
         Returns:
             (K,) structured array, sorted by id, in the ego frame at t+1. `id`: cluster_id. `centre`: (3,) metres, of
@@ -150,8 +175,8 @@ class FlowResult:
         Convention:
             The box encloses the points of sweep t, moved by their flow. If only one side of an object is visible, the
             box encloses that side. On simulated drives, objects of 50 points and more have their centre inside the true
-            box and their velocity within 0.75 m/s, except for a turning articulated lorry (4 m/s). Two thirds of all
-            rows are small pieces of the static world; nearly all of these have a confidence below 0.7.
+            box and their velocity within 0.75 m/s, except for a turning articulated lorry (4 m/s). Many smaller ones are
+            pieces of the static world; nearly all of these have a confidence below 0.7, and `track` removes them.
 
         Raises:
             CFlowError: the number of points differs, or the result is from a file without flow or clusters.
@@ -186,7 +211,8 @@ class FlowResult:
         ahead, left, z = ((low + high) / 2).T
         objects["centre"] = np.stack([cos * ahead - sin * left, sin * ahead + cos * left, z], axis=1)
         objects["size"] = high - low
-        return objects[np.linalg.norm(objects["velocity"], axis=1) >= min_speed]
+        is_fast = np.linalg.norm(objects["velocity"], axis=1) >= min_speed
+        return objects[is_fast & (objects["num_points"] >= min_points)]
 
     def save(self, path: str | Path) -> None:
         """Write every field that is not None to one .npz file."""

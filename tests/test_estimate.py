@@ -15,6 +15,7 @@ from cflow_torch import (
     CFlowError,
     CorrelationFlow,
     CorrelationFlowKeypoints,
+    Sweep,
     VerifiedFlow,
     estimate_flow,
     make_config,
@@ -52,6 +53,20 @@ def test_invalid_arguments_are_refused(arguments, complaint):
     assert isinstance(caught.value, ValueError)
 
 
+@pytest.mark.parametrize(
+    "pc1, more, complaint",
+    [
+        (Sweep(P1), {"gm0": np.zeros(50, bool), "T_ego1_ego0": EYE}, "T_ego1_ego0, gm0 and a Sweep are given"),
+        (P1, {}, "pc1 is ndarray: give cflow_torch.Sweep"),
+        (Sweep(P1), {"pch": [P1]}, "pch1 is ndarray"),
+        (Sweep(P1, pose=EYE), {}, "pose"),
+    ],
+)
+def test_sweeps_with_arrays_are_refused(pc1, more, complaint):
+    with pytest.raises(CFlowError, match=complaint):
+        estimate_flow(Sweep(P0), pc1, **more)
+
+
 @pytest.mark.parametrize("method, num_future", [("dense", 0), ("verified", 2)])
 def test_estimate_flow_equals_the_module(method, num_future):
     """With history, sweeps after t+1 and the times of points."""
@@ -67,6 +82,8 @@ def test_estimate_flow_equals_the_module(method, num_future):
             arguments[f"T_ego1_ego{side}"] = [np.linalg.inv(window.pc1.pose) @ sweep.pose for sweep in sweeps]
     (expected,) = make_model(settings)([window])
     assert_same_bits(estimate_flow(**arguments, **settings.as_dict()), expected)
+    of_sweeps = estimate_flow(window.pc0, window.pc1, pch=window.pch, pcf=window.pcf, config=settings)
+    assert_same_bits(of_sweeps, expected)
     if num_future:
         for less in (replace(window, pcf=()), replace(window, pc1=replace(window.pc1, point_times=None))):
             assert not torch.equal(make_model(settings)([less])[0].residual_flow, expected.residual_flow)

@@ -87,7 +87,7 @@ class FlowStream:
 
     def push(
         self,
-        points: Array,
+        points: Array | Sweep,
         pose: Array | None = None,
         time: int | float | None = None,
         is_ground: Array | None = None,
@@ -96,7 +96,7 @@ class FlowStream:
         """Add the sweep t+1 and return the flow of sweep t.
 
         Args:
-            points: (N, 3+) float, metres, ego frame of this sweep; copied.
+            points: (N, 3+) float, metres, ego frame of this sweep; copied. Or a `Sweep`, alone: it has all of these.
             pose: (4, 4) `T_world_ego`; None = estimate it by KISS-ICP (extra `odometry`). Give poses for all sweeps of
                 the stream, or for none.
             time: nanoseconds (int) or seconds (float); None = unknown. Give times for all sweeps, or for none.
@@ -111,10 +111,16 @@ class FlowStream:
 
         Cost: the method for one window and, where needed, the ground and pose of one sweep.
         """
-        stamp = None if time is None else round(time * 1e9) if isinstance(time, float) else int(time)
-        if not self._accepts(stamp):
+        if isinstance(points, Sweep):
+            if any(value is not None for value in (pose, time, is_ground, point_times)):
+                raise CFlowError("a Sweep and more are given: put pose, time, mask and point times into the Sweep")
+            given = points
+        else:
+            stamp = None if time is None else round(time * 1e9) if isinstance(time, float) else int(time)
+            given = Sweep(points, is_ground, pose, stamp, point_times)
+        if not self._accepts(given.timestamp_ns):
             return None
-        sweep = self._prepare(Sweep(points, is_ground, pose, stamp, point_times))
+        sweep = self._prepare(given)
         if self._sweeps:
             before, *history = self._sweeps
             window = Window(before, sweep, tuple(history))

@@ -16,7 +16,7 @@ from cflow_torch.applications.track_table import confirmed, join_tables
 from cflow_torch.config import make_config
 from cflow_torch.data.log import CachedLog, Log, window
 from cflow_torch.estimate import make_model
-from cflow_torch.types import CFlowError, FlowResult, Window
+from cflow_torch.types import CFlowError, FlowResult, Sweep, Window
 
 _MAX_MISSED = 3  # sweeps that a track survives unseen
 _ACCELERATION = 3.0  # m/s², standard deviation
@@ -70,11 +70,11 @@ class Tracker:
         # Points of the tracks, where the next sweep should have them, and the track of each.
         self._points, self._owner = torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, dtype=torch.int64)
 
-    def push(self, sweeps: Window, result: FlowResult) -> Tracked:
+    def push(self, sweeps: Window | tuple[Sweep, Sweep], result: FlowResult) -> Tracked:
         """Continue the tracks by one sweep.
 
         Args:
-            sweeps: the window of the pair t, t+1; its pc0, the poses and the time stamps are used.
+            sweeps: the window of the pair t, t+1, or the two sweeps; the points of t, poses and time stamps are used.
             result: its flow; residual_flow, cluster_id, is_valid and, if present, confidence.
 
         Returns:
@@ -84,6 +84,7 @@ class Tracker:
             CFlowError: the sweep is not later than the one before, or the result belongs to another sweep or lacks a
                 field.
         """
+        sweeps = sweeps if isinstance(sweeps, Window) else Window(*sweeps)
         if any(getattr(result, name) is None for name in ("residual_flow", "cluster_id", "is_valid")):
             raise CFlowError("tracks need residual flow, cluster_id and is_valid: `cflow flow` writes them by default")
         times = self._times(sweeps)

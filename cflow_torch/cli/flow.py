@@ -12,7 +12,8 @@ and verbose=true prints it.
 
 result_name=NAME also writes the total flow into the HDF5 scenes, as key NAME of every sweep, where the viewers of
 OpenSceneFlow read it. tracks=true also writes OUTPUT/<log id>/tracks.parquet when all frames of a log are complete: one
-row per moving object and sweep, with id, box and velocity.
+row per moving object and sweep, with id, box and velocity. tracks=mot and tracks=kitti add OUTPUT/<log id>/mot.txt or
+kitti.txt, the tracks in these formats.
 
 examples:
   cflow flow data=av2 data.root=/data/av2/val output=outputs/val
@@ -35,7 +36,8 @@ from typing import Any, Callable, NamedTuple, Sequence
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
-from cflow_torch.applications.track_table import TRACKS_FILE, write_tracks
+from cflow_torch.applications.track_table import TRACKS_FILE, read_tracks, write_tracks
+from cflow_torch.applications.track_text import write_kitti, write_mot
 from cflow_torch.applications.tracking import track
 from cflow_torch.cli import run
 from cflow_torch.cli.run import Failures, Sources
@@ -52,6 +54,7 @@ from cflow_torch.fleet.work import source_name
 from cflow_torch.types import CFlowError
 
 _FOR_TRACKS = {"residual", "cluster_id", "is_valid"}  # contents
+_TRACK_FORMATS = {"mot": write_mot, "kitti": write_kitti}
 
 
 class FlowRun(NamedTuple):
@@ -67,6 +70,8 @@ def task(cfg: DictConfig) -> None:
     shard = find_shard(cfg.shard.index, cfg.shard.count, os.environ)
     if cfg.result_name is not None:
         _check_results(cfg, shard)
+    if cfg.tracks not in (False, True, *_TRACK_FORMATS):
+        raise CFlowError(f"tracks={cfg.tracks}: give true, false, {' or '.join(_TRACK_FORMATS)}")
     contents = _contents(cfg, run.make_model(cfg).config.method == "verified")
     done = compute(cfg, shard, contents, _check_scenes if cfg.result_name is not None else None)
     if done is None:
@@ -75,7 +80,7 @@ def task(cfg: DictConfig) -> None:
     if cfg.result_name is not None and done.report["stopped_by"] is None:  # a signal leaves no time for this
         failures = _into_scenes(cfg.result_name, done.sources.logs, as_path(done.job.output))
     if cfg.tracks and done.report["stopped_by"] is None:
-        failures += _write_tracks(done.sources, shard, as_path(done.job.output))
+        failures += _write_tracks(cfg.tracks, done.sources, shard, as_path(done.job.output))
     finish(done, shard, failures, cfg.verbose)
 
 
@@ -184,7 +189,7 @@ def _contents(cfg: DictConfig, has_confidence: bool) -> tuple[str, ...]:
     return tuple(name for name in allowed if name in given)
 
 
-def _write_tracks(sources: run.Sources, shard: Shard, output: Path) -> Failures:
+def _write_tracks(kind: Any, sources: run.Sources, shard: Shard, output: Path) -> Failures:
     """Write the tracks of each log of this shard whose frames are all complete, also those of other shards."""
     failures: Failures = []
     flow = run.stored_flow(output, ())
@@ -193,9 +198,13 @@ def _write_tracks(sources: run.Sources, shard: Shard, output: Path) -> Failures:
             log = sources.open(unit.source)
             folder = output / log.log_id
             stamps = [int(stamp) for stamp in log.timestamps[:-1]]
-            if complete_frames(folder) >= set(stamps) and not (folder / TRACKS_FILE).exists():
+            if not complete_frames(folder) >= set(stamps):
+                continue
+            if not (folder / TRACKS_FILE).exists():
                 results = ((index, flow(log, index)) for index in range(len(stamps)))
                 write_tracks(folder / TRACKS_FILE, track(log, results))
+            if kind in _TRACK_FORMATS:
+                _TRACK_FORMATS[kind](folder / f"{kind}.txt", read_tracks(folder / TRACKS_FILE), log)
     return failures
 
 

@@ -20,7 +20,7 @@ from cflow_torch.cli.choices import CONFIGS, SETTERS, files, groups, own_setting
 from cflow_torch.config import CONFIGS as METHODS
 from cflow_torch.config import PRESETS, Config, make_config
 
-# A setting has the type of its default in configs/. If that is null, auto or a list, it takes any value, except these.
+# A setting has the type of its default in configs/. If that is null, auto or a list, it takes any value. Others:
 _TYPES: dict[str, Any] = {
     "batches": List[int],
     "cluster": Optional[int],
@@ -28,6 +28,7 @@ _TYPES: dict[str, Any] = {
     "max_flow": Optional[float],
     "pace": Optional[float],
     "pair": Optional[int],
+    "tracks": Any,
 }
 
 

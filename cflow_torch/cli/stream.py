@@ -65,7 +65,7 @@ def play(stream: FlowStream, log: Log, pace: Any = None, count: Any = None) -> d
         sweep = log.sweep(index)
         arrival = time.perf_counter() if due is None else begin + due[index]
         time.sleep(max(arrival - time.perf_counter(), 0.0))
-        result = stream.push(sweep.points, sweep.pose, sweep.timestamp_ns, sweep.is_ground, sweep.point_times)
+        result = stream.push(sweep)
         if result is not None:
             result.is_valid.any().item()  # waits for the GPU
             latencies.append(time.perf_counter() - arrival)

@@ -29,8 +29,7 @@ def sweeps() -> list[Sweep]:
 
 
 def push(stream: FlowStream, sweep: Sweep, **changes: Any) -> FlowResult | None:
-    sweep = replace(sweep, **changes)
-    return stream.push(sweep.points, sweep.pose, sweep.timestamp_ns, sweep.is_ground, sweep.point_times)
+    return stream.push(replace(sweep, **changes))
 
 
 def expected(sweeps: list[Sweep], index: int, settings: Any) -> FlowResult:
@@ -138,6 +137,11 @@ def test_a_bad_sweep_is_refused_and_the_stream_goes_on(
 def test_settings_that_a_stream_cannot_have_are_refused(settings: dict, message: str) -> None:
     with pytest.raises(CFlowError, match=message):
         FlowStream(**settings)
+
+
+def test_a_sweep_with_more_is_refused(sweeps: list[Sweep]) -> None:
+    with pytest.raises(CFlowError, match="into the Sweep"):
+        FlowStream("fast").push(sweeps[0], sweeps[0].pose)
 
 
 def test_missing_ground_and_poses_are_estimated() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from cflow_torch import CFlowError, FlowResult, Sweep, Tracker, Window, track
 from cflow_torch.applications.kalman import States
 from cflow_torch.applications.linking import VOXELS, box_of_point, boxes, link
 from cflow_torch.applications.track_table import join_tables, read_tracks, write_tracks
+from cflow_torch.applications.track_text import write_kitti, write_mot
 
 
 def ids_of(log: Staged, table: dict[str, np.ndarray], car: int) -> list[int]:
@@ -175,7 +177,7 @@ def test_ids_survive_empty_sweeps_and_missing_frames() -> None:
 def test_wrong_inputs_are_one_clear_error() -> None:
     log = Staged([straight((0, 0), (0.9, 0.0))])
     tracker = Tracker()
-    tracker.push(Window(log.sweep(3), log.sweep(4)), log.result(3))
+    tracker.push((log.sweep(3), log.sweep(4)), log.result(3))
     with pytest.raises(CFlowError, match="order of time"):
         tracker.push(Window(log.sweep(2), log.sweep(3)), log.result(2))
     with pytest.raises(CFlowError, match="rows"):
@@ -248,3 +250,31 @@ def test_a_table_comes_back_from_disk(tmp_path: Any) -> None:
     for name in ("broken.parquet", "missing.parquet"):
         with pytest.raises(CFlowError, match="tracks=true"):
             read_tracks(tmp_path / name)
+
+
+def test_tracks_are_written_as_text(tmp_path: Path) -> None:
+    """A car that drives to the left of a vehicle that has turned by 90 degrees to the left: ahead of the vehicle."""
+    poses = np.tile(np.eye(4), (12, 1, 1))
+    poses[:, :3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+    poses[:, :3, 3] = (-20, -5, 1)
+    log = Staged([straight((-12, 0), (0.0, 0.9))], poses)
+    table = track(log, log.results())
+    write_mot(tmp_path / "mot.txt", table, log)
+    mot = np.loadtxt(tmp_path / "mot.txt", delimiter=",", ndmin=2)
+    assert np.array_equal(mot[:, :6], [[frame, 1, -1, -1, -1, -1] for frame in range(1, 12)])
+    assert np.allclose(mot[:, 6], 0.9) and np.allclose(
+        mot[:, 7:], np.stack([table[axis] for axis in "xyz"], 1), atol=1e-3
+    )
+
+    write_kitti(tmp_path / "kitti.txt", table, log)
+    lines = [line.split() for line in (tmp_path / "kitti.txt").read_text().splitlines()]
+    assert [line[:5] for line in lines] == [[str(index), "0", "Misc", "-1", "-1"] for index in range(11)]
+    height, width, length, x, y, z, rotation, score = np.array([line[10:] for line in lines], float).T
+    assert np.allclose(height, 1.2) and np.allclose(score, 0.9, atol=1e-6)
+    assert np.allclose(width, 3.8, atol=1e-5) and np.allclose(length, 1.4, atol=1e-5), "it drives sideways"
+    # It is 8 + 1.9 m to the right, first 5 + 0.7 m ahead, and its lower face is 1 m below the origin.
+    assert np.allclose(x, 9.9, atol=0.01) and np.allclose(y, 1, atol=1e-5)
+    assert np.allclose(z, 5.7 + 0.9 * np.arange(11), atol=0.05)
+    assert np.allclose(rotation, -np.pi / 2, atol=1e-5), "KITTI: 0 = along x of the camera, negative to the left"
+    alpha = np.array([line[5] for line in lines], float)
+    assert np.allclose(alpha, rotation - np.arctan2(x, z), atol=1e-4)

@@ -46,6 +46,8 @@ def test_resumed_and_sharded_runs_write_the_same_table(tmp_path: Path, capsys: p
     assert other.read_bytes() == file.read_bytes()
 
     before = file.read_bytes()
+    assert call("flow", "whole", *run[:2], "tracks=mot") == 0 and call("flow", "whole", *run[:2], "tracks=csv") == 2
+    assert (file.parent / "mot.txt").read_text().count("\n") == len(whole["id"])
     file.unlink()
     sorted(file.parent.glob("*.feather"))[2].unlink()
     assert call("flow", "whole", *run) == 0 and file.read_bytes() == before

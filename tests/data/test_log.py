@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import sys
 from pathlib import Path
 from typing import Any, Sequence
 
@@ -116,9 +117,22 @@ def test_a_data_frame_has_a_row_per_point(drive: Drive, result: FlowResult, monk
     assert np.array_equal(frame[["flow_tx_m", "flow_ty_m", "flow_tz_m"]], result.flow) and len(frame) == len(points)
     with pytest.raises(CFlowError, match="one row per row"):
         result.to_pandas(points[1:])
-    monkeypatch.setitem(__import__("sys").modules, "pandas", None)
+    monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(CFlowError, match="pip install pandas"):
         result.to_pandas()
+
+
+def test_an_open3d_cloud_has_all_fields(drive: Drive, result: FlowResult, monkeypatch: pytest.MonkeyPatch) -> None:
+    points = drive.sweep(3).points
+    monkeypatch.setitem(sys.modules, "open3d.t.geometry", None)
+    with pytest.raises(CFlowError, match="pip install open3d"):
+        result.to_open3d(points)
+    monkeypatch.undo()
+    pytest.importorskip("open3d")
+    cloud = result.to_open3d(points)
+    assert np.array_equal(cloud.point.positions.numpy(), points)
+    for name, values in result.numpy().items():
+        assert np.array_equal(cloud.point[name].numpy().reshape(values.shape), values), name
 
 
 def test_objects_are_the_moving_objects_of_the_simulator(drive: Drive, result: FlowResult) -> None:
@@ -151,6 +165,8 @@ def test_objects_are_the_moving_objects_of_the_simulator(drive: Drive, result: F
         difference = np.angle(np.exp(1j * (row["heading"] - np.arctan2(pose[1, 0], pose[0, 0]))))
         assert abs(difference) < 0.4, category
     assert num_moving >= 6 and num_missed <= 1 and is_found[objects["confidence"] > 0.7].mean() > 0.8
+    every = result.objects(drive.sweep(3).points, min_points=1)
+    assert np.array_equal(every[every["num_points"] >= 10], objects) and len(every) > len(objects)
     with pytest.raises(CFlowError, match="without"):
         FlowResult.of({"flow": result.flow}).objects(drive.sweep(3).points)
     empty = result.objects(drive.sweep(3).points, min_speed=1e3)
