@@ -275,27 +275,33 @@ def errors(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
-    """A Markdown table: a row per method and history, and next to it `default` on the windows that the method has."""
+    """A Markdown table with a row per method; methods that miss windows have `default` on theirs in the last column."""
     finished = [row for row in rows if "dynamic" in row]
-    older = {row["window"] for row in rows if row["history"] > 0}
-    windows = {row["window"] for row in rows}
-    lines = []
-    for name, history in dict.fromkeys((row["method"], row["history"]) for row in rows):
-        own = [row for row in finished if (row["method"], row["history"]) == (name, history)]
-        run = {row["window"] for row in own}
-        same = [r for r in finished if (r["method"], r["history"]) == ("default", 0) and r["window"] in run]
-        stopped = len([r for r in rows if (r["method"], r["history"]) == (name, history)]) - len(own)
+    older = {row["window"] for row in finished if row["history"] > 0}
+    windows, lines = {row["window"] for row in rows}, []
+    for name in dict.fromkeys(row["method"] for row in rows):
+        pairs, longer = ([row for row in finished if row["method"] == name and (row["history"] > 0) == is_longer]
+                         for is_longer in (False, True))  # fmt: skip
+        run = {row["window"] for row in pairs}
+        same = [row for row in finished if (row["method"], row["history"]) == ("default", 0) and row["window"] in run]
         lines.append(
             {
-                "method": name + (f", {history} older sweeps" if history else ""),
-                "windows": f"{len(own)}" + (f", {stopped} stopped" if stopped else ""),
-                "all sets": errors(own) if not history else "",
-                "sets with older sweeps": errors([row for row in own if row["window"] in older]),
-                "`default` on these windows": errors(same) if run < windows and not history else "",
-                "CPU s": f"{np.mean([row['cpu'] for row in own]):.2f}" if own else "",
+                "method": name,
+                "windows": f"{len(pairs)}",
+                "two sweeps": errors(pairs),
+                "CPU s": seconds(pairs),
+                "two sweeps, sets with older ones": errors([row for row in pairs if row["window"] in older]),
+                "older sweeps": errors(longer),
+                "CPU s, older sweeps": seconds(longer),
+                "`default` on these windows": errors(same) if run < windows else "",
             }
         )
     return markdown(lines)
+
+
+def seconds(rows: Sequence[dict[str, Any]]) -> str:
+    """Mean of processor seconds."""
+    return f"{np.mean([row['cpu'] for row in rows]):.2f}" if rows else ""
 
 
 def main() -> None:
