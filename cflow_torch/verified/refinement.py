@@ -101,12 +101,12 @@ def deskew(
     flow, centre = (torch.view_as_complex(values.index_select(0, owner)) for values in (rigid.flow, rigid.centre))
     # The centre is that of t; at the instant of another sweep it has moved on.
     since_t = (sweeps.elapsed[:, 1:2] - sweeps.elapsed).flatten().index_select(0, image)
-    at_instant = torch.complex(*points.position) - flow * time
+    at_instant = torch.complex(*points.position[:2]) - flow * time
     arm = at_instant - centre - flow * since_t
     at_instant = at_instant + (rotate(-time * rigid.rotation.index_select(0, owner), arm) - arm)
-    position = torch.view_as_real(at_instant).t()
+    position = torch.cat((torch.view_as_real(at_instant).t(), points.position[2:]))
 
-    inside = flat_nonzero(grid.contains(position))
+    inside = flat_nonzero(grid.contains(position[:2]))
     position, image = position.index_select(1, inside), image.index_select(0, inside)
     place = grid.pixel_of_image(position, image, sweeps.batch.num_windows * num_steps).long()
     pixel, number = torch.unique(place, return_inverse=True)

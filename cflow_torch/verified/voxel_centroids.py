@@ -15,7 +15,7 @@ from cflow_torch.verified.height_slices import HeightSlicedSweeps, slice_of
 # Centroids are whole numbers of 1 / UNITS metre: their sums are exact, in any order of the points and on any device.
 UNITS = 1024
 _BEYOND = 2.0**28  # units: a place far beyond every other
-_FARTHEST = 2.0**48  # square units: no square between voxels of a region is as large
+_FARTHEST = 2.0**46  # square units: no square between voxels of a region is as large
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class ObjectPoints:
         window, step: (N,) int64, which sweep: step 0 = t+1, 1 = t, ...
         pixel: (N,) int64, number of its occupied pixel, 0 ... P - 1.
         part: (N,) int64, height slice, from 0 on.
-        position: (2, N) float64, x and y, metres, frame of t+1; inside the region.
+        position: (3, N) float64, metres, frame of t+1; inside the region.
         time: (N,) float32, sweep intervals, `Batch.point_times`; None = there are none.
     """
 
@@ -72,12 +72,12 @@ def points_of_objects(
     """
     points = flat_nonzero(lookup(lookup(wanted, objects.of_pixel), sweeps.pixel_of_point))
     pixel, rows = sweeps.pixel_of_point.index_select(0, points), sweeps.point(points)
-    x, y, z = sweeps.batch.positions.index_select(1, rows).unbind(0)
+    position = sweeps.batch.positions.index_select(1, rows)
     window, step, owner = gather(pixel, sweeps.pixels.window, sweeps.pixels.step, objects.of_pixel)
-    part = slice_of(z, slice_height, num_slices).long()
+    part = slice_of(position[2], slice_height, num_slices).long()
     times = sweeps.batch.point_times
     time = None if times is None else times.index_select(0, rows)
-    return ObjectPoints(owner, window, step, pixel, part, torch.stack((x, y)), time)
+    return ObjectPoints(owner, window, step, pixel, part, position, time)
 
 
 class Voxels:
@@ -92,6 +92,7 @@ class Voxels:
         owner, window, step, part: (V,) int64, as for `ObjectPoints`.
         place: (V + 1,) complex128, x + iy of the centroid, whole units of 1/1024 m from the lower corner of the region;
             the last entry, of no voxel, is far away.
+        height: (V + 1,) float64, z of the centroid, whole units from 0.
         time: (V,) float64, mean of `ObjectPoints.time`; None = there are none.
 
     Convention: a coordinate is rounded to the nearest unit, their mean down to a whole one.
@@ -104,9 +105,10 @@ class Voxels:
         key, voxel, count = torch.unique(
             points.pixel * num_slices + points.part, return_inverse=True, return_counts=True
         )
-        corner = torch.tensor(sweeps.grid.lower[:2], dtype=torch.float64, device=key.device)[:, None]
+        corner = torch.tensor((*sweeps.grid.lower[:2], 0.0), dtype=torch.float64, device=key.device)[:, None]
         sums = scatter_count(voxel, key.numel(), whole((points.position - corner) * UNITS))
-        self.place = torch.complex(*F.pad(torch.floor(sums / count), (0, 1), value=_BEYOND))
+        x, y, self.height = F.pad(torch.floor(sums / count), (0, 1), value=_BEYOND)
+        self.place = torch.complex(x, y)
         # The first pixel of the table is "none", as in `HeightSlicedSweeps.rank`.
         self._of_key = torch.full((num_slices * (sweeps.num_pixels + 1),), key.numel(), device=key.device)
         self._of_key.scatter_(0, key + num_slices, torch.arange(key.numel(), device=key.device))
@@ -118,36 +120,40 @@ class Voxels:
         if points.time is not None:
             self.time = torch.zeros_like(count, dtype=torch.float64).index_add_(0, voxel, points.time.double()) / count
 
-    def nearest(self, sweep: Tensor, part: Tensor, place: Tensor) -> Tensor:
-        """Nearest voxel of a sweep, in the 3 x 3 pixels around a place and in the slice given.
+    def nearest(self, sweep: Tensor, part: Tensor, place: Tensor, height: Tensor) -> Tensor:
+        """Nearest voxel of a sweep, in the 3 x 3 pixels around a place, in the slice given and in those next to it.
 
         Args:
             sweep: (K,) int64, window * S + step.
             part: (K,) int64.
             place: (K,) complex128, x + iy, units from the lower corner, anywhere.
+            height: (K,) float64, units.
 
         Returns:
-            (K,) int64, V = there is none.
+            (K,) int64, V = there is none. Ties: the lowest slice of the first pixel in raster order; the highest slice
+            is below the first.
 
-        Cost: nine lookups each.
+        Cost: 27 lookups each.
         """
-        voxel = self.around(sweep, part, place, 1)
+        voxel = self.around(sweep, part, place, 1, 1)
         square = square_of(self.place.index_select(0, voxel.view(-1)).view_as(voxel).sub_(place))
+        square += (self.height.index_select(0, voxel.view(-1)).view_as(voxel) - height).square_()
         # The square and the place in one number: its least is found several times faster than by argmin. In float64,
         # which holds these numbers exactly, many times faster than in int64.
-        slot = torch.arange(9, dtype=torch.float64, device=place.device)[:, None]
-        key = torch.add(slot, square.clamp_(max=_FARTHEST), alpha=16)
-        return voxel.gather(0, key.amin(0, keepdim=True).long().bitwise_and_(15))[0]
+        slot = torch.arange(len(voxel), dtype=torch.float64, device=place.device)[:, None]
+        key = torch.add(slot, square.clamp_(max=_FARTHEST), alpha=32)
+        return voxel.gather(0, key.amin(0, keepdim=True).long().bitwise_and_(31))[0]
 
-    def around(self, sweep: Tensor, part: Tensor, place: Tensor, reach: int) -> Tensor:
+    def around(self, sweep: Tensor, part: Tensor, place: Tensor, reach: int, layers: int = 0) -> Tensor:
         """Voxels of a sweep in the pixels around a place, `reach` pixels each way, and in the slice given.
 
         Args:
             sweep, part, place: as for `nearest`.
             reach: r, pixels.
+            layers: l, slices below and above.
 
         Returns:
-            ((2 r + 1)^2, K) int64, in raster order, V = there is none. Near the border and beyond it, the pixels are
+            ((2 r + 1)^2 (2 l + 1), K) int64, pixel by pixel in raster order, V = there is none. Near the border and beyond it, the pixels are
             the outermost ones.
         """
         grid = self._sweeps.grid
@@ -158,8 +164,10 @@ class Voxels:
         line = torch.arange(-reach, reach + 1, device=part.device)
         pixel = pixel + torch.add(line, line[:, None], alpha=grid.width).view(-1, 1)
         pixel.clamp_(0, self._sweeps.rank.numel() - 1)  # a tiny image has fewer rows or columns than are asked for
-        rank = self._sweeps.rank.index_select(0, pixel.view(-1)).view_as(pixel)
-        return self._of_key.index_select(0, torch.add(part, rank, alpha=self._num_slices).view(-1)).view_as(pixel)
+        rank = self._sweeps.rank.index_select(0, pixel.view(-1)).view(len(pixel), 1, -1)
+        near = torch.arange(-layers, layers + 1, device=part.device)[:, None]
+        key = torch.add((part + near) & (self._num_slices - 1), rank, alpha=self._num_slices).view(-1)
+        return self._of_key.index_select(0, key).view(len(pixel) * len(near), -1)
 
 
 def whole(x: Tensor) -> Tensor:

@@ -1,26 +1,32 @@
-"""Rigid registration: a few Gauss-Newton steps on the voxel centroids of objects; de-skewing.
+"""Rigid registration: a few Gauss-Newton steps on the voxels of objects, surface to surface; de-skewing.
 
-An object turns about a centre and moves on, both in proportion to the time that passes. Lengths are units of 1/1024 m
-from the lower corner of the region; the turn is the tangent of half the angle.
+An object rotates about a centre and moves on, both in proportion to the time that passes. Voxels are in units of
+1/1024 m from the lower corner of the region; the rotation is the tangent of half the angle.
 """
 
 from __future__ import annotations
 
+import math
+from itertools import product
 from typing import NamedTuple, Sequence
+
+import numpy as np
 
 from cflow_torch.config import VerifiedConfig
 from oracle.height_slices import SlicedSweeps, Vector
-from oracle.voxels import UNITS, Point, Voxel, Voxels, centroids, meeting_weight, nearest, whole
+from oracle.voxels import LAYERS, UNITS, Point, Voxel, Voxels, centroids, nearest, whole
 
-LAYER_HEIGHT, NUM_LAYERS = 0.1, 16  # of voxels, metres; their number, then they repeat
-SIGMA = 0.12  # metres, of the weight of a pair of voxels
-MOST_TIME = 2.5  # sweep intervals: older sweeps are not looked at
-NUM_STEPS, STEP_LENGTH = 5, 1.6  # steps, as long as so many of Gauss and Newton
-LONGEST_WAY = 0.15 * UNITS  # per interval, in x and in y, from the given flow
-LARGEST_TURN = 0.1  # tangent of half the angle per interval
-HELD = 40.0  # perfect pairs that the given translation is worth
-HELD_TURN = 20.0  # perfect pairs at a distance of 1 m that no turn is worth
-LEAST_STRETCH = 0.75  # where the time between points is a smaller share of that between sweeps, it is not believed
+LAYER_HEIGHT, NUM_LAYERS = 0.1, LAYERS  # of voxels, metres; their number, then they repeat
+FARTHEST = 0.2  # metres, between the voxels of a pair
+FAR = 3.0  # squared distance of a pair, in standard deviations of both surfaces, at which its weight is a quarter
+NOISE = 0.05  # metres, standard deviation of a centroid across its surface
+UNKNOWN = 0.2  # metres, standard deviation of a surface of fewer than three voxels
+MOST_TIME = 2.5  # sweep intervals: older sweeps are ignored
+NUM_STEPS, STEP_LENGTH = 4, 1.4  # steps, as long as so many of Gauss and Newton
+LONGEST_CORRECTION = 0.15  # metres per interval, in x and in y, from the given flow
+LARGEST_ROTATION = 0.1  # tangent of half the angle per interval
+HELD, HELD_ROTATION = 2.0, 5.0  # pairs that the given translation is worth, and, at 1 m, no rotation
+LEAST_STRETCH = 0.75  # where the time between points is a smaller share of that between sweeps, it is ignored
 
 
 class RigidMotion(NamedTuple):
@@ -38,65 +44,109 @@ class RigidMotion(NamedTuple):
 
 
 class Pair(NamedTuple):
-    """A voxel and the one that it finds in another sweep: time from one to the other, in whole 1/16; turned arm of the
-    first, what is missing, weight; how much longer than between the sweeps it is between the points, in intervals."""
+    """A voxel and the nearest one at t+1: time from one to the other, in whole 1/16; rotated arm of the first and error,
+    metres; (3, 3) weight; how much longer than between the sweeps it is between the points, in intervals."""
 
     time: float
-    arm: tuple[int, int]
-    error: tuple[int, int]
-    weight: float
+    arm: tuple[float, float]
+    error: np.ndarray
+    weight: np.ndarray
     late: float
 
 
 def register(points: Sequence[Point], flow: Sequence[Vector], sweeps: SlicedSweeps) -> list[RigidMotion]:
     """Refine the motion of every object, from (x, y) metres per interval. One without points at t keeps its flow."""
-    voxels, lower = centroids(points, sweeps), sweeps.lower
+    voxels, lower = voxels_near_t(points, sweeps), sweeps.lower
+    spreads = spread_of(voxels, sweeps)
     result = []
     for owner, start in enumerate(flow):
-        members = [voxel for voxel in voxels.values() if voxel.owner == owner]
-        at_t = [voxel for voxel in members if voxel.step == 1]
+        at_t = [voxel for voxel in voxels.values() if voxel.owner == owner and voxel.step == 1]
         if not at_t:
             result.append(RigidMotion(start, 0.0, lower))
             continue
         centre = (sum(v.x for v in at_t) // len(at_t), sum(v.y for v in at_t) // len(at_t))
-        given = (start[0] * UNITS, start[1] * UNITS)
-        way, turn = given, 0.0
+        v_x, v_y, rotation = *start, 0.0
         for _ in range(NUM_STEPS):
-            found = find_pairs(members, voxels, sweeps, centre, way, turn)
-            dx, dy, angle = (STEP_LENGTH * change for change in gauss_newton(found, given, way, turn))
-            way = (limit(way[0] + dx, given[0], LONGEST_WAY), limit(way[1] + dy, given[1], LONGEST_WAY))
-            turn = limit(turn + angle / 2, 0.0, LARGEST_TURN)
+            found = find_pairs(owner, voxels, spreads, sweeps, centre, (v_x, v_y), rotation)
+            dx, dy, angle = (STEP_LENGTH * change for change in gauss_newton(found, start, (v_x, v_y), rotation))
+            v_x = limit(v_x + dx, start[0], LONGEST_CORRECTION)
+            v_y = limit(v_y + dy, start[1], LONGEST_CORRECTION)
+            rotation = limit(rotation + angle / 2, 0.0, LARGEST_ROTATION)
         corner = (centre[0] / UNITS + lower[0], centre[1] / UNITS + lower[1])
-        result.append(RigidMotion((way[0] / UNITS, way[1] / UNITS), turn, corner))
+        result.append(RigidMotion((v_x, v_y), rotation, corner))
     return result
 
 
-def find_pairs(
-    members: Sequence[Voxel], voxels: Voxels, sweeps: SlicedSweeps, centre: tuple[int, int], way: Vector, turn: float
-) -> list[Pair]:
-    """Voxels of an object that find each other under its motion, looked for from both ends.
+def voxels_near_t(points: Sequence[Point], sweeps: SlicedSweeps) -> Voxels:
+    """Voxels of the sweeps that are not far in time from t+1."""
+    return centroids([p for p in points if abs(sweeps.elapsed[p.step]) <= MOST_TIME], sweeps)
 
-    Every voxel of another sweep looks for the nearest one at t+1, every voxel of t+1 for the nearest one in each other
-    sweep. If what is nearest belongs to another object there is no pair; two that choose each other count twice.
+
+def spread_of(voxels: Voxels, sweeps: SlicedSweeps) -> dict[Voxel, np.ndarray]:
+    """(3, 3) covariance, square metres, of the centroids of an object and sweep in the 3 x 3 x 3 blocks around a voxel.
+
+    Blocks are 2 voxels wide, or 4 if the centroids in the smaller ones lie nearly on a line. Centroids are whole 256ths
+    of a metre.
     """
+    spreads: dict[Voxel, np.ndarray] = {}
+    for side in (2, 4):
+        lists: dict[tuple[int, ...], list[tuple[int, ...]]] = {}
+        blocks = {}
+        for v in voxels.values():
+            sizes = (sweeps.size * UNITS * side, sweeps.size * UNITS * side, LAYER_HEIGHT * UNITS * side)
+            blocks[v] = tuple(math.floor(at / size) for at, size in zip((v.x, v.y, v.z), sizes))
+            lists.setdefault((v.step, v.owner, *blocks[v]), []).append((v.x // 4, v.y // 4, v.z // 4))
+        for v, (c, r, h) in blocks.items():
+            if v in spreads:
+                continue
+            near = [
+                position
+                for dc, dr, dh in product((-1, 0, 1), repeat=3)
+                for position in lists.get((v.step, v.owner, c + dc, r + dr, h + dh), [])
+            ]
+            n, sums = len(near), [sum(values) for values in zip(*near)]
+            scaled = [[n * sum(p[i] * p[j] for p in near) - sums[i] * sums[j] for j in range(3)] for i in range(3)]
+            trace = sum(scaled[i][i] for i in range(3))
+            minors = sum(scaled[i][i] * scaled[j][j] - scaled[i][j] ** 2 for i, j in ((0, 1), (0, 2), (1, 2)))
+            if (n >= 3 and 5 * minors >= trace * trace) or side == 4:
+                spreads[v] = np.array(scaled) / (256 * n) ** 2 + (n < 3) * UNKNOWN**2 * np.eye(3)
+    return spreads
+
+
+def find_pairs(
+    owner: int,
+    voxels: Voxels,
+    spreads: dict[Voxel, np.ndarray],
+    sweeps: SlicedSweeps,
+    centre: tuple[int, int],
+    velocity: Vector,
+    rotation: float,
+) -> list[Pair]:
+    """Voxels of an object and the nearest ones at t+1 under its motion, metres per interval. If the nearest one is far,
+    or of another object, there is no pair."""
     found = []
-    for voxel in members:
-        others = range(1, len(sweeps.elapsed)) if voxel.step == 0 else [0]
-        for step in others:
-            start, end = (sweeps.elapsed[1] - sweeps.elapsed[m] for m in (voxel.step, step))  # intervals since t
-            if abs(end - start) > MOST_TIME:
-                continue
-            # The centre is that of t; it moves on, and the voxel turns about it.
-            arm_x, arm_y = voxel.x - centre[0] - way[0] * start, voxel.y - centre[1] - way[1] * start
-            arm_x, arm_y = rotate(turn * (end - start), arm_x, arm_y)
-            x, y = whole(centre[0] + way[0] * end + arm_x), whole(centre[1] + way[1] * end + arm_y)
-            partner = nearest(voxels, step, voxel.part, x, y, sweeps)
-            if partner is None or partner.owner != voxel.owner:
-                continue
-            error = (partner.x - x, partner.y - y)
-            weight = meeting_weight(error[0] ** 2 + error[1] ** 2, SIGMA)
-            late = whole((partner.time - voxel.time) * UNITS) / UNITS
-            found.append(Pair(whole((end - start) * 16) / 16, (whole(arm_x), whole(arm_y)), error, weight, late))
+    v_x, v_y = velocity[0] * UNITS, velocity[1] * UNITS
+    for voxel in voxels.values():
+        if voxel.owner != owner or voxel.step == 0:
+            continue
+        end, elapsed = sweeps.elapsed[1], sweeps.elapsed[voxel.step]  # intervals from t to t+1, from the voxel to t+1
+        # The centre is that of t; it moves on, and the voxel rotates about it.
+        start = end - elapsed
+        arm_x, arm_y = rotate(rotation * elapsed, voxel.x - centre[0] - v_x * start, voxel.y - centre[1] - v_y * start)
+        x, y = whole(centre[0] + v_x * end + arm_x), whole(centre[1] + v_y * end + arm_y)
+        partner = nearest(voxels, 0, voxel.part, x, y, voxel.z, sweeps)
+        if partner is None or partner.owner != owner:
+            continue
+        error = np.array([partner.x - x, partner.y - y, partner.z - voxel.z])
+        if (error**2).sum() > round((FARTHEST * UNITS) ** 2):
+            continue
+        error = error / UNITS
+        inverse = np.linalg.inv(spreads[voxel] + spreads[partner] + NOISE**2 * np.eye(3))
+        weight = (FAR / (FAR + error @ inverse @ error)) ** 2 * NOISE**2 * inverse
+        weight = np.floor(256 * weight + 0.5) / 256
+        late = whole((partner.time - voxel.time) * UNITS) / UNITS
+        arm = (whole(arm_x / 16) / 64, whole(arm_y / 16) / 64)
+        found.append(Pair(whole(elapsed * 16) / 16, arm, error, weight, late))
     return found
 
 
@@ -107,27 +157,20 @@ def rotate(turn: float, x: float, y: float) -> Vector:
     return cos * x - sin * y, sin * x + cos * y
 
 
-def gauss_newton(found: Sequence[Pair], given: Vector, way: Vector, turn: float) -> tuple[float, float, float]:
-    """Least squares: change of the translation (units) and of the angle (radians, small), per interval.
+def gauss_newton(found: Sequence[Pair], given: Vector, velocity: Vector, rotation: float) -> np.ndarray:
+    """Least squares: change of the translation (metres) and of the angle (radians, small), per interval.
 
-    Minimises, over the pairs with times k, arms r and errors e, sum w (k (dx - r_y a) - e_x)^2 +
-    w (k (dy + r_x a) - e_y)^2, and the squares that hold on to the given translation and to no turn.
+    Minimises, over the pairs with times k and arms r, the squared errors that are left in x and y, each weighted, and
+    the squares that hold on to the given translation and to no rotation.
     """
-    s = s_x = s_y = s_xy = e_x = e_y = e_a = 0.0
-    for k, (r_x, r_y), (x, y), w, _ in found:
-        s += w * k * k
-        s_x += w * k * k * r_x
-        s_y += w * k * k * r_y
-        s_xy += w * k * k * (r_x * r_x + r_y * r_y)
-        e_x += w * k * x
-        e_y += w * k * y
-        e_a += w * k * (r_x * y - r_y * x)
-    held_turn = HELD_TURN * UNITS**2
-    a, a_x, a_y, a_xy = s + HELD, s_x, -s_y, s_xy + held_turn
-    b_x, b_y = e_x + HELD * (given[0] - way[0]), e_y + HELD * (given[1] - way[1])
-    b_a = e_a - held_turn * (2 * turn)
-    angle = (b_a - (a_y * b_x + a_x * b_y) / a) / (a_xy - (a_y * a_y + a_x * a_x) / a)
-    return (b_x - a_y * angle) / a, (b_y - a_x * angle) / a, angle
+    matrix, force = np.diag([HELD, HELD, HELD_ROTATION]), np.zeros(3)
+    force[:2] = HELD * (np.array(given) - velocity)
+    force[2] = -HELD_ROTATION * 2 * rotation
+    for k, (r_x, r_y), error, weight, _ in found:
+        change = k * np.array([[1.0, 0.0, -r_y], [0.0, 1.0, r_x]])
+        matrix += change.T @ weight[:2, :2] @ change
+        force += change.T @ weight[:2] @ error
+    return np.linalg.solve(matrix, force)
 
 
 def limit(value: float, middle: float, most: float) -> float:
@@ -155,17 +198,18 @@ def register_deskewed(
 
 
 def stretch_of(points: Sequence[Point], seen: Sequence[RigidMotion], sweeps: SlicedSweeps) -> list[float]:
-    """Of each object: sum of w k (k + late) over the sum of w k^2, over its pairs of voxels; 1 without any."""
-    voxels, (x0, y0) = centroids(points, sweeps), sweeps.lower
+    """Of each object: sum of w k (k + late) over the sum of w k^2, over its pairs of voxels, with the weight in x plus
+    that in y; 1 without any."""
+    voxels, (x0, y0) = voxels_near_t(points, sweeps), sweeps.lower
+    spreads = spread_of(voxels, sweeps)
     result = []
     for owner, motion in enumerate(seen):
-        members = [voxel for voxel in voxels.values() if voxel.owner == owner]
-        members = members if any(voxel.step == 1 for voxel in members) else []
         centre = (round((motion.centre[0] - x0) * UNITS), round((motion.centre[1] - y0) * UNITS))
-        way = (motion.flow[0] * UNITS, motion.flow[1] * UNITS)
         total = late = 0.0
-        for k, _, _, weight, of_pair in find_pairs(members, voxels, sweeps, centre, way, motion.rotation):
-            total, late = total + weight * k * k, late + weight * k * of_pair
+        if any(voxel.owner == owner and voxel.step == 1 for voxel in voxels.values()):
+            for pair in find_pairs(owner, voxels, spreads, sweeps, centre, motion.flow, motion.rotation):
+                weight = pair.weight[0, 0] + pair.weight[1, 1]
+                total, late = total + weight * pair.time**2, late + weight * pair.time * pair.late
         stretch = 1 + late / total if total > 0 else 1.0
         result.append(stretch if stretch >= LEAST_STRETCH else 1.0)
     return result

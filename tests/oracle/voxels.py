@@ -8,6 +8,7 @@ from typing import Dict, NamedTuple, Sequence, Tuple
 
 from oracle.height_slices import Pixel, SlicedSweeps, slice_of
 
+LAYERS = 32  # slices of the registration, then they repeat
 UNITS = 1024  # of a metre: centroids are whole numbers of them
 
 
@@ -19,17 +20,19 @@ class Point(NamedTuple):
     owner: int
     x: float
     y: float
+    z: float
     time: float
 
 
 class Voxel(NamedTuple):
-    """Sweep, slice and object of some points of a pixel, their centroid in units from the lower corner, mean time."""
+    """Sweep, slice and object of some points of a pixel, their centroid in units from the lower corner and z = 0, mean time."""
 
     step: int
     part: int
     owner: int
     x: int
     y: int
+    z: int
     time: float
 
 
@@ -49,7 +52,7 @@ def points_of_objects(
         for x, y, z, time in cloud:
             owner = object_of.get((m, *sweeps.pixel(x, y)), -1)
             if owner >= 0 and wanted[owner]:
-                points.append(Point(m, slice_of(z, height, num_slices), owner, x, y, time))
+                points.append(Point(m, slice_of(z, height, num_slices), owner, x, y, z, time))
     return points
 
 
@@ -62,26 +65,32 @@ def centroids(points: Sequence[Point], sweeps: SlicedSweeps) -> Voxels:
     for place, own in inside.items():
         x = sum(whole((p.x - x0) * UNITS) for p in own) // len(own)
         y = sum(whole((p.y - y0) * UNITS) for p in own) // len(own)
+        z = sum(whole(p.z * UNITS) for p in own) // len(own)
         time = sum(p.time for p in own) / len(own)
-        voxels[place] = Voxel(own[0].step, own[0].part, own[0].owner, x, y, time)
+        voxels[place] = Voxel(own[0].step, own[0].part, own[0].owner, x, y, z, time)
     return voxels
 
 
-def around(voxels: Voxels, step: int, part: int, x: float, y: float, sweeps: SlicedSweeps, reach: int) -> list[Voxel]:
-    """Voxels of a sweep and slice in the pixels around a place in units, `reach` each way, in raster order. At the
-    border and beyond it, they are the outermost pixels."""
+def around(
+    voxels: Voxels, step: int, part: int, x: float, y: float, sweeps: SlicedSweeps, reach: int, layers: int = 0
+) -> list[Voxel]:
+    """Voxels of a sweep in the pixels around a place in units, `reach` each way, in raster order, and in the slice and
+    `layers` below and above it. At the border and beyond it, they are the outermost pixels."""
     row, col = (
         min(max(math.floor(at / (sweeps.size * UNITS)), reach), length - 1 - reach)
         for at, length in zip((y, x), sweeps.shape)
     )
-    places = [(step, row + dy, col + dx, part) for dy, dx in product(range(-reach, reach + 1), repeat=2)]
+    slices = [(part + up) % LAYERS for up in range(-layers, layers + 1)]
+    pixels = product(range(-reach, reach + 1), repeat=2)
+    places = [(step, row + dy, col + dx, of_slice) for dy, dx in pixels for of_slice in slices]
     return [voxels[place] for place in places if place in voxels]
 
 
-def nearest(voxels: Voxels, step: int, part: int, x: float, y: float, sweeps: SlicedSweeps) -> Voxel | None:
-    """The nearest of the voxels in the 3 x 3 pixels around a place; of equals the first in raster order."""
-    found = around(voxels, step, part, x, y, sweeps, 1)
-    return min(found, key=lambda voxel: (voxel.x - x) ** 2 + (voxel.y - y) ** 2, default=None)
+def nearest(voxels: Voxels, step: int, part: int, x: float, y: float, z: float, sweeps: SlicedSweeps) -> Voxel | None:
+    """The nearest of the voxels in the 3 x 3 pixels around a place, in its slice and those next to it; the last slice
+    is below the first one. Ties: the first pixel in raster order, then the lowest slice."""
+    found = around(voxels, step, part, x, y, sweeps, 1, 1)
+    return min(found, key=lambda voxel: (voxel.x - x) ** 2 + (voxel.y - y) ** 2 + (voxel.z - z) ** 2, default=None)
 
 
 def meeting_weight(squared_distance: float, sigma: float) -> float:

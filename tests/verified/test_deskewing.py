@@ -69,7 +69,7 @@ def test_motion_and_points_equal_the_oracle(num_past, num_future):
         places += [(number, p.step, p.owner + len(expected), p.part, round(1e6 * p.x), round(1e6 * p.y)) for p in moved]
         expected += oracle.register_deskewed(window.points(), window.flow, of_window, window.sweeps, window.config)
     assert stretched > 10
-    x, y = (torch.round(1e6 * values).long().tolist() for values in sharp.position)
+    x, y = (torch.round(1e6 * values).long().tolist() for values in sharp.position[:2])
     names = zip(sharp.window.tolist(), sharp.step.tolist(), sharp.owner.tolist(), sharp.part.tolist(), x, y)
     assert sorted(names) == sorted(places)
     image = drawn.pixels.window * num_steps + drawn.pixels.step
@@ -123,7 +123,7 @@ def test_a_known_motion_under_known_times_is_found(elapsed):
 
     sharp, _ = deskew(points, scene.sweeps, found)
     for step in range(len(elapsed)):  # the images of both units become one
-        first, second = sharp.position[:, sharp.step == step].chunk(2, 1)
+        first, second = sharp.position[:2, sharp.step == step].chunk(2, 1)
         assert (first - second).abs().max() < 2e-3
 
 
