@@ -45,7 +45,8 @@ def test_the_wheel_holds_the_package_and_nothing_else(wheel: Path) -> None:
         *(ROOT / "configs").rglob("*.yaml"),
     ]
     expected = {re.sub("^configs/", "cflow_torch/configs/", file.relative_to(ROOT).as_posix()) for file in kept}
-    assert names_in(wheel) == expected | {"cflow_torch/py.typed", "cflow_torch/verified/confidence.json"}
+    files = ("py.typed", "verified/confidence.json", "viz/page.html")
+    assert names_in(wheel) == expected | {f"cflow_torch/{file}" for file in files}
     assert wheel.name.endswith("-py3-none-any.whl")
     assert wheel.stat().st_size < 2**20, "under 1 MiB: no picture, no data"
 
