@@ -52,7 +52,7 @@ def test_is_stored_with_outputs(name: str) -> None:
 def test_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture) -> None:
     plt = pytest.importorskip("matplotlib.pyplot")
     plt.switch_backend("agg")
-    if any("viz.page" in cell["source"] for cell in cells(name)):
+    if any("show(pairs" in cell["source"] for cell in cells(name)):
         pytest.importorskip("k3d", reason="needs the extra html (Python 3.9)")
     here = tmp_path / "here"
     here.mkdir()
