@@ -175,8 +175,8 @@ class FlowResult:
         Convention:
             The box encloses the points of sweep t, moved by their flow. If only one side of an object is visible, the
             box encloses that side. On simulated drives, objects of 50 points and more have their centre inside the true
-            box and their velocity within 0.75 m/s, except for a turning articulated lorry (4 m/s). Many smaller ones are
-            pieces of the static world; nearly all of these have a confidence below 0.7, and `track` removes them.
+            box and their velocity within 0.75 m/s, except for a turning articulated lorry (4 m/s). Many smaller ones
+            are pieces of the static world; nearly all of these have a confidence below 0.7, and `track` removes them.
 
         Raises:
             CFlowError: the number of points differs, or the result is from a file without flow or clusters.
