@@ -199,6 +199,13 @@ def drive_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+# Where the ids of tracks point to, away from the edges.
+ANCHORS = """[...document.querySelectorAll("#labels span")]
+  .filter(span => !span.hidden && span.textContent.includes("m/s"))
+  .map(span => [parseFloat(span.style.left), parseFloat(span.style.top)])
+  .filter(([x, y]) => x > 30 && x < innerWidth - 30 && y > 10 && y < innerHeight - 60)"""
+
+
 def picture(tab: Any) -> np.ndarray:
     """(H, W, 3) int64 screenshot."""
     return np.array(Image.open(io.BytesIO(tab.screenshot())).convert("RGB")).astype(np.int64)
@@ -218,7 +225,7 @@ def test_a_browser_shows_plays_and_recolours_a_drive(browser: Any, drive_page: P
     tab.goto(drive_page.as_uri())
     tab.wait_for_function("window.viewer && viewer.ready", timeout=60_000)
     assert tab.locator("h1").inner_text() and "preset fast" in tab.locator("#head").inner_text()
-    assert tab.locator("#labels span:has-text('m/s')").count() > 0
+    anchors = tab.evaluate(ANCHORS)
     for name in ("arrows", "boxes", "trails", "labels", "rings"):  # only points are left
         tab.locator(f"#show-{name}").uncheck()
     settled = "viewer.go(viewer.state.frame)"
@@ -231,6 +238,9 @@ def test_a_browser_shows_plays_and_recolours_a_drive(browser: Any, drive_page: P
     tab.evaluate("document.querySelectorAll('.panel').forEach(panel => { panel.style.opacity = 0; })")  # not the legend
     first = picture(tab)
     assert count_of(first, colors) > 200, "moving objects are drawn in the colours of their flow"
+    below = [first[int(y) - 5 : int(y) + 45, int(x) - 25 : int(x) + 25] for x, y in anchors]
+    hits = [count_of(pixels, colors) > 0 for pixels in below]
+    assert len(hits) > 2 and np.mean(hits) > 0.7, "points are where the tracks are"
     tab.locator("#show-ground").uncheck()
     tab.evaluate(settled)
     assert (picture(tab) != first).any(axis=2).sum() > 500, "the ground can be hidden"
