@@ -6,7 +6,7 @@ picture=flow         the flow from above; truth=true|false|auto adds the ground 
 picture=clusters     the points by cluster
 picture=keypoints    the key points of both sweeps and their matches (model=keypoints)
 picture=correlation  one cluster and the correlation of all its shifts (model=paper); cluster=ID chooses it
-picture=scales       coarse to fine, one column per pixel size (model=paper with three sizes)
+picture=scales       coarse to fine, one column per pixel size (model=paper with three sizes), and one cluster
 picture=animation    the flow of many pairs: first= step= count= format=gif|mp4 frames_per_second= width=
 
 examples:
@@ -124,7 +124,7 @@ PICTURES: dict[str, Callable[[DictConfig, SceneFlowModel, Log, Window], Any]] = 
     "clusters": _from_above,
     "keypoints": lambda cfg, model, log, sweeps: plot_keypoints(sweeps, model.config),
     "correlation": lambda cfg, model, log, sweeps: plot_correlation(sweeps, model.config, cluster_id=cfg.cluster),
-    "scales": lambda cfg, model, log, sweeps: plot_scales(sweeps, model.config),
+    "scales": lambda cfg, model, log, sweeps: plot_scales(sweeps, model.config, cluster_id=cfg.cluster),
 }
 
 

@@ -12,8 +12,8 @@ from cflow_torch.types import FlowResult, Window
 from cflow_torch.viz import style
 from cflow_torch.viz.bev import longest_flow, point_rows, view_of
 from cflow_torch.viz.occupancy import sweep_marks
-from cflow_torch.viz.panel import FLOW_CAPTION, draw_flow, group_medians
-from cflow_torch.viz.stages import Scale, scales
+from cflow_torch.viz.panel import FLOW_CAPTION, draw_flow
+from cflow_torch.viz.stages import Scale, choose_cluster, scales
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -21,36 +21,39 @@ if TYPE_CHECKING:
 
 _MARGIN = 2.0  # metres around the object in the close-up
 _SMALLEST = 4.0  # metres, half a side of the close-up
-_MIN_POINTS = 30  # of the object in the close-up
 
 
-def plot_scales(window: Window, config: Config | None = None) -> Figure:
+def plot_scales(window: Window, config: Config | None = None, *, cluster_id: int | None = None) -> Figure:
     """Draw coarse to fine, one column per pixel size.
 
     Args:
         window: sweeps.
         config: of one of the paper's methods; None = the preset "paper" with pixels of 0.4, 0.2 and 0.1 m, without
             older sweeps.
+        cluster_id: as in `FlowResult`; None = the cluster with the largest number of points times metres of flow.
 
     Returns:
-        Figure, 1600 pixels wide. Above, close up on the object that coarse to fine changes most: sweep t moved by the
-        flow of the coarser scales, and t+1; in the last column t moved by the whole flow. Below: the flow so far, in
-        the colours of the wheel; in the last column the flow of the finest pixels alone.
+        Figure, 1600 pixels wide. Above, close up on one cluster: sweep t moved by the flow of the coarser scales, and
+        t+1; in the last column t moved by the whole flow. Below: the flow so far, in the colours of the wheel; in the
+        last column the flow of the finest pixels alone.
 
     Convention: metres, frame of t+1.
 
     Raises:
-        CFlowError: matplotlib is not installed, the method does not process one scale after the other (presets default
-            and fast), or the input is invalid.
+        CFlowError: matplotlib is not installed, there is no such cluster, the method does not process one scale after
+            the other (presets default and fast), or the input is invalid.
 
     Source: the paper's multi-scale strategy and its figure.
     """
     if config is None:
         config, window = make_config("paper", pixel_sizes=(0.4, 0.2, 0.1)), replace(window, pch=(), pcf=())
     found, result = scales(window, config)
+    of_point = result.cluster_id.numpy()
+    cluster_id = choose_cluster(of_point, found[-1].flow, cluster_id)
+    shown = np.full(len(of_point), False) if cluster_id is None else of_point == cluster_id
     _, alone = scales(window, config.replace(pixel_sizes=config.pixel_sizes[-1:]))
     count = len(found) + 1
-    left, gap, side = 0.6, 0.22, 1.75  # inches; `side` is for the legends
+    left, gap, side = 0.8, 0.22, 1.75  # inches; `side` is for the legends
     width = (16.0 - left - gap * count - side) / count
     lines = 1 if count <= 4 else 2  # of the panels' names
     more = 0.2 * (lines - 1)  # inches
@@ -60,9 +63,10 @@ def plot_scales(window: Window, config: Config | None = None) -> Figure:
         [style.add_panel(figure, left + i * (width + gap), bottom, width, width) for i in range(count)]
         for bottom in (above_y, below_y)
     )
-    style.add_heading(figure, 0.32, "coarse to fine: " + " → ".join(f"{size:g} m" for size in config.pixel_sizes))
+    title = "coarse to fine: " + " → ".join(f"{size:g} m" for size in config.pixel_sizes)
+    style.add_heading(figure, 0.32, title if cluster_id is None else f"{title}; cluster {cluster_id}")
     position = point_rows("points", window.pc0.points) + result.pose_flow.numpy()
-    _draw_close_up(above, position, found, _changed_object(result, alone))
+    _draw_close_up(above, position, found, shown)
     max_flow = _draw_flows(below, config, position, found, result, alone)
     for axes in (*above, *below):
         name = axes.get_title().replace(": ", ":\n", lines - 1)
@@ -77,22 +81,6 @@ def plot_scales(window: Window, config: Config | None = None) -> Figure:
         axes.axis("off")
     style.add_caption(figure, FLOW_CAPTION)
     return figure
-
-
-def _changed_object(result: FlowResult, alone: FlowResult) -> np.ndarray:
-    """(N,) bool, points of the object whose flow differs most between coarse to fine and the finest pixels alone.
-
-    Convention: among the larger clusters, the largest median change, at most the flow itself, times the score of the
-        match. If nothing changes, the fastest cluster.
-    """
-    cluster, flow = result.cluster_id.numpy(), result.residual_flow.numpy()
-    change = np.linalg.norm(flow - alone.residual_flow.numpy(), axis=1)
-    speed = np.linalg.norm(flow, axis=1)
-    weight = (np.minimum(change, speed) if change.any() else speed) * result.score.numpy()
-    number, median, count = group_medians(cluster, weight[:, None])
-    if not len(number):
-        return cluster >= 0
-    return cluster == number[np.where(count >= min(_MIN_POINTS, count.max()), median[:, 0], -1).argmax()]
 
 
 def _square(position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

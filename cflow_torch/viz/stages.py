@@ -132,13 +132,10 @@ def cluster_correlation(window: Window, config: Config, cluster_id: int | None =
     if not isinstance(config, DenseConfig) or config.clustering != "components":
         raise _not_drawable(config, "correlation map per cluster", "paper")
     (*_, last), result = scales(window, config)
-    numbers, flow, count = group_medians(result.cluster_id.numpy(), last.flow)
-    if not len(numbers):
-        raise CFlowError("no cluster has points in both sweeps: there is no correlation to draw")
+    of_point = result.cluster_id.numpy()
+    cluster_id = choose_cluster(of_point, last.flow, cluster_id)
     if cluster_id is None:
-        cluster_id = int(numbers[(np.linalg.norm(flow, axis=1) * count).argmax()])
-    if cluster_id not in numbers:
-        raise CFlowError(f"cluster_id={cluster_id}: no such cluster is in both sweeps; the last is {numbers[-1]}")
+        raise CFlowError("no cluster has points in both sweeps: there is no correlation to draw")
     sweeps, grid = last.sweeps, last.sweeps.grid
     clusters, _, _ = find_clusters(sweeps, config)
     pairs = make_pairs(clusters, sweeps.batch, grid.pixel_size, config.max_speed)
@@ -157,8 +154,30 @@ def cluster_correlation(window: Window, config: Config, cluster_id: int | None =
         ncc=ncc.numpy(),
         shift=shifts[pair].numpy(),
         score=float(scores[pair]),
-        flow=flow[numbers == cluster_id][0],
+        flow=group_medians(np.where(of_point == cluster_id, 0, -1), last.flow)[1][0],
     )
+
+
+def choose_cluster(of_point: np.ndarray, flow: np.ndarray, cluster_id: int | None = None) -> int | None:
+    """The given cluster, or else that with the largest number of points times metres of flow; None = there is none.
+
+    Args:
+        of_point: (N,) int64 cluster of each point, -1 = none.
+        flow: (N, 3) float64 residual flow, metres per sweep interval.
+        cluster_id: a cluster.
+
+    Raises:
+        CFlowError: no point is in the given cluster.
+    """
+    numbers, median, count = group_medians(of_point, flow)
+    if cluster_id is None:
+        return int(numbers[(np.linalg.norm(median, axis=1) * count).argmax()]) if len(numbers) else None
+    if cluster_id not in numbers:
+        last = f"the last is {numbers[-1]}" if len(numbers) else "there is none"
+        raise CFlowError(
+            f"cluster={cluster_id} is not a cluster that is in both sweeps: {last}; picture=clusters shows all"
+        )
+    return cluster_id
 
 
 @torch.inference_mode()
