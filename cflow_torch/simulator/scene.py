@@ -88,9 +88,9 @@ class Scene:
         # In the body: rotate about x, about y, move to the centre; a leg then swings about the y axis through the hip.
         angle = table.swing * np.sin(2 * math.pi * table.stride * seconds + table.phase)
         hip = np.where(angle[:, None] == 0, 0, (0, 0, HIP))
-        pose = _rotation_y(table.pitch) @ _rotation_x(table.roll)
+        pose = _rotation(1, table.pitch) @ _rotation(0, table.roll)
         pose[:, :3, 3] = table.centre - hip
-        pose = _rotation_y(angle) @ pose
+        pose = _rotation(1, angle) @ pose
         pose[:, :3, 3] += hip
         return Solids(
             torch.from_numpy(table.kind),
@@ -101,17 +101,11 @@ class Scene:
         )
 
 
-def _rotation_x(angle: np.ndarray) -> np.ndarray:
+def _rotation(axis: int, angle: np.ndarray) -> np.ndarray:
+    """(P, 4, 4) rotations by `angle` (P,) radians about x (0), y (1) or z (2)."""
+    first, second = (axis + 1) % 3, (axis + 2) % 3
     rotation = np.tile(np.eye(4), (len(angle), 1, 1))
-    rotation[:, 1, 1] = rotation[:, 2, 2] = np.cos(angle)
-    rotation[:, 2, 1] = np.sin(angle)
-    rotation[:, 1, 2] = -rotation[:, 2, 1]
-    return rotation
-
-
-def _rotation_y(angle: np.ndarray) -> np.ndarray:
-    rotation = np.tile(np.eye(4), (len(angle), 1, 1))
-    rotation[:, 0, 0] = rotation[:, 2, 2] = np.cos(angle)
-    rotation[:, 0, 2] = np.sin(angle)
-    rotation[:, 2, 0] = -rotation[:, 0, 2]
+    rotation[:, first, first] = rotation[:, second, second] = np.cos(angle)
+    rotation[:, second, first] = np.sin(angle)
+    rotation[:, first, second] = -rotation[:, second, first]
     return rotation
