@@ -38,28 +38,63 @@ def test_help_explains_a_command_with_examples_and_settings(
     assert capsys.readouterr().out == text
 
 
-QUICK = (
-    "--version",
-    "--help",
-    "eval --help",
-    "help clean",
-    "settings",
-    "settings max_speed",
-    "info",
-    "completion bash",
+# ---------------------------------------------------------------- wrong calls
+
+
+# Mistakes that are found without Hydra and torch, then the others.
+PLAIN = (
+    ("fliw", "unknown command 'fliw' (did you mean flow?): give one of demo, flow,"),
+    ("eval modle=paper", "unknown setting 'modle' (did you mean model?): `cflow eval --cfg job`"),
+    ("flow num_history=2", "(did you mean model.num_history?)"),
+    ("eval model=papr", "model=papr (did you mean paper?): give one of default, fast, keypoints, offline, paper"),
+    ("eval model.densify=nearest", "densify is a setting of method keypoints, not of verified"),
+    ("eval model.num_history=-1", "num_history=-1: give a whole number of at least 0"),
+    ("plot cluster=3", "setting 'cluster' belongs to picture=correlation: give that as well"),
+    ("flow data=av2", "the data is missing: give data.root=PATH"),
+    ("flow fast", "fast: there is no such file or folder; settings are NAME=VALUE"),
+    ("flow data=av2 data.root=/no/such/folder", "/no/such/folder"),
+    ("completion", "one of bash, zsh, fish, got nothing"),
+    ("clean standing=true", "setting standing was removed: use remove_stopped"),
+    ("eval -m model=fast,papr", "model=papr (did you mean paper?)"),
+    ("eval model.num_history=1.5", "num_history=1.5: give a whole number of at least 0"),
+    ("eval --bogus", "unknown option '--bogus'"),
+    ("submit masks=none", "masks=none: there is no such file or folder"),
 )
-WRONG = (
-    *("fliw", "eval /no/such/path", "flow data=av2 data.root=/no/such/path", "flow data=av2", "eval --bogus"),
-    *("eval model=papr", "eval -m model=fast,papr", "eval modle=paper", "eval model.num_history=-1"),
-    *("eval model.densify=nearest", "plot cluster=3", "clean standing=true", "settings maxspeed", "submit masks=none"),
+OTHERS = (
+    ("eval -m hydra/launcher=joblob data.seed=1,2", "pip install hydra-joblib-launcher hydra-submitit-launcher"),
+    ("eval model.pixel_sizes=[0.2", "cannot read 'model.pixel_sizes=[0.2'"),
+    ("eval model.method=dense", "is a setting of method verified"),
+    ("bench repeats=0", "repeats=0: give a whole number of at least 1"),
+    ("bench batches=[0]", "batches=[0]: give whole numbers of at least 1"),
+    ("eval data.step=0", "data.step=0: give a whole number of at least 1"),
+    ("eval definition=mine data.num_sweeps=2", "mine"),
+    ("demo pair=99 data.num_sweeps=2", "has pairs 0 to 0"),
+    ("plot log=1e5 data.num_sweeps=2", "log=1e5: there is no such log"),
+    ("plot pair=1.5", "pair=1.5: Value '1.5' of type 'float' could not be converted to Integer"),
+    ("plot picture=animation width=abc", "width=abc: Value 'abc'"),
+    ("flow contents=[confidence] model=paper", "only model=default, fast and offline have a confidence"),
 )
+
+
+@pytest.mark.parametrize(("call", "message"), PLAIN + OTHERS)
+def test_a_wrong_call_is_one_line_with_a_hint(
+    call: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cflow: Cflow, capsys: Any
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert cflow(*shlex.split(call)) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and error.count("\n") == 1 and message in error
+    assert not list(tmp_path.rglob("*results.json")) + list(tmp_path.glob("outputs/flow/**/*.feather"))
+
+
+HELPFUL = ("--version", "--help", "eval --help", "help clean", "settings", "settings data", "info", "completion bash")
 
 
 def test_help_and_wrong_calls_come_without_torch_and_hydra(cflow: Cflow, capsys: pytest.CaptureFixture) -> None:
     code = f"""
 import sys
 from cflow_torch.cli.main import main
-for call in {QUICK + WRONG}:
+for call in {[*HELPFUL, *(call for call, _ in PLAIN)]}:
     try:
         main(call.split())
     except SystemExit as stop:
@@ -70,52 +105,10 @@ for call in {QUICK + WRONG}:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith(f"cflow_torch {cflow_torch.__version__}\n")
-    assert len(done.stderr.splitlines()) == done.stderr.count("error: ") == len(WRONG)
+    assert len(done.stderr.splitlines()) == done.stderr.count("error: ") == len(PLAIN)
     assert cflow() == 0
     text = capsys.readouterr().out
     assert all(f"  {command}" in text for command in COMMANDS)
-
-
-# ---------------------------------------------------------------- wrong calls
-
-
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        ("fliw", "unknown command 'fliw' (did you mean flow?): give one of demo, flow,"),
-        ("eval modle=paper", "unknown setting 'modle' (did you mean model?): `cflow eval --cfg job`"),
-        ("flow num_history=2", "(did you mean model.num_history?)"),
-        ("eval model=papr", "model=papr (did you mean paper?): give one of default, fast, keypoints, offline, paper"),
-        ("eval -m hydra/launcher=joblob data.seed=1,2", "pip install hydra-joblib-launcher hydra-submitit-launcher"),
-        ("eval model.pixel_sizes=[0.2", "cannot read 'model.pixel_sizes=[0.2'"),
-        ("eval model.densify=nearest", "densify is a setting of method keypoints, not of verified"),
-        ("eval model.method=dense", "is a setting of method verified"),
-        ("eval model.num_history=-1", "num_history=-1: give a whole number of at least 0"),
-        ("bench repeats=0", "repeats=0: give a whole number of at least 1"),
-        ("bench batches=[0]", "batches=[0]: give whole numbers of at least 1"),
-        ("eval data.step=0", "data.step=0: give a whole number of at least 1"),
-        ("eval definition=mine data.num_sweeps=2", "mine"),
-        ("demo pair=99 data.num_sweeps=2", "has pairs 0 to 0"),
-        ("plot cluster=3", "setting 'cluster' belongs to picture=correlation: give that as well"),
-        ("plot log=1e5 data.num_sweeps=2", "log=1e5: there is no such log"),
-        ("plot pair=1.5", "pair=1.5: Value '1.5' of type 'float' could not be converted to Integer"),
-        ("plot picture=animation width=abc", "width=abc: Value 'abc'"),
-        ("flow data=av2", "the data is missing: give data.root=PATH"),
-        ("flow fast", "fast: there is no such file or folder; settings are NAME=VALUE"),
-        ("flow data=av2 data.root=/no/such/folder", "/no/such/folder"),
-        ("flow contents=[confidence] model=paper", "only model=default, fast and offline have a confidence"),
-        ("completion", "one of bash, zsh, fish, got nothing"),
-        ("clean standing=true", "setting standing was removed: use remove_stopped"),
-    ],
-)
-def test_a_wrong_call_is_one_line_with_a_hint(
-    call: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cflow: Cflow, capsys: Any
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert cflow(*shlex.split(call)) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("error: ") and error.count("\n") == 1 and message in error
-    assert not list(tmp_path.rglob("*results.json")) + list(tmp_path.glob("outputs/flow/**/*.feather"))
 
 
 def bench_that_raises(error: BaseException, monkeypatch: pytest.MonkeyPatch) -> None:
