@@ -18,7 +18,6 @@ from cflow_torch.config import KeypointsConfig
 from cflow_torch.keypoints.descriptors import KeyPoints
 from cflow_torch.keypoints.match_candidates import chunks, pair, pairs_at_once
 from cflow_torch.ops.indices import flat_nonzero, gather
-from cflow_torch.ops.segments import segment_amin
 
 # The ratio rho is used to four decimals, so that the ratio test compares integers.
 _RATIO_UNIT = 10_000
@@ -62,9 +61,8 @@ def match(pc0: KeyPoints, pc1: KeyPoints, reach: Tensor, config: KeypointsConfig
         The accepted matches.
 
     Convention:
-        Scores are compared exactly, as count^2 / energy of the candidate. Ties: smallest distance, then smallest dy,
-        then smallest dx. A match is accepted if R > rho R' holds in integers for the second best R'. A tie for the
-        best is therefore rejected. A match without a second candidate is accepted.
+        Scores are compared exactly, as count^2 / energy of the candidate. A match is accepted if R > rho R' holds in
+        integers for the second best R'. Ties: rejected. A match without a second candidate is accepted.
 
     Cost: time (key points x match candidates) x L^2; memory a fixed number of pairs, plus L^2 bytes a point.
     """
@@ -78,14 +76,12 @@ def match(pc0: KeyPoints, pc1: KeyPoints, reach: Tensor, config: KeypointsConfig
         value = square.double() / energy  # exact enough to tell any two different fractions apart
         top = value.new_zeros(num_source).scatter_reduce_(0, source, value, "amax")
         tied = flat_nonzero(value == top.index_select(0, source))
-        p, q = gather(tied, source, target)
-        dy, dx = _shift(pc0, pc1, p, q)
-        order = ((dy * dy + dx * dx) * (1 << 17) + dy + (1 << 16)) * 2 + (dx > 0)  # length and dy leave the sign of dx
-        first = segment_amin(order, p, num_source, torch.iinfo(torch.int64).max)
-        best = tied.index_select(0, flat_nonzero(order == first.index_select(0, p)))
+        p = source.index_select(0, tied)
+        best_of_point = torch.zeros_like(pc0.row).scatter_(0, p, tied)  # any of a tie, which the ratio test rejects
+        best = tied.index_select(0, flat_nonzero(tied == best_of_point.index_select(0, p)))
         p = source.index_select(0, best)
         # The ratio test against every other contender: c1^2 E2 > rho^2 c2^2 E1.
-        rivalled = torch.zeros_like(pc0.row).index_copy_(0, p, best).index_select(0, source)
+        rivalled = best_of_point.index_select(0, source)
         best_square, best_energy = gather(rivalled, square, energy)
         is_rival = best_square * energy * _RATIO_UNIT**2 <= square * best_energy * rho**2
         rivals = flat_nonzero(is_rival.index_fill_(0, best, False))

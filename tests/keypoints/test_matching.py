@@ -9,14 +9,7 @@ from scenes import config
 
 from cflow_torch.keypoints import match_candidates, matching
 from cflow_torch.keypoints.descriptors import KeyPoints, describe
-from cflow_torch.keypoints.matching import Matches, match
-
-
-def matched(images: np.ndarray, images1: np.ndarray, reach: float, **overrides) -> Matches:
-    settings = config("keypoints", **overrides)
-    pc0, pc1 = (describe(torch.from_numpy(i), settings.patch_size) for i in (images, images1))
-    return match(pc0, pc1, torch.full((len(images),), reach, dtype=torch.float64), settings)
-
+from cflow_torch.keypoints.matching import match
 
 # ---------------------------------------------------------------------------------------------------------- by hand
 
@@ -48,13 +41,6 @@ def test_the_ratio_test_is_strict_and_exact():
 def test_a_single_candidate_is_accepted_and_a_tie_is_rejected():
     assert shifts(hand_made([[5, 5]], [9]), hand_made([[4, 3]], [1]), ratio=2.0) == {0: (-1, -2)}
     assert shifts(hand_made([[5, 5]], [9]), hand_made([[4, 3], [9, 9]], [9, 9]), ratio=1.0) == {}
-
-
-def test_the_energy_of_the_candidate_counts():
-    # One pixel, two near candidates with E = 2 and a farther one with E = 1; c = 1 for all.
-    image, image1 = np.zeros((2, 1, 12, 12), dtype=bool)
-    image[0, 5, 5] = image1[0, 5, 6] = image1[0, 5, 7] = image1[0, 5, 1] = True
-    assert matched(image, image1, 10.0, patch_size=3).shift.tolist() == [[0, -4]]
 
 
 def test_a_match_at_the_radius_is_allowed():
