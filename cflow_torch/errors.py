@@ -1,6 +1,12 @@
-"""The error class of the package. This module imports nothing, so that a wrong call is answered at once."""
+"""The error and warning classes of the package. This module does not import torch, so that a wrong call is answered at
+once."""
 
 from __future__ import annotations
+
+import sys
+import warnings
+
+_NOT_OF_USERS = ("cflow_torch", "torch", "contextlib")  # packages between the user's code and a warning
 
 
 class CFlowError(ValueError):
@@ -8,3 +14,19 @@ class CFlowError(ValueError):
 
     The message says what you passed, what is allowed, and what to do.
     """
+
+
+class CFlowWarning(UserWarning):
+    """Input that is allowed, but likely a mistake."""
+
+
+class NoActivePoints(CFlowWarning):
+    """A window without a point that takes part, so its result is empty."""
+
+
+def warn(text: str, category: type[CFlowWarning] = CFlowWarning) -> None:
+    """Warn, and name the line of the user's code that called the package."""
+    level, frame = 2, sys._getframe(1)
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").split(".")[0] in _NOT_OF_USERS:
+        level, frame = level + 1, frame.f_back
+    warnings.warn(text, category, stacklevel=level)

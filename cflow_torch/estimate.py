@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import replace
 from typing import Any, Sequence
 
@@ -10,14 +9,13 @@ import numpy as np
 
 from cflow_torch.config import Config, make_config
 from cflow_torch.dense.method import CorrelationFlow
+from cflow_torch.errors import warn
 from cflow_torch.keypoints.method import CorrelationFlowKeypoints
 from cflow_torch.model import SceneFlowModel
-from cflow_torch.types import Array, CFlowError, FlowResult, Sweep, Window, as_numpy
+from cflow_torch.types import Array, CFlowError, FlowResult, Sweep, Window
 from cflow_torch.verified.method import VerifiedFlow
-from cflow_torch.windows.ground import find_ground_batch, has_ground
-from cflow_torch.windows.validation import check_windows, choose_device, keep_nearest
-
-GROUND = (None, "auto", "patchwork")
+from cflow_torch.windows.ground import CHOICES, find_ground_batch
+from cflow_torch.windows.validation import choose_device, keep_nearest
 
 
 def estimate_flow(
@@ -40,7 +38,7 @@ def estimate_flow(
     method: str | None = None,
     preset: str | None = None,
     config: Config | None = None,
-    ground: str | None = None,
+    ground: str | None = "auto",
     device: Any = "auto",
     **overrides: Any,
 ) -> FlowResult:
@@ -52,10 +50,10 @@ def estimate_flow(
         pc1: points of sweep t+1, (N1, 3+).
         T_ego1_ego0: (4, 4), maps coordinates of the ego frame at t to the one at t+1 (pose1^-1 pose0). None = pc0 is
             already in the frame of t+1.
-        gm0, gm1: ground masks, True = ground; None = nothing is ground, unless `ground` says otherwise.
+        gm0, gm1: ground masks, (N,) bool, True = ground; None = see `ground`.
         pch: older sweeps t-1, t-2, ...; the nearest `num_history` of them are used.
         T_ego1_egoh: (4, 4) for each of `pch`; may be left out only if `T_ego1_ego0` is left out too.
-        gmh: ground mask of each of `pch`; empty = nothing is ground.
+        gmh: ground mask of each of `pch`, or empty.
         dt0, dt1: times of the points, seconds after the instant of their sweep, see `Sweep.point_times`. The presets
             `default`, `fast` and `offline` use them if every sweep has them.
         dth: times of the points of each of `pch`.
@@ -64,8 +62,8 @@ def estimate_flow(
         method: "dense", "keypoints" or "verified"; None = the method of the preset.
         preset: "default", "fast", "offline", "keypoints" or "paper"; None = the preset of the method, or "default".
         config: settings from `make_config`, instead of `method` and `preset`.
-        ground: None = only the masks count; "auto" = find the ground of every sweep without a mask (`find_ground`);
-            "patchwork" = find it with Patchwork++ (`pip install pypatchworkpp`).
+        ground: what to do with sweeps without a mask. "grid" = find their ground (`find_ground`); "auto" = the same,
+            and say so; "patchwork" = find it with Patchwork++ (`pip install pypatchworkpp`); None = they have none.
         device: "auto" = the device of the tensors, else a GPU if there is one, else the CPU.
         **overrides: any field of `Config`, for example `pixel_sizes=(0.4, 0.2, 0.1)`.
 
@@ -77,7 +75,8 @@ def estimate_flow(
         `is_valid` False. Empty sweeps give an empty or all-zero result.
 
     Warns:
-        UserWarning: a sweep without a mask contains ground, and `ground` is None; or no point of pc0 is active.
+        CFlowWarning: the ground was found (`ground="auto"`); a likely mistake in the input, see
+            `SceneFlowModel.forward`; or no point of pc0 is active.
 
     Raises:
         CFlowError: wrong shape or dtype, a transform that is not rigid, mixed devices, an unknown setting.
@@ -90,8 +89,8 @@ def estimate_flow(
 
     Source: Alg. general_correlation_flow; Sec. CorrelationFlow-Keypoints.
     """
-    if ground not in GROUND:
-        raise CFlowError(f"ground={ground!r}: give one of {', '.join(map(repr, GROUND))}")
+    if ground not in CHOICES:
+        raise CFlowError(f"ground={ground!r}: give one of {', '.join(map(repr, CHOICES))}")
     if config is None:
         config = make_config(preset, method, **overrides)
     elif not isinstance(config, Config) or (preset, method) != (None, None):
@@ -114,19 +113,16 @@ def estimate_flow(
         extra = [name for name, value in {**one, **several}.items() if value is not None and len(value) > 0]
         if extra:
             raise CFlowError(f"{', '.join(extra)} and a Sweep are given: put masks, poses and times into the Sweep")
-        window = Window(pc0, pc1, tuple(pch), tuple(pcf))  # type: ignore[arg-type]  # check_windows finds arrays
+        window = Window(pc0, pc1, tuple(pch), tuple(pcf))  # type: ignore[arg-type]  # it refuses arrays
     else:
         window = Window(
-            pc0=_sweep(moved, pc0, gm0, T_ego1_ego0, dt0),
-            pc1=_sweep(moved, pc1, gm1, None, dt1),
+            pc0=_sweep("0", moved, pc0, gm0, T_ego1_ego0, dt0),
+            pc1=_sweep("1", moved, pc1, gm1, None, dt1),
             pch=_sweeps(moved, "h", pch, gm=gmh, T_ego1_ego=T_ego1_egoh, dt=dth),
             pcf=_sweeps(moved, "f", pcf, gm=gmf, T_ego1_ego=T_ego1_egof, dt=dtf),
         )
-    check_windows([window])
     window = _find_ground(keep_nearest(window, config.num_history), ground, device)
-    (result,) = make_model(config, device)([window])
-    _warn_if_nothing_is_active(result, window, config)
-    return result
+    return make_model(config, device)([window])[0]
 
 
 def make_model(config: Config, device: Any = "auto") -> SceneFlowModel:
@@ -146,51 +142,38 @@ def make_model(config: Config, device: Any = "auto") -> SceneFlowModel:
 
 
 def _find_ground(window: Window, ground: str | None, device: Any) -> Window:
-    """Add the missing ground masks, or warn if there is ground and `ground` is None."""
-    chosen = choose_device([window], device)
+    """Add the missing ground masks."""
     sweeps = [window.pc0, window.pc1, *window.pch, *window.pcf]
     bare = [index for index, sweep in enumerate(sweeps) if sweep.is_ground is None]
     clouds = [sweeps[index].points for index in bare]
     if ground is None:
-        if any(has_ground(clouds, device=chosen)):
-            warnings.warn(
-                "a sweep without a ground mask contains ground, which joins the objects on it into one cluster, so "
-                "moving objects are missed: pass ground='auto', or masks gm0 and gm1 (gmh, gmf), all False if this is "
-                "not ground",
-                UserWarning,
-                stacklevel=3,
-            )
-        return window
-    method = "grid" if ground == "auto" else ground
-    for index, mask in zip(bare, find_ground_batch(clouds, method, device=chosen)):
+        masks: list[Any] = [np.zeros(len(cloud), dtype=bool) for cloud in clouds]
+    else:
+        method = "grid" if ground == "auto" else ground
+        masks = find_ground_batch(clouds, method, device=choose_device([window], device))
+    if ground == "auto" and any(bool(mask.any()) for mask in masks):
+        warn(
+            "there is no ground mask for some sweeps, so we found their ground. To turn this line off give masks (gm0, "
+            "gm1), ground='grid' (the same result), or ground=None if the clouds have no ground"
+        )
+    for index, mask in zip(bare, masks):
         sweeps[index] = replace(sweeps[index], is_ground=mask)
     first_future = 2 + len(window.pch)
     return Window(sweeps[0], sweeps[1], tuple(sweeps[2:first_future]), tuple(sweeps[first_future:]))
 
 
-def _warn_if_nothing_is_active(result: FlowResult, window: Window, config: Config) -> None:
-    """Warn about points in millimetres, in another place or all on the ground: legal, but rarely meant."""
-    if len(result.is_valid) == 0 or bool(result.is_valid.any()):
-        return
-    positions = as_numpy(window.pc0.points)[:, :3]
-    finite = positions[np.isfinite(positions).all(axis=1)]
-    seen = "all are NaN or infinite"
-    if len(finite):
-        low, high = finite.min(axis=0), finite.max(axis=0)
-        extent = ", ".join(f"{axis} {a:.6g} to {b:.6g}" for axis, a, b in zip("xyz", low, high))
-        seen = f"they span {extent} in their own frame"
-    warnings.warn(
-        f"none of the {len(positions)} points of pc0 is active ({seen}): are they metres, near the ego vehicle, and "
-        f"not all of them ground? point_cloud_range={config.point_cloud_range}, in the ego frame at t+1",
-        UserWarning,
-        stacklevel=3,
-    )
-
-
-def _sweep(moved: str | None, points: Array, is_ground: Any, transform: Array | None, times: Array | None) -> Sweep:
+def _sweep(
+    name: str, moved: str | None, points: Array, is_ground: Any, transform: Array | None, times: Array | None
+) -> Sweep:
     """A sweep whose world is the ego frame at t+1, so its pose is T_ego1_ego. No sweep has a pose if none is moved."""
     pose = None if moved is None else np.eye(4) if transform is None else transform
-    return Sweep(points, is_ground, pose, point_times=times)
+    try:
+        return Sweep(points, is_ground, pose, point_times=times)
+    except CFlowError as error:
+        message = str(error)
+        for field, argument in (("points", "pc"), ("is_ground", "gm"), ("pose", "T_ego1_ego"), ("point_times", "dt")):
+            message = message.replace(f"Sweep.{field}", argument + name)
+        raise CFlowError(message) from None
 
 
 def _sweeps(moved: str | None, side: str, clouds: Sequence[Any], **others: Sequence[Any]) -> tuple[Sweep, ...]:
@@ -206,4 +189,4 @@ def _sweeps(moved: str | None, side: str, clouds: Sequence[Any], **others: Seque
                 f"{name}{side} has {len(values)} entries for {len(clouds)} sweeps of pc{side}: give one per sweep"
             )
     columns = (values if len(values) > 0 else [None] * len(clouds) for values in others.values())
-    return tuple(_sweep(moved, *row) for row in zip(clouds, *columns))
+    return tuple(_sweep(f"{side}[{i}]", moved, *row) for i, row in enumerate(zip(clouds, *columns)))

@@ -14,6 +14,7 @@ from cflow_torch.stages import stage
 from cflow_torch.types import CFlowError, FlowResult, Window
 from cflow_torch.windows.bev_grid import Grid
 from cflow_torch.windows.collation import Batch, make_batch
+from cflow_torch.windows.inspection import Inspection, warn_of_inactive
 from cflow_torch.windows.memory import split_windows
 from cflow_torch.windows.validation import check_windows, choose_device
 
@@ -98,6 +99,7 @@ class SceneFlowModel(nn.Module):
             )
         self.config: Any = config
         self.device = device
+        self.inspect: Any = Inspection()  # None = do not warn of likely mistakes in the windows
 
     @classmethod
     def from_preset(cls: type[Any], preset: str | None = None, device: Any = "auto", **overrides: Any) -> Any:
@@ -137,6 +139,10 @@ class SceneFlowModel(nn.Module):
         Returns:
             B results. Each depends only on its window and the settings.
 
+        Warns:
+            CFlowWarning: likely mistakes in the windows, see `Inspection`.
+            NoActivePoints: no point of a pc0 is active.
+
         Cost: one CPU thread, whatever number torch is set to. To use more cores, start more processes.
 
         Raises:
@@ -155,6 +161,9 @@ class SceneFlowModel(nn.Module):
                     motion = self.motion(batch)
                 with stage("spread"):  # outside of inference mode: a training loop may use these tensors
                     results += _results(batch, motion)
+        if self.inspect is not None:
+            self.inspect(windows)
+        warn_of_inactive(windows, results, self.config)
         return results
 
 

@@ -12,10 +12,13 @@ import torch
 from torch import Tensor
 
 from cflow_torch.errors import CFlowError as CFlowError
+from cflow_torch.errors import CFlowWarning as CFlowWarning
 
 Array = Union[np.ndarray, Tensor]
 # Names in flow files and data frames -> fields of `FlowResult`.
 VECTORS = {"flow": "flow", "residual": "residual_flow", "pose": "pose_flow"}
+# No sweep has so many columns. An array with more is a transposed one, (3, N) or (4, N).
+_MOST_COLUMNS = 1000
 _OBJECT = np.dtype("i8, 3f8, 3f8, 3f8, f8, i8, f8")
 _OBJECT.names = ("id", "centre", "size", "velocity", "heading", "num_points", "confidence")
 
@@ -26,6 +29,47 @@ def as_numpy(value: Array, dtype: Any | None = None) -> np.ndarray:
         value = value.detach().cpu()
         value = (value.float() if value.dtype == torch.bfloat16 else value).numpy()
     return np.asarray(value, dtype=dtype)
+
+
+def check_array(array: Any, name: str, shape: tuple[int | None, ...], kinds: str, wanted: str) -> None:
+    """Check the type, shape and dtype of an array.
+
+    Args:
+        array: anything.
+        name: in the message.
+        shape: None = any length.
+        kinds: allowed kinds of dtypes, of "b" bool, "iu" integers, "f" floats.
+        wanted: what to give, for the message.
+
+    Raises:
+        CFlowError: not a dense array or tensor of that shape and dtype.
+    """
+    if not isinstance(array, (np.ndarray, Tensor)):
+        raise CFlowError(f"{name} is {type(array).__name__}: give {wanted}, a NumPy array or a torch tensor")
+    if isinstance(array, Tensor) and array.layout != torch.strided:
+        raise CFlowError(f"{name} has layout {array.layout}: give a dense tensor")
+    if isinstance(array, np.ma.MaskedArray):
+        raise CFlowError(f"{name} is a masked array, whose mask would be lost: give .filled(...), of points with NaN")
+    if len(array.shape) != len(shape) or any(b is not None and a != b for a, b in zip(array.shape, shape)):
+        raise CFlowError(f"{name} has shape {tuple(array.shape)}: give {wanted}")
+    if _kind(array.dtype) not in kinds:
+        raise CFlowError(f"{name} has dtype {array.dtype}: give {wanted}")
+
+
+def _kind(dtype: Any) -> str:
+    """The letter of NumPy for a kind of dtype, also of torch's."""
+    if not isinstance(dtype, torch.dtype):
+        return str(dtype.kind)
+    return "b" if dtype == torch.bool else "f" if dtype.is_floating_point else "c" if dtype.is_complex else "i"
+
+
+def check_points(points: Any, name: str) -> None:
+    """Check that these are (N, 3+) floats."""
+    check_array(points, name, (None, None), "f", "(N, 3+) floating-point metres, columns x, y, z")
+    if points.shape[1] < 3:
+        raise CFlowError(f"{name} has shape {tuple(points.shape)}: give (N, 3+), columns x, y, z in metres")
+    if points.shape[1] > _MOST_COLUMNS:
+        raise CFlowError(f"{name} has shape {tuple(points.shape)}: a row is a point; give its transpose, (N, 3+)")
 
 
 @dataclass(frozen=True)
@@ -42,6 +86,9 @@ class Sweep:
             before it; None = all points at that instant. `timestamp_ns` and `pose` are those of this instant, and the
             points must already be compensated for the motion of the vehicle until this instant. The verified method
             uses the times if every sweep of a window has them.
+
+    Raises:
+        CFlowError: wrong type, shape or dtype.
     """
 
     points: Array
@@ -49,6 +96,19 @@ class Sweep:
     pose: Array | None = None
     timestamp_ns: int | None = None
     point_times: Array | None = None
+
+    def __post_init__(self) -> None:
+        check_points(self.points, "Sweep.points")
+        rows = self.points.shape[0]
+        if self.is_ground is not None:
+            check_array(
+                self.is_ground, "Sweep.is_ground", (rows,), "b", f"({rows},) bool, True = ground, one per point"
+            )
+        if self.point_times is not None:
+            wanted = f"({rows},) floats, seconds after the time stamp of the sweep, one per point"
+            check_array(self.point_times, "Sweep.point_times", (rows,), "f", wanted)
+        if self.pose is not None and np.shape(self.pose) != (4, 4):
+            raise CFlowError(f"Sweep.pose has shape {np.shape(self.pose)}: give one (4, 4) matrix T_world_ego")
 
 
 @dataclass(frozen=True)
@@ -60,12 +120,29 @@ class Window:
         pc1: sweep t+1, whose ego frame is the frame of the flow.
         pch: sweeps t-1, t-2, ... t-h, nearest first; may be shorter than `num_history`.
         pcf: sweeps t+2, t+3, ..., nearest first; may be shorter than `num_future`.
+
+    Raises:
+        CFlowError: one of them is not a `Sweep`.
     """
 
     pc0: Sweep
     pc1: Sweep
     pch: tuple[Sweep, ...] = ()
     pcf: tuple[Sweep, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name, others in (("pch", self.pch), ("pcf", self.pcf)):
+            if not isinstance(others, (list, tuple)):
+                raise CFlowError(f"{name} is {type(others).__name__}: give a tuple of cflow_torch.Sweep, () for none")
+        for name, sweep in named_sweeps(self):
+            if not isinstance(sweep, Sweep):
+                raise CFlowError(f"{name} is {type(sweep).__name__}: give cflow_torch.Sweep(points, ...)")
+
+
+def named_sweeps(window: Window) -> list[tuple[str, Sweep]]:
+    """Every sweep with its name: t+1, then t, t-1, ... from newest to oldest, then t+2, t+3, ..."""
+    others = [(f"pc{side}{i}", sweep) for side in "hf" for i, sweep in enumerate(getattr(window, f"pc{side}"), 1)]
+    return [("pc1", window.pc1), ("pc0", window.pc0), *others]
 
 
 @dataclass(frozen=True)

@@ -15,13 +15,18 @@ from cflow_torch import (
     CFlowError,
     CorrelationFlow,
     CorrelationFlowKeypoints,
+    FlowStream,
     Sweep,
     VerifiedFlow,
+    Window,
     estimate_flow,
     make_config,
     make_model,
 )
+from cflow_torch.errors import CFlowWarning, NoActivePoints
+from cflow_torch.simulator import make_drive
 from cflow_torch.stages import TimedModel
+from cflow_torch.windows.ground import find_ground_batch
 
 RNG = np.random.default_rng(0)
 P0, P1 = RNG.uniform(-5, 5, (50, 3)).astype(np.float32), RNG.uniform(-5, 5, (40, 3)).astype(np.float32)
@@ -40,7 +45,7 @@ EYE = np.eye(4)
         ({"pcf": [P1], "T_ego1_ego0": EYE, "preset": "offline"}, "T_ego1_ego0 is given but T_ego1_egof is not"),
         ({"pcf": [P1], "T_ego1_egof": [EYE] * 2, "preset": "offline"}, "T_ego1_egof has 2 entries for 1 sweeps of pcf"),
         ({"pcf": [P1], "gmf": [None, None], "preset": "offline"}, "gmf has 2 entries for 1 sweeps of pcf"),
-        ({"T_ego1_ego0": EYE[None]}, r"pc0 has shape \(1, 4, 4\)"),
+        ({"T_ego1_ego0": EYE[None]}, r"T_ego1_ego0 has shape \(1, 4, 4\)"),
         ({"T_ego1_ego0": EYE, "pch": [P1], "T_ego1_egoh": [np.diag([1, 1, -1, 1.0])]}, "pch1 is not rigid"),
         ({"max_hight": 3}, "unknown setting max_hight: the fields are pixel_size"),
         ({"ground": "yes"}, "ground='yes'.*'auto'"),
@@ -108,12 +113,81 @@ def test_everything_ground_and_single_points():
     ids=["millimetres", "nothing finite"],
 )
 def test_a_warning_if_no_point_is_active(points, seen):
-    with pytest.warns(UserWarning, match=f"none of the .* points of pc0 is active.*{seen}"):
+    with pytest.warns(NoActivePoints, match=f"none of the .* points of pc0 is active.*{seen}"):
         assert not estimate_flow(points, P1).is_valid.any()
+    with pytest.warns(NoActivePoints, match="none of the"):
+        make_model(config("dense"))([Window(Sweep(points), Sweep(P1))])
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         estimate_flow(P0, P1)
         estimate_flow(P0[:0], P1)
+
+
+@pytest.fixture(scope="module")
+def street():
+    """Two sweeps of a moving vehicle without masks, and the transform between them."""
+    now, later = (replace(sweep, is_ground=None) for sweep in make_drive(seed=1, num_sweeps=3, profile="demo")[1:])
+    return now, later, np.linalg.inv(later.pose) @ now.pose
+
+
+def test_ground_is_found_where_there_is_no_mask(street):
+    now, later, T = street
+    masks = dict(zip(("gm0", "gm1"), find_ground_batch([now.points, later.points])))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        expected = estimate_flow(now.points, later.points, T_ego1_ego0=T, preset="paper", **masks)
+        named = estimate_flow(now.points, later.points, T_ego1_ego0=T, preset="paper", ground="grid")
+        left_in = estimate_flow(now.points, later.points, T_ego1_ego0=T, preset="paper", ground=None)
+    with pytest.warns(CFlowWarning, match="no ground mask for some sweeps, so we found.*ground=None") as caught:
+        found = estimate_flow(now.points, later.points, T_ego1_ego0=T, preset="paper")
+    assert caught[0].filename == __file__ and len(caught) == 1
+    assert_same_bits(found, expected)
+    assert_same_bits(named, expected)
+    assert left_in.is_valid.sum() > 1.5 * expected.is_valid.sum()
+
+
+FLIP = np.diag([1.0, -1, -1, 1])
+
+
+@pytest.mark.parametrize(
+    ("change", "found"),
+    [
+        (lambda a, b, T: (a, b, np.linalg.inv(T)), "inverted"),
+        (lambda a, b, T: (b, a, T), "interchanged"),
+        (lambda a, b, T: (a, a, T), "the same points"),
+        (lambda a, b, T: (a @ np.float32(FLIP[:3, :3]), b @ np.float32(FLIP[:3, :3]), FLIP @ T @ FLIP), "z seems"),
+    ],
+    ids=["inverted", "interchanged", "repeated", "z down"],
+)
+def test_likely_mistakes_are_warned_of(street, change, found):
+    now, later, T = street
+    pc0, pc1, T = change(now.points, later.points, T)
+    masks = [np.zeros(len(points), bool) for points in (pc0, pc1)]
+    with pytest.warns(CFlowWarning, match=found):
+        estimate_flow(pc0, pc1, T_ego1_ego0=T, gm0=masks[0], gm1=masks[1], preset="paper")
+    model, window = make_model(make_config("paper")), Window(Sweep(pc0, masks[0], T), Sweep(pc1, masks[1], np.eye(4)))
+    with pytest.warns(CFlowWarning, match=found):
+        model([window])
+    with warnings.catch_warnings():  # once, but for repeated sweeps
+        warnings.simplefilter("error" if found != "the same points" else "ignore")
+        model([window])
+
+
+def test_ground_left_in_is_warned_of_once(street):
+    now, later, _ = street
+    model = make_model(make_config("paper"))
+    with pytest.warns(CFlowWarning, match="without a ground mask contains ground"):
+        model([Window(now, later)])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model([Window(now, later)])
+
+
+def test_a_stream_warns_of_inverted_poses():
+    stream, drive = FlowStream("paper"), make_drive(seed=1, num_sweeps=2, profile="demo")
+    with pytest.warns(CFlowWarning, match="inverted"):
+        for sweep in drive:
+            stream.push(sweep.points, np.linalg.inv(sweep.pose), sweep.timestamp_ns, sweep.is_ground)
 
 
 # ------------------------------------------------------------------------------------------------------- the module

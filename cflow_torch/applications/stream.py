@@ -11,10 +11,10 @@ import torch
 
 from cflow_torch.config import Config, make_config
 from cflow_torch.data.odometry import Odometry
-from cflow_torch.estimate import GROUND, make_model
+from cflow_torch.estimate import make_model
 from cflow_torch.types import Array, CFlowError, FlowResult, Sweep, Window, as_numpy
 from cflow_torch.windows.collation import make_batch
-from cflow_torch.windows.ground import find_ground_batch
+from cflow_torch.windows.ground import CHOICES, find_ground_batch
 from cflow_torch.windows.validation import check_windows, choose_device, read_ground, read_positions
 
 _log = logging.getLogger(__name__)
@@ -63,8 +63,8 @@ class FlowStream:
         max_gap: float = 0.5,
         **overrides: Any,
     ) -> None:
-        if ground not in GROUND:
-            raise CFlowError(f"ground={ground!r}: give one of {', '.join(map(repr, GROUND))}")
+        if ground not in CHOICES:
+            raise CFlowError(f"ground={ground!r}: give one of {', '.join(map(repr, CHOICES))}")
         if not max_gap > 0:
             raise CFlowError(f"max_gap={max_gap}: give seconds above 0")
         config = (config or make_config(preset)).replace(**overrides)
@@ -162,7 +162,7 @@ class FlowStream:
         points = read_positions([sweep], device).t()
         is_ground, pose, times = sweep.is_ground, sweep.pose, sweep.point_times
         if is_ground is not None:
-            is_ground = read_ground(sweep, "the sweep", device).clone()
+            is_ground = read_ground(sweep, device).clone()
         elif self._ground is not None:
             is_ground = find_ground_batch([points], "grid" if self._ground == "auto" else self._ground)[0]
         if times is not None:

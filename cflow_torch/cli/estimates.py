@@ -14,14 +14,14 @@ from typing import Any, Callable, Iterator, Sequence, Tuple, TypeVar
 
 import torch
 
-from cflow_torch.fleet.machine import AUTO, choose_layout
+from cflow_torch.fleet.machine import AUTO, choose_layout, frames_per_worker
 from cflow_torch.fleet.processes import ChildProcess, WorkerDied
-from cflow_torch.fleet.progress import frames
+from cflow_torch.fleet.progress import frames, show_warnings_as_lines
 from cflow_torch.model import SceneFlowModel
 from cflow_torch.stages import TimedModel
 from cflow_torch.types import CFlowError, FlowResult, Window
+from cflow_torch.windows.inspection import inactive_is_an_error
 
-_PAIRS_PER_WORKER = 50  # at least; a process takes as long to start as about 30 windows
 _AHEAD = 2  # windows per worker that are read ahead
 
 Item = TypeVar("Item")
@@ -42,8 +42,9 @@ def estimates(
         Each item, in order, and a function that returns its window and flow, or raises the error of that pair.
     """
     method: Any = model.model
-    devices = choose_layout(method.device, AUTO, AUTO, os.environ).devices
-    count = min(len(devices), len(items) // _PAIRS_PER_WORKER) if devices[0] == "cpu" else 1
+    most = len(items) // frames_per_worker(method.config)
+    devices = choose_layout(method.device, AUTO, AUTO, os.environ, most).devices
+    count = len(devices) if devices[0] == "cpu" else 1
     if count < 2:
         for item in frames(items):
             yield item, lambda item=item: _estimate(model, read(item))  # type: ignore[misc]
@@ -93,16 +94,18 @@ def estimates(
 
 
 def _estimate(model: TimedModel, sweeps: Window) -> tuple[Window, FlowResult]:
-    return sweeps, model([sweeps])[0]
+    with inactive_is_an_error():
+        return sweeps, model([sweeps])[0]
 
 
 def _make_estimate(method: SceneFlowModel) -> Callable[[Window], tuple[dict[str, Any], Any]]:
     """Make the function that a worker process calls: window -> arrays and seconds."""
     torch.set_num_threads(1)
+    show_warnings_as_lines()
     model = TimedModel(method)
 
     def estimate(sweeps: Window) -> tuple[dict[str, Any], Any]:
-        (result,) = model([sweeps])
+        _, result = _estimate(model, sweeps)
         return result.numpy(), model.pairs.pop()  # tensors would take shared memory, of which containers have little
 
     return estimate

@@ -38,6 +38,8 @@ def task(cfg: DictConfig) -> float:
     logs, failures = run.open_logs(cfg)
     ensure_writable(output)
     failures += run.for_each_pair(logs, model, scores.add, pairs)
+    if scores.metrics.num_frames == 0 and failures:
+        raise CFlowError("no pair could be scored; {} failed first: {}".format(*failures[0]))
     if scores.metrics.num_frames == 0:
         raise CFlowError("no pair has labels, so there is nothing to score; `cflow flow` needs no labels")
     results = scores.report(output, logs, model.report(), failures)

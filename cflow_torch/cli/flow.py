@@ -46,9 +46,9 @@ from cflow_torch.data.flow_file import CONTENTS, ON_REQUEST, read_flow
 from cflow_torch.data.hdf5.results import check_result_name, check_writable, write_hdf5_results
 from cflow_torch.data.paths import as_path
 from cflow_torch.fleet.job import Job, Shard, find_shard
-from cflow_torch.fleet.machine import choose_layout
+from cflow_torch.fleet.machine import AUTO, choose_layout, frames_per_worker
 from cflow_torch.fleet.manifest import claim_folder, complete_frames, find_conflict, frame_file, make_identity
-from cflow_torch.fleet.report import forecast, format_missing, format_report
+from cflow_torch.fleet.report import count_todo, forecast, format_missing, format_report
 from cflow_torch.fleet.run import report_file, run_fleet
 from cflow_torch.fleet.work import source_name
 from cflow_torch.types import CFlowError
@@ -132,6 +132,10 @@ def compute(
     claim_folder(output, identity, cfg.resume, cfg.overwrite, shard.count == 1)
     write_text(output / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(kept)))
     about = {"config": settings, "versions": run.versions()}
+    if name == "local" and workers == AUTO and layout.devices[0] == "cpu":
+        least = frames_per_worker(config)
+        count = count_todo(job, shard.units(sources.logs), least * len(layout.devices))
+        layout = choose_layout(cfg.device, workers, batch, os.environ, count // least)
     return FlowRun(sources, job, run_fleet(job, sources.logs, layout, shard, name, about, **engine))
 
 

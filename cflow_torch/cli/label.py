@@ -3,9 +3,9 @@
 Each sweep gets the keys dufo (dynamic), dufocluster, cluster and nnd, and ground_mask if it has none, with the types
 and meanings of the harness's own scripts. The flow that they follow from is estimated first, as by `cflow flow`, with
 the preset offline: sweeps before and after. Then each scene is copied, labelled and replaced, so a killed run leaves
-the old scene or the new one. Run the command again to resume; labelled scenes are skipped. You can delete OUTPUT when
-all scenes are labelled. With shards, the process that completes the flow of a scene labels it. The exit statuses are
-those of `cflow flow`.
+the old scene or the new one. Run the command again to resume; labelled scenes are skipped. The report is next to the
+scenes, cflow_label-0-of-1.json. You can delete OUTPUT when all scenes are labelled. With shards, the process that
+completes the flow of a scene labels it. The exit statuses are those of `cflow flow`.
 
 examples:
   cflow label /data/scenes/train
@@ -29,6 +29,7 @@ from cflow_torch.cli.flow import FlowRun, compute, finish
 from cflow_torch.cli.run import Failures, Sources
 from cflow_torch.data.flow_file import read_flow
 from cflow_torch.data.hdf5.results import check_writable, labelled_by, write_hdf5_labels
+from cflow_torch.data.json_file import write_json
 from cflow_torch.data.paths import as_path
 from cflow_torch.estimate import make_model
 from cflow_torch.fleet.job import Job, Shard, find_shard
@@ -63,7 +64,10 @@ def task(cfg: DictConfig) -> None:
 def _label(done: FlowRun, shard: Shard, cfg: DictConfig) -> Failures:
     """Label the scenes of a shard whose flow is complete. If one cannot be written, it stays as it was."""
     failures: Failures = []
-    model, count, waiting = make_model(done.job.config, cfg.device), 0, 0
+    labelled: list[str] = []
+    waiting: list[str] = []
+    model = make_model(done.job.config, cfg.device)
+    model.inspect = None  # the logs were checked when their flow was estimated
     workers = len(choose_layout(cfg.device, cfg.engine.workers, 1, os.environ).devices)
     scenes = [unit.source for unit in shard.units(done.sources.logs)]
     for scene in tqdm(scenes, desc="labels", unit="scene", disable=None):
@@ -76,13 +80,18 @@ def _label(done: FlowRun, shard: Shard, cfg: DictConfig) -> Failures:
             log = done.sources.open(scene)
             stamps = log.timestamps[:-1]
             if not set(stamps) <= complete_frames(folder):
-                waiting += 1  # failed frames are in the report; others belong to another shard
+                waiting.append(scene.name)  # failed frames are in the report; others belong to another shard
                 continue
             flows = (read_flow(frame_file(folder, stamp)) for stamp in stamps)
             labels = find_labels(log, flows, model, workers)
             write_hdf5_labels(scene, labels, done.job.identity, overwrite=done.job.redo)
-            count += 1
-    print(f"scenes labelled: {count}, scenes without complete flow yet: {waiting}")
+            labelled.append(scene.name)
+    print(f"scenes labelled: {len(labelled)}, scenes without complete flow yet: {len(waiting)}")
+    if scenes:
+        file = scenes[0].parent / f"cflow_label-{shard.index}-of-{shard.count}.json"
+        kept = {"labelled": labelled, "waiting": waiting, "not_labelled": [list(failure) for failure in failures]}
+        write_json(file, {**done.report, **kept})
+        print(f"report: {file}")
     return failures
 
 

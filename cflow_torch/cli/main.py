@@ -117,7 +117,9 @@ def _run_with_settings(command: str, rest: list[str]) -> None:
 
     def task(cfg: Any) -> Any:
         from cflow_torch.cli.run import complete_data  # imports torch, which Hydra's own answers do not need
+        from cflow_torch.fleet.progress import show_warnings_as_lines
 
+        show_warnings_as_lines()
         try:
             OmegaConf.resolve(cfg)
             for source in HydraConfig.get().runtime.config_sources:

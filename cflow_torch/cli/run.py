@@ -66,7 +66,9 @@ def make_model(cfg: DictConfig) -> SceneFlowModel:
         CFlowError: an unknown or invalid setting.
     """
     settings: dict[str, Any] = OmegaConf.to_container(cfg.model, resolve=True)  # type: ignore[assignment]
-    return estimate.make_model(config_from(settings), cfg.device)
+    model = estimate.make_model(config_from(settings), cfg.device)
+    model.inspect = None  # the logs are checked when they are opened
+    return model
 
 
 def is_sweep() -> bool:

@@ -10,15 +10,15 @@ import tempfile
 import time
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO, Any, Collection, Iterator
+from typing import IO, Any, Iterator
 
 from cflow_torch.data.paths import PathLike, as_path, forget_listings, is_remote, remote_errors
 from cflow_torch.errors import CFlowError
 
 # Object stores, in which a put replaces the older file at once and nobody sees an incomplete one.
 _ATOMIC_PUTS = {"s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "oss", "memory"}
-_TEMPORARY = re.compile(r"\.(?P<target>.+)\.[0-9a-f]{8}\.tmp")
-_ABANDONED = 86_400.0  # seconds without a change after which a temporary file belongs to no running process
+_TEMPORARY = re.compile(r"\..+\.[0-9a-f]{8}\.tmp")
+_ABANDONED = 3600.0  # seconds without a change after which a temporary file belongs to no running process
 
 
 @contextmanager
@@ -126,13 +126,13 @@ def atomic_folder(folder: PathLike) -> Iterator[Path]:
             shutil.rmtree(path, ignore_errors=True)
 
 
-def remove_stale(folder: PathLike, names: Collection[str] = ()) -> list[str]:
+def remove_stale(folder: PathLike) -> list[str]:
     """Remove the temporary files and folders that killed processes have left in a folder.
+
+    They count as left if they have not changed for an hour: a shorter time could hit another process that still writes.
 
     Args:
         folder: local or remote; its subfolders are not searched.
-        names: files or folders that nobody but the caller writes from now on. Their temporary files are removed at
-            once; those of other names only if they have not changed for a day, because a process may still write them.
 
     Returns:
         Sorted names of what was removed; empty if the folder does not exist.
@@ -144,8 +144,7 @@ def remove_stale(folder: PathLike, names: Collection[str] = ()) -> list[str]:
     forget_listings(folder)
     with remote_errors(folder):
         for path in list(folder.iterdir()) if folder.is_dir() else []:
-            match = _TEMPORARY.fullmatch(path.name)
-            if match is None or not (match["target"] in names or _is_abandoned(path)):
+            if not (_TEMPORARY.fullmatch(path.name) and _is_abandoned(path)):
                 continue
             if path.is_dir():
                 shutil.rmtree(path, ignore_errors=True)

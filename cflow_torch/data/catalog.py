@@ -13,9 +13,9 @@ from cflow_torch.data.log_check import check_log
 from cflow_torch.data.names import safe_name
 from cflow_torch.data.paths import as_path, is_path_like, remote_errors
 from cflow_torch.types import CFlowError, Sweep
+from cflow_torch.windows.ground import CHOICES
 from cflow_torch.windows.ground import find_ground as ground_of
 
-GROUND_METHODS = ("grid", "patchwork")
 _OF_ALL = ("find_ground", "odometry", "check")  # settings of every data set
 AUTO = "auto"  # recognise the data set
 _log = logging.getLogger(__name__)
@@ -148,24 +148,27 @@ def find_sources(name: str, root: Any) -> Sequence[Any]:
 
 
 def open_log(
-    name: str, source: Any, find_ground: Any = None, odometry: bool = False, check: bool = True, **settings: Any
+    name: str, source: Any, find_ground: Any = "auto", odometry: bool = False, check: bool = True, **settings: Any
 ) -> Log:
     """Open one log.
 
     Args:
         name: a key of `DATA_SETS`, or the target of `find_user_sources`.
         source: from `find_sources` or `find_user_sources`.
-        find_ground: None, or a method of `cflow_torch.windows.ground.find_ground` for sweeps without a ground mask.
+        find_ground: method of `cflow_torch.windows.ground.find_ground` for sweeps without a ground mask, "grid" or
+            "patchwork"; "auto" = "grid", with a line that says so; None = they have no ground.
         odometry: estimate poses with kiss-icp if the log has none.
-        check: warn if ground is left in, or if the static world is not static, see `check_log`.
+        check: warn of likely mistakes, see `check_log`.
         **settings: keyword arguments of the reader.
 
     Raises:
         CFlowError: a log that cannot be read, or whose name cannot be a folder's; a setting that the reader does not
             have (the message lists its own) or cannot use.
     """
-    if find_ground is not None and find_ground not in GROUND_METHODS:
-        raise CFlowError(f"find_ground={find_ground!r}: choose null or one of {', '.join(GROUND_METHODS)}")
+    if find_ground not in CHOICES:
+        raise CFlowError(f"find_ground={find_ground!r}: choose null or one of {', '.join(filter(None, CHOICES))}")
+    if odometry and name == "hdf5":
+        settings = {"needs_poses": False, **settings}
     log = _user_logs(name, settings)[source.number] if isinstance(source, UserSource) else _open(name, source, settings)
     safe_name(log.log_id, f"{source}: the log")  # names the folder of its results
     if odometry:
@@ -200,20 +203,25 @@ class GroundSegmentedLog(LogWrapper):
 
     Args:
         log: any log.
-        method: as for `cflow_torch.windows.ground.find_ground`.
+        method: as `find_ground` of `open_log`.
+
+    Attributes:
+        has_found_ground: True once ground was found although nobody asked for it, by "auto".
 
     Cost: one call of `find_ground` per sweep without a mask.
     """
 
     def __init__(self, log: Log, method: str = "grid") -> None:
         super().__init__(log)
-        self.method = method
+        self.method, self.has_found_ground = method, False
 
     def sweep(self, index: int) -> Sweep:
         sweep = self.log.sweep(index)
         if sweep.is_ground is not None:
             return sweep
-        is_ground: Any = ground_of(sweep.points, self.method)
+        is_auto = self.method == "auto"
+        is_ground: Any = ground_of(sweep.points, "grid" if is_auto else self.method)
+        self.has_found_ground |= is_auto and bool(is_ground.any())
         return replace(sweep, is_ground=is_ground)
 
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Iterator, Protocol, Sequence, TypeVar
+from typing import Any, Iterator, Protocol, Sequence, TypeVar, overload
 
 import numpy as np
 from torch.utils.data import Dataset
 
-from cflow_torch.types import CFlowError, Sweep, Window
+from cflow_torch.types import CFlowError, Sweep, Window, check_array
 
 _Log = TypeVar("_Log", bound="Log")
 
@@ -22,15 +22,25 @@ class FlowLabels:
         flow: (N, 3) float32, metres, TOTAL flow t -> t+1 (ego motion included), axes of ego1.
         category: (N,) uint8, Argoverse 2 index 1 ... 30, 0 = background.
         is_valid: (N,) bool, False where the truth is unknown.
+
+    Raises:
+        CFlowError: wrong type, shape or dtype.
     """
 
     flow: np.ndarray
     category: np.ndarray
     is_valid: np.ndarray
 
+    def __post_init__(self) -> None:
+        check_array(self.flow, "FlowLabels.flow", (None, 3), "f", "(N, 3) floats, metres, total flow")
+        rows = len(self.flow)
+        wanted = f"({rows},) integers, Argoverse 2 index of each point, 0 = background"
+        check_array(self.category, "FlowLabels.category", (rows,), "iu", wanted)
+        check_array(self.is_valid, "FlowLabels.is_valid", (rows,), "b", f"({rows},) bool, False = unknown")
+
 
 class Log(Protocol):
-    """One drive, a sequence of sweeps: `len(log)`, `log[-1]`, `for sweep in log` and `with log` work.
+    """One drive, a sequence of sweeps: `len(log)`, `log[-1]`, `log[1:3]`, `for sweep in log` and `with log` work.
 
     To write your own reader, inherit from this class, set `log_id` and `timestamps`, and implement `sweep`.
 
@@ -73,8 +83,13 @@ class Log(Protocol):
     def __len__(self) -> int:
         return len(self.timestamps)
 
-    def __getitem__(self, index: int) -> Sweep:
-        return self.sweep(range(len(self))[index])
+    @overload
+    def __getitem__(self, index: int) -> Sweep: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[Sweep]: ...
+    def __getitem__(self, index: int | slice) -> Sweep | list[Sweep]:
+        chosen = range(len(self))[index]
+        return self.sweep(chosen) if isinstance(chosen, int) else [self.sweep(k) for k in chosen]
 
     def __iter__(self) -> Iterator[Sweep]:
         return map(self.sweep, range(len(self)))

@@ -2,38 +2,26 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from cflow_torch.data.log import Log
-from cflow_torch.types import CFlowError, Sweep
+from cflow_torch.errors import CFlowError, warn
 from cflow_torch.windows.ego_motion import rigid_transform
+from cflow_torch.windows.structure import FEWEST_IN_PLACE, Patches, is_better_inverted, move, structure
 
 BASELINE = 5  # sweeps between the two that are compared: the error of a wrong frame grows with the vehicle's rotation
 _PAIRS = 2  # compared per log
-_NEAREST, _FARTHEST = 2.5, 50.0  # metres from the origin: without the own car, and near enough for dense structure
-_CELL = 1.0  # metres, side of the cells whose points form one patch of a wall
-_FEWEST = 6  # points in a cell
-_BLUR = 0.03  # metres, smallest thickness of a patch: range noise and calibration
-_CLEARANCE = 0.4  # metres above the lowest point of a cell, below which a point may be ground
 _MOST_POINTS = 8000
-_STEPS = 10
-_PRIOR = np.diag([1.0, 1.0, 100.0])  # 1 / (m^2, m^2, rad^2), for directions that the scene leaves open (a long wall)
-_FEWEST_IN_PLACE = 150  # smallest agreement times points that we judge
 # Tolerances. Correct poses gave at most 13 mm on a real drive without de-skewing and 7 mm on simulated ones; sweeps
 # at the beginning of a turn, not de-skewed, 58 mm together with 0.7 degrees.
 _SHIFT, _SHIFT_PER_METRE, _SHIFT_PER_RADIAN = 0.03, 0.01, 10.0
 _ROTATION = np.radians(1.5)
-_BETTER, _GOOD = 2.0, 0.15  # factor by which other poses must fit better, and their least agreement, to be suggested
+_BETTER, _GOOD = 2.0, 0.15  # factor by which no motion must fit better, and its least agreement, to be suggested
 _HOPELESS = 0.2  # share of `own`; correct poses gave 0.27 (the case above) or more than 0.5
 _ALIGNED = 0.5  # share of `own` from which a fit has converged; a LiDAR at a wrong position gave 0.7 and more
-
-
-class StaticWorldWarning(UserWarning):
-    """The static world moves under the poses of a log."""
 
 
 @dataclass(frozen=True)
@@ -89,19 +77,19 @@ def static_world_residual(log: Log, index: int, baseline: int = BASELINE) -> Sta
     has_poses = older.pose is not None and newer.pose is not None
     pose0, pose1 = (rigid_transform(s.pose, "pose") if has_poses else np.eye(4) for s in (older, newer))
     T_1_0 = np.linalg.inv(pose1) @ pose0
-    source, target = _structure(older), _structure(newer)[:, :2]
-    patches = _Patches(target)
+    source, target = structure(older), structure(newer)[:, :2]
+    patches = Patches(target)
     source = source[np.random.default_rng(0).permutation(len(source))[:_MOST_POINTS]]
-    moved = _move(source, T_1_0)
+    moved = move(source, T_1_0)
     agreement, (shift, rotation, aligned) = patches.agreement(moved), patches.fit(moved)
     own = patches.agreement(target)  # an upper bound for other sweeps
-    if own * min(len(source), len(target)) < _FEWEST_IN_PLACE:
+    if own * min(len(source), len(target)) < FEWEST_IN_PLACE:
         return StaticResidual(index, index + baseline, shift, rotation, float("nan"), float("nan"), "")
-    inverted = patches.agreement(_move(source, pose1 @ np.linalg.inv(pose0)))
+    inverted = patches.agreement(move(source, pose1 @ np.linalg.inv(pose0)))
     unmoved = patches.agreement(source[:, :2])
     size, distance = float(np.linalg.norm(shift)), float(np.linalg.norm(T_1_0[:3, 3]))
     verdict = ""
-    if inverted > max(_BETTER * agreement, _GOOD, unmoved):
+    if is_better_inverted(agreement, unmoved, inverted):
         verdict = "The poses seem to be inverted. They must map ego coordinates to the world (T_world_ego)."
     elif unmoved > max(_BETTER * agreement, _GOOD) or max(agreement / _HOPELESS, aligned / _ALIGNED) < own:
         verdict = (
@@ -123,7 +111,7 @@ def static_world_residual(log: Log, index: int, baseline: int = BASELINE) -> Sta
 
 
 def check_static_world(log: Log) -> list[StaticResidual]:
-    """Warn if the static world moves between two sweeps of a log.
+    """Measure whether the static world moves between two sweeps of a log, and warn if it does.
 
     Args:
         log: any log. We compare the two pairs over which the vehicle turns most if it has `poses`, else first and last.
@@ -132,24 +120,32 @@ def check_static_world(log: Log) -> list[StaticResidual]:
         The residuals; empty for a log of one sweep.
 
     Warns:
-        StaticWorldWarning: once, with the verdict on the worst pair.
+        CFlowWarning: once, with the verdict on the worst pair.
 
     Cost: reads two sweeps per pair; 0.15 s each.
     """
-    baseline = min(BASELINE, len(log.timestamps) - 1)
-    if baseline < 1:
-        return []
-    found = [static_world_residual(log, index, baseline) for index in _choose(log, baseline)]
-    bad = [residual for residual in found if residual.verdict]
-    if bad:
-        worst = max(bad, key=lambda residual: float(np.linalg.norm(residual.shift)))
-        warnings.warn(
-            f"log {log.log_id}, sweeps {worst.index} and {worst.later}: the static world is not static. "
-            + worst.verdict,
-            StaticWorldWarning,
-            stacklevel=2,
-        )
+    found = _residuals(log)
+    if _worst(found):
+        warn(f"log {log.log_id}: {_worst(found)}")
     return found
+
+
+def static_world_verdict(log: Log) -> str:
+    """The text of the warning of `check_static_world`; "" = the static world is static."""
+    return _worst(_residuals(log))
+
+
+def _worst(found: list[StaticResidual]) -> str:
+    bad = [residual for residual in found if residual.verdict]
+    if not bad:
+        return ""
+    worst = max(bad, key=lambda residual: float(np.linalg.norm(residual.shift)))
+    return f"from sweep {worst.index} to {worst.later} the static world moves. {worst.verdict}"
+
+
+def _residuals(log: Log) -> list[StaticResidual]:
+    baseline = min(BASELINE, len(log.timestamps) - 1)
+    return [static_world_residual(log, index, baseline) for index in _choose(log, baseline)] if baseline > 0 else []
 
 
 def _choose(log: Any, baseline: int) -> list[int]:
@@ -165,79 +161,3 @@ def _choose(log: Any, baseline: int) -> list[int]:
         if len(chosen) < _PAIRS and all(abs(index - other) >= baseline for other in chosen):
             chosen.append(index)
     return chosen
-
-
-def _structure(sweep: Sweep) -> np.ndarray:
-    """Return (N, 3) float64 points above ground, neither too near nor too far."""
-    points = np.asarray(sweep.points)[:, :3].astype(np.float64)
-    reach = np.hypot(points[:, 0], points[:, 1])
-    keep = np.isfinite(points).all(1) & (reach > _NEAREST) & (reach < _FARTHEST)
-    if sweep.is_ground is not None:
-        return points[keep & ~np.asarray(sweep.is_ground)]
-    points = points[keep]
-    _, cell = np.unique(_cells(points[:, :2], 2 * _CELL), return_inverse=True)
-    lowest = np.full(cell.max(initial=-1) + 1, np.inf)
-    np.minimum.at(lowest, cell, points[:, 2])
-    return points[points[:, 2] > lowest[cell] + _CLEARANCE]
-
-
-def _cells(xy: np.ndarray, size: float) -> np.ndarray:
-    """Return (N,) int64 cell indices; coordinates are within 10 km under all but hopeless poses."""
-    column, row = np.floor(np.clip(xy, -1e4, 1e4) / size).astype(np.int64).T
-    return row * 100_003 + column
-
-
-def _move(points: np.ndarray, transform: np.ndarray) -> np.ndarray:
-    """Return (N, 2) float64, x and y after a transform."""
-    return points @ transform[:2, :3].T + transform[:2, 3]
-
-
-class _Patches:
-    """Gaussian patches of structure in the bird's-eye view."""
-
-    def __init__(self, xy: np.ndarray) -> None:
-        self.cell, member, count = np.unique(_cells(xy, _CELL), return_inverse=True, return_counts=True)
-        self.mean = np.stack([np.bincount(member, xy[:, k], len(count)) / count for k in (0, 1)], 1)
-        dx, dy = (xy - self.mean[member]).T
-        xx, xyy, yy = (np.bincount(member, product, len(count)) / count for product in (dx * dx, dx * dy, dy * dy))
-        xx, yy = xx + _BLUR**2, yy + _BLUR**2
-        inverse = np.stack([yy, -xyy, -xyy, xx], 1) / (xx * yy - xyy**2)[:, None]
-        self.precision = inverse.reshape(-1, 2, 2)
-        self.usable = count >= _FEWEST
-
-    def agreement(self, xy: np.ndarray) -> float:
-        """Mean over points of exp(-d^2 / 2), d = Mahalanobis distance to the patch of the cell; 0 without a patch."""
-        _, offset, precision = self._pairs(xy)
-        distance = np.einsum("ni,nij,nj->n", offset, precision, offset)
-        return float(np.exp(-distance / 2).sum() / max(len(xy), 1))
-
-    def fit(self, xy: np.ndarray) -> tuple[np.ndarray, float, float]:
-        """Return the shift and rotation that move points onto the patches, and the agreement after them."""
-        x, y, rotation = 0.0, 0.0, 0.0
-        for _ in range(_STEPS):
-            moved = _rotated(xy, rotation) + (x, y)
-            hit, offset, precision = self._pairs(moved)
-            pull = np.einsum("nij,nj->ni", precision, offset)
-            weight = 1 / (1 + (offset * pull).sum(1) / 4) ** 2
-            jacobian = np.zeros((len(offset), 2, 3))
-            jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1
-            jacobian[:, 0, 2], jacobian[:, 1, 2] = -(moved[hit, 1] - y), moved[hit, 0] - x
-            weighted = jacobian * weight[:, None, None]
-            hessian = np.einsum("nia,nij,njb->ab", weighted, precision, jacobian) / max(len(xy), 1) + _PRIOR
-            gradient = np.einsum("nia,ni->a", weighted, pull) / max(len(xy), 1) + _PRIOR @ (x, y, rotation)
-            x, y, rotation = np.array([x, y, rotation]) - np.linalg.solve(hessian, gradient)
-        return np.array([x, y]), float(rotation), self.agreement(_rotated(xy, rotation) + (x, y))
-
-    def _pairs(self, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return which points fall on a patch, their offsets from its mean (M, 2), and its precision (M, 2, 2)."""
-        if not len(self.cell):
-            return np.zeros(len(xy), bool), np.zeros((0, 2)), np.zeros((0, 2, 2))
-        key = _cells(xy, _CELL)
-        patch = np.searchsorted(self.cell, key).clip(0, len(self.cell) - 1)
-        hit = (self.cell[patch] == key) & self.usable[patch]
-        return hit, xy[hit] - self.mean[patch[hit]], self.precision[patch[hit]]
-
-
-def _rotated(xy: np.ndarray, angle: float) -> np.ndarray:
-    cos, sin = np.cos(angle), np.sin(angle)
-    return xy @ np.array([[cos, sin], [-sin, cos]])

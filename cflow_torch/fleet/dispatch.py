@@ -9,7 +9,7 @@ from queue import Empty, Queue
 from threading import Thread
 from typing import Any, Callable, Iterator, Protocol, Sequence
 
-from cflow_torch.fleet.job import Done, Event, Failed, Opened, Step, Unit
+from cflow_torch.fleet.job import Done, Event, Failed, Noted, Opened, Step, Unit
 from cflow_torch.fleet.processes import WorkerDied
 from cflow_torch.fleet.progress import log_line
 from cflow_torch.fleet.work import describe, source_name
@@ -124,7 +124,7 @@ def _do(process: Process, unit: Unit, stop: Callable[[], bool], retries: int) ->
         try:
             for event in _events(process, part, stop):
                 if not isinstance(event, Opened):
-                    if missing is not None and event.timestamp is not None:
+                    if missing is not None and isinstance(event, (Done, Failed)) and event.timestamp is not None:
                         missing.discard(event.timestamp)
                     yield event
                     continue
@@ -144,6 +144,7 @@ def _do(process: Process, unit: Unit, stop: Callable[[], bool], retries: int) ->
             message = f"{num_deaths} workers died on this part of the log, the last one {how}: the rest is left"
             yield Failed(unit.number, name, message)
             return
+        yield Noted(unit.number, name, f"a worker died {how}; another one goes on with the frames that are missing")
         if part.deaths <= retries:
             parts.append(part)
         elif len(stamps) > 1:

@@ -95,7 +95,16 @@ class Failed:
     timestamp: int | None = None
 
 
-Event = Union[Opened, Done, Failed]
+@dataclass(frozen=True)
+class Noted:
+    """Something that a user should know about a log, or about a worker."""
+
+    unit: int
+    name: str
+    message: str
+
+
+Event = Union[Opened, Done, Failed, Noted]
 
 
 class Step(NamedTuple):

@@ -9,6 +9,7 @@ from typing import Any, Mapping
 
 import torch
 
+from cflow_torch.config import Config
 from cflow_torch.types import CFlowError
 from cflow_torch.windows.memory import available_memory, control_groups
 
@@ -34,7 +35,15 @@ class Layout:
     batch: int
 
 
-def choose_layout(device: str, workers: Any, batch: Any, environ: Mapping[str, str]) -> Layout:
+def frames_per_worker(config: Config) -> int:
+    """The least number of frames for which another worker on a CPU saves time.
+
+    A process takes as long to start as about 10 windows of the verified method, or 30 to 100 windows of the others.
+    """
+    return 20 if config.method == "verified" else 100
+
+
+def choose_layout(device: str, workers: Any, batch: Any, environ: Mapping[str, str], most: int | None = None) -> Layout:
     """Replace "auto" by numbers and devices.
 
     Args:
@@ -43,6 +52,7 @@ def choose_layout(device: str, workers: Any, batch: Any, environ: Mapping[str, s
         batch: windows, or "auto".
         environ: environment variables. LOCAL_RANK or SLURM_LOCALID choose the GPU where several processes share a
             machine; LOCAL_WORLD_SIZE and SLURM_CPUS_PER_TASK limit the cores.
+        most: limit of "auto" on a CPU, for a run with few frames; None = no limit.
 
     Raises:
         CFlowError: not a whole number of at least 1, or a GPU that does not exist.
@@ -54,7 +64,8 @@ def choose_layout(device: str, workers: Any, batch: Any, environ: Mapping[str, s
         count = len(gpus)
     else:
         cores, memory = usable_cores(environ), available_memory(environ)
-        count = cores if memory is None else max(1, min(cores, memory // WORKER_MEMORY))
+        limits = [cores, *([] if memory is None else [memory // WORKER_MEMORY]), *([] if most is None else [most])]
+        count = max(1, min(limits))
     size = (GPU_BATCH if gpus else CPU_BATCH) if batch == AUTO else _at_least_1("batch", batch)
     devices = tuple(gpus[k % len(gpus)] for k in range(count)) if gpus else ("cpu",) * count
     return Layout(devices, size)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import warnings
 from contextlib import suppress
 from typing import Any, Iterable, Iterator, Sized
 
@@ -55,6 +56,11 @@ class Progress(tqdm):  # type: ignore[type-arg]
 def log_line(text: str) -> None:
     """Print a line on stderr, above the bar."""
     tqdm.write(text, file=_Stderr())
+
+
+def show_warnings_as_lines() -> None:
+    """Show warnings as lines for people, without the path of a source file, from now on."""
+    warnings.showwarning = lambda message, *_, **__: log_line(f"warning: {message}")
 
 
 def frames(items: Iterable[Any], name: str = "") -> Iterator[Any]:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import platform
 from collections import Counter
+from contextlib import suppress
 from typing import Any, Sequence
 
 from cflow_torch.data.catalog import open_log
 from cflow_torch.data.paths import as_path
-from cflow_torch.fleet.job import Done, Event, Job, Opened, Shard, Unit
+from cflow_torch.fleet.job import Done, Event, Job, Noted, Opened, Shard, Unit
 from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.manifest import complete_frames
 from cflow_torch.fleet.work import describe, source_name
@@ -25,16 +26,32 @@ def forecast(job: Job, units: Sequence[Unit]) -> str:
     total = left = 0
     for unit in units:
         try:
-            log = open_log(job.reader, unit.source, **{**job.settings, "check": False})
-            stamps = [int(log.timestamps[i]) for i in unit.frames(len(log.timestamps) - 1)]
-            complete = set() if job.redo else complete_frames(as_path(job.output) / log.log_id)
+            log_id, frames, todo = _count(job, unit)
         except Exception as error:
             lines.append(f"{'?':>8} {'?':>8}  {source_name(unit.source)}: cannot be opened: {describe(error)}")
             continue
-        todo = len(set(stamps) - complete)
-        total, left = total + len(stamps), left + todo
-        lines.append(f"{len(stamps):8} {todo:8}  {log.log_id}")
+        total, left = total + frames, left + todo
+        lines.append(f"{frames:8} {todo:8}  {log_id}")
     return "\n".join([*lines, f"{total:8} {left:8}  in total; dry run: nothing was written to {job.output}"])
+
+
+def count_todo(job: Job, units: Sequence[Unit], enough: int) -> int:
+    """Count the frames that a run would compute, until there are enough. Logs that cannot be opened have none."""
+    count = 0
+    for unit in units:
+        if count >= enough:
+            break
+        with suppress(Exception):
+            count += _count(job, unit)[2]
+    return count
+
+
+def _count(job: Job, unit: Unit) -> tuple[str, int, int]:
+    """Name of a unit's log, number of its frames, and number of those that are not complete."""
+    with open_log(job.reader, unit.source, **{**job.settings, "check": False, "odometry": False}) as log:
+        stamps = {int(log.timestamps[i]) for i in unit.frames(len(log.timestamps) - 1)}
+        complete = set() if job.redo else complete_frames(as_path(job.output) / log.log_id)
+        return log.log_id, len(stamps), len(stamps - complete)
 
 
 class Counters:
@@ -46,6 +63,7 @@ class Counters:
 
     def __init__(self, units: Sequence[Unit]) -> None:
         self.failures: list[tuple[str, str]] = []  # (frame or log, message)
+        self.notes: Counter[tuple[str, str]] = Counter()  # (log, message)
         self.num_opened = self.total = self.num_before = self.num_failed = 0  # units; frames
         self._waiting: dict[tuple[int, int], str] = {}  # (unit number, time stamp) -> frame, neither on disk nor failed
         self._unopened = {unit.number for unit in units}
@@ -61,9 +79,14 @@ class Counters:
         """True if every frame is on disk."""
         return not (self.failures or self._unopened or self._waiting)
 
+    def times_noted(self, message: str) -> int:
+        """How often a message was noted, for any log."""
+        return sum(count for (_, text), count in self.notes.items() if text == message)
+
     def add(self, event: Event) -> int:
         """Count an event. Returns the number of frames that it settles: they are on disk, or have failed."""
-        self._unopened.discard(event.unit)
+        if not isinstance(event, Noted):
+            self._unopened.discard(event.unit)
         if isinstance(event, Opened):
             num_before = len(event.frames) - len(event.todo)
             self.num_opened += 1
@@ -71,6 +94,9 @@ class Counters:
             self.num_before += num_before
             self._waiting.update({(event.unit, stamp): f"{event.log_id}/{stamp}" for stamp in event.todo})
             return num_before
+        if isinstance(event, Noted):
+            self.notes[event.name, event.message] += 1
+            return 0
         if isinstance(event, Done):
             self._seconds.update(event.seconds)
         else:
@@ -95,7 +121,7 @@ class Counters:
             "status": "complete", "incomplete" (something failed or is missing) or "interrupted"; "frames": "total",
             "complete_before", "computed", "failed", "failed_logs" (or parts of logs), "waiting" (of opened logs) and
             "unopened_units"; "frames_per_s" of those computed; "stages": seconds per computed frame, summed over the
-            workers, that overlap in time; "failures", "waiting".
+            workers, that overlap in time; "failures", "waiting"; "notes": log, message and how often.
         """
         computed = self.total - self.num_before - self.num_failed - len(self._waiting)
         return {
@@ -120,6 +146,7 @@ class Counters:
             "stages": {name: total / max(1, computed) for name, total in self._seconds.items()},
             "failures": [list(failure) for failure in self.failures],
             "waiting": self.waiting,
+            "notes": [[*note, count] for note, count in self.notes.items()],
         }
 
 
@@ -136,6 +163,8 @@ def format_report(report: dict[str, Any], verbose: bool = False) -> str:
         ("  failed", frames["failed"]),
         ("  not done", frames["waiting"]),
     ]
+    if report["notes"]:
+        rows.append(("warnings", sum(count for *_, count in report["notes"])))
     if frames["failed_logs"]:
         rows.append(("logs or parts of logs that failed", frames["failed_logs"]))
     if frames["unopened_units"]:

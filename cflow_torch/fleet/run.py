@@ -12,7 +12,7 @@ from typing import Any, Iterator, Sequence
 from cflow_torch.data.atomic import remove_stale
 from cflow_torch.data.json_file import write_json
 from cflow_torch.data.paths import as_path
-from cflow_torch.fleet.job import Event, Failed, Job, Shard, split
+from cflow_torch.fleet.job import Event, Failed, Job, Noted, Shard, split
 from cflow_torch.fleet.local import run_local
 from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.processes import SIGNALS
@@ -21,6 +21,7 @@ from cflow_torch.fleet.ray_engine import run_ray
 from cflow_torch.fleet.report import Counters
 from cflow_torch.types import CFlowError
 
+_SHOWN = 3  # how often a message is shown; the report names all logs that it is about
 ENGINES: dict[str, Any] = {"local": run_local, "ray": run_ray}
 
 
@@ -69,7 +70,7 @@ def run_fleet(
         report["exit_status"] = 128 + ended_by if ended_by else 0 if counters.is_complete else 1
         try:
             file = report_file(job.output, shard)
-            remove_stale(file.parent, {file.name})
+            remove_stale(file.parent)
             write_json(file, report)
         except OSError as error:
             log_line(f"the report could not be written: {error}")
@@ -91,6 +92,8 @@ def _follow(events: Iterator[Event], counters: Counters, num_units: int) -> None
                 progress.total = round(counters.total * max(1, num_units / counters.num_opened))
             if isinstance(event, Failed):
                 log_line(f"failed: {event.name}: {event.message}")
+            elif isinstance(event, Noted) and counters.times_noted(event.message) <= _SHOWN:
+                log_line(f"warning: {event.name}: {event.message}")
             progress.update(settled)
         progress.total = progress.n
 

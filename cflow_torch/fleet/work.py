@@ -18,15 +18,16 @@ from cflow_torch.data.atomic import remove_stale
 from cflow_torch.data.catalog import open_log
 from cflow_torch.data.flow_file import write_flow
 from cflow_torch.data.log import CachedLog, Log, window
-from cflow_torch.data.log_check import check_log
+from cflow_torch.data.log_check import find_problems
 from cflow_torch.data.names import safe_name
 from cflow_torch.data.paths import as_path
 from cflow_torch.estimate import make_model
-from cflow_torch.fleet.job import Done, Event, Failed, Job, Opened, Step, Unit
+from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Step, Unit
 from cflow_torch.fleet.manifest import claim_log, complete_frames, frame_file
-from cflow_torch.fleet.progress import log_line
+from cflow_torch.fleet.progress import log_line, show_warnings_as_lines
 from cflow_torch.stages import FlowModel, stage_seconds
 from cflow_torch.types import CFlowError, FlowResult, Window
+from cflow_torch.windows.inspection import inactive_is_an_error, repeats
 
 _AHEAD = 2  # batches that are read ahead, and that wait to be written
 _REPORT_EVERY_S = 0.5  # a call of a worker process and its answer take a millisecond or two
@@ -43,6 +44,7 @@ class _Frame:
 
     timestamp: int
     content: Window | FlowResult | Exception | None = None
+    is_repetition: bool = False
     seconds: dict[str, float] = field(default_factory=dict)
 
 
@@ -64,7 +66,10 @@ class Worker:
         except (RuntimeError, AssertionError) as error:
             raise CFlowError(f"no worker can start on {device}: {describe(error)}") from error
         self._job, self._device, self._ahead = job, device, _AHEAD
-        self._model: FlowModel = make_model(job.config, device) if model is None else model
+        self._model: Any = model
+        if model is None:
+            self._model = make_model(job.config, device)
+            self._model.inspect = None  # the log is checked instead
         self._source: Any = None
         self._log: Any = None
         self._reader, self._writer = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
@@ -77,7 +82,7 @@ class Worker:
             stop: called before each batch. Once it returns True, computed frames are written and no others begin.
 
         Yields:
-            `Opened` once, then `Done` and `Failed` in the order of the log.
+            `Opened` once, then `Done` and `Failed` in the order of the log, and `Noted`.
 
         Raises:
             DeviceLost: the GPU can no longer be used.
@@ -92,15 +97,19 @@ class Worker:
             todo = {i: stamp for i, stamp in stamps.items() if stamp not in complete}
             if todo or complete:
                 claim_log(folder, log, self._job.identity)
-            remove_stale(folder, {frame_file(folder, stamp).name for stamp in todo.values()})
+            remove_stale(folder)
         except Exception as error:
             yield Failed(unit.number, source_name(unit.source), describe(error))
             return
         yield Opened(unit.number, log.log_id, tuple(stamps.values()), tuple(todo.values()))
-        if todo and self._job.settings.get("check", True) and unit.first == 0:
+        checks = bool(self._job.settings.get("check", True))
+        if checks and 0 in todo:
             with suppress(Exception):  # the frames of a sweep that cannot be read will fail
-                check_log(log)
+                for text in find_problems(log):
+                    yield Noted(unit.number, log.log_id, text)
         for frame in self._pass(log, folder, list(todo), stop):
+            if checks and frame.is_repetition:
+                yield Noted(unit.number, f"{log.log_id}/{frame.timestamp}", "the next sweep has the same points")
             if isinstance(frame.content, Exception):
                 name = f"{log.log_id}/{frame.timestamp}"
                 yield Failed(unit.number, name, describe(frame.content), frame.timestamp)
@@ -154,7 +163,8 @@ class Worker:
     def _read_one(self, log: Log, index: int) -> _Frame:
         frame = _Frame(int(log.timestamps[index]))
         with _stage(frame, "read"):
-            frame.content = window(log, index, self._job.config.num_history, self._job.config.num_future)
+            frame.content = sweeps = window(log, index, self._job.config.num_history, self._job.config.num_future)
+            frame.is_repetition = repeats(sweeps.pc0, sweeps.pc1)
         return frame
 
     def _compute(self, frames: list[_Frame]) -> None:
@@ -164,7 +174,7 @@ class Worker:
             return
         start, results = time.perf_counter(), None
         try:
-            with stage_seconds() as stages:
+            with stage_seconds() as stages, inactive_is_an_error():
                 results = self._model([frame.content for frame in good])  # type: ignore[misc]
         except Exception as error:
             if len(good) == 1:
@@ -211,6 +221,7 @@ class WorkerProcess(Worker):
         if device == "cpu":
             torch.set_num_threads(1)
             pyarrow.set_cpu_count(1)
+        show_warnings_as_lines()
         super().__init__(job, device)
         self._events: Iterator[Event] | None = None  # of the current unit
         self._stops = False

@@ -15,10 +15,10 @@ import torch
 from torch import Tensor, nn
 
 from cflow_torch.config import make_config
-from cflow_torch.estimate import GROUND, make_model
+from cflow_torch.estimate import make_model
 from cflow_torch.types import Array, CFlowError, Sweep, Window
 from cflow_torch.windows.ego_motion import compensate
-from cflow_torch.windows.ground import find_ground_batch, has_ground
+from cflow_torch.windows.ground import CHOICES, find_ground_batch, has_ground
 from cflow_torch.windows.validation import read_positions
 
 
@@ -65,8 +65,8 @@ class SequenceFlow(nn.Module):
 
     def __init__(self, preset: str | None = None, device: Any = "auto", ground: str | None = None, **settings: Any):
         super().__init__()
-        if ground not in GROUND:
-            raise CFlowError(f"ground={ground!r}: give one of {', '.join(map(repr, GROUND))}")
+        if ground not in CHOICES:
+            raise CFlowError(f"ground={ground!r}: give one of {', '.join(map(repr, CHOICES))}")
         self.model = make_model(make_config(preset, **settings), device)
         self.num_history: int = self.model.config.num_history
         self.ground = ground

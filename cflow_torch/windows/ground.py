@@ -18,17 +18,21 @@ from torch import Tensor
 
 from cflow_torch.ops.lower_surface import UNKNOWN, lower_surface
 from cflow_torch.ops.threads import one_thread
-from cflow_torch.types import Array, CFlowError, Sweep, Window
+from cflow_torch.types import Array, CFlowError, Sweep, Window, check_points
 from cflow_torch.windows.ground_plane import REACH, millimetres, near_plane, order_statistics
-from cflow_torch.windows.validation import check_points, choose_device, read_positions
+from cflow_torch.windows.validation import choose_device, read_positions
 
 METHODS = ("grid", "patchwork")
+CHOICES = (None, "auto", *METHODS)  # settings: None = there is no ground; "auto" = "grid" where there is no mask
 THRESHOLD = 0.3  # metres above the surface; the rule of the Argoverse 2 raster
 
 # Cells are powers of two of a millimetre, so floor division is a shift, also for negative numbers.
 _CELL_BITS, _CELLS = 10, 256  # 1.024 m
 
 _HIGHEST = 1 << 28  # heights are clamped to this, mm
+# Within 32 m, of the points farther than half a metre from the ground less than 1.5 % lie below it on four real drives
+# and 15 simulated ones, and more than 97 % if z points down.
+_NEAR, _FAR, _SHARE_BELOW, _FEWEST_BELOW = 32_000, 500, 0.8, 200
 _PATCHWORK_HEIGHT = 1.723  # metres, sensor height that Patchwork++'s default settings assume
 
 
@@ -113,12 +117,35 @@ def has_ground(clouds: Sequence[Array], most_points: int = 30_000, device: Any =
     """
     if not clouds:
         return []
+    points, sweep, inside = _thinned(clouds, most_points, device)
+    return list(near_plane(points, sweep, inside, len(clouds)).is_there.tolist())
+
+
+@one_thread()
+def is_upside_down(cloud: Array, most_points: int = 30_000, device: Any = "auto") -> bool:
+    """Test whether z points down: there is ground, and nearly all points farther from it than half a metre are below.
+
+    Args:
+        cloud: (N, 3+).
+        most_points, device: as in `has_ground`.
+
+    Raises, Cost: as `has_ground`.
+    """
+    points, sweep, inside = _thinned([cloud], most_points, device)
+    plane = near_plane(points, sweep, inside, 1)
+    above = points[2] - plane.at(points[0], points[1], sweep)
+    is_far = inside & (above.abs() > _FAR) & (points[:2].abs() < _NEAR).all(0)
+    num_far, num_below = int(is_far.sum()), int((is_far & (above < 0)).sum())
+    return bool(plane.is_there) and num_below >= max(_FEWEST_BELOW, _SHARE_BELOW * num_far)
+
+
+def _thinned(clouds: Sequence[Array], most_points: int, device: Any) -> tuple[Tensor, Tensor, Tensor]:
+    """(3, N) mm, sweep and `inside` of every k-th point of each cloud."""
     for number, cloud in enumerate(clouds):
         check_points(cloud, f"points of sweep {number}")
-    thinned = [cloud[:: max(1, -(-cloud.shape[0] // most_points))] for cloud in clouds]
-    positions, sweep = _stack(thinned, device)
+    positions, sweep = _stack([cloud[:: max(1, -(-cloud.shape[0] // most_points))] for cloud in clouds], device)
     points, inside = millimetres(positions)
-    return list(near_plane(points, sweep, inside, len(clouds)).is_there.tolist())
+    return points, sweep, inside
 
 
 def _grid(positions: Tensor, sweep: Tensor, num_sweeps: int, threshold: int) -> Tensor:

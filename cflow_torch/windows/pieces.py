@@ -124,7 +124,7 @@ class PieceReader:
         """(N,) bool, False in sweeps without a mask; None = no sweep has one."""
         if all(entry.sweep.is_ground is None for entry in group):
             return None
-        return torch.cat([read_ground(entry.sweep, entry.name, self.device) for entry in group])
+        return torch.cat([read_ground(entry.sweep, self.device) for entry in group])
 
     def _times(self, group: Sequence[Entry]) -> Tensor | None:
         """(N,) float64 sweep intervals, 0 in windows whose times are not used; None = no window uses them."""

@@ -9,10 +9,10 @@ from typing import NamedTuple, Sequence
 import numpy as np
 
 from cflow_torch.config import Config
-from cflow_torch.types import CFlowError, Sweep, Window, as_numpy
+from cflow_torch.types import CFlowError, Sweep, Window, as_numpy, named_sweeps
 from cflow_torch.windows.bev_grid import Grid
 from cflow_torch.windows.ego_motion import rigid_transform
-from cflow_torch.windows.validation import keep_nearest, named_sweeps
+from cflow_torch.windows.validation import keep_nearest
 
 # Largest plausible distance between two poses of a window, metres: 2 s at 50 m/s.
 _FARTHEST_POSE = 100.0

@@ -1,4 +1,4 @@
-"""Check what users pass in: shapes, dtypes, devices. Then read points, masks and times as tensors."""
+"""Check windows: their types, the resolution of their points, devices. Then read points, masks and times as tensors."""
 
 from __future__ import annotations
 
@@ -12,11 +12,9 @@ import torch
 from torch import Tensor
 
 from cflow_torch.config import Config
-from cflow_torch.types import Array, CFlowError, Sweep, Window
+from cflow_torch.types import CFlowError, Sweep, Window, named_sweeps
 
 _ALL_ROWS = slice(None)
-# No sweep has so many columns. An array with more is a transposed one, (3, N) or (4, N).
-_MOST_COLUMNS = 1000
 # Largest time of a point, seconds from the instant of its sweep. Larger numbers have another unit.
 _LONGEST_TIME = 10.0
 # Times of points are multiples of this part of a sweep interval, so that their sums are exact in any order.
@@ -24,12 +22,12 @@ _TICKS = 1 << 20
 _log = logging.getLogger(__name__)
 
 
-def check_windows(windows: Any, config: Config | None = None) -> None:
-    """Check that this is a list of windows of sweeps of arrays.
+def check_windows(windows: Any, config: Config) -> None:
+    """Check that this is a list of windows whose points are fine enough.
 
     Args:
         windows: anything.
-        config: settings whose region and finest pixels the points must be fine enough for; None = not checked.
+        config: settings whose region and finest pixels the points must be fine enough for.
 
     Raises:
         CFlowError: what is wrong, by the name that users know it by.
@@ -39,17 +37,8 @@ def check_windows(windows: Any, config: Config | None = None) -> None:
     for window in windows:
         if not isinstance(window, Window):
             raise CFlowError(f"the list holds {type(window).__name__}: give cflow_torch.Window(pc0=Sweep(...), ...)")
-        for name, others in (("pch", window.pch), ("pcf", window.pcf)):
-            if not isinstance(others, (list, tuple)):
-                raise CFlowError(f"{name} is {type(others).__name__}: give a tuple of cflow_torch.Sweep, () for none")
         for name, sweep in named_sweeps(window):
-            if not isinstance(sweep, Sweep):
-                raise CFlowError(f"{name} is {type(sweep).__name__}: give cflow_torch.Sweep(points, ...)")
-            check_points(sweep.points, name)
-            if sweep.point_times is not None:
-                _check_point_times(sweep, name)
-            if config is not None:
-                _check_resolution(sweep.points.dtype, name, config)
+            _check_resolution(sweep.points.dtype, name, config)
 
 
 def keep_nearest(window: Window, num_history: int) -> Window:
@@ -58,46 +47,6 @@ def keep_nearest(window: Window, num_history: int) -> Window:
         return window
     _log.info("of %d history sweeps the nearest %d are used (num_history)", len(window.pch), num_history)
     return replace(window, pch=window.pch[:num_history])
-
-
-def named_sweeps(window: Window) -> list[tuple[str, Sweep]]:
-    """Every sweep with its name: t+1, then t, t-1, ... from newest to oldest, then t+2, t+3, ..."""
-    others = [(f"pc{side}{i}", sweep) for side in "hf" for i, sweep in enumerate(getattr(window, f"pc{side}"), 1)]
-    return [("pc1", window.pc1), ("pc0", window.pc0), *others]
-
-
-def check_points(points: Any, name: str) -> None:
-    """Check that these are (N, 3+) floats."""
-    if not isinstance(points, (np.ndarray, Tensor)):
-        raise CFlowError(f"{name} is {type(points).__name__}: give a NumPy array or a torch tensor of shape (N, 3+)")
-    _check_plain(points, name)
-    if points.ndim != 2 or points.shape[1] < 3:
-        raise CFlowError(f"{name} has shape {tuple(points.shape)}: give (N, 3+), columns x, y, z in metres")
-    if points.shape[1] > _MOST_COLUMNS:
-        raise CFlowError(f"{name} has shape {tuple(points.shape)}: a row is a point; give its transpose, (N, 3+)")
-    if not _is_floating(points):
-        raise CFlowError(f"{name} has dtype {points.dtype}: give floating-point metres")
-
-
-def _check_point_times(sweep: Sweep, name: str) -> None:
-    """Check that there is one float per point. `read_point_times` checks the values."""
-    times, wanted = sweep.point_times, f"give ({sweep.points.shape[0]},) floats, seconds after the sweep's time stamp"
-    if not isinstance(times, (np.ndarray, Tensor)):
-        raise CFlowError(f"point times of {name} are {type(times).__name__}: {wanted}")
-    _check_plain(times, f"point times of {name}")
-    if tuple(times.shape) != (sweep.points.shape[0],) or not _is_floating(times):
-        raise CFlowError(f"point times of {name} have shape {tuple(times.shape)} and dtype {times.dtype}: {wanted}")
-
-
-def _is_floating(array: Array) -> bool:
-    return array.is_floating_point() if isinstance(array, Tensor) else np.issubdtype(array.dtype, np.floating)
-
-
-def _check_plain(array: Array, name: str) -> None:
-    if isinstance(array, Tensor) and array.layout != torch.strided:
-        raise CFlowError(f"{name} has layout {array.layout}: give a dense tensor")
-    if isinstance(array, np.ma.MaskedArray):
-        raise CFlowError(f"{name} is a masked array, whose mask would be lost: give .filled(...), of points with NaN")
 
 
 def resolution(dtype: Any, distance: float) -> float:
@@ -166,25 +115,12 @@ def read_positions(sweeps: Sequence[Sweep], device: torch.device, rows: slice = 
     return torch.empty(parts[0].shape, dtype=torch.float64, device=device).copy_(parts[0])
 
 
-def read_ground(sweep: Sweep, name: str, device: torch.device) -> Tensor:
-    """(N,) bool ground mask, True = ground; all False for a sweep without a mask.
-
-    Raises:
-        CFlowError: not a bool array or tensor with one entry per point.
-    """
-    mask, num_points = sweep.is_ground, sweep.points.shape[0]
+def read_ground(sweep: Sweep, device: torch.device) -> Tensor:
+    """(N,) bool ground mask, True = ground; all False for a sweep without a mask."""
+    mask = sweep.is_ground
     if mask is None:
-        return torch.zeros(num_points, dtype=torch.bool, device=device)
-    if not isinstance(mask, (np.ndarray, Tensor)):
-        raise CFlowError(f"ground mask of {name} is {type(mask).__name__}: give a bool array or tensor of shape (N,)")
-    if tuple(mask.shape) != (num_points,):
-        raise CFlowError(f"ground mask of {name} has shape {tuple(mask.shape)}: give ({num_points},), one per point")
-    if mask.dtype not in (torch.bool, np.bool_):
-        raise CFlowError(f"ground mask of {name} has dtype {mask.dtype}: give bool, True = ground")
-    _check_plain(mask, f"ground mask of {name}")
-    if isinstance(mask, np.ndarray):
-        mask = torch.from_numpy(np.array(mask))
-    return mask.to(device)
+        return torch.zeros(sweep.points.shape[0], dtype=torch.bool, device=device)
+    return (torch.from_numpy(np.array(mask)) if isinstance(mask, np.ndarray) else mask).to(device)
 
 
 def read_point_times(sweep: Sweep, name: str, interval: float | None, device: torch.device) -> Tensor:

@@ -12,6 +12,7 @@ from typing import Any, Callable
 import numpy as np
 import pytest
 from omegaconf import OmegaConf
+from small_logs import write_small_log
 
 from cflow_torch import make_config
 from cflow_torch.cli import estimates, run
@@ -130,6 +131,40 @@ def test_bad_frames_and_bad_logs_are_reported_and_skipped(
     assert record["num_pairs"] == 2 + 3 and [name for name, _ in record["failures"]] == ["no-poses", frame]
 
 
+def test_a_scene_without_poses_names_what_helps(tmp_path: Path, cflow: Cflow, capsys: pytest.CaptureFixture) -> None:
+    h5py = pytest.importorskip("h5py")
+    file = write_small_log("hdf5", tmp_path / "data") / "synthetic-demo-0003.h5"
+    with h5py.File(file, "r+") as scene:
+        for group in scene.values():
+            group.pop("pose"), group.pop("ego_motion", None)
+    assert cflow("eval", file, f"output={tmp_path / 'out'}", "model=paper") == 2
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert all(text in last for text in ("no pair could be scored", "has no pose", "ego_motion", "data.odometry=true"))
+
+
+def test_warnings_are_one_line_without_a_source_path(
+    tmp_path: Path, cflow: Cflow, capsys: pytest.CaptureFixture
+) -> None:
+    folder = write_small_log("arrays", tmp_path / "data")
+    shutil.rmtree(next(folder.rglob("ground")))
+    for command in (("plot",), ("flow", "engine.workers=1")):
+        assert cflow(*command, folder, f"output={tmp_path / command[0]}", "model=paper") == 0
+        lines = [line for line in capsys.readouterr().err.splitlines() if "warning" in line.lower()]
+        assert len(lines) == 1 and lines[0].startswith("warning: ") and ".py" not in lines[0]
+        assert "no ground masks, so we find the ground" in lines[0] and "data.find_ground=null" in lines[0]
+
+
+def test_flow_without_an_active_point_is_not_complete(
+    tmp_path: Path, cflow: Cflow, capsys: pytest.CaptureFixture
+) -> None:
+    folder = write_small_log("arrays", tmp_path / "data")
+    call = ("flow", folder, f"output={tmp_path / 'out'}", "model=paper", "engine.workers=1")
+    assert cflow(*call, "model.point_cloud_range=[500,500,-9,560,560,9]") == 1
+    said = capsys.readouterr()
+    assert "status             incomplete" in said.out and "none of the" in said.err
+    assert not list((tmp_path / "out").glob("*/*.feather"))
+
+
 def test_a_failure_ends_a_run_but_not_a_sweep(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(run, "is_sweep", lambda: False)
     with pytest.raises(SystemExit, match="1"):
@@ -166,9 +201,8 @@ def test_worker_processes_give_the_results_of_one_process(
     shutil.copytree(log_folder, root)
     sorted(root.glob("sensors/lidar/*"))[0].write_bytes(b"broken")
     records = []
-    for name, least in (("one", 50), ("two", 1)):
-        monkeypatch.setattr(estimates, "_PAIRS_PER_WORKER", least)
-        monkeypatch.setattr(estimates, "choose_layout", lambda *_: Layout(("cpu",) * 2, 1))
+    for name, workers in (("one", 1), ("two", 2)):
+        monkeypatch.setattr(estimates, "choose_layout", lambda *_, count=workers: Layout(("cpu",) * count, 1))
         assert evaluate(f"data.root={root}", f"output={tmp_path / name}") == 1
         records.append(results_of(tmp_path / name))
     one, two = records

@@ -17,7 +17,8 @@ from cflow_torch.data.bags import BagLog
 from cflow_torch.data.bags.point_cloud2 import points_and_times, seconds_after
 from cflow_torch.data.catalog import find_sources, open_log
 from cflow_torch.data.log import window
-from cflow_torch.data.log_check import SkewWarning, check_log
+from cflow_torch.data.log_check import check_log
+from cflow_torch.types import CFlowWarning
 
 
 @pytest.fixture
@@ -73,11 +74,11 @@ def test_missing_times_of_points_are_warned_of(recording: TinyRecording, tmp_pat
     path = write_bag(tmp_path, "ros1", recording)
     log = BagLog(path)
     with warnings.catch_warnings():
-        warnings.simplefilter("error", SkewWarning)
+        warnings.simplefilter("error", CFlowWarning)
         check_log(log)
         path.write_bytes(path.read_bytes().replace(b"\x01\x00\x00\x00t", b"\x01\x00\x00\x00u"))
         check_log(BagLog(path, deskew=False))
-    with pytest.warns(SkewWarning, match="deskew"):
+    with pytest.warns(CFlowWarning, match="deskew"):
         check_log(BagLog(path))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from cflow_torch.data.arrays import write_array_log
 from cflow_torch.data.catalog import GroundSegmentedLog, find_sources, open_log
 from cflow_torch.simulator import Drive, make_drive
 from cflow_torch.simulator.benchmark import FORMATS
-from cflow_torch.types import CFlowError
+from cflow_torch.types import CFlowError, CFlowWarning
 
 
 @pytest.fixture(scope="module")
@@ -48,9 +49,14 @@ def test_a_simulated_drive_of_every_sensor_is_scored_from_its_own_format(profile
 
 def test_ground_is_found_where_there_is_no_mask(drive: Drive, arrays: Path) -> None:
     (source,) = find_sources("arrays", arrays)
-    assert open_log("arrays", source, check=False).sweep(0).is_ground is None
-    log: Any = open_log("arrays", source, find_ground="grid")
+    assert open_log("arrays", source, find_ground=None).sweep(0).is_ground is None
+    with pytest.warns(CFlowWarning, match="no ground masks, so we find the ground .find_ground=auto"):
+        default = open_log("arrays", source)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        log: Any = open_log("arrays", source, find_ground="grid")
     truth, found = drive.sweep(1).is_ground, log.sweep(1).is_ground
+    assert np.array_equal(default.sweep(1).is_ground, found)
     assert found.dtype == np.bool_ and (found & truth).sum() / (found | truth).sum() > 0.9
     assert log.labels(0) is None and log.log_id == drive.log_id and np.array_equal(log.poses, drive.poses)
     assert not hasattr(log, "eval_mask") and pickle.loads(pickle.dumps(log)).files == log.files

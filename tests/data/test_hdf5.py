@@ -63,6 +63,25 @@ def test_a_bad_sweep_is_named(tmp_path, replaced, complaint):
             log.sweep(3)
 
 
+def test_a_scene_without_poses_uses_its_ego_motion(drive, tmp_path):
+    write_hdf5_scene(drive, tmp_path / "a.h5")
+    with h5py.File(tmp_path / "a.h5", "r+") as scene:
+        for group in scene.values():
+            del group["pose"]
+    start = np.linalg.inv(drive.poses[0])
+    with HDF5Log(tmp_path / "a.h5") as log:
+        for index in (2, 0, 1):
+            assert np.allclose(log.sweep(index).pose, start @ drive.poses[index], atol=1e-5)
+        assert np.allclose(log.poses, start @ drive.poses, atol=1e-5)
+    with h5py.File(tmp_path / "a.h5", "r+") as scene:
+        for group in scene.values():
+            group.pop("ego_motion", None)
+    with HDF5Log(tmp_path / "a.h5") as log, HDF5Log(tmp_path / "a.h5", needs_poses=False) as unposed:
+        with pytest.raises(CFlowError, match="has no pose.*Store pose.*ego_motion.*data.odometry=true"):
+            log.sweep(0)
+        assert unposed.sweep(1).pose is None
+
+
 def test_data_of_other_files_are_never_read(tmp_path):
     """Links, external storage and virtual datasets refer to other files, which may be any file."""
     other, secret = write_scene(tmp_path / "other.h5"), tmp_path / "secret"

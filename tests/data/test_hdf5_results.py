@@ -14,7 +14,7 @@ from hdf5_scene import STAMPS, write_scene
 
 from cflow_torch import CFlowError
 from cflow_torch.data.hdf5.reader import HDF5Log, find_hdf5_scenes
-from cflow_torch.data.hdf5.results import RESERVED_KEYS, write_hdf5_results
+from cflow_torch.data.hdf5.results import RESERVED_KEYS, write_hdf5_labels, write_hdf5_results
 
 h5py = pytest.importorskip("h5py")
 
@@ -51,6 +51,22 @@ def test_a_result_is_written_and_the_rest_stays(scene: Path) -> None:
     stored = after[f"{STAMPS[1]}/cflow"]
     assert stored.dtype == np.float32 and stored.shape == (51, 3) and (stored == np.float32(0.1)).all()
     assert find_hdf5_scenes(scene.parent) == [scene] and os.listdir(scene.parent) == [scene.name]
+
+
+@pytest.mark.parametrize("compression", [None, "gzip"])
+def test_what_is_added_is_compressed_as_the_points_are(scene: Path, compression: str | None) -> None:
+    with h5py.File(scene, "r+") as opened:
+        for group in opened.values():
+            points = group["lidar"][()]
+            del group["lidar"]
+            group.create_dataset("lidar", data=points, compression=compression, shuffle=compression is not None)
+    write_hdf5_results(scene, "cflow", [(STAMPS[0], flow_of(0))])
+    write_hdf5_labels(scene, [(STAMPS[0], {"dufo": np.ones(50, np.uint8), "nnd": np.zeros(50, np.uint8)})])
+    with h5py.File(scene) as opened:
+        for key in ("cflow", "dufo", "nnd"):
+            stored = opened[str(STAMPS[0])][key]
+            assert (stored.compression, stored.shuffle) == (compression, compression is not None)
+        assert (opened[str(STAMPS[0])]["dufo"][()] == 1).all()
 
 
 def test_an_older_result_is_replaced_without_growth(scene: Path) -> None:

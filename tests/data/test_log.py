@@ -13,7 +13,7 @@ from torch.utils.data import DataLoader
 
 from cflow_torch import CFlowError, FlowResult, Window, make_config, make_model
 from cflow_torch.data.flow_file import CONTENTS, ON_REQUEST, read_flow, write_flow
-from cflow_torch.data.log import CachedLog, Log, WindowDataset, window, windows
+from cflow_torch.data.log import CachedLog, FlowLabels, Log, WindowDataset, window, windows
 from cflow_torch.simulator import Drive, make_drive
 from cflow_torch.types import Sweep
 
@@ -44,10 +44,32 @@ def test_logs_and_wrappers_are_sequences(drive: Drive) -> None:
     for log in (Mine(), CachedLog(Mine(), 2)):
         assert [len(sweep.points) for sweep in log] == [0, 1, 2] and len(log) == 3
         assert len(log[-1].points) == 2 and log.labels(0) is None
+        assert [[len(sweep.points) for sweep in log[part]] for part in (slice(1, 3), slice(None, None, -2))] == [
+            [1, 2],
+            [2, 0],
+        ]
         with pytest.raises(IndexError):
             log[3]
     recent = pickle.loads(pickle.dumps(CachedLog(drive, 2)))
     assert np.array_equal(recent.sweep(1).points, drive.sweep(1).points)
+
+
+@pytest.mark.parametrize(
+    ("field", "values", "complaint"),
+    [
+        ("category", np.zeros(4, bool), r"category has dtype bool: give \(4,\) integers"),
+        ("category", np.zeros(3, np.uint8), r"category has shape \(3,\)"),
+        ("is_valid", np.ones(4, np.uint8), "is_valid has dtype uint8"),
+        ("flow", np.zeros((4, 2), np.float32), r"flow has shape \(4, 2\)"),
+        ("flow", np.zeros((4, 3), int), "flow has dtype int64"),
+        ("flow", [[0.0] * 3] * 4, "flow is list"),
+    ],
+)
+def test_labels_of_a_wrong_type_or_shape_are_refused(field: str, values: Any, complaint: str) -> None:
+    good = {"flow": np.zeros((4, 3), np.float32), "category": np.zeros(4, np.uint8), "is_valid": np.ones(4, bool)}
+    FlowLabels(**good)
+    with pytest.raises(CFlowError, match=f"FlowLabels.{complaint}"):
+        FlowLabels(**{**good, field: values})
 
 
 def test_windows_read_each_sweep_once(drive: Drive) -> None:

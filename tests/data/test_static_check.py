@@ -1,4 +1,4 @@
-"""Warnings when a log is opened: wrong poses or frames, and ground without masks."""
+"""Warnings when a log is opened: wrong poses, frames, units, axes and orders of sweeps."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ import pytest
 
 from cflow_torch import CFlowError, Sweep
 from cflow_torch.data.av2 import AV2Log
-from cflow_torch.data.log_check import GroundWarning, check_log
-from cflow_torch.data.static_check import StaticWorldWarning, check_static_world, static_world_residual
+from cflow_torch.data.log_check import check_log, find_problems
+from cflow_torch.data.static_check import check_static_world, static_world_residual
 from cflow_torch.simulator import make_drive
+from cflow_torch.types import CFlowWarning
 
 
 class Changed:
@@ -46,7 +47,7 @@ def verdict(log) -> str:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         found = check_static_world(log)
-    messages = [str(w.message) for w in caught if issubclass(w.category, StaticWorldWarning)]
+    messages = [str(w.message) for w in caught if issubclass(w.category, CFlowWarning)]
     assert found and len(messages) <= 1
     assert bool(messages) == any(residual.verdict for residual in found)
     return messages[0] if messages else ""
@@ -115,13 +116,40 @@ def test_too_few_points_raise_no_warning(drive):
             static_world_residual(drive, index, baseline)
 
 
-def test_opening_a_log_checks_ground_and_poses(drive):
-    with pytest.warns(UserWarning) as caught:
-        check_log(Changed(drive, lambda pose: np.eye(4), masks=False))
-    assert {warning.category for warning in caught} == {GroundWarning, StaticWorldWarning}
-    assert any("data.find_ground=grid" in str(warning.message) for warning in caught)
+class Rearranged(Changed):
+    """A log with changed points, or with the points of other sweeps."""
+
+    def __init__(self, log, change=lambda points: points, order=(0, 1, 2, 3, 4, 5, 6, 7)):
+        super().__init__(log)
+        self.change, self.order = change, order
+
+    def sweep(self, index):
+        sweep, points = self.log.sweep(index), self.log.sweep(self.order[index]).points
+        return Sweep(self.change(np.asarray(points)), None, sweep.pose, sweep.timestamp_ns)
+
+
+@pytest.mark.parametrize(
+    ("change", "order", "found"),
+    [
+        (lambda points: 1000 * points, range(8), "in metres"),
+        (lambda points: 0.001 * points, range(8), "in metres"),
+        (lambda points: points + np.float32([500, 0, 0]), range(8), "frame of the LiDAR or of the vehicle"),
+        (lambda points: points * np.float32([1, -1, -1]), range(8), "z seems to point down"),
+        (lambda points: points, (0, 0, 2, 3, 4, 5, 6, 7), "the same points"),
+        (lambda points: points, (0, 2, 1, 3, 4, 5, 6, 7), "interchanged"),
+    ],
+    ids=["millimetres", "kilometres", "elsewhere", "z down", "repeated", "interchanged"],
+)
+def test_wrong_sweeps_are_recognised(change, order, found):
+    log = make_drive(seed=1, num_sweeps=8, profile="demo")
+    assert find_problems(Rearranged(log)) == []
+    assert any(found in text for text in find_problems(Rearranged(log, change, order)))
+
+
+def test_opening_a_log_warns_of_likely_mistakes(drive):
+    with pytest.warns(CFlowWarning, match=f"log {drive.log_id}: .*static world moves"):
+        check_log(Changed(drive, lambda pose: np.eye(4)))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        check_log(drive)
         for good in (drive, Changed(drive, masks=False, ground=False), Changed(drive, is_broken=True)):
             check_log(good)

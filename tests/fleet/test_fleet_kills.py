@@ -77,4 +77,9 @@ def test_a_killed_run_is_resumed_and_its_workers_end(
     assert 3 < len(frames(tmp_path)) < len(expected) and flow_of(tmp_path).items() <= expected.items()
     assert command(f"data.root={many}", f"output={tmp_path}") == 0
     assert flow_of(tmp_path) == expected, "nothing is lost"
-    assert not list(tmp_path.rglob(".*")), "no temporary file is left"
+    left = list(tmp_path.rglob(".*"))
+    assert all(file.name.endswith(".tmp") for file in left)
+    for file in left:
+        os.utime(file, (0, 0))
+    assert command(f"data.root={many}", f"output={tmp_path}") == 0
+    assert not list(tmp_path.rglob(".*")), "old temporary files are removed"

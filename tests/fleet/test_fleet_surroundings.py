@@ -14,7 +14,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cflow_torch import CFlowError
+from cflow_torch import CFlowError, make_config
 from cflow_torch.fleet import machine, progress
 from cflow_torch.fleet.job import Shard, find_shard, split
 from cflow_torch.fleet.machine import Layout, choose_layout, usable_cores
@@ -97,7 +97,11 @@ def test_layout_is_chosen_from_the_machine(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(machine, "available_memory", lambda environ: 10 * machine.WORKER_MEMORY + 1)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert choose_layout("auto", "auto", "auto", {}) == Layout(("cpu",) * 10, machine.CPU_BATCH)
-    assert choose_layout("cpu", 3, 7, {}) == Layout(("cpu",) * 3, 7)
+    assert choose_layout("cpu", 3, 7, {}, 1) == Layout(("cpu",) * 3, 7)
+    frames = 3 * machine.frames_per_worker(make_config("default"))
+    few = [number // machine.frames_per_worker(make_config("default")) for number in (0, 7, frames - 1, frames)]
+    assert [len(choose_layout("cpu", "auto", 1, {}, most).devices) for most in few] == [1, 1, 2, 3]
+    assert machine.frames_per_worker(make_config("paper")) > machine.frames_per_worker(make_config("default"))
     monkeypatch.setattr(machine, "available_memory", lambda environ: 1)
     assert choose_layout("cpu", "auto", "auto", {}).devices == ("cpu",)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)

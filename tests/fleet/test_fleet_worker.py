@@ -7,22 +7,26 @@ import operator
 import threading
 import time
 import weakref
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Callable, Iterator, Sequence
 
+import numpy as np
 import pytest
 from small_fleet import CONFIG, PAIRS, flow_files, make_job, tree
 
-from cflow_torch import CFlowError, FlowResult, Window, make_model
+from cflow_torch import CFlowError, FlowResult, Window, make_config, make_model
 from cflow_torch.data.av2 import AV2Log
+from cflow_torch.data.log import LogWrapper
 from cflow_torch.fleet import dispatch as dispatching
 from cflow_torch.fleet.dispatch import WorkerDied, dispatch
-from cflow_torch.fleet.job import Done, Event, Failed, Job, Opened, Shard, Unit
+from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Shard, Unit
 from cflow_torch.fleet.local import run_local
 from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.processes import ChildProcess
 from cflow_torch.fleet.report import Counters, format_missing, format_report
 from cflow_torch.fleet.work import Worker, WorkerProcess
+from cflow_torch.simulator import make_drive
 
 
 @pytest.fixture
@@ -64,6 +68,31 @@ def test_a_bad_frame_does_not_spoil_its_batch(
     assert all(type(error).__name__ in event.message or "too odd" in event.message for event in failed)
     assert [event.timestamp for event in events if isinstance(event, Done)] == [stamps[i] for i in (0, 2, 4)]
     assert len(flow_files(tmp_path)) == 3 and flow_files(tmp_path).items() <= single.items()
+
+
+def test_frames_without_an_active_point_fail_and_repeated_sweeps_are_noted(tmp_path: Path) -> None:
+    drive = make_drive(seed=1, num_sweeps=5, profile="demo")
+
+    class Odd(LogWrapper):
+        """Its second sweep is in millimetres, its last one repeats the fourth."""
+
+        def sweep(self, index: int) -> Any:
+            sweep = self.log.sweep(min(index, 3))
+            points = sweep.points * np.float32(1000 if index == 1 else 1)
+            return replace(sweep, points=points, pose=np.eye(4), timestamp_ns=self.timestamps[index])
+
+    class Opener(Worker):
+        def _open(self, source: Any) -> Any:
+            return Odd(drive)
+
+    job = make_job(tmp_path, config=make_config("paper"), settings={}, batch=4)
+    events = list(Opener(job, "cpu").run(Unit(0, "odd")))
+    (failed,) = [event for event in events if isinstance(event, Failed)]
+    assert failed.timestamp == drive.timestamps[1] and "none of the 26523 points of pc0 is active" in failed.message
+    assert [event.timestamp for event in events if isinstance(event, Done)] == [drive.timestamps[i] for i in (0, 2, 3)]
+    notes = [(event.name, event.message) for event in events if isinstance(event, Noted)]
+    assert notes[-1] == (f"{drive.log_id}/{drive.timestamps[3]}", "the next sweep has the same points")
+    assert any("static world moves" in text for _, text in notes), "the log is checked by the unit of its first frame"
 
 
 def test_the_memory_of_a_failed_batch_is_free_before_its_frames_are_repeated(source: Path, tmp_path: Path) -> None:
@@ -169,6 +198,7 @@ def test_after_a_death_the_unit_is_repeated_then_each_frame_by_itself(
     assert 1000 - deadly[names[3]] == 3, "once with the unit, then twice by itself"
     assert counters.failures == [(names[3], "2 workers died on it, the last one by SIGSEGV")]
     assert (counters.total, counters.waiting) == (PAIRS, [])
+    assert counters.times_noted("a worker died by SIGSEGV; another one goes on with the frames that are missing") == 4
     found = {name: content for name, content in tree(tmp_path).items() if name != "manifest.json"}
     assert found == {n: c for n, c in single.items() if n not in ("manifest.json", f"{names[3]}.feather")}
     assert all(process.is_closed.is_set() for process in processes)
@@ -192,8 +222,10 @@ def test_a_log_that_cannot_be_opened_alive_is_left(source: Path, tmp_path: Path)
         def call(self, unit: Unit, stop: bool) -> Any:
             raise WorkerDied("by SIGABRT")
 
-    events = list(dispatch([Deadly(make_job(tmp_path))], units_of([source]), lambda: False, retries=1))
-    assert events == [Failed(0, source.name, "2 workers died on it, the last one by SIGABRT")]
+    died, again, failed = dispatch([Deadly(make_job(tmp_path))], units_of([source]), lambda: False, retries=1)
+    text = "a worker died by SIGABRT; another one goes on with the frames that are missing"
+    assert died == again == Noted(0, source.name, text)
+    assert failed == Failed(0, source.name, "2 workers died on it, the last one by SIGABRT")
 
 
 def test_workers_that_die_at_their_start_are_started_three_times(source: Path, tmp_path: Path) -> None:
@@ -283,9 +315,11 @@ def test_the_report_lists_what_is_missing() -> None:
     assert counters.add(Done(0, 10, {"read": 2.0})) == 1
     assert counters.add(Failed(0, "a/11", "odd", 11)) == 1
     assert counters.add(Failed(1, "b", "no log")) == 0
+    assert [counters.add(Noted(2, name, "odd")) for name in "cca"] == [0, 0, 0] and counters.times_noted("odd") == 3
     report = counters.report(4.0, Layout(("cpu",), 1), Shard(), "local", "SIGTERM")
     assert report["status"] == "interrupted" and report["stopped_by"] == "SIGTERM"
     assert list(report["frames"].values()) == [40, 10, 1, 1, 1, 28, 1]
+    assert report["notes"] == [["c", "odd", 2], ["a", "odd", 1]] and "warnings" in format_report(report)
     missing = format_missing(report).splitlines()
     assert missing[:3] == ["  a/11: odd", "  b: no log", "  a/12: not done"]
     assert missing[-2:] == ["  and 10 more, all of them in the report", "  1 logs or parts of logs: not begun"]

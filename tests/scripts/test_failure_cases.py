@@ -52,11 +52,12 @@ def test_later_sweeps_fix_an_appearing_car(failures: Any) -> None:
 
 
 def test_a_wrong_frame_is_found_by_the_static_check(failures: Any) -> None:
-    from cflow_torch.data.static_check import StaticWorldWarning, check_static_world
+    from cflow_torch.data.static_check import check_static_world
+    from cflow_torch.types import CFlowWarning
 
     good = failures.drives.turn(0).drive
     with warnings.catch_warnings():
-        warnings.simplefilter("error", StaticWorldWarning)
+        warnings.simplefilter("error", CFlowWarning)
         check_static_world(good)
-    with pytest.warns(StaticWorldWarning, match="ego_T_lidar"):
+    with pytest.warns(CFlowWarning, match="ego_T_lidar"):
         check_static_world(failures.MisplacedPoses(good))

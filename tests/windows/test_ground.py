@@ -195,11 +195,11 @@ def street() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return pc0, pc1, np.repeat([0, 1, 2], [len(car), 6000, len(floor)])
 
 
-def test_ground_auto_finds_the_moving_car(street):
+def test_the_moving_car_is_found(street):
     pc0, pc1, part = street
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        result = estimate_flow(pc0, pc1, ground="auto", preset="paper")
+        result = estimate_flow(pc0, pc1, ground="grid", preset="paper")
     flow, is_valid = result.residual_flow.numpy(), result.is_valid.numpy()
     # The lowest 0.3 m of everything count as ground, and between rings the surface is up to 0.15 m too high.
     above = pc0[:, 2] > -1.25
@@ -207,26 +207,22 @@ def test_ground_auto_finds_the_moving_car(street):
     assert is_valid[(part < 2) & above].all() and not is_valid[part == 2].any()
 
 
-def test_a_missing_mask_gives_a_warning(street):
+def test_ground_that_is_left_in_spoils_the_flow(street):
     pc0, pc1, part = street
-    with pytest.warns(UserWarning, match="ground='auto'") as record:
-        result = estimate_flow(pc0, pc1, preset="paper")
-    assert len(record) == 1 and record[0].filename == __file__
-    assert np.abs(result.residual_flow.numpy()[part == 0] - [0.8, 0, 0]).max() > 0.5  # the warning's reason
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        nothing = np.zeros(len(pc0), dtype=bool)
-        estimate_flow(pc0, pc1, gm0=nothing, gm1=nothing, preset="paper")
+        result = estimate_flow(pc0, pc1, ground=None, preset="paper")
+        assert np.abs(result.residual_flow.numpy()[part == 0] - [0.8, 0, 0]).max() > 0.5
         estimate_flow(pc0[part < 2], pc1[part < 2], preset="paper")
 
 
-def test_ground_auto_keeps_given_masks_and_adds_those_of_the_history(street):
+def test_finding_ground_keeps_given_masks_and_adds_those_of_the_history(street):
     pc0, pc1, part = street
     mine = part == 0  # not ground, but the user's mask counts
-    result = estimate_flow(pc0, pc1, gm0=mine, ground="auto", preset="paper")
+    result = estimate_flow(pc0, pc1, gm0=mine, ground="grid", preset="paper")
     assert not result.is_valid[mine].any() and result.is_valid[part == 1].all()
     older = pc0 - np.where(mine[:, None], [0.8, 0, 0], 0)
     settings = {"pch": [older], "num_history": 1, "preset": "paper"}
     gm0, gm1, gmh = find_ground_batch([pc0, pc1, older])
     masked = estimate_flow(pc0, pc1, gm0=gm0, gm1=gm1, gmh=[gmh], **settings)
-    assert_same(estimate_flow(pc0, pc1, ground="auto", **settings), masked)
+    assert_same(estimate_flow(pc0, pc1, ground="grid", **settings), masked)

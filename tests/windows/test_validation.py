@@ -35,10 +35,12 @@ def refused(*sweeps: Sweep, match: str) -> None:
     ],
 )
 def test_invalid_points_are_named(points, complaint):
-    good = Sweep(P1)
-    refused(Sweep(points), good, match="pc0.*" + complaint)
-    refused(good, Sweep(points), match="pc1.*" + complaint)
-    refused(good, good, Sweep(points), match="pch1.*" + complaint)
+    with pytest.raises(CFlowError, match="Sweep.points.*" + complaint):
+        Sweep(points)
+    with pytest.raises(CFlowError, match="pc1 .*" + complaint):
+        estimate_flow(P0, points)
+    with pytest.raises(CFlowError, match=r"pch\[1\] .*" + complaint):
+        estimate_flow(P0, P1, pch=[P0, points])
 
 
 @pytest.mark.parametrize(
@@ -51,18 +53,27 @@ def test_invalid_points_are_named(points, complaint):
     ],
 )
 def test_invalid_ground_masks_are_named(mask, complaint):
-    refused(Sweep(P0, mask), Sweep(P1), match="ground mask of pc0.*" + complaint)
-    refused(Sweep(P1), Sweep(P0), Sweep(P0 + 1, mask), match="ground mask of pch1.*" + complaint)
+    with pytest.raises(CFlowError, match="Sweep.is_ground .*" + complaint):
+        Sweep(P0, mask)
+    with pytest.raises(CFlowError, match="gm0 .*" + complaint):
+        estimate_flow(P0, P1, gm0=mask)
 
 
 @pytest.mark.parametrize(
-    "windows",
-    [None, Window(Sweep(P0), Sweep(P1)), [Sweep(P0)], [P0, P1], [Window(P0, P1)], [Window(Sweep(P0), Sweep(P1), None)]],
-    ids=["None", "Window", "Sweep", "arrays", "Window of arrays", "no history"],
+    "times, complaint", [(np.zeros(3), r"shape \(3,\)"), (np.zeros(50, np.int64), "dtype int64.*seconds")]
 )
-def test_invalid_windows_are_refused(windows):
-    with pytest.raises(CFlowError, match="Window|Sweep"):
-        MODEL(windows)
+def test_invalid_times_of_points_are_named(times, complaint):
+    with pytest.raises(CFlowError, match="Sweep.point_times .*" + complaint):
+        Sweep(P0, point_times=times)
+
+
+def test_invalid_windows_are_refused():
+    for windows in (None, Window(Sweep(P0), Sweep(P1)), [Sweep(P0)], [P0, P1]):
+        with pytest.raises(CFlowError, match="Window"):
+            MODEL(windows)
+    for sweeps in ((P0, P1), (Sweep(P0), Sweep(P1), None), (Sweep(P0), Sweep(P1), (P0,))):
+        with pytest.raises(CFlowError, match="give .*cflow_torch.Sweep"):
+            Window(*sweeps)
 
 
 @pytest.mark.parametrize("given", [(0,), (1,), (0, 1), (1, 2)])
@@ -72,7 +83,10 @@ def test_poses_of_some_sweeps_only_are_refused(given):
 
 @pytest.mark.parametrize("which, name", [(0, "pc0"), (1, "pose1"), (2, "pch1")])
 def test_bad_poses_are_named(which, name):
-    for bad in (EYE * np.nan, MIRROR, np.eye(3), "pose"):
+    for bad in (np.eye(3), "pose"):
+        with pytest.raises(CFlowError, match=r"Sweep.pose has shape .*\(4, 4\)"):
+            Sweep(P0, pose=bad)
+    for bad in (EYE * np.nan, MIRROR):
         refused(*(Sweep(p, pose=bad if i == which else EYE) for i, p in enumerate((P0, P1, P0 + 1))), match=name)
 
 

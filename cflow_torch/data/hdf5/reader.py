@@ -43,6 +43,7 @@ class HDF5Log(Log):
         file: `<scene>.h5`.
         ego_T_lidar: (4, 4), coordinates of the stored points to the frame whose poses are stored; None = the same
             frame; "auto" = recognise it (see Convention).
+        needs_poses: False = sweeps of a scene without poses have the pose None, for `with_poses`.
 
     Attributes:
         log_id: file name without its suffix.
@@ -54,6 +55,7 @@ class HDF5Log(Log):
         - Points, labels and results stay in the frame of the file, that of the LiDAR. A sweep's `pose` is the LiDAR's:
           the stored pose times `ego_T_lidar`. So the static world is static even if the file combines points in the
           sensor frame with poses of the ego vehicle.
+        - A scene without `pose` gets poses from `ego_motion`; the world is then the frame of the first sweep.
         - "auto" uses the file's attribute `ego_T_lidar` if it has one (our writer's files do), otherwise
           `recognized_extrinsics` of the first sweep.
         - Index files next to a scene are pickles: they are never opened.
@@ -63,8 +65,9 @@ class HDF5Log(Log):
             a rigid motion.
     """
 
-    def __init__(self, file: PathLike, ego_T_lidar: Any = "auto") -> None:
-        self.file = as_path(file)
+    def __init__(self, file: PathLike, ego_T_lidar: Any = "auto", needs_poses: bool = True) -> None:
+        self.file, self._needs_poses = as_path(file), needs_poses
+        self._chain = [np.eye(4)]  # poses from `ego_motion`, as far as they are known
         self.log_id = self.file.stem
         self._scene = open_scene(self.file)
         # HDF5 closes its files after the interpreter has ended, which crashes if Python reads the file.
@@ -79,7 +82,7 @@ class HDF5Log(Log):
         self.ego_T_lidar = rigid_transform(ego_T_lidar, f"ego_T_lidar of {self.file}")
 
     def __reduce__(self) -> Any:
-        return HDF5Log, (self.file, self.ego_T_lidar)  # another process opens the file itself
+        return HDF5Log, (self.file, self.ego_T_lidar, self._needs_poses)  # another process opens the file itself
 
     def close(self) -> None:
         """Close the scene's file."""
@@ -90,8 +93,8 @@ class HDF5Log(Log):
         rows, timestamp = self._rows(index), self.timestamps[index]
         points = self._needed(index, "lidar", dtype=np.float32)
         is_ground = self._column(index, "ground_mask", rows, np.bool_)
-        pose = self._needed(index, "pose", (4, 4), np.float64)
-        if not np.array_equal(self.ego_T_lidar, np.eye(4)):
+        pose = self._stored_pose(index)
+        if pose is not None and not np.array_equal(self.ego_T_lidar, np.eye(4)):
             pose = rigid_transform(pose, f"pose of sweep {timestamp} in {self.file}") @ self.ego_T_lidar
         nanoseconds = timestamp if timestamp >= _FIRST_NANOSECOND else timestamp * 1000
         times = self._column(index, "lidar_dt", rows, np.float32)
@@ -123,7 +126,7 @@ class HDF5Log(Log):
         Raises:
             CFlowError: no such pair, or a pose that cannot be read or is not a rigid motion.
         """
-        poses = [self._needed(k, "pose", (4, 4)) for k in (index, index + 1)]
+        poses: Any = [self._stored_pose(k, None) for k in (index, index + 1)]
         for pose in poses:
             rigid_transform(pose, f"pose of sweep {index} or {index + 1} of {self.file}")
         return StoredMotion(harness_motion(*poses), np.array_equal(self.ego_T_lidar, np.eye(4)))
@@ -151,9 +154,29 @@ class HDF5Log(Log):
     @property
     def poses(self) -> np.ndarray:
         """(K, 4, 4) float64 `T_world_lidar` of every sweep, without reading any points."""
-        stored = np.stack([self._needed(index, "pose", (4, 4), np.float64) for index in range(len(self))])
+        stored = np.stack([self._stored_pose(index) for index in range(len(self))])
         with np.errstate(all="ignore"):  # NaN stays NaN
             return stored @ self.ego_T_lidar
+
+    def _stored_pose(self, index: int, dtype: Any = np.float64) -> Any:
+        """Read a pose, or compute it from the ego motion of all sweeps before; None if poses are not needed."""
+        pose = self._values(index, "pose", [(4, 4)], dtype)
+        if pose is not None:
+            return pose
+        while len(self._chain) <= index:
+            motion = self._values(len(self._chain) - 1, "ego_motion", [(4, 4)], np.float64)
+            if motion is None:
+                break
+            name = f"ego_motion of sweep {self.timestamps[len(self._chain) - 1]} in {self.file}"
+            self._chain.append(self._chain[-1] @ np.linalg.inv(rigid_transform(motion, name)))
+        if index < len(self._chain) > 1 or (index == 0 and self._values(0, "ego_motion") is not None):
+            return self._chain[index]
+        if not self._needs_poses:
+            return None
+        raise CFlowError(
+            f"{self.file}: sweep {self.timestamps[index]} has no pose; it has {', '.join(self.keys(index))}. Store "
+            "pose (T_world_ego) of every sweep, or ego_motion to the next sweep, or set data.odometry=true"
+        )
 
     def _stated_extrinsics(self) -> np.ndarray:
         """Return the extrinsics of the scene's attribute, otherwise the recognised ones."""

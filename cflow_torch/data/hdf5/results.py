@@ -66,7 +66,7 @@ def write_hdf5_results(file: str | Path, name: str, results: Iterable[tuple[int,
         Number of sweeps written.
 
     Convention:
-        float32, neither chunked nor compressed, as the harness stores it. NaN rows are kept (viewers show them white).
+        float32, compressed as the points of the sweep are. NaN rows are kept (viewers show them white).
         All results go into a copy next to the file, which replaces it at the end, so the scene is always the old or the
         new one. Readers that have it open continue with the old one. Only one process may write into a scene at a time.
 
@@ -103,7 +103,7 @@ def write_hdf5_labels(
     Returns:
         Number of sweeps written.
 
-    Convention: as for `write_hdf5_results`, the scene is always the old or the new one.
+    Convention: as for `write_hdf5_results`, compressed as the points are; the scene is always the old or the new one.
 
     Raises:
         CFlowError: see `write_hdf5_results`; or the scene has labels, and `overwrite` is False.
@@ -145,7 +145,7 @@ def _changed(file: str | Path) -> Iterator[Any]:
     h5py = import_h5py()
     check_writable(file)
     file = Path(file).resolve()  # a link stays a link
-    remove_stale(file.parent, {file.name})  # the copy of a writer that was killed
+    remove_stale(file.parent)  # copies of writers that were killed
     with atomic_name(file) as copy:
         shutil.copy(file, copy)
         with _writing(file):
@@ -201,7 +201,9 @@ def _is_like(stored: Any, shape: tuple[int, ...], dtype: Any) -> bool:
 
 
 def _store(sweep: Any, key: str, older: Any, values: np.ndarray) -> None:
-    if older is None:
-        sweep.create_dataset(key, data=values)
-    else:
+    if older is not None:
         older[...] = values  # in place, because HDF5 never frees the space of a deleted dataset
+        return
+    points = sweep["lidar"]
+    filters = {name: getattr(points, name) for name in ("compression", "compression_opts", "shuffle")}
+    sweep.create_dataset(key, data=values, **(filters if points.compression and len(values) else {}))
