@@ -120,7 +120,8 @@ class PandaSetLog(Log):
         cuboids = [_columns(file, ("uuid", "label", "yaw", "cuboids.sensor_id", *_POSITION, *_SIZE)) for file in files]
         T_ego1_ego0 = np.linalg.inv(self._poses[index + 1]) @ self._poses[index]
         flow = np.zeros((len(points), 3), np.float32)
-        category, is_valid = np.zeros(len(points), np.uint8), np.zeros(len(points), bool)
+        category: np.ndarray = np.zeros(len(points), np.uint8)
+        is_valid = np.zeros(len(points), bool)
         for lidar in _LIDARS:
             rows = np.flatnonzero(lidars == lidar)
             boxes0, boxes1 = (self._boxes(cuboids[k], files[k], index + k, lidar) for k in (0, 1))
