@@ -197,7 +197,9 @@ def test_a_killed_run_leaves_whole_scenes_and_resumes(scenes: Path, tmp_path: Pa
     assert label(scenes, output) == 0
     assert first.stat().st_ino == inode, "a labelled scene is not written again"
     assert frames == {f: f.stat().st_mtime_ns for f in tmp_path.glob("out/*/*.feather")}, "flow is not computed again"
-    assert all("nnd" in sweep for sweep in stored(second)) and sorted(os.listdir(scenes)) == sorted(before)
+    assert all("nnd" in sweep for sweep in stored(second)) and sorted(
+        name for name in os.listdir(scenes) if not name.endswith(".json")
+    ) == sorted(before)
 
 
 def test_shards_label_every_scene_once(scenes: Path, tmp_path: Path, capsys: Any) -> None:
@@ -205,7 +207,7 @@ def test_shards_label_every_scene_once(scenes: Path, tmp_path: Path, capsys: Any
     for index, count in ((1, 0), (0, 1), (2, 1)):
         assert label(scenes, f"output={tmp_path / 'out'}", f"shard.index={index}", "shard.count=3") == 0
         assert f"scenes labelled: {count}," in capsys.readouterr().out
-    assert all("dufo" in sweep for file in scenes.iterdir() for sweep in stored(file))
+    assert all("dufo" in sweep for file in scenes.glob("*.h5") for sweep in stored(file))
 
 
 def test_broken_scenes_are_reported_and_the_others_labelled(scenes: Path, tmp_path: Path, capsys: Any) -> None:

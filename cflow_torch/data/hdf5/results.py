@@ -12,7 +12,7 @@ from typing import Any, Iterable, Iterator, Mapping
 
 import numpy as np
 
-from cflow_torch.data.atomic import atomic_name, remove_stale
+from cflow_torch.data.atomic import atomic_name
 from cflow_torch.data.files import file_errors
 from cflow_torch.data.hdf5.stored import import_h5py, member, open_scene
 from cflow_torch.data.names import is_timestamp
@@ -145,7 +145,8 @@ def _changed(file: str | Path) -> Iterator[Any]:
     h5py = import_h5py()
     check_writable(file)
     file = Path(file).resolve()  # a link stays a link
-    remove_stale(file.parent)  # copies of writers that were killed
+    for left in file.parent.glob(f".{file.name}.*.tmp"):  # copies of writers that were killed
+        left.unlink()
     with atomic_name(file) as copy:
         shutil.copy(file, copy)
         with _writing(file):
