@@ -2,10 +2,19 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+from typing import Any
+
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+
+
+@lru_cache(maxsize=256)
+def constant(values: tuple[Any, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """A small tensor from nested tuples of numbers. It is uploaded to the device once; never write to it."""
+    return torch.tensor(values, dtype=dtype, device=device)
 
 
 def flat_nonzero(mask: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ position, and its front comes to a new one.
 
 What is longer than other objects moves only if both of its ends do, as those of a tram. The ends of a wall do not: one
 stays, or each goes where the view of it ends. The ends of a guard rail may keep pace with the ego vehicle, since its
-few beams meet it at places that are fixed in the vehicle's frame; but no vehicle is as low as a rail.
+few beams meet it at positions that are fixed in the vehicle's frame; but no vehicle is as low as a rail.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import math
 import torch
 from torch import Tensor
 
-from cflow_torch.ops.indices import flat_nonzero, gather, renumber, scatter_count
+from cflow_torch.ops.indices import constant, flat_nonzero, gather, renumber, scatter_count
 from cflow_torch.verified.height_slices import HeightSlicedSweeps, Pixels, count_slices
 
 # A line: largest standard deviation across and smallest along, metres.
@@ -104,7 +104,7 @@ def both_ends_move(sweeps: HeightSlicedSweeps, roots: Tensor, is_long: Tensor) -
         is_long: (V,) bool, those that are asked about; each has pixels at t+1.
 
     Returns:
-        (V,) bool: between the sweep that is farthest in time from t+1 and t+1 both ends have gone the same way along
+        (V,) bool: from the sweep that is farthest in time to t+1 (or back), both ends have moved in one direction along
         the component, at least 1.2 m, alike to a tenth of their sum; and its pixels at t+1 have two slices on average.
         False for all others.
 
@@ -122,20 +122,20 @@ def both_ends_move(sweeps: HeightSlicedSweeps, roots: Tensor, is_long: Tensor) -
     count = name.numel()
     number = renumber(name, is_long.numel()).index_select(0, roots.flatten())
     some = flat_nonzero(number < count)
-    pixels, owner = sweeps.pixels.take(some % roots.shape[1]), number.index_select(0, some)
+    pixels, component = sweeps.pixels.take(some % roots.shape[1]), number.index_select(0, some)
     is_new = pixels.step == 0
     num_slices = torch.where(is_new, count_slices(pixels.slices).long() - _TALL, 0)
-    is_tall = scatter_count(owner, count, num_slices) >= 0
+    is_tall = scatter_count(component, count, num_slices) >= 0
 
     # Ends in four directions, at t+1 and in the farthest sweep; pixels of other sweeps count for a component behind.
     is_farthest = pixels.step == sweeps.elapsed.abs().argmax(1).index_select(0, pixels.window)
-    of_sweep = torch.where(is_new, owner, torch.where(is_farthest, owner + count, 2 * count))
+    of_sweep = torch.where(is_new, component, torch.where(is_farthest, component + count, 2 * count))
     along = torch.stack((pixels.row, pixels.col, pixels.row + pixels.col, pixels.row - pixels.col)).double()
     infinite = along.new_full((4, 2 * count + 1), math.inf)
     low = infinite.scatter_reduce(1, of_sweep.expand(4, -1), along, "amin")[:, :-1].view(4, 2, count)
     high = (-infinite).scatter_reduce(1, of_sweep.expand(4, -1), along, "amax")[:, :-1].view(4, 2, count)
-    metres = [scale * sweeps.grid.pixel_size for scale in (1.0, 1.0, math.sqrt(0.5), math.sqrt(0.5))]
-    unit = torch.tensor(metres, dtype=torch.float64, device=along.device)[:, None]
+    metres = tuple(scale * sweeps.grid.pixel_size for scale in (1.0, 1.0, math.sqrt(0.5), math.sqrt(0.5)))
+    unit = constant(metres, torch.float64, along.device)[:, None]
     direction = ((high[:, 0] - low[:, 0]) * unit).argmax(0)[None]
     low, high = (((ends[:, 0] - ends[:, 1]) * unit).gather(0, direction)[0] for ends in (low, high))
     both = (low + high).abs()  # infinite or NaN where the component is not seen

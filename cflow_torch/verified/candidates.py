@@ -14,6 +14,7 @@ from cflow_torch.dense.correlation import best_shifts
 from cflow_torch.dense.templates import TemplatePairs, make_pairs
 from cflow_torch.ops.cross_correlation import parabola_vertex
 from cflow_torch.ops.indices import (
+    constant,
     flat_nonzero,
     gather,
     lazy_empty,
@@ -26,7 +27,7 @@ from cflow_torch.ops.segments import bounding_boxes, masked_median
 from cflow_torch.verified.component_tree import Components, Nodes
 from cflow_torch.verified.height_slices import OWN, HeightSlicedSweeps, count_slices
 
-# A node whose box has more pixels is correlated at a coarser scale: its parts are followed at the finer ones.
+# A node whose box has more pixels is correlated at a coarser scale: its children are followed at the finer ones.
 _LARGEST_BOX = 1 << 12
 
 
@@ -69,7 +70,7 @@ def list_motions(estimates: Tensor, available: Tensor, intervals: Tensor) -> Ten
 
     Args:
         estimates: (M, K, 2) float64, (y, x) finest pixels m -> t+1, nearest sweep first.
-        available: (M, K) bool, False = there is no estimate; its entry is ignored.
+        available: (M, K) bool, False = it is unknown; its entry is ignored.
         intervals: (M, K) float64, sweep intervals from m to t+1; not 0 where an estimate is available.
 
     Convention:
@@ -89,7 +90,7 @@ def list_motions(estimates: Tensor, available: Tensor, intervals: Tensor) -> Ten
 def _find_peaks(
     nodes: Nodes, components: Components, sweeps: HeightSlicedSweeps, config: VerifiedConfig
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Displacement m -> t+1 of nodes for every other sweep m, to parts of a pixel.
+    """Displacement m -> t+1 of nodes for every other sweep m, to fractions of a pixel.
 
     Args:
         nodes, components, sweeps, config: as for `propose`.
@@ -97,18 +98,18 @@ def _find_peaks(
     Returns:
         estimates: (N, S - 1, 2) float64, (y, x), finest pixels m -> t+1, nearest sweep first.
         scores: (N, S - 1) float32, NCC at the peak.
-        available: (N, S - 1) bool, False = no pixel in that sweep; both above are 0 there.
+        available: (N, S - 1) bool, False = no pixel in that sweep; both above are 0 then.
 
-    Convention: a peak at no shift stays there. The parabola counts slices of the node's own pixels.
+    Convention: a peak at no shift stays. The parabola counts slices of the node's own pixels.
     """
     images = _NodeImages.of(nodes, components.blocks, sweeps.num_steps)
     clusters = Clusters(nodes.window, images.first, images.size, images.pixels)
     pairs = make_pairs(clusters, sweeps.batch, images.block.double() * sweeps.grid.pixel_size, config.max_speed)
     shift, score = best_shifts(pairs, config.correlation, config.max_memory)
-    place = shift + _parabola(images, pairs, shift)
-    place *= images.block.index_select(0, pairs.cluster)[:, None]
+    peak = shift + _parabola(images, pairs, shift)
+    peak *= images.block.index_select(0, pairs.cluster)[:, None]
     shape, slot = (nodes.count, sweeps.num_steps - 1), pairs.cluster * (sweeps.num_steps - 1) + pairs.source
-    estimates = place.new_zeros((shape[0] * shape[1], 2)).index_copy_(0, slot, place).view(*shape, 2)
+    estimates = peak.new_zeros((shape[0] * shape[1], 2)).index_copy_(0, slot, peak).view(*shape, 2)
     scores = score.new_zeros(shape[0] * shape[1]).index_copy_(0, slot, score).view(shape)
     available = torch.zeros_like(scores, dtype=torch.bool)
     available.view(-1).index_fill_(0, slot, True)
@@ -138,12 +139,12 @@ class _NodeImages(NamedTuple):
     def of(cls, nodes: Nodes, blocks: Sequence[int], num_steps: int) -> _NodeImages:
         """Draw the nodes.
 
-        Convention: the scale is that of the level; if the box is larger than `_LARGEST_BOX` pixels there, the finest
+        Convention: the scale is that of the level; if the box is larger than `_LARGEST_BOX` pixels at it, the finest
             scale at which it is not, or the coarsest.
         """
         members, node, device = nodes.members, nodes.node, nodes.node.device
         corner, extent = bounding_boxes(members.row, members.col, node, nodes.count)
-        block = torch.tensor(blocks, device=device)
+        block = constant(tuple(blocks), torch.int64, device)
         tops = torch.div(corner[:, None], block[:, None], rounding_mode="floor")  # (N, scales, 2)
         sizes = torch.div((corner + extent - 1)[:, None], block[:, None], rounding_mode="floor") - tops + 1
         num_small = (sizes.prod(2) <= _LARGEST_BOX).sum(1)  # they come first, as scales are coarse to fine
@@ -157,19 +158,19 @@ class _NodeImages(NamedTuple):
         table = torch.stack((end - area, block, *size.unbind(1), *first.unbind(1)))
         start, side, height, width, top, left = take_columns(table, node)
         row, col = (torch.div(values, side, rounding_mode="floor") for values in (members.row, members.col))
-        place = (members.step * height + row - top).mul_(width).add_(start).add_(col - left)
+        index = (members.step * height + row - top).mul_(width).add_(start).add_(col - left)
         total = int(end[-1]) if nodes.count else 0
         # Where several of the finest pixels fall into one, all slices are set.
         slices = torch.where(side == 1, members.slices, OWN)
-        image = lazy_zeros(total, torch.uint8, device).index_copy_(0, place, slices)
-        node_at = lazy_empty(total, torch.int32, device).scatter_(0, place, node.int())
-        place = flat_nonzero(image)
-        node = node_at.index_select(0, place).long()
+        image = lazy_zeros(total, torch.uint8, device).index_copy_(0, index, slices)
+        node_at = lazy_empty(total, torch.int32, device).scatter_(0, index, node.int())
+        index = flat_nonzero(image)
+        node = node_at.index_select(0, index).long()
         start, _, height, width, top, left = take_columns(table, node)
-        place -= start
-        line = torch.div(place, width, rounding_mode="floor")
+        index -= start
+        line = torch.div(index, width, rounding_mode="floor")
         step = torch.div(line, height, rounding_mode="floor")
-        pixels = ClusterPixels(node, step, line - step * height + top, place - line * width + left)
+        pixels = ClusterPixels(node, step, line - step * height + top, index - line * width + left)
         return cls(block, first, size, end - area, image, pixels)
 
 
@@ -187,13 +188,13 @@ def _parabola(images: _NodeImages, pairs: TemplatePairs, shift: Tensor) -> Tenso
     pair, row, col = gather(some, pairs.template.image, pairs.template.row, pairs.template.col)
     (dy, dx), node = shift.index_select(0, pair).unbind(1), pairs.cluster.index_select(0, pair)
     (height, width), start = images.size.index_select(0, node).unbind(1), images.start.index_select(0, node)
-    beside = torch.tensor(((0, -1, 1, 0, 0), (0, 0, 0, -1, 1)), device=shift.device)
+    beside = constant(((0, -1, 1, 0, 0), (0, 0, 0, -1, 1)), torch.int64, shift.device)
     y, x = (row + dy)[:, None] + beside[0], (col + dx)[:, None] + beside[1]
     inside = (y >= 0) & (y < height[:, None]) & (x >= 0) & (x < width[:, None])
-    place = (start[:, None] + y * width[:, None] + x).mul_(inside)
+    index = (start[:, None] + y * width[:, None] + x).mul_(inside)
     own = images.image.index_select(0, start + ((pairs.source.index_select(0, pair) + 1) * height + row) * width + col)
-    there = images.image.index_select(0, place.view(-1)).view_as(place)
-    meets = count_slices(own[:, None] & there) * inside
+    target = images.image.index_select(0, index.view(-1)).view_as(index)
+    meets = count_slices(own[:, None] & target) * inside
     of_beside = pair[:, None] * 5 + torch.arange(5, device=shift.device)
     sums = scatter_count(of_beside.view(-1), len(shift) * 5, meets.view(-1).long()).view(-1, 5)
     middle, above, below, left, right = sums.unbind(1)

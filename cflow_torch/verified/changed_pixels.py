@@ -7,6 +7,7 @@ that is missing counts only where the other sweep saw through: a return in the s
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -23,21 +24,33 @@ _ABOVE_LOWEST, _NEAR, _OUTLIERS = 1.6, 12.0, 50
 _PER_METRE, _HIGHEST = 256, 8192  # steps of height, and the largest number of them, up and down
 
 
-def find_changed(sweeps: HeightSlicedSweeps) -> Tensor:
-    """(P,) bool: a slice of the pixel is missing in another sweep of its window that saw its position.
+class ChangedPixels(NamedTuple):
+    """What P pixels show of change; all False in windows without history, where one other sweep would decide.
+
+    Args:
+        is_missing: (P,) bool, a slice is missing in another sweep, and not occluded there.
+        has_changed: (P,) bool, a slice is missing in another sweep that saw its position.
+    """
+
+    is_missing: Tensor
+    has_changed: Tensor
+
+
+def find_changed(sweeps: HeightSlicedSweeps) -> ChangedPixels:
+    """Compare every pixel in place with every other sweep of its window.
 
     Convention:
-        All False in windows without history, where one other sweep would decide. A slice is missing if none of the
-        3 x 3 pixels around its position has it. Its height is that of its middle, the first at or above the lowest
-        point of its pixel. A sweep saw a position if a return in its direction is at least as far away.
+        A slice is missing if none of the 3 x 3 pixels around its position has it. Its height is that of its middle, the
+        first at or above the lowest point of its pixel. A sweep saw a position if a return in its direction is at least
+        as far away; it is occluded if all returns there are nearer. Without a return, neither is known.
 
     Cost: a lookup for each pixel and sweep, and a range image of every sweep.
     """
     pixels, num_steps = sweeps.pixels, sweeps.num_steps
-    has_changed = torch.zeros_like(pixels.slices, dtype=torch.bool)
+    nothing = torch.zeros_like(pixels.slices, dtype=torch.bool)
     if num_steps == 2:
-        return has_changed
-    every, area = torch.arange(num_steps, device=has_changed.device), sweeps.grid.height * sweeps.grid.width
+        return ChangedPixels(nothing, nothing)
+    every, area = torch.arange(num_steps, device=nothing.device), sweeps.grid.height * sweeps.grid.width
     index = torch.add((pixels.index - pixels.step * area)[:, None], every, alpha=area)
     around = sweeps.image.index_select(0, index.view(-1)).view_as(index) >> NUM_SLICES
     is_given = ((sweeps.elapsed != 0) | (every == 0)) & sweeps.has_history[:, None]
@@ -45,8 +58,12 @@ def find_changed(sweeps: HeightSlicedSweeps) -> Tensor:
     comparison, bit = _bits(missing)
     pixel, step = split_index(comparison, num_steps)
     sweep = pixels.window.index_select(0, pixel) * num_steps + step
-    is_seen = RangeImages(sweeps).farther(sweep, *_centre(sweeps, pixel, bit)) >= 0
-    return has_changed.index_fill_(0, pixel.index_select(0, flat_nonzero(is_seen)), True)
+    farther = RangeImages(sweeps).farther(sweep, *_centre(sweeps, pixel, bit))
+    is_missing, has_changed = (
+        nothing.index_fill(0, pixel.index_select(0, flat_nonzero(of)), True)
+        for of in ((farther >= 0) | farther.isinf(), farther >= 0)
+    )
+    return ChangedPixels(is_missing, has_changed)
 
 
 def _bits(missing: Tensor) -> tuple[Tensor, Tensor]:

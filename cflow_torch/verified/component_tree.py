@@ -1,6 +1,6 @@
 """The component tree: components at several scales, those of them that may move, and the cut that selects objects.
 
-A component at one scale holds parts at the next finer one. It may be one object whose parts are too small to be
+A component at one scale holds children at the next finer one. It may be one object whose children are too small to be
 followed, or several objects that move apart. All components that may move are nodes of one list, whatever their scale,
 and every later step runs once, on that list.
 """
@@ -19,11 +19,14 @@ from cflow_torch.ops.indices import flat_nonzero, floor_divide, gather, lazy_zer
 from cflow_torch.ops.labeling import label_together, padded_size
 from cflow_torch.ops.segments import bounding_boxes, segment_amin
 from cflow_torch.verified.aperture import both_ends_move
+from cflow_torch.verified.changed_pixels import ChangedPixels
 from cflow_torch.verified.height_slices import HeightSlicedSweeps, Pixels
 
+# The static test: a component may move only if more than one of so many of its pixels is missing somewhere.
+_MISSING = 20
 # Metres: changed pixels that reach farther at t+1 are not those of a person or of a cyclist.
 _LOCAL = 3.0
-# What every object costs, sixteenths of a slice of evidence: parts move on their own only if they explain more by it.
+# What every object costs, sixteenths of a slice of evidence: children move on their own only if they explain more.
 _PRICE = 16 * 4
 
 
@@ -39,6 +42,7 @@ class Components:
         parent: (V + 1,) int64, component of the next coarser level; V = none.
         size: (V,) int64, number of pixels; 0 = a free name.
         is_linked: (V,) bool, it has pixels at t+1 and before.
+        may_move: (V,) bool, it is linked, and the static test does not rule a motion out.
         blocks: of each scale the finest pixels a side of a pixel of its images.
     """
 
@@ -49,6 +53,7 @@ class Components:
     parent: Tensor
     size: Tensor
     is_linked: Tensor
+    may_move: Tensor
     blocks: tuple[int, ...]
 
     @property
@@ -112,51 +117,55 @@ class Objects:
         return self.component.numel()
 
 
-def find_components(sweeps: HeightSlicedSweeps, has_changed: Tensor, blocks: Sequence[int]) -> Components:
-    """Components of all scales by one union-find.
+def find_components(sweeps: HeightSlicedSweeps, change: ChangedPixels, blocks: Sequence[int]) -> Components:
+    """Components of all scales by one union-find, and the static test.
 
     Args:
         sweeps: P occupied pixels.
-        has_changed: (P,) bool.
+        change: what they show.
         blocks: finest pixels a side of a pixel, coarse to fine, the last one 1. Each scale is dilated as in
             Alg. clustering, but nothing is eroded: so scales are nested. Plain components of the finest pixels follow.
+
+    Convention: the static test holds in windows with history only.
 
     Cost: one pass over the images of each scale, a few rounds of union-find, some passes over the pixels.
     """
     pixels, grid, num_windows = sweeps.pixels, sweeps.grid, sweeps.batch.num_windows
-    changed = flat_nonzero(has_changed)
-    images, places = [], []
+    changed = flat_nonzero(change.has_changed)
+    images, positions = [], []
     for block in blocks:
         height, width = -(-grid.height // block), -(-grid.width // block)
         row, col = pixels.row, pixels.col
         if block > 1:
             row, col = floor_divide(row, block), floor_divide(col, block)
-        places.append((torch.add(row, pixels.window, alpha=padded_size(height)), col))
-        images.append((_draw(places[-1][0], places[-1][1], num_windows, height, width), 3))
+        positions.append((torch.add(row, pixels.window, alpha=padded_size(height)), col))
+        images.append((_draw(*positions[-1], num_windows, height, width), 3))
     images.append((images[-1][0], 1))
-    places.append(places[-1])
-    of_changed = gather(changed, *places[-1])
+    positions.append(positions[-1])
+    of_changed = gather(changed, *positions[-1])
     if sweeps.num_steps > 2:
         images.append((_draw(of_changed[0], of_changed[1], num_windows, grid.height, grid.width), 1))
     found = label_together(images)
-    roots = torch.stack([part.of_pixel(*at) for part, at in zip(found, places)])
+    roots = torch.stack([blocks_of.of_pixel(*at) for blocks_of, at in zip(found, positions)])
     changed_root, count = found[-1].of_pixel(*of_changed), found[0].num_components
     parent = torch.full((count + 1,), count, dtype=torch.int64, device=changed.device)
     for coarse, fine in zip(roots, roots[1:]):
         parent.scatter_(0, fine, coarse)
 
-    firsts = tuple(part.first for part in found)
-    # One sum counts all pixels and, above 2^32, those at t+1.
-    code = 1 + ((pixels.step == 0).long() << 32)
-    root, code = torch.cat((roots[-1], changed_root)), torch.cat((code, code.index_select(0, changed)))
-    sums = scatter_count(root, count + 1, code)
+    firsts = tuple(blocks_of.first for blocks_of in found)
+    root = torch.cat((roots[-1], changed_root))
+    # The first sum counts all pixels and, above 2^32, those at t+1; the second those that are missing, or may be.
+    is_missing = change.is_missing | ~sweeps.has_history.index_select(0, pixels.window)
+    codes = torch.stack((1 + ((pixels.step == 0).long() << 32), is_missing.long()))
+    sums = scatter_count(root, count + 1, torch.cat((codes, codes.index_select(1, changed)), 1))
     # What the components of a level hold adds up to what those of the coarser level hold.
     for level in range(len(roots) - 1, 0, -1):
         names = slice(firsts[level], (*firsts, count)[level + 1])
-        sums.index_add_(0, parent[names], sums[names].clone())
-    size, num_newest = sums[:-1] & 0xFFFFFFFF, sums[:-1] >> 32
+        sums += scatter_count(parent[names], count + 1, sums[:, names])
+    (size, num_missing), num_newest = sums[:, :-1] & 0xFFFFFFFF, sums[0, :-1] >> 32
     is_linked = (num_newest > 0) & (num_newest < size)
-    return Components(roots, changed, changed_root, firsts, parent, size, is_linked, tuple(blocks))
+    may_move = is_linked & (num_missing * _MISSING > size)
+    return Components(roots, changed, changed_root, firsts, parent, size, is_linked, may_move, tuple(blocks))
 
 
 def _draw(row: Tensor, col: Tensor, num_windows: int, height: int, width: int) -> Tensor:
@@ -179,7 +188,7 @@ def movable_nodes(sweeps: HeightSlicedSweeps, components: Components, longest: f
 
     Cost: linear in the pixels of the nodes.
     """
-    roots, count, may_move = components.roots, components.count, components.is_linked
+    roots, count, may_move = components.roots, components.count, components.may_move
     length = _length(sweeps, components) * sweeps.grid.pixel_size
     is_long = may_move & (length > (math.inf if longest is None else longest))
     travels = both_ends_move(sweeps, roots, is_long)
@@ -223,7 +232,7 @@ def _length(sweeps: HeightSlicedSweeps, components: Components) -> Tensor:
 
 
 def select_objects(nodes: Nodes, components: Components, evidence: Tensor, num_pixels: int) -> tuple[Objects, Tensor]:
-    """Cut the tree from below: a component wins where its one motion has more evidence than its parts together.
+    """Cut the tree from below: a component wins where its one motion has more evidence than its children together.
 
     Args:
         nodes: N of them.
@@ -236,19 +245,19 @@ def select_objects(nodes: Nodes, components: Components, evidence: Tensor, num_p
         If none did, it moves with the node of its changed pixels, if that does; else it is static with its finest
         component, or belongs to none if that is not linked. Pixels of copies belong to a node that moves, or to none.
 
-    Convention: a part counts with its evidence less `_PRICE`, at least 0. The whole must have more; at a draw the parts
-        keep their own motion.
+    Convention: a child counts with its evidence less `_PRICE`, at least 0. The whole must have more; at a draw the
+        children keep their own motion.
 
     Cost: a few passes over the nodes for each level, and over the pixels.
     """
     count, num_levels = nodes.count, components.num_levels
-    parts = evidence.new_zeros(count + 1)
-    for level in range(num_levels - 1, 0, -1):  # finer levels first: what a node holds is complete when its turn comes
-        value = torch.maximum(evidence, parts[:-1])
+    children = evidence.new_zeros(count + 1)
+    for level in range(num_levels - 1, 0, -1):  # finer levels first: what a node holds is complete before it counts
+        value = torch.maximum(evidence, children[:-1])
         value = (value - _PRICE).clamp_(min=0)
-        parts.index_add_(0, nodes.parent, value.masked_fill_(nodes.level != level, 0))
+        children.index_add_(0, nodes.parent, value.masked_fill_(nodes.level != level, 0))
     own = torch.arange(count + 1, device=evidence.device)
-    winner = torch.where(F.pad(evidence, (0, 1)) > parts, own, count)
+    winner = torch.where(F.pad(evidence, (0, 1)) > children, own, count)
     winner[-1:] = count
     parent = F.pad(nodes.parent, (0, 1), value=count)
     for _ in range(num_levels - 1):  # coarse winners spread to what they hold, a level at a time

@@ -1,7 +1,7 @@
 """The margin of motions, and the confidence of the flow of each point (docs/verified.md).
 
 The margin of a motion says how much worse it explains the sweeps when it is displaced. Along a wall that seems to slide
-nothing gets worse, and a trunk of few points fits many places: what fits as well when displaced is static.
+nothing gets worse, and a trunk of few points fits many positions: what fits as well when displaced is static.
 
 Counts that need no truth give every point a probability, from a table. A moving object is trusted by its margin, a
 static one by the share of its neighbourhood that is matched. What could not be linked to t+1 is trusted the less the
@@ -17,7 +17,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from cflow_torch.ops.indices import flat_nonzero, floor_divide, gather, lookup, scatter_count
+from cflow_torch.ops.indices import constant, flat_nonzero, floor_divide, gather, lookup, scatter_count
 from cflow_torch.verified.aperture import principal_axes
 from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import HeightSlicedSweeps, count_slices
@@ -39,7 +39,7 @@ class MotionMargin(NamedTuple):
         z: (G,) float64, slices matched by the motion less those matched by the best displaced one, in standard
             deviations of noise; 0 = it is not better, or the object is static.
         is_dynamic: (G,) bool, it moves: its motion is better by one standard deviation, or is better at all and more
-            of it is matched by the motion than in place, and is not a line: beams meet a rail at positions that move.
+            of it is matched by the motion than in index, and is not a line: beams meet a rail at positions that move.
     """
 
     z: Tensor
@@ -58,7 +58,7 @@ def motion_margin(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMoti
     """
     size, device = sweeps.grid.pixel_size, rigid.flow.device
     motion, off = rigid.pixels_per_interval(size), _DISPLACEMENT / size
-    displaced = torch.tensor([(0, 0), (off, 0), (-off, 0), (0, off), (0, -off)], dtype=torch.float64, device=device)
+    displaced = constant(((0, 0), (off, 0), (-off, 0), (0, off), (0, -off)), torch.float64, device)
     pixel = flat_nonzero(lookup(motion.any(1), objects.of_pixel))
     members, which = sweeps.pixels.take(pixel), objects.of_pixel.index_select(0, pixel)
     wins = count_wins(sweeps, members, which, motion[:, None] + displaced)
@@ -99,14 +99,14 @@ def confidence_of(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMoti
     moving = first + kind * (1 + len(bounds)) + lookup(_bin(margin, bounds), objects.of_pixel)
 
     static = torch.where(objects.of_pixel == objects.count, unlinked, static)
-    place = torch.where(lookup(motion.any(1), objects.of_pixel), moving, static)
-    probabilities = torch.tensor(TABLE["probabilities"], dtype=torch.float32, device=device)
-    return torch.cat((probabilities.index_select(0, place), probabilities[:1]))
+    index = torch.where(lookup(motion.any(1), objects.of_pixel), moving, static)
+    probabilities = constant(tuple(TABLE["probabilities"]), torch.float32, device)
+    return torch.cat((probabilities.index_select(0, index), probabilities[:1]))
 
 
 def _bin(values: Tensor, bounds: list[float]) -> Tensor:
     """(K,) int64, how many of the ascending bounds each value reaches."""
-    return torch.bucketize(values, torch.tensor(bounds, dtype=values.dtype, device=values.device), right=True)
+    return torch.bucketize(values, constant(tuple(bounds), values.dtype, values.device), right=True)
 
 
 def _neighbourhood(sweeps: HeightSlicedSweeps, motion: Tensor) -> tuple[Tensor, Tensor]:
@@ -126,8 +126,8 @@ def _neighbourhood(sweeps: HeightSlicedSweeps, motion: Tensor) -> tuple[Tensor, 
     of_t, block_of_t = pixels.take(source), block.index_select(0, source)
     elapsed = sweeps.elapsed[:, 1].index_select(0, of_t.window)
     row, col = (motion.index_select(0, source) * elapsed[:, None] + 0.5).floor_().long().unbind(1)
-    place = sweeps.index(of_t.window, torch.zeros_like(row), of_t.row + row, of_t.col + col)
-    matched = of_t.slices & sweeps.image.index_select(0, place)
+    index = sweeps.index(of_t.window, torch.zeros_like(row), of_t.row + row, of_t.col + col)
+    matched = of_t.slices & sweeps.image.index_select(0, index)
     both = count_slices(of_t.slices).long() + (count_slices(matched).long() << 32)
     sums = scatter_count(block_of_t, sweeps.batch.num_windows * height * width, both).index_select(0, block)
     return sums & 0xFFFFFFFF, sums >> 32

@@ -126,25 +126,25 @@ class HeightSlicedSweeps:
         Cost: linear in points and pixels.
         """
         device, num_images = batch.image.device, batch.num_windows * batch.num_steps
-        num_points, num_places = batch.image.numel(), num_images * grid.height * grid.width
-        image = lazy_zeros(2 * num_places + 1, torch.uint8, device)
-        place = torch.empty(num_points, dtype=torch.int64, device=device)
-        part, is_tall = (torch.empty(num_points, dtype=of, device=device) for of in (torch.uint8, torch.bool))
+        num_points, num_indices = batch.image.numel(), num_images * grid.height * grid.width
+        image = lazy_zeros(2 * num_indices + 1, torch.uint8, device)
+        index = torch.empty(num_points, dtype=torch.int64, device=device)
+        height_slice, is_tall = (torch.empty(num_points, dtype=of, device=device) for of in (torch.uint8, torch.bool))
         ground = None if min_height is None or batch.ground is None else batch.ground.mean()
         for points in chunks(0, num_points, device):
             positions = batch.positions[:, points]
             at = grid.pixel_of_image(positions, batch.image[points], num_images, batch.is_active[points]).long()
             image.index_fill_(0, at, 1)
-            place[points] = at
-            part[points] = slice_of(positions[2], SLICE_HEIGHT)
+            index[points] = at
+            height_slice[points] = slice_of(positions[2], SLICE_HEIGHT)
             if ground is not None and batch.ground is not None and min_height is not None:
                 window = floor_divide(batch.image[points].long(), batch.num_steps)
                 height = batch.ground.at(positions, window, ground)
                 is_tall[points] = positions[2] * 100 >= height + round(100 * min_height)
         if ground is not None:  # after all points are drawn: a tall one makes its pixel tall whatever else lies there
-            image.index_fill_(0, torch.where(is_tall, place, num_places), 2)
-        image[num_places] = 0  # it stood for points that are inactive
-        pixel = occupied(image[:num_places])
+            image.index_fill_(0, torch.where(is_tall, index, num_indices), 2)
+        image[num_indices] = 0  # that of points that are inactive
+        pixel = occupied(image[:num_indices])
         rank = lazy_zeros(len(image), torch.int32, device)
         if ground is not None:
             is_kept = _is_near_tall(image, pixel, grid)
@@ -154,8 +154,8 @@ class HeightSlicedSweeps:
             )
             image.index_fill_(0, left_out, 0)
         rank.scatter_(0, pixel, torch.arange(1, len(pixel) + 1, dtype=torch.int32, device=device))
-        pixel_of_point = (rank.index_select(0, place).long() - 1).remainder_(len(pixel) + 1)
-        pixels = _pixels(pixel, _slices(pixel_of_point, part, len(pixel)), grid, batch.num_steps)
+        pixel_of_point = (rank.index_select(0, index).long() - 1).remainder_(len(pixel) + 1)
+        pixels = _pixels(pixel, _slices(pixel_of_point, height_slice, len(pixel)), grid, batch.num_steps)
         _draw_neighbourhoods(image, pixels, grid)
         return cls(batch, grid, image, rank, pixels, pixel_of_point, pixel[:0])
 
@@ -172,14 +172,14 @@ class HeightSlicedSweeps:
         Cost: that of the copies.
         """
         count, of_row = self.num_pixels, self.pixel_of_point.index_select(0, rows)
-        part = slice_of(self.batch.positions[2].index_select(0, rows), SLICE_HEIGHT)
+        height_slice = slice_of(self.batch.positions[2].index_select(0, rows), SLICE_HEIGHT)
         is_copied = torch.zeros(count, dtype=torch.bool, device=rows.device).index_fill_(0, of_row, True)
         pixel = flat_nonzero(is_copied)
         of_copy = renumber(pixel, count).index_select(0, of_row)
         # The same pixels, in the second half of the images and of the windows.
         behind = [self.image.numel() // 2, self.batch.num_windows, 0, 0, 0]
         table = take_columns(self.pixels.table, pixel) + torch.tensor(behind, device=rows.device)[:, None]
-        pixels = Pixels(table, _slices(of_copy, part, len(pixel)))
+        pixels = Pixels(table, _slices(of_copy, height_slice, len(pixel)))
         _draw_neighbourhoods(self.image, pixels, self.grid)
         rank = torch.arange(count + 1, count + 1 + len(pixel), dtype=torch.int32, device=rows.device)
         of_point = self.pixel_of_point + (self.pixel_of_point == count) * len(pixel)  # "none" is a larger number now
@@ -260,10 +260,10 @@ def slice_bits(slices: Tensor) -> tuple[Tensor, Tensor]:
     return split_index(flat_nonzero(bits.bool()), NUM_SLICES)
 
 
-def _slices(of_point: Tensor, part: Tensor, num_pixels: int) -> Tensor:
+def _slices(of_point: Tensor, height_slice: Tensor, num_pixels: int) -> Tensor:
     """(P,) uint8 masks of the slices, (N,) uint8, of the points of each pixel; a point of pixel P counts nowhere."""
-    lanes = torch.zeros((num_pixels + 1) * NUM_SLICES, dtype=torch.bool, device=part.device)
-    lanes.index_fill_(0, torch.add(part, of_point, alpha=NUM_SLICES), True)
+    lanes = torch.zeros((num_pixels + 1) * NUM_SLICES, dtype=torch.bool, device=height_slice.device)
+    lanes.index_fill_(0, torch.add(height_slice, of_point, alpha=NUM_SLICES), True)
     # A pixel is four bytes that hold 0 or 1; read as one number, its bits are 0, 8, 16 and 24.
     word = lanes.view(torch.int32)[:num_pixels]
     word = word | (word >> 7)
@@ -292,7 +292,7 @@ def _draw_neighbourhoods(image: Tensor, pixels: Pixels, grid: Grid) -> None:
 
 def _is_near_tall(image: Tensor, pixel: Tensor, grid: Grid) -> Tensor:
     """(P,) bool: is a pixel of value 2 at most `_RESIDUE_REACH` rows and columns away from each of these flat indices?
-    Ground residue, which a ground mask left over, seems to move, because it looks different in every sweep."""
+    Ground residue, which a ground mask left over, seems to move, because it differs in every sweep."""
     answer = image.index_select(0, pixel) == 2
     low = flat_nonzero(~answer)
     line, col = split_index(pixel.index_select(0, low), grid.width)
@@ -301,6 +301,6 @@ def _is_near_tall(image: Tensor, pixel: Tensor, grid: Grid) -> Tensor:
     # Beyond the border the border's pixel is looked up, which is as near.
     rows = (row[:, None] + reach).clamp_(0, grid.height - 1).add_(number[:, None], alpha=grid.height)
     cols = (col[:, None] + reach).clamp_(0, grid.width - 1)
-    place = torch.add(cols[:, None], rows[:, :, None], alpha=grid.width)
-    is_tall = image.index_select(0, place.view(-1)).view(len(low), len(reach) ** 2) == 2
+    index = torch.add(cols[:, None], rows[:, :, None], alpha=grid.width)
+    is_tall = image.index_select(0, index.view(-1)).view(len(low), len(reach) ** 2) == 2
     return answer.index_copy_(0, low, is_tall.any(1))

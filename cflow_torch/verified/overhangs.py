@@ -1,6 +1,6 @@
 """Objects under overhangs: a car under the crown of a tree shares its bird's-eye component with the crown.
 
-In space the two are apart. We join cells in three dimensions. A component that lies
+In space the two are apart. We join the cells of components that may move in three dimensions. A component that lies
 under another one and above none is drawn once more, by itself, as an image of the same batch. It is a node like any
 other.
 """
@@ -43,8 +43,7 @@ def add_overhung(sweeps: HeightSlicedSweeps, components: Components, nodes: Node
 
     Args:
         sweeps: images, and the points.
-        components: we search the points of those with pixels at t+1 and before, dilated at the finest pixels. With
-            history, one of the pixels must have changed.
+        components: we search the points of those that may move, dilated at the finest pixels.
         nodes: those of all levels.
 
     Returns:
@@ -55,14 +54,11 @@ def add_overhung(sweeps: HeightSlicedSweeps, components: Components, nodes: Node
         the next occupied cell above it in any column, with two empty ones at least between. Of two components in one
         pixel of a sweep the one whose first cell is the first has it.
 
-    Cost: linear in the points; 13 lookups for each cell, a few rounds of union-find.
+    Cost: linear in the points that may move; 13 lookups for each cell, a few rounds of union-find.
     """
     level, num_own, num_points = components.num_levels - 2, sweeps.num_pixels, sweeps.batch.image.numel()
-    root, window = components.roots[level], sweeps.pixels.window
-    has_changed = torch.zeros_like(components.is_linked).index_fill_(0, root.index_select(0, components.changed), True)
-    is_searched = has_changed.index_select(0, root) | ~sweeps.has_history.index_select(0, window)
-    is_searched &= components.is_linked.index_select(0, root)
-    rows = flat_nonzero(lookup(is_searched, sweeps.pixel_of_point))
+    may_move = components.may_move.index_select(0, components.roots[level])
+    rows = flat_nonzero(lookup(may_move, sweeps.pixel_of_point))
     component, num_names = _components_under(sweeps, rows)
     under = flat_nonzero(component < num_names)
     rows, component = gather(under, rows, component)
@@ -103,7 +99,7 @@ def _components_under(sweeps: HeightSlicedSweeps, rows: Tensor) -> tuple[Tensor,
     batch, grid = sweeps.batch, sweeps.grid
     # A free margin all around: neighbours need no bounds check.
     num_rows, num_cols = (int((grid.upper[axis] - grid.lower[axis]) / _CELL) + 3 for axis in (1, 0))
-    place = torch.empty_like(rows)
+    index = torch.empty_like(rows)
     lowest = torch.full((batch.num_windows,), 1 << 41, device=rows.device)
     height = torch.empty_like(rows)
     size = torch.full((), _CELL, dtype=torch.float64, device=rows.device)  # see `Grid.pixel`
@@ -111,15 +107,15 @@ def _components_under(sweeps: HeightSlicedSweeps, rows: Tensor) -> tuple[Tensor,
         x, y, z = batch.positions.index_select(1, rows[some]).unbind(0)
         window = floor_divide(batch.image.index_select(0, rows[some]).long(), batch.num_steps)
         row, col = ((at - low).div_(size).long().add_(1) for at, low in ((y, grid.lower[1]), (x, grid.lower[0])))
-        place[some] = torch.add(row, window, alpha=num_rows).mul_(num_cols).add_(col)
+        index[some] = torch.add(row, window, alpha=num_rows).mul_(num_cols).add_(col)
         height[some] = (z / SLICE_HEIGHT).floor_().clamp_(-(2.0**40), 2.0**40).long()
         lowest.scatter_reduce_(0, window, height[some], "amin")
-    window = floor_divide(place, num_rows * num_cols)
+    window = floor_divide(index, num_rows * num_cols)
     height = height.sub_(lowest.index_select(0, window)).clamp_(max=_NUM_SLICES - 3).add_(1)
-    place = place.mul_(_NUM_SLICES).add_(height)
+    index = index.mul_(_NUM_SLICES).add_(height)
 
     shape = batch.num_windows * num_rows * num_cols * _NUM_SLICES
-    is_occupied = lazy_zeros(shape, torch.bool, rows.device).index_fill_(0, place, True)
+    is_occupied = lazy_zeros(shape, torch.bool, rows.device).index_fill_(0, index, True)
     cells = flat_nonzero(is_occupied)
     count = cells.numel()
     number = lazy_empty(shape, torch.int32, rows.device)
@@ -142,7 +138,7 @@ def _components_under(sweeps: HeightSlicedSweeps, rows: Tensor) -> tuple[Tensor,
     )
     is_object = (rise <= _HIGHEST_FOOT) & (top - foot >= _SMALLEST) & (top - foot <= _LARGEST)
     wanted = (is_under & ~is_over & is_object).index_select(0, component)
-    return torch.where(wanted, component, count).index_select(0, number.index_select(0, place).long()), count
+    return torch.where(wanted, component, count).index_select(0, number.index_select(0, index).long()), count
 
 
 @lru_cache(maxsize=64)

@@ -107,18 +107,18 @@ def count_wins(sweeps: HeightSlicedSweeps, members: Pixels, component: Tensor, c
         of, start, own, from_step, near_border = gather(at, component, first, members.slices, members.step, border)
         start.add_(to, alpha=moves.area)
         seen = sweeps.image.index_select(0, start)
-        here, near = own & seen, own & (seen >> NUM_SLICES)
-        left, left_far = (own & ~here)[:, None], (own & ~near)[:, None]
+        in_both, near = own & seen, own & (seen >> NUM_SLICES)
+        left, left_far = (own & ~in_both)[:, None], (own & ~near)[:, None]
         which = of * (2 * num_steps) + torch.where(to > 0, to + num_steps, from_step)
         index = moves.offset.index_select(0, which).add_(start[:, None])
         leaves = flat_nonzero(near_border < moves.longest.index_select(0, which))
         index.index_copy_(0, leaves, moves.checked(members, *gather(leaves, at, to, which)))
         seen, far = sweeps.image.index_select(0, index.view(-1)).view_as(index), moves.is_far.index_select(0, which)
         won = seen & torch.where(far, left_far, left)  # no slice of the neighbourhood is left
-        lost = here[:, None] & ~torch.where(far, seen >> NUM_SLICES, seen)
+        lost = in_both[:, None] & ~torch.where(far, seen >> NUM_SLICES, seen)
         counts = counts_of.index_select(0, (won | lost << NUM_SLICES).view(-1).int())
         sums.index_add_(0, (of[:, None] * num_candidates + column).view(-1), counts)
-        in_place.index_add_(0, of, count_slices(here).long())
+        in_place.index_add_(0, of, count_slices(in_both).long())
         is_given = moves.is_given.index_select(0, which)
         near_and_all.index_add_(
             0, of * 2 + (to > 0), counts_of.index_select(0, (near | own << NUM_SLICES).int()) * is_given

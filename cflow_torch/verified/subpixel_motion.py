@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from cflow_torch.ops.indices import flat_nonzero, gather, lookup, scatter_count
+from cflow_torch.ops.indices import constant, flat_nonzero, gather, lookup, scatter_count
 from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import HeightSlicedSweeps, count_slices
 from cflow_torch.verified.voxel_centroids import UNITS, Voxels, meeting_weights, points_of_objects, whole
@@ -70,7 +70,7 @@ def _is_biased(sweeps: HeightSlicedSweeps, objects: Objects, wanted: Tensor) -> 
     pixels = sweeps.pixels
     some = flat_nonzero(lookup(wanted, objects.of_pixel) & (pixels.step < 2))
     of, asked = objects.of_pixel.index_select(0, some), pixels.take(some)
-    sides = torch.tensor(_SIDES, device=of.device)
+    sides = constant(_SIDES, torch.int64, of.device)
     offset = torch.cat((sides, -sides)) * (2 * asked.step - 1)[:, None, None]  # (K, 8, 2)
     row, col = asked.row[:, None] + offset[..., 0], asked.col[:, None] + offset[..., 1]
     index = sweeps.index(asked.window[:, None], 1 - asked.step[:, None], row, col)

@@ -24,13 +24,22 @@ from run import config_for, seed_range
 from score import score
 from sets import make_sets
 
-from cflow_torch.verified import component_tree, confidence, method, paired_test, refinement, rigid_registration
+from cflow_torch.verified import (
+    changed_pixels,
+    component_tree,
+    confidence,
+    method,
+    paired_test,
+    refinement,
+    rigid_registration,
+)
 
 COLUMNS = ("dynamic", "pedestrian", "static", "near", "far")
 
 
 def _without_changed(sweeps: Any) -> Any:
-    return torch.zeros_like(sweeps.pixels.slices, dtype=torch.bool)
+    change = changed_pixels.find_changed(sweeps)
+    return changed_pixels.ChangedPixels(change.is_missing, torch.zeros_like(change.has_changed))
 
 
 def _without_margin(*given: Any) -> Any:
@@ -50,6 +59,7 @@ def _nothing_is_slow(sweeps: Any, objects: Any, motion: Any, may_be_slow: Any) -
 STEPS: dict[str, list[Callable[[], Any]]] = {
     "all steps": [],
     "no changed pixels": [lambda: patch.object(method, "find_changed", _without_changed)],
+    "no static test": [lambda: patch.object(component_tree, "_MISSING", 1 << 40)],
     "no objects under overhangs": [
         lambda: patch.object(method, "add_overhung", lambda sweeps, _, nodes: (sweeps, nodes))
     ],

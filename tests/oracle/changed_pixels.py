@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Sequence
+from typing import NamedTuple, Sequence
 
 import numpy as np
 
@@ -13,19 +13,25 @@ AZIMUTHS, ELEVATIONS, RISE = 720, 120, 1 / 57.3
 ABOVE_LOWEST, NEAR = 1.6, 12.0  # metres
 
 
-def find_changed(
-    sweeps: SlicedSweeps, in_sight: Sequence[np.ndarray], origins: Sequence[Sequence[float]]
-) -> set[Pixel]:
-    """Pixels of which a slice is missing in another sweep that saw its position; none in windows of two sweeps.
+class Change(NamedTuple):
+    """Pixels of which a slice is missing in another sweep and not hidden there, and those of which one is missing in
+    another sweep that saw its place."""
+
+    is_missing: set[Pixel]
+    has_changed: set[Pixel]
+
+
+def find_changed(sweeps: SlicedSweeps, in_sight: Sequence[np.ndarray], origins: Sequence[Sequence[float]]) -> Change:
+    """Compare every pixel in place with every other sweep; nothing has changed in windows of two sweeps.
 
     Args:
         sweeps: the window.
         in_sight: (N, 3) of each sweep: its points, those that are not drawn included.
         origins: of the ego frame of each sweep, metres, frame of t+1.
     """
-    changed: set[Pixel] = set()
+    change = Change(set(), set())
     if len(sweeps.images) == 2:
-        return changed
+        return change
     lowest: dict[Pixel, float] = {}
     for m, cloud in enumerate(sweeps.clouds):
         for x, y, z, _ in cloud:
@@ -35,37 +41,40 @@ def find_changed(
     for other, (cloud, origin) in enumerate(zip(in_sight, origins)):
         sensor = np.array([*origin]) + (0, 0, height)
         pixels: list[Pixel] = []
-        positions: list[tuple[float, float, float]] = []
+        places: list[tuple[float, float, float]] = []
         for pixel in sweeps.pixels():
             missing = sweeps.at(*pixel) & ~sweeps.around(other, *pixel[1:])
-            for bit in range(NUM_SLICES):
-                if missing >> bit & 1:
+            for part in range(NUM_SLICES):
+                if missing >> part & 1:
                     pixels.append(pixel)
-                    positions.append(middle_of(sweeps, pixel, bit, lowest[pixel]))
+                    places.append(middle_of(sweeps, pixel, part, lowest[pixel]))
         farthest: dict[Cell, float] = {}
         for direction, distance in zip(*directions(cloud, sensor)):
             farthest[direction] = max(distance, farthest.get(direction, 0.0))
-        for pixel, direction, distance in zip(pixels, *directions(np.array(positions).reshape(-1, 3), sensor)):
-            if farthest.get(direction, -math.inf) >= distance:
-                changed.add(pixel)
-    return changed
+        for pixel, direction, distance in zip(pixels, *directions(np.array(places).reshape(-1, 3), sensor)):
+            if direction not in farthest:
+                change.is_missing.add(pixel)  # nobody knows
+            elif farthest[direction] >= distance:
+                change.is_missing.add(pixel)
+                change.has_changed.add(pixel)
+    return change
 
 
-def middle_of(sweeps: SlicedSweeps, pixel: Pixel, bit: int, lowest: float) -> tuple[float, float, float]:
+def middle_of(sweeps: SlicedSweeps, pixel: Pixel, part: int, lowest: float) -> tuple[float, float, float]:
     """x, y, z of the middle of a slice, the first one at or above the lowest point of its pixel."""
     _, row, col = pixel
     first = math.floor(lowest / SLICE_HEIGHT)
-    height = first + (bit - first) % NUM_SLICES + 0.5
+    height = first + (part - first) % NUM_SLICES + 0.5
     x, y = (col + 0.5) * sweeps.size + sweeps.lower[0], (row + 0.5) * sweeps.size + sweeps.lower[1]
     return x, y, height * SLICE_HEIGHT
 
 
-def directions(positions: np.ndarray, sensor: np.ndarray) -> tuple[list[Cell], list[float]]:
-    """Bin of the range image and distance over ground of positions (N, 3), as a sensor sees them; in float32.
+def directions(places: np.ndarray, sensor: np.ndarray) -> tuple[list[Cell], list[float]]:
+    """Bin of the range image and distance over ground of places (N, 3), as a sensor sees them; in float32.
 
     Convention: azimuth is y / (|x| + |y|), elevation is height over distance.
     """
-    x, y, z = (positions - sensor).astype(np.float32).T
+    x, y, z = (places - sensor).astype(np.float32).T
     distance = np.sqrt(x * x + y * y)
     around = y / np.maximum(np.abs(x) + np.abs(y), np.float32(1e-3))
     around = np.where(x >= 0, around + np.float32(1), np.float32(3) - around)  # 0 ... 4

@@ -7,6 +7,7 @@ from typing import Any, Iterable, NamedTuple, Sequence, Tuple
 
 from cflow_torch.config import VerifiedConfig
 from oracle.aperture import both_ends_move
+from oracle.changed_pixels import Change
 from oracle.height_slices import Pixel, SlicedSweeps
 
 PRICE = 16 * 4  # what every part costs, sixteenths of a slice
@@ -38,12 +39,12 @@ class Tree(NamedTuple):
     Attributes:
         levels: components of each level; dilated ones coarse to fine, then plain ones.
         nodes: coarse to fine, then those of changed pixels.
-        searched: pixels of the finest dilated components that are linked and, with history, have changed in part.
+        may_move: pixels of the finest dilated components that may move, long ones included.
     """
 
     levels: list[list[Cells]]
     nodes: list[Node]
-    searched: set[Pixel]
+    may_move: set[Pixel]
 
 
 def join(cells: Iterable[tuple[int, ...]], reach: int) -> dict[Any, int]:
@@ -81,25 +82,26 @@ def is_linked(members: Cells) -> bool:
     return members[0][0] == 0 < members[-1][0]
 
 
-def grow(sweeps: SlicedSweeps, changed: set[Pixel], config: VerifiedConfig) -> Tree:
+def grow(sweeps: SlicedSweeps, change: Change, config: VerifiedConfig) -> Tree:
     """Components of all scales, and which of them may move.
 
-    Convention: a plain component that equals the dilated one around it is not in the list a second time. Lengths are
-        those at t+1.
+    Convention: in windows with history more than 5 % of the pixels of what may move are missing. A plain component that
+        equals the dilated one around it is not in the list a second time. Lengths are those at t+1.
     """
     pixels, longest = sweeps.pixels(), config.max_object_length
     scales = [(round(size / sweeps.size), 3) for size in config.pixel_sizes]
     levels = [components(pixels, block, reach) for block, reach in [*scales, (1, 1)]]
     tree, node_of = Tree(levels, [], set()), {}  # type: ignore[var-annotated]
-    for level, found in enumerate([*levels, components(list(changed), 1, 1)]):
+    for level, found in enumerate([*levels, components(list(change.has_changed), 1, 1)]):
         in_tree = level < len(levels)
         known = set(levels[level - 1]) if level == len(levels) - 1 else set()
         first = len(tree.nodes)
         for members in found:
-            if not is_linked(members):
+            num_missing = sum(pixel in change.is_missing for pixel in members)
+            if not is_linked(members) or (len(sweeps.images) > 2 and 20 * num_missing <= len(members)):
                 continue
-            if level == len(scales) - 1 and (len(sweeps.images) == 2 or not changed.isdisjoint(members)):
-                tree.searched.update(members)
+            if level == len(scales) - 1:
+                tree.may_move.update(members)
             is_long = in_tree and longest is not None and length(members) * sweeps.size > longest
             travels = is_long and both_ends_move(sweeps, members)
             if members not in known and (travels or not is_long):

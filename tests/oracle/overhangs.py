@@ -14,12 +14,12 @@ SQUARE = 10  # cells a side of a square that has one height of the ground
 GAP, HIGHEST_FOOT, SMALLEST, LARGEST = 3, 2, 1, 10  # slices
 
 
-def find_overhung(sweeps: SlicedSweeps, searched: set[Pixel], level: int) -> tuple[SlicedSweeps, list[Node]]:
+def find_overhung(sweeps: SlicedSweeps, may_move: set[Pixel], level: int) -> tuple[SlicedSweeps, list[Node]]:
     """Copies of the points that lie under something, drawn by themselves, and the components that they make.
 
     Args:
         sweeps: the window.
-        searched: pixels whose points are looked through.
+        may_move: pixels whose points are looked through.
         level: that the nodes are to have.
 
     Convention: cells of all sweeps join if they touch, corners included. The next occupied cell above a cell is over it
@@ -27,7 +27,7 @@ def find_overhung(sweeps: SlicedSweeps, searched: set[Pixel], level: int) -> tup
         the one whose first cell is the first has it.
     """
     points = [(m, place) for m, cloud in enumerate(sweeps.clouds) for place in cloud]
-    points = [(m, place) for m, place in points if (m, *sweeps.pixel(place.x, place.y)) in searched]
+    points = [(m, place) for m, place in points if (m, *sweeps.pixel(place.x, place.y)) in may_move]
     cells = cells_of([place for _, place in points], sweeps)
     component = join(cells, 1)
     wanted = components_under(component)

@@ -154,7 +154,7 @@ def estimate(every: Sequence[Cloud], ground: Sequence[np.ndarray], config: Verif
     seen = [cloud.points[keep] for cloud, keep in zip(every, in_sight)]
     tree = grow(sweeps, find_changed(sweeps, seen, [cloud.origin for cloud in every]), config)
     num_levels = len(tree.levels)
-    copies, overhung = find_overhung(sweeps, tree.searched, num_levels + 1)
+    copies, overhung = find_overhung(sweeps, tree.may_move, num_levels + 1)
     nodes = [*tree.nodes, *overhung]
     candidates, scores = propose(nodes, config)
     proven = [verify(node, motions, num_levels, config) for node, motions in zip(nodes, candidates)]

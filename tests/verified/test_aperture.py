@@ -28,7 +28,7 @@ class Scene(NamedTuple):
 
 
 def line(rng: np.random.Generator, start, direction: float, length: float, noise: float) -> Pixels:
-    count = rng.integers(1, 60)
+    count = rng.integers(1, 200)
     along, across = rng.uniform(0, length, count), rng.normal(0, noise, count)
     y = start[0] + along * np.sin(direction) + across * np.cos(direction)
     x = start[1] + along * np.cos(direction) - across * np.sin(direction)
@@ -93,7 +93,7 @@ def answers(scenes: Sequence[Scene], size: float = 0.1) -> list[list[bool]]:
 def test_answers_equal_the_oracle_in_a_batch_and_alone(size):
     rng = np.random.default_rng(int(100 * size))
     slid = stayed = 0
-    for _ in range(6):
+    for _ in range(4):
         scenes = [random_scene(rng, num_sweeps) for num_sweeps in (2, 4, 3)]
         together = answers(scenes, size)
         assert [answer for scene in scenes for answer in answers([scene], size)] == together
@@ -129,9 +129,9 @@ def test_what_stands_there_need_not_belong_to_the_component():
 
 
 def test_the_share_that_must_be_covered():
-    # 41 of 60 pixels are in both sweeps, then 36 and a few slices of one next to them.
+    # 41 of 60 pixels are in both sweeps, then 32.
     assert slides({0: rail(0, 60), 1: rail(19, 79)}, (0, 13))
-    assert not slides({0: rail(0, 60), 1: rail(24, 83)}, (0, 13))
+    assert not slides({0: rail(0, 60), 1: rail(28, 83)}, (0, 13))
 
 
 # ---------------------------------------------------------------------------------------------------- long vehicles

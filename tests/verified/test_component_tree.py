@@ -12,9 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from moving_scenes import for_oracle, from_images
 from oracle import component_tree as oracle
+from oracle.changed_pixels import Change
 from oracle.height_slices import Pixel, SlicedSweeps
 
 from cflow_torch.config import VerifiedConfig
+from cflow_torch.verified.changed_pixels import ChangedPixels
 from cflow_torch.verified.component_tree import Components, Nodes, find_components, movable_nodes, select_objects
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 
@@ -23,7 +25,7 @@ Name = Tuple[FrozenSet[Pixel], int]  # pixels and level of a node
 
 
 class Grown(NamedTuple):
-    """Windows of random pixels, some of which have changed, and their trees."""
+    """Windows of random pixels, some of which are missing or have changed, and their trees."""
 
     sweeps: HeightSlicedSweeps
     components: Components
@@ -51,15 +53,17 @@ def grown(seed: int, longest: float | None = 3.0, blocks=(4, 2, 1), shape=(3, 3,
     elapsed = np.tile(np.arange(shape[1], dtype=np.float64), (shape[0], 1))
     images[-1, 2:], elapsed[-1, 2:] = 0, 0  # a pair among others
     sweeps = from_images(images, SIZE, elapsed)
+    # Few pixels are missing in some stripes, so that the static test decides, and most of them in others.
     odds = np.choose(sweeps.pixels.col.numpy() // 6 % 4, (0.0, 0.15, 0.1, 0.95))
-    changed = torch.from_numpy(rng.random(sweeps.num_pixels) < odds) & sweeps.has_history[sweeps.pixels.window]
+    is_missing = torch.from_numpy(rng.random(sweeps.num_pixels) < odds) & sweeps.has_history[sweeps.pixels.window]
+    change = ChangedPixels(is_missing, is_missing & torch.from_numpy(rng.random(sweeps.num_pixels) < 0.8))
     config = VerifiedConfig(pixel_sizes=tuple(SIZE * block for block in blocks), max_object_length=longest)
     windows, trees = [for_oracle(sweeps, window) for window in range(shape[0])], []
     for window, drawn in enumerate(windows):
         mine = (sweeps.pixels.window == window).nonzero()[:, 0]
-        own = {pixel for pixel, is_in in zip(drawn.pixels(), changed[mine].tolist()) if is_in}
-        trees.append(oracle.grow(drawn, own, config))
-    components = find_components(sweeps, changed, blocks)
+        sets = ({p for p, is_in in zip(drawn.pixels(), values[mine].tolist()) if is_in} for values in change)
+        trees.append(oracle.grow(drawn, Change(*sets), config))
+    components = find_components(sweeps, change, blocks)
     return Grown(sweeps, components, movable_nodes(sweeps, components, longest), windows, trees)
 
 
@@ -136,8 +140,19 @@ def test_a_whole_must_explain_more_than_its_parts_less_their_price(whole, wins):
     images = np.zeros((1, 2, 9, 12), dtype=np.uint8)
     images[0, :, 2:6, 2], images[0, :, 2:6, 6] = 1, 1
     sweeps = from_images(images, SIZE)
-    components = find_components(sweeps, torch.zeros(sweeps.num_pixels, dtype=torch.bool), (2, 1))
+    change = ChangedPixels(*torch.zeros((2, sweeps.num_pixels), dtype=torch.bool))
+    components = find_components(sweeps, change, (2, 1))
     nodes = movable_nodes(sweeps, components, None)
     assert nodes.level.tolist() == [0, 1, 1] and nodes.parent.tolist() == [3, 0, 0]
     objects, node = select_objects(nodes, components, torch.tensor([whole, 100, 100]), sweeps.num_pixels)
     assert node.tolist() == ([0] if wins else [1, 2])
+
+
+@pytest.mark.parametrize("num_missing, may_move", [(0, False), (1, False), (2, True)])
+def test_what_is_hardly_missing_anywhere_may_not_move(num_missing, may_move):
+    images = np.zeros((1, 3, 9, 12), dtype=np.uint8)
+    images[0, :2, 2:4, 1:6] = 1  # 20 pixels: one of them is 5 per cent
+    sweeps = from_images(images, SIZE)
+    is_missing = torch.arange(sweeps.num_pixels) < num_missing
+    components = find_components(sweeps, ChangedPixels(is_missing, torch.zeros_like(is_missing)), (1,))
+    assert movable_nodes(sweeps, components, None).count == may_move
