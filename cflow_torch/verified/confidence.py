@@ -66,7 +66,8 @@ def motion_margin(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMoti
     gain, matched = (surplus[:, 0] - surplus[:, 1:].amax(1)).clamp(min=0), surplus[:, 0] + wins.in_place
     z = torch.where(gain > 0, gain.double() / matched.double().sqrt(), 0.0)
     newest = flat_nonzero(members.step == 0)
-    is_line, _, _ = principal_axes(*gather(newest, which, members.row, members.col), objects.count, size)
+    component, row, col = gather(newest, which, members.row, members.col)
+    is_line, _, _ = principal_axes(component, row, col, objects.count, size)
     return MotionMargin(z, (z >= _Z) | ((gain > 0) & (surplus[:, 0] > wins.in_place) & ~is_line))
 
 

@@ -93,7 +93,7 @@ def motion_by_pixel(
     Args:
         sweeps: finest images.
         objects: G of them.
-        rigid: their motion in the plane. They keep to the ground: the slope around their centre gives the z of the flow.
+        rigid: their motion in the plane. The slope of the ground around their centre gives the z of the flow.
         score: (G,) float32.
         confidence: (P + 1,) float32.
         is_weak: (G,) bool, objects that give way to moving objects under an overhang.

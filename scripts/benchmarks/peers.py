@@ -328,7 +328,7 @@ def main() -> None:
     rows = {key(row): row for file in given.merge for row in json.loads(file.read_text())}
     runs = [(name, history) for name in given.methods for history in (given.history if name in OURS[:3] else (0,))]
     all_cases = [each for path in given.paths for each in cases(path, given)]
-    for name, history in runs:
+    for name, history in runs if all_cases else []:
         try:
             method = make_method(name, history, given)
         except ImportError as error:
