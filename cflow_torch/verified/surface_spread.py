@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.ops.indices import scatter_count
@@ -61,14 +62,14 @@ def _sums_around(block: Tensor, image: Tensor, values: Tensor) -> Tensor:
     """
     col, row, layer = block[0] + 1, block[1] + 1, block[2].clamp(2 - _LAYER // 2, _LAYER // 2 - 2) + _LAYER // 2
     key, of_voxel = torch.unique(((image * _ROW + row) * _ROW + col) * _LAYER + layer, return_inverse=True)
-    sums = scatter_count(of_voxel, len(key), values)
+    rows = F.pad(scatter_count(of_voxel, len(key), values).t(), (0, 0, 0, 1))  # the last one is for no block
     line = torch.arange(-1, 2, device=key.device)
-    offset = ((line[:, None] * _ROW + line)[:, :, None] * _LAYER + line).view(-1, 1)
-    wanted = (key + offset).view(-1)
-    at = torch.searchsorted(key, wanted).clamp_(max=max(len(key) - 1, 0))
-    is_there = key.index_select(0, at) == wanted
-    around = sums.index_select(1, at) * is_there
-    return around.view(len(sums), 27, -1).sum(1).index_select(1, of_voxel)
+    # The layers of a column follow each other: we search for the lowest of three and read on.
+    middle = (key + ((line[:, None] * _ROW + line) * _LAYER).view(-1, 1)).view(-1)
+    at = torch.searchsorted(key, middle - 1) + (line + 1)[:, None]
+    found = F.pad(key, (0, 3), value=1 << 62).index_select(0, at.view(-1)).view_as(at)
+    at = torch.where(found <= middle + 1, at, len(key)).view(-1)
+    return rows.index_select(0, at).view(27, -1).sum(0).view(-1, len(values)).t().index_select(1, of_voxel)
 
 
 def symmetric_adjugate(

@@ -44,8 +44,8 @@ class RigidMotion(NamedTuple):
 
 
 class Pair(NamedTuple):
-    """A voxel and the nearest one at t+1: time from one to the other, in whole 1/16; rotated arm of the first and error,
-    metres; (3, 3) weight; how much longer than between the sweeps it is between the points, in intervals."""
+    """A voxel and the nearest one at t+1: time from one to the other, in whole 1/16; rotated arm of the first and
+    error, metres; (3, 3) weight; how much longer than between the sweeps it is between the points, in intervals."""
 
     time: float
     arm: tuple[float, float]

@@ -25,7 +25,8 @@ class Point(NamedTuple):
 
 
 class Voxel(NamedTuple):
-    """Sweep, slice and object of some points of a pixel, their centroid in units from the lower corner and z = 0, mean time."""
+    """Sweep, slice and object of some points of a pixel, their centroid in units from the lower corner and z = 0, and
+    their mean time."""
 
     step: int
     part: int
