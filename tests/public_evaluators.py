@@ -106,6 +106,12 @@ def total_flow(points: np.ndarray, residual: np.ndarray, T: np.ndarray) -> np.nd
     return ((start + residual) @ T[:3, :3].T + T[:3, 3] - start).astype(np.float32)
 
 
+def residual_at_t(pair: Pair) -> np.ndarray:
+    """True residual of the real pair in the axes of t, by the float64 poses."""
+    T, start = pair.T_float64, pair.points.astype(np.float64)
+    return ((start + pair.labels.flow - T[:3, 3]) @ T[:3, :3] - start).astype(np.float32)
+
+
 def write_table(file: Path, **columns: np.ndarray) -> None:
     file.parent.mkdir(parents=True, exist_ok=True)
     feather.write_feather(pa.table(columns), str(file))

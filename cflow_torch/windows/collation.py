@@ -43,7 +43,7 @@ class Batch:
         origin: (B, S, 3) float64, metres, frame of t+1: origin of the ego frame of each sweep.
         rows: for each window the slice of the P points that holds its pc0.
         pose_flow: (N, 3) float32, metres, T_ego1_ego0 p - p of all rows of pc0; 0 for points that are not finite.
-        ground: heights of the ground points of t and t+1; None = the method does not need them.
+        ground: heights of the ground points of t; None = the method does not need them.
         point_times: (P,) float32, sweep intervals from the instant of its sweep to the measurement of each point,
             multiples of 2^-20; 0 in windows of which a sweep has no times. None = no window has them, or the method
             does not need them.

@@ -47,7 +47,7 @@ class PieceReader:
     Args:
         timeline: the sweeps.
         config, grid, device, num_axes: as for `make_batch`.
-        ground: where the ground points of t and t+1 are counted; None = nowhere.
+        ground: where the ground points of t are counted; None = nowhere.
     """
 
     timeline: Timeline
@@ -86,7 +86,7 @@ class PieceReader:
             moved = raw if matrix is None else compensate(raw, matrix, 3 if step == 1 else max(num_axes, checked_axes))
             is_active, pose_flow, row = grid.contains(moved[:checked_axes]), None, None
             if ground is not None:
-                if self.ground is not None and step <= 1:
+                if self.ground is not None and step == 1:
                     found = flat_nonzero(is_active & ground[rows])
                     self.ground.add(_select(window, found), moved.index_select(1, found))
                 is_active &= ~ground[rows]

@@ -228,7 +228,7 @@ def test_broken_scenes_are_reported_and_the_others_labelled(scenes: Path, tmp_pa
     ("call", "message"),
     [
         ("{}", "no scene in {}"),
-        ("{}/nowhere", "nowhere is neither a file nor a folder"),
+        ("{}/nowhere", "nowhere: there is no such file or folder"),
         ("data=av2 data.root={}", "labels are written into HDF5 scenes of OpenSceneFlow"),
         ("{} model=paper", "give model=offline, default or fast"),
     ],

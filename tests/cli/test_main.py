@@ -49,7 +49,7 @@ PLAIN = (
     ("eval model=papr", "model=papr (did you mean paper?): give one of default, fast, keypoints, offline, paper"),
     ("eval model.densify=nearest", "densify is a setting of method keypoints, not of verified"),
     ("eval model.num_history=-1", "num_history=-1: give a whole number of at least 0"),
-    ("plot cluster=3", "setting 'cluster' belongs to picture=correlation: give that as well"),
+    ("plot cluster=3", "setting 'cluster' belongs to picture=correlation or picture=scales: give that as well"),
     ("flow data=av2", "the data is missing: give data.root=PATH"),
     ("flow fast", "fast: there is no such file or folder; settings are NAME=VALUE"),
     ("flow data=av2 data.root=/no/such/folder", "/no/such/folder"),

@@ -87,7 +87,7 @@ def verified_flow(
     Args:
         clouds: sweeps m = t, t-1, ... nearest first, then t+2, t+3, ...
         cloud1: sweep t+1.
-        ground: (N, 3) float64, metres, frame of t+1, ground points of t and t+1 where they are known.
+        ground: (N, 3) float64, metres, frame of t+1, ground points of t where they are known.
 
     Convention: where sweeps after t+1 may be given, points go by them if they show their object more than twice as
         often as those before t do. Ids: objects of both windows, then of both copies.

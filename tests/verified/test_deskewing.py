@@ -181,7 +181,7 @@ def test_times_that_are_none_are_refused(change, message):
     times = late(turning_car(4), 1).pc0.point_times
     with pytest.raises(CFlowError, match=message) as caught:
         flow_with(change(times))
-    assert "pc0" in str(caught.value)
+    assert "point_times" in str(caught.value)
 
 
 def test_time_stamps_say_how_long_an_interval_is():

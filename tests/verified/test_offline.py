@@ -169,7 +169,6 @@ def later(offset: float, stamp: int | None, pose: np.ndarray | None = None) -> S
         ((later(1, 200), later(2, 150)), "out of order.*pcf1"),
         ((later(1, 100),), "out of order"),  # the time of t+1
         ((later(1, 200, np.eye(4)),), "pose of every sweep"),
-        ((Sweep(P[:, :2]),), r"pcf1 has shape \(50, 2\)"),
         (P, "pcf is ndarray"),
         (tuple(later(i, 200 + i) for i in range(5)), "5 future sweeps but num_future=4"),
     ],

@@ -19,7 +19,8 @@ class Sample:
     """One pair of sweeps of a batch, with its history.
 
     Args:
-        window: points that are finite and not ground, with the poses of the frame of the points.
+        window: points that are finite and not ground, with the poses of the frame of the points. If the batch has the
+            whole sweep t as "origin_pc0", its ground points follow those of pc0, with a mask.
         rows0: (K,) int64, rows of batch["pc0"] that are in `window.pc0`.
         rows1: (K1,) int64, rows of batch["pc1"] that are in `window.pc1`.
         T_ego1_ego0: (4, 4) float32, motion that the harness computes from the poses and adds itself.
@@ -39,7 +40,8 @@ def read_batch(batch: Mapping[str, Any], num_history: int, ego_T_lidar: Any = No
     Args:
         batch: as the harness collates it. For each sweep i of 0 and 1: "pc{i}" (B, N, 3) or a list of B (N, 3),
             "pose{i}" (B, 4, 4) or a list of B (4, 4), optionally "gm{i}" (B, N), True = ground. For history, nearest
-            first: "pch1", "poseh1", "gmh1", "pch2", ... "auto" also reads "timestamp" and "origin_pc0".
+            first: "pch1", "poseh1", "gmh1", "pch2", ... "origin_pc0" (B, N, 3), all points of t, gives the ground.
+            "auto" also reads "timestamp".
         num_history: maximum number of history sweeps; the batch may have fewer.
         ego_T_lidar: (4, 4); None = identity; "auto" = `recognized_extrinsics` of the sweep.
 
@@ -66,6 +68,15 @@ def _sample(batch: Mapping[str, Any], b: int, history: list[str], ego_T_lidar: A
         poses.append(rigid_transform(_entry(batch, f"pose{name}", b), f"batch['pose{name}'][{b}]"))
     lidar_poses = poses if extrinsics is None else [pose @ extrinsics for pose in poses]
     sweeps = [Sweep(points, None, pose) for points, pose in zip(clouds, lidar_poses)]
+    ground = _ground_of_t(batch, b).to(clouds[0])
+    if len(ground):
+        is_ground = torch.arange(len(clouds[0]) + len(ground), device=ground.device) >= len(clouds[0])
+        whole = Sweep(torch.cat((clouds[0], ground)), is_ground, lidar_poses[0])
+        # At the start of a scene the harness repeats t as history. Copies must stay equal to t, or they would count.
+        repeats = [
+            torch.equal(points, clouds[0]) and np.array_equal(pose, poses[0]) for points, pose in zip(clouds, poses)
+        ]
+        sweeps = [whole if repeated else sweep for sweep, repeated in zip(sweeps, repeats)]
     T_ego1_ego0 = harness_motion(_entry(batch, "pose0", b), _entry(batch, "pose1", b))
     T_lidar1_lidar0 = None if extrinsics is None else relative_transform(lidar_poses[1], lidar_poses[0])
     return Sample(Window(sweeps[0], sweeps[1], tuple(sweeps[2:])), rows[0], rows[1], T_ego1_ego0, T_lidar1_lidar0)
@@ -88,6 +99,17 @@ def _points(batch: Mapping[str, Any], b: int, name: str) -> tuple[Tensor, Tensor
             raise CFlowError(f"batch['{mask_key}'][{b}] has {found}, but {key} has {len(points)} points")
     rows = keep.nonzero()[:, 0]
     return points[:, :3].index_select(0, rows), rows
+
+
+def _ground_of_t(batch: Mapping[str, Any], b: int) -> Tensor:
+    """(K, 3) ground points of t, which the harness has taken out of pc0; none if the batch does not have them."""
+    if "origin_pc0" not in batch or "gm0" not in batch:
+        return torch.zeros((0, 3))
+    points, is_ground = _entry(batch, "origin_pc0", b), _mask(batch, "gm0", b)
+    if len(points) != is_ground.numel():
+        return torch.zeros((0, 3))
+    points = points[is_ground.to(points.device), :3]
+    return points[points.isfinite().all(dim=1)]
 
 
 def _mask(batch: Mapping[str, Any], key: str, b: int) -> Tensor:

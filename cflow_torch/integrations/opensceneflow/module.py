@@ -104,14 +104,15 @@ class CFlow(nn.Module):
     def _output(self, batch: Mapping[str, Any], b: int, sample: Sample, result: FlowResult) -> dict[str, Tensor]:
         """Output of one sample."""
         pc0, pc1 = batch["pc0"][b][:, :3], batch["pc1"][b][:, :3]
-        residual = result.residual_flow
+        num_points = len(sample.rows0)  # ground points follow them
+        residual, is_valid = result.residual_flow[:num_points], result.is_valid[:num_points]
         device = residual.device
         points, rows = pc0.detach().to(device).float(), sample.rows0.to(device)
         if sample.T_lidar1_lidar0 is not None:
             residual = residual_for_harness(residual, points[rows], sample.T_ego1_ego0, sample.T_lidar1_lidar0)
         flow = torch.zeros_like(points).index_copy_(0, rows, residual)
         if self.output == "valid":
-            rows = rows[result.is_valid]
+            rows = rows[is_valid]
         elif "gm0" in batch:  # without padding, the iter_only path expects a row for every point
             rows = torch.arange(len(pc0), device=device)
         rows1 = sample.rows1.to(device)
