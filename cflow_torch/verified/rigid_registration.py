@@ -139,7 +139,7 @@ class _VoxelPairs:
         error_z = voxels.height.index_select(0, other) - height
         is_pair = self._object_of_voxel.index_select(0, other) == index
         is_pair &= square_of(error) + error_z * error_z <= round((_FARTHEST * UNITS) ** 2)
-        x, y, z = (values * is_pair / UNITS for values in (error.real, error.imag, error_z))
+        x, y, z = torch.stack((error.real, error.imag, error_z)) * is_pair / UNITS
 
         xx, xy, xz, yy, yz, zz = (self._spread.index_select(0, voxel) + self._spread.index_select(0, other)).unbind(1)
         noise = NOISE**2
@@ -147,7 +147,7 @@ class _VoxelPairs:
         square = (xx * x * x + yy * y * y + zz * z * z + 2 * (xy * x * y + xz * x * z + yz * y * z)) / det
         weight = _FAR / (_FAR + square)
         weight = weight * weight * is_pair / det * noise
-        xx, xy, xz, yy, yz = (whole(256 * (values * weight)) / 256 for values in (xx, xy, xz, yy, yz))
+        xx, xy, xz, yy, yz = whole(256 * (torch.stack((xx, xy, xz, yy, yz)) * weight)) / 256
         force_x, force_y = xx * x + xy * y + xz * z, xy * x + yy * y + yz * z
 
         r_x, r_y = (torch.view_as_real(whole(arm / (UNITS / _ARM))) / _ARM).unbind(1)

@@ -153,8 +153,8 @@ class Voxels:
             layers: l, slices below and above.
 
         Returns:
-            ((2 r + 1)^2 (2 l + 1), K) int64, pixel by pixel in raster order, V = there is none. Near the border and beyond it, the pixels are
-            the outermost ones.
+            ((2 r + 1)^2 (2 l + 1), K) int64, pixel by pixel in raster order, V = there is none. Near the border and
+            beyond it, the pixels are the outermost ones.
         """
         grid = self._sweeps.grid
         last = torch.tensor((grid.width - 1 - reach, grid.height - 1 - reach), device=part.device)

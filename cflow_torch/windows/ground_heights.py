@@ -15,8 +15,8 @@ _BLOCK = 2.0
 # With fewer ground points than this in 6 m x 6 m the height is unknown.
 _FEWEST_POINTS = 5
 _FEWEST_BLOCKS = 5  # of a plane
-# Blocks each way that a plane is fitted to, 10 m x 10 m; we fit it three times, without the blocks that are farther than
-# this from it (millimetres), such as a pavement. A steeper plane is not ground.
+# Blocks each way that a plane is fitted to, 10 m x 10 m. We fit it three times, without the blocks that are farther
+# than this from it (millimetres), such as a pavement. A steeper plane is not ground.
 _REACH, _NUM_FITS, _FARTHEST = 2, 3, 100
 _STEEPEST = 0.3
 # Heights are whole centimetres, bounded so that no sum overflows; unknown ground lies below every point.
