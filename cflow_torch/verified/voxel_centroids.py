@@ -14,6 +14,7 @@ from cflow_torch.verified.height_slices import HeightSlicedSweeps, slice_of
 
 # Centroids are whole numbers of 1 / UNITS metre: their sums are exact, in any order of the points and on any device.
 UNITS = 1024
+_HIGHEST = 2.0**24  # units: coordinates are clamped to this, which is far beyond a region, so that no square overflows
 _BEYOND = 2.0**28  # units: a place far beyond every other
 _FARTHEST = 2.0**46  # square units: no square between voxels of a region is as large
 
@@ -106,7 +107,8 @@ class Voxels:
             points.pixel * num_slices + points.part, return_inverse=True, return_counts=True
         )
         corner = torch.tensor((*sweeps.grid.lower[:2], 0.0), dtype=torch.float64, device=key.device)[:, None]
-        sums = scatter_count(voxel, key.numel(), whole((points.position - corner) * UNITS))
+        position = whole((points.position - corner) * UNITS).clamp_(-_HIGHEST, _HIGHEST)
+        sums = scatter_count(voxel, key.numel(), position)
         x, y, self.height = F.pad(torch.floor(sums / count), (0, 1), value=_BEYOND)
         self.place = torch.complex(x, y)
         # The first pixel of the table is "none", as in `HeightSlicedSweeps.rank`.

@@ -66,7 +66,7 @@ def centroids(points: Sequence[Point], sweeps: SlicedSweeps) -> Voxels:
     for place, own in inside.items():
         x = sum(whole((p.x - x0) * UNITS) for p in own) // len(own)
         y = sum(whole((p.y - y0) * UNITS) for p in own) // len(own)
-        z = sum(whole(p.z * UNITS) for p in own) // len(own)
+        z = sum(min(max(whole(p.z * UNITS), -(2**24)), 2**24) for p in own) // len(own)
         time = sum(p.time for p in own) / len(own)
         voxels[place] = Voxel(own[0].step, own[0].part, own[0].owner, x, y, z, time)
     return voxels
