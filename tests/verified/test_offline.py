@@ -174,9 +174,8 @@ def later(offset: float, stamp: int | None, pose: np.ndarray | None = None) -> S
     ],
 )
 def test_bad_sweeps_after_t1_are_refused(pcf, complaint):
-    window = Window(later(-1, 0), later(0, 100), (), pcf)
     with pytest.raises(CFlowError, match=complaint):
-        VerifiedFlow(OFFLINE)([window])
+        VerifiedFlow(OFFLINE)([Window(later(-1, 0), later(0, 100), (), pcf)])
 
 
 def test_poses_of_the_future_are_checked():
