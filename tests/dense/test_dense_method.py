@@ -141,8 +141,7 @@ def test_ground_never_moves_and_joins_nothing():
     assert (result.residual_flow[:400, 0] == 0.5).all()
     assert not result.residual_flow[400:].any() and not result.is_valid[400:].any()
     assert (result.cluster_id[400:] == -1).all() and not result.score[400:].any()
-    with pytest.warns(UserWarning, match="ground"):
-        joined = estimate_flow(pc0, pc1, ground=None, **PAPER)
+    joined = estimate_flow(pc0, pc1, ground=None, **PAPER)
     assert joined.is_valid.all() and (joined.residual_flow[:400, 0] != 0.5).all()  # the mask was necessary
 
 

@@ -11,7 +11,7 @@ import pytest
 FIXED = {
     "long_side": (0.7, 0.045),
     "rail": (1.8, 0.03),
-    "touching": (0.4, 0.005),
+    "touching": (0.4, 0.03),
     "turning": (0.2, 0.13),
     "vertical": (0.17, 0.02),
     "fast": (4.0, 0.012),
