@@ -2,8 +2,9 @@
 
 data=arrays reads such a folder. A point is dynamic if its residual flow is at least 0.05 m per sweep.
 remove_stopped=true follows objects and also removes those that move at another time, such as a waiting car. map=true
-also writes OUTPUT/<log id>.ply, the static points in the world, one per voxel. Only x, y, z are kept. A log is written
-as a whole or not at all. Repeat the command to write the missing logs. OUTPUT/config.yaml holds settings and versions.
+also writes OUTPUT/<log id>.ply, the static points in the world, one per voxel, and a picture of them, <log id>.png.
+Folders of clouds and Argoverse 2 keep their other columns, such as intensity. A log is written as a whole or not at
+all. Repeat the command to write the missing logs. OUTPUT/config.yaml holds settings and versions.
 
 examples:
   cflow clean /data/drive map=true voxel_size=0.2            any recognised format, also bags
@@ -17,17 +18,20 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Callable
 
+import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from cflow_torch.applications.cleaning import CleanLog, static_map
 from cflow_torch.cli import run
 from cflow_torch.data.arrays import ArraysLog, write_array_log
-from cflow_torch.data.arrays.cloud_file import SUFFIXES, write_cloud
+from cflow_torch.data.arrays.cloud_file import KITTI_COLUMNS, SUFFIXES, write_cloud
 from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.json_file import describe_changes
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import is_remote
 from cflow_torch.types import CFlowError, FlowResult
+from cflow_torch.viz.bev import save_picture
+from cflow_torch.viz.static_map import plot_map
 
 
 def task(cfg: DictConfig) -> None:
@@ -48,16 +52,28 @@ def task(cfg: DictConfig) -> None:
         folder, file = output / log.log_id, output / f"{log.log_id}.ply"
         flow: Callable[[int], FlowResult] | None = None if stored is None else partial(stored, log)
         with run.collect_failures(failures, log.log_id):
+            suffix, cost = cfg.suffix or _own_suffix(log), ""
             if not folder.exists():
                 clean = CleanLog(log, model, flow, cfg.remove_stopped)
                 poses = None if log.sweep(0).pose is None else "kitti"
-                write_array_log(clean, output, cfg.suffix or _own_suffix(log), poses)
-            print(f"{folder}: {len(log.timestamps)} sweeps")
+                write_array_log(clean, output, suffix, poses)
+                cost = "" if clean.cost is None else f"; {clean.cost}"
+            bin_columns = max(3 + len(log.columns(0)), KITTI_COLUMNS) if suffix == ".bin" else KITTI_COLUMNS
+            to_read = "" if bin_columns == KITTI_COLUMNS else f", read them with data.bin_columns={bin_columns}"
+            print(f"{folder}: {len(log.timestamps)} sweeps{to_read}{cost}")
             if cfg.map and not file.exists():
-                points = static_map(ArraysLog(folder, ground=None), cfg.voxel_size)
+                points = static_map(ArraysLog(folder, ground=None, bin_columns=bin_columns), cfg.voxel_size)
                 write_cloud(file, points)
-                print(f"{file}: {len(points)} points")
+                print(f"{file}: {len(points)} points{_draw(points, file.with_suffix('.png'))}")
     run.finish(failures)
+
+
+def _draw(points: np.ndarray, file: Path) -> str:
+    """Draw the map if matplotlib is installed, and name the picture."""
+    try:
+        return f", drawn in {save_picture(plot_map(points, file.stem), file)}"
+    except CFlowError as error:
+        return f" (no picture: {error})"
 
 
 def _claim(cfg: DictConfig, output: Path) -> None:

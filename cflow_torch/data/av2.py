@@ -8,6 +8,7 @@ from typing import Sequence
 import numpy as np
 import pyarrow as pa
 
+from cflow_torch.data.arrays.cloud_file import read_columns
 from cflow_torch.data.arrow_file import FeatherFile, bool_column, float_columns, integer_column, text_column
 from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes, make_boxes
 from cflow_torch.data.categories import CATEGORIES
@@ -114,6 +115,10 @@ class AV2Log(Log):
             if annotations.exists():
                 return self._labels_from_annotations(annotations, timestamp, self.timestamps[index + 1])
         return None
+
+    def columns(self, index: int) -> dict[str, np.ndarray]:
+        """Read intensity, laser_number, offset_ns and any other number of the points of sweep `index`."""
+        return read_columns(self._files[self._timestamp(index)])
 
     def _points(self, timestamp: int) -> np.ndarray:
         """(N, 3) float32."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Iterator, Protocol, Sequence, TypeVar, overload
+from typing import Any, Iterator, Mapping, Protocol, Sequence, TypeVar, overload
 
 import numpy as np
 from torch.utils.data import Dataset
@@ -64,6 +64,15 @@ class Log(Protocol):
         """Read the truth of the pair (index, index + 1); None where the log has none."""
         self._timestamp(index)
         return None
+
+    def columns(self, index: int) -> Mapping[str, np.ndarray]:
+        """Read what the log has of each point of sweep `index` besides its position, such as intensity, ring and time.
+
+        Name -> (N,) bool, integers or floats, as stored; {} where the reader gives none. Models ignore them, and
+        `CleanLog` and `write_array_log` keep them.
+        """
+        self._timestamp(index)
+        return {}
 
     def close(self) -> None:
         """Close the files that the log holds open."""
@@ -184,6 +193,10 @@ class LogWrapper(Log):
     def labels(self, index: int) -> FlowLabels | None:
         """Read the labels of the wrapped log."""
         return self.log.labels(index)
+
+    def columns(self, index: int) -> Mapping[str, np.ndarray]:
+        """Read the other columns of the wrapped log."""
+        return self.log.columns(index)
 
     def close(self) -> None:
         """Close the wrapped log."""

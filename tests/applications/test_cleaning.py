@@ -41,6 +41,10 @@ def test_waiting_cars_are_removed_by_their_tracks_and_parked_cars_stay() -> None
     for index in range(len(log) - 1):
         car = log.world(index)[2]
         assert np.array_equal(by_tracks.moving(index), (car == 0) | (car == 1)), index
+    removed = sum(int(by_tracks.moving(k).sum()) - int(by_flow.moving(k).sum()) for k in range(len(log)))
+    assert by_flow.cost is None and by_tracks.cost is not None
+    assert by_tracks.cost.removed == removed > 0 and f"removed {removed} more points" in str(by_tracks.cost)
+    assert by_tracks.cost.points == sum(len(log.sweep(k).points) for k in range(len(log)))
     assert not by_flow.moving(2)[log.world(2)[2] == 0].any() and not by_flow.moving(12)[log.world(12)[2] == 1].any()
 
 
@@ -54,6 +58,24 @@ def test_ground_and_point_times_stay_with_their_rows() -> None:
     log = Whole([straight((0, 0), (0.9, 0.0))])
     sweep, stays = cleaned(log)[3], np.flatnonzero(~cleaned(log).moving(3))
     assert np.array_equal(sweep.is_ground, stays % 7 == 0) and np.allclose(sweep.point_times, stays * 1e-6)
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".ply", ".bin"])
+def test_other_columns_stay_with_their_rows(tmp_path: Path, suffix: str) -> None:
+    class WithRows(Staged):
+        def columns(self, index: int) -> dict[str, np.ndarray]:
+            return {"column_3": np.arange(len(self.sweep(index).points), dtype=np.float32)}
+
+    log = WithRows([straight((0, 0), (0.9, 0.0))])
+    source = ArraysLog(write_array_log(log, tmp_path / "all", suffix, poses=None))
+    clean = CleanLog(source, flow=log.result)
+    back = ArraysLog(write_array_log(clean, tmp_path / "clean", suffix, poses=None))
+    for index in (3, len(log) - 1):
+        row, points = back.columns(index)["column_3"].astype(int), source.sweep(index).points
+        assert 0 < len(row) < len(points) and np.array_equal(back.sweep(index).points, points[row])
+    log.columns = lambda index: {"ring": np.zeros(3, int)}  # type: ignore[method-assign]
+    with pytest.raises(CFlowError, match="column ring of sweep 2 has shape"):
+        cleaned(log).columns(2)
 
 
 def test_a_clean_log_is_written_and_read_like_any_log(tmp_path: Path) -> None:
@@ -106,8 +128,14 @@ def test_the_command_resumes_and_refuses_changed_settings(tmp_path: Path, capsys
     log = ArraysLog(tmp_path / "clean" / file.stem)
     assert len(log) == 4 and len(log[0].points) > 1000 and log[0].is_ground is not None
     before = file.read_bytes()
+    picture = file.with_suffix(".png")
+    assert picture.read_bytes()[:4] == b"\x89PNG"
+    given = ArraysLog(tmp_path / "clean" / file.stem).columns(0)
+    assert set(given) == {"intensity", "laser_number", "offset_ns"} and len(given["intensity"]) == len(log[0].points)
     file.unlink()
+    capsys.readouterr()
     assert call("clean", "clean", *settings) == 0 and file.read_bytes() == before
+    assert f"drawn in {picture}" in capsys.readouterr().out
     capsys.readouterr()
     assert call("clean", "clean", "model=fast", "remove_stopped=true") == 2
     assert "remove_stopped was" in capsys.readouterr().err

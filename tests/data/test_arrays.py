@@ -11,7 +11,7 @@ import scenes
 from pyarrow import feather, parquet
 
 from cflow_torch import CFlowError, Sweep
-from cflow_torch.data.arrays.cloud_file import SUFFIXES, read_cloud, write_cloud
+from cflow_torch.data.arrays.cloud_file import SUFFIXES, read_cloud, read_columns, write_cloud
 from cflow_torch.data.arrays.ply import read_ply, write_ply
 from cflow_torch.data.arrays.poses_text import (
     Trajectory,
@@ -24,11 +24,12 @@ from cflow_torch.data.arrays.poses_text import (
 )
 from cflow_torch.data.arrays.reader import ArraysLog, find_array_logs, natural_key
 from cflow_torch.data.arrays.writer import write_array_log
+from cflow_torch.data.log import Log
 
 STAMP = 1_700_000_000_123_456_789
 
 
-class SmallLog:
+class SmallLog(Log):
     """Three sweeps of 40 points with full poses (yaw, pitch, roll)."""
 
     log_id = "small"
@@ -86,6 +87,54 @@ def test_clouds_come_back_from_every_suffix(tmp_path, suffix):
             read_cloud(file)
     with pytest.raises(CFlowError, match="missing"):
         read_cloud(tmp_path / f"missing{suffix}")
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_other_columns_come_back_from_every_suffix(tmp_path, suffix):
+    rng, file = np.random.default_rng(0), tmp_path / f"a{suffix}"
+    points = rng.normal(size=(20, 3)).astype(np.float32)
+    columns = {
+        "intensity": rng.integers(0, 256, 20).astype(np.uint8),
+        "half": rng.random(20).astype(np.float16),
+        "time": rng.random(20),
+        "stamp": STAMP + np.arange(20) * 512,  # float64 keeps multiples of 256 at this size
+        "is_strongest": rng.random(20) < 0.5,
+    }
+    write_cloud(file, points, columns)
+    width = 3 + len(columns)
+    assert np.array_equal(read_cloud(file, width), points)
+    found = read_columns(file, width)
+    if suffix == ".bin":
+        for values, stored in zip(columns.values(), found.values()):
+            assert np.array_equal(stored, values.astype(np.float32))
+        return
+    assert list(found) == list(columns)
+    for name, values in columns.items():
+        assert np.array_equal(found[name], values), name
+    exact = set(columns) - {".ply": {"half", "stamp", "is_strongest"}, ".pcd": {"half", "is_strongest"}}.get(
+        suffix, set()
+    )
+    exact -= {"half"} if suffix == ".parquet" else set()
+    assert all(found[name].dtype == columns[name].dtype for name in exact)
+    with pytest.raises(CFlowError, match="column time has shape"):
+        write_cloud(file, points, {"time": np.zeros(19)})
+
+
+def test_columns_without_a_name_stay_in_a_plain_array(tmp_path):
+    table = np.random.default_rng(0).normal(size=(20, 5)).astype(np.float32)
+    np.save(tmp_path / "a.npy", table)
+    (tmp_path / "a.bin").write_bytes(table.tobytes())
+    np.savez(tmp_path / "a.npz", points=table, ring=np.arange(20), about=np.array([{}]), corners=np.zeros((4, 3)))
+    for suffix, more in ((".npy", []), (".bin", []), (".npz", ["ring"])):
+        columns = read_columns(tmp_path / f"a{suffix}", 5)
+        assert sorted(columns) == sorted(["column_3", "column_4", *more])
+        assert np.array_equal(columns["column_4"], table[:, 4])
+        write_cloud(tmp_path / f"b{suffix}", table[:, :3], columns)
+        assert sorted(read_columns(tmp_path / f"b{suffix}", 5)) == sorted(columns)
+    assert np.array_equal(np.load(tmp_path / "b.npy"), table)
+    assert (tmp_path / "b.bin").read_bytes() == table.tobytes()
+    write_cloud(tmp_path / "b.ply", table[:, :3], {"laser number": np.arange(20)})
+    assert list(read_columns(tmp_path / "b.ply")) == ["laser_number"]
 
 
 @pytest.mark.parametrize("poses", ["kitti", "tum", "npy", None])

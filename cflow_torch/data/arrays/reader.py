@@ -9,7 +9,7 @@ from typing import Any, Sequence
 
 import numpy as np
 
-from cflow_torch.data.arrays.cloud_file import KITTI_COLUMNS, SUFFIXES, read_cloud
+from cflow_torch.data.arrays.cloud_file import KITTI_COLUMNS, SUFFIXES, read_cloud, read_columns
 from cflow_torch.data.arrays.poses_text import (
     Trajectory,
     checked_poses,
@@ -122,6 +122,11 @@ class ArraysLog(Log):
         pose = None if self.poses is None else self.poses[index].copy()
         time = self.timestamps[index] if self._has_times else None
         return Sweep(points.astype(np.float32, copy=False), is_ground, pose, time)
+
+    def columns(self, index: int) -> dict[str, np.ndarray]:
+        """Read the columns of cloud `index` besides x, y, z, see `cloud_file.read_columns`."""
+        self._timestamp(index)
+        return read_columns(self.files[index], self._bin_columns)
 
     def _trajectory(self, poses: Any, calibration: Any) -> tuple[Trajectory | None, str, bool]:
         """Return the poses, their name for messages, and whether a calibration converted them to the LiDAR's."""

@@ -29,7 +29,7 @@ def write_array_log(log: Log, root: str | Path, suffix: str = ".npy", poses: str
 
     Convention:
         The folder appears complete or not at all. Points are in the log's ego frame, poses `T_world_ego`. Masks and
-        times are written if every sweep has them.
+        times are written if every sweep has them, and every cloud has the columns that the log has for it.
 
     Raises:
         CFlowError: an unknown suffix or format, poses requested but missing, or the folder exists.
@@ -50,7 +50,8 @@ def _write(log: Log, folder: Path, suffix: str, poses: str | None) -> None:
     transforms, times, masks = [], [], []
     for index in range(len(log.timestamps)):
         sweep = log.sweep(index)
-        write_cloud(folder / "points" / f"{index:06d}{suffix}", np.asarray(sweep.points)[:, :3])
+        points = np.asarray(sweep.points)[:, :3]
+        write_cloud(folder / "points" / f"{index:06d}{suffix}", points, log.columns(index))
         transforms.append(sweep.pose)
         times.append(sweep.timestamp_ns)
         masks.append(sweep.is_ground)
