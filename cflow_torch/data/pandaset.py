@@ -135,6 +135,12 @@ class PandaSetLog(Log):
             is_valid &= (in_cuboid == (category > 0)) & ~np.isin(classes, _WITHOUT_FLOW)
         return FlowLabels(flow, category, is_valid)
 
+    def columns(self, index: int) -> dict[str, np.ndarray]:
+        """Read i (intensity), t (unix time in seconds) and d (index of the LiDAR) of the points of sweep `index`."""
+        self._timestamp(index)
+        columns = _columns(self._files[index])
+        return {name: columns[name] for name in ("i", "t", "d") if name in columns}
+
     def _cloud(self, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Read (N, 3) float32 points in the frame of the pose, (N,) float64 unix times in seconds, (N,) LiDAR index."""
         names = ("x", "y", "z", "t", "d")
@@ -173,10 +179,11 @@ class PandaSetLog(Log):
             )
 
 
-def _columns(file: Path, names: Sequence[str]) -> dict[str, np.ndarray]:
-    """Read columns of a pickled data frame."""
+def _columns(file: Path, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
+    """Read columns of a pickled data frame; None = all."""
     with file_errors(file):
         columns = load_columns(io.BytesIO(gzip.decompress(read_bytes(file))))
+        names = list(columns) if names is None else names
         missing = [name for name in names if name not in columns]
         if missing:
             raise CFlowError(f"it lacks the columns {missing}; it has {list(columns)}")

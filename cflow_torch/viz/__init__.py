@@ -8,6 +8,7 @@ from cflow_torch.viz.keypoints import plot_keypoints
 from cflow_torch.viz.page import Page, save_page, show
 from cflow_torch.viz.recording import record_log
 from cflow_torch.viz.scales import plot_scales
+from cflow_torch.viz.static_map import plot_map
 from cflow_torch.viz.wheel import flow_to_rgb, wheel_image
 
 __all__ = [
@@ -19,6 +20,7 @@ __all__ = [
     "plot_correlation",
     "plot_flow",
     "plot_keypoints",
+    "plot_map",
     "plot_scales",
     "record_log",
     "save_animation",

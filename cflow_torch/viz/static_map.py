@@ -9,6 +9,7 @@ import numpy as np
 from cflow_torch.types import Array, as_numpy
 from cflow_torch.viz import style
 from cflow_torch.viz.bev import point_rows
+from cflow_torch.viz.panel import dot_area
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -49,7 +50,7 @@ def plot_map(points: Array, title: str | None = None) -> Figure:
     order = np.argsort(position[:, 2], kind="stable")
     x, y, z = position[order].T
     lowest, highest = np.percentile(shown[:, 2], _HEIGHTS)
-    dots = axes.scatter(x, y, s=0.25, c=z, cmap="viridis_r", vmin=lowest, vmax=highest, linewidths=0)
+    dots = axes.scatter(x, y, s=dot_area(axes), c=z, cmap="viridis_r", vmin=lowest, vmax=highest, linewidths=0)
     style.draw_scale(axes)
     box = style.legend_box(axes, position, np.zeros(len(position), bool), (1.8, 0.66))
     bar = figure.colorbar(dots, cax=box.inset_axes((0.1, 0.7, 0.8, 0.18)), orientation="horizontal")

@@ -80,6 +80,8 @@ def test_a_recording_comes_back(sequence: Path) -> None:
     assert np.allclose(world, recording.world(1), atol=1e-4)
     offsets = np.concatenate([unit.offset_ns for unit in recording.units(1)]) * 1e-9
     assert np.allclose(sweep.point_times, offsets, atol=1e-6)
+    columns = log.columns(1)
+    assert list(columns) == ["i", "t", "d"] and np.array_equal(np.bincount(columns["d"]), [NUM_STATIC + NUM_ON_CAR] * 2)
 
 
 def test_cuboids_become_flow(sequence: Path) -> None:

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from cflow_torch import CFlowError, FlowResult
-from cflow_torch.viz import flow_to_rgb, panel, plot_clusters, plot_flow, save_picture
+from cflow_torch.viz import flow_to_rgb, panel, plot_clusters, plot_flow, plot_map, save_picture
 from cflow_torch.viz.animation import Frame, flow_figures
 from cflow_torch.viz.clusters import PALETTE, cluster_colors
 
@@ -95,6 +95,16 @@ def test_truth_adds_truth_and_error(scene: Scene) -> None:
     assert np.abs(car - flow_to_rgb(truth[0], 0.8)).max() <= 1  # longest is 0.78 m
     large, none, unknown = colors_at(figure, (16.0, 21.0), (-19.0, -9.0), (11.0, -11.0), axes=2)
     assert large.tolist() == [255, 255, 255] and none.max() < 15 and unknown.tolist() == [80, 90, 110]
+
+
+def test_a_map_is_coloured_by_height_and_the_highest_points_are_on_top() -> None:
+    far = np.array([5e5, 4e6, 300.0])  # metres, as in UTM
+    low, high, above = block(0, 0, 30), block(20, 20, 9) + (0, 0, 8), block(10, -10, 3) + (0, 0, 8)
+    figure = plot_map(np.concatenate([above, low, high, [[np.nan] * 3]]) + far, "hill")
+    at = [tuple(far[:2] + xy) for xy in ((0.0, 0.0), (20.0, 20.0), (10.0, -10.0), (-12.0, 22.0))]
+    yellow, dark, covering, nothing = colors_at(figure, *at)
+    assert yellow[0] > 240 and dark.max() < 90 and covering.max() < 90 and nothing.tolist() == [255, 255, 255]
+    pixels(plot_map(np.zeros((0, 3))))
 
 
 @pytest.mark.parametrize("rows", [0, 40])
