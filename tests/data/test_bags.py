@@ -48,6 +48,9 @@ def test_a_bag_comes_back(form: str, order: str, recording: TinyRecording, tmp_p
         offsets = recording.units(index)[0].offset_ns * 1e-9
         assert np.allclose(sweep.point_times, offsets, atol=1e-9) and sweep.timestamp_ns == recording.timestamps[index]
         assert np.array_equal(again.sweep(index).points, sweep.points)
+    columns = log.columns(0)
+    assert set(columns) == {"ring", "t"} and columns["ring"].dtype == np.uint16
+    assert np.array_equal(columns["t"], recording.units(0)[0].offset_ns), "those of shots without a return are left out"
     raw = BagLog(path, deskew=False).sweep(1).points
     assert np.allclose(raw, recording.units(1)[0].points @ MOUNT[:3, :3].T + MOUNT[:3, 3], atol=1e-4)
     assert len(window(log, 1, num_history=1).pch) == 1 and log.labels(0) is None

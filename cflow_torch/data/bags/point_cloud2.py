@@ -31,6 +31,22 @@ def points_and_times(message: Any, stamp_ns: int) -> tuple[np.ndarray, np.ndarra
     missing = [name for name in names if name not in fields]
     if missing:
         raise ValueError(f"the cloud lacks the fields {missing}; it has {list(fields)}")
+    table, points, kept = _returns(message, names)
+    times = seconds_after(table[names[3]][kept], stamp_ns) if len(names) > 3 else None
+    return points[kept], times
+
+
+def other_columns(message: Any) -> dict[str, np.ndarray]:
+    """Return the other fields of the points that `points_and_times` returns: name -> (N,) numbers as stored."""
+    single = [field.name for field in message.fields if field.count <= 1 and field.datatype in _TYPES]
+    names = [name for name in single if name not in ("", "x", "y", "z")]
+    table, _, kept = _returns(message, [*"xyz", *names])
+    return {name: table[name][kept].astype(table[name].dtype.newbyteorder("=")) for name in names}
+
+
+def _returns(message: Any, names: list[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the structured (N,) rows of a cloud, their (N, 3) float64 points, and (N,) bool, False = no return."""
+    fields = {field.name: field for field in message.fields}
     order = ">" if message.is_bigendian else "<"
     kinds = [order + _TYPES[fields[name].datatype] for name in names]
     offsets, step = [fields[name].offset for name in names], message.point_step
@@ -39,9 +55,7 @@ def points_and_times(message: Any, stamp_ns: int) -> tuple[np.ndarray, np.ndarra
     rows = np.frombuffer(message.data, np.uint8, message.height * row_step).reshape(message.height, row_step)
     table = np.ascontiguousarray(rows[:, : message.width * step]).view(kind).reshape(-1)
     points = np.stack([table[axis] for axis in "xyz"], axis=1).astype(np.float64)
-    kept = np.isfinite(points).all(axis=1) & (points != 0).any(axis=1)
-    times = seconds_after(table[names[3]][kept], stamp_ns) if len(names) > 3 else None
-    return points[kept], times
+    return table, points, np.isfinite(points).all(axis=1) & (points != 0).any(axis=1)
 
 
 def seconds_after(values: np.ndarray, stamp_ns: int) -> np.ndarray | None:

@@ -11,7 +11,7 @@ import numpy as np
 from cflow_torch.data.arrays.poses_text import Trajectory
 from cflow_torch.data.arrays.poses_text import poses_at as covered_poses
 from cflow_torch.data.bags.frames import Frames, Sample, sample, sorted_poses
-from cflow_torch.data.bags.point_cloud2 import points_and_times
+from cflow_torch.data.bags.point_cloud2 import other_columns, points_and_times
 from cflow_torch.data.files import file_errors, find_folders, shortened
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import PathLike, as_path, check_file, is_remote
@@ -133,6 +133,12 @@ class BagLog(Log):
             T = (np.linalg.inv(self.poses[index]) @ at)[group]
             points = np.einsum("nij,nj->ni", T[:, :3, :3], points) + T[:, :3, 3]
         return Sweep(points.astype(np.float32), None, self.poses[index].copy(), time, times)
+
+    def columns(self, index: int) -> dict[str, np.ndarray]:
+        """Read the other fields of the cloud, such as intensity and ring, of the points of sweep `index`."""
+        time = self._timestamp(index)
+        with file_errors(f"{self.path}, {self.topic} at {time} ns"):
+            return other_columns(self._cloud(time))
 
     def _reader(self) -> Any:
         """Return the bag, opened by this process: after a fork or unpickling it is opened again."""
