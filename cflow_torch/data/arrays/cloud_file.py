@@ -96,7 +96,8 @@ def write_cloud(path: PathLike, points: np.ndarray, columns: Mapping[str, np.nda
     Raises:
         CFlowError: an unknown suffix, or points or columns of another shape.
     """
-    path, points, named = as_path(path), np.asarray(points), dict(columns or {})
+    path, points = as_path(path), np.asarray(points)
+    named: dict[str, Any] = dict(columns or {})
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise CFlowError(f"{path} has suffix {suffix!r}; clouds are {', '.join(SUFFIXES)}")
