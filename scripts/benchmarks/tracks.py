@@ -1,42 +1,69 @@
-"""Compare tracks with the moving groups of single sweeps, on simulated drives of five sensors.
+"""Score tracks on labelled HDF5 scenes and on simulated drives.
 
-python scripts/benchmarks/tracks.py                        a drive of 20 sweeps per sensor and scene
-python scripts/benchmarks/tracks.py --model fast --only av2
+python scripts/benchmarks/tracks.py DATA/pandaset-002 DATA/kitti-0000/kitti-0000-c2.h5     scenes, or folders of them
+python scripts/benchmarks/tracks.py --simulated av2 nuscenes --num-sweeps 12               a street and a crossing each
 
-Drives have seeds 300 and above; settings of the tracker were chosen on seeds 400 and 401. Ground masks are exact where
-the data set has masks, and estimated by grid elsewhere. nuScenes is read at 10 Hz. We score an object in a sweep if it
-moves at 0.5 m/s or more and has at least 20 active points.
+The drives have the seeds 300 and 301; settings of the tracker were chosen on 400 and 401. Ground masks are exact where
+the data set has masks, and estimated by grid elsewhere. nuScenes is read at 10 Hz. We score confirmed tracks. A moving
+object has a labelled speed of 0.5 m/s or more.
 
-Columns: number of scored objects over all sweeps; the share of them with a moving group, and with a track (recall); id
-switches per 100 objects with a track; error of the horizontal velocity of groups and of tracks over the same objects,
-m/s, mean and median; share of groups and of table rows that are static objects.
+Columns: moving objects with 20 active points or more, over all sweeps; the share of them that the flow moves in part,
+and of which a track has a point (coverage); changes of the track that has most points of an object; moving boxes a
+sweep most of whose points have labels; those of them whose labelled points mostly belong to no moving object (false
+boxes); median error of the horizontal velocity of the flow and of the tracks, m/s.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Dict, Iterator
+from typing import Any, Dict, NamedTuple
 
 import numpy as np
 import torch
 from table import markdown
 
-from cflow_torch import Tracker, make_config, make_model
+from cflow_torch import Tracker, VerifiedFlow, make_config, make_model
 from cflow_torch.applications.moving_groups import MOVING
 from cflow_torch.applications.track_table import confirmed, join_tables
 from cflow_torch.data.catalog import GroundSegmentedLog
-from cflow_torch.data.log import CachedLog, FlowLabels, Log, window
+from cflow_torch.data.hdf5 import HDF5Log, find_hdf5_scenes
+from cflow_torch.data.log import Log, windows
+from cflow_torch.evaluation.frame import ego_motion_flow
 from cflow_torch.simulator import make_drive
 from cflow_torch.simulator.benchmark import FORMATS
 from cflow_torch.simulator.drive import Drive
-from cflow_torch.types import FlowResult, Sweep, Window
+from cflow_torch.types import Sweep
 
 WITH_MASKS = ("av2", "aevascenes")
+DRIVES = ((300, "street"), (301, "crossing"))
 SPEED, POINTS = 0.5, 20  # m/s and points, least of a scored object
 Row = Dict[str, Any]
+
+
+class Truth(NamedTuple):
+    """Objects of one sweep."""
+
+    object_id: np.ndarray  # (N,) int64 of each point, 0 = background
+    is_known: np.ndarray  # (N,) bool, False = without label
+    velocity: np.ndarray  # (objects, 3) over ground, m/s in the world, by id
+
+
+class LabelledLog(HDF5Log):
+    """A scene with labels and the ids of objects."""
+
+    def truth(self, index: int) -> Truth:
+        """Mean velocity of the labelled points of each object."""
+        sweep, after, labels = self.sweep(index), self.sweep(index + 1), self.labels(index)
+        seconds = (self.timestamps[index + 1] - self.timestamps[index]) * 1e-9
+        residual = labels.flow - ego_motion_flow(sweep.points, np.linalg.inv(after.pose) @ sweep.pose)
+        object_id = np.where(labels.is_valid, self.values(index, "flow_instance_id"), 0).astype(np.int64)
+        count = np.bincount(object_id).clip(1)
+        velocity = np.stack([np.bincount(object_id, each) / count for each in residual.T], 1) / seconds
+        velocity[0] = 0
+        return Truth(object_id, labels.is_valid, velocity @ after.pose[:3, :3].T)
 
 
 class SimulatedLog(Log):
@@ -52,141 +79,100 @@ class SimulatedLog(Log):
         sweep = self.drive.sweep(index * self.step)
         return sweep if self._has_masks else replace(sweep, is_ground=None)
 
-    def labels(self, index: int) -> FlowLabels | None:
-        """None, because `truth` has more."""
-        return None
-
-    def truth(self, index: int) -> tuple[np.ndarray, np.ndarray]:
-        """(N,) index of each point's body, the last = ground; (bodies + 1, 3) velocities over ground, m/s."""
+    def truth(self, index: int) -> Truth:
+        """Velocity of each body to the next sweep."""
         times = (np.array(self.timestamps[index : index + 2]) - self.timestamps[0]) * 1e-9
         now, then = self.drive.scene.body_poses(times)[:, :, :3, 3]
-        velocity = np.concatenate([(then - now) / (times[1] - times[0]), np.zeros((1, 3))])
-        table, solid = self.drive.scene.table, self.drive.returns(index * self.step).solid.numpy()
-        return np.append(table.body, len(now))[solid], velocity
-
-    def opened(self) -> Log:
-        """The log with ground masks."""
-        return self if self._has_masks else GroundSegmentedLog(self, "grid")
+        velocity = np.concatenate([np.zeros((1, 3)), (then - now) / (times[1] - times[0])])
+        solid = self.drive.returns(index * self.step).solid.numpy()
+        body = np.append(self.drive.scene.table.body, len(now))[solid]
+        return Truth(np.where(body < len(now), body + 1, 0), np.ones(len(body), bool), velocity)
 
 
-def score(log: SimulatedLog, pairs: Iterator[tuple[int, Window, FlowResult]]) -> Row:
+def score(log: LabelledLog | SimulatedLog, model: VerifiedFlow) -> Row:
     """Counts and errors of a drive, to be summed."""
+    read = log if log.sweep(0).is_ground is not None else GroundSegmentedLog(log, "grid")
     tracker, tables, sweeps = Tracker(), [], []
-    for index, given, result in pairs:
-        table, track_id = tracker.push(given, result)
+    for index, given in enumerate(windows(read, model.config.num_history, model.config.num_future)):
+        flow = model([given])[0]
+        table, track_id = tracker.push(given, flow)
         tables.append({**table, "sweep": np.full(len(table["id"]), index)})
-        sweeps.append((index, result.numpy(), given, track_id))
+        sweeps.append((flow.numpy(), np.asarray(given.pc1.pose)[:3, :3], track_id, log.truth(index)))
     kept = confirmed(join_tables(tables))
-    counts: Row = dict.fromkeys(("objects", "grouped", "tracked", "switches", "groups", "false_groups"), 0)
-    counts.update(rows=len(kept["id"]), false_rows=0, raw=[], filtered=[])
+    counts: Row = dict.fromkeys(("objects", "moved", "tracked", "switches", "boxes", "false"), 0)
+    counts.update(sweeps=len(sweeps), single=[], tracks=[])
     last: dict[int, int] = {}
-    for index, flow, given, track_id in sweeps:
-        body, velocity = log.truth(index)
-        ground = len(velocity) - 1
-        seconds = (log.timestamps[index + 1] - log.timestamps[index]) * 1e-9
-        moves = (np.linalg.norm(flow["residual_flow"], axis=1) >= MOVING) & (flow["cluster_id"] >= 0)
-        rotation = np.asarray(given.pc1.pose)[:3, :3]
+    for index, (flow, rotation, track_id, truth) in enumerate(sweeps):
         rows = {name: values[kept["sweep"] == index] for name, values in kept.items()}
-        track_id = np.where(np.isin(track_id, rows["id"]), track_id, -1)
-        is_dynamic = np.linalg.norm(velocity, axis=1) >= SPEED
-        for owner in _bodies_of(flow["cluster_id"], moves, body):
-            counts["groups"] += 1
-            counts["false_groups"] += not is_dynamic[owner]
-        for owner in _bodies_of(track_id, track_id >= 0, body):
-            has_moved = is_dynamic[owner] or (owner < ground and not log.drive.scene.bodies[owner].is_static)
-            counts["false_rows"] += not has_moved
-        for dynamic in np.flatnonzero(is_dynamic):
-            on_body = flow["is_valid"] & (body == dynamic)
-            if on_body.sum() < POINTS:
+        seconds = (log.timestamps[index + 1] - log.timestamps[index]) * 1e-9
+        moves = np.linalg.norm(flow["residual_flow"], axis=1) >= MOVING
+        for row in rows["id"][rows["is_moving"]]:
+            on_track = track_id == row
+            if truth.is_known[on_track].mean() > 0.5:
+                is_moving = np.isin(truth.object_id[on_track & truth.is_known], moving(truth))
+                counts["boxes"] += 1
+                counts["false"] += is_moving.mean() < 0.5
+        for each in moving(truth):
+            on_object = flow["is_valid"] & (truth.object_id == each)
+            if on_object.sum() < POINTS:
                 continue
             counts["objects"] += 1
-            group = _most_frequent(flow["cluster_id"][on_body & moves])
-            of_track = _most_frequent(track_id[on_body & (track_id >= 0)])
-            counts["grouped"] += group is not None
-            if of_track is None:
+            counts["moved"] += (on_object & moves).any()
+            found = Counter(track_id[on_object & np.isin(track_id, rows["id"])].tolist())
+            if not found:
                 continue
+            track = found.most_common(1)[0][0]
             counts["tracked"] += 1
-            counts["switches"] += last.get(dynamic, of_track) != of_track
-            last[dynamic] = of_track
-            if group is None:
-                continue
-            raw = rotation @ flow["residual_flow"][moves & (flow["cluster_id"] == group)].mean(0) / seconds
-            row = np.flatnonzero(rows["id"] == of_track)[0]
-            filtered = np.array([rows[name][row] for name in ("vx", "vy")])
-            counts["raw"].append(float(np.linalg.norm((raw - velocity[dynamic])[:2])))
-            counts["filtered"].append(float(np.linalg.norm(filtered - velocity[dynamic, :2])))
+            counts["switches"] += last.get(each, track) != track
+            last[each] = track
+            on_track = moves & (track_id == track)
+            if on_track.any():
+                row = np.flatnonzero(rows["id"] == track)[0]
+                filtered = np.array([rows["vx"][row], rows["vy"][row]])
+                single = rotation @ flow["residual_flow"][on_track].mean(0) / seconds
+                for name, velocity in (("single", single[:2]), ("tracks", filtered)):
+                    counts[name].append(float(np.linalg.norm(velocity - truth.velocity[each, :2])))
     return counts
 
 
-def _most_frequent(numbers: np.ndarray) -> int | None:
-    """The most frequent number, None without numbers."""
-    values, count = np.unique(numbers, return_counts=True)
-    return int(values[count.argmax()]) if len(values) else None
+def moving(truth: Truth) -> np.ndarray:
+    """Ids of the objects that move."""
+    return np.flatnonzero(np.linalg.norm(truth.velocity, axis=1) >= SPEED)
 
 
-def _bodies_of(group: np.ndarray, chosen: np.ndarray, body: np.ndarray) -> Iterator[int]:
-    """For each group with at least five chosen points, the body that most of them belong to."""
-    for value, count in zip(*np.unique(group[chosen], return_counts=True)):
-        owner = _most_frequent(body[chosen & (group == value)])
-        if count >= 5 and owner is not None:
-            yield owner
-
-
-def summary(sensor: str, parts: list[Row]) -> Row:
+def summary(name: str, parts: list[Row]) -> Row:
     """A row of the table."""
-    total = {name: sum((part[name] for part in parts[1:]), parts[0][name]) for name in parts[0]}
-    raw, filtered = (total[name] or [float("nan")] for name in ("raw", "filtered"))
-
-    def share(part: str, whole: str) -> float:
-        return 100 * total[part] / max(1, total[whole])
-
+    total = {key: sum((part[key] for part in parts[1:]), parts[0][key]) for key in parts[0]}
     return {
-        "sensor": sensor,
-        "objects": total["objects"],
-        "recall of groups, %": share("grouped", "objects"),
-        "recall of tracks, %": share("tracked", "objects"),
-        "switches / 100": share("switches", "tracked"),
-        "velocity, single (mean, median)": f"{np.mean(raw):.3f}, {np.median(raw):.3f}",
-        "velocity, tracks": f"{np.mean(filtered):.3f}, {np.median(filtered):.3f}",
-        "static groups, %": share("false_groups", "groups"),
-        "static rows, %": share("false_rows", "rows"),
-        "rows": total["rows"],
+        "drive": name,
+        "sweeps": total["sweeps"],
+        "objects x sweeps": total["objects"],
+        "moved by the flow, %": 100 * total["moved"] / max(1, total["objects"]),
+        "coverage, %": 100 * total["tracked"] / max(1, total["objects"]),
+        "id switches": total["switches"],
+        "boxes a sweep": total["boxes"] / total["sweeps"],
+        "false boxes a sweep": total["false"] / total["sweeps"],
+        "velocity, single": float(np.median(total["single"] or [np.nan])),
+        "velocity, tracks": float(np.median(total["tracks"] or [np.nan])),
     }
 
 
 def main() -> None:
-    """Simulate, estimate, track, print."""
+    """Estimate, track, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("paths", nargs="*", type=Path)
+    parser.add_argument("--simulated", nargs="*", default=(), choices=tuple(FORMATS), metavar="SENSOR")
     parser.add_argument("--model", default="default", help="preset")
-    parser.add_argument("--only", nargs="*", default=tuple(FORMATS), choices=tuple(FORMATS))
-    parser.add_argument("--scenes", nargs="*", default=("street", "crossing"))
-    parser.add_argument("--first-seed", type=int, default=300)
-    parser.add_argument("--num-sweeps", type=int, default=20)
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("--num-sweeps", type=int, default=20, help="of a simulated drive")
     given = parser.parse_args()
     torch.set_num_threads(1)
     model = make_model(make_config(given.model), "auto")
-
-    def pairs(log: Log) -> Iterator[tuple[int, Window, FlowResult]]:
-        recent = CachedLog(log, model.config.num_sweeps)
-        for index in range(len(log.timestamps) - 1):
-            sweeps = window(recent, index, model.config.num_history, model.config.num_future)
-            yield index, sweeps, model([sweeps])[0]
-
-    rows, everything = [], []
-    for sensor in given.only:
-        logs = [
-            SimulatedLog(sensor, given.first_seed + number, scene, given.num_sweeps)
-            for number, scene in enumerate(given.scenes)
-        ]
-        parts = [score(log, pairs(log.opened())) for log in logs]
-        everything += parts
-        rows.append(summary(sensor, parts))
-        print(rows[-1], flush=True)
-    rows.append(summary("all", everything))
+    files = [file for path in given.paths for file in find_hdf5_scenes(path)]
+    rows = [summary(file.stem, [score(LabelledLog(file), model)]) for file in files]
+    for sensor in given.simulated:
+        drives = [SimulatedLog(sensor, seed, scene, given.num_sweeps) for seed, scene in DRIVES]
+        rows.append(summary(f"simulated {sensor}", [score(log, model) for log in drives]))
     print(markdown(rows))
-    if given.json:
-        given.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":
