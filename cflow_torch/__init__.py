@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from cflow_torch.types import Window as Window
     from cflow_torch.verified.method import VerifiedFlow as VerifiedFlow
 
-__version__ = "0.3.0"
+__version__ = "0.4.0"
 
 # The module of each name. We import it on first use, because torch takes seconds that `cflow --version` does not need.
 _MODULES = {
