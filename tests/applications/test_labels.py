@@ -95,6 +95,8 @@ def confusion(file: Path) -> np.ndarray:
                 moves = np.linalg.norm(residual, axis=1) >= 0.05
                 moving = np.setdiff1d(sweep["flow_instance_id"][moves & ~sweep["ground_mask"]], [0])
                 scored &= log.labels(index).is_valid
+            elif "flow_instance_id" not in sweep:  # nor has the last sweep of a real drive ids: nothing is scored
+                moves, scored = np.zeros_like(scored), np.zeros_like(scored)
             else:  # the last sweep has no flow: objects that moved in the sweep before still move
                 moves = np.isin(sweep["flow_instance_id"], moving)
             dufo = sweep["dufo"] > 0
