@@ -20,7 +20,7 @@ from torch import Tensor
 from cflow_torch.ops.indices import constant, flat_nonzero, floor_divide, gather, lookup, scatter_count
 from cflow_torch.verified.aperture import principal_axes
 from cflow_torch.verified.component_tree import Objects
-from cflow_torch.verified.height_slices import HeightSlicedSweeps, count_slices
+from cflow_torch.verified.height_slices import HeightSlicedSweeps, Pixels, count_slices
 from cflow_torch.verified.paired_test import count_wins
 from cflow_torch.verified.rigid_motion import RigidMotion
 
@@ -52,23 +52,57 @@ def motion_margin(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMoti
     Args:
         sweeps: finest images.
         objects: G of them.
-        rigid: their motion. Rotations are ignored: an object counts as if it moved as its centre does.
+        rigid: their motion.
 
     Cost: five lookups for each pixel of the moving objects and each sweep.
     """
     size, device = sweeps.grid.pixel_size, rigid.flow.device
-    motion, off = rigid.pixels_per_interval(size), _DISPLACEMENT / size
+    off = _DISPLACEMENT / size
     displaced = constant(((0, 0), (off, 0), (-off, 0), (0, off), (0, -off)), torch.float64, device)
-    pixel = flat_nonzero(lookup(motion.any(1), objects.of_pixel))
+    pixel = flat_nonzero(lookup(rigid.flow.any(1), objects.of_pixel))
     members, which = sweeps.pixels.take(pixel), objects.of_pixel.index_select(0, pixel)
-    wins = count_wins(sweeps, members, which, motion[:, None] + displaced)
-    surplus = wins.won - wins.lost
-    gain, matched = (surplus[:, 0] - surplus[:, 1:].amax(1)).clamp(min=0), surplus[:, 0] + wins.in_place
+    group, motion = _groups_of_one_motion(sweeps, members, which, rigid)
+    wins = count_wins(sweeps, members, group, motion[:, None] + displaced)
+    counts = torch.cat((wins.won - wins.lost, wins.in_place[:, None]), 1)
+    object_of_group = torch.zeros_like(wins.in_place).scatter_(0, group, which)
+    counts = torch.zeros(objects.count, 6, dtype=torch.int64, device=device).index_add_(0, object_of_group, counts)
+    surplus, in_place = counts[:, :5], counts[:, 5]
+    gain, matched = (surplus[:, 0] - surplus[:, 1:].amax(1)).clamp(min=0), surplus[:, 0] + in_place
     z = torch.where(gain > 0, gain.double() / matched.double().sqrt(), 0.0)
     newest = flat_nonzero(members.step == 0)
     component, row, col = gather(newest, which, members.row, members.col)
     is_line, _, _ = principal_axes(component, row, col, objects.count, size)
-    return MotionMargin(z, (z >= _Z) | ((gain > 0) & (surplus[:, 0] > wins.in_place) & ~is_line))
+    return MotionMargin(z, (z >= _Z) | ((gain > 0) & (surplus[:, 0] > in_place) & ~is_line))
+
+
+def _groups_of_one_motion(
+    sweeps: HeightSlicedSweeps, pixels: Pixels, which: Tensor, rigid: RigidMotion
+) -> tuple[Tensor, Tensor]:
+    """Groups of pixels that share a motion: the pixels of an object, but those that its rotation takes a pixel
+    farther are groups of their own.
+
+    Args:
+        sweeps: finest images.
+        pixels: K pixels of objects.
+        which: (K,) int64, object of each.
+        rigid: motion of the G objects.
+
+    Returns:
+        group: (K,) int64, of each pixel.
+        motion: (G + groups, 2) float64, (y, x), pixels per interval.
+    """
+    size, lower = sweeps.grid.pixel_size, sweeps.grid.lower
+    motion = rigid.pixels_per_interval(size)
+    # Where the pixel's part of the object is at t.
+    since_t = sweeps.elapsed.index_select(0, pixels.window)
+    since_t = since_t[:, 1] - since_t.gather(1, pixels.step[:, None])[:, 0]
+    shift_y, shift_x = (motion.index_select(0, which) * since_t[:, None]).unbind(1)
+    x = (pixels.col.double() + 0.5 - shift_x) * size + lower[0]
+    y = (pixels.row.double() + 0.5 - shift_y) * size + lower[1]
+    flow = torch.stack(rigid.flow_at(which, x, y)[::-1], 1) / size
+    rotates = flat_nonzero(((flow - motion.index_select(0, which)).abs() >= 1).any(1))
+    group = which.index_copy(0, rotates, torch.arange(len(rotates), device=which.device) + len(motion))
+    return group, torch.cat((motion, flow.index_select(0, rotates)))
 
 
 def confidence_of(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMotion, margin: Tensor) -> Tensor:

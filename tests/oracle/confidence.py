@@ -11,6 +11,7 @@ import cflow_torch
 from oracle.aperture import principal_axis
 from oracle.height_slices import Cell, Pixel, SlicedSweeps, Vector, count, shift
 from oracle.paired_test import count_in_place, count_wins
+from oracle.registration import RigidMotion
 
 FILE = Path(cflow_torch.__file__).parent / "verified" / "confidence.json"
 TABLE: dict[str, Any] = json.loads(FILE.read_text(encoding="utf-8"))
@@ -18,23 +19,38 @@ DISPLACEMENT, BLOCK = 0.4, 1.6  # metres per interval; metres
 KINDS = ("left out", "unlinked", "static", "moving")  # in the order of the table; the last has four parts
 
 
-def margin(sweeps: SlicedSweeps, members: Sequence[Pixel], motion: Vector) -> tuple[float, bool]:
+def margin(sweeps: SlicedSweeps, members: Sequence[Pixel], rigid: RigidMotion) -> tuple[float, bool]:
     """What an object's motion loses by being displaced by 0.4 m per interval, the best of four ways, in standard
     deviations of what it finds; and whether it is dynamic. 0 for what is static.
 
-    What loses at least one standard deviation is dynamic; of the rest that which loses something, is found less where
-    it stands than where it moves to, and is no line.
+    What loses at least one standard deviation is dynamic; of the rest that which loses something, is found less in
+    place than where it moves to, and is no line.
     """
     off = DISPLACEMENT / sweeps.size
-    ways = [(0.0, 0.0), (off, 0.0), (-off, 0.0), (0.0, off), (0.0, -off)]
-    counts = [count_wins(sweeps, members, (motion[0] + y, motion[1] + x)) for y, x in ways]
-    surplus, *displaced = (won - lost for won, lost in counts)
+    surpluses = [0] * 5
+    for pixel in members:
+        y, x = motion_of_pixel(sweeps, pixel, rigid)
+        for i, (dy, dx) in enumerate([(0.0, 0.0), (off, 0.0), (-off, 0.0), (0.0, off), (0.0, -off)]):
+            won, lost = count_wins(sweeps, [pixel], (y + dy, x + dx))
+            surpluses[i] += won - lost
+    surplus, *displaced = surpluses
     gain, stays = surplus - max(displaced), count_in_place(sweeps, members)
-    if not any(motion) or gain <= 0:
+    if not any(rigid.flow) or gain <= 0:
         return 0.0, False
     is_line, _, _ = principal_axis([(r, c) for m, r, c in members if m == 0], sweeps.size)
     z = gain / math.sqrt(surplus + stays)
     return z, z >= 1 or (surplus > stays and not is_line)
+
+
+def motion_of_pixel(sweeps: SlicedSweeps, pixel: Pixel, rigid: RigidMotion) -> Vector:
+    """(y, x) pixels per interval, of one pixel of an object: that of the centre, if the rotation adds less than a
+    pixel in y and in x."""
+    (m, r, c), size, lower = pixel, sweeps.size, sweeps.lower
+    y, x = rigid.flow[1] / size, rigid.flow[0] / size
+    since_t = sweeps.elapsed[1] - sweeps.elapsed[m]
+    at_t = (c + 0.5 - x * since_t) * size + lower[0], (r + 0.5 - y * since_t) * size + lower[1]
+    own_x, own_y = (value / size for value in rigid.flow_at(*at_t))
+    return (own_y, own_x) if max(abs(own_y - y), abs(own_x - x)) >= 1 else (y, x)
 
 
 def confidences(

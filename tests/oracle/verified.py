@@ -229,7 +229,7 @@ def settle(
     apparent = register(points, start, sweeps)
     rigid = register_deskewed(points, start, apparent, sweeps, config) if has_times else list(apparent)
     shown = [(motion.flow[1] / size, motion.flow[0] / size) for motion in apparent]
-    margins = [margin(sweeps, own, motion) for own, motion in zip(members, shown)]
+    margins = [margin(sweeps, own, motion) for own, motion in zip(members, apparent)]
     rigid = [
         m if is_dynamic else m._replace(flow=(0.0, 0.0), rotation=0.0) for m, (_, is_dynamic) in zip(rigid, margins)
     ]

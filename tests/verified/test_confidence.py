@@ -93,6 +93,21 @@ def test_what_could_nearly_as_well_be_displaced_moves_if_it_left_its_place_and_i
     assert np.allclose(result.residual_flow[:, 0], 5.0 if width else 0.0, atol=0.2)
 
 
+def test_the_margin_of_a_bus_that_turns_follows_its_rotation():
+    # 5 m from the centre, 5 degrees are 0.44 m: more than a pixel, and than the displacement of the margin.
+    x = np.arange(-5.5, 5.5, 0.1)
+    sides = np.concatenate([np.stack((x, np.full_like(x, y)), 1) for y in (-1.25, 1.25)])
+    ends = np.array([(x, y) for x in (-5.5, 5.5) for y in np.arange(-1.2, 1.25, 0.1)])
+    outline = np.concatenate((sides, ends))
+    bus = np.concatenate([np.c_[outline, np.full(len(outline), z)] for z in (-0.9, -0.4, 0.1, 0.6)])
+    angle = np.radians(5.0)
+    R = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    moved = np.c_[bus[:, :2] @ R.T + (0.7, 0.1), bus[:, 2]]
+    result = flow_as_oracle(Window(Sweep(bus), Sweep(moved)), MODEL.replace(max_object_length=15.0))
+    error = np.linalg.norm(result.residual_flow.numpy() - (moved - bus), axis=1)
+    assert error.mean() < 0.1
+
+
 @pytest.mark.slow
 def test_dropping_what_is_least_trusted_lowers_the_error():
     drive = make_drive(seed=11, num_sweeps=8)
