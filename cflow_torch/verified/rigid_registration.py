@@ -12,11 +12,12 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.ops.chunks import chunks
-from cflow_torch.ops.indices import flat_nonzero, gather, lookup, scatter_count
+from cflow_torch.ops.indices import constant, flat_nonzero, gather, lookup, scatter_count
+from cflow_torch.ops.linear import adjugate
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 from cflow_torch.verified.rigid_motion import RigidMotion, rotate
-from cflow_torch.verified.surface_spread import NOISE, spread_of, symmetric_adjugate
-from cflow_torch.verified.voxel_centroids import UNITS, ObjectPoints, Voxels, square_of, whole
+from cflow_torch.verified.surface_spread import NOISE, spread_of
+from cflow_torch.verified.voxel_centroids import UNITS, ObjectPoints, Voxels, whole
 
 # We chose these on real pairs and windows with history (docs/benchmarks.md).
 LAYER_HEIGHT, NUM_LAYERS = 0.1, 32  # of the voxels, metres
@@ -25,8 +26,8 @@ _FAR = 3.0  # squared distance of a pair, in standard deviations of both surface
 _MOST_TIME = 2.5  # sweep intervals: t, t-1 and their jitter; older sweeps pull where the rotation is not constant
 _NUM_STEPS = 4
 _STEP_LENGTH = 1.4  # of that of Gauss and Newton: nearest partners change with each step, so theirs falls short
-_LONGEST_CORRECTION = 0.15  # metres per interval, in x and in y, from the given flow
-_LARGEST_ROTATION = 0.1  # tangent of half the angle per interval
+# From the given flow in x and in y, metres per interval, and from no rotation, tangent of half the angle per interval.
+_LARGEST_CHANGE = (0.15, 0.15, 0.1)
 # Pairs of points without a surface that the given translation is worth, and, at a distance of 1 m, no rotation.
 _HELD, _HELD_ROTATION = 2.0, 5.0
 _ARM = 64  # arms are whole 64ths of a metre, and weights whole 256ths: sums are exact in any order
@@ -51,13 +52,20 @@ def register(points: ObjectPoints, sweeps: HeightSlicedSweeps, flow: Tensor) -> 
 
     Cost: 27 lookups a step for each voxel and sweep, and twice 27 searches for each block of voxels.
     """
-    pairs = _VoxelPairs(points, sweeps, len(flow))
-    velocity, rotation = flow, torch.zeros_like(flow[:, 0])
+    pairs, device = _VoxelPairs(points, sweeps, len(flow)), flow.device
+    # The motion: x, y and the tangent of half the angle, (3, G). The angle is twice its tangent, nearly.
+    given = motion = F.pad(flow.t(), (0, 0, 0, 1))
+    held = constant((_HELD, _HELD, 4 * _HELD_ROTATION), torch.float64, device)[:, None]
+    largest = constant(_LARGEST_CHANGE, torch.float64, device)[:, None]
+    lower, upper = given - largest, given + largest
     for _ in range(_NUM_STEPS):
-        velocity, rotation = _solve(flow, velocity, rotation, pairs.normal_equations(velocity, rotation))
-    corner = torch.tensor(sweeps.grid.lower[:2], dtype=torch.float64, device=flow.device)
-    centre = torch.view_as_real(pairs.centre) / UNITS + corner
-    return RigidMotion(velocity, rotation, centre)
+        equations = pairs.normal_equations(motion)
+        force = equations[:, 3] + held * (given - motion)
+        inverse, scale = adjugate(equations[:, :3] + torch.diag(held[:, 0])[:, :, None])
+        change = (inverse * force).sum(1) / scale
+        motion = torch.clamp(torch.add(motion, change, alpha=_STEP_LENGTH), lower, upper)
+    corner = constant(sweeps.grid.lower[:2], torch.float64, device)
+    return RigidMotion(motion[:2].t().contiguous(), motion[2], torch.view_as_real(pairs.centre) / UNITS + corner)
 
 
 def stretch_of(points: ObjectPoints, sweeps: HeightSlicedSweeps, rigid: RigidMotion) -> Tensor:
@@ -75,8 +83,9 @@ def stretch_of(points: ObjectPoints, sweeps: HeightSlicedSweeps, rigid: RigidMot
 
     Convention: k is rounded to a 16th and b - a to a 1024th, halves up.
     """
-    sums = _VoxelPairs(points, sweeps, len(rigid.flow)).normal_equations(rigid.flow, rigid.rotation)
-    squares, late = sums[0] + sums[2], sums[-1]
+    motion = torch.cat((rigid.flow.t(), rigid.rotation[None]))
+    equations = _VoxelPairs(points, sweeps, len(rigid.flow)).normal_equations(motion)
+    squares, late = equations[0, 0] + equations[1, 1], equations[0, 4]
     stretch = torch.where(squares > 0, 1 + late / squares, torch.ones_like(squares))
     return torch.where(stretch < _LEAST_STRETCH, torch.ones_like(stretch), stretch)
 
@@ -104,79 +113,58 @@ class _VoxelPairs:
         self._elapsed = elapsed.index_select(0, self._sweep + step)
         self._end = sweeps.elapsed[:, 1].index_select(0, window)
         self._object_of_voxel = F.pad(voxels.owner, (0, 1), value=-1)
-        self._spread = F.pad(spread_of(voxels, sweeps.grid.pixel_size, LAYER_HEIGHT), (0, 0, 0, 1))
+        noise = NOISE**2 / 2 * torch.eye(3, dtype=torch.float64, device=points.owner.device)[:, :, None]
+        self._spread = F.pad(spread_of(voxels, sweeps.grid.pixel_size, LAYER_HEIGHT), (0, 1)) + noise
 
-    def normal_equations(self, velocity: Tensor, rotation: Tensor) -> Tensor:
-        """Sums over the pairs of each object under a motion, (9 or 10, G) float64.
-
-        They are the normal matrix (xx, xy, yy, x angle, y angle, angle angle) and the force (x, y, angle) of the
-        translation in metres and the angle in radians, per interval; and, where there are times, w k (b - a) as in
-        `stretch_of`.
+    def normal_equations(self, motion: Tensor) -> Tensor:
+        """Sums over the pairs of each object under a motion.
 
         Args:
-            velocity: (G, 2) float64, metres per interval.
-            rotation: (G,) float64, tangent of half the angle per interval.
+            motion: (3, G) float64, x and y in metres per interval, and the tangent of half the angle.
+
+        Returns:
+            (3, 4, G) float64: the normal matrix and, in column 3, the force. Where there are times, (3, 5, G), with
+            w k (b - a) as in `stretch_of` in column 4.
         """
-        speed = torch.view_as_complex(velocity.contiguous() * UNITS)
-        motion = torch.stack((self.centre, speed, rotation.to(speed.dtype)))
-        num_sums = 9 if self._voxels.time is None else 10
-        total = velocity.new_zeros((num_sums, self._num_objects))
-        row = torch.arange(num_sums, device=rotation.device)[:, None] * self._num_objects
-        for some in chunks(0, self._voxel.numel(), rotation.device, 27):
+        speed = torch.complex(motion[0], motion[1]) * UNITS
+        state = torch.stack((self.centre, speed, motion[2].to(speed.dtype)))
+        num_columns = 4 if self._voxels.time is None else 5
+        total = motion.new_zeros(3 * num_columns * self._num_objects)
+        row = torch.arange(3 * num_columns, device=motion.device)[:, None] * self._num_objects
+        for some in chunks(0, self._voxel.numel(), motion.device, 27):
             index = self._object[some]
-            terms = self._terms(some, index, *motion.index_select(1, index).unbind(0))
-            total.view(-1).index_add_(0, (index + row).view(-1), terms.view(-1))
-        return total
+            terms = self._terms(some, index, *state.index_select(1, index).unbind(0))
+            total.index_add_(0, (index + row).view(-1), terms.view(-1))
+        return total.view(3, num_columns, self._num_objects)
 
     def _terms(self, some: slice, index: Tensor, centre: Tensor, velocity: Tensor, rotation: Tensor) -> Tensor:
-        """(9 or 10, K) summands of some voxels."""
+        """(3, 4 or 5, K) summands of some voxels."""
         voxels, voxel, elapsed, end = self._voxels, self._voxel[some], self._elapsed[some], self._end[some]
         place, height, part = gather(voxel, voxels.place, voxels.height, voxels.part)
         arm = rotate(rotation.real * elapsed, place - centre - velocity * (end - elapsed))
         target = whole(centre + velocity * end + arm)
         other = voxels.nearest(self._sweep[some], part, target, height)
-        error = voxels.place.index_select(0, other) - target
-        error_z = voxels.height.index_select(0, other) - height
+        error = torch.view_as_real(voxels.place.index_select(0, other) - target).t()
+        error = torch.cat((error, (voxels.height.index_select(0, other) - height)[None]))
         is_pair = self._object_of_voxel.index_select(0, other) == index
-        is_pair &= square_of(error) + error_z * error_z <= round((_FARTHEST * UNITS) ** 2)
-        x, y, z = torch.stack((error.real, error.imag, error_z)) * is_pair / UNITS
+        is_pair &= error.square().sum(0) <= round((_FARTHEST * UNITS) ** 2)
+        error = error * is_pair / UNITS
 
-        xx, xy, xz, yy, yz, zz = (self._spread.index_select(0, voxel) + self._spread.index_select(0, other)).unbind(1)
-        noise = NOISE**2
-        (xx, xy, xz, yy, yz, zz), det = symmetric_adjugate(xx + noise, xy, xz, yy + noise, yz, zz + noise)
-        square = (xx * x * x + yy * y * y + zz * z * z + 2 * (xy * x * y + xz * x * z + yz * y * z)) / det
-        weight = _FAR / (_FAR + square)
-        weight = weight * weight * is_pair / det * noise
-        xx, xy, xz, yy, yz = whole(256 * (torch.stack((xx, xy, xz, yy, yz)) * weight)) / 256
-        force_x, force_y = xx * x + xy * y + xz * z, xy * x + yy * y + yz * z
+        inverse, scale = adjugate(self._spread.index_select(2, voxel) + self._spread.index_select(2, other))
+        square = ((inverse * error).sum(1) * error).sum(0) / scale
+        weight = (_FAR / (_FAR + square)).square_() * is_pair / scale * NOISE**2
+        weight = whole(256 * (inverse[:2] * weight)) / 256
 
-        r_x, r_y = (torch.view_as_real(whole(arm / (UNITS / _ARM))) / _ARM).unbind(1)
-        k = whole(16 * elapsed) / 16
-        kk = k * k
-        x_angle, y_angle = kk * (xy * r_x - xx * r_y), kk * (yy * r_x - xy * r_y)
-        terms = [kk * xx, kk * xy, kk * yy, x_angle, y_angle, r_x * y_angle - r_y * x_angle]
-        terms += [k * force_x, k * force_y, k * (r_x * force_y - r_y * force_x)]
-        if voxels.time is not None:
-            late = (lookup(voxels.time, other) - voxels.time.index_select(0, voxel)) * is_pair
-            terms.append((xx + yy) * k * (whole(UNITS * late) / UNITS))
-        return torch.stack(terms)
-
-
-def _solve(given: Tensor, velocity: Tensor, rotation: Tensor, sums: Tensor) -> tuple[Tensor, Tensor]:
-    """The motion after a Gauss-Newton step.
-
-    Args:
-        given: (G, 2) float64, velocity that is held on to, metres per interval.
-        velocity, rotation: of G objects, as for `normal_equations`.
-        sums: as `normal_equations` gives them.
-    """
-    xx, xy, yy, x_angle, y_angle, angle_angle = sums[:6]
-    x, y = sums[6:8] + _HELD * (given - velocity).t()
-    angle = sums[8] - _HELD_ROTATION * 2 * rotation
-    (xx, xy, x_angle, yy, y_angle, angle_angle), det = symmetric_adjugate(
-        xx + _HELD, xy, x_angle, yy + _HELD, y_angle, angle_angle + _HELD_ROTATION
-    )
-    change = torch.stack((xx * x + xy * y + x_angle * angle, xy * x + yy * y + y_angle * angle), 1) / det[:, None]
-    turned = (x_angle * x + y_angle * y + angle_angle * angle) / det
-    velocity = torch.clamp(velocity + _STEP_LENGTH * change, given - _LONGEST_CORRECTION, given + _LONGEST_CORRECTION)
-    return velocity, (rotation + _STEP_LENGTH * turned / 2).clamp(-_LARGEST_ROTATION, _LARGEST_ROTATION)
+        # Derivative of the position at t+1, (2, 3, K), whole 16ths times whole 64ths of a metre.
+        k, one = whole(16 * elapsed) / 16, torch.ones_like(elapsed)
+        r_x, r_y = torch.view_as_real(whole(arm / (UNITS / _ARM)) / (_ARM / 2)).unbind(1)
+        zero = torch.zeros_like(one)
+        change = torch.stack((one, zero, -r_y, zero, one, r_x)).view(2, 3, -1) * k
+        weighted = (weight[:, :2, None] * change).sum(1)
+        columns = torch.cat((weighted, (weight * error).sum(1)[:, None]), 1)
+        terms = (change[:, :, None] * columns[:, None]).sum(0)
+        if voxels.time is None:
+            return terms
+        late = (lookup(voxels.time, other) - voxels.time.index_select(0, voxel)) * is_pair
+        late = (weight[0, 0] + weight[1, 1]) * k * (whole(UNITS * late) / UNITS)
+        return torch.cat((terms, late.expand(3, 1, -1)), 1)

@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from cflow_torch.ops.indices import scatter_count
+from cflow_torch.ops.indices import constant, scatter_count
 from cflow_torch.verified.voxel_centroids import UNITS, Voxels
 
 NOISE = 0.05  # metres, standard deviation of a centroid that is not that of its surface
@@ -15,7 +15,7 @@ NOISE = 0.05  # metres, standard deviation of a centroid that is not that of its
 _SIDES = (2, 4)
 _FEWEST = 3  # voxels; a lonely voxel may belong to a surface of any direction
 _UNKNOWN = 0.2  # metres, standard deviation of such a surface
-_LINE = 5  # sum of the principal minors of a covariance, at least a 5th of its squared trace: not on a line
+_LINE = 5 / 3  # squared trace of a covariance over the sum of its squared entries, at least: not on a line
 _STEP = 4  # units: coordinates are whole 256ths of a metre, so that sums are exact
 _ROW, _LAYER = 1 << 15, 1 << 12  # more than blocks in a row or column; more than blocks above each other
 
@@ -28,27 +28,27 @@ def spread_of(voxels: Voxels, pixel_size: float, layer_height: float) -> Tensor:
         pixel_size, layer_height: metres, sides of a voxel.
 
     Returns:
-        (V, 6) float64, square metres: xx, xy, xz, yy, yz, zz.
+        (3, 3, V) float64, square metres.
 
     Cost: twice 27 searches for each block.
     """
     position = torch.cat((torch.view_as_real(voxels.place[:-1]).t(), voxels.height[None, :-1]))
-    x, y, z = coordinates = torch.floor(position / _STEP)
-    moments = torch.stack((torch.ones_like(x), x, y, z, x * x, x * y, x * z, y * y, y * z, z * z))
-    size = torch.tensor((pixel_size, pixel_size, layer_height), dtype=torch.float64, device=x.device)[:, None] * UNITS
+    xyz, device = torch.floor(position / _STEP), position.device
+    first, second = (constant(axes, torch.int64, device) for axes in ((0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)))
+    moments = torch.cat((torch.ones_like(xyz[:1]), xyz, xyz.index_select(0, first) * xyz.index_select(0, second)))
+    size = constant((pixel_size, pixel_size, layer_height), torch.float64, device)[:, None] * UNITS
     image = voxels.owner * voxels.num_steps + voxels.step
-    unknown = _UNKNOWN**2 * torch.tensor((1.0, 0, 0, 1, 0, 1), dtype=torch.float64, device=x.device)[:, None]
-    spread, is_known = coordinates.new_zeros((len(x), 6)), torch.zeros_like(image, dtype=torch.bool)
+    unknown = _UNKNOWN**2 * torch.eye(3, dtype=torch.float64, device=device)[:, :, None]
+    spread, is_known = position.new_zeros((3, 3, position.shape[1])), torch.zeros_like(image, dtype=torch.bool)
     for side in _SIDES:
         sums = _sums_around(torch.floor(position / (side * size)).long(), image, moments)
-        n, x, y, z = sums[:4]
-        products = torch.stack((x * x, x * y, x * z, y * y, y * z, z * z))
-        xx, xy, xz, yy, yz, zz = scaled = n * sums[4:] - products
-        trace, minors = xx + yy + zz, xx * yy + xx * zz + yy * zz - xy * xy - xz * xz - yz * yz
-        here = scaled / (n * n) * (_STEP / UNITS) ** 2
-        here = here + unknown * (n < _FEWEST)
-        spread = torch.where(is_known[:, None], spread, here.t())
-        is_known |= (n >= _FEWEST) & (_LINE * minors >= trace * trace)
+        n, total = sums[0], sums[1:4]
+        squares = sums.index_select(0, constant((4, 5, 6, 5, 7, 8, 6, 8, 9), torch.int64, device)).view(3, 3, -1)
+        scaled = n * squares - total[:, None] * total
+        here = scaled / (n * n) * (_STEP / UNITS) ** 2 + unknown * (n < _FEWEST)
+        spread = torch.where(is_known, spread, here)
+        trace = scaled.diagonal(dim1=0, dim2=1).sum(-1)
+        is_known |= (n >= _FEWEST) & (trace * trace >= _LINE * scaled.square().sum((0, 1)))
     return spread
 
 
@@ -70,12 +70,3 @@ def _sums_around(block: Tensor, image: Tensor, values: Tensor) -> Tensor:
     found = F.pad(key, (0, 3), value=1 << 62).index_select(0, at.view(-1)).view_as(at)
     at = torch.where(found <= middle + 1, at, len(key)).view(-1)
     return rows.index_select(0, at).view(27, -1).sum(0).view(-1, len(values)).t().index_select(1, of_voxel)
-
-
-def symmetric_adjugate(
-    xx: Tensor, xy: Tensor, xz: Tensor, yy: Tensor, yz: Tensor, zz: Tensor
-) -> tuple[tuple[Tensor, ...], Tensor]:
-    """Adjugate of symmetric 3 x 3 matrices, by its entries in the same order, and the determinant."""
-    a_xx, a_xy, a_xz = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
-    entries = (a_xx, a_xy, a_xz, xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy)
-    return entries, xx * a_xx + xy * a_xy + xz * a_xz

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from cflow_torch.ops.indices import flat_nonzero, gather, lookup, scatter_count
+from cflow_torch.ops.indices import constant, flat_nonzero, gather, lookup, scatter_count
 from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import HeightSlicedSweeps, slice_of
 
@@ -159,9 +159,9 @@ class Voxels:
             beyond it, the pixels are the outermost ones.
         """
         grid = self._sweeps.grid
-        last = torch.tensor((grid.width - 1 - reach, grid.height - 1 - reach), device=part.device)
-        size = torch.full((), grid.pixel_size * UNITS, dtype=torch.float64, device=part.device)
-        at = torch.floor(torch.view_as_real(place) / size).clamp_(torch.full_like(last, reach), last).long()
+        ends = ((reach, reach), (grid.width - 1 - reach, grid.height - 1 - reach))
+        size = constant((grid.pixel_size * UNITS,), torch.float64, part.device)
+        at = torch.floor(torch.view_as_real(place) / size).clamp_(*constant(ends, torch.int64, part.device)).long()
         pixel = torch.add(at[:, 0], at[:, 1], alpha=grid.width).add_(sweep, alpha=grid.height * grid.width)
         line = torch.arange(-reach, reach + 1, device=part.device)
         pixel = pixel + torch.add(line, line[:, None], alpha=grid.width).view(-1, 1)

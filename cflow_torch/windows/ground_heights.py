@@ -8,6 +8,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from cflow_torch.ops.indices import constant
+from cflow_torch.ops.linear import adjugate
 from cflow_torch.windows.bev_grid import Grid
 
 # Side of the blocks in which heights are averaged, metres; with the eight blocks around it, 6 m x 6 m.
@@ -16,8 +18,8 @@ _BLOCK = 2.0
 _FEWEST_POINTS = 5
 _FEWEST_BLOCKS = 5  # of a plane
 # Blocks each way that a plane is fitted to, 10 m x 10 m. We fit it three times, without the blocks that are farther
-# than this from it (millimetres), such as a pavement. A steeper plane is not ground.
-_REACH, _NUM_FITS, _FARTHEST = 2, 3, 100
+# than this from it (millimetres; at a tie a block stays), such as a pavement. A steeper plane is not ground.
+_REACH, _NUM_FITS, _FARTHEST = 2, 3, 100 + 1e-6
 _STEEPEST = 0.3
 # Heights are whole centimetres, bounded so that no sum overflows; unknown ground lies below every point.
 _HIGHEST = 10**10
@@ -90,29 +92,27 @@ class GroundHeights:
         sums = F.pad(torch.stack((self._heights, self._counts)), (_REACH, _REACH, _REACH, _REACH)).view(2, -1)
         line = torch.arange(-_REACH, _REACH + 1, device=window.device)
         dy, dx = torch.cartesian_prod(line, line).unbind(1)
-        last = torch.tensor((cols - 1, rows - 1), device=window.device)
-        lower = torch.tensor(self._lower[:2], dtype=torch.float64, device=window.device)
-        col, row = torch.floor((centre - lower) / _BLOCK).clamp_(torch.zeros_like(last), last).long().unbind(1)
+        ends = constant(((0, 0), (cols - 1, rows - 1)), torch.int64, window.device)
+        lower = constant(self._lower[:2], torch.float64, window.device)
+        col, row = torch.floor((centre - lower) / _BLOCK).clamp_(*ends).long().unbind(1)
         line_of_block = (window % num_windows * (rows + 2 * _REACH) + row + _REACH)[:, None] + dy
         block = line_of_block * (cols + 2 * _REACH) + (col + _REACH)[:, None] + dx
         height, count = sums.index_select(1, block.view(-1)).view(2, *block.shape)
         height = torch.div(10 * height, count.clamp(min=1), rounding_mode="floor").double()
         is_used = is_known = count >= _FEWEST_POINTS
-        dy, dx = dy.double(), dx.double()
-        terms = torch.stack((torch.ones_like(dx), dx, dy, dx * dx, dx * dy, dy * dy), 1)
+        design = torch.stack((torch.ones_like(dx), dx, dy)).double()
+        products = (design[:, None] * design).view(9, -1)
+        is_flat = torch.ones_like(window, dtype=torch.bool)
         for _ in range(_NUM_FITS):
-            n, x, y, xx, xy, yy = (is_used.double() @ terms).unbind(1)
-            h, hx, hy = ((height * is_used) @ terms[:, :3]).unbind(1)
-            xx, xy, yy, hx, hy = n * xx - x * x, n * xy - x * y, n * yy - y * y, n * hx - h * x, n * hy - h * y
-            det = xx * yy - xy * xy
-            is_flat = (n >= _FEWEST_BLOCKS) & (4 * det >= n * n * n * n)
-            det = torch.where(is_flat, det, torch.ones_like(det))
-            slope_x, slope_y = (hx * yy - hy * xy) / det, (hy * xx - hx * xy) / det
-            middle = (h - slope_x * x - slope_y * y) / n.clamp(min=1)
-            plane = middle[:, None] + slope_x[:, None] * dx + slope_y[:, None] * dy
-            is_used = is_known & ((height - plane).abs() <= _FARTHEST)
-        slope = torch.stack((slope_x, slope_y), 1) / (1000 * _BLOCK)
-        return slope * (is_flat & (slope.square().sum(1) <= _STEEPEST**2))[:, None]
+            used = is_used.double()
+            normal, force = (used @ products.t()).t().view(3, 3, -1), ((height * used) @ design.t()).t()
+            inverse, det = adjugate(normal)
+            n = normal[0, 0]
+            is_flat &= (n >= _FEWEST_BLOCKS) & (4 * det >= n * n * n)
+            plane = (inverse * force).sum(1) / torch.where(is_flat, det, 1.0)
+            is_used = is_known & ((height - (plane[:, :, None] * design[:, None]).sum(0)).abs() <= _FARTHEST)
+        slope = plane[1:] / (1000 * _BLOCK)
+        return (slope * (is_flat & (slope.square().sum(0) <= _STEEPEST**2))).t().contiguous()
 
     def _block(self, positions: Tensor) -> Tensor:
         """(N,) int32 block of positions inside the region, where int() rounds down."""

@@ -152,7 +152,7 @@ def ground_slope(ground: Sequence[np.ndarray], centre: Vector, config: VerifiedC
             return 0.0, 0.0
         design = np.array([(dx, dy, 1.0) for dx, dy, _ in used])
         a, b, c = np.linalg.lstsq(design, np.array([h for *_, h in used]), rcond=None)[0]
-        used = [(dx, dy, h) for dx, dy, h in known if abs(h - a * dx - b * dy - c) <= 100]
+        used = [(dx, dy, h) for dx, dy, h in known if abs(h - a * dx - b * dy - c) <= 100 + 1e-6]
     slope = float(a) / 1000 / GROUND_BLOCK, float(b) / 1000 / GROUND_BLOCK
     return slope if math.hypot(*slope) <= 0.3 else (0.0, 0.0)
 

@@ -40,6 +40,18 @@ def test_slopes_equal_the_oracle_in_any_order():
     assert 20 < known < 130
 
 
+def test_what_fits_no_plane_has_no_slope_whatever_is_left_of_it():
+    # Of rough ground, few blocks are near a plane: too few of them, or on a line.
+    for seed in range(100):
+        rng = np.random.default_rng(seed)
+        points = rng.uniform(-8, 8, (300, 3))
+        points[:, 2] = rng.normal(0, 0.2, (9, 9))[tuple((points[:, :2] // 2).astype(int).T)] - 1.7
+        centres = rng.uniform(-6, 6, (5, 2))
+        found = ground_of(points).slopes(torch.from_numpy(centres), torch.zeros(5, dtype=torch.int64))
+        expected = [ground_slope([points], (x, y), MODEL) for x, y in centres.tolist()]
+        np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
 def on_a_ramp(window: Window, slope: float) -> Window:
     def tilted(sweep: Sweep) -> Sweep:
         points = sweep.points.copy()

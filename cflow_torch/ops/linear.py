@@ -1,0 +1,22 @@
+"""Small linear algebra on many matrices at once: they come first in the shape, so operations are elementwise."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def adjugate(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """Adjugate and determinant of symmetric 3 x 3 matrices; their ratio is the inverse.
+
+    Args:
+        matrix: (3, 3, K) float64.
+
+    Returns:
+        (3, 3, K) and (K,) float64.
+
+    Convention: whole numbers give whole numbers, exact below 2^53. Each result depends on its own matrix only.
+    """
+    # A row of the adjugate is the cross product of the two other rows.
+    rows = torch.linalg.cross(torch.roll(matrix, -1, 0), torch.roll(matrix, -2, 0), dim=1)
+    return rows, (matrix[0] * rows[0]).sum(0)
