@@ -6,7 +6,7 @@ from typing import NamedTuple, Sequence
 
 import numpy as np
 import torch
-from oracle.height_slices import NUM_SLICES, SLICE_HEIGHT, Pixel, Place, SlicedSweeps, Vector
+from oracle.height_slices import NUM_SLICES, SLICE_HEIGHT, Pixel, SlicedSweeps, SweepPoint, Vector
 from oracle.registration import LAYER_HEIGHT, NUM_LAYERS
 from oracle.voxels import Point
 from oracle.voxels import points_of_objects as listed_points
@@ -80,7 +80,7 @@ def for_oracle(sweeps: HeightSlicedSweeps, window: int) -> SlicedSweeps:
         drawn = sweeps.pixel_of_point[: batch.image.numel()] < sweeps.num_pixels
         mine = drawn & (batch.image == window * sweeps.num_steps + step)
         table = torch.cat((batch.positions, times.double()[None]))[:, mine]
-        clouds.append([Place(*row) for row in table.T.tolist()])
+        clouds.append([SweepPoint(*row) for row in table.T.tolist()])
         mine = (pixels.window == window) & (pixels.step == step)
         cells = zip(pixels.row[mine].tolist(), pixels.col[mine].tolist())
         images.append(dict(zip(cells, pixels.slices[mine].tolist())))

@@ -33,8 +33,8 @@ def refine(
         The motion in metres; and the apparent motion, that of the images, which differs where points have times.
     """
     newest = flat_nonzero((sweeps.pixels.step == 0) & (objects.of_pixel < objects.count))
-    row, col, owner = gather(newest, sweeps.pixels.row, sweeps.pixels.col, objects.of_pixel)
-    length = bounding_boxes(row, col, owner, objects.count)[1].amax(1).double() * sweeps.grid.pixel_size
+    row, col, object_id = gather(newest, sweeps.pixels.row, sweeps.pixels.col, objects.of_pixel)
+    length = bounding_boxes(row, col, object_id, objects.count)[1].amax(1).double() * sweeps.grid.pixel_size
     start = subpixel_motion(sweeps, objects, motion, length <= (math.inf if longest is None else longest))
     moves = start.any(1)
     points = points_of_objects(sweeps, objects, moves, LAYER_HEIGHT, NUM_LAYERS)
@@ -69,7 +69,7 @@ def register_deskewed(
     is_pair = ~sweeps.has_history
     points = points.take(~is_pair.index_select(0, points.window))
     again = register(*deskew(points, sweeps, divided), start / stretch)
-    is_again = torch.bincount(points.owner, minlength=len(start)) > 0
+    is_again = torch.bincount(points.object_id, minlength=len(start)) > 0
     return RigidMotion(
         torch.where(is_again[:, None], again.flow, divided.flow),
         torch.where(is_again, again.rotation, divided.rotation),
@@ -96,22 +96,22 @@ def deskew(
     Cost: a sort of the points.
     """
     assert points.time is not None
-    grid, num_steps, owner = sweeps.grid, sweeps.num_steps, points.owner
+    grid, num_steps, object_id = sweeps.grid, sweeps.num_steps, points.object_id
     time, image = points.time.double(), points.window * num_steps + points.step
-    flow, centre = (torch.view_as_complex(values.index_select(0, owner)) for values in (rigid.flow, rigid.centre))
+    flow, centre = (torch.view_as_complex(values.index_select(0, object_id)) for values in (rigid.flow, rigid.centre))
     # The centre is that of t; at the instant of another sweep it has moved on.
     since_t = (sweeps.elapsed[:, 1:2] - sweeps.elapsed).flatten().index_select(0, image)
     at_instant = torch.complex(*points.position[:2]) - flow * time
     arm = at_instant - centre - flow * since_t
-    at_instant = at_instant + (rotate(-time * rigid.rotation.index_select(0, owner), arm) - arm)
+    at_instant = at_instant + (rotate(-time * rigid.rotation.index_select(0, object_id), arm) - arm)
     position = torch.cat((torch.view_as_real(at_instant).t(), points.position[2:]))
 
     inside = flat_nonzero(grid.contains(position[:2]))
     position, image = position.index_select(1, inside), image.index_select(0, inside)
-    place = grid.pixel_of_image(position, image, sweeps.batch.num_windows * num_steps).long()
-    pixel, number = torch.unique(place, return_inverse=True)
+    index = grid.pixel_of_image(position, image, sweeps.batch.num_windows * num_steps).long()
+    pixel, number = torch.unique(index, return_inverse=True)
     moved = replace(points.at(inside), position=position, pixel=number)
-    first = segment_amin(moved.owner, number, pixel.numel(), len(rigid.rotation)).index_select(0, number)
+    first = segment_amin(moved.object_id, number, pixel.numel(), len(rigid.rotation)).index_select(0, number)
     of_image, within = split_index(pixel, grid.height * grid.width)
     window, step = split_index(of_image, num_steps)
     table = torch.stack((pixel, window, step, *split_index(within, grid.width)))
@@ -119,4 +119,4 @@ def deskew(
     rank = lazy_zeros(len(sweeps.rank), torch.int32, pixel.device)
     rank.scatter_(0, pixel, torch.arange(1, len(pixel) + 1, dtype=torch.int32, device=pixel.device))
     drawn = replace(sweeps, pixels=pixels, rank=rank)
-    return moved.take(moved.owner == first), drawn
+    return moved.take(moved.object_id == first), drawn

@@ -32,7 +32,7 @@ _LARGEST_CHANGE = (0.15, 0.15, 0.1)
 _HELD, _HELD_ROTATION = 2.0, 5.0
 _ARM = 64  # arms are whole 64ths of a metre, and weights whole 256ths: sums are exact in any order
 # An object that covers a quarter of a turn of the sensor in an interval would be nearer than its own length. Times that
-# differ by more are those of a place that is measured at the end of one sweep and at the start of the next.
+# differ by more are those of a direction that is measured at the end of one sweep and at the start of the next.
 _LEAST_STRETCH = 0.75
 
 
@@ -104,16 +104,16 @@ class _VoxelPairs:
         voxels = Voxels(points, sweeps, NUM_LAYERS)
         self._voxels, self._num_objects = voxels, num_objects
         at_t = flat_nonzero(voxels.step == 1)
-        position = F.pad(torch.view_as_real(voxels.place[at_t]).t(), (0, 0, 0, 1), value=1.0)
-        *sums, count = scatter_count(voxels.owner[at_t], num_objects, position)
+        position = F.pad(torch.view_as_real(voxels.position[at_t]).t(), (0, 0, 0, 1), value=1.0)
+        *sums, count = scatter_count(voxels.object_id[at_t], num_objects, position)
         self.centre = torch.complex(*(torch.floor(total / count.clamp(min=1)) for total in sums))
-        self._voxel = flat_nonzero((voxels.step != 0) & (count > 0).index_select(0, voxels.owner))
-        window, step, self._object = gather(self._voxel, voxels.window, voxels.step, voxels.owner)
+        self._voxel = flat_nonzero((voxels.step != 0) & (count > 0).index_select(0, voxels.object_id))
+        window, step, self._object = gather(self._voxel, voxels.window, voxels.step, voxels.object_id)
         self._sweep = window * sweeps.num_steps  # t+1
         self._elapsed = elapsed.index_select(0, self._sweep + step)
         self._end = sweeps.elapsed[:, 1].index_select(0, window)
-        self._object_of_voxel = F.pad(voxels.owner, (0, 1), value=-1)
-        noise = NOISE**2 / 2 * torch.eye(3, dtype=torch.float64, device=points.owner.device)[:, :, None]
+        self._object_of_voxel = F.pad(voxels.object_id, (0, 1), value=-1)
+        noise = NOISE**2 / 2 * torch.eye(3, dtype=torch.float64, device=points.object_id.device)[:, :, None]
         self._spread = F.pad(spread_of(voxels, sweeps.grid.pixel_size, LAYER_HEIGHT), (0, 1)) + noise
 
     def normal_equations(self, motion: Tensor) -> Tensor:
@@ -140,11 +140,11 @@ class _VoxelPairs:
     def _terms(self, some: slice, index: Tensor, centre: Tensor, velocity: Tensor, rotation: Tensor) -> Tensor:
         """(3, 4 or 5, K) summands of some voxels."""
         voxels, voxel, elapsed, end = self._voxels, self._voxel[some], self._elapsed[some], self._end[some]
-        place, height, part = gather(voxel, voxels.place, voxels.height, voxels.part)
-        arm = rotate(rotation.real * elapsed, place - centre - velocity * (end - elapsed))
+        position, height, layer = gather(voxel, voxels.position, voxels.height, voxels.layer)
+        arm = rotate(rotation.real * elapsed, position - centre - velocity * (end - elapsed))
         target = whole(centre + velocity * end + arm)
-        other = voxels.nearest(self._sweep[some], part, target, height)
-        error = torch.view_as_real(voxels.place.index_select(0, other) - target).t()
+        other = voxels.nearest(self._sweep[some], layer, target, height)
+        error = torch.view_as_real(voxels.position.index_select(0, other) - target).t()
         error = torch.cat((error, (voxels.height.index_select(0, other) - height)[None]))
         is_pair = self._object_of_voxel.index_select(0, other) == index
         is_pair &= error.square().sum(0) <= round((_FARTHEST * UNITS) ** 2)

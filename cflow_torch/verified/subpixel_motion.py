@@ -95,10 +95,10 @@ def _significant_shift(voxels: Voxels, num_objects: int) -> Tensor:
     """
     some = flat_nonzero(voxels.step < 2)
     window, step, layer, of, position = gather(
-        some, voxels.window, voxels.step, voxels.part, voxels.owner, voxels.place
+        some, voxels.window, voxels.step, voxels.layer, voxels.object_id, voxels.position
     )
     near = voxels.around(window * voxels.num_steps + 1 - step, layer, position, _AROUND)
-    ahead = torch.view_as_real(voxels.place.index_select(0, near.view(-1)).view_as(near) - position).permute(2, 0, 1)
+    ahead = torch.view_as_real(voxels.position.index_select(0, near.view(-1)).view_as(near) - position).permute(2, 0, 1)
     ahead = ahead.clamp(-_BEYOND, _BEYOND).mul_((2 * step - 1).double())  # from t+1 all signs change
 
     weights, shift = meeting_weights(_SIGMA, step.device), position.real.new_zeros((2, num_objects))

@@ -32,12 +32,12 @@ def spread_of(voxels: Voxels, pixel_size: float, layer_height: float) -> Tensor:
 
     Cost: twice 27 searches for each block.
     """
-    position = torch.cat((torch.view_as_real(voxels.place[:-1]).t(), voxels.height[None, :-1]))
+    position = torch.cat((torch.view_as_real(voxels.position[:-1]).t(), voxels.height[None, :-1]))
     xyz, device = torch.floor(position / _STEP), position.device
     first, second = (constant(axes, torch.int64, device) for axes in ((0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)))
     moments = torch.cat((torch.ones_like(xyz[:1]), xyz, xyz.index_select(0, first) * xyz.index_select(0, second)))
     size = constant((pixel_size, pixel_size, layer_height), torch.float64, device)[:, None] * UNITS
-    image = voxels.owner * voxels.num_steps + voxels.step
+    image = voxels.object_id * voxels.num_steps + voxels.step
     unknown = _UNKNOWN**2 * torch.eye(3, dtype=torch.float64, device=device)[:, :, None]
     spread, is_known = position.new_zeros((3, 3, position.shape[1])), torch.zeros_like(image, dtype=torch.bool)
     for side in _SIDES:

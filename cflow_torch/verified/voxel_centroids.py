@@ -1,4 +1,4 @@
-"""Voxels (pixels by height slices of every sweep), the centroids of their points, and the nearest one to a place."""
+"""Voxels (pixels by height slices of every sweep), the centroids of their points, and the nearest one to a position."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from cflow_torch.verified.height_slices import HeightSlicedSweeps, slice_of
 # Centroids are whole numbers of 1 / UNITS metre: their sums are exact, in any order of the points and on any device.
 UNITS = 1024
 _HIGHEST = 2.0**24  # units: coordinates are clamped to this, which is far beyond a region, so that no square overflows
-_BEYOND = 2.0**28  # units: a place far beyond every other
+_BEYOND = 2.0**28  # units: a position far beyond every other
 _FARTHEST = 2.0**46  # square units: no square between voxels of a region is as large
 
 
@@ -24,19 +24,19 @@ class ObjectPoints:
     """N points of G objects, of all sweeps; the points of a pixel have one object.
 
     Args:
-        owner: (N,) int64, object of each.
+        object_id: (N,) int64, object of each.
         window, step: (N,) int64, which sweep: step 0 = t+1, 1 = t, ...
         pixel: (N,) int64, number of its occupied pixel, 0 ... P - 1.
-        part: (N,) int64, height slice, from 0 on.
+        layer: (N,) int64, height slice, from 0 on.
         position: (3, N) float64, metres, frame of t+1; inside the region.
         time: (N,) float32, sweep intervals, `Batch.point_times`; None = there are none.
     """
 
-    owner: Tensor
+    object_id: Tensor
     window: Tensor
     step: Tensor
     pixel: Tensor
-    part: Tensor
+    layer: Tensor
     position: Tensor
     time: Tensor | None = None
 
@@ -46,11 +46,11 @@ class ObjectPoints:
 
     def at(self, index: Tensor) -> ObjectPoints:
         """Some of them, (K,) int64."""
-        owner, window, step, pixel, part = (
-            values.index_select(0, index) for values in (self.owner, self.window, self.step, self.pixel, self.part)
+        object_id, window, step, pixel, layer = (
+            values.index_select(0, index) for values in (self.object_id, self.window, self.step, self.pixel, self.layer)
         )
         time = None if self.time is None else self.time.index_select(0, index)
-        return ObjectPoints(owner, window, step, pixel, part, self.position.index_select(1, index), time)
+        return ObjectPoints(object_id, window, step, pixel, layer, self.position.index_select(1, index), time)
 
 
 def points_of_objects(
@@ -74,11 +74,11 @@ def points_of_objects(
     points = flat_nonzero(lookup(lookup(wanted, objects.of_pixel), sweeps.pixel_of_point))
     pixel, rows = sweeps.pixel_of_point.index_select(0, points), sweeps.point(points)
     position = sweeps.batch.positions.index_select(1, rows)
-    window, step, owner = gather(pixel, sweeps.pixels.window, sweeps.pixels.step, objects.of_pixel)
-    part = slice_of(position[2], slice_height, num_slices).long()
+    window, step, object_id = gather(pixel, sweeps.pixels.window, sweeps.pixels.step, objects.of_pixel)
+    layer = slice_of(position[2], slice_height, num_slices).long()
     times = sweeps.batch.point_times
     time = None if times is None else times.index_select(0, rows)
-    return ObjectPoints(owner, window, step, pixel, part, position, time)
+    return ObjectPoints(object_id, window, step, pixel, layer, position, time)
 
 
 class Voxels:
@@ -90,9 +90,9 @@ class Voxels:
         num_slices: of the points.
 
     Attributes:
-        owner, window, step, part: (V,) int64, as for `ObjectPoints`.
-        place: (V + 1,) complex128, x + iy of the centroid, whole units of 1/1024 m from the lower corner of the region;
-            the last entry, of no voxel, is far away.
+        object_id, window, step, layer: (V,) int64, as for `ObjectPoints`.
+        position: (V + 1,) complex128, x + iy of the centroid, whole units of 1/1024 m from the lower corner of the
+            region; the last entry, of no voxel, is far away.
         height: (V + 1,) float64, z of the centroid, whole units from 0.
         time: (V,) float64, mean of `ObjectPoints.time`; None = there are none.
 
@@ -104,31 +104,31 @@ class Voxels:
     def __init__(self, points: ObjectPoints, sweeps: HeightSlicedSweeps, num_slices: int) -> None:
         self._sweeps, self._num_slices, self.num_steps = sweeps, num_slices, sweeps.num_steps
         key, voxel, count = torch.unique(
-            points.pixel * num_slices + points.part, return_inverse=True, return_counts=True
+            points.pixel * num_slices + points.layer, return_inverse=True, return_counts=True
         )
         corner = torch.tensor((*sweeps.grid.lower[:2], 0.0), dtype=torch.float64, device=key.device)[:, None]
         position = whole((points.position - corner) * UNITS).clamp_(-_HIGHEST, _HIGHEST)
         sums = scatter_count(voxel, key.numel(), position)
         x, y, self.height = F.pad(torch.floor(sums / count), (0, 1), value=_BEYOND)
-        self.place = torch.complex(x, y)
+        self.position = torch.complex(x, y)
         # The first pixel of the table is "none", as in `HeightSlicedSweeps.rank`.
         self._of_key = torch.full((num_slices * (sweeps.num_pixels + 1),), key.numel(), device=key.device)
         self._of_key.scatter_(0, key + num_slices, torch.arange(key.numel(), device=key.device))
         # Of all points of a voxel these are the same, so it does not matter which of them is written last.
         first = torch.zeros_like(key).scatter_(0, voxel, torch.arange(len(voxel), device=key.device))
-        self.owner, self.window, self.step = gather(first, points.owner, points.window, points.step)
-        self.part = key & (num_slices - 1)
+        self.object_id, self.window, self.step = gather(first, points.object_id, points.window, points.step)
+        self.layer = key & (num_slices - 1)
         self.time: Tensor | None = None
         if points.time is not None:
             self.time = torch.zeros_like(count, dtype=torch.float64).index_add_(0, voxel, points.time.double()) / count
 
-    def nearest(self, sweep: Tensor, part: Tensor, place: Tensor, height: Tensor) -> Tensor:
-        """Nearest voxel of a sweep, in the 3 x 3 pixels around a place, in the slice given and in those next to it.
+    def nearest(self, sweep: Tensor, layer: Tensor, position: Tensor, height: Tensor) -> Tensor:
+        """Nearest voxel of a sweep, in the 3 x 3 pixels around a position, in the slice given and in those next to it.
 
         Args:
             sweep: (K,) int64, window * S + step.
-            part: (K,) int64.
-            place: (K,) complex128, x + iy, units from the lower corner, anywhere.
+            layer: (K,) int64.
+            position: (K,) complex128, x + iy, units from the lower corner, anywhere.
             height: (K,) float64, units.
 
         Returns:
@@ -137,20 +137,20 @@ class Voxels:
 
         Cost: 27 lookups each.
         """
-        voxel = self.around(sweep, part, place, 1, 1)
-        square = square_of(self.place.index_select(0, voxel.view(-1)).view_as(voxel).sub_(place))
+        voxel = self.around(sweep, layer, position, 1, 1)
+        square = square_of(self.position.index_select(0, voxel.view(-1)).view_as(voxel).sub_(position))
         square += (self.height.index_select(0, voxel.view(-1)).view_as(voxel) - height).square_()
-        # The square and the place in one number: its least is found several times faster than by argmin. In float64,
+        # The square and the slot in one number: its least is found several times faster than by argmin. In float64,
         # which holds these numbers exactly, many times faster than in int64.
-        slot = torch.arange(len(voxel), dtype=torch.float64, device=place.device)[:, None]
+        slot = torch.arange(len(voxel), dtype=torch.float64, device=position.device)[:, None]
         key = torch.add(slot, square.clamp_(max=_FARTHEST), alpha=32)
         return voxel.gather(0, key.amin(0, keepdim=True).long().bitwise_and_(31))[0]
 
-    def around(self, sweep: Tensor, part: Tensor, place: Tensor, reach: int, layers: int = 0) -> Tensor:
-        """Voxels of a sweep in the pixels around a place, `reach` pixels each way, and in the slice given.
+    def around(self, sweep: Tensor, layer: Tensor, position: Tensor, reach: int, layers: int = 0) -> Tensor:
+        """Voxels of a sweep in the pixels around a position, `reach` pixels each way, and in the slice given.
 
         Args:
-            sweep, part, place: as for `nearest`.
+            sweep, layer, position: as for `nearest`.
             reach: r, pixels.
             layers: l, slices below and above.
 
@@ -160,20 +160,20 @@ class Voxels:
         """
         grid = self._sweeps.grid
         ends = ((reach, reach), (grid.width - 1 - reach, grid.height - 1 - reach))
-        size = constant((grid.pixel_size * UNITS,), torch.float64, part.device)
-        at = torch.floor(torch.view_as_real(place) / size).clamp_(*constant(ends, torch.int64, part.device)).long()
+        size = constant((grid.pixel_size * UNITS,), torch.float64, layer.device)
+        at = torch.floor(torch.view_as_real(position) / size).clamp_(*constant(ends, torch.int64, layer.device)).long()
         pixel = torch.add(at[:, 0], at[:, 1], alpha=grid.width).add_(sweep, alpha=grid.height * grid.width)
-        line = torch.arange(-reach, reach + 1, device=part.device)
+        line = torch.arange(-reach, reach + 1, device=layer.device)
         pixel = pixel + torch.add(line, line[:, None], alpha=grid.width).view(-1, 1)
         pixel.clamp_(0, self._sweeps.rank.numel() - 1)  # a tiny image has fewer rows or columns than are asked for
         rank = self._sweeps.rank.index_select(0, pixel.view(-1)).view(len(pixel), 1, -1)
-        near = torch.arange(-layers, layers + 1, device=part.device)[:, None]
-        key = torch.add((part + near) & (self._num_slices - 1), rank, alpha=self._num_slices).view(-1)
+        near = torch.arange(-layers, layers + 1, device=layer.device)[:, None]
+        key = torch.add((layer + near) & (self._num_slices - 1), rank, alpha=self._num_slices).view(-1)
         return self._of_key.index_select(0, key).view(len(pixel) * len(near), -1)
 
 
 def whole(x: Tensor) -> Tensor:
-    """Nearest whole number, halves up; of a complex number, that of each part."""
+    """Nearest whole number, halves up; of a complex number, that of both parts."""
     if x.is_complex():
         return torch.view_as_complex(whole(torch.view_as_real(x)))
     return torch.floor(x + 0.5)

@@ -69,17 +69,17 @@ def confidences(
     result = {}
     for pixel in at_t:
         _, r, c = pixel
-        number, found = blocks[_block(sweeps, r, c)]
-        owner = object_of.get(pixel)
-        if owner is None:
-            place = first_place("unlinked") + _bin(number, TABLE["crowd"])
-        elif any(motions[owner]):
+        total, found = blocks[_block(sweeps, r, c)]
+        number = object_of.get(pixel)
+        if number is None:
+            index = first_bin("unlinked") + _bin(total, TABLE["crowd"])
+        elif any(motions[number]):
             x, y = (c + 0.5) * sweeps.size + sweeps.lower[0], (r + 0.5) * sweeps.size + sweeps.lower[1]
             kind = 2 * (len(sweeps.images) > 2) + (x * x + y * y >= TABLE["far"] ** 2)
-            place = first_place("moving") + kind * (1 + len(TABLE["margin"])) + _bin(margins[owner], TABLE["margin"])
+            index = first_bin("moving") + kind * (1 + len(TABLE["margin"])) + _bin(margins[number], TABLE["margin"])
         else:
-            place = first_place("static") + sum(10 * found >= bound * number for bound in TABLE["share"])
-        result[pixel] = TABLE["probabilities"][place]
+            index = first_bin("static") + sum(10 * found >= bound * total for bound in TABLE["share"])
+        result[pixel] = TABLE["probabilities"][index]
     return result
 
 
@@ -94,7 +94,7 @@ def neighbourhoods(sweeps: SlicedSweeps, motion: dict[Pixel, Vector]) -> dict[Ce
     return sums
 
 
-def first_place(kind: str) -> int:
+def first_bin(kind: str) -> int:
     """Where a kind begins in the table."""
     sizes = [1, 1 + len(TABLE["crowd"]), 1 + len(TABLE["share"])]
     return sum(sizes[: KINDS.index(kind)])

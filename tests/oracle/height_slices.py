@@ -19,7 +19,7 @@ Pixel = Tuple[int, int, int]  # sweep (0 = t+1, 1 = t, ...), row, column
 Vector = Tuple[float, float]
 
 
-class Place(NamedTuple):
+class SweepPoint(NamedTuple):
     """A point: metres in the frame of t+1, and sweep intervals from the instant of its sweep."""
 
     x: float
@@ -40,7 +40,7 @@ class SlicedSweeps(NamedTuple):
         shape: rows and columns.
     """
 
-    clouds: list[list[Place]]
+    clouds: list[list[SweepPoint]]
     images: list[dict[Cell, int]]
     elapsed: list[float]
     seconds: list[float]
@@ -52,7 +52,7 @@ class SlicedSweeps(NamedTuple):
         """Eq. 3d_to_bev."""
         return math.floor((y - self.lower[1]) / self.size), math.floor((x - self.lower[0]) / self.size)
 
-    def drawn(self, clouds: list[list[Place]]) -> SlicedSweeps:
+    def drawn(self, clouds: list[list[SweepPoint]]) -> SlicedSweeps:
         """The same window with other points."""
         images: list[dict[Cell, int]] = [{} for _ in clouds]
         for image, cloud in zip(images, clouds):

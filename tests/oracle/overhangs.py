@@ -1,4 +1,4 @@
-"""Objects under overhangs: what stands on the ground under something else, as cells in space tell it."""
+"""Objects under overhangs: what is on the ground under something else, by its cells in space."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 from itertools import product
 
 from oracle.component_tree import Node, is_linked, join
-from oracle.height_slices import SLICE_HEIGHT, Cell, Pixel, Place, SlicedSweeps
+from oracle.height_slices import SLICE_HEIGHT, Cell, Pixel, SlicedSweeps, SweepPoint
 
 SIDE = 0.4  # metres, of a cell
 HIGHEST = 29  # slices from the lowest cell on; what lies higher counts as this one
@@ -26,30 +26,32 @@ def find_overhung(sweeps: SlicedSweeps, may_move: set[Pixel], level: int) -> tup
         if it is of another component and two empty ones at least lie between. Of two components in one pixel of a sweep
         the one whose first cell is the first has it.
     """
-    points = [(m, place) for m, cloud in enumerate(sweeps.clouds) for place in cloud]
-    points = [(m, place) for m, place in points if (m, *sweeps.pixel(place.x, place.y)) in may_move]
-    cells = cells_of([place for _, place in points], sweeps)
+    points = [(m, point) for m, cloud in enumerate(sweeps.clouds) for point in cloud]
+    points = [(m, point) for m, point in points if (m, *sweeps.pixel(point.x, point.y)) in may_move]
+    cells = cells_of([point for _, point in points], sweeps)
     component = join(cells, 1)
     wanted = components_under(component)
-    copied: list[list[Place]] = [[] for _ in sweeps.clouds]
-    owner: dict[Pixel, int] = {}
-    for (m, place), cell in zip(points, cells):
+    copied: list[list[SweepPoint]] = [[] for _ in sweeps.clouds]
+    object_of: dict[Pixel, int] = {}
+    for (m, point), cell in zip(points, cells):
         if component[cell] in wanted:
-            pixel = (m, *sweeps.pixel(place.x, place.y))
-            owner[pixel] = min(component[cell], owner.get(pixel, component[cell]))
-            copied[m].append(place)
+            pixel = (m, *sweeps.pixel(point.x, point.y))
+            object_of[pixel] = min(component[cell], object_of.get(pixel, component[cell]))
+            copied[m].append(point)
     copies = sweeps.drawn(copied)
-    parts = [tuple(sorted(p for p, own in owner.items() if own == number)) for number in sorted(set(owner.values()))]
+    parts = [
+        tuple(sorted(p for p, own in object_of.items() if own == number)) for number in sorted(set(object_of.values()))
+    ]
     return copies, [Node(members, level, None, False, copies) for members in parts if is_linked(members)]
 
 
-def cells_of(places: list[Place], sweeps: SlicedSweeps) -> list[tuple[int, ...]]:
+def cells_of(cloud: list[SweepPoint], sweeps: SlicedSweeps) -> list[tuple[int, ...]]:
     """Row and column, counted from one cell outside the region, and slice above the lowest one, of some points."""
-    (x0, y0), heights = sweeps.lower, [math.floor(place.z / SLICE_HEIGHT) for place in places]
+    (x0, y0), heights = sweeps.lower, [math.floor(point.z / SLICE_HEIGHT) for point in cloud]
     lowest = min(heights, default=0)
     return [
-        (math.floor((place.y - y0) / SIDE) + 1, math.floor((place.x - x0) / SIDE) + 1, min(height - lowest, HIGHEST))
-        for place, height in zip(places, heights)
+        (math.floor((point.y - y0) / SIDE) + 1, math.floor((point.x - x0) / SIDE) + 1, min(height - lowest, HIGHEST))
+        for point, height in zip(cloud, heights)
     ]
 
 

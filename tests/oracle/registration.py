@@ -30,14 +30,14 @@ LEAST_STRETCH = 0.75  # where the time between points is a smaller share of that
 
 
 class RigidMotion(NamedTuple):
-    """Motion per sweep interval: (x, y) of the flow at the centre, turn, centre; metres."""
+    """Motion per sweep interval: (x, y) of the flow at the centre, rotation, centre; metres."""
 
     flow: Vector
     rotation: float
     centre: Vector
 
     def flow_at(self, x: float, y: float) -> Vector:
-        """Flow of a point of t, by its place; all in metres."""
+        """Flow of a point of t, by its position; all in metres."""
         arm_x, arm_y = x - self.centre[0], y - self.centre[1]
         turned_x, turned_y = rotate(self.rotation, arm_x, arm_y)
         return (turned_x - arm_x) + self.flow[0], (turned_y - arm_y) + self.flow[1]
@@ -59,15 +59,15 @@ def register(points: Sequence[Point], flow: Sequence[Vector], sweeps: SlicedSwee
     voxels, lower = voxels_near_t(points, sweeps), sweeps.lower
     spreads = spread_of(voxels, sweeps)
     result = []
-    for owner, start in enumerate(flow):
-        at_t = [voxel for voxel in voxels.values() if voxel.owner == owner and voxel.step == 1]
+    for object_id, start in enumerate(flow):
+        at_t = [voxel for voxel in voxels.values() if voxel.object_id == object_id and voxel.step == 1]
         if not at_t:
             result.append(RigidMotion(start, 0.0, lower))
             continue
         centre = (sum(v.x for v in at_t) // len(at_t), sum(v.y for v in at_t) // len(at_t))
         v_x, v_y, rotation = *start, 0.0
         for _ in range(NUM_STEPS):
-            found = find_pairs(owner, voxels, spreads, sweeps, centre, (v_x, v_y), rotation)
+            found = find_pairs(object_id, voxels, spreads, sweeps, centre, (v_x, v_y), rotation)
             dx, dy, angle = (STEP_LENGTH * change for change in gauss_newton(found, start, (v_x, v_y), rotation))
             v_x = limit(v_x + dx, start[0], LONGEST_CORRECTION)
             v_y = limit(v_y + dy, start[1], LONGEST_CORRECTION)
@@ -95,14 +95,14 @@ def spread_of(voxels: Voxels, sweeps: SlicedSweeps) -> dict[Voxel, np.ndarray]:
         for v in voxels.values():
             sizes = (sweeps.size * UNITS * side, sweeps.size * UNITS * side, LAYER_HEIGHT * UNITS * side)
             blocks[v] = tuple(math.floor(at / size) for at, size in zip((v.x, v.y, v.z), sizes))
-            lists.setdefault((v.step, v.owner, *blocks[v]), []).append((v.x // 4, v.y // 4, v.z // 4))
+            lists.setdefault((v.step, v.object_id, *blocks[v]), []).append((v.x // 4, v.y // 4, v.z // 4))
         for v, (c, r, h) in blocks.items():
             if v in spreads:
                 continue
             near = [
                 position
                 for dc, dr, dh in product((-1, 0, 1), repeat=3)
-                for position in lists.get((v.step, v.owner, c + dc, r + dr, h + dh), [])
+                for position in lists.get((v.step, v.object_id, c + dc, r + dr, h + dh), [])
             ]
             n, sums = len(near), [sum(values) for values in zip(*near)]
             scaled = [[n * sum(p[i] * p[j] for p in near) - sums[i] * sums[j] for j in range(3)] for i in range(3)]
@@ -114,7 +114,7 @@ def spread_of(voxels: Voxels, sweeps: SlicedSweeps) -> dict[Voxel, np.ndarray]:
 
 
 def find_pairs(
-    owner: int,
+    object_id: int,
     voxels: Voxels,
     spreads: dict[Voxel, np.ndarray],
     sweeps: SlicedSweeps,
@@ -127,15 +127,15 @@ def find_pairs(
     found = []
     v_x, v_y = velocity[0] * UNITS, velocity[1] * UNITS
     for voxel in voxels.values():
-        if voxel.owner != owner or voxel.step == 0:
+        if voxel.object_id != object_id or voxel.step == 0:
             continue
         end, elapsed = sweeps.elapsed[1], sweeps.elapsed[voxel.step]  # intervals from t to t+1, from the voxel to t+1
         # The centre is that of t; it moves on, and the voxel rotates about it.
         start = end - elapsed
         arm_x, arm_y = rotate(rotation * elapsed, voxel.x - centre[0] - v_x * start, voxel.y - centre[1] - v_y * start)
         x, y = whole(centre[0] + v_x * end + arm_x), whole(centre[1] + v_y * end + arm_y)
-        partner = nearest(voxels, 0, voxel.part, x, y, voxel.z, sweeps)
-        if partner is None or partner.owner != owner:
+        partner = nearest(voxels, 0, voxel.layer, x, y, voxel.z, sweeps)
+        if partner is None or partner.object_id != object_id:
             continue
         error = np.array([partner.x - x, partner.y - y, partner.z - voxel.z])
         if (error**2).sum() > round((FARTHEST * UNITS) ** 2):
@@ -150,10 +150,10 @@ def find_pairs(
     return found
 
 
-def rotate(turn: float, x: float, y: float) -> Vector:
-    """Rotate by the angle whose half has the tangent `turn`."""
-    n = 1 + turn * turn
-    cos, sin = (1 - turn * turn) / n, 2 * turn / n
+def rotate(rotation: float, x: float, y: float) -> Vector:
+    """Rotate by the angle whose half has the tangent `rotation`."""
+    n = 1 + rotation * rotation
+    cos, sin = (1 - rotation * rotation) / n, 2 * rotation / n
     return cos * x - sin * y, sin * x + cos * y
 
 
@@ -193,8 +193,8 @@ def register_deskewed(
         return divided
     sharp = deskew(points, divided, sweeps, config)
     again = register(sharp, [(x / s, y / s) for (x, y), s in zip(start, stretch)], sweeps)
-    present = {point.owner for point in points}
-    return [again[owner] if owner in present else motion for owner, motion in enumerate(divided)]
+    present = {point.object_id for point in points}
+    return [again[object_id] if object_id in present else motion for object_id, motion in enumerate(divided)]
 
 
 def stretch_of(points: Sequence[Point], seen: Sequence[RigidMotion], sweeps: SlicedSweeps) -> list[float]:
@@ -203,11 +203,11 @@ def stretch_of(points: Sequence[Point], seen: Sequence[RigidMotion], sweeps: Sli
     voxels, (x0, y0) = voxels_near_t(points, sweeps), sweeps.lower
     spreads = spread_of(voxels, sweeps)
     result = []
-    for owner, motion in enumerate(seen):
+    for object_id, motion in enumerate(seen):
         centre = (round((motion.centre[0] - x0) * UNITS), round((motion.centre[1] - y0) * UNITS))
         total = late = 0.0
-        if any(voxel.owner == owner and voxel.step == 1 for voxel in voxels.values()):
-            for pair in find_pairs(owner, voxels, spreads, sweeps, centre, motion.flow, motion.rotation):
+        if any(voxel.object_id == object_id and voxel.step == 1 for voxel in voxels.values()):
+            for pair in find_pairs(object_id, voxels, spreads, sweeps, centre, motion.flow, motion.rotation):
                 weight = pair.weight[0, 0] + pair.weight[1, 1]
                 total, late = total + weight * pair.time**2, late + weight * pair.time * pair.late
         stretch = 1 + late / total if total > 0 else 1.0
@@ -220,16 +220,16 @@ def deskew(
 ) -> list[Point]:
     """Points where they were at the instant of their sweep; of those in one pixel, those of the first object."""
     x0, y0, _, x1, y1, _ = config.point_cloud_range
-    moved, owner_of = [], {}  # type: ignore[var-annotated]
+    moved, object_of = [], {}  # type: ignore[var-annotated]
     for point in points:
-        (f_x, f_y), turn, (c_x, c_y) = motions[point.owner]
+        (f_x, f_y), rotation, (c_x, c_y) = motions[point.object_id]
         since_t = sweeps.elapsed[1] - sweeps.elapsed[point.step]
         x, y = point.x - f_x * point.time, point.y - f_y * point.time
         arm_x, arm_y = x - c_x - f_x * since_t, y - c_y - f_y * since_t
-        turned_x, turned_y = rotate(-point.time * turn, arm_x, arm_y)
+        turned_x, turned_y = rotate(-point.time * rotation, arm_x, arm_y)
         x, y = x + (turned_x - arm_x), y + (turned_y - arm_y)
         if x0 <= x <= x1 and y0 <= y <= y1:
             pixel = (point.step, *sweeps.pixel(x, y))
-            owner_of[pixel] = min(owner_of.get(pixel, point.owner), point.owner)
+            object_of[pixel] = min(object_of.get(pixel, point.object_id), point.object_id)
             moved.append((pixel, point._replace(x=x, y=y)))
-    return [point for pixel, point in moved if owner_of[pixel] == point.owner]
+    return [point for pixel, point in moved if object_of[pixel] == point.object_id]

@@ -27,27 +27,27 @@ def subpixel_motion(
     """The motion of the objects of a pair, (x, y) metres per interval, from (y, x) pixels per interval, 0 = static;
     what moves keeps its motion."""
     slow = []
-    for owner, motion in enumerate(motions):
-        members = [pixel for pixel, own in object_of.items() if own == owner]
-        slow.append(may_be_slow[owner] and not any(motion) and is_biased(sweeps, members))
+    for object_id, motion in enumerate(motions):
+        members = [pixel for pixel, own in object_of.items() if own == object_id]
+        slow.append(may_be_slow[object_id] and not any(motion) and is_biased(sweeps, members))
     every = centroids(points_of_objects(sweeps, object_of, slow, sweeps.size, NUM_LAYERS), sweeps)
     result = [(x * sweeps.size, y * sweeps.size) for y, x in motions]
-    for owner in [owner for owner, is_slow in enumerate(slow) if is_slow]:
-        cubes = [cube_of(every, voxel, sweeps) for voxel in every.values() if voxel.owner == owner]
-        x, y = (way / UNITS / sweeps.elapsed[1] for way in significant_shift(cubes))
-        result[owner] = (x, y)
+    for object_id in [object_id for object_id, is_slow in enumerate(slow) if is_slow]:
+        cubes = [cube_of(every, voxel, sweeps) for voxel in every.values() if voxel.object_id == object_id]
+        x, y = (shift / UNITS / sweeps.elapsed[1] for shift in significant_shift(cubes))
+        result[object_id] = (x, y)
     return result
 
 
 def is_biased(sweeps: SlicedSweeps, members: Sequence[Pixel]) -> bool:
-    """Whether an object matches more of the other sweep a pixel ahead than a pixel behind, or the other way round."""
+    """Whether an object matches more of the other sweep a pixel ahead than a pixel behind, or the reverse."""
     size = sum(count(sweeps.at(*pixel)) for pixel in members)
     for dy, dx in SIDES:
         a, b = 0, 0
         for m, r, c in members:
-            way = 1 if m == 1 else -1
-            ahead = sweeps.at(m, r, c) & sweeps.at(1 - m, r + way * dy, c + way * dx)
-            behind = sweeps.at(m, r, c) & sweeps.at(1 - m, r - way * dy, c - way * dx)
+            direction = 1 if m == 1 else -1
+            ahead = sweeps.at(m, r, c) & sweeps.at(1 - m, r + direction * dy, c + direction * dx)
+            behind = sweeps.at(m, r, c) & sweeps.at(1 - m, r - direction * dy, c - direction * dx)
             a, b = a + count(ahead & ~behind), b + count(behind & ~ahead)
         if (a - b) ** 2 >= BIAS_Z**2 * (a + b) and abs(a - b) * LEAST_BIAS >= size > 0:
             return True
@@ -57,7 +57,7 @@ def is_biased(sweeps: SlicedSweeps, members: Sequence[Pixel]) -> bool:
 def cube_of(every: Voxels, voxel: Voxel, sweeps: SlicedSweeps) -> Cube:
     """What a cube of an object may meet: the cubes of the other sweep, in its layer, in the 5 x 5 pixels around it."""
     sign = 1 if voxel.step == 1 else -1
-    near = around(every, 1 - voxel.step, voxel.part, voxel.x, voxel.y, sweeps, AROUND)
+    near = around(every, 1 - voxel.step, voxel.layer, voxel.x, voxel.y, sweeps, AROUND)
     return np.array([(sign * (other.x - voxel.x), sign * (other.y - voxel.y)) for other in near]).reshape(-1, 2)
 
 
@@ -84,10 +84,10 @@ def meet(cube: Cube, x: int, y: int) -> tuple[float, int, int]:
 
     Ties: the first in raster order.
     """
-    ways = [(dx - x, dy - y) for dx, dy in cube.tolist()]
-    if not ways:
+    offsets = [(dx - x, dy - y) for dx, dy in cube.tolist()]
+    if not offsets:
         return 0.0, 0, 0
-    dx, dy = min(ways, key=lambda way: way[0] ** 2 + way[1] ** 2)
+    dx, dy = min(offsets, key=lambda offset: offset[0] ** 2 + offset[1] ** 2)
     return meeting_weight(dx * dx + dy * dy, SIGMA), dx, dy
 
 

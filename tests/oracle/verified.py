@@ -20,8 +20,8 @@ from oracle.component_tree import Node, grow, length, select_objects
 from oracle.confidence import TABLE, confidences, margin
 from oracle.height_slices import (
     Pixel,
-    Place,
     SlicedSweeps,
+    SweepPoint,
     Vector,
     empty_sweeps,
     ground_heights,
@@ -47,7 +47,7 @@ class Part(NamedTuple):
         object_of: object of each pixel that has one.
         rigid, scores: of each object.
         is_weak: of each object, whether it is that of changed pixels.
-        trust: of each pixel of t.
+        confidence: of each pixel of t.
     """
 
     sweeps: SlicedSweeps
@@ -55,14 +55,14 @@ class Part(NamedTuple):
     rigid: list[RigidMotion]
     scores: list[float]
     is_weak: list[bool]
-    trust: dict[Pixel, float]
+    confidence: dict[Pixel, float]
 
     def moves(self, pixel: Pixel, surely: bool = False) -> bool:
         """Has it an object that moves, surely = and that is not weak?"""
-        owner = self.object_of.get(pixel)
-        if owner is None or (surely and self.is_weak[owner]):
+        number = self.object_of.get(pixel)
+        if number is None or (surely and self.is_weak[number]):
             return False
-        return any(self.rigid[owner].flow) or self.rigid[owner].rotation != 0
+        return any(self.rigid[number].flow) or self.rigid[number].rotation != 0
 
 
 class Found(NamedTuple):
@@ -111,23 +111,23 @@ def verified_flow(
 
     num_points, slopes = len(is_inside), {}  # type: ignore[var-annotated]
     flow, ids = np.zeros((num_points, 3)), np.full(num_points, -1, dtype=np.int64)
-    scores, trust = np.zeros(num_points), np.full(num_points, TABLE["probabilities"][0])
+    scores, confidence = np.zeros(num_points), np.full(num_points, TABLE["probabilities"][0])
     for row, i in enumerate(np.flatnonzero(before.drawn[1]).tolist()):
         if is_inside[i]:
             side = int(after is not before and shown[-1][row] > 2 * shown[0][row])
             which, pixel = sides[side].which[1][row]
             part = sides[side].parts[which]
-            owner = part.object_of.get(pixel)
-            trust[i] = part.trust[pixel]
-            if owner is not None:
-                x, y = part.rigid[owner].flow_at(*clouds[0].points[i, :2].tolist())
-                centre = part.rigid[owner].centre
+            number = part.object_of.get(pixel)
+            confidence[i] = part.confidence[pixel]
+            if number is not None:
+                x, y = part.rigid[number].flow_at(*clouds[0].points[i, :2].tolist())
+                centre = part.rigid[number].centre
                 if (x or y) and centre not in slopes:
                     slopes[centre] = ground_slope(ground, centre, config)
                 slope_x, slope_y = slopes.get(centre, (0.0, 0.0))
                 flow[i] = x, y, slope_x * x + slope_y * y
-                ids[i], scores[i] = first_id[side, which] + owner, part.scores[owner]
-    return PointMotion([flow], ids, scores, trust)
+                ids[i], scores[i] = first_id[side, which] + number, part.scores[number]
+    return PointMotion([flow], ids, scores, confidence)
 
 
 def number_shown(found: Found) -> list[int]:
@@ -145,12 +145,12 @@ def estimate(every: Sequence[Cloud], ground: Sequence[np.ndarray], config: Verif
         means = ground_heights(ground, config)
         for cloud, keep in zip(every, drawn):
             keep[keep] = ~is_residue(cloud.points[keep], means, config)
-    places: list[list[Place]] = []
+    points: list[list[SweepPoint]] = []
     for cloud, keep in zip(every, drawn):
         times = np.zeros(len(keep)) if cloud.times is None else cloud.times
-        places.append([Place(*row) for row in np.column_stack([cloud.points, times])[keep].tolist()])
+        points.append([SweepPoint(*row) for row in np.column_stack([cloud.points, times])[keep].tolist()])
     elapsed, seconds = [cloud.intervals for cloud in every], [cloud.seconds for cloud in every]
-    sweeps = empty_sweeps(elapsed, seconds, config).drawn(places)
+    sweeps = empty_sweeps(elapsed, seconds, config).drawn(points)
     seen = [cloud.points[keep] for cloud, keep in zip(every, in_sight)]
     tree = grow(sweeps, find_changed(sweeps, seen, [cloud.origin for cloud in every]), config)
     num_levels = len(tree.levels)
@@ -164,18 +164,20 @@ def estimate(every: Sequence[Cloud], ground: Sequence[np.ndarray], config: Verif
         object_of, chosen = select_objects(nodes, [found[1] for found in proven], num_levels, plain, of_part)
         motions = [(0.0, 0.0) if i is None else proven[i][0] for i in chosen]
         if min(elapsed) < 0:
-            motions = [best_nearby(of_part, object_of, owner, *at, config) for owner, at in enumerate(motions)]
-        rigid, trust = settle(of_part, object_of, motions, every[0].times is not None, config)
+            motions = [best_nearby(of_part, object_of, number, *at, config) for number, at in enumerate(motions)]
+        rigid, confidence = settle(of_part, object_of, motions, every[0].times is not None, config)
         of_objects = [0.0 if i is None else scores[i] for i in chosen]
         is_weak = [i is not None and nodes[i].level == num_levels for i in chosen]
-        parts.append(Part(of_part, object_of, rigid, of_objects, is_weak, trust))
-    home, copied = parts
+        parts.append(Part(of_part, object_of, rigid, of_objects, is_weak, confidence))
+    window_part, copied = parts
     which = []
-    for m, of_sweep in enumerate(places):
+    for m, of_sweep in enumerate(points):
         under = set(copies.clouds[m])
-        pixels = [(place, (m, *sweeps.pixel(place.x, place.y))) for place in of_sweep]
-        which.append([(int(p in under and copied.moves(at) and not home.moves(at, True)), at) for p, at in pixels])
-    return Found((home, copied), drawn, which)
+        pixels = [(point, (m, *sweeps.pixel(point.x, point.y))) for point in of_sweep]
+        which.append(
+            [(int(p in under and copied.moves(at) and not window_part.moves(at, True)), at) for p, at in pixels]
+        )
+    return Found((window_part, copied), drawn, which)
 
 
 def verify(node: Node, candidates: Sequence[Vector], num_levels: int, config: VerifiedConfig) -> tuple[Vector, int]:
@@ -190,12 +192,12 @@ def verify(node: Node, candidates: Sequence[Vector], num_levels: int, config: Ve
 
 
 def best_nearby(
-    sweeps: SlicedSweeps, object_of: dict[Pixel, int], owner: int, y: float, x: float, config: VerifiedConfig
+    sweeps: SlicedSweeps, object_of: dict[Pixel, int], number: int, y: float, x: float, config: VerifiedConfig
 ) -> Vector:
     """The motion of most evidence within two pixels of that of an object; of equals the nearest, then the first."""
     offsets = sorted(product(range(-2, 3), repeat=2), key=lambda offset: offset[0] ** 2 + offset[1] ** 2)
     found = [(y + dy, x + dx) for dy, dx in offsets] if y or x else [(y, x)]
-    members = [pixel for pixel, own in object_of.items() if own == owner]
+    members = [pixel for pixel, own in object_of.items() if own == number]
     counts = [count_wins(sweeps, members, motion) for motion in found]
     best, most = best_candidate([evidence_of(*of_motion, config.significance) for of_motion in counts], found)
     return best if most > 0 else (y, x)
@@ -219,8 +221,8 @@ def settle(
     """
     size, longest = sweeps.size, config.max_object_length
     members: list[list[Pixel]] = [[] for _ in motions]
-    for pixel, owner in object_of.items():
-        members[owner].append(pixel)
+    for pixel, number in object_of.items():
+        members[number].append(pixel)
     start = [(x * size, y * size) for y, x in motions]
     if len(sweeps.images) == 2:
         may_be_slow = [longest is None or length(tuple(own)) * size <= longest for own in members]

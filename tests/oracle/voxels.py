@@ -16,8 +16,8 @@ class Point(NamedTuple):
     """A point of an object: sweep, slice, object, metres, sweep intervals since the instant of the sweep."""
 
     step: int
-    part: int
-    owner: int
+    layer: int
+    object_id: int
     x: float
     y: float
     z: float
@@ -29,8 +29,8 @@ class Voxel(NamedTuple):
     their mean time."""
 
     step: int
-    part: int
-    owner: int
+    layer: int
+    object_id: int
     x: int
     y: int
     z: int
@@ -51,9 +51,9 @@ def points_of_objects(
     points = []
     for m, cloud in enumerate(sweeps.clouds):
         for x, y, z, time in cloud:
-            owner = object_of.get((m, *sweeps.pixel(x, y)), -1)
-            if owner >= 0 and wanted[owner]:
-                points.append(Point(m, slice_of(z, height, num_slices), owner, x, y, z, time))
+            object_id = object_of.get((m, *sweeps.pixel(x, y)), -1)
+            if object_id >= 0 and wanted[object_id]:
+                points.append(Point(m, slice_of(z, height, num_slices), object_id, x, y, z, time))
     return points
 
 
@@ -61,36 +61,36 @@ def centroids(points: Sequence[Point], sweeps: SlicedSweeps) -> Voxels:
     """Voxels that hold points: each coordinate rounded to the nearest unit, their mean down to a whole one."""
     (x0, y0), inside = sweeps.lower, {}  # type: ignore[var-annotated]
     for p in points:
-        inside.setdefault((p.step, *sweeps.pixel(p.x, p.y), p.part), []).append(p)
+        inside.setdefault((p.step, *sweeps.pixel(p.x, p.y), p.layer), []).append(p)
     voxels = {}
-    for place, own in inside.items():
+    for index, own in inside.items():
         x = sum(whole((p.x - x0) * UNITS) for p in own) // len(own)
         y = sum(whole((p.y - y0) * UNITS) for p in own) // len(own)
         z = sum(min(max(whole(p.z * UNITS), -(2**24)), 2**24) for p in own) // len(own)
         time = sum(p.time for p in own) / len(own)
-        voxels[place] = Voxel(own[0].step, own[0].part, own[0].owner, x, y, z, time)
+        voxels[index] = Voxel(own[0].step, own[0].layer, own[0].object_id, x, y, z, time)
     return voxels
 
 
 def around(
-    voxels: Voxels, step: int, part: int, x: float, y: float, sweeps: SlicedSweeps, reach: int, layers: int = 0
+    voxels: Voxels, step: int, layer: int, x: float, y: float, sweeps: SlicedSweeps, reach: int, layers: int = 0
 ) -> list[Voxel]:
-    """Voxels of a sweep in the pixels around a place in units, `reach` each way, in raster order, and in the slice and
-    `layers` below and above it. At the border and beyond it, they are the outermost pixels."""
+    """Voxels of a sweep in the pixels around a position in units, `reach` each way, in raster order, in the slice and
+    in `layers` below and above it. At the border and beyond it, they are the outermost pixels."""
     row, col = (
         min(max(math.floor(at / (sweeps.size * UNITS)), reach), length - 1 - reach)
         for at, length in zip((y, x), sweeps.shape)
     )
-    slices = [(part + up) % LAYERS for up in range(-layers, layers + 1)]
+    slices = [(layer + up) % LAYERS for up in range(-layers, layers + 1)]
     pixels = product(range(-reach, reach + 1), repeat=2)
-    places = [(step, row + dy, col + dx, of_slice) for dy, dx in pixels for of_slice in slices]
-    return [voxels[place] for place in places if place in voxels]
+    near = [(step, row + dy, col + dx, of_slice) for dy, dx in pixels for of_slice in slices]
+    return [voxels[index] for index in near if index in voxels]
 
 
-def nearest(voxels: Voxels, step: int, part: int, x: float, y: float, z: float, sweeps: SlicedSweeps) -> Voxel | None:
-    """The nearest of the voxels in the 3 x 3 pixels around a place, in its slice and those next to it; the last slice
-    is below the first one. Ties: the first pixel in raster order, then the lowest slice."""
-    found = around(voxels, step, part, x, y, sweeps, 1, 1)
+def nearest(voxels: Voxels, step: int, layer: int, x: float, y: float, z: float, sweeps: SlicedSweeps) -> Voxel | None:
+    """The nearest of the voxels in the 3 x 3 pixels around a position, in its slice and those next to it; the last
+    slice is below the first one. Ties: the first pixel in raster order, then the lowest slice."""
+    found = around(voxels, step, layer, x, y, sweeps, 1, 1)
     return min(found, key=lambda voxel: (voxel.x - x) ** 2 + (voxel.y - y) ** 2 + (voxel.z - z) ** 2, default=None)
 
 

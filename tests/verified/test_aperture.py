@@ -61,7 +61,7 @@ def answers(scenes: Sequence[Scene], size: float = 0.1) -> list[list[bool]]:
     """Of a batch; they are those of the oracle."""
     num_steps = max(scene.num_sweeps for scene in scenes)
     image = np.zeros((len(scenes), num_steps, HEIGHT, WIDTH), dtype=np.uint8)
-    owner = np.full(image.shape, sum(len(scene.components) for scene in scenes))
+    number_of = np.full(image.shape, sum(len(scene.components) for scene in scenes))
     elapsed, number = np.zeros((len(scenes), num_steps)), 0
     for window, scene in enumerate(scenes):
         elapsed[window, : scene.num_sweeps] = np.arange(scene.num_sweeps)
@@ -71,10 +71,10 @@ def answers(scenes: Sequence[Scene], size: float = 0.1) -> list[list[bool]]:
         for component in scene.components:
             for m, pixels in component.items():
                 for r, c in pixels:
-                    image[window, m, r, c], owner[window, m, r, c] = 1 + (r + c) % 15, number
+                    image[window, m, r, c], number_of[window, m, r, c] = 1 + (r + c) % 15, number
             number += 1
     sweeps = from_images(image, size, elapsed)
-    owners = torch.from_numpy(owner.ravel())[sweeps.pixels.index]
+    owners = torch.from_numpy(number_of.ravel())[sweeps.pixels.index]
     candidates = torch.from_numpy(np.concatenate([scene.candidates for scene in scenes]))
     kept = owners < number
     members, component = sweeps.pixels.take(kept.nonzero()[:, 0]), owners[kept]
@@ -140,7 +140,7 @@ def test_the_share_that_must_be_covered():
 def long_things(seed: int) -> tuple[np.ndarray, np.ndarray]:
     """(3, 4, H, W) slices and owners of nine long things, some of which move, and some of which end anywhere."""
     rng, (height, width) = np.random.default_rng(seed), (90, 110)
-    image, owner = np.zeros((3, 4, height, width), dtype=np.uint8), np.full((3, 4, height, width), 9)
+    image, number_of = np.zeros((3, 4, height, width), dtype=np.uint8), np.full((3, 4, height, width), 9)
     for number in range(9):
         direction, length = rng.choice([0.0, 0.3, -0.4]), rng.uniform(10, 60)
         start, speed = rng.uniform((5, 15), (25, 30)) + [30 * (number // 3), 0], rng.choice([0, 3, 5])
@@ -149,22 +149,22 @@ def long_things(seed: int) -> tuple[np.ndarray, np.ndarray]:
             along = rng.uniform(0, length, 200) - m * speed + rng.choice([0, rng.normal(0, 2)])
             r = (start[0] + along * np.sin(direction)).astype(int).clip(0, height - 1)
             c = (start[1] + along * np.cos(direction)).astype(int).clip(0, width - 1)
-            image[number % 3, m, r, c], owner[number % 3, m, r, c] = slices, number
-    return image, owner
+            image[number % 3, m, r, c], number_of[number % 3, m, r, c] = slices, number
+    return image, number_of
 
 
 def test_ends_equal_the_oracle():
     moved = stayed = 0
     for seed in range(12):
-        image, owner = long_things(seed)
+        image, number_of = long_things(seed)
         sweeps, is_long = from_images(image), np.random.default_rng(seed).random(9) < 0.9
-        roots = torch.from_numpy(owner.ravel())[sweeps.pixels.index]
+        roots = torch.from_numpy(number_of.ravel())[sweeps.pixels.index]
         # Two levels: things by themselves, and all in one.
         found = both_ends_move(sweeps, torch.stack((torch.full_like(roots, 9), roots)), torch.tensor([*is_long, False]))
         assert not found[9]
         for number, answer in enumerate(found[:9].tolist()):
             window = int(sweeps.pixels.window[roots == number][0])
-            members = [tuple(place) for place in np.argwhere((owner[window] == number) & (image[window] > 0)).tolist()]
+            members = [tuple(place) for place in np.argwhere((number_of[window] == number) & (image[window] > 0)).tolist()]
             assert answer == (bool(is_long[number]) and oracle.both_ends_move(for_oracle(sweeps, window), members))
             moved, stayed = moved + answer, stayed + (not answer)
     assert moved > 10 and stayed > 10

@@ -28,7 +28,7 @@ def with_times(scene: Scene, times: torch.Tensor) -> Scene:
 
 
 def late(window: Window, seed: int) -> Window:
-    """Times of two units half a turn apart, with places of points as they were."""
+    """Times of two units half a turn apart, with positions of points as they were."""
     rng = np.random.default_rng(seed)
 
     def timed(sweep: Sweep) -> Sweep:
@@ -51,33 +51,35 @@ def test_motion_and_points_equal_the_oracle(num_past, num_future):
     scene = moving_scene(range(8), num_past, snap=1 / 16, speed=0.8, num_future=num_future)
     rng, num_steps = np.random.default_rng(num_past), num_past + num_future
     times = np.floor(rng.choice([-0.4, 0.1, 0.3], scene.sweeps.batch.image.numel()) * 2**20) / 2**20
-    place = np.array([*range(num_past), *range(-1, -1 - num_future, -1)])
-    times -= place[scene.sweeps.batch.image.numpy() % num_steps] * 0.125  # what is older was measured earlier
+    age = np.array([*range(num_past), *range(-1, -1 - num_future, -1)])
+    times -= age[scene.sweeps.batch.image.numpy() % num_steps] * 0.125  # what is older was measured earlier
     scene = with_times(scene, torch.from_numpy(times))
     points = scene.points()
     seen = register(points, scene.sweeps, scene.flow)
     found = register_deskewed(points, scene.sweeps, scene.flow, seen)
     sharp, drawn = deskew(points, scene.sweeps, seen)
-    assert len(sharp.owner) < len(points.owner), "some leave the region or meet another object"
+    assert len(sharp.object_id) < len(points.object_id), "some leave the region or meet another object"
     expected: list[oracle.RigidMotion] = []
-    places: list[tuple[int, ...]] = []
+    positions: list[tuple[int, ...]] = []
     stretched = 0
     for number, window in enumerate(scene.windows()):
         of_window = oracle.register(window.points(), window.flow, window.sweeps)
         stretch = oracle.stretch_of(window.points(), of_window, window.sweeps)
         stretched += sum(s not in (0.0, 1.0) for s in stretch)
         moved = oracle.deskew(window.points(), of_window, window.sweeps, window.config)
-        places += [(number, p.step, p.owner + len(expected), p.part, round(1e6 * p.x), round(1e6 * p.y)) for p in moved]
+        positions += [
+            (number, p.step, p.object_id + len(expected), p.layer, round(1e6 * p.x), round(1e6 * p.y)) for p in moved
+        ]
         expected += oracle.register_deskewed(window.points(), window.flow, of_window, window.sweeps, window.config)
     assert stretched > 10
     x, y = (torch.round(1e6 * values).long().tolist() for values in sharp.position[:2])
-    names = zip(sharp.window.tolist(), sharp.step.tolist(), sharp.owner.tolist(), sharp.part.tolist(), x, y)
-    assert sorted(names) == sorted(places)
+    names = zip(sharp.window.tolist(), sharp.step.tolist(), sharp.object_id.tolist(), sharp.layer.tolist(), x, y)
+    assert sorted(names) == sorted(positions)
     image = drawn.pixels.window * num_steps + drawn.pixels.step
-    place = (image * drawn.grid.height + drawn.pixels.row) * drawn.grid.width + drawn.pixels.col
-    assert torch.equal(place, drawn.pixels.index)
-    assert torch.equal(drawn.rank[place], torch.arange(1, len(place) + 1).int())
-    assert int((drawn.rank > 0).sum()) == len(place)
+    index = (image * drawn.grid.height + drawn.pixels.row) * drawn.grid.width + drawn.pixels.col
+    assert torch.equal(index, drawn.pixels.index)
+    assert torch.equal(drawn.rank[index], torch.arange(1, len(index) + 1).int())
+    assert int((drawn.rank > 0).sum()) == len(index)
     for name in ("flow", "rotation", "centre"):
         values = np.array([getattr(motion, name) for motion in expected])
         np.testing.assert_allclose(getattr(found, name), values.reshape(getattr(found, name).shape), atol=1e-6)

@@ -78,8 +78,8 @@ def test_what_meets_nothing_keeps_its_motion():
 
 def test_an_object_turns_about_its_centre_which_moves_with_it():
     """Of sweeps t+1, t and t-1 at a constant turn and speed: all pairs agree."""
-    angle, way = 0.04, (0.4, -0.2)
-    clouds = [sides(k * angle, k * way[0], k * way[1]) for k in (1, 0, -1)]
-    found = assert_equals_oracle(one_object(clouds, way))
-    assert (found.flow[0] - torch.tensor(way)).abs().max() < 2e-3
+    angle, shift = 0.04, (0.4, -0.2)
+    clouds = [sides(k * angle, k * shift[0], k * shift[1]) for k in (1, 0, -1)]
+    found = assert_equals_oracle(one_object(clouds, shift))
+    assert (found.flow[0] - torch.tensor(shift)).abs().max() < 2e-3
     assert abs(2 * math.atan(float(found.rotation[0])) - angle) < 0.1 * angle
