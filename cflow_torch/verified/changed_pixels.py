@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from cflow_torch.ops.chunks import chunks
-from cflow_torch.ops.indices import flat_nonzero, floor_divide, gather, scatter_count, split_index
-from cflow_torch.verified.height_slices import NUM_SLICES, SLICE_HEIGHT, HeightSlicedSweeps, slice_bits
+from cflow_torch.ops.indices import constant, flat_nonzero, floor_divide, gather, scatter_count, split_index
+from cflow_torch.verified.height_slices import NUM_SLICES, SLICE_HEIGHT, HeightSlicedSweeps
 
 # Range images: bins of about half a degree around, and of one degree up and down, half of them below level.
 _AZIMUTHS, _ELEVATIONS, _RISE = 720, 120, 1 / 57.3
@@ -69,7 +69,8 @@ def find_changed(sweeps: HeightSlicedSweeps) -> ChangedPixels:
 def _bits(missing: Tensor) -> tuple[Tensor, Tensor]:
     """The set bits of (P, S) uint8 masks: flat index of the mask and number of the bit, (K,) int64 each."""
     some = flat_nonzero(missing.bool())
-    entry, bit = slice_bits(missing.view(-1).index_select(0, some))
+    bits = missing.view(-1).index_select(0, some)[:, None] >> constant((0, 1, 2, 3), torch.uint8, missing.device)
+    entry, bit = split_index(flat_nonzero((bits & 1).bool()), NUM_SLICES)
     return some.index_select(0, entry), bit
 
 

@@ -254,12 +254,6 @@ def count_slices(slices: Tensor) -> Tensor:
     return (pairs & 3) + (pairs >> 2)
 
 
-def slice_bits(slices: Tensor) -> tuple[Tensor, Tensor]:
-    """The set bits of (K,) uint8 masks of slices: position of the mask and number of the bit, (L,) int64 each."""
-    bits = (slices[:, None] >> torch.arange(NUM_SLICES, dtype=torch.uint8, device=slices.device)) & 1
-    return split_index(flat_nonzero(bits.bool()), NUM_SLICES)
-
-
 def _slices(of_point: Tensor, height_slice: Tensor, num_pixels: int) -> Tensor:
     """(P,) uint8 masks of the slices, (N,) uint8, of the points of each pixel; a point of pixel P counts nowhere."""
     lanes = torch.zeros((num_pixels + 1) * NUM_SLICES, dtype=torch.bool, device=height_slice.device)

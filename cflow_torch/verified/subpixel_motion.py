@@ -8,12 +8,13 @@ must gain significantly by its shift to become a moving one. Registration finds 
 from __future__ import annotations
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.ops.indices import constant, flat_nonzero, gather, lookup, scatter_count
 from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import HeightSlicedSweeps, count_slices
-from cflow_torch.verified.voxel_centroids import UNITS, Voxels, meeting_weights, points_of_objects, whole
+from cflow_torch.verified.voxel_centroids import UNITS, Voxels, points_of_objects, whole
 
 _SIDES = ((0, 1), (1, -1), (1, 0), (1, 1))  # (dy, dx), a pixel ahead; the opposite is behind
 _BIAS_Z, _LEAST_BIAS = 3, 0.1  # a directional bias, standard deviations of noise, and as a share of the object's slices
@@ -101,7 +102,7 @@ def _significant_shift(voxels: Voxels, num_objects: int) -> Tensor:
     ahead = torch.view_as_real(voxels.position.index_select(0, near.view(-1)).view_as(near) - position).permute(2, 0, 1)
     ahead = ahead.clamp(-_BEYOND, _BEYOND).mul_((2 * step - 1).double())  # from t+1 all signs change
 
-    weights, shift = meeting_weights(_SIGMA, step.device), position.real.new_zeros((2, num_objects))
+    weights, shift = _meeting_weights(_SIGMA, step.device), position.real.new_zeros((2, num_objects))
     weight, error = _meet(ahead, weights)
     unshifted = weight
     for _ in range(_NUM_STEPS):
@@ -123,3 +124,16 @@ def _meet(ahead: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
     key = (x * x).add_(y * y).mul_(32).add_(slot).amin(0).long()
     weight = weights.index_select(0, (key >> 11).clamp_(max=2048))
     return weight, ahead.gather(1, (key & 31).expand(2, 1, -1))[:, 0]
+
+
+def _meeting_weights(sigma: float, device: torch.device) -> Tensor:
+    """(2049,) float64: weights exp(-d^2 / 2 sigma^2) of centroids that miss each other by d, whole 256ths.
+
+    Args:
+        sigma: metres.
+        device: where it is to lie.
+
+    Convention: entry i stands for d^2 from 64 i to 64 (i + 1) square units; the last one, 0, for all that is farther.
+    """
+    square = 64 * torch.arange(2048, dtype=torch.float64) + 32
+    return F.pad(whole(256 * torch.exp(square / (-2 * (sigma * UNITS) ** 2))) / 256, (0, 1)).to(device)

@@ -138,7 +138,8 @@ class Voxels:
         Cost: 27 lookups each.
         """
         voxel = self.around(sweep, layer, position, 1, 1)
-        square = square_of(self.position.index_select(0, voxel.view(-1)).view_as(voxel).sub_(position))
+        apart = self.position.index_select(0, voxel.view(-1)).view_as(voxel).sub_(position)
+        square = torch.view_as_real(apart).square_().sum(-1)
         square += (self.height.index_select(0, voxel.view(-1)).view_as(voxel) - height).square_()
         # The square and the slot in one number: its least is found several times faster than by argmin. In float64,
         # which holds these numbers exactly, many times faster than in int64.
@@ -177,21 +178,3 @@ def whole(x: Tensor) -> Tensor:
     if x.is_complex():
         return torch.view_as_complex(whole(torch.view_as_real(x)))
     return torch.floor(x + 0.5)
-
-
-def square_of(x: Tensor) -> Tensor:
-    """Squared length of complex numbers."""
-    return torch.view_as_real(x).square().sum(-1)
-
-
-def meeting_weights(sigma: float, device: torch.device) -> Tensor:
-    """(2049,) float64: weights exp(-d^2 / 2 sigma^2) of centroids that miss each other by d, whole 256ths.
-
-    Args:
-        sigma: metres.
-        device: where it is to lie.
-
-    Convention: entry i stands for d^2 from 64 i to 64 (i + 1) square units; the last one, 0, for all that is farther.
-    """
-    square = 64 * torch.arange(2048, dtype=torch.float64) + 32
-    return F.pad(whole(256 * torch.exp(square / (-2 * (sigma * UNITS) ** 2))) / 256, (0, 1)).to(device)

@@ -164,7 +164,7 @@ def test_ends_equal_the_oracle():
         assert not found[9]
         for number, answer in enumerate(found[:9].tolist()):
             window = int(sweeps.pixels.window[roots == number][0])
-            members = [tuple(place) for place in np.argwhere((number_of[window] == number) & (image[window] > 0)).tolist()]
+            members = [tuple(at) for at in np.argwhere((number_of[window] == number) & (image[window] > 0)).tolist()]
             assert answer == (bool(is_long[number]) and oracle.both_ends_move(for_oracle(sweeps, window), members))
             moved, stayed = moved + answer, stayed + (not answer)
     assert moved > 10 and stayed > 10
