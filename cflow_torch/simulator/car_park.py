@@ -10,7 +10,7 @@ import numpy as np
 from cflow_torch.simulator import objects
 from cflow_torch.simulator.ground import Ground
 from cflow_torch.simulator.objects import Body, Route
-from cflow_torch.simulator.scene import Scene, SolidTable
+from cflow_torch.simulator.scene import Scene
 from cflow_torch.simulator.street import EAST, NORTH, SOUTH, WEST
 
 HALF_SIZE = 55.0  # of the paved square, metres
@@ -29,7 +29,7 @@ def build_car_park(rng: np.random.Generator) -> Scene:
     radius = 5.5
     ego = Route(sum(FREE_X) / 2 + 1.5 - radius, -1.2, EAST, -7.0, rng.uniform(2.5, 4), radius, math.pi / 2)
     bodies = (*_cars(rng), *_people(rng), *_fixed(rng))
-    return Scene(ground, ego, bodies, SolidTable.of(bodies))
+    return Scene(ground, ego, bodies)
 
 
 def _cars(rng: np.random.Generator) -> Iterator[Body]:

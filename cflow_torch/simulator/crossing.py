@@ -10,7 +10,7 @@ import numpy as np
 from cflow_torch.simulator import objects
 from cflow_torch.simulator.ground import Ground
 from cflow_torch.simulator.objects import Body, Route
-from cflow_torch.simulator.scene import Scene, SolidTable
+from cflow_torch.simulator.scene import Scene
 from cflow_torch.simulator.street import EAST, NORTH, PAVEMENT, SOUTH, WEST, furniture, houses, lane
 
 HALF_WIDTH = 7.0  # of both streets, metres
@@ -29,7 +29,7 @@ def build_crossing(rng: np.random.Generator) -> Scene:
     else:  # from a rolling stop straight across
         ego = Route(-16.0, -1.75, EAST, speed=rng.uniform(3, 5), acceleration=rng.uniform(1.0, 2.0))
     bodies = (*_traffic(rng), *_people(rng), *_parked(rng), *houses(rng, ground), *furniture(rng, ground))
-    return Scene(ground, ego, bodies, SolidTable.of(bodies))
+    return Scene(ground, ego, bodies)
 
 
 def _traffic(rng: np.random.Generator) -> Iterator[Body]:

@@ -9,7 +9,7 @@ import numpy as np
 from cflow_torch.simulator import objects
 from cflow_torch.simulator.ground import Ground
 from cflow_torch.simulator.objects import Body, Route
-from cflow_torch.simulator.scene import Scene, SolidTable
+from cflow_torch.simulator.scene import Scene
 from cflow_torch.simulator.street import EAST, WEST
 
 LANES = (2.9, 6.6, 10.3)  # of the middles of the lanes from the median, fast lane first, metres
@@ -26,7 +26,7 @@ def build_highway(rng: np.random.Generator) -> Scene:
     speed = rng.uniform(22, 30)
     ego = Route(0.0, -LANES[1], EAST, speed=speed)
     bodies = (*_traffic(rng, speed), *_fixed(rng))
-    return Scene(ground, ego, bodies, SolidTable.of(bodies))
+    return Scene(ground, ego, bodies)
 
 
 def _traffic(rng: np.random.Generator, ego_speed: float) -> Iterator[Body]:

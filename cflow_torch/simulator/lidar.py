@@ -10,10 +10,9 @@ import torch
 from torch import Tensor
 
 from cflow_torch.simulator.ground import Ground
-from cflow_torch.simulator.moving_solids import MovingSolids
 from cflow_torch.simulator.range_image import RangeImage, cast_shots, cast_unit
 from cflow_torch.simulator.raycast import Solids, incidence
-from cflow_torch.simulator.rolling import Shots
+from cflow_torch.simulator.rolling import MovingSolids, Shots
 from cflow_torch.simulator.sensors import LidarProfile, SpinningLidar
 
 GROUND_ALBEDO = 0.25

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from cflow_torch.simulator.lidar import EgoMotion, Returns
-from cflow_torch.simulator.moving_solids import MovingSolids
+from cflow_torch.simulator.rolling import MovingSolids
 from cflow_torch.simulator.scene import Scene
 from cflow_torch.simulator.sensors import LidarProfile
 

@@ -9,7 +9,7 @@ import numpy as np
 from cflow_torch.simulator import objects
 from cflow_torch.simulator.ground import Ground
 from cflow_torch.simulator.objects import Body, Route
-from cflow_torch.simulator.scene import Scene, SolidTable
+from cflow_torch.simulator.scene import Scene
 from cflow_torch.simulator.street import EAST, NORTH, SOUTH, WEST
 
 HALF_WIDTH = 3.1  # metres
@@ -25,7 +25,7 @@ def build_narrow(rng: np.random.Generator) -> Scene:
     ground = Ground(slope, bend, kerb=0.1, half_widths=(HALF_WIDTH, 1.0), crossing_x=NOWHERE)
     ego = Route(0.0, -1.3, EAST, speed=rng.uniform(5, 8), acceleration=-rng.uniform(0.3, 0.8))
     bodies = (*_traffic(rng), *_people(rng), *_fixed(rng))
-    return Scene(ground, ego, bodies, SolidTable.of(bodies))
+    return Scene(ground, ego, bodies)
 
 
 def _traffic(rng: np.random.Generator) -> Iterator[Body]:

@@ -10,9 +10,8 @@ import torch
 from torch import Tensor
 
 from cflow_torch.simulator.ground import Ground
-from cflow_torch.simulator.moving_solids import MovingSolids
 from cflow_torch.simulator.raycast import Solids, cast_solids, nearest_hits, ray_directions, take
-from cflow_torch.simulator.rolling import RollingRays, Shots, covered_blocks
+from cflow_torch.simulator.rolling import MovingSolids, RollingRays, Shots, covered_blocks
 from cflow_torch.simulator.sensors import SpinningLidar
 
 

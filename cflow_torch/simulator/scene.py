@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Sequence
 
 import numpy as np
@@ -49,7 +50,6 @@ class Scene:
         ground: the ground.
         ego: route of the recording vehicle's rear axle.
         bodies: everything else.
-        table: the solids of the bodies.
         num_own: number of bodies, the last ones, that are the recording vehicle itself. They occlude other bodies, but
             have no returns.
     """
@@ -57,13 +57,16 @@ class Scene:
     ground: Ground
     ego: Route
     bodies: tuple[Body, ...]
-    table: SolidTable
     num_own: int = 0
+
+    @cached_property
+    def table(self) -> SolidTable:
+        """The solids of the bodies."""
+        return SolidTable.of(self.bodies)
 
     def with_own(self, own: Sequence[Body]) -> Scene:
         """The scene with the recording vehicle added."""
-        bodies = (*self.bodies, *own)
-        return Scene(self.ground, self.ego, bodies, SolidTable.of(bodies), len(own))
+        return Scene(self.ground, self.ego, (*self.bodies, *own), len(own))
 
     def body_poses(self, seconds: np.ndarray) -> np.ndarray:
         """(T, num_bodies, 4, 4) float64 `T_world_body` at `seconds` (T,)."""
@@ -74,8 +77,7 @@ class Scene:
         """The scene reduced to its moving bodies, and (P',) int64 index in this scene of each of its solids."""
         is_dynamic = np.array([not body.is_static for body in self.bodies])
         chosen = tuple(body for body, moves in zip(self.bodies, is_dynamic) if moves)
-        scene = Scene(self.ground, self.ego, chosen, SolidTable.of(chosen))
-        return scene, np.flatnonzero(is_dynamic[self.table.body])
+        return Scene(self.ground, self.ego, chosen), np.flatnonzero(is_dynamic[self.table.body])
 
     def solids(self, seconds: float, body_poses: np.ndarray) -> Solids:
         """All solids at one time.

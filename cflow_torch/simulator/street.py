@@ -14,7 +14,7 @@ import numpy as np
 from cflow_torch.simulator import objects
 from cflow_torch.simulator.ground import Ground
 from cflow_torch.simulator.objects import Body, Route
-from cflow_torch.simulator.scene import Scene, SolidTable
+from cflow_torch.simulator.scene import Scene
 
 EAST, NORTH, WEST, SOUTH = 0.0, math.pi / 2, math.pi, -math.pi / 2
 PAVEMENT = 4.0  # width, metres
@@ -29,7 +29,7 @@ def build_street(rng: np.random.Generator) -> Scene:
     # From lane y = -1.6 into lane x = crossing + 1.75; a metre before the bend at time 0.
     ego = Route(crossing - 16.25, -1.6, EAST, start=-1.0, speed=rng.uniform(5, 7), radius=18.0, angle=math.pi / 2)
     bodies = (*_traffic(rng, crossing), *_people(rng, crossing), *_parked(rng, ground), *_fixed(rng, ground))
-    return Scene(ground, ego, bodies, SolidTable.of(bodies))
+    return Scene(ground, ego, bodies)
 
 
 def lane(rng: np.random.Generator, y: float, heading: float, speed: float, *xs: float) -> Iterator[Body]:

@@ -41,7 +41,7 @@ from cflow_torch.simulator.drive import Drive
 from cflow_torch.simulator.ground import Ground
 from cflow_torch.simulator.objects import Route
 from cflow_torch.simulator.profiles import PROFILES
-from cflow_torch.simulator.scene import Scene, SolidTable
+from cflow_torch.simulator.scene import Scene
 
 DUFO = {"d_p 2": (0.1, 0.2, 2), "d_p 1": (0.1, 0.2, 1)}
 
@@ -76,7 +76,7 @@ def light(num_sweeps: int) -> SimulatedLog:
     )
     walls = (objects.wall(10, y, 60, 6, 8) for y in (12, -12))
     bodies = (*(objects.car(rng, route) for route in routes), *walls)
-    scene = Scene(Ground((0.0, 0.0), 0.0), Route(-6, 0, speed=2), bodies, SolidTable.of(bodies))
+    scene = Scene(Ground((0.0, 0.0), 0.0), Route(-6, 0, speed=2), bodies)
     log = SimulatedLog("av2", 0, "street", num_sweeps)
     log.drive = Drive(scene, PROFILES["av2"], 0, num_sweeps, "light")
     return log

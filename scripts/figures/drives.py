@@ -17,7 +17,7 @@ from cflow_torch.simulator.ground import Ground
 from cflow_torch.simulator.objects import Body, Route, Solid, box
 from cflow_torch.simulator.profiles import PROFILES
 from cflow_torch.simulator.raycast import CYLINDER
-from cflow_torch.simulator.scene import Scene, SolidTable
+from cflow_torch.simulator.scene import Scene
 
 PAIR, NUM_SWEEPS = 5, 11  # sweep t, so that four older ones exist, and four after t+1
 FLAT = Ground((0.0, 0.0), 0.0, kerb=0.0, half_widths=(1e4, 1.0), crossing_x=1e5)
@@ -49,7 +49,7 @@ def drive_past(
     bodies: Sequence[Body], seed: int, *, ground: Ground = FLAT, profile: str = "av2", speed: float = 5, **route: float
 ) -> Drive:
     """A drive past bodies, straight ahead unless `route` has other arguments of `Route`."""
-    scene = Scene(ground, Route(0, 0, speed=speed, **route), tuple(bodies), SolidTable.of(tuple(bodies)))
+    scene = Scene(ground, Route(0, 0, speed=speed, **route), tuple(bodies))
     return Drive(scene, PROFILES[profile], seed, NUM_SWEEPS, "failure")
 
 

@@ -18,7 +18,7 @@ from cflow_torch.simulator.profiles import PROFILES
 from cflow_torch.simulator.range_image import cast_shots
 from cflow_torch.simulator.raycast import BOX, CYLINDER, ELLIPSOID, Solids, cast_solids, ray_directions
 from cflow_torch.simulator.rolling import Shots
-from cflow_torch.simulator.scene import Scene, SolidTable
+from cflow_torch.simulator.scene import Scene
 from cflow_torch.types import CFlowError
 
 
@@ -92,7 +92,7 @@ def test_rolling_shots_equal_brute_force(name):
     """Test every ray at its own time against every solid, with the poses of LiDAR and solids at that time."""
     street = SCENES["street"](np.random.default_rng([3, 0]))
     bodies = tuple(body for body in street.bodies if body.category or len(body.solids) < 5)[:90]
-    scene = Scene(street.ground, street.ego, bodies, SolidTable.of(bodies))
+    scene = Scene(street.ground, street.ego, bodies)
     drive = Drive(scene, PROFILES[name], 0, 2, "small")
     seconds = float(drive._seconds[1])
     ego, solids = drive._motion.ego_motion(seconds), drive._motion.solids(1)

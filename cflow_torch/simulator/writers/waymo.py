@@ -15,11 +15,20 @@ import pyarrow.parquet as pq
 
 from cflow_torch.data.categories import META_CLASSES
 from cflow_torch.data.names import safe_name
-from cflow_torch.data.waymo.parquet import BOX, LASER, LIDAR, PIXEL_POSE, SEGMENT, TIME, TRACK, VEHICLE_POSE
+from cflow_torch.data.waymo.parquet import (
+    BOX,
+    CALIBRATION,
+    LASER,
+    LIDAR,
+    PIXEL_POSE,
+    SEGMENT,
+    TIME,
+    TRACK,
+    VEHICLE_POSE,
+)
 from cflow_torch.data.waymo.range_image import LASERS, TOP, LaserCalibration
 from cflow_torch.simulator.recording import Recording, UnitReturns
 from cflow_torch.simulator.writers.waymo_encoding import encode_images, poses_of_shots, true_poses_of_shots
-from cflow_torch.simulator.writers.waymo_schemas import SCHEMAS
 from cflow_torch.types import CFlowError
 
 BOX_TYPE: dict[str, int] = {
@@ -32,6 +41,42 @@ BOX_TYPE: dict[str, int] = {
 del BOX_TYPE["RAILED_VEHICLE"]
 
 _XYZ = ("x", "y", "z")
+# Component -> the columns that the reader reads, as the official classes print them.
+_IMAGE, _SHAPE, _TRANSFORM = pa.list_(pa.float32()), pa.list_(pa.int32(), 3), pa.list_(pa.float64(), 16)
+_FRAME_KEYS: list[tuple[str, Any]] = [(SEGMENT, pa.string()), (TIME, pa.int64())]
+SCHEMAS: dict[str, pa.Schema] = {
+    "lidar": pa.schema(
+        [
+            *_FRAME_KEYS,
+            (LASER, pa.int8()),
+            *((f"{LIDAR}{k}.{part}", kind) for k in (1, 2) for part, kind in (("values", _IMAGE), ("shape", _SHAPE))),
+        ]
+    ),
+    "lidar_calibration": pa.schema(
+        [
+            (SEGMENT, pa.string()),
+            (LASER, pa.int8()),
+            (f"{CALIBRATION}extrinsic.transform", _TRANSFORM),
+            (f"{CALIBRATION}beam_inclination.min", pa.float64()),
+            (f"{CALIBRATION}beam_inclination.max", pa.float64()),
+            (f"{CALIBRATION}beam_inclination.values", pa.list_(pa.float64())),
+        ]
+    ),
+    "lidar_pose": pa.schema(
+        [*_FRAME_KEYS, (LASER, pa.int8()), (f"{PIXEL_POSE}.values", _IMAGE), (f"{PIXEL_POSE}.shape", _SHAPE)]
+    ),
+    "vehicle_pose": pa.schema([*_FRAME_KEYS, (VEHICLE_POSE, _TRANSFORM)]),
+    "lidar_box": pa.schema(
+        [
+            *_FRAME_KEYS,
+            (TRACK, pa.string()),
+            *((f"{BOX}box.{part}.{axis}", pa.float64()) for part in ("center", "size") for axis in "xyz"),
+            (f"{BOX}box.heading", pa.float64()),
+            (f"{BOX}type", pa.int8()),
+            (f"{BOX}num_lidar_points_in_box", pa.int64()),
+        ]
+    ),
+}
 
 
 def write_waymo_segment(log: Recording, root: str | Path) -> Path:
