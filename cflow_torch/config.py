@@ -334,10 +334,10 @@ def _known(kind: type[Config], overrides: dict[str, Any]) -> dict[str, Any]:
     for name in unknown:
         if name in REMOVED:
             raise CFlowError(f"setting {name} was removed: {REMOVED[name]}")
-        owners = [method for method, other in CONFIGS.items() if name in (f.name for f in fields(other))]
-        if owners:
+        methods = [method for method, other in CONFIGS.items() if name in (f.name for f in fields(other))]
+        if methods:
             raise CFlowError(
-                f"{name} is a setting of method {' and '.join(owners)}, not of {fields(kind)[0].default}: "
+                f"{name} is a setting of method {' and '.join(methods)}, not of {fields(kind)[0].default}: "
                 "leave it out, or choose another preset"
             )
     if unknown:

@@ -152,11 +152,11 @@ class SceneFlowModel(nn.Module):
         grid, device = self.grid(self.config.pixel_sizes[-1]), choose_device(windows, self.device)
         results: list[FlowResult] = []
         with torch.autocast(device.type, enabled=False):  # counts would lose bits
-            for part in split_windows(windows, grid, device, self.bytes_per_point, self.config.max_memory):
+            for some in split_windows(windows, grid, device, self.bytes_per_point, self.config.max_memory):
                 with torch.inference_mode():  # a tenth faster than no_grad: the work is many small operations
                     with stage("compensate"):
                         batch = make_batch(
-                            part, self.config, grid, device, self.num_axes, self.needs_ground, self.needs_times
+                            some, self.config, grid, device, self.num_axes, self.needs_ground, self.needs_times
                         )
                     motion = self.motion(batch)
                 with stage("spread"):  # outside of inference mode: a training loop may use these tensors

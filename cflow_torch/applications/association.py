@@ -1,4 +1,4 @@
-"""Associate the tracks of a drive with the moving groups and the static points of its next sweep."""
+"""Associate tracks with the moving groups and the static points of the next sweep, by shared voxels and by boxes."""
 
 from __future__ import annotations
 
@@ -7,15 +7,17 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from cflow_torch.applications.linking import box_of_point, link
 from cflow_torch.applications.moving_groups import MIN_POINTS, MovingGroups
 from cflow_torch.applications.track_state import Tracks
 from cflow_torch.ops.indices import lookup
+from cflow_torch.ops.segments import first_of_segment
 
 _MIN_SHARE = 0.1  # of common voxels, for a match of two groups
 _MIN_CLAIM = 0.5  # of a track's points, which must lie in its box for a claim on a group that holds several objects
 _MIN_STOPPED_SHARE = 0.3  # of a track's points, which must lie in its box for the object to have stopped there
 _MARGIN = 0.2  # metres by which that box is larger
+VOXELS = (0.3, 0.6, 1.2)  # metres; a group of few points shares no small voxel with itself in the next sweep
+_HEIGHT = 3.0  # of a voxel, in sides: the beams meet an object at other heights in each sweep
 
 
 class Matches(NamedTuple):
@@ -41,17 +43,17 @@ def divide(groups: MovingGroups, tracks: Tracks) -> MovingGroups:
     (group, box), pair_of_point, count = torch.unique(pairs, dim=1, return_inverse=True, return_counts=True)
     least = lookup(_MIN_CLAIM * tracks.num_points[known], torch.where(box < 0, len(known), box), torch.inf)
     claims = count >= least
-    part = torch.where(claims, box + 1, 0)
-    last = torch.zeros_like(groups.count).scatter_reduce(0, group, part, "amax")
+    piece = torch.where(claims, box + 1, 0)
+    last = torch.zeros_like(groups.count).scatter_reduce(0, group, piece, "amax")
     is_divided = torch.bincount(group[claims], minlength=len(groups.count)) > 1
-    part = torch.where(is_divided[group], torch.where(claims, part, last[group]), 0)
-    return groups.divide(part[pair_of_point])
+    piece = torch.where(is_divided[group], torch.where(claims, piece, last[group]), 0)
+    return groups.divide(piece[pair_of_point])
 
 
-def match(tracks: Tracks, points: Tensor, owner: Tensor, groups: MovingGroups) -> Matches:
+def match(tracks: Tracks, points: Tensor, track_of_point: Tensor, groups: MovingGroups) -> Matches:
     """Match tracks, with (P, 3) points and the track of each, to the moving groups and static points of a sweep."""
     moves = groups.group >= 0
-    track, group = link(points, owner, groups.point[moves], groups.group[moves], _MIN_SHARE)
+    track, group = link(points, track_of_point, groups.point[moves], groups.group[moves], _MIN_SHARE)
     may_have_stopped = tracks.is_confirmed.clone()
     may_have_stopped[track] = False
     candidate = may_have_stopped.nonzero()[:, 0]
@@ -62,3 +64,116 @@ def match(tracks: Tracks, points: Tensor, owner: Tensor, groups: MovingGroups) -
     track_of_box = torch.where(has_stopped, candidate, -1)
     track_of_static = lookup(track_of_box, torch.where(box < 0, len(candidate), box), -1)
     return Matches(track, group, candidate[has_stopped], count[has_stopped], track_of_static)
+
+
+def link(points0: Tensor, group0: Tensor, points1: Tensor, group1: Tensor, min_share: float) -> tuple[Tensor, Tensor]:
+    """Match groups of two sweeps that overlap, one to one: in small voxels, and what remains in larger ones.
+
+    Args and Returns: as `link_in_voxels`.
+    """
+    earlier, current = (torch.zeros(0, dtype=torch.int64, device=points0.device) for _ in range(2))
+    for side in VOXELS:
+        rest0, rest1 = ~torch.isin(group0, earlier), ~torch.isin(group1, current)
+        more = link_in_voxels(points0[rest0], group0[rest0], points1[rest1], group1[rest1], min_share, side)
+        earlier, current = torch.cat([earlier, more[0]]), torch.cat([current, more[1]])
+    return earlier, current
+
+
+def link_in_voxels(
+    points0: Tensor, group0: Tensor, points1: Tensor, group1: Tensor, min_share: float, side: float
+) -> tuple[Tensor, Tensor]:
+    """Match groups of two sweeps that share voxels, one to one.
+
+    Args:
+        points0: (N0, 3) float64, metres: points of the earlier groups, moved to where they should be now.
+        group0: (N0,) int64, group of each, from 0.
+        points1, group1: (N1, 3) and (N1,), the groups of the current sweep, in the same frame.
+        min_share: least overlap of a match: common voxels over the voxels of either group (intersection over union).
+        side: of a voxel, metres.
+
+    Returns:
+        (K,) int64 earlier groups and (K,) int64 current groups.
+
+    Convention:
+        Greedy, the largest overlap first. Ties: the smaller earlier group, then the smaller current one.
+
+    Cost: three sorts of the points, and as many rounds as it takes to match all groups, mostly two or three.
+    """
+    voxel0, voxel1 = _voxels(points0, points1, side)
+    own0, size0 = _distinct(group0, voxel0)
+    own1, size1 = _distinct(group1, voxel1)
+    own1 = own1[:, own1[1].argsort(stable=True)]
+    begin, end = (torch.searchsorted(own1[1], own0[1].contiguous(), right=right) for right in (False, True))
+    count = end - begin
+    first = count.cumsum(0) - count
+    row = torch.arange(int(count.sum()), device=count.device) + (begin - first).repeat_interleave(count)
+    pairs = torch.stack([own0[0].repeat_interleave(count), own1[0].index_select(0, row)])
+    pairs, shared = torch.unique(pairs, dim=1, return_counts=True)
+    share = shared / (size0[pairs[0]] + size1[pairs[1]] - shared)
+    order = share.argsort(descending=True, stable=True)
+    earlier, current = pairs[:, order[share[order] >= min_share]]
+    matches = [pairs[:, :0]]
+    while earlier.numel():  # take all pairs that are the best of both their groups, then go on with the other groups
+        position = torch.arange(len(earlier), device=earlier.device)
+        is_best = (first_of_segment(earlier, int(earlier.max()) + 1) == position) & (
+            first_of_segment(current, int(current.max()) + 1) == position
+        )
+        matches.append(torch.stack([earlier[is_best], current[is_best]]))
+        is_left = ~(torch.isin(earlier, earlier[is_best]) | torch.isin(current, current[is_best]))
+        earlier, current = earlier[is_left], current[is_left]
+    matched = torch.cat(matches, 1)
+    return matched[0], matched[1]
+
+
+def box_of_point(points: Tensor, centre: Tensor, size: Tensor, heading: Tensor) -> Tensor:
+    """(N,) int64 index of the first box that holds each point, -1 = none.
+
+    Args:
+        points: (N, 3) float64, metres.
+        centre, size: (K, 3) metres; size is length along the heading, width, height.
+        heading: (K,) radians from +x.
+
+    Cost: K * N comparisons.
+    """
+    none = torch.full((len(points),), -1, device=points.device)
+    if not len(centre) or not len(points):
+        return none
+    offset = points[None] - centre[:, None]
+    along, across = rotate(offset[..., 0], offset[..., 1], -heading[:, None])
+    is_inside = (along.abs() <= size[:, None, 0] / 2) & (across.abs() <= size[:, None, 1] / 2)
+    is_inside &= offset[..., 2].abs() <= size[:, None, 2] / 2
+    return torch.where(is_inside.any(0), is_inside.to(torch.uint8).argmax(0), none)
+
+
+def boxes(points: Tensor, group: Tensor, heading: Tensor) -> tuple[Tensor, Tensor]:
+    """Centre and size, (K, 3) float64 each, of the upright boxes along `heading` (K,) around groups (N,) of points.
+
+    No group may be empty.
+    """
+    along, across = rotate(points[:, 0], points[:, 1], -heading[group])
+    local = torch.stack([along, across, points[:, 2]], 1)
+    index, extremes = group[:, None].expand(-1, 3), local.new_zeros(len(heading), 3)
+    low = extremes.scatter_reduce(0, index, local, "amin", include_self=False)
+    high = extremes.scatter_reduce(0, index, local, "amax", include_self=False)
+    middle = (low + high) / 2
+    return torch.stack([*rotate(middle[:, 0], middle[:, 1], heading), middle[:, 2]], 1), high - low
+
+
+def rotate(x: Tensor, y: Tensor, angle: Tensor) -> tuple[Tensor, Tensor]:
+    """x, y rotated by `angle` radians to the left."""
+    cos, sin = angle.cos(), angle.sin()
+    return cos * x - sin * y, sin * x + cos * y
+
+
+def _voxels(points0: Tensor, points1: Tensor, side: float) -> tuple[Tensor, Tensor]:
+    """(N0,), (N1,) int64: index of the voxel of each point, shared by both sets."""
+    both = torch.cat([points0, points1])
+    voxel = (both / both.new_tensor((side, side, _HEIGHT * side))).floor().long()
+    index = torch.unique(voxel, dim=0, return_inverse=True)[1]
+    return index[: len(points0)], index[len(points0) :]
+
+
+def _distinct(group: Tensor, voxel: Tensor) -> tuple[Tensor, Tensor]:
+    """(2, V) int64 distinct pairs (group, voxel), sorted; number of voxels of each group."""
+    own = torch.unique(torch.stack([group, voxel]), dim=1)
+    return own, torch.bincount(own[0])

@@ -10,7 +10,7 @@ from typing import Any, Callable
 import numpy as np
 import torch
 
-from cflow_torch.applications.linking import box_of_point, boxes
+from cflow_torch.applications.association import box_of_point, boxes
 from cflow_torch.applications.moving_groups import MOVING
 from cflow_torch.applications.track_table import confirmed, join_tables
 from cflow_torch.applications.tracking import Tracker
@@ -204,7 +204,7 @@ def static_map(log: Log, voxel_size: float = 0.1) -> np.ndarray:
     if not voxel_size > 0:
         raise CFlowError(f"voxel_size={voxel_size}: give a positive length in metres")
     known: Any = np.zeros(0, np.int64)
-    parts: list[Any] = [np.zeros((0, 3))]
+    clouds: list[Any] = [np.zeros((0, 3))]
     origin: Any = None
     for index in range(len(log.timestamps)):
         sweep = log.sweep(index)
@@ -222,9 +222,9 @@ def static_map(log: Log, voxel_size: float = 0.1) -> np.ndarray:
         key, first = np.unique((voxel[:, 0] << 42) | (voxel[:, 1] << 21) | voxel[:, 2], return_index=True)
         position: Any = np.searchsorted(known, key)
         is_new = np.append(known, -1)[position] != key
-        parts.append(points[np.sort(first[is_new])])
+        clouds.append(points[np.sort(first[is_new])])
         known = np.insert(known, position[is_new], key[is_new])
-    return np.concatenate(parts)
+    return np.concatenate(clouds)
 
 
 def _inside(sweep: Sweep, centre: torch.Tensor, size: torch.Tensor, heading: torch.Tensor) -> np.ndarray:

@@ -61,10 +61,10 @@ class MovingGroups:
         groups = cls(row, point, step, group, cluster[is_large], count[is_large], count)
         return replace(groups, confidence=groups.mean(confidence[row][:, None])[:, 0])
 
-    def divide(self, part: Tensor) -> MovingGroups:
-        """Divide the groups by the index of a part, from 0, of each moving point; parts keep cluster and confidence."""
+    def divide(self, piece: Tensor) -> MovingGroups:
+        """Divide the groups by the index of a piece, from 0, of each moving point; they keep cluster and confidence."""
         moves = self.group >= 0
-        pairs = torch.stack([self.group[moves], part])
+        pairs = torch.stack([self.group[moves], piece])
         (origin, _), index, count = torch.unique(pairs, dim=1, return_inverse=True, return_counts=True)
         group = self.group.clone()
         group[moves] = index

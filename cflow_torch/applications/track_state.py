@@ -1,13 +1,12 @@
-"""State of the tracks of a drive."""
+"""State of the tracks of a drive, and the Kalman filter of their motion."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, Callable, NamedTuple
 
 import torch
 from torch import Tensor
-
-from cflow_torch.applications.kalman import States
 
 # A track is confirmed by the motion that it has shown: most groups that do not last are noise of the static world.
 _MIN_EVIDENCE = 2.0  # sum of the log-odds of its confidence
@@ -15,6 +14,45 @@ _NO_CONFIDENCE = 0.7  # log-odds of a method without confidence
 _THIN = 0.12  # metres; we do not trust narrower boxes: posts, and slices of fronts along which a shadow moves
 _MIN_TRAVEL, _MIN_TRAVEL_OF_LENGTH = 0.3, 0.1  # metres, and share of the length of its box: least net displacement
 _TRAVEL_FACTOR = 2.0  # largest factor between the net displacement of its box and that of its flow
+
+
+@dataclass(frozen=True)
+class States:
+    """States of K objects in a constant-velocity Kalman filter.
+
+    The noise is equal along all axes, so one 2x2 covariance of (position, velocity) serves all three.
+
+    Args:
+        position, velocity: (K, 3) float64, metres and m/s in the world.
+        covariance: (K, 2, 2) float64 of (position, velocity), for each axis.
+    """
+
+    position: Tensor
+    velocity: Tensor
+    covariance: Tensor
+
+    def predict(self, seconds: float, acceleration: float) -> States:
+        """States after `seconds`, in which each object has a constant random acceleration of the given standard
+        deviation, m/s²."""
+        transition = self.covariance.new_tensor([[1.0, seconds], [0.0, 1.0]])
+        push = self.covariance.new_tensor([seconds**2 / 2, seconds]) * acceleration
+        covariance = transition @ self.covariance @ transition.T + torch.outer(push, push)
+        return States(self.position + seconds * self.velocity, self.velocity, covariance)
+
+    def update(self, position: Tensor, velocity: Tensor, noise: Tensor) -> States:
+        """States after a measurement of position and velocity.
+
+        Args:
+            position, velocity: (K, 3) float64, measured.
+            noise: (K, 2) float64, standard deviations of the two, per axis.
+        """
+        residual = torch.stack([position - self.position, velocity - self.velocity], 1)  # (K, 2, 3)
+        spread = self.covariance + torch.diag_embed(noise**2)
+        gain = torch.linalg.solve(spread, self.covariance).transpose(1, 2)  # both are symmetric
+        change = gain @ residual
+        covariance = (torch.eye(2, dtype=gain.dtype, device=gain.device) - gain) @ self.covariance
+        covariance = (covariance + covariance.transpose(1, 2)) / 2  # symmetric despite rounding
+        return States(self.position + change[:, 0], self.velocity + change[:, 1], covariance)
 
 
 class Tracks(NamedTuple):

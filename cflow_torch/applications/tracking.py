@@ -8,8 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cflow_torch.applications.association import Matches, divide, match
-from cflow_torch.applications.linking import boxes
+from cflow_torch.applications.association import Matches, boxes, divide, match
 from cflow_torch.applications.moving_groups import MOVING, MovingGroups
 from cflow_torch.applications.track_state import Tracks
 from cflow_torch.applications.track_table import confirmed, join_tables
@@ -68,7 +67,7 @@ class Tracker:
         self._num_sweeps, self._num_tracks = 0, 0
         self._tracks = Tracks.none(torch.device("cpu"))
         # Points of the tracks, where the next sweep should have them, and the track of each.
-        self._points, self._owner = torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, dtype=torch.int64)
+        self._points, self._track_index = torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, dtype=torch.int64)
 
     def push(self, sweeps: Window | tuple[Sweep, Sweep], result: FlowResult) -> Tracked:
         """Continue the tracks by one sweep.
@@ -89,9 +88,9 @@ class Tracker:
             raise CFlowError("tracks need residual flow, cluster_id and is_valid: `cflow flow` writes them by default")
         times = self._times(sweeps)
         groups = MovingGroups.of(sweeps, result)
-        tracks, points, owner = self._predict(groups.point.device, times)
+        tracks, points, track_index = self._predict(groups.point.device, times)
         groups = divide(groups, tracks)
-        matches = match(tracks, points, owner, groups)
+        matches = match(tracks, points, track_index, groups)
         flow = groups.mean(groups.step)
         tracks, track_of_group = self._update(tracks, groups, flow, matches, times)
 
@@ -101,19 +100,19 @@ class Tracker:
         track_of_point[~moves] = matches.track_of_static
         has_track = track_of_point >= 0
         track_of_point = track_of_point[has_track]
-        track_id = torch.full((len(result.residual_flow),), -1, device=owner.device)
+        track_id = torch.full((len(result.residual_flow),), -1, device=track_index.device)
         track_id[groups.row[has_track]] = tracks.id[track_of_point]
 
         # Move everything to the next sweep: moving points by their own flow, all others by the velocity of their track.
         step = tracks.velocity * times.interval
         step[track_of_group] = flow
-        is_missing = tracks.missed[owner] > 0
-        missing = points[is_missing] + step[owner[is_missing]]
+        is_missing = tracks.missed[track_index] > 0
+        missing = points[is_missing] + step[track_index[is_missing]]
         seen = groups.point[has_track]
         seen = seen + torch.where(moves[has_track, None], groups.step[has_track], step[track_of_point])
         table = self._table(tracks, times.now, sweeps.pc0.timestamp_ns)
-        owner = torch.cat([owner[is_missing], track_of_point])
-        self._keep(tracks._replace(box=tracks.box + step), torch.cat([missing, seen]), owner)
+        track_index = torch.cat([track_index[is_missing], track_of_point])
+        self._keep(tracks._replace(box=tracks.box + step), torch.cat([missing, seen]), track_index)
         self._num_sweeps += 1
         return Tracked(table, track_id.cpu().numpy())
 
@@ -136,10 +135,10 @@ class Tracker:
         Boxes and points are already where the last flow brings them. If the sweep is late, they move on by velocity.
         """
         tracks = self._tracks.map(lambda values: values.to(device))
-        points, owner = self._points.to(device), self._owner.to(device)
-        points = points + times.late * tracks.velocity[owner]
+        points, track_index = self._points.to(device), self._track_index.to(device)
+        points = points + times.late * tracks.velocity[track_index]
         states = tracks.states().predict(times.elapsed, _ACCELERATION)
-        return tracks._replace(box=tracks.box + times.late * tracks.velocity, **vars(states)), points, owner
+        return tracks._replace(box=tracks.box + times.late * tracks.velocity, **vars(states)), points, track_index
 
     def _update(
         self, tracks: Tracks, groups: MovingGroups, flow: Tensor, matches: Matches, times: _Times
@@ -216,12 +215,12 @@ class Tracker:
             "confidence": rows.confidence,
         }
 
-    def _keep(self, tracks: Tracks, points: Tensor, owner: Tensor) -> None:
+    def _keep(self, tracks: Tracks, points: Tensor, track_index: Tensor) -> None:
         """Store the tracks, without those that have not been seen for too long."""
         is_kept = tracks.missed <= _MAX_MISSED
-        owner = torch.where(is_kept, is_kept.cumsum(0) - 1, -1)[owner]
+        track_index = torch.where(is_kept, is_kept.cumsum(0) - 1, -1)[track_index]
         self._tracks = tracks.take(is_kept)
-        self._points, self._owner = points[owner >= 0], owner[owner >= 0]
+        self._points, self._track_index = points[track_index >= 0], track_index[track_index >= 0]
 
 
 def track(

@@ -36,8 +36,7 @@ from typing import Any, Callable, NamedTuple, Sequence
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
-from cflow_torch.applications.track_table import TRACKS_FILE, read_tracks, write_tracks
-from cflow_torch.applications.track_text import write_kitti, write_mot
+from cflow_torch.applications.track_table import TRACKS_FILE, read_tracks, write_kitti, write_mot, write_tracks
 from cflow_torch.applications.tracking import track
 from cflow_torch.cli import run
 from cflow_torch.cli.run import Failures, Sources

@@ -103,7 +103,7 @@ def _check_model(preset: str, given: dict[str, str]) -> None:
 def _read(text: str) -> Any:
     """Read a number, a word, null or a list of them as Hydra does; `ValueError` for everything else."""
     if text.startswith("[") and text.endswith("]"):
-        return [_read(part.strip()) for part in text[1:-1].split(",")]
+        return [_read(word.strip()) for word in text[1:-1].split(",")]
     if text == "null":
         return None
     if _NUMBER.fullmatch(text):

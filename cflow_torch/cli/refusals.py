@@ -61,9 +61,9 @@ def unknown_setting(key: str, method: str | None, command: str) -> str:
         except CFlowError as error:
             if not str(error).startswith("unknown"):
                 return str(error)
-    owners = [f"picture={file.stem}" for file in files("picture") if key in own_settings(file)]
-    if command == "plot" and owners:
-        return f"setting {key!r} belongs to {' or '.join(owners)}: give that as well, or leave the setting out"
+    pictures = [f"picture={file.stem}" for file in files("picture") if key in own_settings(file)]
+    if command == "plot" and pictures:
+        return f"setting {key!r} belongs to {' or '.join(pictures)}: give that as well, or leave the setting out"
     if name in _REMOVED:
         return f"setting {name} was removed: {_REMOVED[name]}"
     known = [*groups(command), *settings(command)]

@@ -133,7 +133,7 @@ def _about(name: str) -> list[str]:
         if name in (key, key.rpartition(".")[2]):
             chosen.setdefault(f"{key}: {meaning}", {}).setdefault(default, []).append(where)
     for head, defaults in chosen.items():
-        lines = [f"  default {default}: {', '.join(places)}" for default, places in defaults.items()]
+        lines = [f"  default {default}: {', '.join(names)}" for default, names in defaults.items()]
         found.append("\n".join([head, *lines]))
     if not found:
         known = [key for key, *_ in _entries()] + [one for names, _ in _sections() for one in names]

@@ -39,9 +39,9 @@ def _flow_so_far(batch: Batch, flow: Tensor | None, motion: Motion) -> Tensor:
     """(A, P) float64, metres per sweep interval: sum of the flow over the scales, for every point before t+1."""
     total = torch.empty_like(batch.positions) if flow is None else flow
     for points in chunks(batch.num_newest, len(batch.image), batch.image.device):
-        part, cluster = total[:, points], motion.cluster(points)
+        of_chunk, cluster = total[:, points], motion.cluster(points)
         if flow is None:
-            motion.flow_of(cluster, out=part)
+            motion.flow_of(cluster, out=of_chunk)
         else:
-            part += motion.flow_of(cluster, out=torch.empty_like(part))
+            of_chunk += motion.flow_of(cluster, out=torch.empty_like(of_chunk))
     return total

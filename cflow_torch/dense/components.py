@@ -77,8 +77,8 @@ def components_by_size(
         closed = pad([close_3x3_kornia(alone[:, :height, :width])])
     else:
         closed = close_3x3(alone, height, width)
-    part, num_parts = _components(closed, indices, 1, config)
-    return torch.where(oversized, part.add_(count), component), count + num_parts
+    piece, num_pieces = _components(closed, indices, 1, config)
+    return torch.where(oversized, piece.add_(count), component), count + num_pieces
 
 
 def _components(padded: Tensor, indices: PixelIndices, reach: int, config: ClusteringConfig) -> tuple[Tensor, int]:

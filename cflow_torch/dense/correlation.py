@@ -221,7 +221,7 @@ def _best_of_each_pair(
     Convention: ties as in `best_shifts`.
     """
     # Cheap bounds of the energy leave few candidates. Division rounds monotonically, so no winner is lost.
-    parts = [windows.bounds(target[part], shift[:, part]) for part in chunks(0, len(pair), pair.device, 16)]
+    parts = [windows.bounds(target[some], shift[:, some]) for some in chunks(0, len(pair), pair.device, 16)]
     least, most = (torch.cat(bounds) for bounds in zip(*parts)) if parts else (count, count)
     square = (count * count).double()
     bound = square.new_zeros(num_pairs).scatter_reduce_(0, pair, square / most, "amax")

@@ -48,20 +48,20 @@ def find_dense_clusters(sweeps: ProjectedSweeps, config: DenseConfig) -> tuple[C
     # Occupied pixels, once per label and sweep.
     member = (label >= 0).nonzero()[:, 0]
     key = torch.unique(label[member] * num_cells + pixel[member])
-    owner, image, raster = key // num_cells, key % num_cells // area, key % area
+    label_of_pixel, image, raster = key // num_cells, key % num_cells // area, key % area
     step = image % batch.num_steps
     steps_seen = torch.zeros((num_labels, batch.num_steps), dtype=torch.bool, device=key.device)
-    steps_seen[owner, step] = True
+    steps_seen[label_of_pixel, step] = True
     kept = (steps_seen[:, 0] & steps_seen[:, 1:].any(1)).nonzero()[:, 0]
     # Labels ascend with the window.
-    first = segment_amin(raster + image // batch.num_steps * area, owner, num_labels, num_cells)
+    first = segment_amin(raster + image // batch.num_steps * area, label_of_pixel, num_labels, num_cells)
     kept = kept[first[kept].argsort(stable=True)]
     cluster_of_label = renumber(kept, num_labels)
 
-    is_kept = cluster_of_label[owner] < len(kept)
-    owner, step, raster = cluster_of_label[owner[is_kept]], step[is_kept], raster[is_kept]
-    pixels = Pixels(owner, step, raster // grid.width, raster % grid.width)
-    boxes = bounding_boxes(pixels.row, pixels.col, owner, len(kept))
+    is_kept = cluster_of_label[label_of_pixel] < len(kept)
+    label_of_pixel, step, raster = cluster_of_label[label_of_pixel[is_kept]], step[is_kept], raster[is_kept]
+    pixels = Pixels(label_of_pixel, step, raster // grid.width, raster % grid.width)
+    boxes = bounding_boxes(pixels.row, pixels.col, label_of_pixel, len(kept))
     clusters = Clusters(first[kept] // area, *boxes, pixels)
     return clusters, cluster_of_label[label], torch.arange(len(label), device=label.device)
 

@@ -51,8 +51,8 @@ class SceneFlowMetrics:
                 has none.
         """
         scored = score_points(frame, self.definition)
-        for part in self.parts.values():
-            part.update_points(scored)
+        for metric in self.parts.values():
+            metric.update_points(scored)
         self.num_frames += 1
         self.num_points += len(scored.error)
         self.num_nan += scored.num_nan
@@ -63,8 +63,8 @@ class SceneFlowMetrics:
         Raises:
             CFlowError: the definitions differ.
         """
-        for part, another in zip(self.parts.values(), other.parts.values()):
-            part.merge(another)
+        for metric, another in zip(self.parts.values(), other.parts.values()):
+            metric.merge(another)
         self.num_frames += other.num_frames
         self.num_points += other.num_points
         self.num_nan += other.num_nan
@@ -79,7 +79,7 @@ class SceneFlowMetrics:
             "num_frames": self.num_frames,
             "num_points": self.num_points,
             "num_nan": self.num_nan,
-            **{name: part.compute() for name, part in self.parts.items()},
+            **{name: metric.compute() for name, metric in self.parts.items()},
         }
 
 

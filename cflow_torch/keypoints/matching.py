@@ -157,8 +157,8 @@ def _contenders(
 def _join(parts: Iterable[tuple[Tensor, ...]], enough: int) -> Iterator[tuple[Tensor, ...]]:
     """Concatenate consecutive parts until each result has `enough` elements."""
     waiting: list[tuple[Tensor, ...]] = []
-    for part in parts:
-        waiting.append(part)
+    for one in parts:
+        waiting.append(one)
         if sum(len(values) for values, *_ in waiting) >= enough:
             yield tuple(map(torch.cat, zip(*waiting)))
             waiting = []

@@ -78,7 +78,7 @@ def scan(
         T_world_ego: (4, 4) float64.
         generator: source of noise, drop-out and the azimuth at which the sweep begins.
     """
-    parts, first_laser = [], 0
+    of_units, first_laser = [], 0
     T_solid_ego = torch.linalg.inv(solids.pose) @ T_world_ego
     for number, unit in enumerate(profile.units):
         step = 2 * math.pi / unit.num_columns
@@ -97,9 +97,9 @@ def scan(
         column = hit // len(unit.elevations)
         column = column if unit.span > 0 else unit.num_columns - 1 - column
         offset_ns = torch.zeros_like(column)
-        parts.append(_returns(points, local, image, hit, reflected, unit, (number, first_laser), column, offset_ns))
+        of_units.append(_returns(points, local, image, hit, reflected, unit, (number, first_laser), column, offset_ns))
         first_laser += len(unit.elevations)
-    return _concatenate(parts)
+    return _concatenate(of_units)
 
 
 def scan_rolling(
@@ -114,7 +114,7 @@ def scan_rolling(
         ego: motion of the vehicle.
         generator: source of noise, drop-out and the azimuth at which the sweep begins.
     """
-    parts, first_laser = [], 0
+    of_units, first_laser = [], 0
     for number, unit in enumerate(profile.units):
         first, end = unit.active_columns or (0, unit.num_columns)
         step = math.radians(unit.span) / unit.num_columns
@@ -152,11 +152,11 @@ def scan_rolling(
         interval_ns = profile.sweep_interval_ns / unit.num_columns
         offset_ns = ((column + first).double() * interval_ns - profile.reference * profile.sweep_interval_ns).round()
         image_column = (column + first) % unit.num_columns
-        parts.append(
+        of_units.append(
             _returns(points, local, image, hit, reflected, unit, (number, first_laser), image_column, offset_ns)
         )
         first_laser += len(unit.elevations)
-    return _concatenate(parts)
+    return _concatenate(of_units)
 
 
 def _measure(
@@ -229,5 +229,5 @@ def _returns(
     )
 
 
-def _concatenate(parts: list[Returns]) -> Returns:
-    return Returns(*(torch.cat([getattr(part, column.name) for part in parts]) for column in fields(Returns)))
+def _concatenate(of_units: list[Returns]) -> Returns:
+    return Returns(*(torch.cat([getattr(returns, column.name) for returns in of_units]) for column in fields(Returns)))

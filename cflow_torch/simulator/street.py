@@ -54,8 +54,8 @@ def _traffic(rng: np.random.Generator, crossing: float) -> Iterator[Body]:
     yield from lane(rng, 1.6, WEST, 0.0, crossing + 14, crossing + 21.5, crossing + 29)
     yield from lane(rng, 4.6, WEST, 0.0, crossing + 14, crossing + 21.5)
     # Out of the cross street: a car turns right (west), an articulated truck turns right (east).
-    turn = {"radius": 9.0, "angle": -math.pi / 2}
-    route = Route(crossing - 1.75, 4.6 + 9.0, SOUTH, start=rng.uniform(0, 4), speed=rng.uniform(4, 6), **turn)
+    arc = {"radius": 9.0, "angle": -math.pi / 2}
+    route = Route(crossing - 1.75, 4.6 + 9.0, SOUTH, start=rng.uniform(0, 4), speed=rng.uniform(4, 6), **arc)
     yield objects.car(rng, route)
     route = Route(crossing + 1.75, -4.6 - 12, NORTH, rng.uniform(5, 10), rng.uniform(3, 5), 12.0, -math.pi / 2)
     yield from objects.articulated_truck(route)

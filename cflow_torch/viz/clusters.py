@@ -111,6 +111,6 @@ def _draw_sizes(axes: Axes, position: np.ndarray, has_one: np.ndarray, size: np.
     words = ("under 10", "10 to 99", "100 to 999", "1000 or more")
     counts, _ = np.histogram(size, bounds)
     columns = (("points in view", *words, "all"), ("clusters", *map(str, counts), str(len(size))))
-    look: Any = {"fontsize": 11, "color": style.INK, "va": "center", "linespacing": 1.5, "transform": box.transAxes}
+    font: Any = {"fontsize": 11, "color": style.INK, "va": "center", "linespacing": 1.5, "transform": box.transAxes}
     for x, side, column in zip((0.06, 0.94), ("left", "right"), columns):
-        box.text(x, 0.5, "\n".join(column), ha=side, **look)
+        box.text(x, 0.5, "\n".join(column), ha=side, **font)

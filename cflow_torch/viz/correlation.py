@@ -100,8 +100,8 @@ def _draw_map(axes: Axes, colors: Axes, found: ClusterCorrelation) -> None:
     low_y, low_x = -(height // 2) - 0.5, -(width // 2) - 0.5
     axes.set_facecolor("#d5d9de")
     extent = (low_x, low_x + width, low_y, low_y + height)
-    look: Any = {"origin": "lower", "interpolation": "nearest", "aspect": "auto"}
-    image = axes.imshow(found.ncc, extent=extent, cmap=_COLORMAP, vmin=0, **look)
+    options: Any = {"origin": "lower", "interpolation": "nearest", "aspect": "auto"}
+    image = axes.imshow(found.ncc, extent=extent, cmap=_COLORMAP, vmin=0, **options)
     dy, dx = found.shift
     axes.plot(0, 0, "+", color="white", markersize=9, markeredgewidth=1.2)
     axes.plot(dx, dy, "o", markersize=13, markeredgewidth=2.2, markerfacecolor="none", markeredgecolor=_PEAK)

@@ -94,7 +94,7 @@ def _draw_matches(axes: Axes, found: KeyPointMatches, low: np.ndarray, high: np.
     axes.add_collection(LineCollection(lines, colors=style.INK, linewidths=1.9, alpha=0.5, zorder=4))
     axes.add_collection(LineCollection(lines, colors=color[moves], linewidths=1.1, zorder=5))
     axes.scatter(end[moves, 0], end[moves, 1], s=14, c=color[moves], linewidths=0.6, edgecolors=style.INK, zorder=6)
-    along = np.concatenate([start + part * flow for part in np.linspace(0, 1, _ALONG)])
+    along = np.concatenate([start + share * flow for share in np.linspace(0, 1, _ALONG)])
     style.draw_wheel(axes, along, np.tile(moves, _ALONG), max_flow)
 
 

@@ -117,10 +117,10 @@ def draw_scale(axes: Axes) -> None:
     inches, metres = inches_of(axes), np.diff([axes.get_xlim(), axes.get_ylim()])[:, 0]
     x, y = np.array([axes.get_xlim()[0], axes.get_ylim()[0]]) + 0.25 * metres / inches
     length = round_length(metres[0] / 6)
-    look: Any = {"color": INK, "zorder": 8, "path_effects": [withStroke(linewidth=8, foreground="white")]}
-    axes.plot([x, x + length], [y, y], linewidth=4, solid_capstyle="butt", **look)
+    options: Any = {"color": INK, "zorder": 8, "path_effects": [withStroke(linewidth=8, foreground="white")]}
+    axes.plot([x, x + length], [y, y], linewidth=4, solid_capstyle="butt", **options)
     above = y + 0.08 * metres[1] / inches[1]
-    axes.text(x + length / 2, above, f"{length:g} m", fontsize=12, ha="center", va="bottom", **look)
+    axes.text(x + length / 2, above, f"{length:g} m", fontsize=12, ha="center", va="bottom", **options)
 
 
 def legend_box(

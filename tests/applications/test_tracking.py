@@ -11,10 +11,9 @@ import torch
 from staged_cars import Staged, straight
 
 from cflow_torch import CFlowError, FlowResult, Sweep, Tracker, Window, track
-from cflow_torch.applications.kalman import States
-from cflow_torch.applications.linking import VOXELS, box_of_point, boxes, link
-from cflow_torch.applications.track_table import join_tables, read_tracks, write_tracks
-from cflow_torch.applications.track_text import write_kitti, write_mot
+from cflow_torch.applications.association import VOXELS, box_of_point, boxes, link
+from cflow_torch.applications.track_state import States
+from cflow_torch.applications.track_table import join_tables, read_tracks, write_kitti, write_mot, write_tracks
 
 
 def ids_of(log: Staged, table: dict[str, np.ndarray], car: int) -> list[int]:

@@ -100,7 +100,7 @@ def _open_archive(path: Path) -> dict[str, Callable[[], bytes]]:
         return {
             name.as_posix(): partial(read_bytes, file)
             for name, file in files.items()
-            if not any(part.startswith(".") for part in name.parts)
+            if not any(folder.startswith(".") for folder in name.parts)
         }
     if not path.is_file():
         raise CFlowError(f"{path} does not exist: give a zip, or the folder that it is made from")

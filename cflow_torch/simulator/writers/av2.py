@@ -88,7 +88,7 @@ def _write_log(log: Recording, folder: Path) -> None:
         folder / "calibration" / "egovehicle_SE3_sensor.feather",
         {"sensor_name": list(log.calibration), **_pose_columns(np.stack(list(log.calibration.values())))},
     )
-    columns = {name: np.concatenate([part[name] for part in annotations]) for name in annotations[0]}
+    columns = {name: np.concatenate([table[name] for table in annotations]) for name in annotations[0]}
     _write_feather(folder / "annotations.feather", columns)
     _write_map(folder / "map", log.log_id, log.ground_raster())
 

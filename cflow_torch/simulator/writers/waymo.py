@@ -49,7 +49,7 @@ SCHEMAS: dict[str, pa.Schema] = {
         [
             *_FRAME_KEYS,
             (LASER, pa.int8()),
-            *((f"{LIDAR}{k}.{part}", kind) for k in (1, 2) for part, kind in (("values", _IMAGE), ("shape", _SHAPE))),
+            *((f"{LIDAR}{k}.{name}", kind) for k in (1, 2) for name, kind in (("values", _IMAGE), ("shape", _SHAPE))),
         ]
     ),
     "lidar_calibration": pa.schema(
@@ -70,7 +70,7 @@ SCHEMAS: dict[str, pa.Schema] = {
         [
             *_FRAME_KEYS,
             (TRACK, pa.string()),
-            *((f"{BOX}box.{part}.{axis}", pa.float64()) for part in ("center", "size") for axis in "xyz"),
+            *((f"{BOX}box.{name}.{axis}", pa.float64()) for name in ("center", "size") for axis in "xyz"),
             (f"{BOX}box.heading", pa.float64()),
             (f"{BOX}type", pa.int8()),
             (f"{BOX}num_lidar_points_in_box", pa.int64()),
