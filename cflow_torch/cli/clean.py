@@ -28,7 +28,6 @@ from cflow_torch.data.arrays.cloud_file import KITTI_COLUMNS, SUFFIXES, write_cl
 from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.json_file import describe_changes
 from cflow_torch.data.log import Log
-from cflow_torch.data.paths import is_remote
 from cflow_torch.types import CFlowError, FlowResult
 from cflow_torch.viz.bev import save_picture
 from cflow_torch.viz.static_map import plot_map
@@ -36,9 +35,7 @@ from cflow_torch.viz.static_map import plot_map
 
 def task(cfg: DictConfig) -> None:
     """Run `cflow clean`."""
-    output = run.output_folder(cfg)
-    if is_remote(output):
-        raise CFlowError(f"output={output}: give a folder of this machine, and copy the logs from there")
+    output = run.local_folder(cfg)
     if cfg.suffix is not None and cfg.suffix not in SUFFIXES:
         raise CFlowError(f"suffix={cfg.suffix}: give one of {', '.join(SUFFIXES)}")
     if not cfg.voxel_size > 0:

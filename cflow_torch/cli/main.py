@@ -87,7 +87,7 @@ def _run(arguments: list[str]) -> None:
     try:
         if not has_settings:
             return import_module(f"cflow_torch.cli.{command}").task(rest)  # type: ignore[no-any-return]
-        from cflow_torch.cli.precheck import check_call
+        from cflow_torch.cli.arguments import check_call
 
         check_call(command, rest)
     except CFlowError as error:

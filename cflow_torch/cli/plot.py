@@ -32,7 +32,6 @@ from cflow_torch.applications.deskewing import deskew
 from cflow_torch.cli import run
 from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.log import CachedLog, Log, window
-from cflow_torch.data.paths import is_remote
 from cflow_torch.fleet.progress import frames as counted
 from cflow_torch.model import SceneFlowModel
 from cflow_torch.types import CFlowError, FlowResult, Window
@@ -50,9 +49,7 @@ _PAIR = 3  # default; some history precedes it
 
 def task(cfg: DictConfig) -> None:
     """Run `cflow plot`."""
-    output = run.output_folder(cfg)
-    if is_remote(output):
-        raise CFlowError(f"output={cfg.output}: give a folder of this machine, and copy the picture from there")
+    output = run.local_folder(cfg)
     blank_figure((1, 1), 100)  # fails now if matplotlib is missing, not after the work
     model = run.make_model(cfg)
     if cfg.picture == "animation":

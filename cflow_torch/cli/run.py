@@ -25,7 +25,7 @@ from cflow_torch.data.atomic import write_text
 from cflow_torch.data.catalog import AUTO, find_sources, find_user_sources, open_log, recognise
 from cflow_torch.data.flow_file import read_flow
 from cflow_torch.data.log import CachedLog, Log, window
-from cflow_torch.data.paths import as_path
+from cflow_torch.data.paths import as_path, is_remote
 from cflow_torch.fleet.manifest import frame_file
 from cflow_torch.fleet.progress import log_line
 from cflow_torch.model import SceneFlowModel
@@ -90,6 +90,18 @@ def output_folder(cfg: DictConfig) -> Path:
     if not is_sweep() or any(override.startswith("shard.index=") for override in HydraConfig.get().overrides.task):
         return folder
     return folder / HydraConfig.get().sweep.subdir
+
+
+def local_folder(cfg: DictConfig) -> Path:
+    """The output folder of a command that writes to this machine only.
+
+    Raises:
+        CFlowError: it is remote.
+    """
+    output = output_folder(cfg)
+    if is_remote(output):
+        raise CFlowError(f"output={output}: give a folder of this machine, and copy the files from there")
+    return output
 
 
 def complete_data(data: DictConfig) -> DictConfig:

@@ -29,7 +29,7 @@ from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.json_file import json_ready
 from cflow_torch.data.log import Log, window
 from cflow_torch.evaluation.submission.archive import check_submission, is_complete, pack, write_frame
-from cflow_torch.evaluation.submission.formats import Rounding, SubmissionVersion, encode, get_version
+from cflow_torch.evaluation.submission.formats import SubmissionVersion, encode, get_version
 from cflow_torch.evaluation.submission.frames import (
     Frame,
     MaskArchive,
@@ -114,7 +114,7 @@ def _write(
 ) -> Failures:
     """Estimate and write the frames that do not exist yet."""
     failures: Failures = []
-    rounding, config = Rounding(), model.config
+    largest, total, count, config = 0.0, 0.0, 0, model.config
     todo = [frame for frame, rows in plan if not is_complete(folder, frame.name, rows, version)]
 
     def read(frame: Frame) -> Window:
@@ -124,12 +124,13 @@ def _write(
         with run.collect_failures(failures, frame.name):
             sweeps, result = estimate()
             mask = point_mask(frame.log, frame.index, sweeps.pc0, masks) if version.is_masked else None
-            columns, lost = encode(version, result, sweeps.pc0.is_ground, mask)
+            columns, error = encode(version, result, sweeps.pc0.is_ground, mask)
             write_frame(folder, frame.name, columns)
-            rounding.add(lost)
+            largest, total, count = max(largest, error.max(initial=0.0)), total + error.sum(), count + len(error)
     print(f"frames written: {len(todo) - len(failures)}, already there: {len(plan) - len(todo)}")
-    if rounding.num_points:
-        print(f"float16 rounding of the new ones: {rounding}")
+    if count:
+        mean = total / count
+        print(f"float16 rounding of the new ones: largest {largest:.6f} m, mean {mean:.8f} m over {count:,} points")
     return failures
 
 

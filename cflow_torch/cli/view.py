@@ -31,7 +31,7 @@ from cflow_torch.cli import run
 from cflow_torch.cli.run import Failures
 from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.log import CachedLog, Log, window
-from cflow_torch.data.paths import as_path, is_remote
+from cflow_torch.data.paths import as_path
 from cflow_torch.fleet.progress import frames as counted
 from cflow_torch.types import CFlowError, FlowResult
 from cflow_torch.viz.page import load_k3d, save_page
@@ -45,9 +45,7 @@ def task(cfg: DictConfig) -> None:
     if cfg.format not in FORMATS:
         raise CFlowError(f"format={cfg.format}: give one of {', '.join(FORMATS)}")
     load_k3d() if cfg.format == "html" else load_rerun()  # fails now if it is missing, not after the work
-    output = run.output_folder(cfg)
-    if is_remote(output):
-        raise CFlowError(f"output={output}: give a folder of this machine, and copy the files from there")
+    output = run.local_folder(cfg)
     chosen = run.chosen_pairs(cfg, "data.")
     for name in ("max_flow", "voxel"):
         if cfg[name] is None or not 0 < cfg[name] < float("inf"):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from small_logs import SMALL_LOGS, write_small_log
 
-from cflow_torch.cli.arguments import for_hydra
+from cflow_torch.cli.arguments import split
 from cflow_torch.data.catalog import DATA_SETS, recognise
 from cflow_torch.data.flow_file import read_flow
 from cflow_torch.types import CFlowError
@@ -51,7 +51,7 @@ def test_an_unknown_or_ambiguous_format_is_an_error(tmp_path: Path) -> None:
 
 def test_a_path_by_itself_is_the_data_root() -> None:
     call = ["-m", "/a b/c", "model=paper,fast", "--config-dir", "conf", "-p", "model"]
-    assert for_hydra(call) == ['data.root="/a b/c"', "model=paper,fast", "-m", "--config-dir", "conf", "-p", "model"]
+    assert split(call) == (['data.root="/a b/c"', "model=paper,fast"], ["-m", "--config-dir", "conf", "-p", "model"])
 
 
 # ---------------------------------------------------------------- your own reader

@@ -13,10 +13,9 @@ from omegaconf import OmegaConf
 
 from cflow_torch import make_config
 from cflow_torch.cli import settings
-from cflow_torch.cli.arguments import for_hydra
+from cflow_torch.cli.arguments import check_call, split
 from cflow_torch.cli.choices import CONFIGS, groups
 from cflow_torch.cli.main import COMMANDS, HELP
-from cflow_torch.cli.precheck import check_call
 from cflow_torch.cli.run import make_model
 from cflow_torch.config import CONFIGS as METHODS
 from cflow_torch.config import PRESETS, REMOVED
@@ -123,15 +122,15 @@ def test_a_removed_setting_is_explained(setting: str, cflow: Cflow, capsys: pyte
     + ["a (1)", "x=y", "s3://bucket/a", "C:\\data", "50%", "a#b"],
 )
 def test_names_are_text_even_if_they_look_like_numbers(name: str) -> None:
-    read = OverridesParser.create().parse_overrides(for_hydra([f"log={name}", f"+data.root={name}", "pair=1"]))
+    read = OverridesParser.create().parse_overrides(split([f"log={name}", f"+data.root={name}", "pair=1"])[0])
     assert [override.value() for override in read] == [name, name, 1]
 
 
 def test_hydra_syntax_in_names_keeps_its_meaning(compose: Compose) -> None:
-    cfg = compose("plot", *for_hydra(["log=null", "output=${device}"]))
+    cfg = compose("plot", *split(["log=null", "output=${device}"])[0])
     assert cfg.log is None and cfg.output == "auto"
-    assert for_hydra(["-m", "log=1_0,b,2_0", "pair=1,2"]) == ['log="1_0",b,"2_0"', "pair=1,2", "-m"]
-    assert for_hydra(["log=choice(a,b)", "log='1_0'"]) == ["log=choice(a,b)", "log='1_0'"]
+    assert split(["-m", "log=1_0,b,2_0", "pair=1,2"]) == (['log="1_0",b,"2_0"', "pair=1,2"], ["-m"])
+    assert split(["log=choice(a,b)", "log='1_0'"])[0] == ["log=choice(a,b)", "log='1_0'"]
 
 
 # ---------------------------------------------------------------- cflow settings

@@ -55,34 +55,9 @@ def get_version(number: Any) -> SubmissionVersion:
     return VERSIONS[number]
 
 
-@dataclass
-class Rounding:
-    """Error of rounding to float16: lengths of the differences in metres.
-
-    Args:
-        largest: largest error of a point.
-        total: sum of the errors of all points.
-        num_points: number of points.
-    """
-
-    largest: float = 0.0
-    total: float = 0.0
-    num_points: int = 0
-
-    def add(self, other: Rounding) -> None:
-        """Include the points of another file."""
-        self.largest = max(self.largest, other.largest)
-        self.total += other.total
-        self.num_points += other.num_points
-
-    def __str__(self) -> str:
-        mean = self.total / max(self.num_points, 1)
-        return f"largest {self.largest:.6f} m, mean {mean:.8f} m over {self.num_points:,} points"
-
-
 def encode(
     version: SubmissionVersion, result: FlowResult, is_ground: Array | None = None, mask: np.ndarray | None = None
-) -> tuple[dict[str, np.ndarray], Rounding]:
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Convert the flow of one frame to the columns of its file.
 
     Args:
@@ -93,7 +68,7 @@ def encode(
 
     Returns:
         Columns by name, in the order of the format (flow in metres until the next sweep, float16; `is_dynamic` bool),
-        and the error of rounding to float16.
+        and (M,) float64, metres, the error of each row from rounding to float16.
 
     Convention:
         A residual flow is in the axes of t+1, as OpenSceneFlow writes it, and 0 for ground points. `is_dynamic` is
@@ -111,22 +86,22 @@ def encode(
         residual, flow = residual[keep], as_numpy(result.flow)[keep]
     else:
         flow = residual if is_ground is None else np.where(as_numpy(is_ground)[:, None], np.float32(0), residual)
-    half, rounding = to_half(flow)
+    half, error = to_half(flow)
     columns = {
         **{f"flow_t{axis}_m": half[:, i] for i, axis in enumerate("xyz")},
         "is_dynamic": np.linalg.norm(residual, axis=1) >= np.float32(DYNAMIC_THRESHOLD),
     }
-    return {name: columns[name] for name in version.columns}, rounding
+    return {name: columns[name] for name in version.columns}, error
 
 
-def to_half(flow: np.ndarray) -> tuple[np.ndarray, Rounding]:
+def to_half(flow: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Round a flow to float16.
 
     Args:
         flow: (M, 3) of any float type, metres.
 
     Returns:
-        (M, 3) float16, and the error of rounding.
+        (M, 3) float16, and (M,) float64, metres, the error of each row.
 
     Raises:
         CFlowError: a value is NaN, infinite, or larger than float16 can hold.
@@ -135,5 +110,4 @@ def to_half(flow: np.ndarray) -> tuple[np.ndarray, Rounding]:
     if bad.any():
         raise CFlowError(f"the flow of {bad.sum()} points is NaN, infinite or beyond float16 ({LARGEST:g} m)")
     half = flow.astype(np.float16)
-    error = np.linalg.norm(half.astype(np.float64) - flow.astype(np.float64), axis=1)
-    return half, Rounding(float(error.max(initial=0.0)), float(error.sum()), len(error))
+    return half, np.linalg.norm(half.astype(np.float64) - flow.astype(np.float64), axis=1)
