@@ -1,4 +1,4 @@
-"""demo, flow and eval as a user runs them: their output, and their errors."""
+"""demo, flow, eval and bench as a user runs them: their output, and their errors."""
 
 from __future__ import annotations
 
@@ -12,10 +12,12 @@ from typing import Any, Callable
 import numpy as np
 import pytest
 from omegaconf import OmegaConf
+from scenes import RANGE, scene
 from small_logs import write_small_log
 
-from cflow_torch import make_config
+from cflow_torch import make_config, make_model
 from cflow_torch.cli import estimates, run
+from cflow_torch.cli.bench import measure
 from cflow_torch.cli.comparison import summary
 from cflow_torch.cli.record import objective
 from cflow_torch.config import config_from
@@ -208,3 +210,25 @@ def test_worker_processes_give_the_results_of_one_process(
     one, two = records
     assert two["num_pairs"] == 2 and two["seconds_per_pair"]["pairs"] == one["seconds_per_pair"]["pairs"]
     assert all(one[key] == two[key] for key in ("results", "failures", "data"))
+
+
+def test_bench_measures_total_stages_and_batches() -> None:
+    model = make_model(make_config("paper", point_cloud_range=RANGE), "cpu")
+    report = measure(model, [scene(1), scene(2)], repeats=3, batches=[3])
+    seconds = report["seconds"]
+    assert seconds["pairs"] == 6 and 0 < seconds["min"] <= seconds["median"] <= seconds["max"]
+    assert set(seconds["stages"]) == {"compensate", "project", "cluster", "correlate", "pool", "spread"}
+    assert 0 < sum(seconds["stages"].values()) < 1.5 * seconds["max"]
+    batch = report["batches"][3]
+    assert batch["windows_per_s"] == pytest.approx(3 / batch["median"])
+    assert report["peak_bytes"] > 2**20
+
+
+def test_bench_writes_what_it_prints(tmp_path: Path, cflow: Cflow, capsys: Any) -> None:
+    data = ["data.num_sweeps=3", f"data.cache={tmp_path}", "model=paper", SMALL, "pairs=5", "repeats=1", "batches=[2]"]
+    assert cflow("bench", *data, f"output={tmp_path / 'out'}") == 0
+    report = json.loads((tmp_path / "out" / "bench.json").read_text())
+    assert report["windows"] == 2, "the log has two pairs"
+    assert report["model"]["method"] == "dense"
+    printed = capsys.readouterr().out
+    assert f"{1000 * report['seconds']['median']:.1f}" in printed and "windows per second" in printed

@@ -3,13 +3,25 @@
 from __future__ import annotations
 
 import math
+import sys
 
 import numpy as np
 import pytest
 import torch
-from scenes import assert_same, box, config, flow_as_oracle, needs_gpu, needs_kornia_labelling, pose, scene
+from oracle import reference_flow
+from scenes import (
+    assert_same,
+    assert_same_bits,
+    box,
+    config,
+    flow_as_oracle,
+    needs_gpu,
+    needs_kornia_labelling,
+    pose,
+    scene,
+)
 
-from cflow_torch import CorrelationFlow, Sweep, Window, estimate_flow, make_config
+from cflow_torch import CFlowError, CorrelationFlow, FlowResult, Sweep, Window, estimate_flow, make_config
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.hdf5.reader import HDF5Log
 from cflow_torch.data.log import window as window_of
@@ -226,3 +238,71 @@ def test_older_sweeps_are_warped_by_their_steps():
     window = Window(row_of_dots(11.5, 6), row_of_dots(18.5, 6), (row_of_dots(4.5, 6),))
     result = flow_as_oracle(window, TWO_SCALES.replace(num_history=1))
     assert result.residual_flow[:, 0].tolist() == [7.0] * 6 and result.score.tolist() == [1.0] * 6
+
+
+# ------------------------------------------------------------------------------- vertical motion, sectional view
+
+SECTIONAL = METRE.replace(sectional_view=True)
+
+
+def vertical(pc0: np.ndarray, pc1: np.ndarray, settings=SECTIONAL) -> FlowResult:
+    return flow_as_oracle(Window(Sweep(pc0), Sweep(pc1)), settings)
+
+
+@pytest.mark.parametrize("move", [(3, 4, 1), (-4, 3, -2), (0, 2, 1), (0, 0, 2), (3, 0, 0)])
+def test_a_vertical_move_is_found(move):
+    ell = np.array(
+        [(c + 0.5, r + 0.5, 0.5) for r, c in [(r, 10) for r in range(10, 22)] + [(21, c) for c in range(11, 22)]]
+    )
+    points = np.concatenate([ell + [0, 0, z] for z in range(6)])
+    result, flat = vertical(points, points + move), vertical(points, points + move, METRE)
+    np.testing.assert_allclose(result.residual_flow, np.tile(move, (len(points), 1)), atol=1e-6)
+    assert flat.residual_flow.tolist() == [[*map(float, move[:2]), 0.0]] * len(points)
+    assert torch.equal(flat.score, result.score)
+
+
+def test_motion_along_the_heading_is_corrected():
+    # 0.8 -> 1.2: the same BEV pixel, as its grid starts at -0.25; the grid of the section starts at 0.
+    settings = SECTIONAL.replace(point_cloud_range=(-0.25, 0.0, -math.inf, 20.0, 20.0, math.inf))
+    before = np.array([[0.8 + i, 5.5, 0.5] for i in range(4)])
+    after = before + [0.4, 0, 0]
+    assert vertical(before, after, settings).residual_flow.tolist() == [[1.0, 0.0, 0.0]] * 4
+    assert not vertical(before, after, settings.replace(sectional_view=False)).residual_flow.any()
+
+
+def test_a_point_far_above_is_refused_with_a_hint():
+    car = np.random.default_rng(0).uniform((5, 5, 0), (9, 7, 1.5), (300, 3))
+    car[7, 2] = 1e5
+    with pytest.raises(CFlowError, match="finite z bounds"):
+        CorrelationFlow(SECTIONAL)([Window(Sweep(car), Sweep(car + [2.0, 0.0, 0.0]))])
+
+
+# ------------------------------------------------------------------------------------------------------ HDBSCAN
+
+HDBSCAN = [
+    {"num_history": 2, "pixel_sizes": (0.5, 0.25)},
+    {"num_history": 1, "sectional_view": True, "max_speed": 5.0},
+]
+
+
+@pytest.mark.parametrize("overrides", HDBSCAN, ids=["scales", "sectional"])
+def test_hdbscan_equals_the_oracle_in_a_batch(overrides):
+    pytest.importorskip("hdbscan")
+    settings, nothing = config(clustering="hdbscan", min_cluster_size=8, **overrides), Sweep(np.zeros((0, 3)))
+    windows = [scene(seed, num_history=settings.num_history) for seed in range(2)] + [Window(nothing, nothing)]
+    model = CorrelationFlow(settings)
+    for window, result in zip(windows, model(windows)):
+        assert_same_bits(model([window])[0], result)
+        assert_same(result, reference_flow(window, settings))
+
+
+def test_too_few_points_form_no_hdbscan_cluster():
+    few = Sweep(np.random.default_rng(0).uniform(0, 1, (8, 3)))
+    (result,) = CorrelationFlow(config(clustering="hdbscan"))([Window(few, few)])
+    assert (result.cluster_id == -1).all() and result.is_valid.all()
+
+
+def test_a_missing_hdbscan_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "hdbscan", None)
+    with pytest.raises(CFlowError, match=r"pip install hdbscan"):
+        CorrelationFlow(config(clustering="hdbscan"))([scene(0)])

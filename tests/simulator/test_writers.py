@@ -1,8 +1,9 @@
-"""The Argoverse 2 writer, read back with pyarrow, and the Waymo writer where a turn begins."""
+"""The Argoverse 2 writer, read back with pyarrow, the Waymo writer where a turn begins, and drives that are cached."""
 
 from __future__ import annotations
 
 import os
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -11,8 +12,10 @@ from pyarrow import feather
 from scipy.spatial import cKDTree
 
 from cflow_torch.data.av2 import AV2Log
+from cflow_torch.data.log import window
 from cflow_torch.data.waymo import WaymoLog
-from cflow_torch.simulator import Drive, make_drive
+from cflow_torch.simulator import Drive, benchmark, make_drive
+from cflow_torch.simulator.benchmark import benchmark_logs
 from cflow_torch.simulator.writers import waymo_encoding
 from cflow_torch.simulator.writers.av2 import write_av2_log
 from cflow_torch.simulator.writers.waymo import write_waymo_segment
@@ -102,3 +105,30 @@ def test_waymo_writes_true_poses_where_a_turn_begins(tmp_path, monkeypatch):
     for index in used:
         stored, read = drive.sweep(index).points, log.sweep(index).points
         assert len(stored) == len(read) and cKDTree(read).query(stored)[0].max() < 1e-4
+
+
+# ---------------------------------------------------------------------------------------------- cached drives
+
+
+def test_a_drive_is_made_once(tmp_path, monkeypatch):
+    first = benchmark_logs(tmp_path, "demo", [1, 2], 3)
+    drive, log = make_drive(seed=2, num_sweeps=3, profile="demo"), AV2Log(first[1])
+    assert log.log_id == drive.log_id and list(log.timestamps) == list(drive.timestamps)
+    np.testing.assert_array_equal(window(log, 1).pc0.points, drive.sweep(1).points.astype(np.float16))
+    stamps = {file: file.stat().st_mtime_ns for file in tmp_path.rglob("*.feather")}
+    (first[0].parent / ".making-x" / "synthetic-demo-0003").mkdir(parents=True)  # left over from a run that was killed
+    again = benchmark_logs(tmp_path, "demo", [1, 2, 3], 3)
+    assert again[:2] == first and len(list(again[2].rglob("*.feather"))) > 3
+    assert {file: file.stat().st_mtime_ns for file in stamps} == stamps
+    with pytest.raises(CFlowError, match="profile"):
+        benchmark_logs(tmp_path, "none", [1], 3)
+
+
+def test_a_changed_generator_makes_new_drives(tmp_path, monkeypatch):
+    shutil.copytree(benchmark._HERE, tmp_path / "code")
+    key = benchmark.generator_key()
+    monkeypatch.setattr(benchmark, "_HERE", tmp_path / "code")
+    assert benchmark.generator_key() == key
+    file = tmp_path / "code" / "street.py"
+    file.write_bytes(file.read_bytes() + b"\n")
+    assert benchmark.generator_key() != key

@@ -1,4 +1,4 @@
-"""Bird's-eye pictures of flow and clusters: positions, colours, legends, and the saved file."""
+"""Bird's-eye pictures of flow and clusters: positions, colours, legends, and the saved file; the colour wheel."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from cflow_torch import CFlowError, FlowResult
-from cflow_torch.viz import flow_to_rgb, panel, plot_clusters, plot_flow, plot_map, save_picture
+from cflow_torch.viz import flow_to_rgb, panel, plot_clusters, plot_flow, plot_map, save_picture, wheel_image
 from cflow_torch.viz.animation import Frame, flow_figures
 from cflow_torch.viz.clusters import PALETTE, cluster_colors
 
@@ -22,9 +22,9 @@ OPEN = (-np.inf,) * 3 + (np.inf,) * 3
 Scene = Tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
-def block(x: float, y: float, size: float = 3.0) -> np.ndarray:
-    """Square of points, 10 a metre, centred at (x, y)."""
-    axis = np.arange(-size / 2, size / 2, 0.1)
+def block(x: float, y: float, size: float = 3.0, step: float = 0.1) -> np.ndarray:
+    """Square of points every `step` metres, centred at (x, y)."""
+    axis = np.arange(-size / 2, size / 2, step)
     grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2) + (x, y)
     return np.column_stack([grid, np.ones(len(grid))])
 
@@ -99,7 +99,7 @@ def test_truth_adds_truth_and_error(scene: Scene) -> None:
 
 def test_a_map_is_coloured_by_height_and_the_highest_points_are_on_top() -> None:
     far = np.array([5e5, 4e6, 300.0])  # metres, as in UTM
-    low, high, above = block(0, 0, 30), block(20, 20, 9) + (0, 0, 8), block(10, -10, 3) + (0, 0, 8)
+    low, high, above = block(0, 0, 30, 0.14), block(20, 20, 9) + (0, 0, 8), block(10, -10) + (0, 0, 8)
     figure = plot_map(np.concatenate([above, low, high, [[np.nan] * 3]]) + far, "hill")
     at = [tuple(far[:2] + xy) for xy in ((0.0, 0.0), (20.0, 20.0), (10.0, -10.0), (-12.0, 22.0))]
     yellow, dark, covering, nothing = colors_at(figure, *at)
@@ -194,3 +194,28 @@ def test_a_saved_picture_is_the_picture(scene: Scene, tmp_path: Path) -> None:
     assert [file.name for file in path.parent.iterdir()] == ["flow.png"]
     with pytest.raises(CFlowError, match=r"does not end in \.png"):
         save_picture(figure, tmp_path / "flow.pdf")
+
+
+# ---------------------------------------------------------------------------------------------- colours of the wheel
+
+
+def test_axes_of_the_ego_frame() -> None:
+    # By hand: steps 0, 13.5, 27, 40.5 of 54. 13.5 / 15 of green is 229.5, a tie, hence one level either way.
+    expected = [(255, 0, 0), (255, 229.5, 0), (0, 255 - 255 * 2 / 11, 255), (255 * 4.5 / 13, 0, 255)]
+    rgb = flow_to_rgb(np.array([[1, 0], [0, 1], [-1, 0], [0, -1]]))
+    assert np.abs(rgb - np.array(expected)).max() <= 0.5 + 1e-9
+
+
+def test_saturation_follows_length() -> None:
+    red = flow_to_rgb(np.array([[0.0, 0], [0.25, 0], [0.5, 0], [1, 0], [2, 0]]), max_flow=1.0)
+    assert red.tolist() == [[255, 255, 255], [255, 191, 191], [255, 128, 128], [255, 0, 0], [128, 0, 0]]
+    assert (flow_to_rgb(np.array([[np.nan, 0.0], [np.inf, 1.0]])) == 255).all()
+
+
+def test_wheel_image_has_the_axes_of_the_picture() -> None:
+    image = wheel_image(101)
+    red, yellow = image[50, -2, :3].astype(int), image[1, 50, :3].astype(int)
+    assert red[0] == 255 and red[1:].max() < 15
+    assert yellow[:2].min() > 220 and yellow[2] < 15
+    assert (image[50, 50, :3] > 250).all()
+    assert image[0, 0, 3] == 0 and image[50, 50, 3] == 255
