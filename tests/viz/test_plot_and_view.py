@@ -62,7 +62,7 @@ def test_truth_is_residual_and_only_where_it_is_known(
 
     monkeypatch.setattr(plot_command, "plot_flow", spy)
     for truth in ("auto", "false"):
-        assert cflow("plot", "pair=1", "model=paper", f"truth={truth}") == 2
+        assert cflow("plot", "pair=1", "model=paper", SMALL, f"truth={truth}") == 2
     assert seen[1] is None
     log = AV2Log(drive / NAME)
     labels, sweeps = log.labels(1), window(log, 1)
@@ -72,7 +72,7 @@ def test_truth_is_residual_and_only_where_it_is_known(
     expected = np.where(labels.is_valid[:, None], labels.flow - pose_flow, np.nan)
     assert np.allclose(seen[0], expected, atol=1e-4, equal_nan=True) and np.nanmax(np.abs(expected)) > 0.3
     monkeypatch.setattr(AV2Log, "labels", lambda self, index: None)
-    assert cflow("plot", "pair=1", "model=paper", "truth=true") == 2 and "truth=true" in capsys.readouterr().err
+    assert cflow("plot", "pair=1", "model=paper", SMALL, "truth=true") == 2 and "truth=true" in capsys.readouterr().err
 
 
 def test_an_animation_has_a_picture_for_every_pair(
@@ -100,7 +100,7 @@ def test_an_animation_has_a_picture_for_every_pair(
 def test_a_picture_that_cannot_be_drawn_is_reported(
     arguments: list, message: str, cflow: Callable, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
-    assert cflow("plot", "pair=0", *arguments) == 2
+    assert cflow("plot", "pair=0", SMALL, *arguments) == 2
     error = capsys.readouterr().err
     assert message in error and "Traceback" not in error
     assert not [file for file in tmp_path.rglob("*") if file.is_file()]
