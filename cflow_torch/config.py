@@ -193,8 +193,8 @@ class VerifiedConfig(_WithHistory):
     method: str = _method("verified")
     num_future: int = setting(  # type: ignore[assignment]
         0,
-        "number of sweeps after t+1, for recordings: they decide the motion of objects that they show more than twice "
-        "as often as the sweeps before t do. The method then takes twice the time",
+        "number of sweeps after t+1, for recordings. They decide the motion of an object that is in them more than "
+        "twice as often as in the sweeps before t. The method then takes twice the time",
         low=0,
     )
     max_object_length: float | None = setting(

@@ -21,7 +21,7 @@ class CFlowWarning(UserWarning):
 
 
 class NoActivePoints(CFlowWarning):
-    """A window without a point that takes part, so its result is empty."""
+    """A window without an active point, so its result is empty."""
 
 
 def warn(text: str, category: type[CFlowWarning] = CFlowWarning) -> None:

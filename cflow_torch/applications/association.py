@@ -13,8 +13,8 @@ from cflow_torch.ops.indices import lookup
 from cflow_torch.ops.segments import first_of_segment
 
 _MIN_SHARE = 0.1  # of common voxels, for a match of two groups
-_MIN_CLAIM = 0.5  # of a track's points, which must lie in its box for a claim on a group that holds several objects
-_MIN_STOPPED_SHARE = 0.3  # of a track's points, which must lie in its box for the object to have stopped there
+_MIN_CLAIM = 0.5  # share of a track's points that a group has in its box, from which the track claims the group
+_MIN_STOPPED_SHARE = 0.3  # share of a track's points that lie in its box, from which its object has stopped there
 _MARGIN = 0.2  # metres by which that box is larger
 VOXELS = (0.3, 0.6, 1.2)  # metres; a group of few points shares no small voxel with itself in the next sweep
 _HEIGHT = 3.0  # of a voxel, in sides: the beams meet an object at other heights in each sweep

@@ -62,7 +62,11 @@ class MovingGroups:
         return replace(groups, confidence=groups.mean(confidence[row][:, None])[:, 0])
 
     def divide(self, piece: Tensor) -> MovingGroups:
-        """Divide the groups by the index of a piece, from 0, of each moving point; they keep cluster and confidence."""
+        """Divide the groups into pieces, which keep the cluster and the confidence of their group.
+
+        Args:
+            piece: for each moving point, the piece of its group that it belongs to, from 0.
+        """
         moves = self.group >= 0
         pairs = torch.stack([self.group[moves], piece])
         (origin, _), index, count = torch.unique(pairs, dim=1, return_inverse=True, return_counts=True)

@@ -28,7 +28,7 @@ class _Times(NamedTuple):
     now: float  # time of sweep t
     interval: float  # from t to t+1
     elapsed: float  # from the sweep before to t
-    late: float  # part of `elapsed` that the flow of the sweep before does not span
+    late: float  # from the end of the last flow to t; more than 0 if a sweep is missing
 
 
 class Tracked(NamedTuple):

@@ -12,7 +12,6 @@ examples:
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any, Callable
 
 from omegaconf import DictConfig
@@ -50,7 +49,9 @@ def task(cfg: DictConfig) -> None:
         scores.add(log, index, sweeps, result)
         results.append((index, result))
         if draws and index == cfg.pair:
-            picture = _draw(log, model, sweeps, result, output)
+            view: Any = {"is_ground": sweeps.pc0.is_ground, "point_cloud_range": model.config.point_cloud_range}
+            figure = plot_flow(sweeps.pc0.points, result, title=f"CorrelationFlow, {log.log_id}", **view)
+            picture = str(save_picture(figure, output / "flow.png"))
 
     for log in logs:
         remove_stale(output / log.log_id)
@@ -73,15 +74,3 @@ def _can(name: str, load: Callable[[], Any]) -> bool:
         print(f"no {name} ({error}); everything else is written")
         return False
     return True
-
-
-def _draw(log: Log, model: TimedModel, sweeps: Window, result: FlowResult, output: Path) -> str:
-    """Draw the flow of a pair; returns the file."""
-    figure = plot_flow(
-        sweeps.pc0.points,
-        result,
-        is_ground=sweeps.pc0.is_ground,
-        point_cloud_range=model.config.point_cloud_range,
-        title=f"CorrelationFlow, {log.log_id}",
-    )
-    return str(save_picture(figure, output / "flow.png"))

@@ -28,8 +28,15 @@ from cflow_torch.cli.run import Failures
 from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.json_file import json_ready
 from cflow_torch.data.log import Log, window
-from cflow_torch.evaluation.submission.archive import check_submission, is_complete, pack, write_frame
-from cflow_torch.evaluation.submission.formats import SubmissionVersion, encode, get_version
+from cflow_torch.evaluation.submission.archive import (
+    SubmissionVersion,
+    check_submission,
+    encode,
+    get_version,
+    is_complete,
+    pack,
+    write_frame,
+)
 from cflow_torch.evaluation.submission.frames import (
     Frame,
     MaskArchive,

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from cflow_torch.simulator.raycast import ELLIPSOID, Blocks, UnitRays, cosine_of_incidence, take
 
-_ROUNDS = 2  # that find the column which meets a solid, and the solid's pose then; each divides the error by 6 or more
+_ROUNDS = 2  # of finding the column whose shots meet a solid, and its pose then; each divides the error by 6 or more
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,8 @@ from cflow_torch.config import Config, make_config
 from cflow_torch.types import Window
 from cflow_torch.viz import style
 from cflow_torch.viz.bev import longest_flow
-from cflow_torch.viz.occupancy import sweep_marks
 from cflow_torch.viz.panel import MOVING
-from cflow_torch.viz.stages import KeyPointMatches, keypoint_matches
+from cflow_torch.viz.stages import KeyPointMatches, keypoint_matches, sweep_marks
 from cflow_torch.viz.wheel import flow_to_rgb
 
 if TYPE_CHECKING:

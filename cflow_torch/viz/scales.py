@@ -11,9 +11,8 @@ from cflow_torch.config import Config, make_config
 from cflow_torch.types import FlowResult, Window
 from cflow_torch.viz import style
 from cflow_torch.viz.bev import longest_flow, point_rows, view_of
-from cflow_torch.viz.occupancy import sweep_marks
 from cflow_torch.viz.panel import FLOW_CAPTION, draw_flow
-from cflow_torch.viz.stages import Scale, choose_cluster, scales
+from cflow_torch.viz.stages import Scale, choose_cluster, scales, sweep_marks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -20,16 +20,8 @@ from cflow_torch import CFlowError, CorrelationFlow
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.hdf5.reader import HDF5Log
 from cflow_torch.data.log import window
-from cflow_torch.evaluation.submission import (
-    check_submission,
-    encode,
-    get_version,
-    pack,
-    plan_log,
-    write_frame,
-)
-from cflow_torch.evaluation.submission.formats import to_half
-from cflow_torch.evaluation.submission.frames import MaskArchive, point_mask, read_frame_list, require_logs
+from cflow_torch.evaluation.submission.archive import check_submission, encode, get_version, pack, to_half, write_frame
+from cflow_torch.evaluation.submission.frames import MaskArchive, plan_log, point_mask, read_frame_list, require_logs
 from cflow_torch.simulator import make_drive
 from cflow_torch.simulator.writers.av2 import write_av2_log
 

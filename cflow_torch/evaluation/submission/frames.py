@@ -16,7 +16,7 @@ from cflow_torch.data.files import file_errors
 from cflow_torch.data.log import Log
 from cflow_torch.data.names import is_timestamp, safe_name
 from cflow_torch.data.paths import read_bytes
-from cflow_torch.evaluation.submission.formats import SubmissionVersion
+from cflow_torch.evaluation.submission.archive import SubmissionVersion
 from cflow_torch.types import CFlowError, Sweep, as_numpy
 
 STRIDE = 5  # without masks, every fifth pair of a log is evaluated
