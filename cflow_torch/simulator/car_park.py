@@ -8,7 +8,7 @@ from typing import Iterator
 import numpy as np
 
 from cflow_torch.simulator import objects
-from cflow_torch.simulator.ground import Ground
+from cflow_torch.simulator.ground import NOWHERE, Ground
 from cflow_torch.simulator.objects import Body, Route
 from cflow_torch.simulator.scene import Scene
 from cflow_torch.simulator.street import EAST, NORTH, SOUTH, WEST
@@ -24,7 +24,7 @@ def build_car_park(rng: np.random.Generator) -> Scene:
     """Draw a scene from `rng`."""
     bend = float(rng.choice((-1, 1)) * rng.uniform(5e-5, 2e-4))
     slope = (rng.uniform(-0.02, 0.02), rng.uniform(-0.015, 0.015))
-    ground = Ground(slope, bend, kerb=0.12, half_widths=(HALF_SIZE, 1.0), crossing_x=1e5)
+    ground = Ground(slope, bend, kerb=0.12, half_widths=(HALF_SIZE, 1.0), crossing_x=NOWHERE)
     # Along the middle aisle, then a tight turn into the lane across the rows.
     radius = 5.5
     ego = Route(sum(FREE_X) / 2 + 1.5 - radius, -1.2, EAST, -7.0, rng.uniform(2.5, 4), radius, math.pi / 2)

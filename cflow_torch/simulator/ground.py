@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+NOWHERE = 1e5  # metres; the middle of a cross street that no ray reaches
 _BISECTIONS = 12  # between pavement level and road level: they find a kerb face to the millimetre
 
 

@@ -7,7 +7,7 @@ from typing import Iterator
 import numpy as np
 
 from cflow_torch.simulator import objects
-from cflow_torch.simulator.ground import Ground
+from cflow_torch.simulator.ground import NOWHERE, Ground
 from cflow_torch.simulator.objects import Body, Route
 from cflow_torch.simulator.scene import Scene
 from cflow_torch.simulator.street import EAST, WEST
@@ -15,7 +15,6 @@ from cflow_torch.simulator.street import EAST, WEST
 LANES = (2.9, 6.6, 10.3)  # of the middles of the lanes from the median, fast lane first, metres
 EDGE = 13.5  # where the grass begins
 REACH = 420.0  # how far the road is furnished, metres
-NOWHERE = 1e5  # where the other street of the ground is, metres
 
 
 def build_highway(rng: np.random.Generator) -> Scene:

@@ -78,7 +78,7 @@ def scan(
         T_world_ego: (4, 4) float64.
         generator: source of noise, drop-out and the azimuth at which the sweep begins.
     """
-    of_units, first_laser = [], 0
+    of_units = []
     T_solid_ego = torch.linalg.inv(solids.pose) @ T_world_ego
     for number, unit in enumerate(profile.units):
         step = 2 * math.pi / unit.num_columns
@@ -97,8 +97,7 @@ def scan(
         column = hit // len(unit.elevations)
         column = column if unit.span > 0 else unit.num_columns - 1 - column
         offset_ns = torch.zeros_like(column)
-        of_units.append(_returns(points, local, image, hit, reflected, unit, (number, first_laser), column, offset_ns))
-        first_laser += len(unit.elevations)
+        of_units.append(_returns(points, local, image, hit, reflected, profile, number, column, offset_ns))
     return _concatenate(of_units)
 
 
@@ -114,7 +113,7 @@ def scan_rolling(
         ego: motion of the vehicle.
         generator: source of noise, drop-out and the azimuth at which the sweep begins.
     """
-    of_units, first_laser = [], 0
+    of_units = []
     for number, unit in enumerate(profile.units):
         first, end = unit.active_columns or (0, unit.num_columns)
         step = math.radians(unit.span) / unit.num_columns
@@ -152,10 +151,7 @@ def scan_rolling(
         interval_ns = profile.sweep_interval_ns / unit.num_columns
         offset_ns = ((column + first).double() * interval_ns - profile.reference * profile.sweep_interval_ns).round()
         image_column = (column + first) % unit.num_columns
-        of_units.append(
-            _returns(points, local, image, hit, reflected, unit, (number, first_laser), image_column, offset_ns)
-        )
-        first_laser += len(unit.elevations)
+        of_units.append(_returns(points, local, image, hit, reflected, profile, number, image_column, offset_ns))
     return _concatenate(of_units)
 
 
@@ -208,21 +204,22 @@ def _returns(
     image: RangeImage,
     hit: Tensor,
     reflected: Tensor,
-    unit: SpinningLidar,
-    numbers: tuple[int, int],
+    profile: LidarProfile,
+    number: int,
     column: Tensor,
     offset_ns: Tensor,
 ) -> Returns:
-    """Returns of one unit; `numbers` are its index and the number of its first laser."""
+    """Returns of unit `number`."""
+    unit, first_laser = profile.units[number], sum(len(before.elevations) for before in profile.units[:number])
     laser = torch.tensor(unit.elevations, dtype=torch.float64).sort().indices
     beam = hit % len(unit.elevations)
     return Returns(
         points=points.T.contiguous(),
         solid=image.solid.index_select(0, hit),
         intensity=(255 * reflected).clamp(0, 255).to(torch.uint8),
-        laser_number=((numbers[1] + laser[beam]) % 256).to(torch.uint8),
+        laser_number=((first_laser + laser[beam]) % 256).to(torch.uint8),
         offset_ns=offset_ns.to(torch.int32),
-        unit=torch.full((len(hit),), numbers[0]),
+        unit=torch.full((len(hit),), number),
         local=local.T.contiguous(),
         ring=beam.to(torch.int32),
         column=column.to(torch.int32),

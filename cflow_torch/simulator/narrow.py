@@ -7,7 +7,7 @@ from typing import Iterator
 import numpy as np
 
 from cflow_torch.simulator import objects
-from cflow_torch.simulator.ground import Ground
+from cflow_torch.simulator.ground import NOWHERE, Ground
 from cflow_torch.simulator.objects import Body, Route
 from cflow_torch.simulator.scene import Scene
 from cflow_torch.simulator.street import EAST, NORTH, SOUTH, WEST
@@ -15,7 +15,6 @@ from cflow_torch.simulator.street import EAST, NORTH, SOUTH, WEST
 HALF_WIDTH = 3.1  # metres
 PAVEMENT = 1.5
 REACH = 90.0
-NOWHERE = 1e5  # where the other street of the ground is, metres
 
 
 def build_narrow(rng: np.random.Generator) -> Scene:

@@ -20,6 +20,7 @@ from cflow_torch.types import CFlowError
 
 # A PNG of one pixel: the devkit requires a map file, which it opens only to draw it.
 _BLACK_PIXEL = "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAAAAAA6fptVAAAACklEQVR4nGNgAAAAAgABSK+kcQAAAABJRU5ErkJggg=="
+_VERSION = "v1.0-mini"  # folder of the tables
 _VISIBILITY = ("v0-40", "v40-60", "v60-80", "v80-100")
 Table = List[Dict[str, Any]]
 NUSCENES_NAMES: dict[str, str] = {
@@ -35,18 +36,12 @@ NUSCENES_NAMES: dict[str, str] = {
 """Argoverse 2 category -> the nearest category of nuScenes in the same meta class."""
 
 
-def write_nuscenes(
-    recording: Recording,
-    root: str | Path,
-    version: str = "v1.0-mini",
-    key_frame_interval: float = 0.5,
-) -> Path:
+def write_nuscenes(recording: Recording, root: str | Path, key_frame_interval: float = 0.5) -> Path:
     """Write `recording` to `root/<log_id>`, a data root of nuScenes with one scene of that name.
 
     Args:
         recording: the recording. If none of its LiDARs is called LIDAR_TOP, the first one gets that name.
         root: folder, made if it does not exist.
-        version: name of the folder of the tables.
         key_frame_interval: seconds between samples; only samples have boxes. The first and the last sweep are samples,
             so that every pair has truth.
 
@@ -81,7 +76,7 @@ def write_nuscenes(
         tables["scene"][0]["log_token"] = log
         (folder / "maps").mkdir()
         (folder / image).write_bytes(b64decode(_BLACK_PIXEL))
-        write_tables(folder / version, tables)
+        write_tables(folder / _VERSION, tables)
     return Path(root) / recording.log_id
 
 
