@@ -21,7 +21,7 @@ from cflow_torch.windows.validation import check_windows, choose_device
 
 @dataclass(frozen=True)
 class Motion:
-    """Motion of M clusters of points. Entry M stands for "no cluster": motion 0, id -1, score 0.
+    """Motion of M clusters of points. Entry M means "no cluster": motion 0, id -1, score 0.
 
     Args:
         cluster_of_cell: (Q,) int32 or int64, cluster of each cell (a pixel of a sweep, or a point), M = none.
