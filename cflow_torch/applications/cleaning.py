@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from cflow_torch.applications.association import box_of_point, boxes
-from cflow_torch.applications.moving_groups import MOVING
+from cflow_torch.applications.moving_groups import MOVING, pose_of
 from cflow_torch.applications.track_table import confirmed, join_tables
 from cflow_torch.applications.tracking import Tracker
 from cflow_torch.config import make_config
@@ -140,7 +140,7 @@ class CleanLog(Log):
         """(N,) bool, points of the last sweep in a box that a moving cluster of the sweep before has reached."""
         result, moves = self._flow(index - 1), self._moves(index - 1)
         before = _world(self._log.sweep(index - 1))[moves]
-        step = as_numpy(result.residual_flow, np.float64)[moves] @ _pose(sweep)[:3, :3].T
+        step = as_numpy(result.residual_flow, np.float64)[moves] @ pose_of(sweep)[:3, :3].T
         clusters, group = np.unique(as_numpy(result.cluster_id)[moves], return_inverse=True)
         total = np.zeros((len(clusters), 3))
         np.add.at(total, group, step)
@@ -170,7 +170,7 @@ class CleanLog(Log):
         start = {name: values[first] for name, values in tracks.items()}
         for index in range(int(start["sweep"].max(initial=0))):
             sweep = self._log.sweep(index)
-            distance = np.hypot(*(start[axis] - _pose(sweep)[k, 3] for k, axis in enumerate("xy")))
+            distance = np.hypot(*(start[axis] - pose_of(sweep)[k, 3] for k, axis in enumerate("xy")))
             waits = (start["sweep"] > index) & (distance < _MAX_DISTANCE)
             centre, size = (
                 torch.from_numpy(np.stack([start[name][waits] for name in names], 1))
@@ -212,7 +212,7 @@ def static_map(log: Log, voxel_size: float = 0.1) -> np.ndarray:
             raise CFlowError(f"log {log.log_id} has no poses, and a map needs them: data.odometry=true estimates them")
         points = _world(sweep)
         points = points[np.isfinite(points).all(1)]
-        origin = np.floor(_pose(sweep)[:3, 3] / voxel_size) if origin is None else origin
+        origin = np.floor(pose_of(sweep)[:3, 3] / voxel_size) if origin is None else origin
         voxel = (np.floor(points / voxel_size) - origin).astype(np.int64) + _MAX_VOXELS
         if ((voxel < 0) | (voxel >= 2 * _MAX_VOXELS)).any():
             raise CFlowError(
@@ -235,9 +235,5 @@ def _inside(sweep: Sweep, centre: torch.Tensor, size: torch.Tensor, heading: tor
 
 def _world(sweep: Sweep) -> np.ndarray:
     """(N, 3) float64, points in the world."""
-    pose = _pose(sweep)
+    pose = pose_of(sweep)
     return as_numpy(sweep.points, np.float64)[:, :3] @ pose[:3, :3].T + pose[:3, 3]
-
-
-def _pose(sweep: Sweep) -> np.ndarray:
-    return np.eye(4) if sweep.pose is None else as_numpy(sweep.pose, np.float64)

@@ -14,7 +14,7 @@ from typing import Any, Callable, Iterable, Iterator, NamedTuple, Sequence
 
 import numpy as np
 
-from cflow_torch.applications.moving_groups import MOVING
+from cflow_torch.applications.moving_groups import MOVING, pose_of
 from cflow_torch.data.catalog import open_log
 from cflow_torch.data.hdf5.results import write_hdf5_labels
 from cflow_torch.data.log import CachedLog, Log, windows
@@ -171,19 +171,15 @@ def _dynamic_points(sweep: Sweep, other: Sweep, result: FlowResult) -> DynamicPo
     residual, group = as_numpy(result.residual_flow, np.float64), as_numpy(result.cluster_id)
     rows = np.flatnonzero((np.linalg.norm(residual, axis=1) >= MOVING) & (group >= 0))
     interval = _seconds(other) - _seconds(sweep)  # negative where the flow leads to the sweep before
-    velocity = residual[rows] @ _pose(other)[:3, :3].T / interval
+    velocity = residual[rows] @ pose_of(other)[:3, :3].T / interval
     confidence = as_numpy(result.confidence, np.float64)[rows]  # type: ignore[arg-type]  # checked before
-    positions = _transform(sweep, rows, _pose(sweep))
+    positions = _transform(sweep, rows, pose_of(sweep))
     return DynamicPoints(rows, positions, velocity, group[rows], confidence, _seconds(sweep))
 
 
 def _seconds(sweep: Sweep) -> float:
     """Time of a sweep, to 0.1 microseconds."""
     return float(sweep.timestamp_ns or 0) / 1e9
-
-
-def _pose(sweep: Sweep) -> np.ndarray:
-    return as_numpy(sweep.pose, np.float64)  # type: ignore[arg-type]  # HDF5 scenes have them
 
 
 def _transform(sweep: Sweep, rows: Any, transform: Any) -> np.ndarray:
@@ -225,7 +221,7 @@ def _number_groups(group: np.ndarray, moves: np.ndarray, is_ground: np.ndarray) 
 
 def _has_moved_by_nearest(tree: Callable[..., Any], sweep: Sweep, other: Sweep, workers: int) -> np.ndarray:
     """(N,) uint8 `nnd`; 0 for points that are not finite."""
-    points = _transform(sweep, slice(None), np.linalg.inv(_pose(other)) @ _pose(sweep))
+    points = _transform(sweep, slice(None), np.linalg.inv(pose_of(other)) @ pose_of(sweep))
     others = as_numpy(other.points)[:, :3].astype(np.float64)
     is_finite, nnd = np.isfinite(points).all(axis=1), np.zeros(len(points), np.uint8)
     nearest = tree(others[np.isfinite(others).all(axis=1)])

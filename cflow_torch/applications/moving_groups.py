@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from cflow_torch.types import CFlowError, FlowResult, Window, as_numpy
+from cflow_torch.types import CFlowError, FlowResult, Sweep, Window, as_numpy
 
 MOVING = 0.05  # metres per sweep: least residual flow of a moving point, as in evaluation
 MIN_POINTS = 5  # of a group
@@ -47,7 +46,7 @@ class MovingGroups:
         if len(points) != len(flow):
             raise CFlowError(f"the flow has {len(flow)} rows, its sweep {len(points)} points: give its own window")
         row = (result.is_valid & points.isfinite().all(1)).nonzero()[:, 0]
-        pose0, pose1 = (_pose(sweep.pose).to(flow.device) for sweep in (sweeps.pc0, sweeps.pc1))
+        pose0, pose1 = (torch.tensor(pose_of(sweep), device=flow.device) for sweep in (sweeps.pc0, sweeps.pc1))
         point, step = points[row] @ pose0[:3, :3].T + pose0[:3, 3], flow[row] @ pose1[:3, :3].T
         cluster_of_point = result.cluster_id[row]
         is_moving = (cluster_of_point >= 0) & (step.norm(dim=1) >= MOVING)
@@ -82,5 +81,6 @@ class MovingGroups:
         return total / self.count[:, None]
 
 
-def _pose(pose: Any) -> Tensor:
-    return torch.eye(4, dtype=torch.float64) if pose is None else torch.as_tensor(as_numpy(pose, np.float64).copy())
+def pose_of(sweep: Sweep) -> np.ndarray:
+    """(4, 4) float64 `T_world_ego` of a sweep; the identity if it has no pose."""
+    return np.eye(4) if sweep.pose is None else as_numpy(sweep.pose, np.float64)

@@ -9,6 +9,7 @@ from typing import Callable, Mapping, TypeVar
 import numpy as np
 import torch
 
+from cflow_torch.data.categories import CATEGORY_INDEX
 from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.simulator.car_park import build_car_park
 from cflow_torch.simulator.crossing import build_crossing
@@ -16,7 +17,7 @@ from cflow_torch.simulator.highway import build_highway
 from cflow_torch.simulator.lidar import Returns, scan, scan_rolling
 from cflow_torch.simulator.motion import Motion
 from cflow_torch.simulator.narrow import build_narrow
-from cflow_torch.simulator.objects import CATEGORIES, own_truck
+from cflow_torch.simulator.objects import own_truck
 from cflow_torch.simulator.profiles import PROFILES, WEATHER, in_weather
 from cflow_torch.simulator.recording import Boxes, GroundRaster, UnitReturns
 from cflow_torch.simulator.scene import Scene
@@ -72,7 +73,7 @@ class Drive(Log):
         self._body_poses = scene.body_poses(self._seconds)
         self.poses = self._motion.ego_poses(self._seconds)
         self._is_annotated = self._annotated(scene)
-        self._category = np.array([CATEGORIES.get(body.category or "", 0) for body in scene.bodies], np.uint8)
+        self._category = np.array([CATEGORY_INDEX[body.category or "NONE"] for body in scene.bodies], np.uint8)
         identity = np.random.default_rng([seed, 1])
         self.track_ids = tuple(str(uuid.UUID(bytes=identity.bytes(16), version=4)) for _ in scene.bodies)
         self._cache: OrderedDict[int, Returns] = OrderedDict()

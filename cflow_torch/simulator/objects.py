@@ -16,16 +16,6 @@ from cflow_torch.simulator.raycast import BOX, CYLINDER, ELLIPSOID
 Vector = Tuple[float, float, float]
 HIP = 0.9  # height about which legs swing, metres
 
-# Argoverse 2 category index (1-based, alphabetical) of the categories that occur.
-CATEGORIES = {
-    "BICYCLIST": 4,
-    "BUS": 7,
-    "PEDESTRIAN": 17,
-    "REGULAR_VEHICLE": 19,
-    "TRUCK_CAB": 26,
-    "VEHICULAR_TRAILER": 27,
-}
-
 
 class Solid(NamedTuple):
     """One solid of a body.
