@@ -1,4 +1,4 @@
-"""The licence expression, for which setuptools has a name from version 77 on. All else is in pyproject.toml."""
+"""The licence expression. In pyproject.toml, setuptools 75 rejects it, which is the newest for Python 3.8."""
 
 import setuptools
 

@@ -6,7 +6,7 @@ import math
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields, replace
 from numbers import Integral, Real
-from typing import Any, TypeVar
+from typing import Any, Optional, Tuple, TypeVar
 
 from cflow_torch.errors import CFlowError
 
@@ -55,21 +55,21 @@ class Config:
     """
 
     method: str = _method("")
-    pixel_sizes: tuple[float, ...] = setting(
+    pixel_sizes: Tuple[float, ...] = setting(
         (0.1,), "side s of a BEV pixel, metres, one per scale, coarse to fine (Eq. 3d_to_bev)"
     )
-    point_cloud_range: tuple[float, ...] = setting(
+    point_cloud_range: Tuple[float, ...] = setting(
         (-35.0, -35.0, -math.inf, 35.0, 35.0, math.inf),
         "(x0, y0, z0, x1, y1, z1), metres, both ends included, frame of t+1; only z may be infinite",
     )
-    ego_box: tuple[float, ...] | None = setting(
+    ego_box: Optional[Tuple[float, ...]] = setting(
         None,
         "(x0, y0, x1, y1), metres, both ends included, frame of each sweep: the method ignores the points in this box, "
         "which are returns of the vehicle itself. None = it ignores none",
         kind=tuple,
         optional=True,
     )
-    max_speed: float | None = setting(
+    max_speed: Optional[float] = setting(
         None,
         "m/s: the search ends at displacements of max_speed * elapsed time + one pixel. None = the paper's search "
         "range, half of the cluster's bounding box",
@@ -80,7 +80,7 @@ class Config:
     sweep_interval: float = setting(
         0.1, "seconds between consecutive sweeps where time stamps are missing", low=1e-6, high=1e6
     )
-    max_memory: float | None = setting(
+    max_memory: Optional[float] = setting(
         None,
         "bytes of working memory that the method may plan with. None = no limit",
         kind=float,
@@ -197,7 +197,7 @@ class VerifiedConfig(_WithHistory):
         "twice as often as in the sweeps before t. The method then takes twice the time",
         low=0,
     )
-    max_object_length: float | None = setting(
+    max_object_length: Optional[float] = setting(
         25.0,
         "metres: a component that is longer than this at t+1 moves only if both of its ends move (trams, trains). "
         "None = a component of any length may move",
@@ -210,7 +210,7 @@ class VerifiedConfig(_WithHistory):
         low=0,
         high=1000,
     )
-    min_height: float | None = setting(
+    min_height: Optional[float] = setting(
         0.4,
         "metres: where the ground is known, the method ignores pixels that rise less than this above the ground around "
         "them, unless a taller pixel is near. None = it ignores none",

@@ -135,3 +135,11 @@ def test_settings_survive_a_dictionary(preset):
     for wrong in ({}, {"method": "sparse"}, {**plain, "voxel_size": 1}, {**plain, "max_speed": -1}):
         with pytest.raises(CFlowError, match="give|the fields are"):
             config_from(wrong)
+
+
+@pytest.mark.parametrize("kind", CONFIGS.values())
+def test_python_38_can_evaluate_the_types_of_the_settings(kind: type) -> None:
+    """Hydra evaluates them: Python 3.8 has neither tuple[float, ...] nor float | None."""
+    for each in kind.__mro__[:-1]:
+        for name, annotation in each.__annotations__.items():
+            assert "|" not in annotation and "tuple[" not in annotation, f"{each.__name__}.{name}: {annotation}"
