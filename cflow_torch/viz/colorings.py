@@ -13,6 +13,7 @@ from cflow_torch.viz.wheel import flow_to_rgb
 STATIC, GROUND, UNKNOWN, FIRST = 0, 1, 2, 3  # greys, which the page chooses; the colours of a palette begin at FIRST
 HUES, LEVELS = 36, 6  # the wheel in the page; one more level is for flow longer than max_flow
 _PALEST = 0.35  # saturation of slow motion, which would be white on a light page
+_FADED, _GREY = 0.15, 140  # static objects: share of their colour, the rest is this grey, which both themes show
 _STEPS = 64  # colours of a ramp
 _RAMP = np.array([(66, 125, 245), (38, 190, 205), (112, 205, 80), (250, 200, 40), (235, 60, 45)], float)
 
@@ -25,14 +26,14 @@ def make_colorings(max_flow: float, interval: float) -> list[dict[str, Any]]:
         interval: seconds from sweep to sweep.
     """
     speed = max_flow / interval
-    rim = f"right: ahead of the vehicle; rim: {max_flow:.4g} m per sweep, {speed:.3g} m/s"
-    wheel, ramp, objects = _wheel().tolist(), _ramp().tolist(), PALETTE.tolist()
+    rim = f"right: ahead of the vehicle; rim: {max_flow:.4g} m per sweep, {speed:.3g}\u00a0m/s"
+    wheel, ramp, objects = _wheel().tolist(), _ramp().tolist(), np.concatenate([PALETTE, _faded()]).tolist()
     likely = "probability of an error below 0.1 m"
     rows = (
         # name, text, palette, scale, note, meaning of the greys
         ("flow", "residual flow", wheel, None, rim, ("static", "ground", "")),
         ("speed", "speed over ground", ramp, (0, speed, "m/s"), "", ("static", "ground", "")),
-        ("object", "object", objects, None, "moving objects keep their colour", ("none", "ground", "")),
+        ("object", "object", objects, None, "bright: moving or tracked; pale: static", ("no object", "ground", "")),
         ("confidence", "confidence", ramp, (1, 0, ""), likely, ("", "ground", "unknown")),
         ("truth", "true flow", wheel, None, rim, ("static", "ground", "unknown")),
         ("error", "end-point error", ramp, (0, MAX_ERROR, "m"), "", (f"below {MIN_ERROR:g} m", "ground", "unknown")),
@@ -67,10 +68,27 @@ def ramp_entry(value: np.ndarray, most: float) -> np.ndarray:
     return FIRST + (np.nan_to_num(value) / most * _STEPS).clip(0, _STEPS - 1).astype(np.int64)
 
 
-def object_entry(position: np.ndarray, cluster: np.ndarray, ground: np.ndarray) -> np.ndarray:
-    """(N,) uint8 entries of the palette of objects."""
+def _faded() -> np.ndarray:
+    """(10, 3) uint8 colours of static objects."""
+    return np.rint(_FADED * PALETTE + (1 - _FADED) * _GREY).astype(np.uint8)
+
+
+def object_entry(position: np.ndarray, cluster: np.ndarray, moving: np.ndarray, ground: np.ndarray) -> np.ndarray:
+    """Colour clusters, neighbours differently. A cluster is static unless at least half of its points move.
+
+    Args:
+        position: (N, 3), metres.
+        cluster: (N,) int64, -1 = none.
+        moving, ground: (N,) bool.
+
+    Returns:
+        (N,) uint8 entries of the palette of objects: its colours, then the pale ones of static objects.
+    """
     entry = np.where(ground, GROUND, STATIC).astype(np.uint8)
     has_one = cluster >= 0
     colors = cluster_colors(position[has_one], cluster[has_one], (0, 0, 0))
-    entry[has_one] = FIRST + (colors[:, None] == PALETTE).all(axis=2).argmax(axis=1)
+    _, number, size = np.unique(cluster[has_one], return_inverse=True, return_counts=True)
+    moves = 2 * np.bincount(number, moving[has_one]) >= size
+    pale = np.where(moves, 0, len(PALETTE))[number]
+    entry[has_one] = FIRST + (colors[:, None] == PALETTE).all(axis=2).argmax(axis=1) + pale
     return entry

@@ -42,9 +42,11 @@ class PackedDrive:
         speed = np.linalg.norm(scene.residual, axis=1)
         static = np.where(ground, GROUND, STATIC)
         moving = ~ground & (speed > MOVING)
+        cluster = np.where(ground, -1, scene.cluster)
         entries = {
             "flow": np.where(moving, wheel_entry(scene.residual, self.max_flow), static),
             "speed": np.where(moving, ramp_entry(speed, self.max_flow), static),
+            "object": colorings.object_entry(position, cluster, moving, ground),
         }
         important = moving
         if scene.confidence is not None:
@@ -62,9 +64,7 @@ class PackedDrive:
         kept = self._thin(position, important, ground)
         units = np.rint(position[kept] / _UNIT).astype(np.int16)
         entries = {name: entry[kept].astype(np.uint8) for name, entry in entries.items()}
-        cluster = np.where(ground, -1, scene.cluster)[kept]
-        entries["object"] = colorings.object_entry(position[kept], cluster, ground[kept])
-        self.points.append((units, entries, cluster))
+        self.points.append((units, entries, cluster[kept]))
         self.num_given += len(position)
         near = np.hypot(position[:, 0], position[:, 1]) < _FLOOR_RADIUS
         height = position[near & ground, 2] if (near & ground).any() else np.sort(position[near, 2])[: near.sum() // 10]
