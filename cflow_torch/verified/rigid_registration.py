@@ -54,7 +54,7 @@ def register(points: ObjectPoints, sweeps: HeightSlicedSweeps, flow: Tensor) -> 
     """
     pairs, device = _VoxelPairs(points, sweeps, len(flow)), flow.device
     # The motion: x, y and the tangent of half the angle, (3, G). The angle is twice its tangent, nearly.
-    given = motion = F.pad(flow.t(), (0, 0, 0, 1))
+    given = motion = F.pad(flow, (0, 1)).t()
     held = constant((_HELD, _HELD, 4 * _HELD_ROTATION), torch.float64, device)[:, None]
     largest = constant(_LARGEST_CHANGE, torch.float64, device)[:, None]
     lower, upper = given - largest, given + largest
@@ -104,7 +104,7 @@ class _VoxelPairs:
         voxels = Voxels(points, sweeps, NUM_LAYERS)
         self._voxels, self._num_objects = voxels, num_objects
         at_t = flat_nonzero(voxels.step == 1)
-        position = F.pad(torch.view_as_real(voxels.position[at_t]).t(), (0, 0, 0, 1), value=1.0)
+        position = F.pad(torch.view_as_real(voxels.position[at_t]), (0, 1), value=1.0).t()
         *sums, count = scatter_count(voxels.object_id[at_t], num_objects, position)
         self.centre = torch.complex(*(torch.floor(total / count.clamp(min=1)) for total in sums))
         self._voxel = flat_nonzero((voxels.step != 0) & (count > 0).index_select(0, voxels.object_id))

@@ -75,7 +75,8 @@ def test_points_keep_their_positions_and_have_the_colours_of_their_flow(street: 
     np.testing.assert_array_equal(entries["truth"][at][CAR], flow[CAR])
     assert (entries["error"][at][CAR] == STATIC).all() and (entries["error"][at][FLOOR] == GROUND).all()
     car, wall = entries["object"][at][CAR], entries["object"][at][WALL]
-    assert len(set(car)) == len(set(wall)) == 1 and FIRST <= car[0] < FIRST + len(PALETTE) <= wall[0], "the wall is pale"
+    assert len(set(car)) == len(set(wall)) == 1
+    assert FIRST <= car[0] < FIRST + len(PALETTE) <= wall[0], "the wall is pale"
     assert np.ptp(color_of(street, "object", car[0])) > 80 > 60 > np.ptp(color_of(street, "object", wall[0]))
     assert "confidence" not in entries
     still, entries = points_of(street, 1)
