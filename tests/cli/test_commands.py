@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import sys
 from importlib.util import find_spec
@@ -57,7 +58,7 @@ def test_demo_writes_all_its_files(tmp_path: Path, cache: Path, cflow: Cflow, ca
     assert config_from(left) == make_config("fast", point_cloud_range=region)
     assert (tmp_path / "flow.png").read_bytes().startswith(b"\x89PNG")
     printed = capsys.readouterr().out
-    assert printed.startswith("mean dynamic error 0.")
+    assert re.search("^mean dynamic error 0[.]", printed, re.MULTILINE)  # Python 3.8 has no k3d, which is said before
     assert f"picture: {tmp_path / 'flow.png'}" in printed and "CAR" in printed
     if find_spec("k3d"):
         assert f"3-D page, for any browser: {tmp_path / 'flow.html'}" in printed
