@@ -1,13 +1,14 @@
 #!/usr/bin/env python3
 """Confidence of the flow (docs/verified.md): fit its table on simulated drives, and evaluate it on others.
 
-  python scripts/ablation/calibrate_confidence.py fit CACHE                 writes verified/confidence.json
-  python scripts/ablation/calibrate_confidence.py evaluate CACHE --seeds 300 301 302 303 --figure docs/confidence.png
-  python scripts/ablation/calibrate_confidence.py evaluate --real             Argoverse 2 pair, KITTI 0000 (CFLOW_DATA)
+  python scripts/ablation/calibrate_confidence.py fit                            writes verified/confidence.json
+  python scripts/ablation/calibrate_confidence.py evaluate --seeds 300-303       simulated drives
+  python scripts/ablation/calibrate_confidence.py evaluate --real                Argoverse 2 pair, KITTI 0000
 
-CACHE is a folder for the simulated drives. The windows come from sets.py: five sensors, four kinds of scenes, pairs
-(h = 0) and history (h = 4), region +-70 m, without ground. We fit on seeds 100 ... 103. A point is right if the
-end-point error of its residual flow is below 0.1 m per interval.
+The windows come from sets.py: five sensors, four kinds of scenes, pairs (h = 0) and history (h = 4), region +-70 m,
+without ground. We fit on seeds 100-103. A point is right if the end-point error of its residual flow is below 0.1 m per
+interval. The columns are the expected calibration error of all and of dynamic points, and the end-point error in metres
+of dynamic and of static points after a share of them is dropped, the least confident first.
 """
 
 from __future__ import annotations
@@ -15,7 +16,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Iterable, Iterator, Sequence
@@ -24,6 +24,7 @@ import numpy as np
 import sets
 import torch
 from derived_sets import MOVES
+from run import CACHE, seed_range
 from sets import Item
 from sklearn.isotonic import isotonic_regression
 
@@ -32,8 +33,8 @@ from cflow_torch.types import FlowResult
 from cflow_torch.verified import confidence
 
 RIGHT = 0.1  # metres
-DROPPED = (0.0, 0.05, 0.1, 0.2, 0.3, 0.5)
-NUM_BINS = 10  # of the reliability table
+DROPPED = (0.0, 0.05, 0.1, 0.3)
+NUM_BINS = 10  # of the calibration error
 MAX_POINTS = 3000  # per window and bin in the fit, so that one large vehicle does not decide it
 BOX = (-70.0, -70.0, -math.inf, 70.0, 70.0, math.inf)
 TABLE_FILE = Path(confidence.__file__).with_name("confidence.json")
@@ -41,16 +42,10 @@ TABLE_FILE = Path(confidence.__file__).with_name("confidence.json")
 POINTS, RIGHT_ONES, DYNAMIC, RIGHT_DYNAMIC, ERROR, DYNAMIC_ERROR = range(6)
 
 
-def simulated(cache: Path, seeds: Sequence[int]) -> Iterator[Item]:
-    """Simulated windows of all sensors."""
+def simulated(seeds: tuple[int, int]) -> Iterator[Item]:
+    """Windows of all sensors, simulated with the first to the last of the seeds."""
     for profile in sets.PROFILES:
-        yield from sets.simulated(profile, tuple(seeds), cache)
-
-
-def kitti() -> Iterator[Item]:
-    """Windows of both parts of KITTI 0000 with the whole history."""
-    for path in (sets.KITTI, sets.KITTI_LATER):
-        yield from sets.kitti(path)[sets.HISTORY :]
+        yield from sets.simulated(profile, range(seeds[0], seeds[1] + 1), CACHE)
 
 
 def statistics(items: Iterable[Item], histories: Sequence[int], max_points: float = math.inf) -> np.ndarray:
@@ -66,15 +61,13 @@ def statistics(items: Iterable[Item], histories: Sequence[int], max_points: floa
     models = {h: make_model(make_config("default", num_history=h, point_cloud_range=BOX)) for h in histories}
     confidence.TABLE["probabilities"] = [i / num_bins for i in range(num_bins)]  # the result encodes the bin
     try:
-        for number, item in enumerate(items, 1):
+        for item in items:
             for h, model in models.items():
                 (result,) = model([replace(item.window, pch=item.window.pch[:h], pcf=())])
                 of_window = _sums(result, item, num_bins)
                 sums += of_window * np.minimum(1, max_points / np.maximum(of_window[:, :1], 1))
-            print(f"\r{number} windows", end="", file=sys.stderr, flush=True)
     finally:
         confidence.TABLE["probabilities"] = kept
-    print(file=sys.stderr)
     return sums
 
 
@@ -106,29 +99,17 @@ def fit(sums: np.ndarray) -> list[float]:
     return result
 
 
-def reliability(sums: np.ndarray, dynamic: bool = False) -> tuple[list[tuple[float, float, int]], float]:
-    """Mean confidence, share of right points and number of points by tenths of confidence; calibration error."""
+def calibration_error(sums: np.ndarray, dynamic: bool) -> float:
+    """Mean difference of confidence and share of right points over tenths of confidence, weighted by points."""
     predicted = np.array(confidence.TABLE["probabilities"])
     points, right = sums[:, [DYNAMIC, RIGHT_DYNAMIC] if dynamic else [POINTS, RIGHT_ONES]].T
     tenth = np.minimum((predicted * NUM_BINS).astype(int), NUM_BINS - 1)
-    rows, gap = [], 0.0
-    for i in range(NUM_BINS):
-        inside = tenth == i
-        number = points[inside].sum()
-        if number:
-            rows.append(((predicted * points)[inside].sum() / number, right[inside].sum() / number, int(number)))
-            gap += abs(rows[-1][0] - rows[-1][1]) * number
-    return rows, gap / max(points.sum(), 1)
+    gaps = np.abs(np.bincount(tenth, predicted * points - right, NUM_BINS))
+    return float(gaps.sum() / max(points.sum(), 1))
 
 
-def sparsification(sums: np.ndarray, dynamic: bool, shares: Sequence[float]) -> list[float]:
-    """Mean error after a share of the points is dropped, the least confident first. Ties: dropped proportionally.
-
-    Args:
-        sums: result of `statistics`.
-        dynamic: True = dynamic points, False = static ones.
-        shares: of these points, from 0 to below 1.
-    """
+def sparsification(sums: np.ndarray, dynamic: bool) -> list[float]:
+    """Mean error after each of the shares `DROPPED` is dropped. Ties: dropped proportionally."""
     order = np.argsort(confidence.TABLE["probabilities"], kind="stable")
     points, error = sums[order, DYNAMIC], sums[order, DYNAMIC_ERROR]
     if not dynamic:
@@ -136,75 +117,43 @@ def sparsification(sums: np.ndarray, dynamic: bool, shares: Sequence[float]) -> 
     mean = error / np.maximum(points, 1)
     before = np.concatenate(([0.0], np.cumsum(points)[:-1]))
     result = []
-    for share in shares:
+    for share in DROPPED:
         left = np.clip(before + points - share * points.sum(), 0, points)
         result.append(float((mean * left).sum() / max(left.sum(), 1)))
     return result
 
 
-def report(name: str, sums: np.ndarray) -> None:
-    """Print the calibration of a set."""
-    rows, gap = reliability(sums)
-    print(f"\n### {name}\n\nExpected calibration error {gap:.4f}; of dynamic points {reliability(sums, True)[1]:.3f}\n")
-    print("| mean confidence | share right | points |\n|---|---|---|")
-    for mean, share, number in rows:
-        print(f"| {mean:.3f} | {share:.3f} | {number} |")
-    print(f"\n| dropped | {' | '.join(f'{100 * share:.0f} %' for share in DROPPED)} |\n|{'---|' * (1 + len(DROPPED))}")
-    for kind, dynamic in (("dynamic", True), ("static", False)):
-        values = sparsification(sums, dynamic, DROPPED)
-        print(f"| {kind} EPE, m | {' | '.join(f'{value:.4f}' for value in values)} |")
-
-
-def draw(sums_of: dict[str, np.ndarray], path: Path) -> None:
-    """Draw the reliability, and the error over the dropped share, with a line per set."""
-    from matplotlib.figure import Figure
-
-    styles = ({"color": "blue", "marker": "o"}, {"color": "orange", "marker": "s"}, {"color": "green", "marker": "^"})
-    figure = Figure(figsize=(13, 4.2), layout="constrained")
-    diagram, moving, static = figure.subplots(1, 3)
-    diagram.plot([0, 1], [0, 1], color="0.6", linestyle="--", label="ideal")
-    shares = np.linspace(0, 0.5, 26)
-    for (name, sums), style in zip(sums_of.items(), styles):
-        rows, gap = reliability(sums)
-        diagram.plot([r[0] for r in rows], [r[1] for r in rows], label=f"{name}: error {gap:.3f}", **style)
-        for axes, dynamic in ((moving, True), (static, False)):
-            axes.plot(100 * shares, sparsification(sums, dynamic, shares), label=name, markevery=5, **style)
-    diagram.set(xlabel="confidence", ylabel="share of points right to 0.1 m", title="Reliability", xlim=(0, 1.02))
-    moving.set(xlabel="least confident dropped, %", ylabel="EPE, m", title="Dynamic points")
-    static.set(xlabel="least confident dropped, %", ylabel="EPE, m", title="Static points")
-    for axes in (diagram, moving, static):
-        axes.set_ylim(bottom=0)
-        axes.grid(alpha=0.3)
-        axes.legend(fontsize=9)
-    figure.savefig(path, dpi=110)
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
+def main() -> None:
+    """Fit the table, or print how well it is calibrated."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("task", choices=("fit", "evaluate"))
-    parser.add_argument("cache", type=Path, nargs="?", help="folder of the simulated drives")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[100, 101, 102, 103])
-    parser.add_argument("--real", action="store_true", help="evaluate: also on real data")
-    parser.add_argument("--figure", type=Path, help="evaluate: PNG to draw")
-    args = parser.parse_args(arguments)
+    parser.add_argument("--seeds", type=seed_range, metavar="FIRST-LAST", help="of simulated drives")
+    parser.add_argument("--real", action="store_true", help="evaluate on real data")
+    given = parser.parse_args()
     torch.set_num_threads(1)
-    if args.task == "fit":
-        sums = statistics(simulated(args.cache, args.seeds), (0, 4), MAX_POINTS)
+    if given.task == "fit":
+        sums = statistics(simulated(given.seeds or (100, 103)), (0, 4), MAX_POINTS)
         table = {**confidence.TABLE, "probabilities": fit(sums)}
         TABLE_FILE.write_text(json.dumps(table) + "\n", encoding="utf-8")
         return
     sums_of: dict[str, np.ndarray] = {}
-    for h in (0, sets.HISTORY) if args.cache is not None else ():
-        sums_of[f"simulated, h = {h}"] = statistics(simulated(args.cache, args.seeds), (h,))
-    if args.real:
+    if given.real:
         pair = [sets.make_item(item.window, item.labels) for item in sets.av2_pair()]  # ego motion of the poses
         sums_of["Argoverse 2 pair"] = statistics(pair, (0,))
-        for h in (0, sets.HISTORY):
-            sums_of[f"KITTI 0000, h = {h}"] = statistics(kitti(), (h,))
+    for h in (0, sets.HISTORY):
+        if given.seeds:
+            sums_of[f"simulated, h = {h}"] = statistics(simulated(given.seeds), (h,))
+        if given.real:
+            items = [item for path in (sets.KITTI, sets.KITTI_LATER) for item in sets.kitti(path)[sets.HISTORY :]]
+            sums_of[f"KITTI 0000, h = {h}"] = statistics(items, (h,))
+    dropped = ", ".join(f"{100 * share:.0f}" for share in DROPPED)
+    print(
+        f"| set | error, all / dynamic | dynamic, dropped {dropped} % | static, dropped {dropped} % |\n|---|---|---|---|"
+    )
     for name, sums in sums_of.items():
-        report(name, sums)
-    if args.figure is not None:
-        draw(sums_of, args.figure)
+        gaps = " / ".join(f"{calibration_error(sums, dynamic):.4f}" for dynamic in (False, True))
+        left = (", ".join(f"{value:.4f}" for value in sparsification(sums, dynamic)) for dynamic in (True, False))
+        print(f"| {name} | {gaps} | {' | '.join(left)} |")
 
 
 if __name__ == "__main__":

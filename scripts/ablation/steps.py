@@ -4,25 +4,20 @@
   python scripts/ablation/steps.py                     simulated seeds 700-703 of two sensors, odd windows of KITTI
   python scripts/ablation/steps.py --sets bridge tram   other sets of sets.py; --seeds selects others
 
-Columns: end-point error of dynamic objects, of dynamic pedestrians (divided by speed) and of the static background, in
-metres; near, far: dynamic bucket-normalised error within 35 m and at 35-70 m.
+The columns are those of run.py.
 """
 
 from __future__ import annotations
 
-import argparse
-import math
-import os
-import sys
 from contextlib import ExitStack
-from pathlib import Path
+from functools import partial
 from typing import Any, Callable
 from unittest.mock import patch
 
 import torch
-from run import config_for, seed_range
-from score import score
-from sets import make_sets
+from run import CACHE, make_parser, print_table, score_preset
+from score import Figures
+from sets import ScoredSet, make_sets
 
 from cflow_torch.verified import (
     changed_pixels,
@@ -33,8 +28,6 @@ from cflow_torch.verified import (
     refinement,
     rigid_registration,
 )
-
-COLUMNS = ("dynamic", "pedestrian", "static", "near", "far")
 
 
 def _without_changed(sweeps: Any) -> Any:
@@ -78,25 +71,22 @@ SETTINGS: dict[str, dict[str, Any]] = {
 }
 
 
+def score_without(scored: ScoredSet, name: str) -> Figures:
+    """Score `default` without a step."""
+    with ExitStack() as stack:
+        for make_patch in STEPS.get(name, []):
+            stack.enter_context(make_patch())
+        return score_preset(scored, "default", SETTINGS.get(name, {}))
+
+
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    default = [f"sim {sensor} 700-703 h=4" for sensor in ("av2", "waymo")]
-    parser.add_argument("--sets", nargs="+", default=[*default, "kitti odd h=4"])
-    parser.add_argument("--seeds", nargs="+", type=seed_range, default=[(700, 703)], metavar="FIRST-LAST")
-    parser.add_argument("--cache", type=Path, default=Path(os.environ.get("CFLOW_CACHE") or "outputs/cache"))
-    given = parser.parse_args()
-    torch.set_num_threads(1)
-    print(f"| set | left out | {' | '.join(COLUMNS)} |\n|{'---|' * (2 + len(COLUMNS))}")
-    for scored in make_sets(given.sets, given.seeds, given.cache):
-        for name in (*STEPS, *SETTINGS):
-            with ExitStack() as stack:
-                for make_patch in STEPS.get(name, []):
-                    stack.enter_context(make_patch())
-                figures = score(scored, config_for(scored, "default", SETTINGS.get(name, {})))
-            cells = (figures.get(column, math.nan) for column in COLUMNS)
-            row = " | ".join("-" if math.isnan(value) else f"{value:.4f}" for value in cells)
-            print(f"| {scored.name} | {name} | {row} |", flush=True)
+    """Print the table, row by row."""
+    given = make_parser(
+        __doc__, [*(f"sim {sensor} 700-703 h=4" for sensor in ("av2", "waymo")), "kitti odd h=4"], (700, 703)
+    ).parse_args()
+    settings = {name: partial(score_without, name=name) for name in (*STEPS, *SETTINGS)}
+    print_table(make_sets(given.sets, given.seeds, CACHE), settings)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()
