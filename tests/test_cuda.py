@@ -1,4 +1,4 @@
-"""A GPU gives the flow of the CPU on whole sweeps. `python -m pytest -m cuda` runs these tests on a machine with a GPU."""
+"""A GPU gives the flow of the CPU on whole sweeps. On a machine with a GPU: `python -m pytest -m cuda`."""
 
 from __future__ import annotations
 

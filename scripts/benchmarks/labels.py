@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Compare labels of moving points with DUFOMap and HDBSCAN, by which OpenSceneFlow makes them.
 
-  python scripts/benchmarks/labels.py DATA/kitti-0000 --json FILE       labelled HDF5 scenes, or folders of them
+  python scripts/benchmarks/labels.py DATA/kitti-0000                   labelled HDF5 scenes, or folders of them
   python scripts/benchmarks/labels.py panda.h5 --sensor-height 1.46     the LiDAR is above the origin of the points
   python scripts/benchmarks/labels.py --simulated av2 waymo             simulated drives
   pip install dufomap hdbscan h5py                                      else only our columns
@@ -15,7 +15,6 @@ Times are processor seconds per sweep on one thread, without reading and writing
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
 import sys
 import tempfile
@@ -25,6 +24,7 @@ from typing import Any, Sequence
 
 import numpy as np
 import torch
+from labelled import true_residual
 from scipy import spatial  # noqa: F401 (its import is not timed)
 from table import markdown
 
@@ -35,7 +35,6 @@ from cflow_torch.data.catalog import open_log
 from cflow_torch.data.categories import CATEGORY_INDEX
 from cflow_torch.data.hdf5 import HDF5Log, find_hdf5_scenes, write_hdf5_scene
 from cflow_torch.data.log import CachedLog, Log, window, windows
-from cflow_torch.evaluation.frame import ego_motion_flow
 from cflow_torch.simulator.benchmark import FORMATS, benchmark_logs
 from cflow_torch.types import as_numpy
 
@@ -112,13 +111,11 @@ def counts(log: Log, labels: Sequence[np.ndarray]) -> list[int]:
     """Numbers of true positive, false positive and false negative points; true positive and false negative walkers."""
     total = np.zeros(5, np.int64)
     for index, found in enumerate(labels):
-        truth = log.labels(index)
+        truth, sweep = log.labels(index), log.sweep(index)
         if truth is None:
             continue
-        sweep, after = log.sweep(index), log.sweep(index + 1)
-        pose_flow = ego_motion_flow(sweep.points, np.linalg.inv(after.pose) @ sweep.pose)
         is_scored = truth.is_valid & ~sweep.is_ground & (np.linalg.norm(sweep.points[:, :2], axis=1) <= RANGE)
-        moves = is_scored & (np.linalg.norm(truth.flow - pose_flow, axis=1) >= MOVING)
+        moves = is_scored & (np.linalg.norm(true_residual(log, index), axis=1) >= MOVING)
         walks = moves & (truth.category == CATEGORY_INDEX["PEDESTRIAN"])
         masks = (found & moves, found & is_scored & ~moves, ~found & moves, found & walks, ~found & walks)
         total += [mask.sum() for mask in masks]
@@ -163,7 +160,6 @@ def main() -> None:
     parser.add_argument("--simulated", nargs="*", default=[], choices=tuple(FORMATS), metavar="SENSOR")
     parser.add_argument("--presets", nargs="+", default=["offline", "fast"])
     parser.add_argument("--num-sweeps", type=int, default=8, help="of a simulated drive")
-    parser.add_argument("--json", type=Path)
     given = parser.parse_args()
     torch.set_num_threads(1)
     results: dict[str, list[dict[str, Any]]] = {}
@@ -179,9 +175,6 @@ def main() -> None:
                 peer = theirs(cached, given.sensor_height)
                 result.update({} if peer is None else {"DUFOMap": peer})
                 results.setdefault(name, []).append(result)
-                print(json.dumps({"file": file.name, **result}), file=sys.stderr, flush=True)
-    if given.json:
-        given.json.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
     print(markdown([table_row(name, scenes) for name, scenes in results.items()]))
 
 

@@ -11,8 +11,7 @@
 Methods: presets of this package; `zero`; `nearest` (the nearest point of the next sweep); `clusters` (HDBSCAN, and
 Open3D's ICP for each cluster); `icpflow`, `nsfp`, `fastnsf` of a checkout of OpenSceneFlow (848bf86) with the settings
 of its YAML files, on a CPU (opensceneflow_cpu.py). `icpflow-author` has the search radius of the original code: twice
-the greater of 1.67 m and the ego motion. OpenSceneFlow uses 1.67 m. `nsfp-100` has a patience of 100 steps, which the
-YAML file recommends. A method whose package is missing is skipped.
+the greater of 1.67 m and the ego motion. OpenSceneFlow uses 1.67 m. A method whose package is missing is skipped.
 
 All methods get the same points: both sweeps in the frame of t+1, without ground, within `--reach` metres (a square).
 Our presets get the sweeps with the ground mask and the same region. We score labelled points that are not ground. Each
@@ -27,7 +26,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import signal
 import sys
 import time
@@ -50,14 +48,14 @@ from cflow_torch.evaluation.scored_points import score_points
 from cflow_torch.types import Window, as_numpy
 
 OURS = ("default", "fast", "paper", "keypoints")
-HARNESS = {  # name -> model and its YAML file in the checkout, changed settings
-    "icpflow": ("icpflow", "ICPFlow", {}),
-    "icpflow-author": ("icpflow", "ICPFlow", {}),
-    "fastnsf": ("fastnsf", "FastNSF", {}),
-    "nsfp": ("nsfp", "NSFP", {}),
-    "nsfp-100": ("nsfp", "NSFP", {"early_patience": 100}),
+HARNESS = {  # name -> YAML file and class of the model in the checkout
+    "icpflow": ("icpflow", "ICPFlow"),
+    "icpflow-author": ("icpflow", "ICPFlow"),
+    "fastnsf": ("fastnsf", "FastNSF"),
+    "nsfp": ("nsfp", "NSFP"),
 }
 METHODS = (*OURS, "zero", "nearest", "clusters", *HARNESS)
+SEED = 0  # of torch and NumPy, set before every window
 RADIUS = 1.67  # metres, least search radius of ICP-Flow
 Method = Callable[["Case"], np.ndarray]
 
@@ -132,9 +130,6 @@ def scores(case: Case, residual_flow: np.ndarray, reach: float) -> dict[str, flo
     return {name: float(each.mean()) if len(each) else float("nan") for name, each in values.items()}
 
 
-# ------------------------------------------------------------------------------------------------ methods
-
-
 def preset(name: str, num_history: int, reach: float) -> Method:
     """A preset of this package."""
     low, high = (-reach, -reach, -np.inf), (reach, reach, np.inf)
@@ -198,13 +193,13 @@ def of_harness(name: str, root: Path) -> Method:
     from joblib import parallel_config
     from omegaconf import OmegaConf
 
-    file, kind, changes = HARNESS[name]
+    file, kind = HARNESS[name]
     models = load_models(root)
     if not hasattr(models, kind):
         raise ImportError(f"{kind}: a package of OpenSceneFlow is missing")
     settings: Any = OmegaConf.to_container(OmegaConf.load(root / "conf" / "model" / f"{file}.yaml").target)
     del settings["_target_"]
-    model = getattr(models, kind)(**{**settings, **changes})
+    model = getattr(models, kind)(**settings)
 
     def estimate(case: Case) -> np.ndarray:
         if name == "icpflow-author":
@@ -236,27 +231,24 @@ def make_method(name: str, num_history: int, given: argparse.Namespace) -> Metho
     return on_rows({"nearest": nearest, "clusters": clusters}[name])
 
 
-# ------------------------------------------------------------------------------------------------ measuring
-
-
 def _stop(*_: Any) -> None:
     raise TimeoutError
 
 
-def measure(method: Method, case: Case, seed: int, limit: int, reach: float) -> dict[str, float]:
-    """Errors, processor and wall seconds of a window. Without errors if it was stopped at the limit."""
-    torch.manual_seed(seed)
-    np.random.seed(seed)
+def measure(method: Method, case: Case, limit: int, reach: float) -> dict[str, float]:
+    """Errors and processor seconds of a window. Without errors if it was stopped at the limit."""
+    torch.manual_seed(SEED)
+    np.random.seed(SEED)
     signal.signal(signal.SIGALRM, _stop)
     signal.alarm(limit)
-    begin, wall = time.process_time(), time.perf_counter()
+    begin = time.process_time()
     try:
         flow = method(case)
     except TimeoutError:
         flow = None
     finally:
         signal.alarm(0)
-    spent = {"cpu": time.process_time() - begin, "wall": time.perf_counter() - wall}
+    spent = {"cpu": time.process_time() - begin}
     return spent if flow is None else {**scores(case, flow, reach), **spent}
 
 
@@ -317,7 +309,6 @@ def main() -> None:
     parser.add_argument("--every", type=int, default=8, help="step between windows")
     parser.add_argument("--windows", type=int, help="at most so many windows of a set")
     parser.add_argument("--reach", type=float, default=35.0, help="metres, half side of the square")
-    parser.add_argument("--seed", type=int, default=0, help="of torch and NumPy, set before every window")
     parser.add_argument("--limit", type=int, default=0, help="seconds of wall time for a window; 0 = none")
     parser.add_argument("--json", type=Path, help="file for the figures of every window")
     parser.add_argument(
@@ -337,8 +328,8 @@ def main() -> None:
         for set_name, case in all_cases:
             if history and len(case.window.pch) < history:
                 continue
-            of_run = {"set": set_name, "window": case.name, "method": name, "history": history, "seed": given.seed}
-            row = {**of_run, **measure(method, case, given.seed, given.limit, given.reach), "load": os.getloadavg()[0]}
+            row = {"set": set_name, "window": case.name, "method": name, "history": history}
+            row.update(measure(method, case, given.limit, given.reach))
             rows[key(row)] = row
             print(json.dumps(row), file=sys.stderr, flush=True)
             if given.json:
@@ -348,7 +339,7 @@ def main() -> None:
 
 def key(row: dict[str, Any]) -> tuple[Any, ...]:
     """What a row measures."""
-    return row["window"], row["method"], row["history"], row["seed"]
+    return row["window"], row["method"], row["history"]
 
 
 if __name__ == "__main__":

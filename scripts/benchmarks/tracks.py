@@ -17,83 +17,30 @@ from __future__ import annotations
 
 import argparse
 from collections import Counter
-from dataclasses import replace
 from pathlib import Path
-from typing import Any, Dict, NamedTuple
+from typing import Any, Dict
 
 import numpy as np
 import torch
+from labelled import LabelledLog, SimulatedLog, Truth, with_ground
 from table import markdown
 
 from cflow_torch import Tracker, VerifiedFlow, make_config, make_model
 from cflow_torch.applications.moving_groups import MOVING
 from cflow_torch.applications.track_table import confirmed, join_tables
-from cflow_torch.data.catalog import GroundSegmentedLog
-from cflow_torch.data.hdf5 import HDF5Log, find_hdf5_scenes
-from cflow_torch.data.log import Log, windows
-from cflow_torch.evaluation.frame import ego_motion_flow
-from cflow_torch.simulator import make_drive
+from cflow_torch.data.hdf5 import find_hdf5_scenes
+from cflow_torch.data.log import windows
 from cflow_torch.simulator.benchmark import FORMATS
-from cflow_torch.simulator.drive import Drive
-from cflow_torch.types import Sweep
 
-WITH_MASKS = ("av2", "aevascenes")
 DRIVES = ((300, "street"), (301, "crossing"))
 SPEED, POINTS = 0.5, 20  # m/s and points, least of a scored object
 Row = Dict[str, Any]
 
 
-class Truth(NamedTuple):
-    """Objects of one sweep."""
-
-    object_id: np.ndarray  # (N,) int64 of each point, 0 = background
-    is_known: np.ndarray  # (N,) bool, False = without label
-    velocity: np.ndarray  # (objects, 3) over ground, m/s in the world, by id
-
-
-class LabelledLog(HDF5Log):
-    """A scene with labels and the ids of objects."""
-
-    def truth(self, index: int) -> Truth:
-        """Mean velocity of the labelled points of each object."""
-        sweep, after, labels = self.sweep(index), self.sweep(index + 1), self.labels(index)
-        seconds = (self.timestamps[index + 1] - self.timestamps[index]) * 1e-9
-        residual = labels.flow - ego_motion_flow(sweep.points, np.linalg.inv(after.pose) @ sweep.pose)
-        object_id = np.where(labels.is_valid, self.values(index, "flow_instance_id"), 0).astype(np.int64)
-        count = np.bincount(object_id).clip(1)
-        velocity = np.stack([np.bincount(object_id, each) / count for each in residual.T], 1) / seconds
-        velocity[0] = 0
-        return Truth(object_id, labels.is_valid, velocity @ after.pose[:3, :3].T)
-
-
-class SimulatedLog(Log):
-    """A simulated drive with the sweep rate and ground masks of its data set, and with the truth."""
-
-    def __init__(self, profile: str, seed: int, scene: str, num_sweeps: int) -> None:
-        self.step, self._has_masks = 2 if profile == "nuscenes" else 1, profile in WITH_MASKS
-        self.drive: Drive = make_drive(seed, num_sweeps * self.step, profile, scene)
-        self.log_id, self.timestamps = self.drive.log_id, self.drive.timestamps[:: self.step]
-
-    def sweep(self, index: int) -> Sweep:
-        """Sweep of the drive, without its mask if the data set has none."""
-        sweep = self.drive.sweep(index * self.step)
-        return sweep if self._has_masks else replace(sweep, is_ground=None)
-
-    def truth(self, index: int) -> Truth:
-        """Velocity of each body to the next sweep."""
-        times = (np.array(self.timestamps[index : index + 2]) - self.timestamps[0]) * 1e-9
-        now, then = self.drive.scene.body_poses(times)[:, :, :3, 3]
-        velocity = np.concatenate([np.zeros((1, 3)), (then - now) / (times[1] - times[0])])
-        solid = self.drive.returns(index * self.step).solid.numpy()
-        body = np.append(self.drive.scene.table.body, len(now))[solid]
-        return Truth(np.where(body < len(now), body + 1, 0), np.ones(len(body), bool), velocity)
-
-
 def score(log: LabelledLog | SimulatedLog, model: VerifiedFlow) -> Row:
     """Counts and errors of a drive, to be summed."""
-    read = log if log.sweep(0).is_ground is not None else GroundSegmentedLog(log, "grid")
     tracker, tables, sweeps = Tracker(), [], []
-    for index, given in enumerate(windows(read, model.config.num_history, model.config.num_future)):
+    for index, given in enumerate(windows(with_ground(log), model.config.num_history, model.config.num_future)):
         flow = model([given])[0]
         table, track_id = tracker.push(given, flow)
         tables.append({**table, "sweep": np.full(len(table["id"]), index)})

@@ -109,23 +109,16 @@ def about_runs(ours: Ours) -> list[str]:
     """A line per data set with the data, versions and dates of our numbers."""
     lines = []
     for data_set, rows in ours.items():
-        records = [run.record for run in rows.values()]
-
-        def every(*values: Any) -> str:
-            return " and ".join(sorted({str(value) for value in values}))
-
-        lines.append(
-            f"{data_set}: {every(*(r['num_pairs'] for r in records))} windows of "
-            f"{every(*(len(r['data']['logs']) for r in records))} logs (digest "
-            f"{every(*(r['data']['digest'] for r in records))}), definition "
-            f"{every(*(r['definition']['name'] for r in records))}, cflow_torch "
-            f"{every(*(r['versions']['cflow_torch'] for r in records))}, torch "
-            f"{every(*(r['versions']['torch'] for r in records))}, {every(*(r['date'][:10] for r in records))}; "
-            f"{every(*(r['machine']['threads'] for r in records))} thread(s)"
-        )
-        failed = sum(len(r["failures"]) for r in records)
-        if failed:
-            lines.append(f"{data_set}: {failed} pairs failed and are not scored")
+        about = []
+        for r in (run.record for run in rows.values()):
+            logs, versions = r["data"]["logs"], r["versions"]
+            about.append(
+                f"{data_set}: {r['num_pairs']} windows of {len(logs)} logs (digest {r['data']['digest']}), definition "
+                f"{r['definition']['name']}, cflow_torch {versions['cflow_torch']}, torch {versions['torch']}, "
+                f"{r['date'][:10]}; {r['machine']['threads']} thread(s)"
+                + (f"; {len(r['failures'])} pairs failed" if r["failures"] else "")
+            )
+        lines += dict.fromkeys(about)
     return lines
 
 

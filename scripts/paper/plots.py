@@ -3,36 +3,33 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Mapping, Sequence
+from typing import Any, List, Mapping, Sequence, Tuple
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from results import CLASSES, METHODS, Ours, Run, protocol, range_errors
 
 ERROR = "Dynamic Bucket-Normalized EPE"
-TITLES = {"CAR": "Car", "PED": "Pedestrian", "VRU": "VRU", "OTHER": "Other"}
-CLASS_STYLE = {
+STYLES = {
     "CAR": {"color": "blue", "marker": "o"},
     "PED": {"color": "green", "marker": "^"},
     "VRU": {"color": "orange", "marker": "D"},
     "OTHER": {"color": "red", "marker": "s"},
-}
-HISTORY_STYLE = {
     "h=0": {"color": "blue", "marker": "o"},
     "h=2": {"color": "red", "marker": "s"},
     "h=4": {"color": "green", "marker": "^"},
-}
-METHOD_STYLE = {
     "CorrelationFlow": {"color": "#0000ff", "marker": "o"},
     "SSF": {"color": "#ff0000", "marker": "s"},
     "CorrelationFlow-Keypoint": {"color": "#00c800", "marker": "^"},
     "RVLoss": {"color": "#ffa500", "marker": "D"},
     "TeFlow": {"color": "#800080", "marker": "p"},
-    "SeFlow++": {"color": "#ffc0cb", "marker": "o"},
+    "SeFlow++": {"color": "#ffc0cb", "marker": "o", "markerfacecolor": "none"},
     "VoteFlow": {"color": "#008080", "marker": "x"},
     "SeFlow": {"color": "#4b0082", "marker": "+"},
 }
+SHOWN = ("CAR", "PED", "VRU", "OTHER")  # classes in the paper's order
 PAPER_SET = "paper, Argoverse 2 val"
+Panels = List[Tuple[str, Mapping[str, Sequence[float]]]]  # title, and values by line or bar
 
 
 def draw(name: str, paper: dict[str, Any], ours: Ours) -> Figure:
@@ -43,8 +40,50 @@ def draw(name: str, paper: dict[str, Any], ours: Ours) -> Figure:
         paper: the paper's numbers, an entry of figures.yaml.
         ours: data set -> row -> run; may be empty or have gaps.
     """
-    figures = {"history": _history, "scales": _scales, "datasets": _datasets, "range_split": _range_split}
-    return figures[name](paper, ours)
+    at, panels = paper["at"], _panels(name, paper, ours)
+    if name == "datasets":
+        return _bars(panels, at, ["Overall", *ours])
+    columns = {"history": len(panels), "scales": len(SHOWN), "range_split": math.ceil(len(panels) / 2)}[name]
+    rows = math.ceil(len(panels) / columns)
+    figure = Figure(figsize=(min(13.0, 4.8 * columns), 3.6 * rows), layout="constrained")
+    all_axes: list[Axes] = figure.subplots(rows, columns, squeeze=False).ravel().tolist()
+    for axes, (title, lines) in zip(all_axes, panels):
+        for label, values in lines.items():
+            axes.plot(range(len(at)), values, label=label, clip_on=False, **STYLES[label])
+        axes.set(title=title, xticks=range(len(at)), xticklabels=at, xlabel=paper.get("x", "metres"))
+        axes.set_ylim(0, 1.05 * max(0.38, *_errors(panels)))
+        axes.grid(axis="y", linestyle="--", alpha=0.6)
+    for axes in all_axes[::columns]:
+        axes.set_ylabel(ERROR)
+    for axes in all_axes[len(panels) :]:
+        axes.set_axis_off()
+    figure.legend(*all_axes[0].get_legend_handles_labels(), ncols=4, loc="outside upper center", fontsize=9)
+    return figure
+
+
+def _panels(name: str, paper: dict[str, Any], ours: Ours) -> Panels:
+    """Title and lines of each panel: the paper's first, then those of our data sets."""
+    if name == "history":
+        rows = [f"h={h}" for h in paper["at"]]
+        mine = [(data_set, {c: _of_class(runs, rows, c) for c in SHOWN}) for data_set, runs in ours.items()]
+        return [(PAPER_SET, {c: paper["lines"][c] for c in SHOWN}), *mine]
+    if name == "scales":
+        panels: Panels = [(f"{PAPER_SET}: {c}", paper["panels"][c]) for c in SHOWN]
+        for data_set, runs in ours.items():
+            for c in SHOWN:
+                lines = {h: _of_class(runs, [f"{h}, {n} scales" for n in paper["at"]], c) for h in paper["panels"][c]}
+                panels.append((f"{data_set}: {c}", lines))
+        return panels
+    if name == "datasets":
+        bars = {method: [s.overall, *(s.data_sets[d] for d in ours)] for method, s in protocol(ours).items()}
+        return [("paper, test set of the 2026 challenge", paper["bars"]), *([("this package", bars)] if bars else [])]
+    mine = [(d, {m: range_errors(runs[m]) for m in METHODS.values() if m in runs}) for d, runs in ours.items()]
+    return [*((f"{data_set} (paper)", lines) for data_set, lines in paper["panels"].items()), *mine]
+
+
+def _errors(panels: Panels) -> list[float]:
+    """All errors that are not NaN."""
+    return [v for _, lines in panels for values in lines.values() for v in values if not math.isnan(v)]
 
 
 def _of_class(runs: Mapping[str, Run], rows: Sequence[str], which: str) -> list[float]:
@@ -53,113 +92,18 @@ def _of_class(runs: Mapping[str, Run], rows: Sequence[str], which: str) -> list[
     return [runs[row].values()[at] if row in runs else math.nan for row in rows]
 
 
-def _history(paper: dict[str, Any], ours: Ours) -> Figure:
-    """Error over h with a line per class: the paper's panel, then a panel per data set."""
-    figure = Figure(figsize=(5.2 * (1 + len(ours)), 4.0), layout="constrained")
-    panels = figure.subplots(1, 1 + len(ours), sharey=True, squeeze=False)[0]
-    rows = [f"h={h}" for h in paper["at"]]
-    lines = {PAPER_SET: paper["lines"]}
-    for data_set, runs in ours.items():
-        lines[data_set] = {which: _of_class(runs, rows, which) for which in CLASSES}
-    for axes, (title, of_class) in zip(panels, lines.items()):
-        for which, style in CLASS_STYLE.items():
-            axes.plot(paper["at"], of_class[which], label=TITLES[which], clip_on=False, **style)
-        axes.set(title=title, xlabel=paper["x"], xticks=paper["at"], xlim=(0, 9))
-        _grid(axes)
-    panels[0].set_ylabel(ERROR)
-    figure.legend(*panels[0].get_legend_handles_labels(), ncols=4, loc="outside upper center")
-    _error_axis(panels, top=0.4)
-    return figure
-
-
-def _scales(paper: dict[str, Any], ours: Ours) -> Figure:
-    """Error over the number of scales with a line per h: a row of four classes for the paper and for each data set."""
-    figure = Figure(figsize=(13, 3.3 * (1 + len(ours))), layout="constrained")
-    grid = figure.subplots(1 + len(ours), 4, squeeze=False)
-    for panels, (title, runs) in zip(grid, [(PAPER_SET, {}), *ours.items()]):
-        for axes, which in zip(panels, TITLES):
-            for h, style in HISTORY_STYLE.items():
-                if title == PAPER_SET:
-                    values = paper["panels"][which][h]
-                else:
-                    values = _of_class(runs, [f"{h}, {n} scales" for n in paper["at"]], which)
-                axes.plot(paper["at"], values, label=f"${h}$", clip_on=False, **style)
-            axes.set(title=TITLES[which], xticks=paper["at"], xlim=(1, 5))
-            _grid(axes)
-        panels[0].set_ylabel(f"{title}\n{ERROR}", fontsize=8)
-        _error_axis(panels, top=0.4)
-    for axes in grid[-1]:
-        axes.set_xlabel(paper["x"])
-    figure.legend(*grid[0, 0].get_legend_handles_labels(), ncols=3, loc="outside upper center")
-    return figure
-
-
-def _datasets(paper: dict[str, Any], ours: Ours) -> Figure:
-    """Bars with a group per data set and a bar per method; below, our two variants on our data sets."""
-    scores = protocol(ours)
-    rows = 2 if scores else 1
-    figure = Figure(figsize=(12, 3.9 * rows), layout="constrained")
-    panels = figure.subplots(rows, 1, squeeze=False)[:, 0]
-    _bars(panels[0], paper["at"], paper["bars"])
-    panels[0].set_title("paper, test set of the 2026 challenge", fontsize=9)
-    figure.legend(*panels[0].get_legend_handles_labels(), ncols=8, loc="outside upper center", fontsize=8)
-    if scores:
-        groups = ["Overall", *ours]
-        _bars(panels[1], groups, {m: [s.overall, *(s.data_sets[d] for d in ours)] for m, s in scores.items()})
-        panels[1].set_title("this package", fontsize=9)
-        panels[1].set_xlim(panels[0].get_xlim() if len(groups) <= len(paper["at"]) else None)  # bars of equal width
-    return figure
-
-
-def _bars(axes: Axes, groups: Sequence[str], bars: Mapping[str, Sequence[float]]) -> None:
+def _bars(panels: Panels, *groups: Sequence[str]) -> Figure:
+    """Bars with a group per data set and a bar per method; all panels have bars of one width."""
+    figure = Figure(figsize=(12, 3.9 * len(panels)), layout="constrained")
     width = 0.1
-    for number, (method, values) in enumerate(bars.items()):
-        shift = (number - (len(bars) - 1) / 2) * width
-        positions = [group + shift for group in range(len(groups))]
-        axes.bar(positions, values, width * 0.95, label=method, color=METHOD_STYLE[method]["color"])
-    axes.set(xticks=range(len(groups)), xticklabels=groups, ylabel=ERROR, xlim=(-0.6, len(groups) - 0.4))
-    highest = max((v for values in bars.values() for v in values if not math.isnan(v)), default=0.0)
-    axes.set_ylim(0.1, max(0.92, highest * 1.05))  # from 0.1, as in the paper
-    if highest < 1:
-        axes.set_yticks([0.1, 0.3, 0.5, 0.7, 0.9])
-    axes.grid(axis="y", linestyle="--", alpha=0.4)
-    axes.set_axisbelow(True)
-
-
-def _range_split(paper: dict[str, Any], ours: Ours) -> Figure:
-    """Error at short and long range: the paper's 2 x 2 panels, and ours in further columns."""
-    panels = [(f"{name} (paper)", lines) for name, lines in paper["panels"].items()]
-    for data_set, runs in ours.items():
-        panels.append((data_set, {m: range_errors(runs[m]) for m in METHODS.values() if m in runs}))
-    columns = 2 + math.ceil(len(ours) / 2)
-    figure = Figure(figsize=(4.2 * columns, 7.5), layout="constrained")
-    grid = figure.subplots(2, columns, squeeze=False)
-    all_axes = [grid[row, column] for row in range(2) for column in range(2)]  # AEVA, AV2 above TruckScene, Waymo
-    all_axes += [grid[row, column] for column in range(2, columns) for row in range(2)]
-    for axes, (title, lines) in zip(all_axes, panels):
-        for method, values in lines.items():
-            style = dict(METHOD_STYLE[method])
-            if method == "SeFlow++":
-                style["markerfacecolor"] = "none"
-            axes.plot([0, 1], values, label=method, markersize=8, **style)
-        axes.set(title=title, xticks=[0, 1], xticklabels=[f"{name}m" for name in paper["at"]], xlim=(-0.1, 1.1))
-        _error_axis([axes], bottom=0.1, top=0.9)
-    for axes in all_axes[len(panels) :]:
-        axes.set_axis_off()
-    for axes in grid[:, 0]:
-        axes.set_ylabel(ERROR)
-    figure.legend(*all_axes[0].get_legend_handles_labels(), ncols=4, loc="outside upper center", fontsize=9)
+    for axes, (title, bars), names in zip(figure.subplots(len(panels), 1, squeeze=False)[:, 0], panels, groups):
+        for number, (method, values) in enumerate(bars.items()):
+            shift = (number - (len(bars) - 1) / 2) * width
+            positions = [group + shift for group in range(len(names))]
+            axes.bar(positions, values, width * 0.95, label=method, color=STYLES[method]["color"])
+        axes.set(title=title, xticks=range(len(names)), xticklabels=names, ylabel=ERROR)
+        axes.set(xlim=(-0.6, max(map(len, groups)) - 0.4), ylim=(0.1, None))  # from 0.1, as in the paper
+        axes.grid(axis="y", linestyle="--", alpha=0.4)
+        axes.set_axisbelow(True)
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), ncols=8, loc="outside upper center", fontsize=8)
     return figure
-
-
-def _grid(axes: Axes) -> None:
-    axes.grid(axis="y", linestyle="--", alpha=0.6)
-
-
-def _error_axis(panels: Sequence[Axes], top: float, bottom: float = 0.0) -> None:
-    """Set one range of errors for all panels: the paper's range, extended where a value would be outside."""
-    limits = [axes.dataLim.intervaly for axes in panels]
-    high = max([top, *(limit[1] * 1.05 for limit in limits if math.isfinite(limit[1]))])
-    low = min([bottom, *(limit[0] * 0.95 for limit in limits if math.isfinite(limit[0]))])
-    for axes in panels:
-        axes.set_ylim(low, high)

@@ -96,7 +96,7 @@ def row_of(experiment: str, model: dict[str, Any]) -> str:
 
 
 def load_runs(folder: Path) -> tuple[Runs, list[str]]:
-    """Load all runs of experiments below a folder; also returns remarks on files that were not used."""
+    """Load the latest run of each row below a folder; also returns remarks on files that cannot be used."""
     runs: Runs = {}
     remarks: list[str] = []
     for file in sorted(folder.rglob("results.json")):
@@ -113,11 +113,7 @@ def load_runs(folder: Path) -> tuple[Runs, list[str]]:
         name = data["label"] + (f" ({data['profile']})" if data["name"] == "benchmark" else "")
         run = Run(experiment, name, row_of(experiment, config["model"]), record)
         rows = runs.setdefault(experiment, {}).setdefault(name, {})
-        if run.row in rows:
-            older, newer = sorted((run, rows[run.row]), key=lambda r: r.record["date"])
-            remarks.append(f"{experiment}, {name}, {run.row}: two runs; the one of {newer.record['date']} is shown")
-            run = newer
-        rows[run.row] = run
+        rows[run.row] = max(run, rows.get(run.row, run), key=lambda each: each.record["date"])
     return runs, remarks
 
 
