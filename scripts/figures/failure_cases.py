@@ -53,12 +53,7 @@ class Attempt(NamedTuple):
 
 @dataclass(frozen=True)
 class Case:
-    """A failure.
-
-    Args:
-        staged: the drive, and its scored objects.
-        attempts: results by several settings. The first one fails.
-    """
+    """A failure: a drive with its scored objects, and the results by several settings. The first one fails."""
 
     staged: Staged
     attempts: list[Attempt]
@@ -125,19 +120,11 @@ class WithoutMasks(LogWrapper):
 
 
 _DEFAULT = (by("default"),)
-_SECTIONAL_VIEW = (by("paper", num_history=4), by("paper", num_history=4, sectional_view=True))
 _PAPER_AND_DEFAULT = (by("paper"), by("default"))
 _HISTORY_OR_NOT = (by("default"), by("default", num_history=0))
-_LONG_SIDE = (by("default", num_history=0), by("offline", num_history=0), by("default", num_history=4))
-_GROUND = (
-    by("default", "`default`, ground=None", WithoutMasks),
-    by("default", "`default`, ground='auto'", lambda drive: GroundSegmentedLog(WithoutMasks(drive))),
-)
-_WRONG_FRAME = (by("default", "`default`, wrong frame", MisplacedPoses), by("default", "`default`, right frame"))
-_WIDE = by("default", "`default`, point_cloud_range=±100 m", point_cloud_range=WIDE)
 # The drive, the settings (the first one fails), and the seed of the picture.
 CASES: dict[str, tuple[Callable[[int], Staged], Sequence[Setting], int | None]] = {
-    "long_side": (drives.tram, _LONG_SIDE, 0),
+    "long_side": (drives.tram, [by(p, num_history=h) for p, h in (("default", 0), ("offline", 0), ("default", 4))], 0),
     "rail": (drives.rail, _PAPER_AND_DEFAULT, 0),
     "bridge": (drives.bridge, _DEFAULT, 0),
     "gantry": (drives.gantry, _DEFAULT, None),
@@ -145,11 +132,22 @@ CASES: dict[str, tuple[Callable[[int], Staged], Sequence[Setting], int | None]] 
     "touching": (drives.touching, _PAPER_AND_DEFAULT, 0),
     "turning": (drives.turning, (by("paper", num_history=4), *_HISTORY_OR_NOT), 4),
     "abreast": (drives.abreast, _DEFAULT, None),
-    "vertical": (drives.vertical, _SECTIONAL_VIEW, None),
+    "vertical": (drives.vertical, [by("paper", num_history=4, sectional_view=on) for on in (False, True)], None),
     "fast": (drives.fast, (by("default", max_speed=40), by("default")), 2),
-    "beyond_region": (drives.far, (by("default"), _WIDE), None),
-    "ground_left_in": (drives.street, _GROUND, 1),
-    "wrong_frame": (drives.turn, _WRONG_FRAME, 0),
+    "beyond_region": (drives.far, (by("default"), by("default", "`default`, ±100 m", point_cloud_range=WIDE)), None),
+    "ground_left_in": (
+        drives.street,
+        (
+            by("default", "`default`, ground=None", WithoutMasks),
+            by("default", "`default`, ground='auto'", lambda drive: GroundSegmentedLog(WithoutMasks(drive))),
+        ),
+        1,
+    ),
+    "wrong_frame": (
+        drives.turn,
+        (by("default", "`default`, wrong frame", MisplacedPoses), by("default", "`default`, right frame")),
+        0,
+    ),
     "appearing": (drives.appearing, (by("default"), by("offline")), 0),
     "appeared": (partial(drives.appearing, later=4), _DEFAULT, None),
     "rolling_shutter": (drives.rolling_shutter, _DEFAULT, None),

@@ -1,17 +1,15 @@
 #!/usr/bin/env python3
 """Accuracy and time of ground finding: simulated drives, the Argoverse 2 pair and its map, KITTI's stored mask.
 
-  python scripts/figures/ground.py                          the table, without methods and data that are not available
-  CFLOW_DATA=FOLDER python scripts/figures/ground.py        folder of the real data (default: ../shared/data)
+  python scripts/figures/ground.py                  the table; CFLOW_DATA is the folder of the real data
 
-Prints Markdown, and a line per call of Patchwork++ (`| grep '^|'` removes it). In simulated drives, points below or at
-most 0.3 m above the true surface are ground. Processor times are medians of 15 calls for one sweep.
+In simulated drives, points below or at most 0.3 m above the true surface are ground. The last column is the median
+processor time of a sweep in ms. Patchwork++ prints a line per call (`| grep '^|'` removes it).
 """
 
 from __future__ import annotations
 
 import os
-import statistics
 import time
 from pathlib import Path
 from typing import Iterator, Tuple
@@ -29,8 +27,6 @@ from cflow_torch.windows.ground import find_ground
 
 SEEDS = (410, 411, 412)  # the settings were tuned on 400 ... 409
 AV2 = Path("av2-7fab2350", "val", "7fab2350-7eaf-3b7e-a39d-6937a4c1bede")
-METHODS = ("grid", "patchwork")
-CALLS = 15
 Case = Tuple[str, np.ndarray, np.ndarray, np.ndarray]  # name, points, true mask, mask of scored points
 
 
@@ -52,23 +48,20 @@ def simulated() -> Iterator[Case]:
 
 def real(root: Path) -> Iterator[Case]:
     """Sweeps of the available real data."""
-    raster = read_ground_raster(root / AV2 / "map") if (root / AV2).is_dir() else None
-    if raster is not None:
-        log = AV2Log(root / AV2)
-        for index in (0, 1):
-            sweep = log.sweep(index)
-            points, truth = np.asarray(sweep.points), np.asarray(sweep.is_ground)
+    if (root / AV2).is_dir():
+        log, raster = AV2Log(root / AV2), read_ground_raster(root / AV2 / "map")
+        for sweep in log:
+            points = np.asarray(sweep.points)
             city = points.astype(np.float64) @ sweep.pose[:3, :3].T + sweep.pose[:3, 3]
             deep = np.concatenate([city[:, :2], np.full((len(city), 1), -1e6)], 1)
             on_raster = raster.is_ground(deep)  # points far below the surface are ground wherever the height is known
-            yield "Argoverse 2 pair, on the raster", points, truth, on_raster
+            yield "Argoverse 2 pair, on the raster", points, np.asarray(sweep.is_ground), on_raster
     file = root / "kitti-0000" / "kitti-0000-a.h5"
     if file.is_file():
         with HDF5Log(file) as scene:
-            for index in range(0, 16, 5):
-                sweep = scene.sweep(index)
-                points, truth = np.asarray(sweep.points), np.asarray(sweep.is_ground)
-                yield "KITTI, stored mask (Patchwork++ + 0.2 m)", points, truth, np.ones(len(points), bool)
+            for sweep in (scene.sweep(index) for index in range(0, 16, 5)):
+                truth = np.asarray(sweep.is_ground)
+                yield "KITTI, stored mask (Patchwork++ + 0.2 m)", np.asarray(sweep.points), truth, np.ones_like(truth)
 
 
 def scores(mask: np.ndarray, truth: np.ndarray, is_scored: np.ndarray) -> tuple[float, float, float]:
@@ -78,43 +71,24 @@ def scores(mask: np.ndarray, truth: np.ndarray, is_scored: np.ndarray) -> tuple[
     return both / (mask | truth).sum(), both / max(mask.sum(), 1), both / truth.sum()
 
 
-def median_ms(points: np.ndarray, method: str) -> float:
-    """Median processor time of a call in ms."""
-    seconds = []
-    for _ in range(CALLS):
-        start = time.process_time()
-        find_ground(points, method=method)
-        seconds.append(time.process_time() - start)
-    return 1000 * statistics.median(seconds)
-
-
 def main() -> None:
-    """Print the tables."""
+    """Print the table."""
     torch.set_num_threads(1)
     root = Path(os.environ.get("CFLOW_DATA") or Path(__file__).resolve().parents[3] / "shared" / "data")
-    methods: list[str] = []
-    for method in METHODS:
-        try:
-            find_ground(np.zeros((1, 3)), method=method)
-            methods.append(method)
-        except CFlowError as error:
-            print(f"{method} is left out: {error}\n")
-    print("| sweeps | " + " | ".join(f"{m}: IoU | precision | recall" for m in methods) + " |")
-    print("|---" * (1 + 3 * len(methods)) + "|")
-    table: dict[str, list[list[tuple[float, float, float]]]] = {}
-    for cases in (simulated(), real(root)):
-        for name, points, truth, is_scored in cases:
-            rows = table.setdefault(name, [[] for _ in methods])
-            for row, method in zip(rows, methods):
-                row.append(scores(find_ground(points, method=method), truth, is_scored))
-    for name, rows in table.items():
-        cells = [f"{value:.3f}" for row in rows for value in np.mean(row, 0)]
-        print(f"| {name} ({len(rows[0])}) | " + " | ".join(cells) + " |")
-
-    points = make_drive(seed=SEEDS[0], num_sweeps=1, profile="av2").sweep(0).points
-    print(f"\n| one sweep of {len(points)} points, one thread | processor ms |\n|---|---|")
-    for method in methods:
-        print(f"| {method} | {median_ms(points, method):.1f} |")
+    print("| sweeps | method | IoU | precision | recall | ms |\n|---|---|---|---|---|---|")
+    rows: dict[tuple[str, str], list[tuple[float, ...]]] = {}
+    for name, points, truth, is_scored in (*simulated(), *real(root)):
+        for method in ("grid", "patchwork"):
+            start = time.process_time()
+            try:
+                mask = find_ground(points, method=method)
+            except CFlowError:  # Patchwork++ is not installed
+                continue
+            milliseconds = 1000 * (time.process_time() - start)
+            rows.setdefault((name, method), []).append((*scores(mask, truth, is_scored), milliseconds))
+    for (name, method), values in rows.items():
+        cells = [f"{value:.3f}" for value in np.mean(values, 0)[:3]]
+        print(f"| {name} ({len(values)}) | {method} | {' | '.join(cells)} | {np.median(values, 0)[3]:.1f} |")
 
 
 if __name__ == "__main__":
