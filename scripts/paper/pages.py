@@ -22,8 +22,8 @@ PER_SET = ("datasets", "range_split")  # experiments whose columns are data sets
 INTRODUCTION = """# The paper's tables next to ours
 
 The score is the dynamic bucket-normalised EPE; lower is better. The paper's rows are of Argoverse 2 val, ours of other
-data. You can compare whether a change helps, but not the numbers. The page has the means over the classes, and the CSV
-files next to the pictures have each class. docs/settings.md has the commands.
+data. You can compare whether a change helps, but not the numbers. The tables have the means over the classes, and the
+CSV files next to the pictures have each class. docs/settings.md has the commands.
 """
 Cells = List[List[str]]
 
@@ -50,27 +50,25 @@ def class_cells(paper: dict[str, Any], ours: Ours) -> Cells:
 
 
 def set_cells(paper: dict[str, Any], ours: Ours) -> Cells:
-    """Header and rows of a table with a column per data set (and range): first the paper's methods, then ours."""
-    scores = protocol(ours)
+    """Header and rows of a table with a column per method: a row per data set (and range), the paper's first."""
+    rows: list[tuple[str, str, dict[str, float]]] = []
     if "bars" in paper:
-        cells = [["method", "from", *paper["at"], *ours]]
-        for method, printed in paper["bars"].items():
-            cells.append([method, "paper", *map(number, printed), *("-" for _ in ours)])
-        for method, score in scores.items():
-            mine = [number(score.overall), *("-" for _ in paper["at"][1:])]
-            cells.append([method, "ours", *mine, *(number(score.data_sets[data_set]) for data_set in ours)])
-        return cells
-    panels = paper["panels"]
-    cells = [["method", "from", *(f"{data_set} {name} m" for data_set in (*panels, *ours) for name in RANGES)]]
-    for method in next(iter(panels.values())):
-        printed = [value for panel in panels.values() for value in panel[method]]
-        cells.append([method, "paper", *map(number, printed), *("-" for _ in ours for _ in RANGES)])
-    for method in scores:
-        mine = [range_errors(runs[method]) if method in runs else [math.nan] * 2 for runs in ours.values()]
-        cells.append(
-            [method, "ours", *("-" for _ in panels for _ in RANGES), *(number(v) for pair in mine for v in pair)]
-        )
-    return cells
+        methods, scores = list(paper["bars"]), protocol(ours)
+        for index, name in enumerate(paper["at"]):
+            rows.append((name, "paper", {method: paper["bars"][method][index] for method in methods}))
+        if scores:
+            rows.append(("Overall", "ours", {method: score.overall for method, score in scores.items()}))
+        rows += [(name, "ours", {method: score.data_sets[name] for method, score in scores.items()}) for name in ours]
+    else:
+        methods = list(next(iter(paper["panels"].values())))
+        for name, origin, of_range in (
+            *((name, "paper", panel) for name, panel in paper["panels"].items()),
+            *((name, "ours", {m: range_errors(run) for m, run in runs.items()}) for name, runs in ours.items()),
+        ):
+            for index, reach in enumerate(RANGES):
+                rows.append((f"{name} {reach} m", origin, {m: values[index] for m, values in of_range.items()}))
+    cells = [[name, origin, *(number(values.get(m, math.nan)) for m in methods)] for name, origin, values in rows]
+    return [["data set", "from", *methods], *cells]
 
 
 def mean_cells(cells: Cells) -> Cells:
@@ -160,7 +158,8 @@ def write_pages(results: Path, output: Path) -> None:
         is_figure = "at" in about
         shown = cells
         if name in PER_SET:
-            shown = [row for row in cells if row is cells[0] or row[0] in METHODS.values()]
+            kept = [column for column, name in enumerate(cells[0]) if column < 2 or name in METHODS.values()]
+            shown = [[row[column] for column in kept] for row in cells]
         elif is_figure:
             shown = mean_cells(cells)
         else:
