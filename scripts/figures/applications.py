@@ -145,19 +145,19 @@ def stream(file: Path) -> None:
         axes.plot(range(1, STREAMED), ms, ".-", label=preset)
     axes.axhline(1000 * INTERVAL, color="0.6", linewidth=0.8)
     axes.text(0, 1000 * INTERVAL, "the next sweep", ha="left", va="top", color="0.4", fontsize=8)
-    axes.set(xlabel="sweep", ylabel="latency (ms)", ylim=(0, None))
+    axes.set(xlabel="sweep", ylabel="latency on one core (ms)", ylim=(0, None))
     axes.legend(frameon=False, ncols=3, loc="upper left", fontsize=8)
     figure.savefig(file, dpi=110)
 
 
 def latencies(flows: FlowStream, sweeps: Sequence[Sweep]) -> list[float]:
-    """Seconds from each sweep but the first to the flow of the one before it."""
+    """Processor seconds from each sweep but the first to the flow of the one before it."""
     seconds = []
     for sweep in sweeps:
-        begin = time.perf_counter()
+        begin = time.process_time()
         result = flows.push(sweep.points, sweep.pose, sweep.timestamp_ns, sweep.is_ground)
         if result is not None:
-            seconds.append(time.perf_counter() - begin)
+            seconds.append(time.process_time() - begin)
     return seconds
 
 
