@@ -23,7 +23,8 @@ INTRODUCTION = """# The paper's tables next to ours
 
 The score is the dynamic bucket-normalised EPE; lower is better. The paper's rows are of Argoverse 2 val, ours of other
 data. You can compare whether a change helps, but not the numbers. The tables have the means over the classes, and the
-CSV files next to the pictures have each class. docs/settings.md has the commands.
+CSV files next to the pictures have each class. The runs of a table are those of the table before if it names none.
+docs/settings.md has the commands.
 """
 Cells = List[List[str]]
 
@@ -166,18 +167,17 @@ def write_pages(results: Path, output: Path) -> None:
             shown = [[*row[:2], *row[-2:]] for row in cells]
         page += [f"## {about['title']} ({about['label']})", "", markdown(shown)]
         described = about_runs(ours)
-        notes = ["same runs as above"] if described and described == last_described else list(described)
+        notes = [] if described == last_described else list(described)
         notes += [about["note"]] if "note" in about else []
         last_described = described or last_described
         if name in PER_SET:
             notes.append("the picture shows the paper's other methods, with numbers in scripts/paper/figures.yaml")
             notes += [f"{method}: {reason}" for method, score in protocol(ours).items() for reason in score.missing]
-        page += [f"- {line}" for line in notes]
+        page += [*(f"- {line}" for line in notes), ""] if notes else []
         if draw is not None and is_figure:
             with atomic_file(output / f"{name}.png") as stream:
                 draw(name, about, ours).savefig(stream, format="png", dpi=130)
-            page += ["", f"![{about['title']}]({output.name}/{name}.png)"]
-        page.append("")
+            page += [f"![{about['title']}]({output.name}/{name}.png)", ""]
     missing = missing_runs(paper, runs)
     for title, lines in (("Missing runs", missing), ("Remarks", remarks)):
         if lines:
