@@ -182,11 +182,6 @@ def kitti(path: Path = KITTI) -> list[Item]:
     return [make_item(window(sweeps, i, HISTORY, FUTURE), log.labels(i), log.eval_mask(i)) for i in pairs]
 
 
-def whole_history(path: Path) -> list[Item]:
-    """The labelled pairs of a scene that have `HISTORY` older sweeps."""
-    return kitti(path)[HISTORY:]
-
-
 @lru_cache(maxsize=None)
 def kitti_steps(step: int) -> list[Item]:
     """Pairs (t, t + step) of KITTI 0000, with the labels of the pairs in between chained object by object."""
@@ -249,8 +244,8 @@ def staged(stage: Callable[[int], drives.Staged]) -> list[Item]:
     return items
 
 
-def _every_second(load: Callable[[], list[Item]], start: int) -> Callable[[], list[Item]]:
-    return lambda: load()[start::2]
+def _sliced(load: Callable[[], list[Item]], start: int, step: int = 2) -> Callable[[], list[Item]]:
+    return lambda: load()[start::step]
 
 
 _STEPS = {step: partial(kitti_steps, step) for step in (3, 5)}
@@ -258,33 +253,39 @@ _STEPS = {step: partial(kitti_steps, step) for step in (3, 5)}
 _REAL: tuple[tuple[str, str, int, Callable[[], list[Item]], int], ...] = (
     ("av2 pair h=0", "real", 0, av2_pair, 1),
     ("kitti h=0", "real", 0, kitti, 1),
-    ("kitti h=4", "real", 4, _every_second(kitti, 4), 1),
-    ("third sweeps h=0", "real", 0, _every_second(_STEPS[3], 0), 3),
-    ("fifth sweeps h=0", "real", 0, _every_second(_STEPS[5], 0), 5),
+    ("kitti h=4", "real", 4, _sliced(kitti, 4), 1),
+    ("third sweeps h=0", "real", 0, _sliced(_STEPS[3], 0), 3),
+    ("fifth sweeps h=0", "real", 0, _sliced(_STEPS[5], 0), 5),
     ("merge h=0", "real", 0, merged, 1),
-    ("kitti odd h=4", "odd", 4, _every_second(kitti, 5), 1),
-    ("third sweeps odd h=0", "odd", 0, _every_second(_STEPS[3], 1), 3),
-    ("fifth sweeps odd h=0", "odd", 0, _every_second(_STEPS[5], 1), 5),
+    ("kitti odd h=4", "odd", 4, _sliced(kitti, 5), 1),
+    ("third sweeps odd h=0", "odd", 0, _sliced(_STEPS[3], 1), 3),
+    ("fifth sweeps odd h=0", "odd", 0, _sliced(_STEPS[5], 1), 5),
     ("crown h=0", "merged", 0, partial(kitti, CROWN), 1),
-    ("later kitti h=4", "merged", 4, _every_second(partial(kitti, KITTI_LATER), 4), 1),
-    *((f"pandaset {part} h=4", "pandaset", 4, partial(whole_history, path), 1) for part, path in PANDASET.items()),
+    ("later kitti h=4", "merged", 4, _sliced(partial(kitti, KITTI_LATER), 4), 1),
+    *(
+        (f"pandaset {part} h=4", "pandaset", 4, _sliced(partial(kitti, path), HISTORY, 1), 1)
+        for part, path in PANDASET.items()
+    ),
+)
+_STAGES = (
+    "hedge",
+    "crowd",
+    "tram",
+    "rolling_shutter",
+    "appearing",
+    "tree",
+    "bridge",
+    "gantry",
+    "wires",
+    "abreast",
+    "border",
 )
 _SCENES: dict[str, Callable[[int], drives.Staged]] = {
-    "hedge": drives.hedge,
-    "crowd": drives.crowd,
-    "tram": drives.tram,
-    "rolling": drives.rolling_shutter,
-    "appears": drives.appearing,
+    **{name: getattr(drives, name) for name in _STAGES},
     **{f"walkers-{gap:g}": partial(drives.walkers, gap=gap) for gap in (0.1, 0.2, 0.3, 0.5)},
     **{
         f"facade-{profile}-{step:g}": partial(drives.facade, step=step, profile=profile)
         for profile in ("av2", "waymo")
         for step in (0.1, 0.3, 0.55, 1.0, 1.5)  # metres of the vehicle per sweep
     },
-    "tree": drives.tree,
-    "bridge": drives.bridge,
-    "gantry": drives.gantry,
-    "wires": drives.wires,
-    "abreast": drives.abreast,
-    "border": drives.border,
 }

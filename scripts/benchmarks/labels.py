@@ -162,11 +162,12 @@ def main() -> None:
     parser.add_argument("--num-sweeps", type=int, default=8, help="of a simulated drive")
     given = parser.parse_args()
     torch.set_num_threads(1)
-    results: dict[str, list[dict[str, Any]]] = {}
+    table: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as scratch:
         rows = {f"simulated {sensor}": simulated(Path(scratch), sensor, given.num_sweeps) for sensor in given.simulated}
         rows.update({file.stem: [file] for path in given.paths for file in find_hdf5_scenes(path)})
         for name, files in rows.items():
+            scenes = []
             for file in files:
                 log = HDF5Log(file)
                 cached = CachedLog(log, len(log))
@@ -174,8 +175,9 @@ def main() -> None:
                 result = {preset: ours(cached, preset) for preset in given.presets}
                 peer = theirs(cached, given.sensor_height)
                 result.update({} if peer is None else {"DUFOMap": peer})
-                results.setdefault(name, []).append(result)
-    print(markdown([table_row(name, scenes) for name, scenes in results.items()]))
+                scenes.append(result)
+            table.append(table_row(name, scenes))
+    print(markdown(table))
 
 
 if __name__ == "__main__":

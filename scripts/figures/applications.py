@@ -44,10 +44,8 @@ STREAMED, INTERVAL = 40, 0.1  # sweeps; seconds between them
 @lru_cache(maxsize=None)
 def crossing() -> tuple[Log, list[FlowResult]]:
     """A simulated crossing and its flow."""
-    log = make_drive(301, CROSSING_SWEEPS, "av2", "crossing")
-    model = make_model(make_config("offline"))
-    settings = model.config
-    return log, [model([each])[0] for each in windows(log, settings.num_history, settings.num_future)]
+    log, model = make_drive(301, CROSSING_SWEEPS, "av2", "crossing"), make_model(make_config("offline"))
+    return log, [model([each])[0] for each in windows(log, model.config.num_history, model.config.num_future)]
 
 
 def tracks(file: Path) -> None:
@@ -155,10 +153,9 @@ def latencies(flows: FlowStream, sweeps: Sequence[Sweep]) -> list[float]:
     seconds = []
     for sweep in sweeps:
         begin = time.process_time()
-        result = flows.push(sweep.points, sweep.pose, sweep.timestamp_ns, sweep.is_ground)
-        if result is not None:
-            seconds.append(time.process_time() - begin)
-    return seconds
+        flows.push(sweep)
+        seconds.append(time.process_time() - begin)
+    return seconds[1:]
 
 
 def deskewed(file: Path) -> None:

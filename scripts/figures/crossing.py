@@ -1,7 +1,6 @@
 """Draw docs/pictures/crossing.webp, the animation of the README: a simulated crossing in the page of `cflow view`.
 
     python scripts/figures/crossing.py outputs/crossing            # estimates the flow (minutes), then draws
-    python scripts/figures/crossing.py outputs/crossing --page OLD.html
 
 Needs the extras `html` and `test`, and Chromium on the path. Five seconds of the drive are shown at half speed. Each
 sweep is in two pictures, because the camera follows the vehicle smoothly.
@@ -37,12 +36,11 @@ Object.assign(viewer.state, { follow: false, rings: false, labels: true, size: 1
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("output", type=Path)
-    parser.add_argument("--page", type=Path, help="a page that this script wrote before")
     given = parser.parse_args()
     given.output.mkdir(parents=True, exist_ok=True)
-    page = given.page or given.output / "crossing.html"
+    page = given.output / "crossing.html"
     drive = make_drive(SEED, FIRST + COUNT + 2, "av2", "crossing")
-    if given.page is None:
+    if not page.exists():
         write_page(drive, page)
     T_viewer_ego = np.linalg.inv(drive.poses[FIRST + 1]) @ drive.poses[FIRST + 1 : FIRST + 2 + COUNT]
     pictures = take(page, T_viewer_ego[:, :3, 3])

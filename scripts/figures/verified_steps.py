@@ -2,12 +2,10 @@
 """Draw the steps of the verified method (docs/verified.md) on two small simulated drives (drives.py).
 
 python scripts/figures/verified_steps.py                        docs/pictures/verified_steps.png
-python scripts/figures/verified_steps.py --folder FOLDER        in another folder
 """
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 from typing import Any
 
@@ -120,9 +118,6 @@ def draw_row(panels: list[Any], drive: Any, low: tuple[float, float], width: flo
 
 def main() -> None:
     """Draw the picture."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--folder", type=Path, default=FOLDER)
-    folder = parser.parse_args().folder
     torch.set_num_threads(1)
     figure = style.blank_figure((LEFT + 5 * (WIDE + GAP), FOOT + HEAD + 2 * (HIGH + GAP)), 100)
     for row, (name, staged, low, width) in enumerate(ROWS):
@@ -136,7 +131,7 @@ def main() -> None:
             else:
                 font = {"fontsize": 10.5, "color": style.FAINT, "linespacing": 1.3, "va": "top"}
                 axes.text(0, -0.05, caption, transform=axes.transAxes, **font)
-    save_picture(figure, folder / "verified_steps.png")
+    save_picture(figure, FOLDER / "verified_steps.png")
 
 
 if __name__ == "__main__":
