@@ -125,8 +125,8 @@ def make_batch(
 
     Args:
         windows: B windows, at least one.
-        config: `ego_box`, `sweep_interval`, `point_cloud_range`, `num_history` and `num_future` are used. Of a longer
-            history the nearest sweeps are taken.
+        config: `ego_box`, `sweep_interval`, `point_cloud_range`, `num_history` and `num_future` are used. If a
+            history is longer, its nearest sweeps are used.
         grid: the images of any scale; they contain the region.
         device: device of the batch.
         num_axes: coordinates to keep, 2 or 3.
