@@ -24,8 +24,8 @@ LAYER_HEIGHT, NUM_LAYERS = 0.1, 32  # of the voxels, metres
 _FARTHEST = 0.2  # metres, between the voxels of a pair
 _FAR = 3.0  # squared distance of a pair, in standard deviations of both surfaces, at which its weight is a quarter
 _MOST_TIME = 2.5  # sweep intervals: t, t-1 and their jitter; older sweeps pull where the rotation is not constant
-# Of each step, in those of Gauss and Newton: nearest partners change with each step, so theirs falls short.
-_STEP_LENGTHS = (1.7, 1.7, 1.2)
+_NUM_STEPS = 4
+_STEP_LENGTH = 1.4  # of that of Gauss and Newton: nearest partners change with each step, so theirs falls short
 # From the given flow in x and in y, metres per interval, and from no rotation, tangent of half the angle per interval.
 _LARGEST_CHANGE = (0.15, 0.15, 0.1)
 # Pairs of points without a surface that the given translation is worth, and, at a distance of 1 m, no rotation.
@@ -58,12 +58,12 @@ def register(points: ObjectPoints, sweeps: HeightSlicedSweeps, flow: Tensor) -> 
     held = constant((_HELD, _HELD, 4 * _HELD_ROTATION), torch.float64, device)[:, None]
     largest = constant(_LARGEST_CHANGE, torch.float64, device)[:, None]
     lower, upper = given - largest, given + largest
-    for length in _STEP_LENGTHS:
+    for _ in range(_NUM_STEPS):
         equations = pairs.normal_equations(motion)
         force = equations[:, 3] + held * (given - motion)
         inverse, scale = adjugate(equations[:, :3] + torch.diag(held[:, 0])[:, :, None])
         change = (inverse * force).sum(1) / scale
-        motion = torch.clamp(torch.add(motion, change, alpha=length), lower, upper)
+        motion = torch.clamp(torch.add(motion, change, alpha=_STEP_LENGTH), lower, upper)
     corner = constant(sweeps.grid.lower[:2], torch.float64, device)
     return RigidMotion(motion[:2].t().contiguous(), motion[2], torch.view_as_real(pairs.centre) / UNITS + corner)
 

@@ -22,7 +22,7 @@ FAR = 3.0  # squared distance of a pair, in standard deviations of both surfaces
 NOISE = 0.05  # metres, standard deviation of a centroid across its surface
 UNKNOWN = 0.2  # metres, standard deviation of a surface of fewer than three voxels
 MOST_TIME = 2.5  # sweep intervals: older sweeps are ignored
-STEP_LENGTHS = (1.7, 1.7, 1.2)  # of each step, in those of Gauss and Newton
+NUM_STEPS, STEP_LENGTH = 4, 1.4  # steps, as long as so many of Gauss and Newton
 LONGEST_CORRECTION = 0.15  # metres per interval, in x and in y, from the given flow
 LARGEST_ROTATION = 0.1  # tangent of half the angle per interval
 HELD, HELD_ROTATION = 2.0, 5.0  # pairs that the given translation is worth, and, at 1 m, no rotation
@@ -66,9 +66,9 @@ def register(points: Sequence[Point], flow: Sequence[Vector], sweeps: SlicedSwee
             continue
         centre = (sum(v.x for v in at_t) // len(at_t), sum(v.y for v in at_t) // len(at_t))
         v_x, v_y, rotation = *start, 0.0
-        for length in STEP_LENGTHS:
+        for _ in range(NUM_STEPS):
             found = find_pairs(object_id, voxels, spreads, sweeps, centre, (v_x, v_y), rotation)
-            dx, dy, angle = (length * change for change in gauss_newton(found, start, (v_x, v_y), rotation))
+            dx, dy, angle = (STEP_LENGTH * change for change in gauss_newton(found, start, (v_x, v_y), rotation))
             v_x = limit(v_x + dx, start[0], LONGEST_CORRECTION)
             v_y = limit(v_y + dy, start[1], LONGEST_CORRECTION)
             rotation = limit(rotation + angle / 2, 0.0, LARGEST_ROTATION)
