@@ -1,0 +1,231 @@
+#!/usr/bin/env python3
+"""Check a GPU within minutes: equality with the CPU, speed, launches, memory. Then run `pytest -m cuda`.
+
+  PYTHONPATH=. python scripts/benchmarks/gpu_check.py                      tables, and outputs/gpu_check.json
+  PYTHONPATH=. python scripts/benchmarks/gpu_check.py --output FILE --skip memory
+
+We have not run this script on a GPU, because we had none. Without a GPU it compares the CPU with itself, which only
+tests the script.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import time
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any, Callable, Dict, List, Sequence
+
+import numpy as np
+import torch
+from table import markdown
+from torch.profiler import ProfilerActivity, profile
+
+from cflow_torch import Config, FlowResult, Sweep, Window, make_config, make_model
+from cflow_torch.data.log import window
+from cflow_torch.simulator import make_drive
+from cflow_torch.stages import TimedModel, stage_seconds
+
+TOLERANCE = 1e-4  # metres; also of scores and confidences
+EXACT = ("cluster_id", "is_valid")
+SCALES = (0.8, 0.4, 0.3, 0.2, 0.1)
+PAPER, KEYS, DEFAULT = make_config("paper"), make_config("paper", method="keypoints"), make_config("default")
+TWO = PAPER.replace(num_history=2, pixel_sizes=(0.4, 0.1))
+LITTLE = 30_000_000  # bytes, less than a batch needs
+# name -> (settings, number of windows in a batch)
+VARIANTS: dict[str, tuple[Config, int]] = {
+    "dense, h = 0": (PAPER, 1),
+    "dense, h = 0, +-70 m": (PAPER.replace(point_cloud_range=(-70.0, -70.0, -3.0, 70.0, 70.0, 5.0)), 1),
+    "dense, h = 0, connectivity 4": (PAPER.replace(connectivity=4), 1),
+    "dense, h = 0, conv": (
+        PAPER.replace(correlation="conv", point_cloud_range=(-20.0, -20.0, -3.0, 20.0, 20.0, 5.0)),
+        1,
+    ),
+    "dense, h = 4, 5 scales": (PAPER.replace(num_history=4, pixel_sizes=SCALES), 1),
+    "dense, h = 2, 2 scales": (TWO, 3),
+    "dense, h = 2, 2 scales, max_memory 30 MB": (TWO.replace(max_memory=LITTLE), 3),
+    "dense, max_speed": (TWO.replace(max_speed=30.0), 1),
+    "dense, sectional view": (TWO.replace(sectional_view=True), 2),
+    "key points": (KEYS, 1),
+    "key points, preset keypoints": (make_config("keypoints"), 1),
+    "key points, nearest": (KEYS.replace(densify="nearest"), 1),
+    "key points, max_memory 30 MB": (KEYS.replace(max_memory=LITTLE), 3),
+    "preset default": (DEFAULT, 3),
+    "preset default, h = 0": (DEFAULT.replace(num_history=0), 3),
+    "preset default, max_memory 30 MB": (DEFAULT.replace(max_memory=LITTLE), 3),
+    "preset fast": (make_config("fast"), 3),
+}
+MEASURED: dict[str, Config] = {
+    "dense, h = 4, 5 scales": VARIANTS["dense, h = 4, 5 scales"][0],
+    "dense, h = 0": PAPER,
+    "key points": KEYS,
+    "preset default": DEFAULT,
+}
+# Prefixes of CUDA functions, because the suffixes differ from version to version.
+LAUNCHES = ("cudaLaunchKernel", "cuLaunchKernel")
+WAITS = ("cudaStreamSynchronize", "cudaDeviceSynchronize", "cudaEventSynchronize")
+COPIES = ("cudaMemcpy", "cudaMemset")
+SEEDS, SWEEPS = (7, 8, 9), 6  # t + 1, t, and a history of four
+STREETS: list[Window] = []  # filled by `main`
+Rows = List[Dict[str, Any]]
+
+
+def make_streets() -> list[Window]:
+    """Simulated windows."""
+    return [window(make_drive(seed=seed, num_sweeps=SWEEPS), SWEEPS - 2, SWEEPS - 2) for seed in SEEDS]
+
+
+def windows_for(config: Config, number: int) -> list[Window]:
+    """Windows with the history of a config; there are three different ones, which are repeated."""
+    chosen = [STREETS[i % len(STREETS)] for i in range(number)]
+    return [replace(sweeps, pch=sweeps.pch[: config.num_history]) for sweeps in chosen]
+
+
+def check_equality(device: str) -> Rows:
+    """Compare GPU and CPU in every variant: rows that differ in each field, the largest difference of the floats."""
+    rows = []
+    for name, (config, number) in VARIANTS.items():
+        windows = windows_for(config, number)
+        on_gpu, on_cpu = (make_model(config, where)(windows) for where in (device, "cpu"))
+        rows.append({"variant": name, **compare(on_gpu, on_cpu)})
+    return rows
+
+
+def compare(results: Sequence[FlowResult], expected: Sequence[FlowResult]) -> dict[str, Any]:
+    """Points, points that differ in each field, the largest difference of a float, and whether all is equal."""
+    row: dict[str, Any] = {"points": sum(len(result.flow) for result in expected)}
+    largest = 0.0
+    for field in fields(FlowResult):
+        row[field.name] = 0
+        for a, b in zip(results, expected):
+            x, y = getattr(a, field.name), getattr(b, field.name)
+            if y is None:  # only the verified method has a confidence
+                continue
+            x = x.cpu()
+            row[field.name] += int((x != y).view(len(y), -1).any(1).sum())
+            if x.is_floating_point() and x.numel():
+                largest = max(largest, float((x - y).abs().max()))
+    row["largest_difference"] = largest
+    row["same"] = all(row[name] == 0 for name in EXACT) and largest <= TOLERANCE
+    return row
+
+
+def measure_speed(device: str) -> Rows:
+    """Milliseconds of a batch and windows per second, from NumPy arrays and from tensors on the device."""
+    rows = []
+    for name, config in MEASURED.items():
+        for size in (1, 8, 32) if device == "cuda" else (1, 2):
+            host = windows_for(config, size)
+            for kind, windows in (("arrays", host), (device, [on_device(each, device) for each in host])):
+                watch, end = TimedModel(make_model(config, device)), time.monotonic() + 2
+                for run in range(30):
+                    if run < 3 or time.monotonic() < end:
+                        watch(windows)
+                median = watch.report()["median"]
+                rows.append(
+                    {"work": name, "input": kind, "batch": size, "ms": 1000 * median, "windows/s": size / median}
+                )
+    return rows
+
+
+def on_device(sweeps: Window, device: str) -> Window:
+    """The window with its points on the device."""
+
+    def uploaded(sweep: Sweep) -> Sweep:
+        points, is_ground = (torch.as_tensor(np.asarray(x)).to(device) for x in (sweep.points, sweep.is_ground))
+        return replace(sweep, points=points, is_ground=is_ground)
+
+    return Window(uploaded(sweeps.pc0), uploaded(sweeps.pc1), tuple(map(uploaded, sweeps.pch)))
+
+
+def count_launches(device: str) -> Rows:
+    """Kernel launches, waits and copies of warm batches."""
+    rows = []
+    for name, config in MEASURED.items() if device == "cuda" else ():
+        model = make_model(config, device)
+        for size in (1, 16):
+            windows = windows_for(config, size)
+            rows.append({"work": name, "batch": size, **by_profiler(lambda: model(windows))})  # noqa: B023
+    return rows or [{"work": "none: tests/test_devices.py counts on a simulated accelerator"}]
+
+
+def by_profiler(run: Callable[[], Any]) -> dict[str, Any]:
+    """Launches, waits and copies of CUDA, and milliseconds of its kernels."""
+    with stage_seconds() as stages:
+        run()
+    torch.cuda.synchronize()
+    with profile(activities=[ProfilerActivity.CPU, ProfilerActivity.CUDA]) as profiler:
+        run()
+        torch.cuda.synchronize()
+    events = profiler.events() or []
+    on_gpu = [e for e in events if e.device_type == torch.autograd.DeviceType.CUDA and e.name not in stages]
+    return {
+        "launches": sum(event.name.startswith(LAUNCHES) for event in events),
+        "syncs": sum(event.name.startswith(WAITS) for event in events) - 1,  # without our own
+        "copies": sum(event.name.startswith(COPIES) for event in events),
+        "gpu_ms": sum(event.time_range.elapsed_us() for event in on_gpu) / 1000,
+    }
+
+
+def measure_memory(device: str) -> Rows:
+    """Peak memory on a GPU, with and without a limit; the limit must not change the flow."""
+    rows = []
+    size = 32 if device == "cuda" else 2
+    for name, config in MEASURED.items():
+        batch = windows_for(config, size)
+        free = [result.to("cpu") for result in make_model(config, device)(batch)]
+        for limit in (None, 1_000_000_000, 200_000_000):
+            model = make_model(config.replace(max_memory=limit), device)
+            model(batch)  # the first run allocates caches
+            if device == "cuda":
+                torch.cuda.reset_peak_memory_stats()
+                before = torch.cuda.memory_allocated()
+            results = model(batch)
+            peak = (torch.cuda.max_memory_allocated() - before) / 1e6 if device == "cuda" else None
+            row = {"work": name, "batch": size, "max_memory_MB": limit and limit / 1e6, "peak_MB": peak}
+            rows.append({**row, "same": compare(results, free)["same"]})
+    return rows
+
+
+PARTS: dict[str, Callable[[str], Rows]] = {
+    "equality": check_equality,
+    "speed": measure_speed,
+    "launches": count_launches,
+    "memory": measure_memory,
+}
+
+
+def main() -> None:
+    """Run the parts, print tables, write JSON; the exit status is 1 if results differ or a part failed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--output", type=Path, default=Path("outputs/gpu_check.json"))
+    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu", choices=("cuda", "cpu"))
+    parser.add_argument("--skip", nargs="*", default=[], choices=list(PARTS))
+    given = parser.parse_args()
+    STREETS.extend(make_streets())
+    name = torch.cuda.get_device_name() if given.device == "cuda" else "no GPU: the CPU is compared with itself"
+    report: dict[str, Any] = {"device": name, "platform": platform.platform(), "torch": torch.__version__}
+    print(json.dumps(report))
+    wrong: list[str] = []
+    for title, part in PARTS.items():
+        if title in given.skip:
+            continue
+        try:
+            rows = report[title] = part(given.device)
+        except Exception as error:  # go on with the other parts
+            report[title] = f"{type(error).__name__}: {error}"
+            print(f"\n## {title}: {report[title]}")
+            wrong.append(title)
+            continue
+        print(f"\n## {title}\n\n{markdown(rows)}", flush=True)
+        wrong += [f"{title}: {next(iter(row.values()))}" for row in rows if not row.get("same", True)]
+        given.output.parent.mkdir(parents=True, exist_ok=True)
+        given.output.write_text(json.dumps(report, indent=1) + "\n")
+    if wrong:
+        raise SystemExit("wrong: " + "; ".join(wrong))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,135 @@
+#!/usr/bin/env python3
+"""Compare the times of presets, settings and the OpenCV loop: medians of alternating runs in this process, one thread.
+
+  python scripts/benchmarks/speed_table.py                                              a simulated street
+  python scripts/benchmarks/speed_table.py --data-set av2 --root /data/av2/val/LOG --repeats 50 --json FILE
+
+The table also has the launches and waits of a window, counted on a simulated accelerator (tests/pretend_device.py).
+Needs opencv-python-headless, and torch 2.9 for the counts. `cflow bench` measures one setting in more detail.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import sys
+import time
+from functools import partial
+from pathlib import Path
+from typing import Any, Callable, Dict, Iterator
+
+import cv2
+import torch
+from opencv_loop import opencv_flow
+from table import markdown
+
+from cflow_torch import Config, Window, make_config, make_model
+from cflow_torch.cli.run import machine, versions
+from cflow_torch.data.catalog import find_sources, open_log
+from cflow_torch.data.log import window
+from cflow_torch.simulator import make_drive
+
+HISTORY = 4
+PAPER, KEYS, DEFAULT = make_config("paper"), make_config("keypoints"), make_config("default")
+# The settings of the paper's figure benefit_multiscale.
+FULL = PAPER.replace(num_history=HISTORY, pixel_sizes=(0.8, 0.4, 0.3, 0.2, 0.1))
+WIDE = PAPER.replace(point_cloud_range=DEFAULT.point_cloud_range)
+WIDE_HISTORY = WIDE.replace(num_history=HISTORY)
+WIDE_SCALES = WIDE_HISTORY.replace(pixel_sizes=DEFAULT.pixel_sizes)
+Call = Callable[[Window], Any]
+Rows = Iterator[Dict[str, Any]]
+
+
+def of(config: Config) -> Call:
+    """The flow by a model with these settings, with its history."""
+    model = make_model(config, "cpu")
+    return lambda sweeps: model([with_history(sweeps, config)])
+
+
+def loop(config: Config) -> Call:
+    """The flow by the OpenCV loop."""
+    return lambda sweeps: opencv_flow(with_history(sweeps, config), config)
+
+
+def with_history(sweeps: Window, config: Config) -> Window:
+    """The window with as many older sweeps as the settings use."""
+    return Window(sweeps.pc0, sweeps.pc1, sweeps.pch[: config.num_history])
+
+
+# What is compared: the two calls whose times are divided.
+COMPARED: dict[str, tuple[Call, Call]] = {
+    "`default` / `paper`, h = 0, equal region": (of(DEFAULT.replace(num_history=0)), of(WIDE)),
+    "`default` / `paper`, h = 4, equal region": (of(DEFAULT), of(WIDE_HISTORY)),
+    "OpenCV loop / `default`, h = 4, equal region and scales": (loop(WIDE_SCALES), of(DEFAULT)),
+    "OpenCV loop / `paper`, h = 0": (loop(PAPER), of(PAPER)),
+    "OpenCV loop / `paper`, h = 4, five scales": (loop(FULL), of(FULL)),
+    "`keypoints` / `paper`, h = 0": (of(KEYS), of(PAPER)),
+}
+COUNTED = {"`paper`": PAPER, "`default`": DEFAULT, "`paper`, h = 4, five scales": FULL, "`keypoints`": KEYS}
+
+
+def times(sweeps: Window, repeats: int) -> Rows:
+    """Ratio of the times of two calls, the median over neighbouring runs: a slow spell of the machine hits both."""
+    for name, calls in COMPARED.items():
+        seconds: list[list[float]] = [[], []]
+        for repeat in range(-1, repeats):
+            for call, taken in zip(calls, seconds):
+                call(sweeps)  # the second of two runs counts
+                start = time.perf_counter()
+                call(sweeps)
+                if repeat >= 0:
+                    taken.append(time.perf_counter() - start)
+        ms = "{:.1f} and {:.1f}".format(*(1000 * statistics.median(each) for each in seconds))
+        yield {"what": name, "is": statistics.median(a / b for a, b in zip(*seconds)), "ms": ms}
+
+
+def counts(sweeps: Window) -> Rows:
+    """Launches and waits of a window on a simulated accelerator, and launches of sixteen windows over those of one."""
+    sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
+    import pretend_device
+
+    for name, config in COUNTED.items() if pretend_device.IS_THERE else ():
+        given = with_history(sweeps, config)
+        with pretend_device.PretendDevice() as device:
+            model = make_model(config, pretend_device.DEVICE)
+            model([given])
+            one, sixteen = (device.count(partial(model, [given] * number)) for number in (1, 16))
+        yield {"what": f"launches / waits of a window, {name}", "is": "{} / {}".format(*one)}
+        yield {"what": f"launches of 16 windows / one, {name}", "is": sixteen[0] / one[0]}
+
+
+def load(data_set: str, root: str) -> Window:
+    """A window of a simulated street, or of the first log below a folder."""
+    log: Any = make_drive(seed=7, num_sweeps=HISTORY + 2, profile="av2")
+    if root:
+        log = open_log(data_set, find_sources(data_set, root)[0], check=False)
+    return window(log, min(HISTORY, len(log.timestamps) - 2), HISTORY)
+
+
+def main() -> None:
+    """Measure, print, write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data-set", default="av2", help="data set of --root, as in cflow's data=")
+    parser.add_argument("--root", default="", help="a log or a folder of logs; default: a simulated street")
+    parser.add_argument("--repeats", type=int, default=20)
+    parser.add_argument("--json", type=Path)
+    given = parser.parse_args()
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    sweeps = load(given.data_set, given.root)
+    rows = []
+    for part in (times(sweeps, given.repeats), counts(sweeps)):
+        for row in part:
+            rows.append(row)
+            print(row, file=sys.stderr, flush=True)
+    about = {"points": len(sweeps.pc0.points), "older_sweeps": len(sweeps.pch), "repeats": given.repeats}
+    report = {"machine": machine(), "versions": versions(), **about}
+    print(json.dumps(report))
+    print(markdown(rows))
+    if given.json:
+        given.json.write_text(json.dumps({**report, "rows": rows}, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
