@@ -12,6 +12,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any, Iterator
 
+from cflow_torch.data.names import safe_name
 from cflow_torch.data.paths import PathLike, as_path, forget_listings, is_remote, remote_errors
 from cflow_torch.errors import CFlowError
 
@@ -94,36 +95,34 @@ def _put_file(path: Any) -> Iterator[IO[bytes]]:
 
 
 @contextmanager
-def atomic_folder(folder: PathLike) -> Iterator[Path]:
-    """Create a folder that takes its name only when the block ends, and then replaces an older one.
+def new_folder(root: PathLike, name: str) -> Iterator[Path]:
+    """Create the folder `root/name`, which takes its name only when the block ends.
 
     Args:
-        folder: final name, on this machine; its parent is created if it does not exist.
+        root: on this machine; it is created if it does not exist.
+        name: of the log.
 
     Yields:
-        An empty folder under a temporary name. If the block raises, it is removed and the older one stays.
+        An empty folder under a temporary name. If the block raises, it is removed.
 
     Raises:
-        CFlowError: the folder would be remote.
+        CFlowError: the folder exists, would be remote, or `name` cannot be used as a folder name.
     """
-    folder = as_path(folder)
+    folder = as_path(root) / safe_name(name, "log_id")
     if is_remote(folder):
         raise CFlowError(f"{folder} is remote: write the folder on this machine and copy it there")
-    new, old = (folder.with_name(_temporary_name(folder.name)) for _ in range(2))
+    if folder.exists():
+        raise CFlowError(f"{folder} exists already: remove it, or choose another root")
+    new = folder.with_name(_temporary_name(folder.name))
     try:
         new.mkdir(parents=True)
         yield new
         for path in new.rglob("*"):
             if path.is_file():
                 _sync(path)
-        if folder.exists():
-            os.replace(folder, old)
         os.replace(new, folder)
     finally:
-        if old.exists() and not folder.exists():  # the second rename failed
-            os.replace(old, folder)
-        for path in (new, old):
-            shutil.rmtree(path, ignore_errors=True)
+        shutil.rmtree(new, ignore_errors=True)
 
 
 def remove_stale(folder: PathLike) -> list[str]:

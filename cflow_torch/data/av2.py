@@ -12,7 +12,7 @@ from cflow_torch.data.arrays.cloud_file import read_columns
 from cflow_torch.data.arrow_file import FeatherFile, bool_column, float_columns, integer_column, text_column
 from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes, make_boxes
 from cflow_torch.data.categories import CATEGORIES
-from cflow_torch.data.files import file_errors, find_folders
+from cflow_torch.data.files import file_errors
 from cflow_torch.data.ground import GROUND_RULES, read_ground_raster
 from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.data.names import is_timestamp
@@ -21,23 +21,10 @@ from cflow_torch.data.rigid_motion import poses_from_quaternions, transform_poin
 from cflow_torch.types import CFlowError, Sweep
 
 MIN_INTERIOR_POINTS = 1  # av2-api's data loader drops boxes that hold no point, so their track ends
-SEARCH_DEPTH = 4  # <root>/<data set>/sensor/<split>/<log>, the deepest layout in use
 
 _POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
 _SIZE = ("length_m", "width_m", "height_m")
 _FLOW = ("flow_tx_m", "flow_ty_m", "flow_tz_m")
-
-
-def find_av2_logs(root: PathLike) -> list[Path]:
-    """Find the folders of all logs, which hold `sensors/lidar`, sorted.
-
-    Args:
-        root: a log, a split (holds logs), or a folder of splits, at most four levels above the logs.
-
-    Raises:
-        CFlowError: `root` is not a folder.
-    """
-    return find_folders(as_path(root), _is_log, SEARCH_DEPTH, "a log, or a folder of logs")
 
 
 class AV2Log(Log):

@@ -115,7 +115,10 @@ def flow_from_boxes(points: np.ndarray, boxes0: Boxes, boxes1: Boxes, T_ego1_ego
     is_valid = np.ones(len(start), dtype=bool)
     successor = {track: row for row, track in enumerate(boxes1.track_id)}
     for row, track in enumerate(boxes0.track_id):
-        inside = _rows_in_box(start, boxes0.size[row] + _MARGIN, boxes0.pose[row])
+        size, pose = boxes0.size[row] + _MARGIN, boxes0.pose[row]
+        # A bounding square rules out most points first.
+        near = np.flatnonzero((np.abs(start[:, :2] - pose[:2, 3]) <= np.linalg.norm(size) / 2 + 1e-6).all(axis=1))
+        inside = near[points_in_box(start[near], size, pose)]
         category[inside] = boxes0.category[row]
         if track not in successor:
             is_valid[inside] = False
@@ -123,12 +126,3 @@ def flow_from_boxes(points: np.ndarray, boxes0: Boxes, boxes1: Boxes, T_ego1_ego
         motion = boxes1.pose[successor[track]] @ np.linalg.inv(boxes0.pose[row])
         flow[inside] = transform_points(start[inside], motion) - start[inside]
     return FlowLabels(flow=flow.astype(np.float32), category=category, is_valid=is_valid)
-
-
-def _rows_in_box(points: np.ndarray, size: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Return the (M,) int64 rows of points inside a box; a bounding square rules out most points first."""
-    radius = np.linalg.norm(size) / 2 + 1e-6
-    near = np.abs(points[:, 0] - pose[0, 3]) <= radius
-    near &= np.abs(points[:, 1] - pose[1, 3]) <= radius
-    rows = np.flatnonzero(near)
-    return rows[points_in_box(points[rows], size, pose)]

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import Any, Mapping, NamedTuple, Sequence
 
+from cflow_torch.data.files import find_folders
 from cflow_torch.data.log import Log, LogWrapper
 from cflow_torch.data.log_check import check_log
 from cflow_torch.data.names import safe_name
@@ -22,27 +23,36 @@ _log = logging.getLogger(__name__)
 
 
 class DataSet(NamedTuple):
-    """One format: its reader's function root -> sources, its class source -> `Log`, what one log is, and the ends of
-    paths by which we recognise it."""
+    """One format.
 
-    find: str
+    Args:
+        log: module and class of its reader, source -> `Log`. The module is imported when it is needed.
+        what: what one log is.
+        marks: ends of paths by which we recognise the format.
+        find: function of that module, root -> sources; "" = the folders that hold the first mark, at most `depth`
+            levels below the root, or the root itself if there is no mark.
+    """
+
     log: str
     what: str
     marks: tuple[str, ...] = ()
+    find: str = ""
+    depth: int = 0
 
 
-# The key is also the module of the reader, which is imported when it is needed.
+_NUSCENES = ("v1.*/scene.json",)
 DATA_SETS: dict[str, DataSet] = {
-    "av2": DataSet("find_av2_logs", "AV2Log", "Argoverse 2 log", ("sensors/lidar",)),
-    "hdf5": DataSet("find_hdf5_scenes", "HDF5Log", "scene", ("*.h5",)),
-    "nuscenes": DataSet("find_nuscenes_scenes", "NuScenesLog", "nuScenes scene", ("v1.*/scene.json",)),
-    "truckscenes": DataSet("find_truckscenes_scenes", "TruckScenesLog", "TruckScenes scene", ("v1.*/scene.json",)),
-    "waymo": DataSet("find_waymo_segments", "WaymoLog", "Waymo segment", ("lidar/*.parquet",)),
-    "pandaset": DataSet("find_pandaset_sequences", "PandaSetLog", "PandaSet sequence", ("lidar/poses.json",)),
-    "aevascenes": DataSet("find_aevascenes_sequences", "AevaScenesLog", "AevaScenes sequence", ("sequence.json",)),
-    "bags": DataSet("find_bags", "BagLog", "bag", ("*.bag", "*.mcap", "*.db3")),
-    "kiss_icp": DataSet("find_kiss_icp", "KissICPLog", "data for a loader of KISS-ICP"),
-    "arrays": DataSet("find_array_logs", "ArraysLog", "folder of point clouds"),  # everything without a mark
+    # <root>/<data set>/sensor/<split>/<log> is the deepest layout in use.
+    "av2": DataSet("av2.AV2Log", "Argoverse 2 log", ("sensors/lidar",), depth=4),
+    "hdf5": DataSet("hdf5.HDF5Log", "scene", ("*.h5",), "find_hdf5_scenes"),
+    "nuscenes": DataSet("nuscenes.NuScenesLog", "nuScenes scene", _NUSCENES, "find_nuscenes_scenes"),
+    "truckscenes": DataSet("truckscenes.TruckScenesLog", "TruckScenes scene", _NUSCENES, "find_truckscenes_scenes"),
+    "waymo": DataSet("waymo.WaymoLog", "Waymo segment", ("lidar/*.parquet",), "find_waymo_segments"),
+    "pandaset": DataSet("pandaset.PandaSetLog", "PandaSet sequence", ("lidar/poses.json",), depth=2),
+    "aevascenes": DataSet("aevascenes.AevaScenesLog", "AevaScenes sequence", ("sequence.json",), depth=3),
+    "bags": DataSet("bags.BagLog", "bag", ("*.bag", "*.mcap", "*.db3"), "find_bags"),
+    "kiss_icp": DataSet("kiss_icp.KissICPLog", "data for a loader of KISS-ICP"),
+    "arrays": DataSet("arrays.ArraysLog", "folder of point clouds", (), "find_array_logs"),  # all without a mark
 }
 _DEEPEST = 6  # levels below the root that are searched for a mark
 
@@ -137,13 +147,18 @@ def find_sources(name: str, root: Any) -> Sequence[Any]:
         CFlowError: no such data set, or nothing of its format at the path.
         OSError: a remote path cannot be reached.
     """
-    top = as_path(root)
-    find = _import(name, "find")
+    top, (module, _), form = as_path(root), _reader(name), DATA_SETS[name]
     with remote_errors(top):
-        sources = find(top)
+        if form.find:
+            sources = getattr(module, form.find)(top)
+        elif form.marks:
+            what = f"a folder that holds {form.marks[0]}, or a folder of such folders"
+            sources = find_folders(top, lambda folder: (folder / form.marks[0]).exists(), form.depth, what)
+        else:
+            sources = [top]
     if not sources:
-        marks = " or ".join(DATA_SETS[name].marks)
-        raise CFlowError(f"no {DATA_SETS[name].what} in {root}" + (f": there is no {marks}" if marks else ""))
+        marks = " or ".join(form.marks)
+        raise CFlowError(f"no {form.what} in {root}" + (f": there is no {marks}" if marks else ""))
     return list(sources)
 
 
@@ -183,7 +198,7 @@ def open_log(
 
 
 def _open(name: str, source: Any, settings: Mapping[str, Any]) -> Log:
-    reader = _import(name, "log")
+    _, reader = _reader(name)
     known = list(inspect.signature(reader.__init__).parameters)[2:]  # of the class, Python 3.8 returns Protocol's
     unknown = sorted(set(settings) - set(known))
     if unknown:
@@ -225,8 +240,10 @@ class GroundSegmentedLog(LogWrapper):
         return replace(sweep, is_ground=is_ground)
 
 
-def _import(name: str, part: str) -> Any:
-    """Import the function `find` or the class `log` of a data set."""
+def _reader(name: str) -> tuple[Any, Any]:
+    """Import the module and the class of a data set's reader."""
     if name not in DATA_SETS:
         raise CFlowError(f"data set {name!r}: choose one of {', '.join(DATA_SETS)}")
-    return getattr(import_module(f"cflow_torch.data.{name}"), getattr(DATA_SETS[name], part))
+    module, _, log = DATA_SETS[name].log.partition(".")
+    imported = import_module(f"cflow_torch.data.{module}")
+    return imported, getattr(imported, log)

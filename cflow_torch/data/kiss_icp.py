@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 from contextlib import contextmanager, redirect_stdout
-from pathlib import Path
 from typing import Any, Iterator
 
 import numpy as np
@@ -16,11 +15,6 @@ from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.ego_motion import rigid_transform
 
 _OTHERS = {"rosbag": "bags", "mcap": "bags"}  # loaders without random access -> our own reader
-
-
-def find_kiss_icp(root: PathLike) -> list[Path]:
-    """Return the path itself; only the loader knows its contents."""
-    return [as_path(root)]
 
 
 class KissICPLog(Log):

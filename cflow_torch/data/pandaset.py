@@ -11,7 +11,7 @@ import numpy as np
 
 from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes, make_boxes, upright_poses
 from cflow_torch.data.categories import CATEGORY_INDEX
-from cflow_torch.data.files import file_errors, find_folders
+from cflow_torch.data.files import file_errors
 from cflow_torch.data.json_file import read_json
 from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.data.paths import PathLike, as_path, read_bytes, remote_errors
@@ -19,7 +19,6 @@ from cflow_torch.data.pickles import load_columns
 from cflow_torch.data.rigid_motion import poses_from_json, transform_points
 from cflow_torch.types import CFlowError, Sweep
 
-SEARCH_DEPTH = 2  # <root>/<data set>/<sequence>
 _LIDARS = (0, 1)  # Pandar64, which rotates, and PandarGT, which looks forward
 _EVERY_LIDAR = -1  # of a cuboid; an object at different positions for both LiDARs has a cuboid for each
 _POSITION, _SIZE = (
@@ -47,19 +46,6 @@ CATEGORY_NAME: dict[str, str] = {label: name for name, labels in _LABELS.items()
 
 _GROUND = ("Driveway", "Ground", "Lane Line Marking", "Other Road Marking", "Road", "Sidewalk", "Stop Line Marking")
 _WITHOUT_FLOW = ("Exhaust", "Reflection", "Smoke", "Spray or rain")
-
-
-def find_pandaset_sequences(root: PathLike) -> list[Path]:
-    """Find the folders of all sequences, sorted.
-
-    Args:
-        root: a sequence (holds `lidar/poses.json`), or a folder at most two levels above the sequences.
-
-    Raises:
-        CFlowError: `root` is not a folder.
-    """
-    what = "a sequence (it holds lidar/poses.json), or a folder of sequences"
-    return find_folders(as_path(root), lambda folder: (folder / "lidar" / "poses.json").is_file(), SEARCH_DEPTH, what)
 
 
 class PandaSetLog(Log):

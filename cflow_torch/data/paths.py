@@ -6,11 +6,9 @@ interface and the functions below.
 
 from __future__ import annotations
 
-import errno
 import mmap
 import re
 import shutil
-import stat
 import tempfile
 from contextlib import contextmanager
 from functools import lru_cache
@@ -102,8 +100,7 @@ def read_bytes(path: Path) -> bytes:
     """Read a file, in one request if it is remote.
 
     Raises:
-        OSError: as for a local file, and if the remote file system cannot be reached. A device or a pipe, which an
-            unpacked archive can contain, is refused, because reading it might never end.
+        OSError: as for a local file, and if the remote file system cannot be reached.
     """
     if not is_remote(path):
         check_file(path)
@@ -153,11 +150,8 @@ def _open(path: Any, **settings: Any) -> Any:
 
 
 def check_file(path: Path) -> str:
-    """Return the name of a local file, which must be a regular file or a folder, and not a git-lfs pointer."""
-    mode = path.stat().st_mode
-    if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
-        raise OSError(errno.EINVAL, "is a device or a pipe, not a file", str(path))
-    if stat.S_ISREG(mode):
+    """Return the name of a local file or folder, which must not be a git-lfs pointer."""
+    if not path.is_dir():
         with open(path, "rb") as file:
             if file.read(len(_POINTER)) == _POINTER:
                 raise CFlowError(f"{path} is a git-lfs pointer, not the data: run git lfs pull there, or download it")

@@ -8,6 +8,7 @@ from typing import ClassVar, Mapping, Sequence
 import numpy as np
 
 from cflow_torch.data.arrays.pcd import pcd_fields
+from cflow_torch.data.files import file_errors
 from cflow_torch.data.nuscenes.reader import NUSCENES_CATEGORIES, OWN_TRAILER, Footprint, NuScenesLog
 from cflow_torch.data.nuscenes.tables import SceneSource, find_scenes
 from cflow_torch.data.paths import PathLike
@@ -71,7 +72,8 @@ class TruckScenesLog(NuScenesLog):
         self._deskew = deskew
 
     def _points_of(self, content: bytes, file: Path) -> tuple[np.ndarray, np.ndarray | None]:
-        fields = pcd_fields(content, file)
+        with file_errors(file, "copy it again"):
+            fields = pcd_fields(content)
         needed = ("x", "y", "z", "timestamp") if self._deskew else ("x", "y", "z")
         missing = [name for name in needed if name not in fields or fields[name].ndim != 1]
         if missing:

@@ -164,7 +164,7 @@ def test_existing_labels_are_replaced_only_with_overwrite(scenes: Path, tmp_path
         for name in scene:
             scene[name]["dufo"] = np.full(len(scene[name]["lidar"]), 7, np.int64)
     before = file.read_bytes()
-    with pytest.raises(CFlowError, match="already has dufo: overwrite=true"):
+    with pytest.raises(CFlowError, match="already has labels: overwrite=true"):
         label_scene(file, make_model(make_config("fast"), "cpu"))
     assert label(scenes, output) == 2
     error = capsys.readouterr().err
@@ -183,12 +183,12 @@ def test_a_killed_run_leaves_whole_scenes_and_resumes(scenes: Path, tmp_path: Pa
     output = f"output={tmp_path / 'out'}"
     code = (
         "import os, signal\nfrom cflow_torch.cli.main import main\nfrom cflow_torch.data.hdf5 import results\n"
-        "write, count = results._write_labels, []\n"
+        "write, count = results._store_label, []\n"
         "def die(*arguments):\n"
         "    count.append(1)\n"
         "    write(*arguments)\n"
-        "    if len(count) == 7: os.kill(os.getpid(), signal.SIGKILL)\n"
-        f"results._write_labels = die\nmain({[*CALL, str(scenes), output]!r})\n"
+        "    if len(count) == 33: os.kill(os.getpid(), signal.SIGKILL)\n"
+        f"results._store_label = die\nmain({[*CALL, str(scenes), output]!r})\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == -signal.SIGKILL, done.stderr

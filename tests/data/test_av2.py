@@ -13,8 +13,9 @@ import pyarrow.feather as feather
 import pytest
 from scenes import pose
 
-from cflow_torch.data.av2 import AV2Log, find_av2_logs
+from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.boxes import Boxes, flow_from_boxes
+from cflow_torch.data.catalog import find_sources
 from cflow_torch.data.ground import GroundRaster, read_ground_raster
 from cflow_torch.data.log import window
 from cflow_torch.types import CFlowError
@@ -71,7 +72,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_the_real_log_is_read(av2_folder: Path, data_root: Path) -> None:
-    assert av2_folder in find_av2_logs(data_root)
+    assert av2_folder in find_sources("av2", data_root)
     log = AV2Log(av2_folder)
     assert log.log_id == av2_folder.name
     assert list(log.timestamps) == [315966265259836000, 315966265360032000]

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from cflow_torch import CFlowError
-from cflow_torch.data.arrays.pcd import read_pcd, write_pcd
+from cflow_torch.data.arrays.cloud_file import read_cloud
+from cflow_torch.data.arrays.pcd import pcd_fields, write_pcd
 
 DATA = ("ascii", "binary", "binary_compressed")
 DTYPES = ("f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8")
@@ -35,7 +36,7 @@ def test_every_type_comes_back(tmp_path, data, rows):
         for kind in DTYPES
     }
     write_as(tmp_path / "a.pcd", fields, data)
-    again = read_pcd(tmp_path / "a.pcd")
+    again = pcd_fields((tmp_path / "a.pcd").read_bytes())
     assert list(again) == list(fields)
     for name, values in fields.items():
         assert again[name].dtype == values.dtype and np.array_equal(again[name], values), name
@@ -46,7 +47,7 @@ def test_padding_and_vector_fields_are_left_out(tmp_path):
     rows["x"], rows["normal"], rows["t"] = (1.5, np.nan), 7, (3, 2**60 + 1)
     header = b"VERSION 0.7\nFIELDS x _ normal t\nSIZE 4 1 4 8\nTYPE F U F U\nCOUNT 1 4 3 1\nWIDTH 2\nHEIGHT 1\n"
     (tmp_path / "a.pcd").write_bytes(header + b"VIEWPOINT 0 0 0 1 0 0 0\nPOINTS 2\nDATA binary\n" + rows.tobytes())
-    cloud = read_pcd(tmp_path / "a.pcd")
+    cloud = pcd_fields((tmp_path / "a.pcd").read_bytes())
     assert list(cloud) == ["x", "t"] and cloud["t"].tolist() == [3, 2**60 + 1]
     assert np.array_equal(cloud["x"], rows["x"], equal_nan=True)
 
@@ -60,11 +61,11 @@ def test_every_truncation_is_detected(tmp_path, data):
     for size in range(0, len(whole) - (4 if data == "ascii" else 0), 7):
         file.write_bytes(whole[:size])
         with pytest.raises(CFlowError, match=r"a\.pcd"):
-            read_pcd(file)
+            read_cloud(file)
 
 
 def test_without_pypcd4_the_message_names_it(tmp_path, monkeypatch):
     write_pcd(tmp_path / "a.pcd", {"x": np.zeros(2, np.float32)})
     monkeypatch.setitem(sys.modules, "pypcd4", None)
     with pytest.raises(CFlowError, match=r"pip install pypcd4"):
-        read_pcd(tmp_path / "a.pcd")
+        pcd_fields((tmp_path / "a.pcd").read_bytes())

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from cflow_torch.data.aevascenes import AevaScenesLog
-from cflow_torch.data.aevascenes.reader import CATEGORY_NAME
+from cflow_torch.data.aevascenes import CATEGORY_NAME, AevaScenesLog
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.boxes import Boxes, flow_from_boxes, upright_poses
 from cflow_torch.data.categories import CATEGORY_INDEX

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Mapping
 
@@ -11,10 +12,10 @@ import numpy as np
 import pyarrow as pa
 from pyarrow import feather, parquet
 
-from cflow_torch.data.arrays.pcd import read_pcd, write_pcd
-from cflow_torch.data.arrays.ply import read_ply, write_ply
+from cflow_torch.data.arrays.pcd import pcd_fields, write_pcd
+from cflow_torch.data.arrays.ply import ply_fields, write_ply
 from cflow_torch.data.atomic import atomic_file
-from cflow_torch.data.files import file_errors, read_npy
+from cflow_torch.data.files import file_errors, shortened
 from cflow_torch.data.paths import PathLike, as_path, read_bytes
 from cflow_torch.types import CFlowError, check_array
 
@@ -46,11 +47,11 @@ def read_cloud(path: PathLike, bin_columns: int = KITTI_COLUMNS) -> np.ndarray:
         CFlowError: no such file, an unknown suffix, or a file that is truncated or has other contents.
     """
     path = as_path(path)
-    points, _ = _read(path, bin_columns, False)
-    if points.dtype.kind != "f":
-        raise CFlowError(f"{path} has {points.dtype} coordinates; they must be floating-point metres")
-    points = points[:, :3].astype(np.float32 if points.dtype.itemsize < 8 else np.float64, copy=False)
-    return points.astype(points.dtype.newbyteorder("="), copy=False)
+    with file_errors(path, _hint(path)):
+        points = np.stack(_positions(_read(path, bin_columns)), axis=1)
+        if points.ndim != 2 or points.dtype.kind != "f":
+            raise CFlowError(f"x, y, z must be floating-point metres, (N,) each, got {points.dtype}")
+    return points.astype(np.float32 if points.dtype.itemsize < 8 else np.float64, copy=False)
 
 
 def read_columns(path: PathLike, bin_columns: int = KITTI_COLUMNS) -> dict[str, np.ndarray]:
@@ -70,11 +71,13 @@ def read_columns(path: PathLike, bin_columns: int = KITTI_COLUMNS) -> dict[str, 
     Raises:
         CFlowError: as in `read_cloud`.
     """
-    points, columns = _read(as_path(path), bin_columns, True)
-    kept = {}
-    for name, values in columns.items():
+    path, kept = as_path(path), {}
+    with file_errors(path, _hint(path)):
+        fields = _read(path, bin_columns)
+        shape = _positions(fields)[0].shape
+    for name, values in fields.items():
         kind = values.dtype
-        if name not in _AXES and values.shape == (len(points),) and kind.kind in "biuf" and kind.itemsize <= 8:
+        if name not in _AXES and values.shape == shape and kind.kind in "biuf" and kind.itemsize <= 8:
             kept[name] = values.astype(kind.newbyteorder("="), copy=False)
     return kept
 
@@ -98,16 +101,16 @@ def write_cloud(path: PathLike, points: np.ndarray, columns: Mapping[str, np.nda
     """
     path, points = as_path(path), np.asarray(points)
     named: dict[str, Any] = dict(columns or {})
-    suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise CFlowError(f"{path} has suffix {suffix!r}; clouds are {', '.join(SUFFIXES)}")
+    suffix = _suffix(path)
     if points.ndim != 2 or points.shape[1] != 3 or points.dtype not in (np.float32, np.float64):
         raise CFlowError(f"points have shape {points.shape} and dtype {points.dtype}; pass (N, 3) float32 or float64")
     for name, values in named.items():
         check_array(values, f"column {name}", (len(points),), "biuf", f"({len(points)},) numbers, one per point")
     fields = {axis: np.ascontiguousarray(points[:, k]) for k, axis in enumerate(_AXES)}
-    fields.update({_storable_name(name, suffix): _storable(values, suffix) for name, values in named.items()})
-    if list(named) == _unnamed(3 + len(named)):
+    for name, values in named.items():
+        allowed = re.sub("[^!-~]", "_", name) if suffix in (".pcd", ".ply") else name
+        fields[allowed] = _storable(values, suffix)
+    if all(name == f"column_{k}" for k, name in enumerate(named, 3)):
         points, named = np.column_stack([points, *named.values()]), {}
     if suffix in (".pcd", ".ply"):
         (write_pcd if suffix == ".pcd" else write_ply)(path, fields)
@@ -118,50 +121,27 @@ def write_cloud(path: PathLike, points: np.ndarray, columns: Mapping[str, np.nda
             padding = max(0, KITTI_COLUMNS - table.shape[1])
             file.write(np.pad(table, ((0, 0), (0, padding))).astype("<f4").tobytes())
         elif suffix == ".npy":
-            np.save(file, _structured(fields) if named else points)
+            kind = np.dtype([(name, values.dtype) for name, values in fields.items()])
+            np.save(file, np.rec.fromarrays(list(fields.values()), dtype=kind) if named else points)
         elif suffix == ".npz":
             np.savez(file, points=points, **named)
         else:
             (feather.write_feather if suffix == ".feather" else parquet.write_table)(pa.table(fields), file)
 
 
-def _read(path: Path, bin_columns: int, with_columns: bool) -> tuple[np.ndarray, Mapping[str, np.ndarray]]:
-    """Return (N, 3) positions and all columns by name, if they are wanted, else any of them."""
+def _suffix(path: Path) -> str:
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise CFlowError(f"{path} has suffix {suffix!r}; clouds are {', '.join(SUFFIXES)}")
-    if suffix == ".bin":
-        return _split(_read_bin(path, bin_columns))
-    if suffix in (".pcd", ".ply"):
-        return _from_fields(path, (read_pcd if suffix == ".pcd" else read_ply)(path))
-    if suffix in (".feather", ".parquet"):
-        return _read_table(path, with_columns)
-    return _read_numpy(path, with_columns)
+    return suffix
 
 
-def _unnamed(count: int) -> list[str]:
-    """Names of the columns after z of an array without names, which has `count` columns."""
-    return [f"column_{k}" for k in range(3, count)]
-
-
-def _split(table: np.ndarray) -> tuple[np.ndarray, Mapping[str, np.ndarray]]:
-    return table[:, :3], dict(zip(_unnamed(table.shape[1]), table.T[3:]))
-
-
-def _structured(fields: Mapping[str, np.ndarray]) -> np.ndarray:
-    """(N,) structured array of the fields."""
-    table = np.zeros(len(fields["x"]), [(name, values.dtype) for name, values in fields.items()])
-    for name, values in fields.items():
-        table[name] = values
-    return table
-
-
-def _storable_name(name: str, suffix: str) -> str:
-    return re.sub("[^!-~]", "_", name) if suffix in (".pcd", ".ply") else name
+def _hint(path: Path) -> str:
+    return "pass plain arrays, not pickled objects" if path.suffix.lower() in (".npy", ".npz") else "copy it again"
 
 
 def _storable(values: np.ndarray, suffix: str) -> np.ndarray:
-    """The values in a type that the format has."""
+    """Return the values in a type that the format has."""
     kind: Any = values.dtype
     if suffix in (".pcd", ".ply") and kind == np.bool_:
         kind = np.uint8
@@ -172,83 +152,66 @@ def _storable(values: np.ndarray, suffix: str) -> np.ndarray:
     return np.ascontiguousarray(values, kind)
 
 
-def _read_bin(path: Path, columns: int) -> np.ndarray:
-    with file_errors(path):
-        data = read_bytes(path)
-    if len(data) % (4 * columns):
+def _positions(fields: Mapping[str, np.ndarray]) -> list[np.ndarray]:
+    if not set(_AXES) <= set(fields):
+        raise CFlowError(f"it has {list(fields)}; it needs x, y, z")
+    return [fields[axis] for axis in _AXES]
+
+
+def _read(path: Path, bin_columns: int) -> Mapping[str, np.ndarray]:
+    """Read all columns by name; those without a name are x, y, z, column_3, ..."""
+    suffix, content = _suffix(path), read_bytes(path)
+    if suffix in (".pcd", ".ply"):
+        return (pcd_fields if suffix == ".pcd" else ply_fields)(content)
+    if suffix in (".feather", ".parquet"):
+        return _table_columns((feather if suffix == ".feather" else parquet).read_table, content)
+    if suffix == ".npz":
+        return _archive_columns(content)
+    if suffix == ".npy":
+        return _array_columns(np.load(io.BytesIO(content), allow_pickle=False))
+    if len(content) % (4 * bin_columns):
         raise CFlowError(
-            f"{path} has {len(data)} bytes, not a multiple of {4 * columns} ({columns} float32 per point): it is "
-            "truncated, or has another number of columns (bin_columns: 4 in KITTI, 5 in nuScenes)"
+            f"it has {len(content)} bytes, not a multiple of {4 * bin_columns} ({bin_columns} float32 per point): it "
+            "is truncated, or has another number of columns (bin_columns: 4 in KITTI, 5 in nuScenes)"
         )
-    return np.frombuffer(data, "<f4").reshape(-1, columns)
+    return _array_columns(np.frombuffer(content, "<f4").reshape(-1, bin_columns))
 
 
-def _read_numpy(path: Path, with_columns: bool) -> tuple[np.ndarray, Mapping[str, np.ndarray]]:
-    hint = "pass plain arrays, not pickled objects"
-    others: dict[str, np.ndarray] = {}
-    if path.suffix.lower() == ".npz":
-        with file_errors(path, hint), np.load(io.BytesIO(read_bytes(path)), allow_pickle=False) as arrays:
-            if with_columns:
-                others = _readable(arrays)
-            if all(axis in arrays.files for axis in _AXES):
-                return _from_fields(path, {**others, **{axis: arrays[axis] for axis in _AXES}})
-            named = [name for name in arrays.files if name in _CLOUD_KEYS]
-            found = [arrays[name] for name in named or arrays.files]
-            tables = [array for array in found if array.ndim == 2 and array.shape[1] >= 3]
-            if len(tables) != 1:
-                has = ", ".join(arrays.files)[:200]
-                need = f"x, y, z, or one (N, 3+) array, named {_CLOUD_KEYS[0]} if there are several"
-                raise CFlowError(f"{path} has the arrays {has}; it needs {need}")
-        (stored,) = tables
-    else:
-        stored = read_npy(path, hint)
-    if stored.dtype.names is not None:
-        return _from_fields(path, {name: stored[name] for name in stored.dtype.names})
-    if stored.ndim != 2 or stored.shape[1] < 3:
-        raise CFlowError(f"{path} has an array of shape {stored.shape}; it must be (N, 3+), columns x, y, z first")
-    points, columns = _split(stored)
-    return points, {**columns, **others}
+def _array_columns(array: np.ndarray) -> dict[str, np.ndarray]:
+    if array.dtype.names is not None:
+        return {name: array[name] for name in array.dtype.names}
+    if array.ndim != 2 or array.shape[1] < 3:
+        raise CFlowError(f"it has an array of shape {array.shape}; it must be (N, 3+), columns x, y, z first")
+    return dict(zip((*_AXES, *(f"column_{k}" for k in range(3, array.shape[1]))), array.T))
 
 
-def _readable(arrays: Any) -> dict[str, np.ndarray]:
-    """The arrays of an .npz file that are not pickled objects, which may be next to the points."""
-    found = {}
-    for name in arrays.files:
-        try:
-            found[name] = arrays[name]
-        except ValueError:
-            continue
-    return found
+def _archive_columns(content: bytes) -> dict[str, np.ndarray]:
+    """Read an .npz file, which may also hold pickled objects: these stay unread."""
+    arrays = {}
+    with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+        for name in archive.files:
+            with suppress(ValueError):
+                arrays[name] = archive[name]
+    if set(_AXES) <= set(arrays):
+        return arrays
+    tables = {name: array for name, array in arrays.items() if array.ndim == 2 and array.shape[1] >= 3}
+    named = [array for name, array in tables.items() if name in _CLOUD_KEYS] or list(tables.values())
+    if len(named) != 1:
+        need = f"x, y, z, or one (N, 3+) array, named {_CLOUD_KEYS[0]} if there are several"
+        raise CFlowError(f"it has the arrays {shortened(arrays.keys())}; pass plain arrays {need}")
+    return {**_array_columns(named[0]), **arrays}
 
 
-def _read_table(path: Path, with_columns: bool) -> tuple[np.ndarray, Mapping[str, np.ndarray]]:
-    read = feather.read_table if path.suffix.lower() == ".feather" else parquet.read_table
-    with file_errors(path):
-        table = read(pa.BufferReader(read_bytes(path)), use_threads=False)
-        table.validate(full=True)
-    names = table.column_names
-    chosen = _AXES if all(axis in names for axis in _AXES) else tuple(names[:3])
-    columns = [table.column(names.index(name)) for name in chosen]
-    if len(columns) < 3:
-        raise CFlowError(f"{path} has the columns {names}; it needs x, y, z")
-    if any(not pa.types.is_floating(column.type) or column.null_count for column in columns):
-        raise CFlowError(f"{path}: {', '.join(chosen)} must be floating-point metres without empty entries")
-    others = [name for name in names if with_columns and name not in chosen and _is_number(table.field(name).type)]
-    return np.stack([column.to_numpy() for column in columns], axis=1), {
-        name: table.column(name).to_numpy() for name in others
+def _table_columns(read: Any, content: bytes) -> dict[str, np.ndarray]:
+    table = read(pa.BufferReader(content), use_threads=False)
+    table.validate(full=True)
+    if not set(_AXES) <= set(table.column_names):
+        table = table.rename_columns([*_AXES, *table.column_names[3:]][: table.num_columns])
+    if any(table.column(axis).null_count for axis in _AXES):
+        raise CFlowError("x, y, z must not have empty entries")
+    kinds = (pa.types.is_floating, pa.types.is_integer, pa.types.is_boolean)
+    return {
+        name: column.to_numpy()
+        for name, column in zip(table.column_names, table.columns)
+        if any(is_kind(column.type) for is_kind in kinds)
     }
-
-
-def _is_number(kind: Any) -> bool:
-    return bool(pa.types.is_floating(kind) or pa.types.is_integer(kind) or pa.types.is_boolean(kind))
-
-
-def _from_fields(path: Path, fields: Mapping[str, np.ndarray]) -> tuple[np.ndarray, Mapping[str, np.ndarray]]:
-    columns = [fields[axis] for axis in _AXES if axis in fields]
-    if len(columns) < 3:
-        raise CFlowError(f"{path} has the fields {list(fields)}; it needs x, y, z")
-    if len({column.shape for column in columns}) > 1 or columns[0].ndim != 1:
-        raise CFlowError(f"{path}: x, y, z have shapes {[column.shape for column in columns]}; each must be (N,)")
-    if any(column.dtype.kind not in "fiu" for column in columns):
-        raise CFlowError(f"{path}: x, y, z have dtypes {[str(column.dtype) for column in columns]}, not numbers")
-    return np.stack(columns, axis=1), fields

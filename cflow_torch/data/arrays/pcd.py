@@ -8,18 +8,15 @@ from typing import Any, Mapping
 import numpy as np
 
 from cflow_torch.data.atomic import atomic_file
-from cflow_torch.data.files import file_errors
-from cflow_torch.data.paths import PathLike, as_path, read_bytes
+from cflow_torch.data.paths import PathLike
 from cflow_torch.types import CFlowError
 
-_HINT = "pass a .pcd file of version 0.7"
 
-
-def read_pcd(path: PathLike) -> dict[str, np.ndarray]:
-    """Read the fields of a text, binary or compressed cloud.
+def pcd_fields(content: bytes) -> dict[str, np.ndarray]:
+    """Read the fields of a text, binary or compressed cloud of version 0.7.
 
     Args:
-        path: a `.pcd` file.
+        content: of a `.pcd` file.
 
     Returns:
         Field name -> (N,) array of the dtype that SIZE and TYPE state, in the order of the file.
@@ -29,20 +26,13 @@ def read_pcd(path: PathLike) -> dict[str, np.ndarray]:
         are left out. VIEWPOINT is not applied, so points stay in their stored frame. NaN points stay.
 
     Raises:
-        CFlowError: pypcd4 is missing; no such file; not a PCD file of version 0.7; or less data than its header states.
+        CFlowError: pypcd4 is missing.
+        Exception: nearly any, if it is not a PCD file of version 0.7, or has less data than its header states.
     """
-    with file_errors(path, _HINT):
-        return pcd_fields(read_bytes(as_path(path)), path)
-
-
-def pcd_fields(content: bytes, path: PathLike) -> dict[str, np.ndarray]:
-    """Read the fields of a cloud from the contents of its file, see `read_pcd`."""
-    pypcd4 = _pypcd4()
-    with file_errors(path, _HINT):
-        cloud = pypcd4.PointCloud.from_fileobj(io.BytesIO(content))
-        header, table = cloud.metadata, np.atleast_1d(cloud.pc_data)
-        if len(table) != header.width * header.height:
-            raise ValueError(f"it has {len(table)} points, but its header states {header.width} x {header.height}")
+    cloud = _pypcd4().PointCloud.from_fileobj(io.BytesIO(content))
+    header, table = cloud.metadata, np.atleast_1d(cloud.pc_data)
+    if len(table) != header.width * header.height:
+        raise ValueError(f"it has {len(table)} points, but its header states {header.width} x {header.height}")
     # pypcd4 names padding "#...", splits fields of several values, and mixes up those of compressed files.
     names = [name for name, count in zip(header.fields, header.count) if count == 1 and name[0] != "#"]
     # pypcd4 1.4 makes a two-dimensional table of a cloud without points.

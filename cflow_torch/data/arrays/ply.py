@@ -15,8 +15,7 @@ from typing import Mapping
 import numpy as np
 
 from cflow_torch.data.atomic import atomic_file
-from cflow_torch.data.files import file_errors
-from cflow_torch.data.paths import PathLike, as_path, read_bytes
+from cflow_torch.data.paths import PathLike
 
 _CODES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
 _NAMES = dict(zip(_CODES, ("char", "uchar", "short", "ushort", "int", "uint", "float", "double")))
@@ -28,42 +27,40 @@ _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 _LONGEST_HEADER = 65536  # bytes
 
 
-def read_ply(path: PathLike) -> dict[str, np.ndarray]:
+def ply_fields(content: bytes) -> dict[str, np.ndarray]:
     """Read all properties of the vertices.
 
     Args:
-        path: a `.ply` file whose first element is `vertex`; further elements, such as faces, are not read.
+        content: of a `.ply` file whose first element is `vertex`; further elements, such as faces, are not read.
 
     Returns:
         Property name -> (N,) array of the type that the header states, in the byte order of the machine.
 
     Raises:
-        CFlowError: no such file, not a PLY file, an invalid header, or less data than it states.
+        Exception: nearly any, if it is not a PLY file, has an invalid header, or less data than that states.
 
     Source: G. Turk, "The PLY Polygon File Format".
     """
-    with file_errors(path):
-        content = read_bytes(as_path(path))
-        header = re.match(rb"ply\s(.*?)\nend_header\s*?\n", content[:_LONGEST_HEADER], re.DOTALL)
-        if header is None:
-            raise ValueError("it has no complete header")
-        lines = [line.split() for line in header[1].decode("ascii").splitlines()]
-        lines = [words for words in lines if words and words[0] not in ("comment", "obj_info")]
-        (_, order, _), (_, element, count) = lines[:2]
-        if element != "vertex":
-            raise ValueError(f"its first element is {element}, not vertex")
-        properties = takewhile(lambda words: words[0] == "property", lines[2:])
-        kind = np.dtype([(name, _ORDERS[order] + _TYPES[code]) for _, code, name in properties])
-        body = content[header.end() :]
-        if order == "ascii":
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # NumPy warns if there are no points
-                warnings.simplefilter("error", DeprecationWarning)  # NumPy warns if 256 is stored in a byte
-                table = np.loadtxt(io.BytesIO(body), kind, max_rows=int(count), ndmin=1)
-        else:
-            table = np.frombuffer(body, kind, int(count))
-        if len(table) < int(count):
-            raise ValueError(f"it has {len(table)} of {count} vertices")
+    header = re.match(rb"ply\s(.*?)\nend_header\s*?\n", content[:_LONGEST_HEADER], re.DOTALL)
+    if header is None:
+        raise ValueError("it has no complete header")
+    lines = [line.split() for line in header[1].decode("ascii").splitlines()]
+    lines = [words for words in lines if words and words[0] not in ("comment", "obj_info")]
+    (_, order, _), (_, element, count) = lines[:2]
+    if element != "vertex":
+        raise ValueError(f"its first element is {element}, not vertex")
+    properties = takewhile(lambda words: words[0] == "property", lines[2:])
+    kind = np.dtype([(name, _ORDERS[order] + _TYPES[code]) for _, code, name in properties])
+    body = content[header.end() :]
+    if order == "ascii":
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # NumPy warns if there are no points
+            warnings.simplefilter("error", DeprecationWarning)  # NumPy warns if 256 is stored in a byte
+            table = np.loadtxt(io.BytesIO(body), kind, max_rows=int(count), ndmin=1)
+    else:
+        table = np.frombuffer(body, kind, int(count))
+    if len(table) < int(count):
+        raise ValueError(f"it has {len(table)} of {count} vertices")
     return {name: table[name].astype(kind[name].newbyteorder("=")) for name in kind.names or ()}
 
 

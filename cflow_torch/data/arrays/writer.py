@@ -9,9 +9,8 @@ import numpy as np
 from cflow_torch.data.arrays.cloud_file import SUFFIXES, write_cloud
 from cflow_torch.data.arrays.poses_text import write_kitti_poses, write_times, write_tum_poses
 from cflow_torch.data.arrays.reader import GROUND_FOLDER
-from cflow_torch.data.atomic import atomic_folder
+from cflow_torch.data.atomic import new_folder
 from cflow_torch.data.log import Log
-from cflow_torch.data.names import safe_name
 from cflow_torch.types import CFlowError
 
 
@@ -38,12 +37,9 @@ def write_array_log(log: Log, root: str | Path, suffix: str = ".npy", poses: str
         raise CFlowError(
             f"suffix={suffix!r}, poses={poses!r}: pass one of {SUFFIXES} and 'kitti', 'tum', 'npy' or None"
         )
-    folder = Path(root) / safe_name(log.log_id, "log_id")
-    if folder.exists():
-        raise CFlowError(f"{folder} already exists: remove it, or choose another root")
-    with atomic_folder(folder) as new:
-        _write(log, new, suffix, poses)
-    return folder
+    with new_folder(root, log.log_id) as folder:
+        _write(log, folder, suffix, poses)
+    return Path(root) / log.log_id
 
 
 def _write(log: Log, folder: Path, suffix: str, poses: str | None) -> None:

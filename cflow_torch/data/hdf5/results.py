@@ -5,10 +5,9 @@ from __future__ import annotations
 import os
 import re
 import shutil
-from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any, Iterable, Iterator, Mapping
+from typing import Any, Callable, Iterable, Mapping
 
 import numpy as np
 
@@ -21,14 +20,12 @@ from cflow_torch.types import Array, CFlowError, as_numpy
 LABELS = ("dufo", "cluster", "dufocluster", "nnd")  # keys of labels for self-supervised training
 LABELLED = "cflow_labels"  # attribute of a scene that has ours
 # Keys of the scenes themselves, and names that have a special meaning in the viewers.
-RESERVED_KEYS = frozenset(
-    (
-        *("lidar", "lidar_id", "lidar_dt", "lidar_center", "ground_mask", "pose", "ego_motion", "eval_mask"),
-        *("flow", "flow_is_valid", "flow_category_indices", "flow_instance_id"),
-        *(*LABELS, "label", "raw", "pc0_dynamic", "pc1_dynamic", "pch1_dynamic"),
-        *("pc0", "pc1", "gm0", "gm1", "pose0", "pose1"),
-    )
-)
+RESERVED_KEYS = {
+    *("lidar", "lidar_id", "lidar_dt", "lidar_center", "ground_mask", "pose", "ego_motion", "eval_mask"),
+    *("flow", "flow_is_valid", "flow_category_indices", "flow_instance_id"),
+    *(*LABELS, "label", "raw", "pc0_dynamic", "pc1_dynamic", "pch1_dynamic"),
+    *("pc0", "pc1", "gm0", "gm1", "pose0", "pose1"),
+}
 _writing = partial(file_errors, hint="pass a complete scene, and free space for a copy of it", doing="write")
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_.-]{0,63}")
 
@@ -77,12 +74,7 @@ def write_hdf5_results(file: str | Path, name: str, results: Iterable[tuple[int,
     Cost: one copy of the scene, in time and, until the end, in space.
     """
     check_result_name(name)
-    count = 0
-    with _changed(file) as scene:
-        for timestamp, flow in results:
-            _write_flow(scene, Path(file), str(timestamp), name, as_numpy(flow))
-            count += 1
-    return count
+    return _write(file, ((timestamp, {name: as_numpy(flow)}) for timestamp, flow in results), _store_flow)
 
 
 def write_hdf5_labels(
@@ -110,17 +102,9 @@ def write_hdf5_labels(
 
     Cost: one copy of the scene.
     """
-    count = 0
-    with _changed(file) as scene:
-        with _writing(file):
-            found = [] if overwrite else _labels_in(scene)
-        if found:
-            raise CFlowError(f"{file} already has {', '.join(found)}: overwrite=true replaces them, or label a copy")
-        for timestamp, values in labels:
-            _write_labels(scene, Path(file), str(timestamp), values)
-            count += 1
-        scene.attrs[LABELLED] = made_by
-    return count
+    if not overwrite and labelled_by(file) is not None:
+        raise CFlowError(f"{file} already has labels: overwrite=true replaces them, or label a copy")
+    return _write(file, labels, _store_label, {LABELLED: made_by})
 
 
 def labelled_by(file: str | Path) -> str | None:
@@ -130,75 +114,54 @@ def labelled_by(file: str | Path) -> str | None:
         CFlowError: the scene cannot be read.
     """
     with open_scene(Path(file)) as scene, file_errors(file):
-        made_by = scene.attrs.get(LABELLED, "" if _labels_in(scene) else None)
+        has_labels = any(set(scene[stamp]) & set(LABELS) for stamp in scene if is_timestamp(stamp))
+        made_by = scene.attrs.get(LABELLED, "" if has_labels else None)
         return None if made_by is None else str(made_by)
 
 
-def _labels_in(scene: Any) -> list[str]:
-    """Return the keys of labels in an open scene."""
-    return sorted({key for stamp in scene if is_timestamp(stamp) for key in set(scene[stamp]) & set(LABELS)})
-
-
-@contextmanager
-def _changed(file: str | Path) -> Iterator[Any]:
-    """Open a copy of a scene that replaces it when the block ends, and is removed if the block raises."""
-    h5py = import_h5py()
+def _write(file: str | Path, sweeps: Iterable[Any], store: Callable[..., None], attributes: Any = {}) -> int:  # noqa: B006
+    """Store the arrays of sweeps in a copy of a scene, which then replaces it; return the number of sweeps."""
     check_writable(file)
     file = Path(file).resolve()  # a link stays a link
     for left in file.parent.glob(f".{file.name}.*.tmp"):  # copies of writers that were killed
         left.unlink()
+    count = 0
     with atomic_name(file) as copy:
         shutil.copy(file, copy)
-        with _writing(file):
-            scene = h5py.File(copy, "r+")
-        try:
-            yield scene
-        finally:
-            with _writing(file):
-                scene.close()
+        with _writing(file), import_h5py().File(copy, "r+") as scene:
+            for timestamp, arrays in sweeps:
+                sweep = member(scene, str(timestamp), file)
+                points = None if sweep is None else member(sweep, "lidar", file)
+                if points is None:
+                    raise CFlowError(f"{file} has no sweep {timestamp}")
+                for key, values in arrays.items():
+                    with _writing(f"{file}: {key} of sweep {timestamp}"):
+                        store(sweep, key, member(sweep, key, file), values)
+                count += 1
+            scene.attrs.update(attributes)
+    return count
 
 
-def _sweep(scene: Any, file: Path, timestamp: str) -> tuple[Any, int]:
-    """Return the group of a sweep and its number of points."""
-    sweep = member(scene, timestamp, file)
-    points = None if sweep is None else member(sweep, "lidar", f"{file}: sweep {timestamp}")
-    if sweep is None or points is None:
-        raise CFlowError(f"{file} has no sweep {timestamp}")
-    return sweep, len(points)
+def _store_flow(sweep: Any, name: str, older: Any, flow: np.ndarray) -> None:
+    _check_shape(flow, (len(sweep["lidar"]), 3))
+    if older is not None and (older.shape, older.dtype) != (flow.shape, np.float32):
+        raise CFlowError(f"{name} is not a flow result, so it is not replaced")
+    _store(sweep, name, older, flow.astype(np.float32))
 
 
-def _write_flow(scene: Any, file: Path, timestamp: str, name: str, flow: np.ndarray) -> None:
-    where = f"{file}: sweep {timestamp}"
-    sweep, rows = _sweep(scene, file, timestamp)
-    with _writing(where):
-        if flow.shape != (rows, 3):
-            raise CFlowError(f"{file}: the flow of sweep {timestamp} has shape {flow.shape}, expected ({rows}, 3)")
-        older = member(sweep, name, where)
-        # A dataset with two names is not replaced, because the other key would change as well.
-        if older is not None and not _is_like(older, (rows, 3), np.float32):
-            raise CFlowError(f"{file}: {name} of sweep {timestamp} is not a flow result, so it is not replaced")
-        _store(sweep, name, older, flow.astype(np.float32))
+def _store_label(sweep: Any, key: str, older: Any, values: np.ndarray) -> None:
+    _check_shape(values, (len(sweep["lidar"]),))
+    if older is not None and key not in LABELS:
+        return
+    if older is not None and (older.shape, older.dtype) != (values.shape, values.dtype):
+        del sweep[key]
+        older = None
+    _store(sweep, key, older, values)
 
 
-def _write_labels(scene: Any, file: Path, timestamp: str, labels: Mapping[str, np.ndarray]) -> None:
-    where = f"{file}: sweep {timestamp}"
-    sweep, rows = _sweep(scene, file, timestamp)
-    with _writing(where):
-        for key, values in labels.items():
-            if values.shape != (rows,):
-                raise CFlowError(f"{where}: {key} has shape {values.shape}, expected ({rows},)")
-            older = member(sweep, key, where)
-            if older is not None and key not in LABELS:
-                continue
-            if older is not None and not _is_like(older, values.shape, values.dtype):
-                del sweep[key]
-                older = None
-            _store(sweep, key, older, values)
-
-
-def _is_like(stored: Any, shape: tuple[int, ...], dtype: Any) -> bool:
-    """Whether a dataset has the shape and dtype, and only one name."""
-    return bool(stored.shape == shape and stored.dtype == dtype and import_h5py().h5o.get_info(stored.id).rc == 1)
+def _check_shape(values: np.ndarray, shape: tuple[int, ...]) -> None:
+    if values.shape != shape:
+        raise CFlowError(f"it has shape {values.shape}, expected {shape}")
 
 
 def _store(sweep: Any, key: str, older: Any, values: np.ndarray) -> None:

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import json
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Iterator, Mapping, Sequence
+from typing import Mapping, Sequence
 
 import numpy as np
 import pyarrow as pa
 from pyarrow import feather
 
-from cflow_torch.data.atomic import atomic_folder
-from cflow_torch.data.names import safe_name
+from cflow_torch.data.atomic import new_folder
 from cflow_torch.data.rigid_motion import to_quaternions
 from cflow_torch.simulator.recording import Boxes, GroundRaster, Recording
-from cflow_torch.types import CFlowError
 
 CITY = "SYN"  # in place of Argoverse 2's code of the city
 _DYNAMIC = 0.05  # metres per sweep from which a point counts as dynamic in Argoverse 2
@@ -44,20 +41,6 @@ def write_av2_log(log: Recording, root: str | Path) -> Path:
     with new_folder(root, log.log_id) as folder:
         _write_log(log, folder)
     return Path(root) / log.log_id
-
-
-@contextmanager
-def new_folder(root: str | Path, log_id: str) -> Iterator[Path]:
-    """A folder to fill, which becomes `root/<log_id>` when the block ends and is deleted if the block raises.
-
-    Raises:
-        CFlowError: `log_id` cannot be used as a folder name, or the folder exists.
-    """
-    folder = Path(root) / safe_name(log_id, "log_id")
-    if folder.exists():
-        raise CFlowError(f"{folder} exists already: delete it, or choose another root")
-    with atomic_folder(folder) as new:
-        yield new
 
 
 def _write_log(log: Recording, folder: Path) -> None:

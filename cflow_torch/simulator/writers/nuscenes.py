@@ -11,11 +11,11 @@ from typing import Any, Dict, List, Mapping, Sequence
 
 import numpy as np
 
+from cflow_torch.data.atomic import new_folder
 from cflow_torch.data.names import safe_name
 from cflow_torch.data.nuscenes.reader import NUSCENES_CATEGORIES
 from cflow_torch.data.rigid_motion import to_quaternions
 from cflow_torch.simulator.recording import Recording, UnitReturns
-from cflow_torch.simulator.writers.av2 import new_folder
 from cflow_torch.types import CFlowError
 
 # A PNG of one pixel: the devkit requires a map file, which it opens only to draw it.

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from cflow_torch.data.arrays.pcd import write_pcd
+from cflow_torch.data.atomic import new_folder
 from cflow_torch.simulator.recording import Recording, UnitReturns
-from cflow_torch.simulator.writers.av2 import new_folder
 from cflow_torch.simulator.writers.nuscenes import NUSCENES_NAMES, SceneWriter, write_tables
 
 _VERSION, _KEY_FRAME_INTERVAL = "v1.2-mini", 0.5  # seconds

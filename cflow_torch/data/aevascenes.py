@@ -2,25 +2,27 @@
 
 from __future__ import annotations
 
+import io
+import math
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Sequence
 
 import numpy as np
+from numpy.lib import format as npy
 
-from cflow_torch.data.aevascenes.clouds import Cloud
 from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes, make_boxes
-from cflow_torch.data.files import file_errors, find_folders, shortened
+from cflow_torch.data.files import file_errors, shortened
 from cflow_torch.data.json_file import read_json
 from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.data.names import path_inside
-from cflow_torch.data.paths import PathLike, as_path
+from cflow_torch.data.paths import PathLike, as_path, read_bytes
+from cflow_torch.data.pickles import load_array
 from cflow_torch.data.rigid_motion import poses_from_json, transform_points
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.ego_motion import relative_transform
 
-SEARCH_DEPTH = 3  # <root>/<data set>/<split>/<sequence>
-_HINT = "pass a complete sequence of AevaScenes"
+_HINT = "copy the sequence from the data set again"
 
 CATEGORY_NAME: dict[str, str] = {
     **dict.fromkeys(("unknown", "pole_trunk", "building", "other_structure", "vegetation"), "NONE"),
@@ -46,19 +48,6 @@ GROUND = ("road", "lane_boundary", "road_marking", "reflective_marker", "sidewal
 CATEGORY_NAME.update(dict.fromkeys(GROUND, "NONE"))
 
 _PATHS = {"compensated": ("point_cloud_compensated_path", "point_cloud_path"), "raw": ("point_cloud_raw_path",)}
-
-
-def find_aevascenes_sequences(root: PathLike) -> list[Path]:
-    """Find the folders of all sequences, sorted.
-
-    Args:
-        root: a sequence (holds `sequence.json`), a split, or a folder at most three levels above the sequences.
-
-    Raises:
-        CFlowError: `root` is not a folder.
-    """
-    what = "a sequence (it holds sequence.json), or a folder of sequences"
-    return find_folders(as_path(root), lambda folder: (folder / "sequence.json").is_file(), SEARCH_DEPTH, what)
 
 
 class AevaScenesLog(Log):
@@ -191,3 +180,50 @@ class AevaScenesLog(Log):
     def _poses_of(self, nodes: Sequence[Any], what: str) -> np.ndarray:
         """Build (K, 4, 4) float64 poses from objects with translation {x, y, z} and rotation {w, x, y, z}."""
         return poses_from_json(nodes, "translation", "rotation", f"{self._file}: {what}: number")
+
+
+class Cloud:
+    """One .npz file in memory; arrays are unpacked when you ask for them.
+
+    A missing or damaged file, or an array of another type or shape, is a `CFlowError`.
+    """
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+        with file_errors(file, _HINT):
+            self._arrays = np.load(io.BytesIO(read_bytes(file)), allow_pickle=False)
+            self._keys = list(self._arrays.files)
+
+    def numbers(self, key: str, columns: int) -> np.ndarray:
+        """Return an array as (N, columns) float32."""
+        if key not in self._keys:
+            raise CFlowError(f"{self.file} has no array {key}; it has {self._keys[:20]}")
+        array = self._array(key, np.floating, lambda a: a.size % columns == 0 and a.shape[1:] in ((), (columns,)))
+        return array.reshape(-1, columns).astype(np.float32, copy=False)
+
+    def seconds(self, key: str, rows: int) -> np.ndarray | None:
+        """Return an array of integer nanoseconds as (rows,) float64 seconds; None if there is no such array."""
+        if key not in self._keys:
+            return None
+        return self._array(key, np.integer, lambda a: a.shape in ((rows,), (rows, 1))).reshape(rows) * 1e-9
+
+    def _array(self, key: str, kind: type, is_shape: Any) -> np.ndarray:
+        with file_errors(f"{self.file}: {key}", _HINT):
+            array: np.ndarray = self._arrays[key]
+            if not np.issubdtype(array.dtype, kind) or not is_shape(array):
+                raise CFlowError(f"{self.file}: {key} has shape {array.shape} and dtype {array.dtype}; {_HINT}")
+            return array
+
+    def names(self, key: str) -> list[str] | None:
+        """Return the texts of an array of any shape, executing nothing; None if there is no such array."""
+        if key not in self._keys:
+            return None
+        with file_errors(f"{self.file}: {key}", _HINT):
+            with self._arrays.zip.open(f"{key}.npy") as member:
+                npy.read_magic(member)
+                shape, _, dtype = npy.read_array_header_1_0(member)
+                stored = load_array(member) if dtype.hasobject else self._arrays[key]
+            texts: list[str] = stored.ravel().tolist()
+            if {type(text) for text in texts} - {str} or len(texts) != math.prod(shape):
+                raise ValueError(f"it must hold {math.prod(shape)} strings")
+            return texts
