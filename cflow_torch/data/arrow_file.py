@@ -1,4 +1,4 @@
-"""Feather files (Arrow IPC, version 2), and columns of Arrow tables as NumPy arrays and texts."""
+"""Feather files (Arrow IPC, version 2), and their columns as NumPy arrays."""
 
 from __future__ import annotations
 
@@ -48,45 +48,42 @@ class FeatherFile:
         self.num_rows: int = self._table.num_rows
 
     def read(self, columns: Sequence[str]) -> pa.Table:
-        """Return some columns, in the given order.
-
-        Raises:
-            CFlowError: a column is missing or occurs twice.
-        """
+        """Return some columns, in the given order; a column that is missing or occurs twice is a `CFlowError`."""
         check_columns(self.file, self.names, columns)
         return self._table.select(list(columns))
 
+    def floats(self, columns: Sequence[str], dtype: type = np.float64) -> np.ndarray:
+        """Return K floating-point columns as (rows, K).
 
-def float_columns(table: pa.Table, columns: Sequence[str], file: Any, dtype: type = np.float64) -> np.ndarray:
-    """Return K floating-point columns as (rows, K); another type or an empty entry is a `CFlowError`."""
-    values = np.empty((table.num_rows, len(columns)), dtype)
-    for position, name in enumerate(columns):
-        values[:, position] = _column(table, name, file, "floating point", pa.types.is_floating).to_numpy()
-    return values
+        Raises:
+            CFlowError: a column is missing, occurs twice, has another type or an empty entry; so do the other methods.
+        """
+        check_columns(self.file, self.names, columns)
+        values: np.ndarray = np.empty((self.num_rows, len(columns)), dtype)
+        for position, name in enumerate(columns):
+            values[:, position] = self._column(name, "floating point", pa.types.is_floating).to_numpy()
+        return values
 
+    def integers(self, column: str) -> np.ndarray:
+        """Return an integer column as (rows,) int64."""
+        return self._column(column, "integer", pa.types.is_integer).to_numpy().astype(np.int64)
 
-def integer_column(table: pa.Table, column: str, file: Any) -> np.ndarray:
-    """Return an integer column as (rows,) int64; another type or an empty entry is a `CFlowError`."""
-    return _column(table, column, file, "integer", pa.types.is_integer).to_numpy().astype(np.int64)
+    def bools(self, column: str) -> np.ndarray:
+        """Return a column as (rows,) bool."""
+        return self._column(column, "bool", pa.types.is_boolean).to_numpy().astype(bool)
 
+    def texts(self, column: str) -> np.ndarray:
+        """Return the texts of a column, also of a dictionary column, as (rows,) objects."""
+        return np.array([*self._column(column, "text", _is_text).to_pylist(), None], object)[:-1]
 
-def bool_column(table: pa.Table, column: str, file: Any) -> np.ndarray:
-    """Return a column as (rows,) bool; another type or an empty entry is a `CFlowError`."""
-    return _column(table, column, file, "bool", pa.types.is_boolean).to_numpy().astype(bool)
-
-
-def text_column(table: pa.Table, column: str, file: Any) -> list[str]:
-    """Return the text of every row, also of a dictionary column; another type or an empty entry is a `CFlowError`."""
-    return list(_column(table, column, file, "text", _is_text).to_pylist())
-
-
-def _column(table: pa.Table, column: str, file: Any, kind: str, is_kind: Any) -> pa.ChunkedArray:
-    values = table.column(column)
-    if not is_kind(values.type):
-        raise CFlowError(f"{file}: column {column} must be {kind}, got {values.type}")
-    if values.null_count:
-        raise CFlowError(f"{file} has {values.null_count} empty entries in {column}; copy it again")
-    return values
+    def _column(self, column: str, kind: str, is_kind: Any) -> pa.ChunkedArray:
+        check_columns(self.file, self.names, [column])
+        values = self._table.column(column)
+        if not is_kind(values.type):
+            raise CFlowError(f"{self.file}: column {column} must be {kind}, got {values.type}")
+        if values.null_count:
+            raise CFlowError(f"{self.file} has {values.null_count} empty entries in {column}; copy it again")
+        return values
 
 
 def _is_text(kind: pa.DataType) -> bool:

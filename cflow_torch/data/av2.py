@@ -6,10 +6,9 @@ from pathlib import Path
 from typing import Sequence
 
 import numpy as np
-import pyarrow as pa
 
 from cflow_torch.data.arrays.cloud_file import read_columns
-from cflow_torch.data.arrow_file import FeatherFile, bool_column, float_columns, integer_column, text_column
+from cflow_torch.data.arrow_file import FeatherFile
 from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes, make_boxes
 from cflow_torch.data.categories import CATEGORIES
 from cflow_torch.data.files import file_errors
@@ -69,11 +68,11 @@ class AV2Log(Log):
     def sweep(self, index: int) -> Sweep:
         """Read sweep `index`, with a ground mask if the log has a raster."""
         timestamp = self._timestamp(index)
-        points, pose, file = self._points(timestamp), self._poses[timestamp], self._files[timestamp]
-        is_ground, stored = None, FeatherFile(file)
+        stored, pose, is_ground = FeatherFile(self._files[timestamp]), self._poses[timestamp], None
+        points = stored.floats("xyz", np.float32)
         times = None  # logs of other writers may lack them
         if "offset_ns" in stored.names:
-            times = integer_column(stored.read(["offset_ns"]), "offset_ns", file) * 1e-9
+            times = stored.integers("offset_ns") * 1e-9
         if self._raster is not None and self._rule is not None:
             is_ground = self._raster.is_ground(transform_points(points, pose), self._rule)
         return Sweep(points=points, is_ground=is_ground, pose=pose.copy(), timestamp_ns=timestamp, point_times=times)
@@ -109,49 +108,41 @@ class AV2Log(Log):
 
     def _points(self, timestamp: int) -> np.ndarray:
         """(N, 3) float32."""
-        file = self._files[timestamp]
-        return float_columns(FeatherFile(file).read("xyz"), "xyz", file, np.float32)
+        return FeatherFile(self._files[timestamp]).floats("xyz", np.float32)
 
     def _read_poses(self) -> dict[int, np.ndarray]:
         """Sweep time -> (4, 4) float64 T_world_ego."""
         file = self.folder / "city_SE3_egovehicle.feather"
-        table = FeatherFile(file).read(("timestamp_ns", *_POSE))
-        row_of = {time: row for row, time in enumerate(integer_column(table, "timestamp_ns", file).tolist())}
+        stored = FeatherFile(file)
+        row_of = {time: row for row, time in enumerate(stored.integers("timestamp_ns").tolist())}
         missing = [time for time in self.timestamps if time not in row_of]
         if missing:
             raise CFlowError(f"{file} has no pose at exactly the time of sweep {missing[0]} ({len(missing)} missing)")
-        rows = [row_of[time] for time in self.timestamps]
-        return dict(zip(self.timestamps, _poses(table.take(rows), file, self.timestamps)))
+        rows = np.array([row_of[time] for time in self.timestamps])
+        return dict(zip(self.timestamps, _poses(stored, rows, self.timestamps)))
 
     def _stored_labels(self, file: Path, timestamp: int) -> FlowLabels:
         stored = FeatherFile(file)
-        table = stored.read((*_FLOW, "classes"))
+        flow, category = stored.floats(_FLOW, np.float32), stored.integers("classes")
         rows = len(self._points(timestamp))
-        if table.num_rows != rows:
-            raise CFlowError(f"{file} has {table.num_rows} rows but sweep {timestamp} has {rows} points")
-        category = integer_column(table, "classes", file)
+        if stored.num_rows != rows:
+            raise CFlowError(f"{file} has {stored.num_rows} rows but sweep {timestamp} has {rows} points")
         if category.size and not 0 <= category.min() <= category.max() < len(CATEGORIES):
             raise CFlowError(
                 f"{file}: classes are 0 ... {len(CATEGORIES) - 1}, got {category.min()} ... {category.max()}"
             )
-        is_valid = np.ones(rows, dtype=bool)
-        if "is_valid" in stored.names:
-            is_valid = bool_column(stored.read(["is_valid"]), "is_valid", file)
-        return FlowLabels(float_columns(table, _FLOW, file, np.float32), category.astype(np.uint8), is_valid)
+        is_valid = stored.bools("is_valid") if "is_valid" in stored.names else np.ones(rows, dtype=bool)
+        return FlowLabels(flow, category.astype(np.uint8), is_valid)
 
     def _labels_from_annotations(self, file: Path, timestamp0: int, timestamp1: int) -> FlowLabels | None:
         stored = FeatherFile(file)
-        table = stored.read(("timestamp_ns", "track_uuid", "category", *_SIZE, *_POSE))
-        times = integer_column(table, "timestamp_ns", file)
+        times = stored.integers("timestamp_ns")
         if not times.size or timestamp0 < times.min() or timestamp1 > times.max():
             return None
         is_used: np.ndarray = np.ones(len(times), dtype=bool)
         if "num_interior_pts" in stored.names:
-            points_inside = integer_column(stored.read(["num_interior_pts"]), "num_interior_pts", file)
-            is_used = points_inside >= MIN_INTERIOR_POINTS
-        boxes0, boxes1 = (
-            _boxes(table.filter(pa.array(is_used & (times == time))), file) for time in (timestamp0, timestamp1)
-        )
+            is_used = stored.integers("num_interior_pts") >= MIN_INTERIOR_POINTS
+        boxes0, boxes1 = (_boxes(stored, np.flatnonzero(is_used & (times == t))) for t in (timestamp0, timestamp1))
         T_ego1_ego0 = np.linalg.inv(self._poses[timestamp1]) @ self._poses[timestamp0]
         return flow_from_boxes(self._points(timestamp0), boxes0, boxes1, T_ego1_ego0)
 
@@ -160,15 +151,15 @@ def _is_log(folder: Path) -> bool:
     return (folder / "sensors" / "lidar").is_dir()
 
 
-def _poses(table: pa.Table, file: Path, names: Sequence[int | str]) -> np.ndarray:
-    """(K, 4, 4) float64."""
-    values = float_columns(table, _POSE, file)
-    return poses_from_quaternions(values[:, 4:], values[:, :4], lambda row: f"{file}: the pose of {names[row]}")
+def _poses(stored: FeatherFile, rows: np.ndarray, names: Sequence[int | str]) -> np.ndarray:
+    """Return the (K, 4, 4) float64 poses of K rows."""
+    values = stored.floats(_POSE)[rows]
+    return poses_from_quaternions(values[:, 4:], values[:, :4], lambda row: f"{stored.file}: the pose of {names[row]}")
 
 
-def _boxes(table: pa.Table, file: Path) -> Boxes:
-    """Boxes of one sweep, in the order of the file."""
-    tracks, names = (text_column(table, column, file) for column in ("track_uuid", "category"))
-    with file_errors(file):
+def _boxes(stored: FeatherFile, rows: np.ndarray) -> Boxes:
+    """Return the boxes of some rows, in the order of the file."""
+    tracks, names = (stored.texts(column)[rows].tolist() for column in ("track_uuid", "category"))
+    with file_errors(stored.file):
         category = category_indices(names, {name: name for name in CATEGORIES[1:]})
-        return make_boxes(tracks, category, float_columns(table, _SIZE, file), _poses(table, file, tracks))
+        return make_boxes(tracks, category, stored.floats(_SIZE)[rows], _poses(stored, rows, tracks))

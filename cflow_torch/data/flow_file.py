@@ -9,7 +9,7 @@ import pyarrow as pa
 import torch
 from pyarrow import feather
 
-from cflow_torch.data.arrow_file import FeatherFile, bool_column, float_columns, integer_column
+from cflow_torch.data.arrow_file import FeatherFile
 from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.paths import PathLike, as_path
 from cflow_torch.types import VECTORS, CFlowError, FlowResult, vector_columns
@@ -50,7 +50,6 @@ def read_flow(path: PathLike) -> FlowResult:
         CFlowError: the file is missing, cannot be reached, is truncated, or holds none of the contents.
     """
     path = as_path(path)
-    scalars = {"cluster_id": integer_column, "is_valid": bool_column}
     fields = {}
     try:
         file = FeatherFile(path)
@@ -58,11 +57,12 @@ def read_flow(path: PathLike) -> FlowResult:
             columns = vector_columns(name) if name in VECTORS else [name]
             if not set(columns) & set(file.names):
                 continue
-            table = file.read(columns)
-            if name in scalars:
-                fields[name] = scalars[name](table, name, path)
+            if name == "cluster_id":
+                fields[name] = file.integers(name)
+            elif name == "is_valid":
+                fields[name] = file.bools(name)
             else:
-                values = float_columns(table, columns, path, np.float32)
+                values = file.floats(columns, np.float32)
                 fields[VECTORS.get(name, name)] = values if name in VECTORS else values[:, 0]
         if not fields:
             raise CFlowError(f"its columns are {', '.join(file.names)}")

@@ -12,7 +12,7 @@ from tiny_recording import TinyRecording, rigid, turn_z
 
 from cflow_torch.data.categories import CATEGORY_INDEX, meta_class
 from cflow_torch.data.nuscenes.reader import Footprint, NuScenesLog, find_nuscenes_scenes, pcd_bin_points
-from cflow_torch.data.nuscenes.tables import Annotations, SceneSource
+from cflow_torch.data.nuscenes.tables import Annotations
 from cflow_torch.data.nuscenes.tracks import Tracks
 from cflow_torch.data.rigid_motion import poses_from_quaternions, transform_points
 from cflow_torch.simulator import make_drive
@@ -45,12 +45,6 @@ def drive():
 def tiny(tmp_path):
     """Six sweeps, all of them samples."""
     return write_nuscenes(TinyRecording(("LIDAR_TOP",)), tmp_path / "data", key_frame_interval=0.1)
-
-
-def test_two_lidars_are_merged(tmp_path):
-    several = TinyRecording(("LIDAR_TOP", "SECOND"))
-    points = open_log(write_nuscenes(several, tmp_path / "tiny"), own_vehicle=None).sweep(1).points
-    assert np.abs(points - several.sweep(1).points).max() < 2e-5
 
 
 def test_labels_between_samples_are_near_the_truth(drive, tmp_path):
@@ -180,11 +174,7 @@ def test_inconsistent_rows_are_refused(tiny, table, change, complaint):
         open_log(tiny)
 
 
-def test_missing_scenes_and_unknown_categories_are_refused(tiny, tmp_path):
-    with pytest.raises(CFlowError, match="has 1 sweeps"):
-        open_log(write_nuscenes(TinyRecording(("LIDAR_TOP",), num_sweeps=1), tmp_path / "one"))
-    with pytest.raises(CFlowError, match="no scene 'scene-0061'"):
-        NuScenesLog(SceneSource(tiny, VERSION, "scene-0061"))
+def test_unknown_categories_are_refused(tiny):
     edit(tiny, "category", lambda rows: [{**row, "name": "vehicle.spaceship"} for row in rows])
     with pytest.raises(CFlowError, match="category.json: the categories .*spaceship.* are unknown"):
         open_log(tiny)
@@ -199,9 +189,6 @@ def test_a_bad_sweep_costs_no_other(tiny):
         with pytest.raises(CFlowError, match=f"{file.name}.*{complaint}"):
             log.sweep(0)
     assert len(log.sweep(1).points) == 40
-    file.unlink()
-    with pytest.raises(CFlowError, match=f"{file.name} is missing; copy"):
-        log.sweep(0)
 
 
 def test_a_real_sweep_is_read(data_root: Path, tmp_path: Path) -> None:

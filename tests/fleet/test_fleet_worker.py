@@ -6,7 +6,6 @@ import functools
 import operator
 import threading
 import time
-import weakref
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Callable, Iterator, Sequence
@@ -93,29 +92,6 @@ def test_frames_without_an_active_point_fail_and_repeated_sweeps_are_noted(tmp_p
     notes = [(event.name, event.message) for event in events if isinstance(event, Noted)]
     assert notes[-1] == (f"{drive.log_id}/{drive.timestamps[3]}", "the next sweep has the same points")
     assert any("static world moves" in text for _, text in notes), "the log is checked by the unit of its first frame"
-
-
-def test_the_memory_of_a_failed_batch_is_free_before_its_frames_are_repeated(source: Path, tmp_path: Path) -> None:
-    """The traceback of the error holds what the batch has allocated on the GPU."""
-
-    class Big:
-        pass
-
-    alive: list[bool] = []
-
-    class Hungry(FailingModel):
-        taken: Any = None
-
-        def __call__(self, windows: Sequence[Window]) -> list[FlowResult]:
-            if len(windows) > 1:
-                big = Big()
-                self.taken = weakref.ref(big)
-                raise RuntimeError("CUDA: out of memory")
-            alive.append(self.taken is not None and self.taken() is not None)
-            return self.model(windows)
-
-    list(Worker(make_job(tmp_path), "cpu", model=Hungry([], MemoryError)).run(Unit(0, source)))
-    assert alive == [False] * 5
 
 
 def test_a_lost_gpu_ends_its_worker(source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -267,14 +243,6 @@ def test_an_error_outside_of_frames_fails_only_its_unit(
     failed = [(e.name, e.message) for e in events if isinstance(e, Failed)]
     assert failed == [(first.name, "RuntimeError: can't start new thread")]
     assert len(flow_files(tmp_path)) == PAIRS - 3 and flow_files(tmp_path).items() <= single.items()
-
-
-def test_a_stop_lets_the_frames_in_hand_be_finished(fleet: Path, tmp_path: Path) -> None:
-    units, job = units_of(sorted(fleet.iterdir())), make_job(tmp_path, batch=1)
-    processes = [ThreadProcess(job), ThreadProcess(job)]
-    counters = count(dispatch(processes, units, lambda: any(tmp_path.rglob("*.feather")), 1), units)
-    assert 0 < len(flow_files(tmp_path)) < PAIRS
-    assert len(counters.waiting) + len(flow_files(tmp_path)) == counters.total
 
 
 def test_a_stop_does_not_wait_for_a_worker_that_hangs(source: Path, tmp_path: Path, monkeypatch: Any) -> None:

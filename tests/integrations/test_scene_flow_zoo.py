@@ -98,14 +98,6 @@ def test_causal_gives_one_flow_in_the_axes_of_t_with_nan_in_padding_rows() -> No
     assert output.valid_flow_mask.data_ptr() != sequence.full_pc_mask.data_ptr()
 
 
-def test_non_causal_gives_a_flow_for_every_sweep_but_the_last() -> None:
-    sweeps = drive(5)
-    (output,) = run([make_sequence(sweeps, LoaderType.NON_CAUSAL)], num_history=2)
-    assert output.ego_flows.shape == (4, 640, 3)
-    for index in range(4):
-        np.testing.assert_allclose(output.flow(index), expected(sweeps, index, 2), rtol=0, atol=1e-6)
-
-
 def test_sequences_of_a_batch_may_differ_in_length_and_kind() -> None:
     sweeps = drive(4)
     others = make_sequence(drive(3, velocity=0.7), LoaderType.NON_CAUSAL), make_sequence(drive(2, yaw_step=-0.05))
@@ -113,6 +105,9 @@ def test_sequences_of_a_batch_may_differ_in_length_and_kind() -> None:
     outputs = run(batch, num_history=1)
     assert [len(output.ego_flows) for output in outputs] == [1, 2, 1] and run([]) == []
     np.testing.assert_allclose(outputs[0].flow(0), expected(sweeps, 2, 1), rtol=0, atol=1e-6)
+    for index in range(2):
+        flow = outputs[1].flow(index)
+        np.testing.assert_allclose(flow, expected(drive(3, velocity=0.7), index, 1), rtol=0, atol=1e-6)
     for sequence, output in zip(batch, outputs):
         (alone,) = run([sequence], num_history=1)
         np.testing.assert_array_equal(output.ego_flows.numpy(), alone.ego_flows.numpy())
@@ -138,12 +133,9 @@ def test_the_error_outside_of_a_checkout_has_the_fix(monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize(
     ("changes", "complaint"),
     [
-        ({"full_pc": None}, r"batched_sequence\[1\]\.full_pc is not a tensor"),
-        ({"full_pc": torch.zeros(1, 640, 3)}, r"full_pc has shape \(1, 640, 3\).*at least 2"),
-        ({"full_pc_mask": torch.zeros(2, 7)}, r"full_pc_mask has shape \(2, 7\).*give \(2, 640\)"),
+        ({"full_pc": torch.zeros(1, 640, 3)}, r"batched_sequence\[1\]\.full_pc .*\(1, 640, 3\).*at least 2"),
+        ({"full_pc_mask": torch.zeros(2, 7)}, r"full_pc_mask have shapes .*\(2, 7\)"),
         ({"pc_poses_ego_to_global": torch.full((2, 4, 4), NAN)}, r"pc_poses_ego_to_global\[0\] holds NaN"),
-        ({"pc_poses_sensor_to_ego": 2 * torch.eye(4).repeat(2, 1, 1)}, r"pc_poses_sensor_to_ego\[0\] is not rigid"),
-        ({"loader_type": "causal"}, r"loader_type is None: give LoaderType\.CAUSAL"),
     ],
 )
 def test_the_error_names_the_bad_field_of_a_sequence(changes: dict[str, Any], complaint: str) -> None:

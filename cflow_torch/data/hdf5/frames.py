@@ -53,8 +53,7 @@ def recognized_extrinsics(timestamp: int, points: np.ndarray, is_ground: np.ndar
         Argoverse 2 sweeps (by their time stamp) with ground more than 1.2 m below the origin have points in the frame
         of up_lidar and poses of the ego frame. We return the extrinsics of one log of that set. Those of the scene's
         own log are not in its file: take them from `calibration/egovehicle_SE3_sensor.feather`. For all other sets we
-            return the
-        identity (nuScenes and ZOD have poses of the sensor, Waymo and TruckScenes points in the ego frame).
+        return the identity (nuScenes and ZOD have poses of the sensor, Waymo and TruckScenes points in the ego frame).
     """
     if not is_argoverse2(timestamp) or is_ground is None:
         return np.eye(4)

@@ -91,7 +91,7 @@ class HDF5Log(Log):
     def sweep(self, index: int) -> Sweep:
         """Read sweep `index`: float32 points, float64 pose of their frame; ground mask and times if stored."""
         rows, timestamp = self._rows(index), self.timestamps[index]
-        points = self._needed(index, "lidar", dtype=np.float32)
+        points: Any = self._values(index, "lidar", dtype=np.float32)
         is_ground = self._column(index, "ground_mask", rows, np.bool_)
         pose = self._stored_pose(index)
         if pose is not None and not np.array_equal(self.ego_T_lidar, np.eye(4)):
@@ -148,7 +148,10 @@ class HDF5Log(Log):
         Raises:
             CFlowError: no such sweep or key; the message lists the keys.
         """
-        values = self._needed(index, key)
+        values = self._values(index, key)
+        if values is None:
+            has = ", ".join(self.keys(index))
+            raise CFlowError(f"{self.file}: sweep {self.timestamps[index]} has no {key}; it has {has}")
         return values[:, 0] if values.ndim == 2 and values.shape[1] == 1 else values
 
     @property
@@ -192,13 +195,9 @@ class HDF5Log(Log):
     def _group(self, index: int) -> Any:
         return member(self._scene, str(self._timestamp(index)), self.file)
 
-    def _array(self, index: int, key: str) -> Any | None:
-        """Return the array of a key without reading it; None if there is none."""
-        return member(self._group(index), key, f"{self.file}: sweep {self.timestamps[index]}")
-
     def _rows(self, index: int) -> int:
         """Return the number of points of a sweep without reading them."""
-        stored = self._array(index, "lidar")
+        stored = member(self._group(index), "lidar", f"{self.file}: sweep {self.timestamps[index]}")
         shape: tuple[int, ...] = () if stored is None else stored.shape
         if len(shape) != 2 or shape[1] < 3:
             raise CFlowError(f"{self.file}: lidar of sweep {self.timestamps[index]} has shape {shape}, not (N, 3+)")
@@ -208,23 +207,16 @@ class HDF5Log(Log):
         self, index: int, key: str, shapes: Sequence[tuple[int, ...]] = (), dtype: Any = None
     ) -> np.ndarray | None:
         """Read the values of a key in one of the given shapes; None if there are none."""
-        stored = self._array(index, key)
+        group = self._group(index)
+        what = f"{self.file}: {key} of sweep {self.timestamps[index]}"
+        stored = member(group, key, what)
         if stored is None:
             return None
-        what = f"{self.file}: {key} of sweep {self.timestamps[index]}"
         with scene_errors(what), np.errstate(over="ignore"):  # float64 beyond float32 becomes infinite, "no return"
             if shapes and stored.shape not in shapes:
                 raise CFlowError(f"{what} has shape {stored.shape}, expected {shapes[0]}")
             values: np.ndarray = stored[()]
             return values if dtype is None else values.astype(dtype, copy=False)
-
-    def _needed(self, index: int, key: str, shape: tuple[int, ...] | None = None, dtype: Any = None) -> np.ndarray:
-        """Read the values of a key that must exist."""
-        values = self._values(index, key, [shape] if shape else [], dtype)
-        if values is None:
-            has = ", ".join(self.keys(index))
-            raise CFlowError(f"{self.file}: sweep {self.timestamps[index]} has no {key}; it has {has}")
-        return values
 
     def _column(self, index: int, key: str, rows: int, dtype: Any = None) -> np.ndarray | None:
         """Read the (N,) values of a key that is stored as (N,) or (N, 1); None if there are none."""

@@ -49,10 +49,10 @@ def member(group: Any, name: str, where: PathLike) -> Any | None:
         link = group.get(name, getlink=True)
         if link is None:
             return None
-        is_own = isinstance(link, h5py.HardLink)  # `group[name]` of another kind could open a file elsewhere
-        found: Any = group[name] if is_own else None
+        # `group[name]` of a link could open a file elsewhere.
+        found: Any = group[name] if isinstance(link, h5py.HardLink) else None
         is_array = isinstance(found, h5py.Dataset)
-        if not is_own or (is_array and (found.is_virtual or found.external)):
+        if found is None or (is_array and (found.is_virtual or found.external)):
             raise CFlowError(f"{where}: {name} is a link or lies in other files, which are not read; {_HINT}")
         if is_array and (found.shape is None or found.dtype.kind not in "biuf"):
             raise CFlowError(f"{where}: {name} is not an array of bool, integers or floats; {_HINT}")

@@ -34,9 +34,8 @@ class Tracks:
             is a guess. Guesses come first.
 
         Convention: at a sample, its own boxes. Between two samples the centre and the size change linearly, the
-            rotation at a
-        constant rate. An object that only one of the two samples has continues its motion between that sample and the
-        next one beyond; if that one lacks it too, the object stays where it is.
+            rotation at a constant rate. An object that only one of the two samples has continues its motion between
+            that sample and the next one beyond; if that one lacks it too, the object stays where it is.
         """
         times = self._times
         if not len(self._annotations.time) or not times[0] <= time <= times[-1]:
