@@ -41,9 +41,9 @@ def write_small_log(name: str, folder: Path) -> Path:
         write_hdf5_scene(drive, folder / f"{drive.log_id}.h5")
         write_index_files(folder)
     elif name == "nuscenes":
-        write_nuscenes(TinyRecording(("LIDAR_TOP",)), folder)
+        write_nuscenes(TinyRecording(("LIDAR_TOP",), num_sweeps=3), folder)
     elif name == "truckscenes":
-        write_truckscenes(TinyRecording(("LIDAR_LEFT", "LIDAR_RIGHT")), folder)
+        write_truckscenes(TinyRecording(("LIDAR_LEFT", "LIDAR_RIGHT"), num_sweeps=3), folder)
     else:
         roof = replace(PROFILES["waymo"].units[0], num_columns=265)
         write_waymo_segment(Drive(drive.scene, replace(PROFILES["waymo"], units=(roof,)), 3, 2, "small"), folder)

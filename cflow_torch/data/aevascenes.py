@@ -90,7 +90,7 @@ class AevaScenesLog(Log):
         if clouds not in _PATHS:
             raise CFlowError(f"clouds={clouds!r}: choose one of {', '.join(_PATHS)}")
         self._clouds, self._ground = clouds, ground
-        self._clouds_of = lru_cache(1)(self._open_clouds)  # several arrays of a sweep's clouds are read in turn
+        self._clouds_of = lru_cache(1)(self._open_clouds)  # several arrays of a sweep's clouds are read
         self._file = self.folder / "sequence.json"
         with file_errors(self._file, _HINT):
             content = read_json(self._file)

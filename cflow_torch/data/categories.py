@@ -65,14 +65,9 @@ META_CLASSES: dict[str, tuple[str, ...]] = {
 META_NAMES: tuple[str, ...] = tuple(META_CLASSES)
 
 
-def _meta_lookup() -> np.ndarray:
-    lookup = np.full(len(CATEGORIES), -1, dtype=np.int64)
-    for index, members in enumerate(META_CLASSES.values()):
-        lookup[[CATEGORY_INDEX[name] for name in members]] = index
-    return lookup
-
-
-_META_OF_CATEGORY = _meta_lookup()
+_META_OF_CATEGORY = np.array(
+    [next((index for index, names in enumerate(META_CLASSES.values()) if name in names), -1) for name in CATEGORIES]
+)
 
 
 def meta_class(category: np.ndarray) -> np.ndarray:

@@ -50,9 +50,9 @@ def write_json(path: PathLike, value: Any) -> None:
 def json_ready(value: Any) -> Any:
     """Replace what JSON cannot hold: tuples by lists, NaN (no points) by null, infinity by text."""
     if isinstance(value, dict):
-        return {str(key): json_ready(part) for key, part in value.items()}
+        return {str(key): json_ready(member) for key, member in value.items()}
     if isinstance(value, (list, tuple)):
-        return [json_ready(part) for part in value]
+        return [json_ready(member) for member in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None if math.isnan(value) else str(value)
     return value
@@ -62,8 +62,10 @@ def flatten(value: Any, name: str = "") -> dict[str, Any]:
     """Flatten nested dictionaries into one, with keys joined by dots; lists are values."""
     if not isinstance(value, dict):
         return {name: value}
-    parts: list[dict[str, Any]] = [flatten(part, f"{name}.{key}" if name else str(key)) for key, part in value.items()]
-    return {key: leaf for part in parts for key, leaf in part.items()}
+    leaves: dict[str, Any] = {}
+    for key, member in value.items():
+        leaves.update(flatten(member, f"{name}.{key}" if name else str(key)))
+    return leaves
 
 
 def describe_changes(before: Any, now: Any, ignored: Any = ()) -> str:

@@ -43,11 +43,11 @@ def path_inside(folder: Path, relative: Any, what: str) -> Path:
         what: what it names, for the message.
 
     Raises:
-        CFlowError: the value is not a text, is empty or absolute, or a part of it is not a safe name, such as `..`.
+        CFlowError: the value is not a text, is empty or absolute, or a name in it is not safe, such as `..`.
     """
-    parts = relative.split("/") if isinstance(relative, str) else [""]
-    named = [part for part in parts if part not in ("", ".")]
-    if not parts[0] or not named or not all(map(is_safe_name, named)):
+    names = relative.split("/") if isinstance(relative, str) else [""]
+    named = [name for name in names if name not in ("", ".")]
+    if not names[0] or not named or not all(map(is_safe_name, named)):
         shown = ascii(relative)[:_SHOWN]
         raise CFlowError(f"{what} {shown} is not read: it must name a file below {folder}; {_RULE}")
     return folder.joinpath(*named)

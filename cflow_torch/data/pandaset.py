@@ -111,8 +111,8 @@ class PandaSetLog(Log):
         for lidar in _LIDARS:
             rows = np.flatnonzero(lidars == lidar)
             boxes0, boxes1 = (self._boxes(cuboids[k], files[k], index + k, lidar) for k in (0, 1))
-            part = flow_from_boxes(points[rows], boxes0, boxes1, T_ego1_ego0)
-            flow[rows], category[rows], is_valid[rows] = part.flow, part.category, part.is_valid
+            found = flow_from_boxes(points[rows], boxes0, boxes1, T_ego1_ego0)
+            flow[rows], category[rows], is_valid[rows] = found.flow, found.category, found.is_valid
         classes = self._classes(index, len(points))
         if classes is not None:
             names, name_of_point = np.unique(classes, return_inverse=True)

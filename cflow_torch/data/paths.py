@@ -55,13 +55,12 @@ def as_path(path: PathLike) -> Path:
     try:
         import fsspec
         from upath import UPath
-    except ImportError:
-        raise CFlowError(f"{path} is remote, which needs: pip install universal_pathlib fsspec") from None
-    try:
+
         fsspec.get_filesystem_class(scheme)
-    except (ImportError, ValueError) as error:  # it names the missing package
+    except (ImportError, ValueError) as error:  # it names a missing package
         raise CFlowError(
-            f"fsspec has no file system {scheme}:// ({error}): {path}; is it spelled correctly?"
+            f"{path} cannot be opened: fsspec has no file system {scheme}:// ({error}). Is it spelled correctly? "
+            "Remote paths need pip install universal_pathlib fsspec, and the package of their file system"
         ) from error
     found: Any = UPath(f"{scheme}://{path[match.end() :].rstrip('/')}")
     return found  # type: ignore[no-any-return]

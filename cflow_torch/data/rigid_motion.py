@@ -106,8 +106,8 @@ def _rotations_between(first: np.ndarray, last: np.ndarray, share: np.ndarray) -
     from kornia.geometry.conversions import axis_angle_to_quaternion, quaternion_to_axis_angle
 
     axis_angle = quaternion_to_axis_angle(torch.from_numpy(to_quaternions(np.swapaxes(first, 1, 2) @ last)))
-    part = axis_angle_to_quaternion(axis_angle * torch.from_numpy(np.asarray(share, np.float64))[:, None])
-    return np.asarray(first, np.float64) @ to_rotations(part.numpy())
+    rotated = axis_angle_to_quaternion(axis_angle * torch.from_numpy(np.asarray(share, np.float64))[:, None])
+    return np.asarray(first, np.float64) @ to_rotations(rotated.numpy())
 
 
 def _poses(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ from cflow_torch.fleet.work import describe, source_name
 from cflow_torch.types import CFlowError
 
 _POLL_S = 0.2  # how soon a signal is noticed
-_GRACE_S = 20.0  # time to finish the frames in hand after a signal; schedulers kill after 30 s or more
+_GRACE_S = 20.0  # time to finish the frames that have begun after a signal; schedulers kill after 30 s or more
 _MAX_FAILED_STARTS = 3  # in a row; then a worker is given up
 # Processes that may die on one unit; then the rest of it is left. Perhaps all its frames are too large for the memory,
 # and each new process takes seconds to start.
@@ -47,7 +47,7 @@ def dispatch(
     Args:
         processes: one per worker, not started yet. Each is used by a thread of its own.
         units: numbered as in `split`.
-        stop: called often. Once it returns True, frames in hand are finished and no others begin.
+        stop: called often. Once it returns True, frames that have begun are finished and no others begin.
         retries: how often a unit, and then each of its frames by itself, is repeated.
 
     Yields:
@@ -117,12 +117,12 @@ def _start(process: Process) -> None:
 def _do(process: Process, unit: Unit, stop: Callable[[], bool], retries: int) -> Iterator[Event]:
     """Do a unit and yield its events. When the process dies, start it again and repeat the frames that are missing."""
     name, is_opened, num_deaths = source_name(unit.source), False, 0
-    parts = deque([unit])
-    while parts and not stop():
-        part = parts.popleft()
-        missing = None if part.only is None else set(part.only)  # frames that are not settled; None = not known
+    pieces = deque([unit])
+    while pieces and not stop():
+        piece = pieces.popleft()
+        missing = None if piece.only is None else set(piece.only)  # frames that are not settled; None = not known
         try:
-            for event in _events(process, part, stop):
+            for event in _events(process, piece, stop):
                 if not isinstance(event, Opened):
                     if missing is not None and isinstance(event, (Done, Failed)) and event.timestamp is not None:
                         missing.discard(event.timestamp)
@@ -139,19 +139,19 @@ def _do(process: Process, unit: Unit, stop: Callable[[], bool], retries: int) ->
         _start(process)
         num_deaths += 1
         stamps = sorted(missing or [])
-        part = replace(part, only=None if missing is None else frozenset(missing), deaths=part.deaths + 1)
+        piece = replace(piece, only=None if missing is None else frozenset(missing), deaths=piece.deaths + 1)
         if num_deaths == max(_MAX_DEATHS, 2 * (retries + 1)):
             message = f"{num_deaths} workers died on this part of the log, the last one {how}: the rest is left"
             yield Failed(unit.number, name, message)
             return
         yield Noted(unit.number, name, f"a worker died {how}; another one goes on with the frames that are missing")
-        if part.deaths <= retries:
-            parts.append(part)
+        if piece.deaths <= retries:
+            pieces.append(piece)
         elif len(stamps) > 1:
-            parts.extend(replace(part, only=frozenset([stamp]), deaths=0) for stamp in stamps)
+            pieces.extend(replace(piece, only=frozenset([stamp]), deaths=0) for stamp in stamps)
         elif stamps or not is_opened:
             frame = "/".join([name, *map(str, stamps)])
-            message = f"{part.deaths} worker{'s' * (part.deaths > 1)} died on it, the last one {how}"
+            message = f"{piece.deaths} worker{'s' * (piece.deaths > 1)} died on it, the last one {how}"
             yield Failed(unit.number, frame, message, stamps[0] if stamps else None)
 
 

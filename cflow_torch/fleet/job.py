@@ -116,11 +116,11 @@ class Step(NamedTuple):
 
 def split(units: Sequence[Unit], workers: int) -> list[Unit]:
     """Split units until there are enough of them for all workers, and number them from 0."""
-    parts = -(-_UNITS_PER_WORKER * workers // max(1, len(units))) if workers > 1 else 1
+    count = -(-_UNITS_PER_WORKER * workers // max(1, len(units))) if workers > 1 else 1
     pieces = []
     for unit in units:
-        length = (unit.last - unit.first) / parts
-        edges = [unit.first + length * part for part in range(parts + 1)]
+        length = (unit.last - unit.first) / count
+        edges = [unit.first + length * k for k in range(count + 1)]
         pieces += [replace(unit, first=first, last=last) for first, last in zip(edges, edges[1:])]
     return [replace(unit, number=number) for number, unit in enumerate(pieces)]
 
@@ -140,7 +140,7 @@ class Shard:
             )
 
     def units(self, sources: Sequence[Any]) -> list[Unit]:
-        """This shard's part of the logs.
+        """Return this shard's share of the logs.
 
         The sequence of all logs is divided into `count` parts of equal length. So a shard opens only its own logs, and
         shares at most the first and the last of them with a neighbour.

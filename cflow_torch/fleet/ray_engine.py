@@ -46,7 +46,7 @@ def run_ray(
         units: numbered as in `split`.
         layout: one worker per device. Workers that do not fit into the cluster start when there is room. Ray chooses
             the GPUs.
-        stop: called often. Once it returns True, frames in hand are finished and no others begin.
+        stop: called often. Once it returns True, frames that have begun are finished and no others begin.
         address: None = start a cluster in this process, and end it; "auto" or "HOST:PORT" = join the cluster that this
             machine is part of. An existing connection of the caller is used and kept.
         num_cpus: CPUs of the cluster that a worker takes; "auto" = 1 without a GPU, 0 with one.

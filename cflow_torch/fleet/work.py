@@ -40,7 +40,7 @@ class DeviceLost(CFlowError):
 
 @dataclass
 class _Frame:
-    """A frame on its way through a worker."""
+    """A frame that a worker reads, computes and writes."""
 
     timestamp: int
     content: Window | FlowResult | Exception | None = None
@@ -231,7 +231,7 @@ class WorkerProcess(Worker):
 
         Args:
             unit: the same at each call until the unit has ended.
-            stop: finish the frames in hand and begin no others.
+            stop: finish the frames that have begun, and begin no others.
         """
         self._stops = stop
         running, self._events = self._events or self.run(unit, lambda: self._stops), None

@@ -14,7 +14,7 @@ from tiny_recording import TinyRecording
 
 from cflow_torch import CFlowError
 from cflow_torch.data.bags import BagLog
-from cflow_torch.data.bags.point_cloud2 import points_and_times, seconds_after
+from cflow_torch.data.bags.messages import points_and_times, seconds_after
 from cflow_torch.data.catalog import find_sources, open_log
 from cflow_torch.data.log import window
 from cflow_torch.data.log_check import check_log

@@ -12,8 +12,8 @@ from cflow_torch import CFlowError, Sweep
 from cflow_torch.data.arrays.cloud_file import write_cloud
 from cflow_torch.data.arrays.poses_text import write_kitti_poses
 from cflow_torch.data.catalog import find_sources, open_log
+from cflow_torch.data.log_check import check_static_world
 from cflow_torch.data.odometry import PosedLog, poses_from_odometry, with_poses
-from cflow_torch.data.static_check import check_static_world
 from cflow_torch.simulator import make_drive
 
 needs_kiss_icp = pytest.mark.skipif(find_spec("kiss_icp") is None, reason="needs KISS-ICP (extra odometry)")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,34 +11,32 @@ from cflow_torch import CFlowError
 from cflow_torch.data.arrays.cloud_file import read_cloud
 from cflow_torch.data.arrays.pcd import pcd_fields, write_pcd
 
-DATA = ("ascii", "binary", "binary_compressed")
 DTYPES = ("f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8")
 
 pypcd4 = pytest.importorskip("pypcd4", reason="needs the extra clouds: pip install pypcd4")
 
 
-def write_as(path: Path, fields: dict[str, np.ndarray], data: str) -> None:
-    """Write a file as other programs do."""
-    kinds = [values.dtype for values in fields.values()]
-    cloud = pypcd4.PointCloud.from_points(list(fields.values()), list(fields), kinds)
-    cloud.save(path, pypcd4.Encoding(data))
-
-
-@pytest.mark.parametrize("data", DATA)
+@pytest.mark.parametrize("data", ("ascii", "binary", "binary_compressed"))
 @pytest.mark.parametrize("rows", [0, 1, 40])
 def test_every_type_comes_back(tmp_path, data, rows):
-    rng = np.random.default_rng(0)
+    """Of files of other programs. Without its last line a file is refused."""
+    rng, file = np.random.default_rng(0), tmp_path / "a.pcd"
     fields = {
         kind: rng.integers(np.iinfo(kind).min, np.iinfo(kind).max, rows, kind, True)
         if kind[0] in "iu"
         else rng.integers(-(2**20), 2**20, rows).astype(kind) / 1024  # exact in ten decimals
         for kind in DTYPES
     }
-    write_as(tmp_path / "a.pcd", fields, data)
-    again = pcd_fields((tmp_path / "a.pcd").read_bytes())
+    kinds = [values.dtype for values in fields.values()]
+    pypcd4.PointCloud.from_points(list(fields.values()), list(fields), kinds).save(file, pypcd4.Encoding(data))
+    again = pcd_fields(file.read_bytes())
     assert list(again) == list(fields)
     for name, values in fields.items():
         assert again[name].dtype == values.dtype and np.array_equal(again[name], values), name
+    if rows:
+        file.write_bytes(file.read_bytes()[:-30])
+        with pytest.raises(CFlowError, match=r"a\.pcd"):
+            read_cloud(file)
 
 
 def test_padding_and_vector_fields_are_left_out(tmp_path):
@@ -50,18 +47,6 @@ def test_padding_and_vector_fields_are_left_out(tmp_path):
     cloud = pcd_fields((tmp_path / "a.pcd").read_bytes())
     assert list(cloud) == ["x", "t"] and cloud["t"].tolist() == [3, 2**60 + 1]
     assert np.array_equal(cloud["x"], rows["x"], equal_nan=True)
-
-
-@pytest.mark.parametrize("data", DATA)
-def test_every_truncation_is_detected(tmp_path, data):
-    file = tmp_path / "a.pcd"
-    write_as(file, {"x": np.arange(20, dtype=np.float32), "t": np.arange(20, dtype=np.uint64)}, data)
-    whole = file.read_bytes()
-    # The last line end of a text file, and the last digits of its last number, cannot be missed.
-    for size in range(0, len(whole) - (4 if data == "ascii" else 0), 7):
-        file.write_bytes(whole[:size])
-        with pytest.raises(CFlowError, match=r"a\.pcd"):
-            read_cloud(file)
 
 
 def test_without_pypcd4_the_message_names_it(tmp_path, monkeypatch):

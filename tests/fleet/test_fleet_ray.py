@@ -6,15 +6,14 @@ import os
 import signal
 import sys
 from pathlib import Path
-from typing import Any, Callable, Iterator
+from typing import Any
 
 import pytest
 from small_fleet import PAIRS, TWO, make_job, run, tree
 
 from cflow_torch import CFlowError
-from cflow_torch.data.av2 import AV2Log
 from cflow_torch.fleet import ray_engine
-from cflow_torch.fleet.job import Job, Unit
+from cflow_torch.fleet.job import Unit
 from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.ray_engine import run_ray
 
@@ -31,62 +30,37 @@ def test_equals_the_local_engine_byte_for_byte(fleet: Path, single: dict[str, by
     assert signal.getsignal(signal.SIGTERM) is before
 
 
-class LethalActor:
-    """A worker that is killed when it reads a frame with a file next to the output. The file contains how often."""
-
-    def __init__(self, folder: str, job: Job, *more: Any) -> None:
-        self._folder = Path(job.output).parent / "kills"
-        self._actor = ray_engine._Actor(folder, job, *more)  # the real one, because this runs in the worker process
-
-    def start(self) -> None:
-        self._actor.start()
-        read = self._actor._process._read_one
-
-        def lethal_read(log: Any, index: int) -> Any:
-            file = self._folder / f"{log.log_id}.{log.timestamps[index]}"
-            count = int(file.read_text()) if file.exists() else 0
-            if count > 0:
-                file.write_text(str(count - 1))
-                os.kill(os.getpid(), signal.SIGKILL)
-            return read(log, index)
-
-        self._actor._process._read_one = lethal_read  # type: ignore[method-assign]
+class LethalActor(ray_engine._Actor):
+    """A worker whose process is killed at each call of a unit that still has a file next to the output."""
 
     def step(self, unit: Unit, stop: bool) -> Any:
-        return self._actor.step(unit, stop)
-
-
-@pytest.fixture
-def kills(fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[int, int], Path]]:
-    """Function (index of a frame, count) that makes a frame of the longest log deadly; returns its file."""
-    from ray import cloudpickle
-
-    monkeypatch.setattr(ray_engine, "_Actor", LethalActor)
-    (tmp_path / "kills").mkdir()
-    this = sys.modules[__name__]
-    cloudpickle.register_pickle_by_value(this)  # Ray's processes cannot import a test
-
-    def mark(index: int, count: int) -> Path:
-        log = AV2Log(sorted(fleet.iterdir())[1])
-        file = tmp_path / "kills" / f"{log.log_id}.{log.timestamps[index]}"
-        file.write_text(str(count))
-        return file
-
-    yield mark
-    cloudpickle.unregister_pickle_by_value(this)
+        file = Path(self._job.output).parent / f"kills-{unit.number}"
+        count = int(file.read_text()) if file.exists() else 0
+        if count > 0:
+            file.write_text(str(count - 1))
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().step(unit, stop)
 
 
 @pytest.mark.slow
-def test_a_killed_worker_is_replaced_and_a_frame_that_always_kills_is_reported(
-    fleet: Path, single: dict[str, bytes], tmp_path: Path, kills: Any
+def test_a_killed_worker_is_replaced_and_a_unit_that_always_kills_is_reported(
+    fleet: Path, single: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    once, always = kills(1, 1), kills(3, 1000)
-    report = run(fleet, tmp_path / "out", TWO, engine="ray", retries=1)
-    assert once.read_text() == "0" and 1000 - int(always.read_text()) in (3, 4)
-    ((name, message),) = report["failures"]
-    assert name == always.name.replace(".", "/") and "2 workers died on it" in message
-    assert report["frames"]["computed"] == PAIRS - 1
-    assert tree(tmp_path / "out") == {file: c for file, c in single.items() if file != f"{name}.feather"}
+    from ray import cloudpickle
+
+    monkeypatch.setattr(ray_engine, "_Actor", LethalActor)
+    this = sys.modules[__name__]
+    cloudpickle.register_pickle_by_value(this)  # Ray's processes cannot import a test
+    (tmp_path / "kills-0").write_text("1")
+    (tmp_path / "kills-2").write_text("1000")
+    try:
+        report = run(fleet, tmp_path / "out", TWO, engine="ray", retries=1)
+    finally:
+        cloudpickle.unregister_pickle_by_value(this)
+    assert (tmp_path / "kills-0").read_text() == "0" and (tmp_path / "kills-2").read_text() == "998"
+    ((_, message),) = report["failures"]
+    assert "2 workers died on it" in message and 0 < report["frames"]["computed"] < PAIRS
+    assert tree(tmp_path / "out").items() <= single.items()
 
 
 def start(layout: Layout, **settings: Any) -> None:

@@ -20,10 +20,10 @@ from cflow_torch.data.log import LogWrapper
 from cflow_torch.fleet import dispatch as dispatching
 from cflow_torch.fleet.dispatch import WorkerDied, dispatch
 from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Shard, Unit
-from cflow_torch.fleet.local import run_local
 from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.processes import ChildProcess
 from cflow_torch.fleet.report import Counters, format_missing, format_report
+from cflow_torch.fleet.run import run_local
 from cflow_torch.fleet.work import Worker, WorkerProcess
 from cflow_torch.simulator import make_drive
 

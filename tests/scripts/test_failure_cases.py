@@ -52,7 +52,7 @@ def test_later_sweeps_fix_an_appearing_car(failures: Any) -> None:
 
 
 def test_a_wrong_frame_is_found_by_the_static_check(failures: Any) -> None:
-    from cflow_torch.data.static_check import check_static_world
+    from cflow_torch.data.log_check import check_static_world
     from cflow_torch.types import CFlowWarning
 
     good = failures.drives.turn(0).drive

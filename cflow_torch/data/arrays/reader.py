@@ -176,7 +176,7 @@ class ArraysLog(Log):
 
 def natural_key(name: str) -> tuple[Any, ...]:
     """Sort key that compares the digits of a name as numbers: 2 before 10."""
-    return tuple((0, int(part), part) if part.isdecimal() else (1, 0, part) for part in re.findall(r"\d+|\D+", name))
+    return tuple((0, int(run), run) if run.isdecimal() else (1, 0, run) for run in re.findall(r"\d+|\D+", name))
 
 
 def _clouds(folder: Path) -> tuple[Path, dict[str, list[Path]]]:

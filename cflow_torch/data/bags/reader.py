@@ -10,8 +10,7 @@ import numpy as np
 
 from cflow_torch.data.arrays.poses_text import Trajectory
 from cflow_torch.data.arrays.poses_text import poses_at as covered_poses
-from cflow_torch.data.bags.frames import Frames, Sample, sample, sorted_poses
-from cflow_torch.data.bags.point_cloud2 import other_columns, points_and_times
+from cflow_torch.data.bags.messages import Frames, Sample, other_columns, points_and_times, sample, sorted_poses
 from cflow_torch.data.files import file_errors, find_folders, shortened
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import PathLike, as_path, check_file, is_remote
@@ -69,7 +68,7 @@ class BagLog(Log):
     Convention: points are float32 in the ego frame. Poses are float64 `T_world_ego`, interpolated at the time of the
         cloud; the world is the root of the transforms, or that of the topic. A topic's poses are those of its
         `child_frame_id`, if transforms connect it to the ego frame, else of the ego frame itself. `is_ground` is None.
-        Times of points: see `point_cloud2.seconds_after`.
+        Times of points: see `messages.seconds_after`.
 
     Cost: opening a bag reads all its clouds, poses and transforms once.
 

@@ -10,8 +10,7 @@ import numpy as np
 
 from cflow_torch.data.atomic import atomic_file, atomic_name
 from cflow_torch.data.boxes import points_in_box
-from cflow_torch.data.hdf5.reader import EXTRINSIC, HDF5Log, find_hdf5_scenes
-from cflow_torch.data.hdf5.stored import import_h5py
+from cflow_torch.data.hdf5.reader import EXTRINSIC, HDF5Log, find_hdf5_scenes, import_h5py
 from cflow_torch.data.log import Log
 from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.types import CFlowError

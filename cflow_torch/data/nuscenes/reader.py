@@ -145,8 +145,8 @@ class NuScenesLog(Log):
         slices, group = np.unique(lag // _TIME_SLICE, return_inverse=True)
         for position, middle in enumerate(slices * _TIME_SLICE + (_TIME_SLICE // 2 if lag.any() else 0)):
             rows = np.flatnonzero(group == position)
-            part = self._labels_of(points[rows], index, int(middle))
-            flow[rows], category[rows], is_valid[rows] = part.flow, part.category, part.is_valid
+            found = self._labels_of(points[rows], index, int(middle))
+            flow[rows], category[rows], is_valid[rows] = found.flow, found.category, found.is_valid
         return FlowLabels(flow, category, is_valid)
 
     def _labels_of(self, points: np.ndarray, index: int, lag: int) -> FlowLabels:
@@ -174,12 +174,12 @@ class NuScenesLog(Log):
         The latter are 0 if the format does not store them.
         """
         time = self._timestamp(index)
-        parts = []
+        clouds = []
         for chain in self._lidars.values():
             row = int(np.abs(chain.times - time).argmin())
             if abs(int(chain.times[row]) - time) <= MAX_UNIT_LAG:
-                parts.append(self._unit_points(chain, row, index))
-        return np.concatenate([points for points, _ in parts]), np.concatenate([lag for _, lag in parts])
+                clouds.append(self._unit_points(chain, row, index))
+        return np.concatenate([points for points, _ in clouds]), np.concatenate([lag for _, lag in clouds])
 
     def _unit_points(self, chain: LidarChain, row: int, index: int) -> tuple[np.ndarray, np.ndarray]:
         """Read one sweep of one LiDAR, see `_cloud`."""

@@ -55,7 +55,8 @@ def read_batch(batch: Mapping[str, Any], num_history: int, ego_T_lidar: Any = No
     """
     history = [f"h{i}" for i in range(1, num_history + 1)]
     present = [name for name in history if f"pc{name}" in batch]
-    return [_sample(batch, b, present, ego_T_lidar) for b in range(len(_value(batch, "pose0")))]
+    _entry(batch, "pose0", 0)
+    return [_sample(batch, b, present, ego_T_lidar) for b in range(len(batch["pose0"]))]
 
 
 def _sample(batch: Mapping[str, Any], b: int, history: list[str], ego_T_lidar: Any) -> Sample:
@@ -136,19 +137,14 @@ def _extrinsics(batch: Mapping[str, Any], b: int, ego_T_lidar: Any) -> np.ndarra
     return None if np.array_equal(found, np.eye(4)) else found
 
 
-def _value(batch: Mapping[str, Any], key: str) -> Any:
-    if key not in batch:
-        raise CFlowError(f"the batch has no '{key}', which the method needs; it has {', '.join(map(str, batch))}")
-    return batch[key]
-
-
 def _entry(batch: Mapping[str, Any], key: str, b: int) -> Any:
     """Sample b of a key, whose value is a tensor with a batch dimension or a list."""
-    value = _value(batch, key)
+    if key not in batch:
+        raise CFlowError(f"the batch has no '{key}', which the method needs; it has {', '.join(map(str, batch))}")
     try:
-        return value[b]
+        return batch[key][b]
     except (IndexError, TypeError, KeyError):
-        raise CFlowError(f"batch['{key}'] is {_described(value)}: give one entry per sample") from None
+        raise CFlowError(f"batch['{key}'] is {_described(batch[key])}: give one entry per sample") from None
 
 
 def _described(value: Any) -> str:
