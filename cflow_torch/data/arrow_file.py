@@ -7,19 +7,9 @@ from typing import Any, Sequence
 import numpy as np
 import pyarrow as pa
 
-from cflow_torch.data.files import file_errors, shortened
+from cflow_torch.data.files import check_columns, file_errors
 from cflow_torch.data.paths import read_bytes
 from cflow_torch.types import CFlowError
-
-
-def check_columns(file: Any, names: Sequence[str], columns: Sequence[str], hint: str = "copy it again") -> None:
-    """Raise a `CFlowError` if a needed column is missing or occurs several times; `hint` ends the message."""
-    missing = [name for name in columns if name not in names]
-    if missing:
-        raise CFlowError(f"{file} lacks the columns {missing}; it has {shortened(names)}; {hint}")
-    repeated = [name for name in columns if names.count(name) > 1]
-    if repeated:
-        raise CFlowError(f"{file} has several columns {repeated}; keep one of each")
 
 
 class FeatherFile:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Callable, Iterator
+from typing import Any, Callable, Iterator, Sequence
 
 import numpy as np
 
@@ -48,6 +48,16 @@ def shortened(text: Any) -> str:
     """The text on one line of at most 400 characters."""
     line = " ".join(str(text).split())
     return line if len(line) <= _MAX_TEXT else line[:_MAX_TEXT] + " ..."
+
+
+def check_columns(file: Any, names: Sequence[str], columns: Sequence[str], hint: str = "copy it again") -> None:
+    """Raise a `CFlowError` if a needed column is missing or occurs several times; `hint` ends the message."""
+    missing = [name for name in columns if name not in names]
+    if missing:
+        raise CFlowError(f"{file} lacks the columns {missing}; it has {shortened(names)}; {hint}")
+    repeated = [name for name in columns if names.count(name) > 1]
+    if repeated:
+        raise CFlowError(f"{file} has several columns {repeated}; keep one of each")
 
 
 def read_npy(path: Path, hint: str) -> np.ndarray:

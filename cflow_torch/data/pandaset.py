@@ -11,7 +11,7 @@ import numpy as np
 
 from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes, make_boxes, upright_poses
 from cflow_torch.data.categories import CATEGORY_INDEX
-from cflow_torch.data.files import file_errors
+from cflow_torch.data.files import check_columns, file_errors
 from cflow_torch.data.json_file import read_json
 from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.data.paths import PathLike, as_path, read_bytes, remote_errors
@@ -170,7 +170,5 @@ def _columns(file: Path, names: Sequence[str] | None = None) -> dict[str, np.nda
     with file_errors(file):
         columns = load_columns(io.BytesIO(gzip.decompress(read_bytes(file))))
         names = list(columns) if names is None else names
-        missing = [name for name in names if name not in columns]
-        if missing:
-            raise CFlowError(f"it lacks the columns {missing}; it has {list(columns)}")
+        check_columns(file, list(columns), names)
         return {name: columns[name] for name in names}

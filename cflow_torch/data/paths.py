@@ -9,6 +9,7 @@ from __future__ import annotations
 import mmap
 import re
 import shutil
+import stat
 import tempfile
 from contextlib import contextmanager
 from functools import lru_cache
@@ -99,7 +100,8 @@ def read_bytes(path: Path) -> bytes:
     """Read a file, in one request if it is remote.
 
     Raises:
-        OSError: as for a local file, and if the remote file system cannot be reached.
+        OSError: as for a local file, and if the remote file system cannot be reached. Devices and pipes, which an
+            unpacked archive can contain, are refused.
     """
     if not is_remote(path):
         check_file(path)
@@ -149,8 +151,11 @@ def _open(path: Any, **settings: Any) -> Any:
 
 
 def check_file(path: Path) -> str:
-    """Return the name of a local file or folder, which must not be a git-lfs pointer."""
-    if not path.is_dir():
+    """Return the name of a local file, which must be a regular file or a folder, and not a git-lfs pointer."""
+    mode = path.stat().st_mode
+    if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
+        raise OSError(f"{path} is a device or a pipe, not a file")  # reading it might never end
+    if stat.S_ISREG(mode):
         with open(path, "rb") as file:
             if file.read(len(_POINTER)) == _POINTER:
                 raise CFlowError(f"{path} is a git-lfs pointer, not the data: run git lfs pull there, or download it")

@@ -8,11 +8,10 @@ from typing import ClassVar, Mapping, Sequence
 import numpy as np
 
 from cflow_torch.data.arrays.pcd import pcd_fields
-from cflow_torch.data.files import file_errors
+from cflow_torch.data.files import check_columns, file_errors
 from cflow_torch.data.nuscenes.reader import NUSCENES_CATEGORIES, OWN_TRAILER, Footprint, NuScenesLog
 from cflow_torch.data.nuscenes.tables import SceneSource, find_scenes
 from cflow_torch.data.paths import PathLike
-from cflow_torch.types import CFlowError
 
 TRUCKSCENES_CATEGORIES: dict[str, str] = {
     **NUSCENES_CATEGORIES,
@@ -75,8 +74,6 @@ class TruckScenesLog(NuScenesLog):
         with file_errors(file, "copy it again"):
             fields = pcd_fields(content)
         needed = ("x", "y", "z", "timestamp") if self._deskew else ("x", "y", "z")
-        missing = [name for name in needed if name not in fields or fields[name].ndim != 1]
-        if missing:
-            raise CFlowError(f"{file} lacks the fields {missing}; it has {list(fields)}. Is it a sweep of TruckScenes?")
+        check_columns(file, list(fields), needed, "is it a sweep of TruckScenes?")
         points = np.stack([fields[axis].astype(np.float32) for axis in "xyz"], axis=1)
         return points, fields["timestamp"].astype(np.int64) if self._deskew else None

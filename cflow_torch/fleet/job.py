@@ -155,7 +155,7 @@ class Shard:
 
 
 def find_shard(index: Any, count: Any, environ: Mapping[str, str]) -> Shard:
-    """The shard of this process.
+    """Return the shard of this process.
 
     Args:
         index: from 0, or "auto".
@@ -179,7 +179,7 @@ def find_shard(index: Any, count: Any, environ: Mapping[str, str]) -> Shard:
 
 
 def _from_environment(environ: Mapping[str, str]) -> Shard | None:
-    """The shard that torchrun or SLURM gives this process; None if neither does.
+    """Return the shard that torchrun or SLURM gives this process; None if neither does.
 
     A SLURM batch script is not a task of a step: only `srun` sets SLURM_STEP_NUM_TASKS. Without `srun`, a script with
     `--ntasks=8` must not compute one eighth.

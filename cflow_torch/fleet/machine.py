@@ -36,7 +36,7 @@ class Layout:
 
 
 def frames_per_worker(config: Config) -> int:
-    """The least number of frames for which another worker on a CPU saves time.
+    """Return the least number of frames for which another worker on a CPU saves time.
 
     A process takes as long to start as about 10 windows of the verified method, or 30 to 100 windows of the others.
     """
@@ -72,7 +72,7 @@ def choose_layout(device: str, workers: Any, batch: Any, environ: Mapping[str, s
 
 
 def _gpus(device: str, environ: Mapping[str, str]) -> list[str]:
-    """GPUs of this process; empty on a CPU."""
+    """Return the GPUs of this process; none on a CPU."""
     name = str(device)
     if name == "cpu" or (name == AUTO and not torch.cuda.is_available()):
         return []
@@ -86,7 +86,7 @@ def _gpus(device: str, environ: Mapping[str, str]) -> list[str]:
 
 
 def usable_cores(environ: Mapping[str, str]) -> int:
-    """Cores of this process: limited by its affinity, its container's quota, its share of a SLURM or torchrun job."""
+    """Count the cores of this process: its affinity, its container's quota and its SLURM or torchrun job limit them."""
     counts = [os.cpu_count() or 1]
     with suppress(AttributeError):  # not on every system
         counts.append(len(os.sched_getaffinity(0)))

@@ -37,9 +37,9 @@ _REMEDY = "give output=FOLDER, or overwrite=true"
 def make_identity(
     config: Config, reader: str, settings: Mapping[str, Any], contents: Sequence[str] = CONTENTS
 ) -> dict[str, Any]:
-    """What determines a result besides the sweeps: method without `max_memory`, data settings, contents, versions.
+    """Return what determines a result besides the sweeps: method, data settings, contents of files, versions.
 
-    CPU and CUDA builds of one torch version count as the same.
+    `max_memory` does not change results, so it is left out. CPU and CUDA builds of one torch version count as the same.
     """
     versions = {
         "cflow_torch": __version__,
@@ -81,7 +81,7 @@ def claim_folder(output: Path, identity: Mapping[str, Any], resume: bool, overwr
 
 
 def find_conflict(output: Path, identity: Mapping[str, Any], resume: bool) -> str | None:
-    """Why results of this identity must not be added to a folder, as a phrase in a message; None if they may."""
+    """Return why results of this identity must not be added to a folder, as a phrase; None if they may be added."""
     before = _read(output / MANIFEST)
     if before is None:
         return None
@@ -115,7 +115,7 @@ def claim_log(folder: Path, log: Log, run: str) -> None:
 
 
 def _describe_log(log: Log, run: str) -> dict[str, Any]:
-    """The manifest of a log. A sweep that cannot be read has no digest, and its frames will fail."""
+    """Return the manifest of a log. A sweep that cannot be read has no digest, and its frames will fail."""
     stamps = [int(stamp) for stamp in log.timestamps]
     digests = {}
     for index in sorted({0, len(stamps) // 2, len(stamps) - 1} & set(range(len(stamps)))):
@@ -125,7 +125,7 @@ def _describe_log(log: Log, run: str) -> dict[str, Any]:
 
 
 def complete_frames(folder: Path) -> set[int]:
-    """Time stamps whose flow is in a log's folder.
+    """Return the time stamps whose flow is in a log's folder.
 
     Files without the log's manifest do not count, because their input is unknown.
     """
@@ -138,12 +138,12 @@ def complete_frames(folder: Path) -> set[int]:
 
 
 def frame_file(folder: Path, timestamp: int) -> Path:
-    """The path of a frame's flow."""
+    """Return the path of a frame's flow."""
     return folder / f"{timestamp}.feather"
 
 
 def _digest(log: Log, index: int) -> str:
-    """Hash of the parts of a sweep that the method uses."""
+    """Hash what the method uses of a sweep."""
     sweep, digest = log.sweep(index), hashlib.sha256()
     for values in (sweep.points, sweep.is_ground, sweep.pose):
         digest.update(b"none" if values is None else as_numpy(values).tobytes())

@@ -47,7 +47,7 @@ def count_todo(job: Job, units: Sequence[Unit], enough: int) -> int:
 
 
 def _count(job: Job, unit: Unit) -> tuple[str, int, int]:
-    """Name of a unit's log, number of its frames, and number of those that are not complete."""
+    """Return the name of a unit's log, the number of its frames, and how many of them are not complete."""
     with open_log(job.reader, unit.source, **{**job.settings, "check": False, "odometry": False}) as log:
         stamps = {int(log.timestamps[i]) for i in unit.frames(len(log.timestamps) - 1)}
         complete = set() if job.redo else complete_frames(as_path(job.output) / log.log_id)
@@ -108,7 +108,7 @@ class Counters:
         return 1
 
     def report(self, seconds: float, layout: Layout, shard: Shard, engine: str, signal_name: str) -> dict[str, Any]:
-        """All figures of a run.
+        """Return all figures of a run.
 
         Args:
             seconds: from the start of the engine to its end.
@@ -151,7 +151,7 @@ class Counters:
 
 
 def format_report(report: dict[str, Any], verbose: bool = False) -> str:
-    """The report as a table, if `verbose` with the times of the stages."""
+    """Return the report as a table, if `verbose` with the times of the stages."""
     frames, shard, devices = report["frames"], report["shard"], report["devices"]
     workers = f"workers: {len(devices)} on {', '.join(sorted(set(devices)))}"
     rows = [
@@ -179,7 +179,7 @@ def format_report(report: dict[str, Any], verbose: bool = False) -> str:
 
 
 def format_missing(report: dict[str, Any]) -> str:
-    """What is missing, a line each; "" if nothing is."""
+    """List what is missing, a line each; "" if nothing is."""
     failures = [f"  {name}: {message}" for name, message in report["failures"]]
     lines = [*dict.fromkeys(failures), *(f"  {name}: not done" for name in report["waiting"])]  # parts of a log repeat
     if len(lines) > _SHOWN:

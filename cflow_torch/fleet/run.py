@@ -138,7 +138,7 @@ def run_fleet(
 
 
 def report_file(output: str, shard: Shard) -> Any:
-    """The path of a shard's report."""
+    """Return the path of a shard's report."""
     return as_path(output) / "reports" / f"shard-{shard.index}-of-{shard.count}.json"
 
 

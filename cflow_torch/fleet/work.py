@@ -264,11 +264,11 @@ def _stage(frame: _Frame, name: str) -> Iterator[None]:
 
 
 def describe(error: BaseException) -> str:
-    """An error in one line. The kind is named if it is neither the package's own nor the system's."""
+    """Describe an error in one line; its class is named unless it is a `CFlowError` or an OSError."""
     text = " ".join(str(error).split()) or "no message"
     return text if isinstance(error, (CFlowError, OSError)) else f"{type(error).__name__}: {text}"
 
 
 def source_name(source: Any) -> str:
-    """The name of a log that is not open."""
+    """Return the name of a log that is not open."""
     return str(getattr(source, "scene", None) or getattr(source, "stem", None) or source)

@@ -130,7 +130,7 @@ def _read_frame(name: str, frame: Any, data: Any) -> _LogFrame:
 
 
 def _earlier(known: Sequence[_LogFrame], first: _LogFrame, num_history: int) -> list[_LogFrame]:
-    """Known frames before `first`, at most `num_history`, with poses in the global frame of `first`."""
+    """Return the known frames before `first`, at most `num_history`, with poses in the global frame of `first`."""
     same = [frame for frame in known if (frame.log_id, frame.log_idx) == (first.log_id, first.log_idx)]
     if not same:  # another log, or items that do not overlap, whose global frames are unrelated
         return []

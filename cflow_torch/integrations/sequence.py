@@ -8,6 +8,7 @@ from __future__ import annotations
 import importlib
 import warnings
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any, Sequence
 
 import numpy as np
@@ -15,6 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from cflow_torch.config import make_config
+from cflow_torch.data.log import window
 from cflow_torch.estimate import make_model
 from cflow_torch.types import Array, CFlowError, Sweep, Window
 from cflow_torch.windows.ego_motion import compensate
@@ -104,15 +106,9 @@ class SequenceFlow(nn.Module):
     def _windows(self, frames: Sequence[Frame], first: int) -> list[Window]:
         oldest = max(first - self.num_history, 0)
         sweeps = self._sweeps(frames[oldest:])
-        return [
-            Window(
-                sweeps[i],
-                sweeps[i + 1],
-                tuple(sweeps[max(i - self.num_history, 0) : i][::-1]),
-                tuple(sweeps[i + 2 : i + 2 + self.model.config.num_future]),
-            )
-            for i in range(first - oldest, len(sweeps) - 1)
-        ]
+        log: Any = SimpleNamespace(timestamps=sweeps, sweep=sweeps.__getitem__)
+        indices = range(first - oldest, len(sweeps) - 1)
+        return [window(log, i, self.num_history, self.model.config.num_future) for i in indices]
 
     def _sweeps(self, frames: Sequence[Frame]) -> list[Sweep]:
         points = [frame.ego_points() for frame in frames]
@@ -165,6 +161,6 @@ def import_from(module: str, name: str, how: str) -> Any:
 
 
 def times_in_ns(stamps: Sequence[Any]) -> tuple[int | None, ...]:
-    """Time stamps of sweeps; None for each if they are not nanoseconds, because some data sets number their sweeps."""
+    """Return the time stamps of sweeps; None for each if they are not nanoseconds (some data sets number sweeps)."""
     shortest = min((int(b) - int(a) for a, b in zip(stamps, stamps[1:])), default=0)
     return tuple(int(stamp) if shortest >= 1_000_000 else None for stamp in stamps)

@@ -139,6 +139,12 @@ def test_urls_are_remote_paths(tmp_path, monkeypatch):
         as_path("s3://bucket/val")
 
 
+def test_pipes_are_refused(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(OSError, match="device or a pipe"):
+        paths.read_bytes(tmp_path / "pipe")
+
+
 @pytest.mark.parametrize("name", REMOTE)
 def test_every_data_set_is_read_from_remote_as_from_local(written, far, name):
     (expected,) = find_sources(name, written(name))

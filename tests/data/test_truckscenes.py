@@ -140,7 +140,7 @@ def test_a_bad_sweep_costs_no_other(recording, tiny):
     file = next((tiny / "samples" / "LIDAR_LEFT").glob(f"*_{log.timestamps[0]}.pcd"))
     fields = pcd_fields(file.read_bytes())
     for change, complaint in [
-        ({"timestamp": None}, r"lacks the fields \['timestamp'\]"),
+        ({"timestamp": None}, r"lacks the columns \['timestamp'\]"),
         ({"timestamp": fields["timestamp"] - fields["timestamp"].min()}, "microseconds since 1970.* deskew=False"),
         ({"timestamp": fields["timestamp"] * np.uint64(1000)}, "microseconds since 1970.* deskew=False"),
     ]:

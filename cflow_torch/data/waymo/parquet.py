@@ -8,8 +8,7 @@ from typing import Any, Collection, Sequence, Tuple
 import numpy as np
 import pyarrow.parquet as pq
 
-from cflow_torch.data.arrow_file import check_columns
-from cflow_torch.data.files import file_errors
+from cflow_torch.data.files import check_columns, file_errors
 from cflow_torch.data.paths import source_for_mmap, source_for_random_access
 from cflow_torch.types import CFlowError
 from cflow_torch.windows.ego_motion import rigid_transform
