@@ -14,32 +14,21 @@ from cflow_torch.data.paths import PathLike, read_bytes
 _SHOWN = 5  # differences that a message lists
 
 
-def read_json(file: Path) -> Any:
+def read_json(file: Path, use: Callable[[dict[str, Any]], Any] | None = None) -> Any:
     """Read a JSON file.
 
-    Convention: UTF-8, with or without a byte order mark. NaN and Infinity are accepted, as Python writes them; check
-        the numbers where they must be finite (1e999 is infinite, too).
-
-    Raises:
-        CFlowError: the file is not UTF-8 or not JSON.
-        OSError: as `read_bytes`.
-    """
-    return parse_json(read_bytes(file), file)
-
-
-def parse_json(data: bytes, file: Any, use: Callable[[dict[str, Any]], Any] | None = None) -> Any:
-    """Parse the bytes of a JSON document.
-
     Args:
-        data: the document.
-        file: where it comes from, for the message.
+        file: UTF-8, with or without a byte order mark. NaN and Infinity are accepted, as Python writes them; check the
+            numbers where they must be finite (1e999 is infinite, too).
         use: called with each object, inner ones first; its result replaces the object.
 
     Raises:
-        CFlowError: the document is not UTF-8 or not JSON, or `use` raises.
+        CFlowError: the file is not UTF-8 or not JSON, or `use` raises.
+        OSError: as `read_bytes`.
     """
+    content = read_bytes(file)
     with file_errors(f"{file} as JSON"):
-        return json.loads(data.decode("utf-8-sig"), object_hook=use)
+        return json.loads(content.decode("utf-8-sig"), object_hook=use)
 
 
 def write_json(path: PathLike, value: Any) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 from pathlib import Path
 from typing import Any, Callable
 
@@ -22,6 +23,7 @@ LIMIT = 12e9  # bytes, of a worker's address space
 CAUSES: dict[str, Callable[[], Any]] = {
     "SIGKILL": lambda: os.kill(os.getpid(), signal.SIGKILL),
     "SIGSEGV": lambda: os.kill(os.getpid(), signal.SIGSEGV),
+    "SystemExit": lambda: sys.exit("out"),
     "hang": lambda: os.kill(os.getpid(), signal.SIGSTOP),
     "memory": lambda: np.ones(int(LIMIT), np.uint8),
 }
@@ -45,22 +47,24 @@ def make_deadly_worker(*arguments: Any) -> Any:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("once, always", [(("SIGKILL", "hang"), "SIGSEGV"), (("SystemExit",), "memory")])
 def test_dying_workers_lose_only_the_frame_that_always_kills(
-    fleet: Path, single: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    once: tuple[str, ...],
+    always: str,
+    fleet: Path,
+    single: dict[str, bytes],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv(DEADLY, str(tmp_path))
     monkeypatch.setattr(running, "_make_worker", make_deadly_worker)
     logs = [AV2Log(folder) for folder in sorted(fleet.iterdir())]
-    frames = [
-        f"{log.log_id}.{log.timestamps[k]}" for log, k in ((logs[0], 2), (logs[1], 2), (logs[2], 1), (logs[1], 4))
-    ]
-    for frame, cause in zip(frames, ("SIGKILL:1", "hang:1", "SIGSEGV:99", "memory:99")):
-        (tmp_path / frame).write_text(cause)
+    for log, cause in zip(logs, once):
+        (tmp_path / f"{log.log_id}.{log.timestamps[2]}").write_text(f"{cause}:1")
+    (tmp_path / f"{logs[2].log_id}.{logs[2].timestamps[1]}").write_text(f"{always}:99")
     report = run(fleet, tmp_path / "out", TWO, timeout=20, memory=LIMIT)
-    failures = dict(report["failures"])
-    always, hungry = (frame.replace(".", "/") for frame in frames[2:])
-    assert failures.keys() == {always, hungry}
-    assert "2 workers died on it" in failures[always] and "MemoryError" in failures[hungry]
-    assert (report["frames"]["computed"], report["exit_status"]) == (PAIRS - 2, 1)
-    lost = {f"{always}.feather", f"{hungry}.feather"}
-    assert tree(tmp_path / "out") == {file: content for file, content in single.items() if file not in lost}
+    ((name, message),) = report["failures"]
+    assert name == f"{logs[2].log_id}/{logs[2].timestamps[1]}"
+    assert ("MemoryError" if always == "memory" else "2 workers died on it") in message
+    assert (report["frames"]["computed"], report["exit_status"]) == (PAIRS - 1, 1)
+    assert tree(tmp_path / "out") == {file: c for file, c in single.items() if file != f"{name}.feather"}

@@ -50,7 +50,7 @@ def read_cloud(path: PathLike, bin_columns: int = KITTI_COLUMNS) -> np.ndarray:
     with file_errors(path, _hint(path)):
         points = np.stack(_positions(_read(path, bin_columns)), axis=1)
         if points.ndim != 2 or points.dtype.kind != "f":
-            raise CFlowError(f"x, y, z must be floating-point metres, (N,) each, got {points.dtype}")
+            raise CFlowError(f"x, y, z must be (N,) floating-point metres each, got {points.dtype}, {points.shape}")
     return points.astype(np.float32 if points.dtype.itemsize < 8 else np.float64, copy=False)
 
 
@@ -207,7 +207,7 @@ def _table_columns(read: Any, content: bytes) -> dict[str, np.ndarray]:
     table.validate(full=True)
     if not set(_AXES) <= set(table.column_names):
         table = table.rename_columns([*_AXES, *table.column_names[3:]][: table.num_columns])
-    if any(table.column(axis).null_count for axis in _AXES):
+    if any(table.column(axis).null_count for axis in _AXES if axis in table.column_names):
         raise CFlowError("x, y, z must not have empty entries")
     kinds = (pa.types.is_floating, pa.types.is_integer, pa.types.is_boolean)
     return {

@@ -104,7 +104,7 @@ def write_hdf5_labels(
     """
     if not overwrite and labelled_by(file) is not None:
         raise CFlowError(f"{file} already has labels: overwrite=true replaces them, or label a copy")
-    return _write(file, labels, _store_label, {LABELLED: made_by})
+    return _write(file, labels, _store_label, **{LABELLED: made_by})
 
 
 def labelled_by(file: str | Path) -> str | None:
@@ -119,7 +119,7 @@ def labelled_by(file: str | Path) -> str | None:
         return None if made_by is None else str(made_by)
 
 
-def _write(file: str | Path, sweeps: Iterable[Any], store: Callable[..., None], attributes: Any = {}) -> int:  # noqa: B006
+def _write(file: str | Path, sweeps: Iterable[Any], store: Callable[..., None], **attributes: str) -> int:
     """Store the arrays of sweeps in a copy of a scene, which then replaces it; return the number of sweeps."""
     check_writable(file)
     file = Path(file).resolve()  # a link stays a link
@@ -131,7 +131,7 @@ def _write(file: str | Path, sweeps: Iterable[Any], store: Callable[..., None], 
         with _writing(file), import_h5py().File(copy, "r+") as scene:
             for timestamp, arrays in sweeps:
                 sweep = member(scene, str(timestamp), file)
-                points = None if sweep is None else member(sweep, "lidar", file)
+                points = None if sweep is None else member(sweep, "lidar", f"{file}: sweep {timestamp}")
                 if points is None:
                     raise CFlowError(f"{file} has no sweep {timestamp}")
                 for key, values in arrays.items():

@@ -11,9 +11,9 @@ from typing import Any, Collection, Dict, Sequence
 import numpy as np
 
 from cflow_torch.data.files import file_errors, find_folders
-from cflow_torch.data.json_file import parse_json
+from cflow_torch.data.json_file import read_json
 from cflow_torch.data.names import safe_name
-from cflow_torch.data.paths import PathLike, as_path, read_bytes
+from cflow_torch.data.paths import PathLike, as_path
 from cflow_torch.data.rigid_motion import poses_from_quaternions
 from cflow_torch.types import CFlowError
 
@@ -139,7 +139,7 @@ def read_table(folder: Path, table: str, key: str = "", values: Collection[str] 
         return chosen if not key or row[key] in values else None
 
     with file_errors(file, "copy all tables of the version"):
-        rows = parse_json(read_bytes(file), file, use)
+        rows = read_json(file, use)
         if not isinstance(rows, list) or not all(row is None or type(row) is dict for row in rows):
             raise ValueError("it is not a list of rows")
         return [row for row in rows if row is not None]

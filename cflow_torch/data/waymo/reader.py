@@ -159,14 +159,13 @@ class WaymoLog(Log):
             raise CFlowError(f"{component.file} has lasers {sorted(rows)}; lasers {missing} are missing, copy it again")
         calibration = {}
         for laser in self._lasers:
-            where = f"{component.file}: extrinsic of laser {laser}"
-            mount = matrix_of(rows[laser][f"{CALIBRATION}extrinsic.transform"], where)
-            with file_errors(f"{component.file}: beam inclinations of laser {laser}"):
-                values, low, high = (rows[laser][name] for name in names)
-                if values:
-                    calibration[laser] = LaserCalibration(mount, np.array(values, dtype=np.float64))
-                else:
-                    calibration[laser] = LaserCalibration(mount, None, float(low), float(high))
+            row, where = rows[laser], f"{component.file}: laser {laser}"
+            with file_errors(where):
+                mount = matrix_of(row[f"{CALIBRATION}extrinsic.transform"], f"{where}: extrinsic")
+                values, low, high = (row[name] for name in names)
+                table = np.array(values, dtype=np.float64) if values else None
+                ends = (0.0, 0.0) if values else (float(low), float(high))
+                calibration[laser] = LaserCalibration(mount, table, *ends)
         return calibration
 
     def _read_poses(self, times: Sequence[int]) -> dict[int, np.ndarray]:
