@@ -26,10 +26,10 @@ class DataSet(NamedTuple):
     """One format.
 
     Args:
-        log: module and class of its reader, source -> `Log`. The module is imported when it is needed.
+        log: class of its reader, source -> `Log`.
         what: what one log is.
         marks: ends of paths by which we recognise the format.
-        find: function of that module, root -> sources; "" = the folders that hold the first mark, at most `depth`
+        find: function of its module, root -> sources; "" = the folders that hold the first mark, at most `depth`
             levels below the root, or the root itself if there is no mark.
     """
 
@@ -41,18 +41,19 @@ class DataSet(NamedTuple):
 
 
 _NUSCENES = ("v1.*/scene.json",)
+# The key is also the module of the reader, which is imported when it is needed.
 DATA_SETS: dict[str, DataSet] = {
     # <root>/<data set>/sensor/<split>/<log> is the deepest layout in use.
-    "av2": DataSet("av2.AV2Log", "Argoverse 2 log", ("sensors/lidar",), depth=4),
-    "hdf5": DataSet("hdf5.HDF5Log", "scene", ("*.h5",), "find_hdf5_scenes"),
-    "nuscenes": DataSet("nuscenes.NuScenesLog", "nuScenes scene", _NUSCENES, "find_nuscenes_scenes"),
-    "truckscenes": DataSet("truckscenes.TruckScenesLog", "TruckScenes scene", _NUSCENES, "find_truckscenes_scenes"),
-    "waymo": DataSet("waymo.WaymoLog", "Waymo segment", ("lidar/*.parquet",), "find_waymo_segments"),
-    "pandaset": DataSet("pandaset.PandaSetLog", "PandaSet sequence", ("lidar/poses.json",), depth=2),
-    "aevascenes": DataSet("aevascenes.AevaScenesLog", "AevaScenes sequence", ("sequence.json",), depth=3),
-    "bags": DataSet("bags.BagLog", "bag", ("*.bag", "*.mcap", "*.db3"), "find_bags"),
-    "kiss_icp": DataSet("kiss_icp.KissICPLog", "data for a loader of KISS-ICP"),
-    "arrays": DataSet("arrays.ArraysLog", "folder of point clouds", (), "find_array_logs"),  # all without a mark
+    "av2": DataSet("AV2Log", "Argoverse 2 log", ("sensors/lidar",), depth=4),
+    "hdf5": DataSet("HDF5Log", "scene", ("*.h5",), "find_hdf5_scenes"),
+    "nuscenes": DataSet("NuScenesLog", "nuScenes scene", _NUSCENES, "find_nuscenes_scenes"),
+    "truckscenes": DataSet("TruckScenesLog", "TruckScenes scene", _NUSCENES, "find_truckscenes_scenes"),
+    "waymo": DataSet("WaymoLog", "Waymo segment", ("lidar/*.parquet",), "find_waymo_segments"),
+    "pandaset": DataSet("PandaSetLog", "PandaSet sequence", ("lidar/poses.json",), depth=2),
+    "aevascenes": DataSet("AevaScenesLog", "AevaScenes sequence", ("sequence.json",), depth=3),
+    "bags": DataSet("BagLog", "bag", ("*.bag", "*.mcap", "*.db3"), "find_bags"),
+    "kiss_icp": DataSet("KissICPLog", "data for a loader of KISS-ICP"),
+    "arrays": DataSet("ArraysLog", "folder of point clouds", (), "find_array_logs"),  # all without a mark
 }
 _DEEPEST = 6  # levels below the root that are searched for a mark
 
@@ -244,6 +245,5 @@ def _reader(name: str) -> tuple[Any, Any]:
     """Import the module and the class of a data set's reader."""
     if name not in DATA_SETS:
         raise CFlowError(f"data set {name!r}: choose one of {', '.join(DATA_SETS)}")
-    module, _, log = DATA_SETS[name].log.partition(".")
-    imported = import_module(f"cflow_torch.data.{module}")
-    return imported, getattr(imported, log)
+    module = import_module(f"cflow_torch.data.{name}")
+    return module, getattr(module, DATA_SETS[name].log)
