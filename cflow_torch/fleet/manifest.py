@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import re
 from contextlib import suppress
 from dataclasses import asdict
@@ -25,11 +26,12 @@ from cflow_torch.data.atomic import remove_stale, write_text
 from cflow_torch.data.flow_file import CONTENTS
 from cflow_torch.data.json_file import describe_changes, json_ready, read_json
 from cflow_torch.data.log import Log
-from cflow_torch.data.paths import forget_listings, remote_errors
+from cflow_torch.data.paths import forget_listings, is_remote, remote_errors
 from cflow_torch.types import CFlowError, as_numpy
 
 MANIFEST = "manifest.json"
 _FORMAT = 1
+_ENDING = b"ARROW1"  # last bytes of a feather file
 _OURS = re.compile(r"[0-9]+\.feather|manifest\.json|tracks\.parquet|\..+\.tmp")
 _REMEDY = "give output=FOLDER, or overwrite=true"
 
@@ -127,19 +129,31 @@ def _describe_log(log: Log, run: str) -> dict[str, Any]:
 def complete_frames(folder: Path) -> set[int]:
     """Return the time stamps whose flow is in a log's folder.
 
-    Files without the log's manifest do not count, because their input is unknown.
+    Files without the log's manifest do not count, because their input is unknown. Neither do incomplete ones, for
+    example of a copy that was cut off.
+
+    Cost: reads the last bytes of every local file.
     """
     forget_listings(folder)
     with remote_errors(folder):
         names = [file.name for file in folder.iterdir()] if folder.is_dir() else []
     if MANIFEST not in names:
         return set()
-    return {int(name[: -len(".feather")]) for name in names if re.fullmatch(r"[0-9]{1,20}\.feather", name)}
+    frames = [name for name in names if re.fullmatch(r"[0-9]{1,20}\.feather", name)]
+    return {int(name[: -len(".feather")]) for name in frames if is_remote(folder) or _is_whole(folder / name)}
 
 
 def frame_file(folder: Path, timestamp: int) -> Path:
     """Return the path of a frame's flow."""
     return folder / f"{timestamp}.feather"
+
+
+def _is_whole(file: Path) -> bool:
+    """Return whether a file ends like a complete feather file."""
+    with suppress(OSError), open(file, "rb") as opened:
+        opened.seek(-len(_ENDING), os.SEEK_END)
+        return opened.read() == _ENDING
+    return False
 
 
 def _digest(log: Log, index: int) -> str:

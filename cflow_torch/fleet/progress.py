@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import warnings
+from contextlib import suppress
 from typing import Any, Iterable, Iterator, Sized
 
 from tqdm import tqdm
@@ -13,16 +14,27 @@ _BAR = "{desc}{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} frames [{elapsed}<{r
 _LINE = "{desc}{n_fmt} of {total_fmt} frames, {rate_noinv_fmt}, {remaining} left"
 
 
-class _Lines:
+class _Stderr:
+    """Standard error that may be gone, such as a closed terminal: the run goes on, and the text is lost."""
+
+    def write(self, text: str) -> None:
+        with suppress(OSError):
+            sys.stderr.write(text)
+            sys.stderr.flush()
+
+    def flush(self) -> None:
+        pass
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(sys.stderr, name)
+
+
+class _Lines(_Stderr):
     """Standard error that is not a terminal: each text of a bar is a line of its own."""
 
     def write(self, text: str) -> None:
         if text.strip():
-            sys.stderr.write(text.strip() + "\n")
-            sys.stderr.flush()
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(sys.stderr, name)
+            super().write(text.strip() + "\n")
 
 
 class Progress(tqdm):  # type: ignore[type-arg]
@@ -36,14 +48,14 @@ class Progress(tqdm):  # type: ignore[type-arg]
     def __init__(self, total: int | None = None, name: str = "") -> None:
         settings = {"total": total, "unit": " frames", "smoothing": 0.05, "desc": f"{name}: " if name else ""}
         if sys.stderr.isatty():
-            super().__init__(bar_format=_BAR, **settings)
+            super().__init__(file=_Stderr(), bar_format=_BAR, **settings)
         else:  # a short run prints nothing
             super().__init__(file=_Lines(), bar_format=_LINE, mininterval=EVERY, miniters=1, delay=EVERY, **settings)
 
 
 def log_line(text: str) -> None:
     """Print a line on stderr, above the bar."""
-    tqdm.write(text, file=sys.stderr)
+    tqdm.write(text, file=_Stderr())
 
 
 def show_warnings_as_lines() -> None:

@@ -85,15 +85,28 @@ def register(name: str = "CorrelationFlow") -> None:
 
 def _read_sequence(sequence: Any, name: str) -> tuple[list[Frame], int, Tensor]:
     """Return sweeps without padding, the first one whose flow is needed, and the (K, PadN) mask (1, 0, NaN)."""
+    for field in ("full_pc", "full_pc_mask", *_POSES):
+        if not isinstance(getattr(sequence, field, None), Tensor):
+            raise CFlowError(f"{name}.{field} is not a tensor: give a TorchFullFrameInputSequence")
     points, mask = sequence.full_pc, sequence.full_pc_mask
-    if points.ndim != 3 or len(points) < 2 or mask.shape != points.shape[:2]:
-        given = f"{tuple(points.shape)} and {tuple(mask.shape)}"
-        raise CFlowError(
-            f"{name}.full_pc and full_pc_mask have shapes {given}: give (K, PadN, 3) and (K, PadN), K of at least 2"
-        )
-    is_row, frames = ~torch.isnan(mask), []
-    for k, rows in enumerate(is_row):
-        sensor, ego = (rigid_transform(getattr(sequence, p)[k].detach().cpu(), f"{name}.{p}[{k}]") for p in _POSES)
-        frames.append(Frame(points[k][rows], mask[k][rows] > 0, sensor, ego))
+    if points.ndim != 3 or points.shape[2] != 3 or points.shape[0] < 2:
+        raise CFlowError(f"{name}.full_pc has shape {tuple(points.shape)}: give (K, PadN, 3) metres, K of at least 2")
+    if mask.shape != points.shape[:2]:
+        given, shape = tuple(mask.shape), tuple(points.shape[:2])
+        raise CFlowError(f"{name}.full_pc_mask has shape {given}: give {shape}, float with NaN in padding rows")
+    is_row = ~torch.isnan(mask)
+    poses = []
+    for side in _POSES:
+        pose = getattr(sequence, side).detach().cpu()
+        if pose.shape != (len(points), 4, 4):
+            raise CFlowError(f"{name}.{side} has shape {tuple(pose.shape)}: give ({len(points)}, 4, 4), one per sweep")
+        poses.append([rigid_transform(matrix, f"{name}.{side}[{k}]") for k, matrix in enumerate(pose)])
+    frames = [
+        Frame(cloud[rows], flags[rows] > 0, sensor_to_ego, ego_to_global)
+        for cloud, flags, rows, sensor_to_ego, ego_to_global in zip(points, mask, is_row, *poses)
+    ]
+    loader = getattr(getattr(sequence, "loader_type", None), "name", None)
+    if loader not in ("CAUSAL", "NON_CAUSAL"):
+        raise CFlowError(f"{name}.loader_type is {loader!r}: give LoaderType.CAUSAL or LoaderType.NON_CAUSAL")
     valid = (mask > 0).float().masked_fill(~is_row, torch.nan)
-    return frames, len(frames) - 2 if sequence.loader_type.name == "CAUSAL" else 0, valid
+    return frames, len(frames) - 2 if loader == "CAUSAL" else 0, valid

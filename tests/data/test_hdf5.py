@@ -101,6 +101,15 @@ def test_data_of_other_files_are_never_read(tmp_path):
             log.sweep(0)
 
 
+def test_other_files_are_refused(tmp_path):
+    write_scene(tmp_path / "one.h5", STAMPS[:1])
+    for name in ("one", "missing"):
+        with pytest.raises(CFlowError, match=f"{name}.h5"):
+            HDF5Log(tmp_path / f"{name}.h5")
+    with pytest.raises(CFlowError, match="nowhere"):
+        find_hdf5_scenes(tmp_path / "nowhere")
+
+
 def test_every_key_is_read_in_its_own_type(tmp_path):
     """float32 poses, (N, 3) points, int8 categories with -1 = no label, eval_mask (N,) are variants that occur."""
     extra = {

@@ -39,6 +39,14 @@ def test_paths_in_tables_cannot_leave_the_folder(tmp_path: Path) -> None:
             path_inside(tmp_path, relative, "f")
 
 
+def test_links_in_the_data_are_followed(tmp_path: Path) -> None:
+    elsewhere, root = tmp_path / "elsewhere", tmp_path / "root"
+    elsewhere.mkdir(), root.mkdir()
+    (elsewhere / "x.bin").write_bytes(b"data")
+    (root / "data").symlink_to(elsewhere)
+    assert path_inside(root, "data/x.bin", "f").read_bytes() == b"data", "users link data sets"
+
+
 def test_time_stamps_are_recognised() -> None:
     assert is_timestamp("315966000000000000") and is_timestamp("0")
     for name in ("", "-1", "²", "\u0663", "1e5", "9" * 19 + "0", "9223372036854775808", " 1"):

@@ -12,7 +12,7 @@ from tiny_recording import TinyRecording, rigid, turn_z
 
 from cflow_torch.data.categories import CATEGORY_INDEX, meta_class
 from cflow_torch.data.nuscenes.reader import Footprint, NuScenesLog, find_nuscenes_scenes, pcd_bin_points
-from cflow_torch.data.nuscenes.tables import Annotations
+from cflow_torch.data.nuscenes.tables import Annotations, SceneSource
 from cflow_torch.data.nuscenes.tracks import Tracks
 from cflow_torch.data.rigid_motion import poses_from_quaternions, transform_points
 from cflow_torch.simulator import make_drive
@@ -178,6 +178,17 @@ def test_unknown_categories_are_refused(tiny):
     edit(tiny, "category", lambda rows: [{**row, "name": "vehicle.spaceship"} for row in rows])
     with pytest.raises(CFlowError, match="category.json: the categories .*spaceship.* are unknown"):
         open_log(tiny)
+
+
+@pytest.mark.parametrize(
+    ("num_sweeps", "scene", "complaint"),
+    [(1, "", "has 1 sweeps"), (6, "scene-0061", "no scene 'scene-0061'"), (6, "", r"\.bin is missing; copy")],
+)
+def test_what_is_missing_is_named(tmp_path, num_sweeps, scene, complaint):
+    tiny = write_nuscenes(TinyRecording(("LIDAR_TOP",), num_sweeps=num_sweeps), tmp_path, key_frame_interval=0.1)
+    min((tiny / "samples" / "LIDAR_TOP").iterdir()).unlink()
+    with pytest.raises(CFlowError, match=complaint):
+        (NuScenesLog(SceneSource(tiny, VERSION, scene)) if scene else open_log(tiny)).sweep(0)
 
 
 def test_a_bad_sweep_costs_no_other(tiny):

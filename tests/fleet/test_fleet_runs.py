@@ -83,6 +83,14 @@ def test_a_second_run_computes_only_missing_frames(fleet: Path, single: dict[str
     assert all(file.stat().st_mtime_ns == time for file, time in times.items()), "complete files are kept"
 
 
+def test_incomplete_files_are_computed_again(fleet: Path, single: dict[str, bytes], out: Path) -> None:
+    for number, file in enumerate(frames(out)[::2]):
+        whole = file.read_bytes()
+        file.write_bytes(b"" if number == 0 else whole[: len(whole) // 2] + bytes(len(whole) - len(whole) // 2))
+    assert run(fleet, out)["frames"]["computed"] == PAIRS // 2
+    assert tree(out) == single
+
+
 def test_other_settings_are_rejected_by_name(fleet: Path, single: dict[str, bytes], out: Path) -> None:
     with pytest.raises(CFlowError, match=re.escape("method.pixel_sizes was [0.4], is [0.8]") + ".*overwrite=true"):
         run(fleet, out, settings=OTHER)

@@ -1,9 +1,10 @@
-"""What a run takes from its surroundings: its share of the work, the workers of the machine, signals."""
+"""What a run takes from its surroundings: its share of the work, the workers of the machine, signals, a terminal."""
 
 from __future__ import annotations
 
 import os
 import signal
+import sys
 import time
 from fractions import Fraction
 from typing import Any
@@ -14,9 +15,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cflow_torch import CFlowError, make_config
-from cflow_torch.fleet import machine
+from cflow_torch.fleet import machine, progress
 from cflow_torch.fleet.job import Shard, find_shard, split
 from cflow_torch.fleet.machine import Layout, choose_layout, usable_cores
+from cflow_torch.fleet.progress import Progress, log_line
 from cflow_torch.fleet.run import StopSignal
 
 # Shares of the work
@@ -125,7 +127,7 @@ def test_the_job_limits_the_cores() -> None:
     assert usable_cores({"SLURM_CPUS_PER_TASK": "many", "LOCAL_WORLD_SIZE": "0"}) == cores
 
 
-# Signals
+# Signals and terminals
 
 
 def test_the_first_signal_finishes_and_the_second_interrupts() -> None:
@@ -149,3 +151,29 @@ def test_a_run_ignores_sighup_under_nohup() -> None:
             assert not stop()
     finally:
         signal.signal(signal.SIGHUP, before)
+
+
+class Closed:
+    """A terminal that was closed."""
+
+    def write(self, text: str) -> int:
+        raise OSError(5, "Input/output error")
+
+    def isatty(self) -> bool:
+        return True
+
+    fileno = flush = write
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # tqdm's, of a bar without a terminal
+@pytest.mark.parametrize("is_terminal", [True, False])
+def test_progress_survives_a_closed_terminal(monkeypatch: pytest.MonkeyPatch, is_terminal: bool) -> None:
+    monkeypatch.setattr(progress, "EVERY", 0.0)
+    monkeypatch.setattr(Closed, "isatty", lambda self: is_terminal)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "stderr", Closed())
+        log_line("a frame failed")
+        with Progress(3) as bar:
+            bar.update(2)
+            bar.update(1)
+    assert bar.n == 3
