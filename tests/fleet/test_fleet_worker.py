@@ -299,3 +299,11 @@ def test_settings_of_the_engine_are_checked(source: Path, tmp_path: Path) -> Non
     for settings in ({"timeout": 0}, {"timeout": "long"}, {"memory": -1}, {"memory": True}):
         with pytest.raises(CFlowError, match=f"engine.{next(iter(settings))}=.*above 0"):
             list(run_local(make_job(tmp_path), units_of([source]), Layout(("cpu",), 1), lambda: False, **settings))
+
+
+def test_a_stop_lets_started_frames_finish(fleet: Path, tmp_path: Path) -> None:
+    units, job = units_of(sorted(fleet.iterdir())), make_job(tmp_path, batch=1)
+    processes = [ThreadProcess(job), ThreadProcess(job)]
+    counters = count(dispatch(processes, units, lambda: any(tmp_path.rglob("*.feather")), 1), units)
+    assert 0 < len(flow_files(tmp_path)) < PAIRS
+    assert len(counters.waiting) + len(flow_files(tmp_path)) == counters.total
