@@ -130,7 +130,7 @@ def _describe_inactive(points: Array, config: Config) -> str:
 
 @contextmanager
 def inactive_is_an_error() -> Iterator[None]:
-    """Turn the warning of `warn_of_inactive` into a `CFlowError`, for results that nobody looks over one by one."""
+    """Turn the warning of `warn_of_inactive` into a `CFlowError`, for results that nobody reads one by one."""
     with warnings.catch_warnings():
         warnings.simplefilter("error", NoActivePoints)
         try:
