@@ -242,8 +242,9 @@ def select_objects(nodes: Nodes, components: Components, evidence: Tensor, num_p
 
     Returns:
         The objects, and the node of each, (G,) int64, N = none. A pixel belongs to the coarsest of its nodes that won.
-        If none did, it moves with the node of its changed pixels, if that does; else it is static with its finest
-        component, or belongs to none if that is not linked. Pixels of copies belong to a node that moves, or to none.
+        If none did, it moves with the node of its changed pixels, if that moves. Otherwise it is static and belongs
+        to its finest component, or to none if that is not linked. Pixels of copies belong to a node that moves, or to
+        none.
 
     Convention: a child counts with its evidence less `_PRICE`, at least 0. The whole must have more; at a draw the
         children keep their own motion.

@@ -48,15 +48,15 @@ def register_deskewed(
     """The motion of objects per sweep interval, from the apparent motion and the times of points.
 
     Args:
-        points: of the objects that move, of all sweeps. Without times all is as it is apparent.
+        points: of the objects that move, of all sweeps. Without times, the apparent motion is returned.
         sweeps: finest images.
         start: (G, 2) float64, x and y, metres per sweep interval, what the registration started from.
         apparent: what it found.
 
     Returns:
-        The motion. Of more than two sweeps the points are de-skewed and registered once more, from the start divided by
-        the same factor. Of pairs the motion is divided only: smooth sides, once they are sharp, slide towards the
-        pattern of the beams, which goes with the vehicle, and no third sweep holds them.
+        The motion. With more than two sweeps, the points are de-skewed and registered again, from the start divided by
+        the same factor. For pairs the motion is only divided: de-skewed smooth sides would slide along the pattern of
+        the beams, and there is no third sweep to prevent it.
 
     Convention: times of 0 change nothing, to the last bit.
 

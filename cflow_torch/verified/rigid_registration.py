@@ -78,8 +78,8 @@ def stretch_of(points: ObjectPoints, sweeps: HeightSlicedSweeps, rigid: RigidMot
 
     Returns:
         (G,) float64: sum of w k (k + b - a) over the sum of w k^2, over all pairs of voxels; w is the weight of a pair
-        in x plus that in y, k the intervals between its sweeps, a and b the mean times of its voxels in intervals. So
-        the motion divided by it explains the pairs best. 1 for objects without pairs, and where it is below 0.75.
+        in x plus that in y, k the intervals between its sweeps, a and b the mean times of its voxels in intervals. The
+        motion divided by this ratio explains the pairs best. 1 for objects without pairs, and where it is below 0.75.
 
     Convention: k is rounded to a 16th and b - a to a 1024th, halves up.
     """
