@@ -77,10 +77,9 @@ def _bits(missing: Tensor) -> tuple[Tensor, Tensor]:
 def _centre(sweeps: HeightSlicedSweeps, pixel: Tensor, bit: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """x, y and z, (K,) float64, metres, of the middle of slices, by their pixels and bits, (K,) int64 each."""
     row, col, lowest = gather(pixel, sweeps.pixels.row, sweeps.pixels.col, sweeps.lowest)
-    size, (x, y) = sweeps.grid.pixel_size, sweeps.grid.lower[:2]
     first = torch.floor(lowest / SLICE_HEIGHT)
     height = first + torch.remainder(bit - first, NUM_SLICES) + 0.5
-    return (col.double() + 0.5) * size + x, (row.double() + 0.5) * size + y, height * SLICE_HEIGHT
+    return (*sweeps.grid.centre(row, col), height * SLICE_HEIGHT)
 
 
 class RangeImages:

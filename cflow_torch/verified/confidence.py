@@ -91,15 +91,12 @@ def _groups_of_one_motion(
         group: (K,) int64, of each pixel.
         motion: (G + groups, 2) float64, (y, x), pixels per interval.
     """
-    size, lower = sweeps.grid.pixel_size, sweeps.grid.lower
-    motion = rigid.pixels_per_interval(size)
-    # Where the pixel's part of the object is at t.
-    since_t = sweeps.elapsed.index_select(0, pixels.window)
-    since_t = since_t[:, 1] - since_t.gather(1, pixels.step[:, None])[:, 0]
-    shift_y, shift_x = (motion.index_select(0, which) * since_t[:, None]).unbind(1)
-    x = (pixels.col.double() + 0.5 - shift_x) * size + lower[0]
-    y = (pixels.row.double() + 0.5 - shift_y) * size + lower[1]
-    flow = torch.stack(rigid.flow_at(which, x, y)[::-1], 1) / size
+    size, motion = sweeps.grid.pixel_size, rigid.pixels_per_interval(sweeps.grid.pixel_size)
+    elapsed = sweeps.elapsed.index_select(0, pixels.window)
+    since_t = elapsed[:, 1] - elapsed.gather(1, pixels.step[:, None])[:, 0]
+    (x, y), (flow_x, flow_y) = sweeps.grid.centre(pixels.row, pixels.col), rigid.flow.index_select(0, which).unbind(1)
+    flow_x, flow_y = rigid.flow_at(which, x - flow_x * since_t, y - flow_y * since_t)  # by where the pixel was at t
+    flow = torch.stack((flow_y, flow_x), 1) / size
     rotates = flat_nonzero(((flow - motion.index_select(0, which)).abs() >= 1).any(1))
     group = which.index_copy(0, rotates, torch.arange(len(rotates), device=which.device) + len(motion))
     return group, torch.cat((motion, flow.index_select(0, rotates)))
@@ -126,8 +123,7 @@ def confidence_of(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMoti
     unlinked = 1 + _bin(number, crowd)
     static = 2 + len(crowd) + sum(10 * matched >= bound * number for bound in share)
 
-    y, x = ((at.double() + 0.5) * size for at in (pixels.row, pixels.col))
-    x, y = x + sweeps.grid.lower[0], y + sweeps.grid.lower[1]
+    x, y = sweeps.grid.centre(pixels.row, pixels.col)
     is_far = x * x + y * y >= float(TABLE["far"]) ** 2
     kind = 2 * sweeps.has_history.index_select(0, pixels.window) + is_far.long()
     first = 3 + len(crowd) + len(share)

@@ -50,6 +50,11 @@ class Grid:
         """W of Eq. bev_dims."""
         return math.floor((self.upper[0] - self.lower[0]) / self.pixel_size) + 1
 
+    def centre(self, row: Tensor, col: Tensor) -> tuple[Tensor, Tensor]:
+        """x and y of the centres of pixels, (K,) float64, metres, by their rows and columns, (K,) int64."""
+        x, y = (at.double().add_(0.5).mul_(self.pixel_size) for at in (col, row))
+        return x.add_(self.lower[0]), y.add_(self.lower[1])
+
     def contains(self, positions: Tensor) -> Tensor:
         """Test whether positions are finite and inside the region, both ends included.
 

@@ -48,7 +48,8 @@ def motion_of_pixel(sweeps: SlicedSweeps, pixel: Pixel, rigid: RigidMotion) -> V
     (m, r, c), size, lower = pixel, sweeps.size, sweeps.lower
     y, x = rigid.flow[1] / size, rigid.flow[0] / size
     since_t = sweeps.elapsed[1] - sweeps.elapsed[m]
-    at_t = (c + 0.5 - x * since_t) * size + lower[0], (r + 0.5 - y * since_t) * size + lower[1]
+    centre = (c + 0.5) * size + lower[0], (r + 0.5) * size + lower[1]
+    at_t = centre[0] - rigid.flow[0] * since_t, centre[1] - rigid.flow[1] * since_t
     own_x, own_y = (value / size for value in rigid.flow_at(*at_t))
     return (own_y, own_x) if max(abs(own_y - y), abs(own_x - x)) >= 1 else (y, x)
 
