@@ -4,8 +4,8 @@ The margin of a motion says how much worse it explains the sweeps when it is dis
 nothing gets worse, and a trunk of few points fits many positions: what fits as well when displaced is static.
 
 Counts that need no truth give every point a probability, from a table. A moving object is trusted by its margin, a
-static one by the share of its neighbourhood that is matched. What could not be linked to t+1 is trusted the less the
-more of it there is.
+static one by the share of its neighbourhood that is matched, and less beside a moving object, which may be larger than
+it seems. What could not be linked to t+1 is trusted the less the more of it there is.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from cflow_torch.ops.indices import constant, flat_nonzero, floor_divide, gather, lookup, scatter_count
+from cflow_torch.ops.indices import constant, flat_nonzero, floor_divide, gather, lazy_zeros, lookup, scatter_count
 from cflow_torch.verified.aperture import principal_axes
 from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import HeightSlicedSweeps, Pixels, count_slices
@@ -25,7 +25,8 @@ from cflow_torch.verified.paired_test import count_wins
 from cflow_torch.verified.rigid_motion import RigidMotion
 
 # Bounds of the bins and the probabilities, written by scripts/ablation/calibrate_confidence.py. Bins, in order: left
-# out; unlinked, by `crowd`; static, by `share`; moving, by `margin`: pairs near, pairs far, with history near and far.
+# out; unlinked, by `crowd`; static, by `share`; static beside a moving object; moving, by `margin`: pairs near, pairs far,
+# with history near and far.
 TABLE = json.loads(Path(__file__).with_name("confidence.json").read_text(encoding="utf-8"))
 _BLOCK = 1.6  # metres, sides of a neighbourhood
 _DISPLACEMENT = 0.4  # metres per interval, along x and along y
@@ -114,25 +115,37 @@ def confidence_of(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMoti
     Returns:
         (P + 1,) float32; entry P is for points whose pixel was left out. Undefined for pixels of other sweeps.
 
-    Cost: one lookup for each pixel of t.
+    Cost: one lookup for each pixel of t, and nine for those that move.
     """
     pixels, size, device = sweeps.pixels, sweeps.grid.pixel_size, margin.device
     motion = rigid.pixels_per_interval(size)
     number, matched = _neighbourhood(sweeps, lookup(motion, objects.of_pixel))
     crowd, share, bounds = (TABLE[name] for name in ("crowd", "share", "margin"))
     unlinked = 1 + _bin(number, crowd)
+    moves = lookup(motion.any(1), objects.of_pixel)
     static = 2 + len(crowd) + sum(10 * matched >= bound * number for bound in share)
+    static = torch.where(_is_beside(sweeps, moves), 3 + len(crowd) + len(share), static)
 
     x, y = sweeps.grid.centre(pixels.row, pixels.col)
     is_far = x * x + y * y >= float(TABLE["far"]) ** 2
     kind = 2 * sweeps.has_history.index_select(0, pixels.window) + is_far.long()
-    first = 3 + len(crowd) + len(share)
+    first = 4 + len(crowd) + len(share)
     moving = first + kind * (1 + len(bounds)) + lookup(_bin(margin, bounds), objects.of_pixel)
 
     static = torch.where(objects.of_pixel == objects.count, unlinked, static)
-    index = torch.where(lookup(motion.any(1), objects.of_pixel), moving, static)
+    index = torch.where(moves, moving, static)
     probabilities = constant(tuple(TABLE["probabilities"]), torch.float32, device)
     return torch.cat((probabilities.index_select(0, index), probabilities[:1]))
+
+
+def _is_beside(sweeps: HeightSlicedSweeps, moves: Tensor) -> Tensor:
+    """(P,) bool: one of the 3 x 3 pixels around each pixel, or a copy of it, moves in the same sweep; (P,) bool."""
+    some = sweeps.pixels.take(flat_nonzero(moves))
+    dy, dx = constant(((-1, -1, -1, 0, 0, 0, 1, 1, 1), (-1, 0, 1) * 3), torch.int64, moves.device)
+    window = some.window % len(sweeps.batch.rows)  # that of a copy is the window of the pixel itself
+    index = sweeps.index(window[:, None], some.step[:, None], some.row[:, None] + dy, some.col[:, None] + dx)
+    is_beside = lazy_zeros(sweeps.image.numel(), torch.bool, moves.device).index_fill_(0, index.view(-1), True)
+    return is_beside.index_select(0, sweeps.pixels.index)
 
 
 def _bin(values: Tensor, bounds: list[float]) -> Tensor:

@@ -3,12 +3,14 @@
 
   python scripts/ablation/calibrate_confidence.py fit                            writes verified/confidence.json
   python scripts/ablation/calibrate_confidence.py evaluate --seeds 300-303       simulated drives
-  python scripts/ablation/calibrate_confidence.py evaluate --real                Argoverse 2 pair, KITTI 0000
+  python scripts/ablation/calibrate_confidence.py evaluate --real                Argoverse 2 pair, KITTI 0000, PandaSet
 
 The windows come from sets.py: five sensors, four kinds of scenes, pairs (h = 0) and history (h = 4), region +-70 m,
 without ground. We fit on seeds 100-103. A point is right if the end-point error of its residual flow is below 0.1 m per
-interval. The columns are the expected calibration error of all and of dynamic points, and the end-point error in metres
-of dynamic and of static points after a share of them is dropped, the least confident first.
+interval. The columns are the expected calibration error of all and of dynamic points; the end-point error in metres of
+dynamic and of static points after a share of them is dropped, the least confident first; and what an alarm finds that
+2 % of the static points raise: the share of the dynamic points that are missed (their flow is less than half of the
+true one), and the number of missed points.
 """
 
 from __future__ import annotations
@@ -39,7 +41,8 @@ MAX_POINTS = 3000  # per window and bin in the fit, so that one large vehicle do
 BOX = (-70.0, -70.0, -math.inf, 70.0, 70.0, math.inf)
 TABLE_FILE = Path(confidence.__file__).with_name("confidence.json")
 # Columns of the statistics, sums over the points of a bin: all points, and dynamic ones.
-POINTS, RIGHT_ONES, DYNAMIC, RIGHT_DYNAMIC, ERROR, DYNAMIC_ERROR = range(6)
+POINTS, RIGHT_ONES, DYNAMIC, RIGHT_DYNAMIC, ERROR, DYNAMIC_ERROR, MISSED = range(7)
+FALSE_ALARMS = 0.02  # share of static points
 
 
 def simulated(seeds: tuple[int, int]) -> Iterator[Item]:
@@ -49,7 +52,7 @@ def simulated(seeds: tuple[int, int]) -> Iterator[Item]:
 
 
 def statistics(items: Iterable[Item], histories: Sequence[int], max_points: float = math.inf) -> np.ndarray:
-    """(C, 6) float64: sums over the points of each of the C bins of the table.
+    """(C, 7) float64: sums over the points of each of the C bins of the table.
 
     Args:
         items: with h = 4.
@@ -57,7 +60,7 @@ def statistics(items: Iterable[Item], histories: Sequence[int], max_points: floa
         max_points: weight of a window in a bin; if it has more points, all of them get less weight.
     """
     num_bins = len(confidence.TABLE["probabilities"])
-    kept, sums = confidence.TABLE["probabilities"], np.zeros((num_bins, 6))
+    kept, sums = confidence.TABLE["probabilities"], np.zeros((num_bins, 7))
     models = {h: make_model(make_config("default", num_history=h, point_cloud_range=BOX)) for h in histories}
     confidence.TABLE["probabilities"] = [i / num_bins for i in range(num_bins)]  # the result encodes the bin
     try:
@@ -79,14 +82,15 @@ def _sums(result: FlowResult, item: Item, num_bins: int) -> np.ndarray:
     error = np.linalg.norm(flow["residual_flow"][rows] - truth[rows], axis=1)
     moves = np.linalg.norm(truth[rows], axis=1) >= MOVES
     right = error < RIGHT
-    columns = (np.ones(len(rows)), right, moves, right & moves, error, error * moves)
+    is_missed = moves & (2 * np.linalg.norm(flow["residual_flow"][rows], axis=1) < np.linalg.norm(truth[rows], axis=1))
+    columns = (np.ones(len(rows)), right, moves, right & moves, error, error * moves, is_missed)
     return np.stack([np.bincount(bins, column, num_bins) for column in columns], 1)
 
 
 def fit(sums: np.ndarray) -> list[float]:
     """Probability of each bin: share of right points, made monotonic along each row of the table."""
     table = confidence.TABLE
-    sizes = [1, 1 + len(table["crowd"]), 1 + len(table["share"])] + 4 * [1 + len(table["margin"])]
+    sizes = [1, 1 + len(table["crowd"]), 1 + len(table["share"]), 1] + 4 * [1 + len(table["margin"])]
     starts = np.cumsum([0, *sizes])
     result: list[float] = []
     for row, (start, end) in enumerate(zip(starts, starts[1:])):
@@ -123,6 +127,15 @@ def sparsification(sums: np.ndarray, dynamic: bool) -> list[float]:
     return result
 
 
+def share_of_missed_found(sums: np.ndarray) -> float:
+    """Share of the missed points among the least trusted ones that hold `FALSE_ALARMS` of the static points."""
+    order = np.argsort(confidence.TABLE["probabilities"], kind="stable")
+    missed, static = sums[order, MISSED], sums[order, POINTS] - sums[order, DYNAMIC]
+    before = np.concatenate(([0.0], np.cumsum(static)[:-1]))
+    taken = np.clip((FALSE_ALARMS * static.sum() - before) / np.maximum(static, 1), 0, 1)
+    return float((missed * taken).sum() / max(missed.sum(), 1))
+
+
 def main() -> None:
     """Fit the table, or print how well it is calibrated."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -146,12 +159,15 @@ def main() -> None:
         if given.real:
             items = [item for path in (sets.KITTI, sets.KITTI_LATER) for item in sets.kitti(path)[sets.HISTORY :]]
             sums_of[f"KITTI 0000, h = {h}"] = statistics(items, (h,))
+            items = [item for path in sets.PANDASET.values() for item in sets.kitti(path)[sets.HISTORY :: 4]]
+            sums_of[f"PandaSet, h = {h}"] = statistics(items, (h,))
     dropped = ", ".join(f"{100 * share:.0f}" for share in DROPPED)
-    print(f"| set | error, all / dynamic | dynamic, dropped {dropped} % | static, the same |\n|---|---|---|---|")
+    print(f"| set | error, all / dynamic | dynamic, dropped {dropped} % | static, the same | missed found |\n|{'---|' * 5}")
     for name, sums in sums_of.items():
         gaps = " / ".join(f"{calibration_error(sums, dynamic):.4f}" for dynamic in (False, True))
         left = (", ".join(f"{value:.4f}" for value in sparsification(sums, dynamic)) for dynamic in (True, False))
-        print(f"| {name} | {gaps} | {' | '.join(left)} |")
+        found = f"{share_of_missed_found(sums):.2f} of {sums[:, MISSED].sum():.0f}"
+        print(f"| {name} | {gaps} | {' | '.join(left)} | {found} |")
 
 
 if __name__ == "__main__":

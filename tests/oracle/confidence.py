@@ -16,7 +16,7 @@ from oracle.registration import RigidMotion
 FILE = Path(cflow_torch.__file__).parent / "verified" / "confidence.json"
 TABLE: dict[str, Any] = json.loads(FILE.read_text(encoding="utf-8"))
 DISPLACEMENT, BLOCK = 0.4, 1.6  # metres per interval; metres
-KINDS = ("left out", "unlinked", "static", "moving")  # in the order of the table; the last has four parts
+KINDS = ("left out", "unlinked", "static", "beside", "moving")  # in the order of the table; the last has four parts
 
 
 def margin(sweeps: SlicedSweeps, members: Sequence[Pixel], rigid: RigidMotion) -> tuple[float, bool]:
@@ -79,7 +79,10 @@ def confidences(
             kind = 2 * (len(sweeps.images) > 2) + (x * x + y * y >= TABLE["far"] ** 2)
             index = first_bin("moving") + kind * (1 + len(TABLE["margin"])) + _bin(margins[number], TABLE["margin"])
         else:
-            index = first_bin("static") + sum(10 * found >= bound * total for bound in TABLE["share"])
+            near = [(1, r + dy, c + dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
+            is_beside = any(q in object_of and any(motions[object_of[q]]) for q in near)
+            share = sum(10 * found >= bound * total for bound in TABLE["share"])
+            index = first_bin("beside") if is_beside else first_bin("static") + share
         result[pixel] = TABLE["probabilities"][index]
     return result
 
@@ -97,7 +100,7 @@ def neighbourhoods(sweeps: SlicedSweeps, motion: dict[Pixel, Vector]) -> dict[Ce
 
 def first_bin(kind: str) -> int:
     """Where a kind begins in the table."""
-    sizes = [1, 1 + len(TABLE["crowd"]), 1 + len(TABLE["share"])]
+    sizes = [1, 1 + len(TABLE["crowd"]), 1 + len(TABLE["share"]), 1]
     return sum(sizes[: KINDS.index(kind)])
 
 

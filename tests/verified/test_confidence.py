@@ -7,6 +7,7 @@ import pytest
 import torch
 from oracle import confidence as oracle
 from scenes import config, flow_as_oracle, scene
+from test_changed_movers import beside_a_wall
 from turning_car import MODEL, turning_car
 
 from cflow_torch import Sweep, VerifiedFlow, Window, make_config, make_model
@@ -27,14 +28,13 @@ def numbered(monkeypatch):
 def test_the_table_is_monotone_and_the_oracle_reads_it():
     assert oracle.TABLE == confidence.TABLE
     table, start, rows = confidence.TABLE, 1, []
-    for bounds in ("crowd", "share", *4 * ("margin",)):
-        length = len(table[bounds]) + 1
+    for length in (len(table["crowd"]) + 1, len(table["share"]) + 1, 1, *4 * (len(table["margin"]) + 1,)):
         rows.append(table["probabilities"][start : start + length])
         start += length
     assert start == len(table["probabilities"]) and all(0 < p < 1 for p in table["probabilities"])
-    unlinked, static, *moving = rows
+    unlinked, static, (beside,), *moving = rows
     assert unlinked == sorted(unlinked, reverse=True) and unlinked[0] > unlinked[-1]
-    assert all(row == sorted(row) and row[0] < row[-1] for row in (static, *moving))
+    assert all(row == sorted(row) and row[0] < row[-1] for row in (static, *moving)) and beside < static[0]
 
 
 def test_every_bin_equals_the_oracle(numbered):
@@ -45,8 +45,17 @@ def test_every_bin_equals_the_oracle(numbered):
         window = scene(500 + seed, num_history=seed % 3, poses=seed % 5 > 0, stamps=seed % 2 > 0)
         result = flow_as_oracle(window, settings)
         seen |= {round(64 * value) for value in result.confidence[result.is_valid].tolist()}
-    kinds = [sum(low <= place < high for place in seen) for low, high in ((1, 6), (6, 11), (11, 23), (23, 35))]
-    assert min(kinds) >= 2, (kinds, seen)  # of every kind: not linked, static, moving in pairs, moving with history
+    kinds = [sum(low <= place < high for place in seen) for low, high in ((1, 6), (6, 11), (12, 24), (24, 36))]
+    assert min(kinds) >= 2, (kinds, seen)  # unlinked, static, moving in pairs, moving with history
+
+
+def test_the_wall_beside_a_walker_is_trusted_less(numbered):
+    window, is_walker = beside_a_wall(0.13, 20.0)
+    settings = MODEL.replace(point_cloud_range=(-10.0, -10.0, -3.0, 10.0, 10.0, 8.0), num_history=4)
+    bins = (64 * flow_as_oracle(window, settings).confidence).round()
+    is_beside = bins == 11
+    assert is_beside.any() and not is_beside[is_walker].all()
+    assert np.abs(window.pc0.points[is_beside, 0] - 4.0).max() < 1.0
 
 
 def test_far_begins_where_the_table_says(numbered, monkeypatch):
