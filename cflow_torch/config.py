@@ -224,7 +224,7 @@ class VerifiedConfig(_WithHistory):
         blocks = [size / self.pixel_sizes[-1] for size in self.pixel_sizes]
         if any(math.isinf(block) or abs(block - round(block)) > 1e-6 for block in blocks):
             raise CFlowError(
-                f"pixel_sizes={self.pixel_sizes}: the verified method (presets default, fast and offline) takes whole "
+                f"pixel_sizes={self.pixel_sizes}: the verified method (presets default and offline) takes whole "
                 "multiples of the finest size: give for example (0.4, 0.2, 0.1)"
             )
 
@@ -244,7 +244,6 @@ _DEFAULT = {
 # The method of each preset, and its changes to the defaults of the method.
 PRESETS: dict[str, tuple[str, dict[str, Any]]] = {
     "default": ("verified", _DEFAULT),
-    "fast": ("verified", {"num_history": 2, "point_cloud_range": _REGION, "max_speed": 60.0}),
     "offline": ("verified", {**_DEFAULT, "num_future": 4}),
     "paper": ("dense", {}),
     # Chosen on the simulated seeds 200 ... 209: docs/method.md.
@@ -261,9 +260,10 @@ PRESETS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 _PRESET_OF_METHOD = {"dense": "paper", "keypoints": "keypoints", "verified": "default"}
 
-# Settings of the version before this one, and their replacement.
+# Presets and settings of the version before this one, and their replacement.
+REMOVED_PRESETS = {"fast": "use default with num_history=2"}
 REMOVED = {
-    "thorough": "leave it out, every step of the method is always on; preset fast has one scale and less history",
+    "thorough": "leave it out, every step of the method is always on",
     "max_object": "use max_object_length",
 }
 
@@ -272,8 +272,8 @@ def make_config(preset: str | None = None, method: str | None = None, **override
     """Make the settings of a preset, with some fields replaced.
 
     Args:
-        preset: "default", "fast", "offline", "paper" or "keypoints"; None = the preset of the method, or "default".
-        method: "dense" (preset "paper"), "keypoints" or "verified" (presets "default", "fast", "offline"); None = the
+        preset: "default", "offline", "paper" or "keypoints"; None = the preset of the method, or "default".
+        method: "dense" (preset "paper"), "keypoints" or "verified" (presets "default", "offline"); None = the
             method of the preset. "keypoints" with preset "paper" gives the paper's key-point settings.
         **overrides: any field of the method's settings; `pixel_size=0.1` is short for `pixel_sizes=(0.1,)`.
 
@@ -288,6 +288,8 @@ def make_config(preset: str | None = None, method: str | None = None, **override
         raise CFlowError(f"method={method!r}: give one of {', '.join(map(repr, CONFIGS))}")
     if preset is None:
         preset = _PRESET_OF_METHOD[method] if method is not None else "default"
+    if preset in REMOVED_PRESETS:
+        raise CFlowError(removed_preset(preset))
     if preset not in PRESETS:
         raise CFlowError(f"preset={preset!r}: give one of {', '.join(map(repr, PRESETS))}")
     own, changes = PRESETS[preset]
@@ -296,6 +298,11 @@ def make_config(preset: str | None = None, method: str | None = None, **override
     if method not in (None, own):
         raise CFlowError(f"preset={preset!r} is of method={own!r}, not of method={method!r}: leave one of them out")
     return CONFIGS[own](**changes).replace(**overrides)
+
+
+def removed_preset(name: str) -> str:
+    """The message for a preset of `REMOVED_PRESETS`."""
+    return f"preset {name!r} was removed in 0.4.0: {REMOVED_PRESETS[name]}"
 
 
 def config_from(settings: dict[str, Any]) -> Config:

@@ -1,6 +1,6 @@
 """An example node for ROS 2: estimate the flow of a PointCloud2 topic as it arrives. Needs a sourced ROS 2.
 
-    python scripts/ros2_flow_node.py --ros-args -p cloud:=/points -p odometry:=/odom -p preset:=fast
+    python scripts/ros2_flow_node.py --ros-args -p cloud:=/points -p odometry:=/odom -p preset:=paper
 
 The node publishes <cloud>/flow: the points of the sweep before, with vx, vy, vz over ground (m/s) and their object id,
 in the axes of the newest sweep. It logs its latency. Clouds and odometry must both be in the frame of the vehicle, or
@@ -36,7 +36,7 @@ class FlowNode(Node):  # type: ignore[misc]
         super().__init__("cflow")
         names: dict[str, str] = {
             name: self.declare_parameter(name, default).value
-            for name, default in {"cloud": "/points", "odometry": "", "preset": "fast", "ground": "auto"}.items()
+            for name, default in {"cloud": "/points", "odometry": "", "preset": "default", "ground": "auto"}.items()
         }
         self._stream = FlowStream(names["preset"], ground=names["ground"] or None)
         self._poses: dict[int, np.ndarray] | None = {} if names["odometry"] else None

@@ -8,7 +8,7 @@ from scenes import RANGE, scene
 
 from cflow_torch import Config, FlowResult, Sweep, Window, make_config
 
-PRESETS = ("default", "fast", "offline", "paper", "keypoints")
+PRESETS = ("default", "offline", "paper", "keypoints")
 
 
 def small(preset: str, **overrides: Any) -> Config:

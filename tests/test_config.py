@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import fields
+from functools import partial
 
 import pytest
 
-from cflow_torch import CFlowError, make_config, make_model
+from cflow_torch import CFlowError, VerifiedFlow, make_config, make_model
 from cflow_torch.config import CONFIGS, PRESETS, REMOVED, DenseConfig, KeypointsConfig, VerifiedConfig, config_from
 
 INF = math.inf
@@ -80,20 +81,26 @@ def test_a_removed_setting_names_its_replacement(name):
         make_config(**{name: 1})
 
 
+def test_the_removed_preset_names_its_replacement():
+    for call in (make_config, VerifiedFlow.from_preset, partial(make_config, method="dense")):
+        with pytest.raises(CFlowError, match="preset 'fast' was removed in 0.4.0: use default with num_history=2"):
+            call("fast")
+
+
 def test_a_setting_of_another_method_names_that_method():
     for preset, name, owners in (
         ("keypoints", "num_history", "dense and verified"),
         ("paper", "significance", "verified"),
         ("default", "patch_size", "keypoints"),
         ("default", "clustering", "dense"),
-        *((preset, name, "dense and keypoints") for preset in ("default", "fast", "offline") for name in CLUSTERING),
+        *((preset, name, "dense and keypoints") for preset in ("default", "offline") for name in CLUSTERING),
     ):
         with pytest.raises(CFlowError, match=f"{name} is a setting of method {owners}, not of"):
             make_config(preset, **{name: 1})
 
 
 def test_presets_and_methods():
-    methods = {**dict.fromkeys(("default", "fast", "offline"), VerifiedConfig), "paper": DenseConfig}
+    methods = {**dict.fromkeys(("default", "offline"), VerifiedConfig), "paper": DenseConfig}
     methods["keypoints"] = KeypointsConfig
     assert {name: type(make_config(name)) for name in PRESETS} == methods
     assert make_config() == make_config("default") == make_config(method="verified")
@@ -104,21 +111,20 @@ def test_presets_and_methods():
         config = make_config(name, max_speed=2.0)
         assert config.max_speed == 2.0 and make_model(config).config == config
         assert config.method == make_model(config).method
-    for preset, method in (("fast", "dense"), ("default", "keypoints"), ("keypoints", "verified")):
+    for preset, method in (("offline", "dense"), ("default", "keypoints"), ("keypoints", "verified")):
         with pytest.raises(CFlowError, match=f"preset='{preset}' is of method=.*leave one of them out"):
             make_config(preset, method)
-    with pytest.raises(CFlowError, match="preset='best': give one of 'default', 'fast', 'offline', 'paper'"):
+    with pytest.raises(CFlowError, match="preset='best': give one of 'default', 'offline', 'paper'"):
         make_config("best")
     with pytest.raises(CFlowError, match="method='sparse': give one of 'dense', 'keypoints', 'verified'"):
         make_config(method="sparse")
 
 
 def test_presets_have_the_paper_s_base_row_and_documented_changes():
-    paper, default, fast = (make_config(name) for name in ("paper", "default", "fast"))
+    paper, default = make_config("paper"), make_config("default")
     assert (paper.pixel_sizes, paper.num_history, paper.sectional_view) == ((0.1,), 0, False)
     assert paper.point_cloud_range == (-35.0, -35.0, -INF, 35.0, 35.0, INF) and paper.max_speed is None
     assert (default.pixel_sizes, default.num_history) == ((0.4, 0.2, 0.1), 4)
-    assert fast == default.replace(pixel_size=0.1, num_history=2)
     assert make_config("offline") == default.replace(num_future=4) and make_config("offline").num_sweeps == 10
     assert make_config(pixel_size=0.2).pixel_sizes == (0.2,)
     with pytest.raises(CFlowError, match="give one of them"):

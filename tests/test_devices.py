@@ -21,7 +21,6 @@ BOUNDS: dict[str, tuple[Config, int, int, int]] = {
     "paper": (small("paper", num_history=0), 639, 31, 729),
     "paper, h = 4, 5 scales": (small("paper", num_history=4, pixel_sizes=SCALES), 3711, 137, 3939),
     "keypoints": (small("keypoints"), 922, 34, 1013),
-    "fast": (small("fast"), 3985, 105, 4165),
     "default": (small("default"), 4027, 105, 4208),
     "offline": (small("offline"), 4324, 122, 4643),
 }

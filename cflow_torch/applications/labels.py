@@ -107,7 +107,7 @@ def find_labels(
         if result.confidence is None or len(result.cluster_id) != len(sweep.points):
             raise CFlowError(
                 f"flow {index} of log {log.log_id} has no confidence or rows of another sweep: labels need the flow of "
-                "each of its pairs by the preset offline, default or fast"
+                "each of its pairs by the preset offline or default"
             )
         groups.append(as_numpy(result.cluster_id, np.int32))
         dynamic.append(_dynamic_points(sweep, other, result))

@@ -27,7 +27,7 @@ class FlowStream:
     of `make_model(config)([window])` with these sweeps to the bit.
 
     Args:
-        preset: "default", "fast", "keypoints" or "paper"; `offline` needs later sweeps and is refused.
+        preset: "default", "keypoints" or "paper"; `offline` needs later sweeps and is refused.
         config: settings, from `make_config`, in place of a preset.
         device: "auto" = that of the given tensors, else a GPU if available, else the CPU.
         ground: None = use the given masks only; "auto" or "patchwork" = find the ground of sweeps without a mask, once.
@@ -46,7 +46,7 @@ class FlowStream:
         CFlowError: a setting is unknown, or asks for sweeps after t+1.
 
     Examples:
-        >>> stream = FlowStream("fast", sweep_interval=0.1)
+        >>> stream = FlowStream("default", sweep_interval=0.1)
         >>> for points, pose, time in sensor:
         ...     result = stream.push(points, pose, time)
         ...     if result is not None:

@@ -6,7 +6,7 @@ written to OUTPUT/comparison.csv. A sweeper minimises the mean dynamic error.
 
 examples:
   cflow eval data=av2 data.root=/data/av2/val model=paper
-  cflow eval data=hdf5 data.root=/data/scenes model=fast     a faster method
+  cflow eval data=hdf5 data.root=/data/scenes model.num_history=2     fewer sweeps: faster
   cflow eval definition=av2                    scores as another public evaluator defines them
   cflow eval -m model.num_history=0,2,4        a sweep: outputs/eval/model.num_history=2/results.json, ...
   cflow eval -m experiment=pixel_size          a table or figure of the paper, see docs/settings.md

@@ -183,7 +183,7 @@ def _contents(cfg: DictConfig, has_confidence: bool) -> tuple[str, ...]:
     if not given or set(given) - set(allowed):
         raise CFlowError(f"contents={given}: give auto, or some of {', '.join(allowed)}")
     if "confidence" in given and not has_confidence:
-        raise CFlowError(f"contents={given}: only model=default, fast and offline have a confidence")
+        raise CFlowError(f"contents={given}: only model=default and offline have a confidence")
     if cfg.result_name is not None and not set(given) >= set(CONTENTS):
         raise CFlowError("result_name= reads the flow files: it needs all contents")
     needed = _FOR_TRACKS | {"confidence"} if has_confidence else _FOR_TRACKS

@@ -10,7 +10,7 @@ completes the flow of a scene labels it. The exit statuses are those of `cflow f
 examples:
   cflow label /data/scenes/train
   cflow label /data/scenes/train dry_run=true                 counts the frames
-  cflow label /data/scenes/train model=fast                   four to seven times faster, finds less
+  cflow label /data/scenes/train model=default                no later sweeps: faster, finds less
   cflow label /data/scenes/train shard.index=2 shard.count=16
 """
 
@@ -45,7 +45,7 @@ def task(cfg: DictConfig) -> None:
     if cfg.data.get("name") != "hdf5":
         raise CFlowError("labels are written into HDF5 scenes of OpenSceneFlow: give their folder, and leave data= out")
     if cfg.model.method != "verified":
-        raise CFlowError("labels need the confidence of the flow: give model=offline, default or fast")
+        raise CFlowError("labels need the confidence of the flow: give model=offline or default")
     shard = find_shard(cfg.shard.index, cfg.shard.count, os.environ)
 
     def check(job: Job, sources: Sources) -> None:

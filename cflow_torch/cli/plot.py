@@ -14,7 +14,7 @@ examples:
   cflow plot picture=correlation pair=2
   cflow plot picture=scales model.pixel_sizes=[0.8,0.4,0.2,0.1]
   cflow plot data=av2 data.root=/data/av2/val/LOG pair=2 truth=true
-  cflow plot picture=animation count=5 model=fast
+  cflow plot picture=animation count=5 model.num_history=0
 """
 
 from __future__ import annotations

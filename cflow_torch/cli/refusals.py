@@ -6,7 +6,7 @@ import re
 from typing import Iterable
 
 from cflow_torch.cli.choices import files, groups, near, own_settings, settings
-from cflow_torch.config import CONFIGS
+from cflow_torch.config import CONFIGS, REMOVED_PRESETS, removed_preset
 from cflow_torch.errors import CFlowError
 
 # Settings of the last version; those of the methods are in `config.REMOVED`.
@@ -42,6 +42,8 @@ def explain(error: Exception, command: str) -> str:
 
 def unknown_choice(group: str, name: str, known: Iterable[str]) -> str:
     """The message for a choice that a group does not have."""
+    if group == "model" and name in REMOVED_PRESETS:
+        return removed_preset(name)
     names = sorted(known)
     return f"{group}={name}{near(name, names)}: give one of {', '.join(names)}"
 

@@ -3,7 +3,7 @@
 With names, it prints only these: a setting, a preset, a command, a group or one of its choices.
 
 --opensceneflow FOLDER writes the model files of OpenSceneFlow's configuration instead: cflow.yaml (preset default),
-cflow_fast.yaml, cflow_paper.yaml and cflow_keypoints.yaml. They are those of the package.
+cflow_paper.yaml and cflow_keypoints.yaml. They are those of the package.
 
 examples:
   cflow settings max_speed          default, allowed values and meaning of a setting
@@ -30,7 +30,7 @@ from cflow_torch.errors import CFlowError
 
 _PAGE = """# Settings
 
-Settings have the same names in Python, `make_config("fast", max_speed=30.0)`, on the command line, `model=fast
+Settings have the same names in Python, `make_config("paper", max_speed=30.0)`, on the command line, `model=paper
 model.max_speed=30`, and in a sweep, `-m model.num_history=0,2,4`. null is None in Python. Words such as Alg. clustering
 are labels of the paper. If a name or a value is wrong, the error message lists what is allowed."""
 # The values are literals, because the harness's eval.yaml and save.yaml define nothing to refer to.

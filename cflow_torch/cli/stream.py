@@ -6,7 +6,7 @@ have no poses, KISS-ICP (extra odometry) estimates them, within that time.
 examples:
   cflow stream drive.bag                          at the speed of the recording
   cflow stream /data/av2/val/LOG pace=null        as fast as possible
-  cflow stream drive.bag model=fast device=cuda
+  cflow stream drive.bag model.num_history=2 device=cuda
 """
 
 from __future__ import annotations

@@ -55,7 +55,7 @@ class SequenceFlow(nn.Module):
     """Estimates residual flow from frames. It has no parameters and no buffers.
 
     Args:
-        preset: "default", "fast", "offline", "keypoints" or "paper" (`make_config`).
+        preset: "default", "offline", "keypoints" or "paper" (`make_config`).
         device: "auto" = that of the given tensors, else a GPU if there is one, else the CPU.
         ground: None = the masks of the frames exclude the ground (`with_ground=False`). "auto" or "patchwork" = also
             find it in every sweep.

@@ -1,1 +1,1 @@
-"""Ours, presets `default` and `fast`: motion candidates, verified; `method.py` is the page to read first."""
+"""Ours, presets `default` and `offline`: motion candidates, verified; `method.py` is the page to read first."""

@@ -33,7 +33,7 @@ _AROUND = 4.0
 
 
 class VerifiedFlow(SceneFlowModel):
-    """Estimate flow by verified motion candidates: the presets `default`, `fast` and `offline`. It has no parameters.
+    """Estimate flow by verified motion candidates: the presets `default` and `offline`. It has no parameters.
 
     Args:
         config: a `VerifiedConfig`; `VerifiedFlow.from_preset` makes it from a preset.
@@ -41,7 +41,7 @@ class VerifiedFlow(SceneFlowModel):
     Examples:
         >>> import torch
         >>> from cflow_torch import Sweep, VerifiedFlow, Window
-        >>> model = VerifiedFlow.from_preset("fast")
+        >>> model = VerifiedFlow.from_preset("default")
         >>> car = 0.1 * torch.cartesian_prod(torch.arange(45.0), torch.arange(18.0), torch.arange(15.0)) + 5.05
         >>> window = Window(pc0=Sweep(car), pc1=Sweep(car + torch.tensor([0.5, 0.0, 0.0])))
         >>> (result,) = model([window])

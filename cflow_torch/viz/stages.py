@@ -3,7 +3,7 @@
 Occupancy images show sweep t in blue, t+1 in red, and pixels of both in a dark colour.
 
 We record a run of the model from scale to scale, and call the functions of the finest scale once more. The presets
-default and fast weigh the motions of all scales together, so they have none of these.
+default and offline weigh the motions of all scales together, so they have none of these.
 """
 
 from __future__ import annotations

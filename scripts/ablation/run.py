@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Compare presets and settings on real and simulated sets (sets.py), in one Markdown table.
 
-  python scripts/ablation/run.py --presets paper fast default --sets real merged
+  python scripts/ablation/run.py --presets paper default --sets real merged
   python scripts/ablation/run.py --set --set significance=3 --set num_history=0    `default`, and two changes of it
   python scripts/ablation/run.py --sets scenes "kitti h=4"                         single sets by their names
 

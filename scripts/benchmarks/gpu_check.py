@@ -55,7 +55,6 @@ VARIANTS: dict[str, tuple[Config, int]] = {
     "preset default": (DEFAULT, 3),
     "preset default, h = 0": (DEFAULT.replace(num_history=0), 3),
     "preset default, max_memory 30 MB": (DEFAULT.replace(max_memory=LITTLE), 3),
-    "preset fast": (make_config("fast"), 3),
 }
 MEASURED: dict[str, Config] = {
     "dense, h = 4, 5 scales": VARIANTS["dense, h = 4, 5 scales"][0],

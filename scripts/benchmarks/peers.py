@@ -46,7 +46,7 @@ from cflow_torch.evaluation.frame import EvalFrame, ego_motion_flow
 from cflow_torch.evaluation.scored_points import score_points
 from cflow_torch.types import Window, as_numpy
 
-OURS = ("default", "fast", "paper", "keypoints")
+OURS = ("default", "paper", "keypoints")
 HARNESS = {  # name -> YAML file and class of the model in the checkout
     "icpflow": ("icpflow", "ICPFlow"),
     "icpflow-author": ("icpflow", "ICPFlow"),
@@ -303,7 +303,7 @@ def main() -> None:
     given = parser.parse_args()
     torch.set_num_threads(1)
     rows = {key(row): row for file in given.merge for row in json.loads(file.read_text())}
-    runs = [(name, history) for name in given.methods for history in (given.history if name in OURS[:3] else (0,))]
+    runs = [(name, history) for name in given.methods for history in (given.history if name in OURS[:2] else (0,))]
     all_cases = [each for path in given.paths for each in cases(path, given)]
     for name, history in runs if all_cases else []:
         try:

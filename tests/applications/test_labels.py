@@ -26,7 +26,7 @@ spatial = pytest.importorskip("scipy.spatial")
 
 KEYS = {"dufo": np.uint8, "cluster": np.int16, "dufocluster": np.int16, "nnd": np.uint8, "ground_mask": np.bool_}
 SMALL = "model.point_cloud_range=[-25,-25,-inf,25,25,inf]"
-CALL = ["label", "model=fast", SMALL, "engine.workers=1", "data.check=false"]
+CALL = ["label", "model=default", "model.num_history=0", SMALL, "engine.workers=1", "data.check=false"]
 
 
 @pytest.fixture(scope="module")
@@ -151,7 +151,7 @@ def test_ground_is_estimated_only_where_the_mask_is_missing(scenes: Path) -> Non
         del scene[names[1]]["ground_mask"]
         scene[names[2]]["ground_mask"][...] = before[2]["ground_mask"] & (np.arange(len(before[2]["lidar"])) % 2 == 0)
         given = scene[names[2]]["ground_mask"][()]
-    label_scene(file, make_model(make_config("fast"), "cpu"))
+    label_scene(file, make_model(make_config(num_history=0), "cpu"))
     after = stored(file)
     np.testing.assert_array_equal(after[2]["ground_mask"], given)
     found, truth = after[1]["ground_mask"], before[1]["ground_mask"]
@@ -165,7 +165,7 @@ def test_existing_labels_are_replaced_only_with_overwrite(scenes: Path, tmp_path
             scene[name]["dufo"] = np.full(len(scene[name]["lidar"]), 7, np.int64)
     before = file.read_bytes()
     with pytest.raises(CFlowError, match="already has labels: overwrite=true"):
-        label_scene(file, make_model(make_config("fast"), "cpu"))
+        label_scene(file, make_model(make_config(num_history=0), "cpu"))
     assert label(scenes, output) == 2
     error = capsys.readouterr().err
     assert "scene-2.h5 has labels of other settings or of another program: give overwrite=true" in error
@@ -232,7 +232,7 @@ def test_broken_scenes_are_reported_and_the_others_labelled(scenes: Path, tmp_pa
         ("{}", "no scene in {}"),
         ("{}/nowhere", "nowhere: there is no such file or folder"),
         ("data=av2 data.root={}", "labels are written into HDF5 scenes of OpenSceneFlow"),
-        ("{} model=paper", "give model=offline, default or fast"),
+        ("{} model=paper", "give model=offline or default"),
     ],
 )
 def test_a_wrong_call_is_one_clear_error(call: str, message: str, tmp_path: Path, capsys: Any) -> None:
@@ -242,7 +242,7 @@ def test_a_wrong_call_is_one_clear_error(call: str, message: str, tmp_path: Path
 
 
 def test_flow_of_another_log_is_refused(scenes: Path) -> None:
-    model = make_model(make_config("fast"), "cpu")
+    model = make_model(make_config(num_history=0), "cpu")
     with HDF5Log(scenes / "scene-1.h5") as log:
         flows = [model([each])[0] for each in windows(log, 2)]
         for wrong, message in ((flows[:-1], "has 3 flows"), ([*flows[1:], flows[0]], "rows of another sweep")):

@@ -72,7 +72,7 @@ def test_few_sweeps_are_kept_and_buffers_may_be_reused(sweeps: list[Sweep]) -> N
 def test_late_and_repeated_sweeps_are_skipped_and_gaps_start_again(
     sweeps: list[Sweep], caplog: pytest.LogCaptureFixture
 ) -> None:
-    settings = small("fast", num_history=2)
+    settings = small("default", num_history=2)
     stream = FlowStream(config=settings, max_gap=0.5)
     for sweep in sweeps[:3]:
         last = push(stream, sweep)
@@ -90,7 +90,7 @@ def test_late_and_repeated_sweeps_are_skipped_and_gaps_start_again(
 
 
 def test_times_in_seconds_and_missing_times_give_the_same_flow(sweeps: list[Sweep]) -> None:
-    settings = small("fast", num_history=2, max_speed=8.0)
+    settings = small("default", num_history=2, max_speed=8.0)
     regular = [replace(sweep, timestamp_ns=None) for sweep in sweeps]
     stream, by_second = FlowStream(config=settings), FlowStream(config=settings)
     for index, sweep in enumerate(regular[:4]):
@@ -114,7 +114,7 @@ BAD = [
 def test_a_bad_sweep_is_refused_and_the_stream_goes_on(
     bad: dict, message: str, first: bool, sweeps: list[Sweep]
 ) -> None:
-    settings = small("fast", num_history=2)
+    settings = small("default", num_history=2)
     stream = FlowStream(config=settings)
     good = sweeps[:3]
     for sweep in good[: 0 if first else 2]:
@@ -141,12 +141,12 @@ def test_settings_that_a_stream_cannot_have_are_refused(settings: dict, message:
 
 def test_a_sweep_with_more_is_refused(sweeps: list[Sweep]) -> None:
     with pytest.raises(CFlowError, match="into the Sweep"):
-        FlowStream("fast").push(sweeps[0], sweeps[0].pose)
+        FlowStream("default").push(sweeps[0], sweeps[0].pose)
 
 
 def test_missing_ground_and_poses_are_estimated() -> None:
     drive = make_drive(seed=2, num_sweeps=4, profile="demo")
-    stream = FlowStream("fast", ground="auto")
+    stream = FlowStream("default", num_history=0, ground="auto")
     if find_spec("kiss_icp") is None:
         with pytest.raises(CFlowError, match="pip install kiss-icp"):
             stream.push(drive.sweep(0).points)
@@ -162,7 +162,7 @@ def test_missing_ground_and_poses_are_estimated() -> None:
 
 def test_the_command_reports_latency(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     data = ("data.num_sweeps=4", f"data.cache={tmp_path / 'cache'}")
-    assert cflow("stream", *data, "model=fast", "pace=null", f"output={tmp_path / 'out'}") == 0
+    assert cflow("stream", *data, "model.num_history=0", "pace=null", f"output={tmp_path / 'out'}") == 0
     report = json.loads((tmp_path / "out" / "stream.json").read_text())
     assert report["sweeps"] == 4 and report["results"] == 3 and report["in_time"] is None
     assert 0 < report["latency"]["p50"] <= report["latency"]["p99"] and "latency: median" in capsys.readouterr().out

@@ -29,12 +29,13 @@ def calls_on_a_drive(folder: Path, num_sweeps: int = 4) -> Callable[..., int]:
 
 def test_resumed_and_sharded_runs_write_the_same_table(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     call = calls_on_a_drive(tmp_path, 5)
-    run = ("model=fast", "engine.workers=1", "tracks=true")
+    run = ("model.num_history=0", "engine.workers=1", "tracks=true")
     assert call("flow", "whole", *run) == 0
     (file,) = (tmp_path / "whole").glob("*/tracks.parquet")
     whole = read_tracks(file)
     assert len(whole["id"]) > 5 and set(whole["sweep"]) <= set(range(4)) and not np.isnan(whole["confidence"]).any()
-    model, (source,) = make_model(make_config("fast", point_cloud_range=RANGE)), find_sources("av2", tmp_path / "data")
+    model = make_model(make_config(num_history=0, point_cloud_range=RANGE))
+    (source,) = find_sources("av2", tmp_path / "data")
     log = open_log("av2", source)
     flow = [model([sweeps])[0] for sweeps in windows(log, model.config.num_history)]
     expected = track(log, enumerate(flow))
@@ -62,7 +63,7 @@ def test_the_viewer_shows_all_tracks(tmp_path: Path, monkeypatch: pytest.MonkeyP
     from cflow_torch.viz import recording
 
     call, shown = calls_on_a_drive(tmp_path, 6), []
-    assert call("flow", "flow", "model=fast", "tracks=true", "engine.workers=1") == 0
+    assert call("flow", "flow", "model.num_history=0", "tracks=true", "engine.workers=1") == 0
     add = recording._Drive.add_tracks
     monkeypatch.setattr(recording._Drive, "add_tracks", lambda self, rows: (shown.append(rows), add(self, rows)))
     assert call("view", "view", "format=rerun", f"flow={tmp_path / 'flow'}") == 0

@@ -48,21 +48,21 @@ def evaluate(cflow: Cflow, log_folder: Path, tmp_path: Path) -> Cflow:
 
 def test_demo_writes_all_its_files(tmp_path: Path, cache: Path, cflow: Cflow, capsys: pytest.CaptureFixture) -> None:
     pytest.importorskip("matplotlib")
-    assert cflow("demo", f"output={tmp_path}", "data.num_sweeps=2", "pair=0", "model=fast", SMALL) == 0
+    assert cflow("demo", f"output={tmp_path}", "data.num_sweeps=2", "pair=0", "model.num_history=0", SMALL) == 0
     (log,) = (AV2Log(folder) for folder in cache.glob("*-2/*/*"))
     assert [file.stem for file in (tmp_path / log.log_id).iterdir()] == [str(log.timestamps[0])]
     scores = results_of(tmp_path)
     assert scores["results"]["num_frames"] == 1 and 0 < scores["results"]["three_way"]["epe_fd"] < 2
     left: Any = OmegaConf.to_container(OmegaConf.load(tmp_path / "config.yaml").model)
     region = (-20.0, -20.0, -np.inf, 20.0, 20.0, np.inf)
-    assert config_from(left) == make_config("fast", point_cloud_range=region)
+    assert config_from(left) == make_config(num_history=0, point_cloud_range=region)
     assert (tmp_path / "flow.png").read_bytes().startswith(b"\x89PNG")
     printed = capsys.readouterr().out
     assert re.search("^mean dynamic error 0[.]", printed, re.MULTILINE)  # Python 3.8 has no k3d, which is said before
     assert f"picture: {tmp_path / 'flow.png'}" in printed and "CAR" in printed
     if find_spec("k3d"):
         assert f"3-D page, for any browser: {tmp_path / 'flow.html'}" in printed
-        assert '"preset":"fast"' in (tmp_path / "flow.html").read_text(encoding="utf-8")
+        assert '"preset":"default"' in (tmp_path / "flow.html").read_text(encoding="utf-8")
     assert not list(tmp_path.rglob(".*")), "no temporary file is left"
 
 

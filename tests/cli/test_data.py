@@ -50,8 +50,8 @@ def test_an_unknown_or_ambiguous_format_is_an_error(tmp_path: Path) -> None:
 
 
 def test_a_path_by_itself_is_the_data_root() -> None:
-    call = ["-m", "/a b/c", "model=paper,fast", "--config-dir", "conf", "-p", "model"]
-    assert split(call) == (['data.root="/a b/c"', "model=paper,fast"], ["-m", "--config-dir", "conf", "-p", "model"])
+    call = ["-m", "/a b/c", "model=paper,default", "--config-dir", "conf", "-p", "model"]
+    assert split(call) == (['data.root="/a b/c"', "model=paper,default"], ["-m", "--config-dir", "conf", "-p", "model"])
 
 
 # ---------------------------------------------------------------- your own reader

@@ -33,7 +33,7 @@ def test_help_explains_a_command_with_examples_and_settings(
     text = capsys.readouterr().out
     assert text.startswith(f"cflow {command}: {COMMANDS[command]}") and f"\nexamples:\n  cflow {command}" in text
     if (CONFIGS / f"{command}.yaml").exists():
-        assert "; default outputs/" in text and "\n  model=default|fast|offline|paper|keypoints\n" in text
+        assert "; default outputs/" in text and "\n  model=default|offline|paper|keypoints\n" in text
     assert cflow("help", command) == 0
     assert capsys.readouterr().out == text
 
@@ -46,16 +46,17 @@ PLAIN = (
     ("fliw", "unknown command 'fliw' (did you mean flow?): give one of demo, flow,"),
     ("eval modle=paper", "unknown setting 'modle' (did you mean model?): `cflow eval --cfg job`"),
     ("flow num_history=2", "(did you mean model.num_history?)"),
-    ("eval model=papr", "model=papr (did you mean paper?): give one of default, fast, keypoints, offline, paper"),
+    ("eval model=papr", "model=papr (did you mean paper?): give one of default, keypoints, offline, paper"),
+    ("eval model=fast", "preset 'fast' was removed in 0.4.0: use default with num_history=2"),
     ("eval model.densify=nearest", "densify is a setting of method keypoints, not of verified"),
     ("eval model.num_history=-1", "num_history=-1: give a whole number of at least 0"),
     ("plot cluster=3", "setting 'cluster' belongs to picture=correlation or picture=scales: give that as well"),
     ("flow data=av2", "the data is missing: give data.root=PATH"),
-    ("flow fast", "fast: there is no such file or folder; settings are NAME=VALUE"),
+    ("flow paper", "paper: there is no such file or folder; settings are NAME=VALUE"),
     ("flow data=av2 data.root=/no/such/folder", "/no/such/folder"),
     ("completion", "one of bash, zsh, fish, got nothing"),
     ("clean standing=true", "setting standing was removed: use remove_stopped"),
-    ("eval -m model=fast,papr", "model=papr (did you mean paper?)"),
+    ("eval -m model=default,papr", "model=papr (did you mean paper?)"),
     ("eval model.num_history=1.5", "num_history=1.5: give a whole number of at least 0"),
     ("eval --bogus", "unknown option '--bogus'"),
     ("submit masks=none", "masks=none: there is no such file or folder"),
@@ -72,7 +73,7 @@ OTHERS = (
     ("plot log=1e5 data.num_sweeps=2", "log=1e5: there is no such log"),
     ("plot pair=1.5", "pair=1.5: Value '1.5' of type 'float' could not be converted to Integer"),
     ("plot picture=animation width=abc", "width=abc: Value 'abc'"),
-    ("flow contents=[confidence] model=paper", "only model=default, fast and offline have a confidence"),
+    ("flow contents=[confidence] model=paper", "only model=default and offline have a confidence"),
 )
 
 

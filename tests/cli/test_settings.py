@@ -56,7 +56,7 @@ def test_examples_use_existing_settings_and_choices() -> None:
 
 def test_calls_for_hydra_are_not_refused_before_it() -> None:
     for call in (
-        "-m model.pixel_sizes=[0.1],[0.2,0.1] model=paper,fast",
+        "-m model.pixel_sizes=[0.1],[0.2,0.1] model=paper,default",
         "experiment=history model.num_history=0,12 model.clustering=hdbscan",
         "model.max_speed=1e2 model.max_memory=null hydra.sweeper.n_trials=5 hydra/launcher=joblib",
         "+data.mine=1 ~experiment",
@@ -145,10 +145,7 @@ def test_the_page_lists_every_setting(cflow: Cflow, capsys: pytest.CaptureFixtur
     rows = [line[2:-2].split(" | ") for line in page.splitlines() if line.startswith("| `model.")]
     assert len(rows) == sum(len(fields(kind)) for kind in METHODS.values())
     name, *cells = next(row for row in reversed(rows) if row[0] == "`model.num_history`")
-    assert (
-        cells[:3] == ["`0`", "default `4`, fast `2`, offline `4`", "a whole number of at least 0"]
-        and "sweeps" in cells[3]
-    )
+    assert cells[:3] == ["`0`", "default `4`, offline `4`", "a whole number of at least 0"] and "sweeps" in cells[3]
     assert "dense \\| keypoints" in page, "bars in cells are escaped"
     for file in CONFIGS.glob("data/*.yaml"):
         assert f"\n## data={file.stem}\n" in page and file.read_text().strip() in page
@@ -163,7 +160,7 @@ def test_the_page_lists_every_setting(cflow: Cflow, capsys: pytest.CaptureFixtur
         ),
         ("shard.index", ["shard.index: index of this process", "default auto: cflow flow, cflow label"]),
         ("data", ["data=av2 ", "data=hdf5 "]),
-        ("fast", ["## Method `verified`", "| `model.significance` | `1.5` |"]),
+        ("offline", ["## Method `verified`", "| `model.significance` | `1.5` |"]),
         ("flow", ["## cflow flow", "contents: ", "flow: output folder of `cflow flow`", "null: cflow clean"]),
     ],
 )

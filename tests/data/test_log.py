@@ -87,7 +87,7 @@ def test_windows_read_each_sweep_once(drive: Drive) -> None:
 
 
 def test_a_data_loader_with_workers_equals_the_loop(drive: Drive) -> None:
-    model = make_model(make_config("fast", num_history=2))
+    model = make_model(make_config(num_history=2))
     data = WindowDataset([drive, make_drive(seed=2, num_sweeps=3, profile="demo")], num_history=2)
     assert len(WindowDataset(drive)) == 4
     loader: Any = DataLoader(data, batch_size=2, num_workers=2, collate_fn=data.collate)

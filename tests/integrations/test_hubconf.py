@@ -29,10 +29,10 @@ def hubconf() -> ModuleType:
 
 def test_hub_loads_the_model_of_the_preset():
     window = scene(0, num_history=1)
-    model = torch.hub.load(ROOT, "cflow", source="local", preset="fast", device="cpu", num_history=1)
-    assert model.config == make_config("fast", num_history=1)
+    model = torch.hub.load(ROOT, "cflow", source="local", preset="paper", device="cpu", num_history=1)
+    assert model.config == make_config("paper", num_history=1)
     assert torch.hub.load(ROOT, "cflow", source="local").config == make_config()
-    assert_same(model([window])[0], make_model(make_config("fast", num_history=1))([window])[0])
+    assert_same(model([window])[0], make_model(make_config("paper", num_history=1))([window])[0])
 
 
 def test_hub_needs_no_other_dependencies(hubconf, tmp_path):

@@ -30,7 +30,7 @@ SMALL = {"pixel_sizes": [0.25], "point_cloud_range": list(RANGE)}
 VARIANTS: dict[str, dict[str, Any]] = {
     "dense": {"method": "dense", "num_frames": 6, **SMALL, "max_extent": 5.0},
     # Batches contain no ground, so no height above ground is known.
-    "verified": {"preset": "fast", "num_frames": 6, **SMALL, "min_height": None, "significance": 0.0},
+    "verified": {"preset": "default", "num_frames": 6, **SMALL, "min_height": None, "significance": 0.0},
     "keypoints": {**SMALL, "method": "keypoints", "patch_size": 11, "ratio_threshold": 1.0, "pixel_sizes": [0.1]},
 }
 EGO_T_LIDAR = np.array([[0.8, -0.6, 0, 1.35], [0.6, 0.8, 0, 0.2], [0, 0, 1, 1.6], [0, 0, 0, 1]])
@@ -230,7 +230,7 @@ def test_the_error_names_the_bad_key_of_a_batch(what: str, key: str, drive: list
 
 
 def test_settings_of_the_method_and_others() -> None:
-    assert CFlow().config == make_config() and CFlow(preset="fast").config == make_config("fast")
+    assert CFlow().config == make_config() and CFlow(preset="paper").config == make_config("paper")
     assert CFlow(method="dense", num_frames=4).config == make_config("paper", num_history=2)
     assert CFlow(method="keypoints", num_frames=2).config == make_config("keypoints")
     assert CFlow(pixel_size=0.2, voxel_size=[1], grid_feature_size=[1]).config == make_config(pixel_size=0.2)
@@ -239,7 +239,7 @@ def test_settings_of_the_method_and_others() -> None:
         model = CFlow(num_iters=4, proof=False, patch_size=11, labeling="kornia", significance=2.0)
     assert len(caught) == 1 and model.config == make_config(significance=2.0)
     wrong: list[dict[str, Any]] = [{"output": "half"}, {"num_frames": 1}, {"num_frames": 2.5}, {"ego_T_lidar": "yes"}]
-    wrong += [{"method": "keypoints", "num_frames": 6}, {"method": "dense", "preset": "fast"}]
+    wrong += [{"method": "keypoints", "num_frames": 6}, {"method": "dense", "preset": "default"}]
     for settings in (*wrong, {"pixel_sizes": [0.1, 0.2]}, {"ego_T_lidar": [[1, 2], [3, 4]]}):
         with pytest.raises(CFlowError):
             CFlow(**settings)
@@ -259,7 +259,7 @@ def test_checkpoint_without_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         write_checkpoint()
 
 
-PRESETS = {"cflow": "default", "cflow_fast": "fast", "cflow_paper": "paper", "cflow_keypoints": "keypoints"}
+PRESETS = {"cflow": "default", "cflow_paper": "paper", "cflow_keypoints": "keypoints"}
 
 
 @pytest.mark.parametrize("name", PRESETS)

@@ -231,7 +231,7 @@ def test_save_writes_the_flow_of_cflow_flow(harness: Harness, checkpoint: Path, 
 def test_seflow_trains_on_labels_of_cflow_label(harness: Harness, data: Path, tmp_path: Path) -> None:
     """SeFlow's data loader reads the labels, and one step of train.py uses all four terms of its loss."""
     shutil.copytree(data / "test", tmp_path / "train")
-    assert cflow("label", tmp_path / "train", f"output={tmp_path / 'out'}", "model=fast", "engine.workers=1") == 0
+    assert cflow("label", tmp_path / "train", f"output={tmp_path / 'out'}", "model=default", "engine.workers=1") == 0
     losses = {"chamfer_dis": 1.0, "static_flow_loss": 1.0, "dynamic_chamfer_dis": 1.0, "cluster_based_pc0pc1": 1.0}
     terms = ", ".join(f"{name}: {weight}" for name, weight in losses.items())
     folders = [f"train_data={tmp_path / 'train'}", f"val_data={data / 'val'}", "num_workers=0"]

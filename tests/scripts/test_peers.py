@@ -31,18 +31,18 @@ def test_rows_of_a_scene(script: Any, scene: Path, tmp_path: Path, monkeypatch: 
     call = ["peers.py", str(scene), "--start", "2", "--history", "0", "2", "--json", str(file)]
     monkeypatch.setattr(sys, "argv", [*call, "--methods", "zero", "nearest", "nsfp"])
     peers.main()
-    monkeypatch.setattr(sys, "argv", [*call, "--merge", str(file), "--methods", "fast", "zero"])
+    monkeypatch.setattr(sys, "argv", [*call, "--merge", str(file), "--methods", "default", "zero"])
     peers.main()
     printed = capsys.readouterr()
     assert "skipped nsfp: give --opensceneflow PATH" in printed.err
     rows = {(row["method"], row["history"]): row for row in json.loads(file.read_text())}
     assert len(json.loads(file.read_text())) == len(rows) == 4
-    (zero, nearest, fast, older) = (rows[key] for key in (("zero", 0), ("nearest", 0), ("fast", 0), ("fast", 2)))
+    (zero, nearest, ours, older) = (rows[key] for key in (("zero", 0), ("nearest", 0), ("default", 0), ("default", 2)))
     assert zero["ratio"] == pytest.approx(1) and zero["static"] < 1e-5 and zero["dynamic"] > 0.1
-    assert fast["dynamic"] < 0.5 * zero["dynamic"] and older["dynamic"] < 0.5 * zero["dynamic"]
-    assert 0.2 * zero["dynamic"] < nearest["dynamic"] and nearest["static"] > 2 * fast["static"]
+    assert ours["dynamic"] < 0.5 * zero["dynamic"] and older["dynamic"] < 0.5 * zero["dynamic"]
+    assert 0.2 * zero["dynamic"] < nearest["dynamic"] and nearest["static"] > 2 * ours["static"]
     lines = printed.out.splitlines()[-4:-1]
-    assert [line.split(" | ")[0] for line in lines] == ["| fast", "| zero", "| nearest"]
+    assert [line.split(" | ")[0] for line in lines] == ["| default", "| zero", "| nearest"]
     assert f"{zero['dynamic']:.3f} / 1.00 / 0.0" in lines[1]
 
 

@@ -27,11 +27,10 @@ def crossing(x: float, speed: float, num_history: int) -> Window:
     return Window(own, newest, tuple(older))
 
 
-@pytest.mark.parametrize("preset", ["default", "fast"])
 @pytest.mark.parametrize("where", [6.4, 7.6, 9.0])
 @pytest.mark.parametrize("speed", [1.4, -1.2])
-def test_what_crosses_the_border_has_its_motion_and_not_another(preset, where, speed):
-    settings = make_config(preset, point_cloud_range=REGION)
+def test_what_crosses_the_border_has_its_motion_and_not_another(where, speed):
+    settings = make_config("default", point_cloud_range=REGION)
     window = crossing(where, speed, settings.num_history)
     result = flow_as_oracle(window, settings)
     inside = torch.as_tensor(np.abs(window.pc0.points[:, 0]) <= 8.0)
@@ -41,9 +40,8 @@ def test_what_crosses_the_border_has_its_motion_and_not_another(preset, where, s
     assert not result.residual_flow[240:].any()
 
 
-@pytest.mark.parametrize("preset", ["default", "fast"])
-def test_what_lies_in_the_margin_has_no_result(preset):
-    settings = make_config(preset, point_cloud_range=REGION)
+def test_what_lies_in_the_margin_has_no_result():
+    settings = make_config("default", point_cloud_range=REGION)
     result = VerifiedFlow(settings)([crossing(10.2, 1.4, settings.num_history)])[0]
     for values, none in ((result.is_valid, 0), (result.residual_flow, 0), (result.score, 0), (result.confidence, 0)):
         assert not (values[:240] != none).any()

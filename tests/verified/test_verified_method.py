@@ -38,15 +38,13 @@ def test_equals_the_oracle_on_random_scenes(seed):
     flow_as_oracle(scene(300 + seed, num_history=seed % 4, poses=seed % 5 > 0, stamps=seed % 2 > 0), settings)
 
 
-@pytest.mark.parametrize("preset", ["default", "fast"])
-def test_presets_equal_the_oracle(preset):
-    settings = make_config(preset, point_cloud_range=MODEL.point_cloud_range)
+def test_the_preset_equals_the_oracle():
+    settings = make_config("default", point_cloud_range=MODEL.point_cloud_range)
     assert flow_as_oracle(turning_car(5, settings.num_history, 0.5), settings).residual_flow.any()
 
 
-@pytest.mark.parametrize("preset", ["default", "fast"])
-def test_a_part_of_the_real_pair_equals_the_oracle(av2_folder, preset):
-    settings = make_config(preset, point_cloud_range=NEAR, max_object_length=6.0)
+def test_a_part_of_the_real_pair_equals_the_oracle(av2_folder):
+    settings = make_config("default", point_cloud_range=NEAR, max_object_length=6.0)
     result = flow_as_oracle(window_of(AV2Log(av2_folder), 0), settings)
     assert (result.residual_flow.norm(dim=1) >= 0.05).sum() > 500  # there is something to find
 
@@ -59,9 +57,8 @@ def test_a_part_of_kitti_equals_the_oracle(kitti_file, num_history):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("preset", ["default", "fast"])
-def test_more_of_real_drives_equals_the_oracle(av2_folder, data_root, preset):
-    settings = make_config(preset, point_cloud_range=WIDER)
+def test_more_of_real_drives_equals_the_oracle(av2_folder, data_root):
+    settings = make_config("default", point_cloud_range=WIDER)
     flow_as_oracle(window_of(AV2Log(av2_folder), 0), settings)
     with HDF5Log(data_root / "av2-crown" / "av2-crown.h5") as log:
         flow_as_oracle(window_of(log, len(log) - 2, settings.num_history), settings)

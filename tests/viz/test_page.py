@@ -193,10 +193,10 @@ def browser() -> Iterator[Any]:
 @pytest.fixture(scope="module")
 def drive_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A simulated drive: four sweeps, with labels and tracks."""
-    drive, model = make_drive(seed=3, num_sweeps=4, profile="demo"), make_model(make_config("fast"))
+    drive, model = make_drive(seed=3, num_sweeps=4, profile="demo"), make_model(make_config(num_history=2))
     results = [(i, model([window(drive, i, model.config.num_history)])[0]) for i in range(3)]
     table, path = track(drive, results), tmp_path_factory.mktemp("drive") / "drive.html"
-    save_page(drive, results, path, tracks=lambda: table, preset="fast")
+    save_page(drive, results, path, tracks=lambda: table, preset="default")
     assert path.stat().st_size < 3e6
     return path
 
@@ -226,7 +226,7 @@ def test_a_browser_shows_plays_and_recolours_a_drive(browser: Any, drive_page: P
     tab.on("pageerror", lambda error: errors.append(str(error)))
     tab.goto(drive_page.as_uri())
     tab.wait_for_function("window.viewer && viewer.ready", timeout=60_000)
-    assert tab.locator("h1").inner_text() and "preset fast" in tab.locator("#head").inner_text()
+    assert tab.locator("h1").inner_text() and "preset default" in tab.locator("#head").inner_text()
     anchors = tab.evaluate(ANCHORS)
     for name in ("arrows", "boxes", "trails", "labels", "rings"):  # only points are left
         tab.locator(f"#show-{name}").uncheck()

@@ -189,8 +189,8 @@ def test_empty_windows_are_drawn_or_refused() -> None:
     ("plot", "settings", "message"),
     [
         (plot_correlation, make_config("default"), r"method=verified.*model=paper"),
-        (plot_scales, make_config("fast"), r"method=verified.*model=paper"),
-        (plot_keypoints, make_config("fast"), r"method=verified.*model=keypoints"),
+        (plot_scales, make_config("default"), r"method=verified.*model=paper"),
+        (plot_keypoints, make_config("default"), r"method=verified.*model=keypoints"),
         (plot_keypoints, paper(), "method=dense has no key points.*model=keypoints"),
         (plot_correlation, keypoints(), "method=keypoints has no correlation map.*model=paper"),
         (plot_correlation, paper(clustering="hdbscan"), "model=paper"),
