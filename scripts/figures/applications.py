@@ -145,7 +145,7 @@ def stream(file: Path) -> None:
     axes.axhline(1000 * INTERVAL, color="0.6", linewidth=0.8)
     axes.text(0, 1000 * INTERVAL, "the next sweep", ha="left", va="top", color="0.4", fontsize=8)
     axes.set(xlabel="sweep", ylabel="latency on one core (ms)", ylim=(0, None))
-    axes.legend(frameon=False, ncols=2, loc="upper left", fontsize=8)
+    figure.legend(frameon=False, ncols=4, loc="outside upper center", fontsize=8)
     figure.savefig(file, dpi=110)
 
 
