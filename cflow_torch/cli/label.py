@@ -10,7 +10,7 @@ completes the flow of a scene labels it. The exit statuses are those of `cflow f
 examples:
   cflow label /data/scenes/train
   cflow label /data/scenes/train dry_run=true                 counts the frames
-  cflow label /data/scenes/train model=default                no later sweeps: faster, finds less
+  cflow label /data/scenes/train model=default                half the time, finds fewer people
   cflow label /data/scenes/train shard.index=2 shard.count=16
 """
 

@@ -158,7 +158,7 @@ def main() -> None:
     parser.add_argument("paths", type=Path, nargs="*", help="labelled HDF5 scenes, or folders of them")
     parser.add_argument("--sensor-height", type=float, default=0.0, help="metres of the LiDAR above the points' origin")
     parser.add_argument("--simulated", nargs="*", default=[], choices=tuple(FORMATS), metavar="SENSOR")
-    parser.add_argument("--presets", nargs="+", default=["offline"])
+    parser.add_argument("--presets", nargs="+", default=["offline", "default"])
     parser.add_argument("--num-sweeps", type=int, default=8, help="of a simulated drive")
     given = parser.parse_args()
     torch.set_num_threads(1)

@@ -139,7 +139,7 @@ def stream(file: Path) -> None:
     figure, axes = plt.subplots(figsize=(7.0, 2.6), layout="constrained")
     for preset, num_history in (("default", 4), ("default", 2), ("default", 0), ("paper", 0)):
         ms = 1000 * np.array(latencies(FlowStream(preset, num_history=num_history, device="cpu"), sweeps))
-        name = f"{preset}, num_history={num_history}"
+        name = f"{preset}, h = {num_history}"
         print(f"{name}: median {np.median(ms):.0f} ms, 99 % within {np.percentile(ms, 99):.0f} ms")
         axes.plot(range(1, STREAMED), ms, ".-", label=name)
     axes.axhline(1000 * INTERVAL, color="0.6", linewidth=0.8)
