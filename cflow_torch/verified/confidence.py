@@ -25,8 +25,8 @@ from cflow_torch.verified.paired_test import count_wins
 from cflow_torch.verified.rigid_motion import RigidMotion
 
 # Bounds of the bins and the probabilities, written by scripts/ablation/calibrate_confidence.py. Bins, in order: left
-# out; unlinked, by `crowd`; static, by `share`; static beside a moving object; moving, by `margin`: pairs near, pairs far,
-# with history near and far.
+# out; unlinked, by `crowd`; static, by `share`; static beside a moving object; moving, by `margin`: pairs near, pairs
+# far, with history near and far.
 TABLE = json.loads(Path(__file__).with_name("confidence.json").read_text(encoding="utf-8"))
 _BLOCK = 1.6  # metres, sides of a neighbourhood
 _DISPLACEMENT = 0.4  # metres per interval, along x and along y
