@@ -139,11 +139,10 @@ def confidence_of(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMoti
 
 
 def _is_beside(sweeps: HeightSlicedSweeps, moves: Tensor) -> Tensor:
-    """(P,) bool: one of the 3 x 3 pixels around each pixel, or a copy of it, moves in the same sweep; (P,) bool."""
+    """(P,) bool: one of the 3 x 3 pixels around each pixel moves, in the same sweep; (P,) bool."""
     some = sweeps.pixels.take(flat_nonzero(moves))
     dy, dx = constant(((-1, -1, -1, 0, 0, 0, 1, 1, 1), (-1, 0, 1) * 3), torch.int64, moves.device)
-    window = some.window % len(sweeps.batch.rows)  # that of a copy is the window of the pixel itself
-    index = sweeps.index(window[:, None], some.step[:, None], some.row[:, None] + dy, some.col[:, None] + dx)
+    index = sweeps.index(some.window[:, None], some.step[:, None], some.row[:, None] + dy, some.col[:, None] + dx)
     is_beside = lazy_zeros(sweeps.image.numel(), torch.bool, moves.device).index_fill_(0, index.view(-1), True)
     return is_beside.index_select(0, sweeps.pixels.index)
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from cflow_torch.ops.indices import flat_nonzero, gather, renumber
+from cflow_torch.ops.indices import flat_nonzero, gather, renumber, scatter_count
 from cflow_torch.verified.aperture import slides_along_itself
 from cflow_torch.verified.component_tree import Nodes
 from cflow_torch.verified.height_slices import NUM_SLICES, OWN, HeightSlicedSweeps, Pixels, count_slices
@@ -18,6 +18,8 @@ _AT_ONCE_CPU, _AT_ONCE_GPU = 1 << 18, 1 << 24
 _FAR = 2  # pixels, in y or in x
 _COVERED = 65  # per cent
 _CHANGED_Z = 4.0
+# A motion must gain so many slices for each sweep besides t and t+1, or one for so many pixels, whichever is less.
+_LEAST_GAIN, _LEAST_SHARE = 5, 12
 
 
 def verify(
@@ -33,18 +35,21 @@ def verify(
         significance: z of all other nodes.
 
     Returns:
-        motion: (N, 2) float64, (y, x), finest pixels per sweep interval; 0 = none is significant.
+        motion: (N, 2) float64, (y, x), finest pixels per sweep interval; 0 = none is significant, or gains enough.
         evidence: (N,) int64, of that motion, sixteenths of a slice.
     """
     tested = flat_nonzero((candidates != 0).any(2).any(1))  # other nodes are static and cost nothing
     node = renumber(tested, nodes.count).index_select(0, nodes.node)
     some = flat_nonzero(node < len(tested))
     members, node = nodes.members.take(some), node.index_select(0, some)
-    level, travels, candidates_of = gather(tested, nodes.level, nodes.travels, candidates)
+    level, travels, window, candidates_of = gather(tested, nodes.level, nodes.travels, nodes.window, candidates)
     wins = count_wins(sweeps, members, node, candidates_of)
     evidence, strict = (evidence_of(wins.won, wins.lost, z) for z in (significance, _CHANGED_Z))
     slides = slides_along_itself(sweeps, members, node, candidates_of, wins.is_covered & ~travels)
     evidence = torch.where((level == num_levels)[:, None], strict, evidence).masked_fill_(slides, 0)
+    num_more = (sweeps.elapsed != 0).sum(1).index_select(0, window) - 1
+    least = torch.minimum(16 * _LEAST_GAIN * num_more, 16 * scatter_count(node, len(tested)) // _LEAST_SHARE)
+    evidence = evidence.masked_fill_(evidence <= least[:, None], 0)
     motion, evidence = best_candidate(evidence, candidates_of)
     return (
         torch.zeros_like(candidates[:, 0]).index_copy_(0, tested, motion),

@@ -162,9 +162,8 @@ def main() -> None:
             items = [item for path in sets.PANDASET.values() for item in sets.kitti(path)[sets.HISTORY :: 4]]
             sums_of[f"PandaSet, h = {h}"] = statistics(items, (h,))
     dropped = ", ".join(f"{100 * share:.0f}" for share in DROPPED)
-    print(
-        f"| set | error, all / dynamic | dynamic, dropped {dropped} % | static, the same | missed found |\n|{'---|' * 5}"
-    )
+    columns = f"error, all / dynamic | dynamic, dropped {dropped} % | static, the same | missed found"
+    print(f"| set | {columns} |\n|{'---|' * 5}")
     for name, sums in sums_of.items():
         gaps = " / ".join(f"{calibration_error(sums, dynamic):.4f}" for dynamic in (False, True))
         left = (", ".join(f"{value:.4f}" for value in sparsification(sums, dynamic)) for dynamic in (True, False))

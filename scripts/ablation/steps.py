@@ -57,6 +57,7 @@ STEPS: dict[str, list[Callable[[], Any]]] = {
         lambda: patch.object(method, "add_overhung", lambda sweeps, _, nodes: (sweeps, nodes))
     ],
     "no aperture test": [lambda: patch.object(paired_test, "slides_along_itself", _nothing_slides)],
+    "no least gain": [lambda: patch.object(paired_test, "_LEAST_GAIN", 0)],
     "no price of an object": [lambda: patch.object(component_tree, "_PRICE", 0)],
     "no margin": [lambda: patch.object(method, "motion_margin", _without_margin)],
     "no registration": [lambda: patch.object(rigid_registration, "_NUM_STEPS", 0)],
